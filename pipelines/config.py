@@ -1,0 +1,240 @@
+"""Every scientific knob: unit, default and reason; canonical text and digest.
+
+A configuration is part of a result: two runs with the same recording, configuration and code give
+the same numbers. Unknown keys and values out of range are refused.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import hashlib
+import json
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any, Self, TypeVar, get_type_hints
+
+from pipelines.errors import ConfigError
+
+FITTING_METHODS = ("along_beam", "paper")
+RESECTION_METHODS = ("free_station",)
+
+_T = TypeVar("_T")
+
+
+def _check(name: str, value: object, low: float, high: float) -> None:
+    """Raise ConfigError unless ``low <= value <= high``."""
+    if isinstance(value, bool) or not isinstance(value, int | float) or not low <= value <= high:
+        raise ConfigError(f"{name} is {value!r}; it must be a number from {low} to {high}.")
+
+
+def _check_methods(name: str, methods: tuple[str, ...], known: tuple[str, ...]) -> None:
+    """Raise ConfigError unless the methods are known, different and at least one."""
+    unknown = [method for method in methods if method not in known]
+    if unknown or not methods or len(set(methods)) < len(methods):
+        raise ConfigError(
+            f"{name} is {list(methods)!r}; it must name one or more of {list(known)}, each once."
+        )
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class StitchingConfig:
+    """How a log becomes points in the base frame.
+
+    Attributes
+    ----------
+    range_min : float
+        Returns nearer than this are the rover itself [m]. 0.9: the VLP-16's own minimum.
+    range_max : float
+        Returns farther than this cannot show a 0.2 m sphere with enough points [m].
+    sigma_levelling : float
+        Standard deviation of the AHRS's roll and pitch [rad]. 0.2 deg: data sheet of the
+        MTi-G-710 for static use.
+    rest : float
+        A rest of the gimbal, or a gap, longer than this ends a stop once the gimbal has turned by
+        half a turn [s]. 3: longer than any step of a step-and-shoot scan.
+    """
+
+    range_min: float = 0.9
+    range_max: float = 60.0
+    sigma_levelling: float = math.radians(0.2)
+    rest: float = 3.0
+
+    def __post_init__(self) -> None:
+        _check("stitching.range_min", self.range_min, 0.0, 10.0)
+        _check("stitching.range_max", self.range_max, 1.0, 300.0)
+        _check("stitching.sigma_levelling", self.sigma_levelling, 1e-6, 0.5)
+        _check("stitching.rest", self.rest, 0.1, 600.0)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ExtractionConfig:
+    """How markers are told from ground, poles and rocks.
+
+    Attributes
+    ----------
+    ground_cell : float
+        Edge of a cell of the ground grid [m].
+    ground_clearance : float
+        Points less than this above the local ground belong to it [m].
+    cluster_gap : float
+        Points closer than this belong together [m].
+    n_points_min : int
+        A group with fewer returns is not looked at.
+    range_max : float
+        Markers are not looked for beyond this distance [m].
+    """
+
+    ground_cell: float = 0.25
+    ground_clearance: float = 0.20
+    cluster_gap: float = 0.15
+    n_points_min: int = 6
+    range_max: float = 35.0
+
+    def __post_init__(self) -> None:
+        _check("extraction.ground_cell", self.ground_cell, 0.05, 2.0)
+        _check("extraction.ground_clearance", self.ground_clearance, 0.02, 2.0)
+        _check("extraction.cluster_gap", self.cluster_gap, 0.02, 1.0)
+        _check("extraction.n_points_min", self.n_points_min, 4, 1000)
+        _check("extraction.range_max", self.range_max, 1.0, 100.0)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class FittingConfig:
+    """How a candidate becomes a centre.
+
+    Attributes
+    ----------
+    methods : tuple of str
+        Fitting methods to run, of ``FITTING_METHODS``; the first is the one that counts.
+    """
+
+    methods: tuple[str, ...] = FITTING_METHODS
+
+    def __post_init__(self) -> None:
+        _check_methods("fitting.methods", self.methods, FITTING_METHODS)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ResectionConfig:
+    """How markers and control marks become a position.
+
+    Attributes
+    ----------
+    methods : tuple of str
+        Resection methods to run, of ``RESECTION_METHODS``; the first is the one that counts.
+    match_tolerance : float
+        A marker farther than this from every control mark is a false one [m].
+    test_level : float
+        Probability with which the global test and the w-tests reject good data.
+    test_power : float
+        Probability with which a bias of the minimal detectable size is found.
+    sigma_common : float
+        Standard deviation per axis that every centre has beyond its own covariance: mounting and
+        encoder of the gimbal [m].
+    """
+
+    methods: tuple[str, ...] = RESECTION_METHODS
+    match_tolerance: float = 0.15
+    test_level: float = 0.001
+    test_power: float = 0.80
+    sigma_common: float = 0.001
+
+    def __post_init__(self) -> None:
+        _check_methods("resection.methods", self.methods, RESECTION_METHODS)
+        _check("resection.match_tolerance", self.match_tolerance, 0.01, 2.0)
+        _check("resection.test_level", self.test_level, 1e-6, 0.2)
+        _check("resection.test_power", self.test_power, 0.5, 0.999)
+        _check("resection.sigma_common", self.sigma_common, 0.0, 0.1)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SurveyConfig:
+    """All of it.
+
+    Attributes
+    ----------
+    marker_radius : float
+        Radius of the spheres [m].
+    tolerance : float
+        Error that a user accepts [m]. 0.03: the study's requirement.
+    stitching : StitchingConfig
+        How a log becomes points.
+    extraction : ExtractionConfig
+        How markers are found.
+    fitting : FittingConfig
+        How centres are estimated.
+    resection : ResectionConfig
+        How the station is positioned.
+    """
+
+    marker_radius: float = 0.100
+    tolerance: float = 0.03
+    stitching: StitchingConfig = field(default_factory=StitchingConfig)
+    extraction: ExtractionConfig = field(default_factory=ExtractionConfig)
+    fitting: FittingConfig = field(default_factory=FittingConfig)
+    resection: ResectionConfig = field(default_factory=ResectionConfig)
+
+    def __post_init__(self) -> None:
+        _check("marker_radius", self.marker_radius, 0.01, 1.0)
+        _check("tolerance", self.tolerance, 1e-4, 1.0)
+
+    @classmethod
+    def from_mapping(cls, values: Mapping[str, Any]) -> Self:
+        """Build a configuration from nested mappings, with defaults for what is not named.
+
+        Parameters
+        ----------
+        values : mapping
+            Nested as in ``to_mapping``; any key may be missing.
+
+        Returns
+        -------
+        SurveyConfig
+            The configuration.
+
+        Raises
+        ------
+        ConfigError
+            If a key is unknown or a value is out of range.
+        """
+        return _build(cls, values, "")
+
+    def to_mapping(self) -> dict[str, Any]:
+        """Return the configuration as nested dictionaries of plain values."""
+        return dataclasses.asdict(self)
+
+    @property
+    def text(self) -> str:
+        """Canonical text: JSON with sorted keys."""
+        return json.dumps(self.to_mapping(), sort_keys=True, separators=(",", ":"))
+
+    @property
+    def digest(self) -> str:
+        """First 16 hexadecimal digits of the SHA-256 of the canonical text."""
+        return hashlib.sha256(self.text.encode()).hexdigest()[:16]
+
+
+def _build(kind: type[_T], values: object, path: str) -> _T:
+    """Build one configuration dataclass from a mapping, recursively."""
+    if not isinstance(values, Mapping):
+        raise ConfigError(f"{path or 'The configuration'} is {values!r}; it must be an object.")
+    types = get_type_hints(kind)
+    unknown = [key for key in values if key not in types]
+    if unknown:
+        raise ConfigError(f"{path}{unknown[0]} is unknown; known here: {', '.join(types)}.")
+    arguments = {key: _plain(types[key], value, f"{path}{key}") for key, value in values.items()}
+    return kind(**arguments)
+
+
+def _plain(expected: Any, value: object, path: str) -> object:
+    """Bring one value of a mapping to the type that the field declares."""
+    if dataclasses.is_dataclass(expected) and isinstance(expected, type):
+        return _build(expected, value, f"{path}.")
+    if expected == tuple[str, ...]:
+        if isinstance(value, str) or not isinstance(value, Sequence):
+            raise ConfigError(f"{path} is {value!r}; it must be a list of names.")
+        return tuple(value)
+    if expected is int and not isinstance(value, int):
+        raise ConfigError(f"{path} is {value!r}; it must be a whole number.")
+    return float(value) if expected is float and isinstance(value, int) else value

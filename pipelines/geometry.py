@@ -1,0 +1,122 @@
+"""Rigid motions, levelling and polar coordinates: the only changer of frames.
+
+Conventions are those of CONVENTIONS.md: ``T_a_b`` maps from ``b`` to ``a``; small motions are
+(rotation, translation) and act on the left.
+"""
+
+import numpy as np
+from numpy.typing import ArrayLike
+from scipy.spatial.transform import Rotation
+
+from pipelines.values import Array, Levelling
+
+_SMALL = 1e-9  # [rad]; below it the series of the exponential is exact in float64
+
+
+def skew(v: ArrayLike) -> Array:
+    """Return the matrix ``[v]x`` with ``[v]x w = v x w``; (..., 3) gives (..., 3, 3)."""
+    v = np.asarray(v, dtype=np.float64)
+    out = np.zeros((*v.shape, 3))
+    out[..., 0, 1], out[..., 0, 2], out[..., 1, 2] = -v[..., 2], v[..., 1], -v[..., 0]
+    out[..., 1, 0], out[..., 2, 0], out[..., 2, 1] = v[..., 2], -v[..., 1], v[..., 0]
+    return out
+
+
+def rot_x(angle: float) -> Array:
+    """Return the rotation about x by an angle [rad]."""
+    return Rotation.from_euler("x", angle).as_matrix()
+
+
+def rot_y(angle: float) -> Array:
+    """Return the rotation about y by an angle [rad]."""
+    return Rotation.from_euler("y", angle).as_matrix()
+
+
+def rot_z(angle: float) -> Array:
+    """Return the rotation about z by an angle [rad]."""
+    return Rotation.from_euler("z", angle).as_matrix()
+
+
+def rigid(R: ArrayLike, t: ArrayLike) -> Array:
+    """Return the (4, 4) motion with rotation ``R`` and translation ``t`` [m]."""
+    T = np.eye(4)
+    T[:3, :3] = R
+    T[:3, 3] = t
+    return T
+
+
+def inverse(T: Array) -> Array:
+    """Return the inverse of a (4, 4) rigid motion."""
+    R = T[:3, :3]
+    return rigid(R.T, -R.T @ T[:3, 3])
+
+
+def transform(T: Array, p: ArrayLike) -> Array:
+    """Move points, (..., 3), by a (4, 4) rigid motion [m]."""
+    return np.asarray(p, dtype=np.float64) @ T[:3, :3].T + T[:3, 3]
+
+
+def exp_motion(xi: ArrayLike) -> Array:
+    """Return the rigid motion of a small-motion vector.
+
+    Parameters
+    ----------
+    xi : (6,)
+        Rotation [rad] and translation [m] of the twist.
+
+    Returns
+    -------
+    (4, 4)
+        ``Exp(xi)``.
+
+    Notes
+    -----
+    Barfoot, State Estimation for Robotics, eq. 7.34 and 7.37, with rotation first.
+    """
+    xi = np.asarray(xi, dtype=np.float64)
+    return rigid(Rotation.from_rotvec(xi[:3]).as_matrix(), left_jacobian(xi[:3]) @ xi[3:])
+
+
+def log_motion(T: Array) -> Array:
+    """Return the small-motion vector (6,) whose ``exp_motion`` is ``T``; rotation below pi."""
+    phi = Rotation.from_matrix(T[:3, :3]).as_rotvec()
+    return np.concatenate([phi, np.linalg.solve(left_jacobian(phi), T[:3, 3])])
+
+
+def left_jacobian(phi: Array) -> Array:
+    """Return the left Jacobian of the rotation vector ``phi``, (3, 3) (Barfoot, eq. 7.37)."""
+    cross = skew(phi)
+    angle = float(np.linalg.norm(phi))
+    if angle < _SMALL:
+        return np.eye(3) + 0.5 * cross
+    first, second = (1.0 - np.cos(angle)) / angle**2, (angle - np.sin(angle)) / angle**3
+    return np.asarray(np.eye(3) + first * cross + second * cross @ cross)
+
+
+def levelling_rotation(levelling: Levelling) -> Array:
+    """Return ``R_station_base = Ry(pitch) Rx(roll)``, (3, 3)."""
+    return np.asarray(rot_y(levelling.pitch) @ rot_x(levelling.roll))
+
+
+def yaw_pitch_roll(R: Array) -> tuple[float, float, float]:
+    """Return yaw, pitch and roll of ``R = Rz(yaw) Ry(pitch) Rx(roll)`` [rad]."""
+    yaw, pitch, roll = Rotation.from_matrix(R).as_euler("ZYX")
+    return float(yaw), float(pitch), float(roll)
+
+
+def included_angle(v: ArrayLike, w: ArrayLike) -> Array:
+    """Return the angle between directions, (..., 3) each, 0 to pi [rad].
+
+    Notes
+    -----
+    By the arc tangent of cross and dot product, which is exact for small and for flat angles
+    (Kahan, 2006, section 13).
+    """
+    v, w = np.asarray(v, dtype=np.float64), np.asarray(w, dtype=np.float64)
+    cross = np.linalg.norm(np.cross(v, w), axis=-1)
+    return np.asarray(np.arctan2(cross, np.sum(v * w, axis=-1)))
+
+
+def wrap(angle: ArrayLike) -> Array:
+    """Reduce angles to [-pi, pi) [rad]."""
+    return np.asarray((np.asarray(angle, dtype=np.float64) + np.pi) % (2.0 * np.pi) - np.pi)
