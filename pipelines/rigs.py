@@ -150,10 +150,12 @@ def _read(values: Mapping[str, Any]) -> Rig:
         key.removesuffix("_rad").removesuffix("_m").removesuffix("_s"): value
         for key, value in values.items()
     }
-    arrays = {k: np.array(v, np.float64) for k, v in fields.items() if isinstance(v, list)}
+    arrays: dict[str, Any] = {
+        k: np.array(v, np.float64) for k, v in fields.items() if isinstance(v, list)
+    }
     if arrays.get("T_head_lidar", np.zeros(0)).shape != (4, 4):
         raise RigError("The rig's T_head_lidar must be a list of four rows of four numbers.")
-    rest = {k: v for k, v in fields.items() if k not in arrays}
+    rest: dict[str, Any] = {k: v for k, v in fields.items() if k not in arrays}
     if "imu_mount" in rest:
         rest["imu_mount"] = ImuMount(rest["imu_mount"])
     if not isinstance(rest.get("cloud_carries_heights", True), bool):

@@ -1,0 +1,1 @@
+"""Scan logs: MCAP files to and from ``ScanLog``, and the preflight report."""
