@@ -1,0 +1,183 @@
+"""From results to statements: errors against truth, and what they mean for a tolerance."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike
+from scipy.optimize import linear_sum_assignment
+
+from pipelines.geometry import inverse, transform, wrap
+from pipelines.values import Array, ControlMarks, Index, MarkerFits, StationFix, StopTruth
+
+UNMATCHED = -1  # the true mark of a fit that stands near none
+_NEAR = 0.5  # [m]; a fit farther than this from every true mark shows something else
+
+
+@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
+class MarkerErrors:
+    """Errors of sphere centres against truth.
+
+    Attributes
+    ----------
+    marks : (n,)
+        True mark of each fit; ``UNMATCHED`` for a fit that stands near none: a false marker.
+    error_base : (n, 3)
+        Estimate minus truth in the base frame; NaN for a false marker [m].
+    error_radial : (n,)
+        Component along the line from the base to the true centre; NaN likewise [m].
+    """
+
+    marks: Index
+    error_base: Array
+    error_radial: Array
+
+    @property
+    def error_3d(self) -> Array:
+        """Length of each error; NaN for a false marker, (n,) [m]."""
+        return np.asarray(np.linalg.norm(self.error_base, axis=1))
+
+
+@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
+class StationError:
+    """Error of a station against truth.
+
+    Attributes
+    ----------
+    error_site : (3,)
+        Estimate minus truth of the position in the site frame [m].
+    error_yaw : float
+        Estimate minus truth of the heading [rad].
+    """
+
+    error_site: Array
+    error_yaw: float
+
+    @property
+    def error_3d(self) -> float:
+        """Length of the error of the position [m]."""
+        return float(np.linalg.norm(self.error_site))
+
+
+@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
+class ErrorSummary:
+    """A sample of error lengths in a few numbers.
+
+    Attributes
+    ----------
+    n : int
+        Size of the sample.
+    mean, rms, p95, largest : float
+        Mean, root mean square, 95th percentile and maximum; NaN for an empty sample [m].
+    share_within : float
+        Share of the sample within the tolerance, 0 to 1; NaN likewise.
+    """
+
+    n: int
+    mean: float
+    rms: float
+    p95: float
+    largest: float
+    share_within: float
+
+
+def marker_errors(fits: MarkerFits, stop: StopTruth, marks: ControlMarks) -> MarkerErrors:
+    """Compare the centres of one stop with the truth.
+
+    Parameters
+    ----------
+    fits : MarkerFits
+        Centres in the base frame.
+    stop : StopTruth
+        True pose of the base frame.
+    marks : ControlMarks
+        True centres.
+
+    Returns
+    -------
+    MarkerErrors
+        In the order of the fits.
+
+    Notes
+    -----
+    Each fit is paired with the true mark that makes the sum of distances least (Kuhn-Munkres), and
+    stays unmatched beyond half a metre. The base frame has no levelling in it, so neither have the
+    errors.
+    """
+    return centre_errors(np.array([f.p_base for f in fits.fits]), stop, marks)
+
+
+def centre_errors(p_base: ArrayLike, stop: StopTruth, marks: ControlMarks) -> MarkerErrors:
+    """Compare centres in the base frame, (n, 3) [m], with the truth; see ``marker_errors``."""
+    found = np.asarray(p_base, dtype=np.float64).reshape(-1, 3)
+    true = transform(inverse(stop.T_site_base), marks.p_site)
+    distances = np.linalg.norm(found[:, None] - true[None], axis=2)
+    rows, columns = linear_sum_assignment(np.minimum(distances, _NEAR))
+    near = distances[rows, columns] < _NEAR
+    rows, columns = rows[near], columns[near]
+    matched = np.full(len(found), UNMATCHED, dtype=np.intp)
+    matched[rows] = columns
+    errors = np.full((len(found), 3), np.nan)
+    errors[rows] = found[rows] - true[columns]
+    radial = np.full(len(found), np.nan)
+    lines = true[columns] / np.linalg.norm(true[columns], axis=1, keepdims=True)
+    radial[rows] = np.sum(errors[rows] * lines, axis=1)
+    return MarkerErrors(marks=matched, error_base=errors, error_radial=radial)
+
+
+def station_error(fix: StationFix, stop: StopTruth) -> StationError:
+    """Compare a station with the truth.
+
+    Parameters
+    ----------
+    fix : StationFix
+        The estimate.
+    stop : StopTruth
+        True pose of the base frame, whose origin and heading are those of the station frame.
+
+    Returns
+    -------
+    StationError
+        In the site frame.
+
+    Notes
+    -----
+    The heading of the base is the yaw of ``R_site_base = Rz(yaw) Ry(pitch) Rx(roll)``.
+    """
+    yaw = np.arctan2(stop.T_site_base[1, 0], stop.T_site_base[0, 0])
+    return StationError(
+        error_site=fix.p_site - stop.T_site_base[:3, 3],
+        error_yaw=float(wrap(fix.yaw - yaw)),
+    )
+
+
+def summarise(errors_3d: ArrayLike, tolerance: float) -> ErrorSummary:
+    """Put a sample of error lengths into a few numbers.
+
+    Parameters
+    ----------
+    errors_3d : (n,)
+        Lengths of errors; NaN are left out [m].
+    tolerance : float
+        Error that is accepted [m].
+
+    Returns
+    -------
+    ErrorSummary
+        With the size of the sample that was used.
+    """
+    sample = np.asarray(errors_3d, dtype=np.float64)
+    sample = sample[np.isfinite(sample)]
+    if not len(sample):
+        return ErrorSummary(
+            n=0, mean=np.nan, rms=np.nan, p95=np.nan, largest=np.nan, share_within=np.nan
+        )
+    return ErrorSummary(
+        n=len(sample),
+        mean=float(sample.mean()),
+        rms=float(np.sqrt(np.mean(sample**2))),
+        p95=float(np.quantile(sample, 0.95)),
+        largest=float(sample.max()),
+        share_within=float(np.mean(sample <= tolerance)),
+    )

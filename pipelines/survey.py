@@ -1,0 +1,161 @@
+"""The whole chain in memory: a scan log goes in, an honest position comes out."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from time import perf_counter
+
+from pipelines.config import SurveyConfig
+from pipelines.errors import MissingRigError, NoMarkersError, SolveError
+from pipelines.extraction import extract
+from pipelines.fitting import fit_markers
+from pipelines.resection import resect, resect_pairs
+from pipelines.stitching import split_stops, stitch
+from pipelines.values import (
+    ControlMarks,
+    MarkerFits,
+    NoFix,
+    PairFixes,
+    Rig,
+    ScanLog,
+    StationFix,
+    StopResult,
+)
+
+Progress = Callable[[float, str], None]
+"""Told the share of the work that is done, 0 to 1, and what comes next; may raise to cancel."""
+
+
+def process(
+    log: ScanLog,
+    *,
+    config: SurveyConfig,
+    rig: Rig | None = None,
+    marks: ControlMarks | None = None,
+    progress: Progress = lambda _share, _what: None,
+) -> tuple[StopResult, ...]:
+    """Find the markers of each stop of a log and position its stations.
+
+    Parameters
+    ----------
+    log : ScanLog
+        One stop or many.
+    config : SurveyConfig
+        What to do, and how.
+    rig : Rig, optional
+        The rig; by default the one that the log describes.
+    marks : ControlMarks, optional
+        Marks at known places; without them there are centres, but no positions.
+    progress : callable
+        Told the share of the work that is done, 0 to 1, and what comes next.
+
+    Returns
+    -------
+    tuple of StopResult
+        One for each stop, in the order of time.
+
+    Raises
+    ------
+    MissingRigError
+        If neither the log nor the caller tells how the LiDAR is mounted.
+    NoMarkersError
+        If not one marker was found in any stop.
+    RecordingError
+        If the log cannot be stitched.
+
+    Notes
+    -----
+    A station that cannot be positioned does not cost its markers: its fix is a ``NoFix`` with the
+    reason. Cost grows linearly with the returns.
+    """
+    rig = rig or log.rig
+    if rig is None:
+        raise MissingRigError(
+            f"{log.origin.name} does not tell how the LiDAR is mounted: it has no /tf_static from "
+            "the gimbal to the LiDAR. Give a rig (--rig rig.json)."
+        )
+    stops = split_stops(log, config.stitching)
+    results = []
+    for i, stop in enumerate(stops):
+        results.append(_process_stop(stop, rig, marks, config, _part(progress, i, len(stops))))
+    if not any(fits.fits for result in results for fits in result.fits.values()):
+        raise NoMarkersError(_why_no_markers(results, config))
+    return tuple(results)
+
+
+def _process_stop(
+    log: ScanLog,
+    rig: Rig,
+    marks: ControlMarks | None,
+    config: SurveyConfig,
+    progress: Progress,
+) -> StopResult:
+    """Run the chain on one stop."""
+    timings: dict[str, float] = {}
+    progress(0.0, f"Stitching {log.origin.name}")
+    with _timed(timings, "stitching"):
+        cloud = stitch(log, rig, config.stitching)
+    progress(0.3, f"Extracting markers from {len(cloud.p_base):,} returns")
+    with _timed(timings, "extraction"):
+        candidates = extract(cloud, config.extraction, config.marker_radius)
+    fits = {}
+    for i, method in enumerate(config.fitting.methods):
+        share = 0.5 + 0.3 * i / len(config.fitting.methods)
+        progress(share, f"Fitting {len(candidates.candidates)} centres by {method}")
+        with _timed(timings, f"fitting.{method}"):
+            fits[method] = fit_markers(
+                method, cloud, candidates, config.fitting, config.marker_radius
+            )
+    progress(0.8, "Positioning the station")
+    with _timed(timings, "resection"):
+        fixes, pairs = _position(fits, marks, config)
+    progress(1.0, f"{log.origin.name} done")
+    return StopResult(
+        name=log.origin.name, cloud=cloud, fits=fits, fixes=fixes, pairs=pairs, timings=timings
+    )
+
+
+def _position(
+    fits: dict[str, MarkerFits], marks: ControlMarks | None, config: SurveyConfig
+) -> tuple[dict[tuple[str, str], StationFix | NoFix], dict[tuple[str, str], PairFixes]]:
+    """Position the station from each set of fits by each resection method."""
+    fixes: dict[tuple[str, str], StationFix | NoFix] = {}
+    pairs: dict[tuple[str, str], PairFixes] = {}
+    if marks is None:
+        return fixes, pairs
+    for fit_method, centres in fits.items():
+        for method in config.resection.methods:
+            key = (fit_method, method)
+            try:
+                fix = resect(method, centres, marks, config.resection)
+            except SolveError as error:
+                fixes[key] = NoFix(method=method, code=error.code, reason=str(error))
+                continue
+            fixes[key] = fix
+            pairs[key] = resect_pairs(method, fix, centres, marks, config.resection)
+    return fixes, pairs
+
+
+def _why_no_markers(results: list[StopResult], config: SurveyConfig) -> str:
+    """Say what was seen instead of markers."""
+    returns = sum(len(result.cloud.p_base) for result in results)
+    refused = [r for result in results for fits in result.fits.values() for r in fits.rejected]
+    closest = max(refused, key=lambda rejection: rejection.n_points, default=None)
+    seen = f"{returns:,} returns show no sphere of radius {config.marker_radius:.3f} m"
+    if closest is None:
+        return f"{seen} between {config.stitching.range_min} and {config.extraction.range_max} m."
+    return f"{seen}; the largest of {len(refused)} refused groups: {closest.reason}"
+
+
+def _part(progress: Progress, i: int, n: int) -> Progress:
+    """Return the progress of part ``i`` of ``n`` as a share of the whole."""
+    return lambda share, what: progress((i + share) / n, what)
+
+
+@contextmanager
+def _timed(timings: dict[str, float], step: str) -> Iterator[None]:
+    """Record how long the step takes [s]."""
+    start = perf_counter()
+    yield
+    timings[step] = perf_counter() - start
