@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from pipelines.errors import RigError
+from pipelines.errors import InputError, RigError
 from pipelines.geometry import rigid, rot_y
 from pipelines.values import Array, ImuMount, Rig
 
@@ -140,7 +140,11 @@ def rig_from_mapping(values: Mapping[str, Any]) -> Rig:
         raise RigError("The rig has no T_head_lidar: a 4x4 matrix from LiDAR to head, in metres.")
     try:
         return _checked(_read(values))
-    except (TypeError, ValueError) as error:
+    except RigError:
+        raise
+    except InputError as error:
+        raise RigError(str(error)) from error
+    except (AttributeError, TypeError, ValueError) as error:
         raise RigError(f"The rig holds a value of the wrong kind: {error}.") from error
 
 
