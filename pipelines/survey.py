@@ -7,11 +7,11 @@ from contextlib import contextmanager
 from time import perf_counter
 
 from pipelines.config import SurveyConfig
-from pipelines.errors import MissingRigError, NoMarkersError, SolveError
+from pipelines.errors import NoMarkersError, SolveError
 from pipelines.extraction import extract
 from pipelines.fitting import fit_markers
 from pipelines.resection import resect, resect_pairs
-from pipelines.stitching import split_stops, stitch
+from pipelines.stitching import choose_rig, split_stops, stitch
 from pipelines.values import (
     ControlMarks,
     MarkerFits,
@@ -69,12 +69,7 @@ def process(
     A station that cannot be positioned does not cost its markers: its fix is a ``NoFix`` with the
     reason. Cost grows linearly with the returns.
     """
-    rig = rig or log.rig
-    if rig is None:
-        raise MissingRigError(
-            f"{log.origin.name} does not tell how the LiDAR is mounted: it has no /tf_static from "
-            "the gimbal to the LiDAR. Give a rig (--rig rig.json)."
-        )
+    rig = choose_rig(log, rig)
     stops = split_stops(log, config.stitching)
     results = []
     for i, stop in enumerate(stops):
