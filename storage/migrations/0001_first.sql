@@ -14,6 +14,7 @@ COMMENT ON TABLE surveys IS 'A field with its control marks and the logs that we
 CREATE TABLE control_marks (
     survey_id VARCHAR NOT NULL,
     mark VARCHAR NOT NULL,
+    place INTEGER NOT NULL,
     x_m DOUBLE NOT NULL,
     y_m DOUBLE NOT NULL,
     z_m DOUBLE NOT NULL,
@@ -27,6 +28,7 @@ COMMENT ON TABLE control_marks IS 'Known sphere centres in the site frame.';
 CREATE TABLE true_marks (
     survey_id VARCHAR NOT NULL,
     mark VARCHAR NOT NULL,
+    place INTEGER NOT NULL,
     x_m DOUBLE NOT NULL,
     y_m DOUBLE NOT NULL,
     z_m DOUBLE NOT NULL,
@@ -46,6 +48,13 @@ CREATE TABLE true_stops (
     PRIMARY KEY (survey_id, stop)
 );
 COMMENT ON TABLE true_stops IS 'True poses of the base frame in the site frame; for comparison only, never an input of a job.';
+
+CREATE TABLE true_worlds (
+    survey_id VARCHAR PRIMARY KEY,
+    rig JSON,
+    about JSON NOT NULL
+);
+COMMENT ON TABLE true_worlds IS 'What else is known of a simulated world: its rig, seed and scenario; for comparison only, never an input of a job.';
 
 CREATE TABLE rigs (
     rig_digest VARCHAR PRIMARY KEY,
@@ -126,26 +135,26 @@ CREATE TABLE marker_fits (
     x_m DOUBLE NOT NULL,
     y_m DOUBLE NOT NULL,
     z_m DOUBLE NOT NULL,
-    cov_xx_m2 DOUBLE NOT NULL,
-    cov_xy_m2 DOUBLE NOT NULL,
-    cov_xz_m2 DOUBLE NOT NULL,
-    cov_yy_m2 DOUBLE NOT NULL,
-    cov_yz_m2 DOUBLE NOT NULL,
-    cov_zz_m2 DOUBLE NOT NULL,
-    sigma_3d_m DOUBLE NOT NULL,
+    cov_xx_m2 DOUBLE,
+    cov_xy_m2 DOUBLE,
+    cov_xz_m2 DOUBLE,
+    cov_yy_m2 DOUBLE,
+    cov_yz_m2 DOUBLE,
+    cov_zz_m2 DOUBLE,
+    sigma_3d_m DOUBLE,
     range_m DOUBLE NOT NULL,
     azimuth_deg DOUBLE NOT NULL,
     elevation_deg DOUBLE NOT NULL,
     n_points INTEGER NOT NULL,
     n_rejected INTEGER NOT NULL,
     n_rings INTEGER NOT NULL,
-    coverage DOUBLE NOT NULL,
-    rms_m DOUBLE NOT NULL,
-    sigma0 DOUBLE NOT NULL,
+    coverage DOUBLE,
+    rms_m DOUBLE,
+    sigma0 DOUBLE,
     radius_m DOUBLE NOT NULL,
     radius_free_m DOUBLE,
     sigma_radius_free_m DOUBLE,
-    mean_intensity DOUBLE NOT NULL,
+    mean_intensity DOUBLE,
     error_x_m DOUBLE,
     error_y_m DOUBLE,
     error_z_m DOUBLE,
@@ -178,6 +187,7 @@ CREATE TABLE station_fixes (
     y_m DOUBLE,
     z_m DOUBLE,
     yaw_deg DOUBLE,
+    rotation DOUBLE[],
     cov_xx_m2 DOUBLE,
     cov_xy_m2 DOUBLE,
     cov_xz_m2 DOUBLE,
@@ -237,10 +247,10 @@ CREATE TABLE resections (
     n_marks INTEGER NOT NULL,
     included_angle_deg DOUBLE NOT NULL,
     included_angle_horizontal_deg DOUBLE NOT NULL,
-    sigma_3d_m DOUBLE NOT NULL,
-    x_m DOUBLE NOT NULL,
-    y_m DOUBLE NOT NULL,
-    z_m DOUBLE NOT NULL,
+    sigma_3d_m DOUBLE,
+    x_m DOUBLE,
+    y_m DOUBLE,
+    z_m DOUBLE,
     error_3d_m DOUBLE
 );
 COMMENT ON TABLE resections IS 'The station positioned from each pair of marks alone (with gravity), in the site frame.';

@@ -1,0 +1,966 @@
+"""The one owner of the DuckDB file: typed put and get, jobs, and snapshots for everybody else.
+
+While a catalogue is open no other process can open its file, not even for reading (DuckDB allows
+one owner), so workers return Arrow tables and people query snapshots (``storage.sandbox``). Every
+read has a cursor of its own and may run in any thread; writes take turns. The file is never opened
+and closed again by this process: that would drop the lock that DuckDB holds on it.
+"""
+
+from __future__ import annotations
+
+import base64
+import json
+import re
+import secrets
+import subprocess
+import threading
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import closing, contextmanager, suppress
+from datetime import UTC, datetime
+from pathlib import Path
+from types import TracebackType
+from typing import Any, Self, TypeVar
+
+import duckdb
+import numpy as np
+import pyarrow as pa
+from numpy.typing import NDArray
+
+from pipelines.errors import ConflictError, ControlError, InputError, NotFoundError
+from pipelines.geometry import rigid, rot_x, rot_y, rot_z, yaw_pitch_roll
+from pipelines.rigs import rig_from_mapping, rig_to_mapping
+from pipelines.values import ControlMarks, StopTruth, Truth
+from storage import migrations, results
+from storage.records import (
+    JobRecord,
+    JobStatus,
+    Page,
+    RecordingRecord,
+    RunRecord,
+    SurveyRecord,
+)
+
+_Record = TypeVar("_Record")
+
+_N_ROWS_MAX = 200_000  # of one of our own queries; a page that needs more should aggregate
+_PAGE_MAX = 1000  # records in one part of a list
+_N_SNAPSHOTS = 3  # kept: one may still be being opened while the next two are made
+_DIGEST = re.compile(r"[0-9a-f]{64}")
+_VERDICTS = ("ok", "weak", "refused")
+
+_SURVEYS = """
+SELECT s.survey_id, s.name, s.tolerance_m, s.created_at,
+    (SELECT count(*) FROM control_marks AS c WHERE c.survey_id = s.survey_id) AS n_control_marks,
+    (SELECT count(*) FROM true_stops AS t WHERE t.survey_id = s.survey_id) AS n_true_stops,
+    (SELECT count(DISTINCT j.recording_id) FROM jobs AS j WHERE j.survey_id = s.survey_id)
+        AS n_recordings
+FROM surveys AS s
+"""
+_SURVEY_BY_KEY = _SURVEYS + "WHERE s.survey_id = $key OR s.name = $key ORDER BY s.survey_id <> $key"
+_SURVEYS_AFTER = (
+    _SURVEYS
+    + """
+WHERE ($at::TIMESTAMPTZ IS NULL OR (s.created_at, s.survey_id) < ($at::TIMESTAMPTZ, $id))
+ORDER BY s.created_at DESC, s.survey_id DESC LIMIT $n
+"""
+)
+_RECORDING = "SELECT * FROM recordings WHERE recording_id = $id"
+_RECORDINGS_AFTER = """
+SELECT * FROM recordings
+WHERE ($at::TIMESTAMPTZ IS NULL OR (uploaded_at, recording_id) < ($at::TIMESTAMPTZ, $id))
+ORDER BY uploaded_at DESC, recording_id DESC LIMIT $n
+"""
+_JOBS = """
+SELECT j.*, s.name AS survey, r.name AS recording
+FROM jobs AS j JOIN surveys AS s USING (survey_id) LEFT JOIN recordings AS r USING (recording_id)
+"""
+_JOB = _JOBS + "WHERE j.job_id = $id"
+_JOBS_AFTER = (
+    _JOBS
+    + """
+WHERE ($at::TIMESTAMPTZ IS NULL OR (j.created_at, j.job_id) < ($at::TIMESTAMPTZ, $id))
+    AND ($survey_id::VARCHAR IS NULL OR j.survey_id = $survey_id)
+    AND ($recording_id::VARCHAR IS NULL OR j.recording_id = $recording_id)
+    AND ($status::VARCHAR IS NULL OR j.status = $status)
+ORDER BY j.created_at DESC, j.job_id DESC LIMIT $n
+"""
+)
+_JOBS_ACCEPTED = _JOBS + "WHERE j.status = 'accepted' ORDER BY j.created_at, j.job_id"
+_RUN = "SELECT * FROM runs WHERE run_id = $id"
+_RUNS_AFTER = """
+SELECT * FROM runs
+WHERE ($at::TIMESTAMPTZ IS NULL OR (finished_at, run_id) < ($at::TIMESTAMPTZ, $id))
+    AND ($survey_id::VARCHAR IS NULL OR survey_id = $survey_id)
+    AND ($recording_id::VARCHAR IS NULL OR recording_id = $recording_id)
+    AND ($job_id::VARCHAR IS NULL OR job_id = $job_id)
+ORDER BY finished_at DESC, run_id DESC LIMIT $n
+"""
+_CONTROL = "SELECT * FROM control_marks WHERE survey_id = $id ORDER BY place"
+_TRUE_MARKS = "SELECT * FROM true_marks WHERE survey_id = $id ORDER BY place"
+_TRUE_STOPS = "SELECT * FROM true_stops WHERE survey_id = $id ORDER BY stop"
+_TRUE_WORLD = "SELECT rig, about FROM true_worlds WHERE survey_id = $id"
+_RESULTS_OF_SURVEY = {
+    "stops": "SELECT x.* FROM stops AS x JOIN runs USING (run_id) WHERE survey_id = $id",
+    "marker_fits": (
+        "SELECT x.* FROM marker_fits AS x JOIN runs USING (run_id) WHERE survey_id = $id"
+    ),
+    "station_fixes": (
+        "SELECT x.* FROM station_fixes AS x JOIN runs USING (run_id) WHERE survey_id = $id"
+    ),
+    "resections": (
+        "SELECT x.* FROM resections AS x JOIN runs USING (run_id) WHERE survey_id = $id"
+    ),
+}
+_INSERT = {
+    "rigs": "INSERT OR IGNORE INTO rigs BY NAME SELECT * FROM incoming",
+    "runs": "INSERT INTO runs BY NAME SELECT * FROM incoming",
+    "stops": "INSERT INTO stops BY NAME SELECT * FROM incoming",
+    "marker_fits": "INSERT INTO marker_fits BY NAME SELECT * FROM incoming",
+    "rejections": "INSERT INTO rejections BY NAME SELECT * FROM incoming",
+    "station_fixes": "INSERT INTO station_fixes BY NAME SELECT * FROM incoming",
+    "observations": "INSERT INTO observations BY NAME SELECT * FROM incoming",
+    "resections": "INSERT INTO resections BY NAME SELECT * FROM incoming",
+    "control_marks": "INSERT OR REPLACE INTO control_marks BY NAME SELECT * FROM incoming",
+    "true_marks": "INSERT OR REPLACE INTO true_marks BY NAME SELECT * FROM incoming",
+    "true_stops": "INSERT OR REPLACE INTO true_stops BY NAME SELECT * FROM incoming",
+}
+_REFRESH = {
+    "marker_fits": """
+        UPDATE marker_fits AS x SET error_x_m = i.error_x_m, error_y_m = i.error_y_m,
+            error_z_m = i.error_z_m, error_radial_m = i.error_radial_m, error_3d_m = i.error_3d_m
+        FROM incoming AS i WHERE x.run_id = i.run_id AND x.stop = i.stop
+            AND x.fit_method = i.fit_method AND x.marker = i.marker
+    """,
+    "station_fixes": """
+        UPDATE station_fixes AS x SET error_x_m = i.error_x_m, error_y_m = i.error_y_m,
+            error_z_m = i.error_z_m, error_yaw_deg = i.error_yaw_deg,
+            error_horizontal_m = i.error_horizontal_m, error_3d_m = i.error_3d_m
+        FROM incoming AS i WHERE x.run_id = i.run_id AND x.stop = i.stop
+            AND x.fit_method = i.fit_method AND x.resection_method = i.resection_method
+    """,
+    "resections": """
+        UPDATE resections AS x SET error_3d_m = i.error_3d_m
+        FROM incoming AS i WHERE x.run_id = i.run_id AND x.stop = i.stop
+            AND x.fit_method = i.fit_method AND x.resection_method = i.resection_method
+            AND x.marks = i.marks
+    """,
+}
+
+
+class Catalogue:
+    """The results, the surveys that they belong to, and the jobs that made them.
+
+    Parameters
+    ----------
+    path : Path
+        The DuckDB file; it and its folder are made when missing.
+    snapshots : Path
+        Folder for the copies that others read; on the same disk, so that a copy costs little.
+    memory_limit : str
+        What DuckDB may use before it spills to disk, in its own words.
+
+    Raises
+    ------
+    ConflictError
+        If another process, or this one, has the file open.
+    SchemaConflictError
+        If another version of spheremark made the file.
+    InputError
+        If the file is not a DuckDB database.
+
+    Notes
+    -----
+    Safe to use from many threads. Once open, the database cannot reach files or the network,
+    and its configuration is locked.
+    """
+
+    def __init__(self, path: Path, *, snapshots: Path, memory_limit: str = "1GB") -> None:
+        self.path = path
+        self._lock = threading.RLock()
+        self._version = 0
+        self._connection = _open(path, memory_limit)
+        self._snapshots = _Snapshots(path, snapshots)
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        traceback: TracebackType | None,
+    ) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Give the file back; the catalogue cannot be used any more."""
+        with self._lock:
+            self._connection.close()
+
+    # Surveys, their marks and their truth
+
+    def create_survey(self, name: str, *, tolerance: float = 0.03) -> SurveyRecord:
+        """Make a survey.
+
+        Parameters
+        ----------
+        name : str
+            Unique, 1 to 200 printable characters.
+        tolerance : float
+            Error that it accepts [m].
+
+        Returns
+        -------
+        SurveyRecord
+            The new survey.
+
+        Raises
+        ------
+        InputError
+            If the name or the tolerance cannot be used.
+        ConflictError
+            If the name is taken.
+        """
+        _check_name("The name of a survey", name)
+        if not 0.0 < tolerance <= 1.0:
+            raise InputError(f"The tolerance is {tolerance!r} m; it must be above 0 and at most 1.")
+        with self._writing() as cursor:
+            if _fetch(cursor, _SURVEY_BY_KEY, {"key": name}).num_rows:
+                raise ConflictError(f"There is already a survey called {name!r}; choose another.")
+            survey_id = secrets.token_hex(8)
+            cursor.execute(
+                "INSERT INTO surveys VALUES (?, ?, ?, ?)", [survey_id, name, tolerance, _now()]
+            )
+        return self.get_survey(survey_id)
+
+    def get_survey(self, key: str) -> SurveyRecord:
+        """Return a survey by its id or its name; NotFoundError if there is none."""
+        return _survey(self._one(_SURVEY_BY_KEY, {"key": key}, f"survey {key!r}"))
+
+    def list_surveys(self, *, after: str | None = None, limit: int = 100) -> Page[SurveyRecord]:
+        """Return a part of the surveys, newest first; ``after`` is ``next`` of the part before."""
+        rows = self._part(_SURVEYS_AFTER, {}, after, limit)
+        return _page(rows, limit, "created_at", "survey_id", _survey)
+
+    def put_control_marks(self, survey: str, marks: ControlMarks) -> None:
+        """Give a survey its control marks, in place of those that it had.
+
+        Parameters
+        ----------
+        survey : str
+            Id or name.
+        marks : ControlMarks
+            With independent coordinates: only their standard deviations are kept.
+
+        Raises
+        ------
+        ControlError
+            If coordinates are not finite, names are not different, or coordinates are correlated.
+        NotFoundError
+            If there is no such survey.
+        """
+        _check_marks(marks)
+        sigmas = np.sqrt(np.diagonal(marks.cov_p_site, axis1=1, axis2=2))
+        survey_id = self.get_survey(survey).survey_id
+        table = _marks_table(survey_id, marks)
+        for axis, name in enumerate(("sigma_x_m", "sigma_y_m", "sigma_z_m")):
+            table = table.append_column(name, pa.array(sigmas[:, axis]))
+        with self._writing() as cursor:
+            _insert(cursor, "control_marks", table)
+            cursor.execute(
+                "DELETE FROM control_marks WHERE survey_id = ? AND NOT list_contains(?, mark)",
+                [survey_id, list(marks.names)],
+            )
+
+    def control_marks(self, survey: str) -> ControlMarks | None:
+        """Return the control marks of a survey (id or name), as they were put; None without."""
+        rows = self.rows(_CONTROL, {"id": self.get_survey(survey).survey_id})
+        if not rows:
+            return None
+        sigmas = np.array([[row[f"sigma_{axis}_m"] for axis in "xyz"] for row in rows])
+        return ControlMarks(
+            names=tuple(row["mark"] for row in rows),
+            p_site=_coordinates(rows),
+            cov_p_site=np.eye(3) * np.square(sigmas)[:, None, :],
+        )
+
+    def put_truth(self, survey: str, truth: Truth) -> None:
+        """Give a survey its truth, and all its results their errors.
+
+        Parameters
+        ----------
+        survey : str
+            Id or name.
+        truth : Truth
+            Its marks and rig take the place of those known; its stops are added to those known, so
+            that the truth of a survey may come stop by stop.
+
+        Raises
+        ------
+        NotFoundError
+            If there is no such survey.
+        """
+        _check_marks(truth.marks)
+        survey_id = self.get_survey(survey).survey_id
+        with self._writing() as cursor:
+            _insert(cursor, "true_marks", _marks_table(survey_id, truth.marks))
+            cursor.execute(
+                "DELETE FROM true_marks WHERE survey_id = ? AND NOT list_contains(?, mark)",
+                [survey_id, list(truth.marks.names)],
+            )
+            _insert(cursor, "true_stops", _true_stops_table(survey_id, truth.stops))
+            cursor.execute(
+                "INSERT OR REPLACE INTO true_worlds VALUES (?, ?, ?)",
+                [survey_id, _rig_text(truth), _json(truth.about)],
+            )
+            _refresh_errors(cursor, survey_id)
+
+    def truth(self, survey: str) -> Truth | None:
+        """Return the truth of a survey (id or name); None when it is not known."""
+        survey_id = self.get_survey(survey).survey_id
+        with closing(self._connection.cursor()) as cursor:
+            return _truth(cursor, survey_id)
+
+    # Recordings
+
+    def add_recording(
+        self, digest: str, *, name: str, size_bytes: int, url: str, preflight: Mapping[str, Any]
+    ) -> RecordingRecord:
+        """Enter an uploaded log; the same bytes twice are one recording, as first entered.
+
+        Parameters
+        ----------
+        digest : str
+            SHA-256 of the bytes, in hexadecimal.
+        name : str
+            Stem of the name of the file.
+        size_bytes : int
+            Length of the file.
+        url : str
+            Where the bytes are.
+        preflight : mapping
+            The report; its ``verdict`` is ``ok``, ``weak`` or ``refused``.
+
+        Returns
+        -------
+        RecordingRecord
+            The recording, whether new or known.
+
+        Raises
+        ------
+        InputError
+            If one of the values cannot be used.
+        """
+        _check_name("The name of a recording", name)
+        verdict = str(preflight.get("verdict"))
+        if not _DIGEST.fullmatch(digest):
+            raise InputError(f"The digest {digest!r} is not a SHA-256: 64 lower-case hex digits.")
+        if verdict not in _VERDICTS or size_bytes < 0:
+            raise InputError(
+                f"The recording {name} has the verdict {verdict!r} and {size_bytes} bytes; a "
+                f"verdict is one of {', '.join(_VERDICTS)}, and a size is not negative."
+            )
+        row = [digest, name, size_bytes, _now(), url, verdict, _json(preflight)]
+        with self._writing() as cursor:
+            cursor.execute("INSERT OR IGNORE INTO recordings VALUES (?, ?, ?, ?, ?, ?, ?)", row)
+        return self.get_recording(digest)
+
+    def get_recording(self, recording_id: str) -> RecordingRecord:
+        """Return a recording by its digest; NotFoundError if there is none."""
+        row = self._one(_RECORDING, {"id": recording_id}, f"recording {recording_id!r}")
+        return _recording(row)
+
+    def list_recordings(
+        self, *, after: str | None = None, limit: int = 100
+    ) -> Page[RecordingRecord]:
+        """Return a part of the recordings, newest first."""
+        rows = self._part(_RECORDINGS_AFTER, {}, after, limit)
+        return _page(rows, limit, "uploaded_at", "recording_id", _recording)
+
+    # Jobs
+
+    def create_job(
+        self, kind: str, *, survey: str, recording_id: str | None, config: Mapping[str, Any]
+    ) -> JobRecord:
+        """Accept work.
+
+        Parameters
+        ----------
+        kind : str
+            What is to be done, for instance ``process``.
+        survey : str
+            Id or name.
+        recording_id : str or None
+            The log to read; none for work on the survey as a whole.
+        config : mapping
+            The effective configuration.
+
+        Returns
+        -------
+        JobRecord
+            With status ``accepted``.
+
+        Raises
+        ------
+        NotFoundError
+            If there is no such survey or recording.
+        """
+        _check_name("The kind of a job", kind)
+        survey_id = self.get_survey(survey).survey_id
+        if recording_id is not None:
+            self.get_recording(recording_id)
+        job_id = secrets.token_hex(8)
+        row = [job_id, kind, survey_id, recording_id, _json(config), _now()]
+        with self._writing() as cursor:
+            cursor.execute(
+                "INSERT INTO jobs (job_id, kind, survey_id, recording_id, config, created_at, "
+                "status, progress_percent, message, attempts) "
+                "VALUES (?, ?, ?, ?, ?, ?, 'accepted', 0, 'Waiting for a worker.', 0)",
+                row,
+            )
+        return self.get_job(job_id)
+
+    def get_job(self, job_id: str) -> JobRecord:
+        """Return a job; NotFoundError if there is none."""
+        return _job(self._one(_JOB, {"id": job_id}, f"job {job_id!r}"))
+
+    def list_jobs(
+        self,
+        *,
+        survey: str | None = None,
+        recording_id: str | None = None,
+        status: JobStatus | None = None,
+        after: str | None = None,
+        limit: int = 100,
+    ) -> Page[JobRecord]:
+        """Return a part of the jobs, newest first, of one survey, recording or status if named."""
+        survey_id = None if survey is None else self.get_survey(survey).survey_id
+        wanted = {"survey_id": survey_id, "recording_id": recording_id, "status": status}
+        rows = self._part(_JOBS_AFTER, wanted, after, limit)
+        return _page(rows, limit, "created_at", "job_id", _job)
+
+    def start_job(self, job_id: str) -> JobRecord:
+        """Begin an attempt at an accepted job; ConflictError if it stands elsewhere."""
+        with self._changing(job_id, JobStatus.ACCEPTED) as cursor:
+            cursor.execute(
+                "UPDATE jobs SET status = 'running', started_at = ?, attempts = attempts + 1, "
+                "progress_percent = 0, message = 'Started.' WHERE job_id = ?",
+                [_now(), job_id],
+            )
+        return self.get_job(job_id)
+
+    def report_progress(self, job_id: str, percent: float, message: str) -> None:
+        """Say how far a running job is, 0 to 100; silent about one that runs no more.
+
+        Notes
+        -----
+        Costs a millisecond, and does not make the newest snapshot old.
+        """
+        with self._writing(is_result=False) as cursor:
+            cursor.execute(
+                "UPDATE jobs SET progress_percent = ?, message = ? "
+                "WHERE job_id = ? AND status = 'running'",
+                [min(max(float(percent), 0.0), 100.0), message, job_id],
+            )
+
+    def finish_job(self, job_id: str, tables: Mapping[str, pa.Table]) -> JobRecord:
+        """Write the results of a running job and its end, both or neither.
+
+        Parameters
+        ----------
+        job_id : str
+            The job.
+        tables : mapping of str to Table
+            Rows by table, as ``storage.results.tables`` makes them.
+
+        Returns
+        -------
+        JobRecord
+            With status ``successful``.
+
+        Raises
+        ------
+        ConflictError
+            If the job neither runs nor is successful already.
+        InputError
+            If there is no table of such a name.
+
+        Notes
+        -----
+        Results are written once: finishing a successful job again changes nothing. Errors are
+        taken against the truth that is known now.
+        """
+        _check_tables(tables)
+        with self._writing() as cursor:
+            job = _job_in(cursor, job_id)
+            if job.status is JobStatus.SUCCESSFUL:
+                return job
+            _require(job, JobStatus.RUNNING)
+            truth = _truth(cursor, job.survey_id)
+            for name, table in results.with_errors(tables, truth).items():
+                _insert(cursor, name, table)
+            cursor.execute(
+                "UPDATE jobs SET status = 'successful', progress_percent = 100, "
+                "message = 'Done.', finished_at = ? WHERE job_id = ?",
+                [_now(), job_id],
+            )
+        return self.get_job(job_id)
+
+    def fail_job(
+        self, job_id: str, *, code: str, reason: str, traceback: str | None = None
+    ) -> JobRecord:
+        """Record that a job failed and why; ConflictError if it came to another end before.
+
+        Parameters
+        ----------
+        job_id : str
+            The job, accepted or running.
+        code : str
+            Stable code of the error.
+        reason : str
+            The error as a sentence for people.
+        traceback : str, optional
+            Where in the code.
+
+        Returns
+        -------
+        JobRecord
+            With status ``failed``.
+        """
+        with self._changing(job_id, JobStatus.ACCEPTED, JobStatus.RUNNING) as cursor:
+            cursor.execute(
+                "UPDATE jobs SET status = 'failed', message = 'Failed.', finished_at = ?, "
+                "error_code = ?, error_reason = ?, error_traceback = ? WHERE job_id = ?",
+                [_now(), code, reason, traceback, job_id],
+            )
+        return self.get_job(job_id)
+
+    def dismiss_job(self, job_id: str) -> JobRecord:
+        """Give up a job that has not come to its end; ConflictError if it has."""
+        with self._changing(job_id, JobStatus.ACCEPTED, JobStatus.RUNNING) as cursor:
+            cursor.execute(
+                "UPDATE jobs SET status = 'dismissed', message = 'Dismissed.', finished_at = ? "
+                "WHERE job_id = ?",
+                [_now(), job_id],
+            )
+        return self.get_job(job_id)
+
+    def requeue_job(self, job_id: str, message: str) -> JobRecord:
+        """Make a running job accepted again, for another attempt, and say why."""
+        with self._changing(job_id, JobStatus.RUNNING) as cursor:
+            cursor.execute(
+                "UPDATE jobs SET status = 'accepted', progress_percent = 0, message = ? "
+                "WHERE job_id = ?",
+                [message, job_id],
+            )
+        return self.get_job(job_id)
+
+    def take_up_jobs(self) -> tuple[JobRecord, ...]:
+        """Make jobs that were running accepted again and return all accepted ones, oldest first.
+
+        For the start of the service: nothing can be running then.
+        """
+        with self._writing() as cursor:
+            cursor.execute(
+                "UPDATE jobs SET status = 'accepted', progress_percent = 0, "
+                "message = 'Taken up again after a restart.' WHERE status = 'running'"
+            )
+            return tuple(_job(row) for row in _fetch(cursor, _JOBS_ACCEPTED, {}).to_pylist())
+
+    def get_run(self, run_id: str) -> RunRecord:
+        """Return a run; NotFoundError if there is none."""
+        return _run(self._one(_RUN, {"id": run_id}, f"run {run_id!r}"))
+
+    def list_runs(
+        self,
+        *,
+        survey: str | None = None,
+        recording_id: str | None = None,
+        job_id: str | None = None,
+        after: str | None = None,
+        limit: int = 100,
+    ) -> Page[RunRecord]:
+        """Return a part of the runs, newest first, of one survey, recording or job if named."""
+        survey_id = None if survey is None else self.get_survey(survey).survey_id
+        wanted = {"survey_id": survey_id, "recording_id": recording_id, "job_id": job_id}
+        rows = self._part(_RUNS_AFTER, wanted, after, limit)
+        return _page(rows, limit, "finished_at", "run_id", _run)
+
+    # Our own static queries
+
+    def columns(
+        self, sql: str, parameters: Mapping[str, Any] | None = None
+    ) -> dict[str, NDArray[Any]]:
+        """Run one of our own static queries, for a figure.
+
+        Parameters
+        ----------
+        sql : str
+            A SELECT with ``$name`` for its parameters; never text from people.
+        parameters : mapping, optional
+            Their values.
+
+        Returns
+        -------
+        dict of str to array
+            Columns; NULL is NaN among numbers and None among objects.
+
+        Raises
+        ------
+        InputError
+            If there are more than 200,000 rows.
+        """
+        table = self.table(sql, parameters)
+        return {name: _to_numpy(table.column(name)) for name in table.column_names}
+
+    def rows(self, sql: str, parameters: Mapping[str, Any] | None = None) -> list[dict[str, Any]]:
+        """Run one of our own static queries like ``columns``, for a list: one mapping per row."""
+        return list(self.table(sql, parameters).to_pylist())
+
+    def table(self, sql: str, parameters: Mapping[str, Any] | None = None) -> pa.Table:
+        """Run one of our own static queries like ``columns``, for a file: an Arrow table."""
+        with closing(self._connection.cursor()) as cursor:
+            return _fetch(cursor, sql, parameters or {})
+
+    def snapshot(self) -> Path:
+        """Return a consistent copy of the database file, as fresh as the last committed result.
+
+        Returns
+        -------
+        Path
+            A file that nobody writes to; it stays until two newer ones exist.
+
+        Notes
+        -----
+        Made only when something but progress was committed since the last one. The copy is
+        made by another process: opening and closing the file here would drop DuckDB's lock.
+        """
+        with self._lock:
+            return self._snapshots.take(self._connection, self._version)
+
+    # What the verbs share
+
+    @contextmanager
+    def _writing(self, *, is_result: bool = True) -> Iterator[duckdb.DuckDBPyConnection]:
+        """Hold the write lock and a transaction."""
+        with self._lock, closing(self._connection.cursor()) as cursor:
+            cursor.execute("BEGIN")
+            try:
+                yield cursor
+                cursor.execute("COMMIT")
+            except BaseException:
+                with suppress(duckdb.Error):
+                    cursor.execute("ROLLBACK")
+                raise
+            self._version += is_result
+
+    @contextmanager
+    def _changing(self, job_id: str, *allowed: JobStatus) -> Iterator[duckdb.DuckDBPyConnection]:
+        """Hold a transaction on a job that stands where it may be changed."""
+        with self._writing() as cursor:
+            _require(_job_in(cursor, job_id), *allowed)
+            yield cursor
+
+    def _one(self, sql: str, parameters: Mapping[str, Any], what: str) -> dict[str, Any]:
+        """Return the first row of a query."""
+        rows = self.rows(sql, parameters)
+        if not rows:
+            raise NotFoundError(f"There is no {what}.")
+        return rows[0]
+
+    def _part(
+        self, sql: str, wanted: Mapping[str, Any], after: str | None, limit: int
+    ) -> list[dict[str, Any]]:
+        """Return the rows of one part of a list, and one more to tell whether another follows."""
+        if not 1 <= limit <= _PAGE_MAX:
+            raise InputError(f"The limit is {limit}; it must be from 1 to {_PAGE_MAX}.")
+        instant, identifier = (None, None) if after is None else _read_mark(after)
+        return self.rows(sql, {**wanted, "at": instant, "id": identifier, "n": limit + 1})
+
+
+class _Snapshots:
+    """The copies of one database file in a folder of their own."""
+
+    def __init__(self, path: Path, folder: Path) -> None:
+        self._path = path
+        self._folder = folder
+        self._version: int | None = None
+        folder.mkdir(parents=True, exist_ok=True)
+        for stale in self._files():
+            stale.unlink(missing_ok=True)
+
+    def take(self, connection: duckdb.DuckDBPyConnection, version: int) -> Path:
+        """Return the newest copy if it has this version, else make it; the caller holds writers."""
+        files = self._files()
+        if files and version == self._version:
+            return files[-1]
+        connection.execute("CHECKPOINT")
+        number = 1 + (int(files[-1].stem.split("-")[1]) if files else 0)
+        target = self._folder / f"snapshot-{number:09d}.duckdb"
+        _copy(self._path, target)
+        self._version = version
+        for old in files[: 1 - _N_SNAPSHOTS]:
+            old.unlink(missing_ok=True)
+        return target
+
+    def _files(self) -> list[Path]:
+        """Return the copies that are there, oldest first."""
+        return sorted(self._folder.glob("snapshot-*.duckdb"))
+
+
+def _copy(source: Path, target: Path) -> None:
+    """Copy a file in a process of its own, sharing blocks where the file system can."""
+    part = target.with_suffix(".part")
+    command = ["cp", "--reflink=auto", "--", str(source), str(part)]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    if done.returncode:
+        raise ConflictError(f"No snapshot of {source} could be made: {done.stderr.strip()}.")
+    part.replace(target)
+
+
+def _open(path: Path, memory_limit: str) -> duckdb.DuckDBPyConnection:
+    """Open the file as its owner, bring its schema up to date, and shut the doors."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    connection = _connect(path, memory_limit)
+    try:
+        _require_alone(connection, path)
+        connection.execute("SET GLOBAL TimeZone = 'UTC'")
+        migrations.migrate(connection, migrations.released())
+        connection.execute("SET enable_external_access = false")
+        connection.execute("SET lock_configuration = true")
+    except BaseException:
+        connection.close()
+        raise
+    return connection
+
+
+def _require_alone(connection: duckdb.DuckDBPyConnection, path: Path) -> None:
+    """Refuse a file that this process has open: DuckDB would share it, locked doors and all."""
+    if connection.sql("SELECT current_setting('lock_configuration')").fetchall()[0][0]:
+        raise ConflictError(f"{path} is already open in this process; close that first.")
+
+
+def _connect(path: Path, memory_limit: str) -> duckdb.DuckDBPyConnection:
+    """Open the file, or say in plain words why that is not possible."""
+    config: dict[str, str | bool | int | float | list[str]] = {
+        "autoinstall_known_extensions": "false",
+        "autoload_known_extensions": "false",
+        "memory_limit": memory_limit,
+    }
+    try:
+        return duckdb.connect(str(path), config=config)
+    except duckdb.IOException as error:
+        if "lock" in str(error):
+            owner = re.search(r"PID (\d+)", str(error))
+            raise ConflictError(
+                f"{path} is in use by another process{f' ({owner[0]})' if owner else ''}. "
+                "One spheremark serves one data folder: stop the other one, or use another folder."
+            ) from error
+        raise InputError(f"{path} is not a database of spheremark: {error}") from error
+    except duckdb.ConnectionException as error:
+        raise ConflictError(f"{path} is already open in this process; close that first.") from error
+
+
+def _fetch(cursor: duckdb.DuckDBPyConnection, sql: str, parameters: Mapping[str, Any]) -> pa.Table:
+    """Run a SELECT of ours and return at most the rows that one answer may have."""
+    table = cursor.sql(sql, params=dict(parameters)).to_arrow_table()
+    if table.num_rows > _N_ROWS_MAX:
+        raise InputError(
+            f"The answer has {table.num_rows} rows; the limit is {_N_ROWS_MAX}. Narrow the filter."
+        )
+    return table
+
+
+def _insert(cursor: duckdb.DuckDBPyConnection, name: str, table: pa.Table) -> None:
+    """Append an Arrow table to the table of that name."""
+    with _incoming(cursor, table):
+        cursor.execute(_INSERT[name])
+
+
+@contextmanager
+def _incoming(cursor: duckdb.DuckDBPyConnection, table: pa.Table) -> Iterator[None]:
+    """Let SQL see an Arrow table as ``incoming``."""
+    cursor.register("incoming", table)
+    try:
+        yield
+    finally:
+        cursor.unregister("incoming")
+
+
+def _refresh_errors(cursor: duckdb.DuckDBPyConnection, survey_id: str) -> None:
+    """Take the errors of a survey's results anew against the truth that is known now."""
+    known = {
+        name: _fetch(cursor, sql, {"id": survey_id}) for name, sql in _RESULTS_OF_SURVEY.items()
+    }
+    fresh = results.with_errors(known, _truth(cursor, survey_id))
+    for name, sql in _REFRESH.items():
+        with _incoming(cursor, fresh[name]):
+            cursor.execute(sql)
+
+
+def _truth(cursor: duckdb.DuckDBPyConnection, survey_id: str) -> Truth | None:
+    """Read the truth of a survey."""
+    worlds = _fetch(cursor, _TRUE_WORLD, {"id": survey_id}).to_pylist()
+    if not worlds:
+        return None
+    marks = _fetch(cursor, _TRUE_MARKS, {"id": survey_id}).to_pylist()
+    stops = _fetch(cursor, _TRUE_STOPS, {"id": survey_id}).to_pylist()
+    rig = worlds[0]["rig"]
+    return Truth(
+        marks=ControlMarks(
+            names=tuple(row["mark"] for row in marks),
+            p_site=_coordinates(marks),
+            cov_p_site=np.zeros((len(marks), 3, 3)),
+        ),
+        stops=tuple(StopTruth(name=row["stop"], T_site_base=_pose(row)) for row in stops),
+        rig=None if rig is None else rig_from_mapping(json.loads(rig)),
+        about=json.loads(worlds[0]["about"]),
+    )
+
+
+def _pose(row: Mapping[str, Any]) -> NDArray[np.float64]:
+    """Return the pose that a row of ``true_stops`` tells."""
+    yaw, pitch, roll = (np.radians(row[f"{name}_deg"]) for name in ("yaw", "pitch", "roll"))
+    return rigid(rot_z(yaw) @ rot_y(pitch) @ rot_x(roll), [row["x_m"], row["y_m"], row["z_m"]])
+
+
+def _coordinates(rows: list[dict[str, Any]]) -> NDArray[np.float64]:
+    """Return the coordinates of rows, (n, 3) [m]."""
+    return np.array([[row["x_m"], row["y_m"], row["z_m"]] for row in rows]).reshape(-1, 3)
+
+
+def _marks_table(survey_id: str, marks: ControlMarks) -> pa.Table:
+    """Return marks as rows, in their order."""
+    x, y, z = marks.p_site.T
+    n = len(marks.names)
+    columns = {"survey_id": [survey_id] * n, "mark": list(marks.names), "place": range(n)}
+    return pa.table(columns | {"x_m": x, "y_m": y, "z_m": z})
+
+
+def _true_stops_table(survey_id: str, stops: tuple[StopTruth, ...]) -> pa.Table:
+    """Return true poses as rows."""
+    rows = []
+    for stop in stops:
+        yaw, pitch, roll = np.degrees(yaw_pitch_roll(stop.T_site_base[:3, :3]))
+        x, y, z = stop.T_site_base[:3, 3]
+        rows.append((survey_id, stop.name, x, y, z, yaw, pitch, roll))
+    names = ("survey_id", "stop", "x_m", "y_m", "z_m", "yaw_deg", "pitch_deg", "roll_deg")
+    types = [pa.string(), pa.string(), *[pa.float64()] * 6]
+    return pa.table(
+        [pa.array([row[i] for row in rows], kind) for i, kind in enumerate(types)], names=names
+    )
+
+
+def _check_marks(marks: ControlMarks) -> None:
+    """Refuse marks that a table cannot hold or a survey cannot use."""
+    if len(set(marks.names)) < len(marks.names) or not all(marks.names):
+        raise ControlError("Marks must have names, all different.")
+    if not np.isfinite(marks.p_site).all():
+        raise ControlError("Marks must have finite coordinates [m].")
+    variances = np.diagonal(marks.cov_p_site, axis1=1, axis2=2)
+    if not (variances >= 0.0).all() or not np.isfinite(variances).all():
+        raise ControlError("Marks must have standard deviations that are finite and not negative.")
+    if (marks.cov_p_site != np.eye(3) * variances[:, None, :]).any():
+        raise ControlError("Marks must have independent coordinates: correlations are not kept.")
+
+
+def _check_name(what: str, name: str) -> None:
+    """Refuse a name that people could not read or type."""
+    if not name.strip() or len(name) > 200 or not name.isprintable():
+        raise InputError(f"{what} is {name!r}; it must have 1 to 200 printable characters.")
+
+
+def _check_tables(tables: Mapping[str, pa.Table]) -> None:
+    """Refuse results for tables that no job writes."""
+    unknown = sorted(set(tables) - set(results.TABLES))
+    if unknown:
+        raise InputError(f"No job writes {unknown[0]!r}; it writes {', '.join(results.TABLES)}.")
+
+
+def _require(job: JobRecord, *allowed: JobStatus) -> None:
+    """Refuse to change a job that stands elsewhere."""
+    if job.status not in allowed:
+        raise ConflictError(f"Job {job.job_id} is {job.status}, not {' or '.join(allowed)}.")
+
+
+def _job_in(cursor: duckdb.DuckDBPyConnection, job_id: str) -> JobRecord:
+    """Read a job inside a transaction."""
+    rows = _fetch(cursor, _JOB, {"id": job_id}).to_pylist()
+    if not rows:
+        raise NotFoundError(f"There is no job {job_id!r}.")
+    return _job(rows[0])
+
+
+def _survey(row: dict[str, Any]) -> SurveyRecord:
+    """Build a record from a row."""
+    return SurveyRecord(tolerance=row.pop("tolerance_m"), **row)
+
+
+def _recording(row: dict[str, Any]) -> RecordingRecord:
+    """Build a record from a row."""
+    return RecordingRecord(**{**row, "preflight": json.loads(row["preflight"])})
+
+
+def _job(row: dict[str, Any]) -> JobRecord:
+    """Build a record from a row."""
+    known = {"config": json.loads(row["config"]), "status": JobStatus(row["status"])}
+    return JobRecord(**{**row, **known})
+
+
+def _run(row: dict[str, Any]) -> RunRecord:
+    """Build a record from a row."""
+    return RunRecord(duration=row.pop("duration_s"), **{**row, "config": json.loads(row["config"])})
+
+
+def _page(
+    rows: list[dict[str, Any]],
+    limit: int,
+    instant: str,
+    identifier: str,
+    build: Callable[[dict[str, Any]], _Record],
+) -> Page[_Record]:
+    """Build a part of a list from its rows, of which one more was asked for."""
+    last = rows[limit - 1] if len(rows) > limit else None
+    mark = None if last is None else _write_mark(last[instant], last[identifier])
+    return Page(items=tuple(build(row) for row in rows[:limit]), next=mark)
+
+
+def _write_mark(instant: datetime, identifier: str) -> str:
+    """Return the place in a list as text that needs no quoting in a URL."""
+    return base64.urlsafe_b64encode(f"{instant.isoformat()} {identifier}".encode()).decode()
+
+
+def _read_mark(mark: str) -> tuple[datetime, str]:
+    """Return the place in a list that ``_write_mark`` wrote."""
+    try:
+        instant, identifier = base64.urlsafe_b64decode(mark.encode()).decode().split(" ", 1)
+        return datetime.fromisoformat(instant), identifier
+    except ValueError as error:
+        raise InputError(
+            f"{mark!r} is no place in this list; pass the 'next' of the part before."
+        ) from error
+
+
+def _to_numpy(column: pa.ChunkedArray) -> NDArray[Any]:
+    """Return a column as an array; NULL becomes NaN among numbers and None among objects."""
+    if pa.types.is_timestamp(column.type):
+        column = column.cast(pa.timestamp("us"))  # NumPy's instants carry no zone; ours are UTC
+    return np.asarray(column.to_numpy())
+
+
+def _json(values: Mapping[str, Any]) -> str:
+    """Return values as JSON; InputError if they are not plain or not finite."""
+    try:
+        return json.dumps(values, sort_keys=True, allow_nan=False)
+    except (TypeError, ValueError) as error:
+        raise InputError(f"Values for the catalogue must be plain and finite: {error}.") from error
+
+
+def _rig_text(truth: Truth) -> str | None:
+    """Return the true rig as JSON, when known."""
+    return None if truth.rig is None else _json(rig_to_mapping(truth.rig))
+
+
+def _now() -> datetime:
+    """Return this instant, in UTC."""
+    return datetime.now(UTC)

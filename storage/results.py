@@ -1,0 +1,546 @@
+"""Results of the pipeline as Arrow tables, named and shaped like the tables of the database.
+
+Pure: workers build the tables, the owner of the database inserts them. NaN and infinite numbers
+become NULL. Lengths in metres, angles in degrees, coordinates in the frame that the schema names.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from datetime import datetime
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+from scipy.stats import chi2
+
+from pipelines.accuracy import centre_errors, station_error
+from pipelines.config import SurveyConfig
+from pipelines.errors import InputError
+from pipelines.geometry import levelling_rotation, rigid
+from pipelines.rigs import rig_digest, rig_to_mapping
+from pipelines.values import (
+    Array,
+    ControlMarks,
+    Levelling,
+    MarkerFit,
+    NoFix,
+    StationFix,
+    Status,
+    StopResult,
+    StopTruth,
+    Truth,
+)
+
+_TO_95 = float(np.sqrt(chi2.ppf(0.95, 2)))  # from the standard ellipse to the 95 % ellipse
+_TEXT, _REAL, _WHOLE, _LONG = pa.string(), pa.float64(), pa.int32(), pa.int64()
+_INSTANT = pa.timestamp("us", "UTC")
+_STOP = {"run_id": _TEXT, "stop": _TEXT}
+_FIT = _STOP | {"fit_method": _TEXT}
+_FIX = _FIT | {"resection_method": _TEXT}
+_PLACE = {"x_m": _REAL, "y_m": _REAL, "z_m": _REAL}
+_COV = dict.fromkeys([f"cov_{axes}_m2" for axes in ("xx", "xy", "xz", "yy", "yz", "zz")], _REAL)
+_ERROR = {"error_x_m": _REAL, "error_y_m": _REAL, "error_z_m": _REAL}
+
+_SCHEMAS = {
+    "rigs": {"rig_digest": _TEXT, "name": _TEXT, "rig": _TEXT},
+    "runs": {
+        **dict.fromkeys(("run_id", "job_id", "survey_id", "recording_id"), _TEXT),
+        **dict.fromkeys(("config", "config_digest", "code_version", "rig_digest"), _TEXT),
+        "finished_at": _INSTANT,
+        "duration_s": _REAL,
+        "peak_memory_bytes": _LONG,
+    },
+    "stops": {
+        **_STOP,
+        "n_returns": _LONG,
+        **dict.fromkeys(("coverage_deg", "duration_s", "roll_deg", "pitch_deg"), _REAL),
+        "sigma_levelling_deg": _REAL,
+        "cloud_url": _TEXT,
+        "notes": pa.list_(_TEXT),
+        "timings_s": _TEXT,
+    },
+    "marker_fits": {
+        **_FIT,
+        **dict.fromkeys(("marker", "mark", "status", "reason"), _TEXT),
+        **_PLACE,
+        **_COV,
+        **dict.fromkeys(("sigma_3d_m", "range_m", "azimuth_deg", "elevation_deg"), _REAL),
+        **dict.fromkeys(("n_points", "n_rejected", "n_rings"), _WHOLE),
+        **dict.fromkeys(("coverage", "rms_m", "sigma0", "radius_m", "radius_free_m"), _REAL),
+        **dict.fromkeys(("sigma_radius_free_m", "mean_intensity"), _REAL),
+        **_ERROR,
+        "error_radial_m": _REAL,
+        "error_3d_m": _REAL,
+    },
+    "rejections": {**_FIT, **_PLACE, "n_points": _WHOLE, "reason": _TEXT},
+    "station_fixes": {
+        **_FIX,
+        "status": _TEXT,
+        "reason": _TEXT,
+        **_PLACE,
+        "yaw_deg": _REAL,
+        "rotation": pa.list_(_REAL),
+        **_COV,
+        "cov_motion": pa.list_(_REAL),
+        **dict.fromkeys(("sigma_3d_m", "sigma_yaw_deg"), _REAL),
+        **dict.fromkeys(("ellipse_major_m", "ellipse_minor_m", "ellipse_bearing_deg"), _REAL),
+        **dict.fromkeys(("ellipse_major_95_m", "ellipse_minor_95_m"), _REAL),
+        "n_markers": _WHOLE,
+        "dof": _WHOLE,
+        "sigma0": _REAL,
+        "passes_global_test": pa.bool_(),
+        **dict.fromkeys(("included_angle_min_deg", "included_angle_max_deg"), _REAL),
+        **_ERROR,
+        **dict.fromkeys(("error_yaw_deg", "error_horizontal_m", "error_3d_m"), _REAL),
+    },
+    "observations": {
+        **_FIX,
+        "marker": _TEXT,
+        "mark": _TEXT,
+        "used": pa.bool_(),
+        "reason": _TEXT,
+        **dict.fromkeys(("residual_x_m", "residual_y_m", "residual_z_m"), _REAL),
+        **dict.fromkeys(("redundancy", "w"), _REAL),
+        **dict.fromkeys(("minimal_detectable_bias_m", "external_reliability_m"), _REAL),
+    },
+    "resections": {
+        **_FIX,
+        "marks": pa.list_(_TEXT),
+        "n_marks": _WHOLE,
+        **dict.fromkeys(("included_angle_deg", "included_angle_horizontal_deg"), _REAL),
+        "sigma_3d_m": _REAL,
+        **_PLACE,
+        "error_3d_m": _REAL,
+    },
+}
+TABLES = tuple(_SCHEMAS)
+"""Names of the tables that a job writes, in the order of writing."""
+
+Row = dict[str, Any]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class RunInfo:
+    """What a run was, beside its numbers.
+
+    Attributes
+    ----------
+    run_id : str
+        Names its rows in every table.
+    job_id, survey_id, recording_id : str
+        Where it belongs.
+    config : SurveyConfig
+        The effective configuration.
+    code_version : str
+        Version of spheremark.
+    finished_at : datetime
+        When the numbers were there, with a time zone.
+    duration : float
+        Time from the log to the numbers [s].
+    peak_memory_bytes : int or None
+        Largest resident size of the worker's process.
+    """
+
+    run_id: str
+    job_id: str
+    survey_id: str
+    recording_id: str
+    config: SurveyConfig
+    code_version: str
+    finished_at: datetime
+    duration: float
+    peak_memory_bytes: int | None = None
+
+
+def tables(
+    run: RunInfo,
+    stops: tuple[StopResult, ...],
+    *,
+    marks: ControlMarks | None = None,
+    truth: Truth | None = None,
+    clouds: Mapping[str, str] | None = None,
+) -> dict[str, pa.Table]:
+    """Put the results of a run into tables.
+
+    Parameters
+    ----------
+    run : RunInfo
+        What the run was.
+    stops : tuple of StopResult
+        What it gave, at least one.
+    marks : ControlMarks, optional
+        The control marks that the fixes refer to.
+    truth : Truth, optional
+        For the ``error_*`` columns, which are NULL without.
+    clouds : mapping of str to str, optional
+        Where the cloud of each stop was written.
+
+    Returns
+    -------
+    dict of str to Table
+        One table for each of ``TABLES``.
+
+    Raises
+    ------
+    InputError
+        If there is no stop, or a fix refers to control marks that are not given.
+
+    Notes
+    -----
+    Markers are called M01, M02 ... in the order of the fits of each method.
+    """
+    if not stops:
+        raise InputError(f"Run {run.run_id} has no stop; a run has at least one.")
+    if marks is None and any(stop.fixes for stop in stops):
+        raise InputError(f"Run {run.run_id} has fixes; give the control marks that they refer to.")
+    rows = _run_rows(run, stops)
+    for stop in stops:
+        names = () if marks is None else marks.names
+        for table, found in _stop_rows(stop, names, (clouds or {}).get(stop.name)).items():
+            rows[table] += [{"run_id": run.run_id, "stop": stop.name, **row} for row in found]
+    return with_errors({name: _table(name, rows[name]) for name in TABLES}, truth)
+
+
+def with_errors(known: Mapping[str, pa.Table], truth: Truth | None) -> dict[str, pa.Table]:
+    """Take the errors of results anew.
+
+    Parameters
+    ----------
+    known : mapping of str to Table
+        Rows of ``marker_fits``, ``station_fixes`` and ``resections``, with those of ``stops`` that
+        they belong to; other tables are passed through.
+    truth : Truth or None
+        What they are compared with; stops that it does not know have no errors.
+
+    Returns
+    -------
+    dict of str to Table
+        The same tables with their ``error_*`` columns replaced.
+    """
+    truths = {} if truth is None else {stop.name: stop for stop in truth.stops}
+    out = dict(known)
+    if truth is not None and "marker_fits" in known:
+        errors = _marker_errors(known["marker_fits"], _levellings(known), truths, truth.marks)
+        out["marker_fits"] = _with_columns(known["marker_fits"], errors)
+    elif "marker_fits" in known:
+        out["marker_fits"] = _with_columns(known["marker_fits"], [{}] * len(known["marker_fits"]))
+    for name, compare in (("station_fixes", _station_errors), ("resections", _pair_errors)):
+        if name in known:
+            errors = [compare(row, truths.get(row["stop"])) for row in known[name].to_pylist()]
+            out[name] = _with_columns(known[name], errors)
+    return out
+
+
+def _run_rows(run: RunInfo, stops: tuple[StopResult, ...]) -> dict[str, list[Row]]:
+    """Return the rows of a run as a whole, and empty lists for those of its stops."""
+    rig = stops[0].cloud.rig
+    digest = rig_digest(rig)
+    rows: dict[str, list[Row]] = {name: [] for name in TABLES}
+    rows["rigs"].append(
+        {"rig_digest": digest, "name": rig.name, "rig": json.dumps(rig_to_mapping(rig))}
+    )
+    rows["runs"].append(
+        {
+            "run_id": run.run_id,
+            "job_id": run.job_id,
+            "survey_id": run.survey_id,
+            "recording_id": run.recording_id,
+            "config": run.config.text,
+            "config_digest": run.config.digest,
+            "code_version": run.code_version,
+            "rig_digest": digest,
+            "finished_at": run.finished_at,
+            "duration_s": run.duration,
+            "peak_memory_bytes": run.peak_memory_bytes,
+        }
+    )
+    return rows
+
+
+def _stop_rows(
+    stop: StopResult, names: tuple[str, ...], cloud_url: str | None
+) -> dict[str, list[Row]]:
+    """Return the rows of one stop by table, without what names run and stop."""
+    rows: dict[str, list[Row]] = {name: [] for name in TABLES[2:]}
+    rows["stops"].append(_stop_row(stop, cloud_url))
+    R = levelling_rotation(stop.cloud.levelling)
+    for method, found in stop.fits.items():
+        label = {"fit_method": method}
+        matched = _matched(stop, method, names)
+        for i, fit in enumerate(found.fits):
+            row = {"marker": marker_name(i), "mark": matched.get(i), **_fit_row(fit, R)}
+            rows["marker_fits"].append(label | row)
+        rows["rejections"] += [
+            label | _place(R @ r.p_base) | {"n_points": r.n_points, "reason": r.reason}
+            for r in found.rejected
+        ]
+    for (fit_method, method), fix in stop.fixes.items():
+        label = {"fit_method": fit_method, "resection_method": method}
+        rows["station_fixes"].append(label | _fix_row(fix))
+        if isinstance(fix, StationFix):
+            n_fits = len(stop.fits[fit_method].fits)
+            rows["observations"] += [label | row for row in _observation_rows(fix, n_fits, names)]
+    for (fit_method, method), _ in stop.pairs.items():
+        label = {"fit_method": fit_method, "resection_method": method}
+        rows["resections"] += [label | row for row in _pair_rows(stop, fit_method, method, names)]
+    return rows
+
+
+def marker_name(place: int) -> str:
+    """Return what the marker at a place among the fits is called: M01, M02, ..."""
+    return f"M{place + 1:02d}"
+
+
+def _stop_row(stop: StopResult, cloud_url: str | None) -> Row:
+    """Return the row of ``stops``."""
+    cloud = stop.cloud
+    return {
+        "n_returns": len(cloud.p_base),
+        "coverage_deg": np.degrees(cloud.coverage),
+        "duration_s": cloud.duration,
+        "roll_deg": np.degrees(cloud.levelling.roll),
+        "pitch_deg": np.degrees(cloud.levelling.pitch),
+        "sigma_levelling_deg": np.degrees(cloud.levelling.sigma),
+        "cloud_url": cloud_url,
+        "notes": list(cloud.notes),
+        "timings_s": json.dumps(dict(stop.timings)),
+    }
+
+
+def _fit_row(fit: MarkerFit, R_station_base: Array) -> Row:
+    """Return the row of ``marker_fits`` without errors and names."""
+    p_station = R_station_base @ fit.p_base
+    x, y, z = p_station
+    return {
+        "status": str(fit.status),
+        "reason": fit.reason,
+        **_place(p_station),
+        **_cov(R_station_base @ fit.cov_p_base @ R_station_base.T),
+        "sigma_3d_m": fit.sigma_3d,
+        "range_m": fit.mean_range,
+        "azimuth_deg": np.degrees(np.arctan2(y, x)),
+        "elevation_deg": np.degrees(np.arctan2(z, np.hypot(x, y))),
+        "n_points": fit.n_points,
+        "n_rejected": len(fit.rejected),
+        "n_rings": fit.n_rings,
+        "coverage": fit.coverage,
+        "rms_m": fit.rms,
+        "sigma0": fit.sigma0,
+        "radius_m": fit.radius,
+        "radius_free_m": fit.radius_free,
+        "sigma_radius_free_m": fit.sigma_radius_free,
+        "mean_intensity": fit.mean_intensity,
+    }
+
+
+def _fix_row(fix: StationFix | NoFix) -> Row:
+    """Return the row of ``station_fixes`` without errors."""
+    if isinstance(fix, NoFix):
+        return {"status": "failed", "reason": fix.reason, "n_markers": 0}
+    return {
+        "status": str(fix.status),
+        "reason": fix.reason,
+        **_place(fix.p_site),
+        "yaw_deg": np.degrees(fix.yaw),
+        "rotation": fix.T_site_station[:3, :3].ravel().tolist(),
+        **_cov(fix.cov_p_site),
+        "cov_motion": fix.cov_T_site_station.ravel().tolist(),
+        "sigma_3d_m": fix.sigma_3d,
+        "sigma_yaw_deg": np.degrees(np.sqrt(fix.cov_T_site_station[2, 2])),
+        **_ellipse(fix.cov_p_site[:2, :2]),
+        "n_markers": len(fix.matches),
+        "dof": fix.dof,
+        "sigma0": fix.sigma0,
+        "passes_global_test": fix.passes_global_test,
+        "included_angle_min_deg": np.degrees(fix.included_angles[0]),
+        "included_angle_max_deg": np.degrees(fix.included_angles[1]),
+    }
+
+
+def _ellipse(cov_horizontal: Array) -> Row:
+    """Return the ellipse of a horizontal covariance, standard and 95 %."""
+    variances, axes = np.linalg.eigh(cov_horizontal)
+    minor, major = np.sqrt(np.maximum(variances, 0.0))
+    return {
+        "ellipse_major_m": major,
+        "ellipse_minor_m": minor,
+        "ellipse_bearing_deg": np.degrees(np.arctan2(axes[0, 1], axes[1, 1])) % 180.0,
+        "ellipse_major_95_m": _TO_95 * major,
+        "ellipse_minor_95_m": _TO_95 * minor,
+    }
+
+
+def _observation_rows(fix: StationFix, n_fits: int, names: tuple[str, ...]) -> list[Row]:
+    """Return one row of ``observations`` for each marker of the stop."""
+    excluded = {exclusion.fit: exclusion.reason for exclusion in fix.excluded}
+    rows: list[Row] = [
+        {"marker": marker_name(i), "used": False, "reason": excluded.get(i, "Not matched.")}
+        for i in range(n_fits)
+    ]
+    for k, (i, mark) in enumerate(fix.matches):
+        residual = dict(
+            zip(
+                ("residual_x_m", "residual_y_m", "residual_z_m"), fix.residuals_site[k], strict=True
+            )
+        )
+        rows[i] |= {
+            "mark": names[mark],
+            "used": True,
+            "reason": "",
+            **residual,
+            "redundancy": fix.redundancies[k],
+            "w": fix.w_statistics[k],
+            "minimal_detectable_bias_m": fix.detectable_biases[k],
+            "external_reliability_m": fix.external_reliabilities[k],
+        }
+    return rows
+
+
+def _pair_rows(stop: StopResult, fit_method: str, method: str, names: tuple[str, ...]) -> list[Row]:
+    """Return one row of ``resections`` for each pair of marks."""
+    pairs = stop.pairs[fit_method, method]
+    return [
+        {
+            "marks": [names[i] for i in pairs.marks[k]],
+            "n_marks": 2,
+            "included_angle_deg": np.degrees(pairs.included_angles[k]),
+            "included_angle_horizontal_deg": np.degrees(pairs.included_angles_horizontal[k]),
+            "sigma_3d_m": pairs.sigma_3d[k],
+            **_place(pairs.p_site[k]),
+        }
+        for k in range(len(pairs.marks))
+    ]
+
+
+def _matched(stop: StopResult, fit_method: str, names: tuple[str, ...]) -> dict[int, str]:
+    """Return the control mark of each fit that the method's first station used."""
+    for (method, _), fix in stop.fixes.items():
+        if method == fit_method and isinstance(fix, StationFix):
+            return {int(i): names[mark] for i, mark in fix.matches}
+    return {}
+
+
+def _place(p: Array) -> Row:
+    """Return coordinates as columns."""
+    return dict(zip(("x_m", "y_m", "z_m"), p, strict=True))
+
+
+def _cov(cov: Array) -> Row:
+    """Return the upper triangle of a covariance as columns."""
+    return dict(zip(_COV, cov[np.triu_indices(3)], strict=True))
+
+
+def _table(name: str, rows: Sequence[Row]) -> pa.Table:
+    """Return rows as an Arrow table in the shape of a table of the database."""
+    schema = pa.schema(list(_SCHEMAS[name].items()))
+    plain = [{key: _plain(value) for key, value in row.items()} for row in rows]
+    return pa.Table.from_pylist(plain, schema=schema)
+
+
+def _plain(value: object) -> object:
+    """Return a value as Arrow takes it: NumPy's scalars as Python's, what is not finite as None."""
+    if isinstance(value, np.generic):
+        value = value.item()
+    return None if isinstance(value, float) and not np.isfinite(value) else value
+
+
+def _with_columns(table: pa.Table, errors: Sequence[Mapping[str, object]]) -> pa.Table:
+    """Return a table with its error columns replaced; what a row does not tell is NULL."""
+    for i, name in enumerate(table.column_names):
+        if name.startswith("error_"):
+            values = pa.array([_plain(row.get(name)) for row in errors], _REAL)
+            table = table.set_column(i, name, values)
+    return table
+
+
+def _levellings(known: Mapping[str, pa.Table]) -> dict[tuple[str, str], Levelling]:
+    """Return how the base leant at each stop of each run."""
+    return {
+        (row["run_id"], row["stop"]): Levelling(
+            roll=np.radians(row["roll_deg"]),
+            pitch=np.radians(row["pitch_deg"]),
+            sigma=np.radians(row["sigma_levelling_deg"]),
+            is_measured=True,
+        )
+        for row in known["stops"].to_pylist()
+    }
+
+
+def _marker_errors(
+    fits: pa.Table,
+    levellings: Mapping[tuple[str, str], Levelling],
+    truths: Mapping[str, StopTruth],
+    marks: ControlMarks,
+) -> list[Row]:
+    """Return the errors of each row of ``marker_fits``, along the axes of the station."""
+    rows = fits.to_pylist()
+    errors: list[Row] = [{} for _ in rows]
+    groups: dict[tuple[str, str, str], list[int]] = {}
+    for i, row in enumerate(rows):
+        groups.setdefault((row["run_id"], row["stop"], row["fit_method"]), []).append(i)
+    for (run_id, stop, _), members in groups.items():
+        if stop in truths:
+            p_station = np.array(
+                [[rows[i][axis] for axis in ("x_m", "y_m", "z_m")] for i in members]
+            )
+            R = levelling_rotation(levellings[run_id, stop])
+            found = centre_errors(p_station @ R, truths[stop], marks)
+            for k, i in enumerate(members):
+                errors[i] = {
+                    **_errors(R @ found.error_base[k]),
+                    "error_radial_m": found.error_radial[k],
+                    "error_3d_m": found.error_3d[k],
+                }
+    return errors
+
+
+def _station_errors(row: Row, truth: StopTruth | None) -> Row:
+    """Return the errors of a row of ``station_fixes``."""
+    if truth is None or row["x_m"] is None:
+        return {}
+    error = station_error(_fix_of(row), truth)
+    return {
+        **_errors(error.error_site),
+        "error_yaw_deg": np.degrees(error.error_yaw),
+        "error_horizontal_m": np.hypot(*error.error_site[:2]),
+        "error_3d_m": error.error_3d,
+    }
+
+
+def _pair_errors(row: Row, truth: StopTruth | None) -> Row:
+    """Return the error of a row of ``resections``."""
+    if truth is None or row["x_m"] is None:
+        return {}
+    p_site = np.array([row["x_m"], row["y_m"], row["z_m"]])
+    return {"error_3d_m": np.linalg.norm(p_site - truth.T_site_base[:3, 3])}
+
+
+def _errors(error: Array) -> Row:
+    """Return an error as columns."""
+    return dict(zip(_ERROR, error, strict=True))
+
+
+def _fix_of(row: Row) -> StationFix:
+    """Return the pose of a row of ``station_fixes``, without what made it."""
+    R = np.array(row["rotation"]).reshape(3, 3)
+    none = np.zeros(0)
+    return StationFix(
+        method=row["resection_method"],
+        T_site_station=rigid(R, [row["x_m"], row["y_m"], row["z_m"]]),
+        cov_T_site_station=np.full((6, 6), np.nan),
+        matches=np.zeros((0, 2), dtype=np.intp),
+        residuals_site=np.zeros((0, 3)),
+        redundancies=none,
+        w_statistics=none,
+        detectable_biases=none,
+        external_reliabilities=none,
+        dof=0,
+        sigma0=np.nan,
+        passes_global_test=True,
+        included_angles=np.full(2, np.nan),
+        status=Status(row["status"]),
+        reason=row["reason"],
+    )
