@@ -1,1 +1,13 @@
-"""Scan logs: MCAP files to and from ``ScanLog``, and the preflight report."""
+"""Scan logs: MCAP files to and from ``ScanLog``, and the preflight report.
+
+A recording is walked once (``container``); each message family is a module that turns its messages
+into neutral columns (``families``): ``pointclouds``, ``joint_states``, ``transforms``,
+``orientations``. ``reading`` chooses among topics and builds the log. Nothing is executed from a
+recording, and no length that it declares is believed before it is checked.
+"""
+
+from storage.recordings.container import file_digest
+from storage.recordings.reading import read_log
+from storage.recordings.writing import write_log
+
+__all__ = ["file_digest", "read_log", "write_log"]

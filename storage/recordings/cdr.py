@@ -1,0 +1,257 @@
+"""CDR, the encoding of ROS 2: a cursor for one message, and many small ones decoded at once.
+
+Plain CDR (XCDR1) and XCDR2 of final types, little and big endian. Alignment counts from behind the
+four bytes of the encapsulation header; XCDR2 aligns nothing wider than four bytes.
+"""
+
+from __future__ import annotations
+
+import re
+import struct
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipelines.values import Mask, Nanos
+from storage.recordings.container import Batch, Channel, Octets
+from storage.recordings.families import BrokenMessageError
+
+_ENCAPSULATIONS = {0: (">", 8), 1: ("<", 8), 6: (">", 4), 7: ("<", 4)}  # identifier: order, widest
+_SIZES = {"B": 1, "i": 4, "I": 4, "d": 8}
+_LAYOUTS_MAX = 256  # layouts of one length on one channel; real topics have one to ten
+
+HEADER = """std_msgs/Header header
+"""
+HEADER_PARTS = """================================================================================
+MSG: std_msgs/Header
+# Standard metadata for higher-level stamped data types.
+builtin_interfaces/Time stamp
+string frame_id
+================================================================================
+MSG: builtin_interfaces/Time
+int32 sec
+uint32 nanosec
+"""
+VECTOR_PARTS = """================================================================================
+MSG: geometry_msgs/Vector3
+float64 x
+float64 y
+float64 z
+================================================================================
+MSG: geometry_msgs/Quaternion
+float64 x 0
+float64 y 0
+float64 z 0
+float64 w 1
+"""
+
+
+class Cursor:
+    """Reads one message from front to back without copying it."""
+
+    def __init__(self, octets: Octets) -> None:
+        """Start behind the encapsulation header."""
+        self._view = octets.data
+        identifier = int.from_bytes(self._view[:2], "big") if len(octets) >= 4 else -1
+        if identifier not in _ENCAPSULATIONS:
+            raise BrokenMessageError(f"its first bytes {bytes(self._view[:4])!r} are not plain CDR")
+        self.order, self._widest = _ENCAPSULATIONS[identifier]
+        self.at = 4
+
+    def number(self, code: str) -> int:
+        """Read one whole number (struct's letter)."""
+        at = self.skip(code)
+        return int(struct.unpack_from(self.order + code, self._view, at)[0])
+
+    def skip(self, code: str, count: int = 1) -> int:
+        """Pass some numbers and return where they begin."""
+        size = _SIZES[code]
+        if count:
+            step = min(size, self._widest)
+            self.at = 4 - (4 - self.at) // step * step
+        at, end = self.at, self.at + size * count
+        if end > len(self._view):
+            raise BrokenMessageError(f"it ends at byte {len(self._view)} and must have {end}")
+        self.at = end
+        return at
+
+    def count(self, smallest: int = 1) -> int:
+        """Read the length of a sequence whose members have at least so many bytes."""
+        n = self.number("I")
+        if n * smallest > len(self._view) - self.at:
+            raise BrokenMessageError(f"it declares {n:,} members, more than it has bytes for")
+        return n
+
+    def text(self) -> str:
+        """Read a string."""
+        n = self.count()
+        self.at += n
+        return bytes(self._view[self.at - n : self.at]).rstrip(b"\0").decode("utf-8", "replace")
+
+    def stamp(self) -> int:
+        """Pass a time and return where it begins."""
+        at = self.skip("i")
+        self.skip("I")
+        return at
+
+    def stamp_ns(self) -> int:
+        """Read a time [ns]."""
+        return self.number("i") * 1_000_000_000 + self.number("I")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Layout:
+    """Where the varying numbers of a small message are; all else is equal in messages alike.
+
+    Attributes
+    ----------
+    names : tuple of tuple of str
+        The strings that tell what the numbers are.
+    stamps : tuple of int
+        Where times begin.
+    columns : tuple of (int, int)
+        Where runs of float64 begin, and their lengths.
+    """
+
+    names: tuple[tuple[str, ...], ...]
+    stamps: tuple[int, ...]
+    columns: tuple[tuple[int, int], ...]
+
+
+@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
+class Table:
+    """Messages of one layout, decoded.
+
+    Attributes
+    ----------
+    names : tuple of tuple of str
+        As in the layout.
+    stamps_ns : (n, s)
+        Times.
+    columns : tuple of (n, k)
+        Numbers.
+    log_times_ns : (n,)
+        When the messages were recorded.
+    """
+
+    names: tuple[tuple[str, ...], ...]
+    stamps_ns: Nanos
+    columns: tuple[NDArray[np.float64], ...]
+    log_times_ns: Nanos
+
+
+class SmallMessages:
+    """Collects the messages of a channel and decodes those of one layout together."""
+
+    def __init__(self, layout_of: Callable[[Cursor], Layout]) -> None:
+        """Start without messages; the function finds the layout of one message."""
+        self._layout_of = layout_of
+        self._rows: dict[int, list[tuple[Octets, Nanos]]] = {}
+        self.n_broken = 0
+        self.reason = ""
+
+    def add(self, batch: Batch) -> None:
+        """Copy the messages of a batch, by length."""
+        for length in np.unique(batch.lengths).tolist():
+            mine = batch.lengths == length
+            rows = batch.octets[batch.starts[mine][:, None] + np.arange(length)]
+            self._rows.setdefault(length, []).append((rows, batch.log_times_ns[mine]))
+
+    def tables(self) -> list[Table]:
+        """Decode all messages, layout by layout."""
+        tables: list[Table] = []
+        for parts in self._rows.values():
+            rows = np.concatenate([part[0] for part in parts])
+            log_times = np.concatenate([part[1] for part in parts])
+            for _ in range(_LAYOUTS_MAX):
+                if not len(rows):
+                    break
+                alike = self._decode_alike(rows, log_times, tables)
+                rows, log_times = rows[~alike], log_times[~alike]
+            self._give_up(len(rows), f"the channel has more than {_LAYOUTS_MAX} layouts")
+        return tables
+
+    def _decode_alike(self, rows: Octets, log_times: Nanos, tables: list[Table]) -> Mask:
+        """Decode the first message and all that are laid out like it; say which."""
+        cursor_order, layout = "<", None
+        try:
+            cursor = Cursor(rows[0])
+            cursor_order, layout = cursor.order, self._layout_of(cursor)
+        except BrokenMessageError as error:
+            alike = (rows == rows[0]).all(axis=1)
+            self._give_up(int(alike.sum()), str(error))
+            return np.asarray(alike)
+        alike = _alike(rows, layout)
+        tables.append(_decode(rows[alike], log_times[alike], layout, cursor_order))
+        return alike
+
+    def _give_up(self, n: int, reason: str) -> None:
+        """Count messages that cannot be decoded."""
+        if n:
+            self.n_broken += n
+            self.reason = self.reason or reason
+
+
+def definition_agrees(channel: Channel, expected: str) -> bool:
+    """Say whether the recorded definition has the fields that the decoder reads.
+
+    Parameters
+    ----------
+    channel : Channel
+        The channel; only definitions written as ``ros2msg`` are compared.
+    expected : str
+        The definition as ROS 2 ships it.
+
+    Returns
+    -------
+    bool
+        False when the top level has other fields or another order.
+    """
+    text = channel.definition.decode("utf-8", "replace")
+    if channel.schema_encoding != "ros2msg" or not text.strip():
+        return True
+    return _fields(text) == _fields(expected)
+
+
+def _fields(text: str) -> list[tuple[str, str]]:
+    """Return type and name of each field of the top level of a definition."""
+    top = re.split(r"^={20,}\s*$", text, maxsplit=1, flags=re.MULTILINE)[0]
+    lines = (re.sub(r"#.*", "", line).split() for line in top.splitlines())
+    fields = [line for line in lines if len(line) >= 2 and "=" not in "".join(line[1:])]
+    return [(kind.rsplit("/", 1)[-1], name) for kind, name, *_ in fields]
+
+
+def _alike(rows: Octets, layout: Layout) -> Mask:
+    """Say which messages agree with the first one wherever the layout does not vary."""
+    fixed = np.ones(rows.shape[1], np.bool_)
+    for at in layout.stamps:
+        fixed[at : at + 8] = False
+    for at, count in layout.columns:
+        fixed[at : at + 8 * count] = False
+    return np.asarray((rows[:, fixed] == rows[0, fixed]).all(axis=1))
+
+
+def _decode(rows: Octets, log_times: Nanos, layout: Layout, order: str) -> Table:
+    """Read all numbers of messages of one layout."""
+    stamps = [
+        _numbers(rows, at, 1, order + "i4").astype(np.int64) * 1_000_000_000
+        + _numbers(rows, at + 4, 1, order + "u4").astype(np.int64)
+        for at in layout.stamps
+    ]
+    return Table(
+        names=layout.names,
+        stamps_ns=np.concatenate(stamps, axis=1) if stamps else np.empty((len(rows), 0), np.int64),
+        columns=tuple(
+            _numbers(rows, at, count, order + "f8").astype(np.float64)
+            for at, count in layout.columns
+        ),
+        log_times_ns=log_times,
+    )
+
+
+def _numbers(rows: Octets, at: int, count: int, kind: str) -> NDArray[np.generic]:
+    """Read a run of numbers from each message."""
+    size = np.dtype(kind).itemsize * count
+    return np.ascontiguousarray(rows[:, at : at + size]).view(kind).reshape(len(rows), count)

@@ -1,0 +1,73 @@
+"""tf2_msgs/msg/TFMessage in CDR: how frames hang together, for good or in time."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from storage.recordings import cdr
+from storage.recordings.container import Batch, Channel
+from storage.recordings.families import Series, broken_note, ordered
+
+SCHEMA = "tf2_msgs/msg/TFMessage"
+DEFINITION = f"""geometry_msgs/TransformStamped[] transforms
+================================================================================
+MSG: geometry_msgs/TransformStamped
+# This expresses a transform from coordinate frame header.frame_id to child_frame_id.
+{cdr.HEADER}string child_frame_id
+Transform transform
+================================================================================
+MSG: geometry_msgs/Transform
+Vector3 translation
+Quaternion rotation
+{cdr.HEADER_PARTS}{cdr.VECTOR_PARTS}"""
+
+_TRANSFORM_MIN = 70  # [bytes] of a transform with empty names
+
+
+class Transforms:
+    """Decoder of a topic of transforms."""
+
+    def __init__(self, channel: Channel) -> None:
+        """Start without messages."""
+        self._topic = channel.topic
+        self._messages = cdr.SmallMessages(_layout)
+
+    def add(self, batch: Batch) -> None:
+        """Take some messages."""
+        self._messages.add(batch)
+
+    def series(self) -> list[Series]:
+        """Give one series per pair of parent and child."""
+        tables = self._messages.tables()
+        notes = broken_note(self._topic, self._messages.n_broken, self._messages.reason)
+        pairs = list(dict.fromkeys(pair for table in tables for pair in table.names))
+        return [self._pair(pair, tables, notes) for pair in pairs]
+
+    def _pair(
+        self, pair: tuple[str, ...], tables: list[cdr.Table], notes: tuple[str, ...]
+    ) -> Series:
+        """Collect the samples of one transform."""
+        places = [
+            (table, place)
+            for table in tables
+            for place, names in enumerate(table.names)
+            if names == pair
+        ]
+        stamps = np.concatenate([table.stamps_ns[:, place] for table, place in places])
+        values = np.concatenate([table.columns[place] for table, place in places])
+        if not stamps.any():
+            stamps = np.concatenate([table.log_times_ns for table, _ in places])
+        finite = np.isfinite(values).all(axis=1)
+        stamps, values, _ = ordered(stamps[finite], values[finite])
+        return Series(topic=self._topic, names=pair, stamps_ns=stamps, values=values, notes=notes)
+
+
+def _layout(cursor: cdr.Cursor) -> cdr.Layout:
+    """Find the numbers of one message with any number of transforms."""
+    names, stamps, columns = [], [], []
+    for _ in range(cursor.count(_TRANSFORM_MIN)):
+        stamps.append(cursor.stamp())
+        parent, child = cursor.text(), cursor.text()
+        names.append((parent.lstrip("/"), child.lstrip("/")))
+        columns.append((cursor.skip("d", 7), 7))
+    return cdr.Layout(names=tuple(names), stamps=tuple(stamps), columns=tuple(columns))
