@@ -1,1 +1,32 @@
-"""A world whose truth is known, and the log that a rig would record in it."""
+"""A world whose truth is known, and the log that a rig would record in it.
+
+``scenario`` makes a ``Field``: terrain, rocks, markers and stops. ``simulate_stop`` turns the
+gimbal at one of the stops and returns the log and, apart from it, the truth. Inside,
+
+- ``options`` says what can be chosen,
+- ``terrain`` and ``rocks`` make the ground, ``scene`` holds whatever a beam can meet,
+- ``field`` puts them together into worlds with names,
+- ``rig`` moves the LiDAR and records encoder and AHRS,
+- ``sensor`` fires the lasers and records their echoes, which ``echo`` traces,
+- ``stop`` runs all of it for one stop.
+
+Why so: the pipeline is believed because it finds what this room hid. Nothing here is imported by
+the steps of the pipeline, and a log holds nothing of the truth.
+"""
+
+from pipelines.simulation.field import SCENARIOS, Field, Stop, scenario
+from pipelines.simulation.options import SimulationConfig
+from pipelines.simulation.rig import commensurability
+from pipelines.simulation.stop import SimulatedStop, simulate_stop, survey_truth
+
+__all__ = [
+    "SCENARIOS",
+    "Field",
+    "SimulatedStop",
+    "SimulationConfig",
+    "Stop",
+    "commensurability",
+    "scenario",
+    "simulate_stop",
+    "survey_truth",
+]

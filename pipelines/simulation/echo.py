@@ -1,0 +1,303 @@
+"""What comes back from a beam of finite width.
+
+One ray is cast along the centre of every beam. Beams that touch a sphere or a pole, or whose
+neighbours see a step, are cast again as a bundle that fills the footprint; the bundle's returns
+merge and split as those of one pulse do.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numba
+import numpy as np
+
+from pipelines.rigs import N_LASERS
+from pipelines.simulation.scene import Caster, Scene, caster
+from pipelines.values import Array, Column, Mask, Rings, _seal
+
+_N_RAYS = 37  # in a bundle
+_MERGE = 0.8  # [m] nearer returns of one pulse are one echo: half a pulse of some 5 ns
+_STEP = 0.10  # [m] departure of a range from the plane through its neighbours
+_NEAR = 0.35  # [m] what passes a sphere's centre closer than this is near it
+
+
+@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
+class Aims:
+    """Where beams start and point.
+
+    Attributes
+    ----------
+    origins_site : (n, 3)
+        Where each beam leaves the spin axis [m].
+    directions_site : (n, 3)
+        Unit vectors along the beams.
+    spin_axes_site : (n, 3)
+        Unit vectors along the spin axis at each shot.
+    """
+
+    origins_site: Array
+    directions_site: Array
+    spin_axes_site: Array
+
+    def __post_init__(self) -> None:
+        n = len(self.origins_site)
+        _seal(self, origins_site=(n, 3), directions_site=(n, 3), spin_axes_site=(n, 3))
+
+    def rows(self, chosen: Mask) -> Aims:
+        """Return some of the beams."""
+        return Aims(
+            origins_site=self.origins_site[chosen],
+            directions_site=self.directions_site[chosen],
+            spin_axes_site=self.spin_axes_site[chosen],
+        )
+
+
+@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
+class Echoes:
+    """The strongest echo of each beam.
+
+    Attributes
+    ----------
+    ranges : (n,)
+        Energy-weighted mean distance along the beam; infinite where nothing answers [m].
+    reflectivities : (n,)
+        Reflectivity of what answers times its share of the footprint, 0 to 1.
+    """
+
+    ranges: Array
+    reflectivities: Array
+
+    def __post_init__(self) -> None:
+        _seal(self, ranges=(None,), reflectivities=(len(self.ranges),))
+
+
+def trace(scene: Scene, aims: Aims, divergence: Array, *, only_near_spheres: bool) -> Echoes:
+    """Return the strongest echo of each beam.
+
+    Parameters
+    ----------
+    scene : Scene
+        What can be met.
+    aims : Aims
+        Beams in the order of firing, whole firings of all lasers.
+    divergence : (2,)
+        Full width of the footprint across and along the spin axis [rad].
+    only_near_spheres : bool
+        Whether beams that pass no sphere closely are left without an echo, save the first and last.
+
+    Returns
+    -------
+    Echoes
+        In the order of the beams.
+    """
+    cast = caster(scene.mesh)
+    ranges = np.full(len(aims.origins_site), np.inf)
+    reflectivities = np.zeros(len(ranges))
+    if only_near_spheres:
+        is_wide = _passes(scene, aims, 0.0, _NEAR)
+        is_wide[:N_LASERS] = is_wide[-N_LASERS:] = True  # how far the gimbal turned must show
+    else:
+        rays = np.hstack([aims.origins_site, aims.directions_site]).astype(np.float32)
+        ranges[:], reflectivities[:] = cast(rays)
+        is_wide = _passes(scene, aims, float(divergence.max()) / 2, 0.0)
+        is_wide |= _sees_step(ranges, N_LASERS)
+    wide = aims.rows(is_wide)
+    ranges[is_wide], reflectivities[is_wide] = _trace_bundles(scene, cast, wide, divergence)
+    return Echoes(ranges=ranges, reflectivities=reflectivities)
+
+
+def _trace_bundles(
+    scene: Scene, cast: Caster, aims: Aims, divergence: Array
+) -> tuple[Array, Array]:
+    """Return range and reflectivity of beams, each cast as a bundle of rays."""
+    n = len(aims.origins_site)
+    directions = _bundles(
+        aims.directions_site, aims.spin_axes_site, _disc(_N_RAYS) * divergence / 2
+    )
+    rays = np.empty((n * _N_RAYS, 6), dtype=np.float32)
+    rays[:, :3] = np.repeat(aims.origins_site, _N_RAYS, axis=0)
+    rays[:, 3:] = directions.reshape(-1, 3)
+    distances, shades = cast(rays)
+    spheres = scene.spheres
+    found: tuple[Array, Array] = _echoes(
+        aims.origins_site,
+        directions,
+        distances.reshape(n, _N_RAYS),
+        shades.reshape(n, _N_RAYS),
+        np.column_stack([spheres.p_site, spheres.radii, spheres.reflectivities]),
+    )
+    return found
+
+
+def _passes(scene: Scene, aims: Aims, half_width: float, clearance: float) -> Mask:
+    """Return which beams pass spheres (or poles, without a clearance) closely enough."""
+    spheres, poles = scene.spheres, scene.poles
+    reach = np.maximum(spheres.radii, clearance)
+    feet = np.concatenate([spheres.p_site, poles.feet_site[: 0 if clearance else None]])
+    tops = np.concatenate([spheres.p_site, poles.tops_site[: 0 if clearance else None]])
+    radii = np.concatenate([reach, poles.radii[: 0 if clearance else None]])
+    found: Mask = _passes_axes(
+        aims.origins_site, aims.directions_site, feet, tops - feet, radii, half_width
+    )
+    return found
+
+
+def _disc(n: int) -> Array:
+    """Return points that fill the unit disc evenly, (n, 2) (Vogel, 1979)."""
+    k = np.arange(n)
+    radii, angles = np.sqrt((k + 0.5) / n), k * np.pi * (3 - np.sqrt(5))
+    return np.column_stack([radii * np.cos(angles), radii * np.sin(angles)])
+
+
+@numba.njit(cache=True, nogil=True)
+def aim(
+    azimuths: Array, gimbal_angles: Array, rings: Rings, lasers: Array, mounting: Array, pose: Array
+) -> tuple[Array, Array, Array]:  # pragma: no cover
+    """Return origins, directions and spin axes of shots in the site frame, (n, 3) each.
+
+    ``lasers`` holds elevation and height of each laser, (k, 2); ``mounting`` is ``T_head_lidar``
+    and ``pose`` is ``T_site_base``.
+    """
+    n = len(azimuths)
+    origins, directions, axes = np.empty((n, 3)), np.empty((n, 3)), np.empty((n, 3))
+    lidar, head, base = np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3))
+    for i in range(n):
+        elevation, height = lasers[rings[i], 0], lasers[rings[i], 1]
+        reach = np.cos(elevation)
+        lidar[0] = (reach * np.cos(azimuths[i]), -reach * np.sin(azimuths[i]), np.sin(elevation))
+        lidar[1] = (0.0, 0.0, 1.0)
+        lidar[2] = (0.0, 0.0, height)
+        _rotate(mounting, lidar, head)
+        for k in range(3):
+            head[2, k] += mounting[k, 3]
+        c, s = np.cos(gimbal_angles[i]), np.sin(gimbal_angles[i])
+        for k in range(3):
+            base[k] = (c * head[k, 0] - s * head[k, 1], s * head[k, 0] + c * head[k, 1], head[k, 2])
+        _rotate(pose, base, head)
+        for k in range(3):
+            directions[i, k], axes[i, k] = head[0, k], head[1, k]
+            origins[i, k] = head[2, k] + pose[k, 3]
+    return origins, directions, axes
+
+
+@numba.njit(cache=True, nogil=True)
+def _rotate(T: Array, v: Array, out: Array) -> None:  # pragma: no cover
+    """Rotate three vectors, the rows of ``v``, by the rotation of ``T``, into ``out``."""
+    for k in range(3):
+        for j in range(3):
+            out[k, j] = T[j, 0] * v[k, 0] + T[j, 1] * v[k, 1] + T[j, 2] * v[k, 2]
+
+
+@numba.njit(cache=True, nogil=True)
+def _passes_axes(
+    origins: Array, directions: Array, feet: Array, axes: Array, radii: Array, half_width: float
+) -> Mask:  # pragma: no cover
+    """Return which beams pass one of the axes within its radius and their own half width."""
+    found = np.zeros(len(origins), dtype=np.bool_)
+    for i in range(len(origins)):
+        d = directions[i]
+        for j in range(len(feet)):
+            wx, wy, wz = feet[j] - origins[i]
+            ax, ay, az = axes[j]
+            wd = wx * d[0] + wy * d[1] + wz * d[2]
+            ad = ax * d[0] + ay * d[1] + az * d[2]
+            # the place on the axis nearest to the line of the beam, clamped to its ends
+            square = ax * ax + ay * ay + az * az - ad * ad
+            s = 0.0
+            if square > 0.0:
+                aw = ax * wx + ay * wy + az * wz
+                s = min(max((wd * ad - aw) / square, 0.0), 1.0)
+            along = wd + s * ad
+            if along <= 0.0:
+                continue
+            px, py, pz = wx + s * ax, wy + s * ay, wz + s * az
+            away = px * px + py * py + pz * pz - along * along
+            if away <= (radii[j] + half_width * along) ** 2:
+                found[i] = True
+                break
+    return found
+
+
+@numba.njit(cache=True, nogil=True)
+def _sees_step(ranges: Array, stride: int) -> Mask:  # pragma: no cover
+    """Return which beams differ from the plane through the beams before and after them.
+
+    Along a sweep the inverse range of a plane is linear to first order, however it is tilted. The
+    first and last firing have no neighbour on one side, and are looked at closely for that.
+    """
+    n = len(ranges)
+    found = np.ones(n, dtype=np.bool_)
+    for i in range(stride, n - stride):
+        before, after = 1.0 / ranges[i - stride], 1.0 / ranges[i + stride]
+        if np.isinf(ranges[i]):
+            found[i] = before + after > 0.0
+        else:
+            found[i] = abs(before + after - 2.0 / ranges[i]) * ranges[i] ** 2 > _STEP
+    return found
+
+
+@numba.njit(cache=True, nogil=True)
+def _bundles(directions: Array, spin_axes: Array, offsets: Array) -> Array:  # pragma: no cover
+    """Return the unit vectors of bundles, (n, k, 3), from offsets across and along the axis."""
+    n, k = len(directions), len(offsets)
+    out = np.empty((n, k, 3))
+    for i in range(n):
+        d = directions[i]
+        across = np.cross(d, spin_axes[i])
+        across /= np.sqrt((across**2).sum())
+        along = np.cross(across, d)
+        for j in range(k):
+            ray = d + offsets[j, 0] * across + offsets[j, 1] * along
+            out[i, j] = ray / np.sqrt((ray**2).sum())
+    return out
+
+
+@numba.njit(cache=True, nogil=True)
+def _echoes(
+    origins: Array,
+    directions: Array,
+    distances: Column,
+    shades: Column,
+    spheres: Array,
+) -> tuple[Array, Array]:  # pragma: no cover
+    """Return the strongest echo of each bundle: range, and reflectivity times share."""
+    n, k = distances.shape
+    ranges, reflectivities = np.empty(n), np.empty(n)
+    t, shade = np.empty(k), np.empty(k)
+    for i in range(n):
+        t[:], shade[:] = distances[i], shades[i]
+        for m in range(len(spheres)):
+            wx, wy, wz = spheres[m, :3] - origins[i]
+            radius = spheres[m, 3]
+            distance = np.sqrt(wx * wx + wy * wy + wz * wz)
+            d = directions[i, 0]
+            if wx * d[0] + wy * d[1] + wz * d[2] < distance - 2.0 * radius:
+                continue  # well beside the bundle or behind it
+            for j in range(k):
+                d = directions[i, j]
+                along = wx * d[0] + wy * d[1] + wz * d[2]
+                inside = radius**2 - (distance**2 - along**2)
+                if inside >= 0.0 and 0.0 < along - np.sqrt(inside) < t[j]:
+                    t[j], shade[j] = along - np.sqrt(inside), spheres[m, 4]
+        ranges[i], reflectivities[i] = _strongest(t, shade)
+    return ranges, reflectivities
+
+
+@numba.njit(cache=True, nogil=True)
+def _strongest(t: Array, shade: Array) -> tuple[float, float]:  # pragma: no cover
+    """Return range and reflectivity of the strongest group of returns of one pulse."""
+    order = np.argsort(t)
+    best_energy, best_range, best_shade = 0.0, np.inf, 0.0
+    energy, moment, share = 0.0, 0.0, 0.0
+    for place in range(len(t)):
+        j = order[place]
+        if np.isinf(t[j]):
+            break
+        if place and t[j] - t[order[place - 1]] > _MERGE:
+            energy, moment, share = 0.0, 0.0, 0.0
+        weight = shade[j] / t[j] ** 2
+        energy, moment, share = energy + weight, moment + weight * t[j], share + shade[j]
+        if energy > best_energy:
+            best_energy, best_range, best_shade = energy, moment / energy, share / len(t)
+    return best_range, best_shade

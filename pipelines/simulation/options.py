@@ -1,0 +1,158 @@
+"""What can be chosen about a simulated rig and sensor: unit, default and reason."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from dataclasses import dataclass
+from typing import Any, ClassVar, Self
+
+from pipelines.errors import ConfigError
+from pipelines.rigs import AZIMUTH_STEP, RANGE_STEP
+from pipelines.values import ImuMount
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SimulationConfig:
+    """How the simulated rig moves and how well its sensors measure.
+
+    Attributes
+    ----------
+    spin_rpm : float
+        Revolutions of the LiDAR per minute. 600: the VLP-16's usual setting.
+    turn : float
+        Time in which the gimbal turns through 360 degrees [s]. 13.2: incommensurate with the 2
+        degree pitch of the channels, so that scan lines do not fall on scan lines.
+    sigma_range : float or None
+        Noise of every range [m]; none takes the noise by reflectivity that was measured on real
+        packets of a VLP-16.
+    sigma_laser_bias : float
+        Spread of the lasers' own range biases, drawn once per rig [m]. 3 mm: after the maker's
+        calibration; 10 mm have been seen.
+    drop_out : float
+        Probability that a return is lost for no reason. 0.005: seen in real packets.
+    divergence : (2,) of float
+        Full width of the evenly lit footprint across and along the spin axis [rad]. As the maker
+        says for this family of sensors.
+    range_step : float
+        Quantisation of ranges [m]; 0 for none.
+    azimuth_step : float
+        Quantisation of azimuths [rad]; 0 for none.
+    encoder_step : float
+        Quantisation of the joint angle [rad]; 0 for none. A 16-bit encoder.
+    sigma_encoder : float
+        Jitter of the joint angle [rad].
+    sigma_eccentricity : float
+        Spread of the two amplitudes of the encoder's eccentricity, unknown to the log [rad].
+    sigma_ahrs_bias : float
+        Error of roll and pitch that stays during a stop [rad]. 0.2 deg: data sheet of the
+        MTi-G-710 for static use.
+    sigma_ahrs : float
+        White noise of roll, pitch and heading [rad].
+    sigma_tilt : float
+        Spread of the rover's roll and pitch on the ground, cut at three times this [rad].
+    sigma_misalignment : float
+        Spread of the three small rotations of the LiDAR's mounting, unknown to the log [rad].
+    axis_offset : (2,) of float
+        Nominal place of the LiDAR's origin in the head frame, x and y [m]. Centimetres, as in the
+        study.
+    sigma_axis_offset : float
+        Spread of the error of that place, unknown to the log [m].
+    gimbal_clock_offset : float
+        What must be added to a gimbal stamp to get the LiDAR's clock [s].
+    imu_mount : ImuMount
+        The part that carries the AHRS.
+    only_near_spheres : bool
+        Trace only beams that pass close by a sphere: quick, and all that centres need.
+    """
+
+    spin_rpm: float = 600.0
+    turn: float = 13.2
+    sigma_range: float | None = None
+    sigma_laser_bias: float = 0.003
+    drop_out: float = 0.005
+    divergence: tuple[float, float] = (3.0e-3, 1.5e-3)
+    range_step: float = RANGE_STEP
+    azimuth_step: float = float(AZIMUTH_STEP)
+    encoder_step: float = 2.0 * math.pi / 65536
+    sigma_encoder: float = math.radians(0.005)
+    sigma_eccentricity: float = math.radians(0.01)
+    sigma_ahrs_bias: float = math.radians(0.2)
+    sigma_ahrs: float = math.radians(0.05)
+    sigma_tilt: float = math.radians(1.5)
+    sigma_misalignment: float = math.radians(0.02)
+    axis_offset: tuple[float, float] = (0.030, 0.020)
+    sigma_axis_offset: float = 0.0005
+    gimbal_clock_offset: float = 0.0
+    imu_mount: ImuMount = ImuMount.BASE
+    only_near_spheres: bool = False
+
+    _BOUNDS: ClassVar[dict[str, tuple[float, float]]] = {
+        "spin_rpm": (300.0, 1200.0),
+        "turn": (0.5, 3600.0),
+        "sigma_range": (0.0, 0.5),
+        "sigma_laser_bias": (0.0, 0.1),
+        "drop_out": (0.0, 0.95),
+        "divergence": (0.0, 0.02),
+        "range_step": (0.0, 0.1),
+        "azimuth_step": (0.0, 0.02),
+        "encoder_step": (0.0, 0.02),
+        "sigma_encoder": (0.0, 0.02),
+        "sigma_eccentricity": (0.0, 0.02),
+        "sigma_ahrs_bias": (0.0, 0.2),
+        "sigma_ahrs": (0.0, 0.2),
+        "sigma_tilt": (0.0, 0.2),
+        "sigma_misalignment": (0.0, 0.05),
+        "axis_offset": (-0.5, 0.5),
+        "sigma_axis_offset": (0.0, 0.05),
+        "gimbal_clock_offset": (-1.0, 1.0),
+    }
+
+    def __post_init__(self) -> None:
+        for name, bounds in self._BOUNDS.items():
+            value = getattr(self, name)
+            is_pair = name in ("divergence", "axis_offset")
+            if name == "sigma_range" and value is None:
+                continue
+            if is_pair and not (isinstance(value, tuple) and len(value) == 2):
+                raise ConfigError(f"simulation.{name} is {value!r}; it must be two numbers.")
+            for number in value if is_pair else (value,):
+                _check(name, number, *bounds)
+        if self.imu_mount not in tuple(ImuMount):
+            raise ConfigError(
+                f"simulation.imu_mount is {self.imu_mount!r}; it must be one of "
+                f"{[str(mount) for mount in ImuMount]}."
+            )
+
+    @classmethod
+    def perfect(cls, **changes: Any) -> Self:
+        """Return a rig and sensor without any error, except for the named changes.
+
+        Parameters
+        ----------
+        **changes : any
+            Fields that shall differ.
+
+        Returns
+        -------
+        SimulationConfig
+            No noise, bias, drop-out or misalignment, thin beams and no quantisation.
+        """
+        zeros: dict[str, Any] = {
+            field.name: 0.0
+            for field in dataclasses.fields(cls)
+            if field.name.startswith("sigma_") or field.name.endswith("_step")
+        }
+        return cls(**{**zeros, "drop_out": 0.0, "divergence": (0.0, 0.0), **changes})
+
+    def to_mapping(self) -> dict[str, Any]:
+        """Return the configuration as plain values."""
+        return {**dataclasses.asdict(self), "imu_mount": str(self.imu_mount)}
+
+
+def _check(name: str, value: object, low: float, high: float) -> None:
+    """Raise ConfigError unless ``low <= value <= high``."""
+    if isinstance(value, bool) or not isinstance(value, int | float) or not low <= value <= high:
+        raise ConfigError(
+            f"simulation.{name} is {value!r}; it must be a number from {low:g} to {high:g}."
+        )

@@ -1,0 +1,252 @@
+"""The rig that turns the LiDAR: what a log tells of it, what it truly is, how it moves.
+
+Times are seconds since the first shot, on the LiDAR's clock.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from pipelines.geometry import exp_motion, rot_z
+from pipelines.rigs import tilted_vlp16
+from pipelines.simulation.options import SimulationConfig
+from pipelines.values import Array, ImuMount, Nanos, Rig, _seal
+
+_RATE = 100.0  # [Hz] of joint samples and orientations
+_LEAD = 0.05  # [s] that the gimbal turns, and is recorded, before the first and after the last shot
+_MARKER_RADIUS = 0.100  # [m] of the sphere that scan lines must not miss ...
+_MARKER_RANGE = 15.0  # [m] ... at this distance
+_LINES_WANTED = 2  # scan lines over its diameter at the least
+
+
+@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
+class Motion:
+    """The true angle of the gimbal, linear between knots.
+
+    Attributes
+    ----------
+    times : (n,)
+        Instants of the knots, ascending [s].
+    angles : (n,)
+        True angle of the head at each knot, unwrapped [rad].
+    """
+
+    times: Array
+    angles: Array
+
+    def __post_init__(self) -> None:
+        _seal(self, times=(None,), angles=(len(self.times),))
+
+    def angle_at(self, times: Array) -> Array:
+        """Return the true angle at some instants [rad]."""
+        return np.interp(times, self.times, self.angles)
+
+
+def even_turn(turn: float, start: float) -> Motion:
+    """Return a turn through 360 degrees at constant speed, with a little before and after it.
+
+    Parameters
+    ----------
+    turn : float
+        Time of the turn [s].
+    start : float
+        Angle at the first shot [rad].
+
+    Returns
+    -------
+    Motion
+        The movement.
+    """
+    times = np.array([-1.0, turn + 1.0])
+    return Motion(times=times, angles=start + 2 * np.pi / turn * times)
+
+
+def nominal_rig(config: SimulationConfig) -> Rig:
+    """Return the rig as its maker and a recording describe it.
+
+    Parameters
+    ----------
+    config : SimulationConfig
+        Nominal axis offset, divergence and place of the AHRS.
+
+    Returns
+    -------
+    Rig
+        Spin axis tilted by 90 degrees, without any error.
+    """
+    rig = tilted_vlp16("tilted-vlp16", config.axis_offset)
+    return replace(rig, divergence=np.array(config.divergence), imu_mount=config.imu_mount)
+
+
+def true_rig(config: SimulationConfig, rng: np.random.Generator) -> Rig:
+    """Return the rig as it really is, which no log tells.
+
+    Parameters
+    ----------
+    config : SimulationConfig
+        How far it may be from nominal.
+    rng : numpy.random.Generator
+        Source of chance.
+
+    Returns
+    -------
+    Rig
+        Misaligned, with range biases, an eccentric encoder and a clock offset.
+    """
+    rig = nominal_rig(config)
+    T_head_lidar = rig.T_head_lidar.copy()
+    twist = np.concatenate([rng.normal(0.0, config.sigma_misalignment, 3), np.zeros(3)])
+    T_head_lidar[:3, :3] = exp_motion(twist)[:3, :3] @ T_head_lidar[:3, :3]
+    T_head_lidar[:2, 3] += rng.normal(0.0, config.sigma_axis_offset, 2)
+    return replace(
+        rig,
+        name="true",
+        T_head_lidar=T_head_lidar,
+        laser_range_biases=rng.normal(0.0, config.sigma_laser_bias, len(rig.laser_heights)),
+        encoder_eccentricity=rng.normal(0.0, config.sigma_eccentricity, 2),
+        gimbal_clock_offset=config.gimbal_clock_offset,
+    )
+
+
+def joint_samples(
+    motion: Motion, duration: float, rig: Rig, config: SimulationConfig, rng: np.random.Generator
+) -> tuple[Array, Nanos]:
+    """Return what the encoder of the gimbal records.
+
+    Parameters
+    ----------
+    motion : Motion
+        The true angle.
+    duration : float
+        Time from the first shot to the last [s].
+    rig : Rig
+        The true rig: eccentricity and clock.
+    config : SimulationConfig
+        Quantisation and jitter.
+    rng : numpy.random.Generator
+        Source of chance.
+
+    Returns
+    -------
+    angles : (n,)
+        Joint angle, unwrapped [rad].
+    offsets_ns : (n,)
+        Instants on the gimbal's clock, since the first shot.
+    """
+    times = _sample_times(duration, rng)
+    truth = motion.angle_at(times)
+    c, s = rig.encoder_eccentricity
+    angles = truth.copy()
+    for _ in range(3):  # the amplitudes belong to the recorded angle; they are small
+        angles = truth - c * np.cos(angles) - s * np.sin(angles)
+    angles = quantised(
+        angles + rng.normal(0.0, config.sigma_encoder, len(times)), config.encoder_step
+    )
+    return angles, _nanoseconds(times - rig.gimbal_clock_offset)
+
+
+def ahrs_samples(
+    motion: Motion,
+    duration: float,
+    R_station_base: Array,
+    rig: Rig,
+    config: SimulationConfig,
+    rng: np.random.Generator,
+) -> tuple[Array, Nanos]:
+    """Return what the AHRS records.
+
+    Parameters
+    ----------
+    motion : Motion
+        The true angle of the gimbal.
+    duration : float
+        Time from the first shot to the last [s].
+    R_station_base : (3, 3)
+        How the base truly leans.
+    rig : Rig
+        Where the AHRS sits.
+    config : SimulationConfig
+        Its bias during a stop, and its noise.
+    rng : numpy.random.Generator
+        Source of chance.
+
+    Returns
+    -------
+    quaternions : (n, 4)
+        Orientation in the world, x y z w; its heading is that of a magnetic compass among motors,
+        that is, of no use.
+    offsets_ns : (n,)
+        Instants on the LiDAR's clock, since the first shot.
+    """
+    times = _sample_times(duration, rng)
+    lean = rng.normal(0.0, config.sigma_ahrs_bias, 3) * (1.0, 1.0, 0.0)
+    shake = Rotation.from_rotvec(rng.normal(0.0, config.sigma_ahrs, (len(times), 3)))
+    mount = Rotation.from_matrix(rig.R_mount_imu)
+    if rig.imu_mount is ImuMount.HEAD:
+        mount = Rotation.from_euler("z", motion.angle_at(times)) * mount
+    base = Rotation.from_matrix(rot_z(rng.uniform(-np.pi, np.pi))) * Rotation.from_rotvec(lean)
+    orientations = base * shake * Rotation.from_matrix(R_station_base) * mount
+    return orientations.as_quat(), _nanoseconds(times)
+
+
+def commensurability(config: SimulationConfig) -> str:
+    """Say what is wrong when the speeds of gimbal and LiDAR make scan lines fall on scan lines.
+
+    Parameters
+    ----------
+    config : SimulationConfig
+        The two speeds.
+
+    Returns
+    -------
+    str
+        A sentence for people; empty when the lines spread well.
+
+    Notes
+    -----
+    With the spin axis horizontal each laser crosses the horizon twice a revolution, at its
+    elevation off the sweep's plane to either side. The largest gap between all these directions of
+    one turn must not exceed half the width of a sphere of radius 0.1 m at 15 m.
+    """
+    gaps = _horizon_gaps(config)
+    worst, wanted = float(gaps.max()), 2 * _MARKER_RADIUS / _MARKER_RANGE / _LINES_WANTED
+    if worst <= wanted:
+        return ""
+    advance = np.degrees(2 * np.pi / config.turn * 60.0 / config.spin_rpm)
+    return (
+        f"A turn of {config.turn:g} s at {config.spin_rpm:g} rpm moves the gimbal {advance:.3f} "
+        f"deg per revolution, which is commensurate with the 2 deg pitch of the channels: scan "
+        f"lines fall on scan lines and leave gaps of {np.degrees(worst):.2f} deg "
+        f"(mean {np.degrees(gaps.mean()):.2f}); change the time of the turn by some percent."
+    )
+
+
+def quantised(values: Array, step: float) -> Array:
+    """Return values rounded to multiples of a step; a step of 0 leaves them."""
+    return np.asarray(np.round(values / step) * step) if step else values
+
+
+def _horizon_gaps(config: SimulationConfig) -> Array:
+    """Return the gaps between the directions in which one turn crosses the horizon [rad]."""
+    period = 60.0 / config.spin_rpm
+    elevations = nominal_rig(config).laser_elevations
+    up = np.arange(0.0, config.turn, period)
+    down = np.arange(period / 2, config.turn, period)
+    speed = 2 * np.pi / config.turn
+    front = speed * up[:, None] + np.pi / 2 - elevations
+    back = speed * down[:, None] - np.pi / 2 + elevations
+    directions = np.sort(np.concatenate([front.ravel(), back.ravel()]) % (2 * np.pi))
+    return np.diff(directions, append=directions[0] + 2 * np.pi)
+
+
+def _sample_times(duration: float, rng: np.random.Generator) -> Array:
+    """Return the instants of samples that bracket all shots [s]."""
+    return np.arange(-_LEAD - rng.uniform(0.0, 1.0 / _RATE), duration + _LEAD, 1.0 / _RATE)
+
+
+def _nanoseconds(times: Array) -> Nanos:
+    """Return times since the first shot as whole nanoseconds."""
+    return np.round(times * 1e9).astype(np.int64)

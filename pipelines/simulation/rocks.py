@@ -1,0 +1,121 @@
+"""Rocks of all sizes: rough convex bodies, some of them nearly round."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from pipelines.simulation.scene import Mesh
+from pipelines.simulation.terrain import Terrain
+from pipelines.values import Array, Index
+
+_COVER = 0.01  # share of the ground that rocks cover
+_DECAY = 4.0  # [1/m] of the exponential in size that the covered share falls with
+_SIZES = (0.05, 1.0)  # [m] smallest and largest diameter
+_HALF = 34.0  # [m] half side of the square they lie in
+_FULL_HALF = 14.0  # [m] half side of the square where the small ones are kept too
+_FAR_SIZE = 0.15  # [m] smaller rocks farther out are not resolved by any beam
+_ROUND_SHARE = 0.15  # of the rocks are nearly round
+_N_FACETS = 9  # planes that a rock is cut by
+_BURIED = 0.3  # share of a rock's half height that its centre lies above ground
+_REFLECTIVITY = (0.10, 0.22)
+
+
+def draw_rocks(rng: np.random.Generator, keep_clear: Array) -> Array:
+    """Return places and sizes of rocks.
+
+    Parameters
+    ----------
+    rng : numpy.random.Generator
+        Source of chance.
+    keep_clear : (n, 3)
+        Places, x and y, and radius where no rock may reach in [m].
+
+    Returns
+    -------
+    (m, 3)
+        Place, x and y, and diameter of each rock [m].
+
+    Notes
+    -----
+    The share of ground under rocks larger than D is ``k exp(-q D)``: the exponential tail of
+    counted fields (Golombek and Rapp, 1997, eq. 4), here with k = 1 % and q = 4 /m so that large
+    rocks occur.
+    """
+    sizes = np.linspace(*_SIZES, 2000)
+    density = _COVER * _DECAY * np.exp(-_DECAY * sizes) / (np.pi / 4 * sizes**2)  # [1/m^3]
+    cumulative = np.concatenate(
+        [[0.0], np.cumsum(np.diff(sizes) * (density[1:] + density[:-1]) / 2)]
+    )
+    n = rng.poisson(cumulative[-1] * (2 * _HALF) ** 2)
+    diameters = np.interp(rng.random(n) * cumulative[-1], cumulative, sizes)
+    places = rng.uniform(-_HALF, _HALF, (n, 2))
+    is_near = np.abs(places).max(axis=1) < _FULL_HALF
+    gap = np.hypot(*(places[:, None, :] - keep_clear[None, :, :2]).transpose(2, 0, 1))
+    is_clear = (gap > keep_clear[None, :, 2] + diameters[:, None] / 2).all(axis=1)
+    keep = is_clear & (is_near | (diameters > _FAR_SIZE))
+    return np.asarray(np.column_stack([places, diameters])[keep])
+
+
+def rock_mesh(rng: np.random.Generator, rocks: Array, terrain: Terrain) -> Mesh:
+    """Return the surfaces of rocks that lie on the ground.
+
+    Parameters
+    ----------
+    rng : numpy.random.Generator
+        Source of chance.
+    rocks : (n, 3)
+        Place, x and y, and diameter of each rock [m].
+    terrain : Terrain
+        The ground.
+
+    Returns
+    -------
+    Mesh
+        All rocks together.
+    """
+    levels = np.digitize(rocks[:, 2], [0.10, 0.20])  # small ones need few triangles
+    balls = [_ball(level) for level in range(3)]
+    meshes = []
+    for (x, y, diameter), level in zip(rocks, levels, strict=True):
+        directions, triangles = balls[level]
+        shape = _shape(rng, directions) * diameter / 2
+        centre = np.array([x, y, 0.0])
+        centre[2] = terrain.height_at(centre) + _BURIED * shape[:, 2].max()
+        meshes.append(Mesh.even(shape + centre, triangles, rng.uniform(*_REFLECTIVITY)))
+    return Mesh.merged(meshes)
+
+
+def _shape(rng: np.random.Generator, directions: Array) -> Array:
+    """Return the surface of a rock of about unit radius in the given directions, (n, 3)."""
+    is_round = rng.random() < _ROUND_SHARE
+    axes = rng.uniform(0.92, 1.0, 3) if is_round else rng.uniform(0.6, 1.0, 3)
+    normals = rng.standard_normal((_N_FACETS, 3))
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    depths = rng.uniform(0.97 if is_round else 0.65, 1.0, _N_FACETS)
+    facing = np.maximum(directions @ normals.T, 1e-9)
+    radii = np.minimum((depths / facing).min(axis=1), 1.0)  # a ball cut by planes stays convex
+    heading = rng.uniform(0, 2 * np.pi)
+    c, s = np.cos(heading), np.sin(heading)
+    return np.asarray(
+        (directions * radii[:, None] * axes) @ np.array([[c, s, 0], [-s, c, 0], [0, 0, 1]])
+    )
+
+
+def _ball(level: int) -> tuple[Array, Index]:
+    """Return unit directions and triangles of an icosahedron, each face split ``level`` times."""
+    g = (1 + 5**0.5) / 2
+    corners: list[tuple[float, float, float]]
+    corners = [(-1, g, 0), (1, g, 0), (-1, -g, 0), (1, -g, 0), (0, -1, g), (0, 1, g)]
+    corners += [(0, -1, -g), (0, 1, -g), (g, 0, -1), (g, 0, 1), (-g, 0, -1), (-g, 0, 1)]
+    faces = "0b5 051 017 07a 0ab 159 5b4 ba2 a76 718 394 342 326 368 389 495 24b 62a 867 981"
+    vertices = np.array(corners, dtype=np.float64)
+    triangles = np.array([[int(c, 16) for c in face] for face in faces.split()], dtype=np.intp)
+    for _ in range(level):
+        vertices /= np.linalg.norm(vertices, axis=1, keepdims=True)
+        a, b, c = (vertices[triangles[:, i]] for i in range(3))
+        n = len(triangles)
+        ia, ib, ic, ab, bc, ca = (np.arange(n) + i * n for i in range(6))
+        split = [(ia, ab, ca), (ib, bc, ab), (ic, ca, bc), (ab, bc, ca)]
+        vertices = np.concatenate([a, b, c, a + b, b + c, c + a])
+        triangles = np.concatenate([np.column_stack(t) for t in split])
+    return vertices / np.linalg.norm(vertices, axis=1, keepdims=True), triangles

@@ -1,0 +1,182 @@
+"""The VLP-16, shot by shot: when each laser fires, and what is recorded of its echo."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Self
+
+import numpy as np
+
+from pipelines.rigs import FIRING_CYCLE, FIRING_ORDER, LASER_CYCLE, N_LASERS
+from pipelines.simulation.echo import Echoes
+from pipelines.simulation.options import SimulationConfig
+from pipelines.simulation.rig import Motion, quantised
+from pipelines.values import Array, Column, Nanos, Rig, Rings, _seal
+
+_RANGE_LIMITS = (0.9, 100.0)  # [m] the VLP-16's own
+_NOISE_LIMITS = (5.0, 15.0, 40.0, 100.0)  # calibrated reflectivity, 0-255
+_NOISE = np.array(
+    [0.0137, 0.0107, 0.0089, 0.0067, 0.0064]
+)  # [m] seen in real packets, between them
+_HALF_SEEN = 0.10 / 50.0**2  # [1/m^2] reflectivity over squared range that answers half the time
+_SOFTNESS = 0.15  # of that limit, in the logarithm of the energy
+_INTENSITY_NOISE = (1.0, 0.05)  # counts, and share of the value
+_NS_CYCLE, _NS_LASER = round(FIRING_CYCLE * 1e9), round(LASER_CYCLE * 1e9)
+
+
+@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
+class Shots:
+    """Some whole firings of all lasers, in the order of firing.
+
+    Attributes
+    ----------
+    offsets_ns : (n,)
+        Instant of each shot since the first one of the stop.
+    rings : (n,) uint8
+        Laser of each shot, 0 the lowest.
+    azimuths : (n,)
+        True azimuth of the spinning head, unwrapped, clockwise from x seen from +z [rad].
+    gimbal_angles : (n,)
+        True angle of the gimbal [rad].
+    """
+
+    offsets_ns: Nanos
+    rings: Rings
+    azimuths: Array
+    gimbal_angles: Array
+
+    def __post_init__(self) -> None:
+        n = len(self.offsets_ns)
+        _seal(self, offsets_ns=(n,), rings=(n,), azimuths=(n,), gimbal_angles=(n,))
+
+
+@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
+class Recorded:
+    """What a driver makes of some shots: those without a return are gone.
+
+    Attributes
+    ----------
+    p_lidar : (n, 3) float32
+        Points, heights of the lasers included [m].
+    intensities : (n,) float32
+        Calibrated reflectivity, 0-255.
+    rings : (n,) uint8
+        Laser of each return.
+    offsets_ns : (n,)
+        Instant of each shot since the first one of the stop.
+    """
+
+    p_lidar: Column
+    intensities: Column
+    rings: Rings
+    offsets_ns: Nanos
+
+    def __post_init__(self) -> None:
+        n = len(self.rings)
+        _seal(self, p_lidar=(n, 3), intensities=(n,), rings=(n,), offsets_ns=(n,))
+
+    @classmethod
+    def joined(cls, pieces: Sequence[Self]) -> Self:
+        """Return several pieces of one recording as one."""
+        return cls(
+            p_lidar=np.concatenate([piece.p_lidar for piece in pieces]),
+            intensities=np.concatenate([piece.intensities for piece in pieces]),
+            rings=np.concatenate([piece.rings for piece in pieces]),
+            offsets_ns=np.concatenate([piece.offsets_ns for piece in pieces]),
+        )
+
+
+def n_firings(config: SimulationConfig) -> int:
+    """Return how often all lasers fire during one turn."""
+    return int(config.turn / FIRING_CYCLE)
+
+
+def fire(first: int, n: int, start_azimuth: float, motion: Motion, spin_rpm: float) -> Shots:
+    """Return some firings of all lasers.
+
+    Parameters
+    ----------
+    first, n : int
+        Place of the first firing within the stop, and number of firings.
+    start_azimuth : float
+        Azimuth at the first shot of the stop [rad].
+    motion : Motion
+        How the gimbal turns meanwhile.
+    spin_rpm : float
+        Revolutions of the LiDAR per minute.
+
+    Returns
+    -------
+    Shots
+        ``16 n`` shots.
+    """
+    firings = np.arange(first, first + n, dtype=np.int64)
+    offsets_ns = (firings[:, None] * _NS_CYCLE + np.arange(N_LASERS) * _NS_LASER).ravel()
+    times = np.asarray(offsets_ns * 1e-9, dtype=np.float64)
+    return Shots(
+        offsets_ns=offsets_ns,
+        rings=np.tile(FIRING_ORDER.astype(np.uint8), n),
+        azimuths=start_azimuth + 2 * np.pi * spin_rpm / 60.0 * times,
+        gimbal_angles=motion.angle_at(times),
+    )
+
+
+def record(
+    shots: Shots, echoes: Echoes, rig: Rig, config: SimulationConfig, rng: np.random.Generator
+) -> Recorded:
+    """Return what is recorded of some shots.
+
+    Parameters
+    ----------
+    shots : Shots
+        The shots.
+    echoes : Echoes
+        What came back from each.
+    rig : Rig
+        The true rig; of it the recording has the range biases, and the maker's laser table.
+    config : SimulationConfig
+        Noise, drop-outs and quantisation.
+    rng : numpy.random.Generator
+        Source of chance.
+
+    Returns
+    -------
+    Recorded
+        In the order of firing.
+    """
+    seen = np.flatnonzero(_is_seen(echoes, config.drop_out, rng))
+    rings, shades = shots.rings[seen], 100.0 * echoes.reflectivities[seen]
+    sigma = range_noise(shades) if config.sigma_range is None else config.sigma_range
+    ranges = echoes.ranges[seen] + rig.laser_range_biases[rings]
+    ranges = quantised(ranges + sigma * rng.standard_normal(len(seen)), config.range_step)
+    azimuths = quantised(shots.azimuths[seen] % (2 * np.pi), config.azimuth_step)
+    floor, share = _INTENSITY_NOISE
+    counts = shades + (floor + share * shades) * rng.standard_normal(len(seen))
+    return Recorded(
+        p_lidar=_points(ranges, azimuths, rig.laser_elevations[rings], rig.laser_heights[rings]),
+        intensities=np.clip(np.round(counts), 0.0, 255.0).astype(np.float32),
+        rings=rings,
+        offsets_ns=shots.offsets_ns[seen],
+    )
+
+
+def range_noise(reflectivities: Array) -> Array:
+    """Return the range noise of a VLP-16 for calibrated reflectivities of 0-255 [m]."""
+    return np.asarray(_NOISE[np.digitize(reflectivities, _NOISE_LIMITS)])
+
+
+def _is_seen(echoes: Echoes, drop_out: float, rng: np.random.Generator) -> np.ndarray:
+    """Return which echoes are strong enough and near enough, and not lost by chance."""
+    is_seen = (echoes.ranges >= _RANGE_LIMITS[0]) & (echoes.ranges <= _RANGE_LIMITS[1])
+    strength = echoes.reflectivities[is_seen] / echoes.ranges[is_seen] ** 2 / _HALF_SEEN
+    chance = (1.0 - drop_out) / (1.0 + np.maximum(strength, 1e-12) ** (-1.0 / _SOFTNESS))
+    is_seen[is_seen] = rng.random(len(chance)) < chance
+    return is_seen
+
+
+def _points(ranges: Array, azimuths: Array, elevations: Array, heights: Array) -> Column:
+    """Return recorded polar measurements as points, (n, 3) (VLP-16 manual, section 9)."""
+    reach = ranges * np.cos(elevations)
+    x, y = reach * np.cos(azimuths), -reach * np.sin(azimuths)
+    return np.column_stack([x, y, ranges * np.sin(elevations) + heights]).astype(np.float32)
