@@ -74,27 +74,30 @@ class ExtractionConfig:
     Attributes
     ----------
     ground_cell : float
-        Edge of a cell of the ground grid [m].
+        Edge of a cell of the ground grid [m]. 0.25: wider than a ball, so that a cell of the open
+        field holds ground.
     ground_clearance : float
-        Points less than this above the local ground belong to it [m].
-    cluster_gap : float
-        Points closer than this belong together [m].
+        Returns less than this above the local ground start no marker [m]. 0.20: most rocks are
+        lower, and the balls of a survey stand higher.
+    scatter_max : float
+        Along-beam scatter about a sphere above this is no noise [m]. 0.035: the maker's 0.03 and
+        its uncertainty.
     n_points_min : int
-        A group with fewer returns is not looked at.
+        A group with fewer returns is not looked at. 6: twice the unknowns of a centre.
     range_max : float
-        Markers are not looked for beyond this distance [m].
+        Markers are not looked for beyond this distance [m]. 35: fewer than six returns there.
     """
 
     ground_cell: float = 0.25
     ground_clearance: float = 0.20
-    cluster_gap: float = 0.15
+    scatter_max: float = 0.035
     n_points_min: int = 6
     range_max: float = 35.0
 
     def __post_init__(self) -> None:
         _check("extraction.ground_cell", self.ground_cell, 0.05, 2.0)
         _check("extraction.ground_clearance", self.ground_clearance, 0.02, 2.0)
-        _check("extraction.cluster_gap", self.cluster_gap, 0.02, 1.0)
+        _check("extraction.scatter_max", self.scatter_max, 0.001, 0.1)
         _check("extraction.n_points_min", self.n_points_min, 4, 1000)
         _check("extraction.range_max", self.range_max, 1.0, 100.0)
 

@@ -1,0 +1,778 @@
+"""Markers among ground, rocks, poles and people: which returns of a stop may be a sphere on a pole.
+
+Works in the base frame with the levelled vertical. The sensor is taken as one point (the origin of
+the base): a few centimetres of axis offset do not change which returns look like a sphere.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numba
+import numpy as np
+from numpy.typing import NDArray
+
+from pipelines.config import ExtractionConfig
+from pipelines.geometry import levelling_rotation
+from pipelines.values import (
+    Array,
+    Column,
+    Index,
+    MarkerCandidate,
+    MarkerCandidates,
+    Mask,
+    Rejection,
+    StitchedCloud,
+)
+
+_STUDY_FIELD = 10.0  # [m] from the station: where the study looks for its highest ground point
+_GROUND_WINDOW = 4  # cells each way of the opening: rocks up to twice this are not ground
+_GROUND_STEP = 0.10  # [m] that a cell's lowest point may lie above the opened surface
+_GROUND_CELLS_MIN = 9  # a marker seen alone covers at most 6 cells: that is not yet ground
+_GROUND_NOISE = 0.05  # [m] that a ground return may lie above its cell's lowest
+_REJECTIONS_MAX = 200  # the most sphere-like groups that are kept with their reason
+_TOUCHING = 0.10  # share of a ball's returns that may lie as far away beside it: mixed pixels
+_STRANGE = 0.3  # share of the returns inside the outline that may be off the ball
+_SIGMAS = 3.5  # standard deviations at which a shape is refused
+_RADIUS_SLACK = 0.12  # of the radius: less is no reason to refuse, the fit judges it
+_N_SHAPELY = 12  # returns that show the width of what they lie on
+_REACH = 4.5  # radii about a seed whose returns decide whether a ball stands free there
+
+
+def extract(
+    cloud: StitchedCloud, config: ExtractionConfig, marker_radius: float
+) -> MarkerCandidates:
+    """Find the groups of returns that may be spherical markers.
+
+    Parameters
+    ----------
+    cloud : StitchedCloud
+        One stop; rings and times are not needed.
+    config : ExtractionConfig
+        Ground grid, limits of the tests.
+    marker_radius : float
+        Radius of the spheres [m].
+
+    Returns
+    -------
+    MarkerCandidates
+        Candidates in the order of azimuth; of the groups that passed the first gate of size and
+        were then refused, the (at most 200) largest, with the reason; and the height of the highest
+        ground point within 10 m, where the study cuts its clouds.
+
+    Notes
+    -----
+    A marker is a ball of known radius that stands free on a pole, so each place where something
+    ends upward and to a side is tried: mean shift of a disc of the ball's size, then a robust fit
+    along the beams, then the tests, which have their sentences in ``_verdict``. Ground is the
+    opening of the lowest point per cell. Where no ground was seen it is unknown, and nothing is
+    cut. Cost grows linearly with the returns.
+    """
+    up = levelling_rotation(cloud.levelling)[2].copy()
+    ball = _Ball(marker_radius, up, float(cloud.rig.divergence.max()))
+    grid = _grid(cloud, config)
+    seeds = _seeds(cloud.p_base, grid.is_above, ball, config.n_points_min)
+    patches = _patches(grid, seeds, marker_radius)
+    table = _look_at_all(cloud.p_base, patches, seeds, _cells_of(seeds, grid), ball)
+    looks = _distinct([_Look(*row) for row in table.tolist()], config, marker_radius)
+    verdicts = [_verdict(look, config, marker_radius) for look in looks]
+    good = [look for look, reason in zip(looks, verdicts, strict=True) if not reason]
+    bad = [(look, reason) for look, reason in zip(looks, verdicts, strict=True) if reason]
+    return MarkerCandidates(
+        candidates=tuple(
+            MarkerCandidate(
+                members=_members(cloud, grid, patches, look.p_base, ball),
+                p_base_rough=look.p_base,
+                score=_score(look, config, marker_radius),
+            )
+            for look in sorted(good, key=lambda look: np.arctan2(look.y, look.x))
+        ),
+        rejected=tuple(
+            Rejection(p_base=look.p_base, n_points=int(look.n_points), reason=reason)
+            for look, reason in bad[:_REJECTIONS_MAX]
+        ),
+        ground_height_max=grid.ground_height_max,
+    )
+
+
+class _Ball(NamedTuple):
+    """What is looked for: radius [m], upward unit vector, full width of the beams [rad]."""
+
+    radius: float
+    up: Array
+    divergence: float
+
+
+class _Grid(NamedTuple):
+    """Each return's cell and height, and which returns rise above the ground.
+
+    Attributes
+    ----------
+    cells : (n,) int32
+        Cell of each return, -1 beyond the range looked at.
+    n_side : int
+        Cells along one side.
+    edge : float
+        Edge of a cell [m].
+    R_station_base : (3, 3)
+        Levelling.
+    is_above : (n,) bool
+        Returns that are not known to be ground.
+    ground_height_max : float
+        Highest ground return within 10 m, levelled [m].
+    """
+
+    cells: NDArray[np.int32]
+    n_side: int
+    edge: float
+    R_station_base: Array
+    is_above: Mask
+    ground_height_max: float
+
+
+def _grid(cloud: StitchedCloud, config: ExtractionConfig) -> _Grid:
+    """Sort returns into cells and tell the ground."""
+    n_side = 2 * int(np.ceil(config.range_max / config.ground_cell))
+    R = levelling_rotation(cloud.levelling)
+    cells, heights, lowest = _lowest_per_cell(
+        cloud.p_base, R, config.ground_cell, n_side, config.range_max
+    )
+    ground = _ground(lowest, _opened(lowest, _GROUND_WINDOW), _GROUND_WINDOW)
+    is_above, highest = _above(
+        cloud.p_base, cells, heights, ground.ravel(), config.ground_clearance
+    )
+    return _Grid(cells, n_side, config.ground_cell, R, is_above, float(highest))
+
+
+@numba.njit(cache=True, nogil=True)
+def _lowest_per_cell(
+    p_base: Column, R: Array, edge: float, n_side: int, range_max: float
+) -> tuple[NDArray[np.int32], Column, Column]:
+    """Return each point's cell (-1: too far) and levelled height, and the lowest point per cell."""
+    n = len(p_base)
+    cells = np.empty(n, np.int32)
+    heights = np.empty(n, np.float32)
+    lowest = np.full((n_side, n_side), np.inf, np.float32)
+    half = n_side // 2
+    for i in range(n):
+        x, y, z = p_base[i, 0], p_base[i, 1], p_base[i, 2]
+        x_level = R[0, 0] * x + R[0, 1] * y + R[0, 2] * z
+        y_level = R[1, 0] * x + R[1, 1] * y + R[1, 2] * z
+        height = np.float32(R[2, 0] * x + R[2, 1] * y + R[2, 2] * z)
+        heights[i] = height
+        if not x_level * x_level + y_level * y_level < range_max * range_max:
+            cells[i] = -1
+            continue
+        row = min(max(int(np.floor(x_level / edge)) + half, 0), n_side - 1)
+        column = min(max(int(np.floor(y_level / edge)) + half, 0), n_side - 1)
+        cells[i] = row * n_side + column
+        lowest[row, column] = min(lowest[row, column], height)
+    return cells, heights, lowest
+
+
+@numba.njit(cache=True, nogil=True)
+def _slide(values: Column, window: int, sign: float) -> Column:
+    """Return the least of ``sign * values`` in a square window; infinite cells do not count."""
+    n_rows, n_columns = values.shape
+    along = np.full(values.shape, np.inf, np.float32)
+    out = np.full(values.shape, np.inf, np.float32)
+    for i in range(n_rows):
+        for j in range(n_columns):
+            for k in range(max(j - window, 0), min(j + window + 1, n_columns)):
+                if np.isfinite(values[i, k]):
+                    along[i, j] = min(along[i, j], sign * values[i, k])
+    for i in range(n_rows):
+        for k in range(max(i - window, 0), min(i + window + 1, n_rows)):
+            for j in range(n_columns):
+                out[i, j] = min(out[i, j], along[k, j])
+    return out
+
+
+def _opened(lowest: Column, window: int) -> Column:
+    """Return the morphological opening of the lowest points; infinite where nothing is near."""
+    eroded = _slide(lowest, window, 1.0)
+    return -_slide(eroded, window, -1.0)
+
+
+@numba.njit(cache=True, nogil=True)
+def _ground(lowest: Column, opened: Column, window: int) -> Column:
+    """Return the ground's height per cell; infinite where no ground was seen in or beside it.
+
+    A cell has ground where its lowest point lies near the opened surface and enough others around
+    do too: a marker behind a rock has no ground around it, and must not become ground itself.
+    """
+    n_rows, n_columns = lowest.shape
+    is_low = lowest < opened + np.float32(_GROUND_STEP)
+    out = np.full(lowest.shape, np.inf, np.float32)
+    for i in range(n_rows):
+        for j in range(n_columns):
+            highest = -np.inf
+            for k in range(max(i - 1, 0), min(i + 2, n_rows)):
+                for m in range(max(j - 1, 0), min(j + 2, n_columns)):
+                    if is_low[k, m]:
+                        highest = max(highest, lowest[k, m])
+            if highest == -np.inf:
+                continue
+            n_low = 0
+            for k in range(max(i - window, 0), min(i + window + 1, n_rows)):
+                for m in range(max(j - window, 0), min(j + window + 1, n_columns)):
+                    n_low += is_low[k, m]
+            if n_low >= _GROUND_CELLS_MIN:
+                out[i, j] = highest
+    return out
+
+
+@numba.njit(cache=True, nogil=True)
+def _above(
+    p_base: Column,
+    cells: NDArray[np.int32],
+    heights: Column,
+    ground: Column,
+    clearance: float,
+) -> tuple[Mask, float]:
+    """Return which points are not known to be ground, and the highest ground point near by."""
+    is_above = np.zeros(len(cells), np.bool_)
+    highest = -np.inf
+    for i in range(len(cells)):
+        if cells[i] < 0:
+            continue
+        over = heights[i] - ground[cells[i]]
+        is_above[i] = over > clearance or ground[cells[i]] == np.inf
+        is_field = p_base[i, 0] ** 2 + p_base[i, 1] ** 2 < _STUDY_FIELD**2
+        if is_field and -np.inf < over < _GROUND_NOISE and heights[i] > highest:
+            highest = heights[i]
+    return is_above, highest
+
+
+@numba.njit(cache=True, nogil=True)
+def _slot(keys: NDArray[np.int64], key: int) -> int:
+    """Return the place of a key in an open hash table, or the free place where it belongs."""
+    mask = len(keys) - 1
+    place = ((key * 0x9E3779B97F4A7C1) >> 17) & mask
+    while keys[place] != -1 and keys[place] != key:
+        place = (place + 1) & mask
+    return place
+
+
+@numba.njit(cache=True, nogil=True)
+def _voxel(x: float, y: float, z: float, edge: float) -> int:
+    """Return the key of the voxel that holds a point within some kilometres."""
+    i, j, k = np.floor(x / edge), np.floor(y / edge), np.floor(z / edge)
+    return ((int(i) + 500_000) * 1_000_000 + int(j) + 500_000) * 1_000_000 + int(k) + 500_000
+
+
+@numba.njit(cache=True, nogil=True)
+def _voxels(p_base: Column, is_above: Mask, edge: float) -> tuple[NDArray[np.int64], Column]:
+    """Return the occupied voxels as an open hash table: keys, and sums of x, y, z with count."""
+    size = 64
+    while size < 2 * np.sum(is_above):
+        size *= 2
+    keys = np.full(size, -1, np.int64)
+    sums = np.zeros((size, 4), np.float32)
+    for i in range(len(p_base)):
+        if is_above[i]:
+            place = _slot(keys, _voxel(p_base[i, 0], p_base[i, 1], p_base[i, 2], edge))
+            keys[place] = _voxel(p_base[i, 0], p_base[i, 1], p_base[i, 2], edge)
+            sums[place, 0] += p_base[i, 0]
+            sums[place, 1] += p_base[i, 1]
+            sums[place, 2] += p_base[i, 2]
+            sums[place, 3] += 1.0
+    return keys, sums
+
+
+@numba.njit(cache=True, nogil=True)
+def _is_free(keys: NDArray[np.int64], p: Array, v_step: Array, v_beam: Array, edge: float) -> bool:
+    """Tell whether nothing lies one step away, at the same depth give or take a voxel."""
+    for depth in (-edge, 0.0, edge):
+        q = p + v_step + depth * v_beam
+        if keys[_slot(keys, _voxel(q[0], q[1], q[2], edge))] != -1:
+            return False
+    return True
+
+
+@numba.njit(cache=True, nogil=True)
+def _around(keys: NDArray[np.int64], sums: Column, p: Array, edge: float) -> Array:
+    """Return sums of x, y, z and count over the 27 voxels about a point."""
+    total = np.zeros(4)
+    for i in range(-1, 2):
+        for j in range(-1, 2):
+            for k in range(-1, 2):
+                key = _voxel(p[0] + i * edge, p[1] + j * edge, p[2] + k * edge, edge)
+                place = _slot(keys, key)
+                if keys[place] != -1:
+                    for axis in range(4):
+                        total[axis] += sums[place, axis]
+    return total
+
+
+@numba.njit(cache=True, nogil=True)
+def _free_ends(
+    keys: NDArray[np.int64], sums: Column, up: Array, radius: float, n_points_min: int
+) -> Array:
+    """Return centres and counts, (k, 4), of what ends upward and to at least one side."""
+    out = np.empty((len(keys), 4))
+    n_out = 0
+    for place in range(len(keys)):
+        if keys[place] == -1:
+            continue
+        p = sums[place, :3].astype(np.float64) / sums[place, 3]
+        v_beam = p / np.linalg.norm(p)
+        v_side = np.cross(up, v_beam)
+        v_side /= np.linalg.norm(v_side) + 1e-12
+        if not _is_free(keys, p, 3.0 * radius * up, v_beam, radius):
+            continue
+        if not (
+            _is_free(keys, p, 3.0 * radius * v_side, v_beam, radius)
+            or _is_free(keys, p, -3.0 * radius * v_side, v_beam, radius)
+        ):
+            continue
+        total = _around(keys, sums, p, radius)
+        if total[3] >= n_points_min:
+            # the points of a cap lie 2/3 R before the centre on average
+            out[n_out, :3] = total[:3] / total[3] + (2.0 / 3.0) * radius * v_beam
+            out[n_out, 3] = total[3]
+            n_out += 1
+    return out[:n_out]
+
+
+@numba.njit(cache=True, nogil=True)
+def _thinned(seeds: Array, gap: float) -> Array:
+    """Return the seeds, ordered by falling count, that have no stronger one within a gap."""
+    kept = np.empty_like(seeds)
+    n_kept = 0
+    for i in range(len(seeds)):
+        is_new = True
+        for j in range(n_kept):
+            dx, dy = seeds[i, 0] - kept[j, 0], seeds[i, 1] - kept[j, 1]
+            dz = seeds[i, 2] - kept[j, 2]
+            if dx * dx + dy * dy + dz * dz < gap * gap:
+                is_new = False
+                break
+        if is_new:
+            kept[n_kept] = seeds[i]
+            n_kept += 1
+    return kept[:n_kept]
+
+
+def _seeds(p_base: Column, is_above: Mask, ball: _Ball, n_points_min: int) -> Array:
+    """Return rough centres, (k, 3), at which a ball may be looked for."""
+    keys, sums = _voxels(p_base, is_above, ball.radius)
+    ends = _free_ends(keys, sums, ball.up, ball.radius, n_points_min)
+    ends = ends[np.lexsort((ends[:, 2], ends[:, 1], ends[:, 0], -ends[:, 3]))]
+    return np.ascontiguousarray(_thinned(ends, 0.5 * ball.radius)[:, :3])
+
+
+class _Look(NamedTuple):
+    """What a group looks like when it is taken for a ball of the known radius.
+
+    Attributes
+    ----------
+    x, y, z : float
+        Centre in the base frame [m].
+    n_points : float
+        Returns that the ball explains.
+    n_strange : float
+        Returns inside its outline, about as far away, that it does not explain.
+    n_beside : float
+        Returns beside and above its outline, about as far away.
+    n_below : float
+        Returns below and beside the pole, about as far away or somewhat nearer.
+    scatter : float
+        Robust standard deviation along the beams [m].
+    width, height : float
+        Extent of the explained returns across and along the vertical [m].
+    radius_free, sigma_radius : float
+        Radius when it is estimated too [m].
+    flat_across, sigma_across : float
+        How much of the ball's curvature across is missing: 0 a ball, 1 a plane.
+    flat_along, sigma_along : float
+        The same along the vertical: 0 a ball, 1 a post.
+    """
+
+    x: float
+    y: float
+    z: float
+    n_points: float
+    n_strange: float
+    n_beside: float
+    n_below: float
+    scatter: float
+    width: float
+    height: float
+    radius_free: float
+    sigma_radius: float
+    flat_across: float
+    sigma_across: float
+    flat_along: float
+    sigma_along: float
+
+    @property
+    def p_base(self) -> Array:
+        """Centre, (3,) [m]."""
+        return np.array([self.x, self.y, self.z])
+
+
+class _Patches(NamedTuple):
+    """Returns sorted by cell, for the cells about the seeds.
+
+    Attributes
+    ----------
+    starts : (n_side ** 2 + 1,)
+        The rows of a cell are ``rows[starts[cell]:starts[cell + 1]]``.
+    rows : (m,) int32
+        Rows of the cloud.
+    n_side : int
+        Cells along one side.
+    margin : int
+        Cells about a seed that may hold returns within reach.
+    reach : float
+        How far about a seed returns are looked at [m].
+    """
+
+    starts: NDArray[np.int64]
+    rows: NDArray[np.int32]
+    n_side: int
+    margin: int
+    reach: float
+
+
+@numba.njit(cache=True, nogil=True)
+def _by_cell(
+    cells: NDArray[np.int32], n_side: int, seed_cells: NDArray[np.int64], margin: int
+) -> tuple[NDArray[np.int64], NDArray[np.int32]]:
+    """Return starts and rows of the returns in and about the seeds' cells, by counting sort."""
+    is_wanted = np.zeros(n_side * n_side, np.bool_)
+    for cell in seed_cells:
+        row, column = cell // n_side, cell % n_side
+        for k in range(max(row - margin, 0), min(row + margin + 1, n_side)):
+            for m in range(max(column - margin, 0), min(column + margin + 1, n_side)):
+                is_wanted[k * n_side + m] = True
+    starts = np.zeros(n_side * n_side + 1, np.int64)
+    for cell in cells:
+        if cell >= 0 and is_wanted[cell]:
+            starts[cell + 1] += 1
+    starts = np.cumsum(starts)
+    ends = starts[:-1].copy()
+    rows = np.empty(starts[-1], np.int32)
+    for i in range(len(cells)):
+        cell = cells[i]
+        if cell >= 0 and is_wanted[cell]:
+            rows[ends[cell]] = i
+            ends[cell] += 1
+    return starts, rows
+
+
+@numba.njit(cache=True, nogil=True)
+def _near(p_base: Column, patches: _Patches, cell: int, c: Array) -> NDArray[np.int32]:
+    """Return the rows of the returns within reach of a point that lies in or by a cell."""
+    n_side, margin = patches.n_side, patches.margin
+    row, column = cell // n_side, cell % n_side
+    low, high = max(column - margin, 0), min(column + margin, n_side - 1)
+    out = np.empty(64, np.int32)
+    n_out = 0
+    for k in range(max(row - margin, 0), min(row + margin + 1, n_side)):
+        first, last = patches.starts[k * n_side + low], patches.starts[k * n_side + high + 1]
+        for i in patches.rows[first:last]:
+            dx, dy, dz = p_base[i, 0] - c[0], p_base[i, 1] - c[1], p_base[i, 2] - c[2]
+            if dx * dx + dy * dy + dz * dz < patches.reach * patches.reach:
+                if n_out == len(out):
+                    out = np.concatenate((out, np.empty(n_out, np.int32)))
+                out[n_out] = i
+                n_out += 1
+    return out[:n_out]
+
+
+@numba.njit(cache=True, nogil=True)
+def _view(points: Array, c: Array, up: Array) -> tuple[Array, Array, Array]:
+    """Return the points as seen toward a centre, and two unit vectors across the view.
+
+    The first array, (n, 3), holds for each beam where it passes the centre, across and up, and how
+    much farther than that the return lies [m].
+    """
+    v_beam = c / np.linalg.norm(c)
+    v_up = up - np.dot(up, v_beam) * v_beam
+    v_up /= np.linalg.norm(v_up) + 1e-12
+    v_across = np.cross(v_up, v_beam)
+    seen = np.empty((len(points), 3))
+    for i in range(len(points)):
+        x, y, z = points[i, 0], points[i, 1], points[i, 2]
+        observed2 = x * x + y * y + z * z
+        share = (c[0] * x + c[1] * y + c[2] * z) / observed2
+        dx, dy, dz = share * x - c[0], share * y - c[1], share * z - c[2]
+        seen[i, 0] = dx * v_across[0] + dy * v_across[1] + dz * v_across[2]
+        seen[i, 1] = dx * v_up[0] + dy * v_up[1] + dz * v_up[2]
+        seen[i, 2] = np.sqrt(observed2) * (1.0 - share)
+    return seen, v_across, v_up
+
+
+@numba.njit(cache=True, nogil=True)
+def _shifted(points: Array, c: Array, up: Array, radius: float) -> tuple[Array, int]:
+    """Return where a disc of the ball's size comes to rest, and how many returns it holds."""
+    n = 0
+    for _ in range(4):
+        seen, v_across, v_up = _view(points, c, up)
+        across, along, depth, n = 0.0, 0.0, 0.0, 0
+        for i in range(len(seen)):
+            is_inside = seen[i, 0] ** 2 + seen[i, 1] ** 2 < (1.15 * radius) ** 2
+            if is_inside and -2.0 * radius < seen[i, 2] < 0.8 * radius:
+                across, along, depth = across + seen[i, 0], along + seen[i, 1], depth + seen[i, 2]
+                n += 1
+        if n == 0:
+            break
+        v_beam = c / np.linalg.norm(c)
+        depth = depth / n + 2.0 / 3.0 * radius
+        c = c + (across / n) * v_across + (along / n) * v_up + depth * v_beam
+    return c, n
+
+
+@numba.njit(cache=True, nogil=True)
+def _surroundings(seen: Array, radius: float, blur: float) -> tuple[int, int]:
+    """Count the returns beside and below the outline that a free ball on a pole would not have."""
+    n_beside, n_below = 0, 0
+    inner = 1.2 * radius + blur
+    for i in range(len(seen)):
+        across, along, depth = seen[i, 0], seen[i, 1], seen[i, 2]
+        gap = np.sqrt(across * across + along * along)
+        is_pole = along < 0.0 and abs(across) < 0.6 * radius + blur
+        if gap < inner or is_pole:
+            continue
+        if along > -0.5 * radius:
+            n_beside += gap < 2.2 * radius + blur and abs(depth) < 1.5 * radius
+        else:
+            n_below += gap < 2.8 * radius + blur and -3.0 * radius < depth < 1.5 * radius
+    return n_beside, n_below
+
+
+@numba.njit(cache=True, nogil=True)
+def _shape(seen: Array, radius: float) -> tuple[Array, Array]:
+    """Return along-beam residuals and their derivatives by ball and shape.
+
+    Derivatives, (n, 6): centre across, up and along the beam, radius, and the missing shares of the
+    curvature across and along the vertical. A beam that misses is expected at the outline.
+    """
+    residuals = np.empty(len(seen))
+    J = np.zeros((len(seen), 6))
+    for i in range(len(seen)):
+        x, y, depth = seen[i, 0], seen[i, 1], seen[i, 2]
+        h2 = radius * radius - x * x - y * y
+        half = np.sqrt(max(h2, 0.0))
+        residuals[i] = depth + half
+        J[i, 2] = 1.0
+        if h2 <= 0.0:
+            continue
+        steep = max(half, 0.25 * radius)  # a beam's footprint keeps the outline from being a cliff
+        J[i, 0], J[i, 1], J[i, 3] = -x / steep, -y / steep, -radius / steep
+        J[i, 4] = half - np.sqrt(radius * radius - y * y)
+        J[i, 5] = half - np.sqrt(radius * radius - x * x)
+    return residuals, J
+
+
+@numba.njit(cache=True, nogil=True)
+def _solve(J: Array, residuals: Array, weights: Array, prior: Array) -> tuple[Array, Array]:
+    """Return the weighted least-squares step and the inverse of its normal matrix."""
+    k = J.shape[1]
+    N = np.diag(prior)
+    g = np.zeros(k)
+    for i in range(len(J)):
+        for a in range(k):
+            g[a] += weights[i] * J[i, a] * residuals[i]
+            for b in range(k):
+                N[a, b] += weights[i] * J[i, a] * J[i, b]
+    inverse = np.linalg.inv(N)
+    return inverse @ g, inverse
+
+
+@numba.njit(cache=True, nogil=True)
+def _weights(seen: Array, residuals: Array, radius: float, blur: float, scatter: float) -> Array:
+    """Return Tukey's weights of the returns that may belong to the ball."""
+    weights = np.zeros(len(seen))
+    limit = 4.7 * scatter
+    for i in range(len(seen)):
+        gap = np.sqrt(seen[i, 0] ** 2 + seen[i, 1] ** 2)
+        is_pole = seen[i, 1] < -0.9 * radius
+        if gap < radius + blur and not is_pole and abs(residuals[i]) < limit:
+            weights[i] = (1.0 - (residuals[i] / limit) ** 2) ** 2
+    return weights
+
+
+@numba.njit(cache=True, nogil=True)
+def _scatter(seen: Array, residuals: Array, radius: float) -> float:
+    """Return the robust standard deviation of the residuals inside the outline [m]."""
+    is_inside = (seen[:, 0] ** 2 + seen[:, 1] ** 2 < (0.9 * radius) ** 2) & (
+        np.abs(residuals) < 1.5 * radius
+    )
+    if np.sum(is_inside) < 3:
+        return np.inf
+    return 1.4826 * np.median(np.abs(residuals[is_inside]))
+
+
+@numba.njit(cache=True, nogil=True)
+def _settled(points: Array, c: Array, up: Array, radius: float, blur: float) -> tuple[Array, float]:
+    """Return the centre of the ball of known radius and the scatter about it [m]."""
+    scatter = 0.03
+    for _ in range(8):
+        seen, v_across, v_up = _view(points, c, up)
+        residuals, J = _shape(seen, radius)
+        scatter = min(max(_scatter(seen, residuals, radius), 0.004), 0.03)
+        weights = _weights(seen, residuals, radius, blur, scatter)
+        # the prior, 3 cm on a start good to that, keeps a handful of returns from running away
+        step, _ = _solve(J[:, :3], residuals, weights, np.full(3, (scatter / 0.03) ** 2))
+        step *= min(1.0, 0.5 * radius / (np.sqrt(np.sum(step**2)) + 1e-12))
+        c = c + step[0] * v_across + step[1] * v_up + step[2] * c / np.linalg.norm(c)
+    return c, scatter
+
+
+@numba.njit(cache=True, nogil=True)
+def _look(points: Array, c: Array, up: Array, radius: float, blur: float) -> Array:
+    """Return the fields of ``_Look`` for the ball near ``c``; too few points leave zeros."""
+    out = np.zeros(16)
+    c, n = _shifted(points, c, up, radius)
+    out[:3], out[3] = c, n
+    seen, _, _ = _view(points, c, up)
+    out[5], out[6] = _surroundings(seen, radius, blur)
+    if n < 4 or out[5] + out[6] > 2.0 + 0.6 * n:
+        return out
+    points = points[seen[:, 0] ** 2 + seen[:, 1] ** 2 < (3.0 * radius + blur) ** 2]
+    c, scatter = _settled(points, c, up, radius, blur)
+    seen, _, _ = _view(points, c, up)
+    residuals, J = _shape(seen, radius)
+    weights = _weights(seen, residuals, radius, blur, max(scatter, 0.006))
+    is_in = weights > 0.0
+    gaps = np.sqrt(seen[:, 0] ** 2 + seen[:, 1] ** 2)
+    is_strange = ~is_in & (gaps < 0.9 * radius) & (np.abs(seen[:, 2]) < 2.0 * radius)
+    out[:3], out[3], out[4] = c, np.sum(is_in), np.sum(is_strange & (seen[:, 1] > -0.8 * radius))
+    out[5], out[6] = _surroundings(seen, radius, blur)
+    if out[3] < 4:
+        return out
+    out[7] = np.sqrt(np.sum(weights * residuals**2) / np.sum(weights))
+    out[8] = np.max(seen[is_in, 0]) - np.min(seen[is_in, 0])
+    out[9] = np.max(seen[is_in, 1]) - np.min(seen[is_in, 1])
+    noise = max(out[7], 0.006)
+    prior = np.full(5, 1e-6)
+    step, inverse = _solve(J[:, :4], residuals, weights, prior[:4])
+    out[10], out[11] = radius + step[3], noise * np.sqrt(inverse[3, 3])
+    step, inverse = _solve(np.hstack((J[:, :3], J[:, 4:])), residuals, weights, prior)
+    out[12], out[13] = step[3], noise * np.sqrt(inverse[3, 3])
+    out[14], out[15] = step[4], noise * np.sqrt(inverse[4, 4])
+    return out
+
+
+@numba.njit(cache=True, nogil=True)
+def _look_at_all(
+    p_base: Column, patches: _Patches, seeds: Array, seed_cells: NDArray[np.int64], ball: _Ball
+) -> Array:
+    """Return one row of ``_Look`` for each seed."""
+    out = np.zeros((len(seeds), 16))
+    for k in range(len(seeds)):
+        rows = _near(p_base, patches, seed_cells[k], seeds[k])
+        points = p_base[rows].astype(np.float64)
+        blur = 0.5 * ball.divergence * np.sqrt(np.sum(seeds[k] ** 2))
+        out[k] = _look(points, seeds[k], ball.up, ball.radius, blur)
+    return out
+
+
+def _cells_of(p_base: Array, grid: _Grid) -> NDArray[np.int64]:
+    """Return the cells of some places, (k, 3)."""
+    places = np.floor((p_base @ grid.R_station_base.T)[:, :2] / grid.edge).astype(np.int64)
+    places = np.clip(places + grid.n_side // 2, 0, grid.n_side - 1)
+    return np.asarray(places[:, 0] * grid.n_side + places[:, 1])
+
+
+def _patches(grid: _Grid, seeds: Array, radius: float) -> _Patches:
+    """Return the returns about the seeds, by cell."""
+    reach = _REACH * radius
+    margin = int(np.ceil(reach / grid.edge)) + 1
+    starts, rows = _by_cell(grid.cells, grid.n_side, _cells_of(seeds, grid), margin)
+    return _Patches(starts, rows, grid.n_side, margin, reach)
+
+
+def _distinct(looks: list[_Look], config: ExtractionConfig, radius: float) -> list[_Look]:
+    """Return the groups that pass the first gate, each once, those with most returns first."""
+    kept: list[_Look] = []
+    worthy = [look for look in looks if _passes_first_gate(look, config, radius)]
+    for look in sorted(worthy, key=lambda look: (-look.n_points, look.x, look.y)):
+        gaps = (np.hypot(np.hypot(look.x - o.x, look.y - o.y), look.z - o.z) for o in kept)
+        if all(gap > 1.5 * radius for gap in gaps):
+            kept.append(look)
+    return kept
+
+
+def _passes_first_gate(look: _Look, config: ExtractionConfig, radius: float) -> bool:
+    """Tell whether a group is worth a verdict: enough returns, about as large as a ball."""
+    return (
+        look.n_points >= config.n_points_min
+        and look.scatter > 0.0
+        and max(look.width, look.height) > 0.8 * radius
+        and look.n_strange <= look.n_points
+    )
+
+
+def _verdict(look: _Look, config: ExtractionConfig, radius: float) -> str:
+    """Return why a group is not a free ball of the known radius; empty if it may be one."""
+    few = 1.0 + _TOUCHING * look.n_points
+    width_min = (0.9 if look.n_points >= _N_SHAPELY else 0.5) * radius
+    off = look.radius_free - radius
+    tests = (
+        (
+            look.n_beside > few,
+            f"It does not stand free: {look.n_beside:.0f} returns beside or above its outline lie "
+            f"as far away, where {look.n_points:.0f} lie on it.",
+        ),
+        (
+            look.n_below > few,
+            f"It does not stand on a pole: {look.n_below:.0f} returns below its outline and beside "
+            "a pole's place lie as far away, as under a rock or a head.",
+        ),
+        (
+            look.n_strange > _STRANGE * (look.n_points + look.n_strange),
+            f"It is not one surface: {look.n_strange:.0f} returns inside its outline are off the "
+            f"sphere that {look.n_points:.0f} lie on.",
+        ),
+        (
+            look.scatter > config.scatter_max,
+            f"Its returns scatter by {1e3 * look.scatter:.0f} mm about a sphere of the known "
+            f"radius; at most {1e3 * config.scatter_max:.0f} mm are taken for noise.",
+        ),
+        (
+            look.width < width_min,
+            f"It is {1e3 * look.width:.0f} mm wide, too slim for a sphere of diameter "
+            f"{2e3 * radius:.0f} mm: a pole.",
+        ),
+        (
+            abs(off) > max(_SIGMAS * look.sigma_radius, _RADIUS_SLACK * radius),
+            f"Its own radius is {1e3 * look.radius_free:.0f} mm (standard deviation "
+            f"{1e3 * look.sigma_radius:.0f} mm), not {1e3 * radius:.0f} mm.",
+        ),
+        (
+            look.flat_along > max(_SIGMAS * look.sigma_along, 0.5),
+            "It is not curved from top to bottom: a post or a panel.",
+        ),
+        (
+            look.flat_across > max(_SIGMAS * look.sigma_across, 0.5),
+            "It is not curved from side to side: a panel or a rail.",
+        ),
+    )
+    return next((reason for is_so, reason in tests if is_so), "")
+
+
+def _score(look: _Look, config: ExtractionConfig, radius: float) -> float:
+    """Return how easily the tests were passed: 1 with ease, 0 just so."""
+    used = (
+        look.n_beside / (1.0 + _TOUCHING * look.n_points),
+        look.n_below / (1.0 + _TOUCHING * look.n_points),
+        look.n_strange / (_STRANGE * (look.n_points + look.n_strange)),
+        look.scatter / config.scatter_max,
+        abs(look.radius_free - radius) / max(_SIGMAS * look.sigma_radius, _RADIUS_SLACK * radius),
+    )
+    return float(np.clip(1.0 - np.mean(np.square(used)), 0.0, 1.0))
+
+
+def _members(cloud: StitchedCloud, grid: _Grid, patches: _Patches, p: Array, ball: _Ball) -> Index:
+    """Return the rows on and about a ball, ascending: its outline, and what of its pole touches."""
+    cell = int(_cells_of(p[None], grid)[0])
+    rows = np.sort(_near(cloud.p_base, patches, cell, p)).astype(np.intp)
+    seen, _, _ = _view(cloud.p_base[rows].astype(np.float64), p, ball.up)
+    blur = 0.5 * ball.divergence * float(np.linalg.norm(p))
+    is_about = np.hypot(seen[:, 0], seen[:, 1]) < 1.5 * ball.radius + blur
+    is_level = (seen[:, 2] > -2.2 * ball.radius) & (seen[:, 2] < 1.6 * ball.radius)
+    return np.asarray(rows[is_about & is_level])
