@@ -12,7 +12,7 @@ from typing import Protocol
 import numpy as np
 
 from pipelines.values import Array, Column, Nanos, Rings
-from storage.recordings.container import Batch, Channel
+from storage.recordings.container import Batch
 
 
 class BrokenMessageError(ValueError):
@@ -82,22 +82,19 @@ class Series:
 class Decoder(Protocol):
     """Takes the messages of one channel, in the order of the file."""
 
-    def __init__(self, channel: Channel) -> None:
-        """Start without messages."""
-
     def add(self, batch: Batch) -> None:
         """Take some messages."""
 
 
 class LidarDecoder(Decoder, Protocol):
-    """Decoder of a LiDAR topic."""
+    """Decoder of a LiDAR topic; made from its channel and the size of the file [bytes]."""
 
     def returns(self) -> Returns:
         """Give all that the messages held."""
 
 
 class SeriesDecoder(Decoder, Protocol):
-    """Decoder of a topic with signals."""
+    """Decoder of a topic with signals; made from its channel."""
 
     def series(self) -> list[Series]:
         """Give the signals that the messages held."""

@@ -16,6 +16,7 @@ from pipelines.values import RING_UNKNOWN, Nanos
 from storage.recordings import cdr
 from storage.recordings.container import Batch, Channel, Octets
 from storage.recordings.families import BrokenMessageError, Returns, broken_note
+from storage.recordings.shot_times import SHOTS_MIN, shot_times
 
 SCHEMA = "sensor_msgs/msg/PointCloud2"
 DEFINITION = f"""# A collection of N-dimensional points, possibly organised as an image.
@@ -48,11 +49,7 @@ _KINDS = ("", "i1", "u1", "i2", "u2", "i4", "u4", "f4", "f8")  # by PointField.d
 _INTENSITIES = ("intensity", "i", "reflectivity", "signal")
 _RINGS = ("ring", "channel", "line", "laser_id", "laserid")
 _TIMES = ("time", "t", "timestamp", "time_stamp", "offset_time", "time_offset", "timeoffset")
-_REVOLUTION_LIMIT = 10.0  # [s] no message spans more; a larger time has another meaning
-_EPOCH = 1e6  # [s] a larger time is absolute
-_EPOCH_NS = 1e15  # the same in nanoseconds
-_SHOTS_MIN = 32  # points that a message needs before its times can be judged
-_ZEROS_MAX = 0.25  # share of zero times that a message with times may have
+_FIELD_MIN = 13  # [bytes] of a field with an empty name
 _BAD_MAX = 0.05  # share of messages whose times may be unusable before all are
 _FIRST_CAPACITY = 1 << 16  # points
 
@@ -70,17 +67,52 @@ class _Field:
         return self.offset + np.dtype(self.kind).itemsize
 
 
-@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
-class _Cloud:
-    """The head of one message, and where its points are."""
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _Layout:
+    """What a point looks like, and the bytes that said so."""
 
-    stamp_ns: int
-    frame: str
+    said: bytes
     fields: dict[str, _Field]
     order: str
-    n: int
     step: int
-    points: Octets
+
+    def named(self, names: tuple[str, ...]) -> _Field | None:
+        """Return the first field that has one of the names, in any case."""
+        lower = {name.lower(): one for name, one in self.fields.items()}
+        return next((lower[name] for name in names if name in lower), None)
+
+    def compiled(self) -> NDArray[np.int64] | None:
+        """Return what the compiled loop must know, or nothing if it cannot do this layout."""
+        x, y, z = (self.fields[axis] for axis in "xyz")
+        intensity, ring, time = (self.named(n) for n in (_INTENSITIES, _RINGS, _TIMES))
+        allowed = (
+            *((axis, ("f4",)) for axis in (x, y, z, intensity)),
+            (ring, ("u1", "u2")),
+            (time, ("f4", "u4")),
+        )
+        if self.order == ">" or any(one and one.kind not in kinds for one, kinds in allowed):
+            return None
+        wide = 2 if ring and ring.kind == "u2" else 1
+        optional = [one.offset if one else -1 for one in (intensity, ring, time)]
+        return np.array([self.step, x.offset, y.offset, z.offset, *optional, wide], np.int64)
+
+    def structured(self) -> np.dtype[np.void]:
+        """Return the type of a point under our own names for its fields."""
+        found = {
+            **{axis: self.fields[axis] for axis in "xyz"},
+            "intensity": self.named(_INTENSITIES),
+            "ring": self.named(_RINGS),
+            "time": self.named(_TIMES),
+        }
+        fields = {name: one for name, one in found.items() if one is not None}
+        return np.dtype(
+            {
+                "names": list(fields),
+                "formats": [self.order + one.kind for one in fields.values()],
+                "offsets": [one.offset for one in fields.values()],
+                "itemsize": self.step,
+            }
+        )
 
 
 @dataclass(slots=True)
@@ -97,16 +129,18 @@ class _Messages:
 class PointClouds:
     """Decoder of a topic of point clouds."""
 
-    def __init__(self, channel: Channel) -> None:
+    def __init__(self, channel: Channel, size: int) -> None:
         """Start without messages."""
         self._topic = channel.topic
+        self._size = size
         self._frame = ""
-        self._fields: dict[str, _Field] = {}
+        self._layout = _Layout(said=b"", fields={}, order="<", step=0)
+        self._compiled: NDArray[np.int64] | None = None
         self._n = 0
-        self._p = np.empty((_FIRST_CAPACITY, 3), np.float32)
-        self._intensities = np.empty(_FIRST_CAPACITY, np.float32)
-        self._rings = np.empty(_FIRST_CAPACITY, np.uint8)
-        self._stamps = np.empty(_FIRST_CAPACITY, np.int64)
+        self._p = np.empty((0, 3), np.float32)
+        self._intensities = np.empty(0, np.float32)
+        self._rings = np.empty(0, np.uint8)
+        self._stamps = np.empty(0, np.int64)
         self._messages = _Messages()
         self._has_bad_rings = False
         self._time_fault = ""
@@ -117,63 +151,81 @@ class PointClouds:
         """Take some messages."""
         for octets, log_time in batch:
             try:
-                self._add(_head(octets), log_time)
+                self._add(octets, log_time)
             except BrokenMessageError as error:
                 self._n_broken += 1
                 self._reason = self._reason or str(error)
 
-    def _add(self, cloud: _Cloud, log_time: int) -> None:
+    def _add(self, octets: Octets, log_time: int) -> None:
         """Append the returns of one message."""
-        self._reserve(cloud.n)
-        self._frame, self._fields = cloud.frame, cloud.fields
+        cursor = cdr.Cursor(octets)
+        stamp, frame = cursor.stamp_ns(), cursor.text().lstrip("/")
+        height, width = cursor.number("I"), cursor.number("I")
+        self._read_layout(cursor, octets)
+        points = _points(cursor, octets, (height, width), self._layout.step)
+        self._frame = frame
         start = self._n
-        times = self._unpack(cloud)
-        stamps, fault = _shot_times(times, cloud.stamp_ns)
-        self._stamps[start : self._n] = cloud.stamp_ns if stamps is None else stamps
+        times = self._unpack(points, height * width)
+        stamps, fault = shot_times(times, stamp)
+        self._stamps[start : self._n] = stamp if stamps is None else stamps
         self._time_fault = self._time_fault or fault
-        latest = 0 if stamps is None or not len(stamps) else int(stamps.max()) - cloud.stamp_ns
+        span = 0 if stamps is None or not len(stamps) else int(stamps.max()) - stamp
         kept = self._messages
         kept.starts.append(start)
-        kept.stamps_ns.append(cloud.stamp_ns)
+        kept.stamps_ns.append(stamp)
         kept.log_times_ns.append(log_time)
-        kept.spans_ns.append(latest)
-        is_telling = self._n - start >= _SHOTS_MIN or bool(latest)
+        kept.spans_ns.append(span)
+        is_telling = self._n - start >= SHOTS_MIN or span != 0
         kept.has_times.append(stamps is not None if is_telling else None)
+
+    def _read_layout(self, cursor: cdr.Cursor, octets: Octets) -> None:
+        """Read the description of a point, unless it is that of the message before."""
+        begin, said = cursor.at, self._layout.said
+        if said and octets[begin : begin + len(said)].tobytes() == said:
+            cursor.at = begin + len(said)
+            return
+        fields = dict(_field(cursor) for _ in range(cursor.count(_FIELD_MIN)))
+        order = ">" if cursor.number("B") else "<"
+        step = cursor.number("I")
+        said = octets[begin : cursor.at].tobytes()
+        self._layout = _Layout(said=said, fields=_checked(fields, step), order=order, step=step)
+        self._compiled = self._layout.compiled()
 
     def _reserve(self, n: int) -> None:
         """Make room; memory that is reserved but not written costs nothing."""
         if self._n + n <= len(self._p):
             return
-        capacity = max(4 * len(self._p), self._n + n)
+        likely = self._size // self._layout.step if not self._n else 2 * len(self._p)
+        capacity = max(likely, self._n + n)
         for name in ("_p", "_intensities", "_rings", "_stamps"):
             old = getattr(self, name)
             new = np.empty((capacity, *old.shape[1:]), old.dtype)
             new[: self._n] = old[: self._n]
             setattr(self, name, new)
 
-    def _unpack(self, cloud: _Cloud) -> NDArray[np.generic] | None:
+    def _unpack(self, points: Octets, n: int) -> NDArray[np.generic] | None:
         """Write the returns of a cloud behind the others; return their times as recorded."""
-        x = _common_layout(cloud)
-        if x is None:
-            return self._unpack_any(cloud)
-        times = np.empty(cloud.n, np.uint32)
-        end = self._n + cloud.n
+        self._reserve(n)
+        if self._compiled is None:
+            return self._unpack_any(points, n)
+        times = np.empty(n, np.uint32)
+        rows = slice(self._n, self._n + n)
         kept, is_bad = _unpack_kernel(
-            cloud.points,
-            np.array([cloud.n, cloud.step, *x], np.int64),
-            self._p[self._n : end].view(np.uint32),
-            self._intensities[self._n : end].view(np.uint32),
-            self._rings[self._n : end],
+            points,
+            self._compiled,
+            self._p[rows].view(np.uint32),
+            self._intensities[rows].view(np.uint32),
+            self._rings[rows],
             times,
         )
         self._n += kept
         self._has_bad_rings |= bool(is_bad)
-        time = _named(cloud.fields, _TIMES)
+        time = self._layout.named(_TIMES)
         return None if time is None else times[:kept].view(time.kind)
 
-    def _unpack_any(self, cloud: _Cloud) -> NDArray[np.generic] | None:
+    def _unpack_any(self, octets: Octets, n: int) -> NDArray[np.generic] | None:
         """Do the same for any layout."""
-        points = _structured(cloud)
+        points = np.frombuffer(octets[: n * self._layout.step], self._layout.structured())
         with np.errstate(over="ignore", invalid="ignore"):
             p = np.stack([points[axis] for axis in "xyz"], axis=1).astype(np.float32)
         keep = np.isfinite(p).all(axis=1) & p.any(axis=1)
@@ -183,9 +235,9 @@ class PointClouds:
         intensities = points["intensity"][keep] if "intensity" in names else np.float32(0)
         self._intensities[rows] = np.nan_to_num(intensities, posinf=0.0, neginf=0.0)
         rings = points["ring"][keep] if "ring" in names else np.array(RING_UNKNOWN)
-        outside = (rings < 0) | (rings >= RING_UNKNOWN)
-        self._has_bad_rings |= bool("ring" in names and outside.any())
-        self._rings[rows] = np.where(outside, RING_UNKNOWN, rings).astype(np.uint8)
+        is_ring = (rings >= 0) & (rings < RING_UNKNOWN)
+        self._has_bad_rings |= bool("ring" in names and not is_ring.all())
+        self._rings[rows] = np.where(is_ring, rings, RING_UNKNOWN).astype(np.uint8)
         self._n = rows.stop
         return points["time"][keep] if "time" in names else None
 
@@ -195,12 +247,12 @@ class PointClouds:
         notes = [*broken_note(self._topic, self._n_broken, self._reason)]
         messages_ns = self._message_stamps(notes)
         has_times = self._has_times(notes, messages_ns)
-        if _named(self._fields, _INTENSITIES) is None:
+        if self._layout.named(_INTENSITIES) is None:
             notes.append(f"The points of {self._topic} carry no intensity; it is taken as 0.")
         if self._has_bad_rings:
             self._rings[:n] = RING_UNKNOWN
             notes.append(f"{self._topic} has rings outside 0 to {RING_UNKNOWN - 1}; none is used.")
-        elif _named(self._fields, _RINGS) is None:
+        elif self._layout.named(_RINGS) is None:
             notes.append(f"The points of {self._topic} do not tell their laser (ring).")
         stamps = self._stamps[:n]
         is_ascending = bool((stamps[1:] >= stamps[:-1]).all())
@@ -240,39 +292,13 @@ class PointClouds:
         verdicts = verdicts or [False]
         if verdicts.count(False) <= _BAD_MAX * len(verdicts):
             return True
-        if _named(self._fields, _TIMES) is None:
-            fault = f"it has the fields {', '.join(self._fields) or 'none'}"
+        if self._layout.named(_TIMES) is None:
+            fault = f"it has the fields {', '.join(self._layout.fields) or 'none'}"
         else:
             fault = self._time_fault or "its messages are too small to tell"
         notes.append(f"The points of {self._topic} carry no time of their own: {fault}.")
         self._stamps[: self._n] = np.repeat(messages_ns, self._counts())
         return False
-
-
-def _head(octets: Octets) -> _Cloud:
-    """Read the head of a cloud and check it against the bytes that are there."""
-    cursor = cdr.Cursor(octets)
-    stamp, frame = cursor.stamp_ns(), cursor.text().lstrip("/")
-    height, width = cursor.number("I"), cursor.number("I")
-    fields = dict(_field(cursor) for _ in range(cursor.count(13)))
-    order = ">" if cursor.number("B") else "<"
-    step, row_step = cursor.number("I"), cursor.number("I")
-    size = cursor.count()
-    points = octets[cursor.at : cursor.at + size]
-    if width and height > 1 and row_step != width * step:
-        points = _without_padding(points, height, width * step, row_step)
-    n = width * height
-    if n * step > len(points):
-        raise BrokenMessageError(f"it declares {n:,} points of {step} bytes in {len(points):,}")
-    return _Cloud(
-        stamp_ns=stamp,
-        frame=frame,
-        fields=_checked(fields, step),
-        order=order,
-        n=n,
-        step=step,
-        points=points,
-    )
 
 
 def _field(cursor: cdr.Cursor) -> tuple[str, _Field]:
@@ -296,6 +322,20 @@ def _checked(fields: dict[str, _Field], step: int) -> dict[str, _Field]:
     return fields
 
 
+def _points(cursor: cdr.Cursor, octets: Octets, shape: tuple[int, int], step: int) -> Octets:
+    """Return the bytes of the points of a cloud of so many rows and columns, without padding."""
+    (height, width), row_step = shape, cursor.number("I")
+    size = cursor.count()
+    points = octets[cursor.at : cursor.at + size]
+    if width and height > 1 and row_step != width * step:
+        points = _without_padding(points, height, width * step, row_step)
+    if height * width * step > len(points):
+        raise BrokenMessageError(
+            f"it declares {height * width:,} points of {step} bytes in {len(points):,} bytes"
+        )
+    return points
+
+
 def _without_padding(points: Octets, height: int, used: int, row_step: int) -> Octets:
     """Drop the padding behind each row of an organised cloud."""
     if row_step < used or row_step * (height - 1) + used > len(points):
@@ -305,98 +345,14 @@ def _without_padding(points: Octets, height: int, used: int, row_step: int) -> O
     return np.ascontiguousarray(rows[:, :used]).ravel()
 
 
-def _named(fields: dict[str, _Field], names: tuple[str, ...]) -> _Field | None:
-    """Return the first field that has one of the names, in any case."""
-    lower = {name.lower(): one for name, one in fields.items()}
-    return next((lower[name] for name in names if name in lower), None)
-
-
-def _common_layout(cloud: _Cloud) -> list[int] | None:
-    """Return what the compiled loop must know of the fields, or nothing if it cannot do them."""
-    x, y, z = (cloud.fields[axis] for axis in "xyz")
-    intensity, ring, time = (_named(cloud.fields, n) for n in (_INTENSITIES, _RINGS, _TIMES))
-    allowed = ((x, "f4"), (y, "f4"), (z, "f4"), (intensity, "f4"), (ring, "u1u2"), (time, "f4u4"))
-    if cloud.order == ">" or any(one and one.kind not in kinds for one, kinds in allowed):
-        return None
-    wide = 2 if ring and ring.kind == "u2" else 1
-    optional = [one.offset if one else -1 for one in (intensity, ring, time)]
-    return [x.offset, y.offset, z.offset, *optional, wide]
-
-
-def _structured(cloud: _Cloud) -> NDArray[np.void]:
-    """View the points of a cloud under our own names for their fields."""
-    found = {
-        **{axis: cloud.fields[axis] for axis in "xyz"},
-        "intensity": _named(cloud.fields, _INTENSITIES),
-        "ring": _named(cloud.fields, _RINGS),
-        "time": _named(cloud.fields, _TIMES),
-    }
-    fields = {name: one for name, one in found.items() if one is not None}
-    kind = np.dtype(
-        {
-            "names": list(fields),
-            "formats": [cloud.order + one.kind for one in fields.values()],
-            "offsets": [one.offset for one in fields.values()],
-            "itemsize": cloud.step,
-        }
-    )
-    return np.frombuffer(cloud.points[: cloud.n * cloud.step], kind)
-
-
-def _shot_times(times: NDArray[np.generic] | None, stamp_ns: int) -> tuple[Nanos | None, str]:
-    """Return the instant of each return, or why its times are of no use.
-
-    Drivers write float32 seconds since the stamp (Velodyne), whole nanoseconds since it (Ouster,
-    Livox), or absolute float64 seconds (Hesai, RoboSense) or nanoseconds: told by type and size.
-    """
-    if times is None:
-        return None, ""
-    if not len(times):
-        return np.empty(0, np.int64), ""
-    low, high = float(times.min()), float(times.max())
-    if not np.isfinite((low, high)).all():
-        return None, "some of its times are not finite"
-    if low == high and len(times) >= _SHOTS_MIN:
-        return None, f"its times are all {low:g}"
-    if len(times) >= _SHOTS_MIN and np.count_nonzero(times) < (1 - _ZEROS_MAX) * len(times):
-        return None, f"{len(times) - np.count_nonzero(times):,} of {len(times):,} times are 0"
-    offsets = _offsets_ns(times, low, high, stamp_ns)
-    if offsets is None:
-        return None, f"its times run from {low:g} to {high:g}, which is neither s nor ns"
-    return offsets + stamp_ns, ""
-
-
-def _offsets_ns(times: NDArray[np.generic], low: float, high: float, stamp_ns: int) -> Nanos | None:
-    """Return nanoseconds since the stamp, or nothing if the times make no sense."""
-    is_whole = times.dtype.kind in "iu"
-    if low > (_EPOCH_NS if is_whole or low > _EPOCH_NS else _EPOCH):
-        absolute = _absolute_ns(times)
-        # A driver may stamp points by the sensor's clock and messages by the computer's.
-        far = stamp_ns and abs(int(absolute[0]) - stamp_ns) > _REVOLUTION_LIMIT * 1e9
-        return absolute - (int(absolute.min()) if far else stamp_ns)
-    scale = 1.0 if is_whole else 1e9
-    if max(abs(low), abs(high)) * scale > _REVOLUTION_LIMIT * 1e9:
-        return None
-    return np.rint(times.astype(np.float64) * scale).astype(np.int64)
-
-
-def _absolute_ns(times: NDArray[np.generic]) -> Nanos:
-    """Return absolute times, in seconds or nanoseconds, as nanoseconds."""
-    if times.dtype.kind in "iu" or float(times.min()) > _EPOCH_NS:
-        return times.astype(np.int64)
-    seconds = np.floor(times.astype(np.float64))
-    fractions = np.rint((times.astype(np.float64) - seconds) * 1e9)
-    return np.asarray(seconds.astype(np.int64) * 1_000_000_000 + fractions.astype(np.int64))
-
-
 @numba.njit(cache=True, nogil=True)
 def _word(octets, at):  # type: ignore[no-untyped-def]  # noqa: ANN001, ANN202
-    """Read four bytes, little endian, at any address."""
+    """Read four bytes, little endian, at any address; unsigned places let it be one load."""
     return (
         np.uint32(octets[at])
-        | np.uint32(octets[at + 1]) << np.uint32(8)
-        | np.uint32(octets[at + 2]) << np.uint32(16)
-        | np.uint32(octets[at + 3]) << np.uint32(24)
+        | np.uint32(octets[at + np.uint64(1)]) << np.uint32(8)
+        | np.uint32(octets[at + np.uint64(2)]) << np.uint32(16)
+        | np.uint32(octets[at + np.uint64(3)]) << np.uint32(24)
     )
 
 
@@ -406,26 +362,25 @@ def _unpack_kernel(octets, layout, p, intensities, rings, times):  # type: ignor
 
     Works on bits, so that one compiled version serves float32 and uint32 and any alignment.
     """
-    n, step, x, y, z, intensity, ring, time, wide = layout
+    step, x, y, z, intensity, ring, time, wide = layout
     exponent, magnitude = np.uint32(0x7F800000), np.uint32(0x7FFFFFFF)
-    kept = 0
-    is_bad = False
-    for i in range(n):
-        at = i * step
-        a, b, c = _word(octets, at + x), _word(octets, at + y), _word(octets, at + z)
-        if ((a | b | c) & magnitude) == 0:
-            continue
-        if (a & exponent) == exponent or (b & exponent) == exponent or (c & exponent) == exponent:
-            continue
+    to_x, to_y, to_z = np.uint64(x), np.uint64(y), np.uint64(z)
+    to_intensity, to_ring, to_time = np.uint64(intensity), np.uint64(ring), np.uint64(time)
+    at, kept, is_bad = np.uint64(0), np.uint64(0), False
+    for _ in range(len(times)):
+        a, b, c = _word(octets, at + to_x), _word(octets, at + to_y), _word(octets, at + to_z)
         p[kept, 0], p[kept, 1], p[kept, 2] = a, b, c
-        bits = np.uint32(0) if intensity < 0 else _word(octets, at + intensity)
+        bits = np.uint32(0) if intensity < 0 else _word(octets, at + to_intensity)
         intensities[kept] = np.uint32(0) if (bits & exponent) == exponent else bits
-        laser = 255 if ring < 0 else np.int64(octets[at + ring])
-        if ring >= 0 and wide == 2:
-            laser |= np.int64(octets[at + ring + 1]) << 8
+        laser = np.uint32(255) if ring < 0 else np.uint32(octets[at + to_ring])
+        if wide == 2:
+            laser |= np.uint32(octets[at + to_ring + np.uint64(1)]) << np.uint32(8)
         if ring >= 0 and laser > 254:
             is_bad = True
-        rings[kept] = laser & 255
-        times[kept] = np.uint32(0) if time < 0 else _word(octets, at + time)
-        kept += 1
+        rings[kept] = np.uint8(laser)
+        times[kept] = np.uint32(0) if time < 0 else _word(octets, at + to_time)
+        is_finite = (a & exponent) != exponent and (b & exponent) != exponent
+        is_finite = is_finite and (c & exponent) != exponent
+        kept += np.uint64(is_finite and ((a | b | c) & magnitude) != 0)
+        at += np.uint64(step)
     return kept, is_bad

@@ -21,7 +21,7 @@ from storage.recordings.frames import FrameTree, recorded_rig
 
 # By encoding and message type: the decoder, and the definition that it reads. A new family is a
 # module and a line here.
-_LIDARS: dict[tuple[str, str], tuple[Callable[[Channel], LidarDecoder], str]] = {
+_LIDARS: dict[tuple[str, str], tuple[Callable[[Channel, int], LidarDecoder], str]] = {
     ("cdr", pointclouds.SCHEMA): (pointclouds.PointClouds, pointclouds.DEFINITION),
 }
 _JOINTS: dict[tuple[str, str], tuple[Callable[[Channel], SeriesDecoder], str]] = {
@@ -42,8 +42,9 @@ _UPRIGHT = 0.1  # sine of half the tilt that a gimbal's transform may have off i
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class _Decoders:
-    """The decoders of one recording, by role and topic."""
+    """The decoders of one recording of some size [bytes], by role and topic."""
 
+    size: int
     lidars: dict[str, LidarDecoder] = field(default_factory=dict)
     joints: dict[str, SeriesDecoder] = field(default_factory=dict)
     frames: dict[str, SeriesDecoder] = field(default_factory=dict)
@@ -61,7 +62,7 @@ class _Decoders:
         """Make the decoder of a channel, or take that of its topic."""
         key = (channel.encoding, channel.schema)
         if key in _LIDARS and self._is_readable(channel, _LIDARS[key][1]):
-            return self.lidars.setdefault(channel.topic, _LIDARS[key][0](channel))
+            return self.lidars.setdefault(channel.topic, _LIDARS[key][0](channel, self.size))
         tables = ((_JOINTS, self.joints), (_FRAMES, self.frames), (_AHRS, self.ahrs))
         for table, mine in tables:
             if key in table and self._is_readable(channel, table[key][1]):
@@ -135,7 +136,7 @@ def read_log(
 
 def _decode(container: Container) -> _Decoders:
     """Walk the file and hand each batch to its decoder."""
-    decoders = _Decoders()
+    decoders = _Decoders(size=container.size)
     for batch in container.batches():
         decoder = decoders.of(batch.channel)
         if decoder is not None:
