@@ -1,0 +1,244 @@
+"""The JSON of ``spheremark process``: results as plain values, every number with its unit.
+
+A public interface: names, frames and signs as in CONVENTIONS.md; what is unknown is null.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from pipelines.accuracy import UNMATCHED, marker_errors, station_error
+from pipelines.config import SurveyConfig
+from pipelines.geometry import levelling_rotation, yaw_pitch_roll
+from pipelines.rigs import rig_digest, rig_to_mapping
+from pipelines.values import (
+    Array,
+    ControlMarks,
+    Levelling,
+    MarkerFit,
+    MarkerFits,
+    NoFix,
+    Origin,
+    Rig,
+    StationFix,
+    StopResult,
+    StopTruth,
+    Truth,
+)
+from storage.results import marker_name
+
+Frame = Literal["station", "base"]
+Plain = dict[str, Any]
+
+NO_CONTROL = "No control marks were given: there are centres, but no position."
+
+
+def survey_answer(
+    origin: Origin,
+    config: SurveyConfig,
+    stops: Sequence[StopResult],
+    *,
+    marks: ControlMarks | None,
+    frame: Frame,
+    truth: Truth | None = None,
+) -> Plain:
+    """Return all that one log gave; truth, if given, adds errors and changes nothing else."""
+    rig = stops[0].cloud.rig
+    poses = {stop.name: stop for stop in truth.stops} if truth else {}
+    return {
+        "log": {"name": origin.name, "sha256": origin.digest},
+        "rig": _rig(rig),
+        "config": config.to_mapping() | {"digest": config.digest},
+        "stops": [
+            stop_answer(stop, config, marks, frame, truth, poses.get(stop.name)) for stop in stops
+        ],
+    }
+
+
+def stop_answer(
+    stop: StopResult,
+    config: SurveyConfig,
+    marks: ControlMarks | None,
+    frame: Frame,
+    truth: Truth | None,
+    pose: StopTruth | None,
+) -> Plain:
+    """Return all that one stop gave."""
+    R_frame_base = _rotation_to(frame, stop.cloud.levelling)
+    stations = [_station(method, stop, fix, marks, pose) for (method, _), fix in stop.fixes.items()]
+    first = stations[0] if stations else {"reason": NO_CONTROL}
+    answer: Plain = {
+        "name": stop.name,
+        "frame": frame,
+        "markers": [
+            marker
+            for fits in stop.fits.values()
+            for marker in _markers(fits, R_frame_base, truth, pose)
+        ],
+        "rejected": _rejected(stop, R_frame_base),
+        "station": first if "position_m" in first else None,
+        "stations": stations,
+        "levelling": _levelling(stop.cloud.levelling),
+        "scan": {
+            "n_returns": len(stop.cloud.p_base),
+            "coverage_deg": math.degrees(stop.cloud.coverage),
+            "duration_s": stop.cloud.duration,
+            "notes": list(stop.cloud.notes),
+        },
+        "tolerance_m": config.tolerance,
+        "timings_s": dict(stop.timings),
+    }
+    if answer["station"] is None:
+        answer["reason"] = first["reason"]
+    return answer
+
+
+def _markers(
+    fits: MarkerFits, R_frame_base: Array, truth: Truth | None, pose: StopTruth | None
+) -> list[Plain]:
+    """Return the markers of one fitting method."""
+    answers = [
+        _marker(marker_name(place), fit, R_frame_base) for place, fit in enumerate(fits.fits)
+    ]
+    if truth is not None and pose is not None:
+        errors = marker_errors(fits, pose, truth.marks)
+        for answer, mark, error in zip(answers, errors.marks, errors.error_3d, strict=True):
+            answer["true_mark"] = None if mark == UNMATCHED else truth.marks.names[mark]
+            answer["error_3d_m"] = _number(error)
+    return answers
+
+
+def _marker(name: str, fit: MarkerFit, R_frame_base: Array) -> Plain:
+    """Return one marker."""
+    return {
+        "id": name,
+        "status": str(fit.status),
+        "reason": fit.reason,
+        "method": fit.method,
+        "centre_m": _numbers(R_frame_base @ fit.p_base),
+        "covariance_m2": _numbers(R_frame_base @ fit.cov_p_base @ R_frame_base.T),
+        "sigma_3d_m": _number(fit.sigma_3d),
+        "range_m": _number(fit.mean_range),
+        "n_points": fit.n_points,
+        "n_rejected": len(fit.rejected),
+        "n_rings": fit.n_rings,
+        "coverage": _number(fit.coverage),
+        "rms_m": _number(fit.rms),
+        "sigma0": _number(fit.sigma0),
+        "radius_m": fit.radius,
+        "radius_free_m": _number(fit.radius_free),
+        "sigma_radius_free_m": _number(fit.sigma_radius_free),
+        "mean_intensity": _number(fit.mean_intensity),
+    }
+
+
+def _rejected(stop: StopResult, R_frame_base: Array) -> list[Plain]:
+    """Return what looked like a marker at first, each group once."""
+    answers: dict[tuple[object, ...], Plain] = {}
+    for fits in stop.fits.values():
+        for rejection in fits.rejected:
+            centre = _numbers(R_frame_base @ rejection.p_base)
+            answer = {
+                "centre_m": centre,
+                "reason": rejection.reason,
+                "n_points": rejection.n_points,
+            }
+            answers.setdefault((*centre, rejection.reason), answer)
+    return list(answers.values())
+
+
+def _station(
+    fit_method: str,
+    stop: StopResult,
+    fix: StationFix | NoFix,
+    marks: ControlMarks | None,
+    pose: StopTruth | None,
+) -> Plain:
+    """Return the station by one fitting and one resection method, or why there is none."""
+    methods = {"method": fix.method, "fit_method": fit_method}
+    if isinstance(fix, NoFix) or marks is None:
+        reason, code = (fix.reason, fix.code) if isinstance(fix, NoFix) else (NO_CONTROL, "")
+        return {"status": "failed", "reason": reason, "code": code, **methods}
+    yaw, _, _ = yaw_pitch_roll(fix.T_site_station[:3, :3])
+    low, high = np.degrees(fix.included_angles)
+    answer: Plain = {
+        "status": str(fix.status),
+        "reason": fix.reason,
+        **methods,
+        "position_m": _numbers(fix.p_site),
+        "rotation": _numbers(fix.T_site_station[:3, :3]),
+        "yaw_deg": math.degrees(yaw),
+        "covariance": _numbers(fix.cov_T_site_station),
+        "position_covariance_m2": _numbers(fix.cov_p_site),
+        "sigma_3d_m": _number(fix.sigma_3d),
+        "sigma_levelling_rad": stop.cloud.levelling.sigma,
+        "dof": fix.dof,
+        "sigma0": _number(fix.sigma0),
+        "passes_global_test": fix.passes_global_test,
+        "included_angle_min_deg": _number(low),
+        "included_angle_max_deg": _number(high),
+        "matches": _matches(fix, marks),
+        "residuals_m": _numbers(fix.residuals_site),
+        "excluded": [
+            {"marker": marker_name(one.fit), "reason": one.reason} for one in fix.excluded
+        ],
+    }
+    if pose is not None:
+        error = station_error(fix, pose)
+        answer["error_3d_m"] = error.error_3d
+        answer["error_yaw_deg"] = math.degrees(error.error_yaw)
+    return answer
+
+
+def _matches(fix: StationFix, marks: ControlMarks) -> list[Plain]:
+    """Return which marker was taken for which mark, with residual and reliability."""
+    return [
+        {
+            "marker": marker_name(int(fit)),
+            "mark": marks.names[mark],
+            "residual_m": _numbers(fix.residuals_site[i]),
+            "redundancy": _number(fix.redundancies[i]),
+            "w": _number(fix.w_statistics[i]),
+            "minimal_detectable_bias_m": _number(fix.detectable_biases[i]),
+            "external_reliability_m": _number(fix.external_reliabilities[i]),
+        }
+        for i, (fit, mark) in enumerate(fix.matches)
+    ]
+
+
+def _levelling(levelling: Levelling) -> Plain:
+    """Return how the base leans."""
+    return {
+        "roll_deg": math.degrees(levelling.roll),
+        "pitch_deg": math.degrees(levelling.pitch),
+        "sigma_levelling_rad": levelling.sigma,
+        "is_measured": levelling.is_measured,
+    }
+
+
+def _rig(rig: Rig) -> Plain:
+    """Return the rig that was used, with its digest."""
+    return rig_to_mapping(rig) | {"digest": rig_digest(rig)}
+
+
+def _rotation_to(frame: Frame, levelling: Levelling) -> Array:
+    """Return the rotation from the base frame to the frame that was asked for."""
+    return levelling_rotation(levelling) if frame == "station" else np.eye(3)
+
+
+def _number(value: float) -> float | None:
+    """Return a number, or null where JSON has none for it."""
+    return float(value) if math.isfinite(value) else None
+
+
+def _numbers(values: ArrayLike) -> Any:
+    """Return an array as nested lists, with null where JSON has no number."""
+    array = np.asarray(values, dtype=np.float64)
+    if array.ndim == 0:
+        return _number(float(array))
+    return [_numbers(part) for part in array]

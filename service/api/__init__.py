@@ -1,0 +1,12 @@
+"""The interface for programs, under ``/api/v1``: routes by what they are about.
+
+Every handler parses, makes one call and answers; what it may answer is in ``models``.
+"""
+
+from fastapi import APIRouter
+
+from service.api import jobs, problems, recordings, results, sql, surveys
+
+router = APIRouter()
+for part in (surveys, recordings, jobs, results, sql, problems):
+    router.include_router(part.router)

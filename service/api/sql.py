@@ -1,0 +1,152 @@
+"""Routes of SQL for people: a question, its answer, what can be asked, and a copy of it all."""
+
+from __future__ import annotations
+
+from datetime import UTC, datetime
+from typing import Annotated, Any
+
+import pyarrow as pa
+from fastapi import APIRouter, Request, Response
+from fastapi import Query as QueryParameter
+from fastapi.responses import FileResponse, PlainTextResponse
+from pyarrow import csv
+
+from service.api.models import Answer, Column, Listing, Query, Table
+from service.state import Current, Service
+from storage.sandbox import QueryResult, run_query, to_csv
+
+router = APIRouter(tags=["sql"])
+
+UNITS = {
+    "m": "m",
+    "m2": "m²",
+    "deg": "deg",
+    "rad": "rad",
+    "s": "s",
+    "ms": "ms",
+    "percent": "%",
+    "bytes": "bytes",
+    "db": "dB",
+    "at": "UTC",
+}
+"""By the last word of a column's name."""
+
+_SCHEMA = """
+SELECT c.table_name, t.comment AS table_comment, t.kind, c.column_name, c.data_type,
+    c.is_nullable
+FROM duckdb_columns() AS c JOIN (
+    SELECT table_name, comment, 'table' AS kind FROM duckdb_tables() WHERE NOT internal
+    UNION ALL SELECT view_name, comment, 'view' FROM duckdb_views() WHERE NOT internal
+) AS t USING (table_name)
+WHERE NOT c.internal ORDER BY t.kind, c.table_name, c.column_index
+"""
+_COORDINATES = """
+SELECT survey, 'mark' AS kind, mark AS name, NULL AS fit_method, NULL AS resection_method,
+    'control' AS status, x_m, y_m, z_m, sqrt(sigma_x_m ^ 2 + sigma_y_m ^ 2 + sigma_z_m ^ 2)
+    AS sigma_3d_m, NULL::DOUBLE AS error_3d_m
+FROM control_marks JOIN (SELECT survey_id, name AS survey FROM surveys) USING (survey_id)
+WHERE $survey::VARCHAR IS NULL OR survey_id = $survey OR survey = $survey
+UNION ALL BY NAME
+SELECT survey, 'station' AS kind, stop AS name, fit_method, resection_method, status, x_m, y_m, z_m,
+    sigma_3d_m, error_3d_m
+FROM latest_station_fixes
+WHERE $survey::VARCHAR IS NULL OR survey_id = $survey OR survey = $survey
+ORDER BY ALL
+"""
+
+
+@router.post(
+    "/sql", name="query", response_model=Answer, responses={200: {"content": {"text/csv": {}}}}
+)
+def query(asked: Query, request: Request, service: Current) -> Any:
+    """Answer one SELECT on a snapshot of the database, as JSON or CSV, within announced limits."""
+    return _answer(service, asked, request)
+
+
+@router.get(
+    "/sql",
+    name="query_by_link",
+    response_model=Answer,
+    responses={200: {"content": {"text/csv": {}}}},
+)
+def query_by_link(
+    q: Annotated[str, QueryParameter(min_length=1, max_length=8000, description="One SELECT.")],
+    request: Request,
+    service: Current,
+) -> Any:
+    """Answer one SELECT that is part of the address: every question is a link."""
+    return _answer(service, Query(sql=q), request)
+
+
+@router.get("/sql/schema", name="get_schema")
+def get_schema(service: Current) -> Listing[Table]:
+    """Describe every table and view with its columns, types and units."""
+    return Listing(items=schema(service))
+
+
+@router.get("/export/results.duckdb", name="export_database", response_class=FileResponse)
+def export_database(service: Current) -> FileResponse:
+    """Return a consistent copy of the database, for one's own DuckDB."""
+    return FileResponse(
+        service.catalogue.snapshot(),
+        media_type="application/vnd.duckdb",
+        filename="results.duckdb",
+    )
+
+
+@router.get("/export/coordinates.csv", name="export_coordinates")
+def export_coordinates(
+    service: Current,
+    survey: Annotated[str | None, QueryParameter(description="Id or name of a survey.")] = None,
+) -> Response:
+    """Return the newest stations and the control marks as CSV, in the site frame."""
+    table = service.catalogue.table(_COORDINATES, {"survey": survey})
+    sink = pa.BufferOutputStream()
+    csv.write_csv(table, sink)
+    return Response(sink.getvalue().to_pybytes(), media_type="text/csv")
+
+
+def schema(service: Service) -> list[Table]:
+    """Return every table and view with its columns."""
+    tables: dict[str, Table] = {}
+    for row in service.catalogue.rows(_SCHEMA):
+        table = Table(
+            name=row["table_name"], kind=row["kind"], comment=row["table_comment"], columns=[]
+        )
+        column = Column(
+            name=row["column_name"], type=row["data_type"], unit=unit_of(row["column_name"])
+        )
+        tables.setdefault(table.name, table).columns.append(column)
+    return list(tables.values())
+
+
+def unit_of(column: str) -> str | None:
+    """Return the unit that a column's name ends with."""
+    return UNITS.get(column.rpartition("_")[2]) if "_" in column else None
+
+
+def _answer(service: Service, asked: Query, request: Request) -> Answer | Response:
+    """Run a question on a snapshot and answer in the shape that was asked for."""
+    snapshot = service.catalogue.snapshot()
+    result = run_query(snapshot, asked.sql, service.limits)
+    if asked.format == "csv" or request.headers.get("accept", "").startswith("text/csv"):
+        return _csv(result, service.limits.rows)
+    columns = [Column(name=c.name, type=c.type, unit=unit_of(c.name)) for c in result.columns]
+    return Answer(
+        columns=columns,
+        rows=[list(row) for row in result.rows],
+        truncated=result.truncated,
+        row_limit=service.limits.rows,
+        elapsed_ms=round(result.elapsed_ms, 3),
+        snapshot_at=datetime.fromtimestamp(snapshot.stat().st_mtime, UTC),
+    )
+
+
+def _csv(result: QueryResult, row_limit: int) -> Response:
+    """Return an answer as CSV; what JSON says beside the rows is in the headers."""
+    headers = {
+        "X-Truncated": str(result.truncated).lower(),
+        "X-Row-Limit": str(row_limit),
+        "X-Elapsed-Ms": f"{result.elapsed_ms:.3f}",
+    }
+    return PlainTextResponse(to_csv(result), media_type="text/csv", headers=headers)

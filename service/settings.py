@@ -1,0 +1,93 @@
+"""Settings: how this installation runs. The only reader of the environment."""
+
+from __future__ import annotations
+
+import ipaddress
+import os
+from pathlib import Path
+from typing import Literal, Self
+
+from pydantic import Field, SecretStr, model_validator
+from pydantic_settings import BaseSettings, SettingsConfigDict
+
+_KNOWN_SCHEMES = ("tcp://", "tls://")
+
+
+def is_loopback(host: str) -> bool:
+    """Whether a host is this machine alone."""
+    if host == "localhost":
+        return True
+    try:
+        return ipaddress.ip_address(host).is_loopback
+    except ValueError:
+        return False
+
+
+class Settings(BaseSettings):
+    """How this installation runs; each field can be set as ``SPHEREMARK_<FIELD>``."""
+
+    model_config = SettingsConfigDict(env_prefix="SPHEREMARK_", frozen=True, extra="forbid")
+
+    data: Path = Field(
+        default=Path("data"),
+        description="Folder that holds the database, the uploaded logs and the clouds.",
+    )
+    host: str = Field(
+        default="127.0.0.1",
+        description="Address to listen on; any other than loopback needs a token.",
+    )
+    port: int = Field(
+        default=8000, ge=0, le=65535, description="Port to listen on; 0 takes a free one."
+    )
+    token: SecretStr | None = Field(
+        default=None,
+        description="Secret that every request must carry as 'Authorization: Bearer <token>'.",
+    )
+    workers: int = Field(
+        default_factory=lambda: min(2, os.cpu_count() or 1),
+        ge=1,
+        le=256,
+        description="Worker processes of the cluster that the service starts itself.",
+    )
+    scheduler: str = Field(
+        default="",
+        description="Address of an existing Dask cluster (tcp://host:port) to use in its place.",
+    )
+    job_attempts: int = Field(
+        default=3,
+        ge=1,
+        le=10,
+        description="How often a job is started before a dead worker fails it.",
+    )
+    max_upload_bytes: int = Field(
+        default=8 << 30, ge=1, description="Largest log that is accepted [bytes]."
+    )
+    sql_seconds: float = Field(
+        default=5.0, gt=0, le=600, description="Time after which a person's query is ended [s]."
+    )
+    sql_rows: int = Field(
+        default=10_000,
+        ge=1,
+        le=1_000_000,
+        description="Rows after which a result is cut, and says so.",
+    )
+    sql_memory_bytes: int = Field(
+        default=512 << 20, ge=64 << 20, description="Memory that one query may use [bytes]."
+    )
+    log_level: Literal["debug", "info", "warning", "error"] = Field(
+        default="info", description="Least severity that is logged."
+    )
+
+    @model_validator(mode="after")
+    def _is_safe(self) -> Self:
+        """Refuse an open address without a token, and an address that is no scheduler."""
+        if not is_loopback(self.host) and not (self.token and self.token.get_secret_value()):
+            raise ValueError(
+                f"host is {self.host}, which others can reach; set SPHEREMARK_TOKEN to a secret, "
+                "or listen on 127.0.0.1"
+            )
+        if self.scheduler and not self.scheduler.startswith(_KNOWN_SCHEMES):
+            raise ValueError(
+                f"scheduler is {self.scheduler!r}; it must look like tcp://host:port, or be empty"
+            )
+        return self
