@@ -179,7 +179,7 @@ class Catalogue:
         self._lock = threading.RLock()
         self._version = 0
         self._connection = _open(path, memory_limit)
-        self._snapshots = _Snapshots(path, snapshots)
+        self._snapshots = Snapshots(path, snapshots)
 
     def __enter__(self) -> Self:
         return self
@@ -235,12 +235,12 @@ class Catalogue:
 
     def get_survey(self, key: str) -> SurveyRecord:
         """Return a survey by its id or its name; NotFoundError if there is none."""
-        return _survey(self._one(_SURVEY_BY_KEY, {"key": key}, f"survey {key!r}"))
+        return survey_of(self._one(_SURVEY_BY_KEY, {"key": key}, f"survey {key!r}"))
 
     def list_surveys(self, *, after: str | None = None, limit: int = 100) -> Page[SurveyRecord]:
         """Return a part of the surveys, newest first; ``after`` is ``next`` of the part before."""
         rows = self._part(_SURVEYS_AFTER, {}, after, limit)
-        return _page(rows, limit, "created_at", "survey_id", _survey)
+        return _page(rows, limit, "created_at", "survey_id", survey_of)
 
     def put_control_marks(self, survey: str, marks: ControlMarks) -> None:
         """Give a survey its control marks, in place of those that it had.
@@ -259,10 +259,10 @@ class Catalogue:
         NotFoundError
             If there is no such survey.
         """
-        _check_marks(marks)
+        check_marks(marks)
         sigmas = np.sqrt(np.diagonal(marks.cov_p_site, axis1=1, axis2=2))
         survey_id = self.get_survey(survey).survey_id
-        table = _marks_table(survey_id, marks)
+        table = marks_table(survey_id, marks)
         for axis, name in enumerate(("sigma_x_m", "sigma_y_m", "sigma_z_m")):
             table = table.append_column(name, pa.array(sigmas[:, axis]))
         with self._writing() as cursor:
@@ -280,7 +280,7 @@ class Catalogue:
         sigmas = np.array([[row[f"sigma_{axis}_m"] for axis in "xyz"] for row in rows])
         return ControlMarks(
             names=tuple(row["mark"] for row in rows),
-            p_site=_coordinates(rows),
+            p_site=coordinates_of(rows),
             cov_p_site=np.eye(3) * np.square(sigmas)[:, None, :],
         )
 
@@ -300,18 +300,18 @@ class Catalogue:
         NotFoundError
             If there is no such survey.
         """
-        _check_marks(truth.marks)
+        check_marks(truth.marks)
         survey_id = self.get_survey(survey).survey_id
         with self._writing() as cursor:
-            _insert(cursor, "true_marks", _marks_table(survey_id, truth.marks))
+            _insert(cursor, "true_marks", marks_table(survey_id, truth.marks))
             cursor.execute(
                 "DELETE FROM true_marks WHERE survey_id = ? AND NOT list_contains(?, mark)",
                 [survey_id, list(truth.marks.names)],
             )
-            _insert(cursor, "true_stops", _true_stops_table(survey_id, truth.stops))
+            _insert(cursor, "true_stops", true_stops_table(survey_id, truth.stops))
             cursor.execute(
                 "INSERT OR REPLACE INTO true_worlds VALUES (?, ?, ?)",
-                [survey_id, _rig_text(truth), _json(truth.about)],
+                [survey_id, rig_text(truth), json_text(truth.about)],
             )
             _refresh_errors(cursor, survey_id)
 
@@ -360,7 +360,7 @@ class Catalogue:
                 f"The recording {name} has the verdict {verdict!r} and {size_bytes} bytes; a "
                 f"verdict is one of {', '.join(_VERDICTS)}, and a size is not negative."
             )
-        row = [digest, name, size_bytes, _now(), url, verdict, _json(preflight)]
+        row = [digest, name, size_bytes, _now(), url, verdict, json_text(preflight)]
         with self._writing() as cursor:
             cursor.execute("INSERT OR IGNORE INTO recordings VALUES (?, ?, ?, ?, ?, ?, ?)", row)
         return self.get_recording(digest)
@@ -368,14 +368,14 @@ class Catalogue:
     def get_recording(self, recording_id: str) -> RecordingRecord:
         """Return a recording by its digest; NotFoundError if there is none."""
         row = self._one(_RECORDING, {"id": recording_id}, f"recording {recording_id!r}")
-        return _recording(row)
+        return recording_of(row)
 
     def list_recordings(
         self, *, after: str | None = None, limit: int = 100
     ) -> Page[RecordingRecord]:
         """Return a part of the recordings, newest first."""
         rows = self._part(_RECORDINGS_AFTER, {}, after, limit)
-        return _page(rows, limit, "uploaded_at", "recording_id", _recording)
+        return _page(rows, limit, "uploaded_at", "recording_id", recording_of)
 
     # Jobs
 
@@ -410,7 +410,7 @@ class Catalogue:
         if recording_id is not None:
             self.get_recording(recording_id)
         job_id = secrets.token_hex(8)
-        row = [job_id, kind, survey_id, recording_id, _json(config), _now()]
+        row = [job_id, kind, survey_id, recording_id, json_text(config), _now()]
         with self._writing() as cursor:
             cursor.execute(
                 "INSERT INTO jobs (job_id, kind, survey_id, recording_id, config, created_at, "
@@ -422,7 +422,7 @@ class Catalogue:
 
     def get_job(self, job_id: str) -> JobRecord:
         """Return a job; NotFoundError if there is none."""
-        return _job(self._one(_JOB, {"id": job_id}, f"job {job_id!r}"))
+        return job_of(self._one(_JOB, {"id": job_id}, f"job {job_id!r}"))
 
     def list_jobs(
         self,
@@ -437,7 +437,7 @@ class Catalogue:
         survey_id = None if survey is None else self.get_survey(survey).survey_id
         wanted = {"survey_id": survey_id, "recording_id": recording_id, "status": status}
         rows = self._part(_JOBS_AFTER, wanted, after, limit)
-        return _page(rows, limit, "created_at", "job_id", _job)
+        return _page(rows, limit, "created_at", "job_id", job_of)
 
     def start_job(self, job_id: str) -> JobRecord:
         """Begin an attempt at an accepted job; ConflictError if it stands elsewhere."""
@@ -463,7 +463,9 @@ class Catalogue:
                 [min(max(float(percent), 0.0), 100.0), message, job_id],
             )
 
-    def finish_job(self, job_id: str, tables: Mapping[str, pa.Table]) -> JobRecord:
+    def finish_job(
+        self, job_id: str, tables: Mapping[str, pa.Table], *, message: str = "Done."
+    ) -> JobRecord:
         """Write the results of a running job and its end, both or neither.
 
         Parameters
@@ -472,6 +474,8 @@ class Catalogue:
             The job.
         tables : mapping of str to Table
             Rows by table, as ``storage.results.tables`` makes them.
+        message : str
+            What the job gave, as a sentence for people.
 
         Returns
         -------
@@ -501,8 +505,8 @@ class Catalogue:
                 _insert(cursor, name, table)
             cursor.execute(
                 "UPDATE jobs SET status = 'successful', progress_percent = 100, "
-                "message = 'Done.', finished_at = ? WHERE job_id = ?",
-                [_now(), job_id],
+                "message = ?, finished_at = ? WHERE job_id = ?",
+                [message, _now(), job_id],
             )
         return self.get_job(job_id)
 
@@ -565,11 +569,11 @@ class Catalogue:
                 "UPDATE jobs SET status = 'accepted', progress_percent = 0, "
                 "message = 'Taken up again after a restart.' WHERE status = 'running'"
             )
-            return tuple(_job(row) for row in _fetch(cursor, _JOBS_ACCEPTED, {}).to_pylist())
+            return tuple(job_of(row) for row in _fetch(cursor, _JOBS_ACCEPTED, {}).to_pylist())
 
     def get_run(self, run_id: str) -> RunRecord:
         """Return a run; NotFoundError if there is none."""
-        return _run(self._one(_RUN, {"id": run_id}, f"run {run_id!r}"))
+        return run_of(self._one(_RUN, {"id": run_id}, f"run {run_id!r}"))
 
     def list_runs(
         self,
@@ -584,7 +588,7 @@ class Catalogue:
         survey_id = None if survey is None else self.get_survey(survey).survey_id
         wanted = {"survey_id": survey_id, "recording_id": recording_id, "job_id": job_id}
         rows = self._part(_RUNS_AFTER, wanted, after, limit)
-        return _page(rows, limit, "finished_at", "run_id", _run)
+        return _page(rows, limit, "finished_at", "run_id", run_of)
 
     # Our own static queries
 
@@ -678,46 +682,6 @@ class Catalogue:
         return self.rows(sql, {**wanted, "at": instant, "id": identifier, "n": limit + 1})
 
 
-class _Snapshots:
-    """The copies of one database file in a folder of their own."""
-
-    def __init__(self, path: Path, folder: Path) -> None:
-        self._path = path
-        self._folder = folder
-        self._version: int | None = None
-        folder.mkdir(parents=True, exist_ok=True)
-        for stale in self._files():
-            stale.unlink(missing_ok=True)
-
-    def take(self, connection: duckdb.DuckDBPyConnection, version: int) -> Path:
-        """Return the newest copy if it has this version, else make it; the caller holds writers."""
-        files = self._files()
-        if files and version == self._version:
-            return files[-1]
-        connection.execute("CHECKPOINT")
-        number = 1 + (int(files[-1].stem.split("-")[1]) if files else 0)
-        target = self._folder / f"snapshot-{number:09d}.duckdb"
-        _copy(self._path, target)
-        self._version = version
-        for old in files[: 1 - _N_SNAPSHOTS]:
-            old.unlink(missing_ok=True)
-        return target
-
-    def _files(self) -> list[Path]:
-        """Return the copies that are there, oldest first."""
-        return sorted(self._folder.glob("snapshot-*.duckdb"))
-
-
-def _copy(source: Path, target: Path) -> None:
-    """Copy a file in a process of its own, sharing blocks where the file system can."""
-    part = target.with_suffix(".part")
-    command = ["cp", "--reflink=auto", "--", str(source), str(part)]
-    done = subprocess.run(command, capture_output=True, text=True, check=False)
-    if done.returncode:
-        raise ConflictError(f"No snapshot of {source} could be made: {done.stderr.strip()}.")
-    part.replace(target)
-
-
 def _open(path: Path, memory_limit: str) -> duckdb.DuckDBPyConnection:
     """Open the file as its owner, bring its schema up to date, and shut the doors."""
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -809,59 +773,13 @@ def _truth(cursor: duckdb.DuckDBPyConnection, survey_id: str) -> Truth | None:
     return Truth(
         marks=ControlMarks(
             names=tuple(row["mark"] for row in marks),
-            p_site=_coordinates(marks),
+            p_site=coordinates_of(marks),
             cov_p_site=np.zeros((len(marks), 3, 3)),
         ),
-        stops=tuple(StopTruth(name=row["stop"], T_site_base=_pose(row)) for row in stops),
+        stops=tuple(StopTruth(name=row["stop"], T_site_base=pose_of(row)) for row in stops),
         rig=None if rig is None else rig_from_mapping(json.loads(rig)),
         about=json.loads(worlds[0]["about"]),
     )
-
-
-def _pose(row: Mapping[str, Any]) -> NDArray[np.float64]:
-    """Return the pose that a row of ``true_stops`` tells."""
-    yaw, pitch, roll = (np.radians(row[f"{name}_deg"]) for name in ("yaw", "pitch", "roll"))
-    return rigid(rot_z(yaw) @ rot_y(pitch) @ rot_x(roll), [row["x_m"], row["y_m"], row["z_m"]])
-
-
-def _coordinates(rows: list[dict[str, Any]]) -> NDArray[np.float64]:
-    """Return the coordinates of rows, (n, 3) [m]."""
-    return np.array([[row["x_m"], row["y_m"], row["z_m"]] for row in rows]).reshape(-1, 3)
-
-
-def _marks_table(survey_id: str, marks: ControlMarks) -> pa.Table:
-    """Return marks as rows, in their order."""
-    x, y, z = marks.p_site.T
-    n = len(marks.names)
-    columns = {"survey_id": [survey_id] * n, "mark": list(marks.names), "place": range(n)}
-    return pa.table(columns | {"x_m": x, "y_m": y, "z_m": z})
-
-
-def _true_stops_table(survey_id: str, stops: tuple[StopTruth, ...]) -> pa.Table:
-    """Return true poses as rows."""
-    rows = []
-    for stop in stops:
-        yaw, pitch, roll = np.degrees(yaw_pitch_roll(stop.T_site_base[:3, :3]))
-        x, y, z = stop.T_site_base[:3, 3]
-        rows.append((survey_id, stop.name, x, y, z, yaw, pitch, roll))
-    names = ("survey_id", "stop", "x_m", "y_m", "z_m", "yaw_deg", "pitch_deg", "roll_deg")
-    types = [pa.string(), pa.string(), *[pa.float64()] * 6]
-    return pa.table(
-        [pa.array([row[i] for row in rows], kind) for i, kind in enumerate(types)], names=names
-    )
-
-
-def _check_marks(marks: ControlMarks) -> None:
-    """Refuse marks that a table cannot hold or a survey cannot use."""
-    if len(set(marks.names)) < len(marks.names) or not all(marks.names):
-        raise ControlError("Marks must have names, all different.")
-    if not np.isfinite(marks.p_site).all():
-        raise ControlError("Marks must have finite coordinates [m].")
-    variances = np.diagonal(marks.cov_p_site, axis1=1, axis2=2)
-    if not (variances >= 0.0).all() or not np.isfinite(variances).all():
-        raise ControlError("Marks must have standard deviations that are finite and not negative.")
-    if (marks.cov_p_site != np.eye(3) * variances[:, None, :]).any():
-        raise ControlError("Marks must have independent coordinates: correlations are not kept.")
 
 
 def _check_name(what: str, name: str) -> None:
@@ -888,28 +806,7 @@ def _job_in(cursor: duckdb.DuckDBPyConnection, job_id: str) -> JobRecord:
     rows = _fetch(cursor, _JOB, {"id": job_id}).to_pylist()
     if not rows:
         raise NotFoundError(f"There is no job {job_id!r}.")
-    return _job(rows[0])
-
-
-def _survey(row: dict[str, Any]) -> SurveyRecord:
-    """Build a record from a row."""
-    return SurveyRecord(tolerance=row.pop("tolerance_m"), **row)
-
-
-def _recording(row: dict[str, Any]) -> RecordingRecord:
-    """Build a record from a row."""
-    return RecordingRecord(**{**row, "preflight": json.loads(row["preflight"])})
-
-
-def _job(row: dict[str, Any]) -> JobRecord:
-    """Build a record from a row."""
-    known = {"config": json.loads(row["config"]), "status": JobStatus(row["status"])}
-    return JobRecord(**{**row, **known})
-
-
-def _run(row: dict[str, Any]) -> RunRecord:
-    """Build a record from a row."""
-    return RunRecord(duration=row.pop("duration_s"), **{**row, "config": json.loads(row["config"])})
+    return job_of(rows[0])
 
 
 def _page(
@@ -946,19 +843,6 @@ def _to_numpy(column: pa.ChunkedArray) -> NDArray[Any]:
     if pa.types.is_timestamp(column.type):
         column = column.cast(pa.timestamp("us"))  # NumPy's instants carry no zone; ours are UTC
     return np.asarray(column.to_numpy())
-
-
-def _json(values: Mapping[str, Any]) -> str:
-    """Return values as JSON; InputError if they are not plain or not finite."""
-    try:
-        return json.dumps(values, sort_keys=True, allow_nan=False)
-    except (TypeError, ValueError) as error:
-        raise InputError(f"Values for the catalogue must be plain and finite: {error}.") from error
-
-
-def _rig_text(truth: Truth) -> str | None:
-    """Return the true rig as JSON, when known."""
-    return None if truth.rig is None else _json(rig_to_mapping(truth.rig))
 
 
 def _now() -> datetime:
