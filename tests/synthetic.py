@@ -9,7 +9,15 @@ from dataclasses import replace
 import numpy as np
 
 from pipelines.rigs import vlp16
-from pipelines.values import Origin, ScanLog
+from pipelines.values import (
+    ControlMarks,
+    Levelling,
+    MarkerFit,
+    MarkerFits,
+    Origin,
+    ScanLog,
+    Status,
+)
 
 NS = 1_000_000_000
 
@@ -93,13 +101,8 @@ def scan_log(rng, rig, *, n=3000, turn=2 * np.pi, duration=13.2, joint_rate=100.
 
 def leaning(rng, rig, lean, angles):
     """Quaternions (x y z w) of an AHRS on a base that leans, with any heading."""
-    roll, pitch = lean
-    cr, sr, cp, sp = np.cos(roll), np.sin(roll), np.cos(pitch), np.sin(pitch)
-    R_station_base = np.array([[cp, 0, sp], [0, 1, 0], [-sp, 0, cp]]) @ np.array(
-        [[1, 0, 0], [0, cr, -sr], [0, sr, cr]]
-    )
     mount = turn_z(angles) if rig.imu_mount == "head" else np.eye(3)
-    R = turn_z(np.array(rng.uniform(-3, 3))) @ R_station_base @ mount @ rig.R_mount_imu
+    R = turn_z(np.array(rng.uniform(-3, 3))) @ lean_matrix(*lean) @ mount @ rig.R_mount_imu
     return quaternions(np.broadcast_to(R, (len(angles), 3, 3)))
 
 
@@ -109,3 +112,64 @@ def quaternions(R):
     length = np.linalg.norm(odd, axis=0)
     half = np.arctan2(length / 2, (np.trace(R, axis1=1, axis2=2) - 1) / 2) / 2
     return np.concatenate([np.sin(half) * odd / length, [np.cos(half)]]).T
+
+
+def field(rng, n=14, *, radius=8.0, middle=(0.0, 0.0, 0.0)):
+    """Control marks in an uneven ring, 0.6 to 1.5 m above the middle."""
+    angle = np.sort((np.arange(n) + rng.uniform(-0.3, 0.3, n)) * 2 * np.pi / n)
+    ring = radius * rng.uniform(0.8, 1.2, n)
+    p_site = np.stack([ring * np.cos(angle), ring * np.sin(angle), rng.uniform(0.6, 1.5, n)], 1)
+    return control(p_site + np.asarray(middle))
+
+
+def control(p_site):
+    """Exact control marks called A, B, C ..."""
+    names = tuple(chr(65 + k) if k < 26 else f"M{k}" for k in range(len(p_site)))
+    return ControlMarks(
+        names=names, p_site=np.array(p_site, float), cov_p_site=np.zeros((len(p_site), 3, 3))
+    )
+
+
+def pose(p_site, yaw, lean=(0.0, 0.0)):
+    """The pose of a base that stands somewhere, (4, 4)."""
+    T = np.eye(4)
+    T[:3, :3], T[:3, 3] = turn_z(np.array(float(yaw))) @ lean_matrix(*lean), p_site
+    return T
+
+
+def lean_matrix(roll, pitch):
+    """``Ry(pitch) Rx(roll)``, written out."""
+    cr, sr, cp, sp = np.cos(roll), np.sin(roll), np.cos(pitch), np.sin(pitch)
+    return np.array([[cp, sp * sr, sp * cr], [0, cr, -sr], [-sp, cp * sr, cp * cr]])
+
+
+def sightings(marks, T_site_base, *, lean=(0.0, 0.0), sigma_level=3e-3, cov=None, noise=None):
+    """The fits that marks would give at a pose; ``cov`` is what they claim, ``noise`` what is."""
+    p_base = (marks.p_site - T_site_base[:3, 3]) @ T_site_base[:3, :3]
+    p_base = p_base if noise is None else p_base + noise
+    cov = np.broadcast_to(np.eye(3) * 4e-3**2 if cov is None else cov, (len(p_base), 3, 3))
+    levelling = Levelling(roll=lean[0], pitch=lean[1], sigma=sigma_level, is_measured=True)
+    fits = tuple(marker_fit(p, c) for p, c in zip(p_base, cov, strict=True))
+    return MarkerFits(method="along_beam", fits=fits, rejected=(), levelling=levelling)
+
+
+def marker_fit(p_base, cov):
+    """A fit with a centre and a covariance; the rest is plausible."""
+    return MarkerFit(
+        p_base=np.array(p_base),
+        cov_p_base=np.array(cov),
+        method="along_beam",
+        status=Status.OK,
+        reason="",
+        radius=0.1,
+        radius_free=0.1,
+        sigma_radius_free=0.002,
+        mean_range=float(np.linalg.norm(p_base)),
+        mean_intensity=60.0,
+        used=np.arange(100),
+        rejected=np.zeros(0, np.intp),
+        residuals=np.zeros(100),
+        sigma0=1.0,
+        n_rings=8,
+        coverage=0.9,
+    )
