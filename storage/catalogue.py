@@ -12,7 +12,6 @@ import base64
 import json
 import re
 import secrets
-import subprocess
 import threading
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import closing, contextmanager, suppress
@@ -26,9 +25,8 @@ import numpy as np
 import pyarrow as pa
 from numpy.typing import NDArray
 
-from pipelines.errors import ConflictError, ControlError, InputError, NotFoundError
-from pipelines.geometry import rigid, rot_x, rot_y, rot_z, yaw_pitch_roll
-from pipelines.rigs import rig_from_mapping, rig_to_mapping
+from pipelines.errors import ConflictError, InputError, NotFoundError
+from pipelines.rigs import rig_from_mapping
 from pipelines.values import ControlMarks, StopTruth, Truth
 from storage import migrations, results
 from storage.records import (
@@ -38,7 +36,21 @@ from storage.records import (
     RecordingRecord,
     RunRecord,
     SurveyRecord,
+    TableInfo,
+    check_marks,
+    coordinates_of,
+    job_of,
+    json_text,
+    marks_table,
+    pose_of,
+    recording_of,
+    rig_text,
+    run_of,
+    survey_of,
+    tables_of,
+    true_stops_table,
 )
+from storage.snapshots import Snapshots
 
 _Record = TypeVar("_Record")
 
@@ -99,6 +111,15 @@ _CONTROL = "SELECT * FROM control_marks WHERE survey_id = $id ORDER BY place"
 _TRUE_MARKS = "SELECT * FROM true_marks WHERE survey_id = $id ORDER BY place"
 _TRUE_STOPS = "SELECT * FROM true_stops WHERE survey_id = $id ORDER BY stop"
 _TRUE_WORLD = "SELECT rig, about FROM true_worlds WHERE survey_id = $id"
+_COLUMNS = """
+SELECT c.table_name, c.column_name, c.data_type, c.comment, t.kind, t.comment AS table_comment
+FROM duckdb_columns() AS c JOIN (
+    SELECT table_name, 'table' AS kind, comment FROM duckdb_tables() WHERE NOT internal
+    UNION ALL
+    SELECT view_name, 'view', comment FROM duckdb_views() WHERE NOT internal
+) AS t USING (table_name)
+WHERE NOT c.internal ORDER BY t.kind DESC, c.table_name, c.column_index
+"""
 _RESULTS_OF_SURVEY = {
     "stops": "SELECT x.* FROM stops AS x JOIN runs USING (run_id) WHERE survey_id = $id",
     "marker_fits": (
@@ -625,6 +646,10 @@ class Catalogue:
         """Run one of our own static queries like ``columns``, for a file: an Arrow table."""
         with closing(self._connection.cursor()) as cursor:
             return _fetch(cursor, sql, parameters or {})
+
+    def schema(self) -> tuple[TableInfo, ...]:
+        """Return the views and tables that people may query, with units and comments."""
+        return tables_of(self.rows(_COLUMNS))
 
     def snapshot(self) -> Path:
         """Return a consistent copy of the database file, as fresh as the last committed result.

@@ -2,13 +2,33 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Mapping
 from dataclasses import dataclass
 from datetime import datetime
 from enum import StrEnum
 from typing import Any, Generic, TypeVar
 
+import numpy as np
+import pyarrow as pa
+
+from pipelines.errors import ControlError, InputError
+from pipelines.geometry import rigid, rot_x, rot_y, rot_z, yaw_pitch_roll
+from pipelines.rigs import rig_to_mapping
+from pipelines.values import Array, ControlMarks, StopTruth, Truth
+
 _Record = TypeVar("_Record")
+
+_UNITS = {
+    "m2": "m²",
+    "m": "m",
+    "deg": "°",
+    "s": "s",
+    "bytes": "bytes",
+    "percent": "%",
+    "at": "UTC",
+}
+"""What people read for the ending of a column's name."""
 
 
 class JobStatus(StrEnum):
@@ -188,3 +208,159 @@ class RunRecord:
     finished_at: datetime
     duration: float
     peak_memory_bytes: int | None
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ColumnInfo:
+    """A column of a table or view.
+
+    Attributes
+    ----------
+    name : str
+        Its name, which carries the unit.
+    type : str
+        DuckDB's name of its type.
+    unit : str
+        Unit for people, from the name; empty for numbers without one and for text.
+    comment : str
+        What it is; empty where the name says it.
+    """
+
+    name: str
+    type: str
+    unit: str
+    comment: str
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class TableInfo:
+    """A table or view that people may query.
+
+    Attributes
+    ----------
+    name : str
+        Its name.
+    kind : str
+        ``table`` or ``view``.
+    comment : str
+        What its rows are.
+    columns : tuple of ColumnInfo
+        Its columns, in their order.
+    """
+
+    name: str
+    kind: str
+    comment: str
+    columns: tuple[ColumnInfo, ...]
+
+
+def unit_of(column: str) -> str:
+    """Return the unit that the name of a column carries, for people; empty when it carries none."""
+    ending = next((end for end in _UNITS if column.endswith(f"_{end}")), None)
+    return "" if ending is None else _UNITS[ending]
+
+
+def tables_of(rows: list[dict[str, Any]]) -> tuple[TableInfo, ...]:
+    """Build the description of tables and views from the rows of their columns."""
+    columns: dict[str, list[ColumnInfo]] = {}
+    about = {row["table_name"]: row for row in rows}
+    comments = {(row["table_name"], row["column_name"]): row["comment"] for row in rows}
+    for row in rows:
+        name, column = row["table_name"], row["column_name"]
+        inherited = comments.get((name.removeprefix("latest_"), column))
+        info = ColumnInfo(
+            name=column,
+            type=row["data_type"],
+            unit=unit_of(column),
+            comment=row["comment"] or inherited or "",
+        )
+        columns.setdefault(name, []).append(info)
+    return tuple(
+        TableInfo(
+            name=name,
+            kind=about[name]["kind"],
+            comment=about[name]["table_comment"] or "",
+            columns=tuple(found),
+        )
+        for name, found in columns.items()
+    )
+
+
+def survey_of(row: dict[str, Any]) -> SurveyRecord:
+    """Build a record from a row."""
+    return SurveyRecord(tolerance=row.pop("tolerance_m"), **row)
+
+
+def recording_of(row: dict[str, Any]) -> RecordingRecord:
+    """Build a record from a row."""
+    return RecordingRecord(**{**row, "preflight": json.loads(row["preflight"])})
+
+
+def job_of(row: dict[str, Any]) -> JobRecord:
+    """Build a record from a row."""
+    known = {"config": json.loads(row["config"]), "status": JobStatus(row["status"])}
+    return JobRecord(**{**row, **known})
+
+
+def run_of(row: dict[str, Any]) -> RunRecord:
+    """Build a record from a row."""
+    return RunRecord(duration=row.pop("duration_s"), **{**row, "config": json.loads(row["config"])})
+
+
+def pose_of(row: Mapping[str, Any]) -> Array:
+    """Return the pose that a row of ``true_stops`` tells."""
+    yaw, pitch, roll = (np.radians(row[f"{name}_deg"]) for name in ("yaw", "pitch", "roll"))
+    return rigid(rot_z(yaw) @ rot_y(pitch) @ rot_x(roll), [row["x_m"], row["y_m"], row["z_m"]])
+
+
+def coordinates_of(rows: list[dict[str, Any]]) -> Array:
+    """Return the coordinates of rows, (n, 3) [m]."""
+    return np.array([[row["x_m"], row["y_m"], row["z_m"]] for row in rows]).reshape(-1, 3)
+
+
+def marks_table(survey_id: str, marks: ControlMarks) -> pa.Table:
+    """Return marks as rows, in their order."""
+    x, y, z = marks.p_site.T
+    n = len(marks.names)
+    columns = {"survey_id": [survey_id] * n, "mark": list(marks.names), "place": range(n)}
+    return pa.table(columns | {"x_m": x, "y_m": y, "z_m": z})
+
+
+def true_stops_table(survey_id: str, stops: tuple[StopTruth, ...]) -> pa.Table:
+    """Return true poses as rows."""
+    rows = []
+    for stop in stops:
+        yaw, pitch, roll = np.degrees(yaw_pitch_roll(stop.T_site_base[:3, :3]))
+        x, y, z = stop.T_site_base[:3, 3]
+        rows.append((survey_id, stop.name, x, y, z, yaw, pitch, roll))
+    names = ("survey_id", "stop", "x_m", "y_m", "z_m", "yaw_deg", "pitch_deg", "roll_deg")
+    types = [pa.string(), pa.string(), *[pa.float64()] * 6]
+    return pa.table(
+        [pa.array([row[i] for row in rows], kind) for i, kind in enumerate(types)], names=names
+    )
+
+
+def json_text(values: Mapping[str, Any]) -> str:
+    """Return values as JSON; InputError if they are not plain or not finite."""
+    try:
+        return json.dumps(values, sort_keys=True, allow_nan=False)
+    except (TypeError, ValueError) as error:
+        raise InputError(f"Values for the catalogue must be plain and finite: {error}.") from error
+
+
+def rig_text(truth: Truth) -> str | None:
+    """Return the true rig as JSON, when known."""
+    return None if truth.rig is None else json_text(rig_to_mapping(truth.rig))
+
+
+def check_marks(marks: ControlMarks) -> None:
+    """Refuse marks that a table cannot hold or a survey cannot use."""
+    if len(set(marks.names)) < len(marks.names) or not all(marks.names):
+        raise ControlError("Marks must have names, all different.")
+    if not np.isfinite(marks.p_site).all():
+        raise ControlError("Marks must have finite coordinates [m].")
+    variances = np.diagonal(marks.cov_p_site, axis1=1, axis2=2)
+    if not (variances >= 0.0).all() or not np.isfinite(variances).all():
+        raise ControlError("Marks must have standard deviations that are finite and not negative.")
+    if (marks.cov_p_site != np.eye(3) * variances[:, None, :]).any():
+        raise ControlError("Marks must have independent coordinates: correlations are not kept.")

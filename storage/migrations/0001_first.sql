@@ -10,6 +10,10 @@ CREATE TABLE surveys (
     created_at TIMESTAMPTZ NOT NULL
 );
 COMMENT ON TABLE surveys IS 'A field with its control marks and the logs that were recorded there.';
+COMMENT ON COLUMN surveys.survey_id IS 'Given by the catalogue; the same in every table.';
+COMMENT ON COLUMN surveys.name IS 'Given by people, unique.';
+COMMENT ON COLUMN surveys.tolerance_m IS '3-D error that the survey accepts.';
+COMMENT ON COLUMN surveys.created_at IS 'When it was made (UTC).';
 
 CREATE TABLE control_marks (
     survey_id VARCHAR NOT NULL,
@@ -24,6 +28,14 @@ CREATE TABLE control_marks (
     PRIMARY KEY (survey_id, mark)
 );
 COMMENT ON TABLE control_marks IS 'Known sphere centres in the site frame.';
+COMMENT ON COLUMN control_marks.mark IS 'What the surveyor calls it.';
+COMMENT ON COLUMN control_marks.place IS 'Its place in the file, from 0.';
+COMMENT ON COLUMN control_marks.x_m IS 'Centre of the sphere in the site frame.';
+COMMENT ON COLUMN control_marks.y_m IS 'Centre of the sphere in the site frame.';
+COMMENT ON COLUMN control_marks.z_m IS 'Centre of the sphere in the site frame, up.';
+COMMENT ON COLUMN control_marks.sigma_x_m IS 'Standard deviation of x; 0 where it is taken as exact.';
+COMMENT ON COLUMN control_marks.sigma_y_m IS 'Standard deviation of y; 0 where it is taken as exact.';
+COMMENT ON COLUMN control_marks.sigma_z_m IS 'Standard deviation of z; 0 where it is taken as exact.';
 
 CREATE TABLE true_marks (
     survey_id VARCHAR NOT NULL,
@@ -35,6 +47,8 @@ CREATE TABLE true_marks (
     PRIMARY KEY (survey_id, mark)
 );
 COMMENT ON TABLE true_marks IS 'True sphere centres in the site frame; for comparison only, never an input of a job.';
+COMMENT ON COLUMN true_marks.mark IS 'What the simulator calls it.';
+COMMENT ON COLUMN true_marks.place IS 'Its place in the file, from 0.';
 
 CREATE TABLE true_stops (
     survey_id VARCHAR NOT NULL,
@@ -48,6 +62,10 @@ CREATE TABLE true_stops (
     PRIMARY KEY (survey_id, stop)
 );
 COMMENT ON TABLE true_stops IS 'True poses of the base frame in the site frame; for comparison only, never an input of a job.';
+COMMENT ON COLUMN true_stops.stop IS 'Name of the stop, as in the tables of results.';
+COMMENT ON COLUMN true_stops.yaw_deg IS 'Heading in R_site_base = Rz(yaw) Ry(pitch) Rx(roll), counter-clockwise from x.';
+COMMENT ON COLUMN true_stops.pitch_deg IS 'Rotation about y in the same product.';
+COMMENT ON COLUMN true_stops.roll_deg IS 'Rotation about x in the same product.';
 
 CREATE TABLE true_worlds (
     survey_id VARCHAR PRIMARY KEY,
@@ -55,6 +73,8 @@ CREATE TABLE true_worlds (
     about JSON NOT NULL
 );
 COMMENT ON TABLE true_worlds IS 'What else is known of a simulated world: its rig, seed and scenario; for comparison only, never an input of a job.';
+COMMENT ON COLUMN true_worlds.rig IS 'The true rig, NULL when unknown.';
+COMMENT ON COLUMN true_worlds.about IS 'Seed, scenario and the like.';
 
 CREATE TABLE rigs (
     rig_digest VARCHAR PRIMARY KEY,
@@ -62,6 +82,8 @@ CREATE TABLE rigs (
     rig JSON NOT NULL
 );
 COMMENT ON TABLE rigs IS 'Every rig that a run used, as JSON.';
+COMMENT ON COLUMN rigs.rig_digest IS 'First 16 hexadecimal digits of the SHA-256 of the canonical rig.';
+COMMENT ON COLUMN rigs.rig IS 'Mounting, laser table and offsets, with units in the keys.';
 
 CREATE TABLE recordings (
     recording_id VARCHAR PRIMARY KEY,
@@ -73,6 +95,13 @@ CREATE TABLE recordings (
     preflight JSON NOT NULL
 );
 COMMENT ON TABLE recordings IS 'Uploaded logs; recording_id is the SHA-256 of the bytes, verdict is ok, weak or refused, preflight says why.';
+COMMENT ON COLUMN recordings.recording_id IS 'SHA-256 of the bytes of the log.';
+COMMENT ON COLUMN recordings.name IS 'Stem of the name of the uploaded file.';
+COMMENT ON COLUMN recordings.size_bytes IS 'Length of the file.';
+COMMENT ON COLUMN recordings.uploaded_at IS 'When it came (UTC).';
+COMMENT ON COLUMN recordings.url IS 'Where the bytes are.';
+COMMENT ON COLUMN recordings.verdict IS 'ok, weak or refused.';
+COMMENT ON COLUMN recordings.preflight IS 'The whole preflight report.';
 
 CREATE TABLE jobs (
     job_id VARCHAR PRIMARY KEY,
@@ -92,6 +121,18 @@ CREATE TABLE jobs (
     error_traceback VARCHAR
 );
 COMMENT ON TABLE jobs IS 'Work asked for; status is accepted, running, successful, failed or dismissed.';
+COMMENT ON COLUMN jobs.kind IS 'What is done, for instance process.';
+COMMENT ON COLUMN jobs.config IS 'The effective configuration.';
+COMMENT ON COLUMN jobs.status IS 'accepted, running, successful, failed or dismissed.';
+COMMENT ON COLUMN jobs.progress_percent IS '0 to 100, as of this snapshot.';
+COMMENT ON COLUMN jobs.message IS 'What was being done last, for people.';
+COMMENT ON COLUMN jobs.attempts IS 'How often it was started.';
+COMMENT ON COLUMN jobs.created_at IS 'When it was asked for (UTC).';
+COMMENT ON COLUMN jobs.started_at IS 'When its last attempt began (UTC).';
+COMMENT ON COLUMN jobs.finished_at IS 'When it came to its end (UTC).';
+COMMENT ON COLUMN jobs.error_code IS 'Stable code of the error, for programs.';
+COMMENT ON COLUMN jobs.error_reason IS 'Why it failed, for people.';
+COMMENT ON COLUMN jobs.error_traceback IS 'Where in the code it failed.';
 
 CREATE TABLE runs (
     run_id VARCHAR PRIMARY KEY,
@@ -107,6 +148,13 @@ CREATE TABLE runs (
     peak_memory_bytes BIGINT
 );
 COMMENT ON TABLE runs IS 'A recording processed with one configuration by one version of the code.';
+COMMENT ON COLUMN runs.run_id IS 'The same in every table of results.';
+COMMENT ON COLUMN runs.config IS 'The effective configuration.';
+COMMENT ON COLUMN runs.config_digest IS 'First 16 hexadecimal digits of the SHA-256 of the canonical configuration.';
+COMMENT ON COLUMN runs.code_version IS 'Version of spheremark.';
+COMMENT ON COLUMN runs.finished_at IS 'When the numbers were there (UTC).';
+COMMENT ON COLUMN runs.duration_s IS 'Time from the log to the numbers.';
+COMMENT ON COLUMN runs.peak_memory_bytes IS 'Largest resident size of the process that made it.';
 
 CREATE TABLE stops (
     run_id VARCHAR NOT NULL,
@@ -123,6 +171,16 @@ CREATE TABLE stops (
     PRIMARY KEY (run_id, stop)
 );
 COMMENT ON TABLE stops IS 'One full scan of a run: how it was made and what weakens it.';
+COMMENT ON COLUMN stops.stop IS 'Name of the stop: that of the log, numbered when the log holds several.';
+COMMENT ON COLUMN stops.n_returns IS 'Returns that were stitched.';
+COMMENT ON COLUMN stops.coverage_deg IS 'Angle that the gimbal turned through, at most 360.';
+COMMENT ON COLUMN stops.duration_s IS 'Time from the first shot to the last.';
+COMMENT ON COLUMN stops.roll_deg IS 'Lean of the base in R_station_base = Ry(pitch) Rx(roll).';
+COMMENT ON COLUMN stops.pitch_deg IS 'Lean of the base in R_station_base = Ry(pitch) Rx(roll).';
+COMMENT ON COLUMN stops.sigma_levelling_deg IS 'Standard deviation of roll and of pitch.';
+COMMENT ON COLUMN stops.cloud_url IS 'Where the thinned cloud is; NULL when it was not kept.';
+COMMENT ON COLUMN stops.notes IS 'What weakens the results, for people.';
+COMMENT ON COLUMN stops.timings_s IS 'Time that each step took.';
 
 CREATE TABLE marker_fits (
     run_id VARCHAR NOT NULL,
@@ -163,6 +221,39 @@ CREATE TABLE marker_fits (
     PRIMARY KEY (run_id, stop, fit_method, marker)
 );
 COMMENT ON TABLE marker_fits IS 'Sphere centres in the station frame, one row per stop, marker and fitting method; covariances without levelling.';
+COMMENT ON COLUMN marker_fits.fit_method IS 'along_beam (ours) or paper (the study).';
+COMMENT ON COLUMN marker_fits.marker IS 'M01, M02 ... by azimuth, within one stop and method.';
+COMMENT ON COLUMN marker_fits.mark IS 'Control mark that it was matched to by the first resection method; NULL when to none.';
+COMMENT ON COLUMN marker_fits.status IS 'ok or weak.';
+COMMENT ON COLUMN marker_fits.reason IS 'Why it is weak; empty when it is not.';
+COMMENT ON COLUMN marker_fits.x_m IS 'Centre in the station frame.';
+COMMENT ON COLUMN marker_fits.y_m IS 'Centre in the station frame.';
+COMMENT ON COLUMN marker_fits.z_m IS 'Centre in the station frame, up.';
+COMMENT ON COLUMN marker_fits.cov_xx_m2 IS 'Covariance of the centre in the station frame, without levelling.';
+COMMENT ON COLUMN marker_fits.cov_xy_m2 IS 'Covariance of the centre in the station frame, without levelling.';
+COMMENT ON COLUMN marker_fits.cov_xz_m2 IS 'Covariance of the centre in the station frame, without levelling.';
+COMMENT ON COLUMN marker_fits.cov_yy_m2 IS 'Covariance of the centre in the station frame, without levelling.';
+COMMENT ON COLUMN marker_fits.cov_yz_m2 IS 'Covariance of the centre in the station frame, without levelling.';
+COMMENT ON COLUMN marker_fits.cov_zz_m2 IS 'Covariance of the centre in the station frame, without levelling.';
+COMMENT ON COLUMN marker_fits.sigma_3d_m IS 'Square root of the trace of the covariance.';
+COMMENT ON COLUMN marker_fits.range_m IS 'From the mean beam origin to the centre.';
+COMMENT ON COLUMN marker_fits.azimuth_deg IS 'Direction to the centre in the station frame, counter-clockwise from x.';
+COMMENT ON COLUMN marker_fits.elevation_deg IS 'Direction to the centre above the horizon of the station.';
+COMMENT ON COLUMN marker_fits.n_points IS 'Returns that carry the estimate.';
+COMMENT ON COLUMN marker_fits.n_rejected IS 'Returns of the candidate that were set aside.';
+COMMENT ON COLUMN marker_fits.n_rings IS 'Different lasers among the used returns; 0 when the log does not tell them.';
+COMMENT ON COLUMN marker_fits.coverage IS 'Share of the visible half of the sphere that has returns, 0 to 1.';
+COMMENT ON COLUMN marker_fits.rms_m IS 'Root mean square of the residuals (observed minus computed along the beam).';
+COMMENT ON COLUMN marker_fits.sigma0 IS 'Square root of the variance factor; 1 means noise as assumed.';
+COMMENT ON COLUMN marker_fits.radius_m IS 'Radius that was assumed.';
+COMMENT ON COLUMN marker_fits.radius_free_m IS 'Radius when estimated together with the centre; NULL when the returns do not tell.';
+COMMENT ON COLUMN marker_fits.sigma_radius_free_m IS 'Standard deviation of radius_free_m.';
+COMMENT ON COLUMN marker_fits.mean_intensity IS 'Mean reflectivity of the used returns, 0 to 255.';
+COMMENT ON COLUMN marker_fits.error_x_m IS 'Estimate minus truth along x of the station frame; NULL without truth or for a false marker.';
+COMMENT ON COLUMN marker_fits.error_y_m IS 'Estimate minus truth along y of the station frame.';
+COMMENT ON COLUMN marker_fits.error_z_m IS 'Estimate minus truth along z of the station frame, up.';
+COMMENT ON COLUMN marker_fits.error_radial_m IS 'Estimate minus truth along the line of sight; positive is too far.';
+COMMENT ON COLUMN marker_fits.error_3d_m IS 'Length of the error.';
 
 CREATE TABLE rejections (
     run_id VARCHAR NOT NULL,
@@ -175,6 +266,11 @@ CREATE TABLE rejections (
     reason VARCHAR NOT NULL
 );
 COMMENT ON TABLE rejections IS 'What looked like a marker at first, and the reason against.';
+COMMENT ON COLUMN rejections.x_m IS 'Where it is, in the station frame.';
+COMMENT ON COLUMN rejections.y_m IS 'Where it is, in the station frame.';
+COMMENT ON COLUMN rejections.z_m IS 'Where it is, in the station frame.';
+COMMENT ON COLUMN rejections.n_points IS 'Number of its returns.';
+COMMENT ON COLUMN rejections.reason IS 'Why it is not used, for people.';
 
 CREATE TABLE station_fixes (
     run_id VARCHAR NOT NULL,
@@ -217,6 +313,40 @@ CREATE TABLE station_fixes (
     PRIMARY KEY (run_id, stop, fit_method, resection_method)
 );
 COMMENT ON TABLE station_fixes IS 'Station poses in the site frame, one row per stop, fitting and resection method; status is ok, weak or failed.';
+COMMENT ON COLUMN station_fixes.resection_method IS 'How the station was positioned from its markers.';
+COMMENT ON COLUMN station_fixes.status IS 'ok, weak or failed.';
+COMMENT ON COLUMN station_fixes.reason IS 'Why it is weak or failed; empty when it is ok.';
+COMMENT ON COLUMN station_fixes.x_m IS 'Position of the station in the site frame; NULL when failed.';
+COMMENT ON COLUMN station_fixes.y_m IS 'Position of the station in the site frame.';
+COMMENT ON COLUMN station_fixes.z_m IS 'Position of the station in the site frame, up.';
+COMMENT ON COLUMN station_fixes.yaw_deg IS 'Heading of the x axis of the station in the site frame, counter-clockwise from x.';
+COMMENT ON COLUMN station_fixes.rotation IS 'R_site_station, nine numbers, rows first.';
+COMMENT ON COLUMN station_fixes.cov_xx_m2 IS 'Covariance of the position in the site frame.';
+COMMENT ON COLUMN station_fixes.cov_xy_m2 IS 'Covariance of the position in the site frame.';
+COMMENT ON COLUMN station_fixes.cov_xz_m2 IS 'Covariance of the position in the site frame.';
+COMMENT ON COLUMN station_fixes.cov_yy_m2 IS 'Covariance of the position in the site frame.';
+COMMENT ON COLUMN station_fixes.cov_yz_m2 IS 'Covariance of the position in the site frame.';
+COMMENT ON COLUMN station_fixes.cov_zz_m2 IS 'Covariance of the position in the site frame.';
+COMMENT ON COLUMN station_fixes.cov_motion IS 'Covariance of a small motion on the left (rotation in rad, translation in m, site frame), 36 numbers, rows first.';
+COMMENT ON COLUMN station_fixes.sigma_3d_m IS 'Square root of the trace of the covariance of the position.';
+COMMENT ON COLUMN station_fixes.sigma_yaw_deg IS 'Standard deviation of the heading.';
+COMMENT ON COLUMN station_fixes.ellipse_major_m IS 'Semi-major axis of the horizontal standard ellipse (1 sigma, 39 % of cases).';
+COMMENT ON COLUMN station_fixes.ellipse_minor_m IS 'Semi-minor axis of the horizontal standard ellipse.';
+COMMENT ON COLUMN station_fixes.ellipse_bearing_deg IS 'Bearing of the major axis, clockwise from y of the site frame, 0 to 180.';
+COMMENT ON COLUMN station_fixes.ellipse_major_95_m IS 'Semi-major axis of the horizontal 95 % ellipse.';
+COMMENT ON COLUMN station_fixes.ellipse_minor_95_m IS 'Semi-minor axis of the horizontal 95 % ellipse.';
+COMMENT ON COLUMN station_fixes.n_markers IS 'Markers that carry the fix.';
+COMMENT ON COLUMN station_fixes.dof IS 'Observations, gravity included, minus unknowns.';
+COMMENT ON COLUMN station_fixes.sigma0 IS 'Square root of the variance factor; NULL without redundancy.';
+COMMENT ON COLUMN station_fixes.passes_global_test IS 'Whether the variance factor agrees with 1; true without redundancy.';
+COMMENT ON COLUMN station_fixes.included_angle_min_deg IS 'Smallest 3-D angle at the station between two used marks.';
+COMMENT ON COLUMN station_fixes.included_angle_max_deg IS 'Largest 3-D angle at the station between two used marks.';
+COMMENT ON COLUMN station_fixes.error_x_m IS 'Estimate minus truth along x of the site frame; NULL without truth.';
+COMMENT ON COLUMN station_fixes.error_y_m IS 'Estimate minus truth along y of the site frame.';
+COMMENT ON COLUMN station_fixes.error_z_m IS 'Estimate minus truth along z of the site frame, up.';
+COMMENT ON COLUMN station_fixes.error_yaw_deg IS 'Estimate minus truth of the heading.';
+COMMENT ON COLUMN station_fixes.error_horizontal_m IS 'Length of the horizontal error.';
+COMMENT ON COLUMN station_fixes.error_3d_m IS 'Length of the error.';
 
 CREATE TABLE observations (
     run_id VARCHAR NOT NULL,
@@ -237,6 +367,15 @@ CREATE TABLE observations (
     PRIMARY KEY (run_id, stop, fit_method, resection_method, marker)
 );
 COMMENT ON TABLE observations IS 'One row per marker and fix: residuals in the site frame (observed minus computed), redundancy (of 3) and reliability.';
+COMMENT ON COLUMN observations.used IS 'Whether the marker carries the fix.';
+COMMENT ON COLUMN observations.reason IS 'Why it does not; empty when it does.';
+COMMENT ON COLUMN observations.residual_x_m IS 'Observed minus computed along x of the site frame; NULL when not used.';
+COMMENT ON COLUMN observations.residual_y_m IS 'Observed minus computed along y of the site frame.';
+COMMENT ON COLUMN observations.residual_z_m IS 'Observed minus computed along z of the site frame.';
+COMMENT ON COLUMN observations.redundancy IS 'Redundancy of its three coordinates together, 0 to 3.';
+COMMENT ON COLUMN observations.w IS 'Largest w-statistic of its coordinates; NULL where not testable.';
+COMMENT ON COLUMN observations.minimal_detectable_bias_m IS 'Smallest bias that the w-test would find with the power of the configuration; NULL where none is.';
+COMMENT ON COLUMN observations.external_reliability_m IS 'Shift of the station by a bias of that size, unseen; NULL where none is found.';
 
 CREATE TABLE resections (
     run_id VARCHAR NOT NULL,
@@ -254,6 +393,15 @@ CREATE TABLE resections (
     error_3d_m DOUBLE
 );
 COMMENT ON TABLE resections IS 'The station positioned from each pair of marks alone (with gravity), in the site frame.';
+COMMENT ON COLUMN resections.marks IS 'The control marks that were used.';
+COMMENT ON COLUMN resections.n_marks IS 'How many; 2 for pairs.';
+COMMENT ON COLUMN resections.included_angle_deg IS '3-D angle at the station between the two centres.';
+COMMENT ON COLUMN resections.included_angle_horizontal_deg IS 'The same in the levelled plane.';
+COMMENT ON COLUMN resections.sigma_3d_m IS 'Square root of the trace of the covariance of the position.';
+COMMENT ON COLUMN resections.x_m IS 'Position of the station in the site frame.';
+COMMENT ON COLUMN resections.y_m IS 'Position of the station in the site frame.';
+COMMENT ON COLUMN resections.z_m IS 'Position of the station in the site frame, up.';
+COMMENT ON COLUMN resections.error_3d_m IS 'Length of estimate minus truth; NULL without truth.';
 
 CREATE TABLE calibrations (
     calibration_id VARCHAR PRIMARY KEY,
@@ -265,6 +413,9 @@ CREATE TABLE calibrations (
     finished_at TIMESTAMPTZ NOT NULL
 );
 COMMENT ON TABLE calibrations IS 'Rigs estimated from scans: parameters in SI units, their covariance, and the resulting rig.';
+COMMENT ON COLUMN calibrations.rig_digest IS 'The resulting rig.';
+COMMENT ON COLUMN calibrations.parameters IS 'Names of the parameters, in SI units.';
+COMMENT ON COLUMN calibrations.covariance IS 'Their covariance, rows in the order of parameters.';
 
 CREATE TABLE adjustments (
     adjustment_id VARCHAR PRIMARY KEY,
@@ -278,6 +429,9 @@ CREATE TABLE adjustments (
     finished_at TIMESTAMPTZ NOT NULL
 );
 COMMENT ON TABLE adjustments IS 'Networks of stations and marks adjusted together.';
+COMMENT ON COLUMN adjustments.dof IS 'Observations minus unknowns.';
+COMMENT ON COLUMN adjustments.sigma0 IS 'Square root of the variance factor.';
+COMMENT ON COLUMN adjustments.passes_global_test IS 'Whether the variance factor agrees with 1.';
 
 CREATE TABLE placements (
     placement_id VARCHAR NOT NULL,
@@ -291,6 +445,10 @@ CREATE TABLE placements (
     PRIMARY KEY (placement_id, stop)
 );
 COMMENT ON TABLE placements IS 'Predicted accuracy per stop of a marker arrangement, and what was achieved once surveyed.';
+COMMENT ON COLUMN placements.model_version IS 'Version of the accuracy model.';
+COMMENT ON COLUMN placements.sigma_3d_m IS 'Predicted: square root of the trace of the covariance of the position.';
+COMMENT ON COLUMN placements.probability_within_tolerance IS 'Predicted probability that the 3-D error is within the tolerance, 0 to 1.';
+COMMENT ON COLUMN placements.error_3d_m IS 'Achieved error of the station, once surveyed.';
 
 CREATE VIEW latest_runs AS
 SELECT * FROM runs
@@ -316,6 +474,17 @@ SELECT survey_id, survey, fit_method, floor(range_m) AS range_from_m, floor(rang
     avg(error_radial_m) AS error_radial_mean_m
 FROM latest_marker_fits GROUP BY ALL ORDER BY ALL;
 COMMENT ON VIEW accuracy_by_distance IS 'Errors of sphere centres in bins of 1 m of distance, newest runs.';
+COMMENT ON COLUMN accuracy_by_distance.range_from_m IS 'Lower end of the bin, included.';
+COMMENT ON COLUMN accuracy_by_distance.range_to_m IS 'Upper end of the bin, excluded.';
+COMMENT ON COLUMN accuracy_by_distance.n_fits IS 'Fits in the bin.';
+COMMENT ON COLUMN accuracy_by_distance.mean_n_points IS 'Mean number of returns of a fit.';
+COMMENT ON COLUMN accuracy_by_distance.error_radial_mean_m IS 'Mean error along the line of sight; positive is too far.';
+COMMENT ON COLUMN accuracy_by_distance.n_errors IS 'Fits whose error is known.';
+COMMENT ON COLUMN accuracy_by_distance.sigma_3d_rms_m IS 'Predicted: root mean square of sigma_3d_m.';
+COMMENT ON COLUMN accuracy_by_distance.error_3d_mean_m IS 'Mean error; the study publishes this one.';
+COMMENT ON COLUMN accuracy_by_distance.error_3d_rms_m IS 'Root mean square error.';
+COMMENT ON COLUMN accuracy_by_distance.error_3d_p95_m IS '95th percentile of the error; the tolerance holds when it is at most that.';
+COMMENT ON COLUMN accuracy_by_distance.error_3d_max_m IS 'Largest error.';
 
 CREATE VIEW accuracy_by_point_count AS
 SELECT survey_id, survey, fit_method, 20 * (n_points // 20) AS n_points_from,
@@ -326,6 +495,16 @@ SELECT survey_id, survey, fit_method, 20 * (n_points // 20) AS n_points_from,
     quantile_cont(error_3d_m, 0.95) AS error_3d_p95_m, max(error_3d_m) AS error_3d_max_m
 FROM latest_marker_fits GROUP BY ALL ORDER BY ALL;
 COMMENT ON VIEW accuracy_by_point_count IS 'Errors of sphere centres in bins of 20 returns, newest runs.';
+COMMENT ON COLUMN accuracy_by_point_count.n_points_from IS 'Lower end of the bin, included.';
+COMMENT ON COLUMN accuracy_by_point_count.n_points_to IS 'Upper end of the bin, excluded.';
+COMMENT ON COLUMN accuracy_by_point_count.n_fits IS 'Fits in the bin.';
+COMMENT ON COLUMN accuracy_by_point_count.mean_range_m IS 'Mean distance of the fits.';
+COMMENT ON COLUMN accuracy_by_point_count.n_errors IS 'Fits whose error is known.';
+COMMENT ON COLUMN accuracy_by_point_count.sigma_3d_rms_m IS 'Predicted: root mean square of sigma_3d_m.';
+COMMENT ON COLUMN accuracy_by_point_count.error_3d_mean_m IS 'Mean error; the study publishes this one.';
+COMMENT ON COLUMN accuracy_by_point_count.error_3d_rms_m IS 'Root mean square error.';
+COMMENT ON COLUMN accuracy_by_point_count.error_3d_p95_m IS '95th percentile of the error; the tolerance holds when it is at most that.';
+COMMENT ON COLUMN accuracy_by_point_count.error_3d_max_m IS 'Largest error.';
 
 CREATE VIEW accuracy_by_included_angle AS
 SELECT r.survey_id, s.name AS survey, x.fit_method, x.resection_method, x.n_marks,
@@ -338,6 +517,16 @@ SELECT r.survey_id, s.name AS survey, x.fit_method, x.resection_method, x.n_mark
 FROM resections AS x JOIN latest_runs AS r USING (run_id) JOIN surveys AS s USING (survey_id)
 GROUP BY ALL ORDER BY ALL;
 COMMENT ON VIEW accuracy_by_included_angle IS 'Errors of stations positioned from pairs of marks in bins of 10 degrees of included angle, newest runs.';
+COMMENT ON COLUMN accuracy_by_included_angle.n_marks IS 'Marks per position; 2 for pairs.';
+COMMENT ON COLUMN accuracy_by_included_angle.included_angle_from_deg IS 'Lower end of the bin, included.';
+COMMENT ON COLUMN accuracy_by_included_angle.included_angle_to_deg IS 'Upper end of the bin, excluded.';
+COMMENT ON COLUMN accuracy_by_included_angle.n_resections IS 'Positions in the bin.';
+COMMENT ON COLUMN accuracy_by_included_angle.n_errors IS 'Positions whose error is known.';
+COMMENT ON COLUMN accuracy_by_included_angle.sigma_3d_rms_m IS 'Predicted: root mean square of sigma_3d_m.';
+COMMENT ON COLUMN accuracy_by_included_angle.error_3d_mean_m IS 'Mean error; the study publishes this one.';
+COMMENT ON COLUMN accuracy_by_included_angle.error_3d_rms_m IS 'Root mean square error.';
+COMMENT ON COLUMN accuracy_by_included_angle.error_3d_p95_m IS '95th percentile of the error; the tolerance holds when it is at most that.';
+COMMENT ON COLUMN accuracy_by_included_angle.error_3d_max_m IS 'Largest error.';
 
 CREATE VIEW accuracy_by_stop AS
 SELECT m.survey_id, m.survey, m.stop, m.fit_method, m.n_fits, m.mean_range_m,
@@ -354,3 +543,12 @@ FROM (
 LEFT JOIN latest_station_fixes AS f USING (survey_id, recording_id, stop, fit_method)
 ORDER BY m.survey, m.stop, m.fit_method;
 COMMENT ON VIEW accuracy_by_stop IS 'Mean error of the sphere centres and error of the station per stop, newest runs.';
+COMMENT ON COLUMN accuracy_by_stop.n_fits IS 'Markers of the stop.';
+COMMENT ON COLUMN accuracy_by_stop.mean_range_m IS 'Mean distance of its markers.';
+COMMENT ON COLUMN accuracy_by_stop.marker_error_3d_mean_m IS 'Mean error of its sphere centres.';
+COMMENT ON COLUMN accuracy_by_stop.marker_error_3d_max_m IS 'Largest error of its sphere centres.';
+COMMENT ON COLUMN accuracy_by_stop.marker_sigma_3d_rms_m IS 'Predicted: root mean square of sigma_3d_m of its centres.';
+COMMENT ON COLUMN accuracy_by_stop.status IS 'Status of the station: ok, weak or failed.';
+COMMENT ON COLUMN accuracy_by_stop.n_markers IS 'Markers that carry the station.';
+COMMENT ON COLUMN accuracy_by_stop.station_sigma_3d_m IS 'Predicted error of the station.';
+COMMENT ON COLUMN accuracy_by_stop.station_error_3d_m IS 'Error of the station.';
