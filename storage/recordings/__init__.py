@@ -7,7 +7,8 @@ recording, and no length that it declares is believed before it is checked.
 """
 
 from storage.recordings.container import file_digest
+from storage.recordings.preflight import Preflight, TopicReport, inspect_log
 from storage.recordings.reading import read_log
 from storage.recordings.writing import write_log
 
-__all__ = ["file_digest", "read_log", "write_log"]
+__all__ = ["Preflight", "TopicReport", "file_digest", "inspect_log", "read_log", "write_log"]

@@ -132,6 +132,10 @@ class Container:
         """Length of the file [bytes]."""
         return len(self.octets)
 
+    def topics(self) -> dict[str, str]:
+        """Return the message type of each topic, as far as the walk has come."""
+        return {channel.topic: channel.schema for channel in self.channels.values()}
+
     def batches(self) -> Iterator[Batch]:
         """Give all messages, in the order of the file.
 

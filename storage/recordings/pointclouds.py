@@ -278,6 +278,7 @@ class PointClouds:
         shifts = np.array(kept.log_times_ns, np.int64) - np.array(kept.spans_ns, np.int64)
         if shifts.any():
             self._stamps[: self._n] += np.repeat(shifts, self._counts())
+            kept.stamps_ns = shifts.tolist()
             notes.append(f"{self._topic} has no stamps; the times of recording are used.")
         return shifts
 

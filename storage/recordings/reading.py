@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Collection
 from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
 from pathlib import Path, PurePosixPath
@@ -15,7 +15,7 @@ from pipelines.errors import MissingGimbalAngleError, MissingLidarError, Recordi
 from pipelines.values import RING_UNKNOWN, ImuMount, Nanos, Origin, Rig, ScanLog
 from storage.recordings import joint_states, orientations, pointclouds, transforms
 from storage.recordings.cdr import definition_agrees
-from storage.recordings.container import Channel, Container, file_digest, opened
+from storage.recordings.container import Batch, Channel, file_digest, opened
 from storage.recordings.families import LidarDecoder, Returns, Series, SeriesDecoder
 from storage.recordings.frames import FrameTree, recorded_rig
 
@@ -41,8 +41,50 @@ _UPRIGHT = 0.1  # sine of half the tilt that a gimbal's transform may have off i
 
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
-class _Decoders:
-    """The decoders of one recording of some size [bytes], by role and topic."""
+class Choice:
+    """What a caller wants of a recording.
+
+    Attributes
+    ----------
+    topics : collection of str or None
+        Topics to use for the roles that they can play.
+    joint : str or None
+        Name of the gimbal's joint.
+    """
+
+    topics: Collection[str] | None = None
+    joint: str | None = None
+
+    def check(self, found: dict[str, str]) -> None:
+        """Refuse names of topics that are not there."""
+        missing = sorted(set(self.topics or ()) - set(found))
+        if missing:
+            raise RecordingError(
+                f"The recording has no topic {missing[0]}; it has {_listed(found)}. Topics are "
+                "named exactly as they were recorded."
+            )
+
+    def among(self, decoders: dict[str, _T]) -> dict[str, _T]:
+        """Return the decoders of the topics that are named, or all if none of them is."""
+        named = {topic: one for topic, one in decoders.items() if topic in (self.topics or ())}
+        return named or decoders
+
+
+@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
+class Decoders:
+    """What takes the messages of one recording, by role and topic.
+
+    Attributes
+    ----------
+    size : int
+        Length of the file [bytes].
+    lidars, joints, frames, ahrs : dict of str to decoder
+        By topic.
+    by_channel : dict of Channel to decoder or None
+        None for channels of no use.
+    notes : list of str
+        What was left out, as sentences for people.
+    """
 
     size: int
     lidars: dict[str, LidarDecoder] = field(default_factory=dict)
@@ -52,11 +94,13 @@ class _Decoders:
     by_channel: dict[Channel, LidarDecoder | SeriesDecoder | None] = field(default_factory=dict)
     notes: list[str] = field(default_factory=list)
 
-    def of(self, channel: Channel) -> LidarDecoder | SeriesDecoder | None:
-        """Return the decoder of a channel, if its messages are of use."""
-        if channel not in self.by_channel:
-            self.by_channel[channel] = self._find(channel)
-        return self.by_channel[channel]
+    def add(self, batch: Batch) -> None:
+        """Hand a batch to the decoder of its channel, if its messages are of use."""
+        if batch.channel not in self.by_channel:
+            self.by_channel[batch.channel] = self._find(batch.channel)
+        decoder = self.by_channel[batch.channel]
+        if decoder is not None:
+            decoder.add(batch)
 
     def _find(self, channel: Channel) -> LidarDecoder | SeriesDecoder | None:
         """Make the decoder of a channel, or take that of its topic."""
@@ -82,7 +126,7 @@ class _Decoders:
 def read_log(
     url: str | Path,
     *,
-    topics: Iterable[str] | None = None,
+    topics: Collection[str] | None = None,
     joint: str | None = None,
     digest: str = "",
 ) -> ScanLog:
@@ -92,7 +136,7 @@ def read_log(
     ----------
     url : str or Path
         A path, or any address that fsspec knows.
-    topics : iterable of str, optional
+    topics : collection of str, optional
         Topics to use. Where one is named for a role (LiDAR, joint, frames, AHRS), others in that
         role are ignored; roles without a named topic are found by their message types.
     joint : str, optional
@@ -125,45 +169,69 @@ def read_log(
     -----
     One walk over the mapped file; memory is that of the result. Cost grows linearly with the file.
     """
-    wanted = None if topics is None else frozenset(topics)
     with opened(url) as container:
-        decoders = _decode(container)
-        found = {channel.topic: channel.schema for channel in container.channels.values()}
-    name = PurePosixPath(str(url)).stem
-    origin = Origin(name=name, digest=digest or file_digest(url))
-    return _assemble(decoders, wanted, joint, found, origin)
+        decoders = Decoders(size=container.size)
+        for batch in container.batches():
+            decoders.add(batch)
+        found = container.topics()
+    origin = Origin(name=stem(url), digest=digest or file_digest(url))
+    return assemble(decoders, found, Choice(topics=topics, joint=joint), origin)
 
 
-def _decode(container: Container) -> _Decoders:
-    """Walk the file and hand each batch to its decoder."""
-    decoders = _Decoders(size=container.size)
-    for batch in container.batches():
-        decoder = decoders.of(batch.channel)
-        if decoder is not None:
-            decoder.add(batch)
-    return decoders
+def stem(url: str | Path) -> str:
+    """Return the name of a recording: that of its file, without the ending.
+
+    Parameters
+    ----------
+    url : str or Path
+        Where it is.
+
+    Returns
+    -------
+    str
+        The name.
+    """
+    return PurePosixPath(str(url)).stem
 
 
-def _assemble(
-    decoders: _Decoders,
-    wanted: frozenset[str] | None,
-    joint: str | None,
-    found: dict[str, str],
-    origin: Origin,
-) -> ScanLog:
-    """Choose among what was decoded and build the log."""
-    _require(wanted or frozenset(), found)
-    returns, notes = _choose_lidar(_chosen(decoders.lidars, wanted), found)
+def assemble(decoders: Decoders, found: dict[str, str], choice: Choice, origin: Origin) -> ScanLog:
+    """Choose among what was decoded and build the log.
+
+    Parameters
+    ----------
+    decoders : Decoders
+        What took the messages.
+    found : dict of str to str
+        Message type of each topic.
+    choice : Choice
+        What the caller wants of it.
+    origin : Origin
+        Name and digest of the recording.
+
+    Returns
+    -------
+    ScanLog
+        The log.
+
+    Raises
+    ------
+    RecordingError
+        As ``read_log`` says.
+    """
+    choice.check(found)
+    returns, lidar_notes = _choose_lidar(choice.among(decoders.lidars), found)
     tree = FrameTree()
-    for series in _all_series(_chosen(decoders.frames, wanted)):
+    for series in _all_series(choice.among(decoders.frames)):
         tree.add(series)
-    imu = _choose_ahrs(_all_series(_chosen(decoders.ahrs, wanted)))
+    imu = _choose_ahrs(_all_series(choice.among(decoders.ahrs)))
     rig, rig_notes = recorded_rig(tree, returns.frame, imu.names[0] if imu else None)
-    joints = _all_series(_chosen(decoders.joints, wanted))
-    gimbal = _choose_gimbal(joints, joint, tree, returns.frame)
+    joints = _all_series(choice.among(decoders.joints))
+    gimbal = _choose_gimbal(joints, choice.joint, tree, returns.frame)
     if gimbal is None:
         gimbal = _angle_of_ahrs(imu, rig, joints, found)
     _require_overlap(returns, gimbal)
+    imu_notes = imu.notes if imu else ()
+    notes = (*decoders.notes, *lidar_notes, *returns.notes, *gimbal.notes, *imu_notes, *rig_notes)
     return ScanLog(
         p_lidar=returns.p_lidar,
         intensities=returns.intensities,
@@ -176,36 +244,13 @@ def _assemble(
         stamps_imu_ns=imu.stamps_ns if imu else np.empty(0, np.int64),
         rig=rig,
         origin=origin,
-        notes=(
-            *decoders.notes,
-            *notes,
-            *returns.notes,
-            *gimbal.notes,
-            *(imu.notes if imu and imu is not gimbal else ()),
-            *rig_notes,
-        ),
+        notes=tuple(dict.fromkeys(notes)),
     )
-
-
-def _require(wanted: frozenset[str], found: dict[str, str]) -> None:
-    """Refuse names of topics that are not there."""
-    missing = sorted(wanted - set(found))
-    if missing:
-        raise RecordingError(
-            f"The recording has no topic {missing[0]}; it has {_listed(found)}. Topics are named "
-            "exactly as they were recorded."
-        )
 
 
 def _listed(found: dict[str, str]) -> str:
     """Return topics with their message types as a phrase."""
     return ", ".join(f"{t} ({s or 'no type'})" for t, s in sorted(found.items())) or "no topics"
-
-
-def _chosen(decoders: dict[str, _T], wanted: frozenset[str] | None) -> dict[str, _T]:
-    """Return the decoders of the topics that were named, or all if none of them was."""
-    named = {topic: one for topic, one in decoders.items() if wanted and topic in wanted}
-    return named or decoders
 
 
 def _all_series(decoders: dict[str, SeriesDecoder]) -> list[Series]:
