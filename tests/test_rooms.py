@@ -115,7 +115,7 @@ def test_every_number_of_the_database_carries_its_unit():
     units = ("_m", "_m2", "_deg", "_s", "_percent", "_bytes", "_rad", "_db")
     unitless = re.compile(
         r"^(n_|dof$|sigma0$|redundancy$|w$|coverage$|attempts$|mean_(n_points|intensity)$"
-        r"|number$|probability_|cov_motion$|n_points_(from|to)$)"
+        r"|number$|place$|probability_|cov_motion$|rotation$|n_points_(from|to)$)"
     )
     query = """SELECT table_name, column_name FROM duckdb_columns() WHERE NOT internal
         AND (data_type LIKE 'DOUBLE%' OR data_type LIKE '%INT%')"""
