@@ -110,12 +110,22 @@ class FittingConfig:
     ----------
     methods : tuple of str
         Fitting methods to run, of ``FITTING_METHODS``; the first is the one that counts.
+    sigma_range_bias : float
+        Standard deviation of what each laser measures too long, before the scan is seen [m].
+        0.003: what remains of the maker's bound of 0.03 after its own calibration.
+    sigma_direction : float
+        Standard deviation of a beam's direction per axis [rad]. 1e-4: azimuth in steps of 0.01 deg,
+        encoder and timing.
     """
 
     methods: tuple[str, ...] = FITTING_METHODS
+    sigma_range_bias: float = 0.003
+    sigma_direction: float = 1e-4
 
     def __post_init__(self) -> None:
         _check_methods("fitting.methods", self.methods, FITTING_METHODS)
+        _check("fitting.sigma_range_bias", self.sigma_range_bias, 1e-6, 0.05)
+        _check("fitting.sigma_direction", self.sigma_direction, 0.0, 0.01)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -1,0 +1,65 @@
+"""Candidate -> marker centre with covariance, by named methods.
+
+Hides how a centre is estimated. A method takes all candidates of a stop together, because they
+share the noise and the lasers of one sensor: ``along_beam`` is maximum likelihood with the range
+of each beam's footprint, ``paper`` is the study's registration of a hemisphere by ICP.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+from pipelines.config import FittingConfig
+from pipelines.errors import ConfigError
+from pipelines.fitting import along_beam, paper
+from pipelines.values import MarkerCandidates, MarkerFit, MarkerFits, Rejection, StitchedCloud
+
+Method = Callable[
+    [StitchedCloud, MarkerCandidates, FittingConfig, float],
+    tuple[tuple[MarkerFit, ...], tuple[Rejection, ...]],
+]
+METHODS: dict[str, Method] = {along_beam.NAME: along_beam.fit, paper.NAME: paper.fit}
+
+
+def fit_markers(
+    method: str,
+    cloud: StitchedCloud,
+    candidates: MarkerCandidates,
+    config: FittingConfig,
+    marker_radius: float,
+) -> MarkerFits:
+    """Estimate the centres of a stop's markers by one method.
+
+    Parameters
+    ----------
+    method : str
+        One of ``METHODS``.
+    cloud : StitchedCloud
+        The stop.
+    candidates : MarkerCandidates
+        What extraction found in it.
+    config : FittingConfig
+        Prior noise.
+    marker_radius : float
+        Radius of the spheres [m].
+
+    Returns
+    -------
+    MarkerFits
+        Centres in the order of the candidates; refused candidates, of the extraction and of the
+        method, with reasons. There may be no fits at all.
+
+    Raises
+    ------
+    ConfigError
+        If the method is unknown.
+    """
+    if method not in METHODS:
+        raise ConfigError(f"Fitting method {method!r} is unknown; known: {', '.join(METHODS)}.")
+    fits, rejected = METHODS[method](cloud, candidates, config, marker_radius)
+    return MarkerFits(
+        method=method,
+        fits=fits,
+        rejected=candidates.rejected + rejected,
+        levelling=cloud.levelling,
+    )

@@ -1,0 +1,461 @@
+"""Centres by maximum likelihood along the beams, all markers of a stop together.
+
+Hides noise, outliers and laser biases. The markers of a stop share what one marker alone cannot
+tell: the noise of this sensor today, and what each laser measures too long.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import NamedTuple
+
+import numpy as np
+
+from pipelines.config import FittingConfig
+from pipelines.fitting.footprint import Prediction, predict, share_of_outline
+from pipelines.geometry import levelling_rotation
+from pipelines.stitching import beams
+from pipelines.values import (
+    RING_UNKNOWN,
+    Array,
+    Beams,
+    Index,
+    MarkerCandidate,
+    MarkerCandidates,
+    MarkerFit,
+    Mask,
+    Rejection,
+    Status,
+    StitchedCloud,
+)
+
+NAME = "along_beam"
+
+# Range noise of a VLP-16 by reflectivity, from recorded packets [m]: a prior, for the ratio between
+# dark and bright; its size is estimated from the stop.
+_REFLECTIVITIES = np.array([1.0, 5.0, 15.0, 40.0, 100.0])
+_SIGMAS = np.array([0.0137, 0.0107, 0.0089, 0.0067, 0.0064])
+_FACTOR_MIN = 0.08  # of the prior noise: 2 mm quantisation alone gives as much
+_FACTOR_START = 3.0  # the largest noise that a VLP-16 shows, 25 mm
+
+_TUKEY = 6.0  # sigmas at which a return has no weight; 98 % efficient on clean data
+_EXPECTED_SQUARE = 0.8449  # mean of weight times square of normal residuals: 1 - 6/c^2 + 15/c^4
+_EFFICIENCY = (
+    0.9651  # variance of the estimate over the inverse normal matrix: E[w^2 x^2]E[w]/E[.]^2
+)
+_POLE_BEGINS = 0.97  # radii below the centre: a footprint that reaches lower may be on the pole
+_POLE_HALF = 0.45  # radii from the vertical through the centre within which the pole is
+_SPREAD_MIN = 1e-5  # [m] of the laser biases: keeps their prior invertible
+_N_STEPS_FREE = 4
+_FEW = 0.0
+_N_STEPS = 12
+_N_STEPS_GATED = 6  # after these the choice of returns by their place stays as it is
+_STEP_MAX = 0.25  # radii per step
+_STRAY = 0.6  # radii that a centre may move from its rough place
+_N_MIN = 4  # returns: one more than unknowns
+_LIT_MIN = 0.2  # share of a footprint below which a return counts less, down to nothing
+_DOF_STOP = 100.0  # returns that the stop's noise is worth when a marker's own is judged
+_DOF_BIAS = 2.0  # lasers that the prior of the biases is worth when their spread is estimated
+
+_N_GOOD = 20  # returns below which a centre is called weak
+_COVERAGE_GOOD = 0.6
+_RADIUS_SIGMAS = 3.0
+_RADIUS_SLACK = 0.006  # [m] by which a free radius may be off whatever its sigma
+_NOISE_FACTOR = 1.6  # of the stop's noise, above which a marker is called weak
+
+
+class _Shots(NamedTuple):
+    """The returns of all candidates in one table.
+
+    Attributes
+    ----------
+    beams : Beams
+        Their beams.
+    rows : (n,)
+        Rows of the cloud.
+    which : (n,)
+        The candidate of each.
+    sigmas : (n,)
+        Prior noise [m].
+    lasers : (n,)
+        Place of each return's laser among those that occur.
+    sigma_biases : (k,)
+        Prior standard deviation of what each of those measures too long [m].
+    up : (3,)
+        Upward unit vector.
+    """
+
+    beams: Beams
+    rows: Index
+    which: Index
+    sigmas: Array
+    lasers: Index
+    sigma_biases: Array
+    up: Array
+
+
+class _State(NamedTuple):
+    """Where the estimate stands.
+
+    Attributes
+    ----------
+    centres : (m, 3)
+        Centres [m].
+    biases : (k,)
+        What each laser measures too long [m].
+    spread : (k,)
+        Their standard deviations, as estimated [m].
+    has_biases : bool
+        Whether biases are estimated already.
+    factor : float
+        Noise in units of the prior.
+    cov_noise, cov_biases : (m, 3, 3)
+        Covariances of the centres by noise and by biases, for a factor of 1 [m^2].
+    """
+
+    centres: Array
+    biases: Array
+    spread: Array
+    has_biases: bool
+    factor: float
+    cov_noise: Array
+    cov_biases: Array
+
+
+class _Estimate(NamedTuple):
+    """A state with what each return says of it: prediction, residuals [m], sigmas [m], weights."""
+
+    state: _State
+    prediction: Prediction
+    residuals: Array
+    sigmas: Array
+    weights: Array
+
+
+def fit(
+    cloud: StitchedCloud, found: MarkerCandidates, config: FittingConfig, radius: float
+) -> tuple[tuple[MarkerFit, ...], tuple[Rejection, ...]]:
+    """Fit all candidates of a stop along their beams, with known radius.
+
+    Parameters
+    ----------
+    cloud : StitchedCloud
+        The stop.
+    found : MarkerCandidates
+        Groups of returns with rough centres good to a few centimetres.
+    config : FittingConfig
+        Prior noise of direction and laser bias.
+    radius : float
+        Radius of the spheres [m].
+
+    Returns
+    -------
+    fits : tuple of MarkerFit
+        Centres with covariances and diagnostics.
+    rejected : tuple of Rejection
+        Candidates that no sphere of this radius explains, with the reason.
+
+    Notes
+    -----
+    Along the beam the residual of a known radius has one minimum (Franaszek, Cheok, Saidi,
+    Witzgall, 2009). Iteratively reweighted Gauss-Newton with Tukey's weight; the noise factor
+    is pooled over the stop, and laser biases are random effects of all markers together, whose
+    spread is estimated by expectation maximisation. Each step costs one pass over the returns.
+    """
+    if not found.candidates:
+        return (), ()
+    shots = _gather(cloud, found.candidates, config)
+    rough = np.array([c.p_base_rough for c in found.candidates])
+    estimate = _estimate(shots, rough, config, radius)
+    free = np.column_stack(_free_radii(shots, estimate, radius)).tolist()
+    results = [
+        _judged(shots, estimate, k, candidate, tuple(free[k]), radius)
+        for k, candidate in enumerate(found.candidates)
+    ]
+    fits = tuple(r for r in results if isinstance(r, MarkerFit))
+    return fits, tuple(r for r in results if isinstance(r, Rejection))
+
+
+def _gather(
+    cloud: StitchedCloud, candidates: tuple[MarkerCandidate, ...], config: FittingConfig
+) -> _Shots:
+    """Return the members of all candidates as one table of shots."""
+    rows = np.concatenate([c.members for c in candidates])
+    which = np.repeat(np.arange(len(candidates)), [len(c.members) for c in candidates])
+    table = beams(cloud, rows)
+    lasers, places = np.unique(table.rings, return_inverse=True)
+    # returns of unknown lasers come from all sixteen: their common part is what is left of a bias
+    sigma = np.where(lasers == RING_UNKNOWN, config.sigma_range_bias / 4.0, config.sigma_range_bias)
+    return _Shots(
+        beams=table,
+        rows=rows,
+        which=which,
+        sigmas=np.interp(table.intensities, _REFLECTIVITIES, _SIGMAS),
+        lasers=places.astype(np.intp),
+        sigma_biases=sigma,
+        up=levelling_rotation(cloud.levelling)[2],
+    )
+
+
+def _summed(values: Array, place: Index, n_places: int) -> Array:
+    """Return the sums of rows, (n, ...), that share a place."""
+    flat = values.reshape(len(values), -1)
+    sums = [np.bincount(place, column, n_places) for column in flat.T]
+    return np.asarray(np.stack(sums, axis=1).reshape(n_places, *values.shape[1:]))
+
+
+def _in_play(shots: _Shots, prediction: Prediction, radius: float) -> Mask:
+    """Tell which returns may be the sphere by their place: on its outline, and not on its pole."""
+    beams = shots.beams
+    u, a = beams.directions_base, beams.across_base
+    b = np.cross(u, a)
+    v_up = shots.up - (u @ shots.up)[:, None] * u
+    v_up /= np.linalg.norm(v_up, axis=1, keepdims=True)
+    axes = np.stack([np.einsum("ij,ij->i", a, v_up), np.einsum("ij,ij->i", b, v_up)], axis=1)
+    half_widths = 0.5 * beams.ranges[:, None] * beams.divergence
+    blur = np.linalg.norm(half_widths * axes, axis=1)
+    along = np.einsum("ij,ij->i", prediction.offsets, axes)
+    across = prediction.offsets[:, 0] * axes[:, 1] - prediction.offsets[:, 1] * axes[:, 0]
+    is_pole = (along - blur < -_POLE_BEGINS * radius) & (
+        np.abs(across) < _POLE_HALF * radius + blur
+    )
+    return np.asarray((prediction.lit > 0.0) & ~is_pole)
+
+
+def _sigmas(shots: _Shots, prediction: Prediction, config: FittingConfig) -> Array:
+    """Return the prior noise of each range: its own, and that of the direction on a slope [m]."""
+    J = prediction.J[:, :3]
+    along = np.einsum("ij,ij->i", J, shots.beams.directions_base)
+    slopes2 = np.maximum(np.einsum("ij,ij->i", J, J) - along**2, 0.0)
+    lateral = config.sigma_direction * shots.beams.ranges
+    return np.asarray(np.sqrt(shots.sigmas**2 + lateral**2 * slopes2))
+
+
+def _tukey(scaled: Array) -> Array:
+    """Return Tukey's weights of residuals in units of their sigma."""
+    return np.where(np.abs(scaled) < _TUKEY, (1.0 - (scaled / _TUKEY) ** 2) ** 2, 0.0)
+
+
+def _factor(scaled: Array, weights: Array, n_unknowns: int, dof_prior: float) -> float:
+    """Return the noise in units of the prior from weighted residuals, robustly and consistently."""
+    dof = max(float(np.sum(weights > 0.0)) - n_unknowns, 1.0 - dof_prior)
+    total = float(np.sum(weights * scaled**2)) / _EXPECTED_SQUARE
+    return max(float(np.sqrt((total + dof_prior) / (dof + dof_prior))), _FACTOR_MIN)
+
+
+class _Normals(NamedTuple):
+    """Normal equations: H, G, D by centre and by laser, and their right-hand sides g, d."""
+
+    H: Array
+    G: Array
+    D: Array
+    g: Array
+    d: Array
+
+
+def _normals(shots: _Shots, J: Array, estimate: _Estimate, n_markers: int) -> _Normals:
+    """Sum the normal equations of centres and biases."""
+    k, residuals = len(shots.sigma_biases), estimate.residuals
+    W = estimate.weights / estimate.sigmas**2
+    pair = shots.which * k + shots.lasers
+    H = _summed(W[:, None, None] * J[:, :, None] * J[:, None, :], shots.which, n_markers)
+    G = _summed(W[:, None] * J, pair, n_markers * k).reshape(n_markers, k, -1)
+    g = _summed((W * residuals)[:, None] * J, shots.which, n_markers)
+    D = np.bincount(shots.lasers, W, k)
+    return _Normals(H, G.transpose(0, 2, 1), D, g, np.bincount(shots.lasers, W * residuals, k))
+
+
+def _stepped(state: _State, N: _Normals, prior: Array, radius: float) -> _State:
+    """Return the state after one Gauss-Newton step of all centres and biases together.
+
+    The centres are eliminated first (Schur's complement), so that the cost is linear in markers. A
+    prior of a metre on each centre keeps the equations solvable and is not felt otherwise.
+    """
+    variance = state.factor**2
+    H_inv = np.linalg.inv(N.H + variance * np.eye(3))
+    spread2 = np.maximum(state.spread, _SPREAD_MIN) ** 2
+    HG = H_inv @ N.G
+    S = np.diag(N.D + variance / spread2) - np.einsum("mik,mij->kj", N.G, HG)
+    S_inv = np.linalg.inv(S)
+    pull = N.d - variance * state.biases / spread2 - np.einsum("mik,mi->k", HG, N.g)
+    d_biases = S_inv @ pull * state.has_biases
+    d_centres = np.einsum("mij,mj->mi", H_inv, N.g - N.G @ d_biases)
+    lengths = np.linalg.norm(d_centres, axis=1, keepdims=True)
+    d_centres *= np.minimum(1.0, _STEP_MAX * radius / np.maximum(lengths, 1e-12))
+    biases = state.biases + d_biases
+    known2 = (biases**2 + variance * np.diag(S_inv)).sum() + _DOF_BIAS * np.mean(prior**2)
+    spread = prior * np.sqrt(known2 / (_DOF_BIAS + len(prior)) / np.mean(prior**2))
+    return state._replace(
+        centres=state.centres + d_centres,
+        biases=biases,
+        spread=spread if state.has_biases else prior,
+        cov_noise=_EFFICIENCY * H_inv,
+        cov_biases=HG @ S_inv @ HG.transpose(0, 2, 1),
+    )
+
+
+def _estimate(shots: _Shots, rough: Array, config: FittingConfig, radius: float) -> _Estimate:
+    """Return the estimate of all centres and biases from rough centres."""
+    n_lasers = len(shots.sigma_biases)
+    nothing = np.zeros((len(rough), 3, 3))
+    state = _State(
+        centres=rough,
+        biases=np.zeros(n_lasers),
+        spread=shots.sigma_biases,
+        has_biases=False,
+        factor=_FACTOR_START,
+        cov_noise=nothing,
+        cov_biases=nothing,
+    )
+    radii = np.full(len(rough), radius)
+    is_in = np.ones(len(shots.rows), dtype=bool)
+    for step in range(_N_STEPS):
+        prediction = predict(shots.beams, state.centres, radii, shots.which)
+        if step < _N_STEPS_GATED:
+            is_in = _in_play(shots, prediction, radius)
+        estimate = _weighed(shots, state, prediction, is_in, config)
+        state = estimate.state._replace(has_biases=step >= _N_STEPS_GATED)
+        N = _normals(shots, prediction.J[:, :3], estimate, len(rough))
+        state = _stepped(state, N, shots.sigma_biases, radius)
+    prediction = predict(shots.beams, state.centres, radii, shots.which)
+    return _weighed(shots, state, prediction, is_in, config)
+
+
+def _weighed(
+    shots: _Shots, state: _State, prediction: Prediction, is_in: Mask, config: FittingConfig
+) -> _Estimate:
+    """Return residuals, their weights and the stop's noise at a state."""
+    residuals = shots.beams.ranges - prediction.ranges - state.biases[shots.lasers]
+    sigmas = _sigmas(shots, prediction, config)
+    grazing = is_in * np.minimum(prediction.lit / _LIT_MIN, 1.0)
+    weights = grazing * _tukey(residuals / sigmas / state.factor)
+    factor = _factor(residuals / sigmas, weights, 3 * len(state.centres), 1.0)
+    return _Estimate(
+        state=state._replace(factor=factor),
+        prediction=prediction,
+        residuals=residuals,
+        sigmas=sigmas,
+        weights=weights,
+    )
+
+
+def _free_radii(shots: _Shots, estimate: _Estimate, radius: float) -> tuple[Array, Array]:
+    """Return radii estimated together with the centres, and their sigmas; NaN if undetermined."""
+    n = len(estimate.state.centres)
+    centres, radii = estimate.state.centres, np.full(n, radius)
+    W = estimate.weights / estimate.sigmas**2
+    ranges = shots.beams.ranges - estimate.state.biases[shots.lasers]
+    N_inv = np.zeros((n, 4, 4))
+    for _ in range(_N_STEPS_FREE):
+        prediction = predict(shots.beams, centres, radii, shots.which)
+        J = prediction.J
+        N = _summed(W[:, None, None] * J[:, :, None] * J[:, None, :], shots.which, n)
+        g = _summed((W * (ranges - prediction.ranges))[:, None] * J, shots.which, n)
+        N_inv = np.linalg.inv(N + estimate.state.factor**2 * np.eye(4))
+        step = np.einsum("mij,mj->mi", N_inv, g)
+        centres = centres + np.clip(step[:, :3], -_STEP_MAX * radius, _STEP_MAX * radius)
+        radii = np.clip(
+            radii + np.clip(step[:, 3], -0.25 * radii, 0.25 * radii), 0.2 * radius, None
+        )
+    sigmas = estimate.state.factor * np.sqrt(_EFFICIENCY * N_inv[:, 3, 3])
+    is_known = (sigmas < 0.5 * radius) & (radii < 5.0 * radius)
+    return np.where(is_known, radii, np.nan), np.where(is_known, sigmas, np.nan)
+
+
+def _own_factor(estimate: _Estimate, mine: Mask) -> float:
+    """Return one marker's noise in units of the prior, from its returns alone."""
+    scaled = estimate.residuals[mine] / estimate.sigmas[mine]
+    return _factor(scaled, estimate.weights[mine], 3, 0.0)
+
+
+def _covariance(estimate: _Estimate, k: int, own: float, n_used: int) -> Array:
+    """Return a centre's covariance: noise as the stop and the marker show it, and biases.
+
+    The factor on few returns is what repeated scans need for errors to agree with covariances: the
+    outline then decides much, and it bends within the uncertainty of the centre.
+    """
+    state = estimate.state
+    variance = (_DOF_STOP * state.factor**2 + n_used * own**2) / (_DOF_STOP + n_used)
+    few = 1.0 + _FEW / n_used
+    return few * variance * state.cov_noise[k] + state.factor**2 * state.cov_biases[k]
+
+
+def _weakness(fit: MarkerFit, factor: float) -> str:
+    """Return why a centre should be used with care; empty if there is no reason."""
+    off = abs(fit.radius_free - fit.radius)
+    tests = (
+        (fit.n_points < _N_GOOD, f"only {fit.n_points} returns (at least {_N_GOOD} are good)"),
+        (fit.n_rings == 1, "all returns are of one laser"),
+        (fit.coverage < _COVERAGE_GOOD, f"only {100 * fit.coverage:.0f} % of it is seen"),
+        (
+            off > max(_RADIUS_SIGMAS * fit.sigma_radius_free, _RADIUS_SLACK),
+            f"its own radius is {1e3 * fit.radius_free:.0f} mm",
+        ),
+        (
+            fit.sigma0 > _NOISE_FACTOR * factor,
+            f"its residuals are {fit.sigma0 / factor:.1f} times those of the stop",
+        ),
+    )
+    reasons = [reason for is_so, reason in tests if is_so]
+    text = ", ".join(reasons)
+    return text[:1].upper() + text[1:] + "." if reasons else ""
+
+
+def _refusal(estimate: _Estimate, k: int, n_used: int, moved: float, radius: float) -> str:
+    """Return why a candidate has no centre; empty if it has one."""
+    if n_used < _N_MIN:
+        return (
+            f"Only {n_used} returns lie on a sphere of radius {1e3 * radius:.0f} mm; a centre needs "
+            f"at least {_N_MIN}."
+        )
+    worst = float(np.sqrt(np.linalg.eigvalsh(estimate.state.cov_noise[k])[-1]))
+    if estimate.state.factor * worst > radius:
+        return "Its returns leave the centre undetermined: they lie on one line."
+    if moved > _STRAY * radius:
+        return (
+            f"The fit left the place where it was found by {1e3 * moved:.0f} mm: no sphere of "
+            f"radius {1e3 * radius:.0f} mm is there."
+        )
+    return ""
+
+
+def _judged(
+    shots: _Shots,
+    estimate: _Estimate,
+    k: int,
+    candidate: MarkerCandidate,
+    free: tuple[float, float],
+    radius: float,
+) -> MarkerFit | Rejection:
+    """Return one candidate's fit with its diagnostics, or the reason why there is none."""
+    mine = shots.which == k
+    used = mine & (estimate.weights > 0.0)
+    p, n_used = estimate.state.centres[k], int(used.sum())
+    moved = float(np.linalg.norm(p - candidate.p_base_rough))
+    reason = _refusal(estimate, k, n_used, moved, radius)
+    if reason:
+        return Rejection(
+            p_base=candidate.p_base_rough.copy(), n_points=len(candidate.members), reason=reason
+        )
+    own = _own_factor(estimate, mine)
+    rings = shots.beams.rings[used]
+    fit = MarkerFit(
+        p_base=p.copy(),
+        cov_p_base=_covariance(estimate, k, own, n_used),
+        method=NAME,
+        status=Status.OK,
+        reason="",
+        radius=radius,
+        radius_free=free[0],
+        sigma_radius_free=free[1],
+        mean_range=float(np.linalg.norm(shots.beams.origins_base[used].mean(axis=0) - p)),
+        mean_intensity=float(shots.beams.intensities[used].mean()),
+        used=shots.rows[used],
+        rejected=shots.rows[mine & ~used],
+        residuals=estimate.residuals[used],
+        sigma0=own,
+        n_rings=len(np.unique(rings[rings != RING_UNKNOWN])),
+        coverage=share_of_outline(estimate.prediction.offsets[used], radius),
+    )
+    weakness = _weakness(fit, estimate.state.factor)
+    return replace(fit, status=Status.WEAK, reason=weakness) if weakness else fit

@@ -1,0 +1,175 @@
+"""The range that a beam of finite width measures to a sphere, with exact derivatives.
+
+Hides the integral over the footprint. A beam lights an ellipse evenly; its range is the mean over
+the part of the ellipse that falls on the sphere. Near the outline that is several millimetres from
+the range of the central ray, and stays smooth where the central ray begins to miss.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numba
+import numpy as np
+
+from pipelines.values import Array, Beams, Index
+
+_N_STRIPS = 8  # strips of the ellipse; with 8 the mean is good to 0.01 mm of a 0.1 m ball at 8 m
+_MIDDLE = 0.3  # radii: returns nearer to the middle belong to no side
+_THIN = 1e-4  # [m]; a thinner footprint is a ray, and this one differs from it by 1e-8 m
+
+
+class Prediction(NamedTuple):
+    """What beams should measure to spheres.
+
+    Attributes
+    ----------
+    ranges : (n,)
+        Predicted ranges; for a beam that passes by, the range of its closest approach [m].
+    J : (n, 4)
+        Derivatives of the ranges by the centre and by the radius.
+    lit : (n,)
+        Share of the footprint that falls on the sphere.
+    offsets : (n, 2)
+        Where the middle of the beam passes the centre, along the footprint's two axes [m].
+    """
+
+    ranges: Array
+    J: Array
+    lit: Array
+    offsets: Array
+
+
+def predict(beams: Beams, centres: Array, radii: Array, which: Index) -> Prediction:
+    """Predict the ranges that beams measure to spheres.
+
+    Parameters
+    ----------
+    beams : Beams
+        Shots; their measured ranges only scale the footprint.
+    centres : (m, 3)
+        Centres in the base frame [m].
+    radii : (m,)
+        Radii [m].
+    which : (n,)
+        The sphere that each beam is aimed at.
+
+    Returns
+    -------
+    Prediction
+        Ranges with derivatives, lit shares and offsets.
+
+    Notes
+    -----
+    Rays of one beam are taken as parallel, which changes the mean by less than 0.05 mm beyond 1 m.
+    Strips along the first axis are integrated in closed form, their sum is Gauss and Chebyshev's
+    rule of the second kind, whose weight is the ellipse's own width; so the outline is integrated
+    exactly along each strip and the mean has no steps.
+    """
+    half_widths = 0.5 * beams.ranges[:, None] * beams.divergence
+    aim = (beams.origins_base, beams.directions_base, beams.across_base)
+    return Prediction(*_predict(aim, np.maximum(half_widths, _THIN), centres, radii, which))
+
+
+def share_of_outline(offsets: Array, radius: float) -> float:
+    """Tell how much of a sphere's visible half has returns.
+
+    Parameters
+    ----------
+    offsets : (n, 2)
+        Where the beams pass the centre, square to them [m].
+    radius : float
+        Radius of the sphere [m].
+
+    Returns
+    -------
+    float
+        Share of the eight sectors of the outline that hold returns off the middle, 0 to 1.
+    """
+    is_off = np.hypot(offsets[:, 0], offsets[:, 1]) > _MIDDLE * radius
+    sectors = np.floor(np.arctan2(offsets[is_off, 1], offsets[is_off, 0]) / (np.pi / 4.0))
+    return len(np.unique(sectors)) / 8.0
+
+
+@numba.njit(cache=True, nogil=True)
+def _predict(
+    aim: tuple[Array, Array, Array], half_widths: Array, centres: Array, radii: Array, which: Index
+) -> tuple[Array, Array, Array, Array]:
+    """Return the fields of ``Prediction``; ``aim`` is origins, directions and first axes."""
+    origins, directions, across = aim
+    n = len(origins)
+    ranges, J, lit, offsets = np.empty(n), np.zeros((n, 4)), np.empty(n), np.empty((n, 2))
+    for i in range(n):
+        u, a = directions[i], across[i]
+        b0, b1, b2 = (
+            u[1] * a[2] - u[2] * a[1],
+            u[2] * a[0] - u[0] * a[2],
+            u[0] * a[1] - u[1] * a[0],
+        )
+        v = centres[which[i]] - origins[i]
+        closest = v[0] * u[0] + v[1] * u[1] + v[2] * u[2]
+        x0 = v[0] * a[0] + v[1] * a[1] + v[2] * a[2]
+        y0 = v[0] * b0 + v[1] * b1 + v[2] * b2
+        depth, by_x, by_y, by_radius, share = _mean_depth(
+            x0, y0, radii[which[i]], half_widths[i, 0], half_widths[i, 1]
+        )
+        ranges[i] = closest - depth
+        J[i, 0] = u[0] - by_x * a[0] - by_y * b0
+        J[i, 1] = u[1] - by_x * a[1] - by_y * b1
+        J[i, 2] = u[2] - by_x * a[2] - by_y * b2
+        J[i, 3] = -by_radius
+        lit[i] = share
+        offsets[i, 0], offsets[i, 1] = -x0, -y0
+    return ranges, J, lit, offsets
+
+
+@numba.njit(cache=True, nogil=True)
+def _mean_depth(
+    x0: float, y0: float, radius: float, half_x: float, half_y: float
+) -> tuple[float, float, float, float, float]:
+    """Return how much nearer than its centre a sphere is on average under a footprint.
+
+    ``x0, y0`` is the centre seen from the middle of the footprint. Returns the mean, its
+    derivatives by x0, y0 and radius, and the lit share.
+    """
+    total, total_x, total_y, total_r = 0.0, 0.0, 0.0, 0.0
+    length, length_x, length_y, length_r = 0.0, 0.0, 0.0, 0.0
+    full = 0.0
+    for k in range(_N_STRIPS):
+        theta = np.pi * (k + 1) / (_N_STRIPS + 1)
+        weight = np.sin(theta)
+        dy = half_y * np.cos(theta) - y0
+        half = half_x * weight
+        full += 2.0 * half * weight
+        h2 = radius * radius - dy * dy
+        if h2 <= 0.0:
+            continue
+        h = np.sqrt(h2)
+        left, right = -half - x0, half - x0
+        if left >= h or right <= -h:
+            continue
+        left_free, right_free = 1.0 * (left > -h), 1.0 * (right < h)
+        left, right = max(left, -h), min(right, h)
+        depth_left = np.sqrt(max(h2 - left * left, 0.0))
+        depth_right = np.sqrt(max(h2 - right * right, 0.0))
+        turn = np.arcsin(right / h) - np.arcsin(left / h)
+        total += weight * 0.5 * (right * depth_right - left * depth_left + h2 * turn)
+        length += weight * (right - left)
+        total_x += weight * (depth_left - depth_right)
+        length_x += weight * (left_free - right_free)
+        # h depends on y0 and on the radius: dh/dy0 = dy / h, dh/dradius = radius / h
+        clipped = 2.0 - left_free - right_free
+        total_y += weight * turn * dy
+        total_r += weight * turn * radius
+        length_y += weight * clipped * dy / h
+        length_r += weight * clipped * radius / h
+    if length <= 0.0:
+        return 0.0, 0.0, 0.0, 0.0, 0.0
+    mean = total / length
+    return (
+        mean,
+        (total_x - mean * length_x) / length,
+        (total_y - mean * length_y) / length,
+        (total_r - mean * length_r) / length,
+        length / full,
+    )

@@ -1,0 +1,158 @@
+"""Centres as the study estimates them: a hemisphere registered to what the ground cut leaves.
+
+Hides the study's method, kept as it is described (section b of its methodology) so that others can
+be compared with it: everything lower than the highest ground point is deleted, the model starts at
+the centroid of the rest, and point-to-point ICP moves it.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from pipelines.config import FittingConfig
+from pipelines.fitting.footprint import predict, share_of_outline
+from pipelines.geometry import levelling_rotation
+from pipelines.stitching import beams
+from pipelines.values import (
+    RING_UNKNOWN,
+    Array,
+    Index,
+    MarkerCandidate,
+    MarkerCandidates,
+    MarkerFit,
+    Rejection,
+    Status,
+    StitchedCloud,
+)
+
+NAME = "paper"
+
+_N_MODEL = 1000  # points of the hemisphere; the study does not tell, and 300 or 3000 change < 1 mm
+_SEGMENT = 1.35  # radii about the found sphere: what the study's segmentation leaves of a cluster
+_N_MIN = 4  # returns: one more than unknowns
+_N_STEPS = 200
+_SETTLED = 1e-7  # relative change of fitness and RMS at which ICP stops
+
+
+def fit(
+    cloud: StitchedCloud, found: MarkerCandidates, config: FittingConfig, radius: float
+) -> tuple[tuple[MarkerFit, ...], tuple[Rejection, ...]]:
+    """Fit the candidates of a stop by the study's hemisphere ICP.
+
+    Parameters
+    ----------
+    cloud : StitchedCloud
+        The stop.
+    found : MarkerCandidates
+        Groups of returns, and the height of the highest ground point.
+    config : FittingConfig
+        Not used: the study knows no noise.
+    radius : float
+        Radius of the spheres [m].
+
+    Returns
+    -------
+    fits : tuple of MarkerFit
+        Centres with the formal covariance of the residuals, which knows nothing of the method's own
+        bias: it is not honest, and is given because the study gives none.
+    rejected : tuple of Rejection
+        Candidates of which the cut leaves too little.
+
+    Notes
+    -----
+    Where the study leaves a choice, this is the reading that gives its errors: the model, 1000
+    points of a hemisphere that faces the scanner, is the source of ICP and the scan its target,
+    so that every point of the model draws on its nearest return. The whole hemisphere is drawn to
+    the part that was seen, hence toward the scanner; where the cut took the lower part, upward.
+    """
+    del config
+    results = [_fit_one(cloud, found, candidate, radius) for candidate in found.candidates]
+    fits = tuple(r for r in results if isinstance(r, MarkerFit))
+    return fits, tuple(r for r in results if isinstance(r, Rejection))
+
+
+def _fit_one(
+    cloud: StitchedCloud, found: MarkerCandidates, candidate: MarkerCandidate, radius: float
+) -> MarkerFit | Rejection:
+    """Fit one candidate, or say why the cut leaves nothing to fit."""
+    used = _left_by_cut(cloud, found.ground_height_max, candidate, radius)
+    if len(used) < _N_MIN:
+        return Rejection(
+            p_base=candidate.p_base_rough.copy(),
+            n_points=len(candidate.members),
+            reason=f"Of {len(candidate.members)} returns the cut at the highest ground point, "
+            f"{found.ground_height_max:.2f} m, leaves {len(used)}; a centre needs {_N_MIN}.",
+        )
+    points = cloud.p_base[used].astype(np.float64)
+    p = _registered(_hemisphere(-points.mean(axis=0), radius), points)
+    return _described(cloud, candidate, used, p, radius)
+
+
+def _left_by_cut(
+    cloud: StitchedCloud, height: float, candidate: MarkerCandidate, radius: float
+) -> Index:
+    """Return the candidate's rows on the sphere that lie above the cut."""
+    points = cloud.p_base[candidate.members].astype(np.float64)
+    heights = points @ levelling_rotation(cloud.levelling)[2]
+    is_sphere = np.linalg.norm(points - candidate.p_base_rough, axis=1) < _SEGMENT * radius
+    return np.asarray(candidate.members[is_sphere & (heights >= height)])
+
+
+def _hemisphere(v_facing: Array, radius: float) -> Array:
+    """Return points spread evenly over the half of a sphere about zero that faces a direction."""
+    z = (np.arange(_N_MODEL) + 0.5) / _N_MODEL
+    phi = np.pi * (1.0 + np.sqrt(5.0)) * np.arange(_N_MODEL)
+    rho = np.sqrt(1.0 - z**2)
+    w = v_facing / np.linalg.norm(v_facing)
+    first = np.cross(w, np.eye(3)[np.argmin(np.abs(w))])
+    first /= np.linalg.norm(first)
+    axes = np.stack([first, np.cross(w, first), w])
+    return radius * np.column_stack([rho * np.cos(phi), rho * np.sin(phi), z]) @ axes
+
+
+def _registered(model: Array, points: Array) -> Array:
+    """Return where point-to-point ICP moves the model's centre, starting at the centroid."""
+    from open3d import geometry, pipelines, utility  # imported here: half a second
+
+    start = np.eye(4)
+    start[:3, 3] = points.mean(axis=0)
+    result = pipelines.registration.registration_icp(
+        geometry.PointCloud(utility.Vector3dVector(model)),
+        geometry.PointCloud(utility.Vector3dVector(points)),
+        np.inf,
+        start,
+        pipelines.registration.TransformationEstimationPointToPoint(),
+        pipelines.registration.ICPConvergenceCriteria(_SETTLED, _SETTLED, _N_STEPS),
+    )
+    return np.array(result.transformation[:3, 3])
+
+
+def _described(
+    cloud: StitchedCloud, candidate: MarkerCandidate, used: Index, p: Array, radius: float
+) -> MarkerFit:
+    """Return the fit with residuals along the beams and the formal covariance."""
+    shots = beams(cloud, used)
+    prediction = predict(shots, p[None], np.array([radius]), np.zeros(len(used), dtype=np.intp))
+    v = cloud.p_base[used] - p
+    distances = np.linalg.norm(v, axis=1)
+    normals = v / distances[:, None]
+    variance = float(np.sum((distances - radius) ** 2)) / max(len(used) - 3, 1)
+    rings = shots.rings[shots.rings != RING_UNKNOWN]
+    return MarkerFit(
+        p_base=p,
+        cov_p_base=variance * np.linalg.inv(normals.T @ normals + 1e-6 * np.eye(3)),
+        method=NAME,
+        status=Status.OK,
+        reason="",
+        radius=radius,
+        radius_free=np.nan,
+        sigma_radius_free=np.nan,
+        mean_range=float(np.linalg.norm(shots.origins_base.mean(axis=0) - p)),
+        mean_intensity=float(shots.intensities.mean()),
+        used=used,
+        rejected=np.setdiff1d(candidate.members, used),
+        residuals=shots.ranges - prediction.ranges,
+        sigma0=1.0,
+        n_rings=len(np.unique(rings)),
+        coverage=share_of_outline(prediction.offsets, radius),
+    )
