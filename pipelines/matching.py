@@ -1,0 +1,464 @@
+"""Which marker is which control mark: hides hypotheses, votes and the tests of a match.
+
+Nobody labels a sphere. All is computed in a site frame that is shifted to the middle of the
+control marks, so that large coordinates cost no digits.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from math import comb
+from typing import NamedTuple
+
+import numpy as np
+from scipy.spatial import cKDTree
+from scipy.spatial.transform import Rotation
+
+from pipelines.adjustment import Observations, Solution, solve
+from pipelines.config import ResectionConfig
+from pipelines.errors import AmbiguousMatchError, NoMatchError, SolveError
+from pipelines.geometry import levelling_rotation, rigid, rot_z, skew, transform
+from pipelines.values import Array, ControlMarks, Index, MarkerFits
+
+_N_CANDIDATES = 300_000  # pairs of pairs that are compared at most; more find nothing new
+_N_HYPOTHESES = 1000  # poses that are looked at; the true one has many votes
+_N_SOLUTIONS = 6  # that are refined: the best, and rivals enough to see that it is ambiguous
+_N_ROUNDS = 8  # of adjusting and matching again; two or three are the rule
+_RIVAL = 14.0  # -2 ln(0.001): how much better, in the weighted sum of squares, the best must be
+_CHANCE = 0.01  # expected number of chance agreements above which a match is none
+
+
+@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
+class Scene:
+    """All that a station is positioned from, as arrays.
+
+    Attributes
+    ----------
+    names : tuple of str
+        Of the control marks.
+    centres_base : (n, 3)
+        Fitted centres [m].
+    cov_centres : (n, 3, 3)
+        Their covariances in base, ``sigma_common`` included [m^2].
+    marks_site : (m, 3)
+        Control marks relative to ``middle`` [m].
+    cov_marks : (m, 3, 3)
+        Their covariances [m^2].
+    middle : (3,)
+        Middle of the control marks in the site frame [m].
+    R_station_base : (3, 3)
+        The measured levelling; its last row is the up direction in base.
+    J_up : (3, 2)
+        Derivative of the up direction by roll and pitch.
+    sigma_level : float
+        Standard deviation of each of the two angles [rad].
+    is_levelled : bool
+        Whether they were measured.
+    """
+
+    names: tuple[str, ...]
+    centres_base: Array
+    cov_centres: Array
+    marks_site: Array
+    cov_marks: Array
+    middle: Array
+    R_station_base: Array
+    J_up: Array
+    sigma_level: float
+    is_levelled: bool
+
+
+class _Hypotheses(NamedTuple):
+    """Poses to be tried: heading [rad] and translation [m] of the levelled frame."""
+
+    yaws: Array
+    translations: Array
+
+
+@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
+class Match:
+    """Which fit is which mark, and the pose that goes with it.
+
+    Attributes
+    ----------
+    marks : (n,)
+        Place of each fit's mark among the control marks; -1 for none.
+    T_site_base : (4, 4)
+        Pose of base, relative to the middle of the marks [m].
+    vtpv : float
+        Weighted sum of squares of the residuals, gravity included.
+    dof : int
+        Degrees of freedom.
+    largest_residual : float
+        Of the matched fits [m].
+    """
+
+    marks: Index
+    T_site_base: Array
+    vtpv: float
+    dof: int
+    largest_residual: float
+
+    @property
+    def n(self) -> int:
+        """Number of matched fits."""
+        return int(np.sum(self.marks >= 0))
+
+    @property
+    def pairs(self) -> Index:
+        """Places among fits and marks, (n, 2)."""
+        fits = np.flatnonzero(self.marks >= 0)
+        return np.stack([fits, self.marks[fits]], axis=1)
+
+
+def gather(fits: MarkerFits, marks: ControlMarks, config: ResectionConfig) -> Scene:
+    """Gather what is known about a station.
+
+    Parameters
+    ----------
+    fits : MarkerFits
+        Centres in base; at least one.
+    marks : ControlMarks
+        Known places; at least one.
+    config : ResectionConfig
+        The sigma that all centres have in common.
+
+    Returns
+    -------
+    Scene
+        The same as arrays.
+    """
+    levelling = fits.levelling
+    R_station_base = levelling_rotation(levelling)
+    cr, sr = np.cos(levelling.roll), np.sin(levelling.roll)
+    cp, sp = np.cos(levelling.pitch), np.sin(levelling.pitch)
+    middle = marks.p_site.mean(axis=0)
+    return Scene(
+        names=marks.names,
+        centres_base=np.stack([fit.p_base for fit in fits.fits]),
+        cov_centres=np.stack([fit.cov_p_base for fit in fits.fits])
+        + config.sigma_common**2 * np.eye(3),
+        marks_site=marks.p_site - middle,
+        cov_marks=marks.cov_p_site,
+        middle=middle,
+        R_station_base=R_station_base,
+        J_up=np.array([[0.0, -cp], [cp * cr, -sp * sr], [-cp * sr, -sp * cr]]),
+        sigma_level=levelling.sigma,
+        is_levelled=levelling.is_measured,
+    )
+
+
+def match_marks(scene: Scene, config: ResectionConfig) -> Match:
+    """Find out which fit is which mark.
+
+    Parameters
+    ----------
+    scene : Scene
+        Centres and marks.
+    config : ResectionConfig
+        How far a marker may be from its mark.
+
+    Returns
+    -------
+    Match
+        Two matched fits or more, refined by an adjustment.
+
+    Raises
+    ------
+    NoMatchError
+        If the markers do not agree with the marks better than chance.
+    AmbiguousMatchError
+        If they agree in two different ways equally well.
+
+    Notes
+    -----
+    Two fits and two marks with the same distance and the same difference of height give a heading
+    and a translation; a mirror image never does. The poses with most votes are tried on all fits,
+    the best are refined and compared. Cost grows with the square of fits times marks until
+    300,000 pairs of pairs, then no more.
+    """
+    levelled = scene.centres_base @ scene.R_station_base.T
+    hypotheses = _voted(_hypotheses(levelled, scene, config), levelled, config)
+    solutions = _solutions(hypotheses, levelled, scene, config)
+    if not solutions:
+        raise NoMatchError(
+            f"No two of the {len(levelled)} markers have the distance and the difference of height "
+            f"of any two of the {len(scene.marks_site)} control marks (within "
+            f"{config.match_tolerance} m): these are marks of another field, or false markers."
+        )
+    best = solutions[0]
+    if best.n > 2 or len(levelled) > 2:
+        _refuse_chance(best, scene, config)
+    rivals = [other for other in solutions[1:] if _is_rival(other, best)]
+    if rivals:
+        raise AmbiguousMatchError(
+            f"{best.n} of {len(levelled)} markers fit the control marks in {len(rivals) + 1} or "
+            "more different ways equally well: several pairs of marks have the same distances "
+            "(a symmetric field). Survey more markers, or move one so that no distance repeats."
+        )
+    return best
+
+
+def observe(scene: Scene, pairs: Index, T: Array) -> tuple[Observations, Observations]:
+    """Linearise centres and gravity at a pose of base, or at many.
+
+    Parameters
+    ----------
+    scene : Scene
+        Centres and marks.
+    pairs : (..., k, 2)
+        Places among centres and marks.
+    T : (..., 4, 4)
+        Poses of base, relative to the middle of the marks [m].
+
+    Returns
+    -------
+    tuple of Observations
+        Centres (k blocks of 3 [m]) and gravity (one block of 2 [rad]).
+    """
+    R, t = T[..., :3, :3], T[..., :3, 3]
+    turned = np.einsum("...ij,...kj->...ki", R, scene.centres_base[pairs[..., 0]])
+    p_site = turned + t[..., None, :]
+    cov_site = R[..., None, :, :] @ scene.cov_centres[pairs[..., 0]]
+    cov_site = cov_site @ np.swapaxes(R, -1, -2)[..., None, :, :]
+    eye = np.broadcast_to(np.eye(3), (*p_site.shape, 3))
+    centres = Observations(
+        residuals=p_site - scene.marks_site[pairs[..., 1]],
+        J=np.concatenate([-skew(p_site), eye], axis=-1),
+        cov=cov_site + scene.cov_marks[pairs[..., 1]],
+    )
+    up = R @ scene.R_station_base[2]
+    J_up = scene.sigma_level * (R @ scene.J_up)[..., :2, :]
+    gravity = Observations(
+        residuals=up[..., None, :2],
+        J=np.concatenate([-skew(up)[..., :2, :], np.zeros((*up.shape[:-1], 2, 3))], axis=-1)[
+            ..., None, :, :
+        ],
+        cov=(J_up @ np.swapaxes(J_up, -1, -2))[..., None, :, :],
+    )
+    return centres, gravity
+
+
+def moved(T: Array, xi: Array) -> Array:
+    """Move poses on the left by small motions, to first order.
+
+    Parameters
+    ----------
+    T : (..., 4, 4)
+        Poses [m].
+    xi : (..., 6)
+        Rotation [rad] and translation [m].
+
+    Returns
+    -------
+    (..., 4, 4)
+        ``Exp(xi) T`` up to the square of ``xi``; rotations stay rotations.
+    """
+    turn = Rotation.from_rotvec(xi[..., :3]).as_matrix()
+    out = np.array(T)
+    out[..., :3, :] = turn @ T[..., :3, :]
+    out[..., :3, 3] += xi[..., 3:]
+    return out
+
+
+def solve_pose(scene: Scene, pairs: Index, start: Array) -> Solution[Array]:
+    """Find the pose of base from some pairs and gravity.
+
+    Parameters
+    ----------
+    scene : Scene
+        Centres and marks.
+    pairs : (..., k, 2)
+        Places among centres and marks.
+    start : (..., 4, 4)
+        Approximate poses, relative to the middle of the marks [m].
+
+    Returns
+    -------
+    Solution
+        Poses with covariances.
+    """
+    return solve(lambda T: observe(scene, pairs, T), moved, start)
+
+
+def _hypotheses(levelled: Array, scene: Scene, config: ResectionConfig) -> _Hypotheses:
+    """Return the poses that bring some two fits onto some two marks."""
+    tolerance = config.match_tolerance
+    first, second = _pairs_far_first(len(levelled))
+    spans = levelled[second] - levelled[first]
+    usable = np.hypot(spans[:, 0], spans[:, 1]) > 2.0 * tolerance
+    first, second, spans = first[usable], second[usable], spans[usable]
+    a, b = np.nonzero(~np.eye(len(scene.marks_site), dtype=np.bool_))
+    targets = scene.marks_site[b] - scene.marks_site[a]
+    lengths = np.linalg.norm(targets, axis=1)
+    order = np.argsort(lengths, kind="stable")
+    reach = np.linalg.norm(spans, axis=1)
+    low = np.searchsorted(lengths[order], reach - tolerance)
+    counts = np.searchsorted(lengths[order], reach + tolerance) - low
+    counts[np.cumsum(counts) > max(_N_CANDIDATES, counts[:1].sum())] = 0
+    rows = np.repeat(np.arange(len(counts)), counts)
+    within = np.arange(len(rows)) - np.repeat(np.cumsum(counts) - counts, counts)
+    columns = order[low[rows] + within]
+    slack = tolerance + 3.0 * scene.sigma_level * reach[rows]
+    agree = np.abs(targets[columns, 2] - spans[rows, 2]) <= slack
+    rows, columns = rows[agree], columns[agree]
+    yaws = np.arctan2(targets[columns, 1], targets[columns, 0]) - np.arctan2(
+        spans[rows, 1], spans[rows, 0]
+    )
+    middles = (levelled[first] + levelled[second])[rows] / 2.0
+    goals = (scene.marks_site[a] + scene.marks_site[b])[columns] / 2.0
+    return _Hypotheses(yaws, goals - _turned(middles, yaws))
+
+
+def _pairs_far_first(n: int) -> tuple[Index, Index]:
+    """Return all pairs of n fits, those far apart in azimuth first."""
+    first, second = np.triu_indices(n, 1)
+    apart = np.minimum(second - first, n - (second - first))
+    order = np.argsort(-apart, kind="stable")
+    return first[order], second[order]
+
+
+def _turned(p: Array, yaws: Array) -> Array:
+    """Turn points, (..., 3), about z by as many angles."""
+    c, s = np.cos(yaws), np.sin(yaws)
+    x, y, z = np.moveaxis(p, -1, 0)
+    x, y, z = np.broadcast_arrays(c * x - s * y, s * x + c * y, z)
+    return np.stack([x, y, z], axis=-1)
+
+
+def _voted(hypotheses: _Hypotheses, levelled: Array, config: ResectionConfig) -> _Hypotheses:
+    """Return the hypotheses that most others agree with."""
+    if len(hypotheses.yaws) <= _N_HYPOTHESES:
+        return hypotheses
+    middle = levelled.mean(axis=0)
+    spread = np.sqrt(np.mean(np.sum((levelled - middle)[:, :2] ** 2, axis=1)))
+    place = _turned(np.tile(middle, (len(hypotheses.yaws), 1)), hypotheses.yaws)
+    place = (place + hypotheses.translations)[:, :2]
+    turns = spread * (hypotheses.yaws % (2.0 * np.pi))
+    cells = np.column_stack([place - place.min(axis=0), turns]) // (2.0 * config.match_tolerance)
+    width = cells.max(axis=0) + 1.0
+    keys = (cells[:, 0] * width[1] + cells[:, 1]) * width[2] + cells[:, 2]
+    _, cell, votes = np.unique(keys, return_inverse=True, return_counts=True)
+    chosen = np.argsort(-votes[cell], kind="stable")[:_N_HYPOTHESES]
+    return _Hypotheses(hypotheses.yaws[chosen], hypotheses.translations[chosen])
+
+
+def _solutions(
+    hypotheses: _Hypotheses, levelled: Array, scene: Scene, config: ResectionConfig
+) -> list[Match]:
+    """Return refined matches that differ from each other, the best first."""
+    if not len(hypotheses.yaws):
+        return []
+    placed = _turned(levelled, hypotheses.yaws[:, None]) + hypotheses.translations[:, None]
+    reach = float(np.linalg.norm(levelled, axis=1).max())
+    slack = 1.0 + 3.0 * scene.sigma_level * reach / config.match_tolerance
+    marks, scores = _assigned(placed, scene.marks_site, config.match_tolerance, slack)
+    solutions: list[tuple[float, Match]] = []
+    for _ in range(_N_SOLUTIONS):
+        best = int(np.argmax(scores))
+        if scores[best] <= 0:
+            break
+        T = rigid(
+            rot_z(hypotheses.yaws[best]) @ scene.R_station_base, hypotheses.translations[best]
+        )
+        refined = _refined(marks[best], T, scene, config)
+        shared = np.sum((marks == marks[best]) & (marks[best] >= 0), axis=1)
+        if refined is not None:
+            solutions.append(refined)
+            same = np.sum((marks == refined[1].marks) & (refined[1].marks >= 0), axis=1)
+            shared = np.maximum(shared, same)
+        scores[2 * shared >= np.sum(marks >= 0, axis=1)] = 0.0
+        scores[best] = 0.0
+    return [match for _, match in sorted(solutions, key=lambda item: -item[0])]
+
+
+def _assigned(
+    placed: Array, marks_site: Array, tolerance: float, slack: float
+) -> tuple[Index, Array]:
+    """Return, for poses, (h, n, 3) of placed fits, the mark of each fit or -1, and a score.
+
+    Heights count less by ``slack``. A mark goes to the fit that is nearest. The score of a matched
+    fit falls from 1 to 0 with the square of its distance (MSAC, Torr and Zisserman 2000).
+    """
+    scale = np.array([1.0, 1.0, 1.0 / slack])
+    distances, marks = cKDTree(marks_site * scale).query(
+        placed * scale, distance_upper_bound=tolerance
+    )
+    distances = np.asarray(distances)
+    h, n = marks.shape
+    found = np.flatnonzero(np.isfinite(distances.ravel()))
+    keys = (found // n) * len(marks_site) + marks.ravel()[found]
+    order = np.lexsort((distances.ravel()[found], keys))
+    winners = found[order[np.unique(keys[order], return_index=True)[1]]]
+    out = np.full(h * n, -1, dtype=np.intp)
+    out[winners] = marks.ravel()[winners]
+    gains = np.zeros(h * n)
+    gains[winners] = 1.0 - (distances.ravel()[winners] / tolerance) ** 2
+    return out.reshape(h, n), gains.reshape(h, n).sum(axis=1)
+
+
+def _refined(
+    marks: Index, T: Array, scene: Scene, config: ResectionConfig
+) -> tuple[float, Match] | None:
+    """Adjust a hypothesis to its matches and match again until nothing changes; with its score."""
+    for _ in range(_N_ROUNDS):
+        fits = np.flatnonzero(marks >= 0)
+        if len(fits) < 2:
+            return None
+        try:
+            solution = solve_pose(scene, np.stack([fits, marks[fits]], axis=1), T)
+        except SolveError:
+            return None
+        T = solution.estimate
+        placed = transform(T, scene.centres_base)[None]
+        again, scores = _assigned(placed, scene.marks_site, config.match_tolerance, 1.0)
+        if np.array_equal(again[0], marks):
+            residuals = solution.groups[0].residuals
+            return float(scores[0]), Match(
+                marks=marks,
+                T_site_base=T,
+                vtpv=_weighted_square(solution),
+                dof=3 * len(fits) - 4,
+                largest_residual=float(np.linalg.norm(residuals, axis=1).max()),
+            )
+        marks = again[0]
+    return None
+
+
+def _weighted_square(solution: Solution[Array]) -> float:
+    """Return the weighted sum of squares at a solution."""
+    return sum(
+        float(np.einsum("km,kmn,kn->", g.residuals, np.linalg.inv(g.cov), g.residuals))
+        for g in solution.groups
+    )
+
+
+def _is_rival(other: Match, best: Match) -> bool:
+    """Return whether another match explains the markers about as well and differs."""
+    shared = int(np.sum((other.marks == best.marks) & (best.marks >= 0)))
+    worse = (other.vtpv - best.vtpv) / max(1.0, best.vtpv / best.dof)
+    return other.n >= best.n and 2 * shared < best.n and worse <= _RIVAL
+
+
+def _refuse_chance(match: Match, scene: Scene, config: ResectionConfig) -> None:
+    """Raise NoMatchError if marks strewn at random would agree as well.
+
+    The expected number of chance agreements is counted a contrario (Moisan and Stival 2004): pairs
+    of fits on pairs of marks, times the ways to choose the others, times the share of the field's
+    volume that lies as near to a mark as the worst of them.
+    """
+    n, m, k = len(scene.centres_base), len(scene.marks_site), match.n
+    near = max(match.largest_residual, 3.0 * float(np.sqrt(scene.cov_centres.trace(0, 1, 2).min())))
+    reach = float(np.linalg.norm(scene.centres_base, axis=1).max())
+    near_height = near + 3.0 * scene.sigma_level * reach
+    extent = np.maximum(np.ptp(scene.marks_site, axis=0), 2.0 * near)
+    share_height = min(1.0, 2.0 * near_height / extent[2])
+    share = min(1.0, m * np.pi * near**2 / (extent[0] * extent[1]) * share_height)
+    share_pair = 2.0 * near / np.hypot(extent[0], extent[1]) * share_height
+    expected = comb(n, 2) * m * (m - 1) * share_pair * comb(n - 2, k - 2) * share ** (k - 2)
+    if expected > _CHANCE:
+        raise NoMatchError(
+            f"Only {k} of {n} markers fit the {m} control marks within {config.match_tolerance} m, "
+            f"and by chance {expected:.2g} such agreements are expected (at most {_CHANCE} is "
+            "accepted): these are marks of another field, or too many markers are false."
+        )
