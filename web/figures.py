@@ -1,0 +1,557 @@
+"""Figures of a survey: from columns, named and in the units of the database, to Plotly.
+
+Metres come in and millimetres are drawn where that is what one reads. Errors exist only against
+truth; where there is none, the same figure shows the predicted sigma and says so in its title.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from typing import Any
+
+import numpy as np
+import plotly.graph_objects as go
+from numpy.typing import NDArray
+
+from web import theme
+
+Columns = Mapping[str, NDArray[Any]]
+
+_MM = 1e3  # [mm/m]
+_RANGE_BIN = 1.0  # [m]; as the view accuracy_by_distance
+_COUNT_BIN = 20  # as the view accuracy_by_point_count
+_ANGLE_BIN = 10.0  # [deg]; as the view accuracy_by_included_angle
+_STUDY_ANGLES = (30.0, 150.0)  # [deg]; what the reference study recommends
+_ELLIPSE_SHARE = 0.05  # the largest ellipse is drawn about this large, as a share of the field
+_STOP_NUMBER = re.compile(r"^(.*?)[\s._-]*(?:[A-Za-z]*)(\d+)$")
+
+
+def floats(columns: Columns, name: str) -> NDArray[np.float64]:
+    """Return a column as floats; NULL is NaN."""
+    return np.asarray(columns[name], dtype=np.float64)
+
+
+def texts(columns: Columns, name: str) -> list[str]:
+    """Return a column as texts; NULL is nothing."""
+    return ["" if value is None else str(value) for value in columns[name]]
+
+
+def select(columns: Columns, keep: NDArray[np.bool_]) -> dict[str, NDArray[Any]]:
+    """Return the rows of a table that are to be kept."""
+    return {name: column[keep] for name, column in columns.items()}
+
+
+def has_errors(columns: Columns) -> bool:
+    """Whether anything is known about the truth of these rows."""
+    return bool(np.isfinite(floats(columns, "error_3d_m")).any())
+
+
+def lane_and_number(stop: str) -> tuple[str, int | None]:
+    """Split the name of a stop into its lane and its number along it: ``lane-2-stop-5``."""
+    found = _STOP_NUMBER.match(stop)
+    return (found[1] or "lane", int(found[2])) if found else (stop, None)
+
+
+def error_against_distance(fits: Columns, tolerance_m: float, *, is_log: bool = False) -> go.Figure:
+    """Draw the error of each sphere centre against its distance."""
+    figure = _quality_figure(fits, "sphere centres against distance", tolerance_m)
+    _add_fits(figure, fits, floats(fits, "range_m"), _RANGE_BIN)
+    _scale(figure, "Distance [m]", is_log=is_log)
+    return figure
+
+
+def error_against_count(fits: Columns, tolerance_m: float, *, is_log: bool = False) -> go.Figure:
+    """Draw the error of each sphere centre against the number of its returns."""
+    figure = _quality_figure(fits, "sphere centres against point count", tolerance_m)
+    _add_fits(figure, fits, floats(fits, "n_points"), _COUNT_BIN)
+    _scale(figure, "Returns on the sphere", is_log=is_log)
+    return figure
+
+
+def error_against_angle(
+    pairs: Columns, fixes: Columns, tolerance_m: float, *, is_log: bool = False
+) -> go.Figure:
+    """Draw the error of the station against included angle: from two marks, and from all."""
+    figure = _quality_figure(pairs, "the station against included angle", tolerance_m)
+    for method, rows in by_method(pairs):
+        _add_pairs(figure, method, rows)
+    for method, rows in by_method(fixes):
+        _add_fixes(figure, method, rows)
+    for low, high in ((0.0, _STUDY_ANGLES[0]), (_STUDY_ANGLES[1], 180.0)):
+        figure.add_vrect(x0=low, x1=high, fillcolor=theme.SHADE, line_width=0, layer="below")
+    figure.update_yaxes(type="log" if is_log else "linear", rangemode="tozero")
+    figure.update_xaxes(title_text="Included angle [deg]", range=[0, 180], dtick=30)
+    return figure
+
+
+def error_along_lane(fits: Columns, tolerance_m: float) -> go.Figure:
+    """Draw the mean error of the centres at each stop along its lane (Figure 11 of the study)."""
+    figure = _quality_figure(fits, "sphere centres along the lane, mean per stop", tolerance_m)
+    stops = texts(fits, "stop")
+    order = _in_lane_order(stops)
+    for method, rows in by_method(fits):
+        _add_lanes(figure, method, rows, order)
+    figure.update_xaxes(
+        title_text="Stop", type="category", categoryorder="array", categoryarray=order
+    )
+    figure.update_yaxes(rangemode="tozero")
+    return figure
+
+
+def site_map(marks: Columns, fixes: Columns, true_stops: Columns) -> go.Figure:
+    """Draw marks, stations and their 95 % ellipses, exaggerated alike with the true places."""
+    figure = _figure("Field, stations and 95 % ellipses")
+    factor = ellipse_factor(marks, fixes)
+    _add_marks(figure, marks)
+    for method, rows in by_method(fixes):
+        _add_stations(figure, method, rows, factor, true_stops)
+    figure.update_xaxes(title_text="x, site [m]", constrain="domain")
+    figure.update_yaxes(title_text="y, site [m]", scaleanchor="x", scaleratio=1)
+    if factor:
+        _note(figure, f"ellipses and errors \N{MULTIPLICATION SIGN}{factor:g}")
+    return figure
+
+
+def ellipse_factor(marks: Columns, fixes: Columns) -> float:
+    """Return by how much ellipses are enlarged: 1, 2 or 5 times a power of ten; 0 for none."""
+    largest = _largest(floats(fixes, "ellipse_major_95_m"))
+    across = [
+        np.ptp(known) if len(known) else 0.0
+        for axis in ("x_m", "y_m")
+        for known in [_known(np.concatenate([floats(marks, axis), floats(fixes, axis)]))]
+    ]
+    if not largest or not max(across):
+        return 0.0
+    wanted = _ELLIPSE_SHARE * float(max(across)) / largest
+    power = 10.0 ** np.floor(np.log10(wanted))
+    return float(power * max(step for step in (1, 2, 5) if step * power <= wanted))
+
+
+def station_residuals(observations: Columns, tolerance_m: float) -> go.Figure:
+    """Draw what each marker disagrees with the station, by axis, with twice its sigma."""
+    figure = _figure("Residuals of the station, by marker and axis")
+    names = [
+        f"{marker} · {mark}" if mark and mark != marker else marker
+        for marker, mark in zip(
+            texts(observations, "marker"), texts(observations, "mark"), strict=True
+        )
+    ]
+    for axis, symbol, colour in (
+        ("x", "circle", theme.OURS),
+        ("y", "diamond", theme.PAPER),
+        ("z", "square", theme.GREEN),
+    ):
+        _add_residuals(figure, observations, names, (axis, symbol, colour))
+    if len(names) and _largest(floats(observations, "residual_x_m")) > tolerance_m / 2:
+        _add_tolerance(figure, tolerance_m)
+    figure.add_hline(y=0, line={"color": theme.LINE, "width": 1}, layer="below")
+    figure.update_xaxes(title_text="Marker · mark", type="category", tickangle=-45)
+    figure.update_yaxes(title_text="Observed - computed [mm]")
+    figure.update_layout(scattermode="group", scattergap=0.35)
+    return figure
+
+
+def by_method(columns: Columns) -> Iterator[tuple[str, dict[str, NDArray[Any]]]]:
+    """Return the rows of each fitting method, the one that counts first."""
+    methods = np.array(texts(columns, "fit_method"), dtype=object)
+    for method in sorted(set(methods.tolist()), key=lambda name: (name != "along_beam", name)):
+        yield method, select(columns, methods == method)
+
+
+def _figure(title: str) -> go.Figure:
+    """Return an empty figure that looks like all others."""
+    return go.Figure(layout={"template": theme.template(), "title": {"text": title}})
+
+
+def _quality_figure(columns: Columns, what: str, tolerance_m: float) -> go.Figure:
+    """Return a figure with an axis for error, or for predicted sigma where there is no truth."""
+    quality = "Error" if has_errors(columns) else "Predicted sigma"
+    figure = _figure(f"{quality} of {what}")
+    figure.update_yaxes(title_text=f"{quality}, 3-D [mm]")
+    _add_tolerance(figure, tolerance_m)
+    return figure
+
+
+def _add_tolerance(figure: go.Figure, tolerance_m: float) -> None:
+    """Draw the tolerance: one look, everywhere."""
+    figure.add_hline(
+        y=tolerance_m * _MM,
+        line={"color": theme.TOLERANCE, "width": 1.5, "dash": "dash"},
+        annotation={
+            "text": f"tolerance {tolerance_m * _MM:g} mm",
+            "font": {"size": 12, "color": theme.TOLERANCE},
+            "yshift": 1,
+        },
+        annotation_position="top right",
+    )
+
+
+def _scale(figure: go.Figure, x_title: str, *, is_log: bool) -> None:
+    """Choose the axes of a scatter: from zero, or both logarithmic."""
+    kind = "log" if is_log else "linear"
+    figure.update_xaxes(title_text=x_title, type=kind)
+    figure.update_yaxes(type=kind, rangemode="normal" if is_log else "tozero")
+    if is_log:
+        axis = {"dtick": "D2", "exponentformat": "none"}
+        figure.update_xaxes(**axis)
+        figure.update_yaxes(**axis)
+        for shape in figure.layout.shapes:  # Plotly wants logarithms in annotations only
+            for note in figure.layout.annotations:
+                note.y = float(np.log10(shape.y0))
+
+
+def _quality_mm(columns: Columns) -> NDArray[np.float64]:
+    """Return the error, or the predicted sigma where there is no truth [mm]."""
+    return floats(columns, "error_3d_m" if has_errors(columns) else "sigma_3d_m") * _MM
+
+
+def _add_fits(figure: go.Figure, fits: Columns, x: NDArray[np.float64], width: float) -> None:
+    """Draw the centres of each method, the RMS of each bin, and what was predicted."""
+    is_error = has_errors(fits)
+    methods = np.array(texts(fits, "fit_method"), dtype=object)
+    for method, rows in by_method(fits):
+        style, own_x = theme.method_style(method), x[methods == method]
+        y = floats(rows, "error_3d_m" if is_error else "sigma_3d_m") * _MM
+        _add_points(figure, style, own_x, y, rows)
+        _add_binned(figure, style, own_x, y, width)
+        if is_error and method == "along_beam":
+            sigma = floats(rows, "sigma_3d_m") * _MM
+            _add_prediction(figure, style, own_x, sigma, width)
+
+
+def _add_points(
+    figure: go.Figure,
+    style: theme.MethodStyle,
+    x: NDArray[np.float64],
+    y: NDArray[np.float64],
+    rows: Columns,
+) -> None:
+    """Draw one point for each centre; weak ones are hollow."""
+    weak = np.array(texts(rows, "status"), dtype=object) != "ok"
+    details = _details(rows, ("stop", "marker", "mark", "reason"), ("range_m", "n_points"))
+    figure.add_scatter(
+        x=x,
+        y=y,
+        mode="markers",
+        name=style.label,
+        legendgroup=style.label,
+        marker={
+            "color": style.colour,
+            "size": 6,
+            "opacity": 0.55,
+            "symbol": np.where(weak, f"{style.symbol}-open", style.symbol).tolist(),
+        },
+        customdata=details,
+        hovertemplate=(
+            "<b>%{customdata[0]} %{customdata[1]}</b> %{customdata[2]}<br>%{y:.1f} mm at "
+            "%{customdata[4]:.2f} m, %{customdata[5]:.0f} returns<br>%{customdata[3]}"
+            f"<extra>{style.label}</extra>"
+        ),
+    )
+
+
+def _details(rows: Columns, words: Sequence[str], numbers: Sequence[str]) -> list[list[Any]]:
+    """Return what a person reads when pointing at a row."""
+    columns: list[Iterable[Any]] = [texts(rows, name) for name in words]
+    columns += [floats(rows, name).round(4).tolist() for name in numbers]
+    return [list(row) for row in zip(*columns, strict=True)]
+
+
+def _add_binned(
+    figure: go.Figure,
+    style: theme.MethodStyle,
+    x: NDArray[np.float64],
+    y: NDArray[np.float64],
+    width: float,
+) -> None:
+    """Draw the RMS of each bin as a line."""
+    middles, values = binned_rms(x, y, width)
+    figure.add_scatter(
+        x=middles,
+        y=values,
+        mode="lines",
+        name=f"{style.label}: RMS of bins",
+        legendgroup=style.label,
+        showlegend=False,
+        line={"color": style.colour, "width": 2.5, "dash": style.dash},
+        hovertemplate=f"RMS %{{y:.1f}} mm about %{{x:.4g}}<extra>{style.label}</extra>",
+    )
+
+
+def _add_prediction(
+    figure: go.Figure,
+    style: theme.MethodStyle,
+    x: NDArray[np.float64],
+    sigma_mm: NDArray[np.float64],
+    width: float,
+) -> None:
+    """Draw the predicted sigma of each bin, as the area that it fills."""
+    middles, values = binned_rms(x, sigma_mm, width)
+    figure.add_scatter(
+        x=middles,
+        y=values,
+        mode="lines",
+        name="predicted sigma (ours)",
+        line={"color": style.colour, "width": 1.5, "dash": "dot"},
+        fill="tozeroy",
+        fillcolor=style.band,
+        hovertemplate="predicted %{y:.1f} mm about %{x:.4g}<extra></extra>",
+    )
+
+
+def binned_rms(
+    x: NDArray[np.float64], y: NDArray[np.float64], width: float
+) -> tuple[list[float], list[float]]:
+    """Return the mean place and the RMS of y in bins of x, leaving out what is not known."""
+    known = np.isfinite(x) & np.isfinite(y)
+    x, y = x[known], y[known]
+    bins = np.floor(x / width)
+    members = [bins == value for value in np.unique(bins)]
+    return (
+        [float(np.mean(x[member])) for member in members],
+        [float(np.sqrt(np.mean(y[member] ** 2))) for member in members],
+    )
+
+
+def _add_pairs(figure: go.Figure, method: str, rows: Columns) -> None:
+    """Draw the station from each pair of marks, and the RMS of bins."""
+    style = theme.method_style(method)
+    x, y = floats(rows, "included_angle_deg"), _quality_mm(rows)
+    details = _details(rows, ("stop",), ("sigma_3d_m",))
+    marks = [" + ".join(str(mark) for mark in pair) for pair in rows["marks"]]
+    figure.add_scatter(
+        x=x,
+        y=y,
+        mode="markers",
+        name=f"{style.label}, two marks",
+        legendgroup=style.label,
+        marker={"color": style.colour, "size": 4, "opacity": 0.3, "symbol": style.symbol},
+        customdata=[[stop, pair] for (stop, _), pair in zip(details, marks, strict=True)],
+        hovertemplate="<b>%{customdata[0]}</b> from %{customdata[1]}<br>%{y:.1f} mm at "
+        f"%{{x:.1f}} deg<extra>{style.label}</extra>",
+    )
+    _add_binned(figure, style, x, y, _ANGLE_BIN)
+
+
+def _add_fixes(figure: go.Figure, method: str, rows: Columns) -> None:
+    """Draw the station from all its marks at the least of its included angles."""
+    style = theme.method_style(method)
+    figure.add_scatter(
+        x=floats(rows, "included_angle_min_deg"),
+        y=_quality_mm(rows),
+        mode="markers",
+        name=f"{style.label}, all marks",
+        legendgroup=f"{style.label}, all marks",
+        marker={
+            "color": style.colour,
+            "size": 11,
+            "symbol": f"{style.symbol}-dot",
+            "line": {"color": theme.RAISED, "width": 1.5},
+        },
+        customdata=_details(rows, ("stop",), ("n_markers",)),
+        hovertemplate="<b>%{customdata[0]}</b> from all %{customdata[1]:.0f} marks<br>%{y:.1f} mm"
+        f"<extra>{style.label}</extra>",
+    )
+
+
+def _in_lane_order(stops: Iterable[str]) -> list[str]:
+    """Return the stops once each, lane by lane, in the order of their numbers."""
+    return sorted(set(stops), key=lambda stop: (lane_and_number(stop)[0], _number(stop), stop))
+
+
+def _number(stop: str) -> int:
+    """Return the number of a stop along its lane; one without comes first."""
+    number = lane_and_number(stop)[1]
+    return -1 if number is None else number
+
+
+def _add_lanes(figure: go.Figure, method: str, rows: Columns, order: Sequence[str]) -> None:
+    """Draw the mean per stop of one method, a line for each lane, and the largest as a whisker."""
+    style, stops = theme.method_style(method), np.array(texts(rows, "stop"), dtype=object)
+    quality = _quality_mm(rows)
+    lanes: dict[str, list[str]] = {}
+    for stop in order:
+        if np.isfinite(quality[stops == stop]).any():
+            lanes.setdefault(lane_and_number(stop)[0], []).append(stop)
+    for i, lane in enumerate(lanes.values()):
+        samples = [_known(quality[stops == stop]) for stop in lane]
+        means = np.array([sample.mean() for sample in samples])
+        largest = np.array([sample.max() for sample in samples])
+        figure.add_scatter(
+            x=lane,
+            y=means,
+            mode="lines+markers",
+            name=style.label,
+            legendgroup=style.label,
+            showlegend=i == 0,
+            line={"color": style.colour, "width": 2.5},
+            marker={"color": style.colour, "size": 9, "symbol": style.symbol},
+            error_y={
+                "type": "data",
+                "symmetric": False,
+                "array": largest - means,
+                "arrayminus": np.zeros(len(lane)),
+                "color": style.colour,
+                "thickness": 1,
+                "width": 5,
+            },
+            customdata=[[len(sample), top] for sample, top in zip(samples, largest, strict=True)],
+            hovertemplate="<b>%{x}</b><br>mean %{y:.1f} mm of %{customdata[0]} markers<br>"
+            f"largest %{{customdata[1]:.1f}} mm<extra>{style.label}</extra>",
+        )
+
+
+def _add_marks(figure: go.Figure, marks: Columns) -> None:
+    """Draw the control marks with their names."""
+    figure.add_scatter(
+        x=floats(marks, "x_m"),
+        y=floats(marks, "y_m"),
+        mode="markers+text",
+        name="control mark",
+        text=texts(marks, "mark"),
+        textposition="top center",
+        textfont={"size": 11, "color": theme.MUTED},
+        marker={"color": theme.MARK, "size": 10, "symbol": "circle-cross-open"},
+        cliponaxis=False,
+        customdata=floats(marks, "z_m").tolist(),
+        hovertemplate="<b>%{text}</b><br>x %{x:.3f} m<br>y %{y:.3f} m<br>z %{customdata:.3f} m"
+        "<extra>control mark</extra>",
+    )
+
+
+def _add_stations(
+    figure: go.Figure, method: str, rows: Columns, factor: float, true_stops: Columns
+) -> None:
+    """Draw the stations of one method with their ellipses and, enlarged alike, their errors."""
+    style = theme.method_style(method)
+    x, y = floats(rows, "x_m"), floats(rows, "y_m")
+    details = _details(rows, ("stop", "status"), ("sigma_3d_m", "error_3d_m", "n_markers", "z_m"))
+    figure.add_scatter(
+        x=x,
+        y=y,
+        mode="markers",
+        name=style.label,
+        legendgroup=style.label,
+        marker={"color": style.colour, "size": 6, "symbol": style.symbol},
+        customdata=[[row[0], row[1], row[2] * _MM, row[4], row[5]] for row in details],
+        hovertemplate="<b>%{customdata[0]}</b> %{customdata[1]}<br>x %{x:.3f} m<br>y %{y:.3f} m<br>"
+        "z %{customdata[4]:.3f} m<br>sigma %{customdata[2]:.1f} mm, %{customdata[3]:.0f} marks"
+        f"<extra>{style.label}</extra>",
+    )
+    outlines = [ellipse_outline(rows, i, factor) for i in range(len(x))]
+    _add_strokes(figure, outlines, style, dash="solid", width=1.5)
+    _add_strokes(figure, _errors(rows, true_stops, factor), style, dash="solid", width=1)
+
+
+def ellipse_outline(fixes: Columns, i: int, factor: float) -> NDArray[np.float64]:
+    """Return the outline of the 95 % ellipse of a station, enlarged; the bearing is from y to x."""
+    turn = np.linspace(0.0, 2.0 * np.pi, 61)
+    major = factor * floats(fixes, "ellipse_major_95_m")[i] * np.cos(turn)
+    minor = factor * floats(fixes, "ellipse_minor_95_m")[i] * np.sin(turn)
+    bearing = np.radians(floats(fixes, "ellipse_bearing_deg")[i])
+    x = floats(fixes, "x_m")[i] + major * np.sin(bearing) + minor * np.cos(bearing)
+    y = floats(fixes, "y_m")[i] + major * np.cos(bearing) - minor * np.sin(bearing)
+    return np.column_stack([x, y])
+
+
+def _errors(rows: Columns, true_stops: Columns, factor: float) -> list[NDArray[np.float64]]:
+    """Return a line from each station towards its true place, enlarged like the ellipses."""
+    truth = dict(
+        zip(
+            texts(true_stops, "stop"),
+            zip(floats(true_stops, "x_m"), floats(true_stops, "y_m"), strict=True),
+            strict=True,
+        )
+    )
+    lines = []
+    for stop, x, y in zip(
+        texts(rows, "stop"), floats(rows, "x_m"), floats(rows, "y_m"), strict=True
+    ):
+        if stop in truth:
+            start = np.array([x, y])
+            lines.append(np.stack([start, start + factor * (np.array(truth[stop]) - start)]))
+    return lines
+
+
+def _add_strokes(
+    figure: go.Figure,
+    strokes: Sequence[NDArray[np.float64]],
+    style: theme.MethodStyle,
+    *,
+    dash: str,
+    width: float,
+) -> None:
+    """Draw many lines as one trace."""
+    if not strokes:
+        return
+    gap = np.full((1, 2), np.nan)
+    joined = np.concatenate([part for stroke in strokes for part in (stroke, gap)])
+    figure.add_scatter(
+        x=joined[:, 0],
+        y=joined[:, 1],
+        mode="lines",
+        legendgroup=style.label,
+        showlegend=False,
+        line={"color": style.colour, "width": width, "dash": dash},
+        hoverinfo="skip",
+    )
+
+
+def _add_residuals(
+    figure: go.Figure, observations: Columns, names: Sequence[str], look: tuple[str, str, str]
+) -> None:
+    """Draw the residuals of one axis with bars of twice their sigma about zero."""
+    axis, symbol, colour = look
+    sigma = floats(observations, f"sigma_{axis}_m") * _MM
+    values = floats(observations, f"residual_{axis}_m") * _MM
+    figure.add_scatter(
+        x=list(names),
+        y=np.where(np.isfinite(values), 0.0, np.nan),
+        mode="lines",
+        line={"width": 0},
+        offsetgroup=axis,
+        legendgroup=axis,
+        showlegend=False,
+        hoverinfo="skip",
+        error_y={"array": 2.0 * sigma, "color": theme.FAINT, "thickness": 5, "width": 0},
+    )
+    figure.add_scatter(
+        x=list(names),
+        y=values,
+        mode="markers",
+        name=f"{axis}, with ±2 sigma",
+        offsetgroup=axis,
+        legendgroup=axis,
+        marker={"color": colour, "size": 8, "symbol": symbol},
+        customdata=sigma,
+        hovertemplate=f"<b>%{{x}}</b><br>{axis} %{{y:.1f}} mm, sigma %{{customdata:.1f}} mm"
+        "<extra></extra>",
+    )
+
+
+def _note(figure: go.Figure, text: str) -> None:
+    """Write a remark into the lower right corner."""
+    figure.add_annotation(
+        text=text,
+        x=1,
+        y=0,
+        xref="paper",
+        yref="paper",
+        xanchor="right",
+        yanchor="bottom",
+        showarrow=False,
+        font={"size": 12, "color": theme.MUTED},
+        bgcolor=theme.RAISED,
+    )
+
+
+def _known(values: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return what is known of a column."""
+    return values[np.isfinite(values)]
+
+
+def _largest(values: NDArray[np.float64]) -> float:
+    """Return the largest magnitude that is known, or zero."""
+    known = _known(values)
+    return float(np.abs(known).max()) if len(known) else 0.0

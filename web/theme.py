@@ -1,0 +1,123 @@
+"""How things look: colours by role, one Plotly template, one style per method.
+
+Colours are names of CSS variables (``var(--ours)``): static/tokens.css gives each its value for
+light and dark, and the page's script puts the values in when it draws. So there is one palette.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import plotly.graph_objects as go
+
+FONT = "'IBM Plex Sans', system-ui, sans-serif"
+MONO = "'IBM Plex Mono', ui-monospace, monospace"
+
+TEXT = "var(--text)"
+MUTED = "var(--text-muted)"
+FAINT = "var(--text-faint)"
+LINE = "var(--line)"
+GRID = "var(--grid)"
+RAISED = "var(--raised)"
+OURS = "var(--ours)"
+OURS_BAND = "var(--ours-band)"
+PAPER = "var(--paper)"
+PAPER_BAND = "var(--paper-band)"
+GREEN = "var(--third)"
+GREEN_BAND = "var(--third-band)"
+TOLERANCE = "var(--tolerance)"
+MARK = "var(--mark)"
+CLOUD = "var(--cloud)"
+SHADE = "var(--shade)"
+
+DIVERGING = (
+    (0.0, "var(--below)"),
+    (0.5, "var(--middle)"),
+    (1.0, "var(--above)"),
+)
+"""From too near to too far, neutral at zero; told apart without red and green."""
+
+HEIGHTS = ((0.0, "var(--low)"), (1.0, "var(--high)"))
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class MethodStyle:
+    """How one fitting method is drawn, everywhere."""
+
+    label: str
+    colour: str
+    band: str
+    symbol: str
+    dash: str
+
+
+_METHODS = {
+    "along_beam": MethodStyle(
+        label="along beam (ours)", colour=OURS, band=OURS_BAND, symbol="circle", dash="solid"
+    ),
+    "paper": MethodStyle(
+        label="paper's method", colour=PAPER, band=PAPER_BAND, symbol="diamond", dash="solid"
+    ),
+}
+
+
+def method_style(method: str) -> MethodStyle:
+    """Return how a method is drawn; one without a style of its own gets a third colour."""
+    return _METHODS.get(method) or MethodStyle(
+        label=method.replace("_", " "),
+        colour=GREEN,
+        band=GREEN_BAND,
+        symbol="square",
+        dash="solid",
+    )
+
+
+def template() -> go.layout.Template:
+    """Return the look of every figure: quiet axes, hairline grid, figures in a monospace."""
+    axis = {
+        "gridcolor": GRID,
+        "linecolor": LINE,
+        "zerolinecolor": LINE,
+        "tickcolor": LINE,
+        "ticks": "outside",
+        "ticklen": 4,
+        "tickfont": {"family": MONO, "size": 12, "color": MUTED},
+        "title": {"font": {"size": 13, "color": TEXT}, "standoff": 10},
+        "automargin": True,
+        "zeroline": False,
+    }
+    legend = {"orientation": "h", "x": 0, "y": 1.02, "xanchor": "left", "yanchor": "bottom"}
+    return go.layout.Template(
+        layout={
+            "font": {"family": FONT, "size": 13, "color": TEXT},
+            "paper_bgcolor": "rgba(0,0,0,0)",
+            "plot_bgcolor": "rgba(0,0,0,0)",
+            "colorway": [OURS, PAPER, GREEN],
+            "margin": {"l": 56, "r": 16, "t": 44, "b": 48},
+            "xaxis": axis,
+            "yaxis": axis,
+            "legend": {**legend, "font": {"size": 12}, "bgcolor": "rgba(0,0,0,0)"},
+            "hoverlabel": {
+                "bgcolor": RAISED,
+                "bordercolor": LINE,
+                "font": {"family": MONO, "size": 12, "color": TEXT},
+                "align": "left",
+            },
+            "hovermode": "closest",
+            "modebar": {"bgcolor": "rgba(0,0,0,0)", "color": FAINT, "activecolor": TEXT},
+            "scene": {name: _axis_3d() for name in ("xaxis", "yaxis", "zaxis")},
+        }
+    )
+
+
+def _axis_3d() -> dict[str, object]:
+    """Return the look of an axis in space: hardly there."""
+    return {
+        "gridcolor": GRID,
+        "zerolinecolor": LINE,
+        "linecolor": LINE,
+        "showbackground": False,
+        "showspikes": False,
+        "tickfont": {"family": MONO, "size": 11, "color": MUTED},
+        "title": {"font": {"size": 12, "color": TEXT}},
+    }
