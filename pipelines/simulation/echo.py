@@ -16,9 +16,10 @@ from pipelines.rigs import N_LASERS
 from pipelines.simulation.scene import Caster, Scene, caster
 from pipelines.values import Array, Column, Mask, Rings, _seal
 
-_N_RAYS = 37  # in a bundle
+_N_RAYS = 61  # in a bundle
 _MERGE = 0.8  # [m] nearer returns of one pulse are one echo: half a pulse of some 5 ns
 _STEP = 0.10  # [m] departure of a range from the plane through its neighbours
+_THINNING = 128  # one firing in so many is traced in any case: every 7 ms
 _NEAR = 0.35  # [m] what passes a sphere's centre closer than this is near it
 
 
@@ -84,7 +85,8 @@ def trace(scene: Scene, aims: Aims, divergence: Array, *, only_near_spheres: boo
     divergence : (2,)
         Full width of the footprint across and along the spin axis [rad].
     only_near_spheres : bool
-        Whether beams that pass no sphere closely are left without an echo, save the first and last.
+        Whether beams that pass no sphere closely are left without an echo, save one firing in
+        128, which tell of the turn and of the ground.
 
     Returns
     -------
@@ -94,12 +96,15 @@ def trace(scene: Scene, aims: Aims, divergence: Array, *, only_near_spheres: boo
     cast = caster(scene.mesh)
     ranges = np.full(len(aims.origins_site), np.inf)
     reflectivities = np.zeros(len(ranges))
+    is_cast = np.ones(len(ranges), dtype=np.bool_)
+    if only_near_spheres:
+        is_cast = np.arange(len(ranges)) // N_LASERS % _THINNING == 0
+    chosen = aims.rows(is_cast)
+    rays = np.hstack([chosen.origins_site, chosen.directions_site]).astype(np.float32)
+    ranges[is_cast], reflectivities[is_cast] = cast(rays)
     if only_near_spheres:
         is_wide = _passes(scene, aims, 0.0, _NEAR)
-        is_wide[:N_LASERS] = is_wide[-N_LASERS:] = True  # how far the gimbal turned must show
     else:
-        rays = np.hstack([aims.origins_site, aims.directions_site]).astype(np.float32)
-        ranges[:], reflectivities[:] = cast(rays)
         is_wide = _passes(scene, aims, float(divergence.max()) / 2, 0.0)
         is_wide |= _sees_step(ranges, N_LASERS)
     wide = aims.rows(is_wide)
@@ -196,24 +201,21 @@ def _passes_axes(
     """Return which beams pass one of the axes within its radius and their own half width."""
     found = np.zeros(len(origins), dtype=np.bool_)
     for i in range(len(origins)):
-        d = directions[i]
+        dx, dy, dz = directions[i, 0], directions[i, 1], directions[i, 2]
         for j in range(len(feet)):
-            wx, wy, wz = feet[j] - origins[i]
-            ax, ay, az = axes[j]
-            wd = wx * d[0] + wy * d[1] + wz * d[2]
-            ad = ax * d[0] + ay * d[1] + az * d[2]
+            wx, wy = feet[j, 0] - origins[i, 0], feet[j, 1] - origins[i, 1]
+            wz = feet[j, 2] - origins[i, 2]
+            ax, ay, az = axes[j, 0], axes[j, 1], axes[j, 2]
+            wd, ad = wx * dx + wy * dy + wz * dz, ax * dx + ay * dy + az * dz
             # the place on the axis nearest to the line of the beam, clamped to its ends
             square = ax * ax + ay * ay + az * az - ad * ad
             s = 0.0
             if square > 0.0:
-                aw = ax * wx + ay * wy + az * wz
-                s = min(max((wd * ad - aw) / square, 0.0), 1.0)
+                s = min(max((wd * ad - ax * wx - ay * wy - az * wz) / square, 0.0), 1.0)
             along = wd + s * ad
-            if along <= 0.0:
-                continue
             px, py, pz = wx + s * ax, wy + s * ay, wz + s * az
             away = px * px + py * py + pz * pz - along * along
-            if away <= (radii[j] + half_width * along) ** 2:
+            if along > 0.0 and away <= (radii[j] + half_width * along) ** 2:
                 found[i] = True
                 break
     return found
@@ -268,8 +270,8 @@ def _echoes(
     for i in range(n):
         t[:], shade[:] = distances[i], shades[i]
         for m in range(len(spheres)):
-            wx, wy, wz = spheres[m, :3] - origins[i]
-            radius = spheres[m, 3]
+            wx, wy = spheres[m, 0] - origins[i, 0], spheres[m, 1] - origins[i, 1]
+            wz, radius = spheres[m, 2] - origins[i, 2], spheres[m, 3]
             distance = np.sqrt(wx * wx + wy * wy + wz * wz)
             d = directions[i, 0]
             if wx * d[0] + wy * d[1] + wz * d[2] < distance - 2.0 * radius:

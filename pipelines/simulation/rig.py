@@ -16,7 +16,7 @@ from pipelines.simulation.options import SimulationConfig
 from pipelines.values import Array, ImuMount, Nanos, Rig, _seal
 
 _RATE = 100.0  # [Hz] of joint samples and orientations
-_LEAD = 0.05  # [s] that the gimbal turns, and is recorded, before the first and after the last shot
+_LEAD = 0.05  # [s] that encoder and AHRS record before the first and after the last shot
 _MARKER_RADIUS = 0.100  # [m] of the sphere that scan lines must not miss ...
 _MARKER_RANGE = 15.0  # [m] ... at this distance
 _LINES_WANTED = 2  # scan lines over its diameter at the least
@@ -45,23 +45,40 @@ class Motion:
         return np.interp(times, self.times, self.angles)
 
 
-def even_turn(turn: float, start: float) -> Motion:
-    """Return a turn through 360 degrees at constant speed, with a little before and after it.
+def recorded_time(config: SimulationConfig) -> float:
+    """Return how long the LiDAR records: the turn, and half a revolution before and after it.
 
     Parameters
     ----------
-    turn : float
-        Time of the turn [s].
+    config : SimulationConfig
+        Time of the turn and speed of the LiDAR.
+
+    Returns
+    -------
+    float
+        Time from the first shot to the end of the last firing [s]. Half a revolution looks into
+        the sky: without the surplus the returns might not span the turn.
+    """
+    return config.turn + 60.0 / config.spin_rpm
+
+
+def even_turn(config: SimulationConfig, start: float) -> Motion:
+    """Return a movement at constant speed, through 360 degrees in the time of the turn.
+
+    Parameters
+    ----------
+    config : SimulationConfig
+        Time of the turn.
     start : float
         Angle at the first shot [rad].
 
     Returns
     -------
     Motion
-        The movement.
+        The movement, which begins before the first shot and ends after the last.
     """
-    times = np.array([-1.0, turn + 1.0])
-    return Motion(times=times, angles=start + 2 * np.pi / turn * times)
+    times = np.array([-1.0, recorded_time(config) + 1.0])
+    return Motion(times=times, angles=start + 2 * np.pi / config.turn * times)
 
 
 def nominal_rig(config: SimulationConfig) -> Rig:
@@ -112,7 +129,7 @@ def true_rig(config: SimulationConfig, rng: np.random.Generator) -> Rig:
 
 
 def joint_samples(
-    motion: Motion, duration: float, rig: Rig, config: SimulationConfig, rng: np.random.Generator
+    motion: Motion, rig: Rig, config: SimulationConfig, rng: np.random.Generator
 ) -> tuple[Array, Nanos]:
     """Return what the encoder of the gimbal records.
 
@@ -120,8 +137,6 @@ def joint_samples(
     ----------
     motion : Motion
         The true angle.
-    duration : float
-        Time from the first shot to the last [s].
     rig : Rig
         The true rig: eccentricity and clock.
     config : SimulationConfig
@@ -136,7 +151,7 @@ def joint_samples(
     offsets_ns : (n,)
         Instants on the gimbal's clock, since the first shot.
     """
-    times = _sample_times(duration, rng)
+    times = _sample_times(config, rng)
     truth = motion.angle_at(times)
     c, s = rig.encoder_eccentricity
     angles = truth.copy()
@@ -150,7 +165,6 @@ def joint_samples(
 
 def ahrs_samples(
     motion: Motion,
-    duration: float,
     R_station_base: Array,
     rig: Rig,
     config: SimulationConfig,
@@ -162,8 +176,6 @@ def ahrs_samples(
     ----------
     motion : Motion
         The true angle of the gimbal.
-    duration : float
-        Time from the first shot to the last [s].
     R_station_base : (3, 3)
         How the base truly leans.
     rig : Rig
@@ -181,7 +193,7 @@ def ahrs_samples(
     offsets_ns : (n,)
         Instants on the LiDAR's clock, since the first shot.
     """
-    times = _sample_times(duration, rng)
+    times = _sample_times(config, rng)
     lean = rng.normal(0.0, config.sigma_ahrs_bias, 3) * (1.0, 1.0, 0.0)
     shake = Rotation.from_rotvec(rng.normal(0.0, config.sigma_ahrs, (len(times), 3)))
     mount = Rotation.from_matrix(rig.R_mount_imu)
@@ -242,9 +254,11 @@ def _horizon_gaps(config: SimulationConfig) -> Array:
     return np.diff(directions, append=directions[0] + 2 * np.pi)
 
 
-def _sample_times(duration: float, rng: np.random.Generator) -> Array:
-    """Return the instants of samples that bracket all shots [s]."""
-    return np.arange(-_LEAD - rng.uniform(0.0, 1.0 / _RATE), duration + _LEAD, 1.0 / _RATE)
+def _sample_times(config: SimulationConfig, rng: np.random.Generator) -> Array:
+    """Return the instants of samples that bracket all shots, on either clock [s]."""
+    lead = _LEAD + abs(config.gimbal_clock_offset)
+    first = -lead - rng.uniform(0.0, 1.0 / _RATE)
+    return np.arange(first, recorded_time(config) + lead, 1.0 / _RATE)
 
 
 def _nanoseconds(times: Array) -> Nanos:

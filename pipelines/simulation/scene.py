@@ -13,7 +13,7 @@ from typing import Self
 import numpy as np
 from numpy.typing import ArrayLike
 
-from pipelines.simulation.terrain import Terrain
+from pipelines.simulation.terrain import Terrain, interpolated
 from pipelines.values import Array, Column, Index, _seal
 
 _N_SIDES = 24  # of a pole: its flats lie 0.1 mm inside the circle
@@ -149,13 +149,13 @@ def terrain_mesh(rng: np.random.Generator, terrain: Terrain) -> Mesh:
         for corner in (nodes[:-1, :-1], nodes[:-1, 1:], nodes[1:, 1:], nodes[1:, :-1])
     )
     triangles = np.concatenate([np.column_stack([a, b, c]), np.column_stack([a, c, d])])
-    n_patches = int(np.ptp(terrain.xs) / _PATCH) + 2
-    shades = rng.uniform(*_REGOLITH, (n_patches, n_patches))
-    column, row = ((p_site[a, i] - p_site[0, i]) // _PATCH for i in range(2))
+    lines = np.arange(terrain.xs[0], terrain.xs[-1] + _PATCH, _PATCH)
+    shades = rng.uniform(*_REGOLITH, (len(lines), len(lines)))
+    middles = p_site[triangles].mean(axis=1)
     return Mesh(
         p_site=p_site,
         triangles=triangles,
-        reflectivities=np.tile(shades[row.astype(np.intp), column.astype(np.intp)], 2),
+        reflectivities=interpolated(lines, lines, shades, middles),
     )
 
 

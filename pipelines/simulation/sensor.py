@@ -87,11 +87,6 @@ class Recorded:
         )
 
 
-def n_firings(config: SimulationConfig) -> int:
-    """Return how often all lasers fire during one turn."""
-    return int(config.turn / FIRING_CYCLE)
-
-
 def fire(first: int, n: int, start_azimuth: float, motion: Motion, spin_rpm: float) -> Shots:
     """Return some firings of all lasers.
 

@@ -48,11 +48,7 @@ class Terrain:
 
     def height_at(self, p_site: Array) -> Array:
         """Return the height of the ground under points, (..., 2 or 3) [m]."""
-        i, u = _cell(self.xs, p_site[..., 0])
-        j, v = _cell(self.ys, p_site[..., 1])
-        low = (1 - u) * self.heights[j, i] + u * self.heights[j, i + 1]
-        high = (1 - u) * self.heights[j + 1, i] + u * self.heights[j + 1, i + 1]
-        return np.asarray((1 - v) * low + v * high)
+        return interpolated(self.xs, self.ys, self.heights, p_site)
 
     def highest_near(self, p_site: Array, radius: float) -> float:
         """Return the height of the highest node within a horizontal distance [m]."""
@@ -112,6 +108,30 @@ def with_mounds(terrain: Terrain, p_site: Array, radius: float) -> Terrain:
         rise = max(float(top[2] - terrain.height_at(top)), 0.0)
         heights += rise * np.cos(np.minimum(away / radius, 1.0) * np.pi / 2) ** 2
     return Terrain(xs=terrain.xs, ys=terrain.ys, heights=heights)
+
+
+def interpolated(xs: Array, ys: Array, grid: Array, p_site: Array) -> Array:
+    """Return the values of a grid at points, bilinear and clamped to its edge.
+
+    Parameters
+    ----------
+    xs, ys : (n,), (m,)
+        Lines of the grid, ascending [m].
+    grid : (m, n)
+        Values at its nodes.
+    p_site : (..., 2 or 3)
+        The points [m].
+
+    Returns
+    -------
+    (...,)
+        The values.
+    """
+    i, u = _cell(xs, p_site[..., 0])
+    j, v = _cell(ys, p_site[..., 1])
+    low = (1 - u) * grid[j, i] + u * grid[j, i + 1]
+    high = (1 - u) * grid[j + 1, i] + u * grid[j + 1, i + 1]
+    return np.asarray((1 - v) * low + v * high)
 
 
 def _cell(lines: Array, x: Array) -> tuple[np.ndarray, Array]:
