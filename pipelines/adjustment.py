@@ -246,13 +246,8 @@ def adjust(
     4.3); the minimal detectable bias along the weakest axis is ``sqrt(lambda0 / e)``, ``e`` the
     smallest eigenvalue of the block of ``P Q_v P`` (Baarda 1968).
     """
+    dof = _degrees_of_freedom(linearise(start))
     solution = solve(linearise, move, start)
-    n = sum(group.residuals.size for group in solution.groups)
-    dof = n - len(solution.cov)
-    if dof < 0:
-        raise TooFewObservationsError(
-            f"{n} observations cannot determine {len(solution.cov)} unknowns."
-        )
     vtpv = sum(_vtpv(group) for group in solution.groups)
     noncentrality = float(ndtri(1.0 - test_level / 2.0) + ndtri(test_power))
     statistics = [_block_statistics(group, solution.cov) for group in solution.groups]
@@ -273,6 +268,14 @@ def adjust(
         noncentrality=noncentrality,
         critical_w=float(ndtri(1.0 - test_level / 2.0)),
     )
+
+
+def _degrees_of_freedom(groups: tuple[Observations, ...]) -> int:
+    """Return the number of observations minus that of the unknowns, if it is not negative."""
+    n, p = sum(group.residuals.size for group in groups), groups[0].J.shape[-1]
+    if n < p:
+        raise TooFewObservationsError(f"{n} observations cannot determine {p} unknowns.")
+    return n - p
 
 
 def _vtpv(group: Observations) -> float:
