@@ -14,7 +14,7 @@ import numpy as np
 
 from pipelines.rigs import N_LASERS
 from pipelines.simulation.scene import Caster, Scene, caster
-from pipelines.values import Array, Column, Mask, Rings, _seal
+from pipelines.values import Array, Column, Mask, _seal
 
 _N_RAYS = 61  # in a bundle
 _MERGE = 0.8  # [m] nearer returns of one pulse are one echo: half a pulse of some 5 ns
@@ -46,7 +46,18 @@ class Aims:
         _seal(self, origins_site=(n, 3), directions_site=(n, 3), spin_axes_site=(n, 3))
 
     def rows(self, chosen: Mask) -> Aims:
-        """Return some of the beams."""
+        """Return some of the beams.
+
+        Parameters
+        ----------
+        chosen : (n,)
+            Which ones.
+
+        Returns
+        -------
+        Aims
+            The chosen ones, in the same order.
+        """
         return Aims(
             origins_site=self.origins_site[chosen],
             directions_site=self.directions_site[chosen],
@@ -153,45 +164,6 @@ def _disc(n: int) -> Array:
     k = np.arange(n)
     radii, angles = np.sqrt((k + 0.5) / n), k * np.pi * (3 - np.sqrt(5))
     return np.column_stack([radii * np.cos(angles), radii * np.sin(angles)])
-
-
-@numba.njit(cache=True, nogil=True)
-def aim(
-    azimuths: Array, gimbal_angles: Array, rings: Rings, lasers: Array, mounting: Array, pose: Array
-) -> tuple[Array, Array, Array]:  # pragma: no cover
-    """Return origins, directions and spin axes of shots in the site frame, (n, 3) each.
-
-    ``lasers`` holds elevation and height of each laser, (k, 2); ``mounting`` is ``T_head_lidar``
-    and ``pose`` is ``T_site_base``.
-    """
-    n = len(azimuths)
-    origins, directions, axes = np.empty((n, 3)), np.empty((n, 3)), np.empty((n, 3))
-    lidar, head, base = np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3))
-    for i in range(n):
-        elevation, height = lasers[rings[i], 0], lasers[rings[i], 1]
-        reach = np.cos(elevation)
-        lidar[0] = (reach * np.cos(azimuths[i]), -reach * np.sin(azimuths[i]), np.sin(elevation))
-        lidar[1] = (0.0, 0.0, 1.0)
-        lidar[2] = (0.0, 0.0, height)
-        _rotate(mounting, lidar, head)
-        for k in range(3):
-            head[2, k] += mounting[k, 3]
-        c, s = np.cos(gimbal_angles[i]), np.sin(gimbal_angles[i])
-        for k in range(3):
-            base[k] = (c * head[k, 0] - s * head[k, 1], s * head[k, 0] + c * head[k, 1], head[k, 2])
-        _rotate(pose, base, head)
-        for k in range(3):
-            directions[i, k], axes[i, k] = head[0, k], head[1, k]
-            origins[i, k] = head[2, k] + pose[k, 3]
-    return origins, directions, axes
-
-
-@numba.njit(cache=True, nogil=True)
-def _rotate(T: Array, v: Array, out: Array) -> None:  # pragma: no cover
-    """Rotate three vectors, the rows of ``v``, by the rotation of ``T``, into ``out``."""
-    for k in range(3):
-        for j in range(3):
-            out[k, j] = T[j, 0] * v[k, 0] + T[j, 1] * v[k, 1] + T[j, 2] * v[k, 2]
 
 
 @numba.njit(cache=True, nogil=True)

@@ -86,7 +86,23 @@ class Field:
     stops: tuple[Stop, ...]
 
     def stop(self, name: str) -> Stop:
-        """Return the stop of a name; NotFoundError when there is none."""
+        """Return the stop of a name.
+
+        Parameters
+        ----------
+        name : str
+            What it is called.
+
+        Returns
+        -------
+        Stop
+            The stop.
+
+        Raises
+        ------
+        NotFoundError
+            If there is none of that name.
+        """
         for stop in self.stops:
             if stop.name == name:
                 return stop

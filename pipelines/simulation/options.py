@@ -146,7 +146,13 @@ class SimulationConfig:
         return cls(**{**zeros, "drop_out": 0.0, "divergence": (0.0, 0.0), **changes})
 
     def to_mapping(self) -> dict[str, Any]:
-        """Return the configuration as plain values."""
+        """Return the configuration as plain values.
+
+        Returns
+        -------
+        dict
+            By field.
+        """
         return {**dataclasses.asdict(self), "imu_mount": str(self.imu_mount)}
 
 

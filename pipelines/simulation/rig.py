@@ -41,7 +41,18 @@ class Motion:
         _seal(self, times=(None,), angles=(len(self.times),))
 
     def angle_at(self, times: Array) -> Array:
-        """Return the true angle at some instants [rad]."""
+        """Return the true angle at some instants.
+
+        Parameters
+        ----------
+        times : (n,)
+            The instants [s].
+
+        Returns
+        -------
+        (n,)
+            The angles, unwrapped [rad].
+        """
         return np.interp(times, self.times, self.angles)
 
 
@@ -237,7 +248,20 @@ def commensurability(config: SimulationConfig) -> str:
 
 
 def quantised(values: Array, step: float) -> Array:
-    """Return values rounded to multiples of a step; a step of 0 leaves them."""
+    """Return values rounded to multiples of a step.
+
+    Parameters
+    ----------
+    values : (n,)
+        The values.
+    step : float
+        The step, in their unit; 0 leaves them.
+
+    Returns
+    -------
+    (n,)
+        The rounded values.
+    """
     return np.asarray(np.round(values / step) * step) if step else values
 
 

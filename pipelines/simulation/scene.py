@@ -46,13 +46,39 @@ class Mesh:
 
     @classmethod
     def even(cls, p_site: Array, triangles: Index, reflectivity: float) -> Self:
-        """Return a mesh of one reflectivity."""
+        """Return a mesh of one reflectivity.
+
+        Parameters
+        ----------
+        p_site : (n, 3)
+            Corners [m].
+        triangles : (m, 3)
+            Rows of ``p_site``.
+        reflectivity : float
+            Diffuse reflectivity of all triangles, 0 to 1.
+
+        Returns
+        -------
+        Mesh
+            The mesh.
+        """
         shades = np.full(len(triangles), reflectivity)
         return cls(p_site=p_site, triangles=triangles, reflectivities=shades)
 
     @classmethod
     def merged(cls, meshes: Sequence[Mesh]) -> Self:
-        """Return several meshes as one."""
+        """Return several meshes as one.
+
+        Parameters
+        ----------
+        meshes : sequence of Mesh
+            The meshes; may be none.
+
+        Returns
+        -------
+        Mesh
+            All their triangles.
+        """
         firsts = np.cumsum([0, *(len(mesh.p_site) for mesh in meshes)])
         shifted = [mesh.triangles + first for mesh, first in zip(meshes, firsts, strict=False)]
         return cls(

@@ -6,10 +6,11 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Self
 
+import numba
 import numpy as np
 
 from pipelines.rigs import FIRING_CYCLE, FIRING_ORDER, LASER_CYCLE, N_LASERS
-from pipelines.simulation.echo import Echoes
+from pipelines.simulation.echo import Aims, Echoes
 from pipelines.simulation.options import SimulationConfig
 from pipelines.simulation.rig import Motion, quantised
 from pipelines.values import Array, Column, Nanos, Rig, Rings, _seal
@@ -78,7 +79,18 @@ class Recorded:
 
     @classmethod
     def joined(cls, pieces: Sequence[Self]) -> Self:
-        """Return several pieces of one recording as one."""
+        """Return several pieces of one recording as one.
+
+        Parameters
+        ----------
+        pieces : sequence of Recorded
+            In the order of firing.
+
+        Returns
+        -------
+        Recorded
+            All of them.
+        """
         return cls(
             p_lidar=np.concatenate([piece.p_lidar for piece in pieces]),
             intensities=np.concatenate([piece.intensities for piece in pieces]),
@@ -115,6 +127,30 @@ def fire(first: int, n: int, start_azimuth: float, motion: Motion, spin_rpm: flo
         azimuths=start_azimuth + 2 * np.pi * spin_rpm / 60.0 * times,
         gimbal_angles=motion.angle_at(times),
     )
+
+
+def aim(shots: Shots, rig: Rig, T_site_base: Array) -> Aims:
+    """Return where shots start and point.
+
+    Parameters
+    ----------
+    shots : Shots
+        The shots.
+    rig : Rig
+        The true rig.
+    T_site_base : (4, 4)
+        True pose of the base [m].
+
+    Returns
+    -------
+    Aims
+        In the order of firing.
+    """
+    lasers = np.column_stack([rig.laser_elevations, rig.laser_heights])
+    origins, directions, axes = _aim(
+        shots.azimuths, shots.gimbal_angles, shots.rings, lasers, rig.T_head_lidar, T_site_base
+    )
+    return Aims(origins_site=origins, directions_site=directions, spin_axes_site=axes)
 
 
 def record(
@@ -157,7 +193,18 @@ def record(
 
 
 def range_noise(reflectivities: Array) -> Array:
-    """Return the range noise of a VLP-16 for calibrated reflectivities of 0-255 [m]."""
+    """Return the range noise of a VLP-16 as seen in real packets.
+
+    Parameters
+    ----------
+    reflectivities : (n,)
+        Calibrated reflectivities, 0-255.
+
+    Returns
+    -------
+    (n,)
+        Standard deviations [m].
+    """
     return np.asarray(_NOISE[np.digitize(reflectivities, _NOISE_LIMITS)])
 
 
@@ -175,3 +222,42 @@ def _points(ranges: Array, azimuths: Array, elevations: Array, heights: Array) -
     reach = ranges * np.cos(elevations)
     x, y = reach * np.cos(azimuths), -reach * np.sin(azimuths)
     return np.column_stack([x, y, ranges * np.sin(elevations) + heights]).astype(np.float32)
+
+
+@numba.njit(cache=True, nogil=True)
+def _aim(
+    azimuths: Array, gimbal_angles: Array, rings: Rings, lasers: Array, mounting: Array, pose: Array
+) -> tuple[Array, Array, Array]:  # pragma: no cover
+    """Return origins, directions and spin axes of shots in the site frame, (n, 3) each.
+
+    ``lasers`` holds elevation and height of each laser, (k, 2); ``mounting`` is ``T_head_lidar``
+    and ``pose`` is ``T_site_base``.
+    """
+    n = len(azimuths)
+    origins, directions, axes = np.empty((n, 3)), np.empty((n, 3)), np.empty((n, 3))
+    lidar, head, base = np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3))
+    for i in range(n):
+        elevation, height = lasers[rings[i], 0], lasers[rings[i], 1]
+        reach = np.cos(elevation)
+        lidar[0] = (reach * np.cos(azimuths[i]), -reach * np.sin(azimuths[i]), np.sin(elevation))
+        lidar[1] = (0.0, 0.0, 1.0)
+        lidar[2] = (0.0, 0.0, height)
+        _rotate(mounting, lidar, head)
+        for k in range(3):
+            head[2, k] += mounting[k, 3]
+        c, s = np.cos(gimbal_angles[i]), np.sin(gimbal_angles[i])
+        for k in range(3):
+            base[k] = (c * head[k, 0] - s * head[k, 1], s * head[k, 0] + c * head[k, 1], head[k, 2])
+        _rotate(pose, base, head)
+        for k in range(3):
+            directions[i, k], axes[i, k] = head[0, k], head[1, k]
+            origins[i, k] = head[2, k] + pose[k, 3]
+    return origins, directions, axes
+
+
+@numba.njit(cache=True, nogil=True)
+def _rotate(T: Array, v: Array, out: Array) -> None:  # pragma: no cover
+    """Rotate three vectors, the rows of ``v``, by the rotation of ``T``, into ``out``."""
+    for k in range(3):
+        for j in range(3):
+            out[k, j] = T[j, 0] * v[k, 0] + T[j, 1] * v[k, 1] + T[j, 2] * v[k, 2]

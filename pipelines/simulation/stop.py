@@ -12,7 +12,7 @@ import numpy as np
 from pipelines.errors import InputError
 from pipelines.geometry import rigid, rot_x, rot_y, rot_z
 from pipelines.rigs import FIRING_CYCLE, rig_digest
-from pipelines.simulation.echo import Aims, aim, trace
+from pipelines.simulation.echo import trace
 from pipelines.simulation.field import Field
 from pipelines.simulation.options import SimulationConfig
 from pipelines.simulation.rig import (
@@ -25,7 +25,7 @@ from pipelines.simulation.rig import (
     true_rig,
 )
 from pipelines.simulation.scene import Scene
-from pipelines.simulation.sensor import Recorded, fire, record
+from pipelines.simulation.sensor import Recorded, aim, fire, record
 from pipelines.values import Array, Origin, Rig, ScanLog, StopTruth, Truth
 
 Progress = Callable[[float, str], None]
@@ -200,20 +200,11 @@ def _scan(
     """Return what the LiDAR records during one turn."""
     n, start_azimuth = int(recorded_time(config) / FIRING_CYCLE), rng.uniform(0.0, 2 * np.pi)
     rig = run.rig
-    lasers = np.column_stack([rig.laser_elevations, rig.laser_heights])
     pieces = []
     for first in range(0, n, _CHUNK):
         progress(first / n, "Casting beams")
         shots = fire(first, min(_CHUNK, n - first), start_azimuth, run.motion, config.spin_rpm)
-        origins, directions, axes = aim(
-            shots.azimuths,
-            shots.gimbal_angles,
-            shots.rings,
-            lasers,
-            rig.T_head_lidar,
-            run.T_site_base,
-        )
-        aims = Aims(origins_site=origins, directions_site=directions, spin_axes_site=axes)
+        aims = aim(shots, rig, run.T_site_base)
         echoes = trace(run.scene, aims, rig.divergence, only_near_spheres=config.only_near_spheres)
         pieces.append(record(shots, echoes, rig, config, rng))
     progress(1.0, "All beams cast")

@@ -47,11 +47,35 @@ class Terrain:
         _seal(self, xs=(None,), ys=(None,), heights=(len(self.ys), len(self.xs)))
 
     def height_at(self, p_site: Array) -> Array:
-        """Return the height of the ground under points, (..., 2 or 3) [m]."""
+        """Return the height of the ground under points.
+
+        Parameters
+        ----------
+        p_site : (..., 2 or 3)
+            The points [m].
+
+        Returns
+        -------
+        (...,)
+            The heights [m].
+        """
         return interpolated(self.xs, self.ys, self.heights, p_site)
 
     def highest_near(self, p_site: Array, radius: float) -> float:
-        """Return the height of the highest node within a horizontal distance [m]."""
+        """Return the height of the highest ground near a point.
+
+        Parameters
+        ----------
+        p_site : (2 or 3,)
+            The point [m].
+        radius : float
+            Horizontal distance within which is looked [m].
+
+        Returns
+        -------
+        float
+            Height of the highest node of the grid there [m].
+        """
         away = np.hypot(self.xs[None, :] - p_site[0], self.ys[:, None] - p_site[1])
         return float(self.heights[away <= radius].max())
 
