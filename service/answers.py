@@ -7,6 +7,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
@@ -16,6 +18,7 @@ from pipelines.accuracy import UNMATCHED, marker_errors, station_error
 from pipelines.config import SurveyConfig
 from pipelines.geometry import levelling_rotation, yaw_pitch_roll
 from pipelines.rigs import rig_digest, rig_to_mapping
+from pipelines.survey import Progress, process
 from pipelines.values import (
     Array,
     ControlMarks,
@@ -23,13 +26,14 @@ from pipelines.values import (
     MarkerFit,
     MarkerFits,
     NoFix,
-    Origin,
     Rig,
+    ScanLog,
     StationFix,
     StopResult,
     StopTruth,
     Truth,
 )
+from storage.recordings import read_log
 from storage.results import marker_name
 
 Frame = Literal["station", "base"]
@@ -38,37 +42,45 @@ Plain = dict[str, Any]
 NO_CONTROL = "No control marks were given: there are centres, but no position."
 
 
-def survey_answer(
-    origin: Origin,
-    config: SurveyConfig,
-    stops: Sequence[StopResult],
-    *,
-    marks: ControlMarks | None,
-    frame: Frame,
-    truth: Truth | None = None,
-) -> Plain:
-    """Return all that one log gave; truth, if given, adds errors and changes nothing else."""
-    rig = stops[0].cloud.rig
-    poses = {stop.name: stop for stop in truth.stops} if truth else {}
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Inputs:
+    """What a log is processed with, and in which frame its centres are wanted.
+
+    Truth, if given, adds errors to the answer and changes nothing else.
+    """
+
+    config: SurveyConfig
+    rig: Rig | None = None
+    marks: ControlMarks | None = None
+    truth: Truth | None = None
+    frame: Frame = "station"
+
+
+def answer_log(path: Path, inputs: Inputs, progress: Progress) -> Plain:
+    """Process a log and return all that it gave."""
+    progress(0.0, f"Reading {path.name}")
+    log = read_log(path)
+    stops = process(
+        log, config=inputs.config, rig=inputs.rig, marks=inputs.marks, progress=progress
+    )
+    return survey_answer(log, stops, inputs)
+
+
+def survey_answer(log: ScanLog, stops: Sequence[StopResult], inputs: Inputs) -> Plain:
+    """Return all that one log gave."""
     return {
-        "log": {"name": origin.name, "sha256": origin.digest},
-        "rig": _rig(rig),
-        "config": config.to_mapping() | {"digest": config.digest},
-        "stops": [
-            stop_answer(stop, config, marks, frame, truth, poses.get(stop.name)) for stop in stops
-        ],
+        "log": {"name": log.origin.name, "sha256": log.origin.digest, "notes": list(log.notes)},
+        "rig": _rig(stops[0].cloud.rig),
+        "config": inputs.config.to_mapping() | {"digest": inputs.config.digest},
+        "stops": [stop_answer(stop, inputs) for stop in stops],
     }
 
 
-def stop_answer(
-    stop: StopResult,
-    config: SurveyConfig,
-    marks: ControlMarks | None,
-    frame: Frame,
-    truth: Truth | None,
-    pose: StopTruth | None,
-) -> Plain:
+def stop_answer(stop: StopResult, inputs: Inputs) -> Plain:
     """Return all that one stop gave."""
+    marks, frame, truth = inputs.marks, inputs.frame, inputs.truth
+    poses = {one.name: one for one in truth.stops} if truth else {}
+    pose = poses.get(stop.name)
     R_frame_base = _rotation_to(frame, stop.cloud.levelling)
     stations = [_station(method, stop, fix, marks, pose) for (method, _), fix in stop.fixes.items()]
     first = stations[0] if stations else {"reason": NO_CONTROL}
@@ -90,7 +102,7 @@ def stop_answer(
             "duration_s": stop.cloud.duration,
             "notes": list(stop.cloud.notes),
         },
-        "tolerance_m": config.tolerance,
+        "tolerance_m": inputs.config.tolerance,
         "timings_s": dict(stop.timings),
     }
     if answer["station"] is None:

@@ -13,7 +13,7 @@ from fastapi import APIRouter, FastAPI, Request, Response
 from fastapi.responses import RedirectResponse
 from fastapi.staticfiles import StaticFiles
 
-from service import api, errors, guard
+from service import api, errors, guard, pages
 from service.errors import UnauthorizedError
 from service.settings import Settings
 from service.state import Current, opened
@@ -30,9 +30,13 @@ def create_app(settings: Settings) -> FastAPI:
     @asynccontextmanager
     async def lifespan(app: FastAPI) -> AsyncIterator[None]:
         logging.getLogger("service").setLevel(settings.log_level.upper())
-        async with opened(settings) as service:
-            app.state.service = service
-            yield
+        try:
+            async with opened(settings) as service:
+                app.state.service = service
+                yield
+        except BaseException as error:
+            app.state.failure = error  # for the one who started us; servers only log it
+            raise
 
     app = FastAPI(
         title="spheremark",
@@ -49,8 +53,10 @@ def create_app(settings: Settings) -> FastAPI:
     app.add_middleware(guard.Guard, settings=settings)
     app.include_router(api.router, prefix=ROOT)
     app.include_router(about)
+    app.include_router(pages.router)
+    app.include_router(pages.router)
     app.mount("/static", StaticFiles(directory=STATIC), name="static")
-    errors.install(app)
+    errors.install(app, pages.error_page)
     return app
 
 

@@ -57,11 +57,16 @@ class Service:
     @property
     def limits(self) -> QueryLimits:
         """Limits of people's queries."""
-        return QueryLimits(
-            seconds=self.settings.sql_seconds,
-            rows=self.settings.sql_rows,
-            memory_bytes=self.settings.sql_memory_bytes,
-        )
+        return query_limits(self.settings)
+
+
+def query_limits(settings: Settings) -> QueryLimits:
+    """Return the limits of people's queries."""
+    return QueryLimits(
+        seconds=settings.sql_seconds,
+        rows=settings.sql_rows,
+        memory_bytes=settings.sql_memory_bytes,
+    )
 
 
 @asynccontextmanager

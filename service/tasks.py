@@ -118,7 +118,7 @@ def _process(order: Order, reporter: Reporter) -> Outcome:
         progress=lambda share, what: reporter.progress(0.1 + 0.8 * share, what),
     )
     reporter.progress(0.9, "Storing the results")
-    clouds = {stop.name: write_cloud(stop.cloud, order.clouds_url) for stop in stops}
+    clouds = {stop.name: write_cloud(stop, order.clouds_url) for stop in stops}
     run = RunInfo(
         run_id=order.run_id,
         job_id=order.job_id,

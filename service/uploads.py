@@ -19,6 +19,7 @@ from starlette.requests import ClientDisconnect
 from pipelines.errors import InputError, NotFoundError
 from service.errors import EmptyBodyError, RefusedRecordingError, TooLargeError
 from storage.catalogue import Catalogue
+from storage.recordings import inspect_log
 from storage.records import RecordingRecord
 
 _BLOCK = 4 << 20  # [bytes] hashed and written at once; large enough that a thread pays off
@@ -117,8 +118,6 @@ def take_in(catalogue: Catalogue, received: Received, name: str) -> tuple[Record
 
 def _enter(catalogue: Catalogue, received: Received, name: str) -> RecordingRecord:
     """Inspect a log and enter it with what was found."""
-    from storage.recordings import inspect_log
-
     return catalogue.add_recording(
         received.digest,
         name=name.removesuffix(".mcap"),

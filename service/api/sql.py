@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from datetime import UTC, datetime
+from pathlib import Path
 from typing import Annotated, Any
 
 import pyarrow as pa
@@ -13,7 +14,8 @@ from pyarrow import csv
 
 from service.api.models import Answer, Column, Listing, Query, Table
 from service.state import Current, Service
-from storage.sandbox import QueryResult, run_query, to_csv
+from storage.catalogue import Catalogue
+from storage.sandbox import QueryLimits, QueryResult, run_query, to_csv
 
 router = APIRouter(tags=["sql"])
 
@@ -100,10 +102,20 @@ def export_coordinates(
     survey: Annotated[str | None, QueryParameter(description="Id or name of a survey.")] = None,
 ) -> Response:
     """Return the newest stations and the control marks as CSV, in the site frame."""
-    table = service.catalogue.table(_COORDINATES, {"survey": survey})
+    return Response(coordinates(service.catalogue, survey), media_type="text/csv")
+
+
+def coordinates(catalogue: Catalogue, survey: str | None) -> bytes:
+    """Return the newest stations and the control marks of one survey or all, as CSV."""
     sink = pa.BufferOutputStream()
-    csv.write_csv(table, sink)
-    return Response(sink.getvalue().to_pybytes(), media_type="text/csv")
+    csv.write_csv(catalogue.table(_COORDINATES, {"survey": survey}), sink)
+    return bytes(sink.getvalue().to_pybytes())
+
+
+def ask(catalogue: Catalogue, limits: QueryLimits, sql: str) -> Answer:
+    """Answer one SELECT on a snapshot of the database."""
+    snapshot = catalogue.snapshot()
+    return _to_answer(run_query(snapshot, sql, limits), limits, snapshot)
 
 
 def schema(service: Service) -> list[Table]:
@@ -127,16 +139,19 @@ def unit_of(column: str) -> str | None:
 
 def _answer(service: Service, asked: Query, request: Request) -> Answer | Response:
     """Run a question on a snapshot and answer in the shape that was asked for."""
-    snapshot = service.catalogue.snapshot()
-    result = run_query(snapshot, asked.sql, service.limits)
     if asked.format == "csv" or request.headers.get("accept", "").startswith("text/csv"):
+        result = run_query(service.catalogue.snapshot(), asked.sql, service.limits)
         return _csv(result, service.limits.rows)
-    columns = [Column(name=c.name, type=c.type, unit=unit_of(c.name)) for c in result.columns]
+    return ask(service.catalogue, service.limits, asked.sql)
+
+
+def _to_answer(result: QueryResult, limits: QueryLimits, snapshot: Path) -> Answer:
+    """Return what a query gave in the wire format."""
     return Answer(
-        columns=columns,
+        columns=[Column(name=c.name, type=c.type, unit=unit_of(c.name)) for c in result.columns],
         rows=[list(row) for row in result.rows],
         truncated=result.truncated,
-        row_limit=service.limits.rows,
+        row_limit=limits.rows,
         elapsed_ms=round(result.elapsed_ms, 3),
         snapshot_at=datetime.fromtimestamp(snapshot.stat().st_mtime, UTC),
     )

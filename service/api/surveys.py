@@ -16,6 +16,7 @@ from pipelines.values import ControlMarks
 from service.api.models import Control, Listing, Mark, NewSurvey, Survey, TruthSummary
 from service.errors import EmptyBodyError, MediaTypeError
 from service.state import Current
+from storage.site_files import format_control, parse_control, parse_truth
 
 router = APIRouter(prefix="/surveys", tags=["surveys"])
 
@@ -91,8 +92,6 @@ def put_control(survey: Key, file: File, service: Current) -> Control:
 @router.get("/{survey}/control", name="get_control")
 def get_control(survey: Key, request: Request, service: Current) -> Response:
     """Return the control marks of a survey, as JSON, or as CSV where text/csv is asked for."""
-    from storage.site_files import format_control
-
     marks = service.catalogue.control_marks(survey)
     if "text/csv" in request.headers.get("accept", "") and marks is not None:
         return PlainTextResponse(format_control(marks), media_type="text/csv")
@@ -102,8 +101,6 @@ def get_control(survey: Key, request: Request, service: Current) -> Response:
 @router.put("/{survey}/truth", name="put_truth", openapi_extra=_bodies("application/json"))
 def put_truth(survey: Key, file: File, service: Current) -> TruthSummary:
     """Give a survey its truth: for comparison only, no job ever sees it."""
-    from storage.site_files import parse_truth
-
     service.catalogue.put_truth(survey, parse_truth(file.text))
     truth = service.catalogue.truth(survey)
     n_marks, n_stops = (len(truth.marks.names), len(truth.stops)) if truth else (0, 0)
@@ -112,8 +109,6 @@ def put_truth(survey: Key, file: File, service: Current) -> TruthSummary:
 
 def _read_control(file: Document) -> ControlMarks:
     """Read control marks from CSV or JSON."""
-    from storage.site_files import parse_control
-
     if file.media_type in ("text/csv", "text/plain", "application/csv"):
         return parse_control(file.text)
     if file.media_type != "application/json":

@@ -1,0 +1,272 @@
+"""The command ``spheremark``: each verb is one call of what the service calls too.
+
+Answers go to standard output, as tables for people or JSON for programs; progress and errors go
+to standard error. Exit codes: 0 done, 1 failed, 2 misused. Heavy imports are inside the commands.
+"""
+
+from __future__ import annotations
+
+import json
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from enum import StrEnum
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+from rich.console import Console
+
+from pipelines.errors import SpheremarkError
+
+if TYPE_CHECKING:
+    from pipelines.survey import Progress
+    from service.settings import Settings
+
+app = typer.Typer(
+    help="Station positions from spherical markers and a gimbal-mounted LiDAR.",
+    no_args_is_help=True,
+    pretty_exceptions_enable=False,
+    add_completion=False,
+)
+out, err = Console(), Console(stderr=True)
+
+AsJson = Annotated[bool, typer.Option("--json", help="JSON for programs.")]
+LogFile = Annotated[Path, typer.Argument(exists=True, dir_okay=False, help="Log (MCAP).")]
+
+
+class Frame(StrEnum):
+    """Frames in which centres can be given."""
+
+    STATION = "station"
+    BASE = "base"
+
+
+def main() -> None:
+    """Run the command line; an error of ours becomes one sentence, or a problem as JSON."""
+    try:
+        app()
+    except SpheremarkError as error:
+        if "--json" in sys.argv:
+            from service.errors import problem_of
+
+            _print_json(problem_of(error, " ".join(sys.argv[1:2])).model_dump(exclude_none=True))
+        err.print(f"[bold red]Error:[/] {error}", highlight=False, soft_wrap=True)
+        raise SystemExit(1) from None
+    except KeyboardInterrupt:
+        raise SystemExit(130) from None
+
+
+@app.command()
+def demo() -> None:
+    """Simulate, upload, process and serve one lane of the study's field."""
+    from service.demo import run
+
+    run(_settings(), out)
+
+
+@app.command()
+def serve(
+    host: Annotated[str | None, typer.Option(help="Address to listen on.")] = None,
+    port: Annotated[int | None, typer.Option(help="Port; 0 takes a free one.")] = None,
+    data: Annotated[Path | None, typer.Option(help="Folder of database, logs and clouds.")] = None,
+) -> None:
+    """Run the service; every setting can come from the environment (SPHEREMARK_...)."""
+    from service.serving import serve as run
+
+    given = {"host": host, "port": port, "data": data}
+    settings = _settings(**{name: value for name, value in given.items() if value is not None})
+    run(settings, ready=lambda address: err.print(f"Serving on [bold]{address}[/]"))
+
+
+@app.command()
+def simulate(
+    folder: Annotated[Path, typer.Argument(metavar="OUT", help="Folder for the logs.")],
+    scenario: Annotated[str, typer.Option(help="World to simulate.")] = "paper-field",
+    stops: Annotated[
+        str, typer.Option(help="Names, lanes (lane3), numbers or ranges (1-7), or all.")
+    ] = "lane3",
+    seed: Annotated[int, typer.Option(min=0, help="Source of chance.")] = 0,
+    turn_s: Annotated[float, typer.Option(help="Time of a full turn of the gimbal [s].")] = 13.2,
+    rpm: Annotated[float, typer.Option(help="Speed of the LiDAR [1/min].")] = 600.0,
+    sigma_mm: Annotated[
+        float | None, typer.Option(help="Noise of every range [mm]; by reflectivity if not given.")
+    ] = None,
+    compression: Annotated[str, typer.Option(help="Of the chunks: none, lz4 or zstd.")] = "none",
+    as_json: AsJson = False,
+) -> None:
+    """Write logs as a recorder would (STOP.mcap), their truth (STOP.truth.json) and control.csv."""
+    from pipelines.simulation import SimulationConfig, commensurability
+    from service.fieldwork import Assignment, survey
+
+    sigma = None if sigma_mm is None else sigma_mm / 1000.0
+    config = SimulationConfig(turn=turn_s, spin_rpm=rpm, sigma_range=sigma)
+    if warning := commensurability(config):
+        err.print(f"[yellow]Warning:[/] {warning}", soft_wrap=True)
+    wanted = Assignment(
+        scenario=scenario, stops=stops, seed=seed, config=config, compression=compression
+    )
+    with _progress() as progress:
+        for made in survey(folder, wanted, progress=progress):
+            paths = {"stop": made.name, "log": str(made.log), "truth": str(made.truth)}
+            sys.stdout.write((json.dumps(paths) if as_json else paths["log"]) + "\n")
+            sys.stdout.flush()
+
+
+@app.command()
+def inspect(log: LogFile, as_json: AsJson = False) -> None:
+    """Say what a log holds and lacks, and whether it can be processed."""
+    from service import tables
+    from storage.recordings import inspect_log
+
+    report = inspect_log(log)
+    if as_json:
+        _print_json(report.to_mapping())
+    else:
+        tables.print_preflight(out, log.name, report)
+    if report.verdict == "refused":
+        raise typer.Exit(1)
+
+
+@app.command()
+def process(
+    logs: Annotated[list[Path], typer.Argument(metavar="LOG...", exists=True, dir_okay=False)],
+    control: Annotated[
+        Path | None, typer.Option(exists=True, dir_okay=False, help="Control marks (CSV).")
+    ] = None,
+    rig: Annotated[
+        Path | None, typer.Option(exists=True, dir_okay=False, help="Rig (JSON), if not the log's.")
+    ] = None,
+    method: Annotated[
+        list[str] | None, typer.Option(help="Fitting method; again for more. The first counts.")
+    ] = None,
+    frame: Annotated[Frame, typer.Option(help="Frame of the centres.")] = Frame.STATION,
+    tolerance_m: Annotated[float, typer.Option(help="Error that is accepted [m].")] = 0.03,
+    radius_m: Annotated[float, typer.Option(help="Radius of the spheres [m].")] = 0.100,
+    truth: Annotated[
+        Path | None,
+        typer.Option(exists=True, dir_okay=False, help="Truth (JSON); adds errors, no more."),
+    ] = None,
+    as_json: AsJson = False,
+) -> None:
+    """Find the markers of logs and position their stations."""
+    from pipelines.config import SurveyConfig
+    from service import tables
+    from service.answers import Inputs, answer_log
+    from storage import site_files
+
+    config = SurveyConfig.from_mapping(
+        {
+            "marker_radius": radius_m,
+            "tolerance": tolerance_m,
+            "fitting": {"methods": method or ["along_beam"]},
+        }
+    )
+    inputs = Inputs(
+        config=config,
+        rig=site_files.read_rig(rig) if rig else None,
+        marks=site_files.read_control(control) if control else None,
+        truth=site_files.read_truth(truth) if truth else None,
+        frame=frame.value,
+    )
+    answers = []
+    for log in logs:
+        with _progress() as progress:
+            answers.append(answer_log(log, inputs, progress))
+        if not as_json:
+            tables.print_answer(out, answers[-1])
+    if as_json:
+        _print_json(answers[0] if len(answers) == 1 else answers)
+
+
+@app.command()
+def query(
+    sql: Annotated[str, typer.Argument(help="One SELECT.")],
+    url: Annotated[str | None, typer.Option(help="Address of a running service.")] = None,
+    data: Annotated[Path | None, typer.Option(help="Data folder that no service uses.")] = None,
+    as_json: AsJson = False,
+    as_csv: Annotated[bool, typer.Option("--csv", help="CSV for programs.")] = False,
+) -> None:
+    """Ask in SQL: a running service, or a data folder that none uses."""
+    from service import tables
+    from service.client import Source
+
+    source = Source(_settings(**({"data": data} if data else {})), url, folder=data)
+    answer = source.ask(sql)
+    if as_json:
+        _print_json(answer)
+    elif as_csv:
+        sys.stdout.write(tables.to_csv(answer))
+    else:
+        tables.print_rows(out, answer)
+    if answer["truncated"]:
+        err.print(f"[yellow]Truncated:[/] only the first {answer['row_limit']:,} rows are here.")
+
+
+@app.command()
+def export(
+    target: Annotated[Path, typer.Argument(metavar="OUT", help="results.duckdb or a .csv.")],
+    url: Annotated[str | None, typer.Option(help="Address of a running service.")] = None,
+    data: Annotated[Path | None, typer.Option(help="Data folder that no service uses.")] = None,
+    survey: Annotated[str | None, typer.Option(help="Only this survey (CSV).")] = None,
+) -> None:
+    """Copy the database (OUT.duckdb), or stations and marks as coordinates (OUT.csv)."""
+    from service.client import Source
+
+    Source(_settings(**({"data": data} if data else {})), url, folder=data).export(target, survey)
+    err.print(f"Wrote {target}.")
+
+
+@app.command()
+def bench(
+    log: Annotated[
+        Path | None, typer.Argument(exists=True, dir_okay=False, help="Log; simulated if missing.")
+    ] = None,
+    repeats: Annotated[int, typer.Option(min=1, help="The best of so many counts.")] = 5,
+    as_json: AsJson = False,
+) -> None:
+    """Measure each step against one read of the file with a checksum, in the same run."""
+    from service import bench as benches
+    from service import tables
+
+    with _progress() as progress:
+        report = benches.run(log, repeats, progress)
+    if as_json:
+        _print_json(report)
+    else:
+        tables.print_bench(out, report)
+
+
+def _settings(**given: Any) -> Settings:
+    """Read the settings; a wrong one is a misuse, said in a sentence."""
+    from pydantic import ValidationError
+
+    from service.settings import Settings
+
+    try:
+        return Settings(**given)
+    except ValidationError as error:
+        for one in error.errors():
+            name = "_".join(["SPHEREMARK", *(str(part).upper() for part in one["loc"])])
+            err.print(f"[bold red]Error:[/] {name}: {one['msg']}", highlight=False, soft_wrap=True)
+        raise typer.Exit(2) from None
+
+
+@contextmanager
+def _progress() -> Iterator[Progress]:
+    """Show a bar on standard error while something long runs."""
+    from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
+
+    columns = (BarColumn(), TextColumn("{task.description}"), TimeElapsedColumn())
+    with Progress(*columns, console=err, transient=True, disable=not err.is_terminal) as bar:
+        task = bar.add_task("", total=1.0)
+        yield lambda share, what: bar.update(task, completed=share, description=what)
+
+
+def _print_json(value: Any) -> None:
+    """Write JSON to standard output."""
+    sys.stdout.write(json.dumps(value, indent=2, allow_nan=False) + "\n")
+
+
+if __name__ == "__main__":
+    main()

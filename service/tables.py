@@ -1,0 +1,160 @@
+"""Answers as tables for people; lengths in metres or millimetres, as the heads say."""
+
+from __future__ import annotations
+
+import csv
+import io
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from rich.console import Console
+from rich.table import Table
+
+from storage.recordings import Preflight
+
+_ROWS_SHOWN = 100  # of an answer in SQL; programs get all
+_COLOURS = {"ok": "green", "weak": "yellow", "refused": "red", "failed": "red"}
+
+Plain = Mapping[str, Any]
+
+
+def print_preflight(out: Console, name: str, report: Preflight) -> None:
+    """Print what a log holds and lacks."""
+    out.print(f"[bold]{name}[/]: {_coloured(report.verdict)}")
+    for reason in (*report.reasons, *report.notes):
+        out.print(f"  {reason}", highlight=False)
+    if report.topics:
+        rows = [
+            (t.topic, t.schema, f"{t.n_messages:,}", f"{t.rate_hz:.1f}", f"{t.longest_gap_s:.3f}")
+            for t in report.topics
+        ]
+        heads = ("topic", "type", "messages", "rate [Hz]", "longest gap [s]")
+        out.print(_table(heads, rows, left=2))
+    facts = {
+        "returns": f"{report.n_returns:,}",
+        "duration [s]": _fixed(report.duration_s, 1),
+        "stops": str(report.n_stops),
+        "gimbal coverage [deg]": _fixed(report.gimbal_coverage_deg, 1),
+        "gimbal speed [deg/s]": _fixed(report.gimbal_speed_deg_per_s, 2),
+        "LiDAR speed [1/min]": _fixed(report.lidar_speed_rpm, 1),
+        "coverage gap [deg]": _fixed(report.coverage_gap_deg, 2),
+        "clock skew [s]": _fixed(report.clock_skew_s, 3),
+        "time for each shot": "yes" if report.has_shot_times else "no",
+        "orientation (AHRS)": "yes" if report.has_orientation else "no",
+        "rig": report.rig or "not in the log",
+    }
+    out.print(_table(("fact", "value"), list(facts.items())))
+
+
+def print_answer(out: Console, answer: Plain) -> None:
+    """Print markers and station of each stop of a log."""
+    for stop in answer["stops"]:
+        out.print(f"[bold]{stop['name']}[/]  (centres in the {stop['frame']} frame)")
+        out.print(_markers(stop["markers"]))
+        for note in stop["scan"]["notes"]:
+            out.print(f"  {note}", highlight=False)
+        if stop["rejected"]:
+            out.print(f"  {len(stop['rejected'])} groups of returns were refused (see --json).")
+        if not stop["stations"]:
+            out.print(f"  {stop['reason']}")
+        for station in stop["stations"]:
+            _print_station(out, station)
+
+
+def print_rows(out: Console, answer: Plain) -> None:
+    """Print an answer in SQL."""
+    heads = [column["name"] for column in answer["columns"]]
+    rows = [["" if v is None else _short(v) for v in row] for row in answer["rows"][:_ROWS_SHOWN]]
+    out.print(_table(heads, rows, left=len(heads)))
+    shown, n = len(rows), len(answer["rows"])
+    more = f", {shown} shown (--json or --csv for all)" if shown < n else ""
+    out.print(f"{n:,} rows in {answer['elapsed_ms']:.1f} ms{more}")
+
+
+def print_bench(out: Console, report: Plain) -> None:
+    """Print times as ratios to one read of the file."""
+    log = report["log"]
+    out.print(
+        f"{log['name']}: {log['size_bytes'] / 1e6:.1f} MB, {log['n_returns']:,} returns; "
+        f"best of {report['repeats']}, one process"
+    )
+    rows = [
+        (step["step"], f"{step['seconds'] * 1e3:,.1f}", f"{step['ratio']:,.1f}")
+        for step in report["steps"]
+    ]
+    out.print(_table(("step", "time [ms]", "x read+CRC"), rows))
+    out.print(f"Peak memory of the process: {report['peak_memory_bytes'] / 1e6:,.0f} MB")
+
+
+def to_csv(answer: Plain) -> str:
+    """Return an answer in SQL as CSV."""
+    text = io.StringIO()
+    writer = csv.writer(text)
+    writer.writerow([column["name"] for column in answer["columns"]])
+    writer.writerows(answer["rows"])
+    return text.getvalue()
+
+
+def _print_station(out: Console, station: Plain) -> None:
+    """Print a station and how far it can be relied on."""
+    methods = f"{station['fit_method']}, {station['method']}"
+    if station.get("position_m") is None:
+        out.print(f"  Station ({methods}): [red]none[/]; {station['reason']}", highlight=False)
+        return
+    x, y, z = station["position_m"]
+    error = station.get("error_3d_m")
+    against = "" if error is None else f"; error {1e3 * error:.1f} mm"
+    out.print(
+        f"  Station ({methods}): {_coloured(station['status'])}  x {x:.4f} y {y:.4f} z {z:.4f} m, "
+        f"yaw {station['yaw_deg']:.3f} deg, sigma {1e3 * station['sigma_3d_m']:.1f} mm (3-D) "
+        f"from {len(station['matches'])} marks, sigma0 {_fixed(station['sigma0'], 2)}{against}",
+        highlight=False,
+        soft_wrap=True,
+    )
+    if station["reason"]:
+        out.print(f"  {station['reason']}", highlight=False)
+
+
+def _markers(markers: Sequence[Plain]) -> Table:
+    """Return markers as a table, with errors where there is truth."""
+    heads = ["marker", "method", "status", "x [m]", "y [m]", "z [m]", "sigma [mm]", "range [m]"]
+    heads += ["points", "rms [mm]"]
+    has_errors = any("error_3d_m" in marker for marker in markers)
+    rows = []
+    for one in markers:
+        row = [one["id"], one["method"], _coloured(one["status"])]
+        row += [f"{value:.4f}" for value in one["centre_m"]]
+        row += [_mm(one["sigma_3d_m"]), f"{one['range_m']:.2f}", str(one["n_points"])]
+        row += [_mm(one["rms_m"])]
+        rows.append(row + ([_mm(one.get("error_3d_m"))] if has_errors else []))
+    return _table(heads + (["error [mm]"] if has_errors else []), rows, left=3)
+
+
+def _table(heads: Sequence[str], rows: Sequence[Sequence[str]], left: int = 1) -> Table:
+    """Return a table whose first columns are flush left."""
+    table = Table(box=None, pad_edge=False, header_style="bold")
+    for i, head in enumerate(heads):
+        table.add_column(head, justify="left" if i < left else "right")
+    for row in rows:
+        table.add_row(*row)
+    return table
+
+
+def _coloured(status: str) -> str:
+    """Return a status in its colour."""
+    return f"[{_COLOURS[status]}]{status}[/]"
+
+
+def _mm(length: float | None) -> str:
+    """Return a length in millimetres."""
+    return "" if length is None else f"{1e3 * length:.1f}"
+
+
+def _fixed(value: float | None, digits: int) -> str:
+    """Return a number, or what stands for one that is not known."""
+    return "-" if value is None else f"{value:.{digits}f}"
+
+
+def _short(value: object) -> str:
+    """Return a value of an answer, numbers to six digits."""
+    return f"{value:.6g}" if isinstance(value, float) else str(value)
