@@ -757,23 +757,28 @@ def _fetch(cursor: duckdb.DuckDBPyConnection, sql: str, parameters: Mapping[str,
         raise InputError(
             f"The answer has {table.num_rows} rows; the limit is {_N_ROWS_MAX}. Narrow the filter."
         )
+    return _without_decimals(table)
+
+
+def _without_decimals(table: pa.Table) -> pa.Table:
+    """Return a table with plain numbers; DuckDB sums whole numbers to 128 bits, a decimal here."""
+    for i, field in enumerate(table.schema):
+        if pa.types.is_decimal(field.type):
+            plain = pa.float64() if field.type.scale else pa.int64()
+            table = table.set_column(i, field.name, table.column(i).cast(plain))
     return table
 
 
 def _insert(cursor: duckdb.DuckDBPyConnection, name: str, table: pa.Table) -> None:
     """Append an Arrow table to the table of that name."""
-    with _incoming(cursor, table):
-        cursor.execute(_INSERT[name])
+    _execute_on(cursor, _INSERT[name], table)
 
 
-@contextmanager
-def _incoming(cursor: duckdb.DuckDBPyConnection, table: pa.Table) -> Iterator[None]:
-    """Let SQL see an Arrow table as ``incoming``."""
+def _execute_on(cursor: duckdb.DuckDBPyConnection, sql: str, table: pa.Table) -> None:
+    """Run SQL that sees an Arrow table as ``incoming``."""
     cursor.register("incoming", table)
-    try:
-        yield
-    finally:
-        cursor.unregister("incoming")
+    cursor.execute(sql)
+    cursor.unregister("incoming")
 
 
 def _refresh_errors(cursor: duckdb.DuckDBPyConnection, survey_id: str) -> None:
@@ -783,8 +788,7 @@ def _refresh_errors(cursor: duckdb.DuckDBPyConnection, survey_id: str) -> None:
     }
     fresh = results.with_errors(known, _truth(cursor, survey_id))
     for name, sql in _REFRESH.items():
-        with _incoming(cursor, fresh[name]):
-            cursor.execute(sql)
+        _execute_on(cursor, sql, fresh[name])
 
 
 def _truth(cursor: duckdb.DuckDBPyConnection, survey_id: str) -> Truth | None:
