@@ -54,7 +54,6 @@ def create_app(settings: Settings) -> FastAPI:
     app.include_router(api.router, prefix=ROOT)
     app.include_router(about)
     app.include_router(pages.router)
-    app.include_router(pages.router)
     app.mount("/static", StaticFiles(directory=STATIC), name="static")
     errors.install(app, pages.error_page)
     return app

@@ -1,4 +1,4 @@
-"""A surveyed field for tests of pages: results with known errors, put through the real catalogue."""
+"""A surveyed field for tests of pages: known errors, put through the real catalogue."""
 
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
@@ -50,7 +50,7 @@ def stop(name, p_site, control, rng):
     members, cloud = _cloud(name, centres, rng)
     fits = {method: _fits(method, centres, members, cloud, rng) for method in NOISE}
     fixes = {(m, "free_station"): _fix(truth, control, fits[m], rng) for m in fits}
-    pairs = {(m, "free_station"): _pairs(truth, control, centres, m, rng) for m in fits}
+    pairs = {(m, "free_station"): _pairs(truth, centres, m, rng) for m in fits}
     result = StopResult(
         name=name, cloud=cloud, fits=fits, fixes=fixes, pairs=pairs, timings={"stitch": 0.4}
     )
@@ -141,7 +141,7 @@ def _fix(truth, control, fits, rng):
     )
 
 
-def _pairs(truth, control, centres, method, rng):
+def _pairs(truth, centres, method, rng):
     """Return the station from each pair of marks."""
     first, second = np.triu_indices(len(centres), 1)
     angles = included_angle(centres[first], centres[second])
@@ -159,14 +159,14 @@ def _pairs(truth, control, centres, method, rng):
 
 
 def fill(
-    catalogue: Catalogue, folder: Path, name: str, *, n_stops=3, with_truth=True, lane="lane-3"
+    catalogue: Catalogue, folder: Path, name: str, *, n_stops=3, with_truth=True, lane="lane3"
 ):
     """Put a survey with a lane of stops into a catalogue, one job for each."""
     rng, control = np.random.default_rng(7), marks()
     survey = catalogue.create_survey(name)
     catalogue.put_control_marks(name, control)
     places = np.column_stack([np.linspace(-4, 4, n_stops), np.full((n_stops, 2), [0.4, 1.1])])
-    stops = [stop(f"{lane}-stop-{i + 1}", place, control, rng) for i, place in enumerate(places)]
+    stops = [stop(f"{lane}-stop{i + 1}", place, control, rng) for i, place in enumerate(places)]
     if with_truth:
         poses = tuple(pose for _, pose in stops)
         catalogue.put_truth(name, Truth(marks=control, stops=poses, rig=None))

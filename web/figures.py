@@ -23,7 +23,13 @@ _RANGE_BIN = 1.0  # [m]; as the view accuracy_by_distance
 _COUNT_BIN = 20  # as the view accuracy_by_point_count
 _ANGLE_BIN = 10.0  # [deg]; as the view accuracy_by_included_angle
 _STUDY_ANGLES = (30.0, 150.0)  # [deg]; what the reference study recommends
-_ELLIPSE_SHARE = 0.05  # the largest ellipse is drawn about this large, as a share of the field
+_ELLIPSE_SHARE = 0.08  # the largest ellipse is drawn about this large, as a share of the field
+_RATIOS = [step * 10.0**power for power in range(-2, 5) for step in (1, 2, 5)]
+_RATIO_AXIS = {
+    "type": "log",
+    "tickvals": _RATIOS,
+    "ticktext": [f"{value:g}" for value in _RATIOS],
+}
 _STOP_NUMBER = re.compile(r"^(.*?)[\s._-]*(?:[A-Za-z]*)(\d+)$")
 
 
@@ -62,10 +68,11 @@ def error_against_distance(fits: Columns, tolerance_m: float, *, is_log: bool = 
 
 
 def error_against_count(fits: Columns, tolerance_m: float, *, is_log: bool = False) -> go.Figure:
-    """Draw the error of each sphere centre against the number of its returns."""
+    """Draw the error of each sphere centre against the number of its returns, always by ratio."""
     figure = _quality_figure(fits, "sphere centres against point count", tolerance_m)
     _add_fits(figure, fits, floats(fits, "n_points"), _COUNT_BIN)
     _scale(figure, "Returns on the sphere", is_log=is_log)
+    figure.update_xaxes(**_RATIO_AXIS)
     return figure
 
 
@@ -80,7 +87,9 @@ def error_against_angle(
         _add_fixes(figure, method, rows)
     for low, high in ((0.0, _STUDY_ANGLES[0]), (_STUDY_ANGLES[1], 180.0)):
         figure.add_vrect(x0=low, x1=high, fillcolor=theme.SHADE, line_width=0, layer="below")
-    figure.update_yaxes(type="log" if is_log else "linear", rangemode="tozero")
+    figure.update_yaxes(rangemode="tozero")
+    if is_log:
+        _make_log(figure)
     figure.update_xaxes(title_text="Included angle [deg]", range=[0, 180], dtick=30)
     return figure
 
@@ -88,13 +97,18 @@ def error_against_angle(
 def error_along_lane(fits: Columns, tolerance_m: float) -> go.Figure:
     """Draw the mean error of the centres at each stop along its lane (Figure 11 of the study)."""
     figure = _quality_figure(fits, "sphere centres along the lane, mean per stop", tolerance_m)
-    stops = texts(fits, "stop")
-    order = _in_lane_order(stops)
+    order = _in_lane_order(texts(fits, "stop"))
+    is_numbered = all(lane_and_number(stop)[1] is not None for stop in order)
     for method, rows in by_method(fits):
-        _add_lanes(figure, method, rows, order)
-    figure.update_xaxes(
-        title_text="Stop", type="category", categoryorder="array", categoryarray=order
-    )
+        _add_lanes(figure, method, rows, order, is_numbered=is_numbered)
+    if is_numbered:
+        lanes = sorted({lane_and_number(stop)[0] for stop in order})
+        title = f"Stop along {lanes[0]}" if len(lanes) == 1 else "Stop along its lane"
+        figure.update_xaxes(title_text=title, dtick=1)
+    else:
+        figure.update_xaxes(
+            title_text="Stop", type="category", categoryorder="array", categoryarray=order
+        )
     figure.update_yaxes(rangemode="tozero")
     return figure
 
@@ -137,12 +151,8 @@ def station_residuals(observations: Columns, tolerance_m: float) -> go.Figure:
             texts(observations, "marker"), texts(observations, "mark"), strict=True
         )
     ]
-    for axis, symbol, colour in (
-        ("x", "circle", theme.OURS),
-        ("y", "diamond", theme.PAPER),
-        ("z", "square", theme.GREEN),
-    ):
-        _add_residuals(figure, observations, names, (axis, symbol, colour))
+    for axis, symbol in (("x", "circle"), ("y", "diamond"), ("z", "square")):
+        _add_residuals(figure, observations, names, axis, symbol)
     if len(names) and _largest(floats(observations, "residual_x_m")) > tolerance_m / 2:
         _add_tolerance(figure, tolerance_m)
     figure.add_hline(y=0, line={"color": theme.LINE, "width": 1}, layer="below")
@@ -181,7 +191,9 @@ def _add_tolerance(figure: go.Figure, tolerance_m: float) -> None:
         annotation={
             "text": f"tolerance {tolerance_m * _MM:g} mm",
             "font": {"size": 12, "color": theme.TOLERANCE},
-            "yshift": 1,
+            "bgcolor": theme.RAISED,
+            "borderpad": 1,
+            "yshift": 2,
         },
         annotation_position="top right",
     )
@@ -193,12 +205,15 @@ def _scale(figure: go.Figure, x_title: str, *, is_log: bool) -> None:
     figure.update_xaxes(title_text=x_title, type=kind)
     figure.update_yaxes(type=kind, rangemode="normal" if is_log else "tozero")
     if is_log:
-        axis = {"dtick": "D2", "exponentformat": "none"}
-        figure.update_xaxes(**axis)
-        figure.update_yaxes(**axis)
-        for shape in figure.layout.shapes:  # Plotly wants logarithms in annotations only
-            for note in figure.layout.annotations:
-                note.y = float(np.log10(shape.y0))
+        figure.update_xaxes(**_RATIO_AXIS)
+        _make_log(figure)
+
+
+def _make_log(figure: go.Figure) -> None:
+    """Make the axis of errors logarithmic; Plotly wants logarithms of annotations, not of lines."""
+    figure.update_yaxes(**_RATIO_AXIS, rangemode="normal")
+    for line, note in zip(figure.layout.shapes, figure.layout.annotations, strict=False):
+        note.y = float(np.log10(line.y0))
 
 
 def _quality_mm(columns: Columns) -> NDArray[np.float64]:
@@ -366,7 +381,9 @@ def _number(stop: str) -> int:
     return -1 if number is None else number
 
 
-def _add_lanes(figure: go.Figure, method: str, rows: Columns, order: Sequence[str]) -> None:
+def _add_lanes(
+    figure: go.Figure, method: str, rows: Columns, order: Sequence[str], *, is_numbered: bool
+) -> None:
     """Draw the mean per stop of one method, a line for each lane, and the largest as a whisker."""
     style, stops = theme.method_style(method), np.array(texts(rows, "stop"), dtype=object)
     quality = _quality_mm(rows)
@@ -374,32 +391,48 @@ def _add_lanes(figure: go.Figure, method: str, rows: Columns, order: Sequence[st
     for stop in order:
         if np.isfinite(quality[stops == stop]).any():
             lanes.setdefault(lane_and_number(stop)[0], []).append(stop)
-    for i, lane in enumerate(lanes.values()):
-        samples = [_known(quality[stops == stop]) for stop in lane]
-        means = np.array([sample.mean() for sample in samples])
-        largest = np.array([sample.max() for sample in samples])
-        figure.add_scatter(
-            x=lane,
-            y=means,
-            mode="lines+markers",
-            name=style.label,
-            legendgroup=style.label,
-            showlegend=i == 0,
-            line={"color": style.colour, "width": 2.5},
-            marker={"color": style.colour, "size": 9, "symbol": style.symbol},
-            error_y={
-                "type": "data",
-                "symmetric": False,
-                "array": largest - means,
-                "arrayminus": np.zeros(len(lane)),
-                "color": style.colour,
-                "thickness": 1,
-                "width": 5,
-            },
-            customdata=[[len(sample), top] for sample, top in zip(samples, largest, strict=True)],
-            hovertemplate="<b>%{x}</b><br>mean %{y:.1f} mm of %{customdata[0]} markers<br>"
-            f"largest %{{customdata[1]:.1f}} mm<extra>{style.label}</extra>",
-        )
+    for i, (lane, members) in enumerate(lanes.items()):
+        samples = [_known(quality[stops == stop]) for stop in members]
+        _add_lane(figure, style, members, samples, is_numbered=is_numbered)
+        figure.data[-1].update(showlegend=i == 0)
+        if len(lanes) > 1:
+            figure.data[-1].update(text=[""] * (len(members) - 1) + [lane])
+
+
+def _add_lane(
+    figure: go.Figure,
+    style: theme.MethodStyle,
+    stops: Sequence[str],
+    samples: Sequence[NDArray[np.float64]],
+    *,
+    is_numbered: bool,
+) -> None:
+    """Draw the mean of each sample along one lane, and the largest as a whisker."""
+    means = np.array([sample.mean() for sample in samples])
+    largest = np.array([sample.max() for sample in samples])
+    figure.add_scatter(
+        x=[lane_and_number(stop)[1] for stop in stops] if is_numbered else list(stops),
+        y=means,
+        mode="lines+markers+text",
+        textposition="top left",
+        textfont={"size": 11, "color": style.colour},
+        name=style.label,
+        legendgroup=style.label,
+        line={"color": style.colour, "width": 2.5},
+        marker={"color": style.colour, "size": 9, "symbol": style.symbol},
+        error_y={
+            "type": "data",
+            "symmetric": False,
+            "array": largest - means,
+            "arrayminus": np.zeros(len(stops)),
+            "color": style.colour,
+            "thickness": 1,
+            "width": 5,
+        },
+        customdata=[[stop, len(s), s.max()] for stop, s in zip(stops, samples, strict=True)],
+        hovertemplate="<b>%{customdata[0]}</b><br>mean %{y:.1f} mm of %{customdata[1]} markers<br>"
+        f"largest %{{customdata[2]:.1f}} mm<extra>{style.label}</extra>",
+    )
 
 
 def _add_marks(figure: go.Figure, marks: Columns) -> None:
@@ -499,10 +532,9 @@ def _add_strokes(
 
 
 def _add_residuals(
-    figure: go.Figure, observations: Columns, names: Sequence[str], look: tuple[str, str, str]
+    figure: go.Figure, observations: Columns, names: Sequence[str], axis: str, symbol: str
 ) -> None:
     """Draw the residuals of one axis with bars of twice their sigma about zero."""
-    axis, symbol, colour = look
     sigma = floats(observations, f"sigma_{axis}_m") * _MM
     values = floats(observations, f"residual_{axis}_m") * _MM
     figure.add_scatter(
@@ -523,7 +555,7 @@ def _add_residuals(
         name=f"{axis}, with ±2 sigma",
         offsetgroup=axis,
         legendgroup=axis,
-        marker={"color": colour, "size": 8, "symbol": symbol},
+        marker={"color": theme.AXES[axis], "size": 8, "symbol": symbol},
         customdata=sigma,
         hovertemplate=f"<b>%{{x}}</b><br>{axis} %{{y:.1f}} mm, sigma %{{customdata:.1f}} mm"
         "<extra></extra>",
@@ -536,8 +568,8 @@ def _note(figure: go.Figure, text: str) -> None:
         text=text,
         x=1,
         y=0,
-        xref="paper",
-        yref="paper",
+        xref="x domain",
+        yref="y domain",
         xanchor="right",
         yanchor="bottom",
         showarrow=False,

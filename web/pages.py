@@ -371,38 +371,39 @@ def _survey_panels(data: SurveyData, *, is_log: bool) -> tuple[Panel, ...]:
     """Return the figures of the dashboard; none of an empty table."""
     if not len(data.fits["stop"]):
         return ()
-    panels = [
-        Panel(
-            name="distance",
-            figure=figures.error_against_distance(data.fits, data.tolerance_m, is_log=is_log),
-            caption="Each point is a sphere at one stop; lines are the RMS in bins of 1 m. "
-            "Hollow points are weak fits.",
-        ),
-        Panel(
-            name="count",
-            figure=figures.error_against_count(data.fits, data.tolerance_m, is_log=is_log),
-            caption="The same spheres by the number of returns that the fit used; bins of 20.",
-        ),
-    ]
-    if len(data.pairs["stop"]):
-        panels.append(
-            Panel(
-                name="angle",
-                figure=figures.error_against_angle(
-                    data.pairs, data.fixes, data.tolerance_m, is_log=is_log
-                ),
-                caption="Small points: the station from two marks alone, with gravity. Large: from "
-                "all marks, at their least angle. Shaded: outside the study's 30 to 150 deg.",
-            )
-        )
-    panels.append(
-        Panel(
-            name="lane",
-            figure=figures.error_along_lane(data.fits, data.tolerance_m),
-            caption="The study's Figure 11. Whiskers end at the largest of each stop.",
-        )
+    distance = Panel(
+        name="distance",
+        figure=figures.error_against_distance(data.fits, data.tolerance_m, is_log=is_log),
+        caption="Each point is a sphere at one stop; lines are the RMS in bins of 1 m. "
+        "Hollow points are weak fits.",
     )
-    return (*panels, *_map_panel(data))
+    count = Panel(
+        name="count",
+        figure=figures.error_against_count(data.fits, data.tolerance_m, is_log=is_log),
+        caption="The same spheres by the number of returns that the fit used; lines are the RMS "
+        "in bins of 20.",
+    )
+    lane = Panel(
+        name="lane",
+        figure=figures.error_along_lane(data.fits, data.tolerance_m),
+        caption="The study's Figure 11. Whiskers end at the largest of each stop.",
+    )
+    return (distance, count, *_map_panel(data), *_angle_panel(data, is_log=is_log), lane)
+
+
+def _angle_panel(data: SurveyData, *, is_log: bool) -> tuple[Panel, ...]:
+    """Return the figure of included angles, if there are any."""
+    if not len(data.pairs["stop"]):
+        return ()
+    figure = figures.error_against_angle(data.pairs, data.fixes, data.tolerance_m, is_log=is_log)
+    return (
+        Panel(
+            name="angle",
+            figure=figure,
+            caption="Small points: the station from two marks alone, with gravity. Large: from "
+            "all marks, at their least angle. Shaded: outside the study's 30 to 150 deg.",
+        ),
+    )
 
 
 def _map_panel(data: SurveyData) -> tuple[Panel, ...]:
@@ -418,7 +419,6 @@ def _map_panel(data: SurveyData) -> tuple[Panel, ...]:
             name="map",
             figure=figures.site_map(data.marks, select(data.fixes, placed), data.true_stops),
             caption=f"{caption}.",
-            kind="square",
         ),
     )
 

@@ -25,6 +25,7 @@ PAPER = "var(--paper)"
 PAPER_BAND = "var(--paper-band)"
 GREEN = "var(--third)"
 GREEN_BAND = "var(--third-band)"
+AXES = {"x": "var(--axis-x)", "y": "var(--axis-y)", "z": "var(--axis-z)"}
 TOLERANCE = "var(--tolerance)"
 MARK = "var(--mark)"
 CLOUD = "var(--cloud)"
@@ -96,7 +97,12 @@ def template() -> go.layout.Template:
             "margin": {"l": 56, "r": 16, "t": 44, "b": 48},
             "xaxis": axis,
             "yaxis": axis,
-            "legend": {**legend, "font": {"size": 12}, "bgcolor": "rgba(0,0,0,0)"},
+            "legend": {
+                **legend,
+                "font": {"size": 12},
+                "bgcolor": "rgba(0,0,0,0)",
+                "itemsizing": "constant",
+            },
             "hoverlabel": {
                 "bgcolor": RAISED,
                 "bordercolor": LINE,

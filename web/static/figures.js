@@ -12,7 +12,8 @@ function coloured(value, styles) {
     return name ? styles.getPropertyValue(name[1]).trim() : value;
   }
   if (Array.isArray(value)) {
-    return typeof value[0] === "number" ? value : value.map((item) => coloured(item, styles));
+    const isNumbers = typeof value[0] === "number" && typeof value.at(-1) === "number";
+    return isNumbers ? value : value.map((item) => coloured(item, styles));
   }
   if (value && typeof value === "object") {
     if ("bdata" in value) return value;
