@@ -128,9 +128,10 @@ def _trace_bundles(
 ) -> tuple[Array, Array]:
     """Return range and reflectivity of beams, each cast as a bundle of rays."""
     n = len(aims.origins_site)
-    directions = _bundles(
-        aims.directions_site, aims.spin_axes_site, _disc(_N_RAYS) * divergence / 2
-    )
+    across = np.cross(aims.directions_site, aims.spin_axes_site)
+    across /= np.linalg.norm(across, axis=1, keepdims=True)
+    along = np.cross(across, aims.directions_site)
+    directions = _bundles(aims.directions_site, across, along, _disc(_N_RAYS) * divergence / 2)
     rays = np.empty((n * _N_RAYS, 6), dtype=np.float32)
     rays[:, :3] = np.repeat(aims.origins_site, _N_RAYS, axis=0)
     rays[:, 3:] = directions.reshape(-1, 3)
@@ -212,18 +213,18 @@ def _sees_step(ranges: Array, stride: int) -> Mask:  # pragma: no cover
 
 
 @numba.njit(cache=True, nogil=True)
-def _bundles(directions: Array, spin_axes: Array, offsets: Array) -> Array:  # pragma: no cover
+def _bundles(
+    directions: Array, across: Array, along: Array, offsets: Array
+) -> Array:  # pragma: no cover
     """Return the unit vectors of bundles, (n, k, 3), from offsets across and along the axis."""
     n, k = len(directions), len(offsets)
     out = np.empty((n, k, 3))
     for i in range(n):
-        d = directions[i]
-        across = np.cross(d, spin_axes[i])
-        across /= np.sqrt((across**2).sum())
-        along = np.cross(across, d)
         for j in range(k):
-            ray = d + offsets[j, 0] * across + offsets[j, 1] * along
-            out[i, j] = ray / np.sqrt((ray**2).sum())
+            u, v = offsets[j, 0], offsets[j, 1]
+            stretch = 1.0 / np.sqrt(1.0 + u * u + v * v)
+            for m in range(3):
+                out[i, j, m] = stretch * (directions[i, m] + u * across[i, m] + v * along[i, m])
     return out
 
 
@@ -240,17 +241,17 @@ def _echoes(
     ranges, reflectivities = np.empty(n), np.empty(n)
     t, shade = np.empty(k), np.empty(k)
     for i in range(n):
-        t[:], shade[:] = distances[i], shades[i]
+        for j in range(k):
+            t[j], shade[j] = distances[i, j], shades[i, j]
         for m in range(len(spheres)):
             wx, wy = spheres[m, 0] - origins[i, 0], spheres[m, 1] - origins[i, 1]
             wz, radius = spheres[m, 2] - origins[i, 2], spheres[m, 3]
             distance = np.sqrt(wx * wx + wy * wy + wz * wz)
-            d = directions[i, 0]
-            if wx * d[0] + wy * d[1] + wz * d[2] < distance - 2.0 * radius:
-                continue  # well beside the bundle or behind it
             for j in range(k):
-                d = directions[i, j]
-                along = wx * d[0] + wy * d[1] + wz * d[2]
+                dx, dy, dz = directions[i, j, 0], directions[i, j, 1], directions[i, j, 2]
+                along = wx * dx + wy * dy + wz * dz
+                if along < distance - 2.0 * radius:
+                    break  # well beside the bundle or behind it
                 inside = radius**2 - (distance**2 - along**2)
                 if inside >= 0.0 and 0.0 < along - np.sqrt(inside) < t[j]:
                     t[j], shade[j] = along - np.sqrt(inside), spheres[m, 4]
@@ -261,14 +262,18 @@ def _echoes(
 @numba.njit(cache=True, nogil=True)
 def _strongest(t: Array, shade: Array) -> tuple[float, float]:  # pragma: no cover
     """Return range and reflectivity of the strongest group of returns of one pulse."""
-    order = np.argsort(t)
+    for i in range(1, len(t)):  # in place: sorted by range, the few rays of a bundle
+        ti, shade_i, j = t[i], shade[i], i
+        while j > 0 and t[j - 1] > ti:
+            t[j], shade[j] = t[j - 1], shade[j - 1]
+            j -= 1
+        t[j], shade[j] = ti, shade_i
     best_energy, best_range, best_shade = 0.0, np.inf, 0.0
     energy, moment, share = 0.0, 0.0, 0.0
-    for place in range(len(t)):
-        j = order[place]
+    for j in range(len(t)):
         if np.isinf(t[j]):
             break
-        if place and t[j] - t[order[place - 1]] > _MERGE:
+        if j and t[j] - t[j - 1] > _MERGE:
             energy, moment, share = 0.0, 0.0, 0.0
         weight = shade[j] / t[j] ** 2
         energy, moment, share = energy + weight, moment + weight * t[j], share + shade[j]

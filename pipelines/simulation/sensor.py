@@ -147,8 +147,9 @@ def aim(shots: Shots, rig: Rig, T_site_base: Array) -> Aims:
         In the order of firing.
     """
     lasers = np.column_stack([rig.laser_elevations, rig.laser_heights])
+    posed = _posed(rig.T_head_lidar, T_site_base)
     origins, directions, axes = _aim(
-        shots.azimuths, shots.gimbal_angles, shots.rings, lasers, rig.T_head_lidar, T_site_base
+        shots.azimuths, shots.gimbal_angles, shots.rings, lasers, posed
     )
     return Aims(origins_site=origins, directions_site=directions, spin_axes_site=axes)
 
@@ -224,40 +225,40 @@ def _points(ranges: Array, azimuths: Array, elevations: Array, heights: Array) -
     return np.column_stack([x, y, ranges * np.sin(elevations) + heights]).astype(np.float32)
 
 
+def _posed(T_head_lidar: Array, T_site_base: Array) -> Array:
+    """Return what cosine and sine of the gimbal angle, and 1, are multiplied with: (3, 3, 4).
+
+    Their sum is the upper part of ``T_site_base Rz(angle) T_head_lidar``.
+    """
+    turning = np.zeros((3, 4, 4))
+    turning[0, :2, :2] = [[1.0, 0.0], [0.0, 1.0]]
+    turning[1, :2, :2] = [[0.0, -1.0], [1.0, 0.0]]
+    turning[2, 2:, 2:] = [[1.0, 0.0], [0.0, 1.0]]
+    return np.ascontiguousarray((T_site_base @ turning @ T_head_lidar)[:, :3])
+
+
 @numba.njit(cache=True, nogil=True)
 def _aim(
-    azimuths: Array, gimbal_angles: Array, rings: Rings, lasers: Array, mounting: Array, pose: Array
+    azimuths: Array, gimbal_angles: Array, rings: Rings, lasers: Array, posed: Array
 ) -> tuple[Array, Array, Array]:  # pragma: no cover
     """Return origins, directions and spin axes of shots in the site frame, (n, 3) each.
 
-    ``lasers`` holds elevation and height of each laser, (k, 2); ``mounting`` is ``T_head_lidar``
-    and ``pose`` is ``T_site_base``.
+    ``lasers`` holds elevation and height of each laser, (k, 2), ``posed`` what ``_posed`` returns.
     """
     n = len(azimuths)
     origins, directions, axes = np.empty((n, 3)), np.empty((n, 3)), np.empty((n, 3))
-    lidar, head, base = np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3))
     for i in range(n):
         elevation, height = lasers[rings[i], 0], lasers[rings[i], 1]
-        reach = np.cos(elevation)
-        lidar[0] = (reach * np.cos(azimuths[i]), -reach * np.sin(azimuths[i]), np.sin(elevation))
-        lidar[1] = (0.0, 0.0, 1.0)
-        lidar[2] = (0.0, 0.0, height)
-        _rotate(mounting, lidar, head)
-        for k in range(3):
-            head[2, k] += mounting[k, 3]
         c, s = np.cos(gimbal_angles[i]), np.sin(gimbal_angles[i])
+        x = np.cos(elevation) * np.cos(azimuths[i])
+        y = -np.cos(elevation) * np.sin(azimuths[i])
+        z = np.sin(elevation)
         for k in range(3):
-            base[k] = (c * head[k, 0] - s * head[k, 1], s * head[k, 0] + c * head[k, 1], head[k, 2])
-        _rotate(pose, base, head)
-        for k in range(3):
-            directions[i, k], axes[i, k] = head[0, k], head[1, k]
-            origins[i, k] = head[2, k] + pose[k, 3]
+            column_x = c * posed[0, k, 0] + s * posed[1, k, 0] + posed[2, k, 0]
+            column_y = c * posed[0, k, 1] + s * posed[1, k, 1] + posed[2, k, 1]
+            column_z = c * posed[0, k, 2] + s * posed[1, k, 2] + posed[2, k, 2]
+            shift = c * posed[0, k, 3] + s * posed[1, k, 3] + posed[2, k, 3]
+            origins[i, k] = shift + height * column_z
+            directions[i, k] = x * column_x + y * column_y + z * column_z
+            axes[i, k] = column_z
     return origins, directions, axes
-
-
-@numba.njit(cache=True, nogil=True)
-def _rotate(T: Array, v: Array, out: Array) -> None:  # pragma: no cover
-    """Rotate three vectors, the rows of ``v``, by the rotation of ``T``, into ``out``."""
-    for k in range(3):
-        for j in range(3):
-            out[k, j] = T[j, 0] * v[k, 0] + T[j, 1] * v[k, 1] + T[j, 2] * v[k, 2]
