@@ -316,7 +316,14 @@ def _one_statement(sql: str) -> str:
             f"{kind} is not possible here: the database can only be read. "
             "Use SELECT, EXPLAIN, DESCRIBE or SUMMARIZE."
         )
-    return str(statements[0].query)
+    return _without_end(str(statements[0].query))
+
+
+def _without_end(statement: str) -> str:
+    """Return a statement without its semicolon and what follows, so that SQL can wrap it."""
+    text = statement.encode()  # positions of tokens count bytes
+    ends = [at for at, _ in duckdb.tokenize(statement) if text[at : at + 1] == b";"]
+    return text[: ends[0]].decode() if ends else statement
 
 
 def _plain_sql(place: int, kind: str) -> str:
