@@ -29,7 +29,9 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
     add_completion=False,
 )
-out, err = Console(), Console(stderr=True)
+_WIDE = 160  # columns of a table that goes into a file or a pipe
+out = Console(width=None if sys.stdout.isatty() else _WIDE)
+err = Console(stderr=True)
 
 AsJson = Annotated[bool, typer.Option("--json", help="JSON for programs.")]
 LogFile = Annotated[Path, typer.Argument(exists=True, dir_okay=False, help="Log (MCAP).")]

@@ -6,11 +6,14 @@ Stops are simulated by a process of its own and uploaded over HTTP as soon as ea
 from __future__ import annotations
 
 import json
+import queue
 import subprocess
 import sys
 import threading
 import time
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
+from datetime import datetime
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -107,20 +110,27 @@ class Rover:
         return [stop for stop in lane if stop not in known] if is_ours else []
 
     def _survey(self, stops: list[str]) -> None:
-        """Simulate stop after stop, upload each one, and wait for the jobs."""
+        """Simulate and upload stop after stop, and say how each job ended."""
         self._console.print(
-            f"Simulating {len(stops)} stops of the study's field, 13 s each; every stop is "
-            "uploaded as soon as it is ready."
+            f"Simulating {len(stops)} stops of the study's field; each one is uploaded as soon "
+            "as it is ready."
         )
-        jobs: dict[str, tuple[str, float]] = {}
-        for made in self._simulated(stops):
-            if not jobs:
-                self._put("/surveys/paper-field/control", self._folder / "control.csv", "text/csv")
-            self._put("/surveys/paper-field/truth", Path(made["truth"]), "application/json")
-            jobs[made["stop"]] = (self._upload(made), time.monotonic())
-            self._tell(jobs)
-        while jobs and not self._leaving.wait(_POLL):
-            self._tell(jobs)
+        jobs: queue.SimpleQueue[str | None] = queue.SimpleQueue()
+        with ThreadPoolExecutor(1) as pool:
+            uploads = pool.submit(self._bring, stops, jobs)
+            while (job := jobs.get()) is not None:
+                self._await(job)
+            uploads.result()
+
+    def _bring(self, stops: list[str], jobs: queue.SimpleQueue[str | None]) -> None:
+        """Simulate and upload stop after stop; pass on the job of each, and none at the end."""
+        try:
+            for made in self._simulated(stops):
+                self._put(f"/surveys/{SURVEY}/control", self._folder / "control.csv", "text/csv")
+                self._put(f"/surveys/{SURVEY}/truth", Path(made["truth"]), "application/json")
+                jobs.put(self._upload(made))
+        finally:
+            jobs.put(None)
 
     def _simulated(self, stops: list[str]) -> Iterator[dict[str, str]]:
         """Yield each stop as soon as a process of its own has written it."""
@@ -155,19 +165,20 @@ class Rover:
         job: str = _checked(answer)["job"]["job_id"]
         return job
 
-    def _tell(self, jobs: dict[str, tuple[str, float]]) -> None:
-        """Say which jobs have come to their end since the last time, and forget them."""
-        for stop, (job_id, uploaded) in list(jobs.items()):
+    def _await(self, job_id: str) -> None:
+        """Wait for the end of a job and say what it gave, or why it gave nothing."""
+        job = self._get(f"/jobs/{job_id}")
+        while job["status"] in ("accepted", "running") and not self._leaving.wait(_POLL):
             job = self._get(f"/jobs/{job_id}")
-            if job["status"] in ("accepted", "running"):
-                continue
-            del jobs[stop]
-            now = time.monotonic()
-            times = (
-                f"[dim]{now - uploaded:.1f} s after its upload, {now - self._begin:.0f} s in all[/]"
-            )
-            said = job["message"] if job["status"] == "successful" else job["error_reason"]
-            self._console.print(f"{said}  {times}")
+        if job["finished_at"] is None:
+            return
+        asked, ended = (datetime.fromisoformat(job[at]) for at in ("created_at", "finished_at"))
+        said = job["message"] if job["status"] == "successful" else job["error_reason"]
+        self._console.print(
+            f"{said}  [dim]{(ended - asked).total_seconds():.1f} s after its upload, "
+            f"{time.monotonic() - self._begin:.0f} s after the start[/]",
+            soft_wrap=True,
+        )
 
     def _summarise(self) -> None:
         """Print the numbers that matter, and where to see more."""

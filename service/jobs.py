@@ -97,6 +97,9 @@ class JobQueue:
                         "distributed.scheduler.allowed-failures": self._settings.job_attempts - 1,
                         # one task per worker: a worker that dies takes no waiting job with it
                         "distributed.scheduler.worker-saturation": 1.0,
+                        # nothing of Dask answers to a browser
+                        "distributed.scheduler.http.routes": [],
+                        "distributed.worker.http.routes": [],
                     }
                 )
             )
@@ -106,7 +109,8 @@ class JobQueue:
                     threads_per_worker=1,
                     processes=True,
                     host="127.0.0.1",
-                    dashboard_address=None,
+                    dashboard_address="127.0.0.1:0",
+                    worker_dashboard_address="127.0.0.1:0",
                     asynchronous=True,
                     silence_logs=logging.ERROR,
                 )

@@ -8,6 +8,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from rich.console import Console
+from rich.markup import escape
 from rich.table import Table
 
 from storage.recordings import Preflight
@@ -134,7 +135,7 @@ def _table(heads: Sequence[str], rows: Sequence[Sequence[str]], left: int = 1) -
     """Return a table whose first columns are flush left."""
     table = Table(box=None, pad_edge=False, header_style="bold")
     for i, head in enumerate(heads):
-        table.add_column(head, justify="left" if i < left else "right")
+        table.add_column(escape(head), justify="left" if i < left else "right")
     for row in rows:
         table.add_row(*row)
     return table

@@ -148,7 +148,10 @@ def _stop_summary(stop: StopResult) -> str:
     fix = next(iter(stop.fixes.values()))
     if isinstance(fix, NoFix):
         return f"{text}; no position: {fix.reason}"
-    sigma = f"{text}; station within {1000 * fix.sigma_3d:.1f} mm (1 sigma, 3-D)"
+    sigma = (
+        f"{text}, {len(fix.matches)} of them on marks; station with a sigma of "
+        f"{1000 * fix.sigma_3d:.1f} mm (3-D)"
+    )
     return f"{sigma}; weak: {fix.reason}" if fix.status is Status.WEAK else f"{sigma}."
 
 
@@ -175,9 +178,11 @@ def code_version() -> str:
     if not (root / ".git").exists():
         return release
     command = ["git", "-C", str(root), "describe", "--always", "--dirty", "--exclude=*"]
-    done = subprocess.run(command, capture_output=True, text=True, check=False)
-    commit = done.stdout.strip()
-    return f"{release}+g{commit.replace('-', '.')}" if done.returncode == 0 else release
+    with suppress(OSError):  # without git, the release has to do
+        done = subprocess.run(command, capture_output=True, text=True, check=False)
+        if done.returncode == 0:
+            return f"{release}+g{done.stdout.strip().replace('-', '.')}"
+    return release
 
 
 class WarmUp(WorkerPlugin):  # type: ignore[misc]  # distributed ships no types
