@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import hashlib
 import io
+import itertools
 import json
 import posixpath
 import secrets
@@ -29,6 +30,7 @@ from storage.results import marker_name
 NO_MARKER = -1  # the marker of a return that belongs to none
 _FORMAT = "1"  # version of the file format; a reader knows every version that was ever written
 _NEAR = 0.5  # [m] around a centre, within which every return is kept
+_CELLS = 256  # cells of 1 m along an edge of the grid; the outermost ones reach to infinity
 _GOLDEN = (np.sqrt(5.0) - 1.0) / 2.0
 
 
@@ -139,7 +141,9 @@ def write_cloud(stop: StopResult, folder: str, *, n_max: int = 200_000) -> str:
         Path or URL of the file, ``<folder>/<SHA-256>.parquet``; the same stop gives the same.
     """
     buffer = io.BytesIO()
-    pq.write_table(_to_table(view(stop, n_max)), buffer, compression="zstd")
+    table = _to_table(view(stop, n_max))
+    split = dict.fromkeys(("x_m", "y_m", "z_m", "residual_m"), "BYTE_STREAM_SPLIT")
+    pq.write_table(table, buffer, compression="zstd", use_dictionary=False, column_encoding=split)
     content = buffer.getvalue()
     url = posixpath.join(folder, f"{hashlib.sha256(content).hexdigest()}.parquet")
     files, path = fsspec.core.url_to_fs(url)
@@ -223,12 +227,16 @@ def to_ply(cloud: CloudView) -> bytes:
 
 
 def _near(p: Column, centres: Array) -> Mask:
-    """Return which points are near a centre; slices by x first, to look at few points twice."""
+    """Return which points are near a centre, looking closely only at those in a cell near one."""
+    cells = np.clip(np.floor(p[:, :2]) + _CELLS // 2, 0, _CELLS - 1).astype(np.intp)
+    may_be_near = np.zeros((_CELLS, _CELLS), dtype=np.bool_)
+    for corner in itertools.product((-_NEAR, _NEAR), repeat=2):
+        at = np.clip(np.floor(centres[:, :2] + corner) + _CELLS // 2, 0, _CELLS - 1)
+        may_be_near[tuple(at.astype(np.intp).T)] = True
+    rows = np.flatnonzero(may_be_near[cells[:, 0], cells[:, 1]])
     is_near = np.zeros(len(p), dtype=np.bool_)
     for centre in centres:
-        slab = np.flatnonzero(np.abs(p[:, 0] - np.float32(centre[0])) <= _NEAR)
-        distances = np.linalg.norm(p[slab] - centre, axis=1)
-        is_near[slab[distances <= _NEAR]] = True
+        is_near[rows[np.linalg.norm(p[rows] - centre, axis=1) <= _NEAR]] = True
     return is_near
 
 
