@@ -272,7 +272,7 @@ def adjust(
 
 def _degrees_of_freedom(groups: tuple[Observations, ...]) -> int:
     """Return the number of observations minus that of the unknowns, if it is not negative."""
-    n, p = sum(group.residuals.size for group in groups), groups[0].J.shape[-1]
+    n, p = sum(group.residuals.size for group in groups), int(groups[0].J.shape[-1])
     if n < p:
         raise TooFewObservationsError(f"{n} observations cannot determine {p} unknowns.")
     return n - p

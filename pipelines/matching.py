@@ -16,7 +16,12 @@ from scipy.spatial.transform import Rotation
 
 from pipelines.adjustment import Observations, Solution, solve
 from pipelines.config import ResectionConfig
-from pipelines.errors import AmbiguousMatchError, NoMatchError, SolveError
+from pipelines.errors import (
+    AmbiguousMatchError,
+    DegenerateGeometryError,
+    NoMatchError,
+    SolveError,
+)
 from pipelines.geometry import levelling_rotation, rigid, rot_z, skew, transform
 from pipelines.values import Array, ControlMarks, Index, MarkerFits
 
@@ -26,6 +31,7 @@ _N_SOLUTIONS = 6  # that are refined: the best, and rivals enough to see that it
 _N_ROUNDS = 8  # of adjusting and matching again; two or three are the rule
 _RIVAL = 14.0  # -2 ln(0.001): how much better, in the weighted sum of squares, the best must be
 _CHANCE = 0.01  # expected number of chance agreements above which a match is none
+_SHARE = 0.4  # of markers or marks, the fewer: of mirrored fields five in fourteen may still fit
 
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
@@ -165,6 +171,8 @@ def match_marks(scene: Scene, config: ResectionConfig) -> Match:
 
     Raises
     ------
+    DegenerateGeometryError
+        If all markers or all marks stand on one plumb line.
     NoMatchError
         If the markers do not agree with the marks better than chance.
     AmbiguousMatchError
@@ -178,6 +186,8 @@ def match_marks(scene: Scene, config: ResectionConfig) -> Match:
     300,000 pairs of pairs, then no more.
     """
     levelled = scene.centres_base @ scene.R_station_base.T
+    _refuse_plumb_line(levelled, "markers", config)
+    _refuse_plumb_line(scene.marks_site, "control marks", config)
     hypotheses = _voted(_hypotheses(levelled, scene, config), levelled, config)
     solutions = _solutions(hypotheses, levelled, scene, config)
     if not solutions:
@@ -279,6 +289,16 @@ def solve_pose(scene: Scene, pairs: Index, start: Array) -> Solution[Array]:
         Poses with covariances.
     """
     return solve(lambda T: observe(scene, pairs, T), moved, start)
+
+
+def _refuse_plumb_line(p: Array, kind: str, config: ResectionConfig) -> None:
+    """Raise DegenerateGeometryError if no two points are apart enough to tell a heading."""
+    apart = float(np.linalg.norm(np.ptp(p[:, :2], axis=0)))
+    if apart <= 2.0 * config.match_tolerance:
+        raise DegenerateGeometryError(
+            f"All {kind} stand on one plumb line (within {apart:.2f} m; more than "
+            f"{2.0 * config.match_tolerance} m is needed): the heading stays open."
+        )
 
 
 def _hypotheses(levelled: Array, scene: Scene, config: ResectionConfig) -> _Hypotheses:
@@ -448,6 +468,12 @@ def _refuse_chance(match: Match, scene: Scene, config: ResectionConfig) -> None:
     volume that lies as near to a mark as the worst of them.
     """
     n, m, k = len(scene.centres_base), len(scene.marks_site), match.n
+    if k < _SHARE * min(n, m):
+        raise NoMatchError(
+            f"Only {k} of {n} markers fit the {m} control marks within {config.match_tolerance} m, "
+            f"and at least {int(np.ceil(_SHARE * min(n, m)))} must: these are marks of another "
+            "field, or too many markers are false."
+        )
     near = max(match.largest_residual, 3.0 * float(np.sqrt(scene.cov_centres.trace(0, 1, 2).min())))
     reach = float(np.linalg.norm(scene.centres_base, axis=1).max())
     near_height = near + 3.0 * scene.sigma_level * reach

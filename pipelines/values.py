@@ -232,7 +232,7 @@ class StitchedCloud:
     intensities : (n,) float32
         Calibrated reflectivity, 0-255.
     rings : (n,) uint8
-        Laser of each return; ``RING_UNKNOWN`` when not recorded.
+        Laser of each return; ``RING_UNKNOWN`` when neither recorded nor told by the elevations.
     times : (n,) float32
         Instant of each shot since the first one of the stop [s].
     levelling : Levelling
@@ -545,7 +545,8 @@ class StationFix:
     detectable_biases : (n,)
         Minimal detectable bias along the weakest axis of each marker; infinite if none is [m].
     external_reliabilities : (n,)
-        Shift of the station that a bias of that size would cause unseen; infinite likewise [m].
+        Largest shift of the station that a bias of each marker would cause unseen; infinite
+        likewise [m].
     dof : int
         Degrees of freedom: observations, gravity included, minus unknowns.
     sigma0 : float

@@ -1,0 +1,321 @@
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.stats import chi2
+
+from pipelines.config import ResectionConfig
+from pipelines.errors import ConfigError, DegenerateGeometryError, NoMarkersError
+from pipelines.geometry import inverse, levelling_rotation, log_motion, rigid
+from pipelines.resection import resect, resect_pairs
+from pipelines.values import Levelling, Status
+from tests.synthetic import control, field, lean_matrix, marker_fit, pose, sightings, turn_z
+
+EXACT = 1e-7  # [m] and [rad] noise-free in, truth out
+CONFIG = ResectionConfig()
+LEAN = (0.06, -0.04)
+STAND = (1.0, -2.0, 0.8)
+
+
+@pytest.fixture
+def rng():
+    return np.random.default_rng(31)
+
+
+def station(T_site_base, levelling):
+    """The true pose of the measured station frame."""
+    return T_site_base @ inverse(rigid(levelling_rotation(levelling), np.zeros(3)))
+
+
+def free(fits, marks, config=CONFIG):
+    return resect("free_station", fits, marks, config)
+
+
+@pytest.mark.parametrize("middle", [(0, 0, 0), (431_250.0, 5_412_800.0, 312.0)])
+def test_noise_free_centres_give_the_true_pose(rng, middle):
+    marks = field(rng, middle=middle)
+    T = pose(np.array(middle) + STAND, 2.2, LEAN)
+    fits = sightings(marks, T, lean=LEAN)
+    fix = free(fits, marks)
+    np.testing.assert_allclose(fix.p_site, T[:3, 3], rtol=0, atol=EXACT)
+    np.testing.assert_allclose(
+        fix.T_site_station[:3, :3], turn_z(np.array(2.2)), rtol=0, atol=EXACT
+    )
+    np.testing.assert_allclose(fix.residuals_site, 0, atol=EXACT)
+    assert fix.status is Status.OK
+    assert fix.dof == 3 * 14 + 2 - 6
+    assert fix.redundancies.sum() < fix.dof  # gravity has the rest
+    assert fix.sigma_3d < 4e-3
+
+
+def test_residuals_are_observed_minus_computed_in_the_site(rng):
+    marks = field(rng)
+    T = pose(STAND, 2.2, LEAN)
+    fits = sightings(marks, T, lean=LEAN, noise=rng.normal(0, 4e-3, (14, 3)))
+    fix = free(fits, marks)
+    T_site_base = fix.T_site_station @ rigid(lean_matrix(*LEAN), np.zeros(3))
+    for (fit, mark), residual in zip(fix.matches, fix.residuals_site, strict=True):
+        p_site = T_site_base[:3, :3] @ fits.fits[fit].p_base + T_site_base[:3, 3]
+        np.testing.assert_allclose(residual, p_site - marks.p_site[mark], rtol=0, atol=1e-9)
+
+
+moves = st.tuples(st.floats(-3, 3), *[st.floats(-1000, 1000)] * 3)
+
+
+@settings(max_examples=15, deadline=None)
+@given(move=moves, seed=st.integers(0, 50))
+def test_moving_the_world_moves_the_answer_and_nothing_else(move, seed):
+    rng = np.random.default_rng(seed)
+    marks = field(rng)
+    fits = sightings(marks, pose(STAND, 2.2), noise=rng.normal(0, 4e-3, (14, 3)))
+    shift = pose(move[1:], move[0])
+    elsewhere = control(marks.p_site @ shift[:3, :3].T + shift[:3, 3])
+    here, there = free(fits, marks), free(fits, elsewhere)
+    np.testing.assert_allclose(there.T_site_station, shift @ here.T_site_station, rtol=0, atol=1e-7)
+    np.testing.assert_allclose(
+        there.cov_p_site, shift[:3, :3] @ here.cov_p_site @ shift[:3, :3].T, rtol=0, atol=1e-10
+    )
+    np.testing.assert_allclose(there.redundancies, here.redundancies, rtol=0, atol=1e-6)
+    assert there.sigma0 == pytest.approx(here.sigma0, rel=1e-6)
+
+
+@settings(max_examples=15, deadline=None)
+@given(seed=st.integers(0, 50))
+def test_the_order_of_markers_and_marks_does_not_matter(seed):
+    rng = np.random.default_rng(seed)
+    marks = field(rng)
+    fits = sightings(marks, pose(STAND, 2.2), noise=rng.normal(0, 4e-3, (14, 3)))
+    shuffled = replace(fits, fits=tuple(fits.fits[k] for k in rng.permutation(14)))
+    order = rng.permutation(14)
+    fix, again = free(fits, marks), free(shuffled, control(marks.p_site[order]))
+    np.testing.assert_allclose(again.T_site_station, fix.T_site_station, rtol=0, atol=1e-8)
+    np.testing.assert_allclose(again.cov_T_site_station, fix.cov_T_site_station, rtol=1e-4)
+
+
+def test_scaling_all_sigmas_scales_the_covariance_by_the_square(rng):
+    marks = field(rng)
+    T = pose(STAND, 2.2)
+    noise = rng.normal(0, 4e-3, (14, 3))
+    exact = replace(CONFIG, sigma_common=0.0)
+    one = free(sightings(marks, T, noise=noise, cov=np.eye(3) * 4e-3**2), marks, exact)
+    thrice = sightings(marks, T, noise=noise, cov=np.eye(3) * 12e-3**2, sigma_level=9e-3)
+    three = free(thrice, marks, exact)
+    np.testing.assert_allclose(three.T_site_station, one.T_site_station, rtol=0, atol=1e-9)
+    np.testing.assert_allclose(three.cov_T_site_station, 9 * one.cov_T_site_station, rtol=1e-6)
+    assert three.sigma0 == pytest.approx(one.sigma0 / 3, rel=1e-6)
+
+
+def test_the_common_sigma_and_the_marks_own_covariance_are_added(rng):
+    marks = field(rng)
+    fits = sightings(marks, pose(STAND, 2.2))
+    plain = free(fits, marks, replace(CONFIG, sigma_common=3e-3))
+    loose = replace(marks, cov_p_site=np.broadcast_to(np.eye(3) * 3e-3**2, (14, 3, 3)).copy())
+    by_marks = free(fits, loose, replace(CONFIG, sigma_common=0.0))
+    np.testing.assert_allclose(by_marks.cov_T_site_station, plain.cov_T_site_station, rtol=1e-6)
+
+
+def noisy_fix(rng, marks, cov_root, lean_sigma=3e-3):
+    """A fix from a random pose with noise as claimed, and its error as a small motion."""
+    lean = rng.uniform(-0.1, 0.1, 2)
+    T = pose(rng.uniform(-3, 3, 3) * [1, 1, 0.1] + marks.p_site.mean(0), rng.uniform(-3, 3), lean)
+    n = len(marks.names)
+    noise = np.einsum("nij,nj->ni", cov_root, rng.normal(size=(n, 3)))
+    cov = cov_root @ np.swapaxes(cov_root, 1, 2)
+    measured = tuple(lean + rng.normal(0, lean_sigma, 2))
+    fits = sightings(marks, T, lean=measured, sigma_level=lean_sigma, cov=cov, noise=noise)
+    fix = free(fits, marks, replace(CONFIG, sigma_common=0.0, test_level=1e-6))
+    error = log_motion(station(T, fits.levelling) @ inverse(fix.T_site_station))
+    return fix, error, T
+
+
+def whitened(rng, n_marks, trials):
+    """Whitened pose errors, (trials, 6), and normalised squared position errors."""
+    marks = field(rng, n_marks, middle=(100.0, 50.0, 10.0))
+    roots = rng.normal(0, 3e-3, (n_marks, 3, 3)) + 4e-3 * np.eye(3)
+    errors, squares = [], []
+    for _ in range(trials):
+        fix, xi, T = noisy_fix(rng, marks, roots)
+        errors.append(np.linalg.solve(np.linalg.cholesky(fix.cov_T_site_station), xi))
+        off = T[:3, 3] - fix.p_site
+        squares.append(off @ np.linalg.solve(fix.cov_p_site, off))
+    return np.array(errors), np.array(squares)
+
+
+def test_the_covariance_of_the_pose_is_honest(rng):
+    errors, squares = whitened(rng, 5, 250)
+    eigenvalues = np.linalg.eigvalsh(errors.T @ errors / len(errors))
+    assert eigenvalues[0] > 0.7  # chance alone gives 0.72 to 1.33
+    assert eigenvalues[-1] < 1.4
+    assert np.mean(squares) / 3 == pytest.approx(1.0, abs=0.2)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("n_marks", [4, 14])
+def test_the_covariance_of_the_pose_is_honest_at_length(n_marks):
+    errors, squares = whitened(np.random.default_rng(n_marks), n_marks, 2500)
+    eigenvalues = np.linalg.eigvalsh(errors.T @ errors / len(errors))
+    np.testing.assert_allclose(eigenvalues, 1.0, rtol=0, atol=0.12)
+    assert np.mean(chi2.sf(np.sum(errors**2, axis=1), 6) > 0.01) == pytest.approx(0.99, abs=0.006)
+    assert np.mean(chi2.sf(squares, 3) > 0.05) == pytest.approx(0.95, abs=0.013)
+
+
+def test_a_false_marker_and_a_moved_mark_are_left_out_with_reasons(rng):
+    marks = field(rng)
+    noise = rng.normal(0, 4e-3, (14, 3))
+    noise[4] += [0.05, 0.0, 0.03]
+    T = pose(STAND, 2.2)
+    fits = sightings(marks, T, noise=noise)
+    fits = replace(fits, fits=(*fits.fits, marker_fit([3.0, 3.0, 0.0], np.eye(3) * 1e-5)))
+    fix = free(fits, marks)
+    assert [exclusion.fit for exclusion in fix.excluded] == [4, 14]
+    assert fix.excluded[0].reason.startswith("w = ")
+    assert f"mark {marks.names[4]}" in fix.excluded[0].reason
+    assert "false marker" in fix.excluded[1].reason
+    assert 4 not in fix.matches[:, 0]
+    assert fix.status is Status.OK
+    np.testing.assert_allclose(fix.p_site, T[:3, 3], rtol=0, atol=5 * fix.sigma_3d)
+
+
+def test_reliability_is_better_with_more_marks(rng):
+    marks = field(rng)
+    T = pose(STAND, 2.2)
+    few = control(marks.p_site[:3])
+    three, all_of_them = free(sightings(few, T), few), free(sightings(marks, T), marks)
+    assert three.detectable_biases.min() > all_of_them.detectable_biases.max()
+    assert three.external_reliabilities.min() > 2 * all_of_them.external_reliabilities.max()
+    assert np.all(all_of_them.redundancies > 2)
+
+
+def test_two_marks_give_a_weak_fix_thanks_to_gravity():
+    marks = control([[6, 0, 0.7], [-5, 2, 1.4]])
+    T = pose(STAND, 2.2, LEAN)
+    fix = free(sightings(marks, T, lean=LEAN), marks)
+    np.testing.assert_allclose(fix.p_site, T[:3, 3], rtol=0, atol=EXACT)
+    assert fix.status is Status.WEAK
+    assert "only two marks" in fix.reason
+    assert fix.dof == 2
+
+
+def test_marks_on_a_line_give_a_weak_fix_thanks_to_gravity():
+    marks = control([[-6, 3, 0.7], [-1, 3, 0.7], [3, 3, 0.7], [7, 3, 0.7]])
+    T = pose((1.0, -2.0, 0.8), 2.2, LEAN)
+    fix = free(sightings(marks, T, lean=LEAN), marks)
+    np.testing.assert_allclose(fix.p_site, T[:3, 3], rtol=0, atol=EXACT)
+    assert fix.status is Status.WEAK
+    assert "on one line" in fix.reason
+
+
+def test_two_marks_on_a_plumb_line_are_refused():
+    marks = control([[6, 0, 0.7], [6, 0, 1.9]])
+    with pytest.raises(DegenerateGeometryError, match="plumb line"):
+        free(sightings(marks, pose(STAND, 2.2)), marks)
+
+
+def test_one_marker_gives_no_position(rng):
+    marks = field(rng)
+    fits = sightings(marks, pose(STAND, 2.2))
+    with pytest.raises(DegenerateGeometryError, match="One marker gives no position"):
+        free(replace(fits, fits=fits.fits[:1]), marks)
+    with pytest.raises(DegenerateGeometryError, match="One control mark gives no position"):
+        free(fits, control(marks.p_site[:1]))
+
+
+def test_no_marker_at_all_is_refused(rng):
+    marks = field(rng)
+    fits = sightings(marks, pose(STAND, 2.2))
+    with pytest.raises(NoMarkersError):
+        free(replace(fits, fits=()), marks)
+
+
+def test_an_unknown_method_is_refused(rng):
+    marks = field(rng)
+    with pytest.raises(ConfigError, match="free_station"):
+        resect("astrolabe", sightings(marks, pose(STAND, 2.2)), marks, CONFIG)
+
+
+def test_centres_worse_than_their_sigmas_make_a_weak_fix(rng):
+    marks = field(rng)
+    noise = rng.normal(0, 1.5e-3, (14, 3)) * 4
+    fits = sightings(marks, pose(STAND, 2.2), noise=noise, cov=np.eye(3) * 1.5e-3**2)
+    fix = free(fits, marks)
+    assert fix.status is Status.WEAK
+    assert fix.excluded or not fix.passes_global_test
+
+
+def test_an_assumed_levelling_makes_a_weak_fix(rng):
+    marks = field(rng)
+    T = pose(STAND, 2.2, (0.02, 0.01))
+    fits = sightings(marks, T)
+    level = Levelling(roll=0.0, pitch=0.0, sigma=np.radians(3), is_measured=False)
+    fix = free(replace(fits, levelling=level), marks)
+    assert fix.status is Status.WEAK
+    assert "assumed" in fix.reason
+    np.testing.assert_allclose(fix.p_site, T[:3, 3], rtol=0, atol=1e-3)
+
+
+def test_a_levelling_that_contradicts_the_marks_is_left_out(rng):
+    marks = field(rng)
+    T = pose(STAND, 2.2)
+    fix = free(sightings(marks, T, lean=(np.radians(2), 0.0), sigma_level=1e-3), marks)
+    np.testing.assert_allclose(fix.p_site, T[:3, 3], rtol=0, atol=EXACT)
+    assert fix.status is Status.WEAK
+    assert "levelling contradicts" in fix.reason
+    assert fix.excluded == ()
+
+
+def test_included_angles_are_those_at_the_station():
+    marks = control([[5, 0, 0.8], [0, 5, 0.8], [-5, 0, 1.4]])
+    fix = free(sightings(marks, pose((0, 0, 0.8), 1.0)), marks)
+    flat = np.arctan2(0.6, 5.0)
+    np.testing.assert_allclose(fix.included_angles, [np.pi / 2, np.pi - flat], rtol=0, atol=EXACT)
+
+
+def test_pairs_are_all_pairs_with_their_angles_and_places(rng):
+    marks = field(rng)
+    T = pose(STAND, 2.2, LEAN)
+    fits = sightings(marks, T, lean=LEAN)
+    pairs = resect_pairs("free_station", free(fits, marks), fits, marks, CONFIG)
+    assert len(pairs.marks) == 91
+    np.testing.assert_allclose(pairs.p_site, np.broadcast_to(T[:3, 3], (91, 3)), rtol=0, atol=EXACT)
+    v = marks.p_site - T[:3, 3]
+    first, second = pairs.marks.T
+    for shown, of in ((pairs.included_angles, v), (pairs.included_angles_horizontal, v[:, :2])):
+        unit = of / np.linalg.norm(of, axis=1, keepdims=True)
+        cosines = np.sum(unit[first] * unit[second], axis=1)
+        np.testing.assert_allclose(np.cos(shown), cosines, rtol=0, atol=1e-6)
+
+
+def test_a_pair_has_the_sigma_of_a_fix_from_two_marks(rng):
+    marks = field(rng)
+    T = pose(STAND, 2.2, LEAN)
+    fits = sightings(marks, T, lean=LEAN, noise=rng.normal(0, 4e-3, (14, 3)))
+    pairs = resect_pairs("free_station", free(fits, marks), fits, marks, CONFIG)
+    row = int(np.flatnonzero(np.all(pairs.marks == [2, 9], axis=1))[0])
+    alone = free(replace(fits, fits=(fits.fits[2], fits.fits[9])), control(marks.p_site[[2, 9]]))
+    np.testing.assert_allclose(pairs.p_site[row], alone.p_site, rtol=0, atol=1e-8)
+    assert pairs.sigma_3d[row] == pytest.approx(alone.sigma_3d, rel=1e-5)
+
+
+def test_pairs_of_opposite_marks_are_best_and_of_neighbours_worst():
+    # known theory: sigma sqrt(1 + cot^2(angle / 2) / 2) per horizontal axis pair, heading unknown
+    sigma = 5e-3
+    for angle in np.radians([30, 60, 90, 120, 150, 179]):
+        marks = control(
+            [[7.5, 0, 0.5], [7.5 * np.cos(angle), 7.5 * np.sin(angle), 1.1], [-3, 2, 0.6]]
+        )
+        fits = sightings(marks, pose((0, 0, 0.8), 0.4), cov=np.eye(3) * sigma**2, sigma_level=1e-6)
+        exact = replace(CONFIG, sigma_common=0.0)
+        pairs = resect_pairs("free_station", free(fits, marks, exact), fits, marks, exact)
+        horizontal = sigma**2 * (1 + 1 / np.tan(angle / 2) ** 2 / 2)
+        expected = np.sqrt(horizontal + sigma**2 / 2)
+        assert pairs.sigma_3d[0] == pytest.approx(expected, rel=0.02)
+
+
+def test_a_pair_on_a_plumb_line_is_left_out():
+    marks = control([[5, 0, 0.5], [5, 0, 1.7], [0, 6, 0.9], [-4, -3, 1.3]])
+    fits = sightings(marks, pose((0, 0, 0.8), 0.4))
+    pairs = resect_pairs("free_station", free(fits, marks), fits, marks, CONFIG)
+    assert len(pairs.marks) == 5
+    assert [0, 1] not in pairs.marks.tolist()
