@@ -132,9 +132,30 @@ def scenario(name: str, seed: int) -> Field:
     """
     if name not in SCENARIOS:
         raise ConfigError(f"There is no scenario {name!r}; there are: {', '.join(SCENARIOS)}.")
+    return SCENARIOS[name](checked_seed(seed))
+
+
+def checked_seed(seed: int) -> int:
+    """Return a seed that can be used.
+
+    Parameters
+    ----------
+    seed : int
+        Source of chance.
+
+    Returns
+    -------
+    int
+        The same.
+
+    Raises
+    ------
+    ConfigError
+        If it is negative.
+    """
     if seed < 0:
         raise ConfigError(f"The seed is {seed}; it must be 0 or more.")
-    return SCENARIOS[name](seed)
+    return seed
 
 
 def _paper_field(seed: int) -> Field:

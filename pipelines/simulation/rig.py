@@ -209,7 +209,7 @@ def ahrs_samples(
     shake = Rotation.from_rotvec(rng.normal(0.0, config.sigma_ahrs, (len(times), 3)))
     mount = Rotation.from_matrix(rig.R_mount_imu)
     if rig.imu_mount is ImuMount.HEAD:
-        mount = Rotation.from_euler("z", motion.angle_at(times)) * mount
+        mount = Rotation.from_euler("z", motion.angle_at(times)[:, None]) * mount
     base = Rotation.from_matrix(rot_z(rng.uniform(-np.pi, np.pi))) * Rotation.from_rotvec(lean)
     orientations = base * shake * Rotation.from_matrix(R_station_base) * mount
     return orientations.as_quat(), _nanoseconds(times)

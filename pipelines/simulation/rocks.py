@@ -38,11 +38,13 @@ def draw_rocks(rng: np.random.Generator, keep_clear: Array) -> Array:
     Notes
     -----
     The share of ground under rocks larger than D is ``k exp(-q D)``: the exponential tail of
-    counted fields (Golombek and Rapp, 1997, eq. 4), here with k = 1 % and q = 4 /m so that large
-    rocks occur.
+    counted fields (Golombek and Rapp, 1997, eq. 4), here with q = 4 /m so that large rocks occur,
+    and 1 % for all of them.
     """
     sizes = np.linspace(*_SIZES, 2000)
-    density = _COVER * _DECAY * np.exp(-_DECAY * sizes) / (np.pi / 4 * sizes**2)  # [1/m^3]
+    shares = _DECAY * np.exp(-_DECAY * sizes)  # of the ground, per metre of diameter
+    shares *= _COVER / np.ptp(np.exp(-_DECAY * sizes))
+    density = shares / (np.pi / 4 * sizes**2)  # [1/m^3]
     cumulative = np.concatenate(
         [[0.0], np.cumsum(np.diff(sizes) * (density[1:] + density[:-1]) / 2)]
     )
