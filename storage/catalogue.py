@@ -255,11 +255,35 @@ class Catalogue:
         return self.get_survey(survey_id)
 
     def get_survey(self, key: str) -> SurveyRecord:
-        """Return a survey by its id or its name; NotFoundError if there is none."""
+        """Return a survey by its id or its name; NotFoundError if there is none.
+
+        Parameters
+        ----------
+        key : str
+            Id or name.
+
+        Returns
+        -------
+        SurveyRecord
+            The survey.
+        """
         return survey_of(self._one(_SURVEY_BY_KEY, {"key": key}, f"survey {key!r}"))
 
     def list_surveys(self, *, after: str | None = None, limit: int = 100) -> Page[SurveyRecord]:
-        """Return a part of the surveys, newest first; ``after`` is ``next`` of the part before."""
+        """Return a part of the surveys, newest first; ``after`` is ``next`` of the part before.
+
+        Parameters
+        ----------
+        after : str, optional
+            ``next`` of the part before; the first part without.
+        limit : int
+            Records in the part, 1 to 1000.
+
+        Returns
+        -------
+        Page of SurveyRecord
+            The part, and where the next begins.
+        """
         rows = self._part(_SURVEYS_AFTER, {}, after, limit)
         return _page(rows, limit, "created_at", "survey_id", survey_of)
 
@@ -294,7 +318,18 @@ class Catalogue:
             )
 
     def control_marks(self, survey: str) -> ControlMarks | None:
-        """Return the control marks of a survey (id or name), as they were put; None without."""
+        """Return the control marks of a survey (id or name), as they were put; None without.
+
+        Parameters
+        ----------
+        survey : str
+            Id or name.
+
+        Returns
+        -------
+        ControlMarks or None
+            In the order that they were put in.
+        """
         rows = self.rows(_CONTROL, {"id": self.get_survey(survey).survey_id})
         if not rows:
             return None
@@ -337,7 +372,18 @@ class Catalogue:
             _refresh_errors(cursor, survey_id)
 
     def truth(self, survey: str) -> Truth | None:
-        """Return the truth of a survey (id or name); None when it is not known."""
+        """Return the truth of a survey (id or name); None when it is not known.
+
+        Parameters
+        ----------
+        survey : str
+            Id or name.
+
+        Returns
+        -------
+        Truth or None
+            Stops in the order of their names.
+        """
         survey_id = self.get_survey(survey).survey_id
         with closing(self._connection.cursor()) as cursor:
             return _truth(cursor, survey_id)
@@ -387,14 +433,38 @@ class Catalogue:
         return self.get_recording(digest)
 
     def get_recording(self, recording_id: str) -> RecordingRecord:
-        """Return a recording by its digest; NotFoundError if there is none."""
+        """Return a recording by its digest; NotFoundError if there is none.
+
+        Parameters
+        ----------
+        recording_id : str
+            SHA-256 of the bytes, in hexadecimal.
+
+        Returns
+        -------
+        RecordingRecord
+            The recording.
+        """
         row = self._one(_RECORDING, {"id": recording_id}, f"recording {recording_id!r}")
         return recording_of(row)
 
     def list_recordings(
         self, *, after: str | None = None, limit: int = 100
     ) -> Page[RecordingRecord]:
-        """Return a part of the recordings, newest first."""
+        """Return a part of the recordings, newest first.
+
+        Parameters
+        ----------
+        after : str, optional
+            ``next`` of the part before; the first part without.
+        limit : int
+            Records in the part, 1 to 1000.
+
+        Returns
+        -------
+        Page of RecordingRecord
+            The part, and where the next begins.
+        """
         rows = self._part(_RECORDINGS_AFTER, {}, after, limit)
         return _page(rows, limit, "uploaded_at", "recording_id", recording_of)
 
@@ -442,7 +512,18 @@ class Catalogue:
         return self.get_job(job_id)
 
     def get_job(self, job_id: str) -> JobRecord:
-        """Return a job; NotFoundError if there is none."""
+        """Return a job; NotFoundError if there is none.
+
+        Parameters
+        ----------
+        job_id : str
+            The job.
+
+        Returns
+        -------
+        JobRecord
+            The job.
+        """
         return job_of(self._one(_JOB, {"id": job_id}, f"job {job_id!r}"))
 
     def list_jobs(
@@ -454,14 +535,44 @@ class Catalogue:
         after: str | None = None,
         limit: int = 100,
     ) -> Page[JobRecord]:
-        """Return a part of the jobs, newest first, of one survey, recording or status if named."""
+        """Return a part of the jobs, newest first, of one survey, recording or status if named.
+
+        Parameters
+        ----------
+        survey : str, optional
+            Only those of one survey, by id or name.
+        recording_id : str, optional
+            Only those of one recording.
+        status : JobStatus, optional
+            Only jobs that stand there.
+        after : str, optional
+            ``next`` of the part before; the first part without.
+        limit : int
+            Records in the part, 1 to 1000.
+
+        Returns
+        -------
+        Page of JobRecord
+            The part, and where the next begins.
+        """
         survey_id = None if survey is None else self.get_survey(survey).survey_id
         wanted = {"survey_id": survey_id, "recording_id": recording_id, "status": status}
         rows = self._part(_JOBS_AFTER, wanted, after, limit)
         return _page(rows, limit, "created_at", "job_id", job_of)
 
     def start_job(self, job_id: str) -> JobRecord:
-        """Begin an attempt at an accepted job; ConflictError if it stands elsewhere."""
+        """Begin an attempt at an accepted job; ConflictError if it stands elsewhere.
+
+        Parameters
+        ----------
+        job_id : str
+            The job.
+
+        Returns
+        -------
+        JobRecord
+            With status ``running`` and one more attempt.
+        """
         with self._changing(job_id, JobStatus.ACCEPTED) as cursor:
             cursor.execute(
                 "UPDATE jobs SET status = 'running', started_at = ?, attempts = attempts + 1, "
@@ -472,6 +583,15 @@ class Catalogue:
 
     def report_progress(self, job_id: str, percent: float, message: str) -> None:
         """Say how far a running job is, 0 to 100; silent about one that runs no more.
+
+        Parameters
+        ----------
+        job_id : str
+            The job.
+        percent : float
+            0 to 100; what is beyond is cut.
+        message : str
+            A sentence for people.
 
         Notes
         -----
@@ -561,7 +681,18 @@ class Catalogue:
         return self.get_job(job_id)
 
     def dismiss_job(self, job_id: str) -> JobRecord:
-        """Give up a job that has not come to its end; ConflictError if it has."""
+        """Give up a job that has not come to its end; ConflictError if it has.
+
+        Parameters
+        ----------
+        job_id : str
+            The job.
+
+        Returns
+        -------
+        JobRecord
+            With status ``dismissed``.
+        """
         with self._changing(job_id, JobStatus.ACCEPTED, JobStatus.RUNNING) as cursor:
             cursor.execute(
                 "UPDATE jobs SET status = 'dismissed', message = 'Dismissed.', finished_at = ? "
@@ -571,7 +702,20 @@ class Catalogue:
         return self.get_job(job_id)
 
     def requeue_job(self, job_id: str, message: str) -> JobRecord:
-        """Make a running job accepted again, for another attempt, and say why."""
+        """Make a running job accepted again, for another attempt, and say why.
+
+        Parameters
+        ----------
+        job_id : str
+            The job.
+        message : str
+            A sentence for people.
+
+        Returns
+        -------
+        JobRecord
+            With status ``accepted``.
+        """
         with self._changing(job_id, JobStatus.RUNNING) as cursor:
             cursor.execute(
                 "UPDATE jobs SET status = 'accepted', progress_percent = 0, message = ? "
@@ -584,6 +728,11 @@ class Catalogue:
         """Make jobs that were running accepted again and return all accepted ones, oldest first.
 
         For the start of the service: nothing can be running then.
+
+        Returns
+        -------
+        tuple of JobRecord
+            To be started, in this order.
         """
         with self._writing() as cursor:
             cursor.execute(
@@ -593,7 +742,18 @@ class Catalogue:
             return tuple(job_of(row) for row in _fetch(cursor, _JOBS_ACCEPTED, {}).to_pylist())
 
     def get_run(self, run_id: str) -> RunRecord:
-        """Return a run; NotFoundError if there is none."""
+        """Return a run; NotFoundError if there is none.
+
+        Parameters
+        ----------
+        run_id : str
+            The run.
+
+        Returns
+        -------
+        RunRecord
+            The run.
+        """
         return run_of(self._one(_RUN, {"id": run_id}, f"run {run_id!r}"))
 
     def list_runs(
@@ -605,7 +765,26 @@ class Catalogue:
         after: str | None = None,
         limit: int = 100,
     ) -> Page[RunRecord]:
-        """Return a part of the runs, newest first, of one survey, recording or job if named."""
+        """Return a part of the runs, newest first, of one survey, recording or job if named.
+
+        Parameters
+        ----------
+        survey : str, optional
+            Only those of one survey, by id or name.
+        recording_id : str, optional
+            Only those of one recording.
+        job_id : str, optional
+            Only those of one job.
+        after : str, optional
+            ``next`` of the part before; the first part without.
+        limit : int
+            Records in the part, 1 to 1000.
+
+        Returns
+        -------
+        Page of RunRecord
+            The part, and where the next begins.
+        """
         survey_id = None if survey is None else self.get_survey(survey).survey_id
         wanted = {"survey_id": survey_id, "recording_id": recording_id, "job_id": job_id}
         rows = self._part(_RUNS_AFTER, wanted, after, limit)
@@ -639,16 +818,48 @@ class Catalogue:
         return {name: _to_numpy(table.column(name)) for name in table.column_names}
 
     def rows(self, sql: str, parameters: Mapping[str, Any] | None = None) -> list[dict[str, Any]]:
-        """Run one of our own static queries like ``columns``, for a list: one mapping per row."""
+        """Run one of our own static queries like ``columns``, for a list: one mapping per row.
+
+        Parameters
+        ----------
+        sql : str
+            A SELECT with ``$name`` for its parameters; never text from people.
+        parameters : mapping, optional
+            Their values.
+
+        Returns
+        -------
+        list of dict
+            Values of Python; instants carry their zone, UTC.
+        """
         return list(self.table(sql, parameters).to_pylist())
 
     def table(self, sql: str, parameters: Mapping[str, Any] | None = None) -> pa.Table:
-        """Run one of our own static queries like ``columns``, for a file: an Arrow table."""
+        """Run one of our own static queries like ``columns``, for a file: an Arrow table.
+
+        Parameters
+        ----------
+        sql : str
+            A SELECT with ``$name`` for its parameters; never text from people.
+        parameters : mapping, optional
+            Their values.
+
+        Returns
+        -------
+        Table
+            Without decimals.
+        """
         with closing(self._connection.cursor()) as cursor:
             return _fetch(cursor, sql, parameters or {})
 
     def schema(self) -> tuple[TableInfo, ...]:
-        """Return the views and tables that people may query, with units and comments."""
+        """Return the views and tables that people may query, with units and comments.
+
+        Returns
+        -------
+        tuple of TableInfo
+            Views first.
+        """
         return tables_of(self.rows(_COLUMNS))
 
     def snapshot(self) -> Path:

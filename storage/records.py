@@ -42,7 +42,13 @@ class JobStatus(StrEnum):
 
     @property
     def is_final(self) -> bool:
-        """Whether a job that stands here never changes again."""
+        """Whether a job that stands here never changes again.
+
+        Returns
+        -------
+        bool
+            True for successful, failed and dismissed.
+        """
         return self not in (JobStatus.ACCEPTED, JobStatus.RUNNING)
 
 
@@ -255,13 +261,35 @@ class TableInfo:
 
 
 def unit_of(column: str) -> str:
-    """Return the unit that the name of a column carries, for people; empty when it carries none."""
+    """Return the unit that the name of a column carries, for people; empty when it carries none.
+
+    Parameters
+    ----------
+    column : str
+        Name of a column.
+
+    Returns
+    -------
+    str
+        The unit as it is printed.
+    """
     ending = next((end for end in _UNITS if column.endswith(f"_{end}")), None)
     return "" if ending is None else _UNITS[ending]
 
 
 def tables_of(rows: list[dict[str, Any]]) -> tuple[TableInfo, ...]:
-    """Build the description of tables and views from the rows of their columns."""
+    """Build the description of tables and views from the rows of their columns.
+
+    Parameters
+    ----------
+    rows : list of dict
+        Rows of a query.
+
+    Returns
+    -------
+    tuple of TableInfo
+        In the order of the rows.
+    """
     columns: dict[str, list[ColumnInfo]] = {}
     about = {row["table_name"]: row for row in rows}
     comments = {(row["table_name"], row["column_name"]): row["comment"] for row in rows}
@@ -287,39 +315,118 @@ def tables_of(rows: list[dict[str, Any]]) -> tuple[TableInfo, ...]:
 
 
 def survey_of(row: dict[str, Any]) -> SurveyRecord:
-    """Build a record from a row."""
+    """Build a record from a row.
+
+    Parameters
+    ----------
+    row : dict
+        A row of a query.
+
+    Returns
+    -------
+    SurveyRecord
+        The record.
+    """
     return SurveyRecord(tolerance=row.pop("tolerance_m"), **row)
 
 
 def recording_of(row: dict[str, Any]) -> RecordingRecord:
-    """Build a record from a row."""
+    """Build a record from a row.
+
+    Parameters
+    ----------
+    row : dict
+        A row of a query.
+
+    Returns
+    -------
+    RecordingRecord
+        The record.
+    """
     return RecordingRecord(**{**row, "preflight": json.loads(row["preflight"])})
 
 
 def job_of(row: dict[str, Any]) -> JobRecord:
-    """Build a record from a row."""
+    """Build a record from a row.
+
+    Parameters
+    ----------
+    row : dict
+        A row of a query.
+
+    Returns
+    -------
+    JobRecord
+        The record.
+    """
     known = {"config": json.loads(row["config"]), "status": JobStatus(row["status"])}
     return JobRecord(**{**row, **known})
 
 
 def run_of(row: dict[str, Any]) -> RunRecord:
-    """Build a record from a row."""
+    """Build a record from a row.
+
+    Parameters
+    ----------
+    row : dict
+        A row of a query.
+
+    Returns
+    -------
+    RunRecord
+        The record.
+    """
     return RunRecord(duration=row.pop("duration_s"), **{**row, "config": json.loads(row["config"])})
 
 
 def pose_of(row: Mapping[str, Any]) -> Array:
-    """Return the pose that a row of ``true_stops`` tells."""
+    """Return the pose that a row of ``true_stops`` tells.
+
+    Parameters
+    ----------
+    row : dict
+        A row of a query.
+
+    Returns
+    -------
+    (4, 4)
+        ``T_site_base`` [m].
+    """
     yaw, pitch, roll = (np.radians(row[f"{name}_deg"]) for name in ("yaw", "pitch", "roll"))
     return rigid(rot_z(yaw) @ rot_y(pitch) @ rot_x(roll), [row["x_m"], row["y_m"], row["z_m"]])
 
 
 def coordinates_of(rows: list[dict[str, Any]]) -> Array:
-    """Return the coordinates of rows, (n, 3) [m]."""
+    """Return the coordinates of rows, (n, 3) [m].
+
+    Parameters
+    ----------
+    rows : list of dict
+        Rows of a query.
+
+    Returns
+    -------
+    (n, 3)
+        In the order of the rows [m].
+    """
     return np.array([[row["x_m"], row["y_m"], row["z_m"]] for row in rows]).reshape(-1, 3)
 
 
 def marks_table(survey_id: str, marks: ControlMarks) -> pa.Table:
-    """Return marks as rows, in their order."""
+    """Return marks as rows, in their order.
+
+    Parameters
+    ----------
+    survey_id : str
+        The survey.
+    marks : ControlMarks
+        The marks.
+
+    Returns
+    -------
+    Table
+        One row for each mark.
+    """
     x, y, z = marks.p_site.T
     n = len(marks.names)
     columns = {"survey_id": [survey_id] * n, "mark": list(marks.names), "place": range(n)}
@@ -327,7 +434,20 @@ def marks_table(survey_id: str, marks: ControlMarks) -> pa.Table:
 
 
 def true_stops_table(survey_id: str, stops: tuple[StopTruth, ...]) -> pa.Table:
-    """Return true poses as rows."""
+    """Return true poses as rows.
+
+    Parameters
+    ----------
+    survey_id : str
+        The survey.
+    stops : tuple of StopTruth
+        The poses.
+
+    Returns
+    -------
+    Table
+        One row for each stop.
+    """
     rows = []
     for stop in stops:
         yaw, pitch, roll = np.degrees(yaw_pitch_roll(stop.T_site_base[:3, :3]))
@@ -341,7 +461,18 @@ def true_stops_table(survey_id: str, stops: tuple[StopTruth, ...]) -> pa.Table:
 
 
 def json_text(values: Mapping[str, Any]) -> str:
-    """Return values as JSON; InputError if they are not plain or not finite."""
+    """Return values as JSON; InputError if they are not plain or not finite.
+
+    Parameters
+    ----------
+    values : mapping
+        What is to be written.
+
+    Returns
+    -------
+    str
+        With sorted keys.
+    """
     try:
         return json.dumps(values, sort_keys=True, allow_nan=False)
     except (TypeError, ValueError) as error:
@@ -349,12 +480,29 @@ def json_text(values: Mapping[str, Any]) -> str:
 
 
 def rig_text(truth: Truth) -> str | None:
-    """Return the true rig as JSON, when known."""
+    """Return the true rig as JSON, when known.
+
+    Parameters
+    ----------
+    truth : Truth
+        The truth.
+
+    Returns
+    -------
+    str or None
+        As in a rig file.
+    """
     return None if truth.rig is None else json_text(rig_to_mapping(truth.rig))
 
 
 def check_marks(marks: ControlMarks) -> None:
-    """Refuse marks that a table cannot hold or a survey cannot use."""
+    """Refuse marks that a table cannot hold or a survey cannot use.
+
+    Parameters
+    ----------
+    marks : ControlMarks
+        The marks.
+    """
     if len(set(marks.names)) < len(marks.names) or not all(marks.names):
         raise ControlError("Marks must have names, all different.")
     if not np.isfinite(marks.p_site).all():

@@ -290,7 +290,18 @@ def _stop_rows(
 
 
 def marker_name(place: int) -> str:
-    """Return what the marker at a place among the fits is called: M01, M02, ..."""
+    """Return what the marker at a place among the fits is called: M01, M02, ...
+
+    Parameters
+    ----------
+    place : int
+        From 0.
+
+    Returns
+    -------
+    str
+        Its name within one stop and method.
+    """
     return f"M{place + 1:02d}"
 
 

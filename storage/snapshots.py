@@ -13,7 +13,15 @@ _N_KEPT = 3  # one may still be being opened while the next two are made
 
 
 class Snapshots:
-    """The copies of one database file in a folder of their own."""
+    """The copies of one database file in a folder of their own.
+
+    Parameters
+    ----------
+    path : Path
+        The database file.
+    folder : Path
+        Where the copies go; made when missing, and emptied of copies from an earlier life.
+    """
 
     def __init__(self, path: Path, folder: Path) -> None:
         self._path = path
@@ -24,7 +32,20 @@ class Snapshots:
             stale.unlink(missing_ok=True)
 
     def take(self, connection: duckdb.DuckDBPyConnection, version: int) -> Path:
-        """Return the newest copy if it has this version, else make it; the caller holds writers."""
+        """Return the newest copy if it has this version, else make it; the caller holds writers.
+
+        Parameters
+        ----------
+        connection : DuckDBPyConnection
+            The open database.
+        version : int
+            Rises with everything that a copy should show.
+
+        Returns
+        -------
+        Path
+            The copy.
+        """
         files = self._files()
         if files and version == self._version:
             return files[-1]

@@ -53,12 +53,24 @@ class Migration:
 
     @property
     def sha256(self) -> str:
-        """SHA-256 of the statements, in hexadecimal."""
+        """SHA-256 of the statements, in hexadecimal.
+
+        Returns
+        -------
+        str
+            64 digits.
+        """
         return hashlib.sha256(self.sql.encode()).hexdigest()
 
 
 def released() -> tuple[Migration, ...]:
-    """Return the migrations that come with this version, in their order."""
+    """Return the migrations that come with this version, in their order.
+
+    Returns
+    -------
+    tuple of Migration
+        At least one.
+    """
     files = (f for f in resources.files(__name__).iterdir() if f.name.endswith(".sql"))
     return tuple(
         Migration(
