@@ -162,6 +162,7 @@ class SmallMessages:
     def tables(self) -> list[Table]:
         """Decode all messages, layout by layout."""
         tables: list[Table] = []
+        self.n_broken, self.reason = 0, ""
         for parts in self._rows.values():
             rows = np.concatenate([part[0] for part in parts])
             log_times = np.concatenate([part[1] for part in parts])

@@ -11,8 +11,10 @@ from typing import Protocol
 
 import numpy as np
 
-from pipelines.values import Array, Column, Nanos, Rings
+from pipelines.values import Array, Column, Mask, Nanos, Rings
 from storage.recordings.container import Batch
+
+_FAR_NS = 86_400e9  # a day: clocks that differ differ for all, or by a mistake of decades
 
 
 class BrokenMessageError(ValueError):
@@ -99,31 +101,72 @@ class SeriesDecoder(Decoder, Protocol):
     def series(self) -> list[Series]:
         """Give the signals that the messages held."""
 
+    def notes(self) -> tuple[str, ...]:
+        """Say, after that, what could not be decoded."""
 
-def ordered(stamps_ns: Nanos, values: Array) -> tuple[Nanos, Array, int]:
-    """Sort samples by time and keep the first of equal stamps.
+
+def series_of(
+    topic: str, names: tuple[str, ...], stamps_ns: Nanos, log_times_ns: Nanos, values: Array
+) -> Series:
+    """Build a series from samples as they were recorded.
+
+    Parameters
+    ----------
+    topic : str
+        Where they come from.
+    names : tuple of str
+        What they are.
+    stamps_ns : (n,)
+        Instants in any order; where all are zero, the times of recording count.
+    log_times_ns : (n,)
+        Times of recording.
+    values : (n, k)
+        Samples; those that are not finite are left out.
+
+    Returns
+    -------
+    Series
+        In the order of time, with the first of samples of one instant.
+    """
+    notes: list[str] = []
+    if not stamps_ns.any():
+        stamps_ns = log_times_ns
+        notes.append(f"{topic} has no stamps; the times of recording are used.")
+    near = plausible(stamps_ns, log_times_ns)
+    if not near.all():
+        notes.append(far_note(topic, int((~near).sum()), "samples"))
+    usable = near & np.isfinite(values).all(axis=1)
+    stamps_ns, values = stamps_ns[usable], values[usable]
+    moved = int((stamps_ns[1:] <= stamps_ns[:-1]).sum())
+    if moved:
+        stamps_ns, first = np.unique(stamps_ns, return_index=True)
+        values = values[first]
+        notes.append(f"{moved} samples of {topic} were out of order or double.")
+    return Series(topic=topic, names=names, stamps_ns=stamps_ns, values=values, notes=tuple(notes))
+
+
+def plausible(stamps_ns: Nanos, log_times_ns: Nanos) -> Mask:
+    """Say which stamps are about as late against the times of recording as the others.
 
     Parameters
     ----------
     stamps_ns : (n,)
-        Instants in any order.
-    values : (n, k)
-        Samples.
+        Stamps of messages.
+    log_times_ns : (n,)
+        When they were recorded.
 
     Returns
     -------
-    stamps_ns : (m,)
-        Strictly increasing instants.
-    values : (m, k)
-        Their samples.
-    moved : int
-        Number of samples that were out of order or left out.
+    (n,) bool
+        False for stamps more than a day off: of a node that had no time yet, for one.
     """
-    if len(stamps_ns) < 2 or bool((np.diff(stamps_ns) > 0).all()):
-        return stamps_ns, values, 0
-    kept, first = np.unique(stamps_ns, return_index=True)
-    moved = int((np.diff(stamps_ns) <= 0).sum())
-    return kept, values[first], moved
+    late = log_times_ns.astype(np.float64) - stamps_ns.astype(np.float64)
+    return np.asarray(np.abs(late - np.median(late)) <= _FAR_NS) if len(late) else late > 0.0
+
+
+def far_note(topic: str, n: int, what: str) -> str:
+    """Return the sentence about stamps that are not plausible."""
+    return f"{n} {what} of {topic} are left out: their stamps are more than a day off."
 
 
 def broken_note(topic: str, n_broken: int, reason: str) -> tuple[str, ...]:

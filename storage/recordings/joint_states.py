@@ -4,10 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from pipelines.values import Nanos
 from storage.recordings import cdr
 from storage.recordings.container import Batch, Channel
-from storage.recordings.families import Series, broken_note, ordered
+from storage.recordings.families import Series, broken_note, series_of
 
 SCHEMA = "sensor_msgs/msg/JointState"
 DEFINITION = f"""# State of a set of torque controlled joints.
@@ -31,35 +30,26 @@ class JointStates:
         """Take some messages."""
         self._messages.add(batch)
 
+    def notes(self) -> tuple[str, ...]:
+        """Say how many messages could not be decoded."""
+        return broken_note(self._topic, self._messages.n_broken, self._messages.reason)
+
     def series(self) -> list[Series]:
         """Give one series per joint, in the order of their names."""
         tables = self._messages.tables()
-        notes = broken_note(self._topic, self._messages.n_broken, self._messages.reason)
         joints = sorted({name for table in tables for name in table.names[0]})
-        return [self._joint(joint, tables, notes) for joint in joints]
+        return [self._joint(joint, tables) for joint in joints]
 
-    def _joint(self, joint: str, tables: list[cdr.Table], notes: tuple[str, ...]) -> Series:
+    def _joint(self, joint: str, tables: list[cdr.Table]) -> Series:
         """Collect the samples of one joint from all layouts."""
         mine = [table for table in tables if joint in table.names[0]]
-        stamps = np.concatenate([_stamps(table) for table in mine])
-        angles = np.concatenate(
-            [table.columns[0][:, table.names[0].index(joint)] for table in mine]
+        return series_of(
+            self._topic,
+            (joint,),
+            np.concatenate([table.stamps_ns[:, 0] for table in mine]),
+            np.concatenate([table.log_times_ns for table in mine]),
+            np.concatenate([t.columns[0][:, [t.names[0].index(joint)]] for t in mine]),
         )
-        if not stamps.any():
-            stamps = np.concatenate([table.log_times_ns for table in mine])
-            notes = (*notes, f"{self._topic} has no stamps; the times of recording are used.")
-        finite = np.isfinite(angles)
-        stamps, values, moved = ordered(stamps[finite], angles[finite, None])
-        if moved:
-            notes = (*notes, f"{moved} samples of {self._topic} were out of order or double.")
-        return Series(
-            topic=self._topic, names=(joint,), stamps_ns=stamps, values=values, notes=notes
-        )
-
-
-def _stamps(table: cdr.Table) -> Nanos:
-    """Return the header stamps of a table."""
-    return np.asarray(table.stamps_ns[:, 0])
 
 
 def _layout(cursor: cdr.Cursor) -> cdr.Layout:

@@ -6,7 +6,7 @@ import numpy as np
 
 from storage.recordings import cdr
 from storage.recordings.container import Batch, Channel
-from storage.recordings.families import Series, broken_note, ordered
+from storage.recordings.families import Series, broken_note, series_of
 
 SCHEMA = "sensor_msgs/msg/Imu"
 DEFINITION = f"""# Orientation, angular velocity [rad/s] and linear acceleration [m/s^2] of an IMU.
@@ -34,31 +34,31 @@ class Orientations:
         """Take some messages."""
         self._messages.add(batch)
 
+    def notes(self) -> tuple[str, ...]:
+        """Say how many messages could not be decoded."""
+        return broken_note(self._topic, self._messages.n_broken, self._messages.reason)
+
     def series(self) -> list[Series]:
         """Give one series per frame; none when the device tells no orientation."""
         tables = self._messages.tables()
-        notes = broken_note(self._topic, self._messages.n_broken, self._messages.reason)
         frames = sorted({table.names[0] for table in tables})
-        found = (
-            self._frame(frame, [t for t in tables if t.names[0] == frame], notes)
-            for frame in frames
-        )
+        found = (self._frame(frame, [t for t in tables if t.names[0] == frame]) for frame in frames)
         return [series for series in found if len(series.stamps_ns)]
 
-    def _frame(
-        self, frame: tuple[str, ...], tables: list[cdr.Table], notes: tuple[str, ...]
-    ) -> Series:
+    def _frame(self, frame: tuple[str, ...], tables: list[cdr.Table]) -> Series:
         """Collect the orientations of one frame."""
-        stamps = np.concatenate([table.stamps_ns[:, 0] for table in tables])
         quaternions = np.concatenate([table.columns[0] for table in tables])
         unknown = np.concatenate([table.columns[1][:, 0] == -1.0 for table in tables])
-        if not stamps.any():
-            stamps = np.concatenate([table.log_times_ns for table in tables])
-            notes = (*notes, f"{self._topic} has no stamps; the times of recording are used.")
-        norms = np.linalg.norm(quaternions, axis=1)
-        usable = (np.abs(norms - 1.0) < _UNIT) & ~unknown
-        stamps, values, _ = ordered(stamps[usable], quaternions[usable] / norms[usable, None])
-        return Series(topic=self._topic, names=frame, stamps_ns=stamps, values=values, notes=notes)
+        with np.errstate(over="ignore", invalid="ignore"):
+            norms = np.linalg.norm(quaternions, axis=1)
+        quaternions[~(np.abs(norms - 1.0) < _UNIT) | unknown] = np.nan
+        return series_of(
+            self._topic,
+            frame,
+            np.concatenate([table.stamps_ns[:, 0] for table in tables]),
+            np.concatenate([table.log_times_ns for table in tables]),
+            quaternions / norms[:, None],
+        )
 
 
 def _layout(cursor: cdr.Cursor) -> cdr.Layout:

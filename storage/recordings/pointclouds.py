@@ -15,7 +15,13 @@ from numpy.typing import NDArray
 from pipelines.values import RING_UNKNOWN, Nanos
 from storage.recordings import cdr
 from storage.recordings.container import Batch, Channel, Octets
-from storage.recordings.families import BrokenMessageError, Returns, broken_note
+from storage.recordings.families import (
+    BrokenMessageError,
+    Returns,
+    broken_note,
+    far_note,
+    plausible,
+)
 from storage.recordings.shot_times import SHOTS_MIN, shot_times
 
 SCHEMA = "sensor_msgs/msg/PointCloud2"
@@ -243,8 +249,9 @@ class PointClouds:
 
     def returns(self) -> Returns:
         """Give all returns, in the order of their instants."""
-        n = self._n
         notes = [*broken_note(self._topic, self._n_broken, self._reason)]
+        self._drop_far(notes)
+        n = self._n
         messages_ns = self._message_stamps(notes)
         has_times = self._has_times(notes, messages_ns)
         if self._layout.named(_INTENSITIES) is None:
@@ -268,6 +275,24 @@ class PointClouds:
             message_stamps_ns=np.sort(messages_ns),
             notes=tuple(notes),
         )
+
+    def _drop_far(self, notes: list[str]) -> None:
+        """Leave out messages whose stamps cannot be."""
+        kept = self._messages
+        log_times = np.array(kept.log_times_ns, np.int64)
+        near = plausible(np.array(kept.stamps_ns, np.int64), log_times)
+        if near.all():
+            return
+        notes.append(far_note(self._topic, int((~near).sum()), "messages"))
+        counts = self._counts()
+        rows = np.repeat(near, counts)
+        for name in ("_p", "_intensities", "_rings", "_stamps"):
+            setattr(self, name, getattr(self, name)[: self._n][rows])
+        self._n = int(rows.sum())
+        kept.starts = [0, *np.cumsum(counts[near])[:-1].tolist()]
+        for name in ("stamps_ns", "log_times_ns", "spans_ns", "has_times"):
+            column = getattr(kept, name)
+            setattr(kept, name, [one for one, is_near in zip(column, near, strict=True) if is_near])
 
     def _message_stamps(self, notes: list[str]) -> Nanos:
         """Return the stamp of each message; without any, put the times of recording instead."""

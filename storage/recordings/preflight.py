@@ -30,6 +30,8 @@ _GAP_WEAK = 0.2 / 15.0  # [rad]: a sphere of 0.2 m at 15 m is as wide
 _SKEW_WEAK = 1.0  # [s]; recorders are late by some tenths
 _TURN_WEAK = np.pi  # half a turn shows the whole scene to a tilted LiDAR
 _MOVES = np.radians(0.1)  # per second; a gimbal at rest turns less
+_SPIN_MIN, _SPIN_MAX = 1.0, 1e3  # [rad/s] a VLP-16 turns at 31 to 126
+_STOP_MAX = 3600.0  # [s]; scan lines of longer stops are not counted
 _CROSSING_MIN = 1e-6  # a laser whose plane is nearer to the horizontal never crosses the horizon
 
 
@@ -219,7 +221,6 @@ def _refused(report: Preflight, error: InputError) -> Preflight:
 
 def _described(report: Preflight, log: ScanLog) -> Preflight:
     """Return the report with what the log itself shows."""
-    stamps = log.stamps_lidar_ns
     spin = _spin(log)
     return replace(
         report,
@@ -228,7 +229,7 @@ def _described(report: Preflight, log: ScanLog) -> Preflight:
         has_shot_times=log.has_shot_times,
         has_orientation=len(log.quaternions_imu) > 0,
         rig=log.rig.name if log.rig else "",
-        duration_s=float(stamps[-1] - stamps[0]) * 1e-9,
+        duration_s=_lasts(log),
         gimbal_speed_deg_per_s=_gimbal_speed_deg(log),
         lidar_speed_rpm=None if spin is None else abs(spin[0]) * 60.0 / (2.0 * np.pi),
     )
@@ -369,6 +370,11 @@ def _wrapped(angles: Array) -> Array:
     return np.asarray((angles + np.pi) % (2.0 * np.pi) - np.pi)
 
 
+def _lasts(log: ScanLog) -> float:
+    """Return the time from the first return to the last [s]."""
+    return float(log.stamps_lidar_ns[-1] - log.stamps_lidar_ns[0]) * 1e-9
+
+
 def _horizon_gap(log: ScanLog, rig: Rig) -> float | None:
     """Return the largest angle along the base's horizon that no scan line crosses [rad].
 
@@ -376,7 +382,7 @@ def _horizon_gap(log: ScanLog, rig: Rig) -> float | None:
     the head; it crosses the horizon where the last row of R makes that zero, twice a revolution.
     """
     spin = _spin(log)
-    if spin is None:
+    if spin is None or not _SPIN_MIN < abs(spin[0]) < _SPIN_MAX or _lasts(log) > _STOP_MAX:
         return None
     speed, azimuth = spin
     R = rig.T_head_lidar[:3, :3]
@@ -392,7 +398,7 @@ def _horizon_gap(log: ScanLog, rig: Rig) -> float | None:
             ]
             period = 2.0 * np.pi / abs(speed)
             first = ((a - azimuth) / speed) % period - period
-            times = np.arange(first, float(stamps[-1] - stamps[0]) * 1e-9 + period, period)
+            times = np.arange(first, _lasts(log) + period, period)
             instants = stamps[0] + np.rint(times * 1e9).astype(np.int64)
             instants = instants[(instants >= start) & (instants <= end)]
             angles = np.interp(

@@ -102,6 +102,11 @@ class Decoders:
         if decoder is not None:
             decoder.add(batch)
 
+    def all_notes(self) -> tuple[str, ...]:
+        """Say what was left out: whole channels, and messages of signals."""
+        signals = (self.joints, self.frames, self.ahrs)
+        return (*self.notes, *(n for role in signals for one in role.values() for n in one.notes()))
+
     def _find(self, channel: Channel) -> LidarDecoder | SeriesDecoder | None:
         """Make the decoder of a channel, or take that of its topic."""
         key = (channel.encoding, channel.schema)
@@ -231,7 +236,14 @@ def assemble(decoders: Decoders, found: dict[str, str], choice: Choice, origin: 
         gimbal = _angle_of_ahrs(imu, rig, joints, found)
     _require_overlap(returns, gimbal)
     imu_notes = imu.notes if imu else ()
-    notes = (*decoders.notes, *lidar_notes, *returns.notes, *gimbal.notes, *imu_notes, *rig_notes)
+    notes = (
+        *decoders.all_notes(),
+        *lidar_notes,
+        *returns.notes,
+        *gimbal.notes,
+        *imu_notes,
+        *rig_notes,
+    )
     return ScanLog(
         p_lidar=returns.p_lidar,
         intensities=returns.intensities,

@@ -6,7 +6,7 @@ import numpy as np
 
 from storage.recordings import cdr
 from storage.recordings.container import Batch, Channel
-from storage.recordings.families import Series, broken_note, ordered
+from storage.recordings.families import Series, broken_note, series_of
 
 SCHEMA = "tf2_msgs/msg/TFMessage"
 DEFINITION = f"""geometry_msgs/TransformStamped[] transforms
@@ -36,16 +36,17 @@ class Transforms:
         """Take some messages."""
         self._messages.add(batch)
 
+    def notes(self) -> tuple[str, ...]:
+        """Say how many messages could not be decoded."""
+        return broken_note(self._topic, self._messages.n_broken, self._messages.reason)
+
     def series(self) -> list[Series]:
         """Give one series per pair of parent and child."""
         tables = self._messages.tables()
-        notes = broken_note(self._topic, self._messages.n_broken, self._messages.reason)
         pairs = list(dict.fromkeys(pair for table in tables for pair in table.names))
-        return [self._pair(pair, tables, notes) for pair in pairs]
+        return [self._pair(pair, tables) for pair in pairs]
 
-    def _pair(
-        self, pair: tuple[str, ...], tables: list[cdr.Table], notes: tuple[str, ...]
-    ) -> Series:
+    def _pair(self, pair: tuple[str, ...], tables: list[cdr.Table]) -> Series:
         """Collect the samples of one transform."""
         places = [
             (table, place)
@@ -53,13 +54,13 @@ class Transforms:
             for place, names in enumerate(table.names)
             if names == pair
         ]
-        stamps = np.concatenate([table.stamps_ns[:, place] for table, place in places])
-        values = np.concatenate([table.columns[place] for table, place in places])
-        if not stamps.any():
-            stamps = np.concatenate([table.log_times_ns for table, _ in places])
-        finite = np.isfinite(values).all(axis=1)
-        stamps, values, _ = ordered(stamps[finite], values[finite])
-        return Series(topic=self._topic, names=pair, stamps_ns=stamps, values=values, notes=notes)
+        return series_of(
+            self._topic,
+            pair,
+            np.concatenate([table.stamps_ns[:, place] for table, place in places]),
+            np.concatenate([table.log_times_ns for table, _ in places]),
+            np.concatenate([table.columns[place] for table, place in places]),
+        )
 
 
 def _layout(cursor: cdr.Cursor) -> cdr.Layout:
