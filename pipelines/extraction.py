@@ -36,6 +36,8 @@ _STRANGE = 0.3  # share of the returns inside the outline that may be off the ba
 _SIGMAS = 3.5  # standard deviations at which a shape is refused
 _RADIUS_SLACK = 0.12  # of the radius: less is no reason to refuse, the fit judges it
 _N_SHAPELY = 12  # returns that show the width of what they lie on
+_N_FACE = 256  # cells along a face of the cube of directions: 0.45 deg
+_SHAPE_SURE = 0.05  # of the radius: a radius known that well tells a ball from a stone by itself
 _REACH = 4.5  # radii about a seed whose returns decide whether a ball stands free there
 
 
@@ -76,6 +78,7 @@ def extract(
     table = _look_at_all(cloud.p_base, patches, seeds, _cells_of(seeds, grid), ball)
     looks = _distinct([_Look(*row) for row in table.tolist()], config, marker_radius)
     verdicts = [_verdict(look, config, marker_radius) for look in looks]
+    verdicts = _grounded(cloud.p_base, looks, verdicts, ball)
     good = [look for look, reason in zip(looks, verdicts, strict=True) if not reason]
     bad = [(look, reason) for look, reason in zip(looks, verdicts, strict=True) if reason]
     return MarkerCandidates(
@@ -191,7 +194,7 @@ def _slide(values: Column, window: int, sign: float) -> Column:
 def _opened(lowest: Column, window: int) -> Column:
     """Return the morphological opening of the lowest points; infinite where nothing is near."""
     eroded = _slide(lowest, window, 1.0)
-    return -_slide(eroded, window, -1.0)
+    return np.asarray(-_slide(eroded, window, -1.0))
 
 
 @numba.njit(cache=True, nogil=True)
@@ -550,8 +553,8 @@ def _shape(seen: Array, radius: float) -> tuple[Array, Array]:
     Derivatives, (n, 6): centre across, up and along the beam, radius, and the missing shares of the
     curvature across and along the vertical. A beam that misses is expected at the outline.
     """
-    residuals = np.empty(len(seen))
-    J = np.zeros((len(seen), 6))
+    residuals: Array = np.empty(len(seen))
+    J: Array = np.zeros((len(seen), 6))
     for i in range(len(seen)):
         x, y, depth = seen[i, 0], seen[i, 1], seen[i, 2]
         h2 = radius * radius - x * x - y * y
@@ -578,7 +581,7 @@ def _solve(J: Array, residuals: Array, weights: Array, prior: Array) -> tuple[Ar
             g[a] += weights[i] * J[i, a] * residuals[i]
             for b in range(k):
                 N[a, b] += weights[i] * J[i, a] * J[i, b]
-    inverse = np.linalg.inv(N)
+    inverse: Array = np.linalg.inv(N)
     return inverse @ g, inverse
 
 
@@ -603,7 +606,7 @@ def _scatter(seen: Array, residuals: Array, radius: float) -> float:
     )
     if np.sum(is_inside) < 3:
         return np.inf
-    return 1.4826 * np.median(np.abs(residuals[is_inside]))
+    return float(1.4826 * np.median(np.abs(residuals[is_inside])))
 
 
 @numba.njit(cache=True, nogil=True)
@@ -753,6 +756,85 @@ def _verdict(look: _Look, config: ExtractionConfig, radius: float) -> str:
         ),
     )
     return next((reason for is_so, reason in tests if is_so), "")
+
+
+@numba.njit(cache=True, nogil=True)
+def _direction_cell(x: float, y: float, z: float) -> int:
+    """Return the cell of a direction on a cube of ``_N_FACE`` squared cells a face."""
+    ax, ay, az = abs(x), abs(y), abs(z)
+    if ax >= ay and ax >= az:
+        face, first, second, largest = int(x > 0.0), y, z, ax
+    elif ay >= az:
+        face, first, second, largest = 2 + int(y > 0.0), x, z, ay
+    else:
+        face, first, second, largest = 4 + int(z > 0.0), x, y, az
+    scale = 0.4999 * _N_FACE / max(largest, 1e-9)
+    row, column = int(first * scale + 0.5 * _N_FACE), int(second * scale + 0.5 * _N_FACE)
+    return (face * _N_FACE + row) * _N_FACE + column
+
+
+@numba.njit(cache=True, nogil=True)
+def _in_directions(p_base: Column, centres: Array, up: Array, reach: float) -> Column:
+    """Return the points, at whatever depth, whose beams may pass some centres within a reach."""
+    is_wanted = np.zeros(6 * _N_FACE * _N_FACE, np.bool_)
+    n_steps = 2 + int(1.5 * reach * _N_FACE / np.sqrt(np.min(np.sum(centres**2, axis=1)) + 1e-9))
+    for k in range(len(centres)):
+        c = centres[k]
+        v_across = np.cross(up, c)
+        v_across *= reach / (np.sqrt(np.sum(v_across**2)) + 1e-12)
+        for i in range(-n_steps, n_steps + 1):
+            for j in range(-n_steps, n_steps + 1):
+                q = c + (i / n_steps) * v_across + (j / n_steps) * reach * up
+                is_wanted[_direction_cell(q[0], q[1], q[2])] = True
+    rows = np.empty(len(p_base), np.int32)
+    n_rows = 0
+    for i in range(len(p_base)):
+        if is_wanted[_direction_cell(p_base[i, 0], p_base[i, 1], p_base[i, 2])]:
+            rows[n_rows] = i
+            n_rows += 1
+    return p_base[rows[:n_rows]]
+
+
+def _beneath(points: Array, look: _Look, ball: _Ball) -> tuple[int, int]:
+    """Count the returns below a group beside a pole's place: those past it, and the others."""
+    c, radius = look.p_base, ball.radius
+    distance = float(np.linalg.norm(c))
+    blur = 0.5 * ball.divergence * distance
+    reach = 2.8 * radius + blur
+    cosines = points @ c / (distance * np.linalg.norm(points, axis=1))
+    near = points[cosines > np.cos(np.arctan(reach / distance))]
+    seen, _, _ = _view(near, c, ball.up)
+    across, along, depth = np.abs(seen[:, 0]), seen[:, 1], seen[:, 2]
+    is_below = (along < -0.3 * radius) & (across > 0.6 * radius + blur)
+    is_below &= np.hypot(across, along) > 1.2 * radius + blur
+    n_past = int(np.sum(is_below & (depth > 1.5 * radius)))
+    return n_past, int(is_below.sum()) - n_past
+
+
+def _grounded(p_base: Column, looks: list[_Look], verdicts: list[str], ball: _Ball) -> list[str]:
+    """Refuse what rests on the ground: beams below a ball on a pole go on past it.
+
+    A group that shows its shape well may have its lower half hidden by something nearer.
+    """
+    open_cases = [look for look, reason in zip(looks, verdicts, strict=True) if not reason]
+    if not open_cases:
+        return verdicts
+    centres = np.array([look.p_base for look in open_cases])
+    points = _in_directions(p_base, centres, ball.up, 3.0 * ball.radius + 0.1).astype(np.float64)
+    return [
+        reason or _resting(points, look, ball) for look, reason in zip(looks, verdicts, strict=True)
+    ]
+
+
+def _resting(points: Array, look: _Look, ball: _Ball) -> str:
+    """Return why a group seems to rest on the ground; empty if it does not."""
+    n_past, n_short = _beneath(points, look, ball)
+    if look.sigma_radius < _SHAPE_SURE * ball.radius or n_short <= 1 + n_past:
+        return ""
+    return (
+        f"It rests on the ground: of {n_past + n_short} beams that pass below it beside a pole's "
+        f"place, {n_short} end at its distance or nearer."
+    )
 
 
 def _score(look: _Look, config: ExtractionConfig, radius: float) -> float:

@@ -33,7 +33,7 @@ NAME = "along_beam"
 
 # Range noise of a VLP-16 by reflectivity, from recorded packets [m]: a prior, for the ratio between
 # dark and bright; its size is estimated from the stop.
-_REFLECTIVITIES = np.array([1.0, 5.0, 15.0, 40.0, 100.0])
+_REFLECTIVITIES = np.array([5.0, 15.0, 40.0, 100.0])  # limits between the classes
 _SIGMAS = np.array([0.0137, 0.0107, 0.0089, 0.0067, 0.0064])
 _FACTOR_MIN = 0.08  # of the prior noise: 2 mm quantisation alone gives as much
 _FACTOR_START = 3.0  # the largest noise that a VLP-16 shows, 25 mm
@@ -190,7 +190,7 @@ def _gather(
         beams=table,
         rows=rows,
         which=which,
-        sigmas=np.interp(table.intensities, _REFLECTIVITIES, _SIGMAS),
+        sigmas=_SIGMAS[np.digitize(table.intensities, _REFLECTIVITIES)],
         lasers=places.astype(np.intp),
         sigma_biases=sigma,
         up=levelling_rotation(cloud.levelling)[2],
@@ -244,25 +244,42 @@ def _factor(scaled: Array, weights: Array, n_unknowns: int, dof_prior: float) ->
 
 
 class _Normals(NamedTuple):
-    """Normal equations: H, G, D by centre and by laser, and their right-hand sides g, d."""
+    """Normal equations, in units of the prior noise.
 
-    H: Array
-    G: Array
-    D: Array
-    g: Array
-    d: Array
+    Attributes
+    ----------
+    centres : (m, 3, 3)
+        Of each centre.
+    mixed : (m, 3, k)
+        Between each centre and each laser's bias.
+    biases : (k,)
+        Of the biases, which are diagonal.
+    pull_centres : (m, 3)
+        Right-hand sides of the centres.
+    pull_biases : (k,)
+        Right-hand sides of the biases.
+    """
+
+    centres: Array
+    mixed: Array
+    biases: Array
+    pull_centres: Array
+    pull_biases: Array
 
 
-def _normals(shots: _Shots, J: Array, estimate: _Estimate, n_markers: int) -> _Normals:
+def _normals(shots: _Shots, estimate: _Estimate) -> _Normals:
     """Sum the normal equations of centres and biases."""
-    k, residuals = len(shots.sigma_biases), estimate.residuals
-    W = estimate.weights / estimate.sigmas**2
-    pair = shots.which * k + shots.lasers
-    H = _summed(W[:, None, None] * J[:, :, None] * J[:, None, :], shots.which, n_markers)
-    G = _summed(W[:, None] * J, pair, n_markers * k).reshape(n_markers, k, -1)
-    g = _summed((W * residuals)[:, None] * J, shots.which, n_markers)
-    D = np.bincount(shots.lasers, W, k)
-    return _Normals(H, G.transpose(0, 2, 1), D, g, np.bincount(shots.lasers, W * residuals, k))
+    m, k = len(estimate.state.centres), len(shots.sigma_biases)
+    J, residuals = estimate.prediction.J[:, :3], estimate.residuals
+    weights = estimate.weights / estimate.sigmas**2
+    mixed = _summed(weights[:, None] * J, shots.which * k + shots.lasers, m * k)
+    return _Normals(
+        centres=_summed(weights[:, None, None] * J[:, :, None] * J[:, None, :], shots.which, m),
+        mixed=mixed.reshape(m, k, 3).transpose(0, 2, 1),
+        biases=_summed(weights, shots.lasers, k),
+        pull_centres=_summed((weights * residuals)[:, None] * J, shots.which, m),
+        pull_biases=_summed(weights * residuals, shots.lasers, k),
+    )
 
 
 def _stepped(state: _State, N: _Normals, prior: Array, radius: float) -> _State:
@@ -272,25 +289,25 @@ def _stepped(state: _State, N: _Normals, prior: Array, radius: float) -> _State:
     prior of a metre on each centre keeps the equations solvable and is not felt otherwise.
     """
     variance = state.factor**2
-    H_inv = np.linalg.inv(N.H + variance * np.eye(3))
+    inverse = np.linalg.inv(N.centres + variance * np.eye(3))
     spread2 = np.maximum(state.spread, _SPREAD_MIN) ** 2
-    HG = H_inv @ N.G
-    S = np.diag(N.D + variance / spread2) - np.einsum("mik,mij->kj", N.G, HG)
-    S_inv = np.linalg.inv(S)
-    pull = N.d - variance * state.biases / spread2 - np.einsum("mik,mi->k", HG, N.g)
-    d_biases = S_inv @ pull * state.has_biases
-    d_centres = np.einsum("mij,mj->mi", H_inv, N.g - N.G @ d_biases)
+    by_bias = inverse @ N.mixed
+    reduced = np.diag(N.biases + variance / spread2)
+    cov_biases = np.linalg.inv(reduced - np.einsum("mik,mij->kj", N.mixed, by_bias))
+    pull = N.pull_biases - np.einsum("mik,mi->k", by_bias, N.pull_centres)
+    d_biases = cov_biases @ (pull - variance * state.biases / spread2) * state.has_biases
+    d_centres = np.einsum("mij,mj->mi", inverse, N.pull_centres - N.mixed @ d_biases)
     lengths = np.linalg.norm(d_centres, axis=1, keepdims=True)
     d_centres *= np.minimum(1.0, _STEP_MAX * radius / np.maximum(lengths, 1e-12))
     biases = state.biases + d_biases
-    known2 = (biases**2 + variance * np.diag(S_inv)).sum() + _DOF_BIAS * np.mean(prior**2)
+    known2 = (biases**2 + variance * np.diag(cov_biases)).sum() + _DOF_BIAS * np.mean(prior**2)
     spread = prior * np.sqrt(known2 / (_DOF_BIAS + len(prior)) / np.mean(prior**2))
     return state._replace(
         centres=state.centres + d_centres,
         biases=biases,
         spread=spread if state.has_biases else prior,
-        cov_noise=_EFFICIENCY * H_inv,
-        cov_biases=HG @ S_inv @ HG.transpose(0, 2, 1),
+        cov_noise=np.asarray(_EFFICIENCY * inverse, dtype=np.float64),
+        cov_biases=by_bias @ cov_biases @ by_bias.transpose(0, 2, 1),
     )
 
 
@@ -315,8 +332,7 @@ def _estimate(shots: _Shots, rough: Array, config: FittingConfig, radius: float)
             is_in = _in_play(shots, prediction, radius)
         estimate = _weighed(shots, state, prediction, is_in, config)
         state = estimate.state._replace(has_biases=step >= _N_STEPS_GATED)
-        N = _normals(shots, prediction.J[:, :3], estimate, len(rough))
-        state = _stepped(state, N, shots.sigma_biases, radius)
+        state = _stepped(state, _normals(shots, estimate), shots.sigma_biases, radius)
     prediction = predict(shots.beams, state.centres, radii, shots.which)
     return _weighed(shots, state, prediction, is_in, config)
 
@@ -343,21 +359,19 @@ def _free_radii(shots: _Shots, estimate: _Estimate, radius: float) -> tuple[Arra
     """Return radii estimated together with the centres, and their sigmas; NaN if undetermined."""
     n = len(estimate.state.centres)
     centres, radii = estimate.state.centres, np.full(n, radius)
-    W = estimate.weights / estimate.sigmas**2
+    weights = estimate.weights / estimate.sigmas**2
     ranges = shots.beams.ranges - estimate.state.biases[shots.lasers]
-    N_inv = np.zeros((n, 4, 4))
+    inverse: Array = np.zeros((n, 4, 4))
     for _ in range(_N_STEPS_FREE):
         prediction = predict(shots.beams, centres, radii, shots.which)
-        J = prediction.J
-        N = _summed(W[:, None, None] * J[:, :, None] * J[:, None, :], shots.which, n)
-        g = _summed((W * (ranges - prediction.ranges))[:, None] * J, shots.which, n)
-        N_inv = np.linalg.inv(N + estimate.state.factor**2 * np.eye(4))
-        step = np.einsum("mij,mj->mi", N_inv, g)
+        J, residuals = prediction.J, ranges - prediction.ranges
+        N = _summed(weights[:, None, None] * J[:, :, None] * J[:, None, :], shots.which, n)
+        pull = _summed((weights * residuals)[:, None] * J, shots.which, n)
+        inverse = np.asarray(np.linalg.inv(N + estimate.state.factor**2 * np.eye(4)))
+        step = np.einsum("mij,mj->mi", inverse, pull)
         centres = centres + np.clip(step[:, :3], -_STEP_MAX * radius, _STEP_MAX * radius)
-        radii = np.clip(
-            radii + np.clip(step[:, 3], -0.25 * radii, 0.25 * radii), 0.2 * radius, None
-        )
-    sigmas = estimate.state.factor * np.sqrt(_EFFICIENCY * N_inv[:, 3, 3])
+        radii = radii + np.clip(step[:, 3], -_STEP_MAX * radii, _STEP_MAX * radii)
+    sigmas = estimate.state.factor * np.sqrt(_EFFICIENCY * inverse[:, 3, 3])
     is_known = (sigmas < 0.5 * radius) & (radii < 5.0 * radius)
     return np.where(is_known, radii, np.nan), np.where(is_known, sigmas, np.nan)
 
@@ -377,7 +391,7 @@ def _covariance(estimate: _Estimate, k: int, own: float, n_used: int) -> Array:
     state = estimate.state
     variance = (_DOF_STOP * state.factor**2 + n_used * own**2) / (_DOF_STOP + n_used)
     few = 1.0 + _FEW / n_used
-    return few * variance * state.cov_noise[k] + state.factor**2 * state.cov_biases[k]
+    return np.asarray(few * variance * state.cov_noise[k] + state.factor**2 * state.cov_biases[k])
 
 
 def _weakness(fit: MarkerFit, factor: float) -> str:
@@ -405,8 +419,8 @@ def _refusal(estimate: _Estimate, k: int, n_used: int, moved: float, radius: flo
     """Return why a candidate has no centre; empty if it has one."""
     if n_used < _N_MIN:
         return (
-            f"Only {n_used} returns lie on a sphere of radius {1e3 * radius:.0f} mm; a centre needs "
-            f"at least {_N_MIN}."
+            f"Only {n_used} returns lie on a sphere of radius {1e3 * radius:.0f} mm; a centre "
+            f"needs at least {_N_MIN}."
         )
     worst = float(np.sqrt(np.linalg.eigvalsh(estimate.state.cov_noise[k])[-1]))
     if estimate.state.factor * worst > radius:

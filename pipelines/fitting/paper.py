@@ -107,7 +107,8 @@ def _hemisphere(v_facing: Array, radius: float) -> Array:
     first = np.cross(w, np.eye(3)[np.argmin(np.abs(w))])
     first /= np.linalg.norm(first)
     axes = np.stack([first, np.cross(w, first), w])
-    return radius * np.column_stack([rho * np.cos(phi), rho * np.sin(phi), z]) @ axes
+    p = np.column_stack([rho * np.cos(phi), rho * np.sin(phi), z]) @ axes
+    return np.asarray(radius * p)
 
 
 def _registered(model: Array, points: Array) -> Array:
