@@ -1,10 +1,4 @@
-"""The one owner of the DuckDB file: typed put and get, jobs, and snapshots for everybody else.
-
-While a catalogue is open no other process can open its file, not even for reading (DuckDB allows
-one owner), so workers return Arrow tables and people query snapshots (``storage.sandbox``). Every
-read has a cursor of its own and may run in any thread; writes take turns. The file is never opened
-and closed again by this process: that would drop the lock that DuckDB holds on it.
-"""
+"""What is kept of surveys, recordings, jobs and runs: typed put and get on the one database."""
 
 from __future__ import annotations
 
@@ -12,23 +6,20 @@ import base64
 import json
 import re
 import secrets
-import threading
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import closing, contextmanager, suppress
+from contextlib import contextmanager
 from datetime import UTC, datetime
-from pathlib import Path
-from types import TracebackType
-from typing import Any, Self, TypeVar
+from typing import Any, TypeVar
 
 import duckdb
 import numpy as np
 import pyarrow as pa
-from numpy.typing import NDArray
 
 from pipelines.errors import ConflictError, InputError, NotFoundError
 from pipelines.rigs import rig_from_mapping
 from pipelines.values import ControlMarks, StopTruth, Truth
-from storage import migrations, results
+from storage import results
+from storage.database import Database, execute_on, fetch
 from storage.records import (
     JobRecord,
     JobStatus,
@@ -36,7 +27,6 @@ from storage.records import (
     RecordingRecord,
     RunRecord,
     SurveyRecord,
-    TableInfo,
     check_marks,
     coordinates_of,
     job_of,
@@ -47,16 +37,12 @@ from storage.records import (
     rig_text,
     run_of,
     survey_of,
-    tables_of,
     true_stops_table,
 )
-from storage.snapshots import Snapshots
 
 _Record = TypeVar("_Record")
 
-_N_ROWS_MAX = 200_000  # of one of our own queries; a page that needs more should aggregate
 _PAGE_MAX = 1000  # records in one part of a list
-_N_SNAPSHOTS = 3  # kept: one may still be being opened while the next two are made
 _DIGEST = re.compile(r"[0-9a-f]{64}")
 _VERDICTS = ("ok", "weak", "refused")
 
@@ -111,15 +97,6 @@ _CONTROL = "SELECT * FROM control_marks WHERE survey_id = $id ORDER BY place"
 _TRUE_MARKS = "SELECT * FROM true_marks WHERE survey_id = $id ORDER BY place"
 _TRUE_STOPS = "SELECT * FROM true_stops WHERE survey_id = $id ORDER BY stop"
 _TRUE_WORLD = "SELECT rig, about FROM true_worlds WHERE survey_id = $id"
-_COLUMNS = """
-SELECT c.table_name, c.column_name, c.data_type, c.comment, t.kind, t.comment AS table_comment
-FROM duckdb_columns() AS c JOIN (
-    SELECT table_name, 'table' AS kind, comment FROM duckdb_tables() WHERE NOT internal
-    UNION ALL
-    SELECT view_name, 'view', comment FROM duckdb_views() WHERE NOT internal
-) AS t USING (table_name)
-WHERE NOT c.internal ORDER BY t.kind DESC, c.table_name, c.column_index
-"""
 _RESULTS_OF_SURVEY = {
     "stops": "SELECT x.* FROM stops AS x JOIN runs USING (run_id) WHERE survey_id = $id",
     "marker_fits": (
@@ -168,55 +145,11 @@ _REFRESH = {
 }
 
 
-class Catalogue:
+class Catalogue(Database):
     """The results, the surveys that they belong to, and the jobs that made them.
 
-    Parameters
-    ----------
-    path : Path
-        The DuckDB file; it and its folder are made when missing.
-    snapshots : Path
-        Folder for the copies that others read; on the same disk, so that a copy costs little.
-    memory_limit : str
-        What DuckDB may use before it spills to disk, in its own words.
-
-    Raises
-    ------
-    ConflictError
-        If another process, or this one, has the file open.
-    SchemaConflictError
-        If another version of spheremark made the file.
-    InputError
-        If the file is not a DuckDB database.
-
-    Notes
-    -----
-    Safe to use from many threads. Once open, the database cannot reach files or the network,
-    and its configuration is locked.
+    Opened as a ``Database`` is: with the path of the file and a folder for snapshots.
     """
-
-    def __init__(self, path: Path, *, snapshots: Path, memory_limit: str = "1GB") -> None:
-        self.path = path
-        self._lock = threading.RLock()
-        self._version = 0
-        self._connection = _open(path, memory_limit)
-        self._snapshots = Snapshots(path, snapshots)
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        traceback: TracebackType | None,
-    ) -> None:
-        self.close()
-
-    def close(self) -> None:
-        """Give the file back; the catalogue cannot be used any more."""
-        with self._lock:
-            self._connection.close()
 
     # Surveys, their marks and their truth
 
@@ -245,8 +178,8 @@ class Catalogue:
         _check_name("The name of a survey", name)
         if not 0.0 < tolerance <= 1.0:
             raise InputError(f"The tolerance is {tolerance!r} m; it must be above 0 and at most 1.")
-        with self._writing() as cursor:
-            if _fetch(cursor, _SURVEY_BY_KEY, {"key": name}).num_rows:
+        with self.writing() as cursor:
+            if fetch(cursor, _SURVEY_BY_KEY, {"key": name}).num_rows:
                 raise ConflictError(f"There is already a survey called {name!r}; choose another.")
             survey_id = secrets.token_hex(8)
             cursor.execute(
@@ -310,7 +243,7 @@ class Catalogue:
         table = marks_table(survey_id, marks)
         for axis, name in enumerate(("sigma_x_m", "sigma_y_m", "sigma_z_m")):
             table = table.append_column(name, pa.array(sigmas[:, axis]))
-        with self._writing() as cursor:
+        with self.writing() as cursor:
             _insert(cursor, "control_marks", table)
             cursor.execute(
                 "DELETE FROM control_marks WHERE survey_id = ? AND NOT list_contains(?, mark)",
@@ -358,7 +291,7 @@ class Catalogue:
         """
         check_marks(truth.marks)
         survey_id = self.get_survey(survey).survey_id
-        with self._writing() as cursor:
+        with self.writing() as cursor:
             _insert(cursor, "true_marks", marks_table(survey_id, truth.marks))
             cursor.execute(
                 "DELETE FROM true_marks WHERE survey_id = ? AND NOT list_contains(?, mark)",
@@ -385,7 +318,7 @@ class Catalogue:
             Stops in the order of their names.
         """
         survey_id = self.get_survey(survey).survey_id
-        with closing(self._connection.cursor()) as cursor:
+        with self.reading() as cursor:
             return _truth(cursor, survey_id)
 
     # Recordings
@@ -428,7 +361,7 @@ class Catalogue:
                 f"verdict is one of {', '.join(_VERDICTS)}, and a size is not negative."
             )
         row = [digest, name, size_bytes, _now(), url, verdict, json_text(preflight)]
-        with self._writing() as cursor:
+        with self.writing() as cursor:
             cursor.execute("INSERT OR IGNORE INTO recordings VALUES (?, ?, ?, ?, ?, ?, ?)", row)
         return self.get_recording(digest)
 
@@ -502,7 +435,7 @@ class Catalogue:
             self.get_recording(recording_id)
         job_id = secrets.token_hex(8)
         row = [job_id, kind, survey_id, recording_id, json_text(config), _now()]
-        with self._writing() as cursor:
+        with self.writing() as cursor:
             cursor.execute(
                 "INSERT INTO jobs (job_id, kind, survey_id, recording_id, config, created_at, "
                 "status, progress_percent, message, attempts) "
@@ -597,7 +530,7 @@ class Catalogue:
         -----
         Costs a millisecond, and does not make the newest snapshot old.
         """
-        with self._writing(is_result=False) as cursor:
+        with self.writing(is_result=False) as cursor:
             cursor.execute(
                 "UPDATE jobs SET progress_percent = ?, message = ? "
                 "WHERE job_id = ? AND status = 'running'",
@@ -636,7 +569,7 @@ class Catalogue:
         taken against the truth that is known now.
         """
         _check_tables(tables)
-        with self._writing() as cursor:
+        with self.writing() as cursor:
             job = _job_in(cursor, job_id)
             if job.status is JobStatus.SUCCESSFUL:
                 return job
@@ -734,12 +667,12 @@ class Catalogue:
         tuple of JobRecord
             To be started, in this order.
         """
-        with self._writing() as cursor:
+        with self.writing() as cursor:
             cursor.execute(
                 "UPDATE jobs SET status = 'accepted', progress_percent = 0, "
                 "message = 'Taken up again after a restart.' WHERE status = 'running'"
             )
-            return tuple(job_of(row) for row in _fetch(cursor, _JOBS_ACCEPTED, {}).to_pylist())
+            return tuple(job_of(row) for row in fetch(cursor, _JOBS_ACCEPTED, {}).to_pylist())
 
     def get_run(self, run_id: str) -> RunRecord:
         """Return a run; NotFoundError if there is none.
@@ -790,114 +723,12 @@ class Catalogue:
         rows = self._part(_RUNS_AFTER, wanted, after, limit)
         return _page(rows, limit, "finished_at", "run_id", run_of)
 
-    # Our own static queries
-
-    def columns(
-        self, sql: str, parameters: Mapping[str, Any] | None = None
-    ) -> dict[str, NDArray[Any]]:
-        """Run one of our own static queries, for a figure.
-
-        Parameters
-        ----------
-        sql : str
-            A SELECT with ``$name`` for its parameters; never text from people.
-        parameters : mapping, optional
-            Their values.
-
-        Returns
-        -------
-        dict of str to array
-            Columns; NULL is NaN among numbers and None among objects.
-
-        Raises
-        ------
-        InputError
-            If there are more than 200,000 rows.
-        """
-        table = self.table(sql, parameters)
-        return {name: _to_numpy(table.column(name)) for name in table.column_names}
-
-    def rows(self, sql: str, parameters: Mapping[str, Any] | None = None) -> list[dict[str, Any]]:
-        """Run one of our own static queries like ``columns``, for a list: one mapping per row.
-
-        Parameters
-        ----------
-        sql : str
-            A SELECT with ``$name`` for its parameters; never text from people.
-        parameters : mapping, optional
-            Their values.
-
-        Returns
-        -------
-        list of dict
-            Values of Python; instants carry their zone, UTC.
-        """
-        return list(self.table(sql, parameters).to_pylist())
-
-    def table(self, sql: str, parameters: Mapping[str, Any] | None = None) -> pa.Table:
-        """Run one of our own static queries like ``columns``, for a file: an Arrow table.
-
-        Parameters
-        ----------
-        sql : str
-            A SELECT with ``$name`` for its parameters; never text from people.
-        parameters : mapping, optional
-            Their values.
-
-        Returns
-        -------
-        Table
-            Without decimals.
-        """
-        with closing(self._connection.cursor()) as cursor:
-            return _fetch(cursor, sql, parameters or {})
-
-    def schema(self) -> tuple[TableInfo, ...]:
-        """Return the views and tables that people may query, with units and comments.
-
-        Returns
-        -------
-        tuple of TableInfo
-            Views first.
-        """
-        return tables_of(self.rows(_COLUMNS))
-
-    def snapshot(self) -> Path:
-        """Return a consistent copy of the database file, as fresh as the last committed result.
-
-        Returns
-        -------
-        Path
-            A file that nobody writes to; it stays until two newer ones exist.
-
-        Notes
-        -----
-        Made only when something but progress was committed since the last one. The copy is
-        made by another process: opening and closing the file here would drop DuckDB's lock.
-        """
-        with self._lock:
-            return self._snapshots.take(self._connection, self._version)
-
     # What the verbs share
-
-    @contextmanager
-    def _writing(self, *, is_result: bool = True) -> Iterator[duckdb.DuckDBPyConnection]:
-        """Hold the write lock and a transaction."""
-        with self._lock, closing(self._connection.cursor()) as cursor:
-            cursor.execute("BEGIN")
-            try:
-                yield cursor
-                cursor.execute("COMMIT")
-            except BaseException:
-                with suppress(duckdb.Error):
-                    cursor.execute("ROLLBACK")
-                raise
-            self._version += is_result
 
     @contextmanager
     def _changing(self, job_id: str, *allowed: JobStatus) -> Iterator[duckdb.DuckDBPyConnection]:
         """Hold a transaction on a job that stands where it may be changed."""
-        with self._writing() as cursor:
+        with self.writing() as cursor:
             _require(_job_in(cursor, job_id), *allowed)
             yield cursor
 
@@ -918,97 +749,28 @@ class Catalogue:
         return self.rows(sql, {**wanted, "at": instant, "id": identifier, "n": limit + 1})
 
 
-def _open(path: Path, memory_limit: str) -> duckdb.DuckDBPyConnection:
-    """Open the file as its owner, bring its schema up to date, and shut the doors."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    connection = _connect(path, memory_limit)
-    try:
-        _require_alone(connection, path)
-        connection.execute("SET GLOBAL TimeZone = 'UTC'")
-        migrations.migrate(connection, migrations.released())
-        connection.execute("SET enable_external_access = false")
-        connection.execute("SET lock_configuration = true")
-    except BaseException:
-        connection.close()
-        raise
-    return connection
-
-
-def _require_alone(connection: duckdb.DuckDBPyConnection, path: Path) -> None:
-    """Refuse a file that this process has open: DuckDB would share it, locked doors and all."""
-    if connection.sql("SELECT current_setting('lock_configuration')").fetchall()[0][0]:
-        raise ConflictError(f"{path} is already open in this process; close that first.")
-
-
-def _connect(path: Path, memory_limit: str) -> duckdb.DuckDBPyConnection:
-    """Open the file, or say in plain words why that is not possible."""
-    config: dict[str, str | bool | int | float | list[str]] = {
-        "autoinstall_known_extensions": "false",
-        "autoload_known_extensions": "false",
-        "memory_limit": memory_limit,
-    }
-    try:
-        return duckdb.connect(str(path), config=config)
-    except duckdb.IOException as error:
-        if "lock" in str(error):
-            owner = re.search(r"PID (\d+)", str(error))
-            raise ConflictError(
-                f"{path} is in use by another process{f' ({owner[0]})' if owner else ''}. "
-                "One spheremark serves one data folder: stop the other one, or use another folder."
-            ) from error
-        raise InputError(f"{path} is not a database of spheremark: {error}") from error
-    except duckdb.ConnectionException as error:
-        raise ConflictError(f"{path} is already open in this process; close that first.") from error
-
-
-def _fetch(cursor: duckdb.DuckDBPyConnection, sql: str, parameters: Mapping[str, Any]) -> pa.Table:
-    """Run a SELECT of ours and return at most the rows that one answer may have."""
-    table = cursor.sql(sql, params=dict(parameters)).to_arrow_table()
-    if table.num_rows > _N_ROWS_MAX:
-        raise InputError(
-            f"The answer has {table.num_rows} rows; the limit is {_N_ROWS_MAX}. Narrow the filter."
-        )
-    return _without_decimals(table)
-
-
-def _without_decimals(table: pa.Table) -> pa.Table:
-    """Return a table with plain numbers; DuckDB sums whole numbers to 128 bits, a decimal here."""
-    for i, field in enumerate(table.schema):
-        if pa.types.is_decimal(field.type):
-            plain = pa.float64() if field.type.scale else pa.int64()
-            table = table.set_column(i, field.name, table.column(i).cast(plain))
-    return table
-
-
 def _insert(cursor: duckdb.DuckDBPyConnection, name: str, table: pa.Table) -> None:
     """Append an Arrow table to the table of that name."""
-    _execute_on(cursor, _INSERT[name], table)
-
-
-def _execute_on(cursor: duckdb.DuckDBPyConnection, sql: str, table: pa.Table) -> None:
-    """Run SQL that sees an Arrow table as ``incoming``."""
-    cursor.register("incoming", table)
-    cursor.execute(sql)
-    cursor.unregister("incoming")
+    execute_on(cursor, _INSERT[name], table)
 
 
 def _refresh_errors(cursor: duckdb.DuckDBPyConnection, survey_id: str) -> None:
     """Take the errors of a survey's results anew against the truth that is known now."""
     known = {
-        name: _fetch(cursor, sql, {"id": survey_id}) for name, sql in _RESULTS_OF_SURVEY.items()
+        name: fetch(cursor, sql, {"id": survey_id}) for name, sql in _RESULTS_OF_SURVEY.items()
     }
     fresh = results.with_errors(known, _truth(cursor, survey_id))
     for name, sql in _REFRESH.items():
-        _execute_on(cursor, sql, fresh[name])
+        execute_on(cursor, sql, fresh[name])
 
 
 def _truth(cursor: duckdb.DuckDBPyConnection, survey_id: str) -> Truth | None:
     """Read the truth of a survey."""
-    worlds = _fetch(cursor, _TRUE_WORLD, {"id": survey_id}).to_pylist()
+    worlds = fetch(cursor, _TRUE_WORLD, {"id": survey_id}).to_pylist()
     if not worlds:
         return None
-    marks = _fetch(cursor, _TRUE_MARKS, {"id": survey_id}).to_pylist()
-    stops = _fetch(cursor, _TRUE_STOPS, {"id": survey_id}).to_pylist()
+    marks = fetch(cursor, _TRUE_MARKS, {"id": survey_id}).to_pylist()
+    stops = fetch(cursor, _TRUE_STOPS, {"id": survey_id}).to_pylist()
     rig = worlds[0]["rig"]
     return Truth(
         marks=ControlMarks(
@@ -1043,7 +805,7 @@ def _require(job: JobRecord, *allowed: JobStatus) -> None:
 
 def _job_in(cursor: duckdb.DuckDBPyConnection, job_id: str) -> JobRecord:
     """Read a job inside a transaction."""
-    rows = _fetch(cursor, _JOB, {"id": job_id}).to_pylist()
+    rows = fetch(cursor, _JOB, {"id": job_id}).to_pylist()
     if not rows:
         raise NotFoundError(f"There is no job {job_id!r}.")
     return job_of(rows[0])
@@ -1076,13 +838,6 @@ def _read_mark(mark: str) -> tuple[datetime, str]:
         raise InputError(
             f"{mark!r} is no place in this list; pass the 'next' of the part before."
         ) from error
-
-
-def _to_numpy(column: pa.ChunkedArray) -> NDArray[Any]:
-    """Return a column as an array; NULL becomes NaN among numbers and None among objects."""
-    if pa.types.is_timestamp(column.type):
-        column = column.cast(pa.timestamp("us"))  # NumPy's instants carry no zone; ours are UTC
-    return np.asarray(column.to_numpy())
 
 
 def _now() -> datetime:

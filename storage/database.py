@@ -1,0 +1,318 @@
+"""The owner of the DuckDB file: opening, transactions, our own queries, and snapshots.
+
+While it is open no other process can open the file, not even for reading (DuckDB allows one owner),
+so workers return Arrow tables and people query snapshots (``storage.sandbox``). Every read has a
+cursor of its own and may run in any thread; writes take turns. The file is never opened and closed
+again by this process: that would drop the lock that DuckDB holds on it.
+"""
+
+from __future__ import annotations
+
+import re
+import threading
+from collections.abc import Iterator, Mapping
+from contextlib import closing, contextmanager, suppress
+from pathlib import Path
+from types import TracebackType
+from typing import Any, Self
+
+import duckdb
+import numpy as np
+import pyarrow as pa
+from numpy.typing import NDArray
+
+from pipelines.errors import ConflictError, InputError
+from storage import migrations
+from storage.records import TableInfo, tables_of
+from storage.snapshots import Snapshots
+
+_N_ROWS_MAX = 200_000  # of one of our own queries; a page that needs more should aggregate
+_COLUMNS = """
+SELECT c.table_name, c.column_name, c.data_type, c.comment, t.kind, t.comment AS table_comment
+FROM duckdb_columns() AS c JOIN (
+    SELECT table_name, 'table' AS kind, comment FROM duckdb_tables() WHERE NOT internal
+    UNION ALL
+    SELECT view_name, 'view', comment FROM duckdb_views() WHERE NOT internal
+) AS t USING (table_name)
+WHERE NOT c.internal ORDER BY t.kind DESC, c.table_name, c.column_index
+"""
+
+
+class Database:
+    """A DuckDB file and the only process that has it open.
+
+    Parameters
+    ----------
+    path : Path
+        The DuckDB file; it and its folder are made when missing.
+    snapshots : Path
+        Folder for the copies that others read; on the same disk, so that a copy costs little.
+    memory_limit : str
+        What DuckDB may use before it spills to disk, in its own words.
+
+    Raises
+    ------
+    ConflictError
+        If another process, or this one, has the file open.
+    SchemaConflictError
+        If another version of spheremark made the file.
+    InputError
+        If the file is not a DuckDB database.
+
+    Notes
+    -----
+    Safe to use from many threads. Once open, the database cannot reach files or the network,
+    and its configuration is locked.
+    """
+
+    def __init__(self, path: Path, *, snapshots: Path, memory_limit: str = "1GB") -> None:
+        self.path = path
+        self._lock = threading.RLock()
+        self._version = 0
+        self._connection = _open(path, memory_limit)
+        self._snapshots = Snapshots(path, snapshots)
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        traceback: TracebackType | None,
+    ) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Give the file back; the catalogue cannot be used any more."""
+        with self._lock:
+            self._connection.close()
+
+    def columns(
+        self, sql: str, parameters: Mapping[str, Any] | None = None
+    ) -> dict[str, NDArray[Any]]:
+        """Run one of our own static queries, for a figure.
+
+        Parameters
+        ----------
+        sql : str
+            A SELECT with ``$name`` for its parameters; never text from people.
+        parameters : mapping, optional
+            Their values.
+
+        Returns
+        -------
+        dict of str to array
+            Columns; NULL is NaN among numbers and None among objects.
+
+        Raises
+        ------
+        InputError
+            If there are more than 200,000 rows.
+        """
+        table = self.table(sql, parameters)
+        return {name: _to_numpy(table.column(name)) for name in table.column_names}
+
+    def rows(self, sql: str, parameters: Mapping[str, Any] | None = None) -> list[dict[str, Any]]:
+        """Run one of our own static queries like ``columns``, for a list: one mapping per row.
+
+        Parameters
+        ----------
+        sql : str
+            A SELECT with ``$name`` for its parameters; never text from people.
+        parameters : mapping, optional
+            Their values.
+
+        Returns
+        -------
+        list of dict
+            Values of Python; instants carry their zone, UTC.
+        """
+        return list(self.table(sql, parameters).to_pylist())
+
+    def table(self, sql: str, parameters: Mapping[str, Any] | None = None) -> pa.Table:
+        """Run one of our own static queries like ``columns``, for a file: an Arrow table.
+
+        Parameters
+        ----------
+        sql : str
+            A SELECT with ``$name`` for its parameters; never text from people.
+        parameters : mapping, optional
+            Their values.
+
+        Returns
+        -------
+        Table
+            Without decimals.
+        """
+        with self.reading() as cursor:
+            return fetch(cursor, sql, parameters or {})
+
+    def schema(self) -> tuple[TableInfo, ...]:
+        """Return the views and tables that people may query, with units and comments.
+
+        Returns
+        -------
+        tuple of TableInfo
+            Views first.
+        """
+        return tables_of(self.rows(_COLUMNS))
+
+    def snapshot(self) -> Path:
+        """Return a consistent copy of the database file, as fresh as the last committed result.
+
+        Returns
+        -------
+        Path
+            A file that nobody writes to; it stays until two newer ones exist.
+
+        Notes
+        -----
+        Made only when something but progress was committed since the last one. The copy is
+        made by another process: opening and closing the file here would drop DuckDB's lock.
+        """
+        with self._lock:
+            return self._snapshots.take(self._connection, self._version)
+
+    @contextmanager
+    def reading(self) -> Iterator[duckdb.DuckDBPyConnection]:
+        """Lend a cursor of its own, for this thread.
+
+        Yields
+        ------
+        DuckDBPyConnection
+            Closed afterwards.
+        """
+        with closing(self._connection.cursor()) as cursor:
+            yield cursor
+
+    @contextmanager
+    def writing(self, *, is_result: bool = True) -> Iterator[duckdb.DuckDBPyConnection]:
+        """Hold the write lock and a transaction: all that is done in it is done, or nothing.
+
+        Parameters
+        ----------
+        is_result : bool
+            Whether snapshots from before are old afterwards.
+
+        Yields
+        ------
+        DuckDBPyConnection
+            A cursor inside the transaction.
+        """
+        with self._lock, closing(self._connection.cursor()) as cursor:
+            cursor.execute("BEGIN")
+            try:
+                yield cursor
+                cursor.execute("COMMIT")
+            except BaseException:
+                with suppress(duckdb.Error):
+                    cursor.execute("ROLLBACK")
+                raise
+            self._version += is_result
+
+
+def _open(path: Path, memory_limit: str) -> duckdb.DuckDBPyConnection:
+    """Open the file as its owner, bring its schema up to date, and shut the doors."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    connection = _connect(path, memory_limit)
+    try:
+        _require_alone(connection, path)
+        connection.execute("SET GLOBAL TimeZone = 'UTC'")
+        migrations.migrate(connection, migrations.released())
+        connection.execute("SET enable_external_access = false")
+        connection.execute("SET lock_configuration = true")
+    except BaseException:
+        connection.close()
+        raise
+    return connection
+
+
+def _require_alone(connection: duckdb.DuckDBPyConnection, path: Path) -> None:
+    """Refuse a file that this process has open: DuckDB would share it, locked doors and all."""
+    if connection.sql("SELECT current_setting('lock_configuration')").fetchall()[0][0]:
+        raise ConflictError(f"{path} is already open in this process; close that first.")
+
+
+def _connect(path: Path, memory_limit: str) -> duckdb.DuckDBPyConnection:
+    """Open the file, or say in plain words why that is not possible."""
+    config: dict[str, str | bool | int | float | list[str]] = {
+        "autoinstall_known_extensions": "false",
+        "autoload_known_extensions": "false",
+        "memory_limit": memory_limit,
+    }
+    try:
+        return duckdb.connect(str(path), config=config)
+    except duckdb.IOException as error:
+        if "lock" in str(error):
+            owner = re.search(r"PID (\d+)", str(error))
+            raise ConflictError(
+                f"{path} is in use by another process{f' ({owner[0]})' if owner else ''}. "
+                "One spheremark serves one data folder: stop the other one, or use another folder."
+            ) from error
+        raise InputError(f"{path} is not a database of spheremark: {error}") from error
+    except duckdb.ConnectionException as error:
+        raise ConflictError(f"{path} is already open in this process; close that first.") from error
+
+
+def fetch(cursor: duckdb.DuckDBPyConnection, sql: str, parameters: Mapping[str, Any]) -> pa.Table:
+    """Run a SELECT of ours and return at most the rows that one answer may have.
+
+    Parameters
+    ----------
+    cursor : DuckDBPyConnection
+        Inside a transaction or not.
+    sql : str
+        Static text with ``$name`` for its parameters.
+    parameters : mapping
+        Their values.
+
+    Returns
+    -------
+    Table
+        Without decimals.
+
+    Raises
+    ------
+    InputError
+        If there are more rows than one answer may have.
+    """
+    table = cursor.sql(sql, params=dict(parameters)).to_arrow_table()
+    if table.num_rows > _N_ROWS_MAX:
+        raise InputError(
+            f"The answer has {table.num_rows} rows; the limit is {_N_ROWS_MAX}. Narrow the filter."
+        )
+    return _without_decimals(table)
+
+
+def _without_decimals(table: pa.Table) -> pa.Table:
+    """Return a table with plain numbers; DuckDB sums whole numbers to 128 bits, a decimal here."""
+    for i, field in enumerate(table.schema):
+        if pa.types.is_decimal(field.type):
+            plain = pa.float64() if field.type.scale else pa.int64()
+            table = table.set_column(i, field.name, table.column(i).cast(plain))
+    return table
+
+
+def execute_on(cursor: duckdb.DuckDBPyConnection, sql: str, table: pa.Table) -> None:
+    """Run SQL that sees an Arrow table as ``incoming``.
+
+    Parameters
+    ----------
+    cursor : DuckDBPyConnection
+        Inside a transaction.
+    sql : str
+        Static text.
+    table : Table
+        What ``incoming`` stands for.
+    """
+    cursor.register("incoming", table)
+    cursor.execute(sql)
+    cursor.unregister("incoming")
+
+
+def _to_numpy(column: pa.ChunkedArray) -> NDArray[Any]:
+    """Return a column as an array; NULL becomes NaN among numbers and None among objects."""
+    if pa.types.is_timestamp(column.type):
+        column = column.cast(pa.timestamp("us"))  # NumPy's instants carry no zone; ours are UTC
+    return np.asarray(column.to_numpy())
