@@ -345,6 +345,8 @@ def snoop(
     adjust_kept: Callable[[Mask], Adjustment[State]],
     n_blocks: int,
     may_drop: Callable[[Mask, int], bool],
+    *,
+    is_studentised: bool = False,
 ) -> tuple[Adjustment[State], Mask, tuple[tuple[int, float], ...]]:
     """Leave out the worst block, one at a time, while its w-test fails.
 
@@ -356,6 +358,9 @@ def snoop(
         Number of all blocks.
     may_drop : callable
         Whether, of the blocks of a mask, the given one can be spared.
+    is_studentised : bool
+        Whether w is divided by ``sigma0`` where that is above 1: for sigmas that are too small
+        throughout, which would otherwise cost good blocks.
 
     Returns
     -------
@@ -365,7 +370,7 @@ def snoop(
     Notes
     -----
     Baarda's data snooping, iterated: after each removal all others are tested anew, since one bad
-    block makes its neighbours look bad.
+    block makes its neighbours look bad. Studentised after Pope (1976).
     """
     keep = np.ones(n_blocks, dtype=np.bool_)
     dropped: list[tuple[int, float]] = []
@@ -373,6 +378,8 @@ def snoop(
         adjustment = adjust_kept(keep)
         places: Index = np.flatnonzero(keep)
         w = np.nan_to_num(adjustment.w_statistics, nan=0.0)
+        if is_studentised:
+            w = w / max(1.0, adjustment.sigma0)
         for worst in np.argsort(-w):
             if w[worst] <= adjustment.critical_w:
                 return adjustment, keep, tuple(dropped)

@@ -30,7 +30,7 @@ from pipelines.values import (
 
 _LINE = 0.05  # spread across over spread along; 3 deg seen from the end
 _UPRIGHT = 0.05  # the same for a pair of marks on a plumb line, which tells no heading
-_MANY_LEFT_OUT = 1.0 / 3.0  # of the matched markers; the rest agrees because it was selected
+_MANY_LEFT_OUT = 1.0 / 3.0  # of the matched markers: not they are bad, but the sigmas too small
 
 
 def resect(
@@ -123,8 +123,9 @@ def free_station(fits: MarkerFits, marks: ControlMarks, config: ResectionConfig)
     AHRS. To each centre ``sigma_common`` is added per axis and independently: a fit's covariance
     knows the noise of its returns only, and what mounting and encoder of the gimbal leave changes
     from direction to direction and from face to face; the part that all centres share is a motion
-    of the pose and cannot be told from it. Gravity that contradicts three or more marks is left
-    out like a bad marker, and the fix is weak.
+    of the pose and cannot be told from it. Where data snooping would leave out more than a third of
+    the markers, the sigmas are to blame: it is done again with w divided by sigma0. Gravity that
+    contradicts three or more marks is left out like a bad marker, and the fix is weak.
     """
     _refuse_too_few(fits, marks)
     scene = gather(fits, marks, config)
@@ -148,6 +149,8 @@ def free_station(fits: MarkerFits, marks: ControlMarks, config: ResectionConfig)
         return int(rest[:-1].sum()) >= 2 and _has_heading(scene, pairs[rest[:-1]])
 
     adjustment, keep, dropped = snoop(adjusted, len(pairs) + 1, may_drop)
+    if len(dropped) > _MANY_LEFT_OUT * len(pairs):
+        adjustment, keep, dropped = snoop(adjusted, len(pairs) + 1, may_drop, is_studentised=True)
     used = pairs[keep[:-1]]
     excluded = _exclusions(match, dropped, scene, adjustment, config)
     reasons = _weaknesses(scene, match, used, adjustment, dropped)
@@ -239,7 +242,7 @@ def _weaknesses(
         if block == match.n
     ]
     n_dropped = sum(block < match.n for block, _ in dropped)
-    if n_dropped >= _MANY_LEFT_OUT * match.n:
+    if n_dropped and n_dropped >= _MANY_LEFT_OUT * match.n:
         reasons.append(f"{n_dropped} of {match.n} matched markers had to be left out")
     if not scene.is_levelled:
         reasons.append("no AHRS: the levelling is only assumed")
