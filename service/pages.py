@@ -21,7 +21,7 @@ router = APIRouter(include_in_schema=False, default_response_class=HTMLResponse)
 
 _N_JOBS = 100  # in one page; the API lists all
 _N_RECORDINGS = 50
-_N_POINTS = 60_000  # of a cloud; the page thins them further
+_N_POINTS = 250_000  # of a cloud; the page thins them further
 _A_YEAR = "public, max-age=31536000, immutable"
 
 _SURVEY_NAMES = "SELECT name FROM surveys ORDER BY created_at DESC, name"

@@ -53,6 +53,15 @@ def has_errors(columns: Columns) -> bool:
     return bool(np.isfinite(floats(columns, "error_3d_m")).any())
 
 
+def on_marks(columns: Columns) -> NDArray[np.bool_]:
+    """Tell which fits stand on a mark; all of them where no mark is known."""
+    known = np.isfinite(floats(columns, "error_3d_m"))
+    if known.any():
+        return known
+    matched = np.array([mark != "" for mark in texts(columns, "mark")], dtype=np.bool_)
+    return matched if matched.any() else np.ones(len(matched), dtype=np.bool_)
+
+
 def lane_and_number(stop: str) -> tuple[str, int | None]:
     """Split the name of a stop into its lane and its number along it: ``lane-2-stop-5``."""
     found = _STOP_NUMBER.match(stop)
@@ -146,7 +155,7 @@ def station_residuals(observations: Columns, tolerance_m: float) -> go.Figure:
     """Draw what each marker disagrees with the station, by axis, with twice its sigma."""
     figure = _figure("Residuals of the station, by marker and axis")
     names = [
-        f"{marker} · {mark}" if mark and mark != marker else marker
+        mark or marker
         for marker, mark in zip(
             texts(observations, "marker"), texts(observations, "mark"), strict=True
         )
@@ -156,7 +165,7 @@ def station_residuals(observations: Columns, tolerance_m: float) -> go.Figure:
     if len(names) and _largest(floats(observations, "residual_x_m")) > tolerance_m / 2:
         _add_tolerance(figure, tolerance_m)
     figure.add_hline(y=0, line={"color": theme.LINE, "width": 1}, layer="below")
-    figure.update_xaxes(title_text="Marker · mark", type="category", tickangle=-45)
+    figure.update_xaxes(title_text="Mark", type="category")
     figure.update_yaxes(title_text="Observed - computed [mm]")
     figure.update_layout(scattermode="group", scattergap=0.35)
     return figure
@@ -231,8 +240,9 @@ def _add_fits(figure: go.Figure, fits: Columns, x: NDArray[np.float64], width: f
         _add_points(figure, style, own_x, y, rows)
         _add_binned(figure, style, own_x, y, width)
         if is_error and method == "along_beam":
-            sigma = floats(rows, "sigma_3d_m") * _MM
-            _add_prediction(figure, style, own_x, sigma, width)
+            known = np.isfinite(y)
+            sigma = floats(rows, "sigma_3d_m")[known] * _MM
+            _add_prediction(figure, style, own_x[known], sigma, width)
 
 
 def _add_points(
@@ -242,7 +252,9 @@ def _add_points(
     y: NDArray[np.float64],
     rows: Columns,
 ) -> None:
-    """Draw one point for each centre; weak ones are hollow."""
+    """Draw one point for each centre whose quality is known; weak ones are hollow."""
+    known = np.isfinite(y)
+    x, y, rows = x[known], y[known], select(rows, known)
     weak = np.array(texts(rows, "status"), dtype=object) != "ok"
     details = _details(rows, ("stop", "marker", "mark", "reason"), ("range_m", "n_points"))
     figure.add_scatter(
@@ -546,7 +558,7 @@ def _add_residuals(
         legendgroup=axis,
         showlegend=False,
         hoverinfo="skip",
-        error_y={"array": 2.0 * sigma, "color": theme.FAINT, "thickness": 5, "width": 0},
+        error_y={"array": 2.0 * sigma, "color": theme.BAR, "thickness": 5, "width": 0},
     )
     figure.add_scatter(
         x=list(names),

@@ -22,12 +22,30 @@ from plotly.io.json import to_json_plotly
 
 from pipelines.accuracy import ErrorSummary, summarise
 from web import assets, figures, scene, theme
-from web.figures import Columns, by_method, floats, has_errors, lane_and_number, select, texts
+from web.figures import (
+    Columns,
+    by_method,
+    floats,
+    has_errors,
+    lane_and_number,
+    on_marks,
+    select,
+    texts,
+)
 from web.filters import Filters
 
 Row = Mapping[str, Any]
 _MM = 1e3  # [mm/m]
 _UNKNOWN = "\N{EN DASH}"
+_ENDINGS = {
+    "_deg_per_s": "deg/s",
+    "_deg": "deg",
+    "_rpm": "rpm",
+    "_hz": "Hz",
+    "_bytes": "B",
+    "_s": "s",
+    "_m": "m",
+}
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -234,7 +252,8 @@ def jobs_page(page: JobsPage) -> str:
 
 def job_page(page: JobPage) -> str:
     """Return one job with its progress."""
-    return _render("job.html", page, here="jobs")
+    config = json.dumps(json.loads(page.job["config"]), indent=2)
+    return _render("job.html", page, here="jobs", config=config)
 
 
 def recording_page(page: RecordingPage) -> str:
@@ -317,16 +336,22 @@ EXAMPLES: tuple[tuple[str, str], ...] = (
 
 def headline(fits: Columns, fixes: Columns, tolerance_m: float) -> tuple[Readout, ...]:
     """Return the few numbers that matter: centres and stations, each method, and the sigma."""
-    readouts = [_quality("Centres", method, rows, tolerance_m) for method, rows in by_method(fits)]
-    readouts += [
-        _quality("Stations", method, rows, tolerance_m) for method, rows in by_method(fixes)
-    ]
-    if has_errors(fits):
-        readouts += [_predicted(rows) for method, rows in by_method(fits) if method == "along_beam"]
-    return tuple(readouts)
+    readouts = []
+    for method, rows in by_method(fits):
+        real = on_marks(rows)
+        n_others = int(np.count_nonzero(~real))
+        readouts.append(
+            _quality("Centres", method, select(rows, real), tolerance_m, n_others=n_others)
+        )
+    for method, rows in by_method(fixes):
+        readouts.append(_quality("Stations", method, rows, tolerance_m))
+    ours = [rows for method, rows in by_method(fits) if method == "along_beam"]
+    return (*readouts, *(_predicted(rows) for rows in ours if has_errors(rows)))
 
 
-def _quality(what: str, method: str, rows: Columns, tolerance_m: float) -> Readout:
+def _quality(
+    what: str, method: str, rows: Columns, tolerance_m: float, *, n_others: int = 0
+) -> Readout:
     """Return the error of one method against truth; without truth its predicted sigma."""
     style = theme.method_style(method)
     is_error = has_errors(rows)
@@ -335,7 +360,8 @@ def _quality(what: str, method: str, rows: Columns, tolerance_m: float) -> Reado
         label=f"{what}, {style.label}",
         value=_number(summary.rms * _MM, 1),
         unit="mm RMS error" if is_error else "mm predicted sigma",
-        note=_share(summary, tolerance_m, is_error=is_error),
+        note=_share(summary, tolerance_m, is_error=is_error)
+        + (f"; {n_others} on no mark" if n_others else ""),
         method=method,
     )
 
@@ -485,12 +511,14 @@ def _stop_row(
     stop: str, method: str, fits: Columns, fix: Row | None, tolerance_m: float
 ) -> dict[str, Any]:
     """Return one row of the table of stops."""
+    n_all, fits = len(fits["stop"]), select(fits, on_marks(fits))
     errors = summarise(floats(fits, "error_3d_m"), tolerance_m)
     sigmas = summarise(floats(fits, "sigma_3d_m"), tolerance_m)
     return {
         "stop": stop,
         "method": method,
         "n_markers": len(fits["stop"]),
+        "n_others": n_all - len(fits["stop"]),
         "mean_range_m": float(np.mean(floats(fits, "range_m"))),
         "error_mean_m": errors.mean,
         "error_max_m": errors.largest,
@@ -543,6 +571,7 @@ def _environment() -> Environment:
         figure_block=lambda figure: _as_block(str(to_json_plotly(figure.to_plotly_json()))),
         method=lambda name: theme.method_style(name).label,
         unit=unit_of,
+        heading=heading,
     )
     environment.globals.update(assets=assets)
     return environment
@@ -564,6 +593,20 @@ def unit_of(column: str) -> str:
         return "rad, m"
     units = {"m": "m", "m2": "m²", "deg": "deg", "s": "s", "bytes": "B", "percent": "%"}
     return units.get(column.rpartition("_")[2], "") if "_" in column else ""
+
+
+def heading(name: str) -> str:
+    """Return the name of a column or key as people write it, with its unit in brackets."""
+    for ending, unit in _ENDINGS.items():
+        if name.endswith(ending):
+            return f"{_words(name.removesuffix(ending))} [{unit}]"
+    return _words(name)
+
+
+def _words(name: str) -> str:
+    """Return a name as words, the first with a capital."""
+    words = name.removeprefix("n_").removeprefix("has_").replace("_", " ")
+    return words[:1].upper() + words[1:]
 
 
 def _number(value: float | None, decimals: int = 2) -> str:

@@ -10,14 +10,15 @@ from numpy.typing import NDArray
 
 from pipelines.values import Array, Column, Index
 from web import theme
-from web.figures import Columns, floats, texts
+from web.figures import Columns, floats, on_marks, select, texts
 
 _MM = 1e3  # [mm/m]
-_N_SHOWN = 24_000  # returns of the surroundings; more makes a browser without a GPU slow
-_MARGIN = 3.0  # [m] of surroundings shown beyond the farthest marker
+_CELLS = (0.15, 0.2, 0.3, 0.4)  # [m]; of the surroundings one return is shown in each cell
+_N_SHOWN = 30_000  # returns of the surroundings; more makes a browser without a GPU slow
+_MARGIN = 2.0  # [m] of surroundings shown beyond the farthest marker that stands on a mark
 _REACH = 1.3  # returns within so many radii of a centre are shown with it
 _COLOUR_SIGMAS = 3.0  # the colours of residuals end here
-_N_AROUND, _N_UP = 24, 13  # facets of a drawn sphere
+_N_MERIDIANS, _N_PARALLELS = 18, 8  # of a drawn sphere
 
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
@@ -47,12 +48,14 @@ class MarkerReturns:
 def stop_scene(scan: Scan, fits: Columns, rejections: Columns) -> go.Figure:
     """Draw a stop: surroundings by height, spheres, and returns coloured by their residual."""
     figure = _figure_3d(f"Scan, spheres and {_what(scan, fits).lower()}")
-    shown = scan.p_station[_surroundings(scan, floats(fits, "range_m"))]
+    reach = _reach(fits)
+    fits = select(fits, floats(fits, "range_m") <= reach)
+    shown = scan.p_station[_surroundings(scan, reach)]
     figure.add_scatter3d(
         **_xyz(shown),
         mode="markers",
         name="surroundings",
-        marker={"size": 1.3, "color": shown[:, 2], "colorscale": theme.HEIGHTS, "opacity": 0.8},
+        marker={"size": 1.6, "color": shown[:, 2], "colorscale": theme.HEIGHTS},
         hoverinfo="skip",
     )
     returns = [marker_returns(scan, fits, i) for i in range(len(fits["marker"]))]
@@ -72,7 +75,7 @@ def marker_close_up(scan: Scan, fits: Columns, i: int) -> go.Figure:
     _add_left_out(figure, returns)
     _add_returns(figure, [returns], floats(fits, "rms_m")[[i]], _what(scan, fits), size=5)
     towards = -_centre(fits, i) / np.linalg.norm(_centre(fits, i))
-    eye = 1.4 * towards + np.array([0.5 * towards[1], -0.5 * towards[0], 0.5])
+    eye = 1.7 * towards + np.array([0.5 * towards[1], -0.5 * towards[0], 0.5])
     figure.update_scenes(camera_eye=dict(zip("xyz", eye.tolist(), strict=True)))
     return figure
 
@@ -142,13 +145,23 @@ def _within(p: NDArray[np.float32], centre: Array, reach: float) -> Index:
     return np.asarray(near[distances < reach], dtype=np.intp)
 
 
-def _surroundings(scan: Scan, ranges: NDArray[np.float64]) -> Index:
-    """Choose evenly among the returns that are not much farther than the markers."""
-    reach = float(np.nanmax(ranges, initial=10.0)) + _MARGIN
-    is_near = np.hypot(scan.p_station[:, 0], scan.p_station[:, 1]) < reach
+def _reach(fits: Columns) -> float:
+    """Return how far a scene goes: beyond the farthest fit that stands on a mark [m]."""
+    return float(np.max(floats(fits, "range_m")[on_marks(fits)], initial=8.0)) + _MARGIN
+
+
+def _surroundings(scan: Scan, reach: float) -> Index:
+    """Choose one return in each cell of space, in the finest grid that keeps few enough."""
+    is_near = np.linalg.norm(scan.p_station, axis=1) < reach
     near = np.flatnonzero(is_near & (scan.markers < 0))
-    step = max(1, -(-len(near) // _N_SHOWN))
-    return np.asarray(near[::step], dtype=np.intp)
+    chosen = near
+    for cell in _CELLS:
+        cells = np.floor(scan.p_station[near] / cell).astype(np.int64) + 1000
+        keys = (cells[:, 0] * 10_000 + cells[:, 1]) * 10_000 + cells[:, 2]
+        chosen = near[np.unique(keys, return_index=True)[1]]
+        if len(chosen) <= _N_SHOWN:
+            break
+    return np.asarray(chosen, dtype=np.intp)
 
 
 def _figure_3d(title: str) -> go.Figure:
@@ -161,7 +174,10 @@ def _figure_3d(title: str) -> go.Figure:
         scene={
             **axes,
             "aspectmode": "data",
-            "camera": {"eye": {"x": 0.85, "y": -0.85, "z": 0.6}},
+            "camera": {
+                "eye": {"x": 0.95, "y": -1.1, "z": 0.7},
+                "center": {"x": 0, "y": 0, "z": -0.1},
+            },
             "dragmode": "turntable",
         },
         margin={"l": 0, "r": 0, "t": 36, "b": 0},
@@ -210,7 +226,7 @@ def _add_left_out(figure: go.Figure, returns: MarkerReturns) -> None:
         mode="markers",
         name="left out: pole, edges",
         hoverinfo="skip",
-        marker={"size": 4, "color": theme.FAINT, "symbol": "x"},
+        marker={"size": 4, "color": theme.FAINT, "symbol": "cross"},
     )
 
 
@@ -244,32 +260,38 @@ def _add_rejections(figure: go.Figure, rejections: Columns) -> None:
         visible="legendonly",
         text=texts(rejections, "reason"),
         hovertemplate="%{text}<extra>rejected</extra>",
-        marker={"size": 4, "color": theme.MUTED, "symbol": "x"},
+        marker={"size": 4, "color": theme.MUTED, "symbol": "cross"},
     )
 
 
 def _add_sphere(figure: go.Figure, centre: Array, radius: float) -> None:
-    """Draw a sphere as a faint surface."""
-    around, up = np.meshgrid(
-        np.linspace(0.0, 2.0 * np.pi, _N_AROUND, endpoint=False),
-        np.linspace(-np.pi / 2.0, np.pi / 2.0, _N_UP),
-    )
-    unit = np.stack([np.cos(up) * np.cos(around), np.cos(up) * np.sin(around), np.sin(up)])
-    corners = centre[:, None] + radius * unit.reshape(3, -1)
-    place = np.arange(_N_AROUND * _N_UP).reshape(_N_UP, _N_AROUND)
-    a, b = place[:-1].ravel(), np.roll(place, -1, axis=1)[:-1].ravel()
-    c, d = place[1:].ravel(), np.roll(place, -1, axis=1)[1:].ravel()
-    figure.add_mesh3d(
-        **_xyz(corners.T),
-        i=np.concatenate([a, b]),
-        j=np.concatenate([b, d]),
-        k=np.concatenate([c, c]),
+    """Draw a sphere as its graticule."""
+    turn = np.linspace(0.0, 2.0 * np.pi, 73)
+    half = np.linspace(-np.pi / 2.0, np.pi / 2.0, 37)
+    lines = [
+        _on_sphere(np.full(len(half), longitude), half)
+        for longitude in np.linspace(0.0, 2.0 * np.pi, _N_MERIDIANS, endpoint=False)
+    ]
+    lines += [
+        _on_sphere(turn, np.full(len(turn), latitude))
+        for latitude in np.linspace(-np.pi / 2.0, np.pi / 2.0, _N_PARALLELS + 2)[1:-1]
+    ]
+    gap = np.full((1, 3), np.nan)
+    joined = np.concatenate([part for line in lines for part in (line, gap)])
+    figure.add_scatter3d(
+        **_xyz(centre + radius * joined),
+        mode="lines",
         name="sphere",
-        color=theme.CLOUD,
-        opacity=0.35,
+        line={"color": theme.CLOUD, "width": 1.5},
         hoverinfo="skip",
-        showlegend=True,
-        lighting={"ambient": 0.75, "diffuse": 0.5, "specular": 0.05},
+    )
+
+
+def _on_sphere(longitudes: Array, latitudes: Array) -> Array:
+    """Return points on the unit sphere, (n, 3)."""
+    level = np.cos(latitudes)
+    return np.column_stack(
+        [level * np.cos(longitudes), level * np.sin(longitudes), np.sin(latitudes)]
     )
 
 

@@ -65,11 +65,11 @@ const isNumber = (i) => {
   return known.length > 0 && known.every((value) => typeof value === "number");
 };
 
-function cell(value) {
+function cell(value, isNumeric) {
   const place = document.createElement("td");
   if (value === null) {
     place.textContent = "NULL";
-    place.className = "null";
+    place.className = isNumeric ? "null number" : "null";
   } else if (typeof value === "number") {
     place.className = "number";
     place.textContent = Number.isInteger(value) ? String(value) : String(+value.toPrecision(7));
@@ -91,12 +91,13 @@ function showAnswer(body) {
       unit.textContent = ` [${column.unit}]`;
       place.append(unit);
     }
-    if (isNumber(i)) place.className = "number";
+    if (isNumber(i)) place.className = "number"; // as its cells
     head.append(place);
   });
+  const numeric = answer.columns.map((_, i) => isNumber(i));
   const rows = answer.rows.slice(0, SHOWN).map((row) => {
     const place = document.createElement("tr");
-    place.append(...row.map(cell));
+    place.append(...row.map((value, i) => cell(value, numeric[i])));
     return place;
   });
   byId("result").querySelector("thead").replaceChildren(head);
@@ -144,7 +145,7 @@ function offerChart() {
   byId("chart").hidden = numeric.length < 2 || answer.rows.length < 2;
   if (byId("chart").hidden) return;
   options(byId("chart-x"), numeric, numeric[0]);
-  options(byId("chart-y"), numeric, numeric.find((name) => /error|rms/.test(name)) ?? numeric[1]);
+  options(byId("chart-y"), numeric, numeric.find((name) => /rms|error_|sigma/.test(name)) ?? numeric[1]);
   options(byId("chart-by"), ["", ...words], words.find((name) => name === "fit_method") ?? "");
   drawChart();
 }
