@@ -118,6 +118,7 @@ class Container:
     _first_ns: int | None = None
     _last_ns: int = 0
     _released: int = 0
+    _zstd: zstandard.ZstdDecompressor = field(default_factory=zstandard.ZstdDecompressor)
 
     def __post_init__(self) -> None:
         found = self.octets[: len(MAGIC)].tobytes()
@@ -224,7 +225,7 @@ class Container:
     def _chunk(self, start: int, length: int) -> Iterator[Batch]:
         """Give the messages of one chunk."""
         try:
-            octets = _unpack_chunk(self.octets[start : start + length])
+            octets = _unpack_chunk(self.octets[start : start + length], self._zstd)
         except (ValueError, struct.error, zstandard.ZstdError, RuntimeError) as error:
             raise self._truncated(start - _RECORD_HEAD, f"a chunk is damaged: {error}") from error
         position, is_whole = 0, True
@@ -365,7 +366,7 @@ def _text(body: bytes, at: int) -> tuple[str, int]:
     return body[at + 4 : end].decode(), end
 
 
-def _unpack_chunk(body: Octets) -> Octets:
+def _unpack_chunk(body: Octets, zstd: zstandard.ZstdDecompressor) -> Octets:
     """Return the records of a chunk, decompressed and checked."""
     head = body[: 8 + 8 + 8 + 4 + 4 + 64].tobytes()
     size, crc = struct.unpack_from("<QI", head, 16)
@@ -374,7 +375,7 @@ def _unpack_chunk(body: Octets) -> Octets:
     packed = body[at + 8 : at + 8 + length]
     if len(packed) != length:
         raise ValueError(f"it declares {length:,} bytes and has {len(packed):,}")
-    octets = packed if compression == "" else _decompress(compression, packed, size)
+    octets = packed if compression == "" else _decompress(compression, packed, size, zstd)
     if len(octets) != size:
         raise ValueError(f"it declares {size:,} bytes of records and holds {len(octets):,}")
     if crc and zlib.crc32(octets.data) != crc:
@@ -382,7 +383,9 @@ def _unpack_chunk(body: Octets) -> Octets:
     return octets
 
 
-def _decompress(compression: str, packed: Octets, size: int) -> Octets:
+def _decompress(
+    compression: str, packed: Octets, size: int, zstd: zstandard.ZstdDecompressor
+) -> Octets:
     """Decompress at most the declared size, which must itself be bearable."""
     if size > _CHUNK_LIMIT:
         raise ValueError(f"it declares {size:,} bytes, more than {_CHUNK_LIMIT:,}")
@@ -391,9 +394,7 @@ def _decompress(compression: str, packed: Octets, size: int) -> Octets:
     elif compression == "zstd":
         if zstandard.frame_content_size(packed.data) not in (-1, size):
             raise ValueError("its compressed frame declares another size")
-        unpacked = zstandard.ZstdDecompressor().decompress(
-            packed.data, max_output_size=max(size, 1)
-        )
+        unpacked = zstd.decompress(packed.data, max_output_size=max(size, 1))
     else:
         raise ValueError(f"its compression {compression!r} is unknown; known: lz4, zstd")
     return np.frombuffer(unpacked, np.uint8)

@@ -172,17 +172,15 @@ class PointClouds:
         self._frame = frame
         start = self._n
         times = self._unpack(points, height * width)
-        stamps, fault = shot_times(times, stamp)
-        self._stamps[start : self._n] = stamp if stamps is None else stamps
+        span, fault = shot_times(times, stamp, self._stamps[start : self._n])
         self._time_fault = self._time_fault or fault
-        span = 0 if stamps is None or not len(stamps) else int(stamps.max()) - stamp
         kept = self._messages
         kept.starts.append(start)
         kept.stamps_ns.append(stamp)
         kept.log_times_ns.append(log_time)
         kept.spans_ns.append(span)
         is_telling = self._n - start >= SHOTS_MIN or span != 0
-        kept.has_times.append(stamps is not None if is_telling else None)
+        kept.has_times.append(not fault if is_telling else None)
 
     def _read_layout(self, cursor: cdr.Cursor, octets: Octets) -> None:
         """Read the description of a point, unless it is that of the message before."""

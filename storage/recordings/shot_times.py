@@ -20,8 +20,8 @@ _EPOCH_NS = 1e15  # the same in nanoseconds
 _ZEROS_MAX = 0.25  # share of zero times that a message with times may have
 
 
-def shot_times(times: NDArray[np.generic] | None, stamp_ns: int) -> tuple[Nanos | None, str]:
-    """Return the instant of each return of a message.
+def shot_times(times: NDArray[np.generic] | None, stamp_ns: int, out: Nanos) -> tuple[int, str]:
+    """Write the instant of each return of a message.
 
     Parameters
     ----------
@@ -29,34 +29,43 @@ def shot_times(times: NDArray[np.generic] | None, stamp_ns: int) -> tuple[Nanos 
         Times as recorded, of any type; none when the points have no such field.
     stamp_ns : int
         Stamp of the message.
+    out : (n,)
+        Receives the instants; the stamp throughout when the times are of no use.
 
     Returns
     -------
-    stamps_ns : (n,) or None
-        Instants, or none when the times are of no use.
+    span_ns : int
+        From the stamp to the latest instant.
     fault : str
-        Why they are of no use, as the end of a sentence; empty when they are not there at all.
+        Why the times are of no use, as the end of a sentence; empty when they are of use.
     """
-    if times is None:
-        return None, ""
-    if not len(times):
-        return np.empty(0, np.int64), ""
-    stamps = np.empty(len(times), np.int64)
+    fault = "there is no such field"
+    if times is not None:
+        if not len(times):
+            return 0, ""
+        span, fault = _written(times, stamp_ns, out)
+        if not fault:
+            return span, ""
+    out[:] = stamp_ns
+    return 0, fault
+
+
+def _written(times: NDArray[np.generic], stamp_ns: int, out: Nanos) -> tuple[int, str]:
+    """Write instants, and return their span and what is wrong with them."""
     is_single = times.dtype == np.dtype("<f4")
     low, high, n_zeros = (
-        _stamp_kernel(times, stamp_ns, stamps)
+        _stamp_kernel(times, stamp_ns, out)
         if is_single
         else (float(times.min()), float(times.max()), int((times == 0).sum()))
     )
     fault = _fault(low, high, n_zeros, len(times))
-    if fault:
-        return None, fault
-    if is_single and max(abs(low), abs(high)) <= _REVOLUTION_LIMIT:
-        return stamps, ""
+    if fault or (is_single and max(abs(low), abs(high)) <= _REVOLUTION_LIMIT):
+        return 0 if fault else round(high * 1e9), fault
     offsets = _offsets_ns(times, low, high, stamp_ns)
     if offsets is None:
-        return None, f"its times run from {low:g} to {high:g}, neither seconds nor nanoseconds"
-    return offsets + stamp_ns, ""
+        return 0, f"its times run from {low:g} to {high:g}, neither seconds nor nanoseconds"
+    out[:] = offsets + stamp_ns
+    return int(offsets.max()), ""
 
 
 def _fault(low: float, high: float, n_zeros: int, n: int) -> str:

@@ -47,7 +47,7 @@ def cloud(points, ns=T0, frame="velodyne", height=1, row_padding=0):
             )
             for name, (kind, offset) in kinds.items()
         ],
-        is_bigendian=points.dtype[0].byteorder == ">",
+        is_bigendian=any(kind.byteorder == ">" for kind, _ in kinds.values()),
         point_step=points.dtype.itemsize,
         row_step=points.dtype.itemsize * rows.shape[1] + row_padding,
         data=np.frombuffer(data, np.uint8),
