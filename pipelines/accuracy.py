@@ -109,7 +109,22 @@ def marker_errors(fits: MarkerFits, stop: StopTruth, marks: ControlMarks) -> Mar
 
 
 def centre_errors(p_base: ArrayLike, stop: StopTruth, marks: ControlMarks) -> MarkerErrors:
-    """Compare centres in the base frame, (n, 3) [m], with the truth; see ``marker_errors``."""
+    """Compare centres with the truth, as ``marker_errors`` does.
+
+    Parameters
+    ----------
+    p_base : (n, 3)
+        Centres [m].
+    stop : StopTruth
+        True pose of the base frame.
+    marks : ControlMarks
+        True centres.
+
+    Returns
+    -------
+    MarkerErrors
+        In the order of the centres.
+    """
     found = np.asarray(p_base, dtype=np.float64).reshape(-1, 3)
     true = transform(inverse(stop.T_site_base), marks.p_site)
     distances = np.linalg.norm(found[:, None] - true[None], axis=2)

@@ -14,7 +14,18 @@ _SMALL = 1e-9  # [rad]; below it the series of the exponential is exact in float
 
 
 def skew(v: ArrayLike) -> Array:
-    """Return the matrix ``[v]x`` with ``[v]x w = v x w``; (..., 3) gives (..., 3, 3)."""
+    """Return the matrix ``[v]x`` with ``[v]x w = v x w``.
+
+    Parameters
+    ----------
+    v : (..., 3)
+        Vectors.
+
+    Returns
+    -------
+    (..., 3, 3)
+        One matrix per vector.
+    """
     v = np.asarray(v, dtype=np.float64)
     out = np.zeros((*v.shape, 3))
     out[..., 0, 1], out[..., 0, 2], out[..., 1, 2] = -v[..., 2], v[..., 1], -v[..., 0]
@@ -23,22 +34,68 @@ def skew(v: ArrayLike) -> Array:
 
 
 def rot_x(angle: float) -> Array:
-    """Return the rotation about x by an angle [rad]."""
+    """Return the rotation about x by an angle.
+
+    Parameters
+    ----------
+    angle : float
+        Right-handed [rad].
+
+    Returns
+    -------
+    (3, 3)
+        Rotation.
+    """
     return Rotation.from_euler("x", angle).as_matrix()
 
 
 def rot_y(angle: float) -> Array:
-    """Return the rotation about y by an angle [rad]."""
+    """Return the rotation about y by an angle.
+
+    Parameters
+    ----------
+    angle : float
+        Right-handed [rad].
+
+    Returns
+    -------
+    (3, 3)
+        Rotation.
+    """
     return Rotation.from_euler("y", angle).as_matrix()
 
 
 def rot_z(angle: float) -> Array:
-    """Return the rotation about z by an angle [rad]."""
+    """Return the rotation about z by an angle.
+
+    Parameters
+    ----------
+    angle : float
+        Right-handed [rad].
+
+    Returns
+    -------
+    (3, 3)
+        Rotation.
+    """
     return Rotation.from_euler("z", angle).as_matrix()
 
 
 def rigid(R: ArrayLike, t: ArrayLike) -> Array:
-    """Return the (4, 4) motion with rotation ``R`` and translation ``t`` [m]."""
+    """Return the motion with a rotation and a translation.
+
+    Parameters
+    ----------
+    R : (3, 3)
+        Rotation.
+    t : (3,)
+        Translation [m].
+
+    Returns
+    -------
+    (4, 4)
+        Rigid motion.
+    """
     T = np.eye(4)
     T[:3, :3] = R
     T[:3, 3] = t
@@ -46,13 +103,37 @@ def rigid(R: ArrayLike, t: ArrayLike) -> Array:
 
 
 def inverse(T: Array) -> Array:
-    """Return the inverse of a (4, 4) rigid motion."""
+    """Return the inverse of a rigid motion.
+
+    Parameters
+    ----------
+    T : (4, 4)
+        Rigid motion ``T_a_b``.
+
+    Returns
+    -------
+    (4, 4)
+        ``T_b_a``.
+    """
     R = T[:3, :3]
     return rigid(R.T, -R.T @ T[:3, 3])
 
 
 def transform(T: Array, p: ArrayLike) -> Array:
-    """Move points, (..., 3), by a (4, 4) rigid motion [m]."""
+    """Move points by a rigid motion.
+
+    Parameters
+    ----------
+    T : (4, 4)
+        Rigid motion ``T_a_b``.
+    p : (..., 3)
+        Points in frame b [m].
+
+    Returns
+    -------
+    (..., 3)
+        Points in frame a [m].
+    """
     return np.asarray(p, dtype=np.float64) @ T[:3, :3].T + T[:3, 3]
 
 
@@ -78,13 +159,39 @@ def exp_motion(xi: ArrayLike) -> Array:
 
 
 def log_motion(T: Array) -> Array:
-    """Return the small-motion vector (6,) whose ``exp_motion`` is ``T``; rotation below pi."""
+    """Return the small-motion vector whose ``exp_motion`` is ``T``.
+
+    Parameters
+    ----------
+    T : (4, 4)
+        Rigid motion that turns by less than pi.
+
+    Returns
+    -------
+    (6,)
+        Rotation [rad] and translation [m] of the twist.
+    """
     phi = Rotation.from_matrix(T[:3, :3]).as_rotvec()
     return np.concatenate([phi, np.linalg.solve(left_jacobian(phi), T[:3, 3])])
 
 
 def left_jacobian(phi: Array) -> Array:
-    """Return the left Jacobian of the rotation vector ``phi``, (3, 3) (Barfoot, eq. 7.37)."""
+    """Return the left Jacobian of a rotation vector.
+
+    Parameters
+    ----------
+    phi : (3,)
+        Rotation vector [rad].
+
+    Returns
+    -------
+    (3, 3)
+        ``V`` in ``Exp(phi, rho) = (exp(phi), V rho)``.
+
+    Notes
+    -----
+    Barfoot, State Estimation for Robotics, eq. 7.37.
+    """
     cross = skew(phi)
     angle = float(np.linalg.norm(phi))
     if angle < _SMALL:
@@ -94,18 +201,50 @@ def left_jacobian(phi: Array) -> Array:
 
 
 def levelling_rotation(levelling: Levelling) -> Array:
-    """Return ``R_station_base = Ry(pitch) Rx(roll)``, (3, 3)."""
+    """Return the rotation that levels the base.
+
+    Parameters
+    ----------
+    levelling : Levelling
+        How the base leans.
+
+    Returns
+    -------
+    (3, 3)
+        ``R_station_base = Ry(pitch) Rx(roll)``.
+    """
     return np.asarray(rot_y(levelling.pitch) @ rot_x(levelling.roll))
 
 
 def yaw_pitch_roll(R: Array) -> tuple[float, float, float]:
-    """Return yaw, pitch and roll of ``R = Rz(yaw) Ry(pitch) Rx(roll)`` [rad]."""
+    """Return yaw, pitch and roll of ``R = Rz(yaw) Ry(pitch) Rx(roll)``.
+
+    Parameters
+    ----------
+    R : (3, 3)
+        Rotation.
+
+    Returns
+    -------
+    tuple of float
+        Yaw, pitch and roll [rad].
+    """
     yaw, pitch, roll = Rotation.from_matrix(R).as_euler("ZYX")
     return float(yaw), float(pitch), float(roll)
 
 
 def included_angle(v: ArrayLike, w: ArrayLike) -> Array:
-    """Return the angle between directions, (..., 3) each, 0 to pi [rad].
+    """Return the angle between directions.
+
+    Parameters
+    ----------
+    v, w : (..., 3)
+        Directions of any length.
+
+    Returns
+    -------
+    (...)
+        Angles, 0 to pi [rad].
 
     Notes
     -----
@@ -118,5 +257,16 @@ def included_angle(v: ArrayLike, w: ArrayLike) -> Array:
 
 
 def wrap(angle: ArrayLike) -> Array:
-    """Reduce angles to [-pi, pi) [rad]."""
+    """Reduce angles to [-pi, pi).
+
+    Parameters
+    ----------
+    angle : (...)
+        Angles [rad].
+
+    Returns
+    -------
+    (...)
+        The same directions [rad].
+    """
     return np.asarray((np.asarray(angle, dtype=np.float64) + np.pi) % (2.0 * np.pi) - np.pi)

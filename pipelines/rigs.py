@@ -98,7 +98,18 @@ def tilted_vlp16(name: str, axis_offset: ArrayLike, tilt: float = np.pi / 2) -> 
 
 
 def rig_to_mapping(rig: Rig) -> dict[str, Any]:
-    """Return a rig as plain values with units in the keys, as in a rig file."""
+    """Return a rig as plain values with units in the keys, as in a rig file.
+
+    Parameters
+    ----------
+    rig : Rig
+        The rig.
+
+    Returns
+    -------
+    dict
+        What ``rig_from_mapping`` takes.
+    """
     return {
         "name": rig.name,
         "T_head_lidar": rig.T_head_lidar.tolist(),
@@ -184,6 +195,17 @@ def _checked(rig: Rig) -> Rig:
 
 
 def rig_digest(rig: Rig) -> str:
-    """Return the first 16 hexadecimal digits of the SHA-256 of the rig's canonical text."""
+    """Return what names a rig: 16 hexadecimal digits.
+
+    Parameters
+    ----------
+    rig : Rig
+        The rig.
+
+    Returns
+    -------
+    str
+        Start of the SHA-256 of the rig's sorted JSON.
+    """
     text = json.dumps(rig_to_mapping(rig), sort_keys=True, separators=(",", ":"))
     return hashlib.sha256(text.encode()).hexdigest()[:16]
