@@ -6,7 +6,7 @@ tell: the noise of this sensor today, and what each laser measures too long.
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import fields, replace
 from typing import NamedTuple
 
 import numpy as np
@@ -433,6 +433,12 @@ def _refusal(estimate: _Estimate, k: int, n_used: int, moved: float, radius: flo
     return ""
 
 
+def _some(beams: Beams, chosen: Mask) -> Beams:
+    """Return some of the beams."""
+    columns = (f.name for f in fields(beams) if f.name != "divergence")
+    return replace(beams, **{name: getattr(beams, name)[chosen] for name in columns})
+
+
 def _judged(
     shots: _Shots,
     estimate: _Estimate,
@@ -452,7 +458,7 @@ def _judged(
             p_base=candidate.p_base_rough.copy(), n_points=len(candidate.members), reason=reason
         )
     own = _own_factor(estimate, mine)
-    rings = shots.beams.rings[used]
+    lit = _some(shots.beams, used)
     fit = MarkerFit(
         p_base=p.copy(),
         cov_p_base=_covariance(estimate, k, own, n_used),
@@ -462,14 +468,14 @@ def _judged(
         radius=radius,
         radius_free=free[0],
         sigma_radius_free=free[1],
-        mean_range=float(np.linalg.norm(shots.beams.origins_base[used].mean(axis=0) - p)),
-        mean_intensity=float(shots.beams.intensities[used].mean()),
+        mean_range=float(np.linalg.norm(lit.origins_base.mean(axis=0) - p)),
+        mean_intensity=float(lit.intensities.mean()),
         used=shots.rows[used],
         rejected=shots.rows[mine & ~used],
         residuals=estimate.residuals[used],
         sigma0=own,
-        n_rings=len(np.unique(rings[rings != RING_UNKNOWN])),
-        coverage=share_of_outline(estimate.prediction.offsets[used], radius),
+        n_rings=len(np.unique(lit.rings[lit.rings != RING_UNKNOWN])),
+        coverage=share_of_outline(lit, estimate.prediction.offsets[used], radius),
     )
     weakness = _weakness(fit, estimate.state.factor)
     return replace(fit, status=Status.WEAK, reason=weakness) if weakness else fit

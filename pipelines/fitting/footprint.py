@@ -16,7 +16,7 @@ from pipelines.values import Array, Beams, Index
 
 _N_STRIPS = 8  # strips of the ellipse; with 8 the mean is good to 0.01 mm of a 0.1 m ball at 8 m
 _MIDDLE = 0.3  # radii: returns nearer to the middle belong to no side
-_THIN = 1e-4  # [m]; a thinner footprint is a ray, and this one differs from it by 1e-8 m
+_THIN = 1e-6  # [m]; a thinner footprint is a ray, and this one differs from it by nothing
 
 
 class Prediction(NamedTuple):
@@ -71,13 +71,15 @@ def predict(beams: Beams, centres: Array, radii: Array, which: Index) -> Predict
     return Prediction(*_predict(aim, np.maximum(half_widths, _THIN), centres, radii, which))
 
 
-def share_of_outline(offsets: Array, radius: float) -> float:
+def share_of_outline(beams: Beams, offsets: Array, radius: float) -> float:
     """Tell how much of a sphere's visible half has returns.
 
     Parameters
     ----------
+    beams : Beams
+        Beams to one sphere.
     offsets : (n, 2)
-        Where the beams pass the centre, square to them [m].
+        Where they pass its centre, as predicted [m].
     radius : float
         Radius of the sphere [m].
 
@@ -86,8 +88,16 @@ def share_of_outline(offsets: Array, radius: float) -> float:
     float
         Share of the eight sectors of the outline that hold returns off the middle, 0 to 1.
     """
-    is_off = np.hypot(offsets[:, 0], offsets[:, 1]) > _MIDDLE * radius
-    sectors = np.floor(np.arctan2(offsets[is_off, 1], offsets[is_off, 0]) / (np.pi / 4.0))
+    u, a = beams.directions_base, beams.across_base
+    passed = offsets[:, :1] * a + offsets[:, 1:] * np.cross(u, a)
+    # the footprint's axes turn over between the two faces of the scan, these do not
+    middle = u.mean(axis=0)
+    first = np.cross(middle, np.eye(3)[np.argmin(np.abs(middle))])
+    first /= np.linalg.norm(first)
+    second = np.cross(middle, first)
+    x, y = passed @ first, passed @ second
+    is_off = np.hypot(x, y) > _MIDDLE * radius
+    sectors = np.floor(np.arctan2(y[is_off], x[is_off]) / (np.pi / 4.0))
     return len(np.unique(sectors)) / 8.0
 
 
@@ -150,9 +160,14 @@ def _mean_depth(
             continue
         left_free, right_free = 1.0 * (left > -h), 1.0 * (right < h)
         left, right = max(left, -h), min(right, h)
-        depth_left = np.sqrt(max(h2 - left * left, 0.0))
-        depth_right = np.sqrt(max(h2 - right * right, 0.0))
-        turn = np.arcsin(right / h) - np.arcsin(left / h)
+        # at the outline depth is zero and its angle a quarter turn, without rounding
+        depth_left, depth_right, turn = 0.0, 0.0, np.pi
+        if left_free:
+            depth_left = np.sqrt(h2 - left * left)
+            turn -= 0.5 * np.pi + np.arcsin(left / h)
+        if right_free:
+            depth_right = np.sqrt(h2 - right * right)
+            turn -= 0.5 * np.pi - np.arcsin(right / h)
         total += weight * 0.5 * (right * depth_right - left * depth_left + h2 * turn)
         length += weight * (right - left)
         total_x += weight * (depth_left - depth_right)

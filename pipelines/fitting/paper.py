@@ -155,5 +155,5 @@ def _described(
         residuals=shots.ranges - prediction.ranges,
         sigma0=1.0,
         n_rings=len(np.unique(rings)),
-        coverage=share_of_outline(prediction.offsets, radius),
+        coverage=share_of_outline(shots, prediction.offsets, radius),
     )

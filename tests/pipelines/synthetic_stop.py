@@ -93,7 +93,7 @@ def ground_ranges(origins, directions, z):
 
 
 def footprint(shots, divergence, n=24):
-    """Rays, (n * n, 3) a shot and each with the same share of the light, that fill the footprint."""
+    """Rays, n * n a shot and each with the same share of the light, that fill the footprint."""
     r = np.sqrt((np.arange(n) + 0.5) / n)
     phi = 2 * np.pi * (np.arange(n) + 0.5) / n
     x = (r[:, None] * np.cos(phi)).ravel() * divergence[0] / 2
@@ -103,9 +103,9 @@ def footprint(shots, divergence, n=24):
     return v / np.linalg.norm(v, axis=-1, keepdims=True)
 
 
-def lit_ranges(shots, centre, radius, divergence):
+def lit_ranges(shots, centre, radius, divergence, n=24):
     """Mean range over the part of each footprint that hits a sphere, infinite where none does."""
-    rays = footprint(shots, divergence)
+    rays = footprint(shots, divergence, n)
     t = sphere_ranges(shots.origins[:, None], rays, centre, radius)
     hits = np.isfinite(t)
     total = np.where(hits, t, 0).sum(axis=1)
