@@ -46,7 +46,6 @@ def create_app(settings: Settings) -> FastAPI:
         openapi_url=f"{ROOT}/openapi.json",
         docs_url=None,  # FastAPI's pages load their scripts from another host
         redoc_url=None,
-        max_body_size=guard.BODY_MAX,
         generate_unique_id_function=lambda route: route.name,
         responses={"default": {"model": errors.Problem, "description": "What went wrong."}},
     )

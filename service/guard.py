@@ -14,6 +14,7 @@ from urllib.parse import urlsplit
 
 from fastapi import Request
 from starlette.datastructures import Headers, MutableHeaders
+from starlette.exceptions import HTTPException
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from pipelines.errors import SpheremarkError
@@ -84,7 +85,8 @@ class Guard:
             response = problem_response(problem_of(error, request.url.path), _challenge(error))
             await response(scope, receive, send_with_headers)
             return
-        await self.app(scope, receive, send_with_headers)
+        bounded = receive if request.url.path in LONG_PATHS else _bounded(receive)
+        await self.app(scope, bounded, send_with_headers)
 
     def check(self, request: Request) -> None:
         """Raise unless the request may pass."""
@@ -101,8 +103,8 @@ class Guard:
                 "things here."
             )
         declared = headers.get("content-length", "")
-        if declared.isdecimal() and int(declared) > BODY_MAX and request.url.path not in LONG_PATHS:
-            raise TooLargeError(f"The body has {int(declared):,} bytes; {BODY_MAX:,} are accepted.")
+        if declared.isdecimal() and request.url.path not in LONG_PATHS:
+            _check_length(int(declared))
         is_open = request.url.path.startswith(OPEN_PATHS)
         if self.token and not is_open and not carries_token(request, self.token):
             raise UnauthorizedError(
@@ -154,6 +156,29 @@ def is_token(given: str, token: str) -> bool:
 def cookie_value(token: str) -> str:
     """Return what a browser keeps in place of the token itself."""
     return hmac.new(token.encode(), b"spheremark cookie", hashlib.sha256).hexdigest()
+
+
+def _check_length(n_bytes: int) -> None:
+    """Refuse a body that no route reads."""
+    if n_bytes > BODY_MAX:
+        raise TooLargeError(f"The body has over {BODY_MAX:,} bytes, the most that is accepted.")
+
+
+def _bounded(receive: Receive) -> Receive:
+    """Return what receives a body whose length nobody declared, up to the limit."""
+    n_bytes = 0
+
+    async def counted() -> Message:
+        nonlocal n_bytes
+        message = await receive()
+        n_bytes += len(message.get("body", b""))
+        try:
+            _check_length(n_bytes)
+        except TooLargeError as error:  # the one kind that FastAPI lets through while it reads
+            raise HTTPException(413, str(error)) from error
+        return message
+
+    return counted
 
 
 def _challenge(error: SpheremarkError) -> dict[str, str]:

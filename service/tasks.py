@@ -16,6 +16,7 @@ from datetime import UTC, datetime
 from functools import lru_cache
 from importlib import metadata
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from time import perf_counter
 from typing import TYPE_CHECKING
 
@@ -197,6 +198,30 @@ class WarmUp(WorkerPlugin):  # type: ignore[misc]  # distributed ships no types
 
 
 def warm_up() -> None:
-    """Load what a job needs, and have the kernels compiled or read from their cache."""
+    """Load what a job needs beside the first one."""
+    import open3d  # noqa: F401
+
     from pipelines import survey  # noqa: F401
     from storage import clouds, recordings, results  # noqa: F401
+
+
+def compile_kernels() -> None:
+    """Run the whole chain on a small simulated log, so that later runs find compiled kernels."""
+    from pipelines.simulation import SimulationConfig, scenario, simulate_stop
+    from pipelines.survey import process
+    from storage.clouds import view
+    from storage.recordings import inspect_log, read_log, write_log
+
+    field = scenario("paper-field", 0)
+    quick = SimulationConfig(only_near_spheres=True)
+    stop = simulate_stop(field, field.stops[0].name, quick)
+    with TemporaryDirectory() as folder:
+        path = Path(folder) / "small.mcap"
+        write_log(stop.log, path)
+        inspect_log(path)
+        for result in process(read_log(path), config=SurveyConfig(), marks=field.marks):
+            view(result, 1000)
+
+
+if __name__ == "__main__":
+    compile_kernels()

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import asyncio
-import sys
 from typing import Annotated, Any
 
 from fastapi import APIRouter, Path, Query, Request, Response
@@ -38,7 +37,6 @@ _BODY = {
     name="upload_recording",
     status_code=201,
     openapi_extra=_BODY,
-    max_body_size=sys.maxsize,  # the settings' limit counts, while the body is written
     responses={200: {"model": Upload, "description": "The same log was here already."}},
 )
 async def upload_recording(

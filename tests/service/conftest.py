@@ -1,0 +1,88 @@
+"""One simulated stop, and a running service on a folder of its own, for the tests of this room."""
+
+import time
+
+import psutil
+import pytest
+from fastapi.testclient import TestClient
+
+from pipelines.simulation import SimulationConfig
+from service.app import create_app
+from service.fieldwork import Assignment, survey
+from service.settings import Settings
+
+MCAP = {"Content-Type": "application/vnd.mcap"}
+
+
+class Site:
+    """A service that runs, and the steps that many tests begin with."""
+
+    def __init__(self, client, stop, control):
+        self.client, self.stop, self.control = client, stop, control
+
+    def survey(self, name):
+        """Make a survey with control and truth."""
+        kind = {"Content-Type": "text/csv"}
+        url = f"/api/v1/surveys/{name}"
+        self.client.put(f"{url}/control", content=self.control, headers=kind).raise_for_status()
+        kind = {"Content-Type": "application/json"}
+        truth = self.stop.truth.read_bytes()
+        self.client.put(f"{url}/truth", content=truth, headers=kind).raise_for_status()
+
+    def upload(self, body=None, name="lane1-stop1", **query):
+        """Send a log."""
+        return self.client.post(
+            "/api/v1/recordings",
+            params={"name": name, **query},
+            content=self.stop.log.read_bytes() if body is None else body,
+            headers=MCAP,
+        )
+
+    def workers(self):
+        """Return the worker processes of the service."""
+        children = psutil.Process().children(recursive=True)
+        return [one for one in children if "spawn_main" in " ".join(one.cmdline())]
+
+    def ended(self, job_id, seconds=60):
+        """Wait for the end of a job."""
+        deadline = time.monotonic() + seconds
+        while time.monotonic() < deadline:
+            job = self.client.get(f"/api/v1/jobs/{job_id}").json()
+            if job["status"] not in ("accepted", "running"):
+                return job
+            time.sleep(0.05)
+        raise TimeoutError(f"job {job_id} did not end within {seconds} s")
+
+
+@pytest.fixture(scope="session")
+def stop(tmp_path_factory):
+    """Return a simulated stop on disk: only beams near spheres, which is all that centres need."""
+    wanted = Assignment(
+        scenario="paper-field",
+        stops="lane1-stop1",
+        seed=3,
+        config=SimulationConfig(only_near_spheres=True),
+        compression="none",
+    )
+    (made,) = survey(tmp_path_factory.mktemp("simulated"), wanted)
+    return made
+
+
+@pytest.fixture(scope="session")
+def control(stop):
+    """Return the control marks of the simulated field as CSV."""
+    return (stop.log.parent / "control.csv").read_text()
+
+
+@pytest.fixture(scope="module")
+def site(tmp_path_factory, stop, control):
+    """Return a service that runs with one worker."""
+    settings = Settings(data=tmp_path_factory.mktemp("data"), workers=1)
+    with TestClient(create_app(settings), base_url="http://127.0.0.1:8000") as client:
+        yield Site(client, stop, control)
+
+
+@pytest.fixture
+def open_site():
+    """Return what wraps a client of a test's own service."""
+    return Site

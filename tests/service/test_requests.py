@@ -1,0 +1,257 @@
+"""What every route does with what it should not get, and what every answer carries."""
+
+import hashlib
+
+import duckdb
+import pytest
+from fastapi.testclient import TestClient
+
+from service.app import create_app
+from service.settings import Settings
+
+DIGEST = "0" * 64
+WRONG = [  # method, path, arguments, status, code
+    ("GET", "/api/v1/nowhere", {}, 404, "not_found"),
+    ("PATCH", "/api/v1/surveys", {}, 405, "method_not_allowed"),
+    ("POST", "/api/v1/surveys", {"json": {}}, 422, "input.validation"),
+    ("POST", "/api/v1/surveys", {"json": {"name": "a", "nme": "b"}}, 422, "input.validation"),
+    ("POST", "/api/v1/surveys", {"content": "{", "headers": {"Content-Type": "application/json"}},
+     400, "input.validation"),
+    ("GET", "/api/v1/surveys?limit=0", {}, 422, "input.validation"),
+    ("GET", "/api/v1/surveys?after=nonsense", {}, 400, "input"),
+    ("GET", "/api/v1/surveys/nobody", {}, 404, "not_found"),
+    ("GET", "/api/v1/surveys/nobody/control", {}, 404, "not_found"),
+    ("PUT", "/api/v1/surveys/a/control", {"content": ""}, 400, "input.empty"),
+    ("PUT", "/api/v1/surveys/a/control", {"content": "x", "headers": {"Content-Type": "a/b"}},
+     415, "input.media_type"),
+    ("PUT", "/api/v1/surveys/a/control",
+     {"content": "mark,x_m,y_m,z_m\nA,1,2,three\n", "headers": {"Content-Type": "text/csv"}},
+     400, "input.control"),
+    ("PUT", "/api/v1/surveys/a/control", {"json": {"marks": [{"mark": "A"}]}},
+     422, "input.validation"),
+    ("PUT", "/api/v1/surveys/a/control",
+     {"content": b"\xff\xfe", "headers": {"Content-Type": "text/csv"}}, 400, "input"),
+    ("PUT", "/api/v1/surveys/nobody/truth", {"json": {"marks": 3}}, 400, "input.truth"),
+    ("POST", "/api/v1/recordings", {"content": b"x"}, 422, "input.validation"),
+    ("POST", "/api/v1/recordings?name=a", {"content": b"x"}, 415, "input.media_type"),
+    ("POST", "/api/v1/recordings?name=a",
+     {"content": b"", "headers": {"Content-Type": "application/vnd.mcap"}}, 400, "input.empty"),
+    ("POST", "/api/v1/recordings?name=a&process=true",
+     {"content": b"x", "headers": {"Content-Type": "application/vnd.mcap"}}, 400, "input"),
+    ("POST", "/api/v1/recordings?name=a&survey=nobody",
+     {"content": b"x", "headers": {"Content-Type": "application/vnd.mcap"}}, 404, "not_found"),
+    ("GET", f"/api/v1/recordings/{DIGEST}", {}, 404, "not_found"),
+    ("GET", "/api/v1/recordings/short", {}, 422, "input.validation"),
+    ("GET", f"/api/v1/recordings/{DIGEST}/preflight", {}, 404, "not_found"),
+    ("GET", f"/api/v1/recordings/{DIGEST}/file", {}, 404, "not_found"),
+    ("POST", "/api/v1/jobs", {"json": {"survey": "nobody", "recording": DIGEST}},
+     404, "not_found"),
+    ("POST", "/api/v1/jobs", {"json": {"kind": "magic", "survey": "a", "recording": DIGEST}},
+     422, "input.validation"),
+    ("GET", "/api/v1/jobs?status=odd", {}, 422, "input.validation"),
+    ("GET", "/api/v1/jobs/none", {}, 404, "not_found"),
+    ("GET", "/api/v1/jobs/none/events", {}, 404, "not_found"),
+    ("DELETE", "/api/v1/jobs/none", {}, 404, "not_found"),
+    ("GET", "/api/v1/runs/none", {}, 404, "not_found"),
+    ("GET", "/api/v1/runs?colour=red", {}, 422, "input.validation"),
+    ("GET", "/api/v1/marker-fits/none", {}, 404, "not_found"),
+    ("GET", "/api/v1/marker-fits?limit=1001", {}, 422, "input.validation"),
+    ("GET", "/api/v1/station-fixes?latest=perhaps", {}, 422, "input.validation"),
+    ("GET", "/api/v1/station-fixes/none", {}, 404, "not_found"),
+    ("POST", "/api/v1/sql", {"json": {"sql": "SELEKT 1"}}, 400, "query.rejected"),
+    ("POST", "/api/v1/sql", {"json": {"sql": "DROP TABLE jobs"}}, 400, "query.rejected"),
+    ("GET", "/api/v1/sql", {}, 422, "input.validation"),
+    ("GET", "/api/v1/problems/none", {}, 404, "not_found"),
+    ("POST", "/api/v1/sql", {"content": b"x" * (17 << 20)}, 413, "input.too_large"),
+    ("POST", "/api/v1/sql", {"content": iter([b"x" * (9 << 20)] * 2)}, 413, "input.too_large"),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("method", "path", "arguments", "status", "code"), WRONG, ids=lambda v: str(v)[:40]
+)
+def test_every_wrong_request_gets_the_one_shape(site, method, path, arguments, status, code):
+    answer = site.client.request(method, path, **arguments)
+    problem = answer.json()
+    assert (answer.status_code, problem["code"]) == (status, code), problem
+    assert answer.headers["content-type"] == "application/problem+json"
+    assert {"type", "title", "status", "detail", "instance", "code"} <= set(problem)
+    assert problem["status"] == status
+    assert problem["detail"]
+    assert site.client.get(problem["type"]).json()["code"] == code
+
+
+def test_every_route_is_among_the_wrong_requests_or_takes_no_input(site):
+    paths = site.client.get("/api/v1/openapi.json").json()["paths"]
+    harmless = {"/config", "/problems", "/sql/schema", "/export/results.duckdb", "/jobs/events",
+                "/export/coordinates.csv"}  # fmt: skip
+    tried = [path.partition("?")[0].removeprefix("/api/v1").split("/")[1:] for _, path, *_ in WRONG]
+    for path in {one.removeprefix("/api/v1") for one in paths} - harmless:
+        parts = path.split("/")[1:]
+        assert any(
+            len(parts) == len(t)
+            and all(a == b or a[0] == "{" for a, b in zip(parts, t, strict=True))
+            for t in tried
+        ), path
+
+
+def test_operations_have_names_of_their_own(site):
+    paths = site.client.get("/api/v1/openapi.json").json()["paths"]
+    names = [one["operationId"] for path in paths.values() for one in path.values()]
+    assert len(set(names)) == len(names) > 25
+
+
+@pytest.mark.parametrize("path", ["/", "/healthz", "/api/v1/nowhere", "/api/v1/surveys"])
+def test_every_answer_carries_the_policy(site, path):
+    headers = site.client.get(path).headers
+    policy = dict(part.split(" ", 1) for part in headers["content-security-policy"].split("; "))
+    assert policy["default-src"] == "'none'"
+    assert policy["script-src"] == "'self'"
+    assert policy["frame-ancestors"] == "'none'"
+    assert headers["x-content-type-options"] == "nosniff"
+
+
+@pytest.mark.parametrize(
+    "headers",
+    [
+        {"Origin": "https://elsewhere.example"},
+        {"Origin": "null"},
+        {"Sec-Fetch-Site": "cross-site"},
+        {"Host": "elsewhere.example"},
+    ],
+)
+def test_another_site_cannot_change_anything(site, headers):
+    answer = site.client.post("/api/v1/surveys", json={"name": "foreign"}, headers=headers)
+    assert (answer.status_code, answer.json()["code"]) == (403, "forbidden")
+    assert site.client.get("/api/v1/surveys/foreign").status_code == 404
+
+
+def test_a_page_of_this_service_may_change_things(site):
+    headers = {"Origin": "http://127.0.0.1:8000", "Sec-Fetch-Site": "same-origin"}
+    answer = site.client.post("/api/v1/surveys", json={"name": "own"}, headers=headers)
+    assert answer.status_code == 201
+
+
+def test_a_file_that_is_no_mcap_is_refused_and_kept_with_its_reason(site):
+    body = b"this is no log"
+    answer = site.upload(body, name="garbage")
+    problem = answer.json()
+    assert (answer.status_code, problem["code"]) == (422, "input.recording.not_mcap")
+    digest = hashlib.sha256(body).hexdigest()
+    assert problem["recording_id"] == digest
+    kept = site.client.get(f"/api/v1/recordings/{digest}").json()
+    assert (kept["verdict"], kept["name"]) == ("refused", "garbage")
+    assert kept["preflight"]["reasons"]
+    site.client.post("/api/v1/surveys", json={"name": "refusing"})
+    job = site.client.post("/api/v1/jobs", json={"survey": "refusing", "recording": digest})
+    assert (job.status_code, job.json()["code"]) == (422, "input.recording.not_mcap")
+
+
+def test_a_log_that_breaks_off_is_refused_or_weak_but_never_ok(site):
+    whole = site.stop.log.read_bytes()
+    answer = site.upload(whole[: len(whole) // 2], name="half")
+    assert answer.status_code == 422
+    assert answer.json()["code"] == "input.recording.truncated"
+
+
+def test_a_log_larger_than_the_limit_is_refused_by_its_header_and_leaves_nothing(tmp_path):
+    settings = Settings(data=tmp_path, workers=1, max_upload_bytes=1000)
+    with TestClient(create_app(settings)) as client:
+        kind = {"Content-Type": "application/octet-stream"}
+        for body in (b"x" * 1001, iter([b"x" * 600] * 2)):
+            answer = client.post("/api/v1/recordings?name=a", content=body, headers=kind)
+            assert (answer.status_code, answer.json()["code"]) == (413, "input.too_large")
+    assert not [path for path in (tmp_path / "recordings").rglob("*") if path.is_file()]
+
+
+def test_control_marks_survive_the_way_there_and_back(site):
+    site.survey("control")
+    url = "/api/v1/surveys/control/control"
+    first = site.client.get(url).json()
+    assert len(first["marks"]) == 14
+    site.client.put(url, json=first).raise_for_status()
+    assert site.client.get(url).json() == first
+    as_csv = site.client.get(url, headers={"Accept": "text/csv"}).text
+    kind = {"Content-Type": "text/csv"}
+    assert site.client.put(url, content=as_csv, headers=kind).json() == first
+
+
+def test_lists_go_on_where_they_ended(site):
+    for i in range(3):
+        site.client.post("/api/v1/surveys", json={"name": f"listed {i}"})
+    names, after = [], None
+    while True:
+        query = {"limit": 2} | ({"after": after} if after else {})
+        part = site.client.get("/api/v1/surveys", params=query).json()
+        names += [one["name"] for one in part["items"]]
+        if (after := part["next"]) is None:
+            break
+    assert len(set(names)) == len(names)
+    assert {f"listed {i}" for i in range(3)} <= set(names)
+
+
+def test_sql_answers_in_json_and_csv_and_says_what_is_cut(site):
+    sql = "SELECT range AS n, range / 2.0 AS half_m FROM range(20000)"
+    answer = site.client.post("/api/v1/sql", json={"sql": sql}).json()
+    assert answer["columns"][1] == {"name": "half_m", "type": "DOUBLE", "unit": "m"}
+    assert (len(answer["rows"]), answer["row_limit"], answer["truncated"]) == (10000, 10000, True)
+    kind = {"Accept": "text/csv"}
+    text = site.client.post("/api/v1/sql", json={"sql": sql}, headers=kind)
+    assert text.headers["x-truncated"] == "true"
+    assert text.text.splitlines()[:2] == ["n,half_m", "0,0.0"]
+    linked = site.client.get("/api/v1/sql", params={"q": "SELECT 1 AS one"}).json()
+    assert linked["rows"] == [[1]]
+
+
+def test_the_schema_names_every_column_with_its_unit(site):
+    tables = {one["name"]: one for one in site.client.get("/api/v1/sql/schema").json()["items"]}
+    units = {column["name"]: column["unit"] for column in tables["marker_fits"]["columns"]}
+    assert units["range_m"] == "m"
+    assert units["cov_xx_m2"] == "m²"
+    assert tables["accuracy_by_stop"]["kind"] == "view"
+
+
+def test_the_exported_database_opens_elsewhere(site, tmp_path):
+    path = tmp_path / "results.duckdb"
+    path.write_bytes(site.client.get("/api/v1/export/results.duckdb").content)
+    site.client.post("/api/v1/surveys", json={"name": "later"})
+    with duckdb.connect(str(path), read_only=True) as copy:
+        assert copy.execute("SELECT count(*) FROM marker_fits").fetchall()[0][0] >= 0
+
+
+def test_a_token_is_asked_for_and_a_browser_can_log_in(tmp_path):
+    settings = Settings(data=tmp_path, workers=1, host="0.0.0.0", token="secret")
+    with TestClient(create_app(settings), base_url="http://rover.example") as client:
+        refused = client.get("/api/v1/surveys")
+        assert (refused.status_code, refused.headers["www-authenticate"]) == (401, "Bearer")
+        bearer = {"Authorization": "Bearer secret"}
+        assert client.get("/api/v1/surveys", headers=bearer).status_code == 200
+        wrong = {"Authorization": "Bearer wrong"}
+        assert client.get("/api/v1/surveys", headers=wrong).status_code == 401
+        assert client.get("/healthz").status_code == 200
+        assert client.get("/login?token=wrong").status_code == 401
+        client.get("/login?token=secret", follow_redirects=False)
+        assert client.get("/api/v1/surveys").status_code == 200
+
+
+def test_an_open_address_without_a_token_is_refused():
+    with pytest.raises(ValueError, match="SPHEREMARK_TOKEN"):
+        Settings(host="0.0.0.0")
+
+
+def test_settings_come_from_the_environment_and_are_described(monkeypatch):
+    monkeypatch.setenv("SPHEREMARK_PORT", "8111")
+    assert Settings().port == 8111
+    assert all(field.description for field in Settings.model_fields.values())
+
+
+def test_an_unforeseen_error_tells_no_secrets(site):
+    app = site.client.app
+    quiet = TestClient(app, raise_server_exceptions=False, base_url="http://127.0.0.1:8000")
+    catalogue, app.state.service = app.state.service, None
+    try:
+        answer = quiet.get("/api/v1/surveys")
+    finally:
+        app.state.service = catalogue
+    assert (answer.status_code, answer.json()["code"]) == (500, "internal")
+    assert "NoneType" not in answer.text
