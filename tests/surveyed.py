@@ -1,5 +1,6 @@
 """A surveyed field for tests of pages: known errors, put through the real catalogue."""
 
+import hashlib
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
 
@@ -159,7 +160,14 @@ def _pairs(truth, centres, method, rng):
 
 
 def fill(
-    catalogue: Catalogue, folder: Path, name: str, *, n_stops=3, with_truth=True, lane="lane3"
+    catalogue: Catalogue,
+    folder: Path,
+    name: str,
+    *,
+    n_stops=3,
+    with_truth=True,
+    lane="lane3",
+    at=NOW,
 ):
     """Put a survey with a lane of stops into a catalogue, one job for each."""
     rng, control = np.random.default_rng(7), marks()
@@ -171,12 +179,13 @@ def fill(
         poses = tuple(pose for _, pose in stops)
         catalogue.put_truth(name, Truth(marks=control, stops=poses, rig=None))
     for i, (result, _) in enumerate(stops):
-        _finish(catalogue, folder, survey.survey_id, f"{name}-{i}", result, control)
+        moment = at + timedelta(minutes=i)
+        _finish(catalogue, folder, survey.survey_id, moment, result, control)
 
 
-def _finish(catalogue, folder, survey_id, salt, result, control):
+def _finish(catalogue, folder, survey_id, moment, result, control):
     """Enter a recording and a successful job with its results."""
-    digest = f"{abs(hash(salt)):x}".rjust(64, "0")[:64]
+    digest = hashlib.sha256(f"{survey_id} {result.name}".encode()).hexdigest()
     report = {"verdict": "ok", "reasons": [], "topics": [{"topic": "/points", "n_messages": 132}]}
     catalogue.add_recording(
         digest, name=result.name, size_bytes=91_000_000, url="/nowhere.mcap", preflight=report
@@ -190,7 +199,7 @@ def _finish(catalogue, folder, survey_id, salt, result, control):
         recording_id=digest,
         config=SurveyConfig(),
         code_version="0.1.0",
-        finished_at=NOW + timedelta(minutes=len(salt)),
+        finished_at=moment,
         duration=2.5,
     )
     clouds = {result.name: write_cloud(result, str(folder), n_max=3000)}

@@ -17,6 +17,7 @@ _CELLS = (0.15, 0.2, 0.3, 0.4)  # [m]; of the surroundings one return is shown i
 _N_SHOWN = 30_000  # returns of the surroundings; more makes a browser without a GPU slow
 _MARGIN = 2.0  # [m] of surroundings shown beyond the farthest marker that stands on a mark
 _REACH = 1.3  # returns within so many radii of a centre are shown with it
+_LEAST = 8.0  # [m] that a scene shows at least, before the margin
 _COLOUR_SIGMAS = 3.0  # the colours of residuals end here
 _N_MERIDIANS, _N_PARALLELS = 18, 8  # of a drawn sphere
 
@@ -147,7 +148,7 @@ def _within(p: NDArray[np.float32], centre: Array, reach: float) -> Index:
 
 def _reach(fits: Columns) -> float:
     """Return how far a scene goes: beyond the farthest fit that stands on a mark [m]."""
-    return float(np.max(floats(fits, "range_m")[on_marks(fits)], initial=8.0)) + _MARGIN
+    return float(np.max(floats(fits, "range_m")[on_marks(fits)], initial=_LEAST)) + _MARGIN
 
 
 def _surroundings(scan: Scan, reach: float) -> Index:

@@ -1,0 +1,180 @@
+"""Every page in a real Chromium: it draws, obeys the policy, stays on this host, and fits."""
+
+import re
+import shutil
+import threading
+import time
+
+import pytest
+import uvicorn
+from playwright.sync_api import sync_playwright
+
+from service.app import create_app
+from service.settings import Settings
+from storage.catalogue import Catalogue
+from tests.surveyed import fill
+
+CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser")
+pytestmark = pytest.mark.skipif(
+    CHROMIUM is None, reason="Chromium is not installed; on Debian: apt-get install chromium"
+)
+
+STOP = "/surveys/field/stops/lane3-stop1"
+PAGES = [
+    "/",
+    "/surveys/field",
+    "/surveys/field?axes=log&method=along_beam",
+    "/surveys/blind",
+    STOP,
+    f"{STOP}?method=paper&marker=M03",
+    "/jobs",
+    "/sql?q=SELECT+stop%2C+x_m%2C+y_m+FROM+latest_station_fixes+ORDER+BY+ALL",
+]
+LOOKS = [(1440, "dark"), (390, "light")]
+HARMLESS = re.compile("GPU stall|willReadFrequently|GroupMarkerNotSet")  # no GPU in a test
+
+
+@pytest.fixture(scope="session")
+def address(tmp_path_factory):
+    data = tmp_path_factory.mktemp("data")
+    with Catalogue(data / "spheremark.duckdb", snapshots=data / "snapshots") as catalogue:
+        fill(catalogue, data / "clouds", "field", n_stops=2)
+        fill(catalogue, data / "clouds", "blind", n_stops=1, with_truth=False, lane="a")
+    app = create_app(Settings(data=data, workers=1))
+    server = uvicorn.Server(uvicorn.Config(app, port=0, log_level="error"))
+    thread = threading.Thread(target=server.run)
+    thread.start()
+    while not server.started:
+        assert thread.is_alive(), "The service did not start."
+        time.sleep(0.05)
+    yield f"http://127.0.0.1:{server.servers[0].sockets[0].getsockname()[1]}"
+    server.should_exit = True
+    thread.join(timeout=30)
+
+
+@pytest.fixture(scope="session")
+def browser():
+    with sync_playwright() as playwright:
+        browser = playwright.chromium.launch(executable_path=CHROMIUM, args=["--no-sandbox"])
+        yield browser
+        browser.close()
+
+
+class Visit:
+    """A page that is watched while it loads."""
+
+    def __init__(self, browser, address, *, width=1440, scheme="light"):
+        self.address, self.complaints, self.strangers = address, [], []
+        self.context = browser.new_context(
+            viewport={"width": width, "height": 900}, color_scheme=scheme
+        )
+        self.page = self.context.new_page()
+        self.page.on("console", self._hear)
+        self.page.on("pageerror", lambda error: self.complaints.append(str(error)))
+        self.page.on("request", self._see)
+
+    def _hear(self, message):
+        if message.type in ("error", "warning") and not HARMLESS.search(message.text):
+            self.complaints.append(message.text)
+
+    def _see(self, request):
+        if not request.url.startswith((self.address, "data:", "blob:")):
+            self.strangers.append(request.url)
+
+    def open(self, path):
+        self.page.goto(self.address + path)
+        self.page.wait_for_selector("[data-figure]:not([data-drawn])", state="detached")
+        return self.page
+
+
+@pytest.fixture
+def visit(browser, address):
+    visits = []
+
+    def start(**look):
+        visits.append(Visit(browser, address, **look))
+        return visits[-1]
+
+    yield start
+    for one in visits:
+        one.context.close()
+
+
+@pytest.mark.parametrize("path", PAGES)
+def test_a_page_draws_without_complaint_and_asks_no_other_host(visit, path):
+    one = visit()
+    page = one.open(path)
+    for plot in page.locator("[data-figure]").all():
+        assert plot.locator("svg.main-svg, canvas").count() > 0
+    page.wait_for_load_state("networkidle")
+    assert one.complaints == []
+    assert one.strangers == []
+
+
+@pytest.mark.parametrize(("width", "scheme"), LOOKS)
+def test_no_page_is_wider_than_the_window(visit, width, scheme):
+    one = visit(width=width, scheme=scheme)
+    for path in ("/", "/surveys/field", STOP, "/jobs", "/sql", "/nowhere"):
+        page = one.open(path)
+        assert page.evaluate("document.documentElement.scrollWidth") <= width, path
+        assert page.evaluate("document.documentElement.dataset.theme") == scheme
+
+
+def test_the_toggle_redraws_the_figures_and_is_remembered(visit):
+    one = visit()
+    page = one.open("/surveys/field")
+    ground = page.evaluate("getComputedStyle(document.body).backgroundColor")
+    page.click("#theme-toggle")
+    page.wait_for_selector("#distance [data-drawn=dark]")
+    assert page.evaluate("getComputedStyle(document.body).backgroundColor") != ground
+    assert one.open("/sql").evaluate("document.documentElement.dataset.theme") == "dark"
+
+
+def test_changing_a_filter_changes_the_address(visit):
+    page = visit().open("/surveys/field")
+    page.select_option("#stop", "lane3-stop2")
+    page.wait_for_url(re.compile(r"stop=lane3-stop2"))
+    assert page.locator("table tbody tr").count() == 2
+
+
+def test_a_query_in_the_address_runs_and_is_charted(visit):
+    page = visit().open(PAGES[-1])
+    page.wait_for_selector("#result-full:not([hidden])")
+    assert page.locator("#result tbody tr").count() == 6
+    assert page.locator("#result thead").inner_text().split() == [
+        "stop",
+        "x_m",
+        "[m]",
+        "y_m",
+        "[m]",
+    ]
+    page.wait_for_selector("#chart-plot svg.main-svg")
+
+
+def test_a_query_is_written_run_and_kept_by_keyboard_alone(visit):
+    page = visit().open("/sql")
+    page.wait_for_selector(".cm-content")
+    page.focus(".cm-content")
+    page.keyboard.press("Control+a")
+    page.keyboard.type("SELECT 42 AS answer_m")
+    page.keyboard.press("Control+Enter")
+    page.wait_for_selector("#result tbody td")
+    assert page.locator("#result tbody td").inner_text() == "42"
+    assert "SELECT+42" in page.url
+    assert page.locator("#history li").count() == 1
+
+
+def test_a_query_that_cannot_run_says_why(visit):
+    page = visit().open("/sql?q=DROP+TABLE+stops")
+    page.wait_for_selector("#result-error:not([hidden])")
+    assert "SELECT" in page.locator("#result-error").inner_text()
+
+
+def test_a_file_that_is_no_log_is_refused_with_its_reason(visit, tmp_path):
+    log = tmp_path / "notes.mcap"
+    log.write_bytes(b"this is not a log" * 100)
+    page = visit().open("/")
+    page.select_option("#upload-survey", "")
+    page.set_input_files("#files", log)
+    page.wait_for_selector("#uploads .outcome:has-text('refused'), #uploads .outcome.bad")
+    assert page.locator("#uploads li").count() == 1
