@@ -36,7 +36,11 @@ _STRANGE = 0.3  # share of the returns inside the outline that may be off the ba
 _SIGMAS = 3.5  # standard deviations at which a shape is refused
 _RADIUS_SLACK = 0.12  # of the radius: less is no reason to refuse, the fit judges it
 _N_SHAPELY = 12  # returns that show the width of what they lie on
+_N_LOOK = 4  # returns without which there is nothing to look at
+_N_STEPS = 6  # of a fit that only has to tell what a group is
+_NOISE_MIN = 0.006  # [m] of any VLP-16: what scatters less is not known better
 _N_FACE = 256  # cells along a face of the cube of directions: 0.45 deg
+_N_SURE = 20  # returns that show a shape well enough to judge by it alone
 _SHAPE_SURE = 0.05  # of the radius: a radius known that well tells a ball from a stone by itself
 _REACH = 4.5  # radii about a seed whose returns decide whether a ball stands free there
 
@@ -74,24 +78,15 @@ def extract(
     ball = _Ball(marker_radius, up, float(cloud.rig.divergence.max()))
     grid = _grid(cloud, config)
     seeds = _seeds(cloud.p_base, grid.is_above, ball, config.n_points_min)
-    patches = _patches(grid, seeds, marker_radius)
-    table = _look_at_all(cloud.p_base, patches, seeds, _cells_of(seeds, grid), ball)
-    looks = _distinct([_Look(*row) for row in table.tolist()], config, marker_radius)
-    verdicts = [_verdict(look, config, marker_radius) for look in looks]
+    looks = _distinct(_looks(cloud, grid, seeds, ball), config, marker_radius)
+    verdicts = [_verdict(look, config, ball) for look in looks]
     verdicts = _grounded(cloud.p_base, looks, verdicts, ball)
     good = [look for look, reason in zip(looks, verdicts, strict=True) if not reason]
     bad = [(look, reason) for look, reason in zip(looks, verdicts, strict=True) if reason]
     return MarkerCandidates(
-        candidates=tuple(
-            MarkerCandidate(
-                members=_members(cloud, grid, patches, look.p_base, ball),
-                p_base_rough=look.p_base,
-                score=_score(look, config, marker_radius),
-            )
-            for look in sorted(good, key=lambda look: np.arctan2(look.y, look.x))
-        ),
+        candidates=_candidates(cloud, grid, good, ball, config),
         rejected=tuple(
-            Rejection(p_base=look.p_base, n_points=int(look.n_points), reason=reason)
+            Rejection(p_base=look.p_base, n_points=look.n_points, reason=reason)
             for look, reason in bad[:_REJECTIONS_MAX]
         ),
         ground_height_max=grid.ground_height_max,
@@ -372,13 +367,13 @@ class _Look(NamedTuple):
     ----------
     x, y, z : float
         Centre in the base frame [m].
-    n_points : float
+    n_points : int
         Returns that the ball explains.
-    n_strange : float
+    n_strange : int
         Returns inside its outline, about as far away, that it does not explain.
-    n_beside : float
+    n_beside : int
         Returns beside and above its outline, about as far away.
-    n_below : float
+    n_below : int
         Returns below and beside the pole, about as far away or somewhat nearer.
     scatter : float
         Robust standard deviation along the beams [m].
@@ -395,10 +390,10 @@ class _Look(NamedTuple):
     x: float
     y: float
     z: float
-    n_points: float
-    n_strange: float
-    n_beside: float
-    n_below: float
+    n_points: int
+    n_strange: int
+    n_beside: int
+    n_below: int
     scatter: float
     width: float
     height: float
@@ -571,107 +566,130 @@ def _shape(seen: Array, radius: float) -> tuple[Array, Array]:
 
 
 @numba.njit(cache=True, nogil=True)
-def _solve(J: Array, residuals: Array, weights: Array, prior: Array) -> tuple[Array, Array]:
-    """Return the weighted least-squares step and the inverse of its normal matrix."""
-    k = J.shape[1]
-    N = np.diag(prior)
-    g = np.zeros(k)
-    for i in range(len(J)):
-        for a in range(k):
-            g[a] += weights[i] * J[i, a] * residuals[i]
-            for b in range(k):
-                N[a, b] += weights[i] * J[i, a] * J[i, b]
-    inverse: Array = np.linalg.inv(N)
-    return inverse @ g, inverse
-
-
-@numba.njit(cache=True, nogil=True)
-def _weights(seen: Array, residuals: Array, radius: float, blur: float, scatter: float) -> Array:
-    """Return Tukey's weights of the returns that may belong to the ball."""
-    weights = np.zeros(len(seen))
-    limit = 4.7 * scatter
-    for i in range(len(seen)):
-        gap = np.sqrt(seen[i, 0] ** 2 + seen[i, 1] ** 2)
-        is_pole = seen[i, 1] < -0.9 * radius
-        if gap < radius + blur and not is_pole and abs(residuals[i]) < limit:
-            weights[i] = (1.0 - (residuals[i] / limit) ** 2) ** 2
-    return weights
-
-
-@numba.njit(cache=True, nogil=True)
-def _scatter(seen: Array, residuals: Array, radius: float) -> float:
-    """Return the robust standard deviation of the residuals inside the outline [m]."""
-    is_inside = (seen[:, 0] ** 2 + seen[:, 1] ** 2 < (0.9 * radius) ** 2) & (
-        np.abs(residuals) < 1.5 * radius
-    )
-    if np.sum(is_inside) < 3:
-        return np.inf
-    return float(1.4826 * np.median(np.abs(residuals[is_inside])))
-
-
-@numba.njit(cache=True, nogil=True)
-def _settled(points: Array, c: Array, up: Array, radius: float, blur: float) -> tuple[Array, float]:
-    """Return the centre of the ball of known radius and the scatter about it [m]."""
-    scatter = 0.03
-    for _ in range(8):
-        seen, v_across, v_up = _view(points, c, up)
-        residuals, J = _shape(seen, radius)
-        scatter = min(max(_scatter(seen, residuals, radius), 0.004), 0.03)
-        weights = _weights(seen, residuals, radius, blur, scatter)
-        # the prior, 3 cm on a start good to that, keeps a handful of returns from running away
-        step, _ = _solve(J[:, :3], residuals, weights, np.full(3, (scatter / 0.03) ** 2))
-        step *= min(1.0, 0.5 * radius / (np.sqrt(np.sum(step**2)) + 1e-12))
-        c = c + step[0] * v_across + step[1] * v_up + step[2] * c / np.linalg.norm(c)
-    return c, scatter
-
-
-@numba.njit(cache=True, nogil=True)
-def _look(points: Array, c: Array, up: Array, radius: float, blur: float) -> Array:
-    """Return the fields of ``_Look`` for the ball near ``c``; too few points leave zeros."""
-    out = np.zeros(16)
-    c, n = _shifted(points, c, up, radius)
-    out[:3], out[3] = c, n
-    seen, _, _ = _view(points, c, up)
-    out[5], out[6] = _surroundings(seen, radius, blur)
-    if n < 4 or out[5] + out[6] > 2.0 + 0.6 * n:
-        return out
-    points = points[seen[:, 0] ** 2 + seen[:, 1] ** 2 < (3.0 * radius + blur) ** 2]
-    c, scatter = _settled(points, c, up, radius, blur)
-    seen, _, _ = _view(points, c, up)
-    residuals, J = _shape(seen, radius)
-    weights = _weights(seen, residuals, radius, blur, max(scatter, 0.006))
-    is_in = weights > 0.0
-    gaps = np.sqrt(seen[:, 0] ** 2 + seen[:, 1] ** 2)
-    is_strange = ~is_in & (gaps < 0.9 * radius) & (np.abs(seen[:, 2]) < 2.0 * radius)
-    out[:3], out[3], out[4] = c, np.sum(is_in), np.sum(is_strange & (seen[:, 1] > -0.8 * radius))
-    out[5], out[6] = _surroundings(seen, radius, blur)
-    if out[3] < 4:
-        return out
-    out[7] = np.sqrt(np.sum(weights * residuals**2) / np.sum(weights))
-    out[8] = np.max(seen[is_in, 0]) - np.min(seen[is_in, 0])
-    out[9] = np.max(seen[is_in, 1]) - np.min(seen[is_in, 1])
-    noise = max(out[7], 0.006)
-    prior = np.full(5, 1e-6)
-    step, inverse = _solve(J[:, :4], residuals, weights, prior[:4])
-    out[10], out[11] = radius + step[3], noise * np.sqrt(inverse[3, 3])
-    step, inverse = _solve(np.hstack((J[:, :3], J[:, 4:])), residuals, weights, prior)
-    out[12], out[13] = step[3], noise * np.sqrt(inverse[3, 3])
-    out[14], out[15] = step[4], noise * np.sqrt(inverse[4, 4])
-    return out
-
-
-@numba.njit(cache=True, nogil=True)
-def _look_at_all(
+def _approached(
     p_base: Column, patches: _Patches, seeds: Array, seed_cells: NDArray[np.int64], ball: _Ball
 ) -> Array:
-    """Return one row of ``_Look`` for each seed."""
-    out = np.zeros((len(seeds), 16))
+    """Return where seeds' discs came to rest, the returns in, beside and below them, (k, 6)."""
+    out = np.zeros((len(seeds), 6))
     for k in range(len(seeds)):
         rows = _near(p_base, patches, seed_cells[k], seeds[k])
-        points = p_base[rows].astype(np.float64)
-        blur = 0.5 * ball.divergence * np.sqrt(np.sum(seeds[k] ** 2))
-        out[k] = _look(points, seeds[k], ball.up, ball.radius, blur)
+        points = _gathered(p_base, rows)
+        c, n = _shifted(points, seeds[k], ball.up, ball.radius)
+        seen, _, _ = _view(points, c, ball.up)
+        blur = 0.5 * ball.divergence * np.sqrt(c[0] ** 2 + c[1] ** 2 + c[2] ** 2)
+        n_beside, n_below = _surroundings(seen, ball.radius, blur)
+        out[k, 0], out[k, 1], out[k, 2] = c[0], c[1], c[2]
+        out[k, 3], out[k, 4], out[k, 5] = n, n_beside, n_below
     return out
+
+
+@numba.njit(cache=True, nogil=True)
+def _gathered(p_base: Column, rows: NDArray[np.int32]) -> Array:
+    """Return some points in float64."""
+    points = np.empty((len(rows), 3))
+    for i in range(len(rows)):
+        points[i, 0], points[i, 1] = p_base[rows[i], 0], p_base[rows[i], 1]
+        points[i, 2] = p_base[rows[i], 2]
+    return points
+
+
+def _solve(J: Array, residuals: Array, weights: Array, prior: float) -> tuple[Array, Array]:
+    """Return the weighted least-squares step and the inverse of its normal matrix."""
+    weighted = J * weights[:, None]
+    inverse = np.asarray(
+        np.linalg.inv(weighted.T @ J + prior * np.eye(J.shape[1])), dtype=np.float64
+    )
+    return inverse @ (weighted.T @ residuals), inverse
+
+
+def _weights(seen: Array, residuals: Array, radius: float, blur: float, scatter: float) -> Array:
+    """Return Tukey's weights of the returns that may belong to the ball."""
+    limit = 4.7 * scatter
+    is_on = np.hypot(seen[:, 0], seen[:, 1]) < radius + blur
+    is_on &= (seen[:, 1] > -0.9 * radius) & (np.abs(residuals) < limit)
+    return np.where(is_on, (1.0 - (residuals / limit) ** 2) ** 2, 0.0)
+
+
+def _scatter(seen: Array, residuals: Array, radius: float) -> float:
+    """Return the robust standard deviation of the residuals inside the outline [m]."""
+    is_inside = np.hypot(seen[:, 0], seen[:, 1]) < 0.9 * radius
+    inside = np.abs(residuals[is_inside & (np.abs(residuals) < 1.5 * radius)])
+    return float(np.clip(1.4826 * np.median(inside), 0.004, 0.03)) if len(inside) > 2 else 0.03
+
+
+def _settled(points: Array, c: Array, ball: _Ball, n_unknowns: int) -> tuple[Array, float, Array]:
+    """Return the centre of the ball near a place, its radius, and the covariance for unit noise.
+
+    With three unknowns the radius stays as it is, with four it is estimated too. The prior, 3 cm on
+    a start good to that, keeps a handful of returns from running away.
+    """
+    radius, inverse = ball.radius, np.eye(n_unknowns)
+    for _ in range(_N_STEPS):
+        seen, v_across, v_up = _view(points, c, ball.up)
+        residuals, J = _shape(seen, radius)
+        scatter = _scatter(seen, residuals, radius)
+        distance = float(np.linalg.norm(c))
+        weights = _weights(seen, residuals, radius, 0.5 * ball.divergence * distance, scatter)
+        step, inverse = _solve(J[:, :n_unknowns], residuals, weights, (scatter / 0.03) ** 2)
+        step *= min(1.0, 0.5 * ball.radius / (float(np.linalg.norm(step)) + 1e-12))
+        c = c + step[0] * v_across + step[1] * v_up + step[2] * c / distance
+        if n_unknowns > 3:
+            radius = float(np.clip(radius + step[3], 0.3 * ball.radius, 3.0 * ball.radius))
+    return c, radius, inverse
+
+
+def _look(points: Array, start: Array, ball: _Ball) -> _Look | None:
+    """Return what is seen near a place; nothing if hardly a return lies on a ball there."""
+    radius = ball.radius
+    c, _, _ = _settled(points, start, ball, 3)
+    blur = 0.5 * ball.divergence * float(np.linalg.norm(c))
+    seen, _, _ = _view(points, c, ball.up)
+    residuals, J = _shape(seen, radius)
+    scatter = _scatter(seen, residuals, radius)
+    weights = _weights(seen, residuals, radius, blur, max(scatter, _NOISE_MIN))
+    is_in = weights > 0.0
+    if is_in.sum() < _N_LOOK:
+        return None
+    is_strange = ~is_in & (np.hypot(seen[:, 0], seen[:, 1]) < 0.9 * radius)
+    is_strange &= (np.abs(seen[:, 2]) < 2.0 * radius) & (seen[:, 1] > -0.8 * radius)
+    rms = float(np.sqrt(np.sum(weights * residuals**2) / np.sum(weights)))
+    noise = max(rms, _NOISE_MIN)
+    n_beside, n_below = _surroundings(seen, radius, blur)
+    flat, cov_flat = _solve(J[:, [0, 1, 2, 4, 5]], residuals, weights, 1e-6)
+    _, radius_free, cov_free = _settled(points, c, ball, 4)
+    return _Look(
+        x=float(c[0]),
+        y=float(c[1]),
+        z=float(c[2]),
+        n_points=int(is_in.sum()),
+        n_strange=int(is_strange.sum()),
+        n_beside=n_beside,
+        n_below=n_below,
+        scatter=rms,
+        width=float(np.ptp(seen[is_in, 0])),
+        height=float(np.ptp(seen[is_in, 1])),
+        radius_free=radius_free,
+        sigma_radius=noise * float(np.sqrt(cov_free[3, 3])),
+        flat_across=float(flat[3]),
+        sigma_across=noise * float(np.sqrt(cov_flat[3, 3])),
+        flat_along=float(flat[4]),
+        sigma_along=noise * float(np.sqrt(cov_flat[4, 4])),
+    )
+
+
+def _looks(cloud: StitchedCloud, grid: _Grid, seeds: Array, ball: _Ball) -> list[_Look]:
+    """Return what is seen where the seeds' discs came to rest with little around them."""
+    patches = _patches(grid, seeds, ball.radius)
+    found = _approached(cloud.p_base, patches, seeds, _cells_of(seeds, grid), ball)
+    is_free = found[:, 4] + found[:, 5] <= 2.0 + 0.6 * found[:, 3]
+    found = found[(found[:, 3] >= _N_LOOK) & is_free]
+    found = found[np.lexsort((found[:, 2], found[:, 1], found[:, 0], -found[:, 3]))]
+    places = _thinned(found[:, :4].copy(), 0.5 * ball.radius)[:, :3]
+    looks = []
+    for place, cell in zip(places, _cells_of(places, grid), strict=True):
+        points = _gathered(cloud.p_base, _near(cloud.p_base, patches, cell, place))
+        looks.append(_look(points, place, ball))
+    return [look for look in looks if look is not None]
 
 
 def _cells_of(p_base: Array, grid: _Grid) -> NDArray[np.int64]:
@@ -710,26 +728,33 @@ def _passes_first_gate(look: _Look, config: ExtractionConfig, radius: float) -> 
     )
 
 
-def _verdict(look: _Look, config: ExtractionConfig, radius: float) -> str:
+def _radius_slack(look: _Look, ball: _Ball) -> float:
+    """Return by how much the free radius may be off: rays instead of wide beams make it larger."""
+    blur = 0.5 * ball.divergence * float(np.linalg.norm(look.p_base))
+    return max(_SIGMAS * look.sigma_radius, _RADIUS_SLACK * ball.radius + 0.6 * blur)
+
+
+def _verdict(look: _Look, config: ExtractionConfig, ball: _Ball) -> str:
     """Return why a group is not a free ball of the known radius; empty if it may be one."""
+    radius = ball.radius
     few = 1.0 + _TOUCHING * look.n_points
     width_min = (0.9 if look.n_points >= _N_SHAPELY else 0.5) * radius
     off = look.radius_free - radius
     tests = (
         (
             look.n_beside > few,
-            f"It does not stand free: {look.n_beside:.0f} returns beside or above its outline lie "
-            f"as far away, where {look.n_points:.0f} lie on it.",
+            f"It does not stand free: {look.n_beside} returns beside or above its outline lie "
+            f"as far away, where {look.n_points} lie on it.",
         ),
         (
             look.n_below > few,
-            f"It does not stand on a pole: {look.n_below:.0f} returns below its outline and beside "
+            f"It does not stand on a pole: {look.n_below} returns below its outline and beside "
             "a pole's place lie as far away, as under a rock or a head.",
         ),
         (
             look.n_strange > _STRANGE * (look.n_points + look.n_strange),
-            f"It is not one surface: {look.n_strange:.0f} returns inside its outline are off the "
-            f"sphere that {look.n_points:.0f} lie on.",
+            f"It is not one surface: {look.n_strange} returns inside its outline are off the "
+            f"sphere that {look.n_points} lie on.",
         ),
         (
             look.scatter > config.scatter_max,
@@ -742,7 +767,7 @@ def _verdict(look: _Look, config: ExtractionConfig, radius: float) -> str:
             f"{2e3 * radius:.0f} mm: a pole.",
         ),
         (
-            abs(off) > max(_SIGMAS * look.sigma_radius, _RADIUS_SLACK * radius),
+            abs(off) > _radius_slack(look, ball),
             f"Its own radius is {1e3 * look.radius_free:.0f} mm (standard deviation "
             f"{1e3 * look.sigma_radius:.0f} mm), not {1e3 * radius:.0f} mm.",
         ),
@@ -829,7 +854,8 @@ def _grounded(p_base: Column, looks: list[_Look], verdicts: list[str], ball: _Ba
 def _resting(points: Array, look: _Look, ball: _Ball) -> str:
     """Return why a group seems to rest on the ground; empty if it does not."""
     n_past, n_short = _beneath(points, look, ball)
-    if look.sigma_radius < _SHAPE_SURE * ball.radius or n_short <= 1 + n_past:
+    is_sure = look.n_points >= _N_SURE and look.sigma_radius < _SHAPE_SURE * ball.radius
+    if is_sure or n_short <= 1 + n_past:
         return ""
     return (
         f"It rests on the ground: of {n_past + n_short} beams that pass below it beside a pole's "
@@ -837,22 +863,39 @@ def _resting(points: Array, look: _Look, ball: _Ball) -> str:
     )
 
 
-def _score(look: _Look, config: ExtractionConfig, radius: float) -> float:
+def _score(look: _Look, config: ExtractionConfig, ball: _Ball) -> float:
     """Return how easily the tests were passed: 1 with ease, 0 just so."""
     used = (
         look.n_beside / (1.0 + _TOUCHING * look.n_points),
         look.n_below / (1.0 + _TOUCHING * look.n_points),
         look.n_strange / (_STRANGE * (look.n_points + look.n_strange)),
         look.scatter / config.scatter_max,
-        abs(look.radius_free - radius) / max(_SIGMAS * look.sigma_radius, _RADIUS_SLACK * radius),
+        abs(look.radius_free - ball.radius) / _radius_slack(look, ball),
     )
     return float(np.clip(1.0 - np.mean(np.square(used)), 0.0, 1.0))
 
 
-def _members(cloud: StitchedCloud, grid: _Grid, patches: _Patches, p: Array, ball: _Ball) -> Index:
+def _candidates(
+    cloud: StitchedCloud, grid: _Grid, looks: list[_Look], ball: _Ball, config: ExtractionConfig
+) -> tuple[MarkerCandidate, ...]:
+    """Return candidates in the order of azimuth."""
+    ordered = sorted(looks, key=lambda look: np.arctan2(look.y, look.x))
+    centres = np.array([look.p_base for look in ordered]).reshape(-1, 3)
+    patches = _patches(grid, centres, ball.radius)
+    cells = _cells_of(centres, grid)
+    return tuple(
+        MarkerCandidate(
+            members=_members(cloud, _near(cloud.p_base, patches, cell, p), p, ball),
+            p_base_rough=p.copy(),
+            score=_score(look, config, ball),
+        )
+        for look, p, cell in zip(ordered, centres, cells, strict=True)
+    )
+
+
+def _members(cloud: StitchedCloud, near: NDArray[np.int32], p: Array, ball: _Ball) -> Index:
     """Return the rows on and about a ball, ascending: its outline, and what of its pole touches."""
-    cell = int(_cells_of(p[None], grid)[0])
-    rows = np.sort(_near(cloud.p_base, patches, cell, p)).astype(np.intp)
+    rows = np.sort(near).astype(np.intp)
     seen, _, _ = _view(cloud.p_base[rows].astype(np.float64), p, ball.up)
     blur = 0.5 * ball.divergence * float(np.linalg.norm(p))
     is_about = np.hypot(seen[:, 0], seen[:, 1]) < 1.5 * ball.radius + blur
