@@ -1,0 +1,200 @@
+"""The command line: what it writes for people and programs, and how it ends."""
+
+import json
+import os
+import signal
+import socket
+import subprocess
+import sys
+import time
+from contextlib import redirect_stderr, redirect_stdout
+from io import StringIO
+from types import SimpleNamespace
+
+import httpx
+import numpy as np
+import pytest
+
+from pipelines.geometry import levelling_rotation
+from pipelines.values import Levelling
+from service.cli import main
+
+COMMAND = (sys.executable, "-m", "service.cli")
+
+
+def run(*arguments, code=0, **environment):
+    """Run a command as its process would, and return what it wrote."""
+    out, err = StringIO(), StringIO()
+    with pytest.MonkeyPatch.context() as patch, redirect_stdout(out), redirect_stderr(err):
+        patch.setattr(sys, "argv", ["spheremark", *map(str, arguments)])
+        for name, value in environment.items():
+            patch.setenv(name, value)
+        with pytest.raises(SystemExit) as ended:
+            main()
+    assert (ended.value.code or 0) == code, err.getvalue()
+    return SimpleNamespace(stdout=out.getvalue(), stderr=err.getvalue())
+
+
+@pytest.fixture(scope="module")
+def answer(stop):
+    """Return what `process --json` says of the simulated stop, by both methods."""
+    done = run(
+        *("process", stop.log, "--control", stop.log.parent / "control.csv", "--truth", stop.truth),
+        *("--method", "along_beam", "--method", "paper", "--json"),
+    )
+    return json.loads(done.stdout)
+
+
+def test_help_is_instant():
+    begin = time.perf_counter()
+    text = subprocess.run([*COMMAND, "--help"], capture_output=True, text=True, check=True).stdout
+    assert time.perf_counter() - begin < 2.0  # 0.2 s alone; this machine may be busy
+    assert "simulate" in text
+
+
+def test_an_answer_has_the_keys_that_others_rely_on(answer):
+    assert {"log", "rig", "config", "stops"} <= set(answer)
+    (stop,) = answer["stops"]
+    assert (stop["name"], stop["frame"]) == ("lane1-stop1", "station")
+    assert {
+        "id",
+        "status",
+        "centre_m",
+        "covariance_m2",
+        "range_m",
+        "n_points",
+        "rms_m",
+        "method",
+    } <= (set(stop["markers"][0]))
+    methods = [marker["method"] for marker in stop["markers"]]
+    assert methods == sorted(methods)  # all of the first method, then all of the second
+    assert min(methods.count("along_beam"), methods.count("paper")) > 8
+    assert stop["markers"][0]["id"] == "M01"
+    assert stop["station"]["fit_method"] == "along_beam"
+    assert {one["fit_method"] for one in stop["stations"]} == {"along_beam", "paper"}
+
+
+def test_the_station_maps_centres_onto_marks(answer, control):
+    (stop,) = answer["stops"]
+    rows = [line.split(",") for line in control.strip().splitlines()[1:]]
+    marks = {name: [float(value) for value in rest[:3]] for name, *rest in rows}
+    station = stop["station"]
+    R, t = np.array(station["rotation"]), np.array(station["position_m"])
+    centres = {m["id"]: m["centre_m"] for m in stop["markers"] if m["method"] == "along_beam"}
+    assert len(station["matches"]) > 8
+    for match in station["matches"]:
+        computed = R @ centres[match["marker"]] + t
+        # observed minus computed, and the fix adds gravity: a tenth of a millimetre between them
+        off = np.linalg.norm(computed - marks[match["mark"]])
+        assert off == pytest.approx(np.linalg.norm(match["residual_m"]), abs=3e-3)
+    assert np.shape(station["covariance"]) == (6, 6)
+    trace = np.trace(station["position_covariance_m2"])
+    assert station["sigma_3d_m"] == pytest.approx(trace**0.5)
+    assert station["error_3d_m"] < 0.005  # [m]
+
+
+def test_frames_differ_by_the_levelling_alone(answer, stop):
+    base = json.loads(run("process", stop.log, "--frame", "base", "--json").stdout)["stops"][0]
+    levelled = answer["stops"][0]
+    lean = levelled["levelling"]
+    R = levelling_rotation(
+        Levelling(
+            roll=np.radians(lean["roll_deg"]),
+            pitch=np.radians(lean["pitch_deg"]),
+            sigma=0.0,
+            is_measured=True,
+        )
+    )
+    p_base = np.array([m["centre_m"] for m in base["markers"]])
+    p_station = np.array([m["centre_m"] for m in levelled["markers"]][: len(p_base)])
+    np.testing.assert_allclose(p_base @ R.T, p_station, rtol=0, atol=1e-9)
+
+
+def test_without_control_the_station_is_null_with_a_reason(stop):
+    (found,) = json.loads(run("process", stop.log, "--json").stdout)["stops"]
+    assert found["station"] is None
+    assert "control" in found["reason"]
+    assert {marker["method"] for marker in found["markers"]} == {"along_beam"}
+
+
+def test_truth_adds_errors_and_changes_nothing_else(answer, stop):
+    control = stop.log.parent / "control.csv"
+    plain = json.loads(run("process", stop.log, "--control", control, "--json").stdout)
+    ours = plain["stops"][0]["markers"]
+    for without, with_truth in zip(ours, answer["stops"][0]["markers"], strict=False):
+        assert {k: with_truth[k] for k in without} == without
+        assert "error_3d_m" in set(with_truth) - set(without)
+
+
+def test_people_get_a_table_and_programs_get_json(stop):
+    assert "M08" in run("process", stop.log).stdout
+    assert json.loads(run("inspect", stop.log, "--json").stdout)["verdict"] in ("ok", "weak")
+    assert "/velodyne_points" in run("inspect", stop.log).stdout
+
+
+def test_a_failure_is_one_sentence_and_exit_code_1(tmp_path):
+    garbage = tmp_path / "garbage.mcap"
+    garbage.write_bytes(b"no log at all")
+    failed = run("process", garbage, code=1)
+    assert "Traceback" not in failed.stderr
+    assert "not an MCAP file" in failed.stderr
+    problem = json.loads(run("process", garbage, "--json", code=1).stdout)
+    assert problem["code"] == "input.recording.not_mcap"
+    assert json.loads(run("inspect", garbage, "--json", code=1).stdout)["verdict"] == "refused"
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [("process",), ("process", "nowhere.mcap"), ("serve", "--port", "port"), ("fly",)],
+)
+def test_misuse_is_exit_code_2(arguments):
+    run(*arguments, code=2)
+
+
+def test_a_wrong_setting_is_misuse_and_named():
+    assert "SPHEREMARK_WORKERS" in run("serve", code=2, SPHEREMARK_WORKERS="none").stderr
+    assert "SPHEREMARK_TOKEN" in run("serve", "--host", "0.0.0.0", code=2).stderr
+
+
+def test_an_unknown_method_is_refused_by_name(stop):
+    assert "along_beam" in run("process", stop.log, "--method", "magic", code=1).stderr
+
+
+def test_commensurate_speeds_are_warned_about(tmp_path):
+    arguments = ("simulate", tmp_path, "--stops", "99", "--turn-s", "18", "--rpm", "600")
+    assert "ommensurate" in run(*arguments, code=1).stderr
+
+
+def test_a_service_is_asked_exported_and_stopped_by_a_signal(tmp_path):
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        port = probe.getsockname()[1]
+    address = f"http://127.0.0.1:{port}"
+    settings = {"SPHEREMARK_PORT": str(port), "SPHEREMARK_DATA": str(tmp_path / "data")}
+    environment = {**os.environ, **settings, "SPHEREMARK_WORKERS": "1"}
+    with subprocess.Popen([*COMMAND, "serve"], env=environment, stderr=subprocess.PIPE) as process:
+        assert address.encode() in process.stderr.readline()
+        asked = run("query", "SELECT 1 AS one_m", "--json", **settings)
+        assert json.loads(asked.stdout)["rows"] == [[1]]
+        run("export", tmp_path / "copy.duckdb", "--url", address)
+        half_an_upload(port)
+        in_use = run("query", "SELECT 1", "--data", tmp_path / "data", code=1)
+        assert "in use" in in_use.stderr
+        with httpx.stream("GET", f"{address}/api/v1/jobs/events"):
+            process.send_signal(signal.SIGTERM)
+            assert process.wait(20) == 0
+        assert process.stderr.read() == b""
+    assert (tmp_path / "copy.duckdb").stat().st_size > 0
+    assert not list((tmp_path / "data/recordings/.partial").iterdir())
+    offline = run("query", "SELECT count(*) AS n FROM recordings", "--csv", **settings)
+    assert offline.stdout.split() == ["n", "0"]
+
+
+def half_an_upload(port):
+    """Begin an upload over a real connection, and go away."""
+    head = (
+        "POST /api/v1/recordings?name=half HTTP/1.1\r\nHost: 127.0.0.1\r\n"
+        "Content-Type: application/vnd.mcap\r\nContent-Length: 20000000\r\n\r\n"
+    )
+    with socket.create_connection(("127.0.0.1", port)) as connection:
+        connection.sendall(head.encode() + b"x" * 5_000_000)
