@@ -155,6 +155,7 @@ function series() {
   const [x, y, by] = ["chart-x", "chart-y", "chart-by"].map((name) => place(byId(name).value));
   const groups = new Map();
   for (const row of answer.rows) {
+    if (row[x] === null || row[y] === null) continue;
     const name = by < 0 ? "" : String(row[by]);
     if (!groups.has(name)) groups.set(name, { x: [], y: [] });
     groups.get(name).x.push(row[x]);

@@ -34,8 +34,11 @@ const theme = EditorView.theme({
 });
 export function createEditor({parent, text, schema, label, onRun}) {
   const run = () => { onRun(); return true; };
+  // A shadow root: there CodeMirror's styles need no inline style element, which the policy forbids
+  const root = parent.appendChild(document.createElement("div")).attachShadow({ mode: "open" });
   return new EditorView({
-    parent,
+    parent: root,
+    root,
     state: EditorState.create({doc: text, extensions: [
       Prec.highest(keymap.of([{key: "Mod-Enter", run}])),
       lineNumbers(), history(), drawSelection(), bracketMatching(), closeBrackets(), autocompletion(),
