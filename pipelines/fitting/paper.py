@@ -113,17 +113,17 @@ def _hemisphere(v_facing: Array, radius: float) -> Array:
 
 def _registered(model: Array, points: Array) -> Array:
     """Return where point-to-point ICP moves the model's centre, starting at the centroid."""
-    from open3d import geometry, pipelines, utility  # imported here: half a second
+    import open3d as o3d  # imported here: half a second
 
     start = np.eye(4)
     start[:3, 3] = points.mean(axis=0)
-    result = pipelines.registration.registration_icp(
-        geometry.PointCloud(utility.Vector3dVector(model)),
-        geometry.PointCloud(utility.Vector3dVector(points)),
+    result = o3d.pipelines.registration.registration_icp(
+        o3d.geometry.PointCloud(o3d.utility.Vector3dVector(model)),
+        o3d.geometry.PointCloud(o3d.utility.Vector3dVector(points)),
         np.inf,
         start,
-        pipelines.registration.TransformationEstimationPointToPoint(),
-        pipelines.registration.ICPConvergenceCriteria(_SETTLED, _SETTLED, _N_STEPS),
+        o3d.pipelines.registration.TransformationEstimationPointToPoint(),
+        o3d.pipelines.registration.ICPConvergenceCriteria(_SETTLED, _SETTLED, _N_STEPS),
     )
     return np.array(result.transformation[:3, 3])
 
