@@ -23,7 +23,6 @@ _RANGE_BIN = 1.0  # [m]; as the view accuracy_by_distance
 _COUNT_BIN = 20  # as the view accuracy_by_point_count
 _ANGLE_BIN = 10.0  # [deg]; as the view accuracy_by_included_angle
 _STUDY_ANGLES = (30.0, 150.0)  # [deg]; what the reference study recommends
-_ELLIPSE_SHARE = 0.08  # the largest ellipse is drawn about this large, as a share of the field
 _RATIOS = [step * 10.0**power for power in range(-2, 5) for step in (1, 2, 5)]
 _RATIO_AXIS = {
     "type": "log",
@@ -122,38 +121,9 @@ def error_along_lane(fits: Columns, tolerance_m: float) -> go.Figure:
     return figure
 
 
-def site_map(marks: Columns, fixes: Columns, true_stops: Columns) -> go.Figure:
-    """Draw marks, stations and their 95 % ellipses, exaggerated alike with the true places."""
-    figure = _figure("Field, stations and 95 % ellipses")
-    factor = ellipse_factor(marks, fixes)
-    _add_marks(figure, marks)
-    for method, rows in by_method(fixes):
-        _add_stations(figure, method, rows, factor, true_stops)
-    figure.update_xaxes(title_text="x, site [m]", constrain="domain")
-    figure.update_yaxes(title_text="y, site [m]", scaleanchor="x", scaleratio=1)
-    if factor:
-        _note(figure, f"ellipses and errors \N{MULTIPLICATION SIGN}{factor:g}")
-    return figure
-
-
-def ellipse_factor(marks: Columns, fixes: Columns) -> float:
-    """Return by how much ellipses are enlarged: 1, 2 or 5 times a power of ten; 0 for none."""
-    largest = _largest(floats(fixes, "ellipse_major_95_m"))
-    across = [
-        np.ptp(known) if len(known) else 0.0
-        for axis in ("x_m", "y_m")
-        for known in [_known(np.concatenate([floats(marks, axis), floats(fixes, axis)]))]
-    ]
-    if not largest or not max(across):
-        return 0.0
-    wanted = _ELLIPSE_SHARE * float(max(across)) / largest
-    power = 10.0 ** np.floor(np.log10(wanted))
-    return float(power * max(step for step in (1, 2, 5) if step * power <= wanted))
-
-
 def station_residuals(observations: Columns, tolerance_m: float) -> go.Figure:
     """Draw what each marker disagrees with the station, by axis, with twice its sigma."""
-    figure = _figure("Residuals of the station, by marker and axis")
+    figure = blank_figure("Residuals of the station, by marker and axis")
     names = [
         mark or marker
         for marker, mark in zip(
@@ -162,7 +132,7 @@ def station_residuals(observations: Columns, tolerance_m: float) -> go.Figure:
     ]
     for axis, symbol in (("x", "circle"), ("y", "diamond"), ("z", "square")):
         _add_residuals(figure, observations, names, axis, symbol)
-    if len(names) and _largest(floats(observations, "residual_x_m")) > tolerance_m / 2:
+    if len(names) and largest(floats(observations, "residual_x_m")) > tolerance_m / 2:
         _add_tolerance(figure, tolerance_m)
     figure.add_hline(y=0, line={"color": theme.LINE, "width": 1}, layer="below")
     figure.update_xaxes(title_text="Mark", type="category")
@@ -178,7 +148,7 @@ def by_method(columns: Columns) -> Iterator[tuple[str, dict[str, NDArray[Any]]]]
         yield method, select(columns, methods == method)
 
 
-def _figure(title: str) -> go.Figure:
+def blank_figure(title: str) -> go.Figure:
     """Return an empty figure that looks like all others."""
     return go.Figure(layout={"template": theme.template(), "title": {"text": title}})
 
@@ -186,7 +156,7 @@ def _figure(title: str) -> go.Figure:
 def _quality_figure(columns: Columns, what: str, tolerance_m: float) -> go.Figure:
     """Return a figure with an axis for error, or for predicted sigma where there is no truth."""
     quality = "Error" if has_errors(columns) else "Predicted sigma"
-    figure = _figure(f"{quality} of {what}")
+    figure = blank_figure(f"{quality} of {what}")
     figure.update_yaxes(title_text=f"{quality}, 3-D [mm]")
     _add_tolerance(figure, tolerance_m)
     return figure
@@ -256,7 +226,7 @@ def _add_points(
     known = np.isfinite(y)
     x, y, rows = x[known], y[known], select(rows, known)
     weak = np.array(texts(rows, "status"), dtype=object) != "ok"
-    details = _details(rows, ("stop", "marker", "mark", "reason"), ("range_m", "n_points"))
+    about = details(rows, ("stop", "marker", "mark", "reason"), ("range_m", "n_points"))
     figure.add_scatter(
         x=x,
         y=y,
@@ -269,7 +239,7 @@ def _add_points(
             "opacity": 0.55,
             "symbol": np.where(weak, f"{style.symbol}-open", style.symbol).tolist(),
         },
-        customdata=details,
+        customdata=about,
         hovertemplate=(
             "<b>%{customdata[0]} %{customdata[1]}</b> %{customdata[2]}<br>%{y:.1f} mm at "
             "%{customdata[4]:.2f} m, %{customdata[5]:.0f} returns<br>%{customdata[3]}"
@@ -278,7 +248,7 @@ def _add_points(
     )
 
 
-def _details(rows: Columns, words: Sequence[str], numbers: Sequence[str]) -> list[list[Any]]:
+def details(rows: Columns, words: Sequence[str], numbers: Sequence[str]) -> list[list[Any]]:
     """Return what a person reads when pointing at a row."""
     columns: list[Iterable[Any]] = [texts(rows, name) for name in words]
     columns += [floats(rows, name).round(4).tolist() for name in numbers]
@@ -345,7 +315,6 @@ def _add_pairs(figure: go.Figure, method: str, rows: Columns) -> None:
     """Draw the station from each pair of marks, and the RMS of bins."""
     style = theme.method_style(method)
     x, y = floats(rows, "included_angle_deg"), _quality_mm(rows)
-    details = _details(rows, ("stop",), ("sigma_3d_m",))
     marks = [" + ".join(str(mark) for mark in pair) for pair in rows["marks"]]
     figure.add_scatter(
         x=x,
@@ -354,7 +323,7 @@ def _add_pairs(figure: go.Figure, method: str, rows: Columns) -> None:
         name=f"{style.label}, two marks",
         legendgroup=style.label,
         marker={"color": style.colour, "size": 4, "opacity": 0.3, "symbol": style.symbol},
-        customdata=[[stop, pair] for (stop, _), pair in zip(details, marks, strict=True)],
+        customdata=[list(row) for row in zip(texts(rows, "stop"), marks, strict=True)],
         hovertemplate="<b>%{customdata[0]}</b> from %{customdata[1]}<br>%{y:.1f} mm at "
         f"%{{x:.1f}} deg<extra>{style.label}</extra>",
     )
@@ -376,7 +345,7 @@ def _add_fixes(figure: go.Figure, method: str, rows: Columns) -> None:
             "symbol": f"{style.symbol}-dot",
             "line": {"color": theme.RAISED, "width": 1.5},
         },
-        customdata=_details(rows, ("stop",), ("n_markers",)),
+        customdata=details(rows, ("stop",), ("n_markers",)),
         hovertemplate="<b>%{customdata[0]}</b> from all %{customdata[1]:.0f} marks<br>%{y:.1f} mm"
         f"<extra>{style.label}</extra>",
     )
@@ -404,7 +373,7 @@ def _add_lanes(
         if np.isfinite(quality[stops == stop]).any():
             lanes.setdefault(lane_and_number(stop)[0], []).append(stop)
     for i, (lane, members) in enumerate(lanes.items()):
-        samples = [_known(quality[stops == stop]) for stop in members]
+        samples = [known_values(quality[stops == stop]) for stop in members]
         _add_lane(figure, style, members, samples, is_numbered=is_numbered)
         figure.data[-1].update(showlegend=i == 0)
         if len(lanes) > 1:
@@ -447,102 +416,6 @@ def _add_lane(
     )
 
 
-def _add_marks(figure: go.Figure, marks: Columns) -> None:
-    """Draw the control marks with their names."""
-    figure.add_scatter(
-        x=floats(marks, "x_m"),
-        y=floats(marks, "y_m"),
-        mode="markers+text",
-        name="control mark",
-        text=texts(marks, "mark"),
-        textposition="top center",
-        textfont={"size": 11, "color": theme.MUTED},
-        marker={"color": theme.MARK, "size": 10, "symbol": "circle-cross-open"},
-        cliponaxis=False,
-        customdata=floats(marks, "z_m").tolist(),
-        hovertemplate="<b>%{text}</b><br>x %{x:.3f} m<br>y %{y:.3f} m<br>z %{customdata:.3f} m"
-        "<extra>control mark</extra>",
-    )
-
-
-def _add_stations(
-    figure: go.Figure, method: str, rows: Columns, factor: float, true_stops: Columns
-) -> None:
-    """Draw the stations of one method with their ellipses and, enlarged alike, their errors."""
-    style = theme.method_style(method)
-    x, y = floats(rows, "x_m"), floats(rows, "y_m")
-    details = _details(rows, ("stop", "status"), ("sigma_3d_m", "error_3d_m", "n_markers", "z_m"))
-    figure.add_scatter(
-        x=x,
-        y=y,
-        mode="markers",
-        name=style.label,
-        legendgroup=style.label,
-        marker={"color": style.colour, "size": 6, "symbol": style.symbol},
-        customdata=[[row[0], row[1], row[2] * _MM, row[4], row[5]] for row in details],
-        hovertemplate="<b>%{customdata[0]}</b> %{customdata[1]}<br>x %{x:.3f} m<br>y %{y:.3f} m<br>"
-        "z %{customdata[4]:.3f} m<br>sigma %{customdata[2]:.1f} mm, %{customdata[3]:.0f} marks"
-        f"<extra>{style.label}</extra>",
-    )
-    outlines = [ellipse_outline(rows, i, factor) for i in range(len(x))]
-    _add_strokes(figure, outlines, style, dash="solid", width=1.5)
-    _add_strokes(figure, _errors(rows, true_stops, factor), style, dash="solid", width=1)
-
-
-def ellipse_outline(fixes: Columns, i: int, factor: float) -> NDArray[np.float64]:
-    """Return the outline of the 95 % ellipse of a station, enlarged; the bearing is from y to x."""
-    turn = np.linspace(0.0, 2.0 * np.pi, 61)
-    major = factor * floats(fixes, "ellipse_major_95_m")[i] * np.cos(turn)
-    minor = factor * floats(fixes, "ellipse_minor_95_m")[i] * np.sin(turn)
-    bearing = np.radians(floats(fixes, "ellipse_bearing_deg")[i])
-    x = floats(fixes, "x_m")[i] + major * np.sin(bearing) + minor * np.cos(bearing)
-    y = floats(fixes, "y_m")[i] + major * np.cos(bearing) - minor * np.sin(bearing)
-    return np.column_stack([x, y])
-
-
-def _errors(rows: Columns, true_stops: Columns, factor: float) -> list[NDArray[np.float64]]:
-    """Return a line from each station towards its true place, enlarged like the ellipses."""
-    truth = dict(
-        zip(
-            texts(true_stops, "stop"),
-            zip(floats(true_stops, "x_m"), floats(true_stops, "y_m"), strict=True),
-            strict=True,
-        )
-    )
-    lines = []
-    for stop, x, y in zip(
-        texts(rows, "stop"), floats(rows, "x_m"), floats(rows, "y_m"), strict=True
-    ):
-        if stop in truth:
-            start = np.array([x, y])
-            lines.append(np.stack([start, start + factor * (np.array(truth[stop]) - start)]))
-    return lines
-
-
-def _add_strokes(
-    figure: go.Figure,
-    strokes: Sequence[NDArray[np.float64]],
-    style: theme.MethodStyle,
-    *,
-    dash: str,
-    width: float,
-) -> None:
-    """Draw many lines as one trace."""
-    if not strokes:
-        return
-    gap = np.full((1, 2), np.nan)
-    joined = np.concatenate([part for stroke in strokes for part in (stroke, gap)])
-    figure.add_scatter(
-        x=joined[:, 0],
-        y=joined[:, 1],
-        mode="lines",
-        legendgroup=style.label,
-        showlegend=False,
-        line={"color": style.colour, "width": width, "dash": dash},
-        hoverinfo="skip",
-    )
-
-
 def _add_residuals(
     figure: go.Figure, observations: Columns, names: Sequence[str], axis: str, symbol: str
 ) -> None:
@@ -574,28 +447,12 @@ def _add_residuals(
     )
 
 
-def _note(figure: go.Figure, text: str) -> None:
-    """Write a remark into the lower right corner."""
-    figure.add_annotation(
-        text=text,
-        x=1,
-        y=0,
-        xref="x domain",
-        yref="y domain",
-        xanchor="right",
-        yanchor="bottom",
-        showarrow=False,
-        font={"size": 12, "color": theme.MUTED},
-        bgcolor=theme.RAISED,
-    )
-
-
-def _known(values: NDArray[np.float64]) -> NDArray[np.float64]:
+def known_values(values: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return what is known of a column."""
     return values[np.isfinite(values)]
 
 
-def _largest(values: NDArray[np.float64]) -> float:
+def largest(values: NDArray[np.float64]) -> float:
     """Return the largest magnitude that is known, or zero."""
-    known = _known(values)
+    known = known_values(values)
     return float(np.abs(known).max()) if len(known) else 0.0

@@ -9,19 +9,14 @@ import json
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, fields
-from datetime import UTC, datetime
-from functools import cache
 from typing import Any
 
 import numpy as np
 import plotly.graph_objects as go
-from jinja2 import Environment, PackageLoader, StrictUndefined
-from markupsafe import Markup
 from numpy.typing import NDArray
-from plotly.io.json import to_json_plotly
 
-from pipelines.accuracy import ErrorSummary, summarise
-from web import assets, figures, scene, theme
+from pipelines.accuracy import summarise
+from web import figures, maps, scene, theme
 from web.figures import (
     Columns,
     by_method,
@@ -33,19 +28,11 @@ from web.figures import (
     texts,
 )
 from web.filters import Filters
+from web.readouts import headline
+from web.templating import environment
 
 Row = Mapping[str, Any]
 _MM = 1e3  # [mm/m]
-_UNKNOWN = "\N{EN DASH}"
-_ENDINGS = {
-    "_deg_per_s": "deg/s",
-    "_deg": "deg",
-    "_rpm": "rpm",
-    "_hz": "Hz",
-    "_bytes": "B",
-    "_s": "s",
-    "_m": "m",
-}
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -177,17 +164,6 @@ class Panel:
     def title(self) -> str:
         """The title of the figure."""
         return str(self.figure.layout.title.text)
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Readout:
-    """A number that matters, with its unit and what it means."""
-
-    label: str
-    value: str
-    unit: str
-    note: str
-    method: str = ""
 
 
 def overview_page(page: OverviewPage) -> str:
@@ -334,65 +310,6 @@ EXAMPLES: tuple[tuple[str, str], ...] = (
 """Queries to begin with, by what they answer."""
 
 
-def headline(fits: Columns, fixes: Columns, tolerance_m: float) -> tuple[Readout, ...]:
-    """Return the few numbers that matter: centres and stations, each method, and the sigma."""
-    readouts = []
-    for method, rows in by_method(fits):
-        real = on_marks(rows)
-        n_others = int(np.count_nonzero(~real))
-        readouts.append(
-            _quality("Centres", method, select(rows, real), tolerance_m, n_others=n_others)
-        )
-    for method, rows in by_method(fixes):
-        readouts.append(_quality("Stations", method, rows, tolerance_m))
-    ours = [rows for method, rows in by_method(fits) if method == "along_beam"]
-    return (*readouts, *(_predicted(rows) for rows in ours if has_errors(rows)))
-
-
-def _quality(
-    what: str, method: str, rows: Columns, tolerance_m: float, *, n_others: int = 0
-) -> Readout:
-    """Return the error of one method against truth; without truth its predicted sigma."""
-    style = theme.method_style(method)
-    is_error = has_errors(rows)
-    summary = summarise(floats(rows, "error_3d_m" if is_error else "sigma_3d_m"), tolerance_m)
-    return Readout(
-        label=f"{what}, {style.label}",
-        value=_number(summary.rms * _MM, 1),
-        unit="mm RMS error" if is_error else "mm predicted sigma",
-        note=_share(summary, tolerance_m, is_error=is_error)
-        + (f"; {n_others} on no mark" if n_others else ""),
-        method=method,
-    )
-
-
-def _share(summary: ErrorSummary, tolerance_m: float, *, is_error: bool) -> str:
-    """Say how many are within the tolerance, and how large the largest is."""
-    if not summary.n:
-        return "none yet"
-    within = round(summary.share_within * summary.n)
-    what = "within" if is_error else "with a sigma within"
-    return (
-        f"{within} of {summary.n} {what} {tolerance_m * _MM:g} mm, "
-        f"largest {summary.largest * _MM:.1f} mm"
-    )
-
-
-def _predicted(rows: Columns) -> Readout:
-    """Say what our sigma promised, and how that compares with the error."""
-    error, sigma = floats(rows, "error_3d_m"), floats(rows, "sigma_3d_m")
-    known = np.isfinite(error)
-    sigma_rms = float(np.sqrt(np.mean(sigma[known] ** 2)))
-    ratio = float(np.sqrt(np.mean(error[known] ** 2))) / sigma_rms if sigma_rms else math.nan
-    return Readout(
-        label="Centres, predicted by us",
-        value=_number(sigma_rms * _MM, 1),
-        unit="mm sigma",
-        note=f"error over sigma {ratio:.2f}; 1 is honest",
-        method="along_beam",
-    )
-
-
 def _survey_panels(data: SurveyData, *, is_log: bool) -> tuple[Panel, ...]:
     """Return the figures of the dashboard; none of an empty table."""
     if not len(data.fits["stop"]):
@@ -443,7 +360,7 @@ def _map_panel(data: SurveyData) -> tuple[Panel, ...]:
     return (
         Panel(
             name="map",
-            figure=figures.site_map(data.marks, select(data.fixes, placed), data.true_stops),
+            figure=maps.site_map(data.marks, select(data.fixes, placed), data.true_stops),
             caption=f"{caption}.",
         ),
     )
@@ -548,74 +465,4 @@ def _plain(column: NDArray[Any]) -> list[Any]:
 def _render(template: str, page: Any, **more: Any) -> str:
     """Fill a template with the fields of a page and what was made of them."""
     context = {field.name: getattr(page, field.name) for field in fields(page)}
-    return _environment().get_template(template).render(**context, **more)
-
-
-@cache
-def _environment() -> Environment:
-    """Return the templates with the filters that they use."""
-    environment = Environment(
-        loader=PackageLoader("web"),
-        autoescape=True,
-        undefined=StrictUndefined,
-        trim_blocks=True,
-        lstrip_blocks=True,
-    )
-    environment.filters.update(
-        metres=lambda value: _number(value, 3),
-        mm=lambda value: _number(None if value is None else value * _MM, 1),
-        fixed=_number,
-        mib=lambda value: _number(None if value is None else value / 2**20, 1),
-        moment=_moment,
-        json_block=json_block,
-        figure_block=lambda figure: _as_block(str(to_json_plotly(figure.to_plotly_json()))),
-        method=lambda name: theme.method_style(name).label,
-        unit=unit_of,
-        heading=heading,
-    )
-    environment.globals.update(assets=assets)
-    return environment
-
-
-def json_block(value: Any) -> Markup:
-    """Return a value as JSON that may stand inside a script element."""
-    return _as_block(json.dumps(value))
-
-
-def _as_block(text: str) -> Markup:
-    """Mark JSON as safe, once nothing in it can end the element that holds it."""
-    return Markup(text.replace("<", "\\u003c").replace("&", "\\u0026"))
-
-
-def unit_of(column: str) -> str:
-    """Return the unit that the name of a column ends in."""
-    if column == "cov_motion":
-        return "rad, m"
-    units = {"m": "m", "m2": "m²", "deg": "deg", "s": "s", "bytes": "B", "percent": "%"}
-    return units.get(column.rpartition("_")[2], "") if "_" in column else ""
-
-
-def heading(name: str) -> str:
-    """Return the name of a column or key as people write it, with its unit in brackets."""
-    for ending, unit in _ENDINGS.items():
-        if name.endswith(ending):
-            return f"{_words(name.removesuffix(ending))} [{unit}]"
-    return _words(name)
-
-
-def _words(name: str) -> str:
-    """Return a name as words, the first with a capital."""
-    words = name.removeprefix("n_").removeprefix("has_").replace("_", " ")
-    return words[:1].upper() + words[1:]
-
-
-def _number(value: float | None, decimals: int = 2) -> str:
-    """Write a number, or a dash for what is not known."""
-    if value is None or not math.isfinite(value):
-        return _UNKNOWN
-    return f"{value:.{decimals}f}"
-
-
-def _moment(value: datetime | None) -> str:
-    """Write an instant in UTC."""
-    return _UNKNOWN if value is None else f"{value.astimezone(UTC):%Y-%m-%d %H:%M:%S} UTC"
+    return environment().get_template(template).render(**context, **more)

@@ -3,7 +3,7 @@ import plotly.graph_objects as go
 import pytest
 from numpy.testing import assert_allclose
 
-from web import figures, theme
+from web import figures, maps, theme
 from web.assets import static_folder
 
 MM = 1e-9  # [mm]; figures only scale
@@ -159,8 +159,8 @@ def test_lanes_and_numbers_are_read_from_names(stop, lane, number):
 
 
 def test_the_map_has_equal_axes_and_says_how_much_it_enlarges():
-    figure = figures.site_map(marks(), fixes(), places([], [], []))
-    factor = figures.ellipse_factor(marks(), fixes())
+    figure = maps.site_map(marks(), fixes(), places([], [], []))
+    factor = maps.ellipse_factor(marks(), fixes())
     assert figure.layout.yaxis.scaleanchor == "x"
     assert figure.layout.yaxis.scaleratio == 1
     assert figure.layout.xaxis.title.text == "x, site [m]"
@@ -168,21 +168,21 @@ def test_the_map_has_equal_axes_and_says_how_much_it_enlarges():
 
 
 def test_ellipses_are_enlarged_by_one_two_or_five_times_a_power_of_ten():
-    factor = figures.ellipse_factor(marks(), fixes())
+    factor = maps.ellipse_factor(marks(), fixes())
     assert factor / 10 ** np.floor(np.log10(factor)) in (1.0, 2.0, 5.0)
     assert 0.02 < factor * 0.004 / 16.0 <= 0.08
 
 
 def test_an_ellipse_points_along_its_bearing_from_y_to_x():
-    outline = figures.ellipse_outline(fixes(), 0, 100.0) - [-4.0, 0.0]
+    outline = maps.ellipse_outline(fixes(), 0, 100.0) - [-4.0, 0.0]
     assert_allclose(np.abs(outline[:, 0]).max(), 0.4, atol=1e-12)
     assert_allclose(np.abs(outline[:, 1]).max(), 0.2, atol=1e-3)
 
 
 def test_the_line_of_a_station_leads_to_its_true_place_enlarged_alike():
     truth = places(["lane3-stop1"], [-4.0 + 0.003], [0.001])
-    figure = figures.site_map(marks(), fixes(), truth)
-    factor = figures.ellipse_factor(marks(), fixes())
+    figure = maps.site_map(marks(), fixes(), truth)
+    factor = maps.ellipse_factor(marks(), fixes())
     line = figure.data[-1]
     assert_allclose([line.x[1], line.y[1]], [-4.0 + factor * 0.003, factor * 0.001], atol=1e-9)
 

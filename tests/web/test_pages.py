@@ -3,7 +3,7 @@ import json
 import numpy as np
 import pytest
 
-from web import assets, pages
+from web import assets, pages, readouts, templating
 
 
 def rows(errors, sigmas, marks, method="along_beam"):
@@ -23,27 +23,27 @@ def nothing():
 
 def test_the_headline_gives_rms_in_millimetres_and_the_share_within_tolerance():
     fits = rows([0.003, 0.004, 0.040], [0.003] * 3, ["A", "B", "C"])
-    first = pages.headline(fits, nothing(), 0.03)[0]
+    first = readouts.headline(fits, nothing(), 0.03)[0]
     assert (first.value, first.unit) == ("23.3", "mm RMS error")
     assert first.note == "2 of 3 within 30 mm, largest 40.0 mm"
 
 
 def test_the_headline_counts_fits_on_no_mark_apart():
     fits = rows([0.003, np.nan], [0.003, 0.020], ["A", None])
-    first = pages.headline(fits, nothing(), 0.03)[0]
+    first = readouts.headline(fits, nothing(), 0.03)[0]
     assert first.value == "3.0"
     assert first.note.endswith("1 on no mark")
 
 
 def test_without_truth_the_headline_gives_sigma_and_never_error():
     fits = rows([np.nan, np.nan], [0.003, 0.004], ["A", "B"])
-    text = str(pages.headline(fits, fits, 0.03))
+    text = str(readouts.headline(fits, fits, 0.03))
     assert "mm predicted sigma" in text
     assert "error" not in text
 
 
 def test_the_headline_sets_error_against_what_was_predicted():
-    last = pages.headline(rows([0.004], [0.002], ["A"]), nothing(), 0.03)[-1]
+    last = readouts.headline(rows([0.004], [0.002], ["A"]), nothing(), 0.03)[-1]
     assert (last.value, last.unit) == ("2.0", "mm sigma")
     assert "2.00" in last.note
 
@@ -61,7 +61,7 @@ def test_the_headline_sets_error_against_what_was_predicted():
     ],
 )
 def test_units_are_read_from_names(column, unit):
-    assert pages.unit_of(column) == unit
+    assert templating.unit_of(column) == unit
 
 
 @pytest.mark.parametrize(
@@ -74,11 +74,11 @@ def test_units_are_read_from_names(column, unit):
     ],
 )
 def test_keys_become_headings_with_units(key, text):
-    assert pages.heading(key) == text
+    assert templating.heading(key) == text
 
 
 def test_json_in_a_page_cannot_end_the_element_that_holds_it():
-    block = pages.json_block({"name": "</script><b>&"})
+    block = templating.json_block({"name": "</script><b>&"})
     assert "<" not in block
     assert json.loads(block) == {"name": "</script><b>&"}
 

@@ -1,0 +1,97 @@
+"""The templates: their filters, and how numbers, units, instants and JSON are written."""
+
+from __future__ import annotations
+
+import json
+import math
+from datetime import UTC, datetime
+from functools import cache
+from typing import Any
+
+from jinja2 import Environment, PackageLoader, StrictUndefined
+from markupsafe import Markup
+from plotly.io.json import to_json_plotly
+
+from web import assets, theme
+
+_MM = 1e3  # [mm/m]
+_UNKNOWN = "\N{EN DASH}"
+_ENDINGS = {
+    "_deg_per_s": "deg/s",
+    "_deg": "deg",
+    "_rpm": "rpm",
+    "_hz": "Hz",
+    "_bytes": "B",
+    "_s": "s",
+    "_m": "m",
+}
+
+
+@cache
+def environment() -> Environment:
+    """Return the templates with the filters that they use."""
+    made = Environment(
+        loader=PackageLoader("web"),
+        autoescape=True,
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+    made.filters.update(
+        metres=lambda value: number(value, 3),
+        mm=lambda value: number(None if value is None else value * _MM, 1),
+        fixed=number,
+        mib=lambda value: number(None if value is None else value / 2**20, 1),
+        moment=_moment,
+        json_block=json_block,
+        figure_block=lambda figure: _as_block(str(to_json_plotly(figure.to_plotly_json()))),
+        method=lambda name: theme.method_style(name).label,
+        unit=unit_of,
+        heading=heading,
+    )
+    made.globals.update(assets=assets)
+    return made
+
+
+def json_block(value: Any) -> Markup:
+    """Return a value as JSON that may stand inside a script element."""
+    return _as_block(json.dumps(value))
+
+
+def _as_block(text: str) -> Markup:
+    """Mark JSON as safe, once nothing in it can end the element that holds it."""
+    return Markup(text.replace("<", "\\u003c").replace("&", "\\u0026"))
+
+
+def unit_of(column: str) -> str:
+    """Return the unit that the name of a column ends in."""
+    if column == "cov_motion":
+        return "rad, m"
+    units = {"m": "m", "m2": "m²", "deg": "deg", "s": "s", "bytes": "B", "percent": "%"}
+    return units.get(column.rpartition("_")[2], "") if "_" in column else ""
+
+
+def heading(name: str) -> str:
+    """Return the name of a column or key as people write it, with its unit in brackets."""
+    for ending, unit in _ENDINGS.items():
+        if name.endswith(ending):
+            return f"{_words(name.removesuffix(ending))} [{unit}]"
+    return _words(name)
+
+
+def _words(name: str) -> str:
+    """Return a name as words, the first with a capital."""
+    words = name.removeprefix("n_").removeprefix("has_").replace("_", " ")
+    return words[:1].upper() + words[1:]
+
+
+def number(value: float | None, decimals: int = 2) -> str:
+    """Write a number, or a dash for what is not known."""
+    if value is None or not math.isfinite(value):
+        return _UNKNOWN
+    return f"{value:.{decimals}f}"
+
+
+def _moment(value: datetime | None) -> str:
+    """Write an instant in UTC."""
+    return _UNKNOWN if value is None else f"{value.astimezone(UTC):%Y-%m-%d %H:%M:%S} UTC"
