@@ -21,6 +21,7 @@ from pipelines.errors import (
     RecordingError,
     RigError,
 )
+from pipelines.threads import side_by_side
 from pipelines.values import (
     RING_UNKNOWN,
     Array,
@@ -74,7 +75,7 @@ class _Joints(NamedTuple):
 class _Lidar(NamedTuple):
     """Rig for the kernel; ``lasers`` has, by ring, height in the cloud, bias, height [m]."""
 
-    T_head_lidar: Array
+    T_head_lidar: tuple[float, ...]  # twelve numbers, row by row
     lasers: Array
     range_limits: Array
 
@@ -458,9 +459,8 @@ def _run(
 ) -> tuple[_Columns, Index]:
     """Run the kernel; return the filled columns and the counts of `_stitch_kernel`."""
     n = len(shots.p_lidar)
-    lidar = _Lidar(
-        rig.T_head_lidar, _laser_table(rig), np.array([config.range_min, config.range_max])
-    )
+    T = tuple(rig.T_head_lidar[:3].ravel().tolist())
+    lidar = _Lidar(T, _laser_table(rig), np.array([config.range_min, config.range_max]))
     out = _Columns(
         np.empty((n, 3), np.float32),
         np.empty(n, np.float32),
@@ -468,10 +468,25 @@ def _run(
         np.empty(n, np.uint8),
         np.empty(n, np.float32),
     )
-    counts = _stitch_kernel(shots, joints, lidar, out)
-    n = counts[0]
-    filled = _Columns(out[0][:n], out[1][:n], out[2][:n], out[3][:n], out[4][:n])
-    return filled, counts
+    start = shots.stamps_ns.min(initial=np.iinfo(np.int64).max)
+
+    def part(first: int, end: int) -> tuple[int, Index]:
+        return first, _stitch_kernel(shots, joints, lidar, start, out, first, end)
+
+    parts = side_by_side(part, n)
+    return _closed_up(out, parts), np.sum([counts for _, counts in parts], axis=0)
+
+
+def _closed_up(out: _Columns, parts: list[tuple[int, Index]]) -> _Columns:
+    """Return the columns without the gap that each part leaves where it kept less than it saw."""
+    n = 0
+    for first, counts in parts:
+        end = first + counts[0]
+        if n < first:
+            for column in out:
+                column[n : n + counts[0]] = column[first:end]
+        n += counts[0]
+    return _Columns(out[0][:n], out[1][:n], out[2][:n], out[3][:n], out[4][:n])
 
 
 def _laser_table(rig: Rig) -> Array:
@@ -489,55 +504,71 @@ def _rotated(cosine, sine, step):  # type: ignore[no-untyped-def]  # noqa: ANN00
     """Return cosine and sine of an angle plus a step, by series where the step is small."""
     if abs(step) < _SMALL_TURN:
         square = step * step
-        c = 1.0 - square * (0.5 - square / 24.0)
-        s = step * (1.0 - square * (1.0 / 6.0 - square / 120.0))
+        c = 1.0 - square * (0.5 - square * (1.0 / 24.0))
+        s = step * (1.0 - square * (1.0 / 6.0 - square * (1.0 / 120.0)))
     else:
         c, s = np.cos(step), np.sin(step)
     return cosine * c - sine * s, sine * c + cosine * s
 
 
 @numba.njit(cache=True, nogil=True)
-def _stitch_kernel(shots, joints, lidar, out):  # type: ignore[no-untyped-def]  # noqa: ANN001, ANN202
-    """Fill ``out`` from the front; count kept, without angle, not finite, out of range."""
-    counts = np.zeros(4, np.int64)
+def _moved(T, x, y, z):  # type: ignore[no-untyped-def]  # noqa: ANN001, ANN202
+    """Return the coordinates of a point after a rigid motion."""
+    return (
+        T[0] * x + T[1] * y + T[2] * z + T[3],
+        T[4] * x + T[5] * y + T[6] * z + T[7],
+        T[8] * x + T[9] * y + T[10] * z + T[11],
+    )
+
+
+@numba.njit(cache=True, nogil=True)
+def _stitch_kernel(shots, joints, lidar, start, out, first, end):  # type: ignore[no-untyped-def]  # noqa: ANN001, ANN202, PLR0913
+    """Fill ``out`` from a part's first row; count kept, no angle, not finite, out of range.
+
+    Values that change seldom are held outside of arrays: each write to ``out`` would make the
+    compiler read them again.
+    """
     T, lasers, p_lidar = lidar.T_head_lidar, lidar.lasers, shots.p_lidar
     stamps, table = joints.stamps_ns, joints.table
-    low, high = lidar.range_limits[0], lidar.range_limits[1]
-    start = shots.stamps_ns.min() if len(shots.stamps_ns) else 0
-    j, last = 0, len(stamps) - 1
-    for i in range(len(shots.stamps_ns)):
+    low2, high2 = lidar.range_limits[0] ** 2, lidar.range_limits[1] ** 2
+    kept, without_angle, not_finite, out_of_range = np.uint64(first), 0, 0, 0
+    since, until = 0, 0  # the joint interval that a shot is expected in
+    angle0 = cosine0 = sine0 = rate = 0.0
+    for i in range(np.uint64(first), np.uint64(end)):
         t = shots.stamps_ns[i]
-        while j < last and stamps[j + 1] <= t:
-            j += 1
-        while j > 0 and stamps[j] > t:  # clouds that are sorted by ring step back in time
-            j -= 1
-        step = table[j, 3] * (t - stamps[j])
-        if t < stamps[0] or t > stamps[last] or not np.isfinite(step):
-            counts[1] += 1
+        if not since <= t < until:
+            j = np.searchsorted(stamps, t, side="right") - 1
+            if j < 0 or t > stamps[-1]:
+                without_angle += 1
+                continue
+            since, until = stamps[j], stamps[j + 1] if j + 1 < len(stamps) else stamps[j]
+            angle0, cosine0, sine0, rate = table[j, 0], table[j, 1], table[j, 2], table[j, 3]
+        step = rate * (t - since)
+        if not np.isfinite(step):
+            without_angle += 1
             continue
         ring = shots.rings[i]
         x, y = np.float64(p_lidar[i, 0]), np.float64(p_lidar[i, 1])
         z = p_lidar[i, 2] - lasers[ring, 0]
-        reach = np.sqrt(x * x + y * y + z * z)
-        if not low <= reach <= high:
-            counts[3 if np.isfinite(reach) else 2] += 1
+        reach2 = x * x + y * y + z * z
+        if not low2 <= reach2 <= high2:
+            out_of_range += np.isfinite(reach2)
+            not_finite += not np.isfinite(reach2)
             continue
-        scale = 1.0 - lasers[ring, 1] / reach
-        x, y, z = x * scale, y * scale, z * scale + lasers[ring, 2]
-        x_head = T[0, 0] * x + T[0, 1] * y + T[0, 2] * z + T[0, 3]
-        y_head = T[1, 0] * x + T[1, 1] * y + T[1, 2] * z + T[1, 3]
-        c, s = _rotated(table[j, 1], table[j, 2], step)
-        k = counts[0]
-        out.p_base[k, 0] = c * x_head - s * y_head
-        out.p_base[k, 1] = s * x_head + c * y_head
-        out.p_base[k, 2] = T[2, 0] * x + T[2, 1] * y + T[2, 2] * z + T[2, 3]
-        angle = table[j, 0] + step
-        out.gimbal_angles[k] = angle - 2.0 * np.pi * np.floor(angle / (2.0 * np.pi) + 0.5)
-        out.intensities[k] = shots.intensities[i]
-        out.rings[k] = shots.rings[i]
-        out.times[k] = (t - start) * 1e-9
-        counts[0] += 1
-    return counts
+        scale = 1.0 - lasers[ring, 1] / np.sqrt(reach2)
+        x, y, z = _moved(T, x * scale, y * scale, z * scale + lasers[ring, 2])
+        c, s = _rotated(cosine0, sine0, step)
+        turns = (angle0 + step) * (0.5 / np.pi)
+        out.p_base[kept, 0], out.p_base[kept, 1], out.p_base[kept, 2] = (
+            c * x - s * y,
+            s * x + c * y,
+            z,
+        )
+        out.gimbal_angles[kept] = 2.0 * np.pi * (turns - np.floor(turns + 0.5))
+        out.intensities[kept], out.rings[kept] = shots.intensities[i], ring
+        out.times[kept] = (t - start) * 1e-9
+        kept += np.uint64(1)
+    return np.array([kept - np.uint64(first), without_angle, not_finite, out_of_range], np.int64)
 
 
 def _refuse_empty(log: ScanLog, joints: _Joints, counts: Index, config: StitchingConfig) -> None:
