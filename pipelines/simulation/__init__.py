@@ -5,7 +5,9 @@ gimbal at one of the stops and returns the log and, apart from it, the truth. In
 
 - ``options`` says what can be chosen,
 - ``terrain`` and ``rocks`` make the ground, ``scene`` holds whatever a beam can meet,
-- ``field`` puts them together into worlds with names,
+- ``field`` puts them together into the study's field; ``bodies`` and ``clutter`` add what is no
+  marker, ``lane`` spreads markers over distances, ``scenarios`` knows all worlds by name,
+- ``visibility`` says how much of each marker a stop can see,
 - ``rig`` moves the LiDAR and records encoder and AHRS,
 - ``sensor`` fires the lasers and records their echoes, which ``echo`` traces,
 - ``stop`` runs all of it for one stop.
@@ -14,13 +16,15 @@ Why so: the pipeline is believed because it finds what this room hid. Nothing he
 the steps of the pipeline, and a log holds nothing of the truth.
 """
 
-from pipelines.simulation.field import SCENARIOS, Field, Stop, scenario
+from pipelines.simulation.field import Decoy, Field, Stop
 from pipelines.simulation.options import SimulationConfig
 from pipelines.simulation.rig import commensurability
+from pipelines.simulation.scenarios import SCENARIOS, scenario
 from pipelines.simulation.stop import SimulatedStop, simulate_stop, survey_truth
 
 __all__ = [
     "SCENARIOS",
+    "Decoy",
     "Field",
     "SimulatedStop",
     "SimulationConfig",

@@ -1,8 +1,7 @@
-"""Whole worlds by name: ground, rocks, markers and where the rover stops."""
+"""The study's field: ground, rocks, markers and where the rover stops."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -18,7 +17,9 @@ PAPER_DISTANCES = np.array(
 )
 """Distances from the LiDAR to the 14 markers in the study, Table 2 [m]."""
 
-_MARKER_RADIUS = 0.100  # [m]
+MARKER_RADIUS = 0.100
+"""Radius of the study's spheres [m]."""
+
 _MARKER_SHADE = 0.50  # red paint at 905 nm
 _POLE_RADIUS = 0.015  # [m]
 _POLE_SHADE = 0.30
@@ -27,7 +28,9 @@ _CENTRES_ABOVE_CUT = (-0.02, 0.13)  # [m] above the highest ground near a stop
 _CUT_RADIUS = 10.0  # [m] within which the study looks for the highest ground
 _LANES, _STOPS = 5, 7
 _FIELD = (4.5, 4.0)  # [m] half sides of the rectangle of stops
-_MAST = 1.05  # [m] of the LiDAR above the ground
+MAST = 1.05
+"""Height of the LiDAR above the ground [m]."""
+
 _N_MOUNDS, _MOUND_DISTANCE, _MOUND_RADIUS, _MOUND_TOP = 5, 9.0, 2.0, 0.82  # the rest in [m]
 _STOP_CLEAR, _MARK_CLEAR = 0.9, 0.5  # [m] around which there are no rocks
 _TERRAIN, _LAYOUT, _ROCKS, _SHADES = range(4)  # streams of chance
@@ -56,6 +59,28 @@ class Stop:
 
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
+class Decoy:
+    """Something that is no marker and might be taken for one.
+
+    Attributes
+    ----------
+    name : str
+        What it is called.
+    kind : str
+        What it is: ``person``, ``pole``, ``wrong ball`` and so on.
+    p_site : (3,)
+        The place where it might be mistaken: the middle of a ball, a head, a crown [m].
+    """
+
+    name: str
+    kind: str
+    p_site: Array
+
+    def __post_init__(self) -> None:
+        _seal(self, p_site=(3,))
+
+
+@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class Field:
     """A world whose truth is known.
 
@@ -75,6 +100,8 @@ class Field:
         Radius of the markers [m].
     stops : tuple of Stop
         Where the rover stops, in the order of driving.
+    decoys : tuple of Decoy
+        What might be taken for a marker; for comparison only.
     """
 
     scenario: str
@@ -84,6 +111,7 @@ class Field:
     marks: ControlMarks
     marker_radius: float
     stops: tuple[Stop, ...]
+    decoys: tuple[Decoy, ...] = ()
 
     def stop(self, name: str) -> Stop:
         """Return the stop of a name.
@@ -110,31 +138,6 @@ class Field:
         raise NotFoundError(f"There is no stop {name!r} in {self.scenario}; there are: {names}.")
 
 
-def scenario(name: str, seed: int) -> Field:
-    """Return a world by the name of its scenario.
-
-    Parameters
-    ----------
-    name : str
-        One of ``SCENARIOS``.
-    seed : int
-        Source of chance, 0 or more: the same seed gives the same world.
-
-    Returns
-    -------
-    Field
-        The world.
-
-    Raises
-    ------
-    ConfigError
-        If there is no such scenario, or the seed is negative.
-    """
-    if name not in SCENARIOS:
-        raise ConfigError(f"There is no scenario {name!r}; there are: {', '.join(SCENARIOS)}.")
-    return SCENARIOS[name](checked_seed(seed))
-
-
 def checked_seed(seed: int) -> int:
     """Return a seed that can be used.
 
@@ -158,15 +161,27 @@ def checked_seed(seed: int) -> int:
     return seed
 
 
-def _paper_field(seed: int) -> Field:
+def paper_field(seed: int) -> Field:
     """Return the study's field: 14 markers around five lanes of seven stops.
 
+    Parameters
+    ----------
+    seed : int
+        Source of chance.
+
+    Returns
+    -------
+    Field
+        The world.
+
+    Notes
+    -----
     The 3-D distances from the LiDAR at the centre stop to the markers are those of Table 2. A few
     mounds between the markers reach up to the spheres, so that the study's cut at the highest
     ground takes the lower part of most spheres, as it did there.
     """
     rng = np.random.default_rng([seed, _LAYOUT])
-    bearings = _bearings(rng)
+    bearings = _bearings(rng, len(PAPER_DISTANCES))
     terrain = rough_terrain(np.random.default_rng([seed, _TERRAIN]))
     mounds = _mounds(rng, bearings)
     terrain = with_mounds(terrain, mounds, _MOUND_RADIUS)
@@ -178,13 +193,9 @@ def _paper_field(seed: int) -> Field:
         terrain=terrain,
         scene=_scene(seed, terrain, marks.p_site, _clearances(stops, marks, mounds)),
         marks=marks,
-        marker_radius=_MARKER_RADIUS,
+        marker_radius=MARKER_RADIUS,
         stops=stops,
     )
-
-
-SCENARIOS: dict[str, Callable[[int], Field]] = {"paper-field": _paper_field}
-"""What ``scenario`` knows by name."""
 
 
 def marker_surfaces(p_site: Array, terrain: Terrain) -> tuple[Mesh, Spheres, Poles]:
@@ -209,23 +220,22 @@ def marker_surfaces(p_site: Array, terrain: Terrain) -> tuple[Mesh, Spheres, Pol
     n = len(p_site)
     feet, tops = p_site.copy(), p_site.copy()
     feet[:, 2] = terrain.height_at(p_site)
-    tops[:, 2] -= np.sqrt(_MARKER_RADIUS**2 - _POLE_RADIUS**2)
+    tops[:, 2] -= np.sqrt(MARKER_RADIUS**2 - _POLE_RADIUS**2)
     meshes = [
         pole_mesh(foot, top, _POLE_RADIUS, _POLE_SHADE)
         for foot, top in zip(feet, tops, strict=True)
     ]
     spheres = Spheres(
         p_site=p_site.copy(),
-        radii=np.full(n, _MARKER_RADIUS),
+        radii=np.full(n, MARKER_RADIUS),
         reflectivities=np.full(n, _MARKER_SHADE),
     )
     poles = Poles(feet_site=feet, tops_site=tops, radii=np.full(n, _POLE_RADIUS))
     return Mesh.merged(meshes), spheres, poles
 
 
-def _bearings(rng: np.random.Generator) -> Array:
+def _bearings(rng: np.random.Generator, n: int) -> Array:
     """Return the bearings of the markers from the centre, about evenly spread [rad]."""
-    n = len(PAPER_DISTANCES)
     jitter = rng.uniform(-0.25, 0.25, n)
     return np.asarray((np.arange(n) + jitter + rng.random()) * 2 * np.pi / n)
 
@@ -247,7 +257,7 @@ def _lanes(rng: np.random.Generator, terrain: Terrain) -> tuple[Stop, ...]:
     for lane, y in enumerate(np.linspace(-_FIELD[1], _FIELD[1], _LANES)):
         for place, x in enumerate(np.linspace(-_FIELD[0], _FIELD[0], _STOPS)):
             p_site = np.array([x, y, 0.0])
-            p_site[2] = terrain.height_at(p_site) + _MAST + rng.uniform(-0.03, 0.03)
+            p_site[2] = terrain.height_at(p_site) + MAST + rng.uniform(-0.03, 0.03)
             heading = np.pi * (lane % 2) + rng.normal(0.0, np.radians(5.0))
             name = f"lane{lane + 1}-stop{place + 1}"
             stops.append(Stop(name=name, p_site=p_site, heading=float(heading)))

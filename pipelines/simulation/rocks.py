@@ -15,6 +15,7 @@ _HALF = 34.0  # [m] half side of the square they lie in
 _FULL_HALF = 14.0  # [m] half side of the square where the small ones are kept too
 _FAR_SIZE = 0.15  # [m] smaller rocks farther out are not resolved by any beam
 _ROUND_SHARE = 0.15  # of the rocks are nearly round
+_ROUND_LEVEL = 2  # of nearly round rocks: flats lie 1 mm inside a ball of 0.1 m
 _N_FACETS = 9  # planes that a rock is cut by
 _BURIED = 0.3  # share of a rock's half height that its centre lies above ground
 _REFLECTIVITY = (0.10, 0.22)
@@ -76,20 +77,20 @@ def rock_mesh(rng: np.random.Generator, rocks: Array, terrain: Terrain) -> Mesh:
         All rocks together.
     """
     levels = np.digitize(rocks[:, 2], [0.10, 0.20])  # small ones need few triangles
-    balls = [_ball(level) for level in range(3)]
+    balls = [ball(level) for level in range(3)]
     meshes = []
     for (x, y, diameter), level in zip(rocks, levels, strict=True):
         directions, triangles = balls[level]
-        shape = _shape(rng, directions) * diameter / 2
+        is_round = rng.random() < _ROUND_SHARE
+        shape = _shape(rng, directions, is_round=is_round) * diameter / 2
         centre = np.array([x, y, 0.0])
         centre[2] = terrain.height_at(centre) + _BURIED * shape[:, 2].max()
         meshes.append(Mesh.even(shape + centre, triangles, rng.uniform(*_REFLECTIVITY)))
     return Mesh.merged(meshes)
 
 
-def _shape(rng: np.random.Generator, directions: Array) -> Array:
+def _shape(rng: np.random.Generator, directions: Array, *, is_round: bool) -> Array:
     """Return the surface of a rock of about unit radius in the given directions, (n, 3)."""
-    is_round = rng.random() < _ROUND_SHARE
     axes = rng.uniform(0.92, 1.0, 3) if is_round else rng.uniform(0.6, 1.0, 3)
     normals = rng.standard_normal((_N_FACETS, 3))
     normals /= np.linalg.norm(normals, axis=1, keepdims=True)
@@ -103,8 +104,43 @@ def _shape(rng: np.random.Generator, directions: Array) -> Array:
     )
 
 
-def _ball(level: int) -> tuple[Array, Index]:
-    """Return unit directions and triangles of an icosahedron, each face split ``level`` times."""
+def round_rock(rng: np.random.Generator, centre: Array, radius: float) -> Mesh:
+    """Return a nearly round rock: a ball with flats and axes that differ by a few percent.
+
+    Parameters
+    ----------
+    rng : numpy.random.Generator
+        Source of chance.
+    centre : (3,)
+        Its middle [m].
+    radius : float
+        Its largest radius [m].
+
+    Returns
+    -------
+    Mesh
+        The rock.
+    """
+    directions, triangles = ball(_ROUND_LEVEL)
+    shape = _shape(rng, directions, is_round=True) * radius
+    return Mesh.even(shape + centre, triangles, rng.uniform(*_REFLECTIVITY))
+
+
+def ball(level: int) -> tuple[Array, Index]:
+    """Return the triangles of a unit ball: an icosahedron, each face split several times.
+
+    Parameters
+    ----------
+    level : int
+        How often each face is split into four.
+
+    Returns
+    -------
+    directions : (n, 3)
+        Unit vectors to the corners.
+    triangles : (m, 3)
+        Rows of ``directions``.
+    """
     g = (1 + 5**0.5) / 2
     corners: list[tuple[float, float, float]]
     corners = [(-1, g, 0), (1, g, 0), (-1, -g, 0), (1, -g, 0), (0, -1, g), (0, 1, g)]

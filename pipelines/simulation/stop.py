@@ -26,6 +26,7 @@ from pipelines.simulation.rig import (
 )
 from pipelines.simulation.scene import Scene
 from pipelines.simulation.sensor import Recorded, aim, fire, record
+from pipelines.simulation.visibility import visible_shares
 from pipelines.values import Array, Origin, Rig, ScanLog, StopTruth, Truth
 
 Progress = Callable[[float, str], None]
@@ -157,7 +158,8 @@ def survey_truth(
     Returns
     -------
     Truth
-        Marks, poses, the true rig, and what the survey was made from.
+        Marks, poses, the true rig, and what the survey was made from; of what else stands on the
+        field, the decoys, and how much of each marker each stop can see.
 
     Raises
     ------
@@ -180,8 +182,21 @@ def survey_truth(
             "seed": seed,
             "marker_radius_m": field.marker_radius,
             "simulation": config.to_mapping(),
+            "decoys": [
+                {"name": decoy.name, "kind": decoy.kind, "p_site_m": decoy.p_site.tolist()}
+                for decoy in field.decoys
+            ],
+            "visible_shares": {stop.truth.name: _shares(field, stop) for stop in stops},
         },
     )
+
+
+def _shares(field: Field, stop: SimulatedStop) -> dict[str, float]:
+    """Return the share of each marker that is not hidden from a stop."""
+    shares = visible_shares(
+        field.scene, field.marks.p_site, field.marker_radius, stop.truth.T_site_base[:3, 3]
+    )
+    return dict(zip(field.marks.names, np.round(shares, 3).tolist(), strict=True))
 
 
 def _lean(rng: np.random.Generator, sigma: float) -> Array:

@@ -128,7 +128,7 @@ def test_nearly_all_markers_are_seen_from_the_corners(paper_field, stitched, nam
 
 
 def test_an_unknown_scenario_or_seed_is_refused(paper_field):
-    with pytest.raises(ConfigError, match="there are: paper-field"):
+    with pytest.raises(ConfigError, match="there are: paper-field, "):
         scenario("moon", 1)
     with pytest.raises(ConfigError, match="seed is -1"):
         scenario("paper-field", -1)

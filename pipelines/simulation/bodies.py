@@ -1,0 +1,138 @@
+"""Shapes that things are built of: boxes, cylinders, ellipsoids and loose facets.
+
+Flats of round bodies lie some tenths of a millimetre inside their circles.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from pipelines.geometry import rot_z
+from pipelines.simulation.rocks import ball
+from pipelines.simulation.scene import Mesh
+from pipelines.values import Array
+
+_N_SIDES = 48  # of a cylinder: 0.6 mm inside a circle of 0.3 m
+_LEVEL = 3  # of an ellipsoid: 1280 triangles
+
+
+def box(centre: ArrayLike, sides: ArrayLike, heading: float, reflectivity: float) -> Mesh:
+    """Return an upright box.
+
+    Parameters
+    ----------
+    centre : (3,)
+        Its middle [m].
+    sides : (3,)
+        Its lengths along its own axes, the third upright [m].
+    heading : float
+        Heading of its first axis, counter-clockwise from x [rad].
+    reflectivity : float
+        Its diffuse reflectivity, 0 to 1.
+
+    Returns
+    -------
+    Mesh
+        Twelve triangles.
+    """
+    signs = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)]) / 2
+    corners = (signs * np.asarray(sides)) @ rot_z(heading).T + np.asarray(centre)
+    faces = ((0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6, 4), (1, 5, 7, 3))
+    triangles = [t for a, b, c, d in faces for t in ((a, b, c), (a, c, d))]
+    return Mesh.even(corners, np.array(triangles, dtype=np.intp), reflectivity)
+
+
+def cylinder(start: ArrayLike, end: ArrayLike, radius: float, reflectivity: float) -> Mesh:
+    """Return a closed cylinder in any direction.
+
+    Parameters
+    ----------
+    start, end : (3,)
+        Ends of its axis [m].
+    radius : float
+        Its radius [m].
+    reflectivity : float
+        Its diffuse reflectivity, 0 to 1.
+
+    Returns
+    -------
+    Mesh
+        Jacket and caps.
+    """
+    low, high = np.asarray(start, dtype=np.float64), np.asarray(end, dtype=np.float64)
+    axis = (high - low) / np.linalg.norm(high - low)
+    aside = np.cross(axis, np.eye(3)[np.argmin(np.abs(axis))])
+    aside /= np.linalg.norm(aside)
+    angles = np.arange(_N_SIDES) * 2 * np.pi / _N_SIDES
+    ring = radius * (np.outer(np.cos(angles), aside) + np.outer(np.sin(angles), _up(axis, aside)))
+    i = np.arange(_N_SIDES)
+    j = np.roll(i, -1)
+    foot, top = np.full(_N_SIDES, 2 * _N_SIDES), np.full(_N_SIDES, 2 * _N_SIDES + 1)
+    jacket = ((i, j, i + _N_SIDES), (j, j + _N_SIDES, i + _N_SIDES))
+    caps = ((j, i, foot), (i + _N_SIDES, j + _N_SIDES, top))
+    triangles = np.concatenate([np.column_stack(columns) for columns in (*jacket, *caps)])
+    return Mesh.even(np.vstack([ring + low, ring + high, low, high]), triangles, reflectivity)
+
+
+def _up(axis: Array, aside: Array) -> Array:
+    """Return the unit vector that completes two others."""
+    return np.asarray(np.cross(axis, aside))
+
+
+def ellipsoid(centre: ArrayLike, axes: ArrayLike, heading: float, reflectivity: float) -> Mesh:
+    """Return an upright ellipsoid.
+
+    Parameters
+    ----------
+    centre : (3,)
+        Its middle [m].
+    axes : (3,)
+        Its half axes, the third upright [m].
+    heading : float
+        Heading of its first axis, counter-clockwise from x [rad].
+    reflectivity : float
+        Its diffuse reflectivity, 0 to 1.
+
+    Returns
+    -------
+    Mesh
+        1280 triangles.
+    """
+    directions, triangles = ball(_LEVEL)
+    surface = (directions * np.asarray(axes)) @ rot_z(heading).T + np.asarray(centre)
+    return Mesh.even(surface, triangles, reflectivity)
+
+
+def leaves(
+    rng: np.random.Generator, centre: ArrayLike, axes: ArrayLike, n: int, size: float
+) -> Mesh:
+    """Return loose facets that fill an ellipsoid evenly, as leaves fill a crown.
+
+    Parameters
+    ----------
+    rng : numpy.random.Generator
+        Source of chance.
+    centre : (3,)
+        Middle of the crown [m].
+    axes : (3,)
+        Its half axes [m].
+    n : int
+        Number of leaves.
+    size : float
+        Length of a leaf [m].
+
+    Returns
+    -------
+    Mesh
+        One triangle per leaf, in any direction, each with its own reflectivity.
+    """
+    directions = rng.standard_normal((n, 3))
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    places = directions * np.cbrt(rng.random((n, 1))) * np.asarray(axes) + np.asarray(centre)
+    corners = places[:, None, :] + size / 2 * rng.standard_normal((n, 3, 3))
+    return Mesh(
+        p_site=corners.reshape(-1, 3),
+        triangles=np.arange(3 * n).reshape(n, 3),
+        reflectivities=rng.uniform(0.3, 0.6, n),  # leaves are bright at 905 nm
+    )

@@ -1,0 +1,66 @@
+"""Markers at chosen distances about one stop: how the error grows with the distance."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from pipelines.simulation.field import MARKER_RADIUS, MAST, Field, Stop, marker_surfaces
+from pipelines.simulation.scene import Mesh, Scene, terrain_mesh
+from pipelines.simulation.terrain import Terrain
+from pipelines.values import Array, ControlMarks
+
+LANE_DISTANCES = np.arange(5.0, 30.1, 2.5)
+"""Distances from the LiDAR to the markers of the range lane [m]."""
+
+_PER_DISTANCE = 8
+_HEIGHTS = (0.7, 1.5)  # [m] of the centres above the ground
+_HALF = 40.0  # [m] half side of the ground
+_LANE = 20  # stream of chance
+
+
+def range_lane(seed: int) -> Field:
+    """Return eight markers at each of eleven distances from 5 to 30 m, about one stop.
+
+    Parameters
+    ----------
+    seed : int
+        Source of chance: of directions, heights and heading.
+
+    Returns
+    -------
+    Field
+        Level ground with nothing else on it. The 3-D distances from the base's origin are exact.
+
+    Notes
+    -----
+    Neighbours in direction are 4 degrees apart and stand at different distances, so that no marker
+    hides another. Simulated with ``only_near_spheres``, a stop gives 88 fits in some seconds.
+    """
+    rng = np.random.default_rng([seed, _LANE])
+    lines = np.linspace(-_HALF, _HALF, 81)
+    terrain = Terrain(xs=lines, ys=lines.copy(), heights=np.zeros((81, 81)))
+    p_site = _ring(rng)
+    posts, spheres, poles = marker_surfaces(p_site, terrain)
+    names = tuple(f"D{d * 10:03.0f}-{i + 1}" for i in range(_PER_DISTANCE) for d in LANE_DISTANCES)
+    heading = float(rng.uniform(-np.pi, np.pi))
+    return Field(
+        scenario="range-lane",
+        seed=seed,
+        terrain=terrain,
+        scene=Scene(
+            mesh=Mesh.merged([terrain_mesh(rng, terrain), posts]), spheres=spheres, poles=poles
+        ),
+        marks=ControlMarks(names=names, p_site=p_site, cov_p_site=np.zeros((len(p_site), 3, 3))),
+        marker_radius=MARKER_RADIUS,
+        stops=(Stop(name="lane-stop1", p_site=np.array([0.0, 0.0, MAST]), heading=heading),),
+    )
+
+
+def _ring(rng: np.random.Generator) -> Array:
+    """Return the centres, (88, 3): distances take turns going round [m]."""
+    distances = np.tile(LANE_DISTANCES, _PER_DISTANCE)
+    n = len(distances)
+    bearings = (np.arange(n) + rng.uniform(-0.15, 0.15, n) + rng.random()) * 2 * np.pi / n
+    heights = rng.uniform(*_HEIGHTS, n)
+    reach = np.sqrt(distances**2 - (heights - MAST) ** 2)
+    return np.column_stack([reach * np.cos(bearings), reach * np.sin(bearings), heights])

@@ -1,0 +1,43 @@
+"""Worlds by name."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+from pipelines.errors import ConfigError
+from pipelines.simulation.clutter import clutter_field, rock_field
+from pipelines.simulation.field import Field, checked_seed, paper_field
+from pipelines.simulation.lane import range_lane
+
+SCENARIOS: dict[str, Callable[[int], Field]] = {
+    "paper-field": paper_field,
+    "clutter-field": clutter_field,
+    "rock-field": rock_field,
+    "range-lane": range_lane,
+}
+"""What ``scenario`` knows by name."""
+
+
+def scenario(name: str, seed: int) -> Field:
+    """Return a world by the name of its scenario.
+
+    Parameters
+    ----------
+    name : str
+        One of ``SCENARIOS``.
+    seed : int
+        Source of chance, 0 or more: the same seed gives the same world.
+
+    Returns
+    -------
+    Field
+        The world.
+
+    Raises
+    ------
+    ConfigError
+        If there is no such scenario, or the seed is negative.
+    """
+    if name not in SCENARIOS:
+        raise ConfigError(f"There is no scenario {name!r}; there are: {', '.join(SCENARIOS)}.")
+    return SCENARIOS[name](checked_seed(seed))
