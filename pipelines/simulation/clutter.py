@@ -257,10 +257,15 @@ def _screen(rng: np.random.Generator, world: Field, mark: Array) -> Item:
     return Item(kind="screen", p_site=place, meshes=[mesh])
 
 
+def _above(place: Array, height: float) -> Array:
+    """Return the place so much higher."""
+    return np.asarray(place + np.array([0.0, 0.0, height]))
+
+
 def _wall(rng: np.random.Generator, foot: Array) -> Item:
     """Return a straight wall."""
     height = rng.uniform(1.6, 2.6)
-    place = foot + [0.0, 0.0, height / 2 - 0.1]
+    place = _above(foot, height / 2 - 0.1)
     sides = (rng.uniform(3.0, 4.0), 0.15, height)
     mesh = box(place, sides, rng.uniform(0.0, np.pi), _WALL_SHADE)
     return Item(kind="wall", p_site=place, meshes=[mesh])
@@ -273,9 +278,9 @@ def _corner(rng: np.random.Generator, foot: Array) -> Item:
     meshes = []
     for turn in (0.75 * np.pi, -0.75 * np.pi):
         away = rot_z(inwards + turn) @ [length / 2, 0.0, 0.0]
-        place = foot + away + [0.0, 0.0, height / 2 - 0.1]
+        place = _above(foot + away, height / 2 - 0.1)
         meshes.append(box(place, (length, 0.15, height), inwards + turn, _WALL_SHADE))
-    return Item(kind="corner", p_site=foot + [0.0, 0.0, height / 2], meshes=meshes)
+    return Item(kind="corner", p_site=_above(foot, height / 2), meshes=meshes)
 
 
 def _person(rng: np.random.Generator, foot: Array) -> Item:
@@ -299,10 +304,10 @@ def _person(rng: np.random.Generator, foot: Array) -> Item:
 def _tree(rng: np.random.Generator, foot: Array) -> Item:
     """Return a trunk with a crown of leaves."""
     trunk, half = rng.uniform(1.2, 2.0), rng.uniform(0.7, 1.0)
-    top = foot + [0.0, 0.0, trunk]
-    crown = top + [0.0, 0.0, 0.6 * half]
+    top = _above(foot, trunk)
+    crown = _above(top, 0.6 * half)
     meshes = [
-        cylinder(foot - [0.0, 0.0, 0.1], crown, rng.uniform(0.06, 0.13), _BARK_SHADE),
+        cylinder(_above(foot, -0.1), crown, rng.uniform(0.06, 0.13), _BARK_SHADE),
         leaves(rng, crown, (half, half, 0.8 * half), int(rng.integers(700, 1400)), 0.09),
     ]
     return Item(kind="tree", p_site=crown, meshes=meshes)
@@ -310,21 +315,21 @@ def _tree(rng: np.random.Generator, foot: Array) -> Item:
 
 def _barrel(rng: np.random.Generator, foot: Array) -> Item:
     """Return a barrel."""
-    top = foot + [0.0, 0.0, 0.88]
-    mesh = cylinder(foot - [0.0, 0.0, 0.1], top, rng.uniform(0.24, 0.30), _PIPE_SHADE)
+    top = _above(foot, 0.88)
+    mesh = cylinder(_above(foot, -0.1), top, rng.uniform(0.24, 0.30), _PIPE_SHADE)
     return Item(kind="barrel", p_site=top, meshes=[mesh])
 
 
 def _upright_pipe(rng: np.random.Generator, foot: Array) -> Item:
     """Return an upright pipe as wide as a marker."""
-    top = foot + [0.0, 0.0, rng.uniform(0.7, 1.5)]
-    mesh = cylinder(foot - [0.0, 0.0, 0.1], top, MARKER_RADIUS, _PIPE_SHADE)
+    top = _above(foot, rng.uniform(0.7, 1.5))
+    mesh = cylinder(_above(foot, -0.1), top, MARKER_RADIUS, _PIPE_SHADE)
     return Item(kind="pipe", p_site=top, meshes=[mesh])
 
 
 def _lying_pipe(rng: np.random.Generator, foot: Array) -> Item:
     """Return a level pipe as wide as a marker, on the ground or held above it."""
-    middle = foot + [0.0, 0.0, rng.uniform(0.10, 0.6)]
+    middle = _above(foot, rng.uniform(0.10, 0.6))
     half = rot_z(rng.uniform(0.0, np.pi)) @ [0.7, 0.0, 0.0]
     mesh = cylinder(middle - half, middle + half, MARKER_RADIUS, _PIPE_SHADE)
     return Item(kind="pipe", p_site=middle, meshes=[mesh])
@@ -340,7 +345,7 @@ def _bare_pole(terrain: Terrain) -> Builder:
     """Return what builds poles without a ball."""
 
     def build(rng: np.random.Generator, foot: Array) -> Item:
-        top = foot + [0.0, 0.0, rng.uniform(0.6, 2.0)]
+        top = _above(foot, rng.uniform(0.6, 2.0))
         mesh, stick = _pole(terrain, top, rng.uniform(0.012, 0.045))
         return Item(kind="pole", p_site=top, meshes=[mesh], sticks=[stick])
 
@@ -351,8 +356,8 @@ def _ball_on_pole(terrain: Terrain, radius: float) -> Builder:
     """Return what builds balls of the wrong size on poles."""
 
     def build(rng: np.random.Generator, foot: Array) -> Item:
-        centre = foot + [0.0, 0.0, rng.uniform(0.7, 1.4)]
-        mesh, stick = _pole(terrain, centre - [0.0, 0.0, 0.98 * radius], 0.015)
+        centre = _above(foot, rng.uniform(0.7, 1.4))
+        mesh, stick = _pole(terrain, _above(centre, -0.98 * radius), 0.015)
         balls = [(centre, radius, _BALL_SHADE)]
         return Item(kind="wrong ball", p_site=centre, meshes=[mesh], balls=balls, sticks=[stick])
 
@@ -363,7 +368,7 @@ def _ball_on_ground(radius: float) -> Builder:
     """Return what builds balls of the wrong size that lie on the ground."""
 
     def build(_rng: np.random.Generator, foot: Array) -> Item:
-        centre = foot + [0.0, 0.0, 0.95 * radius]
+        centre = _above(foot, 0.95 * radius)
         return Item(
             kind="wrong ball", p_site=centre, meshes=[], balls=[(centre, radius, _BALL_SHADE)]
         )
@@ -374,14 +379,14 @@ def _ball_on_ground(radius: float) -> Builder:
 def _round_rock(rng: np.random.Generator, foot: Array) -> Item:
     """Return a nearly round rock of marker size, sunk in by less than half."""
     radius = rng.uniform(*_ROCK_RADII)
-    centre = foot + [0.0, 0.0, radius * rng.uniform(0.3, 0.9)]
+    centre = _above(foot, radius * rng.uniform(0.3, 0.9))
     return Item(kind="rock", p_site=centre, meshes=[round_rock(rng, centre, radius)])
 
 
 def _perched_rock(rng: np.random.Generator, foot: Array) -> Item:
     """Return a nearly round rock of marker size on top of a larger one."""
     below, radius = rng.uniform(0.18, 0.30), rng.uniform(*_ROCK_RADII)
-    base = foot + [0.0, 0.0, 0.6 * below]
-    centre = base + [0.0, 0.0, 0.92 * below + 0.95 * radius]
+    base = _above(foot, 0.6 * below)
+    centre = _above(base, 0.92 * below + 0.95 * radius)
     meshes = [round_rock(rng, base, below), round_rock(rng, centre, radius)]
     return Item(kind="perched rock", p_site=centre, meshes=meshes)
