@@ -47,7 +47,6 @@ _POLE_BEGINS = 0.97  # radii below the centre: a footprint that reaches lower ma
 _POLE_HALF = 0.45  # radii from the vertical through the centre within which the pole is
 _SPREAD_MIN = 1e-5  # [m] of the laser biases: keeps their prior invertible
 _N_STEPS_FREE = 4
-_FEW = 0.0
 _N_STEPS = 12
 _N_STEPS_GATED = 6  # after these the choice of returns by their place stays as it is
 _STEP_MAX = 0.25  # radii per step
@@ -59,7 +58,7 @@ _DOF_BIAS = 2.0  # lasers that the prior of the biases is worth when their sprea
 
 _N_GOOD = 20  # returns below which a centre is called weak
 _COVERAGE_GOOD = 0.6
-_RADIUS_SIGMAS = 3.0
+_RADIUS_SIGMAS = 4.0  # its own sigma is too small by a third on fifty returns, by half on twenty
 _RADIUS_SLACK = 0.006  # [m] by which a free radius may be off whatever its sigma
 _NOISE_FACTOR = 1.6  # of the stop's noise, above which a marker is called weak
 
@@ -385,13 +384,12 @@ def _own_factor(estimate: _Estimate, mine: Mask) -> float:
 def _covariance(estimate: _Estimate, k: int, own: float, n_used: int) -> Array:
     """Return a centre's covariance: noise as the stop and the marker show it, and biases.
 
-    The factor on few returns is what repeated scans need for errors to agree with covariances: the
-    outline then decides much, and it bends within the uncertainty of the centre.
+    The noise is that of the stop until a marker has returns enough to speak for itself: a handful
+    of returns that agree by chance must not look precise.
     """
     state = estimate.state
     variance = (_DOF_STOP * state.factor**2 + n_used * own**2) / (_DOF_STOP + n_used)
-    few = 1.0 + _FEW / n_used
-    return np.asarray(few * variance * state.cov_noise[k] + state.factor**2 * state.cov_biases[k])
+    return np.asarray(variance * state.cov_noise[k] + state.factor**2 * state.cov_biases[k])
 
 
 def _weakness(fit: MarkerFit, factor: float) -> str:
