@@ -73,7 +73,7 @@ class JobQueue:
         self._loop = asyncio.get_running_loop()
         self._client = await self._connect()
         self._client.subscribe_topic(tasks.TOPIC, lambda event: self._heard.put_nowait(event[1]))
-        await self._client.register_plugin(tasks.WarmUp())
+        await self._client.register_plugin(tasks.WarmUp(is_ours=not self._settings.scheduler))
         recorder = asyncio.create_task(self._record())
         self._stack.callback(recorder.cancel)
         for job in await asyncio.to_thread(self._catalogue.take_up_jobs):

@@ -7,6 +7,7 @@ knows the catalogue; what goes wrong is raised and recorded by the service.
 from __future__ import annotations
 
 import resource
+import signal
 import subprocess
 import threading
 from collections.abc import Sequence
@@ -192,8 +193,13 @@ class WarmUp(WorkerPlugin):  # type: ignore[misc]  # distributed ships no types
     name = "spheremark-warm-up"
     idempotent = True
 
+    def __init__(self, *, is_ours: bool) -> None:
+        self.is_ours = is_ours
+
     def setup(self, worker: Worker) -> None:  # noqa: ARG002  the protocol of Dask
         """Begin, without keeping the worker from work."""
+        if self.is_ours:  # Ctrl-C is for the service, which then ends its workers
+            signal.signal(signal.SIGINT, signal.SIG_IGN)
         threading.Thread(target=warm_up, name="warm-up", daemon=True).start()
 
 
