@@ -7,6 +7,6 @@ and drawn for any result, stored or not. Nothing here knows where values come fr
   one stop in space. ``theme`` has their colours by role, which static/tokens.css gives values.
 - ``pages``: what each page shows, as frozen contexts, and functions from them to HTML; beside it
   ``readouts`` (the numbers at a glance), ``filters`` (a view as an address), ``templating``.
-- ``assets`` and static/: style sheets, scripts, fonts. No page has a script or style of its own, and
-  none asks another host.
+- ``assets`` and static/: style sheets, scripts, fonts. Pages have no script or style of their own,
+  and ask no other host.
 """

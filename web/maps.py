@@ -34,7 +34,8 @@ def site_map(marks: Columns, fixes: Columns, true_stops: Columns) -> go.Figure:
     figure.update_xaxes(title_text="x, site [m]", constrain="domain")
     figure.update_yaxes(title_text="y, site [m]", scaleanchor="x", scaleratio=1)
     if factor:
-        _note(figure, f"ellipses and errors \N{MULTIPLICATION SIGN}{factor:g}")
+        what = "ellipses and errors" if len(true_stops["stop"]) else "ellipses"
+        _note(figure, f"{what} \N{MULTIPLICATION SIGN}{factor:g}")
     return figure
 
 
