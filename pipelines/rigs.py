@@ -20,6 +20,7 @@ FIRING_CYCLE = 55.296e-6  # [s] between two firings of the same laser
 LASER_CYCLE = 2.304e-6  # [s] between two lasers of one firing
 RANGE_STEP = 0.002  # [m] resolution of a range
 AZIMUTH_STEP = np.radians(0.01)  # resolution of an azimuth
+N_BLOCKS, FIRINGS_PER_BLOCK = 12, 2  # of a packet
 FIRING_ORDER = np.array([0, 8, 1, 9, 2, 10, 3, 11, 4, 12, 5, 13, 6, 14, 7, 15])
 """Laser index (0 the lowest) in the order of firing: -15, +1, -13, +3, ... degrees."""
 

@@ -200,6 +200,33 @@ class ScanLog:
 
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
+class Firings:
+    """All shots of a VLP-16 as its packets hold them, with and without a return.
+
+    Attributes
+    ----------
+    azimuths : (n,) uint16
+        Azimuth of the first shot of each block of two firings, in hundredths of a degree,
+        clockwise from x seen from +z.
+    distances : (n, 32) uint16
+        Distance of each shot in units of 2 mm, in the order of firing; 0 without a return.
+    reflectivities : (n, 32) uint8
+        Calibrated reflectivity of each shot; 0 without a return.
+    start_ns : int
+        Instant of the first shot; blocks follow each other without a pause.
+    """
+
+    azimuths: NDArray[np.uint16]
+    distances: NDArray[np.uint16]
+    reflectivities: NDArray[np.uint8]
+    start_ns: int
+
+    def __post_init__(self) -> None:
+        n = len(self.azimuths)
+        _seal(self, azimuths=(n,), distances=(n, 32), reflectivities=(n, 32))
+
+
+@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class Levelling:
     """How the base leans, as the AHRS tells.
 

@@ -23,6 +23,16 @@ class SimulationConfig:
     turn : float
         Time in which the gimbal turns through 360 degrees [s]. 13.2: incommensurate with the 2
         degree pitch of the channels, so that scan lines do not fall on scan lines.
+    step : float
+        Angle between the rests of a gimbal that steps instead of turning evenly; 0 turns evenly
+        [rad]. The study is read as having steps of 5 degrees. ``turn`` then means nothing.
+    rest_revolutions : int
+        Revolutions of the LiDAR during each rest. 3: so that at least one whole message without
+        shot times lies well inside.
+    move : float
+        Time of the movement from one rest to the next [s]; the LiDAR runs on.
+    shot_times : bool
+        Whether the points carry a time each; if not, all points of a revolution have its start.
     sigma_range : float or None
         Noise of every range [m]; none takes the noise by reflectivity that was measured on real
         packets of a VLP-16.
@@ -68,6 +78,10 @@ class SimulationConfig:
 
     spin_rpm: float = 600.0
     turn: float = 13.2
+    step: float = 0.0
+    rest_revolutions: int = 3
+    move: float = 0.1
+    shot_times: bool = True
     sigma_range: float | None = None
     sigma_laser_bias: float = 0.003
     drop_out: float = 0.005
@@ -90,6 +104,9 @@ class SimulationConfig:
     _BOUNDS: ClassVar[dict[str, tuple[float, float]]] = {
         "spin_rpm": (300.0, 1200.0),
         "turn": (0.5, 3600.0),
+        "step": (0.0, math.pi / 2),
+        "rest_revolutions": (1, 1000),
+        "move": (0.01, 10.0),
         "sigma_range": (0.0, 0.5),
         "sigma_laser_bias": (0.0, 0.1),
         "drop_out": (0.0, 0.95),

@@ -57,20 +57,71 @@ class Motion:
 
 
 def recorded_time(config: SimulationConfig) -> float:
-    """Return how long the LiDAR records: the turn, and half a revolution before and after it.
+    """Return how long the LiDAR records.
 
     Parameters
     ----------
     config : SimulationConfig
-        Time of the turn and speed of the LiDAR.
+        Time of the turn, or of rests and moves, and speed of the LiDAR.
 
     Returns
     -------
     float
-        Time from the first shot to the end of the last firing [s]. Half a revolution looks into
-        the sky: without the surplus the returns might not span the turn.
+        Time from the first shot to the end of the last firing [s]: of all rests and moves; or of
+        the turn and half a revolution before and after it. Half a revolution looks into the sky:
+        without the surplus the returns might not span the turn.
     """
+    if config.step:
+        rest = config.rest_revolutions * 60.0 / config.spin_rpm
+        return _n_steps(config) * (rest + config.move) + rest
     return config.turn + 60.0 / config.spin_rpm
+
+
+def turning(config: SimulationConfig, start: float) -> Motion:
+    """Return how the gimbal moves: evenly, or from rest to rest.
+
+    Parameters
+    ----------
+    config : SimulationConfig
+        Time of the turn; or step, revolutions per rest and time of a move.
+    start : float
+        Angle at the first shot [rad].
+
+    Returns
+    -------
+    Motion
+        Through 360 degrees.
+    """
+    return stepped_turn(config, start) if config.step else even_turn(config, start)
+
+
+def stepped_turn(config: SimulationConfig, start: float) -> Motion:
+    """Return a movement that rests at every step, at the first and last angle too.
+
+    Parameters
+    ----------
+    config : SimulationConfig
+        Step, revolutions per rest and time of a move; a last step that would lead past 360 degrees
+        is shortened.
+    start : float
+        Angle of the first rest [rad].
+
+    Returns
+    -------
+    Motion
+        Begins with the first shot; the gimbal rests before it and after the last.
+    """
+    rest = config.rest_revolutions * 60.0 / config.spin_rpm
+    begins = np.arange(_n_steps(config) + 1) * (rest + config.move)
+    angles = np.minimum(np.arange(len(begins)) * config.step, 2 * np.pi)
+    return Motion(
+        times=np.column_stack([begins, begins + rest]).ravel(), angles=start + np.repeat(angles, 2)
+    )
+
+
+def _n_steps(config: SimulationConfig) -> int:
+    """Return the number of steps of a turn."""
+    return int(np.ceil(2 * np.pi / config.step - 1e-9))
 
 
 def even_turn(config: SimulationConfig, start: float) -> Motion:
@@ -238,6 +289,12 @@ def commensurability(config: SimulationConfig) -> str:
     worst, wanted = float(gaps.max()), 2 * _MARKER_RADIUS / _MARKER_RANGE / _LINES_WANTED
     if worst <= wanted:
         return ""
+    if config.step:
+        return (
+            f"Rests every {np.degrees(config.step):.3g} deg put scan lines of the 2 deg pitch of "
+            f"the channels on scan lines and leave gaps of {np.degrees(worst):.2f} deg (mean "
+            f"{np.degrees(gaps.mean()):.2f}); choose a finer step that is no multiple of a degree."
+        )
     advance = np.degrees(2 * np.pi / config.turn * 60.0 / config.spin_rpm)
     return (
         f"A turn of {config.turn:g} s at {config.spin_rpm:g} rpm moves the gimbal {advance:.3f} "
@@ -269,11 +326,10 @@ def _horizon_gaps(config: SimulationConfig) -> Array:
     """Return the gaps between the directions in which one turn crosses the horizon [rad]."""
     period = 60.0 / config.spin_rpm
     elevations = nominal_rig(config).laser_elevations
-    up = np.arange(0.0, config.turn, period)
-    down = np.arange(period / 2, config.turn, period)
-    speed = 2 * np.pi / config.turn
-    front = speed * up[:, None] + np.pi / 2 - elevations
-    back = speed * down[:, None] - np.pi / 2 + elevations
+    motion, end = turning(config, 0.0), recorded_time(config) if config.step else config.turn
+    up, down = np.arange(0.0, end, period), np.arange(period / 2, end, period)
+    front = motion.angle_at(up)[:, None] + np.pi / 2 - elevations
+    back = motion.angle_at(down)[:, None] - np.pi / 2 + elevations
     directions = np.sort(np.concatenate([front.ravel(), back.ravel()]) % (2 * np.pi))
     return np.diff(directions, append=directions[0] + 2 * np.pi)
 

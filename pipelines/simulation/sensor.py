@@ -9,12 +9,26 @@ from typing import Self
 import numba
 import numpy as np
 
-from pipelines.rigs import FIRING_CYCLE, FIRING_ORDER, LASER_CYCLE, N_LASERS
+from pipelines.rigs import (
+    AZIMUTH_STEP,
+    FIRING_CYCLE,
+    FIRING_ORDER,
+    FIRINGS_PER_BLOCK,
+    LASER_CYCLE,
+    N_BLOCKS,
+    N_LASERS,
+    RANGE_STEP,
+)
 from pipelines.simulation.echo import Aims, Echoes
 from pipelines.simulation.options import SimulationConfig
 from pipelines.simulation.rig import Motion, quantised
-from pipelines.values import Array, Column, Nanos, Rig, Rings, _seal
+from pipelines.values import Array, Column, Firings, Index, Nanos, Rig, Rings, _seal
 
+FIRINGS_PER_PACKET = N_BLOCKS * FIRINGS_PER_BLOCK
+"""Firings of all lasers that the sensor sends at once."""
+
+_SHOTS_PER_BLOCK = FIRINGS_PER_BLOCK * N_LASERS
+_FULL_TURN = 36_000  # steps of an azimuth
 _RANGE_LIMITS = (0.9, 100.0)  # [m] the VLP-16's own
 _NOISE_LIMITS = (5.0, 15.0, 40.0, 100.0)  # calibrated reflectivity, 0-255
 _NOISE = np.array(
@@ -54,7 +68,7 @@ class Shots:
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class Recorded:
-    """What a driver makes of some shots: those without a return are gone.
+    """What the sensor sends of some shots, and what a driver makes of it.
 
     Attributes
     ----------
@@ -66,25 +80,30 @@ class Recorded:
         Laser of each return.
     offsets_ns : (n,)
         Instant of each shot since the first one of the stop.
+    firings : Firings
+        All shots, those without a return among them; its start is that of the stop.
     """
 
     p_lidar: Column
     intensities: Column
     rings: Rings
     offsets_ns: Nanos
+    firings: Firings
 
     def __post_init__(self) -> None:
         n = len(self.rings)
         _seal(self, p_lidar=(n, 3), intensities=(n,), rings=(n,), offsets_ns=(n,))
 
     @classmethod
-    def joined(cls, pieces: Sequence[Self]) -> Self:
+    def joined(cls, pieces: Sequence[Self], start_ns: int) -> Self:
         """Return several pieces of one recording as one.
 
         Parameters
         ----------
         pieces : sequence of Recorded
             In the order of firing.
+        start_ns : int
+            Instant of the first shot.
 
         Returns
         -------
@@ -96,6 +115,12 @@ class Recorded:
             intensities=np.concatenate([piece.intensities for piece in pieces]),
             rings=np.concatenate([piece.rings for piece in pieces]),
             offsets_ns=np.concatenate([piece.offsets_ns for piece in pieces]),
+            firings=Firings(
+                azimuths=np.concatenate([piece.firings.azimuths for piece in pieces]),
+                distances=np.concatenate([piece.firings.distances for piece in pieces]),
+                reflectivities=np.concatenate([piece.firings.reflectivities for piece in pieces]),
+                start_ns=start_ns,
+            ),
         )
 
 
@@ -162,7 +187,7 @@ def record(
     Parameters
     ----------
     shots : Shots
-        The shots.
+        The shots of whole packets: a multiple of 24 firings.
     echoes : Echoes
         What came back from each.
     rig : Rig
@@ -182,14 +207,61 @@ def record(
     sigma = range_noise(shades) if config.sigma_range is None else config.sigma_range
     ranges = echoes.ranges[seen] + rig.laser_range_biases[rings]
     ranges = quantised(ranges + sigma * rng.standard_normal(len(seen)), config.range_step)
-    azimuths = quantised(shots.azimuths[seen] % (2 * np.pi), config.azimuth_step)
+    azimuths = recorded_azimuths(shots.azimuths, config.azimuth_step)[seen]
     floor, share = _INTENSITY_NOISE
     counts = shades + (floor + share * shades) * rng.standard_normal(len(seen))
+    intensities = np.clip(np.round(counts), 0.0, 255.0).astype(np.float32)
     return Recorded(
         p_lidar=_points(ranges, azimuths, rig.laser_elevations[rings], rig.laser_heights[rings]),
-        intensities=np.clip(np.round(counts), 0.0, 255.0).astype(np.float32),
+        intensities=intensities,
         rings=rings,
         offsets_ns=shots.offsets_ns[seen],
+        firings=_firings(shots.azimuths, seen, ranges, intensities),
+    )
+
+
+def recorded_azimuths(azimuths: Array, step: float) -> Array:
+    """Return the azimuths that a driver finds for all shots of whole packets.
+
+    Parameters
+    ----------
+    azimuths : (n,)
+        True azimuths of shots in the order of firing, unwrapped [rad].
+    step : float
+        Quantisation of azimuths [rad]; 0 for none.
+
+    Returns
+    -------
+    (n,)
+        Azimuths, 0 to a full turn [rad].
+
+    Notes
+    -----
+    A packet tells the azimuth of the first of 32 shots, rounded to the step; that of the others
+    follows from the mean speed within the packet and is rounded again, as drivers do.
+    """
+    blocks = quantised(azimuths.reshape(-1, N_BLOCKS, _SHOTS_PER_BLOCK)[:, :, :1], step)
+    k = np.arange(_SHOTS_PER_BLOCK)
+    times = k // N_LASERS * FIRING_CYCLE + k % N_LASERS * LASER_CYCLE
+    lasting = (N_BLOCKS - 1) * FIRINGS_PER_BLOCK * FIRING_CYCLE
+    speeds = (blocks[:, -1:] - blocks[:, :1]) / lasting
+    return quantised((blocks + speeds * times).ravel(), step) % (2 * np.pi)
+
+
+def _firings(azimuths: Array, seen: Index, ranges: Array, intensities: Column) -> Firings:
+    """Return all shots as packets hold them, given the returns of some."""
+    distances, reflectivities = (
+        np.zeros(len(azimuths), np.uint16),
+        np.zeros(len(azimuths), np.uint8),
+    )
+    distances[seen] = np.round(np.maximum(ranges, RANGE_STEP) / RANGE_STEP)
+    reflectivities[seen] = intensities
+    hundredths = np.round(azimuths[::_SHOTS_PER_BLOCK] / AZIMUTH_STEP) % _FULL_TURN
+    return Firings(
+        azimuths=hundredths.astype(np.uint16),
+        distances=distances.reshape(-1, _SHOTS_PER_BLOCK),
+        reflectivities=reflectivities.reshape(-1, _SHOTS_PER_BLOCK),
+        start_ns=0,
     )
 
 

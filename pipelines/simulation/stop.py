@@ -18,20 +18,20 @@ from pipelines.simulation.options import SimulationConfig
 from pipelines.simulation.rig import (
     Motion,
     ahrs_samples,
-    even_turn,
     joint_samples,
     nominal_rig,
     recorded_time,
     true_rig,
+    turning,
 )
 from pipelines.simulation.scene import Scene
-from pipelines.simulation.sensor import Recorded, aim, fire, record
+from pipelines.simulation.sensor import FIRINGS_PER_PACKET, Recorded, aim, fire, record
 from pipelines.simulation.visibility import visible_shares
-from pipelines.values import Array, Origin, Rig, ScanLog, StopTruth, Truth
+from pipelines.values import Array, Firings, Nanos, Origin, Rig, ScanLog, StopTruth, Truth
 
 Progress = Callable[[float, str], None]
 
-_CHUNK = 1 << 14  # firings at a time: some 100 MB of work space
+_CHUNK = 683 * FIRINGS_PER_PACKET  # firings at a time: some 100 MB of work space
 _FIRST_STOP = datetime(2026, 5, 11, 9, 0, tzinfo=UTC)
 _BETWEEN_STOPS = timedelta(seconds=90)
 _HOME = np.radians(1.0)  # the gimbal starts within this of zero
@@ -50,11 +50,14 @@ class SimulatedStop:
         True pose of the base.
     rig : Rig
         The true rig.
+    firings : Firings
+        All shots of the LiDAR as its packets hold them; its returns are those of the log.
     """
 
     log: ScanLog
     truth: StopTruth
     rig: Rig
+    firings: Firings
 
 
 class _Run(NamedTuple):
@@ -108,7 +111,8 @@ def simulate_stop(
 
     Notes
     -----
-    Work grows linearly with the time of the turn, and takes about a fifth of it on two cores.
+    Work grows linearly with the time of the scan, and takes about a fifth of it on two cores. The
+    points of the log are those that a driver makes of the packets.
     """
     stop = field.stop(name)
     seed = checked_seed(field.seed if seed is None else seed)
@@ -117,18 +121,20 @@ def simulate_stop(
     rig = true_rig(config, np.random.default_rng([seed, _RIG]))
     R_station_base = _lean(rng, config.sigma_tilt)
     T_site_base = rigid(rot_z(stop.heading) @ R_station_base, stop.p_site)
-    motion = even_turn(config, rng.uniform(-_HOME, _HOME))
+    motion = turning(config, rng.uniform(-_HOME, _HOME))
     start_ns = _start_ns(place, rng)
     of_lidar, of_encoder, of_ahrs = rng.spawn(3)
-    returns = _scan(_Run(field.scene, T_site_base, motion, rig), config, of_lidar, progress)
+    returns = Recorded.joined(
+        _scan(_Run(field.scene, T_site_base, motion, rig), config, of_lidar, progress), start_ns
+    )
     joint = joint_samples(motion, rig, config, of_encoder)
     ahrs = ahrs_samples(motion, R_station_base, rig, config, of_ahrs)
     log = ScanLog(
         p_lidar=returns.p_lidar,
         intensities=returns.intensities,
         rings=returns.rings,
-        stamps_lidar_ns=start_ns + returns.offsets_ns,
-        has_shot_times=True,
+        stamps_lidar_ns=start_ns + _stamped(returns.offsets_ns, config),
+        has_shot_times=config.shot_times,
         gimbal_angles=joint[0],
         stamps_gimbal_ns=start_ns + joint[1],
         quaternions_imu=ahrs[0],
@@ -136,7 +142,8 @@ def simulate_stop(
         rig=nominal_rig(config),
         origin=Origin(name=name, digest=""),
     )
-    return SimulatedStop(log=log, truth=StopTruth(name=name, T_site_base=T_site_base), rig=rig)
+    truth = StopTruth(name=name, T_site_base=T_site_base)
+    return SimulatedStop(log=log, truth=truth, rig=rig, firings=returns.firings)
 
 
 def survey_truth(
@@ -211,12 +218,18 @@ def _start_ns(place: int, rng: np.random.Generator) -> int:
     return second * 10**9 + int(rng.integers(10**9))
 
 
+def _stamped(offsets_ns: Nanos, config: SimulationConfig) -> Nanos:
+    """Return the instants that points are recorded with: their own, or that of their revolution."""
+    revolution_ns = round(60e9 / config.spin_rpm)
+    return offsets_ns if config.shot_times else offsets_ns // revolution_ns * revolution_ns
+
+
 def _scan(
     run: _Run, config: SimulationConfig, rng: np.random.Generator, progress: Progress
-) -> Recorded:
-    """Return what the LiDAR records during one turn."""
-    n, start_azimuth = int(recorded_time(config) / FIRING_CYCLE), rng.uniform(0.0, 2 * np.pi)
-    rig = run.rig
+) -> list[Recorded]:
+    """Return what the LiDAR records during one turn, in pieces."""
+    n = int(recorded_time(config) / FIRING_CYCLE) // FIRINGS_PER_PACKET * FIRINGS_PER_PACKET
+    start_azimuth, rig = rng.uniform(0.0, 2 * np.pi), run.rig
     pieces = []
     for first in range(0, n, _CHUNK):
         progress(first / n, "Casting beams")
@@ -225,4 +238,4 @@ def _scan(
         echoes = trace(run.scene, aims, rig.divergence, only_near_spheres=config.only_near_spheres)
         pieces.append(record(shots, echoes, rig, config, rng))
     progress(1.0, "All beams cast")
-    return Recorded.joined(pieces)
+    return pieces

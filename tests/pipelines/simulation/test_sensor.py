@@ -7,7 +7,7 @@ from pipelines.simulation.echo import Echoes
 from pipelines.simulation.rig import even_turn, nominal_rig
 from pipelines.simulation.sensor import aim, fire, record
 
-N_FIRINGS = 4000
+N_FIRINGS = 4008
 CONFIG = SimulationConfig()
 
 

@@ -53,7 +53,8 @@ def test_quantisation_moves_points_by_less_than_its_steps(plain, stitched):
     p_site = stitched(stop, stop.log.rig)
     ranges = np.linalg.norm(p_site - stop.truth.T_site_base[:3, 3], axis=1)
     off = off_surfaces(p_site, plain)
-    assert (off <= 0.001 + ranges * np.radians(0.005) + FLOAT32).all()
+    # block and shot are rounded, each to half a hundredth of a degree
+    assert (off <= 0.001 + ranges * np.radians(0.01) + FLOAT32).all()
     assert np.median(off) > 1e-4
 
 
