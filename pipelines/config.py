@@ -17,6 +17,7 @@ from typing import Any, Self, TypeVar, get_type_hints
 from pipelines.errors import ConfigError
 
 FITTING_METHODS = ("along_beam", "paper")
+PAPER_MODELS = ("hemisphere", "sphere")
 RESECTION_METHODS = ("free_station",)
 
 _T = TypeVar("_T")
@@ -116,16 +117,25 @@ class FittingConfig:
     sigma_direction : float
         Standard deviation of a beam's direction per axis [rad]. 1e-4: azimuth in steps of 0.01 deg,
         encoder and timing.
+    paper_model : str
+        What ``paper`` registers to the returns, of ``PAPER_MODELS``. hemisphere: as the study does;
+        its Figure 3 shows the whole sphere instead.
     """
 
     methods: tuple[str, ...] = FITTING_METHODS
     sigma_range_bias: float = 0.003
     sigma_direction: float = 1e-4
+    paper_model: str = "hemisphere"
 
     def __post_init__(self) -> None:
         _check_methods("fitting.methods", self.methods, FITTING_METHODS)
         _check("fitting.sigma_range_bias", self.sigma_range_bias, 1e-6, 0.05)
         _check("fitting.sigma_direction", self.sigma_direction, 0.0, 0.01)
+        if self.paper_model not in PAPER_MODELS:
+            raise ConfigError(
+                f"fitting.paper_model is {self.paper_model!r}; it must be one of "
+                f"{list(PAPER_MODELS)}."
+            )
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

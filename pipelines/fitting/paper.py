@@ -27,7 +27,7 @@ from pipelines.values import (
 
 NAME = "paper"
 
-_N_MODEL = 1000  # points of the hemisphere; the study does not tell, and 300 or 3000 change < 1 mm
+_N_HALF = 1000  # points of a hemisphere; the study does not tell, and 300 or 3000 change < 1 mm
 _SEGMENT = 1.35  # radii about the found sphere: what the study's segmentation leaves of a cluster
 _N_MIN = 4  # returns: one more than unknowns
 _N_STEPS = 200
@@ -46,7 +46,7 @@ def fit(
     found : MarkerCandidates
         Groups of returns, and the height of the highest ground point.
     config : FittingConfig
-        Not used: the study knows no noise.
+        Which model is registered; the study knows no noise.
     radius : float
         Radius of the spheres [m].
 
@@ -65,14 +65,22 @@ def fit(
     so that every point of the model draws on its nearest return. The whole hemisphere is drawn to
     the part that was seen, hence toward the scanner; where the cut took the lower part, upward.
     """
-    del config
-    results = [_fit_one(cloud, found, candidate, radius) for candidate in found.candidates]
+    is_whole = config.paper_model == "sphere"
+    results = [
+        _fit_one(cloud, found, candidate, radius, is_whole=is_whole)
+        for candidate in found.candidates
+    ]
     fits = tuple(r for r in results if isinstance(r, MarkerFit))
     return fits, tuple(r for r in results if isinstance(r, Rejection))
 
 
 def _fit_one(
-    cloud: StitchedCloud, found: MarkerCandidates, candidate: MarkerCandidate, radius: float
+    cloud: StitchedCloud,
+    found: MarkerCandidates,
+    candidate: MarkerCandidate,
+    radius: float,
+    *,
+    is_whole: bool,
 ) -> MarkerFit | Rejection:
     """Fit one candidate, or say why the cut leaves nothing to fit."""
     used = _left_by_cut(cloud, found.ground_height_max, candidate, radius)
@@ -84,7 +92,7 @@ def _fit_one(
             f"{found.ground_height_max:.2f} m, leaves {len(used)}; a centre needs {_N_MIN}.",
         )
     points = cloud.p_base[used].astype(np.float64)
-    p = _registered(_hemisphere(-points.mean(axis=0), radius), points)
+    p = _registered(_model(-points.mean(axis=0), radius, is_whole=is_whole), points)
     return _described(cloud, candidate, used, p, radius)
 
 
@@ -98,10 +106,11 @@ def _left_by_cut(
     return np.asarray(candidate.members[is_sphere & (heights >= height)])
 
 
-def _hemisphere(v_facing: Array, radius: float) -> Array:
-    """Return points spread evenly over the half of a sphere about zero that faces a direction."""
-    z = (np.arange(_N_MODEL) + 0.5) / _N_MODEL
-    phi = np.pi * (1.0 + np.sqrt(5.0)) * np.arange(_N_MODEL)
+def _model(v_facing: Array, radius: float, *, is_whole: bool) -> Array:
+    """Return points spread evenly over a sphere about zero, or its half that faces a direction."""
+    n = 2 * _N_HALF if is_whole else _N_HALF
+    z = 1.0 - (np.arange(n) + 0.5) / _N_HALF
+    phi = np.pi * (1.0 + np.sqrt(5.0)) * np.arange(n)
     rho = np.sqrt(1.0 - z**2)
     w = v_facing / np.linalg.norm(v_facing)
     first = np.cross(w, np.eye(3)[np.argmin(np.abs(w))])

@@ -303,6 +303,22 @@ def test_the_cut_of_the_study_lifts_its_centre():
     assert cut.p_base[2] - whole.p_base[2] > 0.005
 
 
+def test_the_whole_sphere_as_a_model_is_drawn_further_than_the_hemisphere():
+    cloud = cloud_of(*marker_shots(CENTRE, np.random.default_rng(16), sigma=0.01))
+    outward = CENTRE / np.linalg.norm(CENTRE)
+
+    def pull(model):
+        config = FittingConfig(paper_model=model)
+        return (fit_one(cloud, CENTRE, "paper", config=config).fits[0].p_base - CENTRE) @ outward
+
+    assert pull("sphere") < 2 * pull("hemisphere") < -0.01
+
+
+def test_an_unknown_model_is_refused_with_the_known_ones_named():
+    with pytest.raises(ConfigError, match="hemisphere"):
+        FittingConfig(paper_model="cube")
+
+
 def test_a_ball_below_the_cut_is_lost_to_the_study_and_said_so():
     cloud = cloud_of(*marker_shots(CENTRE, np.random.default_rng(14), sigma=0.01))
     result = fit_one(cloud, CENTRE, "paper", ground=CENTRE[2] + 0.2)
