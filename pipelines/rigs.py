@@ -25,6 +25,7 @@ FIRING_ORDER = np.array([0, 8, 1, 9, 2, 10, 3, 11, 4, 12, 5, 13, 6, 14, 7, 15])
 """Laser index (0 the lowest) in the order of firing: -15, +1, -13, +3, ... degrees."""
 
 _FOCAL_OFFSET = 0.04191  # [m] from the spin axis to where the beams cross (VLP-16 manual)
+_SIGMA_HEADING = np.radians(0.03)  # what careful mounting and an encoder's index leave
 _DIVERGENCE = (3.0e-3, 1.5e-3)  # [rad] full widths across and along the spin axis
 _RIGID_TOLERANCE = 1e-6  # how far a rotation matrix may be from orthonormal
 
@@ -74,6 +75,7 @@ def vlp16(
         divergence=np.array(_DIVERGENCE),
         encoder_eccentricity=np.zeros(2),
         gimbal_clock_offset=0.0,
+        sigma_heading=float(_SIGMA_HEADING),
     )
 
 
@@ -123,6 +125,7 @@ def rig_to_mapping(rig: Rig) -> dict[str, Any]:
         "divergence_rad": rig.divergence.tolist(),
         "encoder_eccentricity_rad": rig.encoder_eccentricity.tolist(),
         "gimbal_clock_offset_s": rig.gimbal_clock_offset,
+        "sigma_heading_rad": rig.sigma_heading,
     }
 
 
@@ -176,8 +179,9 @@ def _read(values: Mapping[str, Any]) -> Rig:
         rest["imu_mount"] = ImuMount(rest["imu_mount"])
     if not isinstance(rest.get("cloud_carries_heights", True), bool):
         raise RigError("The rig's cloud_carries_heights must be true or false.")
-    if "gimbal_clock_offset" in rest:
-        rest["gimbal_clock_offset"] = float(rest["gimbal_clock_offset"])
+    for name in ("gimbal_clock_offset", "sigma_heading"):
+        if name in rest:
+            rest[name] = float(rest[name])
     base = vlp16(str(rest.pop("name", "unnamed")), arrays.pop("T_head_lidar"))
     return replace(base, **arrays, **rest)
 

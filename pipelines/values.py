@@ -109,6 +109,9 @@ class Rig:
         Cosine and sine amplitude that are added to the recorded joint angle [rad].
     gimbal_clock_offset : float
         What is added to a gimbal stamp to get the LiDAR's clock [s].
+    sigma_heading : float
+        Standard deviation of the angle about the gimbal axis that mounting and encoder leave
+        unknown: it turns all centres of a stop together [rad].
     """
 
     name: str
@@ -122,6 +125,7 @@ class Rig:
     divergence: Array
     encoder_eccentricity: Array
     gimbal_clock_offset: float
+    sigma_heading: float
 
     def __post_init__(self) -> None:
         _seal(
@@ -413,7 +417,7 @@ class MarkerFit:
     p_base : (3,)
         Centre [m].
     cov_p_base : (3, 3)
-        Covariance of the centre, without levelling [m^2].
+        Covariance of the centre, without levelling and heading [m^2].
     method : str
         Name of the fitting method.
     status : Status
@@ -486,6 +490,11 @@ class MarkerFit:
     def sigma_3d(self) -> float:
         """Square root of the trace of the covariance [m]."""
         return float(np.sqrt(np.trace(self.cov_p_base)))
+
+    def sigma_total_3d(self, sigma_heading: float) -> float:
+        """Return ``sigma_3d`` with what an unknown heading [rad] of the stop adds to it [m]."""
+        lever = float(np.hypot(self.p_base[0], self.p_base[1]))
+        return float(np.hypot(self.sigma_3d, lever * sigma_heading))
 
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)

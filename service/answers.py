@@ -24,7 +24,6 @@ from pipelines.values import (
     ControlMarks,
     Levelling,
     MarkerFit,
-    MarkerFits,
     NoFix,
     Rig,
     ScanLog,
@@ -89,13 +88,14 @@ def stop_answer(stop: StopResult, inputs: Inputs) -> Plain:
         "frame": frame,
         "markers": [
             marker
-            for fits in stop.fits.values()
-            for marker in _markers(fits, R_frame_base, truth, pose)
+            for method in stop.fits
+            for marker in _markers(stop, method, R_frame_base, truth, pose)
         ],
         "rejected": _rejected(stop, R_frame_base),
         "station": first if "position_m" in first else None,
         "stations": stations,
         "levelling": _levelling(stop.cloud.levelling),
+        "sigma_heading_rad": stop.cloud.rig.sigma_heading,
         "scan": {
             "n_returns": len(stop.cloud.p_base),
             "coverage_deg": math.degrees(stop.cloud.coverage),
@@ -111,11 +111,17 @@ def stop_answer(stop: StopResult, inputs: Inputs) -> Plain:
 
 
 def _markers(
-    fits: MarkerFits, R_frame_base: Array, truth: Truth | None, pose: StopTruth | None
+    stop: StopResult,
+    method: str,
+    R_frame_base: Array,
+    truth: Truth | None,
+    pose: StopTruth | None,
 ) -> list[Plain]:
     """Return the markers of one fitting method."""
+    fits, sigma_heading = stop.fits[method], stop.cloud.rig.sigma_heading
     answers = [
-        _marker(marker_name(place), fit, R_frame_base) for place, fit in enumerate(fits.fits)
+        _marker(marker_name(place), fit, R_frame_base, sigma_heading)
+        for place, fit in enumerate(fits.fits)
     ]
     if truth is not None and pose is not None:
         errors = marker_errors(fits, pose, truth.marks)
@@ -125,7 +131,7 @@ def _markers(
     return answers
 
 
-def _marker(name: str, fit: MarkerFit, R_frame_base: Array) -> Plain:
+def _marker(name: str, fit: MarkerFit, R_frame_base: Array, sigma_heading: float) -> Plain:
     """Return one marker."""
     return {
         "id": name,
@@ -135,6 +141,7 @@ def _marker(name: str, fit: MarkerFit, R_frame_base: Array) -> Plain:
         "centre_m": _numbers(R_frame_base @ fit.p_base),
         "covariance_m2": _numbers(R_frame_base @ fit.cov_p_base @ R_frame_base.T),
         "sigma_3d_m": _number(fit.sigma_3d),
+        "sigma_total_3d_m": _number(fit.sigma_total_3d(sigma_heading)),
         "range_m": _number(fit.mean_range),
         "n_points": fit.n_points,
         "n_rejected": len(fit.rejected),

@@ -58,6 +58,7 @@ _SCHEMAS = {
         "n_returns": _LONG,
         **dict.fromkeys(("coverage_deg", "duration_s", "roll_deg", "pitch_deg"), _REAL),
         "sigma_levelling_deg": _REAL,
+        "sigma_heading_deg": _REAL,
         "cloud_url": _TEXT,
         "notes": pa.list_(_TEXT),
         "timings_s": _TEXT,
@@ -67,7 +68,8 @@ _SCHEMAS = {
         **dict.fromkeys(("marker", "mark", "status", "reason"), _TEXT),
         **_PLACE,
         **_COV,
-        **dict.fromkeys(("sigma_3d_m", "range_m", "azimuth_deg", "elevation_deg"), _REAL),
+        **dict.fromkeys(("sigma_3d_m", "sigma_total_3d_m"), _REAL),
+        **dict.fromkeys(("range_m", "azimuth_deg", "elevation_deg"), _REAL),
         **dict.fromkeys(("n_points", "n_rejected", "n_rings"), _WHOLE),
         **dict.fromkeys(("coverage", "rms_m", "sigma0", "radius_m", "radius_free_m"), _REAL),
         **dict.fromkeys(("sigma_radius_free_m", "mean_intensity"), _REAL),
@@ -266,13 +268,13 @@ def _stop_rows(
     """Return the rows of one stop by table, without what names run and stop."""
     rows: dict[str, list[Row]] = {name: [] for name in TABLES[2:]}
     rows["stops"].append(_stop_row(stop, cloud_url))
-    R = levelling_rotation(stop.cloud.levelling)
+    R, sigma_heading = levelling_rotation(stop.cloud.levelling), stop.cloud.rig.sigma_heading
     for method, found in stop.fits.items():
         label = {"fit_method": method}
         matched = _matched(stop, method, names)
         for i, fit in enumerate(found.fits):
-            row = {"marker": marker_name(i), "mark": matched.get(i), **_fit_row(fit, R)}
-            rows["marker_fits"].append(label | row)
+            row = label | {"marker": marker_name(i), "mark": matched.get(i)}
+            rows["marker_fits"].append(row | _fit_row(fit, R, sigma_heading))
         rows["rejections"] += [
             label | _place(R @ r.p_base) | {"n_points": r.n_points, "reason": r.reason}
             for r in found.rejected
@@ -315,13 +317,14 @@ def _stop_row(stop: StopResult, cloud_url: str | None) -> Row:
         "roll_deg": np.degrees(cloud.levelling.roll),
         "pitch_deg": np.degrees(cloud.levelling.pitch),
         "sigma_levelling_deg": np.degrees(cloud.levelling.sigma),
+        "sigma_heading_deg": np.degrees(cloud.rig.sigma_heading),
         "cloud_url": cloud_url,
         "notes": list(cloud.notes),
         "timings_s": json.dumps(dict(stop.timings)),
     }
 
 
-def _fit_row(fit: MarkerFit, R_station_base: Array) -> Row:
+def _fit_row(fit: MarkerFit, R_station_base: Array, sigma_heading: float) -> Row:
     """Return the row of ``marker_fits`` without errors and names."""
     p_station = R_station_base @ fit.p_base
     x, y, z = p_station
@@ -331,6 +334,7 @@ def _fit_row(fit: MarkerFit, R_station_base: Array) -> Row:
         **_place(p_station),
         **_cov(R_station_base @ fit.cov_p_base @ R_station_base.T),
         "sigma_3d_m": fit.sigma_3d,
+        "sigma_total_3d_m": fit.sigma_total_3d(sigma_heading),
         "range_m": fit.mean_range,
         "azimuth_deg": np.degrees(np.arctan2(y, x)),
         "elevation_deg": np.degrees(np.arctan2(z, np.hypot(x, y))),
