@@ -11,8 +11,9 @@ import hashlib
 import mmap
 import struct
 import tempfile
-import zlib
+from collections import deque
 from collections.abc import Iterator
+from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -22,6 +23,7 @@ import lz4.frame
 import numba
 import numpy as np
 import zstandard
+from isal.isal_zlib import crc32
 from numpy.typing import NDArray
 
 from pipelines.errors import NotFoundError, NotMcapError, RecordingError, TruncatedRecordingError
@@ -37,6 +39,7 @@ _ROWS = 1 << 16  # records that one step of the walk reports
 _CHUNK_LIMIT = 1 << 29  # [bytes] a larger decompressed chunk is refused, whatever it declares
 _KEEP_MAPPED = 1 << 25  # [bytes] pages behind this distance are given back
 _BLOCK = 1 << 22  # [bytes] read at a time for the digest
+_UNPACKERS = 2  # threads that unpack and check chunks ahead of the walk
 _RECOVER = "recover what is readable with `mcap recover` and use the result"
 
 
@@ -107,18 +110,20 @@ class Container:
         The whole file.
     mapping : mmap or None
         What the bytes are mapped through, when they are.
+    pool : ThreadPoolExecutor
+        What unpacks and checks chunks ahead of the walk; stopped before the file is given back.
     channels : dict of int to Channel
         By identifier, as far as the walk has come.
     """
 
     octets: Octets
     mapping: mmap.mmap | None = None
+    pool: ThreadPoolExecutor = field(default_factory=lambda: ThreadPoolExecutor(_UNPACKERS))
     channels: dict[int, Channel] = field(default_factory=dict)
     _schemas: dict[int, tuple[str, str, bytes]] = field(default_factory=dict)
     _first_ns: int | None = None
     _last_ns: int = 0
     _released: int = 0
-    _zstd: zstandard.ZstdDecompressor = field(default_factory=zstandard.ZstdDecompressor)
 
     def __post_init__(self) -> None:
         found = self.octets[: len(MAGIC)].tobytes()
@@ -155,6 +160,7 @@ class Container:
         while True:
             rows, position, is_whole = _walk(self.octets, position)
             chunked = np.isin(rows[:, 0], (_CHUNK, _FOOTER, _DATA_END)).nonzero()[0]
+            chunks = self._unpacked(rows[rows[:, 0] == _CHUNK, 1:3])
             begin = 0
             for end in [*chunked.tolist(), len(rows)]:
                 plain |= bool((rows[begin:end, 0] == _MESSAGE).any())
@@ -166,7 +172,7 @@ class Container:
                 if opcode == _FOOTER:
                     return self._check_end(start + length)
                 if opcode == _CHUNK:
-                    yield from self._chunk(start, length)
+                    yield from self._chunk(start, next(chunks))
                 elif plain:
                     self._check_data(start, length)
                 self._release(start + length)
@@ -222,10 +228,19 @@ class Container:
             definition=definition,
         )
 
-    def _chunk(self, start: int, length: int) -> Iterator[Batch]:
+    def _unpacked(self, spans: Nanos) -> Iterator[Future[Octets]]:
+        """Give the chunks at starts with lengths; the next ones are being unpacked meanwhile."""
+        ahead: deque[Future[Octets]] = deque()
+        for start, length in spans.tolist():
+            ahead.append(self.pool.submit(_unpack_chunk, self.octets[start : start + length]))
+            if len(ahead) > _UNPACKERS:
+                yield ahead.popleft()
+        yield from ahead
+
+    def _chunk(self, start: int, unpacked: Future[Octets]) -> Iterator[Batch]:
         """Give the messages of one chunk."""
         try:
-            octets = _unpack_chunk(self.octets[start : start + length], self._zstd)
+            octets = unpacked.result()
         except (ValueError, struct.error, zstandard.ZstdError, RuntimeError) as error:
             raise self._truncated(start - _RECORD_HEAD, f"a chunk is damaged: {error}") from error
         position, is_whole = 0, True
@@ -239,7 +254,7 @@ class Container:
         """Compare the checksum over the data section, for files whose messages have no other."""
         (expected,) = struct.unpack("<I", self.octets[start : start + length].tobytes()[:4])
         end = start - _RECORD_HEAD
-        if expected and zlib.crc32(self.octets[:end].data) != expected:
+        if expected and crc32(self.octets[:end].data) != expected:
             raise self._truncated(end, "the checksum of the data section does not agree")
 
     def _check_end(self, end: int) -> None:
@@ -291,7 +306,8 @@ def opened(url: str | Path) -> Iterator[Container]:
         mapping = mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ)
         mapping.madvise(mmap.MADV_SEQUENTIAL)
         # Not closed by hand: views may outlive the walk, and the last one of them unmaps.
-        yield Container(np.frombuffer(mapping, np.uint8), mapping)
+        with ThreadPoolExecutor(_UNPACKERS) as pool:
+            yield Container(np.frombuffer(mapping, np.uint8), mapping, pool)
 
 
 @contextmanager
@@ -366,7 +382,7 @@ def _text(body: bytes, at: int) -> tuple[str, int]:
     return body[at + 4 : end].decode(), end
 
 
-def _unpack_chunk(body: Octets, zstd: zstandard.ZstdDecompressor) -> Octets:
+def _unpack_chunk(body: Octets) -> Octets:
     """Return the records of a chunk, decompressed and checked."""
     head = body[: 8 + 8 + 8 + 4 + 4 + 64].tobytes()
     size, crc = struct.unpack_from("<QI", head, 16)
@@ -375,17 +391,15 @@ def _unpack_chunk(body: Octets, zstd: zstandard.ZstdDecompressor) -> Octets:
     packed = body[at + 8 : at + 8 + length]
     if len(packed) != length:
         raise ValueError(f"it declares {length:,} bytes and has {len(packed):,}")
-    octets = packed if compression == "" else _decompress(compression, packed, size, zstd)
+    octets = packed if compression == "" else _decompress(compression, packed, size)
     if len(octets) != size:
         raise ValueError(f"it declares {size:,} bytes of records and holds {len(octets):,}")
-    if crc and zlib.crc32(octets.data) != crc:
+    if crc and crc32(octets.data) != crc:
         raise ValueError("its checksum does not agree")
     return octets
 
 
-def _decompress(
-    compression: str, packed: Octets, size: int, zstd: zstandard.ZstdDecompressor
-) -> Octets:
+def _decompress(compression: str, packed: Octets, size: int) -> Octets:
     """Decompress at most the declared size, which must itself be bearable."""
     if size > _CHUNK_LIMIT:
         raise ValueError(f"it declares {size:,} bytes, more than {_CHUNK_LIMIT:,}")
@@ -394,7 +408,9 @@ def _decompress(
     elif compression == "zstd":
         if zstandard.frame_content_size(packed.data) not in (-1, size):
             raise ValueError("its compressed frame declares another size")
-        unpacked = zstd.decompress(packed.data, max_output_size=max(size, 1))
+        unpacked = zstandard.ZstdDecompressor().decompress(
+            packed.data, max_output_size=max(size, 1)
+        )
     else:
         raise ValueError(f"its compression {compression!r} is unknown; known: lz4, zstd")
     return np.frombuffer(unpacked, np.uint8)
