@@ -14,16 +14,18 @@ help:
 	@sed -n 's/^# //p' Makefile
 
 setup: .venv/.ready
-	@.ci/system-packages libraries
 
 .venv/.ready: requirements.lock pyproject.toml
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info[:2] != (3, 11))' || \
 		{ echo "spheremark needs Python 3.11; $(PYTHON) is $$($(PYTHON) --version 2>&1). Set PYTHON=/path/to/python3.11."; exit 1; }
 	@test -x $(BIN)/python || $(PYTHON) -m venv .venv || \
 		{ echo "Python could not make .venv. On Debian: apt-get install python3-venv"; rm -rf .venv; exit 1; }
+	@.ci/system-packages libraries
 	@echo "Installing the pinned packages into .venv (a few minutes the first time) ..."
 	@$(BIN)/python -m pip install --quiet --disable-pip-version-check -r requirements.lock
 	@$(BIN)/python -m pip install --quiet --disable-pip-version-check --no-deps --editable .
+	@echo "Compiling the numerical kernels, once ..."
+	@$(BIN)/python -m service.tasks
 	@touch $@
 
 demo: setup

@@ -89,10 +89,10 @@ def simulate(
         str, typer.Option(help="Names, lanes (lane3), numbers or ranges (1-7), or all.")
     ] = "lane3",
     seed: Annotated[int, typer.Option(min=0, help="Source of chance.")] = 0,
-    turn_s: Annotated[float, typer.Option(help="Time of a full turn of the gimbal [s].")] = 13.2,
+    turn_s: Annotated[float, typer.Option(help="Time of a full turn of the gimbal \\[s].")] = 13.2,
     rpm: Annotated[float, typer.Option(help="Speed of the LiDAR [1/min].")] = 600.0,
     sigma_mm: Annotated[
-        float | None, typer.Option(help="Noise of every range [mm]; by reflectivity if not given.")
+        float | None, typer.Option(help="Noise of every range \\[mm]; by reflectivity if not given.")
     ] = None,
     compression: Annotated[str, typer.Option(help="Of the chunks: none, lz4 or zstd.")] = "none",
     as_json: AsJson = False,
@@ -143,8 +143,8 @@ def process(
         list[str] | None, typer.Option(help="Fitting method; again for more. The first counts.")
     ] = None,
     frame: Annotated[Frame, typer.Option(help="Frame of the centres.")] = Frame.STATION,
-    tolerance_m: Annotated[float, typer.Option(help="Error that is accepted [m].")] = 0.03,
-    radius_m: Annotated[float, typer.Option(help="Radius of the spheres [m].")] = 0.100,
+    tolerance_m: Annotated[float, typer.Option(help="Error that is accepted \\[m].")] = 0.03,
+    radius_m: Annotated[float, typer.Option(help="Radius of the spheres \\[m].")] = 0.100,
     truth: Annotated[
         Path | None,
         typer.Option(exists=True, dir_okay=False, help="Truth (JSON); adds errors, no more."),
