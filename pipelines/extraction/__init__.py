@@ -1,0 +1,115 @@
+"""Markers among ground, rocks, poles and people: which returns of a stop may be a sphere on a pole.
+
+``extract`` finds them. Inside,
+
+- ``ball`` says what is looked for,
+- ``ground`` tells the ground, ``seeds`` picks the places that are worth a look,
+- ``patches`` gathers the returns about a place, ``looks`` measures what they look like,
+- ``verdicts`` and ``beneath`` say why a group is no marker.
+
+Works in the base frame with the levelled vertical. The sensor is taken as one point (the origin of
+the base): a few centimetres of axis offset do not change which returns look like a sphere.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipelines.config import ExtractionConfig
+from pipelines.extraction.ball import Ball, view
+from pipelines.extraction.beneath import grounded
+from pipelines.extraction.ground import Grid, ground_grid
+from pipelines.extraction.looks import Look, look_at
+from pipelines.extraction.patches import cells_of, near, patches_about
+from pipelines.extraction.seeds import find_seeds
+from pipelines.extraction.verdicts import distinct, score, verdict
+from pipelines.geometry import levelling_rotation
+from pipelines.values import (
+    Array,
+    Index,
+    MarkerCandidate,
+    MarkerCandidates,
+    Rejection,
+    StitchedCloud,
+)
+
+__all__ = ["extract"]
+
+_REJECTIONS_MAX = 200  # the most sphere-like groups that are kept with their reason
+
+
+def extract(
+    cloud: StitchedCloud, config: ExtractionConfig, marker_radius: float
+) -> MarkerCandidates:
+    """Find the groups of returns that may be spherical markers.
+
+    Parameters
+    ----------
+    cloud : StitchedCloud
+        One stop; rings and times are not needed.
+    config : ExtractionConfig
+        Ground grid, limits of the tests.
+    marker_radius : float
+        Radius of the spheres [m].
+
+    Returns
+    -------
+    MarkerCandidates
+        Candidates in the order of azimuth; of the groups that passed the first gate of size and
+        were then refused, the (at most 200) largest, with the reason; and the height of the highest
+        ground point within 10 m, where the study cuts its clouds.
+
+    Notes
+    -----
+    A marker is a ball of known radius that stands free on a pole, so each place where something
+    ends upward and to a side is tried: mean shift of a disc of the ball's size, then a robust fit
+    along the beams, then the tests, which have their sentences in ``verdict``. Ground is the
+    opening of the lowest point per cell. Where no ground was seen it is unknown, and nothing is
+    cut. Cost grows linearly with the returns.
+    """
+    up = levelling_rotation(cloud.levelling)[2].copy()
+    ball = Ball(marker_radius, up, float(cloud.rig.divergence.max()))
+    grid = ground_grid(cloud, config)
+    seeds = find_seeds(cloud.p_base, grid.is_above, ball, config.n_points_min)
+    looks = distinct(look_at(cloud, grid, seeds, ball), config, marker_radius)
+    verdicts = [verdict(look, config, ball) for look in looks]
+    verdicts = grounded(cloud.p_base, looks, verdicts, ball)
+    good = [look for look, reason in zip(looks, verdicts, strict=True) if not reason]
+    bad = [(look, reason) for look, reason in zip(looks, verdicts, strict=True) if reason]
+    return MarkerCandidates(
+        candidates=_candidates(cloud, grid, good, ball, config),
+        rejected=tuple(
+            Rejection(p_base=look.p_base, n_points=look.n_points, reason=reason)
+            for look, reason in bad[:_REJECTIONS_MAX]
+        ),
+        ground_height_max=grid.ground_height_max,
+    )
+
+
+def _candidates(
+    cloud: StitchedCloud, grid: Grid, looks: list[Look], ball: Ball, config: ExtractionConfig
+) -> tuple[MarkerCandidate, ...]:
+    """Return candidates in the order of azimuth."""
+    ordered = sorted(looks, key=lambda look: np.arctan2(look.y, look.x))
+    centres = np.array([look.p_base for look in ordered]).reshape(-1, 3)
+    patches = patches_about(grid, centres, ball.radius)
+    cells = cells_of(centres, grid)
+    return tuple(
+        MarkerCandidate(
+            members=_members(cloud, near(cloud.p_base, patches, cell, p), p, ball),
+            p_base_rough=p.copy(),
+            score=score(look, config, ball),
+        )
+        for look, p, cell in zip(ordered, centres, cells, strict=True)
+    )
+
+
+def _members(cloud: StitchedCloud, near: NDArray[np.int32], p: Array, ball: Ball) -> Index:
+    """Return the rows on and about a ball, ascending: its outline, and what of its pole touches."""
+    rows = np.sort(near).astype(np.intp)
+    seen, _, _ = view(cloud.p_base[rows].astype(np.float64), p, ball.up)
+    blur = 0.5 * ball.divergence * float(np.linalg.norm(p))
+    is_about = np.hypot(seen[:, 0], seen[:, 1]) < 1.5 * ball.radius + blur
+    is_level = (seen[:, 2] > -2.2 * ball.radius) & (seen[:, 2] < 1.6 * ball.radius)
+    return np.asarray(rows[is_about & is_level])

@@ -1,0 +1,176 @@
+"""The ground of a stop: an opened grid of lowest points, unknown where none was seen.
+
+Hides how ground is told from what stands on it.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numba
+import numpy as np
+from numpy.typing import NDArray
+
+from pipelines.config import ExtractionConfig
+from pipelines.geometry import levelling_rotation
+from pipelines.values import Array, Column, Mask, StitchedCloud
+
+_STUDY_FIELD = 10.0  # [m] from the station: where the study looks for its highest ground point
+_GROUND_WINDOW = 4  # cells each way of the opening: rocks up to twice this are not ground
+_GROUND_STEP = 0.10  # [m] that a cell's lowest point may lie above the opened surface
+_GROUND_CELLS_MIN = 9  # a marker seen alone covers at most 6 cells: that is not yet ground
+_GROUND_NOISE = 0.05  # [m] that a ground return may lie above its cell's lowest
+
+
+class Grid(NamedTuple):
+    """Each return's cell and height, and which returns rise above the ground.
+
+    Attributes
+    ----------
+    cells : (n,) int32
+        Cell of each return, -1 beyond the range looked at.
+    n_side : int
+        Cells along one side.
+    edge : float
+        Edge of a cell [m].
+    R_station_base : (3, 3)
+        Levelling.
+    is_above : (n,) bool
+        Returns that are not known to be ground.
+    ground_height_max : float
+        Highest ground return within 10 m, levelled [m].
+    """
+
+    cells: NDArray[np.int32]
+    n_side: int
+    edge: float
+    R_station_base: Array
+    is_above: Mask
+    ground_height_max: float
+
+
+def ground_grid(cloud: StitchedCloud, config: ExtractionConfig) -> Grid:
+    """Sort returns into cells and tell the ground.
+
+    Parameters
+    ----------
+    cloud : StitchedCloud
+        One stop.
+    config : ExtractionConfig
+        Edge of a cell, clearance, and how far to look.
+
+    Returns
+    -------
+    Grid
+        Cells, and what rises above the ground.
+    """
+    n_side = 2 * int(np.ceil(config.range_max / config.ground_cell))
+    R = levelling_rotation(cloud.levelling)
+    cells, heights, lowest = _lowest_per_cell(
+        cloud.p_base, R, config.ground_cell, n_side, config.range_max
+    )
+    ground = _ground(lowest, _opened(lowest, _GROUND_WINDOW), _GROUND_WINDOW)
+    is_above, highest = _above(
+        cloud.p_base, cells, heights, ground.ravel(), config.ground_clearance
+    )
+    return Grid(cells, n_side, config.ground_cell, R, is_above, float(highest))
+
+
+@numba.njit(cache=True, nogil=True)
+def _lowest_per_cell(
+    p_base: Column, R: Array, edge: float, n_side: int, range_max: float
+) -> tuple[NDArray[np.int32], Column, Column]:
+    """Return each point's cell (-1: too far) and levelled height, and the lowest point per cell."""
+    n = len(p_base)
+    cells = np.empty(n, np.int32)
+    heights = np.empty(n, np.float32)
+    lowest = np.full((n_side, n_side), np.inf, np.float32)
+    half = n_side // 2
+    for i in range(n):
+        x, y, z = p_base[i, 0], p_base[i, 1], p_base[i, 2]
+        x_level = R[0, 0] * x + R[0, 1] * y + R[0, 2] * z
+        y_level = R[1, 0] * x + R[1, 1] * y + R[1, 2] * z
+        height = np.float32(R[2, 0] * x + R[2, 1] * y + R[2, 2] * z)
+        heights[i] = height
+        if not x_level * x_level + y_level * y_level < range_max * range_max:
+            cells[i] = -1
+            continue
+        row = min(max(int(np.floor(x_level / edge)) + half, 0), n_side - 1)
+        column = min(max(int(np.floor(y_level / edge)) + half, 0), n_side - 1)
+        cells[i] = row * n_side + column
+        lowest[row, column] = min(lowest[row, column], height)
+    return cells, heights, lowest
+
+
+@numba.njit(cache=True, nogil=True)
+def _slide(values: Column, window: int, sign: float) -> Column:
+    """Return the least of ``sign * values`` in a square window; infinite cells do not count."""
+    n_rows, n_columns = values.shape
+    along = np.full(values.shape, np.inf, np.float32)
+    out = np.full(values.shape, np.inf, np.float32)
+    for i in range(n_rows):
+        for j in range(n_columns):
+            for k in range(max(j - window, 0), min(j + window + 1, n_columns)):
+                if np.isfinite(values[i, k]):
+                    along[i, j] = min(along[i, j], sign * values[i, k])
+    for i in range(n_rows):
+        for k in range(max(i - window, 0), min(i + window + 1, n_rows)):
+            for j in range(n_columns):
+                out[i, j] = min(out[i, j], along[k, j])
+    return out
+
+
+def _opened(lowest: Column, window: int) -> Column:
+    """Return the morphological opening of the lowest points; infinite where nothing is near."""
+    eroded = _slide(lowest, window, 1.0)
+    return np.asarray(-_slide(eroded, window, -1.0))
+
+
+@numba.njit(cache=True, nogil=True)
+def _ground(lowest: Column, opened: Column, window: int) -> Column:
+    """Return the ground's height per cell; infinite where no ground was seen in or beside it.
+
+    A cell has ground where its lowest point lies near the opened surface and enough others around
+    do too: a marker behind a rock has no ground around it, and must not become ground itself.
+    """
+    n_rows, n_columns = lowest.shape
+    is_low = lowest < opened + np.float32(_GROUND_STEP)
+    out = np.full(lowest.shape, np.inf, np.float32)
+    for i in range(n_rows):
+        for j in range(n_columns):
+            highest = -np.inf
+            for k in range(max(i - 1, 0), min(i + 2, n_rows)):
+                for m in range(max(j - 1, 0), min(j + 2, n_columns)):
+                    if is_low[k, m]:
+                        highest = max(highest, lowest[k, m])
+            if highest == -np.inf:
+                continue
+            n_low = 0
+            for k in range(max(i - window, 0), min(i + window + 1, n_rows)):
+                for m in range(max(j - window, 0), min(j + window + 1, n_columns)):
+                    n_low += is_low[k, m]
+            if n_low >= _GROUND_CELLS_MIN:
+                out[i, j] = highest
+    return out
+
+
+@numba.njit(cache=True, nogil=True)
+def _above(
+    p_base: Column,
+    cells: NDArray[np.int32],
+    heights: Column,
+    ground: Column,
+    clearance: float,
+) -> tuple[Mask, float]:
+    """Return which points are not known to be ground, and the highest ground point near by."""
+    is_above = np.zeros(len(cells), np.bool_)
+    highest = -np.inf
+    for i in range(len(cells)):
+        if cells[i] < 0:
+            continue
+        over = heights[i] - ground[cells[i]]
+        is_above[i] = over > clearance or ground[cells[i]] == np.inf
+        is_field = p_base[i, 0] ** 2 + p_base[i, 1] ** 2 < _STUDY_FIELD**2
+        if is_field and -np.inf < over < _GROUND_NOISE and heights[i] > highest:
+            highest = heights[i]
+    return is_above, highest

@@ -1,0 +1,148 @@
+"""Why a group of returns is no marker: the limits of every test, and their sentences."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from pipelines.config import ExtractionConfig
+from pipelines.extraction.ball import Ball
+from pipelines.extraction.looks import Look
+
+_TOUCHING = 0.10  # share of a ball's returns that may lie as far away beside it: mixed pixels
+_STRANGE = 0.3  # share of the returns inside the outline that may be off the ball
+_SIGMAS = 3.5  # standard deviations at which a shape is refused
+_RADIUS_SLACK = 0.12  # of the radius: less is no reason to refuse, the fit judges it
+_N_SHAPELY = 12  # returns that show the width of what they lie on
+
+
+def distinct(looks: list[Look], config: ExtractionConfig, radius: float) -> list[Look]:
+    """Return the groups that pass the first gate, each once, those with most returns first.
+
+    Parameters
+    ----------
+    looks : list of Look
+        What was seen.
+    config : ExtractionConfig
+        How many returns a group needs.
+    radius : float
+        Radius of the ball that is looked for [m].
+
+    Returns
+    -------
+    list of Look
+        Groups worth a verdict.
+    """
+    kept: list[Look] = []
+    worthy = [look for look in looks if _passes_first_gate(look, config, radius)]
+    for look in sorted(worthy, key=lambda look: (-look.n_points, look.x, look.y)):
+        gaps = (np.hypot(np.hypot(look.x - o.x, look.y - o.y), look.z - o.z) for o in kept)
+        if all(gap > 1.5 * radius for gap in gaps):
+            kept.append(look)
+    return kept
+
+
+def _passes_first_gate(look: Look, config: ExtractionConfig, radius: float) -> bool:
+    """Tell whether a group is worth a verdict: enough returns, about as large as a ball."""
+    return (
+        look.n_points >= config.n_points_min
+        and look.scatter > 0.0
+        and max(look.width, look.height) > 0.8 * radius
+        and look.n_strange <= look.n_points
+    )
+
+
+def verdict(look: Look, config: ExtractionConfig, ball: Ball) -> str:
+    """Return why a group is not a free ball of the known radius.
+
+    Parameters
+    ----------
+    look : Look
+        What the group looks like.
+    config : ExtractionConfig
+        Limit of the scatter.
+    ball : Ball
+        What is looked for.
+
+    Returns
+    -------
+    str
+        The reason as a sentence for people; empty if it may be such a ball.
+    """
+    radius = ball.radius
+    few = 1.0 + _TOUCHING * look.n_points
+    width_min = (0.9 if look.n_points >= _N_SHAPELY else 0.5) * radius
+    off = look.radius_free - radius
+    tests = (
+        (
+            look.n_beside > few,
+            f"It does not stand free: {look.n_beside} returns beside or above its outline lie "
+            f"as far away, where {look.n_points} lie on it.",
+        ),
+        (
+            look.n_below > few,
+            f"It does not stand on a pole: {look.n_below} returns below its outline and beside "
+            "a pole's place lie as far away, as under a rock or a head.",
+        ),
+        (
+            look.n_strange > _STRANGE * (look.n_points + look.n_strange),
+            f"It is not one surface: {look.n_strange} returns inside its outline are off the "
+            f"sphere that {look.n_points} lie on.",
+        ),
+        (
+            look.scatter > config.scatter_max,
+            f"Its returns scatter by {1e3 * look.scatter:.0f} mm about a sphere of the known "
+            f"radius; at most {1e3 * config.scatter_max:.0f} mm are taken for noise.",
+        ),
+        (
+            look.width < width_min,
+            f"It is {1e3 * look.width:.0f} mm wide, too slim for a sphere of diameter "
+            f"{2e3 * radius:.0f} mm: a pole.",
+        ),
+        (
+            abs(off) > _radius_slack(look, ball),
+            f"Its own radius is {1e3 * look.radius_free:.0f} mm (standard deviation "
+            f"{1e3 * look.sigma_radius:.0f} mm), not {1e3 * radius:.0f} mm.",
+        ),
+        (
+            look.flat_along > max(_SIGMAS * look.sigma_along, 0.5),
+            "It is not curved from top to bottom: a post or a panel.",
+        ),
+        (
+            look.flat_across > max(_SIGMAS * look.sigma_across, 0.5),
+            "It is not curved from side to side: a panel or a rail.",
+        ),
+    )
+    return next((reason for is_so, reason in tests if is_so), "")
+
+
+def _radius_slack(look: Look, ball: Ball) -> float:
+    """Return by how much the free radius may be off: rays instead of wide beams make it larger."""
+    blur = 0.5 * ball.divergence * float(np.linalg.norm(look.p_base))
+    return max(_SIGMAS * look.sigma_radius, _RADIUS_SLACK * ball.radius + 0.6 * blur)
+
+
+def score(look: Look, config: ExtractionConfig, ball: Ball) -> float:
+    """Return how easily the tests were passed.
+
+    Parameters
+    ----------
+    look : Look
+        What the group looks like.
+    config : ExtractionConfig
+        Limit of the scatter.
+    ball : Ball
+        What is looked for.
+
+    Returns
+    -------
+    float
+        1 with ease, 0 just so.
+    """
+    used = (
+        look.n_beside / (1.0 + _TOUCHING * look.n_points),
+        look.n_below / (1.0 + _TOUCHING * look.n_points),
+        look.n_strange / (_STRANGE * (look.n_points + look.n_strange)),
+        look.scatter / config.scatter_max,
+        abs(look.radius_free - ball.radius) / _radius_slack(look, ball),
+    )
+    return float(np.clip(1.0 - np.mean(np.square(used)), 0.0, 1.0))
