@@ -92,7 +92,7 @@ def simulate(
     turn_s: Annotated[float, typer.Option(help="Time of a full turn of the gimbal \\[s].")] = 13.2,
     rpm: Annotated[float, typer.Option(help="Speed of the LiDAR [1/min].")] = 600.0,
     sigma_mm: Annotated[
-        float | None, typer.Option(help="Noise of every range \\[mm]; by reflectivity if not given.")
+        float | None, typer.Option(help="Noise of ranges \\[mm]; by reflectivity if not given.")
     ] = None,
     compression: Annotated[str, typer.Option(help="Of the chunks: none, lz4 or zstd.")] = "none",
     as_json: AsJson = False,
