@@ -112,7 +112,7 @@ def _process(order: Order, reporter: Reporter) -> Outcome:
 
     start = perf_counter()
     forget_peak_memory()
-    log = read_log(order.recording_url)
+    log = read_log(order.recording_url, digest=order.recording_id)
     stops = process(
         replace(log, origin=Origin(name=order.recording_name, digest=order.recording_id)),
         config=order.config,

@@ -175,11 +175,12 @@ def read_log(
     One walk over the mapped file; memory is that of the result. Cost grows linearly with the file.
     """
     with opened(url) as container:
+        beside = None if digest else container.pool.submit(file_digest, url)
         decoders = Decoders(size=container.size)
         for batch in container.batches():
             decoders.add(batch)
         found = container.topics()
-    origin = Origin(name=stem(url), digest=digest or file_digest(url))
+    origin = Origin(name=stem(url), digest=beside.result() if beside else digest)
     return assemble(decoders, found, Choice(topics=topics, joint=joint), origin)
 
 
