@@ -7,6 +7,7 @@ to standard error. Exit codes: 0 done, 1 failed, 2 misused. Heavy imports are in
 from __future__ import annotations
 
 import json
+import math
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -35,6 +36,13 @@ err = Console(stderr=True)
 
 AsJson = Annotated[bool, typer.Option("--json", help="JSON for programs.")]
 LogFile = Annotated[Path, typer.Argument(exists=True, dir_okay=False, help="Log (MCAP).")]
+
+
+class Format(StrEnum):
+    """What simulated LiDARs write."""
+
+    POINTS = "points"
+    PACKETS = "packets"
 
 
 class Frame(StrEnum):
@@ -84,16 +92,32 @@ def serve(
 @app.command()
 def simulate(
     folder: Annotated[Path, typer.Argument(metavar="OUT", help="Folder for the logs.")],
-    scenario: Annotated[str, typer.Option(help="World to simulate.")] = "paper-field",
+    scenario: Annotated[
+        str,
+        typer.Option(help="World: paper-field, clutter-field, rock-field or range-lane."),
+    ] = "paper-field",
     stops: Annotated[
-        str, typer.Option(help="Names, lanes (lane3), numbers or ranges (1-7), or all.")
-    ] = "lane3",
+        str,
+        typer.Option(
+            help="Names, lanes (lane3), numbers or ranges (1-7), or all.",
+            show_default="lane3, or all where there are no lanes",
+        ),
+    ] = "",
     seed: Annotated[int, typer.Option(min=0, help="Source of chance.")] = 0,
     turn_s: Annotated[float, typer.Option(help="Time of a full turn of the gimbal \\[s].")] = 13.2,
     rpm: Annotated[float, typer.Option(help="Speed of the LiDAR [1/min].")] = 600.0,
     sigma_mm: Annotated[
         float | None, typer.Option(help="Noise of ranges \\[mm]; by reflectivity if not given.")
     ] = None,
+    step_deg: Annotated[
+        float, typer.Option(help="Angle between rests of the gimbal \\[deg]; 0 turns evenly.")
+    ] = 0.0,
+    shot_times: Annotated[
+        bool, typer.Option(help="Whether the points of a cloud carry a time each.")
+    ] = True,
+    form: Annotated[
+        Format, typer.Option("--format", help="Point clouds, or raw packets of a VLP-16.")
+    ] = Format.POINTS,
     compression: Annotated[str, typer.Option(help="Of the chunks: none, lz4 or zstd.")] = "none",
     as_json: AsJson = False,
 ) -> None:
@@ -102,11 +126,22 @@ def simulate(
     from service.fieldwork import Assignment, survey
 
     sigma = None if sigma_mm is None else sigma_mm / 1000.0
-    config = SimulationConfig(turn=turn_s, spin_rpm=rpm, sigma_range=sigma)
+    config = SimulationConfig(
+        turn=turn_s,
+        spin_rpm=rpm,
+        sigma_range=sigma,
+        step=math.radians(step_deg),
+        shot_times=shot_times,
+    )
     if warning := commensurability(config):
         err.print(f"[yellow]Warning:[/] {warning}", soft_wrap=True)
     wanted = Assignment(
-        scenario=scenario, stops=stops, seed=seed, config=config, compression=compression
+        scenario=scenario,
+        stops=stops,
+        seed=seed,
+        config=config,
+        compression=compression,
+        packets=form is Format.PACKETS,
     )
     with _progress() as progress:
         for made in survey(folder, wanted, progress=progress):

@@ -22,16 +22,22 @@ from pipelines.simulation.stop import Progress
 from storage.recordings import write_log
 from storage.site_files import write_control, write_truth
 
+_LANE = "lane3"  # the middle one
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Assignment:
-    """What to simulate, and how to write it."""
+    """What to simulate, and how to write it: as points or as raw packets.
+
+    No stops ask for the middle lane of a field with lanes, and for all stops of any other.
+    """
 
     scenario: str
     stops: str
     seed: int
     config: SimulationConfig
     compression: str
+    packets: bool = False
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -79,7 +85,8 @@ def survey(
 ) -> Iterator[WrittenStop]:
     """Simulate stop after stop into a folder; yield each one when its files are complete."""
     field = scenario(wanted.scenario, wanted.seed)
-    names = chosen_stops(field, wanted.stops)
+    has_lanes = any(stop.name.startswith(_LANE) for stop in field.stops)
+    names = chosen_stops(field, wanted.stops or (_LANE if has_lanes else "all"))
     folder.mkdir(parents=True, exist_ok=True)
     write_control(field.marks, folder / "control.csv")
     for i, name in enumerate(names):
@@ -93,7 +100,13 @@ def _write(
     made = WrittenStop(name=name, log=folder / f"{name}.mcap", truth=folder / f"{name}.truth.json")
     stop = simulate_stop(field, name, wanted.config, progress=progress)
     part = made.log.with_suffix(".part")
-    write_log(stop.log, part, compression=wanted.compression)
+    write_log(
+        stop.log,
+        part,
+        revolution=60.0 / wanted.config.spin_rpm,
+        compression=wanted.compression,
+        firings=stop.firings if wanted.packets else None,
+    )
     write_truth(survey_truth(field, [stop], wanted.config, field.seed), made.truth)
     part.replace(made.log)
     return made

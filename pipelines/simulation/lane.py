@@ -52,7 +52,7 @@ def range_lane(seed: int) -> Field:
         ),
         marks=ControlMarks(names=names, p_site=p_site, cov_p_site=np.zeros((len(p_site), 3, 3))),
         marker_radius=MARKER_RADIUS,
-        stops=(Stop(name="lane-stop1", p_site=np.array([0.0, 0.0, MAST]), heading=heading),),
+        stops=(Stop(name="centre", p_site=np.array([0.0, 0.0, MAST]), heading=heading),),
     )
 
 

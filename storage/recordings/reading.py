@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 
 from pipelines.errors import MissingGimbalAngleError, MissingLidarError, RecordingError
 from pipelines.values import RING_UNKNOWN, ImuMount, Nanos, Origin, Rig, ScanLog
-from storage.recordings import joint_states, orientations, pointclouds, transforms
+from storage.recordings import joint_states, orientations, packets, pointclouds, transforms
 from storage.recordings.cdr import definition_agrees
 from storage.recordings.container import Batch, Channel, file_digest, opened
 from storage.recordings.families import LidarDecoder, Returns, Series, SeriesDecoder
@@ -23,6 +23,7 @@ from storage.recordings.frames import FrameTree, recorded_rig
 # module and a line here.
 _LIDARS: dict[tuple[str, str], tuple[Callable[[Channel, int], LidarDecoder], str]] = {
     ("cdr", pointclouds.SCHEMA): (pointclouds.PointClouds, pointclouds.DEFINITION),
+    ("cdr", packets.SCHEMA): (packets.Packets, packets.DEFINITION),
 }
 _JOINTS: dict[tuple[str, str], tuple[Callable[[Channel], SeriesDecoder], str]] = {
     ("cdr", joint_states.SCHEMA): (joint_states.JointStates, joint_states.DEFINITION),

@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from pipelines.errors import ConfigError, RecordingError
-from pipelines.values import Array, ImuMount, Nanos, Rig, ScanLog
-from storage.recordings import joint_states, orientations, pointclouds, transforms
+from pipelines.values import Array, Firings, ImuMount, Nanos, Rig, ScanLog
+from storage.recordings import joint_states, orientations, packets, pointclouds, transforms
 
 LIDAR_FRAME, IMU_FRAME, HEAD_FRAME, BASE_FRAME = "velodyne", "imu_link", "gimbal_link", "base_link"
 JOINT = "gimbal_joint"
@@ -46,7 +46,12 @@ Item = tuple[int, str, bytes]  # log time [ns], topic, message
 
 
 def write_log(
-    log: ScanLog, path: str | Path, *, revolution: float = 0.1, compression: str = "none"
+    log: ScanLog,
+    path: str | Path,
+    *,
+    revolution: float = 0.1,
+    compression: str = "none",
+    firings: Firings | None = None,
 ) -> None:
     """Write a log as MCAP with the topics of a ROS 2 recording.
 
@@ -57,9 +62,11 @@ def write_log(
     path : str or Path
         The file; replaced if it exists.
     revolution : float
-        Time that one point cloud spans [s].
+        Time that one point cloud, or one message of packets, spans [s].
     compression : str
         ``none``, ``lz4`` or ``zstd``.
+    firings : Firings, optional
+        All shots of the LiDAR: they are written as raw packets, in place of the points.
 
     Raises
     ------
@@ -70,8 +77,9 @@ def write_log(
 
     Notes
     -----
-    ``/velodyne_points`` (x y z intensity ring time, stamped with the start of its revolution),
-    ``/joint_states``, ``/imu/data`` and ``/tf_static``, interleaved in the order of recording.
+    ``/velodyne_points`` (x y z intensity ring time, stamped with the start of its revolution) or
+    ``/velodyne_packets``, ``/joint_states``, ``/imu/data`` and ``/tf_static``, interleaved in the
+    order of recording.
     """
     if compression not in _COMPRESSIONS:
         raise ConfigError(f"compression is {compression!r}; it must be none, lz4 or zstd.")
@@ -82,7 +90,7 @@ def write_log(
     with Path(path).open("wb") as file:
         writer = Writer(file, compression=_COMPRESSIONS[compression])
         writer.start(profile="ros2", library="spheremark")
-        _write_messages(writer, log, round(revolution * 1e9))
+        _write_messages(writer, log, round(revolution * 1e9), firings)
         writer.finish()  # type: ignore[no-untyped-call]
 
 
@@ -91,7 +99,9 @@ def _stamps(log: ScanLog) -> tuple[Nanos, Nanos, Nanos]:
     return log.stamps_lidar_ns, log.stamps_gimbal_ns, log.stamps_imu_ns
 
 
-def _write_messages(writer: Writer, log: ScanLog, revolution_ns: int) -> None:
+def _write_messages(
+    writer: Writer, log: ScanLog, revolution_ns: int, firings: Firings | None
+) -> None:
     """Write all topics that the log has something for, merged by time."""
     channels: dict[str, int] = {}
 
@@ -106,7 +116,10 @@ def _write_messages(writer: Writer, log: ScanLog, revolution_ns: int) -> None:
         name = topic("/tf_static", transforms.SCHEMA, transforms.DEFINITION, durability=1)
         first = min((int(s.min()) for s in _stamps(log) if len(s)), default=0)
         items.append(iter([(first, name, _static_transforms(log.rig, first))]))
-    if len(log.p_lidar):
+    if firings is not None:
+        name = topic("/velodyne_packets", packets.SCHEMA, packets.DEFINITION)
+        items.append(packets.scans(name, LIDAR_FRAME, firings, revolution_ns))
+    elif len(log.p_lidar):
         name = topic("/velodyne_points", pointclouds.SCHEMA, pointclouds.DEFINITION)
         items.append(_clouds(name, log, revolution_ns))
     if len(log.gimbal_angles):
