@@ -14,6 +14,7 @@ import numpy as np
 import plotly.graph_objects as go
 from numpy.typing import NDArray
 
+from pipelines.study import TABLE_2
 from web import theme
 
 Columns = Mapping[str, NDArray[Any]]
@@ -71,6 +72,7 @@ def error_against_distance(fits: Columns, tolerance_m: float, *, is_log: bool = 
     """Draw the error of each sphere centre against its distance."""
     figure = _quality_figure(fits, "sphere centres against distance", tolerance_m)
     _add_fits(figure, fits, floats(fits, "range_m"), _RANGE_BIN)
+    _add_study(figure, fits, TABLE_2.ranges)
     _scale(figure, "Distance [m]", is_log=is_log)
     return figure
 
@@ -79,6 +81,7 @@ def error_against_count(fits: Columns, tolerance_m: float, *, is_log: bool = Fal
     """Draw the error of each sphere centre against the number of its returns, always by ratio."""
     figure = _quality_figure(fits, "sphere centres against point count", tolerance_m)
     _add_fits(figure, fits, floats(fits, "n_points"), _COUNT_BIN)
+    _add_study(figure, fits, TABLE_2.n_points)
     _scale(figure, "Returns on the sphere", is_log=is_log)
     figure.update_xaxes(**_RATIO_AXIS)
     return figure
@@ -253,6 +256,22 @@ def details(rows: Columns, words: Sequence[str], numbers: Sequence[str]) -> list
     columns: list[Iterable[Any]] = [texts(rows, name) for name in words]
     columns += [floats(rows, name).round(4).tolist() for name in numbers]
     return [list(row) for row in zip(*columns, strict=True)]
+
+
+def _add_study(figure: go.Figure, fits: Columns, x: NDArray[np.float64]) -> None:
+    """Lay the study's own Table 2 over errors; a click on its name in the legend takes it away."""
+    if not has_errors(fits):
+        return
+    figure.add_scatter(
+        x=x,
+        y=TABLE_2.errors_3d * _MM,
+        mode="markers",
+        name="study, Table 2",
+        marker={"symbol": "x-thin", "size": 8, "line": {"color": theme.TEXT, "width": 1.5}},
+        customdata=np.column_stack([TABLE_2.ranges, TABLE_2.n_points]),
+        hovertemplate="%{y:.1f} mm at %{customdata[0]:.2f} m, %{customdata[1]:.0f} returns"
+        "<extra>study, Table 2</extra>",
+    )
 
 
 def _add_binned(

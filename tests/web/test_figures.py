@@ -234,3 +234,15 @@ def test_every_colour_has_a_value_for_light_and_for_dark():
         variable = str(name)[4:-1]
         assert f"{variable}:" in light
         assert f"{variable}:" in dark
+
+
+def test_the_studys_own_table_lies_over_errors_and_not_over_sigmas():
+    for figure, x in (
+        (figures.error_against_distance(fits(), 0.03), TABLE_2.ranges),
+        (figures.error_against_count(fits(), 0.03), TABLE_2.n_points),
+    ):
+        (overlay,) = [one for one in figure.data if one.name == "study, Table 2"]
+        assert_allclose(overlay.y, TABLE_2.errors_3d * 1e3, rtol=0, atol=MM)
+        assert_allclose(overlay.x, x, rtol=0, atol=MM)
+    predicted = figures.error_against_distance(fits(with_errors=False), 0.03)
+    assert "study, Table 2" not in [one.name for one in predicted.data]
