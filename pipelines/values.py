@@ -655,6 +655,11 @@ class StationFix:
         return float(np.arctan2(self.T_site_station[1, 0], self.T_site_station[0, 0]))
 
     @property
+    def sigma_yaw(self) -> float:
+        """Standard deviation of ``yaw``, without what mounting and encoder leave unknown [rad]."""
+        return float(np.sqrt(self.cov_T_site_station[2, 2]))
+
+    @property
     def sigma_3d(self) -> float:
         """Square root of the trace of the position's covariance [m]."""
         return float(np.sqrt(np.trace(self.cov_p_site)))

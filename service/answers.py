@@ -192,6 +192,7 @@ def _station(
         "position_m": _numbers(fix.p_site),
         "rotation": _numbers(fix.T_site_station[:3, :3]),
         "yaw_deg": math.degrees(yaw),
+        "sigma_yaw_deg": math.degrees(math.hypot(fix.sigma_yaw, stop.cloud.rig.sigma_heading)),
         "covariance": _numbers(fix.cov_T_site_station),
         "position_covariance_m2": _numbers(fix.cov_p_site),
         "sigma_3d_m": _number(fix.sigma_3d),

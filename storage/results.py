@@ -281,7 +281,7 @@ def _stop_rows(
         ]
     for (fit_method, method), fix in stop.fixes.items():
         label = {"fit_method": fit_method, "resection_method": method}
-        rows["station_fixes"].append(label | _fix_row(fix))
+        rows["station_fixes"].append(label | _fix_row(fix, sigma_heading))
         if isinstance(fix, StationFix):
             n_fits = len(stop.fits[fit_method].fits)
             rows["observations"] += [label | row for row in _observation_rows(fix, n_fits, names)]
@@ -351,7 +351,7 @@ def _fit_row(fit: MarkerFit, R_station_base: Array, sigma_heading: float) -> Row
     }
 
 
-def _fix_row(fix: StationFix | NoFix) -> Row:
+def _fix_row(fix: StationFix | NoFix, sigma_heading: float) -> Row:
     """Return the row of ``station_fixes`` without errors."""
     if isinstance(fix, NoFix):
         return {"status": "failed", "reason": fix.reason, "n_markers": 0}
@@ -364,7 +364,7 @@ def _fix_row(fix: StationFix | NoFix) -> Row:
         **_cov(fix.cov_p_site),
         "cov_motion": fix.cov_T_site_station.ravel().tolist(),
         "sigma_3d_m": fix.sigma_3d,
-        "sigma_yaw_deg": np.degrees(np.sqrt(fix.cov_T_site_station[2, 2])),
+        "sigma_yaw_deg": np.degrees(np.hypot(fix.sigma_yaw, sigma_heading)),
         **_ellipse(fix.cov_p_site[:2, :2]),
         "n_markers": len(fix.matches),
         "dof": fix.dof,

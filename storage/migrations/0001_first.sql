@@ -333,7 +333,7 @@ COMMENT ON COLUMN station_fixes.cov_yz_m2 IS 'Covariance of the position in the 
 COMMENT ON COLUMN station_fixes.cov_zz_m2 IS 'Covariance of the position in the site frame.';
 COMMENT ON COLUMN station_fixes.cov_motion IS 'Covariance of a small motion on the left (rotation in rad, translation in m, site frame), 36 numbers, rows first.';
 COMMENT ON COLUMN station_fixes.sigma_3d_m IS 'Square root of the trace of the covariance of the position.';
-COMMENT ON COLUMN station_fixes.sigma_yaw_deg IS 'Standard deviation of the heading.';
+COMMENT ON COLUMN station_fixes.sigma_yaw_deg IS 'Standard deviation of the heading, with what mounting and encoder leave unknown.';
 COMMENT ON COLUMN station_fixes.ellipse_major_m IS 'Semi-major axis of the horizontal standard ellipse (1 sigma, 39 % of cases).';
 COMMENT ON COLUMN station_fixes.ellipse_minor_m IS 'Semi-minor axis of the horizontal standard ellipse.';
 COMMENT ON COLUMN station_fixes.ellipse_bearing_deg IS 'Bearing of the major axis, clockwise from y of the site frame, 0 to 180.';
