@@ -3,6 +3,7 @@ import plotly.graph_objects as go
 import pytest
 from numpy.testing import assert_allclose
 
+from pipelines.study import TABLE_2
 from web import figures, maps, theme
 from web.assets import static_folder
 
