@@ -137,6 +137,17 @@ def test_errors_taken_anew_are_those_taken_at_once():
         assert late[name].equals(table), name
 
 
+def test_the_total_sigma_of_a_centre_has_the_heading_at_its_distance():
+    result = stop()
+    for row, fit in zip(
+        rows(made_tables(), "marker_fits", fit_method="along_beam"),
+        result.fits["along_beam"].fits,
+        strict=True,
+    ):
+        sideways = np.hypot(*fit.p_base[:2]) * result.cloud.rig.sigma_heading
+        assert row["sigma_total_3d_m"] ** 2 == pytest.approx(fit.sigma_3d**2 + sideways**2)
+
+
 def test_a_pose_can_be_rebuilt_from_its_row():
     (row,) = rows(made_tables(), "station_fixes", fit_method="along_beam")
     fix = stop().fixes["along_beam", "free_station"]
@@ -146,7 +157,8 @@ def test_a_pose_can_be_rebuilt_from_its_row():
     motion = np.array(row["cov_motion"]).reshape(6, 6)
     np.testing.assert_array_equal(motion, fix.cov_T_site_station)
     np.testing.assert_allclose(covariance(row), fix.cov_p_site, rtol=0, atol=1e-18)
-    assert row["sigma_yaw_deg"] == pytest.approx(np.degrees(np.sqrt(fix.cov_T_site_station[2, 2])))
+    variance = fix.cov_T_site_station[2, 2] + stop().cloud.rig.sigma_heading ** 2
+    assert row["sigma_yaw_deg"] == pytest.approx(np.degrees(np.sqrt(variance)))
     assert (row["dof"], row["n_markers"], row["sigma0"]) == (11, 5, None)
 
 
