@@ -45,6 +45,7 @@ _STILL = np.radians(0.1)  # a gimbal at rest stays within this, encoder jitter i
 _NOT_TURNED = np.radians(1.0)  # less is not turning
 _SCRAP = np.radians(30.0)  # less after a stop is no scan but the gimbal finding its place
 _SMEAR = np.radians(0.05)  # 7 mm at 7.5 m: the most that a message without shot times may turn
+_RESTS_MIN = 4  # fewer rests than this are those before and after an even turn
 _JOINT_GAP = 0.5  # [s]; over a longer gap of a moving gimbal the angle is a guess
 _JOINT_GAP_MOTION = np.radians(0.5)
 _SIGMA_UNLEVELLED = np.radians(3.0)  # how a rover may lean on ground it can drive on
@@ -430,8 +431,8 @@ def _without_smear(log: ScanLog, joints: _Joints) -> tuple[_Joints, tuple[str, .
         moved = np.abs(np.diff(_angles_at(joints, edges)))
     else:  # nothing tells how long the only message took
         moved = np.ptp(joints.angles, keepdims=True)
-    smeared = np.maximum(moved, np.append(0.0, moved[:-1])) > _SMEAR
-    if np.mean(smeared) > 0.5:
+    smeared, n_rests = _smeared(moved)
+    if np.mean(smeared) > 0.5 and n_rests < _RESTS_MIN:
         raise MissingShotTimesError(
             f"The points of {log.origin.name} carry no time of their own, and the gimbal turns by "
             f"{np.degrees(np.median(moved)):.2f} deg during a message (at most "
@@ -444,6 +445,18 @@ def _without_smear(log: ScanLog, joints: _Joints) -> tuple[_Joints, tuple[str, .
         f"The points carry no time of their own: {int(np.sum(smeared))} of {len(messages)} "
         "messages were made while the gimbal moved and are left out.",
     )
+
+
+def _smeared(moved: Array) -> tuple[Mask, int]:
+    """Say which messages the gimbal moved in, and how often it rested, given its motion [rad].
+
+    A message is stamped with its start; some drivers stamp the end. The first message of a rest is
+    therefore left out too, unless it is the only one.
+    """
+    smeared = moved > _SMEAR
+    is_first = ~smeared & np.append(True, smeared[:-1])
+    is_last = ~smeared & np.append(smeared[1:], True)
+    return smeared | (is_first & ~is_last & (np.arange(len(moved)) > 0)), int(is_first.sum())
 
 
 def _voided(joints: _Joints, stamps_ns: Nanos) -> _Joints:
