@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping
+from dataclasses import asdict
 from typing import Annotated, Any
 
 from fastapi import APIRouter, Query, Request
@@ -122,16 +123,6 @@ SELECT x.stop, x.n_returns,
         WHERE m.run_id = x.run_id AND m.stop = x.stop AND m.fit_method = 'along_beam') AS n_markers
 FROM stops AS x JOIN runs AS r USING (run_id) WHERE r.job_id = $id ORDER BY x.stop
 """
-_SCHEMA = """
-SELECT table_name, column_name, data_type, comment FROM duckdb_columns()
-WHERE schema_name = 'main' AND NOT internal ORDER BY table_name, column_index
-"""
-_TABLES = """
-SELECT * FROM (
-    SELECT view_name AS table_name, comment, 0 AS place FROM duckdb_views() WHERE NOT internal
-    UNION ALL SELECT table_name, comment, 1 AS place FROM duckdb_tables() WHERE NOT internal
-) ORDER BY place, table_name
-"""
 
 
 @router.get(assets.plotly_url())
@@ -233,8 +224,7 @@ def sql(service: Current, q: Annotated[str, Query(max_length=100_000)] = "") -> 
         pages.SqlPage(
             frame=_frame(service),
             query=q or pages.EXAMPLES[0][1],
-            columns=tuple(service.catalogue.rows(_SCHEMA)),
-            tables=tuple(service.catalogue.rows(_TABLES)),
+            tables=tuple(asdict(table) for table in service.catalogue.schema()),
             seconds=limits.seconds,
             rows=limits.rows,
             memory_bytes=limits.memory_bytes,

@@ -133,7 +133,6 @@ class SqlPage:
 
     frame: Frame
     query: str
-    columns: tuple[Row, ...]
     tables: tuple[Row, ...]
     seconds: float
     rows: int
@@ -239,15 +238,11 @@ def recording_page(page: RecordingPage) -> str:
 
 def sql_page(page: SqlPage) -> str:
     """Return the workbench for queries."""
-    by_table: dict[str, list[Row]] = {}
-    for column in page.columns:
-        by_table.setdefault(column["table_name"], []).append(column)
-    schema = {table: [row["column_name"] for row in rows] for table, rows in by_table.items()}
+    schema = {table["name"]: [row["name"] for row in table["columns"]] for table in page.tables}
     return _render(
         "sql.html",
         page,
         here="sql",
-        by_table=by_table,
         schema=schema,
         examples=EXAMPLES,
         chart_template=_chart_template(),

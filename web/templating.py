@@ -46,7 +46,6 @@ def environment() -> Environment:
         json_block=json_block,
         figure_block=lambda figure: _as_block(str(to_json_plotly(figure.to_plotly_json()))),
         method=lambda name: theme.method_style(name).label,
-        unit=unit_of,
         heading=heading,
     )
     made.globals.update(assets=assets)
@@ -61,14 +60,6 @@ def json_block(value: Any) -> Markup:
 def _as_block(text: str) -> Markup:
     """Mark JSON as safe, once nothing in it can end the element that holds it."""
     return Markup(text.replace("<", "\\u003c").replace("&", "\\u0026"))
-
-
-def unit_of(column: str) -> str:
-    """Return the unit that the name of a column ends in."""
-    if column == "cov_motion":
-        return "rad, m"
-    units = {"m": "m", "m2": "m²", "deg": "deg", "s": "s", "bytes": "B", "percent": "%"}
-    return units.get(column.rpartition("_")[2], "") if "_" in column else ""
 
 
 def heading(name: str) -> str:

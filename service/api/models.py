@@ -233,18 +233,28 @@ class Query(Strict):
 class Column(BaseModel):
     """A column of an answer."""
 
+    model_config = ConfigDict(from_attributes=True)
+
     name: str
     type: str
-    unit: str | None
+    unit: str
+
+
+class DescribedColumn(Column):
+    """A column that can be asked for."""
+
+    comment: str
 
 
 class Table(BaseModel):
     """A table or view that can be asked."""
 
+    model_config = ConfigDict(from_attributes=True)
+
     name: str
     kind: Literal["table", "view"]
-    comment: str | None
-    columns: list[Column]
+    comment: str
+    columns: list[DescribedColumn]
 
 
 class Answer(BaseModel):

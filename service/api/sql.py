@@ -15,33 +15,11 @@ from pyarrow import csv
 from service.api.models import Answer, Column, Listing, Query, Table
 from service.state import Current, Service
 from storage.catalogue import Catalogue
+from storage.records import unit_of
 from storage.sandbox import QueryLimits, QueryResult, run_query, to_csv
 
 router = APIRouter(tags=["sql"])
 
-UNITS = {
-    "m": "m",
-    "m2": "m²",
-    "deg": "deg",
-    "rad": "rad",
-    "s": "s",
-    "ms": "ms",
-    "percent": "%",
-    "bytes": "bytes",
-    "db": "dB",
-    "at": "UTC",
-}
-"""By the last word of a column's name."""
-
-_SCHEMA = """
-SELECT c.table_name, t.comment AS table_comment, t.kind, c.column_name, c.data_type,
-    c.is_nullable
-FROM duckdb_columns() AS c JOIN (
-    SELECT table_name, comment, 'table' AS kind FROM duckdb_tables() WHERE NOT internal
-    UNION ALL SELECT view_name, comment, 'view' FROM duckdb_views() WHERE NOT internal
-) AS t USING (table_name)
-WHERE NOT c.internal ORDER BY t.kind, c.table_name, c.column_index
-"""
 _COORDINATES = """
 SELECT survey, 'mark' AS kind, mark AS name, NULL AS fit_method, NULL AS resection_method,
     'control' AS status, x_m, y_m, z_m, sqrt(sigma_x_m ^ 2 + sigma_y_m ^ 2 + sigma_z_m ^ 2)
@@ -82,8 +60,8 @@ def query_by_link(
 
 @router.get("/sql/schema", name="get_schema")
 def get_schema(service: Current) -> Listing[Table]:
-    """Describe every table and view with its columns, types and units."""
-    return Listing(items=schema(service))
+    """Describe every table and view with its columns, types, units and what they mean."""
+    return Listing(items=[Table.model_validate(table) for table in service.catalogue.schema()])
 
 
 @router.get("/export/results.duckdb", name="export_database", response_class=FileResponse)
@@ -116,25 +94,6 @@ def ask(catalogue: Catalogue, limits: QueryLimits, sql: str) -> Answer:
     """Answer one SELECT on a snapshot of the database."""
     snapshot = catalogue.snapshot()
     return _to_answer(run_query(snapshot, sql, limits), limits, snapshot)
-
-
-def schema(service: Service) -> list[Table]:
-    """Return every table and view with its columns."""
-    tables: dict[str, Table] = {}
-    for row in service.catalogue.rows(_SCHEMA):
-        table = Table(
-            name=row["table_name"], kind=row["kind"], comment=row["table_comment"], columns=[]
-        )
-        column = Column(
-            name=row["column_name"], type=row["data_type"], unit=unit_of(row["column_name"])
-        )
-        tables.setdefault(table.name, table).columns.append(column)
-    return list(tables.values())
-
-
-def unit_of(column: str) -> str | None:
-    """Return the unit that a column's name ends with."""
-    return UNITS.get(column.rpartition("_")[2]) if "_" in column else None
 
 
 def _answer(service: Service, asked: Query, request: Request) -> Answer | Response:

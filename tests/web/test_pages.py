@@ -49,22 +49,6 @@ def test_the_headline_sets_error_against_what_was_predicted():
 
 
 @pytest.mark.parametrize(
-    ("column", "unit"),
-    [
-        ("range_m", "m"),
-        ("cov_xx_m2", "m²"),
-        ("included_angle_deg", "deg"),
-        ("timings_s", "s"),
-        ("size_bytes", "B"),
-        ("n_points", ""),
-        ("w", ""),
-    ],
-)
-def test_units_are_read_from_names(column, unit):
-    assert templating.unit_of(column) == unit
-
-
-@pytest.mark.parametrize(
     ("key", "text"),
     [
         ("gimbal_speed_deg_per_s", "Gimbal speed [deg/s]"),
