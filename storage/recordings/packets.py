@@ -60,6 +60,7 @@ _MODELS = {0x21: "an HDL-32E", 0x24: "a Puck Hi-Res", 0x28: "a VLP-32C", 0xA1: "
 _HOUR_NS = 3_600_000_000_000
 _CLOCK_STEP_NS = 1_000  # of the sensor's clock
 _LATE_MAX_NS = 20e6  # what a packet may be later than others when the computer is busy
+_DRIFT_SPAN = 5.0  # [s] in less time two clocks drift apart by less than their stamps jitter
 _LATE_SHARE = 0.95  # of the packets must be that punctual before the sensor's clock is believed
 _BLOCK = np.dtype(
     [
@@ -262,7 +263,7 @@ def punctual(stamps_ns: Nanos, micros: Nanos) -> tuple[Nanos, str]:
     Returns
     -------
     instants_ns : (n,)
-        A straight line in the sensor's clock, which the stamps follow on average.
+        The sensor's even clock, which the stamps follow on average, drift included.
     note : str
         Why the stamps are taken as they are; empty otherwise.
 
@@ -281,7 +282,10 @@ def punctual(stamps_ns: Nanos, micros: Nanos) -> tuple[Nanos, str]:
     usual = np.abs(late - np.median(late)) <= _LATE_MAX_NS
     if np.ptp(micros) == 0 or np.mean(usual) < _LATE_SHARE:
         return stamps_ns, "the sensor's own clock jumps; the stamps of its packets are used."
-    line = np.polyfit(seconds[usual], late[usual], min(1, int(usual.sum()) - 1))
+    if np.ptp(seconds) < _DRIFT_SPAN:
+        line = np.median(late[usual], keepdims=True)
+    else:
+        line = np.polyfit(seconds[usual], late[usual], 1)
     return stamps_ns - np.rint(late - np.polyval(line, seconds)).astype(np.int64), ""
 
 
