@@ -10,10 +10,11 @@ from typing import TypeVar
 _Part = TypeVar("_Part")
 
 _N_PARTS = 2  # always: sums are taken part by part, and must not depend on the machine
-_ROWS_MIN = 50_000  # fewer are done before a thread has started
 
 
-def side_by_side(work: Callable[[int, int], _Part], n_rows: int) -> list[_Part]:
+def side_by_side(
+    work: Callable[[int, int], _Part], n_rows: int, *, worth: int = 50_000
+) -> list[_Part]:
     """Do the parts of a range of rows at the same time.
 
     Parameters
@@ -23,13 +24,15 @@ def side_by_side(work: Callable[[int, int], _Part], n_rows: int) -> list[_Part]:
         without Python's lock, as compiled loops with ``nogil`` do.
     n_rows : int
         Number of rows.
+    worth : int
+        With fewer rows the work is done before a thread has started: one part, then.
 
     Returns
     -------
     list
         What ``work`` returned for each part, in the order of the rows.
     """
-    if n_rows < _ROWS_MIN:
+    if n_rows < worth:
         return [work(0, n_rows)]
     edges = [part * n_rows // _N_PARTS for part in range(_N_PARTS + 1)]
     with ThreadPoolExecutor(_N_PARTS - 1) as pool:

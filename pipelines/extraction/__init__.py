@@ -93,11 +93,11 @@ def _candidates(
     """Return candidates in the order of azimuth."""
     ordered = sorted(looks, key=lambda look: np.arctan2(look.y, look.x))
     centres = np.array([look.p_base for look in ordered]).reshape(-1, 3)
-    patches = patches_about(grid, centres, ball.radius)
+    patches = patches_about(cloud.p_base, grid, centres, ball.radius)
     cells = cells_of(centres, grid)
     return tuple(
         MarkerCandidate(
-            members=_members(cloud, near(cloud.p_base, patches, cell, p), p, ball),
+            members=_members(cloud, patches.rows[near(patches, cell, p)], p, ball),
             p_base_rough=p.copy(),
             score=score(look, config, ball),
         )

@@ -10,7 +10,8 @@ import numpy as np
 
 from pipelines.extraction.ball import Ball, view
 from pipelines.extraction.looks import Look
-from pipelines.values import Array, Column
+from pipelines.threads import side_by_side
+from pipelines.values import Array, Column, Mask
 
 _N_FACE = 256  # cells along a face of the cube of directions: 0.45 deg
 _N_SURE = 20  # returns that show a shape well enough to judge by it alone
@@ -42,13 +43,18 @@ def grounded(p_base: Column, looks: list[Look], verdicts: list[str], ball: Ball)
     if not open_cases:
         return verdicts
     centres = np.array([look.p_base for look in open_cases])
-    points = _in_directions(p_base, centres, ball.up, 3.0 * ball.radius + 0.1).astype(np.float64)
+    is_wanted = _directions_about(centres, ball.up, 3.0 * ball.radius + 0.1)
+
+    parts = side_by_side(
+        lambda first, end: _in_directions(p_base[first:end], is_wanted), len(p_base)
+    )
+    points = np.concatenate(parts)
     return [
         reason or _resting(points, look, ball) for look, reason in zip(looks, verdicts, strict=True)
     ]
 
 
-def _resting(points: Array, look: Look, ball: Ball) -> str:
+def _resting(points: Column, look: Look, ball: Ball) -> str:
     """Return why a group seems to rest on the ground; empty if it does not."""
     n_past, n_short = _beneath(points, look, ball)
     is_sure = look.n_points >= _N_SURE and look.sigma_radius < _SHAPE_SURE * ball.radius
@@ -60,15 +66,13 @@ def _resting(points: Array, look: Look, ball: Ball) -> str:
     )
 
 
-def _beneath(points: Array, look: Look, ball: Ball) -> tuple[int, int]:
+def _beneath(points: Column, look: Look, ball: Ball) -> tuple[int, int]:
     """Count the returns below a group beside a pole's place: those past it, and the others."""
     c, radius = look.p_base, ball.radius
     distance = float(np.linalg.norm(c))
     blur = 0.5 * ball.divergence * distance
     reach = 2.8 * radius + blur
-    cosines = points @ c / (distance * np.linalg.norm(points, axis=1))
-    near = points[cosines > np.cos(np.arctan(reach / distance))]
-    seen, _, _ = view(near, c, ball.up)
+    seen, _, _ = view(_towards(points, c, reach / distance), c, ball.up)
     across, along, depth = np.abs(seen[:, 0]), seen[:, 1], seen[:, 2]
     is_below = (along < -0.3 * radius) & (across > 0.6 * radius + blur)
     is_below &= np.hypot(across, along) > 1.2 * radius + blur
@@ -77,8 +81,23 @@ def _beneath(points: Array, look: Look, ball: Ball) -> tuple[int, int]:
 
 
 @numba.njit(cache=True, nogil=True)
-def _in_directions(p_base: Column, centres: Array, up: Array, reach: float) -> Column:
-    """Return the points, at whatever depth, whose beams may pass some centres within a reach."""
+def _towards(points: Column, c: Array, tangent: float) -> Array:
+    """Return the points that are seen within an angle, given by its tangent, of a centre."""
+    x, y, z = c
+    least = (x * x + y * y + z * z) / (1.0 + tangent * tangent)
+    rows = np.empty(len(points), np.int32)
+    n_rows = 0
+    for i in range(len(points)):
+        px, py, pz = points[i, 0], points[i, 1], points[i, 2]
+        along = x * px + y * py + z * pz
+        rows[n_rows] = i  # kept only if the next one does not take its place
+        n_rows += along > 0.0 and along * along > least * (px * px + py * py + pz * pz)
+    return points[rows[:n_rows]].astype(np.float64)
+
+
+@numba.njit(cache=True, nogil=True)
+def _directions_about(centres: Array, up: Array, reach: float) -> Mask:
+    """Tell the cells of directions in which beams may pass some centres within a reach."""
     is_wanted = np.zeros(6 * _N_FACE * _N_FACE, np.bool_)
     n_steps = 2 + int(1.5 * reach * _N_FACE / np.sqrt(np.min(np.sum(centres**2, axis=1)) + 1e-9))
     for k in range(len(centres)):
@@ -89,12 +108,17 @@ def _in_directions(p_base: Column, centres: Array, up: Array, reach: float) -> C
             for j in range(-n_steps, n_steps + 1):
                 q = c + (i / n_steps) * v_across + (j / n_steps) * reach * up
                 is_wanted[_direction_cell(q[0], q[1], q[2])] = True
+    return is_wanted
+
+
+@numba.njit(cache=True, nogil=True)
+def _in_directions(p_base: Column, is_wanted: Mask) -> Column:
+    """Return the points, at whatever depth, in the cells that are wanted."""
     rows = np.empty(len(p_base), np.int32)
     n_rows = 0
     for i in range(len(p_base)):
-        if is_wanted[_direction_cell(p_base[i, 0], p_base[i, 1], p_base[i, 2])]:
-            rows[n_rows] = i
-            n_rows += 1
+        rows[n_rows] = i  # kept only if the next one does not take its place
+        n_rows += is_wanted[_direction_cell(p_base[i, 0], p_base[i, 1], p_base[i, 2])]
     return p_base[rows[:n_rows]]
 
 

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from pipelines.config import ExtractionConfig
 from pipelines.geometry import levelling_rotation
+from pipelines.threads import side_by_side
 from pipelines.values import Array, Column, Mask, StitchedCloud
 
 _STUDY_FIELD = 10.0  # [m] from the station: where the study looks for its highest ground point
@@ -66,40 +67,51 @@ def ground_grid(cloud: StitchedCloud, config: ExtractionConfig) -> Grid:
     """
     n_side = 2 * int(np.ceil(config.range_max / config.ground_cell))
     R = levelling_rotation(cloud.levelling)
-    cells, heights, lowest = _lowest_per_cell(
-        cloud.p_base, R, config.ground_cell, n_side, config.range_max
+    n = len(cloud.p_base)
+    cells, is_above = np.empty(n, np.int32), np.empty(n, np.bool_)
+
+    p, edge, clearance = cloud.p_base, config.ground_cell, config.ground_clearance
+    parts = side_by_side(
+        lambda first, end: _lowest_per_cell(
+            p[first:end], R, edge, n_side, config.range_max, cells[first:end]
+        ),
+        n,
     )
-    ground = _ground(lowest, _opened(lowest, _GROUND_WINDOW), _GROUND_WINDOW)
-    is_above, highest = _above(
-        cloud.p_base, cells, heights, ground.ravel(), config.ground_clearance
+    lowest = np.minimum.reduce(parts)
+    ground = _ground(lowest, _opened(lowest, _GROUND_WINDOW), _GROUND_WINDOW).ravel()
+    highest = side_by_side(
+        lambda first, end: _above(
+            p[first:end], R, cells[first:end], ground, clearance, is_above[first:end]
+        ),
+        n,
     )
-    return Grid(cells, n_side, config.ground_cell, R, is_above, float(highest))
+    return Grid(cells, n_side, edge, R, is_above, float(max(highest)))
 
 
 @numba.njit(cache=True, nogil=True)
 def _lowest_per_cell(
-    p_base: Column, R: Array, edge: float, n_side: int, range_max: float
-) -> tuple[NDArray[np.int32], Column, Column]:
-    """Return each point's cell (-1: too far) and levelled height, and the lowest point per cell."""
-    n = len(p_base)
-    cells = np.empty(n, np.int32)
-    heights = np.empty(n, np.float32)
+    p_base: Column,
+    R: Array,
+    edge: float,
+    n_side: int,
+    range_max: float,
+    cells: NDArray[np.int32],
+) -> Column:
+    """Write each point's cell (-1: too far), and return the levelled lowest point per cell."""
     lowest = np.full((n_side, n_side), np.inf, np.float32)
     half = n_side // 2
-    for i in range(n):
+    (a, b, c), (d, e, f), (g, h, k) = R[0], R[1], R[2]
+    for i in range(len(p_base)):
         x, y, z = p_base[i, 0], p_base[i, 1], p_base[i, 2]
-        x_level = R[0, 0] * x + R[0, 1] * y + R[0, 2] * z
-        y_level = R[1, 0] * x + R[1, 1] * y + R[1, 2] * z
-        height = np.float32(R[2, 0] * x + R[2, 1] * y + R[2, 2] * z)
-        heights[i] = height
+        x_level, y_level = a * x + b * y + c * z, d * x + e * y + f * z
         if not x_level * x_level + y_level * y_level < range_max * range_max:
             cells[i] = -1
             continue
         row = min(max(int(np.floor(x_level / edge)) + half, 0), n_side - 1)
         column = min(max(int(np.floor(y_level / edge)) + half, 0), n_side - 1)
         cells[i] = row * n_side + column
-        lowest[row, column] = min(lowest[row, column], height)
-    return cells, heights, lowest
+        lowest[row, column] = min(lowest[row, column], np.float32(g * x + h * y + k * z))
+    return lowest
 
 
 @numba.njit(cache=True, nogil=True)
@@ -157,20 +169,24 @@ def _ground(lowest: Column, opened: Column, window: int) -> Column:
 @numba.njit(cache=True, nogil=True)
 def _above(
     p_base: Column,
+    R: Array,
     cells: NDArray[np.int32],
-    heights: Column,
     ground: Column,
     clearance: float,
-) -> tuple[Mask, float]:
-    """Return which points are not known to be ground, and the highest ground point near by."""
-    is_above = np.zeros(len(cells), np.bool_)
+    is_above: Mask,
+) -> float:
+    """Tell which points are not known to be ground; return the highest ground point near by."""
     highest = -np.inf
+    g, h, k = R[2]
     for i in range(len(cells)):
+        is_above[i] = False
         if cells[i] < 0:
             continue
-        over = heights[i] - ground[cells[i]]
+        x, y, z = p_base[i, 0], p_base[i, 1], p_base[i, 2]
+        height = np.float32(g * x + h * y + k * z)
+        over = height - ground[cells[i]]
         is_above[i] = over > clearance or ground[cells[i]] == np.inf
-        is_field = p_base[i, 0] ** 2 + p_base[i, 1] ** 2 < _STUDY_FIELD**2
-        if is_field and -np.inf < over < _GROUND_NOISE and heights[i] > highest:
-            highest = heights[i]
-    return is_above, highest
+        is_field = x * x + y * y < _STUDY_FIELD**2
+        if is_field and -np.inf < over < _GROUND_NOISE and height > highest:
+            highest = float(height)
+    return highest

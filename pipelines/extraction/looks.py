@@ -16,9 +16,11 @@ from pipelines.extraction.ball import Ball, view
 from pipelines.extraction.ground import Grid
 from pipelines.extraction.patches import Patches, cells_of, gathered, near, patches_about
 from pipelines.extraction.seeds import thinned
-from pipelines.values import Array, Column, StitchedCloud
+from pipelines.threads import side_by_side
+from pipelines.values import Array, StitchedCloud
 
 _N_LOOK = 4  # returns without which there is nothing to look at
+_N_WORTH = 50  # seeds that are worth a thread
 _N_STEPS = 6  # of a fit that only has to tell what a group is
 _NOISE_MIN = 0.006  # [m] of any VLP-16: what scatters less is not known better
 
@@ -98,28 +100,32 @@ def look_at(cloud: StitchedCloud, grid: Grid, seeds: Array, ball: Ball) -> list[
     list of Look
         What is there; places at which hardly a return lies on a ball are left out.
     """
-    patches = patches_about(grid, seeds, ball.radius)
-    found = _approached(cloud.p_base, patches, seeds, cells_of(seeds, grid), ball)
+    patches = patches_about(cloud.p_base, grid, seeds, ball.radius)
+    cells = cells_of(seeds, grid)
+
+    parts = side_by_side(
+        lambda first, end: _approached(patches, seeds[first:end], cells[first:end], ball),
+        len(seeds),
+        worth=_N_WORTH,
+    )
+    found = np.concatenate(parts)
     is_free = found[:, 4] + found[:, 5] <= 2.0 + 0.6 * found[:, 3]
     found = found[(found[:, 3] >= _N_LOOK) & is_free]
     found = found[np.lexsort((found[:, 2], found[:, 1], found[:, 0], -found[:, 3]))]
     places = thinned(found[:, :4].copy(), 0.5 * ball.radius)[:, :3]
     looks = []
     for place, cell in zip(places, cells_of(places, grid), strict=True):
-        points = gathered(cloud.p_base, near(cloud.p_base, patches, cell, place))
+        points = gathered(patches, near(patches, cell, place))
         looks.append(_look(points, place, ball))
     return [look for look in looks if look is not None]
 
 
 @numba.njit(cache=True, nogil=True)
-def _approached(
-    p_base: Column, patches: Patches, seeds: Array, seed_cells: NDArray[np.int64], ball: Ball
-) -> Array:
+def _approached(patches: Patches, seeds: Array, seed_cells: NDArray[np.int64], ball: Ball) -> Array:
     """Return where seeds' discs came to rest, the returns in, beside and below them, (k, 6)."""
     out = np.zeros((len(seeds), 6))
     for k in range(len(seeds)):
-        rows = near(p_base, patches, seed_cells[k], seeds[k])
-        points = gathered(p_base, rows)
+        points = gathered(patches, near(patches, seed_cells[k], seeds[k]))
         c, n = _shifted(points, seeds[k], ball.up, ball.radius)
         seen, _, _ = view(points, c, ball.up)
         blur = 0.5 * ball.divergence * np.sqrt(c[0] ** 2 + c[1] ** 2 + c[2] ** 2)
@@ -134,7 +140,8 @@ def _shifted(points: Array, c: Array, up: Array, radius: float) -> tuple[Array, 
     """Return where a disc of the ball's size comes to rest, and how many returns it holds."""
     n = 0
     for _ in range(4):
-        seen, v_across, v_up = view(points, c, up)
+        # what is farther off than this lies outside of the disc or its depth
+        seen, v_across, v_up = view(_within(points, c, 2.31 * radius), c, up)
         across, along, depth, n = 0.0, 0.0, 0.0, 0
         for i in range(len(seen)):
             is_inside = seen[i, 0] ** 2 + seen[i, 1] ** 2 < (1.15 * radius) ** 2
@@ -147,6 +154,19 @@ def _shifted(points: Array, c: Array, up: Array, radius: float) -> tuple[Array, 
         depth = depth / n + 2.0 / 3.0 * radius
         c = c + (across / n) * v_across + (along / n) * v_up + depth * v_beam
     return c, n
+
+
+@numba.njit(cache=True, nogil=True)
+def _within(points: Array, c: Array, reach: float) -> Array:
+    """Return the points within reach of a place."""
+    kept = np.empty_like(points)
+    n_kept = 0
+    for i in range(len(points)):
+        dx, dy, dz = points[i, 0] - c[0], points[i, 1] - c[1], points[i, 2] - c[2]
+        if dx * dx + dy * dy + dz * dz < reach * reach:
+            kept[n_kept, 0], kept[n_kept, 1], kept[n_kept, 2] = points[i]
+            n_kept += 1
+    return kept[:n_kept]
 
 
 @numba.njit(cache=True, nogil=True)
@@ -214,17 +234,40 @@ def _settled(points: Array, c: Array, ball: Ball, n_unknowns: int) -> tuple[Arra
     """
     radius, inverse = ball.radius, np.eye(n_unknowns)
     for _ in range(_N_STEPS):
-        seen, v_across, v_up = view(points, c, ball.up)
-        residuals, J = _shape(seen, radius)
-        scatter = _scatter(seen, residuals, radius)
-        distance = float(np.linalg.norm(c))
-        weights = _weights(seen, residuals, radius, 0.5 * ball.divergence * distance, scatter)
-        step, inverse = _solve(J[:, :n_unknowns], residuals, weights, (scatter / 0.03) ** 2)
+        N, pull, axes, scatter = _equations(points, c, ball, radius)
+        prior = (scatter / 0.03) ** 2 * np.eye(n_unknowns)
+        inverse = np.linalg.inv(N[:n_unknowns, :n_unknowns] + prior)
+        step = inverse @ pull[:n_unknowns]
         step *= min(1.0, 0.5 * ball.radius / (float(np.linalg.norm(step)) + 1e-12))
-        c = c + step[0] * v_across + step[1] * v_up + step[2] * c / distance
+        c = c + step[:3] @ axes
         if n_unknowns > 3:
             radius = float(np.clip(radius + step[3], 0.3 * ball.radius, 3.0 * ball.radius))
-    return c, radius, inverse
+    return c, radius, np.asarray(inverse)
+
+
+@numba.njit(cache=True, nogil=True)
+def _equations(
+    points: Array, c: Array, ball: Ball, radius: float
+) -> tuple[Array, Array, Array, float]:
+    """Return normal matrix and right-hand side of centre and radius, in axes that come with them.
+
+    The last is the scatter about the ball as it is [m].
+    """
+    seen, v_across, v_up = view(points, c, ball.up)
+    distance = np.sqrt(np.sum(c**2))
+    axes = np.empty((3, 3))
+    axes[0], axes[1], axes[2] = v_across, v_up, c / distance
+    residuals, J = _shape(seen, radius)
+    scatter = _scatter(seen, residuals, radius)
+    weights = _weights(seen, residuals, radius, 0.5 * ball.divergence * distance, scatter)
+    N, pull = np.zeros((4, 4)), np.zeros(4)
+    for i in range(len(seen)):
+        if weights[i] > 0.0:
+            for j in range(4):
+                pull[j] += weights[i] * residuals[i] * J[i, j]
+                for k in range(4):
+                    N[j, k] += weights[i] * J[i, j] * J[i, k]
+    return N, pull, axes, scatter
 
 
 @numba.njit(cache=True, nogil=True)
@@ -260,16 +303,28 @@ def _solve(J: Array, residuals: Array, weights: Array, prior: float) -> tuple[Ar
     return inverse @ (weighted.T @ residuals), inverse
 
 
+@numba.njit(cache=True, nogil=True)
 def _weights(seen: Array, residuals: Array, radius: float, blur: float, scatter: float) -> Array:
     """Return Tukey's weights of the returns that may belong to the ball."""
+    weights = np.zeros(len(seen))
     limit = 4.7 * scatter
-    is_on = np.hypot(seen[:, 0], seen[:, 1]) < radius + blur
-    is_on &= (seen[:, 1] > -0.9 * radius) & (np.abs(residuals) < limit)
-    return np.where(is_on, (1.0 - (residuals / limit) ** 2) ** 2, 0.0)
+    for i in range(len(seen)):
+        is_on = np.hypot(seen[i, 0], seen[i, 1]) < radius + blur and seen[i, 1] > -0.9 * radius
+        if is_on and abs(residuals[i]) < limit:
+            weights[i] = (1.0 - (residuals[i] / limit) ** 2) ** 2
+    return weights
 
 
+@numba.njit(cache=True, nogil=True)
 def _scatter(seen: Array, residuals: Array, radius: float) -> float:
     """Return the robust standard deviation of the residuals inside the outline [m]."""
-    is_inside = np.hypot(seen[:, 0], seen[:, 1]) < 0.9 * radius
-    inside = np.abs(residuals[is_inside & (np.abs(residuals) < 1.5 * radius)])
-    return float(np.clip(1.4826 * np.median(inside), 0.004, 0.03)) if len(inside) > 2 else 0.03
+    inside = np.empty(len(seen))
+    n_inside = 0
+    for i in range(len(seen)):
+        is_inside = np.hypot(seen[i, 0], seen[i, 1]) < 0.9 * radius
+        if is_inside and abs(residuals[i]) < 1.5 * radius:
+            inside[n_inside] = abs(residuals[i])
+            n_inside += 1
+    if n_inside < 3:
+        return 0.03
+    return min(max(1.4826 * np.median(inside[:n_inside]), 0.004), 0.03)

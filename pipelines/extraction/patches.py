@@ -13,7 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipelines.extraction.ground import Grid
-from pipelines.values import Array, Column
+from pipelines.threads import side_by_side
+from pipelines.values import Array, Column, Mask
 
 _REACH = 4.5  # radii about a seed whose returns decide whether a ball stands free there
 
@@ -27,6 +28,8 @@ class Patches(NamedTuple):
         The rows of a cell are ``rows[starts[cell]:starts[cell + 1]]``.
     rows : (m,) int32
         Rows of the cloud.
+    points : (m, 3) float32
+        The returns themselves [m].
     n_side : int
         Cells along one side.
     margin : int
@@ -37,16 +40,19 @@ class Patches(NamedTuple):
 
     starts: NDArray[np.int64]
     rows: NDArray[np.int32]
+    points: Column
     n_side: int
     margin: int
     reach: float
 
 
-def patches_about(grid: Grid, seeds: Array, radius: float) -> Patches:
+def patches_about(p_base: Column, grid: Grid, seeds: Array, radius: float) -> Patches:
     """Return the returns about some places, by cell.
 
     Parameters
     ----------
+    p_base : (n, 3) float32
+        All returns [m].
     grid : Grid
         Cells of all returns.
     seeds : (k, 3)
@@ -61,8 +67,14 @@ def patches_about(grid: Grid, seeds: Array, radius: float) -> Patches:
     """
     reach = _REACH * radius
     margin = int(np.ceil(reach / grid.edge)) + 1
-    starts, rows = _by_cell(grid.cells, grid.n_side, cells_of(seeds, grid), margin)
-    return Patches(starts, rows, grid.n_side, margin, reach)
+    is_wanted = _wanted(grid.n_side, cells_of(seeds, grid), margin)
+
+    parts = side_by_side(
+        lambda first, end: _rows_in(grid.cells, is_wanted, first, end), len(grid.cells)
+    )
+    rows = np.concatenate(parts)
+    starts, rows = _by_cell(grid.cells, rows, len(is_wanted))
+    return Patches(starts, rows, p_base[rows], grid.n_side, margin, reach)
 
 
 def cells_of(p_base: Array, grid: Grid) -> NDArray[np.int64]:
@@ -86,15 +98,13 @@ def cells_of(p_base: Array, grid: Grid) -> NDArray[np.int64]:
 
 
 @numba.njit(cache=True, nogil=True)
-def near(p_base: Column, patches: Patches, cell: int, c: Array) -> NDArray[np.int32]:
-    """Return the rows of the returns within reach of a place.
+def near(patches: Patches, cell: int, c: Array) -> NDArray[np.int32]:
+    """Return which of the returns are within reach of a place.
 
     Parameters
     ----------
-    p_base : (n, 3) float32
-        Returns [m].
     patches : Patches
-        Their rows by cell.
+        Returns by cell.
     cell : int
         A cell that holds the place, or is next to the one that does.
     c : (3,)
@@ -103,69 +113,83 @@ def near(p_base: Column, patches: Patches, cell: int, c: Array) -> NDArray[np.in
     Returns
     -------
     (k,) int32
-        Rows of the cloud.
+        Their places among ``patches.rows`` and ``patches.points``.
     """
-    n_side, margin = patches.n_side, patches.margin
+    n_side, margin, points, starts = patches.n_side, patches.margin, patches.points, patches.starts
     row, column = cell // n_side, cell % n_side
     low, high = max(column - margin, 0), min(column + margin, n_side - 1)
-    out = np.empty(64, np.int32)
+    bottom, top = max(row - margin, 0), min(row + margin, n_side - 1)
+    x, y, z, reach2 = c[0], c[1], c[2], patches.reach**2
+    out = np.empty(starts[top * n_side + high + 1] - starts[bottom * n_side + low], np.int32)
     n_out = 0
-    for k in range(max(row - margin, 0), min(row + margin + 1, n_side)):
-        first, last = patches.starts[k * n_side + low], patches.starts[k * n_side + high + 1]
-        for i in patches.rows[first:last]:
-            dx, dy, dz = p_base[i, 0] - c[0], p_base[i, 1] - c[1], p_base[i, 2] - c[2]
-            if dx * dx + dy * dy + dz * dz < patches.reach * patches.reach:
-                if n_out == len(out):
-                    out = np.concatenate((out, np.empty(n_out, np.int32)))
-                out[n_out] = i
-                n_out += 1
+    for k in range(bottom, top + 1):
+        for i in range(starts[k * n_side + low], starts[k * n_side + high + 1]):
+            dx, dy, dz = points[i, 0] - x, points[i, 1] - y, points[i, 2] - z
+            out[n_out] = i  # kept only if the next one does not take its place
+            n_out += dx * dx + dy * dy + dz * dz < reach2
     return out[:n_out]
 
 
 @numba.njit(cache=True, nogil=True)
-def gathered(p_base: Column, rows: NDArray[np.int32]) -> Array:
-    """Return some points in float64.
+def gathered(patches: Patches, places: NDArray[np.int32]) -> Array:
+    """Return some of the returns in float64.
 
     Parameters
     ----------
-    p_base : (n, 3) float32
-        Returns [m].
-    rows : (k,) int32
-        Those that are wanted.
+    patches : Patches
+        Returns by cell.
+    places : (k,) int32
+        Those that are wanted, as ``near`` gives them.
 
     Returns
     -------
     (k, 3)
         Points [m].
     """
-    points = np.empty((len(rows), 3))
-    for i in range(len(rows)):
-        points[i, 0], points[i, 1] = p_base[rows[i], 0], p_base[rows[i], 1]
-        points[i, 2] = p_base[rows[i], 2]
+    points = np.empty((len(places), 3))
+    for i in range(len(places)):
+        for axis in range(3):
+            points[i, axis] = patches.points[places[i], axis]
     return points
 
 
 @numba.njit(cache=True, nogil=True)
-def _by_cell(
-    cells: NDArray[np.int32], n_side: int, seed_cells: NDArray[np.int64], margin: int
-) -> tuple[NDArray[np.int64], NDArray[np.int32]]:
-    """Return starts and rows of the returns in and about the seeds' cells, by counting sort."""
+def _wanted(n_side: int, seed_cells: NDArray[np.int64], margin: int) -> Mask:
+    """Tell which cells are in and about the seeds' cells."""
     is_wanted = np.zeros(n_side * n_side, np.bool_)
     for cell in seed_cells:
         row, column = cell // n_side, cell % n_side
         for k in range(max(row - margin, 0), min(row + margin + 1, n_side)):
             for m in range(max(column - margin, 0), min(column + margin + 1, n_side)):
                 is_wanted[k * n_side + m] = True
-    starts = np.zeros(n_side * n_side + 1, np.int64)
-    for cell in cells:
-        if cell >= 0 and is_wanted[cell]:
-            starts[cell + 1] += 1
+    return is_wanted
+
+
+@numba.njit(cache=True, nogil=True)
+def _rows_in(cells: NDArray[np.int32], is_wanted: Mask, first: int, end: int) -> NDArray[np.int32]:
+    """Return the rows, of those of a part, that lie in cells that are wanted."""
+    rows = np.empty(end - first, np.int32)
+    n_rows = 0
+    for i in range(first, end):
+        if cells[i] >= 0 and is_wanted[cells[i]]:
+            rows[n_rows] = i
+            n_rows += 1
+    return rows[:n_rows].copy()
+
+
+@numba.njit(cache=True, nogil=True)
+def _by_cell(
+    cells: NDArray[np.int32], rows: NDArray[np.int32], n_cells: int
+) -> tuple[NDArray[np.int64], NDArray[np.int32]]:
+    """Return starts of cells, and rows sorted by their cells, by counting."""
+    starts = np.zeros(n_cells + 1, np.int64)
+    for row in rows:
+        starts[cells[row] + 1] += 1
     starts = np.cumsum(starts)
     ends = starts[:-1].copy()
-    rows = np.empty(starts[-1], np.int32)
-    for i in range(len(cells)):
-        cell = cells[i]
-        if cell >= 0 and is_wanted[cell]:
-            rows[ends[cell]] = i
-            ends[cell] += 1
-    return starts, rows
+    ordered = np.empty_like(rows)
+    for row in rows:
+        cell = cells[row]
+        ordered[ends[cell]] = row
+        ends[cell] += 1
+    return starts, ordered
