@@ -272,6 +272,36 @@ def test_step_and_shoot_without_shot_times_keeps_what_was_made_at_rest(rng):
     assert any("while the gimbal moved" in note for note in cloud.notes)
 
 
+def stepping(rng, rests, rest=0.3, move=0.1):
+    """A log whose messages of 0.1 s are made during short rests and the moves between them."""
+    rig = crooked_rig(rng)
+    log, _ = scan_log(rng, rig, duration=rests * (rest + move), n=20000)
+    begins = np.arange(rests) * (rest + move)
+    knots = np.column_stack([begins, begins + rest]).ravel()
+    times = np.arange(0, rests * (rest + move), 0.01)
+    angles = np.interp(times, knots, np.repeat(np.radians(10) * np.arange(rests), 2))
+    return joints(by_message(log), times, angles), rig
+
+
+@pytest.mark.parametrize("rest", [0.3, 0.5])
+def test_short_rests_without_shot_times_are_enough_when_there_are_many(rng, rest):
+    log, rig = stepping(rng, 30, rest)
+    cloud = stitch(log, rig, CONFIG)
+    off = np.degrees(cloud.gimbal_angles) % 10
+    assert np.all(np.minimum(off, 10 - off) < 0.05)
+    assert len(np.unique(np.round(np.degrees(cloud.gimbal_angles) / 10))) == 30
+    assert len(cloud.p_base) > 0.2 * len(log.p_lidar)
+
+
+def test_two_rests_around_a_turn_do_not_stand_for_a_scan(rng):
+    rig = crooked_rig(rng)
+    log, _ = scan_log(rng, rig, duration=13.0, n=20000)
+    times = np.arange(0, 13, 0.01)
+    log = joints(by_message(log), times, np.interp(times, [1, 12], [0.0, 2 * np.pi]))
+    with pytest.raises(MissingShotTimesError, match="let the gimbal rest"):
+        stitch(log, rig, CONFIG)
+
+
 def test_clocks_that_do_not_overlap_are_refused(rng):
     rig = crooked_rig(rng)
     log, _ = scan_log(rng, rig)

@@ -5,7 +5,15 @@ from scipy.spatial.transform import Rotation
 
 from pipelines.errors import ConfigError
 from pipelines.simulation import SimulationConfig, commensurability
-from pipelines.simulation.rig import ahrs_samples, even_turn, joint_samples, nominal_rig, true_rig
+from pipelines.simulation.rig import (
+    ahrs_samples,
+    even_turn,
+    joint_samples,
+    nominal_rig,
+    recorded_time,
+    true_rig,
+    turning,
+)
 from pipelines.values import ImuMount
 
 
@@ -101,3 +109,19 @@ def test_options_are_plain_values_for_the_truth_file():
     mapping = SimulationConfig(imu_mount=ImuMount.HEAD).to_mapping()
     assert mapping["imu_mount"] == "head"
     assert mapping["spin_rpm"] == 600.0
+
+
+def test_a_stepping_gimbal_rests_for_whole_revolutions_and_ends_with_a_full_turn():
+    config = SimulationConfig(step=np.radians(50.0), rest_revolutions=2, move=0.15)
+    motion = turning(config, 0.3)
+    assert_allclose(recorded_time(config), 9 * 0.2 + 8 * 0.15)
+    rests = np.arange(9) * 0.35
+    for inside in (0.0, 0.1, 0.2):
+        expected = 0.3 + np.radians([0, 50, 100, 150, 200, 250, 300, 350, 360])
+        assert_allclose(motion.angle_at(rests + inside), expected, rtol=0, atol=1e-9)
+    assert_allclose(motion.angle_at(np.array([0.275])), [0.3 + np.radians(25.0)])
+
+
+def test_steps_that_are_multiples_of_the_channel_pitch_are_warned_of():
+    assert "Rests every 10 deg" in commensurability(SimulationConfig(step=np.radians(10.0)))
+    assert not commensurability(SimulationConfig(step=np.radians(1.27)))

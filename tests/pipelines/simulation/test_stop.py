@@ -5,9 +5,11 @@ import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 from scipy.spatial.transform import Rotation
 
+from pipelines.config import StitchingConfig
 from pipelines.errors import InputError, NotFoundError
 from pipelines.rigs import rig_digest, tilted_vlp16
 from pipelines.simulation import SimulationConfig, simulate_stop, survey_truth
+from pipelines.stitching import stitch
 from pipelines.values import ImuMount
 
 FLOAT32 = 2e-6  # [m] what is left of a range of up to 30 m in single precision
@@ -142,6 +144,50 @@ def test_only_near_spheres_keeps_what_the_spheres_return(plain, stitched):
         for s in (whole, part)
     ]
     assert_array_equal(*counts)
+
+
+STEPPED = SimulationConfig.perfect(step=np.radians(45.0), move=0.2, only_near_spheres=True)
+
+
+def test_a_stepping_scan_puts_every_point_on_a_surface(plain, stitched):
+    stop = simulate_stop(plain, "first", STEPPED)
+    off = off_surfaces(stitched(stop, stop.log.rig), plain)
+    assert np.quantile(off, 0.99) < 10 * FLOAT32  # the encoder cuts the corners of a move
+    assert len(stop.log.rings) > 1000
+
+
+def test_points_without_times_are_stamped_with_their_revolution(plain):
+    with_times = simulate_stop(plain, "first", STEPPED).log
+    without = simulate_stop(plain, "first", replace(STEPPED, shot_times=False)).log
+    assert not without.has_shot_times
+    assert_array_equal(without.p_lidar, with_times.p_lidar)
+    late = with_times.stamps_lidar_ns - without.stamps_lidar_ns
+    assert late.min() >= 0
+    assert late.max() < 100_000_000
+    assert_array_equal(np.unique(np.diff(without.stamps_lidar_ns)) % 100_000_000, 0)
+
+
+def test_a_stepping_scan_without_times_is_stitched_from_its_rests(plain):
+    stop = simulate_stop(plain, "first", replace(STEPPED, shot_times=False))
+    cloud = stitch(stop.log, stop.log.rig, StitchingConfig())
+    p_base = cloud.p_base.astype(float)
+    T = stop.truth.T_site_base
+    off = off_surfaces(p_base @ T[:3, :3].T + T[:3, 3], plain)
+    assert off.max() < 1e-3  # [m]; a joint sample may lie a little beyond the rest
+    assert len(p_base) > 0.2 * len(stop.log.rings)
+    assert cloud.coverage > np.radians(359.0)
+
+
+def test_packets_and_points_hold_the_same_returns(noisy):
+    firings, log = noisy.firings, noisy.log
+    assert len(firings.azimuths) % 12 == 0
+    assert (firings.distances > 0).sum() == len(log.rings)
+    heights = noisy.log.rig.laser_heights[log.rings]
+    ranges = np.linalg.norm(log.p_lidar - np.outer(heights, [0.0, 0.0, 1.0]), axis=1)
+    assert_allclose(firings.distances[firings.distances > 0] * 0.002, ranges, rtol=0, atol=1e-5)
+    assert_array_equal(firings.reflectivities[firings.distances > 0], log.intensities)
+    assert firings.start_ns <= log.stamps_lidar_ns[0]
+    assert firings.azimuths.max() < 36_000
 
 
 def test_an_unknown_stop_is_refused_with_the_names_of_the_known(plain, brief):
