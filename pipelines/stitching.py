@@ -104,7 +104,7 @@ def choose_rig(log: ScanLog, rig: Rig | None) -> Rig:
     Returns
     -------
     Rig
-        The rig to use.
+        The rig to use; what raw packets say of the heights of the lasers goes before what it says.
 
     Raises
     ------
@@ -118,7 +118,9 @@ def choose_rig(log: ScanLog, rig: Rig | None) -> Rig:
             "/tf_static from the LiDAR's frame to the gimbal's head. Give a rig (--rig rig.json) "
             "or record /tf_static."
         )
-    return chosen
+    if log.has_heights is None or log.has_heights == chosen.cloud_carries_heights:
+        return chosen
+    return replace(chosen, cloud_carries_heights=log.has_heights)
 
 
 def split_stops(log: ScanLog, config: StitchingConfig) -> tuple[ScanLog, ...]:

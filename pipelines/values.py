@@ -171,6 +171,8 @@ class ScanLog:
         Name and digest of the recording.
     notes : tuple of str
         What the recording cannot give, as sentences for people.
+    has_heights : bool or None
+        Whether the coordinates include the heights of the lasers; none where only a rig can tell.
     """
 
     p_lidar: Column
@@ -185,6 +187,7 @@ class ScanLog:
     rig: Rig | None
     origin: Origin
     notes: tuple[str, ...] = ()
+    has_heights: bool | None = None
 
     def __post_init__(self) -> None:
         _seal(

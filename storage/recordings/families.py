@@ -43,6 +43,8 @@ class Returns:
         Instant of each message, by its header.
     notes : tuple of str
         What is missing, as sentences for people.
+    has_heights : bool or None
+        Whether the coordinates include the heights of the lasers; none where that is not known.
     """
 
     topic: str
@@ -54,6 +56,7 @@ class Returns:
     has_shot_times: bool
     message_stamps_ns: Nanos
     notes: tuple[str, ...]
+    has_heights: bool | None = None
 
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)

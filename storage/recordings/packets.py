@@ -198,6 +198,7 @@ class Packets:
             has_shot_times=True,
             message_stamps_ns=np.sort(messages_ns),
             notes=tuple(notes),
+            has_heights=True,
         )
 
     def _settle(self, heads: Nanos, notes: list[str]) -> Nanos:

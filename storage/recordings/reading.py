@@ -259,6 +259,7 @@ def assemble(decoders: Decoders, found: dict[str, str], choice: Choice, origin: 
         rig=rig,
         origin=origin,
         notes=tuple(dict.fromkeys(notes)),
+        has_heights=returns.has_heights,
     )
 
 

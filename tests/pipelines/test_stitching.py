@@ -272,6 +272,16 @@ def test_step_and_shoot_without_shot_times_keeps_what_was_made_at_rest(rng):
     assert any("while the gimbal moved" in note for note in cloud.notes)
 
 
+def test_packets_know_better_than_a_rig_whether_heights_are_included(rng):
+    rig = crooked_rig(rng)
+    log, p_base = scan_log(rng, rig)
+    wrong = replace(rig, cloud_carries_heights=not rig.cloud_carries_heights)
+    told = replace(log, has_heights=rig.cloud_carries_heights)
+    assert choose_rig(log, wrong) is wrong
+    cloud = stitch(told, choose_rig(told, wrong), CONFIG)
+    np.testing.assert_allclose(cloud.p_base, p_base, rtol=0, atol=FLOAT32)
+
+
 def stepping(rng, rests, rest=0.3, move=0.1):
     """A log whose messages of 0.1 s are made during short rests and the moves between them."""
     rig = crooked_rig(rng)

@@ -123,7 +123,7 @@ def test_simulated_packets_are_the_same_points_as_the_simulated_cloud(stop, writ
     assert_array_equal(log.intensities, stop.log.intensities)
     assert_allclose(log.stamps_lidar_ns, stop.log.stamps_lidar_ns, rtol=0, atol=1)
     assert log.has_shot_times
-    assert log.rig.cloud_carries_heights
+    assert log.has_heights
 
 
 def test_velodyne_decoder_finds_the_simulated_points_in_simulated_packets(stop, written):
