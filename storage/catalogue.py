@@ -8,6 +8,7 @@ import re
 import secrets
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
+from dataclasses import replace
 from datetime import UTC, datetime
 from typing import Any, TypeVar
 
@@ -577,12 +578,19 @@ class Catalogue(Database):
             truth = _truth(cursor, job.survey_id)
             for name, table in results.with_errors(tables, truth).items():
                 _insert(cursor, name, table)
+            ended = replace(
+                job,
+                status=JobStatus.SUCCESSFUL,
+                progress_percent=100.0,
+                message=message,
+                finished_at=_now(),
+            )
             cursor.execute(
                 "UPDATE jobs SET status = 'successful', progress_percent = 100, "
                 "message = ?, finished_at = ? WHERE job_id = ?",
-                [message, _now(), job_id],
+                [message, ended.finished_at, job_id],
             )
-        return self.get_job(job_id)
+        return ended
 
     def fail_job(
         self, job_id: str, *, code: str, reason: str, traceback: str | None = None
