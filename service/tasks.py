@@ -223,6 +223,8 @@ def compile_kernels() -> None:
     stop = simulate_stop(field, field.stops[0].name, quick)
     with TemporaryDirectory() as folder:
         path = Path(folder) / "small.mcap"
+        write_log(stop.log, path, firings=stop.firings)
+        inspect_log(path)
         write_log(stop.log, path)
         inspect_log(path)
         for result in process(read_log(path), config=SurveyConfig(), marks=field.marks):
