@@ -138,6 +138,7 @@ class Packets:
         self._heads: list[Nanos] = []  # per message: stamp, micros, mode and returns of each packet
         self._n_broken = 0
         self._reason = ""
+        self._returns: Returns | None = None
 
     def add(self, batch: Batch) -> None:
         """Take some messages."""
@@ -181,7 +182,13 @@ class Packets:
         self._out.rings[rows], self._out.stamps[rows] = old.rings[rows], old.stamps[rows]
 
     def returns(self) -> Returns:
-        """Give all returns, in the order of their instants."""
+        """Give all returns, in the order of their instants; no message can follow."""
+        if self._returns is None:
+            self._returns = self._settled()
+        return self._returns
+
+    def _settled(self) -> Returns:
+        """Bring all returns to their instants and into their order."""
         notes = [*broken_note(self._topic, self._n_broken, self._reason)]
         heads = np.concatenate([np.empty((0, 4), np.int64), *self._heads])
         messages_ns = self._settle(heads, notes)

@@ -265,6 +265,17 @@ def test_packets_without_stamps_take_those_of_their_messages(rng, tmp_path):
     assert_allclose(bare.stamps_lidar_ns, expected.stamps_lidar_ns, rtol=0, atol=1000)
 
 
+def test_packets_stamped_at_another_age_are_left_out_and_counted(rng, tmp_path):
+    packets = encoded(firings(rng))
+    stamps = T0 + np.arange(4) * PACKET
+    stamps[2] = 5
+    log = read(tmp_path, message(packets, stamps_ns=stamps))
+    distances = packets["data"]["blocks"]["shots"]["distance"]
+    assert len(log.rings) == (distances[[0, 1, 3]] > 0).sum()
+    assert any("more than a day off" in note for note in log.notes)
+    assert inspect_log(tmp_path / "a.mcap").n_returns == len(log.rings)
+
+
 def test_packets_of_another_model_are_refused_by_name(rng, tmp_path):
     packets = encoded(firings(rng))
     packets["data"]["model"] = 0x28
