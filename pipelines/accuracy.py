@@ -232,9 +232,10 @@ class Bound:
     Attributes
     ----------
     value, low, high : float
-        The bound and its 95 % confidence interval, in the unit of what is bounded. Distances: 0
-        means that not even the nearest centre keeps the tolerance, infinity that the farthest does.
-        Counts: 0 means that the fewest returns suffice, infinity that the most do not.
+        The bound and its 95 % confidence interval, in the unit of what is bounded. Distances: the
+        tolerance is kept from the nearest up to here; 0 means that not even the nearest keeps it,
+        infinity that all do. Counts: it is kept from here up to the most returns; 0 means that all
+        keep it, infinity that not even the most do.
     seen : tuple of float
         Least and greatest value in the sample.
     """
@@ -484,11 +485,12 @@ def limits(
 
     Notes
     -----
-    The model of ``fit_error_model`` is fitted again to resamples of whole scans (of single errors,
-    where there are fewer than five scans); the interval is that of their bounds (percentile
-    bootstrap). Cost grows linearly with errors times resamples.
+    The model of ``fit_error_model`` without incidence, which nobody chooses and whose variation
+    therefore counts among the errors, is fitted to the sample and again to resamples of whole scans
+    (of single errors, where there are fewer than five scans); the interval is that of their bounds
+    (percentile bootstrap). Cost grows linearly with errors times resamples.
     """
-    data = _regression(sample)
+    data = _regression(sample, TERMS[:2])
     if demand.density is not None:
         data = data._replace(density=demand.density)
     drawn = _resampled(data.scans, n_resamples, rng)
@@ -518,8 +520,8 @@ class _Regression(NamedTuple):
     scale: float
 
 
-def _regression(sample: ErrorSample) -> _Regression:
-    """Choose the rows that are known and the terms that vary."""
+def _regression(sample: ErrorSample, wanted: tuple[str, ...] = TERMS) -> _Regression:
+    """Choose the rows that are known and, of the wanted terms, those that vary."""
     is_known = np.isfinite(sample.errors_3d) & (sample.n_points > 0) & (sample.ranges > 0)
     has_incidence = bool(np.isfinite(sample.incidences[is_known]).all())
     least = _PER_TERM * (1 + len(TERMS))
@@ -533,7 +535,7 @@ def _regression(sample: ErrorSample) -> _Regression:
     causes = np.column_stack([ranges, counts, np.maximum(sines, 1e-3)])
     reference = np.median(causes, axis=0)
     logs = np.log(causes / reference)
-    varies = np.ptp(logs, axis=0) > 1e-6
+    varies = (np.ptp(logs, axis=0) > 1e-6) & np.isin(TERMS, wanted)
     y = np.log(np.maximum(sample.errors_3d[is_known], _LEAST_ERROR))
     data = _Regression(
         X=np.column_stack([np.ones(len(y)), logs[:, varies]]),
@@ -648,29 +650,27 @@ def _power(data: _Regression, coefficients: Array, term: str) -> Array:
 
 
 def _distances(data: _Regression, coefficients: Array, excess: Array) -> Array:
-    """Return the greatest distance of each fit, with ``density`` returns at a metre."""
+    """Return up to which distance each fit keeps the tolerance, with ``density`` returns at 1 m."""
     of_range, of_count = (_power(data, coefficients, term) for term in TERMS[:2])
     slope = of_range - 2.0 * of_count
     turn = np.log(data.density / (data.reference[0] ** 2 * data.reference[1]))
     room = excess - of_count * turn
     low, high = np.log(np.array(data.range_span) / data.reference[0])
-    is_kept_far = slope * high <= room
-    crossing = room / np.where(slope > 0, slope, 1.0)
-    is_crossed = ~is_kept_far & (slope > 0) & (crossing >= low)
-    found = np.where(is_crossed, data.reference[0] * np.exp(np.clip(crossing, low, high)), 0.0)
-    return np.where(is_kept_far, np.inf, found)
+    is_kept_near, is_kept_far = slope * low <= room, slope * high <= room
+    crossing = np.clip(room / np.where(slope == 0, 1.0, slope), low, high)
+    found = np.where(is_kept_far, np.inf, data.reference[0] * np.exp(crossing))
+    return np.where(is_kept_near, found, 0.0)
 
 
 def _counts(data: _Regression, coefficients: Array, excess: Array, at_range: float) -> Array:
-    """Return the smallest count of each fit at a distance."""
+    """Return from which count on each fit keeps the tolerance at a distance."""
     of_range, of_count = (_power(data, coefficients, term) for term in TERMS[:2])
     room = excess - of_range * np.log(at_range / data.reference[0])
     low, high = np.log(np.array(data.count_span) / data.reference[1])
-    is_kept_low = of_count * low <= room
-    crossing = room / np.where(of_count < 0, of_count, 1.0)
-    is_crossed = ~is_kept_low & (of_count < 0) & (crossing <= high)
-    found = data.reference[1] * np.exp(np.clip(crossing, low, high))
-    return np.where(is_kept_low, 0.0, np.where(is_crossed, found, np.inf))
+    is_kept_few, is_kept_many = of_count * low <= room, of_count * high <= room
+    crossing = np.clip(room / np.where(of_count == 0, 1.0, of_count), low, high)
+    found = np.where(is_kept_few, 0.0, data.reference[1] * np.exp(crossing))
+    return np.where(is_kept_many, found, np.inf)
 
 
 def _bound(values: Array, seen: tuple[float, float]) -> Bound:

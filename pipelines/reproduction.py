@@ -65,6 +65,9 @@ OURS, PAPER, FULL_SPHERE = "along_beam", "paper", "paper_sphere"
 CENTRE, LANE_2, TURNS, DISTANCES = "centre", "lane 2", "turns", "distances"
 """Series of scans."""
 
+FIELD, LEVEL = "field", "level ground"
+"""Places of findings: the study's field with its cut, and ground where the cut takes nothing."""
+
 REFLECTIVITY_BINS = (1.0, 5.0, 15.0, 40.0, 100.0, 256.0)
 """Edges within which the noise of ranges is given."""
 
@@ -73,8 +76,9 @@ _STOPS_OF_LANE_2 = tuple(f"lane2-stop{i + 1}" for i in range(7))
 _TURN = 13.2  # [s]; the default
 _OTHER_TURNS = (4.2, 6.6, 26.4)  # [s]; none commensurate with the pitch of the channels
 _N_THREADS = 2  # a scan in simulation and one in the pipeline
-_N_NOISE_MIN = 200  # triples of shots that tell a noise
-_STEP_MAX = 0.10  # [m] of a second difference: more is an edge
+_RUN = 12  # shots of one laser in a row
+_N_RUNS_MIN = 30  # that tell a noise
+_STEP_MAX = 0.10  # [m] off the parabola: more is an edge
 _SIMILAR = 0.2  # relative difference of reflectivity within one surface
 
 
@@ -121,6 +125,8 @@ class Centres:
         Mean angles between beam and normal of the sphere [rad].
     error_station : (n, 3)
         Estimate minus truth towards the mark, to its left and upward [m].
+    sigma_3d : (n,)
+        Predicted: square roots of the traces of the covariances [m].
     rms : (n,)
         Root mean squares of the residuals along the beam [m].
     """
@@ -132,11 +138,12 @@ class Centres:
     n_points: Array
     incidences: Array
     error_station: Array
+    sigma_3d: Array
     rms: Array
 
     def __post_init__(self) -> None:
         n = len(self.methods)
-        columns = ("scans", "ranges", "n_points", "incidences", "rms")
+        columns = ("scans", "ranges", "n_points", "incidences", "sigma_3d", "rms")
         _seal(self, **dict.fromkeys(columns, (n,)), error_station=(n, 3))
         _same_length(self, "methods", "marks", *columns)
 
@@ -204,7 +211,7 @@ class RangeNoise:
     sigmas : (k,)
         Standard deviation in each of ``REFLECTIVITY_BINS``; NaN where too little was seen [m].
     n : (k,)
-        Number of triples of shots behind each.
+        Number of runs of shots behind each.
     """
 
     sigmas: Array
@@ -301,7 +308,7 @@ class Finding:
     Attributes
     ----------
     place : str
-        ``field`` (the study's, with its cut) or ``level ground`` (where the cut takes nothing).
+        ``FIELD`` or ``LEVEL``.
     method : str
         Fitting method.
     model : ErrorModel
@@ -328,6 +335,7 @@ class _Row(NamedTuple):
     n_points: int
     incidence: float
     error_station: Array
+    sigma_3d: float
     rms: float
 
 
@@ -370,7 +378,7 @@ def plan(seed: int, *, is_quick: bool = False) -> tuple[Scan, ...]:
         for turn in turns
     ]
     found += [
-        Scan(series=DISTANCES, scenario=_LANE, stop="lane-stop1", seed=seed + i, turn=turn)
+        Scan(series=DISTANCES, scenario=_LANE, stop="centre", seed=seed + i, turn=turn)
         for i in range(n_distances)
         for turn in sorted((*(_OTHER_TURNS[:2] if is_quick else _OTHER_TURNS), _TURN))
     ]
@@ -516,8 +524,8 @@ def findings(made: Reproduction, rng: np.random.Generator) -> tuple[Finding, ...
     of the study's own claim.
     """
     places = {
-        "field": made.series(CENTRE, LANE_2, TURNS),
-        "level ground": made.series(DISTANCES),
+        FIELD: made.series(CENTRE, LANE_2, TURNS),
+        LEVEL: made.series(DISTANCES),
     }
     return tuple(
         _finding(made, place, method, scans, rng)
@@ -571,35 +579,36 @@ def range_noise(
 
     Notes
     -----
-    Second differences of three shots in a row of one laser on one surface (equal reflectivity
-    within a fifth), over sqrt(6); median absolute deviation. Curvature and slope cancel; noise that
-    is not white from shot to shot shows in part only, in real and simulated scans alike.
+    Runs of twelve shots in a row of one laser on one surface (equal reflectivity within a fifth)
+    are freed of a parabola, which takes slope and curvature away; the median over runs of the
+    standard deviation of the rest. Long enough to hold the slow part of noise that is not white:
+    real VLP-16 oscillate over five or six shots.
     """
-    r, seconds = np.asarray(ranges, dtype=np.float64), np.asarray(offsets_ns, dtype=np.float64)
-    shades = np.asarray(intensities, dtype=np.float64)
+    seconds = np.asarray(offsets_ns, dtype=np.float64) * 1e-9
     order = np.lexsort((seconds, rings))
-    r, shades, lasers = r[order], shades[order], np.asarray(rings)[order]
-    firings = np.round(seconds[order] * 1e-9 / FIRING_CYCLE)
-    middle = shades[1:-1]
-    in_row = (
-        (np.diff(firings)[:-1] == 1) & (np.diff(firings)[1:] == 1) & (lasers[2:] == lasers[:-2])
-    )
-    alike = np.maximum(np.abs(shades[:-2] - middle), np.abs(shades[2:] - middle))
-    noise = (r[:-2] - 2.0 * r[1:-1] + r[2:]) / np.sqrt(6.0)
-    is_good = in_row & (alike <= _SIMILAR * middle + 1.0) & (np.abs(noise) < _STEP_MAX)
+    firings, lasers = np.round(seconds[order] / FIRING_CYCLE), np.asarray(rings)[order]
+    starts = np.arange(0, len(order) - _RUN, _RUN)
+    ends = starts + _RUN - 1
+    is_run = (firings[ends] - firings[starts] == _RUN - 1) & (lasers[ends] == lasers[starts])
+    runs = order[starts[is_run][:, None] + np.arange(_RUN)]
+    shades = np.asarray(intensities, dtype=np.float64)[runs]
+    middle = np.median(shades, axis=1)
+    rest = np.asarray(ranges, dtype=np.float64)[runs] @ _free_of_parabola()
+    is_alike = (np.abs(shades - middle[:, None]) <= _SIMILAR * middle[:, None] + 1.0).all(axis=1)
+    is_good = is_alike & (np.abs(rest).max(axis=1) < _STEP_MAX)
     places = np.digitize(middle[is_good], REFLECTIVITY_BINS) - 1
-    samples = [noise[is_good][places == k] for k in range(len(REFLECTIVITY_BINS) - 1)]
+    sigmas = np.sqrt(np.sum(rest[is_good] ** 2, axis=1) / (_RUN - 3))
+    samples = [sigmas[places == k] for k in range(len(REFLECTIVITY_BINS) - 1)]
     return RangeNoise(
-        sigmas=np.array([_spread(sample) for sample in samples]),
-        n=np.array([len(sample) for sample in samples], dtype=np.intp),
+        sigmas=np.array([np.median(s) if len(s) >= _N_RUNS_MIN else np.nan for s in samples]),
+        n=np.array([len(s) for s in samples], dtype=np.intp),
     )
 
 
-def _spread(sample: Array) -> float:
-    """Return the robust standard deviation of a sample; NaN of a small one."""
-    if len(sample) < _N_NOISE_MIN:
-        return np.nan
-    return 1.4826 * float(np.median(np.abs(sample - np.median(sample))))
+def _free_of_parabola() -> Array:
+    """Return the projection that takes the best parabola from a run, (12, 12)."""
+    powers = np.vander(np.linspace(-1.0, 1.0, _RUN), 3)
+    return np.asarray(np.eye(_RUN) - powers @ np.linalg.pinv(powers))
 
 
 def _measure(field: Field, scan: Scan, config: SurveyConfig, *, is_first: bool) -> _Measured:
@@ -647,6 +656,7 @@ def _rows(
                 n_points=fit.n_points,
                 incidence=mean_incidence(beams(cloud, fit.used), fit.p_base, fit.radius),
                 error_station=_sight(true[mark], cloud) @ error,
+                sigma_3d=fit.sigma_3d,
                 rms=fit.rms,
             )
         )
@@ -673,6 +683,7 @@ def _joined(rows_of_scans: Sequence[Sequence[_Row]]) -> Centres:
         n_points=np.array([float(row.n_points) for row in rows]),
         incidences=np.array([row.incidence for row in rows]),
         error_station=np.array([row.error_station for row in rows]).reshape(-1, 3),
+        sigma_3d=np.array([row.sigma_3d for row in rows]),
         rms=np.array([row.rms for row in rows]),
     )
 

@@ -260,6 +260,10 @@ def bench(
         Path | None, typer.Argument(exists=True, dir_okay=False, help="Log; simulated if missing.")
     ] = None,
     repeats: Annotated[int, typer.Option(min=1, help="The best of so many counts.")] = 5,
+    quick: Annotated[bool, typer.Option("--quick", help="Without the usual libraries.")] = False,
+    long: Annotated[
+        bool, typer.Option("--long", help="Also logs of 1, 3, 10 and 30 million returns.")
+    ] = False,
     as_json: AsJson = False,
 ) -> None:
     """Measure each step against one read of the file with a checksum, in the same run."""
@@ -267,11 +271,41 @@ def bench(
     from service import tables
 
     with _progress() as progress:
-        report = benches.run(log, repeats, progress)
+        wish = benches.Wish(repeats=repeats, is_quick=quick, is_long=long)
+        report = benches.run(log, wish, progress)
     if as_json:
         _print_json(report)
     else:
         tables.print_bench(out, report)
+
+
+@app.command()
+def reproduce(
+    folder: Annotated[
+        Path, typer.Argument(metavar="[OUT]", help="Folder for page, tables and figures.")
+    ] = Path("reproduction"),
+    quick: Annotated[
+        bool, typer.Option("--quick", help="Fewer worlds: about a minute, with wider intervals.")
+    ] = False,
+    seed: Annotated[int, typer.Option(min=0, help="Source of chance.")] = 0,
+    real: Annotated[
+        Path | None,
+        typer.Option(exists=True, file_okay=False, help="Folder of real scans to set beside."),
+    ] = None,
+    tolerance_m: Annotated[float, typer.Option(help="Error that is accepted \\[m].")] = 0.03,
+    as_json: AsJson = False,
+) -> None:
+    """Regenerate the study's tables and figures in simulation, both methods side by side."""
+    from service import reproduce as reproduction
+    from service import tables
+
+    wish = reproduction.Wish(seed=seed, is_quick=quick, real=real, tolerance=tolerance_m)
+    with _progress() as progress:
+        report = reproduction.run(folder, wish, progress)
+    if as_json:
+        _print_json(report)
+    else:
+        tables.print_reproduction(out, report)
 
 
 def _settings(**given: Any) -> Settings:

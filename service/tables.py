@@ -73,18 +73,98 @@ def print_rows(out: Console, answer: Plain) -> None:
 
 
 def print_bench(out: Console, report: Plain) -> None:
-    """Print times as ratios to one read of the file."""
-    log = report["log"]
+    """Print times as ratios to one read of the file, and what the usual libraries need."""
+    log, memory = report["log"], report["memory"]
     out.print(
         f"{log['name']}: {log['size_bytes'] / 1e6:.1f} MB, {log['n_returns']:,} returns; "
-        f"best of {report['repeats']}, one process"
+        f"best of {report['repeats']}. The unit is {report['yardstick']}."
     )
     rows = [
         (step["step"], f"{step['seconds'] * 1e3:,.1f}", f"{step['ratio']:,.1f}")
         for step in report["steps"]
     ]
+    rows += [
+        (f"the same as {v['name']}", f"{v['chain_seconds'] * 1e3:,.1f}", f"{v['ratio']:,.1f}")
+        for v in report["variants"]
+    ]
     out.print(_table(("step", "time [ms]", "x read+CRC"), rows))
-    out.print(f"Peak memory of the process: {report['peak_memory_bytes'] / 1e6:,.0f} MB")
+    _print_peers(out, report)
+    for one in report.get("linearity", ()):
+        out.print(
+            f"{one['n_returns']:,} returns: {one['seconds']:.2f} s, {one['ns_per_return']:.0f} ns "
+            f"each, {one['ratio']:.1f} x read+CRC"
+        )
+    out.print(
+        f"Memory of a fresh process: {memory['before_bytes'] / 1e6:,.0f} MB resident after its "
+        f"imports, at most {memory['peak_bytes'] / 1e6:,.0f} MB during one scan."
+    )
+
+
+def _print_peers(out: Console, report: Plain) -> None:
+    """Print times and accuracy beside those of the usual libraries."""
+    if peers := report.get("peers"):
+        rows = [
+            (
+                one["step"],
+                f"{1e3 * one['ours_seconds']:,.1f}",
+                f"{1e3 * one['peer_seconds']:,.1f}",
+                f"{one['factor']:,.1f}",
+            )
+            for one in peers
+        ]
+        out.print(_table(("step", "ours [ms]", "usual libraries [ms]", "x ours"), rows))
+    if accuracy := report.get("accuracy"):
+        rows = [
+            (
+                one["method"],
+                f"{one['n_found']} of {one['n_markers']}",
+                str(one["n_false"]),
+                "-" if one["error_rms_m"] is None else f"{1e3 * one['error_rms_m']:.1f}",
+            )
+            for one in accuracy
+        ]
+        out.print(_table(("centres", "found", "false", "RMS error [mm]"), rows))
+
+
+def print_reproduction(out: Console, report: Plain) -> None:
+    """Print the study's tables again, and what keeps the tolerance."""
+    study, tolerance = report["study"], 1e3 * report["tolerance_m"]
+    rows = [
+        (
+            f"{row['distance_m']:.2f}",
+            str(row["study_n_points"]),
+            _mm(row["study_error_3d_m"]),
+            _fixed(row["paper_n_points_mean"], 0),
+            _mm(row["paper_error_3d_mean_m"]),
+            _fixed(row["along_beam_n_points_mean"], 0),
+            _mm(row["along_beam_error_3d_mean_m"]),
+        )
+        for row in report["table2"]
+    ]
+    out.print("[bold]Table 2[/]  centres by distance; mean errors over the simulated worlds")
+    heads = ("distance [m]", "study: returns", "error [mm]", "paper: returns", "error [mm]")
+    out.print(_table((*heads, "along_beam: returns", "error [mm]"), rows))
+    by_stop = [
+        (row["stop"], _mm(row["paper_error_3d_mean_m"]), _mm(row["along_beam_error_3d_mean_m"]))
+        for row in report["table4"]
+    ]
+    out.print("[bold]Table 4[/]  mean error of the centres at each stop of lane 2")
+    out.print(_table(("stop", "paper [mm]", "along_beam [mm]"), by_stop))
+    low, high = study["table2_error_3d_range_m"]
+    out.print(
+        f"[bold]What keeps {tolerance:g} mm[/]  (95 % confidence); the study says, by its mean of "
+        f"{_mm(study['table2_error_3d_mean_m'])} mm ({_mm(low)} to {_mm(high)}): up to "
+        f"{study['greatest_distance_m']:g} m and from {study['smallest_count']} returns",
+        highlight=False,
+        soft_wrap=True,
+    )
+    kept = [
+        (one["place"], one["fit_method"], *(one["said"][key] for key in _SAID))
+        for one in report["statements"]
+    ]
+    said = ("where", "method", "p95: distance", "p95: returns", "mean: distance", "mean: returns")
+    out.print(_table(said, kept, left=2))
+    out.print(f"{report['n_scans']} scans, seed {report['seed']}. Page: {report['page']}")
 
 
 def to_csv(answer: Plain) -> str:

@@ -15,6 +15,7 @@ import numpy as np
 import plotly.graph_objects as go
 from numpy.typing import NDArray
 
+from pipelines import study
 from pipelines.accuracy import summarise
 from web import figures, maps, scene, theme
 from web.figures import (
@@ -29,6 +30,7 @@ from web.figures import (
 )
 from web.filters import Filters
 from web.readouts import headline
+from web.study import statements
 from web.templating import environment
 
 Row = Mapping[str, Any]
@@ -192,6 +194,8 @@ def survey_page(page: SurveyPage) -> str:
         readouts=headline(shown.fits, shown.fixes, data.tolerance_m),
         panels=_survey_panels(shown, is_log=page.filters.is_log),
         rows=_stop_rows(shown),
+        kept=statements(select(shown.fits, on_marks(shown.fits)), data.tolerance_m),
+        study=study,
         all_stops=stops,
         all_lanes=list(dict.fromkeys(lane_and_number(stop)[0] for stop in stops)),
         all_methods=[method for method, _ in by_method(data.fits)],

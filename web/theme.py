@@ -6,6 +6,7 @@ light and dark, and the page's script puts the values in when it draws. So there
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import plotly.graph_objects as go
@@ -128,3 +129,15 @@ def _axis_3d() -> dict[str, object]:
         "tickfont": {"family": MONO, "size": 11, "color": MUTED},
         "title": {"font": {"size": 12, "color": TEXT}},
     }
+
+
+def coloured(value: object, tokens: Mapping[str, str]) -> object:
+    """Return a figure's plain values with colours in the place of the names of CSS variables."""
+    if isinstance(value, str):
+        name = value.removeprefix("var(").removesuffix(")")
+        return tokens.get(name, value) if value.startswith("var(") else value
+    if isinstance(value, Mapping):
+        return {key: coloured(item, tokens) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [coloured(item, tokens) for item in value]
+    return value

@@ -211,3 +211,27 @@ def test_beams_through_the_middle_meet_a_sphere_square_and_grazing_ones_at_its_e
     expected = np.radians((0.0 + 30.0 + 90.0) / 3)
     found = mean_incidence(shots, np.array([8.0, 0.0, 0.0]), 0.1)
     assert found == pytest.approx(expected, abs=1e-9)
+
+
+def test_limits_count_the_variation_of_incidence_among_the_errors():
+    rng = np.random.default_rng(15)
+    plain = sample(rng, n_scans=300)
+    incidences = rng.uniform(0.3, 1.3, len(plain.ranges))
+    errors = plain.errors_3d * (np.sin(incidences) / 0.7) ** -3
+    varied = dataclasses.replace(plain, incidences=incidences, errors_3d=errors)
+    model = fit_error_model(varied)
+    assert abs(model.exponent("incidence") + 3.0) < 3 * model.sigma("incidence") < 0.6
+    demand = Demand(tolerance=0.03)
+    unknown = dataclasses.replace(varied, incidences=np.full(len(errors), np.nan))
+    found = limits(varied, demand, np.random.default_rng(1)).greatest_distance
+    assert found == limits(unknown, demand, np.random.default_rng(1)).greatest_distance
+    is_near = np.abs(varied.ranges - found.value) < 1.0
+    assert np.mean(errors[is_near] <= 0.03) == pytest.approx(0.95, abs=0.03)
+
+
+def test_errors_that_fall_with_distance_keep_nothing_where_the_nearest_does_not():
+    rng = np.random.default_rng(16)
+    falling = sample(rng, a=-2.5, level=0.03, densities=(6800.0,))
+    found = limits(falling, Demand(tolerance=0.03), rng).greatest_distance
+    assert falling.errors_3d[falling.ranges > 25].max() < 0.03
+    assert (found.value, found.high) == (0.0, 0.0)
