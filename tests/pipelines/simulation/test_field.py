@@ -11,7 +11,7 @@ from pipelines.simulation.terrain import rough_terrain
 FIRED = 16 * 13.3 / 55.296e-6  # half a revolution before and after the turn included
 
 
-@pytest.fixture(scope="module", params=[0, 1, 2])
+@pytest.fixture(scope="module", params=[0, 1])
 def field(request):
     return scenario("paper-field", request.param)
 

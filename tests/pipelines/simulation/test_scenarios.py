@@ -76,11 +76,9 @@ def test_decoys_stand_clear_of_stops_and_no_decoy_is_a_marker(clutter):
     assert to_marks.min() > 0.25
 
 
-@pytest.mark.parametrize("seed", [3, 4])
-def test_screens_hide_some_markers_in_part_and_nothing_hides_others_from_the_centre(seed):
-    world = scenario("clutter-field", seed)
-    eye = world.stop("lane3-stop4").p_site
-    shares = np.sort(visible_shares(world.scene, world.marks.p_site, 0.1, eye))
+def test_screens_hide_some_markers_in_part_and_nothing_hides_others_from_the_centre(clutter):
+    eye = clutter.stop("lane3-stop4").p_site
+    shares = np.sort(visible_shares(clutter.scene, clutter.marks.p_site, 0.1, eye))
     assert ((shares > 0.45) & (shares < 0.85)).sum() == 3
     assert (shares[3:] > 0.98).all()
 
@@ -142,8 +140,7 @@ def test_the_truth_tells_decoys_and_visible_shares_beside_the_marks(lane, clutte
     assert set(about["visible_shares"]["lane3-stop4"]) == set(clutter.marks.names)
 
 
-@pytest.mark.parametrize("name", ["clutter-field", "range-lane"])
-def test_worlds_are_drawn_from_their_seed(name):
-    one, again, other = scenario(name, 5), scenario(name, 5), scenario(name, 6)
-    assert_array_equal(one.scene.mesh.p_site, again.scene.mesh.p_site)
-    assert not np.array_equal(one.marks.p_site, other.marks.p_site)
+def test_worlds_are_drawn_from_their_seed(clutter, lane):
+    assert_array_equal(scenario("clutter-field", 3).scene.mesh.p_site, clutter.scene.mesh.p_site)
+    assert_array_equal(scenario("range-lane", 3).marks.p_site, lane.marks.p_site)
+    assert not np.array_equal(scenario("range-lane", 4).marks.p_site, lane.marks.p_site)
