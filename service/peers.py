@@ -1,0 +1,201 @@
+"""The same job put together from the usual libraries, for comparison.
+
+mcap-ros2-support decodes, SciPy rotates, Open3D cuts the ground with a plane, clusters with DBSCAN
+and registers a hemisphere to each cluster; DuckDB takes the rows one by one. Each step is written
+as its documentation shows it, in arrays where the library allows, and with the parameters that
+suit the field.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+from time import perf_counter
+from typing import Any, ClassVar, TypeVar
+
+import numpy as np
+
+from pipelines.errors import InputError
+from pipelines.values import Array, Rig
+
+_PLANE_NEAR = 0.15  # [m] from the plane: ground
+_PLANE_TRIALS = 100
+_CLUSTER_GAP = 0.10  # [m] between neighbours in a cluster
+_CLUSTER_MIN = 10  # neighbours of a point inside a cluster
+_N_POINTS = 20  # of a cluster that may be a marker
+_RMS_MAX = 0.03  # [m] about the sphere
+_N_MODEL = 1000  # points of the hemisphere
+_KINDS = ("", "i1", "u1", "i2", "u2", "i4", "u4", "f4", "f8")  # by PointField.datatype
+
+_Made = TypeVar("_Made")
+
+
+class MissingPeerError(InputError):
+    """A library that the comparison needs is not installed."""
+
+    code: ClassVar[str] = "missing_peer"
+
+
+@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
+class PeerRun:
+    """What the usual libraries gave.
+
+    Attributes
+    ----------
+    seconds : dict of str to float
+        Time by step, under the names of our own steps [s].
+    centres : (n, 3)
+        Spheres that they found, in the base frame [m].
+    """
+
+    seconds: dict[str, float] = field(default_factory=dict)
+    centres: Array
+
+
+def run_peers(log: Path, rig: Rig, radius: float) -> PeerRun:
+    """Do the job once, from the file to committed rows."""
+    _require()
+    seconds: dict[str, float] = {}
+    p_lidar, stamps, joints = _timed(seconds, "read log", lambda: _decode(log))
+    p_base = _timed(seconds, "stitching", lambda: _stitch(p_lidar, stamps, joints, rig))
+    clusters = _timed(seconds, "extraction", lambda: _clusters(p_base))
+    centres = _timed(seconds, "fitting", lambda: _fitted(clusters, radius))
+    _timed(seconds, "rows and commit", lambda: _commit(centres, log.with_suffix(".peer.duckdb")))
+    return PeerRun(seconds=seconds, centres=centres)
+
+
+def ransac_centre(points: Array) -> Array | None:
+    """Return the centre of a sphere by pyransac3d; None where it finds none or is missing."""
+    try:
+        import pyransac3d
+    except ModuleNotFoundError:
+        return None
+    np.random.seed(0)  # noqa: NPY002  the library draws from NumPy's global state
+    centre, _, _ = pyransac3d.Sphere().fit(points, thresh=0.02, maxIteration=500)
+    return np.asarray(centre, dtype=np.float64) if len(centre) == 3 else None
+
+
+def registered_centre(points: Array, radius: float) -> Array:
+    """Return the centre of a hemisphere of known radius by Open3D's point-to-point ICP."""
+    from open3d import geometry, pipelines, utility
+
+    model = geometry.PointCloud(utility.Vector3dVector(_hemisphere(points.mean(axis=0), radius)))
+    start = np.eye(4)
+    start[:3, 3] = points.mean(axis=0)
+    cloud = geometry.PointCloud(utility.Vector3dVector(points))
+    result = pipelines.registration.registration_icp(model, cloud, 3.0 * radius, start)
+    return np.array(result.transformation[:3, 3])
+
+
+def _require() -> None:
+    """Refuse to compare with what is not there."""
+    try:
+        import mcap_ros2.reader  # noqa: F401
+    except ModuleNotFoundError as error:
+        raise MissingPeerError(
+            f"{error.name} is not installed. The comparison needs the development packages: "
+            "pip install 'spheremark[dev]', or use `spheremark bench --quick`."
+        ) from error
+
+
+def _timed(seconds: dict[str, float], step: str, work: Callable[[], _Made]) -> _Made:
+    """Do a step and record how long it took [s]."""
+    start = perf_counter()
+    made = work()
+    seconds[step] = perf_counter() - start
+    return made
+
+
+def _decode(log: Path) -> tuple[Array, Array, Array]:
+    """Return points, their instants and joint samples (instant, angle) [s from the first]."""
+    from mcap_ros2.reader import read_ros2_messages
+
+    points, stamps, joints = [], [], []
+    for message in read_ros2_messages(log):
+        if not message.schema.name.endswith(("PointCloud2", "JointState")):
+            continue
+        said: Any = message.ros_msg
+        stamp = said.header.stamp.sec * 1_000_000_000 + said.header.stamp.nanosec
+        if message.schema.name.endswith("JointState"):
+            joints.append((stamp, said.position[0]))
+            continue
+        rows = np.frombuffer(bytes(said.data), _layout(said))
+        points.append(np.stack([rows["x"], rows["y"], rows["z"]], axis=1).astype(np.float64))
+        stamps.append(stamp + (rows["time"] * 1e9).astype(np.int64))
+    first = joints[0][0]
+    table = np.array([((stamp - first) * 1e-9, angle) for stamp, angle in joints])
+    return np.concatenate(points), (np.concatenate(stamps) - first) * 1e-9, table
+
+
+def _layout(cloud: Any) -> np.dtype[np.void]:
+    """Return the type of a point of a PointCloud2."""
+    return np.dtype(
+        {
+            "names": [one.name for one in cloud.fields],
+            "formats": [_KINDS[one.datatype] for one in cloud.fields],
+            "offsets": [one.offset for one in cloud.fields],
+            "itemsize": cloud.point_step,
+        }
+    )
+
+
+def _stitch(p_lidar: Array, stamps: Array, joints: Array, rig: Rig) -> Array:
+    """Turn points into the base frame, each by the gimbal angle at its instant."""
+    from scipy.spatial.transform import Rotation
+
+    angles = np.interp(stamps, joints[:, 0], joints[:, 1])
+    T = rig.T_head_lidar
+    p_head = p_lidar @ T[:3, :3].T + T[:3, 3]
+    return np.asarray(Rotation.from_euler("z", angles[:, None]).apply(p_head))
+
+
+def _clusters(p_base: Array) -> list[Array]:
+    """Return groups of points off the ground that are as large as a marker may be."""
+    from open3d import geometry, utility
+
+    utility.random.seed(0)
+    cloud = geometry.PointCloud(utility.Vector3dVector(p_base))
+    _, ground = cloud.segment_plane(_PLANE_NEAR, 3, _PLANE_TRIALS)
+    rest = cloud.select_by_index(ground, invert=True)
+    labels = np.asarray(rest.cluster_dbscan(_CLUSTER_GAP, _CLUSTER_MIN))
+    points = np.asarray(rest.points)[np.argsort(labels, kind="stable")]
+    return np.split(points, np.cumsum(np.bincount(labels + 1))[:-1])[1:]
+
+
+def _fitted(clusters: list[Array], radius: float) -> Array:
+    """Return the centres of the clusters whose top a sphere of known radius explains."""
+    centres = []
+    for points in clusters:
+        top = points[points[:, 2] > points[:, 2].max() - 2.0 * radius]  # without the pole
+        if len(top) < _N_POINTS or np.ptp(points[:, :2], axis=0).max() > 4.0 * radius:
+            continue
+        centre = registered_centre(top, radius)
+        off = np.linalg.norm(top - centre, axis=1) - radius
+        if np.sqrt(np.mean(off**2)) < _RMS_MAX:
+            centres.append(centre)
+    return np.array(centres).reshape(-1, 3)
+
+
+def _hemisphere(toward: Array, radius: float) -> Array:
+    """Return points spread evenly over the half of a sphere about zero that faces the sensor."""
+    z = 1.0 - (np.arange(2 * _N_MODEL) + 0.5) / _N_MODEL
+    phi = np.pi * (1.0 + np.sqrt(5.0)) * np.arange(2 * _N_MODEL)
+    rho = np.sqrt(1.0 - z**2)
+    sphere = radius * np.column_stack([rho * np.cos(phi), rho * np.sin(phi), z])
+    return np.asarray(sphere[sphere @ toward < 0.0])
+
+
+def _commit(centres: Array, path: Path) -> None:
+    """Write the centres into a new database, row by row in one transaction."""
+    import duckdb
+
+    path.unlink(missing_ok=True)
+    with duckdb.connect(str(path)) as connection:
+        connection.execute("CREATE TABLE fits (marker INTEGER, x DOUBLE, y DOUBLE, z DOUBLE)")
+        connection.execute("BEGIN")
+        rows = [(i, *centre) for i, centre in enumerate(centres.tolist())]
+        if rows:
+            connection.executemany("INSERT INTO fits VALUES (?, ?, ?, ?)", rows)
+        connection.execute("COMMIT")
+    path.unlink()
