@@ -129,6 +129,12 @@ def _chain(scan: _Scan, folder: Path) -> tuple[Timings, StopResult, int]:
         _checksum(scan.log)
     with _timed(times, "preflight"):
         inspect_log(scan.log)
+    stops, n_returns = _committed(scan, folder, times)
+    return _in_order(times, stops), stops[0], n_returns
+
+
+def _committed(scan: _Scan, folder: Path, times: Timings) -> tuple[tuple[StopResult, ...], int]:
+    """Bring a log into a database of its own; return its stops and the number of returns."""
     with Catalogue(folder / "bench.duckdb", snapshots=folder / "snapshots") as catalogue:
         job = _job(catalogue, scan.log)
         with _timed(times, _CHAIN):
@@ -139,7 +145,7 @@ def _chain(scan: _Scan, folder: Path) -> tuple[Timings, StopResult, int]:
                 rows = tables(_run(catalogue, job), stops, marks=scan.marks)
             with _timed(times, "commit"):
                 catalogue.finish_job(job, rows)
-    return _in_order(times, stops), stops[0], len(log.p_lidar)
+    return stops, len(log.p_lidar)
 
 
 def _checksum(log: Path) -> int:
@@ -288,7 +294,7 @@ def _fresh(log: Path, folder: Path) -> Plain:
     """Run one scan in this process, which has done nothing but import before."""
     before = _resident()
     forget_peak_memory()
-    _chain(_Scan(log=log), folder)
+    _committed(_Scan(log=log), folder, {})
     peak = peak_memory()
     return {"before_bytes": before, "peak_bytes": peak, "scan_bytes": peak - before}
 
