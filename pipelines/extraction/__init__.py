@@ -5,7 +5,8 @@
 - ``ball`` says what is looked for,
 - ``ground`` tells the ground, ``seeds`` picks the places that are worth a look,
 - ``patches`` gathers the returns about a place, ``looks`` measures what they look like,
-- ``verdicts`` and ``beneath`` say why a group is no marker.
+- ``sights`` counts where the beams towards and about a group end,
+- ``verdicts`` says why a group is no marker.
 
 Works in the base frame with the levelled vertical. The sensor is taken as one point (the origin of
 the base): a few centimetres of axis offset do not change which returns look like a sphere.
@@ -18,15 +19,16 @@ from numpy.typing import NDArray
 
 from pipelines.config import ExtractionConfig
 from pipelines.extraction.ball import Ball, view
-from pipelines.extraction.beneath import grounded
 from pipelines.extraction.ground import Grid, ground_grid
 from pipelines.extraction.looks import Look, look_at
 from pipelines.extraction.patches import cells_of, near, patches_about
 from pipelines.extraction.seeds import find_seeds
-from pipelines.extraction.verdicts import distinct, score, verdict
+from pipelines.extraction.sights import sights
+from pipelines.extraction.verdicts import distinct, score, verdict, verdict_on_sight
 from pipelines.geometry import levelling_rotation
 from pipelines.values import (
     Array,
+    Column,
     Index,
     MarkerCandidate,
     MarkerCandidates,
@@ -57,8 +59,8 @@ def extract(
     -------
     MarkerCandidates
         Candidates in the order of azimuth; of the groups that passed the first gate of size and
-        were then refused, the (at most 200) largest, with the reason; and the height of the highest
-        ground point within 10 m, where the study cuts its clouds.
+        were then refused, the (at most 200) most like a ball, with the reason; and the height of
+        the highest ground point within 10 m, where the study cuts its clouds.
 
     Notes
     -----
@@ -74,7 +76,7 @@ def extract(
     seeds = find_seeds(cloud.p_base, grid.is_above, ball, config.n_points_min)
     looks = distinct(look_at(cloud, grid, seeds, ball), config, marker_radius)
     verdicts = [verdict(look, config, ball) for look in looks]
-    verdicts = grounded(cloud.p_base, looks, verdicts, ball)
+    verdicts = _sighted(cloud.p_base, looks, verdicts, ball)
     good = [look for look, reason in zip(looks, verdicts, strict=True) if not reason]
     bad = [(look, reason) for look, reason in zip(looks, verdicts, strict=True) if reason]
     return MarkerCandidates(
@@ -85,6 +87,16 @@ def extract(
         ),
         ground_height_max=grid.ground_height_max,
     )
+
+
+def _sighted(p_base: Column, looks: list[Look], verdicts: list[str], ball: Ball) -> list[str]:
+    """Return the verdicts after a second look, at all beams towards and about what is left."""
+    left = [i for i, reason in enumerate(verdicts) if not reason]
+    centres = np.array([looks[i].p_base for i in left]).reshape(-1, 3)
+    out = list(verdicts)
+    for i, sight in zip(left, sights(p_base, centres, ball), strict=True):
+        out[i] = verdict_on_sight(looks[i], sight, ball)
+    return out
 
 
 def _candidates(

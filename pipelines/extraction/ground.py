@@ -104,13 +104,15 @@ def _lowest_per_cell(
     for i in range(len(p_base)):
         x, y, z = p_base[i, 0], p_base[i, 1], p_base[i, 2]
         x_level, y_level = a * x + b * y + c * z, d * x + e * y + f * z
-        if not x_level * x_level + y_level * y_level < range_max * range_max:
+        height = np.float32(g * x + h * y + k * z)
+        is_near = x_level * x_level + y_level * y_level < range_max * range_max
+        if not (is_near and abs(height) < range_max):
             cells[i] = -1
             continue
         row = min(max(int(np.floor(x_level / edge)) + half, 0), n_side - 1)
         column = min(max(int(np.floor(y_level / edge)) + half, 0), n_side - 1)
         cells[i] = row * n_side + column
-        lowest[row, column] = min(lowest[row, column], np.float32(g * x + h * y + k * z))
+        lowest[row, column] = min(lowest[row, column], height)
     return lowest
 
 
@@ -133,9 +135,23 @@ def _slide(values: Column, window: int, sign: float) -> Column:
 
 
 def _opened(lowest: Column, window: int) -> Column:
-    """Return the morphological opening of the lowest points; infinite where nothing is near."""
+    """Return the morphological opening of the lowest points; infinite where too little is near.
+
+    A window that sees nothing but a marker, behind a mound say, tells nothing about the ground.
+    """
     eroded = _slide(lowest, window, 1.0)
+    eroded[_n_known(lowest, window) < _GROUND_CELLS_MIN] = np.inf
     return np.asarray(-_slide(eroded, window, -1.0))
+
+
+def _n_known(lowest: Column, window: int) -> NDArray[np.int64]:
+    """Return how many cells of the square window about each cell have returns."""
+    padded = np.pad(np.isfinite(lowest), ((window + 1, window), (window + 1, window)))
+    sums = padded.cumsum(axis=0).cumsum(axis=1)
+    side = 2 * window + 1
+    return np.asarray(
+        sums[side:, side:] - sums[:-side, side:] - sums[side:, :-side] + sums[:-side, :-side]
+    )
 
 
 @numba.njit(cache=True, nogil=True)

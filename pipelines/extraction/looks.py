@@ -19,10 +19,12 @@ from pipelines.extraction.seeds import thinned
 from pipelines.threads import side_by_side
 from pipelines.values import Array, StitchedCloud
 
+NOISE_MIN = 0.006
+"""Scatter of any VLP-16: what scatters less is not known better [m]."""
+
 _N_LOOK = 4  # returns without which there is nothing to look at
 _N_WORTH = 50  # seeds that are worth a thread
 _N_STEPS = 6  # of a fit that only has to tell what a group is
-_NOISE_MIN = 0.006  # [m] of any VLP-16: what scatters less is not known better
 
 
 class Look(NamedTuple):
@@ -173,7 +175,7 @@ def _within(points: Array, c: Array, reach: float) -> Array:
 def _surroundings(seen: Array, radius: float, blur: float) -> tuple[int, int]:
     """Count the returns beside and below the outline that a free ball on a pole would not have."""
     n_beside, n_below = 0, 0
-    inner = 1.2 * radius + blur
+    inner = 1.1 * radius + blur  # no footprint that touches the ball is farther out
     for i in range(len(seen)):
         across, along, depth = seen[i, 0], seen[i, 1], seen[i, 2]
         gap = np.sqrt(across * across + along * along)
@@ -183,7 +185,9 @@ def _surroundings(seen: Array, radius: float, blur: float) -> tuple[int, int]:
         if along > -0.5 * radius:
             n_beside += gap < 2.2 * radius + blur and abs(depth) < 1.5 * radius
         else:
-            n_below += gap < 2.8 * radius + blur and -3.0 * radius < depth < 1.5 * radius
+            is_under = abs(across) < 1.9 * radius + blur  # what is farther out stands on its own
+            is_under &= gap < 2.8 * radius + blur
+            n_below += is_under and -3.0 * radius < depth < 1.5 * radius
     return n_beside, n_below
 
 
@@ -195,14 +199,14 @@ def _look(points: Array, start: Array, ball: Ball) -> Look | None:
     seen, _, _ = view(points, c, ball.up)
     residuals, J = _shape(seen, radius)
     scatter = _scatter(seen, residuals, radius)
-    weights = _weights(seen, residuals, radius, blur, max(scatter, _NOISE_MIN))
+    weights = _weights(seen, residuals, radius, blur, max(scatter, NOISE_MIN))
     is_in = weights > 0.0
     if is_in.sum() < _N_LOOK:
         return None
     is_strange = ~is_in & (np.hypot(seen[:, 0], seen[:, 1]) < 0.9 * radius)
     is_strange &= (np.abs(seen[:, 2]) < 2.0 * radius) & (seen[:, 1] > -0.8 * radius)
     rms = float(np.sqrt(np.sum(weights * residuals**2) / np.sum(weights)))
-    noise = max(rms, _NOISE_MIN)
+    noise = max(rms, NOISE_MIN)
     n_beside, n_below = _surroundings(seen, radius, blur)
     flat, cov_flat = _solve(J[:, [0, 1, 2, 4, 5]], residuals, weights, 1e-6)
     _, radius_free, cov_free = _settled(points, c, ball, 4)

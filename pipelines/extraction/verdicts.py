@@ -6,17 +6,23 @@ import numpy as np
 
 from pipelines.config import ExtractionConfig
 from pipelines.extraction.ball import Ball
-from pipelines.extraction.looks import Look
+from pipelines.extraction.looks import NOISE_MIN, Look
+from pipelines.extraction.sights import Sight
 
 _TOUCHING = 0.10  # share of a ball's returns that may lie as far away beside it: mixed pixels
 _STRANGE = 0.3  # share of the returns inside the outline that may be off the ball
 _SIGMAS = 3.5  # standard deviations at which a shape is refused
 _RADIUS_SLACK = 0.12  # of the radius: less is no reason to refuse, the fit judges it
 _N_SHAPELY = 12  # returns that show the width of what they lie on
+_SPREAD_SIGMAS = 3.3  # standard deviations of a spread: centres are estimated, lines not random
+_SPREAD_SLACK = 0.15  # of a spread: less is no reason to refuse
+_N_SURE = 20  # returns that show a shape well enough to say that something hides the rest
+_SHAPE_SURE = 0.05  # of the radius: the same, of the standard deviation of the free radius
+_HIDDEN = 2.0  # as many returns before a ball as on it: two thirds of it are hidden
 
 
 def distinct(looks: list[Look], config: ExtractionConfig, radius: float) -> list[Look]:
-    """Return the groups that pass the first gate, each once, those with most returns first.
+    """Return the groups that pass the first gate, each once, those with best first.
 
     Parameters
     ----------
@@ -34,11 +40,16 @@ def distinct(looks: list[Look], config: ExtractionConfig, radius: float) -> list
     """
     kept: list[Look] = []
     worthy = [look for look in looks if _passes_first_gate(look, config, radius)]
-    for look in sorted(worthy, key=lambda look: (-look.n_points, look.x, look.y)):
+    for look in sorted(worthy, key=lambda look: (-_evidence(look), look.x, look.y)):
         gaps = (np.hypot(np.hypot(look.x - o.x, look.y - o.y), look.z - o.z) for o in kept)
         if all(gap > 1.5 * radius for gap in gaps):
             kept.append(look)
     return kept
+
+
+def _evidence(look: Look) -> float:
+    """Return how much speaks for a ball: many returns that lie close to it."""
+    return look.n_points / max(look.scatter, NOISE_MIN)
 
 
 def _passes_first_gate(look: Look, config: ExtractionConfig, radius: float) -> bool:
@@ -119,6 +130,70 @@ def _radius_slack(look: Look, ball: Ball) -> float:
     """Return by how much the free radius may be off: rays instead of wide beams make it larger."""
     blur = 0.5 * ball.divergence * float(np.linalg.norm(look.p_base))
     return max(_SIGMAS * look.sigma_radius, _RADIUS_SLACK * ball.radius + 0.6 * blur)
+
+
+def verdict_on_sight(look: Look, sight: Sight, ball: Ball) -> str:
+    """Return why the beams about a group say that it is no free ball on a pole.
+
+    Parameters
+    ----------
+    look : Look
+        What the group looks like.
+    sight : Sight
+        Where the beams towards and about it end.
+    ball : Ball
+        What is looked for.
+
+    Returns
+    -------
+    str
+        The reason as a sentence for people; empty if it may be such a ball.
+    """
+    expected = _spread_expected(look, ball)
+    spread_min = expected - max(
+        _SPREAD_SIGMAS / float(np.sqrt(12.0 * max(sight.n_on, 1))), _SPREAD_SLACK
+    )
+    seems_like = ball.radius * float(np.sqrt(sight.spread / expected))
+    n_below = sight.n_held + sight.n_past + sight.n_short
+    tests = (
+        (
+            sight.n_through > 1.0 + _TOUCHING * sight.n_on,
+            f"It lets beams through: {sight.n_through} returns inside its outline lie behind it, "
+            f"where {sight.n_on} lie on it.",
+        ),
+        (
+            sight.n_before > 2.0 + _HIDDEN * sight.n_on,
+            f"Most of it is hidden: {sight.n_before} returns inside its outline lie before it, "
+            f"where {sight.n_on} lie on it.",
+        ),
+        (
+            sight.spread < spread_min,
+            f"It is too small: its returns lie within {1e3 * seems_like:.0f} mm of its middle, not "
+            f"{1e3 * ball.radius:.0f} mm.",
+        ),
+        (
+            sight.n_held > 1.0 + _TOUCHING * sight.n_on,
+            f"It does not stand on a pole: {sight.n_held} returns below it and beside a pole's "
+            "place lie about as far away, as on shoulders, a larger stone or the ground.",
+        ),
+        (
+            sight.n_held + sight.n_short > 1 + sight.n_past and not _may_be_hidden(look, ball),
+            f"It rests on the ground: of {n_below} beams that pass below it beside a pole's "
+            f"place, {sight.n_held + sight.n_short} end at its distance or nearer.",
+        ),
+    )
+    return next((reason for is_so, reason in tests if is_so), "")
+
+
+def _spread_expected(look: Look, ball: Ball) -> float:
+    """Return the spread of returns on the ball: wide beams make its disc somewhat larger."""
+    blur = 0.5 * ball.divergence * float(np.linalg.norm(look.p_base)) / ball.radius
+    return 0.5 * (1.0 + 0.3 * blur) ** 2
+
+
+def _may_be_hidden(look: Look, ball: Ball) -> bool:
+    """Tell whether the shape is so clear that the lower half may be behind something nearer."""
+    return look.n_points >= _N_SURE and look.sigma_radius < _SHAPE_SURE * ball.radius
 
 
 def score(look: Look, config: ExtractionConfig, ball: Ball) -> float:

@@ -1,0 +1,165 @@
+"""What the beams towards and about a group show, at whatever depth they end.
+
+Hides how the beams of a direction are found. A ball on a pole stops the beams that are aimed at it
+and lets pass those beside it: a rock, a head or a crown of leaves does not.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numba
+import numpy as np
+
+from pipelines.extraction.ball import Ball, view
+from pipelines.threads import side_by_side
+from pipelines.values import Array, Column, Mask
+
+_N_FACE = 256  # cells along a face of the cube of directions: 0.45 deg
+_REACH = 4.0  # radii about a centre: shoulders lie within three radii below a head
+_POLE = 0.5  # radii: half the width of what a ball may stand on
+_ASIDE = 1.9  # radii: what is farther to a side may stand there on its own
+_HELD = (-4.0, 1.5)  # radii of depth within which something belongs to what is looked at
+_ON = (-1.3, 0.3)  # radii of depth within which a return may lie on the ball
+
+
+class Sight(NamedTuple):
+    """Beams towards and about a group, counted by where they end.
+
+    Attributes
+    ----------
+    n_on : int
+        Returns inside the outline at the depth of the ball.
+    n_through : int
+        Returns well inside the outline that lie behind the ball.
+    n_before : int
+        Returns inside the outline that lie before the ball.
+    spread : float
+        Mean square of the distances from the centre at which the first ones pass it, in units of
+        the radius squared: about a half for a ball of the known radius.
+    n_held : int
+        Returns below it, beside a pole's place, that lie about as far away.
+    n_past : int
+        Returns there that lie behind it.
+    n_short : int
+        Returns there that end long before it.
+    """
+
+    n_on: int
+    n_through: int
+    n_before: int
+    spread: float
+    n_held: int
+    n_past: int
+    n_short: int
+
+
+def sights(p_base: Column, centres: Array, ball: Ball) -> list[Sight]:
+    """Count the beams towards and about some centres by where they end.
+
+    Parameters
+    ----------
+    p_base : (n, 3) float32
+        All returns of the stop [m].
+    centres : (k, 3)
+        Centres of groups that may be balls [m].
+    ball : Ball
+        What is looked for.
+
+    Returns
+    -------
+    list of Sight
+        What is seen of each.
+    """
+    if not len(centres):
+        return []
+    is_wanted = _directions_about(centres, ball.up, (_REACH + 0.5) * ball.radius + 0.05)
+    parts = side_by_side(
+        lambda first, end: _in_directions(p_base[first:end], is_wanted), len(p_base)
+    )
+    points = np.concatenate(parts)
+    return [Sight(*_counted(points, centre, ball)) for centre in centres]
+
+
+@numba.njit(cache=True, nogil=True)
+def _counted(points: Column, c: Array, ball: Ball) -> tuple[int, int, int, float, int, int, int]:
+    """Return the fields of a sight."""
+    radius, distance = ball.radius, np.sqrt(np.sum(c**2))
+    blur = 0.5 * ball.divergence * distance / radius
+    seen, _, _ = view(_towards(points, c, (_REACH + blur) * radius / distance), c, ball.up)
+    n_on, n_through, n_before, n_held, n_past, n_short = 0, 0, 0, 0, 0, 0
+    total = 0.0
+    for i in range(len(seen)):
+        across, along, depth = np.abs(seen[i, 0]) / radius, seen[i, 1] / radius, seen[i, 2] / radius
+        gap = np.hypot(across, along)
+        if gap < 1.0 + blur and along > -0.9 and _ON[0] < depth < _ON[1]:
+            n_on += 1
+            total += gap * gap
+        elif gap < 0.8:
+            n_through += depth > 1.0
+            n_before += depth <= _ON[0]
+        is_below = along < -0.3 and gap > 1.2 + blur and _POLE + blur < across < _ASIDE + blur
+        if is_below:
+            n_past += depth > _HELD[1]
+            n_short += depth < _HELD[0]
+            n_held += _HELD[0] <= depth <= _HELD[1]
+    return n_on, n_through, n_before, total / max(n_on, 1), n_held, n_past, n_short
+
+
+@numba.njit(cache=True, nogil=True)
+def _towards(points: Column, c: Array, tangent: float) -> Array:
+    """Return the points that are seen within an angle, given by its tangent, of a centre."""
+    x, y, z = c
+    least = (x * x + y * y + z * z) / (1.0 + tangent * tangent)
+    rows = np.empty(len(points), np.int32)
+    n_rows = 0
+    for i in range(len(points)):
+        px, py, pz = points[i, 0], points[i, 1], points[i, 2]
+        along = x * px + y * py + z * pz
+        rows[n_rows] = i  # kept only if the next one does not take its place
+        n_rows += along > 0.0 and along * along > least * (px * px + py * py + pz * pz)
+    return points[rows[:n_rows]].astype(np.float64)
+
+
+@numba.njit(cache=True, nogil=True)
+def _directions_about(centres: Array, up: Array, reach: float) -> Mask:
+    """Tell the cells of directions in which beams may pass some centres within a reach."""
+    is_wanted = np.zeros(6 * _N_FACE * _N_FACE, np.bool_)
+    n_steps = 2 + int(1.5 * reach * _N_FACE / np.sqrt(np.min(np.sum(centres**2, axis=1)) + 1e-9))
+    for k in range(len(centres)):
+        c = centres[k]
+        v_across = np.cross(up, c)
+        v_across *= reach / (np.sqrt(np.sum(v_across**2)) + 1e-12)
+        for i in range(-n_steps, n_steps + 1):
+            for j in range(-n_steps, n_steps + 1):
+                q = c + (i / n_steps) * v_across + (j / n_steps) * reach * up
+                is_wanted[_direction_cell(q[0], q[1], q[2])] = True
+    return is_wanted
+
+
+@numba.njit(cache=True, nogil=True)
+def _in_directions(p_base: Column, is_wanted: Mask) -> Column:
+    """Return the points, at whatever depth, in the cells that are wanted."""
+    rows = np.empty(len(p_base), np.int32)
+    n_rows = 0
+    for i in range(len(p_base)):
+        rows[n_rows] = i  # kept only if the next one does not take its place
+        n_rows += is_wanted[_direction_cell(p_base[i, 0], p_base[i, 1], p_base[i, 2])]
+    return p_base[rows[:n_rows]]
+
+
+@numba.njit(cache=True, nogil=True)
+def _direction_cell(x: float, y: float, z: float) -> int:
+    """Return the cell of a direction on a cube of ``_N_FACE`` squared cells a face."""
+    ax, ay, az = abs(x), abs(y), abs(z)
+    if not ax + ay + az < np.inf:
+        return 0  # a return that is none: any cell will do, the angle refuses it
+    if ax >= ay and ax >= az:
+        face, first, second, largest = int(x > 0.0), y, z, ax
+    elif ay >= az:
+        face, first, second, largest = 2 + int(y > 0.0), x, z, ay
+    else:
+        face, first, second, largest = 4 + int(z > 0.0), x, y, az
+    scale = 0.4999 * _N_FACE / max(largest, 1e-9)
+    row, column = int(first * scale + 0.5 * _N_FACE), int(second * scale + 0.5 * _N_FACE)
+    return (face * _N_FACE + row) * _N_FACE + column
