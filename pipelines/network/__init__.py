@@ -1,0 +1,21 @@
+"""Many stations and marks, adjusted together.
+
+Hides which marker of which station is which mark (``assembly``), the structure of the normal
+equations (``equations``) and the tests (``adjusting``). A network is assembled first and adjusted
+then, because what was observed is worth looking at before it is judged: the refused stations and
+the exported observations need no adjustment.
+"""
+
+from pipelines.network.adjusting import adjust_network
+from pipelines.network.assembly import assemble
+from pipelines.network.values import AdjustedNetwork, BlockTests, LeftOut, Network, Refusal
+
+__all__ = [
+    "AdjustedNetwork",
+    "BlockTests",
+    "LeftOut",
+    "Network",
+    "Refusal",
+    "adjust_network",
+    "assemble",
+]

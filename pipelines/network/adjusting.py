@@ -1,0 +1,412 @@
+"""Network -> AdjustedNetwork: hides the tests and what is left out because of them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.special import chdtrc, chdtri, ndtri
+
+from pipelines.config import ResectionConfig
+from pipelines.errors import TooFewObservationsError
+from pipelines.geometry import skew
+from pipelines.network.equations import (
+    N_DEFECT,
+    Cofactors,
+    Linearised,
+    State,
+    linearise,
+    middle_of,
+    solve_network,
+    start,
+)
+from pipelines.network.values import (
+    AdjustedNetwork,
+    BlockTests,
+    LeftOut,
+    Network,
+    position_by_motion,
+)
+from pipelines.values import Array, Mask
+
+_FALSE_ALARM = 0.05  # probability that a network without gross errors loses an observation
+_UNTESTABLE = 1e-7  # redundancy below which a bias cannot show
+_MANY_LEFT_OUT = 1.0 / 3.0  # of the centres: not they are bad, but the sigmas too small
+_UPRIGHT = 0.05  # spread across over spread along of marks on a plumb line: no heading
+
+
+@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
+class _Tested:
+    """A solution with the statistics of all its blocks; columns run over centres, gravity, control.
+
+    ``tested`` holds ``P Q_v P`` of centres, gravity and control.
+    """
+
+    state: State
+    lin: Linearised
+    cofactors: Cofactors
+    used: Mask
+    tested: tuple[Array, Array, Array]
+    redundancies: Array
+    w: Array
+    weakest: Array
+
+
+def adjust_network(network: Network, config: ResectionConfig) -> AdjustedNetwork:
+    """Adjust all stations and marks of a survey together, and leave gross errors out.
+
+    Parameters
+    ----------
+    network : Network
+        What was observed, with approximate values.
+    config : ResectionConfig
+        Levels of the tests.
+
+    Returns
+    -------
+    AdjustedNetwork
+        Poses, marks, covariances and tests.
+
+    Raises
+    ------
+    TooFewObservationsError
+        If there are fewer observations than unknowns.
+    DegenerateGeometryError
+        If a part of the network can move on its own.
+    NotConvergedError
+        If the steps do not become small.
+
+    Notes
+    -----
+    Observed are each centre in the base frame of its station, the up direction of each station,
+    and the control marks with their covariances. Without control the network is free: stations are
+    levelled, place and heading stay open, and the inner constraints over all marks (their centroid
+    and mean heading stay those of the approximate values) give the covariances of least trace
+    (Meissl 1969). Data snooping after Baarda (1968), one block at a time; the level of a single
+    test is lowered with their number so that a clean network loses an observation in one of twenty
+    cases. Where more than a third of the centres would go, the sigmas are to blame, and w is
+    divided by sigma0 (Pope 1976). Cost grows linearly with the stations and with the third power of
+    the marks.
+    """
+    level = min(config.test_level, _FALSE_ALARM / (3 * network.n_blocks))
+    critical = float(ndtri(1.0 - level / 2.0))
+    tested, dropped = _snoop(network, critical, is_studentised=False)
+    n = len(network.sightings)
+    if sum(block < n for block, _ in dropped) > _MANY_LEFT_OUT * n:
+        tested, dropped = _snoop(network, critical, is_studentised=True)
+    noncentrality = critical + float(ndtri(config.test_power))
+    return _adjusted(network, tested, dropped, (critical, noncentrality), config)
+
+
+def _snoop(
+    network: Network, critical: float, *, is_studentised: bool
+) -> tuple[_Tested, list[tuple[int, float]]]:
+    """Leave out the worst block, one at a time, while its w-test fails."""
+    used = np.ones(network.n_blocks, dtype=np.bool_)
+    state = start(network)
+    dropped: list[tuple[int, float]] = []
+    while True:
+        tested = _test(network, state, used)
+        w = np.nan_to_num(tested.w, nan=0.0)
+        if is_studentised:
+            w = w / max(1.0, _sigma0(network, tested))
+        worst = _worst(network, w, used, critical)
+        if worst is None:
+            return tested, dropped
+        dropped.append((worst, float(w[worst])))
+        state, used = tested.state, used.copy()
+        used[worst] = False
+
+
+def _worst(network: Network, w: Array, used: Mask, critical: float) -> int | None:
+    """Return the block with the largest w above the limit that can be spared."""
+    for block in np.argsort(-w):
+        if w[block] <= critical:
+            return None
+        if _may_drop(network, used, int(block)):
+            return int(block)
+    return None
+
+
+def _may_drop(network: Network, used: Mask, block: int) -> bool:
+    """Return whether a block can be spared without leaving an unknown open."""
+    n, s = len(network.sightings), len(network.stations)
+    if block >= n + s:
+        return int(used[n + s :].sum()) > 2
+    rest = used[:n].copy()
+    station = block - n
+    if block < n:
+        rest[block] = False
+        station, mark = network.sightings[block]
+        if not np.any(network.sightings[rest, 1] == mark):
+            return False
+    own = network.p_base[rest & (network.sightings[:, 0] == station)]
+    own = own @ network.R_station_base[station].T
+    if block < n:
+        return bool(len(own) >= 2 and _has_heading(own))
+    return bool(len(own) >= 3 and used[n : n + s].sum() > 1)
+
+
+def _has_heading(p: Array) -> bool:
+    """Return whether points are far enough from one plumb line to tell a heading."""
+    off = p - p.mean(axis=0)
+    return bool(np.linalg.norm(off[:, :2]) > _UPRIGHT * np.linalg.norm(off))
+
+
+def _degrees_of_freedom(network: Network, used: Mask) -> int:
+    """Return observations minus unknowns plus the defect of the datum."""
+    n, s = len(network.sightings), len(network.stations)
+    observed = (
+        3 * int(used[:n].sum()) + 2 * int(used[n : n + s].sum()) + 3 * int(used[n + s :].sum())
+    )
+    unknown = 6 * s + 3 * len(network.marks) - (N_DEFECT if network.is_free else 0)
+    if observed < unknown:
+        raise TooFewObservationsError(
+            f"{observed} observations cannot determine the {unknown} unknowns of {s} stations and "
+            f"{len(network.marks)} marks."
+        )
+    return observed - unknown
+
+
+def _squares(lin: Linearised) -> tuple[float, float, float]:
+    """Return the weighted sums of squares of centres, gravity and control."""
+    pairs = (
+        (lin.v_centres, lin.P_centres),
+        (lin.v_gravity, lin.P_gravity),
+        (lin.v_control, lin.P_control),
+    )
+    first, second, third = (float(np.einsum("ni,nij,nj->", v, P, v)) for v, P in pairs)
+    return first, second, third
+
+
+def _sigma0(network: Network, tested: _Tested) -> float:
+    """Return the square root of the variance factor; NaN without redundancy."""
+    dof = _degrees_of_freedom(network, tested.used)
+    return float(np.sqrt(sum(_squares(tested.lin)) / dof)) if dof else np.nan
+
+
+def _passes(network: Network, tested: _Tested, level: float) -> bool:
+    """Return whether the residuals are no larger than their sigmas promise."""
+    dof = _degrees_of_freedom(network, tested.used)
+    return dof == 0 or bool(chdtrc(dof, sum(_squares(tested.lin))) >= level)
+
+
+def _test(network: Network, approximate: State, used: Mask) -> _Tested:
+    """Solve with some blocks and test all of them."""
+    _degrees_of_freedom(network, used)
+    state, cofactors = solve_network(network, approximate, used)
+    lin = linearise(network, state, used)
+    station, mark = network.sightings.T
+    own = _own_marks(cofactors)
+    cross = lin.J_centres @ cofactors.between[station, :, mark]
+    turned = lin.J_centres @ cofactors.stations[station] @ np.swapaxes(lin.J_centres, 1, 2)
+    q_centres = turned - cross - np.swapaxes(cross, 1, 2) + own[mark]
+    q_gravity = lin.J_gravity @ cofactors.stations @ np.swapaxes(lin.J_gravity, 1, 2)
+    blocks = (
+        (lin.v_centres, lin.P_centres, q_centres),
+        (lin.v_gravity, lin.P_gravity, q_gravity),
+        (lin.v_control, lin.P_control, own[network.controls]),
+    )
+    tested = tuple(P - P @ Q @ P for _, P, Q in blocks)
+    columns = [_statistics(*block, kept) for block, kept in zip(blocks, tested, strict=True)]
+    redundancies, w, weakest = (np.concatenate(c) for c in zip(*columns, strict=True))
+    return _Tested(
+        state=state,
+        lin=lin,
+        cofactors=cofactors,
+        used=used,
+        tested=(tested[0], tested[1], tested[2]),
+        redundancies=np.where(used, redundancies, np.nan),
+        w=w,
+        weakest=weakest,
+    )
+
+
+def _own_marks(cofactors: Cofactors) -> Array:
+    """Return the covariance of each mark, (m, 3, 3)."""
+    m = len(cofactors.marks) // 3
+    return np.asarray(np.einsum("iaib->iab", cofactors.marks.reshape(m, 3, m, 3)))
+
+
+def _statistics(
+    residuals: Array, weights: Array, cofactors: Array, tested: Array
+) -> tuple[Array, Array, Array]:
+    """Return redundancy, largest w (NaN) and weakest testability (0 if untestable) of blocks."""
+    if not len(residuals):
+        return np.zeros(0), np.zeros(0), np.zeros(0)
+    redundancies = residuals.shape[1] - np.einsum("bij,bji->b", weights, cofactors)
+    squares = np.einsum("bii->bi", tested)
+    testable = squares > _UNTESTABLE * np.einsum("bii->bi", weights)
+    pressed = np.abs(np.einsum("bij,bj->bi", weights, residuals))
+    w = np.where(testable, pressed / np.sqrt(np.where(testable, squares, 1.0)), -1.0).max(axis=1)
+    weakest = np.asarray(np.linalg.eigvalsh(tested)[:, 0], dtype=np.float64)
+    is_open = weakest <= _UNTESTABLE * np.linalg.eigvalsh(weights)[:, 0]
+    return (
+        np.asarray(redundancies),
+        np.where(w < 0, np.nan, w),
+        np.where(is_open, 0.0, weakest),
+    )
+
+
+def _shifts(network: Network, tested: _Tested, noncentrality: float) -> tuple[Array, Array]:
+    """Return how far a just undetectable bias of each centre moves its station and its mark.
+
+    A bias ``b`` moves the unknowns by ``Q_x J' P b`` and is just detectable when
+    ``b' P Q_v P b = lambda0`` (Baarda 1968).
+    """
+    lin, cofactors = tested.lin, tested.cofactors
+    station, mark = network.sightings.T
+    between = cofactors.between[station, :, mark]
+    J_turned = np.swapaxes(lin.J_centres, 1, 2)
+    J_place = position_by_motion(tested.state.T_site_base)[station]
+    by_station = J_place @ (cofactors.stations[station] @ J_turned - between) @ lin.P_centres
+    by_mark = (np.swapaxes(between, 1, 2) @ J_turned - _own_marks(cofactors)[mark]) @ lin.P_centres
+    n = len(network.sightings)
+    used, is_open = tested.used[:n], tested.weakest[:n] == 0.0
+    solid = np.where((used & ~is_open)[:, None, None], tested.tested[0], np.eye(3))
+    out = []
+    for effect in (by_station, by_mark):
+        worst = np.linalg.eigvalsh(effect @ np.linalg.solve(solid, np.swapaxes(effect, 1, 2)))
+        shift = noncentrality * np.sqrt(np.maximum(worst[:, -1], 0.0))
+        out.append(np.where(used, np.where(is_open, np.inf, shift), np.nan))
+    return out[0], out[1]
+
+
+def _adjusted(
+    network: Network,
+    tested: _Tested,
+    dropped: list[tuple[int, float]],
+    limits: tuple[float, float],
+    config: ResectionConfig,
+) -> AdjustedNetwork:
+    """Assemble the result, back in the unshifted site frame."""
+    critical, noncentrality = limits
+    middle = middle_of(network)
+    shift = np.eye(6)
+    shift[3:, :3] = skew(middle)
+    T = np.array(tested.state.T_site_base)
+    T[:, :3, 3] += middle
+    T[:, :3, :3] = T[:, :3, :3] @ np.swapaxes(network.R_station_base, 1, 2)
+    dof, squares = _degrees_of_freedom(network, tested.used), _squares(tested.lin)
+    station_shifts, mark_shifts = _shifts(network, tested, noncentrality)
+    left_out = _left_out(network, tested, dropped, critical)
+    return AdjustedNetwork(
+        network=network,
+        T_site_station=T,
+        cov_T_site_station=shift @ tested.cofactors.stations @ shift.T,
+        p_site=tested.state.p_site + middle,
+        cov_p_site=tested.cofactors.marks,
+        used=tested.used,
+        **_columns(network, tested, noncentrality),
+        station_shifts=station_shifts,
+        mark_shifts=mark_shifts,
+        dof=dof,
+        vtpv=sum(squares),
+        sigma0=_sigma0(network, tested),
+        passes_global_test=_passes(network, tested, config.test_level),
+        limit_vtpv=float(chdtri(dof, config.test_level)) if dof else 0.0,
+        variance_factors=_variance_factors(network, tested),
+        critical_w=critical,
+        noncentrality=noncentrality,
+        left_out=(*network.left_out, *left_out),
+        warnings=_warnings(network, tested, critical, left_out, config.test_level),
+    )
+
+
+def _columns(network: Network, tested: _Tested, noncentrality: float) -> dict[str, BlockTests]:
+    """Return the statistics of each kind of block."""
+    n, s = len(network.sightings), len(network.stations)
+    lin, parts = tested.lin, np.split(np.arange(network.n_blocks), [n, n + s])
+    with np.errstate(divide="ignore"):
+        detectable = np.where(tested.used, noncentrality / np.sqrt(tested.weakest), np.nan)
+    residuals = (lin.v_centres, lin.v_gravity, lin.v_control)
+    return {
+        kind: BlockTests(
+            residuals=v,
+            redundancies=tested.redundancies[part],
+            w_statistics=tested.w[part],
+            detectable_biases=detectable[part],
+        )
+        for kind, v, part in zip(("centres", "gravity", "control"), residuals, parts, strict=True)
+    }
+
+
+def _variance_factors(network: Network, tested: _Tested) -> Array:
+    """Return the sum of squares over redundancy of each kind of block; NaN without redundancy."""
+    n, s = len(network.sightings), len(network.stations)
+    parts = np.split(np.nan_to_num(tested.redundancies), [n, n + s])
+    totals = [float(part.sum()) for part in parts]
+    pairs = zip(_squares(tested.lin), totals, strict=True)
+    return np.array([square / r if r > _UNTESTABLE else np.nan for square, r in pairs])
+
+
+def _left_out(
+    network: Network, tested: _Tested, dropped: list[tuple[int, float]], critical: float
+) -> tuple[LeftOut, ...]:
+    """Say which blocks the tests left out, and why."""
+    n, s = len(network.sightings), len(network.stations)
+    out = []
+    for block, w in dropped:
+        worth = f"w = {w:.1f} (good data stay below {critical:.1f})"
+        if block < n:
+            station, mark = network.sightings[block]
+            off = float(np.linalg.norm(tested.lin.v_centres[block]))
+            out.append(
+                LeftOut(
+                    kind="centre",
+                    station=network.stations[station],
+                    fit=int(network.fits[block]),
+                    mark=network.marks[mark],
+                    reason=f"{worth}: it is {off:.3f} m from where all others have mark "
+                    f"{network.marks[mark]}.",
+                )
+            )
+        elif block < n + s:
+            station = block - n
+            off = np.degrees(float(np.linalg.norm(tested.lin.v_gravity[station])))
+            reason = f"{worth}: the levelling is {off:.2f} deg from what the marks say."
+            name = network.stations[station]
+            out.append(LeftOut(kind="gravity", station=name, fit=-1, mark="", reason=reason))
+        else:
+            control = block - n - s
+            off = float(np.linalg.norm(tested.lin.v_control[control]))
+            mark_name = network.marks[network.controls[control]]
+            reason = f"{worth}: the given coordinates are {off:.3f} m from the adjusted ones."
+            out.append(LeftOut(kind="control", station="", fit=-1, mark=mark_name, reason=reason))
+    return tuple(out)
+
+
+def _warnings(
+    network: Network,
+    tested: _Tested,
+    critical: float,
+    left_out: tuple[LeftOut, ...],
+    level: float,
+) -> tuple[str, ...]:
+    """Say why the network cannot be relied on."""
+    n, s = len(network.sightings), len(network.stations)
+    warnings = []
+    if not _passes(network, tested, level):
+        warnings.append(
+            f"The global test fails (sigma0 = {_sigma0(network, tested):.2f}): residuals are "
+            "larger than their sigmas promise."
+        )
+    control_w = np.nan_to_num(tested.w[n + s :])
+    bad = [
+        f"{network.marks[mark]} (w = {w:.1f})"
+        for mark, w in zip(network.controls, control_w, strict=True)
+        if w > critical
+    ]
+    if bad:
+        warnings.append(
+            f"The control marks {', '.join(bad)} contradict each other or the scans, and too few "
+            "others stand to tell which is wrong."
+        )
+    n_bad = sum(one.kind == "centre" for one in left_out)
+    if n_bad and n_bad > _MANY_LEFT_OUT * n:
+        warnings.append(f"{n_bad} of {n} centres had to be left out.")
+    per_mark = np.bincount(network.sightings[tested.used[:n], 1], minlength=len(network.marks))
+    lonely = [network.marks[m] for m in np.flatnonzero(per_mark == 1) if m not in network.controls]
+    if lonely:
+        warnings.append(f"Seen from one station only, and so unchecked: {', '.join(lonely)}.")
+    return tuple(warnings)

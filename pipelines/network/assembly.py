@@ -1,0 +1,329 @@
+"""Fits of many stations -> Network: hides which marker is which mark, and approximate values.
+
+Nobody labels a sphere. A map of marks grows from the control marks, or from one station: each
+station is matched to the map as it is, and its markers that are not in the map yet enlarge it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from pipelines.config import ResectionConfig
+from pipelines.errors import (
+    AmbiguousMatchError,
+    DegenerateGeometryError,
+    InputError,
+    NoMatchError,
+    SolveError,
+)
+from pipelines.geometry import levelling_rotation, rigid, transform
+from pipelines.matching import gather, match_marks
+from pipelines.network.values import LeftOut, Network, Refusal
+from pipelines.values import Array, ControlMarks, MarkerFits
+
+_EXACT = 1e-5  # [m] sigma of control marks that are given as exact: far below any survey's
+_NEAR_CONTROL = 1.0  # [m] how far a mark can be from a control mark and still be worth a remark
+
+Scan = tuple[str, MarkerFits]
+
+
+@dataclass(slots=True)
+class _Map:
+    """Marks found so far, and which marker of which placed station is which of them."""
+
+    names: list[str] = field(default_factory=list)
+    p_site: list[Array] = field(default_factory=list)
+    cov_p_site: list[Array] = field(default_factory=list)
+    poses: dict[int, Array] = field(default_factory=dict)
+    marks_of: dict[int, list[int]] = field(default_factory=dict)
+    n_control: int = 0
+
+    def as_control(self) -> ControlMarks:
+        """Return the marks as if they were control."""
+        return ControlMarks(
+            names=tuple(self.names),
+            p_site=np.array(self.p_site),
+            cov_p_site=np.array(self.cov_p_site),
+        )
+
+    def add_mark(self, p_site: Array, cov_p_site: Array) -> int:
+        """Enlarge the map by a mark; return its place."""
+        letter = "N" if self.n_control else "M"
+        number = len(self.names) - self.n_control + 1
+        while (name := f"{letter}{number:02d}") in self.names:
+            number += 1
+        self.names.append(name)
+        self.p_site.append(p_site)
+        self.cov_p_site.append(cov_p_site)
+        return len(self.names) - 1
+
+    def place(
+        self, scan: int, fits: MarkerFits, T: Array, marks: Sequence[int], near: float
+    ) -> None:
+        """Enter a station; markers that are far from all marks become new ones."""
+        known = np.array(self.p_site)
+        labels = []
+        for fit, mark in zip(fits.fits, marks, strict=True):
+            p = transform(T, fit.p_base)
+            if mark < 0 and (not len(known) or np.linalg.norm(known - p, axis=1).min() > near):
+                mark = self.add_mark(p, T[:3, :3] @ fit.cov_p_base @ T[:3, :3].T)
+            labels.append(int(mark))
+        self.poses[scan] = T
+        self.marks_of[scan] = labels
+
+
+def assemble(
+    scans: Sequence[Scan], control: ControlMarks | None, config: ResectionConfig
+) -> Network:
+    """Find out which markers of a survey's stations are the same, and where all stand roughly.
+
+    Parameters
+    ----------
+    scans : sequence of (str, MarkerFits)
+        Name of each station and its centres.
+    control : ControlMarks, optional
+        Marks at known places; without any the network is free, in the levelled frame of the first
+        station that is in it.
+    config : ResectionConfig
+        Tolerance of matching.
+
+    Returns
+    -------
+    Network
+        Marks that two stations or more see, and control marks; stations that share two or more of
+        them with others. The rest is refused or left out with a reason.
+
+    Raises
+    ------
+    InputError
+        If two stations have the same name.
+    DegenerateGeometryError
+        If no two stations share enough marks, or fewer than two control marks were seen.
+
+    Notes
+    -----
+    Control marks without a covariance count as known to 0.01 mm, so that they can be tested. Of
+    several groups of stations that share no marks the largest is taken. Cost grows with the
+    stations, and with their square where many cannot be matched.
+    """
+    names = [name for name, _ in scans]
+    if twice := sorted({name for name in names if names.count(name) > 1}):
+        raise InputError(f"Two logs are called {twice[0]!r}; stations are told apart by name.")
+    found, reasons = _grow(scans, control, config)
+    used, lonely = _shared(found)
+    refused = tuple(
+        Refusal(station=names[i], code=DegenerateGeometryError.code, reason=reason)
+        if isinstance(reason, str)
+        else Refusal(station=names[i], code=reason.code, reason=_why(scans[i][1], found, reason))
+        for i, reason in _refused(len(scans), used, reasons)
+    )
+    _refuse_nothing(used, found, control, refused)
+    network = _network(scans, found, used, config.sigma_common)
+    return replace(network, refused=refused, left_out=_unseen(scans, found, used, lonely))
+
+
+def _grow(
+    scans: Sequence[Scan], control: ControlMarks | None, config: ResectionConfig
+) -> tuple[_Map, dict[int, SolveError]]:
+    """Return the largest map that stations can be matched to, and why others cannot."""
+    if control is not None:
+        found = _Map(
+            names=list(control.names),
+            p_site=list(control.p_site),
+            cov_p_site=list(control.cov_p_site),
+            n_control=len(control.names),
+        )
+        return found, _chain(scans, found, list(range(len(scans))), config)
+    best, reasons = _Map(), dict[int, SolveError]()
+    left = list(range(len(scans)))
+    while len(left) > len(best.poses):
+        seed = left[0]
+        fits, found = scans[seed][1], _Map()
+        T = rigid(levelling_rotation(fits.levelling), np.zeros(3))
+        found.place(seed, fits, T, [-1] * len(fits.fits), 0.0)
+        others = [i for i in range(len(scans)) if i != seed]
+        failed = _chain(scans, found, others, config)
+        if len(found.poses) > len(best.poses):
+            best, reasons = found, failed
+        left = [i for i in left if i not in found.poses]
+    return best, reasons
+
+
+def _chain(
+    scans: Sequence[Scan], found: _Map, left: list[int], config: ResectionConfig
+) -> dict[int, SolveError]:
+    """Match stations to a growing map until none is added; return why the others are not."""
+    failed: dict[int, SolveError] = {}
+    while left:
+        failed = {}
+        for i in left:
+            fits = scans[i][1]
+            try:
+                if len(fits.fits) < 2 or not found.names:
+                    raise DegenerateGeometryError("Too few markers.")
+                scene = gather(fits, found.as_control(), config)
+                match = match_marks(scene, config)
+            except SolveError as error:
+                failed[i] = error
+                continue
+            T = np.array(match.T_site_base)
+            T[:3, 3] += scene.middle
+            found.place(i, fits, T, match.marks.tolist(), config.match_tolerance)
+        if len(failed) == len(left):
+            break
+        left = list(failed)
+    return failed
+
+
+def _shared(found: _Map) -> tuple[dict[int, list[tuple[int, int]]], dict[int, list[int]]]:
+    """Return, per station, (fit, mark) that tie it to others, and fits that no other station sees.
+
+    A station that two such marks do not hold goes, and what only it shared with one other with it.
+    """
+    stations = set(found.poses)
+    while True:
+        seen = [m for i in stations for m in found.marks_of[i] if m >= 0]
+        counts = np.bincount(np.array(seen, dtype=np.intp), minlength=len(found.names))
+        counts[: found.n_control] += 1
+        used = {
+            i: [(f, m) for f, m in enumerate(found.marks_of[i]) if m >= 0 and counts[m] > 1]
+            for i in sorted(stations)
+        }
+        weak = {i for i, pairs in used.items() if len(pairs) < 2}
+        if not weak:
+            break
+        stations -= weak
+    lonely = {
+        i: [f for f in range(len(found.marks_of[i])) if f not in {fit for fit, _ in pairs}]
+        for i, pairs in used.items()
+    }
+    return used, lonely
+
+
+def _refused(
+    n: int, used: dict[int, list[tuple[int, int]]], reasons: dict[int, SolveError]
+) -> list[tuple[int, SolveError | str]]:
+    """Return the stations that are not used, with the error or the reason."""
+    alone = "It shares fewer than two marks with the other stations; two, better three, tie it."
+    return [(i, reasons.get(i, alone)) for i in range(n) if i not in used]
+
+
+def _why(fits: MarkerFits, found: _Map, error: SolveError) -> str:
+    """Say why a station could not be matched to the network."""
+    n, m = len(fits.fits), len(found.names)
+    if n < 2:
+        seen = "One marker was" if n else "No marker was"
+        return f"{seen} found in it; two, better three, that other stations see too tie a station."
+    if isinstance(error, AmbiguousMatchError):
+        return (
+            f"Its {n} markers fit the {m} marks of the network in more than one way equally well."
+        )
+    if isinstance(error, NoMatchError):
+        return (
+            f"Its {n} markers do not fit the {m} marks of the network better than chance: it "
+            "shares too few marks with the other stations (two, better three or more, tie it), or "
+            "it stands in another field."
+        )
+    return f"It cannot be tied to the network: {error}"
+
+
+def _refuse_nothing(
+    used: dict[int, list[tuple[int, int]]],
+    found: _Map,
+    control: ControlMarks | None,
+    refused: tuple[Refusal, ...],
+) -> None:
+    """Raise where no network is left."""
+    first = f" {refused[0].station}: {refused[0].reason}" if refused else ""
+    if not used or (control is None and len(used) < 2):
+        ties = "no two stations share two marks" if control is None else "no station sees two marks"
+        raise DegenerateGeometryError(f"There is no network: {ties}.{first}")
+    if control is not None:
+        seen = sorted({m for pairs in used.values() for _, m in pairs if m < found.n_control})
+        p = np.array(found.p_site)[seen]
+        if len(seen) < 2 or np.linalg.norm(np.ptp(p[:, :2], axis=0)) < 1e-2:
+            raise DegenerateGeometryError(
+                f"{len(seen)} control mark(s) were seen; two that do not stand on one plumb line "
+                "are needed for place and heading. Without --control the network is free."
+            )
+
+
+def _unseen(
+    scans: Sequence[Scan],
+    found: _Map,
+    used: dict[int, list[tuple[int, int]]],
+    lonely: dict[int, list[int]],
+) -> tuple[LeftOut, ...]:
+    """Say which centres are no marks of the network, and which control marks nobody saw."""
+    out = []
+    for i, fits in lonely.items():
+        for fit in fits:
+            mark = found.marks_of[i][fit]
+            reason = "No other station sees it: it ties nothing, and may be false."
+            if mark < 0:
+                reason = "Another marker is nearer to the mark beside it: a false marker."
+            out.append(LeftOut(kind="centre", station=scans[i][0], fit=fit, mark="", reason=reason))
+    seen = {mark for pairs in used.values() for _, mark in pairs}
+    for mark in range(found.n_control):
+        if mark not in seen:
+            reason = "No station sees it." + _beside(found, mark, seen)
+            name = found.names[mark]
+            out.append(LeftOut(kind="control", station="", fit=-1, mark=name, reason=reason))
+    return tuple(out)
+
+
+def _beside(found: _Map, mark: int, seen: set[int]) -> str:
+    """Name the seen mark that stands beside a control mark which nobody saw."""
+    new = [other for other in seen if other >= found.n_control]
+    if not new:
+        return ""
+    off = [float(np.linalg.norm(found.p_site[other] - found.p_site[mark])) for other in new]
+    nearest = int(np.argmin(off))
+    if off[nearest] > _NEAR_CONTROL:
+        return ""
+    return (
+        f" But {found.names[new[nearest]]} stands {off[nearest]:.2f} m from it: its coordinates "
+        "contradict the other control marks, or it was moved."
+    )
+
+
+def _network(
+    scans: Sequence[Scan],
+    found: _Map,
+    used: dict[int, list[tuple[int, int]]],
+    sigma_common: float,
+) -> Network:
+    """Bring stations and marks that are used into columns."""
+    places = sorted({mark for pairs in used.values() for _, mark in pairs})
+    row = {mark: k for k, mark in enumerate(places)}
+    sightings = [(k, row[m], f) for k, i in enumerate(used) for f, m in used[i]]
+    columns = np.array(sightings, dtype=np.intp)
+    fits = [scans[i][1].fits[f] for i in used for f, _ in used[i]]
+    levellings = [scans[i][1].levelling for i in used]
+    controls = [mark for mark in places if mark < found.n_control]
+    given = np.array([found.cov_p_site[mark] for mark in controls]).reshape(-1, 3, 3)
+    return Network(
+        stations=tuple(scans[i][0] for i in used),
+        marks=tuple(found.names[mark] for mark in places),
+        sightings=columns[:, :2].copy(),
+        fits=columns[:, 2].copy(),
+        p_base=np.array([fit.p_base for fit in fits]),
+        cov_p_base=np.array([fit.cov_p_base for fit in fits]) + sigma_common**2 * np.eye(3),
+        R_station_base=np.array([levelling_rotation(one) for one in levellings]),
+        cov_up_base=np.array([_cov_up(one.roll, one.pitch, one.sigma) for one in levellings]),
+        controls=np.array([row[mark] for mark in controls], dtype=np.intp),
+        p_control_site=np.array([found.p_site[mark] for mark in controls]).reshape(-1, 3),
+        cov_control_site=given + _EXACT**2 * np.eye(3),
+        T_site_base=np.array([found.poses[i] for i in used]),
+        p_site=np.array([found.p_site[mark] for mark in places]),
+    )
+
+
+def _cov_up(roll: float, pitch: float, sigma: float) -> Array:
+    """Return the covariance of the up direction in base, of roll and pitch of one sigma."""
+    cr, sr, cp, sp = np.cos(roll), np.sin(roll), np.cos(pitch), np.sin(pitch)
+    J = sigma * np.array([[0.0, -cp], [cp * cr, -sp * sr], [-cp * sr, -sp * cr]])
+    return np.asarray(J @ J.T)

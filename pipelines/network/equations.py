@@ -1,0 +1,309 @@
+"""Normal equations of a network: hides their structure.
+
+A station meets others only through marks, so the stations are eliminated one by one and what
+remains is a dense system of the marks alone (Schur complement; Triggs et al., Bundle Adjustment,
+2000, section 6). Cost and memory grow linearly with the stations.
+
+All coordinates are relative to the middle of the approximate marks. Letters as in ``adjustment``:
+``J`` derivative of the residuals, ``P`` weight, ``N`` normal matrix, ``Q`` cofactor.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from pipelines.errors import DegenerateGeometryError, NotConvergedError
+from pipelines.geometry import skew
+from pipelines.matching import moved
+from pipelines.network.values import Network
+from pipelines.values import Array, Mask
+
+N_DEFECT = 4  # of a free network whose stations are levelled: place and heading
+
+_STEPS = 50  # three to six suffice
+_SETTLED = 1e-12  # square of the last step in standard deviations
+_SINGULAR = 1e-11  # eigenvalue of the reduced normal matrix with unit diagonal
+
+
+@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
+class State:
+    """Poses of the stations, (s, 4, 4), and marks, (m, 3), relative to the middle [m]."""
+
+    T_site_base: Array
+    p_site: Array
+
+
+@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
+class Linearised:
+    """Residuals, weights and derivatives at a state.
+
+    Attributes
+    ----------
+    v_centres : (n, 3)
+        ``T p_base - p_site`` [m].
+    P_centres : (n, 3, 3)
+        Weights; zero where a block is not used.
+    J_centres : (n, 3, 6)
+        By the motion of the station; by the mark it is minus the identity.
+    v_gravity : (s, 2)
+        Horizontal part of the measured up direction [rad].
+    P_gravity : (s, 2, 2)
+        Weights.
+    J_gravity : (s, 2, 6)
+        By the motion of the station.
+    v_control : (c, 3)
+        Given minus adjusted coordinates [m]; by the mark minus the identity.
+    P_control : (c, 3, 3)
+        Weights.
+    """
+
+    v_centres: Array
+    P_centres: Array
+    J_centres: Array
+    v_gravity: Array
+    P_gravity: Array
+    J_gravity: Array
+    v_control: Array
+    P_control: Array
+
+
+@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
+class Cofactors:
+    """Covariances of a solution.
+
+    Attributes
+    ----------
+    stations : (s, 6, 6)
+        Of small motions of the stations.
+    between : (s, 6, m, 3)
+        Between stations and marks.
+    marks : (3m, 3m)
+        Of the marks.
+    """
+
+    stations: Array
+    between: Array
+    marks: Array
+
+
+def middle_of(network: Network) -> Array:
+    """Return the middle of the approximate marks.
+
+    Parameters
+    ----------
+    network : Network
+        The network.
+
+    Returns
+    -------
+    (3,)
+        What coordinates are relative to [m].
+    """
+    return np.asarray(network.p_site.mean(axis=0))
+
+
+def start(network: Network) -> State:
+    """Return the approximate values.
+
+    Parameters
+    ----------
+    network : Network
+        The network.
+
+    Returns
+    -------
+    State
+        Relative to the middle.
+    """
+    middle = middle_of(network)
+    T = np.array(network.T_site_base)
+    T[:, :3, 3] -= middle
+    return State(T_site_base=T, p_site=network.p_site - middle)
+
+
+def step_to(state: State, xi: Array, dp: Array) -> State:
+    """Move a state.
+
+    Parameters
+    ----------
+    state : State
+        Where from.
+    xi : (s, 6)
+        Small motions of the stations, on the left.
+    dp : (m, 3)
+        Shifts of the marks [m].
+
+    Returns
+    -------
+    State
+        Where to.
+    """
+    return State(T_site_base=moved(state.T_site_base, xi), p_site=state.p_site + dp)
+
+
+def linearise(network: Network, state: State, used: Mask) -> Linearised:
+    """Return residuals, weights and derivatives.
+
+    Parameters
+    ----------
+    network : Network
+        What was observed.
+    state : State
+        Where.
+    used : (b,)
+        Which blocks count: centres, gravity of each station, control.
+
+    Returns
+    -------
+    Linearised
+        All blocks; those that are not used have no weight.
+    """
+    n, s = len(network.sightings), len(network.stations)
+    station, mark = network.sightings.T
+    R, t = state.T_site_base[:, :3, :3], state.T_site_base[:, :3, 3]
+    R_each = R[station]
+    p = np.einsum("nij,nj->ni", R_each, network.p_base) + t[station]
+    weights = R_each @ np.linalg.inv(network.cov_p_base) @ np.swapaxes(R_each, 1, 2)
+    up = np.einsum("sij,sj->si", R, network.R_station_base[:, 2])
+    cov_up = (R @ network.cov_up_base @ np.swapaxes(R, 1, 2))[:, :2, :2]
+    control = network.p_control_site - middle_of(network)
+    return Linearised(
+        v_centres=p - state.p_site[mark],
+        P_centres=weights * used[:n, None, None],
+        J_centres=np.concatenate([-skew(p), np.broadcast_to(np.eye(3), (n, 3, 3))], axis=2),
+        v_gravity=up[:, :2],
+        P_gravity=np.asarray(np.linalg.inv(cov_up)) * used[n : n + s, None, None],
+        J_gravity=np.concatenate([-skew(up)[:, :2], np.zeros((s, 2, 3))], axis=2),
+        v_control=control - state.p_site[network.controls],
+        P_control=np.asarray(np.linalg.inv(network.cov_control_site)) * used[n + s :, None, None],
+    )
+
+
+@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
+class _Reduced:
+    """Normal equations after the stations are eliminated.
+
+    ``A`` (s, 6, 6) are the stations' own blocks, ``K`` (s, 6, 3m) is ``A^-1`` times their coupling
+    to the marks, ``S`` (3m, 3m) the Schur complement; ``g`` and ``r`` the right sides.
+    """
+
+    A: Array
+    K: Array
+    S: Array
+    g: Array
+    r: Array
+
+
+def _reduce(network: Network, lin: Linearised) -> _Reduced:
+    """Set up the normal equations and eliminate the stations."""
+    s, m = len(network.stations), len(network.marks)
+    station, mark = network.sightings.T
+    pressed = np.swapaxes(lin.J_centres, 1, 2) @ lin.P_centres
+    levelled = np.swapaxes(lin.J_gravity, 1, 2) @ lin.P_gravity
+    stations, g = levelled @ lin.J_gravity, np.einsum("sij,sj->si", levelled, lin.v_gravity)
+    np.add.at(stations, station, pressed @ lin.J_centres)
+    np.add.at(g, station, np.einsum("nij,nj->ni", pressed, lin.v_centres))
+    coupling = np.zeros((s, 6, m, 3))
+    coupling[station, :, mark, :] = -pressed
+    marks, h = np.zeros((m, 3, 3)), np.zeros((m, 3))
+    np.add.at(marks, mark, lin.P_centres)
+    np.add.at(marks, network.controls, lin.P_control)
+    np.add.at(h, mark, -np.einsum("nij,nj->ni", lin.P_centres, lin.v_centres))
+    np.add.at(h, network.controls, -np.einsum("nij,nj->ni", lin.P_control, lin.v_control))
+    flat = coupling.reshape(s, 6, 3 * m)
+    solved = np.asarray(np.linalg.solve(stations, flat), dtype=np.float64)
+    reduced = -flat.reshape(6 * s, 3 * m).T @ solved.reshape(6 * s, 3 * m)
+    own = reduced.reshape(m, 3, m, 3)
+    own[np.arange(m), :, np.arange(m), :] += marks
+    r = -h.ravel() + np.einsum("sij,si->j", solved, g)
+    return _Reduced(A=stations, K=solved, S=(reduced + reduced.T) / 2.0, g=g, r=r)
+
+
+def _datum(network: Network, state: State) -> Array:
+    """Return orthonormal columns of what a free network leaves open: (3m, 4), or (3m, 0)."""
+    m = len(network.marks)
+    if not network.is_free:
+        return np.zeros((3 * m, 0))
+    motions = np.zeros((m, 3, N_DEFECT))
+    motions[:, [0, 1, 2], [0, 1, 2]] = 1.0
+    motions[:, 0, 3], motions[:, 1, 3] = -state.p_site[:, 1], state.p_site[:, 0]
+    return np.linalg.qr(motions.reshape(3 * m, N_DEFECT)).Q
+
+
+def _inverse(normal: Array, datum: Array) -> Array:
+    """Return the inverse of the reduced normal matrix, of least trace in a free network.
+
+    The inner constraints ``datum' dx = 0`` make it the pseudo-inverse (Meissl 1969).
+    """
+    scale = np.sqrt(np.diag(normal))
+    bordered = normal + float(np.mean(scale**2)) * datum @ datum.T
+    values = np.linalg.eigvalsh(bordered / np.outer(scale, scale))
+    if not values[0] > _SINGULAR:
+        raise DegenerateGeometryError(
+            "The observations do not hold the network together (smallest eigenvalue of the scaled "
+            f"normal matrix {values[0]:.1e}, at least {_SINGULAR:.0e} is needed): a station or a "
+            "group of marks can move on its own."
+        )
+    inverse = np.linalg.inv(bordered)
+    inverse = inverse - datum @ (datum.T @ inverse)
+    inverse = inverse - (inverse @ datum) @ datum.T
+    return np.asarray((inverse + inverse.T) / 2.0)
+
+
+def solve_network(network: Network, state: State, used: Mask) -> tuple[State, Cofactors]:
+    """Find the state for which the weighted sum of squares is least.
+
+    Parameters
+    ----------
+    network : Network
+        What was observed.
+    state : State
+        Approximate values.
+    used : (b,)
+        Which blocks count.
+
+    Returns
+    -------
+    tuple
+        State and cofactors.
+
+    Raises
+    ------
+    DegenerateGeometryError
+        If the observations leave more open than the datum of a free network.
+    NotConvergedError
+        If the steps do not become small against the standard deviations.
+
+    Notes
+    -----
+    Gauss-Newton. In a free network each step keeps the marks' centroid and mean heading where the
+    approximate values have them.
+    """
+    m = len(network.marks)
+    for _ in range(_STEPS):
+        reduced = _reduce(network, linearise(network, state, used))
+        cov_marks = _inverse(reduced.S, _datum(network, state))
+        dp = cov_marks @ reduced.r
+        own = np.linalg.solve(reduced.A, reduced.g[..., None])[..., 0]
+        xi = -own - reduced.K @ dp
+        state = step_to(state, xi, dp.reshape(m, 3))
+        size = np.einsum("si,si->", own, reduced.g) + reduced.r @ dp
+        if size < _SETTLED:
+            return state, _cofactors(reduced, cov_marks, m)
+    raise NotConvergedError(
+        f"The network did not settle within {_STEPS} steps; the approximate values are too far "
+        "off or the observations contradict each other."
+    )
+
+
+def _cofactors(reduced: _Reduced, cov_marks: Array, m: int) -> Cofactors:
+    """Return the covariances of stations and marks."""
+    between = -reduced.K @ cov_marks
+    stations = np.linalg.inv(reduced.A) - between @ np.swapaxes(reduced.K, 1, 2)
+    return Cofactors(
+        stations=(stations + np.swapaxes(stations, 1, 2)) / 2.0,
+        between=between.reshape(len(between), 6, m, 3),
+        marks=cov_marks,
+    )

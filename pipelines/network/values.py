@@ -1,0 +1,312 @@
+"""What goes into the adjustment of a network, and what comes out of it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from pipelines.errors import InputError
+from pipelines.values import Array, Index, Mask
+
+
+@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
+class Refusal:
+    """A station that is not in the network.
+
+    Attributes
+    ----------
+    station : str
+        Its name.
+    code : str
+        Stable code of the error.
+    reason : str
+        Why, as a sentence for people.
+    """
+
+    station: str
+    code: str
+    reason: str
+
+
+@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
+class LeftOut:
+    """An observation that is not used.
+
+    Attributes
+    ----------
+    kind : str
+        ``centre``, ``gravity`` or ``control``.
+    station : str
+        Whose observation; empty for a control mark.
+    fit : int
+        Place among the fits of the station; -1 where it is no centre.
+    mark : str
+        Name of the mark; empty where none is known.
+    reason : str
+        Why, as a sentence for people.
+    """
+
+    kind: str
+    station: str
+    fit: int
+    mark: str
+    reason: str
+
+
+@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
+class Network:
+    """Stations, marks and what was observed between them, with approximate values.
+
+    Attributes
+    ----------
+    stations : tuple of str
+        Names, all different.
+    marks : tuple of str
+        Names, all different.
+    sightings : (n, 2)
+        Place of station and mark of each observed centre, by station, each pair once.
+    fits : (n,)
+        Place of each centre among the fits of its station.
+    p_base : (n, 3)
+        Observed centres in the base frames of their stations [m].
+    cov_p_base : (n, 3, 3)
+        Their covariances, what all centres have in common included [m^2].
+    R_station_base : (s, 3, 3)
+        Measured levelling; the last row is the up direction in base.
+    cov_up_base : (s, 3, 3)
+        Covariance of that direction in base, of rank two [rad^2].
+    controls : (c,)
+        Places of the control marks among the marks.
+    p_control_site : (c, 3)
+        Their given coordinates [m]; none make a free network.
+    cov_control_site : (c, 3, 3)
+        Their covariances, regular [m^2].
+    T_site_base : (s, 4, 4)
+        Approximate poses [m].
+    p_site : (m, 3)
+        Approximate marks [m].
+    refused : tuple of Refusal
+        Stations that share too little with the others.
+    left_out : tuple of LeftOut
+        Centres that are no marks of the network, control marks that nobody saw.
+    """
+
+    stations: tuple[str, ...]
+    marks: tuple[str, ...]
+    sightings: Index
+    fits: Index
+    p_base: Array
+    cov_p_base: Array
+    R_station_base: Array
+    cov_up_base: Array
+    controls: Index
+    p_control_site: Array
+    cov_control_site: Array
+    T_site_base: Array
+    p_site: Array
+    refused: tuple[Refusal, ...] = ()
+    left_out: tuple[LeftOut, ...] = ()
+
+    def __post_init__(self) -> None:
+        n, s, m, c = (len(x) for x in (self.sightings, self.stations, self.marks, self.controls))
+        seal(
+            self,
+            {
+                "sightings": (n, 2),
+                "fits": (n,),
+                "p_base": (n, 3),
+                "cov_p_base": (n, 3, 3),
+                "R_station_base": (s, 3, 3),
+                "cov_up_base": (s, 3, 3),
+                "controls": (c,),
+                "p_control_site": (c, 3),
+                "cov_control_site": (c, 3, 3),
+                "T_site_base": (s, 4, 4),
+                "p_site": (m, 3),
+            },
+        )
+
+    @property
+    def is_free(self) -> bool:
+        """Whether nothing but the marks themselves tells where and how the network lies."""
+        return len(self.controls) == 0
+
+    @property
+    def n_blocks(self) -> int:
+        """Number of blocks of observations: centres, gravity of each station, control marks."""
+        return len(self.sightings) + len(self.stations) + len(self.controls)
+
+
+@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
+class BlockTests:
+    """Statistics of blocks of observations, one row per block.
+
+    Attributes
+    ----------
+    residuals : (b, k)
+        Observed minus computed, in the site frame [m], or of the up direction [rad].
+    redundancies : (b,)
+        Redundancy of the block's observations together; NaN where it is not used.
+    w_statistics : (b,)
+        Largest absolute w-statistic of the block; NaN where not testable or not used.
+    detectable_biases : (b,)
+        Minimal detectable bias along the weakest axis; infinite if none is, NaN if not used.
+    """
+
+    residuals: Array
+    redundancies: Array
+    w_statistics: Array
+    detectable_biases: Array
+
+    def __post_init__(self) -> None:
+        b = len(self.residuals)
+        columns = dict.fromkeys(("redundancies", "w_statistics", "detectable_biases"), (b,))
+        seal(self, {"residuals": self.residuals.shape, **columns})
+
+
+@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
+class AdjustedNetwork:
+    """All stations and marks of a survey, adjusted together.
+
+    Attributes
+    ----------
+    network : Network
+        What was observed.
+    T_site_station : (s, 4, 4)
+        Poses of the levelled frames [m].
+    cov_T_site_station : (s, 6, 6)
+        Covariance of a small motion of each, (rotation [rad], translation [m]) on the left.
+    p_site : (m, 3)
+        Marks [m].
+    cov_p_site : (3m, 3m)
+        Their joint covariance [m^2].
+    used : (b,)
+        Whether each block is used: centres, then gravity, then control marks.
+    centres : BlockTests
+        Of the observed centres.
+    gravity : BlockTests
+        Of the stations' levelling.
+    control : BlockTests
+        Of the control marks.
+    station_shifts : (n,)
+        External reliability: largest shift of its station that a just undetectable bias of each
+        centre causes; infinite where a bias cannot be detected, NaN where not used [m].
+    mark_shifts : (n,)
+        The same of its mark [m].
+    dof : int
+        Degrees of freedom: observations minus unknowns plus the datum's defect.
+    vtpv : float
+        Weighted sum of squares of the residuals.
+    sigma0 : float
+        Square root of the a-posteriori variance factor (a priori 1); NaN without redundancy.
+    passes_global_test : bool
+        Whether the residuals are no larger than the sigmas promise.
+    limit_vtpv : float
+        Largest ``vtpv`` that passes.
+    variance_factors : (3,)
+        Sum of squares over redundancy of centres, gravity and control; NaN without redundancy.
+    critical_w : float
+        Largest w that is not a gross error.
+    noncentrality : float
+        How many sigmas a bias must move w to be found with the power of the test.
+    left_out : tuple of LeftOut
+        All observations that are not used.
+    warnings : tuple of str
+        Why the network cannot be relied on, in sentences; empty when it can.
+    """
+
+    network: Network
+    T_site_station: Array
+    cov_T_site_station: Array
+    p_site: Array
+    cov_p_site: Array
+    used: Mask
+    centres: BlockTests
+    gravity: BlockTests
+    control: BlockTests
+    station_shifts: Array
+    mark_shifts: Array
+    dof: int
+    vtpv: float
+    sigma0: float
+    passes_global_test: bool
+    limit_vtpv: float
+    variance_factors: Array
+    critical_w: float
+    noncentrality: float
+    left_out: tuple[LeftOut, ...]
+    warnings: tuple[str, ...]
+
+    def __post_init__(self) -> None:
+        s, m = len(self.network.stations), len(self.network.marks)
+        n = len(self.network.sightings)
+        seal(
+            self,
+            {
+                "T_site_station": (s, 4, 4),
+                "cov_T_site_station": (s, 6, 6),
+                "p_site": (m, 3),
+                "cov_p_site": (3 * m, 3 * m),
+                "used": (self.network.n_blocks,),
+                "station_shifts": (n,),
+                "mark_shifts": (n,),
+                "variance_factors": (3,),
+            },
+        )
+
+    @property
+    def mark_covariances(self) -> Array:
+        """Covariance of each mark, (m, 3, 3) [m^2]."""
+        m = len(self.p_site)
+        return np.asarray(np.einsum("iaib->iab", self.cov_p_site.reshape(m, 3, m, 3)))
+
+    @property
+    def station_covariances(self) -> Array:
+        """Covariance of each station's position, (s, 3, 3) [m^2]."""
+        J = position_by_motion(self.T_site_station)
+        return np.asarray(J @ self.cov_T_site_station @ np.swapaxes(J, -1, -2))
+
+
+def position_by_motion(T: Array) -> Array:
+    """Return the derivative of the positions of poses by small motions on the left.
+
+    Parameters
+    ----------
+    T : (..., 4, 4)
+        Poses [m].
+
+    Returns
+    -------
+    (..., 3, 6)
+        ``[-[p]x, 1]``.
+    """
+    x, y, z = np.moveaxis(T[..., :3, 3], -1, 0)
+    J = np.zeros((*T.shape[:-2], 3, 6))
+    J[..., 0, 1], J[..., 1, 2], J[..., 2, 0] = z, x, y
+    J[..., 1, 0], J[..., 2, 1], J[..., 0, 2] = -z, -x, -y
+    J[..., [0, 1, 2], [3, 4, 5]] = 1.0
+    return J
+
+
+def seal(value: object, shapes: dict[str, tuple[int, ...]]) -> None:
+    """Check the shape of each named array and make it read-only.
+
+    Parameters
+    ----------
+    value : object
+        Whose arrays.
+    shapes : dict
+        Expected shape by name.
+
+    Raises
+    ------
+    InputError
+        If an array has another shape.
+    """
+    for name, shape in shapes.items():
+        array = getattr(value, name)
+        if array.shape != shape:
+            kind = type(value).__name__
+            raise InputError(f"{kind}.{name} has shape {array.shape}, not {shape}.")
+        array.flags.writeable = False

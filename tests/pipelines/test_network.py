@@ -1,0 +1,375 @@
+"""The network against a world whose truth is known, and against a dense solution of its own."""
+
+import re
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.optimize import least_squares
+from scipy.spatial.transform import Rotation
+
+from pipelines.config import ResectionConfig
+from pipelines.errors import DegenerateGeometryError, InputError
+from pipelines.geometry import inverse, levelling_rotation, log_motion, rigid
+from pipelines.network import adjust_network, assemble
+from pipelines.network.equations import linearise, start, step_to
+from pipelines.resection import resect
+from tests.synthetic import control, field, pose, sightings
+
+EXACT = 1e-7  # [m] and [rad] noise-free in, truth out
+CONFIG = ResectionConfig(sigma_common=0.0)
+SIGMA = 4e-3  # [m] of a centre, per axis
+LEVEL = 3e-3  # [rad] of roll and of pitch
+
+
+@pytest.fixture
+def rng():
+    return np.random.default_rng(47)
+
+
+def survey(rng, marks, n, *, sigma=SIGMA, level=LEVEL, only=None):
+    """Scans of n stations, with noise as claimed, and the true poses of base."""
+    scans, poses = [], []
+    for i in range(n):
+        lean = rng.uniform(-0.1, 0.1, 2)
+        place = marks.p_site.mean(axis=0) + rng.uniform([-4, -4, -0.4], [4, 4, 0])
+        T = pose(place, rng.uniform(-3, 3), lean)
+        seen = np.arange(len(marks.names)) if only is None else only[i]
+        visible = control(marks.p_site[seen])
+        fits = sightings(
+            visible, T, lean=tuple(lean + rng.normal(0, level, 2)), sigma_level=LEVEL,
+            cov=np.eye(3) * SIGMA**2, noise=rng.normal(0, sigma, (len(seen), 3)),
+        )  # fmt: skip
+        scans.append((f"stop{i + 1}", fits))
+        poses.append(T)
+    return scans, np.array(poses)
+
+
+def biased(scans, station, fit, shift):
+    """The scans with one centre moved."""
+    name, fits = scans[station]
+    moved = replace(fits.fits[fit], p_base=fits.fits[fit].p_base + shift)
+    others = (*fits.fits[:fit], moved, *fits.fits[fit + 1 :])
+    return [*scans[:station], (name, replace(fits, fits=others)), *scans[station + 1 :]]
+
+
+def network(scans, marks=None, config=CONFIG):
+    return adjust_network(assemble(scans, marks, config), config)
+
+
+def turned_back(estimated, true):
+    """The motion about the vertical, with translation, that lays marks on the true ones."""
+    a, b = estimated - estimated.mean(axis=0), true - true.mean(axis=0)
+    yaw = np.arctan2(np.sum(a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]), np.sum(a[:, :2] * b[:, :2]))
+    R = pose([0, 0, 0], yaw)[:3, :3]
+    return rigid(R, true.mean(axis=0) - R @ estimated.mean(axis=0))
+
+
+def order_of(result, marks, scans, poses):
+    """Which true mark each mark of a free network is, by one sighting of each."""
+    names = [name for name, _ in scans]
+    out = np.zeros(len(result.network.marks), np.intp)
+    rows = zip(result.network.sightings, result.network.p_base, strict=True)
+    for (station, mark), p in rows:
+        T = poses[names.index(result.network.stations[station])]
+        off = np.linalg.norm(marks.p_site - T[:3, :3] @ p - T[:3, 3], axis=1)
+        out[mark] = np.argmin(off)
+    return out
+
+
+@pytest.mark.parametrize("middle", [(0, 0, 0), (431_250.0, 5_412_800.0, 312.0)])
+def test_noise_free_centres_and_control_give_the_true_poses(rng, middle):
+    marks = field(rng, middle=middle)
+    scans, poses = survey(rng, marks, 4, sigma=0.0, level=0.0)
+    result = network(scans, marks)
+    R = np.array([levelling_rotation(fits.levelling) for _, fits in scans])
+    np.testing.assert_allclose(result.T_site_station[:, :3, 3], poses[:, :3, 3], rtol=0, atol=EXACT)
+    np.testing.assert_allclose(
+        result.T_site_station[:, :3, :3] @ R, poses[:, :3, :3], rtol=0, atol=EXACT
+    )
+    np.testing.assert_allclose(result.centres.residuals, 0, atol=EXACT)
+    assert result.left_out == ()
+    assert result.dof == 3 * 4 * 14 + 2 * 4 + 3 * 14 - 6 * 4 - 3 * 14
+
+
+def test_noise_free_centres_without_control_give_the_true_shape(rng):
+    marks = field(rng)
+    scans, poses = survey(rng, marks, 4, sigma=0.0, level=0.0)
+    result = network(scans)
+    order = order_of(result, marks, scans, poses)
+    back = turned_back(result.p_site, marks.p_site[order])
+    p = result.p_site @ back[:3, :3].T + back[:3, 3]
+    np.testing.assert_allclose(p, marks.p_site[order], rtol=0, atol=EXACT)
+    stations = (back @ result.T_site_station)[:, :3, 3]
+    np.testing.assert_allclose(stations, poses[:, :3, 3], rtol=0, atol=EXACT)
+
+
+def test_derivatives_agree_with_differences(rng):
+    marks = field(rng, 5)
+    scans, _ = survey(rng, marks, 3)
+    net = assemble(scans, marks, CONFIG)
+    state, used = start(net), np.ones(net.n_blocks, np.bool_)
+    state = step_to(state, rng.normal(0, 0.1, (3, 6)), rng.normal(0, 0.1, (5, 3)))
+    here, h = linearise(net, state, used), 1e-6
+    mark = net.sightings[:, 1]
+    for k in range(6):
+        xi = np.zeros((3, 6))
+        xi[:, k] = h
+        plus, minus = (
+            linearise(net, step_to(state, sign * xi, np.zeros((5, 3))), used) for sign in (1, -1)
+        )
+        numeric = (plus.v_centres - minus.v_centres) / (2 * h)
+        np.testing.assert_allclose(here.J_centres[..., k], numeric, rtol=0, atol=1e-7)
+        numeric = (plus.v_gravity - minus.v_gravity) / (2 * h)
+        np.testing.assert_allclose(here.J_gravity[..., k], numeric, rtol=0, atol=1e-7)
+    dp = rng.normal(0, 1, (5, 3))
+    there = linearise(net, step_to(state, np.zeros((3, 6)), dp), used)
+    np.testing.assert_allclose(there.v_centres - here.v_centres, -dp[mark], rtol=0, atol=1e-12)
+    expected = -dp[net.controls]
+    np.testing.assert_allclose(there.v_control - here.v_control, expected, rtol=0, atol=1e-12)
+
+
+def dense(net, levellings):
+    """Poses, marks and covariance of the marks by another parametrisation and a numeric Jacobian.
+
+    Roll, pitch, yaw and place of each station; residuals in base; nothing is eliminated.
+    """
+    s, m = len(net.stations), len(net.marks)
+    roots = np.linalg.inv(np.linalg.cholesky(net.cov_p_base))
+    roots_control = np.linalg.inv(np.linalg.cholesky(net.cov_control_site))
+    station, mark = net.sightings.T
+    tilts = np.array([[one.pitch, one.roll] for one in levellings])
+
+    def residuals(x):
+        angles, t = x[: 3 * s].reshape(s, 3), x[3 * s : 6 * s].reshape(s, 3)
+        p = x[6 * s :].reshape(m, 3)
+        R = Rotation.from_euler("ZYX", angles).as_matrix()[station]
+        v = net.p_base - np.einsum("nji,nj->ni", R, p[mark] - t[station])
+        whitened = np.einsum("nij,nj->ni", roots, v)
+        levels = (tilts - angles[:, 1:]) / LEVEL
+        given = np.einsum("nij,nj->ni", roots_control, net.p_control_site - p[net.controls])
+        centroid = (p - net.p_site).mean(axis=0) if net.is_free else np.zeros(0)
+        heading = (
+            [np.sum(np.cross(net.p_site - net.p_site.mean(axis=0), p)[:, 2]) / 100]
+            if net.is_free
+            else []
+        )
+        return np.concatenate(
+            [
+                whitened.ravel(),
+                levels.ravel(),
+                given.ravel(),
+                1e5 * centroid,
+                1e5 * np.array(heading),
+            ]
+        )
+
+    angles = Rotation.from_matrix(net.T_site_base[:, :3, :3]).as_euler("ZYX")
+    x0 = np.concatenate([angles.ravel(), net.T_site_base[:, :3, 3].ravel(), net.p_site.ravel()])
+    found = least_squares(residuals, x0, method="trf", xtol=1e-14, ftol=1e-14, gtol=1e-12)
+    cov = np.linalg.inv(found.jac.T @ found.jac)
+    return found.x, cov, 2 * found.cost
+
+
+@pytest.mark.parametrize("is_free", [True, False])
+def test_an_independent_dense_solution_agrees_to_a_tenth_of_a_millimetre(rng, is_free):
+    marks = field(rng, 8)
+    loose = replace(marks, cov_p_site=np.tile(np.eye(3) * 2e-3**2, (8, 1, 1)))
+    given = replace(loose, p_site=marks.p_site + rng.normal(0, 2e-3, (8, 3)))
+    scans, _ = survey(rng, marks, 5)
+    net = assemble(scans, None if is_free else given, CONFIG)
+    result = adjust_network(net, CONFIG)
+    assert result.used.all()
+    x, cov, vtpv = dense(net, [fits.levelling for _, fits in scans])
+    s = len(net.stations)
+    tenth = 1e-4  # [m]
+    np.testing.assert_allclose(result.p_site, x[6 * s :].reshape(-1, 3), rtol=0, atol=tenth)
+    p_stations = x[3 * s : 6 * s].reshape(-1, 3)
+    np.testing.assert_allclose(result.T_site_station[:, :3, 3], p_stations, rtol=0, atol=tenth)
+    sigmas = np.sqrt(np.diag(cov))
+    np.testing.assert_allclose(np.sqrt(np.diag(result.cov_p_site)), sigmas[6 * s :], rtol=0.02)
+    own = np.einsum("sii->si", result.station_covariances).ravel()
+    np.testing.assert_allclose(np.sqrt(own), sigmas[3 * s : 6 * s], rtol=0.02)
+    assert result.vtpv == pytest.approx(vtpv, rel=0.02)
+
+
+def test_one_station_with_control_is_a_free_station(rng):
+    marks = field(rng)
+    loose = replace(marks, cov_p_site=np.tile(np.eye(3) * 2e-3**2, (14, 1, 1)))
+    scans, _ = survey(rng, marks, 1)
+    fix, result = resect("free_station", scans[0][1], loose, CONFIG), network(scans, loose)
+    off = log_motion(result.T_site_station[0] @ inverse(fix.T_site_station))
+    np.testing.assert_allclose(off, 0, atol=2e-6)
+    np.testing.assert_allclose(result.cov_T_site_station[0], fix.cov_T_site_station, rtol=1e-2,
+                               atol=1e-9)  # fmt: skip
+    assert result.vtpv == pytest.approx(fix.sigma0**2 * fix.dof, rel=1e-3)
+
+
+@pytest.mark.parametrize("is_free", [True, False])
+def test_redundancies_add_up_to_the_degrees_of_freedom(rng, is_free):
+    marks = field(rng)
+    scans, _ = survey(rng, marks, 5)
+    result = network(scans, None if is_free else marks)
+    parts = (result.centres, result.gravity, result.control)
+    total = sum(float(np.sum(part.redundancies)) for part in parts)
+    assert total == pytest.approx(result.dof, abs=1e-6)
+
+
+def test_a_gross_error_of_five_centimetres_is_found_and_named(rng):
+    marks = field(rng)
+    scans, poses = survey(rng, marks, 6)
+    clean = network(scans, marks)
+    result = network(biased(scans, 3, 5, [0.03, -0.03, 0.026]), marks)
+    assert clean.left_out == ()
+    (out,) = result.left_out
+    assert (out.kind, out.station, out.fit, out.mark) == ("centre", "stop4", 5, "F")
+    said = float(re.search(r"it is ([\d.]+) m", out.reason).group(1))
+    assert said == pytest.approx(0.05, abs=3 * SIGMA)
+    off = np.linalg.norm(result.T_site_station[3, :3, 3] - poses[3, :3, 3])
+    assert off < 5e-3
+    assert np.isnan(
+        result.centres.redundancies[~result.used[: len(result.centres.residuals)]]
+    ).all()
+
+
+def test_a_contradicting_control_mark_is_found_and_named(rng):
+    marks = field(rng)
+    scans, _ = survey(rng, marks, 6)
+    p = marks.p_site.copy()
+    p[2] += [0.06, 0.0, -0.05]
+    result = network(scans, control(p))
+    (out,) = result.left_out
+    assert (out.kind, out.mark) == ("control", "C")
+    said = float(re.search(r"are ([\d.]+) m", out.reason).group(1))
+    assert said == pytest.approx(0.078, abs=2 * SIGMA)
+    assert result.passes_global_test
+
+
+def test_a_control_mark_that_is_far_off_is_named_with_what_stands_beside_it(rng):
+    marks = field(rng)
+    scans, _ = survey(rng, marks, 4)
+    p = marks.p_site.copy()
+    p[2] += [0.3, 0.3, 0.0]
+    result = network(scans, control(p))
+    (out,) = result.left_out
+    assert (out.kind, out.mark) == ("control", "C")
+    assert "N01 stands 0.42 m from it" in out.reason
+
+
+def test_two_control_marks_that_contradict_each_other_are_both_named(rng):
+    marks = control([[6.9, 1.1, 0.6], [-3.9, 7.1, 1.5]])
+    scans, _ = survey(rng, marks, 6)
+    p = marks.p_site.copy()
+    p[1] += 0.06 * (p[1] - p[0]) / np.linalg.norm(p[1] - p[0])
+    result = network(scans, control(p))
+    assert not result.passes_global_test
+    assert any("The control marks A (w =" in one and "B (w =" in one for one in result.warnings)
+
+
+def test_two_control_marks_among_many_markers_are_not_enough_to_find_them(rng):
+    marks = field(rng)
+    scans, _ = survey(rng, marks, 2)
+    with pytest.raises(DegenerateGeometryError, match="no station sees two marks"):
+        network(scans, control(marks.p_site[:2]))
+
+
+def test_a_station_that_shares_no_mark_is_refused_and_costs_no_other(rng):
+    marks = field(rng)
+    scans, _ = survey(rng, marks, 4)
+    elsewhere, _ = survey(rng, field(rng, 9, radius=11.0), 1)
+    result = network([*scans[:2], ("lost", elsewhere[0][1]), *scans[2:]], marks)
+    assert [one.station for one in result.network.refused] == ["lost"]
+    assert "shares too few marks" in result.network.refused[0].reason
+    assert result.network.stations == ("stop1", "stop2", "stop3", "stop4")
+
+
+def test_a_station_with_one_marker_is_refused_and_costs_no_other(rng):
+    marks = field(rng)
+    only = [np.arange(14)] * 3 + [np.array([4])]
+    scans, _ = survey(rng, marks, 4, only=only)
+    (refused,) = network(scans).network.refused
+    assert refused.station == "stop4"
+    assert "One marker was found" in refused.reason
+
+
+def test_stations_in_a_row_are_chained_through_the_marks_they_share(rng):
+    angle = np.arange(24) * 2.399963  # the golden angle: no two distances repeat
+    p = np.stack([2.0 * np.arange(24), 6 * np.cos(angle), 1 + 0.4 * np.sin(3 * angle)], axis=1)
+    marks = control(p)
+    only = [np.arange(first, first + 12) for first in (0, 6, 12)]
+    scans, poses = survey(rng, marks, 3, only=only, sigma=1e-4, level=1e-5)
+    result = network(scans)
+    assert len(result.network.marks) == 12  # that two stations share
+    assert sum(one.kind == "centre" for one in result.left_out) == 12
+    order = order_of(result, marks, scans, poses)
+    back = turned_back(result.p_site, marks.p_site[order])
+    off = (back @ result.T_site_station)[:, :3, 3] - poses[:, :3, 3]
+    assert np.linalg.norm(off, axis=1).max() < 2e-3
+
+
+def test_moving_the_control_moves_the_network_and_nothing_else(rng):
+    marks = field(rng)
+    scans, _ = survey(rng, marks, 4)
+    shift = pose((812.0, -65.0, 33.0), 2.1)
+    elsewhere = control(marks.p_site @ shift[:3, :3].T + shift[:3, 3])
+    here, there = network(scans, marks), network(scans, elsewhere)
+    np.testing.assert_allclose(there.T_site_station, shift @ here.T_site_station, rtol=0, atol=1e-7)
+    np.testing.assert_allclose(
+        there.station_covariances,
+        shift[:3, :3] @ here.station_covariances @ shift[:3, :3].T,
+        rtol=0, atol=1e-10,
+    )  # fmt: skip
+    np.testing.assert_allclose(
+        there.centres.redundancies, here.centres.redundancies, rtol=0, atol=1e-5
+    )
+
+
+def test_a_network_of_one_station_without_control_is_refused(rng):
+    scans, _ = survey(rng, field(rng), 1)
+    with pytest.raises(DegenerateGeometryError, match="no two stations share two marks"):
+        network(scans)
+
+
+def test_two_logs_of_one_name_are_refused(rng):
+    scans, _ = survey(rng, field(rng), 1)
+    with pytest.raises(InputError, match="Two logs are called 'stop1'"):
+        network(scans * 2)
+
+
+def test_an_undetected_bias_moves_a_station_by_no_more_than_is_said(rng):
+    marks = field(rng, 6)
+    scans, _ = survey(rng, marks, 3, sigma=0.0, level=0.0)
+    clean = network(scans, marks)
+    k = 7
+    station, _ = clean.network.sightings[k]
+    fit = int(clean.network.fits[k])
+    shifts = []
+    for _ in range(30):
+        v = rng.normal(size=3)
+        moved = network(biased(scans, station, fit, 5e-3 * v / np.linalg.norm(v)), marks)
+        off = moved.T_site_station[station, :3, 3] - clean.T_site_station[station, :3, 3]
+        off = float(np.linalg.norm(off))
+        shifts.append(off * clean.noncentrality / np.sqrt(moved.vtpv))  # just detectable
+    assert 0.7 * clean.station_shifts[k] < max(shifts) <= 1.001 * clean.station_shifts[k]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("is_free", [True, False])
+def test_the_covariances_of_a_network_are_honest(rng, is_free):
+    stations, all_marks = [], []
+    for _ in range(60):
+        marks = field(rng, 10)
+        scans, poses = survey(rng, marks, 8)
+        result = network(scans, None if is_free else marks, replace(CONFIG, test_level=1e-6))
+        order = order_of(result, marks, scans, poses)
+        back = turned_back(result.p_site, marks.p_site[order]) if is_free else np.eye(4)
+        off = (back @ result.T_site_station)[:, :3, 3] - poses[:, :3, 3]
+        R = back[:3, :3]
+        cov = R @ result.station_covariances @ R.T
+        stations.append(np.mean(np.einsum("si,sij,sj->s", off, np.linalg.inv(cov), off)) / 3)
+        if is_free:
+            e = (result.p_site @ R.T + back[:3, 3] - marks.p_site[order]) @ R
+            pinv = np.linalg.pinv(result.cov_p_site, rcond=1e-9, hermitian=True)
+            all_marks.append(e.ravel() @ pinv @ e.ravel() / (30 - 4))
+    assert 0.85 < np.mean(stations) < 1.2
+    assert not all_marks or 0.85 < np.mean(all_marks) < 1.2
