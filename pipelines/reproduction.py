@@ -483,11 +483,13 @@ def table_4(made: Reproduction) -> tuple[Table4Row, ...]:
     Returns
     -------
     tuple of Table4Row
-        In the order of the stops.
+        In the order of the stops, those that were scanned.
     """
     centres, rows = made.centres, []
     for stop in _STOPS_OF_LANE_2:
         scans = np.array([i for i in made.series(LANE_2) if made.scans[i].stop == stop], np.intp)
+        if not len(scans):
+            continue
         keep = {method: centres.of(method, scans) for method in (OURS, PAPER)}
         rows.append(
             Table4Row(
@@ -497,7 +499,7 @@ def table_4(made: Reproduction) -> tuple[Table4Row, ...]:
                     m: summarise(centres.error_3d[k], made.config.tolerance)
                     for m, k in keep.items()
                 },
-                mean_range=float(centres.ranges[keep[OURS]].mean()),
+                mean_range=float(centres.ranges[keep[OURS]].mean()) if keep[OURS].any() else np.nan,
             )
         )
     return tuple(rows)

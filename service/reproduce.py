@@ -9,7 +9,7 @@ from __future__ import annotations
 import csv
 import shutil
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -29,7 +29,6 @@ from pipelines.reproduction import (
     LANE_2,
     OURS,
     PAPER,
-    Finding,
     RangeNoise,
     Reproduction,
     Table2Row,
@@ -70,44 +69,37 @@ class Wish:
     tolerance: float = study.TOLERANCE
 
 
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Real:
+    """What was measured in real scans: noise by sensor, and one row for each sphere."""
+
+    noises: Mapping[str, RangeNoise] = field(default_factory=dict)
+    spheres: Sequence[Plain] = ()
+
+
 def run(folder: Path, wish: Wish, progress: Progress) -> Plain:
     """Simulate, fit, and write the page with its tables and figures; return the statements."""
     config = SurveyConfig.from_mapping(
         {"tolerance": wish.tolerance, "fitting": {"methods": [OURS, PAPER]}}
     )
-    noises, spheres = _real(wish.real, config) if wish.real else ({}, [])
+    real = _real(wish.real, config) if wish.real else None
     made = reproduce(plan(wish.seed, is_quick=wish.is_quick), config, progress=progress)
-    found = findings(made, np.random.default_rng(wish.seed))
-    page = _page(made, found, wish, noises, spheres)
+    page = page_of(made, wish, real)
     folder.mkdir(parents=True, exist_ok=True)
     (folder / "index.html").write_text(reproduction_page(page), "utf-8")
     shutil.copyfile(assets.plotly_script(), folder / assets.plotly_script().name)
     _write_figures(folder / "figures", page)
     _write_tables(folder, made, page)
-    return _report(folder, made, found, page)
+    return _report(folder, made, page)
 
 
-def _page(
-    made: Reproduction,
-    found: Sequence[Finding],
-    wish: Wish,
-    noises: Mapping[str, RangeNoise],
-    spheres: Sequence[Plain],
-) -> ReproductionPage:
+def page_of(made: Reproduction, wish: Wish, real: Real | None = None) -> ReproductionPage:
     """Put everything into the shape of the page."""
+    real = real or Real()
     return ReproductionPage(
-        tolerance_m=wish.tolerance,
+        tolerance_m=made.config.tolerance,
         scans=[asdict(scan) for scan in made.scans],
-        statements=tuple(
-            Statement(
-                method=one.method,
-                place=one.place,
-                model=one.model,
-                p95=one.limits["p95"],
-                mean=one.limits["mean"],
-            )
-            for one in found
-        ),
+        statements=_statements(made, wish.seed),
         table_2=table_2(made),
         table_4=table_4(made),
         icp=models_of_icp(made),
@@ -115,11 +107,25 @@ def _page(
         centre=_columns(made, made.series(CENTRE)),
         lane=_columns(made, made.series(LANE_2)),
         level=_columns(made, made.series(DISTANCES)),
-        noises={_SIMULATED: made.noise, **noises},
-        spheres=[_simulated_spheres(made), *spheres],
+        noises={_SIMULATED: made.noise, **real.noises},
+        spheres=[_simulated_spheres(made), *real.spheres],
         code_version=code_version(),
         config_digest=made.config.digest,
         seed=wish.seed,
+    )
+
+
+def _statements(made: Reproduction, seed: int) -> tuple[Statement, ...]:
+    """Say what each method keeps in each place."""
+    return tuple(
+        Statement(
+            method=one.method,
+            place=one.place,
+            model=one.model,
+            p95=one.limits["p95"],
+            mean=one.limits["mean"],
+        )
+        for one in findings(made, np.random.default_rng(seed))
     )
 
 
@@ -163,7 +169,7 @@ def _simulated_spheres(made: Reproduction) -> Plain:
     }
 
 
-def _real(folder: Path, config: SurveyConfig) -> tuple[dict[str, RangeNoise], list[Plain]]:
+def _real(folder: Path, config: SurveyConfig) -> Real:
     """Measure the real scans of a folder: packets (.bin) for noise, points (.xyz) with a sphere."""
     packets = sorted(folder.glob("vlp16_packets/*.bin"))
     points = sorted(folder.glob("vlp16_spheres/*.xyz"))
@@ -175,7 +181,8 @@ def _real(folder: Path, config: SurveyConfig) -> tuple[dict[str, RangeNoise], li
     for path in packets[:1]:
         shots = read_packets(path)
         noises[_REAL] = range_noise(shots.ranges, shots.rings, shots.offsets_ns, shots.intensities)
-    return noises, [_real_sphere(path.stem, read_points(path), config) for path in points]
+    spheres = [_real_sphere(path.stem, read_points(path), config) for path in points]
+    return Real(noises=noises, spheres=spheres)
 
 
 def _real_sphere(name: str, p: Column, config: SurveyConfig) -> Plain:
@@ -290,9 +297,7 @@ def _plain(value: object) -> object:
     return value
 
 
-def _report(
-    folder: Path, made: Reproduction, found: Iterable[Finding], page: ReproductionPage
-) -> Plain:
+def _report(folder: Path, made: Reproduction, page: ReproductionPage) -> Plain:
     """Return what the command prints."""
     published = study.TABLE_2.errors_3d
     return {
@@ -311,9 +316,6 @@ def _report(
         "table2": _json(_row_2(row) for row in page.table_2),
         "table4": _json(_row_4(row) for row in page.table_4),
         "statements": _json(_statement(one) | {"said": _said(one)} for one in page.statements),
-        "errors": [
-            {"place": one.place, "fit_method": one.method, **asdict(one.errors)} for one in found
-        ],
         "icp_models": {name: asdict(errors) for name, errors in page.icp.items()},
         "range_noise_m": {
             name: [None if np.isnan(s) else float(s) for s in noise.sigmas]
