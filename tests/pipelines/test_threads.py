@@ -1,0 +1,45 @@
+import threading
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from pipelines.config import StitchingConfig
+from pipelines.stitching import stitch
+from pipelines.threads import side_by_side
+from tests.synthetic import crooked_rig, scan_log
+
+
+@pytest.mark.parametrize("n_rows", [0, 1, 7, 49_999, 50_000, 100_001])
+def test_every_row_is_done_once_and_in_order(n_rows):
+    parts = side_by_side(lambda first, end: np.arange(first, end), n_rows)
+    np.testing.assert_array_equal(np.concatenate(parts), np.arange(n_rows))
+
+
+def test_parts_are_done_at_the_same_time():
+    meeting = threading.Barrier(2, timeout=10.0)  # breaks unless both parts get there
+    assert len(side_by_side(lambda _first, _end: meeting.wait(), 10, worth=2)) == 2
+
+
+def test_an_error_in_any_part_reaches_the_caller():
+    def fail_late(first, _end):
+        if first:
+            raise ArithmeticError("the second part")
+
+    with pytest.raises(ArithmeticError, match="the second part"):
+        side_by_side(fail_late, 10, worth=2)
+
+
+def test_returns_left_out_in_either_half_leave_no_gap():
+    rng = np.random.default_rng(4)
+    rig = crooked_rig(rng)
+    log, _ = scan_log(rng, rig, n=120_000)
+    log = replace(log, intensities=np.arange(120_000, dtype=np.float32))  # tells rows apart
+    whole = stitch(log, rig, StitchingConfig())
+    reach = np.linalg.norm(log.p_lidar, axis=1)
+    limits = StitchingConfig(range_min=float(np.quantile(reach, 0.3)))
+    part = stitch(log, rig, limits)
+    keep = np.isin(whole.intensities, part.intensities)
+    assert 50_000 < len(part.p_base) < len(whole.p_base)
+    for column in ("p_base", "gimbal_angles", "intensities", "rings", "times"):
+        np.testing.assert_array_equal(getattr(part, column), getattr(whole, column)[keep])
