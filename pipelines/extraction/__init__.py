@@ -24,11 +24,16 @@ from pipelines.extraction.looks import Look, look_at
 from pipelines.extraction.patches import cells_of, near, patches_about
 from pipelines.extraction.seeds import find_seeds
 from pipelines.extraction.sights import sights
-from pipelines.extraction.verdicts import distinct, score, verdict, verdict_on_sight
+from pipelines.extraction.verdicts import (
+    distinct,
+    score,
+    verdict,
+    verdict_among_others,
+    verdict_on_sight,
+)
 from pipelines.geometry import levelling_rotation
 from pipelines.values import (
     Array,
-    Column,
     Index,
     MarkerCandidate,
     MarkerCandidates,
@@ -76,7 +81,7 @@ def extract(
     seeds = find_seeds(cloud.p_base, grid.is_above, ball, config.n_points_min)
     looks = distinct(look_at(cloud, grid, seeds, ball), config, marker_radius)
     verdicts = [verdict(look, config, ball) for look in looks]
-    verdicts = _sighted(cloud.p_base, looks, verdicts, ball)
+    verdicts = _sighted(cloud, looks, verdicts, ball)
     good = [look for look, reason in zip(looks, verdicts, strict=True) if not reason]
     bad = [(look, reason) for look, reason in zip(looks, verdicts, strict=True) if reason]
     return MarkerCandidates(
@@ -89,14 +94,19 @@ def extract(
     )
 
 
-def _sighted(p_base: Column, looks: list[Look], verdicts: list[str], ball: Ball) -> list[str]:
+def _sighted(cloud: StitchedCloud, looks: list[Look], verdicts: list[str], ball: Ball) -> list[str]:
     """Return the verdicts after a second look, at all beams towards and about what is left."""
-    left = [i for i, reason in enumerate(verdicts) if not reason]
-    centres = np.array([looks[i].p_base for i in left]).reshape(-1, 3)
-    out = list(verdicts)
-    for i, sight in zip(left, sights(p_base, centres, ball), strict=True):
-        out[i] = verdict_on_sight(looks[i], sight, ball)
-    return out
+    left = [look for look, reason in zip(looks, verdicts, strict=True) if not reason]
+    seen = sights(cloud, np.array([look.p_base for look in left]).reshape(-1, 3), ball)
+    reasons = [verdict_on_sight(look, sight, ball) for look, sight in zip(left, seen, strict=True)]
+    good = [
+        (look, sight) for look, sight, reason in zip(left, seen, reasons, strict=True) if not reason
+    ]
+    later = iter(
+        reason or verdict_among_others(look, sight, good)
+        for look, sight, reason in zip(left, seen, reasons, strict=True)
+    )
+    return [reason or next(later) for reason in verdicts]
 
 
 def _candidates(

@@ -10,10 +10,11 @@ from typing import NamedTuple
 
 import numba
 import numpy as np
+from numpy.typing import NDArray
 
 from pipelines.extraction.ball import Ball, view
 from pipelines.threads import side_by_side
-from pipelines.values import Array, Column, Mask
+from pipelines.values import Array, Column, Mask, StitchedCloud
 
 _N_FACE = 256  # cells along a face of the cube of directions: 0.45 deg
 _REACH = 4.0  # radii about a centre: shoulders lie within three radii below a head
@@ -43,6 +44,8 @@ class Sight(NamedTuple):
         Returns there that lie behind it.
     n_short : int
         Returns there that end long before it.
+    brightness : float
+        Mean reflectivity of the first ones, 0-255.
     """
 
     n_on: int
@@ -52,15 +55,27 @@ class Sight(NamedTuple):
     n_held: int
     n_past: int
     n_short: int
+    brightness: float
+
+    @property
+    def is_open_below(self) -> bool:
+        """Tell whether most beams below it, beside a pole's place, go on past it.
+
+        Returns
+        -------
+        bool
+            False if they are stopped, by what it rests on or by something nearer.
+        """
+        return self.n_held + self.n_short <= 1 + self.n_past
 
 
-def sights(p_base: Column, centres: Array, ball: Ball) -> list[Sight]:
+def sights(cloud: StitchedCloud, centres: Array, ball: Ball) -> list[Sight]:
     """Count the beams towards and about some centres by where they end.
 
     Parameters
     ----------
-    p_base : (n, 3) float32
-        All returns of the stop [m].
+    cloud : StitchedCloud
+        One stop.
     centres : (k, 3)
         Centres of groups that may be balls [m].
     ball : Ball
@@ -75,26 +90,32 @@ def sights(p_base: Column, centres: Array, ball: Ball) -> list[Sight]:
         return []
     is_wanted = _directions_about(centres, ball.up, (_REACH + 0.5) * ball.radius + 0.05)
     parts = side_by_side(
-        lambda first, end: _in_directions(p_base[first:end], is_wanted), len(p_base)
+        lambda first, end: _in_directions(cloud.p_base[first:end], is_wanted) + first,
+        len(cloud.p_base),
     )
-    points = np.concatenate(parts)
-    return [Sight(*_counted(points, centre, ball)) for centre in centres]
+    rows = np.concatenate(parts)
+    points, intensities = cloud.p_base[rows], cloud.intensities[rows]
+    return [Sight(*_counted(points, intensities, centre, ball)) for centre in centres]
 
 
 @numba.njit(cache=True, nogil=True)
-def _counted(points: Column, c: Array, ball: Ball) -> tuple[int, int, int, float, int, int, int]:
+def _counted(
+    points: Column, intensities: Column, c: Array, ball: Ball
+) -> tuple[int, int, int, float, int, int, int, float]:
     """Return the fields of a sight."""
     radius, distance = ball.radius, np.sqrt(np.sum(c**2))
     blur = 0.5 * ball.divergence * distance / radius
-    seen, _, _ = view(_towards(points, c, (_REACH + blur) * radius / distance), c, ball.up)
+    rows = _towards(points, c, (_REACH + blur) * radius / distance)
+    seen, _, _ = view(points[rows].astype(np.float64), c, ball.up)
     n_on, n_through, n_before, n_held, n_past, n_short = 0, 0, 0, 0, 0, 0
-    total = 0.0
+    gaps2, light = 0.0, 0.0
     for i in range(len(seen)):
         across, along, depth = np.abs(seen[i, 0]) / radius, seen[i, 1] / radius, seen[i, 2] / radius
         gap = np.hypot(across, along)
         if gap < 1.0 + blur and along > -0.9 and _ON[0] < depth < _ON[1]:
             n_on += 1
-            total += gap * gap
+            gaps2 += gap * gap
+            light += intensities[rows[i]]
         elif gap < 0.8:
             n_through += depth > 1.0
             n_before += depth <= _ON[0]
@@ -103,12 +124,13 @@ def _counted(points: Column, c: Array, ball: Ball) -> tuple[int, int, int, float
             n_past += depth > _HELD[1]
             n_short += depth < _HELD[0]
             n_held += _HELD[0] <= depth <= _HELD[1]
-    return n_on, n_through, n_before, total / max(n_on, 1), n_held, n_past, n_short
+    n = max(n_on, 1)
+    return n_on, n_through, n_before, gaps2 / n, n_held, n_past, n_short, light / n
 
 
 @numba.njit(cache=True, nogil=True)
-def _towards(points: Column, c: Array, tangent: float) -> Array:
-    """Return the points that are seen within an angle, given by its tangent, of a centre."""
+def _towards(points: Column, c: Array, tangent: float) -> NDArray[np.int32]:
+    """Return the rows of the points within an angle, given by its tangent, of a centre."""
     x, y, z = c
     least = (x * x + y * y + z * z) / (1.0 + tangent * tangent)
     rows = np.empty(len(points), np.int32)
@@ -118,7 +140,7 @@ def _towards(points: Column, c: Array, tangent: float) -> Array:
         along = x * px + y * py + z * pz
         rows[n_rows] = i  # kept only if the next one does not take its place
         n_rows += along > 0.0 and along * along > least * (px * px + py * py + pz * pz)
-    return points[rows[:n_rows]].astype(np.float64)
+    return rows[:n_rows]
 
 
 @numba.njit(cache=True, nogil=True)
@@ -138,14 +160,14 @@ def _directions_about(centres: Array, up: Array, reach: float) -> Mask:
 
 
 @numba.njit(cache=True, nogil=True)
-def _in_directions(p_base: Column, is_wanted: Mask) -> Column:
-    """Return the points, at whatever depth, in the cells that are wanted."""
+def _in_directions(p_base: Column, is_wanted: Mask) -> NDArray[np.int32]:
+    """Return the rows of the points, at whatever depth, in the cells that are wanted."""
     rows = np.empty(len(p_base), np.int32)
     n_rows = 0
     for i in range(len(p_base)):
         rows[n_rows] = i  # kept only if the next one does not take its place
         n_rows += is_wanted[_direction_cell(p_base[i, 0], p_base[i, 1], p_base[i, 2])]
-    return p_base[rows[:n_rows]]
+    return rows[:n_rows]
 
 
 @numba.njit(cache=True, nogil=True)

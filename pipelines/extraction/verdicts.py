@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 
 from pipelines.config import ExtractionConfig
@@ -18,6 +20,9 @@ _SPREAD_SIGMAS = 3.3  # standard deviations of a spread: centres are estimated, 
 _SPREAD_SLACK = 0.15  # of a spread: less is no reason to refuse
 _N_SURE = 20  # returns that show a shape well enough to say that something hides the rest
 _SHAPE_SURE = 0.05  # of the radius: the same, of the standard deviation of the free radius
+_N_KNOWN = 3  # markers that are open below, to compare others with
+_UNLIKE = 0.25  # share by which the reflectivity of a marker may differ from that of the others
+_NOISIER = 1.5  # factor by which the scatter of a marker may exceed that of the others
 _HIDDEN = 2.0  # as many returns before a ball as on it: two thirds of it are hidden
 
 
@@ -177,9 +182,52 @@ def verdict_on_sight(look: Look, sight: Sight, ball: Ball) -> str:
             "place lie about as far away, as on shoulders, a larger stone or the ground.",
         ),
         (
-            sight.n_held + sight.n_short > 1 + sight.n_past and not _may_be_hidden(look, ball),
+            not (sight.is_open_below or _may_be_hidden(look, ball)),
             f"It rests on the ground: of {n_below} beams that pass below it beside a pole's "
             f"place, {sight.n_held + sight.n_short} end at its distance or nearer.",
+        ),
+    )
+    return next((reason for is_so, reason in tests if is_so), "")
+
+
+def verdict_among_others(look: Look, sight: Sight, others: Sequence[tuple[Look, Sight]]) -> str:
+    """Return why a group whose pole is hidden differs from markers that are open below.
+
+    Parameters
+    ----------
+    look : Look
+        What the group looks like.
+    sight : Sight
+        Where the beams towards and about it end.
+    others : sequence of (Look, Sight)
+        Groups that have passed the other tests, this one among them or not.
+
+    Returns
+    -------
+    str
+        The reason as a sentence for people; empty if it is open below, if it is like the others,
+        or if there are too few others to tell.
+
+    Notes
+    -----
+    A stone behind a crest and a marker behind a crest look alike. The markers of a survey share
+    their paint, and with it reflectivity and noise.
+    """
+    known = [other for other in others if other[1].is_open_below]
+    if sight.is_open_below or len(known) < _N_KNOWN:
+        return ""
+    brightness = float(np.median([other.brightness for _, other in known]))
+    scatter = float(np.median([max(other.scatter, NOISE_MIN) for other, _ in known]))
+    tests = (
+        (
+            abs(sight.brightness - brightness) > _UNLIKE * brightness,
+            f"What it stands on is hidden, and its reflectivity is {sight.brightness:.0f}, that of "
+            f"the markers {brightness:.0f}.",
+        ),
+        (
+            look.scatter > _NOISIER * scatter,
+            f"What it stands on is hidden, and its returns scatter by {1e3 * look.scatter:.0f} mm, "
+            f"those of the markers by {1e3 * scatter:.0f} mm.",
         ),
     )
     return next((reason for is_so, reason in tests if is_so), "")
