@@ -126,6 +126,9 @@ def _print_peers(out: Console, report: Plain) -> None:
         out.print(_table(("centres", "found", "false", "RMS error [mm]"), rows))
 
 
+_SAID = ("distance", "count", "mean_distance", "mean_count")
+
+
 def print_reproduction(out: Console, report: Plain) -> None:
     """Print the study's tables again, and what keeps the tolerance."""
     study, tolerance = report["study"], 1e3 * report["tolerance_m"]
