@@ -72,7 +72,8 @@ _SCHEMAS = {
         **dict.fromkeys(("range_m", "azimuth_deg", "elevation_deg"), _REAL),
         **dict.fromkeys(("n_points", "n_rejected", "n_rings"), _WHOLE),
         **dict.fromkeys(("coverage", "rms_m", "sigma0", "radius_m", "radius_free_m"), _REAL),
-        **dict.fromkeys(("sigma_radius_free_m", "mean_intensity"), _REAL),
+        **dict.fromkeys(("sigma_radius_free_m", "mean_intensity", "incidence_deg"), _REAL),
+        "variant": _TEXT,
         **_ERROR,
         "error_radial_m": _REAL,
         "error_3d_m": _REAL,
@@ -348,6 +349,8 @@ def _fit_row(fit: MarkerFit, R_station_base: Array, sigma_heading: float) -> Row
         "radius_free_m": fit.radius_free,
         "sigma_radius_free_m": fit.sigma_radius_free,
         "mean_intensity": fit.mean_intensity,
+        "incidence_deg": np.degrees(fit.incidence),
+        "variant": fit.variant,
     }
 
 
@@ -365,7 +368,7 @@ def _fix_row(fix: StationFix | NoFix, sigma_heading: float) -> Row:
         "cov_motion": fix.cov_T_site_station.ravel().tolist(),
         "sigma_3d_m": fix.sigma_3d,
         "sigma_yaw_deg": np.degrees(np.hypot(fix.sigma_yaw, sigma_heading)),
-        **_ellipse(fix.cov_p_site[:2, :2]),
+        **ellipse(fix.cov_p_site[:2, :2]),
         "n_markers": len(fix.matches),
         "dof": fix.dof,
         "sigma0": fix.sigma0,
@@ -375,8 +378,19 @@ def _fix_row(fix: StationFix | NoFix, sigma_heading: float) -> Row:
     }
 
 
-def _ellipse(cov_horizontal: Array) -> Row:
-    """Return the ellipse of a horizontal covariance, standard and 95 %."""
+def ellipse(cov_horizontal: Array) -> Row:
+    """Return the ellipse of a horizontal covariance, standard and 95 %.
+
+    Parameters
+    ----------
+    cov_horizontal : (2, 2)
+        Covariance of x and y [m^2].
+
+    Returns
+    -------
+    dict
+        Semi-axes [m] and the bearing of the major one, clockwise from y [deg].
+    """
     variances, axes = np.linalg.eigh(cov_horizontal)
     minor, major = np.sqrt(np.maximum(variances, 0.0))
     return {
