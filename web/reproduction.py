@@ -133,6 +133,8 @@ def before_and_after_cut(example: Example) -> go.Figure:
             "text": f"Sphere points before and after the study's cut, at {example.distance:.2f} m"
         },
     )
+    figure.update_layout(margin={"t": 92}, legend={"y": 1.14})
+    figure.update_annotations(font={"size": 13, "color": theme.MUTED})
     mm = example.points_station * _MM
     for column, keep in ((1, np.ones(len(mm), dtype=np.bool_)), (2, example.is_left)):
         true = _outline(example.radius, (0.0, 0.0), theme.MUTED, "true sphere")
