@@ -217,6 +217,56 @@ def process(
 
 
 @app.command()
+def adjust(
+    logs: Annotated[list[Path], typer.Argument(metavar="LOG...", exists=True, dir_okay=False)],
+    control: Annotated[
+        Path | None,
+        typer.Option(exists=True, dir_okay=False, help="Control marks (CSV); else a free network."),
+    ] = None,
+    rig: Annotated[
+        Path | None, typer.Option(exists=True, dir_okay=False, help="Rig (JSON), if not the logs'.")
+    ] = None,
+    method: Annotated[str, typer.Option(help="Fitting method.")] = "along_beam",
+    radius_m: Annotated[float, typer.Option(help="Radius of the spheres \\[m].")] = 0.100,
+    gama: Annotated[
+        Path | None, typer.Option(dir_okay=False, help="Write input of GNU Gama (XML).")
+    ] = None,
+    csv: Annotated[
+        Path | None, typer.Option(dir_okay=False, help="Write stations and marks (CSV).")
+    ] = None,
+    report: Annotated[
+        Path | None, typer.Option(dir_okay=False, help="Write the whole report (text).")
+    ] = None,
+    as_json: AsJson = False,
+) -> None:
+    """Adjust all stations and marks of a survey together."""
+    from pipelines.config import SurveyConfig
+    from service import networks, tables
+    from storage import site_files
+    from storage.networks import write_coordinates, write_gama
+
+    config = SurveyConfig.from_mapping(
+        {"marker_radius": radius_m, "fitting": {"methods": [method]}}
+    )
+    marks = site_files.read_control(control) if control else None
+    given = site_files.read_rig(rig) if rig else None
+    with _progress() as progress:
+        book = networks.read_scans(logs, config, given, progress)
+    result = networks.adjust_scans(book, marks, config)
+    answer = networks.network_answer(result, config)
+    if gama:
+        write_gama(result, gama)
+    if csv:
+        write_coordinates(result, csv)
+    if report:
+        report.write_text(networks.report(answer), encoding="utf-8")
+    if as_json:
+        _print_json(answer)
+    else:
+        tables.print_network(out, answer)
+
+
+@app.command()
 def query(
     sql: Annotated[str, typer.Argument(help="One SELECT.")],
     url: Annotated[str | None, typer.Option(help="Address of a running service.")] = None,

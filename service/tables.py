@@ -170,6 +170,38 @@ def print_reproduction(out: Console, report: Plain) -> None:
     out.print(f"{report['n_scans']} scans, seed {report['seed']}. Page: {report['page']}")
 
 
+def print_network(out: Console, answer: Plain) -> None:
+    """Print stations and marks of a network, and what it rests on."""
+    verdict = "passed" if answer["passes_global_test"] else "[red]failed[/]"
+    out.print(
+        f"[bold]Network[/]: {_coloured(answer['status'])}  {len(answer['stations'])} stations, "
+        f"{len(answer['marks'])} marks, {answer['dof']} degrees of freedom, sigma0 "
+        f"{_fixed(answer['sigma0'], 2)}, global test {verdict}"
+    )
+    out.print(answer["datum"]["text"], highlight=False, soft_wrap=True)
+    for warning in answer["warnings"]:
+        out.print(f"[yellow]Warning:[/] {escape(warning)}", highlight=False, soft_wrap=True)
+    for kind in ("stations", "marks"):
+        rows = [
+            (
+                row["name"],
+                *(f"{value:.4f}" for value in row["position_m"]),
+                f"{1e3 * row['sigma_3d_m']:.1f}",
+                f"{1e3 * row['ellipse_major_95_m']:.1f} x {1e3 * row['ellipse_minor_95_m']:.1f}",
+                str(row["n_observations"]),
+            )
+            for row in answer[kind]
+        ]
+        heads = ("x [m]", "y [m]", "z [m]", "sigma [mm]", "95 % ellipse [mm]", "centres")
+        out.print(_table((kind[:-1], *heads), rows))
+    for one in answer["refused"]:
+        out.print(f"  {one['station']}: {escape(one['reason'])}", highlight=False, soft_wrap=True)
+    for one in answer["excluded"]:
+        what = " ".join(part for part in (one["station"], one["marker"], one["mark"]) if part)
+        text = f"  {one['kind'].capitalize()} {what}: {escape(one['reason'])}"
+        out.print(text, highlight=False, soft_wrap=True)
+
+
 def to_csv(answer: Plain) -> str:
     """Return an answer in SQL as CSV."""
     text = io.StringIO()
