@@ -4,11 +4,14 @@ from __future__ import annotations
 
 import subprocess
 from pathlib import Path
+from time import monotonic, sleep
 
 import duckdb
 
 from pipelines.errors import ConflictError
 
+_PATIENCE = 10.0  # [s] to wait for readers: a query of ours takes milliseconds
+_PAUSE = 0.002  # [s] between two tries
 _N_KEPT = 3  # one may still be being opened while the next two are made
 
 
@@ -49,7 +52,7 @@ class Snapshots:
         files = self._files()
         if files and version == self._version:
             return files[-1]
-        connection.execute("CHECKPOINT")
+        _checkpoint(connection)
         number = 1 + (int(files[-1].stem.split("-")[1]) if files else 0)
         target = self._folder / f"snapshot-{number:09d}.duckdb"
         _copy(self._path, target)
@@ -61,6 +64,20 @@ class Snapshots:
     def _files(self) -> list[Path]:
         """Return the copies that are there, oldest first."""
         return sorted(self._folder.glob("snapshot-*.duckdb"))
+
+
+def _checkpoint(connection: duckdb.DuckDBPyConnection) -> None:
+    """Write everything into the file; DuckDB refuses while somebody still reads an older state."""
+    deadline = monotonic() + _PATIENCE
+    while True:
+        try:
+            connection.execute("CHECKPOINT")
+        except duckdb.TransactionException:
+            if monotonic() > deadline:
+                raise
+            sleep(_PAUSE)
+        else:
+            return
 
 
 def _copy(source: Path, target: Path) -> None:
