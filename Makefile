@@ -13,7 +13,7 @@ export OPENBLAS_NUM_THREADS ?= 1
 help:
 	@sed -n 's/^# //p' Makefile
 
-setup: .venv/.ready
+setup: .venv/.ready .venv/.kernels
 
 .venv/.ready: requirements.lock pyproject.toml
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info[:2] != (3, 11))' || \
@@ -24,7 +24,12 @@ setup: .venv/.ready
 	@echo "Installing the pinned packages into .venv (a few minutes the first time) ..."
 	@$(BIN)/python -m pip install --quiet --disable-pip-version-check -r requirements.lock
 	@$(BIN)/python -m pip install --quiet --disable-pip-version-check --no-deps --editable .
+	@touch $@
+
+# numba's cache does not see that a kernel calls another one which has changed
+.venv/.kernels: .venv/.ready $(shell git ls-files 'pipelines/*.py' 'storage/*.py')
 	@echo "Compiling the numerical kernels, once ..."
+	@find pipelines storage -name '*.nb[ic]' -delete
 	@$(BIN)/python -m service.tasks
 	@touch $@
 
