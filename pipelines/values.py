@@ -449,6 +449,10 @@ class MarkerFit:
         Number of different lasers among the used returns; 0 when rings are not recorded.
     coverage : float
         Share of the visible half of the sphere that has returns, 0 to 1.
+    incidence : float
+        Mean angle between the used beams and the sphere's normals; NaN when not told [rad].
+    variant : str
+        Which form of its method ran, where it has several; else empty.
     """
 
     p_base: Array
@@ -467,6 +471,8 @@ class MarkerFit:
     sigma0: float
     n_rings: int
     coverage: float
+    incidence: float = np.nan
+    variant: str = ""
 
     def __post_init__(self) -> None:
         _seal(

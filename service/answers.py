@@ -147,6 +147,8 @@ def _marker(name: str, fit: MarkerFit, R_frame_base: Array, sigma_heading: float
         "n_rejected": len(fit.rejected),
         "n_rings": fit.n_rings,
         "coverage": _number(fit.coverage),
+        "incidence_deg": _number(math.degrees(fit.incidence)),
+        "variant": fit.variant,
         "rms_m": _number(fit.rms),
         "sigma0": _number(fit.sigma0),
         "radius_m": fit.radius,

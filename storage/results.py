@@ -72,7 +72,8 @@ _SCHEMAS = {
         **dict.fromkeys(("range_m", "azimuth_deg", "elevation_deg"), _REAL),
         **dict.fromkeys(("n_points", "n_rejected", "n_rings"), _WHOLE),
         **dict.fromkeys(("coverage", "rms_m", "sigma0", "radius_m", "radius_free_m"), _REAL),
-        **dict.fromkeys(("sigma_radius_free_m", "mean_intensity"), _REAL),
+        **dict.fromkeys(("sigma_radius_free_m", "mean_intensity", "incidence_deg"), _REAL),
+        "variant": _TEXT,
         **_ERROR,
         "error_radial_m": _REAL,
         "error_3d_m": _REAL,
@@ -348,6 +349,8 @@ def _fit_row(fit: MarkerFit, R_station_base: Array, sigma_heading: float) -> Row
         "radius_free_m": fit.radius_free,
         "sigma_radius_free_m": fit.sigma_radius_free,
         "mean_intensity": fit.mean_intensity,
+        "incidence_deg": np.degrees(fit.incidence),
+        "variant": fit.variant,
     }
 
 

@@ -1,8 +1,15 @@
 """Candidate -> marker centre with covariance, by named methods.
 
 Hides how a centre is estimated. A method takes all candidates of a stop together, because they
-share the noise and the lasers of one sensor: ``along_beam`` is maximum likelihood with the range
-of each beam's footprint, ``paper`` is the study's registration of a hemisphere by ICP.
+share the noise and the lasers of one sensor:
+
+- ``along_beam`` is maximum likelihood with the range of each beam's footprint,
+- ``silhouette`` adds which shots hit and which passed by,
+- ``astm_e3125`` is the surveyors' standard: cone, cylinder, 3 sigma,
+- ``free_radius`` and ``algebraic`` estimate the radius too, for comparison,
+- ``paper`` is the study's registration of a hemisphere by ICP.
+
+``bound`` says how well ranges can tell a centre at all: only comparisons with truth use it.
 """
 
 from __future__ import annotations
@@ -11,14 +18,21 @@ from collections.abc import Callable
 
 from pipelines.config import FittingConfig
 from pipelines.errors import ConfigError
-from pipelines.fitting import along_beam, paper
+from pipelines.fitting import along_beam, astm, free, paper, silhouette
 from pipelines.values import MarkerCandidates, MarkerFit, MarkerFits, Rejection, StitchedCloud
 
 Method = Callable[
     [StitchedCloud, MarkerCandidates, FittingConfig, float],
     tuple[tuple[MarkerFit, ...], tuple[Rejection, ...]],
 ]
-METHODS: dict[str, Method] = {along_beam.NAME: along_beam.fit, paper.NAME: paper.fit}
+METHODS: dict[str, Method] = {
+    along_beam.NAME: along_beam.fit,
+    silhouette.NAME: silhouette.fit,
+    astm.NAME: astm.fit,
+    free.GEOMETRIC: free.fit_geometric,
+    free.ALGEBRAIC: free.fit_algebraic,
+    paper.NAME: paper.fit,
+}
 
 
 def fit_markers(

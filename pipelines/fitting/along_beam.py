@@ -12,7 +12,8 @@ from typing import NamedTuple
 import numpy as np
 
 from pipelines.config import FittingConfig
-from pipelines.fitting.footprint import Prediction, predict, share_of_outline
+from pipelines.fitting.description import Fits, incidence, refused, sentence, weaknesses
+from pipelines.fitting.footprint import Linear, linearise, share_of_outline
 from pipelines.geometry import levelling_rotation
 from pipelines.stitching import beams
 from pipelines.values import (
@@ -30,6 +31,7 @@ from pipelines.values import (
 )
 
 NAME = "along_beam"
+WITHOUT_RINGS = "rings unknown: laser heights and biases not applied"
 
 # Range noise of a VLP-16 by reflectivity, from recorded packets [m]: a prior, for the ratio between
 # dark and bright; its size is estimated from the stop.
@@ -38,27 +40,28 @@ _SIGMAS = np.array([0.0137, 0.0107, 0.0089, 0.0067, 0.0064])
 _FACTOR_MIN = 0.08  # of the prior noise: 2 mm quantisation alone gives as much
 _FACTOR_START = 3.0  # the largest noise that a VLP-16 shows, 25 mm
 
-_TUKEY = 6.0  # sigmas at which a return has no weight; 98 % efficient on clean data
-_EXPECTED_SQUARE = 0.8449  # mean of weight times square of normal residuals: 1 - 6/c^2 + 15/c^4
-_EFFICIENCY = (
-    0.9651  # variance of the estimate over the inverse normal matrix: E[w^2 x^2]E[w]/E[.]^2
-)
-_POLE_BEGINS = 0.97  # radii below the centre: a footprint that reaches lower may be on the pole
-_POLE_HALF = 0.45  # radii from the vertical through the centre within which the pole is
+_TUKEY = 8.0  # sigmas at which a return has no weight; 99 % efficient on clean data
+_EXPECTED_SQUARE = 0.9099  # mean of weight times square of normal residuals
+_EFFICIENCY = 0.9753  # variance of the estimate over the inverse normal matrix
+_POLE_BEGINS = 1.0  # radii below the centre: a footprint that begins lower is on the pole
+_POLE_HALF = 0.25  # radii from the vertical through the centre within which the pole is
 _SPREAD_MIN = 1e-5  # [m] of the laser biases: keeps their prior invertible
 _N_STEPS_FREE = 4
-_N_STEPS = 12
-_N_STEPS_GATED = 6  # after these the choice of returns by their place stays as it is
+_N_STEPS = 8
+_N_STEPS_GATED = 5  # after these the choice of returns by their place stays as it is
+_ROUGH = 0.1  # radii by which a rough centre may be off per axis
 _STEP_MAX = 0.25  # radii per step
 _STRAY = 0.6  # radii that a centre may move from its rough place
 _N_MIN = 4  # returns: one more than unknowns
-_LIT_MIN = 0.2  # share of a footprint below which a return counts less, down to nothing
+_GAP_SIGMAS = 3.0  # of its centre by which a return may pass a sphere by and still be its own
+_GAP_MIN, _GAP_MAX = 0.02, 0.3  # radii: least and most of that
 _DOF_STOP = 100.0  # returns that the stop's noise is worth when a marker's own is judged
+_DOF_CLASS = 30.0  # returns that the common noise is worth when that of a class is estimated
 _DOF_BIAS = 2.0  # lasers that the prior of the biases is worth when their spread is estimated
 
-_N_GOOD = 20  # returns below which a centre is called weak
-_COVERAGE_GOOD = 0.6
-_RADIUS_SIGMAS = 4.0  # its own sigma is too small by a third on fifty returns, by half on twenty
+_RADIUS_SIGMAS = 3.5
+_RADIUS_INFLATION = 1.5  # what few returns add to the variance of a free radius: 1 + this exp(-n /
+_RADIUS_RETURNS = 100.0  # this), by Monte Carlo
 _RADIUS_SLACK = 0.006  # [m] by which a free radius may be off whatever its sigma
 _NOISE_FACTOR = 1.6  # of the stop's noise, above which a marker is called weak
 
@@ -76,6 +79,8 @@ class _Shots(NamedTuple):
         The candidate of each.
     sigmas : (n,)
         Prior noise [m].
+    classes : (n,)
+        Class of reflectivity, darkest first.
     lasers : (n,)
         Place of each return's laser among those that occur.
     sigma_biases : (k,)
@@ -88,6 +93,7 @@ class _Shots(NamedTuple):
     rows: Index
     which: Index
     sigmas: Array
+    classes: Index
     lasers: Index
     sigma_biases: Array
     up: Array
@@ -108,8 +114,10 @@ class _State(NamedTuple):
         Whether biases are estimated already.
     factor : float
         Noise in units of the prior.
+    factors : (c,)
+        The same by class of reflectivity.
     cov_noise, cov_biases : (m, 3, 3)
-        Covariances of the centres by noise and by biases, for a factor of 1 [m^2].
+        Covariances of the centres by noise and by biases [m^2].
     """
 
     centres: Array
@@ -117,6 +125,7 @@ class _State(NamedTuple):
     spread: Array
     has_biases: bool
     factor: float
+    factors: Array
     cov_noise: Array
     cov_biases: Array
 
@@ -125,7 +134,7 @@ class _Estimate(NamedTuple):
     """A state with what each return says of it: prediction, residuals [m], sigmas [m], weights."""
 
     state: _State
-    prediction: Prediction
+    linear: Linear
     residuals: Array
     sigmas: Array
     weights: Array
@@ -133,7 +142,7 @@ class _Estimate(NamedTuple):
 
 def fit(
     cloud: StitchedCloud, found: MarkerCandidates, config: FittingConfig, radius: float
-) -> tuple[tuple[MarkerFit, ...], tuple[Rejection, ...]]:
+) -> Fits:
     """Fit all candidates of a stop along their beams, with known radius.
 
     Parameters
@@ -157,9 +166,11 @@ def fit(
     Notes
     -----
     Along the beam the residual of a known radius has one minimum (Franaszek, Cheok, Saidi,
-    Witzgall, 2009). Iteratively reweighted Gauss-Newton with Tukey's weight; the noise factor
-    is pooled over the stop, and laser biases are random effects of all markers together, whose
-    spread is estimated by expectation maximisation. Each step costs one pass over the returns.
+    Witzgall, 2009), save for what the limb adds: there ranges bend so fast that they are linearised
+    over the width of the centre's own uncertainty (``footprint.linearise``). Iteratively reweighted
+    least squares with Tukey's weight; the noise is pooled over the stop, by reflectivity where
+    returns are many, and laser biases are random effects of all markers together, whose spread is
+    estimated by expectation maximisation. Each step costs one pass over the returns.
     """
     if not found.candidates:
         return (), ()
@@ -181,15 +192,19 @@ def _gather(
     """Return the members of all candidates as one table of shots."""
     rows = np.concatenate([c.members for c in candidates])
     which = np.repeat(np.arange(len(candidates)), [len(c.members) for c in candidates])
+    is_finite = np.isfinite(cloud.p_base[rows]).all(axis=1)
+    rows, which = rows[is_finite], which[is_finite]
     table = beams(cloud, rows)
     lasers, places = np.unique(table.rings, return_inverse=True)
     # returns of unknown lasers come from all sixteen: their common part is what is left of a bias
     sigma = np.where(lasers == RING_UNKNOWN, config.sigma_range_bias / 4.0, config.sigma_range_bias)
+    classes = np.digitize(table.intensities, _REFLECTIVITIES)
     return _Shots(
         beams=table,
         rows=rows,
         which=which,
-        sigmas=_SIGMAS[np.digitize(table.intensities, _REFLECTIVITIES)],
+        sigmas=_SIGMAS[classes],
+        classes=classes,
         lasers=places.astype(np.intp),
         sigma_biases=sigma,
         up=levelling_rotation(cloud.levelling)[2],
@@ -203,8 +218,12 @@ def _summed(values: Array, place: Index, n_places: int) -> Array:
     return np.asarray(np.stack(sums, axis=1).reshape(n_places, *values.shape[1:]))
 
 
-def _in_play(shots: _Shots, prediction: Prediction, radius: float) -> Mask:
-    """Tell which returns may be the sphere by their place: on its outline, and not on its pole."""
+def _in_play(shots: _Shots, state: _State, linear: Linear, radius: float) -> Mask:
+    """Tell which returns may be the sphere by their place: on its outline, and not on its pole.
+
+    What passes by no farther than the centre may be off is kept: to leave out returns of the limb
+    wherever the present centre misses them would make every centre right in its own eyes.
+    """
     beams = shots.beams
     u, a = beams.directions_base, beams.across_base
     b = np.cross(u, a)
@@ -213,21 +232,28 @@ def _in_play(shots: _Shots, prediction: Prediction, radius: float) -> Mask:
     axes = np.stack([np.einsum("ij,ij->i", a, v_up), np.einsum("ij,ij->i", b, v_up)], axis=1)
     half_widths = 0.5 * beams.ranges[:, None] * beams.divergence
     blur = np.linalg.norm(half_widths * axes, axis=1)
-    along = np.einsum("ij,ij->i", prediction.offsets, axes)
-    across = prediction.offsets[:, 0] * axes[:, 1] - prediction.offsets[:, 1] * axes[:, 0]
-    is_pole = (along - blur < -_POLE_BEGINS * radius) & (
-        np.abs(across) < _POLE_HALF * radius + blur
+    blur_across = np.linalg.norm(half_widths * axes[:, ::-1], axis=1)
+    along = np.einsum("ij,ij->i", linear.offsets, axes)
+    across = linear.offsets[:, 0] * axes[:, 1] - linear.offsets[:, 1] * axes[:, 0]
+    is_pole = (along + blur < -_POLE_BEGINS * radius) & (
+        np.abs(across) < _POLE_HALF * radius + blur_across
     )
-    return np.asarray((prediction.lit > 0.0) & ~is_pole)
+    off = np.linalg.norm(linear.offsets, axis=1)
+    inward = linear.offsets / np.maximum(off, 1e-9)[:, None]
+    gap = off - radius - np.linalg.norm(half_widths * inward, axis=1)
+    sigma = np.sqrt(np.trace(state.cov_noise, axis1=1, axis2=2))
+    margin = np.clip(_GAP_SIGMAS * sigma, _GAP_MIN * radius, _GAP_MAX * radius)
+    return np.asarray((gap < margin[shots.which]) & ~is_pole)
 
 
-def _sigmas(shots: _Shots, prediction: Prediction, config: FittingConfig) -> Array:
-    """Return the prior noise of each range: its own, and that of the direction on a slope [m]."""
-    J = prediction.J[:, :3]
+def _sigmas(shots: _Shots, linear: Linear, factors: Array, config: FittingConfig) -> Array:
+    """Return the noise of each range: its own, that of the direction on a slope, the bend [m]."""
+    J = linear.J[:, :3]
     along = np.einsum("ij,ij->i", J, shots.beams.directions_base)
     slopes2 = np.maximum(np.einsum("ij,ij->i", J, J) - along**2, 0.0)
     lateral = config.sigma_direction * shots.beams.ranges
-    return np.asarray(np.sqrt(shots.sigmas**2 + lateral**2 * slopes2))
+    own = factors[shots.classes] * shots.sigmas
+    return np.asarray(np.sqrt(own**2 + lateral**2 * slopes2 + linear.bends**2))
 
 
 def _tukey(scaled: Array) -> Array:
@@ -235,11 +261,19 @@ def _tukey(scaled: Array) -> Array:
     return np.where(np.abs(scaled) < _TUKEY, (1.0 - (scaled / _TUKEY) ** 2) ** 2, 0.0)
 
 
-def _factor(scaled: Array, weights: Array, n_unknowns: int, dof_prior: float) -> float:
-    """Return the noise in units of the prior from weighted residuals, robustly and consistently."""
-    dof = max(float(np.sum(weights > 0.0)) - n_unknowns, 1.0 - dof_prior)
-    total = float(np.sum(weights * scaled**2)) / _EXPECTED_SQUARE
-    return max(float(np.sqrt((total + dof_prior) / (dof + dof_prior))), _FACTOR_MIN)
+def _factors(shots: _Shots, state: _State, scaled: Array, weights: Array) -> tuple[float, Array]:
+    """Return the noise in units of the prior: of all returns, and by class of reflectivity.
+
+    A class is believed to have the factor of all until it has returns enough to speak for itself.
+    """
+    squares = state.factors[shots.classes] ** 2 * weights * scaled**2 / _EXPECTED_SQUARE
+    by_class = np.bincount(shots.classes, squares, len(_SIGMAS))
+    counts = np.bincount(shots.classes, weights > 0.0, len(_SIGMAS))
+    n = max(float(counts.sum()), 1.0)
+    dof = max(n - 3.0 * len(state.centres), 0.0)
+    factor2 = (by_class.sum() + 1.0) / (dof + 1.0)
+    own = (by_class + _DOF_CLASS * factor2) / (counts * dof / n + _DOF_CLASS)
+    return max(float(np.sqrt(factor2)), _FACTOR_MIN), np.maximum(np.sqrt(own), _FACTOR_MIN)
 
 
 class _Normals(NamedTuple):
@@ -269,7 +303,7 @@ class _Normals(NamedTuple):
 def _normals(shots: _Shots, estimate: _Estimate) -> _Normals:
     """Sum the normal equations of centres and biases."""
     m, k = len(estimate.state.centres), len(shots.sigma_biases)
-    J, residuals = estimate.prediction.J[:, :3], estimate.residuals
+    J, residuals = estimate.linear.J[:, :3], estimate.residuals
     weights = estimate.weights / estimate.sigmas**2
     mixed = _summed(weights[:, None] * J, shots.which * k + shots.lasers, m * k)
     return _Normals(
@@ -287,22 +321,19 @@ def _stepped(state: _State, N: _Normals, prior: Array, radius: float) -> _State:
     The centres are eliminated first (Schur's complement), so that the cost is linear in markers. A
     prior of a metre on each centre keeps the equations solvable and is not felt otherwise.
     """
-    variance = state.factor**2
-    inverse = np.linalg.inv(N.centres + variance * np.eye(3))
+    inverse = np.linalg.inv(N.centres + np.eye(3))
     spread2 = np.maximum(state.spread, _SPREAD_MIN) ** 2
     by_bias = inverse @ N.mixed
-    reduced = np.diag(N.biases + variance / spread2)
+    reduced = np.diag(N.biases + 1.0 / spread2)
     cov_biases = np.linalg.inv(reduced - np.einsum("mik,mij->kj", N.mixed, by_bias))
     pull = N.pull_biases - np.einsum("mik,mi->k", by_bias, N.pull_centres)
-    d_biases = cov_biases @ (pull - variance * state.biases / spread2) * state.has_biases
+    d_biases = cov_biases @ (pull - state.biases / spread2) * state.has_biases
     d_centres = np.einsum("mij,mj->mi", inverse, N.pull_centres - N.mixed @ d_biases)
-    lengths = np.linalg.norm(d_centres, axis=1, keepdims=True)
-    d_centres *= np.minimum(1.0, _STEP_MAX * radius / np.maximum(lengths, 1e-12))
     biases = state.biases + d_biases
-    known2 = (biases**2 + variance * np.diag(cov_biases)).sum() + _DOF_BIAS * np.mean(prior**2)
+    known2 = (biases**2 + np.diag(cov_biases)).sum() + _DOF_BIAS * np.mean(prior**2)
     spread = prior * np.sqrt(known2 / (_DOF_BIAS + len(prior)) / np.mean(prior**2))
     return state._replace(
-        centres=state.centres + d_centres,
+        centres=state.centres + _shortened(d_centres, radius),
         biases=biases,
         spread=spread if state.has_biases else prior,
         cov_noise=np.asarray(_EFFICIENCY * inverse, dtype=np.float64),
@@ -310,75 +341,90 @@ def _stepped(state: _State, N: _Normals, prior: Array, radius: float) -> _State:
     )
 
 
+def _shortened(steps: Array, radius: float) -> Array:
+    """Return steps of centres, (m, 3), none longer than a quarter of the radius [m]."""
+    lengths = np.linalg.norm(steps, axis=1, keepdims=True)
+    return np.asarray(steps * np.minimum(1.0, _STEP_MAX * radius / np.maximum(lengths, 1e-12)))
+
+
 def _estimate(shots: _Shots, rough: Array, config: FittingConfig, radius: float) -> _Estimate:
     """Return the estimate of all centres and biases from rough centres."""
-    n_lasers = len(shots.sigma_biases)
     nothing = np.zeros((len(rough), 3, 3))
     state = _State(
         centres=rough,
-        biases=np.zeros(n_lasers),
+        biases=np.zeros(len(shots.sigma_biases)),
         spread=shots.sigma_biases,
         has_biases=False,
         factor=_FACTOR_START,
-        cov_noise=nothing,
+        factors=np.full(len(_SIGMAS), _FACTOR_START),
+        cov_noise=nothing + (_ROUGH * radius) ** 2 * np.eye(3),
         cov_biases=nothing,
     )
-    radii = np.full(len(rough), radius)
     is_in = np.ones(len(shots.rows), dtype=bool)
     for step in range(_N_STEPS):
-        prediction = predict(shots.beams, state.centres, radii, shots.which)
+        linear = _linear(shots, state, radius)
         if step < _N_STEPS_GATED:
-            is_in = _in_play(shots, prediction, radius)
-        estimate = _weighed(shots, state, prediction, is_in, config)
+            is_in = _in_play(shots, state, linear, radius)
+        estimate = _weighed(shots, state, linear, is_in, config)
         state = estimate.state._replace(has_biases=step >= _N_STEPS_GATED)
         state = _stepped(state, _normals(shots, estimate), shots.sigma_biases, radius)
-    prediction = predict(shots.beams, state.centres, radii, shots.which)
-    return _weighed(shots, state, prediction, is_in, config)
+    return _weighed(shots, state, _linear(shots, state, radius), is_in, config)
+
+
+def _linear(shots: _Shots, state: _State, radius: float) -> Linear:
+    """Return what the beams should measure, linearised over what is not known of the centres."""
+    spheres = np.column_stack([state.centres, np.full(len(state.centres), radius)])
+    return linearise(shots.beams, spheres, state.cov_noise + state.cov_biases, shots.which)
 
 
 def _weighed(
-    shots: _Shots, state: _State, prediction: Prediction, is_in: Mask, config: FittingConfig
+    shots: _Shots, state: _State, linear: Linear, is_in: Mask, config: FittingConfig
 ) -> _Estimate:
     """Return residuals, their weights and the stop's noise at a state."""
-    residuals = shots.beams.ranges - prediction.ranges - state.biases[shots.lasers]
-    sigmas = _sigmas(shots, prediction, config)
-    grazing = is_in * np.minimum(prediction.lit / _LIT_MIN, 1.0)
-    weights = grazing * _tukey(residuals / sigmas / state.factor)
-    factor = _factor(residuals / sigmas, weights, 3 * len(state.centres), 1.0)
+    residuals = shots.beams.ranges - linear.ranges - state.biases[shots.lasers]
+    scaled = residuals / _sigmas(shots, linear, state.factors, config)
+    factor, factors = _factors(shots, state, scaled, is_in * _tukey(scaled))
+    sigmas = _sigmas(shots, linear, factors, config)
     return _Estimate(
-        state=state._replace(factor=factor),
-        prediction=prediction,
+        state=state._replace(factor=factor, factors=factors),
+        linear=linear,
         residuals=residuals,
         sigmas=sigmas,
-        weights=weights,
+        weights=is_in * _tukey(residuals / sigmas),
     )
 
 
 def _free_radii(shots: _Shots, estimate: _Estimate, radius: float) -> tuple[Array, Array]:
     """Return radii estimated together with the centres, and their sigmas; NaN if undetermined."""
     n = len(estimate.state.centres)
-    centres, radii = estimate.state.centres, np.full(n, radius)
-    weights = estimate.weights / estimate.sigmas**2
+    spheres = np.column_stack([estimate.state.centres, np.full(n, radius)])
+    covs: Array = np.zeros((n, 4, 4))
+    covs[:, :3, :3] = estimate.state.cov_noise + estimate.state.cov_biases
+    covs[:, 3, 3] = np.trace(covs, axis1=1, axis2=2)
     ranges = shots.beams.ranges - estimate.state.biases[shots.lasers]
-    inverse: Array = np.zeros((n, 4, 4))
+    own2 = np.maximum(estimate.sigmas**2 - estimate.linear.bends**2, 1e-12)
     for _ in range(_N_STEPS_FREE):
-        prediction = predict(shots.beams, centres, radii, shots.which)
-        J, residuals = prediction.J, ranges - prediction.ranges
+        linear = linearise(shots.beams, spheres, covs, shots.which)
+        weights = estimate.weights / (own2 + linear.bends**2)
+        J, residuals = linear.J, ranges - linear.ranges
         N = _summed(weights[:, None, None] * J[:, :, None] * J[:, None, :], shots.which, n)
         pull = _summed((weights * residuals)[:, None] * J, shots.which, n)
-        inverse = np.asarray(np.linalg.inv(N + estimate.state.factor**2 * np.eye(4)))
-        step = np.einsum("mij,mj->mi", inverse, pull)
-        centres = centres + np.clip(step[:, :3], -_STEP_MAX * radius, _STEP_MAX * radius)
-        radii = radii + np.clip(step[:, 3], -_STEP_MAX * radii, _STEP_MAX * radii)
-    sigmas = estimate.state.factor * np.sqrt(_EFFICIENCY * inverse[:, 3, 3])
-    is_known = (sigmas < 0.5 * radius) & (radii < 5.0 * radius)
+        covs = np.asarray(np.linalg.inv(N + np.eye(4) / (0.5 * radius) ** 2))
+        step = np.einsum("mij,mj->mi", covs, pull)
+        spheres = spheres + np.clip(step, -_STEP_MAX * radius, _STEP_MAX * radius)
+    counts = np.bincount(shots.which, estimate.weights > 0.0, n)
+    inflation = 1.0 + _RADIUS_INFLATION * np.exp(-counts / _RADIUS_RETURNS)
+    radii, sigmas = spheres[:, 3], np.sqrt(_EFFICIENCY * inflation * covs[:, 3, 3])
+    is_known = (sigmas < 0.4 * radius) & (radii < 5.0 * radius)
     return np.where(is_known, radii, np.nan), np.where(is_known, sigmas, np.nan)
 
 
 def _own_factor(estimate: _Estimate, mine: Mask) -> float:
     """Return one marker's noise in units of the prior, from its returns alone."""
-    scaled = estimate.residuals[mine] / estimate.sigmas[mine]
-    return _factor(scaled, estimate.weights[mine], 3, 0.0)
+    scaled, weights = (estimate.residuals / estimate.sigmas)[mine], estimate.weights[mine]
+    dof = max(float(np.sum(weights > 0.0)) - 3.0, 1.0)
+    ratio2 = float(np.sum(weights * scaled**2)) / _EXPECTED_SQUARE / dof
+    return max(estimate.state.factor * float(np.sqrt(ratio2)), _FACTOR_MIN)
 
 
 def _covariance(estimate: _Estimate, k: int, own: float, n_used: int) -> Array:
@@ -388,29 +434,20 @@ def _covariance(estimate: _Estimate, k: int, own: float, n_used: int) -> Array:
     of returns that agree by chance must not look precise.
     """
     state = estimate.state
-    variance = (_DOF_STOP * state.factor**2 + n_used * own**2) / (_DOF_STOP + n_used)
-    return np.asarray(variance * state.cov_noise[k] + state.factor**2 * state.cov_biases[k])
+    ratio2 = (own / state.factor) ** 2
+    variance = (_DOF_STOP + n_used * ratio2) / (_DOF_STOP + n_used)
+    return np.asarray(variance * state.cov_noise[k] + state.cov_biases[k])
 
 
 def _weakness(fit: MarkerFit, factor: float) -> str:
     """Return why a centre should be used with care; empty if there is no reason."""
+    reasons = weaknesses(fit.n_points, fit.n_rings, fit.coverage)
     off = abs(fit.radius_free - fit.radius)
-    tests = (
-        (fit.n_points < _N_GOOD, f"only {fit.n_points} returns (at least {_N_GOOD} are good)"),
-        (fit.n_rings == 1, "all returns are of one laser"),
-        (fit.coverage < _COVERAGE_GOOD, f"only {100 * fit.coverage:.0f} % of it is seen"),
-        (
-            off > max(_RADIUS_SIGMAS * fit.sigma_radius_free, _RADIUS_SLACK),
-            f"its own radius is {1e3 * fit.radius_free:.0f} mm",
-        ),
-        (
-            fit.sigma0 > _NOISE_FACTOR * factor,
-            f"its residuals are {fit.sigma0 / factor:.1f} times those of the stop",
-        ),
-    )
-    reasons = [reason for is_so, reason in tests if is_so]
-    text = ", ".join(reasons)
-    return text[:1].upper() + text[1:] + "." if reasons else ""
+    if off > max(_RADIUS_SIGMAS * fit.sigma_radius_free, _RADIUS_SLACK):
+        reasons.append(f"its own radius is {1e3 * fit.radius_free:.0f} mm")
+    if fit.sigma0 > _NOISE_FACTOR * factor:
+        reasons.append(f"its residuals are {fit.sigma0 / factor:.1f} times those of the stop")
+    return sentence(reasons)
 
 
 def _refusal(estimate: _Estimate, k: int, n_used: int, moved: float, radius: float) -> str:
@@ -421,7 +458,7 @@ def _refusal(estimate: _Estimate, k: int, n_used: int, moved: float, radius: flo
             f"needs at least {_N_MIN}."
         )
     worst = float(np.sqrt(np.linalg.eigvalsh(estimate.state.cov_noise[k])[-1]))
-    if estimate.state.factor * worst > radius:
+    if worst > radius:
         return "Its returns leave the centre undetermined: they lie on one line."
     if moved > _STRAY * radius:
         return (
@@ -452,9 +489,7 @@ def _judged(
     moved = float(np.linalg.norm(p - candidate.p_base_rough))
     reason = _refusal(estimate, k, n_used, moved, radius)
     if reason:
-        return Rejection(
-            p_base=candidate.p_base_rough.copy(), n_points=len(candidate.members), reason=reason
-        )
+        return refused(candidate, reason)
     own = _own_factor(estimate, mine)
     lit = _some(shots.beams, used)
     fit = MarkerFit(
@@ -469,11 +504,13 @@ def _judged(
         mean_range=float(np.linalg.norm(lit.origins_base.mean(axis=0) - p)),
         mean_intensity=float(lit.intensities.mean()),
         used=shots.rows[used],
-        rejected=shots.rows[mine & ~used],
+        rejected=np.setdiff1d(candidate.members, shots.rows[used]),
         residuals=estimate.residuals[used],
         sigma0=own,
         n_rings=len(np.unique(lit.rings[lit.rings != RING_UNKNOWN])),
-        coverage=share_of_outline(lit, estimate.prediction.offsets[used], radius),
+        coverage=share_of_outline(lit, estimate.linear.offsets[used], radius),
+        incidence=incidence(estimate.linear.offsets[used], radius),
+        variant=WITHOUT_RINGS if np.all(lit.rings == RING_UNKNOWN) else "",
     )
     weakness = _weakness(fit, estimate.state.factor)
     return replace(fit, status=Status.WEAK, reason=weakness) if weakness else fit

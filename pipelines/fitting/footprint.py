@@ -16,6 +16,8 @@ from pipelines.values import Array, Beams, Index
 
 _N_STRIPS = 8  # strips of the ellipse; with 8 the mean is good to 0.01 mm of a 0.1 m ball at 8 m
 _MIDDLE = 0.3  # radii: returns nearer to the middle belong to no side
+_INNER = 0.9  # radii from the middle within which the range hardly bends
+_STRAIGHT = 0.03  # radii over which it bends by less than 0.05 mm there
 _THIN = 1e-6  # [m]; a thinner footprint is a ray, and this one differs from it by nothing
 
 
@@ -69,6 +71,71 @@ def predict(beams: Beams, centres: Array, radii: Array, which: Index) -> Predict
     half_widths = 0.5 * beams.ranges[:, None] * beams.divergence
     aim = (beams.origins_base, beams.directions_base, beams.across_base)
     return Prediction(*_predict(aim, np.maximum(half_widths, _THIN), centres, radii, which))
+
+
+class Linear(NamedTuple):
+    """What beams should measure to spheres whose places are known only so well.
+
+    Attributes
+    ----------
+    ranges : (n,)
+        Predicted ranges, less what the bend adds on average over where the sphere may be [m].
+    J : (n, 4)
+        Derivatives of the ranges by the centre and by the radius, over the width of what is not
+        known of them.
+    bends : (n,)
+        Standard deviation that the bend of the range leaves beside the linear part [m].
+    lit : (n,)
+        Share of the footprint that falls on the sphere in the middle.
+    offsets : (n, 2)
+        Where the middle of the beam passes the centre, along the footprint's two axes [m].
+    """
+
+    ranges: Array
+    J: Array
+    bends: Array
+    lit: Array
+    offsets: Array
+
+
+def linearise(beams: Beams, spheres: Array, covs: Array, which: Index) -> Linear:
+    """Predict ranges, linearised over the width of what is not known of the spheres.
+
+    Parameters
+    ----------
+    beams : Beams
+        Shots; their measured ranges only scale the footprint.
+    spheres : (m, 4)
+        Centres in the base frame and radii [m].
+    covs : (m, k, k)
+        Covariances of the first k of these, 3 if the radius is known, else 4 [m^2].
+    which : (n,)
+        The sphere that each beam is aimed at.
+
+    Returns
+    -------
+    Linear
+        Mean ranges, derivatives, what bends, lit shares and offsets.
+
+    Notes
+    -----
+    Near the outline the range bends within less than a millimetre: a derivative at one place says
+    how precise that beam would be if the centre were known already. Here it is the slope between
+    places the square root of k standard deviations to either side (statistical linearisation by
+    cubature: Garcia-Fernandez, Svensson, Morelande, Sarkka, Posterior linearization filter, 2015).
+    Well inside the outline both agree, and the exact derivative is taken. What the bend adds on
+    average is taken off: without that least squares puts centres some millimetres too near where
+    returns are few (Box, Bias in nonlinear estimation, 1971).
+    """
+    half_widths = np.maximum(0.5 * beams.ranges[:, None] * beams.divergence, _THIN)
+    k = covs.shape[1]
+    variances, axes = np.linalg.eigh(covs)  # along them, so that the world may be turned
+    widths = np.sqrt(k * np.maximum(variances, _THIN**2))[:, :, None]
+    columns, duals = np.zeros((len(spheres), k, 4)), np.zeros((len(spheres), k, 4))
+    columns[:, :, :k] = widths * axes.transpose(0, 2, 1)
+    duals[:, :, :k] = axes.transpose(0, 2, 1) / widths
+    aim = (beams.origins_base, beams.directions_base, beams.across_base)
+    return Linear(*_linearise(aim, half_widths, np.asarray(spheres), (columns, duals), which))
 
 
 def share_of_outline(beams: Beams, offsets: Array, radius: float) -> float:
@@ -131,6 +198,62 @@ def _predict(
         lit[i] = share
         offsets[i, 0], offsets[i, 1] = -x0, -y0
     return ranges, J, lit, offsets
+
+
+@numba.njit(cache=True, nogil=True)
+def _linearise(
+    aim: tuple[Array, Array, Array],
+    half_widths: Array,
+    spheres: Array,
+    spread: tuple[Array, Array],
+    which: Index,
+) -> tuple[Array, Array, Array, Array, Array]:
+    """Return the fields of ``Linear``; ``spread`` is steps to either side, and their duals."""
+    origins, directions, across = aim
+    columns, duals = spread
+    n, k = len(origins), columns.shape[1]
+    ranges, J, bends = np.empty(n), np.zeros((n, 4)), np.zeros(n)
+    lit, offsets = np.empty(n), np.empty((n, 2))
+    for i in range(n):
+        u, a, m = directions[i], across[i], which[i]
+        b = (u[1] * a[2] - u[2] * a[1], u[2] * a[0] - u[0] * a[2], u[0] * a[1] - u[1] * a[0])
+        v0 = spheres[m, 0] - origins[i, 0]
+        v1, v2 = spheres[m, 1] - origins[i, 1], spheres[m, 2] - origins[i, 2]
+        closest = v0 * u[0] + v1 * u[1] + v2 * u[2]
+        x0 = v0 * a[0] + v1 * a[1] + v2 * a[2]
+        y0 = v0 * b[0] + v1 * b[1] + v2 * b[2]
+        radius, half_x, half_y = spheres[m, 3], half_widths[i, 0], half_widths[i, 1]
+        depth, by_x, by_y, by_radius, lit[i] = _mean_depth(x0, y0, radius, half_x, half_y)
+        offsets[i, 0], offsets[i, 1] = -x0, -y0
+        reach = 0.0
+        for s in range(k):
+            c = columns[m, s]
+            reach = max(reach, c[0] * c[0] + c[1] * c[1] + c[2] * c[2] + c[3] * c[3])
+        is_inner = np.hypot(x0, y0) + max(half_x, half_y) + np.sqrt(reach) < _INNER * radius
+        if is_inner and reach < (_STRAIGHT * radius) ** 2:
+            ranges[i] = closest - depth
+            for j in range(3):
+                J[i, j] = u[j] - by_x * a[j] - by_y * b[j]
+            J[i, 3] = -by_radius
+            continue
+        mean, square, linear = 0.0, 0.0, 0.0
+        for s in range(k):
+            c = columns[m, s]
+            along = c[0] * u[0] + c[1] * u[1] + c[2] * u[2]
+            dx = c[0] * a[0] + c[1] * a[1] + c[2] * a[2]
+            dy = c[0] * b[0] + c[1] * b[1] + c[2] * b[2]
+            far = _mean_depth(x0 + dx, y0 + dy, radius + c[3], half_x, half_y)[0]
+            near = _mean_depth(x0 - dx, y0 - dy, radius - c[3], half_x, half_y)[0]
+            plus, minus = along - far, -along - near
+            slope = 0.5 * (plus - minus)
+            mean += 0.5 * (plus + minus) / k
+            square += 0.5 * (plus * plus + minus * minus) / k
+            linear += slope * slope / k
+            for j in range(4):
+                J[i, j] += slope * duals[m, s, j]
+        ranges[i] = closest - depth - (mean + depth)
+        bends[i] = np.sqrt(max(square - mean * mean - linear, 0.0))
+    return ranges, J, bends, lit, offsets
 
 
 @numba.njit(cache=True, nogil=True)

@@ -10,25 +10,21 @@ from __future__ import annotations
 import numpy as np
 
 from pipelines.config import FittingConfig
-from pipelines.fitting.footprint import predict, share_of_outline
+from pipelines.fitting.description import Fits, described, each, on_sphere, refused, spread_of
 from pipelines.geometry import levelling_rotation
-from pipelines.stitching import beams
 from pipelines.values import (
-    RING_UNKNOWN,
     Array,
     Index,
     MarkerCandidate,
     MarkerCandidates,
     MarkerFit,
     Rejection,
-    Status,
     StitchedCloud,
 )
 
 NAME = "paper"
 
 _N_HALF = 1000  # points of a hemisphere; the study does not tell, and 300 or 3000 change < 1 mm
-_SEGMENT = 1.35  # radii about the found sphere: what the study's segmentation leaves of a cluster
 _N_MIN = 4  # returns: one more than unknowns
 _N_STEPS = 200
 _SETTLED = 1e-7  # relative change of fitness and RMS at which ICP stops
@@ -36,7 +32,7 @@ _SETTLED = 1e-7  # relative change of fitness and RMS at which ICP stops
 
 def fit(
     cloud: StitchedCloud, found: MarkerCandidates, config: FittingConfig, radius: float
-) -> tuple[tuple[MarkerFit, ...], tuple[Rejection, ...]]:
+) -> Fits:
     """Fit the candidates of a stop by the study's hemisphere ICP.
 
     Parameters
@@ -66,12 +62,9 @@ def fit(
     the part that was seen, hence toward the scanner; where the cut took the lower part, upward.
     """
     is_whole = config.paper_model == "sphere"
-    results = [
-        _fit_one(cloud, found, candidate, radius, is_whole=is_whole)
-        for candidate in found.candidates
-    ]
-    fits = tuple(r for r in results if isinstance(r, MarkerFit))
-    return fits, tuple(r for r in results if isinstance(r, Rejection))
+    return each(
+        found.candidates, lambda one: _fit_one(cloud, found, one, radius, is_whole=is_whole)
+    )
 
 
 def _fit_one(
@@ -85,25 +78,27 @@ def _fit_one(
     """Fit one candidate, or say why the cut leaves nothing to fit."""
     used = _left_by_cut(cloud, found.ground_height_max, candidate, radius)
     if len(used) < _N_MIN:
-        return Rejection(
-            p_base=candidate.p_base_rough.copy(),
-            n_points=len(candidate.members),
-            reason=f"Of {len(candidate.members)} returns the cut at the highest ground point, "
+        return refused(
+            candidate,
+            f"Of {len(candidate.members)} returns the cut at the highest ground point, "
             f"{found.ground_height_max:.2f} m, leaves {len(used)}; a centre needs {_N_MIN}.",
         )
     points = cloud.p_base[used].astype(np.float64)
     p = _registered(_model(-points.mean(axis=0), radius, is_whole=is_whole), points)
-    return _described(cloud, candidate, used, p, radius)
+    v = points - p
+    distances = np.linalg.norm(v, axis=1)
+    normals = v / distances[:, None]
+    cov = spread_of(normals.T @ normals, distances - radius, 3)
+    return described(cloud, candidate, used, p, cov, method=NAME, radius=radius)
 
 
 def _left_by_cut(
     cloud: StitchedCloud, height: float, candidate: MarkerCandidate, radius: float
 ) -> Index:
     """Return the candidate's rows on the sphere that lie above the cut."""
-    points = cloud.p_base[candidate.members].astype(np.float64)
-    heights = points @ levelling_rotation(cloud.levelling)[2]
-    is_sphere = np.linalg.norm(points - candidate.p_base_rough, axis=1) < _SEGMENT * radius
-    return np.asarray(candidate.members[is_sphere & (heights >= height)])
+    rows = on_sphere(cloud, candidate, radius)
+    heights = cloud.p_base[rows].astype(np.float64) @ levelling_rotation(cloud.levelling)[2]
+    return np.asarray(rows[heights >= height])
 
 
 def _model(v_facing: Array, radius: float, *, is_whole: bool) -> Array:
@@ -135,34 +130,3 @@ def _registered(model: Array, points: Array) -> Array:
         o3d.pipelines.registration.ICPConvergenceCriteria(_SETTLED, _SETTLED, _N_STEPS),
     )
     return np.array(result.transformation[:3, 3])
-
-
-def _described(
-    cloud: StitchedCloud, candidate: MarkerCandidate, used: Index, p: Array, radius: float
-) -> MarkerFit:
-    """Return the fit with residuals along the beams and the formal covariance."""
-    shots = beams(cloud, used)
-    prediction = predict(shots, p[None], np.array([radius]), np.zeros(len(used), dtype=np.intp))
-    v = cloud.p_base[used] - p
-    distances = np.linalg.norm(v, axis=1)
-    normals = v / distances[:, None]
-    variance = float(np.sum((distances - radius) ** 2)) / max(len(used) - 3, 1)
-    rings = shots.rings[shots.rings != RING_UNKNOWN]
-    return MarkerFit(
-        p_base=p,
-        cov_p_base=variance * np.linalg.inv(normals.T @ normals + 1e-6 * np.eye(3)),
-        method=NAME,
-        status=Status.OK,
-        reason="",
-        radius=radius,
-        radius_free=np.nan,
-        sigma_radius_free=np.nan,
-        mean_range=float(np.linalg.norm(shots.origins_base.mean(axis=0) - p)),
-        mean_intensity=float(shots.intensities.mean()),
-        used=used,
-        rejected=np.setdiff1d(candidate.members, used),
-        residuals=shots.ranges - prediction.ranges,
-        sigma0=1.0,
-        n_rings=len(np.unique(rings)),
-        coverage=share_of_outline(shots, prediction.offsets, radius),
-    )

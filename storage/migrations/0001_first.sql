@@ -216,6 +216,8 @@ CREATE TABLE marker_fits (
     radius_free_m DOUBLE,
     sigma_radius_free_m DOUBLE,
     mean_intensity DOUBLE,
+    incidence_deg DOUBLE,
+    variant VARCHAR,
     error_x_m DOUBLE,
     error_y_m DOUBLE,
     error_z_m DOUBLE,
@@ -224,7 +226,7 @@ CREATE TABLE marker_fits (
     PRIMARY KEY (run_id, stop, fit_method, marker)
 );
 COMMENT ON TABLE marker_fits IS 'Sphere centres in the station frame, one row per stop, marker and fitting method; covariances without levelling.';
-COMMENT ON COLUMN marker_fits.fit_method IS 'along_beam (ours) or paper (the study).';
+COMMENT ON COLUMN marker_fits.fit_method IS 'along_beam or silhouette (ours), astm_e3125, free_radius, algebraic, or paper (the study).';
 COMMENT ON COLUMN marker_fits.marker IS 'M01, M02 ... by azimuth, within one stop and method.';
 COMMENT ON COLUMN marker_fits.mark IS 'Control mark that it was matched to by the first resection method; NULL when to none.';
 COMMENT ON COLUMN marker_fits.status IS 'ok or weak.';
@@ -247,6 +249,8 @@ COMMENT ON COLUMN marker_fits.n_points IS 'Returns that carry the estimate.';
 COMMENT ON COLUMN marker_fits.n_rejected IS 'Returns of the candidate that were set aside.';
 COMMENT ON COLUMN marker_fits.n_rings IS 'Different lasers among the used returns; 0 when the log does not tell them.';
 COMMENT ON COLUMN marker_fits.coverage IS 'Share of the visible half of the sphere that has returns, 0 to 1.';
+COMMENT ON COLUMN marker_fits.incidence_deg IS 'Mean angle between the used beams and the normals of the sphere.';
+COMMENT ON COLUMN marker_fits.variant IS 'Which form of its method ran, where it has several; else empty.';
 COMMENT ON COLUMN marker_fits.rms_m IS 'Root mean square of the residuals (observed minus computed along the beam).';
 COMMENT ON COLUMN marker_fits.sigma0 IS 'Square root of the variance factor; 1 means noise as assumed.';
 COMMENT ON COLUMN marker_fits.radius_m IS 'Radius that was assumed.';

@@ -102,7 +102,7 @@ def test_rays_without_noise_give_the_true_centre():
     shots = towards(fire(), CENTRE, 0.2)
     ranges = sphere_ranges(shots.origins, shots.directions, CENTRE, RADIUS)
     fits = fit_one(cloud_of(shots, ranges, rig=RAY), CENTRE + OFF).fits
-    assert_allclose(fits[0].p_base, CENTRE, rtol=0, atol=1e-6)
+    assert_allclose(fits[0].p_base, CENTRE, rtol=0, atol=1e-5)
 
 
 def test_wide_beams_without_noise_give_the_true_centre():
@@ -268,7 +268,7 @@ def test_turning_the_world_turns_the_centre_and_nothing_else(method):
     first = fit_one(cloud, CENTRE, method).fits[0]
     second = fit_one(turned, R @ CENTRE, method).fits[0]
     # float32 columns move the points by half a micrometre; ICP starts its rotation elsewhere
-    atol = 1e-5 if method == "along_beam" else 2e-3
+    atol = 2e-3 if method == "paper" else 2e-4 if method == "silhouette" else 1e-5
     assert_allclose(second.p_base, R @ first.p_base, rtol=0, atol=atol)
 
 
@@ -285,7 +285,7 @@ def test_unknown_lasers_are_fitted_with_less_and_said_so():
 def test_the_study_is_drawn_to_the_scanner_and_our_centre_is_not():
     rng = np.random.default_rng(10)
     outward = CENTRE / np.linalg.norm(CENTRE)
-    pulls = {method: [] for method in METHODS}
+    pulls = {method: [] for method in ("along_beam", "paper")}
     for _ in range(6):
         cloud = cloud_of(*marker_shots(CENTRE, rng, sigma=0.02))
         for method, pulled in pulls.items():

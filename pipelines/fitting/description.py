@@ -1,0 +1,263 @@
+"""What is said of a centre whatever method found it: residuals, coverage, incidence, verdict."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+
+from pipelines.fitting.footprint import predict, share_of_outline
+from pipelines.stitching import beams
+from pipelines.values import (
+    RING_UNKNOWN,
+    Array,
+    Index,
+    MarkerCandidate,
+    MarkerFit,
+    Mask,
+    Rejection,
+    Status,
+    StitchedCloud,
+)
+
+N_GOOD = 20
+"""Returns below which a centre is called weak."""
+
+COVERAGE_GOOD = 0.6
+"""Share of the outline below which a centre is called weak."""
+
+_SEGMENT = 1.35  # radii about the rough centre within which a return may be the sphere
+
+Fits = tuple[tuple[MarkerFit, ...], tuple[Rejection, ...]]
+
+
+def each(
+    candidates: tuple[MarkerCandidate, ...],
+    fit_one: Callable[[MarkerCandidate], MarkerFit | Rejection],
+) -> Fits:
+    """Fit candidates one by one.
+
+    Parameters
+    ----------
+    candidates : tuple of MarkerCandidate
+        Groups of returns.
+    fit_one : callable
+        Returns the fit of one, or the reason why there is none.
+
+    Returns
+    -------
+    fits : tuple of MarkerFit
+        In the order of the candidates.
+    rejected : tuple of Rejection
+        The others.
+    """
+    results = [fit_one(candidate) for candidate in candidates]
+    fits = tuple(r for r in results if isinstance(r, MarkerFit))
+    return fits, tuple(r for r in results if isinstance(r, Rejection))
+
+
+def on_sphere(cloud: StitchedCloud, candidate: MarkerCandidate, radius: float) -> Index:
+    """Return a candidate's rows that may be its sphere by their place.
+
+    Parameters
+    ----------
+    cloud : StitchedCloud
+        The stop.
+    candidate : MarkerCandidate
+        A group of returns.
+    radius : float
+        Radius of the spheres [m].
+
+    Returns
+    -------
+    (n,)
+        Rows with finite coordinates near the rough centre.
+    """
+    away = np.linalg.norm(
+        cloud.p_base[candidate.members].astype(np.float64) - candidate.p_base_rough, axis=1
+    )
+    return np.asarray(candidate.members[away < _SEGMENT * radius])
+
+
+def refused(candidate: MarkerCandidate, reason: str) -> Rejection:
+    """Return a candidate as a rejection.
+
+    Parameters
+    ----------
+    candidate : MarkerCandidate
+        The group of returns.
+    reason : str
+        Why it has no centre, as a sentence.
+
+    Returns
+    -------
+    Rejection
+        Where it was found, with all its returns.
+    """
+    return Rejection(
+        p_base=candidate.p_base_rough.copy(), n_points=len(candidate.members), reason=reason
+    )
+
+
+def described(
+    cloud: StitchedCloud,
+    candidate: MarkerCandidate,
+    used: Index,
+    p_base: Array,
+    cov_p_base: Array,
+    **known: float | str,
+) -> MarkerFit:
+    """Return a fit with what its returns say of it.
+
+    Parameters
+    ----------
+    cloud : StitchedCloud
+        The stop.
+    candidate : MarkerCandidate
+        The group of returns.
+    used : (n,)
+        Rows that carry the estimate.
+    p_base : (3,)
+        Centre [m].
+    cov_p_base : (3, 3)
+        Its covariance [m^2].
+    **known : float or str
+        ``method`` and ``radius``; what else of the fields the method knows.
+
+    Returns
+    -------
+    MarkerFit
+        Residuals along the beams against the footprint's range; weak when returns are few, of one
+        laser or on one side.
+    """
+    shots = beams(cloud, used)
+    radius = float(known["radius"])
+    which = np.zeros(len(used), dtype=np.intp)
+    found = predict(shots, p_base[None], np.array([radius]), which)
+    rings = shots.rings[shots.rings != RING_UNKNOWN]
+    n_rings = len(np.unique(rings))
+    coverage = share_of_outline(shots, found.offsets, radius)
+    reason = sentence(weaknesses(len(used), n_rings, coverage))
+    fields: dict[str, float | str] = {
+        "radius_free": np.nan,
+        "sigma_radius_free": np.nan,
+        "sigma0": 1.0,
+        **known,
+    }
+    return MarkerFit(
+        p_base=np.array(p_base),
+        cov_p_base=np.array(cov_p_base),
+        status=Status.WEAK if reason else Status.OK,
+        reason=reason,
+        mean_range=float(np.linalg.norm(shots.origins_base.mean(axis=0) - p_base)),
+        mean_intensity=float(shots.intensities.mean()),
+        used=used,
+        rejected=np.setdiff1d(candidate.members, used),
+        residuals=shots.ranges - found.ranges,
+        n_rings=n_rings,
+        coverage=coverage,
+        incidence=incidence(found.offsets, radius),
+        **fields,  # type: ignore[arg-type]
+    )
+
+
+def incidence(offsets: Array, radius: float) -> float:
+    """Return the mean angle between beams and the normals of a sphere.
+
+    Parameters
+    ----------
+    offsets : (n, 2)
+        Where the middles of the beams pass its centre [m].
+    radius : float
+        Its radius [m].
+
+    Returns
+    -------
+    float
+        The angle; a beam whose middle passes by counts as grazing [rad].
+    """
+    off = np.minimum(np.hypot(offsets[:, 0], offsets[:, 1]) / radius, 1.0)
+    return float(np.mean(np.arcsin(off)))
+
+
+def weaknesses(n_points: int, n_rings: int, coverage: float) -> list[str]:
+    """Say what weakens a centre whatever method found it.
+
+    Parameters
+    ----------
+    n_points : int
+        Returns that carry it.
+    n_rings : int
+        Different lasers among them; 0 when not recorded.
+    coverage : float
+        Share of the outline that has returns, 0 to 1.
+
+    Returns
+    -------
+    list of str
+        Reasons without capital and full stop.
+    """
+    tests = (
+        (n_points < N_GOOD, f"only {n_points} returns (at least {N_GOOD} are good)"),
+        (n_rings == 1, "all returns are of one laser"),
+        (coverage < COVERAGE_GOOD, f"only {100 * coverage:.0f} % of it is seen"),
+    )
+    return [reason for is_so, reason in tests if is_so]
+
+
+def sentence(reasons: list[str]) -> str:
+    """Return reasons as one sentence; empty if there are none.
+
+    Parameters
+    ----------
+    reasons : list of str
+        Without capital and full stop.
+
+    Returns
+    -------
+    str
+        The sentence.
+    """
+    text = ", ".join(reasons)
+    return text[:1].upper() + text[1:] + "." if reasons else ""
+
+
+def spread_of(normals: Array, residuals: Array, n_unknowns: int) -> Array:
+    """Return the formal covariance of a least-squares fit with equal weights.
+
+    Parameters
+    ----------
+    normals : (k, k)
+        Sum of the products of derivatives.
+    residuals : (n,)
+        What is left [m].
+    n_unknowns : int
+        Unknowns of the fit.
+
+    Returns
+    -------
+    (k, k)
+        Inverse normal matrix times the a-posteriori variance [m^2].
+    """
+    variance = float(residuals @ residuals) / max(len(residuals) - n_unknowns, 1)
+    return np.asarray(variance * np.linalg.inv(normals + 1e-9 * np.eye(len(normals))))
+
+
+def is_undetermined(normals: Array, n: int) -> Mask | bool:
+    """Tell whether a fit's normal equations have no answer worth having.
+
+    Parameters
+    ----------
+    normals : (k, k)
+        Sum of the products of derivatives.
+    n : int
+        Number of returns.
+
+    Returns
+    -------
+    bool
+        Whether the weakest direction has less than a thousandth of one return's say.
+    """
+    if not np.all(np.isfinite(normals)):
+        return True
+    return bool(np.linalg.eigvalsh(normals)[0] < 1e-3 * np.sqrt(max(n, 1)))
