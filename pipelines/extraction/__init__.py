@@ -26,6 +26,7 @@ from pipelines.extraction.seeds import find_seeds
 from pipelines.extraction.sights import sights
 from pipelines.extraction.verdicts import (
     distinct,
+    is_resolved,
     score,
     verdict,
     verdict_among_others,
@@ -33,7 +34,6 @@ from pipelines.extraction.verdicts import (
 )
 from pipelines.geometry import levelling_rotation
 from pipelines.values import (
-    Array,
     Index,
     MarkerCandidate,
     MarkerCandidates,
@@ -43,6 +43,7 @@ from pipelines.values import (
 
 __all__ = ["extract"]
 
+_MIDDLE = 0.87  # radii: incidence up to 60 degrees, as ASTM E3125-17 takes them
 _REJECTIONS_MAX = 200  # the most sphere-like groups that are kept with their reason
 
 
@@ -119,7 +120,7 @@ def _candidates(
     cells = cells_of(centres, grid)
     return tuple(
         MarkerCandidate(
-            members=_members(cloud, patches.rows[near(patches, cell, p)], p, ball),
+            members=_members(cloud, patches.rows[near(patches, cell, p)], look, ball),
             p_base_rough=p.copy(),
             score=score(look, config, ball),
         )
@@ -127,11 +128,16 @@ def _candidates(
     )
 
 
-def _members(cloud: StitchedCloud, near: NDArray[np.int32], p: Array, ball: Ball) -> Index:
-    """Return the rows on and about a ball, ascending: its outline, and what of its pole touches."""
+def _members(cloud: StitchedCloud, near: NDArray[np.int32], look: Look, ball: Ball) -> Index:
+    """Return the rows on and about a ball, ascending: its outline, and what of its pole touches.
+
+    Of a ball that is seen very closely, only its middle: there the returns at its outline, which
+    belong partly to what lies behind, would weigh more than the noise of all the others.
+    """
     rows = np.sort(near).astype(np.intp)
-    seen, _, _ = view(cloud.p_base[rows].astype(np.float64), p, ball.up)
-    blur = 0.5 * ball.divergence * float(np.linalg.norm(p))
-    is_about = np.hypot(seen[:, 0], seen[:, 1]) < 1.5 * ball.radius + blur
+    seen, _, _ = view(cloud.p_base[rows].astype(np.float64), look.p_base, ball.up)
+    blur = 0.5 * ball.divergence * float(np.linalg.norm(look.p_base))
+    reach = _MIDDLE * ball.radius if is_resolved(look, ball) else 1.5 * ball.radius + blur
+    is_about = np.hypot(seen[:, 0], seen[:, 1]) < reach
     is_level = (seen[:, 2] > -2.2 * ball.radius) & (seen[:, 2] < 1.6 * ball.radius)
     return np.asarray(rows[is_about & is_level])

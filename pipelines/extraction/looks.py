@@ -22,6 +22,13 @@ from pipelines.values import Array, StitchedCloud
 NOISE_MIN = 0.006
 """Scatter of any VLP-16: what scatters less is not known better [m]."""
 
+RESOLUTION = 0.055
+"""Scatter, in radii, below which a shape is seen more closely than nature makes balls."""
+
+N_RESOLVED = 60
+"""Returns that such a shape needs at least."""
+
+_CLOSE, _LOOSE = 0.04, 0.3  # radii: least and most that returns may scatter about a ball
 _N_LOOK = 4  # returns without which there is nothing to look at
 _N_WORTH = 50  # seeds that are worth a thread
 _N_STEPS = 6  # of a fit that only has to tell what a group is
@@ -48,6 +55,8 @@ class Look(NamedTuple):
         Extent of the explained returns across and along the vertical [m].
     radius_free, sigma_radius : float
         Radius when it is estimated too [m].
+    scatter_free : float
+        Robust standard deviation along the beams about that ball [m].
     flat_across, sigma_across : float
         How much of the ball's curvature across is missing: 0 a ball, 1 a plane.
     flat_along, sigma_along : float
@@ -66,6 +75,7 @@ class Look(NamedTuple):
     height: float
     radius_free: float
     sigma_radius: float
+    scatter_free: float
     flat_across: float
     sigma_across: float
     flat_along: float
@@ -112,7 +122,11 @@ def look_at(cloud: StitchedCloud, grid: Grid, seeds: Array, ball: Ball) -> list[
     )
     found = np.concatenate(parts)
     is_free = found[:, 4] + found[:, 5] <= 2.0 + 0.6 * found[:, 3]
-    found = found[(found[:, 3] >= _N_LOOK) & is_free]
+    is_crowded = ~is_free & (found[:, 3] >= N_RESOLVED)
+    is_crowded[is_crowded] = _resolved(
+        patches, found[is_crowded], cells_of(found[is_crowded, :3], grid), ball
+    )
+    found = found[(found[:, 3] >= _N_LOOK) & (is_free | is_crowded)]
     found = found[np.lexsort((found[:, 2], found[:, 1], found[:, 0], -found[:, 3]))]
     places = thinned(found[:, :4].copy(), 0.5 * ball.radius)[:, :3]
     looks = []
@@ -191,6 +205,25 @@ def _surroundings(seen: Array, radius: float, blur: float) -> tuple[int, int]:
     return n_beside, n_below
 
 
+@numba.njit(cache=True, nogil=True)
+def _resolved(
+    patches: Patches, found: Array, cells: NDArray[np.int64], ball: Ball
+) -> NDArray[np.bool_]:
+    """Tell where a ball fits so closely that it needs no free space about it to be believed."""
+    out = np.zeros(len(found), np.bool_)
+    for k in range(len(found)):
+        c = found[k, :3].copy()
+        points = gathered(patches, near(patches, cells[k], c))
+        scatter = np.inf
+        for _ in range(_N_STEPS):
+            N, pull, axes, scatter = _equations(points, c, ball, ball.radius)
+            step = np.linalg.solve(N[:3, :3] + 1e-3 * np.eye(3), pull[:3])
+            step *= min(1.0, 0.5 * ball.radius / (np.sqrt(np.sum(step**2)) + 1e-12))
+            c = c + step[0] * axes[0] + step[1] * axes[1] + step[2] * axes[2]
+        out[k] = scatter < 1.5 * RESOLUTION * ball.radius
+    return out
+
+
 def _look(points: Array, start: Array, ball: Ball) -> Look | None:
     """Return what is seen near a place; nothing if hardly a return lies on a ball there."""
     radius = ball.radius
@@ -209,7 +242,9 @@ def _look(points: Array, start: Array, ball: Ball) -> Look | None:
     noise = max(rms, NOISE_MIN)
     n_beside, n_below = _surroundings(seen, radius, blur)
     flat, cov_flat = _solve(J[:, [0, 1, 2, 4, 5]], residuals, weights, 1e-6)
-    _, radius_free, cov_free = _settled(points, c, ball, 4)
+    c_free, radius_free, cov_free = _settled(points, c, ball, 4)
+    seen_free, _, _ = view(points, c_free, ball.up)
+    residuals_free, _ = _shape(seen_free, radius_free)
     return Look(
         x=float(c[0]),
         y=float(c[1]),
@@ -223,6 +258,7 @@ def _look(points: Array, start: Array, ball: Ball) -> Look | None:
         height=float(np.ptp(seen[is_in, 1])),
         radius_free=radius_free,
         sigma_radius=noise * float(np.sqrt(cov_free[3, 3])),
+        scatter_free=_scatter(seen_free, residuals_free, radius_free),
         flat_across=float(flat[3]),
         sigma_across=noise * float(np.sqrt(cov_flat[3, 3])),
         flat_along=float(flat[4]),
@@ -233,13 +269,13 @@ def _look(points: Array, start: Array, ball: Ball) -> Look | None:
 def _settled(points: Array, c: Array, ball: Ball, n_unknowns: int) -> tuple[Array, float, Array]:
     """Return the centre of the ball near a place, its radius, and the covariance for unit noise.
 
-    With three unknowns the radius stays as it is, with four it is estimated too. The prior, 3 cm on
-    a start good to that, keeps a handful of returns from running away.
+    With three unknowns the radius stays as it is, with four it is estimated too. The prior, a third
+    of the radius on a start good to that, keeps a handful of returns from running away.
     """
     radius, inverse = ball.radius, np.eye(n_unknowns)
     for _ in range(_N_STEPS):
         N, pull, axes, scatter = _equations(points, c, ball, radius)
-        prior = (scatter / 0.03) ** 2 * np.eye(n_unknowns)
+        prior = (scatter / (_LOOSE * ball.radius)) ** 2 * np.eye(n_unknowns)
         inverse = np.linalg.inv(N[:n_unknowns, :n_unknowns] + prior)
         step = inverse @ pull[:n_unknowns]
         step *= min(1.0, 0.5 * ball.radius / (float(np.linalg.norm(step)) + 1e-12))
@@ -330,5 +366,5 @@ def _scatter(seen: Array, residuals: Array, radius: float) -> float:
             inside[n_inside] = abs(residuals[i])
             n_inside += 1
     if n_inside < 3:
-        return 0.03
-    return min(max(1.4826 * np.median(inside[:n_inside]), 0.004), 0.03)
+        return _LOOSE * radius
+    return min(max(1.4826 * np.median(inside[:n_inside]), _CLOSE * radius), _LOOSE * radius)

@@ -8,7 +8,7 @@ import numpy as np
 
 from pipelines.config import ExtractionConfig
 from pipelines.extraction.ball import Ball
-from pipelines.extraction.looks import NOISE_MIN, Look
+from pipelines.extraction.looks import N_RESOLVED, NOISE_MIN, RESOLUTION, Look
 from pipelines.extraction.sights import Sight
 
 _TOUCHING = 0.10  # share of a ball's returns that may lie as far away beside it: mixed pixels
@@ -16,10 +16,15 @@ _STRANGE = 0.3  # share of the returns inside the outline that may be off the ba
 _SIGMAS = 3.5  # standard deviations at which a shape is refused
 _RADIUS_SLACK = 0.12  # of the radius: less is no reason to refuse, the fit judges it
 _N_SHAPELY = 12  # returns that show the width of what they lie on
+_HEIGHT_MIN = 0.4  # radii: one line of a scan shows no ball
+_FLAT_UNKNOWN = 1.5  # of the curvature: known no better, it may be a ball, a plane or a hollow
 _SPREAD_SIGMAS = 3.3  # standard deviations of a spread: centres are estimated, lines not random
 _SPREAD_SLACK = 0.15  # of a spread: less is no reason to refuse
 _N_SURE = 20  # returns that show a shape well enough to say that something hides the rest
 _SHAPE_SURE = 0.05  # of the radius: the same, of the standard deviation of the free radius
+_RADIUS_RESOLVED = 0.015  # of the radius: standard deviation of the free radius of a resolved ball
+_FLAT_RESOLVED = 0.25  # of the curvature: what may be missing of that of a resolved ball
+_STRANGE_RESOLVED = 0.05  # share of the returns inside its outline that may be off it
 _N_KNOWN = 3  # markers that are open below, to compare others with
 _UNLIKE = 0.25  # share by which the reflectivity of a marker may differ from that of the others
 _NOISIER = 1.5  # factor by which the scatter of a marker may exceed that of the others
@@ -85,7 +90,7 @@ def verdict(look: Look, config: ExtractionConfig, ball: Ball) -> str:
         The reason as a sentence for people; empty if it may be such a ball.
     """
     radius = ball.radius
-    few = 1.0 + _TOUCHING * look.n_points
+    few = np.inf if is_resolved(look, ball) else 1.0 + _TOUCHING * look.n_points
     width_min = (0.9 if look.n_points >= _N_SHAPELY else 0.5) * radius
     off = look.radius_free - radius
     tests = (
@@ -115,9 +120,19 @@ def verdict(look: Look, config: ExtractionConfig, ball: Ball) -> str:
             f"{2e3 * radius:.0f} mm: a pole.",
         ),
         (
+            look.height < _HEIGHT_MIN * radius,
+            f"Its returns lie on one line, {1e3 * look.height:.0f} mm high: nothing shows whether "
+            "it is round.",
+        ),
+        (
             abs(off) > _radius_slack(look, ball),
             f"Its own radius is {1e3 * look.radius_free:.0f} mm (standard deviation "
             f"{1e3 * look.sigma_radius:.0f} mm), not {1e3 * radius:.0f} mm.",
+        ),
+        (
+            min(look.sigma_across, look.sigma_along) > _FLAT_UNKNOWN,
+            f"Its {look.n_points} returns do not show whether it is curved at all: they lie on a "
+            "line or two.",
         ),
         (
             look.flat_along > max(_SIGMAS * look.sigma_along, 0.5),
@@ -158,6 +173,7 @@ def verdict_on_sight(look: Look, sight: Sight, ball: Ball) -> str:
     spread_min = expected - max(
         _SPREAD_SIGMAS / float(np.sqrt(12.0 * max(sight.n_on, 1))), _SPREAD_SLACK
     )
+    few = np.inf if is_resolved(look, ball) else 1.0 + _TOUCHING * sight.n_on
     seems_like = ball.radius * float(np.sqrt(sight.spread / expected))
     n_below = sight.n_held + sight.n_past + sight.n_short
     tests = (
@@ -177,12 +193,12 @@ def verdict_on_sight(look: Look, sight: Sight, ball: Ball) -> str:
             f"{1e3 * ball.radius:.0f} mm.",
         ),
         (
-            sight.n_held > 1.0 + _TOUCHING * sight.n_on,
+            sight.n_held > max(few - 1.0, 1.0),
             f"It does not stand on a pole: {sight.n_held} returns below it and beside a pole's "
             "place lie about as far away, as on shoulders, a larger stone or the ground.",
         ),
         (
-            not (sight.is_open_below or _may_be_hidden(look, ball)),
+            not (sight.is_open_below or _may_be_hidden(look, ball) or np.isinf(few)),
             f"It rests on the ground: of {n_below} beams that pass below it beside a pole's "
             f"place, {sight.n_held + sight.n_short} end at its distance or nearer.",
         ),
@@ -239,6 +255,31 @@ def _spread_expected(look: Look, ball: Ball) -> float:
     return 0.5 * (1.0 + 0.3 * blur) ** 2
 
 
+def is_resolved(look: Look, ball: Ball) -> bool:
+    """Tell whether the shape is seen so closely that a ball need not stand free to be believed.
+
+    Parameters
+    ----------
+    look : Look
+        What the group looks like.
+    ball : Ball
+        What is looked for.
+
+    Returns
+    -------
+    bool
+        Whether scatter, radius and curvature leave no doubt.
+    """
+    return (
+        look.n_points >= N_RESOLVED
+        and look.scatter_free < RESOLUTION * ball.radius
+        and look.sigma_radius < _RADIUS_RESOLVED * ball.radius
+        and abs(look.radius_free - ball.radius) < _RADIUS_SLACK * ball.radius
+        and max(abs(look.flat_across), abs(look.flat_along)) < _FLAT_RESOLVED
+        and look.n_strange <= _STRANGE_RESOLVED * look.n_points
+    )
+
+
 def _may_be_hidden(look: Look, ball: Ball) -> bool:
     """Tell whether the shape is so clear that the lower half may be behind something nearer."""
     return look.n_points >= _N_SURE and look.sigma_radius < _SHAPE_SURE * ball.radius
@@ -261,9 +302,10 @@ def score(look: Look, config: ExtractionConfig, ball: Ball) -> float:
     float
         1 with ease, 0 just so.
     """
+    few = np.inf if is_resolved(look, ball) else 1.0 + _TOUCHING * look.n_points
     used = (
-        look.n_beside / (1.0 + _TOUCHING * look.n_points),
-        look.n_below / (1.0 + _TOUCHING * look.n_points),
+        look.n_beside / few,
+        look.n_below / few,
         look.n_strange / (_STRANGE * (look.n_points + look.n_strange)),
         look.scatter / config.scatter_max,
         abs(look.radius_free - ball.radius) / _radius_slack(look, ball),
