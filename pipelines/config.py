@@ -25,7 +25,7 @@ FITTING_METHODS = (
     "paper",
 )
 PAPER_MODELS = ("hemisphere", "sphere")
-RESECTION_METHODS = ("free_station",)
+RESECTION_METHODS = ("free_station", "ranges", "paper")
 
 _T = TypeVar("_T")
 
@@ -154,6 +154,7 @@ class ResectionConfig:
     ----------
     methods : tuple of str
         Resection methods to run, of ``RESECTION_METHODS``; the first is the one that counts.
+        free_station: it uses all that a centre tells.
     match_tolerance : float
         A marker farther than this from every control mark is a false one [m].
     test_level : float
@@ -166,7 +167,7 @@ class ResectionConfig:
         0.3 mm: of 0.5 mm and 0.01 deg at 7.5 m.
     """
 
-    methods: tuple[str, ...] = RESECTION_METHODS
+    methods: tuple[str, ...] = ("free_station",)
     match_tolerance: float = 0.15
     test_level: float = 0.001
     test_power: float = 0.80

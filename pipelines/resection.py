@@ -1,13 +1,14 @@
 """MarkerFits + control marks -> StationFix: hides the adjustment and what weakens it.
 
 A free station: the unknown is the full pose of ``base`` in ``site``; centres are observed in
-``base``, gravity is observed by the AHRS.
+``base``, gravity is observed by the AHRS. Beside it positions from distances alone (``ranging``).
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 
@@ -16,6 +17,7 @@ from pipelines.config import ResectionConfig
 from pipelines.errors import ConfigError, DegenerateGeometryError, NoMarkersError
 from pipelines.geometry import included_angle, inverse, rigid, skew, transform
 from pipelines.matching import Match, Scene, gather, match_marks, moved, observe, solve_pose
+from pipelines.ranging import fix_by_ranges, pairs_by_circles
 from pipelines.values import (
     Array,
     ControlMarks,
@@ -197,13 +199,7 @@ def _exclusions(
     """Say which markers were left out, and why."""
     pairs = match.pairs
     placed = transform(adjustment.estimate, scene.centres_base)
-    excluded = []
-    for fit in np.flatnonzero(match.marks < 0):
-        off = float(np.linalg.norm(scene.marks_site - placed[fit], axis=1).min())
-        reason = f"It is {off:.2f} m from the nearest control mark"
-        nearer = off <= config.match_tolerance
-        reason += ", which another marker is nearer to." if nearer else ": a false marker."
-        excluded.append(Exclusion(fit=int(fit), reason=reason))
+    excluded = _false_markers(match, scene, adjustment.estimate, config)
     for block, w in dropped:
         if block < len(pairs):
             fit, mark = pairs[block]
@@ -214,6 +210,21 @@ def _exclusions(
             )
             excluded.append(Exclusion(fit=int(fit), reason=reason))
     return tuple(sorted(excluded, key=lambda exclusion: exclusion.fit))
+
+
+def _false_markers(
+    match: Match, scene: Scene, T: Array, config: ResectionConfig
+) -> list[Exclusion]:
+    """Say which markers are no control marks at a pose of base."""
+    placed = transform(T, scene.centres_base)
+    excluded = []
+    for fit in np.flatnonzero(match.marks < 0):
+        off = float(np.linalg.norm(scene.marks_site - placed[fit], axis=1).min())
+        reason = f"It is {off:.2f} m from the nearest control mark"
+        nearer = off <= config.match_tolerance
+        reason += ", which another marker is nearer to." if nearer else ": a false marker."
+        excluded.append(Exclusion(fit=int(fit), reason=reason))
+    return excluded
 
 
 def _weaknesses(
@@ -334,6 +345,42 @@ def free_station_pairs(
     )
 
 
+def _by_ranges(
+    name: str, fits: MarkerFits, marks: ControlMarks, config: ResectionConfig
+) -> StationFix:
+    """Position a station from distances; which marker is which comes from the centres."""
+    _refuse_too_few(fits, marks)
+    scene = gather(fits, marks, config)
+    match = match_marks(scene, config)
+    excluded = _false_markers(match, scene, match.T_site_base, config)
+    return fix_by_ranges(name, scene, match, config, tuple(excluded))
+
+
+def _pairs_by_circles(
+    fix: StationFix, fits: MarkerFits, marks: ControlMarks, config: ResectionConfig
+) -> PairFixes:
+    """Position a station from the circles about each two of its marks."""
+    scene = gather(fits, marks, config)
+    first, second = np.triu_indices(len(fix.matches), 1)
+    pairs = np.stack([fix.matches[first], fix.matches[second]], axis=1)
+    return pairs_by_circles(scene, pairs, fix.p_site - scene.middle)
+
+
+def _no_pairs(
+    fix: StationFix, _fits: MarkerFits, _marks: ControlMarks, _config: ResectionConfig
+) -> PairFixes:
+    """Return no pairs: two slope distances leave a whole circle of positions."""
+    nothing = np.zeros(0)
+    return PairFixes(
+        method=fix.method,
+        marks=np.zeros((0, 2), dtype=np.intp),
+        included_angles=nothing.copy(),
+        included_angles_horizontal=nothing.copy(),
+        p_site=np.zeros((0, 3)),
+        sigma_3d=nothing.copy(),
+    )
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class _Method:
     """What a resection method can do."""
@@ -342,7 +389,11 @@ class _Method:
     resect_pairs: Callable[[StationFix, MarkerFits, ControlMarks, ResectionConfig], PairFixes]
 
 
-_METHODS = {"free_station": _Method(free_station, free_station_pairs)}
+_METHODS = {
+    "free_station": _Method(free_station, free_station_pairs),
+    "ranges": _Method(partial(_by_ranges, "ranges"), _no_pairs),
+    "paper": _Method(partial(_by_ranges, "paper"), _pairs_by_circles),
+}
 
 
 def _method(name: str) -> _Method:

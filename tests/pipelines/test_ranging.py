@@ -1,0 +1,131 @@
+"""Positions from distances, beside the free station."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from pipelines.config import ResectionConfig
+from pipelines.errors import DegenerateGeometryError
+from pipelines.geometry import inverse, levelling_rotation, log_motion, rigid
+from pipelines.ranging import circles, slope_ranges
+from pipelines.resection import resect, resect_pairs
+from tests.synthetic import control, field, pose, sightings
+
+EXACT = 1e-7  # [m] and [rad] noise-free in, truth out
+CONFIG = ResectionConfig(sigma_common=0.0)
+LEAN = (0.06, -0.04)
+METHODS = ("ranges", "paper")
+
+
+@pytest.fixture
+def rng():
+    return np.random.default_rng(19)
+
+
+def tall(rng, n=8):
+    """Marks whose heights differ enough for slope distances to tell a height."""
+    marks = field(rng, n)
+    p = marks.p_site.copy()
+    p[:, 2] = rng.uniform(0.0, 5.0, n)
+    return control(p)
+
+
+@pytest.mark.parametrize("measure", [slope_ranges, circles])
+def test_derivatives_agree_with_differences(rng, measure):
+    v, h = rng.uniform(1, 9, (6, 3)), 1e-6
+    _, J = measure(v)
+    for k in range(3):
+        d = h * np.eye(3)[k]
+        numeric = (measure(v + d)[0] - measure(v - d)[0]) / (2 * h)
+        np.testing.assert_allclose(J[..., k], numeric, rtol=0, atol=1e-8)
+
+
+@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize("middle", [(0, 0, 0), (431_250.0, 5_412_800.0, 312.0)])
+def test_noise_free_distances_give_the_true_pose(rng, method, middle):
+    marks = field(rng, middle=middle)
+    T = pose(np.add(middle, [1.0, -2.0, 0.8]), 2.2, LEAN)
+    fix = resect(method, sightings(marks, T, lean=LEAN), marks, CONFIG)
+    np.testing.assert_allclose(fix.p_site, T[:3, 3], rtol=0, atol=EXACT)
+    assert fix.yaw == pytest.approx(2.2, abs=EXACT)
+    np.testing.assert_allclose(fix.residuals_site, 0, atol=EXACT)
+    assert fix.method == method
+    assert len(fix.matches) == (3 if method == "paper" else 14)
+    assert len(fix.matches) + len(fix.excluded) == 14
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_the_covariance_of_the_pose_is_honest(rng, method):
+    marks = tall(rng)
+    root = rng.normal(0, 3e-3, (8, 3, 3)) + 4e-3 * np.eye(3)
+    root_marks = np.tile(np.diag([2e-3, 1e-3, 3e-3]), (8, 1, 1))
+    errors = []
+    for _ in range(150):
+        lean = rng.uniform(-0.05, 0.05, 2)
+        T = pose([0.5, -1.0, 1.5], rng.uniform(-3, 3), lean)
+        measured = tuple(lean + rng.normal(0, 3e-3, 2))
+        fits = sightings(
+            marks, T, lean=measured, cov=root @ np.swapaxes(root, 1, 2),
+            noise=np.einsum("nij,nj->ni", root, rng.normal(size=(8, 3))),
+        )  # fmt: skip
+        off = np.einsum("nij,nj->ni", root_marks, rng.normal(size=(8, 3)))
+        given = replace(
+            marks, p_site=marks.p_site + off, cov_p_site=root_marks @ np.swapaxes(root_marks, 1, 2)
+        )
+        fix = resect(method, fits, given, replace(CONFIG, test_level=1e-6))
+        true = T @ inverse(rigid(levelling_rotation(fits.levelling), np.zeros(3)))
+        xi = log_motion(true @ inverse(fix.T_site_station))
+        errors.append(np.linalg.solve(np.linalg.cholesky(fix.cov_T_site_station), xi))
+    errors = np.array(errors)
+    eigenvalues = np.linalg.eigvalsh(errors.T @ errors / len(errors))
+    assert eigenvalues[0] > 0.6  # chance alone gives 0.64 to 1.44
+    assert eigenvalues[-1] < 1.5
+
+
+def test_a_gross_error_in_a_distance_is_found_and_named(rng):
+    marks = tall(rng)
+    T = pose([0.5, -1.0, 1.5], 0.3)
+    fits = sightings(marks, T, noise=rng.normal(0, 4e-3, (8, 3)))
+    bad = fits.fits[2].p_base
+    bad = replace(fits.fits[2], p_base=bad * (1 + 0.06 / np.linalg.norm(bad)))
+    spoiled = replace(fits, fits=(*fits.fits[:2], bad, *fits.fits[3:]))
+    (out,) = resect("ranges", spoiled, marks, CONFIG).excluded
+    assert out.fit == 2
+    assert "distance to mark C" in out.reason
+
+
+def test_distances_to_marks_in_one_plane_with_the_station_leave_its_height_weak(rng):
+    p = field(rng, 6).p_site.copy()
+    p[:, 2] = 0.8 + 0.02 * np.sin(np.arange(6.0))
+    marks = control(p)
+    fits = sightings(marks, pose([1.0, -2.0, 0.5], 0.3))
+    fix = resect("ranges", fits, marks, CONFIG)
+    assert fix.status == "weak" or fix.cov_p_site[2, 2] > 25 * fix.cov_p_site[0, 0]
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_two_marks_are_refused(method):
+    marks = control([[6.9, 1.1, 0.6], [-3.9, 7.1, 1.5]])
+    fits = sightings(marks, pose([0, 0, 0.8], 0.3))
+    with pytest.raises(DegenerateGeometryError, match="three are needed"):
+        resect(method, fits, marks, CONFIG)
+
+
+def test_two_circles_have_the_error_that_the_theory_says(rng):
+    marks = field(rng)
+    sigma = 4e-3
+    fits = sightings(marks, pose([0.0, 0.0, 0.9], 1.0), sigma_level=1e-6)
+    fix = resect("paper", fits, marks, CONFIG)
+    pairs = resect_pairs("paper", fix, fits, marks, CONFIG)
+    assert len(pairs.marks) == 3
+    theory = sigma * np.sqrt(2.0 / np.sin(pairs.included_angles_horizontal) ** 2 + 0.5)
+    np.testing.assert_allclose(pairs.sigma_3d, theory, rtol=0.02)  # height: mean of two
+    np.testing.assert_allclose(pairs.p_site, np.tile([0.0, 0.0, 0.9], (3, 1)), rtol=0, atol=EXACT)
+
+
+def test_slope_distances_have_no_pairs(rng):
+    marks = field(rng)
+    fits = sightings(marks, pose([0.0, 0.0, 0.9], 1.0))
+    fix = resect("ranges", fits, marks, CONFIG)
+    assert len(resect_pairs("ranges", fix, fits, marks, CONFIG).marks) == 0
