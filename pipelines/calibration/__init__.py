@@ -1,0 +1,282 @@
+"""The rig from what spheres show on both faces of a scan: no plane and no coordinate is needed.
+
+A LiDAR whose spin axis is tilted sweeps every direction twice in a full turn of the gimbal, once on
+either side of its head. Errors of the rig move the two sights of one sphere apart; ``calibrate``
+makes them meet. Inside,
+
+- ``gimbal`` says how the parameters of a rig move its beams,
+- ``faces`` gets a rough rig from each sphere's two centres, however bad the start,
+- ``estimation`` adjusts rig and centres to the ranges, and holds what they do not tell.
+
+Why so: the two faces are looked at apart first, because a rig that is wrong by a tenth of a degree
+tears spheres in two, and no extraction would know them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from pipelines.calibration.estimation import Estimate, Inseparable, estimate, residual_rms
+from pipelines.calibration.faces import front_face, rig_from_faces
+from pipelines.calibration.gimbal import GIMBAL, Sights, sights, values
+from pipelines.config import SurveyConfig
+from pipelines.errors import DegenerateGeometryError, RigError
+from pipelines.extraction import extract
+from pipelines.fitting import fit_markers
+from pipelines.rigs import rig_digest
+from pipelines.stitching import choose_rig, split_stops, stitch
+from pipelines.values import Array, Index, Mask, Rig, ScanLog, Status, _seal
+
+__all__ = ["Calibration", "Inseparable", "calibrate"]
+
+Progress = Callable[[float, str], None]
+
+_N_PASSES = 3
+_SETTLED = 0.5  # sigmas by which the rig may still move from pass to pass
+_N_FACE = 6  # returns on either face of a sphere that count as seen on both
+_SUFFIX = "-calibrated"
+_N_SPHERES = 3  # seen on both faces: fewer leave offset and eccentricity undetermined
+
+
+@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
+class Calibration:
+    """A rig estimated from scans, with its uncertainty.
+
+    Attributes
+    ----------
+    rig : Rig
+        The estimated rig; what the scans do not tell is as in the start rig.
+    start : Rig
+        The rig that it began with.
+    names : tuple of str
+        Estimated parameters.
+    units : tuple of str
+        Their units.
+    start_values, estimates : (p,)
+        Their values in the two rigs.
+    cov : (p, p)
+        Covariance of the estimates; singular, because the mean of the laser biases is held.
+    inseparable : tuple of Inseparable
+        Parameters that the scans do not tell, with reasons.
+    stops : tuple of str
+        Names of the stops that were used.
+    n_spheres : int
+        Spheres, each counted at every stop that saw it.
+    n_two_faced : int
+        Those of them that were seen on both faces.
+    n_returns : int
+        Returns that the estimate rests on.
+    dof : int
+        Returns minus unknowns.
+    sigma0 : float
+        Square root of the a-posteriori variance factor; 1 means that ranges are as noisy as a
+        VLP-16's usually are. The covariance rests on the noise as it is.
+    rms_before, rms_after : float
+        Root mean square residual of the same returns with the start rig and with the estimated
+        one, the centres adjusted to either [m].
+    """
+
+    rig: Rig
+    start: Rig
+    names: tuple[str, ...]
+    units: tuple[str, ...]
+    start_values: Array
+    estimates: Array
+    cov: Array
+    inseparable: tuple[Inseparable, ...]
+    stops: tuple[str, ...]
+    n_spheres: int
+    n_two_faced: int
+    n_returns: int
+    dof: int
+    sigma0: float
+    rms_before: float
+    rms_after: float
+
+    def __post_init__(self) -> None:
+        p = len(self.names)
+        _seal(self, start_values=(p,), estimates=(p,), cov=(p, p))
+
+
+def calibrate(
+    logs: Iterable[ScanLog],
+    *,
+    config: SurveyConfig,
+    rig: Rig | None = None,
+    progress: Progress = lambda _share, _what: None,
+) -> Calibration:
+    """Estimate the rig from the spheres of one scan or many.
+
+    Parameters
+    ----------
+    logs : iterable of ScanLog
+        Scans with the same rig. It is gone through several times, so that a collection that reads
+        its logs one by one keeps memory small.
+    config : SurveyConfig
+        How spheres are found; the fitting's sigma of direction.
+    rig : Rig, optional
+        Where to start; by default the one that the logs describe.
+    progress : callable
+        Told the share of the work that is done, 0 to 1, and what comes next; may raise to cancel.
+
+    Returns
+    -------
+    Calibration
+        The rig with covariance, and what these scans do not tell.
+
+    Raises
+    ------
+    DegenerateGeometryError
+        If fewer than three spheres are seen on both faces.
+    MissingRigError
+        If neither the logs nor the caller tell how the LiDAR is mounted.
+    NotConvergedError
+        If the adjustment does not settle.
+    RigError
+        If the logs describe different rigs and none was given.
+
+    Notes
+    -----
+    Offsets of the axis, tilt and zero of the spin axis, eccentricity of the encoder and biases of
+    the lasers are estimated without priors as far as the ranges tell them. Cost grows linearly with
+    returns and with scans.
+    """
+    start = _start(logs, rig)
+    progress(0.0, "Looking at both faces of each sphere")
+    rough = rig_from_faces(_stops(logs, config), start, config)
+    seen, found = _passed(logs, rough, config)
+    for number in range(1, _N_PASSES):
+        progress(number / _N_PASSES, f"Adjusting rig and centres, pass {number + 1}")
+        before = found.rig
+        seen, found = _passed(logs, before, config)
+        if _in_sigmas(found, before) < _SETTLED:
+            break
+    progress(1.0, "Calibrated")
+    return _calibration(start, seen, found, config)
+
+
+def _passed(logs: Iterable[ScanLog], rig: Rig, config: SurveyConfig) -> tuple[_Seen, Estimate]:
+    """Find all spheres with a rig, and adjust it to them."""
+    seen = _see(logs, rig, config)
+    return seen, estimate(
+        *(seen.sights, rig, seen.centres, seen.covs),
+        config.marker_radius,
+        config.fitting.sigma_direction,
+    )
+
+
+def _start(logs: Iterable[ScanLog], rig: Rig | None) -> Rig:
+    """Return the rig to start with."""
+    rigs = {rig_digest(one): one for one in (choose_rig(log, rig) for log in logs)}
+    if not rigs:
+        raise DegenerateGeometryError("No log was given; a calibration needs at least one scan.")
+    if len(rigs) > 1:
+        raise RigError(
+            f"The logs describe {len(rigs)} different rigs; calibrate the logs of one rig, or say "
+            "which one to start with (--rig rig.json)."
+        )
+    return next(iter(rigs.values()))
+
+
+def _stops(logs: Iterable[ScanLog], config: SurveyConfig) -> Iterable[ScanLog]:
+    """Yield the stops of all logs."""
+    for log in logs:
+        yield from split_stops(log, config.stitching)
+
+
+@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
+class _Seen:
+    """What all stops show with one rig: shots at spheres, and rough centres."""
+
+    sights: Sights
+    centres: Array
+    covs: Array
+    stops: tuple[str, ...]
+    n_two_faced: int
+    sigma0: float
+
+
+def _see(logs: Iterable[ScanLog], rig: Rig, config: SurveyConfig) -> _Seen:
+    """Find and fit the spheres of all stops with a rig."""
+    parts, fits, names, n_two_faced = [], [], [], 0
+    for log in _stops(logs, config):
+        cloud = stitch(log, rig, config.stitching)
+        candidates = extract(cloud, config.extraction, config.marker_radius)
+        found = fit_markers("along_beam", cloud, candidates, config.fitting, config.marker_radius)
+        good = [fit for fit in found.fits if fit.status is Status.OK]
+        if not good:
+            continue
+        rows = np.concatenate([fit.used for fit in good])
+        which = np.repeat(np.arange(len(good)), [len(fit.used) for fit in good])
+        n_two_faced += _n_two_faced(front_face(cloud)[rows], which)
+        parts.append(sights(log, cloud, rows, which))
+        fits += good
+        names.append(log.origin.name)
+    if n_two_faced < _N_SPHERES:
+        raise DegenerateGeometryError(
+            f"{n_two_faced} spheres are seen on both faces; a calibration needs at least "
+            f"{_N_SPHERES}. Turn the gimbal by 360 degrees among more markers, or give more scans."
+        )
+    return _Seen(
+        sights=Sights.joined(parts),
+        centres=np.array([fit.p_base for fit in fits]),
+        covs=np.array([fit.cov_p_base for fit in fits]),
+        stops=tuple(names),
+        n_two_faced=n_two_faced,
+        sigma0=float(np.sqrt(np.mean([fit.sigma0**2 for fit in fits]))),
+    )
+
+
+def _n_two_faced(is_front: Mask, which: Index) -> int:
+    """Return the number of spheres with returns enough on both faces."""
+    n = int(which.max()) + 1
+    counts = [np.bincount(which[side], minlength=n) for side in (is_front, ~is_front)]
+    return int(np.sum(np.min(counts, axis=0) >= _N_FACE))
+
+
+def _calibrated(name: str) -> str:
+    """Return what a calibrated rig is called."""
+    return name if name.endswith(_SUFFIX) else name + _SUFFIX
+
+
+def _in_sigmas(found: Estimate, before: Rig) -> float:
+    """Return how far the rig moved, in sigmas of the parameter that moved most."""
+    steps = _chosen(found.rig, found) - _chosen(before, found)
+    sigmas = np.sqrt(np.diag(found.cov))
+    return float(np.max(np.abs(steps) / np.maximum(sigmas, 1e-12)))
+
+
+def _chosen(rig: Rig, found: Estimate) -> Array:
+    """Return the values in a rig of the parameters that were estimated."""
+    return np.concatenate([values(rig)[found.is_free], rig.laser_range_biases[found.lasers]])
+
+
+def _calibration(start: Rig, seen: _Seen, found: Estimate, config: SurveyConfig) -> Calibration:
+    """Put the result together."""
+    free = [parameter for parameter, is_free in zip(GIMBAL, found.is_free, strict=True) if is_free]
+    names = [p.name for p in free] + [f"laser_range_bias_{k}" for k in found.lasers]
+    before, after = (
+        residual_rms(seen.sights, rig, found, seen.covs, config.marker_radius)
+        for rig in (start, found.rig)
+    )
+    return Calibration(
+        rig=replace(found.rig, name=_calibrated(start.name)),
+        start=start,
+        names=tuple(names),
+        units=(*(p.unit for p in free), *("m" for _ in found.lasers)),
+        start_values=_chosen(start, found),
+        estimates=_chosen(found.rig, found),
+        cov=found.cov.copy(),
+        inseparable=found.held,
+        stops=seen.stops,
+        n_spheres=len(found.centres),
+        n_two_faced=seen.n_two_faced,
+        n_returns=int(found.is_used.sum()),
+        dof=found.dof,
+        sigma0=seen.sigma0,
+        rms_before=before,
+        rms_after=after,
+    )

@@ -1,0 +1,422 @@
+"""The adjustment of rig and centres: hides elimination, separability and robust weights."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from pipelines.calibration.gimbal import GIMBAL, Design, Parameter, Sights, design, moved
+from pipelines.errors import NotConvergedError
+from pipelines.values import RING_UNKNOWN, Array, Index, Mask, Rig, Rings
+
+_TUKEY = 6.0  # sigmas at which a return has no weight; 98 % efficient on clean data
+_EXPECTED_SQUARE = 0.8449  # mean of weight times square of normal residuals: 1 - 6/c^2 + 15/c^4
+_EFFICIENCY = 0.9651  # variance over the inverse normal matrix: E[w^2 x^2] E[w] / E[.]^2
+_NOISE_MIN = 0.001  # [m]; half of the resolution of a range
+_NOISE_START = 0.025  # [m]; the largest that a VLP-16 shows
+_DOF_NOISE = 30.0  # returns that the common noise is worth when that of a sphere is estimated
+_N_STEPS = 30
+_N_STEPS_NOISE = 4  # after these the noise stays as it is
+_SHARES = (1.0, 0.5, 0.25, 0.125, 0.0625)  # of a step that are tried
+_SETTLED = 0.02  # of the loss: what a step must save, a fifth of a sigma of one parameter
+_N_STEPS_CENTRES = 6
+_N_LASER = 20  # returns below which the bias of a laser stays as it is
+_PRIOR = 1e3  # [m] of a centre: keeps the equations solvable and is not felt otherwise
+
+
+class Inseparable(NamedTuple):
+    """A parameter that stays at its start value, with the reason."""
+
+    name: str
+    reason: str
+
+
+class Normals(NamedTuple):
+    """Normal equations with the centres eliminated.
+
+    Attributes
+    ----------
+    N : (p, p)
+        Of the parameters alone.
+    pull : (p,)
+        Right-hand side.
+    inverses : (m, 3, 3)
+        Of the centres' own blocks.
+    mixed : (m, 3, p)
+        Between centres and parameters.
+    pull_centres : (m, 3)
+        Right-hand sides of the centres.
+    """
+
+    N: Array
+    pull: Array
+    inverses: Array
+    mixed: Array
+    pull_centres: Array
+
+    def centre_steps(self, steps: Array) -> Array:
+        """Return the steps of the centres that belong to steps of the parameters.
+
+        Parameters
+        ----------
+        steps : (p,)
+            Steps of the parameters.
+
+        Returns
+        -------
+        (m, 3)
+            Steps of the centres [m].
+        """
+        return np.asarray(
+            np.einsum("mij,mj->mi", self.inverses, self.pull_centres - self.mixed @ steps)
+        )
+
+
+def reduced(which: Index, J_centres: Array, J: Array, residuals: Array, weights: Array) -> Normals:
+    """Sum the normal equations of centres and parameters, and eliminate the centres.
+
+    Parameters
+    ----------
+    which : (n,)
+        The centre of each observation; each centre occurs.
+    J_centres : (n, 3)
+        Derivatives by that centre.
+    J : (n, p)
+        Derivatives by the parameters.
+    residuals : (n,)
+        Observed minus computed.
+    weights : (n,)
+        Inverse variances.
+
+    Returns
+    -------
+    Normals
+        Schur's complement with what is needed to get the centres back.
+
+    Notes
+    -----
+    Cost grows linearly with observations and centres.
+    """
+    order = np.argsort(which, kind="stable")
+    J_centres, J = J_centres[order], J[order]
+    weighted = weights[order, None] * np.column_stack([J_centres, residuals[order]])
+    starts = np.searchsorted(which[order], np.arange(which.max() + 1))
+
+    def summed(products: Array) -> Array:
+        return np.asarray(np.add.reduceat(products, starts, axis=0))
+
+    own = summed(weighted[:, :3, None] * J_centres[:, None, :])
+    mixed = summed(weighted[:, :3, None] * J[:, None, :])
+    pull_centres = summed(weighted[:, 3:] * J_centres)
+    inverses = np.asarray(np.linalg.inv(own + np.eye(3) / _PRIOR**2))
+    by_parameter = inverses @ mixed
+    N = (J.T * weights[order]) @ J - np.einsum("mip,miq->pq", mixed, by_parameter)
+    pull = J.T @ weighted[:, 3] - np.einsum("mip,mi->p", by_parameter, pull_centres)
+    return Normals(N, pull, inverses, mixed, pull_centres)
+
+
+def separable(N: Array, parameters: tuple[Parameter, ...]) -> tuple[Mask, tuple[Inseparable, ...]]:
+    """Tell which parameters the observations can tell apart.
+
+    Parameters
+    ----------
+    N : (p, p)
+        Normal matrix with the centres eliminated.
+    parameters : tuple of Parameter
+        What its columns are, and the sigma at which each is as good as unknown.
+
+    Returns
+    -------
+    is_free : (p,)
+        Those to estimate.
+    held : tuple of Inseparable
+        The others, with the reason.
+
+    Notes
+    -----
+    In units of those sigmas, an eigenvalue under 1 belongs to a combination that stays unknown.
+    While there is one, the parameter with the largest part in its vector is held.
+    """
+    scales = np.array([parameter.unknown for parameter in parameters])
+    scaled = N * np.outer(scales, scales)
+    is_free, held = np.ones(len(N), dtype=np.bool_), []
+    while is_free.any():
+        places = np.flatnonzero(is_free)
+        eigenvalues, vectors = np.linalg.eigh(scaled[np.ix_(places, places)])
+        if eigenvalues[0] >= 1.0:
+            break
+        parts = np.abs(vectors[:, 0])
+        worst = int(parts.argmax())
+        is_free[places[worst]] = False
+        partners = [parameters[places[k]].name for k in np.flatnonzero(parts > 0.3) if k != worst]
+        held.append(
+            Inseparable(
+                parameters[places[worst]].name,
+                _reason(parameters[places[worst]], float(eigenvalues[0]), partners),
+            )
+        )
+    return is_free, tuple(held)
+
+
+def _reason(parameter: Parameter, eigenvalue: float, partners: list[str]) -> str:
+    """Say why a parameter is held."""
+    together = f" apart from {', '.join(partners)}" if partners else ""
+    if eigenvalue < 1e-4:
+        return f"These scans do not tell it{together}: {parameter.twin}."
+    sigma = parameter.unknown / np.sqrt(eigenvalue)
+    return (
+        f"These scans tell it{together} only to {sigma:.2g} {parameter.unit} (1 sigma): "
+        f"{parameter.twin}."
+    )
+
+
+class Estimate(NamedTuple):
+    """A rig and centres with what they rest on.
+
+    Attributes
+    ----------
+    rig : Rig
+        The rig.
+    centres : (m, 3)
+        Centres in the base of their stops [m].
+    is_free : (q,)
+        The parameters of ``GIMBAL`` that were estimated.
+    held : tuple of Inseparable
+        The others.
+    lasers : (k,)
+        Lasers whose biases were estimated, their mean held.
+    cov : (p, p)
+        Covariance of the free parameters, then of the biases of those lasers.
+    is_used : (n,)
+        Which returns have weight.
+    dof : int
+        Their number minus that of the unknowns.
+    """
+
+    rig: Rig
+    centres: Array
+    is_free: Mask
+    held: tuple[Inseparable, ...]
+    lasers: Index
+    cov: Array
+    is_used: Mask
+    dof: int
+
+
+class _State(NamedTuple):
+    """Where the estimate stands: rig, centres [m], and what the shots say of them."""
+
+    rig: Rig
+    centres: Array
+    sight: Design
+
+
+class _Problem(NamedTuple):
+    """What stays the same from step to step; ``basis``, (256, k - 1), is that of the biases."""
+
+    seen: Sights
+    covs: Array
+    radius: float
+    sigma_direction: float
+    basis: Array
+
+    def at(self, rig: Rig, centres: Array) -> _State:
+        """Return the state at a rig and centres."""
+        return _State(rig, centres, design(self.seen, rig, centres, self.covs, self.radius))
+
+    def extra(self, state: _State) -> Array:
+        """Return the noise that directions and bends add to each range [m]."""
+        return np.asarray(np.hypot(self.sigma_direction * state.sight.slopes, state.sight.bends))
+
+    def sigmas(self, state: _State, noises: Array) -> Array:
+        """Return the noise of each range, given that of the returns of each sphere [m]."""
+        return np.asarray(np.hypot(noises[self.seen.which], self.extra(state)))
+
+    def noises(self, state: _State, before: Array) -> Array:
+        """Return the noise of each sphere's returns [m], drawn towards that of all."""
+        which, n = self.seen.which, len(before)
+        scaled = state.sight.residuals / self.sigmas(state, before)
+        weights, own = tukey(scaled), scaled * before[which]
+        squares = np.bincount(which, weights * own**2, n) / _EXPECTED_SQUARE
+        dofs = np.maximum(np.bincount(which, weights > 0.0, n) - 3.0, 0.0)
+        of_all = squares.sum() / max(dofs.sum(), 1.0)
+        drawn = (squares + _DOF_NOISE * of_all) / (dofs + _DOF_NOISE)
+        return np.asarray(np.maximum(np.sqrt(drawn), _NOISE_MIN))
+
+    def equations(self, state: _State, sigmas: Array) -> Normals:
+        """Return the normal equations of all parameters and biases."""
+        sight = state.sight
+        J = np.column_stack([sight.J_rig, self.basis[self.seen.rings]])
+        weights = tukey(sight.residuals / sigmas) / sigmas**2
+        return reduced(self.seen.which, sight.J_centres, J, sight.residuals, weights)
+
+    def ahead(self, state: _State, equations: Normals, chosen: Index, sigmas: Array) -> _State:
+        """Return the state after the longest share of a step that lowers the loss, or the last."""
+        steps = np.zeros(len(equations.N))
+        N = equations.N[np.ix_(chosen, chosen)]
+        steps[chosen] = np.linalg.solve(N, equations.pull[chosen])
+        by_rig, by_laser = np.split(steps, [len(GIMBAL)])
+        biases = (self.basis @ by_laser)[: len(state.rig.laser_range_biases)]
+        by_centre = equations.centre_steps(steps)
+        loss, trial = _loss(state.sight.residuals / sigmas), state
+        for share in _SHARES:
+            rig = moved(state.rig, share * by_rig, share * biases)
+            trial = self.at(rig, state.centres + share * by_centre)
+            if _loss(trial.sight.residuals / sigmas) < loss:
+                break
+        return trial
+
+
+def estimate(
+    seen: Sights, rig: Rig, centres: Array, covs: Array, radius: float, sigma_direction: float
+) -> Estimate:
+    """Adjust the rig and all centres to the recorded ranges.
+
+    Parameters
+    ----------
+    seen : Sights
+        Shots at the spheres.
+    rig : Rig
+        Where to start; what cannot be told stays as it is here.
+    centres : (m, 3)
+        Approximate centres, good to a centimetre [m].
+    covs : (m, 3, 3)
+        Their covariances, over whose width ranges are averaged [m^2].
+    radius : float
+        Radius of the spheres [m].
+    sigma_direction : float
+        Standard deviation of a beam's direction per axis [rad].
+
+    Returns
+    -------
+    Estimate
+        Rig and centres with the covariance of what was estimated.
+
+    Raises
+    ------
+    NotConvergedError
+        If the steps do not become small.
+
+    Notes
+    -----
+    Gauss-Newton with Tukey's weights, each step shortened until it lowers the loss; noise is
+    estimated sphere by sphere, each drawn towards the noise of all.
+    """
+    lasers, basis = _contrasts(seen.rings)
+    problem = _Problem(seen, covs, radius, sigma_direction, basis)
+    state = problem.at(rig, centres)
+    noises = np.full(len(centres), _NOISE_START)
+    is_free: Mask = np.ones(len(GIMBAL), dtype=np.bool_)
+    held: tuple[Inseparable, ...] = ()
+    for number in range(_N_STEPS):
+        if number < _N_STEPS_NOISE:
+            noises = problem.noises(state, noises)
+        sigmas = problem.sigmas(state, noises)
+        equations = problem.equations(state, sigmas)
+        if number == 0:
+            is_free, held = separable(equations.N[: len(GIMBAL), : len(GIMBAL)], GIMBAL)
+        chosen = np.flatnonzero(np.append(is_free, np.ones(basis.shape[1], dtype=np.bool_)))
+        better = problem.ahead(state, equations, chosen, sigmas)
+        saved = _loss(state.sight.residuals / sigmas) - _loss(better.sight.residuals / sigmas)
+        if number >= _N_STEPS_NOISE and saved < _SETTLED:
+            return _estimate(problem, state, sigmas, is_free, held, lasers)
+        state = better
+    raise NotConvergedError(
+        f"The calibration did not settle within {_N_STEPS} steps; the start rig is too far off "
+        "or what was taken for spheres is none."
+    )
+
+
+def tukey(scaled: Array) -> Array:
+    """Return Tukey's weights.
+
+    Parameters
+    ----------
+    scaled : (n,)
+        Residuals in units of their sigma.
+
+    Returns
+    -------
+    (n,)
+        1 in the middle, 0 from six sigmas outwards.
+    """
+    return np.where(np.abs(scaled) < _TUKEY, (1.0 - (scaled / _TUKEY) ** 2) ** 2, 0.0)
+
+
+def _contrasts(rings: Rings) -> tuple[Index, Array]:
+    """Return the lasers whose biases can be told, and a basis, (256, k - 1), of mean zero."""
+    counts = np.bincount(rings, minlength=256)
+    counts[RING_UNKNOWN] = 0
+    lasers = np.flatnonzero(counts >= _N_LASER)
+    k = len(lasers)
+    basis = np.zeros((256, max(k - 1, 0)))
+    if k > 1:
+        basis[lasers] = np.linalg.svd(np.eye(k) - 1.0 / k)[0][:, : k - 1]
+    return lasers, basis
+
+
+def _estimate(
+    problem: _Problem,
+    state: _State,
+    sigmas: Array,
+    is_free: Mask,
+    held: tuple[Inseparable, ...],
+    lasers: Index,
+) -> Estimate:
+    """Put the estimate together."""
+    n_free, k = int(is_free.sum()), problem.basis.shape[1]
+    chosen = np.flatnonzero(np.append(is_free, np.ones(k, dtype=np.bool_)))
+    N = problem.equations(state, sigmas).N[np.ix_(chosen, chosen)]
+    J = np.zeros((n_free + len(lasers), n_free + k))
+    J[:n_free, :n_free] = np.eye(n_free)
+    J[n_free:, n_free:] = problem.basis[lasers]
+    residuals = state.sight.residuals
+    is_used = tukey(residuals / sigmas) > 0.0
+    return Estimate(
+        rig=state.rig,
+        centres=state.centres,
+        is_free=is_free,
+        held=held,
+        lasers=lasers,
+        cov=_EFFICIENCY * J @ np.linalg.inv(N) @ J.T,
+        is_used=is_used,
+        dof=int(is_used.sum()) - 3 * len(state.centres) - len(chosen),
+    )
+
+
+def residual_rms(seen: Sights, rig: Rig, found: Estimate, covs: Array, radius: float) -> float:
+    """Return the root mean square residual of an estimate's returns with a rig.
+
+    Parameters
+    ----------
+    seen : Sights
+        Shots at the spheres.
+    rig : Rig
+        The rig; the centres are adjusted to it.
+    found : Estimate
+        Which returns to look at.
+    covs : (m, 3, 3)
+        Covariances of the centres [m^2].
+    radius : float
+        Radius of the spheres [m].
+
+    Returns
+    -------
+    float
+        Root mean square residual [m].
+    """
+    centres, weights = found.centres, found.is_used.astype(np.float64)
+    nothing = np.zeros((len(weights), 0))
+    for _ in range(_N_STEPS_CENTRES):
+        sight = design(seen, rig, centres, covs, radius)
+        equations = reduced(seen.which, sight.J_centres, nothing, sight.residuals, weights)
+        centres = centres + equations.centre_steps(np.zeros(0))
+    residuals = design(seen, rig, centres, covs, radius).residuals
+    return float(np.sqrt(np.mean(residuals[found.is_used] ** 2)))
+
+
+def _loss(scaled: Array) -> float:
+    """Return Tukey's loss of residuals in units of their sigma: half their square if small."""
+    kept = 1.0 - np.minimum(np.abs(scaled) / _TUKEY, 1.0) ** 2
+    return float(np.sum(_TUKEY**2 / 6.0 * (1.0 - kept**3)))

@@ -1,0 +1,166 @@
+"""A rough rig from each sphere's two centres: hides how bad the start may be.
+
+Each face of a scan is whole in itself, whatever the rig: it is found and fitted apart, and what
+separates the two centres of a sphere is put down to the rig.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import replace
+from typing import NamedTuple
+
+import numpy as np
+
+from pipelines.calibration.estimation import separable
+from pipelines.calibration.gimbal import GIMBAL, MOUNTING, aimed, motions, moved, sights
+from pipelines.config import SurveyConfig
+from pipelines.errors import DegenerateGeometryError, RigError
+from pipelines.extraction import extract
+from pipelines.fitting import fit_markers
+from pipelines.stitching import stitch
+from pipelines.values import Array, Index, MarkerFit, Mask, Rig, ScanLog, StitchedCloud
+
+_GATE = 0.05  # [m] and
+_GATE_SLOPE = 0.025  # [rad]: the two centres of one sphere may be so far apart at a distance
+_TILT_MIN = np.radians(20.0)  # of the spin axis: with less there are no two faces
+_N_PAIRS = 3
+_N_ROBUST = 6
+_COLUMNS = ("p_base", "gimbal_angles", "intensities", "rings", "times")
+
+
+class _Pair(NamedTuple):
+    """How far apart the two centres of a sphere are, and how the rig moves them apart.
+
+    ``gap`` is (3,) [m], ``cov`` its covariance, ``J``, (3, q), its derivative by ``MOUNTING``.
+    """
+
+    gap: Array
+    cov: Array
+    J: Array
+
+
+def front_face(cloud: StitchedCloud) -> Mask:
+    """Tell which returns were made on the front of the head.
+
+    Parameters
+    ----------
+    cloud : StitchedCloud
+        A stop.
+
+    Returns
+    -------
+    (n,)
+        Whether the beam went to the side of gimbal axis times spin axis.
+
+    Raises
+    ------
+    RigError
+        If the spin axis is nearly the gimbal's own.
+    """
+    spin = cloud.rig.T_head_lidar[:3, 2]
+    side = np.array([-spin[1], spin[0]])
+    if np.linalg.norm(side) < np.sin(_TILT_MIN):
+        raise RigError(
+            "The LiDAR's spin axis is less than 20 degrees from the gimbal axis: its scan has no "
+            "two faces, and spheres cannot calibrate it. Check T_head_lidar of the rig."
+        )
+    c, s = np.cos(cloud.gimbal_angles), np.sin(cloud.gimbal_angles)
+    x, y = cloud.p_base[:, 0], cloud.p_base[:, 1]
+    return np.asarray((c * x + s * y) * side[0] + (c * y - s * x) * side[1] > 0.0)
+
+
+def rig_from_faces(stops: Iterable[ScanLog], start: Rig, config: SurveyConfig) -> Rig:
+    """Estimate the mounting roughly, from a start that may be bad.
+
+    Parameters
+    ----------
+    stops : iterable of ScanLog
+        Stops with the same rig.
+    start : Rig
+        Where to start: good to about a degree and some centimetres.
+    config : SurveyConfig
+        How spheres are found.
+
+    Returns
+    -------
+    Rig
+        Good to some millimetres; what two faces do not tell is as in the start.
+
+    Raises
+    ------
+    DegenerateGeometryError
+        If fewer than three spheres are seen on both faces.
+
+    Notes
+    -----
+    Least squares of the differences, linear in the parameters, with Cauchy's weights against pairs
+    that are no pairs.
+    """
+    pairs, coverages = [], []
+    for log in stops:
+        cloud = stitch(log, start, config.stitching)
+        coverages.append(np.degrees(cloud.coverage))
+        pairs += _pairs(log, cloud, config)
+    if len(pairs) < _N_PAIRS:
+        raise DegenerateGeometryError(
+            f"{len(pairs)} spheres are seen on both faces in {len(coverages)} scans, whose gimbal "
+            f"turned by {max(coverages):.0f} degrees at most; a calibration needs at least "
+            f"{_N_PAIRS}. Turn it by 360 degrees among more markers, or give more scans."
+        )
+    return moved(start, _solved(pairs), np.zeros_like(start.laser_range_biases))
+
+
+def _pairs(log: ScanLog, cloud: StitchedCloud, config: SurveyConfig) -> list[_Pair]:
+    """Return the spheres that both faces of a stop show."""
+    front = front_face(cloud)
+    sides = [_fits(cloud, rows, config) for rows in (np.flatnonzero(front), np.flatnonzero(~front))]
+    if not all(sides):
+        return []
+    p, q = (np.array([fit.p_base for fit in side]) for side in sides)
+    gaps = np.linalg.norm(p[:, None] - q[None], axis=2)
+    near = gaps < _GATE + _GATE_SLOPE * np.linalg.norm(p, axis=1)[:, None]
+    mutual = (gaps == gaps.min(axis=1, keepdims=True)) & (gaps == gaps.min(axis=0))
+    return [_pair(log, cloud, (sides[0][i], sides[1][j])) for i, j in np.argwhere(near & mutual)]
+
+
+def _fits(cloud: StitchedCloud, rows: Index, config: SurveyConfig) -> list[MarkerFit]:
+    """Return the fits of one face, with their rows in the whole cloud."""
+    face = replace(cloud, **{name: getattr(cloud, name)[rows] for name in _COLUMNS})
+    candidates = extract(face, config.extraction, config.marker_radius)
+    fits = fit_markers("along_beam", face, candidates, config.fitting, config.marker_radius).fits
+    return [replace(fit, used=rows[fit.used], rejected=rows[fit.rejected]) for fit in fits]
+
+
+def _pair(log: ScanLog, cloud: StitchedCloud, fits: tuple[MarkerFit, MarkerFit]) -> _Pair:
+    """Return two centres of a sphere with how the rig moves each."""
+    effects = []
+    for fit in fits:
+        seen = sights(log, cloud, fit.used, np.zeros(len(fit.used), dtype=np.intp))
+        turns, shifts = motions(seen, cloud.rig)
+        arms = cloud.p_base[fit.used] - aimed(seen, cloud.rig).origins_base
+        effects.append((shifts + np.cross(turns, arms[:, None])).mean(axis=0).T)
+    front, back = fits
+    return _Pair(
+        gap=front.p_base - back.p_base,
+        cov=front.cov_p_base + back.cov_p_base,
+        J=(effects[1] - effects[0])[:, : len(MOUNTING)],
+    )
+
+
+def _solved(pairs: list[_Pair]) -> Array:
+    """Return the changes of the parameters that bring the pairs together best."""
+    gaps, covs, J = (np.array(column) for column in zip(*pairs, strict=True))
+    weights = np.linalg.inv(covs)
+    trust = np.ones(len(pairs))
+    changes = np.zeros(len(GIMBAL))
+    for _ in range(_N_ROBUST):
+        N = np.einsum("k,kip,kij,kjq->pq", trust, J, weights, J)
+        is_free, _ = separable(N, MOUNTING)
+        free = np.flatnonzero(is_free)
+        pull = np.einsum("k,kip,kij,kj->p", trust, J, weights, gaps)
+        changes[free] = np.linalg.solve(N[np.ix_(free, free)], pull[free])
+        left = gaps - J @ changes[: len(MOUNTING)]
+        squares = np.einsum("ki,kij,kj->k", left, weights, left)
+        trust = 1.0 / (1.0 + squares / (3.0 * max(float(np.median(squares)), 1.0)))
+    return changes

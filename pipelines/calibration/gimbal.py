@@ -1,0 +1,446 @@
+"""How shots depend on the rig: hides its parameters, their order and their derivatives.
+
+A parameter moves a beam as a rigid body: it turns it about its origin and shifts the origin. The
+range to a sphere changes by what the same motion of the sphere the other way would change it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import NamedTuple
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from pipelines.fitting.footprint import predict
+from pipelines.stitching import beams
+from pipelines.values import Array, Beams, Index, Rig, Rings, ScanLog, StitchedCloud
+
+_RATE_WINDOW = 0.05  # [s] over which the speed of the gimbal is taken: encoders jitter
+_NS = 1e-9  # [s] in a nanosecond
+
+
+class Parameter(NamedTuple):
+    """One number of a rig: what it is, and which sigma of it is as good as not knowing it."""
+
+    name: str
+    unit: str
+    unknown: float
+    twin: str  # what the centres or the pose of the station can do instead
+
+
+_LENGTH, _ANGLE, _TIME = 0.02, np.radians(1.0), 0.005
+
+MOUNTING = (
+    Parameter("axis_offset_x", "m", _LENGTH, "too few spheres are seen on both faces"),
+    Parameter("axis_offset_y", "m", _LENGTH, "too few spheres are seen on both faces"),
+    Parameter("spin_axis_tilt", "rad", _ANGLE, "too few lasers see the spheres"),
+    Parameter("spin_zero", "rad", _ANGLE, "too few spheres are seen on both faces"),
+    Parameter("encoder_cosine", "rad", _ANGLE, "the spheres stand in too few directions"),
+    Parameter("encoder_sine", "rad", _ANGLE, "the spheres stand in too few directions"),
+)
+"""What the difference between the two faces tells."""
+
+OTHERS = (
+    Parameter(
+        "gimbal_clock_offset",
+        "s",
+        _TIME,
+        "at constant speed of the gimbal it turns all centres together, as a heading does; only a "
+        "gimbal that changes its speed while the LiDAR measures can tell it",
+    ),
+    Parameter(
+        "spin_axis_heading", "rad", _ANGLE, "it turns all centres of a stop about the gimbal axis"
+    ),
+    Parameter("height_offset", "m", _LENGTH, "it shifts all centres of a stop along the axis"),
+    Parameter("gimbal_axis_roll", "rad", _ANGLE, "it turns all centres of a stop about x of base"),
+    Parameter("gimbal_axis_pitch", "rad", _ANGLE, "it turns all centres of a stop about y of base"),
+    Parameter(
+        "common_range_bias",
+        "m",
+        _LENGTH,
+        "it puts every centre nearer or farther by the same on both faces",
+    ),
+)
+"""What coordinates of the spheres, or a varying speed, would be needed for."""
+
+GIMBAL = MOUNTING + OTHERS
+
+
+class Sights(NamedTuple):
+    """Shots at spheres as the rig recorded them, before anything of the rig was applied.
+
+    Attributes
+    ----------
+    v_lidar : (n, 3)
+        Directions of the beams in the LiDAR's frame.
+    heights : (n,)
+        Where they leave the spin axis [m].
+    ranges : (n,)
+        Ranges, bias included [m].
+    angles : (n,)
+        Recorded gimbal angle at the instant of the shot on the gimbal's own clock [rad].
+    rates : (n,)
+        Speed of the gimbal [rad/s].
+    rings : (n,) uint8
+        Lasers.
+    which : (n,)
+        The sphere that each one met.
+    divergence : (2,)
+        Full width of the footprint across and along the spin axis [rad].
+    """
+
+    v_lidar: Array
+    heights: Array
+    ranges: Array
+    angles: Array
+    rates: Array
+    rings: Rings
+    which: Index
+    divergence: Array
+
+    @classmethod
+    def joined(cls, parts: list[Sights]) -> Sights:
+        """Return the shots of several stops as one table; spheres are numbered on.
+
+        Parameters
+        ----------
+        parts : list of Sights
+            At least one.
+
+        Returns
+        -------
+        Sights
+            All of them.
+        """
+        firsts = np.cumsum([0, *(part.which.max(initial=-1) + 1 for part in parts)])
+        numbered = [
+            part._replace(which=part.which + first)
+            for part, first in zip(parts, firsts[:-1], strict=True)
+        ]
+        columns = [name for name in cls._fields if name != "divergence"]
+        return numbered[0]._replace(
+            **{name: np.concatenate([getattr(part, name) for part in numbered]) for name in columns}
+        )
+
+
+def sights(log: ScanLog, cloud: StitchedCloud, rows: Index, which: Index) -> Sights:
+    """Undo the stitching of some returns.
+
+    Parameters
+    ----------
+    log : ScanLog
+        The stop.
+    cloud : StitchedCloud
+        The same, stitched.
+    rows : (n,)
+        Rows of the cloud.
+    which : (n,)
+        The sphere that each one met.
+
+    Returns
+    -------
+    Sights
+        The shots as recorded.
+    """
+    rig, table = cloud.rig, beams(cloud, rows)
+    turned = cloud.gimbal_angles[rows].astype(np.float64)
+    rates = _rates(log, rig, table.times)
+    v_head = _turn(table.directions_base, -turned)
+    biases = np.zeros(256)
+    biases[: len(rig.laser_range_biases)] = rig.laser_range_biases
+    heights = np.zeros(256)
+    heights[: len(rig.laser_heights)] = rig.laser_heights
+    return Sights(
+        v_lidar=v_head @ rig.T_head_lidar[:3, :3],
+        heights=heights[table.rings],
+        ranges=table.ranges + biases[table.rings],
+        angles=_recorded(turned, rig) + rates * rig.gimbal_clock_offset,
+        rates=rates,
+        rings=table.rings,
+        which=which,
+        divergence=rig.divergence,
+    )
+
+
+def _rates(log: ScanLog, rig: Rig, times: Array) -> Array:
+    """Return the speed of the gimbal [rad/s] at times since the stop's first shot."""
+    first = int(log.stamps_lidar_ns.min())
+    joints = (log.stamps_gimbal_ns - first) * _NS + rig.gimbal_clock_offset
+    later, earlier = times + 0.5 * _RATE_WINDOW, times - 0.5 * _RATE_WINDOW
+    turned = np.interp(later, joints, log.gimbal_angles)
+    turned -= np.interp(earlier, joints, log.gimbal_angles)
+    passed = np.minimum(later, joints[-1]) - np.maximum(earlier, joints[0])
+    return np.asarray(turned / np.maximum(passed, 0.1 * _RATE_WINDOW))
+
+
+def _recorded(turned: Array, rig: Rig) -> Array:
+    """Return recorded angles from those with the eccentricity applied."""
+    cosine, sine = rig.encoder_eccentricity
+    angles = turned.copy()
+    for _ in range(4):  # converges by the size of the amplitudes each time
+        angles = turned - cosine * np.cos(angles) - sine * np.sin(angles)
+    return angles
+
+
+def _turn(v: Array, angles: Array) -> Array:
+    """Return ``Rz(angle) v`` for rows of vectors, (n, 3) or one, and as many angles."""
+    c, s = np.cos(angles), np.sin(angles)
+    x, y, z = np.broadcast_to(v, (len(angles), 3)).T
+    return np.stack([c * x - s * y, s * x + c * y, z], axis=1)
+
+
+def angles_of(seen: Sights, rig: Rig) -> Array:
+    """Return the true gimbal angle of shots, if the rig is right.
+
+    Parameters
+    ----------
+    seen : Sights
+        Shots as recorded.
+    rig : Rig
+        Eccentricity and clock offset.
+
+    Returns
+    -------
+    (n,)
+        Angles [rad].
+    """
+    cosine, sine = rig.encoder_eccentricity
+    at_shot = seen.angles - seen.rates * rig.gimbal_clock_offset
+    return np.asarray(at_shot + cosine * np.cos(at_shot) + sine * np.sin(at_shot))
+
+
+def aimed(seen: Sights, rig: Rig) -> Beams:
+    """Return shots as lines in the base frame.
+
+    Parameters
+    ----------
+    seen : Sights
+        Shots as recorded.
+    rig : Rig
+        The rig.
+
+    Returns
+    -------
+    Beams
+        As stitching them anew would give.
+    """
+    angles, R = angles_of(seen, rig), rig.T_head_lidar[:3, :3]
+    directions = _turn(seen.v_lidar @ R.T, angles)
+    spin = _turn(R[:, 2], angles)
+    across = np.cross(spin, directions)
+    known = np.zeros(256)
+    known[: len(rig.laser_range_biases)] = rig.laser_range_biases
+    n = len(angles)
+    return Beams(
+        origins_base=_turn(rig.T_head_lidar[:3, 3], angles) + seen.heights[:, None] * spin,
+        directions_base=directions,
+        ranges=seen.ranges - known[seen.rings],
+        across_base=across / np.linalg.norm(across, axis=1, keepdims=True),
+        rings=seen.rings,
+        intensities=np.zeros(n),
+        times=np.zeros(n),
+        divergence=rig.divergence,
+    )
+
+
+def motions(seen: Sights, rig: Rig) -> tuple[Array, Array]:
+    """Return how each parameter moves each beam.
+
+    Parameters
+    ----------
+    seen : Sights
+        Shots as recorded.
+    rig : Rig
+        Where they are linearised.
+
+    Returns
+    -------
+    turns : (n, q, 3)
+        Rotation of the beam about its origin in base, by the parameters of ``GIMBAL`` [rad].
+    shifts : (n, q, 3)
+        Shift of its origin [m].
+    """
+    angles = angles_of(seen, rig)
+    table = aimed(seen, rig)
+    R, z = rig.T_head_lidar[:3, :3], np.array([0.0, 0.0, 1.0])
+    heading, _, _ = _euler(rig)
+    axis_tilt = np.array([-np.sin(heading), np.cos(heading), 0.0])
+    n, origins = len(angles), table.origins_base
+    turns = {name: np.zeros((n, 3)) for name, *_ in GIMBAL}
+    shifts = {name: np.zeros((n, 3)) for name, *_ in GIMBAL}
+    shifts["axis_offset_x"] = _turn(np.array([1.0, 0.0, 0.0]), angles)
+    shifts["axis_offset_y"] = _turn(np.array([0.0, 1.0, 0.0]), angles)
+    shifts["height_offset"] = np.tile(z, (n, 1))
+    turns["spin_zero"] = _turn(R[:, 2], angles)
+    turns["spin_axis_tilt"] = _turn(axis_tilt, angles)
+    turns["spin_axis_heading"] = np.tile(z, (n, 1))
+    for name in ("spin_axis_tilt", "spin_axis_heading"):
+        shifts[name] = seen.heights[:, None] * np.cross(turns[name], turns["spin_zero"])
+    at_shot = seen.angles - seen.rates * rig.gimbal_clock_offset
+    by_angle = {
+        "encoder_cosine": np.cos(at_shot),
+        "encoder_sine": np.sin(at_shot),
+        "gimbal_clock_offset": -seen.rates,
+    }
+    for name, factors in by_angle.items():
+        turns[name] = factors[:, None] * z
+        shifts[name] = factors[:, None] * np.cross(z, origins)
+    for name, axis in (("gimbal_axis_roll", 0), ("gimbal_axis_pitch", 1)):
+        turns[name] = np.tile(np.eye(3)[axis], (n, 1))
+        shifts[name] = np.cross(np.eye(3)[axis], origins)
+    names = [parameter.name for parameter in GIMBAL]
+    return (
+        np.stack([turns[name] for name in names], axis=1),
+        np.stack([shifts[name] for name in names], axis=1),
+    )
+
+
+class Design(NamedTuple):
+    """Residuals of shots with their derivatives.
+
+    Attributes
+    ----------
+    residuals : (n,)
+        Observed minus computed ranges [m].
+    J_centres : (n, 3)
+        Derivatives of the computed ranges by the centre of the sphere that was met.
+    J_rig : (n, q)
+        The same by the parameters of ``GIMBAL``.
+    slopes : (n,)
+        How much the range changes with the direction of the beam [m/rad].
+    bends : (n,)
+        Standard deviation that the bend of the range leaves beside its linear part [m].
+    """
+
+    residuals: Array
+    J_centres: Array
+    J_rig: Array
+    slopes: Array
+    bends: Array
+
+
+def design(seen: Sights, rig: Rig, centres: Array, covs: Array, radius: float) -> Design:
+    """Compare shots with spheres.
+
+    Parameters
+    ----------
+    seen : Sights
+        Shots as recorded.
+    rig : Rig
+        The rig.
+    centres : (m, 3)
+        Centres of the spheres in base [m].
+    covs : (m, 3, 3)
+        Covariances of the centres, over whose width ranges are averaged and linearised [m^2].
+    radius : float
+        Their radius [m].
+
+    Returns
+    -------
+    Design
+        Residuals and derivatives.
+
+    Notes
+    -----
+    With ``v`` from a beam's origin to the centre and ``J`` the derivative of its range by the
+    centre, a turn ``w`` of the beam changes the range by ``(J x v) w`` and a shift of its origin
+    by ``-J``: what counts is where the sphere is as seen from the beam. Near the outline the range
+    bends within less than a millimetre; its slope there is that between places to either side of
+    the centre (statistical linearisation by cubature).
+    """
+    table = aimed(seen, rig)
+    ranges, J, bends = _averaged(table, centres, covs, radius, seen.which)
+    turns, shifts = motions(seen, rig)
+    v = centres[seen.which] - table.origins_base
+    J_rig = np.einsum("nqi,ni->nq", turns, np.cross(J, v)) - np.einsum("nqi,ni->nq", shifts, J)
+    J_rig[:, -1] = 1.0  # a range that is measured too long
+    along = np.einsum("ni,ni->n", J, table.directions_base)
+    slopes2 = np.maximum(np.einsum("ni,ni->n", J, J) - along**2, 0.0)
+    return Design(
+        residuals=table.ranges - ranges,
+        J_centres=J,
+        J_rig=J_rig,
+        slopes=table.ranges * np.sqrt(slopes2),
+        bends=bends,
+    )
+
+
+def _averaged(
+    table: Beams, centres: Array, covs: Array, radius: float, which: Index
+) -> tuple[Array, Array, Array]:
+    """Return mean ranges, derivatives by the centre and what bends, over the centres' widths."""
+    radii = np.full(len(centres), radius)
+    columns = np.sqrt(3.0) * np.linalg.cholesky(covs)
+    places = [centres + side * columns[:, :, k] for k in range(3) for side in (1.0, -1.0)]
+    there = [predict(table, place, radii, which) for place in places]
+    ranges = np.array([one.ranges for one in there])
+    J = np.mean([one.J[:, :3] for one in there], axis=0)
+    linear = np.array([np.einsum("ni,ni->n", J, (place - centres)[which]) for place in places])
+    bends = np.std(ranges - linear, axis=0)
+    return ranges.mean(axis=0), J, bends
+
+
+def _euler(rig: Rig) -> Array:
+    """Return heading, tilt and spin zero of ``R_head_lidar = Rz(heading) Ry(tilt) Rz(zero)``."""
+    return Rotation.from_matrix(rig.T_head_lidar[:3, :3]).as_euler("ZYZ")
+
+
+def values(rig: Rig) -> Array:
+    """Return the parameters of a rig.
+
+    Parameters
+    ----------
+    rig : Rig
+        The rig.
+
+    Returns
+    -------
+    (q,)
+        In the order of ``GIMBAL``; what a rig does not hold, because it belongs to the station or
+        to the definition of base, is zero.
+    """
+    heading, tilt, zero = _euler(rig)
+    x, y = rig.T_head_lidar[:2, 3]
+    known = {
+        "axis_offset_x": x,
+        "axis_offset_y": y,
+        "spin_axis_tilt": tilt,
+        "spin_zero": zero,
+        "encoder_cosine": rig.encoder_eccentricity[0],
+        "encoder_sine": rig.encoder_eccentricity[1],
+        "gimbal_clock_offset": rig.gimbal_clock_offset,
+        "spin_axis_heading": heading,
+    }
+    return np.array([known.get(name, 0.0) for name, *_ in GIMBAL])
+
+
+def moved(rig: Rig, changes: Array, bias_changes: Array) -> Rig:
+    """Return a rig with some of its numbers changed.
+
+    Parameters
+    ----------
+    rig : Rig
+        The rig.
+    changes : (q,)
+        Changes of the parameters of ``GIMBAL``; those that a rig does not hold must be zero.
+    bias_changes : (k,)
+        Changes of the laser range biases [m].
+
+    Returns
+    -------
+    Rig
+        The changed rig, under the same name.
+    """
+    by_name = dict(zip((name for name, *_ in GIMBAL), values(rig) + changes, strict=True))
+    T_head_lidar = rig.T_head_lidar.copy()
+    euler = [by_name[name] for name in ("spin_axis_heading", "spin_axis_tilt", "spin_zero")]
+    T_head_lidar[:3, :3] = Rotation.from_euler("ZYZ", euler).as_matrix()
+    T_head_lidar[:2, 3] = by_name["axis_offset_x"], by_name["axis_offset_y"]
+    return replace(
+        rig,
+        T_head_lidar=T_head_lidar,
+        encoder_eccentricity=np.array([by_name["encoder_cosine"], by_name["encoder_sine"]]),
+        gimbal_clock_offset=float(by_name["gimbal_clock_offset"]),
+        laser_range_biases=rig.laser_range_biases + bias_changes,
+    )
