@@ -314,9 +314,17 @@ def bench(
     long: Annotated[
         bool, typer.Option("--long", help="Also logs of 1, 3, 10 and 30 million returns.")
     ] = False,
+    extraction: Annotated[
+        bool, typer.Option("--extraction", help="Precision and recall of extraction instead.")
+    ] = False,
+    worlds: Annotated[int, typer.Option(min=1, help="Worlds of each scenario for that.")] = 3,
+    seed: Annotated[int, typer.Option(min=0, help="Seed of the first of them.")] = 0,
     as_json: AsJson = False,
 ) -> None:
     """Measure each step against one read of the file with a checksum, in the same run."""
+    if extraction:
+        _bench_extraction(worlds, seed, as_json=as_json)
+        return
     from service import bench as benches
     from service import tables
 
@@ -327,6 +335,18 @@ def bench(
         _print_json(report)
     else:
         tables.print_bench(out, report)
+
+
+def _bench_extraction(worlds: int, seed: int, *, as_json: bool) -> None:
+    """Measure precision and recall of extraction in simulated worlds."""
+    from service import detection
+
+    with _progress() as progress:
+        report = detection.run(worlds, seed, progress)
+    if as_json:
+        _print_json(report)
+    else:
+        detection.print_report(out, report)
 
 
 @app.command()
