@@ -6,7 +6,7 @@ control marks, so that large coordinates cost no digits.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from math import comb
 from typing import NamedTuple
 
@@ -30,6 +30,7 @@ _N_HYPOTHESES = 1000  # poses that are looked at; the true one has many votes
 _N_SOLUTIONS = 6  # that are refined: the best, and rivals enough to see that it is ambiguous
 _N_ROUNDS = 8  # of adjusting and matching again; two or three are the rule
 _RIVAL = 14.0  # -2 ln(0.001): how much better, in the weighted sum of squares, the best must be
+_PAIR = 25.0  # weighted sum of squares (2 dof) above which two markers are not those two marks
 _CHANCE = 0.01  # expected number of chance agreements above which a match is none
 _SHARE = 0.4  # of markers or marks, the fewer: of mirrored fields five in fourteen may still fit
 
@@ -60,6 +61,8 @@ class Scene:
         Standard deviation of each of the two angles [rad].
     is_levelled : bool
         Whether they were measured.
+    sigma_heading : float
+        Standard deviation of the heading that mounting and encoder leave unknown [rad].
     """
 
     names: tuple[str, ...]
@@ -72,6 +75,7 @@ class Scene:
     J_up: Array
     sigma_level: float
     is_levelled: bool
+    sigma_heading: float
 
 
 class _Hypotheses(NamedTuple):
@@ -97,6 +101,9 @@ class Match:
         Degrees of freedom.
     largest_residual : float
         Of the matched fits [m].
+    rivals : (k, 3)
+        Where base would stand, relative to the middle of the marks, by other matches of two
+        markers that explain them about as well; no rows for three or more [m].
     """
 
     marks: Index
@@ -104,6 +111,7 @@ class Match:
     vtpv: float
     dof: int
     largest_residual: float
+    rivals: Array = field(default_factory=lambda: np.zeros((0, 3)))
 
     @property
     def n(self) -> int:
@@ -151,6 +159,7 @@ def gather(fits: MarkerFits, marks: ControlMarks, config: ResectionConfig) -> Sc
         J_up=np.array([[0.0, -cp], [cp * cr, -sp * sr], [-cp * sr, -sp * cr]]),
         sigma_level=levelling.sigma,
         is_levelled=levelling.is_measured,
+        sigma_heading=levelling.sigma_heading,
     )
 
 
@@ -182,12 +191,16 @@ def match_marks(scene: Scene, config: ResectionConfig) -> Match:
     -----
     Two fits and two marks with the same distance and the same difference of height give a heading
     and a translation; a mirror image never does. The poses with most votes are tried on all fits,
-    the best are refined and compared. Cost grows with the square of fits times marks until
-    300,000 pairs of pairs, then no more.
+    the best are refined and compared. Two marks, or two markers, have one distance and one
+    difference of height: the pair that keeps both best is taken, and where else it would fit stands
+    in ``Match.rivals``. Cost grows with the square of fits times marks, to 300,000 pairs of pairs,
+    then no more.
     """
     levelled = scene.centres_base @ scene.R_station_base.T
     _refuse_plumb_line(levelled, "markers", config)
     _refuse_plumb_line(scene.marks_site, "control marks", config)
+    if min(len(levelled), len(scene.marks_site)) == 2:
+        return _matched_pair(levelled, scene, config)
     hypotheses = _voted(_hypotheses(levelled, scene, config), levelled, config)
     solutions = _solutions(hypotheses, levelled, scene, config)
     if not solutions:
@@ -197,8 +210,7 @@ def match_marks(scene: Scene, config: ResectionConfig) -> Match:
             f"{config.match_tolerance} m): these are marks of another field, or false markers."
         )
     best = solutions[0]
-    if best.n > 2 or len(levelled) > 2:
-        _refuse_chance(best, scene, config)
+    _refuse_chance(best, scene, config)
     rivals = [other for other in solutions[1:] if _is_rival(other, best)]
     if rivals:
         raise AmbiguousMatchError(
@@ -328,6 +340,70 @@ def _hypotheses(levelled: Array, scene: Scene, config: ResectionConfig) -> _Hypo
     middles = (levelled[first] + levelled[second])[rows] / 2.0
     goals = (scene.marks_site[a] + scene.marks_site[b])[columns] / 2.0
     return _Hypotheses(yaws, goals - _turned(middles, yaws))
+
+
+def _matched_pair(levelled: Array, scene: Scene, config: ResectionConfig) -> Match:
+    """Return the match of two markers and two marks that keeps distance and height best."""
+    pairs, misfits = _pair_misfits(levelled, scene, config)
+    best = int(np.argmin(misfits)) if len(misfits) else -1
+    has_choice = max(len(levelled), len(scene.marks_site)) > 2
+    if best < 0 or (has_choice and misfits[best] > _PAIR):
+        raise NoMatchError(
+            f"No two of the {len(levelled)} markers have the distance and the difference of height "
+            f"of any two of the {len(scene.marks_site)} control marks (within "
+            f"{config.match_tolerance} m, and what their sigmas allow): these are marks of another "
+            "field, or false markers."
+        )
+    rivals = np.flatnonzero(misfits <= misfits[best] + _RIVAL)
+    poses = [_pair_pose(levelled, scene, pairs[k]) for k in (best, *rivals[rivals != best])]
+    solution = solve_pose(scene, pairs[best], poses[0])
+    marks = np.full(len(levelled), -1, dtype=np.intp)
+    marks[pairs[best, :, 0]] = pairs[best, :, 1]
+    return Match(
+        marks=marks,
+        T_site_base=solution.estimate,
+        vtpv=_weighted_square(solution),
+        dof=2,
+        largest_residual=float(np.linalg.norm(solution.groups[0].residuals, axis=1).max()),
+        rivals=np.array([T[:3, 3] for T in poses[1:]]).reshape(-1, 3),
+    )
+
+
+def _pair_misfits(levelled: Array, scene: Scene, config: ResectionConfig) -> tuple[Index, Array]:
+    """Return pairs of fits on pairs of marks, (h, 2, 2), and how badly each keeps its shape.
+
+    The misfit is the weighted sum of squares of distance and difference of height, (h,).
+    """
+    first, second = _pairs_far_first(len(levelled))
+    a, b = np.nonzero(~np.eye(len(scene.marks_site), dtype=np.bool_))
+    rows, columns = (k.ravel() for k in np.indices((len(first), len(a))))
+    pairs = np.stack(
+        [
+            np.stack([first[rows], a[columns]], axis=1),
+            np.stack([second[rows], b[columns]], axis=1),
+        ],
+        axis=1,
+    )
+    spans = levelled[pairs[:, 1, 0]] - levelled[pairs[:, 0, 0]]
+    targets = scene.marks_site[pairs[:, 1, 1]] - scene.marks_site[pairs[:, 0, 1]]
+    level = np.hypot(spans[:, 0], spans[:, 1])
+    cov = scene.cov_centres[pairs[..., 0]].sum(axis=1) + scene.cov_marks[pairs[..., 1]].sum(axis=1)
+    variance = np.trace(cov, axis1=1, axis2=2)  # of any direction at most
+    stretch = np.linalg.norm(spans, axis=1) - np.linalg.norm(targets, axis=1)
+    rise = spans[:, 2] - targets[:, 2]
+    misfits = stretch**2 / variance + rise**2 / (variance + (level * scene.sigma_level) ** 2)
+    tolerance = config.match_tolerance
+    usable = (level > 2.0 * tolerance) & (np.abs(stretch) <= tolerance)
+    usable &= np.abs(rise) <= tolerance + 3.0 * scene.sigma_level * level
+    return pairs[usable], misfits[usable]
+
+
+def _pair_pose(levelled: Array, scene: Scene, pair: Index) -> Array:
+    """Return the pose of base, (4, 4), that lays two fits on two marks as well as a heading can."""
+    p, q = levelled[pair[:, 0]], scene.marks_site[pair[:, 1]]
+    span, target = p[1] - p[0], q[1] - q[0]
+    R = rot_z(np.arctan2(target[1], target[0]) - np.arctan2(span[1], span[0]))
+    return rigid(R @ scene.R_station_base, q.mean(axis=0) - R @ p.mean(axis=0))
 
 
 def _pairs_far_first(n: int) -> tuple[Index, Index]:

@@ -236,6 +236,8 @@ def _weaknesses(
 ) -> list[str]:
     """Say why a fix cannot be relied on."""
     reasons = []
+    if len(match.rivals):
+        reasons.append(_other_places(scene, match))
     if len(used) < 3:
         reasons.append(
             "only two marks: solved with gravity, and an error in one of them would not show"
@@ -260,6 +262,17 @@ def _weaknesses(
     return reasons
 
 
+def _other_places(scene: Scene, match: Match) -> str:
+    """Say where else the station may stand, when two markers fit two marks in several ways."""
+    places = match.rivals + scene.middle
+    text = ", ".join(f"({x:.2f}, {y:.2f}, {z:.2f})" for x, y, z in places[:3])
+    more = f" and {len(places) - 3} more places" if len(places) > 3 else ""
+    return (
+        f"two markers fit the marks in {len(places) + 1} ways about equally well: the station may "
+        f"as well stand at {text}{more} m; a third mark would tell"
+    )
+
+
 def _fix(
     scene: Scene,
     used: Index,
@@ -278,7 +291,7 @@ def _fix(
     return StationFix(
         method="free_station",
         T_site_station=T_site_base @ inverse(rigid(scene.R_station_base, np.zeros(3))),
-        cov_T_site_station=shift @ adjustment.cov @ shift.T,
+        cov_T_site_station=shift @ adjustment.cov @ shift.T + _cov_heading(scene, T_site_base),
         matches=used,
         residuals_site=adjustment.groups[0].residuals,
         redundancies=adjustment.redundancies[:n],
@@ -293,6 +306,17 @@ def _fix(
         reason="; ".join(reasons),
         excluded=excluded,
     )
+
+
+def _cov_heading(scene: Scene, T_site_base: Array) -> Array:
+    """Return the covariance of a pose that turns about its own plumb line, (6, 6).
+
+    The heading of base is where its joint angle is zero, which mounting and encoder blur; the
+    position does not move.
+    """
+    up = T_site_base[:3, :3] @ scene.R_station_base[2]
+    turn = np.concatenate([up, np.cross(T_site_base[:3, 3], up)])
+    return np.asarray(scene.sigma_heading**2 * np.outer(turn, turn))
 
 
 def _position_by_motion(T: Array) -> Array:

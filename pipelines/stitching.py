@@ -279,7 +279,13 @@ def level(log: ScanLog, rig: Rig, config: StitchingConfig) -> Levelling:
     usable = np.linalg.norm(log.quaternions_imu, axis=1)
     usable = np.isfinite(usable) & (usable > 0.5)
     if not np.any(usable):
-        return Levelling(roll=0.0, pitch=0.0, sigma=_SIGMA_UNLEVELLED, is_measured=False)
+        return Levelling(
+            roll=0.0,
+            pitch=0.0,
+            sigma=_SIGMA_UNLEVELLED,
+            is_measured=False,
+            sigma_heading=rig.sigma_heading,
+        )
     R_world_imu = Rotation.from_quat(log.quaternions_imu[usable]).as_matrix()
     ups = R_world_imu[:, 2, :] @ rig.R_mount_imu.T
     if rig.imu_mount is ImuMount.HEAD:
@@ -290,6 +296,7 @@ def level(log: ScanLog, rig: Rig, config: StitchingConfig) -> Levelling:
         pitch=float(np.arctan2(-up[0], np.hypot(up[1], up[2]))),
         sigma=float(np.hypot(config.sigma_levelling, scatter)),
         is_measured=True,
+        sigma_heading=rig.sigma_heading,
     )
 
 

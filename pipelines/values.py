@@ -235,7 +235,7 @@ class Firings:
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class Levelling:
-    """How the base leans, as the AHRS tells.
+    """How the base leans, as the AHRS tells, and what all centres of a stop have in common.
 
     Attributes
     ----------
@@ -245,12 +245,15 @@ class Levelling:
         Standard deviation of each of the two angles [rad].
     is_measured : bool
         False when no AHRS was recorded and the base is only assumed to be about level.
+    sigma_heading : float
+        Standard deviation of the heading that mounting and encoder leave unknown [rad].
     """
 
     roll: float
     pitch: float
     sigma: float
     is_measured: bool
+    sigma_heading: float = 0.0
 
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
@@ -500,10 +503,10 @@ class MarkerFit:
         """Square root of the trace of the covariance [m]."""
         return float(np.sqrt(np.trace(self.cov_p_base)))
 
-    def sigma_total_3d(self, sigma_heading: float) -> float:
-        """Return ``sigma_3d`` with what an unknown heading [rad] of the stop adds to it [m]."""
-        lever = float(np.hypot(self.p_base[0], self.p_base[1]))
-        return float(np.hypot(self.sigma_3d, lever * sigma_heading))
+    def cov_with_heading(self, sigma_heading: float) -> Array:
+        """Return ``cov_p_base`` with what an unknown heading [rad] of the stop adds to it [m^2]."""
+        sideways = np.array([-self.p_base[1], self.p_base[0], 0.0])
+        return self.cov_p_base + sigma_heading**2 * np.outer(sideways, sideways)
 
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
@@ -665,7 +668,7 @@ class StationFix:
 
     @property
     def sigma_yaw(self) -> float:
-        """Standard deviation of ``yaw``, without what mounting and encoder leave unknown [rad]."""
+        """Standard deviation of ``yaw`` [rad]."""
         return float(np.sqrt(self.cov_T_site_station[2, 2]))
 
     @property

@@ -133,15 +133,15 @@ def _markers(
 
 def _marker(name: str, fit: MarkerFit, R_frame_base: Array, sigma_heading: float) -> Plain:
     """Return one marker."""
+    cov_base = fit.cov_with_heading(sigma_heading)
     return {
         "id": name,
         "status": str(fit.status),
         "reason": fit.reason,
         "method": fit.method,
         "centre_m": _numbers(R_frame_base @ fit.p_base),
-        "covariance_m2": _numbers(R_frame_base @ fit.cov_p_base @ R_frame_base.T),
-        "sigma_3d_m": _number(fit.sigma_3d),
-        "sigma_total_3d_m": _number(fit.sigma_total_3d(sigma_heading)),
+        "covariance_m2": _numbers(R_frame_base @ cov_base @ R_frame_base.T),
+        "sigma_3d_m": _number(math.sqrt(np.trace(cov_base))),
         "range_m": _number(fit.mean_range),
         "n_points": fit.n_points,
         "n_rejected": len(fit.rejected),
@@ -194,7 +194,7 @@ def _station(
         "position_m": _numbers(fix.p_site),
         "rotation": _numbers(fix.T_site_station[:3, :3]),
         "yaw_deg": math.degrees(yaw),
-        "sigma_yaw_deg": math.degrees(math.hypot(fix.sigma_yaw, stop.cloud.rig.sigma_heading)),
+        "sigma_yaw_deg": math.degrees(fix.sigma_yaw),
         "covariance": _numbers(fix.cov_T_site_station),
         "position_covariance_m2": _numbers(fix.cov_p_site),
         "sigma_3d_m": _number(fix.sigma_3d),

@@ -32,7 +32,7 @@ _CHUNK = 1 << 20  # [bytes] of a log that are sent at once
 _POLL = 0.2  # [s] between two looks at a job
 _SUMMARY = """
 SELECT 'sphere centres' AS what, fit_method, count(*) AS n, sqrt(avg(error_3d_m ^ 2)) AS rms_m,
-    max(error_3d_m) AS max_m, sqrt(avg(sigma_total_3d_m ^ 2)) AS sigma_m
+    max(error_3d_m) AS max_m, sqrt(avg(sigma_3d_m ^ 2)) AS sigma_m
 FROM latest_marker_fits WHERE survey = 'paper-field' AND error_3d_m IS NOT NULL GROUP BY ALL
 UNION ALL
 SELECT 'stations', fit_method, count(*), sqrt(avg(error_3d_m ^ 2)), max(error_3d_m),

@@ -65,7 +65,7 @@ _MARKS = "SELECT mark, x_m, y_m, z_m FROM control_marks WHERE survey_id = $id OR
 _TRUE_STOPS = "SELECT stop, x_m, y_m, z_m FROM true_stops WHERE survey_id = $id ORDER BY stop"
 _FITS = """
 SELECT stop, fit_method, marker, mark, status, reason, range_m, n_points,
-    sigma_total_3d_m AS sigma_3d_m, error_3d_m
+    sigma_3d_m, error_3d_m
 FROM latest_marker_fits WHERE survey_id = $id ORDER BY stop, fit_method, marker
 """
 _FIXES = """

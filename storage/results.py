@@ -68,8 +68,7 @@ _SCHEMAS = {
         **dict.fromkeys(("marker", "mark", "status", "reason"), _TEXT),
         **_PLACE,
         **_COV,
-        **dict.fromkeys(("sigma_3d_m", "sigma_total_3d_m"), _REAL),
-        **dict.fromkeys(("range_m", "azimuth_deg", "elevation_deg"), _REAL),
+        **dict.fromkeys(("sigma_3d_m", "range_m", "azimuth_deg", "elevation_deg"), _REAL),
         **dict.fromkeys(("n_points", "n_rejected", "n_rings"), _WHOLE),
         **dict.fromkeys(("coverage", "rms_m", "sigma0", "radius_m", "radius_free_m"), _REAL),
         **dict.fromkeys(("sigma_radius_free_m", "mean_intensity", "incidence_deg"), _REAL),
@@ -282,7 +281,7 @@ def _stop_rows(
         ]
     for (fit_method, method), fix in stop.fixes.items():
         label = {"fit_method": fit_method, "resection_method": method}
-        rows["station_fixes"].append(label | _fix_row(fix, sigma_heading))
+        rows["station_fixes"].append(label | _fix_row(fix))
         if isinstance(fix, StationFix):
             n_fits = len(stop.fits[fit_method].fits)
             rows["observations"] += [label | row for row in _observation_rows(fix, n_fits, names)]
@@ -328,14 +327,14 @@ def _stop_row(stop: StopResult, cloud_url: str | None) -> Row:
 def _fit_row(fit: MarkerFit, R_station_base: Array, sigma_heading: float) -> Row:
     """Return the row of ``marker_fits`` without errors and names."""
     p_station = R_station_base @ fit.p_base
+    cov_base = fit.cov_with_heading(sigma_heading)
     x, y, z = p_station
     return {
         "status": str(fit.status),
         "reason": fit.reason,
         **_place(p_station),
-        **_cov(R_station_base @ fit.cov_p_base @ R_station_base.T),
-        "sigma_3d_m": fit.sigma_3d,
-        "sigma_total_3d_m": fit.sigma_total_3d(sigma_heading),
+        **_cov(R_station_base @ cov_base @ R_station_base.T),
+        "sigma_3d_m": np.sqrt(np.trace(cov_base)),
         "range_m": fit.mean_range,
         "azimuth_deg": np.degrees(np.arctan2(y, x)),
         "elevation_deg": np.degrees(np.arctan2(z, np.hypot(x, y))),
@@ -354,7 +353,7 @@ def _fit_row(fit: MarkerFit, R_station_base: Array, sigma_heading: float) -> Row
     }
 
 
-def _fix_row(fix: StationFix | NoFix, sigma_heading: float) -> Row:
+def _fix_row(fix: StationFix | NoFix) -> Row:
     """Return the row of ``station_fixes`` without errors."""
     if isinstance(fix, NoFix):
         return {"status": "failed", "reason": fix.reason, "n_markers": 0}
@@ -367,7 +366,7 @@ def _fix_row(fix: StationFix | NoFix, sigma_heading: float) -> Row:
         **_cov(fix.cov_p_site),
         "cov_motion": fix.cov_T_site_station.ravel().tolist(),
         "sigma_3d_m": fix.sigma_3d,
-        "sigma_yaw_deg": np.degrees(np.hypot(fix.sigma_yaw, sigma_heading)),
+        "sigma_yaw_deg": np.degrees(fix.sigma_yaw),
         **ellipse(fix.cov_p_site[:2, :2]),
         "n_markers": len(fix.matches),
         "dof": fix.dof,

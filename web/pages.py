@@ -277,7 +277,7 @@ EXAMPLES: tuple[tuple[str, str], ...] = (
     (
         "Worst markers",
         "SELECT survey, stop, marker, mark, fit_method, range_m, n_points,\n"
-        "    coalesce(error_3d_m, sigma_total_3d_m) * 1000 AS error_or_sigma_mm, status, reason\n"
+        "    coalesce(error_3d_m, sigma_3d_m) * 1000 AS error_or_sigma_mm, status, reason\n"
         "FROM latest_marker_fits\nORDER BY error_or_sigma_mm DESC\nLIMIT 20;",
     ),
     (
@@ -297,8 +297,8 @@ EXAMPLES: tuple[tuple[str, str], ...] = (
         "Are the sigmas honest?",
         "SELECT survey, fit_method, count(error_3d_m) AS n,\n"
         "    sqrt(avg(error_3d_m ^ 2)) * 1000 AS error_rms_mm,\n"
-        "    sqrt(avg(sigma_total_3d_m ^ 2)) * 1000 AS predicted_mm,\n"
-        "    sqrt(avg(error_3d_m ^ 2) / avg(sigma_total_3d_m ^ 2)) AS error_over_sigma\n"
+        "    sqrt(avg(sigma_3d_m ^ 2)) * 1000 AS predicted_mm,\n"
+        "    sqrt(avg(error_3d_m ^ 2) / avg(sigma_3d_m ^ 2)) AS error_over_sigma\n"
         "FROM latest_marker_fits\nWHERE error_3d_m IS NOT NULL\nGROUP BY ALL\nORDER BY ALL;",
     ),
     (

@@ -166,6 +166,8 @@ def _chain(
                     raise DegenerateGeometryError("Too few markers.")
                 scene = gather(fits, found.as_control(), config)
                 match = match_marks(scene, config)
+                if len(match.rivals):
+                    raise AmbiguousMatchError("Two markers fit the map in several ways.")
             except SolveError as error:
                 failed[i] = error
                 continue

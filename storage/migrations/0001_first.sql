@@ -178,7 +178,7 @@ COMMENT ON COLUMN stops.coverage_deg IS 'Angle that the gimbal turned through, a
 COMMENT ON COLUMN stops.duration_s IS 'Time from the first shot to the last.';
 COMMENT ON COLUMN stops.roll_deg IS 'Lean of the base in R_station_base = Ry(pitch) Rx(roll).';
 COMMENT ON COLUMN stops.pitch_deg IS 'Lean of the base in R_station_base = Ry(pitch) Rx(roll).';
-COMMENT ON COLUMN stops.sigma_heading_deg IS 'Standard deviation of the heading that mounting and encoder leave unknown; it turns all centres of the stop together.';
+COMMENT ON COLUMN stops.sigma_heading_deg IS 'Standard deviation of the heading that mounting and encoder leave unknown; it turns all centres of the stop together and is part of their covariances.';
 COMMENT ON COLUMN stops.sigma_levelling_deg IS 'Standard deviation of roll and of pitch.';
 COMMENT ON COLUMN stops.cloud_url IS 'Where the thinned cloud is; NULL when it was not kept.';
 COMMENT ON COLUMN stops.notes IS 'What weakens the results, for people.';
@@ -202,7 +202,6 @@ CREATE TABLE marker_fits (
     cov_yz_m2 DOUBLE,
     cov_zz_m2 DOUBLE,
     sigma_3d_m DOUBLE,
-    sigma_total_3d_m DOUBLE,
     range_m DOUBLE NOT NULL,
     azimuth_deg DOUBLE NOT NULL,
     elevation_deg DOUBLE NOT NULL,
@@ -240,8 +239,7 @@ COMMENT ON COLUMN marker_fits.cov_xz_m2 IS 'Covariance of the centre in the stat
 COMMENT ON COLUMN marker_fits.cov_yy_m2 IS 'Covariance of the centre in the station frame, without levelling.';
 COMMENT ON COLUMN marker_fits.cov_yz_m2 IS 'Covariance of the centre in the station frame, without levelling.';
 COMMENT ON COLUMN marker_fits.cov_zz_m2 IS 'Covariance of the centre in the station frame, without levelling.';
-COMMENT ON COLUMN marker_fits.sigma_3d_m IS 'Square root of the trace of the covariance.';
-COMMENT ON COLUMN marker_fits.sigma_total_3d_m IS 'The same with the heading of the stop: what error_3d_m is to be compared with.';
+COMMENT ON COLUMN marker_fits.sigma_3d_m IS 'Square root of the trace of the covariance, heading included.';
 COMMENT ON COLUMN marker_fits.range_m IS 'From the mean beam origin to the centre.';
 COMMENT ON COLUMN marker_fits.azimuth_deg IS 'Direction to the centre in the station frame, counter-clockwise from x.';
 COMMENT ON COLUMN marker_fits.elevation_deg IS 'Direction to the centre above the horizon of the station.';
@@ -337,7 +335,7 @@ COMMENT ON COLUMN station_fixes.cov_yz_m2 IS 'Covariance of the position in the 
 COMMENT ON COLUMN station_fixes.cov_zz_m2 IS 'Covariance of the position in the site frame.';
 COMMENT ON COLUMN station_fixes.cov_motion IS 'Covariance of a small motion on the left (rotation in rad, translation in m, site frame), 36 numbers, rows first.';
 COMMENT ON COLUMN station_fixes.sigma_3d_m IS 'Square root of the trace of the covariance of the position.';
-COMMENT ON COLUMN station_fixes.sigma_yaw_deg IS 'Standard deviation of the heading, with what mounting and encoder leave unknown.';
+COMMENT ON COLUMN station_fixes.sigma_yaw_deg IS 'Standard deviation of the heading.';
 COMMENT ON COLUMN station_fixes.ellipse_major_m IS 'Semi-major axis of the horizontal standard ellipse (1 sigma, 39 % of cases).';
 COMMENT ON COLUMN station_fixes.ellipse_minor_m IS 'Semi-minor axis of the horizontal standard ellipse.';
 COMMENT ON COLUMN station_fixes.ellipse_bearing_deg IS 'Bearing of the major axis, clockwise from y of the site frame, 0 to 180.';
@@ -476,7 +474,7 @@ COMMENT ON VIEW latest_station_fixes IS 'station_fixes of the newest run of each
 CREATE VIEW accuracy_by_distance AS
 SELECT survey_id, survey, fit_method, floor(range_m) AS range_from_m, floor(range_m) + 1 AS range_to_m,
     count(*) AS n_fits, count(error_3d_m) AS n_errors,
-    avg(n_points) AS mean_n_points, sqrt(avg(sigma_total_3d_m ^ 2)) AS sigma_3d_rms_m,
+    avg(n_points) AS mean_n_points, sqrt(avg(sigma_3d_m ^ 2)) AS sigma_3d_rms_m,
     avg(error_3d_m) AS error_3d_mean_m, sqrt(avg(error_3d_m ^ 2)) AS error_3d_rms_m,
     quantile_cont(error_3d_m, 0.95) AS error_3d_p95_m, max(error_3d_m) AS error_3d_max_m,
     avg(error_radial_m) AS error_radial_mean_m
@@ -488,7 +486,7 @@ COMMENT ON COLUMN accuracy_by_distance.n_fits IS 'Fits in the bin.';
 COMMENT ON COLUMN accuracy_by_distance.mean_n_points IS 'Mean number of returns of a fit.';
 COMMENT ON COLUMN accuracy_by_distance.error_radial_mean_m IS 'Mean error along the line of sight; positive is too far.';
 COMMENT ON COLUMN accuracy_by_distance.n_errors IS 'Fits whose error is known.';
-COMMENT ON COLUMN accuracy_by_distance.sigma_3d_rms_m IS 'Predicted: root mean square of sigma_total_3d_m.';
+COMMENT ON COLUMN accuracy_by_distance.sigma_3d_rms_m IS 'Predicted: root mean square of sigma_3d_m.';
 COMMENT ON COLUMN accuracy_by_distance.error_3d_mean_m IS 'Mean error; the study publishes this one.';
 COMMENT ON COLUMN accuracy_by_distance.error_3d_rms_m IS 'Root mean square error.';
 COMMENT ON COLUMN accuracy_by_distance.error_3d_p95_m IS '95th percentile of the error; the tolerance holds when it is at most that.';
@@ -498,7 +496,7 @@ CREATE VIEW accuracy_by_point_count AS
 SELECT survey_id, survey, fit_method, 20 * (n_points // 20) AS n_points_from,
     20 * (n_points // 20) + 20 AS n_points_to,
     count(*) AS n_fits, count(error_3d_m) AS n_errors,
-    avg(range_m) AS mean_range_m, sqrt(avg(sigma_total_3d_m ^ 2)) AS sigma_3d_rms_m,
+    avg(range_m) AS mean_range_m, sqrt(avg(sigma_3d_m ^ 2)) AS sigma_3d_rms_m,
     avg(error_3d_m) AS error_3d_mean_m, sqrt(avg(error_3d_m ^ 2)) AS error_3d_rms_m,
     quantile_cont(error_3d_m, 0.95) AS error_3d_p95_m, max(error_3d_m) AS error_3d_max_m
 FROM latest_marker_fits GROUP BY ALL ORDER BY ALL;
@@ -508,7 +506,7 @@ COMMENT ON COLUMN accuracy_by_point_count.n_points_to IS 'Upper end of the bin, 
 COMMENT ON COLUMN accuracy_by_point_count.n_fits IS 'Fits in the bin.';
 COMMENT ON COLUMN accuracy_by_point_count.mean_range_m IS 'Mean distance of the fits.';
 COMMENT ON COLUMN accuracy_by_point_count.n_errors IS 'Fits whose error is known.';
-COMMENT ON COLUMN accuracy_by_point_count.sigma_3d_rms_m IS 'Predicted: root mean square of sigma_total_3d_m.';
+COMMENT ON COLUMN accuracy_by_point_count.sigma_3d_rms_m IS 'Predicted: root mean square of sigma_3d_m.';
 COMMENT ON COLUMN accuracy_by_point_count.error_3d_mean_m IS 'Mean error; the study publishes this one.';
 COMMENT ON COLUMN accuracy_by_point_count.error_3d_rms_m IS 'Root mean square error.';
 COMMENT ON COLUMN accuracy_by_point_count.error_3d_p95_m IS '95th percentile of the error; the tolerance holds when it is at most that.';
@@ -545,7 +543,7 @@ SELECT m.survey_id, m.survey, m.stop, m.fit_method, m.n_fits, m.mean_range_m,
 FROM (
     SELECT survey_id, survey, recording_id, stop, fit_method, count(*) AS n_fits,
         avg(range_m) AS mean_range_m, avg(error_3d_m) AS error_3d_mean_m,
-        max(error_3d_m) AS error_3d_max_m, sqrt(avg(sigma_total_3d_m ^ 2)) AS sigma_3d_rms_m
+        max(error_3d_m) AS error_3d_max_m, sqrt(avg(sigma_3d_m ^ 2)) AS sigma_3d_rms_m
     FROM latest_marker_fits GROUP BY ALL
 ) AS m
 LEFT JOIN latest_station_fixes AS f USING (survey_id, recording_id, stop, fit_method)
@@ -555,7 +553,7 @@ COMMENT ON COLUMN accuracy_by_stop.n_fits IS 'Markers of the stop.';
 COMMENT ON COLUMN accuracy_by_stop.mean_range_m IS 'Mean distance of its markers.';
 COMMENT ON COLUMN accuracy_by_stop.marker_error_3d_mean_m IS 'Mean error of its sphere centres.';
 COMMENT ON COLUMN accuracy_by_stop.marker_error_3d_max_m IS 'Largest error of its sphere centres.';
-COMMENT ON COLUMN accuracy_by_stop.marker_sigma_3d_rms_m IS 'Predicted: root mean square of sigma_total_3d_m of its centres.';
+COMMENT ON COLUMN accuracy_by_stop.marker_sigma_3d_rms_m IS 'Predicted: root mean square of sigma_3d_m of its centres.';
 COMMENT ON COLUMN accuracy_by_stop.status IS 'Status of the station: ok, weak or failed.';
 COMMENT ON COLUMN accuracy_by_stop.n_markers IS 'Markers that carry the station.';
 COMMENT ON COLUMN accuracy_by_stop.station_sigma_3d_m IS 'Predicted error of the station.';

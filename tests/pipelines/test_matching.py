@@ -119,16 +119,36 @@ def test_a_field_that_is_symmetric_but_for_one_mark_is_not_ambiguous():
     np.testing.assert_array_equal(matched(fits, marks), np.arange(7))
 
 
-def test_two_marks_at_one_height_can_be_swapped_and_are_ambiguous():
-    marks = control([[6, 0, 1], [-5, 2, 1]])
-    with pytest.raises(AmbiguousMatchError):
-        matched(sightings(marks, pose([0.5, 1.0, 0.8], 1.0)), marks)
+def test_two_marks_at_one_height_can_be_swapped_and_the_other_place_is_named():
+    marks, place = control([[6, 0, 1], [-5, 2, 1]]), np.array([0.5, 1.0, 0.8])
+    scene = gather(sightings(marks, pose(place, 1.0)), marks, CONFIG)
+    match = match_marks(scene, CONFIG)
+    places = np.vstack([match.T_site_base[:3, 3], match.rivals]) + scene.middle
+    swapped = 2 * np.array([0.5, 1.0, 1.0]) - place  # half a turn about the middle of the marks
+    swapped[2] = place[2]
+    for expected in (place, swapped):
+        assert np.linalg.norm(places - expected, axis=1).min() < 1e-6
+    assert len(places) == 2
 
 
 def test_two_marks_of_different_height_are_told_apart_by_gravity():
     marks = control([[6, 0, 0.7], [-5, 2, 1.4]])
     fits = sightings(marks, pose([0.5, 1.0, 0.8], 1.0))
     np.testing.assert_array_equal(matched(fits, marks), [0, 1])
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_two_marks_are_found_among_many_markers(seed):
+    rng = np.random.default_rng(seed)
+    everything = field(rng)
+    p = everything.p_site
+    apart = np.triu(np.abs(p[:, None, 2] - p[None, :, 2]), 1)
+    i, j = np.unravel_index(np.argmax(apart), apart.shape)
+    noise = rng.normal(0, 4e-3, (len(p), 3))
+    fits = sightings(everything, pose([0.5, 1.0, 0.8], 1.0), noise=noise)
+    found = matched(fits, control(p[[i, j]]))
+    assert (found[i], found[j]) == (0, 1)
+    assert np.sum(found >= 0) == 2
 
 
 def test_a_mark_goes_to_the_nearer_of_two_markers(rng):

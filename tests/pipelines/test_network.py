@@ -266,11 +266,22 @@ def test_two_control_marks_that_contradict_each_other_are_both_named(rng):
     assert any("The control marks A (w =" in one and "B (w =" in one for one in result.warnings)
 
 
-def test_two_control_marks_among_many_markers_are_not_enough_to_find_them(rng):
+def test_two_control_marks_among_many_markers_hold_a_network(rng):
+    marks = field(rng)
+    p = marks.p_site
+    rise = np.abs(p[:, None, 2] - p[None, :, 2])
+    chosen = list(np.unravel_index(np.argmax(rise), rise.shape))
+    scans, poses = survey(rng, marks, 2)
+    result = network(scans, control(p[chosen]))
+    off = np.linalg.norm(result.T_site_station[:, :3, 3] - poses[:, :3, 3], axis=1)
+    assert off.max() < 20 * SIGMA  # two marks only, and a levelling of 3 mrad
+
+
+def test_two_control_marks_that_no_markers_resemble_are_refused(rng):
     marks = field(rng)
     scans, _ = survey(rng, marks, 2)
     with pytest.raises(DegenerateGeometryError, match="no station sees two marks"):
-        network(scans, control(marks.p_site[:2]))
+        network(scans, control([[0.0, 0.0, 0.0], [60.0, 0.0, 3.0]]))
 
 
 def test_a_station_that_shares_no_mark_is_refused_and_costs_no_other(rng):
