@@ -25,6 +25,7 @@ FITTING_METHODS = (
     "paper",
 )
 PAPER_MODELS = ("hemisphere", "sphere")
+PAPER_CUTS = ("equator", "ground")
 RESECTION_METHODS = ("free_station", "ranges", "paper")
 
 _T = TypeVar("_T")
@@ -34,6 +35,12 @@ def _check(name: str, value: object, low: float, high: float) -> None:
     """Raise ConfigError unless ``low <= value <= high``."""
     if isinstance(value, bool) or not isinstance(value, int | float) or not low <= value <= high:
         raise ConfigError(f"{name} is {value!r}; it must be a number from {low} to {high}.")
+
+
+def _check_choice(name: str, value: object, known: tuple[str, ...]) -> None:
+    """Raise ConfigError unless the value is one of the known ones."""
+    if value not in known:
+        raise ConfigError(f"{name} is {value!r}; it must be one of {list(known)}.")
 
 
 def _check_methods(name: str, methods: tuple[str, ...], known: tuple[str, ...]) -> None:
@@ -128,22 +135,25 @@ class FittingConfig:
     paper_model : str
         What ``paper`` registers to the returns, of ``PAPER_MODELS``. hemisphere: as the study does;
         its Figure 3 shows the whole sphere instead.
+    paper_cut : str
+        What ``paper`` cuts away, of ``PAPER_CUTS``. equator: all below the highest ground point,
+        and the lower half of the sphere in any case, as the highest ground of the study's field
+        must have done: its hemisphere and its errors (Table 2) say so. ground: only what lies below
+        the highest ground point of this scan.
     """
 
     methods: tuple[str, ...] = ("along_beam", "paper")
     sigma_range_bias: float = 0.003
     sigma_direction: float = 1e-4
     paper_model: str = "hemisphere"
+    paper_cut: str = "equator"
 
     def __post_init__(self) -> None:
         _check_methods("fitting.methods", self.methods, FITTING_METHODS)
         _check("fitting.sigma_range_bias", self.sigma_range_bias, 1e-6, 0.05)
         _check("fitting.sigma_direction", self.sigma_direction, 0.0, 0.01)
-        if self.paper_model not in PAPER_MODELS:
-            raise ConfigError(
-                f"fitting.paper_model is {self.paper_model!r}; it must be one of "
-                f"{list(PAPER_MODELS)}."
-            )
+        _check_choice("fitting.paper_model", self.paper_model, PAPER_MODELS)
+        _check_choice("fitting.paper_cut", self.paper_cut, PAPER_CUTS)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

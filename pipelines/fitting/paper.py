@@ -42,7 +42,7 @@ def fit(
     found : MarkerCandidates
         Groups of returns, and the height of the highest ground point.
     config : FittingConfig
-        Which model is registered; the study knows no noise.
+        Which model is registered, and what is cut; the study knows no noise.
     radius : float
         Radius of the spheres [m].
 
@@ -60,36 +60,49 @@ def fit(
     points of a hemisphere that faces the scanner, is the source of ICP and the scan its target,
     so that every point of the model draws on its nearest return. The whole hemisphere is drawn to
     the part that was seen, hence toward the scanner; where the cut took the lower part, upward.
+    The cut at the equator gives Table 2 (mean 29, range 20 to 44 mm, sigma 20 to 30 mm); cut at the
+    highest ground, the simulated field loses an eighth of the returns and errors are 11 to 13 mm.
     """
-    is_whole = config.paper_model == "sphere"
     return each(
-        found.candidates, lambda one: _fit_one(cloud, found, one, radius, is_whole=is_whole)
+        found.candidates,
+        lambda one: _fit_one(cloud, one, _level(cloud, found, one, config), config, radius),
     )
 
 
 def _fit_one(
     cloud: StitchedCloud,
-    found: MarkerCandidates,
     candidate: MarkerCandidate,
+    level: float,
+    config: FittingConfig,
     radius: float,
-    *,
-    is_whole: bool,
 ) -> MarkerFit | Rejection:
     """Fit one candidate, or say why the cut leaves nothing to fit."""
-    used = _left_by_cut(cloud, found.ground_height_max, candidate, radius)
+    used = _left_by_cut(cloud, level, candidate, radius)
     if len(used) < _N_MIN:
         return refused(
             candidate,
-            f"Of {len(candidate.members)} returns the cut at the highest ground point, "
-            f"{found.ground_height_max:.2f} m, leaves {len(used)}; a centre needs {_N_MIN}.",
+            f"Of {len(candidate.members)} returns the cut at the highest ground point or the "
+            f"equator, {level:.2f} m, leaves {len(used)}; a centre needs {_N_MIN}.",
         )
     points = cloud.p_base[used].astype(np.float64)
-    p = _registered(_model(-points.mean(axis=0), radius, is_whole=is_whole), points)
+    p = _registered(
+        _model(-points.mean(axis=0), radius, is_whole=config.paper_model == "sphere"), points
+    )
     v = points - p
     distances = np.linalg.norm(v, axis=1)
     normals = v / distances[:, None]
     cov = spread_of(normals.T @ normals, distances - radius, 3)
     return described(cloud, candidate, used, p, cov, method=NAME, radius=radius)
+
+
+def _level(
+    cloud: StitchedCloud, found: MarkerCandidates, candidate: MarkerCandidate, config: FittingConfig
+) -> float:
+    """Return the height below which returns are cut away [m]."""
+    if config.paper_cut == "ground":
+        return found.ground_height_max
+    height = float(levelling_rotation(cloud.levelling)[2] @ candidate.p_base_rough)
+    return max(found.ground_height_max, height)
 
 
 def _left_by_cut(

@@ -187,6 +187,7 @@ def _pattern(cloud: StitchedCloud) -> tuple[_Pattern | None, str]:
     if not len(cloud.rings) or np.any(cloud.rings == RING_UNKNOWN):
         return None, "the rings of the returns are not known"
     rows = np.unique(np.linspace(0, len(cloud.times) - 1, _N_TIMED).astype(np.intp))
+    rows = rows[np.isfinite(cloud.p_base[rows]).all(axis=1)]
     times = cloud.times[rows].astype(np.float64)
     firings = times - _DELAYS[cloud.rings[rows]]
     turn = np.exp(2j * np.pi * firings / FIRING_CYCLE)
