@@ -91,7 +91,7 @@ def verdict(look: Look, config: ExtractionConfig, ball: Ball) -> str:
     """
     radius = ball.radius
     few = np.inf if is_resolved(look, ball) else 1.0 + _TOUCHING * look.n_points
-    width_min = (0.9 if look.n_points >= _N_SHAPELY else 0.5) * radius
+    width_min = (0.7 if look.n_points >= _N_SHAPELY else 0.5) * radius
     off = look.radius_free - radius
     tests = (
         (

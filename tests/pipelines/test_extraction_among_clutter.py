@@ -1,0 +1,66 @@
+"""Precision and recall of extraction in worlds that the simulator has made."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from pipelines.config import ExtractionConfig
+from pipelines.extraction import extract
+from pipelines.simulation import SimulationConfig
+from pipelines.simulation.detection import DETECTION_PLAN, detection
+from tests.pipelines.synthetic_stop import RADIUS, World, ring_of_markers, scan
+
+COLUMNS = ("p_base", "gimbal_angles", "intensities", "rings", "times")
+
+
+@pytest.fixture(scope="module")
+def few():
+    world = World(balls=tuple((tuple(p), RADIUS) for p in ring_of_markers(n=5)), ground=-0.8)
+    return scan(world, np.random.default_rng(5))
+
+
+def near(places):
+    gaps = np.linalg.norm(places[:, None] - ring_of_markers(n=5)[None], axis=2)
+    return gaps.min(axis=0) < 0.03
+
+
+def rough(found):
+    return np.array([c.p_base_rough for c in found.candidates]).reshape(-1, 3)
+
+
+def test_returns_that_are_none_change_nothing(few):
+    p = np.vstack([few.p_base, np.full((50, 3), np.nan), np.full((50, 3), np.inf)])
+    p[-1] = (3.0, np.nan, 0.0)
+    columns = {name: np.append(getattr(few, name), np.zeros(100)) for name in COLUMNS[1:]}
+    columns = {k: v.astype(getattr(few, k).dtype) for k, v in columns.items()}
+    spoilt = replace(few, p_base=p.astype(np.float32), **columns)
+    again = extract(spoilt, ExtractionConfig(), RADIUS)
+    np.testing.assert_array_equal(rough(again), rough(extract(few, ExtractionConfig(), RADIUS)))
+
+
+def test_markers_are_found_without_any_ground(few):
+    high = few.p_base[:, 2] > -0.60
+    alone = replace(few, **{name: getattr(few, name)[high] for name in COLUMNS})
+    found = extract(alone, ExtractionConfig(), RADIUS)
+    assert near(rough(found)).all()
+
+
+def test_a_marker_half_of_which_is_hidden_is_found(few):
+    place = ring_of_markers(n=5)[0]
+    side = np.cross([0.0, 0.0, 1.0], place)
+    hidden = (few.p_base @ side > 0.0) & (few.p_base @ place > 0.8 * place @ place)
+    half = replace(few, **{name: getattr(few, name)[~hidden] for name in COLUMNS})
+    assert near(rough(extract(half, ExtractionConfig(), RADIUS)))[0]
+
+
+@pytest.mark.slow
+def test_markers_are_found_and_nothing_else_in_worlds_of_clutter():
+    found = detection(DETECTION_PLAN, (21,), SimulationConfig())
+    assert found.recall("clutter-field", 0) > 0.97
+    assert found.recall("rock-field", 0) == 1.0
+    assert found.recall("range-lane", 0) == 1.0
+    assert found.recall("range-lane", 1) > 0.7
+    assert found.n_false["rock-field"] == found.n_false["range-lane"] == 0
+    assert found.worst["clutter-field"] <= 1
+    assert all(sum(t.reasons.values()) == t.n - t.n_found for t in found.tallies)
