@@ -213,10 +213,12 @@ def _resolved(
     out = np.zeros(len(found), np.bool_)
     for k in range(len(found)):
         c = found[k, :3].copy()
-        points = gathered(patches, near(patches, cells[k], c))
+        points = _within(gathered(patches, near(patches, cells[k], c)), c, 2.0 * ball.radius)
         scatter = np.inf
-        for _ in range(_N_STEPS):
+        for step_no in range(_N_STEPS):
             N, pull, axes, scatter = _equations(points, c, ball, ball.radius)
+            if step_no > 0 and scatter > 4.0 * RESOLUTION * ball.radius:
+                break  # it will not come to that any more
             step = np.linalg.solve(N[:3, :3] + 1e-3 * np.eye(3), pull[:3])
             step *= min(1.0, 0.5 * ball.radius / (np.sqrt(np.sum(step**2)) + 1e-12))
             c = c + step[0] * axes[0] + step[1] * axes[1] + step[2] * axes[2]
