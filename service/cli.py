@@ -318,12 +318,19 @@ def bench(
         bool, typer.Option("--extraction", help="Precision and recall of extraction instead.")
     ] = False,
     worlds: Annotated[int, typer.Option(min=1, help="Worlds of each scenario for that.")] = 3,
+    accuracy: Annotated[
+        bool, typer.Option("--accuracy", help="Precision of centres by every method instead.")
+    ] = False,
+    stops: Annotated[int, typer.Option(min=1, help="Stops of 88 markers for that.")] = 6,
     seed: Annotated[int, typer.Option(min=0, help="Seed of the first of them.")] = 0,
     as_json: AsJson = False,
 ) -> None:
     """Measure each step against one read of the file with a checksum, in the same run."""
     if extraction:
         _bench_extraction(worlds, seed, as_json=as_json)
+        return
+    if accuracy:
+        _bench_accuracy(stops, seed, as_json=as_json)
         return
     from service import bench as benches
     from service import tables
@@ -347,6 +354,18 @@ def _bench_extraction(worlds: int, seed: int, *, as_json: bool) -> None:
         _print_json(report)
     else:
         detection.print_report(out, report)
+
+
+def _bench_accuracy(stops: int, seed: int, *, as_json: bool) -> None:
+    """Measure the precision of centres against distance, by every method."""
+    from service import precision
+
+    with _progress() as progress:
+        report = precision.run(precision.Wish(n_stops=stops, seed=seed), progress)
+    if as_json:
+        _print_json(report)
+    else:
+        precision.print_report(out, report)
 
 
 @app.command()
