@@ -267,6 +267,39 @@ def adjust(
 
 
 @app.command()
+def calibrate(
+    logs: Annotated[list[Path], typer.Argument(metavar="LOG...", exists=True, dir_okay=False)],
+    rig: Annotated[
+        Path | None,
+        typer.Option(
+            exists=True, dir_okay=False, help="Rig to start with (JSON), if not the logs'."
+        ),
+    ] = None,
+    radius_m: Annotated[float, typer.Option(help="Radius of the spheres \\[m].")] = 0.100,
+    target: Annotated[
+        Path | None, typer.Option("--out", dir_okay=False, help="Write a rig file for --rig.")
+    ] = None,
+    as_json: AsJson = False,
+) -> None:
+    """Estimate the rig from the two faces of the spheres in logs."""
+    from pipelines.config import SurveyConfig
+    from service import calibrations, tables
+    from storage import site_files
+
+    config = SurveyConfig.from_mapping({"marker_radius": radius_m})
+    start = site_files.read_rig(rig) if rig else None
+    with _progress() as progress:
+        found = calibrations.calibrate_logs(logs, config, start, progress)
+    if target:
+        site_files.write_rig(found.rig, target)
+    answer = calibrations.calibration_answer(found)
+    if as_json:
+        _print_json(answer)
+    else:
+        tables.print_calibration(out, answer)
+
+
+@app.command()
 def query(
     sql: Annotated[str, typer.Argument(help="One SELECT.")],
     url: Annotated[str | None, typer.Option(help="Address of a running service.")] = None,

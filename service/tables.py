@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import io
+import math
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -60,6 +61,24 @@ def print_answer(out: Console, answer: Plain) -> None:
             out.print(f"  {stop['reason']}")
         for station in stop["stations"]:
             _print_station(out, station)
+
+
+def print_calibration(out: Console, answer: Plain) -> None:
+    """Print what scans tell of a rig: lengths in millimetres, angles in degrees."""
+    scales = {"m": (1e3, "mm"), "rad": (math.degrees(1.0), "deg"), "s": (1e3, "ms")}
+    rows = []
+    for parameter in answer["parameters"]:
+        scale, unit = scales[parameter["unit"]]
+        numbers = [scale * parameter[key] for key in ("start", "estimate", "sigma")]
+        rows.append((parameter["name"], unit, *(f"{number:.4f}" for number in numbers)))
+    out.print(_table(("parameter", "unit", "start", "estimate", "sigma"), rows, left=2))
+    out.print(
+        f"{answer['n_two_faced']} of {answer['n_spheres']} spheres on both faces, "
+        f"{answer['n_returns']:,} returns; residuals {1e3 * answer['residual_rms_before_m']:.1f} "
+        f"-> {1e3 * answer['residual_rms_after_m']:.1f} mm; rig {answer['rig_digest']}"
+    )
+    for held in answer["not_separable"]:
+        out.print(f"  {held['name']} stays as it was. {held['reason']}", highlight=False)
 
 
 def print_rows(out: Console, answer: Plain) -> None:

@@ -136,7 +136,8 @@ def separable(N: Array, parameters: tuple[Parameter, ...]) -> tuple[Mask, tuple[
     Notes
     -----
     In units of those sigmas, an eigenvalue under 1 belongs to a combination that stays unknown.
-    While there is one, the parameter with the largest part in its vector is held.
+    While there is one, the parameter with the largest part in its vector is held. What rests on
+    more than geometry is held in any case.
     """
     scales = np.array([parameter.unknown for parameter in parameters])
     scaled = N * np.outer(scales, scales)
@@ -156,7 +157,23 @@ def separable(N: Array, parameters: tuple[Parameter, ...]) -> tuple[Mask, tuple[
                 _reason(parameters[places[worst]], float(eigenvalues[0]), partners),
             )
         )
+    for place in np.flatnonzero(is_free):
+        if parameters[place].caution:
+            free = np.flatnonzero(is_free)
+            variances = np.diag(np.linalg.inv(N[np.ix_(free, free)]))
+            sigma = float(np.sqrt(variances[np.searchsorted(free, place)]))
+            is_free[place] = False
+            held.append(_held_back(parameters[place], sigma))
     return is_free, tuple(held)
+
+
+def _held_back(parameter: Parameter, sigma: float) -> Inseparable:
+    """Say why a parameter is held although the observations tell it."""
+    return Inseparable(
+        parameter.name,
+        f"These scans seem to tell it to {sigma:.2g} {parameter.unit} (1 sigma), but "
+        f"{parameter.caution}.",
+    )
 
 
 def _reason(parameter: Parameter, eigenvalue: float, partners: list[str]) -> str:

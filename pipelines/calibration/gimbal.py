@@ -21,12 +21,25 @@ _NS = 1e-9  # [s] in a nanosecond
 
 
 class Parameter(NamedTuple):
-    """One number of a rig: what it is, and which sigma of it is as good as not knowing it."""
+    """One number of a rig: what it is, and what to say when it is not estimated.
+
+    Attributes
+    ----------
+    name, unit : str
+        Its name and SI unit.
+    unknown : float
+        A sigma of it that is as good as not knowing it.
+    twin : str
+        What else does the same to the observations.
+    caution : str
+        Why it is held even where observations tell it; empty if it is not.
+    """
 
     name: str
     unit: str
     unknown: float
-    twin: str  # what the centres or the pose of the station can do instead
+    twin: str
+    caution: str = ""
 
 
 _LENGTH, _ANGLE, _TIME = 0.02, np.radians(1.0), 0.005
@@ -60,6 +73,8 @@ OTHERS = (
         "m",
         _LENGTH,
         "it puts every centre nearer or farther by the same on both faces",
+        "only the size that near spheres seem to have speaks of it, which rests on the width of "
+        "the beams that is assumed; compare distances between marks with known ones",
     ),
 )
 """What coordinates of the spheres, or a varying speed, would be needed for."""

@@ -198,3 +198,20 @@ def half_an_upload(port):
     )
     with socket.create_connection(("127.0.0.1", port)) as connection:
         connection.sendall(head.encode() + b"x" * 5_000_000)
+
+
+def test_a_calibrated_rig_is_one_that_processing_takes(stop, tmp_path):
+    rig = tmp_path / "rig.json"
+    answer = json.loads(run("calibrate", stop.log, "--json", "--out", rig).stdout)
+    assert {"rig", "parameters", "covariance", "not_separable", "stops"} <= set(answer)
+    n = len(answer["parameters"])
+    sigmas = [parameter["sigma"] for parameter in answer["parameters"]]
+    np.testing.assert_allclose(np.sqrt(np.diag(answer["covariance"])), sigmas)
+    assert n == 6 + 16
+    assert answer["residual_rms_after_m"] < answer["residual_rms_before_m"]
+    assert all(held["reason"] for held in answer["not_separable"])
+    (tmp_path / "answer.json").write_text(json.dumps(answer))
+    for given in (rig, tmp_path / "answer.json"):
+        processed = json.loads(run("process", stop.log, "--rig", given, "--json").stdout)
+        assert processed["rig"]["digest"] == answer["rig_digest"]
+    assert "spin_zero" in run("calibrate", stop.log).stdout
