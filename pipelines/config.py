@@ -175,6 +175,9 @@ class ResectionConfig:
         Standard deviation per axis that every centre has beyond its own covariance: what axis
         offset and eccentricity of the encoder leave after both faces of a sphere are averaged [m].
         0.3 mm: of 0.5 mm and 0.01 deg at 7.5 m.
+    sigma_range : float
+        Standard deviation of what all ranges of a survey are too long, an unknown of a network
+        [m]; 0 leaves it out. 1 mm: the mean of 16 lasers of 3 mm each, and the model of a beam.
     """
 
     methods: tuple[str, ...] = ("free_station",)
@@ -182,6 +185,7 @@ class ResectionConfig:
     test_level: float = 0.001
     test_power: float = 0.80
     sigma_common: float = 0.0003
+    sigma_range: float = 0.001
 
     def __post_init__(self) -> None:
         _check_methods("resection.methods", self.methods, RESECTION_METHODS)
@@ -189,6 +193,7 @@ class ResectionConfig:
         _check("resection.test_level", self.test_level, 1e-6, 0.2)
         _check("resection.test_power", self.test_power, 0.5, 0.999)
         _check("resection.sigma_common", self.sigma_common, 0.0, 0.1)
+        _check("resection.sigma_range", self.sigma_range, 0.0, 0.1)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -111,7 +111,7 @@ def network_answer(result: AdjustedNetwork, config: SurveyConfig) -> Plain:
             for one in network.refused
         ],
         "n_observations": _n_observations(result),
-        "n_unknowns": 6 * len(network.stations) + 3 * len(network.marks),
+        "n_unknowns": 6 * len(network.stations) + 3 * len(network.marks) + _n_biases(result),
         "dof": result.dof,
         "sigma0_a_priori": 1.0,
         "sigma0": _number(result.sigma0),
@@ -129,14 +129,33 @@ def network_answer(result: AdjustedNetwork, config: SurveyConfig) -> Plain:
             )
         ),
         "critical_w": result.critical_w,
+        "range_bias": _range_bias(result),
     }
 
 
 def _n_observations(result: AdjustedNetwork) -> int:
     """Return the number of observed coordinates and angles that were used."""
     n, s = len(result.network.sightings), len(result.network.stations)
-    centres, gravity, control = np.split(result.used, [n, n + s])
-    return 3 * int(centres.sum()) + 2 * int(gravity.sum()) + 3 * int(control.sum())
+    centres, gravity, control = (int(part.sum()) for part in np.split(result.used, [n, n + s]))
+    return 3 * centres + 2 * gravity + 3 * control + _n_biases(result)
+
+
+def _n_biases(result: AdjustedNetwork) -> int:
+    """Return the number of range biases, each an unknown and by its prior an observation."""
+    return int(result.network.sigma_range > 0.0)
+
+
+def _range_bias(result: AdjustedNetwork) -> Plain | None:
+    """Return what all ranges are too long; null where the network has no such unknown."""
+    prior = result.network.sigma_range
+    if prior == 0.0:
+        return None
+    return {
+        "value_m": result.range_bias,
+        "sigma_m": result.sigma_range_bias,
+        "sigma_a_priori_m": prior,
+        "redundancy": 1.0 - (result.sigma_range_bias / prior) ** 2,
+    }
 
 
 def _datum(result: AdjustedNetwork) -> Plain:
@@ -252,9 +271,20 @@ def _summary(answer: Plain, title: str) -> list[str]:
         f"Global test (chi-square, one-sided, level {test['level']:g}): v'Pv = {test['vtpv']:.1f}, "
         f"limit {test['limit']:.1f}: {verdict}",
         f"Local test (w): limit {answer['critical_w']:.2f}",
+        *_bias_line(answer["range_bias"]),
         f"Datum: {answer['datum']['text']}",
     ]  # fmt: skip
     return [*lines, *(f"WARNING: {one}" for one in answer["warnings"]), ""]
+
+
+def _bias_line(bias: Plain | None) -> list[str]:
+    """Return what all ranges are too long, if the network has it as an unknown."""
+    if bias is None:
+        return []
+    value, sigma, prior = (1e3 * bias[k] for k in ("value_m", "sigma_m", "sigma_a_priori_m"))
+    return [
+        f"All ranges too long by {value:.2f} mm, sigma {sigma:.2f} mm (a priori {prior:.2f} mm)"
+    ]
 
 
 def _coordinates(title: str, rows: Sequence[Plain]) -> list[str]:

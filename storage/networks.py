@@ -94,7 +94,8 @@ def format_gama(result: AdjustedNetwork, description: str = "") -> str:
     -----
     Gama knows levelled instruments only. What the levelling leaves uncertain turns all centres of
     a station together and is in the covariance of the set, so that Gama solves the same problem; a
-    set's orientation is the heading of the station. Exact control marks are fixed, others are
+    set's orientation is the heading of the station. Distances are without the range bias that the
+    network found. Exact control marks are fixed, others are
     observed coordinates; in a free network the marks define the datum (``adj="XYZ"``).
     """
     root = ET.Element("gama-local", xmlns=_NAMESPACE)
@@ -167,6 +168,7 @@ def _add_set(parent: ET.Element, result: AdjustedNetwork, station: int) -> None:
     rows = np.flatnonzero((network.sightings[:, 0] == station) & result.used[:n])
     R = network.R_station_base[station]
     p = network.p_base[rows] @ R.T
+    p = p - result.range_bias * p / np.linalg.norm(p, axis=1)[:, None]
     values, J = _polar(p)
     cov = np.zeros((len(rows), 3, len(rows), 3))
     cov[np.arange(len(rows)), :, np.arange(len(rows)), :] = (

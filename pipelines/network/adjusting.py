@@ -79,7 +79,9 @@ def adjust_network(network: Network, config: ResectionConfig) -> AdjustedNetwork
     Notes
     -----
     Observed are each centre in the base frame of its station, the up direction of each station,
-    and the control marks with their covariances. Without control the network is free: stations are
+    and the control marks with their covariances; what all ranges of the survey are too long is one
+    unknown more, with its prior sigma as an observation, because it would swell the ring of marks
+    alike from every station. Without control the network is free: stations are
     levelled, place and heading stay open, and the inner constraints over all marks (their centroid
     and mean heading stay those of the approximate values) give the covariances of least trace
     (Meissl 1969). Data snooping after Baarda (1968), one block at a time; the level of a single
@@ -179,16 +181,22 @@ def _squares(lin: Linearised) -> tuple[float, float, float]:
     return first, second, third
 
 
+def _vtpv(network: Network, tested: _Tested) -> float:
+    """Return the weighted sum of squares, that of the range bias against its prior included."""
+    prior = (tested.state.range_bias / network.sigma_range) ** 2 if network.sigma_range else 0.0
+    return sum(_squares(tested.lin)) + prior
+
+
 def _sigma0(network: Network, tested: _Tested) -> float:
     """Return the square root of the variance factor; NaN without redundancy."""
     dof = _degrees_of_freedom(network, tested.used)
-    return float(np.sqrt(sum(_squares(tested.lin)) / dof)) if dof else np.nan
+    return float(np.sqrt(_vtpv(network, tested) / dof)) if dof else np.nan
 
 
 def _passes(network: Network, tested: _Tested, level: float) -> bool:
     """Return whether the residuals are no larger than their sigmas promise."""
     dof = _degrees_of_freedom(network, tested.used)
-    return dof == 0 or bool(chdtrc(dof, sum(_squares(tested.lin))) >= level)
+    return dof == 0 or bool(chdtrc(dof, _vtpv(network, tested)) >= level)
 
 
 def _test(network: Network, approximate: State, used: Mask) -> _Tested:
@@ -196,11 +204,13 @@ def _test(network: Network, approximate: State, used: Mask) -> _Tested:
     _degrees_of_freedom(network, used)
     state, cofactors = solve_network(network, approximate, used)
     lin = linearise(network, state, used)
-    station, mark = network.sightings.T
+    station = network.sightings[:, 0]
     own = _own_marks(cofactors)
-    cross = lin.J_centres @ cofactors.between[station, :, mark]
+    own_common, between = _common(cofactors, network)
+    J_turned = np.swapaxes(lin.J_common, 1, 2)
+    cross = lin.J_centres @ between @ J_turned
     turned = lin.J_centres @ cofactors.stations[station] @ np.swapaxes(lin.J_centres, 1, 2)
-    q_centres = turned - cross - np.swapaxes(cross, 1, 2) + own[mark]
+    q_centres = turned + cross + np.swapaxes(cross, 1, 2) + lin.J_common @ own_common @ J_turned
     q_gravity = lin.J_gravity @ cofactors.stations @ np.swapaxes(lin.J_gravity, 1, 2)
     blocks = (
         (lin.v_centres, lin.P_centres, q_centres),
@@ -226,6 +236,20 @@ def _own_marks(cofactors: Cofactors) -> Array:
     """Return the covariance of each mark, (m, 3, 3)."""
     m = len(cofactors.marks) // 3
     return np.asarray(np.einsum("iaib->iab", cofactors.marks.reshape(m, 3, m, 3)))
+
+
+def _common(cofactors: Cofactors, network: Network) -> tuple[Array, Array]:
+    """Return, per centre, the covariance of its mark and the range bias, and theirs to its station.
+
+    Shapes are (n, 3 + k, 3 + k) and (n, 6, 3 + k).
+    """
+    station, mark = network.sightings.T
+    with_bias = cofactors.bias_and_marks[mark]
+    bias = np.broadcast_to(cofactors.bias, (len(mark), *cofactors.bias.shape))
+    upper = np.concatenate([_own_marks(cofactors)[mark], with_bias], axis=2)
+    lower = np.concatenate([np.swapaxes(with_bias, 1, 2), bias], axis=2)
+    between = [cofactors.between[station, :, mark], cofactors.with_bias[station]]
+    return np.concatenate([upper, lower], axis=1), np.concatenate(between, axis=2)
 
 
 def _statistics(
@@ -255,12 +279,14 @@ def _shifts(network: Network, tested: _Tested, noncentrality: float) -> tuple[Ar
     ``b' P Q_v P b = lambda0`` (Baarda 1968).
     """
     lin, cofactors = tested.lin, tested.cofactors
-    station, mark = network.sightings.T
-    between = cofactors.between[station, :, mark]
-    J_turned = np.swapaxes(lin.J_centres, 1, 2)
+    station = network.sightings[:, 0]
+    own, between = _common(cofactors, network)
+    J_turned, J_common = np.swapaxes(lin.J_centres, 1, 2), np.swapaxes(lin.J_common, 1, 2)
     J_place = position_by_motion(tested.state.T_site_base)[station]
-    by_station = J_place @ (cofactors.stations[station] @ J_turned - between) @ lin.P_centres
-    by_mark = (np.swapaxes(between, 1, 2) @ J_turned - _own_marks(cofactors)[mark]) @ lin.P_centres
+    by_station = cofactors.stations[station] @ J_turned + between @ J_common
+    by_station = J_place @ by_station @ lin.P_centres
+    by_mark = np.swapaxes(between, 1, 2)[:, :3] @ J_turned + own[:, :3] @ J_common
+    by_mark = by_mark @ lin.P_centres
     n = len(network.sightings)
     used, is_open = tested.used[:n], tested.weakest[:n] == 0.0
     solid = np.where((used & ~is_open)[:, None, None], tested.tested[0], np.eye(3))
@@ -287,7 +313,7 @@ def _adjusted(
     T = np.array(tested.state.T_site_base)
     T[:, :3, 3] += middle
     T[:, :3, :3] = T[:, :3, :3] @ np.swapaxes(network.R_station_base, 1, 2)
-    dof, squares = _degrees_of_freedom(network, tested.used), _squares(tested.lin)
+    dof = _degrees_of_freedom(network, tested.used)
     station_shifts, mark_shifts = _shifts(network, tested, noncentrality)
     left_out = _left_out(network, tested, dropped, critical)
     return AdjustedNetwork(
@@ -300,8 +326,10 @@ def _adjusted(
         **_columns(network, tested, noncentrality),
         station_shifts=station_shifts,
         mark_shifts=mark_shifts,
+        range_bias=tested.state.range_bias,
+        sigma_range_bias=float(np.sqrt(tested.cofactors.bias.sum())),
         dof=dof,
-        vtpv=sum(squares),
+        vtpv=_vtpv(network, tested),
         sigma0=_sigma0(network, tested),
         passes_global_test=_passes(network, tested, config.test_level),
         limit_vtpv=float(chdtri(dof, config.test_level)) if dof else 0.0,

@@ -121,7 +121,7 @@ def assemble(
         for i, reason in _refused(len(scans), used, reasons)
     )
     _refuse_nothing(used, found, control, refused)
-    network = _network(scans, found, used, config.sigma_common)
+    network = _network(scans, found, used, config)
     return replace(network, refused=refused, left_out=_unseen(scans, found, used, lonely))
 
 
@@ -296,7 +296,7 @@ def _network(
     scans: Sequence[Scan],
     found: _Map,
     used: dict[int, list[tuple[int, int]]],
-    sigma_common: float,
+    config: ResectionConfig,
 ) -> Network:
     """Bring stations and marks that are used into columns."""
     places = sorted({mark for pairs in used.values() for _, mark in pairs})
@@ -313,7 +313,7 @@ def _network(
         sightings=columns[:, :2].copy(),
         fits=columns[:, 2].copy(),
         p_base=np.array([fit.p_base for fit in fits]),
-        cov_p_base=np.array([fit.cov_p_base for fit in fits]) + sigma_common**2 * np.eye(3),
+        cov_p_base=np.array([fit.cov_p_base for fit in fits]) + config.sigma_common**2 * np.eye(3),
         R_station_base=np.array([levelling_rotation(one) for one in levellings]),
         cov_up_base=np.array([_cov_up(one.roll, one.pitch, one.sigma) for one in levellings]),
         controls=np.array([row[mark] for mark in controls], dtype=np.intp),
@@ -321,6 +321,7 @@ def _network(
         cov_control_site=given + _EXACT**2 * np.eye(3),
         T_site_base=np.array([found.poses[i] for i in used]),
         p_site=np.array([found.p_site[mark] for mark in places]),
+        sigma_range=config.sigma_range,
     )
 
 

@@ -29,10 +29,14 @@ _SINGULAR = 1e-11  # eigenvalue of the reduced normal matrix with unit diagonal
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class State:
-    """Poses of the stations, (s, 4, 4), and marks, (m, 3), relative to the middle [m]."""
+    """Poses of the stations, (s, 4, 4), and marks, (m, 3), relative to the middle [m].
+
+    ``range_bias`` is what all ranges are too long [m].
+    """
 
     T_site_base: Array
     p_site: Array
+    range_bias: float = 0.0
 
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
@@ -46,7 +50,9 @@ class Linearised:
     P_centres : (n, 3, 3)
         Weights; zero where a block is not used.
     J_centres : (n, 3, 6)
-        By the motion of the station; by the mark it is minus the identity.
+        By the motion of the station.
+    J_common : (n, 3, 3 + k)
+        By the mark, minus the identity, and by the common range bias if there is one.
     v_gravity : (s, 2)
         Horizontal part of the measured up direction [rad].
     P_gravity : (s, 2, 2)
@@ -62,6 +68,7 @@ class Linearised:
     v_centres: Array
     P_centres: Array
     J_centres: Array
+    J_common: Array
     v_gravity: Array
     P_gravity: Array
     J_gravity: Array
@@ -81,11 +88,20 @@ class Cofactors:
         Between stations and marks.
     marks : (3m, 3m)
         Of the marks.
+    with_bias : (s, 6, k)
+        Between stations and the common range bias, if there is one.
+    bias_and_marks : (m, 3, k)
+        Between marks and the bias.
+    bias : (k, k)
+        Of the bias.
     """
 
     stations: Array
     between: Array
     marks: Array
+    with_bias: Array
+    bias_and_marks: Array
+    bias: Array
 
 
 def middle_of(network: Network) -> Array:
@@ -123,7 +139,7 @@ def start(network: Network) -> State:
     return State(T_site_base=T, p_site=network.p_site - middle)
 
 
-def step_to(state: State, xi: Array, dp: Array) -> State:
+def step_to(state: State, xi: Array, dp: Array, db: float = 0.0) -> State:
     """Move a state.
 
     Parameters
@@ -134,13 +150,19 @@ def step_to(state: State, xi: Array, dp: Array) -> State:
         Small motions of the stations, on the left.
     dp : (m, 3)
         Shifts of the marks [m].
+    db : float
+        Change of the range bias [m].
 
     Returns
     -------
     State
         Where to.
     """
-    return State(T_site_base=moved(state.T_site_base, xi), p_site=state.p_site + dp)
+    return State(
+        T_site_base=moved(state.T_site_base, xi),
+        p_site=state.p_site + dp,
+        range_bias=state.range_bias + db,
+    )
 
 
 def linearise(network: Network, state: State, used: Mask) -> Linearised:
@@ -164,7 +186,12 @@ def linearise(network: Network, state: State, used: Mask) -> Linearised:
     station, mark = network.sightings.T
     R, t = state.T_site_base[:, :3, :3], state.T_site_base[:, :3, 3]
     R_each = R[station]
+    towards = network.p_base / np.linalg.norm(network.p_base, axis=1)[:, None]
+    towards = np.einsum("nij,nj->ni", R_each, towards)
     p = np.einsum("nij,nj->ni", R_each, network.p_base) + t[station]
+    p = p - state.range_bias * towards
+    J_mark = np.broadcast_to(-np.eye(3), (n, 3, 3))
+    has_bias = network.sigma_range > 0.0
     weights = R_each @ np.linalg.inv(network.cov_p_base) @ np.swapaxes(R_each, 1, 2)
     up = np.einsum("sij,sj->si", R, network.R_station_base[:, 2])
     cov_up = (R @ network.cov_up_base @ np.swapaxes(R, 1, 2))[:, :2, :2]
@@ -173,6 +200,7 @@ def linearise(network: Network, state: State, used: Mask) -> Linearised:
         v_centres=p - state.p_site[mark],
         P_centres=weights * used[:n, None, None],
         J_centres=np.concatenate([-skew(p), np.broadcast_to(np.eye(3), (n, 3, 3))], axis=2),
+        J_common=np.concatenate([J_mark, -towards[..., None]], axis=2) if has_bias else J_mark,
         v_gravity=up[:, :2],
         P_gravity=np.asarray(np.linalg.inv(cov_up)) * used[n : n + s, None, None],
         J_gravity=np.concatenate([-skew(up)[:, :2], np.zeros((s, 2, 3))], axis=2),
@@ -196,7 +224,7 @@ class _Reduced:
     r: Array
 
 
-def _reduce(network: Network, lin: Linearised) -> _Reduced:
+def _reduce(network: Network, lin: Linearised, bias: float) -> _Reduced:
     """Set up the normal equations and eliminate the stations."""
     s, m = len(network.stations), len(network.marks)
     station, mark = network.sightings.T
@@ -205,31 +233,52 @@ def _reduce(network: Network, lin: Linearised) -> _Reduced:
     stations, g = levelled @ lin.J_gravity, np.einsum("sij,sj->si", levelled, lin.v_gravity)
     np.add.at(stations, station, pressed @ lin.J_centres)
     np.add.at(g, station, np.einsum("nij,nj->ni", pressed, lin.v_centres))
-    coupling = np.zeros((s, 6, m, 3))
-    coupling[station, :, mark, :] = -pressed
-    marks, h = np.zeros((m, 3, 3)), np.zeros((m, 3))
-    np.add.at(marks, mark, lin.P_centres)
-    np.add.at(marks, network.controls, lin.P_control)
-    np.add.at(h, mark, -np.einsum("nij,nj->ni", lin.P_centres, lin.v_centres))
-    np.add.at(h, network.controls, -np.einsum("nij,nj->ni", lin.P_control, lin.v_control))
-    flat = coupling.reshape(s, 6, 3 * m)
-    solved = np.asarray(np.linalg.solve(stations, flat), dtype=np.float64)
-    reduced = -flat.reshape(6 * s, 3 * m).T @ solved.reshape(6 * s, 3 * m)
-    own = reduced.reshape(m, 3, m, 3)
-    own[np.arange(m), :, np.arange(m), :] += marks
-    r = -h.ravel() + np.einsum("sij,si->j", solved, g)
+    own, h = _marks_alone(network, lin, bias)
+    coupling = np.zeros((s, 6, len(h)))
+    blocks = coupling[:, :, : 3 * m].reshape(s, 6, m, 3)
+    blocks[station, :, mark, :] = pressed @ lin.J_common[..., :3]
+    coupling[:, :, : 3 * m] = blocks.reshape(s, 6, 3 * m)
+    for k in range(3, lin.J_common.shape[2]):
+        np.add.at(coupling[:, :, 3 * m], station, (pressed @ lin.J_common[..., k : k + 1])[..., 0])
+    solved = np.asarray(np.linalg.solve(stations, coupling), dtype=np.float64)
+    reduced = own - coupling.reshape(6 * s, -1).T @ solved.reshape(6 * s, -1)
+    r = -h + np.einsum("sij,si->j", solved, g)
     return _Reduced(A=stations, K=solved, S=(reduced + reduced.T) / 2.0, g=g, r=r)
 
 
+def _marks_alone(network: Network, lin: Linearised, bias: float) -> tuple[Array, Array]:
+    """Return normal matrix and gradient of marks and range bias where no station moves."""
+    m, extra = len(network.marks), lin.J_common.shape[2] - 3
+    mark = network.sightings[:, 1]
+    pressed = np.swapaxes(lin.J_common, 1, 2) @ lin.P_centres
+    squares = pressed @ lin.J_common
+    gradient = np.einsum("nij,nj->ni", pressed, lin.v_centres)
+    blocks, h = np.zeros((m, 3 + extra, 3 + extra)), np.zeros((m, 3 + extra))
+    np.add.at(blocks, mark, squares)
+    np.add.at(h, mark, gradient)
+    np.add.at(blocks[:, :3, :3], network.controls, lin.P_control)
+    np.add.at(h[:, :3], network.controls, -np.einsum("nij,nj->ni", lin.P_control, lin.v_control))
+    N = np.zeros((3 * m + extra, 3 * m + extra))
+    diagonal = np.zeros((m, 3, m, 3))
+    diagonal[np.arange(m), :, np.arange(m), :] = blocks[:, :3, :3]
+    N[: 3 * m, : 3 * m] = diagonal.reshape(3 * m, 3 * m)
+    for k in range(extra):
+        N[: 3 * m, 3 * m + k] = N[3 * m + k, : 3 * m] = blocks[:, :3, 3 + k].ravel()
+        N[3 * m + k, 3 * m + k] = blocks[:, 3 + k, 3 + k].sum() + network.sigma_range**-2
+    tail = h[:, 3:].sum(axis=0) + (bias / network.sigma_range**2 if extra else 0.0)
+    return N, np.concatenate([h[:, :3].ravel(), tail])
+
+
 def _datum(network: Network, state: State) -> Array:
-    """Return orthonormal columns of what a free network leaves open: (3m, 4), or (3m, 0)."""
-    m = len(network.marks)
+    """Return orthonormal columns of what a free network leaves open: (3m + k, 4), or none."""
+    m, extra = len(network.marks), int(network.sigma_range > 0.0)
     if not network.is_free:
-        return np.zeros((3 * m, 0))
+        return np.zeros((3 * m + extra, 0))
     motions = np.zeros((m, 3, N_DEFECT))
     motions[:, [0, 1, 2], [0, 1, 2]] = 1.0
     motions[:, 0, 3], motions[:, 1, 3] = -state.p_site[:, 1], state.p_site[:, 0]
-    return np.linalg.qr(motions.reshape(3 * m, N_DEFECT)).Q
+    open_ = np.linalg.qr(motions.reshape(3 * m, N_DEFECT)).Q
+    return np.concatenate([open_, np.zeros((extra, N_DEFECT))])
 
 
 def _inverse(normal: Array, datum: Array) -> Array:
@@ -283,12 +332,12 @@ def solve_network(network: Network, state: State, used: Mask) -> tuple[State, Co
     """
     m = len(network.marks)
     for _ in range(_STEPS):
-        reduced = _reduce(network, linearise(network, state, used))
+        reduced = _reduce(network, linearise(network, state, used), state.range_bias)
         cov_marks = _inverse(reduced.S, _datum(network, state))
         dp = cov_marks @ reduced.r
         own = np.linalg.solve(reduced.A, reduced.g[..., None])[..., 0]
         xi = -own - reduced.K @ dp
-        state = step_to(state, xi, dp.reshape(m, 3))
+        state = step_to(state, xi, dp[: 3 * m].reshape(m, 3), float(dp[3 * m :].sum()))
         size = np.einsum("si,si->", own, reduced.g) + reduced.r @ dp
         if size < _SETTLED:
             return state, _cofactors(reduced, cov_marks, m)
@@ -304,6 +353,9 @@ def _cofactors(reduced: _Reduced, cov_marks: Array, m: int) -> Cofactors:
     stations = np.linalg.inv(reduced.A) - between @ np.swapaxes(reduced.K, 1, 2)
     return Cofactors(
         stations=(stations + np.swapaxes(stations, 1, 2)) / 2.0,
-        between=between.reshape(len(between), 6, m, 3),
-        marks=cov_marks,
+        between=between[:, :, : 3 * m].reshape(len(between), 6, m, 3),
+        marks=cov_marks[: 3 * m, : 3 * m],
+        with_bias=between[:, :, 3 * m :],
+        bias_and_marks=cov_marks[: 3 * m, 3 * m :].reshape(m, 3, -1),
+        bias=cov_marks[3 * m :, 3 * m :],
     )

@@ -86,6 +86,9 @@ class Network:
         Approximate poses [m].
     p_site : (m, 3)
         Approximate marks [m].
+    sigma_range : float
+        Standard deviation of what all ranges of the survey are too long, the same in each [m];
+        0 where there is no such thing.
     refused : tuple of Refusal
         Stations that share too little with the others.
     left_out : tuple of LeftOut
@@ -105,6 +108,7 @@ class Network:
     cov_control_site: Array
     T_site_base: Array
     p_site: Array
+    sigma_range: float = 0.0
     refused: tuple[Refusal, ...] = ()
     left_out: tuple[LeftOut, ...] = ()
 
@@ -194,6 +198,10 @@ class AdjustedNetwork:
         centre causes; infinite where a bias cannot be detected, NaN where not used [m].
     mark_shifts : (n,)
         The same of its mark [m].
+    range_bias : float
+        What all ranges of the survey are too long, as estimated; 0 where the network has none [m].
+    sigma_range_bias : float
+        Its standard deviation [m].
     dof : int
         Degrees of freedom: observations minus unknowns plus the datum's defect.
     vtpv : float
@@ -227,6 +235,8 @@ class AdjustedNetwork:
     control: BlockTests
     station_shifts: Array
     mark_shifts: Array
+    range_bias: float
+    sigma_range_bias: float
     dof: int
     vtpv: float
     sigma0: float

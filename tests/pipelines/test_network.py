@@ -17,7 +17,7 @@ from pipelines.resection import resect
 from tests.synthetic import control, field, pose, sightings
 
 EXACT = 1e-7  # [m] and [rad] noise-free in, truth out
-CONFIG = ResectionConfig(sigma_common=0.0)
+CONFIG = ResectionConfig(sigma_common=0.0, sigma_range=0.0)
 SIGMA = 4e-3  # [m] of a centre, per axis
 LEVEL = 3e-3  # [rad] of roll and of pitch
 
@@ -51,6 +51,16 @@ def biased(scans, station, fit, shift):
     moved = replace(fits.fits[fit], p_base=fits.fits[fit].p_base + shift)
     others = (*fits.fits[:fit], moved, *fits.fits[fit + 1 :])
     return [*scans[:station], (name, replace(fits, fits=others)), *scans[station + 1 :]]
+
+
+def longer(scan, bias):
+    """The scan with all ranges too long."""
+    name, fits = scan
+    moved = [
+        replace(fit, p_base=fit.p_base * (1 + bias / np.linalg.norm(fit.p_base)))
+        for fit in fits.fits
+    ]
+    return name, replace(fits, fits=tuple(moved))
 
 
 def network(scans, marks=None, config=CONFIG):
@@ -107,7 +117,7 @@ def test_noise_free_centres_without_control_give_the_true_shape(rng):
 def test_derivatives_agree_with_differences(rng):
     marks = field(rng, 5)
     scans, _ = survey(rng, marks, 3)
-    net = assemble(scans, marks, CONFIG)
+    net = assemble(scans, marks, replace(CONFIG, sigma_range=1e-3))
     state, used = start(net), np.ones(net.n_blocks, np.bool_)
     state = step_to(state, rng.normal(0, 0.1, (3, 6)), rng.normal(0, 0.1, (5, 3)))
     here, h = linearise(net, state, used), 1e-6
@@ -122,6 +132,12 @@ def test_derivatives_agree_with_differences(rng):
         np.testing.assert_allclose(here.J_centres[..., k], numeric, rtol=0, atol=1e-7)
         numeric = (plus.v_gravity - minus.v_gravity) / (2 * h)
         np.testing.assert_allclose(here.J_gravity[..., k], numeric, rtol=0, atol=1e-7)
+    plus, minus = (
+        linearise(net, step_to(state, np.zeros((3, 6)), np.zeros((5, 3)), sign * h), used)
+        for sign in (1, -1)
+    )
+    numeric = (plus.v_centres - minus.v_centres) / (2 * h)
+    np.testing.assert_allclose(here.J_common[..., 3], numeric, rtol=0, atol=1e-7)
     dp = rng.normal(0, 1, (5, 3))
     there = linearise(net, step_to(state, np.zeros((3, 6)), dp), used)
     np.testing.assert_allclose(there.v_centres - here.v_centres, -dp[mark], rtol=0, atol=1e-12)
@@ -142,9 +158,12 @@ def dense(net, levellings):
 
     def residuals(x):
         angles, t = x[: 3 * s].reshape(s, 3), x[3 * s : 6 * s].reshape(s, 3)
-        p = x[6 * s :].reshape(m, 3)
+        p = x[6 * s : 6 * s + 3 * m].reshape(m, 3)
         R = Rotation.from_euler("ZYX", angles).as_matrix()[station]
-        v = net.p_base - np.einsum("nji,nj->ni", R, p[mark] - t[station])
+        seen = np.einsum("nji,nj->ni", R, p[mark] - t[station])
+        bias = x[6 * s + 3 * m :]
+        longer = seen / np.linalg.norm(seen, axis=1)[:, None] * bias.sum()
+        v = net.p_base - seen - longer
         whitened = np.einsum("nij,nj->ni", roots, v)
         levels = (tilts - angles[:, 1:]) / LEVEL
         given = np.einsum("nij,nj->ni", roots_control, net.p_control_site - p[net.controls])
@@ -161,36 +180,62 @@ def dense(net, levellings):
                 given.ravel(),
                 1e5 * centroid,
                 1e5 * np.array(heading),
+                bias / net.sigma_range if len(bias) else bias,
             ]
         )
 
     angles = Rotation.from_matrix(net.T_site_base[:, :3, :3]).as_euler("ZYX")
-    x0 = np.concatenate([angles.ravel(), net.T_site_base[:, :3, 3].ravel(), net.p_site.ravel()])
+    none = np.zeros(int(net.sigma_range > 0))
+    places = [net.T_site_base[:, :3, 3].ravel(), net.p_site.ravel()]
+    x0 = np.concatenate([angles.ravel(), *places, none])
     found = least_squares(residuals, x0, method="trf", xtol=1e-14, ftol=1e-14, gtol=1e-12)
     cov = np.linalg.inv(found.jac.T @ found.jac)
     return found.x, cov, 2 * found.cost
 
 
+@pytest.mark.parametrize("sigma_range", [0.0, 5e-3])
 @pytest.mark.parametrize("is_free", [True, False])
-def test_an_independent_dense_solution_agrees_to_a_tenth_of_a_millimetre(rng, is_free):
+def test_an_independent_dense_solution_agrees_to_a_tenth_of_a_millimetre(rng, is_free, sigma_range):
     marks = field(rng, 8)
     loose = replace(marks, cov_p_site=np.tile(np.eye(3) * 2e-3**2, (8, 1, 1)))
     given = replace(loose, p_site=marks.p_site + rng.normal(0, 2e-3, (8, 3)))
     scans, _ = survey(rng, marks, 5)
-    net = assemble(scans, None if is_free else given, CONFIG)
-    result = adjust_network(net, CONFIG)
+    config = replace(CONFIG, sigma_range=sigma_range)
+    net = assemble([longer(scan, 6e-3 if sigma_range else 0.0) for scan in scans],
+                   None if is_free else given, config)  # fmt: skip
+    result = adjust_network(net, config)
     assert result.used.all()
     x, cov, vtpv = dense(net, [fits.levelling for _, fits in scans])
     s = len(net.stations)
     tenth = 1e-4  # [m]
-    np.testing.assert_allclose(result.p_site, x[6 * s :].reshape(-1, 3), rtol=0, atol=tenth)
+    np.testing.assert_allclose(
+        result.p_site, x[6 * s : 6 * s + 24].reshape(-1, 3), rtol=0, atol=tenth
+    )
     p_stations = x[3 * s : 6 * s].reshape(-1, 3)
     np.testing.assert_allclose(result.T_site_station[:, :3, 3], p_stations, rtol=0, atol=tenth)
     sigmas = np.sqrt(np.diag(cov))
-    np.testing.assert_allclose(np.sqrt(np.diag(result.cov_p_site)), sigmas[6 * s :], rtol=0.02)
+    np.testing.assert_allclose(
+        np.sqrt(np.diag(result.cov_p_site)), sigmas[6 * s : 6 * s + 24], rtol=0.02
+    )
     own = np.einsum("sii->si", result.station_covariances).ravel()
     np.testing.assert_allclose(np.sqrt(own), sigmas[3 * s : 6 * s], rtol=0.02)
     assert result.vtpv == pytest.approx(vtpv, rel=0.02)
+    if sigma_range:
+        assert result.range_bias == pytest.approx(x[-1], abs=tenth)
+        assert result.sigma_range_bias == pytest.approx(sigmas[-1], rel=0.02)
+
+
+def test_what_all_ranges_are_too_long_is_found_where_control_tells(rng):
+    marks = field(rng)
+    scans, _ = survey(rng, marks, 4)
+    config = replace(CONFIG, sigma_range=0.01)
+    result = network([longer(scan, 0.015) for scan in scans], marks, config)
+    assert result.range_bias == pytest.approx(0.015, abs=4 * result.sigma_range_bias)
+    assert result.sigma_range_bias < 1e-3
+    parts = (result.centres, result.gravity, result.control)
+    total = sum(float(np.sum(part.redundancies)) for part in parts)
+    total += 1 - (result.sigma_range_bias / 0.01) ** 2  # of its prior
+    assert total == pytest.approx(result.dof, abs=1e-6)
 
 
 def test_one_station_with_control_is_a_free_station(rng):

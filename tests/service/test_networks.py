@@ -104,7 +104,7 @@ def test_without_control_the_shape_is_true(free, logs):
 
 
 def test_redundancies_add_up_to_the_degrees_of_freedom(tied):
-    rows = [*tied["observations"], *tied["gravity"], *tied["control"]]
+    rows = [*tied["observations"], *tied["gravity"], *tied["control"], tied["range_bias"]]
     assert sum(row["redundancy"] or 0.0 for row in rows) == pytest.approx(tied["dof"], abs=1e-3)
 
 

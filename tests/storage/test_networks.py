@@ -14,7 +14,7 @@ from pipelines.network import adjust_network, assemble
 from storage.networks import format_coordinates, format_gama, write_gama
 from tests.synthetic import field, pose, sightings
 
-CONFIG = ResectionConfig(sigma_common=0.0)
+CONFIG = ResectionConfig(sigma_common=0.0, sigma_range=0.0)
 GAMA = {"g": "http://www.gnu.org/software/gama/gama-local"}
 TENTH = 1e-4  # [m]
 
