@@ -4,7 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 from time import perf_counter
+
+import numpy as np
 
 from pipelines.config import SurveyConfig
 from pipelines.errors import NoMarkersError, SolveError
@@ -20,6 +23,7 @@ from pipelines.values import (
     Rig,
     ScanLog,
     StationFix,
+    Status,
     StopResult,
 )
 
@@ -104,7 +108,7 @@ def _process_stop(
             )
     progress(0.8, "Positioning the station")
     with _timed(timings, "resection"):
-        fixes, pairs = _position(fits, marks, config)
+        fixes, pairs = _position(fits, marks, config, cloud.coverage)
     progress(1.0, f"{log.origin.name} done")
     return StopResult(
         name=log.origin.name, cloud=cloud, fits=fits, fixes=fixes, pairs=pairs, timings=timings
@@ -112,7 +116,10 @@ def _process_stop(
 
 
 def _position(
-    fits: dict[str, MarkerFits], marks: ControlMarks | None, config: SurveyConfig
+    fits: dict[str, MarkerFits],
+    marks: ControlMarks | None,
+    config: SurveyConfig,
+    coverage: float,
 ) -> tuple[dict[tuple[str, str], StationFix | NoFix], dict[tuple[str, str], PairFixes]]:
     """Position the station from each set of fits by each resection method."""
     fixes: dict[tuple[str, str], StationFix | NoFix] = {}
@@ -127,9 +134,21 @@ def _position(
             except SolveError as error:
                 fixes[key] = NoFix(method=method, code=error.code, reason=str(error))
                 continue
-            fixes[key] = fix
+            fixes[key] = _qualified(fix, coverage)
             pairs[key] = resect_pairs(method, fix, centres, marks, config.resection)
     return fixes, pairs
+
+
+def _qualified(fix: StationFix, coverage: float) -> StationFix:
+    """Return the fix, weak if the gimbal turned by less than half a turn [rad]."""
+    if coverage >= np.pi:
+        return fix
+    reason = (
+        f"the gimbal turned by {np.degrees(coverage):.0f} deg only: under 180 deg no direction is "
+        "swept twice, and errors of the gimbal neither cancel nor show"
+    )
+    reason = f"{fix.reason}; {reason}" if fix.reason else reason
+    return replace(fix, status=Status.WEAK, reason=reason)
 
 
 def _why_no_markers(results: list[StopResult], config: SurveyConfig) -> str:
