@@ -244,6 +244,7 @@ def _pose(
     lean[:2] = -rot_z(yaw)[:2, :2]
     full = np.zeros((6, 6))
     full[2:, 2:] = cov
+    full[2, 2] += scene.sigma_heading**2
     return yaw, full + scene.sigma_level**2 * lean @ lean.T
 
 

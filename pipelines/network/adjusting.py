@@ -319,7 +319,7 @@ def _adjusted(
     return AdjustedNetwork(
         network=network,
         T_site_station=T,
-        cov_T_site_station=shift @ tested.cofactors.stations @ shift.T,
+        cov_T_site_station=shift @ tested.cofactors.stations @ shift.T + _cov_heading(network, T),
         p_site=tested.state.p_site + middle,
         cov_p_site=tested.cofactors.marks,
         used=tested.used,
@@ -338,6 +338,15 @@ def _adjusted(
         noncentrality=noncentrality,
         left_out=(*network.left_out, *left_out),
         warnings=_warnings(network, tested, critical, left_out, config.test_level),
+    )
+
+
+def _cov_heading(network: Network, T: Array) -> Array:
+    """Return the covariance of stations that turn about their own plumb lines, (s, 6, 6)."""
+    up = T[:, :3, 2]
+    turns = np.concatenate([up, np.cross(T[:, :3, 3], up)], axis=1)
+    return np.asarray(
+        network.sigma_headings[:, None, None] ** 2 * turns[:, :, None] * turns[:, None]
     )
 
 

@@ -316,6 +316,7 @@ def _network(
         cov_p_base=np.array([fit.cov_p_base for fit in fits]) + config.sigma_common**2 * np.eye(3),
         R_station_base=np.array([levelling_rotation(one) for one in levellings]),
         cov_up_base=np.array([_cov_up(one.roll, one.pitch, one.sigma) for one in levellings]),
+        sigma_headings=np.array([one.sigma_heading for one in levellings]),
         controls=np.array([row[mark] for mark in controls], dtype=np.intp),
         p_control_site=np.array([found.p_site[mark] for mark in controls]).reshape(-1, 3),
         cov_control_site=given + _EXACT**2 * np.eye(3),

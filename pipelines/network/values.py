@@ -76,6 +76,8 @@ class Network:
         Measured levelling; the last row is the up direction in base.
     cov_up_base : (s, 3, 3)
         Covariance of that direction in base, of rank two [rad^2].
+    sigma_headings : (s,)
+        Standard deviation of what mounting and encoder leave unknown of each heading [rad].
     controls : (c,)
         Places of the control marks among the marks.
     p_control_site : (c, 3)
@@ -103,6 +105,7 @@ class Network:
     cov_p_base: Array
     R_station_base: Array
     cov_up_base: Array
+    sigma_headings: Array
     controls: Index
     p_control_site: Array
     cov_control_site: Array
@@ -123,6 +126,7 @@ class Network:
                 "cov_p_base": (n, 3, 3),
                 "R_station_base": (s, 3, 3),
                 "cov_up_base": (s, 3, 3),
+                "sigma_headings": (s,),
                 "controls": (c,),
                 "p_control_site": (c, 3),
                 "cov_control_site": (c, 3, 3),

@@ -250,6 +250,23 @@ def test_one_station_with_control_is_a_free_station(rng):
     assert result.vtpv == pytest.approx(fix.sigma0**2 * fix.dof, rel=1e-3)
 
 
+def test_what_mounting_leaves_of_the_heading_turns_a_station_and_moves_none(rng):
+    marks = field(rng)
+    scans, _ = survey(rng, marks, 2)
+    blurred = [
+        (name, replace(fits, levelling=replace(fits.levelling, sigma_heading=0.01)))
+        for name, fits in scans
+    ]
+    sharp, blunt = network(scans, marks), network(blurred, marks)
+    np.testing.assert_allclose(
+        blunt.station_covariances, sharp.station_covariances, rtol=0, atol=1e-12
+    )
+    more = blunt.cov_T_site_station[:, 2, 2] - sharp.cov_T_site_station[:, 2, 2]
+    np.testing.assert_allclose(more, 1e-4, rtol=1e-3)
+    fixes = [resect("ranges", one[0][1], marks, CONFIG) for one in (scans, blurred)]
+    assert fixes[1].sigma_yaw == pytest.approx(np.hypot(fixes[0].sigma_yaw, 0.01), rel=1e-6)
+
+
 @pytest.mark.parametrize("is_free", [True, False])
 def test_redundancies_add_up_to_the_degrees_of_freedom(rng, is_free):
     marks = field(rng)
