@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 from rich.console import Console
 
-from pipelines.errors import SpheremarkError
+from pipelines.errors import ConfigError, SpheremarkError
 
 if TYPE_CHECKING:
     from pipelines.survey import Progress
@@ -45,6 +45,14 @@ class Format(StrEnum):
     PACKETS = "packets"
 
 
+class Compression(StrEnum):
+    """How the chunks of a log can be compressed."""
+
+    NONE = "none"
+    LZ4 = "lz4"
+    ZSTD = "zstd"
+
+
 class Frame(StrEnum):
     """Frames in which centres can be given."""
 
@@ -61,10 +69,21 @@ def main() -> None:
             from service.errors import problem_of
 
             _print_json(problem_of(error, " ".join(sys.argv[1:2])).model_dump(exclude_none=True))
-        err.print(f"[bold red]Error:[/] {error}", highlight=False, soft_wrap=True)
+        _print_error(str(error))
+        raise SystemExit(2 if isinstance(error, ConfigError) else 1) from None
+    except OSError as error:
+        if error.filename is None:
+            raise
+        _print_error(f"{error.filename}: {error.strerror}.")
         raise SystemExit(1) from None
     except KeyboardInterrupt:
         raise SystemExit(130) from None
+
+
+def _print_error(sentence: str) -> None:
+    """Print what went wrong; nothing in it is markup."""
+    err.print("[bold red]Error:[/] ", end="")
+    err.print(sentence, markup=False, emoji=False, highlight=False, soft_wrap=True)
 
 
 @app.command()
@@ -118,7 +137,7 @@ def simulate(
     form: Annotated[
         Format, typer.Option("--format", help="Point clouds, or raw packets of a VLP-16.")
     ] = Format.POINTS,
-    compression: Annotated[str, typer.Option(help="Of the chunks: none, lz4 or zstd.")] = "none",
+    compression: Annotated[Compression, typer.Option(help="Of the chunks.")] = Compression.NONE,
     as_json: AsJson = False,
 ) -> None:
     """Write logs as a recorder would (STOP.mcap), their truth (STOP.truth.json) and control.csv."""

@@ -36,7 +36,7 @@ class Source:
     def ask(self, sql: str) -> dict[str, Any]:
         """Answer one SELECT."""
         if self._url:
-            with self._http() as http:
+            with _spoken(self._url), self._http() as http:
                 answer: dict[str, Any] = _checked(http.post("/sql", json={"sql": sql})).json()
                 return answer
         with self._catalogue() as catalogue:
@@ -48,7 +48,8 @@ class Source:
         if target.suffix not in (".duckdb", ".csv"):
             raise InputError(f"{target.name} must end in .duckdb (everything) or .csv.")
         if self._url:
-            self._download(target, survey)
+            with _spoken(self._url):
+                self._download(target, survey)
             return
         with self._catalogue() as catalogue:
             if target.suffix == ".csv":
@@ -93,6 +94,18 @@ class Source:
             )
         with Catalogue(path, snapshots=self._settings.data / "snapshots") as catalogue:
             yield catalogue
+
+
+@contextmanager
+def _spoken(url: str) -> Iterator[None]:
+    """Say in a sentence that nobody answers."""
+    try:
+        yield
+    except httpx.HTTPError as error:
+        raise RemoteError(
+            f"No service answers at {url} ({error}); start `spheremark serve` there, or "
+            "name another address with --url."
+        ) from error
 
 
 def _checked(answer: httpx.Response) -> httpx.Response:

@@ -10,7 +10,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from pipelines.errors import InputError
+from pipelines.errors import ConfigError
 from pipelines.simulation import (
     Field,
     SimulationConfig,
@@ -73,7 +73,7 @@ def _named(part: str, names: Sequence[str]) -> Sequence[str]:
     numbers = re.fullmatch(r"(\d+)(?:-(\d+))?", part)
     first, last = (int(n or numbers[1]) for n in numbers.groups()) if numbers else (0, 0)
     if not 1 <= first <= last <= len(names):
-        raise InputError(
+        raise ConfigError(
             f"There is no stop {part!r}; name stops ({names[0]} ... {names[-1]}), lanes (lane1), "
             f"numbers or ranges from 1 to {len(names)}, or all."
         )

@@ -157,12 +157,12 @@ def test_a_wrong_setting_is_misuse_and_named():
 
 
 def test_an_unknown_method_is_refused_by_name(stop):
-    assert "along_beam" in run("process", stop.log, "--method", "magic", code=1).stderr
+    assert "along_beam" in run("process", stop.log, "--method", "magic", code=2).stderr
 
 
 def test_commensurate_speeds_are_warned_about(tmp_path):
     arguments = ("simulate", tmp_path, "--stops", "99", "--turn-s", "18", "--rpm", "600")
-    assert "ommensurate" in run(*arguments, code=1).stderr
+    assert "ommensurate" in run(*arguments, code=2).stderr
 
 
 def test_a_service_is_asked_exported_and_stopped_by_a_signal(tmp_path):
@@ -215,3 +215,20 @@ def test_a_calibrated_rig_is_one_that_processing_takes(stop, tmp_path):
         processed = json.loads(run("process", stop.log, "--rig", given, "--json").stdout)
         assert processed["rig"]["digest"] == answer["rig_digest"]
     assert "spin_zero" in run("calibrate", stop.log).stdout
+
+
+def test_what_is_wrong_with_a_file_is_said_word_by_word(stop, tmp_path):
+    control = tmp_path / "marks.csv"
+    control.write_text("mark,x,y,z,[/m]\nA,1,2,3,4\n")
+    assert "'[/m]'" in run("process", stop.log, "--control", control, code=1).stderr
+
+
+def test_a_service_that_does_not_answer_is_named():
+    asked = run("query", "SELECT 1", "--url", "http://127.0.0.1:9", code=1)
+    assert "No service answers at http://127.0.0.1:9" in asked.stderr
+
+
+def test_a_compression_that_nobody_knows_is_refused_before_anything_is_written(tmp_path):
+    out = tmp_path / "logs"
+    run("simulate", out, "--compression", "gz", code=2)
+    assert not out.exists()
