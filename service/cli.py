@@ -196,6 +196,10 @@ def process(
     method: Annotated[
         list[str] | None, typer.Option(help="Fitting method; again for more. The first counts.")
     ] = None,
+    resection: Annotated[
+        list[str] | None,
+        typer.Option(help="free_station, ranges or paper; again for more. The first counts."),
+    ] = None,
     frame: Annotated[Frame, typer.Option(help="Frame of the centres.")] = Frame.STATION,
     tolerance_m: Annotated[float, typer.Option(help="Error that is accepted \\[m].")] = 0.03,
     radius_m: Annotated[float, typer.Option(help="Radius of the spheres \\[m].")] = 0.100,
@@ -216,6 +220,7 @@ def process(
             "marker_radius": radius_m,
             "tolerance": tolerance_m,
             "fitting": {"methods": method or ["along_beam"]},
+            "resection": {"methods": resection or ["free_station"]},
         }
     )
     inputs = Inputs(
