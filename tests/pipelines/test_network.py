@@ -1,6 +1,7 @@
 """The network against a world whose truth is known, and against a dense solution of its own."""
 
 import re
+import time
 from dataclasses import replace
 
 import numpy as np
@@ -11,7 +12,7 @@ from scipy.spatial.transform import Rotation
 from pipelines.config import ResectionConfig
 from pipelines.errors import DegenerateGeometryError, InputError
 from pipelines.geometry import inverse, levelling_rotation, log_motion, rigid
-from pipelines.network import adjust_network, assemble
+from pipelines.network import Network, adjust_network, assemble
 from pipelines.network.equations import linearise, start, step_to
 from pipelines.resection import resect
 from tests.synthetic import control, field, pose, sightings
@@ -446,3 +447,44 @@ def test_the_covariances_of_a_network_are_honest(rng, is_free):
             all_marks.append(e.ravel() @ pinv @ e.ravel() / (30 - 4))
     assert 0.85 < np.mean(stations) < 1.2
     assert not all_marks or 0.85 < np.mean(all_marks) < 1.2
+
+
+def wide(rng, n_stations, n_marks=200, n_seen=14):
+    """A network over a wide field, assembled by hand: each station sees the marks about it."""
+    p = np.column_stack([rng.uniform(0, 120, (n_marks, 2)), rng.uniform(0.6, 1.5, n_marks)])
+    T = np.array(
+        [pose([*rng.uniform(0, 120, 2), 0.8], rng.uniform(-3, 3)) for _ in range(n_stations)]
+    )
+    far = np.linalg.norm(T[:, None, :3, 3] - p, axis=2)
+    seen = np.argsort(far, axis=1)[:, :n_seen]
+    centres = np.einsum("skj,sji->ski", p[seen] - T[:, None, :3, 3], T[:, :3, :3])
+    n = n_stations * n_seen
+    return Network(
+        stations=tuple(f"stop{i}" for i in range(n_stations)),
+        marks=tuple(f"M{i}" for i in range(n_marks)),
+        sightings=np.column_stack([np.repeat(np.arange(n_stations), n_seen), seen.ravel()]),
+        fits=np.tile(np.arange(n_seen), n_stations),
+        p_base=centres.reshape(n, 3) + rng.normal(0, SIGMA, (n, 3)),
+        cov_p_base=np.tile(SIGMA**2 * np.eye(3), (n, 1, 1)),
+        R_station_base=np.tile(np.eye(3), (n_stations, 1, 1)),
+        cov_up_base=np.tile(np.diag([LEVEL**2, LEVEL**2, 0.0]), (n_stations, 1, 1)),
+        sigma_headings=np.zeros(n_stations),
+        controls=np.zeros(0, np.intp),
+        p_control_site=np.zeros((0, 3)),
+        cov_control_site=np.zeros((0, 3, 3)),
+        T_site_base=T,
+        p_site=p + rng.normal(0, 0.01, p.shape),
+    )
+
+
+@pytest.mark.slow
+def test_a_thousand_stations_and_two_hundred_marks_are_adjusted_at_a_cost_that_grows_linearly(rng):
+    seconds = []
+    for n in (250, 1000):
+        net = wide(rng, n)
+        begin = time.perf_counter()
+        result = adjust_network(net, CONFIG)
+        seconds.append(time.perf_counter() - begin)
+        assert result.dof == 3 * 14 * n + 2 * n - 6 * n - 600 + 4
+        assert 0.9 < result.sigma0 < 1.1
+    assert seconds[1] < 6 * seconds[0]  # four times the stations
