@@ -46,6 +46,8 @@ _NOT_TURNED = np.radians(1.0)  # less is not turning
 _SCRAP = np.radians(30.0)  # less after a stop is no scan but the gimbal finding its place
 _SMEAR = np.radians(0.05)  # 7 mm at 7.5 m: the most that a message without shot times may turn
 _RESTS_MIN = 4  # fewer rests than this are those before and after an even turn
+_PAUSE = 0.3  # [s]; three revolutions without a return are a pause
+_PAUSE_TURN = np.radians(1.0)  # a pause of a gimbal at rest costs nothing
 _JOINT_GAP = 0.5  # [s]; over a longer gap of a moving gimbal the angle is a guess
 _JOINT_GAP_MOTION = np.radians(0.5)
 _SIGMA_UNLEVELLED = np.radians(3.0)  # how a rover may lean on ground it can drive on
@@ -362,7 +364,8 @@ def stitch(log: ScanLog, rig: Rig, config: StitchingConfig) -> StitchedCloud:
     _refuse_empty(log, joints, counts, config)
     levelling = level(log, rig, config)
     coverage, duration = _extent(log.stamps_lidar_ns, joints)
-    notes += smear_note + _count_notes(counts) + _level_notes(levelling) + _turn_notes(coverage)
+    notes += smear_note + pause_notes(log) + _count_notes(counts)
+    notes += _level_notes(levelling) + _turn_notes(coverage)
     return StitchedCloud(
         p_base=columns.p_base,
         gimbal_angles=columns.gimbal_angles,
@@ -651,6 +654,27 @@ def _level_notes(levelling: Levelling) -> tuple[str, ...]:
             "R_mount_imu of the rig.",
         )
     return ()
+
+
+def pause_notes(log: ScanLog) -> tuple[str, ...]:
+    """Say where the LiDAR was silent while the gimbal turned.
+
+    Parameters
+    ----------
+    log : ScanLog
+        One stop.
+
+    Returns
+    -------
+    tuple of str
+        A sentence for each pause.
+    """
+    return tuple(
+        f"The LiDAR was silent for {(end - start) * _NS:.1f} s while the gimbal turned by "
+        f"{np.degrees(turned):.0f} deg: what stands there was swept on one face only or not at all."
+        for start, end in _lidar_gaps(log, _PAUSE)
+        if (turned := _turned(log, start, end)) > _PAUSE_TURN
+    )
 
 
 def _turn_notes(coverage: float) -> tuple[str, ...]:

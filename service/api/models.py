@@ -72,9 +72,9 @@ class Mark(Strict):
     x_m: float
     y_m: float
     z_m: float
-    sigma_x_m: float = 0.0
-    sigma_y_m: float = 0.0
-    sigma_z_m: float = 0.0
+    sigma_x_m: float = Field(default=0.0, ge=0.0)
+    sigma_y_m: float = Field(default=0.0, ge=0.0)
+    sigma_z_m: float = Field(default=0.0, ge=0.0)
 
 
 class Control(Strict):

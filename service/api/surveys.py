@@ -116,9 +116,10 @@ def _read_control(file: Document) -> ControlMarks:
             f"The body is {file.media_type or 'of no type'}; send text/csv or application/json."
         )
     try:
-        return _to_marks(Control.model_validate_json(file.text).marks)
+        marks = _to_marks(Control.model_validate_json(file.text).marks)
     except ValidationError as error:
         raise RequestValidationError(error.errors()) from error
+    return parse_control(format_control(marks))  # one set of checks for both forms
 
 
 def _to_marks(marks: list[Mark]) -> ControlMarks:

@@ -237,7 +237,7 @@ def _described(report: Preflight, log: ScanLog) -> Preflight:
 
 def _judged(report: Preflight, log: ScanLog, skew: float | None) -> Preflight:
     """Return the report with stops, coverage, reasons and verdict."""
-    from pipelines.stitching import choose_rig, split_stops, stitch
+    from pipelines.stitching import choose_rig, pause_notes, split_stops, stitch
 
     reasons: list[str] = []
     refusal: InputError | None = None
@@ -256,6 +256,7 @@ def _judged(report: Preflight, log: ScanLog, skew: float | None) -> Preflight:
             refusal = refusal or error
     gaps = [gap for gap in (_horizon_gap(stop, rig) for stop in stops) if gap is not None]
     coverage, gap = min(coverages, default=None), max(gaps, default=None)
+    reasons += [note for stop in stops for note in pause_notes(stop)]
     reasons += _reasons(report, coverage, gap, skew)
     report = replace(
         report,
@@ -309,7 +310,10 @@ def _thinned(log: ScanLog) -> ScanLog:
 
 
 def _skew(decoders: Decoders, times: _Times) -> float | None:
-    """Return how much later the LiDAR's messages were recorded than the gimbal's [s]."""
+    """Return how much later the LiDAR's messages were recorded than the gimbal's [s].
+
+    A message of the LiDAR is whole, and can be recorded, when its revolution is over.
+    """
     lidars = [one.returns() for one in decoders.lidars.values()]
     joints = [s for one in decoders.joints.values() for s in one.series() if len(s.stamps_ns)]
     if not lidars or not joints or not len(lidars[0].message_stamps_ns):
@@ -321,7 +325,9 @@ def _skew(decoders: Decoders, times: _Times) -> float | None:
             (joints[0].topic, joints[0].stamps_ns),
         )
     ]
-    return (late[0] - late[1]) * 1e-9
+    stamps = lidars[0].message_stamps_ns
+    revolution = float(np.median(np.diff(stamps))) if len(stamps) > 1 else 0.0
+    return (late[0] - revolution - late[1]) * 1e-9
 
 
 def _gimbal_speed_deg(log: ScanLog) -> float | None:

@@ -222,9 +222,21 @@ def test_the_preflight_of_a_good_log_tells_its_speeds_and_coverage(tmp_path):
     assert_allclose(report.lidar_speed_rpm, 600.0, rtol=0, atol=1e-3)
     assert_allclose(report.gimbal_speed_deg_per_s, 360 / 13.2, rtol=0, atol=1e-6)
     assert_allclose(report.gimbal_coverage_deg, 360.0, rtol=0, atol=0.1)
-    assert_allclose(report.clock_skew_s, 0.1, rtol=0, atol=0.02)
+    assert_allclose(report.clock_skew_s, 0.0, rtol=0, atol=0.02)
     rates = {topic.topic: topic.rate_hz for topic in report.topics}
     assert_allclose(rates["/joint_states"], 100.0, rtol=0, atol=0.01)
+
+
+def test_a_pause_of_the_lidar_in_a_turn_is_weak(tmp_path):
+    log = turn_log(turn=13.2)
+    since = (log.stamps_lidar_ns - log.stamps_lidar_ns[0]) * 1e-9
+    kept = (since < 5.0) | (since > 6.5)
+    columns = ("p_lidar", "intensities", "rings", "stamps_lidar_ns")
+    report = inspected(
+        tmp_path, replace(log, **{name: getattr(log, name)[kept] for name in columns})
+    )
+    assert report.verdict == "weak"
+    assert "silent for 1.5 s while the gimbal turned by 41 deg" in report.reasons[0]
 
 
 def horizon_gap(turn, spin):
