@@ -17,7 +17,6 @@ from pipelines.values import Array, Beams, Index
 _N_STRIPS = 8  # strips of the ellipse; with 8 the mean is good to 0.01 mm of a 0.1 m ball at 8 m
 _MIDDLE = 0.3  # radii: returns nearer to the middle belong to no side
 _INNER = 0.9  # radii from the middle within which the range hardly bends
-_STRAIGHT = 0.03  # radii over which it bends by less than 0.05 mm there
 _THIN = 1e-6  # [m]; a thinner footprint is a ray, and this one differs from it by nothing
 
 
@@ -123,9 +122,9 @@ def linearise(beams: Beams, spheres: Array, covs: Array, which: Index) -> Linear
     how precise that beam would be if the centre were known already. Here it is the slope between
     places the square root of k standard deviations to either side (statistical linearisation by
     cubature: Garcia-Fernandez, Svensson, Morelande, Sarkka, Posterior linearization filter, 2015).
-    Well inside the outline both agree, and the exact derivative is taken. What the bend adds on
-    average is taken off: without that least squares puts centres some millimetres too near where
-    returns are few (Box, Bias in nonlinear estimation, 1971).
+    Well inside the outline both agree, and the exact derivative is taken, with the bend of a ray.
+    What the bend adds on average is taken off: without that least squares puts centres some
+    millimetres too near where returns are few (Box, Bias in nonlinear estimation, 1971).
     """
     half_widths = np.maximum(0.5 * beams.ranges[:, None] * beams.divergence, _THIN)
     k = covs.shape[1]
@@ -229,9 +228,8 @@ def _linearise(
         for s in range(k):
             c = columns[m, s]
             reach = max(reach, c[0] * c[0] + c[1] * c[1] + c[2] * c[2] + c[3] * c[3])
-        is_inner = np.hypot(x0, y0) + max(half_x, half_y) + np.sqrt(reach) < _INNER * radius
-        if is_inner and reach < (_STRAIGHT * radius) ** 2:
-            ranges[i] = closest - depth
+        if np.hypot(x0, y0) + max(half_x, half_y) + np.sqrt(reach) < _INNER * radius:
+            ranges[i] = closest - depth + 0.5 * _bend(columns[m], (a, b), (x0, y0, radius))
             for j in range(3):
                 J[i, j] = u[j] - by_x * a[j] - by_y * b[j]
             J[i, 3] = -by_radius
@@ -254,6 +252,23 @@ def _linearise(
         ranges[i] = closest - depth - (mean + depth)
         bends[i] = np.sqrt(max(square - mean * mean - linear, 0.0))
     return ranges, J, bends, lit, offsets
+
+
+@numba.njit(cache=True, nogil=True)
+def _bend(columns, axes, place):  # type: ignore[no-untyped-def]  # noqa: ANN001, ANN202
+    """Return the mean second derivative of a ray's depth by steps of the sphere, (k, 4)."""
+    a, b = axes
+    x0, y0, radius = place
+    square = radius * radius - x0 * x0 - y0 * y0
+    root = np.sqrt(square)
+    total = 0.0
+    for s in range(len(columns)):
+        c = columns[s]
+        dx = c[0] * a[0] + c[1] * a[1] + c[2] * a[2]
+        dy = c[0] * b[0] + c[1] * b[1] + c[2] * b[2]
+        first = radius * c[3] - x0 * dx - y0 * dy
+        total += (c[3] * c[3] - dx * dx - dy * dy) / root - first * first / (square * root)
+    return total / len(columns)
 
 
 @numba.njit(cache=True, nogil=True)
