@@ -136,17 +136,17 @@ class FittingConfig:
         What ``paper`` registers to the returns, of ``PAPER_MODELS``. hemisphere: as the study does;
         its Figure 3 shows the whole sphere instead.
     paper_cut : str
-        What ``paper`` cuts away, of ``PAPER_CUTS``. equator: all below the highest ground point,
-        and the lower half of the sphere in any case, as the highest ground of the study's field
-        must have done: its hemisphere and its errors (Table 2) say so. ground: only what lies below
-        the highest ground point of this scan.
+        What ``paper`` cuts away, of ``PAPER_CUTS``. ground: what lies below the highest ground
+        point of this scan, as the study describes it. equator: the lower half of the sphere too,
+        as where that point is as high as the spheres; found by comparing readings with the study's
+        Table 2, whose errors it reproduces.
     """
 
     methods: tuple[str, ...] = ("along_beam", "paper")
     sigma_range_bias: float = 0.003
     sigma_direction: float = 1e-4
     paper_model: str = "hemisphere"
-    paper_cut: str = "equator"
+    paper_cut: str = "ground"
 
     def __post_init__(self) -> None:
         _check_methods("fitting.methods", self.methods, FITTING_METHODS)

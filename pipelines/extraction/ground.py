@@ -20,7 +20,7 @@ _STUDY_FIELD = 10.0  # [m] from the station: where the study looks for its highe
 _GROUND_WINDOW = 4  # cells each way of the opening: rocks up to twice this are not ground
 _GROUND_STEP = 0.10  # [m] that a cell's lowest point may lie above the opened surface
 _GROUND_CELLS_MIN = 9  # a marker seen alone covers at most 6 cells: that is not yet ground
-_GROUND_NOISE = 0.05  # [m] that a ground return may lie above its cell's lowest
+_GROUND_RISE = 0.15  # [m] that ground may rise above its cell of the opened grid: tops of mounds
 
 
 class Grid(NamedTuple):
@@ -203,6 +203,6 @@ def _above(
         over = height - ground[cells[i]]
         is_above[i] = over > clearance or ground[cells[i]] == np.inf
         is_field = x * x + y * y < _STUDY_FIELD**2
-        if is_field and -np.inf < over < _GROUND_NOISE and height > highest:
+        if is_field and -np.inf < over < _GROUND_RISE and height > highest:
             highest = float(height)
     return highest

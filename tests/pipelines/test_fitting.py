@@ -312,7 +312,7 @@ def test_the_cut_of_the_study_lifts_its_centre():
     cut = fit_one(cloud, CENTRE, "paper", ground=CENTRE[2] - 0.02, config=config).fits[0]
     assert cut.n_points < whole.n_points
     assert cut.p_base[2] - whole.p_base[2] > 0.005
-    half = fit_one(cloud, CENTRE, "paper").fits[0]
+    half = fit_one(cloud, CENTRE, "paper", config=FittingConfig(paper_cut="equator")).fits[0]
     assert 0.4 < half.n_points / whole.n_points < 0.6
 
 
