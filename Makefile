@@ -46,8 +46,8 @@ check: setup
 	$(BIN)/ruff check .
 	$(BIN)/mypy
 	$(BIN)/lint-imports
-	$(BIN)/numpydoc lint $(shell git ls-files 'pipelines/*.py' 'storage/*.py')
-	$(BIN)/codespell $(shell git ls-files '*.py' '*.md' '*.sql' '*.html' '*.toml')
+	@$(BIN)/numpydoc lint $(shell git ls-files 'pipelines/*.py' 'storage/*.py')
+	@$(BIN)/codespell $(shell git ls-files '*.py' '*.md' '*.sql' '*.html' '*.toml')
 
 bench: setup
 	@$(BIN)/spheremark bench
