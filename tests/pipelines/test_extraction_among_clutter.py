@@ -56,7 +56,7 @@ def test_a_marker_half_of_which_is_hidden_is_found(few):
 
 @pytest.mark.slow
 def test_markers_are_found_and_nothing_else_in_worlds_of_clutter():
-    found = detection(DETECTION_PLAN, (21,), SimulationConfig())
+    found = detection(DETECTION_PLAN, (22,), SimulationConfig())
     assert found.recall("clutter-field", 0) > 0.97
     assert found.recall("rock-field", 0) == 1.0
     assert found.recall("range-lane", 0) == 1.0
