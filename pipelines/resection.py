@@ -156,7 +156,7 @@ def free_station(fits: MarkerFits, marks: ControlMarks, config: ResectionConfig)
     used = pairs[keep[:-1]]
     excluded = _exclusions(match, dropped, scene, adjustment, config)
     reasons = _weaknesses(scene, match, used, adjustment, dropped)
-    return _fix(scene, used, adjustment, excluded, reasons)
+    return _fix(scene, match, used, adjustment, excluded, reasons)
 
 
 def _refuse_too_few(fits: MarkerFits, marks: ControlMarks) -> None:
@@ -275,6 +275,7 @@ def _other_places(scene: Scene, match: Match) -> str:
 
 def _fix(
     scene: Scene,
+    match: Match,
     used: Index,
     adjustment: Adjustment[Array],
     excluded: tuple[Exclusion, ...],
@@ -291,7 +292,9 @@ def _fix(
     return StationFix(
         method="free_station",
         T_site_station=T_site_base @ inverse(rigid(scene.R_station_base, np.zeros(3))),
-        cov_T_site_station=shift @ adjustment.cov @ shift.T + _cov_heading(scene, T_site_base),
+        cov_T_site_station=shift @ adjustment.cov @ shift.T
+        + _cov_heading(scene, T_site_base)
+        + _cov_choice(scene, match, T_site_base),
         matches=used,
         residuals_site=adjustment.groups[0].residuals,
         redundancies=adjustment.redundancies[:n],
@@ -314,9 +317,29 @@ def _cov_heading(scene: Scene, T_site_base: Array) -> Array:
     The heading of base is where its joint angle is zero, which mounting and encoder blur; the
     position does not move.
     """
-    up = T_site_base[:3, :3] @ scene.R_station_base[2]
-    turn = np.concatenate([up, np.cross(T_site_base[:3, 3], up)])
+    turn = _turn(scene, T_site_base)
     return np.asarray(scene.sigma_heading**2 * np.outer(turn, turn))
+
+
+def _cov_choice(scene: Scene, match: Match, T_site_base: Array) -> Array:
+    """Return what it adds to the covariance, (6, 6), that the station may as well stand elsewhere.
+
+    Each of the other places is as likely as the chosen one, and lies half a turn away.
+    """
+    cov = np.zeros((6, 6))
+    n = len(match.rivals)
+    if n:
+        shifts = match.rivals + scene.middle - T_site_base[:3, 3]
+        turn = np.pi * _turn(scene, T_site_base)
+        cov[3:, 3:] = shifts.T @ shifts / (n + 1)
+        cov += n / (n + 1) * np.outer(turn, turn)
+    return cov
+
+
+def _turn(scene: Scene, T_site_base: Array) -> Array:
+    """Return the small motion, (6,), that turns a station about its own plumb line by 1 rad."""
+    up = T_site_base[:3, :3] @ scene.R_station_base[2]
+    return np.concatenate([up, np.cross(T_site_base[:3, 3], up)])
 
 
 def _position_by_motion(T: Array) -> Array:

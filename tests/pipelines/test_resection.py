@@ -198,6 +198,16 @@ def test_two_marks_give_a_weak_fix_thanks_to_gravity():
     assert fix.dof == 2
 
 
+def test_two_marks_that_can_be_swapped_have_a_covariance_that_holds_both_places():
+    marks, place = control([[6, 0, 1], [-5, 2, 1]]), np.array([0.5, 3.0, 0.8])
+    fix = free(sightings(marks, pose(place, 1.0)), marks)
+    assert fix.status is Status.WEAK
+    assert "2 ways about equally well" in fix.reason
+    off = fix.p_site - place
+    assert off @ np.linalg.pinv(fix.cov_p_site) @ off < 3.0
+    assert fix.sigma_yaw > np.pi / 2
+
+
 def test_marks_on_a_line_give_a_weak_fix_thanks_to_gravity():
     marks = control([[-6, 3, 0.7], [-1, 3, 0.7], [3, 3, 0.7], [7, 3, 0.7]])
     T = pose((1.0, -2.0, 0.8), 2.2, LEAN)
