@@ -134,7 +134,7 @@ def test_changing_a_filter_changes_the_address(visit):
     page = visit().open("/surveys/field")
     page.select_option("#stop", "lane3-stop2")
     page.wait_for_url(re.compile(r"stop=lane3-stop2"))
-    assert page.locator("table tbody tr").count() == 2
+    assert page.locator('[aria-labelledby="stops-head"] tbody tr').count() == 2
 
 
 def test_a_query_in_the_address_runs_and_is_charted(visit):
