@@ -349,12 +349,12 @@ def test_no_candidates_give_no_fits(method):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("sigma", [0.02, 0.03])
-def test_the_study_errs_as_in_its_table_under_its_noise(sigma):
+def test_cut_at_the_equator_the_study_errs_as_in_its_table_under_its_noise(sigma):
     field = scenario("paper-field", 4)
     stop = simulate_stop(field, "lane3-stop4", SimulationConfig(sigma_range=sigma))
     cloud = stitch(stop.log, stop.log.rig, StitchingConfig())
     candidates = extract(cloud, ExtractionConfig(), RADIUS)
-    fits = fit_markers("paper", cloud, candidates, CONFIG, RADIUS)
+    fits = fit_markers("paper", cloud, candidates, FittingConfig(paper_cut="equator"), RADIUS)
     errors = marker_errors(fits, stop.truth, field.marks)
     assert len(fits.fits) == 14
     assert abs(errors.error_3d.mean() - TABLE_2.errors_3d.mean()) < 0.003
