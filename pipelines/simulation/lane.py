@@ -18,13 +18,19 @@ _HALF = 40.0  # [m] half side of the ground
 _LANE = 20  # stream of chance
 
 
-def range_lane(seed: int) -> Field:
-    """Return eight markers at each of eleven distances from 5 to 30 m, about one stop.
+def range_lane(
+    seed: int, distances: Array = LANE_DISTANCES, per_distance: int = _PER_DISTANCE
+) -> Field:
+    """Return markers at chosen distances about one stop.
 
     Parameters
     ----------
     seed : int
         Source of chance: of directions, heights and heading.
+    distances : (k,)
+        Distances; eleven from 5 to 30 m by default [m].
+    per_distance : int
+        Markers at each. With more than some 120 in all, near ones would hide others.
 
     Returns
     -------
@@ -33,15 +39,16 @@ def range_lane(seed: int) -> Field:
 
     Notes
     -----
-    Neighbours in direction are 4 degrees apart and stand at different distances, so that no marker
-    hides another. Simulated with ``only_near_spheres``, a stop gives 88 fits in some seconds.
+    Neighbours in direction, 4 degrees apart by default, stand at different distances and hide
+    nothing of each other. Simulated with ``only_near_spheres``, a stop gives 88 fits in some
+    seconds.
     """
     rng = np.random.default_rng([seed, _LANE])
     lines = np.linspace(-_HALF, _HALF, 81)
     terrain = Terrain(xs=lines, ys=lines.copy(), heights=np.zeros((81, 81)))
-    p_site = _ring(rng)
+    p_site = _ring(rng, distances, per_distance)
     posts, spheres, poles = marker_surfaces(p_site, terrain)
-    names = tuple(f"D{d * 10:03.0f}-{i + 1}" for i in range(_PER_DISTANCE) for d in LANE_DISTANCES)
+    names = tuple(f"D{d * 10:03.0f}-{i + 1}" for i in range(per_distance) for d in distances)
     heading = float(rng.uniform(-np.pi, np.pi))
     return Field(
         scenario="range-lane",
@@ -56,9 +63,9 @@ def range_lane(seed: int) -> Field:
     )
 
 
-def _ring(rng: np.random.Generator) -> Array:
-    """Return the centres, (88, 3): distances take turns going round [m]."""
-    distances = np.tile(LANE_DISTANCES, _PER_DISTANCE)
+def _ring(rng: np.random.Generator, distances: Array, per_distance: int) -> Array:
+    """Return the centres, (n, 3): distances take turns going round [m]."""
+    distances = np.tile(distances, per_distance)
     n = len(distances)
     bearings = (np.arange(n) + rng.uniform(-0.15, 0.15, n) + rng.random()) * 2 * np.pi / n
     heights = rng.uniform(*_HEIGHTS, n)
