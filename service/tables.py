@@ -10,11 +10,13 @@ from typing import Any
 
 from rich.console import Console
 from rich.markup import escape
+from rich.measure import Measurement
 from rich.table import Table
 
 from storage.recordings import Preflight
 
 _ROWS_SHOWN = 100  # of an answer in SQL; programs get all
+_WIDEST = 100_000  # [characters]; no row is wider
 _COLOURS = {"ok": "green", "weak": "yellow", "refused": "red", "failed": "red"}
 
 Plain = Mapping[str, Any]
@@ -53,6 +55,10 @@ def print_answer(out: Console, answer: Plain) -> None:
     for stop in answer["stops"]:
         out.print(f"[bold]{stop['name']}[/]  (centres in the {stop['frame']} frame)")
         out.print(_markers(stop["markers"]))
+        for one in stop["markers"]:
+            if one["reason"]:
+                text = f"  {one['id']} ({one['method']}): {escape(one['reason'])}"
+                out.print(text, highlight=False, soft_wrap=True)
         for note in stop["scan"]["notes"]:
             out.print(f"  {note}", highlight=False)
         if stop["rejected"]:
@@ -85,10 +91,21 @@ def print_rows(out: Console, answer: Plain) -> None:
     """Print an answer in SQL."""
     heads = [column["name"] for column in answer["columns"]]
     rows = [["" if v is None else _short(v) for v in row] for row in answer["rows"][:_ROWS_SHOWN]]
-    out.print(_table(heads, rows, left=len(heads)))
+    table = _table(heads, rows, left=len(heads))
+    if Measurement.get(out, out.options.update(max_width=_WIDEST), table).maximum <= out.width:
+        out.print(table)
+    else:
+        _print_one_by_one(out, heads, rows)
     shown, n = len(rows), len(answer["rows"])
     more = f", {shown} shown (--json or --csv for all)" if shown < n else ""
     out.print(f"{n:,} rows in {answer['elapsed_ms']:.1f} ms{more}")
+
+
+def _print_one_by_one(out: Console, heads: Sequence[str], rows: Sequence[Sequence[str]]) -> None:
+    """Print rows that are wider than the terminal one below the other."""
+    for i, row in enumerate(rows, start=1):
+        out.print(f"[bold]row {i}[/]")
+        out.print(_table(("column", "value"), list(zip(heads, row, strict=True)), left=2))
 
 
 def print_bench(out: Console, report: Plain) -> None:

@@ -353,9 +353,9 @@ def _map_panel(data: SurveyData) -> tuple[Panel, ...]:
     placed = np.isfinite(floats(data.fixes, "x_m"))
     if not len(data.marks["mark"]) and not placed.any():
         return ()
-    caption = "Ellipses hold the true place in 95 of 100 cases"
+    caption = "Ellipses are those of 95 % probability"
     if len(data.true_stops["stop"]):
-        caption += "; the line from each station ends there, enlarged alike"
+        caption += "; the line from each station ends at its true place, enlarged alike"
     return (
         Panel(
             name="map",
