@@ -28,7 +28,7 @@ from pipelines.geometry import inverse, transform
 from pipelines.simulation import SimulatedStop, SimulationConfig, scenario, simulate_stop
 from pipelines.survey import Progress, process
 from pipelines.values import Array, ControlMarks, ScanLog, StopResult
-from service.tasks import forget_peak_memory, peak_memory
+from service.provenance import forget_peak_memory, peak_memory
 from storage.catalogue import Catalogue
 from storage.recordings import inspect_log, read_log, write_log
 from storage.results import RunInfo, tables

@@ -28,6 +28,7 @@ from pipelines.errors import ConflictError, SpheremarkError
 from service import tasks
 from service.events import EventLog
 from service.settings import Settings
+from service.work import KINDS, JobKind, Log, Order, Outcome
 from storage.catalogue import Catalogue
 from storage.records import JobRecord
 
@@ -163,7 +164,7 @@ class JobQueue:
             await self.events.add(job)
             order = await asyncio.to_thread(self._order, job)
             live.future = self._client.submit(
-                tasks.process_recording, order, key=f"{job.job_id}-{order.run_id}", pure=False
+                tasks.do, order, key=f"{job.job_id}-{order.result_id}", pure=False
             )
             outcome = await live.future
             if not live.has_begun:
@@ -183,20 +184,28 @@ class JobQueue:
         if ended.status.is_final:
             await self.events.add(ended)
 
-    def _order(self, job: JobRecord) -> tasks.Order:
+    def _order(self, job: JobRecord) -> Order:
         """Put together what a worker needs for a job."""
-        recording = self._catalogue.get_recording(job.recording_id or "")
-        return tasks.Order(
+        catalogue, kind = self._catalogue, JobKind(job.kind)
+        rig = job.options.get("rig")
+        order = Order(
             job_id=job.job_id,
-            run_id=secrets.token_hex(8),
+            kind=kind,
+            result_id=secrets.token_hex(8),
             survey_id=job.survey_id,
-            recording_id=recording.recording_id,
-            recording_url=recording.url,
-            recording_name=recording.name,
+            logs=tuple(self._log(one) for one in recordings_of(job)),
             config=SurveyConfig.from_mapping(job.config),
-            marks=self._catalogue.control_marks(job.survey_id),
+            marks=catalogue.control_marks(job.survey_id),
+            rig=None if rig is None else catalogue.get_rig(rig),
             clouds_url=str(self._clouds),
+            options=job.options,
         )
+        return replace(order, known=KINDS[kind].gather(catalogue, order))
+
+    def _log(self, recording_id: str) -> Log:
+        """Return where a log is and what it is called."""
+        known = self._catalogue.get_recording(recording_id)
+        return Log(recording_id=recording_id, name=known.name, url=known.url)
 
     async def _begin(self, live: _Live) -> None:
         """Record that a worker began; again, if the one before died."""
@@ -207,7 +216,7 @@ class JobQueue:
         live.has_begun = True
         live.job = await asyncio.to_thread(self._catalogue.start_job, job_id)
 
-    def _finish(self, live: _Live, outcome: tasks.Outcome) -> JobRecord:
+    def _finish(self, live: _Live, outcome: Outcome) -> JobRecord:
         """Write results and end of a job in one transaction; a dismissed job keeps none."""
         job_id = live.job.job_id
         try:
@@ -262,3 +271,10 @@ class JobQueue:
                 heard["percent"],
                 heard["message"],
             )
+
+
+def recordings_of(job: JobRecord) -> tuple[str, ...]:
+    """Return the logs that a job reads, in the order in which they were named."""
+    if job.recording_id is not None:
+        return (job.recording_id,)
+    return tuple(job.options.get("recordings", ()))

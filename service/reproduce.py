@@ -44,7 +44,7 @@ from pipelines.reproduction import (
 from pipelines.rigs import vlp16
 from pipelines.survey import Progress
 from pipelines.values import RING_UNKNOWN, Column, Index, Levelling, StitchedCloud
-from service.tasks import code_version
+from service.provenance import code_version
 from storage.reference_scans import read_packets, read_points
 from web import assets
 from web.reproduction import ReproductionPage, panels, reproduction_page

@@ -17,8 +17,8 @@ import numpy as np
 import pyarrow as pa
 
 from pipelines.errors import ConflictError, InputError, NotFoundError
-from pipelines.rigs import rig_from_mapping
-from pipelines.values import ControlMarks, StopTruth, Truth
+from pipelines.rigs import rig_digest, rig_from_mapping, rig_to_mapping
+from pipelines.values import ControlMarks, Rig, StopTruth, Truth
 from storage import results
 from storage.database import Database, execute_on, fetch
 from storage.records import (
@@ -46,9 +46,10 @@ _Record = TypeVar("_Record")
 _PAGE_MAX = 1000  # records in one part of a list
 _DIGEST = re.compile(r"[0-9a-f]{64}")
 _VERDICTS = ("ok", "weak", "refused")
+_NO_OPTIONS: Mapping[str, Any] = {}
 
 _SURVEYS = """
-SELECT s.survey_id, s.name, s.tolerance_m, s.created_at,
+SELECT s.survey_id, s.name, s.tolerance_m, s.created_at, s.rig_digest,
     (SELECT count(*) FROM control_marks AS c WHERE c.survey_id = s.survey_id) AS n_control_marks,
     (SELECT count(*) FROM true_stops AS t WHERE t.survey_id = s.survey_id) AS n_true_stops,
     (SELECT count(DISTINCT j.recording_id) FROM jobs AS j WHERE j.survey_id = s.survey_id)
@@ -93,6 +94,14 @@ WHERE ($at::TIMESTAMPTZ IS NULL OR (finished_at, run_id) < ($at::TIMESTAMPTZ, $i
     AND ($recording_id::VARCHAR IS NULL OR recording_id = $recording_id)
     AND ($job_id::VARCHAR IS NULL OR job_id = $job_id)
 ORDER BY finished_at DESC, run_id DESC LIMIT $n
+"""
+_RIG = "SELECT rig FROM rigs WHERE rig_digest = $digest"
+_PUT_RIG = "INSERT OR IGNORE INTO rigs VALUES (?, ?, ?)"
+_RECORDINGS_OF_SURVEY = """
+SELECT recording_id, name FROM recordings WHERE recording_id IN (
+    SELECT recording_id FROM jobs WHERE survey_id = $id AND status <> 'dismissed'
+    UNION SELECT recording_id FROM runs WHERE survey_id = $id
+) ORDER BY uploaded_at, recording_id
 """
 _CONTROL = "SELECT * FROM control_marks WHERE survey_id = $id ORDER BY place"
 _TRUE_MARKS = "SELECT * FROM true_marks WHERE survey_id = $id ORDER BY place"
@@ -184,7 +193,9 @@ class Catalogue(Database):
                 raise ConflictError(f"There is already a survey called {name!r}; choose another.")
             survey_id = secrets.token_hex(8)
             cursor.execute(
-                "INSERT INTO surveys VALUES (?, ?, ?, ?)", [survey_id, name, tolerance, _now()]
+                "INSERT INTO surveys (survey_id, name, tolerance_m, created_at) "
+                "VALUES (?, ?, ?, ?)",
+                [survey_id, name, tolerance, _now()],
             )
         return self.get_survey(survey_id)
 
@@ -402,10 +413,97 @@ class Catalogue(Database):
         rows = self._part(_RECORDINGS_AFTER, {}, after, limit)
         return _page(rows, limit, "uploaded_at", "recording_id", recording_of)
 
+    def recordings_of_survey(self, survey: str) -> tuple[str, ...]:
+        """Return the logs that jobs of a survey (id or name) were asked to read.
+
+        Parameters
+        ----------
+        survey : str
+            Id or name.
+
+        Returns
+        -------
+        tuple of str
+            Digests, in the order of their upload; those of dismissed jobs are left out.
+        """
+        rows = self.rows(_RECORDINGS_OF_SURVEY, {"id": self.get_survey(survey).survey_id})
+        return tuple(row["recording_id"] for row in rows)
+
+    # Rigs
+
+    def put_rig(self, rig: Rig) -> str:
+        """Keep a rig; the same rig twice is one.
+
+        Parameters
+        ----------
+        rig : Rig
+            The rig.
+
+        Returns
+        -------
+        str
+            Its digest.
+        """
+        digest = rig_digest(rig)
+        with self.writing() as cursor:
+            cursor.execute(_PUT_RIG, [digest, rig.name, json_text(rig_to_mapping(rig))])
+        return digest
+
+    def get_rig(self, digest: str) -> Rig:
+        """Return a rig by its digest; NotFoundError if there is none.
+
+        Parameters
+        ----------
+        digest : str
+            First 16 hexadecimal digits of the SHA-256 of the canonical rig.
+
+        Returns
+        -------
+        Rig
+            The rig.
+        """
+        row = self._one(_RIG, {"digest": digest}, f"rig {digest!r}")
+        return rig_from_mapping(json.loads(row["rig"]))
+
+    def choose_rig(self, survey: str, digest: str | None) -> SurveyRecord:
+        """Let the jobs of a survey use a rig where they name none.
+
+        Parameters
+        ----------
+        survey : str
+            Id or name.
+        digest : str or None
+            A rig that is kept; none for the one that each log describes.
+
+        Returns
+        -------
+        SurveyRecord
+            The survey as it is now.
+
+        Raises
+        ------
+        NotFoundError
+            If there is no such survey or rig.
+        """
+        survey_id = self.get_survey(survey).survey_id
+        if digest is not None:
+            self.get_rig(digest)
+        with self.writing() as cursor:
+            cursor.execute(
+                "UPDATE surveys SET rig_digest = ? WHERE survey_id = ?", [digest, survey_id]
+            )
+        return self.get_survey(survey_id)
+
     # Jobs
 
     def create_job(
-        self, kind: str, *, survey: str, recording_id: str | None, config: Mapping[str, Any]
+        self,
+        kind: str,
+        *,
+        survey: str,
+        recording_id: str | None,
+        config: Mapping[str, Any],
+        options: Mapping[str, Any] = _NO_OPTIONS,
     ) -> JobRecord:
         """Accept work.
 
@@ -419,6 +517,8 @@ class Catalogue(Database):
             The log to read; none for work on the survey as a whole.
         config : mapping
             The effective configuration.
+        options : mapping
+            What was chosen beside it.
 
         Returns
         -------
@@ -435,12 +535,13 @@ class Catalogue(Database):
         if recording_id is not None:
             self.get_recording(recording_id)
         job_id = secrets.token_hex(8)
-        row = [job_id, kind, survey_id, recording_id, json_text(config), _now()]
+        texts = [json_text(config), json_text(options)]
+        row = [job_id, kind, survey_id, recording_id, *texts, _now()]
         with self.writing() as cursor:
             cursor.execute(
-                "INSERT INTO jobs (job_id, kind, survey_id, recording_id, config, created_at, "
-                "status, progress_percent, message, attempts) "
-                "VALUES (?, ?, ?, ?, ?, ?, 'accepted', 0, 'Waiting for a worker.', 0)",
+                "INSERT INTO jobs (job_id, kind, survey_id, recording_id, config, options, "
+                "created_at, status, progress_percent, message, attempts) "
+                "VALUES (?, ?, ?, ?, ?, ?, ?, 'accepted', 0, 'Waiting for a worker.', 0)",
                 row,
             )
         return self.get_job(job_id)

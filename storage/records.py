@@ -82,6 +82,8 @@ class SurveyRecord:
         Error that the survey accepts [m].
     created_at : datetime
         When it was made, in UTC.
+    rig_digest : str or None
+        Rig that its jobs use where they name none; none: the one that each log describes.
     n_control_marks : int
         Number of its control marks.
     n_true_stops : int
@@ -94,6 +96,7 @@ class SurveyRecord:
     name: str
     tolerance: float
     created_at: datetime
+    rig_digest: str | None
     n_control_marks: int
     n_true_stops: int
     n_recordings: int
@@ -146,6 +149,8 @@ class JobRecord:
         The log that it reads: digest and name; none for work on the survey as a whole.
     config : mapping
         The effective configuration.
+    options : mapping
+        What was chosen beside it: ``rig`` (a digest), ``recordings``, and what its kind knows.
     status : JobStatus
         Where it stands.
     progress_percent : float
@@ -169,6 +174,7 @@ class JobRecord:
     recording_id: str | None
     recording: str | None
     config: Mapping[str, Any]
+    options: Mapping[str, Any]
     status: JobStatus
     progress_percent: float
     message: str
@@ -359,8 +365,8 @@ def job_of(row: dict[str, Any]) -> JobRecord:
     JobRecord
         The record.
     """
-    known = {"config": json.loads(row["config"]), "status": JobStatus(row["status"])}
-    return JobRecord(**{**row, **known})
+    texts = {name: json.loads(row[name] or "{}") for name in ("config", "options")}
+    return JobRecord(**{**row, **texts, "status": JobStatus(row["status"])})
 
 
 def run_of(row: dict[str, Any]) -> RunRecord:

@@ -5,8 +5,8 @@ Every handler parses, makes one call and answers; what it may answer is in ``mod
 
 from fastapi import APIRouter
 
-from service.api import jobs, problems, recordings, results, sql, surveys
+from service.api import jobs, problems, recordings, results, rigs, sql, surveys
 
 router = APIRouter()
-for part in (surveys, recordings, jobs, results, sql, problems):
+for part in (surveys, recordings, jobs, results, rigs, sql, problems):
     router.include_router(part.router)

@@ -2,20 +2,27 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import AsyncIterator
-from typing import Annotated
+from typing import Annotated, Any
 
 from fastapi import APIRouter, Depends, Header, Path, Query, Response
+from fastapi.exceptions import RequestValidationError
 from fastapi.sse import EventSourceResponse, ServerSentEvent
+from pydantic import ValidationError
 from starlette.exceptions import HTTPException
 
 from pipelines.config import SurveyConfig
+from pipelines.errors import InputError
+from pipelines.rigs import rig_digest
 from service.api.models import Job, Listing, NewJob
 from service.api.surveys import After, Limit
 from service.errors import RefusedRecordingError
 from service.events import JobEvent
 from service.state import Current, Service
-from storage.records import JobRecord, JobStatus
+from service.work import KINDS, Kind
+from storage.records import JobRecord, JobStatus, SurveyRecord
+from storage.site_files import parse_rig
 
 router = APIRouter(prefix="/jobs", tags=["jobs"])
 
@@ -102,18 +109,56 @@ async def dismiss_job(job: JobId, service: Current) -> Job:
 def start(service: Service, new: NewJob) -> Job:
     """Accept work and hand it to the cluster."""
     survey = service.catalogue.get_survey(new.survey)
-    recording = service.catalogue.get_recording(new.recording)
-    if recording.verdict == "refused":
-        raise RefusedRecordingError.of(recording)
+    kind = KINDS[new.kind]
+    recordings = _recordings(service, new, survey)
     config = SurveyConfig.from_mapping({"tolerance": survey.tolerance} | new.config)
+    options = _options(kind, new) | _rig(service, new, survey)
     record = service.catalogue.create_job(
         new.kind,
         survey=survey.survey_id,
-        recording_id=recording.recording_id,
+        recording_id=recordings[0] if kind.takes_one_log else None,
         config=config.to_mapping(),
+        options=options if kind.takes_one_log else options | {"recordings": recordings},
     )
     service.jobs.submit(record)
     return Job.of(record)
+
+
+def _recordings(service: Service, new: NewJob, survey: SurveyRecord) -> list[str]:
+    """Return the logs that a job is to read: those named, else all that the survey has."""
+    named = [new.recording] if new.recording is not None else new.recordings
+    found = named or service.catalogue.recordings_of_survey(survey.survey_id)
+    records = [service.catalogue.get_recording(one) for one in dict.fromkeys(found)]
+    refused = [one for one in records if one.verdict == "refused"]
+    if refused and named:
+        raise RefusedRecordingError.of(refused[0])
+    records = [one for one in records if one.verdict != "refused"]
+    if not records:
+        raise InputError(
+            f"The survey {survey.name} has no log that can be read; upload one with "
+            "POST /api/v1/recordings?survey=...&process=true, or name 'recordings'."
+        )
+    return [one.recording_id for one in records]
+
+
+def _options(kind: Kind, new: NewJob) -> dict[str, Any]:
+    """Return all options of a kind, with its defaults."""
+    try:
+        return kind.options.model_validate(new.options).model_dump(mode="json")
+    except ValidationError as error:
+        found = [{**one, "loc": ("options", *one["loc"])} for one in error.errors()]
+        raise RequestValidationError(found) from error
+
+
+def _rig(service: Service, new: NewJob, survey: SurveyRecord) -> dict[str, str]:
+    """Return the rig that a job is to use, as an option; none for the one of each log."""
+    if isinstance(new.rig, dict):
+        return {"rig": service.catalogue.put_rig(parse_rig(json.dumps(new.rig)))}
+    if new.rig is not None:
+        return {"rig": rig_digest(service.catalogue.get_rig(new.rig))}
+    if survey.rig_digest is None or not KINDS[new.kind].begins_with_rig_of_survey:
+        return {}
+    return {"rig": survey.rig_digest}
 
 
 def _event(event: JobEvent) -> ServerSentEvent:

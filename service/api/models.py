@@ -5,9 +5,11 @@ from __future__ import annotations
 from datetime import datetime
 from typing import Any, Generic, Literal, Self, TypeVar
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, ConfigDict, Field, model_validator
 
-from pipelines.values import ControlMarks
+from pipelines.rigs import rig_digest, rig_to_mapping
+from pipelines.values import ControlMarks, Rig
+from service.work import KINDS, JobKind
 from storage.records import (
     JobRecord,
     JobStatus,
@@ -47,6 +49,7 @@ class Survey(BaseModel):
     name: str
     tolerance_m: float
     created_at: datetime
+    rig_digest: str | None = Field(description="Rig that its jobs use where they name none.")
     n_control_marks: int
     n_true_stops: int
     n_recordings: int
@@ -59,6 +62,7 @@ class Survey(BaseModel):
             name=record.name,
             tolerance_m=record.tolerance,
             created_at=record.created_at,
+            rig_digest=record.rig_digest,
             n_control_marks=record.n_control_marks,
             n_true_stops=record.n_true_stops,
             n_recordings=record.n_recordings,
@@ -99,6 +103,26 @@ class Control(Strict):
         )
 
 
+class ChosenRig(Strict):
+    """The rig that later jobs of a survey use."""
+
+    rig_digest: str | None = Field(
+        description="Digest of a rig; null for the one that each log describes."
+    )
+
+
+class StoredRig(BaseModel):
+    """A rig that is kept."""
+
+    rig_digest: str
+    rig: dict[str, Any] = Field(description="As in a rig file.")
+
+    @classmethod
+    def of(cls, rig: Rig) -> Self:
+        """Return a rig in the wire format."""
+        return cls(rig_digest=rig_digest(rig), rig=rig_to_mapping(rig))
+
+
 class TruthSummary(BaseModel):
     """What is known of the truth of a survey; for comparison only."""
 
@@ -127,13 +151,39 @@ class Recording(BaseModel):
 class NewJob(Strict):
     """Work to do."""
 
-    kind: Literal["process"] = "process"
+    kind: JobKind = JobKind.PROCESS
     survey: SurveyKey = Field(description="Id or name of the survey.")
-    recording: str = Field(description="Id of the recording.")
+    recording: str | None = Field(
+        default=None, description="Id of the recording; kinds that read several take 'recordings'."
+    )
+    recordings: list[str] | None = Field(
+        default=None,
+        min_length=1,
+        description="Ids of recordings, for kinds that read several; all of the survey by default.",
+    )
+    rig: str | dict[str, Any] | None = Field(
+        default=None,
+        description="Digest of a rig, or a rig file's JSON; by default the rig of the survey, "
+        "and the one that each log describes where it has none.",
+    )
     config: dict[str, Any] = Field(
         default_factory=dict,
         description="What differs from the default configuration, nested as GET /config shows it.",
     )
+    options: dict[str, Any] = Field(
+        default_factory=dict, description="What the kind lets one choose."
+    )
+
+    @model_validator(mode="after")
+    def _check_logs(self) -> Self:
+        """Refuse logs that the kind does not take."""
+        if not KINDS[self.kind].takes_one_log:
+            return self
+        if self.recording is None:
+            raise ValueError(f"a job of the kind {self.kind} needs a recording")
+        if self.recordings is not None:
+            raise ValueError(f"a job of the kind {self.kind} reads one recording")
+        return self
 
 
 class Job(BaseModel):
@@ -148,6 +198,7 @@ class Job(BaseModel):
     recording_id: str | None
     recording: str | None
     config: dict[str, Any]
+    options: dict[str, Any]
     status: JobStatus
     progress_percent: float
     message: str

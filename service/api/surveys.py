@@ -13,7 +13,7 @@ from pydantic import ValidationError
 
 from pipelines.errors import InputError, NotFoundError
 from pipelines.values import ControlMarks
-from service.api.models import Control, Listing, Mark, NewSurvey, Survey, TruthSummary
+from service.api.models import ChosenRig, Control, Listing, Mark, NewSurvey, Survey, TruthSummary
 from service.errors import EmptyBodyError, MediaTypeError
 from service.state import Current
 from storage.site_files import format_control, parse_control, parse_truth
@@ -45,7 +45,7 @@ async def document(request: Request) -> Document:
         raise InputError(f"The body is not UTF-8 text: {error}.") from error
 
 
-def _bodies(*media_types: str) -> dict[str, Any]:
+def bodies(*media_types: str) -> dict[str, Any]:
     """Describe in OpenAPI a body that is a file of one of these types."""
     content = {one: {"schema": {"type": "string"}} for one in media_types}
     return {"requestBody": {"required": True, "content": content}}
@@ -76,7 +76,7 @@ def get_survey(survey: Key, service: Current) -> Survey:
 
 
 @router.put(
-    "/{survey}/control", name="put_control", openapi_extra=_bodies("text/csv", "application/json")
+    "/{survey}/control", name="put_control", openapi_extra=bodies("text/csv", "application/json")
 )
 def put_control(survey: Key, file: File, service: Current) -> Control:
     """Give a survey its control marks, as CSV or JSON; a survey of that name is made if missing."""
@@ -98,7 +98,13 @@ def get_control(survey: Key, request: Request, service: Current) -> Response:
     return Response(Control.of(marks).model_dump_json(), media_type="application/json")
 
 
-@router.put("/{survey}/truth", name="put_truth", openapi_extra=_bodies("application/json"))
+@router.put("/{survey}/rig", name="choose_rig")
+def choose_rig(survey: Key, chosen: ChosenRig, service: Current) -> Survey:
+    """Let later jobs of a survey use a rig where they name none."""
+    return Survey.of(service.catalogue.choose_rig(survey, chosen.rig_digest))
+
+
+@router.put("/{survey}/truth", name="put_truth", openapi_extra=bodies("application/json"))
 def put_truth(survey: Key, file: File, service: Current) -> TruthSummary:
     """Give a survey its truth: for comparison only, no job ever sees it."""
     service.catalogue.put_truth(survey, parse_truth(file.text))

@@ -6,7 +6,8 @@ import pytest
 
 from storage.migrations import Migration, SchemaConflictError, migrate, released
 
-SECOND = Migration(number=2, name="second", sql="CREATE TABLE extra (x_m DOUBLE);")
+N = len(released())
+NEXT = Migration(number=N + 1, name="next", sql="CREATE TABLE extra (x_m DOUBLE);")
 
 
 def tables(connection):
@@ -34,29 +35,31 @@ def test_a_second_opening_applies_nothing():
 def test_only_what_is_missing_is_applied():
     connection = duckdb.connect()
     migrate(connection, released())
-    assert migrate(connection, (*released(), SECOND)) == (2,)
+    assert migrate(connection, (*released(), NEXT)) == (N + 1,)
     assert "extra" in tables(connection)
 
 
 def test_a_changed_migration_is_refused():
     connection = duckdb.connect()
-    migrate(connection, (*released(), SECOND))
-    changed = replace(SECOND, sql="CREATE TABLE extra (x_deg DOUBLE);")
-    with pytest.raises(SchemaConflictError, match=r"2 \(second\) was applied .* in another form"):
+    migrate(connection, (*released(), NEXT))
+    changed = replace(NEXT, sql="CREATE TABLE extra (x_deg DOUBLE);")
+    with pytest.raises(
+        SchemaConflictError, match=rf"{N + 1} \(next\) was applied .* in another form"
+    ):
         migrate(connection, (*released(), changed))
 
 
 def test_a_database_of_a_newer_version_is_refused():
     connection = duckdb.connect()
-    migrate(connection, (*released(), SECOND))
+    migrate(connection, (*released(), NEXT))
     with pytest.raises(SchemaConflictError, match="Use the newer version"):
         migrate(connection, released())
 
 
 def test_a_migration_that_fails_leaves_nothing_behind():
     connection = duckdb.connect()
-    broken = replace(SECOND, sql="CREATE TABLE extra (x_m DOUBLE); SELECT * FROM nowhere;")
+    broken = replace(NEXT, sql="CREATE TABLE extra (x_m DOUBLE); SELECT * FROM nowhere;")
     with pytest.raises(duckdb.CatalogException):
         migrate(connection, (*released(), broken))
     assert "extra" not in tables(connection)
-    assert migrate(connection, (*released(), SECOND)) == (2,)
+    assert migrate(connection, (*released(), NEXT)) == (N + 1,)

@@ -138,9 +138,9 @@ def test_what_only_reads_is_allowed(ask, sql):
 @pytest.mark.parametrize(
     ("sql", "reason"),
     [
-        ("INSERT INTO surveys VALUES ('a', 'b', 1, now())", "INSERT is not possible here"),
+        ("INSERT INTO surveys VALUES ('a', 'b', 1, now(), NULL)", "INSERT is not possible here"),
         (
-            "WITH x AS (INSERT INTO surveys VALUES ('a', 'b', 1, now()) RETURNING *) FROM x",
+            "WITH x AS (INSERT INTO surveys VALUES ('a', 'b', 1, now(), NULL) RETURNING *) FROM x",
             "read-only mode",
         ),
         ("COPY surveys TO '/tmp/stolen.csv'", "COPY is not possible here"),

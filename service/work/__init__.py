@@ -1,0 +1,16 @@
+"""The kinds of jobs: what each one does in a worker process, from an order to rows.
+
+``orders`` is what all have in common; each kind has a module of its own. A new kind is a member of
+``JobKind``, a module with its work, and a line in ``KINDS``; its tables are named in ``storage``.
+"""
+
+from collections.abc import Mapping
+
+from service.work import processing
+from service.work.orders import JobKind, Kind, Log, Options, Order, Outcome
+
+__all__ = ["KINDS", "JobKind", "Kind", "Log", "Options", "Order", "Outcome"]
+
+KINDS: Mapping[JobKind, Kind] = {
+    JobKind.PROCESS: Kind(work=processing.work, takes_one_log=True),
+}

@@ -1,0 +1,81 @@
+"""Jobs of the kind ``process``: one log through the chain, into tables and a stored cloud."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from datetime import UTC, datetime
+from time import perf_counter
+from typing import TYPE_CHECKING
+
+from pipelines.values import NoFix, Origin, Status, StopResult
+from service.provenance import code_version, forget_peak_memory, peak_memory
+from service.work.orders import Log, Order, Outcome
+
+if TYPE_CHECKING:
+    import pyarrow as pa
+
+    from pipelines.survey import Progress
+
+
+def work(order: Order, progress: Progress) -> Outcome:
+    """Process the one log of an order."""
+    stops, rows = process_log(order, order.logs[0], order.result_id, progress)
+    return Outcome(tables=rows, message=summary(stops))
+
+
+def process_log(
+    order: Order, recording: Log, run_id: str, progress: Progress
+) -> tuple[tuple[StopResult, ...], dict[str, pa.Table]]:
+    """Read a log, run the chain, store the clouds, make the tables of a run."""
+    from pipelines.survey import process
+    from storage.clouds import write_cloud
+    from storage.recordings import read_log
+    from storage.results import RunInfo, tables
+
+    start = perf_counter()
+    forget_peak_memory()
+    progress(0.0, f"Reading {recording.name}")
+    log = read_log(recording.url, digest=recording.recording_id)
+    stops = process(
+        replace(log, origin=Origin(name=recording.name, digest=recording.recording_id)),
+        config=order.config,
+        rig=order.rig,
+        marks=order.marks,
+        progress=lambda share, what: progress(0.1 + 0.8 * share, what),
+    )
+    progress(0.9, "Storing the results")
+    clouds = {stop.name: write_cloud(stop, order.clouds_url) for stop in stops}
+    run = RunInfo(
+        run_id=run_id,
+        job_id=order.job_id,
+        survey_id=order.survey_id,
+        recording_id=recording.recording_id,
+        config=order.config,
+        code_version=code_version(),
+        finished_at=datetime.now(UTC),
+        duration=perf_counter() - start,
+        peak_memory_bytes=peak_memory(),
+    )
+    return stops, tables(run, stops, marks=order.marks, clouds=clouds)
+
+
+def summary(stops: Sequence[StopResult]) -> str:
+    """Say in a sentence or two what a log gave, and what is missing or weak."""
+    return " ".join(_stop_summary(stop) for stop in stops)
+
+
+def _stop_summary(stop: StopResult) -> str:
+    """Say what one stop gave, by the first methods."""
+    n_markers = len(next(iter(stop.fits.values())).fits)
+    text = f"{stop.name}: {n_markers} marker{'' if n_markers == 1 else 's'}"
+    if not stop.fixes:
+        return f"{text}; no control marks, so no position."
+    fix = next(iter(stop.fixes.values()))
+    if isinstance(fix, NoFix):
+        return f"{text}; no position: {fix.reason}"
+    sigma = (
+        f"{text}, {len(fix.matches)} of them on marks; station with a sigma of "
+        f"{1000 * fix.sigma_3d:.1f} mm (3-D)"
+    )
+    return f"{sigma}; weak: {fix.reason}" if fix.status is Status.WEAK else f"{sigma}."
