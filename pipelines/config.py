@@ -136,17 +136,18 @@ class FittingConfig:
         What ``paper`` registers to the returns, of ``PAPER_MODELS``. hemisphere: as the study does;
         its Figure 3 shows the whole sphere instead.
     paper_cut : str
-        What ``paper`` cuts away, of ``PAPER_CUTS``. ground: what lies below the highest ground
-        point of this scan, as the study describes it. equator: the lower half of the sphere too,
-        as where that point is as high as the spheres; found by comparing readings with the study's
-        Table 2, whose errors it reproduces.
+        What ``paper`` cuts away, of ``PAPER_CUTS``. equator: the lower half of each sphere, so that
+        the hemisphere is left that the study shows before its fit; its errors are then those of its
+        Table 2. ground: what lies below the highest ground point of this scan, as the study says
+        in words; how much of a sphere that costs depends on the ground, and its errors are about
+        half of those that it publishes.
     """
 
     methods: tuple[str, ...] = ("along_beam", "paper")
     sigma_range_bias: float = 0.003
     sigma_direction: float = 1e-4
     paper_model: str = "hemisphere"
-    paper_cut: str = "ground"
+    paper_cut: str = "equator"
 
     def __post_init__(self) -> None:
         _check_methods("fitting.methods", self.methods, FITTING_METHODS)

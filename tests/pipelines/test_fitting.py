@@ -312,8 +312,18 @@ def test_the_cut_of_the_study_lifts_its_centre():
     cut = fit_one(cloud, CENTRE, "paper", ground=CENTRE[2] - 0.02, config=config).fits[0]
     assert cut.n_points < whole.n_points
     assert cut.p_base[2] - whole.p_base[2] > 0.005
-    half = fit_one(cloud, CENTRE, "paper", config=FittingConfig(paper_cut="equator")).fits[0]
+    half = fit_one(cloud, CENTRE, "paper").fits[0]
     assert 0.4 < half.n_points / whole.n_points < 0.6
+    assert half.p_base[2] - whole.p_base[2] > 0.005
+
+
+def test_cut_at_the_equator_the_height_of_the_ground_does_not_matter():
+    cloud = cloud_of(*marker_shots(CENTRE, np.random.default_rng(17), sigma=0.01))
+    low, high = (
+        fit_one(cloud, CENTRE, "paper", ground=CENTRE[2] + above).fits[0].p_base
+        for above in (-1.0, 0.2)
+    )
+    assert_allclose(low, high, rtol=0, atol=0)
 
 
 def test_the_whole_sphere_as_a_model_is_drawn_further_than_the_hemisphere():
@@ -336,7 +346,8 @@ def test_an_unknown_model_is_refused_with_the_known_ones_named():
 
 def test_a_ball_below_the_cut_is_lost_to_the_study_and_said_so():
     cloud = cloud_of(*marker_shots(CENTRE, np.random.default_rng(14), sigma=0.01))
-    result = fit_one(cloud, CENTRE, "paper", ground=CENTRE[2] + 0.2)
+    config = FittingConfig(paper_cut="ground")
+    result = fit_one(cloud, CENTRE, "paper", ground=CENTRE[2] + 0.2, config=config)
     assert not result.fits
     assert "highest ground point" in result.rejected[0].reason
 
@@ -349,12 +360,12 @@ def test_no_candidates_give_no_fits(method):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("sigma", [0.02, 0.03])
-def test_cut_at_the_equator_the_study_errs_as_in_its_table_under_its_noise(sigma):
+def test_the_study_errs_as_in_its_table_under_its_noise(sigma):
     field = scenario("paper-field", 4)
     stop = simulate_stop(field, "lane3-stop4", SimulationConfig(sigma_range=sigma))
     cloud = stitch(stop.log, stop.log.rig, StitchingConfig())
     candidates = extract(cloud, ExtractionConfig(), RADIUS)
-    fits = fit_markers("paper", cloud, candidates, FittingConfig(paper_cut="equator"), RADIUS)
+    fits = fit_markers("paper", cloud, candidates, CONFIG, RADIUS)
     errors = marker_errors(fits, stop.truth, field.marks)
     assert len(fits.fits) == 14
     assert abs(errors.error_3d.mean() - TABLE_2.errors_3d.mean()) < 0.003
