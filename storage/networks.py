@@ -167,8 +167,7 @@ def _add_set(parent: ET.Element, result: AdjustedNetwork, station: int) -> None:
     network, n = result.network, len(result.network.sightings)
     rows = np.flatnonzero((network.sightings[:, 0] == station) & result.used[:n])
     R = network.R_station_base[station]
-    p = network.p_base[rows] @ R.T
-    p = p - result.range_bias * p / np.linalg.norm(p, axis=1)[:, None]
+    p = result.p_base[rows] @ R.T
     values, J = _polar(p)
     cov = np.zeros((len(rows), 3, len(rows), 3))
     cov[np.arange(len(rows)), :, np.arange(len(rows)), :] = (

@@ -14,7 +14,7 @@ tears spheres in two, and no extraction would know them.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -22,15 +22,16 @@ import numpy as np
 from pipelines.calibration.estimation import Estimate, Inseparable, estimate, residual_rms
 from pipelines.calibration.faces import front_face, rig_from_faces
 from pipelines.calibration.gimbal import GIMBAL, Sights, sights, values
+from pipelines.calibration.values import BIAS, Calibration, Scan
 from pipelines.config import SurveyConfig
 from pipelines.errors import DegenerateGeometryError, RigError
 from pipelines.extraction import extract
 from pipelines.fitting import fit_markers
 from pipelines.rigs import rig_digest
 from pipelines.stitching import choose_rig, split_stops, stitch
-from pipelines.values import Array, Index, Mask, Rig, ScanLog, Status, _seal
+from pipelines.values import Array, Index, MarkerFits, Mask, Rig, ScanLog, Status
 
-__all__ = ["Calibration", "Inseparable", "calibrate"]
+__all__ = ["Calibration", "Inseparable", "Scan", "calibrate"]
 
 Progress = Callable[[float, str], None]
 
@@ -39,66 +40,6 @@ _SETTLED = 0.5  # sigmas by which the rig may still move from pass to pass
 _N_FACE = 6  # returns on either face of a sphere that count as seen on both
 _SUFFIX = "-calibrated"
 _N_SPHERES = 3  # seen on both faces: fewer leave offset and eccentricity undetermined
-
-
-@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
-class Calibration:
-    """A rig estimated from scans, with its uncertainty.
-
-    Attributes
-    ----------
-    rig : Rig
-        The estimated rig; what the scans do not tell is as in the start rig.
-    start : Rig
-        The rig that it began with.
-    names : tuple of str
-        Estimated parameters.
-    units : tuple of str
-        Their units.
-    start_values, estimates : (p,)
-        Their values in the two rigs.
-    cov : (p, p)
-        Covariance of the estimates; singular, because the mean of the laser biases is held.
-    inseparable : tuple of Inseparable
-        Parameters that the scans do not tell, with reasons.
-    stops : tuple of str
-        Names of the stops that were used.
-    n_spheres : int
-        Spheres, each counted at every stop that saw it.
-    n_two_faced : int
-        Those of them that were seen on both faces.
-    n_returns : int
-        Returns that the estimate rests on.
-    dof : int
-        Returns minus unknowns.
-    sigma0 : float
-        Square root of the a-posteriori variance factor; 1 means that ranges are as noisy as a
-        VLP-16's usually are. The covariance rests on the noise as it is.
-    rms_before, rms_after : float
-        Root mean square residual of the same returns with the start rig and with the estimated
-        one, the centres adjusted to either [m].
-    """
-
-    rig: Rig
-    start: Rig
-    names: tuple[str, ...]
-    units: tuple[str, ...]
-    start_values: Array
-    estimates: Array
-    cov: Array
-    inseparable: tuple[Inseparable, ...]
-    stops: tuple[str, ...]
-    n_spheres: int
-    n_two_faced: int
-    n_returns: int
-    dof: int
-    sigma0: float
-    rms_before: float
-    rms_after: float
-
-    def __post_init__(self) -> None:
-        p = len(self.names)
-        _seal(self, start_values=(p,), estimates=(p,), cov=(p, p))
 
 
 def calibrate(
@@ -189,24 +130,30 @@ def _stops(logs: Iterable[ScanLog], config: SurveyConfig) -> Iterable[ScanLog]:
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class _Seen:
-    """What all stops show with one rig: shots at spheres, and rough centres."""
+    """What all stops show with one rig: shots at spheres, and rough centres.
+
+    ``scans`` are the markers of each stop, ``places``, (m, 2), stop and place of each sphere.
+    """
 
     sights: Sights
     centres: Array
     covs: Array
-    stops: tuple[str, ...]
+    scans: tuple[tuple[str, MarkerFits], ...]
+    places: Index
     n_two_faced: int
     sigma0: float
 
 
 def _see(logs: Iterable[ScanLog], rig: Rig, config: SurveyConfig) -> _Seen:
     """Find and fit the spheres of all stops with a rig."""
-    parts, fits, names, n_two_faced = [], [], [], 0
+    parts, fits, places, n_two_faced = [], [], [], 0
+    scans: list[tuple[str, MarkerFits]] = []
     for log in _stops(logs, config):
         cloud = stitch(log, rig, config.stitching)
         candidates = extract(cloud, config.extraction, config.marker_radius)
         found = fit_markers("along_beam", cloud, candidates, config.fitting, config.marker_radius)
-        good = [fit for fit in found.fits if fit.status is Status.OK]
+        chosen = [k for k, fit in enumerate(found.fits) if fit.status is Status.OK]
+        good = [found.fits[k] for k in chosen]
         if not good:
             continue
         rows = np.concatenate([fit.used for fit in good])
@@ -214,7 +161,8 @@ def _see(logs: Iterable[ScanLog], rig: Rig, config: SurveyConfig) -> _Seen:
         n_two_faced += _n_two_faced(front_face(cloud)[rows], which)
         parts.append(sights(log, cloud, rows, which))
         fits += good
-        names.append(log.origin.name)
+        places += [(len(scans), k) for k in chosen]
+        scans.append((log.origin.name, found))
     if n_two_faced < _N_SPHERES:
         raise DegenerateGeometryError(
             f"{n_two_faced} spheres are seen on both faces; a calibration needs at least "
@@ -224,7 +172,8 @@ def _see(logs: Iterable[ScanLog], rig: Rig, config: SurveyConfig) -> _Seen:
         sights=Sights.joined(parts),
         centres=np.array([fit.p_base for fit in fits]),
         covs=np.array([fit.cov_p_base for fit in fits]),
-        stops=tuple(names),
+        scans=tuple(scans),
+        places=np.array(places, dtype=np.intp),
         n_two_faced=n_two_faced,
         sigma0=float(np.sqrt(np.mean([fit.sigma0**2 for fit in fits]))),
     )
@@ -257,7 +206,7 @@ def _chosen(rig: Rig, found: Estimate) -> Array:
 def _calibration(start: Rig, seen: _Seen, found: Estimate, config: SurveyConfig) -> Calibration:
     """Put the result together."""
     free = [parameter for parameter, is_free in zip(GIMBAL, found.is_free, strict=True) if is_free]
-    names = [p.name for p in free] + [f"laser_range_bias_{k}" for k in found.lasers]
+    names = [p.name for p in free] + [f"{BIAS}{k}" for k in found.lasers]
     before, after = (
         residual_rms(seen.sights, rig, found, seen.covs, config.marker_radius)
         for rig in (start, found.rig)
@@ -271,7 +220,7 @@ def _calibration(start: Rig, seen: _Seen, found: Estimate, config: SurveyConfig)
         estimates=_chosen(found.rig, found),
         cov=found.cov.copy(),
         inseparable=found.held,
-        stops=seen.stops,
+        stops=tuple(name for name, _ in seen.scans),
         n_spheres=len(found.centres),
         n_two_faced=seen.n_two_faced,
         n_returns=int(found.is_used.sum()),
@@ -279,4 +228,20 @@ def _calibration(start: Rig, seen: _Seen, found: Estimate, config: SurveyConfig)
         sigma0=seen.sigma0,
         rms_before=before,
         rms_after=after,
+        basis=found.basis,
+        weights=found.weights,
+        scans=dict(_scans(seen, found)),
     )
+
+
+def _scans(seen: _Seen, found: Estimate) -> Iterator[tuple[str, Scan]]:
+    """Yield name and centres of each stop, those of the estimate in place of the rough ones."""
+    for number, (name, rough) in enumerate(seen.scans):
+        fits = list(rough.fits)
+        effects = np.zeros((len(fits), 3, found.basis.shape[1]))
+        for sphere in np.flatnonzero(seen.places[:, 0] == number):
+            place = seen.places[sphere, 1]
+            p, cov = found.centres[sphere].copy(), found.cov_centres[sphere].copy()
+            fits[place] = replace(fits[place], p_base=p, cov_p_base=cov)
+            effects[place] = found.effects[sphere]
+        yield name, Scan(fits=replace(rough, fits=tuple(fits)), effects=effects)

@@ -209,6 +209,15 @@ class Estimate(NamedTuple):
         Which returns have weight.
     dof : int
         Their number minus that of the unknowns.
+    basis : (p, k)
+        The parameters of ``cov`` by independent unknowns: biases are told only against their mean.
+    weights : (k, k)
+        What the two faces tell of these unknowns, whatever all ranges are too long; inverse of a
+        covariance.
+    effects : (m, 3, k)
+        How much an unknown that is wrong moves each centre.
+    cov_centres : (m, 3, 3)
+        Covariances of the centres if the rig were known [m^2].
     """
 
     rig: Rig
@@ -219,6 +228,10 @@ class Estimate(NamedTuple):
     cov: Array
     is_used: Mask
     dof: int
+    basis: Array
+    weights: Array
+    effects: Array
+    cov_centres: Array
 
 
 class _State(NamedTuple):
@@ -384,22 +397,36 @@ def _estimate(
     """Put the estimate together."""
     n_free, k = int(is_free.sum()), problem.basis.shape[1]
     chosen = np.flatnonzero(np.append(is_free, np.ones(k, dtype=np.bool_)))
-    N = problem.equations(state, sigmas).N[np.ix_(chosen, chosen)]
+    equations = problem.equations(state, sigmas)
     J = np.zeros((n_free + len(lasers), n_free + k))
     J[:n_free, :n_free] = np.eye(n_free)
     J[n_free:, n_free:] = problem.basis[lasers]
-    residuals = state.sight.residuals
-    is_used = tukey(residuals / sigmas) > 0.0
+    is_used = tukey(state.sight.residuals / sigmas) > 0.0
     return Estimate(
         rig=state.rig,
         centres=state.centres,
         is_free=is_free,
         held=held,
         lasers=lasers,
-        cov=_EFFICIENCY * J @ np.linalg.inv(N) @ J.T,
+        cov=_EFFICIENCY * J @ np.linalg.inv(equations.N[np.ix_(chosen, chosen)]) @ J.T,
         is_used=is_used,
         dof=int(is_used.sum()) - 3 * len(state.centres) - len(chosen),
+        basis=J,
+        weights=_told(equations.N, chosen) / _EFFICIENCY,
+        effects=equations.inverses @ equations.mixed[:, :, chosen],
+        cov_centres=_EFFICIENCY * equations.inverses,
     )
+
+
+def _told(N: Array, chosen: Index) -> Array:
+    """Return what is told of some unknowns whatever the common range bias is.
+
+    The size that near spheres seem to have speaks of that bias too, but rests on the width of the
+    beams that is assumed.
+    """
+    bias = [parameter.name for parameter in GIMBAL].index("common_range_bias")
+    across = N[chosen, bias]
+    return np.asarray(N[np.ix_(chosen, chosen)] - np.outer(across, across) / N[bias, bias])
 
 
 def residual_rms(seen: Sights, rig: Rig, found: Estimate, covs: Array, radius: float) -> float:

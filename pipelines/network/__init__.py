@@ -8,14 +8,24 @@ the exported observations need no adjustment.
 
 from pipelines.network.adjusting import adjust_network
 from pipelines.network.assembly import assemble
-from pipelines.network.values import AdjustedNetwork, BlockTests, LeftOut, Network, Refusal
+from pipelines.network.values import (
+    RANGE_BIAS,
+    AdjustedNetwork,
+    BlockTests,
+    LeftOut,
+    Network,
+    Refusal,
+    Shared,
+)
 
 __all__ = [
+    "RANGE_BIAS",
     "AdjustedNetwork",
     "BlockTests",
     "LeftOut",
     "Network",
     "Refusal",
+    "Shared",
     "adjust_network",
     "assemble",
 ]

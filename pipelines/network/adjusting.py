@@ -25,12 +25,14 @@ from pipelines.network.values import (
     BlockTests,
     LeftOut,
     Network,
+    Parts,
     position_by_motion,
 )
 from pipelines.values import Array, Mask
 
 _FALSE_ALARM = 0.05  # probability that a network without gross errors loses an observation
 _UNTESTABLE = 1e-7  # redundancy below which a bias cannot show
+_UNTOLD = 1e-9  # the same below which nothing else tells where a control mark is
 _MANY_LEFT_OUT = 1.0 / 3.0  # of the centres: not they are bad, but the sigmas too small
 _UPRIGHT = 0.05  # spread across over spread along of marks on a plumb line: no heading
 
@@ -79,16 +81,16 @@ def adjust_network(network: Network, config: ResectionConfig) -> AdjustedNetwork
     Notes
     -----
     Observed are each centre in the base frame of its station, the up direction of each station,
-    and the control marks with their covariances; what all ranges of the survey are too long is one
-    unknown more, with its prior sigma as an observation, because it would swell the ring of marks
-    alike from every station. Without control the network is free: stations are
-    levelled, place and heading stay open, and the inner constraints over all marks (their centroid
-    and mean heading stay those of the approximate values) give the covariances of least trace
-    (Meissl 1969). Data snooping after Baarda (1968), one block at a time; the level of a single
-    test is lowered with their number so that a clean network loses an observation in one of twenty
-    cases. Where more than a third of the centres would go, the sigmas are to blame, and w is
-    divided by sigma0 (Pope 1976). Cost grows linearly with the stations and with the third power of
-    the marks.
+    and the control marks with their covariances; what all stations share are unknowns too, with
+    what is known of them as observations: a common range bias would swell the ring of marks alike
+    from every station, and so would a rig that is wrong. Without control the network is free:
+    stations are levelled, place and heading stay open, and the inner constraints over all marks
+    (their centroid and mean heading stay those of the approximate values) give the covariances of
+    least trace (Meissl 1969). Data snooping after Baarda (1968), one block at a time; the level of
+    a single test is lowered with their number so that a clean network loses an observation in one
+    of twenty cases. Where more than a third of the centres would go, the sigmas are to blame, and w
+    is divided by sigma0 (Pope 1976). Cost grows linearly with the stations and with the third power
+    of the marks.
     """
     level = min(config.test_level, _FALSE_ALARM / (3 * network.n_blocks))
     critical = float(ndtri(1.0 - level / 2.0))
@@ -182,9 +184,9 @@ def _squares(lin: Linearised) -> tuple[float, float, float]:
 
 
 def _vtpv(network: Network, tested: _Tested) -> float:
-    """Return the weighted sum of squares, that of the range bias against its prior included."""
-    prior = (tested.state.range_bias / network.sigma_range) ** 2 if network.sigma_range else 0.0
-    return sum(_squares(tested.lin)) + prior
+    """Return the weighted sum of squares, with what all share against what was known of it."""
+    shared = tested.state.shared
+    return sum(_squares(tested.lin)) + float(shared @ network.shared.weights @ shared)
 
 
 def _sigma0(network: Network, tested: _Tested) -> float:
@@ -239,16 +241,16 @@ def _own_marks(cofactors: Cofactors) -> Array:
 
 
 def _common(cofactors: Cofactors, network: Network) -> tuple[Array, Array]:
-    """Return, per centre, the covariance of its mark and the range bias, and theirs to its station.
+    """Return, per centre, the covariance of its mark and what all share, and to its station.
 
     Shapes are (n, 3 + k, 3 + k) and (n, 6, 3 + k).
     """
     station, mark = network.sightings.T
-    with_bias = cofactors.bias_and_marks[mark]
-    bias = np.broadcast_to(cofactors.bias, (len(mark), *cofactors.bias.shape))
-    upper = np.concatenate([_own_marks(cofactors)[mark], with_bias], axis=2)
-    lower = np.concatenate([np.swapaxes(with_bias, 1, 2), bias], axis=2)
-    between = [cofactors.between[station, :, mark], cofactors.with_bias[station]]
+    mixed = cofactors.shared_and_marks[mark]
+    shared = np.broadcast_to(cofactors.shared, (len(mark), *cofactors.shared.shape))
+    upper = np.concatenate([_own_marks(cofactors)[mark], mixed], axis=2)
+    lower = np.concatenate([np.swapaxes(mixed, 1, 2), shared], axis=2)
+    between = [cofactors.between[station, :, mark], cofactors.with_shared[station]]
     return np.concatenate([upper, lower], axis=1), np.concatenate(between, axis=2)
 
 
@@ -316,6 +318,8 @@ def _adjusted(
     dof = _degrees_of_freedom(network, tested.used)
     station_shifts, mark_shifts = _shifts(network, tested, noncentrality)
     left_out = _left_out(network, tested, dropped, critical)
+    predictions, cov_predictions = _predicted_control(network, tested)
+    parts = tested.cofactors.parts
     return AdjustedNetwork(
         network=network,
         T_site_station=T,
@@ -326,8 +330,16 @@ def _adjusted(
         **_columns(network, tested, noncentrality),
         station_shifts=station_shifts,
         mark_shifts=mark_shifts,
-        range_bias=tested.state.range_bias,
-        sigma_range_bias=float(np.sqrt(tested.cofactors.bias.sum())),
+        shared=tested.state.shared,
+        cov_shared=tested.cofactors.shared,
+        parts=Parts(
+            own=shift @ parts.own @ shift.T,
+            coupling=shift @ parts.coupling,
+            cov_common=parts.cov_common,
+        ),
+        control_predictions=predictions,
+        cov_control_predictions=cov_predictions,
+        mark_weaknesses=_mark_weaknesses(network, tested),
         dof=dof,
         vtpv=_vtpv(network, tested),
         sigma0=_sigma0(network, tested),
@@ -339,6 +351,39 @@ def _adjusted(
         left_out=(*network.left_out, *left_out),
         warnings=_warnings(network, tested, critical, left_out, config.test_level),
     )
+
+
+def _predicted_control(network: Network, tested: _Tested) -> tuple[Array, Array]:
+    """Return where all else would put each control mark, minus where it is given, with covariance.
+
+    With ``v`` and ``P`` of a block, ``(P Q_v P)^-1 P v`` is what the others predict for it, and the
+    inverse its covariance (Baarda 1968): no adjustment has to be done again.
+    """
+    first = len(network.sightings) + len(network.stations)
+    own = _own_marks(tested.cofactors)[network.controls]
+    shifts, covs = -tested.lin.v_control, own + network.cov_control_site
+    weights, solid = tested.lin.P_control, tested.tested[2]
+    for row in np.flatnonzero(tested.used[first:]):
+        eigenvalues = np.linalg.eigvalsh(solid[row])
+        if eigenvalues[0] <= _UNTOLD * np.linalg.eigvalsh(weights[row])[0]:
+            shifts[row], covs[row] = np.nan, np.nan
+            continue
+        covs[row] = np.linalg.inv(solid[row])
+        shifts[row] = -covs[row] @ weights[row] @ tested.lin.v_control[row]
+    return shifts, covs
+
+
+def _mark_weaknesses(network: Network, tested: _Tested) -> tuple[str, ...]:
+    """Say of each mark why it should be used with care."""
+    n = len(network.sightings)
+    counts = np.bincount(network.sightings[tested.used[:n], 1], minlength=len(network.marks))
+    out = []
+    for mark, doubt in enumerate(network.doubts):
+        reasons = [doubt] if doubt else []
+        if counts[mark] == 1 and mark not in network.controls:
+            reasons.append("Seen from one station only, and so unchecked.")
+        out.append(" ".join(reasons))
+    return tuple(out)
 
 
 def _cov_heading(network: Network, T: Array) -> Array:
@@ -446,4 +491,7 @@ def _warnings(
     lonely = [network.marks[m] for m in np.flatnonzero(per_mark == 1) if m not in network.controls]
     if lonely:
         warnings.append(f"Seen from one station only, and so unchecked: {', '.join(lonely)}.")
+    doubtful = [name for name, doubt in zip(network.marks, network.doubts, strict=True) if doubt]
+    if doubtful:
+        warnings.append(f"Marks that may be false: {', '.join(doubtful)}; the reasons stand there.")
     return tuple(warnings)

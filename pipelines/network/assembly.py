@@ -11,6 +11,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
+from pipelines.calibration import Calibration
 from pipelines.config import ResectionConfig
 from pipelines.errors import (
     AmbiguousMatchError,
@@ -21,10 +22,15 @@ from pipelines.errors import (
 )
 from pipelines.geometry import levelling_rotation, rigid, transform
 from pipelines.matching import gather, match_marks
-from pipelines.network.values import LeftOut, Network, Refusal
-from pipelines.values import Array, ControlMarks, MarkerFits
+from pipelines.network.values import LeftOut, Network, Refusal, Shared
+from pipelines.values import Array, ControlMarks, MarkerFit, MarkerFits, Status
 
 _EXACT = 1e-5  # [m] sigma of control marks that are given as exact: far below any survey's
+_NO_MARK, _DOUBTED = -1, -2  # in place of a mark: none is near; the one that is near may be false
+_FEW = 2.0  # fewer than one in so many of the stations that stand near: a mark may be false
+_VERY_FEW = 4.0  # and then it most likely is
+_N_HOLD = 3  # marks that a station keeps, doubtful ones included
+_ODD_SIGMAS, _ODD_SLACK = 3.29, 0.006  # [m] by which the mean radius of a sphere may be off
 _NEAR_CONTROL = 1.0  # [m] how far a mark can be from a control mark and still be worth a remark
 
 Scan = tuple[str, MarkerFits]
@@ -76,7 +82,10 @@ class _Map:
 
 
 def assemble(
-    scans: Sequence[Scan], control: ControlMarks | None, config: ResectionConfig
+    scans: Sequence[Scan],
+    control: ControlMarks | None,
+    config: ResectionConfig,
+    calibration: Calibration | None = None,
 ) -> Network:
     """Find out which markers of a survey's stations are the same, and where all stand roughly.
 
@@ -89,6 +98,9 @@ def assemble(
         station that is in it.
     config : ResectionConfig
         Tolerance of matching.
+    calibration : Calibration, optional
+        The rig as both faces of the spheres tell it: its parameters become unknowns of the network.
+        Centres that it adjusted take the place of those of ``scans``.
 
     Returns
     -------
@@ -112,8 +124,15 @@ def assemble(
     names = [name for name, _ in scans]
     if twice := sorted({name for name in names if names.count(name) > 1}):
         raise InputError(f"Two logs are called {twice[0]!r}; stations are told apart by name.")
+    if calibration is not None:
+        scans = [(name, calibration.adjusted(name, fits)) for name, fits in scans]
     found, reasons = _grow(scans, control, config)
     used, lonely = _shared(found)
+    doubts, dropped = _doubts(scans, found, used)
+    for i, fit in dropped:
+        found.marks_of[i][fit] = _DOUBTED
+    if dropped:
+        used, lonely = _shared(found)
     refused = tuple(
         Refusal(station=names[i], code=DegenerateGeometryError.code, reason=reason)
         if isinstance(reason, str)
@@ -121,8 +140,14 @@ def assemble(
         for i, reason in _refused(len(scans), used, reasons)
     )
     _refuse_nothing(used, found, control, refused)
-    network = _network(scans, found, used, config)
-    return replace(network, refused=refused, left_out=_unseen(scans, found, used, lonely))
+    network = _network(scans, found, used, doubts)
+    network = replace(
+        network,
+        cov_p_base=network.cov_p_base + config.sigma_common**2 * np.eye(3),
+        shared=_in_common(network, config, calibration),
+        refused=refused,
+    )
+    return replace(network, left_out=_unseen(scans, found, used, lonely, dropped))
 
 
 def _grow(
@@ -205,6 +230,65 @@ def _shared(found: _Map) -> tuple[dict[int, list[tuple[int, int]]], dict[int, li
     return used, lonely
 
 
+def _doubts(
+    scans: Sequence[Scan], found: _Map, used: dict[int, list[tuple[int, int]]]
+) -> tuple[dict[int, str], dict[tuple[int, int], str]]:
+    """Say which marks may be false, and which centres go because theirs most likely is.
+
+    A sphere is seen from all around. What only a few see, of all the stations that stand as near to
+    it, is no mark for the network, unless a station would stand on too few others.
+    """
+    doubts: dict[int, str] = {}
+    dropped: dict[tuple[int, int], str] = {}
+    n_marks = {i: len(pairs) for i, pairs in used.items()}
+    for mark in sorted({mark for pairs in used.values() for _, mark in pairs}):
+        if mark < found.n_control:
+            continue
+        seen = [(i, fit) for i, pairs in used.items() for fit, m in pairs if m == mark]
+        near, reason = _as_near(scans, found, used, mark, seen), ""
+        is_weak = all(scans[i][1].fits[fit].status is Status.WEAK for i, fit in seen)
+        if _FEW * len(seen) < near:
+            reason = f"Only {len(seen)} of the {near} stations that stand near enough see it."
+        if is_weak:
+            weakness = scans[seen[0][0]][1].fits[seen[0][1]].reason.rstrip(".")
+            reason += f" All {len(seen)} of its markers are weak: {weakness}."
+        reason += _odd_radius([scans[i][1].fits[fit] for i, fit in seen])
+        limit = _FEW if is_weak else _VERY_FEW
+        if limit * len(seen) <= near and all(n_marks[i] > _N_HOLD for i, _ in seen):
+            dropped |= dict.fromkeys(seen, f"{reason.strip()} It may be false.")
+            for i, _ in seen:
+                n_marks[i] -= 1
+        elif reason:
+            doubts[mark] = reason.strip()
+    return doubts, dropped
+
+
+def _as_near(
+    scans: Sequence[Scan],
+    found: _Map,
+    used: dict[int, list[tuple[int, int]]],
+    mark: int,
+    seen: list[tuple[int, int]],
+) -> int:
+    """Return how many stations stand as near to a mark as the farthest that sees it."""
+    reach = max(float(np.linalg.norm(scans[i][1].fits[fit].p_base)) for i, fit in seen)
+    places = np.array([found.poses[i][:3, 3] for i in used])
+    return int(np.sum(np.linalg.norm(places - found.p_site[mark], axis=1) < reach + 0.1))
+
+
+def _odd_radius(fits: list[MarkerFit]) -> str:
+    """Say that the sightings of a mark agree on another radius; empty if they do not."""
+    known = [fit for fit in fits if np.isfinite(fit.radius_free) and fit.sigma_radius_free > 0.0]
+    if not known:
+        return ""
+    weights = np.array([fit.sigma_radius_free**-2.0 for fit in known])
+    mean = float(np.average([fit.radius_free for fit in known], weights=weights))
+    off, sigma = mean - known[0].radius, float(weights.sum() ** -0.5)
+    if abs(off) < _ODD_SIGMAS * sigma + _ODD_SLACK:
+        return ""
+    return f" Its own radius is {1e3 * mean:.0f} mm, sigma {1e3 * sigma:.0f} mm."
+
+
 def _refused(
     n: int, used: dict[int, list[tuple[int, int]]], reasons: dict[int, SolveError]
 ) -> list[tuple[int, SolveError | str]]:
@@ -258,15 +342,16 @@ def _unseen(
     found: _Map,
     used: dict[int, list[tuple[int, int]]],
     lonely: dict[int, list[int]],
+    dropped: dict[tuple[int, int], str],
 ) -> tuple[LeftOut, ...]:
     """Say which centres are no marks of the network, and which control marks nobody saw."""
     out = []
     for i, fits in lonely.items():
         for fit in fits:
-            mark = found.marks_of[i][fit]
             reason = "No other station sees it: it ties nothing, and may be false."
-            if mark < 0:
+            if found.marks_of[i][fit] == _NO_MARK:
                 reason = "Another marker is nearer to the mark beside it: a false marker."
+            reason = dropped.get((i, fit), reason)
             out.append(LeftOut(kind="centre", station=scans[i][0], fit=fit, mark="", reason=reason))
     seen = {mark for pairs in used.values() for _, mark in pairs}
     for mark in range(found.n_control):
@@ -296,7 +381,7 @@ def _network(
     scans: Sequence[Scan],
     found: _Map,
     used: dict[int, list[tuple[int, int]]],
-    config: ResectionConfig,
+    doubts: dict[int, str],
 ) -> Network:
     """Bring stations and marks that are used into columns."""
     places = sorted({mark for pairs in used.values() for _, mark in pairs})
@@ -313,7 +398,7 @@ def _network(
         sightings=columns[:, :2].copy(),
         fits=columns[:, 2].copy(),
         p_base=np.array([fit.p_base for fit in fits]),
-        cov_p_base=np.array([fit.cov_p_base for fit in fits]) + config.sigma_common**2 * np.eye(3),
+        cov_p_base=np.array([fit.cov_p_base for fit in fits]),
         R_station_base=np.array([levelling_rotation(one) for one in levellings]),
         cov_up_base=np.array([_cov_up(one.roll, one.pitch, one.sigma) for one in levellings]),
         sigma_headings=np.array([one.sigma_heading for one in levellings]),
@@ -322,7 +407,28 @@ def _network(
         cov_control_site=given + _EXACT**2 * np.eye(3),
         T_site_base=np.array([found.poses[i] for i in used]),
         p_site=np.array([found.p_site[mark] for mark in places]),
-        sigma_range=config.sigma_range,
+        shared=Shared.none(len(fits)),
+        doubts=tuple(doubts.get(mark, "") for mark in places),
+    )
+
+
+def _in_common(
+    network: Network, config: ResectionConfig, calibration: Calibration | None
+) -> Shared:
+    """Return what all stations share: a range bias, and the parameters of a calibration."""
+    bias = Shared.range_bias(network.p_base, config.sigma_range)
+    if calibration is None:
+        return bias
+    names, weights = calibration.unknowns, calibration.weights
+    rows = zip(network.sightings[:, 0], network.fits, strict=True)
+    effects = np.array([calibration.effects(network.stations[i], int(fit)) for i, fit in rows])
+    k = len(names)
+    known = np.zeros((k + len(bias.names),) * 2)
+    known[:k, :k], known[k:, k:] = weights, bias.weights
+    return Shared(
+        names=(*names, *bias.names),
+        effects=np.concatenate([effects, bias.effects], axis=2),
+        weights=known,
     )
 
 

@@ -17,7 +17,7 @@ import numpy as np
 from pipelines.errors import DegenerateGeometryError, NotConvergedError
 from pipelines.geometry import skew
 from pipelines.matching import moved
-from pipelines.network.values import Network
+from pipelines.network.values import Network, Parts
 from pipelines.values import Array, Mask
 
 N_DEFECT = 4  # of a free network whose stations are levelled: place and heading
@@ -31,12 +31,12 @@ _SINGULAR = 1e-11  # eigenvalue of the reduced normal matrix with unit diagonal
 class State:
     """Poses of the stations, (s, 4, 4), and marks, (m, 3), relative to the middle [m].
 
-    ``range_bias`` is what all ranges are too long [m].
+    ``shared``, (k,), are the unknowns that all stations have in common.
     """
 
     T_site_base: Array
     p_site: Array
-    range_bias: float = 0.0
+    shared: Array
 
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
@@ -52,7 +52,7 @@ class Linearised:
     J_centres : (n, 3, 6)
         By the motion of the station.
     J_common : (n, 3, 3 + k)
-        By the mark, minus the identity, and by the common range bias if there is one.
+        By the mark, minus the identity, and by what all stations share.
     v_gravity : (s, 2)
         Horizontal part of the measured up direction [rad].
     P_gravity : (s, 2, 2)
@@ -88,20 +88,23 @@ class Cofactors:
         Between stations and marks.
     marks : (3m, 3m)
         Of the marks.
-    with_bias : (s, 6, k)
-        Between stations and the common range bias, if there is one.
-    bias_and_marks : (m, 3, k)
-        Between marks and the bias.
-    bias : (k, k)
-        Of the bias.
+    with_shared : (s, 6, k)
+        Between stations and what all share.
+    shared_and_marks : (m, 3, k)
+        Between marks and what all share.
+    shared : (k, k)
+        Of what all share.
+    parts : Parts
+        What these were made of.
     """
 
     stations: Array
     between: Array
     marks: Array
-    with_bias: Array
-    bias_and_marks: Array
-    bias: Array
+    with_shared: Array
+    shared_and_marks: Array
+    shared: Array
+    parts: Parts
 
 
 def middle_of(network: Network) -> Array:
@@ -136,10 +139,11 @@ def start(network: Network) -> State:
     middle = middle_of(network)
     T = np.array(network.T_site_base)
     T[:, :3, 3] -= middle
-    return State(T_site_base=T, p_site=network.p_site - middle)
+    nothing = np.zeros(len(network.shared.names))
+    return State(T_site_base=T, p_site=network.p_site - middle, shared=nothing)
 
 
-def step_to(state: State, xi: Array, dp: Array, db: float = 0.0) -> State:
+def step_to(state: State, xi: Array, dp: Array, d_shared: Array) -> State:
     """Move a state.
 
     Parameters
@@ -150,8 +154,8 @@ def step_to(state: State, xi: Array, dp: Array, db: float = 0.0) -> State:
         Small motions of the stations, on the left.
     dp : (m, 3)
         Shifts of the marks [m].
-    db : float
-        Change of the range bias [m].
+    d_shared : (k,)
+        Changes of what all share.
 
     Returns
     -------
@@ -161,7 +165,7 @@ def step_to(state: State, xi: Array, dp: Array, db: float = 0.0) -> State:
     return State(
         T_site_base=moved(state.T_site_base, xi),
         p_site=state.p_site + dp,
-        range_bias=state.range_bias + db,
+        shared=state.shared + d_shared,
     )
 
 
@@ -186,12 +190,9 @@ def linearise(network: Network, state: State, used: Mask) -> Linearised:
     station, mark = network.sightings.T
     R, t = state.T_site_base[:, :3, :3], state.T_site_base[:, :3, 3]
     R_each = R[station]
-    towards = network.p_base / np.linalg.norm(network.p_base, axis=1)[:, None]
-    towards = np.einsum("nij,nj->ni", R_each, towards)
-    p = np.einsum("nij,nj->ni", R_each, network.p_base) + t[station]
-    p = p - state.range_bias * towards
+    effects = R_each @ network.shared.effects
+    p = np.einsum("nij,nj->ni", R_each, network.p_base) + t[station] - effects @ state.shared
     J_mark = np.broadcast_to(-np.eye(3), (n, 3, 3))
-    has_bias = network.sigma_range > 0.0
     weights = R_each @ np.linalg.inv(network.cov_p_base) @ np.swapaxes(R_each, 1, 2)
     up = np.einsum("sij,sj->si", R, network.R_station_base[:, 2])
     cov_up = (R @ network.cov_up_base @ np.swapaxes(R, 1, 2))[:, :2, :2]
@@ -200,7 +201,7 @@ def linearise(network: Network, state: State, used: Mask) -> Linearised:
         v_centres=p - state.p_site[mark],
         P_centres=weights * used[:n, None, None],
         J_centres=np.concatenate([-skew(p), np.broadcast_to(np.eye(3), (n, 3, 3))], axis=2),
-        J_common=np.concatenate([J_mark, -towards[..., None]], axis=2) if has_bias else J_mark,
+        J_common=np.concatenate([J_mark, -effects], axis=2),
         v_gravity=up[:, :2],
         P_gravity=np.asarray(np.linalg.inv(cov_up)) * used[n : n + s, None, None],
         J_gravity=np.concatenate([-skew(up)[:, :2], np.zeros((s, 2, 3))], axis=2),
@@ -213,8 +214,9 @@ def linearise(network: Network, state: State, used: Mask) -> Linearised:
 class _Reduced:
     """Normal equations after the stations are eliminated.
 
-    ``A`` (s, 6, 6) are the stations' own blocks, ``K`` (s, 6, 3m) is ``A^-1`` times their coupling
-    to the marks, ``S`` (3m, 3m) the Schur complement; ``g`` and ``r`` the right sides.
+    ``A`` (s, 6, 6) are the stations' own blocks, ``K`` (s, 6, 3m + k) is ``A^-1`` times their
+    coupling to marks and shared unknowns, ``S`` (3m + k, 3m + k) the Schur complement; ``g`` and
+    ``r`` the right sides.
     """
 
     A: Array
@@ -224,7 +226,7 @@ class _Reduced:
     r: Array
 
 
-def _reduce(network: Network, lin: Linearised, bias: float) -> _Reduced:
+def _reduce(network: Network, lin: Linearised, shared: Array) -> _Reduced:
     """Set up the normal equations and eliminate the stations."""
     s, m = len(network.stations), len(network.marks)
     station, mark = network.sightings.T
@@ -233,45 +235,45 @@ def _reduce(network: Network, lin: Linearised, bias: float) -> _Reduced:
     stations, g = levelled @ lin.J_gravity, np.einsum("sij,sj->si", levelled, lin.v_gravity)
     np.add.at(stations, station, pressed @ lin.J_centres)
     np.add.at(g, station, np.einsum("nij,nj->ni", pressed, lin.v_centres))
-    own, h = _marks_alone(network, lin, bias)
-    coupling = np.zeros((s, 6, len(h)))
-    blocks = coupling[:, :, : 3 * m].reshape(s, 6, m, 3)
-    blocks[station, :, mark, :] = pressed @ lin.J_common[..., :3]
-    coupling[:, :, : 3 * m] = blocks.reshape(s, 6, 3 * m)
-    for k in range(3, lin.J_common.shape[2]):
-        np.add.at(coupling[:, :, 3 * m], station, (pressed @ lin.J_common[..., k : k + 1])[..., 0])
+    own, h = _marks_alone(network, lin, shared)
+    to_marks = np.zeros((s, 6, m, 3))
+    to_marks[station, :, mark, :] = pressed @ lin.J_common[..., :3]
+    to_shared = np.zeros((s, 6, len(shared)))
+    np.add.at(to_shared, station, pressed @ lin.J_common[..., 3:])
+    coupling = np.concatenate([to_marks.reshape(s, 6, 3 * m), to_shared], axis=2)
     solved = np.asarray(np.linalg.solve(stations, coupling), dtype=np.float64)
     reduced = own - coupling.reshape(6 * s, -1).T @ solved.reshape(6 * s, -1)
     r = -h + np.einsum("sij,si->j", solved, g)
     return _Reduced(A=stations, K=solved, S=(reduced + reduced.T) / 2.0, g=g, r=r)
 
 
-def _marks_alone(network: Network, lin: Linearised, bias: float) -> tuple[Array, Array]:
-    """Return normal matrix and gradient of marks and range bias where no station moves."""
-    m, extra = len(network.marks), lin.J_common.shape[2] - 3
+def _marks_alone(network: Network, lin: Linearised, shared: Array) -> tuple[Array, Array]:
+    """Return normal matrix and gradient of marks and shared unknowns where no station moves."""
+    m, k = len(network.marks), len(shared)
     mark = network.sightings[:, 1]
     pressed = np.swapaxes(lin.J_common, 1, 2) @ lin.P_centres
     squares = pressed @ lin.J_common
     gradient = np.einsum("nij,nj->ni", pressed, lin.v_centres)
-    blocks, h = np.zeros((m, 3 + extra, 3 + extra)), np.zeros((m, 3 + extra))
-    np.add.at(blocks, mark, squares)
-    np.add.at(h, mark, gradient)
-    np.add.at(blocks[:, :3, :3], network.controls, lin.P_control)
-    np.add.at(h[:, :3], network.controls, -np.einsum("nij,nj->ni", lin.P_control, lin.v_control))
-    N = np.zeros((3 * m + extra, 3 * m + extra))
+    blocks, h = np.zeros((m, 3, 3 + k)), np.zeros((m, 3))
+    np.add.at(blocks, mark, squares[:, :3])
+    np.add.at(h, mark, gradient[:, :3])
+    np.add.at(blocks[:, :, :3], network.controls, lin.P_control)
+    np.add.at(h, network.controls, -np.einsum("nij,nj->ni", lin.P_control, lin.v_control))
+    N = np.zeros((3 * m + k, 3 * m + k))
     diagonal = np.zeros((m, 3, m, 3))
-    diagonal[np.arange(m), :, np.arange(m), :] = blocks[:, :3, :3]
+    diagonal[np.arange(m), :, np.arange(m), :] = blocks[:, :, :3]
     N[: 3 * m, : 3 * m] = diagonal.reshape(3 * m, 3 * m)
-    for k in range(extra):
-        N[: 3 * m, 3 * m + k] = N[3 * m + k, : 3 * m] = blocks[:, :3, 3 + k].ravel()
-        N[3 * m + k, 3 * m + k] = blocks[:, 3 + k, 3 + k].sum() + network.sigma_range**-2
-    tail = h[:, 3:].sum(axis=0) + (bias / network.sigma_range**2 if extra else 0.0)
-    return N, np.concatenate([h[:, :3].ravel(), tail])
+    N[: 3 * m, 3 * m :] = blocks[:, :, 3:].reshape(3 * m, k)
+    N[3 * m :, : 3 * m] = N[: 3 * m, 3 * m :].T
+    weights = network.shared.weights
+    N[3 * m :, 3 * m :] = squares[:, 3:, 3:].sum(axis=0) + weights
+    tail = gradient[:, 3:].sum(axis=0) + weights @ shared
+    return N, np.concatenate([h.ravel(), tail])
 
 
 def _datum(network: Network, state: State) -> Array:
     """Return orthonormal columns of what a free network leaves open: (3m + k, 4), or none."""
-    m, extra = len(network.marks), int(network.sigma_range > 0.0)
+    m, extra = len(network.marks), len(network.shared.names)
     if not network.is_free:
         return np.zeros((3 * m + extra, 0))
     motions = np.zeros((m, 3, N_DEFECT))
@@ -286,8 +288,10 @@ def _inverse(normal: Array, datum: Array) -> Array:
 
     The inner constraints ``datum' dx = 0`` make it the pseudo-inverse (Meissl 1969).
     """
+    held = np.abs(datum).max(axis=1, initial=0.0) > 0.0
     scale = np.sqrt(np.diag(normal))
-    bordered = normal + float(np.mean(scale**2)) * datum @ datum.T
+    border = float(np.mean(scale[held] ** 2)) if held.any() else 0.0
+    bordered = normal + border * datum @ datum.T
     values = np.linalg.eigvalsh(bordered / np.outer(scale, scale))
     if not values[0] > _SINGULAR:
         raise DegenerateGeometryError(
@@ -332,12 +336,12 @@ def solve_network(network: Network, state: State, used: Mask) -> tuple[State, Co
     """
     m = len(network.marks)
     for _ in range(_STEPS):
-        reduced = _reduce(network, linearise(network, state, used), state.range_bias)
+        reduced = _reduce(network, linearise(network, state, used), state.shared)
         cov_marks = _inverse(reduced.S, _datum(network, state))
         dp = cov_marks @ reduced.r
         own = np.linalg.solve(reduced.A, reduced.g[..., None])[..., 0]
         xi = -own - reduced.K @ dp
-        state = step_to(state, xi, dp[: 3 * m].reshape(m, 3), float(dp[3 * m :].sum()))
+        state = step_to(state, xi, dp[: 3 * m].reshape(m, 3), dp[3 * m :])
         size = np.einsum("si,si->", own, reduced.g) + reduced.r @ dp
         if size < _SETTLED:
             return state, _cofactors(reduced, cov_marks, m)
@@ -348,14 +352,16 @@ def solve_network(network: Network, state: State, used: Mask) -> tuple[State, Co
 
 
 def _cofactors(reduced: _Reduced, cov_marks: Array, m: int) -> Cofactors:
-    """Return the covariances of stations and marks."""
+    """Return the covariances of stations, marks and what all share."""
     between = -reduced.K @ cov_marks
-    stations = np.linalg.inv(reduced.A) - between @ np.swapaxes(reduced.K, 1, 2)
+    own = np.asarray(np.linalg.inv(reduced.A), dtype=np.float64)
+    stations = own - between @ np.swapaxes(reduced.K, 1, 2)
     return Cofactors(
         stations=(stations + np.swapaxes(stations, 1, 2)) / 2.0,
         between=between[:, :, : 3 * m].reshape(len(between), 6, m, 3),
-        marks=cov_marks[: 3 * m, : 3 * m],
-        with_bias=between[:, :, 3 * m :],
-        bias_and_marks=cov_marks[: 3 * m, 3 * m :].reshape(m, 3, -1),
-        bias=cov_marks[3 * m :, 3 * m :],
+        marks=cov_marks[: 3 * m, : 3 * m].copy(),
+        with_shared=between[:, :, 3 * m :],
+        shared_and_marks=cov_marks[: 3 * m, 3 * m :].reshape(m, 3, -1),
+        shared=cov_marks[3 * m :, 3 * m :].copy(),
+        parts=Parts(own=own, coupling=reduced.K, cov_common=cov_marks),
     )

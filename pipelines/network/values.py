@@ -9,6 +9,9 @@ import numpy as np
 from pipelines.errors import InputError
 from pipelines.values import Array, Index, Mask
 
+RANGE_BIAS = "common_range_bias"
+"""The shared unknown that is what all ranges are too long [m]."""
+
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class Refusal:
@@ -55,6 +58,69 @@ class LeftOut:
 
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
+class Shared:
+    """Unknowns that all stations share: what the rig does to every centre, and no centre tells.
+
+    Attributes
+    ----------
+    names : tuple of str
+        What they are; ``RANGE_BIAS`` is what all ranges are too long.
+    effects : (n, 3, k)
+        How much a unit of each moves each observed centre in base.
+    weights : (k, k)
+        What is known of them beside the centres: the inverse of a covariance about zero; singular
+        where nothing is known.
+    """
+
+    names: tuple[str, ...]
+    effects: Array
+    weights: Array
+
+    def __post_init__(self) -> None:
+        k = len(self.names)
+        seal(self, {"effects": (len(self.effects), 3, k), "weights": (k, k)})
+
+    @classmethod
+    def none(cls, n: int) -> Shared:
+        """Return no unknowns of n centres.
+
+        Parameters
+        ----------
+        n : int
+            Number of centres.
+
+        Returns
+        -------
+        Shared
+            Without names.
+        """
+        return cls(names=(), effects=np.zeros((n, 3, 0)), weights=np.zeros((0, 0)))
+
+    @classmethod
+    def range_bias(cls, p_base: Array, sigma: float) -> Shared:
+        """Return one unknown: what all ranges of a survey are too long.
+
+        Parameters
+        ----------
+        p_base : (n, 3)
+            Observed centres [m].
+        sigma : float
+            Its standard deviation before anything is seen; 0 for no such unknown [m].
+
+        Returns
+        -------
+        Shared
+            With one name, or none.
+        """
+        if sigma == 0.0:
+            return cls.none(len(p_base))
+        towards = p_base / np.linalg.norm(p_base, axis=1)[:, None]
+        return cls(
+            names=(RANGE_BIAS,), effects=towards[..., None], weights=np.array([[sigma**-2.0]])
+        )
+
+
+@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class Network:
     """Stations, marks and what was observed between them, with approximate values.
 
@@ -88,9 +154,10 @@ class Network:
         Approximate poses [m].
     p_site : (m, 3)
         Approximate marks [m].
-    sigma_range : float
-        Standard deviation of what all ranges of the survey are too long, the same in each [m];
-        0 where there is no such thing.
+    shared : Shared
+        What all stations have in common.
+    doubts : (m,) tuple of str
+        Why each mark may be false, as a sentence for people; empty where there is no reason.
     refused : tuple of Refusal
         Stations that share too little with the others.
     left_out : tuple of LeftOut
@@ -111,7 +178,8 @@ class Network:
     cov_control_site: Array
     T_site_base: Array
     p_site: Array
-    sigma_range: float = 0.0
+    shared: Shared
+    doubts: tuple[str, ...]
     refused: tuple[Refusal, ...] = ()
     left_out: tuple[LeftOut, ...] = ()
 
@@ -134,6 +202,18 @@ class Network:
                 "p_site": (m, 3),
             },
         )
+        if len(self.shared.effects) != n:
+            raise InputError(f"There are {n} centres, but effects on {len(self.shared.effects)}.")
+        if len(self.doubts) != m:
+            raise InputError(f"There are {m} marks, but doubts about {len(self.doubts)}.")
+
+    @property
+    def sigma_range(self) -> float:
+        """What the range bias is known to beforehand; 0 where there is no such unknown [m]."""
+        if RANGE_BIAS not in self.shared.names:
+            return 0.0
+        place = self.shared.names.index(RANGE_BIAS)
+        return float(self.shared.weights[place, place] ** -0.5)
 
     @property
     def is_free(self) -> bool:
@@ -174,6 +254,29 @@ class BlockTests:
 
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
+class Parts:
+    """What the joint covariance of stations, marks and shared unknowns is made of.
+
+    Attributes
+    ----------
+    own : (s, 6, 6)
+        Covariance of each station's motion if marks and shared unknowns were known.
+    coupling : (s, 6, 3m + k)
+        How much a station moves, with the sign turned, when marks and shared unknowns move.
+    cov_common : (3m + k, 3m + k)
+        Covariance of marks and shared unknowns.
+    """
+
+    own: Array
+    coupling: Array
+    cov_common: Array
+
+    def __post_init__(self) -> None:
+        s, u = len(self.own), len(self.cov_common)
+        seal(self, {"own": (s, 6, 6), "coupling": (s, 6, u), "cov_common": (u, u)})
+
+
+@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class AdjustedNetwork:
     """All stations and marks of a survey, adjusted together.
 
@@ -202,10 +305,20 @@ class AdjustedNetwork:
         centre causes; infinite where a bias cannot be detected, NaN where not used [m].
     mark_shifts : (n,)
         The same of its mark [m].
-    range_bias : float
-        What all ranges of the survey are too long, as estimated; 0 where the network has none [m].
-    sigma_range_bias : float
-        Its standard deviation [m].
+    shared : (k,)
+        The unknowns that all stations share, as estimated.
+    cov_shared : (k, k)
+        Their covariance.
+    parts : Parts
+        What the joint covariance of all is made of.
+    control_predictions : (c, 3)
+        Where each control mark would be by all else, minus where it is given; NaN where nothing
+        else tells [m].
+    cov_control_predictions : (c, 3, 3)
+        Covariances of these differences [m^2].
+    mark_weaknesses : tuple of str
+        Why each mark should be used with care, as a sentence for people; empty where there is no
+        reason.
     dof : int
         Degrees of freedom: observations minus unknowns plus the datum's defect.
     vtpv : float
@@ -239,8 +352,12 @@ class AdjustedNetwork:
     control: BlockTests
     station_shifts: Array
     mark_shifts: Array
-    range_bias: float
-    sigma_range_bias: float
+    shared: Array
+    cov_shared: Array
+    parts: Parts
+    control_predictions: Array
+    cov_control_predictions: Array
+    mark_weaknesses: tuple[str, ...]
     dof: int
     vtpv: float
     sigma0: float
@@ -265,9 +382,48 @@ class AdjustedNetwork:
                 "used": (self.network.n_blocks,),
                 "station_shifts": (n,),
                 "mark_shifts": (n,),
+                "shared": (len(self.network.shared.names),),
+                "control_predictions": self.network.p_control_site.shape,
+                "cov_control_predictions": self.network.cov_control_site.shape,
                 "variance_factors": (3,),
             },
         )
+
+    @property
+    def range_bias(self) -> float:
+        """What all ranges of the survey are too long; 0 where the network has no such unknown."""
+        names = self.network.shared.names
+        return float(self.shared[names.index(RANGE_BIAS)]) if RANGE_BIAS in names else 0.0
+
+    @property
+    def sigma_range_bias(self) -> float:
+        """Standard deviation of the range bias [m]."""
+        names = self.network.shared.names
+        if RANGE_BIAS not in names:
+            return 0.0
+        place = names.index(RANGE_BIAS)
+        return float(np.sqrt(self.cov_shared[place, place]))
+
+    @property
+    def p_base(self) -> Array:
+        """Observed centres less what all have in common, (n, 3) [m]."""
+        return np.asarray(self.network.p_base - self.network.shared.effects @ self.shared)
+
+    @property
+    def cov_positions(self) -> Array:
+        """Joint covariance of all stations' positions, then all marks, (3s + 3m, 3s + 3m) [m^2].
+
+        Grows with the square of the stations: for networks of tens of them.
+        """
+        s, m = len(self.T_site_station), len(self.p_site)
+        J = position_by_motion(self.T_site_station)
+        coupled = (J @ self.parts.coupling).reshape(3 * s, -1)
+        own = J @ self.parts.own @ np.swapaxes(J, -1, -2)
+        stations = coupled @ self.parts.cov_common @ coupled.T
+        for i, cov in enumerate(own):
+            stations[3 * i : 3 * i + 3, 3 * i : 3 * i + 3] += cov
+        between = -coupled @ self.parts.cov_common[:, : 3 * m]
+        return np.block([[stations, between], [between.T, self.cov_p_site]])
 
     @property
     def mark_covariances(self) -> Array:

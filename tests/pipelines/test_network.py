@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 from pipelines.config import ResectionConfig
 from pipelines.errors import DegenerateGeometryError, InputError
 from pipelines.geometry import inverse, levelling_rotation, log_motion, rigid
-from pipelines.network import Network, adjust_network, assemble
+from pipelines.network import Network, Shared, adjust_network, assemble
 from pipelines.network.equations import linearise, start, step_to
 from pipelines.resection import resect
 from tests.synthetic import control, field, pose, sightings
@@ -120,27 +120,30 @@ def test_derivatives_agree_with_differences(rng):
     scans, _ = survey(rng, marks, 3)
     net = assemble(scans, marks, replace(CONFIG, sigma_range=1e-3))
     state, used = start(net), np.ones(net.n_blocks, np.bool_)
-    state = step_to(state, rng.normal(0, 0.1, (3, 6)), rng.normal(0, 0.1, (5, 3)))
+    state = step_to(state, rng.normal(0, 0.1, (3, 6)), rng.normal(0, 0.1, (5, 3)), np.zeros(1))
     here, h = linearise(net, state, used), 1e-6
     mark = net.sightings[:, 1]
     for k in range(6):
         xi = np.zeros((3, 6))
         xi[:, k] = h
         plus, minus = (
-            linearise(net, step_to(state, sign * xi, np.zeros((5, 3))), used) for sign in (1, -1)
+            linearise(net, step_to(state, sign * xi, np.zeros((5, 3)), np.zeros(1)), used)
+            for sign in (1, -1)
         )
         numeric = (plus.v_centres - minus.v_centres) / (2 * h)
         np.testing.assert_allclose(here.J_centres[..., k], numeric, rtol=0, atol=1e-7)
         numeric = (plus.v_gravity - minus.v_gravity) / (2 * h)
         np.testing.assert_allclose(here.J_gravity[..., k], numeric, rtol=0, atol=1e-7)
     plus, minus = (
-        linearise(net, step_to(state, np.zeros((3, 6)), np.zeros((5, 3)), sign * h), used)
+        linearise(
+            net, step_to(state, np.zeros((3, 6)), np.zeros((5, 3)), np.array([sign * h])), used
+        )
         for sign in (1, -1)
     )
     numeric = (plus.v_centres - minus.v_centres) / (2 * h)
     np.testing.assert_allclose(here.J_common[..., 3], numeric, rtol=0, atol=1e-7)
     dp = rng.normal(0, 1, (5, 3))
-    there = linearise(net, step_to(state, np.zeros((3, 6)), dp), used)
+    there = linearise(net, step_to(state, np.zeros((3, 6)), dp, np.zeros(1)), used)
     np.testing.assert_allclose(there.v_centres - here.v_centres, -dp[mark], rtol=0, atol=1e-12)
     expected = -dp[net.controls]
     np.testing.assert_allclose(there.v_control - here.v_control, expected, rtol=0, atol=1e-12)
@@ -474,6 +477,8 @@ def wide(rng, n_stations, n_marks=200, n_seen=14):
         cov_control_site=np.zeros((0, 3, 3)),
         T_site_base=T,
         p_site=p + rng.normal(0, 0.01, p.shape),
+        shared=Shared.none(n),
+        doubts=("",) * n_marks,
     )
 
 
