@@ -22,7 +22,7 @@ import numpy as np
 from pipelines.calibration.estimation import Estimate, Inseparable, estimate, residual_rms
 from pipelines.calibration.faces import front_face, rig_from_faces
 from pipelines.calibration.gimbal import GIMBAL, Sights, sights, values
-from pipelines.calibration.values import BIAS, Calibration, Scan
+from pipelines.calibration.outcome import BIAS, Calibration, Scan
 from pipelines.config import SurveyConfig
 from pipelines.errors import DegenerateGeometryError, RigError
 from pipelines.extraction import extract
