@@ -18,7 +18,7 @@ the steps of the pipeline, and a log holds nothing of the truth.
 
 from pipelines.simulation.field import Decoy, Field, Stop
 from pipelines.simulation.options import SimulationConfig
-from pipelines.simulation.rig import commensurability
+from pipelines.simulation.rig import commensurability, horizon_lines
 from pipelines.simulation.scenarios import SCENARIOS, scenario
 from pipelines.simulation.stop import SimulatedStop, simulate_stop, survey_truth
 
@@ -30,6 +30,7 @@ __all__ = [
     "SimulationConfig",
     "Stop",
     "commensurability",
+    "horizon_lines",
     "scenario",
     "simulate_stop",
     "survey_truth",

@@ -322,15 +322,31 @@ def quantised(values: Array, step: float) -> Array:
     return np.asarray(np.round(values / step) * step) if step else values
 
 
-def _horizon_gaps(config: SimulationConfig) -> Array:
-    """Return the gaps between the directions in which one turn crosses the horizon [rad]."""
+def horizon_lines(config: SimulationConfig) -> Array:
+    """Return the directions in which the scan lines of one turn cross the horizon.
+
+    Parameters
+    ----------
+    config : SimulationConfig
+        The speeds of gimbal and LiDAR.
+
+    Returns
+    -------
+    (n,)
+        Azimuths in the base frame, front and back face, ascending from 0 to 2 pi [rad].
+    """
     period = 60.0 / config.spin_rpm
     elevations = nominal_rig(config).laser_elevations
     motion, end = turning(config, 0.0), recorded_time(config) if config.step else config.turn
     up, down = np.arange(0.0, end, period), np.arange(period / 2, end, period)
     front = motion.angle_at(up)[:, None] + np.pi / 2 - elevations
     back = motion.angle_at(down)[:, None] - np.pi / 2 + elevations
-    directions = np.sort(np.concatenate([front.ravel(), back.ravel()]) % (2 * np.pi))
+    return np.sort(np.concatenate([front.ravel(), back.ravel()]) % (2 * np.pi))
+
+
+def _horizon_gaps(config: SimulationConfig) -> Array:
+    """Return the gaps between the directions in which one turn crosses the horizon [rad]."""
+    directions = horizon_lines(config)
     return np.diff(directions, append=directions[0] + 2 * np.pi)
 
 

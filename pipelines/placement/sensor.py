@@ -1,0 +1,286 @@
+"""What a scan puts on a sphere: hides the firing pattern, its gaps, and the worth of each return.
+
+A turn of the gimbal draws upright lines of shots round the horizon. How many cross a sphere, and
+where, depends on distance, and on where between the lines the sphere happens to stand.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import NamedTuple
+
+import numpy as np
+
+from pipelines.errors import ConfigError
+from pipelines.fitting.footprint import linearise
+from pipelines.rigs import FIRING_CYCLE, N_LASERS
+from pipelines.simulation import SimulationConfig, commensurability, horizon_lines
+from pipelines.values import Array, Beams, _seal
+
+N_ROWS = 16
+"""Rows that each strip of a disc is cut into."""
+
+_N_PER_ROW = 4  # beams along a row's height
+_N_PER_STRIP = 4  # and across a strip
+_N_PHASES = 400  # places between the lines that a sphere is tried at
+_GOLDEN = 0.6180339887498949  # of a turn from place to place: no pitch of lines repeats it
+_SHARE_MIN = 0.02  # of a footprint that makes a return
+_N_ROUNDS = 4  # in which precision and worth of the returns settle
+_DISTANCES = np.geomspace(1.5, 45.0, 28)  # [m]
+_LOST = 1e-3  # [m^2] a centre worse than this is not found
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Sensor:
+    """A tilted VLP-16 on a turning gimbal, and how it is driven.
+
+    Attributes
+    ----------
+    turn : float
+        Time in which the gimbal turns through 360 degrees [s].
+    spin_rpm : float
+        Revolutions of the LiDAR per minute.
+    sigma_range : float
+        Noise of a range to a marker [m]. 6.7 mm: real packets at the reflectivity of bright paint.
+    sigma_direction : float
+        Standard deviation of a beam's direction per axis [rad].
+    sigma_range_bias : float
+        Spread of what each laser measures too long [m].
+    divergence : tuple of float
+        Full width of the footprint along the sweep and square to it [rad].
+    elevations : tuple of float
+        Least and greatest elevation at which spheres are looked for [rad]. 75 degrees either way:
+        beyond it the outer lasers do not reach.
+    """
+
+    turn: float = 13.2
+    spin_rpm: float = 600.0
+    sigma_range: float = 0.0067
+    sigma_direction: float = 1e-4
+    sigma_range_bias: float = 0.003
+    divergence: tuple[float, float] = (3.0e-3, 1.5e-3)
+    elevations: tuple[float, float] = (float(np.radians(-75.0)), float(np.radians(75.0)))
+
+    def __post_init__(self) -> None:
+        self.scan  # noqa: B018  its own checks of turn, speed and footprint
+        if not 1e-5 <= self.sigma_range <= 0.5:
+            raise ConfigError(
+                f"sigma_range is {self.sigma_range!r}; 0.00001 to 0.5 m are possible."
+            )
+
+    @property
+    def scan(self) -> SimulationConfig:
+        """The same speeds as a simulation has them."""
+        return SimulationConfig(turn=self.turn, spin_rpm=self.spin_rpm, divergence=self.divergence)
+
+    @property
+    def warning(self) -> str:
+        """What is wrong with the two speeds, for people; empty when the lines spread well."""
+        return commensurability(self.scan)
+
+    @property
+    def line_spacing(self) -> float:
+        """Mean angle between lines at the horizon [rad]."""
+        return 2.0 * np.pi / (2.0 * N_LASERS * self.turn * self.spin_rpm / 60.0)
+
+    @property
+    def shot_spacing(self) -> float:
+        """Angle from one shot of a line to the next [rad]."""
+        return 2.0 * np.pi * self.spin_rpm / 60.0 * FIRING_CYCLE
+
+
+@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
+class Returns:
+    """What the returns of a sphere are worth, by distance, strip and rows from the top.
+
+    Attributes
+    ----------
+    distances : (d,)
+        Distances that are tabulated, ascending, even in the logarithm [m].
+    areas : (d, c, k)
+        Area that returns come from, of the upper k rows of each strip, k from 0 [m^2].
+    information : (d, c, k, 6)
+        Fisher information that the same area gives for one return per square metre: towards-towards,
+        towards-left, towards-up, left-left, left-up, up-up [1].
+    spread : (d, 3)
+        By how much the lines' places make the variances of a centre larger than evenly spread
+        returns would: towards, left, up; the mean over places where it is found.
+    worst_spread : (d, 3)
+        The same for the 95th percentile of places.
+    worst_share : (d,)
+        Returns at the least lucky place over those expected.
+    lost : (d, 2)
+        Share of places at which fewer than half the expected returns come, and at which a centre
+        cannot be found at all.
+    """
+
+    distances: Array
+    areas: Array
+    information: Array
+    spread: Array
+    worst_spread: Array
+    worst_share: Array
+    lost: Array
+
+    def __post_init__(self) -> None:
+        d = len(self.distances)
+        _seal(self, distances=(d,), areas=(d, None, None), information=(d, None, None, 6))
+        _seal(self, spread=(d, 3), worst_spread=(d, 3), worst_share=(d,), lost=(d, 2))
+
+
+class _Disc(NamedTuple):
+    """Beams over a sphere's disc at one distance, and what each is worth.
+
+    Attributes
+    ----------
+    left : (n,)
+        Where they pass the centre, to the left [m].
+    information : (n, 3, 3)
+        Of each; zero where it does not return.
+    returns : (n,)
+        Whether each returns.
+    """
+
+    left: Array
+    information: Array
+    returns: Array
+
+
+@lru_cache(maxsize=16)
+def returns_of(sensor: Sensor, radius: float, n_strips: int) -> Returns:
+    """Return what a sensor's returns from a sphere are worth.
+
+    Parameters
+    ----------
+    sensor : Sensor
+        The sensor and how it is driven.
+    radius : float
+        Radius of the sphere [m].
+    n_strips : int
+        Strips that its disc is cut into.
+
+    Returns
+    -------
+    Returns
+        Tables over distance.
+
+    Notes
+    -----
+    The worth of a return is that of ``footprint.linearise``: the mean range over the footprint,
+    linearised over the width of what is not known of the centre, which is that of the very fit.
+    The spread comes from the true lines of one turn, tried at 400 places.
+    """
+    discs = [_disc(sensor, radius, n_strips, d) for d in _DISTANCES]
+    shape = (len(_DISTANCES), n_strips, N_ROWS, _N_PER_ROW * _N_PER_STRIP)
+    cell = (2.0 * _reaches(sensor, radius) / n_strips / _N_PER_STRIP)[:, None, None, None]
+    cell = cell * cell * n_strips * _N_PER_STRIP / (N_ROWS * _N_PER_ROW)
+    areas = np.stack([disc.returns for disc in discs]).reshape(shape) * cell
+    worth = np.stack([disc.information for disc in discs]).reshape(*shape, 3, 3)
+    upper = np.triu_indices(3)
+    worth = worth[..., upper[0], upper[1]] * cell[..., None]
+    spreads = [_spread(sensor, radius, disc, d) for disc, d in zip(discs, _DISTANCES, strict=True)]
+    mean, worst, share, lost = (np.array(column) for column in zip(*spreads, strict=True))
+    return Returns(
+        distances=_DISTANCES.copy(),
+        areas=_from_top(areas.sum(axis=-1)),
+        information=_from_top(worth.sum(axis=3)),
+        spread=mean,
+        worst_spread=worst,
+        worst_share=share,
+        lost=lost,
+    )
+
+
+def _from_top(rows: Array) -> Array:
+    """Return cumulative sums over rows, axis 2, that begin with nothing."""
+    sums = np.cumsum(rows, axis=2)
+    return np.concatenate([np.zeros_like(sums[:, :, :1]), sums], axis=2)
+
+
+def _reaches(sensor: Sensor, radius: float) -> Array:
+    """Return how far from its centre a sphere's returns come, footprint included [m]."""
+    return radius + 0.5 * max(sensor.divergence) * _DISTANCES
+
+
+def _density(sensor: Sensor, distance: float) -> float:
+    """Return the returns per square metre of a disc at the horizon [1/m^2]."""
+    return 1.0 / (sensor.line_spacing * sensor.shot_spacing * distance**2)
+
+
+def _disc(sensor: Sensor, radius: float, n_strips: int, distance: float) -> _Disc:
+    """Return beams over the disc, strip by strip, row by row from the top."""
+    reach = radius + 0.5 * max(sensor.divergence) * distance
+    n_left, n_up = n_strips * _N_PER_STRIP, N_ROWS * _N_PER_ROW
+    left = reach * ((2.0 * np.arange(n_left) + 1.0) / n_left - 1.0)
+    up = -reach * ((2.0 * np.arange(n_up) + 1.0) / n_up - 1.0)
+    grid = np.stack(np.meshgrid(left, up, indexing="ij"), axis=-1)
+    grid = grid.reshape(n_strips, _N_PER_STRIP, N_ROWS, _N_PER_ROW, 2)
+    left, up = grid.transpose(4, 0, 2, 1, 3).reshape(2, -1)
+    table = _beams(sensor, left, up, distance)
+    cell = (2.0 * reach) ** 2 / (n_left * n_up)
+    spheres = np.array([[distance, 0.0, 0.0, radius]])
+    which = np.zeros(len(left), dtype=np.intp)
+    cov = np.eye(3) * (0.02 * radius) ** 2
+    lateral2 = (sensor.sigma_direction * distance) ** 2
+    information, returns = np.zeros((len(left), 3, 3)), np.zeros(len(left))
+    for _ in range(_N_ROUNDS):
+        linear = linearise(table, spheres, cov[None], which)
+        J, returns = linear.J[:, :3], (linear.lit > _SHARE_MIN).astype(np.float64)
+        along = np.einsum("ij,ij->i", J, table.directions_base)
+        slopes2 = np.maximum(np.einsum("ij,ij->i", J, J) - along**2, 0.0)
+        variance = sensor.sigma_range**2 + lateral2 * slopes2 + linear.bends**2
+        information = (returns / variance)[:, None, None] * J[:, :, None] * J[:, None, :]
+        N = information.sum(axis=0) * cell * _density(sensor, distance)
+        cov = np.asarray(np.linalg.inv(N + np.eye(3) / (0.3 * radius) ** 2))
+    return _Disc(left=left, information=information, returns=returns)
+
+
+def _beams(sensor: Sensor, left: Array, up: Array, distance: float) -> Beams:
+    """Return parallel beams along x that pass a centre at some distances, swept upwards."""
+    n = len(left)
+    return Beams(
+        origins_base=np.column_stack([np.zeros(n), left, up]),
+        directions_base=np.tile([1.0, 0.0, 0.0], (n, 1)),
+        ranges=np.full(n, distance),
+        across_base=np.tile([0.0, 0.0, 1.0], (n, 1)),
+        rings=np.zeros(n, np.uint8),
+        intensities=np.full(n, 50.0),
+        times=np.zeros(n),
+        divergence=np.array(sensor.divergence),
+    )
+
+
+def _spread(
+    sensor: Sensor, radius: float, disc: _Disc, distance: float
+) -> tuple[Array, Array, float, Array]:
+    """Return mean and worst spread, worst share of returns, and shares of places that lose."""
+    columns, inverse = np.unique(np.round(disc.left, 9), return_inverse=True)
+    worth = np.zeros((len(columns), 3, 3))
+    np.add.at(worth, inverse, disc.information)
+    counts = np.bincount(inverse, disc.returns)
+    height = 2.0 * (columns[1] - columns[0]) * len(columns) / 2.0 / (N_ROWS * _N_PER_ROW)
+    per_line = height / (distance * sensor.shot_spacing)
+    crossings = _crossings(sensor, columns, distance)
+    information = np.einsum("pc,cij->pij", crossings, worth) * per_line
+    returns = crossings @ counts * per_line
+    even = information.mean(axis=0)
+    floor = np.eye(3) / (0.3 * radius) ** 2
+    variances = np.einsum("pii->pi", np.linalg.inv(information + floor))
+    usual = np.diag(np.linalg.inv(even + floor))
+    is_found = variances.sum(axis=1) < max(_LOST, 6.0 * float(usual.sum()))
+    ratios = variances[is_found] / usual if is_found.any() else np.full((1, 3), 36.0)
+    lost = np.array([np.mean(returns < 0.5 * returns.mean()), np.mean(~is_found)])
+    share = float(returns.min() / max(returns.mean(), 1e-9))
+    return np.asarray(ratios.mean(axis=0)), np.quantile(ratios, 0.95, axis=0), share, lost
+
+
+def _crossings(sensor: Sensor, columns: Array, distance: float) -> Array:
+    """Return how many lines pass each column of a disc at each place it may stand, (p, c)."""
+    lines = np.sort(horizon_lines(sensor.scan))
+    lines = np.concatenate([lines - 2 * np.pi, lines, lines + 2 * np.pi])
+    places = 2 * np.pi * (np.arange(_N_PHASES) * _GOLDEN % 1.0)
+    half = 0.5 * (columns[1] - columns[0])
+    edges = np.append(columns - half, columns[-1] + half) / distance
+    below = np.searchsorted(lines, places[:, None] + edges[None, :])
+    return np.asarray(np.diff(below, axis=1), dtype=np.float64)

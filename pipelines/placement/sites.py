@@ -1,0 +1,161 @@
+"""Sites: from a simulated world, or from heights on a grid."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from pipelines.errors import InputError
+from pipelines.placement.values import Arrangement, Site, Stops
+from pipelines.simulation import Field
+from pipelines.simulation.scene import Mesh, caster
+from pipelines.values import Array
+
+CELLS_MAX = 16_000_000
+"""Nodes of a terrain at most; a tenth of a metre over 400 m square."""
+
+_CELL = 0.1  # [m] of a simulated world's map
+_HALF = 30.0  # [m] half side of that map
+_ABOVE = 60.0  # [m] from where its surface is probed
+_POLE_HEIGHTS = (0.62, 1.50)  # [m] the study's
+
+
+def site_of_field(world: Field) -> Site:
+    """Return the site of a simulated world: its ground and all that stands on it but its markers.
+
+    Parameters
+    ----------
+    world : Field
+        The world.
+
+    Returns
+    -------
+    Site
+        On a grid of 0.1 m, 60 m square.
+
+    Notes
+    -----
+    The surface is probed from above, so that what overhangs reaches down to the ground.
+    """
+    lines = np.arange(-_HALF, _HALF + _CELL / 2, _CELL)
+    x, y = np.meshgrid(lines, lines)
+    ground = world.terrain.height_at(np.stack([x, y], axis=-1))
+    surface = np.maximum(ground, _probed(_without_markers(world), x, y).reshape(x.shape))
+    return Site(
+        name=f"{world.scenario}, seed {world.seed}",
+        xs=lines,
+        ys=lines.copy(),
+        ground=np.asarray(ground),
+        surface=surface,
+        pole_heights=_POLE_HEIGHTS,
+        marker_radius=world.marker_radius,
+    )
+
+
+def stops_of_field(world: Field) -> Stops:
+    """Return the stops of a simulated world.
+
+    Parameters
+    ----------
+    world : Field
+        The world.
+
+    Returns
+    -------
+    Stops
+        In the order of driving.
+    """
+    return Stops(
+        names=tuple(stop.name for stop in world.stops),
+        p_site=np.array([stop.p_site for stop in world.stops]),
+    )
+
+
+def marks_of_field(world: Field) -> Arrangement:
+    """Return the marks of a simulated world as an arrangement.
+
+    Parameters
+    ----------
+    world : Field
+        The world.
+
+    Returns
+    -------
+    Arrangement
+        As they stand.
+    """
+    return Arrangement(names=world.marks.names, p_site=np.array(world.marks.p_site))
+
+
+def _without_markers(world: Field) -> Mesh:
+    """Return the mesh of a world without the poles of its markers."""
+    poles, mesh = world.scene.poles, world.scene.mesh
+    middles = mesh.p_site[mesh.triangles].mean(axis=1)
+    away = np.full(len(middles), np.inf)
+    for foot, top in zip(poles.feet_site, poles.tops_site, strict=True):
+        is_near = (middles[:, 2] > foot[2] - 0.01) & (middles[:, 2] < top[2] + 0.01)
+        gap = np.hypot(middles[:, 0] - foot[0], middles[:, 1] - foot[1])
+        away = np.where(is_near, np.minimum(away, gap), away)
+    keep = away > 1.5 * (poles.radii.max() if len(poles.radii) else 0.0)
+    return Mesh(
+        p_site=mesh.p_site.copy(),
+        triangles=mesh.triangles[keep],
+        reflectivities=mesh.reflectivities[keep],
+    )
+
+
+def _probed(mesh: Mesh, x: Array, y: Array) -> Array:
+    """Return the height of the highest triangle over places; minus infinity over none [m]."""
+    rays = np.zeros((x.size, 6), np.float32)
+    rays[:, 0], rays[:, 1], rays[:, 2], rays[:, 5] = x.ravel(), y.ravel(), _ABOVE, -1.0
+    met, _ = caster.__wrapped__(mesh)(rays)
+    return np.where(np.isfinite(met), _ABOVE - met.astype(np.float64), -np.inf)
+
+
+def site_of_grid(
+    name: str, xs: Array, ys: Array, heights: Array, *, surface: Array | None = None
+) -> Site:
+    """Return the site of an elevation model.
+
+    Parameters
+    ----------
+    name : str
+        Where it comes from, for people.
+    xs, ys : (n,), (m,)
+        Lines of an even grid, ascending [m].
+    heights : (m, n)
+        Heights, rows along y; NaN where they are not known [m].
+    surface : (m, n), optional
+        Heights of what hides; the ground itself by default [m].
+
+    Returns
+    -------
+    Site
+        With its usual poles and markers.
+
+    Raises
+    ------
+    InputError
+        If the grid is too small or too large, uneven, or knows no height at all.
+    """
+    if heights.size > CELLS_MAX:
+        raise InputError(
+            f"{name} has {heights.size:,} cells; {CELLS_MAX:,} are the most. Take a part of it or "
+            "wider cells."
+        )
+    if min(heights.shape) < 2 or not np.isfinite(heights).any():
+        raise InputError(f"{name} holds no terrain: none of {heights.size:,} cells has a height.")
+    steps = np.concatenate([np.diff(xs), np.diff(ys)])
+    if steps.min() <= 0 or np.ptp(steps) > 1e-3 * steps.mean():
+        raise InputError(
+            f"The cells of {name} are {steps.min():g} to {steps.max():g} m wide; an even grid of "
+            "square cells is needed. Resample it (gdalwarp -tr)."
+        )
+    ground = np.array(heights, dtype=np.float64)
+    top = ground.copy() if surface is None else np.fmax(surface, ground)
+    return Site(
+        name=name,
+        xs=np.array(xs, np.float64),
+        ys=np.array(ys, np.float64),
+        ground=ground,
+        surface=top,
+    )
