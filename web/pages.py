@@ -8,7 +8,7 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -31,7 +31,7 @@ from web.figures import (
 from web.filters import Filters
 from web.readouts import headline
 from web.study import statements
-from web.templating import environment
+from web.templating import render
 
 Row = Mapping[str, Any]
 _MM = 1e3  # [mm/m]
@@ -171,7 +171,7 @@ def overview_page(page: OverviewPage) -> str:
     """Return the first page."""
     newest = page.newest
     readouts = headline(newest.fits, newest.fixes, newest.tolerance_m) if newest else ()
-    return _render("overview.html", page, here="overview", readouts=readouts)
+    return render("overview.html", page, here="overview", readouts=readouts)
 
 
 def survey_page(page: SurveyPage) -> str:
@@ -187,7 +187,7 @@ def survey_page(page: SurveyPage) -> str:
         pairs=keep(data.pairs),
     )
     stops = sorted(set(texts(data.fits, "stop")), key=_lane_order)
-    return _render(
+    return render(
         "survey.html",
         page,
         here="survey",
@@ -209,7 +209,7 @@ def stop_page(page: StopPage) -> str:
     """Return one stop: its scan, its markers, its position."""
     markers = _rows(page.fits)
     place = page.stops.index(page.stop["stop"])
-    return _render(
+    return render(
         "stop.html",
         page,
         here="survey",
@@ -226,24 +226,24 @@ def stop_page(page: StopPage) -> str:
 
 def jobs_page(page: JobsPage) -> str:
     """Return the list of jobs."""
-    return _render("jobs.html", page, here="jobs")
+    return render("jobs.html", page, here="jobs")
 
 
 def job_page(page: JobPage) -> str:
     """Return one job with its progress."""
     config = json.dumps(json.loads(page.job["config"]), indent=2)
-    return _render("job.html", page, here="jobs", config=config)
+    return render("job.html", page, here="jobs", config=config)
 
 
 def recording_page(page: RecordingPage) -> str:
     """Return one recording with its preflight report."""
-    return _render("recording.html", page, here="overview")
+    return render("recording.html", page, here="overview")
 
 
 def sql_page(page: SqlPage) -> str:
     """Return the workbench for queries."""
     schema = {table["name"]: [row["name"] for row in table["columns"]] for table in page.tables}
-    return _render(
+    return render(
         "sql.html",
         page,
         here="sql",
@@ -262,7 +262,7 @@ def _chart_template() -> dict[str, Any]:
 
 def error_page(page: ErrorPage) -> str:
     """Return what went wrong in the look of all pages."""
-    return _render("error.html", page, here="")
+    return render("error.html", page, here="")
 
 
 EXAMPLES: tuple[tuple[str, str], ...] = (
@@ -459,9 +459,3 @@ def _plain(column: NDArray[Any]) -> list[Any]:
     """Return a column as plain values, with None for what is not known."""
     values: list[Any] = column.tolist()
     return [None if isinstance(value, float) and math.isnan(value) else value for value in values]
-
-
-def _render(template: str, page: Any, **more: Any) -> str:
-    """Fill a template with the fields of a page and what was made of them."""
-    context = {field.name: getattr(page, field.name) for field in fields(page)}
-    return environment().get_template(template).render(**context, **more)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+from dataclasses import fields
 from datetime import UTC, datetime
 from functools import cache
 from typing import Any
@@ -50,6 +51,12 @@ def environment() -> Environment:
     )
     made.globals.update(assets=assets)
     return made
+
+
+def render(template: str, page: Any, **more: Any) -> str:
+    """Fill a template with the fields of a page and what was made of them."""
+    context = {field.name: getattr(page, field.name) for field in fields(page)}
+    return environment().get_template(template).render(**context, **more)
 
 
 def json_block(value: Any) -> Markup:
