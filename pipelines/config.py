@@ -166,6 +166,9 @@ class ResectionConfig:
     methods : tuple of str
         Resection methods to run, of ``RESECTION_METHODS``; the first is the one that counts.
         free_station: it uses all that a centre tells.
+    subset_methods : tuple of str
+        Methods by which the station is positioned from each pair and each triple of its markers
+        too, to show what the included angle does. Ours and the study's.
     match_tolerance : float
         A marker farther than this from every control mark is a false one [m].
     test_level : float
@@ -182,6 +185,7 @@ class ResectionConfig:
     """
 
     methods: tuple[str, ...] = ("free_station",)
+    subset_methods: tuple[str, ...] = ("free_station", "paper")
     match_tolerance: float = 0.15
     test_level: float = 0.001
     test_power: float = 0.80
@@ -190,6 +194,7 @@ class ResectionConfig:
 
     def __post_init__(self) -> None:
         _check_methods("resection.methods", self.methods, RESECTION_METHODS)
+        _check_methods("resection.subset_methods", self.subset_methods, RESECTION_METHODS)
         _check("resection.match_tolerance", self.match_tolerance, 0.01, 2.0)
         _check("resection.test_level", self.test_level, 1e-6, 0.2)
         _check("resection.test_power", self.test_power, 0.5, 0.999)

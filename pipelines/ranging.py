@@ -19,13 +19,12 @@ from pipelines.adjustment import (
     adjust,
     external_reliabilities,
     snoop,
-    solve,
 )
 from pipelines.config import ResectionConfig
 from pipelines.errors import DegenerateGeometryError
 from pipelines.geometry import included_angle, rigid, rot_z, skew
 from pipelines.matching import Match, Scene
-from pipelines.values import Array, Exclusion, Index, Mask, PairFixes, StationFix, Status
+from pipelines.values import Array, Exclusion, Index, Mask, StationFix, Status
 
 Measure = Callable[[Array], tuple[Array, Array]]
 """Gives what is measured of vectors, (..., 3), and its derivative by them."""
@@ -113,7 +112,7 @@ def fix_by_ranges(
 
     def adjusted(keep: Mask) -> Adjustment[Array]:
         return adjust(
-            lambda p: (_observe(measure, scene, pairs[keep], p),),
+            lambda p: (observe_distances(measure, scene, pairs[keep], p),),
             lambda p, dp: np.asarray(p + dp),
             match.T_site_base[:3, 3],
             test_level=config.test_level,
@@ -140,45 +139,25 @@ def fix_by_ranges(
     return _fix(name, measure, scene, pairs[keep], adjustment, every)
 
 
-def pairs_by_circles(scene: Scene, pairs: Index, start: Array) -> PairFixes:
-    """Position a station from two circles, for each pair of marks.
+def observe_distances(measure: Measure, scene: Scene, pairs: Index, p: Array) -> Observations:
+    """Linearise what is measured at positions.
 
     Parameters
     ----------
+    measure : callable
+        ``circles`` or ``slope_ranges``.
     scene : Scene
         Centres and marks.
-    pairs : (n, 2, 2)
-        For each pair, places among centres and marks.
-    start : (3,)
-        Approximate position, relative to the middle; it chooses between the two intersections [m].
+    pairs : (..., k, 2)
+        Places among centres and marks.
+    p : (..., 3)
+        Positions, relative to the middle of the marks [m].
 
     Returns
     -------
-    PairFixes
-        Pairs whose circles touch rather than cut are left out.
+    Observations
+        With covariances of centres, marks and levelling.
     """
-    v, w = np.moveaxis(scene.centres_base[pairs[..., 0]], 1, 0) @ scene.R_station_base.T
-    flat = np.array([1.0, 1.0, 0.0])
-    angles = included_angle(v * flat, w * flat)
-    cut = np.sin(angles) > 0.05  # [rad] 3 deg
-    pairs = pairs[cut]
-    solution = solve(
-        lambda p: (_observe(circles, scene, pairs, p),),
-        lambda p, dp: np.asarray(p + dp),
-        np.tile(start, (len(pairs), 1)),
-    )
-    return PairFixes(
-        method="paper",
-        marks=pairs[..., 1],
-        included_angles=included_angle(v, w)[cut],
-        included_angles_horizontal=angles[cut],
-        p_site=solution.estimate + scene.middle,
-        sigma_3d=np.sqrt(np.trace(solution.cov, axis1=1, axis2=2)),
-    )
-
-
-def _observe(measure: Measure, scene: Scene, pairs: Index, p: Array) -> Observations:
-    """Linearise what is measured at positions, (..., 3); ``pairs`` is (..., k, 2)."""
     levelled, cov_levelled = _levelled(scene, pairs)
     marks = scene.marks_site[pairs[..., 1]]
     measured, by_centre = measure(levelled)

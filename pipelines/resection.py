@@ -7,7 +7,6 @@ A free station: the unknown is the full pose of ``base`` in ``site``; centres ar
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
 from functools import partial
 
 import numpy as np
@@ -16,8 +15,8 @@ from pipelines.adjustment import Adjustment, adjust, external_reliabilities, sno
 from pipelines.config import ResectionConfig
 from pipelines.errors import ConfigError, DegenerateGeometryError, NoMarkersError
 from pipelines.geometry import included_angle, inverse, rigid, skew, transform
-from pipelines.matching import Match, Scene, gather, match_marks, moved, observe, solve_pose
-from pipelines.ranging import fix_by_ranges, pairs_by_circles
+from pipelines.matching import Match, Scene, gather, match_marks, moved, observe
+from pipelines.ranging import fix_by_ranges
 from pipelines.values import (
     Array,
     ControlMarks,
@@ -25,7 +24,6 @@ from pipelines.values import (
     Index,
     MarkerFits,
     Mask,
-    PairFixes,
     StationFix,
     Status,
 )
@@ -67,33 +65,9 @@ def resect(
     AmbiguousMatchError
         If they agree in two different ways equally well.
     """
-    return _method(method).resect(fits, marks, config)
-
-
-def resect_pairs(
-    method: str, fix: StationFix, fits: MarkerFits, marks: ControlMarks, config: ResectionConfig
-) -> PairFixes:
-    """Position a station from each pair of its markers alone, gravity included.
-
-    Parameters
-    ----------
-    method : str
-        One of ``RESECTION_METHODS``.
-    fix : StationFix
-        The fix from all markers: its matches and its pose as approximate value.
-    fits : MarkerFits
-        The fits that it came from.
-    marks : ControlMarks
-        The marks that it came from.
-    config : ResectionConfig
-        As for the fix.
-
-    Returns
-    -------
-    PairFixes
-        One row per pair; pairs on a plumb line give no heading and are left out.
-    """
-    return _method(method).resect_pairs(fix, fits, marks, config)
+    if method not in _METHODS:
+        raise ConfigError(f"There is no resection method {method!r}; known: {', '.join(_METHODS)}.")
+    return _METHODS[method](fits, marks, config)
 
 
 def free_station(fits: MarkerFits, marks: ControlMarks, config: ResectionConfig) -> StationFix:
@@ -348,50 +322,6 @@ def _position_by_motion(T: Array) -> Array:
     return np.concatenate([-skew(p), np.broadcast_to(np.eye(3), (*p.shape, 3))], axis=-1)
 
 
-def free_station_pairs(
-    fix: StationFix, fits: MarkerFits, marks: ControlMarks, config: ResectionConfig
-) -> PairFixes:
-    """Position a station from each pair of its markers and gravity, all pairs at once.
-
-    Parameters
-    ----------
-    fix : StationFix
-        The fix from all markers.
-    fits : MarkerFits
-        The fits that it came from.
-    marks : ControlMarks
-        The marks that it came from.
-    config : ResectionConfig
-        As for the fix.
-
-    Returns
-    -------
-    PairFixes
-        With the sigma that the same model gives each pair.
-    """
-    scene = gather(fits, marks, config)
-    first, second = np.triu_indices(len(fix.matches), 1)
-    pairs = np.stack([fix.matches[first], fix.matches[second]], axis=1)
-    pairs = pairs[np.array([_has_heading(scene, pair) for pair in pairs], dtype=np.bool_)]
-    start = fix.T_site_station @ rigid(scene.R_station_base, np.zeros(3))
-    start[:3, 3] -= scene.middle
-    solution = solve_pose(scene, pairs, np.tile(start, (len(pairs), 1, 1)))
-    J = _position_by_motion(solution.estimate)
-    cov_p_site = J @ solution.cov @ np.swapaxes(J, -1, -2)
-    v, w = np.moveaxis(scene.centres_base[pairs[..., 0]], 1, 0)
-    flat = np.array([1.0, 1.0, 0.0])
-    return PairFixes(
-        method="free_station",
-        marks=pairs[..., 1],
-        included_angles=included_angle(v, w),
-        included_angles_horizontal=included_angle(
-            v @ scene.R_station_base.T * flat, w @ scene.R_station_base.T * flat
-        ),
-        p_site=solution.estimate[:, :3, 3] + scene.middle,
-        sigma_3d=np.sqrt(np.trace(cov_p_site, axis1=1, axis2=2)),
-    )
-
-
 def _by_ranges(
     name: str, fits: MarkerFits, marks: ControlMarks, config: ResectionConfig
 ) -> StationFix:
@@ -403,48 +333,8 @@ def _by_ranges(
     return fix_by_ranges(name, scene, match, config, tuple(excluded))
 
 
-def _pairs_by_circles(
-    fix: StationFix, fits: MarkerFits, marks: ControlMarks, config: ResectionConfig
-) -> PairFixes:
-    """Position a station from the circles about each two of its marks."""
-    scene = gather(fits, marks, config)
-    first, second = np.triu_indices(len(fix.matches), 1)
-    pairs = np.stack([fix.matches[first], fix.matches[second]], axis=1)
-    return pairs_by_circles(scene, pairs, fix.p_site - scene.middle)
-
-
-def _no_pairs(
-    fix: StationFix, _fits: MarkerFits, _marks: ControlMarks, _config: ResectionConfig
-) -> PairFixes:
-    """Return no pairs: two slope distances leave a whole circle of positions."""
-    nothing = np.zeros(0)
-    return PairFixes(
-        method=fix.method,
-        marks=np.zeros((0, 2), dtype=np.intp),
-        included_angles=nothing.copy(),
-        included_angles_horizontal=nothing.copy(),
-        p_site=np.zeros((0, 3)),
-        sigma_3d=nothing.copy(),
-    )
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class _Method:
-    """What a resection method can do."""
-
-    resect: Callable[[MarkerFits, ControlMarks, ResectionConfig], StationFix]
-    resect_pairs: Callable[[StationFix, MarkerFits, ControlMarks, ResectionConfig], PairFixes]
-
-
-_METHODS = {
-    "free_station": _Method(free_station, free_station_pairs),
-    "ranges": _Method(partial(_by_ranges, "ranges"), _no_pairs),
-    "paper": _Method(partial(_by_ranges, "paper"), _pairs_by_circles),
+_METHODS: dict[str, Callable[[MarkerFits, ControlMarks, ResectionConfig], StationFix]] = {
+    "free_station": free_station,
+    "ranges": partial(_by_ranges, "ranges"),
+    "paper": partial(_by_ranges, "paper"),
 }
-
-
-def _method(name: str) -> _Method:
-    """Return the named method."""
-    if name not in _METHODS:
-        raise ConfigError(f"There is no resection method {name!r}; known: {', '.join(_METHODS)}.")
-    return _METHODS[name]

@@ -13,18 +13,19 @@ from pipelines.config import SurveyConfig
 from pipelines.errors import NoMarkersError, SolveError
 from pipelines.extraction import extract
 from pipelines.fitting import fit_markers
-from pipelines.resection import resect, resect_pairs
+from pipelines.resection import resect
 from pipelines.stitching import choose_rig, split_stops, stitch
+from pipelines.subsets import resect_subsets
 from pipelines.values import (
     ControlMarks,
     MarkerFits,
     NoFix,
-    PairFixes,
     Rig,
     ScanLog,
     StationFix,
     Status,
     StopResult,
+    SubsetFixes,
 )
 
 Progress = Callable[[float, str], None]
@@ -108,10 +109,12 @@ def _process_stop(
             )
     progress(0.8, "Positioning the station")
     with _timed(timings, "resection"):
-        fixes, pairs = _position(fits, marks, config, cloud.coverage)
+        fixes = _position(fits, marks, config, cloud.coverage)
+    with _timed(timings, "subsets"):
+        subsets = _subsets(fits, fixes, marks, config)
     progress(1.0, f"{log.origin.name} done")
     return StopResult(
-        name=log.origin.name, cloud=cloud, fits=fits, fixes=fixes, pairs=pairs, timings=timings
+        name=log.origin.name, cloud=cloud, fits=fits, fixes=fixes, subsets=subsets, timings=timings
     )
 
 
@@ -120,23 +123,42 @@ def _position(
     marks: ControlMarks | None,
     config: SurveyConfig,
     coverage: float,
-) -> tuple[dict[tuple[str, str], StationFix | NoFix], dict[tuple[str, str], PairFixes]]:
+) -> dict[tuple[str, str], StationFix | NoFix]:
     """Position the station from each set of fits by each resection method."""
     fixes: dict[tuple[str, str], StationFix | NoFix] = {}
-    pairs: dict[tuple[str, str], PairFixes] = {}
     if marks is None:
-        return fixes, pairs
+        return fixes
     for fit_method, centres in fits.items():
         for method in config.resection.methods:
-            key = (fit_method, method)
             try:
                 fix = resect(method, centres, marks, config.resection)
             except SolveError as error:
-                fixes[key] = NoFix(method=method, code=error.code, reason=str(error))
-                continue
-            fixes[key] = _qualified(fix, coverage)
-            pairs[key] = resect_pairs(method, fix, centres, marks, config.resection)
-    return fixes, pairs
+                no = NoFix(method=method, code=error.code, reason=str(error))
+                fixes[fit_method, method] = no
+            else:
+                fixes[fit_method, method] = _qualified(fix, coverage)
+    return fixes
+
+
+def _subsets(
+    fits: dict[str, MarkerFits],
+    fixes: dict[tuple[str, str], StationFix | NoFix],
+    marks: ControlMarks | None,
+    config: SurveyConfig,
+) -> dict[tuple[str, str], tuple[SubsetFixes, ...]]:
+    """Position the station from all pairs and triples of the fix that uses most markers."""
+    found: dict[tuple[str, str], tuple[SubsetFixes, ...]] = {}
+    if marks is None:
+        return found
+    for fit_method, centres in fits.items():
+        own = [f for (m, _), f in fixes.items() if m == fit_method and isinstance(f, StationFix)]
+        if not own:
+            continue
+        fix = max(own, key=lambda one: len(one.matches))
+        for method in config.resection.subset_methods:
+            key = (fit_method, method)
+            found[key] = resect_subsets(method, fix, centres, marks, config.resection)
+    return found
 
 
 def _qualified(fix: StationFix, coverage: float) -> StationFix:

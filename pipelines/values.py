@@ -678,21 +678,24 @@ class StationFix:
 
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
-class PairFixes:
-    """The station positioned from each pair of marks alone, one row per pair.
+class SubsetFixes:
+    """The station positioned from every k of its marks alone, one row per subset.
 
     Attributes
     ----------
     method : str
         Name of the resection method.
-    marks : (n, 2)
-        Places of the two marks among the control marks.
-    included_angles : (n,)
-        3-D angle at the station between the two centres [rad].
-    included_angles_horizontal : (n,)
+    marks : (n, k)
+        Places of the marks among the control marks; k is 2 for pairs, 3 for triples.
+    included_angles : (n, 2)
+        Smallest and largest 3-D angle at the station between two of the centres; equal for pairs
+        [rad].
+    included_angles_horizontal : (n, 2)
         The same in the levelled plane [rad].
     p_site : (n, 3)
         Position of the station [m].
+    sigma_horizontal : (n,)
+        Square root of the trace of the covariance of x and y [m].
     sigma_3d : (n,)
         Square root of the trace of the position's covariance [m].
     """
@@ -702,14 +705,16 @@ class PairFixes:
     included_angles: Array
     included_angles_horizontal: Array
     p_site: Array
+    sigma_horizontal: Array
     sigma_3d: Array
 
     def __post_init__(self) -> None:
-        columns: dict[str, Shape] = dict.fromkeys(
-            ("included_angles", "included_angles_horizontal", "sigma_3d"), (None,)
+        angles: dict[str, Shape] = dict.fromkeys(
+            ("included_angles", "included_angles_horizontal"), (None, 2)
         )
-        _seal(self, marks=(None, 2), p_site=(None, 3), **columns)
-        _same_length(self, "marks", "p_site", *columns)
+        sigmas: dict[str, Shape] = dict.fromkeys(("sigma_horizontal", "sigma_3d"), (None,))
+        _seal(self, marks=(None, None), p_site=(None, 3), **angles, **sigmas)
+        _same_length(self, "marks", "p_site", *angles, *sigmas)
 
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
@@ -745,8 +750,8 @@ class StopResult:
         By fitting method.
     fixes : mapping of (str, str) to StationFix or NoFix
         By fitting and resection method; empty when there are no control marks.
-    pairs : mapping of (str, str) to PairFixes
-        For each fix, the station from each pair of its marks.
+    subsets : mapping of (str, str) to tuple of SubsetFixes
+        The station from each pair and each triple of its marks, by fitting and resection method.
     timings : mapping of str to float
         Time that each step took [s].
     """
@@ -755,7 +760,7 @@ class StopResult:
     cloud: StitchedCloud
     fits: Mapping[str, MarkerFits]
     fixes: Mapping[tuple[str, str], StationFix | NoFix]
-    pairs: Mapping[tuple[str, str], PairFixes]
+    subsets: Mapping[tuple[str, str], tuple[SubsetFixes, ...]]
     timings: Mapping[str, float] = field(default_factory=dict)
 
 

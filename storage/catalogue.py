@@ -147,7 +147,8 @@ _REFRESH = {
             AND x.fit_method = i.fit_method AND x.resection_method = i.resection_method
     """,
     "resections": """
-        UPDATE resections AS x SET error_3d_m = i.error_3d_m
+        UPDATE resections AS x
+        SET error_horizontal_m = i.error_horizontal_m, error_3d_m = i.error_3d_m
         FROM incoming AS i WHERE x.run_id = i.run_id AND x.stop = i.stop
             AND x.fit_method = i.fit_method AND x.resection_method = i.resection_method
             AND x.marks = i.marks

@@ -33,6 +33,7 @@ from pipelines.values import (
     StopTruth,
     Truth,
 )
+from storage.resections import resections_table, resections_with_errors
 
 _TO_95 = float(np.sqrt(chi2.ppf(0.95, 2)))  # from the standard ellipse to the 95 % ellipse
 _TEXT, _REAL, _WHOLE, _LONG = pa.string(), pa.float64(), pa.int32(), pa.int64()
@@ -116,6 +117,8 @@ _SCHEMAS = {
         "sigma_3d_m": _REAL,
         **_PLACE,
         "error_3d_m": _REAL,
+        **dict.fromkeys(("included_angle_max_deg", "sigma_horizontal_m"), _REAL),
+        "error_horizontal_m": _REAL,
     },
 }
 TABLES = tuple(_SCHEMAS)
@@ -203,7 +206,10 @@ def tables(
         names = () if marks is None else marks.names
         for table, found in _stop_rows(stop, names, (clouds or {}).get(stop.name)).items():
             rows[table] += [{"run_id": run.run_id, "stop": stop.name, **row} for row in found]
-    return with_errors({name: _table(name, rows[name]) for name in TABLES}, truth)
+    made = {name: _table(name, rows[name]) for name in TABLES}
+    names = () if marks is None else marks.names
+    made["resections"] = resections_table(run.run_id, stops, names, made["resections"].schema)
+    return with_errors(made, truth)
 
 
 def with_errors(known: Mapping[str, pa.Table], truth: Truth | None) -> dict[str, pa.Table]:
@@ -229,10 +235,12 @@ def with_errors(known: Mapping[str, pa.Table], truth: Truth | None) -> dict[str,
         out["marker_fits"] = _with_columns(known["marker_fits"], errors)
     elif "marker_fits" in known:
         out["marker_fits"] = _with_columns(known["marker_fits"], [{}] * len(known["marker_fits"]))
-    for name, compare in (("station_fixes", _station_errors), ("resections", _pair_errors)):
-        if name in known:
-            errors = [compare(row, truths.get(row["stop"])) for row in known[name].to_pylist()]
-            out[name] = _with_columns(known[name], errors)
+    if "station_fixes" in known:
+        fixes = known["station_fixes"].to_pylist()
+        errors = [_station_errors(row, truths.get(row["stop"])) for row in fixes]
+        out["station_fixes"] = _with_columns(known["station_fixes"], errors)
+    if "resections" in known:
+        out["resections"] = resections_with_errors(known["resections"], truths)
     return out
 
 
@@ -285,9 +293,6 @@ def _stop_rows(
         if isinstance(fix, StationFix):
             n_fits = len(stop.fits[fit_method].fits)
             rows["observations"] += [label | row for row in _observation_rows(fix, n_fits, names)]
-    for (fit_method, method), _ in stop.pairs.items():
-        label = {"fit_method": fit_method, "resection_method": method}
-        rows["resections"] += [label | row for row in _pair_rows(stop, fit_method, method, names)]
     return rows
 
 
@@ -427,22 +432,6 @@ def _observation_rows(fix: StationFix, n_fits: int, names: tuple[str, ...]) -> l
     return rows
 
 
-def _pair_rows(stop: StopResult, fit_method: str, method: str, names: tuple[str, ...]) -> list[Row]:
-    """Return one row of ``resections`` for each pair of marks."""
-    pairs = stop.pairs[fit_method, method]
-    return [
-        {
-            "marks": [names[i] for i in pairs.marks[k]],
-            "n_marks": 2,
-            "included_angle_deg": np.degrees(pairs.included_angles[k]),
-            "included_angle_horizontal_deg": np.degrees(pairs.included_angles_horizontal[k]),
-            "sigma_3d_m": pairs.sigma_3d[k],
-            **_place(pairs.p_site[k]),
-        }
-        for k in range(len(pairs.marks))
-    ]
-
-
 def _matched(stop: StopResult, fit_method: str, names: tuple[str, ...]) -> dict[int, str]:
     """Return the control mark of each fit that the method's first station used."""
     for (method, _), fix in stop.fixes.items():
@@ -463,9 +452,26 @@ def _cov(cov: Array) -> Row:
 
 def _table(name: str, rows: Sequence[Row]) -> pa.Table:
     """Return rows as an Arrow table in the shape of a table of the database."""
-    schema = pa.schema(list(_SCHEMAS[name].items()))
+    return table_of(_SCHEMAS[name], rows)
+
+
+def table_of(columns: Mapping[str, pa.DataType], rows: Sequence[Row]) -> pa.Table:
+    """Return rows as an Arrow table.
+
+    Parameters
+    ----------
+    columns : mapping of str to DataType
+        Its columns, in their order.
+    rows : sequence of dict
+        What a row does not tell is NULL, and so is what is not finite.
+
+    Returns
+    -------
+    Table
+        One row for each.
+    """
     plain = [{key: _plain(value) for key, value in row.items()} for row in rows]
-    return pa.Table.from_pylist(plain, schema=schema)
+    return pa.Table.from_pylist(plain, schema=pa.schema(list(columns.items())))
 
 
 def _plain(value: object) -> object:
@@ -536,14 +542,6 @@ def _station_errors(row: Row, truth: StopTruth | None) -> Row:
         "error_horizontal_m": np.hypot(*error.error_site[:2]),
         "error_3d_m": error.error_3d,
     }
-
-
-def _pair_errors(row: Row, truth: StopTruth | None) -> Row:
-    """Return the error of a row of ``resections``."""
-    if truth is None or row["x_m"] is None:
-        return {}
-    p_site = np.array([row["x_m"], row["y_m"], row["z_m"]])
-    return {"error_3d_m": np.linalg.norm(p_site - truth.T_site_base[:3, 3])}
 
 
 def _errors(error: Array) -> Row:

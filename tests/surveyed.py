@@ -2,6 +2,7 @@
 
 import hashlib
 from datetime import UTC, datetime, timedelta
+from itertools import combinations
 from pathlib import Path
 
 import numpy as np
@@ -14,13 +15,13 @@ from pipelines.values import (
     Levelling,
     MarkerFit,
     MarkerFits,
-    PairFixes,
     Rejection,
     StationFix,
     Status,
     StitchedCloud,
     StopResult,
     StopTruth,
+    SubsetFixes,
     Truth,
 )
 from storage.catalogue import Catalogue
@@ -51,9 +52,9 @@ def stop(name, p_site, control, rng):
     members, cloud = _cloud(name, centres, rng)
     fits = {method: _fits(method, centres, members, cloud, rng) for method in NOISE}
     fixes = {(m, "free_station"): _fix(truth, control, fits[m], rng) for m in fits}
-    pairs = {(m, "free_station"): _pairs(truth, centres, m, rng) for m in fits}
+    subsets = {(m, "free_station"): _subsets(truth, centres, m, rng) for m in fits}
     result = StopResult(
-        name=name, cloud=cloud, fits=fits, fixes=fixes, pairs=pairs, timings={"stitch": 0.4}
+        name=name, cloud=cloud, fits=fits, fixes=fixes, subsets=subsets, timings={"stitch": 0.4}
     )
     return result, truth
 
@@ -142,19 +143,26 @@ def _fix(truth, control, fits, rng):
     )
 
 
-def _pairs(truth, centres, method, rng):
-    """Return the station from each pair of marks."""
-    first, second = np.triu_indices(len(centres), 1)
-    angles = included_angle(centres[first], centres[second])
-    sigma = 0.004 / np.sqrt(np.maximum(np.sin(angles), 0.05))
-    errors = rng.normal(size=(len(first), 3)) * sigma[:, None]
+def _subsets(truth, centres, method, rng):
+    """Return the station from each pair and each triple of marks."""
+    return tuple(_subsets_of(size, truth, centres, method, rng) for size in (2, 3))
+
+
+def _subsets_of(size, truth, centres, method, rng):
+    chosen = np.array(list(combinations(range(len(centres)), size)))
+    first, second = np.triu_indices(size, 1)
+    angles = included_angle(centres[chosen[:, first]], centres[chosen[:, second]])
+    spread = np.stack([angles.min(axis=1), angles.max(axis=1)], axis=1)
+    sigma = 0.004 / np.sqrt(np.maximum(np.sin(spread[:, 1]), 0.05))
+    errors = rng.normal(size=(len(chosen), 3)) * sigma[:, None]
     bias = 0.02 if method == "paper" else 0.0
-    return PairFixes(
+    return SubsetFixes(
         method="free_station",
-        marks=np.column_stack([first, second]),
-        included_angles=angles,
-        included_angles_horizontal=angles,
+        marks=chosen,
+        included_angles=spread,
+        included_angles_horizontal=spread.copy(),
         p_site=truth.T_site_base[:3, 3] + errors + bias,
+        sigma_horizontal=np.sqrt(2.0) * sigma,
         sigma_3d=np.sqrt(3.0) * sigma,
     )
 

@@ -21,6 +21,7 @@ FRAMELESS = {  # counts, clocks, scalars per row, and tables of the sensor: no c
     "intensities", "rings", "gimbal_angles", "times", "ranges", "members", "used", "rejected",
     "residuals", "matches", "redundancies", "w_statistics", "detectable_biases", "marks",
     "external_reliabilities", "included_angles", "included_angles_horizontal", "sigma_3d",
+    "sigma_horizontal",
     "divergence", "laser_elevations", "laser_heights", "laser_range_biases",
     "encoder_eccentricity",
 }  # fmt: skip

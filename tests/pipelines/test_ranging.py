@@ -9,7 +9,7 @@ from pipelines.config import ResectionConfig
 from pipelines.errors import DegenerateGeometryError
 from pipelines.geometry import inverse, levelling_rotation, log_motion, rigid
 from pipelines.ranging import circles, slope_ranges
-from pipelines.resection import resect, resect_pairs
+from pipelines.resection import resect
 from tests.synthetic import control, field, pose, sightings
 
 EXACT = 1e-7  # [m] and [rad] noise-free in, truth out
@@ -110,22 +110,3 @@ def test_two_marks_are_refused(method):
     fits = sightings(marks, pose([0, 0, 0.8], 0.3))
     with pytest.raises(DegenerateGeometryError, match="three are needed"):
         resect(method, fits, marks, CONFIG)
-
-
-def test_two_circles_have_the_error_that_the_theory_says(rng):
-    marks = field(rng)
-    sigma = 4e-3
-    fits = sightings(marks, pose([0.0, 0.0, 0.9], 1.0), sigma_level=1e-6)
-    fix = resect("paper", fits, marks, CONFIG)
-    pairs = resect_pairs("paper", fix, fits, marks, CONFIG)
-    assert len(pairs.marks) == 3
-    theory = sigma * np.sqrt(2.0 / np.sin(pairs.included_angles_horizontal) ** 2 + 0.5)
-    np.testing.assert_allclose(pairs.sigma_3d, theory, rtol=0.02)  # height: mean of two
-    np.testing.assert_allclose(pairs.p_site, np.tile([0.0, 0.0, 0.9], (3, 1)), rtol=0, atol=EXACT)
-
-
-def test_slope_distances_have_no_pairs(rng):
-    marks = field(rng)
-    fits = sightings(marks, pose([0.0, 0.0, 0.9], 1.0))
-    fix = resect("ranges", fits, marks, CONFIG)
-    assert len(resect_pairs("ranges", fix, fits, marks, CONFIG).marks) == 0

@@ -9,7 +9,7 @@ from scipy.stats import chi2
 from pipelines.config import ResectionConfig
 from pipelines.errors import ConfigError, DegenerateGeometryError, NoMarkersError
 from pipelines.geometry import inverse, levelling_rotation, log_motion, rigid
-from pipelines.resection import resect, resect_pairs
+from pipelines.resection import resect
 from pipelines.values import Levelling, Status
 from tests.synthetic import control, field, lean_matrix, marker_fit, pose, sightings, turn_z
 
@@ -282,52 +282,3 @@ def test_included_angles_are_those_at_the_station():
     fix = free(sightings(marks, pose((0, 0, 0.8), 1.0)), marks)
     flat = np.arctan2(0.6, 5.0)
     np.testing.assert_allclose(fix.included_angles, [np.pi / 2, np.pi - flat], rtol=0, atol=EXACT)
-
-
-def test_pairs_are_all_pairs_with_their_angles_and_places(rng):
-    marks = field(rng)
-    T = pose(STAND, 2.2, LEAN)
-    fits = sightings(marks, T, lean=LEAN)
-    pairs = resect_pairs("free_station", free(fits, marks), fits, marks, CONFIG)
-    assert len(pairs.marks) == 91
-    np.testing.assert_allclose(pairs.p_site, np.broadcast_to(T[:3, 3], (91, 3)), rtol=0, atol=EXACT)
-    v = marks.p_site - T[:3, 3]
-    first, second = pairs.marks.T
-    for shown, of in ((pairs.included_angles, v), (pairs.included_angles_horizontal, v[:, :2])):
-        unit = of / np.linalg.norm(of, axis=1, keepdims=True)
-        cosines = np.sum(unit[first] * unit[second], axis=1)
-        np.testing.assert_allclose(np.cos(shown), cosines, rtol=0, atol=1e-6)
-
-
-def test_a_pair_has_the_sigma_of_a_fix_from_two_marks(rng):
-    marks = field(rng)
-    T = pose(STAND, 2.2, LEAN)
-    fits = sightings(marks, T, lean=LEAN, noise=rng.normal(0, 4e-3, (14, 3)))
-    pairs = resect_pairs("free_station", free(fits, marks), fits, marks, CONFIG)
-    row = int(np.flatnonzero(np.all(pairs.marks == [2, 9], axis=1))[0])
-    alone = free(replace(fits, fits=(fits.fits[2], fits.fits[9])), control(marks.p_site[[2, 9]]))
-    np.testing.assert_allclose(pairs.p_site[row], alone.p_site, rtol=0, atol=1e-8)
-    assert pairs.sigma_3d[row] == pytest.approx(alone.sigma_3d, rel=1e-5)
-
-
-def test_pairs_of_opposite_marks_are_best_and_of_neighbours_worst():
-    # known theory: sigma sqrt(1 + cot^2(angle / 2) / 2) per horizontal axis pair, heading unknown
-    sigma = 5e-3
-    for angle in np.radians([30, 60, 90, 120, 150, 179]):
-        marks = control(
-            [[7.5, 0, 0.5], [7.5 * np.cos(angle), 7.5 * np.sin(angle), 1.1], [-3, 2, 0.6]]
-        )
-        fits = sightings(marks, pose((0, 0, 0.8), 0.4), cov=np.eye(3) * sigma**2, sigma_level=1e-6)
-        exact = replace(CONFIG, sigma_common=0.0)
-        pairs = resect_pairs("free_station", free(fits, marks, exact), fits, marks, exact)
-        horizontal = sigma**2 * (1 + 1 / np.tan(angle / 2) ** 2 / 2)
-        expected = np.sqrt(horizontal + sigma**2 / 2)
-        assert pairs.sigma_3d[0] == pytest.approx(expected, rel=0.02)
-
-
-def test_a_pair_on_a_plumb_line_is_left_out():
-    marks = control([[5, 0, 0.5], [5, 0, 1.7], [0, 6, 0.9], [-4, -3, 1.3]])
-    fits = sightings(marks, pose((0, 0, 0.8), 0.4))
-    pairs = resect_pairs("free_station", free(fits, marks), fits, marks, CONFIG)
-    assert len(pairs.marks) == 5
-    assert [0, 1] not in pairs.marks.tolist()

@@ -13,13 +13,13 @@ from pipelines.values import (
     Levelling,
     MarkerFits,
     NoFix,
-    PairFixes,
     Rejection,
     StationFix,
     Status,
     StitchedCloud,
     StopResult,
     StopTruth,
+    SubsetFixes,
     Truth,
 )
 from storage.results import RunInfo, tables
@@ -123,13 +123,23 @@ def stop(name="L1S1", seed=3):
     """A stop with two fitting methods, of which the second one could not be positioned."""
     rng = np.random.default_rng(seed)
     points = cloud(name, rng)
-    pairs = PairFixes(
+    pairs = SubsetFixes(
         method="free_station",
         marks=np.array([[0, 1], [0, 2]]),
-        included_angles=np.radians([32.0, 75.0]),
-        included_angles_horizontal=np.radians([29.0, 74.0]),
+        included_angles=np.radians([[32.0, 32.0], [75.0, 75.0]]),
+        included_angles_horizontal=np.radians([[29.0, 29.0], [74.0, 74.0]]),
         p_site=np.array([P_SITE + np.array([0.01, 0, 0]), [np.nan] * 3]),
+        sigma_horizontal=np.array([0.015, np.nan]),
         sigma_3d=np.array([0.02, np.nan]),
+    )
+    triples = SubsetFixes(
+        method="free_station",
+        marks=np.array([[0, 1, 2]]),
+        included_angles=np.radians([[32.0, 107.0]]),
+        included_angles_horizontal=np.radians([[29.0, 103.0]]),
+        p_site=np.array([P_SITE + np.array([0.003, 0.004, 0.012])]),
+        sigma_horizontal=np.array([0.006]),
+        sigma_3d=np.array([0.013]),
     )
     no = NoFix(method="free_station", code="solve.no_match", reason="No match.")
     return StopResult(
@@ -140,7 +150,7 @@ def stop(name="L1S1", seed=3):
             "paper": fits("paper", 5 * SHIFT_BASE, points.p_base, rng),
         },
         fixes={("along_beam", "free_station"): fix(rng), ("paper", "free_station"): no},
-        pairs={("along_beam", "free_station"): pairs},
+        subsets={("along_beam", "free_station"): (pairs, triples)},
         timings={"stitching": 0.1},
     )
 

@@ -120,9 +120,6 @@ def test_errors_of_the_station_are_along_the_axes_of_the_site():
     np.testing.assert_allclose(error, SHIFT_SITE, rtol=0, atol=1e-12)
     assert row["error_horizontal_m"] == pytest.approx(np.hypot(*SHIFT_SITE[:2]), abs=1e-12)
     assert row["error_yaw_deg"] == pytest.approx(0.5, abs=1e-9)
-    first, second = rows(found, "resections")
-    assert first["error_3d_m"] == pytest.approx(0.01, abs=1e-12)
-    assert second["error_3d_m"] is None
 
 
 @pytest.mark.parametrize("known", [None, truth("another")])
@@ -195,12 +192,30 @@ def test_every_marker_of_a_fix_has_an_observation_that_says_whether_it_was_used(
     assert found[0]["external_reliability_m"] is None
 
 
-def test_pairs_name_their_marks():
-    first, second = rows(made_tables(), "resections")
+def test_pairs_and_triples_name_their_marks_and_angles():
+    first, second, triple = rows(made_tables(), "resections")
     assert first["marks"] == [MARKS.names[0], MARKS.names[1]]
     assert first["included_angle_deg"] == pytest.approx(32.0)
+    assert first["included_angle_max_deg"] == pytest.approx(32.0)
     np.testing.assert_array_equal(place(first), P_SITE + np.array([0.01, 0, 0]))
-    assert second["x_m"] is None
+    assert second["x_m"] is second["sigma_horizontal_m"] is None
+    assert triple["marks"] == list(MARKS.names[:3])
+    assert [one["n_marks"] for one in (first, second, triple)] == [2, 2, 3]
+    assert triple["included_angle_deg"] == pytest.approx(32.0)
+    assert triple["included_angle_max_deg"] == pytest.approx(107.0)
+
+
+def test_errors_of_pairs_and_triples_are_lengths_in_the_plane_and_in_space():
+    known = truth("L1S1")
+    base = known.stops[0].T_site_base[:3, 3]
+    first, second, triple = rows(made_tables(known), "resections")
+    for row in (first, triple):
+        error = np.array(place(row)) - base
+        assert row["error_3d_m"] == pytest.approx(np.sqrt(error @ error))
+        assert row["error_horizontal_m"] == pytest.approx(np.sqrt(error[:2] @ error[:2]))
+    assert second["error_3d_m"] is None
+    elsewhere = rows(made_tables(truth("another")), "resections")
+    assert [row["error_3d_m"] for row in elsewhere] == [None] * 3
 
 
 def test_a_stop_tells_how_it_was_made():
@@ -229,7 +244,7 @@ def test_rejections_are_kept_with_their_reason():
 
 
 def test_a_stop_without_control_has_centres_and_no_fix():
-    alone = dataclasses.replace(stop(), fixes={}, pairs={})
+    alone = dataclasses.replace(stop(), fixes={}, subsets={})
     found = tables(run(), (alone,))
     assert found["station_fixes"].num_rows == found["observations"].num_rows == 0
     assert found["marker_fits"].num_rows == 14

@@ -1,0 +1,265 @@
+"""The station from every two and every three of its markers: hides a solver of hundreds at once.
+
+Each subset is a small resection of its own, with gravity. All start at the pose from all markers,
+which is right to centimetres, so that the weights can stay as they are there and only the
+geometry is taken anew at each step.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import partial
+from itertools import combinations
+from typing import NamedTuple
+
+import numpy as np
+
+from pipelines.config import ResectionConfig
+from pipelines.errors import ConfigError
+from pipelines.geometry import included_angle, rigid, skew
+from pipelines.matching import Scene, gather, observe
+from pipelines.ranging import Measure, circles, observe_distances, slope_ranges
+from pipelines.values import Array, ControlMarks, Index, MarkerFits, Mask, StationFix, SubsetFixes
+
+SIZES = (2, 3)
+"""How many markers a subset has."""
+
+_UPRIGHT = 0.05  # spread across over spread along a plumb line that tells no heading
+_FLAT = 0.05  # [rad] 3 deg: circles that cut at less than this touch rather than cut
+_USELESS = 1.0  # [m] a position worse than this says nothing of its geometry
+_N_STEPS = 40
+_SETTLED = 1e-7  # [m] and [rad]; steps shrink at least tenfold
+_USABLE = 1e-4  # [m] of the last step, for positions that hardly move any more
+_DAMPING = 1e-9  # of the trace of the normal matrix; keeps singular ones solvable
+
+
+class Positions(NamedTuple):
+    """Positions, (s, 3), with covariances, (s, 3, 3), and whether the steps became small, (s,)."""
+
+    p: Array
+    cov: Array
+    is_settled: Mask
+
+
+_Solve = Callable[[Scene, Index, Index, Array], Positions]
+
+
+def resect_subsets(
+    method: str, fix: StationFix, fits: MarkerFits, marks: ControlMarks, config: ResectionConfig
+) -> tuple[SubsetFixes, ...]:
+    """Position a station from each pair and each triple of its markers alone.
+
+    Parameters
+    ----------
+    method : str
+        One of ``RESECTION_METHODS``; it need not be that of the fix.
+    fix : StationFix
+        The fix from all markers: its matches and its pose as approximate value.
+    fits : MarkerFits
+        The fits that it came from.
+    marks : ControlMarks
+        The marks that it came from.
+    config : ResectionConfig
+        As for the fix.
+
+    Returns
+    -------
+    tuple of SubsetFixes
+        Pairs, then triples. Left out are subsets that tell no position: on a plumb line
+        (``free_station``), circles that touch rather than cut (``paper``), pairs of slope distances
+        (``ranges``), and all whose sigma is above a metre.
+
+    Raises
+    ------
+    ConfigError
+        If there is no such method.
+
+    Notes
+    -----
+    Predicted sigmas are those at the pose from all markers. Cost: 14 markers have 91 pairs and 364
+    triples, which take some milliseconds; it grows with the third power of the markers.
+    """
+    if method not in _METHODS:
+        raise ConfigError(f"There is no resection method {method!r}; known: {', '.join(_METHODS)}.")
+    scene = gather(fits, marks, config)
+    start = fix.T_site_station @ rigid(scene.R_station_base, np.zeros(3))
+    start[:3, 3] -= scene.middle
+    return tuple(_subsets(method, scene, fix.matches, start, size) for size in SIZES)
+
+
+def _subsets(method: str, scene: Scene, matches: Index, start: Array, size: int) -> SubsetFixes:
+    """Solve all subsets of one size."""
+    n = len(matches)
+    chosen = np.array(list(combinations(range(n), size)), dtype=np.intp).reshape(-1, size)
+    is_usable, solve = _METHODS[method]
+    chosen = chosen[is_usable(scene.marks_site[matches[:, 1]] - start[:3, 3], chosen)]
+    found = solve(scene, matches, chosen, start)
+    sigma_3d = np.sqrt(np.trace(found.cov, axis1=1, axis2=2))
+    keep = found.is_settled & (sigma_3d < _USELESS)
+    levelled = scene.centres_base[matches[:, 0]] @ scene.R_station_base.T
+    return SubsetFixes(
+        method=method,
+        marks=matches[chosen[keep], 1],
+        included_angles=_spread_of_angles(levelled, chosen[keep]),
+        included_angles_horizontal=_spread_of_angles(levelled * [1.0, 1.0, 0.0], chosen[keep]),
+        p_site=found.p[keep] + scene.middle,
+        sigma_horizontal=np.sqrt(np.trace(found.cov[keep, :2, :2], axis1=1, axis2=2)),
+        sigma_3d=sigma_3d[keep],
+    )
+
+
+def _angles(v: Array, chosen: Index) -> Array:
+    """Return the angles between each two vectors of each subset, (s, 1) or (s, 3)."""
+    table = included_angle(v[:, None], v[None])
+    first, second = np.triu_indices(chosen.shape[1], 1)
+    return np.asarray(table[chosen[:, first], chosen[:, second]])
+
+
+def _spread_of_angles(v: Array, chosen: Index) -> Array:
+    """Return the smallest and the largest angle between the vectors of each subset, (s, 2)."""
+    angles = _angles(v, chosen)
+    return np.stack([angles.min(axis=1), angles.max(axis=1)], axis=1)
+
+
+def _by_pose(scene: Scene, matches: Index, chosen: Index, start: Array) -> Positions:
+    """Position subsets by their full poses: centres and gravity, as the free station does.
+
+    The motion turns about the station. Weights and normal matrices are those of ``start``; the
+    gradient is exact, so that the steps end where the adjustment of each subset alone would.
+    """
+    R, t = start[:3, :3], start[:3, 3]
+    centres, gravity = observe(scene, matches, start)
+    weights, of_gravity = _inverses(centres.cov)[chosen], _inverses(gravity.cov[0])
+    q = (scene.centres_base[matches[:, 0]] @ R.T)[chosen]
+    goals = (scene.marks_site[matches[:, 1]] - t)[chosen]
+    up = R @ scene.R_station_base[2]
+    cov = _inverses(_normal_matrices(q, weights, up, of_gravity))
+    turn, shift, pull_up = np.zeros((3, len(chosen), 3))
+    step = np.full((len(chosen), 6), np.inf)
+    for _ in range(_N_STEPS):
+        R_turn = _rotations(turn)
+        p = q @ np.swapaxes(R_turn, 1, 2)
+        pulls = (weights @ (p + shift[:, None] - goals)[..., None])[..., 0]
+        leaning = R_turn @ up
+        pull_up[:, :2] = leaning[:, :2] @ of_gravity
+        gradient = np.concatenate(
+            [np.cross(p, pulls).sum(axis=1) + np.cross(leaning, pull_up), pulls.sum(axis=1)], axis=1
+        )
+        step = -(cov @ gradient[..., None])[..., 0]
+        turn, shift = turn + step[:, :3], shift + step[:, 3:]
+        if np.abs(step).max(initial=0.0) < _SETTLED:
+            break
+    is_settled = np.abs(step).max(axis=1, initial=0.0) < _USABLE
+    return Positions(t + shift, cov[:, 3:, 3:], is_settled)
+
+
+def _normal_matrices(q: Array, weights: Array, up: Array, of_gravity: Array) -> Array:
+    """Return the normal matrices of small motions about the station, (s, 6, 6)."""
+    J = np.concatenate([-skew(q), np.broadcast_to(np.eye(3), (*q.shape, 3))], axis=-1)
+    N = np.asarray((np.swapaxes(J, -1, -2) @ weights @ J).sum(axis=1))
+    J_up = -skew(up)[:2]
+    N[:, :3, :3] += J_up.T @ of_gravity @ J_up
+    return N
+
+
+def _inverses(matrices: Array) -> Array:
+    """Return the inverses of the last two dimensions."""
+    return np.asarray(np.linalg.inv(matrices), dtype=np.float64)
+
+
+def _rotations(turns: Array) -> Array:
+    """Return the rotations of small turns, (s, 3, 3), by the formula of Rodrigues."""
+    angles = np.linalg.norm(turns, axis=1)[:, None, None]
+    cross = skew(turns)
+    half = np.sinc(angles / (2.0 * np.pi))  # NumPy's sinc has a pi in it
+    return np.asarray(np.eye(3) + np.sinc(angles / np.pi) * cross + half**2 / 2.0 * cross @ cross)
+
+
+def _has_heading(towards: Array, chosen: Index) -> Mask:
+    """Tell which subsets of marks do not stand on one plumb line."""
+    off = towards[chosen] - towards[chosen].mean(axis=1, keepdims=True)
+    across = np.linalg.norm(off[..., :2], axis=(1, 2))
+    return np.asarray(across > _UPRIGHT * np.linalg.norm(off, axis=(1, 2)))
+
+
+def _circles_cut(towards: Array, chosen: Index) -> Mask:
+    """Tell about which subsets of marks circles through the station cut each other there."""
+    cuts = np.sin(_angles(towards * [1.0, 1.0, 0.0], chosen))
+    return np.asarray(cuts.max(axis=1) > _FLAT)
+
+
+def _are_three(_towards: Array, chosen: Index) -> Mask:
+    """Tell which subsets have three marks; two slope distances leave a whole circle."""
+    return np.full(len(chosen), chosen.shape[1] >= 3)
+
+
+def _by_distances(
+    measure: Measure, scene: Scene, matches: Index, chosen: Index, start: Array
+) -> Positions:
+    """Position subsets by distances alone, as the study's circles and ``ranges`` do."""
+    p_start = start[:3, 3]
+    seen = observe_distances(measure, scene, matches, p_start)
+    marks = scene.marks_site[matches[:, 1]]
+    measured = seen.residuals + measure(marks - p_start)[0]
+    weights = _inverses(seen.cov)
+    return meet(measure, marks[chosen], measured[chosen], weights[chosen], p_start)
+
+
+def meet(
+    measure: Measure, marks: Array, measured: Array, weights: Array, start: Array
+) -> Positions:
+    """Find the positions that meet the distances to some marks best, many problems at once.
+
+    Parameters
+    ----------
+    measure : callable
+        What is measured: ``circles`` or ``slope_ranges``.
+    marks : (s, k, 3)
+        Marks of each problem [m].
+    measured : (s, k, m)
+        What was measured to each.
+    weights : (s, k, m, m)
+        Inverses of their covariances.
+    start : (3,)
+        Approximate position, common to all; it chooses between intersections [m].
+
+    Returns
+    -------
+    Positions
+        With covariances at ``start``, infinite where the problem is singular there.
+
+    Notes
+    -----
+    Gauss-Newton, with that part of the second derivative that is never negative: circles that miss
+    each other are met where they are nearest, and the normal matrix alone is singular there.
+    """
+    p = np.broadcast_to(start, (len(marks), 3)).copy()
+    cov, step = np.full((len(marks), 3, 3), np.inf), np.full_like(p, np.inf)
+    plane = np.diag([1.0, 1.0, 0.0 if measure is circles else 1.0])
+    for i in range(_N_STEPS):
+        computed, J = measure(marks - p[:, None])
+        weighted = np.swapaxes(J, -1, -2) @ weights
+        N = (weighted @ J).sum(axis=1)
+        if i == 0:
+            is_regular = np.linalg.eigvalsh(N)[:, 0] > 1.0 / _USELESS**2
+            cov[is_regular] = _inverses(N[is_regular])
+        beyond = computed - measured
+        gradient = -(weighted @ beyond[..., None])[..., 0].sum(axis=1)
+        bend = np.maximum(beyond[..., 0] / computed[..., 0], 0.0) * weights[..., 0, 0]
+        across = bend.sum(axis=1)[:, None, None] * plane
+        across -= np.einsum("sk,ski,skj->sij", bend, J[..., 0, :], J[..., 0, :])
+        damping = _DAMPING * np.trace(N, axis1=1, axis2=2)[:, None, None] * np.eye(3)
+        step = -np.linalg.solve(N + across + damping, gradient[..., None])[..., 0]
+        p += step
+        if np.abs(step).max(initial=0.0) < _SETTLED:
+            break
+    return Positions(p, cov, np.asarray(np.abs(step).max(axis=1, initial=0.0) < _USABLE))
+
+
+_METHODS: dict[str, tuple[Callable[[Array, Index], Mask], _Solve]] = {
+    "free_station": (_has_heading, _by_pose),
+    "ranges": (_are_three, partial(_by_distances, slope_ranges)),
+    "paper": (_circles_cut, partial(_by_distances, circles)),
+}
+"""For each method: which subsets it can use, by the vectors to their marks, and how it solves them.
+"""
