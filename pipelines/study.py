@@ -22,6 +22,9 @@ TOLERANCE = 0.03
 GREATEST_DISTANCE = 7.5
 """Distance up to which the study says that its tolerance is kept [m]."""
 
+LEAST_ANGLE, WIDEST_ANGLE = np.radians(30.0), np.radians(150.0)
+"""Included angles between which the study says that its tolerance is kept [rad]."""
+
 SMALLEST_COUNT = 100
 """Number of returns from which the study says that its tolerance is kept."""
 

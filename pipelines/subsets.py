@@ -87,6 +87,58 @@ def resect_subsets(
     return tuple(_subsets(method, scene, fix.matches, start, size) for size in SIZES)
 
 
+def theory_of_pairs(method: str, sigma: float, angles: Array) -> Array:
+    """Return the horizontal error that two marks give in theory.
+
+    Parameters
+    ----------
+    method : str
+        ``free_station``, 3-D centres with unknown heading, or ``paper``, two circles.
+    sigma : float
+        Standard deviation of a centre per axis [m].
+    angles : (...)
+        Included angles in the plane [rad].
+
+    Returns
+    -------
+    (...)
+        Square root of the trace of the covariance of x and y [m].
+
+    Notes
+    -----
+    Both marks equally far. Circles: ``sqrt(2) sigma / sin``, which grows again towards 180 degrees,
+    where the circles touch; centres: ``sigma sqrt(1 + cot^2(angle / 2) / 2)``, which does not.
+    """
+    if method == "paper":
+        return np.asarray(np.sqrt(2.0) * sigma / np.sin(angles))
+    return np.asarray(sigma * np.sqrt(1.0 + 0.5 / np.tan(np.asarray(angles) / 2.0) ** 2))
+
+
+def angles_that_keep(method: str, sigma: float, tolerance: float) -> tuple[float, float]:
+    """Return between which included angles two marks keep a tolerance in theory.
+
+    Parameters
+    ----------
+    method : str
+        As for ``theory_of_pairs``, of which this is the inverse.
+    sigma : float
+        Standard deviation of a centre per axis [m].
+    tolerance : float
+        Horizontal error that is accepted [m].
+
+    Returns
+    -------
+    tuple of float
+        Smallest and largest angle; NaN where none keeps it [rad].
+    """
+    if method == "paper":
+        sine = np.sqrt(2.0) * sigma / tolerance
+        least = float(np.arcsin(sine)) if sine <= 1.0 else np.nan
+        return least, np.pi - least
+    room = 2.0 * ((tolerance / sigma) ** 2 - 1.0)  # the square of cot(angle / 2)
+    return (2.0 * float(np.arctan2(1.0, np.sqrt(room))), np.pi) if room >= 0.0 else (np.nan, np.nan)
+
+
 def _subsets(method: str, scene: Scene, matches: Index, start: Array, size: int) -> SubsetFixes:
     """Solve all subsets of one size."""
     n = len(matches)

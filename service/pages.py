@@ -15,7 +15,7 @@ from service.errors import Problem
 from service.state import Current, Service
 from storage import clouds
 from web import assets, pages, scene
-from web.figures import Columns
+from web.figures import Columns, texts
 from web.filters import Filters
 
 router = APIRouter(include_in_schema=False, default_response_class=HTMLResponse)
@@ -64,20 +64,31 @@ _SURVEY = "SELECT survey_id, name, tolerance_m FROM surveys WHERE name = $key OR
 _MARKS = "SELECT mark, x_m, y_m, z_m FROM control_marks WHERE survey_id = $id ORDER BY mark"
 _TRUE_STOPS = "SELECT stop, x_m, y_m, z_m FROM true_stops WHERE survey_id = $id ORDER BY stop"
 _FITS = """
-SELECT stop, fit_method, marker, mark, status, reason, range_m, n_points,
-    sigma_3d_m, error_3d_m
-FROM latest_marker_fits WHERE survey_id = $id ORDER BY stop, fit_method, marker
+SELECT m.stop, m.fit_method, m.marker, m.mark, m.status, m.reason, m.range_m, m.n_points,
+    m.sigma_3d_m, m.error_3d_m,
+    sqrt(greatest(0, m.sigma_3d_m ^ 2
+        - (radians(x.sigma_heading_deg) * m.range_m * cos(radians(m.elevation_deg))) ^ 2) / 3)
+        AS sigma_axis_m
+FROM latest_marker_fits AS m JOIN stops AS x USING (run_id, stop)
+WHERE survey_id = $id ORDER BY m.stop, m.fit_method, m.marker
 """
 _FIXES = """
 SELECT stop, fit_method, resection_method, status, reason, x_m, y_m, z_m, sigma_3d_m,
+    sqrt(cov_xx_m2 + cov_yy_m2) AS sigma_horizontal_m,
     ellipse_major_95_m, ellipse_minor_95_m, ellipse_bearing_deg, n_markers,
-    included_angle_min_deg, included_angle_max_deg, error_3d_m
+    included_angle_min_deg, included_angle_max_deg, error_horizontal_m, error_3d_m
 FROM latest_station_fixes WHERE survey_id = $id ORDER BY stop, fit_method
 """
-_PAIRS = """
-SELECT x.stop, x.fit_method, x.marks, x.included_angle_deg, x.sigma_3d_m, x.error_3d_m
+_SUBSETS = """
+SELECT x.stop, x.fit_method, x.marks, x.included_angle_deg, x.included_angle_max_deg,
+    x.sigma_horizontal_m, x.error_horizontal_m
 FROM resections AS x JOIN latest_runs AS r USING (run_id)
-WHERE r.survey_id = $id AND x.n_marks = 2 ORDER BY x.stop, x.fit_method
+WHERE r.survey_id = $id AND x.n_marks = $n_marks AND x.resection_method = $resection
+ORDER BY x.stop, x.fit_method, x.marks
+"""
+_SUBSET_METHODS = """
+SELECT DISTINCT x.resection_method FROM resections AS x JOIN latest_runs AS r USING (run_id)
+WHERE r.survey_id = $id ORDER BY x.resection_method
 """
 _STOP_NAMES = """
 SELECT DISTINCT x.stop FROM stops AS x JOIN latest_runs AS r USING (run_id)
@@ -142,7 +153,7 @@ def overview(request: Request, service: Current) -> str:
         pages.OverviewPage(
             frame=_frame(service),
             address=_address(request),
-            newest=_survey_data(service, newest[0]["name"]) if newest else None,
+            newest=_survey_data(service, newest[0]["name"], Filters()) if newest else None,
             surveys=tuple(rows(_SURVEYS)),
             recordings=tuple(rows(_RECORDINGS, {"n": _N_RECORDINGS})),
             n_active_jobs=rows(_N_ACTIVE)[0]["n"],
@@ -171,11 +182,12 @@ def survey(name: str, request: Request, service: Current) -> str:
     """Show the dashboard of a survey."""
     found = _survey(service, name)
     query = {key: request.query_params.getlist(key) for key in request.query_params}
+    filters = Filters.from_query(query)
     return pages.survey_page(
         pages.SurveyPage(
             frame=_frame(service, found["name"]),
-            data=_survey_data(service, name),
-            filters=Filters.from_query(query),
+            data=_survey_data(service, name, filters),
+            filters=filters,
             jobs=_jobs(service, survey=found["survey_id"], is_active=True),
             address=_address(request),
         )
@@ -265,12 +277,13 @@ def _survey(service: Service, key: str) -> Mapping[str, Any]:
     return found[0]
 
 
-def _survey_data(service: Service, key: str) -> pages.SurveyData:
-    """Return the newest results of a survey."""
+def _survey_data(service: Service, key: str, filters: Filters) -> pages.SurveyData:
+    """Return the newest results of a survey, with those from few marks that are wanted."""
     survey = _survey(service, key)
+    few = {"n_marks": filters.n_marks, "resection": filters.resection}
 
-    def columns(sql: str) -> Columns:
-        return service.catalogue.columns(sql, {"id": survey["survey_id"]})
+    def columns(sql: str, **more: object) -> Columns:
+        return service.catalogue.columns(sql, {"id": survey["survey_id"], **more})
 
     return pages.SurveyData(
         name=survey["name"],
@@ -279,7 +292,8 @@ def _survey_data(service: Service, key: str) -> pages.SurveyData:
         true_stops=columns(_TRUE_STOPS),
         fits=columns(_FITS),
         fixes=columns(_FIXES),
-        pairs=columns(_PAIRS),
+        subsets=columns(_SUBSETS, **few),
+        subset_methods=tuple(texts(columns(_SUBSET_METHODS), "resection_method")),
     )
 
 

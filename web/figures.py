@@ -22,8 +22,7 @@ Columns = Mapping[str, NDArray[Any]]
 _MM = 1e3  # [mm/m]
 _RANGE_BIN = 1.0  # [m]; as the view accuracy_by_distance
 _COUNT_BIN = 20  # as the view accuracy_by_point_count
-_ANGLE_BIN = 10.0  # [deg]; as the view accuracy_by_included_angle
-_STUDY_ANGLES = (30.0, 150.0)  # [deg]; what the reference study recommends
+ANGLE_BIN = 10.0  # [deg]; as the view accuracy_by_included_angle
 _RATIOS = [step * 10.0**power for power in range(-2, 5) for step in (1, 2, 5)]
 _RATIO_AXIS = {
     "type": "log",
@@ -87,24 +86,6 @@ def error_against_count(fits: Columns, tolerance_m: float, *, is_log: bool = Fal
     return figure
 
 
-def error_against_angle(
-    pairs: Columns, fixes: Columns, tolerance_m: float, *, is_log: bool = False
-) -> go.Figure:
-    """Draw the error of the station against included angle: from two marks, and from all."""
-    figure = _quality_figure(pairs, "the station against included angle", tolerance_m)
-    for method, rows in by_method(pairs):
-        _add_pairs(figure, method, rows)
-    for method, rows in by_method(fixes):
-        _add_fixes(figure, method, rows)
-    for low, high in ((0.0, _STUDY_ANGLES[0]), (_STUDY_ANGLES[1], 180.0)):
-        figure.add_vrect(x0=low, x1=high, fillcolor=theme.SHADE, line_width=0, layer="below")
-    figure.update_yaxes(rangemode="tozero")
-    if is_log:
-        _make_log(figure)
-    figure.update_xaxes(title_text="Included angle [deg]", range=[0, 180], dtick=30)
-    return figure
-
-
 def error_along_lane(fits: Columns, tolerance_m: float) -> go.Figure:
     """Draw the mean error of the centres at each stop along its lane (Figure 11 of the study)."""
     figure = _quality_figure(fits, "sphere centres along the lane, mean per stop", tolerance_m)
@@ -136,7 +117,7 @@ def station_residuals(observations: Columns, tolerance_m: float) -> go.Figure:
     for axis, symbol in (("x", "circle"), ("y", "diamond"), ("z", "square")):
         _add_residuals(figure, observations, names, axis, symbol)
     if len(names) and largest(floats(observations, "residual_x_m")) > tolerance_m / 2:
-        _add_tolerance(figure, tolerance_m)
+        add_tolerance(figure, tolerance_m)
     figure.add_hline(y=0, line={"color": theme.LINE, "width": 1}, layer="below")
     figure.update_xaxes(title_text="Mark", type="category")
     figure.update_yaxes(title_text="Observed - computed [mm]")
@@ -161,11 +142,11 @@ def _quality_figure(columns: Columns, what: str, tolerance_m: float) -> go.Figur
     quality = "Error" if has_errors(columns) else "Predicted sigma"
     figure = blank_figure(f"{quality} of {what}")
     figure.update_yaxes(title_text=f"{quality}, 3-D [mm]")
-    _add_tolerance(figure, tolerance_m)
+    add_tolerance(figure, tolerance_m)
     return figure
 
 
-def _add_tolerance(figure: go.Figure, tolerance_m: float) -> None:
+def add_tolerance(figure: go.Figure, tolerance_m: float) -> None:
     """Draw the tolerance: one look, everywhere."""
     figure.add_hline(
         y=tolerance_m * _MM,
@@ -188,14 +169,15 @@ def _scale(figure: go.Figure, x_title: str, *, is_log: bool) -> None:
     figure.update_yaxes(type=kind, rangemode="normal" if is_log else "tozero")
     if is_log:
         figure.update_xaxes(**_RATIO_AXIS)
-        _make_log(figure)
+        make_log(figure)
 
 
-def _make_log(figure: go.Figure) -> None:
+def make_log(figure: go.Figure) -> None:
     """Make the axis of errors logarithmic; Plotly wants logarithms of annotations, not of lines."""
     figure.update_yaxes(**_RATIO_AXIS, rangemode="normal")
     for line, note in zip(figure.layout.shapes, figure.layout.annotations, strict=False):
-        note.y = float(np.log10(line.y0))
+        if note.yref == "y":
+            note.y = float(np.log10(line.y0))
 
 
 def _quality_mm(columns: Columns) -> NDArray[np.float64]:
@@ -211,7 +193,7 @@ def _add_fits(figure: go.Figure, fits: Columns, x: NDArray[np.float64], width: f
         style, own_x = theme.method_style(method), x[methods == method]
         y = floats(rows, "error_3d_m" if is_error else "sigma_3d_m") * _MM
         _add_points(figure, style, own_x, y, rows)
-        _add_binned(figure, style, own_x, y, width)
+        add_binned(figure, style, own_x, y, width)
         if is_error and method == "along_beam":
             known = np.isfinite(y)
             sigma = floats(rows, "sigma_3d_m")[known] * _MM
@@ -274,7 +256,7 @@ def _add_study(figure: go.Figure, fits: Columns, x: NDArray[np.float64]) -> None
     )
 
 
-def _add_binned(
+def add_binned(
     figure: go.Figure,
     style: theme.MethodStyle,
     x: NDArray[np.float64],
@@ -327,46 +309,6 @@ def binned_rms(
     return (
         [float(np.mean(x[member])) for member in members],
         [float(np.sqrt(np.mean(y[member] ** 2))) for member in members],
-    )
-
-
-def _add_pairs(figure: go.Figure, method: str, rows: Columns) -> None:
-    """Draw the station from each pair of marks, and the RMS of bins."""
-    style = theme.method_style(method)
-    x, y = floats(rows, "included_angle_deg"), _quality_mm(rows)
-    marks = [" + ".join(str(mark) for mark in pair) for pair in rows["marks"]]
-    figure.add_scatter(
-        x=x,
-        y=y,
-        mode="markers",
-        name=f"{style.label}, two marks",
-        legendgroup=style.label,
-        marker={"color": style.colour, "size": 4, "opacity": 0.3, "symbol": style.symbol},
-        customdata=[list(row) for row in zip(texts(rows, "stop"), marks, strict=True)],
-        hovertemplate="<b>%{customdata[0]}</b> from %{customdata[1]}<br>%{y:.1f} mm at "
-        f"%{{x:.1f}} deg<extra>{style.label}</extra>",
-    )
-    _add_binned(figure, style, x, y, _ANGLE_BIN)
-
-
-def _add_fixes(figure: go.Figure, method: str, rows: Columns) -> None:
-    """Draw the station from all its marks at the least of its included angles."""
-    style = theme.method_style(method)
-    figure.add_scatter(
-        x=floats(rows, "included_angle_min_deg"),
-        y=_quality_mm(rows),
-        mode="markers",
-        name=f"{style.label}, all marks",
-        legendgroup=f"{style.label}, all marks",
-        marker={
-            "color": style.colour,
-            "size": 11,
-            "symbol": f"{style.symbol}-dot",
-            "line": {"color": theme.RAISED, "width": 1.5},
-        },
-        customdata=details(rows, ("stop",), ("n_markers",)),
-        hovertemplate="<b>%{customdata[0]}</b> from all %{customdata[1]:.0f} marks<br>%{y:.1f} mm"
-        f"<extra>{style.label}</extra>",
     )
 
 

@@ -10,6 +10,7 @@ from urllib.parse import urlencode
 import numpy as np
 from numpy.typing import NDArray
 
+from pipelines.config import RESECTION_METHODS
 from pipelines.errors import InputError
 from web.figures import Columns, floats, lane_and_number, select, texts
 
@@ -25,6 +26,8 @@ class Filters:
     range_to_m: float | None = None
     status: str = ""
     is_log: bool = False
+    n_marks: int = 2
+    resection: str = "free_station"
 
     @classmethod
     def from_query(cls, query: Mapping[str, Sequence[str]]) -> Self:
@@ -33,6 +36,12 @@ class Filters:
         axes = first.get("axes", "linear")
         if axes not in ("linear", "log"):
             raise InputError(f"axes is {axes!r}; it must be linear or log.")
+        marks, resection = first.get("marks", "2"), first.get("resection", "free_station")
+        if marks not in ("2", "3"):
+            raise InputError(f"marks is {marks!r}; it must be 2 or 3.")
+        if resection not in RESECTION_METHODS:
+            known = ", ".join(RESECTION_METHODS)
+            raise InputError(f"resection is {resection!r}; it must be one of {known}.")
         return cls(
             methods=tuple(query.get("method", ())),
             lane=first.get("lane", ""),
@@ -41,6 +50,8 @@ class Filters:
             range_to_m=_number(first, "range_to_m"),
             status=first.get("status", ""),
             is_log=axes == "log",
+            n_marks=int(marks),
+            resection=resection,
         )
 
     def query(self) -> str:
@@ -51,7 +62,10 @@ class Filters:
             for name in ("lane", "stop", "range_from_m", "range_to_m", "status")
             if (value := getattr(self, name)) not in ("", None)
         ]
-        return urlencode(pairs + ([("axes", "log")] if self.is_log else []))
+        pairs += [("axes", "log")] if self.is_log else []
+        pairs += [("marks", self.n_marks)] if self.n_marks != 2 else []
+        pairs += [("resection", self.resection)] if self.resection != "free_station" else []
+        return urlencode(pairs)
 
     @property
     def is_restricting(self) -> bool:

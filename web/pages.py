@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from pipelines import study
 from pipelines.accuracy import summarise
-from web import figures, maps, scene, theme
+from web import angles, figures, maps, scene, theme
 from web.figures import (
     Columns,
     by_method,
@@ -55,7 +55,8 @@ class SurveyData:
     true_stops: Columns
     fits: Columns
     fixes: Columns
-    pairs: Columns
+    subsets: Columns
+    subset_methods: tuple[str, ...]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -184,7 +185,8 @@ def survey_page(page: SurveyPage) -> str:
         true_stops=data.true_stops,
         fits=keep(data.fits),
         fixes=keep(data.fixes),
-        pairs=keep(data.pairs),
+        subsets=keep(data.subsets),
+        subset_methods=data.subset_methods,
     )
     stops = sorted(set(texts(data.fits, "stop")), key=_lane_order)
     return render(
@@ -192,7 +194,7 @@ def survey_page(page: SurveyPage) -> str:
         page,
         here="survey",
         readouts=headline(shown.fits, shown.fixes, data.tolerance_m),
-        panels=_survey_panels(shown, is_log=page.filters.is_log),
+        panels=_survey_panels(shown, page.filters),
         rows=_stop_rows(shown),
         kept=statements(select(shown.fits, on_marks(shown.fits)), data.tolerance_m),
         study=study,
@@ -289,9 +291,10 @@ EXAMPLES: tuple[tuple[str, str], ...] = (
     (
         "Error by included angle",
         "SELECT fit_method, included_angle_from_deg, n_resections,\n"
-        "    error_3d_rms_m * 1000 AS rms_mm, sigma_3d_rms_m * 1000 AS predicted_mm\n"
-        "FROM accuracy_by_included_angle\nWHERE n_marks = 2\n"
-        "ORDER BY fit_method, included_angle_from_deg;",
+        "    error_3d_rms_m * 1000 AS rms_mm, sigma_3d_rms_m * 1000 AS predicted_mm,\n"
+        "    resection_method, n_marks\n"
+        "FROM accuracy_by_included_angle\n"
+        "ORDER BY n_marks, resection_method, fit_method, included_angle_from_deg;",
     ),
     (
         "Are the sigmas honest?",
@@ -309,10 +312,11 @@ EXAMPLES: tuple[tuple[str, str], ...] = (
 """Queries to begin with, by what they answer."""
 
 
-def _survey_panels(data: SurveyData, *, is_log: bool) -> tuple[Panel, ...]:
+def _survey_panels(data: SurveyData, filters: Filters) -> tuple[Panel, ...]:
     """Return the figures of the dashboard; none of an empty table."""
     if not len(data.fits["stop"]):
         return ()
+    is_log = filters.is_log
     distance = Panel(
         name="distance",
         figure=figures.error_against_distance(data.fits, data.tolerance_m, is_log=is_log),
@@ -330,22 +334,30 @@ def _survey_panels(data: SurveyData, *, is_log: bool) -> tuple[Panel, ...]:
         figure=figures.error_along_lane(data.fits, data.tolerance_m),
         caption="The study's Figure 11. Whiskers end at the largest of each stop.",
     )
-    return (distance, count, *_map_panel(data), *_angle_panel(data, is_log=is_log), lane)
+    return (distance, count, *_map_panel(data), *_angle_panel(data, filters), lane)
 
 
-def _angle_panel(data: SurveyData, *, is_log: bool) -> tuple[Panel, ...]:
+def _angle_panel(data: SurveyData, filters: Filters) -> tuple[Panel, ...]:
     """Return the figure of included angles, if there are any."""
-    if not len(data.pairs["stop"]):
+    if not len(data.subsets["stop"]):
         return ()
-    figure = figures.error_against_angle(data.pairs, data.fixes, data.tolerance_m, is_log=is_log)
-    return (
-        Panel(
-            name="angle",
-            figure=figure,
-            caption="Small points: the station from two marks alone, with gravity. Large: from "
-            "all marks, at their least angle. Shaded: outside the study's 30 to 150 deg.",
-        ),
+    counts = np.array(texts(data.fixes, "resection_method")) == "free_station"
+    shown = angles.Subsets(
+        rows=data.subsets,
+        fixes=select(data.fixes, counts),
+        n_marks=filters.n_marks,
+        resection=filters.resection,
+        sigma_axis_m=angles.centres_sigma(data.fits),
     )
+    caption = (
+        "Each point is a stop positioned from a few of its marks alone; lines through them are the "
+        "RMS in bins of 10 deg, level lines the stations from all marks. Theory is for two marks "
+        "with centres as good as ours are predicted to be, per axis. The study's limits are those "
+        "of its circles, which touch instead of cutting near 0 and 180 deg; 3-D centres lose "
+        "nothing towards 180 deg."
+    )
+    figure = angles.error_against_angle(shown, data.tolerance_m, is_log=filters.is_log)
+    return (Panel(name="angle", figure=figure, caption=caption),)
 
 
 def _map_panel(data: SurveyData) -> tuple[Panel, ...]:

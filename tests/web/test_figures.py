@@ -1,5 +1,4 @@
 import numpy as np
-import plotly.graph_objects as go
 import pytest
 from numpy.testing import assert_allclose
 
@@ -58,17 +57,6 @@ def places(stops, x, y):
     return {"stop": np.array(stops, dtype=object), "x_m": np.array(x), "y_m": np.array(y)}
 
 
-def pairs():
-    return {
-        "stop": np.array(["s1", "s1"], dtype=object),
-        "fit_method": np.array(["along_beam", "along_beam"], dtype=object),
-        "marks": np.array([["P01", "P02"], ["P01", "P03"]], dtype=object),
-        "included_angle_deg": np.array([40.0, 120.0]),
-        "sigma_3d_m": np.array([0.003, 0.004]),
-        "error_3d_m": np.array([0.002, 0.005]),
-    }
-
-
 def trace(figure, name):
     return next(one for one in figure.data if one.name == name)
 
@@ -123,15 +111,6 @@ def test_bins_give_the_root_mean_square_of_what_is_known():
     )
     assert_allclose(middles, [1.3, 2.5])
     assert_allclose(values, [np.sqrt(12.5), 2.0])
-
-
-def test_the_angle_figure_has_pairs_and_whole_fixes_in_degrees():
-    figure = figures.error_against_angle(pairs(), fixes(), 0.03)
-    label = theme.method_style("along_beam").label
-    assert_allclose(trace(figure, f"{label}, two marks").x, [40.0, 120.0])
-    assert_allclose(trace(figure, f"{label}, two marks").y, [2.0, 5.0], atol=MM)
-    assert_allclose(trace(figure, f"{label}, all marks").x, 20.0)
-    assert figure.layout.xaxis.title.text == "Included angle [deg]"
 
 
 def test_the_lane_figure_shows_the_mean_of_each_stop_in_order():
@@ -214,7 +193,6 @@ def test_methods_look_the_same_in_every_figure():
     drawn = [
         figures.error_against_distance(fits(), 0.03).data[0],
         figures.error_along_lane(fits(), 0.03).data[0],
-        figures.error_against_angle(pairs(), fixes(), 0.03).data[0],
     ]
     assert {one.marker.color for one in drawn} == {style.colour}
 
@@ -227,8 +205,6 @@ def test_a_method_of_tomorrow_gets_a_look_of_its_own():
 
 def test_every_colour_has_a_value_for_light_and_for_dark():
     light, dark = (static_folder() / "tokens.css").read_text().split('[data-theme="dark"]')
-    figure = figures.error_against_angle(pairs(), fixes(), 0.03)
-    assert isinstance(figure, go.Figure)
     names = {value for value in vars(theme).values() if str(value).startswith("var(")}
     names |= {colour for _, colour in (*theme.DIVERGING, *theme.HEIGHTS)} | {*theme.AXES.values()}
     for name in names:

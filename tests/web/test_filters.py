@@ -51,12 +51,21 @@ def test_filters_read_back_from_their_own_query():
         range_from_m=2.5,
         status="ok",
         is_log=True,
+        n_marks=3,
+        resection="paper",
     )
     assert Filters.from_query(parse_qs(filters.query())) == filters
 
 
 @pytest.mark.parametrize(
-    "query", [{"range_from_m": "near"}, {"range_to_m": "inf"}, {"axes": "square"}]
+    "query",
+    [
+        {"range_from_m": "near"},
+        {"range_to_m": "inf"},
+        {"axes": "square"},
+        {"marks": "4"},
+        {"resection": "magic"},
+    ],
 )
 def test_what_cannot_be_read_is_refused_by_name(query):
     with pytest.raises(InputError, match=next(iter(query))):
