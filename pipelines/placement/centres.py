@@ -29,8 +29,7 @@ REFERENCE_DISTANCE = 8.0
 
 # Variance of fits by ``along_beam`` over the bound of their returns: towards, left, up. Pooled over
 # 2254 simulated spheres from 3 to 16 m; weights, the pole's side and lost limbs cost that much.
-_EFFICIENCY = (1.0, 1.0, 1.0)
-_BIAS_LEFT = 0.22  # of the spread of laser biases: what stays in a centre when all lasers saw it
+_EFFICIENCY = (1.23, 1.42, 1.28)
 _LOST_MAX = 0.05  # share of places between the lines where a sphere may be missed
 
 
@@ -133,8 +132,8 @@ class Centres:
     lost : (e, n)
         Probability that lines pass the sphere by.
     cov_site : (e, n, 3, 3)
-        Covariance of the centre in the axes of the site; infinite on the diagonal where nothing is
-        seen [m^2].
+        Covariance of the centre by the noise of its returns, in the axes of the site; infinite on
+        the diagonal where nothing is seen [m^2].
     """
 
     shares: Array
@@ -213,7 +212,6 @@ def expect_centres(
         (factors, model.log_factors[3], model.log_factors[4], float(np.exp(model.log_count[0]))),
         (
             1.0 / (sensor.line_spacing * sensor.shot_spacing),
-            (_BIAS_LEFT * sensor.sigma_range_bias) ** 2,
             np.sin(sensor.elevations[0]),
             np.sin(sensor.elevations[1]),
         ),
@@ -246,7 +244,7 @@ def _expect(places: tuple, table: tuple, factors: tuple, constants: tuple, out: 
     eyes, marks, lowest = places
     distances, areas, information, spread, lost_at = table
     axis_factors, by_distance, by_count, count_factor = factors
-    density, bias2, sine_min, sine_max = constants
+    density, sine_min, sine_max = constants
     shares, n_points, lost, covs = out
     n_d, n_strips, n_k = areas.shape
     first, ratio = np.log(distances[0]), np.log(distances[1] / distances[0])
@@ -306,7 +304,6 @@ def _expect(places: tuple, table: tuple, factors: tuple, constants: tuple, out: 
             for q in range(3):
                 for r in range(3):
                     local[q, r] *= scale[q] * scale[r] / det
-            local[0, 0] += bias2
             axes[0, 0], axes[1, 0], axes[2, 0] = dx / d, dy / d, dz / d
             axes[0, 1], axes[1, 1], axes[2, 1] = -dy / flat, dx / flat, 0.0
             axes[0, 2] = -dz * dx / (d * flat)

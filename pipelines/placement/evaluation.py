@@ -7,7 +7,7 @@ import numpy as np
 
 from pipelines.errors import InputError
 from pipelines.placement.centres import CentreModel, Centres, expect_centres, is_found
-from pipelines.placement.positions import Positions, predict_positions, reliability
+from pipelines.placement.positions import Positions, Sighting, predict_positions, reliability
 from pipelines.placement.probability import probability_within
 from pipelines.placement.sight import behind_others, look
 from pipelines.placement.values import (
@@ -69,9 +69,10 @@ def evaluate(
     check_sizes(len(stops.names), len(marks.names))
     eyes = stops.p_site
     alone = look(site, eyes, marks) if sights is None else sights
-    centres, positions, seen = _predict(site, eyes, marks, model, wish, alone)
+    centres, sighting, positions = _predict(site, eyes, marks, model, wish, alone)
+    seen = sighting.is_seen
     covs = positions.cov_motion[:, 3:, 3:].copy()
-    tested = reliability(eyes, marks.p_site, centres.cov_site, positions, wish)
+    tested = reliability(sighting, positions, wish)
     n_used = positions.used.sum(axis=1).astype(np.intp)
     return Evaluation(
         stops=stops,
@@ -138,7 +139,7 @@ def field_map(
     check_sizes(1, len(marks.names))
     eyes, is_known = field_eyes(site, xs, ys)
     alone = look(site, eyes, marks) if sights is None else sights
-    _, positions, seen = _predict(site, eyes, marks, model, wish, alone)
+    _, sighting, positions = _predict(site, eyes, marks, model, wish, alone)
     covs = positions.cov_motion[:, 3:, 3:]
     sigmas = np.sqrt(np.trace(covs, axis1=1, axis2=2))
     is_open = ~np.isfinite(sigmas) | ~is_known
@@ -149,7 +150,7 @@ def field_map(
         ys=np.array(ys, dtype=np.float64),
         sigma_3d=np.where(is_open, np.nan, sigmas).reshape(shape),
         probability=np.where(is_open, np.nan, probability).reshape(shape),
-        n_seen=(seen.sum(axis=1) * is_known).astype(np.intp).reshape(shape),
+        n_seen=(sighting.is_seen.sum(axis=1) * is_known).astype(np.intp).reshape(shape),
     )
 
 
@@ -215,12 +216,18 @@ def _predict(
     model: CentreModel,
     wish: Requirement,
     alone: Sights,
-) -> tuple[Centres, Positions, Mask]:
+) -> tuple[Centres, Sighting, Positions]:
     """Return what is to be expected of centres and positions, and which marks are found."""
     sights = behind_others(site, eyes, marks, alone)
     centres = expect_centres(model, eyes, marks, sights)
-    seen = is_found(centres, wish.n_points_min)
-    return centres, predict_positions(eyes, marks.p_site, centres.cov_site, seen, wish), seen
+    sighting = Sighting(
+        eyes_site=eyes,
+        marks_site=marks.p_site,
+        cov_centres=centres.cov_site,
+        sigma_laser_bias=model.sensor.sigma_range_bias,
+        is_seen=is_found(centres, wish.n_points_min),
+    )
+    return centres, sighting, predict_positions(sighting, wish)
 
 
 @numba.njit(cache=True, nogil=True)

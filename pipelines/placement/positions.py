@@ -13,8 +13,11 @@ import numpy as np
 from scipy.special import ndtri
 
 from pipelines.placement.values import Requirement
+from pipelines.rigs import N_LASERS
 from pipelines.values import Array, Index, Mask
 
+_BIAS_LEFT = 0.22  # of the spread of laser biases: what a survey leaves to each centre, simulated
+_SIGMA_AIM = 6e-5  # [rad] what mounting and encoder leave of a direction after both faces, simulated
 _SINGULAR = 1e-11  # pivot over diagonal below which an unknown is undetermined
 _LOOSE2 = 1.0  # [m^2] a position that is worse than this is none
 _UNTESTABLE = 1e-7  # redundancy below which a bias cannot show
@@ -28,29 +31,48 @@ class Positions(NamedTuple):
     cov_motion : (e, 6, 6)
         Of a small motion about the station, rotation [rad] and translation [m]; infinite on the
         diagonal where there is no position.
+    cofactor : (e, 6, 6)
+        The same as the adjustment of the survey will claim it.
     used : (e, n)
         Marks that carry each position.
     """
 
     cov_motion: Array
+    cofactor: Array
     used: Mask
 
 
-def predict_positions(
-    eyes_site: Array, marks_site: Array, cov_centres: Array, is_seen: Mask, wish: Requirement
-) -> Positions:
-    """Predict the covariances of positions.
+class Sighting(NamedTuple):
+    """Marks as seen from eyes.
 
-    Parameters
+    Attributes
     ----------
     eyes_site : (e, 3)
         Places of the LiDAR [m].
     marks_site : (n, 3)
         Marks [m].
     cov_centres : (e, n, 3, 3)
-        Covariances of their centres in the axes of the site [m^2].
+        Covariances of their centres by noise, in the axes of the site [m^2].
+    sigma_laser_bias : float
+        Spread of what each laser measures too long [m].
     is_seen : (e, n)
         Which are found.
+    """
+
+    eyes_site: Array
+    marks_site: Array
+    cov_centres: Array
+    sigma_laser_bias: float
+    is_seen: Mask
+
+
+def predict_positions(sighting: Sighting, wish: Requirement) -> Positions:
+    """Predict the covariances of positions.
+
+    Parameters
+    ----------
+    sighting : Sighting
+        Marks as seen.
     wish : Requirement
         Method, and what is known of levelling and marks.
 
@@ -61,20 +83,45 @@ def predict_positions(
 
     Notes
     -----
-    ``free_station``: ``(sum J' P J + G)^-1`` with ``J = [-[v]x, 1]`` of each mark and the AHRS's
-    information ``G`` on roll and pitch, as ``resection`` adjusts them. ``paper``: horizontal
-    distances and heights of the three marks whose circles cut best, and the lean carried through
-    them as ``ranging`` does; its heading is that of the three directions.
+    ``free_station``: weights are those of the adjustment, ``Q = (sum J' P J + G)^-1`` with
+    ``J = [-[v]x, 1]`` of each mark and the AHRS's information ``G`` on roll and pitch; a survey
+    takes what lasers and gimbal leave as different at every mark. The covariance of what comes out
+    has them as they are: noise of each mark, what is left of its direction, and an excess of all
+    ranges together, which hardly moves a station that marks stand round: ``Q J' P C P J Q``.
+    ``paper``: horizontal distances and heights of the three marks whose circles cut best, and the
+    lean carried through them as ``ranging`` does; its heading is that of the three directions.
     """
-    eyes, marks = np.ascontiguousarray(eyes_site), np.ascontiguousarray(marks_site)
-    covs = cov_centres + (wish.sigma_marks**2 + wish.resection.sigma_common**2) * np.eye(3)
-    out = np.zeros((len(eyes), 6, 6))
+    eyes, marks = np.ascontiguousarray(sighting.eyes_site), np.ascontiguousarray(sighting.marks_site)
+    covs = sighting.cov_centres + wish.sigma_marks**2 * np.eye(3)
+    bias = sighting.sigma_laser_bias
+    extra = ((_BIAS_LEFT * bias) ** 2, wish.resection.sigma_common**2, _SIGMA_AIM**2)
+    shape = (len(eyes), 6, 6)
+    cofactor, moved, out = np.zeros(shape), np.zeros(shape[:2]), np.zeros(shape)
+    used = np.array(sighting.is_seen)
     if wish.method == "paper":
-        used = np.zeros(is_seen.shape, dtype=np.bool_)
-        _by_circles(eyes, marks, covs, is_seen, wish.sigma_levelling**2, used, out)
-        return Positions(out, used)
-    _by_motion(eyes, marks, covs, is_seen, wish.sigma_levelling**-2, out)
-    return Positions(out, np.array(is_seen))
+        used[:] = False
+        seen = (eyes, marks, covs, sighting.is_seen)
+        _by_circles(seen, extra, wish.sigma_levelling**2, used, (out, cofactor, moved))
+    else:
+        _by_motion(
+            (eyes, marks, covs, used), extra, wish.sigma_levelling**-2, (out, cofactor, moved)
+        )
+    out += bias**2 / N_LASERS * moved[:, :, None] * moved[:, None, :]
+    return Positions(cov_motion=out, cofactor=cofactor, used=used)
+
+
+@numba.njit(cache=True, nogil=True)
+def _claimed(cov: Array, v: tuple[float, float, float], extra: tuple, known: Array, true: Array) -> None:
+    """Fill in a centre's covariance as a survey takes it, and as it is, shared excess apart."""
+    bias2, common2, aim2 = extra
+    d2 = v[0] * v[0] + v[1] * v[1] + v[2] * v[2]
+    for i in range(3):
+        for j in range(3):
+            along = v[i] * v[j]
+            known[i, j] = cov[i, j] + bias2 * along / d2
+            true[i, j] = cov[i, j] - aim2 * along
+        known[i, i] += common2
+        true[i, i] += aim2 * d2
 
 
 @numba.njit(cache=True, nogil=True)
@@ -112,29 +159,53 @@ def _inverted(N: Array, out: Array) -> bool:
 
 @numba.njit(cache=True, nogil=True)
 def _by_motion(
-    eyes: Array, marks: Array, covs: Array, is_seen: Mask, gravity: float, out: Array
+    seen: tuple[Array, Array, Array, Mask], extra: tuple, gravity: float, out: tuple
 ) -> None:
-    """Fill in the covariances of free stations."""
-    P, J, PJ = np.empty((3, 3)), np.zeros((3, 6)), np.empty((3, 6))
-    N = np.empty((6, 6))
+    """Fill in the covariances of free stations, and how a common excess of ranges moves them."""
+    eyes, marks, covs, is_seen = seen
+    cov_motion, cofactor, moved = out
+    P, J, PJ, CPJ = np.empty((3, 3)), np.zeros((3, 6)), np.empty((3, 6)), np.empty((3, 6))
+    N, M, pull = np.empty((6, 6)), np.empty((6, 6)), np.empty(6)
+    known, true = np.empty((3, 3)), np.empty((3, 3))
+    J[0, 3] = J[1, 4] = J[2, 5] = 1.0
     for e in range(len(eyes)):
         N[:] = 0.0
         N[0, 0] = N[1, 1] = gravity
+        M[:] = N
+        pull[:] = 0.0
         for m in range(len(marks)):
-            if not is_seen[e, m] or not _inverted(covs[e, m], P):
+            if not is_seen[e, m]:
                 continue
             x, y, z = marks[m, 0] - eyes[e, 0], marks[m, 1] - eyes[e, 1], marks[m, 2] - eyes[e, 2]
+            _claimed(covs[e, m], (x, y, z), extra, known, true)
+            if not _inverted(known, P):
+                continue
             J[0, 1], J[0, 2], J[1, 0], J[1, 2], J[2, 0], J[2, 1] = z, -y, -z, x, y, -x
-            J[0, 3] = J[1, 4] = J[2, 5] = 1.0
-            for i in range(3):
-                for j in range(6):
-                    PJ[i, j] = P[i, 0] * J[0, j] + P[i, 1] * J[1, j] + P[i, 2] * J[2, j]
+            d = np.sqrt(x * x + y * y + z * z)
+            _product(P, J, PJ)
+            _product(true, PJ, CPJ)
             for i in range(6):
+                pull[i] += (PJ[0, i] * x + PJ[1, i] * y + PJ[2, i] * z) / d
                 for j in range(6):
-                    N[i, j] += J[0, i] * PJ[0, j] + J[1, i] * PJ[1, j] + J[2, i] * PJ[2, j]
-        ok = _inverted(N, out[e])
-        if not ok or out[e, 3, 3] + out[e, 4, 4] + out[e, 5, 5] > _LOOSE2:
-            out[e] = np.diag(np.full(6, np.inf))
+                    for k in range(3):
+                        N[i, j] += J[k, i] * PJ[k, j]
+                        M[i, j] += PJ[k, i] * CPJ[k, j]
+        Q = cofactor[e]
+        ok = _inverted(N, Q)
+        if not ok or Q[3, 3] + Q[4, 4] + Q[5, 5] > _LOOSE2:
+            Q[:] = np.diag(np.full(6, np.inf))
+            cov_motion[e] = Q
+            continue
+        cov_motion[e] = Q @ M @ Q
+        moved[e] = Q @ pull
+
+
+@numba.njit(cache=True, nogil=True)
+def _product(A: Array, B: Array, out: Array) -> None:
+    """Fill in the product of a (3, 3) and a (3, 6) matrix."""
+    for i in range(3):
+        for j in range(6):
+            out[i, j] = A[i, 0] * B[0, j] + A[i, 1] * B[1, j] + A[i, 2] * B[2, j]
 
 
 @numba.njit(cache=True, nogil=True)
@@ -168,36 +239,39 @@ def _best_three(eye: Array, marks: Array, is_seen: Mask, units: Array, three: In
 
 @numba.njit(cache=True, nogil=True)
 def _by_circles(
-    eyes: Array, marks: Array, covs: Array, is_seen: Mask, level2: float, used: Mask, out: Array
+    seen: tuple[Array, Array, Array, Mask], extra: tuple, level2: float, used: Mask, out: tuple
 ) -> None:
-    """Fill in the covariances of positions by three circles."""
+    """Fill in the covariances of positions by three circles, and how a common excess moves them."""
+    eyes, marks, covs, is_seen = seen
+    cov_motion, cofactor, moved = out
     units, three = np.empty((len(marks), 2)), np.empty(3, np.intp)
-    A, C, W, gain = np.zeros((6, 3)), np.zeros((6, 6)), np.empty((6, 6)), np.zeros((3, 6))
-    lean, Q, N = np.zeros((6, 2)), np.empty((3, 3)), np.zeros((3, 3))
-    B = np.zeros((2, 3))
+    A, W, gain = np.zeros((6, 3)), np.empty((6, 6)), np.zeros((3, 6))
+    C, lean, Q, N = np.zeros((6, 6)), np.zeros((6, 2)), np.empty((3, 3)), np.zeros((3, 3))
+    B, excess = np.zeros((2, 3)), np.empty(6)
+    known, true = np.empty((3, 3)), np.empty((3, 3))
     for e in range(len(eyes)):
-        out[e] = np.diag(np.full(6, np.inf))
+        cov_motion[e] = np.diag(np.full(6, np.inf))
+        cofactor[e] = cov_motion[e]
         if not _best_three(eyes[e], marks, is_seen[e], units, three):
             continue
-        C[:] = 0.0
+        C[:], W[:] = 0.0, 0.0
         yaw2 = 0.0
         for r in range(3):
-            m = three[r]
+            m, s = three[r], slice(2 * r, 2 * r + 2)
             x, y, z = marks[m, 0] - eyes[e, 0], marks[m, 1] - eyes[e, 1], marks[m, 2] - eyes[e, 2]
+            _claimed(covs[e, m], (x, y, z), extra, known, true)
             u, v = units[m]
             B[0, 0], B[0, 1], B[1, 2] = u, v, 1.0
-            for q in range(2):  # -skew(v), its first two columns, seen through B
-                lean[2 * r, 0], lean[2 * r, 1] = -z * v, z * u
-                lean[2 * r + 1, 0], lean[2 * r + 1, 1] = y, -x
-                A[2 * r + q] = B[q]
-            C[2 * r : 2 * r + 2, 2 * r : 2 * r + 2] = B @ covs[e, m] @ B.T
+            A[s] = B
+            lean[2 * r, 0], lean[2 * r, 1] = -z * v, z * u  # B (-[v]x), its first two columns
+            lean[2 * r + 1, 0], lean[2 * r + 1, 1] = y, -x
+            C[s, s] = B @ true @ B.T
+            W[s, s] = np.linalg.inv(B @ known @ B.T + level2 * lean[s] @ lean[s].T)
             flat2 = x * x + y * y
-            side2 = v * v * covs[e, m, 0, 0] - 2.0 * u * v * covs[e, m, 0, 1]
-            yaw2 += (side2 + u * u * covs[e, m, 1, 1]) / flat2 / 9.0
-        W[:] = 0.0
-        for r in range(3):
-            s = slice(2 * r, 2 * r + 2)
-            W[s, s] = np.linalg.inv(C[s, s] + level2 * lean[s] @ lean[s].T)
+            d = np.sqrt(flat2 + z * z)
+            excess[2 * r], excess[2 * r + 1] = np.sqrt(flat2) / d, z / d
+            side2 = v * v * true[0, 0] - 2.0 * u * v * true[0, 1] + u * u * true[1, 1]
+            yaw2 += side2 / flat2 / 9.0
         N[:] = A.T @ W @ A
         if not _inverted(N, Q):
             continue
@@ -208,12 +282,15 @@ def _by_circles(
             continue
         for r in range(3):
             used[e, three[r]] = True
-        out[e] = 0.0
-        out[e, 3:, 3:] = position
-        out[e, 0, 0] = out[e, 1, 1] = level2
-        out[e, 2, 2] = yaw2
-        out[e, 3:, :2] = -level2 * tilt
-        out[e, :2, 3:] = -level2 * tilt.T
+        cov_motion[e] = 0.0
+        cov_motion[e, 3:, 3:] = position
+        cov_motion[e, 0, 0] = cov_motion[e, 1, 1] = level2
+        cov_motion[e, 2, 2] = yaw2
+        cov_motion[e, 3:, :2] = -level2 * tilt
+        cov_motion[e, :2, 3:] = -level2 * tilt.T
+        cofactor[e] = cov_motion[e]
+        cofactor[e, 3:, 3:] = Q
+        moved[e, 3:] = gain @ excess
 
 
 class Reliability(NamedTuple):
@@ -234,19 +311,13 @@ class Reliability(NamedTuple):
     external: Array
 
 
-def reliability(
-    eyes_site: Array, marks_site: Array, cov_centres: Array, found: Positions, wish: Requirement
-) -> Reliability:
+def reliability(sighting: Sighting, found: Positions, wish: Requirement) -> Reliability:
     """Say how large an error in one mark must be to be found, and what a smaller one does.
 
     Parameters
     ----------
-    eyes_site : (e, 3)
-        Places of the LiDAR [m].
-    marks_site : (n, 3)
-        Marks [m].
-    cov_centres : (e, n, 3, 3)
-        Covariances of their centres in the axes of the site [m^2].
+    sighting : Sighting
+        Marks as seen.
     found : Positions
         What ``predict_positions`` made of them.
     wish : Requirement
@@ -257,15 +328,18 @@ def reliability(
     Reliability
         Baarda's measures, as ``adjustment`` gives them after a survey.
     """
-    v = marks_site[None] - eyes_site[:, None]
-    extra = (wish.sigma_marks**2 + wish.resection.sigma_common**2) * np.eye(3)
-    covs = np.where(found.used[..., None, None], cov_centres + extra, np.eye(3))
+    v = sighting.marks_site[None] - sighting.eyes_site[:, None]
+    d2 = np.maximum(np.sum(v**2, axis=2), 1e-9)[..., None, None]
+    known = sighting.cov_centres + (wish.sigma_marks**2 + wish.resection.sigma_common**2) * np.eye(3)
+    bias2 = (_BIAS_LEFT * sighting.sigma_laser_bias) ** 2
+    known = known + bias2 * v[..., :, None] * v[..., None, :] / d2
+    covs = np.where(found.used[..., None, None], known, np.eye(3))
     is_fixed = np.isfinite(found.cov_motion).all(axis=(1, 2))
     used = found.used & is_fixed[:, None]
-    Q = np.where(is_fixed[:, None, None], found.cov_motion, 0.0)
+    Q = np.where(is_fixed[:, None, None], found.cofactor, 0.0)
     if wish.method == "paper":
         J, covs = _circle_equations(v, covs, wish)
-        Q = _by_weights(J, covs, used)
+        Q = Q[:, 3:, 3:]
         to_position = np.eye(3)
     else:
         J = _motion_equations(v)
@@ -309,13 +383,3 @@ def _circle_equations(v: Array, covs: Array, wish: Requirement) -> tuple[Array, 
     lean = B @ _motion_equations(v)[..., :2]
     cov = B @ covs @ np.swapaxes(B, -1, -2)
     return B, cov + wish.sigma_levelling**2 * lean @ np.swapaxes(lean, -1, -2)
-
-
-def _by_weights(J: Array, covs: Array, used: Mask) -> Array:
-    """Return the inverse normal matrices of the used blocks; zero where singular."""
-    weighted = np.linalg.solve(covs, J) * used[..., None, None]
-    N = np.einsum("enmp,enmq->epq", J, weighted)
-    is_fixed = used.sum(axis=1) >= 3
-    return np.where(
-        is_fixed[:, None, None], np.linalg.inv(np.where(is_fixed[:, None, None], N, np.eye(3))), 0.0
-    )

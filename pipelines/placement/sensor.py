@@ -25,6 +25,8 @@ _N_PER_ROW = 4  # beams along a row's height
 _N_PER_STRIP = 4  # and across a strip
 _N_PHASES = 400  # places between the lines that a sphere is tried at
 _GOLDEN = 0.6180339887498949  # of a turn from place to place: no pitch of lines repeats it
+_REFLECTIVITIES = (3.0, 9.0, 24.5, 63.0, 130.0)  # calibrated, at which real packets show ...
+_SIGMAS = (0.0137, 0.0107, 0.0089, 0.0067, 0.0064)  # ... this noise of ranges [m]
 _SHARE_MIN = 0.02  # of a footprint that makes a return
 _N_ROUNDS = 4  # in which precision and worth of the returns settle
 _DISTANCES = np.geomspace(1.5, 45.0, 28)  # [m]
@@ -41,8 +43,12 @@ class Sensor:
         Time in which the gimbal turns through 360 degrees [s].
     spin_rpm : float
         Revolutions of the LiDAR per minute.
-    sigma_range : float
-        Noise of a range to a marker [m]. 6.7 mm: real packets at the reflectivity of bright paint.
+    reflectivity : float
+        Calibrated reflectivity of the spheres, 0 to 255. 42: red paint that sends half of the light
+        back, the mean over a sphere.
+    noise : float or None
+        Noise of a range to a sphere [m]; none takes what real packets of a VLP-16 show at the
+        reflectivity.
     sigma_direction : float
         Standard deviation of a beam's direction per axis [rad].
     sigma_range_bias : float
@@ -56,7 +62,8 @@ class Sensor:
 
     turn: float = 13.2
     spin_rpm: float = 600.0
-    sigma_range: float = 0.0067
+    reflectivity: float = 42.0
+    noise: float | None = None
     sigma_direction: float = 1e-4
     sigma_range_bias: float = 0.003
     divergence: tuple[float, float] = (3.0e-3, 1.5e-3)
@@ -68,6 +75,13 @@ class Sensor:
             raise ConfigError(
                 f"sigma_range is {self.sigma_range!r}; 0.00001 to 0.5 m are possible."
             )
+
+    @property
+    def sigma_range(self) -> float:
+        """Noise of a range to a sphere [m]."""
+        if self.noise is not None:
+            return self.noise
+        return float(np.interp(np.log(self.reflectivity), np.log(_REFLECTIVITIES), _SIGMAS))
 
     @property
     def scan(self) -> SimulationConfig:
@@ -162,8 +176,8 @@ def returns_of(sensor: Sensor, radius: float, n_strips: int) -> Returns:
 
     Returns
     -------
-    Returns
-        Tables over distance.
+    tables : Returns
+        Over distance.
 
     Notes
     -----
