@@ -51,6 +51,7 @@ class Service:
     settings: Settings
     catalogue: Catalogue
     inbox: Inbox
+    terrains: Inbox
     jobs: JobQueue
     idempotency: Idempotency = field(default_factory=Idempotency)
 
@@ -73,11 +74,12 @@ def query_limits(settings: Settings) -> QueryLimits:
 async def opened(settings: Settings) -> AsyncIterator[Service]:
     """Open the database, the inbox and the cluster; close them in the opposite order."""
     data = settings.data.resolve()
-    inbox = Inbox(data / "recordings")
-    inbox.open()
+    inbox, terrains = Inbox(data / "recordings"), Inbox(data / "terrains")
+    for one in (inbox, terrains):
+        one.open()
     with Catalogue(data / DATABASE, snapshots=data / "snapshots") as catalogue:
         async with JobQueue(settings, catalogue, data / "clouds") as jobs:
-            yield Service(settings, catalogue, inbox, jobs)
+            yield Service(settings, catalogue, inbox, terrains, jobs)
 
 
 def current(request: Request) -> Service:

@@ -1,4 +1,4 @@
-"""Logs on their way in: a body streamed to disk while it is hashed, then named by its digest.
+"""Files on their way in: a body streamed to disk while it is hashed, then named by its digest.
 
 Hides temporary files, blocks and threads; nothing of an upload that breaks off remains.
 """
@@ -33,7 +33,7 @@ class InterruptedUploadError(InputError):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Received:
-    """A log that arrived whole: where it is, its SHA-256 and its size [bytes]."""
+    """A file that arrived whole: where it is, its SHA-256 and its size [bytes]."""
 
     path: Path
     digest: str
@@ -41,7 +41,7 @@ class Received:
 
 
 class Inbox:
-    """A folder of logs named by digest, and the files that are still being written beside it."""
+    """A folder of files named by digest, and the files that are still being written beside it."""
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
@@ -53,23 +53,25 @@ class Inbox:
         for left in self._partial.iterdir():
             left.unlink()
 
-    async def receive(self, chunks: AsyncIterator[bytes], max_bytes: int) -> Received:
-        """Keep a body as ``<sha256>.mcap``; the same bytes twice are one file."""
-        handle, name = tempfile.mkstemp(suffix=".mcap", dir=self._partial)
+    async def receive(
+        self, chunks: AsyncIterator[bytes], max_bytes: int, ending: str = ".mcap"
+    ) -> Received:
+        """Keep a body as ``<sha256><ending>``; the same bytes twice are one file."""
+        handle, name = tempfile.mkstemp(suffix=ending, dir=self._partial)
         path = Path(name)
         try:
             with os.fdopen(handle, "wb") as file:
                 digest, size = await _write_and_hash(chunks, file, max_bytes)
             if size == 0:
-                raise EmptyBodyError("The body is empty; send the log itself as the body.")
-            target = await asyncio.to_thread(self._keep, path, digest)
+                raise EmptyBodyError("The body is empty; send the file itself as the body.")
+            target = await asyncio.to_thread(self._keep, path, f"{digest}{ending}")
         finally:
             await asyncio.to_thread(path.unlink, missing_ok=True)
         return Received(path=target, digest=digest, size_bytes=size)
 
-    def _keep(self, path: Path, digest: str) -> Path:
+    def _keep(self, path: Path, name: str) -> Path:
         """Give a complete file its name."""
-        target = self.folder / f"{digest}.mcap"
+        target = self.folder / name
         path.chmod(0o644)
         path.replace(target)
         return target
