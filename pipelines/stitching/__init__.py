@@ -7,9 +7,7 @@ the instant of its shot, after the beam's bias has been taken off along the beam
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import NamedTuple
 
-import numba
 import numpy as np
 from scipy.spatial.transform import Rotation
 
@@ -21,6 +19,7 @@ from pipelines.errors import (
     RecordingError,
     RigError,
 )
+from pipelines.stitching.turning import Joints, Lidar, Shots, turned
 from pipelines.threads import side_by_side
 from pipelines.values import (
     RING_UNKNOWN,
@@ -53,44 +52,8 @@ _JOINT_GAP_MOTION = np.radians(0.5)
 _SIGMA_UNLEVELLED = np.radians(3.0)  # how a rover may lean on ground it can drive on
 _LEAN_STRANGE = np.radians(45.0)  # more is a wrong mounting, not a slope
 _ELEVATION_CLEAN = 0.1  # of the lasers' spacing: rings are inferred only from such elevations
-_SMALL_TURN = 0.1  # [rad]; below it the series in `_rotated` is good to 1.4e-9
 _WINDOW = 12  # samples of the gimbal angle per rest when looking for rests
 _N_PROBES = 100_000  # shots that are looked at when searching for gaps
-
-
-class _Shots(NamedTuple):
-    """Columns of the log that the kernel reads."""
-
-    p_lidar: Column
-    intensities: Column
-    rings: Rings
-    stamps_ns: Nanos
-
-
-class _Joints(NamedTuple):
-    """Gimbal on the LiDAR's clock; ``table`` has angle, cosine, sine, turning rate [rad/ns]."""
-
-    stamps_ns: Nanos
-    angles: Array
-    table: Array
-
-
-class _Lidar(NamedTuple):
-    """Rig for the kernel; ``lasers`` has, by ring, height in the cloud, bias, height [m]."""
-
-    T_head_lidar: tuple[float, ...]  # twelve numbers, row by row
-    lasers: Array
-    range_limits: Array
-
-
-class _Columns(NamedTuple):
-    """Columns of the cloud that the kernel fills from the front."""
-
-    p_base: Column
-    gimbal_angles: Column
-    intensities: Column
-    rings: Rings
-    times: Column
 
 
 def choose_rig(log: ScanLog, rig: Rig | None) -> Rig:
@@ -302,7 +265,7 @@ def level(log: ScanLog, rig: Rig, config: StitchingConfig) -> Levelling:
     )
 
 
-def _angles_at(joints: _Joints, stamps_ns: Nanos) -> Array:
+def _angles_at(joints: Joints, stamps_ns: Nanos) -> Array:
     """Return the gimbal angle [rad] at some instants of the LiDAR's clock."""
     start = joints.stamps_ns[0]
     return np.asarray(np.interp(stamps_ns - start, joints.stamps_ns - start, joints.angles))
@@ -359,11 +322,12 @@ def stitch(log: ScanLog, rig: Rig, config: StitchingConfig) -> StitchedCloud:
     rings, notes = _lasers_of(log, rig)
     joints = _joints(log, rig)
     joints, smear_note = _without_smear(log, joints)
-    shots = _Shots(log.p_lidar, log.intensities, rings, log.stamps_lidar_ns)
-    columns, counts = _run(shots, joints, rig, config)
+    shots = Shots(log.p_lidar, log.intensities, rings, log.stamps_lidar_ns)
+    first, final = _first_and_last(log.stamps_lidar_ns)
+    columns, counts = turned(shots, joints, _lidar(rig, config), first)
     _refuse_empty(log, joints, counts, config)
     levelling = level(log, rig, config)
-    coverage, duration = _extent(log.stamps_lidar_ns, joints)
+    coverage, duration = _extent(first, final, joints)
     notes += smear_note + pause_notes(log) + _count_notes(counts)
     notes += _level_notes(levelling) + _turn_notes(coverage)
     return StitchedCloud(
@@ -415,7 +379,7 @@ def _nearest_lasers(p_lidar: Column, rig: Rig) -> tuple[Rings, Column]:
     return rings, best
 
 
-def _joints(log: ScanLog, rig: Rig) -> _Joints:
+def _joints(log: ScanLog, rig: Rig) -> Joints:
     """Return the gimbal on the LiDAR's clock, eccentricity applied."""
     if not len(log.gimbal_angles):
         raise MissingGimbalAngleError(
@@ -430,10 +394,10 @@ def _joints(log: ScanLog, rig: Rig) -> _Joints:
     rates = np.append(steps / gaps, 0.0)
     rates[:-1][(gaps > _JOINT_GAP / _NS) & (np.abs(steps) > _JOINT_GAP_MOTION)] = np.nan
     table = np.stack([angles, np.cos(angles), np.sin(angles), rates], axis=1)
-    return _Joints(stamps_ns, angles, table)
+    return Joints(stamps_ns, angles, table)
 
 
-def _without_smear(log: ScanLog, joints: _Joints) -> tuple[_Joints, tuple[str, ...]]:
+def _without_smear(log: ScanLog, joints: Joints) -> tuple[Joints, tuple[str, ...]]:
     """Void the angle where a message without shot times was made by a moving gimbal."""
     if log.has_shot_times or not len(log.stamps_lidar_ns):
         return joints, ()
@@ -471,7 +435,7 @@ def _smeared(moved: Array) -> tuple[Mask, int]:
     return smeared | (is_first & ~is_last & (np.arange(len(moved)) > 0)), int(is_first.sum())
 
 
-def _voided(joints: _Joints, stamps_ns: Nanos) -> _Joints:
+def _voided(joints: Joints, stamps_ns: Nanos) -> Joints:
     """Return the gimbal with the angle unknown in the sample intervals of the given instants."""
     table = joints.table.copy()
     hit = np.searchsorted(joints.stamps_ns, stamps_ns, side="right") - 1
@@ -479,39 +443,15 @@ def _voided(joints: _Joints, stamps_ns: Nanos) -> _Joints:
     return joints._replace(table=table)
 
 
-def _run(
-    shots: _Shots, joints: _Joints, rig: Rig, config: StitchingConfig
-) -> tuple[_Columns, Index]:
-    """Run the kernel; return the filled columns and the counts of `_stitch_kernel`."""
-    n = len(shots.p_lidar)
-    T = tuple(rig.T_head_lidar[:3].ravel().tolist())
-    lidar = _Lidar(T, _laser_table(rig), np.array([config.range_min, config.range_max]))
-    out = _Columns(
-        np.empty((n, 3), np.float32),
-        np.empty(n, np.float32),
-        np.empty(n, np.float32),
-        np.empty(n, np.uint8),
-        np.empty(n, np.float32),
+def _lidar(rig: Rig, config: StitchingConfig) -> Lidar:
+    """Return the rig, and which ranges are wanted, as the loops need them."""
+    lasers = np.ascontiguousarray(_laser_table(rig).T)
+    return Lidar(
+        tuple(rig.T_head_lidar[:3].ravel().tolist()),
+        lasers,
+        bool(lasers[1].any()),
+        (config.range_min, config.range_max),
     )
-    start = shots.stamps_ns.min(initial=np.iinfo(np.int64).max)
-
-    def part(first: int, end: int) -> tuple[int, Index]:
-        return first, _stitch_kernel(shots, joints, lidar, start, out, first, end)
-
-    parts = side_by_side(part, n)
-    return _closed_up(out, parts), np.sum([counts for _, counts in parts], axis=0)
-
-
-def _closed_up(out: _Columns, parts: list[tuple[int, Index]]) -> _Columns:
-    """Return the columns without the gap that each part leaves where it kept less than it saw."""
-    n = 0
-    for first, counts in parts:
-        end = first + counts[0]
-        if n < first:
-            for column in out:
-                column[n : n + counts[0]] = column[first:end]
-        n += counts[0]
-    return _Columns(out[0][:n], out[1][:n], out[2][:n], out[3][:n], out[4][:n])
 
 
 def _laser_table(rig: Rig) -> Array:
@@ -524,79 +464,7 @@ def _laser_table(rig: Rig) -> Array:
     return table
 
 
-@numba.njit(cache=True, nogil=True)
-def _rotated(cosine, sine, step):  # type: ignore[no-untyped-def]  # noqa: ANN001, ANN202
-    """Return cosine and sine of an angle plus a step, by series where the step is small."""
-    if abs(step) < _SMALL_TURN:
-        square = step * step
-        c = 1.0 - square * (0.5 - square * (1.0 / 24.0))
-        s = step * (1.0 - square * (1.0 / 6.0 - square * (1.0 / 120.0)))
-    else:
-        c, s = np.cos(step), np.sin(step)
-    return cosine * c - sine * s, sine * c + cosine * s
-
-
-@numba.njit(cache=True, nogil=True)
-def _moved(T, x, y, z):  # type: ignore[no-untyped-def]  # noqa: ANN001, ANN202
-    """Return the coordinates of a point after a rigid motion."""
-    return (
-        T[0] * x + T[1] * y + T[2] * z + T[3],
-        T[4] * x + T[5] * y + T[6] * z + T[7],
-        T[8] * x + T[9] * y + T[10] * z + T[11],
-    )
-
-
-@numba.njit(cache=True, nogil=True)
-def _stitch_kernel(shots, joints, lidar, start, out, first, end):  # type: ignore[no-untyped-def]  # noqa: ANN001, ANN202, PLR0913
-    """Fill ``out`` from a part's first row; count kept, no angle, not finite, out of range.
-
-    Values that change seldom are held outside of arrays: each write to ``out`` would make the
-    compiler read them again.
-    """
-    T, lasers, p_lidar = lidar.T_head_lidar, lidar.lasers, shots.p_lidar
-    stamps, table = joints.stamps_ns, joints.table
-    low2, high2 = lidar.range_limits[0] ** 2, lidar.range_limits[1] ** 2
-    kept, without_angle, not_finite, out_of_range = np.uint64(first), 0, 0, 0
-    since, until = 0, 0  # the joint interval that a shot is expected in
-    angle0 = cosine0 = sine0 = rate = 0.0
-    for i in range(np.uint64(first), np.uint64(end)):
-        t = shots.stamps_ns[i]
-        if not since <= t < until:
-            j = np.searchsorted(stamps, t, side="right") - 1
-            if j < 0 or t > stamps[-1]:
-                without_angle += 1
-                continue
-            since, until = stamps[j], stamps[j + 1] if j + 1 < len(stamps) else stamps[j]
-            angle0, cosine0, sine0, rate = table[j, 0], table[j, 1], table[j, 2], table[j, 3]
-        step = rate * (t - since)
-        if not np.isfinite(step):
-            without_angle += 1
-            continue
-        ring = shots.rings[i]
-        x, y = np.float64(p_lidar[i, 0]), np.float64(p_lidar[i, 1])
-        z = p_lidar[i, 2] - lasers[ring, 0]
-        reach2 = x * x + y * y + z * z
-        if not low2 <= reach2 <= high2:
-            out_of_range += np.isfinite(reach2)
-            not_finite += not np.isfinite(reach2)
-            continue
-        scale = 1.0 - lasers[ring, 1] / np.sqrt(reach2)
-        x, y, z = _moved(T, x * scale, y * scale, z * scale + lasers[ring, 2])
-        c, s = _rotated(cosine0, sine0, step)
-        turns = (angle0 + step) * (0.5 / np.pi)
-        out.p_base[kept, 0], out.p_base[kept, 1], out.p_base[kept, 2] = (
-            c * x - s * y,
-            s * x + c * y,
-            z,
-        )
-        out.gimbal_angles[kept] = 2.0 * np.pi * (turns - np.floor(turns + 0.5))
-        out.intensities[kept], out.rings[kept] = shots.intensities[i], ring
-        out.times[kept] = (t - start) * 1e-9
-        kept += np.uint64(1)
-    return np.array([kept - np.uint64(first), without_angle, not_finite, out_of_range], np.int64)
-
-
-def _refuse_empty(log: ScanLog, joints: _Joints, counts: Index, config: StitchingConfig) -> None:
+def _refuse_empty(log: ScanLog, joints: Joints, counts: Index, config: StitchingConfig) -> None:
     """Raise RecordingError if nothing was kept, saying why."""
     if counts[0]:
         return
@@ -616,10 +484,20 @@ def _refuse_empty(log: ScanLog, joints: _Joints, counts: Index, config: Stitchin
     )
 
 
-def _extent(stamps_lidar_ns: Nanos, joints: _Joints) -> tuple[float, float]:
+def _first_and_last(stamps_ns: Nanos) -> tuple[int, int]:
+    """Return the first and the last instant [ns]; zero if there is none."""
+    if not len(stamps_ns):
+        return 0, 0
+    parts = side_by_side(
+        lambda low, high: (stamps_ns[low:high].min(), stamps_ns[low:high].max()), len(stamps_ns)
+    )
+    return int(min(low for low, _ in parts)), int(max(high for _, high in parts))
+
+
+def _extent(first: int, final: int, joints: Joints) -> tuple[float, float]:
     """Return the angle [rad] and the time [s] from the first shot with an angle to the last."""
-    first = max(stamps_lidar_ns.min(), joints.stamps_ns[0])
-    final = min(stamps_lidar_ns.max(), joints.stamps_ns[-1])
+    first = max(first, int(joints.stamps_ns[0]))
+    final = min(final, int(joints.stamps_ns[-1]))
     inside = joints.angles[(joints.stamps_ns >= first) & (joints.stamps_ns <= final)]
     times = joints.stamps_ns - first
     edges = np.interp([0, final - first], times, joints.angles)
