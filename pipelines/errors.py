@@ -99,6 +99,12 @@ class NoMarkersError(TooFewObservationsError):
     code: ClassVar[str] = "solve.no_markers"
 
 
+class NoGroundError(TooFewObservationsError):
+    """No ground was seen."""
+
+    code: ClassVar[str] = "solve.no_ground"
+
+
 class DegenerateGeometryError(SolveError):
     """The geometry leaves an unknown undetermined."""
 
