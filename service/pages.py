@@ -151,7 +151,7 @@ def overview(request: Request, service: Current) -> str:
     newest = rows(_NEWEST_SURVEY)
     return pages.overview_page(
         pages.OverviewPage(
-            frame=_frame(service),
+            frame=frame_of(service),
             address=_address(request),
             newest=_survey_data(service, newest[0]["name"], Filters()) if newest else None,
             surveys=tuple(rows(_SURVEYS)),
@@ -185,7 +185,7 @@ def survey(name: str, request: Request, service: Current) -> str:
     filters = Filters.from_query(query)
     return pages.survey_page(
         pages.SurveyPage(
-            frame=_frame(service, found["name"]),
+            frame=frame_of(service, found["name"]),
             data=_survey_data(service, name, filters),
             filters=filters,
             jobs=_jobs(service, survey=found["survey_id"], is_active=True),
@@ -197,7 +197,7 @@ def survey(name: str, request: Request, service: Current) -> str:
 @router.get("/jobs")
 def jobs(service: Current) -> str:
     """Show the newest jobs."""
-    return pages.jobs_page(pages.JobsPage(frame=_frame(service), jobs=_jobs(service)))
+    return pages.jobs_page(pages.JobsPage(frame=frame_of(service), jobs=_jobs(service)))
 
 
 @router.get("/jobs/{job_id}")
@@ -207,7 +207,7 @@ def job(job_id: str, service: Current) -> str:
     if not found:
         raise NotFoundError(f"There is no job {job_id!r}.")
     stops = service.catalogue.rows(_JOB_STOPS, {"id": job_id})
-    frame = _frame(service, found[0]["survey"])
+    frame = frame_of(service, found[0]["survey"])
     return pages.job_page(pages.JobPage(frame=frame, job=found[0], stops=tuple(stops)))
 
 
@@ -219,7 +219,7 @@ def recording(recording_id: str, request: Request, service: Current) -> str:
         raise NotFoundError(f"There is no recording {recording_id!r}.")
     return pages.recording_page(
         pages.RecordingPage(
-            frame=_frame(service),
+            frame=frame_of(service),
             recording=found[0],
             preflight=json.loads(found[0]["preflight"]),
             jobs=_jobs(service, recording=recording_id),
@@ -234,7 +234,7 @@ def sql(service: Current, q: Annotated[str, Query(max_length=100_000)] = "") -> 
     limits = service.limits
     return pages.sql_page(
         pages.SqlPage(
-            frame=_frame(service),
+            frame=frame_of(service),
             query=q or pages.EXAMPLES[0][1],
             tables=tuple(asdict(table) for table in service.catalogue.schema()),
             seconds=limits.seconds,
@@ -258,7 +258,7 @@ def error_page(_: Request, problem: Problem) -> HTMLResponse:
     return HTMLResponse(text, status_code=problem.status)
 
 
-def _frame(service: Service, survey: str = "") -> pages.Frame:
+def frame_of(service: Service, survey: str = "") -> pages.Frame:
     """Return what every page shows around itself."""
     names = tuple(row["name"] for row in service.catalogue.rows(_SURVEY_NAMES))
     return pages.Frame(surveys=names, survey=survey)
@@ -308,7 +308,7 @@ def _stop_page(
     by_method = {**key, "method": chosen}
     names = catalogue.rows(_STOP_NAMES, {"id": survey["survey_id"]})
     return pages.StopPage(
-        frame=_frame(service, survey["name"]),
+        frame=frame_of(service, survey["name"]),
         survey=survey["name"],
         tolerance_m=survey["tolerance_m"],
         stop=row,
