@@ -69,7 +69,9 @@ def evaluate(
     check_sizes(len(stops.names), len(marks.names))
     eyes = stops.p_site
     alone = look(site, eyes, marks) if sights is None else sights
-    centres, sighting, positions = _predict(site, eyes, marks, model, wish, alone)
+    sights = behind_others(site, eyes, marks, alone)
+    centres, sighting = sighting_of(eyes, marks, model, wish, sights)
+    positions = predict_positions(sighting, wish)
     seen = sighting.is_seen
     covs = positions.cov_motion[:, 3:, 3:].copy()
     tested = reliability(sighting, positions, wish)
@@ -139,7 +141,9 @@ def field_map(
     check_sizes(1, len(marks.names))
     eyes, is_known = field_eyes(site, xs, ys)
     alone = look(site, eyes, marks) if sights is None else sights
-    _, sighting, positions = _predict(site, eyes, marks, model, wish, alone)
+    sights = behind_others(site, eyes, marks, alone)
+    _, sighting = sighting_of(eyes, marks, model, wish, sights)
+    positions = predict_positions(sighting, wish)
     covs = positions.cov_motion[:, 3:, 3:]
     sigmas = np.sqrt(np.trace(covs, axis1=1, axis2=2))
     is_open = ~np.isfinite(sigmas) | ~is_known
@@ -209,16 +213,31 @@ def check_sizes(n_stops: int, n_marks: int) -> None:
             raise InputError(f"{n:,} {what} were given; a plan takes {most:,} at most.")
 
 
-def _predict(
-    site: Site,
-    eyes: Array,
-    marks: Arrangement,
-    model: CentreModel,
-    wish: Requirement,
-    alone: Sights,
-) -> tuple[Centres, Sighting, Positions]:
-    """Return what is to be expected of centres and positions, and which marks are found."""
-    sights = behind_others(site, eyes, marks, alone)
+def sighting_of(
+    eyes: Array, marks: Arrangement, model: CentreModel, wish: Requirement, sights: Sights
+) -> tuple[Centres, Sighting]:
+    """Return what is to be expected of centres, and which marks are found.
+
+    Parameters
+    ----------
+    eyes : (e, 3)
+        Places of the LiDAR in the site frame [m].
+    marks : Arrangement
+        The marks.
+    model : CentreModel
+        How well centres will be known.
+    wish : Requirement
+        Returns that a sphere needs.
+    sights : Sights
+        What is seen of the marks.
+
+    Returns
+    -------
+    centres : Centres
+        Returns and covariances.
+    sighting : Sighting
+        What positions are predicted from.
+    """
     centres = expect_centres(model, eyes, marks, sights)
     sighting = Sighting(
         eyes_site=eyes,
@@ -227,7 +246,7 @@ def _predict(
         sigma_laser_bias=model.sensor.sigma_range_bias,
         is_seen=is_found(centres, wish.n_points_min),
     )
-    return centres, sighting, predict_positions(sighting, wish)
+    return centres, sighting
 
 
 @numba.njit(cache=True, nogil=True)

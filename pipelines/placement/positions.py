@@ -17,9 +17,13 @@ from pipelines.rigs import N_LASERS
 from pipelines.values import Array, Index, Mask
 
 _BIAS_LEFT = 0.22  # of the spread of laser biases: what a survey leaves to each centre, simulated
-_SIGMA_AIM = 6e-5  # [rad] what mounting and encoder leave of a direction after both faces, simulated
+_SIGMA_AIM = (
+    6e-5  # [rad] what mounting and encoder leave of a direction after both faces, simulated
+)
 _SINGULAR = 1e-11  # pivot over diagonal below which an unknown is undetermined
-_LOOSE2 = 1.0  # [m^2] a position that is worse than this is none
+LOOSE2 = 1.0
+"""Variance of a position above which it is none [m^2]."""
+
 _UNTESTABLE = 1e-7  # redundancy below which a bias cannot show
 
 
@@ -91,10 +95,9 @@ def predict_positions(sighting: Sighting, wish: Requirement) -> Positions:
     ``paper``: horizontal distances and heights of the three marks whose circles cut best, and the
     lean carried through them as ``ranging`` does; its heading is that of the three directions.
     """
-    eyes, marks = np.ascontiguousarray(sighting.eyes_site), np.ascontiguousarray(sighting.marks_site)
+    eyes, marks = _places(sighting)
     covs = sighting.cov_centres + wish.sigma_marks**2 * np.eye(3)
-    bias = sighting.sigma_laser_bias
-    extra = ((_BIAS_LEFT * bias) ** 2, wish.resection.sigma_common**2, _SIGMA_AIM**2)
+    extra = _extra(sighting, wish)
     shape = (len(eyes), 6, 6)
     cofactor, moved, out = np.zeros(shape), np.zeros(shape[:2]), np.zeros(shape)
     used = np.array(sighting.is_seen)
@@ -106,12 +109,30 @@ def predict_positions(sighting: Sighting, wish: Requirement) -> Positions:
         _by_motion(
             (eyes, marks, covs, used), extra, wish.sigma_levelling**-2, (out, cofactor, moved)
         )
-    out += bias**2 / N_LASERS * moved[:, :, None] * moved[:, None, :]
+    out += shared_variance(sighting.sigma_laser_bias) * moved[:, :, None] * moved[:, None, :]
     return Positions(cov_motion=out, cofactor=cofactor, used=used)
 
 
+def shared_variance(sigma_laser_bias: float) -> float:
+    """Return the variance of what all ranges of a survey are too long: the lasers' mean.
+
+    Parameters
+    ----------
+    sigma_laser_bias : float
+        Spread of what each laser measures too long [m].
+
+    Returns
+    -------
+    float
+        The variance [m^2].
+    """
+    return sigma_laser_bias**2 / N_LASERS
+
+
 @numba.njit(cache=True, nogil=True)
-def _claimed(cov: Array, v: tuple[float, float, float], extra: tuple, known: Array, true: Array) -> None:
+def _claimed(
+    cov: Array, v: tuple[float, float, float], extra: tuple, known: Array, true: Array
+) -> None:
     """Fill in a centre's covariance as a survey takes it, and as it is, shared excess apart."""
     bias2, common2, aim2 = extra
     d2 = v[0] * v[0] + v[1] * v[1] + v[2] * v[2]
@@ -125,7 +146,7 @@ def _claimed(cov: Array, v: tuple[float, float, float], extra: tuple, known: Arr
 
 
 @numba.njit(cache=True, nogil=True)
-def _inverted(N: Array, out: Array) -> bool:
+def inverted(N: Array, out: Array) -> bool:
     """Invert a symmetric positive matrix into another; false if it is singular."""
     n = len(N)
     L = np.zeros((n, n))
@@ -158,46 +179,121 @@ def _inverted(N: Array, out: Array) -> bool:
 
 
 @numba.njit(cache=True, nogil=True)
+def _inform(cov: Array, v: tuple[float, float, float], extra: tuple, out: tuple) -> bool:
+    """Fill in what one mark adds to normal matrix, spread and pull; false if it adds nothing."""
+    N, M, pull = out
+    P, J = np.empty((3, 3)), np.zeros((3, 6))
+    PJ, CPJ = np.empty((3, 6)), np.empty((3, 6))
+    known, true = np.empty((3, 3)), np.empty((3, 3))
+    x, y, z = v
+    _claimed(cov, v, extra, known, true)
+    if not inverted(known, P):
+        return False
+    J[0, 1], J[0, 2], J[1, 0], J[1, 2], J[2, 0], J[2, 1] = z, -y, -z, x, y, -x
+    J[0, 3] = J[1, 4] = J[2, 5] = 1.0
+    d = np.sqrt(x * x + y * y + z * z)
+    _product(P, J, PJ)
+    _product(true, PJ, CPJ)
+    for i in range(6):
+        pull[i] = (PJ[0, i] * x + PJ[1, i] * y + PJ[2, i] * z) / d
+        for j in range(6):
+            N[i, j] = J[0, i] * PJ[0, j] + J[1, i] * PJ[1, j] + J[2, i] * PJ[2, j]
+            M[i, j] = PJ[0, i] * CPJ[0, j] + PJ[1, i] * CPJ[1, j] + PJ[2, i] * CPJ[2, j]
+    return True
+
+
+@numba.njit(cache=True, nogil=True)
 def _by_motion(
     seen: tuple[Array, Array, Array, Mask], extra: tuple, gravity: float, out: tuple
 ) -> None:
     """Fill in the covariances of free stations, and how a common excess of ranges moves them."""
     eyes, marks, covs, is_seen = seen
     cov_motion, cofactor, moved = out
-    P, J, PJ, CPJ = np.empty((3, 3)), np.zeros((3, 6)), np.empty((3, 6)), np.empty((3, 6))
     N, M, pull = np.empty((6, 6)), np.empty((6, 6)), np.empty(6)
-    known, true = np.empty((3, 3)), np.empty((3, 3))
-    J[0, 3] = J[1, 4] = J[2, 5] = 1.0
+    one = (np.empty((6, 6)), np.empty((6, 6)), np.empty(6))
     for e in range(len(eyes)):
-        N[:] = 0.0
+        N[:], pull[:] = 0.0, 0.0
         N[0, 0] = N[1, 1] = gravity
         M[:] = N
-        pull[:] = 0.0
         for m in range(len(marks)):
             if not is_seen[e, m]:
                 continue
-            x, y, z = marks[m, 0] - eyes[e, 0], marks[m, 1] - eyes[e, 1], marks[m, 2] - eyes[e, 2]
-            _claimed(covs[e, m], (x, y, z), extra, known, true)
-            if not _inverted(known, P):
-                continue
-            J[0, 1], J[0, 2], J[1, 0], J[1, 2], J[2, 0], J[2, 1] = z, -y, -z, x, y, -x
-            d = np.sqrt(x * x + y * y + z * z)
-            _product(P, J, PJ)
-            _product(true, PJ, CPJ)
-            for i in range(6):
-                pull[i] += (PJ[0, i] * x + PJ[1, i] * y + PJ[2, i] * z) / d
-                for j in range(6):
-                    for k in range(3):
-                        N[i, j] += J[k, i] * PJ[k, j]
-                        M[i, j] += PJ[k, i] * CPJ[k, j]
+            v = (marks[m, 0] - eyes[e, 0], marks[m, 1] - eyes[e, 1], marks[m, 2] - eyes[e, 2])
+            if _inform(covs[e, m], v, extra, one):
+                N += one[0]
+                M += one[1]
+                pull += one[2]
         Q = cofactor[e]
-        ok = _inverted(N, Q)
-        if not ok or Q[3, 3] + Q[4, 4] + Q[5, 5] > _LOOSE2:
+        ok = inverted(N, Q)
+        if not ok or Q[3, 3] + Q[4, 4] + Q[5, 5] > LOOSE2:
             Q[:] = np.diag(np.full(6, np.inf))
             cov_motion[e] = Q
             continue
         cov_motion[e] = Q @ M @ Q
         moved[e] = Q @ pull
+
+
+class Information(NamedTuple):
+    """What each mark adds to what a free station knows; sums over marks are what it knows.
+
+    Attributes
+    ----------
+    normal : (e, n, 6, 6)
+        To the normal matrix by the weights of a survey.
+    spread : (e, n, 6, 6)
+        To the spread of its right-hand side.
+    pull : (e, n, 6)
+        To what a common excess of ranges does to that [1/m].
+    """
+
+    normal: Array
+    spread: Array
+    pull: Array
+
+
+def information(sighting: Sighting, wish: Requirement) -> Information:
+    """Return what each mark adds to what a free station knows.
+
+    Parameters
+    ----------
+    sighting : Sighting
+        Marks as seen.
+    wish : Requirement
+        What is known of the marks.
+
+    Returns
+    -------
+    Information
+        Zero for marks that are not found.
+    """
+    shape = sighting.is_seen.shape
+    out = Information(np.zeros((*shape, 6, 6)), np.zeros((*shape, 6, 6)), np.zeros((*shape, 6)))
+    covs = sighting.cov_centres + wish.sigma_marks**2 * np.eye(3)
+    eyes, marks = _places(sighting)
+    _informed((eyes, marks, covs, sighting.is_seen), _extra(sighting, wish), tuple(out))
+    return out
+
+
+def _places(sighting: Sighting) -> tuple[Array, Array]:
+    """Return eyes and marks as the kernels want them."""
+    return np.ascontiguousarray(sighting.eyes_site), np.ascontiguousarray(sighting.marks_site)
+
+
+def _extra(sighting: Sighting, wish: Requirement) -> tuple[float, float, float]:
+    """Return the variances of what lasers and gimbal leave, as a survey takes it and as it is."""
+    bias = sighting.sigma_laser_bias
+    return (_BIAS_LEFT * bias) ** 2, wish.resection.sigma_common**2, _SIGMA_AIM**2
+
+
+@numba.njit(cache=True, nogil=True)
+def _informed(seen: tuple[Array, Array, Array, Mask], extra: tuple, out: tuple) -> None:
+    """Fill in what each seen mark adds."""
+    eyes, marks, covs, is_seen = seen
+    for e in range(len(eyes)):
+        for m in range(len(marks)):
+            if is_seen[e, m]:
+                v = (marks[m, 0] - eyes[e, 0], marks[m, 1] - eyes[e, 1], marks[m, 2] - eyes[e, 2])
+                _inform(covs[e, m], v, extra, (out[0][e, m], out[1][e, m], out[2][e, m]))
 
 
 @numba.njit(cache=True, nogil=True)
@@ -273,12 +369,12 @@ def _by_circles(
             side2 = v * v * true[0, 0] - 2.0 * u * v * true[0, 1] + u * u * true[1, 1]
             yaw2 += side2 / flat2 / 9.0
         N[:] = A.T @ W @ A
-        if not _inverted(N, Q):
+        if not inverted(N, Q):
             continue
         gain[:] = Q @ A.T @ W
         tilt = gain @ lean
         position = gain @ C @ gain.T + level2 * tilt @ tilt.T
-        if np.trace(position) > _LOOSE2:
+        if np.trace(position) > LOOSE2:
             continue
         for r in range(3):
             used[e, three[r]] = True
@@ -330,7 +426,9 @@ def reliability(sighting: Sighting, found: Positions, wish: Requirement) -> Reli
     """
     v = sighting.marks_site[None] - sighting.eyes_site[:, None]
     d2 = np.maximum(np.sum(v**2, axis=2), 1e-9)[..., None, None]
-    known = sighting.cov_centres + (wish.sigma_marks**2 + wish.resection.sigma_common**2) * np.eye(3)
+    known = sighting.cov_centres + (wish.sigma_marks**2 + wish.resection.sigma_common**2) * np.eye(
+        3
+    )
     bias2 = (_BIAS_LEFT * sighting.sigma_laser_bias) ** 2
     known = known + bias2 * v[..., :, None] * v[..., None, :] / d2
     covs = np.where(found.used[..., None, None], known, np.eye(3))

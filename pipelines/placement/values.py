@@ -95,11 +95,26 @@ class Site:
         (...,)
             Heights, bilinear; NaN off the grid and where the ground is not known [m].
         """
-        return _bilinear(self, self.ground, p_site)
+        return bilinear(self, self.ground, p_site)
 
 
-def _bilinear(site: Site, grid: Array, p_site: Array) -> Array:
-    """Return the values of one of the site's grids at points; NaN off the grid."""
+def bilinear(site: Site, grid: Array, p_site: Array) -> Array:
+    """Return the values of one of a site's grids at points.
+
+    Parameters
+    ----------
+    site : Site
+        Whose lines the grid has.
+    grid : (m, n)
+        Values, rows along y.
+    p_site : (..., 2 or 3)
+        The points [m].
+
+    Returns
+    -------
+    (...,)
+        Values, bilinear; NaN off the grid.
+    """
     u = (p_site[..., 0] - site.xs[0]) / (site.xs[1] - site.xs[0])
     v = (p_site[..., 1] - site.ys[0]) / (site.ys[1] - site.ys[0])
     n_y, n_x = grid.shape
