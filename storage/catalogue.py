@@ -19,7 +19,7 @@ import pyarrow as pa
 from pipelines.errors import ConflictError, InputError, NotFoundError
 from pipelines.rigs import rig_digest, rig_from_mapping, rig_to_mapping
 from pipelines.values import ControlMarks, Rig, StopTruth, Truth
-from storage import results
+from storage import adjustments, results
 from storage.database import Database, execute_on, fetch
 from storage.records import (
     JobRecord,
@@ -107,6 +107,29 @@ _CONTROL = "SELECT * FROM control_marks WHERE survey_id = $id ORDER BY place"
 _TRUE_MARKS = "SELECT * FROM true_marks WHERE survey_id = $id ORDER BY place"
 _TRUE_STOPS = "SELECT * FROM true_stops WHERE survey_id = $id ORDER BY stop"
 _TRUE_WORLD = "SELECT rig, about FROM true_worlds WHERE survey_id = $id"
+_ADJUSTED_OF_SURVEY = {
+    "adjustments": "SELECT * FROM adjustments WHERE survey_id = $id",
+    "adjusted_stations": (
+        "SELECT x.* FROM adjusted_stations AS x JOIN adjustments USING (adjustment_id) "
+        "WHERE survey_id = $id"
+    ),
+    "adjusted_marks": (
+        "SELECT x.* FROM adjusted_marks AS x JOIN adjustments USING (adjustment_id) "
+        "WHERE survey_id = $id"
+    ),
+}
+_REFRESH_ADJUSTED = {
+    "adjusted_stations": """
+        UPDATE adjusted_stations AS x SET error_x_m = i.error_x_m, error_y_m = i.error_y_m,
+            error_z_m = i.error_z_m, error_yaw_deg = i.error_yaw_deg, error_3d_m = i.error_3d_m
+        FROM incoming AS i WHERE x.adjustment_id = i.adjustment_id AND x.station = i.station
+    """,
+    "adjusted_marks": """
+        UPDATE adjusted_marks AS x SET error_x_m = i.error_x_m, error_y_m = i.error_y_m,
+            error_z_m = i.error_z_m, error_3d_m = i.error_3d_m
+        FROM incoming AS i WHERE x.adjustment_id = i.adjustment_id AND x.mark = i.mark
+    """,
+}
 _RESULTS_OF_SURVEY = {
     "stops": "SELECT x.* FROM stops AS x JOIN runs USING (run_id) WHERE survey_id = $id",
     "marker_fits": (
@@ -119,6 +142,7 @@ _RESULTS_OF_SURVEY = {
         "SELECT x.* FROM resections AS x JOIN runs USING (run_id) WHERE survey_id = $id"
     ),
 }
+_TRUE_TABLES = ("true_marks", "true_stops")
 _INSERT = {
     "rigs": "INSERT OR IGNORE INTO rigs BY NAME SELECT * FROM incoming",
     "runs": "INSERT INTO runs BY NAME SELECT * FROM incoming",
@@ -128,10 +152,21 @@ _INSERT = {
     "station_fixes": "INSERT INTO station_fixes BY NAME SELECT * FROM incoming",
     "observations": "INSERT INTO observations BY NAME SELECT * FROM incoming",
     "resections": "INSERT INTO resections BY NAME SELECT * FROM incoming",
+    "adjustments": "INSERT INTO adjustments BY NAME SELECT * FROM incoming",
+    "adjusted_stations": "INSERT INTO adjusted_stations BY NAME SELECT * FROM incoming",
+    "adjusted_marks": "INSERT INTO adjusted_marks BY NAME SELECT * FROM incoming",
+    "adjusted_observations": "INSERT INTO adjusted_observations BY NAME SELECT * FROM incoming",
+    "refused_stations": "INSERT INTO refused_stations BY NAME SELECT * FROM incoming",
+    "control_checks": "INSERT INTO control_checks BY NAME SELECT * FROM incoming",
+    "calibrations": "INSERT INTO calibrations BY NAME SELECT * FROM incoming",
+    "calibrated_parameters": "INSERT INTO calibrated_parameters BY NAME SELECT * FROM incoming",
+    "calibration_gaps": "INSERT INTO calibration_gaps BY NAME SELECT * FROM incoming",
+    "documents": "INSERT INTO documents BY NAME SELECT * FROM incoming",
     "control_marks": "INSERT OR REPLACE INTO control_marks BY NAME SELECT * FROM incoming",
     "true_marks": "INSERT OR REPLACE INTO true_marks BY NAME SELECT * FROM incoming",
     "true_stops": "INSERT OR REPLACE INTO true_stops BY NAME SELECT * FROM incoming",
 }
+_OF_JOBS = tuple(name for name in _INSERT if name not in ("control_marks", *_TRUE_TABLES))
 _REFRESH = {
     "marker_fits": """
         UPDATE marker_fits AS x SET error_x_m = i.error_x_m, error_y_m = i.error_y_m,
@@ -678,7 +713,8 @@ class Catalogue(Database):
                 return job
             _require(job, JobStatus.RUNNING)
             truth = _truth(cursor, job.survey_id)
-            for name, table in results.with_errors(tables, truth).items():
+            compared = adjustments.with_errors(results.with_errors(tables, truth), truth)
+            for name, table in compared.items():
                 _insert(cursor, name, table)
             ended = replace(
                 job,
@@ -869,8 +905,15 @@ def _refresh_errors(cursor: duckdb.DuckDBPyConnection, survey_id: str) -> None:
     known = {
         name: fetch(cursor, sql, {"id": survey_id}) for name, sql in _RESULTS_OF_SURVEY.items()
     }
-    fresh = results.with_errors(known, _truth(cursor, survey_id))
+    truth = _truth(cursor, survey_id)
+    fresh = results.with_errors(known, truth)
     for name, sql in _REFRESH.items():
+        execute_on(cursor, sql, fresh[name])
+    adjusted = {
+        name: fetch(cursor, sql, {"id": survey_id}) for name, sql in _ADJUSTED_OF_SURVEY.items()
+    }
+    fresh = adjustments.with_errors(adjusted, truth)
+    for name, sql in _REFRESH_ADJUSTED.items():
         execute_on(cursor, sql, fresh[name])
 
 
@@ -902,9 +945,9 @@ def _check_name(what: str, name: str) -> None:
 
 def _check_tables(tables: Mapping[str, pa.Table]) -> None:
     """Refuse results for tables that no job writes."""
-    unknown = sorted(set(tables) - set(results.TABLES))
+    unknown = sorted(set(tables) - set(_OF_JOBS))
     if unknown:
-        raise InputError(f"No job writes {unknown[0]!r}; it writes {', '.join(results.TABLES)}.")
+        raise InputError(f"No job writes {unknown[0]!r}; it writes {', '.join(_OF_JOBS)}.")
 
 
 def _require(job: JobRecord, *allowed: JobStatus) -> None:

@@ -10,7 +10,6 @@ import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from datetime import datetime
-from typing import Any
 
 import numpy as np
 import pyarrow as pa
@@ -34,6 +33,7 @@ from pipelines.values import (
     Truth,
 )
 from storage.resections import resections_table, resections_with_errors
+from storage.rows import Row, plain, table_of
 
 _TO_95 = float(np.sqrt(chi2.ppf(0.95, 2)))  # from the standard ellipse to the 95 % ellipse
 _TEXT, _REAL, _WHOLE, _LONG = pa.string(), pa.float64(), pa.int32(), pa.int64()
@@ -123,8 +123,6 @@ _SCHEMAS = {
 }
 TABLES = tuple(_SCHEMAS)
 """Names of the tables that a job writes, in the order of writing."""
-
-Row = dict[str, Any]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -455,37 +453,11 @@ def _table(name: str, rows: Sequence[Row]) -> pa.Table:
     return table_of(_SCHEMAS[name], rows)
 
 
-def table_of(columns: Mapping[str, pa.DataType], rows: Sequence[Row]) -> pa.Table:
-    """Return rows as an Arrow table.
-
-    Parameters
-    ----------
-    columns : mapping of str to DataType
-        Its columns, in their order.
-    rows : sequence of dict
-        What a row does not tell is NULL, and so is what is not finite.
-
-    Returns
-    -------
-    Table
-        One row for each.
-    """
-    plain = [{key: _plain(value) for key, value in row.items()} for row in rows]
-    return pa.Table.from_pylist(plain, schema=pa.schema(list(columns.items())))
-
-
-def _plain(value: object) -> object:
-    """Return a value as Arrow takes it: NumPy's scalars as Python's, what is not finite as None."""
-    if isinstance(value, np.generic):
-        value = value.item()
-    return None if isinstance(value, float) and not np.isfinite(value) else value
-
-
 def _with_columns(table: pa.Table, errors: Sequence[Mapping[str, object]]) -> pa.Table:
     """Return a table with its error columns replaced; what a row does not tell is NULL."""
     for i, name in enumerate(table.column_names):
         if name.startswith("error_"):
-            values = pa.array([_plain(row.get(name)) for row in errors], _REAL)
+            values = pa.array([plain(row.get(name)) for row in errors], _REAL)
             table = table.set_column(i, name, values)
     return table
 

@@ -116,8 +116,10 @@ def test_every_table_and_view_is_documented():
 def test_every_number_of_the_database_carries_its_unit():
     units = ("_m", "_m2", "_deg", "_s", "_percent", "_bytes", "_rad", "_db")
     unitless = re.compile(
-        r"^(n_|dof$|sigma0$|redundancy$|w$|coverage$|attempts$|mean_(n_points|intensity)$"
-        r"|number$|place$|probability_|cov_motion$|rotation$|n_points_(from|to)$)"
+        r"^(n_|dof$|sigma0$|redundancy$|w$|coverage$|attempts$|mean_(n_points|intensity|redundancy)$"
+        r"|number$|place$|probability_|cov_motion$|rotation$|n_points_(from|to)$"
+        r"|(vtpv|vtpv_limit|w_limit|test_level)$|variance_factor_"
+        r"|(start_value|estimate|sigma)$)"  # calibrated_parameters: the unit stands in the row
     )
     query = """SELECT table_name, column_name FROM duckdb_columns() WHERE NOT internal
         AND (data_type LIKE 'DOUBLE%' OR data_type LIKE '%INT%')"""

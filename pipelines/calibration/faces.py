@@ -113,6 +113,24 @@ def rig_from_faces(stops: Iterable[ScanLog], start: Rig, config: SurveyConfig) -
 
 def _pairs(log: ScanLog, cloud: StitchedCloud, config: SurveyConfig) -> list[_Pair]:
     """Return the spheres that both faces of a stop show."""
+    return [_pair(log, cloud, fits) for fits in both_faces(cloud, config)]
+
+
+def both_faces(cloud: StitchedCloud, config: SurveyConfig) -> list[tuple[MarkerFit, MarkerFit]]:
+    """Fit the spheres of a stop on either face apart.
+
+    Parameters
+    ----------
+    cloud : StitchedCloud
+        A stop.
+    config : SurveyConfig
+        How spheres are found.
+
+    Returns
+    -------
+    list of (MarkerFit, MarkerFit)
+        What the front and the back of the head show of each sphere that both see.
+    """
     front = front_face(cloud)
     sides = [_fits(cloud, rows, config) for rows in (np.flatnonzero(front), np.flatnonzero(~front))]
     if not all(sides):
@@ -121,7 +139,7 @@ def _pairs(log: ScanLog, cloud: StitchedCloud, config: SurveyConfig) -> list[_Pa
     gaps = np.linalg.norm(p[:, None] - q[None], axis=2)
     near = gaps < _GATE + _GATE_SLOPE * np.linalg.norm(p, axis=1)[:, None]
     mutual = (gaps == gaps.min(axis=1, keepdims=True)) & (gaps == gaps.min(axis=0))
-    return [_pair(log, cloud, (sides[0][i], sides[1][j])) for i, j in np.argwhere(near & mutual)]
+    return [(sides[0][i], sides[1][j]) for i, j in np.argwhere(near & mutual)]
 
 
 def _fits(cloud: StitchedCloud, rows: Index, config: SurveyConfig) -> list[MarkerFit]:

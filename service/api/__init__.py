@@ -5,8 +5,22 @@ Every handler parses, makes one call and answers; what it may answer is in ``mod
 
 from fastapi import APIRouter
 
-from service.api import jobs, problems, recordings, results, rigs, sql, surveys
+from service.api import (
+    adjustments,
+    calibrations,
+    jobs,
+    plans,
+    problems,
+    recordings,
+    results,
+    rigs,
+    sql,
+    surveys,
+)
 
 router = APIRouter()
-for part in (surveys, recordings, jobs, results, rigs, sql, problems):
+for part in (
+    *(surveys, recordings, jobs, results, adjustments, calibrations),
+    *(rigs, plans, sql, problems),
+):
     router.include_router(part.router)

@@ -6,11 +6,15 @@
 
 from collections.abc import Mapping
 
-from service.work import processing
+from service.work import adjusting, calibrating, processing
 from service.work.orders import JobKind, Kind, Log, Options, Order, Outcome
 
 __all__ = ["KINDS", "JobKind", "Kind", "Log", "Options", "Order", "Outcome"]
 
 KINDS: Mapping[JobKind, Kind] = {
     JobKind.PROCESS: Kind(work=processing.work, takes_one_log=True),
+    JobKind.ADJUST: Kind(
+        work=adjusting.work, options=adjusting.AdjustOptions, gather=adjusting.gather
+    ),
+    JobKind.CALIBRATE: Kind(work=calibrating.work, begins_with_rig_of_survey=False),
 }

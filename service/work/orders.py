@@ -23,6 +23,8 @@ class JobKind(StrEnum):
     """What can be asked for."""
 
     PROCESS = "process"
+    ADJUST = "adjust"
+    CALIBRATE = "calibrate"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -82,7 +82,7 @@ def site(tmp_path_factory, stop, control):
         yield Site(client, stop, control)
 
 
-@pytest.fixture
+@pytest.fixture(scope="session")
 def open_site():
     """Return what wraps a client of a test's own service."""
     return Site

@@ -1,0 +1,231 @@
+"""Jobs of the kind ``adjust``: all stations and marks of a survey together.
+
+Centres that were fitted before in the same way are taken from their rows; only the logs for which
+there are none are processed, and that gives the rows that a job of its own would have given.
+"""
+
+from __future__ import annotations
+
+import json
+import secrets
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
+from datetime import UTC, datetime
+from time import perf_counter
+from typing import TYPE_CHECKING, Any
+
+from pydantic import Field
+
+from pipelines.errors import SpheremarkError
+from pipelines.rigs import rig_digest
+from service.provenance import code_version
+from service.work import processing
+from service.work.orders import Log, Options, Order, Outcome
+
+if TYPE_CHECKING:
+    import pyarrow as pa
+
+    from pipelines.network import AdjustedNetwork, Refusal
+    from pipelines.survey import Progress
+    from pipelines.values import MarkerFits
+    from storage.catalogue import Catalogue
+
+Row = dict[str, Any]
+
+_SCANS = 0.9  # share of the work that the scans take
+_RUNS = """
+SELECT r.run_id, r.recording_id, r.rig_digest, r.config, r.code_version
+FROM runs AS r JOIN jobs AS j USING (job_id)
+WHERE r.survey_id = $survey AND list_contains($recordings::VARCHAR[], r.recording_id)
+    AND (json_extract_string(j.options, '$.rig') IS NOT DISTINCT FROM $rig::VARCHAR)
+ORDER BY r.finished_at DESC
+"""
+_STOPS = "SELECT * FROM stops WHERE list_contains($runs::VARCHAR[], run_id) ORDER BY run_id, stop"
+_FITS = "SELECT * FROM marker_fits WHERE list_contains($runs::VARCHAR[], run_id)"
+
+
+class AdjustOptions(Options):
+    """What one can choose about an adjustment."""
+
+    control: bool = Field(
+        default=True, description="Use the survey's control marks, if it has any; else free."
+    )
+    reprocess: bool = Field(
+        default=False, description="Fit all centres anew, even those that were fitted before."
+    )
+
+
+def gather(catalogue: Catalogue, order: Order) -> Mapping[str, pa.Table]:
+    """Return the runs whose centres are those that this job would fit, newest first, with rows.
+
+    Which of them this version of the code made, the worker sees.
+    """
+    wanted = {
+        "survey": order.survey_id,
+        "recordings": [log.recording_id for log in order.logs],
+        "rig": None if order.rig is None else rig_digest(order.rig),
+    }
+    runs = catalogue.table(_RUNS, wanted)
+    if order.options.get("reprocess"):
+        runs = runs.slice(0, 0)
+    keep = [row["run_id"] for row in runs.to_pylist() if _is_alike(row, order)]
+    return {
+        "runs": runs,
+        "stops": catalogue.table(_STOPS, {"runs": keep}),
+        "marker_fits": catalogue.table(_FITS, {"runs": keep}),
+    }
+
+
+def _is_alike(run: Row, order: Order) -> bool:
+    """Whether a run fitted centres as this order asks for."""
+    done, wanted = json.loads(run["config"]), order.config.to_mapping()
+    method = wanted["fitting"]["methods"][0]
+    return method in done["fitting"]["methods"] and _way(done) == _way(wanted)
+
+
+def _way(config: Mapping[str, Any]) -> str:
+    """Return all of a configuration that centres depend on, but for the method's name."""
+    fitting = {key: value for key, value in config["fitting"].items() if key != "methods"}
+    parts = {key: config[key] for key in ("marker_radius", "stitching", "extraction")}
+    return json.dumps(parts | {"fitting": fitting}, sort_keys=True)
+
+
+@dataclass(slots=True)
+class _Book:
+    """Stations as they come in: centres, where they are from, and who gave none."""
+
+    scans: list[tuple[str, MarkerFits]] = field(default_factory=list)
+    sources: dict[str, Row] = field(default_factory=dict)
+    refused: list[Refusal] = field(default_factory=list)
+    tables: list[dict[str, pa.Table]] = field(default_factory=list)
+
+    def enter(self, stop: str, fits: MarkerFits, source: Row) -> None:
+        """Add a station; a stop that was recorded again gets a number."""
+        name, again = stop, 1
+        while name in self.sources:
+            again += 1
+            name = f"{stop} ({again})"
+        self.scans.append((name, fits))
+        self.sources[name] = {"station": name, "stop": stop, **source}
+
+
+def work(order: Order, progress: Progress) -> Outcome:
+    """Adjust the stations of all logs of an order."""
+    import pyarrow as pa
+
+    from service import networks
+    from service.work.network_rows import control_checks, network_rows
+    from storage import adjustments
+    from storage.documents import documents
+
+    start = perf_counter()
+    book = _read(order, progress)
+    progress(_SCANS, f"Adjusting {len(book.scans)} stations")
+    marks = order.marks if order.options.get("control", True) else None
+    scans = networks.Fieldbook(scans=tuple(book.scans), refused=tuple(book.refused))
+    result = networks.adjust_scans(scans, marks, order.config)
+    answer = networks.network_answer(result, order.config)
+    progress(0.5 * (1.0 + _SCANS), "Leaving out each control mark in turn")
+    rows = network_rows(answer, book.sources)
+    rows["control_checks"] = control_checks(result, order.config.resection)
+    rows["adjustments"][0] |= {
+        "job_id": order.job_id,
+        "survey_id": order.survey_id,
+        "finished_at": datetime.now(UTC),
+        "config": order.config.text,
+        "config_digest": order.config.digest,
+        "code_version": code_version(),
+        "duration_s": perf_counter() - start,
+    }
+    own = adjustments.tables(order.result_id, rows)
+    own["documents"] = documents(order.result_id, _files(result, answer))
+    for name in book.tables[0] if book.tables else ():
+        own[name] = pa.concat_tables([tables[name] for tables in book.tables])
+    return Outcome(tables=own, message=_summary(answer, rows["control_checks"]))
+
+
+def _read(order: Order, progress: Progress) -> _Book:
+    """Bring in the centres of each log; one that gives none costs no other."""
+    from pipelines.network import Refusal
+
+    book, first = _Book(), None
+    for i, log in enumerate(order.logs):
+        try:
+            for stop, fits, source in _centres(order, log, book, _part(progress, i, order)):
+                book.enter(stop, fits, source)
+        except SpheremarkError as error:
+            first = first or error
+            book.refused.append(Refusal(station=log.name, code=error.code, reason=str(error)))
+    if not book.scans and first is not None:
+        raise first
+    return book
+
+
+def _centres(
+    order: Order, log: Log, book: _Book, progress: Progress
+) -> Iterator[tuple[str, MarkerFits, Row]]:
+    """Yield the stops of a log with their centres: those of an earlier run, or new ones."""
+    from storage.centres import read_centres
+
+    method = order.config.fitting.methods[0]
+    known = set(order.known["stops"].column("run_id").to_pylist())
+    wanted = (log.recording_id, code_version())
+    run = next(
+        (
+            row
+            for row in order.known["runs"].to_pylist()
+            if row["run_id"] in known and (row["recording_id"], row["code_version"]) == wanted
+        ),
+        None,
+    )
+    if run is not None:
+        progress(0.0, f"Taking the centres of {log.name} from an earlier run")
+        source = {key: run[key] for key in ("run_id", "recording_id", "rig_digest")}
+        stops, fits = order.known["stops"], order.known["marker_fits"]
+        for stop, found in read_centres(stops, fits, run["run_id"], method):
+            yield stop, found, source
+        return
+    run_id = secrets.token_hex(8)
+    done, tables = processing.process_log(order, log, run_id, progress)
+    book.tables.append(tables)
+    for one in done:
+        digest = rig_digest(one.cloud.rig)
+        source = {"run_id": run_id, "recording_id": log.recording_id, "rig_digest": digest}
+        yield one.name, one.fits[method], source
+
+
+def _part(progress: Progress, i: int, order: Order) -> Progress:
+    """Return the progress of one log as a share of the whole."""
+    return lambda share, what: progress(_SCANS * (i + share) / len(order.logs), what)
+
+
+def _files(result: AdjustedNetwork, answer: Row) -> dict[str, str]:
+    """Return what a network can be downloaded as."""
+    from service import networks
+    from storage.networks import format_coordinates, format_gama
+
+    return {
+        "adjustment.json": json.dumps(answer),
+        "report.txt": networks.report(answer),
+        "coordinates.csv": format_coordinates(result),
+        "gama.xml": format_gama(result),
+    }
+
+
+def _summary(answer: Row, checks: list[Row]) -> str:
+    """Say in some sentences what an adjustment gave, and what is missing or weak."""
+    kind = "with control" if answer["datum"]["kind"] == "control" else "as a free network"
+    sigmas = [one["sigma_3d_m"] for one in answer["stations"]]
+    test = "passed" if answer["passes_global_test"] else "FAILED"
+    parts = [
+        f"{len(answer['stations'])} stations and {len(answer['marks'])} marks adjusted {kind}: "
+        f"stations with sigmas to {1000 * max(sigmas):.1f} mm (3-D), global test {test}."
+    ]
+    if checks:
+        worst = max(checks, key=lambda row: float(row["difference_3d_m"]))
+        parts.append(
+            f"Left out in turn, control marks are met to {1000 * worst['difference_3d_m']:.1f} mm."
+        )
+    if answer["refused"]:
+        parts.append("Without " + ", ".join(one["station"] for one in answer["refused"]) + ".")
+    return " ".join([*parts, *answer["warnings"]])

@@ -1,0 +1,192 @@
+"""A network as rows of the database, and each of its control marks left out in turn."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from pipelines.config import ResectionConfig
+from pipelines.errors import SolveError
+from pipelines.network import AdjustedNetwork, adjust_network
+
+Row = dict[str, Any]
+
+_AXES = ("x", "y", "z")
+_COV = [
+    (axes, "xyz".index(axes[0]), "xyz".index(axes[1]))
+    for axes in ("xx", "xy", "xz", "yy", "yz", "zz")
+]
+_N_LEFT = 2  # control marks that a network needs for place and heading
+
+
+def network_rows(answer: Row, sources: Mapping[str, Row]) -> dict[str, list[Row]]:
+    """Return the rows of a network's answer by table, without what names and made it.
+
+    ``sources`` says of each station which stop of which run its centres are from.
+    """
+    seen = [row for row in answer["observations"] if row["used"]]
+    return {
+        "adjustments": [_adjustment(answer, sources)],
+        "adjusted_stations": [
+            sources[row["name"]]
+            | _placed(row, row["position_covariance_m2"])
+            | _mean_redundancy(seen, "station", row["name"])
+            | {
+                "yaw_deg": row["yaw_deg"],
+                "sigma_yaw_deg": row["sigma_yaw_deg"],
+                "rotation": [value for line in row["rotation"] for value in line],
+                "cov_motion": [value for line in row["covariance"] for value in line],
+            }
+            for row in answer["stations"]
+        ],
+        "adjusted_marks": [
+            {"mark": row["name"], "is_control": row["is_control"]}
+            | _placed(row, row["covariance_m2"])
+            | _mean_redundancy(seen, "mark", row["name"])
+            for row in answer["marks"]
+        ],
+        "adjusted_observations": list(_observations(answer)),
+        "refused_stations": answer["refused"],
+    }
+
+
+def _adjustment(answer: Row, sources: Mapping[str, Row]) -> Row:
+    """Return the row of the adjustment as a whole."""
+    bias = answer["range_bias"] or {}
+    rigs = {sources[row["name"]]["rig_digest"] for row in answer["stations"]}
+    return {
+        **{key: answer[key] for key in ("status", "warnings", "dof", "sigma0")},
+        **{key: answer[key] for key in ("n_observations", "n_unknowns", "passes_global_test")},
+        "n_stations": len(answer["stations"]),
+        "n_marks": len(answer["marks"]),
+        "n_left_out": len(answer["excluded"]),
+        "n_refused": len(answer["refused"]),
+        "n_control_marks": len(answer["datum"]["control_marks"]),
+        "datum": answer["datum"]["kind"],
+        "datum_text": answer["datum"]["text"],
+        "fit_method": answer["method"],
+        "vtpv": answer["global_test"]["vtpv"],
+        "vtpv_limit": answer["global_test"]["limit"],
+        "test_level": answer["global_test"]["level"],
+        "w_limit": answer["critical_w"],
+        **{f"variance_factor_{key}": value for key, value in answer["variance_factors"].items()},
+        "range_bias_m": bias.get("value_m"),
+        "sigma_range_bias_m": bias.get("sigma_m"),
+        "rig_digest": next(iter(rigs)) if len(rigs) == 1 else None,
+    }
+
+
+def _placed(row: Row, cov: Sequence[Sequence[float]]) -> Row:
+    """Return place, covariance, ellipses and counts of a station or a mark."""
+    kept = ("sigma_3d_m", "n_observations", *(key for key in row if key.startswith("ellipse_")))
+    return {
+        **{f"{axis}_m": value for axis, value in zip(_AXES, row["position_m"], strict=True)},
+        **{f"cov_{axes}_m2": cov[i][k] for axes, i, k in _COV},
+        **{key: row[key] for key in kept},
+    }
+
+
+def _mean_redundancy(observations: Sequence[Row], key: str, name: str) -> Row:
+    """Return the mean redundancy of the centres of a station or a mark."""
+    own = [row["redundancy"] for row in observations if row[key] == name]
+    known = [value for value in own if value is not None]
+    return {"mean_redundancy": sum(known) / len(known) if known else None}
+
+
+def _observations(answer: Row) -> Iterator[Row]:
+    """Yield the row of each centre, levelling and control mark, used or not."""
+    reasons = {
+        (one["kind"], one["station"], one["marker"] or one["mark"]): one
+        for one in answer["excluded"]
+    }
+
+    def judged(kind: str, row: Row) -> Row:
+        own = row.get("marker") or (row.get("mark") if kind == "control" else None)
+        left = reasons.pop((kind, row.get("station"), own), None)
+        left = left or reasons.pop((kind, row.get("station"), row.get("mark")), None)
+        reason = "" if row["used"] else (left or {}).get("reason", "Left out.")
+        names = {key: row.get(key) for key in ("station", "marker", "mark")}
+        return names | {"kind": kind, "used": row["used"], "reason": reason} | _tests(row)
+
+    yield from (judged("centre", row) for row in answer["observations"])
+    yield from (judged("gravity", row) for row in answer["gravity"])
+    yield from (judged("control", row) for row in answer["control"])
+    for (kind, station, _), one in reasons.items():
+        yield {
+            "kind": kind,
+            "station": station,
+            "marker": one["marker"],
+            "mark": one["mark"],
+            "used": False,
+            "reason": one["reason"],
+        }
+
+
+def _tests(row: Row) -> Row:
+    """Return residuals and reliability of an observation, angles in degrees."""
+    found = {key: row[key] for key in ("redundancy", "w")}
+    for key in ("external_reliability_station_m", "external_reliability_mark_m"):
+        found[key] = row.get(key)
+    if "residual_rad" in row:
+        bias = row["minimal_detectable_bias_rad"]
+        residual = zip(_AXES, row["residual_rad"], strict=False)
+        return found | {
+            **{f"residual_{axis}_deg": math.degrees(value) for axis, value in residual},
+            "minimal_detectable_bias_deg": None if bias is None else math.degrees(bias),
+        }
+    residual = zip(_AXES, row["residual_m"], strict=True)
+    return found | {
+        **{f"residual_{axis}_m": value for axis, value in residual},
+        "minimal_detectable_bias_m": row["minimal_detectable_bias_m"],
+    }
+
+
+def control_checks(result: AdjustedNetwork, config: ResectionConfig) -> list[Row]:
+    """Return, for each control mark, where the network puts it without its coordinates.
+
+    None where fewer than three are there, and none of a mark without which there is no network.
+    """
+    network = result.network
+    n_before = len(network.sightings) + len(network.stations)
+    used = np.flatnonzero(result.used[n_before:])
+    counts = np.bincount(
+        network.sightings[result.used[: len(network.sightings)], 1], minlength=len(network.marks)
+    )
+    places = [int(i) for i in used if counts[network.controls[i]]]
+    if len(used) <= _N_LEFT:
+        return []
+    return [row for i in places if (row := _check(result, i, config)) is not None]
+
+
+def _check(result: AdjustedNetwork, i: int, config: ResectionConfig) -> Row | None:
+    """Return where a network without its control mark ``i`` puts it, if there is such a network."""
+    network = result.network
+    mark = int(network.controls[i])
+    others = np.arange(len(network.controls)) != i
+    without = replace(
+        network,
+        controls=network.controls[others],
+        p_control_site=network.p_control_site[others],
+        cov_control_site=network.cov_control_site[others],
+    )
+    try:
+        found = adjust_network(without, config)
+    except SolveError:
+        return None
+    n = len(network.sightings)
+    n_seen = int(np.sum(found.used[:n] & (network.sightings[:, 1] == mark)))
+    difference = found.p_site[mark] - network.p_control_site[i]
+    cov = found.mark_covariances[mark] + network.cov_control_site[i]
+    sigmas = np.sqrt(np.diag(cov))
+    return {
+        "mark": network.marks[mark],
+        "n_observations": n_seen,
+        **{f"difference_{axis}_m": value for axis, value in zip(_AXES, difference, strict=True)},
+        "difference_3d_m": float(np.linalg.norm(difference)),
+        **{f"sigma_{axis}_m": value for axis, value in zip(_AXES, sigmas, strict=True)},
+        "sigma_3d_m": float(np.sqrt(np.trace(cov))),
+    }

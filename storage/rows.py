@@ -1,0 +1,48 @@
+"""Rows as Arrow tables: what is not known or not finite becomes NULL."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+
+Row = dict[str, Any]
+
+
+def table_of(columns: Mapping[str, pa.DataType], rows: Sequence[Row]) -> pa.Table:
+    """Return rows as an Arrow table.
+
+    Parameters
+    ----------
+    columns : mapping of str to DataType
+        Its columns, in their order.
+    rows : sequence of dict
+        What a row does not tell is NULL, and so is what is not finite.
+
+    Returns
+    -------
+    Table
+        One row for each.
+    """
+    known = [{key: plain(value) for key, value in row.items()} for row in rows]
+    return pa.Table.from_pylist(known, schema=pa.schema(list(columns.items())))
+
+
+def plain(value: object) -> object:
+    """Return a value as Arrow takes it.
+
+    Parameters
+    ----------
+    value : object
+        A value of Python or a scalar of NumPy.
+
+    Returns
+    -------
+    object
+        NumPy's scalars as Python's, what is not finite as None.
+    """
+    if isinstance(value, np.generic):
+        value = value.item()
+    return None if isinstance(value, float) and not np.isfinite(value) else value

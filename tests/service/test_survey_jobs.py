@@ -1,0 +1,242 @@
+"""Jobs over a survey as a whole: its network adjusted and its gimbal calibrated over HTTP."""
+
+import json
+from types import SimpleNamespace
+from xml.etree import ElementTree as ET
+
+import numpy as np
+import pytest
+from fastapi.testclient import TestClient
+
+from pipelines.simulation import SimulationConfig
+from service.app import create_app
+from service.fieldwork import Assignment, survey
+from service.settings import Settings
+
+STOPS = ("lane2-stop2", "lane3-stop5", "lane4-stop3")
+
+
+@pytest.fixture(scope="module")
+def field(tmp_path_factory):
+    """Return three stops on disk: only beams near spheres, which is all that centres need."""
+    wanted = Assignment(
+        scenario="paper-field",
+        stops=",".join(STOPS),
+        seed=11,
+        config=SimulationConfig(only_near_spheres=True),
+        compression="none",
+    )
+    made = tuple(survey(tmp_path_factory.mktemp("field"), wanted))
+    return SimpleNamespace(stops=made, control=(made[0].log.parent / "control.csv").read_text())
+
+
+@pytest.fixture(scope="module")
+def site(tmp_path_factory, field, open_site):
+    """Return a service with a survey whose three logs were processed."""
+    settings = Settings(data=tmp_path_factory.mktemp("data"), workers=1)
+    with TestClient(create_app(settings), base_url="http://127.0.0.1:8000") as client:
+        site = open_site(client, field.stops[0], field.control)
+        site.survey("field")
+        for stop in field.stops:
+            truth = {"content": stop.truth.read_bytes(),
+                     "headers": {"Content-Type": "application/json"}}  # fmt: skip
+            client.put("/api/v1/surveys/field/truth", **truth).raise_for_status()
+            job = site.upload(stop.log.read_bytes(), stop.name, survey="field", process="true")
+            assert site.ended(job.json()["job"]["job_id"])["status"] == "successful"
+        yield site
+
+
+@pytest.fixture(scope="module")
+def run(site):
+    """Return what asks for a job and waits for its end."""
+
+    def asked(kind, survey="field", **more):
+        answer = site.client.post("/api/v1/jobs", json={"kind": kind, "survey": survey, **more})
+        assert answer.status_code == 202, answer.text
+        return site.ended(answer.json()["job_id"], seconds=120)
+
+    return asked
+
+
+@pytest.fixture(scope="module")
+def rows(site):
+    """Return what asks the service for the rows of a table that a job wrote."""
+
+    def asked(table, job):
+        key = "calibration_id" if table.startswith("calibrat") else "adjustment_id"
+        whole = "calibrations" if table.startswith("calibrat") else "adjustments"
+        key = "job_id" if table == "runs" else key
+        whole = "jobs" if table == "runs" else whole
+        sql = (
+            f"SELECT x.* FROM {table} AS x WHERE {key} IN "  # noqa: S608
+            f"(SELECT {key} FROM {whole} WHERE job_id = '{job['job_id']}')"
+        )
+        answer = site.client.post("/api/v1/sql", json={"sql": sql}).json()
+        names = [column["name"] for column in answer["columns"]]
+        return [dict(zip(names, row, strict=True)) for row in answer["rows"]]
+
+    return asked
+
+
+@pytest.fixture(scope="module")
+def tied(run):
+    """Return the job of the network with control."""
+    return run("adjust")
+
+
+@pytest.fixture(scope="module")
+def free(run):
+    """Return the job of the free network."""
+    return run("adjust", options={"control": False})
+
+
+@pytest.fixture(scope="module")
+def calibrated(run):
+    """Return the job of the calibration."""
+    return run("calibrate")
+
+
+def test_a_network_with_control_is_near_the_truth_and_says_how_near(tied, rows):
+    assert tied["status"] == "successful", tied
+    found = rows("adjusted_stations", tied)
+    assert {row["station"] for row in found} == set(STOPS)
+    for row in found:
+        assert row["sigma_3d_m"] < 0.003
+        assert row["error_3d_m"] < 4.0 * row["sigma_3d_m"]
+        assert 0.0 < row["mean_redundancy"] < 3.0
+
+
+def test_adjusting_takes_the_centres_of_earlier_runs_and_makes_no_new_ones(site, tied, rows):
+    assert not rows("runs", tied)
+    known = {run["run_id"]: run for run in site.client.get("/api/v1/runs").json()["items"]}
+    for row in rows("adjusted_stations", tied):
+        assert row["rig_digest"] == known[row["run_id"]]["rig_digest"]
+
+
+def test_centres_that_were_read_back_adjust_as_those_that_are_fitted_anew(run, rows, tied):
+    again = run("adjust", options={"reprocess": True})
+    assert again["status"] == "successful", again
+    assert len(rows("runs", again)) == len(STOPS)
+    first, second = (
+        sorted(rows("adjusted_stations", job), key=lambda row: row["station"])
+        for job in (tied, again)
+    )
+    for one, other in zip(first, second, strict=True):
+        for axis in ("x_m", "y_m", "z_m", "sigma_3d_m"):
+            assert one[axis] == pytest.approx(other[axis], abs=1e-9)
+
+
+def test_the_errors_of_a_free_network_are_those_after_it_was_laid_on_the_truth(free, rows):
+    (whole,) = rows("adjustments", free)
+    found = rows("adjusted_marks", free)
+    assert whole["datum"] == "free"
+    assert not any(row["is_control"] for row in found)
+    flat = [np.hypot(row["error_x_m"], row["error_y_m"]) for row in found]
+    assert np.sqrt(np.mean(np.square(flat))) < 0.003  # [m] it lies in the frame of the first stop
+    normed = [row["error_3d_m"] / row["sigma_3d_m"] for row in found]
+    assert 0.3 < np.sqrt(np.mean(np.square(normed))) < 2.0  # levelling tilts all marks together
+
+
+def test_every_control_mark_is_left_out_in_turn(tied, free, rows):
+    found = rows("control_checks", tied)
+    assert len(found) > 8
+    normed = [row["difference_3d_m"] / row["sigma_3d_m"] for row in found]
+    assert 0.5 < np.sqrt(np.mean(np.square(normed))) < 1.7
+    assert not rows("control_checks", free)
+
+
+def test_what_is_not_used_stands_in_the_rows_with_a_reason(tied, rows):
+    found = rows("adjusted_observations", tied)
+    assert {row["kind"] for row in found} == {"centre", "gravity", "control"}
+    for row in found:
+        assert row["used"] == (row["reason"] == "")
+
+
+def test_a_network_can_be_downloaded_in_four_forms(site, tied, rows):
+    (whole,) = rows("adjustments", tied)
+    url = f"/api/v1/adjustments/{whole['adjustment_id']}/files"
+    names = ("adjustment.json", "report.txt", "coordinates.csv", "gama.xml")
+    texts = {name: site.client.get(f"{url}/{name}") for name in names}
+    assert {answer.status_code for answer in texts.values()} == {200}
+    assert len(json.loads(texts["adjustment.json"].text)["stations"]) == len(STOPS)
+    assert "NETWORK ADJUSTMENT" in texts["report.txt"].text
+    assert texts["coordinates.csv"].headers["content-type"].startswith("text/csv")
+    assert ET.fromstring(texts["gama.xml"].text).tag.endswith("gama-local")
+    assert site.client.get(f"{url}/other.txt").status_code == 404
+
+
+def test_an_adjustment_is_one_answer_with_its_stations_and_marks(site, tied):
+    items = site.client.get("/api/v1/adjustments", params={"survey": "field"}).json()["items"]
+    (listed,) = [one for one in items if one["job_id"] == tied["job_id"]]
+    answer = site.client.get(f"/api/v1/adjustments/{listed['adjustment_id']}").json()
+    assert answer["sigma0"] == listed["sigma0"]
+    assert {one["station"] for one in answer["stations"]} == set(STOPS)
+    assert {"marks", "control_checks", "refused", "files"} <= set(answer)
+
+
+def test_a_calibration_brings_the_faces_together_and_its_rig_is_kept(site, calibrated, rows):
+    assert calibrated["status"] == "successful", calibrated
+    (whole,) = rows("calibrations", calibrated)
+    assert whole["gap_rms_after_m"] < whole["gap_rms_before_m"]
+    assert whole["gap_rms_after_m"] == pytest.approx(whole["gap_sigma_after_m"], rel=0.5)
+    told = rows("calibrated_parameters", calibrated)
+    assert all(one["sigma"] > 0 for one in told if one["is_estimated"])
+    assert [one for one in told if not one["is_estimated"] and one["reason"]]
+    rig = site.client.get(f"/api/v1/rigs/{whole['rig_digest']}").json()
+    file = site.client.get(f"/api/v1/calibrations/{whole['calibration_id']}/files/rig.json").json()
+    assert rig["rig"] == file
+
+
+def test_later_jobs_use_the_rig_that_was_chosen_and_name_it(site, calibrated, run, rows):
+    (whole,) = rows("calibrations", calibrated)
+    url = "/api/v1/surveys/field/rig"
+    chosen = site.client.put(url, json={"rig_digest": whole["rig_digest"]}).json()
+    assert chosen["rig_digest"] == whole["rig_digest"]
+    job = run("adjust")
+    site.client.put(url, json={"rig_digest": None}).raise_for_status()
+    assert job["options"]["rig"] == whole["rig_digest"]
+    assert {row["rig_digest"] for row in rows("adjusted_stations", job)} == {whole["rig_digest"]}
+    assert run("adjust")["options"].get("rig") is None
+
+
+def test_a_job_takes_a_rig_as_json_and_processes_with_it(site, run, rows):
+    digest = site.client.get("/api/v1/runs").json()["items"][0]["rig_digest"]
+    rig = site.client.get(f"/api/v1/rigs/{digest}").json()["rig"] | {"name": "bench"}
+    recording = site.client.get("/api/v1/recordings").json()["items"][0]["recording_id"]
+    job = run("process", recording=recording, rig=rig)
+    (done,) = rows("runs", job)
+    assert done["rig_digest"] == job["options"]["rig"] != digest
+
+
+def test_a_survey_without_logs_cannot_be_adjusted(site):
+    site.client.post("/api/v1/surveys", json={"name": "nothing"}).raise_for_status()
+    answer = site.client.post("/api/v1/jobs", json={"kind": "adjust", "survey": "nothing"})
+    assert answer.status_code == 400
+    assert "no log" in answer.json()["detail"]
+
+
+def test_an_unknown_option_is_refused_with_its_name(site):
+    new = {"kind": "adjust", "survey": "field", "options": {"contrl": True}}
+    answer = site.client.post("/api/v1/jobs", json=new)
+    assert (answer.status_code, answer.json()["code"]) == (422, "input.validation")
+    assert "options.contrl" in answer.json()["detail"]
+
+
+def test_one_station_makes_no_free_network_and_costs_nothing_else(site, run, tied):
+    recording = site.client.get("/api/v1/recordings").json()["items"][0]["recording_id"]
+    job = run("adjust", recordings=[recording], options={"control": False})
+    assert (job["status"], job["error_code"]) == ("failed", "solve.degenerate"), job
+    assert "no network" in job["error_reason"]
+    items = site.client.get("/api/v1/adjustments").json()["items"]
+    assert tied["job_id"] in {one["job_id"] for one in items}
+
+
+def test_one_control_mark_gives_no_datum(site, run, field):
+    one = "\n".join(field.control.strip().splitlines()[:2])
+    kind = {"Content-Type": "text/csv"}
+    site.client.put("/api/v1/surveys/one mark/control", content=one, headers=kind)
+    items = site.client.get("/api/v1/recordings").json()["items"]
+    recordings = [item["recording_id"] for item in items]
+    job = run("adjust", survey="one mark", recordings=recordings)
+    assert (job["status"], job["error_code"]) == ("failed", "solve.degenerate"), job
+    assert "control mark" in job["error_reason"]
