@@ -8,18 +8,21 @@ from __future__ import annotations
 
 import re
 import struct
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 
 from pipelines.values import Mask, Nanos
-from storage.recordings.container import Batch, Channel, Octets
+from storage.recordings.container import Batch, Channel
 from storage.recordings.families import BrokenMessageError
+from storage.recordings.records import Octets
 
 _ENCAPSULATIONS = {0: (">", 8), 1: ("<", 8), 6: (">", 4), 7: ("<", 4)}  # identifier: order, widest
 _SIZES = {"B": 1, "i": 4, "I": 4, "d": 8}
+_ALIKE_MAX = 1 << 10  # messages that are compared with one at a time
 _LAYOUTS_MAX = 256  # layouts of one length on one channel; real topics have one to ten
 
 HEADER = """std_msgs/Header header
@@ -156,7 +159,7 @@ class SmallMessages:
         """Copy the messages of a batch, by length."""
         for length in np.unique(batch.lengths).tolist():
             mine = batch.lengths == length
-            rows = batch.octets[batch.starts[mine][:, None] + np.arange(length)]
+            rows = sliding_window_view(batch.octets, length)[batch.starts[mine]]
             self._rows.setdefault(length, []).append((rows, batch.log_times_ns[mine]))
 
     def tables(self) -> list[Table]:
@@ -193,6 +196,48 @@ class SmallMessages:
         if n:
             self.n_broken += n
             self.reason = self.reason or reason
+
+
+def heads_alike(batch: Batch, i: int, size: int, varying: Iterable[int]) -> Octets:
+    """Find messages that begin alike.
+
+    Parameters
+    ----------
+    batch : Batch
+        Messages of one channel.
+    i : int
+        The first of them.
+    size : int
+        How many bytes are compared.
+    varying : iterable of int
+        Which of these may differ.
+
+    Returns
+    -------
+    (n, size) uint8
+        The beginnings of message i and of those behind it that are like it.
+    """
+    rows = slice(i, i + _ALIKE_MAX)
+    n = n_leading(batch.lengths[rows] >= size)
+    heads = sliding_window_view(batch.octets, size)[batch.starts[rows][:n]]
+    fixed = np.delete(np.arange(size), list(varying))
+    return np.asarray(heads[: n_leading((heads[:, fixed] == heads[0, fixed]).all(axis=1))])
+
+
+def n_leading(is_so: Mask) -> int:
+    """Count what is so before the first that is not.
+
+    Parameters
+    ----------
+    is_so : (n,) bool
+        What is so.
+
+    Returns
+    -------
+    int
+        From 0 to n.
+    """
+    return len(is_so) if is_so.all() else int(np.argmin(is_so))
 
 
 def definition_agrees(channel: Channel, expected: str) -> bool:
@@ -236,23 +281,57 @@ def _alike(rows: Octets, layout: Layout) -> Mask:
 
 def _decode(rows: Octets, log_times: Nanos, layout: Layout, order: str) -> Table:
     """Read all numbers of messages of one layout."""
-    stamps = [
-        _numbers(rows, at, 1, order + "i4").astype(np.int64) * 1_000_000_000
-        + _numbers(rows, at + 4, 1, order + "u4").astype(np.int64)
-        for at in layout.stamps
-    ]
+    stamps = [stamps_ns(rows, at, order) for at in layout.stamps]
     return Table(
         names=layout.names,
-        stamps_ns=np.concatenate(stamps, axis=1) if stamps else np.empty((len(rows), 0), np.int64),
+        stamps_ns=np.column_stack([np.empty((len(rows), 0), np.int64), *stamps]),
         columns=tuple(
-            _numbers(rows, at, count, order + "f8").astype(np.float64)
+            numbers(rows, at, count, order + "f8").astype(np.float64)
             for at, count in layout.columns
         ),
         log_times_ns=log_times,
     )
 
 
-def _numbers(rows: Octets, at: int, count: int, kind: str) -> NDArray[np.generic]:
-    """Read a run of numbers from each message."""
+def stamps_ns(rows: Octets, at: int, order: str) -> Nanos:
+    """Read a time from each of some messages.
+
+    Parameters
+    ----------
+    rows : (n, size) uint8
+        Messages, or equally long beginnings of them.
+    at : int
+        Where it begins.
+    order : str
+        Of bytes: ``<`` or ``>``.
+
+    Returns
+    -------
+    (n,)
+        Times [ns].
+    """
+    seconds = numbers(rows, at, 1, order + "i4")[:, 0].astype(np.int64)
+    return seconds * 1_000_000_000 + numbers(rows, at + 4, 1, order + "u4")[:, 0].astype(np.int64)
+
+
+def numbers(rows: Octets, at: int, count: int, kind: str) -> NDArray[np.generic]:
+    """Read a run of numbers from each of some messages.
+
+    Parameters
+    ----------
+    rows : (n, size) uint8
+        Messages, or equally long beginnings of them.
+    at : int
+        Where the run begins.
+    count : int
+        How many numbers it has.
+    kind : str
+        Their type, with the order of bytes.
+
+    Returns
+    -------
+    (n, count)
+        The numbers.
+    """
     size = np.dtype(kind).itemsize * count
     return np.ascontiguousarray(rows[:, at : at + size]).view(kind).reshape(len(rows), count)

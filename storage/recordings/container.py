@@ -1,8 +1,8 @@
 """The MCAP container: from a file to batches of raw messages, one channel at a time.
 
 Hides: records, chunks, compression, checksums, and how far a damaged file can be believed. The file
-is mapped into memory and walked once from front to back, so that an index is neither needed nor
-trusted; no declared length is used before it is checked.
+is walked once from front to back, so that an index is neither needed nor trusted; no declared
+length is used before it is checked.
 """
 
 from __future__ import annotations
@@ -11,35 +11,39 @@ import hashlib
 import mmap
 import struct
 import tempfile
-from collections import deque
 from collections.abc import Iterator
-from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 
 import fsspec
-import lz4.frame
-import numba
 import numpy as np
-import zstandard
 from isal.isal_zlib import crc32
-from numpy.typing import NDArray
 
 from pipelines.errors import NotFoundError, NotMcapError, RecordingError, TruncatedRecordingError
 from pipelines.values import Nanos
+from storage.recordings.chunks import Chunks
+from storage.recordings.records import (
+    CHANNEL,
+    CHUNK,
+    DATA_END,
+    FOOTER,
+    MAGIC,
+    MESSAGE,
+    MESSAGE_HEAD,
+    RECORD_HEAD,
+    SCHEMA,
+    Octets,
+    text,
+    walk,
+)
 
-Octets = NDArray[np.uint8]
-
-MAGIC = b"\x89MCAP0\r\n"
-_FOOTER, _SCHEMA, _CHANNEL, _MESSAGE, _CHUNK, _DATA_END = 0x02, 0x03, 0x04, 0x05, 0x06, 0x0F
-_RECORD_HEAD = 9  # [bytes] opcode and length before the body of a record
-_MESSAGE_HEAD = 22  # [bytes] channel, sequence and two times before the data of a message
-_ROWS = 1 << 16  # records that one step of the walk reports
-_CHUNK_LIMIT = 1 << 29  # [bytes] a larger decompressed chunk is refused, whatever it declares
+_OF_USE = np.array([FOOTER, SCHEMA, CHANNEL, MESSAGE, CHUNK, DATA_END])
+_ENDS = np.array([FOOTER, DATA_END])
 _KEEP_MAPPED = 1 << 25  # [bytes] pages behind this distance are given back
 _BLOCK = 1 << 22  # [bytes] read at a time for the digest
-_UNPACKERS = 2  # threads that unpack and check chunks ahead of the walk
+_MORE = 1.1  # that a file may be larger than its first chunks promise
+_SWELLING_MAX = 10.0  # that is believed of a whole file before it is unpacked
 _RECOVER = "recover what is readable with `mcap recover` and use the result"
 
 
@@ -110,16 +114,17 @@ class Container:
         The whole file.
     mapping : mmap or None
         What the bytes are mapped through, when they are.
-    pool : ThreadPoolExecutor
-        What unpacks and checks chunks ahead of the walk; stopped before the file is given back.
+    file : int or None
+        Descriptor of the file, when there is one.
     channels : dict of int to Channel
         By identifier, as far as the walk has come.
     """
 
     octets: Octets
     mapping: mmap.mmap | None = None
-    pool: ThreadPoolExecutor = field(default_factory=lambda: ThreadPoolExecutor(_UNPACKERS))
+    file: int | None = None
     channels: dict[int, Channel] = field(default_factory=dict)
+    _source: Chunks = field(init=False)
     _schemas: dict[int, tuple[str, str, bytes]] = field(default_factory=dict)
     _first_ns: int | None = None
     _last_ns: int = 0
@@ -132,11 +137,19 @@ class Container:
                 f"The file begins with {found!r}, not with {MAGIC!r}: it is not an MCAP file. "
                 "Record with `ros2 bag record --storage mcap`, or convert with `mcap convert`."
             )
+        self._source = Chunks(self.octets, self.file)
 
     @property
     def size(self) -> int:
         """Length of the file [bytes]."""
         return len(self.octets)
+
+    @property
+    def likely_size(self) -> int:
+        """Length of the file if it were not compressed, judged by its first chunks [bytes]."""
+        swelling = self._source.swelling
+        likely = min(_MORE * swelling, _SWELLING_MAX) if swelling > 1.0 else 1.0
+        return int(likely * self.size)
 
     def topics(self) -> dict[str, str]:
         """Return the message type of each topic, as far as the walk has come."""
@@ -155,38 +168,38 @@ class Container:
         TruncatedRecordingError
             When the walk meets damage, after all that is readable before it.
         """
-        position = len(MAGIC)
+        position, is_whole = len(MAGIC), True
         plain = False  # whether messages stand outside chunks
-        while True:
-            rows, position, is_whole = _walk(self.octets, position)
-            chunked = np.isin(rows[:, 0], (_CHUNK, _FOOTER, _DATA_END)).nonzero()[0]
-            chunks = self._unpacked(rows[rows[:, 0] == _CHUNK, 1:3])
-            begin = 0
-            for end in [*chunked.tolist(), len(rows)]:
-                plain |= bool((rows[begin:end, 0] == _MESSAGE).any())
-                yield from self._group(self.octets, rows[begin:end])
-                begin = end + 1
-                if end == len(rows):
-                    break
-                opcode, start, length = rows[end, :3].tolist()
-                if opcode == _FOOTER:
+        while is_whole and position < self.size:
+            rows, position, is_whole = walk(self.octets, position)
+            for alike in _runs(rows[np.isin(rows[:, 0], _OF_USE)]):
+                opcode, start, length = alike[0, :3].tolist()
+                if opcode == FOOTER:
                     return self._check_end(start + length)
-                if opcode == _CHUNK:
-                    yield from self._chunk(start, next(chunks))
+                if opcode == CHUNK:
+                    yield from self._chunked(alike)
+                elif opcode != DATA_END:
+                    plain |= bool((alike[:, 0] == MESSAGE).any())
+                    yield from self._group(self.octets, alike)
                 elif plain:
                     self._check_data(start, length)
-                self._release(start + length)
-            if not is_whole:
-                raise self._truncated(position, "a record is cut")
-            if not len(rows):
-                raise self._truncated(position, "the file ends without its footer")
+                self._release(int(alike[-1, 1:3].sum()))
+        what = "the file ends without its footer" if is_whole else "a record is cut"
+        raise self._truncated(position, what)
+
+    def _chunked(self, rows: Nanos) -> Iterator[Batch]:
+        """Give the messages of chunks that follow each other."""
+        for stretch in self._source.stretches(rows):
+            yield from self._group(stretch.octets, stretch.rows)
+            if stretch.damage is not None:
+                raise self._truncated(*stretch.damage)
 
     def _group(self, octets: Octets, rows: Nanos) -> Iterator[Batch]:
         """Register schemas and channels of some records, then give their messages by channel."""
         kinds = rows[:, 0]
-        for opcode, start, length in rows[(kinds == _SCHEMA) | (kinds == _CHANNEL), :3].tolist():
+        for opcode, start, length in rows[(kinds == SCHEMA) | (kinds == CHANNEL), :3].tolist():
             self._register(opcode, octets[start : start + length].tobytes())
-        rows = rows[kinds == _MESSAGE]
+        rows = rows[kinds == MESSAGE]
         if not len(rows):
             return
         self._last_ns = max(self._last_ns, int(rows[:, 4].max()))
@@ -199,24 +212,24 @@ class Container:
             yield Batch(
                 channel=channel,
                 octets=octets,
-                starts=mine[:, 1] + _MESSAGE_HEAD,
-                lengths=mine[:, 2] - _MESSAGE_HEAD,
+                starts=mine[:, 1] + MESSAGE_HEAD,
+                lengths=mine[:, 2] - MESSAGE_HEAD,
                 log_times_ns=mine[:, 4],
             )
 
     def _register(self, opcode: int, body: bytes) -> None:
         """Remember a schema or a channel; a malformed one costs its channel, not the file."""
         try:
-            if opcode == _SCHEMA:
-                name, at = _text(body, 2)
-                encoding, at = _text(body, at)
+            if opcode == SCHEMA:
+                name, at = text(body, 2)
+                encoding, at = text(body, at)
                 (length,) = struct.unpack_from("<I", body, at)
                 schema = (name, encoding, body[at + 4 : at + 4 + length])
                 self._schemas[int.from_bytes(body[:2], "little")] = schema
                 return
             identifier, schema_id = struct.unpack_from("<HH", body)
-            topic, at = _text(body, 4)
-            encoding, at = _text(body, at)
+            topic, at = text(body, 4)
+            encoding, at = text(body, at)
         except (struct.error, ValueError):
             return
         name, schema_encoding, definition = self._schemas.get(schema_id, ("", "", b""))
@@ -228,32 +241,10 @@ class Container:
             definition=definition,
         )
 
-    def _unpacked(self, spans: Nanos) -> Iterator[Future[Octets]]:
-        """Give the chunks at starts with lengths; the next ones are being unpacked meanwhile."""
-        ahead: deque[Future[Octets]] = deque()
-        for start, length in spans.tolist():
-            ahead.append(self.pool.submit(_unpack_chunk, self.octets[start : start + length]))
-            if len(ahead) > _UNPACKERS:
-                yield ahead.popleft()
-        yield from ahead
-
-    def _chunk(self, start: int, unpacked: Future[Octets]) -> Iterator[Batch]:
-        """Give the messages of one chunk."""
-        try:
-            octets = unpacked.result()
-        except (ValueError, struct.error, zstandard.ZstdError, RuntimeError) as error:
-            raise self._truncated(start - _RECORD_HEAD, f"a chunk is damaged: {error}") from error
-        position, is_whole = 0, True
-        while is_whole and position < len(octets):
-            rows, position, is_whole = _walk(octets, position)
-            yield from self._group(octets, rows)
-        if not is_whole:
-            raise self._truncated(start - _RECORD_HEAD, "a record in a chunk is cut")
-
     def _check_data(self, start: int, length: int) -> None:
         """Compare the checksum over the data section, for files whose messages have no other."""
         (expected,) = struct.unpack("<I", self.octets[start : start + length].tobytes()[:4])
-        end = start - _RECORD_HEAD
+        end = start - RECORD_HEAD
         if expected and crc32(self.octets[:end].data) != expected:
             raise self._truncated(end, "the checksum of the data section does not agree")
 
@@ -306,8 +297,7 @@ def opened(url: str | Path) -> Iterator[Container]:
         mapping = mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ)
         mapping.madvise(mmap.MADV_SEQUENTIAL)
         # Not closed by hand: views may outlive the walk, and the last one of them unmaps.
-        with ThreadPoolExecutor(_UNPACKERS) as pool:
-            yield Container(np.frombuffer(mapping, np.uint8), mapping, pool)
+        yield Container(np.frombuffer(mapping, np.uint8), mapping, file.fileno())
 
 
 @contextmanager
@@ -373,86 +363,8 @@ def file_digest(url: str | Path) -> str:
     return digest.hexdigest()
 
 
-def _text(body: bytes, at: int) -> tuple[str, int]:
-    """Read a string with its length before it; return it and the place behind it."""
-    (length,) = struct.unpack_from("<I", body, at)
-    end = at + 4 + length
-    if end > len(body):
-        raise ValueError("a string is longer than its record")
-    return body[at + 4 : end].decode(), end
-
-
-def _unpack_chunk(body: Octets) -> Octets:
-    """Return the records of a chunk, decompressed and checked."""
-    head = body[: 8 + 8 + 8 + 4 + 4 + 64].tobytes()
-    size, crc = struct.unpack_from("<QI", head, 16)
-    compression, at = _text(head, 28)
-    (length,) = struct.unpack_from("<Q", head, at)
-    packed = body[at + 8 : at + 8 + length]
-    if len(packed) != length:
-        raise ValueError(f"it declares {length:,} bytes and has {len(packed):,}")
-    octets = packed if compression == "" else _decompress(compression, packed, size)
-    if len(octets) != size:
-        raise ValueError(f"it declares {size:,} bytes of records and holds {len(octets):,}")
-    if crc and crc32(octets.data) != crc:
-        raise ValueError("its checksum does not agree")
-    return octets
-
-
-def _decompress(compression: str, packed: Octets, size: int) -> Octets:
-    """Decompress at most the declared size, which must itself be bearable."""
-    if size > _CHUNK_LIMIT:
-        raise ValueError(f"it declares {size:,} bytes, more than {_CHUNK_LIMIT:,}")
-    if compression == "lz4":
-        unpacked = lz4.frame.LZ4FrameDecompressor().decompress(packed, max_length=size + 1)
-    elif compression == "zstd":
-        if zstandard.frame_content_size(packed.data) not in (-1, size):
-            raise ValueError("its compressed frame declares another size")
-        unpacked = zstandard.ZstdDecompressor().decompress(
-            packed.data, max_output_size=max(size, 1)
-        )
-    else:
-        raise ValueError(f"its compression {compression!r} is unknown; known: lz4, zstd")
-    return np.frombuffer(unpacked, np.uint8)
-
-
-def _walk(octets: Octets, position: int) -> tuple[Nanos, int, bool]:
-    """Return the next records (opcode, start, length, channel, log time), the place behind them
-    and whether the walk can go on.
-    """  # noqa: D205
-    rows = np.empty((min(_ROWS, (len(octets) - position) // _RECORD_HEAD + 1), 5), np.int64)
-    n, position, is_whole = _walk_kernel(octets, position, rows)
-    return rows[:n], position, is_whole
-
-
-@numba.njit(cache=True, nogil=True)
-def _walk_kernel(octets, position, rows):  # type: ignore[no-untyped-def]  # noqa: ANN001, ANN202
-    """Fill rows with records until they are full, the footer is met, or a record is cut."""
-    size = len(octets)
-    n = 0
-    while n < len(rows) and position < size:
-        if position + 9 > size:
-            return n, position, False
-        opcode = octets[position]
-        length = np.int64(0)
-        for k in range(8):
-            length |= np.int64(octets[position + 1 + k]) << (8 * k)
-        start = position + 9
-        if opcode == 0 or length < 0 or length > size - start or (opcode == 5 and length < 22):
-            return n, position, False
-        channel = np.int64(-1)
-        log_time = np.int64(0)
-        if opcode == 5:
-            channel = np.int64(octets[start]) | np.int64(octets[start + 1]) << 8
-            for k in range(8):
-                log_time |= np.int64(octets[start + 6 + k]) << (8 * k)
-        rows[n, 0] = opcode
-        rows[n, 1] = start
-        rows[n, 2] = length
-        rows[n, 3] = channel
-        rows[n, 4] = log_time
-        n += 1
-        position = start + length
-        if opcode == 2:
-            break
-    return n, position, True
+def _runs(rows: Nanos) -> Iterator[Nanos]:
+    """Cut records into chunks that follow each other, ends, and all others."""
+    kinds = (rows[:, 0] == CHUNK) + 2 * np.isin(rows[:, 0], _ENDS)
+    is_new = (kinds[1:] != kinds[:-1]) | (kinds[1:] == 2)
+    yield from (run for run in np.split(rows, np.flatnonzero(is_new) + 1) if len(run))

@@ -92,7 +92,7 @@ class Decoder(Protocol):
 
 
 class LidarDecoder(Decoder, Protocol):
-    """Decoder of a LiDAR topic; made from its channel and the size of the file [bytes]."""
+    """Decoder of a LiDAR topic; made from its channel and the likely size of all [bytes]."""
 
     def returns(self) -> Returns:
         """Give all that the messages held."""

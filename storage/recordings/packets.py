@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import struct
 from collections.abc import Iterator
+from functools import cache
 from itertools import pairwise
 from typing import NamedTuple
 
@@ -27,9 +28,10 @@ from pipelines.rigs import (
     RANGE_STEP,
     tilted_vlp16,
 )
-from pipelines.values import Column, Firings, Nanos, Rings
+from pipelines.threads import side_by_side
+from pipelines.values import Firings, Mask, Nanos, Rings
 from storage.recordings import cdr
-from storage.recordings.container import Batch, Channel, Octets
+from storage.recordings.container import Batch, Channel
 from storage.recordings.families import (
     BrokenMessageError,
     Returns,
@@ -37,6 +39,8 @@ from storage.recordings.families import (
     far_note,
     plausible,
 )
+from storage.recordings.points import Columns
+from storage.recordings.records import Octets
 
 SCHEMA = "velodyne_msgs/msg/VelodyneScan"
 DEFINITION = f"""# Velodyne LIDAR scan packets.
@@ -51,7 +55,10 @@ _SHOTS = FIRINGS_PER_BLOCK * N_LASERS  # of a block
 _POINTS_MAX = N_BLOCKS * _SHOTS  # of a packet
 _STRIDE = 1216  # [bytes] of a packet in a message: its stamp, its data, and what aligns the next
 _USED = 1214  # [bytes] of it that are not padding
+_PADDING = _STRIDE - _USED
+_AT_MODEL = 1213  # [bytes] from the beginning of a packet
 _FULL_TURN = 36_000  # steps of an azimuth
+_WORTH = 64  # packets that two threads unpack sooner than one
 _BLOCK_NS = round(FIRINGS_PER_BLOCK * FIRING_CYCLE * 1e9)
 _PACKET_NS = N_BLOCKS * _BLOCK_NS
 _VLP16, _STRONGEST, _DUAL = 0x22, 0x37, 0x39
@@ -77,15 +84,6 @@ _STAMPED = np.dtype([("sec", "<i4"), ("nanosec", "<u4"), ("data", _PACKET), ("pa
 Item = tuple[int, str, bytes]  # log time [ns], topic, message
 
 
-class _Out(NamedTuple):
-    """Columns that the kernel fills from a row on."""
-
-    p: Column
-    intensities: Column
-    rings: Rings
-    stamps: Nanos
-
-
 class _Sensor(NamedTuple):
     """What the kernel must know of a VLP-16.
 
@@ -101,6 +99,7 @@ class _Sensor(NamedTuple):
     lasting: NDArray[np.float32]
 
 
+@cache
 def _sensor() -> _Sensor:
     """Return the VLP-16; in single precision wherever velodyne-decoder has it."""
     rig = tilted_vlp16("", (0.0, 0.0))
@@ -130,56 +129,80 @@ class Packets:
         self._topic = channel.topic
         self._size = size
         self._frame = ""
-        self._sensor = _sensor()
         self._n = 0
-        self._out = _empty(0)
-        self._message_stamps: list[int] = []
-        self._log_times: list[int] = []
-        self._heads: list[Nanos] = []  # per message: stamp, micros, mode and returns of each packet
+        self._out = Columns.empty(0)
+        self._message_stamps = [np.empty(0, np.int64)]
+        self._log_times = [np.empty(0, np.int64)]
+        self._sizes = [np.empty(0, np.int64)]  # packets of each message
+        self._heads = [np.empty((0, 4), np.int64)]  # packets: stamp, micros, mode and returns
         self._n_broken = 0
         self._reason = ""
         self._returns: Returns | None = None
 
     def add(self, batch: Batch) -> None:
         """Take some messages."""
-        for octets, log_time in batch:
+        i, n = 0, len(batch.starts)
+        while i < n:
             try:
-                self._add(octets, log_time)
+                i += self._add(batch, i)
             except BrokenMessageError as error:
+                i += 1
                 self._n_broken += 1
                 self._reason = self._reason or str(error)
 
-    def _add(self, octets: Octets, log_time: int) -> None:
-        """Append the returns of one message."""
+    def _add(self, batch: Batch, i: int) -> int:
+        """Append message i, and those behind it that begin alike; return how many these are."""
+        octets = batch.octets[batch.starts[i] : batch.starts[i] + batch.lengths[i]]
         cursor = cdr.Cursor(octets)
-        stamp, frame = cursor.stamp_ns(), cursor.text().lstrip("/")
-        n = cursor.number("I")
-        at = cursor.at
-        if n and at + n * _STRIDE - (_STRIDE - _USED) > len(octets):
-            raise BrokenMessageError(f"it declares {n:,} packets, more than it has bytes for")
-        for model in {int(byte) for byte in octets[at + 1213 :: _STRIDE][:n]} - {_VLP16}:
+        cursor.stamp()
+        self._frame, at_count = cursor.text().lstrip("/"), cursor.skip("I")
+        varying = (*range(4, 12), *range(at_count, cursor.at))
+        rows = cdr.heads_alike(batch, i, cursor.at, varying)
+        counts = cdr.numbers(rows, at_count, 1, cursor.order + "u4")[:, 0].astype(np.int64)
+        room = batch.lengths[i : i + len(rows)] - cursor.at
+        n = cdr.n_leading((counts == 0) | (counts * _STRIDE - _PADDING <= room))
+        if not n:
             raise BrokenMessageError(
-                f"its packets are those of {_MODELS.get(model, 'another model')} (0x{model:02x}), "
-                "and only those of a VLP-16 (0x22) are decoded: record the driver's point clouds"
+                f"it declares {counts[0]:,} packets, more than it has bytes for"
             )
-        self._reserve(n * _POINTS_MAX)
-        heads = np.empty((n, 4), np.int64)
-        is_little = cursor.order == "<"
-        self._n = _unpack_kernel(octets, at, is_little, self._sensor, self._out, self._n, heads)
-        self._frame = frame
-        self._message_stamps.append(stamp)
-        self._log_times.append(log_time)
+        places = _places(batch.starts[i : i + n] + cursor.at, counts[:n])
+        n = _n_of_ours(batch.octets, places, counts[:n])
+        if not n:
+            raise BrokenMessageError(_complaint(batch.octets[places[: counts[0]] + _AT_MODEL]))
+        self._unpack(batch.octets, places[: counts[:n].sum()], is_little=cursor.order == "<")
+        self._message_stamps.append(cdr.stamps_ns(rows[:n], 4, cursor.order))
+        self._log_times.append(batch.log_times_ns[i : i + n])
+        self._sizes.append(counts[:n])
+        return n
+
+    def _unpack(self, octets: Octets, places: Nanos, *, is_little: bool) -> None:
+        """Append the returns of packets."""
+        heads = np.empty((len(places), 4), np.int64)
+
+        def count(begin: int, end: int) -> None:
+            _heads_kernel(octets, places[begin:end], is_little, heads[begin:end])
+
+        side_by_side(count, len(places), worth=_WORTH)
+        self._reserve(int(heads[:, 3].sum()))
+        rows = self._n + np.cumsum(heads[:, 3]) - heads[:, 3]
+        sensor, out = _sensor(), self._out
+
+        def unpack(begin: int, end: int) -> None:
+            part = slice(begin, end)
+            _packets_kernel(octets, places[part], rows[part], heads[part], sensor, out)
+
+        side_by_side(unpack, len(places), worth=_WORTH)
+        self._n += int(heads[:, 3].sum())
         self._heads.append(heads)
 
     def _reserve(self, n: int) -> None:
         """Make room; memory that is reserved but not written costs nothing."""
-        if self._n + n <= len(self._out.rings):
+        old = self._out
+        if self._n + n <= len(old.rings):
             return
-        likely = self._size // _STRIDE * _POINTS_MAX if not self._n else 2 * len(self._out.rings)
-        old, self._out = self._out, _empty(max(likely, self._n + n))
-        rows = slice(self._n)
-        self._out.p[rows], self._out.intensities[rows] = old.p[rows], old.intensities[rows]
-        self._out.rings[rows], self._out.stamps[rows] = old.rings[rows], old.stamps[rows]
+        likely = self._size // _STRIDE * _POINTS_MAX if not self._n else 2 * len(old.rings)
+        self._out = Columns.empty(max(likely, self._n + n))
+        self._out.put(0, old.taken(slice(self._n)))
 
     def returns(self) -> Returns:
         """Give all returns, in the order of their instants; no message can follow."""
@@ -190,33 +213,32 @@ class Packets:
     def _settled(self) -> Returns:
         """Bring all returns to their instants and into their order."""
         notes = [*broken_note(self._topic, self._n_broken, self._reason)]
-        heads = np.concatenate([np.empty((0, 4), np.int64), *self._heads])
-        messages_ns = self._settle(heads, notes)
-        stamps = self._out.stamps[: self._n]
-        is_ascending = bool((stamps[1:] >= stamps[:-1]).all())
-        rows = slice(self._n) if is_ascending else np.argsort(stamps, kind="stable")
+        messages_ns, counts = self._settle(np.concatenate(self._heads), notes)
+        out = self._out.in_order(counts)  # shots follow each other in a packet
         return Returns(
             topic=self._topic,
             frame=self._frame,
-            p_lidar=self._out.p[rows],
-            intensities=self._out.intensities[rows],
-            rings=self._out.rings[rows],
-            stamps_ns=self._out.stamps[rows],
+            p_lidar=out.p,
+            intensities=out.intensities,
+            rings=out.rings,
+            stamps_ns=out.stamps,
             has_shot_times=True,
             message_stamps_ns=np.sort(messages_ns),
             notes=tuple(notes),
             has_heights=True,
         )
 
-    def _settle(self, heads: Nanos, notes: list[str]) -> Nanos:
-        """Bring the returns to the instants of their shots; return those of the messages."""
-        messages_ns = np.array(self._message_stamps, np.int64)
+    def _settle(self, heads: Nanos, notes: list[str]) -> tuple[Nanos, Nanos]:
+        """Bring the returns to the instants of their shots.
+
+        Return the instants of the messages, and the numbers of returns of packets.
+        """
+        messages_ns, sizes = np.concatenate(self._message_stamps), np.concatenate(self._sizes)
         if not len(heads):
-            return messages_ns
-        sizes = np.array([len(one) for one in self._heads])
-        log_times = np.array(self._log_times, np.int64)
+            return messages_ns, heads[:, 3]
+        log_times = np.concatenate(self._log_times)
         if not heads[:, 0].any():
-            messages_ns, stamps_ns = _stamps_of_messages(messages_ns, log_times, self._heads)
+            messages_ns, stamps_ns = _stamps_of_messages(messages_ns, log_times, heads, sizes)
             notes.append(
                 f"The packets of {self._topic} have no stamps; those of messages are used."
             )
@@ -226,35 +248,44 @@ class Packets:
         shifts = stamps_ns - heads[:, 0]
         if np.abs(shifts).max() > _CLOCK_STEP_NS:
             self._out.stamps[: self._n] += np.repeat(shifts, heads[:, 3])
-            heads[:, 0] = stamps_ns
-            self._heads = np.split(heads, np.cumsum(sizes)[:-1])
-        self._drop_far(
-            np.repeat(plausible(stamps_ns, np.repeat(log_times, sizes)), heads[:, 3]), notes
-        )
+        near = plausible(stamps_ns, np.repeat(log_times, sizes))
+        self._drop_far(near, heads[:, 3], notes)
         modes = sorted(
             {_MODES.get(int(mode), "unknown returns") for mode in np.unique(heads[:, 2])}
         )
         notes.append(f"{self._topic} holds raw packets of a VLP-16 ({', '.join(modes)}).")
-        return messages_ns
+        return messages_ns, heads[near, 3]
 
-    def _drop_far(self, near: NDArray[np.bool_], notes: list[str]) -> None:
-        """Leave out returns whose stamps cannot be."""
+    def _drop_far(self, near: Mask, counts: Nanos, notes: list[str]) -> None:
+        """Leave out the returns of packets whose stamps cannot be."""
         if near.all():
             return
-        notes.append(far_note(self._topic, int((~near).sum()), "returns"))
-        rows = np.flatnonzero(near)
-        p, intensities, rings, stamps = self._out
-        self._out = _Out(p[rows], intensities[rows], rings[rows], stamps[rows])
-        self._n = len(self._out.rings)
+        notes.append(far_note(self._topic, int(counts[~near].sum()), "returns"))
+        rows = np.flatnonzero(np.repeat(near, counts))
+        self._out, self._n = self._out.taken(rows), len(rows)
 
 
-def _empty(n: int) -> _Out:
-    """Return columns for so many returns."""
-    return _Out(
-        np.empty((n, 3), np.float32),
-        np.empty(n, np.float32),
-        np.empty(n, np.uint8),
-        np.empty(n, np.int64),
+def _places(begins: Nanos, counts: Nanos) -> Nanos:
+    """Return where the packets of messages begin that follow each other from given places on."""
+    since = np.arange(counts.sum()) - np.repeat(np.cumsum(counts) - counts, counts)
+    return np.asarray(np.repeat(begins, counts) + _STRIDE * since)
+
+
+def _n_of_ours(octets: Octets, places: Nanos, counts: Nanos) -> int:
+    """Return how many messages there are before the first with a packet of another model."""
+    is_other = octets[places + _AT_MODEL] != _VLP16
+    if not is_other.any():
+        return len(counts)
+    return int(np.searchsorted(np.cumsum(counts), np.argmax(is_other), side="right"))
+
+
+def _complaint(models: Octets) -> str:
+    """Say why packets of some models are not decoded."""
+    others = sorted(set(models.tolist()) - {_VLP16})
+    named = " and ".join(f"{_MODELS.get(one, 'another model')} (0x{one:02x})" for one in others)
+    return (
+        f"its packets are those of {named}, and only those of a VLP-16 (0x22) are decoded: record "
+        "the driver's point clouds"
     )
 
 
@@ -298,13 +329,14 @@ def punctual(stamps_ns: Nanos, micros: Nanos) -> tuple[Nanos, str]:
 
 
 def _stamps_of_messages(
-    messages_ns: Nanos, log_times_ns: Nanos, heads: list[Nanos]
+    messages_ns: Nanos, log_times_ns: Nanos, heads: Nanos, sizes: Nanos
 ) -> tuple[Nanos, Nanos]:
     """Return instants of messages and packets where the packets have no stamps.
 
     A message is stamped with its first packet, or recorded when its last one is complete.
     """
-    since = [(one[:, 1] - one[:1, 1]) * 1_000 % _HOUR_NS for one in heads]
+    micros = np.split(heads[:, 1], np.cumsum(sizes)[:-1])
+    since = [(one - one[:1]) * 1_000 % _HOUR_NS for one in micros]
     if not messages_ns.any():
         lasting = [int(one.max(initial=0)) + _PACKET_NS for one in since]
         messages_ns = log_times_ns - np.array(lasting, np.int64)
@@ -327,33 +359,51 @@ def _short(octets, at):  # type: ignore[no-untyped-def]  # noqa: ANN001, ANN202
     return np.uint32(octets[at]) | np.uint32(octets[at + np.uint64(1)]) << np.uint32(8)
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
-def _unpack_kernel(octets, at, is_little, sensor, out, n, heads):  # type: ignore[no-untyped-def]  # noqa: ANN001, ANN202, PLR0913
-    """Append the returns of packets from a byte on to row ``n`` on; return the new number of rows.
+@numba.njit(cache=True, nogil=True)
+def _heads_kernel(octets, places, is_little, heads):  # type: ignore[no-untyped-def]  # noqa: ANN001, ANN202
+    """Fill stamp, micros, mode and number of returns of packets that begin at places.
 
-    Fills stamp, micros, mode and returns of each packet. The data of a packet are little endian
-    whatever the message is. A block that does not begin as one ends its packet.
+    The data of a packet are little endian whatever the message is. A block that does not begin as
+    one ends its packet.
     """
-    for k in range(len(heads)):
-        stamp = _number(octets, at, 4, is_little) * np.int64(1_000_000_000)
-        stamp += _number(octets, at + 4, 4, is_little)
-        data = np.uint64(at + 8)
-        heads[k, 0], heads[k, 1] = stamp, _number(octets, at + 1208, 4, True)
-        heads[k, 2], heads[k, 3] = octets[at + 1212], n
+    for k in range(len(places)):
+        at = places[k]
+        heads[k, 0] = _number(octets, at, 4, is_little) * np.int64(1_000_000_000)
+        heads[k, 0] += _number(octets, at + 4, 4, is_little)
+        heads[k, 1], heads[k, 2] = _number(octets, at + 1208, 4, True), octets[at + 1212]
         step = 2 if octets[at + 1212] == 0x39 else 1
+        n = 0
+        for i in range(0, 12, step):
+            block = np.uint64(at + 8 + 100 * i)
+            other = block + np.uint64(100 * (step - 1))
+            if _short(octets, block) != 0xEEFF or _short(octets, other) != 0xEEFF:
+                break
+            for j in range(np.uint64(4), np.uint64(100), np.uint64(3)):
+                steps = _short(octets, block + j)
+                n += steps != 0
+                if step == 2:
+                    last = _short(octets, other + j)
+                    n += last != 0 and last != steps
+        heads[k, 3] = n
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _packets_kernel(octets, places, rows, heads, sensor, out):  # type: ignore[no-untyped-def]  # noqa: ANN001, ANN202
+    """Write the returns of packets that begin at places, of each from its row on."""
+    for k in range(len(places)):
+        data = np.uint64(places[k] + 8)
+        step = 2 if heads[k, 2] == 0x39 else 1
         first = np.int32(_short(octets, data + np.uint64(2)))
         last = np.int32(_short(octets, data + np.uint64(1102)))
         speed = np.float32((last - first + 36000) % 36000) / sensor.lasting[11 // step]
+        n, end = np.uint64(rows[k]), np.uint64(rows[k] + heads[k, 3])
         for i in range(0, 12, step):
+            if n == end:
+                break
             block = data + np.uint64(100 * i)
             strongest = block + np.uint64(100 * (step - 1))
-            if _short(octets, block) != 0xEEFF or _short(octets, strongest) != 0xEEFF:
-                break
-            place = (np.uint64(i // step), speed, stamp)
-            n = _unpack_block(octets, (block, strongest), place, sensor, out, np.uint64(n))
-        heads[k, 3] = np.int64(n) - heads[k, 3]
-        at += 1216
-    return np.int64(n)
+            place = (np.uint64(i // step), speed, heads[k, 0])
+            n = _unpack_block(octets, (block, strongest), place, sensor, out, n)
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")

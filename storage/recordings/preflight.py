@@ -191,7 +191,7 @@ def _inspect(url: str | Path) -> Preflight:
     damage: InputError | None = None
     times = _Times()
     with opened(url) as container:
-        decoders = Decoders(size=container.size)
+        decoders = Decoders(container=container)
         try:
             for batch in container.batches():
                 times.add(batch)

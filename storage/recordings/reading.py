@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Collection
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
 from pathlib import Path, PurePosixPath
@@ -15,7 +16,7 @@ from pipelines.errors import MissingGimbalAngleError, MissingLidarError, Recordi
 from pipelines.values import RING_UNKNOWN, ImuMount, Nanos, Origin, Rig, ScanLog
 from storage.recordings import joint_states, orientations, packets, pointclouds, transforms
 from storage.recordings.cdr import definition_agrees
-from storage.recordings.container import Batch, Channel, file_digest, opened
+from storage.recordings.container import Batch, Channel, Container, file_digest, opened
 from storage.recordings.families import LidarDecoder, Returns, Series, SeriesDecoder
 from storage.recordings.frames import FrameTree, recorded_rig
 
@@ -77,8 +78,8 @@ class Decoders:
 
     Attributes
     ----------
-    size : int
-        Length of the file [bytes].
+    container : Container
+        The recording; it tells how much is to be expected.
     lidars, joints, frames, ahrs : dict of str to decoder
         By topic.
     by_channel : dict of Channel to decoder or None
@@ -87,7 +88,7 @@ class Decoders:
         What was left out, as sentences for people.
     """
 
-    size: int
+    container: Container
     lidars: dict[str, LidarDecoder] = field(default_factory=dict)
     joints: dict[str, SeriesDecoder] = field(default_factory=dict)
     frames: dict[str, SeriesDecoder] = field(default_factory=dict)
@@ -112,7 +113,8 @@ class Decoders:
         """Make the decoder of a channel, or take that of its topic."""
         key = (channel.encoding, channel.schema)
         if key in _LIDARS and self._is_readable(channel, _LIDARS[key][1]):
-            return self.lidars.setdefault(channel.topic, _LIDARS[key][0](channel, self.size))
+            decoder = _LIDARS[key][0](channel, self.container.likely_size)
+            return self.lidars.setdefault(channel.topic, decoder)
         tables = ((_JOINTS, self.joints), (_FRAMES, self.frames), (_AHRS, self.ahrs))
         for table, mine in tables:
             if key in table and self._is_readable(channel, table[key][1]):
@@ -175,13 +177,14 @@ def read_log(
     -----
     One walk over the mapped file; memory is that of the result. Cost grows linearly with the file.
     """
-    with opened(url) as container:
-        beside = None if digest else container.pool.submit(file_digest, url)
-        decoders = Decoders(size=container.size)
+    with ThreadPoolExecutor(1) as beside, opened(url) as container:
+        hashing = None if digest else beside.submit(file_digest, url)
+        decoders = Decoders(container=container)
         for batch in container.batches():
             decoders.add(batch)
         found = container.topics()
-    origin = Origin(name=stem(url), digest=beside.result() if beside else digest)
+        digest = hashing.result() if hashing else digest
+    origin = Origin(name=stem(url), digest=digest)
     return assemble(decoders, found, Choice(topics=topics, joint=joint), origin)
 
 

@@ -7,12 +7,12 @@ leave the field zero, constant, or filled for half of the cloud only: that count
 
 from __future__ import annotations
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
 from pipelines.values import Nanos
 
+NO_FIELD = "there is no such field"
 SHOTS_MIN = 32  # points that a message needs before its times can be judged
 _REVOLUTION_LIMIT = 10.0  # [s] no message spans more; a larger time has another meaning
 _EPOCH = 1e6  # [s] a larger time is absolute
@@ -39,7 +39,7 @@ def shot_times(times: NDArray[np.generic] | None, stamp_ns: int, out: Nanos) -> 
     fault : str
         Why the times are of no use, as the end of a sentence; empty when they are of use.
     """
-    fault = "there is no such field"
+    fault = NO_FIELD
     if times is not None:
         if not len(times):
             return 0, ""
@@ -52,15 +52,10 @@ def shot_times(times: NDArray[np.generic] | None, stamp_ns: int, out: Nanos) -> 
 
 def _written(times: NDArray[np.generic], stamp_ns: int, out: Nanos) -> tuple[int, str]:
     """Write instants, and return their span and what is wrong with them."""
-    is_single = times.dtype == np.dtype("<f4")
-    low, high, n_zeros = (
-        _stamp_kernel(times, stamp_ns, out)
-        if is_single
-        else (float(times.min()), float(times.max()), int((times == 0).sum()))
-    )
-    fault = _fault(low, high, n_zeros, len(times))
-    if fault or (is_single and max(abs(low), abs(high)) <= _REVOLUTION_LIMIT):
-        return 0 if fault else round(high * 1e9), fault
+    low, high = float(times.min()), float(times.max())
+    fault = fault_of(low, high, int((times == 0).sum()), len(times))
+    if fault:
+        return 0, fault
     offsets = _offsets_ns(times, low, high, stamp_ns)
     if offsets is None:
         return 0, f"its times run from {low:g} to {high:g}, neither seconds nor nanoseconds"
@@ -68,8 +63,23 @@ def _written(times: NDArray[np.generic], stamp_ns: int, out: Nanos) -> tuple[int
     return int(offsets.max()), ""
 
 
-def _fault(low: float, high: float, n_zeros: int, n: int) -> str:
-    """Say what is wrong with times by their extremes and their zeros."""
+def fault_of(low: float, high: float, n_zeros: int, n: int) -> str:
+    """Say what is wrong with the times of a message.
+
+    Parameters
+    ----------
+    low, high : float
+        The earliest and the latest; not finite if one is not.
+    n_zeros : int
+        How many are zero.
+    n : int
+        How many there are.
+
+    Returns
+    -------
+    str
+        The end of a sentence; empty when nothing is wrong.
+    """
     if not np.isfinite(high - low):
         return "some of its times are not finite"
     if n < SHOTS_MIN:
@@ -77,6 +87,31 @@ def _fault(low: float, high: float, n_zeros: int, n: int) -> str:
     if low == high:
         return f"its times are all {low:g}"
     return f"{n_zeros:,} of {n:,} times are 0" if n_zeros > _ZEROS_MAX * n else ""
+
+
+def plain_span(kind: str, low: float, high: float) -> int | None:
+    """Return how long after its stamp a message ends, if its times are counted from there.
+
+    Parameters
+    ----------
+    kind : str
+        Type of the times: whole nanoseconds or seconds.
+    low, high : float
+        The earliest and the latest.
+
+    Returns
+    -------
+    int or None
+        Of the latest [ns]; none when the times have another meaning.
+    """
+    scale = _scale(np.dtype(kind))
+    is_plain = max(abs(low), abs(high)) * scale <= _REVOLUTION_LIMIT * 1e9
+    return round(high * scale) if is_plain else None
+
+
+def _scale(kind: np.dtype[np.generic]) -> float:
+    """Return the nanoseconds that 1 means in times since a stamp."""
+    return 1.0 if kind.kind in "iu" else 1e9
 
 
 def _offsets_ns(times: NDArray[np.generic], low: float, high: float, stamp_ns: int) -> Nanos | None:
@@ -87,7 +122,7 @@ def _offsets_ns(times: NDArray[np.generic], low: float, high: float, stamp_ns: i
         # A driver may stamp points by the sensor's clock and messages by the computer's.
         far = stamp_ns and abs(int(absolute[0]) - stamp_ns) > _REVOLUTION_LIMIT * 1e9
         return absolute - (int(absolute.min()) if far else stamp_ns)
-    scale = 1.0 if is_whole else 1e9
+    scale = _scale(times.dtype)
     if max(abs(low), abs(high)) * scale > _REVOLUTION_LIMIT * 1e9:
         return None
     return np.rint(times.astype(np.float64) * scale).astype(np.int64)
@@ -100,17 +135,3 @@ def _absolute_ns(times: NDArray[np.generic], *, is_ns: bool) -> Nanos:
     seconds = np.floor(times.astype(np.float64))
     fractions = np.rint((times.astype(np.float64) - seconds) * 1e9)
     return np.asarray(seconds.astype(np.int64) * 1_000_000_000 + fractions.astype(np.int64))
-
-
-@numba.njit(cache=True, nogil=True)
-def _stamp_kernel(times, stamp_ns, stamps):  # type: ignore[no-untyped-def]  # noqa: ANN001, ANN202
-    """Add float32 seconds to a stamp; return least and greatest time and the number of zeros."""
-    low, high, n_zeros = np.float32(np.inf), np.float32(-np.inf), 0
-    for i in range(len(times)):
-        time = times[i]
-        low, high = min(low, time), max(high, time)
-        if time - time != 0:  # not a number, or infinite
-            high = np.float32(np.inf)
-        n_zeros += time == 0
-        stamps[i] = stamp_ns + np.int64(np.rint(np.float64(time) * 1e9))
-    return low, high, n_zeros

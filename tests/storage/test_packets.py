@@ -1,6 +1,7 @@
 """Raw packets of a VLP-16: written, read back, and decoded as velodyne-decoder does."""
 
 import sqlite3
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -307,6 +308,23 @@ def test_a_message_that_is_cut_is_left_out_and_counted(rng, tmp_path):
     log = read(tmp_path, (schema, data), (schema, data[:-1300]))
     assert len(log.rings) == (packets["data"]["blocks"]["shots"]["distance"] > 0).sum()
     assert any("declares 4 packets" in note for note in log.notes)
+
+
+def test_messages_of_many_lengths_decode_as_each_of_them_does_alone(rng, tmp_path):
+    """Of both byte orders, some cut, some without packets, and some with dual returns."""
+    packets = encoded(firings(rng, n_packets=500))
+    packets["data"]["mode"][150:400] = 0x39
+    edges = np.r_[0, np.sort(rng.integers(0, 500, 60)), 500]
+    messages = [message(packets[a:b], little_endian=k % 7 > 1) if a < b else None
+                for k, (a, b) in enumerate(pairwise(edges))]  # fmt: skip
+    whole = [one for one in messages if one is not None]
+    cut = [(schema, data[:-50]) if k % 9 == 4 else (schema, data)
+           for k, (schema, data) in enumerate(whole)]  # fmt: skip
+    together = read(tmp_path, *cut)
+    alone = [read(tmp_path, one) for k, one in enumerate(whole) if k % 9 != 4]
+    for name in ("p_lidar", "intensities", "rings", "stamps_lidar_ns"):
+        expected = np.concatenate([getattr(log, name) for log in alone])
+        assert_array_equal(getattr(together, name), expected, err_msg=name)
 
 
 def test_a_message_without_packets_holds_nothing(rng, tmp_path):

@@ -340,6 +340,61 @@ def test_returns_that_are_none_are_dropped(tmp_path):
         assert_array_equal(log.rings, points["ring"][kept])
 
 
+def as_whole_nanoseconds(points):
+    """The same points as a driver writes them that counts nanoseconds."""
+    kinds = [(name, "<f4") for name in (*"xyz", "intensity")] + [("ring", "u1"), ("t", "<u4")]
+    columns = [points[name] for name in (*"xyz", "intensity", "ring")]
+    return np.rec.fromarrays([*columns, np.round(points["time"] * 1e9)], dtype=kinds)
+
+
+def as_absolute_doubles(points, ns):
+    """The same points as a driver writes them that knows no single precision."""
+    kinds = [(name, "<f8") for name in (*"xyz", "intensity", "timestamp")]
+    columns = [points[name] for name in (*"xyz", "intensity")]
+    return np.rec.fromarrays([*columns, ns * 1e-9 + points["time"].astype(np.float64)], dtype=kinds)
+
+
+def test_clouds_of_changing_layouts_come_back_one_behind_the_other(tmp_path):
+    """Messages that begin alike are unpacked together, all others alone: it must not show."""
+    rng = np.random.default_rng(28)
+    items, expected, instants = turning(n=300), [], []
+    for k in range(24):
+        ns = T0 + k * 200_000_000
+        points = velodyne(rng, n=64 + 16 * k)
+        points["y"][rng.integers(0, len(points), 9 if k % 3 == 0 else 0)] = np.nan
+        keep = np.isfinite(points["y"])
+        expected.append(np.column_stack([points[name] for name in (*"xyz", "intensity")])[keep])
+        instants.append(ns - T0 + points["time"][keep].astype(np.float64) * 1e9)
+        if k % 8 == 5:
+            points = as_absolute_doubles(points, ns)
+        elif k % 4 == 2:
+            points = as_whole_nanoseconds(points)
+        height, padding = (8, 5) if k % 5 == 1 else (1, 0)
+        message = cloud(points, ns, height=height, row_padding=padding)
+        items.append(("/points", ns + 100_000_000, message))
+    log = read_log(record(tmp_path / "a.mcap", items))
+    found = np.column_stack([log.p_lidar, log.intensities])
+    assert_array_equal(found, np.concatenate(expected))
+    assert_allclose(log.stamps_lidar_ns - T0, np.concatenate(instants), rtol=0, atol=250)
+
+
+@pytest.mark.parametrize("size", [64, 20_000])
+def test_times_that_are_usable_are_not_lost_by_some_that_are_not(tmp_path, size):
+    rng = np.random.default_rng(30)
+    clouds = [velodyne(rng, n=size) for _ in range(30)]
+    clouds[7]["time"] = 0.0
+    items = [
+        ("/points", T0 + k * 10**8, cloud(points, T0 + k * 10**8))
+        for k, points in enumerate(clouds)
+    ]
+    log = read_log(record(tmp_path / "a.mcap", [*items, *turning(n=400)]))
+    assert log.has_shot_times
+    found = (log.stamps_lidar_ns - T0).reshape(30, size)
+    times = np.stack([points["time"] for points in clouds]).astype(np.float64)
+    expected = np.sort(np.arange(30)[:, None] * 1e8 + times * 1e9, axis=None).reshape(30, size)
+    assert_allclose(found, expected, rtol=0, atol=FLOAT_TIME)
+
+
 def test_rings_that_cannot_be_are_not_used(tmp_path):
     points = velodyne(np.random.default_rng(13))
     points["ring"][3] = 300

@@ -1,11 +1,14 @@
 """Recordings that cannot be used, each the smallest that deserves it, and the preflight report."""
 
+import io
 import json
 import math
 from dataclasses import replace
 
 import numpy as np
 import pytest
+from mcap.records import Chunk, Message
+from mcap.stream_reader import StreamReader, breakup_chunk
 from mcap.writer import CompressionType
 from numpy.testing import assert_allclose
 from scipy.spatial.transform import Rotation
@@ -22,7 +25,8 @@ from pipelines.errors import (
 from pipelines.rigs import tilted_vlp16
 from pipelines.values import Origin, ScanLog
 from storage.recordings import inspect_log, read_log, write_log
-from storage.recordings.container import MAGIC
+from storage.recordings.container import opened
+from storage.recordings.records import MAGIC
 from tests.storage.recorder import T0, cloud, joints, record, small_log, turning, velodyne
 
 
@@ -79,6 +83,27 @@ def test_a_flipped_bit_is_noticed(tmp_path, compression):
     path.write_bytes(octets)
     with pytest.raises(TruncatedRecordingError, match="a chunk is damaged"):
         read_log(path)
+
+
+@pytest.mark.parametrize("compression", list(CompressionType))
+def test_what_comes_before_a_damaged_chunk_is_given(tmp_path, compression):
+    items = [
+        ("/points", T0 + k * 10**8, cloud(velodyne(np.random.default_rng(k)), T0 + k * 10**8))
+        for k in range(40)
+    ]
+    path = record(tmp_path / "a.mcap", items, compression=compression, chunk_size=3000)
+    octets = bytearray(path.read_bytes())
+    records = StreamReader(io.BytesIO(octets), emit_chunks=True).records
+    chunks = [one for one in records if isinstance(one, Chunk)]
+    octets[octets.index(chunks[9].data) + len(chunks[9].data) // 2] ^= 1
+    path.write_bytes(octets)
+    times = []
+    with opened(path) as container:
+        batches = container.batches()
+        with pytest.raises(TruncatedRecordingError, match="is damaged"):
+            times.extend(time for batch in batches for time in batch.log_times_ns.tolist())
+    messages = [one for chunk in chunks[:9] for one in breakup_chunk(chunk)]
+    assert times == [one.log_time for one in messages if isinstance(one, Message)]
 
 
 def test_a_flipped_bit_outside_chunks_is_noticed_by_the_checksum_of_the_data(tmp_path):
