@@ -375,7 +375,8 @@ def test_clouds_of_changing_layouts_come_back_one_behind_the_other(tmp_path):
     log = read_log(record(tmp_path / "a.mcap", items))
     found = np.column_stack([log.p_lidar, log.intensities])
     assert_array_equal(found, np.concatenate(expected))
-    assert_allclose(log.stamps_lidar_ns - T0, np.concatenate(instants), rtol=0, atol=250)
+    step = np.spacing(T0 * 1e-9) * 1e9  # [ns] of float64 seconds since 1970
+    assert_allclose(log.stamps_lidar_ns - T0, np.concatenate(instants), rtol=0, atol=2 * step)
 
 
 @pytest.mark.parametrize("size", [64, 20_000])
