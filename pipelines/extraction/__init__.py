@@ -79,7 +79,7 @@ def extract(
     up = levelling_rotation(cloud.levelling)[2].copy()
     ball = Ball(marker_radius, up, float(cloud.rig.divergence.max()))
     grid = ground_grid(cloud, config)
-    seeds = find_seeds(cloud.p_base, grid.is_above, ball, config.n_points_min)
+    seeds = find_seeds(cloud.p_base, grid.rows_above, ball, config.n_points_min)
     looks = distinct(look_at(cloud, grid, seeds, ball), config, marker_radius)
     verdicts = [verdict(look, config, ball) for look in looks]
     verdicts = _sighted(cloud, looks, verdicts, ball)

@@ -18,7 +18,7 @@ class Ball(NamedTuple):
     divergence: float
 
 
-@numba.njit(cache=True, nogil=True)
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def view(points: Array, c: Array, up: Array) -> tuple[Array, Array, Array]:
     """Return points as seen toward a centre.
 

@@ -136,7 +136,7 @@ def look_at(cloud: StitchedCloud, grid: Grid, seeds: Array, ball: Ball) -> list[
     return [look for look in looks if look is not None]
 
 
-@numba.njit(cache=True, nogil=True)
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def _approached(patches: Patches, seeds: Array, seed_cells: NDArray[np.int64], ball: Ball) -> Array:
     """Return where seeds' discs came to rest, the returns in, beside and below them, (k, 6)."""
     out = np.zeros((len(seeds), 6))
@@ -151,7 +151,7 @@ def _approached(patches: Patches, seeds: Array, seed_cells: NDArray[np.int64], b
     return out
 
 
-@numba.njit(cache=True, nogil=True)
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def _shifted(points: Array, c: Array, up: Array, radius: float) -> tuple[Array, int]:
     """Return where a disc of the ball's size comes to rest, and how many returns it holds."""
     n = 0
@@ -172,7 +172,7 @@ def _shifted(points: Array, c: Array, up: Array, radius: float) -> tuple[Array, 
     return c, n
 
 
-@numba.njit(cache=True, nogil=True)
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def _within(points: Array, c: Array, reach: float) -> Array:
     """Return the points within reach of a place."""
     kept = np.empty_like(points)
@@ -185,7 +185,7 @@ def _within(points: Array, c: Array, reach: float) -> Array:
     return kept[:n_kept]
 
 
-@numba.njit(cache=True, nogil=True)
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def _surroundings(seen: Array, radius: float, blur: float) -> tuple[int, int]:
     """Count the returns beside and below the outline that a free ball on a pole would not have."""
     n_beside, n_below = 0, 0
@@ -205,7 +205,7 @@ def _surroundings(seen: Array, radius: float, blur: float) -> tuple[int, int]:
     return n_beside, n_below
 
 
-@numba.njit(cache=True, nogil=True)
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def _resolved(
     patches: Patches, found: Array, cells: NDArray[np.int64], ball: Ball
 ) -> NDArray[np.bool_]:
@@ -287,7 +287,7 @@ def _settled(points: Array, c: Array, ball: Ball, n_unknowns: int) -> tuple[Arra
     return c, radius, np.asarray(inverse)
 
 
-@numba.njit(cache=True, nogil=True)
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def _equations(
     points: Array, c: Array, ball: Ball, radius: float
 ) -> tuple[Array, Array, Array, float]:
@@ -312,7 +312,7 @@ def _equations(
     return N, pull, axes, scatter
 
 
-@numba.njit(cache=True, nogil=True)
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def _shape(seen: Array, radius: float) -> tuple[Array, Array]:
     """Return along-beam residuals and their derivatives by ball and shape.
 
@@ -345,7 +345,7 @@ def _solve(J: Array, residuals: Array, weights: Array, prior: float) -> tuple[Ar
     return inverse @ (weighted.T @ residuals), inverse
 
 
-@numba.njit(cache=True, nogil=True)
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def _weights(seen: Array, residuals: Array, radius: float, blur: float, scatter: float) -> Array:
     """Return Tukey's weights of the returns that may belong to the ball."""
     weights = np.zeros(len(seen))
@@ -357,7 +357,7 @@ def _weights(seen: Array, residuals: Array, radius: float, blur: float, scatter:
     return weights
 
 
-@numba.njit(cache=True, nogil=True)
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def _scatter(seen: Array, residuals: Array, radius: float) -> float:
     """Return the robust standard deviation of the residuals inside the outline [m]."""
     inside = np.empty(len(seen))

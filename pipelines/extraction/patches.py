@@ -97,7 +97,7 @@ def cells_of(p_base: Array, grid: Grid) -> NDArray[np.int64]:
     return np.asarray(places[:, 0] * grid.n_side + places[:, 1])
 
 
-@numba.njit(cache=True, nogil=True)
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def near(patches: Patches, cell: int, c: Array) -> NDArray[np.int32]:
     """Return which of the returns are within reach of a place.
 
@@ -130,7 +130,7 @@ def near(patches: Patches, cell: int, c: Array) -> NDArray[np.int32]:
     return out[:n_out]
 
 
-@numba.njit(cache=True, nogil=True)
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def gathered(patches: Patches, places: NDArray[np.int32]) -> Array:
     """Return some of the returns in float64.
 
@@ -153,7 +153,7 @@ def gathered(patches: Patches, places: NDArray[np.int32]) -> Array:
     return points
 
 
-@numba.njit(cache=True, nogil=True)
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def _wanted(n_side: int, seed_cells: NDArray[np.int64], margin: int) -> Mask:
     """Tell which cells are in and about the seeds' cells."""
     is_wanted = np.zeros(n_side * n_side, np.bool_)
@@ -165,7 +165,7 @@ def _wanted(n_side: int, seed_cells: NDArray[np.int64], margin: int) -> Mask:
     return is_wanted
 
 
-@numba.njit(cache=True, nogil=True)
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def _rows_in(cells: NDArray[np.int32], is_wanted: Mask, first: int, end: int) -> NDArray[np.int32]:
     """Return the rows, of those of a part, that lie in cells that are wanted."""
     rows = np.empty(end - first, np.int32)
@@ -177,7 +177,7 @@ def _rows_in(cells: NDArray[np.int32], is_wanted: Mask, first: int, end: int) ->
     return rows[:n_rows].copy()
 
 
-@numba.njit(cache=True, nogil=True)
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def _by_cell(
     cells: NDArray[np.int32], rows: NDArray[np.int32], n_cells: int
 ) -> tuple[NDArray[np.int64], NDArray[np.int32]]:

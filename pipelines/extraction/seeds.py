@@ -10,17 +10,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipelines.extraction.ball import Ball
-from pipelines.values import Array, Column, Mask
+from pipelines.values import Array, Column
 
 
-def find_seeds(p_base: Column, is_above: Mask, ball: Ball, n_points_min: int) -> Array:
+def find_seeds(
+    p_base: Column, rows_above: NDArray[np.int32], ball: Ball, n_points_min: int
+) -> Array:
     """Return rough centres at which a ball may be looked for.
 
     Parameters
     ----------
     p_base : (n, 3) float32
         Returns [m].
-    is_above : (n,) bool
+    rows_above : (m,) int32
         Those that are not known to be ground.
     ball : Ball
         What is looked for.
@@ -32,13 +34,13 @@ def find_seeds(p_base: Column, is_above: Mask, ball: Ball, n_points_min: int) ->
     (k, 3)
         Places, those with most returns first [m].
     """
-    keys, sums = _voxels(p_base, is_above, ball.radius)
+    keys, sums = _voxels(p_base, rows_above, ball.radius)
     ends = _free_ends(keys, sums, ball.up, ball.radius, n_points_min)
     ends = ends[np.lexsort((ends[:, 2], ends[:, 1], ends[:, 0], -ends[:, 3]))]
     return np.ascontiguousarray(thinned(ends, 0.5 * ball.radius)[:, :3])
 
 
-@numba.njit(cache=True, nogil=True)
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def _slot(keys: NDArray[np.int64], key: int) -> int:
     """Return the place of a key in an open hash table, or the free place where it belongs."""
     mask = len(keys) - 1
@@ -48,33 +50,35 @@ def _slot(keys: NDArray[np.int64], key: int) -> int:
     return place
 
 
-@numba.njit(cache=True, nogil=True)
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def _voxel(x: float, y: float, z: float, edge: float) -> int:
     """Return the key of the voxel that holds a point within some kilometres."""
     i, j, k = np.floor(x / edge), np.floor(y / edge), np.floor(z / edge)
     return ((int(i) + 500_000) * 1_000_000 + int(j) + 500_000) * 1_000_000 + int(k) + 500_000
 
 
-@numba.njit(cache=True, nogil=True)
-def _voxels(p_base: Column, is_above: Mask, edge: float) -> tuple[NDArray[np.int64], Column]:
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _voxels(
+    p_base: Column, rows: NDArray[np.int32], edge: float
+) -> tuple[NDArray[np.int64], Column]:
     """Return the occupied voxels as an open hash table: keys, and sums of x, y, z with count."""
     size = 64
-    while size < 2 * np.sum(is_above):
+    while size < 2 * len(rows):
         size *= 2
     keys = np.full(size, -1, np.int64)
     sums = np.zeros((size, 4), np.float32)
-    for i in range(len(p_base)):
-        if is_above[i]:
-            place = _slot(keys, _voxel(p_base[i, 0], p_base[i, 1], p_base[i, 2], edge))
-            keys[place] = _voxel(p_base[i, 0], p_base[i, 1], p_base[i, 2], edge)
-            sums[place, 0] += p_base[i, 0]
-            sums[place, 1] += p_base[i, 1]
-            sums[place, 2] += p_base[i, 2]
-            sums[place, 3] += 1.0
+    for i in rows:
+        key = _voxel(p_base[i, 0], p_base[i, 1], p_base[i, 2], edge)
+        place = _slot(keys, key)
+        keys[place] = key
+        sums[place, 0] += p_base[i, 0]
+        sums[place, 1] += p_base[i, 1]
+        sums[place, 2] += p_base[i, 2]
+        sums[place, 3] += 1.0
     return keys, sums
 
 
-@numba.njit(cache=True, nogil=True)
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def _is_free(keys: NDArray[np.int64], p: Array, v_step: Array, v_beam: Array, edge: float) -> bool:
     """Tell whether nothing lies one step away, at the same depth give or take a voxel."""
     for depth in (-edge, 0.0, edge):
@@ -84,7 +88,7 @@ def _is_free(keys: NDArray[np.int64], p: Array, v_step: Array, v_beam: Array, ed
     return True
 
 
-@numba.njit(cache=True, nogil=True)
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def _around(keys: NDArray[np.int64], sums: Column, p: Array, edge: float) -> Array:
     """Return sums of x, y, z and count over the 27 voxels about a point."""
     total = np.zeros(4)
@@ -99,7 +103,7 @@ def _around(keys: NDArray[np.int64], sums: Column, p: Array, edge: float) -> Arr
     return total
 
 
-@numba.njit(cache=True, nogil=True)
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def _free_ends(
     keys: NDArray[np.int64], sums: Column, up: Array, radius: float, n_points_min: int
 ) -> Array:
@@ -129,7 +133,7 @@ def _free_ends(
     return out[:n_out]
 
 
-@numba.njit(cache=True, nogil=True)
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def thinned(seeds: Array, gap: float) -> Array:
     """Return the places that have no earlier one within a gap.
 

@@ -98,7 +98,7 @@ def sights(cloud: StitchedCloud, centres: Array, ball: Ball) -> list[Sight]:
     return [Sight(*_counted(points, intensities, centre, ball)) for centre in centres]
 
 
-@numba.njit(cache=True, nogil=True)
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def _counted(
     points: Column, intensities: Column, c: Array, ball: Ball
 ) -> tuple[int, int, int, float, int, int, int, float]:
@@ -128,7 +128,7 @@ def _counted(
     return n_on, n_through, n_before, gaps2 / n, n_held, n_past, n_short, light / n
 
 
-@numba.njit(cache=True, nogil=True)
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def _towards(points: Column, c: Array, tangent: float) -> NDArray[np.int32]:
     """Return the rows of the points within an angle, given by its tangent, of a centre."""
     x, y, z = c
@@ -143,7 +143,7 @@ def _towards(points: Column, c: Array, tangent: float) -> NDArray[np.int32]:
     return rows[:n_rows]
 
 
-@numba.njit(cache=True, nogil=True)
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def _directions_about(centres: Array, up: Array, reach: float) -> Mask:
     """Tell the cells of directions in which beams may pass some centres within a reach."""
     is_wanted = np.zeros(6 * _N_FACE * _N_FACE, np.bool_)
@@ -159,7 +159,7 @@ def _directions_about(centres: Array, up: Array, reach: float) -> Mask:
     return is_wanted
 
 
-@numba.njit(cache=True, nogil=True)
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def _in_directions(p_base: Column, is_wanted: Mask) -> NDArray[np.int32]:
     """Return the rows of the points, at whatever depth, in the cells that are wanted."""
     rows = np.empty(len(p_base), np.int32)
@@ -170,7 +170,7 @@ def _in_directions(p_base: Column, is_wanted: Mask) -> NDArray[np.int32]:
     return rows[:n_rows]
 
 
-@numba.njit(cache=True, nogil=True)
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def _direction_cell(x: float, y: float, z: float) -> int:
     """Return the cell of a direction on a cube of ``_N_FACE`` squared cells a face."""
     ax, ay, az = abs(x), abs(y), abs(z)
