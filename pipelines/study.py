@@ -2,7 +2,7 @@
 
 "Evaluation Method of Spherical Marker Arrangement for LiDAR-SLAM using a Robot Simulator": 14
 spheres of 0.20 m diameter, a VLP-16 tilted by 90 degrees on a gimbal, one turn per stop. Its
-Table 4 and its Figures 3, 8, 9 and 11 exist only as descriptions.
+Table 4 and its figures exist only as descriptions.
 """
 
 from __future__ import annotations
@@ -18,6 +18,11 @@ TITLE = "Evaluation Method of Spherical Marker Arrangement for LiDAR-SLAM using 
 
 TOLERANCE = 0.03
 """Error that the study accepts [m]."""
+
+SIGMA_RANGE = 0.03
+"""Noise of a range in the study's simulation [m]. It gives none: this is the accuracy of ranging
+that it names, and what the model of a VLP-16 that comes with its simulator, Webots, says of itself
+(0.03 m over a reach of 100 m)."""
 
 GREATEST_DISTANCE = 7.5
 """Distance up to which the study says that its tolerance is kept [m]."""
@@ -82,3 +87,36 @@ TABLE_2 = PublishedCentres(
     errors_3d=_TABLE_2[:, 5].copy(),
 )
 """Table 2, "Estimation accuracy of marker center location by distance"."""
+
+
+@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
+class PublishedStations:
+    """Errors of the station by included angle as the study's Table 3 gives them.
+
+    Attributes
+    ----------
+    included_angles : (n,)
+        Between its two markers, seen from the station [rad].
+    errors : (n,)
+        Error of the station [m].
+    """
+
+    included_angles: Array
+    errors: Array
+
+    def __post_init__(self) -> None:
+        _seal(self, included_angles=(None,), errors=(None,))
+        _same_length(self, "included_angles", "errors")
+
+
+TABLE_3 = PublishedStations(
+    included_angles=np.radians([17.54, 33.19, 57.54, 99.27, 133.13, 148.59, 165.05]),
+    errors=np.array([0.0560, 0.0350, 0.0277, 0.0256, 0.0284, 0.0324, 0.0477]),
+)
+"""Table 3, "Accuracy of self-position estimation for each included angle"."""
+
+GRANTED_ERROR = 0.017
+"""Error that the study grants each axis of each marker's centre [m]."""
+
+GRANTED_DISTANCE = 7.5
+"""Distance of its markers in that experiment, to a few centimetres [m]."""

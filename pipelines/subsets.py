@@ -174,20 +174,47 @@ def _spread_of_angles(v: Array, chosen: Index) -> Array:
 
 
 def _by_pose(scene: Scene, matches: Index, chosen: Index, start: Array) -> Positions:
-    """Position subsets by their full poses: centres and gravity, as the free station does.
-
-    The motion turns about the station. Weights and normal matrices are those of ``start``; the
-    gradient is exact, so that the steps end where the adjustment of each subset alone would.
-    """
+    """Position subsets by their full poses: centres and gravity, as the free station does."""
     R, t = start[:3, :3], start[:3, 3]
     centres, gravity = observe(scene, matches, start)
-    weights, of_gravity = _inverses(centres.cov)[chosen], _inverses(gravity.cov[0])
-    q = (scene.centres_base[matches[:, 0]] @ R.T)[chosen]
-    goals = (scene.marks_site[matches[:, 1]] - t)[chosen]
-    up = R @ scene.R_station_base[2]
+    q = scene.centres_base[matches[:, 0]] @ R.T
+    goals = scene.marks_site[matches[:, 1]] - t
+    up, of_gravity = R @ scene.R_station_base[2], _inverses(gravity.cov[0])
+    weights = _inverses(centres.cov)
+    found = place(q[chosen], goals[chosen], weights[chosen], up, of_gravity)
+    return found._replace(p=t + found.p)
+
+
+def place(q: Array, goals: Array, weights: Array, up: Array, of_gravity: Array) -> Positions:
+    """Find the stations from which centres lie on their marks best, many problems at once.
+
+    Parameters
+    ----------
+    q : (s, k, 3)
+        Centres of each problem as vectors from the station, about turned into the site [m].
+    goals : (s, k, 3)
+        The marks, relative to the approximate station [m].
+    weights : (s, k, 3, 3)
+        Inverses of the covariances of their differences.
+    up : (3,)
+        Measured up direction, turned like the centres.
+    of_gravity : (2, 2)
+        Inverse of the covariance of its horizontal part.
+
+    Returns
+    -------
+    Positions
+        Of the stations, relative to the approximate one.
+
+    Notes
+    -----
+    The motion turns about the station. Weights and normal matrices are those of the approximate
+    pose; the gradient is exact, so that the steps end where the adjustment of each problem alone
+    would.
+    """
     cov = _inverses(_normal_matrices(q, weights, up, of_gravity))
-    turn, shift, pull_up = np.zeros((3, len(chosen), 3))
-    step = np.full((len(chosen), 6), np.inf)
+    turn, shift, pull_up = np.zeros((3, len(q), 3))
+    step = np.full((len(q), 6), np.inf)
     for _ in range(_N_STEPS):
         R_turn = _rotations(turn)
         p = q @ np.swapaxes(R_turn, 1, 2)
@@ -202,7 +229,7 @@ def _by_pose(scene: Scene, matches: Index, chosen: Index, start: Array) -> Posit
         if np.abs(step).max(initial=0.0) < _SETTLED:
             break
     is_settled = np.abs(step).max(axis=1, initial=0.0) < _USABLE
-    return Positions(t + shift, cov[:, 3:, 3:], is_settled)
+    return Positions(shift, cov[:, 3:, 3:], is_settled)
 
 
 def _normal_matrices(q: Array, weights: Array, up: Array, of_gravity: Array) -> Array:

@@ -25,22 +25,30 @@ from pipelines.extraction import extract
 from pipelines.fitting import fit_markers
 from pipelines.reproduction import (
     CENTRE,
+    CENTRE_REAL,
     DISTANCES,
+    DISTANCES_REAL,
     LANE_2,
     OURS,
     PAPER,
+    AngleLimit,
     RangeNoise,
+    Reading,
     Reproduction,
     Table2Row,
+    Table3Row,
     Table4Row,
+    angle_experiment,
     findings,
     models_of_icp,
     plan,
     range_noise,
+    readings,
     reproduce,
     table_2,
     table_4,
 )
+from pipelines.reproduction.included_angle import CIRCLES
 from pipelines.rigs import vlp16
 from pipelines.survey import Progress
 from pipelines.values import RING_UNKNOWN, Column, Index, Levelling, StitchedCloud
@@ -102,11 +110,14 @@ def page_of(made: Reproduction, wish: Wish, real: Real | None = None) -> Reprodu
         statements=_statements(made, wish.seed),
         table_2=table_2(made),
         table_4=table_4(made),
+        readings=readings(made),
+        angles=angle_experiment(made.config.tolerance, np.random.default_rng(wish.seed)),
         icp=models_of_icp(made),
         example=made.example,
         centre=_columns(made, made.series(CENTRE)),
         lane=_columns(made, made.series(LANE_2)),
-        level=_columns(made, made.series(DISTANCES)),
+        distances=_columns(made, made.series(DISTANCES)),
+        real=_columns(made, made.series(DISTANCES_REAL)),
         noises={_SIMULATED: made.noise, **real.noises},
         spheres=[_simulated_spheres(made), *real.spheres],
         code_version=code_version(),
@@ -159,7 +170,7 @@ def _columns(made: Reproduction, scans: Index) -> dict[str, NDArray[Any]]:
 
 def _simulated_spheres(made: Reproduction) -> Plain:
     """Return what the fits of the simulated spheres leave, as one row beside the real ones."""
-    keep = made.centres.of(OURS, made.series(CENTRE))
+    keep = made.centres.of(OURS, made.series(CENTRE_REAL))
     return {
         "name": f"{int(keep.sum())} simulated, median",
         "radius_m": made.config.marker_radius,
@@ -230,6 +241,9 @@ def _write_tables(folder: Path, made: Reproduction, page: ReproductionPage) -> N
     """Write the tables of the study, the statements and all centres as CSV."""
     _write(folder / "table2.csv", [_row_2(row) for row in page.table_2])
     _write(folder / "table4.csv", [_row_4(row) for row in page.table_4])
+    _write(folder / "table3.csv", [_row_3(row) for row in page.angles.rows])
+    _write(folder / "angle_limits.csv", [_limit(one) for one in page.angles.limits])
+    _write(folder / "readings.csv", [_reading(one) for one in page.readings])
     _write(folder / "statements.csv", [_statement(one) for one in page.statements])
     everything = _columns(made, np.arange(len(made.scans)))
     rows = zip(*(column.tolist() for column in everything.values()), strict=True)
@@ -248,7 +262,51 @@ def _row_2(row: Table2Row) -> Plain:
         found[f"{method}_error_3d_mean_m"] = errors.mean
         found[f"{method}_error_3d_max_m"] = errors.largest
         found[f"{method}_n"] = errors.n
-    return found
+    return found | {
+        "paper_minus_study_m": row.errors[PAPER].mean - row.published_error,
+    }
+
+
+def _row_3(row: Table3Row) -> Plain:
+    """Return one row of Table 3 as plain values."""
+    errors = {f"{_key(name)}_error_m": error for name, error in row.errors.items()}
+    return {
+        "included_angle_deg": round(float(np.degrees(row.included_angle)), 2),
+        "study_error_m": row.published,
+        **errors,
+        "three_circles_minus_study_m": row.errors[CIRCLES] - row.published,
+    }
+
+
+def _limit(one: AngleLimit) -> Plain:
+    """Return the angles that keep the tolerance for one sigma as plain values."""
+    return {
+        "sigma_axis_m": one.sigma,
+        "two_centres_from_deg": float(np.degrees(one.least)),
+        "two_circles_from_deg": float(np.degrees(one.least_circles)),
+        "two_circles_to_deg": float(np.degrees(one.widest_circles)),
+        "two_centres_error_horizontal_rms_m": one.rms,
+    }
+
+
+def _reading(one: Reading) -> Plain:
+    """Return one reading of the study's method as plain values."""
+    return {
+        "series": one.series,
+        "fit_method": one.method,
+        "n": one.errors.n,
+        "n_points_mean": one.n_points,
+        "error_3d_mean_m": one.errors.mean,
+        "error_3d_min_m": one.least,
+        "error_3d_max_m": one.errors.largest,
+        "bias_beyond_m": float(one.bias_station[0]),
+        "bias_up_m": float(one.bias_station[2]),
+    }
+
+
+def _key(name: str) -> str:
+    """Return a name as part of a column's."""
+    return name.replace(" ", "_")
 
 
 def _row_4(row: Table4Row) -> Plain:
@@ -314,6 +372,11 @@ def _report(folder: Path, made: Reproduction, page: ReproductionPage) -> Plain:
             "table2_error_3d_range_m": [float(published.min()), float(published.max())],
         },
         "table2": _json(_row_2(row) for row in page.table_2),
+        "table2_paper_minus_study_m": _difference(page.table_2),
+        "readings": _json(_reading(one) for one in page.readings),
+        "table3": _json(_row_3(row) for row in page.angles.rows),
+        "table3_rms_from_study_m": page.angles.rms_from_published,
+        "angle_limits": _json(_limit(one) for one in page.angles.limits),
         "table4": _json(_row_4(row) for row in page.table_4),
         "statements": _json(_statement(one) | {"said": _said(one)} for one in page.statements),
         "icp_models": {name: asdict(errors) for name, errors in page.icp.items()},
@@ -323,6 +386,12 @@ def _report(folder: Path, made: Reproduction, page: ReproductionPage) -> Plain:
         },
         "spheres": _json(dict(row) for row in page.spheres),
     }
+
+
+def _difference(rows: Sequence[Table2Row]) -> float:
+    """Return the mean of Table 2 by the study's method minus that which the study prints [m]."""
+    ours = float(np.nanmean([row.errors[PAPER].mean for row in rows]))
+    return ours - float(study.TABLE_2.errors_3d.mean())
 
 
 def _said(one: Statement) -> dict[str, str]:

@@ -5,8 +5,11 @@ import numpy as np
 from pipelines.config import SurveyConfig
 from pipelines.reproduction import (
     CENTRE,
+    CENTRE_REAL,
     DISTANCES,
+    DISTANCES_REAL,
     FULL_SPHERE,
+    GROUND,
     LANE_2,
     OURS,
     PAPER,
@@ -18,8 +21,8 @@ from pipelines.reproduction import (
 )
 from pipelines.study import TABLE_2
 
-SIGMA = {OURS: 0.001, PAPER: 0.003, FULL_SPHERE: 0.003}  # [m] per axis at 8 m
-BIAS = {OURS: 0.0, PAPER: -0.027, FULL_SPHERE: -0.06}  # [m] towards the scanner
+SIGMA = {OURS: 0.001, PAPER: 0.003, FULL_SPHERE: 0.003, GROUND: 0.003}  # [m] per axis at 8 m
+BIAS = {OURS: 0.0, PAPER: -0.027, FULL_SPHERE: -0.06, GROUND: -0.012}  # [m] towards the scanner
 
 
 def scans():
@@ -33,10 +36,12 @@ def scans():
         for i in range(7)
     ]
     level = [
-        Scan(series=DISTANCES, scenario="range-lane", stop="centre", seed=0, turn=turn)
+        Scan(series=series, scenario="range-lane", stop="centre", seed=0, turn=turn)
+        for series in (DISTANCES, DISTANCES_REAL)
         for turn in (6.6, 13.2)
     ]
-    return (*centre, *lane, *level)
+    real = Scan(series=CENTRE_REAL, scenario="paper-field", stop="lane3-stop4", seed=0, turn=13.2)
+    return (*centre, *lane, *level, real)
 
 
 def reproduction(seed=3):
@@ -49,7 +54,7 @@ def reproduction(seed=3):
     }
     return Reproduction(
         scans=plan,
-        n_marks=np.array([14] * 9 + [88] * 2),
+        n_marks=np.array([14] * 9 + [88] * 4 + [14]),
         centres=Centres(
             **joined,
             sigma_3d=np.full(len(joined["scans"]), 0.002),
@@ -65,8 +70,10 @@ def reproduction(seed=3):
 
 
 def _centres(i, scan, rng):
-    methods = [OURS, PAPER] + ([FULL_SPHERE] if scan.series == CENTRE else [])
-    ranges = np.repeat(np.arange(5.0, 30.1, 2.5), 8) if scan.series == DISTANCES else TABLE_2.ranges
+    is_centre = scan.series in (CENTRE, CENTRE_REAL)
+    methods = [OURS, PAPER] + ([FULL_SPHERE, GROUND] if is_centre else [])
+    is_lane = scan.scenario == "range-lane"
+    ranges = np.repeat(np.arange(5.0, 30.1, 2.5), 8) if is_lane else TABLE_2.ranges
     n = len(ranges)
     names = np.repeat(methods, n)
     sigmas = np.array([SIGMA[name] for name in names]) * np.tile(ranges, len(methods)) / 8.0
@@ -95,6 +102,7 @@ def example(rng):
         points_station=points,
         is_left=points[:, 2] > -0.02,
         cut=-0.02,
+        ground=-0.06,
         radius=0.1,
         centres_station={
             OURS: np.array([0.001, 0.0, 0.0]),

@@ -5,15 +5,18 @@ Horizontal errors, because the theory is one of the plane: heights rest on the l
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 import plotly.graph_objects as go
 from numpy.typing import NDArray
+from plotly.subplots import make_subplots
 
-from pipelines.study import LEAST_ANGLE, WIDEST_ANGLE
-from pipelines.subsets import theory_of_pairs
+from pipelines.reproduction import AngleExperiment, AngleLimit, Arcs
+from pipelines.reproduction.included_angle import CIRCLES, PAIR, TRIPLE
+from pipelines.study import LEAST_ANGLE, TABLE_3, WIDEST_ANGLE
+from pipelines.subsets import angles_that_keep, theory_of_pairs
 from web import theme
 from web.figures import (
     ANGLE_BIN,
@@ -78,7 +81,7 @@ def error_against_angle(shown: Subsets, tolerance_m: float, *, is_log: bool = Fa
     if is_log:
         make_log(figure)
     elif len(worst):
-        top = 1.15 * max(float(np.quantile(worst, 0.97)), tolerance_m) * _MM
+        top = 1.3 * max(float(np.quantile(worst, 0.97)), tolerance_m) * _MM
         figure.update_yaxes(range=[0.0, top])
     which = "" if shown.n_marks == 2 else ", the widest of three"
     figure.update_xaxes(title_text=f"Included angle{which} [deg]", range=[0, 180], dtick=30)
@@ -173,3 +176,124 @@ def centres_sigma(fits: Columns) -> float:
         np.zeros(0) if first is None else known_values(floats(first, "sigma_axis_m"))
     )
     return float(np.sqrt(np.mean(known**2))) if len(known) else np.nan
+
+
+_WAYS = (
+    (CIRCLES, theme.PAPER, "solid"),
+    (PAIR, theme.OURS, "dot"),
+    (TRIPLE, theme.OURS, "solid"),
+)
+
+
+def station_by_angle(made: AngleExperiment) -> go.Figure:
+    """Draw the study's Figure 10 again: the station's error by included angle, both methods."""
+    figure = blank_figure("Error of the station by included angle, 17 mm granted to each axis")
+    for name, colour, dash in _WAYS:
+        figure.add_scatter(
+            x=np.degrees(made.angles),
+            y=made.curves[name] * _MM,
+            mode="lines",
+            name=f"{name} ({'study' if name == CIRCLES else 'free station'})",
+            line={"color": colour, "width": 2.5 if dash == "solid" else 1.75, "dash": dash},
+            hovertemplate=f"{name}: %{{y:.1f}} mm at %{{x:.0f}} deg<extra></extra>",
+        )
+    within = made.tolerance >= TABLE_3.errors
+    for keep, said, colour in (
+        (within, "study, Table 3: within", "var(--below)"),
+        (~within, "study, Table 3: beyond", "var(--above)"),
+    ):
+        figure.add_scatter(
+            x=np.degrees(TABLE_3.included_angles[keep]),
+            y=TABLE_3.errors[keep] * _MM,
+            mode="markers",
+            name=said,
+            marker={"symbol": "x", "size": 9, "color": colour},
+            hovertemplate="study: %{y:.1f} mm at %{x:.2f} deg<extra></extra>",
+        )
+    add_tolerance(figure, made.tolerance)
+    add_limits_of_study(figure, is_shaded=True)
+    figure.update_yaxes(title_text="Error, median over signs [mm]", range=[0.0, 80.0])
+    figure.update_xaxes(title_text="Included angle [deg]", range=[0, 180], dtick=30)
+    return figure
+
+
+def limit_by_sigma(limits: Sequence[AngleLimit], tolerance_m: float) -> go.Figure:
+    """Draw between which angles two marks keep the tolerance, by how good the centres are."""
+    figure = blank_figure(f"Angles at which two marks keep {tolerance_m * _MM:g} mm")
+    sigmas = np.linspace(0.0005, tolerance_m, 200)
+    for method, (name, colour, dash) in _THEORIES.items():
+        known = np.array([angles_that_keep(method, float(s), tolerance_m) for s in sigmas])
+        for bounds, is_first in ((known[:, 0], True), (known[:, 1], False)):
+            figure.add_scatter(
+                x=sigmas * _MM,
+                y=np.degrees(bounds),
+                mode="lines",
+                name=name,
+                legendgroup=name,
+                showlegend=is_first,
+                line={"color": colour, "width": 2, "dash": dash},
+                hovertemplate=f"{name}: %{{y:.0f}} deg at %{{x:.1f}} mm<extra></extra>",
+            )
+    tried = [one for one in limits if np.isfinite(one.least)]
+    figure.add_scatter(
+        x=[one.sigma * _MM for one in tried],
+        y=[np.degrees(one.least) for one in tried],
+        mode="markers+text",
+        text=[f"{np.degrees(one.least):.0f}" for one in tried],
+        textposition="bottom right",
+        textfont={"size": 11, "color": theme.OURS},
+        name="free station, tried there",
+        marker={"color": theme.OURS, "size": 8},
+        customdata=[one.rms * _MM for one in tried],
+        hovertemplate="%{y:.1f} deg at %{x:.0f} mm: RMS %{customdata:.1f} mm<extra></extra>",
+    )
+    figure.update_xaxes(title_text="Sigma of a centre per axis [mm]", range=[0, tolerance_m * _MM])
+    figure.update_yaxes(title_text="Included angle [deg]", range=[0, 185], dtick=30)
+    return figure
+
+
+def circles_of_study(arcs: Arcs) -> go.Figure:
+    """Draw the study's Figure 4 again: three circles through the station, and from near."""
+    degrees = np.degrees(arcs.included_angle)
+    figure = make_subplots(cols=2, horizontal_spacing=0.12, column_titles=["Field", "From near"])
+    figure.update_layout(
+        template=theme.template(),
+        title={"text": f"Position from three circles, included angle {degrees:.2f} deg"},
+        margin={"t": 92},
+        legend={"y": 1.14},
+    )
+    figure.update_annotations(font={"size": 13, "color": theme.MUTED})
+    turn = np.linspace(0.0, 2.0 * np.pi, 181)
+    for i, (mark, radius) in enumerate(zip(arcs.shifted_site, arcs.radii, strict=True)):
+        far = mark[:, None] + radius * np.stack([np.cos(turn), np.sin(turn)])
+        middle = np.arctan2(-mark[1], -mark[0])
+        near = middle + np.linspace(-0.02, 0.02, 41)
+        arc = (mark[:, None] + radius * np.stack([np.cos(near), np.sin(near)])) * _MM
+        for column, (x, y) in ((1, far), (2, arc)):
+            figure.add_scatter(
+                x=x, y=y, mode="lines", name="circles about the shifted marks",
+                legendgroup="circles", showlegend=i == 0 and column == 1, hoverinfo="skip",
+                line={"color": theme.PAPER, "width": 1.5}, row=1, col=column,
+            )  # fmt: skip
+    shown = (
+        ("marks", arcs.marks_site, theme.MARK, "circle", (1,)),
+        ("true station", np.zeros((1, 2)), theme.TEXT, "cross-thin", (1, 2)),
+        ("where they meet best", arcs.p_site[None], theme.PAPER, "diamond", (1, 2)),
+    )
+    for name, p, colour, symbol, columns in shown:
+        for column in columns:
+            x, y = p.T * (1.0 if column == 1 else _MM)
+            figure.add_scatter(
+                x=x, y=y, mode="markers", name=name, legendgroup=name, showlegend=column == 1,
+                marker={"color": colour, "size": 9, "symbol": symbol,
+                        "line": {"color": colour, "width": 2}},
+                hovertemplate=f"{name}<extra></extra>", row=1, col=column,
+            )  # fmt: skip
+    reach = 1.6 * float(np.linalg.norm(arcs.p_site)) * _MM + 25.0
+    figure.update_xaxes(title_text="x [m]", scaleanchor="y", constrain="domain", col=1)
+    figure.update_yaxes(title_text="y [m]", constrain="domain", col=1)
+    figure.update_xaxes(
+        title_text="x [mm]", scaleanchor="y2", constrain="domain", range=[-reach, reach], col=2
+    )
+    figure.update_yaxes(title_text="y [mm]", constrain="domain", range=[-reach, reach], col=2)
+    return figure

@@ -72,11 +72,22 @@ class OverviewPage:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+class SurveyResults:
+    """What was made of a survey as a whole, the rig that its jobs use, and repeated stops."""
+
+    adjustments: tuple[Row, ...] = ()
+    calibrations: tuple[Row, ...] = ()
+    repeats: tuple[Row, ...] = ()
+    rig_digest: str | None = None
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class SurveyPage:
     """The dashboard of a survey."""
 
     frame: Frame
     data: SurveyData
+    results: SurveyResults
     filters: Filters
     jobs: tuple[Row, ...]
     address: str
@@ -112,11 +123,12 @@ class JobsPage:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class JobPage:
-    """One job, and the stops that it gave."""
+    """One job, the stops that it gave, and what it made of a survey as a whole."""
 
     frame: Frame
     job: Row
     stops: tuple[Row, ...]
+    made: tuple[Row, ...]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -209,15 +221,15 @@ def survey_page(page: SurveyPage) -> str:
 
 def stop_page(page: StopPage) -> str:
     """Return one stop: its scan, its markers, its position."""
-    markers = _rows(page.fits)
+    markers = plain_rows(page.fits)
     place = page.stops.index(page.stop["stop"])
     return render(
         "stop.html",
         page,
         here="survey",
         markers=markers,
-        rejected=_rows(page.rejections),
-        used=_rows(page.observations),
+        rejected=plain_rows(page.rejections),
+        used=plain_rows(page.observations),
         panels=_stop_panels(page),
         fix=next((fix for fix in page.fixes if fix["fit_method"] == page.method), None),
         before=page.stops[place - 1] if place else "",
@@ -234,7 +246,8 @@ def jobs_page(page: JobsPage) -> str:
 def job_page(page: JobPage) -> str:
     """Return one job with its progress."""
     config = json.dumps(json.loads(page.job["config"]), indent=2)
-    return render("job.html", page, here="jobs", config=config)
+    options = json.loads(page.job["options"] or "{}")
+    return render("job.html", page, here="jobs", config=config, options=options)
 
 
 def recording_page(page: RecordingPage) -> str:
@@ -350,11 +363,10 @@ def _angle_panel(data: SurveyData, filters: Filters) -> tuple[Panel, ...]:
         sigma_axis_m=angles.centres_sigma(data.fits),
     )
     caption = (
-        "Each point is a stop positioned from a few of its marks alone; lines through them are the "
-        "RMS in bins of 10 deg, level lines the stations from all marks. Theory is for two marks "
-        "with centres as good as ours are predicted to be, per axis. The study's limits are those "
-        "of its circles, which touch instead of cutting near 0 and 180 deg; 3-D centres lose "
-        "nothing towards 180 deg."
+        "Each point is a stop from a few of its marks alone, lines their RMS in bins of 10 deg; "
+        "level lines: from all marks. Theory: two marks, centres as good as ours are predicted, "
+        "per axis. Circles touch instead of cutting near 0 and 180 deg, which gives the study its "
+        "limits; 3-D centres lose nothing towards 180 deg."
     )
     figure = angles.error_against_angle(shown, data.tolerance_m, is_log=filters.is_log)
     return (Panel(name="angle", figure=figure, caption=caption),)
@@ -426,7 +438,7 @@ def _residual_panel(page: StopPage) -> dict[str, Panel]:
 def _stop_rows(data: SurveyData) -> list[dict[str, Any]]:
     """Return the table of stops: one row per stop and method."""
     rows = []
-    fixes = {(row["stop"], row["fit_method"]): row for row in _rows(data.fixes)}
+    fixes = {(row["stop"], row["fit_method"]): row for row in plain_rows(data.fixes)}
     for method, fits in by_method(data.fits):
         stops = np.array(texts(fits, "stop"), dtype=object)
         for stop in sorted(set(stops.tolist()), key=_lane_order):
@@ -461,7 +473,7 @@ def _lane_order(stop: str) -> tuple[str, int, str]:
     return (lane, -1 if number is None else number, stop)
 
 
-def _rows(columns: Columns) -> list[dict[str, Any]]:
+def plain_rows(columns: Columns) -> list[dict[str, Any]]:
     """Return columns as rows of plain values."""
     lists: list[list[Any]] = [_plain(column) for column in columns.values()]
     return [dict(zip(columns, row, strict=True)) for row in zip(*lists, strict=True)]

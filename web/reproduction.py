@@ -17,19 +17,27 @@ from plotly.subplots import make_subplots
 from pipelines import study
 from pipelines.accuracy import ErrorModel, ErrorSummary
 from pipelines.reproduction import (
+    CENTRE,
+    CENTRE_REAL,
     FIELD,
     FULL_SPHERE,
-    LEVEL,
+    GROUND,
+    LANE,
     OURS,
     PAPER,
+    REAL,
     REFLECTIVITY_BINS,
+    AngleExperiment,
     Example,
     RangeNoise,
+    Reading,
     Table2Row,
     Table4Row,
 )
+from pipelines.reproduction.included_angle import CIRCLES, PAIR, TRIPLE
 from pipelines.study import GREATEST_DISTANCE, SMALLEST_COUNT, TABLE_2
 from web import theme
+from web.angles import circles_of_study, limit_by_sigma, station_by_angle
 from web.figures import (
     Columns,
     by_method,
@@ -45,6 +53,7 @@ from web.study import Statement
 from web.templating import environment, number
 
 _MM = 1e3  # [mm/m]
+_REACH = 1.75  # radii of the sphere that are shown about its centre
 _N_MEAN_MIN = 3  # errors that make a mean worth drawing
 _TICKS = [step * 10.0**power for power in range(-1, 4) for step in (1, 2, 5)]
 _RATIOS = {"type": "log", "tickvals": _TICKS, "ticktext": [f"{value:g}" for value in _TICKS]}
@@ -155,12 +164,14 @@ def before_and_after_cut(example: Example) -> go.Figure:
                 row=1,
                 col=column,
             )
-        figure.add_hline(
-            y=example.cut * _MM,
-            line={"color": theme.TEXT, "width": 1.5, "dash": "dash"},
-            row=1,
-            col=column,
-        )
+        for height, dash in ((example.cut, "dash"), (example.ground, "dot")):
+            if abs(height) < _REACH * example.radius:
+                figure.add_hline(
+                    y=height * _MM,
+                    line={"color": theme.TEXT, "width": 1.5, "dash": dash},
+                    row=1,
+                    col=column,
+                )
         figure.update_xaxes(title_text="Right of the centre [mm]", row=1, col=column)
     figure.update_yaxes(title_text="Above the centre [mm]", col=1)
     _equal_axes(figure, example, n_columns=2)
@@ -284,7 +295,7 @@ def _outline(radius: float, centre: Sequence[float], colour: str, name: str) -> 
 
 def _equal_axes(figure: go.Figure, example: Example, *, n_columns: int) -> None:
     """Give all axes one scale and room for the sphere and what stands about it."""
-    reach = 1.75 * example.radius * _MM
+    reach = _REACH * example.radius * _MM
     for column in range(1, n_columns + 1):
         number = "" if column == 1 else str(column)
         figure.update_layout(
@@ -304,7 +315,8 @@ def _equal_axes(figure: go.Figure, example: Example, *, n_columns: int) -> None:
 class ReproductionPage:
     """What the page of a reproduction shows.
 
-    ``field`` and ``level`` are columns of fits as the database names them, with ``turn_s``.
+    ``centre``, ``lane``, ``distances`` and ``real`` are columns of fits as the database names them,
+    with ``turn_s``; the last are the distances with the noise of a real sensor.
     """
 
     tolerance_m: float
@@ -312,11 +324,14 @@ class ReproductionPage:
     statements: tuple[Statement, ...]
     table_2: tuple[Table2Row, ...]
     table_4: tuple[Table4Row, ...]
+    readings: tuple[Reading, ...]
+    angles: AngleExperiment
     icp: Mapping[str, ErrorSummary]
     example: Example
     centre: Columns
     lane: Columns
-    level: Columns
+    distances: Columns
+    real: Columns
     noises: Mapping[str, RangeNoise]
     spheres: Sequence[Mapping[str, Any]]
     code_version: str
@@ -338,7 +353,12 @@ def reproduction_page(page: ReproductionPage) -> str:
             panels={panel.name: panel for panel in panels(page)},
             readouts=_readouts(page),
             methods=(OURS, PAPER),
-            icp_labels=_ICP_LABELS,
+            cuts={PAPER: "half of each sphere", GROUND: "below the highest ground"},
+            noises_of={
+                CENTRE: f"{study.SIGMA_RANGE * _MM:g} mm, the study's simulator",
+                CENTRE_REAL: "7 to 14 mm, a real VLP-16",
+            },
+            ways=(CIRCLES, PAIR, TRIPLE),
             total=_total(page.table_2),
             study=study,
         )
@@ -347,9 +367,11 @@ def reproduction_page(page: ReproductionPage) -> str:
 
 def panels(page: ReproductionPage) -> tuple[Panel, ...]:
     """Return all figures of a reproduction."""
-    models = {one.method: one.model for one in page.statements if one.place == LEVEL and one.model}
-    ladder = error_against_distance(page.level, page.tolerance_m, is_log=True)
-    ladder.update_layout(title_text="Error of sphere centres to 30 m")
+    models = {one.method: one.model for one in page.statements if one.place == LANE and one.model}
+    ladder = error_against_distance(page.distances, page.tolerance_m, is_log=True)
+    ladder.update_layout(title_text="Error of sphere centres to 30 m, noise 30 mm")
+    real = error_against_distance(page.real, page.tolerance_m, is_log=True)
+    real.update_layout(title_text="Error of sphere centres to 30 m, noise of a real VLP-16")
     distance = error_against_distance(page.centre, page.tolerance_m)
     count = error_against_count(page.centre, page.tolerance_m)
     return (
@@ -367,28 +389,52 @@ def panels(page: ReproductionPage) -> tuple[Panel, ...]:
         ),
         Panel(
             name="turns",
-            figure=model_against_count(page.level, models, page.tolerance_m, _DISTANCES_SHOWN),
-            caption="Each line is one distance on level ground, each point one time of the turn: "
+            figure=model_against_count(page.distances, models, page.tolerance_m, _DISTANCES_SHOWN),
+            caption="Each line is one distance, each point one time of the turn: "
             "along a line only the count changes, from line to line only the distance. Dotted: the "
             "error model.",
         ),
         Panel(
             name="ladder",
             figure=ladder,
-            caption="The same spheres, all times of the turn, to 30 m; lines are the RMS in bins "
-            "of 1 m. The study's field ends at 9.3 m.",
+            caption="The same spheres, all times of the turn; lines are the RMS in bins of 1 m. "
+            "The study's field ends at 9.3 m.",
+        ),
+        Panel(
+            name="ladder-real",
+            figure=real,
+            caption="The same again with the noise by reflectivity of real packets, under 14 mm.",
         ),
         Panel(
             name="figure9",
             figure=before_and_after_cut(page.example),
-            caption="Figure 9. One simulated marker as the LiDAR sees it. Dashed: the highest "
-            "ground point, below which the study deletes everything.",
+            caption="Figure 9. One simulated marker as the LiDAR sees it. Dashed: the cut, which "
+            "leaves the hemisphere that the study shows; dotted, where it is near: the highest "
+            "ground point of this scan.",
         ),
         Panel(
             name="figure3",
             figure=models_of_icp(page.example, _ICP_LABELS),
             caption="Figure 3. The same marker from aside, the LiDAR to the left: where ICP with a "
             "hemisphere, ICP with a full sphere, and our fit put the sphere.",
+        ),
+        Panel(
+            name="figure4",
+            figure=circles_of_study(page.angles.arcs),
+            caption="Figure 4. Circles of the true distances about marks that are off by 17 mm per "
+            "axis; of all signs of the errors, those whose error is the median.",
+        ),
+        Panel(
+            name="figure10",
+            figure=station_by_angle(page.angles),
+            caption="Figure 10. Lines: medians over all signs of the errors. Crosses: the study's "
+            "printed errors. The free station has the lower limit and no upper one.",
+        ),
+        Panel(
+            name="limits",
+            figure=limit_by_sigma(page.angles.limits, page.tolerance_m),
+            caption="Between the lines the horizontal error of two marks is within. Two centres "
+            "have a lower limit that falls with their sigma, two circles an upper one too.",
         ),
         Panel(
             name="figure11",
@@ -406,6 +452,9 @@ def panels(page: ReproductionPage) -> tuple[Panel, ...]:
 
 
 _DISTANCES_SHOWN = (5.0, 7.5, 10.0, 15.0, 20.0)  # [m]
+
+
+_PLACES = {FIELD: "the study's field", LANE: "noise 30 mm", REAL: "noise of a real VLP-16"}
 
 
 def _readouts(page: ReproductionPage) -> tuple[Readout, ...]:
@@ -428,10 +477,10 @@ def _readouts(page: ReproductionPage) -> tuple[Readout, ...]:
     for one in page.statements:
         if one.method == OURS:
             value, _, interval = one.distance.partition(" m")
-            where = "in the study's field" if one.place == FIELD else "on level ground"
+            where = _PLACES[one.place]
             found.append(
                 Readout(
-                    label=f"{page.tolerance_m * _MM:g} mm kept to, {where}",
+                    label=f"{page.tolerance_m * _MM:g} mm kept, {where}",
                     value=value,
                     unit="m",
                     note=interval.strip(" ()") or "as far as markers stand there",

@@ -19,6 +19,7 @@ from pipelines.accuracy import (
 )
 from pipelines.errors import TooFewObservationsError
 from web.figures import Columns, by_method, floats, has_errors, texts
+from web.templating import signed
 
 _SEED = 20  # of the resamples: the same rows give the same page
 _N_RESAMPLES = 200
@@ -61,7 +62,7 @@ class Statement:
         if self.model is None or term not in self.model.terms:
             return "\N{EN DASH}"
         power, sigma = self.model.exponent(term), self.model.sigma(term)
-        return f"{_signed(power)} ± {sigma:.2f}"
+        return f"{signed(power)} ± {sigma:.2f}"
 
 
 def statements(fits: Columns, tolerance_m: float, *, place: str = "") -> tuple[Statement, ...]:
@@ -121,8 +122,3 @@ def _count(value: float, seen: tuple[float, float]) -> str:
     if math.isinf(value):
         return f"> {seen[1]:.0f}"
     return f"≤ {seen[0]:.0f}" if value == 0 else f"{math.ceil(value)}"
-
-
-def _signed(value: float) -> str:
-    """Write a number with its sign, a true minus."""
-    return f"{value:+.2f}".replace("-", "\N{MINUS SIGN}")

@@ -41,6 +41,8 @@ def environment() -> Environment:
     made.filters.update(
         metres=lambda value: number(value, 3),
         mm=lambda value: number(None if value is None else value * _MM, 1),
+        signed_mm=lambda value: signed(value * _MM, 1),
+        degrees=lambda value: number(math.degrees(value), 2),
         fixed=number,
         mib=lambda value: number(None if value is None else value / 2**20, 1),
         moment=_moment,
@@ -81,6 +83,13 @@ def _words(name: str) -> str:
     """Return a name as words, the first with a capital."""
     words = name.removeprefix("n_").removeprefix("has_").replace("_", " ")
     return words[:1].upper() + words[1:]
+
+
+def signed(value: float, decimals: int = 2) -> str:
+    """Write a number with its sign, a true minus; or a dash for what is not known."""
+    if not math.isfinite(value):
+        return _UNKNOWN
+    return f"{value:+.{decimals}f}".replace("-", "\N{MINUS SIGN}")
 
 
 def number(value: float | None, decimals: int = 2) -> str:
