@@ -31,6 +31,7 @@ _FEW = 2.0  # fewer than one in so many of the stations that stand near: a mark 
 _VERY_FEW = 4.0  # and then it most likely is
 _N_HOLD = 3  # marks that a station keeps, doubtful ones included
 _ODD_SIGMAS, _ODD_SLACK = 3.29, 0.006  # [m] by which the mean radius of a sphere may be off
+_STEEP = 1e-3  # of a line of sight that is nearly the gimbal axis: across is no direction there
 _NEAR_CONTROL = 1.0  # [m] how far a mark can be from a control mark and still be worth a remark
 
 Scan = tuple[str, MarkerFits]
@@ -398,7 +399,7 @@ def _network(
         sightings=columns[:, :2].copy(),
         fits=columns[:, 2].copy(),
         p_base=np.array([fit.p_base for fit in fits]),
-        cov_p_base=np.array([fit.cov_p_base for fit in fits]),
+        cov_p_base=np.array([_symmetric(fit.p_base, fit.cov_p_base) for fit in fits]),
         R_station_base=np.array([levelling_rotation(one) for one in levellings]),
         cov_up_base=np.array([_cov_up(one.roll, one.pitch, one.sigma) for one in levellings]),
         sigma_headings=np.array([one.sigma_heading for one in levellings]),
@@ -410,6 +411,31 @@ def _network(
         shared=Shared.none(len(fits)),
         doubts=tuple(doubts.get(mark, "") for mark in places),
     )
+
+
+def _own(p_base: Array, cov_p_base: Array, config: ResectionConfig) -> Array:
+    """Return the covariances of centres without the error of range that all of them share."""
+    v = p_base / np.linalg.norm(p_base, axis=1, keepdims=True)
+    variances = shared_variances(p_base, cov_p_base, config.sigma_range)
+    return np.asarray(cov_p_base - variances[:, None, None] * v[:, :, None] * v[:, None, :])
+
+
+def _symmetric(p_base: Array, cov_p_base: Array) -> Array:
+    """Return the covariance of a centre without what correlates along, across and above.
+
+    A sphere looks alike on all sides of the line of sight. What correlation its returns show comes
+    from where the centre happened to be put, and as a weight would turn errors across the line of
+    sight into errors along it: over many stations the ring of marks swells by 0.2 mm.
+    """
+    along = p_base / np.linalg.norm(p_base)
+    across = np.array([-along[1], along[0], 0.0])
+    length = np.linalg.norm(across)
+    if length < _STEEP:
+        return cov_p_base
+    across /= length
+    axes = np.array([along, across, np.cross(along, across)])
+    variances = np.einsum("ki,ij,kj->k", axes, cov_p_base, axes)
+    return np.asarray(axes.T @ (variances[:, None] * axes))
 
 
 def _in_common(
