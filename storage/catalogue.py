@@ -145,13 +145,6 @@ _RESULTS_OF_SURVEY = {
 _TRUE_TABLES = ("true_marks", "true_stops")
 _INSERT = {
     "rigs": "INSERT OR IGNORE INTO rigs BY NAME SELECT * FROM incoming",
-    "runs": "INSERT INTO runs BY NAME SELECT * FROM incoming",
-    "stops": "INSERT INTO stops BY NAME SELECT * FROM incoming",
-    "marker_fits": "INSERT INTO marker_fits BY NAME SELECT * FROM incoming",
-    "rejections": "INSERT INTO rejections BY NAME SELECT * FROM incoming",
-    "station_fixes": "INSERT INTO station_fixes BY NAME SELECT * FROM incoming",
-    "observations": "INSERT INTO observations BY NAME SELECT * FROM incoming",
-    "resections": "INSERT INTO resections BY NAME SELECT * FROM incoming",
     "adjustments": "INSERT INTO adjustments BY NAME SELECT * FROM incoming",
     "adjusted_stations": "INSERT INTO adjusted_stations BY NAME SELECT * FROM incoming",
     "adjusted_marks": "INSERT INTO adjusted_marks BY NAME SELECT * FROM incoming",
@@ -166,7 +159,11 @@ _INSERT = {
     "true_marks": "INSERT OR REPLACE INTO true_marks BY NAME SELECT * FROM incoming",
     "true_stops": "INSERT OR REPLACE INTO true_stops BY NAME SELECT * FROM incoming",
 }
-_OF_JOBS = tuple(name for name in _INSERT if name not in ("control_marks", *_TRUE_TABLES))
+_APPENDED = results.TABLES[1:]  # as they are, column by column: much the quickest way
+_OF_JOBS = (
+    *_APPENDED,
+    *(name for name in _INSERT if name not in ("control_marks", *_TRUE_TABLES)),
+)
 _REFRESH = {
     "marker_fits": """
         UPDATE marker_fits AS x SET error_x_m = i.error_x_m, error_y_m = i.error_y_m,
@@ -897,7 +894,12 @@ class Catalogue(Database):
 
 def _insert(cursor: duckdb.DuckDBPyConnection, name: str, table: pa.Table) -> None:
     """Append an Arrow table to the table of that name."""
-    execute_on(cursor, _INSERT[name], table)
+    if not table.num_rows:
+        return
+    if name in _APPENDED:
+        cursor.from_arrow(table).insert_into(name)
+    else:
+        execute_on(cursor, _INSERT[name], table)
 
 
 def _refresh_errors(cursor: duckdb.DuckDBPyConnection, survey_id: str) -> None:

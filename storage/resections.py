@@ -50,7 +50,8 @@ def _table(
     """Return the subsets of one size at one stop."""
     n, k = found.marks.shape
     known = dict(zip(("run_id", "stop", "fit_method", "resection_method"), labels, strict=True))
-    columns = {name: pa.repeat(value, n) for name, value in known.items()}
+    text = pa.string()  # said, because to guess a scalar's type costs more than all else here
+    columns = {name: pa.repeat(pa.scalar(value, text), n) for name, value in known.items()}
     marks = pa.array(names, pa.string()).take(pa.array(found.marks.ravel()))
     columns["marks"] = pa.ListArray.from_arrays(np.arange(0, n * k + 1, k, dtype=np.int32), marks)
     columns["n_marks"] = pa.repeat(pa.scalar(k, pa.int32()), n)
