@@ -35,6 +35,9 @@ _ALIASES = {
     "sigma_y_m": ("sigma_y", "sigma_n", "sy"),
     "sigma_z_m": ("sigma_z", "sigma_h", "sz"),
     "sigma_m": ("sigma",),
+    "target_height_m": ("target_height", "th"),
+    "down_m": ("down", "d"),
+    "note": ("description", "desc", "code", "note"),
 }
 _NAMES = {
     spelling: column
@@ -42,25 +45,71 @@ _NAMES = {
     for alias in aliases
     for spelling in (alias, f"{alias}_m")
 }
+_AXES = {
+    "enu": ("x_m", "y_m", "z_m"),
+    "neu": ("y_m", "x_m", "z_m"),
+    "ned": ("y_m", "x_m", "down_m"),
+}
+_UNITS = {"m": 1.0, "mm": 1e-3, "ft": 0.3048, "us-ft": 1200.0 / 3937.0}
 _ROWS_MAX = 10_000
 _SIZE_MAX = 4_000_000  # characters; far more than so many rows need
 _APART_MIN = 0.01  # [m] marks nearer than this are one mark twice
 _COORDINATE_MAX = 1e8  # [m] larger than any national grid
 _EXPECTED = "expected mark,x_m,y_m,z_m and, if known, sigma_x_m,sigma_y_m,sigma_z_m [m]"
+_HEIGHT_MAX = 100.0  # [m] of a target above its mark
 _RIGID_TOLERANCE = 1e-6  # how far a rotation matrix may be from orthonormal
 
 _T = TypeVar("_T")
 
 
-def parse_control(text: str) -> ControlMarks:
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ControlLayout:
+    """How to read a table of control marks where it does not say so itself.
+
+    Attributes
+    ----------
+    axes : str
+        What three coordinates without names, or called x, y and z, are: ``enu`` (east, north, up),
+        ``neu`` or ``ned`` (down). Columns called easting, northing or the like say it themselves.
+    unit : str
+        Unit of coordinates and their sigmas: ``m``, ``mm``, ``ft`` or ``us-ft``.
+    target_height : float
+        Height of the centres above the given points, where a column of the table does not give it
+        mark by mark [m].
+    """
+
+    axes: str = "enu"
+    unit: str = "m"
+    target_height: float = 0.0
+
+    def __post_init__(self) -> None:
+        for what, value, known in (("axes", self.axes, _AXES), ("unit", self.unit, _UNITS)):
+            if value not in known:
+                raise ControlError(
+                    f"The {what} of the control table are given as {value!r}; known: "
+                    f"{', '.join(known)}."
+                )
+        if not abs(self.target_height) < _HEIGHT_MAX:
+            raise ControlError(
+                f"The target height is {self.target_height:g} m; it must be below {_HEIGHT_MAX:g}."
+            )
+
+
+_PLAIN = ControlLayout()
+
+
+def parse_control(text: str, layout: ControlLayout = _PLAIN) -> ControlMarks:
     """Read a table of control marks.
 
     Parameters
     ----------
     text : str
         CSV with comma, semicolon or tab. Columns are found by their usual names in any order and
-        case; without a header they are mark, x, y, z and, if there are seven, three sigmas. Empty
+        case (``P,N,E,Z,D`` too, whose last is a description); without a header they are mark, three
+        coordinates and, if there are seven, three sigmas, or a description if there are five. Empty
         lines and what follows a ``#`` are skipped.
+    layout : ControlLayout
+        What the table does not say itself.
 
     Returns
     -------
@@ -80,12 +129,12 @@ def parse_control(text: str) -> ControlMarks:
     rows = list(_rows(text))
     if not rows:
         raise ControlError(f"The control table is empty; {_EXPECTED}.")
-    columns, body = _columns(rows)
+    columns, body = _columns(rows, layout.axes)
     if not body:
         raise ControlError(f"The control table has a header but no marks; {_EXPECTED}.")
     if len(body) > _ROWS_MAX:
         raise ControlError(f"The control table has more than {_ROWS_MAX:,} marks.")
-    return _marks([_Row(line=line, columns=columns, cells=cells) for line, cells in body])
+    return _marks([_Row(line=n, columns=columns, cells=cells) for n, cells in body], layout)
 
 
 def format_control(marks: ControlMarks) -> str:
@@ -216,13 +265,15 @@ def format_rig(rig: Rig) -> str:
     return json.dumps(rig_to_mapping(rig), indent=1, allow_nan=False) + "\n"
 
 
-def read_control(path: str | Path) -> ControlMarks:
+def read_control(path: str | Path, layout: ControlLayout = _PLAIN) -> ControlMarks:
     """Read control marks from a file, as ``parse_control`` does.
 
     Parameters
     ----------
     path : str or Path
         The file.
+    layout : ControlLayout
+        What the file does not say itself.
 
     Returns
     -------
@@ -236,7 +287,7 @@ def read_control(path: str | Path) -> ControlMarks:
     ControlError
         If it cannot be used.
     """
-    return _read(path, parse_control, ControlError)
+    return _read(path, lambda text: parse_control(text, layout), ControlError)
 
 
 def write_control(marks: ControlMarks, path: str | Path) -> None:
@@ -360,6 +411,17 @@ class _Row:
             raise ControlError(f"Line {self.line} of the control table has a mark without a name.")
         return name
 
+    def position(self, layout: ControlLayout) -> list[float]:
+        """Return the place of the centre [m]."""
+        unit = _UNITS[layout.unit]
+        is_down = "down_m" in self.columns
+        x, y = unit * self.number("x_m"), unit * self.number("y_m")
+        z = unit * (-self.number("down_m") if is_down else self.number("z_m"))
+        height = layout.target_height
+        if "target_height_m" in self.columns:
+            height = unit * self.number("target_height_m")
+        return [x, y, z + height]
+
     def sigmas(self) -> list[float]:
         """Return the standard deviations of the coordinates [m]."""
         if "sigma_m" in self.columns:
@@ -395,28 +457,52 @@ def _without_comment(line: str) -> str:
 
 
 def _columns(
-    rows: list[tuple[int, list[str]]],
+    rows: list[tuple[int, list[str]]], axes: str
 ) -> tuple[list[str], list[tuple[int, list[str]]]]:
     """Return the names of the columns, and the rows below the header if there is one."""
     first = rows[0][1]
-    if len(first) in (4, 7) and all(_is_number(cell) for cell in first[1:]):
-        return list(CONTROL_COLUMNS[: len(first)]), rows
-    columns = [_NAMES.get(cell.lower(), "") for cell in first]
-    unknown = [cell for cell, column in zip(first, columns, strict=True) if not column]
+    if len(first) in (4, 5, 7) and all(_is_number(cell) for cell in first[1:4]):
+        sigmas = [f"sigma_{axis}" for axis in _AXES["neu" if axes == "ned" else axes]]
+        rest = {4: [], 5: ["note"], 7: sigmas}[len(first)]
+        return ["mark", *_AXES[axes], *rest], rows
+    columns = _named(first, axes)
+    _require_columns(columns, first)
+    return columns, rows[1:]
+
+
+def _named(header: list[str], axes: str) -> list[str]:
+    """Return what each column of a header is."""
+    words = [cell.lower() for cell in header]
+    columns = [_NAMES.get(word, "") for word in words]
+    unknown = [cell for cell, column in zip(header, columns, strict=True) if not column]
     if unknown:
         raise ControlError(
-            f"The control table has the unknown column {unknown[0]!r} ({', '.join(first)}); "
+            f"The control table has the unknown column {unknown[0]!r} ({', '.join(header)}); "
             f"{_EXPECTED}."
         )
-    doubled = [column for column in columns if columns.count(column) > 1]
-    missing = [column for column in CONTROL_COLUMNS[:4] if column not in columns]
+    if "z_m" in columns:  # a d beside a height is the description of P,N,E,Z,D
+        columns = ["note" if column == "down_m" else column for column in columns]
+    turned = dict(zip(("x", "y", "z"), _AXES[axes], strict=True))
+    if axes != "enu":
+        turned |= {"sigma_x": "sigma_y_m", "sx": "sigma_y_m"}
+        turned |= {"sigma_y": "sigma_x_m", "sy": "sigma_x_m"}
+    return [
+        turned.get(word.removesuffix("_m"), column)
+        for word, column in zip(words, columns, strict=True)
+    ]
+
+
+def _require_columns(columns: list[str], header: list[str]) -> None:
+    """Refuse a header that lacks something or has it twice."""
+    doubled = [column for column in columns if columns.count(column) > 1 and column != "note"]
+    third = "down_m" if "down_m" in columns else "z_m"
+    missing = [column for column in ("mark", "x_m", "y_m", third) if column not in columns]
     sigmas = [column for column in columns if column.startswith("sigma")]
     if sigmas not in ([], ["sigma_m"]) and sorted(sigmas) != list(CONTROL_COLUMNS[4:]):
         missing += ["all three of sigma_x_m, sigma_y_m, sigma_z_m, or sigma_m alone"]
     if doubled or missing:
         fault = f"has {doubled[0]} twice" if doubled else f"lacks {missing[0]}"
-        raise ControlError(f"The control table {fault} ({', '.join(first)}); {_EXPECTED}.")
-    return columns, rows[1:]
+        raise ControlError(f"The control table {fault} ({', '.join(header)}); {_EXPECTED}.")
 
 
 def _is_number(cell: str) -> bool:
@@ -428,7 +514,7 @@ def _is_number(cell: str) -> bool:
     return True
 
 
-def _marks(rows: list[_Row]) -> ControlMarks:
+def _marks(rows: list[_Row], layout: ControlLayout) -> ControlMarks:
     """Build the marks, all different in name and place."""
     lines: dict[str, int] = {}
     for row in rows:
@@ -438,8 +524,8 @@ def _marks(rows: list[_Row]) -> ControlMarks:
                 f"{row.name()!r}; names must differ."
             )
         lines[row.name()] = row.line
-    p = np.array([[row.number(column) for column in ("x_m", "y_m", "z_m")] for row in rows])
-    sigmas = np.array([row.sigmas() for row in rows])
+    p = np.array([row.position(layout) for row in rows])
+    sigmas = np.array([row.sigmas() for row in rows]) * _UNITS[layout.unit]
     _require_apart(p, rows)
     return ControlMarks(
         names=tuple(lines), p_site=p, cov_p_site=sigmas[:, :, None] ** 2 * np.eye(3)

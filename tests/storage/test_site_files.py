@@ -14,6 +14,7 @@ from pipelines.rigs import rig_to_mapping, tilted_vlp16
 from pipelines.values import ControlMarks, StopTruth, Truth
 from storage.site_files import (
     CONTROL_COLUMNS,
+    ControlLayout,
     format_control,
     format_rig,
     format_truth,
@@ -212,3 +213,50 @@ def test_a_file_that_is_no_text_is_refused(tmp_path):
     (tmp_path / "a.csv").write_bytes(b"\x89MCAP0\r\n\xff\xfe")
     with pytest.raises(ControlError, match="UTF-8"):
         read_control(tmp_path / "a.csv")
+
+
+NORTHING_FIRST = np.array([[20.0, 10.0, 3.0]])  # x east, y north, z up of what stands below
+
+
+@pytest.mark.parametrize(
+    ("text", "layout"),
+    [
+        ("A,10,20,3", ControlLayout(axes="neu")),
+        ("A,10,20,-3", ControlLayout(axes="ned")),
+        ("mark,x,y,z\nA,10,20,3", ControlLayout(axes="neu")),
+        ("mark,x,y,z\nA,10,20,-3", ControlLayout(axes="ned")),
+        ("P,N,E,Z,D\nA,10,20,3,red ball", ControlLayout()),
+        ("A,10,20,3,red ball", ControlLayout(axes="neu")),
+        ("mark,n,e,d\nA,10,20,-3", ControlLayout()),
+        ("mark,e,n,h\nA,20000,10000,3000", ControlLayout(unit="mm")),
+        ("mark,e,n,h\nA,20,10,1.5", ControlLayout(target_height=1.5)),
+        ("mark,e,n,h,th\nA,20,10,1.25,1.75", ControlLayout(target_height=9.0)),
+    ],
+)
+def test_axes_units_and_target_heights_lead_to_the_same_centre(text, layout):
+    marks = parse_control(text, layout)
+    np.testing.assert_allclose(marks.p_site, NORTHING_FIRST, rtol=0, atol=1e-12)
+
+
+def test_feet_are_feet_and_those_of_the_us_survey_a_little_longer():
+    feet, us = (
+        parse_control("A,1000,0,0,0.01,0,0", ControlLayout(unit=unit)) for unit in ("ft", "us-ft")
+    )
+    assert feet.p_site[0, 0] == pytest.approx(304.8, abs=1e-9)
+    assert us.p_site[0, 0] - feet.p_site[0, 0] == pytest.approx(0.0006096, abs=1e-7)
+    assert np.sqrt(feet.cov_p_site[0, 0, 0]) == pytest.approx(0.003048, abs=1e-12)
+
+
+@pytest.mark.parametrize("text", ["A,10,20,3,0.1,0.2,0.3", "m,x,y,z,sx,sy,sz\nA,10,20,3,.1,.2,.3"])
+def test_sigmas_follow_their_axes(text):
+    text = text.replace("m,x", "mark,x")
+    marks = parse_control(text, ControlLayout(axes="neu"))
+    np.testing.assert_allclose(np.sqrt(np.diag(marks.cov_p_site[0])), [0.2, 0.1, 0.3], atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    "wrong", [{"axes": "esu"}, {"unit": "yard"}, {"target_height": float("nan")}]
+)
+def test_a_layout_that_is_none_is_refused(wrong):
+    with pytest.raises(ControlError, match="control table|target height"):
+        ControlLayout(**wrong)
