@@ -13,7 +13,7 @@ from fastapi import APIRouter, FastAPI, Request, Response
 from fastapi.responses import RedirectResponse
 from fastapi.staticfiles import StaticFiles
 
-from service import api, errors, guard, pages
+from service import api, errors, guard, pages, plan_pages, result_pages
 from service.errors import UnauthorizedError
 from service.settings import Settings
 from service.state import Current, opened
@@ -53,6 +53,8 @@ def create_app(settings: Settings) -> FastAPI:
     app.include_router(api.router, prefix=ROOT)
     app.include_router(about)
     app.include_router(pages.router)
+    app.include_router(plan_pages.router)
+    app.include_router(result_pages.router)
     app.mount("/static", StaticFiles(directory=STATIC), name="static")
     errors.install(app, pages.error_page)
     return app

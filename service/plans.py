@@ -13,22 +13,41 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
 from pipelines.errors import InputError, NotFoundError
 from pipelines.placement import (
     Arrangement,
+    CentreModel,
+    Requirement,
+    Sensor,
     Sights,
     Site,
     Stops,
+    evaluate,
+    field_eyes,
+    field_map,
     look,
     marks_of_field,
+    sensor_model,
     site_of_field,
     stops_of_field,
 )
+from pipelines.placement.candidates import PlaceRules, find_candidates
+from pipelines.placement.optimising import Goal, optimise, propose_mark
 from pipelines.simulation import scenario
 from pipelines.values import Array
+from service.planning import (
+    Plain,
+    evaluation_answer,
+    field_answer,
+    optimum_answer,
+    proposal_answer,
+)
+from storage import plans as kept
+from storage.catalogue import Catalogue
 
 SCENARIOS = {
     "paper-field": "the study's field (simulated)",
@@ -40,6 +59,8 @@ SCENARIOS = {
 TERRAIN = "terrain:"  # before the id of an uploaded one
 _GROUNDS_KEPT = 6
 _SIGHTS_KEPT = 400  # marks; of a map of 64 x 64 places each takes 130 kB
+_SEED = 0  # of the optimiser's later starts
+_ROUND_IT = 3.0  # [m] shown around the outermost marks
 _STOPS_ACROSS = 3  # of a terrain for which nobody has said where the rover stops
 
 
@@ -51,6 +72,41 @@ class Ground:
     site: Site
     stops: Stops
     marks: Arrangement
+
+    @property
+    def view(self) -> tuple[float, float, float, float]:
+        """The part of it that a map shows: x and y from, x and y to [m]."""
+        p = np.concatenate([self.stops.p_site, self.marks.p_site])[:, :2]
+        lines = (self.site.xs, self.site.ys)
+        if not len(self.marks.names):
+            (x0, x1), (y0, y1) = ((line[0], line[-1]) for line in lines)
+        else:
+            (x0, x1), (y0, y1) = (
+                (max(line[0], p[:, k].min() - _ROUND_IT), min(line[-1], p[:, k].max() + _ROUND_IT))
+                for k, line in enumerate(lines)
+            )
+        return float(x0), float(y0), float(x1), float(y1)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Asked:
+    """A plan, put together: what is judged, by which model, and what is wanted of it."""
+
+    ground: Ground
+    stops: Stops
+    marks: Arrangement
+    model: CentreModel
+    wish: Requirement
+
+
+class Place(NamedTuple):
+    """Where a mark stands: on a pole above the ground, or with its centre at a height [m]."""
+
+    name: str
+    x: float
+    y: float
+    pole: float | None = None
+    z: float | None = None
 
 
 def simulated_ground(key: str) -> Ground:
@@ -110,18 +166,27 @@ def stops_at(site: Site, places: Sequence[tuple[str, float, float]]) -> Stops:
     return Stops(names=tuple(place[0] for place in places), p_site=np.column_stack([xy, z]))
 
 
-def marks_at(site: Site, places: Sequence[tuple[str, float, float, float]]) -> Arrangement:
-    """Return marks on poles of given heights [m] above the ground."""
-    array = np.array([place[1:] for place in places], dtype=np.float64).reshape(-1, 3)
-    z = site.ground_at(array) + array[:, 2]
-    for (name, x, y, _), height in zip(places, z, strict=True):
-        if not np.isfinite(height):
+def marks_at(site: Site, places: Sequence[Place]) -> Arrangement:
+    """Return marks where they are said to stand."""
+    xy = np.array([(place.x, place.y) for place in places], dtype=np.float64).reshape(-1, 2)
+    ground = site.ground_at(xy)
+    heights = np.empty(len(places))
+    for k, place in enumerate(places):
+        if not np.isfinite(ground[k]):
             raise InputError(
-                f"Mark {name} at {x:.2f}, {y:.2f} m is off the terrain, or where its height is not "
-                f"known; {_extent_text(site)}."
+                f"Mark {place.name} at {place.x:.2f}, {place.y:.2f} m is off the terrain, or where "
+                f"its height is not known; {_extent_text(site)}."
+            )
+        heights[k] = place.z if place.z is not None else ground[k] + (place.pole or 0.0)
+        if heights[k] < ground[k] + site.marker_radius:
+            raise InputError(
+                f"Mark {place.name} is under the ground: its centre is "
+                f"{heights[k] - ground[k]:.3f} m above it, and a sphere of {site.marker_radius:g} m "
+                "radius needs more than that. "
+                "Give it a higher pole."
             )
     return Arrangement(
-        names=tuple(place[0] for place in places), p_site=np.column_stack([array[:, :2], z])
+        names=tuple(place.name for place in places), p_site=np.column_stack([xy, heights])
     )
 
 
@@ -142,7 +207,7 @@ class Lookout:
 
     def look(self, ground: Ground, eyes_site: Array, marks: Arrangement) -> Sights:
         """Return what ``pipelines.placement.look`` does."""
-        eyes = hashlib.sha256(np.ascontiguousarray(eyes_site)).digest()
+        eyes = hashlib.sha256(np.ascontiguousarray(eyes_site).tobytes()).digest()
         keys = [(ground.key, eyes, p.tobytes()) for p in marks.p_site]
         with self._lock:
             known = {key: self._known[key] for key in keys if key in self._known}
@@ -161,3 +226,56 @@ class Lookout:
             self._known.update(fresh)
             while len(self._known) > _SIGHTS_KEPT:
                 self._known.popitem(last=False)
+
+
+class Planner:
+    """What plans of a service have in common: its fields, its models, and what is in sight."""
+
+    def __init__(self, catalogue: Catalogue) -> None:
+        self._catalogue = catalogue
+        self._lookout = Lookout()
+
+    def ground(self, key: str) -> Ground:
+        """Return the field of a key; NotFoundError if there is none."""
+        if not key.startswith(TERRAIN):
+            return simulated_ground(key)
+        known = kept.get_terrain(self._catalogue, key.removeprefix(TERRAIN))
+        return terrain_ground(key, known["name"], Path(known["url"]))
+
+    def model(self, key: str, sensor: Sensor, radius: float) -> CentreModel:
+        """Return the model of centres that was asked for."""
+        return sensor_model(sensor, radius)
+
+    def evaluate(self, asked: Asked) -> Plain:
+        """Return what an arrangement promises at its stops."""
+        sights = self._lookout.look(asked.ground, asked.stops.p_site, asked.marks)
+        site = asked.ground.site
+        found = evaluate(site, asked.stops, asked.marks, asked.model, asked.wish, sights=sights)
+        return evaluation_answer(site, asked.model, found)
+
+    def optimise(self, asked: Asked, goal: Goal, rules: PlaceRules) -> Plain:
+        """Return the best places for a number of marks, or the fewest that keep the tolerance."""
+        site, stops = asked.ground.site, asked.stops
+        places = find_candidates(site, stops, rules)
+        rng = np.random.default_rng(_SEED)  # the same question has the same answer
+        found = optimise(site, stops, places, asked.model, asked.wish, goal, rng)
+        return optimum_answer(site, asked.model, found)
+
+    def suggest(self, asked: Asked, rules: PlaceRules) -> Plain:
+        """Return the one more mark that would help most."""
+        site, stops = asked.ground.site, asked.stops
+        places = find_candidates(site, stops, rules)
+        found = propose_mark(site, stops, asked.marks, places, asked.model, asked.wish)
+        return proposal_answer(site, found)
+
+    def field(self, asked: Asked, n_across: int) -> Plain:
+        """Return what an arrangement promises on a grid over the part that a map shows."""
+        x0, y0, x1, y1 = asked.ground.view
+        step = max(x1 - x0, y1 - y0) / n_across
+        xs, ys = (np.arange(a + step / 2, b, step) for a, b in ((x0, x1), (y0, y1)))
+        site = asked.ground.site
+        eyes, _ = field_eyes(site, xs, ys)
+        sights = self._lookout.look(asked.ground, eyes, asked.marks)
+        return field_answer(
+            field_map(site, xs, ys, asked.marks, asked.model, asked.wish, sights=sights)
+        )

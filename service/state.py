@@ -13,6 +13,7 @@ from fastapi import Depends, Request
 
 from service.errors import ReusedKeyError
 from service.jobs import JobQueue
+from service.plans import Planner
 from service.settings import Settings
 from service.uploads import Inbox
 from storage.catalogue import Catalogue
@@ -53,6 +54,7 @@ class Service:
     inbox: Inbox
     terrains: Inbox
     jobs: JobQueue
+    planner: Planner
     idempotency: Idempotency = field(default_factory=Idempotency)
 
     @property
@@ -79,7 +81,8 @@ async def opened(settings: Settings) -> AsyncIterator[Service]:
         one.open()
     with Catalogue(data / DATABASE, snapshots=data / "snapshots") as catalogue:
         async with JobQueue(settings, catalogue, data / "clouds") as jobs:
-            yield Service(settings, catalogue, inbox, terrains, jobs)
+            planner = Planner(catalogue)
+            yield Service(settings, catalogue, inbox, terrains, jobs, planner)
 
 
 def current(request: Request) -> Service:

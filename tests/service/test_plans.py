@@ -1,0 +1,176 @@
+import csv
+import io
+
+import numpy as np
+import pytest
+import rasterio
+from fastapi.testclient import TestClient
+from rasterio.transform import from_origin
+
+from service.app import create_app
+from service.settings import Settings
+from storage.catalogue import Catalogue
+from tests.surveyed import fill
+
+MARKS = [
+    {"name": "A", "x_m": 6.5, "y_m": 0.5, "pole_height_m": 1.0},
+    {"name": "B", "x_m": -1.0, "y_m": 6.5, "pole_height_m": 1.0},
+    {"name": "C", "x_m": -6.5, "y_m": -3.0, "pole_height_m": 1.0},
+]
+
+
+@pytest.fixture(scope="module")
+def client(tmp_path_factory):
+    data = tmp_path_factory.mktemp("data")
+    with Catalogue(data / "spheremark.duckdb", snapshots=data / "snapshots") as catalogue:
+        fill(catalogue, data / "clouds", "field", n_stops=2)
+    with TestClient(
+        create_app(Settings(data=data, workers=1)), base_url="http://127.0.0.1:8000"
+    ) as client:
+        yield client
+
+
+def evaluated(client, **plan):
+    response = client.post(
+        "/api/v1/plans/evaluate", json={"marks": MARKS, "model": "sensor", **plan}
+    )
+    response.raise_for_status()
+    return response.json()
+
+
+def refused(client, path="/api/v1/plans/evaluate", **plan):
+    response = client.post(path, json={"marks": MARKS, "model": "sensor", **plan})
+    assert response.status_code in (404, 422), response.text
+    return response.json()["detail"]
+
+
+def terrain(tmp_path, heights, cell=0.5):
+    path = tmp_path / "hill.tif"
+    shape = {"height": heights.shape[0], "width": heights.shape[1], "count": 1, "dtype": "float32"}
+    place = from_origin(0.0, cell * heights.shape[0], cell, cell)
+    with rasterio.open(path, "w", driver="GTiff", transform=place, nodata=-9999.0, **shape) as file:
+        file.write(heights.astype(np.float32), 1)
+    return path
+
+
+def test_an_answer_given_back_is_answered_alike(client):
+    first = evaluated(client)
+    again = evaluated(
+        client, marks=[{k: m[k] for k in ("name", "position_m")} for m in first["marks"]]
+    )
+    assert again["stops"] == first["stops"]
+    assert len(first["stops"]) == 35
+    assert all(0 < stop["sigma_3d_m"] < 0.03 for stop in first["stops"])
+
+
+def test_a_mark_that_moves_is_looked_for_anew_and_the_others_are_not_forgotten(client):
+    evaluated(client)
+    moved = evaluated(client, marks=[{**MARKS[0], "x_m": 7.5}, *MARKS[1:]])
+    fresh = evaluated(client, marks=[*MARKS[1:], {**MARKS[0], "x_m": 7.5}])
+    assert [s["sigma_3d_m"] for s in moved["stops"]] == pytest.approx(
+        [s["sigma_3d_m"] for s in fresh["stops"]], rel=1e-9
+    )
+
+
+def test_the_map_agrees_with_a_stop_that_stands_on_it(client):
+    field = evaluated(client, field_cells=21)["field"]
+    i, j = 10, 10
+    place = {"name": "here", "x_m": field["x_m"][i], "y_m": field["y_m"][j]}
+    (stop,) = evaluated(client, stops=[place])["stops"]
+    assert field["sigma_3d_m"][j][i] == pytest.approx(stop["sigma_3d_m"], abs=1e-6)
+    assert field["n_seen"][j][i] == len(stop["visible_marks"])
+
+
+def test_a_plan_comes_as_csv_and_geojson_too(client):
+    def file(kind):
+        return client.post(
+            "/api/v1/plans/evaluate", json={"marks": MARKS}, headers={"Accept": kind}
+        )
+
+    rows = list(csv.DictReader(io.StringIO(file("text/csv").text)))
+    assert [row["kind"] for row in rows].count("mark") == 3
+    assert float(rows[0]["z_m"]) == pytest.approx(float(rows[0]["ground_m"]) + 1.0)
+    features = file("application/geo+json").json()["features"]
+    assert features[0]["geometry"]["coordinates"] == pytest.approx(
+        [float(rows[0][f"{axis}_m"]) for axis in "xyz"]
+    )
+
+
+def test_optimised_marks_are_better_than_those_one_began_with(client):
+    plan = {"marks": MARKS, "model": "sensor", "n_marks": 3, "is_robust": False}
+    best = client.post("/api/v1/plans/optimise", json=plan).json()
+    assert len(best["marks"]) == 3
+    assert best["worst_sigma_3d_m"] < evaluated(client)["worst_sigma_3d_m"]
+    keep = [{key: mark[key] for key in ("name", "position_m")} for mark in best["marks"]]
+    assert evaluated(client, marks=keep)["stops"] == best["stops"]
+
+
+def test_one_more_mark_is_suggested_that_helps(client):
+    answer = client.post("/api/v1/plans/suggest", json={"marks": MARKS, "model": "sensor"}).json()
+    assert answer["worst_sigma_3d_after_m"] < answer["worst_sigma_3d_before_m"]
+
+
+def test_a_kept_plan_stands_beside_what_came_of_it(client):
+    kept = client.post("/api/v1/plans", json={"marks": MARKS, "name": "first", "survey": "field"})
+    assert kept.status_code == 201
+    found = client.get(kept.headers["Location"]).json()
+    surveyed = [stop for stop in found["stops"] if stop["run_id"]]
+    assert {stop["stop"] for stop in surveyed} == {"lane3-stop1", "lane3-stop2"}
+    fix = client.get("/api/v1/station-fixes", params={"fit_method": "along_beam"}).json()["items"]
+    errors = {
+        row["stop"]: row["error_3d_m"] for row in fix if row["resection_method"] == "free_station"
+    }
+    assert {stop["stop"]: stop["error_3d_m"] for stop in surveyed} == pytest.approx(errors)
+    sql = "SELECT count(*), count(error_3d_m) FROM placements"
+    assert client.get("/api/v1/sql", params={"q": sql}).json()["rows"] == [[35, 2]]
+    page = client.get(f"/plan/{found['placement_id']}").text
+    assert "Promised and achieved" in page
+    assert "first" in client.get("/plan").text
+
+
+def test_an_uploaded_terrain_can_be_planned_on(client, tmp_path):
+    x = np.linspace(-1, 1, 61)
+    path = terrain(tmp_path, 8.0 * np.exp(-8 * (x[:, None] ** 2 + x[None] ** 2)))  # a hill between
+    body = path.read_bytes()
+    made = client.post("/api/v1/terrains", params={"name": "hill.tif"}, content=body)
+    assert made.status_code == 201, made.text
+    key = made.json()["key"]
+    assert key in [one["key"] for one in client.get("/api/v1/plans/sites").json()["items"]]
+    places = [("E", 24.0, 15.0), ("N", 15.0, 24.0)]
+    marks = [{"name": n, "x_m": px, "y_m": py, "pole_height_m": 1.0} for n, px, py in places]
+    stops = [{"name": "west", "x_m": 6.0, "y_m": 15.0}]
+    (stop,) = evaluated(client, site=key, marks=marks, stops=stops)["stops"]
+    assert stop["visible_marks"] == ["N"]  # the hill hides the eastern one
+    assert stop["sigma_3d_m"] is None
+    assert stop["reason"]
+
+
+def test_a_file_that_is_no_terrain_is_refused_and_not_kept(client):
+    for name, body in (("hill.tif", b"no raster"), ("hill.txt", b"1 2 3")):
+        answer = client.post("/api/v1/terrains", params={"name": name}, content=body)
+        assert answer.status_code in (400, 415, 422), answer.text
+        assert name in answer.json()["detail"] or "tif" in answer.json()["detail"]
+    assert not [s for s in client.get("/api/v1/plans/sites").json()["items"] if "txt" in s["name"]]
+
+
+@pytest.mark.parametrize(
+    ("wrong", "said"),
+    [
+        ({"marks": [{**MARKS[0], "pole_height_m": -0.5}]}, "under the ground"),
+        ({"marks": [{**MARKS[0], "x_m": 1e4}]}, "off the terrain"),
+        ({"stops": [{"name": "far", "x_m": 500.0, "y_m": 0.0}]}, "off the terrain"),
+        ({"site": "nowhere"}, "There is no field"),
+        ({"site": "terrain:" + 64 * "0"}, "There is no terrain"),
+        ({"marks": [MARKS[0], MARKS[0]]}, "needs a name of its own"),
+        ({"stops": []}, "no stop"),
+        ({"turn_s": 0.001}, "turn"),
+    ],
+)
+def test_what_cannot_be_planned_is_refused_with_the_reason(client, wrong, said):
+    assert said in refused(client, **wrong)
+
+
+def test_a_stop_that_sees_nothing_says_so(client):
+    answer = evaluated(client, marks=[])
+    assert all(stop["sigma_3d_m"] is None and stop["reason"] for stop in answer["stops"])
+    assert answer["worst_sigma_3d_m"] is None

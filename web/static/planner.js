@@ -1,0 +1,522 @@
+// The planner: marks that move, the service that answers what they promise, the address that holds it all.
+const { PlanMap, SHOWN, rangeOf, paintScale } = await import(document.getElementById("planner").dataset.map);
+
+const API = "/api/v1/plans";
+const CELLS = { moving: 32, still: 64 }; // across the longer side of the map
+const KEPT = 60; // steps that can be undone
+const byId = (name) => document.getElementById(name);
+const controls = ["site", "method", "tolerance", "turn", "rpm", "model", "show"];
+const state = { plans: [], active: 0, stop: "", stops: null, site: null, past: [] };
+
+// ---- the address
+
+function readAddress() {
+  const query = new URLSearchParams(location.search);
+  for (const name of controls) {
+    const value = query.get(name);
+    const field = byId(name);
+    if (value === null) continue;
+    if (field.tagName === "SELECT" && ![...field.options].some((option) => option.value === value)) {
+      field.add(new Option(value, value)); // the service says if it knows none of that name
+    }
+    field.value = value;
+  }
+  state.stop = query.get("stop") ?? "";
+  state.stops = query.get("stops") === null ? null : parseStops(query.get("stops"));
+  return ["a", "b"].map((key) => query.get(key)).filter((text) => text !== null).map(parseMarks);
+}
+
+function parseMarks(text) {
+  return text.split(";").filter(Boolean).map((part) => {
+    const [name, numbers] = part.split(":");
+    const [x, y, pole] = (numbers ?? "").split(",").map(Number);
+    return { name, x, y, pole };
+  }).filter((mark) => [mark.x, mark.y, mark.pole].every(Number.isFinite));
+}
+
+function parseStops(text) {
+  return text.split(";").filter(Boolean).map((part) => {
+    const [name, numbers] = part.split(":");
+    const [x, y] = (numbers ?? "").split(",").map(Number);
+    return { name, x, y };
+  }).filter((stop) => Number.isFinite(stop.x) && Number.isFinite(stop.y));
+}
+
+const round = (value, digits) => String(+value.toFixed(digits));
+const marksText = (marks) => marks.map((m) => `${m.name}:${round(m.x, 3)},${round(m.y, 3)},${round(m.pole, 3)}`).join(";");
+
+function writeAddress() {
+  const query = new URLSearchParams();
+  for (const name of controls) query.set(name, byId(name).value);
+  state.plans.forEach((plan, i) => query.set("ab"[i], marksText(plan.marks)));
+  if (state.stop) query.set("stop", state.stop);
+  if (state.stops) query.set("stops", state.stops.map((s) => `${s.name}:${round(s.x, 3)},${round(s.y, 3)}`).join(";"));
+  history.replaceState(null, "", `/plan?${query}`);
+}
+
+// ---- the service
+
+function request(plan, more = {}) {
+  return {
+    site: byId("site").value,
+    marks: plan.marks.map((m) => ({ name: m.name, x_m: m.x, y_m: m.y, pole_height_m: m.pole })),
+    stops: state.stops?.map((s) => ({ name: s.name, x_m: s.x, y_m: s.y })) ?? null,
+    method: byId("method").value,
+    tolerance_m: byId("tolerance").valueAsNumber / 1000,
+    turn_s: byId("turn").valueAsNumber,
+    spin_rpm: byId("rpm").valueAsNumber,
+    model: byId("model").value,
+    ...more,
+  };
+}
+
+async function post(path, body, accept = "application/json") {
+  const response = await fetch(`${API}${path}`, {
+    method: "POST",
+    headers: { "Content-Type": "application/json", Accept: accept },
+    body: JSON.stringify(body),
+  });
+  if (!response.ok) throw new Error((await response.json()).detail);
+  return accept === "application/json" ? response.json() : response.text();
+}
+
+function say(problem) {
+  byId("plan-problem").textContent = problem;
+  byId("plan-problem").hidden = !problem;
+}
+
+function tell(news) {
+  byId("plan-news").textContent = news;
+  byId("plan-news").hidden = !news;
+}
+
+// One question at a time for each plan; what moved in the meantime is asked next.
+async function evaluate(plan, cells) {
+  plan.wanted = Math.max(plan.wanted ?? 0, cells);
+  if (plan.isAsking) return;
+  plan.isAsking = true;
+  plan.map.box.classList.add("busy");
+  while (plan.wanted) {
+    const wanted = plan.wanted;
+    plan.wanted = 0;
+    try {
+      const answer = await post("/evaluate", request(plan, { field_cells: wanted }));
+      Object.assign(plan, { evaluation: answer, field: answer.field });
+      say("");
+    } catch (error) {
+      Object.assign(plan, { evaluation: null, field: null });
+      say(error.message);
+    }
+    draw();
+  }
+  plan.isAsking = false;
+  plan.map.box.classList.remove("busy");
+}
+
+const evaluateAll = () => state.plans.forEach((plan) => evaluate(plan, CELLS.still));
+
+// ---- drawing
+
+function draw() {
+  const shown = byId("show").value;
+  const tolerance = byId("tolerance").valueAsNumber / 1000;
+  const fields = shown === "ground" ? [state.site.ground] : state.plans.map((plan) => plan.field);
+  const range = rangeOf(fields, shown, tolerance);
+  for (const plan of state.plans) {
+    plan.map.show({ ...plan, site: state.site, stops: state.stops, shown, range, tolerance, stop: state.stop });
+    plan.figure.classList.toggle("active", plan === state.plans[state.active]);
+    paintScale(plan.figure, shown, range, tolerance);
+    drawHead(plan, tolerance);
+  }
+  drawMarks();
+  drawStops();
+}
+
+const mm = (value) => (value === null || value === undefined ? "–" : (1000 * value).toFixed(value < 0.01 ? 2 : 1));
+const percent = (value) => (value === null || value === undefined ? "–" : (100 * value).toFixed(1));
+
+function drawHead(plan, tolerance) {
+  const letter = "AB"[state.plans.indexOf(plan)];
+  const n = plan.marks.length;
+  plan.figure.querySelector("h2").textContent =
+    `${state.plans.length > 1 ? `Arrangement ${letter}: ` : ""}${n} mark${n === 1 ? "" : "s"}`;
+  const { evaluation } = plan;
+  plan.figure.querySelector(".caption").textContent = evaluation
+    ? `${evaluation.site.name}, ${evaluation.method === "paper" ? "three circles" : "free station"}. ${evaluation.model.text}`
+    : "No prediction yet.";
+  const stops = evaluation?.stops ?? [];
+  const worst = stops.reduce((a, b) => (worse(a, b) ? a : b), stops[0]);
+  const n_kept = stops.filter((stop) => stop.probability_within_tolerance >= 0.95).length;
+  plan.figure.querySelector(".readouts").replaceChildren(
+    readout("Worst stop, 3-D sigma", mm(worst?.sigma_3d_m), "mm", worst?.name ?? ""),
+    readout(`Within ${round(1000 * tolerance, 3)} mm, least`, percent(worst?.probability_within_tolerance), "%", "probability at the worst stop"),
+    readout("Stops that keep it", `${n_kept} of ${stops.length}`, "", "with 95 % probability"),
+  );
+}
+
+// Whether one stop is worse than another: without a position is worst.
+const worse = (a, b) => (a.sigma_3d_m ?? Infinity) >= (b.sigma_3d_m ?? Infinity);
+
+function readout(label, value, unit, note) {
+  const box = document.createElement("div");
+  box.className = "readout";
+  const [dt, dd, small, about] = ["dt", "dd", "small", "dd"].map((name) => document.createElement(name));
+  dt.textContent = label;
+  dd.textContent = value;
+  small.textContent = unit;
+  about.className = "note";
+  about.textContent = note;
+  dd.append(small);
+  box.append(dt, dd, about);
+  return box;
+}
+
+function cell(text, kind = "number") {
+  const place = document.createElement("td");
+  place.className = kind;
+  place.textContent = text;
+  return place;
+}
+
+function drawMarks() {
+  const plan = state.plans[state.active];
+  const body = byId("marks-table").tBodies[0];
+  const rows = plan.marks.map((mark, place) => markRow(plan, mark, place));
+  const focus = document.activeElement?.dataset?.cell;
+  if (body.contains(document.activeElement) && body.rows.length === rows.length) {
+    plan.marks.forEach((mark, place) => refreshRow(body.rows[place], plan, mark)); // keep what is being typed
+    return;
+  }
+  body.replaceChildren(...rows);
+  if (focus) body.querySelector(`[data-cell="${CSS.escape(focus)}"]`)?.focus();
+  byId("marks-head").textContent = state.plans.length > 1 ? `Marks of arrangement ${"AB"[state.active]}` : "Marks";
+}
+
+const known = (plan, mark) => plan.evaluation?.marks.find((one) => one.name === mark.name);
+
+function derived(plan, mark) {
+  const answer = known(plan, mark);
+  const stops = plan.evaluation?.stops ?? [];
+  const n = stops.filter((stop) => stop.visible_marks.includes(mark.name)).length;
+  return [
+    answer ? answer.ground_m.toFixed(3) : "–",
+    answer ? answer.position_m[2].toFixed(3) : "–",
+    stops.length ? `${n} of ${stops.length}` : "–",
+  ];
+}
+
+function refreshRow(row, plan, mark) {
+  derived(plan, mark).forEach((text, i) => { row.cells[4 + i].textContent = text; });
+}
+
+function markRow(plan, mark, place) {
+  const row = document.createElement("tr");
+  const input = (key, digits) => {
+    const field = document.createElement("input");
+    Object.assign(field, { type: "number", step: "0.01", value: mark[key].toFixed(digits) });
+    field.dataset.cell = `${place} ${key}`;
+    field.setAttribute("aria-label", `${{ x: "x", y: "y", pole: "Pole height" }[key]} of ${mark.name} [m]`);
+    field.addEventListener("change", () => {
+      if (!Number.isFinite(field.valueAsNumber)) { field.value = mark[key].toFixed(digits); return; }
+      remember();
+      mark[key] = field.valueAsNumber;
+      changed(plan, CELLS.still);
+    });
+    const box = cell("");
+    box.append(field);
+    return box;
+  };
+  const remove = document.createElement("button");
+  Object.assign(remove, { type: "button", className: "remove", textContent: "Remove" });
+  remove.setAttribute("aria-label", `Remove ${mark.name}`);
+  remove.addEventListener("click", () => drop(plan, place));
+  const last = cell("", "screen-only");
+  last.append(remove);
+  row.append(cell(mark.name, "mono"), input("x", 3), input("y", 3), input("pole", 2), ...derived(plan, mark).map((text) => cell(text)), last);
+  return row;
+}
+
+function drawStops() {
+  const table = byId("stops-table");
+  const heads = ["Stop"];
+  state.plans.forEach((_, i) => {
+    const letter = state.plans.length > 1 ? `${"AB"[i]}: ` : "";
+    heads.push(`${letter}sigma [mm]`, `${letter}within [%]`, `${letter}marks`, `${letter}angles [deg]`, `${letter}DOP`);
+  });
+  heads.push("Why not, or weak");
+  const head = document.createElement("tr");
+  head.append(...heads.map((text, i) => {
+    const place = document.createElement("th");
+    const [name, unit] = text.split(" [");
+    place.textContent = name;
+    if (unit) {
+      const small = document.createElement("small");
+      small.textContent = ` [${unit}`;
+      place.append(small);
+    }
+    if (i > 0 && i < heads.length - 1) place.className = "number";
+    return place;
+  }));
+  table.tHead.replaceChildren(head);
+  const names = state.plans.flatMap((plan) => plan.evaluation?.stops.map((stop) => stop.name) ?? []);
+  table.tBodies[0].replaceChildren(...[...new Set(names)].map(stopRow));
+  byId("stops-about").textContent =
+    "Predicted for each stop. Choose one to see on the map which marks are in its sight: broken lines are hidden or too far.";
+}
+
+function stopRow(name) {
+  const row = document.createElement("tr");
+  row.setAttribute("aria-selected", String(name === state.stop));
+  const button = document.createElement("button");
+  Object.assign(button, { type: "button", className: "plain", textContent: name });
+  const first = cell("", "mono");
+  first.append(button);
+  row.append(first);
+  const reasons = [];
+  for (const plan of state.plans) {
+    const stop = plan.evaluation?.stops.find((one) => one.name === name);
+    const p = stop?.probability_within_tolerance;
+    const within = cell(percent(p));
+    if (p !== undefined && p < 0.95) within.innerHTML = `<span class="over">${percent(p)}</span>`;
+    const angle = (value) => (value === null || value === undefined ? "–" : value.toFixed(0));
+    const angles = stop ? `${angle(stop.included_angle_min_deg)} to ${angle(stop.included_angle_max_deg)}` : "–";
+    const dop = stop?.dop === null || stop?.dop === undefined ? "–" : stop.dop.toFixed(2);
+    row.append(cell(mm(stop?.sigma_3d_m)), within, cell(stop ? String(stop.n_used) : "–"), cell(angles), cell(dop));
+    if (stop?.reason) reasons.push(stop.reason);
+  }
+  row.append(cell([...new Set(reasons)].join(" "), "reason"));
+  row.addEventListener("click", () => choose(name));
+  return row;
+}
+
+// ---- changes
+
+function remember() {
+  const marks = state.plans.map((plan) => plan.marks);
+  state.past.push(JSON.stringify({ marks, stops: state.stops, active: state.active }));
+  if (state.past.length > KEPT) state.past.shift();
+  byId("undo").disabled = false;
+}
+
+function changed(plan, cells) {
+  tell("");
+  writeAddress();
+  draw();
+  evaluate(plan, cells);
+}
+
+function choose(name) {
+  state.stop = state.stop === name ? "" : name;
+  writeAddress();
+  draw();
+}
+
+function drop(plan, place) {
+  remember();
+  plan.marks.splice(place, 1);
+  changed(plan, CELLS.still);
+}
+
+function freeName(taken, letter) {
+  for (let i = 1; ; i += 1) {
+    const name = `${letter}${String(i).padStart(2, "0")}`;
+    if (!taken.some((one) => one.name === name)) return name;
+  }
+}
+
+// The stops become the user's own when the first of them is moved, added or removed.
+function ownStops() {
+  state.stops ??= state.site.stops.map((stop) => ({ name: stop.name, x: stop.position_m[0], y: stop.position_m[1] }));
+  return state.stops;
+}
+
+function stopsChanged(cells) {
+  tell("");
+  writeAddress();
+  draw();
+  state.plans.forEach((plan) => evaluate(plan, cells));
+}
+
+function usualPole(marks) {
+  const [low, high] = state.site.pole_heights_m;
+  return marks.length ? marks.at(-1).pole : (low + high) / 2;
+}
+
+function open(marks) {
+  const figure = byId("plan-template").content.firstElementChild.cloneNode(true);
+  byId("plans").append(figure);
+  const plan = { marks, evaluation: null, field: null, figure };
+  const activate = () => {
+    const place = state.plans.indexOf(plan);
+    if (place !== state.active) { state.active = place; draw(); }
+  };
+  plan.map = new PlanMap(figure.querySelector(".map"), {
+    onMove(place, x, y, isFirst) {
+      if (isFirst) { activate(); remember(); }
+      Object.assign(plan.marks[place], { x, y });
+      changed(plan, CELLS.moving);
+    },
+    onEnd: () => evaluate(plan, CELLS.still),
+    onRemove: (place) => drop(plan, place),
+    onMoveStop(name, x, y, isFirst) {
+      if (isFirst) { activate(); remember(); }
+      Object.assign(ownStops().find((stop) => stop.name === name), { x, y });
+      stopsChanged(CELLS.moving);
+    },
+    onEndStop: () => evaluateAll(),
+    onRemoveStop(name) {
+      remember();
+      state.stops = ownStops().filter((stop) => stop.name !== name);
+      if (state.stop === name) state.stop = "";
+      stopsChanged(CELLS.still);
+    },
+    onAdd(x, y) {
+      activate();
+      remember();
+      if (state.adding === "stop") {
+        ownStops().push({ name: freeName(ownStops(), "S"), x, y });
+        setAdding("");
+        stopsChanged(CELLS.still);
+        return;
+      }
+      plan.marks.push({ name: freeName(plan.marks, "P"), x, y, pole: usualPole(plan.marks) });
+      setAdding("");
+      changed(plan, CELLS.still);
+    },
+    onStop: (name) => { activate(); choose(name); },
+  });
+  figure.addEventListener("pointerdown", activate);
+  state.plans.push(plan);
+  return plan;
+}
+
+function close() {
+  const plan = state.plans.pop();
+  plan.figure.remove();
+  state.active = 0;
+}
+
+function setMarks(all, active) {
+  while (state.plans.length > all.length) close();
+  while (state.plans.length < all.length) open([]);
+  all.forEach((marks, i) => { state.plans[i].marks = marks; });
+  state.active = Math.min(active, all.length - 1);
+  byId("compare").setAttribute("aria-pressed", String(all.length > 1));
+  writeAddress();
+  draw();
+  evaluateAll();
+}
+
+function setAdding(what) {
+  state.adding = what;
+  byId("add").setAttribute("aria-pressed", String(what === "mark"));
+  byId("add-stop").setAttribute("aria-pressed", String(what === "stop"));
+  state.plans.forEach((plan) => { plan.map.adding = Boolean(what); });
+  tell(what ? `Click on the map where the ${what} shall stand.` : "");
+}
+
+const own = (mark) => ({ name: mark.name, x: mark.position_m[0], y: mark.position_m[1], pole: mark.pole_height_m });
+
+async function during(button, work) {
+  const label = button.textContent;
+  Object.assign(button, { disabled: true, textContent: "Working" });
+  say("");
+  try {
+    await work(state.plans[state.active]);
+  } catch (error) {
+    say(error.message);
+  } finally {
+    Object.assign(button, { disabled: false, textContent: label });
+  }
+}
+
+// ---- what people can do
+
+byId("add").addEventListener("click", () => setAdding(state.adding === "mark" ? "" : "mark"));
+byId("add-stop").addEventListener("click", () => setAdding(state.adding === "stop" ? "" : "stop"));
+byId("undo").addEventListener("click", () => {
+  const past = JSON.parse(state.past.pop());
+  byId("undo").disabled = !state.past.length;
+  state.stops = past.stops;
+  setMarks(past.marks, past.active);
+});
+byId("compare").addEventListener("click", () => {
+  remember();
+  const marks = state.plans.map((plan) => plan.marks);
+  setMarks(marks.length > 1 ? [marks[state.active]] : [marks[0], structuredClone(marks[0])], marks.length > 1 ? 0 : 1);
+});
+byId("optimise").addEventListener("click", (event) => during(event.currentTarget, async (plan) => {
+  const answer = await post("/optimise", request(plan, { n_marks: byId("count").valueAsNumber }));
+  remember();
+  plan.marks = answer.marks.map(own);
+  changed(plan, CELLS.still);
+  tell(answer.text);
+}));
+byId("suggest").addEventListener("click", (event) => during(event.currentTarget, async (plan) => {
+  const answer = await post("/suggest", request(plan));
+  remember();
+  plan.marks.push({ ...own(answer.mark), name: freeName(plan.marks, "P") });
+  changed(plan, CELLS.still);
+  tell(answer.text);
+}));
+byId("save").addEventListener("click", (event) => during(event.currentTarget, async (plan) => {
+  const name = window.prompt("Name of the plan", `${plan.marks.length} marks`);
+  if (!name) return;
+  const survey = byId("model").value.startsWith("survey:") ? byId("model").value.slice(7) : null;
+  const kept = await post("", { ...request(plan), name, survey });
+  tell("");
+  const link = document.createElement("a");
+  Object.assign(link, { href: `/plan/${kept.placement_id}`, textContent: name });
+  byId("plan-news").replaceChildren("Kept as ", link, `: ${kept.stops.length} rows of placements.`);
+  byId("plan-news").hidden = false;
+}));
+for (const button of document.querySelectorAll("[data-file]")) {
+  const [type, ending] = { csv: ["text/csv", "csv"], geojson: ["application/geo+json", "geojson"] }[button.dataset.file];
+  button.addEventListener("click", () => during(button, async (plan) => {
+    const text = await post("/evaluate", request(plan), type);
+    const link = document.createElement("a");
+    Object.assign(link, { href: URL.createObjectURL(new Blob([text], { type })), download: `plan.${ending}` });
+    link.click();
+    URL.revokeObjectURL(link.href);
+  }));
+}
+byId("print").addEventListener("click", () => window.print());
+byId("terrain-choose").addEventListener("click", () => byId("terrain-file").click());
+byId("terrain-file").addEventListener("change", (event) => during(byId("terrain-choose"), async () => {
+  const [file] = event.target.files;
+  if (!file) return;
+  const response = await fetch(`/api/v1/terrains?${new URLSearchParams({ name: file.name })}`, { method: "POST", body: file });
+  const answer = await response.json();
+  if (!response.ok) throw new Error(answer.detail);
+  const field = byId("site");
+  if (![...field.options].some((option) => option.value === answer.key)) field.add(new Option(answer.name, answer.key));
+  field.value = answer.key;
+  await changeSite();
+}));
+for (const name of controls) {
+  byId(name).addEventListener("change", () => {
+    if (!byId(name).reportValidity()) return;
+    if (name === "site") { changeSite().catch((error) => say(error.message)); return; }
+    writeAddress();
+    draw();
+    if (name !== "show") evaluateAll();
+  });
+}
+byId("plan-controls").addEventListener("submit", (event) => event.preventDefault());
+
+async function openSite(all) {
+  const response = await fetch(`${API}/sites/${encodeURIComponent(byId("site").value)}`);
+  const answer = await response.json();
+  if (!response.ok) throw new Error(answer.detail);
+  state.site = answer;
+  state.past = [];
+  byId("undo").disabled = true;
+  setMarks(all.length ? all : [answer.marks.map(own)], 0);
+}
+
+function changeSite() {
+  Object.assign(state, { stops: null, stop: "" });
+  return openSite([]);
+}
+
+openSite(readAddress()).catch((error) => say(error.message));
