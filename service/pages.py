@@ -60,7 +60,9 @@ WHERE ($job IS NULL OR j.job_id = $job)
 ORDER BY j.created_at DESC, j.job_id LIMIT $n
 """
 _N_ACTIVE = "SELECT count(*) AS n FROM jobs WHERE status IN ('accepted', 'running')"
-_SURVEY = "SELECT survey_id, name, tolerance_m FROM surveys WHERE name = $key OR survey_id = $key"
+_SURVEY = """
+SELECT survey_id, name, tolerance_m, rig_digest FROM surveys WHERE name = $key OR survey_id = $key
+"""
 _MARKS = "SELECT mark, x_m, y_m, z_m FROM control_marks WHERE survey_id = $id ORDER BY mark"
 _TRUE_STOPS = "SELECT stop, x_m, y_m, z_m FROM true_stops WHERE survey_id = $id ORDER BY stop"
 _FITS = """
@@ -135,6 +137,31 @@ SELECT x.stop, x.n_returns,
 FROM stops AS x JOIN runs AS r USING (run_id) WHERE r.job_id = $id ORDER BY x.stop
 """
 
+_JOB_MADE = """
+SELECT '/adjustments/' || adjustment_id AS address,
+    'Network of ' || n_stations || ' stations and ' || n_marks || ' marks' AS what
+FROM adjustments WHERE job_id = $id
+UNION ALL
+SELECT '/calibrations/' || calibration_id, 'Calibration of the gimbal'
+FROM calibrations WHERE job_id = $id
+"""
+_ADJUSTMENTS = """
+SELECT a.adjustment_id, a.datum, a.status, a.n_stations, a.n_marks, a.passes_global_test, a.sigma0,
+    a.finished_at,
+    (SELECT sqrt(avg(x.sigma_3d_m ^ 2)) FROM adjusted_stations AS x
+        WHERE x.adjustment_id = a.adjustment_id) AS station_sigma_rms_m,
+    (SELECT sqrt(avg(x.difference_3d_m ^ 2)) FROM control_checks AS x
+        WHERE x.adjustment_id = a.adjustment_id) AS control_rms_m
+FROM adjustments AS a WHERE a.survey_id = $id ORDER BY a.finished_at DESC LIMIT $n
+"""
+_CALIBRATIONS = """
+SELECT calibration_id, rig_digest, len(stops) AS n_stops, gap_rms_before_m, gap_rms_after_m,
+    finished_at
+FROM calibrations WHERE survey_id = $id ORDER BY finished_at DESC LIMIT $n
+"""
+_REPEATS = "SELECT * FROM repeated_stops WHERE survey_id = $id"
+_N_RESULTS = 20  # networks and calibrations in the page of their survey
+
 
 @router.get(assets.plotly_url())
 def plotly_script() -> FileResponse:
@@ -187,6 +214,7 @@ def survey(name: str, request: Request, service: Current) -> str:
         pages.SurveyPage(
             frame=frame_of(service, found["name"]),
             data=_survey_data(service, name, filters),
+            results=_survey_results(service, found),
             filters=filters,
             jobs=_jobs(service, survey=found["survey_id"], is_active=True),
             address=_address(request),
@@ -208,7 +236,10 @@ def job(job_id: str, service: Current) -> str:
         raise NotFoundError(f"There is no job {job_id!r}.")
     stops = service.catalogue.rows(_JOB_STOPS, {"id": job_id})
     frame = frame_of(service, found[0]["survey"])
-    return pages.job_page(pages.JobPage(frame=frame, job=found[0], stops=tuple(stops)))
+    made = service.catalogue.rows(_JOB_MADE, {"id": job_id})
+    return pages.job_page(
+        pages.JobPage(frame=frame, job=found[0], stops=tuple(stops), made=tuple(made))
+    )
 
 
 @router.get("/recordings/{recording_id}")
@@ -294,6 +325,17 @@ def _survey_data(service: Service, key: str, filters: Filters) -> pages.SurveyDa
         fixes=columns(_FIXES),
         subsets=columns(_SUBSETS, **few),
         subset_methods=tuple(texts(columns(_SUBSET_METHODS), "resection_method")),
+    )
+
+
+def _survey_results(service: Service, survey: Mapping[str, Any]) -> pages.SurveyResults:
+    """Return what was made of a survey as a whole."""
+    rows, key = service.catalogue.rows, {"id": survey["survey_id"]}
+    return pages.SurveyResults(
+        adjustments=tuple(rows(_ADJUSTMENTS, {**key, "n": _N_RESULTS})),
+        calibrations=tuple(rows(_CALIBRATIONS, {**key, "n": _N_RESULTS})),
+        repeats=tuple(rows(_REPEATS, key)),
+        rig_digest=survey["rig_digest"],
     )
 
 

@@ -35,7 +35,7 @@ def site_map(marks: Columns, fixes: Columns, true_stops: Columns) -> go.Figure:
     figure.update_yaxes(title_text="y, site [m]", scaleanchor="x", scaleratio=1)
     if factor:
         what = "ellipses and errors" if len(true_stops["stop"]) else "ellipses"
-        _note(figure, f"{what} \N{MULTIPLICATION SIGN}{factor:g}")
+        add_note(figure, f"{what} \N{MULTIPLICATION SIGN}{factor:g}")
     return figure
 
 
@@ -54,11 +54,16 @@ def ellipse_factor(marks: Columns, fixes: Columns) -> float:
     return float(power * max(step for step in (1, 2, 5) if step * power <= wanted))
 
 
-def ellipse_outline(fixes: Columns, i: int, factor: float) -> NDArray[np.float64]:
-    """Return the outline of the 95 % ellipse of a station, enlarged; the bearing is from y to x."""
+def ellipse_outline(
+    fixes: Columns, i: int, factor: float, *, size: str = "_95"
+) -> NDArray[np.float64]:
+    """Return the outline of an ellipse, enlarged; the bearing is from y to x.
+
+    ``size`` is ``_95`` for the 95 % ellipse, nothing for the standard one.
+    """
     turn = np.linspace(0.0, 2.0 * np.pi, 61)
-    major = factor * floats(fixes, "ellipse_major_95_m")[i] * np.cos(turn)
-    minor = factor * floats(fixes, "ellipse_minor_95_m")[i] * np.sin(turn)
+    major = factor * floats(fixes, f"ellipse_major{size}_m")[i] * np.cos(turn)
+    minor = factor * floats(fixes, f"ellipse_minor{size}_m")[i] * np.sin(turn)
     bearing = np.radians(floats(fixes, "ellipse_bearing_deg")[i])
     x = floats(fixes, "x_m")[i] + major * np.sin(bearing) + minor * np.cos(bearing)
     y = floats(fixes, "y_m")[i] + major * np.cos(bearing) - minor * np.sin(bearing)
@@ -137,8 +142,7 @@ def _add_strokes(
     """Draw many lines as one trace."""
     if not strokes:
         return
-    gap = np.full((1, 2), np.nan)
-    joined = np.concatenate([part for stroke in strokes for part in (stroke, gap)])
+    joined = joined_strokes(strokes)
     figure.add_scatter(
         x=joined[:, 0],
         y=joined[:, 1],
@@ -150,7 +154,14 @@ def _add_strokes(
     )
 
 
-def _note(figure: go.Figure, text: str) -> None:
+def joined_strokes(strokes: Sequence[NDArray[np.float64]]) -> NDArray[np.float64]:
+    """Return many lines as one with gaps, (n, 2)."""
+    gap = np.full((1, 2), np.nan)
+    parts = [part for stroke in strokes for part in (stroke, gap)]
+    return np.concatenate(parts) if parts else gap
+
+
+def add_note(figure: go.Figure, text: str) -> None:
     """Write a remark into the lower right corner."""
     figure.add_annotation(
         text=text,

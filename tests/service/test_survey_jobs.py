@@ -240,3 +240,75 @@ def test_one_control_mark_gives_no_datum(site, run, field):
     job = run("adjust", survey="one mark", recordings=recordings)
     assert (job["status"], job["error_code"]) == ("failed", "solve.degenerate"), job
     assert "control mark" in job["error_reason"]
+
+
+def page(site, path):
+    answer = site.client.get(path, headers={"accept": "text/html"})
+    assert answer.status_code == 200, answer.text[-2000:]
+    return answer.text
+
+
+def test_the_page_of_a_network_has_what_surveyors_look_for(site, tied, rows):
+    (whole,) = rows("adjustments", tied)
+    text = page(site, f"/adjustments/{whole['adjustment_id']}")
+    for name in ("map", "residuals", "tests", "checks"):
+        assert f'id="figure-{name}"' in text
+    assert "a posteriori" in text
+    assert "Control left out in turn" in text
+    assert "report.txt" in text
+    assert "against truth" in text
+
+
+def test_the_page_of_a_free_network_leaves_out_no_control(site, free, rows):
+    (whole,) = rows("adjustments", free)
+    text = page(site, f"/adjustments/{whole['adjustment_id']}")
+    assert 'id="figure-checks"' not in text
+    assert "after it was laid on the truth" in text
+
+
+def test_where_truth_is_not_known_no_page_of_a_network_speaks_of_errors(site, run, rows):
+    kind = {"Content-Type": "text/csv"}
+    site.client.put("/api/v1/surveys/dark/control", content=site.control, headers=kind)
+    items = site.client.get("/api/v1/recordings").json()["items"]
+    job = run("adjust", survey="dark", recordings=[item["recording_id"] for item in items])
+    (whole,) = rows("adjustments", job)
+    assert {row["error_3d_m"] for row in rows("adjusted_stations", job)} == {None}
+    text = page(site, f"/adjustments/{whole['adjustment_id']}").split("<footer")[0]
+    assert "truth not known" in text
+    assert "RMS error" not in text
+    assert "Error <small>" not in text
+
+
+def test_the_page_of_a_calibration_lets_one_use_its_rig(site, calibrated, rows):
+    (whole,) = rows("calibrations", calibrated)
+    path = f"/calibrations/{whole['calibration_id']}"
+    text = page(site, path)
+    assert 'id="figure-gaps"' in text
+    assert "What these scans do not tell" in text
+    fields = {"rig": whole["rig_digest"], "back": path}
+    answer = site.client.post("/surveys/field/rig", data=fields, follow_redirects=False)
+    assert (answer.status_code, answer.headers["location"]) == (303, path)
+    assert "Use each log's own rig again" in page(site, path)
+    site.client.post("/surveys/field/rig", data={"rig": "", "back": "//elsewhere"})
+    assert site.client.get("/api/v1/surveys/field").json()["rig_digest"] is None
+
+
+@pytest.mark.usefixtures("tied", "calibrated")
+def test_the_survey_offers_work_on_the_whole_and_lists_what_came_of_it(site):
+    text = page(site, "/surveys/field")
+    assert "Adjust all stations" in text
+    assert "Calibrate the gimbal" in text
+    assert "Network, with control" in text
+    answer = site.client.post(
+        "/surveys/field/jobs", data={"kind": "adjust", "control": "no"}, follow_redirects=False
+    )
+    assert answer.status_code == 303
+    job = site.ended(answer.headers["location"].removeprefix("/jobs/"))
+    assert (job["kind"], job["options"]["control"]) == ("adjust", False)
+    assert "/adjustments/" in page(site, answer.headers["location"])
+
+
+def test_a_form_that_asks_for_nothing_known_is_refused(site):
+    answer = site.client.post("/surveys/field/jobs", data={"kind": "process"})
+    assert (answer.status_code, answer.json()["code"]) == (400, "input")
+    assert site.client.post("/surveys/field/jobs", json={"kind": "adjust"}).status_code == 400
