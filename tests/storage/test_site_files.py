@@ -258,5 +258,5 @@ def test_sigmas_follow_their_axes(text):
     "wrong", [{"axes": "esu"}, {"unit": "yard"}, {"target_height": float("nan")}]
 )
 def test_a_layout_that_is_none_is_refused(wrong):
-    with pytest.raises(ControlError, match="control table|target height"):
+    with pytest.raises(ControlError, match=r"control table|target height"):
         ControlLayout(**wrong)
