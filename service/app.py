@@ -53,7 +53,6 @@ def create_app(settings: Settings) -> FastAPI:
     app.include_router(api.router, prefix=ROOT)
     app.include_router(about)
     app.include_router(pages.router)
-    app.include_router(result_pages.router)
     app.include_router(plan_pages.router)
     app.include_router(result_pages.router)
     app.mount("/static", StaticFiles(directory=STATIC), name="static")
