@@ -19,6 +19,7 @@ import typer
 from rich.console import Console
 
 from pipelines.errors import ConfigError, SpheremarkError
+from service.cli_plan import plan
 
 if TYPE_CHECKING:
     from pipelines.survey import Progress
@@ -30,6 +31,7 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
     add_completion=False,
 )
+app.add_typer(plan, name="plan")
 _WIDE = 160  # columns of a table that goes into a file or a pipe
 out = Console(width=None if sys.stdout.isatty() else _WIDE)
 err = Console(stderr=True)

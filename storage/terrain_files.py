@@ -161,7 +161,7 @@ def _extent(path: Path) -> tuple[Array, Array]:
 
 
 def _pieces(path: Path) -> Iterator[Array]:
-    """Return the points of a cloud piece by piece, (n, 3) [m]; those that are not finite left out."""
+    """Return the points of a cloud piece by piece, (n, 3), if finite [m]."""
     suffix = path.suffix.lower()
     if suffix in (".laz", ".las"):
         with laspy.open(path) as file:

@@ -3,14 +3,26 @@
 - ``values`` says what a site, an arrangement and an evaluation are; ``sites`` makes sites,
 - ``sensor`` knows what a scan puts on a sphere, ``centres`` how well its centre will be known,
 - ``sight`` what hides it, ``positions`` and ``probability`` what centres make of a position,
-- ``evaluation`` puts these together for stops and for a grid over the field.
+- ``evaluation`` puts these together for stops and for a grid over the field,
+- ``candidates`` says where marks may stand, ``optimising`` which of these places are best,
+- ``learning`` fits the model of centres to one's own surveys.
 
 Why so: an arrangement is judged in milliseconds, without simulating a scan, so that hundreds of
 thousands can be compared; simulation is what the promises are tested against.
 """
 
+from pipelines.placement.candidates import Candidates, PlaceRules, find_candidates
 from pipelines.placement.centres import CentreModel, Provenance, sensor_model
-from pipelines.placement.evaluation import evaluate, field_eyes, field_map
+from pipelines.placement.evaluation import check_sizes, evaluate, field_eyes, field_map
+from pipelines.placement.learning import FitRows, fitted_model
+from pipelines.placement.optimising import (
+    Goal,
+    Optimum,
+    Proposal,
+    draw_arrangement,
+    optimise,
+    propose_mark,
+)
 from pipelines.placement.sensor import Sensor
 from pipelines.placement.sight import look
 from pipelines.placement.sites import marks_of_field, site_of_field, site_of_grid, stops_of_field
@@ -28,20 +40,32 @@ from pipelines.placement.values import (
 __all__ = [
     "PLAN_METHODS",
     "Arrangement",
+    "Candidates",
     "CentreModel",
     "Evaluation",
     "FieldMap",
+    "FitRows",
+    "Goal",
+    "Optimum",
+    "PlaceRules",
+    "Proposal",
     "Provenance",
     "Requirement",
     "Sensor",
     "Sights",
     "Site",
     "Stops",
+    "check_sizes",
+    "draw_arrangement",
     "evaluate",
     "field_eyes",
     "field_map",
+    "find_candidates",
+    "fitted_model",
     "look",
     "marks_of_field",
+    "optimise",
+    "propose_mark",
     "sensor_model",
     "site_of_field",
     "site_of_grid",

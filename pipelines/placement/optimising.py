@@ -37,8 +37,10 @@ _LOST = 1e3  # [m] counts for a stop without a position: worse than any that has
 _LOOSE_PRIOR = np.array([3.0, 3.0, 3.0, 10.0, 10.0, 10.0])  # [rad, m] before any mark is seen
 _SURE = 1.96  # sigmas within which an error of any shape lies with 95 %: 3-D sigma on one axis
 _ROUNDS = 30  # of exchanges; four to eight settle
-_STARTS = 3  # greedy, and others that chance has shaken
-_SHAKEN = 0.34  # share of marks that such a start has elsewhere
+_STARTS = 8  # the greedy one among them
+_POWER = 12.0  # of the mean over stops that is as good as their largest, and smoother
+_SHAKEN = 0.4  # share of marks that such a start has elsewhere
+_TRIED = 12  # candidates that are judged in full for each mark, the most promising first
 _SCREENED = 160  # places that whole judgements try for each mark
 
 
@@ -154,6 +156,7 @@ class _Task(NamedTuple):
     shared2: float
     near: np.ndarray
     wish: Requirement
+    power: float = np.inf
 
 
 def optimise(
@@ -345,14 +348,22 @@ def _sums(task: _Task, chosen: Index) -> tuple[Array, Array, Array]:
 
 
 def _best(task: _Task, k: int, goal: Goal, rng: np.random.Generator) -> tuple[Index, int]:
-    """Return the best places of k marks that several starts led to, and exchanges made."""
-    starts = [_greedy(task, k)]
-    found = []
+    """Return the best places of k marks that several starts led to, and exchanges made.
+
+    The first start is greedy, the second goes on from it with places at random, the others shake
+    what is best so far (iterated local search: Lourenco, Martin, Stuetzle, 2003). Each goes down
+    on a high power mean over the stops, which has fewer dead ends than their largest, then on that.
+    """
+    smooth = task._replace(power=_POWER)
+    best, score, n_exchanges = _greedy(task, k), (np.inf, np.inf, np.inf), 0
     for i in range(_STARTS):
-        start = starts[0] if i == 0 else _shaken(task, starts[0], rng)
-        found.append(_exchanged(task, start, goal, rng))
-    scores = [_wanted(task, chosen, goal) for chosen, _ in found]
-    return found[min(range(len(found)), key=scores.__getitem__)]
+        start = best if i == 0 else _shaken(task, best, 1.0 if i == 1 else _SHAKEN, rng)
+        found, n = _exchanged(smooth, start, goal, rng)
+        found, m = _exchanged(task, found, goal, rng)
+        n_exchanges += n + m
+        if (other := _wanted(task, found, goal)) < score:
+            best, score = found, other
+    return best, n_exchanges
 
 
 def _greedy(task: _Task, k: int) -> Index:
@@ -387,10 +398,10 @@ def _bound(task: _Task, chosen: Index) -> tuple[float, float]:
     )
 
 
-def _shaken(task: _Task, chosen: Index, rng: np.random.Generator) -> Index:
-    """Return an arrangement of which some marks stand elsewhere."""
+def _shaken(task: _Task, chosen: Index, share: float, rng: np.random.Generator) -> Index:
+    """Return an arrangement of which a share of the marks stands elsewhere."""
     out = chosen.copy()
-    for i in rng.choice(len(out), max(1, round(_SHAKEN * len(out))), replace=False):
+    for i in rng.choice(len(out), max(1, round(share * len(out))), replace=False):
         others = np.delete(out, i)
         free = np.flatnonzero(~task.near[others].any(axis=0))
         out[i] = rng.choice(free) if len(free) else out[i]
@@ -440,11 +451,19 @@ def _promising(
         worsts = np.empty((len(places), 2))
         limit = np.inf if goal.is_robust and _is_broken(task, chosen, goal) else score[0]
         stops = np.argsort(-_sigmas(task, chosen))
-        _judge(_sums(task, others), tuple(task.added), task.shared2, places, stops, limit, worsts)
+        _judge(
+            _sums(task, others),
+            tuple(task.added),
+            task.shared2,
+            places,
+            stops,
+            (limit, task.power),
+            worsts,
+        )
     order = np.lexsort((worsts[:, 1], worsts[:, 0]))
     if not (goal.is_robust and _is_broken(task, chosen, goal)):
         order = order[[tuple(worsts[o]) < tuple(score) for o in order]]
-    return places[order[:40]]
+    return places[order[:_TRIED]]
 
 
 def _is_broken(task: _Task, chosen: Index, goal: Goal) -> bool:
@@ -481,9 +500,12 @@ def _sigmas(task: _Task, chosen: Index) -> Array:
 
 
 def _score(task: _Task, chosen: Index) -> tuple[float, float]:
-    """Return the largest sigma over all stops and their mean [m]."""
+    """Return the largest sigma over all stops, or their power mean, and their mean [m]."""
     sigmas = _sigmas(task, chosen)
-    return float(sigmas.max()), float(sigmas.mean())
+    worst = float(sigmas.max())
+    if np.isfinite(task.power):
+        worst *= float(np.mean((sigmas / worst) ** task.power)) ** (1.0 / task.power)
+    return worst, float(sigmas.mean())
 
 
 def _after_loss(task: _Task, chosen: Index) -> float:
@@ -617,22 +639,32 @@ def _judge(  # noqa: PLR0913  a kernel takes what it needs
     shared2: float,
     places: Index,
     stops: Index,
-    limit: float,
+    rule: tuple[float, float],
     out: Array,
 ) -> None:
-    """Fill in the largest sigma and the mean with each candidate added; stop beyond a limit."""
+    """Fill in the largest sigma, or power mean, and the mean with each candidate added.
+
+    Beyond a limit it is not looked any further.
+    """
+    limit, power = rule
+    is_smooth = np.isfinite(power)
+    beyond = len(stops) * limit**power if is_smooth and np.isfinite(limit) else np.inf
     N, M, pull, Q = np.empty((6, 6)), np.empty((6, 6)), np.empty(6), np.empty((6, 6))
     for i in range(len(places)):
         c = places[i]
-        worst, total = 0.0, 0.0
+        worst, total, powers = 0.0, 0.0, 0.0
         for e in stops:
             N[:] = sums[0][e] + added[0][e, c]
             M[:] = sums[1][e] + added[1][e, c]
             pull[:] = sums[2][e] + added[2][e, c]
             sigma = _sigma_of(N, M, pull, shared2, Q)
-            worst = max(worst, sigma)
             total += sigma
-            if worst > limit:
-                total = np.inf
+            if is_smooth:
+                powers += sigma**power
+            else:
+                worst = max(worst, sigma)
+            if worst > limit or powers > beyond:
+                worst, powers, total = max(worst, 2.0 * limit), 2.0 * beyond, np.inf
                 break
-        out[i, 0], out[i, 1] = worst, total / len(stops)
+        out[i, 0] = (powers / len(stops)) ** (1.0 / power) if is_smooth else worst
+        out[i, 1] = total / len(stops)

@@ -113,6 +113,22 @@ def predict_positions(sighting: Sighting, wish: Requirement) -> Positions:
     return Positions(cov_motion=out, cofactor=cofactor, used=used)
 
 
+def claimed_bias_variance(sigma_laser_bias: float) -> float:
+    """Return the variance that a survey leaves to each centre's distance for the lasers' biases.
+
+    Parameters
+    ----------
+    sigma_laser_bias : float
+        Spread of what each laser measures too long [m].
+
+    Returns
+    -------
+    float
+        The variance [m^2].
+    """
+    return (_BIAS_LEFT * sigma_laser_bias) ** 2
+
+
 def shared_variance(sigma_laser_bias: float) -> float:
     """Return the variance of what all ranges of a survey are too long: the lasers' mean.
 
@@ -281,8 +297,8 @@ def _places(sighting: Sighting) -> tuple[Array, Array]:
 
 def _extra(sighting: Sighting, wish: Requirement) -> tuple[float, float, float]:
     """Return the variances of what lasers and gimbal leave, as a survey takes it and as it is."""
-    bias = sighting.sigma_laser_bias
-    return (_BIAS_LEFT * bias) ** 2, wish.resection.sigma_common**2, _SIGMA_AIM**2
+    bias2 = claimed_bias_variance(sighting.sigma_laser_bias)
+    return bias2, wish.resection.sigma_common**2, _SIGMA_AIM**2
 
 
 @numba.njit(cache=True, nogil=True)
@@ -429,7 +445,7 @@ def reliability(sighting: Sighting, found: Positions, wish: Requirement) -> Reli
     known = sighting.cov_centres + (wish.sigma_marks**2 + wish.resection.sigma_common**2) * np.eye(
         3
     )
-    bias2 = (_BIAS_LEFT * sighting.sigma_laser_bias) ** 2
+    bias2 = claimed_bias_variance(sighting.sigma_laser_bias)
     known = known + bias2 * v[..., :, None] * v[..., None, :] / d2
     covs = np.where(found.used[..., None, None], known, np.eye(3))
     is_fixed = np.isfinite(found.cov_motion).all(axis=(1, 2))
