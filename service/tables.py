@@ -67,6 +67,23 @@ def print_answer(out: Console, answer: Plain) -> None:
             out.print(f"  {stop['reason']}")
         for station in stop["stations"]:
             _print_station(out, station)
+        _print_distances(out, stop["distances"])
+
+
+def _print_distances(out: Console, distances: Plain | None) -> None:
+    """Print how the distances between marks compare with the control."""
+    if distances is None or not distances["n"]:
+        return
+    n, n_off = distances["n"], distances["n_off"]
+    worst = max(distances["pairs"], key=lambda pair: abs(pair["residual_m"] / pair["sigma_m"]))
+    first, second = worst["marks"]
+    text = (
+        f"  Distances between marks against control: {n_off} of {n} are off; worst {first} - "
+        f"{second}: {1e3 * worst['residual_m']:+.1f} mm, sigma {1e3 * worst['sigma_m']:.1f} mm"
+    )
+    if distances["suspects"]:
+        text += f"; look at {', '.join(distances['suspects'])}"
+    out.print(text, highlight=False, markup=False, soft_wrap=True)
 
 
 def print_calibration(out: Console, answer: Plain) -> None:
@@ -175,6 +192,7 @@ def print_reproduction(out: Console, report: Plain) -> None:
             _mm(row["study_error_3d_m"]),
             _fixed(row["paper_n_points_mean"], 0),
             _mm(row["paper_error_3d_mean_m"]),
+            _difference(row["paper_minus_study_m"]),
             _fixed(row["along_beam_n_points_mean"], 0),
             _mm(row["along_beam_error_3d_mean_m"]),
         )
@@ -182,7 +200,15 @@ def print_reproduction(out: Console, report: Plain) -> None:
     ]
     out.print("[bold]Table 2[/]  centres by distance; mean errors over the simulated worlds")
     heads = ("distance [m]", "study: returns", "error [mm]", "paper: returns", "error [mm]")
-    out.print(_table((*heads, "along_beam: returns", "error [mm]"), rows))
+    out.print(_table((*heads, "- study", "along_beam: returns", "error [mm]"), rows))
+    out.print(
+        f"Mean of the paper's method minus the study's {_mm(study['table2_error_3d_mean_m'])} mm: "
+        f"{_difference(report['table2_paper_minus_study_m'])} mm, with the noise and the cut that "
+        "the page names\n",
+        highlight=False,
+        soft_wrap=True,
+    )
+    _print_angles(out, report)
     by_stop = [
         (row["stop"], _mm(row["paper_error_3d_mean_m"]), _mm(row["along_beam_error_3d_mean_m"]))
         for row in report["table4"]
@@ -204,6 +230,31 @@ def print_reproduction(out: Console, report: Plain) -> None:
     said = ("where", "method", "p95: distance", "p95: returns", "mean: distance", "mean: returns")
     out.print(_table(said, kept, left=2))
     out.print(f"{report['n_scans']} scans, seed {report['seed']}. Page: {report['page']}")
+
+
+def _print_angles(out: Console, report: Plain) -> None:
+    """Print the study's Table 3 again, and what the free station gives there."""
+    rows = [
+        (
+            f"{row['included_angle_deg']:.2f}",
+            _mm(row["study_error_m"]),
+            _mm(row["three_circles_error_m"]),
+            _difference(row["three_circles_minus_study_m"]),
+            _mm(row["two_centres_error_m"]),
+            _mm(row["three_centres_error_m"]),
+        )
+        for row in report["table3"]
+    ]
+    out.print(
+        "[bold]Table 3[/]  the station by included angle, 17 mm granted to each axis of each mark"
+    )
+    heads = ("angle [deg]", "study [mm]", "circles [mm]", "- study")
+    out.print(_table((*heads, "free station: two [mm]", "three [mm]"), rows))
+
+
+def _difference(value: float | None) -> str:
+    """Write a difference [m] in millimetres, with its sign."""
+    return "-" if value is None else f"{1e3 * value:+.1f}"
 
 
 def print_network(out: Console, answer: Plain) -> None:
@@ -230,12 +281,41 @@ def print_network(out: Console, answer: Plain) -> None:
         ]
         heads = ("x [m]", "y [m]", "z [m]", "sigma [mm]", "95 % ellipse [mm]", "centres")
         out.print(_table((kind[:-1], *heads), rows))
+    _print_checks(out, answer)
     for one in answer["refused"]:
         out.print(f"  {one['station']}: {escape(one['reason'])}", highlight=False, soft_wrap=True)
     for one in answer["excluded"]:
         what = " ".join(part for part in (one["station"], one["marker"], one["mark"]) if part)
         text = f"  {one['kind'].capitalize()} {what}: {escape(one['reason'])}"
         out.print(text, highlight=False, soft_wrap=True)
+
+
+def _print_checks(out: Console, answer: Plain) -> None:
+    """Print what is known of a network's accuracy without truth."""
+    for row in answer["marks"]:
+        if row["status"] != "ok":
+            out.print(f"  Mark {row['name']}: {escape(row['reason'])}", highlight=False)
+    rows = [
+        (
+            row["mark"],
+            *(f"{1e3 * value:+.1f}" for value in row["predicted_minus_given_m"]),
+            *(f"{1e3 * value:.1f}" for value in row["sigma_predicted_minus_given_m"]),
+        )
+        for row in answer["control"]
+        if row["predicted_minus_given_m"] is not None
+    ]
+    if rows:
+        heads = ("control left out", "dx [mm]", "dy", "dz", "sigma x [mm]", "y", "z")
+        out.print(_table(heads, rows))
+    for row in answer["repeated_stops"]:
+        out.print(
+            f"  {' and '.join(row['stations'])} stand {1e3 * row['apart_3d_m']:.1f} mm apart; "
+            f"their centres agree to {1e3 * row['difference_rms_m']:.1f} mm (RMS; predicted "
+            f"{1e3 * row['predicted_rms_m']:.1f})",
+            highlight=False,
+        )
+    if answer["calibration"]:
+        print_calibration(out, answer["calibration"])
 
 
 def to_csv(answer: Plain) -> str:

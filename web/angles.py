@@ -220,7 +220,8 @@ def station_by_angle(made: AngleExperiment) -> go.Figure:
 def limit_by_sigma(limits: Sequence[AngleLimit], tolerance_m: float) -> go.Figure:
     """Draw between which angles two marks keep the tolerance, by how good the centres are."""
     figure = blank_figure(f"Angles at which two marks keep {tolerance_m * _MM:g} mm")
-    sigmas = np.linspace(0.0005, tolerance_m, 200)
+    widest = tolerance_m / np.sqrt(2.0)  # beyond which circles keep it nowhere
+    sigmas = np.sort(np.append(np.linspace(0.0005, tolerance_m, 200), widest * (1.0 - 1e-9)))
     for method, (name, colour, dash) in _THEORIES.items():
         known = np.array([angles_that_keep(method, float(s), tolerance_m) for s in sigmas])
         for bounds, is_first in ((known[:, 0], True), (known[:, 1], False)):
@@ -255,7 +256,7 @@ def limit_by_sigma(limits: Sequence[AngleLimit], tolerance_m: float) -> go.Figur
 def circles_of_study(arcs: Arcs) -> go.Figure:
     """Draw the study's Figure 4 again: three circles through the station, and from near."""
     degrees = np.degrees(arcs.included_angle)
-    figure = make_subplots(cols=2, horizontal_spacing=0.12, column_titles=["Field", "From near"])
+    figure = make_subplots(cols=2, horizontal_spacing=0.2, column_titles=["Field", "From near"])
     figure.update_layout(
         template=theme.template(),
         title={"text": f"Position from three circles, included angle {degrees:.2f} deg"},
@@ -263,37 +264,44 @@ def circles_of_study(arcs: Arcs) -> go.Figure:
         legend={"y": 1.14},
     )
     figure.update_annotations(font={"size": 13, "color": theme.MUTED})
-    turn = np.linspace(0.0, 2.0 * np.pi, 181)
-    for i, (mark, radius) in enumerate(zip(arcs.shifted_site, arcs.radii, strict=True)):
-        far = mark[:, None] + radius * np.stack([np.cos(turn), np.sin(turn)])
-        middle = np.arctan2(-mark[1], -mark[0])
-        near = middle + np.linspace(-0.02, 0.02, 41)
-        arc = (mark[:, None] + radius * np.stack([np.cos(near), np.sin(near)])) * _MM
-        for column, (x, y) in ((1, far), (2, arc)):
-            figure.add_scatter(
-                x=x, y=y, mode="lines", name="circles about the shifted marks",
-                legendgroup="circles", showlegend=i == 0 and column == 1, hoverinfo="skip",
-                line={"color": theme.PAPER, "width": 1.5}, row=1, col=column,
-            )  # fmt: skip
-    shown = (
+    for i in range(len(arcs.radii)):
+        _add_circle(figure, arcs, i)
+    for name, p, colour, symbol, columns in (
         ("marks", arcs.marks_site, theme.MARK, "circle", (1,)),
         ("true station", np.zeros((1, 2)), theme.TEXT, "cross-thin", (1, 2)),
         ("where they meet best", arcs.p_site[None], theme.PAPER, "diamond", (1, 2)),
-    )
-    for name, p, colour, symbol, columns in shown:
+    ):
+        look = {"color": colour, "size": 9, "symbol": symbol, "line": {"color": colour, "width": 2}}
         for column in columns:
             x, y = p.T * (1.0 if column == 1 else _MM)
             figure.add_scatter(
                 x=x, y=y, mode="markers", name=name, legendgroup=name, showlegend=column == 1,
-                marker={"color": colour, "size": 9, "symbol": symbol,
-                        "line": {"color": colour, "width": 2}},
-                hovertemplate=f"{name}<extra></extra>", row=1, col=column,
+                marker=look, hovertemplate=f"{name}<extra></extra>", row=1, col=column,
             )  # fmt: skip
     reach = 1.6 * float(np.linalg.norm(arcs.p_site)) * _MM + 25.0
+    near = {"range": [-reach, reach], "constrain": "domain", "col": 2}
     figure.update_xaxes(title_text="x [m]", scaleanchor="y", constrain="domain", col=1)
     figure.update_yaxes(title_text="y [m]", constrain="domain", col=1)
-    figure.update_xaxes(
-        title_text="x [mm]", scaleanchor="y2", constrain="domain", range=[-reach, reach], col=2
-    )
-    figure.update_yaxes(title_text="y [mm]", constrain="domain", range=[-reach, reach], col=2)
+    figure.update_xaxes(title_text="x [mm]", scaleanchor="y2", **near)
+    figure.update_yaxes(title_text="y [mm]", **near)
     return figure
+
+
+def _add_circle(figure: go.Figure, arcs: Arcs, i: int) -> None:
+    """Draw one circle whole, and its arc by the station."""
+    mark, radius = arcs.shifted_site[i], arcs.radii[i]
+    whole = np.linspace(0.0, 2.0 * np.pi, 181)
+    by_station = np.arctan2(-mark[1], -mark[0]) + np.linspace(-0.02, 0.02, 41)
+    for column, turn, unit in ((1, whole, 1.0), (2, by_station, _MM)):
+        figure.add_scatter(
+            x=(mark[0] + radius * np.cos(turn)) * unit,
+            y=(mark[1] + radius * np.sin(turn)) * unit,
+            mode="lines",
+            name="circles about the shifted marks",
+            legendgroup="circles",
+            showlegend=i == 0 and column == 1,
+            hoverinfo="skip",
+            line={"color": theme.PAPER, "width": 1.5},
+            row=1,
+            col=column,
+        )

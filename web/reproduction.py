@@ -367,11 +367,40 @@ def reproduction_page(page: ReproductionPage) -> str:
 
 def panels(page: ReproductionPage) -> tuple[Panel, ...]:
     """Return all figures of a reproduction."""
-    models = {one.method: one.model for one in page.statements if one.place == LANE and one.model}
-    ladder = error_against_distance(page.distances, page.tolerance_m, is_log=True)
-    ladder.update_layout(title_text="Error of sphere centres to 30 m, noise 30 mm")
-    real = error_against_distance(page.real, page.tolerance_m, is_log=True)
-    real.update_layout(title_text="Error of sphere centres to 30 m, noise of a real VLP-16")
+    return (
+        *_centre_panels(page),
+        *_far_panels(page),
+        *_angle_panels(page),
+        Panel(
+            name="figure9",
+            figure=before_and_after_cut(page.example),
+            caption="Figure 9. One simulated marker as the LiDAR sees it. Dashed: the cut, which "
+            "leaves the hemisphere that the study shows; dotted, where it is near: the highest "
+            "ground point of this scan.",
+        ),
+        Panel(
+            name="figure3",
+            figure=models_of_icp(page.example, _ICP_LABELS),
+            caption="Figure 3. The same marker from aside, the LiDAR to the left: where ICP with a "
+            "hemisphere, ICP with a full sphere, and our fit put the sphere.",
+        ),
+        Panel(
+            name="figure11",
+            figure=error_along_lane(page.lane, page.tolerance_m),
+            caption="Figure 11. Mean over markers and worlds at each stop; whiskers end at the "
+            "largest.",
+        ),
+        Panel(
+            name="noise",
+            figure=noise_by_reflectivity(page.noises),
+            caption="From runs of twelve shots of one laser on one surface, freed of a parabola"
+            + ("; real: packets of a VLP-16." if len(page.noises) > 1 else "; the first scan."),
+        ),
+    )
+
+
+def _centre_panels(page: ReproductionPage) -> tuple[Panel, ...]:
+    """Return the two halves of Figure 8."""
     distance = error_against_distance(page.centre, page.tolerance_m)
     count = error_against_count(page.centre, page.tolerance_m)
     return (
@@ -387,6 +416,17 @@ def panels(page: ReproductionPage) -> tuple[Panel, ...]:
             caption="Figure 8, right. The same spheres by the returns that each method used: the "
             "study's cut leaves it fewer.",
         ),
+    )
+
+
+def _far_panels(page: ReproductionPage) -> tuple[Panel, ...]:
+    """Return the figures that tell distance and count apart."""
+    models = {one.method: one.model for one in page.statements if one.place == LANE and one.model}
+    ladder = error_against_distance(page.distances, page.tolerance_m, is_log=True)
+    ladder.update_layout(title_text="Error of sphere centres to 30 m, noise 30 mm")
+    real = error_against_distance(page.real, page.tolerance_m, is_log=True)
+    real.update_layout(title_text="Error of sphere centres to 30 m, noise of a real VLP-16")
+    return (
         Panel(
             name="turns",
             figure=model_against_count(page.distances, models, page.tolerance_m, _DISTANCES_SHOWN),
@@ -405,25 +445,12 @@ def panels(page: ReproductionPage) -> tuple[Panel, ...]:
             figure=real,
             caption="The same again with the noise by reflectivity of real packets, under 14 mm.",
         ),
-        Panel(
-            name="figure9",
-            figure=before_and_after_cut(page.example),
-            caption="Figure 9. One simulated marker as the LiDAR sees it. Dashed: the cut, which "
-            "leaves the hemisphere that the study shows; dotted, where it is near: the highest "
-            "ground point of this scan.",
-        ),
-        Panel(
-            name="figure3",
-            figure=models_of_icp(page.example, _ICP_LABELS),
-            caption="Figure 3. The same marker from aside, the LiDAR to the left: where ICP with a "
-            "hemisphere, ICP with a full sphere, and our fit put the sphere.",
-        ),
-        Panel(
-            name="figure4",
-            figure=circles_of_study(page.angles.arcs),
-            caption="Figure 4. Circles of the true distances about marks that are off by 17 mm per "
-            "axis; of all signs of the errors, those whose error is the median.",
-        ),
+    )
+
+
+def _angle_panels(page: ReproductionPage) -> tuple[Panel, ...]:
+    """Return the figures of the station by included angle."""
+    return (
         Panel(
             name="figure10",
             figure=station_by_angle(page.angles),
@@ -437,16 +464,10 @@ def panels(page: ReproductionPage) -> tuple[Panel, ...]:
             "have a lower limit that falls with their sigma, two circles an upper one too.",
         ),
         Panel(
-            name="figure11",
-            figure=error_along_lane(page.lane, page.tolerance_m),
-            caption="Figure 11. Mean over markers and worlds at each stop; whiskers end at the "
-            "largest.",
-        ),
-        Panel(
-            name="noise",
-            figure=noise_by_reflectivity(page.noises),
-            caption="From runs of twelve shots of one laser on one surface, freed of a parabola"
-            + ("; real: packets of a VLP-16." if len(page.noises) > 1 else "; the first scan."),
+            name="figure4",
+            figure=circles_of_study(page.angles.arcs),
+            caption="Figure 4. Circles of the true distances about marks that are off by 17 mm per "
+            "axis; of all signs of the errors, those whose error is the median.",
         ),
     )
 
