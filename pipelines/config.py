@@ -178,10 +178,17 @@ class ResectionConfig:
     sigma_common : float
         Standard deviation per axis that every centre has beyond its own covariance: what axis
         offset and eccentricity of the encoder leave after both faces of a sphere are averaged [m].
-        0.3 mm: of 0.5 mm and 0.01 deg at 7.5 m.
+        0.2 mm: of 0.5 mm and 0.01 deg at 7.5 m, by simulation.
     sigma_range : float
         Standard deviation of what all ranges of a survey are too long, an unknown of a network
         [m]; 0 leaves it out. 1 mm: the mean of 16 lasers of 3 mm each, and the model of a beam.
+    sigma_range_shared : float
+        How much of it is in the covariance of every centre already, as if it were its own [m].
+        0.9 mm: the mean of the 16 lasers, of 3 mm each, that a sphere is seen by, by simulation. At
+        most about half of a centre's variance along its line of sight is taken to be shared.
+    sigma_height : float
+        Standard deviation of what all centres of a survey are too high, as the foot of their poles
+        and the tilt of the spin axis leave [m]; 0 leaves it out. 0.12 mm, by simulation.
     """
 
     methods: tuple[str, ...] = ("free_station",)
@@ -189,8 +196,10 @@ class ResectionConfig:
     match_tolerance: float = 0.15
     test_level: float = 0.001
     test_power: float = 0.80
-    sigma_common: float = 0.0003
+    sigma_common: float = 0.0002
     sigma_range: float = 0.001
+    sigma_range_shared: float = 0.0009
+    sigma_height: float = 0.00012
 
     def __post_init__(self) -> None:
         _check_methods("resection.methods", self.methods, RESECTION_METHODS)
@@ -200,6 +209,8 @@ class ResectionConfig:
         _check("resection.test_power", self.test_power, 0.5, 0.999)
         _check("resection.sigma_common", self.sigma_common, 0.0, 0.1)
         _check("resection.sigma_range", self.sigma_range, 0.0, 0.1)
+        _check("resection.sigma_range_shared", self.sigma_range_shared, 0.0, 0.1)
+        _check("resection.sigma_height", self.sigma_height, 0.0, 0.1)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

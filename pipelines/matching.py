@@ -32,6 +32,7 @@ _N_ROUNDS = 8  # of adjusting and matching again; two or three are the rule
 _RIVAL = 14.0  # -2 ln(0.001): how much better, in the weighted sum of squares, the best must be
 _PAIR = 25.0  # weighted sum of squares (2 dof) above which two markers are not those two marks
 _CHANCE = 0.01  # expected number of chance agreements above which a match is none
+_SHARED = 0.55  # of the variance along a line of sight, at most, that all centres share
 _SHARE = 0.4  # of markers or marks, the fewer: of mirrored fields five in fourteen may still fit
 
 
@@ -63,6 +64,12 @@ class Scene:
         Whether they were measured.
     sigma_heading : float
         Standard deviation of the heading that mounting and encoder leave unknown [rad].
+    sigma_range : float
+        Standard deviation of what all ranges are too long together [m].
+    shared : (n,)
+        How much of each centre's variance along its line of sight is that [m^2].
+    sigma_height : float
+        Standard deviation of what all centres are too high together [m].
     """
 
     names: tuple[str, ...]
@@ -76,6 +83,9 @@ class Scene:
     sigma_level: float
     is_levelled: bool
     sigma_heading: float
+    sigma_range: float
+    shared: Array
+    sigma_height: float
 
 
 class _Hypotheses(NamedTuple):
@@ -147,11 +157,13 @@ def gather(fits: MarkerFits, marks: ControlMarks, config: ResectionConfig) -> Sc
     cr, sr = np.cos(levelling.roll), np.sin(levelling.roll)
     cp, sp = np.cos(levelling.pitch), np.sin(levelling.pitch)
     middle = marks.p_site.mean(axis=0)
+    p_base = np.stack([fit.p_base for fit in fits.fits])
+    cov_p_base = np.stack([fit.cov_p_base for fit in fits.fits])
+    cov_p_base += config.sigma_common**2 * np.eye(3)
     return Scene(
         names=marks.names,
-        centres_base=np.stack([fit.p_base for fit in fits.fits]),
-        cov_centres=np.stack([fit.cov_p_base for fit in fits.fits])
-        + config.sigma_common**2 * np.eye(3),
+        centres_base=p_base,
+        cov_centres=cov_p_base,
         marks_site=marks.p_site - middle,
         cov_marks=marks.cov_p_site,
         middle=middle,
@@ -160,7 +172,39 @@ def gather(fits: MarkerFits, marks: ControlMarks, config: ResectionConfig) -> Sc
         sigma_level=levelling.sigma,
         is_levelled=levelling.is_measured,
         sigma_heading=levelling.sigma_heading,
+        sigma_range=config.sigma_range,
+        shared=shared_variances(p_base, cov_p_base, config),
+        sigma_height=config.sigma_height,
     )
+
+
+def shared_variances(p_base: Array, cov_p_base: Array, config: ResectionConfig) -> Array:
+    """Return how much of the variance of centres is an error of range that they all share.
+
+    Parameters
+    ----------
+    p_base : (n, 3)
+        Centres [m].
+    cov_p_base : (n, 3, 3)
+        Their covariances [m^2].
+    config : ResectionConfig
+        The sigma that they share.
+
+    Returns
+    -------
+    (n,)
+        Variance along each line of sight, at most about half of what the centre has if all else
+        of it were known [m^2].
+
+    Notes
+    -----
+    The covariance of a centre says how far it may be off, biases of lasers included. Those are the
+    same for all centres: taken as independent, they would seem to blur the place of a station
+    among marks on all sides, where they cancel.
+    """
+    v = p_base / np.linalg.norm(p_base, axis=1, keepdims=True)
+    own = 1.0 / np.einsum("ni,ni->n", v, np.linalg.solve(cov_p_base, v[..., None])[..., 0])
+    return np.asarray(np.minimum(config.sigma_range_shared**2, _SHARED * own))
 
 
 def match_marks(scene: Scene, config: ResectionConfig) -> Match:

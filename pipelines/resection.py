@@ -266,7 +266,7 @@ def _fix(
     return StationFix(
         method="free_station",
         T_site_station=T_site_base @ inverse(rigid(scene.R_station_base, np.zeros(3))),
-        cov_T_site_station=shift @ adjustment.cov @ shift.T
+        cov_T_site_station=shift @ (adjustment.cov + _cov_shared(scene, used, adjustment)) @ shift.T
         + _cov_heading(scene, T_site_base)
         + _cov_choice(scene, match, T_site_base),
         matches=used,
@@ -283,6 +283,25 @@ def _fix(
         reason="; ".join(reasons),
         excluded=excluded,
     )
+
+
+def _cov_shared(scene: Scene, used: Index, adjustment: Adjustment[Array]) -> Array:
+    """Return what it changes in the covariance, (6, 6), that some errors are shared by all centres.
+
+    An error of all ranges is partly in the covariance of each centre, as if it were its own; an
+    error of all heights is not. The estimate is the same: only how sure it is, changes.
+    """
+    R, group = adjustment.estimate[:3, :3], adjustment.groups[0]
+    p_base = scene.centres_base[used[:, 0]]
+    variances = scene.shared[used[:, 0]]
+    lines = (p_base / np.linalg.norm(p_base, axis=1, keepdims=True)) @ R.T
+    gains = adjustment.cov @ np.swapaxes(np.linalg.solve(group.cov, group.J), 1, 2)  # up to sign
+    of_ranges = np.einsum("npk,nk->np", gains, lines)
+    of_heights = gains.sum(axis=0) @ (R @ scene.R_station_base[2])
+    together = of_ranges.sum(axis=0)
+    shared = scene.sigma_range**2 * np.outer(together, together)
+    shared += scene.sigma_height**2 * np.outer(of_heights, of_heights)
+    return np.asarray(shared - (of_ranges * variances[:, None]).T @ of_ranges)
 
 
 def _cov_heading(scene: Scene, T_site_base: Array) -> Array:

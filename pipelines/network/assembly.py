@@ -21,7 +21,7 @@ from pipelines.errors import (
     SolveError,
 )
 from pipelines.geometry import levelling_rotation, rigid, transform
-from pipelines.matching import gather, match_marks
+from pipelines.matching import gather, match_marks, shared_variances
 from pipelines.network.values import LeftOut, Network, Refusal, Shared
 from pipelines.values import Array, ControlMarks, MarkerFit, MarkerFits, Status
 
@@ -142,9 +142,12 @@ def assemble(
     )
     _refuse_nothing(used, found, control, refused)
     network = _network(scans, found, used, doubts)
+    cov_p_base = network.cov_p_base + config.sigma_common**2 * np.eye(3)
+    if calibration is None:
+        cov_p_base = _own(network.p_base, cov_p_base, config)
     network = replace(
         network,
-        cov_p_base=network.cov_p_base + config.sigma_common**2 * np.eye(3),
+        cov_p_base=cov_p_base,
         shared=_in_common(network, config, calibration),
         refused=refused,
     )
@@ -416,7 +419,7 @@ def _network(
 def _own(p_base: Array, cov_p_base: Array, config: ResectionConfig) -> Array:
     """Return the covariances of centres without the error of range that all of them share."""
     v = p_base / np.linalg.norm(p_base, axis=1, keepdims=True)
-    variances = shared_variances(p_base, cov_p_base, config.sigma_range)
+    variances = shared_variances(p_base, cov_p_base, config)
     return np.asarray(cov_p_base - variances[:, None, None] * v[:, :, None] * v[:, None, :])
 
 
@@ -442,7 +445,8 @@ def _in_common(
     network: Network, config: ResectionConfig, calibration: Calibration | None
 ) -> Shared:
     """Return what all stations share: a range bias, and the parameters of a calibration."""
-    bias = Shared.range_bias(network.p_base, config.sigma_range)
+    ups_base = network.R_station_base[network.sightings[:, 0], 2]
+    bias = Shared.of_rig(network.p_base, ups_base, config.sigma_range, config.sigma_height)
     if calibration is None:
         return bias
     names, weights = calibration.unknowns, calibration.weights

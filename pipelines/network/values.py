@@ -10,6 +10,7 @@ from pipelines.errors import InputError
 from pipelines.values import Array, Index, Mask
 
 RANGE_BIAS = "common_range_bias"
+HEIGHT_BIAS = "common_height_bias"
 """The shared unknown that is what all ranges are too long [m]."""
 
 
@@ -64,7 +65,8 @@ class Shared:
     Attributes
     ----------
     names : tuple of str
-        What they are; ``RANGE_BIAS`` is what all ranges are too long.
+        What they are; ``RANGE_BIAS`` is what all ranges are too long, ``HEIGHT_BIAS`` what all
+        centres are too high.
     effects : (n, 3, k)
         How much a unit of each moves each observed centre in base.
     weights : (k, k)
@@ -97,26 +99,40 @@ class Shared:
         return cls(names=(), effects=np.zeros((n, 3, 0)), weights=np.zeros((0, 0)))
 
     @classmethod
-    def range_bias(cls, p_base: Array, sigma: float) -> Shared:
-        """Return one unknown: what all ranges of a survey are too long.
+    def of_rig(
+        cls, p_base: Array, ups_base: Array, sigma_range: float, sigma_height: float
+    ) -> Shared:
+        """Return what all ranges of a survey are too long, and all centres too high.
 
         Parameters
         ----------
         p_base : (n, 3)
             Observed centres [m].
-        sigma : float
-            Its standard deviation before anything is seen; 0 for no such unknown [m].
+        ups_base : (n, 3)
+            The up direction in base, for each.
+        sigma_range, sigma_height : float
+            Standard deviations before anything is seen; 0 for no such unknown [m].
 
         Returns
         -------
         Shared
-            With one name, or none.
+            With two names, one or none.
         """
-        if sigma == 0.0:
-            return cls.none(len(p_base))
         towards = p_base / np.linalg.norm(p_base, axis=1)[:, None]
+        known = [
+            (name, effect, sigma)
+            for name, effect, sigma in (
+                (RANGE_BIAS, towards, sigma_range),
+                (HEIGHT_BIAS, ups_base, sigma_height),
+            )
+            if sigma > 0.0
+        ]
+        if not known:
+            return cls.none(len(p_base))
         return cls(
-            names=(RANGE_BIAS,), effects=towards[..., None], weights=np.array([[sigma**-2.0]])
+            names=tuple(name for name, _, _ in known),
+            effects=np.stack([effect for _, effect, _ in known], axis=-1),
+            weights=np.diag([sigma**-2.0 for _, _, sigma in known]),
         )
 
 

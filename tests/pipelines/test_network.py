@@ -18,7 +18,9 @@ from pipelines.resection import resect
 from tests.synthetic import control, field, pose, sightings
 
 EXACT = 1e-7  # [m] and [rad] noise-free in, truth out
-CONFIG = ResectionConfig(sigma_common=0.0, sigma_range=0.0)
+CONFIG = ResectionConfig(
+    sigma_common=0.0, sigma_range=0.0, sigma_range_shared=0.0, sigma_height=0.0
+)
 SIGMA = 4e-3  # [m] of a centre, per axis
 LEVEL = 3e-3  # [rad] of roll and of pitch
 
@@ -118,32 +120,33 @@ def test_noise_free_centres_without_control_give_the_true_shape(rng):
 def test_derivatives_agree_with_differences(rng):
     marks = field(rng, 5)
     scans, _ = survey(rng, marks, 3)
-    net = assemble(scans, marks, replace(CONFIG, sigma_range=1e-3))
+    net = assemble(scans, marks, replace(CONFIG, sigma_range=1e-3, sigma_height=1e-4))
     state, used = start(net), np.ones(net.n_blocks, np.bool_)
-    state = step_to(state, rng.normal(0, 0.1, (3, 6)), rng.normal(0, 0.1, (5, 3)), np.zeros(1))
+    state = step_to(state, rng.normal(0, 0.1, (3, 6)), rng.normal(0, 0.1, (5, 3)), np.zeros(2))
     here, h = linearise(net, state, used), 1e-6
     mark = net.sightings[:, 1]
     for k in range(6):
         xi = np.zeros((3, 6))
         xi[:, k] = h
         plus, minus = (
-            linearise(net, step_to(state, sign * xi, np.zeros((5, 3)), np.zeros(1)), used)
+            linearise(net, step_to(state, sign * xi, np.zeros((5, 3)), np.zeros(2)), used)
             for sign in (1, -1)
         )
         numeric = (plus.v_centres - minus.v_centres) / (2 * h)
         np.testing.assert_allclose(here.J_centres[..., k], numeric, rtol=0, atol=1e-7)
         numeric = (plus.v_gravity - minus.v_gravity) / (2 * h)
         np.testing.assert_allclose(here.J_gravity[..., k], numeric, rtol=0, atol=1e-7)
-    plus, minus = (
-        linearise(
-            net, step_to(state, np.zeros((3, 6)), np.zeros((5, 3)), np.array([sign * h])), used
+    for k, unit in enumerate(np.eye(2)):
+        plus, minus = (
+            linearise(
+                net, step_to(state, np.zeros((3, 6)), np.zeros((5, 3)), sign * h * unit), used
+            )
+            for sign in (1, -1)
         )
-        for sign in (1, -1)
-    )
-    numeric = (plus.v_centres - minus.v_centres) / (2 * h)
-    np.testing.assert_allclose(here.J_common[..., 3], numeric, rtol=0, atol=1e-7)
+        numeric = (plus.v_centres - minus.v_centres) / (2 * h)
+        np.testing.assert_allclose(here.J_common[..., 3 + k], numeric, rtol=0, atol=1e-7)
     dp = rng.normal(0, 1, (5, 3))
-    there = linearise(net, step_to(state, np.zeros((3, 6)), dp, np.zeros(1)), used)
+    there = linearise(net, step_to(state, np.zeros((3, 6)), dp, np.zeros(2)), used)
     np.testing.assert_allclose(there.v_centres - here.v_centres, -dp[mark], rtol=0, atol=1e-12)
     expected = -dp[net.controls]
     np.testing.assert_allclose(there.v_control - here.v_control, expected, rtol=0, atol=1e-12)

@@ -14,7 +14,7 @@ from pipelines.values import Levelling, Status
 from tests.synthetic import control, field, lean_matrix, marker_fit, pose, sightings, turn_z
 
 EXACT = 1e-7  # [m] and [rad] noise-free in, truth out
-CONFIG = ResectionConfig()
+CONFIG = ResectionConfig(sigma_range=0.0, sigma_range_shared=0.0, sigma_height=0.0)
 LEAN = (0.06, -0.04)
 STAND = (1.0, -2.0, 0.8)
 

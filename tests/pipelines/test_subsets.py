@@ -14,7 +14,9 @@ from pipelines.subsets import resect_subsets
 from tests.synthetic import control, field, pose, sightings
 
 EXACT = 1e-7  # [m] and [rad] noise-free in, truth out
-CONFIG = ResectionConfig(sigma_common=0.0)
+CONFIG = ResectionConfig(
+    sigma_common=0.0, sigma_range=0.0, sigma_range_shared=0.0, sigma_height=0.0
+)
 STAND = (0.7, -1.2, 0.4)
 LEAN = (0.06, -0.04)
 
