@@ -18,10 +18,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipelines.config import ExtractionConfig
-from pipelines.extraction.ball import Ball, view
-from pipelines.extraction.ground import Grid, ground_grid
+from pipelines.extraction.ball import Ball, seen_from, view_of
+from pipelines.extraction.ground import ground_grid
 from pipelines.extraction.looks import Look, look_at
-from pipelines.extraction.patches import cells_of, near, patches_about
 from pipelines.extraction.seeds import find_seeds
 from pipelines.extraction.sights import sights
 from pipelines.extraction.verdicts import (
@@ -82,11 +81,13 @@ def extract(
     seeds = find_seeds(cloud.p_base, grid.rows_above, ball, config.n_points_min)
     looks = distinct(look_at(cloud, grid, seeds, ball), config, marker_radius)
     verdicts = [verdict(look, config, ball) for look in looks]
-    verdicts = _sighted(cloud, looks, verdicts, ball)
-    good = [look for look, reason in zip(looks, verdicts, strict=True) if not reason]
+    verdicts, rows = _sighted(cloud, looks, verdicts, ball)
+    good = [
+        (look, mine) for look, mine, reason in zip(looks, rows, verdicts, strict=True) if not reason
+    ]
     bad = [(look, reason) for look, reason in zip(looks, verdicts, strict=True) if reason]
     return MarkerCandidates(
-        candidates=_candidates(cloud, grid, good, ball, config),
+        candidates=_candidates(cloud, good, ball, config),
         rejected=tuple(
             Rejection(p_base=look.p_base, n_points=look.n_points, reason=reason)
             for look, reason in bad[:_REJECTIONS_MAX]
@@ -95,8 +96,13 @@ def extract(
     )
 
 
-def _sighted(cloud: StitchedCloud, looks: list[Look], verdicts: list[str], ball: Ball) -> list[str]:
-    """Return the verdicts after a second look, at all beams towards and about what is left."""
+def _sighted(
+    cloud: StitchedCloud, looks: list[Look], verdicts: list[str], ball: Ball
+) -> tuple[list[str], list[NDArray[np.int32]]]:
+    """Return the verdicts after a second look, at all beams towards and about what is left.
+
+    With them the returns that were looked at; none of what had been refused before.
+    """
     left = [look for look, reason in zip(looks, verdicts, strict=True) if not reason]
     seen = sights(cloud, np.array([look.p_base for look in left]).reshape(-1, 3), ball)
     reasons = [verdict_on_sight(look, sight, ball) for look, sight in zip(left, seen, strict=True)]
@@ -104,40 +110,40 @@ def _sighted(cloud: StitchedCloud, looks: list[Look], verdicts: list[str], ball:
         (look, sight) for look, sight, reason in zip(left, seen, reasons, strict=True) if not reason
     ]
     later = iter(
-        reason or verdict_among_others(look, sight, good)
+        (reason or verdict_among_others(look, sight, good), sight.rows)
         for look, sight, reason in zip(left, seen, reasons, strict=True)
     )
-    return [reason or next(later) for reason in verdicts]
+    nothing = np.zeros(0, np.int32)
+    both = [(reason, nothing) if reason else next(later) for reason in verdicts]
+    return [reason for reason, _ in both], [rows for _, rows in both]
 
 
 def _candidates(
-    cloud: StitchedCloud, grid: Grid, looks: list[Look], ball: Ball, config: ExtractionConfig
+    cloud: StitchedCloud,
+    found: list[tuple[Look, NDArray[np.int32]]],
+    ball: Ball,
+    config: ExtractionConfig,
 ) -> tuple[MarkerCandidate, ...]:
-    """Return candidates in the order of azimuth."""
-    ordered = sorted(looks, key=lambda look: np.arctan2(look.y, look.x))
-    centres = np.array([look.p_base for look in ordered]).reshape(-1, 3)
-    patches = patches_about(cloud.p_base, grid, centres, ball.radius)
-    cells = cells_of(centres, grid)
+    """Return candidates in the order of azimuth, from looks and the returns about them."""
     return tuple(
         MarkerCandidate(
-            members=_members(cloud, patches.rows[near(patches, cell, p)], look, ball),
-            p_base_rough=p.copy(),
+            members=_members(cloud, rows, look, ball),
+            p_base_rough=look.p_base,
             score=score(look, config, ball),
         )
-        for look, p, cell in zip(ordered, centres, cells, strict=True)
+        for look, rows in sorted(found, key=lambda one: np.arctan2(one[0].y, one[0].x))
     )
 
 
-def _members(cloud: StitchedCloud, near: NDArray[np.int32], look: Look, ball: Ball) -> Index:
+def _members(cloud: StitchedCloud, rows: NDArray[np.int32], look: Look, ball: Ball) -> Index:
     """Return the rows on and about a ball, ascending: its outline, and what of its pole touches.
 
     Of a ball that is seen very closely, only its middle: there the returns at its outline, which
     belong partly to what lies behind, would weigh more than the noise of all the others.
     """
-    rows = np.sort(near).astype(np.intp)
-    seen, _, _ = view(cloud.p_base[rows].astype(np.float64), look.p_base, ball.up)
+    seen = seen_from(cloud.p_base[rows].astype(np.float64), view_of(look.p_base, ball.up))
     blur = 0.5 * ball.divergence * float(np.linalg.norm(look.p_base))
     reach = _MIDDLE * ball.radius if is_resolved(look, ball) else 1.5 * ball.radius + blur
     is_about = np.hypot(seen[:, 0], seen[:, 1]) < reach
     is_level = (seen[:, 2] > -2.2 * ball.radius) & (seen[:, 2] < 1.6 * ball.radius)
-    return np.asarray(rows[is_about & is_level])
+    return np.asarray(rows[is_about & is_level], dtype=np.intp)

@@ -18,14 +18,22 @@ class Ball(NamedTuple):
     divergence: float
 
 
+class View(NamedTuple):
+    """A centre [m], and unit vectors across and up the view of it."""
+
+    x: float
+    y: float
+    z: float
+    across: tuple[float, float, float]
+    up: tuple[float, float, float]
+
+
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def view(points: Array, c: Array, up: Array) -> tuple[Array, Array, Array]:
-    """Return points as seen toward a centre.
+def view_of(c: Array, up: Array) -> View:
+    """Return how a centre is looked at.
 
     Parameters
     ----------
-    points : (n, 3)
-        Returns in the base frame [m].
     c : (3,)
         The centre [m].
     up : (3,)
@@ -33,23 +41,60 @@ def view(points: Array, c: Array, up: Array) -> tuple[Array, Array, Array]:
 
     Returns
     -------
-    seen : (n, 3)
-        Where each beam passes the centre, across and up, and how much farther than that its return
-        lies [m].
-    v_across, v_up : (3,)
-        Unit vectors across the view.
+    View
+        Axes of the view.
     """
-    v_beam = c / np.linalg.norm(c)
-    v_up = up - np.dot(up, v_beam) * v_beam
-    v_up /= np.linalg.norm(v_up) + 1e-12
-    v_across = np.cross(v_up, v_beam)
+    distance = np.sqrt(c[0] ** 2 + c[1] ** 2 + c[2] ** 2)
+    x, y, z = c[0] / distance, c[1] / distance, c[2] / distance
+    along = up[0] * x + up[1] * y + up[2] * z
+    p, q, r = up[0] - along * x, up[1] - along * y, up[2] - along * z
+    length = np.sqrt(p * p + q * q + r * r) + 1e-12
+    p, q, r = p / length, q / length, r / length
+    across = (q * z - r * y, r * x - p * z, p * y - q * x)
+    return View(c[0], c[1], c[2], across, (p, q, r))
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def passing(view: View, x: float, y: float, z: float) -> tuple[float, float, float]:
+    """Return how the beam of a return passes a centre.
+
+    Parameters
+    ----------
+    view : View
+        How the centre is looked at.
+    x, y, z : float
+        The return [m].
+
+    Returns
+    -------
+    across, along, depth : float
+        Where the beam passes, across and up, and how much farther than that the return lies [m].
+    """
+    observed2 = x * x + y * y + z * z
+    share = (view.x * x + view.y * y + view.z * z) / observed2
+    dx, dy, dz = share * x - view.x, share * y - view.y, share * z - view.z
+    across = dx * view.across[0] + dy * view.across[1] + dz * view.across[2]
+    along = dx * view.up[0] + dy * view.up[1] + dz * view.up[2]
+    return across, along, np.sqrt(observed2) * (1.0 - share)
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def seen_from(points: Array, view: View) -> Array:
+    """Return how the beams of some returns pass a centre.
+
+    Parameters
+    ----------
+    points : (n, 3)
+        Returns in the base frame [m].
+    view : View
+        How the centre is looked at.
+
+    Returns
+    -------
+    (n, 3)
+        As ``passing`` says.
+    """
     seen = np.empty((len(points), 3))
     for i in range(len(points)):
-        x, y, z = points[i, 0], points[i, 1], points[i, 2]
-        observed2 = x * x + y * y + z * z
-        share = (c[0] * x + c[1] * y + c[2] * z) / observed2
-        dx, dy, dz = share * x - c[0], share * y - c[1], share * z - c[2]
-        seen[i, 0] = dx * v_across[0] + dy * v_across[1] + dz * v_across[2]
-        seen[i, 1] = dx * v_up[0] + dy * v_up[1] + dz * v_up[2]
-        seen[i, 2] = np.sqrt(observed2) * (1.0 - share)
-    return seen, v_across, v_up
+        seen[i] = passing(view, points[i, 0], points[i, 1], points[i, 2])
+    return seen

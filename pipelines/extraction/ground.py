@@ -123,12 +123,10 @@ def _extremes_per_cell(
         _level(p_base[low : low + _BLOCK], R, x, y, z)
         _cells_of_block(x, y, z, layout, block)
         for i in range(len(block)):
-            if block[i] >= 0:
-                extreme = extremes[block[i]]
-                if z[i] < extreme[0]:
-                    extreme[0] = z[i]
-                if z[i] > extreme[1]:
-                    extreme[1] = z[i]
+            cell = block[i]
+            if cell >= 0:
+                extremes[cell, 0] = min(extremes[cell, 0], z[i])
+                extremes[cell, 1] = max(extremes[cell, 1], z[i])
     shape = (layout.n_side, layout.n_side)
     return extremes[:, 0].copy().reshape(shape), extremes[:, 1].copy().reshape(shape)
 

@@ -6,15 +6,16 @@ robust fits along the beams with known radius, with free radius, and with missin
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from collections.abc import Callable
+from typing import Any, NamedTuple
 
 import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from pipelines.extraction.ball import Ball, view
+from pipelines.extraction.ball import Ball, View, passing, seen_from, view_of
 from pipelines.extraction.ground import Grid
-from pipelines.extraction.patches import Patches, cells_of, gathered, near, patches_about
+from pipelines.extraction.patches import Patches, patches_about, points_near
 from pipelines.extraction.seeds import thinned
 from pipelines.threads import side_by_side
 from pipelines.values import Array, StitchedCloud
@@ -93,6 +94,9 @@ class Look(NamedTuple):
         return np.array([self.x, self.y, self.z])
 
 
+_N_FIELDS = len(Look._fields)
+
+
 def look_at(cloud: StitchedCloud, grid: Grid, seeds: Array, ball: Ball) -> list[Look]:
     """Return what is seen where the seeds' discs came to rest with little around them.
 
@@ -113,62 +117,68 @@ def look_at(cloud: StitchedCloud, grid: Grid, seeds: Array, ball: Ball) -> list[
         What is there; places at which hardly a return lies on a ball are left out.
     """
     patches = patches_about(cloud.p_base, grid, seeds, ball.radius)
-    cells = cells_of(seeds, grid)
-
-    parts = side_by_side(
-        lambda first, end: _approached(patches, seeds[first:end], cells[first:end], ball),
-        len(seeds),
-        worth=_N_WORTH,
-    )
-    found = np.concatenate(parts)
-    is_free = found[:, 4] + found[:, 5] <= 2.0 + 0.6 * found[:, 3]
-    is_crowded = ~is_free & (found[:, 3] >= N_RESOLVED)
-    is_crowded[is_crowded] = _resolved(
-        patches, found[is_crowded], cells_of(found[is_crowded, :3], grid), ball
-    )
-    found = found[(found[:, 3] >= _N_LOOK) & (is_free | is_crowded)]
+    found = np.concatenate(_shared(_approached, patches, seeds, ball))
+    found = found[(found[:, 3] >= _N_LOOK) & (found[:, 4] > 0.0)]
     found = found[np.lexsort((found[:, 2], found[:, 1], found[:, 0], -found[:, 3]))]
     places = thinned(found[:, :4].copy(), 0.5 * ball.radius)[:, :3]
-    looks = []
-    for place, cell in zip(places, cells_of(places, grid), strict=True):
-        points = gathered(patches, near(patches, cell, place))
-        looks.append(_look(points, place, ball))
-    return [look for look in looks if look is not None]
+    rows = np.concatenate(_shared(_looked, patches, places, ball))
+    return [
+        Look(*row[:3], *(int(count) for count in row[3:7]), *row[7:])
+        for row in rows.tolist()
+        if row[3]
+    ]
+
+
+def _shared(
+    work: Callable[[Patches, Array, Ball], NDArray[Any]],
+    patches: Patches,
+    places: Array,
+    ball: Ball,
+) -> list[NDArray[Any]]:
+    """Do something at all places, shared among threads."""
+    return side_by_side(
+        lambda first, end: work(patches, places[first:end], ball), len(places), worth=_N_WORTH
+    )
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def _approached(patches: Patches, seeds: Array, seed_cells: NDArray[np.int64], ball: Ball) -> Array:
-    """Return where seeds' discs came to rest, the returns in, beside and below them, (k, 6)."""
-    out = np.zeros((len(seeds), 6))
+def _approached(patches: Patches, seeds: Array, ball: Ball) -> Array:
+    """Return where seeds' discs came to rest, the returns in them, and 1 if worth a look, (k, 5).
+
+    Little lies about a free ball; one that is seen closely needs no free space to be believed.
+    """
+    out = np.zeros((len(seeds), 5))
     for k in range(len(seeds)):
-        points = gathered(patches, near(patches, seed_cells[k], seeds[k]))
+        points = points_near(patches, seeds[k])
         c, n = _shifted(points, seeds[k], ball.up, ball.radius)
-        seen, _, _ = view(points, c, ball.up)
-        blur = 0.5 * ball.divergence * np.sqrt(c[0] ** 2 + c[1] ** 2 + c[2] ** 2)
-        n_beside, n_below = _surroundings(seen, ball.radius, blur)
-        out[k, 0], out[k, 1], out[k, 2] = c[0], c[1], c[2]
-        out[k, 3], out[k, 4], out[k, 5] = n, n_beside, n_below
+        n_beside, n_below = _surroundings(points, c, ball)
+        is_free = n_beside + n_below <= 2.0 + 0.6 * n
+        out[k, :3], out[k, 3] = c, n
+        out[k, 4] = is_free or (n >= N_RESOLVED and _is_resolved(points, c, ball))
     return out
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
 def _shifted(points: Array, c: Array, up: Array, radius: float) -> tuple[Array, int]:
     """Return where a disc of the ball's size comes to rest, and how many returns it holds."""
-    n = 0
+    c, n = c.copy(), 0
     for _ in range(4):
-        # what is farther off than this lies outside of the disc or its depth
-        seen, v_across, v_up = view(_within(points, c, 2.31 * radius), c, up)
+        view = view_of(c, up)
         across, along, depth, n = 0.0, 0.0, 0.0, 0
-        for i in range(len(seen)):
-            is_inside = seen[i, 0] ** 2 + seen[i, 1] ** 2 < (1.15 * radius) ** 2
-            if is_inside and -2.0 * radius < seen[i, 2] < 0.8 * radius:
-                across, along, depth = across + seen[i, 0], along + seen[i, 1], depth + seen[i, 2]
-                n += 1
+        for i in range(len(points)):
+            x, y, z = points[i, 0], points[i, 1], points[i, 2]
+            gap2 = (x - view.x) ** 2 + (y - view.y) ** 2 + (z - view.z) ** 2
+            if gap2 >= (2.31 * radius) ** 2:  # outside of the disc or its depth
+                continue
+            a, b, d = passing(view, x, y, z)
+            if a * a + b * b < (1.15 * radius) ** 2 and -2.0 * radius < d < 0.8 * radius:
+                across, along, depth, n = across + a, along + b, depth + d, n + 1
         if n == 0:
             break
-        v_beam = c / np.linalg.norm(c)
-        depth = depth / n + 2.0 / 3.0 * radius
-        c = c + (across / n) * v_across + (along / n) * v_up + depth * v_beam
+        across, along, depth = across / n, along / n, depth / n + 2.0 / 3.0 * radius
+        depth /= np.sqrt(c[0] ** 2 + c[1] ** 2 + c[2] ** 2)
+        for axis in range(3):
+            c[axis] += across * view.across[axis] + along * view.up[axis] + depth * c[axis]
     return c, n
 
 
@@ -186,105 +196,119 @@ def _within(points: Array, c: Array, reach: float) -> Array:
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def _surroundings(seen: Array, radius: float, blur: float) -> tuple[int, int]:
+def _surroundings(points: Array, c: Array, ball: Ball) -> tuple[int, int]:
     """Count the returns beside and below the outline that a free ball on a pole would not have."""
-    n_beside, n_below = 0, 0
-    inner = 1.1 * radius + blur  # no footprint that touches the ball is farther out
-    for i in range(len(seen)):
-        across, along, depth = seen[i, 0], seen[i, 1], seen[i, 2]
-        gap = np.sqrt(across * across + along * along)
+    n_beside, n_below, radius = 0, 0, ball.radius
+    blur = 0.5 * ball.divergence * np.sqrt(c[0] ** 2 + c[1] ** 2 + c[2] ** 2)
+    inner2 = (1.1 * radius + blur) ** 2  # no footprint that touches the ball is farther out
+    view = view_of(c, ball.up)
+    for i in range(len(points)):
+        across, along, depth = passing(view, points[i, 0], points[i, 1], points[i, 2])
+        gap2 = across * across + along * along
         is_pole = along < 0.0 and abs(across) < 0.6 * radius + blur
-        if gap < inner or is_pole:
+        if gap2 < inner2 or is_pole:
             continue
         if along > -0.5 * radius:
-            n_beside += gap < 2.2 * radius + blur and abs(depth) < 1.5 * radius
+            n_beside += gap2 < (2.2 * radius + blur) ** 2 and abs(depth) < 1.5 * radius
         else:
             is_under = abs(across) < 1.9 * radius + blur  # what is farther out stands on its own
-            is_under &= gap < 2.8 * radius + blur
+            is_under &= gap2 < (2.8 * radius + blur) ** 2
             n_below += is_under and -3.0 * radius < depth < 1.5 * radius
     return n_beside, n_below
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def _resolved(
-    patches: Patches, found: Array, cells: NDArray[np.int64], ball: Ball
-) -> NDArray[np.bool_]:
-    """Tell where a ball fits so closely that it needs no free space about it to be believed."""
-    out = np.zeros(len(found), np.bool_)
-    for k in range(len(found)):
-        c = found[k, :3].copy()
-        points = _within(gathered(patches, near(patches, cells[k], c)), c, 2.0 * ball.radius)
-        scatter = np.inf
-        for step_no in range(_N_STEPS):
-            N, pull, axes, scatter = _equations(points, c, ball, ball.radius)
-            if step_no > 0 and scatter > 4.0 * RESOLUTION * ball.radius:
-                break  # it will not come to that any more
-            step = np.linalg.solve(N[:3, :3] + 1e-3 * np.eye(3), pull[:3])
-            step *= min(1.0, 0.5 * ball.radius / (np.sqrt(np.sum(step**2)) + 1e-12))
-            c = c + step[0] * axes[0] + step[1] * axes[1] + step[2] * axes[2]
-        out[k] = scatter < 1.5 * RESOLUTION * ball.radius
+def _is_resolved(points: Array, c: Array, ball: Ball) -> bool:
+    """Tell whether a ball fits so closely that it needs no free space about it to be believed."""
+    points = _within(points, c, 2.0 * ball.radius)
+    scatter = np.inf
+    for step_no in range(_N_STEPS):
+        N, pull, axes, scatter = _equations(points, c, ball, ball.radius)
+        if step_no > 0 and scatter > 4.0 * RESOLUTION * ball.radius:
+            break  # it will not come to that any more
+        step = np.linalg.solve(N[:3, :3] + 1e-3 * np.eye(3), pull[:3])
+        step *= min(1.0, 0.5 * ball.radius / (np.sqrt(np.sum(step**2)) + 1e-12))
+        c = c + step[0] * axes[0] + step[1] * axes[1] + step[2] * axes[2]
+    return scatter < 1.5 * RESOLUTION * ball.radius
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _looked(patches: Patches, places: Array, ball: Ball) -> Array:
+    """Return what is seen near places, (k, 17), as ``Look`` names it; zeros if no ball is there."""
+    out = np.zeros((len(places), _N_FIELDS))
+    for k in range(len(places)):
+        _look(points_near(patches, places[k]), places[k], ball, out[k])
     return out
 
 
-def _look(points: Array, start: Array, ball: Ball) -> Look | None:
-    """Return what is seen near a place; nothing if hardly a return lies on a ball there."""
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _look(points: Array, start: Array, ball: Ball, out: Array) -> None:
+    """Write what is seen near a place; nothing if hardly a return lies on a ball there."""
     radius = ball.radius
     c, _, _ = _settled(points, start, ball, 3)
-    blur = 0.5 * ball.divergence * float(np.linalg.norm(c))
-    seen, _, _ = view(points, c, ball.up)
+    blur = 0.5 * ball.divergence * np.sqrt(np.sum(c**2))
+    seen = seen_from(points, view_of(c, ball.up))
     residuals, J = _shape(seen, radius)
-    scatter = _scatter(seen, residuals, radius)
-    weights = _weights(seen, residuals, radius, blur, max(scatter, NOISE_MIN))
-    is_in = weights > 0.0
-    if is_in.sum() < _N_LOOK:
-        return None
-    is_strange = ~is_in & (np.hypot(seen[:, 0], seen[:, 1]) < 0.9 * radius)
-    is_strange &= (np.abs(seen[:, 2]) < 2.0 * radius) & (seen[:, 1] > -0.8 * radius)
-    rms = float(np.sqrt(np.sum(weights * residuals**2) / np.sum(weights)))
+    scatter = max(_scatter(seen, residuals, radius), NOISE_MIN)
+    weights = _weights(seen, residuals, radius, blur, scatter)
+    if np.sum(weights > 0.0) < _N_LOOK:
+        return
+    rms = np.sqrt(np.sum(weights * residuals**2) / np.sum(weights))
     noise = max(rms, NOISE_MIN)
-    n_beside, n_below = _surroundings(seen, radius, blur)
-    flat, cov_flat = _solve(J[:, [0, 1, 2, 4, 5]], residuals, weights, 1e-6)
+    flat, cov_flat = _flatness(J, residuals, weights)
     c_free, radius_free, cov_free = _settled(points, c, ball, 4)
-    seen_free, _, _ = view(points, c_free, ball.up)
+    seen_free = seen_from(points, view_of(c_free, ball.up))
     residuals_free, _ = _shape(seen_free, radius_free)
-    return Look(
-        x=float(c[0]),
-        y=float(c[1]),
-        z=float(c[2]),
-        n_points=int(is_in.sum()),
-        n_strange=int(is_strange.sum()),
-        n_beside=n_beside,
-        n_below=n_below,
-        scatter=rms,
-        width=float(np.ptp(seen[is_in, 0])),
-        height=float(np.ptp(seen[is_in, 1])),
-        radius_free=radius_free,
-        sigma_radius=noise * float(np.sqrt(cov_free[3, 3])),
-        scatter_free=_scatter(seen_free, residuals_free, radius_free),
-        flat_across=float(flat[3]),
-        sigma_across=noise * float(np.sqrt(cov_flat[3, 3])),
-        flat_along=float(flat[4]),
-        sigma_along=noise * float(np.sqrt(cov_flat[4, 4])),
-    )
+    out[:3] = c
+    out[3], out[4] = np.sum(weights > 0.0), _n_strange(seen, weights, radius)
+    out[5], out[6] = _surroundings(points, c, ball)
+    out[7], out[8], out[9] = rms, _extent(seen[:, 0], weights), _extent(seen[:, 1], weights)
+    out[10], out[11] = radius_free, noise * np.sqrt(cov_free[3, 3])
+    out[12] = _scatter(seen_free, residuals_free, radius_free)
+    out[13], out[14] = flat[3], noise * np.sqrt(cov_flat[3, 3])
+    out[15], out[16] = flat[4], noise * np.sqrt(cov_flat[4, 4])
 
 
-def _settled(points: Array, c: Array, ball: Ball, n_unknowns: int) -> tuple[Array, float, Array]:
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _n_strange(seen: Array, weights: Array, radius: float) -> int:
+    """Count the returns inside the outline, about as far away, that the ball does not explain."""
+    n = 0
+    for i in range(len(seen)):
+        is_inside = np.hypot(seen[i, 0], seen[i, 1]) < 0.9 * radius and seen[i, 1] > -0.8 * radius
+        n += is_inside and abs(seen[i, 2]) < 2.0 * radius and not weights[i] > 0.0
+    return n
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _extent(places: Array, weights: Array) -> float:
+    """Return how far apart the places are that have a weight [m]."""
+    low, high = np.inf, -np.inf
+    for i in range(len(places)):
+        if weights[i] > 0.0:
+            low, high = min(low, places[i]), max(high, places[i])
+    return high - low
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _settled(
+    points: Array, start: Array, ball: Ball, n_unknowns: int
+) -> tuple[Array, float, Array]:
     """Return the centre of the ball near a place, its radius, and the covariance for unit noise.
 
     With three unknowns the radius stays as it is, with four it is estimated too. The prior, a third
     of the radius on a start good to that, keeps a handful of returns from running away.
     """
-    radius, inverse = ball.radius, np.eye(n_unknowns)
+    c, radius, inverse = start.copy(), ball.radius, np.eye(n_unknowns)
     for _ in range(_N_STEPS):
         N, pull, axes, scatter = _equations(points, c, ball, radius)
         prior = (scatter / (_LOOSE * ball.radius)) ** 2 * np.eye(n_unknowns)
         inverse = np.linalg.inv(N[:n_unknowns, :n_unknowns] + prior)
-        step = inverse @ pull[:n_unknowns]
-        step *= min(1.0, 0.5 * ball.radius / (float(np.linalg.norm(step)) + 1e-12))
-        c = c + step[:3] @ axes
+        step = np.dot(inverse, pull[:n_unknowns])
+        step *= min(1.0, 0.5 * ball.radius / (np.sqrt(np.sum(step**2)) + 1e-12))
+        c += step[0] * axes[0] + step[1] * axes[1] + step[2] * axes[2]
         if n_unknowns > 3:
-            radius = float(np.clip(radius + step[3], 0.3 * ball.radius, 3.0 * ball.radius))
-    return c, radius, np.asarray(inverse)
+            radius = min(max(radius + step[3], 0.3 * ball.radius), 3.0 * ball.radius)
+    return c, radius, inverse
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
@@ -295,13 +319,15 @@ def _equations(
 
     The last is the scatter about the ball as it is [m].
     """
-    seen, v_across, v_up = view(points, c, ball.up)
-    distance = np.sqrt(np.sum(c**2))
+    view = view_of(c, ball.up)
+    distance = np.sqrt(c[0] ** 2 + c[1] ** 2 + c[2] ** 2)
     axes = np.empty((3, 3))
-    axes[0], axes[1], axes[2] = v_across, v_up, c / distance
+    axes[0], axes[1], axes[2] = view.across, view.up, c / distance
+    blur = 0.5 * ball.divergence * distance
+    seen = _about(points, view, radius + blur)
     residuals, J = _shape(seen, radius)
     scatter = _scatter(seen, residuals, radius)
-    weights = _weights(seen, residuals, radius, 0.5 * ball.divergence * distance, scatter)
+    weights = _weights(seen, residuals, radius, blur, scatter)
     N, pull = np.zeros((4, 4)), np.zeros(4)
     for i in range(len(seen)):
         if weights[i] > 0.0:
@@ -310,6 +336,18 @@ def _equations(
                 for k in range(4):
                     N[j, k] += weights[i] * J[i, j] * J[i, k]
     return N, pull, axes, scatter
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _about(points: Array, view: View, reach: float) -> Array:
+    """Return how those beams pass a centre that do so within reach."""
+    seen = np.empty((len(points), 3))
+    n = 0
+    for i in range(len(points)):
+        across, along, depth = passing(view, points[i, 0], points[i, 1], points[i, 2])
+        seen[n, 0], seen[n, 1], seen[n, 2] = across, along, depth
+        n += across * across + along * along < reach * reach
+    return seen[:n]
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
@@ -336,13 +374,20 @@ def _shape(seen: Array, radius: float) -> tuple[Array, Array]:
     return residuals, J
 
 
-def _solve(J: Array, residuals: Array, weights: Array, prior: float) -> tuple[Array, Array]:
-    """Return the weighted least-squares step and the inverse of its normal matrix."""
-    weighted = J * weights[:, None]
-    inverse = np.asarray(
-        np.linalg.inv(weighted.T @ J + prior * np.eye(J.shape[1])), dtype=np.float64
-    )
-    return inverse @ (weighted.T @ residuals), inverse
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _flatness(J: Array, residuals: Array, weights: Array) -> tuple[Array, Array]:
+    """Return centre and missing curvatures, and their covariance for unit noise."""
+    N, pull = 1e-6 * np.eye(5), np.zeros(5)
+    for i in range(len(J)):
+        if weights[i] > 0.0:
+            for j in range(5):
+                slope = weights[i] * J[i, j + (j > 2)]  # all but the radius
+                pull[j] += slope * residuals[i]
+                for k in range(5):
+                    N[j, k] += slope * J[i, k + (k > 2)]
+    inverse = np.linalg.inv(N)
+    flat: Array = np.dot(inverse, pull)
+    return flat, np.asarray(inverse, dtype=np.float64)
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")

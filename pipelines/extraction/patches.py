@@ -18,6 +18,8 @@ from pipelines.values import Array, Column, Mask
 
 _REACH = 4.5  # radii about a seed whose returns decide whether a ball stands free there
 
+_ROUNDED = 1e-4  # [m]: more than a cell's edge may be off by rounding
+
 
 class Patches(NamedTuple):
     """Returns sorted by cell, for the cells about the seeds.
@@ -25,24 +27,24 @@ class Patches(NamedTuple):
     Attributes
     ----------
     starts : (n_side ** 2 + 1,)
-        The rows of a cell are ``rows[starts[cell]:starts[cell + 1]]``.
-    rows : (m,) int32
-        Rows of the cloud.
+        The returns of a cell are ``points[starts[cell]:starts[cell + 1]]``.
     points : (m, 3) float32
         The returns themselves [m].
     n_side : int
         Cells along one side.
-    margin : int
-        Cells about a seed that may hold returns within reach.
+    edge : float
+        Edge of a cell [m].
+    R_station_base : (3, 3)
+        Levelling.
     reach : float
         How far about a seed returns are looked at [m].
     """
 
     starts: NDArray[np.int64]
-    rows: NDArray[np.int32]
     points: Column
     n_side: int
-    margin: int
+    edge: float
+    R_station_base: Array
     reach: float
 
 
@@ -67,90 +69,65 @@ def patches_about(p_base: Column, grid: Grid, seeds: Array, radius: float) -> Pa
     """
     reach = _REACH * radius
     margin = int(np.ceil(reach / grid.edge)) + 1
-    is_wanted = _wanted(grid.n_side, cells_of(seeds, grid), margin)
+    is_wanted = _wanted(grid.n_side, _cells_of(seeds, grid), margin)
 
     parts = side_by_side(
         lambda first, end: _rows_in(grid.cells, is_wanted, first, end), len(grid.cells)
     )
     rows = np.concatenate(parts)
     starts, rows = _by_cell(grid.cells, rows, len(is_wanted))
-    return Patches(starts, rows, p_base[rows], grid.n_side, margin, reach)
+    return Patches(starts, p_base[rows], grid.n_side, grid.edge, grid.R_station_base, reach)
 
 
-def cells_of(p_base: Array, grid: Grid) -> NDArray[np.int64]:
-    """Return the cells of some places.
-
-    Parameters
-    ----------
-    p_base : (k, 3)
-        The places [m].
-    grid : Grid
-        The grid.
-
-    Returns
-    -------
-    (k,)
-        Cells; of a place beyond the grid, the nearest one.
-    """
+def _cells_of(p_base: Array, grid: Grid) -> NDArray[np.int64]:
+    """Return the cells of some places; of a place beyond the grid, the nearest one."""
     places = np.floor((p_base @ grid.R_station_base.T)[:, :2] / grid.edge).astype(np.int64)
     places = np.clip(places + grid.n_side // 2, 0, grid.n_side - 1)
     return np.asarray(places[:, 0] * grid.n_side + places[:, 1])
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def near(patches: Patches, cell: int, c: Array) -> NDArray[np.int32]:
-    """Return which of the returns are within reach of a place.
+def points_near(patches: Patches, c: Array) -> Array:
+    """Return the returns within reach of a place.
 
     Parameters
     ----------
     patches : Patches
         Returns by cell.
-    cell : int
-        A cell that holds the place, or is next to the one that does.
     c : (3,)
-        The place [m].
-
-    Returns
-    -------
-    (k,) int32
-        Their places among ``patches.rows`` and ``patches.points``.
-    """
-    n_side, margin, points, starts = patches.n_side, patches.margin, patches.points, patches.starts
-    row, column = cell // n_side, cell % n_side
-    low, high = max(column - margin, 0), min(column + margin, n_side - 1)
-    bottom, top = max(row - margin, 0), min(row + margin, n_side - 1)
-    x, y, z, reach2 = c[0], c[1], c[2], patches.reach**2
-    out = np.empty(starts[top * n_side + high + 1] - starts[bottom * n_side + low], np.int32)
-    n_out = 0
-    for k in range(bottom, top + 1):
-        for i in range(starts[k * n_side + low], starts[k * n_side + high + 1]):
-            dx, dy, dz = points[i, 0] - x, points[i, 1] - y, points[i, 2] - z
-            out[n_out] = i  # kept only if the next one does not take its place
-            n_out += dx * dx + dy * dy + dz * dz < reach2
-    return out[:n_out]
-
-
-@numba.njit(cache=True, nogil=True, error_model="numpy")
-def gathered(patches: Patches, places: NDArray[np.int32]) -> Array:
-    """Return some of the returns in float64.
-
-    Parameters
-    ----------
-    patches : Patches
-        Returns by cell.
-    places : (k,) int32
-        Those that are wanted, as ``near`` gives them.
+        A place at most a cell from one that the patches are about [m].
 
     Returns
     -------
     (k, 3)
         Points [m].
     """
-    points = np.empty((len(places), 3))
-    for i in range(len(places)):
-        for axis in range(3):
-            points[i, axis] = patches.points[places[i], axis]
-    return points
+    n_side, points, starts = patches.n_side, patches.points, patches.starts
+    x, y, z, reach2 = c[0], c[1], c[2], patches.reach**2
+    bottom, top = _span(patches, patches.R_station_base[0], c)
+    low, high = _span(patches, patches.R_station_base[1], c)
+    n = 0
+    for k in range(bottom, top + 1):
+        n += starts[k * n_side + high + 1] - starts[k * n_side + low]
+    out = np.empty((n + 1, 3))
+    n_out = 0
+    for k in range(bottom, top + 1):
+        for i in range(starts[k * n_side + low], starts[k * n_side + high + 1]):
+            p, q, r = np.float64(points[i, 0]), np.float64(points[i, 1]), np.float64(points[i, 2])
+            # kept only if the next one does not take its place
+            out[n_out, 0], out[n_out, 1], out[n_out, 2] = p, q, r
+            n_out += (p - x) ** 2 + (q - y) ** 2 + (r - z) ** 2 < reach2
+    return out[:n_out]
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _span(patches: Patches, v_axis: Array, c: Array) -> tuple[int, int]:
+    """Return the first and the last cell along an axis that may hold returns within reach."""
+    place = v_axis[0] * c[0] + v_axis[1] * c[1] + v_axis[2] * c[2]
+    reach, half = patches.reach + _ROUNDED, patches.n_side // 2
+    first = int(np.floor((place - reach) / patches.edge)) + half
+    last = int(np.floor((place + reach) / patches.edge)) + half
+    return max(first, 0), min(last, patches.n_side - 1)
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")

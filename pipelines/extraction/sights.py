@@ -12,11 +12,13 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from pipelines.extraction.ball import Ball, view
+from pipelines.extraction.ball import Ball, seen_from, view_of
 from pipelines.threads import side_by_side
 from pipelines.values import Array, Column, Mask, StitchedCloud
 
-_N_FACE = 256  # cells along a face of the cube of directions: 0.45 deg
+_N_SIDE = 128  # cells along a side of the octahedron of directions: 0.5 to 1 deg
+_STEP = 0.05  # [m] at most between the directions about a centre that are looked up
+_BLOCK = 2048  # returns whose directions are found at once
 _REACH = 4.0  # radii about a centre: shoulders lie within three radii below a head
 _POLE = 0.5  # radii: half the width of what a ball may stand on
 _ASIDE = 1.9  # radii: what is farther to a side may stand there on its own
@@ -46,6 +48,8 @@ class Sight(NamedTuple):
         Returns there that end long before it.
     brightness : float
         Mean reflectivity of the first ones, 0-255.
+    rows : (m,) int32
+        Returns of the cloud whose beams pass within four radii, ascending.
     """
 
     n_on: int
@@ -56,6 +60,7 @@ class Sight(NamedTuple):
     n_past: int
     n_short: int
     brightness: float
+    rows: NDArray[np.int32]
 
     @property
     def is_open_below(self) -> bool:
@@ -95,18 +100,19 @@ def sights(cloud: StitchedCloud, centres: Array, ball: Ball) -> list[Sight]:
     )
     rows = np.concatenate(parts)
     points, intensities = cloud.p_base[rows], cloud.intensities[rows]
-    return [Sight(*_counted(points, intensities, centre, ball)) for centre in centres]
+    seen = [Sight(*_counted(points, intensities, centre, ball)) for centre in centres]
+    return [sight._replace(rows=rows[sight.rows]) for sight in seen]
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
 def _counted(
     points: Column, intensities: Column, c: Array, ball: Ball
-) -> tuple[int, int, int, float, int, int, int, float]:
+) -> tuple[int, int, int, float, int, int, int, float, NDArray[np.int32]]:
     """Return the fields of a sight."""
     radius, distance = ball.radius, np.sqrt(np.sum(c**2))
     blur = 0.5 * ball.divergence * distance / radius
     rows = _towards(points, c, (_REACH + blur) * radius / distance)
-    seen, _, _ = view(points[rows].astype(np.float64), c, ball.up)
+    seen = seen_from(points[rows].astype(np.float64), view_of(c, ball.up))
     n_on, n_through, n_before, n_held, n_past, n_short = 0, 0, 0, 0, 0, 0
     gaps2, light = 0.0, 0.0
     for i in range(len(seen)):
@@ -125,7 +131,7 @@ def _counted(
             n_short += depth < _HELD[0]
             n_held += _HELD[0] <= depth <= _HELD[1]
     n = max(n_on, 1)
-    return n_on, n_through, n_before, gaps2 / n, n_held, n_past, n_short, light / n
+    return n_on, n_through, n_before, gaps2 / n, n_held, n_past, n_short, light / n, rows
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
@@ -146,16 +152,20 @@ def _towards(points: Column, c: Array, tangent: float) -> NDArray[np.int32]:
 @numba.njit(cache=True, nogil=True, error_model="numpy")
 def _directions_about(centres: Array, up: Array, reach: float) -> Mask:
     """Tell the cells of directions in which beams may pass some centres within a reach."""
-    is_wanted = np.zeros(6 * _N_FACE * _N_FACE, np.bool_)
-    n_steps = 2 + int(1.5 * reach * _N_FACE / np.sqrt(np.min(np.sum(centres**2, axis=1)) + 1e-9))
+    is_wanted = np.zeros(2 * _N_SIDE * _N_SIDE, np.bool_)
+    xyz, cell = np.empty((3, 1), np.float32), np.empty(1, np.int32)
     for k in range(len(centres)):
         c = centres[k]
         v_across = np.cross(up, c)
         v_across *= reach / (np.sqrt(np.sum(v_across**2)) + 1e-12)
+        n_steps = 2 + int(max(1.5 * reach * _N_SIDE / np.sqrt(np.sum(c**2)), reach / _STEP))
         for i in range(-n_steps, n_steps + 1):
             for j in range(-n_steps, n_steps + 1):
-                q = c + (i / n_steps) * v_across + (j / n_steps) * reach * up
-                is_wanted[_direction_cell(q[0], q[1], q[2])] = True
+                for axis in range(3):
+                    aside = i * v_across[axis] + j * reach * up[axis]
+                    xyz[axis, 0] = c[axis] + aside / n_steps
+                _direction_cells(xyz[0], xyz[1], xyz[2], cell)
+                is_wanted[cell[0]] = True
     return is_wanted
 
 
@@ -163,25 +173,31 @@ def _directions_about(centres: Array, up: Array, reach: float) -> Mask:
 def _in_directions(p_base: Column, is_wanted: Mask) -> NDArray[np.int32]:
     """Return the rows of the points, at whatever depth, in the cells that are wanted."""
     rows = np.empty(len(p_base), np.int32)
+    cells = np.empty(_BLOCK, np.int32)
+    xyz = np.empty((3, _BLOCK), np.float32)
     n_rows = 0
-    for i in range(len(p_base)):
-        rows[n_rows] = i  # kept only if the next one does not take its place
-        n_rows += is_wanted[_direction_cell(p_base[i, 0], p_base[i, 1], p_base[i, 2])]
+    for low in range(0, len(p_base), _BLOCK):
+        points = p_base[low : low + _BLOCK]
+        n = len(points)
+        for i in range(n):
+            xyz[0, i], xyz[1, i], xyz[2, i] = points[i, 0], points[i, 1], points[i, 2]
+        _direction_cells(xyz[0, :n], xyz[1, :n], xyz[2, :n], cells)
+        for i in range(n):
+            rows[n_rows] = low + i  # kept only if the next one does not take its place
+            n_rows += is_wanted[cells[i]]
     return rows[:n_rows]
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def _direction_cell(x: float, y: float, z: float) -> int:
-    """Return the cell of a direction on a cube of ``_N_FACE`` squared cells a face."""
-    ax, ay, az = abs(x), abs(y), abs(z)
-    if not ax + ay + az < np.inf:
-        return 0  # a return that is none: any cell will do, the angle refuses it
-    if ax >= ay and ax >= az:
-        face, first, second, largest = int(x > 0.0), y, z, ax
-    elif ay >= az:
-        face, first, second, largest = 2 + int(y > 0.0), x, z, ay
-    else:
-        face, first, second, largest = 4 + int(z > 0.0), x, y, az
-    scale = 0.4999 * _N_FACE / max(largest, 1e-9)
-    row, column = int(first * scale + 0.5 * _N_FACE), int(second * scale + 0.5 * _N_FACE)
-    return (face * _N_FACE + row) * _N_FACE + column
+def _direction_cells(x: Column, y: Column, z: Column, cells: NDArray[np.int32]) -> None:
+    """Write the cells of some directions: the octahedron seen from above and from below.
+
+    A return that is none gets any cell: the angle refuses it later.
+    """
+    half, side = np.float32(0.4999 * _N_SIDE), np.int32(_N_SIDE)
+    for i in range(len(x)):
+        total = abs(x[i]) + abs(y[i]) + abs(z[i])
+        scale = half / total if (total > 0.0) & (total < np.inf) else np.float32(0.0)
+        row, column = np.int32(x[i] * scale + half), np.int32(y[i] * scale + half)
+        cell = (row + (side if z[i] > 0.0 else np.int32(0))) * side + column
+        cells[i] = cell if scale > 0.0 else np.int32(0)
