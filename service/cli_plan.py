@@ -152,6 +152,105 @@ def optimise(
     _deliver(siting.optimise(asked, rules, goal), csv, geojson, as_json=as_json, planning=planning)
 
 
+@plan.command()
+def random(
+    arrangements: Annotated[int, typer.Option(min=1, help="How many are tried.")] = 100_000,
+    least: Annotated[int, typer.Option(help="Least number of marks.")] = 3,
+    most: Annotated[int, typer.Option(help="Greatest number of marks.")] = 14,
+    distance_m: Annotated[
+        float | None, typer.Option(help="Greatest distance \\[m]; of the results if not given.")
+    ] = None,
+    angle_deg: Annotated[
+        tuple[float, float] | None,
+        typer.Option(help="Window of included angles \\[deg]; of the results if not given."),
+    ] = None,
+    error_m: Annotated[
+        float, typer.Option(help="Error on each axis of a centre \\[m]; 0 takes the model's.")
+    ] = 0.017,
+    tolerance_m: Tolerance = 0.03,
+    seed: Seed = 0,
+    fit_method: Annotated[
+        str, typer.Option(help="Fitting method whose results tell distance and window.")
+    ] = "paper",
+    turn_s: TurnS = 13.2,
+    rpm: Rpm = 600.0,
+    data: Data = None,
+    server: Server = None,
+    survey: Survey = "",
+    folder: Annotated[
+        Path | None, typer.Option("--out", file_okay=False, help="Write tables and figures.")
+    ] = None,
+    as_json: AsJson = False,
+) -> None:
+    """Try arrangements at random, as the study does: an error on every centre, pass or fail."""
+    import math
+
+    from pipelines.placement import Sensor, Trial, sensor_model
+    from service import trials
+    from service.centre_models import model_of_surveys
+
+    ask = _ask(data, server)
+    limits = trials.limits_of_results(ask, fit_method, tolerance_m)
+    window = angle_deg or (limits["angle_min_deg"], limits["angle_max_deg"])
+    farthest = distance_m or limits["greatest_distance_m"]
+    trial = Trial(
+        n_arrangements=arrangements,
+        n_marks=(least, most),
+        distances=(min(2.0, farthest / 2), farthest),
+        angles=(math.radians(window[0]), math.radians(window[1])),
+        error=error_m or None,
+        tolerance=tolerance_m,
+        seed=seed,
+    )
+    sensor = Sensor(turn=turn_s, spin_rpm=rpm)
+    model = (
+        sensor_model(sensor) if ask is None else model_of_surveys(ask, sensor, 0.100, survey=survey)
+    )
+    answer = trials.run(trial, model, limits)
+    if folder:
+        trials.write(folder, answer)
+    if as_json:
+        sys.stdout.write(json.dumps(answer, indent=2, allow_nan=False) + "\n")
+    else:
+        _print_trials(answer)
+
+
+def _print_trials(answer: dict[str, Any]) -> None:
+    """Print how many arrangements pass."""
+    limits = answer["limits"]
+    out.print(
+        f"{answer['n_arrangements']:,} arrangements from {answer['distance_min_m']:g} to "
+        f"{answer['distance_max_m']:g} m ({limits['distance_source']}), included angles from "
+        f"{answer['angle_min_deg']:g} to {answer['angle_max_deg']:g} deg "
+        f"({limits['angle_source']}): {answer['n_in_window']:,} in the window. "
+        f"Of these {_text(answer['pass_rate_in_window'], 100.0, 1)} % pass, of the others "
+        f"{_text(answer['pass_rate_outside'], 100.0, 1)} %.",
+        highlight=False,
+    )
+    table = Table("marks", "in the window", "pass [%]", "median [mm]", "p95 [mm]")
+    for row in answer["by_number_of_marks"]:
+        table.add_row(str(row["n_marks"]), *_passed(row))
+    out.print(table)
+    table = Table("worst angle [deg]", "all", "pass [%]", "median [mm]", "p95 [mm]")
+    for row in answer["by_worst_angle"]:
+        table.add_row(f"{row['angle_from_deg']:g} - {row['angle_to_deg']:g}", *_passed(row))
+    out.print(table)
+    table = Table("included angle [deg]", "study [mm]", "here [mm]")
+    for row in answer["table3"]:
+        table.add_row(
+            f"{row['included_angle_deg']:.2f}",
+            _text(row["study_error_3d_m"], 1e3, 1),
+            _text(row["median_error_3d_m"], 1e3, 1),
+        )
+    out.print(table)
+
+
+def _passed(row: dict[str, Any]) -> tuple[str, ...]:
+    """Return the columns of one class of arrangements."""
+    lengths = (_text(row[key], 1e3, 1) for key in ("median_error_3d_m", "p95_error_3d_m"))
+    return f"{row['n']:,}", _text(row["pass_rate"], 100.0, 1), *lengths
+
+
 def _ask(data: Path | None, server: str | None) -> Any:
     """Return what answers SQL, or nothing where no results were named."""
     if data is None and server is None:

@@ -5,6 +5,7 @@
 - ``sight`` what hides it, ``positions`` and ``probability`` what centres make of a position,
 - ``evaluation`` puts these together for stops and for a grid over the field,
 - ``candidates`` says where marks may stand, ``optimising`` which of these places are best,
+- ``trials`` is the study's own procedure: marks at random, pass or fail,
 - ``learning`` fits the model of centres to one's own surveys.
 
 Why so: an arrangement is judged in milliseconds, without simulating a scan, so that hundreds of
@@ -26,6 +27,15 @@ from pipelines.placement.optimising import (
 from pipelines.placement.sensor import Sensor
 from pipelines.placement.sight import look
 from pipelines.placement.sites import marks_of_field, site_of_field, site_of_grid, stops_of_field
+from pipelines.placement.trials import (
+    Share,
+    Trial,
+    TrialResult,
+    by_number,
+    by_worst_angle,
+    errors_by_angle,
+    try_at_random,
+)
 from pipelines.placement.values import (
     PLAN_METHODS,
     Arrangement,
@@ -52,11 +62,17 @@ __all__ = [
     "Provenance",
     "Requirement",
     "Sensor",
+    "Share",
     "Sights",
     "Site",
     "Stops",
+    "Trial",
+    "TrialResult",
+    "by_number",
+    "by_worst_angle",
     "check_sizes",
     "draw_arrangement",
+    "errors_by_angle",
     "evaluate",
     "field_eyes",
     "field_map",
@@ -70,4 +86,5 @@ __all__ = [
     "site_of_field",
     "site_of_grid",
     "stops_of_field",
+    "try_at_random",
 ]
