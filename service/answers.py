@@ -15,7 +15,9 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from pipelines.accuracy import UNMATCHED, marker_errors, station_error
+from pipelines.checking import check_distances, leave_each_out
 from pipelines.config import SurveyConfig
+from pipelines.errors import SolveError
 from pipelines.geometry import levelling_rotation, yaw_pitch_roll
 from pipelines.rigs import rig_digest, rig_to_mapping
 from pipelines.survey import Progress, process
@@ -24,6 +26,7 @@ from pipelines.values import (
     ControlMarks,
     Levelling,
     MarkerFit,
+    MarkerFits,
     NoFix,
     Rig,
     ScanLog,
@@ -77,11 +80,13 @@ def survey_answer(log: ScanLog, stops: Sequence[StopResult], inputs: Inputs) -> 
 
 def stop_answer(stop: StopResult, inputs: Inputs) -> Plain:
     """Return all that one stop gave."""
-    marks, frame, truth = inputs.marks, inputs.frame, inputs.truth
+    frame, truth = inputs.frame, inputs.truth
     poses = {one.name: one for one in truth.stops} if truth else {}
     pose = poses.get(stop.name)
     R_frame_base = _rotation_to(frame, stop.cloud.levelling)
-    stations = [_station(method, stop, fix, marks, pose) for (method, _), fix in stop.fixes.items()]
+    stations = [
+        _station(method, stop, fix, inputs, pose) for (method, _), fix in stop.fixes.items()
+    ]
     first = stations[0] if stations else {"reason": NO_CONTROL}
     answer: Plain = {
         "name": stop.name,
@@ -94,6 +99,7 @@ def stop_answer(stop: StopResult, inputs: Inputs) -> Plain:
         "rejected": _rejected(stop, R_frame_base),
         "station": first if "position_m" in first else None,
         "stations": stations,
+        "distances": _distances(stop, inputs),
         "levelling": _levelling(stop.cloud.levelling),
         "sigma_heading_rad": stop.cloud.rig.sigma_heading,
         "scan": {
@@ -177,10 +183,11 @@ def _station(
     fit_method: str,
     stop: StopResult,
     fix: StationFix | NoFix,
-    marks: ControlMarks | None,
+    inputs: Inputs,
     pose: StopTruth | None,
 ) -> Plain:
     """Return the station by one fitting and one resection method, or why there is none."""
+    marks = inputs.marks
     methods = {"method": fix.method, "fit_method": fit_method}
     if isinstance(fix, NoFix) or marks is None:
         reason, code = (fix.reason, fix.code) if isinstance(fix, NoFix) else (NO_CONTROL, "")
@@ -206,6 +213,7 @@ def _station(
         "included_angle_max_deg": _number(high),
         "matches": _matches(fix, marks),
         "residuals_m": _numbers(fix.residuals_site),
+        "without_each": _without_each(fix, stop.fits[fit_method], marks, inputs.config),
         "excluded": [
             {"marker": marker_name(one.fit), "reason": one.reason} for one in fix.excluded
         ],
@@ -231,6 +239,63 @@ def _matches(fix: StationFix, marks: ControlMarks) -> list[Plain]:
         }
         for i, (fit, mark) in enumerate(fix.matches)
     ]
+
+
+def _without_each(
+    fix: StationFix, fits: MarkerFits, marks: ControlMarks, config: SurveyConfig
+) -> list[Plain]:
+    """Return the station without each of its markers, and each mark as the others predict it."""
+    if fix.method != "free_station":
+        return []
+    omissions = leave_each_out(fix, fits, marks, config.resection)
+    sigmas = np.sqrt(np.diagonal(omissions.cov_predictions, axis1=1, axis2=2))
+    return [
+        {
+            "marker": marker_name(int(fit)),
+            "mark": marks.names[mark],
+            "station_shift_m": _numbers(shift),
+            "station_shift_3d_m": float(np.linalg.norm(shift)),
+            "mark_predicted_minus_given_m": _numbers(off),
+            "sigma_predicted_minus_given_m": _numbers(sigma),
+        }
+        for (fit, mark), shift, off, sigma in zip(
+            fix.matches, omissions.shifts, omissions.predictions, sigmas, strict=False
+        )
+    ]
+
+
+def _distances(stop: StopResult, inputs: Inputs) -> Plain | None:
+    """Return the distances between marks in this scan against the control; null without any."""
+    method, marks = next(iter(stop.fits)), inputs.marks
+    if marks is None or len(stop.fits[method].fits) < 2 or len(marks.names) < 2:
+        return None
+    config = inputs.config
+    try:
+        checks = check_distances(stop.fits[method], marks, config.resection, config.tolerance)
+    except SolveError as error:
+        return {"reason": str(error), "n": 0, "n_off": 0, "suspects": [], "pairs": []}
+    columns = (checks.fits, checks.marks, checks.measured, checks.given, checks.sigmas)
+    pairs = [
+        {
+            "markers": [marker_name(int(fit)) for fit in fits],
+            "marks": [marks.names[mark] for mark in places],
+            "measured_m": float(measured),
+            "given_m": float(given),
+            "residual_m": float(measured - given),
+            "sigma_m": float(sigma),
+            "is_off": bool(is_off),
+        }
+        for fits, places, measured, given, sigma, is_off in zip(
+            *columns, checks.is_off, strict=True
+        )
+    ]
+    return {
+        "reason": "",
+        "n": len(pairs),
+        "n_off": int(checks.is_off.sum()),
+        "suspects": [marks.names[mark] for mark in checks.suspects],
+        "pairs": pairs,
+    }
 
 
 def _levelling(levelling: Levelling) -> Plain:

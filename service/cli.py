@@ -9,20 +9,30 @@ from __future__ import annotations
 import json
 import math
 import sys
-from collections.abc import Iterator
-from contextlib import contextmanager
 from enum import StrEnum
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
-from rich.console import Console
 
 from pipelines.errors import ConfigError, SpheremarkError
 from service.cli_plan import plan
+from service.cli_survey import (
+    Axes,
+    ControlAxes,
+    ControlFile,
+    ControlUnit,
+    TargetHeight,
+    Unit,
+    adjust,
+    calibrate,
+    read_control,
+)
+from service.terminal import err, out
+from service.terminal import print_json as _print_json
+from service.terminal import progress as _progress
 
 if TYPE_CHECKING:
-    from pipelines.survey import Progress
     from service.settings import Settings
 
 app = typer.Typer(
@@ -32,9 +42,6 @@ app = typer.Typer(
     add_completion=False,
 )
 app.add_typer(plan, name="plan")
-_WIDE = 160  # columns of a table that goes into a file or a pipe
-out = Console(width=None if sys.stdout.isatty() else _WIDE)
-err = Console(stderr=True)
 
 AsJson = Annotated[bool, typer.Option("--json", help="JSON for programs.")]
 LogFile = Annotated[Path, typer.Argument(exists=True, dir_okay=False, help="Log (MCAP).")]
@@ -189,9 +196,10 @@ def inspect(log: LogFile, as_json: AsJson = False) -> None:
 @app.command()
 def process(
     logs: Annotated[list[Path], typer.Argument(metavar="LOG...", exists=True, dir_okay=False)],
-    control: Annotated[
-        Path | None, typer.Option(exists=True, dir_okay=False, help="Control marks (CSV).")
-    ] = None,
+    control: ControlFile = None,
+    control_axes: ControlAxes = Axes.ENU,
+    control_unit: ControlUnit = Unit.METRE,
+    target_height_m: TargetHeight = 0.0,
     rig: Annotated[
         Path | None, typer.Option(exists=True, dir_okay=False, help="Rig (JSON), if not the log's.")
     ] = None,
@@ -228,7 +236,7 @@ def process(
     inputs = Inputs(
         config=config,
         rig=site_files.read_rig(rig) if rig else None,
-        marks=site_files.read_control(control) if control else None,
+        marks=read_control(control, control_axes, control_unit, target_height_m),
         truth=site_files.read_truth(truth) if truth else None,
         frame=frame.value,
     )
@@ -242,87 +250,8 @@ def process(
         _print_json(answers[0] if len(answers) == 1 else answers)
 
 
-@app.command()
-def adjust(
-    logs: Annotated[list[Path], typer.Argument(metavar="LOG...", exists=True, dir_okay=False)],
-    control: Annotated[
-        Path | None,
-        typer.Option(exists=True, dir_okay=False, help="Control marks (CSV); else a free network."),
-    ] = None,
-    rig: Annotated[
-        Path | None, typer.Option(exists=True, dir_okay=False, help="Rig (JSON), if not the logs'.")
-    ] = None,
-    method: Annotated[str, typer.Option(help="Fitting method.")] = "along_beam",
-    radius_m: Annotated[float, typer.Option(help="Radius of the spheres \\[m].")] = 0.100,
-    gama: Annotated[
-        Path | None, typer.Option(dir_okay=False, help="Write input of GNU Gama (XML).")
-    ] = None,
-    csv: Annotated[
-        Path | None, typer.Option(dir_okay=False, help="Write stations and marks (CSV).")
-    ] = None,
-    report: Annotated[
-        Path | None, typer.Option(dir_okay=False, help="Write the whole report (text).")
-    ] = None,
-    as_json: AsJson = False,
-) -> None:
-    """Adjust all stations and marks of a survey together."""
-    from pipelines.config import SurveyConfig
-    from service import networks, tables
-    from storage import site_files
-    from storage.networks import write_coordinates, write_gama
-
-    config = SurveyConfig.from_mapping(
-        {"marker_radius": radius_m, "fitting": {"methods": [method]}}
-    )
-    marks = site_files.read_control(control) if control else None
-    given = site_files.read_rig(rig) if rig else None
-    with _progress() as progress:
-        book = networks.read_scans(logs, config, given, progress)
-    result = networks.adjust_scans(book, marks, config)
-    answer = networks.network_answer(result, config)
-    if gama:
-        write_gama(result, gama)
-    if csv:
-        write_coordinates(result, csv)
-    if report:
-        report.write_text(networks.report(answer), encoding="utf-8")
-    if as_json:
-        _print_json(answer)
-    else:
-        tables.print_network(out, answer)
-
-
-@app.command()
-def calibrate(
-    logs: Annotated[list[Path], typer.Argument(metavar="LOG...", exists=True, dir_okay=False)],
-    rig: Annotated[
-        Path | None,
-        typer.Option(
-            exists=True, dir_okay=False, help="Rig to start with (JSON), if not the logs'."
-        ),
-    ] = None,
-    radius_m: Annotated[float, typer.Option(help="Radius of the spheres \\[m].")] = 0.100,
-    target: Annotated[
-        Path | None, typer.Option("--out", dir_okay=False, help="Write a rig file for --rig.")
-    ] = None,
-    as_json: AsJson = False,
-) -> None:
-    """Estimate the rig from the two faces of the spheres in logs."""
-    from pipelines.config import SurveyConfig
-    from service import calibrations, tables
-    from storage import site_files
-
-    config = SurveyConfig.from_mapping({"marker_radius": radius_m})
-    start = site_files.read_rig(rig) if rig else None
-    with _progress() as progress:
-        found = calibrations.calibrate_logs(logs, config, start, progress)
-    if target:
-        site_files.write_rig(found.rig, target)
-    answer = calibrations.calibration_answer(found)
-    if as_json:
-        _print_json(answer)
-    else:
-        tables.print_calibration(out, answer)
+app.command()(adjust)
+app.command()(calibrate)
 
 
 @app.command()
@@ -469,22 +398,6 @@ def _settings(**given: Any) -> Settings:
             name = "_".join(["SPHEREMARK", *(str(part).upper() for part in one["loc"])])
             err.print(f"[bold red]Error:[/] {name}: {one['msg']}", highlight=False, soft_wrap=True)
         raise typer.Exit(2) from None
-
-
-@contextmanager
-def _progress() -> Iterator[Progress]:
-    """Show a bar on standard error while something long runs."""
-    from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
-
-    columns = (BarColumn(), TextColumn("{task.description}"), TimeElapsedColumn())
-    with Progress(*columns, console=err, transient=True, disable=not err.is_terminal) as bar:
-        task = bar.add_task("", total=1.0)
-        yield lambda share, what: bar.update(task, completed=share, description=what)
-
-
-def _print_json(value: Any) -> None:
-    """Write JSON to standard output."""
-    sys.stdout.write(json.dumps(value, indent=2, allow_nan=False) + "\n")
 
 
 if __name__ == "__main__":

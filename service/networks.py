@@ -15,17 +15,34 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
+from pipelines.calibration import Calibration
 from pipelines.config import SurveyConfig
 from pipelines.errors import SpheremarkError
 from pipelines.geometry import yaw_pitch_roll
-from pipelines.network import AdjustedNetwork, BlockTests, Refusal, adjust_network, assemble
+from pipelines.network import (
+    AdjustedNetwork,
+    BlockTests,
+    Refusal,
+    Repeat,
+    adjust_network,
+    assemble,
+    repeated_stops,
+)
 from pipelines.survey import Progress, process
 from pipelines.values import ControlMarks, MarkerFits, Rig
+from service.calibrations import calibrate_logs, calibration_answer
+from service.network_report import report
 from storage.recordings import read_log
 from storage.results import ellipse, marker_name
 
+__all__ = [
+    "Fieldbook", "adjust_scans", "calibrate_scans", "calibrated", "network_answer", "read_scans",
+    "report",
+]  # fmt: skip
+
 Plain = dict[str, Any]
 
+_JOINT = 50  # marks whose joint covariance is in the JSON
 _SCANS = 0.95  # share of the work that the scans take
 _FREE = (
     "Free network: the levelled stations give the vertical; place and heading are those of the "
@@ -71,18 +88,39 @@ def _scans(
         yield stop.name, stop.fits[config.fitting.methods[0]]
 
 
+def calibrate_scans(
+    logs: Sequence[Path], book: Fieldbook, config: SurveyConfig, rig: Rig | None, progress: Progress
+) -> Calibration:
+    """Estimate the rig from the logs that gave stations, to be adjusted with the network."""
+    refused = {one.station for one in book.refused}
+    good = [log for log in logs if log.stem not in refused]
+    return calibrate_logs(good, config, rig, progress)
+
+
 def adjust_scans(
-    book: Fieldbook, control: ControlMarks | None, config: SurveyConfig
+    book: Fieldbook,
+    control: ControlMarks | None,
+    config: SurveyConfig,
+    calibration: Calibration | None = None,
 ) -> AdjustedNetwork:
-    """Adjust all stations and marks together."""
-    network = assemble(book.scans, control, config.resection)
+    """Adjust all stations and marks together, and the rig where it was calibrated before."""
+    network = assemble(book.scans, control, config.resection, calibration)
     network = replace(network, refused=(*book.refused, *network.refused))
     return adjust_network(network, config.resection)
 
 
-def network_answer(result: AdjustedNetwork, config: SurveyConfig) -> Plain:
-    """Return a network as plain values."""
+def calibrated(result: AdjustedNetwork, calibration: Calibration) -> Calibration:
+    """Return a calibration with what the network adds to it."""
+    k = len(calibration.unknowns)
+    return calibration.corrected(result.shared[:k], result.cov_shared[:k, :k])
+
+
+def network_answer(
+    result: AdjustedNetwork, config: SurveyConfig, calibration: Calibration | None = None
+) -> Plain:
+    """Return a network as plain values; ``calibration`` as it was before the network."""
     network = result.network
+    rig = None if calibration is None else calibrated(result, calibration)
     return {
         "status": "weak" if result.warnings else "ok",
         "warnings": list(result.warnings),
@@ -93,9 +131,11 @@ def network_answer(result: AdjustedNetwork, config: SurveyConfig) -> Plain:
         "marks": [_mark(result, i) for i in range(len(network.marks))],
         "observations": [_observation(result, i) for i in range(len(network.sightings))],
         "gravity": _blocks(result.gravity, network.stations, "station", "rad"),
-        "control": _blocks(
-            result.control, [network.marks[m] for m in network.controls], "mark", "m"
-        ),
+        "control": _control(result),
+        "repeated_stops": [_repeat(network.stations, one) for one in repeated_stops(result)],
+        "calibration": None if rig is None else calibration_answer(rig),
+        "shared_unknowns": _shared(result),
+        "marks_covariance_m2": _joint(result),
         "excluded": [
             {
                 "kind": one.kind,
@@ -141,8 +181,50 @@ def _n_observations(result: AdjustedNetwork) -> int:
 
 
 def _n_biases(result: AdjustedNetwork) -> int:
-    """Return the number of range biases, each an unknown and by its prior an observation."""
-    return int(result.network.sigma_range > 0.0)
+    """Return the number of shared unknowns, each by what was known of it an observation too."""
+    return len(result.network.shared.names)
+
+
+def _shared(result: AdjustedNetwork) -> list[Plain]:
+    """Return what all stations share: range bias and, in a calibration, corrections of the rig."""
+    sigmas, shared = np.sqrt(np.diag(result.cov_shared)), result.network.shared
+    redundancies = 1.0 - np.diag(shared.weights @ result.cov_shared)
+    rows = zip(shared.names, result.shared, sigmas, redundancies, strict=True)
+    return [
+        {"name": name, "value": float(value), "sigma": float(sigma), "redundancy": float(r)}
+        for name, value, sigma, r in rows
+    ]
+
+
+def _joint(result: AdjustedNetwork) -> Any:
+    """Return the joint covariance of all marks; null where there are very many."""
+    return _numbers(result.cov_p_site) if len(result.p_site) <= _JOINT else None
+
+
+def _control(result: AdjustedNetwork) -> list[Plain]:
+    """Return the control marks, each also as all else predicts it."""
+    network = result.network
+    rows = _blocks(result.control, [network.marks[m] for m in network.controls], "mark", "m")
+    for i, row in enumerate(rows):
+        cov, is_told = result.cov_control_predictions[i], result.control_predictions[i, 0]
+        told = bool(np.isfinite(is_told))
+        sigmas = np.sqrt(np.diag(cov))
+        off = _numbers(result.control_predictions[i])
+        row["predicted_minus_given_m"] = off if told else None
+        row["sigma_predicted_minus_given_m"] = _numbers(sigmas) if told else None
+    return rows
+
+
+def _repeat(names: Sequence[str], repeat: Repeat) -> Plain:
+    """Return two stations that stand at one place."""
+    return {
+        "stations": [names[i] for i in repeat.stations],
+        "apart_m": _numbers(repeat.apart),
+        "apart_3d_m": float(np.linalg.norm(repeat.apart)),
+        "n_marks": repeat.n_marks,
+        "difference_rms_m": repeat.rms,
+        "predicted_rms_m": repeat.predicted_rms,
+    }
 
 
 def _range_bias(result: AdjustedNetwork) -> Plain | None:
@@ -195,6 +277,8 @@ def _mark(result: AdjustedNetwork, i: int) -> Plain:
     return {
         "name": network.marks[i],
         "is_control": i in network.controls,
+        "status": "weak" if result.mark_weaknesses[i] else "ok",
+        "reason": result.mark_weaknesses[i],
         "position_m": _numbers(result.p_site[i]),
         "covariance_m2": _numbers(cov),
         "sigma_3d_m": float(np.sqrt(np.trace(cov))),
@@ -236,149 +320,9 @@ def _blocks(tests: BlockTests, names: Sequence[str], kind: str, unit: str) -> li
     ]
 
 
-def report(answer: Plain, title: str = "") -> str:
-    """Return a network as a text that surveyors read, from its JSON."""
-    parts = [
-        *_summary(answer, title),
-        *_coordinates("ADJUSTED STATIONS", answer["stations"]),
-        *_coordinates("ADJUSTED MARKS (* control)", answer["marks"]),
-        *_centres(answer),
-        *_others(answer),
-        *_not_used(answer),
-    ]
-    return "\n".join(parts) + "\n"
-
-
-def _summary(answer: Plain, title: str) -> list[str]:
-    """Return what the adjustment is and whether it holds."""
-    test, factors = answer["global_test"], answer["variance_factors"]
-    verdict = "passed" if answer["passes_global_test"] else "FAILED"
-    lines = [
-        f"NETWORK ADJUSTMENT{'  ' + title if title else ''}",
-        "=" * 78,
-        f"Stations                        {len(answer['stations']):8d}",
-        f"Marks                           {len(answer['marks']):8d}",
-        f"Observations (coordinates)      {answer['n_observations']:8d}",
-        f"Unknowns                        {answer['n_unknowns']:8d}",
-        f"Defect of the datum             {answer['datum']['defect']:8d}",
-        f"Degrees of freedom              {answer['dof']:8d}",
-        "",
-        "Variance factor a priori           1.000",
-        f"Variance factor a posteriori    {_fixed(_square(answer['sigma0']), 3, 8)}",
-        f"Sigma0 a posteriori             {_fixed(answer['sigma0'], 3, 8)}",
-        *(f"  of {kind:<8}                   {_fixed(factors[kind], 3, 8)}  (variance factor)"
-          for kind in ("centres", "gravity", "control")),
-        f"Global test (chi-square, one-sided, level {test['level']:g}): v'Pv = {test['vtpv']:.1f}, "
-        f"limit {test['limit']:.1f}: {verdict}",
-        f"Local test (w): limit {answer['critical_w']:.2f}",
-        *_bias_line(answer["range_bias"]),
-        f"Datum: {answer['datum']['text']}",
-    ]  # fmt: skip
-    return [*lines, *(f"WARNING: {one}" for one in answer["warnings"]), ""]
-
-
-def _bias_line(bias: Plain | None) -> list[str]:
-    """Return what all ranges are too long, if the network has it as an unknown."""
-    if bias is None:
-        return []
-    value, sigma, prior = (1e3 * bias[k] for k in ("value_m", "sigma_m", "sigma_a_priori_m"))
-    return [
-        f"All ranges too long by {value:.2f} mm, sigma {sigma:.2f} mm (a priori {prior:.2f} mm)"
-    ]
-
-
-def _coordinates(title: str, rows: Sequence[Plain]) -> list[str]:
-    """Return coordinates with sigmas and 95 % ellipses."""
-    lines = [
-        title,
-        "-" * 78,
-        f"{'Name':<14} {'X':>12} {'Y':>12} {'Z':>12} {'sX':>5} {'sY':>5} {'sZ':>5} {'a95':>6} "
-        f"{'b95':>6} {'bearing':>7} {'seen':>4}",
-        f"{'':<14} {'[m]':>12} {'[m]':>12} {'[m]':>12} {'[mm]':>5} {'[mm]':>5} {'[mm]':>5} "
-        f"{'[mm]':>6} {'[mm]':>6} {'[deg]':>7}",
-    ]
-    for row in rows:
-        name = row["name"] + ("*" if row.get("is_control") else "")
-        x, y, z = row["position_m"]
-        cov = row.get("position_covariance_m2") or row["covariance_m2"]
-        sigmas = " ".join(f"{1e3 * math.sqrt(cov[k][k]):5.1f}" for k in range(3))
-        a, b = 1e3 * row["ellipse_major_95_m"], 1e3 * row["ellipse_minor_95_m"]
-        lines.append(
-            f"{name:<14} {x:12.4f} {y:12.4f} {z:12.4f} {sigmas} {a:6.1f} {b:6.1f} "
-            f"{row['ellipse_bearing_deg']:7.1f} {row['n_observations']:4d}"
-        )
-    return [*lines, ""]
-
-
-def _centres(answer: Plain) -> list[str]:
-    """Return observed centres with residuals and reliability, the worst first."""
-    lines = [
-        "OBSERVED CENTRES, largest w first (v observed - computed, r of 3, EX: shift by an MDB)",
-        "-" * 78,
-        f"{'Station':<14} {'Marker':<6} {'Mark':<8} {'vX':>6} {'vY':>6} {'vZ':>6} {'r':>5} "
-        f"{'w':>5} {'MDB':>6} {'EX stn':>7} {'EX mark':>8}",
-        f"{'':<30} {'[mm]':>6} {'[mm]':>6} {'[mm]':>6} {'':>5} {'':>5} {'[mm]':>6} {'[mm]':>7} "
-        f"{'[mm]':>8}",
-    ]
-    rows = sorted(answer["observations"], key=lambda row: -(row["w"] or 0.0))
-    for row in rows:
-        v = " ".join(f"{1e3 * value:6.1f}" for value in row["residual_m"])
-        reach = " ".join(
-            _fixed(None if row[key] is None else 1e3 * row[key], 1, width)
-            for key, width in (
-                ("minimal_detectable_bias_m", 6),
-                ("external_reliability_station_m", 7),
-                ("external_reliability_mark_m", 8),
-            )
-        )
-        lines.append(
-            f"{row['station']:<14} {row['marker']:<6} {row['mark']:<8} {v} "
-            f"{_fixed(row['redundancy'], 2, 5)} {_fixed(row['w'], 2, 5)} {reach}"
-            f"{'' if row['used'] else '  left out'}"
-        )
-    return [*lines, ""]
-
-
-def _others(answer: Plain) -> list[str]:
-    """Return residuals of levelling and control."""
-    lines = ["OBSERVED LEVELLING", "-" * 78, "Station          vX [deg]  vY [deg]     r     w"]
-    for row in answer["gravity"]:
-        v = " ".join(f"{math.degrees(value):9.3f}" for value in row["residual_rad"])
-        lines.append(
-            f"{row['station']:<14} {v} {_fixed(row['redundancy'], 2, 5)} {_fixed(row['w'], 2, 5)}"
-        )
-    if answer["control"]:
-        lines += ["", "CONTROL MARKS", "-" * 78, "Mark            vX [mm]  vY [mm]  vZ [mm]     w"]
-    for row in answer["control"]:
-        v = " ".join(f"{1e3 * value:8.2f}" for value in row["residual_m"])
-        lines.append(f"{row['mark']:<14} {v} {_fixed(row['w'], 2, 5)}")
-    return [*lines, ""]
-
-
-def _not_used(answer: Plain) -> list[str]:
-    """Return what was left out, and why."""
-    lines = ["NOT USED", "-" * 78]
-    lines += [f"Station {one['station']}: {one['reason']}" for one in answer["refused"]]
-    for one in answer["excluded"]:
-        named = [one["station"], one["marker"], one["mark"]]
-        what = " ".join(part for part in named if part)
-        lines.append(f"{one['kind'].capitalize()} {what}: {one['reason']}")
-    return lines if len(lines) > 2 else [*lines, "Nothing: all observations were used."]
-
-
 def _part(progress: Progress, i: int, n: int) -> Progress:
     """Return the progress of log ``i`` of ``n`` as a share of the whole."""
     return lambda share, what: progress(_SCANS * (i + share) / n, what)
-
-
-def _square(value: float | None) -> float | None:
-    """Return the square of a number, if there is one."""
-    return None if value is None else value**2
-
-
-def _fixed(value: float | None, digits: int, width: int) -> str:
-    """Return a number of fixed width, or a dash."""
-    return f"{'-':>{width}}" if value is None else f"{value:{width}.{digits}f}"
 
 
 def _number(value: float) -> float | None:

@@ -127,30 +127,46 @@ def _print_one_by_one(out: Console, heads: Sequence[str], rows: Sequence[Sequenc
 
 def print_bench(out: Console, report: Plain) -> None:
     """Print times as ratios to one read of the file, and what the usual libraries need."""
-    log, memory = report["log"], report["memory"]
+    log = report["log"]
     out.print(
         f"{log['name']}: {log['size_bytes'] / 1e6:.1f} MB, {log['n_returns']:,} returns; "
-        f"best of {report['repeats']}. The unit is {report['yardstick']}."
+        f"best of {report['repeats']}. 1 x is {report['yardstick']}: "
+        f"{1e3 * report['yardstick_seconds']:.1f} ms."
     )
     rows = [
-        (step["step"], f"{step['seconds'] * 1e3:,.1f}", f"{step['ratio']:,.1f}")
+        (step["step"], f"{step['seconds'] * 1e3:,.1f}", f"{step['ratio']:,.2f}")
         for step in report["steps"]
     ]
-    rows += [
-        (f"the same as {v['name']}", f"{v['chain_seconds'] * 1e3:,.1f}", f"{v['ratio']:,.1f}")
-        for v in report["variants"]
-    ]
     out.print(_table(("step", "time [ms]", "x read+CRC"), rows))
+    _print_variants(out, report)
     _print_peers(out, report)
-    for one in report.get("linearity", ()):
-        out.print(
-            f"{one['n_returns']:,} returns: {one['seconds']:.2f} s, {one['ns_per_return']:.0f} ns "
-            f"each, {one['ratio']:.1f} x read+CRC"
-        )
+    _print_growth(out, report)
+    memory = report["memory"]
     out.print(
         f"Memory of a fresh process: {memory['before_bytes'] / 1e6:,.0f} MB resident after its "
-        f"imports, at most {memory['peak_bytes'] / 1e6:,.0f} MB during one scan."
+        f"imports, at most {memory['peak_bytes'] / 1e6:,.0f} MB during one scan "
+        f"(bar: {memory['bar_bytes'] / 1e6:,.0f} MB)."
     )
+
+
+def _print_variants(out: Console, report: Plain) -> None:
+    """Print what the chain costs on one scan in each dress, against what it may cost."""
+    rows = [
+        (
+            one["name"],
+            f"{one['size_bytes'] / 1e6:.1f}",
+            f"{1e3 * one['read_log_seconds']:,.1f}",
+            f"{one['read_log_ratio']:.2f}",
+            f"{1e3 * one['chain_seconds']:,.1f}",
+            f"{one['ratio']:.1f}",
+            "-" if one["bar_ratio"] is None else f"{one['bar_ratio']:.0f}",
+            f"{1e3 * one['peer_seconds']:,.0f}" if "peer_seconds" in one else "-",
+            f"{one['factor']:.1f}" if "factor" in one else "-",
+        )
+        for one in report["variants"]
+    ]
+    heads = ("log", "MB", "reading [ms]", "x read+CRC", "log to rows [ms]", "x read+CRC", "at most")
+    out.print(_table((*heads, "usual libraries [ms]", "x ours"), rows))
 
 
 def _print_peers(out: Console, report: Plain) -> None:
@@ -166,6 +182,14 @@ def _print_peers(out: Console, report: Plain) -> None:
             for one in peers
         ]
         out.print(_table(("step", "ours [ms]", "usual libraries [ms]", "x ours"), rows))
+        out.print(f"Bar: the chain at least {report['bar_factor']:.0f} times quicker than theirs.")
+    if pcl := report.get("pcl"):
+        said = ", ".join(
+            f"{step} {1e3 * pcl[f'{step}_seconds']:,.0f} ms"
+            for step in ("plane", "clusters")
+            if f"{step}_seconds" in pcl
+        )
+        out.print(f"PCL, files not counted: {said}.")
     if accuracy := report.get("accuracy"):
         rows = [
             (
@@ -177,6 +201,39 @@ def _print_peers(out: Console, report: Plain) -> None:
             for one in accuracy
         ]
         out.print(_table(("centres", "found", "false", "RMS error [mm]"), rows))
+
+
+def _print_growth(out: Console, report: Plain) -> None:
+    """Print how cost grows with returns and with stations."""
+    if linearity := report.get("linearity"):
+        rows = [
+            (
+                f"{one['n_returns']:,}",
+                f"{one['seconds']:.3f}",
+                f"{one['ns_per_return']:.0f}",
+                f"{one['ratio']:.1f}",
+            )
+            for one in linearity["sizes"]
+        ]
+        out.print(_table(("returns", "log to rows [s]", "ns a return", "x read+CRC"), rows))
+        out.print(
+            f"Straight line: {1e3 * linearity['fixed_seconds']:.1f} ms and "
+            f"{linearity['line_ns_per_return']:.1f} ns a return; no size is farther from it than "
+            f"{100 * linearity['worst_share_off_line']:.0f} %."
+        )
+    if networks := report.get("network"):
+        rows = [
+            (
+                f"{one['n_stations']:,} x {one['n_marks']}",
+                f"{one['assembly_seconds']:.2f}",
+                f"{one['adjustment_seconds']:.2f}",
+                f"{1e3 * one['adjustment_seconds'] / one['n_stations']:.2f}",
+                f"{one['ms_per_station']:.2f}",
+            )
+            for one in networks
+        ]
+        heads = ("stations x marks", "assembly [s]", "adjustment [s]", "ms a station", "both [ms]")
+        out.print(_table(heads, rows))
 
 
 _SAID = ("distance", "count", "mean_distance", "mean_count")

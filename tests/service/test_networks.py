@@ -148,3 +148,71 @@ def test_people_get_tables(logs):
     assert "Network: ok" in text
     assert "lane2-stop2" in text
     assert "M14" in text
+
+
+def test_each_control_mark_is_predicted_by_all_else(tied, logs):
+    given = dict(zip(*control_of(logs), strict=True))
+    for row in tied["control"]:
+        off = np.array(row["predicted_minus_given_m"])
+        sigma = np.array(row["sigma_predicted_minus_given_m"])
+        assert row["mark"] in given
+        assert np.all(np.abs(off) < 5 * sigma)
+        assert 0 < np.linalg.norm(off) < 0.03
+        assert np.all(sigma > 1e-4)
+
+
+def control_of(logs):
+    control = read_control(logs[0].parent / "control.csv")
+    return control.names, control.p_site
+
+
+def test_control_in_feet_at_the_feet_of_poles_gives_the_same_stations(tied, logs, tmp_path):
+    names, p = control_of(logs)
+    foot, height = 0.3048, 1.25
+    rows = [
+        f"{name},{n / foot!r},{e / foot!r},{(u - height) / foot!r},ball"
+        for name, (e, n, u) in zip(names, p.tolist(), strict=True)
+    ]
+    path = tmp_path / "book.csv"
+    path.write_text("\n".join(rows))
+    options = ("--control-axes", "neu", "--control-unit", "ft", "--target-height-m", height)
+    answer = json.loads(run(*logs, "--control", path, *options, "--json").stdout)
+    for one, other in zip(answer["stations"], tied["stations"], strict=True):
+        np.testing.assert_allclose(one["position_m"], other["position_m"], rtol=0, atol=1e-6)
+
+
+def test_a_stop_that_was_scanned_twice_is_compared_with_itself(logs, tmp_path):
+    again = tmp_path / "again.mcap"
+    again.write_bytes(logs[0].read_bytes())
+    answer = json.loads(run(logs[0], again, logs[1], "--json").stdout)
+    (repeat,) = answer["repeated_stops"]
+    assert set(repeat["stations"]) == {STOPS[0], "again"}
+    assert repeat["apart_3d_m"] < 1e-6
+    assert repeat["difference_rms_m"] < 1e-6 < 1e-3 < repeat["predicted_rms_m"]
+
+
+def test_the_joint_covariance_of_marks_has_theirs_on_its_diagonal(free):
+    joint = np.array(free["marks_covariance_m2"])
+    for i, mark in enumerate(free["marks"]):
+        block = joint[3 * i : 3 * i + 3, 3 * i : 3 * i + 3]
+        np.testing.assert_allclose(block, mark["covariance_m2"], rtol=1e-9)
+    assert all(mark["status"] == "ok" for mark in free["marks"])
+
+
+def test_a_rig_is_adjusted_with_the_network_and_serves_as_a_rig(logs, tmp_path):
+    answer = json.loads(run(*logs[:2], "--calibrate", "--json").stdout)
+    rig = answer["calibration"]
+    names = [row["name"] for row in rig["parameters"]]
+    assert names[:2] == ["axis_offset_x", "axis_offset_y"]
+    assert np.shape(rig["covariance"]) == (len(names), len(names))
+    assert "common_range_bias" in [row["name"] for row in answer["shared_unknowns"]]
+    rows = [*answer["observations"], *answer["gravity"], *answer["shared_unknowns"]]
+    assert sum(row["redundancy"] or 0.0 for row in rows) == pytest.approx(answer["dof"], abs=1e-3)
+    truth = read_truth(logs[0].with_name(f"{logs[0].stem}.truth.json")).rig
+    place = names.index("axis_offset_x")
+    off = rig["parameters"][place]["estimate"] - truth.T_head_lidar[0, 3]
+    assert abs(off) < 4 * rig["parameters"][place]["sigma"] < 4e-3
+    path = tmp_path / "rig.json"
+    path.write_text(json.dumps(rig))
+    again = json.loads(run(*logs[:2], "--rig", path, "--json").stdout)
+    assert again["passes_global_test"]
