@@ -8,6 +8,7 @@ the exported observations need no adjustment.
 
 from pipelines.network.adjusting import adjust_network
 from pipelines.network.assembly import assemble
+from pipelines.network.repeats import Repeat, repeated_stops
 from pipelines.network.values import (
     RANGE_BIAS,
     AdjustedNetwork,
@@ -25,7 +26,9 @@ __all__ = [
     "LeftOut",
     "Network",
     "Refusal",
+    "Repeat",
     "Shared",
     "adjust_network",
     "assemble",
+    "repeated_stops",
 ]
