@@ -1,6 +1,7 @@
 """Jobs over a survey as a whole: its network adjusted and its gimbal calibrated over HTTP."""
 
 import json
+from dataclasses import replace
 from types import SimpleNamespace
 from xml.etree import ElementTree as ET
 
@@ -12,13 +13,14 @@ from pipelines.simulation import SimulationConfig
 from service.app import create_app
 from service.fieldwork import Assignment, survey
 from service.settings import Settings
+from storage.recordings import read_log, write_log
 
-STOPS = ("lane2-stop2", "lane3-stop5", "lane4-stop3")
+STOPS = ("lane2-stop2", "lane4-stop3")
 
 
 @pytest.fixture(scope="module")
 def field(tmp_path_factory):
-    """Return three stops on disk: only beams near spheres, which is all that centres need."""
+    """Return two stops on disk: only beams near spheres, which is all that centres need."""
     wanted = Assignment(
         scenario="paper-field",
         stops=",".join(STOPS),
@@ -32,7 +34,7 @@ def field(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def site(tmp_path_factory, field, open_site):
-    """Return a service with a survey whose three logs were processed."""
+    """Return a service with a survey whose two logs were processed."""
     settings = Settings(data=tmp_path_factory.mktemp("data"), workers=1)
     with TestClient(create_app(settings), base_url="http://127.0.0.1:8000") as client:
         site = open_site(client, field.stops[0], field.control)
@@ -91,9 +93,10 @@ def free(run):
 
 
 @pytest.fixture(scope="module")
-def calibrated(run):
+def calibrated(site, run):
     """Return the job of the calibration."""
-    return run("calibrate")
+    recording = site.client.get("/api/v1/recordings").json()["items"][0]["recording_id"]
+    return run("calibrate", recordings=[recording])
 
 
 def test_a_network_with_control_is_near_the_truth_and_says_how_near(tied, rows):
@@ -194,6 +197,7 @@ def test_later_jobs_use_the_rig_that_was_chosen_and_name_it(site, calibrated, ru
     assert chosen["rig_digest"] == whole["rig_digest"]
     job = run("adjust")
     site.client.put(url, json={"rig_digest": None}).raise_for_status()
+    assert job["status"] == "successful", job
     assert job["options"]["rig"] == whole["rig_digest"]
     assert {row["rig_digest"] for row in rows("adjusted_stations", job)} == {whole["rig_digest"]}
     assert run("adjust")["options"].get("rig") is None
@@ -312,3 +316,45 @@ def test_a_form_that_asks_for_nothing_known_is_refused(site):
     answer = site.client.post("/surveys/field/jobs", data={"kind": "process"})
     assert (answer.status_code, answer.json()["code"]) == (400, "input")
     assert site.client.post("/surveys/field/jobs", json={"kind": "adjust"}).status_code == 400
+
+
+@pytest.fixture(scope="module")
+def cut(field, tmp_path_factory):
+    """Return a log whose gimbal turned by less than half a turn, and one that shows no sphere."""
+    folder, log = tmp_path_factory.mktemp("cut"), read_log(field.stops[0].log)
+    stamps = log.stamps_lidar_ns
+    part = stamps < stamps[0] + 0.4 * (stamps[-1] - stamps[0])
+    rows = {"part": np.flatnonzero(part), "bare": np.arange(0, len(stamps), 600)}
+    columns = ("p_lidar", "intensities", "rings", "stamps_lidar_ns")
+    for name, keep in rows.items():
+        few = {column: getattr(log, column)[keep].copy() for column in columns}
+        write_log(replace(log, **few), folder / f"{name}.mcap")
+    return {name: (folder / f"{name}.mcap").read_bytes() for name in rows}
+
+
+def test_less_than_half_a_turn_cannot_calibrate(site, run, cut):
+    part = site.upload(cut["part"], "part").json()["recording_id"]
+    job = run("calibrate", recordings=[part])
+    assert (job["status"], job["error_code"]) == ("failed", "solve.degenerate"), job
+    assert "both faces" in job["error_reason"]
+
+
+def test_a_log_that_shows_no_sphere_costs_a_network_no_other(site, run, rows, cut):
+    bare = site.upload(cut["bare"], "bare").json()["recording_id"]
+    items = site.client.get("/api/v1/recordings").json()["items"]
+    good = [item["recording_id"] for item in items if item["name"] in STOPS]
+    job = run("adjust", recordings=[bare, *good])
+    assert job["status"] == "successful", job
+    assert {row["station"] for row in rows("adjusted_stations", job)} == set(STOPS)
+    (refused,) = rows("refused_stations", job)
+    assert (refused["station"], refused["code"]) == ("bare", "solve.no_markers")
+    assert "Without bare" in job["message"]
+
+
+def test_logs_that_all_show_no_sphere_fail_with_the_reason_of_the_first(site, run, cut):
+    bare = site.upload(cut["bare"], "bare").json()["recording_id"]
+    for kind in ("adjust", "calibrate"):
+        job = run(kind, recordings=[bare])
+        assert job["status"] == "failed"
+        assert job["error_code"].startswith("solve.")
+        assert job["error_reason"]
