@@ -72,13 +72,17 @@ def process(
     Notes
     -----
     A station that cannot be positioned does not cost its markers: its fix is a ``NoFix`` with the
-    reason. Cost grows linearly with the returns.
+    reason. Cost grows linearly with the returns. A log is let go as soon as it is stitched: who
+    keeps no reference to it, as in ``process(read_log(path), ...)``, needs less memory.
     """
     rig = choose_rig(log, rig)
-    stops = split_stops(log, config.stitching)
-    results = []
-    for i, stop in enumerate(stops):
-        results.append(_process_stop(stop, rig, marks, config, _part(progress, i, len(stops))))
+    stops = list(split_stops(log, config.stitching))
+    del log
+    results: list[StopResult] = []
+    n = len(stops)
+    while stops:
+        part = _part(progress, len(results), n)
+        results.append(_process_stop(stops.pop(0), rig, marks, config, part))
     if not any(fits.fits for result in results for fits in result.fits.values()):
         raise NoMarkersError(_why_no_markers(results, config))
     return tuple(results)
@@ -93,9 +97,11 @@ def _process_stop(
 ) -> StopResult:
     """Run the chain on one stop."""
     timings: dict[str, float] = {}
-    progress(0.0, f"Stitching {log.origin.name}")
+    name = log.origin.name
+    progress(0.0, f"Stitching {name}")
     with _timed(timings, "stitching"):
         cloud = stitch(log, rig, config.stitching)
+    del log
     progress(0.3, f"Extracting markers from {len(cloud.p_base):,} returns")
     with _timed(timings, "extraction"):
         candidates = extract(cloud, config.extraction, config.marker_radius)
@@ -112,9 +118,9 @@ def _process_stop(
         fixes = _position(fits, marks, config, cloud.coverage)
     with _timed(timings, "subsets"):
         subsets = _subsets(fits, fixes, marks, config)
-    progress(1.0, f"{log.origin.name} done")
+    progress(1.0, f"{name} done")
     return StopResult(
-        name=log.origin.name, cloud=cloud, fits=fits, fixes=fixes, subsets=subsets, timings=timings
+        name=name, cloud=cloud, fits=fits, fixes=fixes, subsets=subsets, timings=timings
     )
 
 

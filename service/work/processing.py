@@ -8,7 +8,7 @@ from datetime import UTC, datetime
 from time import perf_counter
 from typing import TYPE_CHECKING
 
-from pipelines.values import NoFix, Origin, Status, StopResult
+from pipelines.values import NoFix, Origin, ScanLog, Status, StopResult
 from service.provenance import code_version, forget_peak_memory, peak_memory
 from service.work.orders import Log, Order, Outcome
 
@@ -30,15 +30,13 @@ def process_log(
     """Read a log, run the chain, store the clouds, make the tables of a run."""
     from pipelines.survey import process
     from storage.clouds import write_cloud
-    from storage.recordings import read_log
     from storage.results import RunInfo, tables
 
     start = perf_counter()
     forget_peak_memory()
     progress(0.0, f"Reading {recording.name}")
-    log = read_log(recording.url, digest=recording.recording_id)
     stops = process(
-        replace(log, origin=Origin(name=recording.name, digest=recording.recording_id)),
+        _read(recording),  # and not kept: it is let go once it is stitched
         config=order.config,
         rig=order.rig,
         marks=order.marks,
@@ -79,3 +77,11 @@ def _stop_summary(stop: StopResult) -> str:
         f"{1000 * fix.sigma_3d:.1f} mm (3-D)"
     )
     return f"{sigma}; weak: {fix.reason}" if fix.status is Status.WEAK else f"{sigma}."
+
+
+def _read(recording: Log) -> ScanLog:
+    """Read a log; it is called as the service calls the recording."""
+    from storage.recordings import read_log
+
+    log = read_log(recording.url, digest=recording.recording_id)
+    return replace(log, origin=Origin(name=recording.name, digest=recording.recording_id))

@@ -54,6 +54,42 @@ def test_a_marker_half_of_which_is_hidden_is_found(few):
     assert near(rough(extract(half, ExtractionConfig(), RADIUS)))[0]
 
 
+def aside(cloud, place):
+    """How far to a side of a centre each beam passes, in radii; far for those behind."""
+    side = np.cross([0.0, 0.0, 1.0], place)
+    along = cloud.p_base @ place
+    passes = (cloud.p_base @ (side / np.linalg.norm(side))) / along * (place @ place) / RADIUS
+    return np.where(along > 0.0, passes, -np.inf)
+
+
+@pytest.mark.parametrize(("seen_to", "is_found"), [(0.5, True), (0.0, True), (-0.5, False)])
+def test_a_marker_at_the_edge_of_a_partial_turn_is_found_if_half_of_it_is_seen(
+    few, seen_to, is_found
+):
+    place = ring_of_markers(n=5)[0]
+    seen = aside(few, place) <= seen_to
+    found = extract(
+        replace(few, **{name: getattr(few, name)[seen] for name in COLUMNS}),
+        ExtractionConfig(),
+        RADIUS,
+    )
+    assert near(rough(found))[0] == is_found
+    refused = [r.reason for r in found.rejected if np.linalg.norm(r.p_base - place) < 2 * RADIUS]
+    assert bool(refused) != is_found
+    assert all("slim" in reason for reason in refused)
+
+
+def test_a_marker_most_of_which_is_behind_something_is_refused_with_a_reason(few):
+    place = ring_of_markers(n=5)[0]
+    passes, p = aside(few, place), few.p_base.copy()
+    is_behind = (passes > -0.4) & (passes < 2.0)  # 70 % of its width
+    p[is_behind] *= 0.5
+    found = extract(replace(few, p_base=p), ExtractionConfig(), RADIUS)
+    assert not near(rough(found))[0]
+    assert any(np.linalg.norm(r.p_base - place) < 2 * RADIUS for r in found.rejected)
+    assert near(rough(found))[1:].all()
+
+
 @pytest.mark.slow
 def test_markers_are_found_and_nothing_else_in_worlds_of_clutter():
     found = detection(DETECTION_PLAN, (22,), SimulationConfig())

@@ -1,3 +1,4 @@
+import weakref
 from dataclasses import replace
 
 import numpy as np
@@ -114,3 +115,16 @@ def test_progress_rises_and_may_stop_the_work(stop):
 
     with pytest.raises(KeyboardInterrupt):
         process(stop.log, config=CONFIG, progress=stop_it)
+
+
+def test_a_log_that_nobody_else_keeps_is_let_go_once_it_is_stitched(stop):
+    logs = [replace(stop.log, p_lidar=stop.log.p_lidar.copy())]
+    returns = weakref.ref(logs[0].p_lidar)
+    is_kept = {}
+    process(
+        logs.pop(),
+        config=CONFIG,
+        progress=lambda _share, what: is_kept.update({what.split()[0]: returns() is not None}),
+    )
+    assert is_kept["Stitching"]
+    assert not is_kept["Extracting"]
