@@ -126,4 +126,4 @@ def _variances(numbers: dict[str, np.ndarray]) -> np.ndarray:
     variances = np.einsum("nij,njk,nik->ni", axes, cov, axes)
     heading2 = (np.radians(numbers["sigma_heading_deg"]) * flat) ** 2
     variances[:, 1] = np.maximum(variances[:, 1] - heading2, 0.05 * variances[:, 1])
-    return variances
+    return np.asarray(variances)

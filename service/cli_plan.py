@@ -5,15 +5,12 @@ from __future__ import annotations
 import json
 import sys
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated, Any
 
 import typer
 from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
-
-if TYPE_CHECKING:
-    from service.plans import Asked
 
 plan = typer.Typer(
     help="Where to put markers: evaluate, optimise, try at random.", no_args_is_help=True
@@ -258,7 +255,7 @@ def _ask(data: Path | None, server: str | None) -> Any:
     from service.client import Source
     from service.settings import Settings
 
-    settings = Settings(**({"data": data} if data else {}))
+    settings = Settings(data=data) if data else Settings()
     return Source(settings, server, folder=data).ask
 
 
@@ -301,9 +298,9 @@ def _print(answer: dict[str, Any]) -> None:
     for line in answer.get("notes", ()):
         out.print(line, markup=False, highlight=False)
     if one := answer.get("one_more"):
-        place = ", ".join(f"{v:.2f}" for v in one["position_m"])
+        at = ", ".join(f"{v:.2f}" for v in one["position_m"])
         out.print(
-            f"One more mark at {place} m (pole {one['pole_height_m']:.2f} m) would bring the worst "
+            f"One more mark at {at} m (pole {one['pole_height_m']:.2f} m) would bring the worst "
             f"stop from {_text(one['worst_sigma_3d_before_m'], 1e3, 2)} to "
             f"{_text(one['worst_sigma_3d_m'], 1e3, 2)} mm.",
             highlight=False,

@@ -181,4 +181,4 @@ def _ply(path: Path) -> Array:
 
     if not path.read_bytes()[:4].startswith(b"ply"):
         raise ValueError("its first line is not 'ply'")
-    return np.asarray(o3d.io.read_point_cloud(str(path)).points, dtype=np.float64)
+    return np.asarray(o3d.io.read_point_cloud(path).points, dtype=np.float64)

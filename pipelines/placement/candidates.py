@@ -129,7 +129,7 @@ def find_candidates(site: Site, stops: Stops, rules: PlaceRules) -> Candidates:
     if not keep.any():
         left = ", ".join(f"{int(mask.sum())} {why}" for why, mask in masks.items())
         raise DegenerateGeometryError(
-            f"No mark may stand anywhere: of {len(place)} places on a grid of {spacing:g} m, {left}."
+            f"No mark may stand anywhere: of {len(place)} places, one every {spacing:g} m, {left}."
         )
     place = place[keep]
     heights = np.unique(np.linspace(*site.pole_heights, _LEVELS))

@@ -9,6 +9,7 @@ from __future__ import annotations
 import hashlib
 import json
 from dataclasses import asdict, dataclass, field
+from typing import Any
 
 import numba
 import numpy as np
@@ -30,6 +31,7 @@ REFERENCE_DISTANCE = 8.0
 # Variance of fits by ``along_beam`` over the bound of their returns: towards, left, up. Pooled over
 # 2254 simulated spheres from 3 to 16 m; weights, the pole's side and lost limbs cost that much.
 _EFFICIENCY = (1.23, 1.42, 1.28)
+Group = tuple[Any, ...]  # arrays and numbers that go together into a kernel
 _LOST_MAX = 0.05  # share of places between the lines where a sphere may be missed
 
 
@@ -239,74 +241,84 @@ def is_found(centres: Centres, n_points_min: float) -> np.ndarray:
 
 
 @numba.njit(cache=True, nogil=True)
-def _expect(places: tuple, table: tuple, factors: tuple, constants: tuple, out: tuple) -> None:
+def _seen(table: Group, place: float, lowest: np.ndarray, info: Array) -> tuple[float, float]:
+    """Fill in the information of the visible part of a disc; return its area and that of all."""
+    areas, information = table[1], table[2]
+    n_strips, n_rows = areas.shape[1], areas.shape[2] - 1
+    i = int(place)
+    seen, whole = 0.0, 0.0
+    info[:] = 0.0
+    for c in range(n_strips):
+        rows = 0.5 * (1.0 - lowest[c]) * n_rows
+        k = min(int(rows), n_rows - 1)
+        w = rows - k
+        for side in range(2):
+            part = place - i if side == 1 else 1.0 - place + i
+            whole += part * areas[i + side, c, n_rows]
+            lower, upper = part * (1.0 - w), part * w
+            seen += lower * areas[i + side, c, k] + upper * areas[i + side, c, k + 1]
+            for q in range(6):
+                info[q] += lower * information[i + side, c, k, q]
+                info[q] += upper * information[i + side, c, k + 1, q]
+    return seen, whole
+
+
+@numba.njit(cache=True, nogil=True)
+def _local(info: Array, density: float, out: Array) -> bool:
+    """Fill in the covariance towards, left and up; false where nothing determines it."""
+    a, b, c = density * info[0] + 1.0, density * info[1], density * info[2]
+    g, h, f = density * info[3] + 1.0, density * info[4], density * info[5] + 1.0
+    det = a * (g * f - h * h) - b * (b * f - h * c) + c * (b * h - g * c)
+    if det <= 0.0:
+        return False
+    out[0, 0], out[1, 1], out[2, 2] = g * f - h * h, a * f - c * c, a * g - b * b
+    out[0, 1] = out[1, 0] = c * h - b * f
+    out[0, 2] = out[2, 0] = b * h - c * g
+    out[1, 2] = out[2, 1] = b * c - a * h
+    out /= det
+    return True
+
+
+@numba.njit(cache=True, nogil=True)
+def _axes(v: Array, d: float, flat: float, out: Array) -> None:
+    """Fill in the axes towards, left and up, in columns."""
+    out[:, 0] = v / d
+    out[0, 1], out[1, 1], out[2, 1] = -v[1] / flat, v[0] / flat, 0.0
+    out[0, 2], out[1, 2] = -v[2] * v[0] / (d * flat), -v[2] * v[1] / (d * flat)
+    out[2, 2] = flat / d
+
+
+@numba.njit(cache=True, nogil=True)
+def _expect(places: Group, table: Group, factors: Group, constants: Group, out: Group) -> None:
     """Fill in shares, counts, chances of loss and covariances of every eye and mark."""
     eyes, marks, lowest = places
-    distances, areas, information, spread, lost_at = table
+    distances, spread, lost_at = table[0], table[3], table[4]
     axis_factors, by_distance, by_count, count_factor = factors
     density, sine_min, sine_max = constants
     shares, n_points, lost, covs = out
-    n_d, n_strips, n_k = areas.shape
     first, ratio = np.log(distances[0]), np.log(distances[1] / distances[0])
-    info, scale = np.empty(6), np.empty(3)
-    axes = np.empty((3, 3))
+    info, local, axes, v = np.empty(6), np.empty((3, 3)), np.empty((3, 3)), np.empty(3)
     for e in range(len(eyes)):
         for m in range(len(marks)):
             covs[e, m] = np.diag(np.full(3, np.inf))
-            dx, dy, dz = (
-                marks[m, 0] - eyes[e, 0],
-                marks[m, 1] - eyes[e, 1],
-                marks[m, 2] - eyes[e, 2],
-            )
-            d = np.sqrt(dx * dx + dy * dy + dz * dz)
-            place = (np.log(max(d, 1e-6)) - first) / ratio
-            if place < 0.0 or place >= n_d - 1.0 or dz < sine_min * d or dz > sine_max * d:
+            v[:] = marks[m] - eyes[e]
+            flat = max(np.hypot(v[0], v[1]), 1e-9)
+            d = np.hypot(flat, v[2])
+            place = (np.log(d) - first) / ratio
+            is_far = place < 0.0 or place >= len(distances) - 1.0
+            if is_far or v[2] < sine_min * d or v[2] > sine_max * d:
                 continue
             i = int(place)
             t = place - i
-            seen, whole = 0.0, 0.0
-            info[:] = 0.0
-            for c in range(n_strips):
-                rows = 0.5 * (1.0 - lowest[e, m, c]) * (n_k - 1)
-                k = min(int(rows), n_k - 2)
-                w = rows - k
-                for side in range(2):
-                    part = t if side == 1 else 1.0 - t
-                    whole += part * areas[i + side, c, n_k - 1]
-                    lower, upper = part * (1.0 - w), part * w
-                    seen += lower * areas[i + side, c, k] + upper * areas[i + side, c, k + 1]
-                    for q in range(6):
-                        info[q] += lower * information[i + side, c, k, q]
-                        info[q] += upper * information[i + side, c, k + 1, q]
-            flat = np.sqrt(dx * dx + dy * dy)
-            here = density / (d * d) * d / flat
+            seen, whole = _seen(table, place, lowest[e, m], info)
+            here = count_factor * density / (d * flat)
             shares[e, m] = seen / whole
-            n_points[e, m] = count_factor * here * seen
+            n_points[e, m] = here * seen
             lost[e, m] = (1.0 - t) * lost_at[i] + t * lost_at[i + 1]
-            here *= count_factor
-            a = here * info[0] + 1.0
-            b, cc = here * info[1], here * info[2]
-            g, h, f = here * info[3] + 1.0, here * info[4], here * info[5] + 1.0
-            det = a * (g * f - h * h) - b * (b * f - h * cc) + cc * (b * h - g * cc)
-            if shares[e, m] <= 1e-6 or det <= 0.0:
+            if shares[e, m] <= 1e-6 or not _local(info, here, local):
                 continue
-            extra = (d / 8.0) ** by_distance * max(shares[e, m], 1e-3) ** by_count
-            for q in range(3):
-                swell = (1.0 - t) * spread[i, q] + t * spread[i + 1, q]
-                scale[q] = np.sqrt(axis_factors[q] * extra * swell)
-            local = np.array(
-                [
-                    [g * f - h * h, cc * h - b * f, b * h - cc * g],
-                    [cc * h - b * f, a * f - cc * cc, b * cc - a * h],
-                    [b * h - cc * g, b * cc - a * h, a * g - b * b],
-                ]
-            )
-            for q in range(3):
-                for r in range(3):
-                    local[q, r] *= scale[q] * scale[r] / det
-            axes[0, 0], axes[1, 0], axes[2, 0] = dx / d, dy / d, dz / d
-            axes[0, 1], axes[1, 1], axes[2, 1] = -dy / flat, dx / flat, 0.0
-            axes[0, 2] = -dz * dx / (d * flat)
-            axes[1, 2] = -dz * dy / (d * flat)
-            axes[2, 2] = flat / d
+            extra = (d / REFERENCE_DISTANCE) ** by_distance * max(shares[e, m], 1e-3) ** by_count
+            scale = np.sqrt(axis_factors * extra * ((1.0 - t) * spread[i] + t * spread[i + 1]))
+            _axes(v, d, flat, axes)
+            axes *= scale
             covs[e, m] = axes @ local @ axes.T

@@ -101,7 +101,7 @@ def evaluate(
     )
 
 
-def field_map(
+def field_map(  # noqa: PLR0913  all that a map is made of
     site: Site,
     xs: Array,
     ys: Array,
@@ -280,8 +280,8 @@ def _dilution(eyes: Array, marks: Array, positions: Positions) -> Array:
     N[:, 0, 2] = N[:, 2, 0] = np.sum(w * v[..., 0], axis=1)
     N[:, 1, 1] = N[:, 2, 2] = N[:, 3, 3] = w.sum(axis=1)
     is_fixed = np.isfinite(positions.cov_motion[:, 0, 0]) & (w.sum(axis=1) >= 2)
-    Q = np.linalg.inv(np.where(is_fixed[:, None, None], N, np.eye(4)))
-    return np.where(is_fixed, np.sqrt(np.trace(Q[:, 1:, 1:], axis1=1, axis2=2)), np.inf)
+    inverse = np.linalg.inv(np.where(is_fixed[:, None, None], N, np.eye(4)))
+    return np.where(is_fixed, np.sqrt(np.trace(inverse[:, 1:, 1:], axis1=1, axis2=2)), np.inf)
 
 
 def _reasons(

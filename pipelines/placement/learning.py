@@ -34,6 +34,7 @@ _SIGMA_CONSTANT, _SIGMA_POWER = 1.0, 0.5  # priors of factors' logarithms and of
 _LEFT_LEAST = 0.1  # of a variance that must remain when known parts of it are taken off
 _DOF_PRIOR = 30.0  # degrees of freedom that a variance factor of one is worth
 _HUBER = 1.345
+_COLUMNS = ("ranges", "n_points", "incidences", "intensities", "turns", "stops", "dof", "sigma0")
 _N_STEPS = 12
 
 
@@ -82,17 +83,16 @@ class FitRows:
     newest: str
 
     def __post_init__(self) -> None:
-        names = ("ranges", "n_points", "incidences", "intensities", "turns", "stops")
-        names += ("dof", "sigma0")
-        _seal(self, **dict.fromkeys(names, (None,)), variances=(None, 3))
-        _same_length(self, *names, "variances")
+        columns = dict.fromkeys(_COLUMNS, (None,))
+        _seal(self, **columns, variances=(None, 3))
+        _same_length(self, *_COLUMNS, "variances")
 
 
 class _Data(NamedTuple):
     """Logarithms of variances over the sensor model's, with their causes."""
 
     y: Array
-    X: Array
+    design: Array
     stops: Index
 
 
@@ -200,11 +200,13 @@ def _data(rows: FitRows, usable: Mask, expected: Array, counts: Array, known: fl
         ]
     )
     n = len(causes)
-    X = np.zeros((n, 3, 3 + len(TERMS)))
-    X[:, :, :3] = np.eye(3)
-    X[:, :, 3:] = causes[:, None, :]
+    design = np.zeros((n, 3, 3 + len(TERMS)))
+    design[:, :, :3] = np.eye(3)
+    design[:, :, 3:] = causes[:, None, :]
     y = np.log(variances / expected)
-    return _Data(y=y.ravel(), X=X.reshape(3 * n, -1), stops=np.repeat(rows.stops[usable], 3))
+    return _Data(
+        y=y.ravel(), design=design.reshape(3 * n, -1), stops=np.repeat(rows.stops[usable], 3)
+    )
 
 
 def _centred(values: Array) -> Array:
@@ -216,20 +218,22 @@ def _centred(values: Array) -> Array:
 
 def _regressed(data: _Data) -> tuple[Array, Array, float]:
     """Return coefficients, their covariance, and the scatter of single logarithms."""
-    k = data.X.shape[1]
+    k = data.design.shape[1]
     prior = np.diag([_SIGMA_CONSTANT**-2.0] * 3 + [_SIGMA_POWER**-2.0] * (k - 3))
-    beta, scatter = np.zeros(k), 1.0
-    weights = np.ones(len(data.y))
+    beta: Array = np.zeros(k)
+    scatter, residuals, weights = 1.0, data.y, np.ones(len(data.y))
     for _ in range(_N_STEPS):
-        weighted = data.X * (weights / scatter**2)[:, None]
-        beta = np.linalg.solve(weighted.T @ data.X + prior, weighted.T @ data.y)
-        residuals = data.y - data.X @ beta
+        weighted = data.design * (weights / scatter**2)[:, None]
+        beta = np.asarray(
+            np.linalg.solve(weighted.T @ data.design + prior, weighted.T @ data.y), dtype=np.float64
+        )
+        residuals = data.y - data.design @ beta
         scatter = max(1.4826 * float(np.median(np.abs(residuals))), 0.02)
         weights = np.minimum(1.0, _HUBER * scatter / np.maximum(np.abs(residuals), 1e-12))
-    bread = np.linalg.inv((data.X * (weights / scatter**2)[:, None]).T @ data.X + prior)
+    bread = np.linalg.inv((data.design * (weights / scatter**2)[:, None]).T @ data.design + prior)
     _, clusters = np.unique(data.stops, return_inverse=True)
     scores = np.zeros((int(clusters.max()) + 1, k))
-    np.add.at(scores, clusters, data.X * (weights * residuals / scatter**2)[:, None])
+    np.add.at(scores, clusters, data.design * (weights * residuals / scatter**2)[:, None])
     n = len(scores)
     cov = bread @ (scores.T @ scores * n / (n - 1) + prior) @ bread
     return np.asarray(beta, dtype=np.float64), np.asarray(cov, dtype=np.float64), scatter

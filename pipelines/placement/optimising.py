@@ -37,11 +37,11 @@ _LOST = 1e3  # [m] counts for a stop without a position: worse than any that has
 _LOOSE_PRIOR = np.array([3.0, 3.0, 3.0, 10.0, 10.0, 10.0])  # [rad, m] before any mark is seen
 _SURE = 1.96  # sigmas within which an error of any shape lies with 95 %: 3-D sigma on one axis
 _ROUNDS = 30  # of exchanges; four to eight settle
-_STARTS = 8  # the greedy one among them
+_STARTS, _STARTS_WHOLE = 8, 2  # the greedy one among them; the latter of whole judgements
 _POWER = 12.0  # of the mean over stops that is as good as their largest, and smoother
 _SHAKEN = 0.4  # share of marks that such a start has elsewhere
 _TRIED = 12  # candidates that are judged in full for each mark, the most promising first
-_SCREENED = 160  # places that whole judgements try for each mark
+_SCREENED = 60  # places that whole judgements try for each mark
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -159,7 +159,7 @@ class _Task(NamedTuple):
     power: float = np.inf
 
 
-def optimise(
+def optimise(  # noqa: PLR0913  all that a plan is made of
     site: Site,
     stops: Stops,
     candidates: Candidates,
@@ -210,13 +210,16 @@ def optimise(
     if goal.n_marks is not None:
         found = _best(task, goal.n_marks, goal, rng)
         return _optimum(site, stops, candidates, model, task, found, goal)
-    for k in range(3 if wish.method == "paper" else 2, goal.most + 1):
-        if goal.is_robust and k < 3:
-            continue
-        optimum = _optimum(site, stops, candidates, model, task, _best(task, k, goal, rng), goal)
-        if optimum.is_kept:
-            return optimum
-    raise DegenerateGeometryError(_impossible(task, stops, optimum, goal))
+    least = 3 if wish.method == "paper" or goal.is_robust else 2
+    if goal.most < least:
+        raise ConfigError(f"At most {goal.most} marks; {least} are needed for what is asked.")
+    tried = []
+    for k in range(least, goal.most + 1):
+        found = _best(task, k, goal, rng)
+        tried.append(_optimum(site, stops, candidates, model, task, found, goal))
+        if tried[-1].is_kept:
+            return tried[-1]
+    raise DegenerateGeometryError(_impossible(task, stops, tried[-1], goal))
 
 
 def propose_mark(
@@ -356,7 +359,8 @@ def _best(task: _Task, k: int, goal: Goal, rng: np.random.Generator) -> tuple[In
     """
     smooth = task._replace(power=_POWER)
     best, score, n_exchanges = _greedy(task, k), (np.inf, np.inf, np.inf), 0
-    for i in range(_STARTS):
+    n_starts = _STARTS_WHOLE if task.wish.method == "paper" else _STARTS
+    for i in range(n_starts):
         start = best if i == 0 else _shaken(task, best, 1.0 if i == 1 else _SHAKEN, rng)
         found, n = _exchanged(smooth, start, goal, rng)
         found, m = _exchanged(task, found, goal, rng)
@@ -440,7 +444,7 @@ def _promising(
 ) -> Index:
     """Return the candidates that would be better in place i than what stands there, best first."""
     others = np.delete(chosen, i)
-    free = ~task.near[others].any(axis=0)
+    free = np.array(~task.near[others].any(axis=0))
     free[chosen] = False
     if task.wish.method == "paper":
         places = np.flatnonzero(free)
@@ -495,8 +499,8 @@ def _sigmas(task: _Task, chosen: Index) -> Array:
         variances = np.trace(
             predict_positions(some, task.wish).cov_motion[:, 3:, 3:], axis1=1, axis2=2
         )
-        return np.minimum(np.sqrt(variances), _LOST)
-    return np.asarray(_sigmas_of(_sums(task, chosen), task.shared2))
+        return np.asarray(np.minimum(np.sqrt(variances), _LOST), dtype=np.float64)
+    return np.asarray(_sigmas_of(_sums(task, chosen), task.shared2), dtype=np.float64)
 
 
 def _score(task: _Task, chosen: Index) -> tuple[float, float]:
@@ -606,29 +610,29 @@ def _gains(normal: Array, added: Array) -> Array:
 
 
 @numba.njit(cache=True, nogil=True)
-def _sigma_of(N: Array, M: Array, pull: Array, shared2: float, Q: Array) -> float:
+def _sigma_of(N: Array, spread: Array, pull: Array, shared2: float, inverse: Array) -> float:
     """Return the 3-D sigma of one stop; large without a position."""
-    if not inverted(N, Q) or Q[3, 3] + Q[4, 4] + Q[5, 5] > LOOSE2:
+    if not inverted(N, inverse) or inverse[3, 3] + inverse[4, 4] + inverse[5, 5] > LOOSE2:
         return _LOST
     total = 0.0
     for i in range(3, 6):
         moved = 0.0
         for j in range(6):
-            moved += Q[i, j] * pull[j]
+            moved += inverse[i, j] * pull[j]
             for k in range(6):
-                total += Q[i, j] * M[j, k] * Q[k, i]
+                total += inverse[i, j] * spread[j, k] * inverse[k, i]
         total += shared2 * moved * moved
-    return np.sqrt(total)
+    return float(np.sqrt(total))
 
 
 @numba.njit(cache=True, nogil=True)
 def _sigmas_of(sums: tuple[Array, Array, Array], shared2: float) -> Array:
     """Return the 3-D sigma of each stop; large without a position."""
     normal, spread, pull = sums
-    Q = np.empty((6, 6))
+    inverse = np.empty((6, 6))
     out = np.empty(len(normal))
     for e in range(len(normal)):
-        out[e] = _sigma_of(normal[e], spread[e], pull[e], shared2, Q)
+        out[e] = _sigma_of(normal[e], spread[e], pull[e], shared2, inverse)
     return out
 
 
@@ -649,15 +653,15 @@ def _judge(  # noqa: PLR0913  a kernel takes what it needs
     limit, power = rule
     is_smooth = np.isfinite(power)
     beyond = len(stops) * limit**power if is_smooth and np.isfinite(limit) else np.inf
-    N, M, pull, Q = np.empty((6, 6)), np.empty((6, 6)), np.empty(6), np.empty((6, 6))
+    N, spread, pull, inverse = np.empty((6, 6)), np.empty((6, 6)), np.empty(6), np.empty((6, 6))
     for i in range(len(places)):
         c = places[i]
         worst, total, powers = 0.0, 0.0, 0.0
         for e in stops:
             N[:] = sums[0][e] + added[0][e, c]
-            M[:] = sums[1][e] + added[1][e, c]
+            spread[:] = sums[1][e] + added[1][e, c]
             pull[:] = sums[2][e] + added[2][e, c]
-            sigma = _sigma_of(N, M, pull, shared2, Q)
+            sigma = _sigma_of(N, spread, pull, shared2, inverse)
             total += sigma
             if is_smooth:
                 powers += sigma**power

@@ -6,7 +6,7 @@ are about the station itself, so that the translation block is the covariance of
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numba
 import numpy as np
@@ -25,6 +25,13 @@ LOOSE2 = 1.0
 """Variance of a position above which it is none [m^2]."""
 
 _UNTESTABLE = 1e-7  # redundancy below which a bias cannot show
+
+
+Group = tuple[Any, ...]
+"""Arrays and numbers that go together into a kernel."""
+
+Vector = tuple[float, float, float]
+"""Coordinates that go together into a kernel."""
 
 
 class Positions(NamedTuple):
@@ -146,9 +153,7 @@ def shared_variance(sigma_laser_bias: float) -> float:
 
 
 @numba.njit(cache=True, nogil=True)
-def _claimed(
-    cov: Array, v: tuple[float, float, float], extra: tuple, known: Array, true: Array
-) -> None:
+def _claimed(cov: Array, v: Vector, extra: Group, known: Array, true: Array) -> None:
     """Fill in a centre's covariance as a survey takes it, and as it is, shared excess apart."""
     bias2, common2, aim2 = extra
     d2 = v[0] * v[0] + v[1] * v[1] + v[2] * v[2]
@@ -162,91 +167,118 @@ def _claimed(
 
 
 @numba.njit(cache=True, nogil=True)
-def inverted(N: Array, out: Array) -> bool:
-    """Invert a symmetric positive matrix into another; false if it is singular."""
+def _rooted(N: Array, root: Array) -> bool:
+    """Fill in the inverse of the lower Cholesky root; false if the matrix is singular."""
     n = len(N)
-    L = np.zeros((n, n))
     for i in range(n):
         for j in range(i + 1):
             s = N[i, j]
             for k in range(j):
-                s -= L[i, k] * L[j, k]
+                s -= root[i, k] * root[j, k]
             if i == j:
                 if not s > _SINGULAR * N[i, i]:
                     return False
-                L[i, i] = np.sqrt(s)
+                s = np.sqrt(s)
+                root[i, i] = s
             else:
-                L[i, j] = s / L[j, j]
-    for i in range(n):  # L becomes its own inverse
-        L[i, i] = 1.0 / L[i, i]
+                root[i, j] = s / root[j, j]
+    for i in range(n):
+        root[i, i] = 1.0 / root[i, i]
         for j in range(i):
             s = 0.0
             for k in range(j, i):
-                s -= L[i, k] * L[k, j]
-            L[i, j] = s * L[i, i]
+                s -= root[i, k] * root[k, j]
+            root[i, j] = s * root[i, i]
+    return True
+
+
+@numba.njit(cache=True, nogil=True)
+def inverted(N: Array, out: Array) -> bool:
+    """Invert a symmetric positive matrix into another; false if it is singular.
+
+    Parameters
+    ----------
+    N : (n, n)
+        The matrix.
+    out : (n, n)
+        Becomes its inverse; unchanged where there is none.
+
+    Returns
+    -------
+    bool
+        Whether there is one.
+    """
+    n = len(N)
+    root = np.zeros((n, n))
+    if not _rooted(N, root):
+        return False
     for i in range(n):
         for j in range(i + 1):
             s = 0.0
             for k in range(i, n):
-                s += L[k, i] * L[k, j]
+                s += root[k, i] * root[k, j]
             out[i, j] = s
             out[j, i] = s
     return True
 
 
 @numba.njit(cache=True, nogil=True)
-def _inform(cov: Array, v: tuple[float, float, float], extra: tuple, out: tuple) -> bool:
+def _inform(cov: Array, v: Vector, extra: Group, out: Group) -> bool:
     """Fill in what one mark adds to normal matrix, spread and pull; false if it adds nothing."""
-    N, M, pull = out
-    P, J = np.empty((3, 3)), np.zeros((3, 6))
-    PJ, CPJ = np.empty((3, 6)), np.empty((3, 6))
+    N, spread, pull = out
+    weight, J = np.empty((3, 3)), np.zeros((3, 6))
+    weighted, spread_by = np.empty((3, 6)), np.empty((3, 6))
     known, true = np.empty((3, 3)), np.empty((3, 3))
     x, y, z = v
     _claimed(cov, v, extra, known, true)
-    if not inverted(known, P):
+    if not inverted(known, weight):
         return False
     J[0, 1], J[0, 2], J[1, 0], J[1, 2], J[2, 0], J[2, 1] = z, -y, -z, x, y, -x
     J[0, 3] = J[1, 4] = J[2, 5] = 1.0
     d = np.sqrt(x * x + y * y + z * z)
-    _product(P, J, PJ)
-    _product(true, PJ, CPJ)
+    _product(weight, J, weighted)
+    _product(true, weighted, spread_by)
     for i in range(6):
-        pull[i] = (PJ[0, i] * x + PJ[1, i] * y + PJ[2, i] * z) / d
+        pull[i] = (weighted[0, i] * x + weighted[1, i] * y + weighted[2, i] * z) / d
         for j in range(6):
-            N[i, j] = J[0, i] * PJ[0, j] + J[1, i] * PJ[1, j] + J[2, i] * PJ[2, j]
-            M[i, j] = PJ[0, i] * CPJ[0, j] + PJ[1, i] * CPJ[1, j] + PJ[2, i] * CPJ[2, j]
+            N[i, j] = J[0, i] * weighted[0, j] + J[1, i] * weighted[1, j] + J[2, i] * weighted[2, j]
+            spread[i, j] = (
+                weighted[0, i] * spread_by[0, j]
+                + weighted[1, i] * spread_by[1, j]
+                + weighted[2, i] * spread_by[2, j]
+            )
     return True
 
 
 @numba.njit(cache=True, nogil=True)
 def _by_motion(
-    seen: tuple[Array, Array, Array, Mask], extra: tuple, gravity: float, out: tuple
+    seen: tuple[Array, Array, Array, Mask], extra: Group, gravity: float, out: Group
 ) -> None:
     """Fill in the covariances of free stations, and how a common excess of ranges moves them."""
     eyes, marks, covs, is_seen = seen
     cov_motion, cofactor, moved = out
-    N, M, pull = np.empty((6, 6)), np.empty((6, 6)), np.empty(6)
+    N, spread, pull = np.empty((6, 6)), np.empty((6, 6)), np.empty(6)
     one = (np.empty((6, 6)), np.empty((6, 6)), np.empty(6))
     for e in range(len(eyes)):
         N[:], pull[:] = 0.0, 0.0
         N[0, 0] = N[1, 1] = gravity
-        M[:] = N
+        spread[:] = N
         for m in range(len(marks)):
             if not is_seen[e, m]:
                 continue
             v = (marks[m, 0] - eyes[e, 0], marks[m, 1] - eyes[e, 1], marks[m, 2] - eyes[e, 2])
             if _inform(covs[e, m], v, extra, one):
                 N += one[0]
-                M += one[1]
+                spread += one[1]
                 pull += one[2]
-        Q = cofactor[e]
-        ok = inverted(N, Q)
-        if not ok or Q[3, 3] + Q[4, 4] + Q[5, 5] > LOOSE2:
-            Q[:] = np.diag(np.full(6, np.inf))
-            cov_motion[e] = Q
+        inverse = cofactor[e]
+        ok = inverted(N, inverse)
+        if not ok or inverse[3, 3] + inverse[4, 4] + inverse[5, 5] > LOOSE2:
+            inverse[:] = np.diag(np.full(6, np.inf))
+            cov_motion[e] = inverse
             continue
-        cov_motion[e] = Q @ M @ Q
-        moved[e] = Q @ pull
+        cov_motion[e] = inverse @ spread @ inverse
+        moved[e] = inverse @ pull
 
 
 class Information(NamedTuple):
@@ -302,7 +334,7 @@ def _extra(sighting: Sighting, wish: Requirement) -> tuple[float, float, float]:
 
 
 @numba.njit(cache=True, nogil=True)
-def _informed(seen: tuple[Array, Array, Array, Mask], extra: tuple, out: tuple) -> None:
+def _informed(seen: tuple[Array, Array, Array, Mask], extra: Group, out: Group) -> None:
     """Fill in what each seen mark adds."""
     eyes, marks, covs, is_seen = seen
     for e in range(len(eyes)):
@@ -313,11 +345,15 @@ def _informed(seen: tuple[Array, Array, Array, Mask], extra: tuple, out: tuple) 
 
 
 @numba.njit(cache=True, nogil=True)
-def _product(A: Array, B: Array, out: Array) -> None:
+def _product(design: Array, circle: Array, out: Array) -> None:
     """Fill in the product of a (3, 3) and a (3, 6) matrix."""
     for i in range(3):
         for j in range(6):
-            out[i, j] = A[i, 0] * B[0, j] + A[i, 1] * B[1, j] + A[i, 2] * B[2, j]
+            out[i, j] = (
+                design[i, 0] * circle[0, j]
+                + design[i, 1] * circle[1, j]
+                + design[i, 2] * circle[2, j]
+            )
 
 
 @numba.njit(cache=True, nogil=True)
@@ -350,50 +386,60 @@ def _best_three(eye: Array, marks: Array, is_seen: Mask, units: Array, three: In
 
 
 @numba.njit(cache=True, nogil=True)
-def _by_circles(
-    seen: tuple[Array, Array, Array, Mask], extra: tuple, level2: float, used: Mask, out: tuple
-) -> None:
+def _circle(cov: Array, v: Vector, rules: tuple[Group, float], row: int, out: Group) -> float:
+    """Fill in one mark's circle and height: two rows of all; return the variance of its azimuth.
+
+    Filled in are derivative, covariance of errors, weights, effect of the lean, and that of a
+    common excess of ranges.
+    """
+    extra, level2 = rules
+    design, errors, weights, lean, excess = out
+    known, true, circle = np.empty((3, 3)), np.empty((3, 3)), np.zeros((2, 3))
+    x, y, z = v
+    _claimed(cov, v, extra, known, true)
+    flat = max(np.hypot(x, y), 1e-9)
+    ux, uy = x / flat, y / flat
+    circle[0, 0], circle[0, 1], circle[1, 2] = ux, uy, 1.0
+    s = slice(row, row + 2)
+    design[s] = circle
+    lean[row, 0], lean[row, 1] = -z * uy, z * ux  # the first two columns of -[v]x
+    lean[row + 1, 0], lean[row + 1, 1] = y, -x
+    errors[s, s] = circle @ true @ circle.T
+    weights[s, s] = np.linalg.inv(circle @ known @ circle.T + level2 * lean[s] @ lean[s].T)
+    d = np.sqrt(flat * flat + z * z)
+    excess[row], excess[row + 1] = flat / d, z / d
+    side2 = uy * uy * true[0, 0] - 2.0 * ux * uy * true[0, 1] + ux * ux * true[1, 1]
+    return float(side2 / (flat * flat))
+
+
+@numba.njit(cache=True, nogil=True)
+def _by_circles(seen: Group, extra: Group, level2: float, used: Mask, out: Group) -> None:
     """Fill in the covariances of positions by three circles, and how a common excess moves them."""
     eyes, marks, covs, is_seen = seen
     cov_motion, cofactor, moved = out
     units, three = np.empty((len(marks), 2)), np.empty(3, np.intp)
-    A, W, gain = np.zeros((6, 3)), np.empty((6, 6)), np.zeros((3, 6))
-    C, lean, Q, N = np.zeros((6, 6)), np.zeros((6, 2)), np.empty((3, 3)), np.zeros((3, 3))
-    B, excess = np.zeros((2, 3)), np.empty(6)
-    known, true = np.empty((3, 3)), np.empty((3, 3))
+    design, lean, excess = np.zeros((6, 3)), np.zeros((6, 2)), np.empty(6)
+    errors, weights, inverse = np.zeros((6, 6)), np.zeros((6, 6)), np.empty((3, 3))
     for e in range(len(eyes)):
         cov_motion[e] = np.diag(np.full(6, np.inf))
         cofactor[e] = cov_motion[e]
         if not _best_three(eyes[e], marks, is_seen[e], units, three):
             continue
-        C[:], W[:] = 0.0, 0.0
         yaw2 = 0.0
         for r in range(3):
-            m, s = three[r], slice(2 * r, 2 * r + 2)
-            x, y, z = marks[m, 0] - eyes[e, 0], marks[m, 1] - eyes[e, 1], marks[m, 2] - eyes[e, 2]
-            _claimed(covs[e, m], (x, y, z), extra, known, true)
-            u, v = units[m]
-            B[0, 0], B[0, 1], B[1, 2] = u, v, 1.0
-            A[s] = B
-            lean[2 * r, 0], lean[2 * r, 1] = -z * v, z * u  # B (-[v]x), its first two columns
-            lean[2 * r + 1, 0], lean[2 * r + 1, 1] = y, -x
-            C[s, s] = B @ true @ B.T
-            W[s, s] = np.linalg.inv(B @ known @ B.T + level2 * lean[s] @ lean[s].T)
-            flat2 = x * x + y * y
-            d = np.sqrt(flat2 + z * z)
-            excess[2 * r], excess[2 * r + 1] = np.sqrt(flat2) / d, z / d
-            side2 = v * v * true[0, 0] - 2.0 * u * v * true[0, 1] + u * u * true[1, 1]
-            yaw2 += side2 / flat2 / 9.0
-        N[:] = A.T @ W @ A
-        if not inverted(N, Q):
+            m = three[r]
+            v = (marks[m, 0] - eyes[e, 0], marks[m, 1] - eyes[e, 1], marks[m, 2] - eyes[e, 2])
+            rows = (design, errors, weights, lean, excess)
+            yaw2 += _circle(covs[e, m], v, (extra, level2), 2 * r, rows) / 9.0
+        if not inverted(design.T @ weights @ design, inverse):
             continue
-        gain[:] = Q @ A.T @ W
+        gain = inverse @ design.T @ weights
         tilt = gain @ lean
-        position = gain @ C @ gain.T + level2 * tilt @ tilt.T
+        position = gain @ errors @ gain.T + level2 * tilt @ tilt.T
         if np.trace(position) > LOOSE2:
             continue
-        for r in range(3):
-            used[e, three[r]] = True
+        for m in three:
+            used[e, m] = True
         cov_motion[e] = 0.0
         cov_motion[e, 3:, 3:] = position
         cov_motion[e, 0, 0] = cov_motion[e, 1, 1] = level2
@@ -401,7 +447,7 @@ def _by_circles(
         cov_motion[e, 3:, :2] = -level2 * tilt
         cov_motion[e, :2, 3:] = -level2 * tilt.T
         cofactor[e] = cov_motion[e]
-        cofactor[e, 3:, 3:] = Q
+        cofactor[e, 3:, 3:] = inverse
         moved[e, 3:] = gain @ excess
 
 
@@ -448,26 +494,26 @@ def reliability(sighting: Sighting, found: Positions, wish: Requirement) -> Reli
     bias2 = claimed_bias_variance(sighting.sigma_laser_bias)
     known = known + bias2 * v[..., :, None] * v[..., None, :] / d2
     covs = np.where(found.used[..., None, None], known, np.eye(3))
-    is_fixed = np.isfinite(found.cov_motion).all(axis=(1, 2))
-    used = found.used & is_fixed[:, None]
-    Q = np.where(is_fixed[:, None, None], found.cofactor, 0.0)
+    is_fixed: Mask = np.asarray(np.isfinite(found.cov_motion).all(axis=(1, 2)))
+    used = np.asarray(found.used & is_fixed[:, None])
+    inverse = np.where(is_fixed[:, None, None], found.cofactor, 0.0)
     if wish.method == "paper":
         J, covs = _circle_equations(v, covs, wish)
-        Q = Q[:, 3:, 3:]
+        inverse = inverse[:, 3:, 3:]
         to_position = np.eye(3)
     else:
         J = _motion_equations(v)
         to_position = np.eye(6)[3:]
-    P = np.linalg.inv(covs)
-    PJ = P @ J
-    tested = P - PJ @ Q[:, None] @ np.swapaxes(PJ, -1, -2)
+    weight = np.linalg.inv(covs)
+    weighted = weight @ J
+    tested = weight - weighted @ inverse[:, None] @ np.swapaxes(weighted, -1, -2)
     redundancies = np.einsum("enij,enji->en", tested, covs)
     weakest = np.linalg.eigvalsh(tested)[..., 0]
-    is_open = weakest < _UNTESTABLE * np.linalg.eigvalsh(P)[..., 0]
+    is_open = weakest < _UNTESTABLE * np.linalg.eigvalsh(weight)[..., 0]
     power = wish.resection.test_power
     noncentrality = float(ndtri(1.0 - wish.resection.test_level / 2.0) + ndtri(power))
     biases = noncentrality / np.sqrt(np.where(is_open, 1.0, weakest))
-    effects = to_position @ Q[:, None] @ np.swapaxes(PJ, -1, -2)
+    effects = to_position @ inverse[:, None] @ np.swapaxes(weighted, -1, -2)
     safe = np.where(is_open[..., None, None], np.eye(covs.shape[-1]), tested)
     shifts = effects @ np.linalg.solve(safe, np.swapaxes(effects, -1, -2))
     external = noncentrality * np.sqrt(np.maximum(np.linalg.eigvalsh(shifts)[..., -1], 0.0))
@@ -492,8 +538,12 @@ def _motion_equations(v: Array) -> Array:
 def _circle_equations(v: Array, covs: Array, wish: Requirement) -> tuple[Array, Array]:
     """Return derivatives, (e, n, 2, 3), and covariances of horizontal distances and heights."""
     flat = np.maximum(np.hypot(v[..., 0], v[..., 1]), 1e-9)
-    B = np.zeros((*v.shape[:-1], 2, 3))
-    B[..., 0, 0], B[..., 0, 1], B[..., 1, 2] = v[..., 0] / flat, v[..., 1] / flat, 1.0
-    lean = B @ _motion_equations(v)[..., :2]
-    cov = B @ covs @ np.swapaxes(B, -1, -2)
-    return B, cov + wish.sigma_levelling**2 * lean @ np.swapaxes(lean, -1, -2)
+    circle = np.zeros((*v.shape[:-1], 2, 3))
+    circle[..., 0, 0], circle[..., 0, 1], circle[..., 1, 2] = (
+        v[..., 0] / flat,
+        v[..., 1] / flat,
+        1.0,
+    )
+    lean = circle @ _motion_equations(v)[..., :2]
+    cov = circle @ covs @ np.swapaxes(circle, -1, -2)
+    return circle, cov + wish.sigma_levelling**2 * lean @ np.swapaxes(lean, -1, -2)

@@ -7,7 +7,7 @@ import math
 import numba
 import numpy as np
 
-from pipelines.values import Array
+from pipelines.values import Array, Mask
 
 _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(24)
 _FAR = 8.5  # standard deviations beyond which nothing is left
@@ -35,7 +35,7 @@ def probability_within(covs: Array, tolerance: float) -> Array:
     quadrature of 24 x 24 nodes over the two longer axes and the error function along the shortest;
     the sines of the substitution take the root out of the edge. Good to 1e-6.
     """
-    is_known = np.isfinite(covs).all(axis=(1, 2))
+    is_known: Mask = np.asarray(np.isfinite(covs).all(axis=(1, 2)))
     axes = np.linalg.eigvalsh(np.where(is_known[:, None, None], covs, np.eye(3)))
     sigmas = np.sqrt(np.maximum(axes, (_THIN * tolerance) ** 2)) / tolerance
     found = _within(np.ascontiguousarray(sigmas), _NODES, _WEIGHTS)

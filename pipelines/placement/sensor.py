@@ -115,8 +115,8 @@ class Returns:
     areas : (d, c, k)
         Area that returns come from, of the upper k rows of each strip, k from 0 [m^2].
     information : (d, c, k, 6)
-        Fisher information that the same area gives for one return per square metre: towards-towards,
-        towards-left, towards-up, left-left, left-up, up-up [1].
+        Fisher information that the same area gives for one return per square metre:
+        towards-towards, towards-left, towards-up, left-left, left-up, up-up [1].
     spread : (d, 3)
         By how much the lines' places make the variances of a centre larger than evenly spread
         returns would: towards, left, up; the mean over places where it is found.

@@ -25,6 +25,9 @@ _BEHIND = 0.05  # [m] something nearer to the sphere than this is its own foot
 _MANY = 400  # pairs of eye and mark that are worth a second thread
 _HIDDEN, _SEEN = 1.0, -1.0
 
+Ray = tuple[float, float, float, float, float, float]
+"""Origin, level direction and length [m]."""
+
 
 def look(site: Site, eyes_site: Array, marks: Arrangement) -> Sights:
     """Tell what can be seen of marks, each as if it stood there alone.
@@ -107,11 +110,11 @@ def _height(grid: Array, u: float, v: float) -> float:
     low = (1.0 - u) * grid[j, i] + u * grid[j, i + 1]
     high = (1.0 - u) * grid[j + 1, i] + u * grid[j + 1, i + 1]
     height = (1.0 - v) * low + v * high
-    return height if height == height else -1e9  # noqa: PLR0124
+    return height if height == height else -1e9
 
 
 @numba.njit(cache=True, nogil=True)
-def _clears(coarse: Array, frame: tuple[float, float, float], ray: tuple, slope: float) -> bool:
+def _clears(coarse: Array, frame: tuple[float, float, float], ray: Ray, slope: float) -> bool:
     """Return whether a ray of some slope stays above the highest surface nearby."""
     x, y, z, dx, dy, length = ray
     x0, y0, cell = frame
@@ -119,8 +122,8 @@ def _clears(coarse: Array, frame: tuple[float, float, float], ray: tuple, slope:
     n = int(length / (_COARSE * cell)) + 1
     for k in range(n + 1):
         s = min(k * _COARSE * cell, length)
-        i = int(round((x + s * dx - x0) / cell))
-        j = int(round((y + s * dy - y0) / cell))
+        i = round((x + s * dx - x0) / cell)
+        j = round((y + s * dy - y0) / cell)
         i, j = min(max(i, 0), n_x - 1), min(max(j, 0), n_y - 1)
         before = max(s - _COARSE * cell, 0.0)
         if coarse[j, i] > z + min(slope * s, slope * before):
@@ -129,7 +132,7 @@ def _clears(coarse: Array, frame: tuple[float, float, float], ray: tuple, slope:
 
 
 @numba.njit(cache=True, nogil=True)
-def _horizon(surface: Array, frame: tuple[float, float, float], ray: tuple) -> float:
+def _horizon(surface: Array, frame: tuple[float, float, float], ray: Ray) -> float:
     """Return the steepest slope at which something along a ray is met."""
     x, y, z, dx, dy, length = ray
     x0, y0, cell = frame

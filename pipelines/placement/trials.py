@@ -8,7 +8,8 @@ centres has them. The station is taken as level, as the study takes it.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import NamedTuple
+from itertools import pairwise
+from typing import Any, NamedTuple
 
 import numba
 import numpy as np
@@ -18,7 +19,7 @@ from pipelines.placement.centres import CentreModel, expect_centres
 from pipelines.placement.sight import N_STRIPS
 from pipelines.placement.values import Arrangement, Sights
 from pipelines.threads import side_by_side
-from pipelines.values import Array, Column, Index, Mask, _same_length, _seal
+from pipelines.values import Array, Index, Mask, _same_length, _seal
 
 ARRANGEMENTS_MAX = 5_000_000
 """Arrangements that are tried at most."""
@@ -74,8 +75,8 @@ class Trial:
             raise ConfigError(f"{low} to {high} marks; three circles need 3, and 40 are the most.")
         if not 0.5 <= self.distances[0] < self.distances[1] <= 45.0:
             raise ConfigError(
-                f"Distances from {self.distances[0]:g} to {self.distances[1]:g} m; they must ascend "
-                "within 0.5 to 45 m."
+                f"Distances from {self.distances[0]:g} to {self.distances[1]:g} m; they must "
+                "ascend within 0.5 to 45 m."
             )
         if not 0.0 <= self.angles[0] < self.angles[1] <= np.pi + 1e-9:
             raise ConfigError(
@@ -236,7 +237,7 @@ def by_worst_angle(result: TrialResult) -> tuple[Share, ...]:
     angles = np.degrees(result.worst_angles)
     return tuple(
         _share(result, (angles >= a) & (angles < b), float(a), float(b))
-        for a, b in zip(BINS_DEG, BINS_DEG[1:], strict=False)
+        for a, b in pairwise(BINS_DEG)
     )
 
 
@@ -406,7 +407,7 @@ def _attach(rng: np.random.Generator, p: Array, error: float, sigmas: Array, off
 
 
 @numba.njit(cache=True, nogil=True)
-def _try(rng: np.random.Generator, plan: tuple, out: tuple) -> None:
+def _try(rng: np.random.Generator, plan: tuple[Any, ...], out: tuple[Any, ...]) -> None:
     """Fill in worst angle, error and window of each arrangement."""
     counts, distances, window, error, sigmas = plan
     worst, errors, inside = out

@@ -377,8 +377,8 @@ class Evaluation:
 
     def __post_init__(self) -> None:
         s, n = len(self.stops.names), len(self.marks.names)
-        pairs = ("is_seen", "shares", "ranges", "n_points", "redundancies")
-        pairs += ("detectable_biases", "external_reliabilities")
+        _seal(self, **dict.fromkeys(("is_seen", "shares", "ranges", "n_points"), (s, n)))
+        pairs = ("redundancies", "detectable_biases", "external_reliabilities")
         _seal(self, **dict.fromkeys(pairs, (s, n)))
         _seal(self, **dict.fromkeys(("sigma_3d", "probability", "dop", "n_used", "dof"), (s,)))
         _seal(self, cov_p_site=(s, 3, 3), cov_motion=(s, 6, 6), angles=(s, 2))
