@@ -13,7 +13,7 @@ from fastapi import APIRouter, FastAPI, Request, Response
 from fastapi.responses import RedirectResponse
 from fastapi.staticfiles import StaticFiles
 
-from service import api, errors, guard, pages, plan_pages, result_pages
+from service import api, errors, guard, pages, plan_pages, result_pages, site_pages
 from service.errors import UnauthorizedError
 from service.settings import Settings
 from service.state import Current, opened
@@ -52,6 +52,7 @@ def create_app(settings: Settings) -> FastAPI:
     app.add_middleware(guard.Guard, settings=settings)
     app.include_router(api.router, prefix=ROOT)
     app.include_router(about)
+    app.include_router(site_pages.router)  # before the survey, whose name takes slashes
     app.include_router(pages.router)
     app.include_router(plan_pages.router)
     app.include_router(result_pages.router)

@@ -17,6 +17,7 @@ import typer
 
 from pipelines.errors import ConfigError, SpheremarkError
 from service.cli_plan import plan
+from service.cli_site import site
 from service.cli_survey import (
     Axes,
     ControlAxes,
@@ -252,6 +253,7 @@ def process(
 
 app.command()(adjust)
 app.command()(calibrate)
+app.command()(site)
 
 
 @app.command()

@@ -9,7 +9,6 @@ from __future__ import annotations
 import json
 import math
 import uuid
-from collections.abc import Iterable
 from dataclasses import dataclass
 from datetime import date
 from pathlib import Path
@@ -48,64 +47,130 @@ class CloudExtent:
     bounds: Array
 
 
-def write_laz(
-    stops: Iterable[StationPoints], path: Path, *, software: str, day: date
-) -> CloudExtent:
-    """Write the returns of stops into one LAZ file (LAS 1.4, point format 6).
+class LazFile:
+    """The returns of stops in one LAZ file (LAS 1.4, point format 6), written stop by stop.
 
-    Parameters
-    ----------
-    stops : iterable of StationPoints
-        One at a time is held.
-    path : Path
-        The file.
-    software : str
-        What made it.
-    day : date
-        Day that the header names.
-
-    Returns
-    -------
-    CloudExtent
-        What was written.
-
-    Raises
-    ------
-    InputError
-        If there is no return, or more stops than a LAZ file can number.
-
-    Notes
-    -----
     A return has ``point_source_id``, the number of its station from 1, ``intensity`` with 0-255
     stretched to 16 bits, ``gps_time``, seconds since the first return of its stop, and as an extra
     dimension ``ring``. Names and poses of the stations are in an extended record of user
     ``spheremark``. Coordinates are those of the site: a local system without a place on Earth.
+
+    Parameters
+    ----------
+    path : Path
+        The file.
+    software : str
+        What makes it.
+    day : date
+        Day that the header names.
     """
-    writer: laspy.LasWriter | None = None
-    extents: list[CloudExtent] = []
-    stations: list[dict[str, Any]] = []
-    try:
-        for number, stop in enumerate(stops, start=1):
-            if number > np.iinfo(np.uint16).max:
-                raise InputError(f"A LAZ file can number {number - 1} stations and no more.")
-            p_site = stop.p_site
-            if writer is None:
-                header = _laz_header(stop.T_site_station[:3, 3], software, day)
-                writer = laspy.open(
-                    path, mode="w", header=header, laz_backend=laspy.LazBackend.Lazrs
-                )
-            for first in range(0, len(p_site), _CHUNK):
-                rows = slice(first, first + _CHUNK)
-                writer.write_points(_laz_points(stop, p_site, rows, number, writer.header))
-            extents.append(_extent(p_site))
-            stations.append(_station(number, stop))
-        extent = _joined(extents)
-        if writer is not None:
-            writer.write_evlrs(_stations_record(stations))
-    finally:
-        if writer is not None:
-            writer.close()
-    return extent
+
+    def __init__(self, path: Path, *, software: str, day: date) -> None:
+        self._path, self._software, self._day = path, software, day
+        self._writer: laspy.LasWriter | None = None
+        self._extents: list[CloudExtent] = []
+        self._stations: list[dict[str, Any]] = []
+
+    def add(self, stop: StationPoints) -> None:
+        """Write the returns of one stop.
+
+        Parameters
+        ----------
+        stop : StationPoints
+            The stop.
+
+        Raises
+        ------
+        InputError
+            If there are more stops than a LAZ file can number.
+        """
+        number, p_site = len(self._stations) + 1, stop.p_site
+        if number > np.iinfo(np.uint16).max:
+            raise InputError(f"A LAZ file can number {number - 1} stations and no more.")
+        if self._writer is None:
+            header = _laz_header(stop.T_site_station[:3, 3], self._software, self._day)
+            backend = laspy.LazBackend.Lazrs
+            self._writer = laspy.open(self._path, mode="w", header=header, laz_backend=backend)
+        for first in range(0, len(p_site), _CHUNK):
+            rows = slice(first, first + _CHUNK)
+            points = _laz_points(stop, p_site, rows, number, self._writer.header)
+            self._writer.write_points(points)
+        self._extents.append(_extent(p_site))
+        self._stations.append(_station(number, stop))
+
+    def finish(self) -> CloudExtent:
+        """Write what stands at the end of the file.
+
+        Returns
+        -------
+        CloudExtent
+            What was written.
+
+        Raises
+        ------
+        InputError
+            If there is no return.
+        """
+        extent = _joined(self._extents)
+        if self._writer is not None:
+            self._writer.write_evlrs(_stations_record(self._stations))
+        return extent
+
+    def close(self) -> None:
+        """Let go of the file."""
+        if self._writer is not None:
+            self._writer.close()
+
+
+class E57File:
+    """The returns of stops in one E57 file (ASTM E2807-11), a scan with a pose for each stop.
+
+    Coordinates are single precision in the station frame; ``pose`` is ``T_site_station``;
+    ``rowIndex`` is the laser. Identifiers follow from the contents, so that the same survey gives
+    the same file.
+
+    Parameters
+    ----------
+    path : Path
+        The file.
+    software : str
+        What makes it.
+    """
+
+    def __init__(self, path: Path, *, software: str) -> None:
+        path.unlink(missing_ok=True)
+        self._image = libe57.ImageFile(str(path), "w")
+        self._scans = _e57_root(self._image, software)
+        self._extents: list[CloudExtent] = []
+
+    def add(self, stop: StationPoints) -> None:
+        """Write the returns of one stop.
+
+        Parameters
+        ----------
+        stop : StationPoints
+            The stop.
+        """
+        self._extents.append(_e57_scan(self._image, self._scans, stop))
+
+    def finish(self) -> CloudExtent:
+        """Say what was written.
+
+        Returns
+        -------
+        CloudExtent
+            What was written, in the site frame.
+
+        Raises
+        ------
+        InputError
+            If there is no return.
+        """
+        return _joined(self._extents)
+
+    def close(self) -> None:
+        """Let go of the file."""
+        self._image.close()
 
 
 def _laz_header(p_site: Array, software: str, day: date) -> laspy.LasHeader:
@@ -178,44 +243,6 @@ def _joined(extents: list[CloudExtent]) -> CloudExtent:
             ]
         ),
     )
-
-
-def write_e57(stops: Iterable[StationPoints], path: Path, *, software: str) -> CloudExtent:
-    """Write the returns of stops into one E57 file, a scan with a pose for each stop.
-
-    Parameters
-    ----------
-    stops : iterable of StationPoints
-        One at a time is held.
-    path : Path
-        The file.
-    software : str
-        What made it.
-
-    Returns
-    -------
-    CloudExtent
-        What was written, in the site frame.
-
-    Raises
-    ------
-    InputError
-        If there is no return.
-
-    Notes
-    -----
-    ASTM E2807-11. Coordinates are single precision in the station frame; ``pose`` is
-    ``T_site_station``; ``rowIndex`` is the laser. Identifiers follow from the contents, so that the
-    same survey gives the same file.
-    """
-    path.unlink(missing_ok=True)
-    image = libe57.ImageFile(str(path), "w")
-    try:
-        scans = _e57_root(image, software)
-        extents = [_e57_scan(image, scans, stop) for stop in stops]
-        return _joined(extents)
-    finally:
-        image.close()
 
 
 def _e57_root(image: Any, software: str) -> Any:

@@ -11,6 +11,7 @@ from service.api import (
     jobs,
     plans,
     problems,
+    products,
     recordings,
     results,
     rigs,
@@ -21,6 +22,6 @@ from service.api import (
 router = APIRouter()
 for part in (
     *(surveys, recordings, jobs, results, adjustments, calibrations),
-    *(rigs, plans, sql, problems),
+    *(products, rigs, plans, sql, problems),
 ):
     router.include_router(part.router)

@@ -6,7 +6,7 @@
 
 from collections.abc import Mapping
 
-from service.work import adjusting, calibrating, processing
+from service.work import adjusting, calibrating, processing, siting
 from service.work.orders import JobKind, Kind, Log, Options, Order, Outcome
 
 __all__ = ["KINDS", "JobKind", "Kind", "Log", "Options", "Order", "Outcome"]
@@ -17,4 +17,5 @@ KINDS: Mapping[JobKind, Kind] = {
         work=adjusting.work, options=adjusting.AdjustOptions, gather=adjusting.gather
     ),
     JobKind.CALIBRATE: Kind(work=calibrating.work, begins_with_rig_of_survey=False),
+    JobKind.SITE: Kind(work=siting.work, options=siting.SiteOptions, gather=siting.gather),
 }

@@ -25,6 +25,7 @@ class JobKind(StrEnum):
     PROCESS = "process"
     ADJUST = "adjust"
     CALIBRATE = "calibrate"
+    SITE = "site"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -1,0 +1,84 @@
+"""Routes of the page of a site: its clouds, its ground, and the form by which they are made."""
+
+from __future__ import annotations
+
+from fastapi import APIRouter
+from fastapi.responses import HTMLResponse, RedirectResponse
+
+from pipelines.elevation import ElevationModel
+from pipelines.errors import InputError, NotFoundError
+from service.api.jobs import start
+from service.api.models import NewJob
+from service.api.products import Product, products_of
+from service.pages import frame_of
+from service.result_pages import Fields
+from service.state import Current, Service
+from service.work import JobKind
+from web import site
+
+router = APIRouter(include_in_schema=False, default_response_class=HTMLResponse)
+
+_MARKS = """
+SELECT mark, x_m, y_m FROM control_marks JOIN surveys AS s USING (survey_id)
+WHERE s.survey_id = $id ORDER BY mark
+"""
+_STATIONS = """
+SELECT station AS name, x_m, y_m FROM adjusted_stations WHERE adjustment_id = $adjustment
+UNION ALL
+SELECT DISTINCT stop AS name, x_m, y_m FROM latest_station_fixes
+WHERE $adjustment IS NULL AND survey_id = $id AND x_m IS NOT NULL
+    AND fit_method = 'along_beam' AND resection_method = 'free_station'
+ORDER BY name
+"""
+_JOBS = """
+SELECT job_id FROM jobs
+WHERE survey_id = $id AND kind = 'site' AND status IN ('accepted', 'running') ORDER BY created_at
+"""
+
+
+@router.get("/surveys/{name}/site")
+def site_page(name: str, service: Current) -> str:
+    """Show what was made of all stops of a survey."""
+    survey = service.catalogue.get_survey(name)
+    products = products_of(service, name)
+    newest = next((one for one in products if one.kind == "geotiff"), None)
+    key = {"id": survey.survey_id}
+    adjustment = {"adjustment": newest.adjustment_id if newest else None}
+    return site.site_page(
+        site.SitePage(
+            frame=frame_of(service, survey.name),
+            survey=survey.name,
+            products=tuple(one.model_dump() for one in products),
+            model=_model(service, newest),
+            marks=service.catalogue.columns(_MARKS, key),
+            stations=service.catalogue.columns(_STATIONS, key | adjustment),
+            jobs=tuple(row["job_id"] for row in service.catalogue.rows(_JOBS, key)),
+        )
+    )
+
+
+@router.post("/surveys/{name}/site")
+def ask(name: str, fields: Fields, service: Current) -> RedirectResponse:
+    """Start a job that makes cloud and ground, and show it."""
+    try:
+        options = {key: float(value) for key, value in fields.items()}
+    except ValueError as error:
+        raise InputError(f"The form has a value that is no number: {error}.") from error
+    job = start(service, NewJob(kind=JobKind.SITE, survey=name, options=options))
+    return RedirectResponse(f"/jobs/{job.job_id}", status_code=303)
+
+
+def _model(service: Service, newest: Product | None) -> ElevationModel | None:
+    """Read the newest model of the ground, if it is there."""
+    from storage.elevation_files import read_geotiff
+
+    if newest is None:
+        return None
+    rows = service.catalogue.rows(
+        "SELECT url FROM site_products WHERE product_id = $id AND kind = 'geotiff'",
+        {"id": newest.product_id},
+    )
+    try:
+        return read_geotiff(rows[0]["url"])
+    except NotFoundError:
+        return None
