@@ -95,9 +95,10 @@ def adjust(
     given = site_files.read_rig(rig) if rig else None
     with progress() as told:
         book = networks.read_scans(logs, config, given, told)
-        found = networks.calibrate_scans(logs, book, config, given, told) if calibrating else None
-    result = networks.adjust_scans(book, marks, config, found)
-    answer = networks.network_answer(result, config, found)
+        if calibrating:
+            book = networks.with_calibration(book, logs, config, given, told)
+    result = networks.adjust_scans(book, marks, config)
+    answer = networks.network_answer(result, config, book)
     if gama:
         write_gama(result, gama)
     if csv:

@@ -17,7 +17,7 @@ from numpy.typing import ArrayLike
 
 from pipelines.calibration import Calibration
 from pipelines.config import SurveyConfig
-from pipelines.errors import SpheremarkError
+from pipelines.errors import RigError, SolveError, SpheremarkError
 from pipelines.geometry import yaw_pitch_roll
 from pipelines.network import (
     AdjustedNetwork,
@@ -36,8 +36,8 @@ from storage.recordings import read_log
 from storage.results import ellipse, marker_name
 
 __all__ = [
-    "Fieldbook", "adjust_scans", "calibrate_scans", "calibrated", "network_answer", "read_scans",
-    "report",
+    "Fieldbook", "adjust_scans", "calibrated", "network_answer", "read_scans", "report",
+    "with_calibration",
 ]  # fmt: skip
 
 Plain = dict[str, Any]
@@ -52,10 +52,16 @@ _FREE = (
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Fieldbook:
-    """The centres of each station that a survey's logs gave, and the stations that gave none."""
+    """The centres of each station that a survey's logs gave, and the stations that gave none.
+
+    ``calibration`` is the rig from the same logs, if it was asked for; ``uncalibrated`` says why it
+    could not be had.
+    """
 
     scans: tuple[tuple[str, MarkerFits], ...]
     refused: tuple[Refusal, ...]
+    calibration: Calibration | None = None
+    uncalibrated: str = ""
 
 
 def read_scans(
@@ -88,23 +94,23 @@ def _scans(
         yield stop.name, stop.fits[config.fitting.methods[0]]
 
 
-def calibrate_scans(
-    logs: Sequence[Path], book: Fieldbook, config: SurveyConfig, rig: Rig | None, progress: Progress
-) -> Calibration:
-    """Estimate the rig from the logs that gave stations, to be adjusted with the network."""
+def with_calibration(
+    book: Fieldbook, logs: Sequence[Path], config: SurveyConfig, rig: Rig | None, progress: Progress
+) -> Fieldbook:
+    """Return a fieldbook with the rig from its logs, or why they do not tell it."""
     refused = {one.station for one in book.refused}
     good = [log for log in logs if log.stem not in refused]
-    return calibrate_logs(good, config, rig, progress)
+    try:
+        return replace(book, calibration=calibrate_logs(good, config, rig, progress))
+    except (SolveError, RigError) as error:
+        return replace(book, uncalibrated=str(error))
 
 
 def adjust_scans(
-    book: Fieldbook,
-    control: ControlMarks | None,
-    config: SurveyConfig,
-    calibration: Calibration | None = None,
+    book: Fieldbook, control: ControlMarks | None, config: SurveyConfig
 ) -> AdjustedNetwork:
-    """Adjust all stations and marks together, and the rig where it was calibrated before."""
-    network = assemble(book.scans, control, config.resection, calibration)
+    """Adjust all stations and marks together, and the rig where the fieldbook has one."""
+    network = assemble(book.scans, control, config.resection, book.calibration)
     network = replace(network, refused=(*book.refused, *network.refused))
     return adjust_network(network, config.resection)
 
@@ -116,14 +122,19 @@ def calibrated(result: AdjustedNetwork, calibration: Calibration) -> Calibration
 
 
 def network_answer(
-    result: AdjustedNetwork, config: SurveyConfig, calibration: Calibration | None = None
+    result: AdjustedNetwork, config: SurveyConfig, book: Fieldbook | None = None
 ) -> Plain:
-    """Return a network as plain values; ``calibration`` as it was before the network."""
-    network = result.network
+    """Return a network as plain values, with the rig that was adjusted with it."""
+    network, warnings = result.network, list(result.warnings)
+    calibration = None if book is None else book.calibration
     rig = None if calibration is None else calibrated(result, calibration)
+    if book is not None and book.uncalibrated:
+        warnings.append(f"The rig could not be calibrated and stays as it was: {book.uncalibrated}")
+    if not result.passes_global_test and rig is None:
+        warnings.append("Where the rig may be wrong, adjusting it too can tell (--calibrate).")
     return {
-        "status": "weak" if result.warnings else "ok",
-        "warnings": list(result.warnings),
+        "status": "weak" if warnings else "ok",
+        "warnings": warnings,
         "datum": _datum(result),
         "method": config.fitting.methods[0],
         "config": config.to_mapping() | {"digest": config.digest},

@@ -10,11 +10,21 @@ from xml.etree import ElementTree as ET
 import numpy as np
 import pytest
 
+from pipelines.config import SurveyConfig
+from pipelines.rigs import rig_from_mapping, rig_to_mapping
 from pipelines.simulation import SimulationConfig
 from service.cli import main
 from service.fieldwork import Assignment, survey
+from service.networks import (
+    Fieldbook,
+    adjust_scans,
+    network_answer,
+    read_scans,
+    with_calibration,
+)
 from storage.site_files import read_control, read_truth
 
+CONFIG = SurveyConfig.from_mapping({"fitting": {"methods": ["along_beam"]}})
 STOPS = ("lane2-stop2", "lane3-stop5", "lane4-stop3")
 
 
@@ -216,3 +226,22 @@ def test_a_rig_is_adjusted_with_the_network_and_serves_as_a_rig(logs, tmp_path):
     path.write_text(json.dumps(rig))
     again = json.loads(run(*logs[:2], "--rig", path, "--json").stdout)
     assert again["passes_global_test"]
+
+
+def test_a_rig_that_the_logs_do_not_tell_stays_and_the_network_stands(logs):
+    upright = rig_to_mapping(read_truth(logs[0].with_name(f"{logs[0].stem}.truth.json")).rig)
+    upright["T_head_lidar"] = np.eye(4).tolist()
+    book = Fieldbook(scans=scans_of(logs[:2]), refused=())
+    told = with_calibration(
+        book, logs[:2], CONFIG, rig_from_mapping(upright), lambda _share, _what: None
+    )
+    answer = network_answer(adjust_scans(told, None, CONFIG), CONFIG, told)
+    assert answer["calibration"] is None
+    assert any("two faces" in warning for warning in answer["warnings"])
+    assert len(answer["stations"]) == 2
+
+
+def scans_of(logs):
+    book = read_scans(logs, CONFIG, None, lambda _share, _what: None)
+    assert not book.refused
+    return book.scans
