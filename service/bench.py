@@ -1,8 +1,10 @@
 """How long each step takes, as a multiple of one read of the file with a checksum in the same run.
 
-The yardstick makes machines comparable: it is what any program must pay that looks at each byte.
+The yardstick (``service.yardstick``) makes machines comparable. One scan is measured in three
+dresses: as points, as raw packets, and as points in zstd, all against one read of the plain points.
 Beside each step stands what the usual libraries need for it (``service.peers``), beside the
-centres what theirs are worth. Memory is that of a fresh process that runs one scan.
+centres what theirs are worth. Memory is that of a fresh process that runs one scan; how cost grows
+is told by ``service.growth``.
 """
 
 from __future__ import annotations
@@ -11,7 +13,7 @@ import json
 import subprocess
 import sys
 import tempfile
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
@@ -20,43 +22,48 @@ from time import perf_counter
 from typing import Any
 
 import numpy as np
-from isal.isal_zlib import crc32
-from numpy.typing import NDArray
 
 from pipelines.config import FittingConfig, SurveyConfig
 from pipelines.geometry import inverse, transform
-from pipelines.simulation import SimulatedStop, SimulationConfig, scenario, simulate_stop
+from pipelines.simulation import SimulationConfig, scenario, simulate_stop
 from pipelines.survey import Progress, process
-from pipelines.values import Array, ControlMarks, ScanLog, StopResult
+from pipelines.values import Array, ControlMarks, StopResult
+from service import yardstick
 from service.provenance import forget_peak_memory, peak_memory
 from storage.catalogue import Catalogue
 from storage.recordings import inspect_log, read_log, write_log
 from storage.results import RunInfo, tables
 
-_BLOCK = 4 << 20  # [bytes] read at once
 _STOP = "lane3-stop4"  # the centre of the field
-_TURN = 21.0  # [s]: three million returns
+_TURN = 20.7  # [s]: three million returns
 _NEAR = 0.1  # [m] from a true centre: farther is a false marker
 _METHOD = "along_beam"
 _CONFIG = SurveyConfig(fitting=FittingConfig(methods=(_METHOD,)))
 _CHAIN = "log to rows committed"
 _OURS = {"fitting": f"fitting.{_METHOD}"}  # where a peer's step is called otherwise here
-_SIZES = (1, 3, 10, 30)  # [millions of returns] of the long runs
+_POINTS, _PACKETS, _ZSTD = "points", "packets", "points in zstd"
+_BARS = {_POINTS: 8.0, _PACKETS: 8.0, _ZSTD: 20.0}  # x read+CRC that the chain may cost
+_BAR_PEERS = 15.0  # times quicker than the usual libraries
+_BAR_MEMORY = 500e6  # [bytes] of one scan
 Timings = dict[str, float]
 Plain = dict[str, Any]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Wish:
-    """What to measure: the best of how many runs, without slow peers, with long logs."""
+    """What to measure: the best of how many runs, without slow peers, and how cost grows.
+
+    The turn of the gimbal at the simulated stop [s] says how many returns there are.
+    """
 
     repeats: int = 5
     is_quick: bool = False
     is_long: bool = False
+    turn: float = _TURN
 
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
-class _Scan:
+class Scan:
     """A log on disk with what is known of it; marks and true centres when it was simulated."""
 
     log: Path
@@ -64,76 +71,94 @@ class _Scan:
     true_base: Array | None = None
 
 
+@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
+class Measured:
+    """The best time of each step [s], the result of a run, and the number of its returns."""
+
+    times: Timings
+    result: StopResult
+    n_returns: int
+
+
 def run(log: Path | None, wish: Wish, progress: Progress) -> Plain:
-    """Measure the chain on a log, or on a simulated stop; the best of each step counts."""
+    """Measure the chain on a log, or on a simulated stop in three dresses."""
     with tempfile.TemporaryDirectory() as text:
         folder = Path(text)
-        variants: dict[str, Path] = {}
-        if log:
-            scan = _Scan(log=log)
-        else:
-            progress(0.0, "Simulating a stop of three million returns")
-            field = scenario("paper-field", 0)
-            stop = simulate_stop(field, _STOP, SimulationConfig(turn=_TURN))
-            scan, variants = _written(stop, field.marks, folder)
-        times, result, n_returns = _measured(scan, folder, wish, progress)
-        report = _report(scan.log, n_returns, times, wish)
-        report["memory"] = _memory(scan, folder)
+        progress(0.0, "Reading" if log else "Simulating a stop of three million returns")
+        scans = {log.name: Scan(log=log)} if log else _simulated(folder, wish.turn)
+        plain = next(iter(scans.values()))
+        read, measured = measure(scans, folder, wish.repeats, progress)
+        first = next(iter(measured.values()))
+        report = _report(plain.log, first, read, wish)
         report["variants"] = [
-            _variant(name, replace(scan, log=path), folder, wish, progress)
-            for name, path in variants.items()
+            _variant(name, scan.log, measured[name], read) for name, scan in scans.items()
         ]
+        report["memory"] = _memory(plain, folder)
         if not wish.is_quick:
-            progress(0.7, "The usual libraries")
-            report |= _compared(scan, result, report)
+            progress(0.6, "The usual libraries")
+            report |= _compared(scans, first.result, report)
         if wish.is_long:
-            report["linearity"] = [_long(scan, n, folder, progress) for n in _SIZES]
+            from service.growth import grown
+
+            report |= grown(plain, folder, progress)
         return report
 
 
-def _written(
-    stop: SimulatedStop, marks: ControlMarks, folder: Path
-) -> tuple[_Scan, dict[str, Path]]:
-    """Write a stop as points, and its variants; return the scan and the variants' paths."""
-    variants = {name: folder / f"{name}.mcap" for name in ("points zstd", "packets")}
-    write_log(stop.log, folder / f"{_STOP}.mcap")
-    write_log(stop.log, variants["points zstd"], compression="zstd")
-    write_log(stop.log, variants["packets"], firings=stop.firings)
-    return _Scan(
+def _simulated(folder: Path, turn: float) -> dict[str, Scan]:
+    """Write one stop in three dresses."""
+    field = scenario("paper-field", 0)
+    stop = simulate_stop(field, _STOP, SimulationConfig(turn=turn))
+    scan = Scan(
         log=folder / f"{_STOP}.mcap",
-        marks=marks,
-        true_base=transform(inverse(stop.truth.T_site_base), marks.p_site),
-    ), variants
+        marks=field.marks,
+        true_base=transform(inverse(stop.truth.T_site_base), field.marks.p_site),
+    )
+    packets, zstd = folder / f"{_STOP} packets.mcap", folder / f"{_STOP} zstd.mcap"
+    write_log(stop.log, scan.log)
+    write_log(stop.log, packets, firings=stop.firings)
+    write_log(stop.log, zstd, compression="zstd")
+    return {
+        _POINTS: scan,
+        _PACKETS: replace(scan, log=packets),
+        _ZSTD: replace(scan, log=zstd),
+    }
 
 
-def _measured(
-    scan: _Scan, folder: Path, wish: Wish, progress: Progress
-) -> tuple[Timings, StopResult, int]:
-    """Run the chain a few times; return the best times, the first stop and the number of returns.
+def measure(
+    scans: Mapping[str, Scan], folder: Path, repeats: int, progress: Progress
+) -> tuple[float, dict[str, Measured]]:
+    """Run the chain on scans in turn, a few times; return the yardstick [s] and the best times.
 
-    The first run compiles kernels and fills the cache of the file; it does not count.
+    The first round compiles kernels and fills the cache of the files; it does not count. Yardstick
+    and scans take turns, so that what else the machine does befalls all of them.
     """
-    _chain(scan, folder / f"{scan.log.stem} warm")
-    found = []
-    for i in range(wish.repeats):
-        progress(i / wish.repeats, f"{scan.log.stem}: run {i + 1} of {wish.repeats}")
-        found.append(_chain(scan, folder / f"{scan.log.stem} {i}"))
-    best = {step: min(times[step] for times, _, _ in found) for step in found[0][0]}
-    return best, found[0][1], found[0][2]
+    plain = next(iter(scans.values()))
+    reads: list[float] = []
+    found: dict[str, list[Measured]] = {name: [] for name in scans}
+    for i in range(repeats + 1):
+        progress(0.6 * i / (repeats + 1), f"Run {i} of {repeats}" if i else "A first run")
+        reads.append(yardstick.read_seconds(plain.log))
+        for k, (name, scan) in enumerate(scans.items()):
+            found[name].append(_chain(scan, folder / f"{i} {k}"))
+    return min(reads), {name: _best(runs[1:]) for name, runs in found.items()}
 
 
-def _chain(scan: _Scan, folder: Path) -> tuple[Timings, StopResult, int]:
-    """Run everything once; return the time of each step [s], the first stop and its returns."""
+def _best(runs: Sequence[Measured]) -> Measured:
+    """Return the best time of each step."""
+    times = {step: min(one.times[step] for one in runs) for step in runs[0].times}
+    return replace(runs[0], times=times)
+
+
+def _chain(scan: Scan, folder: Path) -> Measured:
+    """Run everything once."""
     times: Timings = {}
-    with _timed(times, "read+CRC"):
-        _checksum(scan.log)
     with _timed(times, "preflight"):
         inspect_log(scan.log)
-    stops, n_returns = _committed(scan, folder, times)
-    return _in_order(times, stops), stops[0], n_returns
+    stops, n_returns = committed(scan, folder, times)
+    return Measured(times=_in_order(times, stops), result=stops[0], n_returns=n_returns)
 
 
-def _committed(scan: _Scan, folder: Path, times: Timings) -> tuple[tuple[StopResult, ...], int]:
+def committed(scan: Scan, folder: Path, times: Timings) -> tuple[tuple[StopResult, ...], int]:
     """Bring a log into a database of its own; return its stops and the number of returns."""
     with Catalogue(folder / "bench.duckdb", snapshots=folder / "snapshots") as catalogue:
         job = _job(catalogue, scan.log)
@@ -146,15 +171,6 @@ def _committed(scan: _Scan, folder: Path, times: Timings) -> tuple[tuple[StopRes
             with _timed(times, "commit"):
                 catalogue.finish_job(job, rows)
     return stops, len(log.p_lidar)
-
-
-def _checksum(log: Path) -> int:
-    """Read a file once, with a CRC-32."""
-    crc = 0
-    with log.open("rb") as file:
-        while block := file.read(_BLOCK):
-            crc = crc32(block, crc)
-    return crc
 
 
 def _job(catalogue: Catalogue, log: Path) -> str:
@@ -190,61 +206,81 @@ def _in_order(times: Timings, stops: Sequence[StopResult]) -> Timings:
     for stop in stops:
         for step, seconds in stop.timings.items():
             steps[step] = steps.get(step, 0.0) + seconds
-    first = {name: times[name] for name in ("read+CRC", "preflight", "read log")}
+    first = {name: times[name] for name in ("preflight", "read log")}
     last = {name: times[name] for name in ("rows", "commit", _CHAIN)}
     return first | steps | last
 
 
-def _report(log: Path, n_returns: int, best: Timings, wish: Wish) -> Plain:
+def _report(log: Path, measured: Measured, read: float, wish: Wish) -> Plain:
     """Return the best time of each step, and its ratio to the yardstick."""
     return {
-        "log": {"name": log.name, "size_bytes": log.stat().st_size, "n_returns": n_returns},
+        "log": {
+            "name": log.name,
+            "size_bytes": log.stat().st_size,
+            "n_returns": measured.n_returns,
+        },
         "repeats": wish.repeats,
-        "yardstick": "one read of the file in blocks of 4 MiB with isal's CRC-32, cache warm",
+        "yardstick": yardstick.WHAT,
+        "yardstick_seconds": read,
         "steps": [
-            {"step": step, "seconds": seconds, "ratio": seconds / best["read+CRC"]}
-            for step, seconds in best.items()
+            {"step": step, "seconds": seconds, "ratio": seconds / read}
+            for step, seconds in measured.times.items()
         ],
     }
 
 
-def _variant(name: str, scan: _Scan, folder: Path, wish: Wish, progress: Progress) -> Plain:
-    """Return what the chain costs on the same scan in another dress."""
-    best, _, _ = _measured(scan, folder, wish, progress)
+def _variant(name: str, log: Path, measured: Measured, read: float) -> Plain:
+    """Return what the chain costs on a scan in one dress, against a read of the plain points."""
+    chain, ours = measured.times[_CHAIN], measured.times["read log"]
     return {
         "name": name,
-        "size_bytes": scan.log.stat().st_size,
-        "read_log_seconds": best["read log"],
-        "chain_seconds": best[_CHAIN],
-        "ratio": best[_CHAIN] / best["read+CRC"],
+        "size_bytes": log.stat().st_size,
+        "read_log_seconds": ours,
+        "read_log_ratio": ours / read,
+        "chain_seconds": chain,
+        "ratio": chain / read,
+        "bar_ratio": _BARS.get(name),
     }
 
 
-def _compared(scan: _Scan, result: StopResult, report: Plain) -> Plain:
+def _compared(scans: Mapping[str, Scan], result: StopResult, report: Plain) -> Plain:
     """Return what the usual libraries need for each step, and what their centres are worth."""
-    from service.peers import run_peers
+    from service.peers import pcl_seconds, run_peers
 
-    radius = _CONFIG.marker_radius
-    peer = min(
-        (run_peers(scan.log, result.cloud.rig, radius) for _ in range(2)),
-        key=lambda one: sum(one.seconds.values()),
-    )
-    ours = {step["step"]: step["seconds"] for step in report["steps"]}
-    ours["rows and commit"] = ours["rows"] + ours["commit"]
-    steps = [
-        {
-            "step": step,
-            "ours_seconds": (mine := ours[_OURS.get(step, step)]),
-            "peer_seconds": seconds,
-            "factor": seconds / mine,
-        }
-        for step, seconds in (*peer.seconds.items(), (_CHAIN, sum(peer.seconds.values())))
-    ]
+    radius, plain = _CONFIG.marker_radius, next(iter(scans.values()))
+    peers = {name: run_peers(scan.log, result.cloud.rig, radius) for name, scan in scans.items()}
+    variants = []
+    for one in report["variants"]:
+        seconds = sum(peers[one["name"]].seconds.values())
+        factor = seconds / one["chain_seconds"]
+        variants.append({**one, "peer_seconds": seconds, "factor": factor})
+    peer = next(iter(peers.values()))
     fits = result.fits[_METHOD].fits
     found = {"spheremark, along_beam": np.array([fit.p_base for fit in fits])}
     found["Open3D: plane, DBSCAN, ICP"] = peer.centres
     found |= _centres_of_peers(result, radius)
-    return {"peers": steps, "accuracy": _accuracy(found, scan.true_base)}
+    return {
+        "variants": variants,
+        "bar_factor": _BAR_PEERS,
+        "peers": _steps_of_peers(report["steps"], peer.seconds),
+        "pcl": pcl_seconds(result.cloud.p_base),
+        "accuracy": _accuracy(found, plain.true_base),
+    }
+
+
+def _steps_of_peers(steps: Sequence[Plain], seconds: Timings) -> list[Plain]:
+    """Return the times of our steps beside those of the usual libraries."""
+    ours = {step["step"]: step["seconds"] for step in steps}
+    ours["rows and commit"] = ours["rows"] + ours["commit"]
+    return [
+        {
+            "step": step,
+            "ours_seconds": (mine := ours[_OURS.get(step, step)]),
+            "peer_seconds": theirs,
+            "factor": theirs / mine,
+        }
+        for step, theirs in (*seconds.items(), (_CHAIN, sum(seconds.values())))
+    ]
 
 
 def _centres_of_peers(result: StopResult, radius: float) -> dict[str, Array]:
@@ -282,19 +318,19 @@ def _accuracy(found: dict[str, Array], true_base: Array | None) -> list[Plain]:
     return rows
 
 
-def _memory(scan: _Scan, folder: Path) -> Plain:
+def _memory(scan: Scan, folder: Path) -> Plain:
     """Run one scan in a fresh process; return its resident memory before and at the most."""
     command = [sys.executable, "-m", "service.bench", str(scan.log), str(folder / "fresh")]
     done = subprocess.run(command, capture_output=True, text=True, check=True)
     found: Plain = json.loads(done.stdout)
-    return found
+    return found | {"bar_bytes": _BAR_MEMORY}
 
 
 def _fresh(log: Path, folder: Path) -> Plain:
     """Run one scan in this process, which has done nothing but import before."""
     before = _resident()
     forget_peak_memory()
-    _committed(_Scan(log=log), folder, {})
+    committed(Scan(log=log), folder, {})
     peak = peak_memory()
     return {"before_bytes": before, "peak_bytes": peak, "scan_bytes": peak - before}
 
@@ -303,46 +339,6 @@ def _resident() -> int:
     """Return the resident size of this process [bytes]."""
     forget_peak_memory()
     return peak_memory()
-
-
-def _long(scan: _Scan, millions: int, folder: Path, progress: Progress) -> Plain:
-    """Return what the chain costs on a log of so many million returns."""
-    progress(0.9, f"A log of {millions} million returns")
-    path = folder / f"{millions}M.mcap"
-    write_log(_stretched(read_log(scan.log, digest="0" * 64), millions * 1_000_000), path)
-    times, _, n_returns = _measured(
-        replace(scan, log=path), folder, Wish(repeats=2), lambda _share, _what: None
-    )
-    path.unlink()
-    return {
-        "n_returns": n_returns,
-        "seconds": times[_CHAIN],
-        "ratio": times[_CHAIN] / times["read+CRC"],
-        "ns_per_return": 1e9 * times[_CHAIN] / n_returns,
-    }
-
-
-def _stretched(log: ScanLog, n: int) -> ScanLog:
-    """Return a log of n returns: the beginning of one, or one turned again and again."""
-    repeats = -(-n // len(log.p_lidar))
-    span = int(log.stamps_gimbal_ns[-1] - log.stamps_gimbal_ns[0])
-    span += int(np.median(np.diff(log.stamps_gimbal_ns)))
-    turn = 2.0 * np.pi * np.sign(log.gimbal_angles[-1] - log.gimbal_angles[0])
-
-    def again(column: NDArray[Any], step: float) -> NDArray[Any]:
-        return np.concatenate([column + column.dtype.type(k * step) for k in range(repeats)])
-
-    return replace(
-        log,
-        p_lidar=np.tile(log.p_lidar, (repeats, 1))[:n],
-        intensities=np.tile(log.intensities, repeats)[:n],
-        rings=np.tile(log.rings, repeats)[:n],
-        stamps_lidar_ns=again(log.stamps_lidar_ns, span)[:n],
-        gimbal_angles=again(log.gimbal_angles, turn),
-        stamps_gimbal_ns=again(log.stamps_gimbal_ns, span),
-        quaternions_imu=np.tile(log.quaternions_imu, (repeats, 1)),
-        stamps_imu_ns=again(log.stamps_imu_ns, span),
-    )
 
 
 @contextmanager

@@ -222,7 +222,7 @@ def _print_growth(out: Console, report: Plain) -> None:
             f"{100 * linearity['worst_share_off_line']:.0f} %."
         )
     if networks := report.get("network"):
-        rows = [
+        costs = [
             (
                 f"{one['n_stations']:,} x {one['n_marks']}",
                 f"{one['assembly_seconds']:.2f}",
@@ -233,7 +233,7 @@ def _print_growth(out: Console, report: Plain) -> None:
             for one in networks
         ]
         heads = ("stations x marks", "assembly [s]", "adjustment [s]", "ms a station", "both [ms]")
-        out.print(_table(heads, rows))
+        out.print(_table(heads, costs))
 
 
 _SAID = ("distance", "count", "mean_distance", "mean_count")

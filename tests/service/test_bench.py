@@ -1,0 +1,141 @@
+"""The benchmark on a short scan: what it says must hang together; how quick it is, is not asked."""
+
+import json
+
+import numpy as np
+import pytest
+from rich.console import Console
+from typer.testing import CliRunner
+
+from pipelines.simulation import SimulationConfig, scenario, simulate_stop
+from service import bench, growth, peers, tables, yardstick
+from service.cli import app
+from storage.recordings import read_log, write_log
+
+TURN = 4.0  # [s]: half a million returns
+
+
+@pytest.fixture(scope="module")
+def report():
+    said = []
+    wish = bench.Wish(repeats=1, turn=TURN)
+    found = bench.run(None, wish, lambda share, what: said.append((share, what)))
+    assert all(0.0 <= share <= 1.0 for share, _ in said)
+    return found
+
+
+@pytest.fixture(scope="module")
+def written(tmp_path_factory):
+    """One stop as points, in zstd and as packets."""
+    stop = simulate_stop(scenario("paper-field", 1), "lane3-stop4", SimulationConfig(turn=TURN))
+    folder = tmp_path_factory.mktemp("bench")
+    paths = {name: folder / f"{name}.mcap" for name in ("points", "zstd", "packets")}
+    write_log(stop.log, paths["points"])
+    write_log(stop.log, paths["zstd"], compression="zstd")
+    write_log(stop.log, paths["packets"], firings=stop.firings)
+    return paths
+
+
+def test_one_scan_is_measured_in_three_dresses_against_one_yardstick(report):
+    variants = {one["name"]: one for one in report["variants"]}
+    assert {name: one["bar_ratio"] for name, one in variants.items()} == {
+        "points": 8.0, "packets": 8.0, "points in zstd": 20.0,
+    }  # fmt: skip
+    sizes = [variants[name]["size_bytes"] for name in ("packets", "points in zstd", "points")]
+    assert sizes == sorted(sizes)
+    assert report["log"]["size_bytes"] == variants["points"]["size_bytes"]
+    for one in variants.values():
+        assert 0.0 < one["read_log_seconds"] < one["chain_seconds"]
+        assert one["ratio"] == one["chain_seconds"] / report["yardstick_seconds"]
+        assert one["factor"] == one["peer_seconds"] / one["chain_seconds"]
+
+
+def test_the_steps_are_those_of_the_chain(report):
+    seconds = {one["step"]: one["seconds"] for one in report["steps"]}
+    assert list(seconds)[:3] == ["preflight", "read log", "stitching"]
+    parts = sum(seconds.values()) - seconds["preflight"] - seconds["log to rows committed"]
+    assert 0.5 * seconds["log to rows committed"] < parts < 1.01 * seconds["log to rows committed"]
+    theirs = {one["step"]: one["peer_seconds"] for one in report["peers"]}
+    assert list(theirs) == [
+        "read log", "stitching", "extraction", "fitting", "rows and commit",
+        "log to rows committed",
+    ]  # fmt: skip
+    total = theirs.pop("log to rows committed")
+    assert total == pytest.approx(sum(theirs.values()))
+
+
+def test_memory_is_that_of_a_fresh_process(report):
+    memory = report["memory"]
+    assert 50e6 < memory["before_bytes"] < memory["peak_bytes"] < 1e9
+    assert memory["scan_bytes"] == memory["peak_bytes"] - memory["before_bytes"]
+
+
+def test_the_centres_of_all_are_held_against_the_truth(report):
+    by_method = {one["method"]: one for one in report["accuracy"]}
+    assert {"spheremark, along_beam", "Open3D: plane, DBSCAN, ICP"} <= set(by_method)
+    for one in by_method.values():
+        assert one["n_markers"] == 14
+        assert (one["error_rms_m"] is None) == (one["n_found"] == 0)
+
+
+def test_the_report_is_a_table_and_json(report):
+    out = Console(record=True, width=160)
+    tables.print_bench(out, report)
+    text = out.export_text()
+    for word in ("read log", "packets", "points in zstd", "usual libraries", "Memory"):
+        assert word in text
+    assert json.loads(json.dumps(report)) == report
+
+
+@pytest.mark.parametrize("dress", ["points", "zstd", "packets"])
+def test_the_usual_libraries_read_the_same_returns(written, dress):
+    log = read_log(written[dress])
+    points, instants, joints = peers._decode(written[dress])
+    assert np.abs(points - log.p_lidar).max() < 1e-4
+    ours = (log.stamps_lidar_ns - log.stamps_gimbal_ns[0]) * 1e-9
+    assert np.abs(instants - ours).max() < 3e-6  # the decoder counts whole microseconds
+    assert np.abs(np.unwrap(joints[:, 1]) - log.gimbal_angles).max() < 1e-12
+
+
+def test_a_log_of_ones_own_is_measured_without_truth(written):
+    command = ["bench", str(written["packets"]), "--repeats", "1", "--quick", "--json"]
+    found = json.loads(CliRunner().invoke(app, command).stdout)
+    assert found["log"]["n_returns"] == len(read_log(written["points"]).p_lidar)
+    assert [one["bar_ratio"] for one in found["variants"]] == [None]
+    assert "peers" not in found
+
+
+def test_the_yardstick_is_measured_in_a_process_of_its_own(tmp_path):
+    (tmp_path / "a").write_bytes(bytes(50_000_000))
+    (tmp_path / "b").write_bytes(bytes(50))
+    assert yardstick.read_seconds(tmp_path / "a") > 10 * yardstick.read_seconds(tmp_path / "b") > 0
+
+
+def test_a_stretched_log_turns_on_evenly(written):
+    log = read_log(written["points"])
+    n = 2 * len(log.p_lidar) + 100
+    longer = growth._stretched(log, n)
+    assert len(longer.p_lidar) == n
+    assert (np.diff(longer.stamps_lidar_ns) >= 0).all()
+    assert (np.diff(longer.stamps_gimbal_ns) > 0).all()
+    same = longer.p_lidar[len(log.p_lidar) : 2 * len(log.p_lidar)]
+    assert (same == log.p_lidar).all()
+    turned = longer.gimbal_angles[len(log.gimbal_angles)] - log.gimbal_angles[0]
+    assert abs(turned) == pytest.approx(2.0 * np.pi)
+
+
+def test_a_straight_line_tells_what_is_fixed_and_what_each_return_costs():
+    n = np.array([1e6, 3e6, 1e7])
+    sizes = [{"n_returns": int(k), "seconds": 0.02 + 3e-8 * k} for k in n]
+    found = growth.line(sizes)
+    assert found["fixed_seconds"] == pytest.approx(0.02)
+    assert found["line_ns_per_return"] == pytest.approx(30.0)
+    assert found["worst_share_off_line"] < 1e-9
+    sizes[2]["seconds"] *= 1.5
+    assert growth.line(sizes)["worst_share_off_line"] > 0.05
+
+
+def test_a_network_is_assembled_and_adjusted_as_it_is_timed():
+    found = growth.adjust(12, 20)
+    assert (found["n_stations"], found["n_marks"], found["n_sightings"]) == (12, 20, 168)
+    assert 0.8 < found["sigma0"] < 1.2
