@@ -159,7 +159,6 @@ SELECT calibration_id, rig_digest, len(stops) AS n_stops, gap_rms_before_m, gap_
     finished_at
 FROM calibrations WHERE survey_id = $id ORDER BY finished_at DESC LIMIT $n
 """
-_REPEATS = "SELECT * FROM repeated_stops WHERE survey_id = $id"
 _N_RESULTS = 20  # networks and calibrations in the page of their survey
 
 
@@ -334,7 +333,6 @@ def _survey_results(service: Service, survey: Mapping[str, Any]) -> pages.Survey
     return pages.SurveyResults(
         adjustments=tuple(rows(_ADJUSTMENTS, {**key, "n": _N_RESULTS})),
         calibrations=tuple(rows(_CALIBRATIONS, {**key, "n": _N_RESULTS})),
-        repeats=tuple(rows(_REPEATS, key)),
         rig_digest=survey["rig_digest"],
     )
 

@@ -29,6 +29,7 @@ _OBSERVATIONS = """
 SELECT * FROM adjusted_observations WHERE adjustment_id = $id ORDER BY kind, station, marker, mark
 """
 _CHECKS = "SELECT * FROM control_checks WHERE adjustment_id = $id ORDER BY mark"
+_REPEATS = "SELECT * FROM repeated_stops WHERE adjustment_id = $id ORDER BY station, again"
 _REFUSED = "SELECT * FROM refused_stations WHERE adjustment_id = $id ORDER BY station"
 _CALIBRATION = """
 SELECT c.*, s.name AS survey, s.rig_digest AS chosen_rig
@@ -53,6 +54,7 @@ def adjustment(adjustment_id: str, service: Current) -> str:
             marks=catalogue.columns(_MARKS, key),
             observations=catalogue.columns(_OBSERVATIONS, key),
             checks=catalogue.columns(_CHECKS, key),
+            repeats=tuple(catalogue.rows(_REPEATS, key)),
             refused=tuple(catalogue.rows(_REFUSED, key)),
             files=_files(service, adjustment_id),
         )

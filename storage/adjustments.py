@@ -72,6 +72,7 @@ SCHEMAS: Mapping[str, Mapping[str, pa.DataType]] = {
         **_ID,
         "mark": _TEXT,
         "is_control": _TRUTH_VALUE,
+        **dict.fromkeys(("status", "reason"), _TEXT),
         **_PLACE,
         **_COV,
         "sigma_3d_m": _REAL,
@@ -98,6 +99,13 @@ SCHEMAS: Mapping[str, Mapping[str, pa.DataType]] = {
         "n_observations": _WHOLE,
         **dict.fromkeys([f"difference_{axis}_m" for axis in ("x", "y", "z", "3d")], _REAL),
         **dict.fromkeys([f"sigma_{axis}_m" for axis in ("x", "y", "z", "3d")], _REAL),
+    },
+    "repeated_stops": {
+        **_ID,
+        **dict.fromkeys(("station", "again"), _TEXT),
+        "n_marks": _WHOLE,
+        **dict.fromkeys([f"apart_{axis}_m" for axis in ("x", "y", "z", "3d")], _REAL),
+        **dict.fromkeys(("difference_rms_m", "predicted_rms_m"), _REAL),
     },
 }
 """Columns of each table, in the order of the database."""

@@ -29,6 +29,7 @@ class AdjustmentPage:
     marks: Columns
     observations: Columns
     checks: Columns
+    repeats: tuple[Row, ...]
     refused: tuple[Row, ...]
     files: tuple[str, ...]
 

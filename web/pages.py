@@ -73,11 +73,10 @@ class OverviewPage:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SurveyResults:
-    """What was made of a survey as a whole, the rig that its jobs use, and repeated stops."""
+    """What was made of a survey as a whole, and the rig that its jobs use."""
 
     adjustments: tuple[Row, ...] = ()
     calibrations: tuple[Row, ...] = ()
-    repeats: tuple[Row, ...] = ()
     rig_digest: str | None = None
 
 

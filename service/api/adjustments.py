@@ -35,6 +35,7 @@ _PARTS = {
     "stations": "SELECT * FROM adjusted_stations WHERE adjustment_id = $id ORDER BY station",
     "marks": "SELECT * FROM adjusted_marks WHERE adjustment_id = $id ORDER BY mark",
     "control_checks": "SELECT * FROM control_checks WHERE adjustment_id = $id ORDER BY mark",
+    "repeated_stops": "SELECT * FROM repeated_stops WHERE adjustment_id = $id ORDER BY ALL",
     "refused": "SELECT * FROM refused_stations WHERE adjustment_id = $id ORDER BY station",
 }
 

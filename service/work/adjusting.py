@@ -114,7 +114,7 @@ def work(order: Order, progress: Progress) -> Outcome:
     import pyarrow as pa
 
     from service import networks
-    from service.work.network_rows import control_checks, network_rows
+    from service.work.network_rows import network_rows
     from storage import adjustments
     from storage.documents import documents
 
@@ -125,9 +125,7 @@ def work(order: Order, progress: Progress) -> Outcome:
     scans = networks.Fieldbook(scans=tuple(book.scans), refused=tuple(book.refused))
     result = networks.adjust_scans(scans, marks, order.config)
     answer = networks.network_answer(result, order.config)
-    progress(0.5 * (1.0 + _SCANS), "Leaving out each control mark in turn")
     rows = network_rows(answer, book.sources)
-    rows["control_checks"] = control_checks(result, order.config.resection)
     rows["adjustments"][0] |= {
         "job_id": order.job_id,
         "survey_id": order.survey_id,
@@ -201,12 +199,12 @@ def _part(progress: Progress, i: int, order: Order) -> Progress:
 
 def _files(result: AdjustedNetwork, answer: Row) -> dict[str, str]:
     """Return what a network can be downloaded as."""
-    from service import networks
+    from service.network_report import report
     from storage.networks import format_coordinates, format_gama
 
     return {
         "adjustment.json": json.dumps(answer),
-        "report.txt": networks.report(answer),
+        "report.txt": report(answer),
         "coordinates.csv": format_coordinates(result),
         "gama.xml": format_gama(result),
     }

@@ -1,17 +1,10 @@
-"""A network as rows of the database, and each of its control marks left out in turn."""
+"""A network's answer as rows of the database."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import replace
 from typing import Any
-
-import numpy as np
-
-from pipelines.config import ResectionConfig
-from pipelines.errors import SolveError
-from pipelines.network import AdjustedNetwork, adjust_network
 
 Row = dict[str, Any]
 
@@ -20,7 +13,6 @@ _COV = [
     (axes, "xyz".index(axes[0]), "xyz".index(axes[1]))
     for axes in ("xx", "xy", "xz", "yy", "yz", "zz")
 ]
-_N_LEFT = 2  # control marks that a network needs for place and heading
 
 
 def network_rows(answer: Row, sources: Mapping[str, Row]) -> dict[str, list[Row]]:
@@ -44,13 +36,16 @@ def network_rows(answer: Row, sources: Mapping[str, Row]) -> dict[str, list[Row]
             for row in answer["stations"]
         ],
         "adjusted_marks": [
-            {"mark": row["name"], "is_control": row["is_control"]}
+            {"mark": row["name"]}
+            | {key: row[key] for key in ("is_control", "status", "reason")}
             | _placed(row, row["covariance_m2"])
             | _mean_redundancy(seen, "mark", row["name"])
             for row in answer["marks"]
         ],
         "adjusted_observations": list(_observations(answer)),
         "refused_stations": answer["refused"],
+        "control_checks": list(_checks(answer)),
+        "repeated_stops": list(_repeats(answer)),
     }
 
 
@@ -145,48 +140,28 @@ def _tests(row: Row) -> Row:
     }
 
 
-def control_checks(result: AdjustedNetwork, config: ResectionConfig) -> list[Row]:
-    """Return, for each control mark, where the network puts it without its coordinates.
+def _checks(answer: Row) -> Iterator[Row]:
+    """Yield, for each control mark, where all else puts it, minus where it was given."""
+    counts = {one["name"]: one["n_observations"] for one in answer["marks"]}
+    for row in answer["control"]:
+        if row["predicted_minus_given_m"] is None:
+            continue
+        yield {"mark": row["mark"], "n_observations": counts[row["mark"]]} | {
+            f"{name}_{axis}_m": value
+            for name, key in (
+                ("difference", "predicted_minus_given_m"),
+                ("sigma", "sigma_predicted_minus_given_m"),
+            )
+            for axis, value in zip((*_AXES, "3d"), (*row[key], math.hypot(*row[key])), strict=True)
+        }
 
-    None where fewer than three are there, and none of a mark without which there is no network.
-    """
-    network = result.network
-    n_before = len(network.sightings) + len(network.stations)
-    used = np.flatnonzero(result.used[n_before:])
-    counts = np.bincount(
-        network.sightings[result.used[: len(network.sightings)], 1], minlength=len(network.marks)
-    )
-    places = [int(i) for i in used if counts[network.controls[i]]]
-    if len(used) <= _N_LEFT:
-        return []
-    return [row for i in places if (row := _check(result, i, config)) is not None]
 
-
-def _check(result: AdjustedNetwork, i: int, config: ResectionConfig) -> Row | None:
-    """Return where a network without its control mark ``i`` puts it, if there is such a network."""
-    network = result.network
-    mark = int(network.controls[i])
-    others = np.arange(len(network.controls)) != i
-    without = replace(
-        network,
-        controls=network.controls[others],
-        p_control_site=network.p_control_site[others],
-        cov_control_site=network.cov_control_site[others],
-    )
-    try:
-        found = adjust_network(without, config)
-    except SolveError:
-        return None
-    n = len(network.sightings)
-    n_seen = int(np.sum(found.used[:n] & (network.sightings[:, 1] == mark)))
-    difference = found.p_site[mark] - network.p_control_site[i]
-    cov = found.mark_covariances[mark] + network.cov_control_site[i]
-    sigmas = np.sqrt(np.diag(cov))
-    return {
-        "mark": network.marks[mark],
-        "n_observations": n_seen,
-        **{f"difference_{axis}_m": value for axis, value in zip(_AXES, difference, strict=True)},
-        "difference_3d_m": float(np.linalg.norm(difference)),
-        **{f"sigma_{axis}_m": value for axis, value in zip(_AXES, sigmas, strict=True)},
-        "sigma_3d_m": float(np.sqrt(np.trace(cov))),
-    }
+def _repeats(answer: Row) -> Iterator[Row]:
+    """Yield the stations that stand at one place."""
+    for one in answer["repeated_stops"]:
+        station, again = one["stations"]
+        yield {"station": station, "again": again} | {
+            **{f"apart_{axis}_m": value for axis, value in zip(_AXES, one["apart_m"], strict=True)},
+            **{key: one[key] for key in ("apart_3d_m", "n_marks")},
+            **{key: one[key] for key in ("difference_rms_m", "predicted_rms_m")},
+        }

@@ -127,6 +127,8 @@ CREATE TABLE adjusted_marks (
     adjustment_id VARCHAR NOT NULL,
     mark VARCHAR NOT NULL,
     is_control BOOLEAN NOT NULL,
+    status VARCHAR NOT NULL,
+    reason VARCHAR NOT NULL,
     x_m DOUBLE NOT NULL,
     y_m DOUBLE NOT NULL,
     z_m DOUBLE NOT NULL,
@@ -153,6 +155,8 @@ CREATE TABLE adjusted_marks (
 COMMENT ON TABLE adjusted_marks IS 'Sphere centres of a network, in the frame of its stations. Errors as those of adjusted_stations, against the true mark nearest to it.';
 COMMENT ON COLUMN adjusted_marks.mark IS 'Name of the control mark; M01, M02 ... in a free network, N01, N02 ... for marks beside control.';
 COMMENT ON COLUMN adjusted_marks.is_control IS 'Whether it was observed as control.';
+COMMENT ON COLUMN adjusted_marks.status IS 'ok or weak.';
+COMMENT ON COLUMN adjusted_marks.reason IS 'Why it is weak; empty when it is not.';
 COMMENT ON COLUMN adjusted_marks.x_m IS 'Centre of the sphere.';
 COMMENT ON COLUMN adjusted_marks.y_m IS 'Centre of the sphere.';
 COMMENT ON COLUMN adjusted_marks.z_m IS 'Centre of the sphere, up.';
@@ -234,7 +238,7 @@ CREATE TABLE control_checks (
     sigma_3d_m DOUBLE NOT NULL,
     PRIMARY KEY (adjustment_id, mark)
 );
-COMMENT ON TABLE control_checks IS 'Each control mark left out in turn: where the network puts it without its coordinates, minus what was given. No error against truth: both have sigmas.';
+COMMENT ON TABLE control_checks IS 'Each control mark left out in turn: where the network puts it without its coordinates, minus what was given. No error against truth: both have sigmas. A mark that nothing else tells has no row.';
 COMMENT ON COLUMN control_checks.n_observations IS 'Stations that observed it.';
 COMMENT ON COLUMN control_checks.difference_x_m IS 'Predicted minus given along x of the site frame.';
 COMMENT ON COLUMN control_checks.difference_y_m IS 'Predicted minus given along y of the site frame.';
@@ -242,6 +246,29 @@ COMMENT ON COLUMN control_checks.difference_z_m IS 'Predicted minus given along 
 COMMENT ON COLUMN control_checks.difference_3d_m IS 'Length of the difference.';
 COMMENT ON COLUMN control_checks.sigma_x_m IS 'Standard deviation of that difference, prediction and given mark together.';
 COMMENT ON COLUMN control_checks.sigma_3d_m IS 'Square root of the trace of the covariance of the difference.';
+
+CREATE TABLE repeated_stops (
+    adjustment_id VARCHAR NOT NULL,
+    station VARCHAR NOT NULL,
+    again VARCHAR NOT NULL,
+    n_marks INTEGER NOT NULL,
+    apart_x_m DOUBLE NOT NULL,
+    apart_y_m DOUBLE NOT NULL,
+    apart_z_m DOUBLE NOT NULL,
+    apart_3d_m DOUBLE NOT NULL,
+    difference_rms_m DOUBLE NOT NULL,
+    predicted_rms_m DOUBLE NOT NULL,
+    PRIMARY KEY (adjustment_id, station, again)
+);
+COMMENT ON TABLE repeated_stops IS 'Stations of a network that stand at one place: their centres laid on each other. No error against truth: what both have in common does not show.';
+COMMENT ON COLUMN repeated_stops.again IS 'The station that stands beside it.';
+COMMENT ON COLUMN repeated_stops.n_marks IS 'Marks that both saw.';
+COMMENT ON COLUMN repeated_stops.apart_x_m IS 'How far the second stands from the first, along x.';
+COMMENT ON COLUMN repeated_stops.apart_y_m IS 'The same along y.';
+COMMENT ON COLUMN repeated_stops.apart_z_m IS 'The same along z, up.';
+COMMENT ON COLUMN repeated_stops.apart_3d_m IS 'How far apart they stand.';
+COMMENT ON COLUMN repeated_stops.difference_rms_m IS 'Root mean square 3-D difference of their centres after a rigid motion.';
+COMMENT ON COLUMN repeated_stops.predicted_rms_m IS 'What the covariances of the centres promise.';
 
 -- Calibrations
 
@@ -359,24 +386,3 @@ CREATE VIEW latest_calibrations AS
 SELECT s.name AS survey, c.* FROM calibrations AS c JOIN surveys AS s USING (survey_id)
 QUALIFY row_number() OVER (PARTITION BY c.survey_id ORDER BY c.finished_at DESC) = 1;
 COMMENT ON VIEW latest_calibrations IS 'The newest calibration of each survey.';
-
-CREATE VIEW repeated_stops AS
-SELECT f.survey_id, f.survey, f.stop, f.fit_method, f.resection_method, f.recording_id,
-    count(*) OVER again AS n_recordings,
-    f.x_m - avg(f.x_m) OVER again AS difference_x_m,
-    f.y_m - avg(f.y_m) OVER again AS difference_y_m,
-    f.z_m - avg(f.z_m) OVER again AS difference_z_m,
-    sqrt((f.x_m - avg(f.x_m) OVER again) ^ 2 + (f.y_m - avg(f.y_m) OVER again) ^ 2
-        + (f.z_m - avg(f.z_m) OVER again) ^ 2) AS difference_3d_m,
-    f.sigma_3d_m
-FROM latest_station_fixes AS f WHERE f.x_m IS NOT NULL
-WINDOW again AS (PARTITION BY f.survey_id, f.stop, f.fit_method, f.resection_method)
-QUALIFY count(*) OVER again > 1
-ORDER BY f.survey, f.stop, f.fit_method, f.resection_method, f.recording_id;
-COMMENT ON VIEW repeated_stops IS 'Stops that were recorded more than once under one name without moving the rover: each position minus their mean. No error against truth: what all repetitions have in common does not show.';
-COMMENT ON COLUMN repeated_stops.n_recordings IS 'How often the stop was recorded.';
-COMMENT ON COLUMN repeated_stops.difference_x_m IS 'Position minus the mean of all, along x of the site frame.';
-COMMENT ON COLUMN repeated_stops.difference_y_m IS 'The same along y of the site frame.';
-COMMENT ON COLUMN repeated_stops.difference_z_m IS 'The same along z of the site frame, up.';
-COMMENT ON COLUMN repeated_stops.difference_3d_m IS 'Length of the difference.';
-COMMENT ON COLUMN repeated_stops.sigma_3d_m IS 'Predicted, of the position alone.';

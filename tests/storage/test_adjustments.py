@@ -58,7 +58,7 @@ def network(truth, datum, T=None, shift=(0.0, 0.0, 0.0)):
     p = transform(T, truth.marks.p_site)
     p[0] += shift
     marks = [
-        {"mark": f"M{i}", "is_control": False} | placed(one)
+        {"mark": f"M{i}", "is_control": False, "status": "ok", "reason": ""} | placed(one)
         for i, one in enumerate([*p, p[0] + [0.0, 0.0, 3.0]])
     ]
     whole = {"job_id": "job", "survey_id": "survey", "n_stations": len(stations), "datum": datum,
@@ -210,31 +210,6 @@ def test_what_was_chosen_for_a_job_is_kept_beside_its_configuration(catalogue):
     assert catalogue.get_job(job.job_id).options == options
     (row,) = catalogue.rows("SELECT options FROM jobs")
     assert json.loads(row["options"]) == options
-
-
-def test_two_recordings_of_one_stop_are_compared_with_their_mean(catalogue):
-    survey_id = catalogue.get_survey("lane").survey_id
-    for i in range(2):
-        digest = f"{i:064x}"
-        catalogue.add_recording(
-            digest, name="L1S1", size_bytes=1, url="x", preflight={"verdict": "ok"}
-        )
-        job = catalogue.create_job("process", survey="lane", recording_id=digest, config={})
-        catalogue.start_job(job.job_id)
-        made = made_tables(
-            run_id=f"run{i}", job_id=job.job_id, survey_id=survey_id, recording_id=digest
-        )
-        fixes = made["station_fixes"].to_pylist()
-        for row in fixes:
-            if row["x_m"] is not None:
-                row["x_m"] += 0.004 * i
-        made["station_fixes"] = made["station_fixes"].from_pylist(
-            fixes, schema=made["station_fixes"].schema
-        )
-        catalogue.finish_job(job.job_id, made)
-    found = catalogue.rows("FROM repeated_stops")
-    assert [round(row["difference_x_m"], 6) for row in found] == [-0.002, 0.002]
-    assert {row["n_recordings"] for row in found} == {2}
 
 
 def test_a_file_of_a_result_says_what_type_it_is():
