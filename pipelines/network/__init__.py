@@ -8,6 +8,7 @@ the exported observations need no adjustment.
 
 from pipelines.network.adjusting import adjust_network
 from pipelines.network.assembly import assemble
+from pipelines.network.comparison import NetworkErrors, compare
 from pipelines.network.repeats import Repeat, repeated_stops
 from pipelines.network.values import (
     RANGE_BIAS,
@@ -25,10 +26,12 @@ __all__ = [
     "BlockTests",
     "LeftOut",
     "Network",
+    "NetworkErrors",
     "Refusal",
     "Repeat",
     "Shared",
     "adjust_network",
     "assemble",
+    "compare",
     "repeated_stops",
 ]

@@ -1,0 +1,85 @@
+"""A whole simulated survey from ranges to a network, against the truth of the world."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from pipelines.config import SurveyConfig
+from pipelines.errors import TruthError
+from pipelines.network import adjust_network, assemble, compare
+from pipelines.simulation import SimulationConfig, scenario, simulate_stop
+from pipelines.survey import process
+from pipelines.values import StopTruth, Truth
+from tests.synthetic import control, field, pose, sightings
+
+CONFIG = SurveyConfig.from_mapping({"fitting": {"methods": ["along_beam"]}})
+WORLD = SimulationConfig(only_near_spheres=True, sigma_range=0.020)
+
+
+def truth_of(marks, poses):
+    stops = tuple(StopTruth(name=name, T_site_base=T) for name, T in poses.items())
+    return Truth(marks=marks, stops=stops, rig=None)
+
+
+@pytest.fixture
+def small():
+    """A network of three stations with noise, and its truth."""
+    rng = np.random.default_rng(3)
+    marks = field(rng)
+    poses = {f"S{i}": pose(rng.uniform(-3, 3, 3), rng.uniform(-3, 3)) for i in range(3)}
+    scans = [
+        (name, sightings(marks, T, noise=rng.normal(0, 4e-3, (14, 3))))
+        for name, T in poses.items()
+    ]  # fmt: skip
+    return adjust_network(assemble(scans, None, CONFIG.resection), CONFIG.resection), truth_of(
+        marks, poses
+    )
+
+
+def test_a_network_compares_alike_with_a_truth_that_was_moved(small):
+    result, truth = small
+    motion = pose([40.0, -7.0, 2.0], 1.0, (0.3, -0.2))
+    marks = control(truth.marks.p_site @ motion[:3, :3].T + motion[:3, 3])
+    moved = truth_of(marks, {one.name: motion @ one.T_site_base for one in truth.stops})
+    here, there = compare(result, truth), compare(result, moved)
+    np.testing.assert_allclose(there.error_marks, here.error_marks, atol=1e-9)
+    np.testing.assert_allclose(there.error_stations, here.error_stations, atol=1e-9)
+    assert there.nees_marks == pytest.approx(here.nees_marks, rel=1e-6)
+    assert 1e-3 < here.rms_marks < 6e-3
+    assert 0.3 < here.nees_marks < 2.0
+
+
+def test_a_mark_that_is_none_is_called_false(small):
+    result, truth = small
+    keep = np.arange(1, 14)
+    fewer = replace(truth, marks=control(truth.marks.p_site[keep]))
+    errors = compare(result, fewer)
+    assert np.sum(errors.marks < 0) == 1
+    assert np.isnan(errors.error_marks[errors.marks < 0]).all()
+
+
+def test_the_truth_of_another_survey_is_refused(small):
+    result, truth = small
+    with pytest.raises(TruthError, match="0 stations"):
+        compare(result, replace(truth, stops=()))
+
+
+@pytest.mark.slow
+def test_a_survey_of_the_study_s_field_reaches_a_millimetre():
+    """35 stops of one world; means over 38 worlds: marks 0.53 mm, stations 0.83 mm, NEES 1.1."""
+    world = scenario("paper-field", 77)
+    scans, poses = [], {}
+    for stop in world.stops:
+        made = simulate_stop(world, stop.name, WORLD)
+        (found,) = process(made.log, config=CONFIG)
+        scans.append((stop.name, found.fits["along_beam"]))
+        poses[stop.name] = made.truth.T_site_base
+    result = adjust_network(assemble(scans, None, CONFIG.resection), CONFIG.resection)
+    errors = compare(result, truth_of(world.marks, poses))
+    assert len(result.network.stations) == 35
+    assert np.all(errors.marks >= 0)
+    assert errors.rms_marks < 0.85e-3  # the bar of 0.7 mm holds in 37 of 38 worlds
+    assert errors.rms_stations < 1.5e-3
+    assert 0.5 < errors.nees_marks < 1.8  # one world: 36 degrees of freedom
+    assert 0.6 < errors.nees_stations < 1.6
