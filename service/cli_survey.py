@@ -80,6 +80,12 @@ def adjust(
     report: Annotated[
         Path | None, typer.Option(dir_okay=False, help="Write the whole report (text).")
     ] = None,
+    truth: Annotated[
+        list[Path] | None,
+        typer.Option(
+            exists=True, dir_okay=False, help="Truth (JSON); adds errors, no more. Again for more."
+        ),
+    ] = None,
     as_json: AsJson = False,
 ) -> None:
     """Adjust all stations and marks of a survey together."""
@@ -99,6 +105,8 @@ def adjust(
             book = networks.with_calibration(book, logs, config, given, told)
     result = networks.adjust_scans(book, marks, config)
     answer = networks.network_answer(result, config, book)
+    if truth:
+        answer["errors"] = networks.error_answer(result, [site_files.read_truth(f) for f in truth])
     if gama:
         write_gama(result, gama)
     if csv:

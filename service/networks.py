@@ -26,18 +26,19 @@ from pipelines.network import (
     Repeat,
     adjust_network,
     assemble,
+    compare,
     repeated_stops,
 )
 from pipelines.survey import Progress, process
-from pipelines.values import ControlMarks, MarkerFits, Rig
+from pipelines.values import ControlMarks, MarkerFits, Rig, Truth
 from service.calibrations import calibrate_logs, calibration_answer
 from service.network_report import report
 from storage.recordings import read_log
 from storage.results import ellipse, marker_name
 
 __all__ = [
-    "Fieldbook", "adjust_scans", "calibrated", "network_answer", "read_scans", "report",
-    "with_calibration",
+    "Fieldbook", "adjust_scans", "calibrated", "error_answer", "network_answer", "read_scans",
+    "report", "with_calibration",
 ]  # fmt: skip
 
 Plain = dict[str, Any]
@@ -181,6 +182,36 @@ def network_answer(
         ),
         "critical_w": result.critical_w,
         "range_bias": _range_bias(result),
+    }
+
+
+def error_answer(result: AdjustedNetwork, truths: Sequence[Truth]) -> Plain:
+    """Return the errors of a network against the truths of its logs, which share their marks."""
+    stops = {stop.name: stop for truth in truths for stop in truth.stops}
+    errors = compare(result, replace(truths[0], stops=tuple(stops.values())))
+    network, names = result.network, truths[0].marks.names
+    return {
+        "rms_marks_m": errors.rms_marks,
+        "rms_stations_m": errors.rms_stations,
+        "nees_per_dof_marks": _number(errors.nees_marks),
+        "nees_per_dof_stations": _number(errors.nees_stations),
+        "n_false_marks": int(np.sum(errors.marks < 0)),
+        "marks": [
+            {
+                "name": name,
+                "true_mark": None if place < 0 else names[place],
+                "error_m": None if place < 0 else _numbers(error),
+            }
+            for name, place, error in zip(
+                network.marks, errors.marks, errors.error_marks, strict=True
+            )
+        ],
+        "stations": [
+            {"name": name, "error_m": _numbers(error) if is_known else None}
+            for name, is_known, error in zip(
+                network.stations, errors.stations, errors.error_stations, strict=True
+            )
+        ],
     }
 
 

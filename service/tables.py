@@ -373,6 +373,14 @@ def _print_checks(out: Console, answer: Plain) -> None:
         )
     if answer["calibration"]:
         print_calibration(out, answer["calibration"])
+    if errors := answer.get("errors"):
+        out.print(
+            f"Against truth, place and attitude apart: marks {1e3 * errors['rms_marks_m']:.2f} mm "
+            f"RMS, stations {1e3 * errors['rms_stations_m']:.2f} mm RMS; normalised squared error "
+            f"{_fixed(errors['nees_per_dof_marks'], 2)} and "
+            f"{_fixed(errors['nees_per_dof_stations'], 2)}; {errors['n_false_marks']} false marks",
+            highlight=False, soft_wrap=True,
+        )  # fmt: skip
 
 
 def to_csv(answer: Plain) -> str:

@@ -245,3 +245,14 @@ def scans_of(logs):
     book = read_scans(logs, CONFIG, None, lambda _share, _what: None)
     assert not book.refused
     return book.scans
+
+
+def test_truth_adds_errors_and_changes_nothing_else(free, logs):
+    truths = [item for log in logs for item in ("--truth", log.with_name(f"{log.stem}.truth.json"))]
+    answer = json.loads(run(*logs, *truths, "--json").stdout)
+    errors = answer.pop("errors")
+    assert answer == free
+    assert 0 < errors["rms_marks_m"] < 0.01
+    assert 0 < errors["rms_stations_m"] < 0.01
+    assert {row["true_mark"] for row in errors["marks"]} == set(control_of(logs)[0])
+    assert errors["n_false_marks"] == 0
