@@ -96,7 +96,7 @@ def ask(name: str, fields: Fields, service: Current) -> RedirectResponse:
     kind = kinds.get(fields.get("kind", ""))
     if kind is None:
         raise InputError(f"The kind is {fields.get('kind')!r}; it is one of {', '.join(kinds)}.")
-    options = {"control": fields["control"] == "yes"} if "control" in fields else {}
+    options = {name: fields[name] == "yes" for name in ("control", "calibrate") if name in fields}
     job = start(service, NewJob(kind=kind, survey=name, options=options))
     return RedirectResponse(f"/jobs/{job.job_id}", status_code=303)
 

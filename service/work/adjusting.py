@@ -9,22 +9,23 @@ from __future__ import annotations
 import json
 import secrets
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
 from time import perf_counter
 from typing import TYPE_CHECKING, Any
 
 from pydantic import Field
 
-from pipelines.errors import SpheremarkError
+from pipelines.errors import RigError, SolveError, SpheremarkError
 from pipelines.rigs import rig_digest
 from service.provenance import code_version
-from service.work import processing
+from service.work import calibrating, processing
 from service.work.orders import Log, Options, Order, Outcome
 
 if TYPE_CHECKING:
     import pyarrow as pa
 
+    from pipelines.calibration import Calibration
     from pipelines.network import AdjustedNetwork, Refusal
     from pipelines.survey import Progress
     from pipelines.values import MarkerFits
@@ -49,6 +50,9 @@ class AdjustOptions(Options):
 
     control: bool = Field(
         default=True, description="Use the survey's control marks, if it has any; else free."
+    )
+    calibrate: bool = Field(
+        default=False, description="Estimate the rig in the same adjustment; reads all logs anew."
     )
     reprocess: bool = Field(
         default=False, description="Fit all centres anew, even those that were fitted before."
@@ -111,20 +115,24 @@ class _Book:
 
 def work(order: Order, progress: Progress) -> Outcome:
     """Adjust the stations of all logs of an order."""
-    import pyarrow as pa
-
     from service import networks
     from service.work.network_rows import network_rows
     from storage import adjustments
     from storage.documents import documents
 
     start = perf_counter()
-    book = _read(order, progress)
+    with_rig = bool(order.options.get("calibrate"))
+    book = _read(order, _share(progress, 0.0, 0.5 * _SCANS if with_rig else _SCANS))
+    rig, why = None, ""
+    if with_rig:
+        rig, why = _rig(order, book, _share(progress, 0.5 * _SCANS, 0.8))
     progress(_SCANS, f"Adjusting {len(book.scans)} stations")
     marks = order.marks if order.options.get("control", True) else None
-    scans = networks.Fieldbook(scans=tuple(book.scans), refused=tuple(book.refused))
+    scans = networks.Fieldbook(
+        scans=tuple(book.scans), refused=tuple(book.refused), calibration=rig, uncalibrated=why
+    )
     result = networks.adjust_scans(scans, marks, order.config)
-    answer = networks.network_answer(result, order.config)
+    answer = networks.network_answer(result, order.config, scans)
     rows = network_rows(answer, book.sources)
     rows["adjustments"][0] |= {
         "job_id": order.job_id,
@@ -135,11 +143,38 @@ def work(order: Order, progress: Progress) -> Outcome:
         "code_version": code_version(),
         "duration_s": perf_counter() - start,
     }
-    own = adjustments.tables(order.result_id, rows)
-    own["documents"] = documents(order.result_id, _files(result, answer))
-    for name in book.tables[0] if book.tables else ():
-        own[name] = pa.concat_tables([tables[name] for tables in book.tables])
-    return Outcome(tables=own, message=_summary(answer, rows["control_checks"]))
+    made = [*book.tables, adjustments.tables(order.result_id, rows)]
+    files, message = _files(result, answer), _summary(answer, rows["control_checks"])
+    if rig is not None:
+        found = networks.calibrated(result, rig)
+        left = _share(progress, _SCANS, 1.0)
+        tables, more, sentence = calibrating.results(order, found, left, start)
+        made, files, message = [*made, tables], files | more, f"{message} {sentence}"
+    made.append({"documents": documents(order.result_id, files)})
+    return Outcome(tables=_joined(made), message=message)
+
+
+def _rig(order: Order, book: _Book, progress: Progress) -> tuple[Calibration | None, str]:
+    """Calibrate the rig of the logs that gave stations, or say why they do not tell it."""
+    from pipelines.calibration import calibrate
+
+    used = {source["recording_id"] for source in book.sources.values()}
+    good = replace(order, logs=tuple(log for log in order.logs if log.recording_id in used))
+    logs = calibrating.logs_of(good)
+    try:
+        return calibrate(logs, config=order.config, rig=order.rig, progress=progress), ""
+    except (SolveError, RigError) as error:
+        return None, str(error)
+
+
+def _joined(parts: list[dict[str, pa.Table]]) -> dict[str, pa.Table]:
+    """Return the rows of several results as one table each."""
+    import pyarrow as pa
+
+    names = dict.fromkeys(name for part in parts for name in part)
+    return {
+        name: pa.concat_tables([part[name] for part in parts if name in part]) for name in names
+    }
 
 
 def _read(order: Order, progress: Progress) -> _Book:
@@ -149,7 +184,8 @@ def _read(order: Order, progress: Progress) -> _Book:
     book, first = _Book(), None
     for i, log in enumerate(order.logs):
         try:
-            for stop, fits, source in _centres(order, log, book, _part(progress, i, order)):
+            part = _share(progress, i / len(order.logs), (i + 1) / len(order.logs))
+            for stop, fits, source in _centres(order, log, book, part):
                 book.enter(stop, fits, source)
         except SpheremarkError as error:
             first = first or error
@@ -192,9 +228,9 @@ def _centres(
         yield one.name, one.fits[method], source
 
 
-def _part(progress: Progress, i: int, order: Order) -> Progress:
-    """Return the progress of one log as a share of the whole."""
-    return lambda share, what: progress(_SCANS * (i + share) / len(order.logs), what)
+def _share(progress: Progress, begin: float, end: float) -> Progress:
+    """Return the progress of a part of the work as a share of the whole."""
+    return lambda share, what: progress(begin + (end - begin) * share, what)
 
 
 def _files(result: AdjustedNetwork, answer: Row) -> dict[str, str]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from time import perf_counter
@@ -18,6 +18,9 @@ from service.work.orders import Log, Order, Outcome
 from storage.results import marker_name
 
 if TYPE_CHECKING:
+    import pyarrow as pa
+
+    from pipelines.calibration import Calibration
     from pipelines.calibration.agreement import FaceGaps
     from pipelines.survey import Progress
 
@@ -28,33 +31,54 @@ _ESTIMATE = 0.7  # share of the work that the estimate takes; comparing the face
 
 @dataclass(frozen=True, slots=True)
 class _Logs:
-    """Logs that are read anew each time: a calibration goes through them often, one by one."""
+    """Logs that are read anew each time: a calibration goes through them often, one by one.
+
+    A log that has the name of another gets a number, as its station does in a network.
+    """
 
     logs: tuple[Log, ...]
 
     def __iter__(self) -> Iterator[ScanLog]:
         from storage.recordings import read_log
 
+        counts: dict[str, int] = {}
         for one in self.logs:
+            counts[one.name] = again = counts.get(one.name, 0) + 1
+            name = one.name if again == 1 else f"{one.name} ({again})"
             log = read_log(one.url, digest=one.recording_id)
-            yield replace(log, origin=Origin(name=one.name, digest=one.recording_id))
+            yield replace(log, origin=Origin(name=name, digest=one.recording_id))
+
+
+def logs_of(order: Order) -> Iterable[ScanLog]:
+    """Return the logs of an order, to be gone through as often as one likes."""
+    return _Logs(order.logs)
 
 
 def work(order: Order, progress: Progress) -> Outcome:
     """Calibrate the rig of the logs of an order."""
     from pipelines.calibration import calibrate
-    from service.calibrations import calibration_answer
-    from storage import calibrations
     from storage.documents import documents
-    from storage.site_files import format_rig
 
-    start, logs = perf_counter(), _Logs(order.logs)
+    start = perf_counter()
     found = calibrate(
-        logs,
+        logs_of(order),
         config=order.config,
         rig=order.rig,
         progress=lambda share, what: progress(_ESTIMATE * share, what),
     )
+    tables, files, message = results(order, found, _part(progress, _ESTIMATE), start)
+    tables["documents"] = documents(order.result_id, files)
+    return Outcome(tables=tables, message=message)
+
+
+def results(
+    order: Order, found: Calibration, progress: Progress, start: float
+) -> tuple[dict[str, pa.Table], dict[str, str], str]:
+    """Return the tables of a calibration, its files, and a sentence."""
+    from service.calibrations import calibration_answer
+    from storage import calibrations
+    from storage.site_files import format_rig
+
     answer = calibration_answer(found)
     gaps = [_gaps(order, rig, _half(progress, i)) for i, rig in enumerate((found.start, found.rig))]
     rows = calibration_rows(answer, *gaps)
@@ -70,8 +94,7 @@ def work(order: Order, progress: Progress) -> Outcome:
     }
     tables = calibrations.tables(order.result_id, rows)
     files = {"calibration.json": json.dumps(answer), "rig.json": format_rig(found.rig)}
-    tables["documents"] = documents(order.result_id, files)
-    return Outcome(tables=tables, message=_summary(answer, *gaps))
+    return tables, files, _summary(answer, *gaps)
 
 
 def _gaps(order: Order, rig: Rig, progress: Callable[[float], None]) -> FaceGaps:
@@ -80,7 +103,7 @@ def _gaps(order: Order, rig: Rig, progress: Callable[[float], None]) -> FaceGaps
     from pipelines.stitching import split_stops
 
     def stops() -> Iterator[ScanLog]:
-        for i, log in enumerate(_Logs(order.logs)):
+        for i, log in enumerate(logs_of(order)):
             progress(i / len(order.logs))
             yield from split_stops(log, order.config.stitching)
 
@@ -90,7 +113,12 @@ def _gaps(order: Order, rig: Rig, progress: Callable[[float], None]) -> FaceGaps
 def _half(progress: Progress, i: int) -> Callable[[float], None]:
     """Return the progress of the comparison with the rig before (0) or after (1)."""
     what = f"Comparing the faces of the spheres {('before', 'after')[i]} the calibration"
-    return lambda share: progress(_ESTIMATE + (1.0 - _ESTIMATE) * (i + share) / 2.0, what)
+    return lambda share: progress((i + share) / 2.0, what)
+
+
+def _part(progress: Progress, begin: float) -> Progress:
+    """Return the progress of what is left of the work."""
+    return lambda share, what: progress(begin + (1.0 - begin) * share, what)
 
 
 def calibration_rows(answer: Row, before: FaceGaps, after: FaceGaps) -> dict[str, list[Row]]:

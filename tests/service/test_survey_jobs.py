@@ -190,6 +190,19 @@ def test_a_calibration_brings_the_faces_together_and_its_rig_is_kept(site, calib
     assert rig["rig"] == file
 
 
+def test_a_network_can_estimate_the_rig_with_its_stations(site, run, rows):
+    job = run("adjust", options={"calibrate": True})
+    assert job["status"] == "successful", job
+    (network,) = rows("adjustments", job)
+    (rig,) = rows("calibrations", job)
+    assert rig["calibration_id"] == network["adjustment_id"]
+    assert rig["gap_rms_after_m"] < rig["gap_rms_before_m"]
+    answer = site.client.get(f"/api/v1/adjustments/{network['adjustment_id']}").json()
+    assert {"report.txt", "rig.json"} <= set(answer["files"])
+    for row in rows("adjusted_stations", job):
+        assert row["error_3d_m"] < 4.0 * row["sigma_3d_m"]
+
+
 def test_later_jobs_use_the_rig_that_was_chosen_and_name_it(site, calibrated, run, rows):
     (whole,) = rows("calibrations", calibrated)
     url = "/api/v1/surveys/field/rig"
