@@ -311,6 +311,9 @@ def bench(
     accuracy: Annotated[
         bool, typer.Option("--accuracy", help="Precision of centres by every method instead.")
     ] = False,
+    coverage: Annotated[
+        int, typer.Option(min=0, help="Do error ellipses hold? So many surveys instead.")
+    ] = 0,
     stops: Annotated[int, typer.Option(min=1, help="Stops of 88 markers for that.")] = 6,
     seed: Annotated[int, typer.Option(min=0, help="Seed of the first of them.")] = 0,
     as_json: AsJson = False,
@@ -318,6 +321,9 @@ def bench(
     """Measure each step against one read of the file with a checksum, in the same run."""
     if extraction:
         _bench_extraction(worlds, seed, as_json=as_json)
+        return
+    if coverage:
+        _bench_coverage(coverage, seed, as_json=as_json)
         return
     if accuracy:
         _bench_accuracy(stops, seed, as_json=as_json)
@@ -332,6 +338,20 @@ def bench(
         _print_json(report)
     else:
         tables.print_bench(out, report)
+
+
+def _bench_coverage(n_surveys: int, seed: int, *, as_json: bool) -> None:
+    """Measure how often stations of simulated surveys lie within their ellipses; keep it."""
+    from service import coverage
+
+    with _progress() as progress:
+        report = coverage.run(n_surveys, seed, progress)
+    path = coverage.keep(report, _settings().data)
+    if as_json:
+        _print_json(report)
+    else:
+        coverage.print_report(out, report)
+        err.print(f"Kept as {path}; the service shows it at /coverage.")
 
 
 def _bench_extraction(worlds: int, seed: int, *, as_json: bool) -> None:

@@ -1,4 +1,4 @@
-"""Routes of the page of a site: its clouds, its ground, and the form by which they are made."""
+"""Routes of two pages: a site with its clouds and its ground, and whether error bars hold."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ from fastapi.responses import HTMLResponse, RedirectResponse
 
 from pipelines.elevation import ElevationModel
 from pipelines.errors import InputError, NotFoundError
+from service import coverage
 from service.api.jobs import start
 from service.api.models import NewJob
 from service.api.products import Product, products_of
@@ -14,6 +15,7 @@ from service.pages import frame_of
 from service.result_pages import Fields
 from service.state import Current, Service
 from service.work import JobKind
+from web import coverage as web_coverage
 from web import site
 
 router = APIRouter(include_in_schema=False, default_response_class=HTMLResponse)
@@ -34,6 +36,15 @@ _JOBS = """
 SELECT job_id FROM jobs
 WHERE survey_id = $id AND kind = 'site' AND status IN ('accepted', 'running') ORDER BY created_at
 """
+
+
+@router.get("/coverage")
+def coverage_page(service: Current) -> str:
+    """Show whether error ellipses hold what they promise."""
+    report = coverage.kept(service.settings.data)
+    return web_coverage.coverage_page(
+        web_coverage.CoveragePage(frame=frame_of(service), report=report)
+    )
 
 
 @router.get("/surveys/{name}/site")

@@ -89,7 +89,8 @@ def work(order: Order, progress: Progress) -> Outcome:
     from service.site import ENDINGS, KINDS, SiteWish, make_site
     from storage.products import keep_file, product_rows
 
-    options = SiteOptions.model_validate(order.options).model_dump()
+    own = {key: order.options[key] for key in SiteOptions.model_fields if key in order.options}
+    options = SiteOptions.model_validate(own).model_dump()
     rows = {(row["recording_id"], row["stop"]): row for row in order.known["poses"].to_pylist()}
     poses = _poses(order, rows)
     with TemporaryDirectory(prefix="spheremark-") as folder:
