@@ -28,11 +28,11 @@ CONFIG = SurveyConfig.from_mapping({"fitting": {"methods": ["along_beam"]}})
 STOPS = ("lane2-stop2", "lane3-stop5", "lane4-stop3")
 
 
-def run(*arguments, code=0):
+def run(*arguments, code=0, command="adjust"):
     """Run a command as its process would, and return what it wrote."""
     out, err = StringIO(), StringIO()
     with pytest.MonkeyPatch.context() as patch, redirect_stdout(out), redirect_stderr(err):
-        patch.setattr("sys.argv", ["spheremark", "adjust", *map(str, arguments)])
+        patch.setattr("sys.argv", ["spheremark", command, *map(str, arguments)])
         with pytest.raises(SystemExit) as ended:
             main()
     assert (ended.value.code or 0) == code, err.getvalue()
@@ -256,3 +256,21 @@ def test_truth_adds_errors_and_changes_nothing_else(free, logs):
     assert 0 < errors["rms_stations_m"] < 0.01
     assert {row["true_mark"] for row in errors["marks"]} == set(control_of(logs)[0])
     assert errors["n_false_marks"] == 0
+
+
+def test_a_scan_tells_on_site_which_control_mark_is_given_wrongly(logs, tmp_path):
+    names, p = control_of(logs)
+    rows = [[name, *place] for name, place in zip(names, p.tolist(), strict=True)]
+    rows[3][1] += 0.09
+    path = tmp_path / "wrong.csv"
+    path.write_text("\n".join(",".join(map(str, row)) for row in rows))
+    done = run(logs[0], "--control", path, "--json", command="process")
+    stop = json.loads(done.stdout)["stops"][0]
+    distances = stop["distances"]
+    assert distances["suspects"][:1] == [names[3]]
+    assert all(names[3] in pair["marks"] for pair in distances["pairs"] if pair["is_off"])
+    assert distances["n_off"] == sum(pair["is_off"] for pair in distances["pairs"]) > 5
+    station = stop["station"]
+    left = {row["mark"]: row for row in station["without_each"]}
+    assert names[3] not in left
+    assert all(0 < row["station_shift_3d_m"] < 0.005 for row in left.values())
