@@ -116,7 +116,8 @@ def test_every_table_and_view_is_documented():
 def test_every_number_of_the_database_carries_its_unit():
     units = ("_m", "_m2", "_deg", "_s", "_percent", "_bytes", "_rad", "_db")
     unitless = re.compile(
-        r"^(n_|dof$|sigma0$|redundancy$|w$|coverage$|attempts$|mean_(n_points|intensity|redundancy)$"
+        r"^(n_|dof$|dop$|sigma0$|redundancy$|w$|coverage$|attempts$"
+        r"|mean_(n_points|intensity|redundancy)$"
         r"|number$|place$|probability_|cov_motion$|rotation$|n_points_(from|to)$"
         r"|(vtpv|vtpv_limit|w_limit|test_level)$|variance_factor_"
         r"|(start_value|estimate|sigma)$)"  # calibrated_parameters: the unit stands in the row
@@ -148,5 +149,6 @@ def test_the_lock_file_names_no_place_of_a_package():
 def test_every_dependency_is_locked():
     locked = set(re.findall(r"^([a-z0-9-]+)==", (ROOT / "requirements.lock").read_text(), re.M))
     project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
-    packages = {*project["dependencies"], *project["optional-dependencies"]["dev"]}
+    wanted = (*project["dependencies"], *project["optional-dependencies"]["dev"])
+    packages = {one.partition("[")[0] for one in wanted}
     assert packages <= locked, packages - locked

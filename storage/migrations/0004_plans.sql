@@ -80,7 +80,7 @@ CREATE VIEW placements AS
 SELECT p.placement_id, p.name, p.survey_id, s.name AS survey, p.site_name, p.marks, p.n_marks,
     p.model_version, p.model_source, p.resection_method, p.tolerance_m, x.stop, x.n_seen, x.n_used,
     x.sigma_3d_m, x.probability_within_tolerance, x.included_angle_min_deg,
-    x.included_angle_max_deg, x.dop, x.reason, f.run_id, f.n_markers AS achieved_n_markers,
+    x.included_angle_max_deg, x.dop, x.reason, f.run_id, f.n_markers,
     f.sigma_3d_m AS achieved_sigma_3d_m, f.error_3d_m, f.error_3d_m <= p.tolerance_m AS is_within_tolerance,
     p.created_at
 FROM plans AS p JOIN planned_stops AS x USING (placement_id)
@@ -90,7 +90,7 @@ LEFT JOIN latest_station_fixes AS f ON f.survey_id = p.survey_id AND f.stop = x.
 ORDER BY p.created_at DESC, p.placement_id, x.place;
 COMMENT ON VIEW placements IS 'Per stop what a kept plan promised and, once a stop of that name is surveyed, what came of it.';
 COMMENT ON COLUMN placements.run_id IS 'Run that surveyed the stop; NULL until then.';
-COMMENT ON COLUMN placements.achieved_n_markers IS 'Markers that carried the position once surveyed.';
+COMMENT ON COLUMN placements.n_markers IS 'Markers that carried the position once surveyed.';
 COMMENT ON COLUMN placements.achieved_sigma_3d_m IS 'Sigma of the position once surveyed.';
 COMMENT ON COLUMN placements.error_3d_m IS 'Error of the position once surveyed; NULL without truth.';
 COMMENT ON COLUMN placements.is_within_tolerance IS 'Whether that error keeps the tolerance.';
