@@ -110,11 +110,13 @@ def _sizes(what: str, rows: Columns, page: AdjustmentPage) -> Readout:
 def _left_out(checks: Columns) -> Readout:
     """Say how near the network comes to control marks that it was not given."""
     difference, sigma = floats(checks, "difference_3d_m"), floats(checks, "sigma_3d_m")
+    worst = int(difference.argmax())
+    largest = f"largest {number(float(difference[worst]) * _MM, 1)} mm at {checks['mark'][worst]}"
     return Readout(
         label="Control left out in turn",
         value=number(_rms(difference) * _MM, 2),
-        unit="mm RMS difference",
-        note=f"predicted {number(_rms(sigma) * _MM, 2)} mm; no error against truth",
+        unit="mm RMS",
+        note=f"predicted minus given; sigma {number(_rms(sigma) * _MM, 2)} mm, {largest}",
     )
 
 

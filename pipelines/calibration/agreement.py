@@ -40,12 +40,24 @@ class FaceGaps:
 
     @property
     def rms(self) -> float:
-        """Root mean square length of the gaps [m]; NaN without any."""
+        """Root mean square length of the gaps.
+
+        Returns
+        -------
+        float
+            NaN without any [m].
+        """
         return _rms(np.sum(self.gap_base**2, axis=1))
 
     @property
     def sigma(self) -> float:
-        """What ``rms`` should be by the covariances [m]."""
+        """What ``rms`` should be by the covariances.
+
+        Returns
+        -------
+        float
+            NaN without any [m].
+        """
         return _rms(np.trace(self.cov_gap_base, axis1=1, axis2=2))
 
 

@@ -233,10 +233,10 @@ def test_a_survey_without_logs_cannot_be_adjusted(site):
 
 
 def test_an_unknown_option_is_refused_with_its_name(site):
-    new = {"kind": "adjust", "survey": "field", "options": {"contrl": True}}
+    new = {"kind": "adjust", "survey": "field", "options": {"colour": True}}
     answer = site.client.post("/api/v1/jobs", json=new)
     assert (answer.status_code, answer.json()["code"]) == (422, "input.validation")
-    assert "options.contrl" in answer.json()["detail"]
+    assert "options.colour" in answer.json()["detail"]
 
 
 def test_one_station_makes_no_free_network_and_costs_nothing_else(site, run, tied):
