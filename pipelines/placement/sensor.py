@@ -13,7 +13,7 @@ from typing import NamedTuple
 import numpy as np
 
 from pipelines.errors import ConfigError
-from pipelines.fitting.footprint import linearise
+from pipelines.fitting.footprint import Prediction, predict
 from pipelines.rigs import FIRING_CYCLE, N_LASERS
 from pipelines.simulation import SimulationConfig, commensurability, horizon_lines
 from pipelines.values import Array, Beams, _seal
@@ -30,7 +30,7 @@ _SIGMAS = (0.0137, 0.0107, 0.0089, 0.0067, 0.0064)  # ... this noise of ranges [
 _SHARE_MIN = 0.02  # of a footprint that makes a return
 _N_ROUNDS = 4  # in which precision and worth of the returns settle
 _DISTANCES = np.geomspace(1.5, 45.0, 28)  # [m]
-_LOST = 1e-3  # [m^2] a centre worse than this is not found
+_LOST = 1e-4  # [m^2] a centre worse than this, and than six times the usual, counts as lost
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -181,8 +181,8 @@ def returns_of(sensor: Sensor, radius: float, n_strips: int) -> Returns:
 
     Notes
     -----
-    The worth of a return is that of ``footprint.linearise``: the mean range over the footprint,
-    linearised over the width of what is not known of the centre, which is that of the very fit.
+    The worth of a return is that of the mean range over its footprint, linearised over the width of
+    what is not known of the centre, as the fit along the beam has it.
     The spread comes from the true lines of one turn, tried at 400 places.
     """
     discs = [_disc(sensor, radius, n_strips, d) for d in _DISTANCES]
@@ -233,21 +233,44 @@ def _disc(sensor: Sensor, radius: float, n_strips: int, distance: float) -> _Dis
     left, up = grid.transpose(4, 0, 2, 1, 3).reshape(2, -1)
     table = _beams(sensor, left, up, distance)
     cell = (2.0 * reach) ** 2 / (n_left * n_up)
-    spheres = np.array([[distance, 0.0, 0.0, radius]])
-    which = np.zeros(len(left), dtype=np.intp)
     cov = np.eye(3) * (0.02 * radius) ** 2
     lateral2 = (sensor.sigma_direction * distance) ** 2
-    information, returns = np.zeros((len(left), 3, 3)), np.zeros(len(left))
+    middle = _ranges(table, np.array([distance, 0.0, 0.0]), radius)
+    returns = (middle.lit > _SHARE_MIN).astype(np.float64)
+    information: Array = np.zeros((len(left), 3, 3))
     for _ in range(_N_ROUNDS):
-        linear = linearise(table, spheres, cov[None], which)
-        J, returns = linear.J[:, :3], (linear.lit > _SHARE_MIN).astype(np.float64)
-        along = np.einsum("ij,ij->i", J, table.directions_base)
-        slopes2 = np.maximum(np.einsum("ij,ij->i", J, J) - along**2, 0.0)
-        variance = sensor.sigma_range**2 + lateral2 * slopes2 + linear.bends**2
+        J, bend2 = _slopes(table, middle.ranges, distance, radius, cov)
+        variance = sensor.sigma_range**2 + lateral2 * np.sum(J[:, 1:] ** 2, axis=1) + bend2
         information = (returns / variance)[:, None, None] * J[:, :, None] * J[:, None, :]
         N = information.sum(axis=0) * cell * _density(sensor, distance)
         cov = np.asarray(np.linalg.inv(N + np.eye(3) / (0.3 * radius) ** 2))
     return _Disc(left=left, information=information, returns=returns)
+
+
+def _ranges(table: Beams, centre: Array, radius: float) -> Prediction:
+    """Return what beams measure to one sphere."""
+    which = np.zeros(len(table.ranges), dtype=np.intp)
+    return predict(table, centre[None], np.array([radius]), which)
+
+
+def _slopes(
+    table: Beams, ranges: Array, distance: float, radius: float, cov: Array
+) -> tuple[Array, Array]:
+    """Return derivatives by the centre over the width of what is not known of it, and their bend.
+
+    The slope between places the square root of three standard deviations to either side, which for
+    a normal spread is the mean derivative, and the variance that the second order adds.
+    """
+    J, bend2 = np.ones((len(ranges), 3)), np.zeros(len(ranges))
+    for axis in (1, 2):
+        step = np.zeros(3)
+        step[axis] = max(np.sqrt(3.0 * cov[axis, axis]), 1e-5)
+        centre = np.array([distance, 0.0, 0.0])
+        above = _ranges(table, centre + step, radius).ranges
+        below = _ranges(table, centre - step, radius).ranges
+        J[:, axis] = (above - below) / (2.0 * step[axis])
+        bend2 += (above + below - 2.0 * ranges) ** 2 / 18.0
+    return J, bend2
 
 
 def _beams(sensor: Sensor, left: Array, up: Array, distance: float) -> Beams:

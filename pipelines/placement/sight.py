@@ -136,7 +136,7 @@ def _horizon(surface: Array, frame: tuple[float, float, float], ray: Ray) -> flo
     """Return the steepest slope at which something along a ray is met."""
     x, y, z, dx, dy, length = ray
     x0, y0, cell = frame
-    n = max(int(length / cell), 1)
+    n = max(int(2.0 * length / cell), 1)
     step = length / n
     steepest = -1e9
     for k in range(1, n + 1):

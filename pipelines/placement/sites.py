@@ -16,6 +16,8 @@ CELLS_MAX = 16_000_000
 _CELL = 0.1  # [m] of a simulated world's map
 _HALF = 30.0  # [m] half side of that map
 _ABOVE = 60.0  # [m] from where its surface is probed
+_STEEP = 0.35  # share of a face that is seen from above below which it is sampled besides
+_PARTS_MAX = 400  # that an edge is cut into at most: 20 m
 _POLE_HEIGHTS = (0.62, 1.50)  # [m] the study's
 
 
@@ -34,12 +36,16 @@ def site_of_field(world: Field) -> Site:
 
     Notes
     -----
-    The surface is probed from above, so that what overhangs reaches down to the ground.
+    The surface is probed from above, so that what overhangs reaches down to the ground; upright
+    faces, which a probe from above may miss, are sampled besides and raise the nodes around.
     """
     lines = np.arange(-_HALF, _HALF + _CELL / 2, _CELL)
     x, y = np.meshgrid(lines, lines)
     ground = world.terrain.height_at(np.stack([x, y], axis=-1))
-    surface = np.maximum(ground, _probed(_without_markers(world), x, y).reshape(x.shape))
+    mesh = _without_markers(world)
+    surface = np.maximum(ground, _probed(mesh, x, y).reshape(x.shape))
+    _burn(surface, lines, _on_steep(mesh))
+    surface = np.maximum(surface, _balls(world, x, y))
     return Site(
         name=f"{world.scenario}, seed {world.seed}",
         xs=lines,
@@ -101,6 +107,47 @@ def _without_markers(world: Field) -> Mesh:
         triangles=mesh.triangles[keep],
         reflectivities=mesh.reflectivities[keep],
     )
+
+
+def _on_steep(mesh: Mesh) -> Array:
+    """Return points on the steep triangles of a mesh, half a cell apart, (n, 3) [m]."""
+    a, b, c = np.moveaxis(mesh.p_site[mesh.triangles], 1, 0)
+    normals = np.cross(b - a, c - a)
+    areas = np.linalg.norm(normals, axis=1)
+    is_steep = np.abs(normals[:, 2]) < _STEEP * areas
+    a, b, c = a[is_steep], b[is_steep], c[is_steep]
+    edges = np.maximum(np.linalg.norm(b - a, axis=1), np.linalg.norm(c - a, axis=1))
+    n_parts = np.minimum(np.ceil(2.0 * edges / _CELL).astype(np.intp), _PARTS_MAX)
+    points = [np.zeros((0, 3))]
+    for n in np.unique(n_parts):
+        u, v = np.meshgrid(np.arange(n + 1) / max(n, 1), np.arange(n + 1) / max(n, 1))
+        u, v = u[u + v <= 1.0 + 1e-9], v[u + v <= 1.0 + 1e-9]
+        some = n_parts == n
+        along = (
+            u[None, :, None] * (b - a)[some][:, None] + v[None, :, None] * (c - a)[some][:, None]
+        )
+        points.append((a[some][:, None] + along).reshape(-1, 3))
+    return np.concatenate(points)
+
+
+def _burn(surface: Array, lines: Array, points: Array) -> None:
+    """Raise the nodes about points to their heights, in place."""
+    cells = np.floor((points[:, :2] - lines[0]) / _CELL).astype(np.intp)
+    inside = ((cells >= 0) & (cells < len(lines) - 1)).all(axis=1)
+    i, j = cells[inside].T
+    for right, up in ((0, 0), (0, 1), (1, 0), (1, 1)):
+        np.maximum.at(surface, (j + up, i + right), points[inside, 2])
+
+
+def _balls(world: Field, x: Array, y: Array) -> Array:
+    """Return the height of the highest sphere that is no marker over places; minus infinity [m]."""
+    tops = np.full(x.shape, -np.inf)
+    balls = world.scene.spheres
+    for centre, radius in zip(balls.p_site, balls.radii, strict=True):
+        if np.linalg.norm(world.marks.p_site - centre, axis=1).min(initial=np.inf) > 1e-3:
+            rise2 = radius**2 - (x - centre[0]) ** 2 - (y - centre[1]) ** 2
+            tops = np.where(rise2 > 0, np.maximum(tops, centre[2] + np.sqrt(np.abs(rise2))), tops)
+    return np.asarray(tops)
 
 
 def _probed(mesh: Mesh, x: Array, y: Array) -> Array:

@@ -5,6 +5,7 @@ All lengths are metres in the site frame, z up.
 
 from __future__ import annotations
 
+from collections import Counter
 from dataclasses import dataclass, field, replace
 from typing import Self
 
@@ -209,9 +210,9 @@ class Arrangement:
 
 def _refuse_doubles(what: str, names: tuple[str, ...]) -> None:
     """Raise InputError if a name occurs twice."""
-    doubles = sorted({name for name in names if names.count(name) > 1}) if names else []
-    if doubles:
-        raise InputError(f"Two {what} are called {doubles[0]!r}; each needs a name of its own.")
+    name, n = Counter(names).most_common(1)[0] if names else ("", 0)
+    if n > 1:
+        raise InputError(f"Two {what} are called {name!r}; each needs a name of its own.")
 
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
