@@ -18,7 +18,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from pathlib import Path
-from time import perf_counter
+from time import perf_counter, process_time
 from typing import Any
 
 import numpy as np
@@ -27,9 +27,9 @@ from pipelines.config import FittingConfig, SurveyConfig
 from pipelines.geometry import inverse, transform
 from pipelines.simulation import SimulationConfig, scenario, simulate_stop
 from pipelines.survey import Progress, process
-from pipelines.values import Array, ControlMarks, StopResult
-from service import yardstick
+from pipelines.values import Array, ControlMarks, ScanLog, StopResult
 from service.provenance import forget_peak_memory, peak_memory
+from service.yardstick import WHAT, Cost, least, read_cost
 from storage.catalogue import Catalogue
 from storage.recordings import inspect_log, read_log, write_log
 from storage.results import RunInfo, tables
@@ -46,6 +46,7 @@ _BARS = {_POINTS: 8.0, _PACKETS: 8.0, _ZSTD: 20.0}  # x read+CRC that the chain 
 _BAR_PEERS = 15.0  # times quicker than the usual libraries
 _BAR_MEMORY = 500e6  # [bytes] of one scan
 Timings = dict[str, float]
+Costs = dict[str, Cost]
 Plain = dict[str, Any]
 
 
@@ -73,9 +74,9 @@ class Scan:
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class Measured:
-    """The best time of each step [s], the result of a run, and the number of its returns."""
+    """The least cost of each step, the result of a run, and the number of its returns."""
 
-    times: Timings
+    costs: Costs
     result: StopResult
     n_returns: int
 
@@ -126,51 +127,56 @@ def _simulated(folder: Path, turn: float) -> dict[str, Scan]:
 
 def measure(
     scans: Mapping[str, Scan], folder: Path, repeats: int, progress: Progress
-) -> tuple[float, dict[str, Measured]]:
-    """Run the chain on scans in turn, a few times; return the yardstick [s] and the best times.
+) -> tuple[Cost, dict[str, Measured]]:
+    """Run the chain on scans in turn, a few times; return the yardstick and the least costs.
 
     The first round compiles kernels and fills the cache of the files; it does not count. Yardstick
     and scans take turns, so that what else the machine does befalls all of them.
     """
     plain = next(iter(scans.values()))
-    reads: list[float] = []
+    reads: list[Cost] = []
     found: dict[str, list[Measured]] = {name: [] for name in scans}
     for i in range(repeats + 1):
         progress(0.6 * i / (repeats + 1), f"Run {i} of {repeats}" if i else "A first run")
-        reads.append(yardstick.read_seconds(plain.log))
+        reads.append(read_cost(plain.log))
         for k, (name, scan) in enumerate(scans.items()):
             found[name].append(_chain(scan, folder / f"{i} {k}"))
-    return min(reads), {name: _best(runs[1:]) for name, runs in found.items()}
+    return least(reads), {name: _best(runs[1:]) for name, runs in found.items()}
 
 
 def _best(runs: Sequence[Measured]) -> Measured:
-    """Return the best time of each step."""
-    times = {step: min(one.times[step] for one in runs) for step in runs[0].times}
-    return replace(runs[0], times=times)
+    """Return the least cost of each step."""
+    costs = {step: least(one.costs[step] for one in runs) for step in runs[0].costs}
+    return replace(runs[0], costs=costs)
 
 
 def _chain(scan: Scan, folder: Path) -> Measured:
     """Run everything once."""
-    times: Timings = {}
-    with _timed(times, "preflight"):
-        inspect_log(scan.log)
-    stops, n_returns = committed(scan, folder, times)
-    return Measured(times=_in_order(times, stops), result=stops[0], n_returns=n_returns)
+    costs: Costs = {}
+    with _timed(costs, "preflight"):
+        preflight = inspect_log(scan.log)
+    stops = _committed(scan, folder, costs)
+    return Measured(costs=_in_order(costs, stops), result=stops[0], n_returns=preflight.n_returns)
 
 
-def committed(scan: Scan, folder: Path, times: Timings) -> tuple[tuple[StopResult, ...], int]:
-    """Bring a log into a database of its own; return its stops and the number of returns."""
+def _committed(scan: Scan, folder: Path, costs: Costs) -> tuple[StopResult, ...]:
+    """Bring a log into a database of its own; return its stops."""
     with Catalogue(folder / "bench.duckdb", snapshots=folder / "snapshots") as catalogue:
         job = _job(catalogue, scan.log)
-        with _timed(times, _CHAIN):
-            with _timed(times, "read log"):
-                log = read_log(scan.log, digest="0" * 64)  # the service has it from the upload
-            stops = process(log, config=_CONFIG, marks=scan.marks)
-            with _timed(times, "rows"):
-                rows = tables(_run(catalogue, job), stops, marks=scan.marks)
-            with _timed(times, "commit"):
+        run = _run(catalogue, job)
+        with _timed(costs, _CHAIN):
+            stops = process(_read(scan.log, costs), config=_CONFIG, marks=scan.marks)
+            with _timed(costs, "rows"):
+                rows = tables(run, stops, marks=scan.marks)
+            with _timed(costs, "commit"):
                 catalogue.finish_job(job, rows)
-    return stops, len(log.p_lidar)
+    return stops
+
+
+def _read(log: Path, costs: Costs) -> ScanLog:
+    """Read a log as the service does: nobody keeps it, and the upload has told its digest."""
+    with _timed(costs, "read log"):
+        return read_log(log, digest="0" * 64)
 
 
 def _job(catalogue: Catalogue, log: Path) -> str:
@@ -200,19 +206,23 @@ def _run(catalogue: Catalogue, job_id: str) -> RunInfo:
     )
 
 
-def _in_order(times: Timings, stops: Sequence[StopResult]) -> Timings:
-    """Put the times of the chain's own steps, summed over stops, between reading and rows."""
+def _in_order(costs: Costs, stops: Sequence[StopResult]) -> Costs:
+    """Put the times of the chain's own steps, summed over stops, between reading and rows.
+
+    What these took of processors is not known.
+    """
     steps: Timings = {}
     for stop in stops:
         for step, seconds in stop.timings.items():
             steps[step] = steps.get(step, 0.0) + seconds
-    first = {name: times[name] for name in ("preflight", "read log")}
-    last = {name: times[name] for name in ("rows", "commit", _CHAIN)}
-    return first | steps | last
+    first = {name: costs[name] for name in ("preflight", "read log")}
+    middle = {name: Cost(seconds, float("nan")) for name, seconds in steps.items()}
+    last = {name: costs[name] for name in ("rows", "commit", _CHAIN)}
+    return first | middle | last
 
 
-def _report(log: Path, measured: Measured, read: float, wish: Wish) -> Plain:
-    """Return the best time of each step, and its ratio to the yardstick."""
+def _report(log: Path, measured: Measured, read: Cost, wish: Wish) -> Plain:
+    """Return the least time of each step, and its ratio to the yardstick."""
     return {
         "log": {
             "name": log.name,
@@ -220,25 +230,29 @@ def _report(log: Path, measured: Measured, read: float, wish: Wish) -> Plain:
             "n_returns": measured.n_returns,
         },
         "repeats": wish.repeats,
-        "yardstick": yardstick.WHAT,
-        "yardstick_seconds": read,
+        "yardstick": WHAT,
+        "yardstick_seconds": read.seconds,
+        "yardstick_cpu_seconds": read.cpu_seconds,
         "steps": [
-            {"step": step, "seconds": seconds, "ratio": seconds / read}
-            for step, seconds in measured.times.items()
+            {"step": step, "seconds": cost.seconds, "ratio": cost.seconds / read.seconds}
+            for step, cost in measured.costs.items()
         ],
     }
 
 
-def _variant(name: str, log: Path, measured: Measured, read: float) -> Plain:
+def _variant(name: str, log: Path, measured: Measured, read: Cost) -> Plain:
     """Return what the chain costs on a scan in one dress, against a read of the plain points."""
-    chain, ours = measured.times[_CHAIN], measured.times["read log"]
+    chain, ours = measured.costs[_CHAIN], measured.costs["read log"]
     return {
         "name": name,
         "size_bytes": log.stat().st_size,
-        "read_log_seconds": ours,
-        "read_log_ratio": ours / read,
-        "chain_seconds": chain,
-        "ratio": chain / read,
+        "read_log_seconds": ours.seconds,
+        "read_log_ratio": ours.seconds / read.seconds,
+        "read_log_cpu_ratio": ours.cpu_seconds / read.cpu_seconds,
+        "chain_seconds": chain.seconds,
+        "ratio": chain.seconds / read.seconds,
+        "chain_cpu_seconds": chain.cpu_seconds,
+        "cpu_ratio": chain.cpu_seconds / read.cpu_seconds,
         "bar_ratio": _BARS.get(name),
     }
 
@@ -330,7 +344,7 @@ def _fresh(log: Path, folder: Path) -> Plain:
     """Run one scan in this process, which has done nothing but import before."""
     before = _resident()
     forget_peak_memory()
-    committed(Scan(log=log), folder, {})
+    _committed(Scan(log=log), folder, {})
     peak = peak_memory()
     return {"before_bytes": before, "peak_bytes": peak, "scan_bytes": peak - before}
 
@@ -342,11 +356,11 @@ def _resident() -> int:
 
 
 @contextmanager
-def _timed(times: Timings, step: str) -> Iterator[None]:
-    """Record how long a step takes [s]."""
-    start = perf_counter()
+def _timed(costs: Costs, step: str) -> Iterator[None]:
+    """Record what a step costs."""
+    start, cpu = perf_counter(), process_time()
     yield
-    times[step] = perf_counter() - start
+    costs[step] = Cost(perf_counter() - start, process_time() - cpu)
 
 
 if __name__ == "__main__":

@@ -52,7 +52,7 @@ def grown(scan: Scan, folder: Path, progress: Progress) -> Plain:
     progress(0.95, "Networks")
     adjust(*_NETWORKS[0])  # compiles what there is to compile
     return {
-        "linearity": {"sizes": sizes, **line(sizes)},
+        "linearity": {"sizes": sizes, **line(sizes), "cpu": line(sizes, "cpu_seconds")},
         "network": [adjust(*size) for size in _NETWORKS],
     }
 
@@ -65,18 +65,20 @@ def measured(log: ScanLog, n_returns: int, scan: Scan, folder: Path) -> Plain:
         {"": replace(scan, log=path)}, folder / str(n_returns), _REPEATS, lambda *_: None
     )
     path.unlink()
-    seconds = found[""].times[_CHAIN]
+    cost = found[""].costs[_CHAIN]
     return {
         "n_returns": n_returns,
-        "seconds": seconds,
-        "ratio": seconds / read,
-        "ns_per_return": 1e9 * seconds / n_returns,
+        "seconds": cost.seconds,
+        "ratio": cost.seconds / read.seconds,
+        "cpu_seconds": cost.cpu_seconds,
+        "ns_per_return": 1e9 * cost.seconds / n_returns,
+        "cpu_ns_per_return": 1e9 * cost.cpu_seconds / n_returns,
     }
 
 
-def line(sizes: Sequence[Plain]) -> Plain:
-    """Fit a straight line to times against returns, all sizes by their relative error alike."""
-    n, seconds = (np.array([one[key] for one in sizes]) for key in ("n_returns", "seconds"))
+def line(sizes: Sequence[Plain], cost: str = "seconds") -> Plain:
+    """Fit a straight line to costs against returns, all sizes by their relative error alike."""
+    n, seconds = (np.array([one[key] for one in sizes]) for key in ("n_returns", cost))
     rows = np.column_stack([np.ones(len(n)), n]) / seconds[:, None]
     (fixed, each), *_ = np.linalg.lstsq(rows, np.ones(len(n)), rcond=None)
     return {

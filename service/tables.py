@@ -159,14 +159,16 @@ def _print_variants(out: Console, report: Plain) -> None:
             f"{one['read_log_ratio']:.2f}",
             f"{1e3 * one['chain_seconds']:,.1f}",
             f"{one['ratio']:.1f}",
+            f"{one['cpu_ratio']:.1f}",
             "-" if one["bar_ratio"] is None else f"{one['bar_ratio']:.0f}",
             f"{1e3 * one['peer_seconds']:,.0f}" if "peer_seconds" in one else "-",
             f"{one['factor']:.1f}" if "factor" in one else "-",
         )
         for one in report["variants"]
     ]
-    heads = ("log", "MB", "reading [ms]", "x read+CRC", "log to rows [ms]", "x read+CRC", "at most")
-    out.print(_table((*heads, "usual libraries [ms]", "x ours"), rows))
+    reading, chain = ("reading [ms]", "x"), ("log to rows [ms]", "x", "x CPU", "bar")
+    heads = ("log", "MB", *reading, *chain, "usual libraries [ms]", "x ours")
+    out.print(_table(heads, rows))
 
 
 def _print_peers(out: Console, report: Plain) -> None:
@@ -211,16 +213,19 @@ def _print_growth(out: Console, report: Plain) -> None:
                 f"{one['n_returns']:,}",
                 f"{one['seconds']:.3f}",
                 f"{one['ns_per_return']:.0f}",
+                f"{one['cpu_ns_per_return']:.0f}",
                 f"{one['ratio']:.1f}",
             )
             for one in linearity["sizes"]
         ]
-        out.print(_table(("returns", "log to rows [s]", "ns a return", "x read+CRC"), rows))
-        out.print(
-            f"Straight line: {1e3 * linearity['fixed_seconds']:.1f} ms and "
-            f"{linearity['line_ns_per_return']:.1f} ns a return; no size is farther from it than "
-            f"{100 * linearity['worst_share_off_line']:.0f} %."
-        )
+        heads = ("returns", "log to rows [s]", "ns a return", "CPU [ns]", "x read+CRC")
+        out.print(_table(heads, rows))
+        for what, fit in (("Time", linearity), ("CPU", linearity["cpu"])):
+            out.print(
+                f"{what} in a straight line: {1e3 * fit['fixed_seconds']:.1f} ms and "
+                f"{fit['line_ns_per_return']:.1f} ns a return; no size is farther from it than "
+                f"{100 * fit['worst_share_off_line']:.0f} %."
+            )
     if networks := report.get("network"):
         costs = [
             (
@@ -232,8 +237,8 @@ def _print_growth(out: Console, report: Plain) -> None:
             )
             for one in networks
         ]
-        heads = ("stations x marks", "assembly [s]", "adjustment [s]", "ms a station", "both [ms]")
-        out.print(_table(heads, costs))
+        names = ("stations x marks", "assembly [s]", "adjustment [s]", "ms a station", "both [ms]")
+        out.print(_table(names, costs))
 
 
 _SAID = ("distance", "count", "mean_distance", "mean_count")

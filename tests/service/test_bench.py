@@ -108,7 +108,9 @@ def test_a_log_of_ones_own_is_measured_without_truth(written):
 def test_the_yardstick_is_measured_in_a_process_of_its_own(tmp_path):
     (tmp_path / "a").write_bytes(bytes(50_000_000))
     (tmp_path / "b").write_bytes(bytes(50))
-    assert yardstick.read_seconds(tmp_path / "a") > 10 * yardstick.read_seconds(tmp_path / "b") > 0
+    long, short = (yardstick.read_cost(tmp_path / name) for name in "ab")
+    assert long.seconds > 10 * short.seconds > 0.0
+    assert long.cpu_seconds > 10 * short.cpu_seconds > 0.0
 
 
 def test_a_stretched_log_turns_on_evenly(written):
