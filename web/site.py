@@ -19,6 +19,7 @@ from web.templating import render
 _CELLS_MAX = 400  # cells along an edge that a picture shows
 _SUN = (np.radians(315.0), np.radians(40.0))  # azimuth, clockwise from y, and height of the light
 _STEEPER = 3.0  # times that slopes are shaded
+_TAIL = 0.02  # share of the cells below and above the colours: a mound does not take them all
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -68,6 +69,8 @@ def ground_figure(model: ElevationModel, marks: Columns, stations: Columns) -> g
         x=xs,
         y=ys,
         z=np.round(heights, 4),
+        zmin=float(np.nanquantile(heights, _TAIL)),
+        zmax=float(np.nanquantile(heights, 1.0 - _TAIL)),
         colorscale=list(theme.HEIGHTS),
         colorbar=bar,
         hovertemplate="x %{x:.2f} m, y %{y:.2f} m<br>height %{z:.3f} m<extra></extra>",

@@ -13,9 +13,18 @@ from storage.elevation_files import read_geotiff
 
 
 @pytest.fixture(scope="module")
-def made(site):
-    """Return the products of a survey whose one log was processed."""
+def too_early(site):
+    """Return the job that was asked for before any log of the survey was processed."""
     site.survey("quarry")
+    site.upload(survey="quarry")
+    answer = site.client.post("/api/v1/jobs", json={"kind": "site", "survey": "quarry"})
+    return site.ended(answer.json()["job_id"])
+
+
+@pytest.fixture(scope="module")
+def made(site, too_early):
+    """Return the products of a survey whose one log was processed."""
+    assert too_early["status"] == "failed"
     job = site.upload(survey="quarry", process="true").json()["job"]["job_id"]
     assert site.ended(job)["status"] == "successful"
     wanted = {"kind": "site", "survey": "quarry", "options": {"cell_m": 1.0, "voxel_m": 0.02}}
@@ -95,14 +104,9 @@ def test_the_form_of_a_site_starts_a_job(made, site):
     assert site.ended(job, seconds=120)["status"] == "successful"
 
 
-def test_a_survey_without_poses_is_refused_with_what_to_do(site):
-    body = site.stop.log.read_bytes()
-    site.client.post("/api/v1/surveys", json={"name": "bare"})
-    site.upload(body, survey="bare")
-    answer = site.client.post("/api/v1/jobs", json={"kind": "site", "survey": "bare"})
-    done = site.ended(answer.json()["job_id"])
-    assert done["status"] == "failed"
-    assert "adjust" in done["error_reason"]
+def test_a_survey_without_poses_is_refused_with_what_to_do(too_early):
+    assert too_early["error_code"] == "not_found"
+    assert "adjust" in too_early["error_reason"]
 
 
 def test_what_is_no_product_is_not_found(made, site):
