@@ -22,7 +22,6 @@ from pipelines.placement import (
     Site,
     Stops,
 )
-from pipelines.placement.optimising import Optimum, Proposal
 
 Plain = dict[str, Any]
 
@@ -41,54 +40,6 @@ def evaluation_answer(site: Site, model: CentreModel, found: Evaluation) -> Plai
         "worst_sigma_3d_m": _number(found.worst_sigma_3d),
         "worst_probability_within_tolerance": found.worst_probability,
         "keeps_tolerance_95": bool(found.worst_probability >= 0.95),
-    }
-
-
-def optimum_answer(site: Site, model: CentreModel, found: Optimum) -> Plain:
-    """Return the best places that were found, and how near they are to the best there can be."""
-    answer = evaluation_answer(site, model, found.evaluation)
-    return answer | {
-        "worst_sigma_3d_after_loss_m": _number(found.worst_after_loss),
-        "is_kept": found.is_kept,
-        "log_det": _number(found.log_det),
-        "log_det_bound": _number(found.log_det_bound),
-        "n_candidates": found.n_candidates,
-        "n_exchanges": found.n_exchanges,
-        "text": optimum_text(found),
-    }
-
-
-def optimum_text(found: Optimum) -> str:
-    """Say what an optimum promises."""
-    n, wish = len(found.evaluation.marks.names), found.evaluation.requirement
-    loss = (
-        f"{1e3 * found.worst_after_loss:.1f} mm after the loss of any one"
-        if math.isfinite(found.worst_after_loss)
-        else "no position at some stop after the loss of one"
-    )
-    kept = "is kept" if found.is_kept else "is not kept"
-    return (
-        f"{n} marks, the best of {found.n_candidates:,} places: the worst stop has "
-        f"{1e3 * found.evaluation.worst_sigma_3d:.1f} mm, {loss}. The tolerance of "
-        f"{1e3 * wish.tolerance:g} mm {kept}."
-    )
-
-
-def proposal_answer(site: Site, found: Proposal) -> Plain:
-    """Return the one more mark that would help most, and how much."""
-    before, after = found.before, found.after
-    last = marks_answer(site, after.marks)[-1]
-    if np.isfinite(before.worst_sigma_3d):
-        text = f"from {1e3 * before.worst_sigma_3d:.1f} to {1e3 * after.worst_sigma_3d:.1f} mm"
-    else:
-        text = f"from no position to {1e3 * after.worst_sigma_3d:.1f} mm"
-    return {
-        "mark": last,
-        "worst_sigma_3d_before_m": _number(before.worst_sigma_3d),
-        "worst_sigma_3d_after_m": _number(after.worst_sigma_3d),
-        "mean_sigma_3d_before_m": _number(float(np.mean(before.sigma_3d))),
-        "mean_sigma_3d_after_m": _number(float(np.mean(after.sigma_3d))),
-        "text": f"{last['name']} helps most: it brings the worst stop {text}.",
     }
 
 

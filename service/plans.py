@@ -13,7 +13,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -35,17 +35,10 @@ from pipelines.placement import (
     site_of_field,
     stops_of_field,
 )
-from pipelines.placement.candidates import PlaceRules, find_candidates
-from pipelines.placement.optimising import Goal, optimise, propose_mark
 from pipelines.simulation import scenario
 from pipelines.values import Array
-from service.planning import (
-    Plain,
-    evaluation_answer,
-    field_answer,
-    optimum_answer,
-    proposal_answer,
-)
+from service.centre_models import model_of_surveys
+from service.planning import Plain, evaluation_answer, field_answer
 from storage import plans as kept
 from storage.catalogue import Catalogue
 
@@ -56,10 +49,12 @@ SCENARIOS = {
 }
 """Simulated fields that can be planned on, as their key and what people call them."""
 
+AUTOMATIC, SENSOR_ALONE, _SURVEY = "auto", "sensor", "survey:"
 TERRAIN = "terrain:"  # before the id of an uploaded one
 _GROUNDS_KEPT = 6
+_MODELS_KEPT = 8
+_NEWEST = "SELECT max(finished_at) AS finished_at, count(*) AS n FROM runs"
 _SIGHTS_KEPT = 400  # marks; of a map of 64 x 64 places each takes 130 kB
-_SEED = 0  # of the optimiser's later starts
 _ROUND_IT = 3.0  # [m] shown around the outermost marks
 _STOPS_ACROSS = 3  # of a terrain for which nobody has said where the rover stops
 
@@ -181,9 +176,8 @@ def marks_at(site: Site, places: Sequence[Place]) -> Arrangement:
         if heights[k] < ground[k] + site.marker_radius:
             raise InputError(
                 f"Mark {place.name} is under the ground: its centre is "
-                f"{heights[k] - ground[k]:.3f} m above it, and a sphere of {site.marker_radius:g} m "
-                "radius needs more than that. "
-                "Give it a higher pole."
+                f"{heights[k] - ground[k]:.3f} m above it, and a sphere of "
+                f"{site.marker_radius:g} m radius needs more than that. Give it a higher pole."
             )
     return Arrangement(
         names=tuple(place.name for place in places), p_site=np.column_stack([xy, heights])
@@ -234,6 +228,8 @@ class Planner:
     def __init__(self, catalogue: Catalogue) -> None:
         self._catalogue = catalogue
         self._lookout = Lookout()
+        self._lock = threading.Lock()
+        self._models: dict[tuple[Any, ...], CentreModel] = {}
 
     def ground(self, key: str) -> Ground:
         """Return the field of a key; NotFoundError if there is none."""
@@ -243,8 +239,34 @@ class Planner:
         return terrain_ground(key, known["name"], Path(known["url"]))
 
     def model(self, key: str, sensor: Sensor, radius: float) -> CentreModel:
-        """Return the model of centres that was asked for."""
-        return sensor_model(sensor, radius)
+        """Return the model of centres that was asked for, as of the newest results."""
+        if key == SENSOR_ALONE:
+            return sensor_model(sensor, radius)
+        survey = key.removeprefix(_SURVEY)
+        if key.startswith(_SURVEY):
+            survey = self._catalogue.get_survey(survey).name
+        elif key != AUTOMATIC:
+            raise InputError(
+                f"There is no model {key!r}: known are {AUTOMATIC}, {SENSOR_ALONE} and "
+                f"{_SURVEY}<name>."
+            )
+        else:
+            survey = ""
+        (newest,) = self._catalogue.rows(_NEWEST)
+        asked = (survey, sensor, radius, newest["finished_at"], newest["n"])
+        with self._lock:
+            known = self._models.get(asked)
+        if known is None:
+            known = model_of_surveys(self._ask, sensor, radius, survey=survey)
+            with self._lock:
+                self._models = {**dict(list(self._models.items())[-_MODELS_KEPT:]), asked: known}
+        return known
+
+    def _ask(self, sql: str) -> Plain:
+        """Answer a SELECT of our own from the catalogue."""
+        table = self._catalogue.table(sql)
+        rows = zip(*(column.to_pylist() for column in table.columns), strict=True)
+        return {"columns": [{"name": name} for name in table.column_names], "rows": list(rows)}
 
     def evaluate(self, asked: Asked) -> Plain:
         """Return what an arrangement promises at its stops."""
@@ -252,21 +274,6 @@ class Planner:
         site = asked.ground.site
         found = evaluate(site, asked.stops, asked.marks, asked.model, asked.wish, sights=sights)
         return evaluation_answer(site, asked.model, found)
-
-    def optimise(self, asked: Asked, goal: Goal, rules: PlaceRules) -> Plain:
-        """Return the best places for a number of marks, or the fewest that keep the tolerance."""
-        site, stops = asked.ground.site, asked.stops
-        places = find_candidates(site, stops, rules)
-        rng = np.random.default_rng(_SEED)  # the same question has the same answer
-        found = optimise(site, stops, places, asked.model, asked.wish, goal, rng)
-        return optimum_answer(site, asked.model, found)
-
-    def suggest(self, asked: Asked, rules: PlaceRules) -> Plain:
-        """Return the one more mark that would help most."""
-        site, stops = asked.ground.site, asked.stops
-        places = find_candidates(site, stops, rules)
-        found = propose_mark(site, stops, asked.marks, places, asked.model, asked.wish)
-        return proposal_answer(site, found)
 
     def field(self, asked: Asked, n_across: int) -> Plain:
         """Return what an arrangement promises on a grid over the part that a map shows."""

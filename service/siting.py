@@ -161,10 +161,10 @@ def _notes(found: Optimum, goal: Goal) -> list[str]:
     return notes
 
 
-def one_more(asked: Asked) -> Plain:
+def one_more(asked: Asked, rules: PlaceRules | None = None) -> Plain:
     """Return the one more mark that would help most."""
     site = asked.ground.site
-    candidates = placement.find_candidates(site, asked.stops, PlaceRules())
+    candidates = placement.find_candidates(site, asked.stops, rules or PlaceRules())
     found = placement.propose_mark(
         site, asked.stops, asked.marks, candidates, asked.model, asked.wish
     )

@@ -116,7 +116,7 @@ def test_every_table_and_view_is_documented():
 def test_every_number_of_the_database_carries_its_unit():
     units = ("_m", "_m2", "_deg", "_s", "_percent", "_bytes", "_rad", "_db")
     unitless = re.compile(
-        r"^(n_|dof$|dop$|sigma0$|redundancy$|w$|coverage$|attempts$"
+        r"^(n_|share_|dof$|dop$|sigma0$|redundancy$|w$|coverage$|attempts$"
         r"|mean_(n_points|intensity|redundancy)$"
         r"|number$|place$|probability_|cov_motion$|rotation$|n_points_(from|to)$"
         r"|(vtpv|vtpv_limit|w_limit|test_level)$|variance_factor_"

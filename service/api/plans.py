@@ -14,6 +14,7 @@ from pipelines.errors import InputError
 from pipelines.placement import Requirement, Sensor
 from pipelines.placement.candidates import PlaceRules
 from pipelines.placement.optimising import Goal
+from service import siting
 from service.api.models import Listing, Strict
 from service.planning import Plain, site_answer, to_csv, to_geojson
 from service.plans import SCENARIOS, TERRAIN, Asked, Place, marks_at, stops_at, terrain_ground
@@ -185,14 +186,14 @@ def evaluate_plan(plan: JudgedPlan, request: Request, service: Current) -> Respo
 def optimise_plan(plan: WantedPlan, service: Current) -> Said:
     """Find the best places for a number of marks, or the fewest that keep the tolerance."""
     goal = Goal(n_marks=plan.n_marks, is_robust=plan.is_robust)
-    answer = service.planner.optimise(_asked(service, plan), goal, plan.rules.to_values())
+    answer = siting.optimise(_asked(service, plan), plan.rules.to_values(), goal)
     return Said.model_validate(answer)
 
 
 @router.post("/plans/suggest", name="suggest_mark")
 def suggest_mark(plan: BetterPlan, service: Current) -> Said:
     """Name the one more mark that would help most."""
-    answer = service.planner.suggest(_asked(service, plan), plan.rules.to_values())
+    answer = siting.one_more(_asked(service, plan), plan.rules.to_values())
     return Said.model_validate(answer)
 
 

@@ -28,6 +28,7 @@ PAGES = [
     STOP,
     f"{STOP}?method=paper&marker=M03",
     "/jobs",
+    "/plan?a=P01:6.5,0.5,1;P02:-1,6.5,1;P03:-6.5,-3,1&b=P01:6.5,0.5,1;P02:-1,6.5,1&stop=lane3-stop1",
     "/sql?q=SELECT+stop%2C+x_m%2C+y_m+FROM+latest_station_fixes+ORDER+BY+ALL",
 ]
 LOOKS = [(1440, "dark"), (390, "light")]
@@ -114,7 +115,7 @@ def test_a_page_draws_without_complaint_and_asks_no_other_host(visit, path):
 @pytest.mark.parametrize(("width", "scheme"), LOOKS)
 def test_no_page_is_wider_than_the_window(visit, width, scheme):
     one = visit(width=width, scheme=scheme)
-    for path in ("/", "/surveys/field", STOP, "/jobs", "/sql", "/nowhere"):
+    for path in ("/", "/surveys/field", STOP, "/jobs", "/plan", "/sql", "/nowhere"):
         page = one.open(path)
         assert page.evaluate("document.documentElement.scrollWidth") <= width, path
         assert page.evaluate("document.documentElement.dataset.theme") == scheme
@@ -178,3 +179,23 @@ def test_a_file_that_is_no_log_is_refused_with_its_reason(visit, tmp_path):
     page.set_input_files("#files", log)
     page.wait_for_selector("#uploads .outcome:has-text('refused'), #uploads .outcome.bad")
     assert page.locator("#uploads li").count() == 1
+
+
+def test_a_mark_that_is_dragged_moves_the_prediction_and_the_address(visit):
+    page = visit().open("/plan?model=sensor&a=P01:6.5,0.5,1;P02:-1,6.5,1;P03:-6.5,-3,1")
+    worst = page.locator(".plan .readout dd").first
+    page.wait_for_selector("#stops-table tbody tr")
+    before = worst.inner_text()
+    box = page.locator("[data-key='mark P02'] circle").nth(1).bounding_box()
+    page.mouse.move(box["x"] + 5, box["y"] + 5)
+    page.mouse.down()
+    page.mouse.move(box["x"] + 150, box["y"] + 60, steps=4)
+    page.mouse.up()
+    page.wait_for_function(
+        "before => document.querySelector('.plan .readout dd').innerText !== before", arg=before
+    )
+    assert "P02%3A-1%2C6.5" not in page.url
+    page.keyboard.press("Delete")
+    page.wait_for_function("() => document.querySelectorAll('#marks-table tbody tr').length === 2")
+    page.click("#undo")
+    page.wait_for_function("() => document.querySelectorAll('#marks-table tbody tr').length === 3")

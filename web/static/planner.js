@@ -450,14 +450,15 @@ byId("optimise").addEventListener("click", (event) => during(event.currentTarget
   remember();
   plan.marks = answer.marks.map(own);
   changed(plan, CELLS.still);
-  tell(answer.text);
+  tell(answer.notes.join(" "));
 }));
 byId("suggest").addEventListener("click", (event) => during(event.currentTarget, async (plan) => {
   const answer = await post("/suggest", request(plan));
   remember();
-  plan.marks.push({ ...own(answer.mark), name: freeName(plan.marks, "P") });
+  plan.marks.push(own(answer));
   changed(plan, CELLS.still);
-  tell(answer.text);
+  const before = answer.worst_sigma_3d_before_m === null ? "no position" : `${mm(answer.worst_sigma_3d_before_m)} mm`;
+  tell(`${answer.name} helps most: it brings the worst stop from ${before} to ${mm(answer.worst_sigma_3d_m)} mm.`);
 }));
 byId("save").addEventListener("click", (event) => during(event.currentTarget, async (plan) => {
   const name = window.prompt("Name of the plan", `${plan.marks.length} marks`);
