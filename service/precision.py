@@ -15,123 +15,145 @@ from rich.table import Table
 
 from pipelines.accuracy import UNMATCHED, marker_errors
 from pipelines.config import FITTING_METHODS, SurveyConfig
+from pipelines.errors import DegenerateGeometryError
 from pipelines.extraction import extract
 from pipelines.fitting import fit_markers
 from pipelines.fitting.bound import cramer_rao, hits
 from pipelines.geometry import inverse, transform
-from pipelines.simulation import SimulationConfig, scenario, simulate_stop
+from pipelines.simulation import SimulationConfig, simulate_stop
+from pipelines.simulation.lane import range_lane
 from pipelines.stitching import beams, stitch
 from pipelines.survey import Progress
 from pipelines.values import Array, MarkerFits, StitchedCloud
 
 _SEGMENT = 1.5  # radii from a true centre within which returns may be of its sphere
 _TOLERANCE = 0.03  # [m] and four sigmas by which the range of a hit may be off
-_BIN = 2.5  # [m] between the distances of the lane
+_SHARE = 0.02  # of a footprint: a beam that touches with less has a derivative without limit
+_DISTANCES = (5.0, 10.0, 15.0, 20.0, 25.0, 30.0)  # [m]
+_PER_DISTANCE = 20
+_TURN = SimulationConfig().turn
+_LONG_TURN = 20.7  # [s] as incommensurate with the channels as the usual one
 Plain = dict[str, Any]
+
+
+class Case(NamedTuple):
+    """Noise of the ranges [m] and time of the turn [s]."""
+
+    sigma: float
+    turn: float
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Wish:
-    """How many stops of 8 markers at each distance, under what noise, in what turn, by whom."""
+    """How many stops of 20 markers at each of six distances, in which cases, by which methods."""
 
-    n_stops: int = 6
-    sigmas: tuple[float, ...] = (0.01, 0.02)
-    turn: float = SimulationConfig().turn
+    n_stops: int = 3
+    cases: tuple[Case, ...] = (Case(0.01, _TURN), Case(0.02, _TURN))
     methods: tuple[str, ...] = FITTING_METHODS
     seed: int = 0
+
+
+def full_wish(seed: int) -> Wish:
+    """Return the wish for a thousand fits and more at each distance, by the methods that count."""
+    cases = (*Wish().cases, Case(0.02, _LONG_TURN))
+    return Wish(n_stops=64, cases=cases, methods=("along_beam", "silhouette"), seed=seed)
+
+
+class Bounds(NamedTuple):
+    """Least mean square error by every beam that hit, by those that hit clearly, and how many."""
+
+    every: float
+    clear: float
+    n_hits: int
 
 
 class _Row(NamedTuple):
     """One fit against truth."""
 
-    sigma: float
+    case: Case
     distance: float
     method: str
     error: float
     radial: float
     nees: float
-    bound2: float
-    n_hits: int
+    bounds: Bounds
     is_weak: bool
 
 
 def accuracy_table(wish: Wish, progress: Progress) -> list[Plain]:
     """Fit simulated markers by every method; return one row per noise, distance and method."""
     config, rows = SurveyConfig(), []
-    n = len(wish.sigmas) * wish.n_stops
+    n = len(wish.cases) * wish.n_stops
     for i in range(n):
-        sigma = wish.sigmas[i // wish.n_stops]
-        progress(i / n, f"Stop {i % wish.n_stops + 1} at sigma {1e3 * sigma:.0f} mm")
-        rows += _stop(sigma, wish.seed + i % wish.n_stops, wish, config)
-    keys = sorted({(row.sigma, row.distance) for row in rows})
-    return [
-        _summary([row for row in rows if (row.sigma, row.distance, row.method) == (*key, method)])
-        for key in keys
-        for method in wish.methods
-        if any((row.sigma, row.distance, row.method) == (*key, method) for row in rows)
-    ]
+        case, k = wish.cases[i // wish.n_stops], i % wish.n_stops
+        progress(i / n, f"Stop {k + 1} at sigma {1e3 * case.sigma:.0f} mm, turn {case.turn:.1f} s")
+        rows += _stop(case, wish.seed + k, wish.methods, config)
+    found: dict[tuple[Case, float, int], list[_Row]] = {}
+    for row in rows:
+        found.setdefault((row.case, row.distance, wish.methods.index(row.method)), []).append(row)
+    return [_summary(found[key]) for key in sorted(found)]
 
 
-def _stop(sigma: float, seed: int, wish: Wish, config: SurveyConfig) -> list[_Row]:
+def _stop(case: Case, seed: int, methods: tuple[str, ...], config: SurveyConfig) -> list[_Row]:
     """Simulate one stop and compare every method with the truth."""
-    field = scenario("range-lane", seed)
+    field = range_lane(seed, np.array(_DISTANCES), _PER_DISTANCE)
     usual = SimulationConfig()
     rig = SimulationConfig.perfect(
-        sigma_range=sigma,
+        sigma_range=case.sigma,
         divergence=usual.divergence,
         range_step=usual.range_step,
         azimuth_step=usual.azimuth_step,
         encoder_step=usual.encoder_step,
-        turn=wish.turn,
+        turn=case.turn,
         only_near_spheres=True,
     )
     stop = simulate_stop(field, field.stops[0].name, rig)
     cloud = stitch(stop.log, stop.rig, config.stitching)
     true = transform(inverse(stop.truth.T_site_base), field.marks.p_site)
-    bounds = [_bound(cloud, p, field.marker_radius, sigma) for p in true]
     found = extract(cloud, config.extraction, field.marker_radius)
+    bounds = [_bounds(cloud, p, field.marker_radius, case.sigma) for p in true]
     rows = []
-    for method in wish.methods:
+    for method in methods:
         fits = fit_markers(method, cloud, found, config.fitting, field.marker_radius)
         errors = marker_errors(fits, stop.truth, field.marks)
-        rows += _rows(sigma, fits, true, bounds, errors.marks.tolist())
+        rows += _rows(case, fits, true, bounds, errors.marks.tolist())
     return rows
 
 
-def _bound(cloud: StitchedCloud, p: Array, radius: float, sigma: float) -> tuple[float, int]:
-    """Return the least mean square error [m^2] by the very beams that hit, and their number."""
-    near = np.linalg.norm(cloud.p_base - p.astype(np.float32), axis=1) < _SEGMENT * radius
-    table = beams(cloud, np.flatnonzero(near))
-    is_hit = hits(table, p, radius, _TOLERANCE + 4.0 * sigma)
-    table = beams(cloud, np.flatnonzero(near)[is_hit])
-    return float(np.trace(cramer_rao(table, p, radius, sigma))), int(is_hit.sum())
+def _bounds(cloud: StitchedCloud, p: Array, radius: float, sigma: float) -> Bounds | None:
+    """Return the bounds by beams that hit; none where too few hit clearly to tell a centre."""
+    is_near = np.linalg.norm(cloud.p_base - p.astype(np.float32), axis=1) < _SEGMENT * radius
+    near, tolerance = np.flatnonzero(is_near), _TOLERANCE + 4.0 * sigma
+    shots = beams(cloud, near)
+    every, clear = (near[hits(shots, p, radius, tolerance, share)] for share in (0.0, _SHARE))
+    try:
+        least = (cramer_rao(beams(cloud, some), p, radius, sigma) for some in (every, clear))
+        of_every, of_clear = (float(np.trace(cov)) for cov in least)
+    except DegenerateGeometryError:
+        return None
+    return Bounds(of_every, of_clear, len(every))
 
 
 def _rows(
-    sigma: float,
-    fits: MarkerFits,
-    true: Array,
-    bounds: list[tuple[float, int]],
-    marks: list[int],
+    case: Case, fits: MarkerFits, true: Array, bounds: list[Bounds | None], marks: list[int]
 ) -> list[_Row]:
     """Return one row per fit of a true marker."""
     rows = []
     for fit, mark in zip(fits.fits, marks, strict=True):
-        if mark == UNMATCHED:
+        bound = bounds[mark]
+        if mark == UNMATCHED or bound is None:
             continue
-        p, (bound2, n_hits) = true[mark], bounds[mark]
-        error = fit.p_base - p
-        distance = float(np.linalg.norm(p))
+        p, error = true[mark], fit.p_base - true[mark]
+        away = float(np.linalg.norm(p))
         rows.append(
             _Row(
-                sigma=sigma,
-                distance=round(distance / _BIN) * _BIN,
+                case=case,
+                distance=min(_DISTANCES, key=lambda d: abs(d - away)),
                 method=fits.method,
                 error=float(np.linalg.norm(error)),
-                radial=float(error @ p) / distance,
+                radial=float(error @ p) / away,
                 nees=float(error @ np.linalg.solve(fit.cov_p_base, error)),
-                bound2=bound2,
-                n_hits=n_hits,
+                bounds=bound,
                 is_weak=bool(fit.reason),
             )
         )
@@ -140,18 +162,21 @@ def _rows(
 
 def _summary(rows: list[_Row]) -> Plain:
     """Return what the fits of one method at one distance are worth."""
-    first = rows[0]
-    errors, bound2 = np.array([r.error for r in rows]), np.array([r.bound2 for r in rows])
-    rms, bound = float(np.sqrt(np.mean(errors**2))), float(np.sqrt(bound2.mean()))
+    first, errors = rows[0], np.array([r.error for r in rows])
+    rms = float(np.sqrt(np.mean(errors**2)))
+    every2, clear2, n_hits = np.mean([r.bounds for r in rows], axis=0).tolist()
     return {
-        "sigma_m": first.sigma,
+        "sigma_m": first.case.sigma,
+        "turn_s": first.case.turn,
         "distance_m": first.distance,
         "method": first.method,
         "n": len(rows),
-        "mean_hits": float(np.mean([r.n_hits for r in rows])),
-        "bound_m": bound,
+        "mean_hits": n_hits,
+        "bound_m": every2**0.5,
+        "bound_clear_m": clear2**0.5,
         "rms_m": rms,
-        "bound_over_rms": bound / rms,
+        "bound_over_rms": every2**0.5 / rms,
+        "bound_clear_over_rms": clear2**0.5 / rms,
         "median_m": float(np.median(errors)),
         "p95_m": float(np.quantile(errors, 0.95)),
         "radial_bias_m": float(np.mean([r.radial for r in rows])),
@@ -164,7 +189,7 @@ def run(wish: Wish, progress: Progress) -> Plain:
     """Return the table with what it was made from."""
     return {
         "stops": wish.n_stops,
-        "turn_s": wish.turn,
+        "per_distance": _PER_DISTANCE,
         "seed": wish.seed,
         "rows": accuracy_table(wish, progress),
     }
@@ -173,23 +198,27 @@ def run(wish: Wish, progress: Progress) -> Plain:
 def print_report(out: Console, report: Plain) -> None:
     """Print the table: millimetres, and the share of the bound that is reached."""
     out.print(
-        f"{report['stops']} stops of 8 markers at each distance, turn {report['turn_s']:.1f} s. "
-        "The bound is Cramer and Rao's, of ranges alone, for the very beams that hit."
+        f"{report['stops']} stops of {report['per_distance']} markers at each distance. The bound "
+        "is Cramer and Rao's, of ranges alone, for the very beams that hit; clear: for those of "
+        "which a fiftieth or more hit, without the grazing ones whose derivative has no limit."
     )
-    table = Table("sigma", "distance [m]", "method", "n", "hits", "bound", "RMS", "bound/RMS")
-    for name in ("median", "p95", "radial", "NEES"):
+    table = Table("sigma", "turn [s]", "distance [m]", "method")
+    names = ("n", "hits", "bound", "RMS", "bound/RMS", "clear/RMS", "median", "p95", "radial")
+    for name in (*names, "NEES"):
         table.add_column(name, justify="right")
     for row in report["rows"]:
         lengths = (row[k] * 1e3 for k in ("median_m", "p95_m", "radial_bias_m"))
         table.add_row(
             f"{row['sigma_m'] * 1e3:.0f}",
-            f"{row['distance_m']:.1f}",
+            f"{row['turn_s']:.1f}",
+            f"{row['distance_m']:.0f}",
             row["method"],
             str(row["n"]),
             f"{row['mean_hits']:.0f}",
             f"{row['bound_m'] * 1e3:.2f}",
             f"{row['rms_m'] * 1e3:.2f}",
             f"{row['bound_over_rms']:.2f}",
+            f"{row['bound_clear_over_rms']:.2f}",
             *(f"{length:.1f}" for length in lengths),
             f"{row['mean_nees']:.1f}",
         )

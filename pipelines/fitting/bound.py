@@ -12,12 +12,11 @@ from pipelines.errors import DegenerateGeometryError
 from pipelines.fitting.footprint import predict
 from pipelines.values import Array, Beams, Mask
 
-_SHARE_MIN = 0.02  # of a footprint: a beam that touches with less is one that passes by
 _N_MIN = 3  # ranges, as many as unknowns
 _CONDITION_MAX = 1e12
 
 
-def hits(shots: Beams, p_true: Array, radius: float, tolerance: float) -> Mask:
+def hits(shots: Beams, p_true: Array, radius: float, tolerance: float, share: float = 0.0) -> Mask:
     """Tell which beams returned from a sphere.
 
     Parameters
@@ -30,18 +29,18 @@ def hits(shots: Beams, p_true: Array, radius: float, tolerance: float) -> Mask:
         Radius of the sphere [m].
     tolerance : float
         By how much a range may differ from the one predicted: some sigmas of the noise [m].
+    share : float
+        Share of the footprint that must meet the sphere, and more. Zero takes every beam that hit;
+        with 0.02 those are left out that touch with so little that their derivative has no limit.
 
     Returns
     -------
     (n,)
-        Whether a fiftieth of the footprint or more meets the sphere and the range is that of the
-        sphere. Beams that touch with less return by luck only, and their derivative has no limit.
+        Whether the footprint meets the sphere and the range is that of the sphere.
     """
     which = np.zeros(len(shots.ranges), dtype=np.intp)
     expected = predict(shots, p_true[None], np.array([radius]), which)
-    return np.asarray(
-        (expected.lit > _SHARE_MIN) & (np.abs(shots.ranges - expected.ranges) < tolerance)
-    )
+    return np.asarray((expected.lit > share) & (np.abs(shots.ranges - expected.ranges) < tolerance))
 
 
 def cramer_rao(shots: Beams, p_true: Array, radius: float, sigma: float) -> Array:
@@ -71,7 +70,7 @@ def cramer_rao(shots: Beams, p_true: Array, radius: float, sigma: float) -> Arra
     """
     n = len(shots.ranges)
     expected = predict(shots, p_true[None], np.array([radius]), np.zeros(n, dtype=np.intp))
-    J = expected.J[expected.lit > _SHARE_MIN, :3]
+    J = expected.J[expected.lit > 0.0, :3]
     information = J.T @ J / sigma**2
     if len(J) < _N_MIN or np.linalg.cond(information) > _CONDITION_MAX:
         raise DegenerateGeometryError(

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 
 from pipelines.fitting.footprint import predict, share_of_outline
+from pipelines.fitting.radius import other_radius, own_radius
 from pipelines.stitching import beams
 from pipelines.values import (
     RING_UNKNOWN,
@@ -25,6 +27,9 @@ N_GOOD = 20
 
 COVERAGE_GOOD = 0.6
 """Share of the outline below which a centre is called weak."""
+
+WITHOUT_RINGS = "rings unknown: laser heights and biases not applied"
+"""What is said of a fit to returns without rings."""
 
 _SEGMENT = 1.35  # radii about the rough centre within which a return may be the sphere
 
@@ -127,8 +132,9 @@ def described(
     Returns
     -------
     MarkerFit
-        Residuals along the beams against the footprint's range; weak when returns are few, of one
-        laser or on one side.
+        Residuals along the beams against the footprint's range, and the radius that the returns
+        show by themselves unless the method knows one; weak when returns are few, of one laser, on
+        one side or of another radius.
     """
     shots = beams(cloud, used)
     radius = float(known["radius"])
@@ -136,14 +142,20 @@ def described(
     found = predict(shots, p_base[None], np.array([radius]), which)
     rings = shots.rings[shots.rings != RING_UNKNOWN]
     n_rings = len(np.unique(rings))
-    coverage = share_of_outline(shots, found.offsets, radius)
-    reason = sentence(weaknesses(len(used), n_rings, coverage))
-    fields: dict[str, float | str] = {
-        "radius_free": np.nan,
-        "sigma_radius_free": np.nan,
+    coverage = share_of_outline(shots.directions_base, shots.across_base, found.offsets, radius)
+    residuals = shots.ranges - found.ranges
+    own = own_radius(beams(cloud, on_sphere(cloud, candidate, radius)), radius)
+    variants = (known.get("variant"), "" if n_rings else WITHOUT_RINGS)
+    fields: dict[str, Any] = {
+        "radius_free": own[0],
+        "sigma_radius_free": own[1],
         "sigma0": 1.0,
         **known,
+        "variant": "; ".join(str(said) for said in variants if said),
     }
+    reasons = weaknesses(len(used), n_rings, coverage)
+    reasons += other_radius(radius, fields["radius_free"], fields["sigma_radius_free"])
+    reason = sentence(reasons)
     return MarkerFit(
         p_base=np.array(p_base),
         cov_p_base=np.array(cov_p_base),
@@ -152,13 +164,33 @@ def described(
         mean_range=float(np.linalg.norm(shots.origins_base.mean(axis=0) - p_base)),
         mean_intensity=float(shots.intensities.mean()),
         used=used,
-        rejected=np.setdiff1d(candidate.members, used),
-        residuals=shots.ranges - found.ranges,
+        rejected=left_out(candidate.members, used),
+        residuals=residuals,
         n_rings=n_rings,
         coverage=coverage,
         incidence=incidence(found.offsets, radius),
-        **fields,  # type: ignore[arg-type]
+        **fields,
     )
+
+
+def left_out(members: Index, used: Index) -> Index:
+    """Return the rows of a candidate that do not carry its centre.
+
+    Parameters
+    ----------
+    members : (n,)
+        Rows of the candidate, ascending.
+    used : (m,)
+        Those that carry the centre.
+
+    Returns
+    -------
+    (n - m,)
+        The others, ascending.
+    """
+    is_left = np.ones(len(members), dtype=bool)
+    is_left[np.searchsorted(members, used)] = False
+    return np.asarray(members[is_left])
 
 
 def incidence(offsets: Array, radius: float) -> float:

@@ -7,9 +7,12 @@ clock: ring, time and azimuth of the returns about a marker tell every shot betw
 from __future__ import annotations
 
 from dataclasses import replace
+from itertools import pairwise
 from typing import NamedTuple
 
+import numba
 import numpy as np
+from numpy.typing import NDArray
 
 from pipelines.config import FittingConfig
 from pipelines.fitting import along_beam
@@ -21,13 +24,17 @@ from pipelines.stitching import beams
 from pipelines.values import (
     RING_UNKNOWN,
     Array,
+    Column,
     Index,
     MarkerCandidates,
     MarkerFit,
     Mask,
+    Rings,
     Status,
     StitchedCloud,
 )
+
+Rows = NDArray[np.int32]
 
 NAME = "silhouette"
 RANGES_ONLY = "ranges only: "
@@ -35,6 +42,7 @@ RANGES_ONLY = "ranges only: "
 _DELAYS = np.argsort(FIRING_ORDER) * LASER_CYCLE  # [s] of each laser within its firing
 _PHASE_MAX = 3e-6  # [s] scatter of the firing clock: one laser's share of a firing
 _N_TIMED = 20_000  # returns that tell the clock and the spin
+_THINNED = 8  # one in so many of them tells the mean rate of the spin
 _SPIN_MAX = np.radians(0.2)  # scatter of azimuths about a steady spin
 _REACH = 1.5  # radii: shots that pass a centre closer are asked
 _DEPTH = 2.0  # radii before and behind the centre within which a return is the sphere's own
@@ -43,6 +51,7 @@ _LUCK = 0.01  # share of shots that hit and are lost, or pass by and answer
 _EDGES = np.linspace(-1.2, 0.2, 15)  # half widths inside the outline where half answer
 _SOFTNESSES = (0.03, 0.06, 0.12, 0.24)  # half widths over which the answer turns to yes
 _EDGE, _SIGMA_EDGE = -0.6, 0.4  # prior of the edge
+_N_PRODUCT = 100  # chances that are multiplied before the logarithm is taken
 _N_PLACES = 24  # where a centre may be, when the link is sought
 _REACH_SIGMAS, _REACH_WIDTHS = 4.0, 2.0  # of a centre, of a footprint: shots within are in doubt
 _DRIFT = 0.05  # [s] over which the spin is steady
@@ -53,9 +62,8 @@ _MARGIN = np.radians(1.0)  # what the LiDAR's place off the axis does to directi
 _THIN = 1e-6  # [m]
 _WIDER = 1.5  # of the variance: samples beyond the first round are drawn so much wider
 _FLOOR = 0.01  # of the prior covariance: keeps a sample's covariance invertible
-_SCALE, _SCALE_FEW, _FEW = 0.75, 0.35, 25.0  # of the covariance by returns, by Monte Carlo
-_N_SAMPLES = 400
-_N_ROUNDS = 3
+_SCALE, _SCALE_FEW, _FEW = 0.84, 0.39, 25.0  # of the covariance by returns, by Monte Carlo
+_SAMPLES = (128, 128, 320)  # in rounds
 
 
 class _Pattern(NamedTuple):
@@ -82,23 +90,19 @@ class _Firings(NamedTuple):
 
     Attributes
     ----------
-    times, azimuths, angles : (m,)
-        Instant of the first laser [s], azimuth then, gimbal angle then [rad].
+    azimuths, angles : (m,)
+        Azimuth of the first laser and gimbal angle at its instant [rad].
     spin, turn : float
         Rates of the two [rad/s].
-    v_base : (m, 3)
-        Direction of a laser without elevation.
     row_of : (m, 16)
         Row of the cloud that each shot returned as; -1 where it did not.
     """
 
-    times: Array
     azimuths: Array
     angles: Array
     spin: float
     turn: float
-    v_base: Array
-    row_of: Index
+    row_of: Rows
 
 
 class _Passing(NamedTuple):
@@ -160,7 +164,8 @@ def fit(
     if pattern is None:
         return tuple(_without_outline(fit, why_not) for fit in fits), rejected
     firings = _firings(cloud, pattern)
-    passing = [_doubtful(_passing(cloud, firings, fit), fit) for fit in fits]
+    near = _passing(cloud, firings, fits)
+    passing = [_doubtful(shots, fit) for fit, shots in zip(fits, near, strict=True)]
     link = _link(fits, passing)
     updated = tuple(
         _updated(cloud, fit, shots, link) for fit, shots in zip(fits, passing, strict=True)
@@ -229,34 +234,111 @@ def _steady(times: Array, azimuths: Array) -> tuple[float, Array]:
     turns = np.exp(1j * azimuths)
     for width in _SEARCHES:
         trial = spin * (1.0 + width * np.linspace(-2.0, 2.0, 81))
-        power = [abs(np.mean(turns * np.exp(-1j * rate * times))) for rate in trial]
-        spin = float(trial[int(np.argmax(power))])
+        spin = float(trial[_steadiest(times[::_THINNED], azimuths[::_THINNED], trial)])
     mean = float(np.angle(np.mean(turns * np.exp(-1j * spin * times))))
     return spin, mean + np.angle(turns * np.exp(-1j * (spin * times + mean)))
 
 
 def _firings(cloud: StitchedCloud, pattern: _Pattern) -> _Firings:
     """Return every firing between the first return and the last."""
-    delays = _DELAYS[cloud.rings]
-    numbers = np.rint((cloud.times - delays - pattern.phase) / FIRING_CYCLE).astype(np.intp)
-    first = int(numbers.min())
-    numbered = np.arange(first, int(numbers.max()) + 1, dtype=np.float64)
+    first, row_of = _numbered(cloud.times, cloud.rings, pattern.phase, _DELAYS)
+    numbered = np.arange(first, first + len(row_of), dtype=np.float64)
     times: Array = pattern.phase + FIRING_CYCLE * numbered
-    row_of = np.full((len(times), N_LASERS), -1, dtype=np.intp)
-    row_of[numbers - first, cloud.rings] = np.arange(len(numbers))
-    stamps, places = np.unique(cloud.times[:: max(len(numbers) // _N_TIMED, 1)], return_index=True)
-    angles = np.unwrap(cloud.gimbal_angles[:: max(len(numbers) // _N_TIMED, 1)][places])
+    thin = slice(None, None, max(len(cloud.times) // _N_TIMED, 1))
+    stamps, places = np.unique(cloud.times[thin], return_index=True)
+    angles = np.unwrap(cloud.gimbal_angles[thin][places])
     gimbal = np.interp(times, stamps, angles.astype(np.float64))
     azimuths = pattern.spin * times + np.interp(times, pattern.times, pattern.azimuths)
     return _Firings(
-        times=times,
         azimuths=azimuths,
         angles=gimbal,
         spin=pattern.spin,
-        turn=float(np.median(np.gradient(gimbal, FIRING_CYCLE))),
-        v_base=_directions(cloud, azimuths, gimbal, np.zeros(len(times))),
+        turn=float(np.median(np.diff(gimbal))) / FIRING_CYCLE,
         row_of=row_of,
     )
+
+
+@numba.njit(cache=True, nogil=True)
+def _numbered(times: Column, rings: Rings, phase: float, delays: Array) -> tuple[int, Rows]:
+    """Return the number of the first firing, and the row of each shot from there on."""
+    low, high = 1 << 60, -(1 << 60)
+    for i in range(len(times)):
+        number = int(np.rint((times[i] - delays[rings[i]] - phase) / FIRING_CYCLE))
+        low, high = min(low, number), max(high, number)
+    row_of = np.full((high - low + 1, N_LASERS), -1, np.int32)
+    for i in range(len(times)):
+        number = int(np.rint((times[i] - delays[rings[i]] - phase) / FIRING_CYCLE))
+        row_of[number - low, rings[i]] = i
+    return low, row_of
+
+
+def _passing(
+    cloud: StitchedCloud, firings: _Firings, fits: tuple[MarkerFit, ...]
+) -> list[_Passing]:
+    """Return the shots that pass each sphere closely, save those its pole may have answered."""
+    rig, centres = cloud.rig, np.array([fit.p_base for fit in fits])
+    sights = centres / np.linalg.norm(centres, axis=1)[:, None]
+    reaches = _REACH * np.array([fit.radius / fit.mean_range for fit in fits]) + _MARGIN
+    which, m, ring = _aimed(
+        np.column_stack([sights, np.sin(reaches), np.cos(reaches)]),
+        (firings.azimuths, firings.angles),
+        rig.T_head_lidar[:3, :3].copy(),
+        np.stack([rig.laser_elevations, _DELAYS]),
+    )
+    angles = firings.angles[m] + firings.turn * _DELAYS[ring]
+    azimuths = firings.azimuths[m] + firings.spin * _DELAYS[ring]
+    u = _directions(cloud, azimuths, angles, rig.laser_elevations[ring])
+    spin_axis = rig.T_head_lidar[:3, 2]
+    origins = _turned(rig.T_head_lidar[:3, 3] + rig.laser_heights[ring, None] * spin_axis, angles)
+    across = np.cross(_turned(np.tile(spin_axis, (len(m), 1)), angles), u)
+    across /= np.linalg.norm(across, axis=1, keepdims=True)
+    rows = firings.row_of[m, ring]
+    seen = np.where(rows < 0, np.inf, np.linalg.norm(cloud.p_base[rows] - origins, axis=1))
+    up, edges = levelling_rotation(cloud.levelling)[2], np.searchsorted(which, range(len(fits) + 1))
+    return [
+        _past(fit, (origins[a:b], u[a:b], across[a:b], seen[a:b]), rig.divergence, up)
+        for fit, (a, b) in zip(fits, pairwise(edges), strict=True)
+    ]
+
+
+@numba.njit(cache=True, nogil=True)
+def _aimed(
+    sights: Array,
+    turns: tuple[Array, Array],
+    R: Array,
+    lasers: Array,
+) -> tuple[Index, Index, Index]:
+    """Return marker, firing and laser of the shots that aim near a sphere, marker by marker.
+
+    ``sights`` has the directions and the sine and cosine of how near, ``R`` is that of the LiDAR
+    in the head, ``lasers`` has elevations and delays.
+    """
+    n = len(turns[0])
+    sines, cosines = np.sin(lasers[0]), np.cos(lasers[0])
+    found = [(0, 0, 0) for _ in range(0)]
+    for m in range(n):
+        c, s = np.cos(turns[1][m]), np.sin(turns[1][m])
+        # a firing lasts so short that head and spin stand still, within the margin of the reach
+        x, y = np.cos(turns[0][m]), -np.sin(turns[0][m])
+        for k in range(len(sights)):
+            hx, hy = c * sights[k, 0] + s * sights[k, 1], c * sights[k, 1] - s * sights[k, 0]
+            hz = sights[k, 2]
+            height = hx * R[0, 2] + hy * R[1, 2] + hz * R[2, 2]
+            ahead = x * (hx * R[0, 0] + hy * R[1, 0] + hz * R[2, 0])
+            ahead += y * (hx * R[0, 1] + hy * R[1, 1] + hz * R[2, 1])
+            if ahead < 0.5:
+                continue
+            for ring in range(len(sines)):
+                if (
+                    abs(height - sines[ring]) < sights[k, 3]
+                    and ahead * cosines[ring] + height * sines[ring] > sights[k, 4]
+                ):
+                    found.append((k, m, ring))
+    table = np.empty((3, len(found)), np.intp)
+    for i in range(len(found)):
+        table[0, i], table[1, i], table[2, i] = found[i]
+    order = np.argsort(table[0], kind="mergesort")
+    return table[0][order], table[1][order], table[2][order]
 
 
 def _directions(cloud: StitchedCloud, azimuths: Array, angles: Array, elevations: Array) -> Array:
@@ -278,32 +360,21 @@ def _turned(v_head: Array, angles: Array) -> Array:
     return np.column_stack([c * x - s * y, s * x + c * y, z])
 
 
-def _passing(cloud: StitchedCloud, firings: _Firings, fit: MarkerFit) -> _Passing:
-    """Return the shots that pass one sphere closely, save those that its pole may have answered."""
-    rig, p, radius = cloud.rig, fit.p_base, fit.radius
-    sight = p / np.linalg.norm(p)
-    reach = float(np.abs(rig.laser_elevations).max()) + _REACH * radius / fit.mean_range + _MARGIN
-    near = np.flatnonzero(firings.v_base @ sight > np.cos(reach))
-    m, ring = np.repeat(near, N_LASERS), np.tile(np.arange(N_LASERS), len(near))
-    angles = firings.angles[m] + firings.turn * _DELAYS[ring]
-    azimuths = firings.azimuths[m] + firings.spin * _DELAYS[ring]
-    u = _directions(cloud, azimuths, angles, rig.laser_elevations[ring])
-    spin_axis = rig.T_head_lidar[:3, 2]
-    origins = _turned(rig.T_head_lidar[:3, 3] + rig.laser_heights[ring, None] * spin_axis, angles)
+def _past(
+    fit: MarkerFit, shots: tuple[Array, Array, Array, Array], divergence: Array, up: Array
+) -> _Passing:
+    """Return of the shots aimed near one sphere those that its outline may tell of."""
+    origins, u, across, seen = shots
+    p, radius = fit.p_base, fit.radius
     along = np.einsum("ij,ij->i", p - origins, u)
     passed = origins + along[:, None] * u - p
-    keep = (along > 0.0) & (np.einsum("ij,ij->i", passed, passed) < (_REACH * radius) ** 2)
-    rows = firings.row_of[m[keep], ring[keep]]
-    seen = np.where(rows < 0, np.inf, np.linalg.norm(cloud.p_base[rows] - origins[keep], axis=1))
-    depth = (seen - along[keep]) / radius
-    axes = _plane(sight, levelling_rotation(cloud.levelling)[2])
-    places = passed[keep] @ axes.T
-    across = np.cross(_turned(np.tile(spin_axis, (int(keep.sum()), 1)), angles[keep]), u[keep])
-    across /= np.linalg.norm(across, axis=1, keepdims=True)
-    both = np.stack([across, np.cross(u[keep], across)], axis=1) @ axes.T
-    half_widths = 0.5 * along[keep, None, None] * rig.divergence[:, None] * both
+    axes = _plane(p / np.linalg.norm(p), up)
+    places, depth = passed @ axes.T, (seen - along) / radius
+    both = np.stack([across, np.cross(u, across)], axis=1) @ axes.T
+    half_widths = 0.5 * along[:, None, None] * divergence[:, None] * both
     is_pole = (places[:, 1] < -_POLE_FROM * radius) & (np.abs(places[:, 0]) < _POLE * radius)
-    asked = (depth > -_DEPTH) & ~is_pole
+    is_near = (along > 0.0) & (np.einsum("ij,ij->i", passed, passed) < (_REACH * radius) ** 2)
+    asked = is_near & (depth > -_DEPTH) & ~is_pole
     return _Passing(places[asked], half_widths[asked], (depth < _DEPTH)[asked], axes)
 
 
@@ -314,20 +385,61 @@ def _plane(sight: Array, up: Array) -> Array:
     return np.stack([side, np.cross(side, sight)])
 
 
-def _logarithms(shots: _Passing, radius: float, shifts: Array, links: Array) -> Array:
-    """Return the log-likelihood of what hit and what did not, for some centres and links, (k,).
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _steadiest(times: Array, azimuths: Array, rates: Array) -> int:
+    """Return which rate leaves the azimuths least spread about a mean."""
+    best, most = 0, -1.0
+    for k in range(len(rates)):
+        x, y = 0.0, 0.0
+        for i in range(len(times)):
+            angle = azimuths[i] - rates[k] * times[i]
+            x += np.cos(angle)
+            y += np.sin(angle)
+        if x * x + y * y > most:
+            best, most = k, x * x + y * y
+    return best
 
-    ``shifts`` are the centres in the plane, (k, 2); ``links`` has where half of the shots answer
-    and over what distance that changes, (k, 2), in half widths of the footprint.
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _entered(places: Array, half_widths: Array, radius: float, shifts: Array) -> Array:
+    """Return how far footprints are inside the outline, in their half widths, (k, n).
+
+    ``shifts`` are the centres in the plane, (k, 2).
     """
-    offsets = shots.places - shifts[:, None, :]
-    away = np.linalg.norm(offsets, axis=-1)
-    outward = offsets / np.maximum(away, 1e-9)[..., None]
-    widths = np.linalg.norm(np.einsum("nij,knj->kni", shots.half_widths, outward), axis=-1)
-    entered = (radius - away) / np.maximum(widths, _THIN)
-    x = np.clip((entered - links[:, :1]) / links[:, 1:], -40.0, 40.0)
-    chance = _LUCK + (1.0 - 2.0 * _LUCK) / (1.0 + np.exp(-x))
-    return np.asarray(np.log(np.where(shots.has_hit, chance, 1.0 - chance)).sum(axis=1))
+    entered = np.empty((len(shifts), len(places)))
+    for k in range(len(shifts)):
+        for i in range(len(places)):
+            x, y = places[i, 0] - shifts[k, 0], places[i, 1] - shifts[k, 1]
+            away = np.hypot(x, y)
+            first = half_widths[i, 0, 0] * x + half_widths[i, 0, 1] * y
+            second = half_widths[i, 1, 0] * x + half_widths[i, 1, 1] * y
+            width = np.hypot(first, second) / max(away, 1e-9)
+            entered[k, i] = (radius - away) / max(width, _THIN)
+    return entered
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _logarithms(entered: Array, has_hit: Mask, edges: Array, softness: float) -> Array:
+    """Return the log-likelihood of what hit and what did not, (k, e), for edges and a softness.
+
+    ``edges`` are where half of the shots answer, (e,), and ``softness`` over what distance that
+    changes, in half widths of the footprint.
+    """
+    k, n = entered.shape
+    shift = np.exp(edges / softness)
+    total, product = np.zeros((k, len(edges))), np.ones(len(edges))
+    for s in range(k):
+        product[:] = 1.0
+        for i in range(n):
+            odds = np.exp(min(-entered[s, i] / softness, 300.0))  # against a hit, at edge zero
+            for e in range(len(edges)):
+                chance = _LUCK + (1.0 - 2.0 * _LUCK) / (1.0 + odds * shift[e])
+                product[e] *= chance if has_hit[i] else 1.0 - chance
+            if i % _N_PRODUCT == _N_PRODUCT - 1 or i == n - 1:  # a hundredth to this is above zero
+                for e in range(len(edges)):
+                    total[s, e] += np.log(product[e])
+                    product[e] = 1.0
+    return total
 
 
 def _doubtful(shots: _Passing, fit: MarkerFit) -> _Passing:
@@ -343,21 +455,23 @@ def _doubtful(shots: _Passing, fit: MarkerFit) -> _Passing:
     )
 
 
-def _link(fits: tuple[MarkerFit, ...], passing: list[_Passing]) -> Array:
-    """Return where on its way in half of the shots answer, and how softly, (2,).
+def _link(fits: tuple[MarkerFit, ...], passing: list[_Passing]) -> tuple[float, float]:
+    """Return where on its way in half of the shots answer, and how softly [half widths].
 
     Each marker's centre is only known so well, so that its likelihood is the mean over places where
     it may be.
     """
-    links = np.array([[edge, soft] for edge in _EDGES for soft in _SOFTNESSES])
-    total = -0.5 * ((links[:, 0] - _EDGE) / _SIGMA_EDGE) ** 2
+    prior = -0.5 * ((_EDGES - _EDGE) / _SIGMA_EDGE) ** 2
+    total = np.tile(prior, (len(_SOFTNESSES), 1))
     z = _normal(_N_PLACES)
     for fit, shots in zip(fits, passing, strict=True):
         shifts = z @ np.linalg.cholesky(fit.cov_p_base).T @ shots.axes.T
-        for i, link in enumerate(links):
-            logs = _logarithms(shots, fit.radius, shifts, np.tile(link, (len(z), 1)))
-            total[i] += logs.max() + np.log(np.mean(np.exp(logs - logs.max())))
-    return np.asarray(links[int(np.argmax(total))])
+        entered = _entered(shots.places, shots.half_widths, fit.radius, shifts)
+        for i, softness in enumerate(_SOFTNESSES):
+            logs = _logarithms(entered, shots.has_hit, _EDGES, softness)
+            total[i] += logs.max(axis=0) + np.log(np.mean(np.exp(logs - logs.max(axis=0)), axis=0))
+    softest, edge = np.unravel_index(int(np.argmax(total)), total.shape)
+    return float(_EDGES[edge]), _SOFTNESSES[int(softest)]
 
 
 def _normal(n: int) -> Array:
@@ -366,15 +480,17 @@ def _normal(n: int) -> Array:
     return np.concatenate([half, -half])
 
 
-def _updated(cloud: StitchedCloud, fit: MarkerFit, shots: _Passing, link: Array) -> MarkerFit:
+def _updated(
+    cloud: StitchedCloud, fit: MarkerFit, shots: _Passing, link: tuple[float, float]
+) -> MarkerFit:
     """Return the fit with what its outline says."""
-    z = _normal(_N_SAMPLES)
     precision = np.linalg.inv(fit.cov_p_base)
     mean, cov, wide = np.zeros(3), fit.cov_p_base, 1.0
-    links = np.tile(link, (len(z), 1))
-    for _ in range(_N_ROUNDS):
+    for n in _SAMPLES:
+        z = _normal(n)
         d = mean + z @ np.linalg.cholesky(wide * cov).T
-        logs = _logarithms(shots, fit.radius, d @ shots.axes.T, links)
+        entered = _entered(shots.places, shots.half_widths, fit.radius, d @ shots.axes.T)
+        logs = _logarithms(entered, shots.has_hit, np.array(link[:1]), link[1])[:, 0]
         logs += 0.5 * np.sum(z**2, axis=1) - 0.5 * np.einsum("ij,jk,ik->i", d, precision, d)
         weights = np.exp(logs - logs.max())
         weights /= weights.sum()
