@@ -16,8 +16,9 @@ from storage.elevation_files import read_geotiff
 def too_early(site):
     """Return the job that was asked for before any log of the survey was processed."""
     site.survey("quarry")
-    site.upload(survey="quarry")
-    answer = site.client.post("/api/v1/jobs", json={"kind": "site", "survey": "quarry"})
+    recording = site.upload().json()["recording_id"]
+    wanted = {"kind": "site", "survey": "quarry", "recordings": [recording]}
+    answer = site.client.post("/api/v1/jobs", json=wanted)
     return site.ended(answer.json()["job_id"])
 
 
