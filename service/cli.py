@@ -314,7 +314,10 @@ def bench(
     coverage: Annotated[
         int, typer.Option(min=0, help="Do error ellipses hold? So many surveys instead.")
     ] = 0,
-    stops: Annotated[int, typer.Option(min=1, help="Stops of 88 markers for that.")] = 6,
+    stops: Annotated[int, typer.Option(min=1, help="Stops of 120 markers for --accuracy.")] = 3,
+    full: Annotated[
+        bool, typer.Option("--full", help="Over 1000 fits at each distance for --accuracy.")
+    ] = False,
     seed: Annotated[int, typer.Option(min=0, help="Seed of the first of them.")] = 0,
     as_json: AsJson = False,
 ) -> None:
@@ -326,7 +329,7 @@ def bench(
         _bench_coverage(coverage, seed, as_json=as_json)
         return
     if accuracy:
-        _bench_accuracy(stops, seed, as_json=as_json)
+        _bench_accuracy(stops, seed, is_full=full, as_json=as_json)
         return
     from service import bench as benches
     from service import tables
@@ -366,12 +369,13 @@ def _bench_extraction(worlds: int, seed: int, *, as_json: bool) -> None:
         detection.print_report(out, report)
 
 
-def _bench_accuracy(stops: int, seed: int, *, as_json: bool) -> None:
+def _bench_accuracy(stops: int, seed: int, *, is_full: bool, as_json: bool) -> None:
     """Measure the precision of centres against distance, by every method."""
     from service import precision
 
     with _progress() as progress:
-        report = precision.run(precision.Wish(n_stops=stops, seed=seed), progress)
+        few = precision.Wish(n_stops=stops, seed=seed)
+        report = precision.run(precision.full_wish(seed) if is_full else few, progress)
     if as_json:
         _print_json(report)
     else:
