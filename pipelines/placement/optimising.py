@@ -213,6 +213,7 @@ def optimise(  # noqa: PLR0913  all that a plan is made of
     least = 3 if wish.method == "paper" or goal.is_robust else 2
     if goal.most < least:
         raise ConfigError(f"At most {goal.most} marks; {least} are needed for what is asked.")
+    _refuse_impossible(task, stops)
     tried = []
     for k in range(least, goal.most + 1):
         found = _best(task, k, goal, rng)
@@ -553,6 +554,21 @@ def _optimum(  # noqa: PLR0913  all that an answer is made of
         n_candidates=len(candidates.p_site),
         n_exchanges=n_exchanges,
     )
+
+
+def _refuse_impossible(task: _Task, stops: Stops) -> None:
+    """Raise if not even all marks at once would bring the 3-D sigma below the tolerance."""
+    if task.wish.method == "paper":
+        return
+    sigmas = _sigmas(task, np.flatnonzero(task.sighting.is_seen.any(axis=0)))
+    worst = int(np.argmax(sigmas))
+    if sigmas[worst] > task.wish.tolerance:
+        best = f"{1e3 * sigmas[worst]:.2g} mm (3-D sigma)" if sigmas[worst] < _LOST else "nothing"
+        raise DegenerateGeometryError(
+            f"No arrangement keeps {1e3 * task.wish.tolerance:g} mm: even a mark at each of "
+            f"{task.near.shape[0]} places at once would leave {best} at {stops.names[worst]}. Ask "
+            "for a larger tolerance, or allow more places."
+        )
 
 
 def _impossible(task: _Task, stops: Stops, best: Optimum, goal: Goal) -> str:

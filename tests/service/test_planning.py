@@ -1,0 +1,177 @@
+"""``spheremark plan`` from the outside, and the files that go into it."""
+
+import json
+
+import numpy as np
+import pytest
+import rasterio
+from rasterio.transform import Affine
+from typer.testing import CliRunner
+
+from pipelines.errors import DegenerateGeometryError, InputError
+from pipelines.placement import Trial, errors_by_angle, sensor_model, try_at_random
+from pipelines.placement.sensor import Sensor
+from pipelines.study import TABLE_3
+from service.cli import app
+from storage.plan_files import read_keep_out, read_marks, read_stops
+from storage.terrain_files import read_terrain
+
+
+def plan(*words):
+    result = CliRunner().invoke(app, ["plan", *map(str, words)], catch_exceptions=False)
+    assert result.exit_code == 0, result.output
+    return json.loads(result.stdout)
+
+
+def write_plain(path, slope=0.0, n=300):
+    """Write an elevation model of 0.2 m cells about the origin."""
+    x = (np.arange(n) - n / 2 + 0.5) * 0.2
+    heights = np.tile(slope * x, (n, 1)).astype(np.float32)
+    with rasterio.open(
+        path, "w", driver="GTiff", width=n, height=n, count=1, dtype="float32",
+        transform=Affine(0.2, 0, -n * 0.1, 0, -0.2, n * 0.1), nodata=-9999.0,
+    ) as file:  # fmt: skip
+        file.write(heights, 1)
+    return path
+
+
+@pytest.fixture
+def small(tmp_path):
+    terrain = write_plain(tmp_path / "plain.tif")
+    stops = tmp_path / "stops.csv"
+    stops.write_text("name,x_m,y_m\nA,0,0\nB,3,1\n")
+    return ("--terrain", terrain, "--stops", stops)
+
+
+def test_what_optimise_answers_evaluate_answers_again(small, tmp_path):
+    csv, geojson = tmp_path / "plan.csv", tmp_path / "plan.geojson"
+    options = (*small, "--spacing-m", 2.0, "--json")
+    best = plan("optimise", "--marks", 4, "--csv", csv, "--geojson", geojson, *options)
+    assert [stop["name"] for stop in best["stops"]] == ["A", "B"]
+    assert len(best["marks"]) == 4
+    file = tmp_path / "best.json"
+    file.write_text(json.dumps(best))
+    for marks in (file, csv):
+        again = plan("evaluate", "--marks", marks, *small, "--json")
+        assert again["stops"] == best["stops"]
+    drawn = json.loads(geojson.read_text())
+    assert len(drawn["features"]) == 6
+    assert best["stops"][0]["probability_within_tolerance"] > 0.999
+
+
+def test_the_least_number_of_marks_is_found_and_one_more_is_named(small, tmp_path):
+    best = plan("optimise", *small, "--spacing-m", 2.0, "--json")
+    assert 3 <= len(best["marks"]) <= 5
+    assert best["optimum"]["keeps_tolerance"]
+    file = tmp_path / "best.json"
+    file.write_text(json.dumps(best))
+    more = plan("evaluate", "--marks", file, *small, "--suggest", "--json")["one_more"]
+    assert more["worst_sigma_3d_m"] < more["worst_sigma_3d_before_m"]
+
+
+def test_a_plan_refuses_what_cannot_be(small, tmp_path):
+    marks = tmp_path / "marks.csv"
+    marks.write_text("mark,x_m,y_m,z_m\nM1,4,0,-0.5\nM2,0,4,1\nM3,-4,0,1\n")
+    with pytest.raises(InputError, match="M1 is under the ground"):
+        plan("evaluate", "--marks", marks, *small)
+    with pytest.raises(DegenerateGeometryError, match="Ask for a larger tolerance"):
+        plan("optimise", *small, "--spacing-m", 3.0, "--tolerance-m", 0.00002)
+    marks.write_text("mark,x_m,y_m,z_m\n" + "".join(f"M{i},{i},0,1\n" for i in range(10_000)))
+    with pytest.raises(InputError, match="10,000 marks"):
+        plan("evaluate", "--marks", marks, *small)
+    stops = tmp_path / "off.csv"
+    stops.write_text("name,x_m,y_m\nfar,400,0\n")
+    with pytest.raises(InputError, match=r"far at 400\.00, 0\.00 m is off the terrain"):
+        plan("optimise", "--marks", 3, small[0], small[1], "--stops", stops)
+
+
+def test_terrains_are_read_with_the_right_way_up(tmp_path):
+    site = read_terrain(write_plain(tmp_path / "slope.tif", slope=0.1))
+    assert float(site.ground_at(np.array([10.0, -5.0]))) == pytest.approx(1.0, abs=1e-3)
+    grid = tmp_path / "grid.asc"
+    rows = "\n".join(" ".join(str(10 * j + i) for i in range(4)) for j in range(3, -1, -1))
+    grid.write_text(f"ncols 4\nnrows 4\nxllcorner 100\nyllcorner 200\ncellsize 1\n{rows}\n")
+    site = read_terrain(grid)
+    assert float(site.ground_at(np.array([102.5, 201.5]))) == pytest.approx(12.0)
+
+
+def test_a_cloud_becomes_ground_and_what_hides(tmp_path):
+    import laspy
+
+    rng = np.random.default_rng(1)
+    p = np.column_stack([rng.uniform(-4, 4, (60_000, 2)), rng.normal(0.0, 0.005, 60_000)])
+    wall = (np.abs(p[:, 0] - 1.0) < 0.1) & (np.abs(p[:, 1]) < 1.0)
+    p[wall, 2] = rng.uniform(0.0, 2.0, wall.sum())
+    cloud = laspy.LasData(laspy.LasHeader(point_format=3, version="1.4"))
+    cloud.header.scales, cloud.header.offsets = [0.001] * 3, [0.0] * 3
+    cloud.x, cloud.y, cloud.z = p.T
+    cloud.write(tmp_path / "scan.laz")
+    site = read_terrain(tmp_path / "scan.laz")
+    assert abs(float(site.ground_at(np.array([-2.0, 0.5])))) < 0.03
+    middle = np.argmin(np.abs(site.ys)), np.argmin(np.abs(site.xs - 1.0))
+    assert site.surface[middle] > 1.5
+    assert site.ground[middle] < 0.3
+
+
+def test_what_is_no_terrain_is_refused(tmp_path):
+    wrong = tmp_path / "wrong.tif"
+    wrong.write_text("no raster")
+    with pytest.raises(InputError, match="no elevation model"):
+        read_terrain(wrong)
+    with pytest.raises(InputError, match="is expected"):
+        read_terrain(write_plain(tmp_path / "plain.tif").rename(tmp_path / "plain.txt"))
+    with pytest.raises(InputError, match="are the most"):
+        read_terrain(huge_raster(tmp_path / "huge.tif"))
+
+
+def huge_raster(path):
+    """Write a raster of 10^9 cells that holds nothing."""
+    with rasterio.open(
+        path, "w", driver="GTiff", width=50_000, height=20_000, count=1, dtype="uint8",
+        transform=Affine(0.1, 0, 0, 0, -0.1, 0), tiled=True, sparse_ok=True,
+    ):  # fmt: skip
+        return path
+
+
+def test_files_of_a_plan_say_what_is_wrong(tmp_path):
+    file = tmp_path / "file"
+    file.write_text("name,x_m\nA,1\n")
+    with pytest.raises(InputError, match="name,x_m,y_m"):
+        read_stops(file)
+    file.write_text('{"marks": [{"name": "A"}]}')
+    with pytest.raises(InputError, match="position_m"):
+        read_marks(file)
+    file.write_text('{"type": "Point", "coordinates": [0, 0]}')
+    with pytest.raises(InputError, match="no polygon"):
+        read_keep_out(file)
+    square = {"type": "Polygon", "coordinates": [[[0, 0], [1, 0], [1, 1], [0, 1], [0, 0]]]}
+    file.write_text(json.dumps(square))
+    assert len(read_keep_out(file)[0]) == 5
+
+
+def test_three_circles_give_the_study_s_table():
+    errors = errors_by_angle(TABLE_3.included_angles, 0.017, 7.5)
+    assert np.sqrt(np.mean((errors - TABLE_3.errors) ** 2)) < 0.002
+
+
+def test_the_study_s_window_parts_what_passes_from_what_does_not():
+    window = (np.radians(30.0), np.radians(150.0))
+    result = try_at_random(Trial(n_arrangements=30_000, n_marks=(3, 3), angles=window))
+    inside = result.passes[result.is_in_window].mean()
+    outside = result.passes[~result.is_in_window].mean()
+    assert inside > 0.83 > 0.75 > outside
+    again = try_at_random(Trial(n_arrangements=30_000, n_marks=(3, 3), angles=window))
+    np.testing.assert_array_equal(result.errors_3d, again.errors_3d)
+
+
+def test_centres_as_good_as_ours_pass_whatever_the_angles():
+    result = try_at_random(Trial(n_arrangements=5_000, error=None), sensor_model(Sensor()))
+    assert result.passes.mean() > 0.999
+
+
+def test_trials_come_as_tables_and_figures(tmp_path):
+    answer = plan("random", "--arrangements", 3000, "--out", tmp_path, "--json")
+    assert {row["n_marks"] for row in answer["by_number_of_marks"]} == set(range(3, 15))
+    assert answer["window_that_keeps_tolerance_deg"] == pytest.approx([47.5, 142.5], abs=15)
+    names = {path.name for path in tmp_path.iterdir()}
+    assert {"index.html", "table3.csv", "by_worst_angle.csv"} <= names
