@@ -61,17 +61,23 @@ class Inputs:
 def answer_log(path: Path, inputs: Inputs, progress: Progress) -> Plain:
     """Process a log and return all that it gave."""
     progress(0.0, f"Reading {path.name}")
-    log = read_log(path)
-    stops = process(
-        log, config=inputs.config, rig=inputs.rig, marks=inputs.marks, progress=progress
+    logs = [read_log(path)]
+    about = _about(logs[0])
+    stops = process(  # which lets the log go once it is stitched: nobody else may hold it
+        logs.pop(), config=inputs.config, rig=inputs.rig, marks=inputs.marks, progress=progress
     )
-    return survey_answer(log, stops, inputs)
+    return survey_answer(about, stops, inputs)
 
 
-def survey_answer(log: ScanLog, stops: Sequence[StopResult], inputs: Inputs) -> Plain:
+def _about(log: ScanLog) -> Plain:
+    """Return what one remembers of a log."""
+    return {"name": log.origin.name, "sha256": log.origin.digest, "notes": list(log.notes)}
+
+
+def survey_answer(about: Plain, stops: Sequence[StopResult], inputs: Inputs) -> Plain:
     """Return all that one log gave."""
     return {
-        "log": {"name": log.origin.name, "sha256": log.origin.digest, "notes": list(log.notes)},
+        "log": about,
         "rig": _rig(stops[0].cloud.rig),
         "config": inputs.config.to_mapping() | {"digest": inputs.config.digest},
         "stops": [stop_answer(stop, inputs) for stop in stops],

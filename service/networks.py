@@ -90,8 +90,7 @@ def _scans(
     path: Path, config: SurveyConfig, rig: Rig | None, progress: Progress
 ) -> Iterator[tuple[str, MarkerFits]]:
     """Give name and centres of each stop of a log."""
-    log = read_log(path)
-    for stop in process(log, config=config, rig=rig, progress=progress):
+    for stop in process(read_log(path), config=config, rig=rig, progress=progress):
         yield stop.name, stop.fits[config.fitting.methods[0]]
 
 

@@ -76,6 +76,17 @@ WRONG = [  # method, path, arguments, status, code
     ("POST", "/api/v1/sql", {"json": {"sql": "SELEKT 1"}}, 400, "query.rejected"),
     ("POST", "/api/v1/sql", {"json": {"sql": "DROP TABLE jobs"}}, 400, "query.rejected"),
     ("GET", "/api/v1/sql", {}, 422, "input.validation"),
+    ("GET", "/api/v1/plans/sites/nowhere", {}, 404, "not_found"),
+    ("POST", "/api/v1/plans/evaluate", {"json": {"marks": [{"name": "A"}]}},
+     422, "input.validation"),
+    ("POST", "/api/v1/plans/evaluate", {"json": {"model": "guess"}}, 400, "input"),
+    ("POST", "/api/v1/plans/optimise", {"json": {"n_marks": 1}}, 422, "input.validation"),
+    ("POST", "/api/v1/plans/suggest", {"json": {"colour": "red"}}, 422, "input.validation"),
+    ("POST", "/api/v1/plans", {"json": {"marks": []}}, 422, "input.validation"),
+    ("GET", "/api/v1/plans/none", {}, 404, "not_found"),
+    ("GET", "/api/v1/surveys/nobody/products", {}, 404, "not_found"),
+    ("GET", "/api/v1/products/none/laz", {}, 404, "not_found"),
+    ("POST", "/api/v1/terrains?name=hill.txt", {"content": b"1"}, 400, "input"),
     ("GET", "/api/v1/problems/none", {}, 404, "not_found"),
     ("POST", "/api/v1/sql", {"content": b"x" * (17 << 20)}, 413, "input.too_large"),
     ("POST", "/api/v1/sql", {"content": iter([b"x" * (9 << 20)] * 2)}, 413, "input.too_large"),
@@ -98,8 +109,8 @@ def test_every_wrong_request_gets_the_one_shape(site, method, path, arguments, s
 
 def test_every_route_is_among_the_wrong_requests_or_takes_no_input(site):
     paths = site.client.get("/api/v1/openapi.json").json()["paths"]
-    harmless = {"/config", "/problems", "/sql/schema", "/export/results.duckdb", "/jobs/events",
-                "/export/coordinates.csv"}  # fmt: skip
+    harmless = {"/config", "/problems", "/plans/sites", "/sql/schema", "/jobs/events",
+                "/export/results.duckdb", "/export/coordinates.csv"}  # fmt: skip
     tried = [path.partition("?")[0].removeprefix("/api/v1").split("/")[1:] for _, path, *_ in WRONG]
     for path in {one.removeprefix("/api/v1") for one in paths} - harmless:
         parts = path.split("/")[1:]
