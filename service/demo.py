@@ -121,6 +121,14 @@ class Rover:
             while (job := jobs.get()) is not None:
                 self._await(job)
             uploads.result()
+        if not self._leaving.is_set():
+            self._await(self._adjust())
+
+    def _adjust(self) -> str:
+        """Ask for all stations and marks to be adjusted together; return the id of the job."""
+        asked = {"kind": "adjust", "survey": SURVEY}
+        job: str = _checked(self._http.post("/jobs", json=asked))["job_id"]
+        return job
 
     def _bring(self, stops: list[str], jobs: queue.SimpleQueue[str | None]) -> None:
         """Simulate and upload stop after stop; pass on the job of each, and none at the end."""
