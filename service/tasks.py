@@ -113,6 +113,25 @@ def compile_kernels() -> None:
         inspect_log(path)
         for result in process(read_log(path), config=SurveyConfig(), marks=field.marks):
             view(result, 1000)
+    _compile_planner()
+
+
+def _compile_planner() -> None:
+    """Judge and better a small plan, so that the planner's page answers at once."""
+    from pipelines.placement import Goal, PlaceRules, Requirement, Sensor, sensor_model
+    from service import siting
+    from service.plans import Asked, simulated_ground
+
+    ground = simulated_ground("paper-field")
+    asked = Asked(
+        ground=ground,
+        stops=ground.stops,
+        marks=ground.marks,
+        model=sensor_model(Sensor(), ground.site.marker_radius),
+        wish=Requirement(),
+    )
+    siting.evaluate(asked)
+    siting.optimise(asked, PlaceRules(spacing=4.0), Goal(n_marks=3))
 
 
 if __name__ == "__main__":

@@ -227,7 +227,7 @@ function markRow(plan, mark, place) {
     return box;
   };
   const remove = document.createElement("button");
-  Object.assign(remove, { type: "button", className: "remove", textContent: "Remove" });
+  Object.assign(remove, { type: "button", className: "remove", textContent: "\u00d7", title: `Remove ${mark.name}` });
   remove.setAttribute("aria-label", `Remove ${mark.name}`);
   remove.addEventListener("click", () => drop(plan, place));
   const last = cell("", "screen-only");
