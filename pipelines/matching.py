@@ -88,6 +88,25 @@ class Scene:
     sigma_height: float
 
 
+class Spans(NamedTuple):
+    """Marks two by two, in both orders, the nearest to each other first.
+
+    Attributes
+    ----------
+    first, second : (h,)
+        Places among the marks.
+    targets : (h, 3)
+        From the first to the second [m].
+    lengths : (h,)
+        How long each is [m].
+    """
+
+    first: Index
+    second: Index
+    targets: Array
+    lengths: Array
+
+
 class _Hypotheses(NamedTuple):
     """Poses to be tried: heading [rad] and translation [m] of the levelled frame."""
 
@@ -207,7 +226,30 @@ def shared_variances(p_base: Array, cov_p_base: Array, config: ResectionConfig) 
     return np.asarray(np.minimum(config.sigma_range_shared**2, _SHARED * own))
 
 
-def match_marks(scene: Scene, config: ResectionConfig) -> Match:
+def spans_between(marks_site: Array, longest: float) -> Spans:
+    """List marks two by two.
+
+    Parameters
+    ----------
+    marks_site : (m, 3)
+        Marks [m].
+    longest : float
+        How far apart they may be [m].
+
+    Returns
+    -------
+    Spans
+        What two fits can be compared with.
+    """
+    pairs = cKDTree(marks_site).query_pairs(longest, output_type="ndarray")
+    first, second = np.concatenate([pairs, pairs[:, ::-1]]).T
+    targets = marks_site[second] - marks_site[first]
+    lengths = np.linalg.norm(targets, axis=1)
+    order = np.lexsort((second, first, lengths))
+    return Spans(first[order], second[order], targets[order], lengths[order])
+
+
+def match_marks(scene: Scene, config: ResectionConfig, spans: Spans | None = None) -> Match:
     """Find out which fit is which mark.
 
     Parameters
@@ -216,6 +258,9 @@ def match_marks(scene: Scene, config: ResectionConfig) -> Match:
         Centres and marks.
     config : ResectionConfig
         How far a marker may be from its mark.
+    spans : Spans, optional
+        Of these marks, at least as long as the fits are apart and a tolerance more; who matches
+        many stations to the same marks lists them once.
 
     Returns
     -------
@@ -237,15 +282,15 @@ def match_marks(scene: Scene, config: ResectionConfig) -> Match:
     and a translation; a mirror image never does. The poses with most votes are tried on all fits,
     the best are refined and compared. Two marks, or two markers, have one distance and one
     difference of height: the pair that keeps both best is taken, and where else it would fit stands
-    in ``Match.rivals``. Cost grows with the square of fits times marks, to 300,000 pairs of pairs,
-    then no more.
+    in ``Match.rivals``. Cost grows with the square of the fits times the pairs of marks that are no
+    farther apart than they, to 300,000 pairs of pairs, then no more.
     """
     levelled = scene.centres_base @ scene.R_station_base.T
     _refuse_plumb_line(levelled, "markers", config)
     _refuse_plumb_line(scene.marks_site, "control marks", config)
     if min(len(levelled), len(scene.marks_site)) == 2:
         return _matched_pair(levelled, scene, config)
-    hypotheses = _voted(_hypotheses(levelled, scene, config), levelled, config)
+    hypotheses = _voted(_hypotheses(levelled, scene, config, spans), levelled, config)
     solutions = _solutions(hypotheses, levelled, scene, config)
     if not solutions:
         raise NoMatchError(
@@ -357,24 +402,24 @@ def _refuse_plumb_line(p: Array, kind: str, config: ResectionConfig) -> None:
         )
 
 
-def _hypotheses(levelled: Array, scene: Scene, config: ResectionConfig) -> _Hypotheses:
+def _hypotheses(
+    levelled: Array, scene: Scene, config: ResectionConfig, known: Spans | None
+) -> _Hypotheses:
     """Return the poses that bring some two fits onto some two marks."""
     tolerance = config.match_tolerance
     first, second = _pairs_far_first(len(levelled))
     spans = levelled[second] - levelled[first]
     usable = np.hypot(spans[:, 0], spans[:, 1]) > 2.0 * tolerance
     first, second, spans = first[usable], second[usable], spans[usable]
-    a, b = np.nonzero(~np.eye(len(scene.marks_site), dtype=np.bool_))
-    targets = scene.marks_site[b] - scene.marks_site[a]
-    lengths = np.linalg.norm(targets, axis=1)
-    order = np.argsort(lengths, kind="stable")
     reach = np.linalg.norm(spans, axis=1)
-    low = np.searchsorted(lengths[order], reach - tolerance)
-    counts = np.searchsorted(lengths[order], reach + tolerance) - low
+    longest = float(reach.max(initial=0.0)) + 2.0 * tolerance
+    a, b, targets, lengths = known or spans_between(scene.marks_site, longest)
+    low = np.searchsorted(lengths, reach - tolerance)
+    counts = np.searchsorted(lengths, reach + tolerance) - low
     counts[np.cumsum(counts) > max(_N_CANDIDATES, counts[:1].sum())] = 0
     rows = np.repeat(np.arange(len(counts)), counts)
     within = np.arange(len(rows)) - np.repeat(np.cumsum(counts) - counts, counts)
-    columns = order[low[rows] + within]
+    columns = low[rows] + within
     slack = tolerance + 3.0 * scene.sigma_level * reach[rows]
     agree = np.abs(targets[columns, 2] - spans[rows, 2]) <= slack
     rows, columns = rows[agree], columns[agree]

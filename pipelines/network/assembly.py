@@ -6,10 +6,12 @@ station is matched to the map as it is, and its markers that are not in the map 
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
+from scipy.spatial.distance import pdist
 
 from pipelines.calibration import Calibration
 from pipelines.config import ResectionConfig
@@ -21,7 +23,7 @@ from pipelines.errors import (
     SolveError,
 )
 from pipelines.geometry import levelling_rotation, rigid, transform
-from pipelines.matching import gather, match_marks, shared_variances
+from pipelines.matching import Spans, gather, match_marks, shared_variances, spans_between
 from pipelines.network.doubts import doubt
 from pipelines.network.values import LeftOut, Network, Refusal, Shared
 from pipelines.values import Array, ControlMarks, MarkerFits
@@ -44,14 +46,20 @@ class _Map:
     poses: dict[int, Array] = field(default_factory=dict)
     marks_of: dict[int, list[int]] = field(default_factory=dict)
     n_control: int = 0
+    longest: float = 0.0
+    drawn: tuple[ControlMarks, Spans] | None = None
 
-    def as_control(self) -> ControlMarks:
-        """Return the marks as if they were control."""
-        return ControlMarks(
-            names=tuple(self.names),
-            p_site=np.array(self.p_site),
-            cov_p_site=np.array(self.cov_p_site),
-        )
+    def as_control(self) -> tuple[ControlMarks, Spans]:
+        """Return the marks as if they were control, and how far they are apart."""
+        if self.drawn is None:
+            marks = ControlMarks(
+                names=tuple(self.names),
+                p_site=np.array(self.p_site),
+                cov_p_site=np.array(self.cov_p_site),
+            )
+            spans = spans_between(marks.p_site - marks.p_site.mean(axis=0), self.longest)
+            self.drawn = (marks, spans)
+        return self.drawn
 
     def add_mark(self, p_site: Array, cov_p_site: Array) -> int:
         """Enlarge the map by a mark; return its place."""
@@ -62,6 +70,7 @@ class _Map:
         self.names.append(name)
         self.p_site.append(p_site)
         self.cov_p_site.append(cov_p_site)
+        self.drawn = None
         return len(self.names) - 1
 
     def place(
@@ -120,7 +129,7 @@ def assemble(
     stations, and with their square where many cannot be matched.
     """
     names = [name for name, _ in scans]
-    if twice := sorted({name for name in names if names.count(name) > 1}):
+    if twice := sorted(name for name, n in Counter(names).items() if n > 1):
         raise InputError(f"Two logs are called {twice[0]!r}; stations are told apart by name.")
     if calibration is not None:
         scans = [(name, calibration.adjusted(name, fits)) for name, fits in scans]
@@ -155,19 +164,21 @@ def _grow(
     scans: Sequence[Scan], control: ControlMarks | None, config: ResectionConfig
 ) -> tuple[_Map, dict[int, SolveError]]:
     """Return the largest map that stations can be matched to, and why others cannot."""
+    longest = max((_extent(fits) for _, fits in scans), default=0.0) + 2.0 * config.match_tolerance
     if control is not None:
         found = _Map(
             names=list(control.names),
             p_site=list(control.p_site),
             cov_p_site=list(control.cov_p_site),
             n_control=len(control.names),
+            longest=longest,
         )
         return found, _chain(scans, found, list(range(len(scans))), config)
     best, reasons = _Map(), dict[int, SolveError]()
     left = list(range(len(scans)))
     while len(left) > len(best.poses):
         seed = left[0]
-        fits, found = scans[seed][1], _Map()
+        fits, found = scans[seed][1], _Map(longest=longest)
         T = rigid(levelling_rotation(fits.levelling), np.zeros(3))
         found.place(seed, fits, T, [-1] * len(fits.fits), 0.0)
         others = [i for i in range(len(scans)) if i != seed]
@@ -176,6 +187,13 @@ def _grow(
             best, reasons = found, failed
         left = [i for i in left if i not in found.poses]
     return best, reasons
+
+
+def _extent(fits: MarkerFits) -> float:
+    """Return how far the two outermost markers of a station are apart [m]."""
+    if len(fits.fits) < 2:
+        return 0.0
+    return float(pdist(np.stack([fit.p_base for fit in fits.fits])).max())
 
 
 def _chain(
@@ -190,8 +208,9 @@ def _chain(
             try:
                 if len(fits.fits) < 2 or not found.names:
                     raise DegenerateGeometryError("Too few markers.")
-                scene = gather(fits, found.as_control(), config)
-                match = match_marks(scene, config)
+                marks, spans = found.as_control()
+                scene = gather(fits, marks, config)
+                match = match_marks(scene, config, spans)
                 if len(match.rivals):
                     raise AmbiguousMatchError("Two markers fit the map in several ways.")
             except SolveError as error:
@@ -340,7 +359,9 @@ def _network(
         sightings=columns[:, :2].copy(),
         fits=columns[:, 2].copy(),
         p_base=np.array([fit.p_base for fit in fits]),
-        cov_p_base=np.array([_symmetric(fit.p_base, fit.cov_p_base) for fit in fits]),
+        cov_p_base=_symmetric(
+            np.array([fit.p_base for fit in fits]), np.array([fit.cov_p_base for fit in fits])
+        ),
         R_station_base=np.array([levelling_rotation(one) for one in levellings]),
         cov_up_base=np.array([_cov_up(one.roll, one.pitch, one.sigma) for one in levellings]),
         sigma_headings=np.array([one.sigma_heading for one in levellings]),
@@ -362,21 +383,21 @@ def _own(p_base: Array, cov_p_base: Array, config: ResectionConfig) -> Array:
 
 
 def _symmetric(p_base: Array, cov_p_base: Array) -> Array:
-    """Return the covariance of a centre without what correlates along, across and above.
+    """Return the covariances of centres without what correlates along, across and above.
 
     A sphere looks alike on all sides of the line of sight. What correlation its returns show comes
     from where the centre happened to be put, and as a weight would turn errors across the line of
     sight into errors along it: over many stations the ring of marks swells by 0.2 mm.
     """
-    along = p_base / np.linalg.norm(p_base)
-    across = np.array([-along[1], along[0], 0.0])
-    length = np.linalg.norm(across)
-    if length < _STEEP:
-        return cov_p_base
-    across /= length
-    axes = np.array([along, across, np.cross(along, across)])
-    variances = np.einsum("ki,ij,kj->k", axes, cov_p_base, axes)
-    return np.asarray(axes.T @ (variances[:, None] * axes))
+    along = p_base / np.linalg.norm(p_base, axis=1, keepdims=True)
+    across = np.column_stack([-along[:, 1], along[:, 0], np.zeros(len(along))])
+    lengths = np.linalg.norm(across, axis=1, keepdims=True)
+    is_steep = lengths < _STEEP
+    across /= np.where(is_steep, 1.0, lengths)
+    axes = np.stack([along, across, np.cross(along, across)], axis=1)
+    variances = np.einsum("nki,nij,nkj->nk", axes, cov_p_base, axes)
+    alike = np.swapaxes(axes, 1, 2) @ (variances[..., None] * axes)
+    return np.where(is_steep[..., None], cov_p_base, alike)
 
 
 def _in_common(

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from pipelines.values import MarkerFit, MarkerFits, Status
+from pipelines.values import Array, MarkerFit, MarkerFits, Status
 
 if TYPE_CHECKING:
     from pipelines.network.assembly import _Map
@@ -47,11 +47,11 @@ def doubt(
     doubts: dict[int, str] = {}
     dropped: dict[tuple[int, int], str] = {}
     n_marks = {i: len(pairs) for i, pairs in used.items()}
-    for mark in sorted({mark for pairs in used.values() for _, mark in pairs}):
+    places = np.array([found.poses[i][:3, 3] for i in used])
+    for mark, seen in sorted(_sightings(used).items()):
         if mark < found.n_control:
             continue
-        seen = [(i, fit) for i, pairs in used.items() for fit, m in pairs if m == mark]
-        near, reason = _as_near(scans, found, used, mark, seen), ""
+        near, reason = _as_near(scans, places, found.p_site[mark], seen), ""
         is_weak = all(scans[i][1].fits[fit].status is Status.WEAK for i, fit in seen)
         if _FEW * len(seen) < near:
             reason = f"Only {len(seen)} of the {near} stations that stand near enough see it."
@@ -69,17 +69,21 @@ def doubt(
     return doubts, dropped
 
 
+def _sightings(used: dict[int, list[tuple[int, int]]]) -> dict[int, list[tuple[int, int]]]:
+    """Return, by mark, the (station, fit) that see it."""
+    seen: dict[int, list[tuple[int, int]]] = {}
+    for i, pairs in used.items():
+        for fit, mark in pairs:
+            seen.setdefault(mark, []).append((i, fit))
+    return seen
+
+
 def _as_near(
-    scans: Sequence[Scan],
-    found: _Map,
-    used: dict[int, list[tuple[int, int]]],
-    mark: int,
-    seen: list[tuple[int, int]],
+    scans: Sequence[Scan], places: Array, p_site: Array, seen: list[tuple[int, int]]
 ) -> int:
     """Return how many stations stand as near to a mark as the farthest that sees it."""
     reach = max(float(np.linalg.norm(scans[i][1].fits[fit].p_base)) for i, fit in seen)
-    places = np.array([found.poses[i][:3, 3] for i in used])
-    return int(np.sum(np.linalg.norm(places - found.p_site[mark], axis=1) < reach + 0.1))
+    return int(np.sum(np.linalg.norm(places - p_site, axis=1) < reach + 0.1))
 
 
 def _odd_radius(fits: list[MarkerFit]) -> str:
