@@ -62,8 +62,10 @@ _MARGIN = np.radians(1.0)  # what the LiDAR's place off the axis does to directi
 _THIN = 1e-6  # [m]
 _WIDER = 1.5  # of the variance: samples beyond the first round are drawn so much wider
 _FLOOR = 0.01  # of the prior covariance: keeps a sample's covariance invertible
-_SCALE, _SCALE_FEW, _FEW = 0.84, 0.39, 25.0  # of the covariance by returns, by Monte Carlo
-_SAMPLES = (128, 128, 320)  # in rounds
+_SCALE, _SCALE_FEW, _FEW = 0.81, 0.37, 25.0  # of the covariance by returns, by Monte Carlo
+_SAMPLES = (128, 128, 128, 320)  # in rounds
+_WORTH = 0.15  # of the samples that must speak: one alone would have no spread
+_FLATTER = 0.8  # a step in the power of the likelihood
 
 
 class _Pattern(NamedTuple):
@@ -480,6 +482,17 @@ def _normal(n: int) -> Array:
     return np.concatenate([half, -half])
 
 
+def _spread(logs: Array) -> Array:
+    """Return the weights of samples, (k,), of a flatter likelihood where too few would speak."""
+    logs = logs - logs.max()
+    while True:
+        weights = np.exp(logs)
+        weights /= weights.sum()
+        if weights @ weights < 1.0 / (_WORTH * len(logs)):
+            return np.asarray(weights)
+        logs = _FLATTER * logs
+
+
 def _updated(
     cloud: StitchedCloud, fit: MarkerFit, shots: _Passing, link: tuple[float, float]
 ) -> MarkerFit:
@@ -492,8 +505,7 @@ def _updated(
         entered = _entered(shots.places, shots.half_widths, fit.radius, d @ shots.axes.T)
         logs = _logarithms(entered, shots.has_hit, np.array(link[:1]), link[1])[:, 0]
         logs += 0.5 * np.sum(z**2, axis=1) - 0.5 * np.einsum("ij,jk,ik->i", d, precision, d)
-        weights = np.exp(logs - logs.max())
-        weights /= weights.sum()
+        weights = _spread(logs)
         mean = weights @ d
         cov = (weights[:, None] * (d - mean)).T @ (d - mean) + _FLOOR * fit.cov_p_base
         wide = _WIDER

@@ -460,6 +460,17 @@ def test_the_outline_sharpens_the_centre():
     assert squares["silhouette"] < 0.75 * squares["along_beam"]
 
 
+def test_the_outline_never_makes_a_centre_look_surer_than_samples_can_tell():
+    rng = np.random.default_rng(32)
+    shares = []
+    for _ in range(40):
+        cloud = cloud_of(*marker_shots(CENTRE * 0.7, rng, sigma=0.02))
+        by_ranges = fit_one(cloud, CENTRE * 0.7).fits[0].cov_p_base
+        by_both = fit_one(cloud, CENTRE * 0.7, "silhouette").fits[0].cov_p_base
+        shares.append(np.linalg.eigvals(np.linalg.solve(by_ranges, by_both)).real.min())
+    assert min(shares) > 0.2 * np.median(shares)
+
+
 def test_the_standard_says_which_variant_ran():
     far = cloud_of(*marker_shots(CENTRE, np.random.default_rng(26), sigma=0.01))
     near = cloud_of(*marker_shots(CENTRE / 2, np.random.default_rng(26), sigma=0.01))
