@@ -30,6 +30,7 @@ _N_HYPOTHESES = 1000  # poses that are looked at; the true one has many votes
 _N_SOLUTIONS = 6  # that are refined: the best, and rivals enough to see that it is ambiguous
 _N_ROUNDS = 8  # of adjusting and matching again; two or three are the rule
 _RIVAL = 14.0  # -2 ln(0.001): how much better, in the weighted sum of squares, the best must be
+_RIVAL_SHARE = 0.5  # of what the best holds, at least, that a rival must hold before it is refined
 _PAIR = 25.0  # weighted sum of squares (2 dof) above which two markers are not those two marks
 _CHANCE = 0.01  # expected number of chance agreements above which a match is none
 _SHARED = 0.55  # of the variance along a line of sight, at most, that all centres share
@@ -543,10 +544,11 @@ def _solutions(
         best = int(np.argmax(scores))
         if scores[best] <= 0:
             break
-        T = rigid(
-            rot_z(hypotheses.yaws[best]) @ scene.R_station_base, hypotheses.translations[best]
-        )
-        refined = _refined(marks[best], T, scene, config)
+        refined = None
+        if np.sum(marks[best] >= 0) >= _RIVAL_SHARE * max((m.n for _, m in solutions), default=0):
+            yaw, translation = hypotheses.yaws[best], hypotheses.translations[best]
+            T = rigid(rot_z(yaw) @ scene.R_station_base, translation)
+            refined = _refined(marks[best], T, scene, config)
         shared = np.sum((marks == marks[best]) & (marks[best] >= 0), axis=1)
         if refined is not None:
             solutions.append(refined)
