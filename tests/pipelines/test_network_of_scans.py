@@ -66,20 +66,23 @@ def test_the_truth_of_another_survey_is_refused(small):
 
 
 @pytest.mark.slow
-def test_a_survey_of_the_study_s_field_reaches_a_millimetre():
-    """35 stops of one world; means over 38 worlds: marks 0.53 mm, stations 0.83 mm, NEES 1.1."""
+def test_half_a_survey_of_the_study_s_field_reaches_a_millimetre():
+    """Every other stop of one world, 18 of 35: errors of marks are 1.4 times those of all stops.
+
+    Means over 38 worlds with all stops: marks 0.53 mm, stations 0.83 mm, NEES 1.1.
+    """
     world = scenario("paper-field", 77)
     scans, poses = [], {}
-    for stop in world.stops:
+    for stop in world.stops[::2]:
         made = simulate_stop(world, stop.name, WORLD)
         (found,) = process(made.log, config=CONFIG)
         scans.append((stop.name, found.fits["along_beam"]))
         poses[stop.name] = made.truth.T_site_base
     result = adjust_network(assemble(scans, None, CONFIG.resection), CONFIG.resection)
     errors = compare(result, truth_of(world.marks, poses))
-    assert len(result.network.stations) == 35
+    assert len(result.network.stations) == 18
     assert np.all(errors.marks >= 0)
-    assert errors.rms_marks < 0.85e-3  # the bar of 0.7 mm holds in 37 of 38 worlds
+    assert errors.rms_marks < 1.15e-3  # 0.74 mm is usual; 0.7 mm of all stops would be 0.98 mm
     assert errors.rms_stations < 1.5e-3
     assert 0.5 < errors.nees_marks < 1.8  # one world: 36 degrees of freedom
     assert 0.6 < errors.nees_stations < 1.6
