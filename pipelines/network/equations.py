@@ -18,7 +18,7 @@ from pipelines.errors import DegenerateGeometryError, NotConvergedError
 from pipelines.geometry import skew
 from pipelines.matching import moved
 from pipelines.network.values import Network, Parts
-from pipelines.values import Array, Mask
+from pipelines.values import Array, Index, Mask
 
 N_DEFECT = 4  # of a free network whose stations are levelled: place and heading
 
@@ -215,8 +215,8 @@ class _Reduced:
     """Normal equations after the stations are eliminated.
 
     ``A`` (s, 6, 6) are the stations' own blocks, ``K`` (s, 6, 3m + k) is ``A^-1`` times their
-    coupling to marks and shared unknowns, ``S`` (3m + k, 3m + k) the Schur complement; ``g`` and
-    ``r`` the right sides.
+    coupling to marks and shared unknowns, zero but in the ``columns`` of each station; ``S``
+    (3m + k, 3m + k) is the Schur complement; ``g`` and ``r`` are the right sides.
     """
 
     A: Array
@@ -224,27 +224,47 @@ class _Reduced:
     S: Array
     g: Array
     r: Array
+    columns: tuple[Index, ...]
 
 
 def _reduce(network: Network, lin: Linearised, shared: Array) -> _Reduced:
     """Set up the normal equations and eliminate the stations."""
     s, m = len(network.stations), len(network.marks)
-    station, mark = network.sightings.T
+    station = network.sightings[:, 0]
     pressed = np.swapaxes(lin.J_centres, 1, 2) @ lin.P_centres
     levelled = np.swapaxes(lin.J_gravity, 1, 2) @ lin.P_gravity
     stations, g = levelled @ lin.J_gravity, np.einsum("sij,sj->si", levelled, lin.v_gravity)
     np.add.at(stations, station, pressed @ lin.J_centres)
     np.add.at(g, station, np.einsum("nij,nj->ni", pressed, lin.v_centres))
-    own, h = _marks_alone(network, lin, shared)
-    to_marks = np.zeros((s, 6, m, 3))
-    to_marks[station, :, mark, :] = pressed @ lin.J_common[..., :3]
+    to_marks = pressed @ lin.J_common[..., :3]
     to_shared = np.zeros((s, 6, len(shared)))
     np.add.at(to_shared, station, pressed @ lin.J_common[..., 3:])
-    coupling = np.concatenate([to_marks.reshape(s, 6, 3 * m), to_shared], axis=2)
-    solved = np.asarray(np.linalg.solve(stations, coupling), dtype=np.float64)
-    reduced = own - coupling.reshape(6 * s, -1).T @ solved.reshape(6 * s, -1)
-    r = -h + np.einsum("sij,si->j", solved, g)
-    return _Reduced(A=stations, K=solved, S=(reduced + reduced.T) / 2.0, g=g, r=r)
+    reduced, h = _marks_alone(network, lin, shared)
+    solved, r, columns = np.zeros((s, 6, 3 * m + len(shared))), -h, []
+    for each, rows in enumerate(_rows_of_stations(network)):
+        own = np.swapaxes(to_marks[rows], 0, 1).reshape(6, -1)
+        coupling = np.concatenate([own, to_shared[each]], axis=1)
+        there = _columns(network.sightings[rows, 1], m, len(shared))
+        part = np.linalg.solve(stations[each], coupling)
+        reduced[there[:, None], there] -= coupling.T @ part
+        r[there] += part.T @ g[each]
+        solved[each][:, there] = part
+        columns.append(there)
+    reduced = (reduced + reduced.T) / 2.0
+    return _Reduced(A=stations, K=solved, S=reduced, g=g, r=r, columns=tuple(columns))
+
+
+def _rows_of_stations(network: Network) -> list[Index]:
+    """Return the sightings of each station."""
+    station = network.sightings[:, 0]
+    ends = np.cumsum(np.bincount(station, minlength=len(network.stations)))
+    return np.split(np.argsort(station, kind="stable"), ends[:-1])
+
+
+def _columns(marks: Index, n_marks: int, n_shared: int) -> Index:
+    """Return where the unknowns of some marks, and all that are shared, stand."""
+    own = 3 * marks[:, None] + np.arange(3)
+    return np.concatenate([own.ravel(), 3 * n_marks + np.arange(n_shared)])
 
 
 def _marks_alone(network: Network, lin: Linearised, shared: Array) -> tuple[Array, Array]:
@@ -353,7 +373,9 @@ def solve_network(network: Network, state: State, used: Mask) -> tuple[State, Co
 
 def _cofactors(reduced: _Reduced, cov_marks: Array, m: int) -> Cofactors:
     """Return the covariances of stations, marks and what all share."""
-    between = -reduced.K @ cov_marks
+    between = np.empty_like(reduced.K)
+    for each, there in enumerate(reduced.columns):
+        between[each] = -reduced.K[each][:, there] @ cov_marks[there]
     own = np.asarray(np.linalg.inv(reduced.A), dtype=np.float64)
     stations = own - between @ np.swapaxes(reduced.K, 1, 2)
     return Cofactors(
