@@ -24,6 +24,7 @@ _POLE = 0.5  # radii: half the width of what a ball may stand on
 _ASIDE = 1.9  # radii: what is farther to a side may stand there on its own
 _HELD = (-4.0, 1.5)  # radii of depth within which something belongs to what is looked at
 _ON = (-1.3, 0.3)  # radii of depth within which a return may lie on the ball
+_UNSEEN = 3.0  # as many beams below it that end nearer as that go past: no more is known
 
 
 class Sight(NamedTuple):
@@ -36,7 +37,7 @@ class Sight(NamedTuple):
     n_through : int
         Returns well inside the outline that lie behind the ball.
     n_before : int
-        Returns inside the outline that lie before the ball.
+        Returns inside the outline that lie before the ball: beams that would have met it.
     spread : float
         Mean square of the distances from the centre at which the first ones pass it, in units of
         the radius squared: about a half for a ball of the known radius.
@@ -66,12 +67,27 @@ class Sight(NamedTuple):
     def is_open_below(self) -> bool:
         """Tell whether most beams below it, beside a pole's place, go on past it.
 
+        Beams that something nearer stops show neither. If they are three in four, nothing is known:
+        what lies behind a crest at its own foot shows no more.
+
         Returns
         -------
         bool
-            False if they are stopped, by what it rests on or by something nearer.
+            False if they are stopped by what it rests on, or too many by something nearer.
         """
-        return self.n_held + self.n_short <= 1 + self.n_past
+        n_nearer_max = _UNSEEN * (1 + self.n_past)
+        return self.n_held <= 1 + self.n_past and self.n_short <= n_nearer_max
+
+    @property
+    def n_aimed(self) -> int:
+        """Count the beams that would have met the ball if nothing were nearer.
+
+        Returns
+        -------
+        int
+            Those that end on it or before it.
+        """
+        return self.n_on + self.n_before
 
 
 def sights(cloud: StitchedCloud, centres: Array, ball: Ball) -> list[Sight]:
@@ -118,13 +134,13 @@ def _counted(
     for i in range(len(seen)):
         across, along, depth = np.abs(seen[i, 0]) / radius, seen[i, 1] / radius, seen[i, 2] / radius
         gap = np.hypot(across, along)
-        if gap < 1.0 + blur and along > -0.9 and _ON[0] < depth < _ON[1]:
+        is_aimed = gap < 1.0 + blur and along > -0.9
+        if is_aimed and _ON[0] < depth < _ON[1]:
             n_on += 1
             gaps2 += gap * gap
             light += intensities[rows[i]]
-        elif gap < 0.8:
-            n_through += depth > 1.0
-            n_before += depth <= _ON[0]
+        n_before += is_aimed and depth <= _ON[0]
+        n_through += gap < 0.8 and depth > 1.0
         is_below = along < -0.3 and gap > 1.2 + blur and _POLE + blur < across < _ASIDE + blur
         if is_below:
             n_past += depth > _HELD[1]

@@ -28,7 +28,7 @@ _STRANGE_RESOLVED = 0.05  # share of the returns inside its outline that may be 
 _N_KNOWN = 3  # markers that are open below, to compare others with
 _UNLIKE = 0.25  # share by which the reflectivity of a marker may differ from that of the others
 _NOISIER = 1.5  # factor by which the scatter of a marker may exceed that of the others
-_HIDDEN = 2.0  # as many returns before a ball as on it: two thirds of it are hidden
+_HIDDEN = 3.0  # as many returns before a ball as on it: three quarters of it are hidden
 
 
 def distinct(looks: list[Look], config: ExtractionConfig, radius: float) -> list[Look]:
@@ -173,12 +173,12 @@ def verdict_on_sight(look: Look, sight: Sight, ball: Ball) -> str:
     spread_min = expected - max(
         _SPREAD_SIGMAS / float(np.sqrt(12.0 * max(sight.n_on, 1))), _SPREAD_SLACK
     )
-    few = np.inf if is_resolved(look, ball) else 1.0 + _TOUCHING * sight.n_on
+    few = np.inf if is_resolved(look, ball) else 1.0 + _TOUCHING * _n_comparable(sight)
     seems_like = ball.radius * float(np.sqrt(sight.spread / expected))
     n_below = sight.n_held + sight.n_past + sight.n_short
     tests = (
         (
-            sight.n_through > 1.0 + _TOUCHING * sight.n_on,
+            sight.n_through > 1.0 + _TOUCHING * min(sight.n_aimed, 2 * sight.n_on),
             f"It lets beams through: {sight.n_through} returns inside its outline lie behind it, "
             f"where {sight.n_on} lie on it.",
         ),
@@ -204,6 +204,17 @@ def verdict_on_sight(look: Look, sight: Sight, ball: Ball) -> str:
         ),
     )
     return next((reason for is_so, reason in tests if is_so), "")
+
+
+def _n_comparable(sight: Sight) -> float:
+    """Return how many returns on a ball those below it are to be compared with.
+
+    Where something nearer hides more of the ball than of what is below it, as many as the ball
+    would have if as much of it were seen as of that.
+    """
+    n_seen = sight.n_held + sight.n_past
+    share_below = n_seen / max(n_seen + sight.n_short, 1)
+    return max(share_below * sight.n_aimed, float(sight.n_on))
 
 
 def verdict_among_others(look: Look, sight: Sight, others: Sequence[tuple[Look, Sight]]) -> str:

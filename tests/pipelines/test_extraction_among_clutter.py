@@ -90,6 +90,30 @@ def test_a_marker_most_of_which_is_behind_something_is_refused_with_a_reason(few
     assert near(rough(found))[1:].all()
 
 
+@pytest.mark.parametrize("towards", ["left", "right", "up", "down"])
+def test_a_marker_with_a_part_behind_something_nearer_is_found_beside_its_whole_ground(
+    few, towards
+):
+    place = ring_of_markers(n=5)[0]  # four radii above the ground, which most beams still reach
+    turn = {"left": (-1.0, 0.0), "right": (1.0, 0.0), "up": (0.0, 1.0), "down": (0.0, -1.0)}
+    p = few.p_base.astype(np.float64)
+    distance = np.linalg.norm(place)
+    side = np.cross([0.0, 0.0, 1.0], place)
+    side /= np.linalg.norm(side)
+    up = np.cross(place, side) / distance
+    passes = (
+        np.column_stack([p @ side, p @ up]) * (distance / (p @ place) * distance / RADIUS)[:, None]
+    )
+    is_near = (p @ place > 0.0) & (np.hypot(*passes.T) < 1.5)
+    for hidden_from in (0.5, 0.1):  # radii from its middle: a fifth of its disc, and 44 %
+        is_behind = is_near & (passes @ turn[towards] > hidden_from)
+        q = few.p_base.copy()
+        q[is_behind] *= 0.5 * distance / np.linalg.norm(p[is_behind], axis=1)[:, None]
+        found = extract(replace(few, p_base=q), ExtractionConfig(), RADIUS)
+        assert near(rough(found)).all()
+        assert len(found.candidates) == 5
+
+
 @pytest.mark.slow
 def test_markers_are_found_and_nothing_else_in_worlds_of_clutter():
     found = detection(DETECTION_PLAN, (22,), SimulationConfig())
