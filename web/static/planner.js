@@ -397,6 +397,7 @@ function close() {
 }
 
 function setMarks(all, active) {
+  tell("");
   while (state.plans.length > all.length) close();
   while (state.plans.length < all.length) open([]);
   all.forEach((marks, i) => { state.plans[i].marks = marks; });
