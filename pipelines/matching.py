@@ -23,10 +23,11 @@ from pipelines.errors import (
     SolveError,
 )
 from pipelines.geometry import levelling_rotation, rigid, rot_z, skew, transform
-from pipelines.values import Array, ControlMarks, Index, MarkerFits
+from pipelines.values import Array, ControlMarks, Index, MarkerFits, Mask
 
 _N_CANDIDATES = 300_000  # pairs of pairs that are compared at most; more find nothing new
 _N_HYPOTHESES = 1000  # poses that are looked at; the true one has many votes
+_N_CELLS = 500  # of a map of the marks, along each side
 _N_SOLUTIONS = 6  # that are refined: the best, and rivals enough to see that it is ambiguous
 _N_ROUNDS = 8  # of adjusting and matching again; two or three are the rule
 _RIVAL = 14.0  # -2 ln(0.001): how much better, in the weighted sum of squares, the best must be
@@ -568,20 +569,37 @@ def _assigned(
     fit falls from 1 to 0 with the square of its distance (MSAC, Torr and Zisserman 2000).
     """
     scale = np.array([1.0, 1.0, 1.0 / slack])
+    h, n = placed.shape[:2]
+    p = placed.reshape(-1, 3)
+    found = np.flatnonzero(_beside_marks(p, marks_site, tolerance))
     distances, marks = cKDTree(marks_site * scale).query(
-        placed * scale, distance_upper_bound=tolerance
+        p[found] * scale, distance_upper_bound=tolerance
     )
-    distances = np.asarray(distances)
-    h, n = marks.shape
-    found = np.flatnonzero(np.isfinite(distances.ravel()))
-    keys = (found // n) * len(marks_site) + marks.ravel()[found]
-    order = np.lexsort((distances.ravel()[found], keys))
-    winners = found[order[np.unique(keys[order], return_index=True)[1]]]
+    near = np.isfinite(distances)
+    found, distances, marks = found[near], np.asarray(distances)[near], np.asarray(marks)[near]
+    keys = (found // n) * len(marks_site) + marks
+    order = np.lexsort((distances, keys))
+    winners = order[np.unique(keys[order], return_index=True)[1]]
     out = np.full(h * n, -1, dtype=np.intp)
-    out[winners] = marks.ravel()[winners]
+    out[found[winners]] = marks[winners]
     gains = np.zeros(h * n)
-    gains[winners] = 1.0 - (distances.ravel()[winners] / tolerance) ** 2
+    gains[found[winners]] = 1.0 - (distances[winners] / tolerance) ** 2
     return out.reshape(h, n), gains.reshape(h, n).sum(axis=1)
+
+
+def _beside_marks(p: Array, marks_site: Array, tolerance: float) -> Mask:
+    """Return which points lie in a cell of a map that touches a mark's: all nearer are among them.
+
+    Most poses put most fits where no mark is, and a look at the map costs less than a search.
+    """
+    low = marks_site[:, :2].min(axis=0)
+    side = max(tolerance, float(np.ptp(marks_site[:, :2], axis=0).max()) / _N_CELLS)
+    cells = np.zeros((_N_CELLS + 4, _N_CELLS + 4), dtype=np.bool_)
+    x, y = ((marks_site[:, :2] - low) // side).astype(np.intp).T + 2
+    around = np.arange(-1, 2)
+    cells[(x[:, None] + around)[:, :, None], (y[:, None] + around)[:, None, :]] = True
+    i, j = np.clip((p[:, :2] - low) // side + 2.0, 0.0, _N_CELLS + 3.0).astype(np.intp).T
+    return np.asarray(cells[i, j])
 
 
 def _refined(
