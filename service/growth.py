@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from time import perf_counter
+from time import perf_counter, process_time
 from typing import Any
 
 import numpy as np
@@ -121,11 +121,12 @@ def adjust(n_stations: int, n_marks: int) -> Plain:
         p_site=marks.p_site[known],
         cov_p_site=marks.cov_p_site[known],
     )
-    config, start = ResectionConfig(), perf_counter()
+    config = ResectionConfig()
+    start, cpu_start = perf_counter(), process_time()
     network = assemble(scans, control, config)
-    between = perf_counter()
+    between, cpu_between = perf_counter(), process_time()
     found = adjust_network(network, config)
-    end = perf_counter()
+    end, cpu_end = perf_counter(), process_time()
     return {
         "n_stations": len(network.stations),
         "n_marks": len(network.marks),
@@ -133,6 +134,8 @@ def adjust(n_stations: int, n_marks: int) -> Plain:
         "sigma0": found.sigma0,
         "assembly_seconds": between - start,
         "adjustment_seconds": end - between,
+        "assembly_cpu_seconds": cpu_between - cpu_start,
+        "adjustment_cpu_seconds": cpu_end - cpu_between,
         "ms_per_station": 1e3 * (end - start) / n_stations,
     }
 
