@@ -260,6 +260,8 @@ def _summary(answer: Row, checks: list[Row]) -> str:
         parts.append(
             f"Left out in turn, control marks are met to {1000 * worst['difference_3d_m']:.1f} mm."
         )
+    if dropped := [one["mark"] for one in answer["excluded"] if one["kind"] == "control"]:
+        parts.append(f"Control that contradicts the rest was left out: {', '.join(dropped)}.")
     if answer["refused"]:
         parts.append("Without " + ", ".join(one["station"] for one in answer["refused"]) + ".")
     return " ".join([*parts, *answer["warnings"]])
