@@ -7,6 +7,7 @@
 PYTHON ?= $(shell command -v python3.11 || command -v python3)
 BIN := .venv/bin
 export OPENBLAS_NUM_THREADS ?= 1
+SIDE_BY_SIDE := --numprocesses 2 --dist loadfile
 
 .PHONY: help demo test check bench lock setup clean
 
@@ -38,8 +39,8 @@ demo: setup
 
 test: setup
 	@.ci/system-packages browser
-	$(BIN)/pytest
-	$(BIN)/pytest -m slow
+	$(BIN)/pytest $(SIDE_BY_SIDE)
+	$(BIN)/pytest $(SIDE_BY_SIDE) -m slow
 
 check: setup
 	$(BIN)/ruff format --check .
