@@ -19,8 +19,8 @@ from pipelines.values import Array, Column, Mask, _seal
 _N_RAYS = 61  # in a bundle
 _MERGE = 0.8  # [m] nearer returns of one pulse are one echo: half a pulse of some 5 ns
 _STEP = 0.10  # [m] departure of a range from the plane through its neighbours
-_THINNING = 128  # one firing in so many is traced in any case: every 7 ms
-_NEAR = 0.35  # [m] what passes a sphere's centre closer than this is near it
+NEAR = 0.35
+"""What passes a sphere's centre closer than this is near it [m]."""
 
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
@@ -83,8 +83,25 @@ class Echoes:
     def __post_init__(self) -> None:
         _seal(self, ranges=(None,), reflectivities=(len(self.ranges),))
 
+    def among(self, chosen: Mask) -> Echoes:
+        """Return these echoes among beams that have none.
 
-def trace(scene: Scene, aims: Aims, divergence: Array, *, only_near_spheres: bool) -> Echoes:
+        Parameters
+        ----------
+        chosen : (n,)
+            Which of all beams these are of.
+
+        Returns
+        -------
+        Echoes
+            Of all beams.
+        """
+        ranges, reflectivities = np.full(len(chosen), np.inf), np.zeros(len(chosen))
+        ranges[chosen], reflectivities[chosen] = self.ranges, self.reflectivities
+        return Echoes(ranges=ranges, reflectivities=reflectivities)
+
+
+def trace(scene: Scene, aims: Aims, divergence: Array, anyway: Mask | None = None) -> Echoes:
     """Return the strongest echo of each beam.
 
     Parameters
@@ -95,9 +112,9 @@ def trace(scene: Scene, aims: Aims, divergence: Array, *, only_near_spheres: boo
         Beams in the order of firing, whole firings of all lasers.
     divergence : (2,)
         Full width of the footprint across and along the spin axis [rad].
-    only_near_spheres : bool
-        Whether beams that pass no sphere closely are left without an echo, save one firing in
-        128, which tell of the turn and of the ground.
+    anyway : (n,), optional
+        Beams that are cast in any case; of the others only those that pass a sphere closely have an
+        echo. All of them, if missing.
 
     Returns
     -------
@@ -107,17 +124,15 @@ def trace(scene: Scene, aims: Aims, divergence: Array, *, only_near_spheres: boo
     cast = caster(scene.mesh)
     ranges = np.full(len(aims.origins_site), np.inf)
     reflectivities = np.zeros(len(ranges))
-    is_cast = np.ones(len(ranges), dtype=np.bool_)
-    if only_near_spheres:
-        is_cast = np.arange(len(ranges)) // N_LASERS % _THINNING == 0
+    is_cast = np.ones(len(ranges), dtype=np.bool_) if anyway is None else anyway
     chosen = aims.rows(is_cast)
     rays = np.hstack([chosen.origins_site, chosen.directions_site]).astype(np.float32)
     ranges[is_cast], reflectivities[is_cast] = cast(rays)
-    if only_near_spheres:
-        is_wide = _passes(scene, aims, 0.0, _NEAR)
-    else:
+    if anyway is None:
         is_wide = _passes(scene, aims, float(divergence.max()) / 2, 0.0)
         is_wide |= _sees_step(ranges, N_LASERS)
+    else:
+        is_wide = _passes(scene, aims, 0.0, NEAR)
     wide = aims.rows(is_wide)
     ranges[is_wide], reflectivities[is_wide] = _trace_bundles(scene, cast, wide, divergence)
     return Echoes(ranges=ranges, reflectivities=reflectivities)

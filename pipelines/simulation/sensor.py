@@ -22,7 +22,7 @@ from pipelines.rigs import (
 from pipelines.simulation.echo import Aims, Echoes
 from pipelines.simulation.options import SimulationConfig
 from pipelines.simulation.rig import Motion, quantised
-from pipelines.values import Array, Column, Firings, Index, Nanos, Rig, Rings, _seal
+from pipelines.values import Array, Column, Firings, Index, Mask, Nanos, Rig, Rings, _seal
 
 FIRINGS_PER_PACKET = N_BLOCKS * FIRINGS_PER_BLOCK
 """Firings of all lasers that the sensor sends at once."""
@@ -37,6 +37,7 @@ _NOISE = np.array(
 _HALF_SEEN = 0.10 / 50.0**2  # [1/m^2] reflectivity over squared range that answers half the time
 _SOFTNESS = 0.15  # of that limit, in the logarithm of the energy
 _INTENSITY_NOISE = (1.0, 0.05)  # counts, and share of the value
+_TURN_WITHIN = 0.01  # [rad] more than the head turns within a firing, at 20 revolutions a second
 _NS_CYCLE, _NS_LASER = round(FIRING_CYCLE * 1e9), round(LASER_CYCLE * 1e9)
 
 
@@ -64,6 +65,26 @@ class Shots:
     def __post_init__(self) -> None:
         n = len(self.offsets_ns)
         _seal(self, offsets_ns=(n,), rings=(n,), azimuths=(n,), gimbal_angles=(n,))
+
+    def rows(self, chosen: Mask) -> Shots:
+        """Return some of the shots.
+
+        Parameters
+        ----------
+        chosen : (n,)
+            Which ones.
+
+        Returns
+        -------
+        Shots
+            The chosen ones, in the same order.
+        """
+        return Shots(
+            offsets_ns=self.offsets_ns[chosen],
+            rings=self.rings[chosen],
+            azimuths=self.azimuths[chosen],
+            gimbal_angles=self.gimbal_angles[chosen],
+        )
 
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
@@ -177,6 +198,34 @@ def aim(shots: Shots, rig: Rig, T_site_base: Array) -> Aims:
         shots.azimuths, shots.gimbal_angles, shots.rings, lasers, posed
     )
     return Aims(origins_site=origins, directions_site=directions, spin_axes_site=axes)
+
+
+def may_pass(shots: Shots, rig: Rig, T_site_base: Array, p_site: Array, near: float) -> Mask:
+    """Return which shots belong to firings of which one may pass a point closely.
+
+    Parameters
+    ----------
+    shots : Shots
+        The shots of whole firings.
+    rig : Rig
+        The true rig.
+    T_site_base : (4, 4)
+        True pose of the base [m].
+    p_site : (m, 3)
+        The points [m].
+    near : float
+        What closely means [m].
+
+    Returns
+    -------
+    (n,)
+        True for all shots of such a firing; some of them may still pass none.
+    """
+    first = slice(None, None, N_LASERS)
+    posed = _posed(rig.T_head_lidar, T_site_base)
+    limits = (near, np.abs(rig.laser_elevations).max(), np.abs(rig.laser_heights).max())
+    found = _may_pass(shots.azimuths[first], shots.gimbal_angles[first], posed, p_site, limits)
+    return np.asarray(np.repeat(found, N_LASERS))
 
 
 def record(
@@ -307,6 +356,47 @@ def _posed(T_head_lidar: Array, T_site_base: Array) -> Array:
     turning[1, :2, :2] = [[0.0, -1.0], [1.0, 0.0]]
     turning[2, 2:, 2:] = [[1.0, 0.0], [0.0, 1.0]]
     return np.ascontiguousarray((T_site_base @ turning @ T_head_lidar)[:, :3])
+
+
+@numba.njit(cache=True, nogil=True)
+def _may_pass(
+    azimuths: Array,
+    gimbal_angles: Array,
+    posed: Array,
+    points: Array,
+    limits: tuple[float, float, float],
+) -> Mask:  # pragma: no cover
+    """Return which firings, fans about the spin axis, may pass a point within the first limit.
+
+    The others are the steepest elevation and the largest height of a laser.
+    """
+    near, steepest, highest = limits
+    slope, reach = np.tan(steepest), near / np.cos(steepest) + highest
+    found = np.zeros(len(azimuths), dtype=np.bool_)
+    w, axis, ahead = np.empty(3), np.empty(3), np.empty(3)
+    for i in range(len(azimuths)):
+        c, s = np.cos(gimbal_angles[i]), np.sin(gimbal_angles[i])
+        x, y = np.cos(azimuths[i]), -np.sin(azimuths[i])
+        for k in range(3):
+            column_x = c * posed[0, k, 0] + s * posed[1, k, 0] + posed[2, k, 0]
+            column_y = c * posed[0, k, 1] + s * posed[1, k, 1] + posed[2, k, 1]
+            ahead[k] = x * column_x + y * column_y
+            axis[k] = c * posed[0, k, 2] + s * posed[1, k, 2] + posed[2, k, 2]
+            w[k] = c * posed[0, k, 3] + s * posed[1, k, 3] + posed[2, k, 3]
+        for j in range(len(points)):
+            px, py, pz = points[j, 0] - w[0], points[j, 1] - w[1], points[j, 2] - w[2]
+            forward = px * ahead[0] + py * ahead[1] + pz * ahead[2]
+            along = px * axis[0] + py * axis[1] + pz * axis[2]
+            from_axis2 = max(px * px + py * py + pz * pz - along * along, 0.0)
+            from_axis = np.sqrt(from_axis2)
+            if (
+                forward > -reach
+                and from_axis2 - forward * forward <= (near + _TURN_WITHIN * from_axis) ** 2
+                and abs(along) <= reach + slope * from_axis
+            ):
+                found[i] = True
+                break
+    return found
 
 
 @numba.njit(cache=True, nogil=True)

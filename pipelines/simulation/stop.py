@@ -11,8 +11,8 @@ import numpy as np
 
 from pipelines.errors import InputError
 from pipelines.geometry import rigid, rot_x, rot_y, rot_z
-from pipelines.rigs import FIRING_CYCLE, rig_digest
-from pipelines.simulation.echo import trace
+from pipelines.rigs import FIRING_CYCLE, N_LASERS, rig_digest
+from pipelines.simulation.echo import NEAR, Echoes, trace
 from pipelines.simulation.field import Field, checked_seed
 from pipelines.simulation.options import SimulationConfig
 from pipelines.simulation.rig import (
@@ -25,7 +25,15 @@ from pipelines.simulation.rig import (
     turning,
 )
 from pipelines.simulation.scene import Scene
-from pipelines.simulation.sensor import FIRINGS_PER_PACKET, Recorded, aim, fire, record
+from pipelines.simulation.sensor import (
+    FIRINGS_PER_PACKET,
+    Recorded,
+    Shots,
+    aim,
+    fire,
+    may_pass,
+    record,
+)
 from pipelines.simulation.visibility import visible_shares
 from pipelines.values import Array, Firings, Nanos, Origin, Rig, ScanLog, StopTruth, Truth
 
@@ -35,6 +43,7 @@ _CHUNK = 683 * FIRINGS_PER_PACKET  # firings at a time: some 100 MB of work spac
 _FIRST_STOP = datetime(2026, 5, 11, 9, 0, tzinfo=UTC)
 _BETWEEN_STOPS = timedelta(seconds=90)
 _HOME = np.radians(1.0)  # the gimbal starts within this of zero
+_THINNING = 128  # one firing in so many is traced in any case: every 7 ms
 _RIG, _STOP = 100, 101  # streams of chance
 
 
@@ -234,8 +243,21 @@ def _scan(
     for first in range(0, n, _CHUNK):
         progress(first / n, "Casting beams")
         shots = fire(first, min(_CHUNK, n - first), start_azimuth, run.motion, config.spin_rpm)
-        aims = aim(shots, rig, run.T_site_base)
-        echoes = trace(run.scene, aims, rig.divergence, only_near_spheres=config.only_near_spheres)
+        if config.only_near_spheres:
+            echoes = _near_spheres(run, shots)
+        else:
+            echoes = trace(run.scene, aim(shots, rig, run.T_site_base), rig.divergence)
         pieces.append(record(shots, echoes, rig, config, rng))
     progress(1.0, "All beams cast")
     return pieces
+
+
+def _near_spheres(run: _Run, shots: Shots) -> Echoes:
+    """Return the echoes of shots that pass spheres closely, and of one firing in 128.
+
+    Those tell of the turn and of the ground.
+    """
+    anyway = np.arange(len(shots.rings)) // N_LASERS % _THINNING == 0
+    chosen = anyway | may_pass(shots, run.rig, run.T_site_base, run.scene.spheres.p_site, NEAR)
+    aims = aim(shots.rows(chosen), run.rig, run.T_site_base)
+    return trace(run.scene, aims, run.rig.divergence, anyway[chosen]).among(chosen)

@@ -1,11 +1,14 @@
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
+from pipelines.geometry import rigid, rot_z
 from pipelines.simulation import SimulationConfig
 from pipelines.simulation.echo import Echoes
 from pipelines.simulation.rig import even_turn, nominal_rig
-from pipelines.simulation.sensor import aim, fire, record
+from pipelines.simulation.sensor import aim, fire, may_pass, record
 
 N_FIRINGS = 4008
 CONFIG = SimulationConfig()
@@ -75,6 +78,23 @@ def test_beams_aim_as_the_frames_are_defined(shots):
         )
         assert_allclose(aims.origins_site[i], pose[:3, 3] + turn @ origin[:3], atol=1e-12)
         assert_allclose(aims.spin_axes_site[i], turn[:, 0], atol=1e-12)
+
+
+@pytest.mark.parametrize("rpm", [300.0, 1200.0])
+def test_no_shot_that_passes_a_point_closely_is_overlooked(rpm):
+    rng, near = np.random.default_rng(5), 0.35
+    points = rng.uniform([-9, -9, -2], [9, 9, 3], (40, 3))
+    shots = fire(0, 20_000, 1.0, even_turn(replace(CONFIG, turn=1.0), 0.2), rpm)
+    rig, pose = nominal_rig(CONFIG), rigid(rot_z(0.3), (0.2, -0.1, 0.5))
+    aims, chosen = aim(shots, rig, pose), may_pass(shots, rig, pose, points, near)
+    passes = np.zeros(len(chosen), dtype=bool)
+    for p in points:
+        w = p - aims.origins_site
+        along = np.sum(w * aims.directions_site, axis=1)
+        passes |= (along > 0) & (np.sum(w**2, axis=1) - along**2 <= near**2)
+    assert passes.mean() > 0.01
+    assert not np.any(passes & ~chosen)
+    assert chosen.mean() < 10 * passes.mean()
 
 
 def test_ranges_are_multiples_of_2_mm(shots):
