@@ -219,10 +219,9 @@ class JobQueue:
     def _finish(self, live: _Live, outcome: Outcome) -> JobRecord:
         """Write results and end of a job in one transaction; a dismissed job keeps none."""
         job_id = live.job.job_id
-        try:
-            return self._catalogue.finish_job(job_id, outcome.tables, message=outcome.message)
-        except ConflictError:
-            return self._catalogue.get_job(job_id)
+        with suppress(ConflictError):
+            self._catalogue.finish_job(job_id, outcome.tables, message=outcome.message)
+        return self._catalogue.get_job(job_id)
 
     async def _fail(
         self, live: _Live, code: str, reason: str, trace: str | None = None

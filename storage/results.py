@@ -123,6 +123,7 @@ _SCHEMAS = {
 }
 TABLES = tuple(_SCHEMAS)
 """Names of the tables that a job writes, in the order of writing."""
+_COMPARED = ("marker_fits", "station_fixes", "resections")  # have errors against truth
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -226,13 +227,16 @@ def with_errors(known: Mapping[str, pa.Table], truth: Truth | None) -> dict[str,
     dict of str to Table
         The same tables with their ``error_*`` columns replaced.
     """
-    truths = {} if truth is None else {stop.name: stop for stop in truth.stops}
+    if truth is None:
+        return {
+            name: _with_columns(table, [{}] * len(table)) if name in _COMPARED else table
+            for name, table in known.items()
+        }
+    truths = {stop.name: stop for stop in truth.stops}
     out = dict(known)
-    if truth is not None and "marker_fits" in known:
+    if "marker_fits" in known:
         errors = _marker_errors(known["marker_fits"], _levellings(known), truths, truth.marks)
         out["marker_fits"] = _with_columns(known["marker_fits"], errors)
-    elif "marker_fits" in known:
-        out["marker_fits"] = _with_columns(known["marker_fits"], [{}] * len(known["marker_fits"]))
     if "station_fixes" in known:
         fixes = known["station_fixes"].to_pylist()
         errors = [_station_errors(row, truths.get(row["stop"])) for row in fixes]
