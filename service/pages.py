@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from typing import Annotated, Any
 
 from fastapi import APIRouter, Query, Request
@@ -100,7 +100,7 @@ _STOP = """
 SELECT x.*, r.job_id, r.recording_id, c.name AS recording, r.finished_at, r.code_version,
     r.config_digest, r.rig_digest
 FROM stops AS x JOIN latest_runs AS r USING (run_id) JOIN recordings AS c USING (recording_id)
-WHERE r.survey_id = $id AND x.stop = $stop ORDER BY r.finished_at DESC LIMIT 1
+WHERE r.survey_id = $id AND x.stop = $stop ORDER BY r.finished_at DESC
 """
 _STOP_METHODS = """
 SELECT DISTINCT fit_method FROM (
@@ -194,13 +194,16 @@ def stop(
     service: Current,
     method: Annotated[str, Query()] = "",
     marker: Annotated[str, Query()] = "",
+    recording: Annotated[str, Query()] = "",
 ) -> str:
-    """Show one stop."""
+    """Show one stop; where several logs have one of this name, that of the newest results."""
     survey = _survey(service, name)
     found = service.catalogue.rows(_STOP, {"id": survey["survey_id"], "stop": stop})
     if not found:
         raise NotFoundError(f"The survey {survey['name']} has no results of a stop {stop!r}.")
-    return pages.stop_page(_stop_page(service, survey, found[0], method, marker))
+    chosen = next((row for row in found if row["recording_id"] == recording), found[0])
+    page = _stop_page(service, survey, chosen, method, marker)
+    return pages.stop_page(replace(page, namesakes=tuple(found) if len(found) > 1 else ()))
 
 
 @router.get("/surveys/{name:path}")

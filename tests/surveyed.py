@@ -176,13 +176,15 @@ def fill(
     with_truth=True,
     lane="lane3",
     at=NOW,
+    all_called=None,
 ):
     """Put a survey with a lane of stops into a catalogue, one job for each."""
     rng, control = np.random.default_rng(7), marks()
     survey = catalogue.create_survey(name)
     catalogue.put_control_marks(name, control)
     places = np.column_stack([np.linspace(-4, 4, n_stops), np.full((n_stops, 2), [0.4, 1.1])])
-    stops = [stop(f"{lane}-stop{i + 1}", place, control, rng) for i, place in enumerate(places)]
+    names = [all_called or f"{lane}-stop{i + 1}" for i in range(n_stops)]
+    stops = [stop(*named, control, rng) for named in zip(names, places, strict=True)]
     if with_truth:
         poses = tuple(pose for _, pose in stops)
         catalogue.put_truth(name, Truth(marks=control, stops=poses, rig=None))
@@ -193,7 +195,7 @@ def fill(
 
 def _finish(catalogue, folder, survey_id, moment, result, control):
     """Enter a recording and a successful job with its results."""
-    digest = hashlib.sha256(f"{survey_id} {result.name}".encode()).hexdigest()
+    digest = hashlib.sha256(f"{survey_id} {moment}".encode()).hexdigest()
     report = {"verdict": "ok", "reasons": [], "topics": [{"topic": "/points", "n_messages": 132}]}
     catalogue.add_recording(
         digest, name=result.name, size_bytes=91_000_000, url="/nowhere.mcap", preflight=report

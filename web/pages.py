@@ -94,7 +94,10 @@ class SurveyPage:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class StopPage:
-    """One stop by one method; ``marker`` is the one to look at from near, if any."""
+    """One stop by one method; ``marker`` is the one to look at from near, if any.
+
+    ``namesakes`` are this stop and others of its name, from other logs of the survey.
+    """
 
     frame: Frame
     survey: str
@@ -110,6 +113,7 @@ class StopPage:
     fixes: tuple[Row, ...]
     observations: Columns
     scan: scene.Scan | None
+    namesakes: tuple[Row, ...] = ()
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -22,6 +22,8 @@ def client(tmp_path_factory):
     with Catalogue(data / "spheremark.duckdb", snapshots=data / "snapshots") as catalogue:
         fill(catalogue, data / "clouds", WICKED, n_stops=1, with_truth=False, lane="a/b<i>")
         fill(catalogue, data / "clouds", "field", n_stops=2, at=NOW + timedelta(days=1))
+        twins = {"with_truth": False, "all_called": "scan", "at": NOW - timedelta(days=1)}
+        fill(catalogue, data / "clouds", "twins", n_stops=2, **twins)
         catalogue.create_survey("empty")
         recording = catalogue.list_recordings().items[0].recording_id
         job = catalogue.create_job("process", survey="empty", recording_id=recording, config={})
@@ -105,6 +107,17 @@ def test_a_marker_can_be_seen_from_near_by_each_method(client, method):
     text = page(client, f"/surveys/field/stops/lane3-stop1?method={method}&marker=M03")
     assert 'id="figure-returns"' in text
     assert "Marker M03" in text
+
+
+def test_logs_of_one_name_are_each_within_reach(client):
+    newest = page(client, "/surveys/twins/stops/scan")
+    assert "2 logs of this survey have a stop of this name" in newest
+    places = set()
+    for address in set(re.findall(r'href="(/surveys/twins/stops/scan\?[^"]+)"', newest)):
+        text = page(client, address.replace("&amp;", "&"))
+        places.add(round(float(re.search(r"<dt>x, site</dt><dd>([^<]+)", text)[1])))
+    assert places == {-4, 4}
+    assert "logs of this survey" not in page(client, "/surveys/field/stops/lane3-stop1")
 
 
 def test_an_empty_survey_says_what_to_do(client):
