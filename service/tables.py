@@ -12,6 +12,7 @@ from rich.console import Console
 from rich.markup import escape
 from rich.measure import Measurement
 from rich.table import Table
+from rich.text import Text
 
 from storage.recordings import Preflight
 
@@ -24,9 +25,9 @@ Plain = Mapping[str, Any]
 
 def print_preflight(out: Console, name: str, report: Preflight) -> None:
     """Print what a log holds and lacks."""
-    out.print(f"[bold]{name}[/]: {_coloured(report.verdict)}")
+    out.print(f"[bold]{escape(name)}[/]: {_coloured(report.verdict)}")
     for reason in (*report.reasons, *report.notes):
-        out.print(f"  {reason}", highlight=False)
+        out.print(f"  {escape(reason)}", highlight=False)
     if report.topics:
         rows = [
             (t.topic, t.schema, f"{t.n_messages:,}", f"{t.rate_hz:.1f}", f"{t.longest_gap_s:.3f}")
@@ -53,7 +54,7 @@ def print_preflight(out: Console, name: str, report: Preflight) -> None:
 def print_answer(out: Console, answer: Plain) -> None:
     """Print markers and station of each stop of a log."""
     for stop in answer["stops"]:
-        out.print(f"[bold]{stop['name']}[/]  (centres in the {stop['frame']} frame)")
+        out.print(f"[bold]{escape(stop['name'])}[/]  (centres in the {stop['frame']} frame)")
         out.print(_markers(stop["markers"]))
         for one in stop["markers"]:
             if one["reason"]:
@@ -345,7 +346,9 @@ def print_network(out: Console, answer: Plain) -> None:
         out.print(_table((kind[:-1], *heads), rows))
     _print_checks(out, answer)
     for one in answer["refused"]:
-        out.print(f"  {one['station']}: {escape(one['reason'])}", highlight=False, soft_wrap=True)
+        out.print(
+            f"  {escape(one['station'])}: {escape(one['reason'])}", highlight=False, soft_wrap=True
+        )
     for one in answer["excluded"]:
         what = " ".join(part for part in (one["station"], one["marker"], one["mark"]) if part)
         text = f"  {one['kind'].capitalize()} {what}: {escape(one['reason'])}"
@@ -356,7 +359,7 @@ def _print_checks(out: Console, answer: Plain) -> None:
     """Print what is known of a network's accuracy without truth."""
     for row in answer["marks"]:
         if row["status"] != "ok":
-            out.print(f"  Mark {row['name']}: {escape(row['reason'])}", highlight=False)
+            out.print(f"  Mark {escape(row['name'])}: {escape(row['reason'])}", highlight=False)
     rows = [
         (
             row["mark"],
@@ -424,7 +427,7 @@ def _markers(markers: Sequence[Plain]) -> Table:
     has_errors = any("error_3d_m" in marker for marker in markers)
     rows = []
     for one in markers:
-        row = [one["id"], one["method"], _coloured(one["status"])]
+        row = [one["id"], one["method"], Text.from_markup(_coloured(one["status"]))]
         row += [f"{value:.4f}" for value in one["centre_m"]]
         row += [_mm(one["sigma_3d_m"]), f"{one['range_m']:.2f}", str(one["n_points"])]
         row += [_mm(one["rms_m"])]
@@ -432,13 +435,13 @@ def _markers(markers: Sequence[Plain]) -> Table:
     return _table(heads + (["error [mm]"] if has_errors else []), rows, left=3)
 
 
-def _table(heads: Sequence[str], rows: Sequence[Sequence[str]], left: int = 1) -> Table:
-    """Return a table whose first columns are flush left."""
+def _table(heads: Sequence[str], rows: Sequence[Sequence[str | Text]], left: int = 1) -> Table:
+    """Return a table whose first columns are flush left; strings stand as they are."""
     table = Table(box=None, pad_edge=False, header_style="bold")
     for i, head in enumerate(heads):
         table.add_column(escape(head), justify="left" if i < left else "right")
     for row in rows:
-        table.add_row(*row)
+        table.add_row(*(escape(cell) if isinstance(cell, str) else cell for cell in row))
     return table
 
 

@@ -129,7 +129,9 @@ def test_truth_adds_errors_and_changes_nothing_else(answer, stop):
 def test_people_get_a_table_and_programs_get_json(stop):
     assert "M08" in run("process", stop.log).stdout
     assert json.loads(run("inspect", stop.log, "--json").stdout)["verdict"] in ("ok", "weak")
-    assert "/velodyne_points" in run("inspect", stop.log).stdout
+    table = run("inspect", stop.log).stdout
+    assert "/velodyne_points" in table
+    assert "duration [s]" in table
 
 
 def test_a_failure_is_one_sentence_and_exit_code_1(tmp_path):
