@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import ThreadPoolExecutor, wait
 from itertools import pairwise
 from typing import TypeVar
 
 _Part = TypeVar("_Part")
 
 _N_PARTS = 2  # always: sums are taken part by part, and must not depend on the machine
+_N_CALLERS = 32  # that may wait for each other's parts; a thread starts when none is idle
+_POOL = ThreadPoolExecutor(_N_CALLERS)  # kept: to start a thread costs more than many a part
 
 
 def side_by_side(
@@ -35,6 +37,9 @@ def side_by_side(
     if n_rows < worth:
         return [work(0, n_rows)]
     edges = [part * n_rows // _N_PARTS for part in range(_N_PARTS + 1)]
-    with ThreadPoolExecutor(_N_PARTS - 1) as pool:
-        others = [pool.submit(work, *span) for span in pairwise(edges[1:])]
-        return [work(edges[0], edges[1]), *(other.result() for other in others)]
+    others = [_POOL.submit(work, *span) for span in pairwise(edges[1:])]
+    try:
+        own = work(edges[0], edges[1])
+    finally:
+        wait(others)
+    return [own, *(other.result() for other in others)]
