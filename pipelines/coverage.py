@@ -7,8 +7,9 @@ are not independent: intervals are made by drawing whole surveys again.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 from scipy.stats import chi2
@@ -20,6 +21,7 @@ from pipelines.network import adjust_network, assemble
 from pipelines.resection import resect
 from pipelines.simulation import Field, SimulationConfig, scenario, simulate_stop
 from pipelines.survey import Progress, process
+from pipelines.threads import in_processes
 from pipelines.values import Array, ControlMarks, Index, MarkerFits, StopTruth, _seal
 
 QUANTITIES = {"horizontal": 2, "position": 3, "pose": 6}
@@ -95,7 +97,6 @@ def survey_draws(
     n_stops: int,
     config: SurveyConfig | None = None,
     simulation: SimulationConfig | None = None,
-    progress: Progress = lambda _share, _what: None,
 ) -> Draws:
     """Simulate one survey, position its stations in both ways, and compare with the truth.
 
@@ -109,8 +110,6 @@ def survey_draws(
         How logs are processed; the first fitting method counts. The default one, if missing.
     simulation : SimulationConfig, optional
         How the rig errs; the default one, with only the beams near spheres, if missing.
-    progress : callable
-        Told the share of the work that is done, 0 to 1, and what comes next; may raise to cancel.
 
     Returns
     -------
@@ -128,8 +127,7 @@ def survey_draws(
     if not 1 <= n_stops <= len(field.stops):
         raise ConfigError(f"{n_stops} stops are wanted; a survey has 1 to {len(field.stops)}.")
     scans, truths = [], []
-    for i, name in enumerate(_spread(field, n_stops)):
-        progress(i / n_stops, f"Survey {seed}: {name}")
+    for name in _spread(field, n_stops):
         stop = simulate_stop(field, name, simulation)
         (result,) = process(stop.log, config=config)
         scans.append((name, result.fits[config.fitting.methods[0]]))
@@ -308,8 +306,16 @@ def nees(draws: Draws) -> dict[tuple[str, str], float]:
     }
 
 
-def simulate_surveys(n_surveys: int, n_stops: int, seed: int, progress: Progress) -> Draws:
-    """Simulate many surveys.
+def simulate_surveys(
+    n_surveys: int,
+    n_stops: int,
+    seed: int,
+    *,
+    simulation: SimulationConfig | None = None,
+    n_processes: int | None = None,
+    progress: Progress = lambda _share, _what: None,
+) -> Draws:
+    """Simulate many surveys, some at a time.
 
     Parameters
     ----------
@@ -319,6 +325,10 @@ def simulate_surveys(n_surveys: int, n_stops: int, seed: int, progress: Progress
         Stops of each.
     seed : int
         Source of chance of the first; the others follow.
+    simulation : SimulationConfig, optional
+        How the rig errs; the default one, with only the beams near spheres, if missing.
+    n_processes : int, optional
+        How many at a time; as many as there are processors by default.
     progress : callable
         Told the share of the work that is done, 0 to 1, and what comes next; may raise to cancel.
 
@@ -327,13 +337,9 @@ def simulate_surveys(n_surveys: int, n_stops: int, seed: int, progress: Progress
     Draws
         One row for each station.
     """
-
-    def part(i: int) -> Callable[[float, str], None]:
-        return lambda share, what: progress((i + share) / n_surveys, what)
-
-    return joined(
-        survey_draws(seed + i, n_stops=n_stops, progress=part(i)) for i in range(n_surveys)
-    )
+    survey = partial(survey_draws, n_stops=n_stops, simulation=simulation)
+    seeds = range(seed, seed + n_surveys)
+    return joined(in_processes(survey, seeds, n_processes=n_processes, progress=progress))
 
 
 def _resampled(surveys: Index, rng: np.random.Generator) -> Array:

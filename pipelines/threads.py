@@ -1,10 +1,12 @@
-"""Compiled loops side by side: hides how the rows of a scan are shared among threads."""
+"""Work side by side: hides how rows of a scan and simulated worlds are shared among processors."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor, wait
+import os
+from collections.abc import Callable, Sequence
+from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor, as_completed, wait
 from itertools import pairwise
+from multiprocessing import get_context
 from typing import TypeVar
 
 _Part = TypeVar("_Part")
@@ -43,3 +45,52 @@ def side_by_side(
     finally:
         wait(others)
     return [own, *(other.result() for other in others)]
+
+
+def in_processes(
+    work: Callable[[int], _Part],
+    seeds: Sequence[int],
+    *,
+    n_processes: int | None = None,
+    progress: Callable[[float, str], None] = lambda _share, _what: None,
+) -> list[_Part]:
+    """Do the same for many seeds, each in one of some fresh processes.
+
+    Parameters
+    ----------
+    work : callable
+        Told a seed; a function of a module, or part of one, so that another process finds it.
+    seeds : sequence of int
+        What to tell it.
+    n_processes : int, optional
+        How many at a time; as many as there are processors by default. With 1 there is none but
+        this one.
+    progress : callable
+        Told the share of the work that is done, 0 to 1, and how much; may raise to cancel.
+
+    Returns
+    -------
+    list
+        What ``work`` returned for each seed, in their order.
+    """
+    n, found = len(seeds), dict[int, _Part]()
+
+    def enter(place: int, part: _Part) -> None:
+        found[place] = part
+        progress(len(found) / n, f"{len(found)} of {n} done")
+
+    n_processes = min(n_processes or os.cpu_count() or 1, n)
+    progress(0.0, f"0 of {n} done")
+    if n_processes <= 1:
+        for place, seed in enumerate(seeds):
+            enter(place, work(seed))
+        return [found[place] for place in range(n)]
+    with ProcessPoolExecutor(n_processes, get_context("spawn")) as pool:
+        places = {pool.submit(work, seed): place for place, seed in enumerate(seeds)}
+        try:
+            for done in as_completed(places):
+                enter(places[done], done.result())
+        except BaseException:
+            pool.shutdown(cancel_futures=True)
+            raise
+    return [found[place] for place in range(n)]

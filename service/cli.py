@@ -11,11 +11,12 @@ import math
 import sys
 from enum import StrEnum
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated
 
 import typer
 
 from pipelines.errors import ConfigError, SpheremarkError
+from service.cli_bench import bench
 from service.cli_plan import plan
 from service.cli_site import site
 from service.cli_survey import (
@@ -32,9 +33,7 @@ from service.cli_survey import (
 from service.terminal import err, out
 from service.terminal import print_json as _print_json
 from service.terminal import progress as _progress
-
-if TYPE_CHECKING:
-    from service.settings import Settings
+from service.terminal import settings as _settings
 
 app = typer.Typer(
     help="Station positions from spherical markers and a gimbal-mounted LiDAR.",
@@ -254,6 +253,7 @@ def process(
 app.command()(adjust)
 app.command()(calibrate)
 app.command()(site)
+app.command()(bench)
 
 
 @app.command()
@@ -295,94 +295,6 @@ def export(
 
 
 @app.command()
-def bench(
-    log: Annotated[
-        Path | None, typer.Argument(exists=True, dir_okay=False, help="Log; simulated if missing.")
-    ] = None,
-    repeats: Annotated[int, typer.Option(min=1, help="The best of so many counts.")] = 5,
-    quick: Annotated[bool, typer.Option("--quick", help="Without the usual libraries.")] = False,
-    long: Annotated[
-        bool, typer.Option("--long", help="Also logs of 1, 3, 10 and 30 million returns.")
-    ] = False,
-    extraction: Annotated[
-        bool, typer.Option("--extraction", help="Precision and recall of extraction instead.")
-    ] = False,
-    worlds: Annotated[int, typer.Option(min=1, help="Worlds of each scenario for that.")] = 3,
-    accuracy: Annotated[
-        bool, typer.Option("--accuracy", help="Precision of centres by every method instead.")
-    ] = False,
-    coverage: Annotated[
-        int, typer.Option(min=0, help="Do error ellipses hold? So many surveys instead.")
-    ] = 0,
-    stops: Annotated[int, typer.Option(min=1, help="Stops of 120 markers for --accuracy.")] = 3,
-    full: Annotated[
-        bool, typer.Option("--full", help="Over 1000 fits at each distance for --accuracy.")
-    ] = False,
-    seed: Annotated[int, typer.Option(min=0, help="Seed of the first of them.")] = 0,
-    as_json: AsJson = False,
-) -> None:
-    """Measure each step against one read of the file with a checksum, in the same run."""
-    if extraction:
-        _bench_extraction(worlds, seed, as_json=as_json)
-        return
-    if coverage:
-        _bench_coverage(coverage, seed, as_json=as_json)
-        return
-    if accuracy:
-        _bench_accuracy(stops, seed, is_full=full, as_json=as_json)
-        return
-    from service import bench as benches
-    from service import tables
-
-    with _progress() as progress:
-        wish = benches.Wish(repeats=repeats, is_quick=quick, is_long=long)
-        report = benches.run(log, wish, progress)
-    if as_json:
-        _print_json(report)
-    else:
-        tables.print_bench(out, report)
-
-
-def _bench_coverage(n_surveys: int, seed: int, *, as_json: bool) -> None:
-    """Measure how often stations of simulated surveys lie within their ellipses; keep it."""
-    from service import coverage
-
-    with _progress() as progress:
-        report = coverage.run(n_surveys, seed, progress)
-    path = coverage.keep(report, _settings().data)
-    if as_json:
-        _print_json(report)
-    else:
-        coverage.print_report(out, report)
-        err.print(f"Kept as {path}; the service shows it at /coverage.")
-
-
-def _bench_extraction(worlds: int, seed: int, *, as_json: bool) -> None:
-    """Measure precision and recall of extraction in simulated worlds."""
-    from service import detection
-
-    with _progress() as progress:
-        report = detection.run(worlds, seed, progress)
-    if as_json:
-        _print_json(report)
-    else:
-        detection.print_report(out, report)
-
-
-def _bench_accuracy(stops: int, seed: int, *, is_full: bool, as_json: bool) -> None:
-    """Measure the precision of centres against distance, by every method."""
-    from service import precision
-
-    with _progress() as progress:
-        few = precision.Wish(n_stops=stops, seed=seed)
-        report = precision.run(precision.full_wish(seed) if is_full else few, progress)
-    if as_json:
-        _print_json(report)
-    else:
-        precision.print_report(out, report)
-
-
-@app.command()
 def reproduce(
     folder: Annotated[
         Path, typer.Argument(metavar="[OUT]", help="Folder for page, tables and figures.")
@@ -409,21 +321,6 @@ def reproduce(
         _print_json(report)
     else:
         tables.print_reproduction(out, report)
-
-
-def _settings(**given: Any) -> Settings:
-    """Read the settings; a wrong one is a misuse, said in a sentence."""
-    from pydantic import ValidationError
-
-    from service.settings import Settings
-
-    try:
-        return Settings(**given)
-    except ValidationError as error:
-        for one in error.errors():
-            name = "_".join(["SPHEREMARK", *(str(part).upper() for part in one["loc"])])
-            err.print(f"[bold red]Error:[/] {name}: {one['msg']}", highlight=False, soft_wrap=True)
-        raise typer.Exit(2) from None
 
 
 if __name__ == "__main__":

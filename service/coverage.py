@@ -32,7 +32,7 @@ from service.provenance import code_version
 
 Plain = dict[str, Any]
 
-N_STOPS = 7
+N_STOPS = 15
 """Stops of each survey."""
 
 NAME = "coverage.json"
@@ -44,7 +44,7 @@ _BINS = np.arange(0.0, 20.5, 0.5)
 
 def run(n_surveys: int, seed: int, progress: Progress) -> Plain:
     """Simulate surveys and report how often their stations lie within their ellipses."""
-    return report(simulate_surveys(n_surveys, N_STOPS, seed, progress), seed)
+    return report(simulate_surveys(n_surveys, N_STOPS, seed, progress=progress), seed)
 
 
 def report(draws: Draws, seed: int) -> Plain:

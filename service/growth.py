@@ -1,7 +1,7 @@
 """How cost grows: scans of a million returns to thirty, networks of a hundred stations and more.
 
 A straight line through times against sizes tells whether cost is linear: what stays fixed, what
-each return costs, and how far the worst size is from the line.
+each return or station costs, and how far the worst size is from the line.
 """
 
 from __future__ import annotations
@@ -34,7 +34,8 @@ from storage.recordings import read_log, write_log
 _SIZES = (1, 2, 3, 6, 10, 20, 30)  # [millions of returns]
 _REPEATS = 2
 _CHAIN = "log to rows committed"
-_NETWORKS = ((100, 20), (300, 60), (1000, 200))  # stations and marks
+_STATIONS, _MARKS = (100, 200, 500, 1000), 200
+_SMALL = ((35, 14), (300, 60))  # stations and marks of other networks
 _AREA = 72.0  # [m^2] for each mark: 120 m by 120 m for 200 of them
 _SEEN = 14  # marks that a station sees: the nearest
 _SIGMA, _SIGMA_LEVEL, _SIGMA_CONTROL = 4e-3, 3e-3, 5e-3  # [m], [rad], [m]
@@ -50,10 +51,20 @@ def grown(scan: Scan, folder: Path, progress: Progress) -> Plain:
         progress(0.8 + 0.15 * i / len(_SIZES), f"A log of {millions} million returns")
         sizes.append(measured(log, millions * 1_000_000, scan, folder))
     progress(0.95, "Networks")
-    adjust(*_NETWORKS[0])  # compiles what there is to compile
+    small = [adjust(*size) for size in (_SMALL[0], *_SMALL)]  # the first compiles
+    large = [adjust(n, _MARKS) for n in _STATIONS]
     return {
-        "linearity": {"sizes": sizes, **line(sizes), "cpu": line(sizes, "cpu_seconds")},
-        "network": [adjust(*size) for size in _NETWORKS],
+        "linearity": {
+            "sizes": sizes,
+            **line(sizes, "n_returns", "seconds"),
+            "cpu": line(sizes, "n_returns", "cpu_seconds"),
+        },
+        "network": [*small[1:], *large],
+        "network_linearity": {"n_marks": _MARKS}
+        | {
+            step: line(large, "n_stations", f"{step}_cpu_seconds")
+            for step in ("assembly", "adjustment")
+        },
     }
 
 
@@ -76,14 +87,14 @@ def measured(log: ScanLog, n_returns: int, scan: Scan, folder: Path) -> Plain:
     }
 
 
-def line(sizes: Sequence[Plain], cost: str = "seconds") -> Plain:
-    """Fit a straight line to costs against returns, all sizes by their relative error alike."""
-    n, seconds = (np.array([one[key] for one in sizes]) for key in ("n_returns", cost))
+def line(sizes: Sequence[Plain], size: str, cost: str) -> Plain:
+    """Fit a straight line to costs against sizes, all of them by their relative error alike."""
+    n, seconds = (np.array([one[key] for one in sizes]) for key in (size, cost))
     rows = np.column_stack([np.ones(len(n)), n]) / seconds[:, None]
     (fixed, each), *_ = np.linalg.lstsq(rows, np.ones(len(n)), rcond=None)
     return {
         "fixed_seconds": float(fixed),
-        "line_ns_per_return": float(1e9 * each),
+        "line_seconds_each": float(each),
         "worst_share_off_line": float(np.abs(rows @ [fixed, each] - 1.0).max()),
     }
 
@@ -136,7 +147,6 @@ def adjust(n_stations: int, n_marks: int) -> Plain:
         "adjustment_seconds": end - between,
         "assembly_cpu_seconds": cpu_between - cpu_start,
         "adjustment_cpu_seconds": cpu_end - cpu_between,
-        "ms_per_station": 1e3 * (end - start) / n_stations,
     }
 
 

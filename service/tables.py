@@ -206,6 +206,9 @@ def _print_peers(out: Console, report: Plain) -> None:
         out.print(_table(("centres", "found", "false", "RMS error [mm]"), rows))
 
 
+_EACH = ("assembly a station [ms CPU]", "adjustment a station [ms CPU]")
+
+
 def _print_growth(out: Console, report: Plain) -> None:
     """Print how cost grows with returns and with stations."""
     if linearity := report.get("linearity"):
@@ -222,24 +225,34 @@ def _print_growth(out: Console, report: Plain) -> None:
         heads = ("returns", "log to rows [s]", "ns a return", "CPU [ns]", "x read+CRC")
         out.print(_table(heads, rows))
         for what, fit in (("Time", linearity), ("CPU", linearity["cpu"])):
-            out.print(
-                f"{what} in a straight line: {1e3 * fit['fixed_seconds']:.1f} ms and "
-                f"{fit['line_ns_per_return']:.1f} ns a return; no size is farther from it than "
-                f"{100 * fit['worst_share_off_line']:.0f} %."
-            )
+            each = f"{1e9 * fit['line_seconds_each']:.1f} ns a return"
+            out.print(_straight(what, each, fit))
     if networks := report.get("network"):
         costs = [
             (
                 f"{one['n_stations']:,} x {one['n_marks']}",
                 f"{one['assembly_seconds']:.2f}",
                 f"{one['adjustment_seconds']:.2f}",
-                f"{1e3 * one['adjustment_seconds'] / one['n_stations']:.2f}",
-                f"{one['ms_per_station']:.2f}",
+                f"{1e3 * one['assembly_cpu_seconds'] / one['n_stations']:.2f}",
+                f"{1e3 * one['adjustment_cpu_seconds'] / one['n_stations']:.2f}",
             )
             for one in networks
         ]
-        names = ("stations x marks", "assembly [s]", "adjustment [s]", "ms a station", "both [ms]")
+        names = ("stations x marks", "assembly [s]", "adjustment [s]", *_EACH)
         out.print(_table(names, costs))
+        lines = report["network_linearity"]
+        for step in ("assembly", "adjustment"):
+            each = f"{1e3 * lines[step]['line_seconds_each']:.2f} ms a station"
+            what = f"CPU of {step} with {lines['n_marks']} marks"
+            out.print(_straight(what, each, lines[step]))
+
+
+def _straight(what: str, each: str, fit: Plain) -> str:
+    """Say what a straight line through costs is."""
+    return (
+        f"{what} in a straight line: {1e3 * fit['fixed_seconds']:.1f} ms and {each}; no size is "
+        f"farther from it than {100 * fit['worst_share_off_line']:.0f} %."
+    )
 
 
 _SAID = ("distance", "count", "mean_distance", "mean_count")

@@ -8,10 +8,12 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any
 
+import typer
 from rich.console import Console
 
 if TYPE_CHECKING:
     from pipelines.survey import Progress
+    from service.settings import Settings
 
 _WIDE = 160  # columns of a table that goes into a file or a pipe
 out = Console(width=None if sys.stdout.isatty() else _WIDE)
@@ -32,3 +34,18 @@ def progress() -> Iterator[Progress]:
 def print_json(value: Any) -> None:
     """Write JSON to standard output."""
     sys.stdout.write(json.dumps(value, indent=2, allow_nan=False) + "\n")
+
+
+def settings(**given: Any) -> Settings:
+    """Read the settings; a wrong one is a misuse, said in a sentence."""
+    from pydantic import ValidationError
+
+    from service.settings import Settings
+
+    try:
+        return Settings(**given)
+    except ValidationError as error:
+        for one in error.errors():
+            name = "_".join(["SPHEREMARK", *(str(part).upper() for part in one["loc"])])
+            err.print(f"[bold red]Error:[/] {name}: {one['msg']}", highlight=False, soft_wrap=True)
+        raise typer.Exit(2) from None

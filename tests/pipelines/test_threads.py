@@ -1,3 +1,4 @@
+import math
 import threading
 from dataclasses import replace
 
@@ -6,7 +7,7 @@ import pytest
 
 from pipelines.config import StitchingConfig
 from pipelines.stitching import stitch
-from pipelines.threads import side_by_side
+from pipelines.threads import in_processes, side_by_side
 from tests.synthetic import crooked_rig, scan_log
 
 
@@ -43,3 +44,25 @@ def test_returns_left_out_in_either_half_leave_no_gap():
     assert 50_000 < len(part.p_base) < len(whole.p_base)
     for column in ("p_base", "gimbal_angles", "intensities", "rings", "times"):
         np.testing.assert_array_equal(getattr(part, column), getattr(whole, column)[keep])
+
+
+def test_seeds_are_worked_on_in_other_processes_and_answered_in_order():
+    told = []
+    found = in_processes(
+        math.factorial, range(4), n_processes=2, progress=lambda share, _what: told.append(share)
+    )
+    assert found == [1, 1, 2, 6]
+    assert told == [0.0, 0.25, 0.5, 0.75, 1.0]
+
+
+def test_an_error_and_a_cancellation_in_a_process_reach_the_caller():
+    with pytest.raises(ValueError, match="negative"):
+        in_processes(math.factorial, [3, -1], n_processes=2)
+
+    def cancel(share, _what):
+        if share:
+            raise KeyboardInterrupt
+
+    for n_processes in (1, 2):
+        with pytest.raises(KeyboardInterrupt):
+            in_processes(math.factorial, range(5), n_processes=n_processes, progress=cancel)

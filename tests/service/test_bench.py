@@ -129,15 +129,26 @@ def test_a_stretched_log_turns_on_evenly(written):
 def test_a_straight_line_tells_what_is_fixed_and_what_each_return_costs():
     n = np.array([1e6, 3e6, 1e7])
     sizes = [{"n_returns": int(k), "seconds": 0.02 + 3e-8 * k} for k in n]
-    found = growth.line(sizes)
+    found = growth.line(sizes, "n_returns", "seconds")
     assert found["fixed_seconds"] == pytest.approx(0.02)
-    assert found["line_ns_per_return"] == pytest.approx(30.0)
+    assert found["line_seconds_each"] == pytest.approx(3e-8)
     assert found["worst_share_off_line"] < 1e-9
     sizes[2]["seconds"] *= 1.5
-    assert growth.line(sizes)["worst_share_off_line"] > 0.05
+    assert growth.line(sizes, "n_returns", "seconds")["worst_share_off_line"] > 0.05
 
 
 def test_a_network_is_assembled_and_adjusted_as_it_is_timed():
     found = growth.adjust(12, 20)
     assert (found["n_stations"], found["n_marks"], found["n_sightings"]) == (12, 20, 168)
     assert 0.8 < found["sigma0"] < 1.2
+
+
+def test_growth_is_printed_with_its_lines():
+    costs = {"fixed_seconds": 0.2, "line_seconds_each": 5e-3, "worst_share_off_line": 0.07}
+    network = [growth.adjust(n, 20) for n in (12, 24)]
+    lines = {"n_marks": 20, "assembly": costs, "adjustment": costs}
+    out = Console(record=True, width=160)
+    tables._print_growth(out, {"network": network, "network_linearity": lines})
+    text = out.export_text()
+    assert "24 x 20" in text
+    assert "CPU of adjustment with 20 marks in a straight line: 200.0 ms and 5.00 ms" in text
