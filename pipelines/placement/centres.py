@@ -29,8 +29,8 @@ REFERENCE_DISTANCE = 8.0
 """Distance at which the factors of a model hold [m]."""
 
 # Variance of fits by ``along_beam`` over the bound of their returns: towards, left, up. Pooled over
-# 2254 simulated spheres from 3 to 16 m; weights, the pole's side and lost limbs cost that much.
-_EFFICIENCY = (1.23, 1.42, 1.28)
+# 2092 simulated spheres from 3 to 16 m; weights, the pole's side and lost limbs cost that much.
+_EFFICIENCY = (0.99, 1.42, 1.28)
 Group = tuple[Any, ...]  # arrays and numbers that go together into a kernel
 _LOST_MAX = 0.05  # share of places between the lines where a sphere may be missed
 

@@ -142,8 +142,8 @@ class _Task(NamedTuple):
         What each adds.
     prior : (6, 6)
         What gravity tells.
-    shared2 : float
-        Variance of what all ranges are too long [m^2].
+    shared2 : tuple of float
+        Variances of what all ranges are too long, and of what all centres are too high [m^2].
     near : (c, c)
         Which candidates are too near to each other.
     wish : Requirement
@@ -153,7 +153,7 @@ class _Task(NamedTuple):
     sighting: Sighting
     added: Information
     prior: Array
-    shared2: float
+    shared2: tuple[float, float]
     near: np.ndarray
     wish: Requirement
     power: float = np.inf
@@ -339,7 +339,10 @@ def _task(
         sighting=sighting,
         added=information(sighting, wish),
         prior=prior,
-        shared2=shared_variance(model.sensor.sigma_range_bias),
+        shared2=(
+            shared_variance(model.sensor.sigma_range_bias),
+            wish.resection.sigma_height**2,
+        ),
         near=gaps < candidates.apart,
         wish=wish,
     )
@@ -626,23 +629,25 @@ def _gains(normal: Array, added: Array) -> Array:
 
 
 @numba.njit(cache=True, nogil=True)
-def _sigma_of(N: Array, spread: Array, pull: Array, shared2: float, inverse: Array) -> float:
+def _sigma_of(
+    N: Array, spread: Array, pull: Array, shared2: tuple[float, float], inverse: Array
+) -> float:
     """Return the 3-D sigma of one stop; large without a position."""
     if not inverted(N, inverse) or inverse[3, 3] + inverse[4, 4] + inverse[5, 5] > LOOSE2:
         return _LOST
-    total = 0.0
+    total = shared2[1]
     for i in range(3, 6):
         moved = 0.0
         for j in range(6):
             moved += inverse[i, j] * pull[j]
             for k in range(6):
                 total += inverse[i, j] * spread[j, k] * inverse[k, i]
-        total += shared2 * moved * moved
+        total += shared2[0] * moved * moved
     return float(np.sqrt(total))
 
 
 @numba.njit(cache=True, nogil=True)
-def _sigmas_of(sums: tuple[Array, Array, Array], shared2: float) -> Array:
+def _sigmas_of(sums: tuple[Array, Array, Array], shared2: tuple[float, float]) -> Array:
     """Return the 3-D sigma of each stop; large without a position."""
     normal, spread, pull = sums
     inverse = np.empty((6, 6))
@@ -656,7 +661,7 @@ def _sigmas_of(sums: tuple[Array, Array, Array], shared2: float) -> Array:
 def _judge(  # noqa: PLR0913  a kernel takes what it needs
     sums: tuple[Array, Array, Array],
     added: tuple[Array, Array, Array],
-    shared2: float,
+    shared2: tuple[float, float],
     places: Index,
     stops: Index,
     rule: tuple[float, float],

@@ -17,9 +17,7 @@ from pipelines.rigs import N_LASERS
 from pipelines.values import Array, Index, Mask
 
 _BIAS_LEFT = 0.22  # of the spread of laser biases: what a survey leaves to each centre, simulated
-_SIGMA_AIM = (
-    6e-5  # [rad] what mounting and encoder leave of a direction after both faces, simulated
-)
+_SIGMA_AIM = 3e-5  # [rad] of each direction, by mounting and encoder, after both faces; simulated
 _SINGULAR = 1e-11  # pivot over diagonal below which an unknown is undetermined
 LOOSE2 = 1.0
 """Variance of a position above which it is none [m^2]."""
@@ -98,7 +96,8 @@ def predict_positions(sighting: Sighting, wish: Requirement) -> Positions:
     ``J = [-[v]x, 1]`` of each mark and the AHRS's information ``G`` on roll and pitch; a survey
     takes what lasers and gimbal leave as different at every mark. The covariance of what comes out
     has them as they are: noise of each mark, what is left of its direction, and an excess of all
-    ranges together, which hardly moves a station that marks stand round: ``Q J' P C P J Q``.
+    ranges together, which hardly moves a station that marks stand round: ``Q J' P C P J Q``. What
+    all centres are too high, a station is too low.
     ``paper``: horizontal distances and heights of the three marks whose circles cut best, and the
     lean carried through them as ``ranging`` does; its heading is that of the three directions.
     """
@@ -117,6 +116,7 @@ def predict_positions(sighting: Sighting, wish: Requirement) -> Positions:
             (eyes, marks, covs, used), extra, wish.sigma_levelling**-2, (out, cofactor, moved)
         )
     out += shared_variance(sighting.sigma_laser_bias) * moved[:, :, None] * moved[:, None, :]
+    out[:, 5, 5] += wish.resection.sigma_height**2
     return Positions(cov_motion=out, cofactor=cofactor, used=used)
 
 
