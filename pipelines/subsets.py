@@ -12,6 +12,7 @@ from functools import partial
 from itertools import combinations
 from typing import NamedTuple
 
+import numba
 import numpy as np
 
 from pipelines.config import ResectionConfig
@@ -213,23 +214,82 @@ def place(q: Array, goals: Array, weights: Array, up: Array, of_gravity: Array) 
     would.
     """
     cov = _inverses(_normal_matrices(q, weights, up, of_gravity))
-    turn, shift, pull_up = np.zeros((3, len(q), 3))
-    step = np.full((len(q), 6), np.inf)
-    for _ in range(_N_STEPS):
-        R_turn = _rotations(turn)
-        p = q @ np.swapaxes(R_turn, 1, 2)
-        pulls = (weights @ (p + shift[:, None] - goals)[..., None])[..., 0]
-        leaning = R_turn @ up
-        pull_up[:, :2] = leaning[:, :2] @ of_gravity
-        gradient = np.concatenate(
-            [np.cross(p, pulls).sum(axis=1) + np.cross(leaning, pull_up), pulls.sum(axis=1)], axis=1
-        )
-        step = -(cov @ gradient[..., None])[..., 0]
-        turn, shift = turn + step[:, :3], shift + step[:, 3:]
-        if np.abs(step).max(initial=0.0) < _SETTLED:
-            break
-    is_settled = np.abs(step).max(axis=1, initial=0.0) < _USABLE
-    return Positions(shift, cov[:, 3:, 3:], is_settled)
+    motions, last = np.zeros((len(q), 6)), np.zeros(len(q))
+    _settle(q, goals, weights, up, of_gravity, cov, motions, last)
+    return Positions(motions[:, 3:], cov[:, 3:, 3:], last < _USABLE)
+
+
+@numba.njit(cache=True, nogil=True)
+def _settle(q, goals, weights, up, of_gravity, cov, motions, last):  # type: ignore[no-untyped-def]  # noqa: ANN001, ANN202, PLR0913
+    """Move each problem by steps of Newton until these are small; tell the size of the last."""
+    R, gradient = np.empty((3, 3)), np.empty(6)
+    for s in range(len(q)):
+        for _ in range(_N_STEPS):
+            _rotation(motions[s, :3], R)
+            _slope(q[s], goals[s], weights[s], R, motions[s, 3:], gradient)
+            _lean(up, of_gravity, R, gradient)
+            last[s] = 0.0
+            for i in range(6):
+                step = 0.0
+                for j in range(6):
+                    step -= cov[s, i, j] * gradient[j]
+                motions[s, i] += step
+                last[s] += abs(step)
+            if last[s] < _SETTLED:
+                break
+
+
+@numba.njit(cache=True, nogil=True)
+def _slope(q, goals, weights, R, shift, gradient):  # type: ignore[no-untyped-def]  # noqa: ANN001, ANN202
+    """Find the gradient of the weighted squares of one problem's centres."""
+    p, off, pull = np.empty(3), np.empty(3), np.empty(3)
+    gradient[:] = 0.0
+    for k in range(len(q)):
+        for i in range(3):
+            p[i] = R[i, 0] * q[k, 0] + R[i, 1] * q[k, 1] + R[i, 2] * q[k, 2]
+            off[i] = p[i] + shift[i] - goals[k, i]
+        for i in range(3):
+            w = weights[k, i]
+            pull[i] = w[0] * off[0] + w[1] * off[1] + w[2] * off[2]
+            gradient[3 + i] += pull[i]
+        _add_cross(p, pull, gradient)
+
+
+@numba.njit(cache=True, nogil=True)
+def _lean(up, of_gravity, R, gradient):  # type: ignore[no-untyped-def]  # noqa: ANN001, ANN202
+    """Add the gradient of gravity's weighted square."""
+    leaning, pull = np.empty(3), np.zeros(3)
+    for i in range(3):
+        leaning[i] = R[i, 0] * up[0] + R[i, 1] * up[1] + R[i, 2] * up[2]
+    for i in range(2):
+        pull[i] = leaning[0] * of_gravity[0, i] + leaning[1] * of_gravity[1, i]
+    _add_cross(leaning, pull, gradient)
+
+
+@numba.njit(cache=True, nogil=True)
+def _add_cross(v, w, out):  # type: ignore[no-untyped-def]  # noqa: ANN001, ANN202
+    """Add the cross product of two vectors to the first places of another."""
+    out[0] += v[1] * w[2] - v[2] * w[1]
+    out[1] += v[2] * w[0] - v[0] * w[2]
+    out[2] += v[0] * w[1] - v[1] * w[0]
+
+
+@numba.njit(cache=True, nogil=True)
+def _rotation(turn, R):  # type: ignore[no-untyped-def]  # noqa: ANN001, ANN202
+    """Find the rotation of a small turn by the formula of Rodrigues."""
+    x, y, z = turn
+    square = x * x + y * y + z * z
+    angle = np.sqrt(square)
+    a = np.sin(angle) / angle if angle > 0.0 else 1.0
+    b = (1.0 - np.cos(angle)) / square if angle > 1e-4 else 0.5 - square / 24.0
+    R[0, 0], R[1, 1], R[2, 2] = (
+        1 - b * (y * y + z * z),
+        1 - b * (x * x + z * z),
+        1 - b * (x * x + y * y),
+    )
+    R[0, 1], R[1, 0] = b * x * y - a * z, b * x * y + a * z
+    R[0, 2], R[2, 0] = b * x * z + a * y, b * x * z - a * y
+    R[1, 2], R[2, 1] = b * y * z - a * x, b * y * z + a * x
 
 
 def _normal_matrices(q: Array, weights: Array, up: Array, of_gravity: Array) -> Array:
@@ -244,14 +304,6 @@ def _normal_matrices(q: Array, weights: Array, up: Array, of_gravity: Array) -> 
 def _inverses(matrices: Array) -> Array:
     """Return the inverses of the last two dimensions."""
     return np.asarray(np.linalg.inv(matrices), dtype=np.float64)
-
-
-def _rotations(turns: Array) -> Array:
-    """Return the rotations of small turns, (s, 3, 3), by the formula of Rodrigues."""
-    angles = np.linalg.norm(turns, axis=1)[:, None, None]
-    cross = skew(turns)
-    half = np.sinc(angles / (2.0 * np.pi))  # NumPy's sinc has a pi in it
-    return np.asarray(np.eye(3) + np.sinc(angles / np.pi) * cross + half**2 / 2.0 * cross @ cross)
 
 
 def _has_heading(towards: Array, chosen: Index) -> Mask:
@@ -326,7 +378,8 @@ def meet(
         gradient = -(weighted @ beyond[..., None])[..., 0].sum(axis=1)
         bend = np.maximum(beyond[..., 0] / computed[..., 0], 0.0) * weights[..., 0, 0]
         across = bend.sum(axis=1)[:, None, None] * plane
-        across -= np.einsum("sk,ski,skj->sij", bend, J[..., 0, :], J[..., 0, :])
+        along = J[..., 0, :]
+        across -= np.swapaxes(along * bend[..., None], 1, 2) @ along
         damping = _DAMPING * np.trace(N, axis1=1, axis2=2)[:, None, None] * np.eye(3)
         step = -np.linalg.solve(N + across + damping, gradient[..., None])[..., 0]
         p += step
