@@ -6,17 +6,20 @@ site. A station is then tried without each of its markers, and each mark predict
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from pipelines.config import ResectionConfig
 from pipelines.geometry import rigid
-from pipelines.matching import gather, match_marks, solve_pose
+from pipelines.matching import Scene, gather, match_marks, solve_pose
 from pipelines.values import Array, ControlMarks, Index, MarkerFits, Mask, StationFix, _seal
 
 _SURPRISE = 3.29  # sigmas that one in a thousand normal residuals exceeds
 _N_LEFT = 3  # markers at least, of which one can be left out
+_UPRIGHT = 0.05  # spread across over spread along a plumb line of marks that tell no heading
+_N_POSE = 6  # unknowns: with as many more observations of centres, the levelling was left out
+_UNKNOWN = 1.0  # [rad] of a levelling that was left out
 
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
@@ -63,7 +66,8 @@ class Omissions:
     Attributes
     ----------
     shifts : (n, 3)
-        Position of the station without the marker, minus its position with all [m].
+        Position of the station without the marker, minus its position with all; NaN, as all else of
+        the row, where the other marks stand on one plumb line and tell no heading [m].
     predictions : (n, 3)
         Where the scan puts the mark when the others alone position the station, minus where it is
         given [m].
@@ -109,7 +113,8 @@ def check_distances(
     Notes
     -----
     Neither pose nor levelling enters. A range bias that all share changes a distance by as much as
-    the two lines of sight open towards each other.
+    the two lines of sight open towards each other; what the covariances of the centres hold of it
+    is taken off them.
     """
     scene = gather(fits, marks, config)
     pairs = match_marks(scene, config).pairs
@@ -121,7 +126,7 @@ def check_distances(
     given = np.linalg.norm(goals[:, 1] - goals[:, 0], axis=1)
     along = (q - p) / measured[:, None]
     along_site = (goals[:, 1] - goals[:, 0]) / given[:, None]
-    cov = scene.cov_centres[places[..., 0]].sum(axis=1)
+    cov = _cov_own(scene)[places[..., 0]].sum(axis=1)
     cov_given = scene.cov_marks[places[..., 1]].sum(axis=1)
     opening = np.sum(along * (_unit(q) - _unit(p)), axis=1) * config.sigma_range
     sigmas = np.sqrt(_projected(cov, along) + _projected(cov_given, along_site) + opening**2)
@@ -136,6 +141,12 @@ def check_distances(
         is_off=is_off,
         suspects=_suspects(places[is_off, :, 1]),
     )
+
+
+def _cov_own(scene: Scene) -> Array:
+    """Return the covariances of centres without the error of range that all of them share."""
+    v = _unit(scene.centres_base)
+    return scene.cov_centres - scene.shared[:, None, None] * v[:, :, None] * v[:, None, :]
 
 
 def _unit(v: Array) -> Array:
@@ -190,21 +201,31 @@ def leave_each_out(
             cov_predictions=np.zeros((0, 3, 3)),
         )
     scene = gather(fits, marks, config)
+    if fix.dof == 3 * n - _N_POSE:
+        scene = replace(scene, sigma_level=_UNKNOWN)
     start = fix.T_site_station @ rigid(scene.R_station_base, np.zeros(3))
     start[:3, 3] -= scene.middle
     all_at_once = solve_pose(scene, fix.matches[None], start[None]).estimate[0]
     others = np.array([np.delete(fix.matches, k, axis=0) for k in range(n)])
-    without = solve_pose(scene, others, np.tile(start, (n, 1, 1)))
-    T, (fit, mark) = without.estimate, fix.matches.T
-    p = np.einsum("nij,nj->ni", T[:, :3, :3], scene.centres_base[fit]) + T[:, :3, 3]
+    rows = np.flatnonzero(_have_heading(scene.marks_site[others[..., 1]]))
+    without = solve_pose(scene, others[rows], np.tile(start, (len(rows), 1, 1)))
+    T, (fit, mark) = without.estimate, fix.matches[rows].T
+    R, t = T[:, :3, :3], T[:, :3, 3]
+    p = np.einsum("nij,nj->ni", R, scene.centres_base[fit]) + t
     J = _by_motion(p)
-    R = T[:, :3, :3]
     cov = R @ scene.cov_centres[fit] @ np.swapaxes(R, 1, 2) + scene.cov_marks[mark]
-    return Omissions(
-        shifts=T[:, :3, 3] - all_at_once[:3, 3],
-        predictions=p - scene.marks_site[mark],
-        cov_predictions=J @ without.cov @ np.swapaxes(J, 1, 2) + cov,
-    )
+    shifts, predictions = (np.full((n, 3), np.nan) for _ in range(2))
+    shifts[rows], predictions[rows] = t - all_at_once[:3, 3], p - scene.marks_site[mark]
+    covs = np.full((n, 3, 3), np.nan)
+    covs[rows] = J @ without.cov @ np.swapaxes(J, 1, 2) + cov
+    return Omissions(shifts=shifts, predictions=predictions, cov_predictions=covs)
+
+
+def _have_heading(p: Array) -> Mask:
+    """Tell which groups of marks, (n, k, 3), do not stand on one plumb line."""
+    off = p - p.mean(axis=1, keepdims=True)
+    across = np.linalg.norm(off[..., :2], axis=(1, 2))
+    return np.asarray(across > _UPRIGHT * np.linalg.norm(off, axis=(1, 2)))
 
 
 def _by_motion(p: Array) -> Array:

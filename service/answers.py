@@ -260,7 +260,7 @@ def _without_each(
             "marker": marker_name(int(fit)),
             "mark": marks.names[mark],
             "station_shift_m": _numbers(shift),
-            "station_shift_3d_m": float(np.linalg.norm(shift)),
+            "station_shift_3d_m": _number(float(np.linalg.norm(shift))),
             "mark_predicted_minus_given_m": _numbers(off),
             "sigma_predicted_minus_given_m": _numbers(sigma),
         }

@@ -10,7 +10,7 @@ from pipelines.config import ResectionConfig
 from pipelines.resection import resect
 from tests.synthetic import control, field, pose, sightings
 
-CONFIG = ResectionConfig(sigma_common=0.0, sigma_range=0.0)
+CONFIG = ResectionConfig(sigma_common=0.0, sigma_range=0.0, sigma_range_shared=0.0)
 SIGMA = 4e-3  # [m] of a centre, per axis
 TOLERANCE = 0.03  # [m]
 
@@ -83,6 +83,23 @@ def test_a_range_bias_in_common_makes_distances_less_sure(rng):
     assert np.sqrt(blunt**2 - sharp**2).max() == pytest.approx(0.02, rel=0.05)  # across the ring
 
 
+def test_a_range_bias_that_centres_claim_as_their_own_counts_once(rng):
+    bias, own = 2e-3, 2e-3  # [m]
+    config = replace(CONFIG, sigma_range=bias, sigma_range_shared=bias)
+    scaled = []
+    for _ in range(150):
+        marks = field(rng, 6)
+        T = pose([0.5, -0.4, -0.2], 0.7)
+        towards = (marks.p_site - T[:3, 3]) @ T[:3, :3]
+        towards /= np.linalg.norm(towards, axis=1, keepdims=True)
+        cov = own**2 * np.eye(3) + bias**2 * towards[:, :, None] * towards[:, None, :]
+        noise = rng.normal(0, own, (6, 3)) + rng.normal(0, bias) * towards
+        fits = sightings(marks, T, cov=cov, noise=noise)
+        checks = check_distances(fits, marks, config, TOLERANCE)
+        scaled.append((checks.measured - checks.given) / checks.sigmas)
+    assert np.sqrt(np.mean(np.square(scaled))) == pytest.approx(1.0, abs=0.06)
+
+
 def test_leaving_a_marker_out_is_positioning_without_it(rng):
     marks = field(rng, 6)
     fits = seen(rng, marks)
@@ -111,3 +128,26 @@ def test_of_two_markers_none_can_be_left_out(rng):
     fits = seen(rng, marks)
     fix = resect("free_station", fits, marks, CONFIG)
     assert len(leave_each_out(fix, fits, marks, CONFIG).shifts) == 0
+
+
+def test_a_marker_whose_others_stand_on_one_pole_cannot_be_left_out(rng):
+    marks = control([[6, 0, 0.7], [-5, 2, 0.6], [-5, 2, 1.6]])
+    fits = seen(rng, marks)
+    fix = resect("free_station", fits, marks, CONFIG)
+    omissions = leave_each_out(fix, fits, marks, CONFIG)
+    first = list(fix.matches[:, 1]).index(0)
+    for column in (omissions.shifts, omissions.predictions, omissions.cov_predictions):
+        assert np.isnan(column[first]).all()
+        assert np.isfinite(np.delete(column, first, axis=0)).all()
+
+
+def test_a_levelling_that_the_fix_left_out_does_not_tilt_what_the_others_predict(rng):
+    marks = field(rng, 6)
+    T = pose([0.5, -0.4, -0.2], 0.7)
+    noise = rng.normal(0, SIGMA, (6, 3))
+    fits = sightings(marks, T, lean=(0.01, 0.0), sigma_level=5e-4, noise=noise)
+    fix = resect("free_station", fits, marks, CONFIG)
+    assert "levelling contradicts" in fix.reason
+    omissions = leave_each_out(fix, fits, marks, CONFIG)
+    assert np.linalg.norm(omissions.predictions, axis=1).max() < 8 * SIGMA
+    assert np.linalg.norm(omissions.shifts, axis=1).max() < 4 * SIGMA
