@@ -28,6 +28,7 @@ from pipelines.geometry import inverse, transform
 from pipelines.simulation import SimulationConfig, scenario, simulate_stop
 from pipelines.survey import Progress, process
 from pipelines.values import Array, ControlMarks, ScanLog, StopResult
+from service.memory import keep_memory
 from service.provenance import forget_peak_memory, peak_memory
 from service.yardstick import WHAT, Cost, least, read_cost
 from storage.catalogue import Catalogue
@@ -82,7 +83,8 @@ class Measured:
 
 
 def run(log: Path | None, wish: Wish, progress: Progress) -> Plain:
-    """Measure the chain on a log, or on a simulated stop in three dresses."""
+    """Measure the chain on a log, or on a simulated stop in three dresses, as a worker does it."""
+    keep_memory()
     with tempfile.TemporaryDirectory() as text:
         folder = Path(text)
         progress(0.0, "Reading" if log else "Simulating a stop of three million returns")
@@ -342,6 +344,7 @@ def _memory(scan: Scan, folder: Path) -> Plain:
 
 def _fresh(log: Path, folder: Path) -> Plain:
     """Run one scan in this process, which has done nothing but import before."""
+    keep_memory()
     before = _resident()
     forget_peak_memory()
     _committed(Scan(log=log), folder, {})

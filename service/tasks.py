@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING
 from distributed import WorkerPlugin, get_worker
 
 from pipelines.config import SurveyConfig
+from service.memory import keep_memory
 from service.work import KINDS, Order, Outcome
 
 if TYPE_CHECKING:
@@ -82,6 +83,7 @@ class WarmUp(WorkerPlugin):  # type: ignore[misc]  # distributed ships no types
 
     def setup(self, worker: Worker) -> None:  # noqa: ARG002  the protocol of Dask
         """Begin, without keeping the worker from work."""
+        keep_memory()
         if self.is_ours:  # Ctrl-C is for the service, which then ends its workers
             signal.signal(signal.SIGINT, signal.SIG_IGN)
         threading.Thread(target=warm_up, name="warm-up", daemon=True).start()

@@ -13,7 +13,6 @@ from datetime import datetime
 
 import numpy as np
 import pyarrow as pa
-from scipy.stats import chi2
 
 from pipelines.accuracy import centre_errors, station_error
 from pipelines.config import SurveyConfig
@@ -35,7 +34,7 @@ from pipelines.values import (
 from storage.resections import resections_table, resections_with_errors
 from storage.rows import Row, plain, table_of
 
-_TO_95 = float(np.sqrt(chi2.ppf(0.95, 2)))  # from the standard ellipse to the 95 % ellipse
+_TO_95 = float(np.sqrt(-2.0 * np.log(0.05)))  # from the standard ellipse to the 95 % ellipse
 _TEXT, _REAL, _WHOLE, _LONG = pa.string(), pa.float64(), pa.int32(), pa.int64()
 _INSTANT = pa.timestamp("us", "UTC")
 _STOP = {"run_id": _TEXT, "stop": _TEXT}

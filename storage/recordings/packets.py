@@ -52,12 +52,12 @@ uint8[1206] data
 """
 
 _SHOTS = FIRINGS_PER_BLOCK * N_LASERS  # of a block
-_POINTS_MAX = N_BLOCKS * _SHOTS  # of a packet
 _STRIDE = 1216  # [bytes] of a packet in a message: its stamp, its data, and what aligns the next
 _USED = 1214  # [bytes] of it that are not padding
 _PADDING = _STRIDE - _USED
 _AT_MODEL = 1213  # [bytes] from the beginning of a packet
 _FULL_TURN = 36_000  # steps of an azimuth
+_MORE = 1.1  # returns that a log may hold beyond what its first packets promise
 _WORTH = 64  # packets that two threads unpack sooner than one
 _BLOCK_NS = round(FIRINGS_PER_BLOCK * FIRING_CYCLE * 1e9)
 _PACKET_NS = N_BLOCKS * _BLOCK_NS
@@ -183,7 +183,7 @@ class Packets:
             _heads_kernel(octets, places[begin:end], is_little, heads[begin:end])
 
         side_by_side(count, len(places), worth=_WORTH)
-        self._reserve(int(heads[:, 3].sum()))
+        self._reserve(int(heads[:, 3].sum()), len(heads))
         rows = self._n + np.cumsum(heads[:, 3]) - heads[:, 3]
         sensor, out = _sensor(), self._out
 
@@ -195,12 +195,13 @@ class Packets:
         self._n += int(heads[:, 3].sum())
         self._heads.append(heads)
 
-    def _reserve(self, n: int) -> None:
-        """Make room; memory that is reserved but not written costs nothing."""
+    def _reserve(self, n: int, n_packets: int) -> None:
+        """Make room for so many returns of so many packets, the first time as if all were alike."""
         old = self._out
         if self._n + n <= len(old.rings):
             return
-        likely = self._size // _STRIDE * _POINTS_MAX if not self._n else 2 * len(old.rings)
+        alike = self._size / _STRIDE * n / max(n_packets, 1)
+        likely = round(_MORE * alike) if not self._n else 2 * len(old.rings)
         self._out = Columns.empty(max(likely, self._n + n))
         self._out.put(0, old.taken(slice(self._n)))
 
