@@ -51,6 +51,12 @@ class _Live:
     is_running: bool = False
     recorded_at: float = 0.0
     stopped: asyncio.Event = field(default_factory=asyncio.Event)
+    turn: asyncio.Lock = field(default_factory=asyncio.Lock)  # beginning and end, one at a time
+
+    @property
+    def is_over(self) -> bool:
+        """Whether its work is done, so that news of it come too late."""
+        return self.future is not None and self.future.done()
 
 
 class JobQueue:
@@ -167,9 +173,10 @@ class JobQueue:
                 tasks.do, order, key=f"{job.job_id}-{order.result_id}", pure=False
             )
             outcome = await live.future
-            if not live.has_begun:
-                await self._begin(live)
-            ended = await asyncio.to_thread(self._finish, live, outcome)
+            async with live.turn:
+                if not live.has_begun:
+                    await self._begin(live)
+                ended = await asyncio.to_thread(self._finish, live, outcome)
         except FutureCancelledError:
             ended = await asyncio.to_thread(self._catalogue.get_job, job.job_id)
         except KilledWorker:
@@ -259,7 +266,11 @@ class JobQueue:
             live.stopped.set()
             return
         if heard["event"] == "started":
-            await self._begin(live)
+            async with live.turn:
+                if not live.is_over:  # else whoever awaits it has begun it
+                    await self._begin(live)
+        if live.is_over:
+            return
         live.job = replace(live.job, progress_percent=heard["percent"], message=heard["message"])
         await self.events.add(live.job)
         if monotonic() - live.recorded_at >= _RECORD_EVERY:
