@@ -101,7 +101,8 @@ def fix_by_ranges(
     -----
     ``paper`` takes the three marks whose circles cut best, weighs them by their sigmas and leaves
     nothing out: three circles give no answer to which is wrong. The covariance of the pose is that
-    of all centres, marks and the levelling carried to first order through position and heading.
+    of all centres, marks and the levelling carried to first order through position and heading,
+    and so are the errors of range and height that all centres share.
     """
     if match.n < 3:
         raise DegenerateGeometryError(
@@ -218,6 +219,7 @@ def _pose(
     effects[1, :, 0] += weights[:, None] * by_mark
     covs = np.stack([cov_levelled, scene.cov_marks[pairs[:, 1]]])
     cov = np.einsum("ekab,ekbc,ekdc->ad", effects, covs, effects)
+    cov += _cov_shared(scene, scene.shared[pairs[:, 0]], levelled, effects[0])
     lean = np.zeros((6, 2))  # of the measured levelling
     lean[2:] = -np.einsum("kab,kbc->ac", effects[0], _leaned(levelled))
     lean[:2] = -rot_z(yaw)[:2, :2]
@@ -225,6 +227,20 @@ def _pose(
     full[2:, 2:] = cov
     full[2, 2] += scene.sigma_heading**2
     return yaw, full + scene.sigma_level**2 * lean @ lean.T
+
+
+def _cov_shared(scene: Scene, variances: Array, levelled: Array, effects: Array) -> Array:
+    """Return what it changes in a covariance, (a, a), that some errors are shared by all centres.
+
+    ``effects``, (k, a, 3), are those of the levelled centres. An error of all ranges is partly in
+    the covariance of each centre, as if it were its own; an error of all heights is not.
+    """
+    lines = levelled / np.linalg.norm(levelled, axis=1, keepdims=True)
+    of_ranges, of_heights = np.einsum("kai,ki->ka", effects, lines), effects[:, :, 2].sum(axis=0)
+    together = of_ranges.sum(axis=0)
+    shared = scene.sigma_range**2 * np.outer(together, together)
+    shared += scene.sigma_height**2 * np.outer(of_heights, of_heights)
+    return np.asarray(shared - (of_ranges * variances[:, None]).T @ of_ranges)
 
 
 def _azimuth_by_place(v: Array) -> Array:

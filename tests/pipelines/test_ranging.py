@@ -13,7 +13,9 @@ from pipelines.resection import resect
 from tests.synthetic import control, field, pose, sightings
 
 EXACT = 1e-7  # [m] and [rad] noise-free in, truth out
-CONFIG = ResectionConfig(sigma_common=0.0)
+CONFIG = ResectionConfig(
+    sigma_common=0.0, sigma_range=0.0, sigma_range_shared=0.0, sigma_height=0.0
+)
 LEAN = (0.06, -0.04)
 METHODS = ("ranges", "paper")
 
@@ -81,6 +83,31 @@ def test_the_covariance_of_the_pose_is_honest(rng, method):
     eigenvalues = np.linalg.eigvalsh(errors.T @ errors / len(errors))
     assert eigenvalues[0] > 0.6  # chance alone gives 0.64 to 1.44
     assert eigenvalues[-1] < 1.5
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_errors_that_all_distances_share_are_in_the_covariance_as_shared(rng, method):
+    bias, height, own = 2e-3, 5e-4, 2e-3  # [m]
+    config = replace(
+        CONFIG, sigma_range=bias, sigma_range_shared=bias, sigma_height=height, test_level=1e-6
+    )
+    marks, squares = field(rng, 8), []
+    for _ in range(100):
+        T = pose([0.5, -0.4, -0.2], rng.uniform(-3, 3))
+        towards = (marks.p_site - T[:3, 3]) @ T[:3, :3]
+        towards /= np.linalg.norm(towards, axis=1, keepdims=True)
+        cov = own**2 * np.eye(3) + bias**2 * towards[:, :, None] * towards[:, None, :]
+        noise = rng.normal(0, own, (8, 3)) + rng.normal(0, bias) * towards
+        noise[:, 2] += rng.normal(0, height)
+        fits = sightings(
+            marks, T, lean=tuple(rng.normal(0, 1e-4, 2)), sigma_level=1e-4, cov=cov, noise=noise
+        )
+        fix = resect(method, fits, marks, config)
+        off, known = fix.p_site - T[:3, 3], fix.cov_p_site
+        squares.append([np.sum(off[:2] ** 2) / np.trace(known[:2, :2]), off[2] ** 2 / known[2, 2]])
+    level, upright = np.mean(squares, axis=0)
+    assert 0.7 < level < 1.4  # chance alone gives 0.8 to 1.2
+    assert 0.6 < upright < 1.5  # and 0.72 to 1.28
 
 
 def test_a_gross_error_in_a_distance_is_found_and_named(rng):
