@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike
+from scipy.special import chdtri
 
 from pipelines.rigs import FIRING_CYCLE
 from pipelines.values import Array, Index, Rings, _seal
@@ -14,6 +15,8 @@ REFLECTIVITY_BINS = (1.0, 5.0, 15.0, 40.0, 100.0, 256.0)
 """Edges within which the noise of ranges is given."""
 
 _RUN = 12  # shots of one laser in a row
+_DOF = _RUN - 3  # once the parabola is taken off
+_MEDIAN = float(np.sqrt(chdtri(_DOF, 0.5) / _DOF))  # of the estimates of a sigma of 1, if normal
 _N_RUNS_MIN = 30  # that tell a noise
 _STEP_MAX = 0.10  # [m] off the parabola: more is an edge
 _SIMILAR = 0.2  # relative difference of reflectivity within one surface
@@ -64,7 +67,8 @@ def range_noise(
     -----
     Runs of twelve shots in a row of one laser on one surface (equal reflectivity within a fifth)
     are freed of a parabola, which takes slope and curvature away; the median over runs of the
-    standard deviation of the rest. Long enough to hold the slow part of noise that is not white:
+    standard deviation of the rest, over what that median is for normal noise of 1: with nine
+    degrees of freedom 4 % less. Long enough to hold the slow part of noise that is not white:
     real VLP-16 oscillate over five or six shots.
     """
     seconds = np.asarray(offsets_ns, dtype=np.float64) * 1e-9
@@ -80,10 +84,12 @@ def range_noise(
     is_alike = (np.abs(shades - middle[:, None]) <= _SIMILAR * middle[:, None] + 1.0).all(axis=1)
     is_good = is_alike & (np.abs(rest).max(axis=1) < _STEP_MAX)
     places = np.digitize(middle[is_good], REFLECTIVITY_BINS) - 1
-    sigmas = np.sqrt(np.sum(rest[is_good] ** 2, axis=1) / (_RUN - 3))
+    sigmas = np.sqrt(np.sum(rest[is_good] ** 2, axis=1) / _DOF)
     samples = [sigmas[places == k] for k in range(len(REFLECTIVITY_BINS) - 1)]
     return RangeNoise(
-        sigmas=np.array([np.median(s) if len(s) >= _N_RUNS_MIN else np.nan for s in samples]),
+        sigmas=np.array(
+            [np.median(s) / _MEDIAN if len(s) >= _N_RUNS_MIN else np.nan for s in samples]
+        ),
         n=np.array([len(s) for s in samples], dtype=np.intp),
     )
 

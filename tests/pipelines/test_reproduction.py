@@ -123,7 +123,7 @@ def test_the_noise_of_ranges_on_a_slope_is_that_of_the_ranges():
     time = np.arange(n) * cycle
     ranges = 5.0 + 40.0 * (time % 0.01) + 300.0 * (time % 0.01) ** 2 + rng.normal(0, 0.006, n)
     found = range_noise(ranges, np.full(n, 3, np.uint8), time * 1e9, np.full(n, 50.0))
-    assert found.sigmas[3] == pytest.approx(0.006, rel=0.06)
+    assert found.sigmas[3] == pytest.approx(0.006, rel=0.02)  # chance alone leaves 0.6 %
     assert np.isnan(found.sigmas[0])
     assert found.n[3] > 2000
 
