@@ -3,6 +3,7 @@
 ``extract`` finds them. Inside,
 
 - ``ball`` says what is looked for,
+- ``cells`` sorts returns by place and direction,
 - ``ground`` tells the ground, ``seeds`` picks the places that are worth a look,
 - ``patches`` gathers the returns about a place, ``looks`` measures what they look like,
 - ``sights`` counts where the beams towards and about a group end,
@@ -19,7 +20,8 @@ from numpy.typing import NDArray
 
 from pipelines.config import ExtractionConfig
 from pipelines.extraction.ball import Ball, seen_from, view_of
-from pipelines.extraction.ground import ground_grid
+from pipelines.extraction.cells import Cells, cells_of
+from pipelines.extraction.ground import ground_of
 from pipelines.extraction.looks import Look, look_at
 from pipelines.extraction.seeds import find_seeds
 from pipelines.extraction.sights import sights
@@ -77,11 +79,12 @@ def extract(
     """
     up = levelling_rotation(cloud.levelling)[2].copy()
     ball = Ball(marker_radius, up, float(cloud.rig.divergence.max()))
-    grid = ground_grid(cloud, config)
-    seeds = find_seeds(cloud.p_base, grid.rows_above, ball, config.n_points_min)
-    looks = distinct(look_at(cloud, grid, seeds, ball), config, marker_radius)
+    cells = cells_of(cloud, config)
+    ground = ground_of(cloud, cells, config)
+    seeds = find_seeds(cloud.p_base, ground.rows_above, ball, config.n_points_min)
+    looks = distinct(look_at(cloud, cells, seeds, ball), config, marker_radius)
     verdicts = [verdict(look, config, ball) for look in looks]
-    verdicts, rows = _sighted(cloud, looks, verdicts, ball)
+    verdicts, rows = _sighted(cloud, cells, looks, verdicts, ball)
     good = [
         (look, mine) for look, mine, reason in zip(looks, rows, verdicts, strict=True) if not reason
     ]
@@ -92,19 +95,20 @@ def extract(
             Rejection(p_base=look.p_base, n_points=look.n_points, reason=reason)
             for look, reason in bad[:_REJECTIONS_MAX]
         ),
-        ground_height_max=grid.ground_height_max,
+        ground_height_max=ground.height_max,
     )
 
 
 def _sighted(
-    cloud: StitchedCloud, looks: list[Look], verdicts: list[str], ball: Ball
+    cloud: StitchedCloud, cells: Cells, looks: list[Look], verdicts: list[str], ball: Ball
 ) -> tuple[list[str], list[NDArray[np.int32]]]:
     """Return the verdicts after a second look, at all beams towards and about what is left.
 
     With them the returns that were looked at; none of what had been refused before.
     """
     left = [look for look, reason in zip(looks, verdicts, strict=True) if not reason]
-    seen = sights(cloud, np.array([look.p_base for look in left]).reshape(-1, 3), ball)
+    centres = np.array([look.p_base for look in left]).reshape(-1, 3)
+    seen = sights(cloud, cells.directions, centres, ball)
     reasons = [verdict_on_sight(look, sight, ball) for look, sight in zip(left, seen, strict=True)]
     good = [
         (look, sight) for look, sight, reason in zip(left, seen, reasons, strict=True) if not reason
@@ -141,9 +145,9 @@ def _members(cloud: StitchedCloud, rows: NDArray[np.int32], look: Look, ball: Ba
     Of a ball that is seen very closely, only its middle: there the returns at its outline, which
     belong partly to what lies behind, would weigh more than the noise of all the others.
     """
-    seen = seen_from(cloud.p_base[rows].astype(np.float64), view_of(look.p_base, ball.up))
+    seen = seen_from(cloud.p_base[rows].T.astype(np.float64), view_of(look.p_base, ball.up))
     blur = 0.5 * ball.divergence * float(np.linalg.norm(look.p_base))
     reach = _MIDDLE * ball.radius if is_resolved(look, ball) else 1.5 * ball.radius + blur
-    is_about = np.hypot(seen[:, 0], seen[:, 1]) < reach
-    is_level = (seen[:, 2] > -2.2 * ball.radius) & (seen[:, 2] < 1.6 * ball.radius)
+    is_about = np.hypot(seen[0], seen[1]) < reach
+    is_level = (seen[2] > -2.2 * ball.radius) & (seen[2] < 1.6 * ball.radius)
     return np.asarray(rows[is_about & is_level], dtype=np.intp)

@@ -84,17 +84,17 @@ def seen_from(points: Array, view: View) -> Array:
 
     Parameters
     ----------
-    points : (n, 3)
+    points : (3, n)
         Returns in the base frame [m].
     view : View
         How the centre is looked at.
 
     Returns
     -------
-    (n, 3)
+    (3, n)
         As ``passing`` says.
     """
-    seen = np.empty((len(points), 3))
-    for i in range(len(points)):
-        seen[i] = passing(view, points[i, 0], points[i, 1], points[i, 2])
+    seen = np.empty(points.shape)
+    for i in range(points.shape[1]):
+        seen[0, i], seen[1, i], seen[2, i] = passing(view, points[0, i], points[1, i], points[2, i])
     return seen

@@ -14,8 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipelines.extraction.ball import Ball, View, passing, seen_from, view_of
-from pipelines.extraction.ground import Grid
-from pipelines.extraction.patches import Patches, patches_about, points_near
+from pipelines.extraction.cells import Cells
+from pipelines.extraction.patches import Patches, n_about, patches_about, points_near
 from pipelines.extraction.seeds import thinned
 from pipelines.threads import side_by_side
 from pipelines.values import Array, StitchedCloud
@@ -31,7 +31,10 @@ N_RESOLVED = 60
 
 _CLOSE, _LOOSE = 0.04, 0.3  # radii: least and most that returns may scatter about a ball
 _N_LOOK = 4  # returns without which there is nothing to look at
-_N_WORTH = 50  # seeds that are worth a thread
+_N_WORTH = 20  # places that are worth a thread
+_N_SAMPLE = 1500  # returns in the cells about a seed that tell whether to look there
+_N_WHOLE = 2000  # returns there that are looked at at once
+_IN_ANY_ORDER = {"reassoc", "contract"}  # sums of many returns at once
 _N_STEPS = 6  # of a fit that only has to tell what a group is
 
 
@@ -97,15 +100,15 @@ class Look(NamedTuple):
 _N_FIELDS = len(Look._fields)
 
 
-def look_at(cloud: StitchedCloud, grid: Grid, seeds: Array, ball: Ball) -> list[Look]:
+def look_at(cloud: StitchedCloud, cells: Cells, seeds: Array, ball: Ball) -> list[Look]:
     """Return what is seen where the seeds' discs came to rest with little around them.
 
     Parameters
     ----------
     cloud : StitchedCloud
         One stop.
-    grid : Grid
-        Cells of its returns.
+    cells : Cells
+        Where its returns lie.
     seeds : (k, 3)
         Where to look [m].
     ball : Ball
@@ -116,7 +119,7 @@ def look_at(cloud: StitchedCloud, grid: Grid, seeds: Array, ball: Ball) -> list[
     list of Look
         What is there; places at which hardly a return lies on a ball are left out.
     """
-    patches = patches_about(cloud.p_base, grid, seeds, ball.radius)
+    patches = patches_about(cloud.p_base, cells, seeds, ball.radius)
     found = np.concatenate(_shared(_approached, patches, seeds, ball))
     found = found[(found[:, 3] >= _N_LOOK) & (found[:, 4] > 0.0)]
     found = found[np.lexsort((found[:, 2], found[:, 1], found[:, 0], -found[:, 3]))]
@@ -145,34 +148,52 @@ def _shared(
 def _approached(patches: Patches, seeds: Array, ball: Ball) -> Array:
     """Return where seeds' discs came to rest, the returns in them, and 1 if worth a look, (k, 5).
 
-    Little lies about a free ball; one that is seen closely needs no free space to be believed.
+    Where returns are many, a sample of them must not show clearly that it is not.
     """
     out = np.zeros((len(seeds), 5))
     for k in range(len(seeds)):
-        points = points_near(patches, seeds[k])
-        c, n = _shifted(points, seeds[k], ball.up, ball.radius)
-        n_beside, n_below = _surroundings(points, c, ball)
-        is_free = n_beside + n_below <= 2.0 + 0.6 * n
-        out[k, :3], out[k, 3] = c, n
-        out[k, 4] = is_free or (n >= N_RESOLVED and _is_resolved(points, c, ball))
+        n = n_about(patches, seeds[k])
+        if n > _N_WHOLE:
+            every = n / _N_SAMPLE
+            points = points_near(patches, seeds[k], every)
+            if not _tried(points, seeds[k], ball, every)[2]:
+                continue
+        c, n, is_worth = _tried(points_near(patches, seeds[k], 1.0), seeds[k], ball, 1.0)
+        out[k, :3], out[k, 3], out[k, 4] = c, n, is_worth
     return out
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
+def _tried(points: Array, seed: Array, ball: Ball, every: float) -> tuple[Array, int, bool]:
+    """Return where a seed's disc comes to rest, the returns in it, and whether to look there.
+
+    Little lies about a free ball; one that is seen closely needs no free space to be believed. Of
+    a sample, one return of so many, both are asked with room for chance.
+    """
+    c, n = _shifted(points, seed, ball.up, ball.radius)
+    n_beside, n_below = _surroundings(points, c, ball)
+    n_about = n_beside + n_below
+    room = 2.0 * np.sqrt(n + n_about) if every > 1.0 else 0.0
+    is_free = n_about <= 2.0 + 0.6 * n + room
+    return c, n, is_free or (n * every >= N_RESOLVED and _is_resolved(points, c, ball, every))
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy", fastmath=_IN_ANY_ORDER)
 def _shifted(points: Array, c: Array, up: Array, radius: float) -> tuple[Array, int]:
     """Return where a disc of the ball's size comes to rest, and how many returns it holds."""
     c, n = c.copy(), 0
     for _ in range(4):
         view = view_of(c, up)
         across, along, depth, n = 0.0, 0.0, 0.0, 0
-        for i in range(len(points)):
-            x, y, z = points[i, 0], points[i, 1], points[i, 2]
-            gap2 = (x - view.x) ** 2 + (y - view.y) ** 2 + (z - view.z) ** 2
-            if gap2 >= (2.31 * radius) ** 2:  # outside of the disc or its depth
-                continue
-            a, b, d = passing(view, x, y, z)
-            if a * a + b * b < (1.15 * radius) ** 2 and -2.0 * radius < d < 0.8 * radius:
-                across, along, depth, n = across + a, along + b, depth + d, n + 1
+        for i in range(points.shape[1]):
+            a, b, d = passing(view, points[0, i], points[1, i], points[2, i])
+            is_in = (
+                (a * a + b * b < (1.15 * radius) ** 2) & (d > -2.0 * radius) & (d < 0.8 * radius)
+            )
+            across += a if is_in else 0.0
+            along += b if is_in else 0.0
+            depth += d if is_in else 0.0
+            n += is_in
         if n == 0:
             break
         across, along, depth = across / n, along / n, depth / n + 2.0 / 3.0 * radius
@@ -183,53 +204,37 @@ def _shifted(points: Array, c: Array, up: Array, radius: float) -> tuple[Array, 
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def _within(points: Array, c: Array, reach: float) -> Array:
-    """Return the points within reach of a place."""
-    kept = np.empty_like(points)
-    n_kept = 0
-    for i in range(len(points)):
-        dx, dy, dz = points[i, 0] - c[0], points[i, 1] - c[1], points[i, 2] - c[2]
-        if dx * dx + dy * dy + dz * dz < reach * reach:
-            kept[n_kept, 0], kept[n_kept, 1], kept[n_kept, 2] = points[i]
-            n_kept += 1
-    return kept[:n_kept]
-
-
-@numba.njit(cache=True, nogil=True, error_model="numpy")
 def _surroundings(points: Array, c: Array, ball: Ball) -> tuple[int, int]:
     """Count the returns beside and below the outline that a free ball on a pole would not have."""
     n_beside, n_below, radius = 0, 0, ball.radius
     blur = 0.5 * ball.divergence * np.sqrt(c[0] ** 2 + c[1] ** 2 + c[2] ** 2)
     inner2 = (1.1 * radius + blur) ** 2  # no footprint that touches the ball is farther out
+    beside2, below2 = (2.2 * radius + blur) ** 2, (2.8 * radius + blur) ** 2
     view = view_of(c, ball.up)
-    for i in range(len(points)):
-        across, along, depth = passing(view, points[i, 0], points[i, 1], points[i, 2])
-        gap2 = across * across + along * along
-        is_pole = along < 0.0 and abs(across) < 0.6 * radius + blur
-        if gap2 < inner2 or is_pole:
-            continue
-        if along > -0.5 * radius:
-            n_beside += gap2 < (2.2 * radius + blur) ** 2 and abs(depth) < 1.5 * radius
-        else:
-            is_under = abs(across) < 1.9 * radius + blur  # what is farther out stands on its own
-            is_under &= gap2 < (2.8 * radius + blur) ** 2
-            n_below += is_under and -3.0 * radius < depth < 1.5 * radius
+    for i in range(points.shape[1]):
+        across, along, depth = passing(view, points[0, i], points[1, i], points[2, i])
+        gap2, aside = across * across + along * along, abs(across)
+        is_out = (gap2 >= inner2) & ~((along < 0.0) & (aside < 0.6 * radius + blur))
+        is_high = along > -0.5 * radius
+        n_beside += is_out & is_high & (gap2 < beside2) & (abs(depth) < 1.5 * radius)
+        # what is farther out stands on its own
+        is_under = is_out & ~is_high & (aside < 1.9 * radius + blur) & (gap2 < below2)
+        n_below += is_under & (depth > -3.0 * radius) & (depth < 1.5 * radius)
     return n_beside, n_below
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def _is_resolved(points: Array, c: Array, ball: Ball) -> bool:
+def _is_resolved(points: Array, c: Array, ball: Ball, every: float) -> bool:
     """Tell whether a ball fits so closely that it needs no free space about it to be believed."""
-    points = _within(points, c, 2.0 * ball.radius)
-    scatter = np.inf
+    points, scatter, is_sample = _within(points, c, 2.0 * ball.radius), np.inf, every > 1.0
     for step_no in range(_N_STEPS):
         N, pull, axes, scatter = _equations(points, c, ball, ball.radius)
-        if step_no > 0 and scatter > 4.0 * RESOLUTION * ball.radius:
+        if step_no > is_sample and scatter > 4.0 * RESOLUTION * ball.radius:
             break  # it will not come to that any more
         step = np.linalg.solve(N[:3, :3] + 1e-3 * np.eye(3), pull[:3])
         step *= min(1.0, 0.5 * ball.radius / (np.sqrt(np.sum(step**2)) + 1e-12))
         c = c + step[0] * axes[0] + step[1] * axes[1] + step[2] * axes[2]
-    return scatter < 1.5 * RESOLUTION * ball.radius
+    return scatter < (2.5 if is_sample else 1.5) * RESOLUTION * ball.radius
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
@@ -237,7 +242,7 @@ def _looked(patches: Patches, places: Array, ball: Ball) -> Array:
     """Return what is seen near places, (k, 17), as ``Look`` names it; zeros if no ball is there."""
     out = np.zeros((len(places), _N_FIELDS))
     for k in range(len(places)):
-        _look(points_near(patches, places[k]), places[k], ball, out[k])
+        _look(points_near(patches, places[k], 1.0), places[k], ball, out[k])
     return out
 
 
@@ -248,23 +253,22 @@ def _look(points: Array, start: Array, ball: Ball, out: Array) -> None:
     c, _, _ = _settled(points, start, ball, 3)
     blur = 0.5 * ball.divergence * np.sqrt(np.sum(c**2))
     seen = seen_from(points, view_of(c, ball.up))
-    residuals, J = _shape(seen, radius)
+    residuals = _residuals(seen, radius)
     scatter = max(_scatter(seen, residuals, radius), NOISE_MIN)
     weights = _weights(seen, residuals, radius, blur, scatter)
     if np.sum(weights > 0.0) < _N_LOOK:
         return
     rms = np.sqrt(np.sum(weights * residuals**2) / np.sum(weights))
     noise = max(rms, NOISE_MIN)
-    flat, cov_flat = _flatness(J, residuals, weights)
+    flat, cov_flat = _flatness(seen, residuals, weights, radius)
     c_free, radius_free, cov_free = _settled(points, c, ball, 4)
     seen_free = seen_from(points, view_of(c_free, ball.up))
-    residuals_free, _ = _shape(seen_free, radius_free)
     out[:3] = c
     out[3], out[4] = np.sum(weights > 0.0), _n_strange(seen, weights, radius)
     out[5], out[6] = _surroundings(points, c, ball)
-    out[7], out[8], out[9] = rms, _extent(seen[:, 0], weights), _extent(seen[:, 1], weights)
+    out[7], out[8], out[9] = rms, _extent(seen[0], weights), _extent(seen[1], weights)
     out[10], out[11] = radius_free, noise * np.sqrt(cov_free[3, 3])
-    out[12] = _scatter(seen_free, residuals_free, radius_free)
+    out[12] = _scatter(seen_free, _residuals(seen_free, radius_free), radius_free)
     out[13], out[14] = flat[3], noise * np.sqrt(cov_flat[3, 3])
     out[15], out[16] = flat[4], noise * np.sqrt(cov_flat[4, 4])
 
@@ -273,9 +277,10 @@ def _look(points: Array, start: Array, ball: Ball, out: Array) -> None:
 def _n_strange(seen: Array, weights: Array, radius: float) -> int:
     """Count the returns inside the outline, about as far away, that the ball does not explain."""
     n = 0
-    for i in range(len(seen)):
-        is_inside = np.hypot(seen[i, 0], seen[i, 1]) < 0.9 * radius and seen[i, 1] > -0.8 * radius
-        n += is_inside and abs(seen[i, 2]) < 2.0 * radius and not weights[i] > 0.0
+    for i in range(len(weights)):
+        x, y = seen[0, i], seen[1, i]
+        is_inside = (x * x + y * y < (0.9 * radius) ** 2) & (y > -0.8 * radius)
+        n += is_inside & (abs(seen[2, i]) < 2.0 * radius) & (weights[i] <= 0.0)
     return n
 
 
@@ -325,66 +330,89 @@ def _equations(
     axes[0], axes[1], axes[2] = view.across, view.up, c / distance
     blur = 0.5 * ball.divergence * distance
     seen = _about(points, view, radius + blur)
-    residuals, J = _shape(seen, radius)
+    residuals = _residuals(seen, radius)
     scatter = _scatter(seen, residuals, radius)
     weights = _weights(seen, residuals, radius, blur, scatter)
-    N, pull = np.zeros((4, 4)), np.zeros(4)
-    for i in range(len(seen)):
-        if weights[i] > 0.0:
-            for j in range(4):
-                pull[j] += weights[i] * residuals[i] * J[i, j]
-                for k in range(4):
-                    N[j, k] += weights[i] * J[i, j] * J[i, k]
+    N, pull = _normals(seen, residuals, weights, radius)
     return N, pull, axes, scatter
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def _about(points: Array, view: View, reach: float) -> Array:
-    """Return how those beams pass a centre that do so within reach."""
-    seen = np.empty((len(points), 3))
+def _within(points: Array, c: Array, reach: float) -> Array:
+    """Return the points, (3, n), within reach of a place."""
+    kept = np.empty(points.shape)
     n = 0
-    for i in range(len(points)):
-        across, along, depth = passing(view, points[i, 0], points[i, 1], points[i, 2])
-        seen[n, 0], seen[n, 1], seen[n, 2] = across, along, depth
+    for i in range(points.shape[1]):
+        x, y, z = points[0, i], points[1, i], points[2, i]
+        kept[0, n], kept[1, n], kept[2, n] = x, y, z
+        n += (x - c[0]) ** 2 + (y - c[1]) ** 2 + (z - c[2]) ** 2 < reach * reach
+    return kept[:, :n].copy()
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _about(points: Array, view: View, reach: float) -> Array:
+    """Return how those beams pass a centre that do so within reach, (3, n)."""
+    seen: Array = seen_from(points, view)
+    n = 0
+    for i in range(seen.shape[1]):
+        across, along, depth = seen[0, i], seen[1, i], seen[2, i]
+        seen[0, n], seen[1, n], seen[2, n] = across, along, depth
         n += across * across + along * along < reach * reach
-    return seen[:n]
+    return seen[:, :n].copy()
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def _shape(seen: Array, radius: float) -> tuple[Array, Array]:
-    """Return along-beam residuals and their derivatives by ball and shape.
-
-    Derivatives, (n, 6): centre across, up and along the beam, radius, and the missing shares of the
-    curvature across and along the vertical. A beam that misses is expected at the outline.
-    """
-    residuals: Array = np.empty(len(seen))
-    J: Array = np.zeros((len(seen), 6))
-    for i in range(len(seen)):
-        x, y, depth = seen[i, 0], seen[i, 1], seen[i, 2]
-        h2 = radius * radius - x * x - y * y
-        half = np.sqrt(max(h2, 0.0))
-        residuals[i] = depth + half
-        J[i, 2] = 1.0
-        if h2 <= 0.0:
-            continue
-        steep = max(half, 0.25 * radius)  # a beam's footprint keeps the outline from being a cliff
-        J[i, 0], J[i, 1], J[i, 3] = -x / steep, -y / steep, -radius / steep
-        J[i, 4] = half - np.sqrt(radius * radius - y * y)
-        J[i, 5] = half - np.sqrt(radius * radius - x * x)
-    return residuals, J
+def _residuals(seen: Array, radius: float) -> Array:
+    """Return residuals along the beams; a beam that misses is expected at the outline."""
+    residuals = np.empty(seen.shape[1])
+    for i in range(len(residuals)):
+        h2 = radius * radius - seen[0, i] * seen[0, i] - seen[1, i] * seen[1, i]
+        residuals[i] = seen[2, i] + np.sqrt(max(h2, 0.0))
+    return residuals
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def _flatness(J: Array, residuals: Array, weights: Array) -> tuple[Array, Array]:
+def _slopes(x: float, y: float, radius: float) -> tuple[float, float, float]:
+    """Return the derivatives of a residual by the centre across and up, and by the radius."""
+    h2 = radius * radius - x * x - y * y
+    # a beam's footprint keeps the outline from being a cliff
+    steep = max(np.sqrt(max(h2, 0.0)), 0.25 * radius)
+    share = 1.0 / steep if h2 > 0.0 else 0.0
+    return -x * share, -y * share, -radius * share
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy", fastmath=_IN_ANY_ORDER)
+def _normals(seen: Array, residuals: Array, weights: Array, radius: float) -> tuple[Array, Array]:
+    """Return normal matrix and right-hand side of centre across, up, along the beam, and radius."""
+    aa, ab, ac, ad, bb, bc, bd, cc, cd, dd = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
+    pa, pb, pc, pd = 0.0, 0.0, 0.0, 0.0
+    for i in range(len(weights)):
+        w, r = weights[i], weights[i] * residuals[i]
+        a, b, d = _slopes(seen[0, i], seen[1, i], radius)
+        aa, ab, ac, ad = aa + w * a * a, ab + w * a * b, ac + w * a, ad + w * a * d
+        bb, bc, bd = bb + w * b * b, bc + w * b, bd + w * b * d
+        cc, cd, dd = cc + w, cd + w * d, dd + w * d * d
+        pa, pb, pc, pd = pa + r * a, pb + r * b, pc + r, pd + r * d
+    N = np.array([[aa, ab, ac, ad], [ab, bb, bc, bd], [ac, bc, cc, cd], [ad, bd, cd, dd]])
+    return N, np.array([pa, pb, pc, pd])
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _flatness(seen: Array, residuals: Array, weights: Array, radius: float) -> tuple[Array, Array]:
     """Return centre and missing curvatures, and their covariance for unit noise."""
-    N, pull = 1e-6 * np.eye(5), np.zeros(5)
-    for i in range(len(J)):
+    N, pull, J = 1e-6 * np.eye(5), np.zeros(5), np.zeros(5)
+    for i in range(len(weights)):
         if weights[i] > 0.0:
+            x, y = seen[0, i], seen[1, i]
+            half = np.sqrt(max(radius * radius - x * x - y * y, 0.0))
+            J[0], J[1], _ = _slopes(x, y, radius)
+            J[2] = 1.0
+            J[3] = half - np.sqrt(radius * radius - y * y) if half > 0.0 else 0.0
+            J[4] = half - np.sqrt(radius * radius - x * x) if half > 0.0 else 0.0
             for j in range(5):
-                slope = weights[i] * J[i, j + (j > 2)]  # all but the radius
-                pull[j] += slope * residuals[i]
+                pull[j] += weights[i] * J[j] * residuals[i]
                 for k in range(5):
-                    N[j, k] += slope * J[i, k + (k > 2)]
+                    N[j, k] += weights[i] * J[j] * J[k]
     inverse = np.linalg.inv(N)
     flat: Array = np.dot(inverse, pull)
     return flat, np.asarray(inverse, dtype=np.float64)
@@ -393,25 +421,24 @@ def _flatness(J: Array, residuals: Array, weights: Array) -> tuple[Array, Array]
 @numba.njit(cache=True, nogil=True, error_model="numpy")
 def _weights(seen: Array, residuals: Array, radius: float, blur: float, scatter: float) -> Array:
     """Return Tukey's weights of the returns that may belong to the ball."""
-    weights = np.zeros(len(seen))
-    limit = 4.7 * scatter
-    for i in range(len(seen)):
-        is_on = np.hypot(seen[i, 0], seen[i, 1]) < radius + blur and seen[i, 1] > -0.9 * radius
-        if is_on and abs(residuals[i]) < limit:
-            weights[i] = (1.0 - (residuals[i] / limit) ** 2) ** 2
+    weights = np.empty(len(residuals))
+    limit, reach2 = 4.7 * scatter, (radius + blur) ** 2
+    for i in range(len(residuals)):
+        x, y, off = seen[0, i], seen[1, i], abs(residuals[i]) / limit
+        is_on = (x * x + y * y < reach2) & (y > -0.9 * radius) & (off < 1.0)
+        weights[i] = (1.0 - off * off) ** 2 if is_on else 0.0
     return weights
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
 def _scatter(seen: Array, residuals: Array, radius: float) -> float:
     """Return the robust standard deviation of the residuals inside the outline [m]."""
-    inside = np.empty(len(seen))
-    n_inside = 0
-    for i in range(len(seen)):
-        is_inside = np.hypot(seen[i, 0], seen[i, 1]) < 0.9 * radius
-        if is_inside and abs(residuals[i]) < 1.5 * radius:
-            inside[n_inside] = abs(residuals[i])
-            n_inside += 1
-    if n_inside < 3:
+    inside = np.empty(len(residuals) + 1)
+    n = 0
+    for i in range(len(residuals)):
+        x, y, off = seen[0, i], seen[1, i], abs(residuals[i])
+        inside[n] = off  # kept only if the next one does not take its place
+        n += (x * x + y * y < (0.9 * radius) ** 2) & (off < 1.5 * radius)
+    if n < 3:
         return _LOOSE * radius
-    return min(max(1.4826 * np.median(inside[:n_inside]), _CLOSE * radius), _LOOSE * radius)
+    return min(max(1.4826 * np.median(inside[:n]), _CLOSE * radius), _LOOSE * radius)

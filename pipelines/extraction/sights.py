@@ -13,12 +13,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipelines.extraction.ball import Ball, seen_from, view_of
-from pipelines.threads import side_by_side
+from pipelines.extraction.cells import (
+    N_DIRECTIONS,
+    N_DIRECTIONS_SIDE,
+    by_cell,
+    direction_cells,
+    rows_in,
+)
 from pipelines.values import Array, Column, Mask, StitchedCloud
 
-_N_SIDE = 128  # cells along a side of the octahedron of directions: 0.5 to 1 deg
 _STEP = 0.05  # [m] at most between the directions about a centre that are looked up
-_BLOCK = 2048  # returns whose directions are found at once
 _REACH = 4.0  # radii about a centre: shoulders lie within three radii below a head
 _POLE = 0.5  # radii: half the width of what a ball may stand on
 _ASIDE = 1.9  # radii: what is farther to a side may stand there on its own
@@ -90,13 +94,17 @@ class Sight(NamedTuple):
         return self.n_on + self.n_before
 
 
-def sights(cloud: StitchedCloud, centres: Array, ball: Ball) -> list[Sight]:
+def sights(
+    cloud: StitchedCloud, directions: NDArray[np.uint16], centres: Array, ball: Ball
+) -> list[Sight]:
     """Count the beams towards and about some centres by where they end.
 
     Parameters
     ----------
     cloud : StitchedCloud
         One stop.
+    directions : (n,) uint16
+        Cells of its returns' directions.
     centres : (k, 3)
         Centres of groups that may be balls [m].
     ball : Ball
@@ -109,30 +117,33 @@ def sights(cloud: StitchedCloud, centres: Array, ball: Ball) -> list[Sight]:
     """
     if not len(centres):
         return []
-    is_wanted = _directions_about(centres, ball.up, (_REACH + 0.5) * ball.radius + 0.05)
-    parts = side_by_side(
-        lambda first, end: _in_directions(cloud.p_base[first:end], is_wanted) + first,
-        len(cloud.p_base),
-    )
-    rows = np.concatenate(parts)
-    points, intensities = cloud.p_base[rows], cloud.intensities[rows]
-    seen = [Sight(*_counted(points, intensities, centre, ball)) for centre in centres]
-    return [sight._replace(rows=rows[sight.rows]) for sight in seen]
+    reach = (_REACH + 0.5) * ball.radius + 0.05
+    is_wanted = np.array([_directions_about(centre, ball.up, reach) for centre in centres])
+    rows = rows_in(directions, np.logical_or.reduce(is_wanted))
+    starts, order = by_cell(directions.take(rows), N_DIRECTIONS)
+    rows = rows.take(order)
+    points, intensities = cloud.p_base.take(rows, axis=0), cloud.intensities.take(rows)
+    near = [_runs(starts, np.flatnonzero(mine)) for mine in is_wanted]
+    seen = [
+        Sight(*_counted(points, intensities, mine, centre, ball))
+        for mine, centre in zip(near, centres, strict=True)
+    ]
+    return [sight._replace(rows=np.sort(rows[sight.rows])) for sight in seen]
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
 def _counted(
-    points: Column, intensities: Column, c: Array, ball: Ball
+    points: Column, intensities: Column, near: NDArray[np.int32], c: Array, ball: Ball
 ) -> tuple[int, int, int, float, int, int, int, float, NDArray[np.int32]]:
-    """Return the fields of a sight."""
+    """Return the fields of a sight, from the returns near its direction."""
     radius, distance = ball.radius, np.sqrt(np.sum(c**2))
     blur = 0.5 * ball.divergence * distance / radius
-    rows = _towards(points, c, (_REACH + blur) * radius / distance)
-    seen = seen_from(points[rows].astype(np.float64), view_of(c, ball.up))
+    rows = _towards(points, near, c, (_REACH + blur) * radius / distance)
+    seen = seen_from(points[rows].T.astype(np.float64), view_of(c, ball.up))
     n_on, n_through, n_before, n_held, n_past, n_short = 0, 0, 0, 0, 0, 0
     gaps2, light = 0.0, 0.0
-    for i in range(len(seen)):
-        across, along, depth = np.abs(seen[i, 0]) / radius, seen[i, 1] / radius, seen[i, 2] / radius
+    for i in range(len(rows)):
+        across, along, depth = np.abs(seen[0, i]) / radius, seen[1, i] / radius, seen[2, i] / radius
         gap = np.hypot(across, along)
         is_aimed = gap < 1.0 + blur and along > -0.9
         if is_aimed and _ON[0] < depth < _ON[1]:
@@ -151,13 +162,15 @@ def _counted(
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def _towards(points: Column, c: Array, tangent: float) -> NDArray[np.int32]:
-    """Return the rows of the points within an angle, given by its tangent, of a centre."""
+def _towards(
+    points: Column, near: NDArray[np.int32], c: Array, tangent: float
+) -> NDArray[np.int32]:
+    """Return which of some rows are within an angle, given by its tangent, of a centre."""
     x, y, z = c
     least = (x * x + y * y + z * z) / (1.0 + tangent * tangent)
-    rows = np.empty(len(points), np.int32)
+    rows = np.empty(len(near) + 1, np.int32)
     n_rows = 0
-    for i in range(len(points)):
+    for i in near:
         px, py, pz = points[i, 0], points[i, 1], points[i, 2]
         along = x * px + y * py + z * pz
         rows[n_rows] = i  # kept only if the next one does not take its place
@@ -166,54 +179,34 @@ def _towards(points: Column, c: Array, tangent: float) -> NDArray[np.int32]:
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def _directions_about(centres: Array, up: Array, reach: float) -> Mask:
-    """Tell the cells of directions in which beams may pass some centres within a reach."""
-    is_wanted = np.zeros(2 * _N_SIDE * _N_SIDE, np.bool_)
-    xyz, cell = np.empty((3, 1), np.float32), np.empty(1, np.int32)
-    for k in range(len(centres)):
-        c = centres[k]
-        v_across = np.cross(up, c)
-        v_across *= reach / (np.sqrt(np.sum(v_across**2)) + 1e-12)
-        n_steps = 2 + int(max(1.5 * reach * _N_SIDE / np.sqrt(np.sum(c**2)), reach / _STEP))
-        for i in range(-n_steps, n_steps + 1):
-            for j in range(-n_steps, n_steps + 1):
-                for axis in range(3):
-                    aside = i * v_across[axis] + j * reach * up[axis]
-                    xyz[axis, 0] = c[axis] + aside / n_steps
-                _direction_cells(xyz[0], xyz[1], xyz[2], cell)
-                is_wanted[cell[0]] = True
+def _runs(starts: NDArray[np.int64], cells: NDArray[np.int64]) -> NDArray[np.int32]:
+    """Return the places of all that lies in some cells."""
+    n = 0
+    for cell in cells:
+        n += starts[cell + 1] - starts[cell]
+    places = np.empty(n, np.int32)
+    n = 0
+    for cell in cells:
+        for i in range(starts[cell], starts[cell + 1]):
+            places[n] = i
+            n += 1
+    return places
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _directions_about(c: Array, up: Array, reach: float) -> Mask:
+    """Tell the cells of directions in which beams may pass a centre within a reach."""
+    is_wanted = np.zeros(N_DIRECTIONS, np.bool_)
+    xyz, cell = np.empty((3, 1), np.float32), np.empty(1, np.uint16)
+    v_across = np.cross(up, c)
+    v_across *= reach / (np.sqrt(np.sum(v_across**2)) + 1e-12)
+    n_fine = 1.5 * reach * N_DIRECTIONS_SIDE / np.sqrt(np.sum(c**2))
+    n_steps = 2 + int(max(n_fine, reach / _STEP))
+    for i in range(-n_steps, n_steps + 1):
+        for j in range(-n_steps, n_steps + 1):
+            for axis in range(3):
+                aside = i * v_across[axis] + j * reach * up[axis]
+                xyz[axis, 0] = c[axis] + aside / n_steps
+            direction_cells(xyz[0], xyz[1], xyz[2], cell)
+            is_wanted[cell[0]] = True
     return is_wanted
-
-
-@numba.njit(cache=True, nogil=True, error_model="numpy")
-def _in_directions(p_base: Column, is_wanted: Mask) -> NDArray[np.int32]:
-    """Return the rows of the points, at whatever depth, in the cells that are wanted."""
-    rows = np.empty(len(p_base), np.int32)
-    cells = np.empty(_BLOCK, np.int32)
-    xyz = np.empty((3, _BLOCK), np.float32)
-    n_rows = 0
-    for low in range(0, len(p_base), _BLOCK):
-        points = p_base[low : low + _BLOCK]
-        n = len(points)
-        for i in range(n):
-            xyz[0, i], xyz[1, i], xyz[2, i] = points[i, 0], points[i, 1], points[i, 2]
-        _direction_cells(xyz[0, :n], xyz[1, :n], xyz[2, :n], cells)
-        for i in range(n):
-            rows[n_rows] = low + i  # kept only if the next one does not take its place
-            n_rows += is_wanted[cells[i]]
-    return rows[:n_rows]
-
-
-@numba.njit(cache=True, nogil=True, error_model="numpy")
-def _direction_cells(x: Column, y: Column, z: Column, cells: NDArray[np.int32]) -> None:
-    """Write the cells of some directions: the octahedron seen from above and from below.
-
-    A return that is none gets any cell: the angle refuses it later.
-    """
-    half, side = np.float32(0.4999 * _N_SIDE), np.int32(_N_SIDE)
-    for i in range(len(x)):
-        total = abs(x[i]) + abs(y[i]) + abs(z[i])
-        scale = half / total if (total > 0.0) & (total < np.inf) else np.float32(0.0)
-        row, column = np.int32(x[i] * scale + half), np.int32(y[i] * scale + half)
-        cell = (row + (side if z[i] > 0.0 else np.int32(0))) * side + column
-        cells[i] = cell if scale > 0.0 else np.int32(0)
