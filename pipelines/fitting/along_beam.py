@@ -192,8 +192,10 @@ def _gather(
     cloud: StitchedCloud, candidates: tuple[MarkerCandidate, ...], config: FittingConfig
 ) -> _Shots:
     """Return the members of all candidates as one table of shots."""
-    members = [c.members[np.isfinite(cloud.p_base[c.members]).all(axis=1)] for c in candidates]
-    together = np.concatenate(members)
+    members = np.concatenate([c.members for c in candidates])
+    is_finite = np.isfinite(cloud.p_base[members]).all(axis=1)
+    ends = np.cumsum([len(c.members) for c in candidates])
+    together, firsts = members[is_finite], np.cumsum(np.r_[0, is_finite])[np.r_[0, ends]]
     table = beams(cloud, together)
     lasers, places = np.unique(table.rings, return_inverse=True)
     # returns of unknown lasers come from all sixteen: their common part is what is left of a bias
@@ -201,7 +203,7 @@ def _gather(
     classes = np.digitize(table.intensities, _REFLECTIVITIES)
     rows = rows_of(
         table,
-        np.cumsum([0, *(len(rows) for rows in members)]),
+        firsts,
         levelling_rotation(cloud.levelling)[2],
         places.astype(np.intp),
         (classes, _SIGMAS[classes], config.sigma_direction),

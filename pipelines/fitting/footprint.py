@@ -11,6 +11,7 @@ from typing import NamedTuple
 
 import numba
 import numpy as np
+from numpy.polynomial import Chebyshev, Polynomial
 
 from pipelines.values import Array, Beams, Index
 
@@ -18,6 +19,8 @@ _N_STRIPS = 8  # strips of the ellipse; with 8 the mean is good to 0.01 mm of a 
 _N_STRIPS_FEW = 6  # along the way to the middle, so that the outline cuts them at one end
 _MIDDLE = 0.3  # radii: returns nearer to the middle belong to no side
 _THIN = 1e-6  # [m]; a thinner footprint is a ray, and this one differs from it by nothing
+_TINY = 1e-300
+_IN_ANY_ORDER = {"reassoc", "contract"}  # sums of a few terms at once
 
 
 def _strips(n: int) -> Array:
@@ -33,8 +36,17 @@ def _rays() -> Array:
     return np.column_stack([places, [1.0 / 4.0, *[1.0 / 8.0] * 6]])
 
 
+def _arctan() -> Array:
+    """Return the series of arctan(t) / t in t squared up to t = 1, highest power first."""
+    series = Chebyshev.interpolate(
+        lambda square: np.arctan(np.sqrt(square)) / np.sqrt(square), 8, domain=[0.0, 1.0]
+    )
+    return np.array(series.convert(kind=Polynomial, domain=[-1, 1], window=[-1, 1]).coef[::-1])
+
+
 _STRIPS, _STRIPS_FEW = _strips(_N_STRIPS), _strips(_N_STRIPS_FEW)
 _RAYS = _rays()
+_ARCTAN = _arctan()
 
 
 class Prediction(NamedTuple):
@@ -166,7 +178,7 @@ def _predict(
     return ranges, J, lit, offsets
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@numba.njit(cache=True, nogil=True, error_model="numpy", fastmath=_IN_ANY_ORDER)
 def depth_inside(
     x0: float, y0: float, radius: float, half_x: float, half_y: float
 ) -> tuple[float, float, float, float]:
@@ -205,9 +217,9 @@ def depth_inside(
     return mean, by_x, by_y, by_radius
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@numba.njit(cache=True, nogil=True, error_model="numpy", fastmath=_IN_ANY_ORDER)
 def depth_anywhere(x0: float, y0: float, radius: float, half_x: float, half_y: float) -> float:
-    """Return ``_mean_depth`` without derivatives, at a fraction of its cost.
+    """Return ``_mean_depth`` without derivatives, at a small fraction of its cost.
 
     Parameters
     ----------
@@ -223,6 +235,11 @@ def depth_anywhere(x0: float, y0: float, radius: float, half_x: float, half_y: f
     float
         How much nearer than its centre the sphere is on average over the lit part; 0 where the
         footprint passes by [m].
+
+    Notes
+    -----
+    Without a branch, so that the compiler does all strips at once: a strip that is not lit has no
+    length.
     """
     total, length = 0.0, 0.0
     if abs(y0) > abs(x0):  # across the outline a strip is lit or not, along it in part
@@ -230,19 +247,30 @@ def depth_anywhere(x0: float, y0: float, radius: float, half_x: float, half_y: f
     for k in range(len(_STRIPS_FEW)):
         weight = _STRIPS_FEW[k, 1]
         dy, half = half_y * _STRIPS_FEW[k, 0] - y0, half_x * weight
-        h2 = radius * radius - dy * dy
-        if h2 <= 0.0:
-            continue
+        h2 = max(radius * radius - dy * dy, 0.0)
         h = np.sqrt(h2)
-        left, right = max(-half - x0, -h), min(half - x0, h)
-        if left >= right:
-            continue
+        left, right = min(max(-half - x0, -h), h), min(max(half - x0, -h), h)
         depth_left = np.sqrt(max(h2 - left * left, 0.0))
         depth_right = np.sqrt(max(h2 - right * right, 0.0))
-        turn = np.arcsin(right / h) - np.arcsin(left / h)
+        turn = _angle(
+            right * depth_left - left * depth_right, depth_left * depth_right + left * right
+        )
         total += weight * 0.5 * (right * depth_right - left * depth_left + h2 * turn)
         length += weight * (right - left)
     return total / length if length > 0.0 else 0.0
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _angle(y: float, x: float) -> float:
+    """Return ``arctan2(y, x)`` for y not below zero, to 1e-8, without a branch."""
+    away = abs(x)
+    tangent = min(y, away) / max(y, away, _TINY)
+    square, series = tangent * tangent, 0.0
+    for k in range(len(_ARCTAN)):
+        series = series * square + _ARCTAN[k]
+    angle = tangent * series
+    angle = 0.5 * np.pi - angle if y > away else angle
+    return np.pi - angle if x < 0.0 else angle
 
 
 @numba.njit(cache=True, nogil=True)

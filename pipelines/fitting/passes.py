@@ -219,17 +219,18 @@ def _linearise(rows: Rows, spheres: Array, covs: Array, matters: Mask, out: Line
     for m in range(len(spheres)):
         sphere, cov = spheres[m], covs[m]
         for i in range(rows.firsts[m], rows.firsts[m + 1]):
-            u, a, b = rows.directions[i], rows.firsts_axis[i], rows.seconds_axis[i]
+            u, a, b = _at(rows.directions, i), _at(rows.firsts_axis, i), _at(rows.seconds_axis, i)
             closest, x0, y0 = 0.0, 0.0, 0.0
             for j in range(3):
                 v = sphere[j] - rows.origins[i, j]
                 closest += v * u[j]
                 x0 += v * a[j]
                 y0 += v * b[j]
+            half_widths = (rows.half_widths[i, 0], rows.half_widths[i, 1])
             depth, by_x, by_y, by_radius, mean, bend = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
             if matters[i]:
                 depth, by_x, by_y, by_radius, mean, bend = _mean_over_places(
-                    (x0, y0, sphere[3]), rows.half_widths[i], (a, b), cov
+                    (x0, y0, sphere[3]), half_widths, (a, b), cov
                 )
             # the bend takes from the depth what it adds to the range
             out.ranges[i] = closest - 2.0 * depth + mean
@@ -241,14 +242,21 @@ def _linearise(rows: Rows, spheres: Array, covs: Array, matters: Mask, out: Line
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
+def _at(rows: Array, i: int) -> tuple[float, float, float]:
+    """Return a row of three as numbers: a view of it would cost more than what is done with it."""
+    return rows[i, 0], rows[i, 1], rows[i, 2]
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def _mean_over_places(place, half_widths, axes, cov):  # type: ignore[no-untyped-def]  # noqa: ANN001, ANN202
     """Return depth, its mean slopes by x0, y0 and radius, its mean, and what is not linear."""
     x0, y0, radius = place
-    half_x, half_y = half_widths[0], half_widths[1]
-    away = max(np.hypot(x0, y0), 1e-9)
+    half_x, half_y = half_widths
+    away = max(np.sqrt(x0 * x0 + y0 * y0), 1e-9)
     c, s = x0 / away, y0 / away
     root = _root(cov, axes, c, s)
-    reach = np.hypot(away + _WIDTH * root[0], _WIDTH * (abs(root[1]) + root[2]))
+    out, aside = away + _WIDTH * root[0], _WIDTH * (abs(root[1]) + root[2])
+    reach = np.sqrt(out * out + aside * aside)
     if reach + max(half_x, half_y) + _WIDTH * (abs(root[3]) + root[5]) < _INNER * radius:
         depth, by_x, by_y, by_radius = depth_inside(x0, y0, radius, half_x, half_y)
         return depth, by_x, by_y, by_radius, depth + 0.5 * _curving(away, radius, root), 0.0

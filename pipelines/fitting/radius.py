@@ -84,18 +84,22 @@ def free_radii(
 def _free(
     rows: Rows, weighing: Weighing, spheres: Array, covs: Array, n_lasers: int
 ) -> tuple[Array, Array]:
-    """Return centres with radii, (m, 4), and their covariances."""
-    radius = spheres[:, 3]
+    """Return centres with radii, (m, 4), and their covariances; what has settled stays."""
+    radius, counts = spheres[:, 3], np.diff(rows.firsts)
+    moves = np.ones(len(spheres), dtype=bool)
     for _ in range(_N_STEPS):
-        linear = linearise(rows, spheres, covs, weighing.weights > 0.0)
-        per_square = weighing.weights / (weighing.variances + linear.bends**2)
+        is_in = (weighing.weights > 0.0) & np.repeat(moves, counts)
+        linear = linearise(rows, spheres, covs, is_in)
+        per_square = is_in * weighing.weights / (weighing.variances + linear.bends**2)
         residuals = weighing.ranges - linear.ranges
         N, _, _, pull, _ = normals_of(rows, linear, residuals, per_square, (4, n_lasers))
-        covs = np.linalg.inv(N + np.eye(4) / (_PRIOR * radius[:, None, None]) ** 2)
+        inverse = np.linalg.inv(N + np.eye(4) / (_PRIOR * radius[:, None, None]) ** 2)
+        covs = np.where(moves[:, None, None], inverse, covs)
         limit = _STEP_MAX * radius[:, None]
-        step = np.clip(np.einsum("mij,mj->mi", covs, pull), -limit, limit)
+        step = np.clip(np.einsum("mij,mj->mi", inverse, pull), -limit, limit)
         spheres = spheres + step
-        if np.abs(step).max() < _SETTLED:
+        moves &= np.abs(step).max(axis=1) >= _SETTLED
+        if not moves.any():
             break
     return spheres, covs
 
