@@ -22,7 +22,7 @@ from storage.recordings.reading import Choice, Decoders, assemble, stem
 OK, WEAK, REFUSED = "ok", "weak", "refused"
 
 _SAMPLE = 40_000  # shots that the trial stitching looks at
-_PROBES = 20_000  # pairs of shots that tell the LiDAR's speed
+_PROBES = 4_000  # pairs of shots that tell the LiDAR's speed
 _PROBE_APART = (
     1_000_000  # [ns] between the shots of a pair: far less than a turn, many azimuth steps
 )
@@ -298,8 +298,7 @@ def _reasons(
 
 def _thinned(log: ScanLog) -> ScanLog:
     """Return a log with at most ``_SAMPLE`` returns, first and last among them."""
-    n = len(log.stamps_lidar_ns)
-    rows = np.unique(np.linspace(0, n - 1, min(n, _SAMPLE)).astype(np.intp))
+    rows = _spread(len(log.stamps_lidar_ns), _SAMPLE)
     return replace(
         log,
         p_lidar=log.p_lidar[rows],
@@ -307,6 +306,11 @@ def _thinned(log: ScanLog) -> ScanLog:
         rings=log.rings[rows],
         stamps_lidar_ns=log.stamps_lidar_ns[rows],
     )
+
+
+def _spread(n: int, most: int) -> Index:
+    """Return at most so many of n places, evenly spread, the first and the last among them."""
+    return np.rint(np.linspace(0, n - 1, min(n, most))).astype(np.intp)
 
 
 def _skew(decoders: Decoders, times: _Times) -> float | None:
@@ -355,7 +359,7 @@ def _spin(log: ScanLog) -> tuple[float, float] | None:
     stamps = log.stamps_lidar_ns
     if not log.has_shot_times or len(stamps) < 2:
         return None
-    rows = np.unique(np.linspace(0, len(stamps) - 1, _PROBES).astype(np.intp))
+    rows = _spread(len(stamps), _PROBES)
     later = np.searchsorted(stamps, stamps[rows] + _PROBE_APART)
     is_near = (later < len(stamps)) & (
         stamps[np.minimum(later, len(stamps) - 1)] - stamps[rows] < 4 * _PROBE_APART
