@@ -112,4 +112,7 @@ def address(plan: Row) -> str:
         query["stops"] = ";".join(
             f"{stop['name']}:{stop['x_m']:.3f},{stop['y_m']:.3f}" for stop in asked["stops"]
         )
+    if asked.get("keep_out_m"):
+        areas = (";".join(f"{x:g},{y:g}" for x, y in area) for area in asked["keep_out_m"])
+        query["keep"] = "|".join(areas)
     return f"/plan?{urlencode(query)}"

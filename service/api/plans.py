@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import asyncio
 import math
+from dataclasses import replace
 from typing import Annotated, Literal
 
+import numpy as np
 from fastapi import APIRouter, Path, Query, Request, Response
 from fastapi.responses import JSONResponse, PlainTextResponse
 from pydantic import BaseModel, ConfigDict, Field, model_validator
@@ -69,6 +71,12 @@ class ChosenStop(Strict):
     y_m: float
 
 
+Corner = tuple[
+    Annotated[float, Field(allow_inf_nan=False)], Annotated[float, Field(allow_inf_nan=False)]
+]
+Area = Annotated[list[Corner], Field(min_length=3, max_length=200)]
+
+
 class Plan(Strict):
     """An arrangement to judge, or to better."""
 
@@ -76,6 +84,11 @@ class Plan(Strict):
     marks: list[PlannedMark] = Field(default_factory=list, max_length=500)
     stops: list[ChosenStop] | None = Field(
         default=None, max_length=5000, description="The field's own stops by default."
+    )
+    keep_out_m: list[Area] = Field(
+        default_factory=list,
+        max_length=50,
+        description="Areas where no mark is put, as corners x, y in the site frame [m].",
     )
     method: Literal["free_station", "paper"] = "free_station"
     tolerance_m: float = Field(default=0.03, gt=0, le=10)
@@ -186,14 +199,14 @@ def evaluate_plan(plan: JudgedPlan, request: Request, service: Current) -> Respo
 def optimise_plan(plan: WantedPlan, service: Current) -> Said:
     """Find the best places for a number of marks, or the fewest that keep the tolerance."""
     goal = Goal(n_marks=plan.n_marks, is_robust=plan.is_robust)
-    answer = siting.optimise(_asked(service, plan), plan.rules.to_values(), goal)
+    answer = siting.optimise(_fenced(service, plan), plan.rules.to_values(), goal)
     return Said.model_validate(answer)
 
 
 @router.post("/plans/suggest", name="suggest_mark")
 def suggest_mark(plan: BetterPlan, service: Current) -> Said:
     """Name the one more mark that would help most."""
-    answer = siting.one_more(_asked(service, plan), plan.rules.to_values())
+    answer = siting.one_more(_fenced(service, plan), plan.rules.to_values())
     return Said.model_validate(answer)
 
 
@@ -278,6 +291,15 @@ def _asked(service: Service, plan: Plan) -> Asked:
         model=service.planner.model(plan.model, sensor, ground.site.marker_radius),
         wish=Requirement(tolerance=plan.tolerance_m, method=plan.method),
     )
+
+
+def _fenced(service: Service, plan: Plan) -> Asked:
+    """Return what is asked, on a field with the areas where no mark may be put."""
+    asked = _asked(service, plan)
+    own = tuple(np.array(area, dtype=np.float64) for area in plan.keep_out_m)
+    site = asked.ground.site
+    site = replace(site, keep_out=(*site.keep_out, *own)) if own else site
+    return replace(asked, ground=replace(asked.ground, site=site))
 
 
 def _place(mark: PlannedMark) -> Place:

@@ -199,3 +199,24 @@ def test_a_mark_that_is_dragged_moves_the_prediction_and_the_address(visit):
     page.wait_for_function("() => document.querySelectorAll('#marks-table tbody tr').length === 2")
     page.click("#undo")
     page.wait_for_function("() => document.querySelectorAll('#marks-table tbody tr').length === 3")
+
+
+def test_no_mark_is_put_where_an_area_was_drawn(visit):
+    page = visit().open("/plan?model=sensor&a=P01:6.5,0.5,1;P02:-1,6.5,1;P03:-6.5,-3,1")
+    page.wait_for_selector("#stops-table tbody tr")
+    page.click("#add-area")
+    svg = page.locator(".plan .map svg")
+    box = svg.bounding_box()
+    for x, y in ((0.02, 0.02), (0.5, 0.02), (0.5, 0.98), (0.02, 0.98)):  # the left half
+        svg.click(position={"x": x * box["width"], "y": y * box["height"]})
+    page.click("#finish-area")
+    page.fill("#count", "4")
+    page.click("#optimise")
+    page.wait_for_selector("#marks-table tbody tr:nth-child(4)")
+    fields = page.get_by_role("spinbutton", name=re.compile("^x of P"))
+    assert all(float(field.input_value()) > -0.6 for field in fields.all())
+    assert "keep=" in page.url
+    page.reload()
+    page.locator("[data-key='area 0']").focus()
+    page.keyboard.press("Delete")
+    page.wait_for_function("() => !location.search.includes('keep=')")

@@ -105,6 +105,19 @@ def test_optimised_marks_are_better_than_those_one_began_with(client):
     assert evaluated(client, marks=keep)["stops"] == best["stops"]
 
 
+def test_areas_keep_marks_out_and_are_kept_with_a_plan(client):
+    left = [[-30, -30], [0, -30], [0, 30], [-30, 30]]
+    plan = {"marks": MARKS, "model": "sensor", "keep_out_m": [left]}
+    best = client.post("/api/v1/plans/optimise", json={**plan, "n_marks": 3}).json()
+    assert all(mark["position_m"][0] >= 0 for mark in best["marks"])
+    more = client.post("/api/v1/plans/suggest", json=plan).json()
+    assert more["position_m"][0] >= 0
+    kept = client.post("/api/v1/plans", json={**plan, "name": "fenced"}).json()
+    page = client.get(f"/plan/{kept['placement_id']}").text
+    assert "keep=-30%2C-30%3B0%2C-30%3B0%2C30%3B-30%2C30" in page
+    assert "keep_out_m" in refused(client, "/api/v1/plans/optimise", keep_out_m=[left[:2]])
+
+
 def test_one_more_mark_is_suggested_that_helps(client):
     answer = client.post("/api/v1/plans/suggest", json={"marks": MARKS, "model": "sensor"}).json()
     assert answer["worst_sigma_3d_m"] < answer["worst_sigma_3d_before_m"]
@@ -121,7 +134,7 @@ def test_a_kept_plan_stands_beside_what_came_of_it(client):
         row["stop"]: row["error_3d_m"] for row in fix if row["resection_method"] == "free_station"
     }
     assert {stop["stop"]: stop["error_3d_m"] for stop in surveyed} == pytest.approx(errors)
-    sql = "SELECT count(*), count(error_3d_m) FROM placements"
+    sql = "SELECT count(*), count(error_3d_m) FROM placements WHERE name = 'first'"
     answer = client.get("/api/v1/sql", params={"q": sql}).json()
     assert answer.get("rows") == [[35, 2]], answer
     page = client.get(f"/plan/{found['placement_id']}").text

@@ -1,4 +1,6 @@
 // One map of a plan: a field of colours, stops, marks that can be dragged, and lines of sight.
+const { drawAreas } = await import(document.getElementById("planner").dataset.areas);
+
 const SVG = "http://www.w3.org/2000/svg";
 const MARGIN = { left: 34, right: 10, top: 10, bottom: 24 }; // [px] for the axes
 const STEP = 0.1; // [m] of an arrow key; ten times that with Shift
@@ -66,7 +68,7 @@ export class PlanMap {
     this.svg.addEventListener("dblclick", (event) => this.add(event));
   }
 
-  // scene: {site, stops, marks, evaluation, field, shown, range, tolerance, stop}
+  // scene: {site, stops, areas, corners, marks, evaluation, field, shown, range, tolerance, stop}
   show(scene) {
     this.scene = scene;
     this.draw();
@@ -136,7 +138,7 @@ export class PlanMap {
   drawMarks() {
     const focused = this.svg.querySelector(":focus")?.dataset.key;
     this.svg.setAttribute("viewBox", `0 0 ${this.at.width} ${this.at.height}`);
-    this.svg.replaceChildren(this.axes(), this.keepOut(), this.sights(), this.stops(), this.marks());
+    this.svg.replaceChildren(this.axes(), drawAreas(this, this.on.area), this.sights(), this.stops(), this.marks());
     if (focused) this.svg.querySelector(`[data-key="${CSS.escape(focused)}"]`)?.focus();
   }
 
@@ -151,15 +153,6 @@ export class PlanMap {
     for (let y = Math.ceil(y0 / step) * step; y <= y1; y += step) {
       group.append(element("line", { class: "grid-line", x1: this.at.x(x0), x2: this.at.x(x1), y1: this.at.y(y), y2: this.at.y(y) }));
       group.append(element("text", { x: MARGIN.left - 6, y: this.at.y(y) + 4, "text-anchor": "end" }, `${y}`));
-    }
-    return group;
-  }
-
-  keepOut() {
-    const group = element("g");
-    for (const polygon of this.scene.site.keep_out_m ?? []) {
-      const points = polygon.map(([x, y]) => `${this.at.x(x)},${this.at.y(y)}`).join(" ");
-      group.append(element("polygon", { class: "keep-out", points }, element("title", {}, "No mark may stand here")));
     }
     return group;
   }
@@ -248,6 +241,10 @@ export class PlanMap {
   handle(glyph, key, from, { move, end, remove, choose }) {
     glyph.addEventListener("click", (event) => event.stopPropagation());
     glyph.addEventListener("pointerdown", (event) => this.drag(event, key, { move, end, choose }));
+    this.keys(glyph, from, { move, end, remove, choose });
+  }
+
+  keys(glyph, from, { move, end, remove, choose }) {
     glyph.addEventListener("keydown", (event) => {
       const arrow = ARROWS[event.key];
       const isRemoving = event.key === "Delete" || event.key === "Backspace";
@@ -292,6 +289,7 @@ export class PlanMap {
   }
 
   add(event) {
+    if (this.isAdding) return;
     if (event.target === this.svg || event.target.closest(".axis")) this.on.onAdd(...this.place(event));
   }
 }

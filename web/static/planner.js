@@ -1,12 +1,13 @@
 // The planner: marks that move, the service that answers what they promise, the address that holds it all.
 const { PlanMap, SHOWN, rangeOf, paintScale } = await import(document.getElementById("planner").dataset.map);
+const { parseAreas, areasText, square, isInside, fillTable } = await import(document.getElementById("planner").dataset.areas);
 
 const API = "/api/v1/plans";
 const CELLS = { moving: 32, still: 64 }; // across the longer side of the map
 const KEPT = 60; // steps that can be undone
 const byId = (name) => document.getElementById(name);
 const controls = ["site", "method", "tolerance", "turn", "rpm", "model", "show"];
-const state = { plans: [], active: 0, stop: "", stops: null, site: null, past: [] };
+const state = { plans: [], active: 0, stop: "", stops: null, areas: [], corners: null, site: null, past: [], adding: "" };
 
 // ---- the address
 
@@ -23,6 +24,7 @@ function readAddress() {
   }
   state.stop = query.get("stop") ?? "";
   state.stops = query.get("stops") === null ? null : parseStops(query.get("stops"));
+  state.areas = parseAreas(query.get("keep") ?? "");
   return ["a", "b"].map((key) => query.get(key)).filter((text) => text !== null).map(parseMarks);
 }
 
@@ -51,6 +53,7 @@ function writeAddress() {
   state.plans.forEach((plan, i) => query.set("ab"[i], marksText(plan.marks)));
   if (state.stop) query.set("stop", state.stop);
   if (state.stops) query.set("stops", state.stops.map((s) => `${s.name}:${round(s.x, 3)},${round(s.y, 3)}`).join(";"));
+  if (state.areas.length) query.set("keep", areasText(state.areas));
   history.replaceState(null, "", `/plan?${query}`);
 }
 
@@ -61,6 +64,7 @@ function request(plan, more = {}) {
     site: byId("site").value,
     marks: plan.marks.map((m) => ({ name: m.name, x_m: m.x, y_m: m.y, pole_height_m: m.pole })),
     stops: state.stops?.map((s) => ({ name: s.name, x_m: s.x, y_m: s.y })) ?? null,
+    keep_out_m: state.areas,
     method: byId("method").value,
     tolerance_m: byId("tolerance").valueAsNumber / 1000,
     turn_s: byId("turn").valueAsNumber,
@@ -123,15 +127,18 @@ function draw() {
   const fields = shown === "ground" ? [state.site.ground] : state.plans.map((plan) => plan.field);
   const range = rangeOf(fields, shown, tolerance);
   for (const plan of state.plans) {
-    plan.map.show({ ...plan, site: state.site, stops: state.stops, shown, range, tolerance, stop: state.stop });
+    plan.map.show({ ...plan, site: state.site, stops: state.stops, areas: state.areas, corners: state.corners, shown, range, tolerance, stop: state.stop });
     plan.figure.classList.toggle("active", plan === state.plans[state.active]);
     paintScale(plan.figure, shown, range, tolerance);
     drawHead(plan, tolerance);
   }
   drawMarks();
   drawStops();
+  byId("areas").hidden = !state.areas.length;
+  fillTable(byId("areas-table").tBodies[0], state.areas, onArea);
 }
 
+const fixed = (value, digits) => (+value.toFixed(digits) || 0).toFixed(digits); // never -0
 const mm = (value) => (value === null || value === undefined ? "–" : (1000 * value).toFixed(value < 0.01 ? 2 : 1));
 const percent = (value) => (value === null || value === undefined ? "–" : (100 * value).toFixed(1));
 
@@ -141,9 +148,10 @@ function drawHead(plan, tolerance) {
   plan.figure.querySelector("h2").textContent =
     `${state.plans.length > 1 ? `Arrangement ${letter}: ` : ""}${n} mark${n === 1 ? "" : "s"}`;
   const { evaluation } = plan;
-  plan.figure.querySelector(".caption").textContent = evaluation
+  const fenced = plan.marks.filter((mark) => state.areas.some((area) => isInside(area, mark.x, mark.y))).map((mark) => mark.name);
+  plan.figure.querySelector(".caption").textContent = (evaluation
     ? `${evaluation.site.name}, ${evaluation.method === "paper" ? "three circles" : "free station"}. ${evaluation.model.text}`
-    : "No prediction yet.";
+    : "No prediction yet.") + (fenced.length ? ` In a keep-out area: ${fenced.join(", ")}.` : "");
   const stops = evaluation?.stops ?? [];
   const worst = stops.reduce((a, b) => (worse(a, b) ? a : b), stops[0]);
   const n_kept = stops.filter((stop) => stop.probability_within_tolerance >= 0.95).length;
@@ -199,8 +207,8 @@ function derived(plan, mark) {
   const stops = plan.evaluation?.stops ?? [];
   const n = stops.filter((stop) => stop.visible_marks.includes(mark.name)).length;
   return [
-    answer ? answer.ground_m.toFixed(3) : "–",
-    answer ? answer.position_m[2].toFixed(3) : "–",
+    answer ? fixed(answer.ground_m, 3) : "–",
+    answer ? fixed(answer.position_m[2], 3) : "–",
     stops.length ? `${n} of ${stops.length}` : "–",
   ];
 }
@@ -213,11 +221,11 @@ function markRow(plan, mark, place) {
   const row = document.createElement("tr");
   const input = (key, digits) => {
     const field = document.createElement("input");
-    Object.assign(field, { type: "number", step: "0.01", value: mark[key].toFixed(digits) });
+    Object.assign(field, { type: "number", step: "0.01", value: fixed(mark[key], digits) });
     field.dataset.cell = `${place} ${key}`;
     field.setAttribute("aria-label", `${{ x: "x", y: "y", pole: "Pole height" }[key]} of ${mark.name} [m]`);
     field.addEventListener("change", () => {
-      if (!Number.isFinite(field.valueAsNumber)) { field.value = mark[key].toFixed(digits); return; }
+      if (!Number.isFinite(field.valueAsNumber)) { field.value = fixed(mark[key], digits); return; }
       remember();
       mark[key] = field.valueAsNumber;
       changed(plan, CELLS.still);
@@ -293,7 +301,7 @@ function stopRow(name) {
 
 function remember() {
   const marks = state.plans.map((plan) => plan.marks);
-  state.past.push(JSON.stringify({ marks, stops: state.stops, active: state.active }));
+  state.past.push(JSON.stringify({ marks, stops: state.stops, areas: state.areas, active: state.active }));
   if (state.past.length > KEPT) state.past.shift();
   byId("undo").disabled = false;
 }
@@ -370,8 +378,10 @@ function open(marks) {
       if (state.stop === name) state.stop = "";
       stopsChanged(CELLS.still);
     },
+    area: onArea,
     onAdd(x, y) {
       activate();
+      if (state.adding === "area") { addCorner(x, y, plan.map.at.scale); return; }
       remember();
       if (state.adding === "stop") {
         ownStops().push({ name: freeName(ownStops(), "S"), x, y });
@@ -408,12 +418,61 @@ function setMarks(all, active) {
   evaluateAll();
 }
 
+// ---- areas where no mark may stand
+
+const onArea = {
+  onChange(place, area, isFirst) {
+    if (isFirst) remember();
+    state.areas = state.areas.with(place, area);
+    writeAddress();
+    draw();
+  },
+  onRemove(place) {
+    remember();
+    state.areas = state.areas.filter((_, i) => i !== place);
+    writeAddress();
+    draw();
+  },
+  onRefused: say,
+};
+
+function addArea(area) {
+  remember();
+  state.areas = [...state.areas, area];
+  setAdding("");
+  writeAddress();
+  draw();
+  tell("No mark will be put there by Optimise and by Best place for one more.");
+}
+
+// A corner near the first one closes the area.
+function addCorner(x, y, scale) {
+  const first = state.corners[0];
+  if (first && state.corners.length > 2 && Math.hypot(x - first[0], y - first[1]) * scale < 12) { addArea(state.corners); return; }
+  state.corners = [...state.corners, [x, y]];
+  byId("finish-area").disabled = state.corners.length < 3;
+  draw();
+}
+
+const ADDING = {
+  "": "",
+  mark: "Click on the map where the mark shall stand.",
+  stop: "Click on the map where the stop shall stand.",
+  area: "Click the corners on the map, then Finish the area or click the first corner again. Backspace takes the last corner back, Escape gives up.",
+};
+
 function setAdding(what) {
   state.adding = what;
-  byId("add").setAttribute("aria-pressed", String(what === "mark"));
-  byId("add-stop").setAttribute("aria-pressed", String(what === "stop"));
+  state.corners = what === "area" ? [] : null;
+  for (const [id, kind] of [["add", "mark"], ["add-stop", "stop"], ["add-area", "area"]]) {
+    byId(id).setAttribute("aria-pressed", String(what === kind));
+  }
+  Object.assign(byId("finish-area"), { hidden: what !== "area", disabled: true });
   state.plans.forEach((plan) => { plan.map.adding = Boolean(what); });
-  tell(what ? `Click on the map where the ${what} shall stand.` : "");
+  tell(ADDING[what]);
+  draw();
+  const { box } = state.plans[state.active].map;
+  if (what && box.getBoundingClientRect().top > 0.7 * window.innerHeight) box.scrollIntoView({ block: "center" });
 }
 
 const own = (mark) => ({ name: mark.name, x: mark.position_m[0], y: mark.position_m[1], pole: mark.pole_height_m });
@@ -435,10 +494,28 @@ async function during(button, work) {
 
 byId("add").addEventListener("click", () => setAdding(state.adding === "mark" ? "" : "mark"));
 byId("add-stop").addEventListener("click", () => setAdding(state.adding === "stop" ? "" : "stop"));
+byId("add-area").addEventListener("click", (event) => {
+  if (event.detail) { setAdding(state.adding === "area" ? "" : "area"); return; }
+  const [x0, y0, x1, y1] = state.site.extent_m; // by keyboard: a square to begin with
+  addArea(square([(x0 + x1) / 2, (y0 + y1) / 2]));
+  tell("A square of 2 m stands in the middle of the map: move it or its corners with the arrow keys.");
+  state.plans[state.active].map.svg.querySelector(`[data-key="area ${state.areas.length - 1}"]`)?.focus();
+});
+byId("finish-area").addEventListener("click", () => addArea(state.corners));
+document.addEventListener("keydown", (event) => {
+  if (!state.adding || event.target.matches("input, select, textarea")) return;
+  if (event.key === "Escape") setAdding("");
+  else if (event.key === "Backspace" && state.corners?.length) {
+    state.corners = state.corners.slice(0, -1);
+    byId("finish-area").disabled = state.corners.length < 3;
+    draw();
+  } else return;
+  event.preventDefault();
+});
 byId("undo").addEventListener("click", () => {
   const past = JSON.parse(state.past.pop());
   byId("undo").disabled = !state.past.length;
-  state.stops = past.stops;
+  Object.assign(state, { stops: past.stops, areas: past.areas });
   setMarks(past.marks, past.active);
 });
 byId("compare").addEventListener("click", () => {
@@ -517,7 +594,7 @@ async function openSite(all) {
 }
 
 function changeSite() {
-  Object.assign(state, { stops: null, stop: "" });
+  Object.assign(state, { stops: null, stop: "", areas: [] });
   return openSite([]);
 }
 
