@@ -15,11 +15,24 @@ from service.cli_survey import (
     ControlFile,
     ControlUnit,
     Logs,
+    RigFile,
     TargetHeight,
     Unit,
     read_control,
 )
 from service.terminal import err, out, print_json, progress
+
+Laz = Annotated[
+    Path | None, typer.Option(dir_okay=False, help="Write the cloud in the site frame (LAZ).")
+]
+E57 = Annotated[
+    Path | None,
+    typer.Option(dir_okay=False, help="Write the cloud as scans with their poses (E57)."),
+]
+GeoTiff = Annotated[
+    Path | None,
+    typer.Option(dir_okay=False, help="Write the ground's heights and sigmas (GeoTIFF)."),
+]
 
 
 def site(
@@ -28,20 +41,10 @@ def site(
     control_axes: ControlAxes = Axes.ENU,
     control_unit: ControlUnit = Unit.METRE,
     target_height_m: TargetHeight = 0.0,
-    rig: Annotated[
-        Path | None, typer.Option(exists=True, dir_okay=False, help="Rig (JSON), if not the logs'.")
-    ] = None,
-    laz: Annotated[
-        Path | None, typer.Option(dir_okay=False, help="Write the cloud in the site frame (LAZ).")
-    ] = None,
-    e57: Annotated[
-        Path | None,
-        typer.Option(dir_okay=False, help="Write the cloud as scans with their poses (E57)."),
-    ] = None,
-    geotiff: Annotated[
-        Path | None,
-        typer.Option(dir_okay=False, help="Write the ground's heights and sigmas (GeoTIFF)."),
-    ] = None,
+    rig: RigFile = None,
+    laz: Laz = None,
+    e57: E57 = None,
+    geotiff: GeoTiff = None,
     cell_m: Annotated[float, typer.Option(help="Edge of a cell of the ground \\[m].")] = 0.25,
     ground_range_m: Annotated[
         float, typer.Option(help="How far from a station ground is used \\[m].")

@@ -44,6 +44,9 @@ ControlUnit = Annotated[Unit, typer.Option(help="Unit of the control file.")]
 TargetHeight = Annotated[
     float, typer.Option(help="Height of the centres above the points of the control file \\[m].")
 ]
+RigFile = Annotated[
+    Path | None, typer.Option(exists=True, dir_okay=False, help="Rig (JSON), if not the logs'.")
+]
 
 
 def read_control(
@@ -63,9 +66,7 @@ def adjust(
     control_axes: ControlAxes = Axes.ENU,
     control_unit: ControlUnit = Unit.METRE,
     target_height_m: TargetHeight = 0.0,
-    rig: Annotated[
-        Path | None, typer.Option(exists=True, dir_okay=False, help="Rig (JSON), if not the logs'.")
-    ] = None,
+    rig: RigFile = None,
     calibrating: Annotated[
         bool, typer.Option("--calibrate", help="Estimate the rig in the same adjustment.")
     ] = False,

@@ -147,16 +147,7 @@ def network_answer(
         "calibration": None if rig is None else calibration_answer(rig),
         "shared_unknowns": _shared(result),
         "marks_covariance_m2": _joint(result),
-        "excluded": [
-            {
-                "kind": one.kind,
-                "station": one.station or None,
-                "marker": marker_name(one.fit) if one.fit >= 0 else None,
-                "mark": one.mark or None,
-                "reason": one.reason,
-            }
-            for one in result.left_out
-        ],
+        "excluded": _excluded(result),
         "refused": [
             {"station": one.station, "code": one.code, "reason": one.reason}
             for one in network.refused
@@ -212,6 +203,20 @@ def error_answer(result: AdjustedNetwork, truths: Sequence[Truth]) -> Plain:
             )
         ],
     }
+
+
+def _excluded(result: AdjustedNetwork) -> list[Plain]:
+    """Return what was left out, and why."""
+    return [
+        {
+            "kind": one.kind,
+            "station": one.station or None,
+            "marker": marker_name(one.fit) if one.fit >= 0 else None,
+            "mark": one.mark or None,
+            "reason": one.reason,
+        }
+        for one in result.left_out
+    ]
 
 
 def _n_observations(result: AdjustedNetwork) -> int:

@@ -6,9 +6,10 @@ What a job and the command have in common: given clouds one by one with their po
 from __future__ import annotations
 
 import json
+import secrets
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import ExitStack, closing
-from dataclasses import dataclass, field
+from contextlib import ExitStack, closing, contextmanager
+from dataclasses import dataclass, field, replace
 from datetime import UTC, date, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -23,7 +24,7 @@ from pipelines.elevation import (
     poses_of_network,
     station_points,
 )
-from pipelines.errors import ConfigError, NotFoundError
+from pipelines.errors import ConfigError, InputError, NotFoundError
 from storage.site_clouds import CloudExtent, E57File, LazFile
 
 if TYPE_CHECKING:
@@ -57,6 +58,9 @@ class SiteWish:
         unknown = set(self.targets) - set(KINDS)
         if unknown or not self.targets:
             raise ConfigError(f"Name one or more of {', '.join(KINDS)}, and nothing else.")
+        for path in self.targets.values():
+            if not path.parent.is_dir():
+                raise InputError(f"There is no folder {path.parent} for {path.name}; make it.")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -69,7 +73,29 @@ class Site:
 
 
 def make_site(stops: Stops, poses: Sequence[StationPose], wish: SiteWish) -> Site:
-    """Write the files that are wanted; one stop at a time is held."""
+    """Write the files that are wanted, all or none; one stop at a time is held."""
+    with _completed(wish.targets) as parts:
+        return _make_site(stops, poses, replace(wish, targets=parts))
+
+
+@contextmanager
+def _completed(targets: Mapping[str, Path]) -> Iterator[Mapping[str, Path]]:
+    """Lend places beside the targets; what is complete moves there, of anything else none stays."""
+    parts = {
+        kind: path.with_name(f".{secrets.token_hex(4)}.part{path.suffix}")
+        for kind, path in targets.items()
+    }
+    try:
+        yield parts
+        for kind, part in parts.items():
+            part.replace(targets[kind])
+    finally:
+        for part in parts.values():
+            part.unlink(missing_ok=True)
+
+
+def _make_site(stops: Stops, poses: Sequence[StationPose], wish: SiteWish) -> Site:
+    """Write the files that are wanted."""
     from storage.elevation_files import write_geotiff
 
     terrain = Terrain(poses, wish.elevation) if "geotiff" in wish.targets else None

@@ -6,13 +6,16 @@ of each station alone.
 
 from __future__ import annotations
 
+import fcntl
 import hashlib
 import json
+import shutil
 from collections.abc import Iterator, Mapping
+from contextlib import contextmanager, suppress
 from dataclasses import replace
 from datetime import UTC, datetime
 from pathlib import Path
-from tempfile import TemporaryDirectory
+from tempfile import TemporaryDirectory, gettempdir
 from typing import TYPE_CHECKING, Any
 
 from pydantic import Field
@@ -32,6 +35,8 @@ if TYPE_CHECKING:
 
 Row = dict[str, Any]
 Key = tuple[str, str]  # recording and stop
+
+_SCRATCH, _IN_USE = "spheremark-site-", "in-use"  # names of folders, and of the file that is locked
 
 _ADJUSTED = """
 SELECT x.recording_id, x.stop, x.rig_digest, x.x_m, x.y_m, x.z_m, x.rotation, x.cov_motion,
@@ -67,9 +72,14 @@ class SiteOptions(Options):
     gap_m: float = Field(
         default=0.0, ge=0, le=10, description="Holes of the ground up to this are filled in [m]."
     )
-    range_m: float = Field(default=30.0, gt=0, description="How far the cloud reaches [m].")
+    range_m: float = Field(
+        default=30.0, gt=0, le=1000, description="How far the cloud reaches [m]."
+    )
     voxel_m: float = Field(
-        default=0.0, ge=0, description="A stop keeps one return in cubes of this edge [m]; 0: all."
+        default=0.0,
+        ge=0,
+        le=100,
+        description="A stop keeps one return in cubes of this edge [m]; 0: all.",
     )
     clouds: bool = Field(default=True, description="Make the clouds, beside the ground.")
 
@@ -93,15 +103,27 @@ def work(order: Order, progress: Progress) -> Outcome:
     options = SiteOptions.model_validate(own).model_dump()
     rows = {(row["recording_id"], row["stop"]): row for row in order.known["poses"].to_pylist()}
     poses = _poses(order, rows)
-    with TemporaryDirectory(prefix="spheremark-") as folder:
+    with scratch() as folder:
         kinds = KINDS if options["clouds"] else ("geotiff",)
-        wish = _wish(SiteWish, {k: Path(folder) / f"site{ENDINGS[k]}" for k in kinds}, options)
+        wish = _wish(SiteWish, {k: folder / f"site{ENDINGS[k]}" for k in kinds}, options)
         stops = _stops(order, rows, poses, progress)
         site = make_site(stops, tuple(poses.values()), wish)
         progress(0.95, "Keeping the files")
         kept = {kind: keep_file(path, order.clouds_url) for kind, path in wish.targets.items()}
     made = _rows(site, kept, _common(order, options, next(iter(rows.values())), site.n_stations))
     return Outcome(tables={"site_products": product_rows(made)}, message=_summary(made))
+
+
+@contextmanager
+def scratch() -> Iterator[Path]:
+    """Lend a folder; remove those of workers that were ended before they could do so."""
+    for left in Path(gettempdir()).glob(f"{_SCRATCH}*"):
+        with suppress(OSError), (left / _IN_USE).open() as lock:
+            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)  # refused while its owner lives
+            shutil.rmtree(left)
+    with TemporaryDirectory(prefix=_SCRATCH) as folder, (Path(folder) / _IN_USE).open("w") as lock:
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        yield Path(folder)
 
 
 def _poses(order: Order, rows: Mapping[Key, Row]) -> dict[Key, StationPose]:

@@ -1,5 +1,6 @@
 """A site over HTTP and on the command line: clouds, ground, and the page that shows them."""
 
+import fcntl
 import json
 
 import laspy
@@ -8,7 +9,11 @@ import pye57
 import pytest
 from typer.testing import CliRunner
 
+from pipelines.elevation import StationPose
+from pipelines.errors import SpheremarkError
 from service.cli import app
+from service.site import SiteWish, make_site
+from service.work.siting import scratch
 from storage.elevation_files import read_geotiff
 
 
@@ -118,6 +123,47 @@ def test_what_is_no_product_is_not_found(made, site):
 def test_the_command_wants_to_know_what_to_write(stop):
     done = CliRunner().invoke(app, ["site", str(stop.log)])
     assert done.exit_code == 2
+
+
+@pytest.mark.parametrize("ending", ["laz", "e57", "geotiff"])
+def test_a_folder_that_is_not_there_is_said_before_anything_is_done(ending, stop, tmp_path):
+    target = tmp_path / "none" / "site.x"
+    done = CliRunner().invoke(app, ["site", str(stop.log), f"--{ending}", str(target)])
+    assert isinstance(done.exception, SpheremarkError)
+    assert str(tmp_path / "none") in str(done.exception)
+
+
+def test_a_site_that_fails_leaves_no_files_and_spoils_none(tmp_path):
+    targets = {"e57": tmp_path / "site.e57", "geotiff": tmp_path / "site.tif"}
+    targets["e57"].write_text("of yesterday")
+    pose = StationPose(name="S1", T_site_station=np.eye(4), cov_T_site_station=1e-6 * np.eye(6))
+    with pytest.raises(SpheremarkError):
+        make_site((), (pose,), SiteWish(targets=targets))  # no stop, so that there is no return
+    assert [path.name for path in tmp_path.iterdir()] == ["site.e57"]
+    assert targets["e57"].read_text() == "of yesterday"
+
+
+@pytest.mark.parametrize(
+    "options", [{"range_m": "inf"}, {"voxel_m": "inf"}, {"voxel_m": 1e300}, {"range_m": "nan"}]
+)
+def test_lengths_that_nobody_can_mean_are_refused_by_name(site, options):
+    wanted = {"kind": "site", "survey": "quarry", "options": options}
+    answer = site.client.post("/api/v1/jobs", json=wanted)
+    assert answer.status_code == 422
+    assert answer.json()["errors"][0]["field"] == f"options.{next(iter(options))}"
+
+
+def test_what_an_ended_worker_left_is_removed_and_what_is_in_use_is_not(tmp_path, monkeypatch):
+    monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
+    for name in ("spheremark-site-left", "spheremark-site-used", "another"):
+        (tmp_path / name).mkdir()
+        (tmp_path / name / "in-use").touch()
+    with (tmp_path / "spheremark-site-used" / "in-use").open() as lock:
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        with scratch() as folder:
+            found = {path.name for path in tmp_path.iterdir()}
+    assert found == {"spheremark-site-used", "another", folder.name}
+    assert not folder.exists()
 
 
 @pytest.mark.slow
