@@ -35,6 +35,7 @@ from storage.resections import resections_table, resections_with_errors
 from storage.rows import Row, plain, table_of
 
 _TO_95 = float(np.sqrt(-2.0 * np.log(0.05)))  # from the standard ellipse to the 95 % ellipse
+_UPPER = np.triu_indices(3)
 _TEXT, _REAL, _WHOLE, _LONG = pa.string(), pa.float64(), pa.int32(), pa.int64()
 _INSTANT = pa.timestamp("us", "UTC")
 _STOP = {"run_id": _TEXT, "stop": _TEXT}
@@ -228,7 +229,7 @@ def with_errors(known: Mapping[str, pa.Table], truth: Truth | None) -> dict[str,
     """
     if truth is None:
         return {
-            name: _with_columns(table, [{}] * len(table)) if name in _COMPARED else table
+            name: _without_errors(table) if name in _COMPARED else table
             for name, table in known.items()
         }
     truths = {stop.name: stop for stop in truth.stops}
@@ -448,7 +449,7 @@ def _place(p: Array) -> Row:
 
 def _cov(cov: Array) -> Row:
     """Return the upper triangle of a covariance as columns."""
-    return dict(zip(_COV, cov[np.triu_indices(3)], strict=True))
+    return dict(zip(_COV, cov[_UPPER], strict=True))
 
 
 def _table(name: str, rows: Sequence[Row]) -> pa.Table:
@@ -462,6 +463,14 @@ def _with_columns(table: pa.Table, errors: Sequence[Mapping[str, object]]) -> pa
         if name.startswith("error_"):
             values = pa.array([plain(row.get(name)) for row in errors], _REAL)
             table = table.set_column(i, name, values)
+    return table
+
+
+def _without_errors(table: pa.Table) -> pa.Table:
+    """Return a table with nothing in its error columns."""
+    for i, name in enumerate(table.column_names):
+        if name.startswith("error_") and table.column(i).null_count < len(table):
+            table = table.set_column(i, name, pa.nulls(len(table), _REAL))
     return table
 
 
