@@ -81,35 +81,70 @@ class Terrain:
 def _filled(ground: Ground, config: ElevationConfig) -> tuple[Ground, np.ndarray]:
     """Fill small holes from the cells around; return which ones were filled.
 
-    The height is the mean of the nearest known cells in all directions, weighted by the inverse
-    square of their distance. To their variance comes how much known heights differ at that
-    distance.
+    The height is the mean of the known cells around, weighted by the inverse square of their
+    distance. To the variance of that mean comes the one that such a mean has as a guess of the
+    cell, by how much known heights differ with distance: ``2 sum w_i g_i - sum w_i w_j g_ij`` with
+    the variogram ``g`` (Matheron, 1963). Where no two known heights tell it, nothing is filled.
     """
     known = np.isfinite(ground.heights)
     distances = np.asarray(ndimage.distance_transform_edt(~known)) * config.cell
     holes = ~known & (distances <= config.gap_max)
     reach = int(np.ceil(2.0 * config.gap_max / config.cell)) + 1
+    steps = _variogram(ground.heights, 2 * reach)
+    if not np.isfinite(steps).any():
+        return ground, np.zeros_like(holes)
+    to_hole, spectrum = _differences(steps, reach)
+    padded = np.stack([np.where(known, a, 0.0) for a in (ground.heights, ground.sigmas**2)])
+    padded = np.pad(padded, ((0, 0), (reach, reach), (reach, reach)))
+    nearness = np.pad(known.astype(np.float64), reach)
     heights, sigmas = ground.heights.copy(), ground.sigmas.copy()
-    steps = _variogram(ground.heights, reach)
+    inverse_squares = _inverse_squares(reach)
     for i, j in np.argwhere(holes):
-        part = (slice(max(i - reach, 0), i + reach + 1), slice(max(j - reach, 0), j + reach + 1))
-        rows, columns = np.nonzero(known[part])
-        away = np.hypot(rows + part[0].start - i, columns + part[1].start - j)
-        weights = away**-2.0 / np.sum(away**-2.0)
-        heights[i, j] = weights @ ground.heights[part][rows, columns]
-        own = weights @ ground.sigmas[part][rows, columns] ** 2
-        nearest = min(int(np.ceil(away.min())), reach)
-        sigmas[i, j] = np.sqrt(own + steps[nearest - 1])
+        part = (slice(i, i + 2 * reach + 1), slice(j, j + 2 * reach + 1))
+        weights = nearness[part] * inverse_squares
+        weights /= weights.sum()
+        height, own = np.sum(weights * padded[:, *part], axis=(1, 2))
+        own += max(2.0 * np.sum(weights * to_hole) - _among(weights, spectrum), 0.0)
+        heights[i, j], sigmas[i, j] = height, np.sqrt(own)
     return Ground(heights, sigmas, ground.counts), holes
 
 
+def _inverse_squares(reach: int) -> Array:
+    """Return the inverse squares of the distances from the middle of a window, in cells."""
+    squares = np.add.outer(*(np.arange(-reach, reach + 1.0) ** 2,) * 2)
+    squares[reach, reach] = np.inf
+    return np.asarray(1.0 / squares)
+
+
+def _differences(steps: Array, reach: int) -> tuple[Array, Array]:
+    """Return the variogram from the middle of a window, and its spectrum over twice the window."""
+    lags = np.arange(1.0, len(steps) + 1.0)
+    is_known = np.isfinite(steps)
+    lags, steps = np.r_[0.0, lags[is_known]], np.r_[0.0, steps[is_known]]
+    n = 2 * (2 * reach + 1)
+    apart = np.minimum(np.arange(n), n - np.arange(n)).astype(np.float64)
+    table = np.interp(np.hypot(*np.meshgrid(apart, apart)), lags, steps)
+    shift = np.abs(np.arange(-reach, reach + 1))
+    return np.asarray(table[np.ix_(shift, shift)]), np.asarray(np.fft.fft2(table).real)
+
+
+def _among(weights: Array, spectrum: Array) -> float:
+    """Return the variogram's mean over all pairs of weighted cells, by Parseval's theorem."""
+    power = np.abs(np.fft.fft2(weights, spectrum.shape)) ** 2
+    return float(np.sum(power * spectrum) / spectrum.size)
+
+
 def _variogram(heights: Array, reach: int) -> Array:
-    """Return half the mean square of the difference of heights 1 ... ``reach`` cells apart."""
-    squares = np.zeros(reach)
+    """Return half the mean square of the difference of heights 1 ... ``reach`` cells apart.
+
+    NaN where no two heights are so far apart.
+    """
+    squares = np.full(reach, np.nan)
     for lag in range(1, reach + 1):
         across = heights[:, lag:] - heights[:, :-lag]
         along = heights[lag:] - heights[:-lag]
         both = np.concatenate([across.ravel(), along.ravel()])
         both = both[np.isfinite(both)]
-        squares[lag - 1] = np.mean(both**2) if len(both) else 0.0
+        if len(both):
+            squares[lag - 1] = 0.5 * np.mean(both**2)
     return squares

@@ -190,6 +190,37 @@ def test_holes_stay_unless_they_are_to_be_filled_and_then_say_so():
     assert np.median(filled.sigmas[filled.is_filled]) > 2 * np.nanmedian(bare.sigmas)
 
 
+def uneven(rng, n=150):
+    """Ground that differs the more the farther apart, as terrain does; centimetres from cell to cell."""
+    waves = np.exp(rng.uniform(np.log(0.03), np.log(1.0), n))  # [1/m]
+    heading, phase = rng.uniform(0, 2 * np.pi, (2, n))
+    k = 2 * np.pi * waves[:, None] * np.stack([np.cos(heading), np.sin(heading)], axis=1)
+    size = 0.03 / np.sqrt(n) * waves**-1.0
+
+    def shape(x, y):
+        out = np.zeros_like(x)
+        for (kx, ky), a, b in zip(k, size, phase, strict=True):
+            out += a * np.cos(kx * x + ky * y + b)
+        return out
+
+    return shape
+
+
+def test_heights_of_filled_holes_are_as_good_as_they_say():
+    rng = np.random.default_rng(12)
+    shape = uneven(rng)
+    points = scanned(rng, n=150_000, reach=12.0, sigma=0.002, shape=shape)
+    holes = np.abs((points[:, :2] + 1.25) % 2.5 - 1.25)  # one each two and a half metres
+    points = points[np.hypot(*holes.T) > 0.9]
+    config = ElevationConfig(range_max=12.0, sigma_range=0.002, gap_max=1.0)
+    model = model_of(points, config)
+    x, y = np.meshgrid(model.xs, model.ys)
+    inside = model.is_filled & (np.hypot(x, y) < 11.0)
+    assert inside.sum() > 800
+    scaled = errors(model, shape)[inside] / model.sigmas[inside]
+    assert 0.8 < np.sqrt(np.mean(scaled**2)) < 1.2
+
+
 def test_cells_that_are_too_many_are_refused_before_memory_is_taken():
     far = [pose(), replace(pose(rigid(np.eye(3), [5000.0, 5000.0, 0.0])), name="far")]
     with pytest.raises(ConfigError, match="larger cells"):
