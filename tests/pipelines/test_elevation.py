@@ -191,7 +191,7 @@ def test_holes_stay_unless_they_are_to_be_filled_and_then_say_so():
 
 
 def uneven(rng, n=150):
-    """Ground that differs the more the farther apart, as terrain does; centimetres from cell to cell."""
+    """Ground that differs the more the farther apart, as terrain does; centimetres at a cell."""
     waves = np.exp(rng.uniform(np.log(0.03), np.log(1.0), n))  # [1/m]
     heading, phase = rng.uniform(0, 2 * np.pi, (2, n))
     k = 2 * np.pi * waves[:, None] * np.stack([np.cos(heading), np.sin(heading)], axis=1)
