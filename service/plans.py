@@ -56,6 +56,8 @@ _MODELS_KEPT = 8
 _NEWEST = "SELECT max(finished_at) AS finished_at, count(*) AS n FROM runs"
 _SIGHTS_KEPT = 400  # marks; of a map of 64 x 64 places each takes 130 kB
 _ROUND_IT = 3.0  # [m] shown around the outermost marks
+_SEED_DIGITS = 18  # a seed of more digits is a mistake
+_POLE_MOST = 100.0  # [m] above the ground, beyond which the height of a mark is a mistake
 _STOPS_ACROSS = 3  # of a terrain for which nobody has said where the rover stops
 
 
@@ -107,7 +109,7 @@ class Place(NamedTuple):
 def simulated_ground(key: str) -> Ground:
     """Return a simulated field by its key: its name, or its name and a seed (``paper-field@3``)."""
     name, _, seed = key.partition("@")
-    if name not in SCENARIOS or not (seed or "0").isdecimal():
+    if name not in SCENARIOS or not (seed or "0").isdecimal() or len(seed) > _SEED_DIGITS:
         raise NotFoundError(
             f"There is no field {key!r}; known are {', '.join(SCENARIOS)}, each also with a seed "
             "(paper-field@3), and terrains that were uploaded."
@@ -173,6 +175,11 @@ def marks_at(site: Site, places: Sequence[Place]) -> Arrangement:
                 f"its height is not known; {_extent_text(site)}."
             )
         heights[k] = place.z if place.z is not None else ground[k] + (place.pole or 0.0)
+        if not heights[k] <= ground[k] + _POLE_MOST:
+            raise InputError(
+                f"Mark {place.name} is {heights[k] - ground[k]:g} m above the ground; a pole of "
+                f"{_POLE_MOST:g} m is the highest that can be meant."
+            )
         if heights[k] < ground[k] + site.marker_radius:
             raise InputError(
                 f"Mark {place.name} is under the ground: its centre is "
@@ -257,13 +264,13 @@ class Planner:
         with self._lock:
             known = self._models.get(asked)
         if known is None:
-            known = model_of_surveys(self._ask, sensor, radius, survey=survey)
+            known = model_of_surveys(self.ask, sensor, radius, survey=survey)
             with self._lock:
                 self._models = {**dict(list(self._models.items())[-_MODELS_KEPT:]), asked: known}
         return known
 
-    def _ask(self, sql: str) -> Plain:
-        """Answer a SELECT of our own from the catalogue."""
+    def ask(self, sql: str) -> Plain:
+        """Answer a SELECT of our own from the catalogue, as the SQL of people is answered."""
         table = self._catalogue.table(sql)
         rows = zip(*(column.to_pylist() for column in table.columns), strict=True)
         return {"columns": [{"name": name} for name in table.column_names], "rows": list(rows)}

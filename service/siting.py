@@ -122,6 +122,7 @@ def evaluate(asked: Asked) -> Plain:
 def optimise(asked: Asked, rules: PlaceRules, goal: Goal) -> Plain:
     """Return the best places, and how good they are known to be."""
     site, stops = asked.ground.site, asked.stops
+    placement.check_sizes(len(stops.names), goal.n_marks or 0)
     candidates = placement.find_candidates(site, stops, rules)
     rng = np.random.default_rng(_SEED)
     found = placement.optimise(site, stops, candidates, asked.model, asked.wish, goal, rng)
@@ -164,6 +165,7 @@ def _notes(found: Optimum, goal: Goal) -> list[str]:
 def one_more(asked: Asked, rules: PlaceRules | None = None) -> Plain:
     """Return the one more mark that would help most."""
     site = asked.ground.site
+    placement.check_sizes(len(asked.stops.names), len(asked.marks.names) + 1)
     candidates = placement.find_candidates(site, asked.stops, rules or PlaceRules())
     found = placement.propose_mark(
         site, asked.stops, asked.marks, candidates, asked.model, asked.wish

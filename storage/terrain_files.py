@@ -92,7 +92,8 @@ def _raster(path: Path, name: str) -> Site:
             turn = file.transform
             heights = file.read(1, masked=True).astype(np.float64).filled(np.nan)
     except RasterioError as error:
-        raise InputError(f"{name} is no elevation model that can be read: {error}.") from error
+        said = str(error).replace(str(path), name)  # where it is kept is nobody's business
+        raise InputError(f"{name} is no elevation model that can be read: {said}.") from error
     if turn.b or turn.d or turn.a <= 0 or turn.e == 0:
         raise InputError(
             f"The rows of {name} do not run from west to east; straighten it (gdalwarp)."

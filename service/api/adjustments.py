@@ -24,7 +24,7 @@ AdjustmentId = Annotated[str, Path(description="Id of the adjustment.")]
 
 _LIST = """
 SELECT s.name AS survey, x.* FROM adjustments AS x JOIN surveys AS s USING (survey_id)
-WHERE ($survey::VARCHAR IS NULL OR s.survey_id = $survey OR s.name = $survey)
+WHERE ($survey::VARCHAR IS NULL OR s.survey_id = $survey)
 ORDER BY x.finished_at DESC, x.adjustment_id LIMIT $n OFFSET $after
 """
 _ONE = """

@@ -24,7 +24,7 @@ CalibrationId = Annotated[str, Path(description="Id of the calibration.")]
 
 _LIST = """
 SELECT s.name AS survey, x.* FROM calibrations AS x JOIN surveys AS s USING (survey_id)
-WHERE ($survey::VARCHAR IS NULL OR s.survey_id = $survey OR s.name = $survey)
+WHERE ($survey::VARCHAR IS NULL OR s.survey_id = $survey)
 ORDER BY x.finished_at DESC, x.calibration_id LIMIT $n OFFSET $after
 """
 _ONE = """

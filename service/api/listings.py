@@ -23,7 +23,7 @@ class ResultFilter(Strict):
     """Which results are wanted."""
 
     survey: str | None = Field(default=None, description="Id or name of a survey.")
-    after: int = Field(default=0, ge=0, description="The 'next' of the part before.")
+    after: int = Field(default=0, ge=0, le=10**15, description="The 'next' of the part before.")
     limit: int = Field(default=100, ge=1, le=1000, description="Items in one part.")
 
 
@@ -46,8 +46,9 @@ class ResultDetail(Result):
 
 def listed(service: Service, sql: str, wanted: ResultFilter) -> Listing[Result]:
     """Return a part of the results that are wanted."""
+    survey = wanted.survey and service.catalogue.get_survey(wanted.survey).survey_id
     rows = service.catalogue.rows(
-        sql, wanted.model_dump(exclude={"limit"}) | {"n": wanted.limit + 1}
+        sql, {"survey": survey, "after": wanted.after, "n": wanted.limit + 1}
     )
     end = wanted.after + wanted.limit
     return Listing(

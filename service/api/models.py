@@ -178,6 +178,8 @@ class NewJob(Strict):
     def _check_logs(self) -> Self:
         """Refuse logs that the kind does not take."""
         if not KINDS[self.kind].takes_one_log:
+            if self.recording is not None and self.recordings is not None:
+                raise ValueError("name the logs in 'recordings' alone, not in 'recording' too")
             return self
         if self.recording is None:
             raise ValueError(f"a job of the kind {self.kind} needs a recording")

@@ -16,7 +16,7 @@ from pipelines.errors import InputError
 from pipelines.placement import Requirement, Sensor
 from pipelines.placement.candidates import PlaceRules
 from pipelines.placement.optimising import Goal
-from service import siting
+from service import siting, trials
 from service.api.models import Listing, Strict
 from service.planning import Plain, site_answer, to_csv, to_geojson
 from service.plans import SCENARIOS, TERRAIN, Asked, Place, marks_at, stops_at, terrain_ground
@@ -27,6 +27,7 @@ from storage import plans as kept
 router = APIRouter(tags=["plans"])
 
 GEOJSON = "application/geo+json"
+_MARKER_RADIUS = 0.100  # [m]
 _GROUND_ACROSS = 150  # places of the ground's heights that a map shows
 _ENDINGS = (".tif", ".tiff", ".asc", ".laz", ".las", ".ply")
 
@@ -153,6 +154,28 @@ class BetterPlan(Plan):
     rules: Rules = Field(default_factory=Rules)
 
 
+class RandomTrial(Strict):
+    """Arrangements at random, as the study tries them."""
+
+    n_arrangements: int = Field(default=100_000, ge=1, le=1_000_000)
+    n_marks_min: int = 3
+    n_marks_max: int = 14
+    distance_max_m: float | None = Field(default=None, description="Of the results by default [m].")
+    angle_min_deg: float | None = Field(
+        default=None, description="Window of included angles; of the results by default [deg]."
+    )
+    angle_max_deg: float | None = None
+    error_per_axis_m: float | None = Field(
+        default=0.017, description="On each axis of a centre; null takes the model of centres [m]."
+    )
+    tolerance_m: float = Field(default=0.03, gt=0, le=10)
+    seed: int = Field(default=0, ge=0)
+    fit_method: str = Field(
+        default="paper", description="Fitting method whose results tell distance and window."
+    )
+    model: str = Field(default="auto", description="As for a plan.")
+
+
 class NamedPlan(Plan):
     """A plan to keep."""
 
@@ -210,6 +233,34 @@ def suggest_mark(plan: BetterPlan, service: Current) -> Said:
     return Said.model_validate(answer)
 
 
+@router.post("/plans/random", name="try_at_random")
+def try_at_random(wanted: RandomTrial, service: Current) -> Said:
+    """Try arrangements at random, as the study does: an error on every centre, pass or fail."""
+    return Said.model_validate(tried(service, wanted))
+
+
+def tried(service: Service, wanted: RandomTrial) -> Plain:
+    """Return what came of arrangements at random."""
+    planner = service.planner
+    limits = trials.limits_of_results(planner.ask, wanted.fit_method, wanted.tolerance_m)
+    angles = (
+        None if angle is None else math.radians(angle)
+        for angle in (wanted.angle_min_deg, wanted.angle_max_deg)
+    )
+    angle_min, angle_max = angles
+    trial = trials.Wanted(
+        n_arrangements=wanted.n_arrangements,
+        n_marks=(wanted.n_marks_min, wanted.n_marks_max),
+        distance=wanted.distance_max_m,
+        angle_min=angle_min,
+        angle_max=angle_max,
+        error=wanted.error_per_axis_m,
+        tolerance=wanted.tolerance_m,
+        seed=wanted.seed,
+    ).trial(limits)
+    return trials.run(trial, planner.model(wanted.model, Sensor(), _MARKER_RADIUS), limits)
+
+
 @router.post("/plans", name="keep_plan", status_code=201)
 def keep_plan(plan: NamedPlan, service: Current, response: Response) -> Said:
     """Keep a plan: its promises become rows of placements."""
@@ -226,7 +277,8 @@ def list_plans(
     survey: Annotated[str | None, Query(description="Id or name of a survey.")] = None,
 ) -> Listing[Said]:
     """List kept plans, newest first."""
-    rows = kept.list_plans(service.catalogue, survey)
+    survey_id = service.catalogue.get_survey(survey).survey_id if survey else None
+    rows = kept.list_plans(service.catalogue, survey_id)
     return Listing(items=[Said.model_validate(row) for row in rows])
 
 

@@ -164,6 +164,7 @@ def test_a_file_that_is_no_terrain_is_refused_and_not_kept(client):
         answer = client.post("/api/v1/terrains", params={"name": name}, content=body)
         assert answer.status_code in (400, 415, 422), answer.text
         assert name in answer.json()["detail"] or "tif" in answer.json()["detail"]
+        assert "/" not in answer.json()["detail"]  # of folders of the service nothing is told
     assert not [s for s in client.get("/api/v1/plans/sites").json()["items"] if "txt" in s["name"]]
 
 
@@ -172,6 +173,8 @@ def test_a_file_that_is_no_terrain_is_refused_and_not_kept(client):
     [
         ({"marks": [{**MARKS[0], "pole_height_m": -0.5}]}, "under the ground"),
         ({"marks": [{**MARKS[0], "x_m": 1e4}]}, "off the terrain"),
+        ({"marks": [{**MARKS[0], "pole_height_m": 1e300}]}, "above the ground"),
+        ({"marks": [{"name": "A", "position_m": [5.0, 5.0, "nan"]}]}, "above the ground"),
         ({"stops": [{"name": "far", "x_m": 500.0, "y_m": 0.0}]}, "off the terrain"),
         ({"site": "nowhere"}, "There is no field"),
         ({"site": "terrain:" + 64 * "0"}, "There is no terrain"),
