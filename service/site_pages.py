@@ -47,7 +47,7 @@ def coverage_page(service: Current) -> str:
     )
 
 
-@router.get("/surveys/{name}/site")
+@router.get("/surveys/{name:path}/site")
 def site_page(name: str, service: Current) -> str:
     """Show what was made of all stops of a survey."""
     survey = service.catalogue.get_survey(name)
@@ -68,7 +68,7 @@ def site_page(name: str, service: Current) -> str:
     )
 
 
-@router.post("/surveys/{name}/site")
+@router.post("/surveys/{name:path}/site")
 def ask(name: str, fields: Fields, service: Current) -> RedirectResponse:
     """Start a job that makes cloud and ground, and show it."""
     try:
