@@ -10,15 +10,15 @@ import re
 import struct
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
-from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 
 from pipelines.values import Mask, Nanos
 from storage.recordings.container import Batch, Channel
 from storage.recordings.families import BrokenMessageError
-from storage.recordings.records import Octets
+from storage.recordings.records import Octets, windows
 
 _ENCAPSULATIONS = {0: (">", 8), 1: ("<", 8), 6: (">", 4), 7: ("<", 4)}  # identifier: order, widest
 _SIZES = {"B": 1, "i": 4, "I": 4, "d": 8}
@@ -157,9 +157,9 @@ class SmallMessages:
 
     def add(self, batch: Batch) -> None:
         """Copy the messages of a batch, by length."""
-        for length in np.unique(batch.lengths).tolist():
+        for length in sorted(set(batch.lengths.tolist())):
             mine = batch.lengths == length
-            rows = sliding_window_view(batch.octets, length)[batch.starts[mine]]
+            rows = windows(batch.octets, length)[batch.starts[mine]]
             self._rows.setdefault(length, []).append((rows, batch.log_times_ns[mine]))
 
     def tables(self) -> list[Table]:
@@ -219,8 +219,9 @@ def heads_alike(batch: Batch, i: int, size: int, varying: Iterable[int]) -> Octe
     """
     rows = slice(i, i + _ALIKE_MAX)
     n = n_leading(batch.lengths[rows] >= size)
-    heads = sliding_window_view(batch.octets, size)[batch.starts[rows][:n]]
-    fixed = np.delete(np.arange(size), list(varying))
+    heads = windows(batch.octets, size)[batch.starts[rows][:n]]
+    fixed = np.ones(size, np.bool_)
+    fixed[list(varying)] = False
     return np.asarray(heads[: n_leading((heads[:, fixed] == heads[0, fixed]).all(axis=1))])
 
 
@@ -261,6 +262,7 @@ def definition_agrees(channel: Channel, expected: str) -> bool:
     return _fields(text) == _fields(expected)
 
 
+@lru_cache(64)
 def _fields(text: str) -> list[tuple[str, str]]:
     """Return type and name of each field of the top level of a definition."""
     top = re.split(r"^={20,}\s*$", text, maxsplit=1, flags=re.MULTILINE)[0]

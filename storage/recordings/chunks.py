@@ -99,6 +99,7 @@ class Chunks:
             One or more of them; the last one if it holds damage.
         """
         chunks: list[Chunk] = []
+        n_octets = 0
         damage = None
         for start, length in rows[:, 1:3].tolist():
             try:
@@ -106,12 +107,13 @@ class Chunks:
             except _BROKEN as error:
                 damage = (start - RECORD_HEAD, f"a chunk is damaged: {error}")
                 break
-            if chunks and sum(one.size for one in chunks) + chunk.size > _STRETCH:
+            if chunks and n_octets + chunk.size > _STRETCH:
                 yield (stretch := self._brought(chunks, None))
                 if stretch.damage is not None:
                     return
-                chunks = []
+                chunks, n_octets = [], 0
             chunks.append(chunk)
+            n_octets += chunk.size
         yield self._brought(chunks, damage)
 
     def _brought(self, chunks: Sequence[Chunk], damage: tuple[int, str] | None) -> Stretch:

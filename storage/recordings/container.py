@@ -205,7 +205,7 @@ class Container:
         self._last_ns = max(self._last_ns, int(rows[:, 4].max()))
         first = int(rows[:, 4].min())
         self._first_ns = first if self._first_ns is None else min(first, self._first_ns)
-        for identifier in np.unique(rows[:, 3]).tolist():
+        for identifier in sorted(set(rows[:, 3].tolist())):
             if (channel := self.channels.get(identifier)) is None:
                 continue
             mine = rows[rows[:, 3] == identifier]

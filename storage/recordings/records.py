@@ -43,6 +43,25 @@ def walk(octets: Octets, position: int) -> tuple[Nanos, int, bool]:
     return rows[:n], position, is_whole
 
 
+def windows(octets: Octets, size: int) -> Octets:
+    """Look at what follows each byte.
+
+    Parameters
+    ----------
+    octets : (n,) uint8
+        Bytes that follow each other in memory.
+    size : int
+        How many to look at.
+
+    Returns
+    -------
+    (n - size + 1, size) uint8
+        Views; NumPy's sliding windows take longer to make than most are used.
+    """
+    n = max(len(octets) - size + 1, 0)
+    return np.ndarray((n, size), np.uint8, buffer=octets, strides=(1, 1))
+
+
 def text(body: bytes, at: int) -> tuple[str, int]:
     """Read a string with its length before it.
 

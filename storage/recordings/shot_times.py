@@ -104,14 +104,14 @@ def plain_span(kind: str, low: float, high: float) -> int | None:
     int or None
         Of the latest [ns]; none when the times have another meaning.
     """
-    scale = _scale(np.dtype(kind))
+    scale = _scale(kind[0])
     is_plain = max(abs(low), abs(high)) * scale <= _REVOLUTION_LIMIT * 1e9
     return round(high * scale) if is_plain else None
 
 
-def _scale(kind: np.dtype[np.generic]) -> float:
+def _scale(kind: str) -> float:
     """Return the nanoseconds that 1 means in times since a stamp."""
-    return 1.0 if kind.kind in "iu" else 1e9
+    return 1.0 if kind in "iu" else 1e9
 
 
 def _offsets_ns(times: NDArray[np.generic], low: float, high: float, stamp_ns: int) -> Nanos | None:
@@ -122,7 +122,7 @@ def _offsets_ns(times: NDArray[np.generic], low: float, high: float, stamp_ns: i
         # A driver may stamp points by the sensor's clock and messages by the computer's.
         far = stamp_ns and abs(int(absolute[0]) - stamp_ns) > _REVOLUTION_LIMIT * 1e9
         return absolute - (int(absolute.min()) if far else stamp_ns)
-    scale = _scale(times.dtype)
+    scale = _scale(times.dtype.kind)
     if max(abs(low), abs(high)) * scale > _REVOLUTION_LIMIT * 1e9:
         return None
     return np.rint(times.astype(np.float64) * scale).astype(np.int64)
