@@ -182,23 +182,24 @@ def random(
     """Try arrangements at random, as the study does: an error on every centre, pass or fail."""
     import math
 
-    from pipelines.placement import Sensor, Trial, sensor_model
+    from pipelines.placement import Sensor, sensor_model
     from service import trials
     from service.centre_models import model_of_surveys
 
     ask = _ask(data, server)
     limits = trials.limits_of_results(ask, fit_method, tolerance_m)
-    window = angle_deg or (limits["angle_min_deg"], limits["angle_max_deg"])
-    farthest = distance_m or limits["greatest_distance_m"]
-    trial = Trial(
+    window = (None, None) if angle_deg is None else (math.radians(v) for v in angle_deg)
+    angle_min, angle_max = window
+    trial = trials.Wanted(
         n_arrangements=arrangements,
         n_marks=(least, most),
-        distances=(min(2.0, farthest / 2), farthest),
-        angles=(math.radians(window[0]), math.radians(window[1])),
+        distance=distance_m,
+        angle_min=angle_min,
+        angle_max=angle_max,
         error=error_m or None,
         tolerance=tolerance_m,
         seed=seed,
-    )
+    ).trial(limits)
     sensor = Sensor(turn=turn_s, spin_rpm=rpm)
     model = (
         sensor_model(sensor) if ask is None else model_of_surveys(ask, sensor, 0.100, survey=survey)

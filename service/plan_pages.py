@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
-from fastapi import APIRouter
-from fastapi.responses import HTMLResponse
+from typing import Any
 
-from service.api.plans import sites
+from fastapi import APIRouter, Request
+from fastapi.responses import HTMLResponse
+from pydantic import ValidationError
+
+from pipelines.errors import InputError
+from service.api.plans import RandomTrial, sites, tried
 from service.pages import frame_of
 from service.state import Current
 from storage import plans as kept
@@ -24,6 +28,35 @@ def plan(service: Current) -> str:
             plans=kept.list_plans(service.catalogue),
         )
     )
+
+
+@router.get("/plan/random")
+def random_marks(request: Request, service: Current) -> str:
+    """Show what comes of marks at random: the study's own procedure."""
+    asked: dict[str, Any] = {key: text for key, text in request.query_params.items() if text}
+    if "error_per_axis_mm" in asked:
+        error = _number(asked.pop("error_per_axis_mm"))
+        asked["error_per_axis_m"] = error / 1000 if error else None
+    if "tolerance_mm" in asked:
+        asked["tolerance_m"] = _number(asked.pop("tolerance_mm")) / 1000
+    try:
+        wanted = RandomTrial.model_validate(asked)
+    except ValidationError as error:
+        first = error.errors()[0]
+        raise InputError(f"{'.'.join(map(str, first['loc']))}: {first['msg']}.") from error
+    return planner.trials_page(
+        planner.TrialsPage(
+            frame=frame_of(service), wanted=wanted.model_dump(), answer=tried(service, wanted)
+        )
+    )
+
+
+def _number(text: str) -> float:
+    """Return a number that was typed."""
+    try:
+        return float(text)
+    except ValueError as error:
+        raise InputError(f"{text!r} is no number.") from error
 
 
 @router.get("/plan/{placement_id}")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 from collections.abc import Mapping
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -40,6 +41,37 @@ SELECT floor(included_angle_deg / {bin}) * {bin} AS angle_deg, count(*) AS n,
     quantile_cont(coalesce(error_3d_m, sigma_3d_m), 0.5) AS error_3d_m
 FROM resections WHERE fit_method = '{method}' AND n_marks = 2 GROUP BY 1 ORDER BY 1
 """
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Wanted:
+    """What is to be tried; a distance or window of None is taken from results [m, rad]."""
+
+    n_arrangements: int = 100_000
+    n_marks: tuple[int, int] = (3, 14)
+    distance: float | None = None
+    angle_min: float | None = None
+    angle_max: float | None = None
+    error: float | None = 0.017
+    tolerance: float = 0.03
+    seed: int = 0
+
+    def trial(self, limits: Plain) -> Trial:
+        """Return the trial within the limits of results."""
+        farthest = limits["greatest_distance_m"] if self.distance is None else self.distance
+        low, high = (
+            float(np.radians(limits[key])) if given is None else given
+            for given, key in ((self.angle_min, "angle_min_deg"), (self.angle_max, "angle_max_deg"))
+        )
+        return Trial(
+            n_arrangements=self.n_arrangements,
+            n_marks=self.n_marks,
+            distances=(min(2.0, farthest / 2), farthest),
+            angles=(low, high),
+            error=self.error,
+            tolerance=self.tolerance,
+            seed=self.seed,
+        )
 
 
 def limits_of_results(ask: Ask | None, method: str, tolerance: float) -> Plain:

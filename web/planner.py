@@ -9,7 +9,7 @@ from urllib.parse import urlencode
 
 import plotly.graph_objects as go
 
-from web import theme
+from web import theme, trials
 from web.figures import blank_figure
 from web.pages import Frame, Panel
 from web.templating import render
@@ -36,6 +36,15 @@ class PlanPage:
     plan: Row
 
 
+@dataclass(frozen=True, slots=True, kw_only=True)
+class TrialsPage:
+    """Marks at random: what was wanted, by its names in the address, and what came of it."""
+
+    frame: Frame
+    wanted: Row
+    answer: Row
+
+
 def planner_page(page: PlannerPage) -> str:
     """Return the planner."""
     return render("planner.html", page, here="plan")
@@ -54,6 +63,34 @@ def plan_page(page: PlanPage) -> str:
     )
 
 
+def trials_page(page: TrialsPage) -> str:
+    """Return what came of marks at random, as tables and figures."""
+    answer = page.answer
+    panels = [
+        Panel(name=name, figure=draw(answer), caption=caption) for name, draw, caption in _TRIALS
+    ]
+    return render("random.html", page, here="plan", panels=panels)
+
+
+_TRIALS = (
+    (
+        "by-angle",
+        trials.error_by_angle,
+        "Error of a position against the included angle of two marks, the third beside the first: "
+        "median over all signs of the error. Grey: the window that the study recommends.",
+    ),
+    (
+        "by-number",
+        trials.pass_rate_by_number,
+        "Arrangements whose three best marks keep the window; more marks make it more likely that "
+        "three cut well.",
+    ),
+    (
+        "by-worst-angle",
+        trials.pass_rate_by_angle,
+        "All arrangements, inside the window and outside, by the angle that decides.",
+    ),
+)
 _CAPTION = (
     "Each stop of the plan. Filled: the error against truth; open: the sigma that the survey "
     "itself states. On the line, prediction and outcome agree; errors scatter below and above it."

@@ -187,6 +187,28 @@ def test_what_cannot_be_planned_is_refused_with_the_reason(client, wrong, said):
     assert said in refused(client, **wrong)
 
 
+def test_marks_at_random_come_as_an_answer_and_as_a_page(client):
+    wanted = {"n_arrangements": 3000, "n_marks_max": 5, "distance_max_m": 7.5}
+    answer = client.post("/api/v1/plans/random", json=wanted).json()
+    assert [row["n_marks"] for row in answer["by_number_of_marks"]] == [3, 4, 5]
+    assert answer["pass_rate_in_window"] > answer["pass_rate_outside"]
+    page = client.get("/plan/random", params={**wanted, "error_per_axis_mm": 17, "seed": ""}).text
+    assert f"{100 * answer['pass_rate_in_window']:.1f}<small>%" in page
+    ours = client.post("/api/v1/plans/random", json={**wanted, "error_per_axis_m": None}).json()
+    assert ours["pass_rate"] > 0.99
+
+
+def test_trials_that_cannot_be_are_refused_on_the_page(client):
+    for wrong, said in (
+        ({"n_marks_min": "two"}, "n_marks_min"),
+        ({"tolerance_mm": "wide"}, "is no number"),
+        ({"angle_min_deg": 170, "angle_max_deg": 20}, "must ascend"),
+    ):
+        answer = client.get("/plan/random", params=wrong)
+        assert answer.status_code == 400
+        assert said in answer.text
+
+
 def test_a_stop_that_sees_nothing_says_so(client):
     answer = evaluated(client, marks=[])
     assert all(stop["sigma_3d_m"] is None and stop["reason"] for stop in answer["stops"])
