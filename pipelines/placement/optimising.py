@@ -37,11 +37,12 @@ _LOST = 1e3  # [m] counts for a stop without a position: worse than any that has
 _LOOSE_PRIOR = np.array([3.0, 3.0, 3.0, 10.0, 10.0, 10.0])  # [rad, m] before any mark is seen
 _SURE = 1.96  # sigmas within which an error of any shape lies with 95 %: 3-D sigma on one axis
 _ROUNDS = 30  # of exchanges; four to eight settle
-_STARTS, _STARTS_WHOLE = 8, 2  # the greedy one among them; the latter of whole judgements
+_STARTS, _STARTS_WHOLE = 8, 4  # the latter of whole judgements
+_DRAWN, _DRAWN_KEPT = 1500, 40  # arrangements at random that these begin with, and judge in full
 _POWER = 12.0  # of the mean over stops that is as good as their largest, and smoother
 _SHAKEN = 0.4  # share of marks that such a start has elsewhere
 _TRIED = 12  # candidates that are judged in full for each mark, the most promising first
-_SCREENED = 60  # places that whole judgements try for each mark
+_SCREENED = 800  # places that whole judgements try in a round, for all marks together
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -357,14 +358,17 @@ def _sums(task: _Task, chosen: Index) -> tuple[Array, Array, Array]:
 def _best(task: _Task, k: int, goal: Goal, rng: np.random.Generator) -> tuple[Index, int]:
     """Return the best places of k marks that several starts led to, and exchanges made.
 
-    The first start is greedy, the second goes on from it with places at random, the others shake
-    what is best so far (iterated local search: Lourenco, Martin, Stuetzle, 2003). Each goes down
-    on a high power mean over the stops, which has fewer dead ends than their largest, then on that.
+    The first start is greedy, or the best of many at random where information says little; the
+    second goes on from it with places at random, the others shake what is best so far (iterated
+    local search: Lourenco, Martin, Stuetzle, 2003). Each goes down on a high power mean over the
+    stops, which has fewer dead ends than their largest, then on that.
     """
     smooth = task._replace(power=_POWER)
     best, score, n_exchanges = _greedy(task, k), (np.inf, np.inf, np.inf), 0
-    n_starts = _STARTS_WHOLE if task.wish.method == "paper" else _STARTS
-    for i in range(n_starts):
+    is_whole = task.wish.method == "paper"
+    if is_whole:
+        best = _best_drawn(task, best, goal, rng)
+    for i in range(_STARTS_WHOLE if is_whole else _STARTS):
         start = best if i == 0 else _shaken(task, best, 1.0 if i == 1 else _SHAKEN, rng)
         found, n = _exchanged(smooth, start, goal, rng)
         found, m = _exchanged(task, found, goal, rng)
@@ -372,6 +376,21 @@ def _best(task: _Task, k: int, goal: Goal, rng: np.random.Generator) -> tuple[In
         if (other := _wanted(task, found, goal)) < score:
             best, score = found, other
     return best, n_exchanges
+
+
+def _best_drawn(task: _Task, other: Index, goal: Goal, rng: np.random.Generator) -> Index:
+    """Return the best of many arrangements at random, and of another with as many marks."""
+    drawn = [other]
+    for _ in range(_DRAWN):
+        chosen: list[int] = []
+        for c in rng.permutation(len(task.near)):
+            if not task.near[c, chosen].any():
+                chosen.append(int(c))
+            if len(chosen) == len(other):
+                drawn.append(np.array(chosen, dtype=np.intp))
+                break
+    drawn.sort(key=lambda chosen: _score(task, chosen))
+    return min(drawn[:_DRAWN_KEPT], key=lambda chosen: _wanted(task, chosen, goal))
 
 
 def _greedy(task: _Task, k: int) -> Index:
@@ -452,7 +471,7 @@ def _promising(
     free[chosen] = False
     if task.wish.method == "paper":
         places = np.flatnonzero(free)
-        places = rng.permutation(places)[:_SCREENED]
+        places = rng.permutation(places)[: max(_SCREENED // len(chosen), 30)]
         worsts = np.array([_score(task, np.append(others, c)) for c in places]).reshape(-1, 2)
     else:
         places = np.flatnonzero(free)
