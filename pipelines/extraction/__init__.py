@@ -145,7 +145,9 @@ def _members(cloud: StitchedCloud, rows: NDArray[np.int32], look: Look, ball: Ba
     Of a ball that is seen very closely, only its middle: there the returns at its outline, which
     belong partly to what lies behind, would weigh more than the noise of all the others.
     """
-    seen = seen_from(cloud.p_base[rows].T.astype(np.float64), view_of(look.p_base, ball.up))
+    seen = seen_from(
+        cloud.p_base.take(rows, axis=0).T.astype(np.float64), view_of(look.p_base, ball.up)
+    )
     blur = 0.5 * ball.divergence * float(np.linalg.norm(look.p_base))
     reach = _MIDDLE * ball.radius if is_resolved(look, ball) else 1.5 * ball.radius + blur
     is_about = np.hypot(seen[0], seen[1]) < reach

@@ -116,35 +116,37 @@ def rows_in(cells: NDArray[np.integer], is_wanted: Mask) -> NDArray[np.int32]:
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
 def by_cell(
-    cells: NDArray[np.integer], n_cells: int
+    cells: NDArray[np.integer], rows: NDArray[np.int32], n_cells: int
 ) -> tuple[NDArray[np.int64], NDArray[np.int32]]:
-    """Sort by cell, by counting.
+    """Sort some returns by their cells, by counting.
 
     Parameters
     ----------
     cells : (n,) int32 or uint16
-        Cells of some returns.
+        Cells of all returns.
+    rows : (k,) int32
+        Those to be sorted.
     n_cells : int
-        Cells that there are.
+        Cells that they may be in.
 
     Returns
     -------
     starts : (n_cells + 1,)
-        Those of a cell are ``order[starts[cell]:starts[cell + 1]]``.
-    order : (n,) int32
-        Places among the returns, in the order of their cells, ascending in each.
+        Where those of each cell begin, and the end of the last.
+    places : (k,) int32
+        Where each of the rows goes.
     """
-    starts = np.zeros(n_cells + 2, np.int64)
-    for i in range(len(cells)):
-        starts[np.int64(cells[i]) + 2] += 1
+    starts = np.zeros(n_cells + 2, np.int64)  # of the cell before, until they have moved on
+    for row in rows:
+        starts[np.int64(cells[row]) + 2] += 1
     for cell in range(n_cells):
         starts[cell + 2] += starts[cell + 1]
-    order = np.empty(len(cells), np.int32)
-    for i in range(len(cells)):
-        place = np.int64(cells[i]) + 1
-        order[starts[place]] = i
-        starts[place] += 1
-    return starts[:-1], order
+    places = np.empty(len(rows), np.int32)
+    for i in range(len(rows)):
+        cell_before = np.int64(cells[rows[i]]) + 1
+        places[i] = starts[cell_before]
+        starts[cell_before] += 1
+    return starts[:-1], places
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")

@@ -5,7 +5,7 @@ Hides how ground is told from what stands on it.
 
 from __future__ import annotations
 
-from typing import NamedTuple, TypeVar
+from typing import NamedTuple
 
 import numba
 import numpy as np
@@ -14,8 +14,6 @@ from numpy.typing import NDArray
 from pipelines.config import ExtractionConfig
 from pipelines.extraction.cells import Cells, rows_in
 from pipelines.values import Array, Column, Mask, StitchedCloud
-
-_Cell = TypeVar("_Cell", np.float32, np.uint8)
 
 _STUDY_FIELD = 10.0  # [m] from the station: where the study looks for its highest ground point
 _GROUND_WINDOW = 4  # cells each way of the opening: rocks up to twice this are not ground
@@ -58,22 +56,54 @@ def ground_of(cloud: StitchedCloud, cells: Cells, config: ExtractionConfig) -> G
     """
     lowest = cells.lowest
     ground = _ground(lowest, _opened(lowest, _GROUND_WINDOW), _GROUND_WINDOW)
-    is_mixed, field_highest = _mixed(cells, ground, config)
-    rows = rows_in(cells.ground, np.append(is_mixed, False))
     v_up, clearance = cells.R_station_base[2], config.ground_clearance
+    is_mixed, field_highest = _mixed(cells, ground, min(clearance, _GROUND_RISE))
+    rows = rows_in(cells.ground, is_mixed)
     rows, high = _above(cloud.p_base, v_up, cells.ground, rows, ground.ravel(), clearance)
     return Ground(rows, max(field_highest, high))
 
 
-def _slid(values: NDArray[_Cell], window: int, combine: np.ufunc, outside: float) -> NDArray[_Cell]:
-    """Return what combining makes of the square window about each cell."""
-    for _ in range(2):  # rows, then columns
-        padded = np.pad(values, ((window, window), (0, 0)), constant_values=outside)
-        out = padded[: len(values)].copy()
-        for shift in range(1, 2 * window + 1):
-            combine(out, padded[shift : shift + len(values)], out=out)
-        values = np.ascontiguousarray(out.T)
-    return values
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _lowest_about(values: Column, window: int) -> Column:
+    """Return the lowest of the square window about each cell."""
+    n, m = values.shape
+    along = values.copy()
+    for i in range(n):
+        for k in range(max(i - window, 0), min(i + window + 1, n)):
+            for j in range(m):
+                along[i, j] = min(along[i, j], values[k, j])
+    lowest = along.copy()
+    for i in range(n):
+        for k in range(1, window + 1):
+            for j in range(m - k):
+                lowest[i, j] = min(lowest[i, j], along[i, j + k])
+            for j in range(m - k):
+                lowest[i, j + k] = min(lowest[i, j + k], along[i, j])
+    return lowest
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _n_about(mask: Mask, window: int) -> NDArray[np.uint8]:
+    """Return how many cells of a mask are set in the square window about each cell."""
+    n, m = mask.shape
+    along = np.zeros((n, m), np.uint8)
+    for i in range(n):
+        for k in range(max(i - window, 0), min(i + window + 1, n)):
+            for j in range(m):
+                along[i, j] += np.uint8(mask[k, j])
+    counts = along.copy()
+    for i in range(n):
+        for k in range(1, window + 1):
+            for j in range(m - k):
+                counts[i, j] += along[i, j + k]
+            for j in range(m - k):
+                counts[i, j + k] += along[i, j]
+    return counts
+
+
+def _highest_about(values: Column, window: int) -> Column:
+    """Return the highest of the square window about each cell."""
+    return np.asarray(-_lowest_about(-values, window))
 
 
 def _opened(lowest: Column, window: int) -> Column:
@@ -81,10 +111,10 @@ def _opened(lowest: Column, window: int) -> Column:
 
     A window that sees nothing but a marker, behind a mound say, tells nothing about the ground.
     """
-    eroded = _slid(lowest, window, np.minimum, np.inf)
-    n_known = _slid(np.isfinite(lowest).astype(np.uint8), window, np.add, 0)
+    eroded = _lowest_about(lowest, window)
+    n_known = _n_about(np.isfinite(lowest), window)
     eroded[(n_known < _GROUND_CELLS_MIN) | ~np.isfinite(eroded)] = -np.inf
-    return _slid(eroded, window, np.maximum, -np.inf)
+    return _highest_about(eroded, window)
 
 
 def _ground(lowest: Column, opened: Column, window: int) -> Column:
@@ -94,31 +124,35 @@ def _ground(lowest: Column, opened: Column, window: int) -> Column:
     do too: a marker behind a rock has no ground around it, and must not become ground itself.
     """
     is_low = lowest < opened + np.float32(_GROUND_STEP)
-    highest = _slid(np.where(is_low, lowest, np.float32(-np.inf)), 1, np.maximum, -np.inf)
-    n_low = _slid(is_low.astype(np.uint8), window, np.add, 0)
-    is_ground = (highest > -np.inf) & (n_low >= _GROUND_CELLS_MIN)
+    highest = _highest_about(np.where(is_low, lowest, np.float32(-np.inf)), 1)
+    is_ground = (highest > -np.inf) & (_n_about(is_low, window) >= _GROUND_CELLS_MIN)
     return np.where(is_ground, highest, np.float32(np.inf))
 
 
-def _mixed(cells: Cells, ground: Column, config: ExtractionConfig) -> tuple[Mask, float]:
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _mixed(cells: Cells, ground: Column, rise_max: float) -> tuple[Mask, float]:
     """Tell the cells whose points must be looked at one by one; return the highest of the others.
 
     The others hold nothing but ground and lie on one side of the edge of the study's field, the
     highest counts where that is inside: an edge about the gimbal's axis, not about the plumb line,
-    which leave at most the sine of the lean between them.
+    which leave at most the sine of the lean between them. What is beyond the grid comes last.
     """
-    lowest, highest, R = cells.lowest, cells.highest, cells.R_station_base
-    places = (np.arange(len(ground)) + 0.5) * config.ground_cell
-    places -= 0.5 * config.ground_cell * len(ground)
-    away = np.hypot(places[:, None], places[None, :])
-    is_seen = np.isfinite(lowest)
-    farthest = np.where(is_seen, np.maximum(np.abs(lowest), np.abs(highest)), 0.0) + away + 1.0
-    slack = config.ground_cell + np.hypot(R[2, 0], R[2, 1]) * farthest
-    with np.errstate(invalid="ignore"):  # where nothing was seen
-        rises = ~(highest - ground <= min(config.ground_clearance, _GROUND_RISE) - 1e-4)
-    is_inside = away + slack < _STUDY_FIELD
-    is_mixed = is_seen & (rises | np.isinf(ground) | (np.abs(away - _STUDY_FIELD) <= slack))
-    return is_mixed, float(highest[is_inside & ~is_mixed].max(initial=-np.inf))
+    n, edge, _ = cells.layout
+    lean = np.hypot(cells.R_station_base[2, 0], cells.R_station_base[2, 1])
+    is_mixed, field_highest = np.zeros(n * n + 1, np.bool_), -np.inf
+    for i in range(n):
+        for j in range(n):
+            low, high, base = cells.lowest[i, j], cells.highest[i, j], ground[i, j]
+            if low == np.inf:
+                continue
+            away = edge * np.hypot(i + 0.5 - 0.5 * n, j + 0.5 - 0.5 * n)
+            slack = edge + lean * (max(abs(low), abs(high)) + away + 1.0)
+            is_known = high - base <= rise_max - 1e-4 and base < np.inf
+            if not is_known or abs(away - _STUDY_FIELD) <= slack:
+                is_mixed[i * n + j] = True
+            elif away + slack < _STUDY_FIELD:
+                field_highest = max(field_highest, float(high))
+    return is_mixed, field_highest
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")

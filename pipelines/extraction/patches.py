@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipelines.extraction.cells import Cells, by_cell, rows_in
+from pipelines.threads import side_by_side
 from pipelines.values import Array, Column, Mask
 
 _REACH = 4.5  # radii about a seed whose returns decide whether a ball stands free there
@@ -71,8 +72,9 @@ def patches_about(p_base: Column, cells: Cells, seeds: Array, radius: float) -> 
     margin = int(np.ceil(reach / layout.edge)) + 1
     is_wanted = _wanted(layout.n_side, _cells_at(seeds, cells), margin)
     rows = rows_in(cells.ground, is_wanted)
-    starts, order = by_cell(cells.ground.take(rows), len(is_wanted) - 1)
-    points = p_base.take(rows.take(order), axis=0)
+    starts, places = by_cell(cells.ground, rows, len(is_wanted) - 1)
+    points = np.empty((len(rows), 3), np.float32)
+    side_by_side(lambda i, j: _place(p_base, rows[i:j], places[i:j], points), len(rows))
     return Patches(starts, points, layout.n_side, layout.edge, cells.R_station_base, reach)
 
 
@@ -170,3 +172,14 @@ def _wanted(n_side: int, seed_cells: NDArray[np.int64], margin: int) -> Mask:
             for m in range(max(column - margin, 0), min(column + margin + 1, n_side)):
                 is_wanted[k * n_side + m] = True
     return is_wanted
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _place(
+    p_base: Column, rows: NDArray[np.int32], places: NDArray[np.int32], points: Column
+) -> None:
+    """Write some returns, each to its place."""
+    for i in range(len(rows)):
+        row, place = rows[i], places[i]
+        points[place, 0], points[place, 1] = p_base[row, 0], p_base[row, 1]
+        points[place, 2] = p_base[row, 2]

@@ -12,6 +12,8 @@ from numpy.typing import NDArray
 from pipelines.extraction.ball import Ball
 from pipelines.values import Array, Column
 
+_Vector = tuple[float, float, float]
+
 
 def find_seeds(
     p_base: Column, rows_above: NDArray[np.int32], ball: Ball, n_points_min: int
@@ -79,28 +81,42 @@ def _voxels(
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def _is_free(keys: NDArray[np.int64], p: Array, v_step: Array, v_beam: Array, edge: float) -> bool:
+def _is_free(
+    keys: NDArray[np.int64], p: _Vector, step: _Vector, beam: _Vector, edge: float
+) -> bool:
     """Tell whether nothing lies one step away, at the same depth give or take a voxel."""
     for depth in (-edge, 0.0, edge):
-        q = p + v_step + depth * v_beam
-        if keys[_slot(keys, _voxel(q[0], q[1], q[2], edge))] != -1:
+        x, y = p[0] + step[0] + depth * beam[0], p[1] + step[1] + depth * beam[1]
+        if keys[_slot(keys, _voxel(x, y, p[2] + step[2] + depth * beam[2], edge))] != -1:
             return False
     return True
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def _around(keys: NDArray[np.int64], sums: Column, p: Array, edge: float) -> Array:
+def _around(
+    keys: NDArray[np.int64], sums: Column, p: _Vector, edge: float
+) -> tuple[float, float, float, float]:
     """Return sums of x, y, z and count over the 27 voxels about a point."""
-    total = np.zeros(4)
+    x, y, z, n = 0.0, 0.0, 0.0, 0.0
     for i in range(-1, 2):
         for j in range(-1, 2):
             for k in range(-1, 2):
                 key = _voxel(p[0] + i * edge, p[1] + j * edge, p[2] + k * edge, edge)
                 place = _slot(keys, key)
                 if keys[place] != -1:
-                    for axis in range(4):
-                        total[axis] += sums[place, axis]
-    return total
+                    x, y, z = x + sums[place, 0], y + sums[place, 1], z + sums[place, 2]
+                    n += sums[place, 3]
+    return x, y, z, n
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _axes(p: _Vector, up: Array) -> tuple[_Vector, _Vector]:
+    """Return the direction of a place, and the unit vector across it, to the left."""
+    distance = np.sqrt(p[0] * p[0] + p[1] * p[1] + p[2] * p[2])
+    x, y, z = p[0] / distance, p[1] / distance, p[2] / distance
+    a, b, c = up[1] * z - up[2] * y, up[2] * x - up[0] * z, up[0] * y - up[1] * x
+    length = np.sqrt(a * a + b * b + c * c) + 1e-12
+    return (x, y, z), (a / length, b / length, c / length)
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
@@ -109,26 +125,26 @@ def _free_ends(
 ) -> Array:
     """Return centres and counts, (k, 4), of what ends upward and to at least one side."""
     out = np.empty((len(keys), 4))
-    n_out = 0
+    n_out, step = 0, 3.0 * radius
+    upward = (step * up[0], step * up[1], step * up[2])
     for place in range(len(keys)):
         if keys[place] == -1:
             continue
-        p = sums[place, :3].astype(np.float64) / sums[place, 3]
-        v_beam = p / np.linalg.norm(p)
-        v_side = np.cross(up, v_beam)
-        v_side /= np.linalg.norm(v_side) + 1e-12
-        if not _is_free(keys, p, 3.0 * radius * up, v_beam, radius):
+        n = np.float64(sums[place, 3])
+        p = (sums[place, 0] / n, sums[place, 1] / n, sums[place, 2] / n)
+        beam, side = _axes(p, up)
+        if not _is_free(keys, p, upward, beam, radius):
             continue
-        if not (
-            _is_free(keys, p, 3.0 * radius * v_side, v_beam, radius)
-            or _is_free(keys, p, -3.0 * radius * v_side, v_beam, radius)
-        ):
+        left = (step * side[0], step * side[1], step * side[2])
+        right = (-left[0], -left[1], -left[2])
+        if not (_is_free(keys, p, left, beam, radius) or _is_free(keys, p, right, beam, radius)):
             continue
-        total = _around(keys, sums, p, radius)
-        if total[3] >= n_points_min:
+        x, y, z, n = _around(keys, sums, p, radius)
+        if n >= n_points_min:
             # the points of a cap lie 2/3 R before the centre on average
-            out[n_out, :3] = total[:3] / total[3] + (2.0 / 3.0) * radius * v_beam
-            out[n_out, 3] = total[3]
+            before = 2.0 / 3.0 * radius
+            out[n_out, 0], out[n_out, 1] = x / n + before * beam[0], y / n + before * beam[1]
+            out[n_out, 2], out[n_out, 3] = z / n + before * beam[2], n
             n_out += 1
     return out[:n_out]
 

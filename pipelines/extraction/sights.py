@@ -120,8 +120,8 @@ def sights(
     reach = (_REACH + 0.5) * ball.radius + 0.05
     is_wanted = np.array([_directions_about(centre, ball.up, reach) for centre in centres])
     rows = rows_in(directions, np.logical_or.reduce(is_wanted))
-    starts, order = by_cell(directions.take(rows), N_DIRECTIONS)
-    rows = rows.take(order)
+    starts, places = by_cell(directions, rows, N_DIRECTIONS)
+    rows[places] = rows.copy()
     points, intensities = cloud.p_base.take(rows, axis=0), cloud.intensities.take(rows)
     near = [_runs(starts, np.flatnonzero(mine)) for mine in is_wanted]
     seen = [
@@ -197,16 +197,18 @@ def _runs(starts: NDArray[np.int64], cells: NDArray[np.int64]) -> NDArray[np.int
 def _directions_about(c: Array, up: Array, reach: float) -> Mask:
     """Tell the cells of directions in which beams may pass a centre within a reach."""
     is_wanted = np.zeros(N_DIRECTIONS, np.bool_)
-    xyz, cell = np.empty((3, 1), np.float32), np.empty(1, np.uint16)
     v_across = np.cross(up, c)
     v_across *= reach / (np.sqrt(np.sum(v_across**2)) + 1e-12)
     n_fine = 1.5 * reach * N_DIRECTIONS_SIDE / np.sqrt(np.sum(c**2))
     n_steps = 2 + int(max(n_fine, reach / _STEP))
-    for i in range(-n_steps, n_steps + 1):
-        for j in range(-n_steps, n_steps + 1):
+    n = 2 * n_steps + 1
+    xyz, cells = np.empty((3, n), np.float32), np.empty(n, np.uint16)
+    for i in range(n):
+        for j in range(n):
             for axis in range(3):
-                aside = i * v_across[axis] + j * reach * up[axis]
-                xyz[axis, 0] = c[axis] + aside / n_steps
-            direction_cells(xyz[0], xyz[1], xyz[2], cell)
-            is_wanted[cell[0]] = True
+                aside = (i - n_steps) * v_across[axis] + (j - n_steps) * reach * up[axis]
+                xyz[axis, j] = c[axis] + aside / n_steps
+        direction_cells(xyz[0], xyz[1], xyz[2], cells)
+        for cell in cells:
+            is_wanted[cell] = True
     return is_wanted
