@@ -84,10 +84,10 @@ def site(
     )
     marks = read_control(control, control_axes, control_unit, target_height_m)
     with progress() as told:
-        made, poses = sites.of_logs(
+        made, network = sites.of_logs(
             logs, marks, site_files.read_rig(rig) if rig else None, config, wish, told
         )
-    answer = sites.site_answer(made, wish, poses)
+    answer = sites.site_answer(made, wish, network)
     if as_json:
         print_json(answer)
     else:
@@ -98,6 +98,8 @@ def _print(answer: dict[str, Any]) -> None:
     """Say what was written."""
     kind = "a free network" if answer["poses"] == "free" else "a network with control"
     out.print(f"{answer['n_stations']} stations, by {kind}.")
+    for one in answer["refused"]:
+        out.print(f"Without {one['station']}: {one['reason']}", markup=False, soft_wrap=True)
     for file in answer["files"]:
         text = f"{file['path']}: {file['n_points']:,} returns"
         if "cell_m" in file:

@@ -29,6 +29,7 @@ from storage.site_clouds import CloudExtent, E57File, LazFile
 
 if TYPE_CHECKING:
     from pipelines.config import SurveyConfig
+    from pipelines.network import Network
     from pipelines.survey import Progress
     from pipelines.values import ControlMarks, Rig, ScanLog, StitchedCloud
 
@@ -149,28 +150,38 @@ def of_logs(
     config: SurveyConfig,
     wish: SiteWish,
     progress: Progress,
-) -> tuple[Site, str]:
-    """Adjust the stations of logs and make what is wanted; say what the poses are from."""
+) -> tuple[Site, Network]:
+    """Adjust the stations of logs and make what is wanted; a log that gives none costs no other."""
     from service.networks import adjust_scans, read_scans
     from storage.recordings import read_log
 
     book = read_scans(logs, config, rig, lambda share, what: progress(0.5 * share, what))
     result = adjust_scans(book, marks, config)
     poses = {pose.name: pose for pose in poses_of_network(result)}
+    refused = {one.station for one in book.refused}
+    good = [path for path in logs if path.stem not in refused]
 
     def read() -> Iterator[ScanLog]:
-        for i, path in enumerate(logs):
-            progress(0.5 + 0.5 * i / len(logs), f"Adding {path.stem} to the site")
+        for i, path in enumerate(good):
+            progress(0.5 + 0.5 * i / len(good), f"Adding {path.stem} to the site")
             yield read_log(path)
 
     stops = stitched(read(), config, lambda _name: rig, poses)
     site = make_site(stops, tuple(poses.values()), wish)
-    return site, "free" if result.network.is_free else "control"
+    return site, result.network
 
 
-def site_answer(site: Site, wish: SiteWish, poses: str) -> dict[str, Any]:
-    """Return what was made as plain values."""
-    answer: dict[str, Any] = {"poses": poses, "n_stations": site.n_stations, "files": []}
+def site_answer(site: Site, wish: SiteWish, network: Network) -> dict[str, Any]:
+    """Return what was made, by the poses of a network, as plain values."""
+    answer: dict[str, Any] = {
+        "poses": "free" if network.is_free else "control",
+        "n_stations": site.n_stations,
+        "refused": [
+            {"station": one.station, "code": one.code, "reason": one.reason}
+            for one in network.refused
+        ],
+        "files": [],
+    }
     for kind, extent in site.clouds.items():
         path = wish.targets[kind]
         answer["files"].append({"kind": kind, "path": str(path), **extent_row(extent)})

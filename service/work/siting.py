@@ -111,7 +111,9 @@ def work(order: Order, progress: Progress) -> Outcome:
         progress(0.95, "Keeping the files")
         kept = {kind: keep_file(path, order.clouds_url) for kind, path in wish.targets.items()}
     made = _rows(site, kept, _common(order, options, next(iter(rows.values())), site.n_stations))
-    return Outcome(tables={"site_products": product_rows(made)}, message=_summary(made))
+    found = {recording for recording, _ in poses}
+    missing = [log.name for log in order.logs if log.recording_id not in found]
+    return Outcome(tables={"site_products": product_rows(made)}, message=_summary(made, missing))
 
 
 @contextmanager
@@ -210,8 +212,8 @@ def _rows(site: Any, kept: Mapping[str, Any], common: Row) -> list[Row]:
     ]
 
 
-def _summary(rows: list[Row]) -> str:
-    """Say in a sentence or two what was made."""
+def _summary(rows: list[Row], missing: list[str]) -> str:
+    """Say in some sentences what was made, and what it lacks."""
     ground = next(row for row in rows if row["kind"] == "geotiff")
     poses = {"fixes": "each station alone", "free": "a free network", "control": "a network"}
     text = (
@@ -219,5 +221,6 @@ def _summary(rows: list[Row]) -> str:
         f"cells of {ground['cell_m']:g} m, {100 * ground['share_known']:.0f} % of them seen, "
         f"median sigma {1000 * ground['sigma_median_m']:.1f} mm."
     )
-    clouds = [row for row in rows if row["kind"] != "geotiff"]
-    return f"{text} Cloud of {clouds[0]['n_points']:,} returns." if clouds else text
+    if clouds := [row for row in rows if row["kind"] != "geotiff"]:
+        text += f" Cloud of {clouds[0]['n_points']:,} returns."
+    return f"{text} Without {', '.join(missing)}, of which there is no pose." if missing else text

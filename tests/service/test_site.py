@@ -15,6 +15,7 @@ from service.cli import app
 from service.site import SiteWish, make_site
 from service.work.siting import scratch
 from storage.elevation_files import read_geotiff
+from storage.recordings import read_log, write_log
 
 
 @pytest.fixture(scope="module")
@@ -94,6 +95,22 @@ def test_the_page_of_a_site_draws_the_ground_and_offers_the_files(made, site):
     assert 'id="figure-sigma"' in page
     assert all(f'href="{one["file"]}"' in page for one in made.values())
     assert "/surveys/quarry/site" in site.client.get("/surveys/quarry").text
+
+
+def test_a_log_without_a_pose_is_named_as_missing(made, site, tmp_path):
+    write_log(read_log(site.stop.log), tmp_path / "again.mcap", compression="zstd")
+    again = site.upload((tmp_path / "again.mcap").read_bytes(), name="again").json()
+    posed = site.upload().json()
+    wanted = {
+        "kind": "site",
+        "survey": "quarry",
+        "recordings": [posed["recording_id"], again["recording_id"]],
+        "options": {"cell_m": 2.0, "clouds": False},
+    }
+    job = site.client.post("/api/v1/jobs", json=wanted).json()["job_id"]
+    message = site.ended(job, seconds=120)["message"]
+    assert message.startswith(f"{made['laz']['n_stations']} station")
+    assert "Without again, of which there is no pose." in message
 
 
 def test_a_survey_with_a_slash_in_its_name_has_a_site_too(site):
@@ -186,13 +203,16 @@ def test_the_command_puts_two_stops_into_one_frame(tmp_path):
         config=SimulationConfig(only_near_spheres=True),
         compression="none",
     )
-    logs = [str(made.log) for made in survey(tmp_path, wanted)]
+    (tmp_path / "broken.mcap").write_bytes(b"no log")
+    logs = [str(tmp_path / "broken.mcap")]  # which costs the others nothing
+    logs += [str(made.log) for made in survey(tmp_path, wanted)]
     outputs = [f"--{kind}={tmp_path / kind}" for kind in ("laz", "e57", "geotiff")]
     control = ["--control", str(tmp_path / "control.csv"), "--cell-m", "1", "--json"]
     done = CliRunner().invoke(app, ["site", *logs, *outputs, *control])
     assert done.exit_code == 0, done.output
     answer = json.loads(done.stdout)
     assert (answer["poses"], answer["n_stations"]) == ("control", 2)
+    assert [one["station"] for one in answer["refused"]] == ["broken"]
     cloud = laspy.read(tmp_path / "laz")
     assert set(np.unique(cloud.point_source_id)) == {1, 2}
     assert answer["files"][0]["n_points"] == cloud.header.point_count
