@@ -32,7 +32,7 @@ from service.memory import keep_memory
 from service.provenance import forget_peak_memory, peak_memory
 from service.yardstick import WHAT, Cost, least, read_cost
 from storage.catalogue import Catalogue
-from storage.recordings import inspect_log, read_log, write_log
+from storage.recordings import inspect_log, read_log, require_file, write_log
 from storage.results import RunInfo, tables
 
 _STOP = "lane3-stop4"  # the centre of the field
@@ -88,7 +88,7 @@ def run(log: Path | None, wish: Wish, progress: Progress) -> Plain:
     with tempfile.TemporaryDirectory() as text:
         folder = Path(text)
         progress(0.0, "Reading" if log else "Simulating a stop of three million returns")
-        scans = {log.name: Scan(log=log)} if log else _simulated(folder, wish.turn)
+        scans = _given(log) if log else _simulated(folder, wish.turn)
         plain = next(iter(scans.values()))
         read, measured = measure(scans, folder, wish.repeats, progress)
         first = next(iter(measured.values()))
@@ -105,6 +105,12 @@ def run(log: Path | None, wish: Wish, progress: Progress) -> Plain:
 
             report |= grown(plain, folder, progress)
         return report
+
+
+def _given(log: Path) -> dict[str, Scan]:
+    """Return a log of somebody's own, under a name that means the same to other processes."""
+    require_file(log)
+    return {log.name: Scan(log=log.resolve())}
 
 
 def _simulated(folder: Path, turn: float) -> dict[str, Scan]:

@@ -6,9 +6,17 @@ into neutral columns (``families``): ``pointclouds``, ``joint_states``, ``transf
 recording, and no length that it declares is believed before it is checked.
 """
 
-from storage.recordings.container import file_digest
+from storage.recordings.container import file_digest, require_file
 from storage.recordings.preflight import Preflight, TopicReport, inspect_log
 from storage.recordings.reading import read_log
 from storage.recordings.writing import write_log
 
-__all__ = ["Preflight", "TopicReport", "file_digest", "inspect_log", "read_log", "write_log"]
+__all__ = [
+    "Preflight",
+    "TopicReport",
+    "file_digest",
+    "inspect_log",
+    "read_log",
+    "require_file",
+    "write_log",
+]

@@ -327,12 +327,33 @@ def local_copy(url: str | Path) -> Iterator[Path]:
     if details["type"] == "directory":
         raise RecordingError(f"{url} is a folder; name the .mcap file in it.")
     if isinstance(files, fsspec.implementations.local.LocalFileSystem):
+        require_file(Path(inner))
         yield Path(inner)
         return
     with tempfile.TemporaryDirectory(prefix="spheremark-") as folder:
         path = Path(folder) / Path(inner).name
         files.get_file(inner, str(path))
         yield path
+
+
+def require_file(path: Path) -> None:
+    """Refuse what is no file on a disk, before somebody waits for it to end.
+
+    Parameters
+    ----------
+    path : Path
+        Something on this machine.
+
+    Raises
+    ------
+    RecordingError
+        If it is a terminal, a pipe, a device or anything else without a length of its own.
+    """
+    if not path.is_file():
+        raise RecordingError(
+            f"{path} is no regular file: a recording is read from a disk, not from a pipe or a "
+            "device. Save it to a file and name that."
+        )
 
 
 def file_digest(url: str | Path) -> str:

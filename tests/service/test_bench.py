@@ -1,12 +1,14 @@
 """The benchmark on a short scan: what it says must hang together; how quick it is, is not asked."""
 
 import json
+import os
 
 import numpy as np
 import pytest
 from rich.console import Console
 from typer.testing import CliRunner
 
+from pipelines.errors import RecordingError
 from pipelines.simulation import SimulationConfig, scenario, simulate_stop
 from service import bench, growth, peers, tables, yardstick
 from service.cli import app
@@ -103,6 +105,12 @@ def test_a_log_of_ones_own_is_measured_without_truth(written):
     assert found["log"]["n_returns"] == len(read_log(written["points"]).p_lidar)
     assert [one["bar_ratio"] for one in found["variants"]] == [None]
     assert "peers" not in found
+
+
+def test_a_log_that_is_no_file_is_refused(tmp_path):
+    os.mkfifo(tmp_path / "log.mcap")
+    with pytest.raises(RecordingError, match="no regular file"):
+        bench.run(tmp_path / "log.mcap", bench.Wish(is_quick=True), lambda _share, _what: None)
 
 
 def test_the_yardstick_is_measured_in_a_process_of_its_own(tmp_path):

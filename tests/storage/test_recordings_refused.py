@@ -3,6 +3,7 @@
 import io
 import json
 import math
+import os
 from dataclasses import replace
 
 import numpy as np
@@ -35,6 +36,12 @@ def test_a_file_that_is_not_there_is_not_found(tmp_path):
         read_log(tmp_path / "none.mcap")
     with pytest.raises(NotFoundError):
         inspect_log(tmp_path / "none.mcap")
+
+
+def test_a_pipe_is_refused_before_anybody_waits_for_it(tmp_path):
+    os.mkfifo(tmp_path / "log.mcap")
+    with pytest.raises(RecordingError, match=r"log\.mcap is no regular file.*Save it"):
+        read_log(tmp_path / "log.mcap")
 
 
 def test_a_folder_is_refused(tmp_path):
