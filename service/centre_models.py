@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from pipelines.errors import InputError
+from pipelines.errors import InputError, NotFoundError
 from pipelines.placement import CentreModel, FitRows, Sensor, fitted_model, sensor_model
 
 ROWS_MOST = 5_000
@@ -57,6 +57,7 @@ WHERE f.status = 'ok' AND f.mark IS NOT NULL AND f.fit_method = '{method}'
 ORDER BY r.finished_at DESC, f.run_id, f.stop, f.marker
 LIMIT {most}
 """
+_KNOWN = "SELECT name FROM surveys WHERE name = '{survey}' OR survey_id = '{survey}'"
 _NAME_MOST = 200  # characters
 
 
@@ -71,6 +72,13 @@ def model_of_surveys(
     """Return the model that surveys tell; that of the sensor where they hold too little."""
     rows = read_fit_rows(ask, radius, survey=survey, fit_method=fit_method)
     return sensor_model(sensor, radius) if rows is None else fitted_model(sensor, radius, rows)
+
+
+def require_survey(ask: Ask, survey: str) -> None:
+    """Refuse the name of a survey that is not there; no name is all surveys."""
+    name = _quoted(survey)
+    if survey and not ask(_KNOWN.format(survey=name))["rows"]:
+        raise NotFoundError(f"There is no survey {survey!r} whose fits could be taken.")
 
 
 def read_fit_rows(ask: Ask, radius: float, *, survey: str, fit_method: str) -> FitRows | None:

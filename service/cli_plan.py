@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import sys
 from pathlib import Path
 from typing import Annotated, Any
@@ -11,6 +12,8 @@ import typer
 from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
+
+from pipelines.errors import ConfigError
 
 plan = typer.Typer(
     help="Where to put markers: evaluate, optimise, try at random.", no_args_is_help=True
@@ -37,11 +40,18 @@ Method = Annotated[str, typer.Option(help="Resection: free_station or paper.")]
 SigmaMarks = Annotated[float, typer.Option(help="Sigma per axis of the marks themselves \\[m].")]
 TurnS = Annotated[float, typer.Option(help="Time of a full turn of the gimbal \\[s].")]
 Rpm = Annotated[float, typer.Option(help="Speed of the LiDAR [1/min].")]
+StepDeg = Annotated[
+    float, typer.Option(help="Step of a gimbal that rests between \\[deg]; 0 turns evenly.")
+]
+Rests = Annotated[int, typer.Option(help="Revolutions of the LiDAR during each rest.")]
 Data = Annotated[
     Path | None,
     typer.Option(file_okay=False, help="Data folder whose fits tell the accuracy of centres."),
 ]
-Server = Annotated[str | None, typer.Option(help="Address of a running service, for the same.")]
+Server = Annotated[
+    str | None,
+    typer.Option("--url", "--server", help="Address of a running service, for the same."),
+]
 Survey = Annotated[str, typer.Option(help="Only the fits of this survey.")]
 Csv = Annotated[Path | None, typer.Option(dir_okay=False, help="Write marks and stops (CSV).")]
 GeoJson = Annotated[
@@ -78,6 +88,8 @@ def evaluate(
     sigma_marks_m: SigmaMarks = 0.0,
     turn_s: TurnS = 13.2,
     rpm: Rpm = 600.0,
+    step_deg: StepDeg = 0.0,
+    rest_revolutions: Rests = 3,
     data: Data = None,
     server: Server = None,
     survey: Survey = "",
@@ -93,10 +105,16 @@ def evaluate(
     from storage.plan_files import read_marks
 
     wish = siting.Wanted(
-        tolerance=tolerance_m, method=method, sigma_marks=sigma_marks_m, turn=turn_s, rpm=rpm
+        tolerance=tolerance_m,
+        method=method,
+        sigma_marks=sigma_marks_m,
+        turn=turn_s,
+        rpm=rpm,
+        step=math.radians(step_deg),
+        rest_revolutions=rest_revolutions,
     )
     ground = siting.ground_of(scenario, seed, terrain, stops)
-    asked = siting.put_together(ground, read_marks(marks), wish, _ask(data, server), survey)
+    asked = siting.put_together(ground, read_marks(marks), wish, _ask(data, server, survey), survey)
     answer = siting.evaluate(asked)
     if suggest:
         answer["one_more"] = siting.one_more(asked)
@@ -129,6 +147,8 @@ def optimise(
     sigma_marks_m: SigmaMarks = 0.0,
     turn_s: TurnS = 13.2,
     rpm: Rpm = 600.0,
+    step_deg: StepDeg = 0.0,
+    rest_revolutions: Rests = 3,
     data: Data = None,
     server: Server = None,
     survey: Survey = "",
@@ -140,10 +160,16 @@ def optimise(
     from service import planning, siting
 
     wish = siting.Wanted(
-        tolerance=tolerance_m, method=method, sigma_marks=sigma_marks_m, turn=turn_s, rpm=rpm
+        tolerance=tolerance_m,
+        method=method,
+        sigma_marks=sigma_marks_m,
+        turn=turn_s,
+        rpm=rpm,
+        step=math.radians(step_deg),
+        rest_revolutions=rest_revolutions,
     )
     ground = siting.ground_of(scenario, seed, terrain, stops, keep_out=keep_out, poles=pole_m)
-    asked = siting.put_together(ground, None, wish, _ask(data, server), survey)
+    asked = siting.put_together(ground, None, wish, _ask(data, server, survey), survey)
     rules = siting.rules_of(reach_m, slope_deg, spacing_m, is_inside_allowed=inside)
     goal = siting.goal_of(marks, probability, is_robust=robust)
     _deliver(siting.optimise(asked, rules, goal), csv, geojson, as_json=as_json, planning=planning)
@@ -171,6 +197,8 @@ def random(
     ] = "paper",
     turn_s: TurnS = 13.2,
     rpm: Rpm = 600.0,
+    step_deg: StepDeg = 0.0,
+    rest_revolutions: Rests = 3,
     data: Data = None,
     server: Server = None,
     survey: Survey = "",
@@ -180,13 +208,11 @@ def random(
     as_json: AsJson = False,
 ) -> None:
     """Try arrangements at random, as the study does: an error on every centre, pass or fail."""
-    import math
-
     from pipelines.placement import Sensor, sensor_model
     from service import trials
     from service.centre_models import model_of_surveys
 
-    ask = _ask(data, server)
+    ask = _ask(data, server, survey)
     limits = trials.limits_of_results(ask, fit_method, tolerance_m)
     window = (None, None) if angle_deg is None else (math.radians(v) for v in angle_deg)
     angle_min, angle_max = window
@@ -200,7 +226,12 @@ def random(
         tolerance=tolerance_m,
         seed=seed,
     ).trial(limits)
-    sensor = Sensor(turn=turn_s, spin_rpm=rpm)
+    sensor = Sensor(
+        turn=turn_s,
+        spin_rpm=rpm,
+        step=math.radians(step_deg),
+        rest_revolutions=rest_revolutions,
+    )
     model = (
         sensor_model(sensor) if ask is None else model_of_surveys(ask, sensor, 0.100, survey=survey)
     )
@@ -249,15 +280,20 @@ def _passed(row: dict[str, Any]) -> tuple[str, ...]:
     return f"{row['n']:,}", _text(row["pass_rate"], 100.0, 1), *lengths
 
 
-def _ask(data: Path | None, server: str | None) -> Any:
+def _ask(data: Path | None, server: str | None, survey: str) -> Any:
     """Return what answers SQL, or nothing where no results were named."""
     if data is None and server is None:
+        if survey:
+            raise ConfigError("--survey needs --data or --url, which say where its fits are.")
         return None
+    from service.centre_models import require_survey
     from service.client import Source
     from service.settings import Settings
 
     settings = Settings(data=data) if data else Settings()
-    return Source(settings, server, folder=data).ask
+    ask = Source(settings, server, folder=data).ask
+    require_survey(ask, survey)
+    return ask
 
 
 def _deliver(

@@ -8,11 +8,12 @@ import rasterio
 from rasterio.transform import Affine
 from typer.testing import CliRunner
 
-from pipelines.errors import DegenerateGeometryError, InputError
+from pipelines.errors import ConfigError, DegenerateGeometryError, InputError, NotFoundError
 from pipelines.placement import Trial, errors_by_angle, sensor_model, try_at_random
 from pipelines.placement.sensor import Sensor
 from pipelines.study import TABLE_3
 from service.cli import app
+from storage.catalogue import Catalogue
 from storage.plan_files import read_keep_out, read_marks, read_stops
 from storage.terrain_files import read_terrain
 
@@ -83,6 +84,19 @@ def test_a_plan_refuses_what_cannot_be(small, tmp_path):
     stops.write_text("name,x_m,y_m\nfar,400,0\n")
     with pytest.raises(InputError, match=r"far at 400\.00, 0\.00 m is off the terrain"):
         plan("optimise", "--marks", 3, small[0], small[1], "--stops", stops)
+
+
+def test_a_survey_whose_fits_are_wanted_must_be_there(small, tmp_path):
+    marks = tmp_path / "marks.csv"
+    marks.write_text("mark,x_m,y_m,z_m\nM1,4,0,1\nM2,0,4,1\nM3,-4,0,1\n")
+    wanted = ("evaluate", "--marks", marks, *small, "--survey", "quarry")
+    with pytest.raises(ConfigError, match="--data or --url"):
+        plan(*wanted)
+    with Catalogue(tmp_path / "spheremark.duckdb", snapshots=tmp_path / "snapshots") as catalogue:
+        catalogue.create_survey("pit")
+    with pytest.raises(NotFoundError, match="no survey 'quarry'"):
+        plan(*wanted, "--data", tmp_path)
+    assert plan(*wanted[:-1], "pit", "--data", tmp_path, "--json")["model"]["source"] == "sensor"
 
 
 def test_terrains_are_read_with_the_right_way_up(tmp_path):
