@@ -6,7 +6,15 @@ from typing import NamedTuple
 
 import numpy as np
 
-from pipelines.calibration.gimbal import GIMBAL, Design, Parameter, Sights, design, moved
+from pipelines.calibration.gimbal import (
+    GIMBAL,
+    N_SHADES,
+    Design,
+    Parameter,
+    Sights,
+    design,
+    moved,
+)
 from pipelines.errors import NotConvergedError
 from pipelines.values import RING_UNKNOWN, Array, Index, Mask, Rig, Rings
 
@@ -15,7 +23,7 @@ _EXPECTED_SQUARE = 0.8449  # mean of weight times square of normal residuals: 1 
 _EFFICIENCY = 0.9651  # variance over the inverse normal matrix: E[w^2 x^2] E[w] / E[.]^2
 _NOISE_MIN = 0.001  # [m]; half of the resolution of a range
 _NOISE_START = 0.025  # [m]; the largest that a VLP-16 shows
-_DOF_NOISE = 30.0  # returns that the common noise is worth when that of a sphere is estimated
+_DOF_NOISE = 30.0  # returns that the common noise is worth beside those of a sphere or a shade
 _N_STEPS = 30
 _N_STEPS_NOISE = 4  # after these the noise stays as it is
 _SHARES = (1.0, 0.5, 0.25, 0.125, 0.0625)  # of a step that are tried
@@ -260,19 +268,28 @@ class _Problem(NamedTuple):
         return np.asarray(np.hypot(self.sigma_direction * state.sight.slopes, state.sight.bends))
 
     def sigmas(self, state: _State, noises: Array) -> Array:
-        """Return the noise of each range, given that of the returns of each sphere [m]."""
-        return np.asarray(np.hypot(noises[self.seen.which], self.extra(state)))
+        """Return the standard deviation of each range, given its noise [m]."""
+        return np.asarray(np.hypot(noises, self.extra(state)))
 
     def noises(self, state: _State, before: Array) -> Array:
-        """Return the noise of each sphere's returns [m], drawn towards that of all."""
-        which, n = self.seen.which, len(before)
+        """Return the noise of each return [m]: of its reflectivity, times that of its sphere.
+
+        Either is drawn towards the noise of all.
+        """
+        which, shades, m = self.seen.which, self.seen.shades, len(state.centres)
         scaled = state.sight.residuals / self.sigmas(state, before)
-        weights, own = tukey(scaled), scaled * before[which]
-        squares = np.bincount(which, weights * own**2, n) / _EXPECTED_SQUARE
-        dofs = np.maximum(np.bincount(which, weights > 0.0, n) - 3.0, 0.0)
-        of_all = squares.sum() / max(dofs.sum(), 1.0)
-        drawn = (squares + _DOF_NOISE * of_all) / (dofs + _DOF_NOISE)
-        return np.asarray(np.maximum(np.sqrt(drawn), _NOISE_MIN))
+        weights = tukey(scaled)
+        squares = weights * (scaled * before) ** 2 / _EXPECTED_SQUARE
+        counts = np.bincount(shades, weights > 0.0, N_SHADES)
+        share = max(1.0 - 3.0 * m / max(float(counts.sum()), 1.0), 0.01)
+        of_all = float(squares.sum()) / max(share * float(counts.sum()), 1.0)
+        by_shade = (np.bincount(shades, squares, N_SHADES) + _DOF_NOISE * of_all) / (
+            share * counts + _DOF_NOISE
+        )
+        dofs = np.maximum(np.bincount(which, weights > 0.0, m) - 3.0, 0.0)
+        ratios = np.bincount(which, squares / by_shade[shades], m) + _DOF_NOISE
+        own = by_shade[shades] * (ratios / (dofs + _DOF_NOISE))[which]
+        return np.asarray(np.maximum(np.sqrt(own), _NOISE_MIN))
 
     def equations(self, state: _State, sigmas: Array) -> Normals:
         """Return the normal equations of all parameters and biases."""
@@ -331,12 +348,13 @@ def estimate(
     Notes
     -----
     Gauss-Newton with Tukey's weights, each step shortened until it lowers the loss; noise is
-    estimated sphere by sphere, each drawn towards the noise of all.
+    estimated by reflectivity and by sphere, each drawn towards the noise of all: beams that graze
+    an outline, which tell most of a centre across, answer weakly and are noisy.
     """
     lasers, basis = _contrasts(seen.rings)
     problem = _Problem(seen, covs, radius, sigma_direction, basis)
     state = problem.at(rig, centres)
-    noises = np.full(len(centres), _NOISE_START)
+    noises = np.full(len(seen.which), _NOISE_START)
     is_free: Mask = np.ones(len(GIMBAL), dtype=np.bool_)
     held: tuple[Inseparable, ...] = ()
     for number in range(_N_STEPS):

@@ -18,6 +18,10 @@ from pipelines.values import Array, Beams, Index, Rig, Rings, ScanLog, StitchedC
 
 _RATE_WINDOW = 0.05  # [s] over which the speed of the gimbal is taken: encoders jitter
 _NS = 1e-9  # [s] in a nanosecond
+_REFLECTIVITIES = np.array([5.0, 15.0, 40.0, 100.0])  # limits between classes of noise
+
+N_SHADES = len(_REFLECTIVITIES) + 1
+"""Classes of reflectivity: a VLP-16 measures what answers weakly with twice the noise."""
 
 
 class Parameter(NamedTuple):
@@ -99,6 +103,8 @@ class Sights(NamedTuple):
         Speed of the gimbal [rad/s].
     rings : (n,) uint8
         Lasers.
+    shades : (n,)
+        Class of reflectivity, 0 to ``N_SHADES - 1`` from dark to bright: the noise depends on it.
     which : (n,)
         The sphere that each one met.
     divergence : (2,)
@@ -111,6 +117,7 @@ class Sights(NamedTuple):
     angles: Array
     rates: Array
     rings: Rings
+    shades: Index
     which: Index
     divergence: Array
 
@@ -173,6 +180,7 @@ def sights(log: ScanLog, cloud: StitchedCloud, rows: Index, which: Index) -> Sig
         angles=_recorded(turned, rig) + rates * rig.gimbal_clock_offset,
         rates=rates,
         rings=table.rings,
+        shades=np.digitize(table.intensities, _REFLECTIVITIES),
         which=which,
         divergence=rig.divergence,
     )
@@ -388,9 +396,9 @@ def _averaged(
     radii = np.full(len(centres), radius)
     columns = np.sqrt(3.0) * np.linalg.cholesky(covs)
     places = [centres + side * columns[:, :, k] for k in range(3) for side in (1.0, -1.0)]
-    there = [predict(table, place, radii, which) for place in places]
-    ranges = np.array([one.ranges for one in there])
-    J = np.mean([one.J[:, :3] for one in there], axis=0)
+    ranges = np.array([predict(table, place, radii, which).ranges for place in places])
+    slopes = (ranges[0::2] - ranges[1::2]).T / 2.0
+    J = np.asarray(np.einsum("nk,nki->ni", slopes, np.linalg.inv(columns)[which]))
     linear = np.array([np.einsum("ni,ni->n", J, (place - centres)[which]) for place in places])
     bends = np.std(ranges - linear, axis=0)
     return ranges.mean(axis=0), J, bends
