@@ -320,10 +320,12 @@ def _adjusted(
     left_out = _left_out(network, tested, dropped, critical)
     predictions, cov_predictions = _predicted_control(network, tested)
     parts = tested.cofactors.parts
+    J = position_by_motion(tested.state.T_site_base)
     return AdjustedNetwork(
         network=network,
         T_site_station=T,
         cov_T_site_station=shift @ tested.cofactors.stations @ shift.T + _cov_heading(network, T),
+        station_covariances=J @ tested.cofactors.stations @ np.swapaxes(J, 1, 2),
         p_site=tested.state.p_site + middle,
         cov_p_site=tested.cofactors.marks,
         used=tested.used,

@@ -304,6 +304,9 @@ class AdjustedNetwork:
         Poses of the levelled frames [m].
     cov_T_site_station : (s, 6, 6)
         Covariance of a small motion of each, (rotation [rad], translation [m]) on the left.
+    station_covariances : (s, 3, 3)
+        Covariance of each station's position: far from the origin that of the motion has no digits
+        left to tell it from [m^2].
     p_site : (m, 3)
         Marks [m].
     cov_p_site : (3m, 3m)
@@ -360,6 +363,7 @@ class AdjustedNetwork:
     network: Network
     T_site_station: Array
     cov_T_site_station: Array
+    station_covariances: Array
     p_site: Array
     cov_p_site: Array
     used: Mask
@@ -393,6 +397,7 @@ class AdjustedNetwork:
             {
                 "T_site_station": (s, 4, 4),
                 "cov_T_site_station": (s, 6, 6),
+                "station_covariances": (s, 3, 3),
                 "p_site": (m, 3),
                 "cov_p_site": (3 * m, 3 * m),
                 "used": (self.network.n_blocks,),
@@ -446,12 +451,6 @@ class AdjustedNetwork:
         """Covariance of each mark, (m, 3, 3) [m^2]."""
         m = len(self.p_site)
         return np.asarray(np.einsum("iaib->iab", self.cov_p_site.reshape(m, 3, m, 3)))
-
-    @property
-    def station_covariances(self) -> Array:
-        """Covariance of each station's position, (s, 3, 3) [m^2]."""
-        J = position_by_motion(self.T_site_station)
-        return np.asarray(J @ self.cov_T_site_station @ np.swapaxes(J, -1, -2))
 
 
 def position_by_motion(T: Array) -> Array:

@@ -404,6 +404,20 @@ def test_moving_the_control_moves_the_network_and_nothing_else(rng):
     )
 
 
+def test_positions_far_from_the_origin_are_as_sure_as_at_it(rng):
+    marks = field(rng)
+    scans, _ = survey(rng, marks, 4)
+    scans = [
+        (name, replace(fits, levelling=replace(fits.levelling, sigma_heading=0.01)))
+        for name, fits in scans
+    ]
+    far = control(np.add(marks.p_site, [431_250.0, 5_412_800.0, 312.0]))
+    here, there = network(scans, marks), network(scans, far)
+    np.testing.assert_allclose(
+        there.station_covariances, here.station_covariances, rtol=1e-5, atol=1e-12
+    )
+
+
 def test_a_network_of_one_station_without_control_is_refused(rng):
     scans, _ = survey(rng, field(rng), 1)
     with pytest.raises(DegenerateGeometryError, match="no two stations share two marks"):
