@@ -271,6 +271,7 @@ def _fix(
         method=name,
         T_site_station=rigid(rot_z(yaw), p),
         cov_T_site_station=shift @ cov @ shift.T,
+        cov_p_site=cov[3:, 3:].copy(),
         matches=np.array(pairs),
         residuals_site=np.einsum("km,kmi->ki", group.residuals, group.J),
         redundancies=adjustment.redundancies,

@@ -263,18 +263,21 @@ def _fix(
     first, second = np.triu_indices(n, 1)
     centres = scene.centres_base[used[:, 0]]
     angles = included_angle(centres[first], centres[second])
+    cov, J = adjustment.cov + _cov_shared(scene, used, adjustment), _position_by_motion(T)
+    shifts = _shifts_of_choice(scene, match, T_site_base)
     return StationFix(
         method="free_station",
         T_site_station=T_site_base @ inverse(rigid(scene.R_station_base, np.zeros(3))),
-        cov_T_site_station=shift @ (adjustment.cov + _cov_shared(scene, used, adjustment)) @ shift.T
+        cov_T_site_station=shift @ cov @ shift.T
         + _cov_heading(scene, T_site_base)
-        + _cov_choice(scene, match, T_site_base),
+        + _cov_choice(scene, shifts, T_site_base),
+        cov_p_site=J @ cov @ J.T + shifts.T @ shifts / (len(shifts) + 1),
         matches=used,
         residuals_site=adjustment.groups[0].residuals,
         redundancies=adjustment.redundancies[:n],
         w_statistics=adjustment.w_statistics[:n],
         detectable_biases=adjustment.detectable_biases[:n],
-        external_reliabilities=external_reliabilities(adjustment, _position_by_motion(T))[:n],
+        external_reliabilities=external_reliabilities(adjustment, J)[:n],
         dof=adjustment.dof,
         sigma0=adjustment.sigma0,
         passes_global_test=adjustment.passes_global_test,
@@ -314,15 +317,19 @@ def _cov_heading(scene: Scene, T_site_base: Array) -> Array:
     return np.asarray(scene.sigma_heading**2 * np.outer(turn, turn))
 
 
-def _cov_choice(scene: Scene, match: Match, T_site_base: Array) -> Array:
+def _shifts_of_choice(scene: Scene, match: Match, T_site_base: Array) -> Array:
+    """Return how far off the other places are where the station may stand as well, (k, 3) [m]."""
+    return np.asarray(match.rivals + scene.middle - T_site_base[:3, 3])
+
+
+def _cov_choice(scene: Scene, shifts: Array, T_site_base: Array) -> Array:
     """Return what it adds to the covariance, (6, 6), that the station may as well stand elsewhere.
 
     Each of the other places is as likely as the chosen one, and lies half a turn away.
     """
     cov = np.zeros((6, 6))
-    n = len(match.rivals)
+    n = len(shifts)
     if n:
-        shifts = match.rivals + scene.middle - T_site_base[:3, 3]
         turn = np.pi * _turn(scene, T_site_base)
         cov[3:, 3:] = shifts.T @ shifts / (n + 1)
         cov += n / (n + 1) * np.outer(turn, turn)

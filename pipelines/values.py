@@ -582,6 +582,9 @@ class StationFix:
     cov_T_site_station : (6, 6)
         Covariance of a small motion (rotation [rad], translation [m]) applied on the left:
         ``T_true = Exp(xi) T_site_station``, expressed in the site frame.
+    cov_p_site : (3, 3)
+        Covariance of the position: far from the site's origin that of the motion has no digits
+        left to tell it from [m^2].
     matches : (n, 2)
         Pairs of (place among the fits, place among the control marks), the used ones.
     residuals_site : (n, 3)
@@ -615,6 +618,7 @@ class StationFix:
     method: str
     T_site_station: Array
     cov_T_site_station: Array
+    cov_p_site: Array
     matches: Index
     residuals_site: Array
     redundancies: Array
@@ -643,6 +647,7 @@ class StationFix:
             self,
             T_site_station=(4, 4),
             cov_T_site_station=(6, 6),
+            cov_p_site=(3, 3),
             matches=(None, 2),
             residuals_site=(len(self.matches), 3),
             included_angles=(2,),
@@ -653,13 +658,6 @@ class StationFix:
     def p_site(self) -> Array:
         """Position of the station, the origin of the station frame, in the site frame [m]."""
         return self.T_site_station[:3, 3]
-
-    @property
-    def cov_p_site(self) -> Array:
-        """Covariance of ``p_site`` [m^2]."""
-        x, y, z = self.p_site
-        J = np.hstack([[[0, z, -y], [-z, 0, x], [y, -x, 0]], np.eye(3)])  # d p / d xi = [-[p]x, 1]
-        return np.asarray(J @ self.cov_T_site_station @ J.T)
 
     @property
     def yaw(self) -> float:

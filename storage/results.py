@@ -541,6 +541,7 @@ def _fix_of(row: Row) -> StationFix:
         method=row["resection_method"],
         T_site_station=rigid(R, [row["x_m"], row["y_m"], row["z_m"]]),
         cov_T_site_station=np.full((6, 6), np.nan),
+        cov_p_site=np.full((3, 3), np.nan),
         matches=np.zeros((0, 2), dtype=np.intp),
         residuals_site=np.zeros((0, 3)),
         redundancies=none,

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from pipelines.config import SurveyConfig
-from pipelines.geometry import exp_motion, included_angle, inverse, rigid, rot_z, transform
+from pipelines.geometry import exp_motion, included_angle, inverse, rigid, rot_z, skew, transform
 from pipelines.rigs import tilted_vlp16
 from pipelines.values import (
     ControlMarks,
@@ -124,10 +124,14 @@ def _fix(truth, control, fits, rng):
     sigma = 0.002 if fits.method == "along_beam" else 0.006
     motion = np.concatenate([rng.normal(scale=2e-4, size=3), rng.normal(scale=sigma, size=3)])
     angles = included_angle(control.p_site[0] - truth.T_site_base[:3, 3], control.p_site[1:])
+    T = exp_motion(motion) @ truth.T_site_base
+    cov = np.diag([4e-8] * 3 + [sigma**2, 1.5 * sigma**2, 0.7 * sigma**2])
+    J = np.hstack([-skew(T[:3, 3]), np.eye(3)])
     return StationFix(
         method="free_station",
-        T_site_station=exp_motion(motion) @ truth.T_site_base,
-        cov_T_site_station=np.diag([4e-8] * 3 + [sigma**2, 1.5 * sigma**2, 0.7 * sigma**2]),
+        T_site_station=T,
+        cov_T_site_station=cov,
+        cov_p_site=J @ cov @ J.T,
         matches=np.column_stack([np.arange(n)] * 2),
         residuals_site=rng.normal(scale=sigma, size=(n, 3)),
         redundancies=np.full(n, 2.6),

@@ -161,6 +161,21 @@ def test_the_covariance_of_the_pose_is_honest_at_length(n_marks):
     assert np.mean(chi2.sf(squares, 3) > 0.05) == pytest.approx(0.95, abs=0.013)
 
 
+@pytest.mark.parametrize("method", ["free_station", "ranges", "paper"])
+def test_positions_far_from_the_origin_are_as_sure_as_at_it(rng, method):
+    marks = field(rng)
+    fits = sightings(marks, pose([0.5, -1.0, 1.5], 0.3), noise=rng.normal(0, 1e-3, (14, 3)))
+    fits = replace(fits, levelling=replace(fits.levelling, sigma_heading=0.02))
+    far = control(np.add(marks.p_site, [431_250.0, 5_412_800.0, 312.0]))
+    here, there = resect(method, fits, marks, CONFIG), resect(method, fits, far, CONFIG)
+    np.testing.assert_allclose(there.cov_p_site, here.cov_p_site, rtol=1e-5, atol=1e-12)
+    x, y, z = here.p_site
+    J = np.array([[0, z, -y, 1, 0, 0], [-z, 0, x, 0, 1, 0], [y, -x, 0, 0, 0, 1]])
+    np.testing.assert_allclose(
+        here.cov_p_site, J @ here.cov_T_site_station @ J.T, rtol=1e-6, atol=1e-12
+    )
+
+
 def test_a_false_marker_and_a_moved_mark_are_left_out_with_reasons(rng):
     marks = field(rng)
     noise = rng.normal(0, 4e-3, (14, 3))

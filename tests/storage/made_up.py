@@ -6,7 +6,7 @@ from datetime import UTC, datetime
 import numpy as np
 
 from pipelines.config import SurveyConfig
-from pipelines.geometry import levelling_rotation, rigid, rot_x, rot_y, rot_z
+from pipelines.geometry import levelling_rotation, rigid, rot_x, rot_y, rot_z, skew
 from pipelines.rigs import tilted_vlp16
 from pipelines.values import (
     Exclusion,
@@ -99,10 +99,12 @@ def fix(rng):
     """A station that uses all marks but the last, in another order than the fits."""
     root = rng.normal(size=(6, 6)) * 1e-3
     matches = np.array([[4, 4], [0, 0], [1, 1], [2, 2], [3, 3]])
+    J = np.hstack([-skew(P_SITE + SHIFT_SITE), np.eye(3)])
     return StationFix(
         method="free_station",
         T_site_station=rigid(rot_z(YAW + TURN), P_SITE + SHIFT_SITE),
         cov_T_site_station=root @ root.T,
+        cov_p_site=J @ root @ root.T @ J.T,
         matches=matches,
         residuals_site=rng.normal(size=(5, 3)) * 1e-3,
         redundancies=rng.uniform(1, 3, 5),
