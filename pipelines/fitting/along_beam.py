@@ -407,8 +407,7 @@ def _judged(
         return refused(candidate, reason)
     own = _own_factor(estimate, mine)
     table, offsets = shots.beams, estimate.linear.offsets[used]
-    rings = table.rings[used]
-    n_rings = len(np.unique(rings[rings != RING_UNKNOWN]))
+    n_rings = len(set(table.rings[used].tolist()) - {RING_UNKNOWN})
     fit = MarkerFit(
         p_base=p.copy(),
         cov_p_base=_covariance(estimate, k, own, n_used),
