@@ -28,6 +28,8 @@ class Wanted:
     sigma_marks: float
     turn: float
     rpm: float
+    step: float = 0.0
+    rest_revolutions: int = 3
 
 
 def ground_of(
@@ -70,7 +72,12 @@ def put_together(
     ground: Ground, marks: Arrangement | None, wanted: Wanted, ask: Ask | None, survey: str
 ) -> Asked:
     """Return a plan that can be judged."""
-    sensor = Sensor(turn=wanted.turn, spin_rpm=wanted.rpm)
+    sensor = Sensor(
+        turn=wanted.turn,
+        spin_rpm=wanted.rpm,
+        step=wanted.step,
+        rest_revolutions=wanted.rest_revolutions,
+    )
     radius = ground.site.marker_radius
     model = (
         placement.sensor_model(sensor, radius)

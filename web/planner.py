@@ -138,6 +138,8 @@ def address(plan: Row) -> str:
         "tolerance": f"{_MM * asked['tolerance_m']:g}",
         "turn": f"{asked['turn_s']:g}",
         "rpm": f"{asked['spin_rpm']:g}",
+        "step": f"{asked.get('step_deg', 0.0):g}",
+        "rests": f"{asked.get('rest_revolutions', 3)}",
         "model": asked["model"],
         "a": ";".join(
             f"{mark['name']}:{mark['position_m'][0]:.3f},{mark['position_m'][1]:.3f},"

@@ -43,6 +43,13 @@ class Sensor:
         Time in which the gimbal turns through 360 degrees [s].
     spin_rpm : float
         Revolutions of the LiDAR per minute.
+    step : float
+        Angle between the rests of a gimbal that steps instead of turning evenly; 0 turns evenly
+        [rad]. ``turn`` then means nothing.
+    rest_revolutions : int
+        Revolutions of the LiDAR during each rest.
+    move : float
+        Time of the movement from one rest to the next; the LiDAR runs on [s].
     reflectivity : float
         Calibrated reflectivity of the spheres, 0 to 255. 42: red paint that sends half of the light
         back, the mean over a sphere.
@@ -62,6 +69,9 @@ class Sensor:
 
     turn: float = 13.2
     spin_rpm: float = 600.0
+    step: float = 0.0
+    rest_revolutions: int = 3
+    move: float = 0.1
     reflectivity: float = 42.0
     noise: float | None = None
     sigma_direction: float = 1e-4
@@ -86,7 +96,14 @@ class Sensor:
     @property
     def scan(self) -> SimulationConfig:
         """The same speeds as a simulation has them."""
-        return SimulationConfig(turn=self.turn, spin_rpm=self.spin_rpm, divergence=self.divergence)
+        return SimulationConfig(
+            turn=self.turn,
+            spin_rpm=self.spin_rpm,
+            step=self.step,
+            rest_revolutions=self.rest_revolutions,
+            move=self.move,
+            divergence=self.divergence,
+        )
 
     @property
     def warning(self) -> str:
@@ -95,7 +112,9 @@ class Sensor:
 
     @property
     def line_spacing(self) -> float:
-        """Mean angle between lines at the horizon [rad]."""
+        """Mean angle between lines at the horizon, those that fall on each other too [rad]."""
+        if self.step:
+            return 2.0 * np.pi / len(horizon_lines(self.scan))
         return 2.0 * np.pi / (2.0 * N_LASERS * self.turn * self.spin_rpm / 60.0)
 
     @property

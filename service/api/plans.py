@@ -95,6 +95,12 @@ class Plan(Strict):
     tolerance_m: float = Field(default=0.03, gt=0, le=10)
     turn_s: float = Field(default=13.2, gt=0, le=3600, description="Time of a turn [s].")
     spin_rpm: float = Field(default=600.0, description="Revolutions of the LiDAR per minute.")
+    step_deg: float = Field(
+        default=0.0, description="Step of a gimbal that rests between; 0 turns evenly [deg]."
+    )
+    rest_revolutions: int = Field(
+        default=3, description="Revolutions of the LiDAR during each rest."
+    )
     model: str = Field(
         default="auto",
         description="Accuracy of centres: 'sensor'; 'survey:<name>', from its marker_fits; or "
@@ -333,7 +339,12 @@ def _evaluated(service: Service, plan: Plan, *, field_cells: int = 0) -> Plain:
 def _asked(service: Service, plan: Plan) -> Asked:
     """Return what is asked as values."""
     ground = service.planner.ground(plan.site)
-    sensor = Sensor(turn=plan.turn_s, spin_rpm=plan.spin_rpm)
+    sensor = Sensor(
+        turn=plan.turn_s,
+        spin_rpm=plan.spin_rpm,
+        step=math.radians(plan.step_deg),
+        rest_revolutions=plan.rest_revolutions,
+    )
     return Asked(
         ground=ground,
         stops=ground.stops

@@ -255,6 +255,35 @@ def test_a_turn_in_step_with_the_channels_loses_spheres():
     assert "commensurate" in lattice.sensor.warning
 
 
+def test_a_gimbal_that_steps_puts_as_many_returns_on_spheres_as_its_simulated_scan(world):
+    from pipelines.config import SurveyConfig
+    from pipelines.simulation import SimulationConfig, simulate_stop
+    from pipelines.survey import process
+
+    scan = SimulationConfig(step=np.radians(1.7), rest_revolutions=1, only_near_spheres=True)
+    stops, marks = stops_of_field(world), marks_of_field(world)
+    log = simulate_stop(world, stops.names[17], scan).log
+    config = SurveyConfig.from_mapping({"fitting": {"methods": ["along_beam"]}})
+    (result,) = process(log, config=config, marks=world.marks)
+    n_used = sum(len(fit.used) for fit in result.fits["along_beam"].fits)
+    model = sensor_model(Sensor(step=scan.step, rest_revolutions=1))
+    found = evaluate(site_of_field(world), one_stop(stops.p_site[17]), marks, model, Requirement())
+    assert len(result.fits["along_beam"].fits) == found.is_seen.sum()
+    assert_allclose(found.n_points.sum(), n_used, rtol=0.05)
+
+
+def test_coarse_steps_pass_far_spheres_by():
+    coarse = sensor_model(Sensor(step=np.radians(10.0)))
+    fine = sensor_model(Sensor(step=np.radians(0.73), rest_revolutions=1))
+    marks = ring(6, 15.0)
+    seen = [
+        evaluate(flat_site(), one_stop(), marks, model, Requirement()).is_seen.sum()
+        for model in (coarse, fine)
+    ]
+    assert seen == [0, 6]
+    assert "Rests every 10 deg" in coarse.sensor.warning
+
+
 def test_more_marks_and_nearer_ones_are_better():
     def sigma(marks):
         return evaluate(flat_site(), one_stop(), marks, MODEL, Requirement()).sigma_3d[0]

@@ -181,6 +181,7 @@ def test_a_file_that_is_no_terrain_is_refused_and_not_kept(client):
         ({"marks": [MARKS[0], MARKS[0]]}, "needs a name of its own"),
         ({"stops": []}, "no stop"),
         ({"turn_s": 0.001}, "turn"),
+        ({"step_deg": -1.0}, "step"),
     ],
 )
 def test_what_cannot_be_planned_is_refused_with_the_reason(client, wrong, said):

@@ -6,7 +6,7 @@ const API = "/api/v1/plans";
 const CELLS = { moving: 32, still: 64 }; // across the longer side of the map
 const KEPT = 60; // steps that can be undone
 const byId = (name) => document.getElementById(name);
-const controls = ["site", "method", "tolerance", "turn", "rpm", "model", "show"];
+const controls = ["site", "method", "tolerance", "turn", "step", "rests", "rpm", "model", "show"];
 const state = { plans: [], active: 0, stop: "", stops: null, areas: [], corners: null, site: null, past: [], adding: "" };
 
 // ---- the address
@@ -69,6 +69,8 @@ function request(plan, more = {}) {
     tolerance_m: byId("tolerance").valueAsNumber / 1000,
     turn_s: byId("turn").valueAsNumber,
     spin_rpm: byId("rpm").valueAsNumber,
+    step_deg: byId("step").valueAsNumber,
+    rest_revolutions: byId("rests").valueAsNumber,
     model: byId("model").value,
     ...more,
   };
@@ -134,6 +136,8 @@ function draw() {
   }
   drawMarks();
   drawStops();
+  byId("rests").disabled = !byId("step").valueAsNumber;
+  byId("turn").disabled = !byId("rests").disabled;
   byId("areas").hidden = !state.areas.length;
   fillTable(byId("areas-table").tBodies[0], state.areas, onArea);
 }
