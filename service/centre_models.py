@@ -76,7 +76,7 @@ def model_of_surveys(
 
 def require_survey(ask: Ask, survey: str) -> None:
     """Refuse the name of a survey that is not there; no name is all surveys."""
-    name = _quoted(survey)
+    name = quoted(survey)
     if survey and not ask(_KNOWN.format(survey=name))["rows"]:
         raise NotFoundError(f"There is no survey {survey!r} whose fits could be taken.")
 
@@ -86,7 +86,7 @@ def read_fit_rows(ask: Ask, radius: float, *, survey: str, fit_method: str) -> F
     if len(survey) > _NAME_MOST:
         raise InputError(f"The name of the survey has {len(survey)} characters.")
     sql = _SQL.format(
-        method=_quoted(fit_method), survey=_quoted(survey), radius=float(radius), most=ROWS_MOST
+        method=quoted(fit_method), survey=quoted(survey), radius=float(radius), most=ROWS_MOST
     )
     answer = ask(sql)
     names = [column["name"] for column in answer["columns"]]
@@ -115,7 +115,7 @@ def read_fit_rows(ask: Ask, radius: float, *, survey: str, fit_method: str) -> F
     )
 
 
-def _quoted(text: str) -> str:
+def quoted(text: str) -> str:
     """Return a text as it stands between the quotes of SQL."""
     return text.replace("'", "''")
 

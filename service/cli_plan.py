@@ -213,7 +213,7 @@ def random(
     from service.centre_models import model_of_surveys
 
     ask = _ask(data, server, survey)
-    limits = trials.limits_of_results(ask, fit_method, tolerance_m)
+    limits = trials.limits_of_results(ask, fit_method, tolerance_m, survey)
     window = (None, None) if angle_deg is None else (math.radians(v) for v in angle_deg)
     angle_min, angle_max = window
     trial = trials.Wanted(

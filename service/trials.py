@@ -21,7 +21,7 @@ from pipelines.placement import (
     errors_by_angle,
     try_at_random,
 )
-from service.centre_models import Ask
+from service.centre_models import Ask, quoted
 from service.planning import Plain, model_answer
 
 _ANGLES_DEG = np.arange(10.0, 171.0, 2.5)
@@ -29,17 +29,22 @@ _BIN_DEG = 10  # of included angles of results
 _PAIRS_LEAST = 8  # in a class of included angles
 _FITS_LEAST = 30
 _BIN_M = 0.5  # of distances of results
+_NO_POSITION = 1e9  # [m] error of pairs that gave none
 
 _DISTANCES = """
 SELECT floor(range_m / {bin}) * {bin} AS range_m, count(*) AS n,
-    quantile_cont(coalesce(error_3d_m, 1.61 * sigma_3d_m), 0.5) AS error_3d_m,
-    count(error_3d_m) > 0 AS has_errors
-FROM marker_fits WHERE fit_method = '{method}' AND mark IS NOT NULL GROUP BY 1 ORDER BY 1
+    quantile_cont(coalesce(error_3d_m, sigma_3d_m), 0.5) AS error_3d_m
+FROM latest_marker_fits WHERE fit_method = '{method}' AND mark IS NOT NULL
+    AND ('{survey}' IN ('', survey, survey_id))
+GROUP BY 1 ORDER BY 1
 """
 _WINDOW = """
-SELECT floor(included_angle_deg / {bin}) * {bin} AS angle_deg, count(*) AS n,
-    quantile_cont(coalesce(error_3d_m, sigma_3d_m), 0.5) AS error_3d_m
-FROM resections WHERE fit_method = '{method}' AND n_marks = 2 GROUP BY 1 ORDER BY 1
+SELECT floor(x.included_angle_deg / {bin}) * {bin} AS angle_deg, count(*) AS n,
+    quantile_cont(coalesce(x.error_3d_m, x.sigma_3d_m, {none}), 0.5) AS error_3d_m
+FROM resections AS x JOIN latest_runs AS r USING (run_id) JOIN surveys AS s USING (survey_id)
+WHERE x.fit_method = '{method}' AND x.n_marks = 2 AND ('{survey}' IN ('', s.name, s.survey_id))
+    AND x.resection_method = if('{method}' = 'paper', 'paper', 'free_station')
+GROUP BY 1 ORDER BY 1
 """
 
 
@@ -74,11 +79,12 @@ class Wanted:
         )
 
 
-def limits_of_results(ask: Ask | None, method: str, tolerance: float) -> Plain:
+def limits_of_results(ask: Ask | None, method: str, tolerance: float, survey: str = "") -> Plain:
     """Return the greatest distance and the window of angles that results keep a tolerance in.
 
     The medians of errors (of sigmas, where no truth is known) by distance and by included angle of
-    pairs; without results, or too few of them, the study's own limits.
+    pairs, by the newest run of each log, of one survey if it is named; without results, or too few
+    of them, the study's own limits.
     """
     limits: Plain = {
         "greatest_distance_m": study.GREATEST_DISTANCE,
@@ -91,11 +97,12 @@ def limits_of_results(ask: Ask | None, method: str, tolerance: float) -> Plain:
         return limits
     if not method.replace("_", "").isalnum():
         raise InputError(f"{method!r} is no fitting method.")
-    near = [row for row in _rows(ask(_DISTANCES.format(bin=_BIN_M, method=method))) if row["n"]]
+    named = {"method": method, "survey": quoted(survey)}
+    near = _rows(ask(_DISTANCES.format(bin=_BIN_M, **named)))
     if sum(row["n"] for row in near) >= _FITS_LEAST:
         limits["distance_source"] = f"{sum(row['n'] for row in near):,} fits by {method}"
         limits["greatest_distance_m"] = _greatest(near, tolerance)
-    pairs = _rows(ask(_WINDOW.format(bin=_BIN_DEG, method=method)))
+    pairs = _rows(ask(_WINDOW.format(bin=_BIN_DEG, none=_NO_POSITION, **named)))
     window = _window([row for row in pairs if row["n"] >= _PAIRS_LEAST], tolerance)
     if window:
         limits["angle_min_deg"], limits["angle_max_deg"] = window

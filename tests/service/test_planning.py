@@ -1,8 +1,10 @@
 """``spheremark plan`` from the outside, and the files that go into it."""
 
 import json
+from datetime import UTC, datetime
 
 import numpy as np
+import pyarrow as pa
 import pytest
 import rasterio
 from rasterio.transform import Affine
@@ -13,9 +15,11 @@ from pipelines.placement import Trial, errors_by_angle, sensor_model, try_at_ran
 from pipelines.placement.sensor import Sensor
 from pipelines.study import TABLE_3
 from service.cli import app
+from service.trials import limits_of_results
 from storage.catalogue import Catalogue
 from storage.plan_files import read_keep_out, read_marks, read_stops
 from storage.terrain_files import read_terrain
+from tests.storage.made_up import made_tables
 
 
 def plan(*words):
@@ -181,6 +185,49 @@ def test_the_study_s_window_parts_what_passes_from_what_does_not():
 def test_centres_as_good_as_ours_pass_whatever_the_angles():
     result = try_at_random(Trial(n_arrangements=5_000, error=None), sensor_model(Sensor()))
     assert result.passes.mean() > 0.999
+
+
+def with_column(table, name, value):
+    """Return a table with one value in a column."""
+    return table.set_column(table.column_names.index(name), name, pa.array([value] * len(table)))
+
+
+def test_limits_of_results_are_those_of_the_newest_run_and_of_the_survey(tmp_path):
+    with Catalogue(tmp_path / "x.duckdb", snapshots=tmp_path / "snapshots") as catalogue:
+        digest, ids = 64 * "a", [catalogue.create_survey(name).survey_id for name in "AB"]
+        catalogue.add_recording(
+            digest, name="L1", size_bytes=7, url="x", preflight={"verdict": "ok"}
+        )
+        config = {"survey": ids[0], "recording_id": digest, "config": {}}
+        for day in (1, 2):
+            job = catalogue.create_job("process", **config).job_id
+            names = {"job_id": job, "survey_id": ids[0], "recording_id": digest}
+            when = datetime(2026, 1, day, tzinfo=UTC)
+            rows = made_tables(run_id=f"run{day}", finished_at=when, **names)
+            fits, pairs = rows["marker_fits"], rows["resections"]
+            both = pa.concat_tables([pairs, with_column(pairs, "resection_method", "paper")])
+            for name, table in (("marker_fits", fits), ("resections", both)):
+                rows[name] = pa.concat_tables(
+                    [with_column(table, "stop", f"S{i}") for i in range(8)]
+                )
+            catalogue.start_job(job)
+            catalogue.finish_job(job, rows)
+
+        def ask(sql):
+            table = catalogue.table(sql)
+            rows = [list(row.values()) for row in table.to_pylist()]
+            return {"columns": [{"name": name} for name in table.column_names], "rows": rows}
+
+        n_fits = 8 * sum(
+            row["fit_method"] == "along_beam" and row["mark"] is not None
+            for row in fits.to_pylist()
+        )
+        n_pairs = 8 * sum(row["n_marks"] == 2 for row in pairs.to_pylist())
+        for survey in ("", "A"):
+            limits = limits_of_results(ask, "along_beam", 0.03, survey)
+            assert limits["distance_source"] == f"{n_fits:,} fits by along_beam"
+            assert limits["angle_source"] == f"{n_pairs:,} pairs of marks by along_beam"
+        assert limits_of_results(ask, "along_beam", 0.03, "B")["distance_source"] == "study"
 
 
 def test_trials_come_as_tables_and_figures(tmp_path):
