@@ -7,6 +7,8 @@ leave the field zero, constant, or filled for half of the cloud only: that count
 
 from __future__ import annotations
 
+from math import isfinite
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -80,7 +82,7 @@ def fault_of(low: float, high: float, n_zeros: int, n: int) -> str:
     str
         The end of a sentence; empty when nothing is wrong.
     """
-    if not np.isfinite(high - low):
+    if not isfinite(high - low):
         return "some of its times are not finite"
     if n < SHOTS_MIN:
         return ""
