@@ -22,7 +22,7 @@ from pipelines.resection import resect
 from pipelines.simulation import Field, SimulationConfig, scenario, simulate_stop
 from pipelines.survey import Progress, process
 from pipelines.threads import in_processes
-from pipelines.values import Array, ControlMarks, Index, MarkerFits, StopTruth, _seal
+from pipelines.values import Array, ControlMarks, Index, MarkerFits, Mask, StopTruth, _seal
 
 QUANTITIES = {"horizontal": 2, "position": 3, "pose": 6}
 """What is compared, with its dimensions: position in the plane, in space, with rotation too."""
@@ -264,14 +264,20 @@ def coverage(
     -------
     tuple of Coverage
         By method, quantity and level.
+
+    Raises
+    ------
+    TooFewObservationsError
+        If a method positioned no station.
     """
     weights = _resampled(draws.surveys, np.random.default_rng(seed))
     found = []
     for (method, quantity), squares in draws.squares.items():
-        known = np.isfinite(squares)
+        known = _known(draws, method, quantity)
+        own = weights[:, known]
+        own = own[own.any(axis=1)]  # surveys without a station may be all that is drawn
         for level in levels:
             inside = squares[known] <= chi2.ppf(level, QUANTITIES[quantity])
-            own = weights[:, known]
             low, high = np.quantile((own @ inside) / own.sum(axis=1), _CONFIDENCE)
             found.append(
                 Coverage(
@@ -299,11 +305,27 @@ def nees(draws: Draws) -> dict[tuple[str, str], float]:
     -------
     dict
         By method and quantity.
+
+    Raises
+    ------
+    TooFewObservationsError
+        If a method positioned no station.
     """
     return {
-        key: float(np.nanmean(squares)) / QUANTITIES[key[1]]
+        key: float(np.mean(squares[_known(draws, *key)])) / QUANTITIES[key[1]]
         for key, squares in draws.squares.items()
     }
+
+
+def _known(draws: Draws, method: str, quantity: str) -> Mask:
+    """Tell which stations a method positioned; at least one."""
+    known: Mask = np.isfinite(draws.squares[method, quantity])
+    if not known.any():
+        raise TooFewObservationsError(
+            f"None of {len(known)} stations was positioned by {method!r}: nothing is known of its "
+            "errors. Simulate more surveys, or such that have marks enough."
+        )
+    return known
 
 
 def simulate_surveys(

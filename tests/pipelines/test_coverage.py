@@ -72,6 +72,21 @@ def test_stations_that_could_not_be_positioned_do_not_count():
     assert counts["network", "position"] == 1400
 
 
+def test_a_method_that_positions_few_stations_has_an_interval_and_one_that_positions_none_says_so():
+    draws = drawn(np.random.default_rng(6), 8, 5)
+    squares = {key: value.copy() for key, value in draws.squares.items()}
+    squares["network", "pose"][10:] = np.nan  # the stations of two surveys of eight are left
+    few = Draws(surveys=draws.surveys, squares=squares, errors=draws.errors, sigmas=draws.sigmas)
+    (one,) = (
+        row for row in coverage(few, (0.68,)) if (row.method, row.quantity) == ("network", "pose")
+    )
+    assert 0.0 <= one.low <= one.share <= one.high <= 1.0
+    squares["network", "pose"][:] = np.nan
+    for ask in (coverage, nees):
+        with pytest.raises(TooFewObservationsError, match="None of 40 stations"):
+            ask(few)
+
+
 def test_one_survey_and_no_stop_are_refused():
     with pytest.raises(TooFewObservationsError, match="two or more"):
         joined([drawn(np.random.default_rng(5), 1)])
