@@ -14,6 +14,7 @@ import numpy as np
 
 from pipelines.calibration import Calibration, calibrate
 from pipelines.config import SurveyConfig
+from pipelines.errors import RecordingError
 from pipelines.rigs import rig_digest, rig_to_mapping
 from pipelines.survey import Progress
 from pipelines.values import Rig, ScanLog
@@ -33,15 +34,24 @@ class _Logs:
     kept: tuple[ScanLog, ...]
 
     def __iter__(self) -> Iterator[ScanLog]:
-        return iter(self.kept) if self.kept else (read_log(path) for path in self.paths)
+        return iter(self.kept) if self.kept else (_read(path) for path in self.paths)
 
 
 def calibrate_logs(
     paths: Sequence[Path], config: SurveyConfig, rig: Rig | None, progress: Progress
 ) -> Calibration:
     """Estimate the rig from the spheres of some logs."""
-    kept = (read_log(paths[0]),) if len(paths) == 1 else ()
+    kept = (_read(paths[0]),) if len(paths) == 1 else ()
     return calibrate(_Logs(tuple(paths), kept), config=config, rig=rig, progress=progress)
+
+
+def _read(path: Path) -> ScanLog:
+    """Read one log of several; what is wrong with it is said of it by name."""
+    try:
+        return read_log(path)
+    except RecordingError as error:
+        error.args = (f"{path.name}: {error}",)
+        raise
 
 
 def calibration_answer(found: Calibration) -> Plain:

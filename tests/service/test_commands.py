@@ -202,6 +202,12 @@ def half_an_upload(port):
         connection.sendall(head.encode() + b"x" * 5_000_000)
 
 
+def test_of_several_logs_the_one_that_cannot_be_read_is_named(stop, tmp_path):
+    (tmp_path / "broken.mcap").write_bytes(b"no log")
+    done = run("calibrate", stop.log, tmp_path / "broken.mcap", code=1)
+    assert "Error: broken.mcap: " in done.stderr
+
+
 def test_a_calibrated_rig_is_one_that_processing_takes(stop, tmp_path):
     rig = tmp_path / "rig.json"
     answer = json.loads(run("calibrate", stop.log, "--json", "--out", rig).stdout)
