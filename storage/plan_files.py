@@ -149,12 +149,13 @@ def _marks_of_plan(text: str) -> str:
     if not rows or "kind" not in rows[0]:
         return text
     columns = ("name", "x_m", "y_m", "z_m")
-    lines = [",".join(columns)]
-    try:
-        lines += [",".join(row[c] for c in columns) for row in rows if row["kind"] == "mark"]
-    except (KeyError, TypeError) as error:
-        raise ControlError("The plan lacks a column of name, x_m, y_m, z_m.") from error
-    return "\n".join(lines) + "\n"
+    if not set(columns) <= set(rows[0]):
+        raise ControlError("The plan lacks a column of name, x_m, y_m, z_m.")
+    table = io.StringIO()
+    writer = csv.DictWriter(table, columns, extrasaction="ignore", lineterminator="\n")
+    writer.writeheader()
+    writer.writerows(row for row in rows if row["kind"] == "mark")
+    return table.getvalue()
 
 
 def _stop_rows(file: str, text: str) -> Iterator[tuple[str, list[float]]]:

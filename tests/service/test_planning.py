@@ -15,6 +15,7 @@ from pipelines.placement import Trial, errors_by_angle, sensor_model, try_at_ran
 from pipelines.placement.sensor import Sensor
 from pipelines.study import TABLE_3
 from service.cli import app
+from service.planning import to_csv
 from service.trials import limits_of_results
 from storage.catalogue import Catalogue
 from storage.plan_files import read_keep_out, read_marks, read_stops
@@ -165,6 +166,14 @@ def test_files_of_a_plan_say_what_is_wrong(tmp_path):
     square = {"type": "Polygon", "coordinates": [[[0, 0], [1, 0], [1, 1], [0, 1], [0, 0]]]}
     file.write_text(json.dumps(square))
     assert len(read_keep_out(file)[0]) == 5
+
+
+def test_marks_of_a_plan_may_have_commas_in_their_names(tmp_path):
+    file = tmp_path / "plan.csv"
+    place = {"position_m": [1.0, 2.0, 3.0]}
+    answer = {"marks": [{"name": "north, low", **place}], "stops": [{"name": "S", **place}]}
+    file.write_text(to_csv(answer))
+    assert read_marks(file).names == ("north, low",)
 
 
 def test_three_circles_give_the_study_s_table():
