@@ -72,9 +72,7 @@ def measured(log: ScanLog, n_returns: int, scan: Scan, folder: Path) -> Plain:
     """Return what the chain costs on a log of so many returns."""
     path = folder / f"{n_returns}.mcap"
     write_log(_stretched(log, n_returns), path)
-    read, found = measure(
-        {"": replace(scan, log=path)}, folder / str(n_returns), _REPEATS, lambda *_: None
-    )
+    read, found = measure({"": replace(scan, log=path)}, folder, _REPEATS, lambda *_: None)
     path.unlink()
     cost = found[""].costs[_CHAIN]
     return {
