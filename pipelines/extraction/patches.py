@@ -137,7 +137,8 @@ def points_near(patches: Patches, c: Array, every: float) -> Array:
     for k in range(bottom, top + 1):
         first, end = _run(patches, k, low, high)
         for j in range(int((end - first) / every)):
-            i = first + int((j + (_GOLDEN * j) % 1.0) * every) if every > 1.0 else first + j
+            aside = _GOLDEN * j
+            i = first + int((j + aside - np.floor(aside)) * every)
             p, q, r = np.float64(points[i, 0]), np.float64(points[i, 1]), np.float64(points[i, 2])
             # kept only if the next one does not take its place
             out[0, n_out], out[1, n_out], out[2, n_out] = p, q, r
