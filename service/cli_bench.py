@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 from typing import Annotated
 
@@ -57,6 +58,7 @@ def bench(
     if accuracy:
         _bench_accuracy(stops, seed, is_full=full, as_json=as_json)
         return
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # as for workers; NumPy reads it when loaded
     from service import bench as benches
     from service import tables
 
