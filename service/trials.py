@@ -43,9 +43,11 @@ SELECT floor(x.included_angle_deg / {bin}) * {bin} AS angle_deg, count(*) AS n,
     quantile_cont(coalesce(x.error_3d_m, x.sigma_3d_m, {none}), 0.5) AS error_3d_m
 FROM resections AS x JOIN latest_runs AS r USING (run_id) JOIN surveys AS s USING (survey_id)
 WHERE x.fit_method = '{method}' AND x.n_marks = 2 AND ('{survey}' IN ('', s.name, s.survey_id))
-    AND x.resection_method = if('{method}' = 'paper', 'paper', 'free_station')
+    AND x.resection_method = if(
+        EXISTS (FROM resections WHERE fit_method = '{method}' AND resection_method = '{method}'),
+        '{method}', 'free_station')
 GROUP BY 1 ORDER BY 1
-"""
+"""  # the study's fits by its own resection, where there are such; each pair counts once
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -248,7 +248,8 @@ def try_at_random(wanted: RandomTrial, service: Current) -> Said:
 def tried(service: Service, wanted: RandomTrial) -> Plain:
     """Return what came of arrangements at random."""
     planner = service.planner
-    limits = trials.limits_of_results(planner.ask, wanted.fit_method, wanted.tolerance_m)
+    survey = wanted.model.partition("survey:")[2]  # which fits tell, they tell of limits too
+    limits = trials.limits_of_results(planner.ask, wanted.fit_method, wanted.tolerance_m, survey)
     angles = (
         None if angle is None else math.radians(angle)
         for angle in (wanted.angle_min_deg, wanted.angle_max_deg)

@@ -199,6 +199,16 @@ def test_marks_at_random_come_as_an_answer_and_as_a_page(client):
     assert ours["pass_rate"] > 0.99
 
 
+def test_limits_of_random_marks_are_those_of_the_survey_that_is_named(client):
+    client.post("/api/v1/surveys", json={"name": "bare"})
+    wanted = {"n_arrangements": 100, "n_marks_max": 5, "tolerance_m": 0.05}
+    sources = [
+        client.post("/api/v1/plans/random", json={**wanted, "model": model}).json()["limits"]
+        for model in ("auto", "survey:field", "survey:bare")
+    ]
+    assert [one["angle_source"] == "study" for one in sources] == [False, False, True]
+
+
 def test_trials_that_cannot_be_are_refused_on_the_page(client):
     for wrong, said in (
         ({"n_marks_min": "two"}, "n_marks_min"),
