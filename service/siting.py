@@ -154,9 +154,7 @@ def optimum_answer(found: Optimum, goal: Goal) -> Plain:
 
 def _notes(found: Optimum, goal: Goal) -> list[str]:
     """Say how good an optimum is, for people."""
-    kept = "is kept" if found.is_kept else "is NOT kept"
-    loss = ", after the loss of any one mark too" if goal.is_robust else ""
-    text = f"The tolerance {kept} with {100 * goal.probability:g} % at every stop{loss}."
+    text = f"The tolerance {_kept(found, goal)}."
     if np.isfinite(found.worst_after_loss):
         text += f" Without its worst mark: {1e3 * found.worst_after_loss:.2f} mm (3-D sigma)."
     notes = [text]
@@ -167,6 +165,16 @@ def _notes(found: Optimum, goal: Goal) -> list[str]:
             f"arrangement of as many marks can exceed."
         )
     return notes
+
+
+def _kept(found: Optimum, goal: Goal) -> str:
+    """Say whether the tolerance is kept, and whether a loss would break it."""
+    with_all = f"with {100 * goal.probability:g} % at every stop"
+    if found.is_kept:
+        return f"is kept {with_all}" + (", after the loss of any one mark too" * goal.is_robust)
+    if found.evaluation.worst_probability >= goal.probability:
+        return f"is kept {with_all}, but NOT after the loss of any one mark"
+    return f"is NOT kept {with_all}"
 
 
 def one_more(asked: Asked, rules: PlaceRules | None = None) -> Plain:

@@ -41,6 +41,7 @@ _STARTS, _STARTS_WHOLE = 8, 4  # the latter of whole judgements
 _DRAWN, _DRAWN_KEPT = 1500, 40  # arrangements at random that these begin with, and judge in full
 _POWER = 12.0  # of the mean over stops that is as good as their largest, and smoother
 _SHAKEN = 0.4  # share of marks that such a start has elsewhere
+_WORSE = 1.3  # than now, at most, while a loss would break what is wanted
 _TRIED = 12  # candidates that are judged in full for each mark, the most promising first
 _SCREENED = 800  # places that whole judgements try in a round, for all marks together
 
@@ -444,10 +445,10 @@ def _exchanged(
     for _ in range(_ROUNDS):
         is_better = False
         for i in rng.permutation(len(chosen)):
-            for c in _promising(task, chosen, int(i), score[1:], goal, rng):
+            for c in _promising(task, chosen, int(i), score, rng):
                 trial = chosen.copy()
                 trial[i] = c
-                found = _wanted(task, trial, goal)
+                found = _wanted(task, trial, goal, score[0])
                 if found < score:
                     chosen, score, is_better = trial, found, True
                     n_exchanges += 1
@@ -461,8 +462,7 @@ def _promising(
     task: _Task,
     chosen: Index,
     i: int,
-    score: tuple[float, float],
-    goal: Goal,
+    score: tuple[float, float, float],
     rng: np.random.Generator,
 ) -> Index:
     """Return the candidates that would be better in place i than what stands there, best first."""
@@ -476,7 +476,7 @@ def _promising(
     else:
         places = np.flatnonzero(free)
         worsts = np.empty((len(places), 2))
-        limit = np.inf if goal.is_robust and _is_broken(task, chosen, goal) else score[0]
+        limit = score[1] if score[0] == 0.0 else _WORSE * score[1]
         stops = np.argsort(-_sigmas(task, chosen))
         _judge(
             _sums(task, others),
@@ -488,27 +488,24 @@ def _promising(
             worsts,
         )
     order = np.lexsort((worsts[:, 1], worsts[:, 0]))
-    if not (goal.is_robust and _is_broken(task, chosen, goal)):
-        order = order[[tuple(worsts[o]) < tuple(score) for o in order]]
+    if score[0] == 0.0:
+        order = order[[tuple(worsts[o]) < score[1:] for o in order]]
     return places[order[:_TRIED]]
 
 
-def _is_broken(task: _Task, chosen: Index, goal: Goal) -> bool:
-    """Return whether the loss of a mark would break what is wanted."""
-    return _wanted(task, chosen, goal)[0] > 0.0
-
-
-def _wanted(task: _Task, chosen: Index, goal: Goal) -> tuple[float, float, float]:
+def _wanted(
+    task: _Task, chosen: Index, goal: Goal, most: float = np.inf
+) -> tuple[float, float, float]:
     """Return what an arrangement is judged by, the less the better.
 
-    By how much the loss of a mark would break the tolerance [m], the largest sigma over all stops
-    [m], and their mean [m].
+    By how much the loss of a mark would break the tolerance, looked at until that is more than some
+    length, the largest sigma over all stops, and their mean [m].
     """
-    worst, mean = _score(task, chosen)
     if not goal.is_robust or len(chosen) < 3:
-        return 0.0, worst, mean
-    broken = _after_loss(task, chosen) - task.wish.tolerance / _SURE
-    return max(broken, 0.0), worst, mean
+        return 0.0, *_score(task, chosen)
+    sure = task.wish.tolerance / _SURE
+    broken = max(_after_loss(task, chosen, most + sure) - sure, 0.0)
+    return (broken, np.inf, np.inf) if broken > most else (broken, *_score(task, chosen))
 
 
 def _sigmas(task: _Task, chosen: Index) -> Array:
@@ -535,9 +532,14 @@ def _score(task: _Task, chosen: Index) -> tuple[float, float]:
     return worst, float(sigmas.mean())
 
 
-def _after_loss(task: _Task, chosen: Index) -> float:
-    """Return the largest sigma over all stops after the loss of any one mark [m]."""
-    return max(float(_sigmas(task, np.delete(chosen, i)).max()) for i in range(len(chosen)))
+def _after_loss(task: _Task, chosen: Index, most: float = np.inf) -> float:
+    """Return the largest sigma over all stops after the loss of any one mark, or one above most."""
+    worst = 0.0
+    for i in range(len(chosen)):
+        worst = max(worst, float(_sigmas(task, np.delete(chosen, i)).max()))
+        if worst > most:
+            break
+    return worst
 
 
 def _optimum(  # noqa: PLR0913  all that an answer is made of

@@ -49,9 +49,12 @@ export function rangeOf(fields, shown, tolerance) {
   if (!values.length) return null;
   const at = (share) => values[Math.round(share * (values.length - 1))];
   const least = { sigma: 1e-4, probability: 0.01, seen: 1, ground: 0.05 }[shown];
+  if (SHOWN[shown].isBestLow || SHOWN[shown].isPlain) {
+    const high = shown === "sigma" ? at(0.98) : values.at(-1);
+    return { low: values[0], high: Math.max(high, values[0] + least) };
+  }
   const low = shown === "probability" ? at(0.02) : values[0];
-  const high = shown === "sigma" ? at(0.98) : values.at(-1);
-  return { low, high: Math.max(high, low + least) };
+  return { low: Math.min(low, values.at(-1) - least), high: values.at(-1) }; // all alike: all good
 }
 
 export class PlanMap {

@@ -527,14 +527,14 @@ byId("compare").addEventListener("click", () => {
   const marks = state.plans.map((plan) => plan.marks);
   setMarks(marks.length > 1 ? [marks[state.active]] : [marks[0], structuredClone(marks[0])], marks.length > 1 ? 0 : 1);
 });
-byId("optimise").addEventListener("click", (event) => during(event.currentTarget, async (plan) => {
+byId("optimise").addEventListener("click", (event) => byId("plan-controls").reportValidity() && during(event.currentTarget, async (plan) => {
   const answer = await post("/optimise", request(plan, { n_marks: byId("count").valueAsNumber }));
   remember();
   plan.marks = answer.marks.map(own);
   changed(plan, CELLS.still);
   tell(answer.notes.join(" "));
 }));
-byId("suggest").addEventListener("click", (event) => during(event.currentTarget, async (plan) => {
+byId("suggest").addEventListener("click", (event) => byId("plan-controls").reportValidity() && during(event.currentTarget, async (plan) => {
   const answer = await post("/suggest", request(plan));
   remember();
   plan.marks.push(own(answer));
