@@ -286,7 +286,12 @@ def _refuse_nothing(
     """Raise where no network is left."""
     first = f" {refused[0].station}: {refused[0].reason}" if refused else ""
     if not used or (control is None and len(used) < 2):
-        ties = "no two stations share two marks" if control is None else "no station sees two marks"
+        ties = (
+            "no two stations share two marks"
+            if control is None
+            else "no station sees two control marks; three tell more, and without --control the "
+            "network is free"
+        )
         raise DegenerateGeometryError(f"There is no network: {ties}.{first}")
     if control is not None:
         seen = sorted({m for pairs in used.values() for _, m in pairs if m < found.n_control})

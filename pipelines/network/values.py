@@ -10,8 +10,10 @@ from pipelines.errors import InputError
 from pipelines.values import Array, Index, Mask
 
 RANGE_BIAS = "common_range_bias"
-HEIGHT_BIAS = "common_height_bias"
 """The shared unknown that is what all ranges are too long [m]."""
+
+HEIGHT_BIAS = "common_height_bias"
+"""The shared unknown that is what all centres are too high [m]."""
 
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
