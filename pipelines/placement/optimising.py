@@ -210,19 +210,24 @@ def optimise(  # noqa: PLR0913  all that a plan is made of
     check_sizes(len(stops.names), goal.n_marks or goal.most)
     task = _task(site, stops, candidates, model, wish)
     if goal.n_marks is not None:
-        found = _best(task, goal.n_marks, goal, rng)
-        return _optimum(site, stops, candidates, model, task, found, goal)
+        best = _best(task, goal.n_marks, goal, rng)
+        return _optimum(site, stops, candidates, model, task, best, goal)
     least = 3 if wish.method == "paper" or goal.is_robust else 2
     if goal.most < least:
         raise ConfigError(f"At most {goal.most} marks; {least} are needed for what is asked.")
     _refuse_impossible(task, stops)
-    tried = []
-    for k in range(least, goal.most + 1):
-        found = _best(task, k, goal, rng)
-        tried.append(_optimum(site, stops, candidates, model, task, found, goal))
-        if tried[-1].is_kept:
-            return tried[-1]
-    raise DegenerateGeometryError(_impossible(task, stops, tried[-1], goal))
+
+    def tried(k: int) -> Optimum:
+        return _optimum(site, stops, candidates, model, task, _best(task, k, goal, rng), goal)
+
+    if _is_doubtful(task, goal) and not (most := tried(goal.most)).is_kept:
+        raise DegenerateGeometryError(_impossible(task, stops, most, goal))
+    for k in range(least, goal.most):
+        if (found := tried(k)).is_kept:
+            return found
+    if (found := tried(goal.most)).is_kept:
+        return found
+    raise DegenerateGeometryError(_impossible(task, stops, found, goal))
 
 
 def propose_mark(
@@ -593,6 +598,16 @@ def _refuse_impossible(task: _Task, stops: Stops) -> None:
             f"{task.near.shape[0]} places at once would leave {best} at {stops.names[worst]}. Ask "
             "for a larger tolerance, or allow more places."
         )
+
+
+def _is_doubtful(task: _Task, goal: Goal) -> bool:
+    """Return whether there is room for the most marks, and a quick choice of them breaks."""
+    try:
+        chosen = _greedy(task, goal.most)
+    except DegenerateGeometryError:
+        return False
+    worst = _after_loss(task, chosen) if goal.is_robust else _score(task, chosen)[0]
+    return worst > task.wish.tolerance / _SURE
 
 
 def _impossible(task: _Task, stops: Stops, best: Optimum, goal: Goal) -> str:
