@@ -18,7 +18,7 @@ from pipelines.extraction.cells import Cells
 from pipelines.extraction.patches import Patches, n_about, patches_about, points_near
 from pipelines.extraction.seeds import thinned
 from pipelines.threads import side_by_side
-from pipelines.values import Array, StitchedCloud
+from pipelines.values import Array, Mask, StitchedCloud
 
 NOISE_MIN = 0.006
 """Scatter of any VLP-16: what scatters less is not known better [m]."""
@@ -35,6 +35,7 @@ _N_WORTH = 20  # places that are worth a thread
 _N_SAMPLE = 1500  # returns in the cells about a seed that tell whether to look there
 _N_WHOLE = 2000  # returns there that are looked at at once
 _IN_ANY_ORDER = {"reassoc", "contract"}  # sums of many returns at once
+_STRAY_SIGMAS = 4.0
 _N_STEPS = 6  # of a fit that only has to tell what a group is
 
 
@@ -61,6 +62,9 @@ class Look(NamedTuple):
         Radius when it is estimated too [m].
     scatter_free : float
         Robust standard deviation along the beams about that ball [m].
+    gain_free : float
+        By how much that ball explains the returns better: likelihood ratio as a chi-square with one
+        degree of freedom.
     flat_across, sigma_across : float
         How much of the ball's curvature across is missing: 0 a ball, 1 a plane.
     flat_along, sigma_along : float
@@ -80,6 +84,7 @@ class Look(NamedTuple):
     radius_free: float
     sigma_radius: float
     scatter_free: float
+    gain_free: float
     flat_across: float
     sigma_across: float
     flat_along: float
@@ -239,7 +244,7 @@ def _is_resolved(points: Array, c: Array, ball: Ball, every: float) -> bool:
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
 def _looked(patches: Patches, places: Array, ball: Ball) -> Array:
-    """Return what is seen near places, (k, 17), as ``Look`` names it; zeros if no ball is there."""
+    """Return what is seen near places, (k, 18), as ``Look`` names it; zeros if no ball is there."""
     out = np.zeros((len(places), _N_FIELDS))
     for k in range(len(places)):
         _look(points_near(patches, places[k], 1.0), places[k], ball, out[k])
@@ -263,14 +268,35 @@ def _look(points: Array, start: Array, ball: Ball, out: Array) -> None:
     flat, cov_flat = _flatness(seen, residuals, weights, radius)
     c_free, radius_free, cov_free = _settled(points, c, ball, 4)
     seen_free = seen_from(points, view_of(c_free, ball.up))
+    residuals_free = _residuals(seen_free, radius_free)
+    scatter_free = _scatter(seen_free, residuals_free, radius_free)
+    weights_free = _weights(seen_free, residuals_free, radius_free, blur, scatter)
     out[:3] = c
     out[3], out[4] = np.sum(weights > 0.0), _n_strange(seen, weights, radius)
     out[5], out[6] = _surroundings(points, c, ball)
     out[7], out[8], out[9] = rms, _extent(seen[0], weights), _extent(seen[1], weights)
     out[10], out[11] = radius_free, noise * np.sqrt(cov_free[3, 3])
-    out[12] = _scatter(seen_free, _residuals(seen_free, radius_free), radius_free)
-    out[13], out[14] = flat[3], noise * np.sqrt(cov_flat[3, 3])
-    out[15], out[16] = flat[4], noise * np.sqrt(cov_flat[4, 4])
+    out[12] = scatter_free
+    is_in = (weights > 0.0) | (weights_free > 0.0)
+    out[13] = _gain(residuals, residuals_free, is_in, _STRAY_SIGMAS * max(scatter, scatter_free))
+    out[14], out[15] = flat[3], noise * np.sqrt(cov_flat[3, 3])
+    out[16], out[17] = flat[4], noise * np.sqrt(cov_flat[4, 4])
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _gain(residuals: Array, others: Array, is_in: Mask, limit: float) -> float:
+    """Return how much better the others explain the returns: of few, the noise is not known either.
+
+    What is farther off than the limit is a stray, and tells nothing by how far.
+    """
+    n, known, free = 0, 0.0, 0.0
+    for i in range(len(residuals)):
+        if is_in[i]:
+            n += 1
+            known += min(abs(residuals[i]), limit) ** 2
+            free += min(abs(others[i]), limit) ** 2
+    least = n * NOISE_MIN**2
+    return max(n - 4, 0) * float(np.log(max(known, least) / max(free, least)))
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")

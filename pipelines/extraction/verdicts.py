@@ -14,6 +14,7 @@ from pipelines.extraction.sights import Sight
 _TOUCHING = 0.10  # share of a ball's returns that may lie as far away beside it: mixed pixels
 _STRANGE = 0.3  # share of the returns inside the outline that may be off the ball
 _SIGMAS = 3.5  # standard deviations at which a shape is refused
+_RADIUS_FAR = 0.6  # of the radius: beams that are wide and few never err by as much
 _RADIUS_SLACK = 0.12  # of the radius: less is no reason to refuse, the fit judges it
 _N_SHAPELY = 12  # returns that show the width of what they lie on
 _HEIGHT_MIN = 0.4  # radii: one line of a scan shows no ball
@@ -125,7 +126,8 @@ def verdict(look: Look, config: ExtractionConfig, ball: Ball) -> str:
             "it is round.",
         ),
         (
-            abs(off) > _radius_slack(look, ball),
+            abs(off) > _radius_slack(look, ball)
+            and (look.gain_free > _SIGMAS**2 or abs(off) > _RADIUS_FAR * radius),
             f"Its own radius is {1e3 * look.radius_free:.0f} mm (standard deviation "
             f"{1e3 * look.sigma_radius:.0f} mm), not {1e3 * radius:.0f} mm.",
         ),
@@ -147,9 +149,9 @@ def verdict(look: Look, config: ExtractionConfig, ball: Ball) -> str:
 
 
 def _radius_slack(look: Look, ball: Ball) -> float:
-    """Return by how much the free radius may be off: rays instead of wide beams make it larger."""
+    """Return by how much the free radius may be off: wide beams are taken for rays."""
     blur = 0.5 * ball.divergence * float(np.linalg.norm(look.p_base))
-    return max(_SIGMAS * look.sigma_radius, _RADIUS_SLACK * ball.radius + 0.6 * blur)
+    return max(_SIGMAS * look.sigma_radius, _RADIUS_SLACK * ball.radius + blur)
 
 
 def verdict_on_sight(look: Look, sight: Sight, ball: Ball) -> str:

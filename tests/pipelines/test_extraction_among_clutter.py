@@ -5,10 +5,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from pipelines.config import ExtractionConfig
+from pipelines.config import ExtractionConfig, StitchingConfig
 from pipelines.extraction import extract
-from pipelines.simulation import SimulationConfig
+from pipelines.simulation import SimulationConfig, simulate_stop
 from pipelines.simulation.detection import DETECTION_PLAN, detection
+from pipelines.simulation.lane import range_lane
+from pipelines.stitching import choose_rig, stitch
 from tests.pipelines.synthetic_stop import RADIUS, World, ring_of_markers, scan
 
 COLUMNS = ("p_base", "gimbal_angles", "intensities", "rings", "times")
@@ -124,3 +126,20 @@ def test_markers_are_found_and_nothing_else_in_worlds_of_clutter():
     assert found.n_false["rock-field"] == found.n_false["range-lane"] == 0
     assert found.worst["clutter-field"] <= 1
     assert all(sum(t.reasons.values()) == t.n - t.n_found for t in found.tallies)
+
+
+def test_far_balls_of_the_right_size_are_not_refused_for_their_size():
+    """Of 20 to 60 returns, beams as wide as half a radius: size is told badly, and not surely."""
+    n_lost = n_balls = 0
+    for seed in range(940, 944):
+        world = range_lane(seed, np.array([12.5, 15.0, 17.5]), 30)
+        simulated = simulate_stop(
+            world, "centre", SimulationConfig(only_near_spheres=True, sigma_range=0.02)
+        )
+        cloud = stitch(simulated.log, choose_rig(simulated.log, None), StitchingConfig())
+        found = extract(cloud, ExtractionConfig(), world.marker_radius)
+        reasons = [rejection.reason for rejection in found.rejected]
+        n_lost += sum(reason.startswith("Its own radius") for reason in reasons)
+        n_balls += len(found.candidates)
+    assert n_balls > 350
+    assert n_lost <= 1
