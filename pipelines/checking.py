@@ -11,12 +11,13 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from pipelines.config import ResectionConfig
-from pipelines.geometry import rigid
-from pipelines.matching import Scene, gather, match_marks, solve_pose
+from pipelines.geometry import rigid, transform
+from pipelines.matching import Match, Scene, gather, match_marks, solve_pose
 from pipelines.values import Array, ControlMarks, Index, MarkerFits, Mask, StationFix, _seal
 
 _SURPRISE = 3.29  # sigmas that one in a thousand normal residuals exceeds
 _N_LEFT = 3  # markers at least, of which one can be left out
+_DISPLACED = 1.0  # [m] from a marker that is no mark: a mark without one may be given wrongly
 _UPRIGHT = 0.05  # spread across over spread along a plumb line of marks that tell no heading
 _N_POSE = 6  # unknowns: with as many more observations of centres, the levelling was left out
 _UNKNOWN = 1.0  # [rad] of a levelling that was left out
@@ -103,7 +104,8 @@ def check_distances(
     Returns
     -------
     DistanceChecks
-        All pairs of markers that are control marks, those that a resection would leave out too.
+        All pairs of markers that are control marks, those that a resection would leave out too. A
+        mark without a marker is paired with a marker without a mark within a metre of it.
 
     Raises
     ------
@@ -117,7 +119,8 @@ def check_distances(
     is taken off them.
     """
     scene = gather(fits, marks, config)
-    pairs = match_marks(scene, config).pairs
+    match = match_marks(scene, config)
+    pairs = np.concatenate([match.pairs, _displaced(scene, match)])
     first, second = np.triu_indices(len(pairs), 1)
     places = np.stack([pairs[first], pairs[second]], axis=1)
     p, q = scene.centres_base[places[:, 0, 0]], scene.centres_base[places[:, 1, 0]]
@@ -141,6 +144,23 @@ def check_distances(
         is_off=is_off,
         suspects=_suspects(places[is_off, :, 1]),
     )
+
+
+def _displaced(scene: Scene, match: Match) -> Index:
+    """Return markers and marks, (k, 2), that have no other and are nearest to each other.
+
+    Where fewer than three others agree, nothing tells that these belong together.
+    """
+    fits = np.flatnonzero(match.marks < 0)
+    marks = np.setdiff1d(np.arange(len(scene.marks_site)), match.marks)
+    if not len(fits) or not len(marks) or len(match.pairs) < _N_LEFT:
+        return np.empty((0, 2), dtype=np.intp)
+    places = transform(match.T_site_base, scene.centres_base[fits])
+    gaps = np.linalg.norm(places[:, None] - scene.marks_site[marks], axis=2)
+    nearest = gaps.argmin(axis=1)
+    is_mutual = gaps.argmin(axis=0)[nearest] == np.arange(len(fits))
+    rows = np.flatnonzero(is_mutual & (gaps.min(axis=1) < _DISPLACED))
+    return np.stack([fits[rows], marks[nearest[rows]]], axis=1)
 
 
 def _cov_own(scene: Scene) -> Array:

@@ -65,6 +65,16 @@ def test_a_mark_that_is_given_wrongly_is_the_suspect(rng):
     assert (checks.marks[checks.is_off] == 4).any(axis=1).mean() > 0.8
 
 
+def test_a_mark_that_no_marker_stands_on_is_the_suspect_where_one_stands_beside_it(rng):
+    marks = field(rng)
+    control_marks = wrong(marks, 4, [0.3, 0.0, 0.0])  # farther than a match may be
+    checks = check_distances(seen(rng, marks), control_marks, CONFIG, TOLERANCE)
+    assert checks.suspects[:1] == (4,)
+    assert len(checks.given) == 14 * 13 / 2
+    far = check_distances(seen(rng, marks), wrong(marks, 4, [3.0, 0.0, 0.0]), CONFIG, TOLERANCE)
+    assert 4 not in far.marks
+
+
 def test_without_errors_nothing_is_suspect(rng):
     marks = field(rng)
     checks = check_distances(seen(rng, marks, noise=0.0), marks, CONFIG, TOLERANCE)
