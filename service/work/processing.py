@@ -8,20 +8,22 @@ from datetime import UTC, datetime
 from time import perf_counter
 from typing import TYPE_CHECKING
 
-from pipelines.values import NoFix, Origin, ScanLog, Status, StopResult
+from pipelines.errors import SolveError
+from pipelines.values import ControlMarks, NoFix, Origin, ScanLog, StationFix, Status, StopResult
 from service.provenance import code_version, forget_peak_memory, peak_memory
 from service.work.orders import Log, Order, Outcome
 
 if TYPE_CHECKING:
     import pyarrow as pa
 
+    from pipelines.config import SurveyConfig
     from pipelines.survey import Progress
 
 
 def work(order: Order, progress: Progress) -> Outcome:
     """Process the one log of an order."""
     stops, rows = process_log(order, order.logs[0], order.result_id, progress)
-    return Outcome(tables=rows, message=summary(stops))
+    return Outcome(tables=rows, message=summary(stops, order.marks, order.config))
 
 
 def process_log(
@@ -58,9 +60,12 @@ def process_log(
     return stops, tables(run, stops, marks=order.marks, clouds=clouds)
 
 
-def summary(stops: Sequence[StopResult]) -> str:
-    """Say in a sentence or two what a log gave, and what is missing or weak."""
-    return " ".join(_stop_summary(stop) for stop in stops)
+def summary(stops: Sequence[StopResult], marks: ControlMarks | None, config: SurveyConfig) -> str:
+    """Say in a sentence or two what a log gave, and what is missing, weak or contradicted."""
+    said = [_stop_summary(stop) for stop in stops]
+    if marks is not None:
+        said += [text for stop in stops if (text := _contradiction(stop, marks, config))]
+    return " ".join(said)
 
 
 def _stop_summary(stop: StopResult) -> str:
@@ -77,6 +82,26 @@ def _stop_summary(stop: StopResult) -> str:
         f"{1000 * fix.sigma_3d:.1f} mm (3-D)"
     )
     return f"{sigma}; weak: {fix.reason}" if fix.status is Status.WEAK else f"{sigma}."
+
+
+def _contradiction(stop: StopResult, marks: ControlMarks, config: SurveyConfig) -> str:
+    """Say which control marks the distances in a scan contradict, if any."""
+    from pipelines.checking import check_distances
+
+    fitted = [key[0] for key, fix in stop.fixes.items() if isinstance(fix, StationFix)]
+    if not fitted:
+        return ""
+    try:
+        checks = check_distances(stop.fits[fitted[0]], marks, config.resection, config.tolerance)
+    except SolveError:  # another method was needed, and has been told why
+        return ""
+    if not checks.suspects:
+        return ""
+    names = ", ".join(marks.names[mark] for mark in checks.suspects)
+    return (
+        f"{int(checks.is_off.sum())} of {len(checks.is_off)} distances between marks in "
+        f"{stop.name} are not those of the control: look at {names}."
+    )
 
 
 def _read(recording: Log) -> ScanLog:

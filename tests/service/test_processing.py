@@ -1,0 +1,39 @@
+"""What a job says of a log in a sentence."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from pipelines.config import SurveyConfig
+from pipelines.values import ControlMarks
+from service.work.processing import summary
+from tests.surveyed import marks, stop
+
+
+@pytest.fixture(scope="module")
+def control():
+    return marks()
+
+
+@pytest.fixture(scope="module")
+def seen(control):
+    result, _ = stop("quarry-1", np.array([0.5, 0.4, 1.1]), control, np.random.default_rng(3))
+    return result
+
+
+def moved(control, place, shift):
+    p = control.p_site.copy()
+    p[place] += shift
+    return ControlMarks(names=control.names, p_site=p, cov_p_site=control.cov_p_site)
+
+
+@pytest.mark.parametrize("shift", [0.08, 0.4])
+def test_a_control_mark_that_the_distances_contradict_is_named(seen, control, shift):
+    said = summary([seen], moved(control, 2, [shift, 0.0, 0.0]), SurveyConfig())
+    assert f"look at {control.names[2]}." in said
+
+
+def test_control_that_agrees_and_no_control_are_not_spoken_of(seen, control):
+    assert "look at" not in summary([seen], control, SurveyConfig())
+    assert "look at" not in summary([replace(seen, fixes={})], None, SurveyConfig())
