@@ -12,6 +12,7 @@ import numpy as np
 
 from pipelines import study
 from pipelines.errors import InputError
+from pipelines.fitting import METHODS
 from pipelines.placement import (
     CentreModel,
     Share,
@@ -88,6 +89,8 @@ def limits_of_results(ask: Ask | None, method: str, tolerance: float, survey: st
     pairs, by the newest run of each log, of one survey if it is named; without results, or too few
     of them, the study's own limits.
     """
+    if method not in METHODS:
+        raise InputError(f"{method!r} is no fitting method; there are {', '.join(METHODS)}.")
     limits: Plain = {
         "greatest_distance_m": study.GREATEST_DISTANCE,
         "angle_min_deg": float(np.degrees(study.LEAST_ANGLE)),
@@ -97,8 +100,6 @@ def limits_of_results(ask: Ask | None, method: str, tolerance: float, survey: st
     }
     if ask is None:
         return limits
-    if not method.replace("_", "").isalnum():
-        raise InputError(f"{method!r} is no fitting method.")
     named = {"method": method, "survey": quoted(survey)}
     near = _rows(ask(_DISTANCES.format(bin=_BIN_M, **named)))
     if sum(row["n"] for row in near) >= _FITS_LEAST:
