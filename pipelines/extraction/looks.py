@@ -7,11 +7,10 @@ robust fits along the beams with known radius, with free radius, and with missin
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numba
 import numpy as np
-from numpy.typing import NDArray
 
 from pipelines.extraction.ball import Ball, View, passing, seen_from, view_of
 from pipelines.extraction.cells import Cells
@@ -125,11 +124,11 @@ def look_at(cloud: StitchedCloud, cells: Cells, seeds: Array, ball: Ball) -> lis
         What is there; places at which hardly a return lies on a ball are left out.
     """
     patches = patches_about(cloud.p_base, cells, seeds, ball.radius)
-    found = np.concatenate(_shared(_approached, patches, seeds, ball))
+    found = _shared(_approached, patches, seeds, ball)
     found = found[(found[:, 3] >= _N_LOOK) & (found[:, 4] > 0.0)]
     found = found[np.lexsort((found[:, 2], found[:, 1], found[:, 0], -found[:, 3]))]
     places = thinned(found[:, :4].copy(), 0.5 * ball.radius)[:, :3]
-    rows = np.concatenate(_shared(_looked, patches, places, ball))
+    rows = _shared(_looked, patches, places, ball)
     return [
         Look(*row[:3], *(int(count) for count in row[3:7]), *row[7:])
         for row in rows.tolist()
@@ -138,15 +137,19 @@ def look_at(cloud: StitchedCloud, cells: Cells, seeds: Array, ball: Ball) -> lis
 
 
 def _shared(
-    work: Callable[[Patches, Array, Ball], NDArray[Any]],
-    patches: Patches,
-    places: Array,
-    ball: Ball,
-) -> list[NDArray[Any]]:
-    """Do something at all places, shared among threads."""
-    return side_by_side(
-        lambda first, end: work(patches, places[first:end], ball), len(places), worth=_N_WORTH
+    work: Callable[[Patches, Array, Ball], Array], patches: Patches, places: Array, ball: Ball
+) -> Array:
+    """Do something at all places, dealt out to threads: those with most returns come first."""
+    n = len(places)
+    dealt = np.concatenate([np.arange(0, n, 2), np.arange(1, n, 2)])
+    mine = places[dealt]
+    parts = side_by_side(
+        lambda first, end: work(patches, mine[first:end], ball), n, worth=_N_WORTH
     )
+    rows = np.concatenate(parts)
+    found = np.empty_like(rows)
+    found[dealt] = rows
+    return found
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
