@@ -10,6 +10,7 @@ import ctypes
 from contextlib import suppress
 
 _ARENA_MAX, _MMAP_MAX, _TRIM_THRESHOLD = -8, -4, -1  # names of glibc's <malloc.h>
+_N_ARENAS = 4  # so that threads do not wait for each other when they reserve; more would keep more
 _KEPT = 512 << 20  # [bytes] that may stay unused; a scan of three million returns takes half
 
 
@@ -20,6 +21,6 @@ def keep_memory() -> None:
     """
     with suppress(OSError, AttributeError, TypeError):
         libc = ctypes.CDLL(None)
-        libc.mallopt(_ARENA_MAX, 1)
+        libc.mallopt(_ARENA_MAX, _N_ARENAS)
         libc.mallopt(_MMAP_MAX, 0)
         libc.mallopt(_TRIM_THRESHOLD, _KEPT)
