@@ -53,7 +53,7 @@ _SIGMA_UNLEVELLED = np.radians(3.0)  # how a rover may lean on ground it can dri
 _LEAN_STRANGE = np.radians(45.0)  # more is a wrong mounting, not a slope
 _ELEVATION_CLEAN = 0.1  # of the lasers' spacing: rings are inferred only from such elevations
 _WINDOW = 12  # samples of the gimbal angle per rest when looking for rests
-_N_PROBES = 100_000  # shots that are looked at when searching for gaps
+_PROBES_PER_REST = 30  # shots that are looked at in the time of a gap when searching for gaps
 
 
 def choose_rig(log: ScanLog, rig: Rig | None) -> Rig:
@@ -148,11 +148,13 @@ def _rests(log: ScanLog, rest: float) -> list[tuple[int, int]]:
 
 def _lidar_gaps(log: ScanLog, rest: float) -> list[tuple[int, int]]:
     """Return start and end [ns] of each time longer than ``rest`` without a return."""
-    stride = max(1, len(log.stamps_lidar_ns) // _N_PROBES)
-    probes = log.stamps_lidar_ns[::stride]
+    stamps_ns = log.stamps_lidar_ns
+    duration = max(int(stamps_ns[-1]) - int(stamps_ns[0]), 0) * _NS if len(stamps_ns) else 0.0
+    stride = int(len(stamps_ns) * rest / (_PROBES_PER_REST * (duration + rest))) + 1
+    probes = stamps_ns[::stride]
     gaps = []
     for k in np.flatnonzero(np.diff(probes) > rest / _NS):
-        block = np.sort(log.stamps_lidar_ns[k * stride : (k + 1) * stride + 1])
+        block = np.sort(stamps_ns[k * stride : (k + 1) * stride + 1])
         widest = int(np.argmax(np.diff(block)))
         gaps.append((int(block[widest]), int(block[widest + 1])))
     return gaps
