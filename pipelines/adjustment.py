@@ -370,23 +370,53 @@ def snoop(
     Notes
     -----
     Baarda's data snooping, iterated: after each removal all others are tested anew, since one bad
-    block makes its neighbours look bad. Studentised after Pope (1976).
+    block makes its neighbours look bad. For the same reason each that was left out before the last
+    is tried again at the end, and kept if no test fails with it. Studentised after Pope (1976).
     """
     keep = np.ones(n_blocks, dtype=np.bool_)
     dropped: list[tuple[int, float]] = []
     while True:
         adjustment = adjust_kept(keep)
         places: Index = np.flatnonzero(keep)
-        w = np.nan_to_num(adjustment.w_statistics, nan=0.0)
-        if is_studentised:
-            w = w / max(1.0, adjustment.sigma0)
+        w = _w_of(adjustment, is_studentised=is_studentised)
         for worst in np.argsort(-w):
             if w[worst] <= adjustment.critical_w:
-                return adjustment, keep, tuple(dropped)
+                return _readmitted(
+                    adjust_kept, adjustment, keep, dropped, is_studentised=is_studentised
+                )
             if may_drop(keep, int(places[worst])):
                 break
         else:
-            return adjustment, keep, tuple(dropped)
+            return _readmitted(
+                adjust_kept, adjustment, keep, dropped, is_studentised=is_studentised
+            )
         dropped.append((int(places[worst]), float(w[worst])))
         keep = keep.copy()
         keep[places[worst]] = False
+
+
+def _w_of(adjustment: Adjustment[State], *, is_studentised: bool) -> Array:
+    """Return the w-statistics of the blocks, 0 where there is none."""
+    w = np.nan_to_num(adjustment.w_statistics, nan=0.0)
+    return w / max(1.0, adjustment.sigma0) if is_studentised else w
+
+
+def _readmitted(
+    adjust_kept: Callable[[Mask], Adjustment[State]],
+    adjustment: Adjustment[State],
+    keep: Mask,
+    dropped: list[tuple[int, float]],
+    *,
+    is_studentised: bool,
+) -> tuple[Adjustment[State], Mask, tuple[tuple[int, float], ...]]:
+    """Take back the blocks that only bad ones dropped after them had made look bad."""
+    left = list(dropped)
+    for one in dropped[:-1]:  # the last was judged with all the others out
+        again = keep.copy()
+        again[one[0]] = True
+        tried = adjust_kept(again)
+        worst = float(_w_of(tried, is_studentised=is_studentised).max())
+        if worst <= tried.critical_w:
+            adjustment, keep = tried, again
+            left.remove(one)
+    return adjustment, keep, tuple(left)

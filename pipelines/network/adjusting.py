@@ -1,25 +1,14 @@
-"""Network -> AdjustedNetwork: hides the tests and what is left out because of them."""
+"""Network -> AdjustedNetwork: hides reliability, predictions, and what is said of the result."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
-from scipy.special import chdtrc, chdtri, ndtri
+from scipy.special import chdtri, ndtri
 
 from pipelines.config import ResectionConfig
-from pipelines.errors import TooFewObservationsError
 from pipelines.geometry import skew
-from pipelines.network.equations import (
-    N_DEFECT,
-    Cofactors,
-    Linearised,
-    State,
-    linearise,
-    middle_of,
-    solve_network,
-    start,
-)
+from pipelines.network.equations import middle_of
+from pipelines.network.snooping import UNTESTABLE, Dropped, Tested, snoop
 from pipelines.network.values import (
     AdjustedNetwork,
     BlockTests,
@@ -28,30 +17,11 @@ from pipelines.network.values import (
     Parts,
     position_by_motion,
 )
-from pipelines.values import Array, Mask
+from pipelines.values import Array
 
 _FALSE_ALARM = 0.05  # probability that a network without gross errors loses an observation
-_UNTESTABLE = 1e-7  # redundancy below which a bias cannot show
 _UNTOLD = 1e-9  # the same below which nothing else tells where a control mark is
-_MANY_LEFT_OUT = 1.0 / 3.0  # of the centres: not they are bad, but the sigmas too small
-_UPRIGHT = 0.05  # spread across over spread along of marks on a plumb line: no heading
-
-
-@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
-class _Tested:
-    """A solution with the statistics of all its blocks; columns run over centres, gravity, control.
-
-    ``tested`` holds ``P Q_v P`` of centres, gravity and control.
-    """
-
-    state: State
-    lin: Linearised
-    cofactors: Cofactors
-    used: Mask
-    tested: tuple[Array, Array, Array]
-    redundancies: Array
-    w: Array
-    weakest: Array
+_MANY_LEFT_OUT = 1.0 / 3.0  # of the centres: not they are bad, but the sigmas; or of control
 
 
 def adjust_network(network: Network, config: ResectionConfig) -> AdjustedNetwork:
@@ -94,187 +64,15 @@ def adjust_network(network: Network, config: ResectionConfig) -> AdjustedNetwork
     """
     level = min(config.test_level, _FALSE_ALARM / (3 * network.n_blocks))
     critical = float(ndtri(1.0 - level / 2.0))
-    tested, dropped = _snoop(network, critical, is_studentised=False)
+    tested, dropped = snoop(network, critical, is_studentised=False)
     n = len(network.sightings)
     if sum(block < n for block, _ in dropped) > _MANY_LEFT_OUT * n:
-        tested, dropped = _snoop(network, critical, is_studentised=True)
+        tested, dropped = snoop(network, critical, is_studentised=True)
     noncentrality = critical + float(ndtri(config.test_power))
     return _adjusted(network, tested, dropped, (critical, noncentrality), config)
 
 
-def _snoop(
-    network: Network, critical: float, *, is_studentised: bool
-) -> tuple[_Tested, list[tuple[int, float]]]:
-    """Leave out the worst block, one at a time, while its w-test fails."""
-    used = np.ones(network.n_blocks, dtype=np.bool_)
-    state = start(network)
-    dropped: list[tuple[int, float]] = []
-    while True:
-        tested = _test(network, state, used)
-        w = np.nan_to_num(tested.w, nan=0.0)
-        if is_studentised:
-            w = w / max(1.0, _sigma0(network, tested))
-        worst = _worst(network, w, used, critical)
-        if worst is None:
-            return tested, dropped
-        dropped.append((worst, float(w[worst])))
-        state, used = tested.state, used.copy()
-        used[worst] = False
-
-
-def _worst(network: Network, w: Array, used: Mask, critical: float) -> int | None:
-    """Return the block with the largest w above the limit that can be spared."""
-    for block in np.argsort(-w):
-        if w[block] <= critical:
-            return None
-        if _may_drop(network, used, int(block)):
-            return int(block)
-    return None
-
-
-def _may_drop(network: Network, used: Mask, block: int) -> bool:
-    """Return whether a block can be spared without leaving an unknown open."""
-    n, s = len(network.sightings), len(network.stations)
-    if block >= n + s:
-        return int(used[n + s :].sum()) > 2
-    rest = used[:n].copy()
-    station = block - n
-    if block < n:
-        rest[block] = False
-        station, mark = network.sightings[block]
-        if not np.any(network.sightings[rest, 1] == mark):
-            return False
-    own = network.p_base[rest & (network.sightings[:, 0] == station)]
-    own = own @ network.R_station_base[station].T
-    if block < n:
-        return bool(len(own) >= 2 and _has_heading(own))
-    return bool(len(own) >= 3 and used[n : n + s].sum() > 1)
-
-
-def _has_heading(p: Array) -> bool:
-    """Return whether points are far enough from one plumb line to tell a heading."""
-    off = p - p.mean(axis=0)
-    return bool(np.linalg.norm(off[:, :2]) > _UPRIGHT * np.linalg.norm(off))
-
-
-def _degrees_of_freedom(network: Network, used: Mask) -> int:
-    """Return observations minus unknowns plus the defect of the datum."""
-    n, s = len(network.sightings), len(network.stations)
-    observed = (
-        3 * int(used[:n].sum()) + 2 * int(used[n : n + s].sum()) + 3 * int(used[n + s :].sum())
-    )
-    unknown = 6 * s + 3 * len(network.marks) - (N_DEFECT if network.is_free else 0)
-    if observed < unknown:
-        raise TooFewObservationsError(
-            f"{observed} observations cannot determine the {unknown} unknowns of {s} stations and "
-            f"{len(network.marks)} marks."
-        )
-    return observed - unknown
-
-
-def _squares(lin: Linearised) -> tuple[float, float, float]:
-    """Return the weighted sums of squares of centres, gravity and control."""
-    pairs = (
-        (lin.v_centres, lin.P_centres),
-        (lin.v_gravity, lin.P_gravity),
-        (lin.v_control, lin.P_control),
-    )
-    first, second, third = (float(np.einsum("ni,nij,nj->", v, P, v)) for v, P in pairs)
-    return first, second, third
-
-
-def _vtpv(network: Network, tested: _Tested) -> float:
-    """Return the weighted sum of squares, with what all share against what was known of it."""
-    shared = tested.state.shared
-    return sum(_squares(tested.lin)) + float(shared @ network.shared.weights @ shared)
-
-
-def _sigma0(network: Network, tested: _Tested) -> float:
-    """Return the square root of the variance factor; NaN without redundancy."""
-    dof = _degrees_of_freedom(network, tested.used)
-    return float(np.sqrt(_vtpv(network, tested) / dof)) if dof else np.nan
-
-
-def _passes(network: Network, tested: _Tested, level: float) -> bool:
-    """Return whether the residuals are no larger than their sigmas promise."""
-    dof = _degrees_of_freedom(network, tested.used)
-    return dof == 0 or bool(chdtrc(dof, _vtpv(network, tested)) >= level)
-
-
-def _test(network: Network, approximate: State, used: Mask) -> _Tested:
-    """Solve with some blocks and test all of them."""
-    _degrees_of_freedom(network, used)
-    state, cofactors = solve_network(network, approximate, used)
-    lin = linearise(network, state, used)
-    station = network.sightings[:, 0]
-    own = _own_marks(cofactors)
-    own_common, between = _common(cofactors, network)
-    J_turned = np.swapaxes(lin.J_common, 1, 2)
-    cross = lin.J_centres @ between @ J_turned
-    turned = lin.J_centres @ cofactors.stations[station] @ np.swapaxes(lin.J_centres, 1, 2)
-    q_centres = turned + cross + np.swapaxes(cross, 1, 2) + lin.J_common @ own_common @ J_turned
-    q_gravity = lin.J_gravity @ cofactors.stations @ np.swapaxes(lin.J_gravity, 1, 2)
-    blocks = (
-        (lin.v_centres, lin.P_centres, q_centres),
-        (lin.v_gravity, lin.P_gravity, q_gravity),
-        (lin.v_control, lin.P_control, own[network.controls]),
-    )
-    tested = tuple(P - P @ Q @ P for _, P, Q in blocks)
-    columns = [_statistics(*block, kept) for block, kept in zip(blocks, tested, strict=True)]
-    redundancies, w, weakest = (np.concatenate(c) for c in zip(*columns, strict=True))
-    return _Tested(
-        state=state,
-        lin=lin,
-        cofactors=cofactors,
-        used=used,
-        tested=(tested[0], tested[1], tested[2]),
-        redundancies=np.where(used, redundancies, np.nan),
-        w=w,
-        weakest=weakest,
-    )
-
-
-def _own_marks(cofactors: Cofactors) -> Array:
-    """Return the covariance of each mark, (m, 3, 3)."""
-    m = len(cofactors.marks) // 3
-    return np.asarray(np.einsum("iaib->iab", cofactors.marks.reshape(m, 3, m, 3)))
-
-
-def _common(cofactors: Cofactors, network: Network) -> tuple[Array, Array]:
-    """Return, per centre, the covariance of its mark and what all share, and to its station.
-
-    Shapes are (n, 3 + k, 3 + k) and (n, 6, 3 + k).
-    """
-    station, mark = network.sightings.T
-    mixed = cofactors.shared_and_marks[mark]
-    shared = np.broadcast_to(cofactors.shared, (len(mark), *cofactors.shared.shape))
-    upper = np.concatenate([_own_marks(cofactors)[mark], mixed], axis=2)
-    lower = np.concatenate([np.swapaxes(mixed, 1, 2), shared], axis=2)
-    between = [cofactors.between[station, :, mark], cofactors.with_shared[station]]
-    return np.concatenate([upper, lower], axis=1), np.concatenate(between, axis=2)
-
-
-def _statistics(
-    residuals: Array, weights: Array, cofactors: Array, tested: Array
-) -> tuple[Array, Array, Array]:
-    """Return redundancy, largest w (NaN) and weakest testability (0 if untestable) of blocks."""
-    if not len(residuals):
-        return np.zeros(0), np.zeros(0), np.zeros(0)
-    redundancies = residuals.shape[1] - np.einsum("bij,bji->b", weights, cofactors)
-    squares = np.einsum("bii->bi", tested)
-    testable = squares > _UNTESTABLE * np.einsum("bii->bi", weights)
-    pressed = np.abs(np.einsum("bij,bj->bi", weights, residuals))
-    w = np.where(testable, pressed / np.sqrt(np.where(testable, squares, 1.0)), -1.0).max(axis=1)
-    weakest = np.asarray(np.linalg.eigvalsh(tested)[:, 0], dtype=np.float64)
-    is_open = weakest <= _UNTESTABLE * np.linalg.eigvalsh(weights)[:, 0]
-    return (
-        np.asarray(redundancies),
-        np.where(w < 0, np.nan, w),
-        np.where(is_open, 0.0, weakest),
-    )
-
-
-def _shifts(network: Network, tested: _Tested, noncentrality: float) -> tuple[Array, Array]:
+def _shifts(network: Network, tested: Tested, noncentrality: float) -> tuple[Array, Array]:
     """Return how far a just undetectable bias of each centre moves its station and its mark.
 
     A bias ``b`` moves the unknowns by ``Q_x J' P b`` and is just detectable when
@@ -282,7 +80,7 @@ def _shifts(network: Network, tested: _Tested, noncentrality: float) -> tuple[Ar
     """
     lin, cofactors = tested.lin, tested.cofactors
     station = network.sightings[:, 0]
-    own, between = _common(cofactors, network)
+    own, between = tested.common
     J_turned, J_common = np.swapaxes(lin.J_centres, 1, 2), np.swapaxes(lin.J_common, 1, 2)
     J_place = position_by_motion(tested.state.T_site_base)[station]
     by_station = cofactors.stations[station] @ J_turned + between @ J_common
@@ -302,8 +100,8 @@ def _shifts(network: Network, tested: _Tested, noncentrality: float) -> tuple[Ar
 
 def _adjusted(
     network: Network,
-    tested: _Tested,
-    dropped: list[tuple[int, float]],
+    tested: Tested,
+    dropped: Dropped,
     limits: tuple[float, float],
     config: ResectionConfig,
 ) -> AdjustedNetwork:
@@ -315,7 +113,7 @@ def _adjusted(
     T = np.array(tested.state.T_site_base)
     T[:, :3, 3] += middle
     T[:, :3, :3] = T[:, :3, :3] @ np.swapaxes(network.R_station_base, 1, 2)
-    dof = _degrees_of_freedom(network, tested.used)
+    dof = tested.dof
     station_shifts, mark_shifts = _shifts(network, tested, noncentrality)
     left_out = _left_out(network, tested, dropped, critical)
     predictions, cov_predictions = _predicted_control(network, tested)
@@ -343,9 +141,9 @@ def _adjusted(
         cov_control_predictions=cov_predictions,
         mark_weaknesses=_mark_weaknesses(network, tested),
         dof=dof,
-        vtpv=_vtpv(network, tested),
-        sigma0=_sigma0(network, tested),
-        passes_global_test=_passes(network, tested, config.test_level),
+        vtpv=tested.vtpv,
+        sigma0=tested.sigma0,
+        passes_global_test=tested.passes(config.test_level),
         limit_vtpv=float(chdtri(dof, config.test_level)) if dof else 0.0,
         variance_factors=_variance_factors(network, tested),
         critical_w=critical,
@@ -355,14 +153,14 @@ def _adjusted(
     )
 
 
-def _predicted_control(network: Network, tested: _Tested) -> tuple[Array, Array]:
+def _predicted_control(network: Network, tested: Tested) -> tuple[Array, Array]:
     """Return where all else would put each control mark, minus where it is given, with covariance.
 
     With ``v`` and ``P`` of a block, ``(P Q_v P)^-1 P v`` is what the others predict for it, and the
     inverse its covariance (Baarda 1968): no adjustment has to be done again.
     """
     first = len(network.sightings) + len(network.stations)
-    own = _own_marks(tested.cofactors)[network.controls]
+    own = tested.own_marks[network.controls]
     shifts, covs = -tested.lin.v_control, own + network.cov_control_site
     weights, solid = tested.lin.P_control, tested.tested[2]
     for row in np.flatnonzero(tested.used[first:]):
@@ -375,7 +173,7 @@ def _predicted_control(network: Network, tested: _Tested) -> tuple[Array, Array]
     return shifts, covs
 
 
-def _mark_weaknesses(network: Network, tested: _Tested) -> tuple[str, ...]:
+def _mark_weaknesses(network: Network, tested: Tested) -> tuple[str, ...]:
     """Say of each mark why it should be used with care."""
     n = len(network.sightings)
     counts = np.bincount(network.sightings[tested.used[:n], 1], minlength=len(network.marks))
@@ -397,7 +195,7 @@ def _cov_heading(network: Network, T: Array) -> Array:
     )
 
 
-def _columns(network: Network, tested: _Tested, noncentrality: float) -> dict[str, BlockTests]:
+def _columns(network: Network, tested: Tested, noncentrality: float) -> dict[str, BlockTests]:
     """Return the statistics of each kind of block."""
     n, s = len(network.sightings), len(network.stations)
     lin, parts = tested.lin, np.split(np.arange(network.n_blocks), [n, n + s])
@@ -415,17 +213,17 @@ def _columns(network: Network, tested: _Tested, noncentrality: float) -> dict[st
     }
 
 
-def _variance_factors(network: Network, tested: _Tested) -> Array:
+def _variance_factors(network: Network, tested: Tested) -> Array:
     """Return the sum of squares over redundancy of each kind of block; NaN without redundancy."""
     n, s = len(network.sightings), len(network.stations)
     parts = np.split(np.nan_to_num(tested.redundancies), [n, n + s])
     totals = [float(part.sum()) for part in parts]
-    pairs = zip(_squares(tested.lin), totals, strict=True)
-    return np.array([square / r if r > _UNTESTABLE else np.nan for square, r in pairs])
+    pairs = zip(tested.squares, totals, strict=True)
+    return np.array([square / r if r > UNTESTABLE else np.nan for square, r in pairs])
 
 
 def _left_out(
-    network: Network, tested: _Tested, dropped: list[tuple[int, float]], critical: float
+    network: Network, tested: Tested, dropped: Dropped, critical: float
 ) -> tuple[LeftOut, ...]:
     """Say which blocks the tests left out, and why."""
     n, s = len(network.sightings), len(network.stations)
@@ -462,7 +260,7 @@ def _left_out(
 
 def _warnings(
     network: Network,
-    tested: _Tested,
+    tested: Tested,
     critical: float,
     left_out: tuple[LeftOut, ...],
     level: float,
@@ -470,9 +268,9 @@ def _warnings(
     """Say why the network cannot be relied on."""
     n, s = len(network.sightings), len(network.stations)
     warnings = []
-    if not _passes(network, tested, level):
+    if not tested.passes(level):
         warnings.append(
-            f"The global test fails (sigma0 = {_sigma0(network, tested):.2f}): residuals are "
+            f"The global test fails (sigma0 = {tested.sigma0:.2f}): residuals are "
             "larger than their sigmas promise."
         )
     control_w = np.nan_to_num(tested.w[n + s :])
@@ -485,6 +283,13 @@ def _warnings(
         warnings.append(
             f"The control marks {', '.join(bad)} contradict each other or the scans, and too few "
             "others stand to tell which is wrong."
+        )
+    against = [one.mark for one in left_out if one.kind == "control"]
+    if len(against) > _MANY_LEFT_OUT * len(network.controls):
+        warnings.append(
+            f"{len(against)} of {len(network.controls)} control marks contradict the others and "
+            f"were left out ({', '.join(against)}): the scans cannot tell which of the two groups "
+            "is right."
         )
     n_bad = sum(one.kind == "centre" for one in left_out)
     if n_bad and n_bad > _MANY_LEFT_OUT * n:

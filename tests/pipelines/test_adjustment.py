@@ -210,6 +210,24 @@ def test_snooping_finds_the_bad_ones_and_keeps_the_good(rng):
     assert result.passes_global_test
 
 
+def test_a_good_reading_that_bad_ones_made_look_bad_is_taken_back():
+    n, bad = 8, [0, 1, 3]
+    design = np.stack([np.ones(n), np.linspace(0.0, 1.0, n)], axis=1)[:, None]
+    readings, cov = design @ np.array([1.0, 2.0]), np.full((n, 1, 1), 1e-4)
+    readings[bad, 0] += [-0.8, 0.5, 0.5]
+    tried = []
+
+    def kept(keep):
+        tried.append(set(np.flatnonzero(~keep)))
+        return adjust(linear(design[keep], readings[keep], cov[keep]), add, np.zeros(2), **LEVELS)
+
+    result, keep, dropped = snoop(kept, n, lambda _keep, _block: True)
+    assert {0, 1, 2, 3} in tried  # the third, good one was out in between
+    assert sorted(block for block, _ in dropped) == bad
+    np.testing.assert_array_equal(np.flatnonzero(~keep), bad)
+    np.testing.assert_allclose(result.estimate, [1.0, 2.0], atol=1e-9)
+
+
 def test_snooping_keeps_what_may_not_be_dropped(rng):
     design, readings, cov = line(rng, n=6)
     readings[2] += 100

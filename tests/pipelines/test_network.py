@@ -335,6 +335,20 @@ def test_two_control_marks_that_contradict_each_other_are_both_named(rng):
     assert any("The control marks A (w =" in one and "B (w =" in one for one in result.warnings)
 
 
+def test_control_of_which_half_is_elsewhere_is_two_groups_of_which_one_is_left_out(rng):
+    marks = field(rng)
+    scans, _ = survey(rng, marks, 6)
+    p = marks.p_site.copy()
+    p[1::2] += [0.08, 0.0, 0.0]
+    result = network(scans, control(p))
+    out = {one.mark for one in result.left_out}
+    halves = set(marks.names[::2]), set(marks.names[1::2])
+    assert out in halves  # and none of the other half, which the first half made look bad
+    assert result.passes_global_test
+    (warning,) = result.warnings
+    assert f"{len(out)} of {len(marks.names)} control marks contradict the others" in warning
+
+
 def test_two_control_marks_among_many_markers_hold_a_network(rng):
     marks = field(rng)
     p = marks.p_site
