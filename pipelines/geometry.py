@@ -11,6 +11,7 @@ from scipy.spatial.transform import Rotation
 from pipelines.values import Array, Levelling
 
 _SMALL = 1e-9  # [rad]; below it the series of the exponential is exact in float64
+_LINE = 0.05  # spread across over spread along of points on a line; 3 deg seen from the end
 
 
 def skew(v: ArrayLike) -> Array:
@@ -271,6 +272,27 @@ def included_angle(v: ArrayLike, w: ArrayLike) -> Array:
     v, w = np.asarray(v, dtype=np.float64), np.asarray(w, dtype=np.float64)
     across = np.linalg.norm(cross(v, w), axis=-1)
     return np.asarray(np.arctan2(across, np.sum(v * w, axis=-1)))
+
+
+def is_on_a_line(p: ArrayLike) -> bool:
+    """Return whether points lie about on one line, or are fewer than three.
+
+    Parameters
+    ----------
+    p : (n, 3)
+        Points [m].
+
+    Returns
+    -------
+    bool
+        True where they spread across their line by less than a twentieth of their spread along it,
+        which is 3 degrees seen from the end.
+    """
+    points = np.asarray(p, dtype=np.float64)
+    if len(points) < 3:
+        return True
+    spreads = np.linalg.svd(points - points.mean(axis=0), compute_uv=False)
+    return bool(spreads[1] < _LINE * spreads[0])
 
 
 def wrap(angle: ArrayLike) -> Array:

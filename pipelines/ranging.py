@@ -21,8 +21,8 @@ from pipelines.adjustment import (
     snoop,
 )
 from pipelines.config import ResectionConfig
-from pipelines.errors import DegenerateGeometryError
-from pipelines.geometry import included_angle, rigid, rot_z, skew
+from pipelines.errors import DegenerateGeometryError, NotConvergedError
+from pipelines.geometry import included_angle, is_on_a_line, rigid, rot_z, skew
 from pipelines.matching import Match, Scene
 from pipelines.values import Array, Exclusion, Index, Mask, StationFix, Status
 
@@ -30,6 +30,8 @@ Measure = Callable[[Array], tuple[Array, Array]]
 """Gives what is measured of vectors, (..., 3), and its derivative by them."""
 
 _LOOSE = 0.1  # [m] a position that is worse than this is weak
+_FAINT = 0.05  # change of distances, RMS, by a unit of way that they cannot tell
+_STEEP = 0.9  # of a way that is nearly the vertical
 
 
 def slope_ranges(v: Array) -> tuple[Array, Array]:
@@ -120,9 +122,12 @@ def fix_by_ranges(
             test_power=config.test_power,
         )
 
-    adjustment, keep, dropped = snoop(
-        adjusted, len(pairs), lambda rest, _block: name == "ranges" and int(rest.sum()) > 4
-    )
+    try:
+        adjustment, keep, dropped = snoop(
+            adjusted, len(pairs), lambda rest, _block: name == "ranges" and int(rest.sum()) > 4
+        )
+    except NotConvergedError as error:
+        raise _unsettled(measure, scene, pairs, match.T_site_base[:3, 3]) or error from error
     out = [
         Exclusion(
             fit=int(pairs[block, 0]),
@@ -138,6 +143,22 @@ def fix_by_ranges(
     ]
     every = tuple(sorted((*excluded, *out, *unused), key=lambda one: one.fit))
     return _fix(name, measure, scene, pairs[keep], adjustment, every)
+
+
+def _unsettled(
+    measure: Measure, scene: Scene, pairs: Index, p: Array
+) -> DegenerateGeometryError | None:
+    """Say which way distances leave a position open; none if they should tell all of it."""
+    J = measure(scene.marks_site[pairs[:, 1]] - p)[1].reshape(-1, 3)
+    _, strengths, ways = np.linalg.svd(J)
+    if strengths[-1] > _FAINT * np.sqrt(len(pairs)):
+        return None
+    way = "the height" if abs(ways[-1, 2]) > _STEEP else "the position across their plane"
+    return DegenerateGeometryError(
+        f"The distances to {len(pairs)} marks leave {way} open: the marks stand about in one plane "
+        "with the station, and on either side of it the distances are the same. Use the method "
+        "free_station, or add a mark well above or below the others."
+    )
 
 
 def observe_distances(measure: Measure, scene: Scene, pairs: Index, p: Array) -> Observations:
@@ -293,6 +314,11 @@ def _weaknesses(pairs: Index, adjustment: Adjustment[Array], cov: Array, scene: 
     reasons = []
     if adjustment.dof == 0:
         reasons.append(f"{len(pairs)} distances: an error in one of them would not show")
+    if is_on_a_line(scene.marks_site[pairs[:, 1]]):
+        reasons.append(
+            "the marks lie on one line: on the other side of it the distances are the same, and "
+            "only the directions of the markers tell the side"
+        )
     if not adjustment.passes_global_test:
         reasons.append(
             f"the global test fails (sigma0 = {adjustment.sigma0:.2f}): residuals are larger than "

@@ -14,7 +14,7 @@ import numpy as np
 from pipelines.adjustment import Adjustment, adjust, external_reliabilities, snoop
 from pipelines.config import ResectionConfig
 from pipelines.errors import ConfigError, DegenerateGeometryError, NoMarkersError
-from pipelines.geometry import included_angle, inverse, rigid, skew, transform
+from pipelines.geometry import included_angle, inverse, is_on_a_line, rigid, skew, transform
 from pipelines.matching import Match, Scene, gather, match_marks, moved, observe
 from pipelines.ranging import fix_by_ranges
 from pipelines.values import (
@@ -28,8 +28,7 @@ from pipelines.values import (
     Status,
 )
 
-_LINE = 0.05  # spread across over spread along; 3 deg seen from the end
-_UPRIGHT = 0.05  # the same for a pair of marks on a plumb line, which tells no heading
+_UPRIGHT = 0.05  # spread across over spread along of marks on a plumb line: no heading
 _MANY_LEFT_OUT = 1.0 / 3.0  # of the matched markers: not they are bad, but the sigmas too small
 
 
@@ -121,7 +120,7 @@ def free_station(fits: MarkerFits, marks: ControlMarks, config: ResectionConfig)
         rest = keep.copy()
         rest[block] = False
         if not rest[-1]:
-            return not _on_a_line(scene.marks_site[pairs[rest[:-1], 1]])
+            return not is_on_a_line(scene.marks_site[pairs[rest[:-1], 1]])
         return int(rest[:-1].sum()) >= 2 and _has_heading(scene, pairs[rest[:-1]])
 
     adjustment, keep, dropped = snoop(adjusted, len(pairs) + 1, may_drop)
@@ -146,14 +145,6 @@ def _refuse_too_few(fits: MarkerFits, marks: ControlMarks) -> None:
                 f"{'One' if n else 'No'} {kind} gives no position: the heading stays open. At "
                 "least two are needed, better three or more."
             )
-
-
-def _on_a_line(p: Array) -> bool:
-    """Return whether points lie about on one line, or are fewer than three."""
-    if len(p) < 3:
-        return True
-    spreads = np.linalg.svd(p - p.mean(axis=0), compute_uv=False)
-    return bool(spreads[1] < _LINE * spreads[0])
 
 
 def _has_heading(scene: Scene, pairs: Index) -> bool:
@@ -216,7 +207,7 @@ def _weaknesses(
         reasons.append(
             "only two marks: solved with gravity, and an error in one of them would not show"
         )
-    elif _on_a_line(scene.marks_site[used[:, 1]]):
+    elif is_on_a_line(scene.marks_site[used[:, 1]]):
         reasons.append("the marks lie on one line: the turn about it rests on gravity alone")
     if not adjustment.passes_global_test:
         reasons.append(

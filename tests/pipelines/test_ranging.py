@@ -131,6 +131,27 @@ def test_distances_to_marks_in_one_plane_with_the_station_leave_its_height_weak(
     assert fix.status == "weak" or fix.cov_p_site[2, 2] > 25 * fix.cov_p_site[0, 0]
 
 
+def test_distances_that_tell_no_height_at_all_are_refused_with_the_reason():
+    p = np.array([[6.0, 4.0, 0.9], [-6.0, 5.0, 0.9], [-3.0, -6.0, 0.9], [6.5, -3.0, 0.9]])
+    marks = control(p)
+    T = pose([0.0, 0.0, 1.0], 0.3)
+    seen = (p - T[:3, 3]) @ T[:3, :3]
+    shorter = -6e-3 * seen / np.linalg.norm(seen, axis=1, keepdims=True)  # than from any height
+    fits = sightings(marks, T, noise=shorter)
+    with pytest.raises(DegenerateGeometryError, match=r"leave the height open.*free_station"):
+        resect("ranges", fits, marks, CONFIG)
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_marks_on_a_line_are_weak_because_of_the_position_on_the_other_side(method):
+    marks = control([[-6.0, 6.0, 0.9], [-3.5, 6.0, 0.9], [1.2, 6.0, 0.9], [6.5, 6.05, 0.9]])
+    T = pose([0.0, 0.0, 2.0], 0.3)
+    fix = resect(method, sightings(marks, T), marks, CONFIG)
+    assert fix.status == "weak"
+    assert "on the other side of it the distances are the same" in fix.reason
+    assert fix.p_site[1] == pytest.approx(0.0, abs=0.05)
+
+
 @pytest.mark.parametrize("method", METHODS)
 def test_two_marks_are_refused(method):
     marks = control([[6.9, 1.1, 0.6], [-3.9, 7.1, 1.5]])
