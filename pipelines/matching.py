@@ -298,7 +298,8 @@ def match_marks(scene: Scene, config: ResectionConfig, spans: Spans | None = Non
         raise NoMatchError(
             f"No two of the {len(levelled)} markers have the distance and the difference of height "
             f"of any two of the {len(scene.marks_site)} control marks (within "
-            f"{config.match_tolerance} m): these are marks of another field, or false markers."
+            f"{config.match_tolerance} m): these are marks of another field, in other units or axes, "
+            "or false markers."
         )
     best = solutions[0]
     _refuse_chance(best, scene, config)
@@ -657,7 +658,7 @@ def _refuse_chance(match: Match, scene: Scene, config: ResectionConfig) -> None:
         raise NoMatchError(
             f"Only {k} of {n} markers fit the {m} control marks within {config.match_tolerance} m, "
             f"and at least {int(np.ceil(_SHARE * min(n, m)))} must: these are marks of another "
-            "field, or too many markers are false."
+            "field or in other axes, or too many markers are false."
         )
     near = max(match.largest_residual, 3.0 * float(np.sqrt(scene.cov_centres.trace(0, 1, 2).min())))
     reach = float(np.linalg.norm(scene.centres_base, axis=1).max())

@@ -130,7 +130,9 @@ def assemble(
     """
     names = [name for name, _ in scans]
     if twice := sorted(name for name, n in Counter(names).items() if n > 1):
-        raise InputError(f"Two logs are called {twice[0]!r}; stations are told apart by name.")
+        raise InputError(
+            f"Two logs are called {twice[0]!r}; stations are told apart by name. Rename one of them."
+        )
     if calibration is not None:
         scans = [(name, calibration.adjusted(name, fits)) for name, fits in scans]
     found, reasons = _grow(scans, control, config)
@@ -287,10 +289,10 @@ def _refuse_nothing(
     first = f" {refused[0].station}: {refused[0].reason}" if refused else ""
     if not used or (control is None and len(used) < 2):
         ties = (
-            "no two stations share two marks"
+            "no two stations share two marks; give more scans, or control marks"
             if control is None
-            else "no station sees two control marks; three tell more, and without --control the "
-            "network is free"
+            else "no station could be tied to two of the control marks. Control of another field, "
+            "in other units or in other axes looks like this; without control the network is free"
         )
         raise DegenerateGeometryError(f"There is no network: {ties}.{first}")
     if control is not None:
