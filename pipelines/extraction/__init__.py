@@ -7,6 +7,7 @@
 - ``ground`` tells the ground, ``seeds`` picks the places that are worth a look,
 - ``patches`` gathers the returns about a place, ``looks`` measures what they look like,
 - ``sights`` counts where the beams towards and about a group end,
+- ``rivals`` compares the ball with other shapes that may have stopped them,
 - ``verdicts`` says why a group is no marker.
 
 Works in the base frame with the levelled vertical. The sensor is taken as one point (the origin of
@@ -22,15 +23,19 @@ from pipelines.config import ExtractionConfig
 from pipelines.extraction.ball import Ball, seen_from, view_of
 from pipelines.extraction.cells import Cells, cells_of
 from pipelines.extraction.ground import ground_of
-from pipelines.extraction.looks import Look, look_at
+from pipelines.extraction.looks import NOISE_MIN, Look, look_at
+from pipelines.extraction.rivals import rivals
 from pipelines.extraction.seeds import find_seeds
-from pipelines.extraction.sights import sights
+from pipelines.extraction.sights import Sight, sights
 from pipelines.extraction.verdicts import (
     distinct,
     is_resolved,
+    noise_among,
     score,
+    spread_expected,
     verdict,
     verdict_among_others,
+    verdict_on_rivals,
     verdict_on_sight,
 )
 from pipelines.geometry import levelling_rotation
@@ -113,13 +118,28 @@ def _sighted(
     good = [
         (look, sight) for look, sight, reason in zip(left, seen, reasons, strict=True) if not reason
     ]
+    noise = noise_among([look for look, _ in good])
     later = iter(
-        (reason or verdict_among_others(look, sight, good), sight.rows)
+        (
+            reason
+            or _rivalled(look, sight, ball, noise)
+            or verdict_among_others(look, sight, good, ball),
+            sight.rows,
+        )
         for look, sight, reason in zip(left, seen, reasons, strict=True)
     )
     nothing = np.zeros(0, np.int32)
     both = [(reason, nothing) if reason else next(later) for reason in verdicts]
     return [reason for reason, _ in both], [rows for _, rows in both]
+
+
+def _rivalled(look: Look, sight: Sight, ball: Ball, noise: float) -> str:
+    """Return why something else explains a group better; its own noise if there are no others."""
+    spread = sight.spread / spread_expected(look, ball)
+    own = max(look.scatter, NOISE_MIN)
+    return verdict_on_rivals(
+        rivals(look, sight.seen, spread, ball, own if np.isnan(noise) else noise)
+    )
 
 
 def _candidates(

@@ -55,6 +55,8 @@ class Sight(NamedTuple):
         Mean reflectivity of the first ones, 0-255.
     rows : (m,) int32
         Returns of the cloud whose beams pass within four radii, ascending.
+    seen : (3, m)
+        How these beams pass the centre, as ``passing`` says, in any order [m].
     """
 
     n_on: int
@@ -66,6 +68,7 @@ class Sight(NamedTuple):
     n_short: int
     brightness: float
     rows: NDArray[np.int32]
+    seen: Array
 
     @property
     def is_open_below(self) -> bool:
@@ -134,7 +137,7 @@ def sights(
 @numba.njit(cache=True, nogil=True, error_model="numpy")
 def _counted(
     points: Column, intensities: Column, near: NDArray[np.int32], c: Array, ball: Ball
-) -> tuple[int, int, int, float, int, int, int, float, NDArray[np.int32]]:
+) -> tuple[int, int, int, float, int, int, int, float, NDArray[np.int32], Array]:
     """Return the fields of a sight, from the returns near its direction."""
     radius, distance = ball.radius, np.sqrt(np.sum(c**2))
     blur = 0.5 * ball.divergence * distance / radius
@@ -158,7 +161,7 @@ def _counted(
             n_short += depth < _HELD[0]
             n_held += _HELD[0] <= depth <= _HELD[1]
     n = max(n_on, 1)
-    return n_on, n_through, n_before, gaps2 / n, n_held, n_past, n_short, light / n, rows
+    return n_on, n_through, n_before, gaps2 / n, n_held, n_past, n_short, light / n, rows, seen
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")

@@ -9,6 +9,7 @@ import numpy as np
 from pipelines.config import ExtractionConfig
 from pipelines.extraction.ball import Ball
 from pipelines.extraction.looks import N_RESOLVED, NOISE_MIN, RESOLUTION, Look
+from pipelines.extraction.rivals import Rivals
 from pipelines.extraction.sights import Sight
 
 _TOUCHING = 0.10  # share of a ball's returns that may lie as far away beside it: mixed pixels
@@ -29,6 +30,10 @@ _STRANGE_RESOLVED = 0.05  # share of the returns inside its outline that may be 
 _N_KNOWN = 3  # markers that are open below, to compare others with
 _UNLIKE = 0.25  # share by which the reflectivity of a marker may differ from that of the others
 _NOISIER = 1.5  # factor by which the scatter of a marker may exceed that of the others
+_N_TELLING = 30  # returns that show the noise of a scan
+_FLAT_UNLIKE = 0.25  # of the curvature: what may be missing where the noise is known from others
+_WIDE = 0.2  # half widths of a beam: what taking it for a ray adds to the noise
+_BETTER = 1.5  # logarithm of the likelihood ratio from which another shape is believed
 _HIDDEN = 3.0  # as many returns before a ball as on it: three quarters of it are hidden
 
 
@@ -171,7 +176,7 @@ def verdict_on_sight(look: Look, sight: Sight, ball: Ball) -> str:
     str
         The reason as a sentence for people; empty if it may be such a ball.
     """
-    expected = _spread_expected(look, ball)
+    expected = spread_expected(look, ball)
     spread_min = expected - max(
         _SPREAD_SIGMAS / float(np.sqrt(12.0 * max(sight.n_on, 1))), _SPREAD_SLACK
     )
@@ -208,6 +213,34 @@ def verdict_on_sight(look: Look, sight: Sight, ball: Ball) -> str:
     return next((reason for is_so, reason in tests if is_so), "")
 
 
+def verdict_on_rivals(rivals: Rivals) -> str:
+    """Return why a group is rather something else than a ball of the known radius.
+
+    Parameters
+    ----------
+    rivals : Rivals
+        How much better other shapes explain all that is seen of it.
+
+    Returns
+    -------
+    str
+        The reason as a sentence for people; empty if none does.
+    """
+    tests = (
+        (
+            rivals.post > _BETTER,
+            f"It goes on below as it is: a post, {2e3 * rivals.half_width_post:.0f} mm wide, "
+            f"explains its returns exp({rivals.post:.1f}) times better than a sphere.",
+        ),
+        (
+            rivals.small > _BETTER,
+            f"It is too small: a ball of radius {1e3 * rivals.radius_small:.0f} mm explains its "
+            f"returns exp({rivals.small:.1f}) times better.",
+        ),
+    )
+    return next((reason for is_so, reason in tests if is_so), "")
+
+
 def _n_comparable(sight: Sight) -> float:
     """Return how many returns on a ball those below it are to be compared with.
 
@@ -219,8 +252,27 @@ def _n_comparable(sight: Sight) -> float:
     return max(share_below * sight.n_aimed, float(sight.n_on))
 
 
-def verdict_among_others(look: Look, sight: Sight, others: Sequence[tuple[Look, Sight]]) -> str:
-    """Return why a group whose pole is hidden differs from markers that are open below.
+def noise_among(looks: Sequence[Look]) -> float:
+    """Return the noise of ranges that the surer groups of a scan share.
+
+    Parameters
+    ----------
+    looks : sequence of Look
+        Groups that may be markers.
+
+    Returns
+    -------
+    float
+        Standard deviation; NaN if too few groups have returns enough to tell [m].
+    """
+    known = [max(look.scatter, NOISE_MIN) for look in looks if look.n_points >= _N_TELLING]
+    return float(np.median(known)) if len(known) >= _N_KNOWN else float("nan")
+
+
+def verdict_among_others(
+    look: Look, sight: Sight, others: Sequence[tuple[Look, Sight]], ball: Ball
+) -> str:
+    """Return why a group differs from the other markers of the scan.
 
     Parameters
     ----------
@@ -230,18 +282,44 @@ def verdict_among_others(look: Look, sight: Sight, others: Sequence[tuple[Look, 
         Where the beams towards and about it end.
     others : sequence of (Look, Sight)
         Groups that have passed the other tests, this one among them or not.
+    ball : Ball
+        What is looked for.
 
     Returns
     -------
     str
-        The reason as a sentence for people; empty if it is open below, if it is like the others,
-        or if there are too few others to tell.
+        The reason as a sentence for people; empty if it is like the others, or if there are too few
+        others to tell.
 
     Notes
     -----
-    A stone behind a crest and a marker behind a crest look alike. The markers of a survey share
-    their paint, and with it reflectivity and noise.
+    The markers of a survey share their paint, and with it reflectivity and noise. What scatters
+    more may lack the curvature of a ball, by the noise of the others; what is missing across and
+    along is tested together. A stone behind a crest and a marker behind a crest look alike: where
+    the pole is hidden, reflectivity and scatter themselves must be those of the others.
     """
+    return _unlike_in_shape(look, others, ball) or _unlike_in_paint(look, sight, others)
+
+
+def _unlike_in_shape(look: Look, others: Sequence[tuple[Look, Sight]], ball: Ball) -> str:
+    """Return why a group is not curved as a ball, by the noise of the others."""
+    blur = 0.5 * ball.divergence * float(np.linalg.norm(look.p_base))
+    noise = float(np.hypot(noise_among([other for other, _ in others]), _WIDE * blur))
+    share = min(noise / max(look.scatter, NOISE_MIN), 1.0)
+    flats = (look.flat_across, look.flat_along)
+    off = np.array(flats) / (share * np.array([look.sigma_across, look.sigma_along]))
+    is_flat = float(np.hypot(*np.maximum(off, 0.0))) > _SIGMAS and max(flats) > _FLAT_UNLIKE
+    if look.n_points < _N_SURE or not is_flat:
+        return ""
+    return (
+        f"It is not curved as a sphere: {100 * max(flats):.0f} % of the curvature are missing, and "
+        f"its returns scatter by {1e3 * look.scatter:.0f} mm, where the noise of the markers is "
+        f"{1e3 * noise:.0f} mm."
+    )
+
+
+def _unlike_in_paint(look: Look, sight: Sight, others: Sequence[tuple[Look, Sight]]) -> str:
+    """Return why a group whose pole is hidden differs from markers that are open below."""
     known = [other for other in others if other[1].is_open_below]
     if sight.is_open_below or len(known) < _N_KNOWN:
         return ""
@@ -262,8 +340,21 @@ def verdict_among_others(look: Look, sight: Sight, others: Sequence[tuple[Look, 
     return next((reason for is_so, reason in tests if is_so), "")
 
 
-def _spread_expected(look: Look, ball: Ball) -> float:
-    """Return the spread of returns on the ball: wide beams make its disc somewhat larger."""
+def spread_expected(look: Look, ball: Ball) -> float:
+    """Return the spread of returns on the ball: wide beams make its disc somewhat larger.
+
+    Parameters
+    ----------
+    look : Look
+        What the group looks like.
+    ball : Ball
+        What is looked for.
+
+    Returns
+    -------
+    float
+        Mean square of the distances at which they pass its centre, in squared radii.
+    """
     blur = 0.5 * ball.divergence * float(np.linalg.norm(look.p_base)) / ball.radius
     return 0.5 * (1.0 + 0.3 * blur) ** 2
 
