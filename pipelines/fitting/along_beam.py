@@ -1,7 +1,8 @@
 """Centres by maximum likelihood along the beams, all markers of a stop together.
 
 Hides noise, outliers and laser biases. The markers of a stop share what one marker alone cannot
-tell: the noise of this sensor today, and what each laser measures too long.
+tell: the noise of this sensor today, what each laser measures too long, and how sharply returns end
+at the outline.
 """
 
 from __future__ import annotations
@@ -22,6 +23,7 @@ from pipelines.fitting.description import (
     weaknesses,
 )
 from pipelines.fitting.footprint import share_of_outline
+from pipelines.fitting.outline import outline_normals, softness
 from pipelines.fitting.passes import (
     Linear,
     Normals,
@@ -64,6 +66,7 @@ _EFFICIENCY = 0.9753  # variance of the estimate over the inverse normal matrix
 _SPREAD_MIN = 1e-5  # [m] of the laser biases: keeps their prior invertible
 _N_STEPS = 8
 _N_STEPS_GATED = 5  # after these the choice of returns by their place stays as it is
+_N_STEPS_RANGES = 3  # without the outline
 _ROUGH = 0.1  # radii by which a rough centre may be off per axis
 _STEP_MAX = 0.25  # radii per step
 _STRAY = 0.6  # radii that a centre may move from its rough place
@@ -132,6 +135,13 @@ class _State(NamedTuple):
     cov_biases: Array
 
 
+class _Outline(NamedTuple):
+    """How softly the outline of all spheres ends; what each return says of it, (n, 2)."""
+
+    softness: float
+    sites: Array
+
+
 class _Estimate(NamedTuple):
     """A state with what each return says of it: prediction, residuals [m], sigmas [m], weights."""
 
@@ -169,16 +179,56 @@ def fit(
     -----
     Along the beam the residual of a known radius has one minimum (Franaszek, Cheok, Saidi,
     Witzgall, 2009), save for what the limb adds: there ranges bend so fast that they are linearised
-    over the width of the centre's own uncertainty (``passes.linearise``). Iteratively reweighted
-    least squares with Tukey's weight; the noise is pooled over the stop, by reflectivity where
-    returns are many, and laser biases are random effects of all markers together, whose spread is
-    estimated by expectation maximisation. Each step costs one pass over the returns.
+    over the width of the centre's own uncertainty (``passes.linearise``). A range of a sphere has
+    a likelihood only where the footprint meets the sphere: that bounds the centre from all sides
+    (``outline``). Iteratively reweighted least squares with Tukey's weight; the noise is pooled
+    over the stop, by reflectivity where returns are many, and laser biases are random effects of
+    all markers together, whose spread is estimated by expectation maximisation. Each step costs one
+    pass over the returns.
     """
+    return _fit(cloud, found, config, radius, asks_outline=True)
+
+
+def fit_ranges(
+    cloud: StitchedCloud, found: MarkerCandidates, config: FittingConfig, radius: float
+) -> Fits:
+    """Fit all candidates of a stop by their ranges alone, wherever their beams meet the spheres.
+
+    Parameters
+    ----------
+    cloud : StitchedCloud
+        The stop.
+    found : MarkerCandidates
+        Groups of returns with rough centres good to a few centimetres.
+    config : FittingConfig
+        Prior noise of direction and laser bias.
+    radius : float
+        Radius of the spheres [m].
+
+    Returns
+    -------
+    fits : tuple of MarkerFit
+        As of ``fit``, for who asks by himself which beams hit.
+    rejected : tuple of Rejection
+        Candidates that no sphere of this radius explains, with the reason.
+    """
+    return _fit(cloud, found, config, radius, asks_outline=False)
+
+
+def _fit(
+    cloud: StitchedCloud,
+    found: MarkerCandidates,
+    config: FittingConfig,
+    radius: float,
+    *,
+    asks_outline: bool,
+) -> Fits:
+    """Return the fits of all candidates, and those that are none."""
     if not found.candidates:
         return (), ()
     shots = _gather(cloud, found.candidates, config)
     rough = np.array([c.p_base_rough for c in found.candidates])
-    estimate = _estimate(shots, rough, radius)
+    estimate = _estimate(shots, rough, radius, asks_outline=asks_outline)
     free = np.column_stack(_free_radii(shots, estimate, radius)).tolist()
     results = [
         _judged(shots, estimate, k, candidate, tuple(free[k]), radius)
@@ -244,6 +294,18 @@ def _normals(shots: _Shots, estimate: _Estimate) -> Normals:
     return Normals(*normals_of(shots.rows, estimate.linear, estimate.residuals, per_square, sizes))
 
 
+def _bounded(
+    shots: _Shots, estimate: _Estimate, radius: float, N: Normals, known: _Outline
+) -> tuple[Normals, _Outline]:
+    """Return normal equations with what the outline adds, and what was learnt of it."""
+    state = estimate.state
+    of_returns = (shots.rows, estimate.linear, estimate.weights, state.cov_noise + state.cov_biases)
+    soft = known.softness or softness(*of_returns, radius)
+    centres, pull_centres, sites = outline_normals(*of_returns, (radius, soft), known.sites)
+    added = N._replace(centres=N.centres + centres, pull_centres=N.pull_centres + pull_centres)
+    return added, _Outline(soft, sites)
+
+
 def _stepped(state: _State, N: Normals, prior: Array, radius: float) -> _State:
     """Return the state after one Gauss-Newton step of all centres and biases together.
 
@@ -276,7 +338,7 @@ def _shortened(steps: Array, radius: float) -> Array:
     return np.asarray(steps * np.minimum(1.0, _STEP_MAX * radius / np.maximum(lengths, 1e-12)))
 
 
-def _estimate(shots: _Shots, rough: Array, radius: float) -> _Estimate:
+def _estimate(shots: _Shots, rough: Array, radius: float, *, asks_outline: bool) -> _Estimate:
     """Return the estimate of all centres and biases from rough centres."""
     nothing = np.zeros((len(rough), 3, 3))
     state = _State(
@@ -290,13 +352,17 @@ def _estimate(shots: _Shots, rough: Array, radius: float) -> _Estimate:
         cov_biases=nothing,
     )
     is_in = np.ones(len(shots.members), dtype=bool)
+    outline = _Outline(softness=0.0, sites=np.zeros((len(shots.members), 2)))
     for step in range(_N_STEPS):
         linear = _linear(shots, state, is_in, radius)
         if step < _N_STEPS_GATED:
             is_in = in_play(shots.rows, linear.offsets, _margins(state, radius), radius)
         estimate = _weighed(shots, state, linear, is_in)
         state = estimate.state._replace(has_biases=step >= _N_STEPS_GATED)
-        state = _stepped(state, _normals(shots, estimate), shots.sigma_biases, radius)
+        N = _normals(shots, estimate)
+        if asks_outline and step >= _N_STEPS_RANGES:
+            N, outline = _bounded(shots, estimate, radius, N, outline)
+        state = _stepped(state, N, shots.sigma_biases, radius)
     return _weighed(shots, state, _linear(shots, state, is_in, radius), is_in)
 
 

@@ -37,7 +37,7 @@ from pipelines.values import (
 Rows = NDArray[np.int32]
 
 NAME = "silhouette"
-RANGES_ONLY = "ranges only: "
+RETURNS_ONLY = "returns only: "
 
 _DELAYS = np.argsort(FIRING_ORDER) * LASER_CYCLE  # [s] of each laser within its firing
 _PHASE_MAX = 3e-6  # [s] scatter of the firing clock: one laser's share of a firing
@@ -154,16 +154,17 @@ def fit(
 
     Notes
     -----
-    The posterior of ``along_beam`` is the prior; every shot that passes closely adds the
+    The posterior of the ranges is the prior; every shot that passes closely adds the
     probability that it hit, or did not, which rises from 0 to 1 as its footprint enters the
     outline. Where on the way it is one half is the same for all markers of a stop and estimated
     with them. Mean and covariance are those of a weighted sample.
     """
-    fits, rejected = along_beam.fit(cloud, found, config, radius)
+    fits, rejected = along_beam.fit_ranges(cloud, found, config, radius)
     if not fits:
         return fits, rejected
     pattern, why_not = _pattern(cloud)
     if pattern is None:
+        fits, rejected = along_beam.fit(cloud, found, config, radius)
         return tuple(_without_outline(fit, why_not) for fit in fits), rejected
     firings = _firings(cloud, pattern)
     near = _passing(cloud, firings, fits)
@@ -176,14 +177,14 @@ def fit(
 
 
 def _without_outline(fit: MarkerFit, why_not: str) -> MarkerFit:
-    """Return the fit by ranges alone, weak, with the reason."""
+    """Return the fit by returns alone, weak, with the reason."""
     said = f"{fit.reason} " if fit.reason else ""
     return replace(
         fit,
         method=NAME,
         status=Status.WEAK,
         reason=f"{said}The outline is not used: {why_not}.",
-        variant=RANGES_ONLY + why_not,
+        variant=RETURNS_ONLY + why_not,
     )
 
 
