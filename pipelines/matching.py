@@ -298,8 +298,8 @@ def match_marks(scene: Scene, config: ResectionConfig, spans: Spans | None = Non
         raise NoMatchError(
             f"No two of the {len(levelled)} markers have the distance and the difference of height "
             f"of any two of the {len(scene.marks_site)} control marks (within "
-            f"{config.match_tolerance} m): these are marks of another field, in other units or axes, "
-            "or false markers."
+            f"{config.match_tolerance} m): these are marks of another field, or in other units or "
+            "axes, or false markers."
         )
     best = solutions[0]
     _refuse_chance(best, scene, config)

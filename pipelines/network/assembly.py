@@ -131,7 +131,7 @@ def assemble(
     names = [name for name, _ in scans]
     if twice := sorted(name for name, n in Counter(names).items() if n > 1):
         raise InputError(
-            f"Two logs are called {twice[0]!r}; stations are told apart by name. Rename one of them."
+            f"Two logs are called {twice[0]!r}; stations are told apart by name. Rename one."
         )
     if calibration is not None:
         scans = [(name, calibration.adjusted(name, fits)) for name, fits in scans]
