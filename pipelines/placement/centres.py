@@ -216,6 +216,8 @@ def expect_centres(
             1.0 / (sensor.line_spacing * sensor.shot_spacing),
             np.sin(sensor.elevations[0]),
             np.sin(sensor.elevations[1]),
+            model.marker_radius,
+            0.5 * max(sensor.divergence),
         ),
         (shares, n_points, lost, covs),
     )
@@ -241,15 +243,22 @@ def is_found(centres: Centres, n_points_min: float) -> np.ndarray:
 
 
 @numba.njit(cache=True, nogil=True)
-def _seen(table: Group, place: float, lowest: np.ndarray, info: Array) -> tuple[float, float]:
-    """Fill in the information of the visible part of a disc; return its area and that of all."""
+def _seen(
+    table: Group, place: float, lowest: np.ndarray, share: float, info: Array
+) -> tuple[float, float]:
+    """Fill in the information of the visible part of a disc; return its area and that of all.
+
+    The disc of the table is wider than the sphere, by what footprints reach: the sphere is a share
+    of it.
+    """
     areas, information = table[1], table[2]
     n_strips, n_rows = areas.shape[1], areas.shape[2] - 1
     i = int(place)
     seen, whole = 0.0, 0.0
     info[:] = 0.0
     for c in range(n_strips):
-        rows = 0.5 * (1.0 - lowest[c]) * n_rows
+        cut = lowest[c] if abs(lowest[c]) >= 1.0 else lowest[c] * share
+        rows = 0.5 * (1.0 - cut) * n_rows
         k = min(int(rows), n_rows - 1)
         w = rows - k
         for side in range(2):
@@ -294,7 +303,7 @@ def _expect(places: Group, table: Group, factors: Group, constants: Group, out: 
     eyes, marks, lowest = places
     distances, spread, lost_at = table[0], table[3], table[4]
     axis_factors, by_distance, by_count, count_factor = factors
-    density, sine_min, sine_max = constants
+    density, sine_min, sine_max, radius, flare = constants
     shares, n_points, lost, covs = out
     first, ratio = np.log(distances[0]), np.log(distances[1] / distances[0])
     info, local, axes, v = np.empty(6), np.empty((3, 3)), np.empty((3, 3)), np.empty(3)
@@ -310,7 +319,7 @@ def _expect(places: Group, table: Group, factors: Group, constants: Group, out: 
                 continue
             i = int(place)
             t = place - i
-            seen, whole = _seen(table, place, lowest[e, m], info)
+            seen, whole = _seen(table, place, lowest[e, m], radius / (radius + flare * d), info)
             here = count_factor * density / (d * flat)
             shares[e, m] = seen / whole
             n_points[e, m] = here * seen

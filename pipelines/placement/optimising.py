@@ -7,13 +7,14 @@ are judged whole.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numba
 import numpy as np
 
 from pipelines.errors import ConfigError, DegenerateGeometryError
+from pipelines.placement.bounds import least_sigmas, widest_sigma
 from pipelines.placement.candidates import Candidates
 from pipelines.placement.centres import CentreModel
 from pipelines.placement.evaluation import check_sizes, evaluate, sighting_of
@@ -37,10 +38,13 @@ _LOST = 1e3  # [m] counts for a stop without a position: worse than any that has
 _LOOSE_PRIOR = np.array([3.0, 3.0, 3.0, 10.0, 10.0, 10.0])  # [rad, m] before any mark is seen
 _SURE = 1.96  # sigmas within which an error of any shape lies with 95 %: 3-D sigma on one axis
 _ROUNDS = 30  # of exchanges; four to eight settle
-_STARTS, _STARTS_WHOLE = 8, 4  # the latter of whole judgements
+_STARTS, _STARTS_LEAST = 8, 2
+_MARKS_STARTED = 64  # in all starts together: many marks leave little to chance
+_STARTS_WHOLE = 4  # of whole judgements
 _DRAWN, _DRAWN_KEPT = 1500, 40  # arrangements at random that these begin with, and judge in full
 _POWER = 12.0  # of the mean over stops that is as good as their largest, and smoother
 _SHAKEN = 0.4  # share of marks that such a start has elsewhere
+_SLACK, _SLACK_WHOLE = 1.1, 2.0  # times the tolerance, beyond which more search does not help
 _WORSE = 1.3  # than now, at most, while a loss would break what is wanted
 _TRIED = 12  # candidates that are judged in full for each mark, the most promising first
 _SCREENED = 800  # places that whole judgements try in a round, for all marks together
@@ -209,21 +213,30 @@ def optimise(  # noqa: PLR0913  all that a plan is made of
     """
     check_sizes(len(stops.names), goal.n_marks or goal.most)
     task = _task(site, stops, candidates, model, wish)
-    if goal.n_marks is not None:
-        best = _best(task, goal.n_marks, goal, rng)
-        return _optimum(site, stops, candidates, model, task, best, goal)
-    least = 3 if wish.method == "paper" or goal.is_robust else 2
-    if goal.most < least:
-        raise ConfigError(f"At most {goal.most} marks; {least} are needed for what is asked.")
-    _refuse_impossible(task, stops)
+    given = site, stops, candidates, model, task
 
     def tried(k: int) -> Optimum:
-        return _optimum(site, stops, candidates, model, task, _best(task, k, goal, rng), goal)
+        return _optimum(*given, _best(task, k, goal, rng), goal)
 
-    if _is_doubtful(task, goal) and not (most := tried(goal.most)).is_kept:
-        raise DegenerateGeometryError(_impossible(task, stops, most, goal))
+    if goal.n_marks is not None:
+        return tried(goal.n_marks)
+    least = _least(task, stops, goal)
+
+    def is_kept(chosen: Index, slack: float) -> bool:
+        wider = replace(wish, tolerance=slack * wish.tolerance)
+        marks = Arrangement.numbered(candidates.p_site[chosen])
+        return _keeps(site, stops, marks, model, wider, goal)
+
+    slack = _SLACK_WHOLE if wish.method == "paper" else _SLACK
+    most = _glance(task, goal.most, goal, rng)
+    if most is not None and not is_kept(most, 1.0):
+        is_near = is_kept(most, slack)
+        found = tried(goal.most) if is_near else _optimum(*given, (most, 0), goal)
+        if not found.is_kept:
+            raise DegenerateGeometryError(_impossible(task, stops, found, goal))
     for k in range(least, goal.most):
-        if (found := tried(k)).is_kept:
+        some = _glance(task, k, goal, rng)
+        if (some is None or is_kept(some, slack)) and (found := tried(k)).is_kept:
             return found
     if (found := tried(goal.most)).is_kept:
         return found
@@ -374,7 +387,8 @@ def _best(task: _Task, k: int, goal: Goal, rng: np.random.Generator) -> tuple[In
     is_whole = task.wish.method == "paper"
     if is_whole:
         best = _best_drawn(task, best, goal, rng)
-    for i in range(_STARTS_WHOLE if is_whole else _STARTS):
+    n_starts = max(_STARTS_LEAST, min(_STARTS, _MARKS_STARTED // k))
+    for i in range(_STARTS_WHOLE if is_whole else n_starts):
         start = best if i == 0 else _shaken(task, best, 1.0 if i == 1 else _SHAKEN, rng)
         found, n = _exchanged(smooth, start, goal, rng)
         found, m = _exchanged(task, found, goal, rng)
@@ -562,26 +576,69 @@ def _optimum(  # noqa: PLR0913  all that an answer is made of
     chosen = chosen[np.argsort(np.arctan2(off[:, 1], off[:, 0]))]
     marks = Arrangement.numbered(candidates.p_site[chosen])
     promised = evaluate(site, stops, marks, model, task.wish)
-    needs_loss = goal.is_robust and len(chosen) >= 3
     after = _after_loss(task, chosen) if len(chosen) > 2 else np.inf
-    is_kept = promised.worst_probability >= goal.probability
-    if needs_loss and is_kept:
-        rest = (np.delete(np.arange(len(chosen)), i) for i in range(len(chosen)))
-        is_kept = all(
-            evaluate(site, stops, marks.rows(keep), model, task.wish).worst_probability
-            >= goal.probability
-            for keep in rest
-        )
     gained, bound = (np.nan, np.nan) if task.wish.method == "paper" else _bound(task, chosen)
     return Optimum(
         evaluation=promised,
         ground=candidates.ground[chosen].copy(),
         worst_after_loss=after if after < _LOST else np.inf,
-        is_kept=is_kept,
+        is_kept=_keeps(site, stops, marks, model, task.wish, goal),
         log_det=gained,
         log_det_bound=bound,
         n_candidates=len(candidates.p_site),
         n_exchanges=n_exchanges,
+    )
+
+
+def _keeps(
+    site: Site,
+    stops: Stops,
+    marks: Arrangement,
+    model: CentreModel,
+    wish: Requirement,
+    goal: Goal,
+) -> bool:
+    """Return whether marks keep the tolerance at every stop, after a loss too if that counts."""
+    n = len(marks.names)
+    keeps = [np.arange(n)]
+    if goal.is_robust and n >= 3:
+        keeps += [np.delete(np.arange(n), i) for i in range(n)]
+    sights = look(site, stops.p_site, marks)
+    return all(
+        evaluate(
+            site, stops, marks.rows(keep), model, wish, sights=sights.rows(keep)
+        ).worst_probability
+        >= goal.probability
+        for keep in keeps
+    )
+
+
+def _least(task: _Task, stops: Stops, goal: Goal) -> int:
+    """Return a number of marks that fewer cannot keep the tolerance with; raise if none can."""
+    least = 3 if task.wish.method == "paper" or goal.is_robust else 2
+    if goal.most < least:
+        raise ConfigError(f"At most {goal.most} marks; {least} are needed for what is asked.")
+    _refuse_impossible(task, stops)
+    sigmas = least_sigmas(task.sighting, task.wish)[:, : goal.most]
+    wanted = widest_sigma(task.wish.tolerance, goal.probability)
+    enough = np.flatnonzero(sigmas.max(axis=0) <= wanted) + 1 + goal.is_robust
+    if len(enough) and enough[0] <= goal.most:
+        return max(least, int(enough[0]))
+    place = sigmas.shape[1] - 1 - (goal.is_robust and sigmas.shape[1] > 1)
+    worst = int(np.argmax(sigmas[:, place]))
+    raise DegenerateGeometryError(
+        f"No arrangement of {goal.most} marks keeps {_asked(task, goal)}: wherever they stood, the "
+        f"3-D sigma at {stops.names[worst]} would be {1e3 * sigmas[worst, place]:.2g} mm or more, "
+        f"and {1e3 * wanted:.2g} mm is the most with which that can be. Ask for a larger "
+        "tolerance, or allow more places."
+    )
+
+
+def _asked(task: _Task, goal: Goal) -> str:
+    """Say what shall be kept."""
+    after = " after the loss of any one" if goal.is_robust else ""
+    return (
+        f"{1e3 * task.wish.tolerance:g} mm with {100 * goal.probability:g} % at every stop{after}"
     )
 
 
@@ -600,23 +657,20 @@ def _refuse_impossible(task: _Task, stops: Stops) -> None:
         )
 
 
-def _is_doubtful(task: _Task, goal: Goal) -> bool:
-    """Return whether there is room for the most marks, and a quick choice of them breaks."""
+def _glance(task: _Task, k: int, goal: Goal, rng: np.random.Generator) -> Index | None:
+    """Return the best places of k marks that a short search finds; none if there is no room."""
     try:
-        chosen = _greedy(task, goal.most)
+        chosen = _greedy(task, k)
     except DegenerateGeometryError:
-        return False
-    worst = _after_loss(task, chosen) if goal.is_robust else _score(task, chosen)[0]
-    return worst > task.wish.tolerance / _SURE
+        return None
+    if task.wish.method == "paper":
+        return _best_drawn(task, chosen, goal, rng)
+    return _exchanged(task._replace(power=_POWER), chosen, goal, rng)[0]
 
 
 def _impossible(task: _Task, stops: Stops, best: Optimum, goal: Goal) -> str:
     """Say that no number of marks keeps the tolerance, and what nothing can exceed."""
-    text = (
-        f"{goal.most} marks do not keep {1e3 * task.wish.tolerance:g} mm with "
-        f"{100 * goal.probability:g} % at every stop"
-    )
-    text += " after the loss of any one" if goal.is_robust else ""
+    text = f"{goal.most} marks do not keep {_asked(task, goal)}"
     worst = int(np.argmax(best.evaluation.sigma_3d))
     text += (
         f": the best that was found leaves {1e3 * best.evaluation.sigma_3d[worst]:.3g} mm (3-D "

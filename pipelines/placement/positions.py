@@ -322,6 +322,29 @@ def information(sighting: Sighting, wish: Requirement) -> Information:
     return out
 
 
+def independent_information(sighting: Sighting, wish: Requirement) -> Array:
+    """Return what each mark tells of a station's position if its rotation were known.
+
+    Parameters
+    ----------
+    sighting : Sighting
+        Marks as seen.
+    wish : Requirement
+        What is known of the marks.
+
+    Returns
+    -------
+    (e, n, 3, 3)
+        By errors as they are, not as a survey weighs them; zero for marks that are not found
+        [1/m^2].
+    """
+    v = sighting.marks_site[None] - sighting.eyes_site[:, None]
+    across = np.sum(v**2, axis=2)[..., None, None] * np.eye(3) - v[..., :, None] * v[..., None, :]
+    covs = sighting.cov_centres + wish.sigma_marks**2 * np.eye(3) + _SIGMA_AIM**2 * across
+    is_seen = sighting.is_seen[..., None, None]
+    return np.where(is_seen, np.linalg.inv(np.where(is_seen, covs, np.eye(3))), 0.0)
+
+
 def _places(sighting: Sighting) -> tuple[Array, Array]:
     """Return eyes and marks as the kernels want them."""
     return np.ascontiguousarray(sighting.eyes_site), np.ascontiguousarray(sighting.marks_site)

@@ -2,7 +2,8 @@
 
 Hides the marching of rays. A sphere's disc is cut into upright strips; for each the highest line
 of sight that something between eye and sphere touches is found. Where even the highest surface
-nearby lies below the lowest line of sight, which is the rule, one coarse march settles it.
+nearby lies below the lowest line of sight, which is the rule, one coarse march settles it. Where
+the surfaces themselves are known, what the grid would hide is looked at among them.
 """
 
 from __future__ import annotations
@@ -14,8 +15,9 @@ import numpy as np
 from scipy.ndimage import maximum_filter
 
 from pipelines.placement.values import Arrangement, Sights, Site
+from pipelines.simulation.scene import Caster, Mesh, caster
 from pipelines.threads import side_by_side
-from pipelines.values import Array
+from pipelines.values import Array, Mask
 
 N_STRIPS = 8
 """Strips that a disc is cut into."""
@@ -24,6 +26,9 @@ _COARSE = 5  # cells from one step of the coarse march to the next
 _BEHIND = 0.05  # [m] something nearer to the sphere than this is its own foot
 _MANY = 400  # pairs of eye and mark that are worth a second thread
 _HIDDEN, _SEEN = 1.0, -1.0
+_N_HEIGHTS = 12  # rays to each strip of a disc
+_N_PAIRS = 10_000  # of eye and mark whose rays are cast at a time: some 50 MB
+_TOUCH = 1e-3  # [m] what is this near to a sphere does not hide it
 
 Ray = tuple[float, float, float, float, float, float]
 """Origin, level direction and length [m]."""
@@ -60,7 +65,55 @@ def look(site: Site, eyes_site: Array, marks: Arrangement) -> Sights:
         _look(grids, frame, (eyes[first:last], p_site), site.marker_radius, lowest[first:last])
 
     side_by_side(part, len(eyes), worth=max(2, _MANY // max(len(p_site), 1)))
+    if site.bodies is not None:
+        _look_again(site.bodies, (eyes, p_site), site.marker_radius, lowest)
     return Sights(lowest=lowest)
+
+
+def _look_again(
+    bodies: Mesh, places: tuple[Array, Array], radius: float, lowest: np.ndarray
+) -> None:
+    """Replace what the grid seems to hide by what the surfaces themselves do.
+
+    A strip of which a share is seen counts as seen from so high on that as much of it is left:
+    under a canopy the upper part hides, which is worth as much.
+    """
+    eyes, marks = places
+    lefts = (2.0 * np.arange(N_STRIPS) + 1.0) / N_STRIPS - 1.0
+    chords = np.sqrt(1.0 - lefts**2)
+    parts = (2.0 * np.arange(_N_HEIGHTS) + 1.0) / _N_HEIGHTS - 1.0
+    disc = radius * np.stack(np.broadcast_arrays(lefts[:, None], chords[:, None] * parts), axis=-1)
+    e, m = np.nonzero((lowest > _SEEN).any(axis=2))
+    is_far = np.hypot(*(marks[m] - eyes[e])[:, :2].T) >= 2.0 * radius
+    for first in range(0, int(is_far.sum()), _N_PAIRS):
+        some = slice(first, first + _N_PAIRS)
+        i, k = e[is_far][some], m[is_far][some]
+        seen = _open_lines(bodies, eyes[i], marks[k], disc.reshape(-1, 2), radius)
+        shares = seen.reshape(len(i), N_STRIPS, _N_HEIGHTS).mean(axis=2)
+        part = np.where(shares == 1.0, _SEEN, chords * (1.0 - 2.0 * shares))
+        lowest[i, k] = np.where(shares == 0.0, _HIDDEN, part)
+
+
+def _open_lines(bodies: Mesh, eyes: Array, marks: Array, disc: Array, radius: float) -> Mask:
+    """Return which lines of sight to points of marks' discs meet nothing before them, (n, k)."""
+    ahead = marks - eyes
+    distances = np.linalg.norm(ahead, axis=1)
+    ahead = ahead / distances[:, None]
+    left = np.column_stack([-ahead[:, 1], ahead[:, 0], np.zeros(len(ahead))])
+    left = left / np.linalg.norm(left, axis=1, keepdims=True)
+    up = np.cross(ahead, left)
+    lines = (marks - eyes)[:, None] + disc[:, :1] * left[:, None] + disc[:, 1:] * up[:, None]
+    rays = np.empty((*lines.shape[:2], 6), np.float32)
+    rays[..., :3] = eyes[:, None]
+    rays[..., 3:] = lines / np.linalg.norm(lines, axis=2, keepdims=True)
+    met, _ = _caster(bodies)(rays.reshape(-1, 6))
+    return np.asarray(met.reshape(lines.shape[:2]) >= distances[:, None] - radius - _TOUCH)
+
+
+@lru_cache(maxsize=4)
+def _caster(bodies: Mesh) -> Caster:
+    """Return what casts rays against surfaces; growing its search tree takes a second."""
+    return caster.__wrapped__(bodies)
 
 
 def behind_others(site: Site, eyes_site: Array, marks: Arrangement, sights: Sights) -> Sights:

@@ -7,6 +7,7 @@ import numpy as np
 from pipelines.errors import InputError
 from pipelines.placement.values import Arrangement, Site, Stops
 from pipelines.simulation import Field
+from pipelines.simulation.rocks import ball
 from pipelines.simulation.scene import Mesh, caster
 from pipelines.values import Array
 
@@ -18,6 +19,7 @@ _HALF = 30.0  # [m] half side of that map
 _ABOVE = 60.0  # [m] from where its surface is probed
 _STEEP = 0.35  # share of a face that is seen from above below which it is sampled besides
 _PARTS_MAX = 400  # that an edge is cut into at most: 20 m
+_BALL_LEVEL = 3  # of its subdivision: flats lie within half a hundredth of the radius
 _POLE_HEIGHTS = (0.62, 1.50)  # [m] the study's
 
 
@@ -37,7 +39,9 @@ def site_of_field(world: Field) -> Site:
     Notes
     -----
     The surface is probed from above, so that what overhangs reaches down to the ground; upright
-    faces, which a probe from above may miss, are sampled besides and raise the nodes around.
+    faces, which a probe from above may miss, are sampled besides and raise the nodes around. It
+    hides too much rather than too little: what it does not hide is seen, and what it does is looked
+    at again among the triangles.
     """
     lines = np.arange(-_HALF, _HALF + _CELL / 2, _CELL)
     x, y = np.meshgrid(lines, lines)
@@ -54,6 +58,7 @@ def site_of_field(world: Field) -> Site:
         surface=surface,
         pole_heights=_POLE_HEIGHTS,
         marker_radius=world.marker_radius,
+        bodies=Mesh.merged([mesh, *_ball_meshes(world)]),
     )
 
 
@@ -139,15 +144,33 @@ def _burn(surface: Array, lines: Array, points: Array) -> None:
         np.maximum.at(surface, (j + up, i + right), points[inside, 2])
 
 
+def _others(world: Field) -> list[tuple[Array, float]]:
+    """Return centres and radii of the spheres that are no marker [m]."""
+    balls = zip(world.scene.spheres.p_site, world.scene.spheres.radii, strict=True)
+    marks = world.marks.p_site
+    return [
+        (centre, float(radius))
+        for centre, radius in balls
+        if np.linalg.norm(marks - centre, axis=1).min(initial=np.inf) > 1e-3
+    ]
+
+
 def _balls(world: Field, x: Array, y: Array) -> Array:
     """Return the height of the highest sphere that is no marker over places; minus infinity [m]."""
     tops = np.full(x.shape, -np.inf)
-    balls = world.scene.spheres
-    for centre, radius in zip(balls.p_site, balls.radii, strict=True):
-        if np.linalg.norm(world.marks.p_site - centre, axis=1).min(initial=np.inf) > 1e-3:
-            rise2 = radius**2 - (x - centre[0]) ** 2 - (y - centre[1]) ** 2
-            tops = np.where(rise2 > 0, np.maximum(tops, centre[2] + np.sqrt(np.abs(rise2))), tops)
+    for centre, radius in _others(world):
+        rise2 = radius**2 - (x - centre[0]) ** 2 - (y - centre[1]) ** 2
+        tops = np.where(rise2 > 0, np.maximum(tops, centre[2] + np.sqrt(np.abs(rise2))), tops)
     return np.asarray(tops)
+
+
+def _ball_meshes(world: Field) -> list[Mesh]:
+    """Return the spheres that are no marker as triangles."""
+    directions, triangles = ball(_BALL_LEVEL)
+    return [
+        Mesh.even(centre + radius * directions, triangles.copy(), 0.5)
+        for centre, radius in _others(world)
+    ]
 
 
 def _probed(mesh: Mesh, x: Array, y: Array) -> Array:

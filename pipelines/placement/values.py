@@ -13,6 +13,7 @@ import numpy as np
 
 from pipelines.config import ResectionConfig
 from pipelines.errors import ConfigError, InputError
+from pipelines.simulation.scene import Mesh
 from pipelines.values import Array, Index, Mask, _same_length, _seal
 
 PLAN_METHODS = ("free_station", "paper")
@@ -51,6 +52,8 @@ class Site:
         Radius of the poles that carry them [m].
     mast : float
         Height of the LiDAR above the ground where a stop does not say [m].
+    bodies : Mesh, optional
+        Surfaces of all that hides, where they are known better than on the grid.
     """
 
     name: str
@@ -63,6 +66,7 @@ class Site:
     marker_radius: float = 0.100
     pole_radius: float = 0.015
     mast: float = 1.05
+    bodies: Mesh | None = None
 
     def __post_init__(self) -> None:
         shape = (len(self.ys), len(self.xs))

@@ -1,0 +1,58 @@
+"""What no arrangement can exceed: so that what cannot be is answered without a search."""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy.stats import chi
+
+from pipelines.placement.positions import Sighting, independent_information
+from pipelines.placement.values import Requirement
+from pipelines.values import Array
+
+
+def least_sigmas(sighting: Sighting, wish: Requirement) -> Array:
+    """Return the 3-D sigmas that no arrangement of so many of the marks goes below.
+
+    Parameters
+    ----------
+    sighting : Sighting
+        All marks that might stand, as seen.
+    wish : Requirement
+        Method, and what is known of the marks.
+
+    Returns
+    -------
+    (s, n)
+        For each stop, with one mark, two and so on; infinite where nothing is seen [m].
+
+    Notes
+    -----
+    As if the station's rotation were known, and every stop had the marks that it likes best to
+    itself: ``trace(A^-1) >= 9 / trace(A)``, and traces of information add up. By three circles
+    three marks carry a position, however many there are.
+    """
+    traces = np.trace(independent_information(sighting, wish), axis1=2, axis2=3)
+    best = -np.sort(-traces, axis=1)
+    if wish.method == "paper":
+        best[:, 3:] = 0.0
+    with np.errstate(divide="ignore"):
+        variances = 9.0 / np.cumsum(best, axis=1)
+    return np.asarray(np.sqrt(variances + wish.resection.sigma_height**2))
+
+
+def widest_sigma(tolerance: float, probability: float) -> float:
+    """Return the largest 3-D sigma with which an error can be within a tolerance so probably.
+
+    Parameters
+    ----------
+    tolerance : float
+        The tolerance [m].
+    probability : float
+        The probability, 0 to 1.
+
+    Returns
+    -------
+    float
+        Of errors that are equal along one, two or three axes, whichever allows most [m].
+    """
+    return float(max(tolerance * np.sqrt(n) / chi(n).ppf(probability) for n in (1, 2, 3)))
