@@ -78,7 +78,29 @@ Corner = tuple[
 Area = Annotated[list[Corner], Field(min_length=3, max_length=200)]
 
 
-class Plan(Strict):
+class Driven(Strict):
+    """How the scans are driven."""
+
+    turn_s: float = Field(default=13.2, gt=0, le=3600, description="Time of a turn [s].")
+    spin_rpm: float = Field(default=600.0, description="Revolutions of the LiDAR per minute.")
+    step_deg: float = Field(
+        default=0.0, description="Step of a gimbal that rests between; 0 turns evenly [deg]."
+    )
+    rest_revolutions: int = Field(
+        default=3, description="Revolutions of the LiDAR during each rest."
+    )
+
+    def to_sensor(self) -> Sensor:
+        """Return the sensor as the core has it."""
+        return Sensor(
+            turn=self.turn_s,
+            spin_rpm=self.spin_rpm,
+            step=math.radians(self.step_deg),
+            rest_revolutions=self.rest_revolutions,
+        )
+
+
+class Plan(Driven):
     """An arrangement to judge, or to better."""
 
     site: str = Field(default="paper-field", description="Key of the field, as GET /plans/sites.")
@@ -93,14 +115,6 @@ class Plan(Strict):
     )
     method: Literal["free_station", "paper"] = "free_station"
     tolerance_m: float = Field(default=0.03, gt=0, le=10)
-    turn_s: float = Field(default=13.2, gt=0, le=3600, description="Time of a turn [s].")
-    spin_rpm: float = Field(default=600.0, description="Revolutions of the LiDAR per minute.")
-    step_deg: float = Field(
-        default=0.0, description="Step of a gimbal that rests between; 0 turns evenly [deg]."
-    )
-    rest_revolutions: int = Field(
-        default=3, description="Revolutions of the LiDAR during each rest."
-    )
     model: str = Field(
         default="auto",
         description="Accuracy of centres: 'sensor'; 'survey:<name>', from its marker_fits; or "
@@ -160,7 +174,7 @@ class BetterPlan(Plan):
     rules: Rules = Field(default_factory=Rules)
 
 
-class RandomTrial(Strict):
+class RandomTrial(Driven):
     """Arrangements at random, as the study tries them."""
 
     n_arrangements: int = Field(default=100_000, ge=1, le=1_000_000)
@@ -265,7 +279,8 @@ def tried(service: Service, wanted: RandomTrial) -> Plain:
         tolerance=wanted.tolerance_m,
         seed=wanted.seed,
     ).trial(limits)
-    return trials.run(trial, planner.model(wanted.model, Sensor(), _MARKER_RADIUS), limits)
+    model = planner.model(wanted.model, wanted.to_sensor(), _MARKER_RADIUS)
+    return trials.run(trial, model, limits)
 
 
 @router.post("/plans", name="keep_plan", status_code=201)
@@ -340,19 +355,13 @@ def _evaluated(service: Service, plan: Plan, *, field_cells: int = 0) -> Plain:
 def _asked(service: Service, plan: Plan) -> Asked:
     """Return what is asked as values."""
     ground = service.planner.ground(plan.site)
-    sensor = Sensor(
-        turn=plan.turn_s,
-        spin_rpm=plan.spin_rpm,
-        step=math.radians(plan.step_deg),
-        rest_revolutions=plan.rest_revolutions,
-    )
     return Asked(
         ground=ground,
         stops=ground.stops
         if plan.stops is None
         else stops_at(ground.site, [(one.name, one.x_m, one.y_m) for one in plan.stops]),
         marks=marks_at(ground.site, [_place(one) for one in plan.marks]),
-        model=service.planner.model(plan.model, sensor, ground.site.marker_radius),
+        model=service.planner.model(plan.model, plan.to_sensor(), ground.site.marker_radius),
         wish=Requirement(tolerance=plan.tolerance_m, method=plan.method),
     )
 

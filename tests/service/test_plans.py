@@ -105,6 +105,24 @@ def test_optimised_marks_are_better_than_those_one_began_with(client):
     assert evaluated(client, marks=keep)["stops"] == best["stops"]
 
 
+def test_trials_at_random_take_the_speeds_of_the_scans(client):
+    """Coarser steps put fewer lines on spheres: larger errors of the model, fewer that pass."""
+    trial = {"n_arrangements": 2_000, "error_per_axis_m": None, "model": "sensor"}
+
+    def passed(**speeds):
+        response = client.post("/api/v1/plans/random", json={**trial, **speeds})
+        response.raise_for_status()
+        return response.json()["pass_rate_in_window"]
+
+    speeds = {"tolerance_m": 0.003, "step_deg": 4.0, "rest_revolutions": 1}
+    assert passed(tolerance_m=0.003) > passed(**speeds) + 0.05
+    query = {"n_arrangements": 2_000, "error_per_axis_mm": 0, "step_deg": 4, "rest_revolutions": 1}
+    page = client.get("/plan/random", params=query).text
+    assert 'name="step_deg" type="number" step="any" value="4"' in page
+    assert "Rests every 4 deg" in page
+    assert "turn" in refused(client, "/api/v1/plans/random", marks=None, turn_s=-1)
+
+
 def test_areas_keep_marks_out_and_are_kept_with_a_plan(client):
     left = [[-30, -30], [0, -30], [0, 30], [-30, 30]]
     plan = {"marks": MARKS, "model": "sensor", "keep_out_m": [left]}
