@@ -183,9 +183,10 @@ class ResectionConfig:
         Standard deviation of what all ranges of a survey are too long, an unknown of a network
         [m]; 0 leaves it out. 1 mm: the mean of 16 lasers of 3 mm each, and the model of a beam.
     sigma_range_shared : float
-        How much of it is in the covariance of every centre already, as if it were its own [m].
-        0.9 mm: the mean of the 16 lasers, of 3 mm each, that a sphere is seen by, by simulation. At
-        most about half of a centre's variance along its line of sight is taken to be shared.
+        How much of it is in the covariance of every centre already, as if it were its own, where
+        the fit does not tell, as ``along_beam`` does by the biases that it found [m]. 0.9 mm: the
+        mean of the 16 lasers, of 3 mm each, that a sphere is seen by, by simulation. At most about
+        half of a centre's variance along its line of sight is taken to be shared.
     sigma_height : float
         Standard deviation of what all centres of a survey are too high, as the foot of their poles
         and the tilt of the spin axis leave [m]; 0 leaves it out. 0.12 mm, by simulation.

@@ -181,6 +181,7 @@ def gather(fits: MarkerFits, marks: ControlMarks, config: ResectionConfig) -> Sc
     p_base = np.stack([fit.p_base for fit in fits.fits])
     cov_p_base = np.stack([fit.cov_p_base for fit in fits.fits])
     cov_p_base += config.sigma_common**2 * np.eye(3)
+    told = np.array([fit.sigma_range_shared for fit in fits.fits])
     return Scene(
         names=marks.names,
         centres_base=p_base,
@@ -194,12 +195,14 @@ def gather(fits: MarkerFits, marks: ControlMarks, config: ResectionConfig) -> Sc
         is_levelled=levelling.is_measured,
         sigma_heading=levelling.sigma_heading,
         sigma_range=config.sigma_range,
-        shared=shared_variances(p_base, cov_p_base, config),
+        shared=shared_variances(p_base, cov_p_base, told, config),
         sigma_height=config.sigma_height,
     )
 
 
-def shared_variances(p_base: Array, cov_p_base: Array, config: ResectionConfig) -> Array:
+def shared_variances(
+    p_base: Array, cov_p_base: Array, told: Array, config: ResectionConfig
+) -> Array:
     """Return how much of the variance of centres is an error of range that they all share.
 
     Parameters
@@ -208,8 +211,10 @@ def shared_variances(p_base: Array, cov_p_base: Array, config: ResectionConfig) 
         Centres [m].
     cov_p_base : (n, 3, 3)
         Their covariances [m^2].
+    told : (n,)
+        The sigma that they share, as their fits have it; NaN where these do not tell [m].
     config : ResectionConfig
-        The sigma that they share.
+        The same for those that do not.
 
     Returns
     -------
@@ -225,7 +230,38 @@ def shared_variances(p_base: Array, cov_p_base: Array, config: ResectionConfig) 
     """
     v = p_base / np.linalg.norm(p_base, axis=1, keepdims=True)
     own = 1.0 / np.einsum("ni,ni->n", v, np.linalg.solve(cov_p_base, v[..., None])[..., 0])
-    return np.asarray(np.minimum(config.sigma_range_shared**2, _SHARED * own))
+    sigmas = np.where(np.isfinite(told), told, config.sigma_range_shared)
+    return np.asarray(np.minimum(sigmas**2, _SHARED * own))
+
+
+def cov_of_shared(scene: Scene, variances: Array, of_ranges: Array, of_heights: Array) -> Array:
+    """Return what it changes in a covariance that some errors are shared by all centres.
+
+    Parameters
+    ----------
+    scene : Scene
+        Sigmas of what all ranges are too long, and all centres too high.
+    variances : (..., k)
+        How much of each centre's variance is shared, ``scene.shared`` [m^2].
+    of_ranges : (..., k, a)
+        How far a unit of each centre's range moves what was estimated.
+    of_heights : (..., a)
+        The same of all heights together.
+
+    Returns
+    -------
+    (..., a, a)
+        To be added.
+
+    Notes
+    -----
+    An error of all ranges is partly in the covariance of each centre, as if it were its own; an
+    error of all heights is not. The estimate is the same: only how sure it is, changes.
+    """
+    together = of_ranges.sum(axis=-2)
+    shared = scene.sigma_range**2 * together[..., :, None] * together[..., None, :]
+    shared += scene.sigma_height**2 * of_heights[..., :, None] * of_heights[..., None, :]
+    return np.asarray(shared - np.swapaxes(of_ranges * variances[..., None], -1, -2) @ of_ranges)
 
 
 def spans_between(marks_site: Array, longest: float) -> Spans:

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from itertools import combinations
+from typing import NamedTuple
 
 import numpy as np
 
@@ -23,7 +24,7 @@ from pipelines.adjustment import (
 from pipelines.config import ResectionConfig
 from pipelines.errors import DegenerateGeometryError, NotConvergedError
 from pipelines.geometry import included_angle, is_on_a_line, rigid, rot_z, skew
-from pipelines.matching import Match, Scene
+from pipelines.matching import Match, Scene, cov_of_shared
 from pipelines.values import Array, Exclusion, Index, Mask, StationFix, Status
 
 Measure = Callable[[Array], tuple[Array, Array]]
@@ -32,6 +33,25 @@ Measure = Callable[[Array], tuple[Array, Array]]
 _LOOSE = 0.1  # [m] a position that is worse than this is weak
 _FAINT = 0.05  # change of distances, RMS, by a unit of way that they cannot tell
 _STEEP = 0.9  # of a way that is nearly the vertical
+
+
+class Influences(NamedTuple):
+    """What each marker adds to the gradient of a position from distances.
+
+    Attributes
+    ----------
+    noise : (k, 3, 3)
+        Its covariance by the errors of centre and mark alone.
+    ranges, heights : (k, 3)
+        The gradient by a unit of the centre's range, and of its height.
+    leans : (k, 3, 2)
+        The gradient by a sigma of roll and of pitch.
+    """
+
+    noise: Array
+    ranges: Array
+    heights: Array
+    leans: Array
 
 
 def slope_ranges(v: Array) -> tuple[Array, Array]:
@@ -191,6 +211,39 @@ def observe_distances(measure: Measure, scene: Scene, pairs: Index, p: Array) ->
     return Observations(residuals=measured - computed, J=by_mark, cov=cov)
 
 
+def influences(measure: Measure, scene: Scene, pairs: Index, p: Array) -> Influences:
+    """Return what errors of each marker add to the gradient of a position from distances.
+
+    Parameters
+    ----------
+    measure : callable
+        ``circles`` or ``slope_ranges``.
+    scene : Scene
+        Centres and marks.
+    pairs : (k, 2)
+        Places among centres and marks.
+    p : (3,)
+        The position, relative to the middle of the marks [m].
+
+    Returns
+    -------
+    Influences
+        To be summed over the markers of a position and turned by its covariance.
+    """
+    levelled, cov_levelled = _levelled(scene, pairs)
+    seen, (_, by_centre) = observe_distances(measure, scene, pairs, p), measure(levelled)
+    pull = np.swapaxes(seen.J, -1, -2) @ np.linalg.inv(seen.cov)
+    of_centre, of_mark = pull @ by_centre, pull @ seen.J
+    own = of_centre @ cov_levelled @ np.swapaxes(of_centre, -1, -2)
+    own += of_mark @ scene.cov_marks[pairs[:, 1]] @ np.swapaxes(of_mark, -1, -2)
+    return Influences(
+        noise=own,
+        ranges=(of_centre @ _lines(levelled)[..., None])[..., 0],
+        heights=of_centre[..., 2],
+        leans=scene.sigma_level * of_centre @ _leaned(levelled),
+    )
+
+
 def _levelled(scene: Scene, pairs: Index) -> tuple[Array, Array]:
     """Return centres and their covariances in the measured levelled frame."""
     R = scene.R_station_base
@@ -240,7 +293,10 @@ def _pose(
     effects[1, :, 0] += weights[:, None] * by_mark
     covs = np.stack([cov_levelled, scene.cov_marks[pairs[:, 1]]])
     cov = np.einsum("ekab,ekbc,ekdc->ad", effects, covs, effects)
-    cov += _cov_shared(scene, scene.shared[pairs[:, 0]], levelled, effects[0])
+    of_ranges = (effects[0] @ _lines(levelled)[..., None])[..., 0]
+    cov += cov_of_shared(
+        scene, scene.shared[pairs[:, 0]], of_ranges, effects[0, ..., 2].sum(axis=0)
+    )
     lean = np.zeros((6, 2))  # of the measured levelling
     lean[2:] = -np.einsum("kab,kbc->ac", effects[0], _leaned(levelled))
     lean[:2] = -rot_z(yaw)[:2, :2]
@@ -250,18 +306,9 @@ def _pose(
     return yaw, full + scene.sigma_level**2 * lean @ lean.T
 
 
-def _cov_shared(scene: Scene, variances: Array, levelled: Array, effects: Array) -> Array:
-    """Return what it changes in a covariance, (a, a), that some errors are shared by all centres.
-
-    ``effects``, (k, a, 3), are those of the levelled centres. An error of all ranges is partly in
-    the covariance of each centre, as if it were its own; an error of all heights is not.
-    """
-    lines = levelled / np.linalg.norm(levelled, axis=1, keepdims=True)
-    of_ranges, of_heights = np.einsum("kai,ki->ka", effects, lines), effects[:, :, 2].sum(axis=0)
-    together = of_ranges.sum(axis=0)
-    shared = scene.sigma_range**2 * np.outer(together, together)
-    shared += scene.sigma_height**2 * np.outer(of_heights, of_heights)
-    return np.asarray(shared - (of_ranges * variances[:, None]).T @ of_ranges)
+def _lines(v: Array) -> Array:
+    """Return the unit vectors of vectors."""
+    return np.asarray(v / np.linalg.norm(v, axis=-1, keepdims=True))
 
 
 def _azimuth_by_place(v: Array) -> Array:

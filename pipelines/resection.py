@@ -15,7 +15,15 @@ from pipelines.adjustment import Adjustment, adjust, external_reliabilities, sno
 from pipelines.config import ResectionConfig
 from pipelines.errors import ConfigError, DegenerateGeometryError, NoMarkersError
 from pipelines.geometry import included_angle, inverse, is_on_a_line, rigid, skew, transform
-from pipelines.matching import Match, Scene, gather, match_marks, moved, observe
+from pipelines.matching import (
+    Match,
+    Scene,
+    cov_of_shared,
+    gather,
+    match_marks,
+    moved,
+    observe,
+)
 from pipelines.ranging import fix_by_ranges
 from pipelines.values import (
     Array,
@@ -280,22 +288,14 @@ def _fix(
 
 
 def _cov_shared(scene: Scene, used: Index, adjustment: Adjustment[Array]) -> Array:
-    """Return what it changes in the covariance, (6, 6), that some errors are shared by all centres.
-
-    An error of all ranges is partly in the covariance of each centre, as if it were its own; an
-    error of all heights is not. The estimate is the same: only how sure it is, changes.
-    """
+    """Return what errors that all centres share change in the covariance of a motion, (6, 6)."""
     R, group = adjustment.estimate[:3, :3], adjustment.groups[0]
     p_base = scene.centres_base[used[:, 0]]
-    variances = scene.shared[used[:, 0]]
     lines = (p_base / np.linalg.norm(p_base, axis=1, keepdims=True)) @ R.T
     gains = adjustment.cov @ np.swapaxes(np.linalg.solve(group.cov, group.J), 1, 2)  # up to sign
-    of_ranges = np.einsum("npk,nk->np", gains, lines)
+    of_ranges = (gains @ lines[..., None])[..., 0]
     of_heights = gains.sum(axis=0) @ (R @ scene.R_station_base[2])
-    together = of_ranges.sum(axis=0)
-    shared = scene.sigma_range**2 * np.outer(together, together)
-    shared += scene.sigma_height**2 * np.outer(of_heights, of_heights)
-    return np.asarray(shared - (of_ranges * variances[:, None]).T @ of_ranges)
+    return cov_of_shared(scene, scene.shared[used[:, 0]], of_ranges, of_heights)
 
 
 def _cov_heading(scene: Scene, T_site_base: Array) -> Array:

@@ -18,8 +18,15 @@ import numpy as np
 from pipelines.config import ResectionConfig
 from pipelines.errors import ConfigError
 from pipelines.geometry import included_angle, rigid, skew
-from pipelines.matching import Scene, gather, observe
-from pipelines.ranging import Measure, circles, observe_distances, slope_ranges
+from pipelines.matching import Scene, cov_of_shared, gather, observe
+from pipelines.ranging import (
+    Influences,
+    Measure,
+    circles,
+    influences,
+    observe_distances,
+    slope_ranges,
+)
 from pipelines.values import Array, ControlMarks, Index, MarkerFits, Mask, StationFix, SubsetFixes
 
 SIZES = (2, 3)
@@ -182,8 +189,13 @@ def _by_pose(scene: Scene, matches: Index, chosen: Index, start: Array) -> Posit
     goals = scene.marks_site[matches[:, 1]] - t
     up, of_gravity = R @ scene.R_station_base[2], _inverses(gravity.cov[0])
     weights = _inverses(centres.cov)
-    found = place(q[chosen], goals[chosen], weights[chosen], up, of_gravity)
-    return found._replace(p=t + found.p)
+    found, cov = _placed(q[chosen], goals[chosen], weights[chosen], up, of_gravity)
+    pull = np.swapaxes(_by_motion(q), -1, -2) @ weights
+    by_range = (pull @ (q / np.linalg.norm(q, axis=1, keepdims=True))[..., None])[..., 0]
+    gain, variances = cov[:, :, 3:], scene.shared[matches[:, 0]]
+    of_heights = ((pull @ up)[chosen].sum(axis=1)[:, None] @ gain)[:, 0]
+    shared = cov_of_shared(scene, variances[chosen], by_range[chosen] @ gain, of_heights)
+    return found._replace(p=t + found.p, cov=found.cov + shared)
 
 
 def place(q: Array, goals: Array, weights: Array, up: Array, of_gravity: Array) -> Positions:
@@ -213,10 +225,17 @@ def place(q: Array, goals: Array, weights: Array, up: Array, of_gravity: Array) 
     pose; the gradient is exact, so that the steps end where the adjustment of each problem alone
     would.
     """
+    return _placed(q, goals, weights, up, of_gravity)[0]
+
+
+def _placed(
+    q: Array, goals: Array, weights: Array, up: Array, of_gravity: Array
+) -> tuple[Positions, Array]:
+    """Return positions, and the covariances of the motions that they come from, (s, 6, 6)."""
     cov = _inverses(_normal_matrices(q, weights, up, of_gravity))
     motions, last = np.zeros((len(q), 6)), np.zeros(len(q))
     _settle(q, goals, weights, up, of_gravity, cov, motions, last)
-    return Positions(motions[:, 3:], cov[:, 3:, 3:], last < _USABLE)
+    return Positions(motions[:, 3:], cov[:, 3:, 3:], last < _USABLE), cov
 
 
 @numba.njit(cache=True, nogil=True)
@@ -294,11 +313,16 @@ def _rotation(turn, R):  # type: ignore[no-untyped-def]  # noqa: ANN001, ANN202
 
 def _normal_matrices(q: Array, weights: Array, up: Array, of_gravity: Array) -> Array:
     """Return the normal matrices of small motions about the station, (s, 6, 6)."""
-    J = np.concatenate([-skew(q), np.broadcast_to(np.eye(3), (*q.shape, 3))], axis=-1)
+    J = _by_motion(q)
     N = np.asarray((np.swapaxes(J, -1, -2) @ weights @ J).sum(axis=1))
     J_up = -skew(up)[:2]
     N[:, :3, :3] += J_up.T @ of_gravity @ J_up
     return N
+
+
+def _by_motion(q: Array) -> Array:
+    """Return the derivative of vectors from the station by its small motions, (..., 3, 6)."""
+    return np.concatenate([-skew(q), np.broadcast_to(np.eye(3), (*q.shape, 3))], axis=-1)
 
 
 def _inverses(matrices: Array) -> Array:
@@ -333,7 +357,25 @@ def _by_distances(
     marks = scene.marks_site[matches[:, 1]]
     measured = seen.residuals + measure(marks - p_start)[0]
     weights = _inverses(seen.cov)
-    return meet(measure, marks[chosen], measured[chosen], weights[chosen], p_start)
+    found = meet(measure, marks[chosen], measured[chosen], weights[chosen], p_start)
+    cov = np.full_like(found.cov, np.inf)
+    good = np.isfinite(found.cov[:, 0, 0])
+    told = influences(measure, scene, matches, p_start)
+    cov[good] = _propagated(scene, matches, told, chosen[good], found.cov[good])
+    return found._replace(cov=cov)
+
+
+def _propagated(scene: Scene, matches: Index, told: Influences, chosen: Index, cov: Array) -> Array:
+    """Return the covariances of positions from distances, with what these have in common.
+
+    ``cov``, (s, 3, 3), are the inverses of the normal matrices.
+    """
+    leans = told.leans[chosen].sum(axis=1)
+    spread = told.noise[chosen].sum(axis=1) + leans @ np.swapaxes(leans, 1, 2)
+    of_heights = (told.heights[chosen].sum(axis=1)[:, None] @ cov)[:, 0]
+    variances = scene.shared[matches[:, 0]][chosen]
+    shared = cov_of_shared(scene, variances, told.ranges[chosen] @ cov, of_heights)
+    return np.asarray(cov @ spread @ cov + shared)
 
 
 def meet(

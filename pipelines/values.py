@@ -456,6 +456,9 @@ class MarkerFit:
         Mean angle between the used beams and the sphere's normals; NaN when not told [rad].
     variant : str
         Which form of its method ran, where it has several; else empty.
+    sigma_range_shared : float
+        How much of its error along the line of sight all centres of the stop have in common, as its
+        covariance has it; NaN when not told [m].
     """
 
     p_base: Array
@@ -476,6 +479,7 @@ class MarkerFit:
     coverage: float
     incidence: float = np.nan
     variant: str = ""
+    sigma_range_shared: float = np.nan
 
     def __post_init__(self) -> None:
         _seal(

@@ -92,6 +92,7 @@ def _fit(row: Row, levelling: Levelling) -> MarkerFit:
         coverage=_number(row["coverage"]),
         incidence=np.radians(_number(row["incidence_deg"])),
         variant=row["variant"] or "",
+        sigma_range_shared=_number(row["sigma_range_shared_m"]),
     )
 
 

@@ -77,6 +77,7 @@ _SCHEMAS = {
         **_ERROR,
         "error_radial_m": _REAL,
         "error_3d_m": _REAL,
+        "sigma_range_shared_m": _REAL,
     },
     "rejections": {**_FIT, **_PLACE, "n_points": _WHOLE, "reason": _TEXT},
     "station_fixes": {
@@ -357,6 +358,7 @@ def _fit_row(fit: MarkerFit, R_station_base: Array, sigma_heading: float) -> Row
         "mean_intensity": fit.mean_intensity,
         "incidence_deg": np.degrees(fit.incidence),
         "variant": fit.variant,
+        "sigma_range_shared_m": fit.sigma_range_shared,
     }
 
 

@@ -23,7 +23,7 @@ from pipelines.fitting.description import (
     weaknesses,
 )
 from pipelines.fitting.footprint import share_of_outline
-from pipelines.fitting.outline import outline_normals, softness
+from pipelines.fitting.outline import Outline, outline_normals, outline_of
 from pipelines.fitting.passes import (
     Linear,
     Normals,
@@ -123,6 +123,10 @@ class _State(NamedTuple):
         The same by class of reflectivity.
     cov_noise, cov_biases : (m, 3, 3)
         Covariances of the centres by noise and by biases [m^2].
+    by_bias : (m, 3, k)
+        How far a unit of each laser's bias moves each centre, with the sign turned.
+    cov_lasers : (k, k)
+        Covariance of the biases [m^2].
     """
 
     centres: Array
@@ -133,12 +137,14 @@ class _State(NamedTuple):
     factors: Array
     cov_noise: Array
     cov_biases: Array
+    by_bias: Array
+    cov_lasers: Array
 
 
-class _Outline(NamedTuple):
-    """How softly the outline of all spheres ends; what each return says of it, (n, 2)."""
+class _Bounds(NamedTuple):
+    """How returns end at the outline, once that is known; what each says of it, (n, 2)."""
 
-    softness: float
+    outline: Outline | None
     sites: Array
 
 
@@ -229,9 +235,10 @@ def _fit(
     shots = _gather(cloud, found.candidates, config)
     rough = np.array([c.p_base_rough for c in found.candidates])
     estimate = _estimate(shots, rough, radius, asks_outline=asks_outline)
-    free = np.column_stack(_free_radii(shots, estimate, radius)).tolist()
+    told = [*_free_radii(shots, estimate, radius), _sigmas_shared(estimate.state)]
+    rows = np.column_stack(told).tolist()
     results = [
-        _judged(shots, estimate, k, candidate, tuple(free[k]), radius)
+        _judged(shots, estimate, k, candidate, tuple(rows[k]), radius)
         for k, candidate in enumerate(found.candidates)
     ]
     fits = tuple(r for r in results if isinstance(r, MarkerFit))
@@ -295,15 +302,15 @@ def _normals(shots: _Shots, estimate: _Estimate) -> Normals:
 
 
 def _bounded(
-    shots: _Shots, estimate: _Estimate, radius: float, N: Normals, known: _Outline
-) -> tuple[Normals, _Outline]:
+    shots: _Shots, estimate: _Estimate, radius: float, N: Normals, known: _Bounds
+) -> tuple[Normals, _Bounds]:
     """Return normal equations with what the outline adds, and what was learnt of it."""
     state = estimate.state
-    of_returns = (shots.rows, estimate.linear, estimate.weights, state.cov_noise + state.cov_biases)
-    soft = known.softness or softness(*of_returns, radius)
-    centres, pull_centres, sites = outline_normals(*of_returns, (radius, soft), known.sites)
+    met = (shots.rows, estimate.linear, estimate.weights, state.cov_noise + state.cov_biases)
+    outline = known.outline or outline_of(*met, radius)
+    centres, pull_centres, sites = outline_normals(*met, outline, known.sites)
     added = N._replace(centres=N.centres + centres, pull_centres=N.pull_centres + pull_centres)
-    return added, _Outline(soft, sites)
+    return added, _Bounds(outline, sites)
 
 
 def _stepped(state: _State, N: Normals, prior: Array, radius: float) -> _State:
@@ -329,7 +336,22 @@ def _stepped(state: _State, N: Normals, prior: Array, radius: float) -> _State:
         spread=spread if state.has_biases else prior,
         cov_noise=np.asarray(_EFFICIENCY * inverse, dtype=np.float64),
         cov_biases=by_bias @ cov_biases @ by_bias.transpose(0, 2, 1),
+        by_bias=by_bias,
+        cov_lasers=cov_biases,
     )
+
+
+def _sigmas_shared(state: _State) -> Array:
+    """Return how much of each centre's error along its line of sight all have in common [m].
+
+    That is what biases of lasers make it agree with the other centres in: the mean covariance.
+    """
+    lines = state.centres / np.linalg.norm(state.centres, axis=1, keepdims=True)
+    pulls = np.einsum("mi,mik->mk", lines, state.by_bias)
+    cov = pulls @ state.cov_lasers @ pulls.T
+    own = np.diag(cov)
+    together = (cov.sum(axis=1) - own) / (len(cov) - 1) if len(cov) > 1 else own
+    return np.asarray(np.sqrt(np.maximum(together, 0.0)))
 
 
 def _shortened(steps: Array, radius: float) -> Array:
@@ -350,9 +372,11 @@ def _estimate(shots: _Shots, rough: Array, radius: float, *, asks_outline: bool)
         factors=np.full(len(_SIGMAS), _FACTOR_START),
         cov_noise=nothing + (_ROUGH * radius) ** 2 * np.eye(3),
         cov_biases=nothing,
+        by_bias=np.zeros((len(rough), 3, len(shots.sigma_biases))),
+        cov_lasers=np.diag(shots.sigma_biases**2),
     )
     is_in = np.ones(len(shots.members), dtype=bool)
-    outline = _Outline(softness=0.0, sites=np.zeros((len(shots.members), 2)))
+    bounds = _Bounds(outline=None, sites=np.zeros((len(shots.members), 2)))
     for step in range(_N_STEPS):
         linear = _linear(shots, state, is_in, radius)
         if step < _N_STEPS_GATED:
@@ -361,7 +385,7 @@ def _estimate(shots: _Shots, rough: Array, radius: float, *, asks_outline: bool)
         state = estimate.state._replace(has_biases=step >= _N_STEPS_GATED)
         N = _normals(shots, estimate)
         if asks_outline and step >= _N_STEPS_RANGES:
-            N, outline = _bounded(shots, estimate, radius, N, outline)
+            N, bounds = _bounded(shots, estimate, radius, N, bounds)
         state = _stepped(state, N, shots.sigma_biases, radius)
     return _weighed(shots, state, _linear(shots, state, is_in, radius), is_in)
 
@@ -460,10 +484,13 @@ def _judged(
     estimate: _Estimate,
     k: int,
     candidate: MarkerCandidate,
-    free: tuple[float, float],
+    told: tuple[float, float, float],
     radius: float,
 ) -> MarkerFit | Rejection:
-    """Return one candidate's fit with its diagnostics, or the reason why there is none."""
+    """Return one candidate's fit with its diagnostics, or the reason why there is none.
+
+    ``told`` are its free radius, the sigma of that, and the error of range that all share [m].
+    """
     mine = slice(*shots.rows.firsts[k : k + 2])
     used = np.arange(mine.start, mine.stop)[estimate.weights[mine] > 0.0]
     p, n_used = estimate.state.centres[k], len(used)
@@ -481,8 +508,8 @@ def _judged(
         status=Status.OK,
         reason="",
         radius=radius,
-        radius_free=free[0],
-        sigma_radius_free=free[1],
+        radius_free=told[0],
+        sigma_radius_free=told[1],
         mean_range=float(np.linalg.norm(table.origins_base[used].mean(axis=0) - p)),
         mean_intensity=float(table.intensities[used].mean()),
         used=shots.members[used],
@@ -495,6 +522,7 @@ def _judged(
         ),
         incidence=incidence(offsets, radius),
         variant="" if n_rings else WITHOUT_RINGS,
+        sigma_range_shared=told[2],
     )
     weakness = _weakness(fit, estimate.state.factor)
     return replace(fit, status=Status.WEAK, reason=weakness) if weakness else fit

@@ -152,7 +152,10 @@ def assemble(
     network = _network(scans, found, used, doubts)
     cov_p_base = network.cov_p_base + config.sigma_common**2 * np.eye(3)
     if calibration is None:
-        cov_p_base = _own(network.p_base, cov_p_base, config)
+        fits = {name: found_there.fits for name, found_there in scans}
+        rows = zip(network.sightings[:, 0], network.fits, strict=True)
+        told = [fits[network.stations[i]][fit].sigma_range_shared for i, fit in rows]
+        cov_p_base = _own(network.p_base, cov_p_base, np.array(told), config)
     network = replace(
         network,
         cov_p_base=cov_p_base,
@@ -382,10 +385,10 @@ def _network(
     )
 
 
-def _own(p_base: Array, cov_p_base: Array, config: ResectionConfig) -> Array:
+def _own(p_base: Array, cov_p_base: Array, told: Array, config: ResectionConfig) -> Array:
     """Return the covariances of centres without the error of range that all of them share."""
     v = p_base / np.linalg.norm(p_base, axis=1, keepdims=True)
-    variances = shared_variances(p_base, cov_p_base, config)
+    variances = shared_variances(p_base, cov_p_base, told, config)
     return np.asarray(cov_p_base - variances[:, None, None] * v[:, :, None] * v[:, None, :])
 
 

@@ -211,6 +211,20 @@ def test_laser_biases_are_seen_and_taken_off():
     assert spread(knowing) < 0.8 * spread(blind)
 
 
+def test_the_error_of_range_that_all_centres_share_is_told():
+    rng = np.random.default_rng(21)
+
+    def told(bias):
+        draw, _ = stop_of(rng, 8.0, 8, sigma=0.006, bias=bias)
+        fits = fit_markers("along_beam", *draw(rng), CONFIG, RADIUS).fits
+        return np.array([fit.sigma_range_shared for fit in fits])
+
+    rough, even = told(0.01), told(0.0)
+    # a mean over at most 16 lasers of 10 mm each; how far they spread is known to a fifth
+    assert np.all((0.7 * 0.01 / 4.0 < rough) & (rough < 1.8 * 0.01 / 4.0))
+    assert even.max() < 0.4 * rough.min()
+
+
 def test_three_returns_are_refused_with_the_reason():
     shots, ranges = returns(*marker_shots(CENTRE, np.random.default_rng(1)))
     cloud = cloud_of(shots.take(slice(40, 43)), ranges[40:43])

@@ -245,6 +245,23 @@ def test_what_all_ranges_are_too_long_is_found_where_control_tells(rng):
     assert total == pytest.approx(result.dof, abs=1e-6)
 
 
+def test_only_what_centres_say_that_they_share_is_taken_from_their_own_variances(rng):
+    marks = field(rng)
+    scans, _ = survey(rng, marks, 3)
+    shared = 0.4 * SIGMA
+    told = [
+        (name, replace(fits, fits=tuple(replace(f, sigma_range_shared=s) for f in fits.fits)))
+        for (name, fits), s in zip(scans, (0.0, shared, np.nan), strict=True)
+    ]
+    config = replace(CONFIG, sigma_range_shared=0.5 * SIGMA)
+    found = assemble(told, marks, config)
+    lines = found.p_base / np.linalg.norm(found.p_base, axis=1, keepdims=True)
+    along = np.einsum("ni,nij,nj->n", lines, found.cov_p_base, lines)
+    of_station = found.sightings[:, 0]
+    for station, taken in enumerate((0.0, shared, 0.5 * SIGMA)):
+        np.testing.assert_allclose(along[of_station == station], SIGMA**2 - taken**2, rtol=1e-6)
+
+
 def test_one_station_with_control_is_a_free_station(rng):
     marks = field(rng)
     loose = replace(marks, cov_p_site=np.tile(np.eye(3) * 2e-3**2, (14, 1, 1)))

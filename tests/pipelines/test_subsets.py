@@ -119,6 +119,36 @@ def test_predicted_sigmas_are_the_spread_of_the_errors(rng, method):
     assert np.allclose(2.0 * np.mean(ratios, axis=0), 1.0, atol=0.15)
 
 
+@pytest.mark.parametrize("method", ["free_station", "paper"])
+def test_errors_that_all_centres_share_are_in_the_predicted_sigmas_as_shared(rng, method):
+    bias, height, own, lean = 3e-3, 3e-3, 3e-3, 1e-3  # [m] and [rad]
+    config = replace(
+        CONFIG, sigma_range=bias, sigma_range_shared=bias, sigma_height=height, test_level=1e-6
+    )
+    marks, T, flat, upright = field(rng, 6), pose([0.5, -0.4, -0.2], 2.2), [], []
+    towards = (marks.p_site - T[:3, 3]) @ T[:3, :3]
+    towards /= np.linalg.norm(towards, axis=1, keepdims=True)
+    cov = own**2 * np.eye(3) + bias**2 * towards[:, :, None] * towards[:, None, :]
+    for _ in range(150):
+        noise = rng.normal(0, own, (6, 3)) + rng.normal(0, bias) * towards
+        noise[:, 2] += rng.normal(0, height)
+        found = seen(
+            marks, T, method, config=config, lean=tuple(rng.normal(0, lean, 2)),
+            sigma_level=lean, cov=cov, noise=noise,
+        )  # fmt: skip
+        off = [one.p_site - T[:3, 3] for one in found]
+        rows = list(zip(off, found, strict=True))
+        flat.append(
+            [np.mean(np.sum(d[:, :2] ** 2, axis=1) / x.sigma_horizontal**2) for d, x in rows]
+        )
+        upright.append(
+            [np.mean(d[:, 2] ** 2 / (x.sigma_3d**2 - x.sigma_horizontal**2)) for d, x in rows]
+        )
+    # as if every centre had them for itself: 0.6 to 1.2 in the plane, 1.5 to 2.5 upright
+    for ratios in (flat, upright):
+        np.testing.assert_allclose(np.mean(ratios, axis=0), 1.0, atol=0.2)
+
+
 def test_a_third_mark_never_makes_the_prediction_worse(rng):
     pairs, triples = seen(field(rng), pose(STAND, 2.2))
     of_pair = {tuple(m): s for m, s in zip(pairs.marks.tolist(), pairs.sigma_3d, strict=True)}

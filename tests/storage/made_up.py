@@ -82,7 +82,8 @@ def fits(method, shift, points, rng):
         used, rejected = members[:-2], members[-2:]
         residuals = rng.normal(size=len(used)) * 0.01
         fit = marker_fit(centre + shift, one)
-        found.append(replace(fit, method=method, used=used, rejected=rejected, residuals=residuals))
+        told = {"used": used, "rejected": rejected, "residuals": residuals}
+        found.append(replace(fit, method=method, sigma_range_shared=7e-4, **told))
     false = marker_fit(np.array([0.0, 0.0, 9.0]), np.eye(3) * 1e-4)
     found.append(
         replace(
