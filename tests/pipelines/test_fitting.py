@@ -221,7 +221,7 @@ def test_the_error_of_range_that_all_centres_share_is_told():
 
     rough, even = told(0.01), told(0.0)
     # a mean over at most 16 lasers of 10 mm each; how far they spread is known to a fifth
-    assert np.all((0.7 * 0.01 / 4.0 < rough) & (rough < 1.8 * 0.01 / 4.0))
+    assert np.all((rough > 0.7 * 0.01 / 4.0) & (rough < 1.8 * 0.01 / 4.0))
     assert even.max() < 0.4 * rough.min()
 
 
