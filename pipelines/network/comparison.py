@@ -15,6 +15,7 @@ from pipelines.values import Array, Index, Mask, Truth
 _NEAR = 0.15  # [m] a mark of a network may be from the true mark that it is
 _N_DATUM = 6  # place and attitude, which only control and levelling give
 _N_MARKS = 3
+_EXACT = 1e-4  # [m] 3-D sigma below which a mark was given, not found
 
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
@@ -33,7 +34,8 @@ class NetworkErrors:
         Estimate minus truth, moved with the marks [m]; NaN where it is unknown.
     nees_marks, nees_stations : float
         Normalised squared error per degree of freedom, all together with their joint covariance,
-        place and attitude projected out; about 1 where the covariance is honest.
+        place and attitude projected out; about 1 where the covariance is honest. Without the marks
+        that were given as exact; NaN where too few are left.
     """
 
     marks: Index
@@ -97,12 +99,13 @@ def compare(result: AdjustedNetwork, truth: Truth) -> NetworkErrors:
     goals = [T_true[n][:3, 3] for n in result.network.stations if n in T_true]
     error_stations[is_known] = p[is_known] - transform(back, np.array(goals))
     joint, s = result.cov_positions, len(p)
+    is_open = np.trace(result.mark_covariances[found], axis1=1, axis2=2) > _EXACT**2
     return NetworkErrors(
         marks=marks,
         error_marks=error_marks,
         stations=is_known,
         error_stations=error_stations,
-        nees_marks=_nees(error_marks, result.p_site, joint[3 * s :, 3 * s :], found),
+        nees_marks=_nees(error_marks, result.p_site, joint[3 * s :, 3 * s :], found[is_open]),
         nees_stations=_nees(error_stations, p, joint, np.flatnonzero(is_known)),
     )
 

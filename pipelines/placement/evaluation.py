@@ -93,7 +93,7 @@ def evaluate(
         angles=_angles(eyes, marks.p_site, positions.used),
         dop=_dilution(eyes, marks.p_site, positions),
         n_used=n_used,
-        dof=(2 * n_used - 3 if wish.method == "paper" else 3 * n_used - 4).astype(np.intp),
+        dof=np.maximum(2 * n_used - 3 if wish.method == "paper" else 3 * n_used - 4, 0),
         redundancies=tested.redundancies,
         detectable_biases=tested.detectable_biases,
         external_reliabilities=tested.external,

@@ -347,7 +347,7 @@ class Evaluation:
     n_used : (s,)
         Marks that carry the position: all that are found, or the three whose circles cut best.
     dof : (s,)
-        Observations minus unknowns; negative where there are too few.
+        Observations minus unknowns; 0 also where there are too few.
     redundancies : (s, n)
         Redundancy of each mark's coordinates together, 0 to 3; 0 for a mark that is not used.
     detectable_biases : (s, n)

@@ -10,7 +10,7 @@ from pipelines.errors import TruthError
 from pipelines.network import adjust_network, assemble, compare
 from pipelines.simulation import SimulationConfig, scenario, simulate_stop
 from pipelines.survey import process
-from pipelines.values import StopTruth, Truth
+from pipelines.values import ControlMarks, StopTruth, Truth
 from tests.synthetic import control, field, pose, sightings
 
 CONFIG = SurveyConfig.from_mapping({"fitting": {"methods": ["along_beam"]}})
@@ -22,9 +22,8 @@ def truth_of(marks, poses):
     return Truth(marks=marks, stops=stops, rig=None)
 
 
-@pytest.fixture
-def small():
-    """A network of three stations with noise, and its truth."""
+def small_survey(with_control=None):
+    """A network of three stations with noise, on some marks as control or free, and its truth."""
     rng = np.random.default_rng(3)
     marks = field(rng)
     poses = {f"S{i}": pose(rng.uniform(-3, 3, 3), rng.uniform(-3, 3)) for i in range(3)}
@@ -32,9 +31,21 @@ def small():
         (name, sightings(marks, T, noise=rng.normal(0, 4e-3, (14, 3))))
         for name, T in poses.items()
     ]  # fmt: skip
-    return adjust_network(assemble(scans, None, CONFIG.resection), CONFIG.resection), truth_of(
-        marks, poses
+    given = None if with_control is None else marks_of(marks, with_control)
+    network = assemble(scans, given, CONFIG.resection)
+    return adjust_network(network, CONFIG.resection), truth_of(marks, poses)
+
+
+def marks_of(marks, n):
+    """The first marks, as exact control."""
+    return ControlMarks(
+        names=marks.names[:n], p_site=marks.p_site[:n], cov_p_site=np.zeros((n, 3, 3))
     )
+
+
+@pytest.fixture
+def small():
+    return small_survey()
 
 
 def test_a_network_compares_alike_with_a_truth_that_was_moved(small):
@@ -48,6 +59,13 @@ def test_a_network_compares_alike_with_a_truth_that_was_moved(small):
     assert there.nees_marks == pytest.approx(here.nees_marks, rel=1e-6)
     assert 1e-3 < here.rms_marks < 6e-3
     assert 0.3 < here.nees_marks < 2.0
+
+
+def test_marks_that_were_given_as_exact_say_nothing_of_the_covariance():
+    whole, part = (compare(*small_survey(n)) for n in (14, 5))
+    assert np.isnan(whole.nees_marks)
+    assert np.isfinite(whole.nees_stations)
+    assert 0.3 < part.nees_marks < 2.0
 
 
 def test_a_mark_that_is_none_is_called_false(small):
