@@ -89,7 +89,8 @@ def rivals(look: Look, seen: Array, spread: float, ball: Ball, noise: float) -> 
     by the area that they might have filled. The edge of an outline is that of wide beams, whose
     place is known only so well. Ranges are those to the part of a beam that is on the shape.
     """
-    return Rivals(*_compared(seen / ball.radius, _blur(look, ball), noise / ball.radius, spread))
+    found = _compared(seen / ball.radius, _blur(look, ball), noise / ball.radius, spread)
+    return Rivals(found[0], found[1], found[2] * ball.radius, found[3] * ball.radius)
 
 
 def _blur(look: Look, ball: Ball) -> float:

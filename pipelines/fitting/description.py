@@ -9,6 +9,7 @@ import numpy as np
 
 from pipelines.fitting.footprint import predict, share_of_outline
 from pipelines.fitting.radius import other_radius, own_radius
+from pipelines.geometry import levelling_rotation
 from pipelines.stitching import beams
 from pipelines.values import (
     RING_UNKNOWN,
@@ -32,6 +33,7 @@ WITHOUT_RINGS = "rings unknown: laser heights and biases not applied"
 """What is said of a fit to returns without rings."""
 
 _SEGMENT = 1.35  # radii about the rough centre within which a return may be the sphere
+_NEARBY = 1.6  # the same where the radius is asked, which may be larger
 
 Fits = tuple[tuple[MarkerFit, ...], tuple[Rejection, ...]]
 
@@ -61,7 +63,9 @@ def each(
     return fits, tuple(r for r in results if isinstance(r, Rejection))
 
 
-def on_sphere(cloud: StitchedCloud, candidate: MarkerCandidate, radius: float) -> Index:
+def on_sphere(
+    cloud: StitchedCloud, candidate: MarkerCandidate, radius: float, reach: float = _SEGMENT
+) -> Index:
     """Return a candidate's rows that may be its sphere by their place.
 
     Parameters
@@ -72,6 +76,8 @@ def on_sphere(cloud: StitchedCloud, candidate: MarkerCandidate, radius: float) -
         A group of returns.
     radius : float
         Radius of the spheres [m].
+    reach : float
+        How far from the rough centre, in radii.
 
     Returns
     -------
@@ -81,7 +87,7 @@ def on_sphere(cloud: StitchedCloud, candidate: MarkerCandidate, radius: float) -
     away = np.linalg.norm(
         cloud.p_base[candidate.members].astype(np.float64) - candidate.p_base_rough, axis=1
     )
-    return np.asarray(candidate.members[away < _SEGMENT * radius])
+    return np.asarray(candidate.members[away < reach * radius])
 
 
 def refused(candidate: MarkerCandidate, reason: str) -> Rejection:
@@ -144,7 +150,8 @@ def described(
     n_rings = len(np.unique(rings))
     coverage = share_of_outline(shots.directions_base, shots.across_base, found.offsets, radius)
     residuals = shots.ranges - found.ranges
-    own = own_radius(beams(cloud, on_sphere(cloud, candidate, radius)), radius)
+    nearby = beams(cloud, on_sphere(cloud, candidate, radius, _NEARBY))
+    own = own_radius(nearby, radius, levelling_rotation(cloud.levelling)[2])
     variants = (known.get("variant"), "" if n_rings else WITHOUT_RINGS)
     fields: dict[str, Any] = {
         "radius_free": own[0],

@@ -10,16 +10,19 @@ from typing import NamedTuple
 
 import numpy as np
 
-from pipelines.fitting.passes import Rows, linearise, normals_of, rows_of
-from pipelines.values import Array, Beams
+from pipelines.fitting.passes import Linear, Rows, in_play, linearise, normals_of, rows_of
+from pipelines.values import Array, Beams, Mask
 
+_ASKED = 1.0  # standard deviations of one step, beyond which the greatest likelihood is sought
+_BETTER, _BETTER_OWN = 9.0, 14.0  # by which it must be greater, as a chi-square; noise unknown
+_CLIP = 9.0  # squared standard deviations beyond which a residual is a stray
+_WEAK_PRIOR = 5.0  # radii: the same as the prior where it only keeps equations solvable
 _N_STEPS = 8
 _SETTLED = 1e-4  # [m] of a step: what is asked is millimetres
 _STEP_MAX = 0.25  # radii per step
 _PRIOR = 0.5  # radii: standard deviation of centre and radius that no return tells
+_MARGIN = 0.1  # radii by which a footprint may pass a sphere by and still be its own
 _START = 0.1  # radii by which a centre may be off per axis
-_INFLATION = 1.5  # what few returns add to the variance of a free radius: 1 + this exp(-n /
-_RETURNS = 100.0  # this), by Monte Carlo
 _SIGMA_MAX, _RADIUS_MAX = 0.4, 5.0  # radii: what is worse or larger is no answer
 _N_ROUNDS = 3
 _SPAN_MIN = 0.001  # [m] returns that lie in one place have no span
@@ -27,7 +30,7 @@ _OUTERMOST = 1.2  # radii over the ninth tenth of the returns' distances from th
 _NORMAL = 1.4826  # standard deviation of a normal spread over its median of absolute values
 _SCATTER_MIN = 0.001  # [m] 2 mm quantisation alone gives as much
 _STRAY_SIGMAS = 4.0
-_SIGMAS = 3.5  # by which a free radius may be off, and
+_SIGMAS = 3.0  # by which a free radius may be off, and
 _SLACK = 0.006  # [m] by which it may whatever its sigma
 
 
@@ -61,9 +64,9 @@ def free_radii(
     weighing : Weighing
         What is known of their ranges.
     spheres : (m, 4)
-        Centres and radii to start from [m].
+        Centres fitted with radii that are assumed, and these [m].
     covs : (m, 4, 4)
-        How well these are known [m^2].
+        How well the centres are known; of the radii nothing is asked [m^2].
     n_lasers : int
         Lasers that ``rows`` tells apart.
 
@@ -71,22 +74,78 @@ def free_radii(
     -------
     radii, sigmas : (m,)
         Both NaN where the returns do not tell [m].
+
+    Notes
+    -----
+    One step of Gauss and Newton from the assumed radius (Rao's score): linear in the noise, so that
+    it is unbiased and its sigma holds if the assumption is true, however few returns there are.
+    The radius of greatest likelihood is not: small spheres look precise. The sigma is that of the
+    step by the noise alone (a sandwich). Where the greatest likelihood is so much greater that the
+    assumption must be wrong, its radius is the answer.
     """
-    found, covs = _free(rows, weighing, spheres, covs, n_lasers)
+    radii, sigmas = _stepped(rows, weighing, spheres, covs, n_lasers)
     radius = spheres[:, 3]
-    counts = np.diff(np.cumsum(np.r_[0, weighing.weights > 0.0])[rows.firsts])
-    inflation = 1.0 + _INFLATION * np.exp(-counts / _RETURNS)
-    radii, sigmas = found[:, 3], np.sqrt(inflation * covs[:, 3, 3])
+    is_asked = np.abs(radii - radius) > _ASKED * sigmas
+    if is_asked.any():
+        wide = _with_radius(covs, np.trace(covs[:, :3, :3], axis1=1, axis2=2))
+        found, known = _free(rows, weighing, spheres, wide, n_lasers, is_asked)
+        misfits = [_misfits(rows, weighing, which, covs) for which in (spheres, found)]
+        is_far = is_asked & (misfits[0] - misfits[1] > _BETTER)
+        radii = np.where(is_far, found[:, 3], radii)
+        sigmas = np.where(is_far, np.sqrt(known[:, 3, 3]), sigmas)
+    return _known(radii, sigmas, radius)
+
+
+def _known(radii: Array, sigmas: Array, radius: Array) -> tuple[Array, Array]:
+    """Return radii with sigmas, NaN where these say that nothing is known."""
     is_known = (sigmas < _SIGMA_MAX * radius) & (radii < _RADIUS_MAX * radius) & (radii > 0.0)
     return np.where(is_known, radii, np.nan), np.where(is_known, sigmas, np.nan)
 
 
-def _free(
+def _with_radius(covs: Array, variances: Array | float) -> Array:
+    """Return covariances of centres as such of spheres, with a variance of the radius."""
+    wide = np.zeros((len(covs), 4, 4))
+    wide[:, :3, :3] = covs[:, :3, :3]
+    wide[:, 3, 3] = variances
+    return wide
+
+
+def _stepped(
     rows: Rows, weighing: Weighing, spheres: Array, covs: Array, n_lasers: int
 ) -> tuple[Array, Array]:
-    """Return centres with radii, (m, 4), and their covariances; what has settled stays."""
-    radius, counts = spheres[:, 3], np.diff(rows.firsts)
-    moves = np.ones(len(spheres), dtype=bool)
+    """Return radii one step from those that are assumed, and their standard deviations."""
+    is_in, square = weighing.weights > 0.0, spheres[:, 3, None, None] ** -2.0 * np.eye(4)
+    residuals = weighing.ranges - linearise(rows, spheres, _with_radius(covs, 0.0), is_in).ranges
+
+    def summed(wide: Array) -> tuple[Array, Array, Array]:
+        linear = linearise(rows, spheres, wide, is_in)
+        per_square = weighing.weights / (weighing.variances + linear.bends**2)
+        N, _, _, pull, _ = normals_of(rows, linear, residuals, per_square, (4, n_lasers))
+        noise = per_square**2 * weighing.variances
+        return N, pull, normals_of(rows, linear, residuals, noise, (4, n_lasers))[0]
+
+    rough = _with_radius(covs, np.trace(covs[:, :3, :3], axis1=1, axis2=2))
+    cov = np.linalg.inv(summed(rough)[0] + square / _PRIOR**2)
+    N, pull, of_noise = summed(np.asarray(cov, dtype=np.float64))
+    by_pull = np.linalg.inv(N + square / _WEAK_PRIOR**2)
+    radii = spheres[:, 3] + np.einsum("mj,mj->m", by_pull[:, 3], pull)
+    return radii, np.sqrt((by_pull @ of_noise @ by_pull)[:, 3, 3])
+
+
+def _misfits(rows: Rows, weighing: Weighing, spheres: Array, covs: Array) -> Array:
+    """Return the sums of squared residuals in units of the noise, strays counting as such."""
+    is_in = weighing.weights > 0.0
+    linear = linearise(rows, spheres, _with_radius(covs, 0.0), is_in)
+    square = (weighing.ranges - linear.ranges) ** 2 / weighing.variances
+    sums = np.cumsum(np.r_[0.0, weighing.weights * np.minimum(square, _CLIP)])
+    return np.asarray(np.diff(sums[rows.firsts]))
+
+
+def _free(
+    rows: Rows, weighing: Weighing, spheres: Array, covs: Array, n_lasers: int, moves: Mask
+) -> tuple[Array, Array]:
+    """Return centres with radii, (m, 4), and their covariances; some move until they settle."""
+    radius, counts, moves = spheres[:, 3], np.diff(rows.firsts), moves.copy()
     for _ in range(_N_STEPS):
         is_in = (weighing.weights > 0.0) & np.repeat(moves, counts)
         linear = linearise(rows, spheres, covs, is_in)
@@ -97,14 +156,14 @@ def _free(
         covs = np.where(moves[:, None, None], inverse, covs)
         limit = _STEP_MAX * radius[:, None]
         step = np.clip(np.einsum("mij,mj->mi", inverse, pull), -limit, limit)
-        spheres = spheres + step
+        spheres = np.where(moves[:, None], spheres + step, spheres)
         moves &= np.abs(step).max(axis=1) >= _SETTLED
         if not moves.any():
             break
     return spheres, covs
 
 
-def own_radius(shots: Beams, radius: float) -> tuple[float, float]:
+def own_radius(shots: Beams, radius: float, up: Array) -> tuple[float, float]:
     """Return the radius that one sphere's returns show, all with the same noise, and its sigma.
 
     Parameters
@@ -112,7 +171,9 @@ def own_radius(shots: Beams, radius: float) -> tuple[float, float]:
     shots : Beams
         Returns from the sphere, and perhaps some of its pole.
     radius : float
-        The radius that was assumed: nothing larger than five of it is an answer [m].
+        The radius that is assumed: nothing larger than five of it is an answer [m].
+    up : (3,)
+        Upward unit vector.
 
     Returns
     -------
@@ -121,24 +182,75 @@ def own_radius(shots: Beams, radius: float) -> tuple[float, float]:
 
     Notes
     -----
-    It starts with the sphere that the returns span, whatever was assumed: from a smaller one the
-    beams at the outline would be taken for such that pass by. The noise is that of the residuals,
-    and what is off by more than some sigmas has no weight: both are found again each round.
+    A centre is fitted with the radius that is assumed, then one step is made from it. Where that
+    says that another radius is true, it starts again with the sphere that the returns span: from a
+    smaller one the beams at the outline would be taken for such that pass by. The noise is that of
+    the residuals, and what is off by more than some sigmas has no weight: both are found again each
+    round.
     """
     n = len(shots.ranges)
     nothing = np.zeros(n, dtype=np.intp)
-    noise = (nothing, np.ones(n), 0.0)
-    rows = rows_of(shots, np.array([0, n]), np.array([0.0, 0.0, 1.0]), nothing, noise)
-    sphere = _spanned(shots)
-    covs = np.array([(_START * sphere[0, 3]) ** 2 * np.eye(4)])
-    weighing = _weighing(rows, sphere, covs)._replace(weights=np.ones(n))
-    for _ in range(_N_ROUNDS):
-        sphere, known = _free(rows, weighing, sphere, covs, 1)
-        if not 0.0 < sphere[0, 3] < _RADIUS_MAX * radius:
-            return float("nan"), float("nan")
-        weighing = _weighing(rows, sphere, known)
-    radii, sigmas = free_radii(rows, weighing, sphere, covs, 1)
+    rows = rows_of(shots, np.array([0, n]), up, nothing, (nothing, np.ones(n), 0.0))
+    spanned = _spanned(shots)
+    weighing, sphere, cov = _fitted(rows, spanned, radius)
+    radii, sigmas = _stepped(rows, weighing, sphere, cov, 1)
+    if np.abs(radii[0] - radius) > _ASKED * sigmas[0]:
+        own, known, gain = _own_spanned(rows, spanned, sphere)
+        if gain > _BETTER_OWN:
+            radii, sigmas = own[:, 3], np.sqrt(known[:, 3, 3])
+    radii, sigmas = _known(radii, sigmas, np.array([radius]))
     return float(radii[0]), float(sigmas[0])
+
+
+def _fitted(rows: Rows, spanned: Array, radius: float) -> tuple[Weighing, Array, Array]:
+    """Return weights, the sphere of a known radius that fits best, and its covariance."""
+    axis = rows.directions.mean(axis=0)
+    shift = 2.0 / 3.0 * (radius - spanned[0, 3]) / float(np.linalg.norm(axis))
+    sphere = np.array([[*(spanned[0, :3] + shift * axis), radius]])
+    cov = _with_radius((_START * radius) ** 2 * np.eye(3)[None], 0.0)
+    for _ in range(_N_STEPS):
+        linear = linearise(rows, sphere, cov)
+        weighing, residuals = _gated(rows, linear, radius)
+        per_square = weighing.weights / (weighing.variances + linear.bends**2)
+        N, _, _, pull, _ = normals_of(rows, linear, residuals, per_square, (3, 1))
+        inverse = np.linalg.inv(N + np.eye(3) / (_PRIOR * radius) ** 2)
+        limit = _STEP_MAX * radius
+        sphere[0, :3] += np.clip(inverse[0] @ pull[0], -limit, limit)
+        cov = _with_radius(inverse, 0.0)
+    return _gated(rows, linearise(rows, sphere, cov), radius)[0], sphere, cov
+
+
+def _gated(rows: Rows, linear: Linear, radius: float) -> tuple[Weighing, Array]:
+    """Return the weights of what lies on a sphere and not on its pole, and residuals."""
+    residuals = rows.ranges - linear.ranges
+    is_in = in_play(rows, linear.offsets, np.array([_MARGIN * radius]), radius)
+    sigma = _scatter(residuals[is_in])
+    is_in &= np.abs(residuals) < _STRAY_SIGMAS * sigma
+    variance = sigma**2 * is_in.sum() / max(is_in.sum() - 4.0, 1.0)
+    variances, weights = np.full(len(is_in), variance), is_in.astype(np.float64)
+    return Weighing(rows.ranges, variances, weights), residuals
+
+
+def _own_spanned(rows: Rows, own: Array, assumed: Array) -> tuple[Array, Array, float]:
+    """Return the sphere of greatest likelihood and its covariance, from that which returns span.
+
+    And by how much it explains them better than one of the assumed radius, as a chi-square: the
+    noise is not known.
+    """
+    known, moves = (_START * own[0, 3]) ** 2 * np.eye(4)[None], np.ones(1, dtype=bool)
+    for _ in range(_N_ROUNDS):
+        weighing = _gated(rows, linearise(rows, own, known), float(own[0, 3]))[0]
+        own, known = _free(rows, weighing, own, known, 1, moves)
+        own[0, 3] = np.clip(own[0, 3], _SPAN_MIN, 2.0 * _RADIUS_MAX * assumed[0, 3])
+    linear = linearise(rows, own, known)
+    weighing, residuals = _gated(rows, linear, float(own[0, 3]))
+    others = rows.ranges - linearise(rows, assumed, _with_radius(known, 0.0)).ranges
+    is_in, limit = weighing.weights > 0.0, _STRAY_SIGMAS**2 * weighing.variances
+    least = max(int(is_in.sum()), 1) * _SCATTER_MIN**2
+    worse, better = (
+        max(float(np.minimum(off**2, limit)[is_in].sum()), least) for off in (others, residuals)
+    )
+    return own, known, max(int(is_in.sum()) - 4, 0) * float(np.log(worse / better))
 
 
 def _spanned(shots: Beams) -> Array:
@@ -154,12 +266,11 @@ def _spanned(shots: Beams) -> Array:
     return np.array([[*(middle + 2.0 / 3.0 * radius * axis), radius]])
 
 
-def _weighing(rows: Rows, spheres: Array, covs: Array) -> Weighing:
-    """Return ranges with the noise that their residuals show, and weights."""
-    residuals = rows.ranges - linearise(rows, spheres, covs).ranges
-    sigma = max(_NORMAL * float(np.median(np.abs(residuals))), _SCATTER_MIN)
-    is_in = np.abs(residuals) < _STRAY_SIGMAS * sigma
-    return Weighing(rows.ranges, np.full(len(residuals), sigma**2), is_in.astype(np.float64))
+def _scatter(residuals: Array) -> float:
+    """Return the robust standard deviation of residuals [m]; the least if there are none."""
+    if not len(residuals):
+        return _SCATTER_MIN
+    return max(_NORMAL * float(np.median(np.abs(residuals))), _SCATTER_MIN)
 
 
 def other_radius(radius: float, radius_free: float, sigma: float) -> list[str]:
