@@ -178,8 +178,16 @@ def to_csv(answer: Mapping[str, Any]) -> str:
     for kind, rows in (("mark", answer["marks"]), ("stop", answer["stops"])):
         for row in rows:
             place = dict(zip(("x_m", "y_m", "z_m"), row["position_m"], strict=True))
-            writer.writerow({"kind": kind, **row, **place})
+            writer.writerow({"kind": kind, **_short({**row, **place})})
     return text.getvalue()
+
+
+def _short(row: Plain) -> Plain:
+    """Return a row with lengths to the micrometre, and probabilities as long as they are."""
+    return {
+        key: round(value, 6) if key.endswith("_m") and isinstance(value, float) else value
+        for key, value in row.items()
+    }
 
 
 def to_geojson(answer: Mapping[str, Any]) -> Plain:

@@ -14,6 +14,7 @@ CANDIDATES_MAX = 20_000
 """Places that are compared at most."""
 
 _SLOPE_BASE = 0.5  # [m] over which slope is measured: what a tripod or a stake stands on
+_DIGITS = 3  # of coordinates: nobody stakes out finer
 _LEVELS = 3  # heights of a centre that are tried at each place
 
 
@@ -123,7 +124,7 @@ def find_candidates(site: Site, stops: Stops, rules: PlaceRules) -> Candidates:
     half = np.ceil((high - low) / 2 / spacing + rules.reach / spacing) * spacing
     lines = [np.arange(-h, h + spacing / 2, spacing) + c for h, c in zip(half, middle, strict=True)]
     x, y = (np.ravel(grid) for grid in np.meshgrid(*lines))
-    place = np.column_stack([x, y])
+    place = np.round(np.column_stack([x, y]), _DIGITS)
     masks = _masks(site, stops, rules, place)
     keep = np.logical_and.reduce(list(masks.values()))
     if not keep.any():
@@ -139,9 +140,8 @@ def find_candidates(site: Site, stops: Stops, rules: PlaceRules) -> Candidates:
             f"{CANDIDATES_MAX:,} are the most. Take a wider spacing than {spacing:g} m."
         )
     ground = np.repeat(site.ground_at(place), len(heights))
-    p_site = np.column_stack(
-        [np.repeat(place, len(heights), axis=0), ground + np.tile(heights, len(place))]
-    )
+    tops = np.round(ground + np.tile(heights, len(place)), _DIGITS)
+    p_site = np.column_stack([np.repeat(place, len(heights), axis=0), tops])
     return Candidates(p_site=p_site, ground=ground, apart=max(rules.apart, 1e-6))
 
 

@@ -44,7 +44,7 @@ _STARTS_WHOLE = 4  # of whole judgements
 _DRAWN, _DRAWN_KEPT = 1500, 40  # arrangements at random that these begin with, and judge in full
 _POWER = 12.0  # of the mean over stops that is as good as their largest, and smoother
 _SHAKEN = 0.4  # share of marks that such a start has elsewhere
-_SLACK, _SLACK_WHOLE = 1.1, 2.0  # times the tolerance, beyond which more search does not help
+_SLACK, _SLACK_WHOLE = 1.15, 2.0  # times the tolerance, beyond which more search does not help
 _WORSE = 1.3  # than now, at most, while a loss would break what is wanted
 _TRIED = 12  # candidates that are judged in full for each mark, the most promising first
 _SCREENED = 800  # places that whole judgements try in a round, for all marks together
@@ -665,7 +665,8 @@ def _glance(task: _Task, k: int, goal: Goal, rng: np.random.Generator) -> Index 
         return None
     if task.wish.method == "paper":
         return _best_drawn(task, chosen, goal, rng)
-    return _exchanged(task._replace(power=_POWER), chosen, goal, rng)[0]
+    whole = replace(goal, is_robust=False)  # judging losses takes ten times as long
+    return _exchanged(task._replace(power=_POWER), chosen, whole, rng)[0]
 
 
 def _impossible(task: _Task, stops: Stops, best: Optimum, goal: Goal) -> str:

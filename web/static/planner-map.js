@@ -43,9 +43,9 @@ function palette(shown) {
 
 // The range of colours that all maps share; a few extreme places do not flatten all others.
 export function rangeOf(fields, shown, tolerance) {
-  const values = fields.flatMap((field) => field?.[SHOWN[shown].key] ?? []).flat()
-    .filter((value) => value !== null && !(shown === "sigma" && value > tolerance))
-    .sort((a, b) => a - b);
+  const known = fields.flatMap((field) => field?.[SHOWN[shown].key] ?? []).flat().filter((value) => value !== null);
+  const kept = known.filter((value) => !(shown === "sigma" && value > tolerance));
+  const values = (kept.length ? kept : known).sort((a, b) => a - b);
   if (!values.length) return null;
   const at = (share) => values[Math.round(share * (values.length - 1))];
   const least = { sigma: 1e-4, probability: 0.01, seen: 1, ground: 0.05 }[shown];
@@ -120,7 +120,7 @@ export class PlanMap {
     rows.forEach((row, j) => row.forEach((value, i) => {
       if (value === null) return;
       const t = Math.min(Math.max((value - range.low) / (range.high - range.low), 0), 1);
-      const isBeyond = (shown === "sigma" && value > tolerance) || (shown === "probability" && value < 0.95);
+      const isBeyond = isBeyondIt(shown, value, tolerance);
       image.data.set([...colour(isLow ? t : 1 - t, isBeyond), 255], 4 * ((ys.length - 1 - j) * xs.length + i));
     }));
     const small = new OffscreenCanvas(xs.length, ys.length);
@@ -297,7 +297,18 @@ export class PlanMap {
   }
 }
 
-export function paintScale(figure, shown, range, tolerance) {
+const isBeyondIt = (shown, value, tolerance) =>
+  (shown === "sigma" && value > tolerance) || (shown === "probability" && value < 0.95);
+
+// What colours beside those of the scale a map has.
+function besideScale(shown, field, tolerance) {
+  const values = (field?.[SHOWN[shown].key] ?? []).flat();
+  const beyond = { sigma: "red: beyond the tolerance", probability: "red: below 95 %" }[shown];
+  const isRed = beyond && values.some((value) => value !== null && isBeyondIt(shown, value, tolerance));
+  return [isRed && beyond, values.includes(null) && "bare: no position"].filter(Boolean).join("; ");
+}
+
+export function paintScale(figure, shown, range, tolerance, field) {
   const canvas = figure.querySelector(".scale canvas");
   const labels = figure.querySelectorAll(".scale span");
   const context = canvas.getContext("2d");
@@ -309,13 +320,13 @@ export function paintScale(figure, shown, range, tolerance) {
   for (let i = 0; i < canvas.width; i += 1) {
     const t = i / (canvas.width - 1);
     const value = range.low + t * (range.high - range.low);
-    const isBeyond = (shown === "sigma" && value > tolerance) || (shown === "probability" && value < 0.95);
+    const isBeyond = isBeyondIt(shown, value, tolerance);
     const [r, g, b] = colour(isBestLow || isPlain ? t : 1 - t, isBeyond);
     context.fillStyle = `rgba(${r}, ${g}, ${b}, 0.85)`;
     context.fillRect(i, 0, 1, 1);
   }
   const said = (value) => `${(scale * value).toFixed(digits)} ${unit}`;
   labels[0].textContent = said(range.low);
-  labels[1].textContent = { sigma: "red: beyond the tolerance; bare: no position", probability: "red: below 95 %; bare: no position" }[shown] ?? "";
-  labels[2].textContent = `${shown === "sigma" ? "from " : ""}${said(range.high)}`;
+  labels[1].textContent = isPlain ? "" : besideScale(shown, field, tolerance);
+  labels[2].textContent = `${said(range.high)}${shown === "sigma" ? " and more" : ""}`;
 }

@@ -131,7 +131,7 @@ function draw() {
   for (const plan of state.plans) {
     plan.map.show({ ...plan, site: state.site, stops: state.stops, areas: state.areas, corners: state.corners, shown, range, tolerance, stop: state.stop });
     plan.figure.classList.toggle("active", plan === state.plans[state.active]);
-    paintScale(plan.figure, shown, range, tolerance);
+    paintScale(plan.figure, shown, range, tolerance, plan.field);
     drawHead(plan, tolerance);
   }
   drawMarks();
@@ -481,16 +481,22 @@ function setAdding(what) {
 
 const own = (mark) => ({ name: mark.name, x: mark.position_m[0], y: mark.position_m[1], pole: mark.pole_height_m });
 
-async function during(button, work) {
+// What takes longer than a moment says so, and how long it has been at it.
+async function during(button, work, news = "") {
   const label = button.textContent;
-  Object.assign(button, { disabled: true, textContent: "Working" });
+  const began = performance.now();
+  const clock = news && setInterval(() => tell(`${news}: ${Math.round((performance.now() - began) / 1000)} s so far.`), 2000);
+  Object.assign(button, { disabled: true, textContent: news ? "Searching" : "Working" });
+  if (news) tell(`${news}.`);
   say("");
   try {
     await work(state.plans[state.active]);
   } catch (error) {
+    if (news) tell("");
     say(error.message);
   } finally {
     Object.assign(button, { disabled: false, textContent: label });
+    clearInterval(clock);
   }
 }
 
@@ -533,7 +539,7 @@ byId("optimise").addEventListener("click", (event) => byId("plan-controls").repo
   plan.marks = answer.marks.map(own);
   changed(plan, CELLS.still);
   tell(answer.notes.join(" "));
-}));
+}, Number.isNaN(byId("count").valueAsNumber) ? "Searching the fewest marks that keep the tolerance" : "Searching the best places"));
 byId("suggest").addEventListener("click", (event) => byId("plan-controls").reportValidity() && during(event.currentTarget, async (plan) => {
   const answer = await post("/suggest", request(plan));
   remember();
@@ -541,7 +547,7 @@ byId("suggest").addEventListener("click", (event) => byId("plan-controls").repor
   changed(plan, CELLS.still);
   const before = answer.worst_sigma_3d_before_m === null ? "no position" : `${mm(answer.worst_sigma_3d_before_m)} mm`;
   tell(`${answer.name} helps most: it brings the worst stop from ${before} to ${mm(answer.worst_sigma_3d_m)} mm.`);
-}));
+}, "Searching the best place for one more"));
 byId("save").addEventListener("click", (event) => during(event.currentTarget, async (plan) => {
   const name = window.prompt("Name of the plan", `${plan.marks.length} marks`);
   if (!name) return;
