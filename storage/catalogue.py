@@ -51,8 +51,11 @@ _SURVEYS = """
 SELECT s.survey_id, s.name, s.tolerance_m, s.created_at, s.rig_digest,
     (SELECT count(*) FROM control_marks AS c WHERE c.survey_id = s.survey_id) AS n_control_marks,
     (SELECT count(*) FROM true_stops AS t WHERE t.survey_id = s.survey_id) AS n_true_stops,
-    (SELECT count(DISTINCT j.recording_id) FROM jobs AS j WHERE j.survey_id = s.survey_id)
-        AS n_recordings
+    (SELECT count(*) FROM (
+        SELECT j.recording_id FROM jobs AS j
+        WHERE j.survey_id = s.survey_id AND j.recording_id IS NOT NULL
+        UNION SELECT o.recording_id FROM survey_recordings AS o WHERE o.survey_id = s.survey_id
+    )) AS n_recordings
 FROM surveys AS s
 """
 _SURVEY_BY_KEY = _SURVEYS + "WHERE s.survey_id = $key OR s.name = $key ORDER BY s.survey_id <> $key"
@@ -104,6 +107,7 @@ _RECORDINGS_OF_SURVEY = """
 SELECT recording_id, name FROM recordings WHERE recording_id IN (
     SELECT recording_id FROM jobs WHERE survey_id = $id AND status <> 'dismissed'
     UNION SELECT recording_id FROM runs WHERE survey_id = $id
+    UNION SELECT recording_id FROM survey_recordings WHERE survey_id = $id
 ) ORDER BY uploaded_at, recording_id
 """
 _CONTROL = "SELECT * FROM control_marks WHERE survey_id = $id ORDER BY place"
@@ -451,8 +455,22 @@ class Catalogue(Database):
         rows = self._part(_RECORDINGS_AFTER, {}, after, limit)
         return _page(rows, limit, "uploaded_at", "recording_id", recording_of)
 
+    def add_to_survey(self, survey: str, recording_id: str) -> None:
+        """Note that a log belongs to a survey; twice is once.
+
+        Parameters
+        ----------
+        survey : str
+            Id or name.
+        recording_id : str
+            SHA-256 of the log.
+        """
+        row = [self.get_survey(survey).survey_id, self.get_recording(recording_id).recording_id]
+        with self.writing() as cursor:
+            cursor.execute("INSERT OR IGNORE INTO survey_recordings VALUES (?, ?)", row)
+
     def recordings_of_survey(self, survey: str) -> tuple[str, ...]:
-        """Return the logs that jobs of a survey (id or name) were asked to read.
+        """Return the logs that were uploaded for a survey (id or name), or read by its jobs.
 
         Parameters
         ----------
@@ -462,7 +480,7 @@ class Catalogue(Database):
         Returns
         -------
         tuple of str
-            Digests, in the order of their upload; those of dismissed jobs are left out.
+            Digests, in the order of their upload; those only of dismissed jobs are left out.
         """
         rows = self.rows(_RECORDINGS_OF_SURVEY, {"id": self.get_survey(survey).survey_id})
         return tuple(row["recording_id"] for row in rows)

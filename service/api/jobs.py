@@ -136,7 +136,7 @@ def _recordings(service: Service, new: NewJob, survey: SurveyRecord) -> list[str
     if not records:
         raise InputError(
             f"The survey {survey.name} has no log that can be read; upload one with "
-            "POST /api/v1/recordings?survey=...&process=true, or name 'recordings'."
+            "POST /api/v1/recordings?survey=..., or name 'recordings'."
         )
     return [one.recording_id for one in records]
 

@@ -55,6 +55,8 @@ async def upload_recording(
     recording, is_new = await asyncio.to_thread(take_in, service.catalogue, received, name)
     response.status_code = 201 if is_new else 200
     response.headers["Location"] = f"/api/v1/recordings/{recording.recording_id}"
+    if survey is not None:
+        await asyncio.to_thread(service.catalogue.add_to_survey, survey, recording.recording_id)
     job = await asyncio.to_thread(_start, service, survey, recording) if process else None
     return Upload(**Recording.of(recording).model_dump(), job=job)
 

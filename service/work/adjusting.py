@@ -103,12 +103,8 @@ class _Book:
     refused: list[Refusal] = field(default_factory=list)
     tables: list[dict[str, pa.Table]] = field(default_factory=list)
 
-    def enter(self, stop: str, fits: MarkerFits, source: Row) -> None:
-        """Add a station; a stop that was recorded again gets a number."""
-        name, again = stop, 1
-        while name in self.sources:
-            again += 1
-            name = f"{stop} ({again})"
+    def enter(self, name: str, stop: str, fits: MarkerFits, source: Row) -> None:
+        """Add a station, of a name of its own, at a stop."""
         self.scans.append((name, fits))
         self.sources[name] = {"station": name, "stop": stop, **source}
 
@@ -159,8 +155,9 @@ def _rig(order: Order, book: _Book, progress: Progress) -> tuple[Calibration | N
     from pipelines.calibration import calibrate
 
     used = {source["recording_id"] for source in book.sources.values()}
-    good = replace(order, logs=tuple(log for log in order.logs if log.recording_id in used))
-    logs = calibrating.logs_of(good)
+    named = zip(order.logs, order.log_names, strict=True)
+    good = tuple(replace(log, name=name) for log, name in named if log.recording_id in used)
+    logs = calibrating.logs_of(replace(order, logs=good))
     try:
         return calibrate(logs, config=order.config, rig=order.rig, progress=progress), ""
     except (SolveError, RigError) as error:
@@ -182,14 +179,14 @@ def _read(order: Order, progress: Progress) -> _Book:
     from pipelines.network import Refusal
 
     book, first = _Book(), None
-    for i, log in enumerate(order.logs):
+    for i, (log, name) in enumerate(zip(order.logs, order.log_names, strict=True)):
         try:
             part = _share(progress, i / len(order.logs), (i + 1) / len(order.logs))
             for stop, fits, source in _centres(order, log, book, part):
-                book.enter(stop, fits, source)
+                book.enter(name + stop.removeprefix(log.name), stop, fits, source)
         except SpheremarkError as error:
             first = first or error
-            book.refused.append(Refusal(station=log.name, code=error.code, reason=str(error)))
+            book.refused.append(Refusal(station=name, code=error.code, reason=str(error)))
     if not book.scans and first is not None:
         raise first
     return book

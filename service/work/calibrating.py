@@ -14,7 +14,7 @@ import numpy as np
 from pipelines.rigs import rig_digest, rig_to_mapping
 from pipelines.values import Origin, Rig, ScanLog
 from service.provenance import code_version
-from service.work.orders import Log, Order, Outcome
+from service.work.orders import Order, Outcome
 from storage.results import marker_name
 
 if TYPE_CHECKING:
@@ -31,27 +31,21 @@ _ESTIMATE = 0.7  # share of the work that the estimate takes; comparing the face
 
 @dataclass(frozen=True, slots=True)
 class _Logs:
-    """Logs that are read anew each time: a calibration goes through them often, one by one.
+    """Logs that are read anew each time: a calibration goes through them often, one by one."""
 
-    A log that has the name of another gets a number, as its station does in a network.
-    """
-
-    logs: tuple[Log, ...]
+    order: Order
 
     def __iter__(self) -> Iterator[ScanLog]:
         from storage.recordings import read_log
 
-        counts: dict[str, int] = {}
-        for one in self.logs:
-            counts[one.name] = again = counts.get(one.name, 0) + 1
-            name = one.name if again == 1 else f"{one.name} ({again})"
+        for one, name in zip(self.order.logs, self.order.log_names, strict=True):
             log = read_log(one.url, digest=one.recording_id)
             yield replace(log, origin=Origin(name=name, digest=one.recording_id))
 
 
 def logs_of(order: Order) -> Iterable[ScanLog]:
     """Return the logs of an order, to be gone through as often as one likes."""
-    return _Logs(order.logs)
+    return _Logs(order)
 
 
 def work(order: Order, progress: Progress) -> Outcome:

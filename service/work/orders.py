@@ -57,6 +57,18 @@ class Order:
     options: Mapping[str, Any] = field(default_factory=dict)
     known: Mapping[str, pa.Table] = field(default_factory=dict)
 
+    @property
+    def log_names(self) -> tuple[str, ...]:
+        """What each log is called in the job: one that has the name of another gets a number."""
+        names: list[str] = []
+        for log in self.logs:
+            name, again = log.name, 1
+            while name in names:
+                again += 1
+                name = f"{log.name} ({again})"
+            names.append(name)
+        return tuple(names)
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Outcome:

@@ -9,10 +9,13 @@ import numpy as np
 import pytest
 from fastapi.testclient import TestClient
 
+from pipelines.config import SurveyConfig
 from pipelines.simulation import SimulationConfig
 from service.app import create_app
 from service.fieldwork import Assignment, survey
 from service.settings import Settings
+from service.work.calibrating import logs_of
+from service.work.orders import JobKind, Log, Order
 from storage.recordings import read_log, write_log
 
 STOPS = ("lane2-stop2", "lane4-stop3")
@@ -371,3 +374,29 @@ def test_logs_that_all_show_no_sphere_fail_with_the_reason_of_the_first(site, ru
         assert job["status"] == "failed"
         assert job["error_code"].startswith("solve.")
         assert job["error_reason"]
+
+
+def test_logs_that_were_uploaded_for_a_survey_belong_to_it_before_any_job_read_them(
+    site, field, run, rows
+):
+    site.survey("later")
+    for stop in field.stops:
+        answer = site.upload(stop.log.read_bytes(), "again", survey="later")
+        assert answer.json()["job"] is None
+    assert site.client.get("/api/v1/surveys/later").json()["n_recordings"] == 2
+    job = run("adjust", survey="later")
+    assert job["status"] == "successful", job
+    assert {row["station"] for row in rows("adjusted_stations", job)} == set(STOPS)
+
+
+def test_logs_of_one_name_are_told_apart_alike_by_networks_and_calibrations(field):
+    logs = tuple(
+        Log(recording_id=str(i) * 64, name=name, url=str(field.stops[i % 2].log))
+        for i, name in enumerate(("a", "a (2)", "a", "b", "a"))
+    )
+    order = Order(
+        job_id="j", kind=JobKind.ADJUST, result_id="r", survey_id="s", logs=logs,
+        config=SurveyConfig(), marks=None, rig=None, clouds_url="",
+    )  # fmt: skip
+    assert order.log_names == ("a", "a (2)", "a (3)", "b", "a (4)")
+    assert [log.origin.name for log in logs_of(order)] == list(order.log_names)
