@@ -31,6 +31,7 @@ _N_KNOWN = 3  # markers that are open below, to compare others with
 _UNLIKE = 0.25  # share by which the reflectivity of a marker may differ from that of the others
 _NOISIER = 1.5  # factor by which the scatter of a marker may exceed that of the others
 _N_TELLING = 30  # returns that show the noise of a scan
+_SIGMAS_UNLIKE = 3.0  # standard deviations at which a shape is refused where the noise is known
 _FLAT_UNLIKE = 0.25  # of the curvature: what may be missing where the noise is known from others
 _WIDE = 0.2  # half widths of a beam: what taking it for a ray adds to the noise
 _BETTER = 1.5  # logarithm of the likelihood ratio from which another shape is believed
@@ -296,7 +297,7 @@ def verdict_among_others(
     The markers of a survey share their paint, and with it reflectivity and noise. What scatters
     more may lack the curvature of a ball, by the noise of the others; what is missing across and
     along is tested together. A stone behind a crest and a marker behind a crest look alike: where
-    the pole is hidden, reflectivity and scatter themselves must be those of the others.
+    the pole is not seen, reflectivity and scatter themselves must be those of the others.
     """
     return _unlike_in_shape(look, others, ball) or _unlike_in_paint(look, sight, others)
 
@@ -308,7 +309,7 @@ def _unlike_in_shape(look: Look, others: Sequence[tuple[Look, Sight]], ball: Bal
     share = min(noise / max(look.scatter, NOISE_MIN), 1.0)
     flats = (look.flat_across, look.flat_along)
     off = np.array(flats) / (share * np.array([look.sigma_across, look.sigma_along]))
-    is_flat = float(np.hypot(*np.maximum(off, 0.0))) > _SIGMAS and max(flats) > _FLAT_UNLIKE
+    is_flat = float(np.hypot(*np.maximum(off, 0.0))) > _SIGMAS_UNLIKE and max(flats) > _FLAT_UNLIKE
     if look.n_points < _N_SURE or not is_flat:
         return ""
     return (
@@ -319,21 +320,21 @@ def _unlike_in_shape(look: Look, others: Sequence[tuple[Look, Sight]], ball: Bal
 
 
 def _unlike_in_paint(look: Look, sight: Sight, others: Sequence[tuple[Look, Sight]]) -> str:
-    """Return why a group whose pole is hidden differs from markers that are open below."""
-    known = [other for other in others if other[1].is_open_below]
-    if sight.is_open_below or len(known) < _N_KNOWN:
+    """Return why a group whose pole is not seen differs from markers that are open below."""
+    known = [other for other in others if other[1].is_seen_below]
+    if sight.is_seen_below or len(known) < _N_KNOWN:
         return ""
     brightness = float(np.median([other.brightness for _, other in known]))
     scatter = float(np.median([max(other.scatter, NOISE_MIN) for other, _ in known]))
     tests = (
         (
             abs(sight.brightness - brightness) > _UNLIKE * brightness,
-            f"What it stands on is hidden, and its reflectivity is {sight.brightness:.0f}, that of "
+            f"What it stands on is not seen, and its reflectivity is {sight.brightness:.0f}, that of "
             f"the markers {brightness:.0f}.",
         ),
         (
             look.scatter > _NOISIER * scatter,
-            f"What it stands on is hidden, and its returns scatter by {1e3 * look.scatter:.0f} mm, "
+            f"What it stands on is not seen, and its returns scatter by {1e3 * look.scatter:.0f} mm, "
             f"those of the markers by {1e3 * scatter:.0f} mm.",
         ),
     )
