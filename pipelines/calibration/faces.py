@@ -104,9 +104,10 @@ def rig_from_faces(stops: Iterable[ScanLog], start: Rig, config: SurveyConfig) -
         pairs += _pairs(log, cloud, config)
     if len(pairs) < _N_PAIRS:
         raise DegenerateGeometryError(
-            f"{len(pairs)} spheres are seen on both faces in {len(coverages)} scans, whose gimbal "
-            f"turned by {max(coverages):.0f} degrees at most; a calibration needs at least "
-            f"{_N_PAIRS}. Turn it by 360 degrees among more markers, or give more scans."
+            f"A calibration needs at least {_N_PAIRS} spheres that are seen on both faces; in "
+            f"{len(coverages)} scan{'' if len(coverages) == 1 else 's'}, whose gimbal turned by "
+            f"{max(coverages):.0f} degrees at most, {len(pairs) or 'none'} were found. Turn it by "
+            "360 degrees among more markers, or give more scans."
         )
     return moved(start, _solved(pairs), np.zeros_like(start.laser_range_biases))
 

@@ -21,6 +21,7 @@ from pipelines.values import Array
 
 _FALSE_ALARM = 0.05  # probability that a network without gross errors loses an observation
 _UNTOLD = 1e-9  # the same below which nothing else tells where a control mark is
+_N_CHECKED = 3  # marks of which a station shows an error in one
 _MANY_LEFT_OUT = 1.0 / 3.0  # of the centres: not they are bad, but the sigmas; or of control
 
 
@@ -298,6 +299,12 @@ def _warnings(
     lonely = [network.marks[m] for m in np.flatnonzero(per_mark == 1) if m not in network.controls]
     if lonely:
         warnings.append(f"Seen from one station only, and so unchecked: {', '.join(lonely)}.")
+    per_station = np.bincount(network.sightings[tested.used[:n], 0], minlength=s)
+    loose = [network.stations[i] for i in np.flatnonzero(per_station < _N_CHECKED)]
+    if loose:
+        warnings.append(
+            f"Held by two marks only, where an error in one would not show: {', '.join(loose)}."
+        )
     doubtful = [name for name, doubt in zip(network.marks, network.doubts, strict=True) if doubt]
     if doubtful:
         warnings.append(f"Marks that may be false: {', '.join(doubtful)}; the reasons stand there.")

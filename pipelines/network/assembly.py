@@ -148,7 +148,7 @@ def assemble(
         else Refusal(station=names[i], code=reason.code, reason=_why(scans[i][1], found, reason))
         for i, reason in _refused(len(scans), used, reasons)
     )
-    _refuse_nothing(used, found, control, refused)
+    _refuse_nothing(used, found, control, _telling(refused, [names[i] for i in reasons]))
     network = _network(scans, found, used, doubts)
     cov_p_base = network.cov_p_base + config.sigma_common**2 * np.eye(3)
     if calibration is None:
@@ -271,7 +271,9 @@ def _why(fits: MarkerFits, found: _Map, error: SolveError) -> str:
         return f"{seen} found in it; two, better three, that other stations see too tie a station."
     if isinstance(error, AmbiguousMatchError):
         return (
-            f"Its {n} markers fit the {m} marks of the network in more than one way equally well."
+            f"Its {n} markers fit the {m} marks of the network in more than one way equally well: "
+            "distances repeat (a symmetric field, or too few marks). Another mark, where no "
+            "distance repeats, tells them apart."
         )
     if isinstance(error, NoMatchError):
         return (
@@ -282,21 +284,27 @@ def _why(fits: MarkerFits, found: _Map, error: SolveError) -> str:
     return f"It cannot be tied to the network: {error}"
 
 
+def _telling(refused: tuple[Refusal, ...], unmatched: list[str]) -> Refusal | None:
+    """Return the refusal that tells most: that of a station which could not be matched."""
+    return next((one for one in refused if one.station in unmatched), next(iter(refused), None))
+
+
 def _refuse_nothing(
     used: dict[int, list[tuple[int, int]]],
     found: _Map,
     control: ControlMarks | None,
-    refused: tuple[Refusal, ...],
+    refused: Refusal | None,
 ) -> None:
-    """Raise where no network is left."""
-    first = f" {refused[0].station}: {refused[0].reason}" if refused else ""
+    """Raise where no network is left, with what a refused station tells of it."""
+    first = f" {refused.station}: {refused.reason}" if refused else ""
     if not used or (control is None and len(used) < 2):
-        ties = (
-            "no two stations share two marks; give more scans, or control marks"
-            if control is None
-            else "no station could be tied to two of the control marks. Control of another field, "
-            "in other units or in other axes looks like this; without control the network is free"
-        )
+        ties = "no two stations share two marks; give more scans, or control marks"
+        if control is not None:
+            ties = "no station could be tied to two of the control marks; without them it is free"
+            if refused is not None and refused.code == NoMatchError.code:
+                ties += (
+                    ". Control of another field, in other units or in other axes looks like this"
+                )
         raise DegenerateGeometryError(f"There is no network: {ties}.{first}")
     if control is not None:
         seen = sorted({m for pairs in used.values() for _, m in pairs if m < found.n_control})

@@ -247,9 +247,10 @@ def _summary(answer: Row, checks: list[Row]) -> str:
     """Say in some sentences what an adjustment gave, and what is missing or weak."""
     kind = "with control" if answer["datum"]["kind"] == "control" else "as a free network"
     sigmas = [one["sigma_3d_m"] for one in answer["stations"]]
+    n = len(sigmas)
     test = "passed" if answer["passes_global_test"] else "FAILED"
     parts = [
-        f"{len(answer['stations'])} stations and {len(answer['marks'])} marks adjusted {kind}: "
+        f"{n} station{'' if n == 1 else 's'} and {len(answer['marks'])} marks adjusted {kind}: "
         f"stations with sigmas to {1000 * max(sigmas):.1f} mm (3-D), global test {test}."
     ]
     if checks:

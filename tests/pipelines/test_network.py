@@ -377,10 +377,27 @@ def test_two_control_marks_among_many_markers_hold_a_network(rng):
     assert off.max() < 20 * SIGMA  # two marks only, and a levelling of 3 mrad
 
 
+def test_a_station_that_two_marks_hold_is_named_as_unchecked(rng):
+    marks = control([[6.9, 1.1, 0.6], [-3.9, 7.1, 1.5]])
+    scans, _ = survey(rng, marks, 1)
+    (warning,) = network(scans, marks).warnings
+    assert warning == "Held by two marks only, where an error in one would not show: stop1."
+
+
+def test_a_symmetric_field_makes_no_network_and_says_that_it_is_the_symmetry(rng):
+    angles = np.arange(6) * np.pi / 3
+    marks = control(np.column_stack([7 * np.cos(angles), 7 * np.sin(angles), np.full(6, 0.9)]))
+    scans, _ = survey(rng, marks, 2)
+    for given in (None, marks):
+        with pytest.raises(DegenerateGeometryError, match="a symmetric field") as refused:
+            network(scans, given)
+        assert "in other units" not in str(refused.value)
+
+
 def test_two_control_marks_that_no_markers_resemble_are_refused(rng):
     marks = field(rng)
     scans, _ = survey(rng, marks, 2)
-    with pytest.raises(DegenerateGeometryError, match="could be tied to two of the control marks"):
+    with pytest.raises(DegenerateGeometryError, match=r"two of the control marks.*in other units"):
         network(scans, control([[0.0, 0.0, 0.0], [60.0, 0.0, 3.0]]))
 
 
