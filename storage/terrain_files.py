@@ -92,7 +92,9 @@ def _raster(path: Path, name: str) -> Site:
             turn = file.transform
             heights = file.read(1, masked=True).astype(np.float64).filled(np.nan)
     except RasterioError as error:
-        said = str(error).replace(str(path), name)  # where it is kept is nobody's business
+        said = (
+            str(error).replace(str(path), name).rstrip(".")
+        )  # where it is kept is nobody's business
         raise InputError(f"{name} is no elevation model that can be read: {said}.") from error
     if turn.b or turn.d or turn.a <= 0 or turn.e == 0:
         raise InputError(
@@ -111,7 +113,9 @@ def _gridded(path: Path, name: str) -> Site:
     try:
         low, high = _extent(path)
     except (laspy.LaspyException, ValueError, EOFError, OSError) as error:
-        raise InputError(f"{name} is no cloud that can be read: {error}.") from error
+        raise InputError(
+            f"{name} is no cloud that can be read: {str(error).rstrip('.')}."
+        ) from error
     if not np.isfinite([low, high]).all():
         raise InputError(f"{name} holds no terrain: it has no points.")
     shape = np.floor((high - low) / _CELL).astype(np.int64) + 1

@@ -27,6 +27,7 @@ _N_PHASES = 400  # places between the lines that a sphere is tried at
 _GOLDEN = 0.6180339887498949  # of a turn from place to place: no pitch of lines repeats it
 _REFLECTIVITIES = (3.0, 9.0, 24.5, 63.0, 130.0)  # calibrated, at which real packets show ...
 _SIGMAS = (0.0137, 0.0107, 0.0089, 0.0067, 0.0064)  # ... this noise of ranges [m]
+_TOGETHER = 5  # centres that share a position
 _SHARE_MIN = 0.02  # of a footprint that makes a return
 _N_ROUNDS = 4  # in which precision and worth of the returns settle
 _DISTANCES = np.geomspace(1.5, 45.0, 28)  # [m]
@@ -138,7 +139,8 @@ class Returns:
         towards-towards, towards-left, towards-up, left-left, left-up, up-up [1].
     spread : (d, 3)
         By how much the lines' places make the variances of a centre larger than evenly spread
-        returns would: towards, left, up; the mean over places where it is found.
+        returns would: towards, left, up; as of one among some that share a position, over places
+        where they are found.
     worst_spread : (d, 3)
         The same for the 95th percentile of places.
     worst_share : (d,)
@@ -328,7 +330,17 @@ def _spread(
     ratios = variances[is_found] / usual if is_found.any() else np.full((1, 3), 36.0)
     lost = np.array([np.mean(returns < 0.5 * returns.mean()), np.mean(~is_found)])
     share = float(returns.min() / max(returns.mean(), 1e-9))
-    return np.asarray(ratios.mean(axis=0)), np.quantile(ratios, 0.95, axis=0), share, lost
+    return _together(ratios), np.quantile(ratios, 0.95, axis=0), share, lost
+
+
+def _together(ratios: Array) -> Array:
+    """Return the spread of one centre among several that share a position: a lucky one weighs more.
+
+    The mean over chance of what the mean information of some centres is worth.
+    """
+    rng = np.random.default_rng(0)
+    worth = np.mean([1.0 / ratios[rng.permutation(len(ratios))] for _ in range(_TOGETHER)], axis=0)
+    return np.asarray((1.0 / worth).mean(axis=0))
 
 
 def _crossings(sensor: Sensor, columns: Array, distance: float) -> Array:

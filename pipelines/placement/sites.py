@@ -15,6 +15,7 @@ CELLS_MAX = 16_000_000
 """Nodes of a terrain at most; a tenth of a metre over 400 m square."""
 
 _CELL = 0.1  # [m] of a simulated world's map
+_CELL_WIDEST = 10.0  # [m] of a terrain
 _HALF = 30.0  # [m] half side of that map
 _ABOVE = 60.0  # [m] from where its surface is probed
 _STEEP = 0.35  # share of a face that is seen from above below which it is sampled besides
@@ -205,7 +206,7 @@ def site_of_grid(
     Raises
     ------
     InputError
-        If the grid is too small or too large, uneven, or knows no height at all.
+        If the grid is too small, too large or too coarse, uneven, or knows no height at all.
     """
     if heights.size > CELLS_MAX:
         raise InputError(
@@ -215,10 +216,16 @@ def site_of_grid(
     if min(heights.shape) < 2 or not np.isfinite(heights).any():
         raise InputError(f"{name} holds no terrain: none of {heights.size:,} cells has a height.")
     steps = np.concatenate([np.diff(xs), np.diff(ys)])
-    if steps.min() <= 0 or np.ptp(steps) > 1e-3 * steps.mean():
+    if not (steps.min() > 0 and np.ptp(steps) <= 1e-3 * steps.mean()):
         raise InputError(
             f"The cells of {name} are {steps.min():g} to {steps.max():g} m wide; an even grid of "
             "square cells is needed. Resample it (gdalwarp -tr)."
+        )
+    if steps.mean() > _CELL_WIDEST:
+        raise InputError(
+            f"The cells of {name} are {steps.mean():g} m wide; marks stand some metres from stops, "
+            f"and {_CELL_WIDEST:g} m is the most. If its unit is not the metre, reproject it "
+            "(gdalwarp)."
         )
     ground = np.array(heights, dtype=np.float64)
     top = ground.copy() if surface is None else np.fmax(surface, ground)

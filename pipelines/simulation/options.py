@@ -11,6 +11,8 @@ from pipelines.errors import ConfigError
 from pipelines.rigs import AZIMUTH_STEP, RANGE_STEP
 from pipelines.values import ImuMount
 
+_LONGEST = 3600.0  # [s] of a scan, as of an even turn
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SimulationConfig:
@@ -135,11 +137,23 @@ class SimulationConfig:
                 raise ConfigError(f"simulation.{name} is {value!r}; it must be two numbers.")
             for number in value if is_pair else (value,):
                 _check(name, number, *bounds)
+        if self.step and self.stepped_time > _LONGEST:
+            raise ConfigError(
+                f"Steps of {math.degrees(self.step):.3g} deg with {self.rest_revolutions} "
+                f"revolutions at each rest take {self.stepped_time / 3600:,.1f} hours; "
+                f"{_LONGEST / 3600:g} is the most. Take longer steps or fewer revolutions."
+            )
         if self.imu_mount not in tuple(ImuMount):
             raise ConfigError(
                 f"simulation.imu_mount is {self.imu_mount!r}; it must be one of "
                 f"{[str(mount) for mount in ImuMount]}."
             )
+
+    @property
+    def stepped_time(self) -> float:
+        """Time of a turn with rests [s]."""
+        rest = self.rest_revolutions * 60.0 / self.spin_rpm
+        return 2.0 * math.pi / self.step * (rest + self.move)
 
     @classmethod
     def perfect(cls, **changes: Any) -> Self:

@@ -15,7 +15,7 @@ from pydantic import BaseModel, ConfigDict, Field, model_validator
 from pipelines.errors import InputError
 from pipelines.placement import Requirement, Sensor
 from pipelines.placement.candidates import PlaceRules
-from pipelines.placement.optimising import Goal
+from pipelines.placement.optimising import MARKS_MOST, Goal
 from service import siting, trials
 from service.api.models import Listing, Strict
 from service.planning import Plain, site_answer, to_csv, to_geojson
@@ -158,7 +158,7 @@ class WantedPlan(Plan):
     n_marks: int | None = Field(
         default=None,
         ge=2,
-        le=60,
+        le=MARKS_MOST,
         description="How many; by default as few as keep the tolerance at every stop.",
     )
 

@@ -123,6 +123,30 @@ def test_trials_at_random_take_the_speeds_of_the_scans(client):
     assert "turn" in refused(client, "/api/v1/plans/random", marks=None, turn_s=-1)
 
 
+def test_what_cannot_be_is_refused_before_it_is_searched(client):
+    wanted = {"marks": [], "tolerance_m": 3e-4}
+    for method in ("free_station", "paper"):
+        said = refused(client, "/api/v1/plans/optimise", method=method, **wanted)
+        assert "wherever they stood" in said
+        assert "Ask for a larger tolerance" in said
+
+
+def test_scans_that_would_take_days_are_refused(client):
+    assert "1,001.0 hours" in refused(client, step_deg=0.01, rest_revolutions=1000)
+    assert "hours" in refused(client, step_deg=1e-9)
+
+
+def test_terrains_without_a_sensible_grid_are_refused(client):
+    def said(cellsize):
+        text = f"ncols 3\nnrows 3\nxllcorner 0\nyllcorner 0\ncellsize {cellsize}\n" + 3 * "1 2 3\n"
+        response = client.post("/api/v1/terrains?name=grid.asc", content=text.encode())
+        assert response.status_code == 400
+        return response.json()["detail"]
+
+    assert "1e+06 m wide" in said(1e6)
+    assert "even grid" in said("nan")
+
+
 def test_areas_keep_marks_out_and_are_kept_with_a_plan(client):
     left = [[-30, -30], [0, -30], [0, 30], [-30, 30]]
     plan = {"marks": MARKS, "model": "sensor", "keep_out_m": [left]}
