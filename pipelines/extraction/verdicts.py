@@ -329,13 +329,13 @@ def _unlike_in_paint(look: Look, sight: Sight, others: Sequence[tuple[Look, Sigh
     tests = (
         (
             abs(sight.brightness - brightness) > _UNLIKE * brightness,
-            f"What it stands on is not seen, and its reflectivity is {sight.brightness:.0f}, that of "
-            f"the markers {brightness:.0f}.",
+            f"What it stands on is not seen, and its reflectivity is {sight.brightness:.0f}, that "
+            f"of the markers {brightness:.0f}.",
         ),
         (
             look.scatter > _NOISIER * scatter,
-            f"What it stands on is not seen, and its returns scatter by {1e3 * look.scatter:.0f} mm, "
-            f"those of the markers by {1e3 * scatter:.0f} mm.",
+            f"What it stands on is not seen, and its returns scatter by "
+            f"{1e3 * look.scatter:.0f} mm, those of the markers by {1e3 * scatter:.0f} mm.",
         ),
     )
     return next((reason for is_so, reason in tests if is_so), "")
