@@ -143,9 +143,7 @@ def _shared(
     n = len(places)
     dealt = np.concatenate([np.arange(0, n, 2), np.arange(1, n, 2)])
     mine = places[dealt]
-    parts = side_by_side(
-        lambda first, end: work(patches, mine[first:end], ball), n, worth=_N_WORTH
-    )
+    parts = side_by_side(lambda first, end: work(patches, mine[first:end], ball), n, worth=_N_WORTH)
     rows = np.concatenate(parts)
     found = np.empty_like(rows)
     found[dealt] = rows

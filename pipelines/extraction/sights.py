@@ -86,17 +86,6 @@ class Sight(NamedTuple):
         return self.n_held <= 1 + self.n_past and self.n_short <= n_nearer_max
 
     @property
-    def is_seen_below(self) -> bool:
-        """Tell whether it is open below and beams show it: of a few lines there may be none there.
-
-        Returns
-        -------
-        bool
-            False also where nothing is known.
-        """
-        return self.is_open_below and self.n_past > 0
-
-    @property
     def n_aimed(self) -> int:
         """Count the beams that would have met the ball if nothing were nearer.
 

@@ -297,7 +297,7 @@ def verdict_among_others(
     The markers of a survey share their paint, and with it reflectivity and noise. What scatters
     more may lack the curvature of a ball, by the noise of the others; what is missing across and
     along is tested together. A stone behind a crest and a marker behind a crest look alike: where
-    the pole is not seen, reflectivity and scatter themselves must be those of the others.
+    the pole is hidden, reflectivity and scatter themselves must be those of the others.
     """
     return _unlike_in_shape(look, others, ball) or _unlike_in_paint(look, sight, others)
 
@@ -320,21 +320,21 @@ def _unlike_in_shape(look: Look, others: Sequence[tuple[Look, Sight]], ball: Bal
 
 
 def _unlike_in_paint(look: Look, sight: Sight, others: Sequence[tuple[Look, Sight]]) -> str:
-    """Return why a group whose pole is not seen differs from markers that are open below."""
-    known = [other for other in others if other[1].is_seen_below]
-    if sight.is_seen_below or len(known) < _N_KNOWN:
+    """Return why a group whose pole is hidden differs from markers that are open below."""
+    known = [other for other in others if other[1].is_open_below]
+    if sight.is_open_below or len(known) < _N_KNOWN:
         return ""
     brightness = float(np.median([other.brightness for _, other in known]))
     scatter = float(np.median([max(other.scatter, NOISE_MIN) for other, _ in known]))
     tests = (
         (
             abs(sight.brightness - brightness) > _UNLIKE * brightness,
-            f"What it stands on is not seen, and its reflectivity is {sight.brightness:.0f}, that "
+            f"What it stands on is hidden, and its reflectivity is {sight.brightness:.0f}, that "
             f"of the markers {brightness:.0f}.",
         ),
         (
             look.scatter > _NOISIER * scatter,
-            f"What it stands on is not seen, and its returns scatter by "
+            f"What it stands on is hidden, and its returns scatter by "
             f"{1e3 * look.scatter:.0f} mm, those of the markers by {1e3 * scatter:.0f} mm.",
         ),
     )
