@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.ndimage import distance_transform_edt
 
 from pipelines.errors import ConfigError, DegenerateGeometryError
 from pipelines.placement.values import Arrangement, Site, Stops, bilinear
@@ -14,6 +15,7 @@ CANDIDATES_MAX = 20_000
 """Places that are compared at most."""
 
 _SLOPE_BASE = 0.5  # [m] over which slope is measured: what a tripod or a stake stands on
+_BEHIND = 0.7  # [m] nearer than this, a surface behind a sphere mixes with the returns of its limb
 _DIGITS = 3  # of coordinates: nobody stakes out finer
 _LEVELS = 3  # heights of a centre that are tried at each place
 
@@ -198,6 +200,11 @@ def _slopes(site: Site, place: Array) -> Array:
 
 
 def _is_free(site: Site, place: Array) -> Mask:
-    """Return at which places nothing stands on the ground that a pole could not pass."""
-    above = bilinear(site, site.surface, place) - site.ground_at(place)
-    return np.asarray(above < site.marker_radius, dtype=np.bool_)
+    """Return at which places nothing is in the way of a pole, or close behind a sphere."""
+    rises = np.nan_to_num(site.surface - site.ground)
+    above = bilinear(site, rises, place)
+    is_tall = rises > site.pole_heights[0] - site.marker_radius
+    if not is_tall.any():
+        return np.asarray(above < site.marker_radius, dtype=np.bool_)
+    gaps = bilinear(site, distance_transform_edt(~is_tall) * site.cell, place)
+    return np.asarray((above < site.marker_radius) & (gaps >= _BEHIND), dtype=np.bool_)

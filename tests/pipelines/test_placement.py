@@ -480,6 +480,17 @@ def test_marks_keep_off_steep_ground_polygons_and_the_rover():
         find_candidates(site, one_stop((10.0, 0.0, 8.0)), nowhere)
 
 
+def test_no_mark_is_put_close_before_a_wall():
+    """Returns of its limb would be mixed with those of the wall: 3.7 times the squared errors."""
+    lines = np.arange(-30.0, 30.1, 0.2)
+    surface = np.zeros((len(lines), len(lines)))
+    surface[:, np.abs(lines - 4.0) < 0.15] = 2.0
+    site = flat_site(surface=surface)
+    places = find_candidates(site, one_stop(), PlaceRules(spacing=0.25)).p_site
+    gaps = np.abs(places[:, 0] - 4.0)
+    assert 0.65 < gaps.min() < 1.0
+
+
 def test_one_more_mark_goes_where_it_helps():
     """Marks on one side only: the next one belongs on the other."""
     site, stops = flat_site(), one_stop()
