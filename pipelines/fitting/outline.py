@@ -8,6 +8,7 @@ where returns are missing, or reach less far than their footprints would, nothin
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import numba
 import numpy as np
@@ -15,23 +16,44 @@ import numpy as np
 from pipelines.fitting.passes import Linear, Rows
 from pipelines.values import Array
 
+_EDGES = np.array([-0.5, -0.25, 0.0, 0.25, 0.5, 0.75, 1.0])  # half widths inside the outline
 _SOFTNESSES = np.array([0.07, 0.14, 0.28, 0.56, 1.12])  # half widths of the footprint
+_EDGE, _SIGMA_EDGE = 0.2, 0.4  # prior of where returns begin
 _SOFTNESS, _SPREAD = 0.2, 0.7  # prior of the softness, and its standard deviation in the logarithm
 _LUCK = 0.01  # share of returns that are from the sphere by their range and yet did not meet it
-_NEAR = 2.0  # half widths inside the outline within which returns tell its softness
+_NEAR = 1.75  # half widths inside the outline within which returns tell of it
 _CERTAIN = 4.0  # standard deviations inside the outline from where meeting is no news
 _CAVITY_MIN = 0.05  # of a centre's precision: the least that is not one return's own
+_N_PRODUCT = 25  # chances that are multiplied before the logarithm is taken
 _TINY = 1e-9  # [m]
 _HALF, _DENSITY = math.sqrt(0.5), 1.0 / math.sqrt(2.0 * math.pi)
 
 
-def softness(rows: Rows, linear: Linear, weights: Array, covs: Array, radius: float) -> float:
-    """Return how softly the outline ends: by how much returns seem to pass spheres by.
+class Outline(NamedTuple):
+    """How returns end at the outline of spheres.
+
+    Attributes
+    ----------
+    radius : float
+        Radius of the spheres [m].
+    edge : float
+        How far inside the outline a footprint must reach to return, in its half widths.
+    softness : float
+        Standard deviation of that, in the same.
+    """
+
+    radius: float
+    edge: float
+    softness: float
+
+
+def outline_of(rows: Rows, linear: Linear, weights: Array, covs: Array, radius: float) -> Outline:
+    """Return how returns end at the outline of the spheres of a stop.
 
     Parameters
     ----------
     rows : Rows
-        Returns of all spheres of a stop.
+        Returns of all spheres.
     linear : Linear
         Where they pass the centres, found from ranges alone.
     weights : (n,)
@@ -43,36 +65,56 @@ def softness(rows: Rows, linear: Linear, weights: Array, covs: Array, radius: fl
 
     Returns
     -------
-    float
-        Standard deviation of where the outline begins, in half widths of the footprint.
+    Outline
+        The same for all spheres.
 
     Notes
     -----
-    Returns lie evenly, save that none can lie outside: where one of them seems to reach inside the
-    outline by ``x``, give or take ``s``, it has the density ``Phi(x / s)``, whose integral over a
-    given width to both sides does not depend on ``s``. Directions that are off, footprints that are
-    wider than they are said to be and what else moves returns across the outline make it soft, and
-    then it says less.
+    Returns lie evenly up to the edge: one that seems to reach inside of it by ``x``, give or take
+    ``s``, has a density like ``Phi(x / s)``. Footprints that are wider or narrower than they are
+    said to be move the edge; directions that are off, and what else carries returns across it, make
+    it soft, and then it says less. Mean over a grid, with a weak prior for few spheres.
     """
     logs = _logarithms(rows, linear, weights, covs, radius)
+    logs -= 0.5 * ((_EDGES[:, None] - _EDGE) / _SIGMA_EDGE) ** 2
     logs -= 0.5 * (np.log(_SOFTNESSES / _SOFTNESS) / _SPREAD) ** 2
     chances = np.exp(logs - logs.max())
-    return float(np.exp(chances @ np.log(_SOFTNESSES) / chances.sum()))
+    chances /= chances.sum()
+    softness = np.exp(chances.sum(axis=0) @ np.log(_SOFTNESSES))
+    return Outline(radius, float(chances.sum(axis=1) @ _EDGES), float(softness))
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
 def _logarithms(rows: Rows, linear: Linear, weights: Array, covs: Array, radius: float) -> Array:
-    """Return the log-likelihood of each softness."""
-    logs = np.zeros(len(_SOFTNESSES))
-    for m in range(len(covs)):
-        for i in range(rows.firsts[m], rows.firsts[m + 1]):
-            half, inside, towards = _met(rows, linear, i, radius)
-            if weights[i] > 0.0 and inside < _NEAR * half:
-                variance = _variance(covs[m], towards) + rows.lateral[i] ** 2
-                for k in range(len(logs)):
-                    sigma = math.sqrt(variance + (_SOFTNESSES[k] * half) ** 2)
-                    logs[k] += math.log(_chance(inside / sigma))
+    """Return the log-likelihood of each edge and softness."""
+    logs, product = np.zeros((len(_EDGES), len(_SOFTNESSES))), np.ones(len(_EDGES))
+    for k in range(len(_SOFTNESSES)):
+        n = 0
+        for m in range(len(covs)):
+            for i in range(rows.firsts[m], rows.firsts[m + 1]):
+                half, inside = _reach(rows, linear, i, radius)
+                if weights[i] == 0.0 or inside > _NEAR * half:
+                    continue
+                variance = _variance(covs[m], _towards(rows, linear, i)) + rows.lateral[i] ** 2
+                sigma = math.sqrt(variance + (_SOFTNESSES[k] * half) ** 2)
+                for e in range(len(_EDGES)):
+                    z, t = inside - _EDGES[e] * half, (_NEAR - _EDGES[e]) * half
+                    product[e] *= _chance(z / sigma) * half / (sigma * _length(t / sigma))
+                n += 1
+                if n % _N_PRODUCT == 0:
+                    logs[:, k] += np.log(product)
+                    product[:] = 1.0
+        logs[:, k] += np.log(product)
+        product[:] = 1.0
     return logs
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _length(t: float) -> float:
+    """Return the integral of the chance of a normal deviate below its limit, up to ``t``."""
+    if t > _CERTAIN:
+        return t
+    return t * 0.5 * math.erfc(-_HALF * t) + _DENSITY * math.exp(-0.5 * t * t)
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
@@ -81,7 +123,7 @@ def outline_normals(
     linear: Linear,
     weights: Array,
     covs: Array,
-    outline: tuple[float, float],
+    outline: Outline,
     sites: Array,
 ) -> tuple[Array, Array, Array]:
     """Return what it adds to the normal equations of centres that returns have met their spheres.
@@ -96,8 +138,8 @@ def outline_normals(
         Robust weights of the returns, 0 to 1.
     covs : (m, 3, 3)
         Covariances of the present centres [m^2].
-    outline : tuple of float
-        Radius of the spheres [m], and softness of the outline in half widths of the footprint.
+    outline : Outline
+        How returns end there.
     sites : (n, 2)
         What the last call returned; zeros before the first.
 
@@ -119,17 +161,19 @@ def outline_normals(
     It speaks of the place across the line of sight alone: how large the outline looks would tell
     the distance too, and would be trusted more than the footprint is known.
     """
-    radius, soft = outline
     n, found = len(covs), np.zeros(sites.shape)
     centres, pull_centres = np.zeros((n, 3, 3)), np.zeros((n, 3))
     for m in range(n):
+        widest = covs[m, 0, 0] + covs[m, 1, 1] + covs[m, 2, 2]
         for i in range(rows.firsts[m], rows.firsts[m + 1]):
-            half, inside, towards = _met(rows, linear, i, radius)
-            variance = _variance(covs[m], towards)
-            blur = (soft * half) ** 2 + rows.lateral[i] ** 2
-            if weights[i] == 0.0 or inside > _CERTAIN * math.sqrt(variance + blur):
+            half, inside = _reach(rows, linear, i, outline.radius)
+            inside -= outline.edge * half
+            blur = (outline.softness * half) ** 2 + rows.lateral[i] ** 2
+            if weights[i] == 0.0 or inside > _CERTAIN * math.sqrt(widest + blur):
                 continue
-            precision, pull = _site(inside, variance, blur, (sites[i, 0], sites[i, 1]))
+            towards = _towards(rows, linear, i)
+            known = (_variance(covs[m], towards), blur)
+            precision, pull = _site(inside, known, (sites[i, 0], sites[i, 1]))
             precision, pull = weights[i] * precision, weights[i] * pull
             found[i, 0], found[i, 1] = precision, pull
             for p in range(3):
@@ -140,9 +184,9 @@ def outline_normals(
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def _site(inside, variance, blur, site):  # type: ignore[no-untyped-def]  # noqa: ANN001, ANN202
+def _site(inside, known, site):  # type: ignore[no-untyped-def]  # noqa: ANN001, ANN202
     """Return precision, and that times the mean, which stand for one return's reaching inside."""
-    own, own_pull = site
+    (variance, blur), (own, own_pull) = known, site
     precision = max(1.0 / variance - own, _CAVITY_MIN / variance)
     pull = inside / variance - own_pull
     spread = 1.0 / precision + blur
@@ -159,31 +203,38 @@ def _site(inside, variance, blur, site):  # type: ignore[no-untyped-def]  # noqa
 @numba.njit(cache=True, nogil=True, error_model="numpy")
 def _chance(z: float) -> float:
     """Return the chance that a return which reaches so far inside has met the sphere."""
+    if z > _CERTAIN:
+        return 1.0
     return _LUCK + (1.0 - _LUCK) * 0.5 * math.erfc(-_HALF * z)
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def _met(rows: Rows, linear: Linear, i: int, radius: float):  # type: ignore[no-untyped-def]  # noqa: ANN202
-    """Return half a footprint's width [m], how far inside the outline it reaches, and its slope."""
+def _reach(rows: Rows, linear: Linear, i: int, radius: float) -> tuple[float, float]:
+    """Return half of a footprint's width and how far it reaches inside the outline [m]."""
     x, y = linear.offsets[i, 0], linear.offsets[i, 1]
-    off = max(math.hypot(x, y), _TINY)
-    x, y = x / off, y / off
-    half = math.hypot(rows.half_widths[i, 0] * x, rows.half_widths[i, 1] * y)
+    off = max(math.sqrt(x * x + y * y), _TINY)
+    a, b = rows.half_widths[i, 0] * x, rows.half_widths[i, 1] * y
+    half = math.sqrt(a * a + b * b) / off
+    return half, radius + half - off
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _towards(rows: Rows, linear: Linear, i: int) -> tuple[float, float, float]:
+    """Return the direction from a centre to a beam, square to the line of sight to the centre."""
+    x, y = linear.offsets[i, 0], linear.offsets[i, 1]
+    off = max(math.sqrt(x * x + y * y), _TINY)
+    x, y, lean = x / off, y / off, off / rows.ranges[i]
     a, b, u = rows.firsts_axis, rows.seconds_axis, rows.directions
-    lean = off / rows.ranges[i]  # square to the line to the centre, not to the beam
-    towards = (
+    return (
         x * a[i, 0] + y * b[i, 0] + lean * u[i, 0],
         x * a[i, 1] + y * b[i, 1] + lean * u[i, 1],
         x * a[i, 2] + y * b[i, 2] + lean * u[i, 2],
     )
-    return half, radius + half - off, towards
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
 def _variance(cov: Array, v: tuple[float, float, float]) -> float:
     """Return the variance along a vector."""
-    total = 0.0
-    for p in range(3):
-        for q in range(3):
-            total += v[p] * cov[p, q] * v[q]
-    return total
+    x, y, z = v
+    crossed = cov[0, 1] * x * y + cov[0, 2] * x * z + cov[1, 2] * y * z
+    return cov[0, 0] * x * x + cov[1, 1] * y * y + cov[2, 2] * z * z + 2.0 * crossed
