@@ -13,6 +13,7 @@ import numpy as np
 from pipelines.config import ResectionConfig
 from pipelines.geometry import rigid, transform
 from pipelines.matching import Match, Scene, gather, match_marks, solve_pose
+from pipelines.ranging import circles, slope_ranges
 from pipelines.values import Array, ControlMarks, Index, MarkerFits, Mask, StationFix, _seal
 
 _SURPRISE = 3.29  # sigmas that one in a thousand normal residuals exceeds
@@ -20,6 +21,7 @@ _N_LEFT = 3  # markers at least, of which one can be left out
 _DISPLACED = 1.0  # [m] from a marker that is no mark: a mark without one may be given wrongly
 _UPRIGHT = 0.05  # spread across over spread along a plumb line of marks that tell no heading
 _N_POSE = 6  # unknowns: with as many more observations of centres, the levelling was left out
+_OPEN = 1e-9  # of the largest eigenvalue of a normal matrix: what is smaller tells nothing
 _UNKNOWN = 1.0  # [rad] of a levelling that was left out
 
 
@@ -190,6 +192,36 @@ def _suspects(off: Index) -> tuple[int, ...]:
         suspects.append(worst)
         off = off[(off != worst).all(axis=1)]
     return tuple(suspects)
+
+
+def dilution_of_precision(fix: StationFix, marks: ControlMarks) -> float:
+    """Return how much the geometry of a station enlarges the errors of what was observed.
+
+    Parameters
+    ----------
+    fix : StationFix
+        The fix.
+    marks : ControlMarks
+        The marks that it came from.
+
+    Returns
+    -------
+    float
+        3-D sigma of the position of a levelled station where each observation has a sigma of 1: the
+        coordinates of centres, or distances (``ranges``; ``paper`` with heights); infinite where
+        these leave it open.
+    """
+    v = marks.p_site[fix.matches[:, 1]] - fix.p_site
+    if fix.method == "free_station":
+        J = np.zeros((len(v), 3, 4))
+        J[:, 0, 0], J[:, 1, 0], J[:, :, 1:] = -v[:, 1], v[:, 0], np.eye(3)
+    else:
+        J = (slope_ranges if fix.method == "ranges" else circles)(v)[1]
+    N = np.einsum("kmi,kmj->ij", J, J)
+    values = np.linalg.eigvalsh(N)
+    if values[0] < _OPEN * values[-1]:
+        return float("inf")
+    return float(np.sqrt(np.trace(np.linalg.inv(N)[-3:, -3:])))
 
 
 def leave_each_out(

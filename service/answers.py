@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from pipelines.accuracy import UNMATCHED, marker_errors, station_error
-from pipelines.checking import check_distances, leave_each_out
+from pipelines.checking import check_distances, dilution_of_precision, leave_each_out
 from pipelines.config import SurveyConfig
 from pipelines.errors import SolveError
 from pipelines.geometry import levelling_rotation, yaw_pitch_roll
@@ -36,7 +36,7 @@ from pipelines.values import (
     Truth,
 )
 from storage.recordings import read_log
-from storage.results import marker_name
+from storage.results import ellipse, marker_name
 
 Frame = Literal["station", "base"]
 Plain = dict[str, Any]
@@ -211,8 +211,11 @@ def _station(
         "covariance": _numbers(fix.cov_T_site_station),
         "position_covariance_m2": _numbers(fix.cov_p_site),
         "sigma_3d_m": _number(fix.sigma_3d),
+        **{key: float(value) for key, value in ellipse(fix.cov_p_site[:2, :2]).items()},
+        "dop": _number(dilution_of_precision(fix, marks)),
         "sigma_levelling_rad": stop.cloud.levelling.sigma,
         "dof": fix.dof,
+        "sigma0_a_priori": 1.0,
         "sigma0": _number(fix.sigma0),
         "passes_global_test": fix.passes_global_test,
         "included_angle_min_deg": _number(low),

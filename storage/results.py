@@ -15,6 +15,7 @@ import numpy as np
 import pyarrow as pa
 
 from pipelines.accuracy import centre_errors, station_error
+from pipelines.checking import dilution_of_precision, leave_each_out
 from pipelines.config import SurveyConfig
 from pipelines.errors import InputError
 from pipelines.geometry import levelling_rotation, rigid
@@ -24,6 +25,7 @@ from pipelines.values import (
     ControlMarks,
     Levelling,
     MarkerFit,
+    MarkerFits,
     NoFix,
     StationFix,
     Status,
@@ -99,6 +101,7 @@ _SCHEMAS = {
         **dict.fromkeys(("included_angle_min_deg", "included_angle_max_deg"), _REAL),
         **_ERROR,
         **dict.fromkeys(("error_yaw_deg", "error_horizontal_m", "error_3d_m"), _REAL),
+        "dop": _REAL,
     },
     "observations": {
         **_FIX,
@@ -109,6 +112,7 @@ _SCHEMAS = {
         **dict.fromkeys(("residual_x_m", "residual_y_m", "residual_z_m"), _REAL),
         **dict.fromkeys(("redundancy", "w"), _REAL),
         **dict.fromkeys(("minimal_detectable_bias_m", "external_reliability_m"), _REAL),
+        "shift_without_m": _REAL,
     },
     "resections": {
         **_FIX,
@@ -203,8 +207,9 @@ def tables(
         raise InputError(f"Run {run.run_id} has fixes; give the control marks that they refer to.")
     rows = _run_rows(run, stops)
     for stop in stops:
-        names = () if marks is None else marks.names
-        for table, found in _stop_rows(stop, names, (clouds or {}).get(stop.name)).items():
+        for table, found in _stop_rows(
+            stop, marks, run.config, (clouds or {}).get(stop.name)
+        ).items():
             rows[table] += [{"run_id": run.run_id, "stop": stop.name, **row} for row in found]
     made = {name: _table(name, rows[name]) for name in TABLES}
     names = () if marks is None else marks.names
@@ -274,9 +279,10 @@ def _run_rows(run: RunInfo, stops: tuple[StopResult, ...]) -> dict[str, list[Row
 
 
 def _stop_rows(
-    stop: StopResult, names: tuple[str, ...], cloud_url: str | None
+    stop: StopResult, marks: ControlMarks | None, config: SurveyConfig, cloud_url: str | None
 ) -> dict[str, list[Row]]:
     """Return the rows of one stop by table, without what names run and stop."""
+    names = () if marks is None else marks.names
     rows: dict[str, list[Row]] = {name: [] for name in TABLES[2:]}
     rows["stops"].append(_stop_row(stop, cloud_url))
     R, sigma_heading = levelling_rotation(stop.cloud.levelling), stop.cloud.rig.sigma_heading
@@ -292,11 +298,26 @@ def _stop_rows(
         ]
     for (fit_method, method), fix in stop.fixes.items():
         label = {"fit_method": fit_method, "resection_method": method}
-        rows["station_fixes"].append(label | _fix_row(fix))
-        if isinstance(fix, StationFix):
-            n_fits = len(stop.fits[fit_method].fits)
-            rows["observations"] += [label | row for row in _observation_rows(fix, n_fits, names)]
+        row = label | _fix_row(fix)
+        if isinstance(fix, StationFix) and marks is not None:
+            fits = stop.fits[fit_method]
+            row["dop"] = dilution_of_precision(fix, marks)
+            shifts = _shifts_without_each(fix, fits, marks, config)
+            found = _observation_rows(fix, len(fits.fits), names, shifts)
+            rows["observations"] += [label | one for one in found]
+        rows["station_fixes"].append(row)
     return rows
+
+
+def _shifts_without_each(
+    fix: StationFix, fits: MarkerFits, marks: ControlMarks, config: SurveyConfig
+) -> Array:
+    """Return how far the station moves without each of its markers; NaN where that is not told."""
+    found = np.full(len(fix.matches), np.nan)
+    if fix.method == "free_station":
+        shifts = leave_each_out(fix, fits, marks, config.resection).shifts
+        found[: len(shifts)] = np.linalg.norm(shifts, axis=1)
+    return found
 
 
 def marker_name(place: int) -> str:
@@ -410,7 +431,9 @@ def ellipse(cov_horizontal: Array) -> Row:
     }
 
 
-def _observation_rows(fix: StationFix, n_fits: int, names: tuple[str, ...]) -> list[Row]:
+def _observation_rows(
+    fix: StationFix, n_fits: int, names: tuple[str, ...], shifts: Array
+) -> list[Row]:
     """Return one row of ``observations`` for each marker of the stop."""
     excluded = {exclusion.fit: exclusion.reason for exclusion in fix.excluded}
     rows: list[Row] = [
@@ -432,6 +455,7 @@ def _observation_rows(fix: StationFix, n_fits: int, names: tuple[str, ...]) -> l
             "w": fix.w_statistics[k],
             "minimal_detectable_bias_m": fix.detectable_biases[k],
             "external_reliability_m": fix.external_reliabilities[k],
+            "shift_without_m": shifts[k],
         }
     return rows
 

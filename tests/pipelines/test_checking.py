@@ -5,9 +5,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from pipelines.checking import check_distances, leave_each_out
+from pipelines.checking import check_distances, dilution_of_precision, leave_each_out
 from pipelines.config import ResectionConfig
 from pipelines.resection import resect
+from pipelines.values import StationFix, Status
 from tests.synthetic import control, field, pose, sightings
 
 CONFIG = ResectionConfig(sigma_common=0.0, sigma_range=0.0, sigma_range_shared=0.0)
@@ -161,3 +162,34 @@ def test_a_levelling_that_the_fix_left_out_does_not_tilt_what_the_others_predict
     omissions = leave_each_out(fix, fits, marks, CONFIG)
     assert np.linalg.norm(omissions.predictions, axis=1).max() < 8 * SIGMA
     assert np.linalg.norm(omissions.shifts, axis=1).max() < 4 * SIGMA
+
+
+@pytest.mark.parametrize(
+    ("method", "directions", "expected"),
+    [
+        # centres all around: their mean in each of three coordinates
+        ("free_station", [[7, 0, 0], [-3.5, 6.1, 0], [-3.5, -6.1, 0]], np.sqrt(3 / 3)),
+        # a tetrahedron: J'J is 4/3 of the unit matrix
+        ("ranges", [[5, 5, 5], [5, -5, -5], [-5, 5, -5], [-5, -5, 5]], np.sqrt(3 * 3 / 4)),
+        # three circles at 120 degrees, and the mean of three heights
+        ("paper", [[7, 0, 0], [-3.5, 6.0622, 0], [-3.5, -6.0622, 0]], np.sqrt(2 * 2 / 3 + 1 / 3)),
+    ],
+)
+def test_the_dilution_of_precision_is_that_of_textbook_geometries(method, directions, expected):
+    marks = control(directions)
+    fix = StationFix(
+        method=method, T_site_station=np.eye(4), cov_T_site_station=np.eye(6), cov_p_site=np.eye(3),
+        matches=np.stack([np.arange(len(directions))] * 2, axis=1),
+        **dict.fromkeys(("redundancies", "w_statistics", "detectable_biases",
+                         "external_reliabilities"), np.zeros(len(directions))),
+        residuals_site=np.zeros((len(directions), 3)), dof=1, sigma0=1.0, passes_global_test=True,
+        included_angles=np.zeros(2), status=Status.OK, reason="", excluded=(),
+    )  # fmt: skip
+    assert dilution_of_precision(fix, marks) == pytest.approx(expected, rel=1e-3)
+
+
+def test_ranges_in_one_plane_with_the_station_dilute_its_height_without_limit():
+    marks = control([[7.0, 0, 0.8], [-3, 6, 0.8], [-3, -6, 0.8], [2, 7, 0.8]])
+    fix = resect("free_station", sightings(marks, pose([0, 0, 0.8], 0.3)), marks, CONFIG)
+    assert np.isfinite(dilution_of_precision(fix, marks))
+    assert np.isinf(dilution_of_precision(replace(fix, method="ranges"), marks))

@@ -190,6 +190,14 @@ def test_every_marker_of_a_fix_has_an_observation_that_says_whether_it_was_used(
     assert found[0]["w"] is None
     assert found[0]["minimal_detectable_bias_m"] is None
     assert found[0]["external_reliability_m"] is None
+    assert all((row["shift_without_m"] is None) == (not row["used"]) for row in found)
+    assert all(0.0 < row["shift_without_m"] < 0.05 for row in found[:5])
+
+
+def test_a_station_tells_how_its_geometry_dilutes_precision():
+    found = {row["fit_method"]: row["dop"] for row in rows(made_tables(), "station_fixes")}
+    assert 0.5 < found["along_beam"] < 3.0
+    assert found["paper"] is None
 
 
 def test_pairs_and_triples_name_their_marks_and_angles():
