@@ -35,6 +35,9 @@ def bench(
     networks: Annotated[
         int, typer.Option(min=0, help="Accuracy of adjusted surveys; so many instead.")
     ] = 0,
+    plans: Annotated[
+        int, typer.Option(min=0, help="Optimised marks beside the best of so many at random.")
+    ] = 0,
     wrong_rig: Annotated[
         bool, typer.Option("--wrong-rig", help="With wrong rigs, calibrated, for --networks.")
     ] = False,
@@ -54,6 +57,9 @@ def bench(
         return
     if networks:
         _bench_networks(networks, seed, is_rig_wrong=wrong_rig, as_json=as_json)
+        return
+    if plans:
+        _bench_plans(plans, seed, as_json=as_json)
         return
     if accuracy:
         _bench_accuracy(stops, seed, is_full=full, as_json=as_json)
@@ -96,6 +102,18 @@ def _bench_networks(n_surveys: int, seed: int, *, is_rig_wrong: bool, as_json: b
         print_json(report)
     else:
         network_trials.print_report(out, report)
+
+
+def _bench_plans(n_drawn: int, seed: int, *, as_json: bool) -> None:
+    """Measure how much better optimised marks are than chance, and how near to the best."""
+    from service import plan_bench
+
+    with progress() as told:
+        report = plan_bench.run(n_drawn, seed, told)
+    if as_json:
+        print_json(report)
+    else:
+        plan_bench.print_report(out, report)
 
 
 def _bench_extraction(worlds: int, seed: int, *, as_json: bool) -> None:

@@ -7,7 +7,9 @@ are judged whole.
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
+from itertools import combinations
 from typing import NamedTuple
 
 import numba
@@ -44,7 +46,8 @@ _STARTS_WHOLE = 4  # of whole judgements
 _DRAWN, _DRAWN_KEPT = 1500, 40  # arrangements at random that these begin with, and judge in full
 _POWER = 12.0  # of the mean over stops that is as good as their largest, and smoother
 _SHAKEN = 0.4  # share of marks that such a start has elsewhere
-_SLACK, _SLACK_WHOLE = 1.15, 2.0  # times the tolerance, beyond which more search does not help
+_FEW = 10  # marks of which a loss matters much; of more, judging losses takes too long at first
+_SLACK, _SLACK_FEW, _SLACK_WHOLE = 1.15, 1.3, 2.0  # times the tolerance: beyond, none helps
 _WORSE = 1.3  # than now, at most, while a loss would break what is wanted
 _TRIED = 12  # candidates that are judged in full for each mark, the most promising first
 _SCREENED = 800  # places that whole judgements try in a round, for all marks together
@@ -227,16 +230,15 @@ def optimise(  # noqa: PLR0913  all that a plan is made of
         marks = Arrangement.numbered(candidates.p_site[chosen])
         return _keeps(site, stops, marks, model, wider, goal)
 
-    slack = _SLACK_WHOLE if wish.method == "paper" else _SLACK
     most = _glance(task, goal.most, goal, rng)
     if most is not None and not is_kept(most, 1.0):
-        is_near = is_kept(most, slack)
+        is_near = is_kept(most, _slack(task, goal.most))
         found = tried(goal.most) if is_near else _optimum(*given, (most, 0), goal)
         if not found.is_kept:
             raise DegenerateGeometryError(_impossible(task, stops, found, goal))
     for k in range(least, goal.most):
         some = _glance(task, k, goal, rng)
-        if (some is None or is_kept(some, slack)) and (found := tried(k)).is_kept:
+        if (some is None or is_kept(some, _slack(task, k))) and (found := tried(k)).is_kept:
             return found
     if (found := tried(goal.most)).is_kept:
         return found
@@ -337,6 +339,49 @@ def draw_arrangement(candidates: Candidates, n_marks: int, rng: np.random.Genera
     raise DegenerateGeometryError(_no_room(candidates, n_marks, len(chosen)))
 
 
+def best_without_search(  # noqa: PLR0913  all that a plan is made of
+    site: Site,
+    stops: Stops,
+    candidates: Candidates,
+    model: CentreModel,
+    wish: Requirement,
+    n_marks: int,
+    drawn: tuple[int, np.random.Generator] | None,
+) -> float:
+    """Return the least 3-D sigma at the worst stop that chance finds, or of all arrangements.
+
+    Parameters
+    ----------
+    site : Site
+        Ground and what hides marks.
+    stops : Stops
+        Places of the LiDAR.
+    candidates : Candidates
+        Where a mark may stand.
+    model : CentreModel
+        How well centres will be known.
+    wish : Requirement
+        Tolerance and method.
+    n_marks : int
+        Number of marks.
+    drawn : tuple of int and numpy.random.Generator, optional
+        How many arrangements are drawn; without it all that there are are judged.
+
+    Returns
+    -------
+    float
+        What an optimised arrangement is measured by [m].
+    """
+    task = _task(site, stops, candidates, model, wish)
+    some: Iterable[Index]
+    if drawn is not None:
+        some = (_drawn(task, n_marks, drawn[1]) for _ in range(drawn[0]))
+    else:
+        every = combinations(range(len(task.near)), n_marks)
+        some = (c for c in map(np.array, every) if task.near[np.ix_(c, c)].sum() == n_marks)
+    return min(_score(task, chosen)[0] for chosen in some)
+
+
 def _no_room(candidates: Candidates, wanted: int, found: int) -> str:
     """Say that there are too few places."""
     return (
@@ -400,17 +445,21 @@ def _best(task: _Task, k: int, goal: Goal, rng: np.random.Generator) -> tuple[In
 
 def _best_drawn(task: _Task, other: Index, goal: Goal, rng: np.random.Generator) -> Index:
     """Return the best of many arrangements at random, and of another with as many marks."""
-    drawn = [other]
-    for _ in range(_DRAWN):
-        chosen: list[int] = []
-        for c in rng.permutation(len(task.near)):
-            if not task.near[c, chosen].any():
-                chosen.append(int(c))
-            if len(chosen) == len(other):
-                drawn.append(np.array(chosen, dtype=np.intp))
-                break
+    drawn = [other, *(_drawn(task, len(other), rng) for _ in range(_DRAWN))]
+    drawn = [chosen for chosen in drawn if len(chosen) == len(other)]
     drawn.sort(key=lambda chosen: _score(task, chosen))
     return min(drawn[:_DRAWN_KEPT], key=lambda chosen: _wanted(task, chosen, goal))
+
+
+def _drawn(task: _Task, k: int, rng: np.random.Generator) -> Index:
+    """Return k candidates at random that are not too near to each other; fewer without room."""
+    chosen: list[int] = []
+    for c in rng.permutation(len(task.near)):
+        if len(chosen) == k:
+            break
+        if not task.near[c, chosen].any():
+            chosen.append(int(c))
+    return np.array(chosen, dtype=np.intp)
 
 
 def _greedy(task: _Task, k: int) -> Index:
@@ -665,8 +714,16 @@ def _glance(task: _Task, k: int, goal: Goal, rng: np.random.Generator) -> Index 
         return None
     if task.wish.method == "paper":
         return _best_drawn(task, chosen, goal, rng)
-    whole = replace(goal, is_robust=False)  # judging losses takes ten times as long
-    return _exchanged(task._replace(power=_POWER), chosen, whole, rng)[0]
+    is_robust = goal.is_robust and k <= _FEW
+    quick = replace(goal, is_robust=is_robust)
+    return _exchanged(task._replace(power=_POWER), chosen, quick, rng)[0]
+
+
+def _slack(task: _Task, k: int) -> float:
+    """Return by how much a short search may miss the tolerance and a long one still keep it."""
+    if task.wish.method == "paper":
+        return _SLACK_WHOLE
+    return _SLACK_FEW if k <= _FEW else _SLACK
 
 
 def _impossible(task: _Task, stops: Stops, best: Optimum, goal: Goal) -> str:

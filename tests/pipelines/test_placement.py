@@ -21,6 +21,7 @@ from pipelines.placement import (
     Sensor,
     Site,
     Stops,
+    best_without_search,
     draw_arrangement,
     evaluate,
     field_map,
@@ -387,6 +388,9 @@ def test_a_small_case_comes_near_the_best_of_all():
         for places in combinations(range(14), 4)
     )
     assert best / found.evaluation.worst_sigma_3d >= 0.95
+    given = (site, stops, candidates, MODEL, Requirement(), 4)
+    assert_allclose(best_without_search(*given, None), best, rtol=1e-9)
+    assert best_without_search(*given, (30, rng)) >= 0.999 * best
 
 
 def test_the_least_number_keeps_the_tolerance_and_one_less_does_not():
