@@ -298,14 +298,14 @@ def _stop_rows(
         ]
     for (fit_method, method), fix in stop.fixes.items():
         label = {"fit_method": fit_method, "resection_method": method}
-        row = label | _fix_row(fix)
+        station: Row = label | _fix_row(fix)
         if isinstance(fix, StationFix) and marks is not None:
             fits = stop.fits[fit_method]
-            row["dop"] = dilution_of_precision(fix, marks)
+            station["dop"] = dilution_of_precision(fix, marks)
             shifts = _shifts_without_each(fix, fits, marks, config)
-            found = _observation_rows(fix, len(fits.fits), names, shifts)
-            rows["observations"] += [label | one for one in found]
-        rows["station_fixes"].append(row)
+            observed = _observation_rows(fix, len(fits.fits), names, shifts)
+            rows["observations"] += [label | one for one in observed]
+        rows["station_fixes"].append(station)
     return rows
 
 
