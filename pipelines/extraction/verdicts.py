@@ -295,9 +295,10 @@ def verdict_among_others(
     Notes
     -----
     The markers of a survey share their paint, and with it reflectivity and noise. What scatters
-    more may lack the curvature of a ball, by the noise of the others; what is missing across and
-    along is tested together. A stone behind a crest and a marker behind a crest look alike: where
-    the pole is hidden, reflectivity and scatter themselves must be those of the others.
+    clearly more may lack the curvature of a ball, by the noise of the others; what is missing
+    across and along is tested together. A stone behind a crest and a marker behind a crest look
+    alike: where the pole is hidden, reflectivity and scatter themselves must be as those
+    of the others.
     """
     return _unlike_in_shape(look, others, ball) or _unlike_in_paint(look, sight, others)
 
@@ -310,7 +311,7 @@ def _unlike_in_shape(look: Look, others: Sequence[tuple[Look, Sight]], ball: Bal
     flats = (look.flat_across, look.flat_along)
     off = np.array(flats) / (share * np.array([look.sigma_across, look.sigma_along]))
     is_flat = float(np.hypot(*np.maximum(off, 0.0))) > _SIGMAS_UNLIKE and max(flats) > _FLAT_UNLIKE
-    if look.n_points < _N_SURE or not is_flat:
+    if look.n_points < _N_SURE or not is_flat or look.scatter <= _NOISIER * noise:
         return ""
     return (
         f"It is not curved as a sphere: {100 * max(flats):.0f} % of the curvature are missing, and "

@@ -117,19 +117,20 @@ def _stepped(
     is_in, square = weighing.weights > 0.0, spheres[:, 3, None, None] ** -2.0 * np.eye(4)
     residuals = weighing.ranges - linearise(rows, spheres, _with_radius(covs, 0.0), is_in).ranges
 
-    def summed(wide: Array) -> tuple[Array, Array, Array]:
+    def summed(wide: Array) -> tuple[Linear, Array, Array, Array]:
         linear = linearise(rows, spheres, wide, is_in)
         per_square = weighing.weights / (weighing.variances + linear.bends**2)
         N, _, _, pull, _ = normals_of(rows, linear, residuals, per_square, (4, n_lasers))
-        noise = per_square**2 * weighing.variances
-        return N, pull, normals_of(rows, linear, residuals, noise, (4, n_lasers))[0]
+        return linear, per_square, N, pull
 
     rough = _with_radius(covs, np.trace(covs[:, :3, :3], axis1=1, axis2=2))
-    cov = np.linalg.inv(summed(rough)[0] + square / _PRIOR**2)
-    N, pull, of_noise = summed(np.asarray(cov, dtype=np.float64))
+    cov = np.linalg.inv(summed(rough)[2] + square / _PRIOR**2)
+    linear, per_square, N, pull = summed(np.asarray(cov, dtype=np.float64))
     by_pull = np.linalg.inv(N + square / _WEAK_PRIOR**2)
+    of_noise = per_square**2 * weighing.variances
+    spread = by_pull @ normals_of(rows, linear, residuals, of_noise, (4, n_lasers))[0] @ by_pull
     radii = spheres[:, 3] + np.einsum("mj,mj->m", by_pull[:, 3], pull)
-    return radii, np.sqrt((by_pull @ of_noise @ by_pull)[:, 3, 3])
+    return radii, np.sqrt(spread[:, 3, 3])
 
 
 def _misfits(rows: Rows, weighing: Weighing, spheres: Array, covs: Array) -> Array:
