@@ -237,4 +237,5 @@ def _variance(cov: Array, v: tuple[float, float, float]) -> float:
     """Return the variance along a vector."""
     x, y, z = v
     crossed = cov[0, 1] * x * y + cov[0, 2] * x * z + cov[1, 2] * y * z
-    return cov[0, 0] * x * x + cov[1, 1] * y * y + cov[2, 2] * z * z + 2.0 * crossed
+    along = cov[0, 0] * x * x + cov[1, 1] * y * y + cov[2, 2] * z * z
+    return float(along + 2.0 * crossed)
