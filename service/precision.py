@@ -200,7 +200,9 @@ def print_report(out: Console, report: Plain) -> None:
     out.print(
         f"{report['stops']} stops of {report['per_distance']} markers at each distance. The bound "
         "is Cramer and Rao's, of ranges alone, for the very beams that hit; clear: for those of "
-        "which a fiftieth or more hit, without the grazing ones whose derivative has no limit."
+        "which a fiftieth or more hit, without the grazing ones whose derivative has no limit. "
+        "along_beam also knows that what returned has met the sphere, and silhouette what passed "
+        "by: both may go below it."
     )
     table = Table("sigma", "turn [s]", "distance [m]", "method")
     names = ("n", "hits", "bound", "RMS", "bound/RMS", "clear/RMS", "median", "p95", "radial")

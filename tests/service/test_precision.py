@@ -51,7 +51,7 @@ def test_centres_keep_the_bars(case):
         assert low - slack_nees < row["mean_nees"] < high + slack_nees
         if row["method"] == "along_beam":
             share, bias = bars(distance)
-            assert row["bound_clear_over_rms"] > share * (1 - slack)
+            assert row["bound_over_rms"] > share * (1 - slack)
             assert abs(row["radial_bias_m"]) < bias + 3 * row["rms_m"] / np.sqrt(3 * n)
         elif case.sigma == 0.02 and distance <= 15:
             assert row["bound_over_rms"] > 1.0
