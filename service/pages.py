@@ -220,6 +220,7 @@ def survey(name: str, request: Request, service: Current) -> str:
             filters=filters,
             jobs=_jobs(service, survey=found["survey_id"], is_active=True),
             address=_address(request),
+            n_logs=len(service.catalogue.recordings_of_survey(found["survey_id"])),
         )
     )
 

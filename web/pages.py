@@ -82,7 +82,7 @@ class SurveyResults:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SurveyPage:
-    """The dashboard of a survey."""
+    """The dashboard of a survey; ``n_logs`` belong to it, with results or not yet."""
 
     frame: Frame
     data: SurveyData
@@ -90,6 +90,7 @@ class SurveyPage:
     filters: Filters
     jobs: tuple[Row, ...]
     address: str
+    n_logs: int
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

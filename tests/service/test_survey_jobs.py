@@ -384,6 +384,9 @@ def test_logs_that_were_uploaded_for_a_survey_belong_to_it_before_any_job_read_t
         answer = site.upload(stop.log.read_bytes(), "again", survey="later")
         assert answer.json()["job"] is None
     assert site.client.get("/api/v1/surveys/later").json()["n_recordings"] == 2
+    text = site.client.get("/surveys/later", headers={"Accept": "text/html"}).text
+    assert "2 logs belong to this survey" in text
+    assert "Adjust all stations</button>" in text
     job = run("adjust", survey="later")
     assert job["status"] == "successful", job
     assert {row["station"] for row in rows("adjusted_stations", job)} == set(STOPS)
