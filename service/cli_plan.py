@@ -256,15 +256,15 @@ def _print_trials(answer: dict[str, Any]) -> None:
         f"{_text(answer['pass_rate_outside'], 100.0, 1)} %.",
         highlight=False,
     )
-    table = Table("marks", "in the window", "pass [%]", "median [mm]", "p95 [mm]")
+    table = _table("marks", "in the window", "pass [%]", "median [mm]", "p95 [mm]")
     for row in answer["by_number_of_marks"]:
         table.add_row(str(row["n_marks"]), *_passed(row))
     out.print(table)
-    table = Table("worst angle [deg]", "all", "pass [%]", "median [mm]", "p95 [mm]")
+    table = _table("worst angle [deg]", "all", "pass [%]", "median [mm]", "p95 [mm]")
     for row in answer["by_worst_angle"]:
         table.add_row(f"{row['angle_from_deg']:g} - {row['angle_to_deg']:g}", *_passed(row))
     out.print(table)
-    table = Table("included angle [deg]", "study [mm]", "here [mm]")
+    table = _table("included angle [deg]", "study [mm]", "here [mm]")
     for row in answer["table3"]:
         table.add_row(
             f"{row['included_angle_deg']:.2f}",
@@ -314,13 +314,13 @@ def _print(answer: dict[str, Any]) -> None:
     """Print marks and stops as tables."""
     out.print(f"[bold]{escape(answer['site']['name'])}[/], method {answer['method']}")
     out.print(answer["model"]["text"], markup=False, highlight=False)
-    table = Table("mark", "x [m]", "y [m]", "z [m]", "pole [m]")
+    table = _table("mark", "x [m]", "y [m]", "z [m]", "pole [m]")
     for mark in answer["marks"]:
         place = (f"{v:.3f}" for v in mark["position_m"])
         table.add_row(escape(mark["name"]), *place, _text(mark["pole_height_m"], 1, 2))
     out.print(table)
     tolerance = f"P(<= {1e3 * answer['tolerance_m']:g} mm)"
-    table = Table("stop", "sigma 3-D [mm]", tolerance, "marks", "angles [deg]", "note")
+    table = _table("stop", "sigma 3-D [mm]", tolerance, "marks", "angles [deg]", "note")
     for stop in answer["stops"]:
         angles = (_text(stop[f"included_angle_{which}_deg"], 1, 0) for which in ("min", "max"))
         table.add_row(
@@ -342,6 +342,11 @@ def _print(answer: dict[str, Any]) -> None:
             f"{_text(one['worst_sigma_3d_m'], 1e3, 2)} mm.",
             highlight=False,
         )
+
+
+def _table(*headings: str) -> Table:
+    """Return a table whose headings keep their units, which are no markup."""
+    return Table(*map(escape, headings))
 
 
 def _text(value: float | None, factor: float, digits: int) -> str:

@@ -204,7 +204,7 @@ def print_report(out: Console, report: Plain) -> None:
         "along_beam also knows that what returned has met the sphere, and silhouette what passed "
         "by: both may go below it."
     )
-    table = Table("sigma", "turn [s]", "distance [m]", "method")
+    table = Table("sigma", r"turn \[s]", r"distance \[m]", "method")
     names = ("n", "hits", "bound", "RMS", "bound/RMS", "clear/RMS", "median", "p95", "radial")
     for name in (*names, "NEES"):
         table.add_column(name, justify="right")

@@ -91,6 +91,14 @@ def test_a_plan_refuses_what_cannot_be(small, tmp_path):
         plan("optimise", "--marks", 3, small[0], small[1], "--stops", stops)
 
 
+def test_tables_for_people_say_their_units(small, tmp_path):
+    marks = tmp_path / "marks.csv"
+    marks.write_text("mark,x_m,y_m,z_m\nM1,4,0,1\nM2,0,4,1\nM3,-4,0,1\n")
+    said = CliRunner().invoke(app, ["plan", "evaluate", "--marks", str(marks), *map(str, small)])
+    for heading in ("x [m]", "pole [m]", "sigma 3-D [mm]", "angles [deg]"):
+        assert heading in said.output
+
+
 def test_a_survey_whose_fits_are_wanted_must_be_there(small, tmp_path):
     marks = tmp_path / "marks.csv"
     marks.write_text("mark,x_m,y_m,z_m\nM1,4,0,1\nM2,0,4,1\nM3,-4,0,1\n")
