@@ -46,8 +46,11 @@ _STARTS_WHOLE = 4  # of whole judgements
 _DRAWN, _DRAWN_KEPT = 1500, 40  # arrangements at random that these begin with, and judge in full
 _POWER = 12.0  # of the mean over stops that is as good as their largest, and smoother
 _SHAKEN = 0.4  # share of marks that such a start has elsewhere
-_FEW = 10  # marks of which a loss matters much; of more, judging losses takes too long at first
-_SLACK, _SLACK_FEW, _SLACK_WHOLE = 1.15, 1.3, 2.0  # times the tolerance: beyond, none helps
+_FEW = 10  # marks that are always searched in full
+_SLACK, _SLACK_WHOLE = (
+    1.15,
+    2.0,
+)  # times the tolerance that a short search keeps: beyond, none helps
 _WORSE = 1.3  # than now, at most, while a loss would break what is wanted
 _TRIED = 12  # candidates that are judged in full for each mark, the most promising first
 _SCREENED = 800  # places that whole judgements try in a round, for all marks together
@@ -230,15 +233,19 @@ def optimise(  # noqa: PLR0913  all that a plan is made of
         marks = Arrangement.numbered(candidates.p_site[chosen])
         return _keeps(site, stops, marks, model, wider, goal)
 
+    slack = _SLACK_WHOLE if wish.method == "paper" else _SLACK
     most = _glance(task, goal.most, goal, rng)
     if most is not None and not is_kept(most, 1.0):
-        is_near = is_kept(most, _slack(task, goal.most))
+        is_near = is_kept(most, slack)
         found = tried(goal.most) if is_near else _optimum(*given, (most, 0), goal)
         if not found.is_kept:
             raise DegenerateGeometryError(_impossible(task, stops, found, goal))
     for k in range(least, goal.most):
         some = _glance(task, k, goal, rng)
-        if (some is None or is_kept(some, _slack(task, k))) and (found := tried(k)).is_kept:
+        if some is not None and is_kept(some, 1.0):  # a better sigma may have a worse shape
+            found = tried(k)
+            return found if found.is_kept else _optimum(*given, (some, 0), goal)
+        if (some is None or is_kept(some, slack)) and (found := tried(k)).is_kept:
             return found
     if (found := tried(goal.most)).is_kept:
         return found
@@ -707,23 +714,20 @@ def _refuse_impossible(task: _Task, stops: Stops) -> None:
 
 
 def _glance(task: _Task, k: int, goal: Goal, rng: np.random.Generator) -> Index | None:
-    """Return the best places of k marks that a short search finds; none if there is no room."""
+    """Return the best places of k marks that a short search finds.
+
+    None where there is no room, and for few marks, of which a short search tells too little.
+    """
+    if k <= _FEW and task.wish.method != "paper":
+        return None
     try:
         chosen = _greedy(task, k)
     except DegenerateGeometryError:
         return None
     if task.wish.method == "paper":
         return _best_drawn(task, chosen, goal, rng)
-    is_robust = goal.is_robust and k <= _FEW
-    quick = replace(goal, is_robust=is_robust)
+    quick = replace(goal, is_robust=False)  # judging losses takes ten times as long
     return _exchanged(task._replace(power=_POWER), chosen, quick, rng)[0]
-
-
-def _slack(task: _Task, k: int) -> float:
-    """Return by how much a short search may miss the tolerance and a long one still keep it."""
-    if task.wish.method == "paper":
-        return _SLACK_WHOLE
-    return _SLACK_FEW if k <= _FEW else _SLACK
 
 
 def _impossible(task: _Task, stops: Stops, best: Optimum, goal: Goal) -> str:
