@@ -151,7 +151,13 @@ class SimulationConfig:
 
     @property
     def stepped_time(self) -> float:
-        """Time of a turn with rests [s]."""
+        """Return how long a turn with rests takes.
+
+        Returns
+        -------
+        float
+            Time of all rests and the movements between them [s].
+        """
         rest = self.rest_revolutions * 60.0 / self.spin_rpm
         return 2.0 * math.pi / self.step * (rest + self.move)
 
