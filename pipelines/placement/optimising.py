@@ -233,9 +233,10 @@ def optimise(  # noqa: PLR0913  all that a plan is made of
         marks = Arrangement.numbered(candidates.p_site[chosen])
         return _keeps(site, stops, marks, model, wider, goal)
 
+    slack = _SLACK_WHOLE if wish.method == "paper" else _SLACK
     most = _glance(task, goal.most, goal, rng)
     if most is not None and not is_kept(most, 1.0):
-        is_near = is_kept(most, _slack(task, goal.most))
+        is_near = is_kept(most, slack)
         found = tried(goal.most) if is_near else _optimum(*given, (most, 0), goal)
         if not found.is_kept:
             raise DegenerateGeometryError(_impossible(task, stops, found, goal))
@@ -244,7 +245,7 @@ def optimise(  # noqa: PLR0913  all that a plan is made of
         if some is not None and is_kept(some, 1.0):  # a better sigma may have a worse shape
             found = tried(k)
             return found if found.is_kept else _optimum(*given, (some, 0), goal)
-        if (some is None or is_kept(some, _slack(task, k))) and (found := tried(k)).is_kept:
+        if (some is None or is_kept(some, slack)) and (found := tried(k)).is_kept:
             return found
     if (found := tried(goal.most)).is_kept:
         return found
@@ -715,22 +716,18 @@ def _refuse_impossible(task: _Task, stops: Stops) -> None:
 def _glance(task: _Task, k: int, goal: Goal, rng: np.random.Generator) -> Index | None:
     """Return the best places of k marks that a short search finds.
 
-    None where there is no room. Losses are minded where marks are few: of more, judging them takes
-    ten times as long.
+    None where there is no room, and for few marks, of which a short search tells too little.
     """
+    if k <= _FEW and task.wish.method != "paper":
+        return None
     try:
         chosen = _greedy(task, k)
     except DegenerateGeometryError:
         return None
     if task.wish.method == "paper":
         return _best_drawn(task, chosen, goal, rng)
-    quick = replace(goal, is_robust=goal.is_robust and k <= _FEW)
+    quick = replace(goal, is_robust=False)  # judging losses takes ten times as long
     return _exchanged(task._replace(power=_POWER), chosen, quick, rng)[0]
-
-
-def _slack(task: _Task, k: int) -> float:
-    """Return by how much a short search may miss the tolerance and a long one still keep it."""
-    return _SLACK_WIDE if task.wish.method == "paper" or k <= _FEW else _SLACK
 
 
 def _impossible(task: _Task, stops: Stops, best: Optimum, goal: Goal) -> str:
