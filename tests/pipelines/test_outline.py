@@ -12,6 +12,7 @@ from pipelines.values import Beams
 
 RADIUS, AWAY = 0.1, 10.0
 WIDTHS = np.array([3.0e-3, 1.5e-3])  # of the footprint [rad]
+SHARE = 0.6  # of what a return tells that is taken, for others are off with it
 LUCK = 0.01
 
 
@@ -46,8 +47,8 @@ def test_one_return_gives_mean_and_variance_of_what_is_left_inside(inside):
     half = 0.5 * WIDTHS[0] * AWAY
     rows, linear, weights, covs = passing(np.array([[RADIUS + half - inside, 0.0]]), sigma)
     N, pull, _ = outline_normals(rows, linear, weights, covs, outline, np.zeros((1, 2)))
-    cov = np.linalg.inv(np.linalg.inv(covs[0]) + N[0])
-    moved = cov @ pull[0]
+    cov = np.linalg.inv(np.linalg.inv(covs[0]) + N[0] / SHARE)
+    moved = cov @ pull[0] / SHARE
 
     def density(x, power=0):
         chance = LUCK + (1 - LUCK) * norm.cdf((x - 0.1 * half) / (0.2 * half))

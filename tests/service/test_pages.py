@@ -24,6 +24,7 @@ def client(tmp_path_factory):
         fill(catalogue, data / "clouds", "field", n_stops=2, at=NOW + timedelta(days=1))
         twins = {"with_truth": False, "all_called": "scan", "at": NOW - timedelta(days=1)}
         fill(catalogue, data / "clouds", "twins", n_stops=2, **twins)
+        catalogue.create_survey("bare")
         catalogue.create_survey("empty")
         recording = catalogue.list_recordings().items[0].recording_id
         job = catalogue.create_job("process", survey="empty", recording_id=recording, config={})
@@ -121,9 +122,16 @@ def test_logs_of_one_name_are_each_within_reach(client):
 
 
 def test_an_empty_survey_says_what_to_do(client):
+    text = page(client, "/surveys/bare")
+    assert "No results yet" in text
+    assert "survey=bare&amp;process=true" in text
+
+
+def test_a_survey_whose_only_job_failed_offers_work_on_its_log(client):
     text = page(client, "/surveys/empty")
     assert "No results yet" in text
-    assert "survey=empty&amp;process=true" in text
+    assert "1 log belongs to this survey" in text
+    assert "Adjust all stations" in text
 
 
 def test_jobs_show_why_they_failed(client):
