@@ -115,6 +115,8 @@ def test_derivatives_agree_with_central_differences(stop):
     thin = np.tile(1e-12 * np.eye(3), (len(centres), 1, 1))
     exact = design(seen, stop.rig, centres, thin, RADIUS)
     lit = predict(aimed(seen, stop.rig), centres, np.full(len(centres), RADIUS), seen.which).lit
+    is_whole = lit > 1.0 - 1e-9  # where the outline cuts a footprint, its range has a kink
+    assert is_whole.sum() > 800
     held = {"height_offset", "gimbal_axis_roll", "gimbal_axis_pitch", "common_range_bias"}
     for place, name in enumerate(NAMES):
         if name in held:
@@ -124,10 +126,10 @@ def test_derivatives_agree_with_central_differences(stop):
             design(seen, moved(stop.rig, sign * step, nothing), centres, thin, RADIUS).residuals
             for sign in (1.0, -1.0)
         )
-        numeric = -(up - down)[lit > 0.999] / 2e-6
+        numeric = -(up - down)[is_whole] / 2e-6
         size = np.abs(numeric).max()
         assert size > 0.01
-        assert_allclose(exact.J_rig[lit > 0.999, place], numeric, rtol=0, atol=2e-3 * size)
+        assert_allclose(exact.J_rig[is_whole, place], numeric, rtol=0, atol=2e-3 * size)
 
 
 def test_ranges_without_noise_give_the_true_rig(field):
