@@ -25,7 +25,7 @@ _NEAR = 1.75  # half widths inside the outline within which returns tell of it
 _CERTAIN = 4.0  # standard deviations inside the outline from where meeting is no news
 _CAVITY_MIN = 0.05  # of a centre's precision: the least that is not one return's own
 _N_PRODUCT = 25  # chances that are multiplied before the logarithm is taken
-_SHARE = 0.6  # of what returns would tell if each were off by itself: a face is off as a whole
+_SHARE = 0.7  # of what returns would tell if each were off by itself: a face is off as a whole
 _TINY = 1e-9  # [m]
 _HALF, _DENSITY = math.sqrt(0.5), 1.0 / math.sqrt(2.0 * math.pi)
 

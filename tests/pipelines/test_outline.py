@@ -12,7 +12,7 @@ from pipelines.values import Beams
 
 RADIUS, AWAY = 0.1, 10.0
 WIDTHS = np.array([3.0e-3, 1.5e-3])  # of the footprint [rad]
-SHARE = 0.6  # of what a return tells that is taken, for others are off with it
+SHARE = 0.7  # of what a return tells that is taken, for others are off with it
 LUCK = 0.01
 
 
