@@ -47,10 +47,7 @@ _DRAWN, _DRAWN_KEPT = 1500, 40  # arrangements at random that these begin with, 
 _POWER = 12.0  # of the mean over stops that is as good as their largest, and smoother
 _SHAKEN = 0.4  # share of marks that such a start has elsewhere
 _FEW = 10  # marks that are always searched in full
-_SLACK, _SLACK_WHOLE = (
-    1.15,
-    2.0,
-)  # times the tolerance that a short search keeps: beyond, none helps
+_SLACK, _SLACK_WHOLE = 1.15, 2.0  # times the tolerance that a short search keeps: more helps none
 _WORSE = 1.3  # than now, at most, while a loss would break what is wanted
 _TRIED = 12  # candidates that are judged in full for each mark, the most promising first
 _SCREENED = 800  # places that whole judgements try in a round, for all marks together

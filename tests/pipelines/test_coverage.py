@@ -108,3 +108,6 @@ def test_ellipses_of_whole_simulated_surveys_hold_their_shares():
     for one in coverage(draws):
         if one.quantity != "pose":
             assert abs(one.share - one.level) <= 0.075, one
+    for (_, quantity), value in nees(draws).items():
+        if quantity != "pose":
+            assert 0.8 < value < 1.25

@@ -117,7 +117,7 @@ def test_rays_without_noise_give_the_true_centre():
     by_ranges = fit_ranges(cloud, candidate, CONFIG, RADIUS)[0][0]
     assert_allclose(by_ranges.p_base, CENTRE, rtol=0, atol=1e-5)
     # the outermost rays hold the outline only as exactly as they lie on it
-    assert_allclose(fit_one(cloud, CENTRE + OFF).fits[0].p_base, CENTRE, rtol=0, atol=1e-4)
+    assert_allclose(fit_one(cloud, CENTRE + OFF).fits[0].p_base, CENTRE, rtol=0, atol=3e-5)
 
 
 def test_wide_beams_without_noise_give_the_true_centre():
@@ -177,7 +177,7 @@ def test_covariances_agree_with_errors_and_the_mean_is_not_biased():
     ("distance", "sigma", "low", "high"),
     # the outline of this world is the same at every distance and without blur: what few returns add
     # to a covariance, found where neither holds, is more than they need here
-    [(4, 0.01, 2.4, 3.6), (7.5, 0.02, 2.4, 3.6), (10, 0.01, 2.4, 3.6), (20, 0.02, 1.9, 4.5)],
+    [(4, 0.01, 2.4, 3.6), (7.5, 0.02, 2.4, 3.6), (10, 0.01, 2.4, 3.6), (20, 0.02, 2.0, 4.5)],
 )
 def test_covariances_hold_at_every_distance(distance, sigma, low, high):
     rng = np.random.default_rng(12)
