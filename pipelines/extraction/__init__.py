@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipelines.config import ExtractionConfig
-from pipelines.extraction.ball import Ball, seen_from, view_of
+from pipelines.extraction.ball import Ball, blur_at, seen_from, view_of
 from pipelines.extraction.cells import Cells, cells_of
 from pipelines.extraction.ground import ground_of
 from pipelines.extraction.looks import NOISE_MIN, Look, look_at
@@ -168,7 +168,7 @@ def _members(cloud: StitchedCloud, rows: NDArray[np.int32], look: Look, ball: Ba
     seen = seen_from(
         cloud.p_base.take(rows, axis=0).T.astype(np.float64), view_of(look.p_base, ball.up)
     )
-    blur = 0.5 * ball.divergence * float(np.linalg.norm(look.p_base))
+    blur = blur_at(look.p_base, ball)
     reach = _MIDDLE * ball.radius if is_resolved(look, ball) else 1.5 * ball.radius + blur
     is_about = np.hypot(seen[0], seen[1]) < reach
     is_level = (seen[2] > -2.2 * ball.radius) & (seen[2] < 1.6 * ball.radius)

@@ -18,6 +18,25 @@ class Ball(NamedTuple):
     divergence: float
 
 
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def blur_at(c: Array, ball: Ball) -> float:
+    """Return half the width of a beam at a place.
+
+    Parameters
+    ----------
+    c : (3,)
+        The place [m].
+    ball : Ball
+        What is looked for.
+
+    Returns
+    -------
+    float
+        By so much a beam that passes the ball may still touch it [m].
+    """
+    return float(0.5 * ball.divergence * np.sqrt(c[0] ** 2 + c[1] ** 2 + c[2] ** 2))
+
+
 class View(NamedTuple):
     """A centre [m], and unit vectors across and up the view of it."""
 

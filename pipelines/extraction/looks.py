@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numba
 import numpy as np
 
-from pipelines.extraction.ball import Ball, View, passing, seen_from, view_of
+from pipelines.extraction.ball import Ball, View, blur_at, passing, seen_from, view_of
 from pipelines.extraction.cells import Cells
 from pipelines.extraction.patches import Patches, n_about, patches_about, points_near
 from pipelines.extraction.seeds import thinned
@@ -213,7 +213,7 @@ def _shifted(points: Array, c: Array, up: Array, radius: float) -> tuple[Array, 
 def _surroundings(points: Array, c: Array, ball: Ball) -> tuple[int, int]:
     """Count the returns beside and below the outline that a free ball on a pole would not have."""
     n_beside, n_below, radius = 0, 0, ball.radius
-    blur = 0.5 * ball.divergence * np.sqrt(c[0] ** 2 + c[1] ** 2 + c[2] ** 2)
+    blur = blur_at(c, ball)
     inner2 = (1.1 * radius + blur) ** 2  # no footprint that touches the ball is farther out
     beside2, below2 = (2.2 * radius + blur) ** 2, (2.8 * radius + blur) ** 2
     view = view_of(c, ball.up)
@@ -257,7 +257,7 @@ def _look(points: Array, start: Array, ball: Ball, out: Array) -> None:
     """Write what is seen near a place; nothing if hardly a return lies on a ball there."""
     radius = ball.radius
     c, _, _ = _settled(points, start, ball, 3)
-    blur = 0.5 * ball.divergence * np.sqrt(np.sum(c**2))
+    blur = blur_at(c, ball)
     seen = seen_from(points, view_of(c, ball.up))
     residuals = _residuals(seen, radius)
     scatter = max(_scatter(seen, residuals, radius), NOISE_MIN)
@@ -355,7 +355,7 @@ def _equations(
     distance = np.sqrt(c[0] ** 2 + c[1] ** 2 + c[2] ** 2)
     axes = np.empty((3, 3))
     axes[0], axes[1], axes[2] = view.across, view.up, c / distance
-    blur = 0.5 * ball.divergence * distance
+    blur = blur_at(c, ball)
     seen = _about(points, view, radius + blur)
     residuals = _residuals(seen, radius)
     scatter = _scatter(seen, residuals, radius)

@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numba
 import numpy as np
 
-from pipelines.extraction.ball import Ball
+from pipelines.extraction.ball import Ball, blur_at
 from pipelines.extraction.looks import Look
 from pipelines.values import Array, Mask
 
@@ -89,13 +89,9 @@ def rivals(look: Look, seen: Array, spread: float, ball: Ball, noise: float) -> 
     by the area that they might have filled. The edge of an outline is that of wide beams, whose
     place is known only so well. Ranges are those to the part of a beam that is on the shape.
     """
-    found = _compared(seen / ball.radius, _blur(look, ball), noise / ball.radius, spread)
+    blur = blur_at(look.p_base, ball) / ball.radius
+    found = _compared(seen / ball.radius, blur, noise / ball.radius, spread)
     return Rivals(found[0], found[1], found[2] * ball.radius, found[3] * ball.radius)
-
-
-def _blur(look: Look, ball: Ball) -> float:
-    """Return the half width of a beam at a group, in radii."""
-    return 0.5 * ball.divergence * float(np.linalg.norm(look.p_base)) / ball.radius
 
 
 class _Beams(NamedTuple):

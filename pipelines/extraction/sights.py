@@ -12,7 +12,7 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from pipelines.extraction.ball import Ball, seen_from, view_of
+from pipelines.extraction.ball import Ball, blur_at, seen_from, view_of
 from pipelines.extraction.cells import (
     N_DIRECTIONS,
     N_DIRECTIONS_SIDE,
@@ -140,7 +140,7 @@ def _counted(
 ) -> tuple[int, int, int, float, int, int, int, float, NDArray[np.int32], Array]:
     """Return the fields of a sight, from the returns near its direction."""
     radius, distance = ball.radius, np.sqrt(np.sum(c**2))
-    blur = 0.5 * ball.divergence * distance / radius
+    blur = blur_at(c, ball) / radius
     rows = _towards(points, near, c, (_REACH + blur) * radius / distance)
     seen = seen_from(points[rows].T.astype(np.float64), view_of(c, ball.up))
     n_on, n_through, n_before, n_held, n_past, n_short = 0, 0, 0, 0, 0, 0

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from pipelines.config import ExtractionConfig
-from pipelines.extraction.ball import Ball
+from pipelines.extraction.ball import Ball, blur_at
 from pipelines.extraction.looks import N_RESOLVED, NOISE_MIN, RESOLUTION, Look
 from pipelines.extraction.rivals import Rivals
 from pipelines.extraction.sights import Sight
@@ -64,6 +64,11 @@ def distinct(looks: list[Look], config: ExtractionConfig, radius: float) -> list
     return kept
 
 
+def _first(tests: Sequence[tuple[bool, str]]) -> str:
+    """Return the reason of the first test that refuses; empty if none does."""
+    return next((reason for refuses, reason in tests if refuses), "")
+
+
 def _evidence(look: Look) -> float:
     """Return how much speaks for a ball: many returns that lie close to it."""
     return look.n_points / max(look.scatter, NOISE_MIN)
@@ -96,10 +101,12 @@ def verdict(look: Look, config: ExtractionConfig, ball: Ball) -> str:
     str
         The reason as a sentence for people; empty if it may be such a ball.
     """
-    radius = ball.radius
+    return _not_free(look, ball) or _not_round(look, config, ball)
+
+
+def _not_free(look: Look, ball: Ball) -> str:
+    """Return why a group does not stand free, or is not one surface."""
     few = np.inf if is_resolved(look, ball) else 1.0 + _TOUCHING * look.n_points
-    width_min = (0.7 if look.n_points >= _N_SHAPELY else 0.5) * radius
-    off = look.radius_free - radius
     tests = (
         (
             look.n_beside > few,
@@ -116,6 +123,16 @@ def verdict(look: Look, config: ExtractionConfig, ball: Ball) -> str:
             f"It is not one surface: {look.n_strange} returns inside its outline are off the "
             f"sphere that {look.n_points} lie on.",
         ),
+    )
+    return _first(tests)
+
+
+def _not_round(look: Look, config: ExtractionConfig, ball: Ball) -> str:
+    """Return why the shape of a group is not that of the ball."""
+    radius = ball.radius
+    width_min = (0.7 if look.n_points >= _N_SHAPELY else 0.5) * radius
+    off = look.radius_free - radius
+    tests = (
         (
             look.scatter > config.scatter_max,
             f"Its returns scatter by {1e3 * look.scatter:.0f} mm about a sphere of the known "
@@ -151,12 +168,12 @@ def verdict(look: Look, config: ExtractionConfig, ball: Ball) -> str:
             "It is not curved from side to side: a panel or a rail.",
         ),
     )
-    return next((reason for is_so, reason in tests if is_so), "")
+    return _first(tests)
 
 
 def _radius_slack(look: Look, ball: Ball) -> float:
     """Return by how much the free radius may be off: wide beams are taken for rays."""
-    blur = 0.5 * ball.divergence * float(np.linalg.norm(look.p_base))
+    blur: float = blur_at(look.p_base, ball)
     return max(_SIGMAS * look.sigma_radius, _RADIUS_SLACK * ball.radius + blur)
 
 
@@ -211,7 +228,7 @@ def verdict_on_sight(look: Look, sight: Sight, ball: Ball) -> str:
             f"place, {sight.n_held + sight.n_short} end at its distance or nearer.",
         ),
     )
-    return next((reason for is_so, reason in tests if is_so), "")
+    return _first(tests)
 
 
 def verdict_on_rivals(rivals: Rivals) -> str:
@@ -239,7 +256,7 @@ def verdict_on_rivals(rivals: Rivals) -> str:
             f"returns exp({rivals.small:.1f}) times better.",
         ),
     )
-    return next((reason for is_so, reason in tests if is_so), "")
+    return _first(tests)
 
 
 def _n_comparable(sight: Sight) -> float:
@@ -305,7 +322,7 @@ def verdict_among_others(
 
 def _unlike_in_shape(look: Look, others: Sequence[tuple[Look, Sight]], ball: Ball) -> str:
     """Return why a group is not curved as a ball, by the noise of the others."""
-    blur = 0.5 * ball.divergence * float(np.linalg.norm(look.p_base))
+    blur = blur_at(look.p_base, ball)
     noise = float(np.hypot(noise_among([other for other, _ in others]), _WIDE * blur))
     share = min(noise / max(look.scatter, NOISE_MIN), 1.0)
     flats = (look.flat_across, look.flat_along)
@@ -339,7 +356,7 @@ def _unlike_in_paint(look: Look, sight: Sight, others: Sequence[tuple[Look, Sigh
             f"{1e3 * look.scatter:.0f} mm, those of the markers by {1e3 * scatter:.0f} mm.",
         ),
     )
-    return next((reason for is_so, reason in tests if is_so), "")
+    return _first(tests)
 
 
 def spread_expected(look: Look, ball: Ball) -> float:
@@ -357,7 +374,7 @@ def spread_expected(look: Look, ball: Ball) -> float:
     float
         Mean square of the distances at which they pass its centre, in squared radii.
     """
-    blur = 0.5 * ball.divergence * float(np.linalg.norm(look.p_base)) / ball.radius
+    blur: float = blur_at(look.p_base, ball) / ball.radius
     return 0.5 * (1.0 + 0.3 * blur) ** 2
 
 
