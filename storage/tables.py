@@ -1,0 +1,205 @@
+"""What is appended to the database and taken anew: rows of results, and their errors."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+
+import duckdb
+import numpy as np
+import pyarrow as pa
+
+from pipelines.errors import InputError
+from pipelines.rigs import rig_from_mapping
+from pipelines.values import ControlMarks, StopTruth, Truth
+from storage import adjustments, results
+from storage.database import execute_on, fetch
+from storage.records import coordinates_of, pose_of
+
+_TRUE_MARKS = "SELECT * FROM true_marks WHERE survey_id = $id ORDER BY place"
+_TRUE_STOPS = "SELECT * FROM true_stops WHERE survey_id = $id ORDER BY stop"
+_TRUE_WORLD = "SELECT rig, about FROM true_worlds WHERE survey_id = $id"
+_ADJUSTED_OF_SURVEY = {
+    "adjustments": "SELECT * FROM adjustments WHERE survey_id = $id",
+    "adjusted_stations": (
+        "SELECT x.* FROM adjusted_stations AS x JOIN adjustments USING (adjustment_id) "
+        "WHERE survey_id = $id"
+    ),
+    "adjusted_marks": (
+        "SELECT x.* FROM adjusted_marks AS x JOIN adjustments USING (adjustment_id) "
+        "WHERE survey_id = $id"
+    ),
+}
+_REFRESH_ADJUSTED = {
+    "adjusted_stations": """
+        UPDATE adjusted_stations AS x SET error_x_m = i.error_x_m, error_y_m = i.error_y_m,
+            error_z_m = i.error_z_m, error_yaw_deg = i.error_yaw_deg, error_3d_m = i.error_3d_m
+        FROM incoming AS i WHERE x.adjustment_id = i.adjustment_id AND x.station = i.station
+    """,
+    "adjusted_marks": """
+        UPDATE adjusted_marks AS x SET error_x_m = i.error_x_m, error_y_m = i.error_y_m,
+            error_z_m = i.error_z_m, error_3d_m = i.error_3d_m
+        FROM incoming AS i WHERE x.adjustment_id = i.adjustment_id AND x.mark = i.mark
+    """,
+}
+_RESULTS_OF_SURVEY = {
+    "stops": "SELECT x.* FROM stops AS x JOIN runs USING (run_id) WHERE survey_id = $id",
+    "marker_fits": (
+        "SELECT x.* FROM marker_fits AS x JOIN runs USING (run_id) WHERE survey_id = $id"
+    ),
+    "station_fixes": (
+        "SELECT x.* FROM station_fixes AS x JOIN runs USING (run_id) WHERE survey_id = $id"
+    ),
+    "resections": (
+        "SELECT x.* FROM resections AS x JOIN runs USING (run_id) WHERE survey_id = $id"
+    ),
+}
+_TRUE_TABLES = ("true_marks", "true_stops")
+_INSERT = {
+    "adjustments": "INSERT INTO adjustments BY NAME SELECT * FROM incoming",
+    "adjusted_stations": "INSERT INTO adjusted_stations BY NAME SELECT * FROM incoming",
+    "adjusted_marks": "INSERT INTO adjusted_marks BY NAME SELECT * FROM incoming",
+    "adjusted_observations": "INSERT INTO adjusted_observations BY NAME SELECT * FROM incoming",
+    "refused_stations": "INSERT INTO refused_stations BY NAME SELECT * FROM incoming",
+    "control_checks": "INSERT INTO control_checks BY NAME SELECT * FROM incoming",
+    "repeated_stops": "INSERT INTO repeated_stops BY NAME SELECT * FROM incoming",
+    "calibrations": "INSERT INTO calibrations BY NAME SELECT * FROM incoming",
+    "calibrated_parameters": "INSERT INTO calibrated_parameters BY NAME SELECT * FROM incoming",
+    "calibration_gaps": "INSERT INTO calibration_gaps BY NAME SELECT * FROM incoming",
+    "site_products": "INSERT INTO site_products BY NAME SELECT * FROM incoming",
+    "documents": "INSERT INTO documents BY NAME SELECT * FROM incoming",
+    "control_marks": "INSERT OR REPLACE INTO control_marks BY NAME SELECT * FROM incoming",
+    "true_marks": "INSERT OR REPLACE INTO true_marks BY NAME SELECT * FROM incoming",
+    "true_stops": "INSERT OR REPLACE INTO true_stops BY NAME SELECT * FROM incoming",
+}
+_APPENDED = results.TABLES[1:]  # as they are, column by column: much the quickest way
+_OF_JOBS = (
+    "rigs",
+    *_APPENDED,
+    *(name for name in _INSERT if name not in ("control_marks", *_TRUE_TABLES)),
+)
+_REFRESH = {
+    "marker_fits": """
+        UPDATE marker_fits AS x SET error_x_m = i.error_x_m, error_y_m = i.error_y_m,
+            error_z_m = i.error_z_m, error_radial_m = i.error_radial_m, error_3d_m = i.error_3d_m
+        FROM incoming AS i WHERE x.run_id = i.run_id AND x.stop = i.stop
+            AND x.fit_method = i.fit_method AND x.marker = i.marker
+    """,
+    "station_fixes": """
+        UPDATE station_fixes AS x SET error_x_m = i.error_x_m, error_y_m = i.error_y_m,
+            error_z_m = i.error_z_m, error_yaw_deg = i.error_yaw_deg,
+            error_horizontal_m = i.error_horizontal_m, error_3d_m = i.error_3d_m
+        FROM incoming AS i WHERE x.run_id = i.run_id AND x.stop = i.stop
+            AND x.fit_method = i.fit_method AND x.resection_method = i.resection_method
+    """,
+    "resections": """
+        UPDATE resections AS x
+        SET error_horizontal_m = i.error_horizontal_m, error_3d_m = i.error_3d_m
+        FROM incoming AS i WHERE x.run_id = i.run_id AND x.stop = i.stop
+            AND x.fit_method = i.fit_method AND x.resection_method = i.resection_method
+            AND x.marks = i.marks
+    """,
+}
+_PUT_RIG = """
+INSERT INTO rigs SELECT $rig_digest, $name, $rig
+WHERE NOT EXISTS (FROM rigs WHERE rig_digest = $rig_digest)
+"""  # half of what INSERT OR IGNORE costs; writes take turns
+
+
+def check_tables(tables: Mapping[str, pa.Table]) -> None:
+    """Refuse results for tables that no job writes.
+
+    Parameters
+    ----------
+    tables : mapping of str to Table
+        Rows by table.
+
+    Raises
+    ------
+    InputError
+        If there is no table of such a name.
+    """
+    unknown = sorted(set(tables) - set(_OF_JOBS))
+    if unknown:
+        raise InputError(f"No job writes {unknown[0]!r}; it writes {', '.join(_OF_JOBS)}.")
+
+
+def append(cursor: duckdb.DuckDBPyConnection, name: str, table: pa.Table) -> None:
+    """Append rows to a table.
+
+    Parameters
+    ----------
+    cursor : DuckDBPyConnection
+        Inside a transaction.
+    name : str
+        The table.
+    table : Table
+        Its rows; a rig that is known already is not written again.
+    """
+    if not table.num_rows:
+        return
+    if name in _APPENDED:
+        cursor.from_arrow(table).insert_into(name)
+    elif name == "rigs":
+        for row in table.to_pylist():
+            cursor.execute(_PUT_RIG, row)
+    else:
+        execute_on(cursor, _INSERT[name], table)
+
+
+def refresh_errors(cursor: duckdb.DuckDBPyConnection, survey_id: str) -> None:
+    """Take the errors of a survey's results anew against the truth that is known now.
+
+    Parameters
+    ----------
+    cursor : DuckDBPyConnection
+        Inside a transaction.
+    survey_id : str
+        The survey.
+    """
+    known = {
+        name: fetch(cursor, sql, {"id": survey_id}) for name, sql in _RESULTS_OF_SURVEY.items()
+    }
+    truth = read_truth(cursor, survey_id)
+    fresh = results.with_errors(known, truth)
+    for name, sql in _REFRESH.items():
+        execute_on(cursor, sql, fresh[name])
+    adjusted = {
+        name: fetch(cursor, sql, {"id": survey_id}) for name, sql in _ADJUSTED_OF_SURVEY.items()
+    }
+    fresh = adjustments.with_errors(adjusted, truth)
+    for name, sql in _REFRESH_ADJUSTED.items():
+        execute_on(cursor, sql, fresh[name])
+
+
+def read_truth(cursor: duckdb.DuckDBPyConnection, survey_id: str) -> Truth | None:
+    """Read the truth of a survey.
+
+    Parameters
+    ----------
+    cursor : DuckDBPyConnection
+        Inside a transaction or not.
+    survey_id : str
+        The survey.
+
+    Returns
+    -------
+    Truth or None
+        Stops in the order of their names; none when it is not known.
+    """
+    worlds = cursor.execute(_TRUE_WORLD, {"id": survey_id}).fetchall()
+    if not worlds:
+        return None
+    rig, about = worlds[0]
+    marks = fetch(cursor, _TRUE_MARKS, {"id": survey_id}).to_pylist()
+    stops = fetch(cursor, _TRUE_STOPS, {"id": survey_id}).to_pylist()
+    return Truth(
+        marks=ControlMarks(
+            names=tuple(row["mark"] for row in marks),
+            p_site=coordinates_of(marks),
+            cov_p_site=np.zeros((len(marks), 3, 3)),
+        ),
+        stops=tuple(StopTruth(name=row["stop"], T_site_base=pose_of(row)) for row in stops),
+        rig=None if rig is None else rig_from_mapping(json.loads(rig)),
+        about=json.loads(about),
+    )
