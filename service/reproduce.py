@@ -18,8 +18,8 @@ from numpy.typing import NDArray
 from plotly.io.json import to_json_plotly
 
 from pipelines import study
-from pipelines.accuracy import Bound
 from pipelines.config import SurveyConfig
+from pipelines.error_model import Bound
 from pipelines.errors import NotFoundError
 from pipelines.extraction import extract
 from pipelines.fitting import fit_markers

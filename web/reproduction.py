@@ -15,7 +15,8 @@ from numpy.typing import NDArray
 from plotly.subplots import make_subplots
 
 from pipelines import study
-from pipelines.accuracy import ErrorModel, ErrorSummary
+from pipelines.accuracy import ErrorSummary
+from pipelines.error_model import ErrorModel
 from pipelines.reproduction import (
     CENTRE,
     CENTRE_REAL,

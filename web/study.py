@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from pipelines.accuracy import (
+from pipelines.error_model import (
     Bound,
     Demand,
     ErrorModel,

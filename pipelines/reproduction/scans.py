@@ -11,8 +11,9 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
-from pipelines.accuracy import UNMATCHED, ErrorSample, marker_errors, mean_incidence
+from pipelines.accuracy import UNMATCHED, marker_errors, mean_incidence
 from pipelines.config import FittingConfig, SurveyConfig
+from pipelines.error_model import ErrorSample
 from pipelines.extraction import extract
 from pipelines.fitting import fit_markers
 from pipelines.geometry import inverse, levelling_rotation, transform

@@ -6,16 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from pipelines.accuracy import (
-    Demand,
-    ErrorModel,
-    ErrorSummary,
-    Limits,
-    Statistic,
-    fit_error_model,
-    limits,
-    summarise,
-)
+from pipelines.accuracy import ErrorSummary, summarise
+from pipelines.error_model import Demand, ErrorModel, Limits, Statistic, fit_error_model, limits
 from pipelines.reproduction.plan import (
     CENTRE,
     CENTRE_REAL,

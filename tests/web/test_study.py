@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from pipelines.accuracy import Bound
+from pipelines.error_model import Bound
 from web import study
 
 
