@@ -356,6 +356,8 @@ class MarkerCandidate:
 
     Attributes
     ----------
+    name : str
+        What its marker is called at this stop, whatever method fits it.
     members : (n,)
         Rows of the stitched cloud, ascending: the sphere, and what of its pole touches it.
     p_base_rough : (3,)
@@ -364,12 +366,29 @@ class MarkerCandidate:
         0 (hardly a sphere) to 1 (all tests passed with ease).
     """
 
+    name: str
     members: Index
     p_base_rough: Array
     score: float
 
     def __post_init__(self) -> None:
         _seal(self, members=(None,), p_base_rough=(3,))
+
+
+def marker_name(place: int) -> str:
+    """Return what the marker at a place among those of a stop is called: M01, M02, ...
+
+    Parameters
+    ----------
+    place : int
+        From 0.
+
+    Returns
+    -------
+    str
+        Its name within one stop.
+    """
+    return f"M{place + 1:02d}"
 
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
@@ -420,6 +439,8 @@ class MarkerFit:
 
     Attributes
     ----------
+    name : str
+        What the marker is called at this stop: that of its candidate.
     p_base : (3,)
         Centre [m].
     cov_p_base : (3, 3)
@@ -461,6 +482,7 @@ class MarkerFit:
         covariance has it; NaN when not told [m].
     """
 
+    name: str
     p_base: Array
     cov_p_base: Array
     method: str

@@ -36,7 +36,7 @@ from pipelines.values import (
     Truth,
 )
 from storage.recordings import read_log
-from storage.results import ellipse, marker_name
+from storage.results import ellipse
 
 Frame = Literal["station", "base"]
 Plain = dict[str, Any]
@@ -131,10 +131,7 @@ def _markers(
 ) -> list[Plain]:
     """Return the markers of one fitting method."""
     fits, sigma_heading = stop.fits[method], stop.cloud.rig.sigma_heading
-    answers = [
-        _marker(marker_name(place), fit, R_frame_base, sigma_heading)
-        for place, fit in enumerate(fits.fits)
-    ]
+    answers = [_marker(fit, R_frame_base, sigma_heading) for fit in fits.fits]
     if truth is not None and pose is not None:
         errors = marker_errors(fits, pose, truth.marks)
         for answer, mark, error in zip(answers, errors.marks, errors.error_3d, strict=True):
@@ -143,11 +140,11 @@ def _markers(
     return answers
 
 
-def _marker(name: str, fit: MarkerFit, R_frame_base: Array, sigma_heading: float) -> Plain:
+def _marker(fit: MarkerFit, R_frame_base: Array, sigma_heading: float) -> Plain:
     """Return one marker."""
     cov_base = fit.cov_with_heading(sigma_heading)
     return {
-        "id": name,
+        "id": fit.name,
         "status": str(fit.status),
         "reason": fit.reason,
         "method": fit.method,
@@ -193,7 +190,7 @@ def _station(
     pose: StopTruth | None,
 ) -> Plain:
     """Return the station by one fitting and one resection method, or why there is none."""
-    marks = inputs.marks
+    fits, marks = stop.fits[fit_method], inputs.marks
     methods = {"method": fix.method, "fit_method": fit_method}
     if isinstance(fix, NoFix) or marks is None:
         reason, code = (fix.reason, fix.code) if isinstance(fix, NoFix) else (NO_CONTROL, "")
@@ -220,11 +217,11 @@ def _station(
         "passes_global_test": fix.passes_global_test,
         "included_angle_min_deg": _number(low),
         "included_angle_max_deg": _number(high),
-        "matches": _matches(fix, marks),
+        "matches": _matches(fix, fits, marks),
         "residuals_m": _numbers(fix.residuals_site),
-        "without_each": _without_each(fix, stop.fits[fit_method], marks, inputs.config),
+        "without_each": _without_each(fix, fits, marks, inputs.config),
         "excluded": [
-            {"marker": marker_name(one.fit), "reason": one.reason} for one in fix.excluded
+            {"marker": fits.fits[one.fit].name, "reason": one.reason} for one in fix.excluded
         ],
     }
     if pose is not None:
@@ -234,11 +231,11 @@ def _station(
     return answer
 
 
-def _matches(fix: StationFix, marks: ControlMarks) -> list[Plain]:
+def _matches(fix: StationFix, fits: MarkerFits, marks: ControlMarks) -> list[Plain]:
     """Return which marker was taken for which mark, with residual and reliability."""
     return [
         {
-            "marker": marker_name(int(fit)),
+            "marker": fits.fits[fit].name,
             "mark": marks.names[mark],
             "residual_m": _numbers(fix.residuals_site[i]),
             "redundancy": _number(fix.redundancies[i]),
@@ -260,7 +257,7 @@ def _without_each(
     sigmas = np.sqrt(np.diagonal(omissions.cov_predictions, axis1=1, axis2=2))
     return [
         {
-            "marker": marker_name(int(fit)),
+            "marker": fits.fits[fit].name,
             "mark": marks.names[mark],
             "station_shift_m": _numbers(shift),
             "station_shift_3d_m": _number(float(np.linalg.norm(shift))),
@@ -275,18 +272,18 @@ def _without_each(
 
 def _distances(stop: StopResult, inputs: Inputs) -> Plain | None:
     """Return the distances between marks in this scan against the control; null without any."""
-    method, marks = next(iter(stop.fits)), inputs.marks
-    if marks is None or len(stop.fits[method].fits) < 2 or len(marks.names) < 2:
+    found, marks = next(iter(stop.fits.values())), inputs.marks
+    if marks is None or len(found.fits) < 2 or len(marks.names) < 2:
         return None
     config = inputs.config
     try:
-        checks = check_distances(stop.fits[method], marks, config.resection, config.tolerance)
+        checks = check_distances(found, marks, config.resection, config.tolerance)
     except SolveError as error:
         return {"reason": str(error), "n": 0, "n_off": 0, "suspects": [], "pairs": []}
     columns = (checks.fits, checks.marks, checks.measured, checks.given, checks.sigmas)
     pairs = [
         {
-            "markers": [marker_name(int(fit)) for fit in fits],
+            "markers": [found.fits[fit].name for fit in fits],
             "marks": [marks.names[mark] for mark in places],
             "measured_m": float(measured),
             "given_m": float(given),

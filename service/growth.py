@@ -180,6 +180,7 @@ def _fits(rng: np.random.Generator, p_base: Array) -> MarkerFits:
 def _fit(p_base: Array) -> MarkerFit:
     """Return a fit to a hundred returns."""
     return MarkerFit(
+        name="",
         p_base=p_base,
         cov_p_base=_SIGMA**2 * np.eye(3),
         method="along_beam",

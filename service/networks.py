@@ -34,7 +34,7 @@ from pipelines.values import ControlMarks, MarkerFits, Rig, Truth
 from service.calibrations import calibrate_logs, calibration_answer
 from service.network_report import report
 from storage.recordings import read_log
-from storage.results import ellipse, marker_name
+from storage.results import ellipse
 
 __all__ = [
     "Fieldbook", "adjust_scans", "calibrated", "error_answer", "network_answer", "read_scans",
@@ -211,7 +211,7 @@ def _excluded(result: AdjustedNetwork) -> list[Plain]:
         {
             "kind": one.kind,
             "station": one.station or None,
-            "marker": marker_name(one.fit) if one.fit >= 0 else None,
+            "marker": one.marker or None,
             "mark": one.mark or None,
             "reason": one.reason,
         }
@@ -339,7 +339,7 @@ def _observation(result: AdjustedNetwork, i: int) -> Plain:
     station, mark = network.sightings[i]
     return {
         "station": network.stations[station],
-        "marker": marker_name(int(network.fits[i])),
+        "marker": network.markers[i],
         "mark": network.marks[mark],
         "used": bool(result.used[i]),
         "residual_m": _numbers(result.centres.residuals[i]),

@@ -74,6 +74,7 @@ def _fit(row: Row, levelling: Levelling) -> MarkerFit:
     R = levelling_rotation(levelling)
     p_base = R.T @ np.array([row["x_m"], row["y_m"], row["z_m"]])
     return MarkerFit(
+        name=row["marker"],
         p_base=p_base,
         cov_p_base=_without_heading(R.T @ _cov(row) @ R, p_base, levelling.sigma_heading),
         method=row["fit_method"],

@@ -25,7 +25,6 @@ from numpy.typing import NDArray
 from pipelines.errors import InputError, NotFoundError
 from pipelines.geometry import levelling_rotation
 from pipelines.values import Array, Column, Index, MarkerFits, Mask, StopResult
-from storage.results import marker_name
 
 NO_MARKER = -1  # the marker of a return that belongs to none
 _FORMAT = "1"  # version of the file format; a reader knows every version that was ever written
@@ -119,7 +118,7 @@ def view(stop: StopResult, n_max: int) -> CloudView:
         is_near=is_near[rows],
         markers=markers[rows],
         residuals=residuals[rows],
-        names=tuple(marker_name(i) for i in range(len(found.fits))),
+        names=tuple(fit.name for fit in found.fits),
     )
 
 

@@ -199,7 +199,7 @@ def tables(
 
     Notes
     -----
-    Markers are called M01, M02 ... in the order of the fits of each method.
+    Markers have the names of their candidates, whatever method fitted them.
     """
     if not stops:
         raise InputError(f"Run {run.run_id} has no stop; a run has at least one.")
@@ -290,7 +290,7 @@ def _stop_rows(
         label = {"fit_method": method}
         matched = _matched(stop, method, names)
         for i, fit in enumerate(found.fits):
-            row = label | {"marker": marker_name(i), "mark": matched.get(i)}
+            row = label | {"marker": fit.name, "mark": matched.get(i)}
             rows["marker_fits"].append(row | _fit_row(fit, R, sigma_heading))
         rows["rejections"] += [
             label | _place(R @ r.p_base) | {"n_points": r.n_points, "reason": r.reason}
@@ -303,7 +303,7 @@ def _stop_rows(
             fits = stop.fits[fit_method]
             station["dop"] = dilution_of_precision(fix, marks)
             shifts = _shifts_without_each(fix, fits, marks, config)
-            observed = _observation_rows(fix, len(fits.fits), names, shifts)
+            observed = _observation_rows(fix, fits, names, shifts)
             rows["observations"] += [label | one for one in observed]
         rows["station_fixes"].append(station)
     return rows
@@ -318,22 +318,6 @@ def _shifts_without_each(
         shifts = leave_each_out(fix, fits, marks, config.resection).shifts
         found[: len(shifts)] = np.linalg.norm(shifts, axis=1)
     return found
-
-
-def marker_name(place: int) -> str:
-    """Return what the marker at a place among the fits is called: M01, M02, ...
-
-    Parameters
-    ----------
-    place : int
-        From 0.
-
-    Returns
-    -------
-    str
-        Its name within one stop and method.
-    """
-    return f"M{place + 1:02d}"
 
 
 def _stop_row(stop: StopResult, cloud_url: str | None) -> Row:
@@ -432,13 +416,13 @@ def ellipse(cov_horizontal: Array) -> Row:
 
 
 def _observation_rows(
-    fix: StationFix, n_fits: int, names: tuple[str, ...], shifts: Array
+    fix: StationFix, fits: MarkerFits, names: tuple[str, ...], shifts: Array
 ) -> list[Row]:
     """Return one row of ``observations`` for each marker of the stop."""
     excluded = {exclusion.fit: exclusion.reason for exclusion in fix.excluded}
     rows: list[Row] = [
-        {"marker": marker_name(i), "used": False, "reason": excluded.get(i, "Not matched.")}
-        for i in range(n_fits)
+        {"marker": fit.name, "used": False, "reason": excluded.get(i, "Not matched.")}
+        for i, fit in enumerate(fits.fits)
     ]
     for k, (i, mark) in enumerate(fix.matches):
         residual = dict(

@@ -90,12 +90,13 @@ def _cloud(name, centres, rng):
 def _fits(method, centres, members, cloud, rng):
     """Return fits whose errors are as large as their covariances say, and the paper's bias."""
     found = []
-    for centre, own in zip(centres, members, strict=True):
+    for i, (centre, own) in enumerate(zip(centres, members, strict=True), start=1):
         sigma = NOISE[method] / np.sqrt(len(own))
         weak = len(own) < 50
         away = centre / np.linalg.norm(centre)
         found.append(
             MarkerFit(
+                name=f"M{i:02d}",
                 p_base=centre + OFFSET[method] * away + rng.normal(scale=sigma, size=3),
                 cov_p_base=sigma**2 * np.eye(3),
                 method=method,

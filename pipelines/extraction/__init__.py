@@ -45,6 +45,7 @@ from pipelines.values import (
     MarkerCandidates,
     Rejection,
     StitchedCloud,
+    marker_name,
 )
 
 __all__ = ["extract"]
@@ -148,14 +149,16 @@ def _candidates(
     ball: Ball,
     config: ExtractionConfig,
 ) -> tuple[MarkerCandidate, ...]:
-    """Return candidates in the order of azimuth, from looks and the returns about them."""
+    """Return candidates M01, M02 ... by azimuth, from looks and the returns about them."""
+    in_turn = sorted(found, key=lambda one: np.arctan2(one[0].y, one[0].x))
     return tuple(
         MarkerCandidate(
+            name=marker_name(place),
             members=_members(cloud, rows, look, ball),
             p_base_rough=look.p_base,
             score=score(look, config, ball),
         )
-        for look, rows in sorted(found, key=lambda one: np.arctan2(one[0].y, one[0].x))
+        for place, (look, rows) in enumerate(in_turn)
     )
 
 

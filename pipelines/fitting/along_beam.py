@@ -502,6 +502,7 @@ def _judged(
     table, offsets = shots.beams, estimate.linear.offsets[used]
     n_rings = len(set(table.rings[used].tolist()) - {RING_UNKNOWN})
     fit = MarkerFit(
+        name=candidate.name,
         p_base=p.copy(),
         cov_p_base=_covariance(estimate, k, own, n_used),
         method=NAME,

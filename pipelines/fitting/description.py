@@ -164,6 +164,7 @@ def described(
     reasons += other_radius(radius, fields["radius_free"], fields["sigma_radius_free"])
     reason = sentence(reasons)
     return MarkerFit(
+        name=candidate.name,
         p_base=np.array(p_base),
         cov_p_base=np.array(cov_p_base),
         status=Status.WEAK if reason else Status.OK,

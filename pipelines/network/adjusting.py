@@ -238,7 +238,7 @@ def _left_out(
                 LeftOut(
                     kind="centre",
                     station=network.stations[station],
-                    fit=int(network.fits[block]),
+                    marker=network.markers[block],
                     mark=network.marks[mark],
                     reason=f"{worth}: it is {off:.3f} m from where all others have mark "
                     f"{network.marks[mark]}.",
@@ -249,13 +249,15 @@ def _left_out(
             off = np.degrees(float(np.linalg.norm(tested.lin.v_gravity[station])))
             reason = f"{worth}: the levelling is {off:.2f} deg from what the marks say."
             name = network.stations[station]
-            out.append(LeftOut(kind="gravity", station=name, fit=-1, mark="", reason=reason))
+            out.append(LeftOut(kind="gravity", station=name, marker="", mark="", reason=reason))
         else:
             control = block - n - s
             off = float(np.linalg.norm(tested.lin.v_control[control]))
             mark_name = network.marks[network.controls[control]]
             reason = f"{worth}: the given coordinates are {off:.3f} m from the adjusted ones."
-            out.append(LeftOut(kind="control", station="", fit=-1, mark=mark_name, reason=reason))
+            out.append(
+                LeftOut(kind="control", station="", marker="", mark=mark_name, reason=reason)
+            )
     return tuple(out)
 
 

@@ -331,13 +331,14 @@ def _unseen(
             if found.marks_of[i][fit] == _NO_MARK:
                 reason = "Another marker is nearer to the mark beside it: a false marker."
             reason = dropped.get((i, fit), reason)
-            out.append(LeftOut(kind="centre", station=scans[i][0], fit=fit, mark="", reason=reason))
+            station, name = scans[i][0], scans[i][1].fits[fit].name
+            out.append(LeftOut(kind="centre", station=station, marker=name, mark="", reason=reason))
     seen = {mark for pairs in used.values() for _, mark in pairs}
     for mark in range(found.n_control):
         if mark not in seen:
             reason = "No station sees it." + _beside(found, mark, seen)
             name = found.names[mark]
-            out.append(LeftOut(kind="control", station="", fit=-1, mark=name, reason=reason))
+            out.append(LeftOut(kind="control", station="", marker="", mark=name, reason=reason))
     return tuple(out)
 
 
@@ -376,6 +377,7 @@ def _network(
         marks=tuple(found.names[mark] for mark in places),
         sightings=columns[:, :2].copy(),
         fits=columns[:, 2].copy(),
+        markers=tuple(fit.name for fit in fits),
         p_base=np.array([fit.p_base for fit in fits]),
         cov_p_base=_symmetric(
             np.array([fit.p_base for fit in fits]), np.array([fit.cov_p_base for fit in fits])

@@ -45,8 +45,8 @@ class LeftOut:
         ``centre``, ``gravity`` or ``control``.
     station : str
         Whose observation; empty for a control mark.
-    fit : int
-        Place among the fits of the station; -1 where it is no centre.
+    marker : str
+        What the marker is called at the station; empty where it is no centre.
     mark : str
         Name of the mark; empty where none is known.
     reason : str
@@ -55,7 +55,7 @@ class LeftOut:
 
     kind: str
     station: str
-    fit: int
+    marker: str
     mark: str
     reason: str
 
@@ -152,6 +152,8 @@ class Network:
         Place of station and mark of each observed centre, by station, each pair once.
     fits : (n,)
         Place of each centre among the fits of its station.
+    markers : (n,) tuple of str
+        What each is called at its station.
     p_base : (n, 3)
         Observed centres in the base frames of their stations [m].
     cov_p_base : (n, 3, 3)
@@ -186,6 +188,7 @@ class Network:
     marks: tuple[str, ...]
     sightings: Index
     fits: Index
+    markers: tuple[str, ...]
     p_base: Array
     cov_p_base: Array
     R_station_base: Array
@@ -222,6 +225,8 @@ class Network:
         )
         if len(self.shared.effects) != n:
             raise InputError(f"There are {n} centres, but effects on {len(self.shared.effects)}.")
+        if len(self.markers) != n:
+            raise InputError(f"There are {n} centres, but names of {len(self.markers)}.")
         if len(self.doubts) != m:
             raise InputError(f"There are {m} marks, but doubts about {len(self.doubts)}.")
 

@@ -12,10 +12,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from pipelines.rigs import rig_digest, rig_to_mapping
-from pipelines.values import Origin, Rig, ScanLog
+from pipelines.values import Origin, Rig, ScanLog, marker_name
 from service.provenance import code_version
 from service.work.orders import Order, Outcome
-from storage.results import marker_name
 
 if TYPE_CHECKING:
     import pyarrow as pa

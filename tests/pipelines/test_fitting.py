@@ -24,7 +24,7 @@ from pipelines.geometry import rot_z
 from pipelines.simulation import SimulationConfig, scenario, simulate_stop
 from pipelines.stitching import beams, stitch
 from pipelines.study import TABLE_2
-from pipelines.values import RING_UNKNOWN, MarkerCandidate, MarkerCandidates, Status
+from pipelines.values import RING_UNKNOWN, MarkerCandidate, MarkerCandidates, Status, marker_name
 from tests.pipelines.synthetic_stop import (
     RADIUS,
     RIG,
@@ -46,8 +46,10 @@ RAY = replace(RIG, divergence=np.zeros(2))
 def found(*groups, ground=-10.0):
     """Candidates from (members, rough centre) pairs."""
     candidates = tuple(
-        MarkerCandidate(members=np.array(rows), p_base_rough=np.array(p), score=1.0)
-        for rows, p in groups
+        MarkerCandidate(
+            name=marker_name(i), members=np.array(rows), p_base_rough=np.array(p), score=1.0
+        )
+        for i, (rows, p) in enumerate(groups)
     )
     return MarkerCandidates(candidates=candidates, rejected=(), ground_height_max=ground)
 
@@ -239,6 +241,15 @@ def test_three_returns_are_refused_with_the_reason():
         result = fit_one(cloud, CENTRE, method)
         assert not result.fits
         assert "needs" in result.rejected[0].reason
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_a_marker_keeps_its_name_where_the_method_refuses_one_before_it(method):
+    shots, ranges = returns(*marker_shots(CENTRE, np.random.default_rng(1), sigma=0.005))
+    rows = np.arange(len(ranges))
+    groups = found((rows[40:43], CENTRE), (rows, CENTRE))
+    result = fit_markers(method, cloud_of(shots, ranges), groups, CONFIG, RADIUS)
+    assert [fit.name for fit in result.fits] == ["M02"]
 
 
 def test_returns_on_one_line_are_weak_or_refused():

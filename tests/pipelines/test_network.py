@@ -308,7 +308,7 @@ def test_a_gross_error_of_five_centimetres_is_found_and_named(rng):
     result = network(biased(scans, 3, 5, [0.03, -0.03, 0.026]), marks)
     assert clean.left_out == ()
     (out,) = result.left_out
-    assert (out.kind, out.station, out.fit, out.mark) == ("centre", "stop4", 5, "F")
+    assert (out.kind, out.station, out.marker, out.mark) == ("centre", "stop4", "M06", "F")
     said = float(re.search(r"it is ([\d.]+) m", out.reason).group(1))
     assert said == pytest.approx(0.05, abs=3 * SIGMA)
     off = np.linalg.norm(result.T_site_station[3, :3, 3] - poses[3, :3, 3])
@@ -532,6 +532,7 @@ def wide(rng, n_stations, n_marks=200, n_seen=14):
         marks=tuple(f"M{i}" for i in range(n_marks)),
         sightings=np.column_stack([np.repeat(np.arange(n_stations), n_seen), seen.ravel()]),
         fits=np.tile(np.arange(n_seen), n_stations),
+        markers=("",) * n,
         p_base=centres.reshape(n, 3) + rng.normal(0, SIGMA, (n, 3)),
         cov_p_base=np.tile(SIGMA**2 * np.eye(3), (n, 1, 1)),
         R_station_base=np.tile(np.eye(3), (n_stations, 1, 1)),

@@ -96,7 +96,7 @@ def test_what_few_stations_see_is_no_mark_of_the_network(rng):
     result = adjust_network(assemble(scans, None, CONFIG), CONFIG)
     assert len(result.network.marks) == 14
     gone = [one for one in result.left_out if "stations that stand near enough" in one.reason]
-    assert {(one.station, one.fit) for one in gone} == {("stop1", 14), ("stop2", 14)}
+    assert {(one.station, one.marker) for one in gone} == {("stop1", "M15"), ("stop2", "M15")}
 
 
 def test_what_a_third_of_the_stations_see_is_a_mark_with_a_doubt(rng):

@@ -86,6 +86,7 @@ def fits_at(stop, marks, covs):
     """Return perfect fits of marks as a levelled station at the stop would have them."""
     return tuple(
         MarkerFit(
+            name="",
             p_base=p - stop,
             cov_p_base=cov,
             method="along_beam",

@@ -77,14 +77,14 @@ def fits(method, shift, points, rng):
     root = rng.normal(size=(len(centres), 3, 3)) * 1e-3
     cov = root @ root.transpose(0, 2, 1) + 1e-6 * np.eye(3)
     found = []
-    for centre, one in zip(centres, cov, strict=True):
+    for i, (centre, one) in enumerate(zip(centres, cov, strict=True), start=1):
         members = np.flatnonzero(np.linalg.norm(points - centre, axis=1) < 0.1)
         used, rejected = members[:-2], members[-2:]
         residuals = rng.normal(size=len(used)) * 0.01
-        fit = marker_fit(centre + shift, one)
+        fit = marker_fit(centre + shift, one, f"M{i:02d}")
         told = {"used": used, "rejected": rejected, "residuals": residuals}
         found.append(replace(fit, method=method, sigma_range_shared=7e-4, **told))
-    false = marker_fit(np.array([0.0, 0.0, 9.0]), np.eye(3) * 1e-4)
+    false = marker_fit(np.array([0.0, 0.0, 9.0]), np.eye(3) * 1e-4, f"M{len(centres) + 1:02d}")
     found.append(
         replace(
             false, method=method, radius_free=np.nan, sigma_radius_free=np.nan,
