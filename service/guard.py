@@ -5,6 +5,8 @@ Hides how a browser can be turned against a service on this machine, and what st
 
 from __future__ import annotations
 
+import asyncio
+import contextlib
 import hashlib
 import hmac
 import ipaddress
@@ -29,8 +31,10 @@ from service.settings import Settings
 
 COOKIE = "spheremark_token"
 OPEN_PATHS = ("/healthz", "/login", "/static/")  # answered without the token
-LONG_PATHS = ("/api/v1/recordings",)  # whose bodies are streamed, with a limit of their own
+LONG_PATHS = ("/api/v1/recordings", "/api/v1/terrains")  # streamed, with a limit of their own
 BODY_MAX = 16 << 20  # [bytes] of any other body
+UNREAD_MAX = 1 << 30  # [bytes] of a refused body that are read before its sender is answered
+UNREAD_SECONDS = 30.0
 SAFE_METHODS = ("GET", "HEAD", "OPTIONS")
 
 POLICY = "; ".join(
@@ -73,22 +77,25 @@ class Guard:
             await self.app(scope, receive, send)
             return
 
+        request = Request(scope)
+        body = _Body(receive, request)
+
         async def send_with_headers(message: Message) -> None:
             if message["type"] == "http.response.start":
+                if message["status"] >= 400:
+                    await body.read_to_its_end()
                 headers = MutableHeaders(scope=message)
                 for name, value in HEADERS.items():
                     headers.setdefault(name, value)
             await send(message)
 
-        request = Request(scope)
         try:
             self.check(request)
         except SpheremarkError as error:
             response = problem_response(problem_of(error, request.url.path), _challenge(error))
             await response(scope, receive, send_with_headers)
             return
-        bounded = receive if request.url.path in LONG_PATHS else _bounded(receive)
-        await self.app(scope, bounded, send_with_headers)
+        await self.app(scope, body.receive, send_with_headers)
 
     def check(self, request: Request) -> None:
         """Raise unless the request may pass."""
@@ -105,8 +112,9 @@ class Guard:
                 "things here."
             )
         declared = headers.get("content-length", "")
-        if declared.isdecimal() and request.url.path not in LONG_PATHS:
-            _check_length(int(declared))
+        is_bounded = request.url.path not in LONG_PATHS
+        if is_bounded and declared.isdecimal() and int(declared) > BODY_MAX:
+            raise _too_large(f"{int(declared):,}")
         is_open = request.url.path.startswith(OPEN_PATHS)
         if self.token and not is_open and not carries_token(request, self.token):
             raise UnauthorizedError(
@@ -160,27 +168,52 @@ def cookie_value(token: str) -> str:
     return hmac.new(token.encode(), b"spheremark cookie", hashlib.sha256).hexdigest()
 
 
-def _check_length(n_bytes: int) -> None:
-    """Refuse a body that no route reads."""
-    if n_bytes > BODY_MAX:
-        raise TooLargeError(f"The body has over {BODY_MAX:,} bytes, the most that is accepted.")
+class _Body:
+    """The body of a request: bounded, and read to its end before a refusal is answered.
 
+    A sender that is still sending reads no answer, and finds its connection reset instead.
+    """
 
-def _bounded(receive: Receive) -> Receive:
-    """Return what receives a body whose length nobody declared, up to the limit."""
-    n_bytes = 0
+    def __init__(self, receive: Receive, request: Request) -> None:
+        headers = request.headers
+        self._receive = receive
+        self._n_bytes = 0
+        self._is_bounded = request.url.path not in LONG_PATHS
+        self._is_asking = "expect" in headers  # and sends nothing before it is told to
+        self._is_open = headers.get("content-length", "0") != "0" or "transfer-encoding" in headers
 
-    async def counted() -> Message:
-        nonlocal n_bytes
-        message = await receive()
-        n_bytes += len(message.get("body", b""))
-        try:
-            _check_length(n_bytes)
-        except TooLargeError as error:  # the one kind that FastAPI lets through while it reads
-            raise HTTPException(413, str(error)) from error
+    async def receive(self) -> Message:
+        """Return the next part; HTTPException once it is more than any route reads."""
+        message = await self._next()
+        if self._is_bounded and self._n_bytes > BODY_MAX:
+            error = _too_large(f"over {BODY_MAX:,}")
+            raise HTTPException(413, str(error))  # the one kind that passes FastAPI while it reads
         return message
 
-    return counted
+    async def read_to_its_end(self) -> None:
+        """Throw away what is still to come, within reason."""
+        if self._is_asking and not self._n_bytes:
+            return
+        n_most = self._n_bytes + UNREAD_MAX
+        with contextlib.suppress(TimeoutError):
+            async with asyncio.timeout(UNREAD_SECONDS):
+                while self._is_open and self._n_bytes < n_most:
+                    await self._next()
+
+    async def _next(self) -> Message:
+        """Return the next part, counted."""
+        message = await self._receive()
+        self._n_bytes += len(message.get("body", b""))
+        self._is_open = bool(message.get("more_body", False))
+        return message
+
+
+def _too_large(found: str) -> TooLargeError:
+    """Return the refusal of a body that no route reads."""
+    return TooLargeError(
+        f"The body has {found} bytes; {BODY_MAX:,} are the most that this address takes. Send less "
+        f"at a time; files go whole to {' and '.join(LONG_PATHS)}."
+    )
 
 
 def _challenge(error: SpheremarkError) -> dict[str, str]:

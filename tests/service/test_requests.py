@@ -1,12 +1,18 @@
 """What every route does with what it should not get, and what every answer carries."""
 
 import hashlib
+import http.client
+import socket
+import threading
+import time
 
 import duckdb
 import pytest
+import uvicorn
 from fastapi.testclient import TestClient
 
 from service.app import create_app
+from service.guard import Guard
 from service.settings import Settings
 
 DIGEST = "0" * 64
@@ -200,6 +206,45 @@ def test_a_log_larger_than_the_limit_is_refused_by_its_header_and_leaves_nothing
             answer = client.post("/api/v1/recordings?name=a", content=body, headers=kind)
             assert (answer.status_code, answer.json()["code"]) == (413, "input.too_large")
     assert not [path for path in (tmp_path / "recordings").rglob("*") if path.is_file()]
+
+
+class Listening:
+    """A guarded application that reads no body, behind a real socket."""
+
+    def __init__(self, tmp_path):
+        async def refuse(_scope, _receive, send):
+            await send({"type": "http.response.start", "status": 404, "headers": []})
+            await send({"type": "http.response.body", "body": b"{}"})
+
+        guarded = Guard(refuse, Settings(data=tmp_path))
+        self.server = uvicorn.Server(uvicorn.Config(guarded, port=0, log_level="critical"))
+        self.thread = threading.Thread(target=self.server.run)
+
+    def __enter__(self):
+        self.thread.start()
+        while not self.server.started:
+            time.sleep(0.01)
+        return self.server.servers[0].sockets[0].getsockname()[1]
+
+    def __exit__(self, *_):
+        self.server.should_exit = True
+        self.thread.join()
+
+
+@pytest.mark.parametrize(("path", "status"), [("/api/v1/plans", 413), ("/api/v1/recordings", 404)])
+def test_a_refusal_is_read_by_a_sender_who_sends_all_before_reading(tmp_path, path, status):
+    with Listening(tmp_path) as port:
+        connection = http.client.HTTPConnection("127.0.0.1", port, timeout=20)
+        connection.request("POST", path, b"x" * (64 << 20))
+        assert connection.getresponse().status == status
+        connection.close()
+
+
+def test_a_sender_who_asks_first_is_refused_without_its_body(tmp_path):
+    with Listening(tmp_path) as port, socket.create_connection(("127.0.0.1", port), 20) as line:
+        head = f"POST /api/v1/plans HTTP/1.1\r\nHost: localhost\r\nContent-Length: {1 << 40}\r\n"
+        line.sendall(f"{head}Expect: 100-continue\r\n\r\n".encode())
+        assert line.recv(100).startswith(b"HTTP/1.1 413 ")
 
 
 def test_control_marks_survive_the_way_there_and_back(site):
