@@ -338,8 +338,10 @@ def _print(answer: dict[str, Any]) -> None:
         at = ", ".join(f"{v:.2f}" for v in one["position_m"])
         out.print(
             f"One more mark at {at} m (pole {one['pole_height_m']:.2f} m) would bring the worst "
-            f"stop from {_text(one['worst_sigma_3d_before_m'], 1e3, 2)} to "
-            f"{_text(one['worst_sigma_3d_m'], 1e3, 2)} mm.",
+            f"stop from {_text(one['worst_sigma_3d_before_m'], 1e3, 3)} to "
+            f"{_text(one['worst_sigma_3d_m'], 1e3, 3)} mm (3-D sigma), the mean of all stops from "
+            f"{_text(one['mean_sigma_3d_before_m'], 1e3, 3)} to "
+            f"{_text(one['mean_sigma_3d_m'], 1e3, 3)} mm.",
             highlight=False,
         )
 

@@ -189,6 +189,8 @@ def one_more(asked: Asked, rules: PlaceRules | None = None) -> Plain:
     return mark | {
         "worst_sigma_3d_before_m": _number(found.before.worst_sigma_3d),
         "worst_sigma_3d_m": _number(found.after.worst_sigma_3d),
+        "mean_sigma_3d_before_m": _number(found.before.sigma_3d.mean()),
+        "mean_sigma_3d_m": _number(found.after.sigma_3d.mean()),
         "worst_probability_within_tolerance": found.after.worst_probability,
         "stops": [
             {"name": name, "sigma_3d_before_m": _number(a), "sigma_3d_m": _number(b)}

@@ -259,6 +259,9 @@ def propose_mark(
 ) -> Proposal:
     """Name the one more mark that would help most.
 
+    It has the least power mean of 3-D sigmas over all stops: the worst count most, and where no
+    place helps them, the next ones do.
+
     Parameters
     ----------
     site : Site
@@ -295,7 +298,7 @@ def propose_mark(
     p_site = np.concatenate([candidates.p_site[places], present.p_site])
     ground = np.concatenate([candidates.ground[places], np.zeros(len(present.names))])
     all_of_them = Candidates(p_site=p_site, ground=ground, apart=1e-6)
-    task = _task(site, stops, all_of_them, model, wish)
+    task = _task(site, stops, all_of_them, model, wish)._replace(power=_POWER)
     fixed = np.arange(n, n + len(present.names))
     scores = [_score(task, np.append(fixed, c)) for c in range(n)]
     best = min(range(n), key=scores.__getitem__)

@@ -202,6 +202,22 @@ def test_a_mark_that_is_dragged_moves_the_prediction_and_the_address(visit):
     page.wait_for_function("() => document.querySelectorAll('#marks-table tbody tr').length === 3")
 
 
+def test_a_stop_that_is_chosen_shows_what_each_mark_does_for_it(visit):
+    page = visit().open("/plan?model=sensor&a=P01:6.5,0.5,1;P02:-1,6.5,1;P03:-6.5,-3,1")
+    page.get_by_role("button", name="lane3-stop4", exact=True).click()
+    table = page.locator("#sights tbody tr")
+    table.nth(2).wait_for()
+    redundancies = [float(row.locator("td").nth(5).inner_text()) for row in table.all()]
+    dof = int(re.search(r"(\d+) degrees", page.locator("#sights p").inner_text())[1])
+    assert sum(redundancies) == pytest.approx(dof - 2, abs=0.1)  # two are those of levelling
+    page.emulate_media(media="print")
+    page.set_viewport_size({"width": 720, "height": 1000})
+    widths = page.evaluate(
+        "['#planner', '#stops-table'].map(q => document.querySelector(q).offsetWidth)"
+    )
+    assert widths[1] <= widths[0]
+
+
 def test_no_mark_is_put_where_an_area_was_drawn(visit):
     page = visit().open("/plan?model=sensor&a=P01:6.5,0.5,1;P02:-1,6.5,1;P03:-6.5,-3,1")
     page.wait_for_selector("#stops-table tbody tr")

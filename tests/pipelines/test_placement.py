@@ -506,6 +506,17 @@ def test_one_more_mark_goes_where_it_helps():
     assert found.p_site[0] < 3.0
 
 
+def test_one_more_mark_helps_the_next_stop_where_no_place_helps_the_worst():
+    site, stops = flat_site(), one_stop((-10.0, 0.0, 1.05), (10.0, 0.0, 1.05))
+    west, east = ring(4, 4.5).p_site, ring(4, 4.0).p_site
+    present = Arrangement.numbered(np.concatenate([west - [10, 0, 0], east + [10, 0, 0]]))
+    places = np.array([[-10.0, -18.0, 1.0], [11.5, 2.0, 1.0]])
+    candidates = Candidates(p_site=places, ground=np.zeros(2), apart=1.0)
+    found = propose_mark(site, stops, present, candidates, MODEL, Requirement())
+    assert found.before.sigma_3d[0] > found.before.sigma_3d[1]
+    assert_allclose(found.p_site, places[1])
+
+
 def rows_of(n_stops, per_stop, factor, rng):
     n = n_stops * per_stop
     ranges = rng.uniform(4.0, 12.0, n)

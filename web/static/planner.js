@@ -1,6 +1,7 @@
 // The planner: marks that move, the service that answers what they promise, the address that holds it all.
 const { PlanMap, SHOWN, rangeOf, paintScale } = await import(document.getElementById("planner").dataset.map);
 const { parseAreas, areasText, square, isInside, fillTable } = await import(document.getElementById("planner").dataset.areas);
+const { fillSights } = await import(document.getElementById("planner").dataset.sights);
 
 const API = "/api/v1/plans";
 const CELLS = { moving: 32, still: 64 }; // across the longer side of the map
@@ -136,6 +137,7 @@ function draw() {
   }
   drawMarks();
   drawStops();
+  fillSights(byId("sights"), state.plans[state.active].evaluation?.stops.find((stop) => stop.name === state.stop));
   byId("rests").disabled = !byId("step").valueAsNumber;
   byId("turn").disabled = !byId("rests").disabled;
   byId("areas").hidden = !state.areas.length;
@@ -273,7 +275,7 @@ function drawStops() {
   const names = state.plans.flatMap((plan) => plan.evaluation?.stops.map((stop) => stop.name) ?? []);
   table.tBodies[0].replaceChildren(...[...new Set(names)].map(stopRow));
   byId("stops-about").textContent =
-    "Predicted for each stop. Choose one to see on the map which marks are in its sight: broken lines are hidden or too far.";
+    "Predicted for each stop. Choose one to see what each mark does for it, and on the map which are in its sight: broken lines are hidden or too far.";
 }
 
 function stopRow(name) {
@@ -545,8 +547,9 @@ byId("suggest").addEventListener("click", (event) => byId("plan-controls").repor
   remember();
   plan.marks.push(own(answer));
   changed(plan, CELLS.still);
-  const before = answer.worst_sigma_3d_before_m === null ? "no position" : `${mm(answer.worst_sigma_3d_before_m)} mm`;
-  tell(`${answer.name} helps most: it brings the worst stop from ${before} to ${mm(answer.worst_sigma_3d_m)} mm.`);
+  const length = (key) => (answer[key] === null ? "no position" : `${(1000 * answer[key]).toFixed(3)} mm`);
+  const [worst, mean] = ["worst", "mean"].map((which) => `from ${length(`${which}_sigma_3d_before_m`)} to ${length(`${which}_sigma_3d_m`)}`);
+  tell(`${answer.name} helps most: it brings the worst stop ${worst} (3-D sigma), the mean of all stops ${mean}.`);
 }, "Searching the best place for one more"));
 byId("save").addEventListener("click", (event) => during(event.currentTarget, async (plan) => {
   const name = window.prompt("Name of the plan", `${plan.marks.length} marks`);
