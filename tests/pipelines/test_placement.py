@@ -508,8 +508,8 @@ def test_one_more_mark_goes_where_it_helps():
 
 def test_one_more_mark_helps_the_next_stop_where_no_place_helps_the_worst():
     site, stops = flat_site(), one_stop((-10.0, 0.0, 1.05), (10.0, 0.0, 1.05))
-    west, east = ring(4, 4.5).p_site, ring(4, 4.0).p_site
-    present = Arrangement.numbered(np.concatenate([west - [10, 0, 0], east + [10, 0, 0]]))
+    west, east, apart = ring(4, 4.5).p_site, ring(4, 4.0).p_site, np.array([10.0, 0.0, 0.0])
+    present = Arrangement.numbered(np.concatenate([west - apart, east + apart]))
     places = np.array([[-10.0, -18.0, 1.0], [11.5, 2.0, 1.0]])
     candidates = Candidates(p_site=places, ground=np.zeros(2), apart=1.0)
     found = propose_mark(site, stops, present, candidates, MODEL, Requirement())
