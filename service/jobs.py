@@ -19,7 +19,7 @@ from time import monotonic
 from typing import Any, Self
 
 import dask
-from distributed import Client, Future, LocalCluster
+from distributed import Client, Future, LocalCluster, Security
 from distributed.client import FutureCancelledError
 from distributed.scheduler import KilledWorker
 
@@ -116,6 +116,8 @@ class JobQueue:
                     threads_per_worker=1,
                     processes=True,
                     host="127.0.0.1",
+                    protocol="tls://",
+                    security=Security.temporary(),  # others on this machine may not give it tasks
                     dashboard_address="127.0.0.1:0",
                     worker_dashboard_address="127.0.0.1:0",
                     asynchronous=True,

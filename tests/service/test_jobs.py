@@ -1,5 +1,6 @@
 """Whole jobs through the running service: from a log over HTTP to rows, once and only once."""
 
+import asyncio
 import json
 import os
 import signal
@@ -7,6 +8,10 @@ import time
 from dataclasses import replace
 
 import numpy as np
+import psutil
+import pytest
+from distributed import Security
+from distributed.comm import connect
 from fastapi.testclient import TestClient
 
 from service.app import create_app
@@ -185,3 +190,15 @@ def test_jobs_are_taken_up_again_after_a_restart(tmp_path, stop, control, open_s
         runs = client.get("/api/v1/runs", params={"survey": "restart"}).json()["items"]
         assert {run["job_id"] for run in runs} == set(jobs)
         assert len(runs) == len(jobs)
+
+
+def test_nobody_else_on_this_machine_can_give_the_workers_tasks(site):
+    assert site.workers()
+    stranger = Security.temporary().get_connection_args("client")
+    ports = [c.laddr.port for c in psutil.Process().net_connections("tcp") if c.status == "LISTEN"]
+    refused = []
+    for port in ports:
+        with pytest.raises(OSError, match=r"TLS|closed|[Tt]imed") as error:
+            asyncio.run(connect(f"tls://127.0.0.1:{port}", timeout=5, **stranger))
+        refused.append("certificate does not match" in str(error.value))
+    assert any(refused)
