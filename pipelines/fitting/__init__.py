@@ -5,7 +5,7 @@ share the noise and the lasers of one sensor:
 
 - ``along_beam`` is maximum likelihood with the range of each beam's footprint, which exists only
   where the footprint meets the sphere,
-- ``silhouette`` adds which shots passed by,
+- ``silhouette`` adds which shots passed by, of those that ``shots`` tells,
 - ``astm_e3125`` is the surveyors' standard: cone, cylinder, 3 sigma,
 - ``free_radius`` and ``algebraic`` estimate the radius too, for comparison,
 - ``paper`` is the study's registration of a hemisphere by ICP.

@@ -7,6 +7,7 @@ at the outline.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -81,6 +82,11 @@ _FEW_INFLATION = 0.45  # what few returns add to the variance of a centre: 1 + t
 _FEW_RETURNS = 30.0  # this), by Monte Carlo
 
 _NOISE_FACTOR = 1.6  # of the stop's noise, above which a marker is called weak
+
+
+Told = Callable[[Array, Array], tuple[Array, Array]]
+"""What else is told of centres, (m, 3) [m] with covariances (m, 3, 3) [m^2]: what it adds to their
+normal equations, (m, 3, 3) [1/m^2], and to the right-hand sides, (m, 3) [1/m]."""
 
 
 class _Shots(NamedTuple):
@@ -196,9 +202,13 @@ def fit(
 
 
 def fit_ranges(
-    cloud: StitchedCloud, found: MarkerCandidates, config: FittingConfig, radius: float
+    cloud: StitchedCloud,
+    found: MarkerCandidates,
+    config: FittingConfig,
+    radius: float,
+    told: Told | None = None,
 ) -> Fits:
-    """Fit all candidates of a stop by their ranges alone, wherever their beams meet the spheres.
+    """Fit all candidates of a stop by their ranges, wherever their beams meet the spheres.
 
     Parameters
     ----------
@@ -210,15 +220,19 @@ def fit_ranges(
         Prior noise of direction and laser bias.
     radius : float
         Radius of the spheres [m].
+    told : callable
+        Is asked in each late step for what else is known of the centres, with where they stand and
+        how well that is known; nothing, if missing.
 
     Returns
     -------
     fits : tuple of MarkerFit
-        As of ``fit``, for who asks by himself which beams hit.
+        As of ``fit``, for who asks by himself which beams hit. What is told narrows the places over
+        which ranges are linearised, so that they tell more themselves.
     rejected : tuple of Rejection
         Candidates that no sphere of this radius explains, with the reason.
     """
-    return _fit(cloud, found, config, radius, asks_outline=False)
+    return _fit(cloud, found, config, radius, asks_outline=False, told=told)
 
 
 def _fit(
@@ -228,15 +242,16 @@ def _fit(
     radius: float,
     *,
     asks_outline: bool,
+    told: Told | None = None,
 ) -> Fits:
     """Return the fits of all candidates, and those that are none."""
     if not found.candidates:
         return (), ()
     shots = _gather(cloud, found.candidates, config)
     rough = np.array([c.p_base_rough for c in found.candidates])
-    estimate = _estimate(shots, rough, radius, asks_outline=asks_outline)
-    told = [*_free_radii(shots, estimate, radius), _sigmas_shared(estimate.state)]
-    rows = np.column_stack(told).tolist()
+    estimate = _estimate(shots, rough, radius, told, asks_outline=asks_outline)
+    known = [*_free_radii(shots, estimate, radius), _sigmas_shared(estimate.state)]
+    rows = np.column_stack(known).tolist()
     results = [
         _judged(shots, estimate, k, candidate, tuple(rows[k]), radius)
         for k, candidate in enumerate(found.candidates)
@@ -313,6 +328,12 @@ def _bounded(
     return added, _Bounds(outline, sites)
 
 
+def _with_told(N: Normals, state: _State, told: Told) -> Normals:
+    """Return normal equations with what else is told of the centres."""
+    centres, pull_centres = told(state.centres, state.cov_noise + state.cov_biases)
+    return N._replace(centres=N.centres + centres, pull_centres=N.pull_centres + pull_centres)
+
+
 def _stepped(state: _State, N: Normals, prior: Array, radius: float) -> _State:
     """Return the state after one Gauss-Newton step of all centres and biases together.
 
@@ -360,7 +381,9 @@ def _shortened(steps: Array, radius: float) -> Array:
     return np.asarray(steps * np.minimum(1.0, _STEP_MAX * radius / np.maximum(lengths, 1e-12)))
 
 
-def _estimate(shots: _Shots, rough: Array, radius: float, *, asks_outline: bool) -> _Estimate:
+def _estimate(
+    shots: _Shots, rough: Array, radius: float, told: Told | None, *, asks_outline: bool
+) -> _Estimate:
     """Return the estimate of all centres and biases from rough centres."""
     nothing = np.zeros((len(rough), 3, 3))
     state = _State(
@@ -386,6 +409,8 @@ def _estimate(shots: _Shots, rough: Array, radius: float, *, asks_outline: bool)
         N = _normals(shots, estimate)
         if asks_outline and step >= _N_STEPS_RANGES:
             N, bounds = _bounded(shots, estimate, radius, N, bounds)
+        if told is not None and step >= _N_STEPS_RANGES:
+            N = _with_told(N, estimate.state, told)
         state = _stepped(state, N, shots.sigma_biases, radius)
     return _weighed(shots, state, _linear(shots, state, is_in, radius), is_in)
 
@@ -436,6 +461,22 @@ def _own_factor(estimate: _Estimate, mine: slice) -> float:
     return max(estimate.state.factor * float(np.sqrt(ratio2)), _FACTOR_MIN)
 
 
+def inflation(n_used: int) -> float:
+    """Return by how much a few returns know less than the noise alone would have it.
+
+    Parameters
+    ----------
+    n_used : int
+        Returns of a marker.
+
+    Returns
+    -------
+    float
+        Factor of the variances of its centre.
+    """
+    return 1.0 + _FEW_INFLATION * float(np.exp(-n_used / _FEW_RETURNS))
+
+
 def _covariance(estimate: _Estimate, k: int, own: float, n_used: int) -> Array:
     """Return a centre's covariance: noise as the stop and the marker show it, and biases.
 
@@ -445,7 +486,7 @@ def _covariance(estimate: _Estimate, k: int, own: float, n_used: int) -> Array:
     state = estimate.state
     ratio2 = (own / state.factor) ** 2
     variance = (_DOF_STOP + n_used * ratio2) / (_DOF_STOP + n_used)
-    few = 1.0 + _FEW_INFLATION * np.exp(-n_used / _FEW_RETURNS)
+    few = inflation(n_used)
     return np.asarray(few * (variance * state.cov_noise[k] + state.cov_biases[k]))
 
 

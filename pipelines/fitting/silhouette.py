@@ -1,131 +1,105 @@
 """Centres from ranges and from the outline: which shots hit the sphere and which passed it by.
 
-Hides the shots that nobody recorded. A driver drops what did not return, but lasers fire by the
-clock: ring, time and azimuth of the returns about a marker tell every shot between them.
+Hides how far the outline bounds a centre: how shots come to answer as their footprints enter it,
+and what that says of where it is.
 """
 
 from __future__ import annotations
 
 from dataclasses import replace
-from itertools import pairwise
 from typing import NamedTuple
 
 import numba
 import numpy as np
-from numpy.typing import NDArray
 
 from pipelines.config import FittingConfig
 from pipelines.fitting import along_beam
 from pipelines.fitting.description import Fits
-from pipelines.fitting.footprint import predict
-from pipelines.geometry import levelling_rotation
-from pipelines.rigs import FIRING_CYCLE, FIRING_ORDER, LASER_CYCLE, N_LASERS
-from pipelines.stitching import beams
-from pipelines.values import (
-    RING_UNKNOWN,
-    Array,
-    Column,
-    Index,
-    MarkerCandidates,
-    MarkerFit,
-    Mask,
-    Rings,
-    Status,
-    StitchedCloud,
-)
-
-Rows = NDArray[np.int32]
+from pipelines.fitting.shots import Firings, Passing, firings_of, passing_of, pattern_of
+from pipelines.values import Array, MarkerCandidates, MarkerFit, Mask, Status, StitchedCloud
 
 NAME = "silhouette"
 RETURNS_ONLY = "returns only: "
 
-_DELAYS = np.argsort(FIRING_ORDER) * LASER_CYCLE  # [s] of each laser within its firing
-_PHASE_MAX = 3e-6  # [s] scatter of the firing clock: one laser's share of a firing
-_N_TIMED = 20_000  # returns that tell the clock and the spin
-_THINNED = 8  # one in so many of them tells the mean rate of the spin
-_SPIN_MAX = np.radians(0.2)  # scatter of azimuths about a steady spin
-_REACH = 1.5  # radii: shots that pass a centre closer are asked
-_DEPTH = 2.0  # radii before and behind the centre within which a return is the sphere's own
-_POLE_FROM, _POLE = 0.6, 0.35  # radii below the centre, and from the vertical: may be the pole
 _LUCK = 0.01  # share of shots that hit and are lost, or pass by and answer
-_EDGES = np.linspace(-1.2, 0.2, 15)  # half widths inside the outline where half answer
-_SOFTNESSES = (0.03, 0.06, 0.12, 0.24)  # half widths over which the answer turns to yes
-_EDGE, _SIGMA_EDGE = -0.6, 0.4  # prior of the edge
+_AT = 10.0  # [m] where the least share of a footprint that answers is told
+_LEAST = np.geomspace(1e-3, 0.3, 24)  # of a footprint: shares that may be the least there
+_SHARE, _SPREAD_SHARE = 0.02, 1.5  # prior of that share, and its deviation in the logarithm
+_SOFTNESSES = (0.015, 0.03, 0.06, 0.12, 0.24)  # half widths over which the answer turns to yes
+_OWN_EDGES = 0.05 * np.linspace(-2.0, 2.0, 5)  # half widths by which a marker's edge may be off,
+_OWN_LOGS = -0.5 * np.linspace(-2.0, 2.0, 5) ** 2  # and the logarithms of their chances
 _N_PRODUCT = 100  # chances that are multiplied before the logarithm is taken
-_N_PLACES = 24  # where a centre may be, when the link is sought
+_N_PLACES = 64  # where a centre may be, when the link is sought
+_N_LINKS = 3  # times that it is sought, ever nearer to the centres
+_WIDER = 1.2  # of the standard deviations: places that are asked lie so much wider
+_GRID, _GRID_END = 17, 2.6  # places to a side, and standard deviations to its ends
+_N_ROUNDS = 3  # of the first time that a centre is asked about; later the last answer is near
+_CAVITY_MIN = 0.05  # of a centre's precision: the least that is not its outline's own
 _REACH_SIGMAS, _REACH_WIDTHS = 4.0, 2.0  # of a centre, of a footprint: shots within are in doubt
-_DRIFT = 0.05  # [s] over which the spin is steady
-_CLOSE = 0.02  # [s] between returns of the same part of a revolution
-_N_RATES = 10
-_SEARCHES = (1e-2, 1e-3, 1e-4, 1e-5, 1e-6)  # of the rate: ever finer about the best
-_MARGIN = np.radians(1.0)  # what the LiDAR's place off the axis does to directions
 _THIN = 1e-6  # [m]
-_WIDER = 1.5  # of the variance: samples beyond the first round are drawn so much wider
-_FLOOR = 0.01  # of the prior covariance: keeps a sample's covariance invertible
-_SCALE, _SCALE_FEW, _FEW = 0.81, 0.37, 25.0  # of the covariance by returns, by Monte Carlo
-_SAMPLES = (128, 128, 128, 320)  # in rounds
+_FLOOR = 0.003  # of the covariance before: keeps that of the places invertible
 _WORTH = 0.15  # of the samples that must speak: one alone would have no spread
 _FLATTER = 0.8  # a step in the power of the likelihood
 
 
-class _Pattern(NamedTuple):
-    """When and whither the lasers fire.
+def _lit(inside: Array) -> Array:
+    """Return what share of a footprint is lit that reaches so far inside [half widths]."""
+    return np.asarray((np.arccos(-inside) + inside * np.sqrt(1.0 - inside**2)) / np.pi)
+
+
+_INSIDE = np.linspace(-1.0, 1.0, 401)
+_LIT = _lit(_INSIDE)
+
+
+class _Link(NamedTuple):
+    """How shots come to answer: the least lit share at _AT that does, and how softly [half widths].
 
     Attributes
     ----------
-    phase : float
-        Instant of the first laser of firing 0 [s].
-    spin : float
-        Rate of the azimuth [rad/s].
-    times, azimuths : (k,)
-        By how much a steady spin is off at some instants [s, rad].
+    least : float
+        Share of a footprint, where half of the shots answer.
+    softness : float
+        Over what distance the answer turns to yes [half widths].
     """
 
-    phase: float
-    spin: float
-    times: Array
-    azimuths: Array
+    least: float
+    softness: float
 
 
-class _Firings(NamedTuple):
-    """All firings of a stop, and which of their shots returned.
+class _Site(NamedTuple):
+    """What an outline tells of its centre across the line of sight, as a normal distribution.
 
     Attributes
     ----------
-    azimuths, angles : (m,)
-        Azimuth of the first laser and gimbal angle at its instant [rad].
-    spin, turn : float
-        Rates of the two [rad/s].
-    row_of : (m, 16)
-        Row of the cloud that each shot returned as; -1 where it did not.
+    precision : (2, 2)
+        Inverse covariance [1/m^2].
+    pull : (2,)
+        That times the mean [1/m].
     """
 
-    azimuths: Array
-    angles: Array
-    spin: float
-    turn: float
-    row_of: Rows
+    precision: Array
+    pull: Array
 
 
-class _Passing(NamedTuple):
-    """Shots that pass one sphere closely, in the plane square to the line of sight.
+class _Beside(NamedTuple):
+    """Where a centre is across its line of sight, and what is known of that beside the outline.
 
     Attributes
     ----------
-    places : (n, 2)
-        Where they pass [m].
-    half_widths : (n, 2, 2)
-        Square roots of their footprints there: half widths times their axes [m].
-    has_hit : (n,)
-        Whether they returned from the sphere.
-    axes : (2, 3)
-        Unit vectors of the plane.
+    place : (2,)
+        The present estimate by both [m].
+    cov : (2, 2)
+        Its covariance [m^2].
+    mean : (2,)
+        Where the rest puts it [m].
+    precision : (2, 2)
+        Inverse covariance of the rest [1/m^2].
     """
 
-    places: Array
-    half_widths: Array
-    has_hit: Mask
-    axes: Array
+    place: Array
+    cov: Array
+    mean: Array
+    precision: Array
 
 
 def fit(
@@ -154,26 +128,20 @@ def fit(
 
     Notes
     -----
-    The posterior of the ranges is the prior; every shot that passes closely adds the
-    probability that it hit, or did not, which rises from 0 to 1 as its footprint enters the
-    outline. Where on the way it is one half is the same for all markers of a stop and estimated
-    with them. Mean and covariance are those of a weighted sample.
+    Every shot that passes closely adds the probability that it hit, or did not, which rises from 0
+    to 1 as its footprint enters the outline. Where on the way it is one half depends on distance:
+    an echo is as strong as the share of the footprint that is lit, over the square of the distance,
+    and the weakest that is heard is the same for all markers of a stop and estimated with them.
+    Expectation propagation (Minka, 2001) with two factors to a centre: ranges, linearised over what
+    both leave open, and its outline, whose moments are summed over places across the line of sight.
     """
-    fits, rejected = along_beam.fit_ranges(cloud, found, config, radius)
-    if not fits:
-        return fits, rejected
-    pattern, why_not = _pattern(cloud)
+    pattern, why_not = pattern_of(cloud) if found.candidates else (None, "there is nothing to fit")
     if pattern is None:
         fits, rejected = along_beam.fit(cloud, found, config, radius)
         return tuple(_without_outline(fit, why_not) for fit in fits), rejected
-    firings = _firings(cloud, pattern)
-    near = _passing(cloud, firings, fits)
-    passing = [_doubtful(shots, fit) for fit, shots in zip(fits, near, strict=True)]
-    link = _link(fits, passing)
-    updated = tuple(
-        _updated(cloud, fit, shots, link) for fit, shots in zip(fits, passing, strict=True)
-    )
-    return updated, rejected
+    outline = _Outline(cloud, firings_of(cloud, pattern), radius)
+    fits, rejected = along_beam.fit_ranges(cloud, found, config, radius, outline.told)
+    return tuple(_named(fit) for fit in fits), rejected
 
 
 def _without_outline(fit: MarkerFit, why_not: str) -> MarkerFit:
@@ -186,221 +154,6 @@ def _without_outline(fit: MarkerFit, why_not: str) -> MarkerFit:
         reason=f"{said}The outline is not used: {why_not}.",
         variant=RETURNS_ONLY + why_not,
     )
-
-
-def _pattern(cloud: StitchedCloud) -> tuple[_Pattern | None, str]:
-    """Return the firing pattern, or why it cannot be told."""
-    if len(cloud.rig.laser_elevations) != N_LASERS:
-        return None, f"the rig has {len(cloud.rig.laser_elevations)} lasers, not a VLP-16's 16"
-    if not len(cloud.rings) or np.any(cloud.rings == RING_UNKNOWN):
-        return None, "the rings of the returns are not known"
-    rows = np.unique(np.linspace(0, len(cloud.times) - 1, _N_TIMED).astype(np.intp))
-    rows = rows[np.isfinite(cloud.p_base[rows]).all(axis=1)]
-    times = cloud.times[rows].astype(np.float64)
-    firings = times - _DELAYS[cloud.rings[rows]]
-    turn = np.exp(2j * np.pi * firings / FIRING_CYCLE)
-    phase = float(np.angle(turn.mean())) / (2 * np.pi) * FIRING_CYCLE
-    off = np.angle(turn * np.exp(-2j * np.pi * phase / FIRING_CYCLE)) / (2 * np.pi) * FIRING_CYCLE
-    if not np.sqrt(np.mean(off**2)) < _PHASE_MAX:
-        return None, "the times of the returns do not follow the VLP-16's firing cycle"
-    order = np.argsort(times)
-    azimuths = _azimuths(cloud, rows)[order]
-    spin, off = _steady(times[order], azimuths)
-    bins = np.round((times[order] - times.min()) / _DRIFT).astype(np.intp)
-    counts = np.bincount(bins)
-    seen = np.flatnonzero(counts)
-    drift = np.bincount(bins, off)[seen] / counts[seen]
-    scatter = np.sqrt(np.mean((off - np.bincount(bins, off)[bins] / counts[bins]) ** 2))
-    if not scatter < _SPIN_MAX:
-        return None, "the azimuths of the returns do not follow a steady spin"
-    return _Pattern(phase, spin, times.min() + seen * _DRIFT, drift), ""
-
-
-def _azimuths(cloud: StitchedCloud, rows: Index) -> Array:
-    """Return the azimuths of returns in the frame of the LiDAR [rad]."""
-    table = beams(cloud, rows)
-    angles = cloud.gimbal_angles[rows].astype(np.float64)
-    c, s, d = np.cos(angles), np.sin(angles), table.directions_base
-    v_head = np.column_stack([c * d[:, 0] + s * d[:, 1], c * d[:, 1] - s * d[:, 0], d[:, 2]])
-    v = v_head @ cloud.rig.T_head_lidar[:3, :3]
-    return np.asarray(np.arctan2(-v[:, 1], v[:, 0]))
-
-
-def _steady(times: Array, azimuths: Array) -> tuple[float, Array]:
-    """Return the rate of the steadiest spin [rad/s], and each azimuth less its rate times time."""
-    gaps, steps = np.diff(times), np.diff(azimuths)
-    is_close = (gaps > 0.0) & (gaps < _CLOSE)
-    rates = (steps[is_close] % (2 * np.pi)) / gaps[is_close]
-    if len(rates) < _N_RATES:
-        return 0.0, np.where(np.arange(len(times)) % 2, np.pi, -np.pi)
-    spin = float(np.median(rates))
-    turns = np.exp(1j * azimuths)
-    for width in _SEARCHES:
-        trial = spin * (1.0 + width * np.linspace(-2.0, 2.0, 81))
-        spin = float(trial[_steadiest(times[::_THINNED], azimuths[::_THINNED], trial)])
-    mean = float(np.angle(np.mean(turns * np.exp(-1j * spin * times))))
-    return spin, mean + np.angle(turns * np.exp(-1j * (spin * times + mean)))
-
-
-def _firings(cloud: StitchedCloud, pattern: _Pattern) -> _Firings:
-    """Return every firing between the first return and the last."""
-    first, row_of = _numbered(cloud.times, cloud.rings, pattern.phase, _DELAYS)
-    numbered = np.arange(first, first + len(row_of), dtype=np.float64)
-    times: Array = pattern.phase + FIRING_CYCLE * numbered
-    thin = slice(None, None, max(len(cloud.times) // _N_TIMED, 1))
-    stamps, places = np.unique(cloud.times[thin], return_index=True)
-    angles = np.unwrap(cloud.gimbal_angles[thin][places])
-    gimbal = np.interp(times, stamps, angles.astype(np.float64))
-    azimuths = pattern.spin * times + np.interp(times, pattern.times, pattern.azimuths)
-    return _Firings(
-        azimuths=azimuths,
-        angles=gimbal,
-        spin=pattern.spin,
-        turn=float(np.median(np.diff(gimbal))) / FIRING_CYCLE,
-        row_of=row_of,
-    )
-
-
-@numba.njit(cache=True, nogil=True)
-def _numbered(times: Column, rings: Rings, phase: float, delays: Array) -> tuple[int, Rows]:
-    """Return the number of the first firing, and the row of each shot from there on."""
-    low, high = 1 << 60, -(1 << 60)
-    for i in range(len(times)):
-        number = int(np.rint((times[i] - delays[rings[i]] - phase) / FIRING_CYCLE))
-        low, high = min(low, number), max(high, number)
-    row_of = np.full((high - low + 1, N_LASERS), -1, np.int32)
-    for i in range(len(times)):
-        number = int(np.rint((times[i] - delays[rings[i]] - phase) / FIRING_CYCLE))
-        row_of[number - low, rings[i]] = i
-    return low, row_of
-
-
-def _passing(
-    cloud: StitchedCloud, firings: _Firings, fits: tuple[MarkerFit, ...]
-) -> list[_Passing]:
-    """Return the shots that pass each sphere closely, save those its pole may have answered."""
-    rig, centres = cloud.rig, np.array([fit.p_base for fit in fits])
-    sights = centres / np.linalg.norm(centres, axis=1)[:, None]
-    reaches = _REACH * np.array([fit.radius / fit.mean_range for fit in fits]) + _MARGIN
-    which, m, ring = _aimed(
-        np.column_stack([sights, np.sin(reaches), np.cos(reaches)]),
-        (firings.azimuths, firings.angles),
-        rig.T_head_lidar[:3, :3].copy(),
-        np.stack([rig.laser_elevations, _DELAYS]),
-    )
-    angles = firings.angles[m] + firings.turn * _DELAYS[ring]
-    azimuths = firings.azimuths[m] + firings.spin * _DELAYS[ring]
-    u = _directions(cloud, azimuths, angles, rig.laser_elevations[ring])
-    spin_axis = rig.T_head_lidar[:3, 2]
-    origins = _turned(rig.T_head_lidar[:3, 3] + rig.laser_heights[ring, None] * spin_axis, angles)
-    across = np.cross(_turned(np.tile(spin_axis, (len(m), 1)), angles), u)
-    across /= np.linalg.norm(across, axis=1, keepdims=True)
-    rows = firings.row_of[m, ring]
-    seen = np.where(rows < 0, np.inf, np.linalg.norm(cloud.p_base[rows] - origins, axis=1))
-    up, edges = levelling_rotation(cloud.levelling)[2], np.searchsorted(which, range(len(fits) + 1))
-    return [
-        _past(fit, (origins[a:b], u[a:b], across[a:b], seen[a:b]), rig.divergence, up)
-        for fit, (a, b) in zip(fits, pairwise(edges), strict=True)
-    ]
-
-
-@numba.njit(cache=True, nogil=True)
-def _aimed(
-    sights: Array,
-    turns: tuple[Array, Array],
-    R: Array,
-    lasers: Array,
-) -> tuple[Index, Index, Index]:
-    """Return marker, firing and laser of the shots that aim near a sphere, marker by marker.
-
-    ``sights`` has the directions and the sine and cosine of how near, ``R`` is that of the LiDAR
-    in the head, ``lasers`` has elevations and delays.
-    """
-    n = len(turns[0])
-    sines, cosines = np.sin(lasers[0]), np.cos(lasers[0])
-    found = [(0, 0, 0) for _ in range(0)]
-    for m in range(n):
-        c, s = np.cos(turns[1][m]), np.sin(turns[1][m])
-        # a firing lasts so short that head and spin stand still, within the margin of the reach
-        x, y = np.cos(turns[0][m]), -np.sin(turns[0][m])
-        for k in range(len(sights)):
-            hx, hy = c * sights[k, 0] + s * sights[k, 1], c * sights[k, 1] - s * sights[k, 0]
-            hz = sights[k, 2]
-            height = hx * R[0, 2] + hy * R[1, 2] + hz * R[2, 2]
-            ahead = x * (hx * R[0, 0] + hy * R[1, 0] + hz * R[2, 0])
-            ahead += y * (hx * R[0, 1] + hy * R[1, 1] + hz * R[2, 1])
-            if ahead < 0.5:
-                continue
-            for ring in range(len(sines)):
-                if (
-                    abs(height - sines[ring]) < sights[k, 3]
-                    and ahead * cosines[ring] + height * sines[ring] > sights[k, 4]
-                ):
-                    found.append((k, m, ring))
-    table = np.empty((3, len(found)), np.intp)
-    for i in range(len(found)):
-        table[0, i], table[1, i], table[2, i] = found[i]
-    order = np.argsort(table[0], kind="mergesort")
-    return table[0][order], table[1][order], table[2][order]
-
-
-def _directions(cloud: StitchedCloud, azimuths: Array, angles: Array, elevations: Array) -> Array:
-    """Return the directions of shots in the base frame, (n, 3)."""
-    v_lidar = np.column_stack(
-        [
-            np.cos(elevations) * np.cos(azimuths),
-            -np.cos(elevations) * np.sin(azimuths),
-            np.sin(elevations),
-        ]
-    )
-    return _turned(v_lidar @ cloud.rig.T_head_lidar[:3, :3].T, angles)
-
-
-def _turned(v_head: Array, angles: Array) -> Array:
-    """Return vectors of the turning head, (n, 3), in the base frame."""
-    c, s = np.cos(angles), np.sin(angles)
-    x, y, z = v_head.T
-    return np.column_stack([c * x - s * y, s * x + c * y, z])
-
-
-def _past(
-    fit: MarkerFit, shots: tuple[Array, Array, Array, Array], divergence: Array, up: Array
-) -> _Passing:
-    """Return of the shots aimed near one sphere those that its outline may tell of."""
-    origins, u, across, seen = shots
-    p, radius = fit.p_base, fit.radius
-    along = np.einsum("ij,ij->i", p - origins, u)
-    passed = origins + along[:, None] * u - p
-    axes = _plane(p / np.linalg.norm(p), up)
-    places, depth = passed @ axes.T, (seen - along) / radius
-    both = np.stack([across, np.cross(u, across)], axis=1) @ axes.T
-    half_widths = 0.5 * along[:, None, None] * divergence[:, None] * both
-    is_pole = (places[:, 1] < -_POLE_FROM * radius) & (np.abs(places[:, 0]) < _POLE * radius)
-    is_near = (along > 0.0) & (np.einsum("ij,ij->i", passed, passed) < (_REACH * radius) ** 2)
-    asked = is_near & (depth > -_DEPTH) & ~is_pole
-    return _Passing(places[asked], half_widths[asked], (depth < _DEPTH)[asked], axes)
-
-
-def _plane(sight: Array, up: Array) -> Array:
-    """Return two unit vectors square to a line of sight, the second one upward, (2, 3)."""
-    side = np.cross(sight, up)
-    side /= np.linalg.norm(side)
-    return np.stack([side, np.cross(side, sight)])
-
-
-@numba.njit(cache=True, nogil=True, error_model="numpy")
-def _steadiest(times: Array, azimuths: Array, rates: Array) -> int:
-    """Return which rate leaves the azimuths least spread about a mean."""
-    best, most = 0, -1.0
-    for k in range(len(rates)):
-        x, y = 0.0, 0.0
-        for i in range(len(times)):
-            angle = azimuths[i] - rates[k] * times[i]
-            x += np.cos(angle)
-            y += np.sin(angle)
-        if x * x + y * y > most:
-            best, most = k, x * x + y * y
-    return best
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
@@ -445,11 +198,63 @@ def _logarithms(entered: Array, has_hit: Mask, edges: Array, softness: float) ->
     return total
 
 
-def _doubtful(shots: _Passing, fit: MarkerFit) -> _Passing:
+class _Outline:
+    """What the shots about the centres of a stop tell, as far as it is known after each step.
+
+    Parameters
+    ----------
+    cloud : StitchedCloud
+        The stop.
+    firings : Firings
+        All its shots.
+    radius : float
+        Radius of the spheres [m].
+    """
+
+    def __init__(self, cloud: StitchedCloud, firings: Firings, radius: float) -> None:
+        self._cloud, self._firings, self._radius = cloud, firings, radius
+        self._n_asked = 0
+        self._link = _Link(_SHARE, _SOFTNESSES[-1])
+        self._passing: list[Passing] = []
+        self._sites: list[_Site] = []
+
+    def told(self, centres: Array, covs: Array) -> tuple[Array, Array]:
+        """Return what the outlines add to the normal equations of centres, as ``Told``."""
+        if not self._n_asked:
+            near = passing_of(self._cloud, self._firings, centres, self._radius)
+            self._passing = [
+                _doubtful(*both, self._radius) for both in zip(near, covs, strict=True)
+            ]
+            self._sites = [_Site(np.zeros((2, 2)), np.zeros(2)) for _ in near]
+        self._n_asked += 1
+        beside = [
+            _beside(p, cov, shots, site)
+            for p, cov, shots, site in zip(centres, covs, self._passing, self._sites, strict=True)
+        ]
+        if self._n_asked <= _N_LINKS:
+            self._link = _link(self._passing, beside, self._radius)
+        n_rounds = _N_ROUNDS if self._n_asked == 1 else 1
+        self._sites = [
+            _site(shots, known, self._link, (self._radius, n_rounds))
+            for shots, known in zip(self._passing, beside, strict=True)
+        ]
+        added = [
+            (
+                shots.axes.T @ site.precision @ shots.axes,
+                shots.axes.T @ (site.pull - site.precision @ known.place),
+            )
+            for shots, site, known in zip(self._passing, self._sites, beside, strict=True)
+        ]
+        return np.array([precision for precision, _ in added]), np.array(
+            [pull for _, pull in added]
+        )
+
+
+def _doubtful(shots: Passing, cov: Array, radius: float) -> Passing:
     """Return the shots that may hit or not as the centre is here or there; others say nothing."""
     widths = np.sqrt(np.sum(shots.half_widths**2, axis=(1, 2)))
-    reach = _REACH_SIGMAS * np.sqrt(np.linalg.eigvalsh(fit.cov_p_base)[-1])
-    gaps = np.abs(np.linalg.norm(shots.places, axis=1) - fit.radius)
+    reach = _REACH_SIGMAS * np.sqrt(np.linalg.eigvalsh(cov)[-1])
+    gaps = np.abs(np.linalg.norm(shots.places, axis=1) - radius)
     near = gaps < reach + _REACH_WIDTHS * widths
     return shots._replace(
         places=shots.places[near],
@@ -458,29 +263,61 @@ def _doubtful(shots: _Passing, fit: MarkerFit) -> _Passing:
     )
 
 
-def _link(fits: tuple[MarkerFit, ...], passing: list[_Passing]) -> tuple[float, float]:
-    """Return where on its way in half of the shots answer, and how softly [half widths].
+def _beside(p: Array, cov: Array, shots: Passing, site: _Site) -> _Beside:
+    """Return where a centre is across the line of sight, and what is known beside its outline."""
+    place, cov_place = shots.axes @ (p - shots.centre), shots.axes @ cov @ shots.axes.T
+    precision = np.linalg.inv(cov_place)
+    least = _CAVITY_MIN * np.linalg.eigvalsh(precision)[0]
+    values, vectors = np.linalg.eigh(precision - site.precision)
+    others = (vectors * np.maximum(values, least)) @ vectors.T
+    mean = np.linalg.solve(others, precision @ place - site.pull)
+    return _Beside(place, cov_place, mean, others)
+
+
+def _edges(least: Array, distance: float) -> Array:
+    """Return where shots begin to answer [half widths], from the least share that does at _AT."""
+    return np.interp(least * (distance / _AT) ** 2, _LIT, _INSIDE)
+
+
+def _link(passing: list[Passing], beside: list[_Beside], radius: float) -> _Link:
+    """Return how shots come to answer, by the markers of a stop together.
 
     Each marker's centre is only known so well, so that its likelihood is the mean over places where
     it may be.
     """
-    prior = -0.5 * ((_EDGES - _EDGE) / _SIGMA_EDGE) ** 2
-    total = np.tile(prior, (len(_SOFTNESSES), 1))
-    z = _normal(_N_PLACES)
-    for fit, shots in zip(fits, passing, strict=True):
-        shifts = z @ np.linalg.cholesky(fit.cov_p_base).T @ shots.axes.T
-        entered = _entered(shots.places, shots.half_widths, fit.radius, shifts)
+    prior = -0.5 * (np.log(_LEAST / _SHARE) / _SPREAD_SHARE) ** 2
+    total, z = np.tile(prior, (len(_SOFTNESSES), 1)), _WIDER * _normal(_N_PLACES)
+    for shots, known in zip(passing, beside, strict=True):
+        places = known.place + z @ np.linalg.cholesky(known.cov).T
+        weights = _log_normal(places, known) + 0.5 * np.sum((z / _WIDER) ** 2, axis=1)
+        entered = _entered(shots.places, shots.half_widths, radius, places)
+        edges = _edges(_LEAST, shots.distance)
         for i, softness in enumerate(_SOFTNESSES):
-            logs = _logarithms(entered, shots.has_hit, _EDGES, softness)
+            logs = _logarithms(entered, shots.has_hit, edges, softness) + weights[:, None]
             total[i] += logs.max(axis=0) + np.log(np.mean(np.exp(logs - logs.max(axis=0)), axis=0))
-    softest, edge = np.unravel_index(int(np.argmax(total)), total.shape)
-    return float(_EDGES[edge]), _SOFTNESSES[int(softest)]
+    softest, least = np.unravel_index(int(np.argmax(total)), total.shape)
+    return _Link(float(_LEAST[least]), _SOFTNESSES[int(softest)])
+
+
+def _log_normal(places: Array, known: _Beside) -> Array:
+    """Return the logarithm of the density of places beside the outline, up to a constant."""
+    off = places - known.mean
+    return np.asarray(-0.5 * np.einsum("ij,jk,ik->i", off, known.precision, off))
 
 
 def _normal(n: int) -> Array:
-    """Return standard normal places, (n, 3), the same every time and without a mean."""
-    half = np.random.default_rng(0).standard_normal((n // 2, 3))
+    """Return standard normal places, (n, 2), the same every time and without a mean."""
+    half = np.random.default_rng(0).standard_normal((n // 2, 2))
     return np.concatenate([half, -half])
+
+
+def _grid() -> Array:
+    """Return places over a square, (n, 2)."""
+    side = np.linspace(-_GRID_END, _GRID_END, _GRID)
+    return np.stack(np.meshgrid(side, side), axis=-1).reshape(-1, 2)
+
+
+_PLACES = _grid()
 
 
 def _spread(logs: Array) -> Array:
@@ -494,31 +331,33 @@ def _spread(logs: Array) -> Array:
         logs = _FLATTER * logs
 
 
-def _updated(
-    cloud: StitchedCloud, fit: MarkerFit, shots: _Passing, link: tuple[float, float]
-) -> MarkerFit:
-    """Return the fit with what its outline says."""
-    precision = np.linalg.inv(fit.cov_p_base)
-    mean, cov, wide = np.zeros(3), fit.cov_p_base, 1.0
-    for n in _SAMPLES:
-        z = _normal(n)
-        d = mean + z @ np.linalg.cholesky(wide * cov).T
-        entered = _entered(shots.places, shots.half_widths, fit.radius, d @ shots.axes.T)
-        logs = _logarithms(entered, shots.has_hit, np.array(link[:1]), link[1])[:, 0]
-        logs += 0.5 * np.sum(z**2, axis=1) - 0.5 * np.einsum("ij,jk,ik->i", d, precision, d)
-        weights = _spread(logs)
-        mean = weights @ d
-        cov = (weights[:, None] * (d - mean)).T @ (d - mean) + _FLOOR * fit.cov_p_base
-        wide = _WIDER
-    p = fit.p_base + mean
-    table = beams(cloud, fit.used)
-    which = np.zeros(len(fit.used), dtype=np.intp)
-    found = predict(table, p[None], np.array([fit.radius]), which)
-    return replace(
-        fit,
-        method=NAME,
-        p_base=p,
-        cov_p_base=(_SCALE + _SCALE_FEW * np.exp(-fit.n_points / _FEW)) * cov,
-        mean_range=float(np.linalg.norm(table.origins_base.mean(axis=0) - p)),
-        residuals=table.ranges - found.ranges,
-    )
+def _site(shots: Passing, known: _Beside, link: _Link, asked: tuple[float, int]) -> _Site:
+    """Return what an outline tells of its centre, as a normal distribution across the sight.
+
+    ``asked`` is the radius, and how often the places that are asked draw nearer. The edge of each
+    marker may be a little off that of all: a normal mean over that.
+    """
+    (radius, n_rounds), mean, cov = asked, known.place, known.cov
+    edges = _edges(np.array([link.least]), shots.distance) + _OWN_EDGES
+    for _ in range(n_rounds):
+        places = mean + _WIDER * _PLACES @ np.linalg.cholesky(cov).T
+        entered = _entered(shots.places, shots.half_widths, radius, places)
+        logs = _logarithms(entered, shots.has_hit, edges, link.softness) + _OWN_LOGS
+        most = logs.max(axis=1)
+        logs = most + np.log(np.exp(logs - most[:, None]).sum(axis=1))
+        weights = _spread(logs + _log_normal(places, known))
+        mean = weights @ places
+        cov = (weights[:, None] * (places - mean)).T @ (places - mean) + _FLOOR * known.cov
+    values, vectors = np.linalg.eigh(np.linalg.inv(cov) - known.precision)
+    precision = (vectors * np.maximum(values, 0.0)) @ vectors.T
+    both = known.precision + precision
+    return _Site(precision, both @ mean - known.precision @ known.mean)
+
+
+def _named(fit: MarkerFit) -> MarkerFit:
+    """Return the fit under this name, and its covariance without what few returns add.
+
+    That comes from the bend of ranges over a place that only they tell.
+    """
+    cov = fit.cov_p_base / along_beam.inflation(fit.n_points)
+    return replace(fit, method=NAME, cov_p_base=cov)

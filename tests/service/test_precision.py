@@ -49,11 +49,10 @@ def test_centres_keep_the_bars(case):
         slack, slack_nees = 3 * 0.5 * 0.9 / np.sqrt(n), 3 * 2.7 / np.sqrt(n)
         low, high = (2.2, 4.5) if few else (2.4, 3.6)
         assert low - slack_nees < row["mean_nees"] < high + slack_nees
-        if row["method"] == "along_beam":
-            share, bias = bars(distance)
-            assert row["bound_over_rms"] > share * (1 - slack)
-            assert abs(row["radial_bias_m"]) < bias + 3 * row["rms_m"] / np.sqrt(3 * n)
-        elif case.sigma == 0.02 and distance <= 15:
+        share, bias = bars(distance)
+        assert row["bound_over_rms"] > share * (1 - slack)
+        assert abs(row["radial_bias_m"]) < bias + 3 * row["rms_m"] / np.sqrt(3 * n)
+        if row["method"] == "silhouette":
             assert row["bound_over_rms"] > 1.0
         reach = 30 if case.sigma == 0.01 else 25 if case.turn > 20 else 20
         if distance <= reach:
