@@ -85,6 +85,7 @@ def _sighting(found: Evaluation, i: int, k: int) -> Plain:
         "name": found.marks.names[k],
         "is_seen": bool(found.is_seen[i, k]),
         "visible_share": float(found.shares[i, k]),
+        "surface_behind_m": _number(found.gaps[i, k]),
         "range_m": float(found.ranges[i, k]),
         "n_points": float(found.n_points[i, k]),
         "redundancy": float(found.redundancies[i, k]),

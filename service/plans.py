@@ -219,7 +219,7 @@ class Lookout:
                 return fresh
             known |= {keys[k]: fresh.rows(np.array([i])) for i, k in enumerate(new)}
             self._remember({keys[k]: known[keys[k]] for k in new})
-        return Sights(lowest=np.concatenate([known[key].lowest for key in keys], axis=1))
+        return Sights.joined([known[key] for key in keys])
 
     def _remember(self, fresh: dict[tuple[str, bytes, bytes], Sights]) -> None:
         """Keep what is new, and forget what is oldest."""

@@ -84,6 +84,7 @@ def evaluate(
         source=model.provenance.source,
         is_seen=seen,
         shares=centres.shares,
+        gaps=sights.gaps.astype(np.float64),
         ranges=np.linalg.norm(marks.p_site[None] - eyes[:, None], axis=2),
         n_points=centres.n_points,
         cov_p_site=covs,
@@ -244,7 +245,7 @@ def sighting_of(
         marks_site=marks.p_site,
         cov_centres=centres.cov_site,
         sigma_laser_bias=model.sensor.sigma_range_bias,
-        is_seen=is_found(centres, wish.n_points_min),
+        is_seen=is_found(centres, wish.n_points_min, wish.share_min),
     )
     return centres, sighting
 
@@ -291,7 +292,7 @@ def _reasons(
     needed: Index = np.full(len(seen), 3 if wish.method == "paper" else 2)
     n_seen = seen.sum(axis=1)
     is_fixed = np.isfinite(positions.cov_motion[:, 0, 0])
-    hidden = (centres.shares < 0.05).sum(axis=1)
+    hidden = (centres.shares < wish.share_min).sum(axis=1)
     return tuple(
         _reason(int(n_seen[e]), int(needed[e]), bool(is_fixed[e]), int(hidden[e]), seen.shape[1])
         for e in range(len(seen))
@@ -303,8 +304,8 @@ def _reason(n_seen: int, needed: int, is_fixed: bool, n_hidden: int, n: int) -> 
     if n_seen < needed:
         seen = f"{n_seen} of {n} marks" if n_seen else f"none of {n} marks"
         return (
-            f"sees {seen} well enough ({n_hidden} hidden, the others too far or between the lines "
-            f"of the scan); a position needs {needed}"
+            f"sees {seen} well enough ({n_hidden} less than half visible, the others too far, "
+            f"between the lines of the scan or close before a wall); a position needs {needed}"
         )
     if not is_fixed:
         return "the marks stand so much in one line with the stop that the position stays open"

@@ -182,7 +182,7 @@ def _expected(model: CentreModel, ranges: Array) -> tuple[Array, Array]:
         names=tuple(str(i) for i in range(n)),
         p_site=np.column_stack([ranges, np.zeros(n), np.zeros(n)]),
     )
-    sights = Sights(lowest=-np.ones((1, n, N_STRIPS), np.float32))
+    sights = Sights.open(1, n, N_STRIPS)
     centres = expect_centres(model, np.zeros((1, 3)), marks, sights)
     return centres.n_points[0], np.einsum("nii->ni", centres.cov_site[0])
 

@@ -27,6 +27,7 @@ _BEHIND = 0.05  # [m] something nearer to the sphere than this is its own foot
 _MANY = 400  # pairs of eye and mark that are worth a second thread
 _HIDDEN, _SEEN = 1.0, -1.0
 _N_HEIGHTS = 12  # rays to each strip of a disc
+_REACH = 0.9  # [m] behind a centre that is looked for a surface
 _N_PAIRS = 10_000  # of eye and mark whose rays are cast at a time: some 50 MB
 _TOUCH = 1e-3  # [m] what is this near to a sphere does not hide it
 
@@ -57,6 +58,7 @@ def look(site: Site, eyes_site: Array, marks: Arrangement) -> Sights:
     its own column (``Sights.with_mark``).
     """
     lowest = np.empty((len(eyes_site), len(marks.names), N_STRIPS), np.float32)
+    gaps = np.empty(lowest.shape[:2], np.float32)
     grids = (site.surface, _highest_near(site))
     frame = (site.xs[0], site.ys[0], site.cell)
     eyes, p_site = np.ascontiguousarray(eyes_site), np.ascontiguousarray(marks.p_site)
@@ -67,7 +69,8 @@ def look(site: Site, eyes_site: Array, marks: Arrangement) -> Sights:
     side_by_side(part, len(eyes), worth=max(2, _MANY // max(len(p_site), 1)))
     if site.bodies is not None:
         _look_again(site.bodies, (eyes, p_site), site.marker_radius, lowest)
-    return Sights(lowest=lowest)
+    _look_behind(site.surface, frame, (eyes, p_site), gaps)
+    return Sights(lowest=lowest, gaps=gaps)
 
 
 def _look_again(
@@ -142,7 +145,7 @@ def behind_others(site: Site, eyes_site: Array, marks: Arrangement, sights: Sigh
     lowest = sights.lowest.copy()
     sizes = (site.marker_radius, site.pole_radius)
     _shade(np.ascontiguousarray(eyes_site), np.ascontiguousarray(marks.p_site), sizes, lowest)
-    return Sights(lowest=lowest)
+    return Sights(lowest=lowest, gaps=sights.gaps.copy())
 
 
 @lru_cache(maxsize=4)
@@ -233,6 +236,37 @@ def _look(
                 slope = _horizon(surface, frame, (x, y, z, bx, by, length))
                 height = tilt * (slope * flat - dz) / radius
                 lowest[e, m, c] = min(max(height, _SEEN), _HIDDEN)
+
+
+@numba.njit(cache=True, nogil=True)
+def _look_behind(
+    surface: Array,
+    frame: tuple[float, float, float],
+    places: tuple[Array, Array],
+    gaps: np.ndarray,
+) -> None:
+    """Fill in how far behind each centre the line of sight to it meets the surface."""
+    eyes, marks = places
+    x0, y0, cell = frame
+    step = min(0.5 * cell, 0.1)
+    for e in range(len(eyes)):
+        for m in range(len(marks)):
+            dx, dy, dz = (
+                marks[m, 0] - eyes[e, 0],
+                marks[m, 1] - eyes[e, 1],
+                marks[m, 2] - eyes[e, 2],
+            )
+            flat = max(np.hypot(dx, dy), 1e-9)
+            gaps[e, m] = np.inf
+            for k in range(1, int(_REACH / step) + 1):
+                s = k * step
+                x, y = marks[m, 0] + s * dx / flat, marks[m, 1] + s * dy / flat
+                if (
+                    _height(surface, (x - x0) / cell, (y - y0) / cell)
+                    >= marks[m, 2] + s * dz / flat
+                ):
+                    gaps[e, m] = s
+                    break
 
 
 @numba.njit(cache=True, nogil=True)

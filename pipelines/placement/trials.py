@@ -321,7 +321,7 @@ def _sigmas(trial: Trial, model: CentreModel | None) -> Array:
         names=tuple(str(i) for i in range(_TABLE)),
         p_site=np.column_stack([distances, np.zeros((_TABLE, 2))]),
     )
-    sights = Sights(lowest=-np.ones((1, _TABLE, N_STRIPS), np.float32))
+    sights = Sights.open(1, _TABLE, N_STRIPS)
     covs = expect_centres(model, np.zeros((1, 3)), marks, sights).cov_site[0]
     variances = np.einsum("nii->ni", covs)
     worst = np.nanmax(np.where(np.isfinite(variances), variances, np.nan), axis=0)

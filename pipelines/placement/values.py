@@ -6,6 +6,7 @@ All lengths are metres in the site frame, z up.
 from __future__ import annotations
 
 from collections import Counter
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from typing import Self
 
@@ -24,6 +25,7 @@ _LIMITS: dict[str, tuple[float, float]] = {
     "sigma_marks": (0.0, 1.0),
     "sigma_levelling": (1e-6, 0.5),
     "n_points_min": (1.0, 10_000.0),
+    "share_min": (0.0, 1.0),
 }
 
 
@@ -235,6 +237,9 @@ class Requirement:
         Standard deviation of roll and of pitch [rad].
     n_points_min : float
         Returns that a sphere needs to be found. 20: with fewer extraction begins to miss some.
+    share_min : float
+        Share of a sphere that must be seen for it to be found. 0.5: with less extraction finds
+        every second one.
     resection : ResectionConfig
         Levels of the tests, and what every centre has beyond its own covariance.
     """
@@ -244,6 +249,7 @@ class Requirement:
     sigma_marks: float = 0.0
     sigma_levelling: float = float(np.radians(0.2))
     n_points_min: float = 20.0
+    share_min: float = 0.5
     resection: ResectionConfig = field(default_factory=ResectionConfig)
 
     def __post_init__(self) -> None:
@@ -267,12 +273,53 @@ class Sights:
     lowest : (e, n, c) float32
         For each upright strip of the sphere's disc, from left to right, the height above the centre
         from which on it is seen, in units of half the disc's height: -1 all of it, 1 nothing.
+    gaps : (e, n) float32
+        From the centre on to the surface behind it; infinite where none is near [m].
     """
 
     lowest: np.ndarray
+    gaps: np.ndarray
 
     def __post_init__(self) -> None:
-        _seal(self, lowest=(None, None, None))
+        _seal(self, lowest=(None, None, None), gaps=self.lowest.shape[:2])
+
+    @classmethod
+    def open(cls, n_eyes: int, n_marks: int, n_strips: int) -> Self:
+        """Return the sights of marks before which and behind which nothing stands.
+
+        Parameters
+        ----------
+        n_eyes, n_marks, n_strips : int
+            How many there are.
+
+        Returns
+        -------
+        Sights
+            All of every disc is seen.
+        """
+        return cls(
+            lowest=np.full((n_eyes, n_marks, n_strips), -1.0, np.float32),
+            gaps=np.full((n_eyes, n_marks), np.inf, np.float32),
+        )
+
+    @classmethod
+    def joined(cls, parts: Sequence[Self]) -> Self:
+        """Return the sights of the marks of several, one after the other.
+
+        Parameters
+        ----------
+        parts : sequence of Sights
+            From the same eyes.
+
+        Returns
+        -------
+        Sights
+            Of all marks.
+        """
+        return cls(
+            lowest=np.concatenate([one.lowest for one in parts], axis=1),
+            gaps=np.concatenate([one.gaps for one in parts], axis=1),
+        )
 
     def with_mark(self, k: int, sights: Self) -> Self:
         """Return the sights after one mark has moved.
@@ -289,8 +336,8 @@ class Sights:
         Sights
             Of all marks.
         """
-        parts = (self.lowest[:, :k], sights.lowest, self.lowest[:, k + 1 :])
-        return replace(self, lowest=np.concatenate(parts, axis=1))
+        places = np.arange(self.gaps.shape[1])
+        return self.joined([self.rows(places[:k]), sights, self.rows(places[k + 1 :])])
 
     def rows(self, keep: Index | Mask) -> Self:
         """Return the sights of some of the marks.
@@ -305,7 +352,7 @@ class Sights:
         Sights
             Of those.
         """
-        return replace(self, lowest=self.lowest[:, keep].copy())
+        return replace(self, lowest=self.lowest[:, keep].copy(), gaps=self.gaps[:, keep].copy())
 
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
@@ -326,6 +373,8 @@ class Evaluation:
         Whether a mark will be found from a stop.
     shares : (s, n)
         Share of a sphere's disc that nothing hides, 0 to 1.
+    gaps : (s, n)
+        From centres on to the surface behind them; infinite where none is near [m].
     ranges : (s, n)
         Distances from stops to centres [m].
     n_points : (s, n)
@@ -365,6 +414,7 @@ class Evaluation:
     source: str
     is_seen: Mask
     shares: Array
+    gaps: Array
     ranges: Array
     n_points: Array
     cov_p_site: Array
@@ -382,7 +432,7 @@ class Evaluation:
 
     def __post_init__(self) -> None:
         s, n = len(self.stops.names), len(self.marks.names)
-        _seal(self, **dict.fromkeys(("is_seen", "shares", "ranges", "n_points"), (s, n)))
+        _seal(self, **dict.fromkeys(("is_seen", "shares", "gaps", "ranges", "n_points"), (s, n)))
         pairs = ("redundancies", "detectable_biases", "external_reliabilities")
         _seal(self, **dict.fromkeys(pairs, (s, n)))
         _seal(self, **dict.fromkeys(("sigma_3d", "probability", "dop", "n_used", "dof"), (s,)))

@@ -239,6 +239,37 @@ def test_a_sphere_that_is_hidden_to_a_height_shows_what_rises_above_it():
     assert shares[2] > 0.8 * above[2]
 
 
+def test_a_sphere_that_is_less_than_half_visible_does_not_count():
+    lines = np.arange(-30.0, 30.1, 0.2)
+    for ridge, counts in ((1.0, True), (1.04, False)):
+        surface = np.zeros((len(lines), len(lines)))
+        surface[:, np.abs(lines - 4.0) < 0.35] = ridge
+        stops, marks = one_stop((0.0, 0.0, 1.05)), Arrangement.numbered(np.array([[8.0, 0.0, 1.0]]))
+        found = evaluate(flat_site(surface=surface), stops, marks, MODEL, Requirement())
+        assert found.n_points[0, 0] > 20
+        assert found.is_seen[0, 0] == counts == (found.shares[0, 0] > 0.5)
+        assert ("1 less than half visible" in found.reasons[0]) == (not counts)
+
+
+def test_a_wall_close_behind_a_sphere_makes_it_worse_and_one_that_touches_it_loses_it():
+    lines = np.arange(-30.0, 30.1, 0.1)
+    ground = np.zeros((len(lines), len(lines)))
+    surface = ground.copy()
+    surface[:, np.abs(lines - 8.0) < 0.05] = 2.0  # 1 m high at 7.95 m, between nodes
+    site = site_of_grid("a wall", lines, lines.copy(), ground, surface=surface)
+    marks = Arrangement.numbered(np.array([[7.85, 0.0, 1.0], [7.4, 0.0, 1.0], [6.5, 0.0, 1.0]]))
+    stops = one_stop((0.0, 0.0, 1.05))
+    sights = look(site, stops.p_site, marks)
+    assert_allclose(sights.gaps[0, 1], 0.55, atol=0.06)
+    assert np.isinf(sights.gaps[0, 2])
+    alone = replace(sights, gaps=np.full((1, 3), np.inf, np.float32))
+    near, free = (expect_centres(MODEL, stops.p_site, marks, one) for one in (sights, alone))
+    traces = np.trace(near.cov_site / free.cov_site, axis1=2, axis2=3)[0] / 3
+    assert traces[1] > 2.0 > traces[2] == 1.0
+    assert near.n_points[0, 1] < 0.9 * free.n_points[0, 1]
+    assert list(near.lost[0] == 1.0) == [True, False, False]
+
+
 def test_a_mark_stands_in_the_way_of_one_behind_it():
     marks = Arrangement.numbered(np.array([[4.0, 0.0, 1.05], [8.0, 0.0, 1.05], [0.0, 6.0, 1.0]]))
     found = evaluate(flat_site(), one_stop(), marks, MODEL, Requirement())

@@ -1,11 +1,17 @@
 // What each mark does for the stop that is chosen: rows of a table.
 const length = (value, digits = 2) => (value === null ? "none" : (1000 * value).toFixed(digits));
 
+function found(one) {
+  if (one.surface_behind_m !== null) return `${one.is_seen ? "yes" : "no"}: a surface ${one.surface_behind_m.toFixed(1)} m behind`;
+  if (one.is_seen) return "yes";
+  return one.visible_share < 0.5 ? "no: less than half visible" : "no: too far";
+}
+
 function cells(one) {
   const isUsed = one.redundancy > 0;
   return [
     one.name,
-    one.is_seen ? "yes" : "no",
+    found(one),
     (100 * one.visible_share).toFixed(0),
     one.range_m.toFixed(2),
     one.n_points.toFixed(0),
