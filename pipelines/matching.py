@@ -6,7 +6,7 @@ control marks, so that large coordinates cost no digits.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from math import comb
 from typing import NamedTuple
 
@@ -32,6 +32,7 @@ _N_SOLUTIONS = 6  # that are refined: the best, and rivals enough to see that it
 _N_ROUNDS = 8  # of adjusting and matching again; two or three are the rule
 _RIVAL = 14.0  # -2 ln(0.001): how much better, in the weighted sum of squares, the best must be
 _RIVAL_SHARE = 0.5  # of what the best holds, at least, that a rival must hold before it is refined
+_N_DISSENT = 3  # other markers that agree on another place: control contradicts itself
 _PAIR = 25.0  # weighted sum of squares (2 dof) above which two markers are not those two marks
 _CHANCE = 0.01  # expected number of chance agreements above which a match is none
 _SHARED = 0.55  # of the variance along a line of sight, at most, that all centres share
@@ -135,6 +136,9 @@ class Match:
     rivals : (k, 3)
         Where base would stand, relative to the middle of the marks, by other matches of two
         markers that explain them about as well; no rows for three or more [m].
+    dissent : (k, 4)
+        How many other markers agree on another place than these, and where base would stand by
+        them, relative to the middle of the marks [m]: control that contradicts itself.
     """
 
     marks: Index
@@ -143,6 +147,7 @@ class Match:
     dof: int
     largest_residual: float
     rivals: Array = field(default_factory=lambda: np.zeros((0, 3)))
+    dissent: Array = field(default_factory=lambda: np.zeros((0, 4)))
 
     @property
     def n(self) -> int:
@@ -346,7 +351,33 @@ def match_marks(scene: Scene, config: ResectionConfig, spans: Spans | None = Non
             "more different ways equally well: several pairs of marks have the same distances "
             "(a symmetric field). Survey more markers, or move one so that no distance repeats."
         )
-    return best
+    return replace(best, dissent=_dissent(best, solutions[1:], scene))
+
+
+def contradiction(match: Match, scene: Scene) -> str:
+    """Say that other markers agree on another place of the station.
+
+    Parameters
+    ----------
+    match : Match
+        The match that was taken.
+    scene : Scene
+        Centres and marks.
+
+    Returns
+    -------
+    str
+        Empty where they do not.
+    """
+    if not len(match.dissent):
+        return ""
+    n, *place = match.dissent[0]
+    x, y, z = np.array(place) + scene.middle
+    off = float(np.linalg.norm(np.array(place) - match.T_site_base[:3, 3]))
+    return (
+        f"the control marks contradict each other: {match.n} markers fit here, and {n:.0f} others "
+        f"fit at ({x:.2f}, {y:.2f}, {z:.2f}) m, {off:.2f} m away"
+    )
 
 
 def observe(scene: Scene, pairs: Index, T: Array) -> tuple[Observations, Observations]:
@@ -676,19 +707,31 @@ def _weighted_square(solution: Solution[Array]) -> float:
 
 
 def _is_rival(other: Match, best: Match) -> bool:
-    """Return whether another match explains the markers about as well and differs."""
+    """Return whether another match explains the same markers about as well and differs."""
+    if _n_others(other, best) * 2 > other.n:
+        return False
     shared = int(np.sum((other.marks == best.marks) & (best.marks >= 0)))
     worse = (other.vtpv - best.vtpv) / max(1.0, best.vtpv / best.dof)
     return other.n >= best.n and 2 * shared < best.n and worse <= _RIVAL
 
 
-def _refuse_chance(match: Match, scene: Scene, config: ResectionConfig) -> None:
-    """Raise NoMatchError if marks strewn at random would agree as well.
+def _dissent(best: Match, others: list[Match], scene: Scene) -> Array:
+    """Return number and place of matches of three or more other markers, (k, 4), by no chance."""
+    rows = []
+    for other in others:
+        n = _n_others(other, best)
+        if n >= _N_DISSENT and 2 * n > other.n and _n_by_chance(other, scene) <= _CHANCE:
+            rows.append([n, *other.T_site_base[:3, 3]])
+    return np.array(sorted(rows, reverse=True)).reshape(-1, 4)
 
-    The expected number of chance agreements is counted a contrario (Moisan and Stival 2004): pairs
-    of fits on pairs of marks, times the ways to choose the others, times the share of the field's
-    volume that lies as near to a mark as the worst of them.
-    """
+
+def _n_others(other: Match, best: Match) -> int:
+    """Return how many markers another match explains that the best one does not."""
+    return int(np.sum((other.marks >= 0) & (best.marks < 0)))
+
+
+def _refuse_chance(match: Match, scene: Scene, config: ResectionConfig) -> None:
+    """Raise NoMatchError if marks strewn at random would agree as well."""
     n, m, k = len(scene.centres_base), len(scene.marks_site), match.n
     if k < _SHARE * min(n, m):
         raise NoMatchError(
@@ -696,6 +739,23 @@ def _refuse_chance(match: Match, scene: Scene, config: ResectionConfig) -> None:
             f"and at least {int(np.ceil(_SHARE * min(n, m)))} must: these are marks of another "
             "field or in other axes, or too many markers are false."
         )
+    expected = _n_by_chance(match, scene)
+    if expected > _CHANCE:
+        raise NoMatchError(
+            f"Only {k} of {n} markers fit the {m} control marks within {config.match_tolerance} m, "
+            f"and by chance {expected:.2g} such agreements are expected (at most {_CHANCE} is "
+            "accepted): these are marks of another field, or too many markers are false."
+        )
+
+
+def _n_by_chance(match: Match, scene: Scene) -> float:
+    """Return how many matches as good are expected of marks strewn at random.
+
+    They are counted a contrario (Moisan and Stival 2004): pairs of fits on pairs of marks, times
+    the ways to choose the others, times the share of the field's volume that lies as near to a mark
+    as the worst of them.
+    """
+    n, m, k = len(scene.centres_base), len(scene.marks_site), match.n
     near = max(match.largest_residual, 3.0 * float(np.sqrt(scene.cov_centres.trace(0, 1, 2).min())))
     reach = float(np.linalg.norm(scene.centres_base, axis=1).max())
     near_height = near + 3.0 * scene.sigma_level * reach
@@ -703,10 +763,4 @@ def _refuse_chance(match: Match, scene: Scene, config: ResectionConfig) -> None:
     share_height = min(1.0, 2.0 * near_height / extent[2])
     share = min(1.0, m * np.pi * near**2 / (extent[0] * extent[1]) * share_height)
     share_pair = 2.0 * near / np.hypot(extent[0], extent[1]) * share_height
-    expected = comb(n, 2) * m * (m - 1) * share_pair * comb(n - 2, k - 2) * share ** (k - 2)
-    if expected > _CHANCE:
-        raise NoMatchError(
-            f"Only {k} of {n} markers fit the {m} control marks within {config.match_tolerance} m, "
-            f"and by chance {expected:.2g} such agreements are expected (at most {_CHANCE} is "
-            "accepted): these are marks of another field, or too many markers are false."
-        )
+    return float(comb(n, 2) * m * (m - 1) * share_pair * comb(n - 2, k - 2) * share ** (k - 2))

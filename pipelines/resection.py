@@ -7,6 +7,7 @@ A free station: the unknown is the full pose of ``base`` in ``site``; centres ar
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from functools import partial
 
 import numpy as np
@@ -18,6 +19,7 @@ from pipelines.geometry import included_angle, inverse, is_on_a_line, rigid, ske
 from pipelines.matching import (
     Match,
     Scene,
+    contradiction,
     cov_of_shared,
     gather,
     match_marks,
@@ -211,6 +213,8 @@ def _weaknesses(
     reasons = []
     if len(match.rivals):
         reasons.append(_other_places(scene, match))
+    if against := contradiction(match, scene):
+        reasons.append(against)
     if len(used) < 3:
         reasons.append(
             "only two marks: solved with gravity, and an error in one of them would not show"
@@ -347,7 +351,11 @@ def _by_ranges(
     scene = gather(fits, marks, config)
     match = match_marks(scene, config)
     excluded = _false_markers(match, scene, match.T_site_base, config)
-    return fix_by_ranges(name, scene, match, config, tuple(excluded))
+    fix = fix_by_ranges(name, scene, match, config, tuple(excluded))
+    if not (against := contradiction(match, scene)):
+        return fix
+    reason = "; ".join(filter(None, (against, fix.reason)))
+    return replace(fix, status=Status.WEAK, reason=reason)
 
 
 _METHODS: dict[str, Callable[[MarkerFits, ControlMarks, ResectionConfig], StationFix]] = {

@@ -193,6 +193,28 @@ def test_a_false_marker_and_a_moved_mark_are_left_out_with_reasons(rng):
     np.testing.assert_allclose(fix.p_site, T[:3, 3], rtol=0, atol=5 * fix.sigma_3d)
 
 
+@pytest.mark.parametrize("method", ["free_station", "ranges", "paper"])
+def test_control_of_which_half_was_moved_makes_a_weak_fix_that_names_both_places(rng, method):
+    marks, T = field(rng), pose(STAND, 2.2)
+    noise = rng.normal(0, 4e-3, (14, 3))
+    moved = control(marks.p_site + np.where(np.arange(14) < 7, 0.0, 0.5)[:, None] * [1, 0, 0])
+    fix = resect(method, sightings(marks, T, noise=noise), moved, CONFIG)
+    assert fix.status is Status.WEAK
+    assert "7 markers fit here, and 7 others fit at" in fix.reason
+    assert "0.50 m away" in fix.reason
+
+
+def test_false_markers_and_two_moved_marks_are_no_contradiction(rng):
+    marks, T = field(rng), pose(STAND, 2.2)
+    away = np.where(np.arange(14) < 12, 0.0, 0.5)[:, None] * [1, 0, 0]
+    fits = sightings(marks, T, noise=rng.normal(0, 4e-3, (14, 3)))
+    strange = [
+        marker_fit(p, np.eye(3) * 1e-5) for p in rng.uniform([-9, -9, -1], [9, 9, 1], (8, 3))
+    ]
+    fits = replace(fits, fits=(*fits.fits, *strange))
+    assert free(fits, control(marks.p_site + away)).status is Status.OK
+
+
 def test_reliability_is_better_with_more_marks(rng):
     marks = field(rng)
     T = pose(STAND, 2.2)
