@@ -131,7 +131,7 @@ def network_answer(
     if book is not None and book.uncalibrated:
         warnings.append(f"The rig could not be calibrated and stays as it was: {book.uncalibrated}")
     if not result.passes_global_test and rig is None:
-        warnings.append("Where the rig may be wrong, adjusting it too can tell (--calibrate).")
+        warnings.append("A wrong rig can be the cause: adjust it together with the stations.")
     return {
         "status": "weak" if warnings else "ok",
         "warnings": warnings,

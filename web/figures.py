@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 import plotly.graph_objects as go
 from numpy.typing import NDArray
+from scipy.optimize import isotonic_regression
 
 from pipelines.study import TABLE_2
 from web import theme
@@ -29,6 +30,7 @@ _RATIO_AXIS = {
     "tickvals": _RATIOS,
     "ticktext": [f"{value:g}" for value in _RATIOS],
 }
+_LABEL_GAP = 0.05  # between names of lanes, as a share of the largest error
 _STOP_NUMBER = re.compile(r"^(.*?)[\s._-]*(?:[A-Za-z]*)(\d+)$")
 
 
@@ -97,6 +99,8 @@ def error_along_lane(fits: Columns, tolerance_m: float) -> go.Figure:
         lanes = sorted({lane_and_number(stop)[0] for stop in order})
         title = f"Stop along {lanes[0]}" if len(lanes) == 1 else "Stop along its lane"
         figure.update_xaxes(title_text=title, dtick=1)
+        if len(lanes) > 1:
+            _name_lanes(figure)
     else:
         figure.update_xaxes(
             title_text="Stop", type="category", categoryorder="array", categoryarray=order
@@ -336,9 +340,35 @@ def _add_lanes(
     for i, (lane, members) in enumerate(lanes.items()):
         samples = [known_values(quality[stops == stop]) for stop in members]
         _add_lane(figure, style, members, samples, is_numbered=is_numbered)
-        figure.data[-1].update(showlegend=i == 0)
-        if len(lanes) > 1:
-            figure.data[-1].update(text=[""] * (len(members) - 1) + [lane])
+        figure.data[-1].update(showlegend=i == 0, meta=lane)
+
+
+def _name_lanes(figure: go.Figure) -> None:
+    """Write the name of each lane before its first stop, one above the other."""
+    lines = figure.data
+    ends = np.array([line.y[0] for line in lines])
+    top = max(float(np.max(np.add(line.y, line.error_y.array))) for line in lines)
+    first, last = min(min(line.x) for line in lines), max(max(line.x) for line in lines)
+    for line, y in zip(lines, apart(ends, _LABEL_GAP * top), strict=True):
+        figure.add_annotation(
+            x=line.x[0],
+            y=y,
+            text=line.meta,
+            showarrow=False,
+            xanchor="right",
+            xshift=-8,
+            font={"size": 11, "color": line.line.color},
+        )
+    figure.update_xaxes(range=[first - 0.9, last + 0.35])
+
+
+def apart(values: NDArray[np.float64], gap: float) -> NDArray[np.float64]:
+    """Return values moved as little as it takes to leave a gap between any two."""
+    order = np.argsort(values)
+    steps = gap * np.arange(len(values))
+    moved = np.empty(len(values))
+    moved[order] = isotonic_regression(values[order] - steps).x + steps
+    return moved
 
 
 def _add_lane(
@@ -355,9 +385,7 @@ def _add_lane(
     figure.add_scatter(
         x=[lane_and_number(stop)[1] for stop in stops] if is_numbered else list(stops),
         y=means,
-        mode="lines+markers+text",
-        textposition="top left",
-        textfont={"size": 11, "color": style.colour},
+        mode="lines+markers",
         name=style.label,
         legendgroup=style.label,
         line={"color": style.colour, "width": 2.5},

@@ -130,6 +130,21 @@ def test_each_lane_is_a_line_of_its_own():
     assert len(figures.error_along_lane(columns, 0.03).data) == 2
 
 
+def test_names_of_lanes_stand_before_their_first_stops_and_clear_of_each_other():
+    columns = fits(35, methods=("along_beam", "paper"))
+    columns["stop"] = np.array([f"lane{i % 5}-stop{1 + i // 5 % 7}" for i in range(70)], object)
+    figure = figures.error_along_lane(columns, 0.03)
+    names = [note for note in figure.layout.annotations if note.text.startswith("lane")]
+    assert sorted(note.text for note in names) == sorted(2 * [f"lane{i}" for i in range(5)])
+    largest = 1000 * columns["error_3d_m"].max()
+    assert np.diff(sorted(note.y for note in names)).min() > 0.049 * largest
+    assert figure.layout.xaxis.range[0] < 1
+
+
+def test_values_are_moved_apart_as_little_as_it_takes():
+    assert_allclose(figures.apart(np.array([5.0, 1.0, 1.2, 9.0]), 1.0), [5.0, 0.6, 1.6, 9.0])
+
+
 @pytest.mark.parametrize(
     ("stop", "lane", "number"),
     [("lane3-stop5", "lane3", 5), ("A 12", "A", 12), ("stop7", "lane", 7), ("gate", "gate", None)],
