@@ -373,7 +373,7 @@ def _angle_panel(data: SurveyData, filters: Filters) -> tuple[Panel, ...]:
         "limits; 3-D centres lose nothing towards 180 deg."
     )
     figure = angles.error_against_angle(shown, data.tolerance_m, is_log=filters.is_log)
-    return (Panel(name="angle", figure=figure, caption=caption),)
+    return (Panel(name="angle", figure=figure, caption=caption, kind="keyed"),)
 
 
 def _map_panel(data: SurveyData) -> tuple[Panel, ...]:
