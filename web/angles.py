@@ -249,7 +249,7 @@ def limit_by_sigma(limits: Sequence[AngleLimit], tolerance_m: float) -> go.Figur
         hovertemplate="%{y:.1f} deg at %{x:.0f} mm: RMS %{customdata:.1f} mm<extra></extra>",
     )
     figure.update_xaxes(title_text="Sigma of a centre per axis [mm]", range=[0, tolerance_m * _MM])
-    figure.update_yaxes(title_text="Included angle [deg]", range=[0, 185], dtick=30)
+    figure.update_yaxes(title_text="Included angle [deg]", range=[-16, 185], dtick=30)
     return figure
 
 
