@@ -20,8 +20,10 @@ from web import adjustments, calibrations
 router = APIRouter(include_in_schema=False, default_response_class=HTMLResponse)
 
 _ADJUSTMENT = """
-SELECT a.*, s.name AS survey, s.tolerance_m
-FROM adjustments AS a JOIN surveys AS s USING (survey_id) WHERE a.adjustment_id = $id
+SELECT a.*, s.name AS survey, s.tolerance_m, c.rig_digest AS adjusted_rig
+FROM adjustments AS a JOIN surveys AS s USING (survey_id)
+LEFT JOIN calibrations AS c ON c.calibration_id = a.adjustment_id
+WHERE a.adjustment_id = $id
 """
 _STATIONS = "SELECT * FROM adjusted_stations WHERE adjustment_id = $id ORDER BY station"
 _MARKS = "SELECT * FROM adjusted_marks WHERE adjustment_id = $id ORDER BY mark"

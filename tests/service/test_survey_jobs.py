@@ -202,6 +202,9 @@ def test_a_network_can_estimate_the_rig_with_its_stations(site, run, rows):
     assert rig["gap_rms_after_m"] < rig["gap_rms_before_m"]
     answer = site.client.get(f"/api/v1/adjustments/{network['adjustment_id']}").json()
     assert {"report.txt", "rig.json"} <= set(answer["files"])
+    page = site.client.get(f"/adjustments/{network['adjustment_id']}").text
+    link = f'href="/calibrations/{rig["calibration_id"]}">{rig["rig_digest"]}</a>'
+    assert f"{rig['start_rig_digest']}, adjusted to <a {link}" in page
     for row in rows("adjusted_stations", job):
         assert row["error_3d_m"] < 4.0 * row["sigma_3d_m"]
 
