@@ -40,7 +40,7 @@ def environment() -> Environment:
     )
     made.filters.update(
         metres=lambda value: number(value, 3),
-        mm=lambda value: number(None if value is None else value * _MM, 1),
+        mm=lambda value, digits=1: number(None if value is None else value * _MM, digits),
         signed_mm=lambda value: signed(value * _MM, 1),
         degrees=lambda value: number(math.degrees(value), 2),
         fixed=number,

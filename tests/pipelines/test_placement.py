@@ -334,6 +334,8 @@ def test_coarse_steps_pass_far_spheres_by():
     ]
     assert seen == [0, 6]
     assert "Rests every 10 deg" in coarse.sensor.warning
+    assert "err two to three times" in coarse.sensor.warning
+    assert not fine.sensor.warning
 
 
 def test_more_marks_and_nearer_ones_are_better():
