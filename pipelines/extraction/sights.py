@@ -28,6 +28,9 @@ _POLE = 0.5  # radii: half the width of what a ball may stand on
 _ASIDE = 1.9  # radii: what is farther to a side may stand there on its own
 _HELD = (-4.0, 1.5)  # radii of depth within which something belongs to what is looked at
 _ON = (-1.3, 0.3)  # radii of depth within which a return may lie on the ball
+_PLACE = 0.1  # radii: what passes nearer to another beam than this passes at the same place
+_MEAN_WIDTH = 0.75  # of the greater half width of a beam: in any direction
+_TINY = 1e-6
 _UNSEEN = 3.0  # as many beams below it that end nearer as that go past: no more is known
 
 
@@ -52,7 +55,11 @@ class Sight(NamedTuple):
     n_short : int
         Returns there that end long before it.
     brightness : float
-        Mean reflectivity of the first ones, 0-255.
+        Reflectivity of what the first ones lie on, 0-255: theirs by the shares of their beams that
+        are inside the outline, by least squares.
+    n_distinct : int
+        Places, a tenth of the radius wide, where the first ones pass the centre: beams that are
+        repeated tell little that is new.
     rows : (m,) int32
         Returns of the cloud whose beams pass within four radii, ascending.
     seen : (3, m)
@@ -67,6 +74,7 @@ class Sight(NamedTuple):
     n_past: int
     n_short: int
     brightness: float
+    n_distinct: int
     rows: NDArray[np.int32]
     seen: Array
 
@@ -84,6 +92,17 @@ class Sight(NamedTuple):
         """
         n_nearer_max = _UNSEEN * (1 + self.n_past)
         return self.n_held <= 1 + self.n_past and self.n_short <= n_nearer_max
+
+    @property
+    def shows_below(self) -> bool:
+        """Tell whether most beams below it, beside a pole's place, are seen to go on past it.
+
+        Returns
+        -------
+        bool
+            False also where no beam returns from there: against the sky, or before a shadow.
+        """
+        return self.n_past > 2 and self.n_past > self.n_held + self.n_short
 
     @property
     def n_aimed(self) -> int:
@@ -137,14 +156,16 @@ def sights(
 @numba.njit(cache=True, nogil=True, error_model="numpy")
 def _counted(
     points: Column, intensities: Column, near: NDArray[np.int32], c: Array, ball: Ball
-) -> tuple[int, int, int, float, int, int, int, float, NDArray[np.int32], Array]:
+) -> tuple[int, int, int, float, int, int, int, float, int, NDArray[np.int32], Array]:
     """Return the fields of a sight, from the returns near its direction."""
     radius, distance = ball.radius, np.sqrt(np.sum(c**2))
     blur = blur_at(c, ball) / radius
     rows = _towards(points, near, c, (_REACH + blur) * radius / distance)
     seen = seen_from(points[rows].T.astype(np.float64), view_of(c, ball.up))
     n_on, n_through, n_before, n_held, n_past, n_short = 0, 0, 0, 0, 0, 0
-    gaps2, light = 0.0, 0.0
+    gaps2, light, lit = 0.0, 0.0, 0.0
+    half = int((1.0 + blur) / _PLACE) + 1
+    is_met = np.zeros((2 * half, 2 * half), np.bool_)
     for i in range(len(rows)):
         across, along, depth = np.abs(seen[0, i]) / radius, seen[1, i] / radius, seen[2, i] / radius
         gap = np.hypot(across, along)
@@ -152,7 +173,11 @@ def _counted(
         if is_aimed and _ON[0] < depth < _ON[1]:
             n_on += 1
             gaps2 += gap * gap
-            light += intensities[rows[i]]
+            column = half + int(np.floor(seen[0, i] / radius / _PLACE))
+            is_met[column, half + int(np.floor(along / _PLACE))] = True
+            share = _lit_share((1.0 - gap) / (_MEAN_WIDTH * blur))
+            light += share * intensities[rows[i]]
+            lit += share * share
         n_before += is_aimed and depth <= _ON[0]
         n_through += gap < 0.8 and depth > 1.0
         is_below = along < -0.3 and gap > 1.2 + blur and _POLE + blur < across < _ASIDE + blur
@@ -160,8 +185,16 @@ def _counted(
             n_past += depth > _HELD[1]
             n_short += depth < _HELD[0]
             n_held += _HELD[0] <= depth <= _HELD[1]
-    n = max(n_on, 1)
-    return n_on, n_through, n_before, gaps2 / n, n_held, n_past, n_short, light / n, rows, seen
+    spread, brightness = gaps2 / max(n_on, 1), light / max(lit, _TINY)
+    counts = (n_on, n_through, n_before, spread, n_held, n_past, n_short)
+    return (*counts, brightness, int(np.sum(is_met)), rows, seen)
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _lit_share(inside: float) -> float:
+    """Return what share of a beam is inside an outline that it enters by so many half widths."""
+    inside = min(max(inside, -1.0), 1.0)
+    return float((np.arccos(-inside) + inside * np.sqrt(1.0 - inside * inside)) / np.pi)
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")

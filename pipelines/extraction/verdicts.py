@@ -28,6 +28,7 @@ _RADIUS_RESOLVED = 0.015  # of the radius: standard deviation of the free radius
 _FLAT_RESOLVED = 0.25  # of the curvature: what may be missing of that of a resolved ball
 _STRANGE_RESOLVED = 0.05  # share of the returns inside its outline that may be off it
 _N_KNOWN = 3  # markers that are open below, to compare others with
+_SHADE = 0.25  # share by which one return's reflectivity may be off: its beam is lit in part
 _UNLIKE = 0.25  # share by which the reflectivity of a marker may differ from that of the others
 _NOISIER = 1.5  # factor by which the scatter of a marker may exceed that of the others
 _N_TELLING = 30  # returns that show the noise of a scan
@@ -314,8 +315,8 @@ def verdict_among_others(
     The markers of a survey share their paint, and with it reflectivity and noise. What scatters
     clearly more may lack the curvature of a ball, by the noise of the others; what is missing
     across and along is tested together. A stone behind a crest and a marker behind a crest look
-    alike: where the pole is hidden, reflectivity and scatter themselves must be as those
-    of the others.
+    alike, and so does a crest that ends against the sky: where no beams show the pole, reflectivity
+    must be as that of the others, and where it is hidden, scatter too.
     """
     return _unlike_in_shape(look, others, ball) or _unlike_in_paint(look, sight, others)
 
@@ -338,20 +339,24 @@ def _unlike_in_shape(look: Look, others: Sequence[tuple[Look, Sight]], ball: Bal
 
 
 def _unlike_in_paint(look: Look, sight: Sight, others: Sequence[tuple[Look, Sight]]) -> str:
-    """Return why a group whose pole is hidden differs from markers that are open below."""
-    known = [other for other in others if other[1].is_open_below]
-    if sight.is_open_below or len(known) < _N_KNOWN:
+    """Return why a group of which nothing shows the pole differs from markers that are open below.
+
+    Reflectivity is as sure as there are places at which beams meet the group.
+    """
+    known = [other for other in others if other[1].shows_below]
+    if sight.shows_below or len(known) < _N_KNOWN:
         return ""
     brightness = float(np.median([other.brightness for _, other in known]))
     scatter = float(np.median([max(other.scatter, NOISE_MIN) for other, _ in known]))
+    unlike = max(_SIGMAS * _SHADE / float(np.sqrt(max(sight.n_distinct, 1))), _UNLIKE)
     tests = (
         (
-            abs(sight.brightness - brightness) > _UNLIKE * brightness,
-            f"What it stands on is hidden, and its reflectivity is {sight.brightness:.0f}, that "
+            abs(sight.brightness - brightness) > unlike * brightness,
+            f"What it stands on is not seen, and its reflectivity is {sight.brightness:.0f}, that "
             f"of the markers {brightness:.0f}.",
         ),
         (
-            look.scatter > _NOISIER * scatter,
+            not sight.is_open_below and look.scatter > _NOISIER * scatter,
             f"What it stands on is hidden, and its returns scatter by "
             f"{1e3 * look.scatter:.0f} mm, those of the markers by {1e3 * scatter:.0f} mm.",
         ),

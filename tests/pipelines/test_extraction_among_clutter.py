@@ -116,6 +116,37 @@ def test_a_marker_with_a_part_behind_something_nearer_is_found_beside_its_whole_
         assert len(found.candidates) == 5
 
 
+@pytest.mark.parametrize(("dimmed", "is_found"), [(1.0, True), (0.4, False)])
+def test_what_nothing_shows_a_pole_of_must_be_painted_as_the_markers(few, dimmed, is_found):
+    place = ring_of_markers(n=5)[0]
+    own = np.linalg.norm(few.p_base - place, axis=1) < 1.5 * RADIUS
+    height = few.p_base[:, 2] / np.linalg.norm(few.p_base, axis=1)
+    is_below = height < place[2] / np.linalg.norm(place)
+    left = own | ~(is_below & (np.abs(aside(few, place)) < 4.0))  # against the sky
+    painted = np.where(own, dimmed, 1.0) * few.intensities
+    cloud = replace(few, intensities=painted.astype(few.intensities.dtype))
+    found = extract(
+        replace(cloud, **{name: getattr(cloud, name)[left] for name in COLUMNS}),
+        ExtractionConfig(),
+        RADIUS,
+    )
+    assert near(rough(found))[0] == is_found
+    refused = [r.reason for r in found.rejected if np.linalg.norm(r.p_base - place) < 2 * RADIUS]
+    assert any("reflectivity" in reason for reason in refused) != is_found
+
+
+@pytest.mark.slow
+def test_a_stepped_scan_takes_no_crest_for_a_marker():
+    found = detection(
+        {"paper-field": DETECTION_PLAN["clutter-field"]},
+        (930, 931),
+        SimulationConfig(step=np.radians(5.0)),
+    )
+    assert found.n_false["paper-field"] == 0
+    # a ball that one line of a stepped scan meets at its limb alone shows no shape
+    assert found.recall("paper-field", 0) > 0.97
+
+
 @pytest.mark.slow
 def test_markers_are_found_and_nothing_else_in_worlds_of_clutter():
     found = detection(DETECTION_PLAN, (22,), SimulationConfig())
