@@ -301,6 +301,8 @@ def _reasons(
 
 def _reason(n_seen: int, needed: int, is_fixed: bool, n_hidden: int, n: int) -> str:  # noqa: FBT001
     """Say why one stop has no position, or a weak one; empty where all is well."""
+    if not n:
+        return f"no mark stands; a position needs {needed}"
     if n_seen < needed:
         seen = f"{n_seen} of {n} marks" if n_seen else f"none of {n} marks"
         return (

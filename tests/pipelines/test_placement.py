@@ -361,6 +361,10 @@ def test_a_stop_that_sees_nothing_says_so():
     assert np.isinf(found.sigma_3d[0])
     assert found.probability[0] == 0.0
     assert "sees none of 4 marks" in found.reasons[0]
+    bare = evaluate(
+        flat_site(), one_stop(), Arrangement.numbered(np.zeros((0, 3))), MODEL, Requirement()
+    )
+    assert bare.reasons == ("no mark stands; a position needs 2",)
 
 
 def test_two_marks_are_a_weak_position_and_one_is_none():
