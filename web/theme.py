@@ -62,15 +62,22 @@ _METHODS = {
         label="paper's method", colour=PAPER, band=PAPER_BAND, symbol="diamond", dash="solid"
     ),
 }
+_OTHERS = {
+    "silhouette": (GREEN, "square"),
+    "astm_e3125": ("var(--fourth)", "triangle-up"),
+    "free_radius": ("var(--fifth)", "triangle-down"),
+    "algebraic": ("var(--sixth)", "pentagon"),
+}
 
 
 def method_style(method: str) -> MethodStyle:
-    """Return how a method is drawn; one without a style of its own gets a third colour."""
+    """Return how a method is drawn: each in a colour and with a symbol of its own."""
+    colour, symbol = _OTHERS.get(method, (MUTED, "hexagon"))
     return _METHODS.get(method) or MethodStyle(
         label=method.replace("_", " "),
-        colour=GREEN,
+        colour=colour,
         band=GREEN_BAND,
-        symbol="square",
+        symbol=symbol,
         dash="solid",
     )
 

@@ -2,6 +2,7 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
+from pipelines.config import FITTING_METHODS
 from pipelines.study import TABLE_2
 from web import figures, maps, theme
 from web.assets import static_folder
@@ -212,9 +213,15 @@ def test_methods_look_the_same_in_every_figure():
     assert {one.marker.color for one in drawn} == {style.colour}
 
 
+def test_no_two_methods_look_the_same():
+    styles = [theme.method_style(method) for method in FITTING_METHODS]
+    assert len({style.colour for style in styles}) == len(styles)
+    assert len({style.symbol for style in styles}) == len(styles)
+
+
 def test_a_method_of_tomorrow_gets_a_look_of_its_own():
-    style = theme.method_style("free_radius")
-    assert style.label == "free radius"
+    style = theme.method_style("next_year")
+    assert style.label == "next year"
     assert style.colour not in (theme.OURS, theme.PAPER)
 
 
