@@ -9,6 +9,7 @@ from xml.etree import ElementTree as ET
 
 import numpy as np
 
+from pipelines.geometry import rot_z, yaw_pitch_roll
 from pipelines.network import AdjustedNetwork
 from pipelines.values import Array
 
@@ -93,10 +94,11 @@ def format_gama(result: AdjustedNetwork, description: str = "") -> str:
     Notes
     -----
     Gama knows levelled instruments only. What the levelling leaves uncertain turns all centres of
-    a station together and is in the covariance of the set, so that Gama solves the same problem; a
-    set's orientation is the heading of the station. Distances are without the range bias that the
-    network found. Exact control marks are fixed, others are
-    observed coordinates; in a free network the marks define the datum (``adj="XYZ"``).
+    a station together and is in the covariance of the set, so that Gama solves the same problem. It
+    is linearised where the network ended: by half a degree of levelling a free network would else
+    lean by a millimetre. A set's orientation is the heading of the station. Distances are without
+    the range bias that the network found. Exact control marks are fixed, others are observed
+    coordinates; in a free network the marks define the datum (``adj="XYZ"``).
     """
     root = ET.Element("gama-local", xmlns=_NAMESPACE)
     frame = {"axes-xy": "en", "angles": "right-handed"}
@@ -166,7 +168,8 @@ def _add_set(parent: ET.Element, result: AdjustedNetwork, station: int) -> None:
     """Add what was observed from a station."""
     network, n = result.network, len(result.network.sightings)
     rows = np.flatnonzero((network.sightings[:, 0] == station) & result.used[:n])
-    R = network.R_station_base[station]
+    level = _level(result.T_site_station[station, :3, :3])
+    R = level @ network.R_station_base[station]
     p = result.p_base[rows] @ R.T
     values, J = _polar(p)
     cov = np.zeros((len(rows), 3, len(rows), 3))
@@ -179,6 +182,7 @@ def _add_set(parent: ET.Element, result: AdjustedNetwork, station: int) -> None:
     leaned = np.stack([-p[:, 2:] * [1, 0, 0], -p[:, 2:] * [0, 1, 0]], axis=2)
     leaned[:, 2, 0], leaned[:, 2, 1] = p[:, 0], p[:, 1]
     leaned = J @ leaned  # by the two horizontal coordinates of the up direction
+    values = values + leaned @ level[:2, 2]
     cov += np.einsum("iak,kl,jbl->iajb", leaned, cov_up[:2, :2], leaned)
     group = ET.SubElement(parent, "obs", {"from": network.stations[station]})
     for (azimuth, zenith, distance), row in zip(values, rows, strict=True):
@@ -189,6 +193,12 @@ def _add_set(parent: ET.Element, result: AdjustedNetwork, station: int) -> None:
         ET.SubElement(group, "s-distance", {"to": to, "val": f"{distance:.7f}"})
     scale = np.tile([_CC, _CC, _MM], len(rows))
     _add_covariance(group, cov.reshape(3 * len(rows), -1) * np.outer(scale, scale))
+
+
+def _level(R_site_station: Array) -> Array:
+    """Return the rotation that makes a station as level as it was found to be, heading kept."""
+    yaw = yaw_pitch_roll(R_site_station)[0]
+    return np.asarray(rot_z(-yaw) @ R_site_station)
 
 
 def _polar(p: Array) -> tuple[Array, Array]:
