@@ -40,6 +40,7 @@ from pipelines.values import (
 
 _UPRIGHT = 0.05  # spread across over spread along of marks on a plumb line: no heading
 _MANY_LEFT_OUT = 1.0 / 3.0  # of the matched markers: not they are bad, but the sigmas too small
+_TELLING = 4  # markers that agree: with fewer, the one that was left out may be the good one
 
 
 def resect(
@@ -234,6 +235,11 @@ def _weaknesses(
     n_dropped = sum(block < match.n for block, _ in dropped)
     if n_dropped and n_dropped >= _MANY_LEFT_OUT * match.n:
         reasons.append(f"{n_dropped} of {match.n} matched markers had to be left out")
+    elif n_dropped and len(used) < _TELLING:
+        reasons.append(
+            f"{n_dropped} of {match.n} matched markers contradicts the others and was left out: "
+            "with so few it may be one of the others that is wrong"
+        )
     if not scene.is_levelled:
         reasons.append("no AHRS: the levelling is only assumed")
     return reasons

@@ -193,6 +193,17 @@ def test_a_false_marker_and_a_moved_mark_are_left_out_with_reasons(rng):
     np.testing.assert_allclose(fix.p_site, T[:3, 3], rtol=0, atol=5 * fix.sigma_3d)
 
 
+@pytest.mark.parametrize(("n", "status"), [(4, Status.WEAK), (5, Status.OK)])
+def test_a_moved_mark_among_so_few_that_it_may_be_another_makes_a_weak_fix(rng, n, status):
+    marks = field(rng, n)
+    noise = rng.normal(0, 1e-3, (n, 3))
+    noise[1] += [0.06, 0.0, 0.03]
+    fix = free(sightings(marks, pose(STAND, 2.2), noise=noise), marks)
+    assert [exclusion.fit for exclusion in fix.excluded] == [1]
+    assert fix.status is status
+    assert ("one of the others" in fix.reason) == (status is Status.WEAK)
+
+
 @pytest.mark.parametrize("method", ["free_station", "ranges", "paper"])
 def test_control_of_which_half_was_moved_makes_a_weak_fix_that_names_both_places(rng, method):
     marks, T = field(rng), pose(STAND, 2.2)
