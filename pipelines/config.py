@@ -132,6 +132,11 @@ class FittingConfig:
     sigma_direction : float
         Standard deviation of a beam's direction per axis [rad]. 1e-4: azimuth in steps of 0.01 deg,
         encoder and timing.
+    sigma_mounting : float
+        Standard deviation of the directions in which LiDAR and gimbal sit, per axis [rad]. 3.5e-4:
+        0.02 deg, good workmanship. It parts the two faces of the scan.
+    sigma_offset : float
+        Standard deviation of where the LiDAR sits on the gimbal, per axis [m].
     paper_model : str
         What ``paper`` registers to the returns, of ``PAPER_MODELS``. hemisphere: as the study does;
         its Figure 3 shows the whole sphere instead.
@@ -146,6 +151,8 @@ class FittingConfig:
     methods: tuple[str, ...] = ("along_beam", "paper")
     sigma_range_bias: float = 0.003
     sigma_direction: float = 1e-4
+    sigma_mounting: float = 3.5e-4
+    sigma_offset: float = 5e-4
     paper_model: str = "hemisphere"
     paper_cut: str = "equator"
 
@@ -153,6 +160,8 @@ class FittingConfig:
         _check_methods("fitting.methods", self.methods, FITTING_METHODS)
         _check("fitting.sigma_range_bias", self.sigma_range_bias, 1e-6, 0.05)
         _check("fitting.sigma_direction", self.sigma_direction, 0.0, 0.01)
+        _check("fitting.sigma_mounting", self.sigma_mounting, 0.0, 0.1)
+        _check("fitting.sigma_offset", self.sigma_offset, 0.0, 0.1)
         _check_choice("fitting.paper_model", self.paper_model, PAPER_MODELS)
         _check_choice("fitting.paper_cut", self.paper_cut, PAPER_CUTS)
 
@@ -176,10 +185,8 @@ class ResectionConfig:
     test_power : float
         Probability with which a bias of the minimal detectable size is found.
     sigma_common : float
-        Standard deviation per axis that every centre has beyond its own covariance: what axis
-        offset, mounting and eccentricity of the encoder leave after both faces of a sphere are
-        averaged [m]. 0.15 mm, by simulation of 750 stations with 0.5 mm, 0.02 and 0.01 deg: their
-        squared errors are then about those that their covariances say, with little noise and much.
+        Standard deviation per axis that every centre has beyond its own covariance: what changes
+        from one direction to the next and both faces share, as the jitter of the encoder [m].
     sigma_range : float
         Standard deviation of what all ranges of a survey are too long, an unknown of a network
         [m]; 0 leaves it out. 1 mm: the mean of 16 lasers of 3 mm each, and the model of a beam.
@@ -198,7 +205,7 @@ class ResectionConfig:
     match_tolerance: float = 0.15
     test_level: float = 0.001
     test_power: float = 0.80
-    sigma_common: float = 0.00015
+    sigma_common: float = 0.00005
     sigma_range: float = 0.001
     sigma_range_shared: float = 0.0009
     sigma_height: float = 0.00012

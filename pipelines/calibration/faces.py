@@ -147,7 +147,8 @@ def _fits(cloud: StitchedCloud, rows: Index, config: SurveyConfig) -> list[Marke
     """Return the fits of one face, with their rows in the whole cloud."""
     face = replace(cloud, **{name: getattr(cloud, name)[rows] for name in _COLUMNS})
     candidates = extract(face, config.extraction, config.marker_radius)
-    fits = fit_markers("along_beam", face, candidates, config.fitting, config.marker_radius).fits
+    alone = replace(config.fitting, sigma_mounting=0.0, sigma_offset=0.0)  # is what is asked here
+    fits = fit_markers("along_beam", face, candidates, alone, config.marker_radius).fits
     return [replace(fit, used=rows[fit.used], rejected=rows[fit.rejected]) for fit in fits]
 
 

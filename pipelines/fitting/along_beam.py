@@ -23,6 +23,7 @@ from pipelines.fitting.description import (
     sentence,
     weaknesses,
 )
+from pipelines.fitting.faces import N_MOUNTING, effects_on, sigmas_of
 from pipelines.fitting.footprint import share_of_outline
 from pipelines.fitting.outline import Outline, outline_normals, outline_of
 from pipelines.fitting.passes import (
@@ -102,12 +103,15 @@ class _Shots(NamedTuple):
         The same as the passes need them.
     sigma_biases : (k,)
         Prior standard deviation of what each laser that occurs measures too long [m].
+    sigma_mounting : (6,)
+        That of the unknowns of the mounting.
     """
 
     beams: Beams
     members: Index
     rows: Rows
     sigma_biases: Array
+    sigma_mounting: Array
 
 
 class _State(NamedTuple):
@@ -119,6 +123,8 @@ class _State(NamedTuple):
         Centres [m].
     biases : (k,)
         What each laser measures too long [m].
+    mounting : (6,)
+        What is wrong in the mounting, as ``faces.effects_on`` has it.
     spread : (k,)
         Their standard deviations, as estimated [m].
     has_biases : bool
@@ -129,14 +135,15 @@ class _State(NamedTuple):
         The same by class of reflectivity.
     cov_noise, cov_biases : (m, 3, 3)
         Covariances of the centres by noise and by biases [m^2].
-    by_bias : (m, 3, k)
-        How far a unit of each laser's bias moves each centre, with the sign turned.
-    cov_lasers : (k, k)
-        Covariance of the biases [m^2].
+    by_bias : (m, 3, k + 6)
+        How far a unit of each bias, or of the mounting, moves each centre, with the sign turned.
+    cov_lasers : (k + 6, k + 6)
+        Covariance of the biases [m^2] and of the mounting.
     """
 
     centres: Array
     biases: Array
+    mounting: Array
     spread: Array
     has_biases: bool
     factor: float
@@ -280,7 +287,22 @@ def _gather(
         places.astype(np.intp),
         (classes, _SIGMAS[classes], config.sigma_direction),
     )
-    return _Shots(beams=table, members=together, rows=rows, sigma_biases=sigma)
+    return _Shots(
+        beams=table,
+        members=together,
+        rows=rows,
+        sigma_biases=sigma,
+        sigma_mounting=sigmas_of(config.sigma_mounting, config.sigma_offset),
+    )
+
+
+def _placed(shots: _Shots, state: _State) -> Rows:
+    """Return the returns with their beams where the mounting, as it is known, has them."""
+    if not state.mounting.any():
+        return shots.rows
+    moves = effects_on(state.centres) @ state.mounting
+    each = np.repeat(moves, np.diff(shots.rows.firsts), axis=0)
+    return shots.rows._replace(origins=shots.rows.origins - shots.rows.up[:, :1] * each)
 
 
 def _margins(state: _State, radius: float) -> Array:
@@ -323,8 +345,13 @@ def _bounded(
     state = estimate.state
     met = (shots.rows, estimate.linear, estimate.weights, state.cov_noise + state.cov_biases)
     outline = known.outline or outline_of(*met, radius)
-    centres, pull_centres, sites = outline_normals(*met, outline, known.sites)
-    added = N._replace(centres=N.centres + centres, pull_centres=N.pull_centres + pull_centres)
+    centres, pull_centres, faces, pull_faces, sites = outline_normals(*met, outline, known.sites)
+    added = N._replace(
+        centres=N.centres + centres,
+        pull_centres=N.pull_centres + pull_centres,
+        faces=N.faces + faces,
+        pull_faces=N.pull_faces + pull_faces,
+    )
     return added, _Bounds(outline, sites)
 
 
@@ -334,32 +361,48 @@ def _with_told(N: Normals, state: _State, told: Told) -> Normals:
     return N._replace(centres=N.centres + centres, pull_centres=N.pull_centres + pull_centres)
 
 
-def _stepped(state: _State, N: Normals, prior: Array, radius: float) -> _State:
-    """Return the state after one Gauss-Newton step of all centres and biases together.
+def _stepped(state: _State, N: Normals, shots: _Shots, radius: float) -> _State:
+    """Return the state after one Gauss-Newton step of centres, biases and mounting together.
 
     The centres are eliminated first (Schur's complement), so that the cost is linear in markers. A
     prior of a metre on each centre keeps the equations solvable and is not felt otherwise.
     """
-    inverse = np.linalg.inv(N.centres + np.eye(3))
+    inverse, prior = np.linalg.inv(N.centres + np.eye(3)), shots.sigma_biases
     spread2 = np.maximum(state.spread, _SPREAD_MIN) ** 2
-    by_bias = inverse @ N.mixed
-    reduced = np.diag(N.biases + 1.0 / spread2)
-    cov_biases = np.linalg.inv(reduced - np.einsum("mik,mij->kj", N.mixed, by_bias))
-    pull = N.pull_biases - np.einsum("mik,mi->k", by_bias, N.pull_centres)
-    d_biases = cov_biases @ (pull - state.biases / spread2) * state.has_biases
-    d_centres = np.einsum("mij,mj->mi", inverse, N.pull_centres - N.mixed @ d_biases)
-    biases = state.biases + d_biases
-    known2 = (biases**2 + np.diag(cov_biases)).sum() + _DOF_BIAS * np.mean(prior**2)
-    spread = prior * np.sqrt(known2 / (_DOF_BIAS + len(prior)) / np.mean(prior**2))
+    mixed, reduced, pull = _shared(state, N, spread2, shots.sigma_mounting)
+    by_bias = inverse @ mixed
+    cov_shared = np.linalg.inv(reduced - np.einsum("mik,mij->kj", mixed, by_bias))
+    pull -= np.einsum("mik,mi->k", by_bias, N.pull_centres)
+    d_shared = cov_shared @ pull * state.has_biases
+    d_centres = np.einsum("mij,mj->mi", inverse, N.pull_centres - mixed @ d_shared)
+    n = len(prior)
+    biases = state.biases + d_shared[:n]
+    known2 = (biases**2 + np.diag(cov_shared)[:n]).sum() + _DOF_BIAS * np.mean(prior**2)
+    spread = prior * np.sqrt(known2 / (_DOF_BIAS + n) / np.mean(prior**2))
     return state._replace(
         centres=state.centres + _shortened(d_centres, radius),
         biases=biases,
+        mounting=state.mounting + d_shared[n:],
         spread=spread if state.has_biases else prior,
         cov_noise=np.asarray(_EFFICIENCY * inverse, dtype=np.float64),
-        cov_biases=by_bias @ cov_biases @ by_bias.transpose(0, 2, 1),
+        cov_biases=by_bias @ cov_shared @ by_bias.transpose(0, 2, 1),
         by_bias=by_bias,
-        cov_lasers=cov_biases,
+        cov_lasers=cov_shared,
     )
+
+
+def _shared(
+    state: _State, N: Normals, spread2: Array, sigma_mounting: Array
+) -> tuple[Array, Array, Array]:
+    """Return normal equations of what all centres share, with the priors: mixed, own, pull."""
+    effects = effects_on(state.centres)
+    between = np.einsum("mik,mip->kp", N.mixed_faces, effects)
+    own = np.einsum("mip,mij,mjq->pq", effects, N.centres, effects)
+    known = np.diag(1.0 / np.maximum(sigma_mounting, 1e-9) ** 2)
+    reduced = np.block([[np.diag(N.biases + 1.0 / spread2), between], [between.T, own + known]])
+    pull_mounting = np.einsum("mip,mi->p", effects, N.pull_faces) - known @ state.mounting
+    pull = np.concatenate([N.pull_biases - state.biases / spread2, pull_mounting])
+    return np.concatenate([N.mixed, N.faces @ effects], axis=2), reduced, pull
 
 
 def _sigmas_shared(state: _State) -> Array:
@@ -389,14 +432,15 @@ def _estimate(
     state = _State(
         centres=rough,
         biases=np.zeros(len(shots.sigma_biases)),
+        mounting=np.zeros(N_MOUNTING),
         spread=shots.sigma_biases,
         has_biases=False,
         factor=_FACTOR_START,
         factors=np.full(len(_SIGMAS), _FACTOR_START),
         cov_noise=nothing + (_ROUGH * radius) ** 2 * np.eye(3),
         cov_biases=nothing,
-        by_bias=np.zeros((len(rough), 3, len(shots.sigma_biases))),
-        cov_lasers=np.diag(shots.sigma_biases**2),
+        by_bias=np.zeros((len(rough), 3, len(shots.sigma_biases) + N_MOUNTING)),
+        cov_lasers=np.diag(np.concatenate([shots.sigma_biases, shots.sigma_mounting]) ** 2),
     )
     is_in = np.ones(len(shots.members), dtype=bool)
     bounds = _Bounds(outline=None, sites=np.zeros((len(shots.members), 2)))
@@ -411,7 +455,7 @@ def _estimate(
             N, bounds = _bounded(shots, estimate, radius, N, bounds)
         if told is not None and step >= _N_STEPS_RANGES:
             N = _with_told(N, estimate.state, told)
-        state = _stepped(state, N, shots.sigma_biases, radius)
+        state = _stepped(state, N, shots, radius)
     return _weighed(shots, state, _linear(shots, state, is_in, radius), is_in)
 
 
@@ -420,7 +464,7 @@ def _linear(shots: _Shots, state: _State, is_in: Mask, radius: float) -> Linear:
     spheres = np.column_stack([state.centres, np.full(len(state.centres), radius)])
     covs: Array = np.zeros((len(spheres), 4, 4))
     covs[:, :3, :3] = state.cov_noise + state.cov_biases
-    return linearise(shots.rows, spheres, covs, is_in)
+    return linearise(_placed(shots, state), spheres, covs, is_in)
 
 
 def _weighed(shots: _Shots, state: _State, linear: Linear, is_in: Mask) -> _Estimate:
@@ -450,7 +494,7 @@ def _free_radii(shots: _Shots, estimate: _Estimate, radius: float) -> tuple[Arra
         weights=estimate.weights,
     )
     spheres = np.column_stack([state.centres, np.full(n, radius)])
-    return free_radii(shots.rows, weighing, spheres, covs, len(shots.sigma_biases))
+    return free_radii(_placed(shots, state), weighing, spheres, covs, len(shots.sigma_biases))
 
 
 def _own_factor(estimate: _Estimate, mine: slice) -> float:

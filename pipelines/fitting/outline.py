@@ -25,7 +25,6 @@ _NEAR = 1.75  # half widths inside the outline within which returns tell of it
 _CERTAIN = 4.0  # standard deviations inside the outline from where meeting is no news
 _CAVITY_MIN = 0.05  # of a centre's precision: the least that is not one return's own
 _N_PRODUCT = 25  # chances that are multiplied before the logarithm is taken
-_SHARE = 0.7  # of what returns would tell if each were off by itself: a face is off as a whole
 _TINY = 1e-9  # [m]
 _HALF, _DENSITY = math.sqrt(0.5), 1.0 / math.sqrt(2.0 * math.pi)
 
@@ -126,7 +125,7 @@ def outline_normals(
     covs: Array,
     outline: Outline,
     sites: Array,
-) -> tuple[Array, Array, Array]:
+) -> tuple[Array, Array, Array, Array, Array]:
     """Return what it adds to the normal equations of centres that returns have met their spheres.
 
     Parameters
@@ -150,6 +149,10 @@ def outline_normals(
         To the normal equations.
     pull_centres : (m, 3)
         To their right-hand sides.
+    faces : (m, 3, 3)
+        As ``centres``, with what is swept downwards counted negative.
+    pull_faces : (m, 3)
+        As ``pull_centres``, counted likewise.
     sites : (n, 2)
         What each return says of how far it reaches inside: precision [1/m^2], and precision times
         mean [1/m].
@@ -160,12 +163,11 @@ def outline_normals(
     2001): each return is taken out of the present estimate, its truth that it reaches inside is
     multiplied in, and a normal distribution of the same mean and variance stands for the product.
     It speaks of the place across the line of sight alone: how large the outline looks would tell
-    the distance too, and would be trusted more than the footprint is known. Returns of one face of
-    the scan are off together where the mounting is: a share of each is taken, by which stations of
-    simulated rigs lie as near to the truth as with all, and their covariances hold.
+    the distance too, and would be trusted more than the footprint is known.
     """
     n, found = len(covs), np.zeros(sites.shape)
     centres, pull_centres = np.zeros((n, 3, 3)), np.zeros((n, 3))
+    faces, pull_faces = np.zeros((n, 3, 3)), np.zeros((n, 3))
     for m in range(n):
         widest = covs[m, 0, 0] + covs[m, 1, 1] + covs[m, 2, 2]
         for i in range(rows.firsts[m], rows.firsts[m + 1]):
@@ -177,14 +179,15 @@ def outline_normals(
             towards = _towards(rows, linear, i)
             known = (_variance(covs[m], towards), blur)
             precision, pull = _site(inside, known, (sites[i, 0], sites[i, 1]))
-            share = _SHARE * weights[i]
-            precision, pull = share * precision, share * pull
+            precision, pull = weights[i] * precision, weights[i] * pull
             found[i, 0], found[i, 1] = precision, pull
             for p in range(3):
                 pull_centres[m, p] += (pull - precision * inside) * towards[p]
+                pull_faces[m, p] += rows.up[i, 0] * (pull - precision * inside) * towards[p]
                 for q in range(3):
                     centres[m, p, q] += precision * towards[p] * towards[q]
-    return centres, pull_centres, found
+                    faces[m, p, q] += rows.up[i, 0] * precision * towards[p] * towards[q]
+    return centres, pull_centres, faces, pull_faces, found
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")

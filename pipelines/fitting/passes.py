@@ -99,6 +99,13 @@ class Normals(NamedTuple):
         Right-hand sides of the centres.
     pull_biases : (l,)
         Right-hand sides of the biases.
+    faces : (m, k, k)
+        As ``centres``, with what is swept downwards counted negative: how much more one face of the
+        scan tells of each centre than the other.
+    mixed_faces : (m, k, l)
+        As ``mixed``, counted likewise.
+    pull_faces : (m, k)
+        As ``pull_centres``, counted likewise.
     """
 
     centres: Array
@@ -106,6 +113,9 @@ class Normals(NamedTuple):
     biases: Array
     pull_centres: Array
     pull_biases: Array
+    faces: Array
+    mixed_faces: Array
+    pull_faces: Array
 
 
 def rows_of(
@@ -397,7 +407,7 @@ def noise_of(rows: Rows, linear: Linear, factors: Array) -> Array:
 @numba.njit(cache=True, nogil=True, error_model="numpy")
 def normals_of(
     rows: Rows, linear: Linear, residuals: Array, per_square: Array, sizes: tuple[int, int]
-) -> tuple[Array, Array, Array, Array, Array]:
+) -> tuple[Array, Array, Array, Array, Array, Array, Array, Array]:
     """Sum the normal equations of centres and biases.
 
     Parameters
@@ -421,9 +431,11 @@ def normals_of(
     m, (k, n_lasers) = len(rows.firsts) - 1, sizes
     centres, mixed = np.zeros((m, k, k)), np.zeros((m, k, n_lasers))
     biases, pull_centres, pull_biases = np.zeros(n_lasers), np.zeros((m, k)), np.zeros(n_lasers)
+    faces, mixed_faces = np.zeros((m, k, k)), np.zeros((m, k, n_lasers))
+    pull_faces = np.zeros((m, k))
     for s in range(m):
         for i in range(rows.firsts[s], rows.firsts[s + 1]):
-            w, laser = per_square[i], rows.lasers[i]
+            w, laser, up = per_square[i], rows.lasers[i], rows.up[i, 0]
             if w == 0.0:
                 continue
             pull = w * residuals[i]
@@ -432,7 +444,10 @@ def normals_of(
             for p in range(k):
                 J = linear.J[i, p]
                 pull_centres[s, p] += pull * J
+                pull_faces[s, p] += up * pull * J
                 mixed[s, p, laser] += w * J
+                mixed_faces[s, p, laser] += up * w * J
                 for q in range(k):
                     centres[s, p, q] += w * J * linear.J[i, q]
-    return centres, mixed, biases, pull_centres, pull_biases
+                    faces[s, p, q] += up * w * J * linear.J[i, q]
+    return centres, mixed, biases, pull_centres, pull_biases, faces, mixed_faces, pull_faces

@@ -120,7 +120,7 @@ def _stepped(
     def summed(wide: Array) -> tuple[Linear, Array, Array, Array]:
         linear = linearise(rows, spheres, wide, is_in)
         per_square = weighing.weights / (weighing.variances + linear.bends**2)
-        N, _, _, pull, _ = normals_of(rows, linear, residuals, per_square, (4, n_lasers))
+        N, _, _, pull, *_ = normals_of(rows, linear, residuals, per_square, (4, n_lasers))
         return linear, per_square, N, pull
 
     rough = _with_radius(covs, np.trace(covs[:, :3, :3], axis1=1, axis2=2))
@@ -152,7 +152,7 @@ def _free(
         linear = linearise(rows, spheres, covs, is_in)
         per_square = is_in * weighing.weights / (weighing.variances + linear.bends**2)
         residuals = weighing.ranges - linear.ranges
-        N, _, _, pull, _ = normals_of(rows, linear, residuals, per_square, (4, n_lasers))
+        N, _, _, pull, *_ = normals_of(rows, linear, residuals, per_square, (4, n_lasers))
         inverse = np.linalg.inv(N + np.eye(4) / (_PRIOR * radius[:, None, None]) ** 2)
         covs = np.where(moves[:, None, None], inverse, covs)
         limit = _STEP_MAX * radius[:, None]
@@ -213,7 +213,7 @@ def _fitted(rows: Rows, spanned: Array, radius: float) -> tuple[Weighing, Array,
         linear = linearise(rows, sphere, cov)
         weighing, residuals = _gated(rows, linear, radius)
         per_square = weighing.weights / (weighing.variances + linear.bends**2)
-        N, _, _, pull, _ = normals_of(rows, linear, residuals, per_square, (3, 1))
+        N, _, _, pull, *_ = normals_of(rows, linear, residuals, per_square, (3, 1))
         inverse = np.linalg.inv(N + np.eye(3) / (_PRIOR * radius) ** 2)
         limit = _STEP_MAX * radius
         sphere[0, :3] += np.clip(inverse[0] @ pull[0], -limit, limit)

@@ -51,9 +51,9 @@ def at_shot(log, rig):
     return sights(log, cloud, rows, which), np.array([fit.p_base for fit in fits]), rows
 
 
-def centre_rms(field, stop, rig):
+def centre_rms(field, stop, rig, config=CONFIG):
     """Root mean square 3-D error of centres after the best rigid motion [m]."""
-    fits = process(stop.log, config=CONFIG, rig=rig)[0].fits["along_beam"].fits
+    fits = process(stop.log, config=config, rig=rig)[0].fits["along_beam"].fits
     T = stop.truth.T_site_base
     true = (field.marks.p_site - T[:3, 3]) @ T[:3, :3]
     p = np.array([fit.p_base for fit in fits])
@@ -129,7 +129,9 @@ def test_derivatives_agree_with_central_differences(stop):
         numeric = -(up - down)[is_whole] / 2e-6
         size = np.abs(numeric).max()
         assert size > 0.01
-        assert_allclose(exact.J_rig[is_whole, place], numeric, rtol=0, atol=2e-3 * size)
+        off = np.abs(exact.J_rig[is_whole, place] - numeric)
+        assert np.quantile(off, 0.995) < 2e-3 * size  # a kink may lie within the step
+        assert off.max() < 2e-2 * size
 
 
 def test_ranges_without_noise_give_the_true_rig(field):
@@ -146,9 +148,14 @@ def test_ranges_without_noise_give_the_true_rig(field):
 
 
 def test_one_scan_with_a_bad_rig_brings_centres_near_those_of_the_true_rig(field, stop, found):
-    bad = centre_rms(field, stop, found.start)
-    ours, best = centre_rms(field, stop, found.rig), centre_rms(field, stop, stop.rig)
-    assert bad > 2.0 * best
+    trusting = replace(CONFIG.fitting, sigma_mounting=0.0, sigma_offset=0.0)
+    trusted = centre_rms(field, stop, found.start, replace(CONFIG, fitting=trusting))
+    bad, best = (centre_rms(field, stop, rig) for rig in (found.start, stop.rig))
+    ours = centre_rms(field, stop, found.rig)
+    assert trusted > 2.0 * best
+    assert (
+        ours < bad < 0.8 * trusted
+    )  # what fits learn of the mounting, and what a calibration adds
     assert ours < 1.25 * best
 
 

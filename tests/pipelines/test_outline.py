@@ -12,7 +12,6 @@ from pipelines.values import Beams
 
 RADIUS, AWAY = 0.1, 10.0
 WIDTHS = np.array([3.0e-3, 1.5e-3])  # of the footprint [rad]
-SHARE = 0.7  # of what a return tells that is taken, for others are off with it
 LUCK = 0.01
 
 
@@ -46,9 +45,9 @@ def test_one_return_gives_mean_and_variance_of_what_is_left_inside(inside):
     sigma, outline = 0.003, Outline(RADIUS, edge=0.1, softness=0.2)
     half = 0.5 * WIDTHS[0] * AWAY
     rows, linear, weights, covs = passing(np.array([[RADIUS + half - inside, 0.0]]), sigma)
-    N, pull, _ = outline_normals(rows, linear, weights, covs, outline, np.zeros((1, 2)))
-    cov = np.linalg.inv(np.linalg.inv(covs[0]) + N[0] / SHARE)
-    moved = cov @ pull[0] / SHARE
+    N, pull, *_ = outline_normals(rows, linear, weights, covs, outline, np.zeros((1, 2)))
+    cov = np.linalg.inv(np.linalg.inv(covs[0]) + N[0])
+    moved = cov @ pull[0]
 
     def density(x, power=0):
         chance = LUCK + (1 - LUCK) * norm.cdf((x - 0.1 * half) / (0.2 * half))
@@ -65,7 +64,7 @@ def test_one_return_gives_mean_and_variance_of_what_is_left_inside(inside):
 def test_a_return_well_inside_says_nothing():
     rows, linear, weights, covs = passing(np.array([[0.05, 0.02], [0.0, 0.0]]), 0.003)
     outline = Outline(RADIUS, edge=0.0, softness=0.1)
-    N, pull, sites = outline_normals(rows, linear, weights, covs, outline, np.zeros((2, 2)))
+    N, pull, *_, sites = outline_normals(rows, linear, weights, covs, outline, np.zeros((2, 2)))
     assert not N.any()
     assert not pull.any()
     assert not sites.any()
@@ -76,7 +75,7 @@ def test_the_outline_does_not_tell_the_distance():
     places = 0.115 * np.column_stack([np.cos(angles), np.sin(angles)])  # it seems too large
     rows, linear, weights, covs = passing(places, 0.003)
     outline = Outline(RADIUS, edge=0.0, softness=0.2)
-    N, pull, _ = outline_normals(rows, linear, weights, covs, outline, np.zeros((40, 2)))
+    N, pull, *_ = outline_normals(rows, linear, weights, covs, outline, np.zeros((40, 2)))
     assert_allclose(pull[0] / np.sqrt(np.trace(N[0])), 0, atol=0.01)
     assert N[0, 0, 0] < 1e-6 * N[0, 1, 1]
 

@@ -1,0 +1,68 @@
+"""What the mounting, which is not known exactly, does to the two faces of a sphere.
+
+A sphere is swept twice in a turn: upwards, and half a turn of the gimbal later downwards. What is
+wrong in how LiDAR and gimbal sit moves one face against the other. An even turn tells as much of a
+centre by both from all sides, and the mean is right; lines of rests that fall together, or a turn
+that is not full, do not, and then this has to be estimated.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from pipelines.values import Array
+
+N_MOUNTING = 6
+"""Unknowns of the mounting: two directions, two offsets, two amplitudes of the encoder."""
+
+_ECCENTRICITY = 0.5  # of the standard deviation of a direction: that of the encoder's amplitudes
+
+
+def sigmas_of(sigma_direction: float, sigma_offset: float) -> Array:
+    """Return what is known of the mounting before the scan is seen.
+
+    Parameters
+    ----------
+    sigma_direction : float
+        Standard deviation of the directions of spin axis and azimuth zero [rad].
+    sigma_offset : float
+        Standard deviation of the place of the LiDAR on the gimbal [m].
+
+    Returns
+    -------
+    (6,)
+        Standard deviations, in the order of ``effects_on``.
+    """
+    angles, amplitudes = np.full(2, sigma_direction), np.full(2, _ECCENTRICITY * sigma_direction)
+    return np.concatenate([angles, np.full(2, sigma_offset), amplitudes])
+
+
+def effects_on(centres: Array) -> Array:
+    """Return how the mounting moves what is swept upwards; the other face moves against it.
+
+    Parameters
+    ----------
+    centres : (m, 3)
+        Centres in the base frame [m].
+
+    Returns
+    -------
+    (m, 3, 6)
+        By the spin axis's direction to the side and the azimuth zero [m/rad], the offset along the
+        sight and to the side [m/m], cosine and sine of the encoder's eccentricity [m/rad].
+    """
+    x, y, z = centres.T
+    flat = np.maximum(np.hypot(x, y), 1e-9)
+    zero, distance = np.zeros_like(x), np.sqrt(x * x + y * y + z * z)
+    aside = np.stack([-y / flat, x / flat, zero], axis=1)
+    ahead = np.stack([x / flat, y / flat, zero], axis=1)
+    above = np.cross(centres / distance[:, None], aside)
+    columns = (
+        aside * distance[:, None],
+        above * distance[:, None],
+        ahead,
+        aside,
+        aside * x[:, None],
+        aside * y[:, None],
+    )
+    return np.stack(columns, axis=2)
