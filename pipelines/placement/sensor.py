@@ -108,15 +108,8 @@ class Sensor:
 
     @property
     def warning(self) -> str:
-        """What is wrong with the two speeds, for people; empty when the lines spread well.
-
-        Of simulated stations whose gimbal rested every 1 and every 5 degrees the errors were 2.8
-        and 2.0 times those promised; every 1.3 degrees, 0.9 times.
-        """
-        text = commensurability(self.scan)
-        if text and self.step:
-            text += " Positions of such scans err two to three times as much as is promised."
-        return text
+        """What is wrong with the two speeds, for people; empty when the lines spread well."""
+        return commensurability(self.scan)
 
     @property
     def line_spacing(self) -> float:
