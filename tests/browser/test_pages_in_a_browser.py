@@ -36,7 +36,7 @@ LOOKS = [(1440, "dark"), (390, "light")]
 HARMLESS = re.compile("GPU stall|willReadFrequently|GroupMarkerNotSet")  # no GPU in a test
 
 
-@pytest.fixture(scope="session")
+@pytest.fixture(scope="module")
 def address(tmp_path_factory):
     data = tmp_path_factory.mktemp("data")
     with Catalogue(data / "spheremark.duckdb", snapshots=data / "snapshots") as catalogue:
@@ -54,7 +54,7 @@ def address(tmp_path_factory):
     thread.join(timeout=30)
 
 
-@pytest.fixture(scope="session")
+@pytest.fixture(scope="module")
 def browser():
     with sync_playwright() as playwright:
         browser = playwright.chromium.launch(executable_path=CHROMIUM, args=["--no-sandbox"])

@@ -5,7 +5,6 @@ import json
 import os
 import signal
 import time
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 
 import numpy as np
@@ -193,12 +192,6 @@ def test_jobs_are_taken_up_again_after_a_restart(tmp_path, stop, control, open_s
         assert len(runs) == len(jobs)
 
 
-def knock(address, arguments):
-    """Connect to an address, in a thread: this one may have an event loop."""
-    with ThreadPoolExecutor(1) as beside:
-        beside.submit(lambda: asyncio.run(connect(address, timeout=5, **arguments))).result()
-
-
 def test_nobody_else_on_this_machine_can_give_the_workers_tasks(site):
     assert site.workers()
     stranger = Security.temporary().get_connection_args("client")
@@ -206,6 +199,6 @@ def test_nobody_else_on_this_machine_can_give_the_workers_tasks(site):
     refused = []
     for port in ports:
         with pytest.raises(OSError, match=r"TLS|closed|[Tt]imed") as error:
-            knock(f"tls://127.0.0.1:{port}", stranger)
+            asyncio.run(connect(f"tls://127.0.0.1:{port}", timeout=5, **stranger))
         refused.append("certificate does not match" in str(error.value))
     assert any(refused)
