@@ -17,7 +17,7 @@ from pipelines.rigs import N_LASERS
 from pipelines.values import Array, Index, Mask
 
 _BIAS_LEFT = 0.22  # of the spread of laser biases: what a survey leaves to each centre, simulated
-_SIGMA_AIM = 3e-5  # [rad] of each direction, by mounting and encoder, after both faces; simulated
+_SIGMA_AIM = 1.5e-5  # [rad] of each direction, by mounting and encoder, after both faces; simulated
 _SINGULAR = 1e-11  # pivot over diagonal below which an unknown is undetermined
 LOOSE2 = 1.0
 """Variance of a position above which it is none [m^2]."""

@@ -114,8 +114,8 @@ def test_trials_at_random_take_the_speeds_of_the_scans(client):
         response.raise_for_status()
         return response.json()["pass_rate_in_window"]
 
-    speeds = {"tolerance_m": 0.003, "step_deg": 4.0, "rest_revolutions": 1}
-    assert passed(tolerance_m=0.003) > passed(**speeds) + 0.05
+    speeds = {"tolerance_m": 0.002, "step_deg": 4.0, "rest_revolutions": 1}
+    assert passed(tolerance_m=0.002) > passed(**speeds) + 0.05
     query = {"n_arrangements": 2_000, "error_per_axis_mm": 0, "step_deg": 4, "rest_revolutions": 1}
     page = client.get("/plan/random", params=query).text
     assert 'name="step_deg" type="number" step="any" value="4"' in page
