@@ -107,8 +107,8 @@ def free_station(fits: MarkerFits, marks: ControlMarks, config: ResectionConfig)
     Residuals are ``T_site_base p_base - p_mark`` with the covariances of both in the site frame,
     and the horizontal part of the measured up direction, turned into the site, with that of the
     AHRS. To each centre ``sigma_common`` is added per axis and independently: a fit's covariance
-    knows the noise of its returns only, and what mounting and encoder of the gimbal leave changes
-    from direction to direction and from face to face; the part that all centres share is a motion
+    knows the noise of its returns, lasers and the mounting, not what changes from direction to
+    direction and moves both faces alike; the part that all centres share is a motion
     of the pose and cannot be told from it. Where data snooping would leave out more than a third of
     the markers, the sigmas are to blame: it is done again with w divided by sigma0. Gravity that
     contradicts three or more marks is left out like a bad marker, and the fix is weak.

@@ -114,7 +114,9 @@ def test_derivatives_agree_with_central_differences(stop):
     seen, centres, _ = at_shot(stop.log, stop.rig)
     thin = np.tile(1e-12 * np.eye(3), (len(centres), 1, 1))
     exact = design(seen, stop.rig, centres, thin, RADIUS)
-    lit = predict(aimed(seen, stop.rig), centres, np.full(len(centres), RADIUS), seen.which).lit
+    lit = predict(
+        aimed(seen, stop.rig), centres, np.full(len(centres), RADIUS - 2e-4), seen.which
+    ).lit
     is_whole = lit > 1.0 - 1e-9  # where the outline cuts a footprint, its range has a kink
     assert is_whole.sum() > 800
     held = {"height_offset", "gimbal_axis_roll", "gimbal_axis_pitch", "common_range_bias"}
@@ -129,9 +131,7 @@ def test_derivatives_agree_with_central_differences(stop):
         numeric = -(up - down)[is_whole] / 2e-6
         size = np.abs(numeric).max()
         assert size > 0.01
-        off = np.abs(exact.J_rig[is_whole, place] - numeric)
-        assert np.quantile(off, 0.995) < 2e-3 * size  # a kink may lie within the step
-        assert off.max() < 2e-2 * size
+        assert_allclose(exact.J_rig[is_whole, place], numeric, rtol=0, atol=2e-3 * size)
 
 
 def test_ranges_without_noise_give_the_true_rig(field):
