@@ -70,6 +70,7 @@ class Database:
         self._lock = threading.RLock()
         self._version = 0
         self._connection = _open(path, memory_limit)
+        self._writer = self._connection.cursor()
         self._snapshots = Snapshots(path, snapshots)
 
     def __enter__(self) -> Self:
@@ -86,6 +87,7 @@ class Database:
     def close(self) -> None:
         """Give the file back; the catalogue cannot be used any more."""
         with self._lock:
+            self._writer.close()
             self._connection.close()
 
     def columns(
@@ -198,11 +200,12 @@ class Database:
         Yields
         ------
         DuckDBPyConnection
-            A cursor inside the transaction.
+            The one cursor that writes, inside the transaction.
         """
-        with self._lock, closing(self._connection.cursor()) as cursor:
-            cursor.execute("BEGIN")
+        with self._lock:
+            cursor = self._writer
             try:
+                cursor.execute("BEGIN")
                 yield cursor
                 cursor.execute("COMMIT")
             except BaseException:
@@ -292,6 +295,55 @@ def _without_decimals(table: pa.Table) -> pa.Table:
             plain = pa.float64() if field.type.scale else pa.int64()
             table = table.set_column(i, field.name, table.column(i).cast(plain))
     return table
+
+
+class Planned:
+    """A statement over rows that come again and again: hides that DuckDB plans it only once.
+
+    Rows of many columns take longer to plan than to write.
+
+    Parameters
+    ----------
+    cursor : DuckDBPyConnection
+        On which it will run; not inside a transaction, which might take the names back.
+    name : str
+        What the statement is called among those of the cursor.
+    sql : str
+        Static text that sees the rows as ``incoming_<name>``. An INSERT should end in RETURNING:
+        DuckDB then does not share out few rows among threads, which costs more than they do.
+    schema : Schema
+        Columns of the rows.
+    """
+
+    def __init__(
+        self, cursor: duckdb.DuckDBPyConnection, name: str, sql: str, schema: pa.Schema
+    ) -> None:
+        self.schema = schema
+        self._rows = schema.empty_table()
+        self._cursor = cursor
+        self._call = f"EXECUTE planned_{name}"
+        cursor.register(f"incoming_{name}", self)
+        cursor.execute(f"PREPARE planned_{name} AS {sql}")
+
+    def run(self, rows: pa.Table) -> None:
+        """Run the statement on some rows, on its cursor; without rows do nothing.
+
+        Parameters
+        ----------
+        rows : Table
+            In the columns of the schema.
+        """
+        if not rows.num_rows:
+            return
+        self._rows = rows if rows.schema.equals(self.schema) else rows.cast(self.schema)
+        try:
+            self._cursor.execute(self._call)
+        finally:
+            self._rows = self.schema.empty_table()
+
+    def __arrow_c_stream__(self, requested_schema: object = None) -> object:
+        """Return the rows of this run as a stream; DuckDB asks for it."""
+        return self._rows.__arrow_c_stream__(requested_schema)
 
 
 def execute_on(cursor: duckdb.DuckDBPyConnection, sql: str, table: pa.Table) -> None:

@@ -47,7 +47,7 @@ _PLACE = {"x_m": _REAL, "y_m": _REAL, "z_m": _REAL}
 _COV = dict.fromkeys([f"cov_{axes}_m2" for axes in ("xx", "xy", "xz", "yy", "yz", "zz")], _REAL)
 _ERROR = {"error_x_m": _REAL, "error_y_m": _REAL, "error_z_m": _REAL}
 
-_SCHEMAS = {
+_COLUMNS = {
     "rigs": {"rig_digest": _TEXT, "name": _TEXT, "rig": _TEXT},
     "runs": {
         **dict.fromkeys(("run_id", "job_id", "survey_id", "recording_id"), _TEXT),
@@ -126,8 +126,9 @@ _SCHEMAS = {
         "error_horizontal_m": _REAL,
     },
 }
-TABLES = tuple(_SCHEMAS)
-"""Names of the tables that a job writes, in the order of writing."""
+SCHEMAS = {name: pa.schema(list(columns.items())) for name, columns in _COLUMNS.items()}
+"""Columns of the tables that a job writes, in the order of writing."""
+TABLES = tuple(SCHEMAS)
 _COMPARED = ("marker_fits", "station_fixes", "resections")  # have errors against truth
 
 
@@ -464,7 +465,7 @@ def _cov(cov: Array) -> Row:
 
 def _table(name: str, rows: Sequence[Row]) -> pa.Table:
     """Return rows as an Arrow table in the shape of a table of the database."""
-    return table_of(_SCHEMAS[name], rows)
+    return table_of(_COLUMNS[name], rows)
 
 
 def _with_columns(table: pa.Table, errors: Sequence[Mapping[str, object]]) -> pa.Table:

@@ -13,7 +13,7 @@ from pipelines.errors import InputError
 from pipelines.rigs import rig_from_mapping
 from pipelines.values import ControlMarks, StopTruth, Truth
 from storage import adjustments, results
-from storage.database import execute_on, fetch
+from storage.database import Planned, execute_on, fetch
 from storage.records import coordinates_of, pose_of
 
 _TRUE_MARKS = "SELECT * FROM true_marks WHERE survey_id = $id ORDER BY place"
@@ -55,6 +55,15 @@ _RESULTS_OF_SURVEY = {
     ),
 }
 _TRUE_TABLES = ("true_marks", "true_stops")
+_INSERT_RESULTS = {
+    "runs": "INSERT INTO runs SELECT * FROM incoming_runs RETURNING 1",
+    "stops": "INSERT INTO stops SELECT * FROM incoming_stops RETURNING 1",
+    "marker_fits": "INSERT INTO marker_fits SELECT * FROM incoming_marker_fits RETURNING 1",
+    "rejections": "INSERT INTO rejections SELECT * FROM incoming_rejections RETURNING 1",
+    "station_fixes": "INSERT INTO station_fixes SELECT * FROM incoming_station_fixes RETURNING 1",
+    "observations": "INSERT INTO observations SELECT * FROM incoming_observations RETURNING 1",
+    "resections": "INSERT INTO resections SELECT * FROM incoming_resections RETURNING 1",
+}
 _INSERT = {
     "adjustments": "INSERT INTO adjustments BY NAME SELECT * FROM incoming",
     "adjusted_stations": "INSERT INTO adjusted_stations BY NAME SELECT * FROM incoming",
@@ -72,10 +81,8 @@ _INSERT = {
     "true_marks": "INSERT OR REPLACE INTO true_marks BY NAME SELECT * FROM incoming",
     "true_stops": "INSERT OR REPLACE INTO true_stops BY NAME SELECT * FROM incoming",
 }
-_APPENDED = results.TABLES[1:]  # as they are, column by column: much the quickest way
 _OF_JOBS = (
-    "rigs",
-    *_APPENDED,
+    *results.TABLES,
     *(name for name in _INSERT if name not in ("control_marks", *_TRUE_TABLES)),
 )
 _REFRESH = {
@@ -100,10 +107,8 @@ _REFRESH = {
             AND x.marks = i.marks
     """,
 }
-_PUT_RIG = """
-INSERT INTO rigs SELECT $rig_digest, $name, $rig
-WHERE NOT EXISTS (FROM rigs WHERE rig_digest = $rig_digest)
-"""  # half of what INSERT OR IGNORE costs; writes take turns
+_RIG_IS_KNOWN = "SELECT 1 FROM rigs WHERE rig_digest = ?"  # most are: a quarter of an INSERT
+_PUT_RIG = "INSERT INTO rigs (rig_digest, name, rig) VALUES ($rig_digest, $name, $rig)"
 
 
 def check_tables(tables: Mapping[str, pa.Table]) -> None:
@@ -124,8 +129,27 @@ def check_tables(tables: Mapping[str, pa.Table]) -> None:
         raise InputError(f"No job writes {unknown[0]!r}; it writes {', '.join(_OF_JOBS)}.")
 
 
+def planned_results(cursor: duckdb.DuckDBPyConnection) -> dict[str, Planned]:
+    """Plan how rows enter the tables of results.
+
+    Parameters
+    ----------
+    cursor : DuckDBPyConnection
+        The one that will write them; not inside a transaction.
+
+    Returns
+    -------
+    dict of str to Planned
+        One statement for each of ``results.TABLES`` but that of rigs.
+    """
+    return {
+        name: Planned(cursor, name, sql, results.SCHEMAS[name])
+        for name, sql in _INSERT_RESULTS.items()
+    }
+
+
 def append(cursor: duckdb.DuckDBPyConnection, name: str, table: pa.Table) -> None:
-    """Append rows to a table.
+    """Append rows to a table other than those of ``planned_results``.
 
     Parameters
     ----------
@@ -138,11 +162,10 @@ def append(cursor: duckdb.DuckDBPyConnection, name: str, table: pa.Table) -> Non
     """
     if not table.num_rows:
         return
-    if name in _APPENDED:
-        cursor.from_arrow(table).insert_into(name)
-    elif name == "rigs":
+    if name == "rigs":
         for row in table.to_pylist():
-            cursor.execute(_PUT_RIG, row)
+            if not cursor.execute(_RIG_IS_KNOWN, [row["rig_digest"]]).fetchall():
+                cursor.execute(_PUT_RIG, row)
     else:
         execute_on(cursor, _INSERT[name], table)
 

@@ -336,6 +336,38 @@ def test_a_job_whose_results_cannot_be_written_writes_none_and_runs_on(catalogue
         catalogue.finish_job(begun.job_id, rows)
     assert catalogue.get_job(begun.job_id).status is JobStatus.RUNNING
     assert count(catalogue, N_FITS) == count(catalogue, "SELECT count(*) AS n FROM runs") == 0
+    catalogue.finish_job(begun.job_id, made_tables(job_id=begun.job_id))
+    assert catalogue.get_job(begun.job_id).status is JobStatus.SUCCESSFUL
+    assert count(catalogue, N_FITS) == 14
+
+
+@pytest.mark.parametrize(
+    ("table", "sql"),
+    [
+        ("marker_fits", "SELECT * FROM marker_fits WHERE run_id = $id ORDER BY rowid"),
+        ("observations", "SELECT * FROM observations WHERE run_id = $id ORDER BY rowid"),
+        ("resections", "SELECT * FROM resections WHERE run_id = $id ORDER BY rowid"),
+    ],
+)
+def test_the_rows_of_each_run_come_out_as_they_went_in(catalogue, table, sql):
+    catalogue.create_survey("lane")
+    for run_id, digest in (("run1", "ab" * 32), ("run2", "cd" * 32)):
+        finished(catalogue, run_id, digest=digest)
+    for run_id in ("run1", "run2"):
+        given = made_tables(run_id=run_id)[table].to_pylist()
+        assert catalogue.rows(sql, {"id": run_id}) == given
+
+
+def test_results_whose_columns_hold_nothing_are_written_as_others(catalogue):
+    catalogue.create_survey("lane")
+    begun = running(catalogue)
+    rows = made_tables(job_id=begun.job_id)
+    at = rows["marker_fits"].column_names.index("mark")
+    n = rows["marker_fits"].num_rows
+    rows["marker_fits"] = rows["marker_fits"].set_column(at, "mark", pa.nulls(n))
+    catalogue.finish_job(begun.job_id, rows)
+    assert count(catalogue, N_FITS) == 14
+    assert count(catalogue, "SELECT count(mark) AS n FROM marker_fits") == 0
 
 
 def test_results_for_a_table_that_no_job_writes_are_refused(catalogue):
