@@ -161,9 +161,9 @@ def _subsets(
         if not own:
             continue
         fix = max(own, key=lambda one: len(one.matches))
-        for method in config.resection.subset_methods:
-            key = (fit_method, method)
-            found[key] = resect_subsets(method, fix, centres, marks, config.resection)
+        methods = config.resection.subset_methods
+        by_method = resect_subsets(methods, fix, centres, marks, config.resection)
+        found |= {(fit_method, method): sizes for method, sizes in by_method.items()}
     return found
 
 

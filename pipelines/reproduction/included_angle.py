@@ -17,9 +17,9 @@ from itertools import product
 
 import numpy as np
 
-from pipelines.ranging import circles
+from pipelines.few_marks import meet, place
 from pipelines.study import GRANTED_DISTANCE, GRANTED_ERROR, TABLE_3
-from pipelines.subsets import angles_that_keep, meet, place
+from pipelines.subsets import angles_that_keep
 from pipelines.values import Array, _seal
 
 CIRCLES, PAIR, TRIPLE = "three circles", "two centres", "three centres"
@@ -201,17 +201,19 @@ def _medians(angle: float) -> dict[str, float]:
 
 def _by_circles(marks: Array) -> Array:
     """Return where circles of the true radii about marks, (s, 3, 3), meet best, (s, 3)."""
-    measured = np.broadcast_to([GRANTED_DISTANCE, 0.0], (*marks.shape[:2], 2))
-    weights = np.broadcast_to(np.eye(2), (*marks.shape[:2], 2, 2))
-    return meet(circles, marks, measured, weights, np.zeros(3)).p
+    chosen = np.arange(marks[..., 0].size).reshape(marks.shape[:2])
+    measured = np.tile([GRANTED_DISTANCE, 0.0], (chosen.size, 1))
+    weights = np.tile(np.eye(2), (chosen.size, 1, 1))
+    return meet(chosen, marks.reshape(-1, 3), measured, weights, np.zeros(3)).p
 
 
 def _by_centres(centres: Array, marks: Array, sigma: float = GRANTED_ERROR) -> Array:
     """Return where the free station stands whose centres, (s, k, 3), are those of marks, (s, 3)."""
-    weights = np.broadcast_to(np.eye(3) / sigma**2, (*centres.shape, 3))
-    goals = np.broadcast_to(marks, centres.shape)
-    gravity = np.eye(2) / _SIGMA_UP**2
-    return place(centres, goals, weights, np.array([0.0, 0.0, 1.0]), gravity).p
+    chosen = np.arange(centres[..., 0].size).reshape(centres.shape[:2])
+    goals = np.tile(marks, (len(centres), 1))
+    weights = np.tile(np.eye(3) / sigma**2, (chosen.size, 1, 1))
+    gravity, up = np.eye(2) / _SIGMA_UP**2, np.array([0.0, 0.0, 1.0])
+    return place(chosen, centres.reshape(-1, 3), goals, weights, up, gravity).p
 
 
 def _limit(sigma: float, tolerance: float, rng: np.random.Generator) -> AngleLimit:

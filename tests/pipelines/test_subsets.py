@@ -29,7 +29,8 @@ def rng():
 def seen(marks, T, method="free_station", config=CONFIG, **how):
     """Pairs and triples by a method, from the free station of all markers."""
     fits = sightings(marks, T, **how)
-    return resect_subsets(method, resect("free_station", fits, marks, config), fits, marks, config)
+    fix = resect("free_station", fits, marks, config)
+    return resect_subsets([method], fix, fits, marks, config)[method]
 
 
 def angles_of(v, chosen):
@@ -199,7 +200,7 @@ def test_all_subsets_of_a_stop_cost_less_than_the_fix_of_a_few_of_them(rng, meth
         work()
         return thread_time() - start
 
-    resect_subsets(method, fix, fits, marks, CONFIG)
-    whole = min(cost(lambda: resect_subsets(method, fix, fits, marks, CONFIG)) for _ in range(5))
+    resect_subsets([method], fix, fits, marks, CONFIG)
+    whole = min(cost(lambda: resect_subsets([method], fix, fits, marks, CONFIG)) for _ in range(5))
     one = min(cost(lambda: resect("free_station", fits, marks, CONFIG)) for _ in range(5))
     assert whole < 10 * one  # 455 of them
