@@ -1,16 +1,14 @@
 """Centres by maximum likelihood along the beams, all markers of a stop together.
 
-Hides noise, outliers and laser biases. The markers of a stop share what one marker alone cannot
-tell: the noise of this sensor today, what each laser measures too long, and how sharply returns end
-at the outline.
+Hides what is made of the estimate (``estimation``): which candidates have a centre, how well it is
+known, and what weakens it.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import replace
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
+import numba
 import numpy as np
 
 from pipelines.config import FittingConfig
@@ -23,20 +21,19 @@ from pipelines.fitting.description import (
     sentence,
     weaknesses,
 )
-from pipelines.fitting.faces import N_MOUNTING, effects_on, sigmas_of
-from pipelines.fitting.footprint import share_of_outline
-from pipelines.fitting.outline import Outline, outline_normals, outline_of
-from pipelines.fitting.passes import (
-    Linear,
-    Normals,
-    Rows,
-    in_play,
-    linearise,
-    noise_of,
-    normals_of,
-    rows_of,
+from pipelines.fitting.estimation import (
+    Estimate,
+    Known,
+    Told,
+    estimate,
+    radii_shown,
+    sigmas_shared,
 )
-from pipelines.fitting.radius import Weighing, free_radii, other_radius
+from pipelines.fitting.faces import sigmas_of
+from pipelines.fitting.footprint import share_of_outline
+from pipelines.fitting.noise import EXPECTED_SQUARE, FACTOR_MIN, Weighed, classes_of
+from pipelines.fitting.radius import other_radius
+from pipelines.fitting.rows import Rows, rows_of
 from pipelines.geometry import levelling_rotation
 from pipelines.stitching import beams
 from pipelines.values import (
@@ -55,39 +52,14 @@ from pipelines.values import (
 
 NAME = "along_beam"
 
-# Range noise of a VLP-16 by reflectivity, from recorded packets [m]: a prior, for the ratio between
-# dark and bright; its size is estimated from the stop.
-_REFLECTIVITIES = np.array([5.0, 15.0, 40.0, 100.0])  # limits between the classes
-_SIGMAS = np.array([0.0137, 0.0107, 0.0089, 0.0067, 0.0064])
-_FACTOR_MIN = 0.08  # of the prior noise: 2 mm quantisation alone gives as much
-_FACTOR_START = 3.0  # the largest noise that a VLP-16 shows, 25 mm
-
-_TUKEY = 8.0  # sigmas at which a return has no weight; 99 % efficient on clean data
-_EXPECTED_SQUARE = 0.9099  # mean of weight times square of normal residuals
-_EFFICIENCY = 0.9753  # variance of the estimate over the inverse normal matrix
-_SPREAD_MIN = 1e-5  # [m] of the laser biases: keeps their prior invertible
-_N_STEPS = 8
-_N_STEPS_GATED = 5  # after these the choice of returns by their place stays as it is
-_N_STEPS_RANGES = 3  # without the outline
-_ROUGH = 0.1  # radii by which a rough centre may be off per axis
-_STEP_MAX = 0.25  # radii per step
 _STRAY = 0.6  # radii that a centre may move from its rough place
 _N_MIN = 4  # returns: one more than unknowns
-_GAP_SIGMAS = 3.0  # of its centre by which a return may pass a sphere by and still be its own
-_GAP_MIN, _GAP_MAX = 0.02, 0.3  # radii: least and most of that
 _DOF_STOP = 100.0  # returns that the stop's noise is worth when a marker's own is judged
-_DOF_CLASS = 30.0  # returns that the common noise is worth when that of a class is estimated
-_DOF_BIAS = 2.0  # lasers that the prior of the biases is worth when their spread is estimated
 
 _FEW_INFLATION = 0.45  # what few returns add to the variance of a centre: 1 + this exp(-n /
 _FEW_RETURNS = 30.0  # this), by Monte Carlo
 
 _NOISE_FACTOR = 1.6  # of the stop's noise, above which a marker is called weak
-
-
-Told = Callable[[Array, Array], tuple[Array, Array]]
-"""What else is told of centres, (m, 3) [m] with covariances (m, 3, 3) [m^2]: what it adds to their
-normal equations, (m, 3, 3) [1/m^2], and to the right-hand sides, (m, 3) [1/m]."""
 
 
 class _Shots(NamedTuple):
@@ -100,75 +72,39 @@ class _Shots(NamedTuple):
     members : (n,)
         Rows of the cloud.
     rows : Rows
-        The same as the passes need them.
-    sigma_biases : (k,)
-        Prior standard deviation of what each laser that occurs measures too long [m].
-    sigma_mounting : (6,)
-        That of the unknowns of the mounting.
+        The same as the estimate needs them.
+    is_told : (k,)
+        Whether each laser that occurs is told from the others.
     """
 
     beams: Beams
     members: Index
     rows: Rows
-    sigma_biases: Array
-    sigma_mounting: Array
+    is_told: Mask
 
 
-class _State(NamedTuple):
-    """Where the estimate stands.
+class _Tally(NamedTuple):
+    """What the returns that carry each centre have in common; all (m,).
 
     Attributes
     ----------
-    centres : (m, 3)
-        Centres [m].
-    biases : (k,)
-        What each laser measures too long [m].
-    mounting : (6,)
-        What is wrong in the mounting, as ``faces.effects_on`` has it.
-    spread : (k,)
-        Their standard deviations, as estimated [m].
-    has_biases : bool
-        Whether biases are estimated already.
-    factor : float
-        Noise in units of the prior.
-    factors : (c,)
-        The same by class of reflectivity.
-    cov_noise, cov_biases : (m, 3, 3)
-        Covariances of the centres by noise and by biases [m^2].
-    by_bias : (m, 3, k + 6)
-        How far a unit of each bias, or of the mounting, moves each centre, with the sign turned.
-    cov_lasers : (k + 6, k + 6)
-        Covariance of the biases [m^2] and of the mounting.
+    n_used, n_rings : ndarray of int
+        Number of them, and of different lasers among them.
+    mean_range, mean_intensity : ndarray
+        Distance from their mean origin [m], and mean reflectivity.
+    sigma0 : ndarray
+        Their noise in units of the prior.
+    coverage, incidence : ndarray
+        Share of the outline that has returns, and their mean angle of incidence [rad].
     """
 
-    centres: Array
-    biases: Array
-    mounting: Array
-    spread: Array
-    has_biases: bool
-    factor: float
-    factors: Array
-    cov_noise: Array
-    cov_biases: Array
-    by_bias: Array
-    cov_lasers: Array
-
-
-class _Bounds(NamedTuple):
-    """How returns end at the outline, once that is known; what each says of it, (n, 2)."""
-
-    outline: Outline | None
-    sites: Array
-
-
-class _Estimate(NamedTuple):
-    """A state with what each return says of it: prediction, residuals [m], sigmas [m], weights."""
-
-    state: _State
-    linear: Linear
-    residuals: Array
-    sigmas: Array
-    weights: Array
+    n_used: Index
+    n_rings: Index
+    mean_range: Array
+    mean_intensity: Array
+    sigma0: Array
+    coverage: Array
+    incidence: Array
 
 
 def fit(
@@ -254,303 +190,101 @@ def _fit(
     """Return the fits of all candidates, and those that are none."""
     if not found.candidates:
         return (), ()
-    shots = _gather(cloud, found.candidates, config)
+    shots, sigma_biases = _gather(cloud, found.candidates, config)
+    sigma_mounting = sigmas_of(config.sigma_mounting, config.sigma_offset)
+    known = Known(radius, sigma_biases, sigma_mounting)
     rough = np.array([c.p_base_rough for c in found.candidates])
-    estimate = _estimate(shots, rough, radius, told, asks_outline=asks_outline)
-    known = [*_free_radii(shots, estimate, radius), _sigmas_shared(estimate.state)]
-    rows = np.column_stack(known).tolist()
-    results = [
-        _judged(shots, estimate, k, candidate, tuple(rows[k]), radius)
-        for k, candidate in enumerate(found.candidates)
-    ]
+    best = estimate(shots.rows, rough, known, told, asks_outline=asks_outline)
+    results = _judged(shots, best, found.candidates, rough, radius)
     fits = tuple(r for r in results if isinstance(r, MarkerFit))
     return fits, tuple(r for r in results if isinstance(r, Rejection))
 
 
 def _gather(
     cloud: StitchedCloud, candidates: tuple[MarkerCandidate, ...], config: FittingConfig
-) -> _Shots:
-    """Return the members of all candidates as one table of shots."""
+) -> tuple[_Shots, Array]:
+    """Return the members of all candidates as one table of shots, and the sigmas of biases."""
     members = np.concatenate([c.members for c in candidates])
     is_finite = np.isfinite(cloud.p_base[members]).all(axis=1)
     ends = np.cumsum([len(c.members) for c in candidates])
     together, firsts = members[is_finite], np.cumsum(np.r_[0, is_finite])[np.r_[0, ends]]
     table = beams(cloud, together)
     lasers, places = np.unique(table.rings, return_inverse=True)
+    is_told = lasers != RING_UNKNOWN
     # returns of unknown lasers come from all sixteen: their common part is what is left of a bias
-    sigma = np.where(lasers == RING_UNKNOWN, config.sigma_range_bias / 4.0, config.sigma_range_bias)
-    classes = np.digitize(table.intensities, _REFLECTIVITIES)
+    sigma_biases = np.where(is_told, config.sigma_range_bias, config.sigma_range_bias / 4.0)
     rows = rows_of(
         table,
         firsts,
         levelling_rotation(cloud.levelling)[2],
         places.astype(np.intp),
-        (classes, _SIGMAS[classes], config.sigma_direction),
+        (*classes_of(table.intensities), config.sigma_direction),
     )
-    return _Shots(
-        beams=table,
-        members=together,
-        rows=rows,
-        sigma_biases=sigma,
-        sigma_mounting=sigmas_of(config.sigma_mounting, config.sigma_offset),
-    )
+    return _Shots(table, together, rows, is_told), sigma_biases
 
 
-def _placed(shots: _Shots, state: _State) -> Rows:
-    """Return the returns with their beams where the mounting, as it is known, has them."""
-    if not state.mounting.any():
-        return shots.rows
-    moves = effects_on(state.centres) @ state.mounting
-    each = np.repeat(moves, np.diff(shots.rows.firsts), axis=0)
-    return shots.rows._replace(origins=shots.rows.origins - shots.rows.up[:, :1] * each)
+def _tallied(shots: _Shots, best: Estimate, radius: float) -> _Tally:
+    """Sum up the returns that carry each centre."""
+    table, offsets = shots.beams, best.linear.offsets
+    seen = (offsets, table.intensities, shots.is_told)
+    tally = _Tally(*_tally(shots.rows, best.state.centres, best.weighed, seen, radius))
+    ratio2 = tally.sigma0 / EXPECTED_SQUARE / np.maximum(tally.n_used - 3.0, 1.0)
+    factors = np.maximum(best.state.noise.factor * np.sqrt(ratio2), FACTOR_MIN)
+    return tally._replace(sigma0=factors)
 
 
-def _margins(state: _State, radius: float) -> Array:
-    """Return by how much a footprint may pass each sphere by and still be its own [m]."""
-    sigma = np.sqrt(np.trace(state.cov_noise, axis1=1, axis2=2))
-    return np.asarray(np.clip(_GAP_SIGMAS * sigma, _GAP_MIN * radius, _GAP_MAX * radius))
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _tally(
+    rows: Rows,
+    centres: Array,
+    weighed: Weighed,
+    seen: tuple[Array, Array, Mask],
+    radius: float,
+) -> tuple[Index, Index, Array, Array, Array, Array, Array]:
+    """Return ``_Tally`` with the weighted squares of residuals in units of sigma for their noise.
 
-
-def _tukey(scaled: Array) -> Array:
-    """Return Tukey's weights of residuals in units of their sigma."""
-    return np.where(np.abs(scaled) < _TUKEY, (1.0 - (scaled / _TUKEY) ** 2) ** 2, 0.0)
-
-
-def _factors(shots: _Shots, state: _State, scaled: Array, weights: Array) -> tuple[float, Array]:
-    """Return the noise in units of the prior: of all returns, and by class of reflectivity.
-
-    A class is believed to have the factor of all until it has returns enough to speak for itself.
+    ``seen`` are offsets, intensities, and which lasers are told apart.
     """
-    squares = state.factors[shots.rows.classes] ** 2 * weights * scaled**2 / _EXPECTED_SQUARE
-    by_class = np.bincount(shots.rows.classes, squares, len(_SIGMAS))
-    counts = np.bincount(shots.rows.classes, weights > 0.0, len(_SIGMAS))
-    n = max(float(counts.sum()), 1.0)
-    dof = max(n - 3.0 * len(state.centres), 0.0)
-    factor2 = (by_class.sum() + 1.0) / (dof + 1.0)
-    own = (by_class + _DOF_CLASS * factor2) / (counts * dof / n + _DOF_CLASS)
-    return max(float(np.sqrt(factor2)), _FACTOR_MIN), np.maximum(np.sqrt(own), _FACTOR_MIN)
+    m, (offsets, intensities, is_told) = len(centres), seen
+    n_used, n_rings, squares = np.zeros(m, np.intp), np.zeros(m, np.intp), np.zeros(m)
+    ranges, means, coverages, angles = np.zeros(m), np.zeros(m), np.zeros(m), np.zeros(m)
+    for s in range(m):
+        first = rows.firsts[s]
+        used = first + np.flatnonzero(weighed.weights[first : rows.firsts[s + 1]] > 0.0)
+        n_used[s] = len(used)
+        if not len(used):
+            continue
+        middle, is_seen = np.zeros(3), np.zeros(len(is_told), np.bool_)
+        for i in used:
+            squares[s] += weighed.weights[i] * (weighed.residuals[i] / weighed.sigmas[i]) ** 2
+            is_seen[rows.lasers[i]] = is_told[rows.lasers[i]]
+            means[s] += intensities[i] / len(used)
+            for j in range(3):
+                middle[j] += rows.origins[j, i] / len(used)
+        n_rings[s], ranges[s] = np.sum(is_seen), np.sqrt(np.sum((middle - centres[s]) ** 2))
+        axes, some = (rows.directions[:, used], rows.firsts_axis[:, used]), offsets[:, used]
+        coverages[s] = share_of_outline(axes[0], axes[1], some, radius)
+        angles[s] = incidence(some, radius)
+    return n_used, n_rings, ranges, means, squares, coverages, angles
 
 
-def _normals(shots: _Shots, estimate: _Estimate) -> Normals:
-    """Sum the normal equations of centres and biases."""
-    per_square = estimate.weights / estimate.sigmas**2
-    sizes = (3, len(shots.sigma_biases))
-    return Normals(*normals_of(shots.rows, estimate.linear, estimate.residuals, per_square, sizes))
+def _refusals(best: Estimate, n_used: Index, rough: Array, radius: float) -> list[str]:
+    """Return why candidates have no centre; empty for each that has one."""
+    moved = np.linalg.norm(best.state.centres - rough, axis=1)
+    worst = np.sqrt(np.linalg.eigvalsh(best.state.cov_noise)[:, -1])
+    return [
+        _refusal(n, sigma, off, radius)
+        for n, sigma, off in zip(n_used.tolist(), worst.tolist(), moved.tolist(), strict=True)
+    ]
 
 
-def _bounded(
-    shots: _Shots, estimate: _Estimate, radius: float, N: Normals, known: _Bounds
-) -> tuple[Normals, _Bounds]:
-    """Return normal equations with what the outline adds, and what was learnt of it."""
-    state = estimate.state
-    met = (shots.rows, estimate.linear, estimate.weights, state.cov_noise + state.cov_biases)
-    outline = known.outline or outline_of(*met, radius)
-    centres, pull_centres, faces, pull_faces, sites = outline_normals(*met, outline, known.sites)
-    added = N._replace(
-        centres=N.centres + centres,
-        pull_centres=N.pull_centres + pull_centres,
-        faces=N.faces + faces,
-        pull_faces=N.pull_faces + pull_faces,
-    )
-    return added, _Bounds(outline, sites)
-
-
-def _with_told(N: Normals, state: _State, told: Told) -> Normals:
-    """Return normal equations with what else is told of the centres."""
-    centres, pull_centres = told(state.centres, state.cov_noise + state.cov_biases)
-    return N._replace(centres=N.centres + centres, pull_centres=N.pull_centres + pull_centres)
-
-
-def _stepped(state: _State, N: Normals, shots: _Shots, radius: float) -> _State:
-    """Return the state after one Gauss-Newton step of centres, biases and mounting together.
-
-    The centres are eliminated first (Schur's complement), so that the cost is linear in markers. A
-    prior of a metre on each centre keeps the equations solvable and is not felt otherwise.
-    """
-    inverse, prior = np.linalg.inv(N.centres + np.eye(3)), shots.sigma_biases
-    spread2 = np.maximum(state.spread, _SPREAD_MIN) ** 2
-    mixed, reduced, pull = _shared(state, N, spread2, shots.sigma_mounting)
-    by_bias = inverse @ mixed
-    cov_shared = np.linalg.inv(reduced - np.einsum("mik,mij->kj", mixed, by_bias))
-    pull -= np.einsum("mik,mi->k", by_bias, N.pull_centres)
-    d_shared = cov_shared @ pull * state.has_biases
-    d_centres = np.einsum("mij,mj->mi", inverse, N.pull_centres - mixed @ d_shared)
-    n = len(prior)
-    biases = state.biases + d_shared[:n]
-    known2 = (biases**2 + np.diag(cov_shared)[:n]).sum() + _DOF_BIAS * np.mean(prior**2)
-    spread = prior * np.sqrt(known2 / (_DOF_BIAS + n) / np.mean(prior**2))
-    return state._replace(
-        centres=state.centres + _shortened(d_centres, radius),
-        biases=biases,
-        mounting=state.mounting + d_shared[n:],
-        spread=spread if state.has_biases else prior,
-        cov_noise=np.asarray(_EFFICIENCY * inverse, dtype=np.float64),
-        cov_biases=by_bias @ cov_shared @ by_bias.transpose(0, 2, 1),
-        by_bias=by_bias,
-        cov_lasers=cov_shared,
-    )
-
-
-def _shared(
-    state: _State, N: Normals, spread2: Array, sigma_mounting: Array
-) -> tuple[Array, Array, Array]:
-    """Return normal equations of what all centres share, with the priors: mixed, own, pull."""
-    effects = effects_on(state.centres)
-    between = np.einsum("mik,mip->kp", N.mixed_faces, effects)
-    own = np.einsum("mip,mij,mjq->pq", effects, N.centres, effects)
-    known = np.diag(1.0 / np.maximum(sigma_mounting, 1e-9) ** 2)
-    reduced = np.block([[np.diag(N.biases + 1.0 / spread2), between], [between.T, own + known]])
-    pull_mounting = np.einsum("mip,mi->p", effects, N.pull_faces) - known @ state.mounting
-    pull = np.concatenate([N.pull_biases - state.biases / spread2, pull_mounting])
-    return np.concatenate([N.mixed, N.faces @ effects], axis=2), reduced, pull
-
-
-def _sigmas_shared(state: _State) -> Array:
-    """Return how much of each centre's error along its line of sight all have in common [m].
-
-    That is what biases of lasers make it agree with the other centres in: the mean covariance.
-    """
-    lines = state.centres / np.linalg.norm(state.centres, axis=1, keepdims=True)
-    pulls = np.einsum("mi,mik->mk", lines, state.by_bias)
-    cov = pulls @ state.cov_lasers @ pulls.T
-    own = np.diag(cov)
-    together = (cov.sum(axis=1) - own) / (len(cov) - 1) if len(cov) > 1 else own
-    return np.asarray(np.sqrt(np.maximum(together, 0.0)))
-
-
-def _shortened(steps: Array, radius: float) -> Array:
-    """Return steps of centres, (m, 3), none longer than a quarter of the radius [m]."""
-    lengths = np.linalg.norm(steps, axis=1, keepdims=True)
-    return np.asarray(steps * np.minimum(1.0, _STEP_MAX * radius / np.maximum(lengths, 1e-12)))
-
-
-def _estimate(
-    shots: _Shots, rough: Array, radius: float, told: Told | None, *, asks_outline: bool
-) -> _Estimate:
-    """Return the estimate of all centres and biases from rough centres."""
-    nothing = np.zeros((len(rough), 3, 3))
-    state = _State(
-        centres=rough,
-        biases=np.zeros(len(shots.sigma_biases)),
-        mounting=np.zeros(N_MOUNTING),
-        spread=shots.sigma_biases,
-        has_biases=False,
-        factor=_FACTOR_START,
-        factors=np.full(len(_SIGMAS), _FACTOR_START),
-        cov_noise=nothing + (_ROUGH * radius) ** 2 * np.eye(3),
-        cov_biases=nothing,
-        by_bias=np.zeros((len(rough), 3, len(shots.sigma_biases) + N_MOUNTING)),
-        cov_lasers=np.diag(np.concatenate([shots.sigma_biases, shots.sigma_mounting]) ** 2),
-    )
-    is_in = np.ones(len(shots.members), dtype=bool)
-    bounds = _Bounds(outline=None, sites=np.zeros((len(shots.members), 2)))
-    for step in range(_N_STEPS):
-        linear = _linear(shots, state, is_in, radius)
-        if step < _N_STEPS_GATED:
-            is_in = in_play(shots.rows, linear.offsets, _margins(state, radius), radius)
-        estimate = _weighed(shots, state, linear, is_in)
-        state = estimate.state._replace(has_biases=step >= _N_STEPS_GATED)
-        N = _normals(shots, estimate)
-        if asks_outline and step >= _N_STEPS_RANGES:
-            N, bounds = _bounded(shots, estimate, radius, N, bounds)
-        if told is not None and step >= _N_STEPS_RANGES:
-            N = _with_told(N, estimate.state, told)
-        state = _stepped(state, N, shots, radius)
-    return _weighed(shots, state, _linear(shots, state, is_in, radius), is_in)
-
-
-def _linear(shots: _Shots, state: _State, is_in: Mask, radius: float) -> Linear:
-    """Return what the beams should measure, linearised over what is not known of the centres."""
-    spheres = np.column_stack([state.centres, np.full(len(state.centres), radius)])
-    covs: Array = np.zeros((len(spheres), 4, 4))
-    covs[:, :3, :3] = state.cov_noise + state.cov_biases
-    return linearise(_placed(shots, state), spheres, covs, is_in)
-
-
-def _weighed(shots: _Shots, state: _State, linear: Linear, is_in: Mask) -> _Estimate:
-    """Return residuals, their weights and the stop's noise at a state."""
-    residuals = shots.beams.ranges - linear.ranges - state.biases[shots.rows.lasers]
-    scaled = residuals / noise_of(shots.rows, linear, state.factors)
-    factor, factors = _factors(shots, state, scaled, is_in * _tukey(scaled))
-    sigmas = noise_of(shots.rows, linear, factors)
-    return _Estimate(
-        state=state._replace(factor=factor, factors=factors),
-        linear=linear,
-        residuals=residuals,
-        sigmas=sigmas,
-        weights=is_in * _tukey(residuals / sigmas),
-    )
-
-
-def _free_radii(shots: _Shots, estimate: _Estimate, radius: float) -> tuple[Array, Array]:
-    """Return radii estimated together with the centres, and their sigmas; NaN if undetermined."""
-    n, state = len(estimate.state.centres), estimate.state
-    covs: Array = np.zeros((n, 4, 4))
-    covs[:, :3, :3] = state.cov_noise + state.cov_biases
-    covs[:, 3, 3] = np.trace(covs, axis1=1, axis2=2)
-    weighing = Weighing(
-        ranges=shots.beams.ranges - state.biases[shots.rows.lasers],
-        variances=np.maximum(estimate.sigmas**2 - estimate.linear.bends**2, 1e-12),
-        weights=estimate.weights,
-    )
-    spheres = np.column_stack([state.centres, np.full(n, radius)])
-    return free_radii(_placed(shots, state), weighing, spheres, covs, len(shots.sigma_biases))
-
-
-def _own_factor(estimate: _Estimate, mine: slice) -> float:
-    """Return one marker's noise in units of the prior, from its returns alone."""
-    scaled, weights = estimate.residuals[mine] / estimate.sigmas[mine], estimate.weights[mine]
-    dof = max(float(np.sum(weights > 0.0)) - 3.0, 1.0)
-    ratio2 = float(np.sum(weights * scaled**2)) / _EXPECTED_SQUARE / dof
-    return max(estimate.state.factor * float(np.sqrt(ratio2)), _FACTOR_MIN)
-
-
-def inflation(n_used: int) -> float:
-    """Return by how much a few returns know less than the noise alone would have it.
-
-    Parameters
-    ----------
-    n_used : int
-        Returns of a marker.
-
-    Returns
-    -------
-    float
-        Factor of the variances of its centre.
-    """
-    return 1.0 + _FEW_INFLATION * float(np.exp(-n_used / _FEW_RETURNS))
-
-
-def _covariance(estimate: _Estimate, k: int, own: float, n_used: int) -> Array:
-    """Return a centre's covariance: noise as the stop and the marker show it, and biases.
-
-    The noise is that of the stop until a marker has returns enough to speak for itself: a handful
-    of returns that agree by chance must not look precise.
-    """
-    state = estimate.state
-    ratio2 = (own / state.factor) ** 2
-    variance = (_DOF_STOP + n_used * ratio2) / (_DOF_STOP + n_used)
-    few = inflation(n_used)
-    return np.asarray(few * (variance * state.cov_noise[k] + state.cov_biases[k]))
-
-
-def _weakness(fit: MarkerFit, factor: float) -> str:
-    """Return why a centre should be used with care; empty if there is no reason."""
-    reasons = weaknesses(fit.n_points, fit.n_rings, fit.coverage)
-    reasons += other_radius(fit.radius, fit.radius_free, fit.sigma_radius_free)
-    if fit.sigma0 > _NOISE_FACTOR * factor:
-        reasons.append(f"its residuals are {fit.sigma0 / factor:.1f} times those of the stop")
-    return sentence(reasons)
-
-
-def _refusal(estimate: _Estimate, k: int, n_used: int, moved: float, radius: float) -> str:
+def _refusal(n_used: int, worst: float, moved: float, radius: float) -> str:
     """Return why a candidate has no centre; empty if it has one."""
     if n_used < _N_MIN:
         return (
             f"Only {n_used} returns lie on a sphere of radius {1e3 * radius:.0f} mm; a centre "
             f"needs at least {_N_MIN}."
         )
-    worst = float(np.sqrt(np.linalg.eigvalsh(estimate.state.cov_noise[k])[-1]))
     if worst > radius:
         return (
             "Its returns leave the centre undetermined: they lie on one line, or on no sphere of "
@@ -564,51 +298,80 @@ def _refusal(estimate: _Estimate, k: int, n_used: int, moved: float, radius: flo
     return ""
 
 
+def inflation(n_used: int | Index) -> Array:
+    """Return by how much a few returns know less than the noise alone would have it.
+
+    Parameters
+    ----------
+    n_used : int or (m,)
+        Returns of a marker, or of each.
+
+    Returns
+    -------
+    (...)
+        Factors of the variances of their centres.
+    """
+    return np.asarray(1.0 + _FEW_INFLATION * np.exp(-np.asarray(n_used) / _FEW_RETURNS))
+
+
+def _covariances(best: Estimate, tally: _Tally) -> Array:
+    """Return the centres' covariances: noise as the stop and the marker show it, and biases.
+
+    The noise is that of the stop until a marker has returns enough to speak for itself: a handful
+    of returns that agree by chance must not look precise.
+    """
+    n_used, ratio2 = tally.n_used, (tally.sigma0 / best.state.noise.factor) ** 2
+    variances = (_DOF_STOP + n_used * ratio2) / (_DOF_STOP + n_used)
+    by_noise = variances[:, None, None] * best.state.cov_noise
+    return np.asarray(inflation(n_used)[:, None, None] * (by_noise + best.state.cov_biases))
+
+
 def _judged(
     shots: _Shots,
-    estimate: _Estimate,
-    k: int,
-    candidate: MarkerCandidate,
-    told: tuple[float, float, float],
+    best: Estimate,
+    candidates: tuple[MarkerCandidate, ...],
+    rough: Array,
     radius: float,
-) -> MarkerFit | Rejection:
-    """Return one candidate's fit with its diagnostics, or the reason why there is none.
+) -> list[MarkerFit | Rejection]:
+    """Return the candidates' fits with their diagnostics, or the reason why there is none."""
+    tally = _tallied(shots, best, radius)
+    radii, sigmas = radii_shown(shots.rows, best, radius)
+    columns = tally._asdict()
+    columns |= {"radius_free": radii, "sigma_radius_free": sigmas}
+    columns["sigma_range_shared"] = sigmas_shared(best.state)
+    n_used = columns.pop("n_used")
+    rows = zip(*(column.tolist() for column in columns.values()), strict=True)
+    told = [{**dict(zip(columns, row, strict=True)), "radius": radius} for row in rows]
+    refusals, covs = _refusals(best, n_used, rough, radius), _covariances(best, tally)
+    return [
+        refused(candidate, refusals[k])
+        if refusals[k]
+        else _described(shots, best, k, candidate, cov_p_base=covs[k].copy(), **told[k])
+        for k, candidate in enumerate(candidates)
+    ]
 
-    ``told`` are its free radius, the sigma of that, and the error of range that all share [m].
-    """
-    mine = slice(*shots.rows.firsts[k : k + 2])
-    used = np.arange(mine.start, mine.stop)[estimate.weights[mine] > 0.0]
-    p, n_used = estimate.state.centres[k], len(used)
-    moved = float(np.linalg.norm(p - candidate.p_base_rough))
-    reason = _refusal(estimate, k, n_used, moved, radius)
-    if reason:
-        return refused(candidate, reason)
-    own = _own_factor(estimate, mine)
-    table, offsets = shots.beams, estimate.linear.offsets[used]
-    n_rings = len(set(table.rings[used].tolist()) - {RING_UNKNOWN})
-    fit = MarkerFit(
+
+def _described(
+    shots: _Shots, best: Estimate, k: int, candidate: MarkerCandidate, **known: Any
+) -> MarkerFit:
+    """Return one candidate's fit; ``known`` are the fields that are found of all together."""
+    first, behind = shots.rows.firsts[k : k + 2]
+    used = first + np.flatnonzero(best.weighed.weights[first:behind] > 0.0)
+    members = shots.members[used]
+    reasons = weaknesses(len(used), known["n_rings"], known["coverage"])
+    reasons += other_radius(known["radius"], known["radius_free"], known["sigma_radius_free"])
+    ratio = known["sigma0"] / best.state.noise.factor
+    if ratio > _NOISE_FACTOR:
+        reasons.append(f"its residuals are {ratio:.1f} times those of the stop")
+    return MarkerFit(
         name=candidate.name,
-        p_base=p.copy(),
-        cov_p_base=_covariance(estimate, k, own, n_used),
+        p_base=best.state.centres[k].copy(),
         method=NAME,
-        status=Status.OK,
-        reason="",
-        radius=radius,
-        radius_free=told[0],
-        sigma_radius_free=told[1],
-        mean_range=float(np.linalg.norm(table.origins_base[used].mean(axis=0) - p)),
-        mean_intensity=float(table.intensities[used].mean()),
-        used=shots.members[used],
-        rejected=left_out(candidate.members, shots.members[used]),
-        residuals=estimate.residuals[used],
-        sigma0=own,
-        n_rings=n_rings,
-        coverage=share_of_outline(
-            table.directions_base[used], table.across_base[used], offsets, radius
-        ),
-        incidence=incidence(offsets, radius),
-        variant="" if n_rings else WITHOUT_RINGS,
-        sigma_range_shared=told[2],
+        status=Status.WEAK if reasons else Status.OK,
+        reason=sentence(reasons),
+        used=members,
+        rejected=left_out(candidate.members, members),
+        residuals=best.weighed.residuals[used],
+        variant="" if known["n_rings"] else WITHOUT_RINGS,
+        **known,
     )
-    weakness = _weakness(fit, estimate.state.factor)
-    return replace(fit, status=Status.WEAK, reason=weakness) if weakness else fit

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from typing import Any
 
+import numba
 import numpy as np
 
 from pipelines.fitting.footprint import predict, share_of_outline
@@ -148,7 +150,11 @@ def described(
     found = predict(shots, p_base[None], np.array([radius]), which)
     rings = shots.rings[shots.rings != RING_UNKNOWN]
     n_rings = len(np.unique(rings))
-    coverage = share_of_outline(shots.directions_base, shots.across_base, found.offsets, radius)
+    directions, across, offsets = (
+        np.ascontiguousarray(vectors.T)
+        for vectors in (shots.directions_base, shots.across_base, found.offsets)
+    )
+    coverage = share_of_outline(directions, across, offsets, radius)
     residuals = shots.ranges - found.ranges
     nearby = beams(cloud, on_sphere(cloud, candidate, radius, _NEARBY))
     own = own_radius(nearby, radius, levelling_rotation(cloud.levelling)[2])
@@ -176,7 +182,7 @@ def described(
         residuals=residuals,
         n_rings=n_rings,
         coverage=coverage,
-        incidence=incidence(found.offsets, radius),
+        incidence=incidence(offsets, radius),
         **fields,
     )
 
@@ -201,12 +207,13 @@ def left_out(members: Index, used: Index) -> Index:
     return np.asarray(members[is_left])
 
 
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def incidence(offsets: Array, radius: float) -> float:
     """Return the mean angle between beams and the normals of a sphere.
 
     Parameters
     ----------
-    offsets : (n, 2)
+    offsets : (2, n)
         Where the middles of the beams pass its centre [m].
     radius : float
         Its radius [m].
@@ -216,8 +223,11 @@ def incidence(offsets: Array, radius: float) -> float:
     float
         The angle; a beam whose middle passes by counts as grazing [rad].
     """
-    off = np.minimum(np.hypot(offsets[:, 0], offsets[:, 1]) / radius, 1.0)
-    return float(np.mean(np.arcsin(off)))
+    total = 0.0
+    for i in range(offsets.shape[1]):
+        off = math.sqrt(offsets[0, i] ** 2 + offsets[1, i] ** 2) / radius
+        total += math.asin(min(off, 1.0))
+    return float(total / offsets.shape[1])
 
 
 def weaknesses(n_points: int, n_rings: int, coverage: float) -> list[str]:

@@ -8,6 +8,7 @@ that is not full, do not, and then this has to be estimated.
 
 from __future__ import annotations
 
+import numba
 import numpy as np
 
 from pipelines.values import Array
@@ -37,6 +38,7 @@ def sigmas_of(sigma_direction: float, sigma_offset: float) -> Array:
     return np.concatenate([angles, np.full(2, sigma_offset), amplitudes])
 
 
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def effects_on(centres: Array) -> Array:
     """Return how the mounting moves what is swept upwards; the other face moves against it.
 
@@ -51,18 +53,16 @@ def effects_on(centres: Array) -> Array:
         By the spin axis's direction to the side and the azimuth zero [m/rad], the offset along the
         sight and to the side [m/m], cosine and sine of the encoder's eccentricity [m/rad].
     """
-    x, y, z = centres.T
-    flat = np.maximum(np.hypot(x, y), 1e-9)
-    zero, distance = np.zeros_like(x), np.sqrt(x * x + y * y + z * z)
-    aside = np.stack([-y / flat, x / flat, zero], axis=1)
-    ahead = np.stack([x / flat, y / flat, zero], axis=1)
-    above = np.cross(centres / distance[:, None], aside)
-    columns = (
-        aside * distance[:, None],
-        above * distance[:, None],
-        ahead,
-        aside,
-        aside * x[:, None],
-        aside * y[:, None],
-    )
-    return np.stack(columns, axis=2)
+    effects = np.zeros((len(centres), 3, N_MOUNTING))
+    for m in range(len(centres)):
+        x, y, z = centres[m, 0], centres[m, 1], centres[m, 2]
+        flat = max(np.sqrt(x * x + y * y), 1e-9)
+        distance = np.sqrt(x * x + y * y + z * z)
+        c, s = x / flat, y / flat
+        aside, ahead = (-s, c, 0.0), (c, s, 0.0)
+        above = (-z * c, -z * s, x * c + y * s)  # times the distance
+        for j in range(3):
+            effects[m, j, 0], effects[m, j, 1] = aside[j] * distance, above[j]
+            effects[m, j, 2], effects[m, j, 3] = ahead[j], aside[j]
+            effects[m, j, 4], effects[m, j, 5] = aside[j] * x, aside[j] * y
+    return effects

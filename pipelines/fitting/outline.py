@@ -13,7 +13,8 @@ from typing import NamedTuple
 import numba
 import numpy as np
 
-from pipelines.fitting.passes import Linear, Rows
+from pipelines.fitting.linearising import Linear
+from pipelines.fitting.rows import Rows
 from pipelines.values import Array
 
 _EDGES = np.array([-0.5, -0.25, 0.0, 0.25, 0.5, 0.75, 1.0])  # half widths inside the outline
@@ -183,10 +184,10 @@ def outline_normals(
             found[i, 0], found[i, 1] = precision, pull
             for p in range(3):
                 pull_centres[m, p] += (pull - precision * inside) * towards[p]
-                pull_faces[m, p] += rows.up[i, 0] * (pull - precision * inside) * towards[p]
+                pull_faces[m, p] += rows.up[0, i] * (pull - precision * inside) * towards[p]
                 for q in range(3):
                     centres[m, p, q] += precision * towards[p] * towards[q]
-                    faces[m, p, q] += rows.up[i, 0] * precision * towards[p] * towards[q]
+                    faces[m, p, q] += rows.up[0, i] * precision * towards[p] * towards[q]
     return centres, pull_centres, faces, pull_faces, found
 
 
@@ -218,9 +219,9 @@ def _chance(z: float) -> float:
 @numba.njit(cache=True, nogil=True, error_model="numpy")
 def _reach(rows: Rows, linear: Linear, i: int, radius: float) -> tuple[float, float]:
     """Return half of a footprint's width and how far it reaches inside the outline [m]."""
-    x, y = linear.offsets[i, 0], linear.offsets[i, 1]
+    x, y = linear.offsets[0, i], linear.offsets[1, i]
     off = max(math.sqrt(x * x + y * y), _TINY)
-    a, b = rows.half_widths[i, 0] * x, rows.half_widths[i, 1] * y
+    a, b = rows.half_widths[0, i] * x, rows.half_widths[1, i] * y
     half = math.sqrt(a * a + b * b) / off
     return half, radius + half - off
 
@@ -228,14 +229,14 @@ def _reach(rows: Rows, linear: Linear, i: int, radius: float) -> tuple[float, fl
 @numba.njit(cache=True, nogil=True, error_model="numpy")
 def _towards(rows: Rows, linear: Linear, i: int) -> tuple[float, float, float]:
     """Return the direction from a centre to a beam, square to the line of sight to the centre."""
-    x, y = linear.offsets[i, 0], linear.offsets[i, 1]
+    x, y = linear.offsets[0, i], linear.offsets[1, i]
     off = max(math.sqrt(x * x + y * y), _TINY)
     x, y, lean = x / off, y / off, off / rows.ranges[i]
     a, b, u = rows.firsts_axis, rows.seconds_axis, rows.directions
     return (
-        x * a[i, 0] + y * b[i, 0] + lean * u[i, 0],
-        x * a[i, 1] + y * b[i, 1] + lean * u[i, 1],
-        x * a[i, 2] + y * b[i, 2] + lean * u[i, 2],
+        x * a[0, i] + y * b[0, i] + lean * u[0, i],
+        x * a[1, i] + y * b[1, i] + lean * u[1, i],
+        x * a[2, i] + y * b[2, i] + lean * u[2, i],
     )
 
 

@@ -10,7 +10,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from pipelines.fitting.passes import Linear, Rows, in_play, linearise, normals_of, rows_of
+from pipelines.fitting.equations import normals_of_spheres
+from pipelines.fitting.linearising import Linear, linearise
+from pipelines.fitting.rows import Rows, in_play, rows_of
 from pipelines.values import Array, Beams, Mask
 
 _ASKED = 1.0  # standard deviations of one step, beyond which the greatest likelihood is sought
@@ -53,7 +55,7 @@ class Weighing(NamedTuple):
 
 
 def free_radii(
-    rows: Rows, weighing: Weighing, spheres: Array, covs: Array, n_lasers: int
+    rows: Rows, weighing: Weighing, spheres: Array, covs: Array, residuals: Array
 ) -> tuple[Array, Array]:
     """Return radii estimated together with the centres, and their standard deviations.
 
@@ -66,9 +68,9 @@ def free_radii(
     spheres : (m, 4)
         Centres fitted with radii that are assumed, and these [m].
     covs : (m, 4, 4)
-        How well the centres are known; of the radii nothing is asked [m^2].
-    n_lasers : int
-        Lasers that ``rows`` tells apart.
+        How well the centres are known; zero of the radii [m^2].
+    residuals : (n,)
+        What the ranges leave after those of ``linearise`` at these [m].
 
     Returns
     -------
@@ -83,14 +85,16 @@ def free_radii(
     step by the noise alone (a sandwich). Where the greatest likelihood is so much greater that the
     assumption must be wrong, its radius is the answer.
     """
-    radii, sigmas = _stepped(rows, weighing, spheres, covs, n_lasers)
+    radii, sigmas = _stepped(rows, weighing, spheres, covs, residuals)
     radius = spheres[:, 3]
     is_asked = np.abs(radii - radius) > _ASKED * sigmas
     if is_asked.any():
         wide = _with_radius(covs, np.trace(covs[:, :3, :3], axis1=1, axis2=2))
-        found, known = _free(rows, weighing, spheres, wide, n_lasers, is_asked)
-        misfits = [_misfits(rows, weighing, which, covs) for which in (spheres, found)]
-        is_far = is_asked & (misfits[0] - misfits[1] > _BETTER)
+        found, known = _free(rows, weighing, spheres, wide, is_asked)
+        is_in = (weighing.weights > 0.0) & np.repeat(is_asked, np.diff(rows.firsts))
+        better = weighing.ranges - linearise(rows, found, covs, is_in).ranges
+        gains = _misfits(rows, weighing, residuals) - _misfits(rows, weighing, better)
+        is_far = is_asked & (gains > _BETTER)
         radii = np.where(is_far, found[:, 3], radii)
         sigmas = np.where(is_far, np.sqrt(known[:, 3, 3]), sigmas)
     return _known(radii, sigmas, radius)
@@ -111,39 +115,35 @@ def _with_radius(covs: Array, variances: Array | float) -> Array:
 
 
 def _stepped(
-    rows: Rows, weighing: Weighing, spheres: Array, covs: Array, n_lasers: int
+    rows: Rows, weighing: Weighing, spheres: Array, covs: Array, residuals: Array
 ) -> tuple[Array, Array]:
     """Return radii one step from those that are assumed, and their standard deviations."""
     is_in, square = weighing.weights > 0.0, spheres[:, 3, None, None] ** -2.0 * np.eye(4)
-    residuals = weighing.ranges - linearise(rows, spheres, _with_radius(covs, 0.0), is_in).ranges
 
     def summed(wide: Array) -> tuple[Linear, Array, Array, Array]:
         linear = linearise(rows, spheres, wide, is_in)
         per_square = weighing.weights / (weighing.variances + linear.bends**2)
-        N, _, _, pull, *_ = normals_of(rows, linear, residuals, per_square, (4, n_lasers))
-        return linear, per_square, N, pull
+        return linear, per_square, *normals_of_spheres(rows, linear, residuals, per_square, 4)
 
     rough = _with_radius(covs, np.trace(covs[:, :3, :3], axis1=1, axis2=2))
     cov = np.linalg.inv(summed(rough)[2] + square / _PRIOR**2)
     linear, per_square, N, pull = summed(np.asarray(cov, dtype=np.float64))
     by_pull = np.linalg.inv(N + square / _WEAK_PRIOR**2)
     of_noise = per_square**2 * weighing.variances
-    spread = by_pull @ normals_of(rows, linear, residuals, of_noise, (4, n_lasers))[0] @ by_pull
+    spread = by_pull @ normals_of_spheres(rows, linear, residuals, of_noise, 4)[0] @ by_pull
     radii = spheres[:, 3] + np.einsum("mj,mj->m", by_pull[:, 3], pull)
     return radii, np.sqrt(spread[:, 3, 3])
 
 
-def _misfits(rows: Rows, weighing: Weighing, spheres: Array, covs: Array) -> Array:
+def _misfits(rows: Rows, weighing: Weighing, residuals: Array) -> Array:
     """Return the sums of squared residuals in units of the noise, strays counting as such."""
-    is_in = weighing.weights > 0.0
-    linear = linearise(rows, spheres, _with_radius(covs, 0.0), is_in)
-    square = (weighing.ranges - linear.ranges) ** 2 / weighing.variances
+    square = residuals**2 / weighing.variances
     sums = np.cumsum(np.r_[0.0, weighing.weights * np.minimum(square, _CLIP)])
     return np.asarray(np.diff(sums[rows.firsts]))
 
 
 def _free(
-    rows: Rows, weighing: Weighing, spheres: Array, covs: Array, n_lasers: int, moves: Mask
+    rows: Rows, weighing: Weighing, spheres: Array, covs: Array, moves: Mask
 ) -> tuple[Array, Array]:
     """Return centres with radii, (m, 4), and their covariances; some move until they settle."""
     radius, counts, moves = spheres[:, 3], np.diff(rows.firsts), moves.copy()
@@ -152,7 +152,7 @@ def _free(
         linear = linearise(rows, spheres, covs, is_in)
         per_square = is_in * weighing.weights / (weighing.variances + linear.bends**2)
         residuals = weighing.ranges - linear.ranges
-        N, _, _, pull, *_ = normals_of(rows, linear, residuals, per_square, (4, n_lasers))
+        N, pull = normals_of_spheres(rows, linear, residuals, per_square, 4)
         inverse = np.linalg.inv(N + np.eye(4) / (_PRIOR * radius[:, None, None]) ** 2)
         covs = np.where(moves[:, None, None], inverse, covs)
         limit = _STEP_MAX * radius[:, None]
@@ -193,8 +193,8 @@ def own_radius(shots: Beams, radius: float, up: Array) -> tuple[float, float]:
     nothing = np.zeros(n, dtype=np.intp)
     rows = rows_of(shots, np.array([0, n]), up, nothing, (nothing, np.ones(n), 0.0))
     spanned = _spanned(shots)
-    weighing, sphere, cov = _fitted(rows, spanned, radius)
-    radii, sigmas = _stepped(rows, weighing, sphere, cov, 1)
+    weighing, residuals, sphere, cov = _fitted(rows, spanned, radius)
+    radii, sigmas = _stepped(rows, weighing, sphere, cov, residuals)
     if np.abs(radii[0] - radius) > _ASKED * sigmas[0]:
         own, known, gain = _own_spanned(rows, spanned, sphere)
         if gain > _BETTER_OWN:
@@ -203,9 +203,9 @@ def own_radius(shots: Beams, radius: float, up: Array) -> tuple[float, float]:
     return float(radii[0]), float(sigmas[0])
 
 
-def _fitted(rows: Rows, spanned: Array, radius: float) -> tuple[Weighing, Array, Array]:
-    """Return weights, the sphere of a known radius that fits best, and its covariance."""
-    axis = rows.directions.mean(axis=0)
+def _fitted(rows: Rows, spanned: Array, radius: float) -> tuple[Weighing, Array, Array, Array]:
+    """Return weights, residuals, the best sphere of a known radius, and its covariance."""
+    axis = rows.directions.mean(axis=1)
     shift = 2.0 / 3.0 * (radius - spanned[0, 3]) / float(np.linalg.norm(axis))
     sphere = np.array([[*(spanned[0, :3] + shift * axis), radius]])
     cov = _with_radius((_START * radius) ** 2 * np.eye(3)[None], 0.0)
@@ -213,12 +213,12 @@ def _fitted(rows: Rows, spanned: Array, radius: float) -> tuple[Weighing, Array,
         linear = linearise(rows, sphere, cov)
         weighing, residuals = _gated(rows, linear, radius)
         per_square = weighing.weights / (weighing.variances + linear.bends**2)
-        N, _, _, pull, *_ = normals_of(rows, linear, residuals, per_square, (3, 1))
-        inverse = np.linalg.inv(N + np.eye(3) / (_PRIOR * radius) ** 2)
+        N, pull = normals_of_spheres(rows, linear, residuals, per_square, 3)
+        inverse: Array = np.asarray(np.linalg.inv(N + np.eye(3) / (_PRIOR * radius) ** 2))
         limit = _STEP_MAX * radius
         sphere[0, :3] += np.clip(inverse[0] @ pull[0], -limit, limit)
         cov = _with_radius(inverse, 0.0)
-    return _gated(rows, linearise(rows, sphere, cov), radius)[0], sphere, cov
+    return *_gated(rows, linearise(rows, sphere, cov), radius), sphere, cov
 
 
 def _gated(rows: Rows, linear: Linear, radius: float) -> tuple[Weighing, Array]:
@@ -241,7 +241,7 @@ def _own_spanned(rows: Rows, own: Array, assumed: Array) -> tuple[Array, Array, 
     known, moves = (_START * own[0, 3]) ** 2 * np.eye(4)[None], np.ones(1, dtype=bool)
     for _ in range(_N_ROUNDS):
         weighing = _gated(rows, linearise(rows, own, known), float(own[0, 3]))[0]
-        own, known = _free(rows, weighing, own, known, 1, moves)
+        own, known = _free(rows, weighing, own, known, moves)
         own[0, 3] = np.clip(own[0, 3], _SPAN_MIN, 2.0 * _RADIUS_MAX * assumed[0, 3])
     linear = linearise(rows, own, known)
     weighing, residuals = _gated(rows, linear, float(own[0, 3]))

@@ -6,8 +6,9 @@ from numpy.testing import assert_allclose
 from scipy.integrate import quad
 from scipy.stats import norm
 
+from pipelines.fitting.linearising import linearise
 from pipelines.fitting.outline import Outline, outline_normals, outline_of
-from pipelines.fitting.passes import linearise, rows_of
+from pipelines.fitting.rows import rows_of
 from pipelines.values import Beams
 
 RADIUS, AWAY = 0.1, 10.0
