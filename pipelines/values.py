@@ -256,6 +256,57 @@ class Levelling:
     sigma_heading: float = 0.0
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class Timed:
+    """A column that changes evenly between samples: found for the rows that are asked for.
+
+    Attributes
+    ----------
+    stamps_ns : (n,)
+        Instant of each row.
+    samples_ns : (m,)
+        Instants of the samples, increasing; what is asked for is not before the first.
+    values : (m,)
+        What was sampled.
+    rates : (m,)
+        Change from each sample on [1/ns].
+    is_angle : bool
+        Whether to reduce to [-pi, pi) [rad].
+
+    Notes
+    -----
+    Of millions of shots a few thousand are asked for; ``column[:]`` gives all of them.
+    """
+
+    stamps_ns: Nanos
+    samples_ns: Nanos
+    values: Array
+    rates: Array
+    is_angle: bool = False
+
+    def __post_init__(self) -> None:
+        _seal(self, stamps_ns=(None,), samples_ns=(None,), values=(None,), rates=(None,))
+        _same_length(self, "samples_ns", "values", "rates")
+
+    def __len__(self) -> int:
+        """Return the number of rows."""
+        return len(self.stamps_ns)
+
+    def __getitem__(self, rows: slice | Index | Mask) -> Column:
+        """Return some rows, float32."""
+        stamps_ns = self.stamps_ns[rows]
+        sample = np.searchsorted(self.samples_ns, stamps_ns, side="right") - 1
+        found = self.values[sample] + self.rates[sample] * (stamps_ns - self.samples_ns[sample])
+        if self.is_angle:
+            turns = found * (0.5 / np.pi)
+            found = 2.0 * np.pi * (turns - np.floor(turns + 0.5))
+        return np.asarray(found, np.float32)
+
+    def __array__(self, dtype: Any = None, copy: object = None) -> NDArray[Any]:
+        """Return all rows, for NumPy's own functions; they are always new."""
+        return np.asarray(self[:], dtype)
+
+
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class StitchedCloud:
     """One stop's returns as points in the base frame, with what is needed to rebuild their beams.
@@ -265,7 +316,8 @@ class StitchedCloud:
     p_base : (n, 3) float32
         Returns [m].
     gimbal_angles : (n,) float32
-        Gimbal angle at each shot, eccentricity applied, reduced to [-pi, pi) [rad].
+        Gimbal angle at each shot, eccentricity applied, reduced to [-pi, pi) [rad]. Like the times,
+        an array, or what finds the rows that are asked for.
     intensities : (n,) float32
         Calibrated reflectivity, 0-255.
     rings : (n,) uint8
@@ -287,10 +339,10 @@ class StitchedCloud:
     """
 
     p_base: Column
-    gimbal_angles: Column
+    gimbal_angles: Column | Timed
     intensities: Column
     rings: Rings
-    times: Column
+    times: Column | Timed
     levelling: Levelling
     rig: Rig
     coverage: float
@@ -299,10 +351,9 @@ class StitchedCloud:
     notes: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
-        columns: dict[str, Shape] = dict.fromkeys(
-            ("gimbal_angles", "intensities", "rings", "times"), (None,)
-        )
-        _seal(self, p_base=(None, 3), **columns)
+        columns = ("gimbal_angles", "intensities", "rings", "times")
+        arrays = (name for name in columns if not isinstance(getattr(self, name), Timed))
+        _seal(self, p_base=(None, 3), **dict.fromkeys(arrays, (None,)))
         _same_length(self, "p_base", *columns)
 
 

@@ -23,7 +23,7 @@ FRAMELESS = {  # counts, clocks, scalars per row, and tables of the sensor: no c
     "external_reliabilities", "included_angles", "included_angles_horizontal", "sigma_3d",
     "sigma_horizontal",
     "divergence", "laser_elevations", "laser_heights", "laser_range_biases",
-    "encoder_eccentricity",
+    "encoder_eccentricity", "stamps_ns", "samples_ns", "values", "rates",
 }  # fmt: skip
 
 

@@ -65,7 +65,8 @@ def front_face(cloud: StitchedCloud) -> Mask:
             "The LiDAR's spin axis is less than 20 degrees from the gimbal axis: its scan has no "
             "two faces, and spheres cannot calibrate it. Check T_head_lidar of the rig."
         )
-    c, s = np.cos(cloud.gimbal_angles), np.sin(cloud.gimbal_angles)
+    angles = cloud.gimbal_angles[:]
+    c, s = np.cos(angles), np.sin(angles)
     x, y = cloud.p_base[:, 0], cloud.p_base[:, 1]
     return np.asarray((c * x + s * y) * side[0] + (c * y - s * x) * side[1] > 0.0)
 

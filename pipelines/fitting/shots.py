@@ -183,7 +183,7 @@ def firings_of(cloud: StitchedCloud, pattern: Pattern) -> Firings:
     Firings
         All of them, with what returned.
     """
-    first, row_of = _numbered(cloud.times, cloud.rings, pattern.phase, _DELAYS)
+    first, row_of = _numbered(cloud.times[:], cloud.rings, pattern.phase, _DELAYS)
     numbered = np.arange(first, first + len(row_of), dtype=np.float64)
     times: Array = pattern.phase + FIRING_CYCLE * numbered
     thin = slice(None, None, max(len(cloud.times) // _N_TIMED, 1))

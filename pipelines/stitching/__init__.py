@@ -21,8 +21,7 @@ from pipelines.errors import (
     RigError,
 )
 from pipelines.stitching.stops import pause_notes, split_stops
-from pipelines.stitching.turning import Joints, Lidar, Shots, turned
-from pipelines.threads import side_by_side
+from pipelines.stitching.turning import Joints, Lidar, Seen, Shots, turned
 from pipelines.values import (
     RING_UNKNOWN,
     Array,
@@ -37,6 +36,7 @@ from pipelines.values import (
     Rings,
     ScanLog,
     StitchedCloud,
+    Timed,
 )
 
 __all__ = ["beams", "choose_rig", "level", "pause_notes", "split_stops", "stitch"]
@@ -186,24 +186,25 @@ def stitch(log: ScanLog, rig: Rig, config: StitchingConfig) -> StitchedCloud:
     The angle is interpolated linearly between joint samples, the eccentricity applied at the
     samples. Sine and cosine are evaluated once per joint sample and carried to the shot by their
     series, which is good to 0.1 micrometres at 60 m. One pass, linear in the number of returns.
+    Where nothing is left out, intensities and rings are those of the log; gimbal angles and times
+    are computed when they are asked for.
     """
     rings, notes = _lasers_of(log, rig)
     joints = _joints(log, rig)
     joints, smear_note = _without_smear(log, joints)
     shots = Shots(log.p_lidar, log.intensities, rings, log.stamps_lidar_ns)
-    first, final = _first_and_last(log.stamps_lidar_ns)
-    columns, counts = turned(shots, joints, _lidar(rig, config), first)
-    _refuse_empty(log, joints, counts, config)
+    kept, seen = turned(shots, joints, _lidar(rig, config))
+    _refuse_empty(log, joints, seen, config)
     levelling = level(log, rig, config)
-    coverage, duration = _extent(first, final, joints)
-    notes += smear_note + pause_notes(log) + _count_notes(counts)
+    coverage, duration = _extent(seen, joints)
+    notes += smear_note + pause_notes(log) + _count_notes(seen)
     notes += _level_notes(levelling) + _turn_notes(coverage)
     return StitchedCloud(
-        p_base=columns.p_base,
-        gimbal_angles=columns.gimbal_angles,
-        intensities=columns.intensities,
-        rings=columns.rings,
-        times=columns.times,
+        p_base=kept.p,
+        gimbal_angles=Timed(kept.stamps_ns, *joints, is_angle=True),
+        intensities=kept.intensities,
+        rings=kept.rings,
+        times=Timed(kept.stamps_ns, np.array([seen.first_ns]), np.zeros(1), np.array([_NS])),
         levelling=levelling,
         rig=rig,
         coverage=coverage,
@@ -261,8 +262,7 @@ def _joints(log: ScanLog, rig: Rig) -> Joints:
     gaps, steps = np.diff(stamps_ns), np.diff(angles)
     rates = np.append(steps / gaps, 0.0)
     rates[:-1][(gaps > _JOINT_GAP / _NS) & (np.abs(steps) > _JOINT_GAP_MOTION)] = np.nan
-    table = np.stack([angles, np.cos(angles), np.sin(angles), rates], axis=1)
-    return Joints(stamps_ns, angles, table)
+    return Joints(stamps_ns, angles, rates)
 
 
 def _without_smear(log: ScanLog, joints: Joints) -> tuple[Joints, tuple[str, ...]]:
@@ -305,40 +305,38 @@ def _smeared(moved: Array) -> tuple[Mask, int]:
 
 def _voided(joints: Joints, stamps_ns: Nanos) -> Joints:
     """Return the gimbal with the angle unknown in the sample intervals of the given instants."""
-    table = joints.table.copy()
+    rates = joints.rates.copy()
     hit = np.searchsorted(joints.stamps_ns, stamps_ns, side="right") - 1
-    table[np.clip(hit, 0, len(table) - 1), 3] = np.nan
-    return joints._replace(table=table)
+    rates[np.clip(hit, 0, len(rates) - 1)] = np.nan
+    return joints._replace(rates=rates)
 
 
 def _lidar(rig: Rig, config: StitchingConfig) -> Lidar:
     """Return the rig, and which ranges are wanted, as the loops need them."""
-    lasers = np.ascontiguousarray(_laser_table(rig).T)
     return Lidar(
         tuple(rig.T_head_lidar[:3].ravel().tolist()),
-        lasers,
-        bool(lasers[1].any()),
+        _by_ring(rig.laser_range_biases),
+        _by_ring(rig.laser_heights),
+        bool(rig.laser_range_biases.any()),
+        float(rig.cloud_carries_heights),
         (config.range_min, config.range_max),
     )
 
 
-def _laser_table(rig: Rig) -> Array:
-    """Return height in the cloud, bias and height [m] of every ring; zero for unknown ones."""
-    table = np.zeros((256, 3))
-    rows = table[: len(rig.laser_heights)]
-    rows[:, 0] = rig.laser_heights if rig.cloud_carries_heights else 0.0
-    rows[:, 1] = rig.laser_range_biases
-    rows[:, 2] = rig.laser_heights
+def _by_ring(values: Array) -> Array:
+    """Return what is known of lasers for every ring; zero for unknown ones."""
+    table = np.zeros(RING_UNKNOWN + 1)
+    table[: len(values)] = values
     return table
 
 
-def _refuse_empty(log: ScanLog, joints: Joints, counts: Index, config: StitchingConfig) -> None:
+def _refuse_empty(log: ScanLog, joints: Joints, seen: Seen, config: StitchingConfig) -> None:
     """Raise RecordingError if nothing was kept, saying why."""
-    if counts[0]:
+    if seen.n_kept:
         return
     if not len(log.stamps_lidar_ns):
         raise RecordingError(f"{log.origin.name} holds no LiDAR return.")
-    if counts[1]:
+    if seen.n_without_angle:
         away = (int(joints.stamps_ns[0]) - int(log.stamps_lidar_ns[0])) * _NS
         raise RecordingError(
             f"No return of {log.origin.name} has a gimbal angle: the joint samples begin "
@@ -348,24 +346,14 @@ def _refuse_empty(log: ScanLog, joints: Joints, counts: Index, config: Stitching
         )
     raise RecordingError(
         f"No return of {log.origin.name} is from {config.range_min} to {config.range_max} m away "
-        f"({counts[2]} are not finite, {counts[3]} are nearer or farther)."
+        f"({seen.n_not_finite} are not finite, {seen.n_out_of_range} are nearer or farther)."
     )
 
 
-def _first_and_last(stamps_ns: Nanos) -> tuple[int, int]:
-    """Return the first and the last instant [ns]; zero if there is none."""
-    if not len(stamps_ns):
-        return 0, 0
-    parts = side_by_side(
-        lambda low, high: (stamps_ns[low:high].min(), stamps_ns[low:high].max()), len(stamps_ns)
-    )
-    return int(min(low for low, _ in parts)), int(max(high for _, high in parts))
-
-
-def _extent(first: int, final: int, joints: Joints) -> tuple[float, float]:
+def _extent(seen: Seen, joints: Joints) -> tuple[float, float]:
     """Return the angle [rad] and the time [s] from the first shot with an angle to the last."""
-    first = max(first, int(joints.stamps_ns[0]))
-    final = min(final, int(joints.stamps_ns[-1]))
+    first = max(seen.first_ns, int(joints.stamps_ns[0]))
+    final = min(seen.last_ns, int(joints.stamps_ns[-1]))
     inside = joints.angles[(joints.stamps_ns >= first) & (joints.stamps_ns <= final)]
     times = joints.stamps_ns - first
     edges = np.interp([0, final - first], times, joints.angles)
@@ -373,16 +361,16 @@ def _extent(first: int, final: int, joints: Joints) -> tuple[float, float]:
     return min(turned, _FULL_TURN), float((final - first) * _NS)
 
 
-def _count_notes(counts: Index) -> tuple[str, ...]:
+def _count_notes(seen: Seen) -> tuple[str, ...]:
     """Say how many shots were left out and why; range limits are no news."""
     notes = []
-    if counts[1]:
+    if seen.n_without_angle:
         notes.append(
-            f"{counts[1]} returns have no gimbal angle (before, after or in a gap of the joint "
-            "samples) and are left out."
+            f"{seen.n_without_angle} returns have no gimbal angle (before, after or in a gap of "
+            "the joint samples) and are left out."
         )
-    if counts[2]:
-        notes.append(f"{counts[2]} returns are not finite and are left out.")
+    if seen.n_not_finite:
+        notes.append(f"{seen.n_not_finite} returns are not finite and are left out.")
     return tuple(notes)
 
 
@@ -436,7 +424,7 @@ def beams(cloud: StitchedCloud, members: Index) -> Beams:
     origin. Across is the spin axis times the direction: the tangent of the sweep.
     """
     rig = cloud.rig
-    heights = _laser_table(rig)[cloud.rings[members], 2]
+    heights = _by_ring(rig.laser_heights)[cloud.rings[members]]
     spin_head = rig.T_head_lidar[:3, 2]
     angles = cloud.gimbal_angles[members].astype(np.float64)
     origins_base = _turn(rig.T_head_lidar[:3, 3] + heights[:, None] * spin_head, angles)

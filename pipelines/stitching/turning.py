@@ -1,8 +1,8 @@
-"""Returns of a turning LiDAR -> points in the base frame: the loops, block by block.
+"""Returns of a turning LiDAR -> points in the base frame: the loops, run by run.
 
-Hides how a return finds its gimbal angle and how a block of returns is turned at once. What a block
-needs in between stays in the cache, and each loop does one thing to few arrays, so that the
-compiler can do it to many returns at a time.
+Hides how a return finds its gimbal angle and how many are turned at once. A run is what was shot
+between two joint samples; the loop over it does all that is usual in one go, and looks nothing up,
+so that the compiler can do it to many returns at a time.
 """
 
 from __future__ import annotations
@@ -15,59 +15,50 @@ import numpy as np
 from pipelines.threads import side_by_side
 from pipelines.values import Array, Column, Index, Mask, Nanos, Rings
 
-_BLOCK = 4096  # returns: few enough for the cache, enough to make the overhead of a block small
-_SMALL_TURN = 0.1  # [rad]; below it the series in `_by_series` is good to 1.4e-9
-
-
-class Shots(NamedTuple):
-    """Columns of the log that are read."""
-
-    p_lidar: Column
-    intensities: Column
-    rings: Rings
-    stamps_ns: Nanos
+_BLOCK = 512  # returns of a run at the most: what is looked up for them stays in the nearest cache
+_SMALL_TURN = 0.1  # [rad]; below it the series in `_turn_run` are good to 1.4e-9
 
 
 class Joints(NamedTuple):
-    """Gimbal on the LiDAR's clock; ``table`` has angle, cosine, sine, turning rate [rad/ns]."""
+    """Gimbal on the LiDAR's clock; its rate [rad/ns] from each sample on is NaN if not known."""
 
     stamps_ns: Nanos
     angles: Array
-    table: Array
+    rates: Array
 
 
 class Lidar(NamedTuple):
-    """Rig for the kernel; ``lasers``, (3, 256), has height in the cloud, bias, height [m]."""
+    """Rig for the kernel: mounting, bias and height [m] of every ring, and wanted ranges [m]."""
 
     T_head_lidar: tuple[float, ...]  # twelve numbers, row by row
-    lasers: Array
+    biases: Array
+    heights: Array
     has_biases: bool
+    height_share: float  # of the heights that coordinates in the cloud have: 0 or 1
     range_limits: tuple[float, float]
 
 
-class Columns(NamedTuple):
-    """Columns of the cloud."""
+class Shots(NamedTuple):
+    """Returns, in the frame of the LiDAR or in the base frame."""
 
-    p_base: Column
-    gimbal_angles: Column
+    p: Column
     intensities: Column
     rings: Rings
-    times: Column
+    stamps_ns: Nanos
 
 
-class _Scratch(NamedTuple):
-    """What is known of the returns of a block."""
+class Seen(NamedTuple):
+    """What was seen of all returns: how many were kept or not and why, first and last instant."""
 
-    x: Array
-    y: Array
-    z: Array
-    cosines: Array
-    sines: Array
-    by_laser: Array
-    keep: Mask
+    n_kept: int
+    n_without_angle: int
+    n_not_finite: int
+    n_out_of_range: int
+    first_ns: int
+    last_ns: int
 
 
-def turned(shots: Shots, joints: Joints, lidar: Lidar, start_ns: int) -> tuple[Columns, Index]:
+def turned(shots: Shots, joints: Joints, lidar: Lidar) -> tuple[Shots, Seen]:
     """Turn returns into points in the base frame.
 
     Parameters
@@ -78,238 +69,200 @@ def turned(shots: Shots, joints: Joints, lidar: Lidar, start_ns: int) -> tuple[C
         The gimbal.
     lidar : Lidar
         The rig, and which ranges are wanted.
-    start_ns : int
-        The instant that times are counted from.
 
     Returns
     -------
-    columns : Columns
-        The returns that are kept, in their order.
-    counts : (4,)
-        How many were kept, had no angle, were not finite, were out of range.
+    kept : Shots
+        The returns that are kept, in their order; if that is all of them, with columns of the
+        given ones.
+    seen : Seen
+        How many were left out, and when the first and the last of all were made.
+    """
+    n = len(shots.rings)
+    p_lidar, p_base = shots.p.reshape(-1), np.empty(3 * n, np.float32)
+    keep = np.ones(n, np.bool_)
+    knots_ns, table = _knots(joints)
 
-    Notes
-    -----
+    def turn(first: int, end: int) -> Index:
+        rows = slice(first, end)
+        every = slice(3 * first, 3 * end)
+        columns = (p_lidar[every], shots.rings[rows], shots.stamps_ns[rows])
+        told: Index = _turn_part(columns, knots_ns, table, lidar, p_base[every], keep[rows])
+        return told
+
+    told = np.array(side_by_side(turn, n))
+    counts = told[:, :4].sum(axis=0).tolist()
+    seen = Seen._make([*counts, int(told[:, 4].min()), int(told[:, 5].max())])
+    found = shots._replace(p=p_base.reshape(n, 3))
+    return (found if seen.n_kept == n else _closed_up(found, keep)), seen
+
+
+def _knots(joints: Joints) -> tuple[Nanos, Array]:
+    """Cut time where the rate changes, and so finely that the gimbal turns little in between.
+
+    Returns instants from the beginning of time to its end, and angle, cosine, sine and rate from
+    each on.
+    """
+    spans = np.diff(joints.stamps_ns, append=joints.stamps_ns[-1:] + 1)
+    turns = np.nan_to_num(np.abs(joints.rates * spans))
+    n_pieces = np.ceil(turns / _SMALL_TURN).astype(np.intp).clip(1)
+    sample = np.repeat(np.arange(len(spans)), n_pieces)
+    piece = np.arange(len(sample)) - np.repeat(np.cumsum(n_pieces) - n_pieces, n_pieces)
+    since = (piece * (spans / n_pieces)[sample]).astype(np.int64)
+    knots_ns = joints.stamps_ns[sample] + since
+    angles, rates = joints.angles[sample] + joints.rates[sample] * since, joints.rates[sample]
+    ends = np.iinfo(np.int64)
+    knots_ns = np.concatenate([[ends.min], knots_ns, joints.stamps_ns[-1:] + 1, [ends.max]])
+    table = np.full((len(knots_ns), 3), np.nan)
+    table[1:-2] = np.stack([np.cos(angles), np.sin(angles), rates], axis=1)
+    return knots_ns, table
+
+
+def _closed_up(shots: Shots, keep: Mask) -> Shots:
+    """Return the returns that are kept; their points are moved in place.
+
     The first part is filled from its last row down, the second from its first row up: what they
     keep meets in the middle, and nothing has to be moved to close a gap.
     """
-    n = len(shots.p_lidar)
-    out = Columns(
-        np.empty((n, 3), np.float32),
-        np.empty(n, np.float32),
-        np.empty(n, np.float32),
-        np.empty(n, np.uint8),
-        np.empty(n, np.float32),
-    )
+    n = len(keep)
+    out = Shots(shots.p, np.empty(n, np.float32), np.empty(n, np.uint8), np.empty(n, np.int64))
 
-    def part(first: int, end: int) -> tuple[int, int, Index]:
+    def part(first: int, end: int) -> tuple[int, int]:
         is_upward = first > 0 or end == n
-        counts = _turn_part(shots, joints, lidar, start_ns, out, first, end, is_upward)
-        kept = int(counts[0])
-        return (first, first + kept, counts) if is_upward else (end - kept, end, counts)
+        n_kept = _close_up(shots, keep, out, first, end, is_upward)
+        return (first, first + n_kept) if is_upward else (end - n_kept, end)
 
     parts = side_by_side(part, n)
     rows = slice(parts[0][0], parts[-1][1])
-    kept = Columns(out[0][rows], out[1][rows], out[2][rows], out[3][rows], out[4][rows])
-    return kept, np.sum([counts for _, _, counts in parts], axis=0)
+    return Shots(out.p[rows], out.intensities[rows], out.rings[rows], out.stamps_ns[rows])
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def _turn_part(shots, joints, lidar, start, out, first, end, is_upward):  # type: ignore[no-untyped-def]  # noqa: ANN001, ANN202, PLR0913
-    """Fill a part of ``out``; count kept, no angle, not finite, out of range."""
-    a = np.empty((6, _BLOCK + 16))  # not a power of two: columns would share places in the cache
-    scratch = _Scratch(a[0], a[1], a[2], a[3], a[4], a[5], np.empty(_BLOCK, np.bool_))
-    counts = np.zeros(4, np.int64)
-    place = first if is_upward else end
-    for done in range(0, end - first, _BLOCK):
-        low = first + done if is_upward else max(end - done - _BLOCK, first)
-        n = min(_BLOCK, end - first - done)
-        to = place if is_upward else place - n
-        kept = _turn_block(shots, joints, lidar, start, out, low, low + n, to, scratch, counts)
-        if kept < n:
-            _close_up(out, to, scratch.keep[:n], is_upward)
-        place += kept if is_upward else -kept
-    return counts
-
-
-@numba.njit(cache=True, nogil=True, error_model="numpy")
-def _turn_block(shots, joints, lidar, start, out, low, high, to, scratch, counts):  # type: ignore[no-untyped-def]  # noqa: ANN001, ANN202, PLR0913
-    """Fill as many rows of ``out`` as the block has, tell which to keep, and return how many."""
-    n = high - low
-    x, y, z = scratch.x[:n], scratch.y[:n], scratch.z[:n]
-    c, s, laser = scratch.cosines[:n], scratch.sines[:n], scratch.by_laser[:n]
-    stamps, rings = shots.stamps_ns[low:high], shots.rings[low:high]
-    n_known = _angles(stamps, joints, c, s, out.gimbal_angles[to : to + n])
-    _spread(shots.p_lidar[low:high], x, y, z)
-    _look_up(lidar.lasers[0], rings, laser)
-    _subtract(z, laser)
-    n_kept = _n_within(x, y, z, lidar.range_limits)
-    if n_kept < n or n_known < n:
-        n_kept = _judge(x, y, z, c, lidar.range_limits, scratch.keep[:n], counts)
-    counts[0] += n_kept
-    if lidar.has_biases:
-        _look_up(lidar.lasers[1], rings, laser)
-        _shorten(x, y, z, laser)
-    _look_up(lidar.lasers[2], rings, laser)
-    _turn(lidar.T_head_lidar, x, y, z, laser, c, s)
-    _gather(x, y, z, out.p_base[to : to + n])
-    _durations(stamps, start, out.times[to : to + n])
-    out.intensities[to : to + n] = shots.intensities[low:high]
-    out.rings[to : to + n] = rings
-    return n_kept
-
-
-@numba.njit(cache=True, nogil=True, error_model="numpy")
-def _angles(stamps, joints, cosines, sines, angles):  # type: ignore[no-untyped-def]  # noqa: ANN001, ANN202
-    """Find cosine, sine and angle of each shot; those without have no number as cosine.
-
-    Shots mostly come in the order of time: those between two joint samples are done at once.
-    Returns how many have an angle.
-    """
-    samples, i, n_known = joints.stamps_ns, 0, 0
-    while i < len(stamps):
-        j = np.searchsorted(samples, stamps[i], side="right") - 1
-        if j < 0 or stamps[i] > samples[-1]:
-            cosines[i], angles[i] = np.nan, np.nan
-            i += 1
-            continue
-        since = samples[j]
-        until = samples[j + 1] if j + 1 < len(samples) else since + 1
-        end = i + 1
-        while end < len(stamps) and since <= stamps[end] < until:
-            end += 1
-        _angles_between(
-            stamps[i:end],
-            since,
-            until,
-            joints.table[j],
-            cosines[i:end],
-            sines[i:end],
-            angles[i:end],
-        )
-        n_known += (end - i) * np.isfinite(joints.table[j, 3])
-        i = end
-    return n_known
-
-
-@numba.njit(cache=True, nogil=True, error_model="numpy")
-def _angles_between(stamps, since, until, sample, cosines, sines, angles):  # type: ignore[no-untyped-def]  # noqa: ANN001, ANN202, PLR0913
-    """Find cosine, sine and angle of shots between two joint samples."""
-    angle, cosine, sine, rate = sample[0], sample[1], sample[2], sample[3]
-    if abs(rate) * (until - since) < _SMALL_TURN:
-        _by_series(stamps, since, cosine, sine, rate, cosines, sines)
-    else:  # also where the rate is no number
-        for i in range(len(stamps)):
-            full = angle + rate * (stamps[i] - since)
-            cosines[i], sines[i] = np.cos(full), np.sin(full)
-    for i in range(len(stamps)):
-        turns = (angle + rate * (stamps[i] - since)) * (0.5 / np.pi)
-        angles[i] = 2.0 * np.pi * (turns - np.floor(turns + 0.5))
-
-
-@numba.njit(cache=True, nogil=True, error_model="numpy")
-def _by_series(stamps, since, cosine, sine, rate, cosines, sines):  # type: ignore[no-untyped-def]  # noqa: ANN001, ANN202, PLR0913
-    """Find cosine and sine of an angle plus small steps."""
-    for i in range(len(stamps)):
-        step = rate * (stamps[i] - since)
-        square = step * step
-        c = 1.0 - square * (0.5 - square * (1.0 / 24.0))
-        s = step * (1.0 - square * (1.0 / 6.0 - square * (1.0 / 120.0)))
-        cosines[i] = cosine * c - sine * s
-        sines[i] = sine * c + cosine * s
-
-
-@numba.njit(cache=True, nogil=True, error_model="numpy")
-def _spread(points, x, y, z):  # type: ignore[no-untyped-def]  # noqa: ANN001, ANN202
-    """Copy coordinates into columns."""
-    for i in range(len(x)):
-        x[i], y[i], z[i] = points[i, 0], points[i, 1], points[i, 2]
-
-
-@numba.njit(cache=True, nogil=True, error_model="numpy")
-def _gather(x, y, z, points):  # type: ignore[no-untyped-def]  # noqa: ANN001, ANN202
-    """Copy columns into coordinates."""
-    for i in range(len(x)):
-        points[i, 0], points[i, 1], points[i, 2] = x[i], y[i], z[i]
-
-
-@numba.njit(cache=True, nogil=True, error_model="numpy")
-def _look_up(table, rings, out):  # type: ignore[no-untyped-def]  # noqa: ANN001, ANN202
-    """Find what a table says of each laser."""
-    for i in range(len(rings)):
-        out[i] = table[rings[i]]
-
-
-@numba.njit(cache=True, nogil=True, error_model="numpy")
-def _subtract(values, less):  # type: ignore[no-untyped-def]  # noqa: ANN001, ANN202
-    """Take one column off another."""
-    for i in range(len(values)):
-        values[i] -= less[i]
-
-
-@numba.njit(cache=True, nogil=True, error_model="numpy")
-def _n_within(x, y, z, limits):  # type: ignore[no-untyped-def]  # noqa: ANN001, ANN202
-    """Count the returns within the limits of range."""
-    n, least2, most2 = 0, limits[0] ** 2, limits[1] ** 2
-    for i in range(len(x)):
-        reach2 = x[i] * x[i] + y[i] * y[i] + z[i] * z[i]
-        n += (least2 <= reach2) & (reach2 <= most2)
-    return n
-
-
-@numba.njit(cache=True, nogil=True, error_model="numpy")
-def _judge(x, y, z, cosines, limits, keep, counts):  # type: ignore[no-untyped-def]  # noqa: ANN001, ANN202, PLR0913
-    """Tell which returns to keep; count those with no angle, not finite, out of range."""
-    n_kept = 0
-    for i in range(len(x)):
-        reach2 = x[i] * x[i] + y[i] * y[i] + z[i] * z[i]
-        has_angle = not np.isnan(cosines[i])
-        keep[i] = has_angle and limits[0] ** 2 <= reach2 <= limits[1] ** 2
-        n_kept += keep[i]
-        counts[1] += not has_angle
-        counts[2] += has_angle and not np.isfinite(reach2)
-        counts[3] += has_angle and np.isfinite(reach2) and not keep[i]
-    return n_kept
-
-
-@numba.njit(cache=True, nogil=True, error_model="numpy")
-def _shorten(x, y, z, biases):  # type: ignore[no-untyped-def]  # noqa: ANN001, ANN202
-    """Take the biases of the lasers off along the beams."""
-    for i in range(len(x)):
-        scale = 1.0 - biases[i] / np.sqrt(x[i] * x[i] + y[i] * y[i] + z[i] * z[i])
-        x[i], y[i], z[i] = scale * x[i], scale * y[i], scale * z[i]
-
-
-@numba.njit(cache=True, nogil=True, error_model="numpy")
-def _turn(T, x, y, z, heights, cosines, sines):  # type: ignore[no-untyped-def]  # noqa: ANN001, ANN202, PLR0913
-    """Move returns from the lasers to the head, and turn the head."""
-    xx, xy, xz, dx, yx, yy, yz, dy, zx, zy, zz, dz = T
-    for i in range(len(x)):
-        a, b, c = x[i], y[i], z[i] + heights[i]
-        u, v = xx * a + xy * b + xz * c + dx, yx * a + yy * b + yz * c + dy
-        x[i] = cosines[i] * u - sines[i] * v
-        y[i] = sines[i] * u + cosines[i] * v
-        z[i] = zx * a + zy * b + zz * c + dz
-
-
-@numba.njit(cache=True, nogil=True, error_model="numpy")
-def _durations(stamps, start, times):  # type: ignore[no-untyped-def]  # noqa: ANN001, ANN202
-    """Find the time since the start [s]."""
-    for i in range(len(stamps)):
-        times[i] = (stamps[i] - start) * 1e-9
-
-
-@numba.njit(cache=True, nogil=True, error_model="numpy")
-def _close_up(out, to, keep, is_upward):  # type: ignore[no-untyped-def]  # noqa: ANN001, ANN202
-    """Move what is kept of a block to its first rows, or to its last."""
+def _close_up(shots, keep, out, first, end, is_upward):  # type: ignore[no-untyped-def]  # noqa: ANN001, ANN202
+    """Copy what is kept of a part to its first rows, or to its last; return how many these are."""
     step = 1 if is_upward else -1
-    k = to if is_upward else to + len(keep) - 1
-    for i in range(len(keep)):
-        row = to + i if is_upward else to + len(keep) - 1 - i
-        if not keep[row - to]:
-            continue
-        out.p_base[k, 0], out.p_base[k, 1] = out.p_base[row, 0], out.p_base[row, 1]
-        out.p_base[k, 2] = out.p_base[row, 2]
-        out.gimbal_angles[k], out.times[k] = out.gimbal_angles[row], out.times[row]
-        out.intensities[k], out.rings[k] = out.intensities[row], out.rings[row]
-        k += step
+    start = first if is_upward else end - 1
+    k = start
+    for i in range(start, start + step * (end - first), step):
+        if keep[i]:
+            out.p[k, 0], out.p[k, 1], out.p[k, 2] = shots.p[i, 0], shots.p[i, 1], shots.p[i, 2]
+            out.intensities[k], out.rings[k] = shots.intensities[i], shots.rings[i]
+            out.stamps_ns[k] = shots.stamps_ns[i]
+            k += step
+    return abs(k - start)
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _turn_part(columns, knots_ns, table, lidar, p_base, keep):  # type: ignore[no-untyped-def]  # noqa: ANN001, ANN202
+    """Turn some returns, tell which to keep, and see what ``Seen`` has."""
+    p, rings, stamps = columns
+    seen = np.array([0, 0, 0, 0, np.iinfo(np.int64).max, np.iinfo(np.int64).min])
+    heights, scales = np.empty(_BLOCK), np.ones(_BLOCK)
+    begin, n = 0, len(rings)
+    while begin < n:
+        j = min(np.searchsorted(knots_ns, stamps[begin], side="right"), len(table) - 1) - 1
+        most = min(n, begin + _BLOCK)
+        end = _run_end(stamps, begin, most, knots_ns[j], knots_ns[j + 1])
+        seen[4], seen[5] = _first_and_last(stamps, begin, end, seen[4], seen[5])
+        if np.isnan(table[j, 2]):
+            keep[begin:end] = False
+            seen[1] += end - begin
+        else:
+            _look_up(lidar.heights, rings, begin, end, heights)
+            if lidar.has_biases:
+                _look_up(lidar.biases, rings, begin, end, scales)
+                _find_scales(p, begin, end, lidar.height_share, heights, scales)
+            at = (knots_ns[j], table[j, 0], table[j, 1], table[j, 2])
+            n_kept = _turn_run(p, stamps, begin, end, at, lidar, heights, scales, p_base)
+            if n_kept < end - begin:
+                _judge(p, begin, end, lidar, heights, keep, seen)
+            seen[0] += n_kept
+        begin = end
+    return seen
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _run_end(stamps, begin, most, since, until):  # type: ignore[no-untyped-def]  # noqa: ANN001, ANN202
+    """Return where the shots end that were made in the same interval as the first one."""
+    end = begin + 1
+    while end + 64 <= most:
+        n_inside = 0
+        for i in range(np.uint64(end), np.uint64(end + 64)):
+            n_inside += (since <= stamps[i]) & (stamps[i] < until)
+        if n_inside < 64:
+            break
+        end += 64
+    while end < most and since <= stamps[end] < until:
+        end += 1
+    return end
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _first_and_last(stamps, begin, end, first, last):  # type: ignore[no-untyped-def]  # noqa: ANN001, ANN202
+    """Find the first and the last instant, known ones among them."""
+    for i in range(np.uint64(begin), np.uint64(end)):
+        first, last = min(first, stamps[i]), max(last, stamps[i])
+    return first, last
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _look_up(table, rings, begin, end, out):  # type: ignore[no-untyped-def]  # noqa: ANN001, ANN202
+    """Find what a table says of the laser of each return."""
+    first = np.uint64(begin)
+    for i in range(np.uint64(end - begin)):
+        out[i] = table[rings[first + i]]
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _beam(p, row, lowered):  # type: ignore[no-untyped-def]  # noqa: ANN001, ANN202
+    """Return a point as seen from where its beam begins, and its squared range."""
+    x, y = np.float64(p[np.uint64(3) * row]), np.float64(p[np.uint64(3) * row + np.uint64(1)])
+    z = p[np.uint64(3) * row + np.uint64(2)] - lowered
+    return x, y, z, x * x + y * y + z * z
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _find_scales(p, begin, end, height_share, heights, scales):  # type: ignore[no-untyped-def]  # noqa: ANN001, ANN202
+    """Put what the coordinates are multiplied by in place of the biases that this takes off."""
+    first = np.uint64(begin)
+    for i in range(np.uint64(end - begin)):
+        _, _, _, reach2 = _beam(p, first + i, height_share * heights[i])
+        scales[i] = 1.0 - scales[i] / np.sqrt(reach2)
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _turn_run(p, stamps, begin, end, at, lidar, heights, scales, p_base):  # type: ignore[no-untyped-def]  # noqa: ANN001, ANN202, PLR0913
+    """Move the returns of a run to the head and turn it; count those within the limits of range."""
+    xx, xy, xz, dx, yx, yy, yz, dy, zx, zy, zz, dz = lidar.T_head_lidar
+    least2, most2, share = (
+        lidar.range_limits[0] ** 2,
+        lidar.range_limits[1] ** 2,
+        lidar.height_share,
+    )
+    since, cosine, sine, rate = at
+    first, n_within = np.uint64(begin), 0
+    for i in range(np.uint64(end - begin)):
+        row = first + i
+        a, b, c, reach2 = _beam(p, row, share * heights[i])
+        n_within += (least2 <= reach2) & (reach2 <= most2)
+        a, b, c = scales[i] * a, scales[i] * b, scales[i] * c + heights[i]
+        u, v = xx * a + xy * b + xz * c + dx, yx * a + yy * b + yz * c + dy
+        step = rate * (stamps[row] - since)
+        square = step * step
+        less = 1.0 - square * (0.5 - square * (1.0 / 24.0))
+        more = step * (1.0 - square * (1.0 / 6.0 - square * (1.0 / 120.0)))
+        cos, sin = cosine * less - sine * more, sine * less + cosine * more
+        p_base[np.uint64(3) * row] = cos * u - sin * v
+        p_base[np.uint64(3) * row + np.uint64(1)] = sin * u + cos * v
+        p_base[np.uint64(3) * row + np.uint64(2)] = zx * a + zy * b + zz * c + dz
+    return n_within
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _judge(p, begin, end, lidar, heights, keep, seen):  # type: ignore[no-untyped-def]  # noqa: ANN001, ANN202, PLR0913
+    """Tell which returns of a run to keep; count those not finite and out of range."""
+    for i in range(begin, end):
+        _, _, _, reach2 = _beam(p, np.uint64(i), lidar.height_share * heights[i - begin])
+        keep[i] = lidar.range_limits[0] ** 2 <= reach2 <= lidar.range_limits[1] ** 2
+        seen[2] += not np.isfinite(reach2)
+        seen[3] += np.isfinite(reach2) and not keep[i]

@@ -1,3 +1,4 @@
+import pickle
 from dataclasses import replace
 
 import numpy as np
@@ -66,6 +67,31 @@ def test_columns_keep_the_order_of_the_log(rng):
     np.testing.assert_array_equal(cloud.intensities, log.intensities)
     expected = (log.stamps_lidar_ns - log.stamps_lidar_ns[0]) / NS
     np.testing.assert_allclose(cloud.times, expected, rtol=0, atol=1e-6)
+
+
+def test_what_is_not_changed_is_shared_with_the_log(rng):
+    rig = crooked_rig(rng)
+    log, _ = scan_log(rng, rig)
+    cloud = stitch(log, rig, CONFIG)
+    assert np.shares_memory(cloud.intensities, log.intensities)
+    assert np.shares_memory(cloud.rings, log.rings)
+
+
+def test_angles_and_times_are_those_of_the_rows_that_are_asked_for(rng):
+    rig = crooked_rig(rng)
+    log, _ = scan_log(rng, rig)
+    cloud = stitch(log, rig, replace(CONFIG, range_min=5.0))
+    times, angles = cloud.times[:].astype(float), cloud.gimbal_angles[:].astype(float)
+    truth = 0.7 + 2 * np.pi * times / 13.2
+    first = (log.stamps_lidar_ns[0] - (1_700_000_000 * NS + 123_456_789)) / NS
+    off = np.exp(1j * (angles - truth - 2 * np.pi * first / 13.2))
+    np.testing.assert_allclose(np.angle(off), 0, atol=2e-6)
+    assert angles.min() >= -np.float32(np.pi)
+    assert angles.max() <= np.float32(np.pi)
+    rows = rng.permutation(len(cloud.p_base))[:100]
+    for column in (cloud.times, cloud.gimbal_angles):
+        np.testing.assert_array_equal(column[rows], column[:][rows])
+        np.testing.assert_array_equal(pickle.loads(pickle.dumps(column))[rows], column[rows])
 
 
 def test_a_cloud_sorted_by_ring_gives_the_same_points(rng):
@@ -141,7 +167,7 @@ def test_beams_leave_at_the_elevation_of_their_laser(rng):
     log, _ = scan_log(rng, rig)
     cloud = stitch(log, rig, CONFIG)
     lines = beams(cloud, np.arange(len(cloud.p_base)))
-    spin = turn_z(cloud.gimbal_angles.astype(float)) @ rig.T_head_lidar[:3, 2]
+    spin = turn_z(cloud.gimbal_angles[:].astype(float)) @ rig.T_head_lidar[:3, 2]
     sines = np.sum(spin * lines.directions_base, axis=1)
     np.testing.assert_allclose(
         np.arcsin(sines), rig.laser_elevations[lines.rings], rtol=0, atol=2e-6
