@@ -25,9 +25,11 @@ _INTENSITIES = ("intensity", "i", "reflectivity", "signal")
 _RINGS = ("ring", "channel", "line", "laser_id", "laserid")
 _TIMES = ("time", "t", "timestamp", "time_stamp", "offset_time", "time_offset", "timeoffset")
 _FIELD_MIN = 13  # [bytes] of a field with an empty name
-_RETURN = 25  # [bytes] in columns
 _PAGE = 1 << 21  # [bytes] of a large page of memory: the fewer are touched, the fewer are faults
 _WORTH = 4  # clouds that two threads unpack sooner than one
+_BLOCK = 1024  # points: few enough for the nearest cache
+_EXPONENT = np.uint32(0x7F800000)  # bits of a float32; all are set where it is not finite
+_MAGNITUDE = np.uint32(0x7FFFFFFF)
 
 
 class Columns(NamedTuple):
@@ -52,9 +54,8 @@ class Columns(NamedTuple):
         Columns
             Not filled.
         """
-        block = np.empty(_RETURN * n + _PAGE, np.uint8)
-        block = block[-block.ctypes.data % _PAGE :]
-        stamps, p, intensities, rings = np.split(block[: _RETURN * n], [8 * n, 20 * n, 24 * n])
+        p, others = _reserved(12 * n), _reserved(13 * n)  # who keeps these may let go of the points
+        stamps, intensities, rings = np.split(others, [8 * n, 12 * n])
         return cls(
             p.view(np.float32).reshape(n, 3),
             intensities.view(np.float32),
@@ -111,6 +112,13 @@ class Columns(NamedTuple):
         if (stamps[begins] >= stamps[begins - 1]).all():
             return self.taken(slice(len(stamps)))
         return self.taken(np.argsort(stamps, kind="stable"))
+
+
+def _reserved(size: int) -> Octets:
+    """Return so many bytes from the beginning of a large page on."""
+    block = np.empty(size + _PAGE, np.uint8)
+    begin = -block.ctypes.data % _PAGE
+    return block[begin : begin + size]
 
 
 class Seen(NamedTuple):
@@ -331,7 +339,7 @@ def unpack_clouds(octets: Octets, clouds: Nanos, layout: Layout, out: Columns) -
     """
     told, compiled = np.empty((len(clouds), 6)), layout.compiled
     p, intensities, rings, stamps = out
-    columns = (p.view(np.uint32), intensities.view(np.uint32), rings, stamps)
+    columns = (p.view(np.uint32).ravel(), intensities.view(np.uint32), rings, stamps)
 
     def unpack(begin: int, end: int) -> None:
         rows = slice(begin, end)
@@ -358,50 +366,175 @@ def _word(octets, at):  # type: ignore[no-untyped-def]  # noqa: ANN001, ANN202
 @numba.njit(cache=True, nogil=True)
 def _clouds_kernel(octets, clouds, layout, columns, told):  # type: ignore[no-untyped-def]  # noqa: ANN001, ANN202
     """Unpack clouds; tell their returns, extreme times, zero times, descents and bad rings."""
+    times = np.empty(_BLOCK, np.uint32)
     for k in range(len(clouds)):
         told[k, 0], told[k, 1], told[k, 2], told[k, 3], told[k, 4], told[k, 5] = _cloud_kernel(
-            octets, clouds[k], layout, columns
+            octets, clouds[k], layout, columns, times
         )
 
 
 @numba.njit(cache=True, nogil=True)
-def _cloud_kernel(octets, cloud, layout, columns):  # type: ignore[no-untyped-def]  # noqa: ANN001, ANN202
+def _cloud_kernel(octets, cloud, layout, columns, times):  # type: ignore[no-untyped-def]  # noqa: ANN001, ANN202
     """Copy the bits of finite returns away from the origin, and add their times to the stamp.
 
-    Works on bits, so that one compiled version serves any alignment. A point that is no return is
-    overwritten by the next one.
+    Works on bits, so that one compiled version serves any alignment, and block by block: each loop
+    does one thing to what is in the nearest cache, most of them to many points at a time.
     """
-    step, x, y, z, intensity, ring, time, is_wide, is_whole = layout
     p, intensities, rings, stamps = columns
-    exponent, magnitude = np.uint32(0x7F800000), np.uint32(0x7FFFFFFF)
-    to_x, to_y, to_z = np.uint64(x), np.uint64(y), np.uint64(z)
-    to_intensity, to_ring, to_time = np.uint64(intensity), np.uint64(ring), np.uint64(time)
+    is_whole = layout[8] != 0
+    at, stamp, row, end = cloud[0], cloud[2], cloud[3], cloud[3]
+    low, high, n_zeros, n_descents, n_bad = np.int32(0x7FFFFFFF), np.int32(-0x7FFFFFFF), 0, 0, 0
+    for done in range(0, cloud[1], _BLOCK):
+        n = min(_BLOCK, cloud[1] - done)
+        _copy_block(octets, at + done * layout[0], layout, (p, intensities, rings, times), end, n)
+        if _may_be_none(p, end, n):
+            n = _close_up(p, intensities, rings, times, end, n)
+        _void(intensities, end, n)
+        _date(times, n, is_whole, stamp, stamps, end)
+        low, high, n_zero = _extremes(times, n, is_whole, low, high)
+        n_zeros += n_zero
+        n_descents += _n_descents(stamps, max(end, row + 1), end + n)
+        n_bad += _n_unknown(rings, end, n) if layout[5] >= 0 else 0
+        end += n
+    return end - row, _time(low, is_whole), _time(high, is_whole), n_zeros, n_descents, n_bad
+
+
+@numba.njit(cache=True, nogil=True)
+def _copy_block(octets, at, layout, columns, row, n):  # type: ignore[no-untyped-def]  # noqa: ANN001, ANN202
+    """Copy n points to columns, whether or not they are returns."""
+    step, x, y, z, intensity, ring, time, is_wide, _ = layout
+    p, intensities, rings, times = columns
+    _copy_coordinates(octets, (at + x, at + y, at + z), step, p, 3 * row, n)
+    places = (at + max(intensity, 0), at + max(ring, 0), at + max(time, 0))
+    _copy_others(octets, places, step, is_wide, (intensities, rings, times), row, n)
+    if intensity < 0:
+        intensities[row : row + n] = 0
+    if ring < 0:
+        rings[row : row + n] = RING_UNKNOWN
+    if time < 0:
+        times[:n] = 0
+
+
+@numba.njit(cache=True, nogil=True)
+def _copy_coordinates(octets, places, step, p, first, n):  # type: ignore[no-untyped-def]  # noqa: ANN001, ANN202
+    """Copy coordinates that begin at some places and come every so many bytes."""
+    x, y, z = np.uint64(places[0]), np.uint64(places[1]), np.uint64(places[2])
+    for i in range(np.uint64(first), np.uint64(first + 3 * n), np.uint64(3)):
+        p[i] = _word(octets, x)
+        p[i + np.uint64(1)] = _word(octets, y)
+        p[i + np.uint64(2)] = _word(octets, z)
+        x += np.uint64(step)
+        y += np.uint64(step)
+        z += np.uint64(step)
+
+
+@numba.njit(cache=True, nogil=True)
+def _copy_others(octets, places, step, is_wide, columns, row, n):  # type: ignore[no-untyped-def]  # noqa: ANN001, ANN202, PLR0913
+    """Copy what is not a coordinate; a ring that cannot be becomes the unknown one."""
+    intensities, rings, times = columns
+    intensity, ring, time = np.uint64(places[0]), np.uint64(places[1]), np.uint64(places[2])
+    second, shift = ring + np.uint64(is_wide), np.uint32(8 * is_wide)
+    k = np.uint64(0)
+    for i in range(np.uint64(row), np.uint64(row + n)):
+        intensities[i] = _word(octets, intensity)
+        times[k] = _word(octets, time)
+        laser = np.uint32(octets[ring]) | np.uint32(octets[second]) << shift
+        rings[i] = np.uint8(min(laser, np.uint32(RING_UNKNOWN)))
+        k += np.uint64(1)
+        intensity += np.uint64(step)
+        time += np.uint64(step)
+        ring += np.uint64(step)
+        second += np.uint64(step)
+
+
+@numba.njit(cache=True, nogil=True)
+def _may_be_none(p, row, n):  # type: ignore[no-untyped-def]  # noqa: ANN001, ANN202
+    """Say whether a coordinate is zero or not finite: then some points may be no returns."""
+    n_odd = 0
+    for i in range(np.uint64(3 * row), np.uint64(3 * (row + n))):
+        n_odd += (p[i] & _MAGNITUDE) - np.uint32(1) >= _EXPONENT - np.uint32(1)
+    return n_odd > 0
+
+
+@numba.njit(cache=True, nogil=True)
+def _close_up(p, intensities, rings, times, row, n):  # type: ignore[no-untyped-def]  # noqa: ANN001, ANN202
+    """Move the returns of a block to its first rows; return their number."""
+    kept = 0
+    for i in range(n):
+        a, b, c = p[3 * (row + i)], p[3 * (row + i) + 1], p[3 * (row + i) + 2]
+        to = row + kept
+        p[3 * to], p[3 * to + 1], p[3 * to + 2] = a, b, c
+        intensities[to], rings[to], times[kept] = intensities[row + i], rings[row + i], times[i]
+        is_finite = (a & _EXPONENT) != _EXPONENT and (b & _EXPONENT) != _EXPONENT
+        is_finite = is_finite and (c & _EXPONENT) != _EXPONENT
+        kept += is_finite and ((a | b | c) & _MAGNITUDE) != 0
+    return kept
+
+
+@numba.njit(cache=True, nogil=True)
+def _void(intensities, row, n):  # type: ignore[no-untyped-def]  # noqa: ANN001, ANN202
+    """Put zero in place of what is not finite."""
+    for i in range(np.uint64(row), np.uint64(row + n)):
+        value = intensities[i]
+        intensities[i] = np.uint32(0) if (value & _EXPONENT) == _EXPONENT else value
+
+
+@numba.njit(cache=True, nogil=True)
+def _date(times, n, is_whole, stamp, stamps, row):  # type: ignore[no-untyped-def]  # noqa: ANN001, ANN202
+    """Find instants from times since a stamp: whole nanoseconds, or the bits of seconds."""
+    first = np.uint64(row)
+    if is_whole:
+        for i in range(np.uint64(n)):
+            stamps[first + i] = stamp + np.int64(times[i])
+        return
+    seconds = times.view(np.float32)
+    for i in range(np.uint64(n)):
+        stamps[first + i] = stamp + np.int64(np.rint(np.float64(seconds[i]) * 1e9))
+
+
+@numba.njit(cache=True, nogil=True)
+def _extremes(times, n, is_whole, low, high):  # type: ignore[no-untyped-def]  # noqa: ANN001, ANN202
+    """Find the extreme times as numbers of the same order, not finite ones outermost; count zeros.
+
+    Whole numbers are many at a time compared sooner than floating ones.
+    """
+    n_zeros, sign = 0, np.uint32(0) if is_whole else ~_MAGNITUDE
+    for i in range(np.uint64(n)):
+        order = _ordered(np.int32(times[i]), is_whole)
+        low, high = min(low, order), max(high, order)
+        n_zeros += (times[i] & ~sign) == 0
+    return low, high, n_zeros
+
+
+@numba.njit(cache=True, nogil=True)
+def _ordered(bits, is_whole):  # type: ignore[no-untyped-def]  # noqa: ANN001, ANN202
+    """Turn the bits of an unsigned or floating number to one of the same order, and back."""
+    if is_whole:
+        return bits ^ np.int32(-0x80000000)
+    return bits ^ ((bits >> np.int32(31)) & np.int32(0x7FFFFFFF))
+
+
+@numba.njit(cache=True, nogil=True)
+def _time(order, is_whole):  # type: ignore[no-untyped-def]  # noqa: ANN001, ANN202
+    """Return the time, as it was recorded, that stands at a place of the order."""
     bits = np.empty(1, np.uint32)
-    seconds = bits.view(np.float32)
-    at, row, stamp = np.uint64(cloud[0]), np.uint64(cloud[3]), cloud[2]
-    first, previous = row, stamp - np.int64(1 << 62)
-    low, high, n_zeros, n_descents, n_bad = np.inf, -np.inf, 0, 0, 0
-    for _ in range(cloud[1]):
-        a, b, c = _word(octets, at + to_x), _word(octets, at + to_y), _word(octets, at + to_z)
-        p[row, 0], p[row, 1], p[row, 2] = a, b, c
-        value = np.uint32(0) if intensity < 0 else _word(octets, at + to_intensity)
-        intensities[row] = np.uint32(0) if (value & exponent) == exponent else value
-        laser = np.uint32(255) if ring < 0 else np.uint32(octets[at + to_ring])
-        if is_wide:
-            laser |= np.uint32(octets[at + to_ring + np.uint64(1)]) << np.uint32(8)
-        rings[row] = np.uint8(laser)
-        bits[0] = np.uint32(0) if time < 0 else _word(octets, at + to_time)
-        t = np.float64(bits[0]) if is_whole else np.float64(seconds[0])
-        instant = stamp + np.int64(np.rint(t if is_whole else t * 1e9))
-        stamps[row] = instant
-        is_finite = (a & exponent) != exponent and (b & exponent) != exponent
-        if is_finite and (c & exponent) != exponent and ((a | b | c) & magnitude) != 0:
-            n_bad += int(ring >= 0 and laser > 254)
-            low = min(low, t)
-            high = np.inf if t - t != 0 else max(high, t)
-            n_zeros += t == 0
-            n_descents += instant < previous
-            previous = instant
-            row += np.uint64(1)
-        at += np.uint64(step)
-    return row - first, low, high, n_zeros, n_descents, n_bad
+    bits[0] = np.uint32(_ordered(order, is_whole))
+    return np.float64(bits[0]) if is_whole else np.float64(bits.view(np.float32)[0])
+
+
+@numba.njit(cache=True, nogil=True)
+def _n_descents(stamps, begin, end):  # type: ignore[no-untyped-def]  # noqa: ANN001, ANN202
+    """Count the instants that are before the one in front of them."""
+    n = 0
+    for i in range(np.uint64(begin), np.uint64(end)):
+        n += stamps[i] < stamps[i - np.uint64(1)]
+    return n
+
+
+@numba.njit(cache=True, nogil=True)
+def _n_unknown(rings, row, n):  # type: ignore[no-untyped-def]  # noqa: ANN001, ANN202
+    """Count the rings that are not known."""
+    n_unknown = 0
+    for i in range(np.uint64(row), np.uint64(row + n)):
+        n_unknown += rings[i] == RING_UNKNOWN
+    return n_unknown
