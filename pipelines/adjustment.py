@@ -151,15 +151,25 @@ def solve(
     Gauss-Newton; covariances may depend on the state and are taken anew at each step. Cost per
     step grows linearly with the blocks and with the third power of the unknowns.
     """
-    state = start
+    return _solve(linearise, move, start, linearise(start))
+
+
+def _solve(
+    linearise: Callable[[State], tuple[Observations, ...]],
+    move: Callable[[State, Array], State],
+    state: State,
+    groups: tuple[Observations, ...],
+) -> Solution[State]:
+    """Return the solution from a state and the observations at it."""
     for _ in range(_STEPS):
-        N, gradient = _normal_equations(linearise(state))
-        step = -np.einsum("...pq,...q->...p", _inverse(_regular(N)), gradient)
+        N, gradient = _normal_equations(groups)
+        step = -(_inverse(_regular(N)) @ gradient[..., None])[..., 0]
         state = move(state, step)
+        groups = linearise(state)
         if np.all(np.einsum("...p,...pq,...q->...", step, N, step) < _SETTLED):
-            groups = linearise(state)
-            N, _ = _normal_equations(groups)
-            return Solution(estimate=state, cov=_inverse(N), groups=groups)
+            return Solution(
+                estimate=state, cov=_inverse(_normal_equations(groups)[0]), groups=groups
+            )
     raise NotConvergedError(
         f"The adjustment did not settle within {_STEPS} steps; the approximate values are too far "
         "off or the observations contradict each other."
@@ -168,16 +178,14 @@ def solve(
 
 def _normal_equations(groups: tuple[Observations, ...]) -> tuple[Array, Array]:
     """Return the normal matrix and the gradient of half the weighted sum of squares."""
-    weighted = [np.linalg.solve(group.cov, group.J) for group in groups]
-    N = sum(
-        np.einsum("...kmp,...kmq->...pq", group.J, PJ)
-        for group, PJ in zip(groups, weighted, strict=True)
-    )
-    gradient = sum(
-        np.einsum("...kmp,...km->...p", PJ, group.residuals)
-        for group, PJ in zip(groups, weighted, strict=True)
-    )
-    return np.asarray(N), np.asarray(gradient)
+    summed: Array = np.zeros(())
+    for group in groups:
+        *problems, k, m, p = group.J.shape
+        columns = np.concatenate([group.J, group.residuals[..., None]], axis=-1)
+        weighted = np.linalg.solve(group.cov, columns).reshape(*problems, k * m, p + 1)
+        J = group.J.reshape(*problems, k * m, p)
+        summed = summed + np.swapaxes(J, -1, -2) @ weighted
+    return summed[..., :-1], summed[..., -1]
 
 
 def _inverse(matrix: Array) -> Array:
@@ -246,8 +254,9 @@ def adjust(
     4.3); the minimal detectable bias along the weakest axis is ``sqrt(lambda0 / e)``, ``e`` the
     smallest eigenvalue of the block of ``P Q_v P`` (Baarda 1968).
     """
-    dof = _degrees_of_freedom(linearise(start))
-    solution = solve(linearise, move, start)
+    first = linearise(start)
+    dof = _degrees_of_freedom(first)
+    solution = _solve(linearise, move, start, first)
     vtpv = sum(_vtpv(group) for group in solution.groups)
     noncentrality = float(ndtri(1.0 - test_level / 2.0) + ndtri(test_power))
     statistics = [_block_statistics(group, solution.cov) for group in solution.groups]
@@ -325,20 +334,17 @@ def external_reliabilities(adjustment: Adjustment[State], J_of_interest: Array) 
     A bias ``b`` moves the unknowns by ``Q_x J' P b`` and is just detectable when
     ``b' P Q_v P b = lambda0`` (Baarda 1968).
     """
-    shifts = []
+    shifts, first = [], 0
     for group in adjustment.groups:
         weights, tested = _testability(group, adjustment.cov)
+        biases = adjustment.detectable_biases[first : first + len(tested)]
+        first, is_open = first + len(tested), np.isinf(biases)
         effects = J_of_interest @ adjustment.cov @ np.swapaxes(group.J, -1, -2) @ weights
-        *_, weakest = _block_statistics(group, adjustment.cov)
-        for effect, block, is_open in zip(effects, tested, weakest == 0.0, strict=True):
-            worst = np.inf if is_open else _largest(effect @ np.linalg.solve(block, effect.T))
-            shifts.append(adjustment.noncentrality * np.sqrt(worst))
-    return np.array(shifts)
-
-
-def _largest(symmetric: Array) -> float:
-    """Return the largest eigenvalue of a symmetric matrix."""
-    return float(np.linalg.eigvalsh(symmetric)[-1])
+        tested[is_open] = np.eye(tested.shape[-1])
+        moved = effects @ np.linalg.solve(tested, np.swapaxes(effects, -1, -2))
+        worst = np.where(is_open, np.inf, np.linalg.eigvalsh(moved)[:, -1])
+        shifts.append(adjustment.noncentrality * np.sqrt(worst))
+    return np.concatenate(shifts)
 
 
 def snoop(

@@ -51,6 +51,30 @@ def cross(v: Array, w: Array) -> Array:
     return np.stack([y * c - z * b, z * a - x * c, x * b - y * a], axis=-1)
 
 
+def exp_rotation(phi: Array) -> Array:
+    """Return the rotations of rotation vectors.
+
+    Parameters
+    ----------
+    phi : (..., 3)
+        Rotation vectors [rad].
+
+    Returns
+    -------
+    (..., 3, 3)
+        Rotations.
+
+    Notes
+    -----
+    Rodrigues' formula, with quotients that hold for no turn too.
+    """
+    half = np.linalg.norm(phi, axis=-1)[..., None, None] / (2.0 * np.pi)
+    turn = skew(phi)
+    return np.asarray(
+        np.eye(3) + np.sinc(2.0 * half) * turn + 0.5 * np.sinc(half) ** 2 * turn @ turn
+    )
+
+
 def rot_x(angle: float) -> Array:
     """Return the rotation about x by an angle.
 
@@ -64,7 +88,8 @@ def rot_x(angle: float) -> Array:
     (3, 3)
         Rotation.
     """
-    return Rotation.from_euler("x", angle).as_matrix()
+    c, s = np.cos(angle), np.sin(angle)
+    return np.array([[1.0, 0.0, 0.0], [0.0, c, -s], [0.0, s, c]])
 
 
 def rot_y(angle: float) -> Array:
@@ -80,7 +105,8 @@ def rot_y(angle: float) -> Array:
     (3, 3)
         Rotation.
     """
-    return Rotation.from_euler("y", angle).as_matrix()
+    c, s = np.cos(angle), np.sin(angle)
+    return np.array([[c, 0.0, s], [0.0, 1.0, 0.0], [-s, 0.0, c]])
 
 
 def rot_z(angle: float) -> Array:
@@ -96,7 +122,8 @@ def rot_z(angle: float) -> Array:
     (3, 3)
         Rotation.
     """
-    return Rotation.from_euler("z", angle).as_matrix()
+    c, s = np.cos(angle), np.sin(angle)
+    return np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
 
 
 def rigid(R: ArrayLike, t: ArrayLike) -> Array:

@@ -10,9 +10,9 @@ from dataclasses import dataclass, field, replace
 from math import comb
 from typing import NamedTuple
 
+import numba
 import numpy as np
 from scipy.spatial import cKDTree
-from scipy.spatial.transform import Rotation
 
 from pipelines.adjustment import Observations, Solution, solve
 from pipelines.config import ResectionConfig
@@ -22,8 +22,8 @@ from pipelines.errors import (
     NoMatchError,
     SolveError,
 )
-from pipelines.geometry import levelling_rotation, rigid, rot_z, skew, transform
-from pipelines.values import Array, ControlMarks, Index, MarkerFits, Mask
+from pipelines.geometry import exp_rotation, levelling_rotation, rigid, rot_z, skew, transform
+from pipelines.values import Array, ControlMarks, Index, MarkerFits
 
 _N_CANDIDATES = 300_000  # pairs of pairs that are compared at most; more find nothing new
 _N_HYPOTHESES = 1000  # poses that are looked at; the true one has many votes
@@ -115,6 +115,9 @@ class _Hypotheses(NamedTuple):
 
     yaws: Array
     translations: Array
+
+
+_AS_IT_IS = _Hypotheses(np.zeros(1), np.zeros((1, 3)))
 
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
@@ -398,26 +401,32 @@ def observe(scene: Scene, pairs: Index, T: Array) -> tuple[Observations, Observa
         Centres (k blocks of 3 [m]) and gravity (one block of 2 [rad]).
     """
     R, t = T[..., :3, :3], T[..., :3, 3]
-    turned = np.einsum("...ij,...kj->...ki", R, scene.centres_base[pairs[..., 0]])
-    p_site = turned + t[..., None, :]
-    cov_site = R[..., None, :, :] @ scene.cov_centres[pairs[..., 0]]
-    cov_site = cov_site @ np.swapaxes(R, -1, -2)[..., None, :, :]
-    eye = np.broadcast_to(np.eye(3), (*p_site.shape, 3))
+    turned, back = R[..., None, :, :], np.swapaxes(R, -1, -2)
+    p_site = scene.centres_base[pairs[..., 0]] @ back + t[..., None, :]
     centres = Observations(
         residuals=p_site - scene.marks_site[pairs[..., 1]],
-        J=np.concatenate([-skew(p_site), eye], axis=-1),
-        cov=cov_site + scene.cov_marks[pairs[..., 1]],
+        J=_by_motion(p_site),
+        cov=turned @ scene.cov_centres[pairs[..., 0]] @ back[..., None, :, :]
+        + scene.cov_marks[pairs[..., 1]],
     )
     up = R @ scene.R_station_base[2]
     J_up = scene.sigma_level * (R @ scene.J_up)[..., :2, :]
+    J = np.zeros((*up.shape[:-1], 1, 2, 6))
+    J[..., 0, :, :3] = -skew(up)[..., :2, :]
     gravity = Observations(
         residuals=up[..., None, :2],
-        J=np.concatenate([-skew(up)[..., :2, :], np.zeros((*up.shape[:-1], 2, 3))], axis=-1)[
-            ..., None, :, :
-        ],
+        J=J,
         cov=(J_up @ np.swapaxes(J_up, -1, -2))[..., None, :, :],
     )
     return centres, gravity
+
+
+def _by_motion(p: Array) -> Array:
+    """Return the derivative of places, (..., 3), by a small motion on the left, (..., 3, 6)."""
+    J = np.zeros((*p.shape, 6))
+    J[..., :3] = -skew(p)
+    J[..., 0, 3] = J[..., 1, 4] = J[..., 2, 5] = 1.0
+    return J
 
 
 def moved(T: Array, xi: Array) -> Array:
@@ -435,9 +444,8 @@ def moved(T: Array, xi: Array) -> Array:
     (..., 4, 4)
         ``Exp(xi) T`` up to the square of ``xi``; rotations stay rotations.
     """
-    turn = Rotation.from_rotvec(xi[..., :3]).as_matrix()
     out = np.array(T)
-    out[..., :3, :] = turn @ T[..., :3, :]
+    out[..., :3, :] = exp_rotation(xi[..., :3]) @ T[..., :3, :]
     out[..., :3, 3] += xi[..., 3:]
     return out
 
@@ -604,70 +612,110 @@ def _solutions(
     """Return refined matches that differ from each other, the best first."""
     if not len(hypotheses.yaws):
         return []
-    placed = _turned(levelled, hypotheses.yaws[:, None]) + hypotheses.translations[:, None]
     reach = float(np.linalg.norm(levelled, axis=1).max())
     slack = 1.0 + 3.0 * scene.sigma_level * reach / config.match_tolerance
-    marks, scores = _assigned(placed, scene.marks_site, config.match_tolerance, slack)
+    marks, scores = _assigned(levelled, hypotheses, scene.marks_site, config.match_tolerance, slack)
+    counts = np.count_nonzero(marks >= 0, axis=1)
     solutions: list[tuple[float, Match]] = []
     for _ in range(_N_SOLUTIONS):
         best = int(np.argmax(scores))
         if scores[best] <= 0:
             break
         refined = None
-        if np.sum(marks[best] >= 0) >= _RIVAL_SHARE * max((m.n for _, m in solutions), default=0):
+        if counts[best] >= _RIVAL_SHARE * max((m.n for _, m in solutions), default=0):
             yaw, translation = hypotheses.yaws[best], hypotheses.translations[best]
             T = rigid(rot_z(yaw) @ scene.R_station_base, translation)
             refined = _refined(marks[best], T, scene, config)
-        shared = np.sum((marks == marks[best]) & (marks[best] >= 0), axis=1)
+        shared = _agreements(marks, marks[best])
         if refined is not None:
             solutions.append(refined)
-            same = np.sum((marks == refined[1].marks) & (refined[1].marks >= 0), axis=1)
-            shared = np.maximum(shared, same)
-        scores[2 * shared >= np.sum(marks >= 0, axis=1)] = 0.0
+            shared = np.maximum(shared, _agreements(marks, refined[1].marks))
+        scores[2 * shared >= counts] = 0.0
         scores[best] = 0.0
     return [match for _, match in sorted(solutions, key=lambda item: -item[0])]
 
 
+@numba.njit(cache=True, nogil=True)
+def _agreements(marks: Index, others: Index) -> Index:
+    """Return how many fits have the same mark in each match, (h, n), and in another one, (n,)."""
+    counts = np.zeros(len(marks), dtype=np.intp)
+    for h in range(len(marks)):
+        for i in range(len(others)):
+            counts[h] += others[i] >= 0 and marks[h, i] == others[i]
+    return counts
+
+
 def _assigned(
-    placed: Array, marks_site: Array, tolerance: float, slack: float
+    p: Array, hypotheses: _Hypotheses, marks_site: Array, tolerance: float, slack: float
 ) -> tuple[Index, Array]:
-    """Return, for poses, (h, n, 3) of placed fits, the mark of each fit or -1, and a score.
+    """Return, for each hypothesis, the mark of each fit or -1, (h, n), and a score, (h,).
 
     Heights count less by ``slack``. A mark goes to the fit that is nearest. The score of a matched
     fit falls from 1 to 0 with the square of its distance (MSAC, Torr and Zisserman 2000).
     """
-    scale = np.array([1.0, 1.0, 1.0 / slack])
-    h, n = placed.shape[:2]
-    p = placed.reshape(-1, 3)
-    found = np.flatnonzero(_beside_marks(p, marks_site, tolerance))
-    distances, marks = cKDTree(marks_site * scale).query(
-        p[found] * scale, distance_upper_bound=tolerance
-    )
-    near = np.isfinite(distances)
-    found, distances, marks = found[near], np.asarray(distances)[near], np.asarray(marks)[near]
-    keys = (found // n) * len(marks_site) + marks
-    order = np.lexsort((distances, keys))
-    winners = order[np.unique(keys[order], return_index=True)[1]]
-    out = np.full(h * n, -1, dtype=np.intp)
-    out[found[winners]] = marks[winners]
-    gains = np.zeros(h * n)
-    gains[found[winners]] = 1.0 - (distances[winners] / tolerance) ** 2
-    return out.reshape(h, n), gains.reshape(h, n).sum(axis=1)
+    eastwards = np.argsort(marks_site[:, 0])
+    extent = float(np.ptp(marks_site[:, 0]))
+    side = max(tolerance, extent / _N_CELLS)
+    cells = marks_site[eastwards[0], 0] + side * np.arange(int(extent / side) + 2)
+    starts = np.searchsorted(marks_site[eastwards, 0], cells)
+    table = (eastwards, marks_site[eastwards], cells, starts)
+    marks = np.full((len(hypotheses.yaws), len(p)), -1, dtype=np.intp)
+    return marks, _assign(p, hypotheses, table, (tolerance, slack), marks)
 
 
-def _beside_marks(p: Array, marks_site: Array, tolerance: float) -> Mask:
-    """Return which points lie in a cell of a map that touches a mark's: all nearer are among them.
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _assign(
+    p: Array,
+    hypotheses: _Hypotheses,
+    table: tuple[Index, Array, Array, Index],
+    limits: tuple[float, float],
+    marks: Index,
+) -> Array:
+    """Fill in marks, of which there are none yet, and return scores.
 
-    Most poses put most fits where no mark is, and a look at the map costs less than a search.
+    ``table`` are the marks from west to east, and where each of some cells begins among them.
     """
-    low = marks_site[:, :2].min(axis=0)
-    side = max(tolerance, float(np.ptp(marks_site[:, :2], axis=0).max()) / _N_CELLS)
-    cells = np.zeros((_N_CELLS + 4, _N_CELLS + 4), dtype=np.bool_)
-    x, y = ((marks_site[:, :2] - low) // side).astype(np.intp).T + 2
-    around = np.arange(-1, 2)
-    cells[(x[:, None] + around)[:, :, None], (y[:, None] + around)[:, None, :]] = True
-    i, j = np.clip((p[:, :2] - low) // side + 2.0, 0.0, _N_CELLS + 3.0).astype(np.intp).T
-    return np.asarray(cells[i, j])
+    n, scores = len(p), np.zeros(len(marks))
+    near, squares = np.empty(n, dtype=np.intp), np.empty(n)
+    owners = np.full(len(table[0]), -1, dtype=np.intp)
+    for h in range(len(marks)):
+        c, s = np.cos(hypotheses.yaws[h]), np.sin(hypotheses.yaws[h])
+        t = hypotheses.translations[h]
+        for i in range(n):
+            x, y, z = c * p[i, 0] - s * p[i, 1], s * p[i, 0] + c * p[i, 1], p[i, 2]
+            near[i], squares[i] = _nearest((x + t[0], y + t[1], z + t[2]), table, limits)
+            owner = owners[near[i]] if near[i] >= 0 else i
+            if near[i] >= 0 and (owner < 0 or squares[i] < squares[owner]):
+                owners[near[i]] = i
+        for i in range(n):
+            if near[i] >= 0 and owners[near[i]] == i:
+                marks[h, i] = table[0][near[i]]
+                scores[h] += 1.0 - squares[i] / limits[0] ** 2
+        for i in range(n):
+            if near[i] >= 0:
+                owners[near[i]] = -1
+    return scores
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _nearest(
+    place: tuple[float, float, float],
+    table: tuple[Index, Array, Array, Index],
+    limits: tuple[float, float],
+) -> tuple[int, float]:
+    """Return the nearest mark, in the order of the table, or -1; and the square of its distance."""
+    (x, y, z), (_, marks, cells, starts), (tolerance, slack) = place, table, limits
+    best, least = -1, tolerance * tolerance
+    side = cells[1] - cells[0]
+    cell = min(max(int((x - tolerance - cells[0]) / side), 0), len(cells) - 1)
+    for j in range(starts[cell], len(marks)):
+        if marks[j, 0] > x + tolerance:
+            break
+        dx, dy, dz = marks[j, 0] - x, marks[j, 1] - y, (marks[j, 2] - z) / slack
+        square = dx * dx + dy * dy + dz * dz
+        if square < least:
+            best, least = j, square
+    return best, least
 
 
 def _refined(
@@ -683,8 +731,8 @@ def _refined(
         except SolveError:
             return None
         T = solution.estimate
-        placed = transform(T, scene.centres_base)[None]
-        again, scores = _assigned(placed, scene.marks_site, config.match_tolerance, 1.0)
+        placed = transform(T, scene.centres_base)
+        again, scores = _assigned(placed, _AS_IT_IS, scene.marks_site, config.match_tolerance, 1.0)
         if np.array_equal(again[0], marks):
             residuals = solution.groups[0].residuals
             return float(scores[0]), Match(

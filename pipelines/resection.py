@@ -15,7 +15,7 @@ import numpy as np
 from pipelines.adjustment import Adjustment, adjust, external_reliabilities, snoop
 from pipelines.config import ResectionConfig
 from pipelines.errors import ConfigError, DegenerateGeometryError, NoMarkersError
-from pipelines.geometry import included_angle, inverse, is_on_a_line, rigid, skew, transform
+from pipelines.geometry import cross, included_angle, inverse, is_on_a_line, rigid, skew, transform
 from pipelines.matching import (
     Match,
     Scene,
@@ -340,7 +340,7 @@ def _cov_choice(scene: Scene, shifts: Array, T_site_base: Array) -> Array:
 def _turn(scene: Scene, T_site_base: Array) -> Array:
     """Return the small motion, (6,), that turns a station about its own plumb line by 1 rad."""
     up = T_site_base[:3, :3] @ scene.R_station_base[2]
-    return np.concatenate([up, np.cross(T_site_base[:3, 3], up)])
+    return np.concatenate([up, cross(T_site_base[:3, 3], up)])
 
 
 def _position_by_motion(T: Array) -> Array:
