@@ -5,7 +5,6 @@ from __future__ import annotations
 import secrets
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
-from pathlib import Path
 from typing import Any
 
 import duckdb
@@ -17,7 +16,7 @@ from storage.database import fetch
 from storage.lists import page_of
 from storage.records import JobRecord, JobStatus, Page, RunRecord, job_of, json_text, run_of
 from storage.surveys import Surveys, check_name, now
-from storage.tables import append, check_tables, planned_results, read_truth
+from storage.tables import check_tables
 
 _NO_OPTIONS: Mapping[str, Any] = {}
 
@@ -52,19 +51,8 @@ ORDER BY finished_at DESC, run_id DESC LIMIT $n
 class Catalogue(Surveys):
     """The results, the surveys that they belong to, and the jobs that made them.
 
-    Parameters
-    ----------
-    path : Path
-        The DuckDB file, as for a ``Database``.
-    snapshots : Path
-        Folder for the copies that others read.
-    memory_limit : str
-        What DuckDB may use before it spills to disk, in its own words.
+    Opened as a ``Database`` is: with the path of the file and a folder for snapshots.
     """
-
-    def __init__(self, path: Path, *, snapshots: Path, memory_limit: str = "1GB") -> None:
-        super().__init__(path, snapshots=snapshots, memory_limit=memory_limit)
-        self._results = planned_results(self._writer)
 
     def create_job(
         self,
@@ -242,13 +230,10 @@ class Catalogue(Surveys):
             if status is JobStatus.SUCCESSFUL:
                 return
             _require(job_id, status, JobStatus.RUNNING)
-            truth = read_truth(cursor, survey_id)
+            truth = self._tables.truth(survey_id)
             compared = adjustments.with_errors(results.with_errors(tables, truth), truth)
             for name, table in compared.items():
-                if name in self._results:
-                    self._results[name].run(table)
-                else:
-                    append(cursor, name, table)
+                self._tables.append(name, table)
             cursor.execute(
                 "UPDATE jobs SET status = 'successful', progress_percent = 100, "
                 "message = ?, finished_at = ? WHERE job_id = ?",

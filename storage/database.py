@@ -318,32 +318,39 @@ class Planned:
     def __init__(
         self, cursor: duckdb.DuckDBPyConnection, name: str, sql: str, schema: pa.Schema
     ) -> None:
-        self.schema = schema
-        self._rows = schema.empty_table()
         self._cursor = cursor
         self._call = f"EXECUTE planned_{name}"
-        cursor.register(f"incoming_{name}", self)
+        self._incoming = _Incoming(schema)
+        cursor.register(f"incoming_{name}", self._incoming)
         cursor.execute(f"PREPARE planned_{name} AS {sql}")
 
     def run(self, rows: pa.Table) -> None:
-        """Run the statement on some rows, on its cursor; without rows do nothing.
+        """Run the statement on some rows, on its cursor.
 
         Parameters
         ----------
         rows : Table
             In the columns of the schema.
         """
-        if not rows.num_rows:
-            return
-        self._rows = rows if rows.schema.equals(self.schema) else rows.cast(self.schema)
+        schema = self._incoming.schema
+        self._incoming.rows = rows if rows.schema.equals(schema) else rows.cast(schema)
         try:
             self._cursor.execute(self._call)
         finally:
-            self._rows = self.schema.empty_table()
+            self._incoming.rows = None
+
+
+class _Incoming:
+    """Rows that are others each time, in the same columns."""
+
+    def __init__(self, schema: pa.Schema) -> None:
+        self.schema = schema
+        self.rows: pa.Table | None = None
 
     def __arrow_c_stream__(self, requested_schema: object = None) -> object:
-        """Return the rows of this run as a stream; DuckDB asks for it."""
-        return self._rows.__arrow_c_stream__(requested_schema)
+        """Return the rows as a stream; DuckDB asks for it, before there are any too."""
+        rows = self.schema.empty_table() if self.rows is None else self.rows
+        return rows.__arrow_c_stream__(requested_schema)
 
 
 def execute_on(cursor: duckdb.DuckDBPyConnection, sql: str, table: pa.Table) -> None:

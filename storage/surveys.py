@@ -7,6 +7,7 @@ import re
 import secrets
 from collections.abc import Mapping
 from datetime import UTC, datetime
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -30,7 +31,7 @@ from storage.records import (
     survey_of,
     true_stops_table,
 )
-from storage.tables import append, read_truth, refresh_errors
+from storage.tables import Tables, read_truth
 
 _DIGEST = re.compile(r"[0-9a-f]{64}")
 _VERDICTS = ("ok", "weak", "refused")
@@ -74,8 +75,19 @@ _CONTROL = "SELECT * FROM control_marks WHERE survey_id = $id ORDER BY place"
 class Surveys(Lists):
     """What people gave: surveys with their marks and truth, logs, rigs.
 
-    Opened as a ``Database`` is: with the path of the file and a folder for snapshots.
+    Parameters
+    ----------
+    path : Path
+        The DuckDB file, as for a ``Database``.
+    snapshots : Path
+        Folder for the copies that others read.
+    memory_limit : str
+        What DuckDB may use before it spills to disk, in its own words.
     """
+
+    def __init__(self, path: Path, *, snapshots: Path, memory_limit: str = "1GB") -> None:
+        super().__init__(path, snapshots=snapshots, memory_limit=memory_limit)
+        self._tables = Tables(self._writer)
 
     # Surveys, their marks and their truth
 
@@ -172,7 +184,7 @@ class Surveys(Lists):
         for axis, name in enumerate(("sigma_x_m", "sigma_y_m", "sigma_z_m")):
             table = table.append_column(name, pa.array(sigmas[:, axis]))
         with self.writing() as cursor:
-            append(cursor, "control_marks", table)
+            self._tables.append("control_marks", table)
             cursor.execute(
                 "DELETE FROM control_marks WHERE survey_id = ? AND NOT list_contains(?, mark)",
                 [survey_id, list(marks.names)],
@@ -220,17 +232,17 @@ class Surveys(Lists):
         check_marks(truth.marks)
         survey_id = self.get_survey(survey).survey_id
         with self.writing() as cursor:
-            append(cursor, "true_marks", marks_table(survey_id, truth.marks))
+            self._tables.append("true_marks", marks_table(survey_id, truth.marks))
             cursor.execute(
                 "DELETE FROM true_marks WHERE survey_id = ? AND NOT list_contains(?, mark)",
                 [survey_id, list(truth.marks.names)],
             )
-            append(cursor, "true_stops", true_stops_table(survey_id, truth.stops))
+            self._tables.append("true_stops", true_stops_table(survey_id, truth.stops))
             cursor.execute(
                 "INSERT OR REPLACE INTO true_worlds VALUES (?, ?, ?)",
                 [survey_id, rig_text(truth), json_text(truth.about)],
             )
-            refresh_errors(cursor, survey_id)
+            self._tables.refresh_errors(survey_id)
 
     def truth(self, survey: str) -> Truth | None:
         """Return the truth of a survey (id or name); None when it is not known.
@@ -375,9 +387,9 @@ class Surveys(Lists):
             Its digest.
         """
         digest = rig_digest(rig)
-        with self.writing() as cursor:
-            row = {"rig_digest": digest, "name": rig.name, "rig": json_text(rig_to_mapping(rig))}
-            append(cursor, "rigs", pa.Table.from_pylist([row]))
+        row = {"rig_digest": digest, "name": rig.name, "rig": json_text(rig_to_mapping(rig))}
+        with self.writing():
+            self._tables.append("rigs", pa.Table.from_pylist([row]))
         return digest
 
     def get_rig(self, digest: str) -> Rig:

@@ -107,7 +107,7 @@ _REFRESH = {
             AND x.marks = i.marks
     """,
 }
-_RIG_IS_KNOWN = "SELECT 1 FROM rigs WHERE rig_digest = ?"  # most are: a quarter of an INSERT
+_RIGS = "SELECT rig_digest FROM rigs"
 _PUT_RIG = "INSERT INTO rigs (rig_digest, name, rig) VALUES ($rig_digest, $name, $rig)"
 
 
@@ -129,70 +129,95 @@ def check_tables(tables: Mapping[str, pa.Table]) -> None:
         raise InputError(f"No job writes {unknown[0]!r}; it writes {', '.join(_OF_JOBS)}.")
 
 
-def planned_results(cursor: duckdb.DuckDBPyConnection) -> dict[str, Planned]:
-    """Plan how rows enter the tables of results.
+class Tables:
+    """The tables, as the one who writes them all sees them.
 
     Parameters
     ----------
     cursor : DuckDBPyConnection
-        The one that will write them; not inside a transaction.
+        The only one that writes; not inside a transaction yet, but whenever something is appended
+        or taken anew.
 
-    Returns
-    -------
-    dict of str to Planned
-        One statement for each of ``results.TABLES`` but that of rigs.
+    Notes
+    -----
+    A statement costs about a millisecond. Those for results are planned once, and what nobody else
+    can have changed is not read again: rigs that are there, and truths.
     """
-    return {
-        name: Planned(cursor, name, sql, results.SCHEMAS[name])
-        for name, sql in _INSERT_RESULTS.items()
-    }
 
+    def __init__(self, cursor: duckdb.DuckDBPyConnection) -> None:
+        self._cursor = cursor
+        self._planned = {
+            name: Planned(cursor, name, sql, results.SCHEMAS[name])
+            for name, sql in _INSERT_RESULTS.items()
+        }
+        self._rigs: set[str] = set()
+        self._truths: dict[str, Truth | None] = {}
 
-def append(cursor: duckdb.DuckDBPyConnection, name: str, table: pa.Table) -> None:
-    """Append rows to a table other than those of ``planned_results``.
+    def append(self, name: str, table: pa.Table) -> None:
+        """Append rows to a table.
 
-    Parameters
-    ----------
-    cursor : DuckDBPyConnection
-        Inside a transaction.
-    name : str
-        The table.
-    table : Table
-        Its rows; a rig that is known already is not written again.
-    """
-    if not table.num_rows:
-        return
-    if name == "rigs":
-        for row in table.to_pylist():
-            if not cursor.execute(_RIG_IS_KNOWN, [row["rig_digest"]]).fetchall():
-                cursor.execute(_PUT_RIG, row)
-    else:
-        execute_on(cursor, _INSERT[name], table)
+        Parameters
+        ----------
+        name : str
+            The table.
+        table : Table
+            Its rows; a rig that is there already is not written again.
+        """
+        if not table.num_rows:
+            return
+        if name in self._planned:
+            self._planned[name].run(table)
+        elif name == "rigs":
+            self._append_rigs(table)
+        else:
+            execute_on(self._cursor, _INSERT[name], table)
 
+    def _append_rigs(self, table: pa.Table) -> None:
+        """Append those rigs that are not there; only of these does the database have to tell."""
+        rows = {row["rig_digest"]: row for row in table.to_pylist()}
+        if rows.keys() <= self._rigs:
+            return
+        self._rigs = {digest for (digest,) in self._cursor.execute(_RIGS).fetchall()}
+        for digest in rows.keys() - self._rigs:
+            self._cursor.execute(_PUT_RIG, rows[digest])
 
-def refresh_errors(cursor: duckdb.DuckDBPyConnection, survey_id: str) -> None:
-    """Take the errors of a survey's results anew against the truth that is known now.
+    def truth(self, survey_id: str) -> Truth | None:
+        """Return the truth of a survey, as ``read_truth`` does.
 
-    Parameters
-    ----------
-    cursor : DuckDBPyConnection
-        Inside a transaction.
-    survey_id : str
-        The survey.
-    """
-    known = {
-        name: fetch(cursor, sql, {"id": survey_id}) for name, sql in _RESULTS_OF_SURVEY.items()
-    }
-    truth = read_truth(cursor, survey_id)
-    fresh = results.with_errors(known, truth)
-    for name, sql in _REFRESH.items():
-        execute_on(cursor, sql, fresh[name])
-    adjusted = {
-        name: fetch(cursor, sql, {"id": survey_id}) for name, sql in _ADJUSTED_OF_SURVEY.items()
-    }
-    fresh = adjustments.with_errors(adjusted, truth)
-    for name, sql in _REFRESH_ADJUSTED.items():
-        execute_on(cursor, sql, fresh[name])
+        Parameters
+        ----------
+        survey_id : str
+            The survey.
+
+        Returns
+        -------
+        Truth or None
+            As it was when it was last taken anew.
+        """
+        if survey_id not in self._truths:
+            self._truths[survey_id] = read_truth(self._cursor, survey_id)
+        return self._truths[survey_id]
+
+    def refresh_errors(self, survey_id: str) -> None:
+        """Take the errors of a survey's results anew against a truth that has changed.
+
+        Parameters
+        ----------
+        survey_id : str
+            The survey.
+        """
+        self._truths.pop(survey_id, None)  # and not kept: the transaction may fail
+        truth = read_truth(self._cursor, survey_id)
+        fresh = results.with_errors(self._fetched(_RESULTS_OF_SURVEY, survey_id), truth)
+        for name, sql in _REFRESH.items():
+            execute_on(self._cursor, sql, fresh[name])
+        fresh = adjustments.with_errors(self._fetched(_ADJUSTED_OF_SURVEY, survey_id), truth)
+        for name, sql in _REFRESH_ADJUSTED.items():
+            execute_on(self._cursor, sql, fresh[name])
+
+    def _fetched(self, queries: Mapping[str, str], survey_id: str) -> dict[str, pa.Table]:
+        """Return what queries say of a survey."""
+        return {name: fetch(self._cursor, sql, {"id": survey_id}) for name, sql in queries.items()}
 
 
 def read_truth(cursor: duckdb.DuckDBPyConnection, survey_id: str) -> Truth | None:
