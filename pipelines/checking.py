@@ -6,13 +6,14 @@ site. A station is then tried without each of its markers, and each mark predict
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
 from pipelines.config import ResectionConfig
 from pipelines.geometry import rigid, transform
-from pipelines.matching import Match, Scene, gather, match_marks, solve_pose
+from pipelines.many_stations import Sightings, adjust
+from pipelines.matching import Match, Scene, gather, match_marks
 from pipelines.ranging import circles, slope_ranges
 from pipelines.values import Array, ControlMarks, Index, MarkerFits, Mask, StationFix, _seal
 
@@ -70,7 +71,8 @@ class Omissions:
     ----------
     shifts : (n, 3)
         Position of the station without the marker, minus its position with all; NaN, as all else of
-        the row, where the other marks stand on one plumb line and tell no heading [m].
+        the row, where the other marks stand on one plumb line and tell no heading, or contradict
+        each other so that they tell no position [m].
     predictions : (n, 3)
         Where the scan puts the mark when the others alone position the station, minus where it is
         given [m].
@@ -253,24 +255,32 @@ def leave_each_out(
             cov_predictions=np.zeros((0, 3, 3)),
         )
     scene = gather(fits, marks, config)
-    if fix.dof == 3 * n - _N_POSE:
-        scene = replace(scene, sigma_level=_UNKNOWN)
+    sigma_level = _UNKNOWN if fix.dof == 3 * n - _N_POSE else scene.sigma_level
+    fit, mark = fix.matches.T
+    seen = Sightings(
+        p_base=scene.centres_base[fit],
+        cov_base=scene.cov_centres[fit],
+        marks=scene.marks_site[mark],
+        cov_marks=scene.cov_marks[mark],
+        up_base=scene.R_station_base[2],
+        J_up=sigma_level * scene.J_up,
+    )
     start = fix.T_site_station @ rigid(scene.R_station_base, np.zeros(3))
     start[:3, 3] -= scene.middle
-    all_at_once = solve_pose(scene, fix.matches[None], start[None]).estimate[0]
-    others = np.array([np.delete(fix.matches, k, axis=0) for k in range(n)])
-    rows = np.flatnonzero(_have_heading(scene.marks_site[others[..., 1]]))
-    without = solve_pose(scene, others[rows], np.tile(start, (len(rows), 1, 1)))
-    T, (fit, mark) = without.estimate, fix.matches[rows].T
+    every = np.arange(n)
+    others = np.tile(every, (n, 1))[~np.eye(n, dtype=np.bool_)].reshape(n, n - 1)
+    with_all, without = (adjust(chosen, seen, start) for chosen in (every[None], others))
+    is_told = without.is_settled & with_all.is_settled & _have_heading(seen.marks[others])
+    T = np.where(is_told[:, None, None], without.T, np.nan)
     R, t = T[:, :3, :3], T[:, :3, 3]
-    p = np.einsum("nij,nj->ni", R, scene.centres_base[fit]) + t
-    J = _by_motion(p)
-    cov = R @ scene.cov_centres[fit] @ np.swapaxes(R, 1, 2) + scene.cov_marks[mark]
-    shifts, predictions = (np.full((n, 3), np.nan) for _ in range(2))
-    shifts[rows], predictions[rows] = t - all_at_once[:3, 3], p - scene.marks_site[mark]
-    covs = np.full((n, 3, 3), np.nan)
-    covs[rows] = J @ without.cov @ np.swapaxes(J, 1, 2) + cov
-    return Omissions(shifts=shifts, predictions=predictions, cov_predictions=covs)
+    q = (R @ seen.p_base[:, :, None])[:, :, 0]
+    cov = R @ seen.cov_base @ np.swapaxes(R, 1, 2) + seen.cov_marks
+    J = _by_motion(q)
+    return Omissions(
+        shifts=t - with_all.T[0, :3, 3],
+        predictions=q + t - seen.marks,
+        cov_predictions=J @ without.cov @ np.swapaxes(J, 1, 2) + cov,
+    )
 
 
 def _have_heading(p: Array) -> Mask:

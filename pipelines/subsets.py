@@ -15,8 +15,8 @@ import numpy as np
 
 from pipelines.config import ResectionConfig
 from pipelines.errors import ConfigError
-from pipelines.few_marks import USELESS, Positions, SharedErrors, carry, meet, place, share
 from pipelines.geometry import cross, included_angle, rigid
+from pipelines.many_stations import USELESS, Positions, SharedErrors, carry, meet, place, share
 from pipelines.matching import Scene, gather, observe
 from pipelines.ranging import Measure, circles, influences, observe_distances, slope_ranges
 from pipelines.values import Array, ControlMarks, Index, MarkerFits, StationFix, SubsetFixes

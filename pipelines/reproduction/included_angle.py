@@ -17,7 +17,7 @@ from itertools import product
 
 import numpy as np
 
-from pipelines.few_marks import meet, place
+from pipelines.many_stations import meet, place
 from pipelines.study import GRANTED_DISTANCE, GRANTED_ERROR, TABLE_3
 from pipelines.subsets import angles_that_keep
 from pipelines.values import Array, _seal

@@ -1,8 +1,8 @@
-"""Stations from two or three marks each, hundreds of them at once: hides compiled loops.
+"""Stations from some of their marks, hundreds of them at once: hides compiled loops.
 
 Each station is a small problem of its own over some rows of common tables: centres with their
-marks and gravity, as the free station has them, or distances alone. Weights stay as they are at an
-approximate position; the geometry is taken anew at each step.
+marks and gravity, as the free station has them, or distances alone. The geometry is always taken
+anew at each step; the weights of ``place`` and ``meet`` stay as they are where these begin.
 """
 
 from __future__ import annotations
@@ -12,7 +12,6 @@ from typing import NamedTuple
 import numba
 import numpy as np
 
-from pipelines.geometry import skew
 from pipelines.values import Array, Index, Mask
 
 USELESS = 1.0
@@ -21,6 +20,8 @@ USELESS = 1.0
 _N_STEPS = 40
 _SETTLED = 1e-7  # [m] and [rad] of a step of Newton; steps shrink at least tenfold
 _MET = 1e-9  # [m] of a step between circles, which may shrink slowly
+_STILL = 1e-15  # square of a step in standard deviations
+_CLOSE = 1e-12  # of the last step, for poses that hardly move any more
 _USABLE = 1e-4  # [m] of the last step, for positions that hardly move any more
 _DAMPING = 1e-9  # of the trace of the normal matrix; keeps singular ones solvable
 
@@ -43,6 +44,51 @@ class Positions(NamedTuple):
     is_settled: Mask
 
 
+class Sightings(NamedTuple):
+    """What stations are adjusted from.
+
+    Attributes
+    ----------
+    p_base : (n, 3)
+        Centres [m].
+    cov_base : (n, 3, 3)
+        Their covariances [m^2].
+    marks : (n, 3)
+        The mark of each [m].
+    cov_marks : (n, 3, 3)
+        Their covariances [m^2].
+    up_base : (3,)
+        Measured up direction.
+    J_up : (3, 2)
+        What a sigma of roll and of pitch adds to it.
+    """
+
+    p_base: Array
+    cov_base: Array
+    marks: Array
+    cov_marks: Array
+    up_base: Array
+    J_up: Array
+
+
+class Poses(NamedTuple):
+    """How stations stand, and how sure that is.
+
+    Attributes
+    ----------
+    T : (s, 4, 4)
+        From base to the frame of the marks [m].
+    cov : (s, 6, 6)
+        Covariances of small motions (rotation about the station [rad], translation [m]).
+    is_settled : (s,) bool
+        Whether the steps became small.
+    """
+
+    T: Array
+    cov: Array
+    is_settled: Mask
+
+
 class SharedErrors(NamedTuple):
     """Errors of range and height that all centres have in common.
 
@@ -61,6 +107,29 @@ class SharedErrors(NamedTuple):
     variances: Array
     sigma_range: float
     sigma_height: float
+
+
+def adjust(chosen: Index, seen: Sightings, start: Array) -> Poses:
+    """Adjust stations to some of their centres and to gravity, as a station alone would be.
+
+    Parameters
+    ----------
+    chosen : (s, k)
+        Which centres each station has.
+    seen : Sightings
+        Centres, marks and gravity.
+    start : (4, 4)
+        Approximate pose, common to all [m].
+
+    Returns
+    -------
+    Poses
+        Where each weighted sum of squares is least, with weights as they are there.
+    """
+    n = len(chosen)
+    T, cov, last = np.tile(start, (n, 1, 1)), np.empty((n, 6, 6)), np.empty(n)
+    _adjust(chosen, *seen, T, cov, last)
+    return Poses(T, cov, last < _CLOSE)
 
 
 def place(
@@ -94,11 +163,9 @@ def place(
     Weights and normal matrices are those of the approximate pose; the gradient is exact, so that
     the steps end where the adjustment of each station alone would.
     """
-    J_up = -skew(up)[:2]
     n = len(chosen)
     motions, cov, last = np.zeros((n, 6)), np.empty((n, 6, 6)), np.zeros(n)
-    leaning = J_up.T @ of_gravity @ J_up
-    _place(chosen, q, goals, weights, up, of_gravity, leaning, motions, cov, last)
+    _place(chosen, q, goals, weights, up, of_gravity, motions, cov, last)
     return Positions(motions[:, 3:], cov, last < _USABLE)
 
 
@@ -182,20 +249,84 @@ def share(chosen: Index, errors: SharedErrors, cov: Array) -> Array:
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def _place(chosen, q, goals, weights, up, of_gravity, leaning, motions, cov, last):  # type: ignore[no-untyped-def]  # noqa: ANN001, ANN202, PLR0913
+def _adjust(chosen, p_base, cov_base, marks, cov_marks, up_base, J_up, T, cov, last):  # type: ignore[no-untyped-def]  # noqa: ANN001, ANN202, PLR0913
+    """Move each station by steps of Gauss and Newton; tell the square of the last in sigmas."""
+    N, gradient, weight = np.empty((6, 6)), np.empty(6), np.empty((3, 3))
+    of_gravity, step = np.empty((2, 2)), np.empty(6)
+    for s in range(len(chosen)):
+        last[s] = np.inf
+        for _ in range(_N_STEPS):
+            N[:] = 0.0
+            up = _times(T[s], up_base)
+            _weigh_gravity(T[s], J_up, of_gravity)
+            _add_gravity(up, of_gravity, N)
+            _lean(up, of_gravity, gradient)
+            for k in chosen[s]:
+                q = _times(T[s], p_base[k])
+                _weigh(T[s], cov_base[k], cov_marks[k], weight)
+                _add_centre(q, weight, N)
+                _add_slope(q, T[s, :3, 3], marks[k], weight, gradient)
+            _invert(N, cov[s])
+            if last[s] < _STILL:
+                break
+            last[s] = 0.0
+            for i in range(6):
+                step[i] = 0.0
+                for j in range(6):
+                    step[i] -= cov[s, i, j] * gradient[j]
+                last[s] -= step[i] * gradient[i]
+            _move(step, T[s])
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _weigh_gravity(T, J_up, of_gravity):  # type: ignore[no-untyped-def]  # noqa: ANN001, ANN202
+    """Find the inverse of the covariance of the horizontal part of the up direction."""
+    a, b = _times(T, J_up[:, 0]), _times(T, J_up[:, 1])
+    xx, xy, yy = a[0] ** 2 + b[0] ** 2, a[0] * a[1] + b[0] * b[1], a[1] ** 2 + b[1] ** 2
+    square = xx * yy - xy * xy
+    of_gravity[0, 0], of_gravity[1, 1] = yy / square, xx / square
+    of_gravity[0, 1] = of_gravity[1, 0] = -xy / square
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _weigh(T, cov_base, cov_mark, weight):  # type: ignore[no-untyped-def]  # noqa: ANN001, ANN202
+    """Find the inverse of the covariance of a centre's difference from its mark."""
+    cov = np.empty((3, 3))
+    for j in range(3):
+        cov[:, j] = _times(T, cov_base[j])
+    for i in range(3):
+        cov[i] = _times(T, cov[i])
+        for j in range(3):
+            cov[i, j] += cov_mark[i, j]
+    _invert(cov, weight)
+
+
+@numba.njit(cache=True, nogil=True)
+def _move(step, T):  # type: ignore[no-untyped-def]  # noqa: ANN001, ANN202
+    """Turn a pose about its own place, and shift it."""
+    R = np.empty((3, 3))
+    _rotation(step, R)
+    for j in range(3):
+        T[0, j], T[1, j], T[2, j] = _times(R, T[:3, j])
+        T[j, 3] += step[3 + j]
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _place(chosen, q, goals, weights, up, of_gravity, motions, cov, last):  # type: ignore[no-untyped-def]  # noqa: ANN001, ANN202, PLR0913
     """Move each station by steps of Newton until these are small; tell the size of the last."""
     R, N, gradient = np.empty((3, 3)), np.empty((6, 6)), np.empty(6)
     for s in range(len(chosen)):
         N[:] = 0.0
-        N[:3, :3] = leaning
+        _add_gravity(up, of_gravity, N)
         for k in chosen[s]:
             _add_centre(q[k], weights[k], N)
         _invert(N, cov[s])
         for _ in range(_N_STEPS):
             _rotation(motions[s], R)
-            _lean(up, of_gravity, R, gradient)
+            _lean(_times(R, up), of_gravity, gradient)
             for k in chosen[s]:
-                _add_slope(q[k], goals[k], weights[k], R, motions[s], gradient)
+                p = _times(R, q[k])
+                _add_slope(p, motions[s, 3:], goals[k], weights[k], gradient)
             last[s] = 0.0
             for i in range(6):
                 step = 0.0
@@ -222,23 +353,32 @@ def _add_centre(q, weight, N):  # type: ignore[no-untyped-def]  # noqa: ANN001, 
 
 
 @numba.njit(cache=True, nogil=True)
-def _lean(up, of_gravity, R, gradient):  # type: ignore[no-untyped-def]  # noqa: ANN001, ANN202
+def _add_gravity(up, of_gravity, N):  # type: ignore[no-untyped-def]  # noqa: ANN001, ANN202
+    """Add gravity to the normal matrix of small motions about the station."""
+    ways = (0.0, up[2], -up[1]), (-up[2], 0.0, up[0])  # crossed with the two axes
+    for a in range(2):
+        for b in range(2):
+            for i in range(3):
+                for j in range(3):
+                    N[i, j] += of_gravity[a, b] * ways[a][i] * ways[b][j]
+
+
+@numba.njit(cache=True, nogil=True)
+def _lean(up, of_gravity, gradient):  # type: ignore[no-untyped-def]  # noqa: ANN001, ANN202
     """Find the gradient of gravity's weighted square."""
-    leaning = _times(R, up)
-    x = leaning[0] * of_gravity[0, 0] + leaning[1] * of_gravity[1, 0]
-    y = leaning[0] * of_gravity[0, 1] + leaning[1] * of_gravity[1, 1]
-    turn = _cross(leaning, (x, y, 0.0))
+    x = up[0] * of_gravity[0, 0] + up[1] * of_gravity[1, 0]
+    y = up[0] * of_gravity[0, 1] + up[1] * of_gravity[1, 1]
+    turn = _cross(up, (x, y, 0.0))
     for i in range(3):
         gradient[i], gradient[3 + i] = turn[i], 0.0
 
 
 @numba.njit(cache=True, nogil=True)
-def _add_slope(q, goal, weight, R, motion, gradient):  # type: ignore[no-untyped-def]  # noqa: ANN001, ANN202
+def _add_slope(q, shift, goal, weight, gradient):  # type: ignore[no-untyped-def]  # noqa: ANN001, ANN202
     """Add the gradient of one centre's weighted square."""
-    p = _times(R, q)
-    off = p[0] + motion[3] - goal[0], p[1] + motion[4] - goal[1], p[2] + motion[5] - goal[2]
+    off = q[0] + shift[0] - goal[0], q[1] + shift[1] - goal[1], q[2] + shift[2] - goal[2]
     pull = _times(weight, off)
-    turn = _cross(p, pull)
+    turn = _cross(q, pull)
     for i in range(3):
         gradient[i] += turn[i]
         gradient[3 + i] += pull[i]
