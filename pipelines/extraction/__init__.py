@@ -17,10 +17,9 @@ the base): a few centimetres of axis offset do not change which returns look lik
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
 from pipelines.config import ExtractionConfig
-from pipelines.extraction.ball import Ball, blur_at, seen_from, view_of
+from pipelines.extraction.ball import Ball, blur_at
 from pipelines.extraction.cells import Cells, cells_of
 from pipelines.extraction.ground import ground_of
 from pipelines.extraction.looks import NOISE_MIN, Look, look_at
@@ -30,15 +29,14 @@ from pipelines.extraction.sights import Sight, sights
 from pipelines.extraction.verdicts import (
     distinct,
     is_resolved,
-    noise_among,
+    peers_among,
     score,
     spread_expected,
     verdict,
-    verdict_among_others,
+    verdict_among_peers,
     verdict_on_rivals,
     verdict_on_sight,
 )
-from pipelines.geometry import levelling_rotation
 from pipelines.values import (
     Index,
     MarkerCandidate,
@@ -83,55 +81,58 @@ def extract(
     opening of the lowest point per cell. Where no ground was seen it is unknown, and nothing is
     cut. Cost grows linearly with the returns.
     """
-    up = levelling_rotation(cloud.levelling)[2].copy()
-    ball = Ball(marker_radius, up, float(cloud.rig.divergence.max()))
     cells = cells_of(cloud, config)
+    ball = Ball(marker_radius, cells.R_station_base[2], float(cloud.rig.divergence.max()))
     ground = ground_of(cloud, cells, config)
     seeds = find_seeds(cloud.p_base, ground.rows_above, ball, config.n_points_min)
     looks = distinct(look_at(cloud, cells, seeds, ball), config, marker_radius)
-    verdicts = [verdict(look, config, ball) for look in looks]
-    verdicts, rows = _sighted(cloud, cells, looks, verdicts, ball)
-    good = [
-        (look, mine) for look, mine, reason in zip(looks, rows, verdicts, strict=True) if not reason
-    ]
-    bad = [(look, reason) for look, reason in zip(looks, verdicts, strict=True) if reason]
+    found, refused = _judged(cloud, cells, looks, config, ball)
     return MarkerCandidates(
-        candidates=_candidates(cloud, good, ball, config),
+        candidates=_candidates(found, ball, config),
         rejected=tuple(
             Rejection(p_base=look.p_base, n_points=look.n_points, reason=reason)
-            for look, reason in bad[:_REJECTIONS_MAX]
+            for look, reason in refused[:_REJECTIONS_MAX]
         ),
         ground_height_max=ground.height_max,
     )
 
 
-def _sighted(
-    cloud: StitchedCloud, cells: Cells, looks: list[Look], verdicts: list[str], ball: Ball
-) -> tuple[list[str], list[NDArray[np.int32]]]:
-    """Return the verdicts after a second look, at all beams towards and about what is left.
+def _judged(
+    cloud: StitchedCloud, cells: Cells, looks: list[Look], config: ExtractionConfig, ball: Ball
+) -> tuple[list[tuple[Look, Sight]], list[tuple[Look, str]]]:
+    """Return the groups that may be markers with what is seen of them, and why the others are not.
 
-    With them the returns that were looked at; none of what had been refused before.
+    What is left after a first look is looked at again, at all beams towards and about it.
     """
+    verdicts = [verdict(look, config, ball) for look in looks]
     left = [look for look, reason in zip(looks, verdicts, strict=True) if not reason]
     centres = np.array([look.p_base for look in left]).reshape(-1, 3)
     seen = sights(cloud, cells.directions, centres, ball)
-    reasons = [verdict_on_sight(look, sight, ball) for look, sight in zip(left, seen, strict=True)]
-    good = [
-        (look, sight) for look, sight, reason in zip(left, seen, reasons, strict=True) if not reason
+    later = _sighted(left, seen, ball)
+    found = [
+        (look, sight) for look, sight, reason in zip(left, seen, later, strict=True) if not reason
     ]
-    noise = noise_among([look for look, _ in good])
-    later = iter(
-        (
-            reason
-            or _rivalled(look, sight, ball, noise)
-            or verdict_among_others(look, sight, good, ball),
-            sight.rows,
-        )
-        for look, sight, reason in zip(left, seen, reasons, strict=True)
+    in_turn = iter(later)
+    reasons = [reason or next(in_turn) for reason in verdicts]
+    return found, [(look, reason) for look, reason in zip(looks, reasons, strict=True) if reason]
+
+
+def _sighted(looks: list[Look], seen: list[Sight], ball: Ball) -> list[str]:
+    """Return the verdicts on groups by what is seen of them, of other shapes and of each other."""
+    reasons = [verdict_on_sight(look, sight, ball) for look, sight in zip(looks, seen, strict=True)]
+    peers = peers_among(
+        [
+            (look, sight)
+            for look, sight, reason in zip(looks, seen, reasons, strict=True)
+            if not reason
+        ]
     )
-    nothing = np.zeros(0, np.int32)
-    both = [(reason, nothing) if reason else next(later) for reason in verdicts]
-    return [reason for reason, _ in both], [rows for _, rows in both]
+    return [
+        reason
+        or _rivalled(look, sight, ball, peers.noise)
+        or verdict_among_peers(look, sight, peers, ball)
+        for look, sight, reason in zip(looks, seen, reasons, strict=True)
+    ]
 
 
 def _rivalled(look: Look, sight: Sight, ball: Ball, noise: float) -> str:
@@ -144,35 +145,30 @@ def _rivalled(look: Look, sight: Sight, ball: Ball, noise: float) -> str:
 
 
 def _candidates(
-    cloud: StitchedCloud,
-    found: list[tuple[Look, NDArray[np.int32]]],
-    ball: Ball,
-    config: ExtractionConfig,
+    found: list[tuple[Look, Sight]], ball: Ball, config: ExtractionConfig
 ) -> tuple[MarkerCandidate, ...]:
     """Return candidates M01, M02 ... by azimuth, from looks and the returns about them."""
     in_turn = sorted(found, key=lambda one: np.arctan2(one[0].y, one[0].x))
     return tuple(
         MarkerCandidate(
             name=marker_name(place),
-            members=_members(cloud, rows, look, ball),
+            members=_members(look, sight, ball),
             p_base_rough=look.p_base,
             score=score(look, config, ball),
         )
-        for place, (look, rows) in enumerate(in_turn)
+        for place, (look, sight) in enumerate(in_turn)
     )
 
 
-def _members(cloud: StitchedCloud, rows: NDArray[np.int32], look: Look, ball: Ball) -> Index:
-    """Return the rows on and about a ball, ascending: its outline, and what of its pole touches.
+def _members(look: Look, sight: Sight, ball: Ball) -> Index:
+    """Return the rows on and about a ball, ascending: its outline, and what of its pole touches it.
 
     Of a ball that is seen very closely, only its middle: there the returns at its outline, which
     belong partly to what lies behind, would weigh more than the noise of all the others.
     """
-    seen = seen_from(
-        cloud.p_base.take(rows, axis=0).T.astype(np.float64), view_of(look.p_base, ball.up)
-    )
+    across, along, depth = sight.seen
     blur = blur_at(look.p_base, ball)
     reach = _MIDDLE * ball.radius if is_resolved(look, ball) else 1.5 * ball.radius + blur
-    is_about = np.hypot(seen[0], seen[1]) < reach
-    is_level = (seen[2] > -2.2 * ball.radius) & (seen[2] < 1.6 * ball.radius)
-    return np.asarray(rows[is_about & is_level], dtype=np.intp)
+    is_about = across * across + along * along < reach * reach
+    is_level = (depth > -2.2 * ball.radius) & (depth < 1.6 * ball.radius)
+    return np.asarray(sight.rows[is_about & is_level], dtype=np.intp)

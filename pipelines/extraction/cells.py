@@ -23,7 +23,7 @@ N_DIRECTIONS_SIDE = 128
 N_DIRECTIONS = 2 * N_DIRECTIONS_SIDE**2
 """Cells of directions."""
 
-_BLOCK = 2048  # returns whose coordinates stay in the cache while all is done with them
+_BLOCK = 512  # returns at a time: the next ones are fetched while all is done with these
 
 
 class Layout(NamedTuple):
@@ -89,14 +89,13 @@ def cells_of(cloud: StitchedCloud, config: ExtractionConfig) -> Cells:
         ),
         n,
     )
-    shape = (n_side, n_side)
-    lowest = np.minimum.reduce([each[:-1, 0] for each in extremes]).reshape(shape)
-    highest = np.maximum.reduce([each[:-1, 1] for each in extremes]).reshape(shape)
+    lowest, highest = _joined(extremes[0], extremes[-1], n_side)
     return Cells(layout, R, ground, directions, lowest, highest)
 
 
-def rows_in(cells: NDArray[np.integer], is_wanted: Mask) -> NDArray[np.int32]:
-    """Return the rows of the returns that lie in some cells.
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def rows_in(cells: NDArray[np.integer], is_wanted: Mask, first: int, end: int) -> NDArray[np.int32]:
+    """Return the rows, of those of a part, of the returns that lie in some cells.
 
     Parameters
     ----------
@@ -104,49 +103,20 @@ def rows_in(cells: NDArray[np.integer], is_wanted: Mask) -> NDArray[np.int32]:
         Cells of all returns.
     is_wanted : (m,)
         Whether a cell is wanted, for all numbers that occur.
+    first, end : int
+        The part: its first row, and the row behind its last.
 
     Returns
     -------
     (k,) int32
         Rows, ascending.
     """
-    parts = side_by_side(lambda first, end: _rows_in(cells, is_wanted, first, end), len(cells))
-    return np.concatenate(parts)
-
-
-@numba.njit(cache=True, nogil=True, error_model="numpy")
-def by_cell(
-    cells: NDArray[np.integer], rows: NDArray[np.int32], n_cells: int
-) -> tuple[NDArray[np.int64], NDArray[np.int32]]:
-    """Sort some returns by their cells, by counting.
-
-    Parameters
-    ----------
-    cells : (n,) int32 or uint16
-        Cells of all returns.
-    rows : (k,) int32
-        Those to be sorted.
-    n_cells : int
-        Cells that they may be in.
-
-    Returns
-    -------
-    starts : (n_cells + 1,)
-        Where those of each cell begin, and the end of the last.
-    places : (k,) int32
-        Where each of the rows goes.
-    """
-    starts = np.zeros(n_cells + 2, np.int64)  # of the cell before, until they have moved on
-    for row in rows:
-        starts[np.int64(cells[row]) + 2] += 1
-    for cell in range(n_cells):
-        starts[cell + 2] += starts[cell + 1]
-    places = np.empty(len(rows), np.int32)
-    for i in range(len(rows)):
-        cell_before = np.int64(cells[rows[i]]) + 1
-        places[i] = starts[cell_before]
-        starts[cell_before] += 1
-    return starts[:-1], places
+    rows = np.empty(end - first, np.int32)
+    n_rows = 0
+    for i in range(first, end):
+        rows[n_rows] = i  # kept only if the next one does not take its place
+        n_rows += is_wanted[np.uint32(cells[i])]
+    return rows[:n_rows]
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
@@ -199,6 +169,18 @@ def _sort(
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
+def _joined(extremes: Column, others: Column, n_side: int) -> tuple[Column, Column]:
+    """Return the lowest and the highest per cell of the ground, of two parts of the returns."""
+    lowest = np.empty((n_side, n_side), np.float32)
+    highest = np.empty((n_side, n_side), np.float32)
+    low, high = lowest.reshape(-1), highest.reshape(-1)
+    for i in range(n_side * n_side):
+        low[i] = min(extremes[i, 0], others[i, 0])
+        high[i] = max(extremes[i, 1], others[i, 1])
+    return lowest, highest
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def _unpack(flat: Column, x: Column, y: Column, z: Column) -> None:
     """Write the coordinates of a few returns side by side."""
     for i in range(len(x)):
@@ -229,16 +211,3 @@ def _ground_cells(
         row = min(np.int32(x[i] * per_edge + half), last)
         column = min(np.int32(y[i] * per_edge + half), last)
         cells[i] = row * n_side + column if is_near else beyond
-
-
-@numba.njit(cache=True, nogil=True, error_model="numpy")
-def _rows_in(
-    cells: NDArray[np.integer], is_wanted: Mask, first: int, end: int
-) -> NDArray[np.int32]:
-    """Return the rows, of those of a part, that lie in cells that are wanted."""
-    rows = np.empty(end - first, np.int32)
-    n_rows = 0
-    for i in range(first, end):
-        rows[n_rows] = i  # kept only if the next one does not take its place
-        n_rows += is_wanted[np.uint32(cells[i])]
-    return rows[:n_rows]

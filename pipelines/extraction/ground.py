@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from pipelines.config import ExtractionConfig
 from pipelines.extraction.cells import Cells, rows_in
+from pipelines.threads import side_by_side
 from pipelines.values import Array, Column, Mask, StitchedCloud
 
 _STUDY_FIELD = 10.0  # [m] from the station: where the study looks for its highest ground point
@@ -58,9 +59,19 @@ def ground_of(cloud: StitchedCloud, cells: Cells, config: ExtractionConfig) -> G
     ground = _ground(lowest, _opened(lowest, _GROUND_WINDOW), _GROUND_WINDOW)
     v_up, clearance = cells.R_station_base[2], config.ground_clearance
     is_mixed, field_highest = _mixed(cells, ground, min(clearance, _GROUND_RISE))
-    rows = rows_in(cells.ground, is_mixed)
-    rows, high = _above(cloud.p_base, v_up, cells.ground, rows, ground.ravel(), clearance)
-    return Ground(rows, max(field_highest, high))
+    parts = side_by_side(
+        lambda first, end: _above(
+            cloud.p_base,
+            v_up,
+            cells.ground,
+            rows_in(cells.ground, is_mixed, first, end),
+            ground.ravel(),
+            clearance,
+        ),
+        len(cloud.p_base),
+    )
+    rows = np.concatenate([rows for rows, _ in parts])
+    return Ground(rows, max(field_highest, *(highest for _, highest in parts)))
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
@@ -145,7 +156,8 @@ def _mixed(cells: Cells, ground: Column, rise_max: float) -> tuple[Mask, float]:
             low, high, base = cells.lowest[i, j], cells.highest[i, j], ground[i, j]
             if low == np.inf:
                 continue
-            away = edge * np.hypot(i + 0.5 - 0.5 * n, j + 0.5 - 0.5 * n)
+            x, y = i + 0.5 - 0.5 * n, j + 0.5 - 0.5 * n
+            away = edge * np.sqrt(x * x + y * y)
             slack = edge + lean * (max(abs(low), abs(high)) + away + 1.0)
             is_known = high - base <= rise_max - 1e-4 and base < np.inf
             if not is_known or abs(away - _STUDY_FIELD) <= slack:

@@ -6,13 +6,14 @@ matter.
 
 from __future__ import annotations
 
+from itertools import accumulate
 from typing import NamedTuple
 
 import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from pipelines.extraction.cells import Cells, by_cell, rows_in
+from pipelines.extraction.cells import Cells, rows_in
 from pipelines.threads import side_by_side
 from pipelines.values import Array, Column, Mask
 
@@ -27,7 +28,7 @@ class Patches(NamedTuple):
 
     Attributes
     ----------
-    starts : (n_side ** 2 + 1,)
+    starts : (n_side ** 2 + 2,) int32
         The returns of a cell are ``points[starts[cell]:starts[cell + 1]]``.
     points : (m, 3) float32
         The returns themselves [m].
@@ -41,7 +42,7 @@ class Patches(NamedTuple):
         How far about a seed returns are looked at [m].
     """
 
-    starts: NDArray[np.int64]
+    starts: NDArray[np.int32]
     points: Column
     n_side: int
     edge: float
@@ -71,11 +72,35 @@ def patches_about(p_base: Column, cells: Cells, seeds: Array, radius: float) -> 
     reach, layout = _REACH * radius, cells.layout
     margin = int(np.ceil(reach / layout.edge)) + 1
     is_wanted = _wanted(layout.n_side, _cells_at(seeds, cells), margin)
-    rows = rows_in(cells.ground, is_wanted)
-    starts, places = by_cell(cells.ground, rows, len(is_wanted) - 1)
-    points = np.empty((len(rows), 3), np.float32)
-    side_by_side(lambda i, j: _place(p_base, rows[i:j], places[i:j], points), len(rows))
+    starts, points = _sorted(p_base, cells.ground, is_wanted)
     return Patches(starts, points, layout.n_side, layout.edge, cells.R_station_base, reach)
+
+
+def _sorted(
+    p_base: Column, cells: NDArray[np.int32], is_wanted: Mask
+) -> tuple[NDArray[np.int32], Column]:
+    """Sort the returns in some cells by cell, by counting; those of a cell stay in their order.
+
+    Each part of the returns is counted on its own, and later finds its places behind those of the
+    parts before.
+    """
+
+    def counted(first: int, end: int) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
+        rows = rows_in(cells, is_wanted, first, end)
+        return rows, _counts(cells, rows, len(is_wanted))
+
+    parts = side_by_side(counted, len(p_base))
+    starts = np.zeros(len(is_wanted) + 1, np.int32)
+    np.cumsum(sum(counts for _, counts in parts), out=starts[1:])
+    points = np.empty((starts[-1], 3), np.float32)
+    places = accumulate((counts for _, counts in parts[:-1]), initial=starts[:-1].copy())
+    jobs = [(rows, begin) for (rows, _), begin in zip(parts, places, strict=True)]
+    side_by_side(
+        lambda first, end: [_place(p_base, cells, *job, points) for job in jobs[first:end]],
+        len(jobs),
+        worth=2,
+    )
+    return starts, points
 
 
 def _cells_at(p_base: Array, cells: Cells) -> NDArray[np.int64]:
@@ -176,11 +201,25 @@ def _wanted(n_side: int, seed_cells: NDArray[np.int64], margin: int) -> Mask:
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
+def _counts(cells: NDArray[np.int32], rows: NDArray[np.int32], n_cells: int) -> NDArray[np.int32]:
+    """Return how many of some returns each cell holds."""
+    counts = np.zeros(n_cells, np.int32)
+    for row in rows:
+        counts[cells[row]] += 1
+    return counts
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def _place(
-    p_base: Column, rows: NDArray[np.int32], places: NDArray[np.int32], points: Column
+    p_base: Column,
+    cells: NDArray[np.int32],
+    rows: NDArray[np.int32],
+    places: NDArray[np.int32],
+    points: Column,
 ) -> None:
-    """Write some returns, each to its place."""
-    for i in range(len(rows)):
-        row, place = rows[i], places[i]
+    """Write some returns, each to the next place of its cell."""
+    for row in rows:
+        place = places[cells[row]]
+        places[cells[row]] = place + 1
         points[place, 0], points[place, 1] = p_base[row, 0], p_base[row, 1]
         points[place, 2] = p_base[row, 2]

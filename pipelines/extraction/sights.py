@@ -16,11 +16,11 @@ from pipelines.extraction.ball import Ball, blur_at, seen_from, view_of
 from pipelines.extraction.cells import (
     N_DIRECTIONS,
     N_DIRECTIONS_SIDE,
-    by_cell,
     direction_cells,
     rows_in,
 )
-from pipelines.values import Array, Column, Mask, StitchedCloud
+from pipelines.threads import side_by_side
+from pipelines.values import Array, Column, StitchedCloud
 
 _STEP = 0.05  # [m] at most between the directions about a centre that are looked up
 _REACH = 4.0  # radii about a centre: shoulders lie within three radii below a head
@@ -32,6 +32,8 @@ _PLACE = 0.1  # radii: what passes nearer to another beam than this passes at th
 _MEAN_WIDTH = 0.75  # of the greater half width of a beam: in any direction
 _TINY = 1e-6
 _UNSEEN = 3.0  # as many beams below it that end nearer as that go past: no more is known
+
+_Groups = tuple[NDArray[np.int64], NDArray[np.int32]]  # where each one's begin, and what they hold
 
 
 class Sight(NamedTuple):
@@ -63,7 +65,7 @@ class Sight(NamedTuple):
     rows : (m,) int32
         Returns of the cloud whose beams pass within four radii, ascending.
     seen : (3, m)
-        How these beams pass the centre, as ``passing`` says, in any order [m].
+        How these beams pass the centre, as ``passing`` says [m].
     """
 
     n_on: int
@@ -139,29 +141,42 @@ def sights(
     """
     if not len(centres):
         return []
-    reach = (_REACH + 0.5) * ball.radius + 0.05
-    is_wanted = np.array([_directions_about(centre, ball.up, reach) for centre in centres])
-    rows = rows_in(directions, np.logical_or.reduce(is_wanted))
-    starts, places = by_cell(directions, rows, N_DIRECTIONS)
-    rows[places] = rows.copy()
-    points, intensities = cloud.p_base.take(rows, axis=0), cloud.intensities.take(rows)
-    near = [_runs(starts, np.flatnonzero(mine)) for mine in is_wanted]
-    seen = [
-        Sight(*_counted(points, intensities, mine, centre, ball))
-        for mine, centre in zip(near, centres, strict=True)
-    ]
-    return [sight._replace(rows=np.sort(rows[sight.rows])) for sight in seen]
+    starts, owners = _centres_by_direction(centres, ball.up, (_REACH + 0.5) * ball.radius + 0.05)
+    is_wanted, cones = starts[1:] > starts[:-1], _cones(centres, ball)
+
+    def towards(first: int, end: int) -> _Groups:
+        rows = rows_in(directions, is_wanted, first, end)
+        groups: _Groups = _towards(cloud.p_base, directions, rows, starts, owners, cones)
+        return groups
+
+    parts = side_by_side(towards, len(directions))
+    found = []
+    for i, centre in enumerate(centres):
+        rows = np.concatenate([rows[begin[i] : begin[i + 1]] for begin, rows in parts])
+        found.append(Sight(*_counted(cloud.p_base, cloud.intensities, rows, centre, ball)))
+    return found
+
+
+def _cones(centres: Array, ball: Ball) -> Array:
+    """Return the cones that are looked at, (k, 4).
+
+    Their axes, not of unit length; and the square of how far a unit vector at the edge of one goes
+    along its axis, in the axis's own length.
+    """
+    distances = np.sqrt(np.sum(centres**2, axis=1))
+    blurs = np.array([blur_at(c, ball) for c in centres])
+    tangents = (_REACH * ball.radius + blurs) / distances
+    return np.column_stack([centres, distances**2 / (1.0 + tangents**2)])
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
 def _counted(
-    points: Column, intensities: Column, near: NDArray[np.int32], c: Array, ball: Ball
+    p_base: Column, intensities: Column, rows: NDArray[np.int32], c: Array, ball: Ball
 ) -> tuple[int, int, int, float, int, int, int, float, int, NDArray[np.int32], Array]:
-    """Return the fields of a sight, from the returns near its direction."""
-    radius, distance = ball.radius, np.sqrt(np.sum(c**2))
+    """Return the fields of a sight, from its returns."""
+    radius = ball.radius
     blur = blur_at(c, ball) / radius
-    rows = _towards(points, near, c, (_REACH + blur) * radius / distance)
-    seen = seen_from(points[rows].T.astype(np.float64), view_of(c, ball.up))
+    seen = seen_from(p_base[rows].T.astype(np.float64), view_of(c, ball.up))
     n_on, n_through, n_before, n_held, n_past, n_short = 0, 0, 0, 0, 0, 0
     gaps2, light, lit = 0.0, 0.0, 0.0
     half = int((1.0 + blur) / _PLACE) + 1
@@ -199,52 +214,79 @@ def _lit_share(inside: float) -> float:
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
 def _towards(
-    points: Column, near: NDArray[np.int32], c: Array, tangent: float
-) -> NDArray[np.int32]:
-    """Return which of some rows are within an angle, given by its tangent, of a centre."""
-    x, y, z = c
-    least = (x * x + y * y + z * z) / (1.0 + tangent * tangent)
-    rows = np.empty(len(near) + 1, np.int32)
-    n_rows = 0
-    for i in near:
-        px, py, pz = points[i, 0], points[i, 1], points[i, 2]
-        along = x * px + y * py + z * pz
-        rows[n_rows] = i  # kept only if the next one does not take its place
-        n_rows += along > 0.0 and along * along > least * (px * px + py * py + pz * pz)
-    return rows[:n_rows]
+    p_base: Column,
+    directions: NDArray[np.uint16],
+    rows: NDArray[np.int32],
+    starts: NDArray[np.int32],
+    owners: NDArray[np.int32],
+    cones: Array,
+) -> _Groups:
+    """Return which of some rows lie in each cone: where those of each begin, and the rows."""
+    n = 0
+    for row in rows:
+        n += starts[directions[row] + 1] - starts[directions[row]]
+    near, whose = np.empty(n + 1, np.int32), np.empty(n + 1, np.int32)
+    n = 0
+    for row in rows:
+        x, y, z = p_base[row, 0], p_base[row, 1], p_base[row, 2]
+        for i in range(starts[directions[row]], starts[directions[row] + 1]):
+            owner = owners[i]
+            along = cones[owner, 0] * x + cones[owner, 1] * y + cones[owner, 2] * z
+            near[n], whose[n] = row, owner  # kept only if the next one does not take its place
+            n += along > 0.0 and along * along > cones[owner, 3] * (x * x + y * y + z * z)
+    groups: _Groups = _grouped(near[:n], whose[:n], len(cones))
+    return groups
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def _runs(starts: NDArray[np.int64], cells: NDArray[np.int64]) -> NDArray[np.int32]:
-    """Return the places of all that lies in some cells."""
+def _centres_by_direction(centres: Array, up: Array, reach: float) -> _Groups:
+    """Return the centres that beams in each cell of directions may pass within a reach.
+
+    Where those of each cell begin, and the centres.
+    """
+    sides = np.empty(len(centres), np.int64)
+    for k in range(len(centres)):
+        n_fine = 1.5 * reach * N_DIRECTIONS_SIDE / np.sqrt(np.sum(centres[k] ** 2))
+        sides[k] = 2 * (2 + int(max(n_fine, reach / _STEP))) + 1
+    owners = np.empty(np.sum(np.minimum(sides**2, N_DIRECTIONS)), np.int32)
+    cells = np.empty(len(owners), np.uint16)
+    latest = np.full(N_DIRECTIONS, -1, np.int64)
     n = 0
-    for cell in cells:
-        n += starts[cell + 1] - starts[cell]
-    places = np.empty(n, np.int32)
-    n = 0
-    for cell in cells:
-        for i in range(starts[cell], starts[cell + 1]):
-            places[n] = i
-            n += 1
-    return places
+    for k in range(len(centres)):
+        for cell in _directions_about(centres[k], up, reach, sides[k]):
+            if latest[cell] != k:
+                latest[cell], cells[n], owners[n] = k, cell, k
+                n += 1
+    groups: _Groups = _grouped(owners[:n], cells[:n], N_DIRECTIONS)
+    return groups
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def _directions_about(c: Array, up: Array, reach: float) -> Mask:
-    """Tell the cells of directions in which beams may pass a centre within a reach."""
-    is_wanted = np.zeros(N_DIRECTIONS, np.bool_)
+def _directions_about(c: Array, up: Array, reach: float, n: int) -> NDArray[np.uint16]:
+    """Return the cells of directions about a centre on a lattice, so many each way."""
     v_across = np.cross(up, c)
     v_across *= reach / (np.sqrt(np.sum(v_across**2)) + 1e-12)
-    n_fine = 1.5 * reach * N_DIRECTIONS_SIDE / np.sqrt(np.sum(c**2))
-    n_steps = 2 + int(max(n_fine, reach / _STEP))
-    n = 2 * n_steps + 1
-    xyz, cells = np.empty((3, n), np.float32), np.empty(n, np.uint16)
+    xyz, cells, half = np.empty((3, n), np.float32), np.empty((n, n), np.uint16), n // 2
     for i in range(n):
         for j in range(n):
             for axis in range(3):
-                aside = (i - n_steps) * v_across[axis] + (j - n_steps) * reach * up[axis]
-                xyz[axis, j] = c[axis] + aside / n_steps
-        direction_cells(xyz[0], xyz[1], xyz[2], cells)
-        for cell in cells:
-            is_wanted[cell] = True
-    return is_wanted
+                aside = (i - half) * v_across[axis] + (j - half) * reach * up[axis]
+                xyz[axis, j] = c[axis] + aside / half
+        direction_cells(xyz[0], xyz[1], xyz[2], cells[i])
+    return cells.reshape(-1)
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _grouped(items: NDArray[np.int32], groups: NDArray[np.integer], n_groups: int) -> _Groups:
+    """Sort items by group, by counting: where those of each group begin, and the items."""
+    starts = np.zeros(n_groups + 2, np.int64)  # of the group before, until they have moved on
+    for group in groups:
+        starts[group + 2] += 1
+    for i in range(n_groups):
+        starts[i + 2] += starts[i + 1]
+    grouped = np.empty_like(items)
+    for i in range(len(items)):
+        group_before = groups[i] + 1
+        grouped[starts[group_before]] = items[i]
+        starts[group_before] += 1
+    return starts[:-1], grouped

@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from math import hypot, sqrt
+from statistics import median
+from typing import NamedTuple
 
 import numpy as np
 
@@ -271,26 +274,50 @@ def _n_comparable(sight: Sight) -> float:
     return max(share_below * sight.n_aimed, float(sight.n_on))
 
 
-def noise_among(looks: Sequence[Look]) -> float:
-    """Return the noise of ranges that the surer groups of a scan share.
+class Peers(NamedTuple):
+    """What the groups of a scan that may be markers share; NaN where too few of them tell.
+
+    Attributes
+    ----------
+    noise : float
+        Standard deviation of ranges, as the surer groups show it [m].
+    brightness, scatter : float
+        Reflectivity, 0-255, and scatter [m] of those that are open below.
+    """
+
+    noise: float
+    brightness: float
+    scatter: float
+
+
+def peers_among(groups: Sequence[tuple[Look, Sight]]) -> Peers:
+    """Return what the groups of a scan that may be markers share.
 
     Parameters
     ----------
-    looks : sequence of Look
-        Groups that may be markers.
+    groups : sequence of (Look, Sight)
+        Groups that have passed the tests of each on its own.
 
     Returns
     -------
-    float
-        Standard deviation; NaN if too few groups have returns enough to tell [m].
+    Peers
+        Noise and paint.
     """
-    known = [max(look.scatter, NOISE_MIN) for look in looks if look.n_points >= _N_TELLING]
-    return float(np.median(known)) if len(known) >= _N_KNOWN else float("nan")
+    noises = [max(look.scatter, NOISE_MIN) for look, _ in groups if look.n_points >= _N_TELLING]
+    known = [(look, sight) for look, sight in groups if sight.shows_below]
+    return Peers(
+        _shared(noises),
+        _shared([sight.brightness for _, sight in known]),
+        _shared([max(look.scatter, NOISE_MIN) for look, _ in known]),
+    )
 
 
-def verdict_among_others(
-    look: Look, sight: Sight, others: Sequence[tuple[Look, Sight]], ball: Ball
-) -> str:
+def _shared(values: Sequence[float]) -> float:
+    """Return the median of what some groups show; NaN if they are too few to tell."""
+    return median(values) if len(values) >= _N_KNOWN else float("nan")
+
+
+def verdict_among_peers(look: Look, sight: Sight, peers: Peers, ball: Ball) -> str:
     """Return why a group differs from the other markers of the scan.
 
     Parameters
@@ -299,8 +326,8 @@ def verdict_among_others(
         What the group looks like.
     sight : Sight
         Where the beams towards and about it end.
-    others : sequence of (Look, Sight)
-        Groups that have passed the other tests, this one among them or not.
+    peers : Peers
+        What the groups share that have passed the other tests, this one among them or not.
     ball : Ball
         What is looked for.
 
@@ -318,17 +345,17 @@ def verdict_among_others(
     alike, and so does a crest that ends against the sky: where no beams show the pole, reflectivity
     must be as that of the others, and where it is hidden, scatter too.
     """
-    return _unlike_in_shape(look, others, ball) or _unlike_in_paint(look, sight, others)
+    return _unlike_in_shape(look, peers, ball) or _unlike_in_paint(look, sight, peers)
 
 
-def _unlike_in_shape(look: Look, others: Sequence[tuple[Look, Sight]], ball: Ball) -> str:
+def _unlike_in_shape(look: Look, peers: Peers, ball: Ball) -> str:
     """Return why a group is not curved as a ball, by the noise of the others."""
-    blur = blur_at(look.p_base, ball)
-    noise = float(np.hypot(noise_among([other for other, _ in others]), _WIDE * blur))
+    noise = hypot(peers.noise, _WIDE * blur_at(look.p_base, ball))
     share = min(noise / max(look.scatter, NOISE_MIN), 1.0)
     flats = (look.flat_across, look.flat_along)
-    off = np.array(flats) / (share * np.array([look.sigma_across, look.sigma_along]))
-    is_flat = float(np.hypot(*np.maximum(off, 0.0))) > _SIGMAS_UNLIKE and max(flats) > _FLAT_UNLIKE
+    sigmas = (share * look.sigma_across, share * look.sigma_along)
+    off = hypot(*(max(flat / sigma, 0.0) for flat, sigma in zip(flats, sigmas, strict=True)))
+    is_flat = off > _SIGMAS_UNLIKE and max(flats) > _FLAT_UNLIKE
     if look.n_points < _N_SURE or not is_flat or look.scatter <= _NOISIER * noise:
         return ""
     return (
@@ -338,27 +365,24 @@ def _unlike_in_shape(look: Look, others: Sequence[tuple[Look, Sight]], ball: Bal
     )
 
 
-def _unlike_in_paint(look: Look, sight: Sight, others: Sequence[tuple[Look, Sight]]) -> str:
+def _unlike_in_paint(look: Look, sight: Sight, peers: Peers) -> str:
     """Return why a group of which nothing shows the pole differs from markers that are open below.
 
     Reflectivity is as sure as there are places at which beams meet the group.
     """
-    known = [other for other in others if other[1].shows_below]
-    if sight.shows_below or len(known) < _N_KNOWN:
+    if sight.shows_below:
         return ""
-    brightness = float(np.median([other.brightness for _, other in known]))
-    scatter = float(np.median([max(other.scatter, NOISE_MIN) for other, _ in known]))
-    unlike = max(_SIGMAS * _SHADE / float(np.sqrt(max(sight.n_distinct, 1))), _UNLIKE)
+    unlike = max(_SIGMAS * _SHADE / sqrt(max(sight.n_distinct, 1)), _UNLIKE)
     tests = (
         (
-            abs(sight.brightness - brightness) > unlike * brightness,
+            abs(sight.brightness - peers.brightness) > unlike * peers.brightness,
             f"What it stands on is not seen, and its reflectivity is {sight.brightness:.0f}, that "
-            f"of the markers {brightness:.0f}.",
+            f"of the markers {peers.brightness:.0f}.",
         ),
         (
-            not sight.is_open_below and look.scatter > _NOISIER * scatter,
+            not sight.is_open_below and look.scatter > _NOISIER * peers.scatter,
             f"What it stands on is hidden, and its returns scatter by "
-            f"{1e3 * look.scatter:.0f} mm, those of the markers by {1e3 * scatter:.0f} mm.",
+            f"{1e3 * look.scatter:.0f} mm, those of the markers by {1e3 * peers.scatter:.0f} mm.",
         ),
     )
     return _first(tests)
