@@ -23,6 +23,7 @@ N_DIRECTIONS_SIDE = 128
 N_DIRECTIONS = 2 * N_DIRECTIONS_SIDE**2
 """Cells of directions."""
 
+_GROUP = 64  # returns that are asked at once whether one of them is wanted: mostly none is
 _BLOCK = 512  # returns at a time: the next ones are fetched while all is done with these
 
 
@@ -94,8 +95,10 @@ def cells_of(cloud: StitchedCloud, config: ExtractionConfig) -> Cells:
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def rows_in(cells: NDArray[np.integer], is_wanted: Mask, first: int, end: int) -> NDArray[np.int32]:
-    """Return the rows, of those of a part, of the returns that lie in some cells.
+def rows_in(
+    cells: NDArray[np.integer], is_wanted: Mask, first: int, end: int
+) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
+    """Return the returns, of those of a part, that lie in some cells.
 
     Parameters
     ----------
@@ -108,15 +111,24 @@ def rows_in(cells: NDArray[np.integer], is_wanted: Mask, first: int, end: int) -
 
     Returns
     -------
-    (k,) int32
+    rows : (k,) int32
         Rows, ascending.
+    own : (k,) int32
+        Their cells.
     """
-    rows = np.empty(end - first, np.int32)
+    rows, own = np.empty(end - first + 1, np.int32), np.empty(end - first + 1, np.int32)
     n_rows = 0
-    for i in range(first, end):
-        rows[n_rows] = i  # kept only if the next one does not take its place
-        n_rows += is_wanted[np.uint32(cells[i])]
-    return rows[:n_rows]
+    for low in range(first, end, _GROUP):
+        group = cells[low : min(low + _GROUP, end)]
+        n_wanted = 0
+        for cell in group:
+            n_wanted += is_wanted[np.uint32(cell)]
+        if n_wanted:
+            for i in range(len(group)):
+                cell = np.uint32(group[i])
+                rows[n_rows], own[n_rows] = low + i, cell  # unless the next one takes its place
+                n_rows += is_wanted[cell]
+    return rows[:n_rows], own[:n_rows]
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")

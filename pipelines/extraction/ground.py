@@ -55,16 +55,14 @@ def ground_of(cloud: StitchedCloud, cells: Cells, config: ExtractionConfig) -> G
     Ground
         What rises above it.
     """
-    lowest = cells.lowest
-    ground = _ground(lowest, _opened(lowest, _GROUND_WINDOW), _GROUND_WINDOW)
+    ground = _ground(cells.lowest, _GROUND_WINDOW)
     v_up, clearance = cells.R_station_base[2], config.ground_clearance
     is_mixed, field_highest = _mixed(cells, ground, min(clearance, _GROUND_RISE))
     parts = side_by_side(
         lambda first, end: _above(
             cloud.p_base,
             v_up,
-            cells.ground,
-            rows_in(cells.ground, is_mixed, first, end),
+            *rows_in(cells.ground, is_mixed, first, end),
             ground.ravel(),
             clearance,
         ),
@@ -112,32 +110,47 @@ def _n_about(mask: Mask, window: int) -> NDArray[np.uint8]:
     return counts
 
 
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _where(mask: Mask, values: Column, other: float) -> Column:
+    """Return values where a mask is set, another elsewhere: many times as quick as ``np.where``."""
+    chosen = np.empty_like(values)
+    for i in range(values.shape[0]):
+        for j in range(values.shape[1]):
+            chosen[i, j] = values[i, j] if mask[i, j] else np.float32(other)
+    return chosen
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def _highest_about(values: Column, window: int) -> Column:
     """Return the highest of the square window about each cell."""
-    return np.asarray(-_lowest_about(-values, window))
+    highest: Column = -_lowest_about(-values, window)
+    return highest
 
 
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def _opened(lowest: Column, window: int) -> Column:
     """Return the morphological opening of the lowest points; -inf where too little is near.
 
     A window that sees nothing but a marker, behind a mound say, tells nothing about the ground.
     """
     eroded = _lowest_about(lowest, window)
-    n_known = _n_about(np.isfinite(lowest), window)
-    eroded[(n_known < _GROUND_CELLS_MIN) | ~np.isfinite(eroded)] = -np.inf
-    return _highest_about(eroded, window)
+    is_known = (_n_about(lowest < np.inf, window) >= _GROUND_CELLS_MIN) & (eroded < np.inf)
+    opened: Column = _highest_about(_where(is_known, eroded, -np.inf), window)
+    return opened
 
 
-def _ground(lowest: Column, opened: Column, window: int) -> Column:
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _ground(lowest: Column, window: int) -> Column:
     """Return the ground's height per cell; infinite where no ground was seen in or beside it.
 
     A cell has ground where its lowest point lies near the opened surface and enough others around
     do too: a marker behind a rock has no ground around it, and must not become ground itself.
     """
-    is_low = lowest < opened + np.float32(_GROUND_STEP)
-    highest = _highest_about(np.where(is_low, lowest, np.float32(-np.inf)), 1)
+    is_low = lowest < _opened(lowest, window) + np.float32(_GROUND_STEP)
+    highest = _highest_about(_where(is_low, lowest, -np.inf), 1)
     is_ground = (highest > -np.inf) & (_n_about(is_low, window) >= _GROUND_CELLS_MIN)
-    return np.where(is_ground, highest, np.float32(np.inf))
+    ground: Column = _where(is_ground, highest, np.inf)
+    return ground
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
@@ -171,8 +184,8 @@ def _mixed(cells: Cells, ground: Column, rise_max: float) -> tuple[Mask, float]:
 def _above(
     p_base: Column,
     v_up: Array,
-    cells: NDArray[np.int32],
     rows: NDArray[np.int32],
+    cells: NDArray[np.int32],
     ground: Column,
     clearance: float,
 ) -> tuple[NDArray[np.int32], float]:
@@ -182,12 +195,12 @@ def _above(
     """
     above = np.empty(len(rows), np.int32)
     n, highest = 0, -np.inf
-    for i in rows:
-        x, y, z = p_base[i, 0], p_base[i, 1], p_base[i, 2]
+    for i in range(len(rows)):
+        x, y, z = p_base[rows[i], 0], p_base[rows[i], 1], p_base[rows[i], 2]
         height = np.float32(v_up[0] * x + v_up[1] * y + v_up[2] * z)
         below = ground[cells[i]]
         over = height - below
-        above[n] = i  # kept only if the next one does not take its place
+        above[n] = rows[i]  # kept only if the next one does not take its place
         n += (over > clearance) | (below == np.inf)
         is_field = x * x + y * y < _STUDY_FIELD**2
         if is_field and -np.inf < over < _GROUND_RISE and height > highest:

@@ -234,12 +234,15 @@ def _is_resolved(points: Array, c: Array, ball: Ball, every: float) -> bool:
     """Tell whether a ball fits so closely that it needs no free space about it to be believed."""
     points, scatter, is_sample = _within(points, c, 2.0 * ball.radius), np.inf, every > 1.0
     for step_no in range(_N_STEPS):
-        N, pull, axes, scatter = _equations(points, c, ball, ball.radius)
+        view = view_of(c, ball.up)
+        seen, residuals, scatter = _residuals_about(points, view, c, ball, ball.radius)
         if step_no > is_sample and scatter > 4.0 * RESOLUTION * ball.radius:
             break  # it will not come to that any more
-        step = np.linalg.solve(N[:3, :3] + 1e-3 * np.eye(3), pull[:3])
+        weights = _weights(seen, residuals, ball.radius, blur_at(c, ball), scatter)
+        N, pull = _normals(seen, residuals, weights, ball.radius)
+        step = np.dot(_inverse(N[:3, :3] + 1e-3 * np.eye(3)), pull[:3])
         step *= min(1.0, 0.5 * ball.radius / (np.sqrt(np.sum(step**2)) + 1e-12))
-        c = c + step[0] * axes[0] + step[1] * axes[1] + step[2] * axes[2]
+        c = _moved(c, view, step)
     return scatter < (2.5 if is_sample else 1.5) * RESOLUTION * ball.radius
 
 
@@ -332,36 +335,57 @@ def _settled(
     """
     c, radius, inverse = start.copy(), ball.radius, np.eye(n_unknowns)
     for _ in range(_N_STEPS):
-        N, pull, axes, scatter = _equations(points, c, ball, radius)
+        view = view_of(c, ball.up)
+        seen, residuals, scatter = _residuals_about(points, view, c, ball, radius)
+        weights = _weights(seen, residuals, radius, blur_at(c, ball), scatter)
+        N, pull = _normals(seen, residuals, weights, radius)
         prior = (scatter / (_LOOSE * ball.radius)) ** 2 * np.eye(n_unknowns)
-        inverse = np.linalg.inv(N[:n_unknowns, :n_unknowns] + prior)
+        inverse = _inverse(N[:n_unknowns, :n_unknowns] + prior)
         step = np.dot(inverse, pull[:n_unknowns])
         step *= min(1.0, 0.5 * ball.radius / (np.sqrt(np.sum(step**2)) + 1e-12))
-        c += step[0] * axes[0] + step[1] * axes[1] + step[2] * axes[2]
+        c = _moved(c, view, step)
         if n_unknowns > 3:
             radius = min(max(radius + step[3], 0.3 * ball.radius), 3.0 * ball.radius)
     return c, radius, inverse
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def _equations(
-    points: Array, c: Array, ball: Ball, radius: float
-) -> tuple[Array, Array, Array, float]:
-    """Return normal matrix and right-hand side of centre and radius, in axes that come with them.
-
-    The last is the scatter about the ball as it is [m].
-    """
-    view = view_of(c, ball.up)
-    distance = np.sqrt(c[0] ** 2 + c[1] ** 2 + c[2] ** 2)
-    axes = np.empty((3, 3))
-    axes[0], axes[1], axes[2] = view.across, view.up, c / distance
-    blur = blur_at(c, ball)
-    seen = _about(points, view, radius + blur)
+def _residuals_about(
+    points: Array, view: View, c: Array, ball: Ball, radius: float
+) -> tuple[Array, Array, float]:
+    """Return how beams pass a ball about as near as its outline, residuals, and their scatter."""
+    seen = _about(points, view, radius + blur_at(c, ball))
     residuals = _residuals(seen, radius)
-    scatter = _scatter(seen, residuals, radius)
-    weights = _weights(seen, residuals, radius, blur, scatter)
-    N, pull = _normals(seen, residuals, weights, radius)
-    return N, pull, axes, scatter
+    return seen, residuals, _scatter(seen, residuals, radius)
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _moved(c: Array, view: View, step: Array) -> Array:
+    """Return a centre after a step across, up and away from the sensor."""
+    moved = c.copy()
+    distance = np.sqrt(c[0] ** 2 + c[1] ** 2 + c[2] ** 2)
+    for axis in range(3):
+        moved[axis] += step[0] * view.across[axis] + step[1] * view.up[axis]
+        moved[axis] += step[2] * c[axis] / distance
+    return moved
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _inverse(N: Array) -> Array:
+    """Return the inverse of a small positive definite matrix (Gauss, Jordan; no pivots needed)."""
+    n, inverse = len(N), N.copy()
+    for k in range(n):
+        pivot = 1.0 / inverse[k, k]
+        inverse[k, k] = 1.0
+        for j in range(n):
+            inverse[k, j] *= pivot
+        for i in range(n):
+            if i != k:
+                factor = inverse[i, k]
+                inverse[i, k] = 0.0
+                for j in range(n):
+                    inverse[i, j] -= factor * inverse[k, j]
+    return inverse
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")

@@ -22,6 +22,8 @@ _REACH = 4.5  # radii about a seed whose returns decide whether a ball stands fr
 _GOLDEN = 0.5 * (np.sqrt(5.0) - 1.0)  # its multiples are spread evenly and never in step
 _ROUNDED = 1e-4  # [m]: more than a cell's edge may be off by rounding
 
+_Rows = NDArray[np.int32]
+
 
 class Patches(NamedTuple):
     """Returns sorted by cell, for the cells about the seeds.
@@ -85,18 +87,19 @@ def _sorted(
     parts before.
     """
 
-    def counted(first: int, end: int) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
-        rows = rows_in(cells, is_wanted, first, end)
-        return rows, _counts(cells, rows, len(is_wanted))
+    def counted(first: int, end: int) -> tuple[_Rows, _Rows, _Rows]:
+        rows, own = rows_in(cells, is_wanted, first, end)
+        return rows, own, _counts(own, len(is_wanted))
 
     parts = side_by_side(counted, len(p_base))
+    counts = [each for _, _, each in parts]
     starts = np.zeros(len(is_wanted) + 1, np.int32)
-    np.cumsum(sum(counts for _, counts in parts), out=starts[1:])
+    np.cumsum(sum(counts), out=starts[1:])
     points = np.empty((starts[-1], 3), np.float32)
-    places = accumulate((counts for _, counts in parts[:-1]), initial=starts[:-1].copy())
-    jobs = [(rows, begin) for (rows, _), begin in zip(parts, places, strict=True)]
+    places = accumulate(counts[:-1], initial=starts[:-1].copy())
+    jobs = [(rows, own, free) for (rows, own, _), free in zip(parts, places, strict=True)]
     side_by_side(
-        lambda first, end: [_place(p_base, cells, *job, points) for job in jobs[first:end]],
+        lambda first, end: [_place(p_base, *job, points) for job in jobs[first:end]],
         len(jobs),
         worth=2,
     )
@@ -161,14 +164,25 @@ def points_near(patches: Patches, c: Array, every: float) -> Array:
     n_out = 0
     for k in range(bottom, top + 1):
         first, end = _run(patches, k, low, high)
-        for j in range(int((end - first) / every)):
-            aside = _GOLDEN * j
-            i = first + int((j + aside - np.floor(aside)) * every)
+        for i in _sampled(first, end, every):
             p, q, r = np.float64(points[i, 0]), np.float64(points[i, 1]), np.float64(points[i, 2])
             # kept only if the next one does not take its place
             out[0, n_out], out[1, n_out], out[2, n_out] = p, q, r
             n_out += (p - x) ** 2 + (q - y) ** 2 + (r - z) ** 2 < reach2
     return out[:, :n_out].copy()
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _sampled(first: int, end: int, every: float) -> NDArray[np.int32]:
+    """Return one of so many rows of a run, here and there; all of them with 1."""
+    rows = np.empty(int((end - first) / every), np.int32)
+    if every == 1.0:
+        rows[:] = np.arange(first, end)
+        return rows
+    for j in range(len(rows)):
+        aside = _GOLDEN * j
+        rows[j] = first + np.int32((j + aside - np.floor(aside)) * every)
+    return rows
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
@@ -201,25 +215,19 @@ def _wanted(n_side: int, seed_cells: NDArray[np.int64], margin: int) -> Mask:
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def _counts(cells: NDArray[np.int32], rows: NDArray[np.int32], n_cells: int) -> NDArray[np.int32]:
-    """Return how many of some returns each cell holds."""
+def _counts(cells: _Rows, n_cells: int) -> _Rows:
+    """Return how often each cell occurs."""
     counts = np.zeros(n_cells, np.int32)
-    for row in rows:
-        counts[cells[row]] += 1
+    for cell in cells:
+        counts[cell] += 1
     return counts
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def _place(
-    p_base: Column,
-    cells: NDArray[np.int32],
-    rows: NDArray[np.int32],
-    places: NDArray[np.int32],
-    points: Column,
-) -> None:
-    """Write some returns, each to the next place of its cell."""
-    for row in rows:
-        place = places[cells[row]]
-        places[cells[row]] = place + 1
+def _place(p_base: Column, rows: _Rows, cells: _Rows, free: _Rows, points: Column) -> None:
+    """Write some returns, each to the next free place of its cell."""
+    for i in range(len(rows)):
+        row, place = rows[i], free[cells[i]]
+        free[cells[i]] = place + 1
         points[place, 0], points[place, 1] = p_base[row, 0], p_base[row, 1]
         points[place, 2] = p_base[row, 2]

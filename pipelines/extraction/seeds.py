@@ -5,6 +5,8 @@ Hides how a few hundred places are picked from millions of returns.
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numba
 import numpy as np
 from numpy.typing import NDArray
@@ -13,6 +15,27 @@ from pipelines.extraction.ball import Ball
 from pipelines.values import Array, Column
 
 _Vector = tuple[float, float, float]
+
+
+class _Voxels(NamedTuple):
+    """Occupied voxels, as an open hash table.
+
+    Attributes
+    ----------
+    keys : (size,)
+        Key of the voxel in each slot; -1 in a free one.
+    numbers : (size,) int32
+        Its number; anything in a free slot.
+    sums : (k, 4) float32
+        Sums of x, y, z of the returns in each voxel, and their count.
+    edge : float
+        Edge of a voxel [m].
+    """
+
+    keys: NDArray[np.int64]
+    numbers: NDArray[np.int32]
+    sums: Column
+    edge: float
 
 
 def find_seeds(
@@ -36,8 +59,8 @@ def find_seeds(
     (k, 3)
         Places, those with most returns first [m].
     """
-    keys, sums = _voxels(p_base, rows_above, ball.radius)
-    ends = _free_ends(keys, sums, ball.up, ball.radius, n_points_min)
+    voxels = _voxels(p_base, rows_above, ball.radius)
+    ends = _free_ends(voxels, ball.up, ball.radius, n_points_min)
     ends = ends[np.lexsort((ends[:, 2], ends[:, 1], ends[:, 0], -ends[:, 3]))]
     return np.ascontiguousarray(thinned(ends, 0.5 * ball.radius)[:, :3])
 
@@ -60,52 +83,53 @@ def _voxel(x: float, y: float, z: float, edge: float) -> int:
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def _voxels(
-    p_base: Column, rows: NDArray[np.int32], edge: float
-) -> tuple[NDArray[np.int64], Column]:
-    """Return the occupied voxels as an open hash table: keys, and sums of x, y, z with count."""
+def _voxels(p_base: Column, rows: NDArray[np.int32], edge: float) -> _Voxels:
+    """Return the voxels that some returns occupy."""
     size = 64
     while size < 2 * len(rows):
         size *= 2
-    keys = np.full(size, -1, np.int64)
-    sums = np.zeros((size, 4), np.float32)
+    keys, numbers = np.full(size, -1, np.int64), np.empty(size, np.int32)
+    sums = np.empty((len(rows), 4), np.float32)
+    n = 0
     for i in rows:
         key = _voxel(p_base[i, 0], p_base[i, 1], p_base[i, 2], edge)
-        place = _slot(keys, key)
-        keys[place] = key
-        sums[place, 0] += p_base[i, 0]
-        sums[place, 1] += p_base[i, 1]
-        sums[place, 2] += p_base[i, 2]
-        sums[place, 3] += 1.0
-    return keys, sums
+        slot = _slot(keys, key)
+        if keys[slot] == -1:
+            keys[slot], numbers[slot] = key, n
+            sums[n] = 0.0
+            n += 1
+        own = sums[numbers[slot]]
+        own[0] += p_base[i, 0]
+        own[1] += p_base[i, 1]
+        own[2] += p_base[i, 2]
+        own[3] += 1.0
+    return _Voxels(keys, numbers, sums[:n], edge)
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def _is_free(
-    keys: NDArray[np.int64], p: _Vector, step: _Vector, beam: _Vector, edge: float
-) -> bool:
+def _is_free(voxels: _Voxels, p: _Vector, step: _Vector, beam: _Vector) -> bool:
     """Tell whether nothing lies one step away, at the same depth give or take a voxel."""
+    edge = voxels.edge
     for depth in (-edge, 0.0, edge):
         x, y = p[0] + step[0] + depth * beam[0], p[1] + step[1] + depth * beam[1]
-        if keys[_slot(keys, _voxel(x, y, p[2] + step[2] + depth * beam[2], edge))] != -1:
+        key = _voxel(x, y, p[2] + step[2] + depth * beam[2], edge)
+        if voxels.keys[_slot(voxels.keys, key)] != -1:
             return False
     return True
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def _around(
-    keys: NDArray[np.int64], sums: Column, p: _Vector, edge: float
-) -> tuple[float, float, float, float]:
+def _around(voxels: _Voxels, p: _Vector) -> tuple[float, float, float, float]:
     """Return sums of x, y, z and count over the 27 voxels about a point."""
-    x, y, z, n = 0.0, 0.0, 0.0, 0.0
+    x, y, z, n, edge = 0.0, 0.0, 0.0, 0.0, voxels.edge
     for i in range(-1, 2):
         for j in range(-1, 2):
             for k in range(-1, 2):
                 key = _voxel(p[0] + i * edge, p[1] + j * edge, p[2] + k * edge, edge)
-                place = _slot(keys, key)
-                if keys[place] != -1:
-                    x, y, z = x + sums[place, 0], y + sums[place, 1], z + sums[place, 2]
-                    n += sums[place, 3]
+                slot = _slot(voxels.keys, key)
+                if voxels.keys[slot] != -1:
+                    own = voxels.sums[voxels.numbers[slot]]
+                    x, y, z, n = x + own[0], y + own[1], z + own[2], n + own[3]
     return x, y, z, n
 
 
@@ -120,26 +144,22 @@ def _axes(p: _Vector, up: Array) -> tuple[_Vector, _Vector]:
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def _free_ends(
-    keys: NDArray[np.int64], sums: Column, up: Array, radius: float, n_points_min: int
-) -> Array:
+def _free_ends(voxels: _Voxels, up: Array, radius: float, n_points_min: int) -> Array:
     """Return centres and counts, (k, 4), of what ends upward and to at least one side."""
-    out = np.empty((len(keys), 4))
+    out = np.empty((len(voxels.sums), 4))
     n_out, step = 0, 3.0 * radius
     upward = (step * up[0], step * up[1], step * up[2])
-    for place in range(len(keys)):
-        if keys[place] == -1:
-            continue
-        n = np.float64(sums[place, 3])
-        p = (sums[place, 0] / n, sums[place, 1] / n, sums[place, 2] / n)
+    for own in voxels.sums:
+        n = np.float64(own[3])
+        p = (own[0] / n, own[1] / n, own[2] / n)
         beam, side = _axes(p, up)
-        if not _is_free(keys, p, upward, beam, radius):
+        if not _is_free(voxels, p, upward, beam):
             continue
         left = (step * side[0], step * side[1], step * side[2])
         right = (-left[0], -left[1], -left[2])
-        if not (_is_free(keys, p, left, beam, radius) or _is_free(keys, p, right, beam, radius)):
+        if not (_is_free(voxels, p, left, beam) or _is_free(voxels, p, right, beam)):
             continue
-        x, y, z, n = _around(keys, sums, p, radius)
+        x, y, z, n = _around(voxels, p)
         if n >= n_points_min:
             # the points of a cap lie 2/3 R before the centre on average
             before = 2.0 / 3.0 * radius
@@ -165,17 +185,15 @@ def thinned(seeds: Array, gap: float) -> Array:
     (k, m)
         The places that stay, in the same order.
     """
-    kept = np.empty_like(seeds)
+    kept, places = np.empty_like(seeds), np.empty((3, len(seeds)))
     n_kept = 0
     for i in range(len(seeds)):
-        is_new = True
+        n_near = 0
         for j in range(n_kept):
-            dx, dy = seeds[i, 0] - kept[j, 0], seeds[i, 1] - kept[j, 1]
-            dz = seeds[i, 2] - kept[j, 2]
-            if dx * dx + dy * dy + dz * dz < gap * gap:
-                is_new = False
-                break
-        if is_new:
-            kept[n_kept] = seeds[i]
+            dx, dy = seeds[i, 0] - places[0, j], seeds[i, 1] - places[1, j]
+            dz = seeds[i, 2] - places[2, j]
+            n_near += dx * dx + dy * dy + dz * dz < gap * gap
+        if not n_near:
+            kept[n_kept], places[:, n_kept] = seeds[i], seeds[i, :3]
             n_kept += 1
     return kept[:n_kept]

@@ -6,6 +6,7 @@ and lets pass those beside it: a rock, a head or a crown of leaves does not.
 
 from __future__ import annotations
 
+from itertools import chain
 from typing import NamedTuple
 
 import numba
@@ -145,16 +146,21 @@ def sights(
     is_wanted, cones = starts[1:] > starts[:-1], _cones(centres, ball)
 
     def towards(first: int, end: int) -> _Groups:
-        rows = rows_in(directions, is_wanted, first, end)
-        groups: _Groups = _towards(cloud.p_base, directions, rows, starts, owners, cones)
+        rows, own = rows_in(directions, is_wanted, first, end)
+        groups: _Groups = _towards(cloud.p_base, rows, own, starts, owners, cones)
         return groups
 
     parts = side_by_side(towards, len(directions))
-    found = []
-    for i, centre in enumerate(centres):
-        rows = np.concatenate([rows[begin[i] : begin[i + 1]] for begin, rows in parts])
-        found.append(Sight(*_counted(cloud.p_base, cloud.intensities, rows, centre, ball)))
-    return found
+
+    def counted(first: int, end: int) -> list[Sight]:
+        found = []
+        for i in range(first, end):
+            rows = np.concatenate([rows[begin[i] : begin[i + 1]] for begin, rows in parts])
+            fields = _counted(cloud.p_base, cloud.intensities, rows, centres[i], ball)
+            found.append(Sight(*fields))
+        return found
+
+    return list(chain(*side_by_side(counted, len(centres), worth=4)))
 
 
 def _cones(centres: Array, ball: Ball) -> Array:
@@ -215,21 +221,22 @@ def _lit_share(inside: float) -> float:
 @numba.njit(cache=True, nogil=True, error_model="numpy")
 def _towards(
     p_base: Column,
-    directions: NDArray[np.uint16],
     rows: NDArray[np.int32],
-    starts: NDArray[np.int32],
+    directions: NDArray[np.int32],
+    starts: NDArray[np.int64],
     owners: NDArray[np.int32],
     cones: Array,
 ) -> _Groups:
     """Return which of some rows lie in each cone: where those of each begin, and the rows."""
     n = 0
-    for row in rows:
-        n += starts[directions[row] + 1] - starts[directions[row]]
+    for cell in directions:
+        n += starts[cell + 1] - starts[cell]
     near, whose = np.empty(n + 1, np.int32), np.empty(n + 1, np.int32)
     n = 0
-    for row in rows:
+    for j in range(len(rows)):
+        row, cell = rows[j], directions[j]
         x, y, z = p_base[row, 0], p_base[row, 1], p_base[row, 2]
-        for i in range(starts[directions[row]], starts[directions[row] + 1]):
+        for i in range(starts[cell], starts[cell + 1]):
             owner = owners[i]
             along = cones[owner, 0] * x + cones[owner, 1] * y + cones[owner, 2] * z
             near[n], whose[n] = row, owner  # kept only if the next one does not take its place

@@ -13,6 +13,7 @@ from pipelines.config import ExtractionConfig
 from pipelines.extraction.ball import Ball, blur_at
 from pipelines.extraction.looks import N_RESOLVED, NOISE_MIN, RESOLUTION, Look
 from pipelines.extraction.rivals import Rivals
+from pipelines.extraction.seeds import thinned
 from pipelines.extraction.sights import Sight
 
 _TOUCHING = 0.10  # share of a ball's returns that may lie as far away beside it: mixed pixels
@@ -59,13 +60,10 @@ def distinct(looks: list[Look], config: ExtractionConfig, radius: float) -> list
     list of Look
         Groups worth a verdict.
     """
-    kept: list[Look] = []
     worthy = [look for look in looks if _passes_first_gate(look, config, radius)]
-    for look in sorted(worthy, key=lambda look: (-_evidence(look), look.x, look.y)):
-        gaps = (np.hypot(np.hypot(look.x - o.x, look.y - o.y), look.z - o.z) for o in kept)
-        if all(gap > 1.5 * radius for gap in gaps):
-            kept.append(look)
-    return kept
+    worthy.sort(key=lambda look: (-_evidence(look), look.x, look.y))
+    places = np.array([(*look[:3], i) for i, look in enumerate(worthy)]).reshape(-1, 4)
+    return [worthy[int(i)] for i in thinned(places, 1.5 * radius)[:, 3]]
 
 
 def _first(tests: Sequence[tuple[bool, str]]) -> str:
@@ -462,4 +460,4 @@ def score(look: Look, config: ExtractionConfig, ball: Ball) -> float:
         look.scatter / config.scatter_max,
         abs(look.radius_free - ball.radius) / _radius_slack(look, ball),
     )
-    return float(np.clip(1.0 - np.mean(np.square(used)), 0.0, 1.0))
+    return max(1.0 - sum(share**2 for share in used) / len(used), 0.0)
