@@ -286,7 +286,23 @@ class SurveyConfig:
     @property
     def digest(self) -> str:
         """First 16 hexadecimal digits of the SHA-256 of the canonical text."""
-        return hashlib.sha256(self.text.encode()).hexdigest()[:16]
+        return digest_of(self.text)
+
+
+def digest_of(text: str) -> str:
+    """Return what names a canonical text: 16 hexadecimal digits.
+
+    Parameters
+    ----------
+    text : str
+        The text.
+
+    Returns
+    -------
+    str
+        Start of its SHA-256.
+    """
+    return hashlib.sha256(text.encode()).hexdigest()[:16]
 
 
 def _build(kind: type[_T], values: object, path: str) -> _T:

@@ -573,7 +573,9 @@ class MarkerFit:
     @property
     def rms(self) -> float:
         """Root mean square of the residuals [m]."""
-        return float(np.sqrt(np.mean(np.square(self.residuals)))) if self.n_points else np.nan
+        if not self.n_points:
+            return np.nan
+        return float(np.sqrt(self.residuals @ self.residuals / self.n_points))
 
     @property
     def sigma_3d(self) -> float:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 
 import numpy as np
 import pyarrow as pa
@@ -10,6 +10,7 @@ import pyarrow.compute as pc
 
 from pipelines.values import Array, StopResult, StopTruth, SubsetFixes
 
+_LABELS = ("run_id", "stop", "fit_method", "resection_method")
 _PLACE = ("x_m", "y_m", "z_m")
 _ERRORS = ("error_horizontal_m", "error_3d_m")
 
@@ -35,38 +36,57 @@ def resections_table(
     Table
         One row for each subset.
     """
-    tables = [
-        _table((run_id, stop.name, *methods), subsets, names, schema)
+    groups = [
+        ((run_id, stop.name, *methods), subsets)
         for stop in stops
         for methods, sizes in stop.subsets.items()
         for subsets in sizes
     ]
-    return pa.concat_tables([schema.empty_table(), *tables])
+    if not groups:
+        return schema.empty_table()
+    found = [subsets for _, subsets in groups]
+    columns = _labels([labels for labels, _ in groups], found) | _marks(found, names)
+    columns |= {name: _numbers(values) for name, values in _measures(found).items()}
+    columns |= {name: pa.nulls(len(columns["marks"]), pa.float64()) for name in _ERRORS}
+    return pa.table([columns[name] for name in schema.names], schema=schema)
 
 
-def _table(
-    labels: tuple[str, ...], found: SubsetFixes, names: tuple[str, ...], schema: pa.Schema
-) -> pa.Table:
-    """Return the subsets of one size at one stop."""
-    n, k = found.marks.shape
-    known = dict(zip(("run_id", "stop", "fit_method", "resection_method"), labels, strict=True))
-    text = pa.string()  # said, because to guess a scalar's type costs more than all else here
-    columns = {name: pa.repeat(pa.scalar(value, text), n) for name, value in known.items()}
-    marks = pa.array(names, pa.string()).take(pa.array(found.marks.ravel()))
-    columns["marks"] = pa.ListArray.from_arrays(np.arange(0, n * k + 1, k, dtype=np.int32), marks)
-    columns["n_marks"] = pa.repeat(pa.scalar(k, pa.int32()), n)
-    angles = np.degrees(found.included_angles)
-    numbers = {
+def _labels(labels: Sequence[tuple[str, ...]], found: Sequence[SubsetFixes]) -> dict[str, pa.Array]:
+    """Return the columns that name run, stop and methods."""
+    rows = pa.array(np.repeat(np.arange(len(found)), [len(one.marks) for one in found]))
+    return {
+        name: pa.array(values, pa.string()).take(rows)
+        for name, values in zip(_LABELS, zip(*labels, strict=True), strict=True)
+    }
+
+
+def _marks(found: Sequence[SubsetFixes], names: tuple[str, ...]) -> dict[str, pa.Array]:
+    """Return the columns that name the marks of each subset and count them."""
+    counts = np.repeat(
+        np.array([one.marks.shape[1] for one in found], dtype=np.int32),
+        [len(one.marks) for one in found],
+    )
+    ends = np.cumsum(counts, dtype=np.int32)
+    places = np.concatenate([one.marks.ravel() for one in found])
+    marks = pa.array(names, pa.string()).take(pa.array(places))
+    return {
+        "marks": pa.ListArray.from_arrays(np.concatenate([np.zeros(1, np.int32), ends]), marks),
+        "n_marks": pa.array(counts),
+    }
+
+
+def _measures(found: Sequence[SubsetFixes]) -> dict[str, Array]:
+    """Return the columns of numbers."""
+    angles = np.degrees(np.concatenate([one.included_angles for one in found]))
+    horizontal = np.concatenate([one.included_angles_horizontal[:, 0] for one in found])
+    return {
         "included_angle_deg": angles[:, 0],
         "included_angle_max_deg": angles[:, 1],
-        "included_angle_horizontal_deg": np.degrees(found.included_angles_horizontal[:, 0]),
-        "sigma_horizontal_m": found.sigma_horizontal,
-        "sigma_3d_m": found.sigma_3d,
-        **dict(zip(_PLACE, found.p_site.T, strict=True)),
+        "included_angle_horizontal_deg": np.degrees(horizontal),
+        "sigma_horizontal_m": np.concatenate([one.sigma_horizontal for one in found]),
+        "sigma_3d_m": np.concatenate([one.sigma_3d for one in found]),
+        **dict(zip(_PLACE, np.concatenate([one.p_site for one in found]).T, strict=True)),
     }
-    columns |= {name: _numbers(values) for name, values in numbers.items()}
-    columns |= {name: pa.nulls(n, pa.float64()) for name in _ERRORS}
-    return pa.table([columns[name] for name in schema.names], schema=schema)
 
 
 def resections_with_errors(known: pa.Table, truths: Mapping[str, StopTruth]) -> pa.Table:

@@ -16,7 +16,7 @@ import pyarrow as pa
 
 from pipelines.accuracy import centre_errors, station_error
 from pipelines.checking import dilution_of_precision, leave_each_out
-from pipelines.config import SurveyConfig
+from pipelines.config import SurveyConfig, digest_of
 from pipelines.errors import InputError
 from pipelines.geometry import levelling_rotation, rigid
 from pipelines.rigs import rig_digest, rig_to_mapping
@@ -45,6 +45,7 @@ _FIT = _STOP | {"fit_method": _TEXT}
 _FIX = _FIT | {"resection_method": _TEXT}
 _PLACE = {"x_m": _REAL, "y_m": _REAL, "z_m": _REAL}
 _COV = dict.fromkeys([f"cov_{axes}_m2" for axes in ("xx", "xy", "xz", "yy", "yz", "zz")], _REAL)
+_FIT_NUMBERS = (*_PLACE, *_COV, "sigma_3d_m", "azimuth_deg", "elevation_deg")
 _ERROR = {"error_x_m": _REAL, "error_y_m": _REAL, "error_z_m": _REAL}
 
 _COLUMNS = {
@@ -255,7 +256,7 @@ def with_errors(known: Mapping[str, pa.Table], truth: Truth | None) -> dict[str,
 
 def _run_rows(run: RunInfo, stops: tuple[StopResult, ...]) -> dict[str, list[Row]]:
     """Return the rows of a run as a whole, and empty lists for those of its stops."""
-    rig = stops[0].cloud.rig
+    rig, config = stops[0].cloud.rig, run.config.text
     digest = rig_digest(rig)
     rows: dict[str, list[Row]] = {name: [] for name in TABLES}
     rows["rigs"].append(
@@ -267,8 +268,8 @@ def _run_rows(run: RunInfo, stops: tuple[StopResult, ...]) -> dict[str, list[Row
             "job_id": run.job_id,
             "survey_id": run.survey_id,
             "recording_id": run.recording_id,
-            "config": run.config.text,
-            "config_digest": run.config.digest,
+            "config": config,
+            "config_digest": digest_of(config),
             "code_version": run.code_version,
             "rig_digest": digest,
             "finished_at": run.finished_at,
@@ -290,9 +291,8 @@ def _stop_rows(
     for method, found in stop.fits.items():
         label = {"fit_method": method}
         matched = _matched(stop, method, names)
-        for i, fit in enumerate(found.fits):
-            row = label | {"marker": fit.name, "mark": matched.get(i)}
-            rows["marker_fits"].append(row | _fit_row(fit, R, sigma_heading))
+        for i, row in enumerate(_fit_rows(found.fits, R, sigma_heading)):
+            rows["marker_fits"].append(label | {"mark": matched.get(i)} | row)
         rows["rejections"] += [
             label | _place(R @ r.p_base) | {"n_points": r.n_points, "reason": r.reason}
             for r in found.rejected
@@ -338,20 +338,28 @@ def _stop_row(stop: StopResult, cloud_url: str | None) -> Row:
     }
 
 
-def _fit_row(fit: MarkerFit, R_station_base: Array, sigma_heading: float) -> Row:
-    """Return the row of ``marker_fits`` without errors and names."""
-    p_station = R_station_base @ fit.p_base
-    cov_base = fit.cov_with_heading(sigma_heading)
-    x, y, z = p_station
+def _fit_rows(fits: Sequence[MarkerFit], R: Array, sigma_heading: float) -> list[Row]:
+    """Return rows of ``marker_fits`` without errors, method and mark; R levels the base."""
+    p = np.array([fit.p_base for fit in fits]).reshape(-1, 3) @ R.T
+    covs = np.array([fit.cov_with_heading(sigma_heading) for fit in fits]).reshape(-1, 3, 3)
+    cov = (R @ covs @ R.T)[:, *_UPPER]
+    sigmas = np.sqrt(np.trace(covs, axis1=1, axis2=2))
+    azimuths = np.degrees(np.arctan2(p[:, 1], p[:, 0]))
+    elevations = np.degrees(np.arctan2(p[:, 2], np.hypot(p[:, 0], p[:, 1])))
+    numbers = np.column_stack([p, cov, sigmas, azimuths, elevations]).tolist()
+    return [
+        dict(zip(_FIT_NUMBERS, row, strict=True)) | _fit_row(fit)
+        for fit, row in zip(fits, numbers, strict=True)
+    ]
+
+
+def _fit_row(fit: MarkerFit) -> Row:
+    """Return what a fit says of itself."""
     return {
+        "marker": fit.name,
         "status": str(fit.status),
         "reason": fit.reason,
-        **_place(p_station),
-        **_cov(R_station_base @ cov_base @ R_station_base.T),
-        "sigma_3d_m": np.sqrt(np.trace(cov_base)),
         "range_m": fit.mean_range,
-        "azimuth_deg": np.degrees(np.arctan2(y, x)),
-        "elevation_deg": np.degrees(np.arctan2(z, np.hypot(x, y))),
         "n_points": fit.n_points,
         "n_rejected": len(fit.rejected),
         "n_rings": fit.n_rings,

@@ -45,6 +45,6 @@ def plain(value: object) -> object:
     object
         NumPy's scalars as Python's, what is not finite as None.
     """
-    if isinstance(value, np.generic):
-        value = value.item()
-    return None if isinstance(value, float) and not math.isfinite(value) else value
+    if isinstance(value, float):  # NumPy's doubles are
+        return value if math.isfinite(value) else None
+    return plain(value.item()) if isinstance(value, np.generic) else value
