@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+import numba
 import numpy as np
 from scipy.spatial.transform import Rotation
 
@@ -425,20 +426,46 @@ def beams(cloud: StitchedCloud, members: Index) -> Beams:
     """
     rig = cloud.rig
     heights = _by_ring(rig.laser_heights)[cloud.rings[members]]
-    spin_head = rig.T_head_lidar[:3, 2]
     angles = cloud.gimbal_angles[members].astype(np.float64)
-    origins_base = _turn(rig.T_head_lidar[:3, 3] + heights[:, None] * spin_head, angles)
-    v_base = cloud.p_base[members] - origins_base
-    ranges = np.linalg.norm(v_base, axis=1)
-    directions = v_base / ranges[:, None]
-    across = np.cross(_turn(np.tile(spin_head, (len(angles), 1)), angles), directions)
+    turns = (np.cos(angles), np.sin(angles))
+    origins, directions, across, ranges = _beams(
+        cloud.p_base[members], turns, heights, rig.T_head_lidar
+    )
     return Beams(
-        origins_base=origins_base,
+        origins_base=origins,
         directions_base=directions,
         ranges=ranges,
-        across_base=across / np.linalg.norm(across, axis=1, keepdims=True),
+        across_base=across,
         rings=cloud.rings[members],
         intensities=cloud.intensities[members].astype(np.float64),
         times=cloud.times[members].astype(np.float64),
         divergence=rig.divergence,
     )
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _beams(
+    p_base: Column, turns: tuple[Array, Array], heights: Array, T_head_lidar: Array
+) -> tuple[Array, Array, Array, Array]:
+    """Return origins, directions, tangents of the sweep, and ranges of returns.
+
+    ``turns`` are cosines and sines of the gimbal angles, heights those of the lasers.
+    """
+    n, T = len(p_base), T_head_lidar
+    origins, directions, across = np.empty((n, 3)), np.empty((n, 3)), np.empty((n, 3))
+    ranges, spin = np.empty(n), (T[0, 2], T[1, 2], T[2, 2])
+    for i in range(n):
+        c, s, o, u, a = turns[0][i], turns[1][i], origins[i], directions[i], across[i]
+        x, y = T[0, 3] + heights[i] * spin[0], T[1, 3] + heights[i] * spin[1]
+        o[0], o[1], o[2] = c * x - s * y, s * x + c * y, T[2, 3] + heights[i] * spin[2]
+        for j in range(3):
+            u[j] = p_base[i, j] - o[j]
+        ranges[i] = np.sqrt(u[0] * u[0] + u[1] * u[1] + u[2] * u[2])
+        for j in range(3):
+            u[j] /= ranges[i]
+        x, y, z = c * spin[0] - s * spin[1], s * spin[0] + c * spin[1], spin[2]
+        a[0], a[1], a[2] = y * u[2] - z * u[1], z * u[0] - x * u[2], x * u[1] - y * u[0]
+        length = np.sqrt(a[0] * a[0] + a[1] * a[1] + a[2] * a[2])
+        for j in range(3):
+            a[j] /= length
+    return origins, directions, across, ranges
