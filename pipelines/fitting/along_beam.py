@@ -205,11 +205,11 @@ def _gather(
 ) -> tuple[_Shots, Array]:
     """Return the members of all candidates as one table of shots, and the sigmas of biases."""
     members = np.concatenate([c.members for c in candidates])
-    is_finite = np.isfinite(cloud.p_base[members]).all(axis=1)
-    ends = np.cumsum([len(c.members) for c in candidates])
-    together, firsts = members[is_finite], np.cumsum(np.r_[0, is_finite])[np.r_[0, ends]]
+    is_finite = np.isfinite(cloud.p_base[members].sum(axis=1))
+    ends = np.cumsum([0, *(len(c.members) for c in candidates)])
+    together, firsts = members[is_finite], np.concatenate([[0], np.cumsum(is_finite)])[ends]
     table = beams(cloud, together)
-    lasers, places = np.unique(table.rings, return_inverse=True)
+    lasers = np.flatnonzero(np.bincount(table.rings))
     is_told = lasers != RING_UNKNOWN
     # returns of unknown lasers come from all sixteen: their common part is what is left of a bias
     sigma_biases = np.where(is_told, config.sigma_range_bias, config.sigma_range_bias / 4.0)
@@ -217,7 +217,7 @@ def _gather(
         table,
         firsts,
         levelling_rotation(cloud.levelling)[2],
-        places.astype(np.intp),
+        np.searchsorted(lasers, table.rings),
         (*classes_of(table.intensities), config.sigma_direction),
     )
     return _Shots(table, together, rows, is_told), sigma_biases

@@ -13,7 +13,7 @@ import numpy as np
 
 from pipelines.fitting.linearising import Linear
 from pipelines.fitting.rows import Rows
-from pipelines.values import Array
+from pipelines.values import Array, Index
 
 
 class Normals(NamedTuple):
@@ -164,25 +164,32 @@ def _sum_up(rows: Rows, J: Array, residuals: Array, per_square: Array, N: Normal
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
 def _sum_spheres(
-    firsts: Array, J: Array, residuals: Array, weights: Array, out: tuple[Array, Array]
+    firsts: Index, J: Array, residuals: Array, weights: Array, out: tuple[Array, Array]
 ) -> None:
     """Fill in the products of derivatives with each other and with residuals, sphere by sphere."""
     N, pull = out
+    k = N.shape[1]
     for s in range(len(N)):
-        span = (firsts[s], firsts[s + 1])
-        for p in range(N.shape[1]):
-            pull[s, p] = _sum_product(span, weights, J[p], residuals)
+        sums = _products(firsts[s], firsts[s + 1], J, residuals, weights)
+        for p in range(k):
+            pull[s, p] = sums[10 + p]
             for q in range(p + 1):
-                N[s, p, q] = N[s, q, p] = _sum_product(span, weights, J[p], J[q])
+                N[s, p, q] = N[s, q, p] = sums[p * (p + 1) // 2 + q]
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy", fastmath={"reassoc", "contract"})
-def _sum_product(span: tuple[int, int], weights: Array, a: Array, b: Array) -> float:
-    """Return the weighted sum of products of two columns over a span of rows."""
-    total = 0.0
-    for i in range(span[0], span[1]):
-        total += weights[i] * a[i] * b[i]
-    return total
+def _products(first, behind, J, residuals, weights):  # type: ignore[no-untyped-def]  # noqa: ANN001, ANN202
+    """Return sums of the ten products of derivatives, by rows, and of those with residuals."""
+    xx = yx = yy = zx = zy = zz = rx = ry = rz = rr = x_pull = y_pull = z_pull = r_pull = 0.0
+    for i in range(first, behind):
+        x, y, z, r, v = J[0, i], J[1, i], J[2, i], J[3, i], residuals[i]
+        wx, wy, wz, wr = weights[i] * x, weights[i] * y, weights[i] * z, weights[i] * r
+        xx, yx, yy = xx + wx * x, yx + wy * x, yy + wy * y
+        zx, zy, zz = zx + wz * x, zy + wz * y, zz + wz * z
+        rx, ry, rz, rr = rx + wr * x, ry + wr * y, rz + wr * z, rr + wr * r
+        x_pull, y_pull = x_pull + wx * v, y_pull + wy * v
+        z_pull, r_pull = z_pull + wz * v, r_pull + wr * v
+    return xx, yx, yy, zx, zy, zz, rx, ry, rz, rr, x_pull, y_pull, z_pull, r_pull
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")

@@ -27,7 +27,20 @@ _CERTAIN = 4.0  # standard deviations inside the outline from where meeting is n
 _CAVITY_MIN = 0.05  # of a centre's precision: the least that is not one return's own
 _N_PRODUCT = 25  # chances that are multiplied before the logarithm is taken
 _TINY = 1e-9  # [m]
-_HALF, _DENSITY = math.sqrt(0.5), 1.0 / math.sqrt(2.0 * math.pi)
+_NEVER = 8.0  # standard deviations outside from where only luck is left
+_PER_SIGMA = 64  # nodes of the normal distribution, between which a series is good to 1e-12
+_DENSITY = 1.0 / math.sqrt(2.0 * math.pi)
+
+
+def _normal() -> Array:
+    """Return nodes of a normal deviate, their chances, densities, and integrals, (n, 4)."""
+    z = np.arange(-_NEVER, _CERTAIN + 1.0 / _PER_SIGMA, 1.0 / _PER_SIGMA)
+    chance = np.array([0.5 * math.erfc(-math.sqrt(0.5) * at) for at in z])
+    density = _DENSITY * np.exp(-0.5 * z * z)
+    return np.column_stack([z, chance, density, z * chance + density])
+
+
+_NORMAL = _normal()
 
 
 class Outline(NamedTuple):
@@ -88,34 +101,30 @@ def outline_of(rows: Rows, linear: Linear, weights: Array, covs: Array, radius: 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
 def _logarithms(rows: Rows, linear: Linear, weights: Array, covs: Array, radius: float) -> Array:
     """Return the log-likelihood of each edge and softness."""
-    logs, product = np.zeros((len(_EDGES), len(_SOFTNESSES))), np.ones(len(_EDGES))
-    for k in range(len(_SOFTNESSES)):
-        n = 0
-        for m in range(len(covs)):
-            for i in range(rows.firsts[m], rows.firsts[m + 1]):
-                half, inside = _reach(rows, linear, i, radius)
-                if weights[i] == 0.0 or inside > _NEAR * half:
-                    continue
-                variance = _variance(covs[m], _towards(rows, linear, i)) + rows.lateral[i] ** 2
-                sigma = math.sqrt(variance + (_SOFTNESSES[k] * half) ** 2)
-                for e in range(len(_EDGES)):
-                    z, t = inside - _EDGES[e] * half, (_NEAR - _EDGES[e]) * half
-                    product[e] *= _chance(z / sigma) * half / (sigma * _length(t / sigma))
-                n += 1
-                if n % _N_PRODUCT == 0:
-                    logs[:, k] += np.log(product)
-                    product[:] = 1.0
-        logs[:, k] += np.log(product)
-        product[:] = 1.0
-    return logs
+    shape, n = (len(_EDGES), len(_SOFTNESSES)), 0
+    logs, product = np.zeros(shape), np.ones(shape)
+    for m in range(len(covs)):
+        for i in range(rows.firsts[m], rows.firsts[m + 1]):
+            half, inside = _reach(rows, linear, i, radius)
+            if weights[i] == 0.0 or inside > _NEAR * half:
+                continue
+            variance = _variance(covs[m], _towards(rows, linear, i)) + rows.lateral[i] ** 2
+            _multiply(inside / half, variance / (half * half), product)
+            n += 1
+            if n % _N_PRODUCT == 0:
+                logs += np.log(product)
+                product[:] = 1.0
+    return logs + np.log(product)
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def _length(t: float) -> float:
-    """Return the integral of the chance of a normal deviate below its limit, up to ``t``."""
-    if t > _CERTAIN:
-        return t
-    return t * 0.5 * math.erfc(-_HALF * t) + _DENSITY * math.exp(-0.5 * t * t)
+def _multiply(inside: float, variance: float, product: Array) -> None:
+    """Multiply densities of how far a footprint reaches inside, in its half widths."""
+    for k in range(len(_SOFTNESSES)):
+        per_sigma = 1.0 / math.sqrt(variance + _SOFTNESSES[k] ** 2)
+        for e in range(len(_EDGES)):
+            z, t = (inside - _EDGES[e]) * per_sigma, (_NEAR - _EDGES[e]) * per_sigma
+            product[e, k] *= _chance(z) * per_sigma / _length(t)
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
@@ -213,7 +222,23 @@ def _chance(z: float) -> float:
     """Return the chance that a return which reaches so far inside has met the sphere."""
     if z > _CERTAIN:
         return 1.0
-    return _LUCK + (1.0 - _LUCK) * 0.5 * math.erfc(-_HALF * z)
+    if not z > -_NEVER:
+        return _LUCK
+    node = _NORMAL[int((z + _NEVER) * _PER_SIGMA + 0.5)]
+    at, density, d = node[0], node[2], z - node[0]
+    bent = d * (at / 2.0 - d * ((at * at - 1.0) / 6.0 - d * (at * at - 3.0) * at / 24.0))
+    return float(_LUCK + (1.0 - _LUCK) * (node[1] + density * d * (1.0 - bent)))
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _length(t: float) -> float:
+    """Return the integral of the chance of a normal deviate below its limit, up to ``t`` >= 0."""
+    if not t < _CERTAIN:
+        return t
+    node = _NORMAL[int((t + _NEVER) * _PER_SIGMA + 0.5)]
+    at, density, d = node[0], node[2], t - node[0]
+    bent = 0.5 - d * (at / 6.0 - d * (at * at - 1.0) / 24.0)
+    return float(node[3] + d * (node[1] + density * d * bent))
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")

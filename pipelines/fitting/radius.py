@@ -85,12 +85,13 @@ def free_radii(
     step by the noise alone (a sandwich). Where the greatest likelihood is so much greater that the
     assumption must be wrong, its radius is the answer.
     """
-    radii, sigmas = _stepped(rows, weighing, spheres, covs, residuals)
-    radius = spheres[:, 3]
-    is_asked = np.abs(radii - radius) > _ASKED * sigmas
+    steps, known, sigmas = _stepped(rows, weighing, spheres, covs, residuals)
+    radius, radii = spheres[:, 3], spheres[:, 3] + steps[:, 3]
+    is_asked = np.abs(steps[:, 3]) > _ASKED * sigmas
     if is_asked.any():
-        wide = _with_radius(covs, np.trace(covs[:, :3, :3], axis1=1, axis2=2))
-        found, known = _free(rows, weighing, spheres, wide, is_asked)
+        limit = _STEP_MAX * radius[:, None]
+        start = spheres + np.clip(steps, -limit, limit)
+        found, known = _free(rows, weighing, start, known, is_asked)
         is_in = (weighing.weights > 0.0) & np.repeat(is_asked, np.diff(rows.firsts))
         better = weighing.ranges - linearise(rows, found, covs, is_in).ranges
         gains = _misfits(rows, weighing, residuals) - _misfits(rows, weighing, better)
@@ -116,8 +117,8 @@ def _with_radius(covs: Array, variances: Array | float) -> Array:
 
 def _stepped(
     rows: Rows, weighing: Weighing, spheres: Array, covs: Array, residuals: Array
-) -> tuple[Array, Array]:
-    """Return radii one step from those that are assumed, and their standard deviations."""
+) -> tuple[Array, Array, Array]:
+    """Return a step of centres and radii, (m, 4), what is known of these, and sigmas of radii."""
     is_in, square = weighing.weights > 0.0, spheres[:, 3, None, None] ** -2.0 * np.eye(4)
 
     def summed(wide: Array) -> tuple[Linear, Array, Array, Array]:
@@ -126,13 +127,12 @@ def _stepped(
         return linear, per_square, *normals_of_spheres(rows, linear, residuals, per_square, 4)
 
     rough = _with_radius(covs, np.trace(covs[:, :3, :3], axis1=1, axis2=2))
-    cov = np.linalg.inv(summed(rough)[2] + square / _PRIOR**2)
-    linear, per_square, N, pull = summed(np.asarray(cov, dtype=np.float64))
+    cov: Array = np.asarray(np.linalg.inv(summed(rough)[2] + square / _PRIOR**2))
+    linear, per_square, N, pull = summed(cov)
     by_pull = np.linalg.inv(N + square / _WEAK_PRIOR**2)
     of_noise = per_square**2 * weighing.variances
     spread = by_pull @ normals_of_spheres(rows, linear, residuals, of_noise, 4)[0] @ by_pull
-    radii = spheres[:, 3] + np.einsum("mj,mj->m", by_pull[:, 3], pull)
-    return radii, np.sqrt(spread[:, 3, 3])
+    return (by_pull @ pull[..., None])[..., 0], cov, np.sqrt(spread[:, 3, 3])
 
 
 def _misfits(rows: Rows, weighing: Weighing, residuals: Array) -> Array:
@@ -194,8 +194,9 @@ def own_radius(shots: Beams, radius: float, up: Array) -> tuple[float, float]:
     rows = rows_of(shots, np.array([0, n]), up, nothing, (nothing, np.ones(n), 0.0))
     spanned = _spanned(shots)
     weighing, residuals, sphere, cov = _fitted(rows, spanned, radius)
-    radii, sigmas = _stepped(rows, weighing, sphere, cov, residuals)
-    if np.abs(radii[0] - radius) > _ASKED * sigmas[0]:
+    steps, _, sigmas = _stepped(rows, weighing, sphere, cov, residuals)
+    radii = radius + steps[:, 3]
+    if np.abs(steps[0, 3]) > _ASKED * sigmas[0]:
         own, known, gain = _own_spanned(rows, spanned, sphere)
         if gain > _BETTER_OWN:
             radii, sigmas = own[:, 3], np.sqrt(known[:, 3, 3])
