@@ -27,7 +27,7 @@ _TIMES = ("time", "t", "timestamp", "time_stamp", "offset_time", "time_offset", 
 _FIELD_MIN = 13  # [bytes] of a field with an empty name
 _PAGE = 1 << 21  # [bytes] of a large page of memory: the fewer are touched, the fewer are faults
 _WORTH = 4  # clouds that two threads unpack sooner than one
-_BLOCK = 1024  # points: few enough for the nearest cache
+_BLOCK = 512  # points: few enough for the nearest cache
 _EXPONENT = np.uint32(0x7F800000)  # bits of a float32; all are set where it is not finite
 _MAGNITUDE = np.uint32(0x7FFFFFFF)
 
