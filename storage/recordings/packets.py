@@ -110,10 +110,12 @@ def _sensor() -> _Sensor:
     blocks = np.arange(N_BLOCKS) * FIRINGS_PER_BLOCK * FIRING_CYCLE
     times = (blocks[:, None] + shots).astype(np.float32)
     return _Sensor(
-        turns=np.column_stack([np.cos(angles), np.sin(angles)]).astype(np.float32),
-        lasers=np.column_stack(
-            [np.cos(elevations), np.sin(elevations), rig.laser_heights[FIRING_ORDER]]
-        ).astype(np.float32),
+        turns=np.stack([np.cos(angles), np.sin(angles)], axis=1).astype(np.float32).ravel(),
+        lasers=np.stack(
+            [np.cos(elevations), np.sin(elevations), rig.laser_heights[FIRING_ORDER]], axis=1
+        )
+        .astype(np.float32)
+        .ravel(),
         rings=FIRING_ORDER.astype(np.uint8),
         since_block=times - times[:, :1],
         since_packet_ns=np.rint((blocks[:, None] + shots) * 1e9).astype(np.int64),
@@ -185,7 +187,7 @@ class Packets:
         side_by_side(count, len(places), worth=_WORTH)
         self._reserve(int(heads[:, 3].sum()), len(heads))
         rows = self._n + np.cumsum(heads[:, 3]) - heads[:, 3]
-        sensor, out = _sensor(), self._out
+        sensor, out = _sensor(), (self._out.p.reshape(-1), *self._out[1:])
 
         def unpack(begin: int, end: int) -> None:
             part = slice(begin, end)
@@ -443,14 +445,18 @@ def _unpack_block(octets, blocks, place, sensor, out, n):  # type: ignore[no-unt
 def _put(out, n, aim, steps, reflectivity, sensor):  # type: ignore[no-untyped-def]  # noqa: ANN001, ANN202
     """Write one return to a row."""
     turn, laser, instant = aim
+    p, intensities, rings, stamps = out
+    at, place, direction = np.uint64(3) * n, np.uint64(3) * laser, np.uint64(2) * turn
     r = np.float32(steps) * np.float32(RANGE_STEP)
-    reach = r * sensor.lasers[laser, 0]
-    out.p[n, 0] = reach * sensor.turns[turn, 0]
-    out.p[n, 1] = -reach * sensor.turns[turn, 1]
-    out.p[n, 2] = r * sensor.lasers[laser, 1] + sensor.lasers[laser, 2]
-    out.intensities[n] = reflectivity
-    out.rings[n] = sensor.rings[laser]
-    out.stamps[n] = instant
+    reach = r * sensor.lasers[place]
+    p[at] = reach * sensor.turns[direction]
+    p[at + np.uint64(1)] = -reach * sensor.turns[direction + np.uint64(1)]
+    p[at + np.uint64(2)] = (
+        r * sensor.lasers[place + np.uint64(1)] + sensor.lasers[place + np.uint64(2)]
+    )
+    intensities[n] = reflectivity
+    rings[n] = sensor.rings[laser]
+    stamps[n] = instant
 
 
 def scans(topic: str, frame: str, firings: Firings, revolution_ns: int) -> Iterator[Item]:

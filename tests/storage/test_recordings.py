@@ -340,6 +340,23 @@ def test_returns_that_are_none_are_dropped(tmp_path):
         assert_array_equal(log.rings, points["ring"][kept])
 
 
+def test_returns_that_are_none_are_dropped_wherever_they_are_in_a_long_cloud(tmp_path):
+    rng = np.random.default_rng(32)
+    points = velodyne(rng, n=3000)
+    is_none = rng.random(3000) < 0.01
+    is_none[[0, 511, 512, 2999]] = True
+    is_none[1024:1536] = True
+    points["y"][is_none] = np.where(np.arange(is_none.sum()) % 2, np.nan, -np.inf)
+    points["intensity"][5::7] = np.nan
+    log = read_log(record(tmp_path / "a.mcap", [("/p", T0, cloud(points)), *turning()]))
+    kept = points[~is_none]
+    assert_array_equal(log.p_lidar, np.column_stack([kept[axis] for axis in "xyz"]))
+    assert_array_equal(log.intensities, np.nan_to_num(kept["intensity"]))
+    assert_array_equal(log.rings, kept["ring"])
+    times = kept["time"].astype(np.float64) * 1e9
+    assert_allclose(log.stamps_lidar_ns - T0, times, rtol=0, atol=FLOAT_TIME)
+
+
 def as_whole_nanoseconds(points):
     """The same points as a driver writes them that counts nanoseconds."""
     kinds = [(name, "<f4") for name in (*"xyz", "intensity")] + [("ring", "u1"), ("t", "<u4")]
