@@ -295,12 +295,16 @@ class Timed:
     def __getitem__(self, rows: slice | Index | Mask) -> Column:
         """Return some rows, float32."""
         stamps_ns = self.stamps_ns[rows]
-        sample = np.searchsorted(self.samples_ns, stamps_ns, side="right") - 1
+        sample: Any = 0  # where there is but one, millions of rows need not be told theirs
+        if len(self.samples_ns) > 1:
+            sample = np.searchsorted(self.samples_ns, stamps_ns, side="right") - 1
         found = self.values[sample] + self.rates[sample] * (stamps_ns - self.samples_ns[sample])
         if self.is_angle:
             turns = found * (0.5 / np.pi)
             found = 2.0 * np.pi * (turns - np.floor(turns + 0.5))
-        return np.asarray(found, np.float32)
+        column = np.asarray(found, np.float32)
+        column.flags.writeable = False  # like an array's own: compiled loops tell the two apart
+        return column
 
     def __array__(self, dtype: Any = None, copy: object = None) -> NDArray[Any]:
         """Return all rows, for NumPy's own functions; they are always new."""
