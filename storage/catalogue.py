@@ -35,7 +35,11 @@ WHERE ($at::TIMESTAMPTZ IS NULL OR (j.created_at, j.job_id) < ($at::TIMESTAMPTZ,
 ORDER BY j.created_at DESC, j.job_id DESC LIMIT $n
 """
 )
-_STANDING = "SELECT status, survey_id FROM jobs WHERE job_id = $id"
+_STANDING = "SELECT status FROM jobs WHERE job_id = $id"
+_SUCCEED = """
+UPDATE jobs SET status = 'successful', progress_percent = 100, message = ?, finished_at = ?
+WHERE job_id = ? AND status = 'running'
+"""
 _JOBS_ACCEPTED = _JOBS + "WHERE j.status = 'accepted' ORDER BY j.created_at, j.job_id"
 _RUN = "SELECT * FROM runs WHERE run_id = $id"
 _RUNS_AFTER = """
@@ -172,6 +176,7 @@ class Catalogue(Surveys):
                 "progress_percent = 0, message = 'Started.' WHERE job_id = ?",
                 [now(), job_id],
             )
+            self._tables.survey_of(job_id)  # asked for now, so that the end need not wait for it
         return self.get_job(job_id)
 
     def report_progress(self, job_id: str, percent: float, message: str) -> None:
@@ -226,19 +231,15 @@ class Catalogue(Surveys):
         """
         check_tables(tables)
         with self.writing() as cursor:
-            status, survey_id = _standing(cursor, job_id)
-            if status is JobStatus.SUCCESSFUL:
-                return
-            _require(job_id, status, JobStatus.RUNNING)
-            truth = self._tables.truth(survey_id)
+            if cursor.execute(_SUCCEED, [message, now(), job_id]).fetchall() == [(0,)]:
+                status = _standing(cursor, job_id)
+                if status is JobStatus.SUCCESSFUL:
+                    return
+                _require(job_id, status, JobStatus.RUNNING)
+            truth = self._tables.truth(self._tables.survey_of(job_id))
             compared = adjustments.with_errors(results.with_errors(tables, truth), truth)
             for name, table in compared.items():
                 self._tables.append(name, table)
-            cursor.execute(
-                "UPDATE jobs SET status = 'successful', progress_percent = 100, "
-                "message = ?, finished_at = ? WHERE job_id = ?",
-                [message, now(), job_id],
-            )
 
     def fail_job(
         self, job_id: str, *, code: str, reason: str, traceback: str | None = None
@@ -383,7 +384,7 @@ class Catalogue(Surveys):
     def _changing(self, job_id: str, *allowed: JobStatus) -> Iterator[duckdb.DuckDBPyConnection]:
         """Hold a transaction on a job that stands where it may be changed."""
         with self.writing() as cursor:
-            _require(job_id, _standing(cursor, job_id)[0], *allowed)
+            _require(job_id, _standing(cursor, job_id), *allowed)
             yield cursor
 
 
@@ -393,9 +394,9 @@ def _require(job_id: str, status: JobStatus, *allowed: JobStatus) -> None:
         raise ConflictError(f"Job {job_id} is {status}, not {' or '.join(allowed)}.")
 
 
-def _standing(cursor: duckdb.DuckDBPyConnection, job_id: str) -> tuple[JobStatus, str]:
-    """Read inside a transaction how a job stands, and its survey."""
+def _standing(cursor: duckdb.DuckDBPyConnection, job_id: str) -> JobStatus:
+    """Read inside a transaction how a job stands."""
     rows = cursor.execute(_STANDING, {"id": job_id}).fetchall()
     if not rows:
         raise NotFoundError(f"There is no job {job_id!r}.")
-    return JobStatus(rows[0][0]), rows[0][1]
+    return JobStatus(rows[0][0])

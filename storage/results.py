@@ -216,7 +216,7 @@ def tables(
     made = {name: _table(name, rows[name]) for name in TABLES}
     names = () if marks is None else marks.names
     made["resections"] = resections_table(run.run_id, stops, names, made["resections"].schema)
-    return with_errors(made, truth)
+    return made if truth is None else with_errors(made, truth)
 
 
 def with_errors(known: Mapping[str, pa.Table], truth: Truth | None) -> dict[str, pa.Table]:

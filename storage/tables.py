@@ -107,6 +107,7 @@ _REFRESH = {
             AND x.marks = i.marks
     """,
 }
+_SURVEY_OF_JOB = "SELECT survey_id FROM jobs WHERE job_id = ?"
 _RIGS = "SELECT rig_digest FROM rigs"
 _PUT_RIG = "INSERT INTO rigs (rig_digest, name, rig) VALUES ($rig_digest, $name, $rig)"
 
@@ -141,7 +142,7 @@ class Tables:
     Notes
     -----
     A statement costs about a millisecond. Those for results are planned once, and what nobody else
-    can have changed is not read again: rigs that are there, and truths.
+    can have changed is not read again: rigs that are there, truths, and the surveys of jobs.
     """
 
     def __init__(self, cursor: duckdb.DuckDBPyConnection) -> None:
@@ -152,6 +153,7 @@ class Tables:
         }
         self._rigs: set[str] = set()
         self._truths: dict[str, Truth | None] = {}
+        self._surveys: dict[str, str] = {}
 
     def append(self, name: str, table: pa.Table) -> None:
         """Append rows to a table.
@@ -180,6 +182,23 @@ class Tables:
         self._rigs = {digest for (digest,) in self._cursor.execute(_RIGS).fetchall()}
         for digest in rows.keys() - self._rigs:
             self._cursor.execute(_PUT_RIG, rows[digest])
+
+    def survey_of(self, job_id: str) -> str:
+        """Return the survey of a job.
+
+        Parameters
+        ----------
+        job_id : str
+            A job that there is.
+
+        Returns
+        -------
+        str
+            Its ``survey_id``.
+        """
+        if job_id not in self._surveys:
+            ((self._surveys[job_id],),) = self._cursor.execute(_SURVEY_OF_JOB, [job_id]).fetchall()
+        return self._surveys[job_id]
 
     def truth(self, survey_id: str) -> Truth | None:
         """Return the truth of a survey, as ``read_truth`` does.
