@@ -399,6 +399,16 @@ def _cross(v, w):  # type: ignore[no-untyped-def]  # noqa: ANN001, ANN202
     return x, y, v[0] * w[1] - v[1] * w[0]
 
 
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _solved(M, v):  # type: ignore[no-untyped-def]  # noqa: ANN001, ANN202, N803
+    """Return the solution of three equations as three numbers."""
+    a, b, c = _cross(M[1], M[2]), _cross(M[2], M[0]), _cross(M[0], M[1])
+    size = M[0, 0] * a[0] + M[0, 1] * a[1] + M[0, 2] * a[2]
+    x = (v[0] * a[0] + v[1] * b[0] + v[2] * c[0]) / size
+    y = (v[0] * a[1] + v[1] * b[1] + v[2] * c[1]) / size
+    return x, y, (v[0] * a[2] + v[1] * b[2] + v[2] * c[2]) / size
+
+
 @numba.njit(cache=True, nogil=True)
 def _rotation(motion, R):  # type: ignore[no-untyped-def]  # noqa: ANN001, ANN202
     """Find the rotation of a small motion by the formula of Rodrigues."""
@@ -440,8 +450,7 @@ def _invert(N, out):  # type: ignore[no-untyped-def]  # noqa: ANN001, ANN202
 @numba.njit(cache=True, nogil=True, error_model="numpy")
 def _meet(chosen, marks, measured, weights, p, cov, last):  # type: ignore[no-untyped-def]  # noqa: ANN001, ANN202, PLR0913
     """Move each station until its steps are small; tell the largest part of the last."""
-    N, bend, gain = np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3))
-    gradient = np.empty(3)
+    N, bend, gradient = np.empty((3, 3)), np.empty((3, 3)), np.empty(3)
     for s in range(len(chosen)):
         for step in range(_N_STEPS):
             N[:], bend[:], gradient[:] = 0.0, 0.0, 0.0
@@ -453,8 +462,7 @@ def _meet(chosen, marks, measured, weights, p, cov, last):  # type: ignore[no-un
             bend += N
             if step == 0 and _exceeds(N, 1.0 / USELESS**2):
                 _invert(N, cov[s])
-            _invert(bend, gain)
-            change = _times(gain, gradient)
+            change = _solved(bend, gradient)
             last[s] = 0.0
             for i in range(3):
                 p[s, i] += change[i]
