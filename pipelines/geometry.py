@@ -51,30 +51,6 @@ def cross(v: Array, w: Array) -> Array:
     return np.stack([y * c - z * b, z * a - x * c, x * b - y * a], axis=-1)
 
 
-def exp_rotation(phi: Array) -> Array:
-    """Return the rotations of rotation vectors.
-
-    Parameters
-    ----------
-    phi : (..., 3)
-        Rotation vectors [rad].
-
-    Returns
-    -------
-    (..., 3, 3)
-        Rotations.
-
-    Notes
-    -----
-    Rodrigues' formula, with quotients that hold for no turn too.
-    """
-    half = np.linalg.norm(phi, axis=-1)[..., None, None] / (2.0 * np.pi)
-    turn = skew(phi)
-    return np.asarray(
-        np.eye(3) + np.sinc(2.0 * half) * turn + 0.5 * np.sinc(half) ** 2 * turn @ turn
-    )
-
-
 def rot_x(angle: float) -> Array:
     """Return the rotation about x by an angle.
 

@@ -7,6 +7,7 @@ control marks, so that large coordinates cost no digits.
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
+from functools import lru_cache
 from math import comb
 from typing import NamedTuple
 
@@ -22,7 +23,7 @@ from pipelines.errors import (
     NoMatchError,
     SolveError,
 )
-from pipelines.geometry import exp_rotation, levelling_rotation, rigid, rot_z, skew, transform
+from pipelines.geometry import levelling_rotation, rigid, rot_z, skew, transform
 from pipelines.values import Array, ControlMarks, Index, MarkerFits
 
 _N_CANDIDATES = 300_000  # pairs of pairs that are compared at most; more find nothing new
@@ -442,10 +443,12 @@ def moved(T: Array, xi: Array) -> Array:
     Returns
     -------
     (..., 4, 4)
-        ``Exp(xi) T`` up to the square of ``xi``; rotations stay rotations.
+        ``Exp(xi) T`` up to the square of ``xi``; rotations stay rotations (Cayley's transform).
     """
+    turn = skew(xi[..., :3])
+    square = np.sum(xi[..., :3] ** 2, axis=-1)[..., None, None]
     out = np.array(T)
-    out[..., :3, :] = exp_rotation(xi[..., :3]) @ T[..., :3, :]
+    out[..., :3, :] += (turn + 0.5 * turn @ turn) @ T[..., :3, :] / (1.0 + 0.25 * square)
     out[..., :3, 3] += xi[..., 3:]
     return out
 
@@ -491,22 +494,43 @@ def _hypotheses(
     first, second, spans = first[usable], second[usable], spans[usable]
     reach = np.linalg.norm(spans, axis=1)
     longest = float(reach.max(initial=0.0)) + 2.0 * tolerance
-    a, b, targets, lengths = known or spans_between(scene.marks_site, longest)
-    low = np.searchsorted(lengths, reach - tolerance)
-    counts = np.searchsorted(lengths, reach + tolerance) - low
+    goals = known or spans_between(scene.marks_site, longest)
+    low = np.searchsorted(goals.lengths, reach - tolerance)
+    counts = np.searchsorted(goals.lengths, reach + tolerance) - low
     counts[np.cumsum(counts) > max(_N_CANDIDATES, counts[:1].sum())] = 0
-    rows = np.repeat(np.arange(len(counts)), counts)
-    within = np.arange(len(rows)) - np.repeat(np.cumsum(counts) - counts, counts)
-    columns = low[rows] + within
-    slack = tolerance + 3.0 * scene.sigma_level * reach[rows]
-    agree = np.abs(targets[columns, 2] - spans[rows, 2]) <= slack
-    rows, columns = rows[agree], columns[agree]
-    yaws = np.arctan2(targets[columns, 1], targets[columns, 0]) - np.arctan2(
-        spans[rows, 1], spans[rows, 0]
-    )
-    middles = (levelled[first] + levelled[second])[rows] / 2.0
-    goals = (scene.marks_site[a] + scene.marks_site[b])[columns] / 2.0
-    return _Hypotheses(yaws, goals - _turned(middles, yaws))
+    slacks = tolerance + 3.0 * scene.sigma_level * reach
+    middles = (levelled[first] + levelled[second]) / 2.0
+    fits = (spans, middles, slacks)
+    return _Hypotheses(*_aligned(fits, (low, low + counts), goals, scene.marks_site))
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _aligned(
+    fits: tuple[Array, Array, Array], ranges: tuple[Index, Index], goals: Spans, marks_site: Array
+) -> tuple[Array, Array]:
+    """Return the poses that bring spans between fits onto those of a range that rise alike.
+
+    ``fits`` are the spans, their middles, and by how much they may rise more or less.
+    """
+    (spans, middles, slacks), (low, high), n = fits, ranges, 0
+    for k in range(len(spans)):
+        for g in range(low[k], high[k]):
+            n += abs(goals.targets[g, 2] - spans[k, 2]) <= slacks[k]
+    yaws, translations, n = np.empty(n), np.empty((n, 3)), 0
+    for k in range(len(spans)):
+        x, y, z = middles[k]
+        azimuth = np.arctan2(spans[k, 1], spans[k, 0])
+        for g in range(low[k], high[k]):
+            if abs(goals.targets[g, 2] - spans[k, 2]) > slacks[k]:
+                continue
+            p, q = marks_site[goals.first[g]], marks_site[goals.second[g]]
+            yaws[n] = np.arctan2(goals.targets[g, 1], goals.targets[g, 0]) - azimuth
+            c, s = np.cos(yaws[n]), np.sin(yaws[n])
+            translations[n, 0] = (p[0] + q[0]) / 2.0 - (c * x - s * y)
+            translations[n, 1] = (p[1] + q[1]) / 2.0 - (s * x + c * y)
+            translations[n, 2] = (p[2] + q[2]) / 2.0 - z
+            n += 1
+    return yaws, translations
 
 
 def _matched_pair(levelled: Array, scene: Scene, config: ResectionConfig) -> Match:
@@ -573,6 +597,7 @@ def _pair_pose(levelled: Array, scene: Scene, pair: Index) -> Array:
     return rigid(R @ scene.R_station_base, q.mean(axis=0) - R @ p.mean(axis=0))
 
 
+@lru_cache(maxsize=8)
 def _pairs_far_first(n: int) -> tuple[Index, Index]:
     """Return all pairs of n fits, those far apart in azimuth first."""
     first, second = np.triu_indices(n, 1)
@@ -581,22 +606,14 @@ def _pairs_far_first(n: int) -> tuple[Index, Index]:
     return first[order], second[order]
 
 
-def _turned(p: Array, yaws: Array) -> Array:
-    """Turn points, (..., 3), about z by as many angles."""
-    c, s = np.cos(yaws), np.sin(yaws)
-    x, y, z = np.moveaxis(p, -1, 0)
-    x, y, z = np.broadcast_arrays(c * x - s * y, s * x + c * y, z)
-    return np.stack([x, y, z], axis=-1)
-
-
 def _voted(hypotheses: _Hypotheses, levelled: Array, config: ResectionConfig) -> _Hypotheses:
     """Return the hypotheses that most others agree with."""
     if len(hypotheses.yaws) <= _N_HYPOTHESES:
         return hypotheses
     middle = levelled.mean(axis=0)
     spread = np.sqrt(np.mean(np.sum((levelled - middle)[:, :2] ** 2, axis=1)))
-    place = _turned(np.tile(middle, (len(hypotheses.yaws), 1)), hypotheses.yaws)
-    place = (place + hypotheses.translations)[:, :2]
+    (x, y, _), c, s = middle, np.cos(hypotheses.yaws), np.sin(hypotheses.yaws)
+    place = np.column_stack([c * x - s * y, s * x + c * y]) + hypotheses.translations[:, :2]
     turns = spread * (hypotheses.yaws % (2.0 * np.pi))
     cells = np.column_stack([place - place.min(axis=0), turns]) // (2.0 * config.match_tolerance)
     width = cells.max(axis=0) + 1.0
@@ -656,40 +673,43 @@ def _assigned(
     eastwards = np.argsort(marks_site[:, 0])
     extent = float(np.ptp(marks_site[:, 0]))
     side = max(tolerance, extent / _N_CELLS)
-    cells = marks_site[eastwards[0], 0] + side * np.arange(int(extent / side) + 2)
-    starts = np.searchsorted(marks_site[eastwards, 0], cells)
-    table = (eastwards, marks_site[eastwards], cells, starts)
+    west = float(marks_site[eastwards[0], 0])
+    edges = west + side * np.arange(int(extent / side) + 2)
+    starts = np.searchsorted(marks_site[eastwards, 0], edges)
+    table = (eastwards, marks_site[eastwards], starts)
     marks = np.full((len(hypotheses.yaws), len(p)), -1, dtype=np.intp)
-    return marks, _assign(p, hypotheses, table, (tolerance, slack), marks)
+    return marks, _assign(p, hypotheses, table, (tolerance, slack, west, side), marks)
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
 def _assign(
     p: Array,
     hypotheses: _Hypotheses,
-    table: tuple[Index, Array, Array, Index],
-    limits: tuple[float, float],
+    table: tuple[Index, Array, Index],
+    limits: tuple[float, float, float, float],
     marks: Index,
 ) -> Array:
     """Fill in marks, of which there are none yet, and return scores.
 
-    ``table`` are the marks from west to east, and where each of some cells begins among them.
+    ``table`` are the marks from west to east, and where cells begin among them; limits as of
+    ``_nearest``.
     """
-    n, scores = len(p), np.zeros(len(marks))
+    n, scores, (eastwards, marks_site, starts) = len(p), np.zeros(len(marks)), table
     near, squares = np.empty(n, dtype=np.intp), np.empty(n)
-    owners = np.full(len(table[0]), -1, dtype=np.intp)
+    owners = np.full(len(eastwards), -1, dtype=np.intp)
     for h in range(len(marks)):
         c, s = np.cos(hypotheses.yaws[h]), np.sin(hypotheses.yaws[h])
         t = hypotheses.translations[h]
         for i in range(n):
             x, y, z = c * p[i, 0] - s * p[i, 1], s * p[i, 0] + c * p[i, 1], p[i, 2]
-            near[i], squares[i] = _nearest((x + t[0], y + t[1], z + t[2]), table, limits)
+            place = (x + t[0], y + t[1], z + t[2])
+            near[i], squares[i] = _nearest(place, marks_site, starts, limits)
             owner = owners[near[i]] if near[i] >= 0 else i
             if near[i] >= 0 and (owner < 0 or squares[i] < squares[owner]):
                 owners[near[i]] = i
         for i in range(n):
             if near[i] >= 0 and owners[near[i]] == i:
-                marks[h, i] = table[0][near[i]]
+                marks[h, i] = eastwards[near[i]]
                 scores[h] += 1.0 - squares[i] / limits[0] ** 2
         for i in range(n):
             if near[i] >= 0:
@@ -700,14 +720,17 @@ def _assign(
 @numba.njit(cache=True, nogil=True, error_model="numpy")
 def _nearest(
     place: tuple[float, float, float],
-    table: tuple[Index, Array, Array, Index],
-    limits: tuple[float, float],
+    marks: Array,
+    starts: Index,
+    limits: tuple[float, float, float, float],
 ) -> tuple[int, float]:
-    """Return the nearest mark, in the order of the table, or -1; and the square of its distance."""
-    (x, y, z), (_, marks, cells, starts), (tolerance, slack) = place, table, limits
+    """Return the nearest mark, in the order of the table, or -1; and the square of its distance.
+
+    ``limits`` are tolerance, slack of heights, where the first cell begins and how wide each is.
+    """
+    (x, y, z), (tolerance, slack, west, side) = place, limits
     best, least = -1, tolerance * tolerance
-    side = cells[1] - cells[0]
-    cell = min(max(int((x - tolerance - cells[0]) / side), 0), len(cells) - 1)
+    cell = min(max(int((x - tolerance - west) / side), 0), len(starts) - 1)
     for j in range(starts[cell], len(marks)):
         if marks[j, 0] > x + tolerance:
             break
