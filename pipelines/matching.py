@@ -1,4 +1,4 @@
-"""Which marker is which control mark: hides hypotheses, votes and the tests of a match.
+"""Which marker is which control mark: hides rivals, refinement and the tests of a match.
 
 Nobody labels a sphere. All is computed in a site frame that is shifted to the middle of the
 control marks, so that large coordinates cost no digits.
@@ -7,13 +7,9 @@ control marks, so that large coordinates cost no digits.
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
-from functools import lru_cache
 from math import comb
-from typing import NamedTuple
 
-import numba
 import numpy as np
-from scipy.spatial import cKDTree
 
 from pipelines.adjustment import Observations, Solution, solve
 from pipelines.config import ResectionConfig
@@ -24,11 +20,17 @@ from pipelines.errors import (
     SolveError,
 )
 from pipelines.geometry import levelling_rotation, rigid, rot_z, skew, transform
+from pipelines.hypotheses import (
+    AS_IT_IS,
+    Hypotheses,
+    Spans,
+    agreements,
+    align,
+    assign,
+    pairs_far_first,
+)
 from pipelines.values import Array, ControlMarks, Index, MarkerFits
 
-_N_CANDIDATES = 300_000  # pairs of pairs that are compared at most; more find nothing new
-_N_HYPOTHESES = 1000  # poses that are looked at; the true one has many votes
-_N_CELLS = 500  # of a map of the marks, along each side
 _N_SOLUTIONS = 6  # that are refined: the best, and rivals enough to see that it is ambiguous
 _N_ROUNDS = 8  # of adjusting and matching again; two or three are the rule
 _RIVAL = 14.0  # -2 ln(0.001): how much better, in the weighted sum of squares, the best must be
@@ -90,35 +92,6 @@ class Scene:
     sigma_range: float
     shared: Array
     sigma_height: float
-
-
-class Spans(NamedTuple):
-    """Marks two by two, in both orders, the nearest to each other first.
-
-    Attributes
-    ----------
-    first, second : (h,)
-        Places among the marks.
-    targets : (h, 3)
-        From the first to the second [m].
-    lengths : (h,)
-        How long each is [m].
-    """
-
-    first: Index
-    second: Index
-    targets: Array
-    lengths: Array
-
-
-class _Hypotheses(NamedTuple):
-    """Poses to be tried: heading [rad] and translation [m] of the levelled frame."""
-
-    yaws: Array
-    translations: Array
-
-
-_AS_IT_IS = _Hypotheses(np.zeros(1), np.zeros((1, 3)))
 
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
@@ -273,29 +246,6 @@ def cov_of_shared(scene: Scene, variances: Array, of_ranges: Array, of_heights: 
     return np.asarray(shared - np.swapaxes(of_ranges * variances[..., None], -1, -2) @ of_ranges)
 
 
-def spans_between(marks_site: Array, longest: float) -> Spans:
-    """List marks two by two.
-
-    Parameters
-    ----------
-    marks_site : (m, 3)
-        Marks [m].
-    longest : float
-        How far apart they may be [m].
-
-    Returns
-    -------
-    Spans
-        What two fits can be compared with.
-    """
-    pairs = cKDTree(marks_site).query_pairs(longest, output_type="ndarray")
-    first, second = np.concatenate([pairs, pairs[:, ::-1]]).T
-    targets = marks_site[second] - marks_site[first]
-    lengths = np.linalg.norm(targets, axis=1)
-    order = np.lexsort((second, first, lengths))
-    return Spans(first[order], second[order], targets[order], lengths[order])
-
-
 def match_marks(scene: Scene, config: ResectionConfig, spans: Spans | None = None) -> Match:
     """Find out which fit is which mark.
 
@@ -337,7 +287,8 @@ def match_marks(scene: Scene, config: ResectionConfig, spans: Spans | None = Non
     _refuse_plumb_line(scene.marks_site, "control marks", config)
     if min(len(levelled), len(scene.marks_site)) == 2:
         return _matched_pair(levelled, scene, config)
-    hypotheses = _voted(_hypotheses(levelled, scene, config, spans), levelled, config)
+    slope = 3.0 * scene.sigma_level
+    hypotheses = align(levelled, scene.marks_site, config.match_tolerance, slope, spans)
     solutions = _solutions(hypotheses, levelled, scene, config)
     if not solutions:
         raise NoMatchError(
@@ -483,56 +434,6 @@ def _refuse_plumb_line(p: Array, kind: str, config: ResectionConfig) -> None:
         )
 
 
-def _hypotheses(
-    levelled: Array, scene: Scene, config: ResectionConfig, known: Spans | None
-) -> _Hypotheses:
-    """Return the poses that bring some two fits onto some two marks."""
-    tolerance = config.match_tolerance
-    first, second = _pairs_far_first(len(levelled))
-    spans = levelled[second] - levelled[first]
-    usable = np.hypot(spans[:, 0], spans[:, 1]) > 2.0 * tolerance
-    first, second, spans = first[usable], second[usable], spans[usable]
-    reach = np.linalg.norm(spans, axis=1)
-    longest = float(reach.max(initial=0.0)) + 2.0 * tolerance
-    goals = known or spans_between(scene.marks_site, longest)
-    low = np.searchsorted(goals.lengths, reach - tolerance)
-    counts = np.searchsorted(goals.lengths, reach + tolerance) - low
-    counts[np.cumsum(counts) > max(_N_CANDIDATES, counts[:1].sum())] = 0
-    slacks = tolerance + 3.0 * scene.sigma_level * reach
-    middles = (levelled[first] + levelled[second]) / 2.0
-    fits = (spans, middles, slacks)
-    return _Hypotheses(*_aligned(fits, (low, low + counts), goals, scene.marks_site))
-
-
-@numba.njit(cache=True, nogil=True, error_model="numpy")
-def _aligned(
-    fits: tuple[Array, Array, Array], ranges: tuple[Index, Index], goals: Spans, marks_site: Array
-) -> tuple[Array, Array]:
-    """Return the poses that bring spans between fits onto those of a range that rise alike.
-
-    ``fits`` are the spans, their middles, and by how much they may rise more or less.
-    """
-    (spans, middles, slacks), (low, high), n = fits, ranges, 0
-    for k in range(len(spans)):
-        for g in range(low[k], high[k]):
-            n += abs(goals.targets[g, 2] - spans[k, 2]) <= slacks[k]
-    yaws, translations, n = np.empty(n), np.empty((n, 3)), 0
-    for k in range(len(spans)):
-        x, y, z = middles[k]
-        azimuth = np.arctan2(spans[k, 1], spans[k, 0])
-        for g in range(low[k], high[k]):
-            if abs(goals.targets[g, 2] - spans[k, 2]) > slacks[k]:
-                continue
-            p, q = marks_site[goals.first[g]], marks_site[goals.second[g]]
-            yaws[n] = np.arctan2(goals.targets[g, 1], goals.targets[g, 0]) - azimuth
-            c, s = np.cos(yaws[n]), np.sin(yaws[n])
-            translations[n, 0] = (p[0] + q[0]) / 2.0 - (c * x - s * y)
-            translations[n, 1] = (p[1] + q[1]) / 2.0 - (s * x + c * y)
-            translations[n, 2] = (p[2] + q[2]) / 2.0 - z
-            n += 1
-    return yaws, translations
-
-
 def _matched_pair(levelled: Array, scene: Scene, config: ResectionConfig) -> Match:
     """Return the match of two markers and two marks that keeps distance and height best."""
     pairs, misfits = _pair_misfits(levelled, scene, config)
@@ -565,7 +466,7 @@ def _pair_misfits(levelled: Array, scene: Scene, config: ResectionConfig) -> tup
 
     The misfit is the weighted sum of squares of distance and difference of height, (h,).
     """
-    first, second = _pairs_far_first(len(levelled))
+    first, second = pairs_far_first(len(levelled))
     a, b = np.nonzero(~np.eye(len(scene.marks_site), dtype=np.bool_))
     rows, columns = (k.ravel() for k in np.indices((len(first), len(a))))
     pairs = np.stack(
@@ -597,41 +498,15 @@ def _pair_pose(levelled: Array, scene: Scene, pair: Index) -> Array:
     return rigid(R @ scene.R_station_base, q.mean(axis=0) - R @ p.mean(axis=0))
 
 
-@lru_cache(maxsize=8)
-def _pairs_far_first(n: int) -> tuple[Index, Index]:
-    """Return all pairs of n fits, those far apart in azimuth first."""
-    first, second = np.triu_indices(n, 1)
-    apart = np.minimum(second - first, n - (second - first))
-    order = np.argsort(-apart, kind="stable")
-    return first[order], second[order]
-
-
-def _voted(hypotheses: _Hypotheses, levelled: Array, config: ResectionConfig) -> _Hypotheses:
-    """Return the hypotheses that most others agree with."""
-    if len(hypotheses.yaws) <= _N_HYPOTHESES:
-        return hypotheses
-    middle = levelled.mean(axis=0)
-    spread = np.sqrt(np.mean(np.sum((levelled - middle)[:, :2] ** 2, axis=1)))
-    (x, y, _), c, s = middle, np.cos(hypotheses.yaws), np.sin(hypotheses.yaws)
-    place = np.column_stack([c * x - s * y, s * x + c * y]) + hypotheses.translations[:, :2]
-    turns = spread * (hypotheses.yaws % (2.0 * np.pi))
-    cells = np.column_stack([place - place.min(axis=0), turns]) // (2.0 * config.match_tolerance)
-    width = cells.max(axis=0) + 1.0
-    keys = (cells[:, 0] * width[1] + cells[:, 1]) * width[2] + cells[:, 2]
-    _, cell, votes = np.unique(keys, return_inverse=True, return_counts=True)
-    chosen = np.argsort(-votes[cell], kind="stable")[:_N_HYPOTHESES]
-    return _Hypotheses(hypotheses.yaws[chosen], hypotheses.translations[chosen])
-
-
 def _solutions(
-    hypotheses: _Hypotheses, levelled: Array, scene: Scene, config: ResectionConfig
+    hypotheses: Hypotheses, levelled: Array, scene: Scene, config: ResectionConfig
 ) -> list[Match]:
     """Return refined matches that differ from each other, the best first."""
     if not len(hypotheses.yaws):
         return []
     reach = float(np.linalg.norm(levelled, axis=1).max())
     slack = 1.0 + 3.0 * scene.sigma_level * reach / config.match_tolerance
-    marks, scores = _assigned(levelled, hypotheses, scene.marks_site, config.match_tolerance, slack)
+    marks, scores = assign(levelled, hypotheses, scene.marks_site, config.match_tolerance, slack)
     counts = np.count_nonzero(marks >= 0, axis=1)
     solutions: list[tuple[float, Match]] = []
     for _ in range(_N_SOLUTIONS):
@@ -643,102 +518,13 @@ def _solutions(
             yaw, translation = hypotheses.yaws[best], hypotheses.translations[best]
             T = rigid(rot_z(yaw) @ scene.R_station_base, translation)
             refined = _refined(marks[best], T, scene, config)
-        shared = _agreements(marks, marks[best])
+        shared = agreements(marks, marks[best])
         if refined is not None:
             solutions.append(refined)
-            shared = np.maximum(shared, _agreements(marks, refined[1].marks))
+            shared = np.maximum(shared, agreements(marks, refined[1].marks))
         scores[2 * shared >= counts] = 0.0
         scores[best] = 0.0
     return [match for _, match in sorted(solutions, key=lambda item: -item[0])]
-
-
-@numba.njit(cache=True, nogil=True)
-def _agreements(marks: Index, others: Index) -> Index:
-    """Return how many fits have the same mark in each match, (h, n), and in another one, (n,)."""
-    counts = np.zeros(len(marks), dtype=np.intp)
-    for h in range(len(marks)):
-        for i in range(len(others)):
-            counts[h] += others[i] >= 0 and marks[h, i] == others[i]
-    return counts
-
-
-def _assigned(
-    p: Array, hypotheses: _Hypotheses, marks_site: Array, tolerance: float, slack: float
-) -> tuple[Index, Array]:
-    """Return, for each hypothesis, the mark of each fit or -1, (h, n), and a score, (h,).
-
-    Heights count less by ``slack``. A mark goes to the fit that is nearest. The score of a matched
-    fit falls from 1 to 0 with the square of its distance (MSAC, Torr and Zisserman 2000).
-    """
-    eastwards = np.argsort(marks_site[:, 0])
-    extent = float(np.ptp(marks_site[:, 0]))
-    side = max(tolerance, extent / _N_CELLS)
-    west = float(marks_site[eastwards[0], 0])
-    edges = west + side * np.arange(int(extent / side) + 2)
-    starts = np.searchsorted(marks_site[eastwards, 0], edges)
-    table = (eastwards, marks_site[eastwards], starts)
-    marks = np.full((len(hypotheses.yaws), len(p)), -1, dtype=np.intp)
-    return marks, _assign(p, hypotheses, table, (tolerance, slack, west, side), marks)
-
-
-@numba.njit(cache=True, nogil=True, error_model="numpy")
-def _assign(
-    p: Array,
-    hypotheses: _Hypotheses,
-    table: tuple[Index, Array, Index],
-    limits: tuple[float, float, float, float],
-    marks: Index,
-) -> Array:
-    """Fill in marks, of which there are none yet, and return scores.
-
-    ``table`` are the marks from west to east, and where cells begin among them; limits as of
-    ``_nearest``.
-    """
-    n, scores, (eastwards, marks_site, starts) = len(p), np.zeros(len(marks)), table
-    near, squares = np.empty(n, dtype=np.intp), np.empty(n)
-    owners = np.full(len(eastwards), -1, dtype=np.intp)
-    for h in range(len(marks)):
-        c, s = np.cos(hypotheses.yaws[h]), np.sin(hypotheses.yaws[h])
-        t = hypotheses.translations[h]
-        for i in range(n):
-            x, y, z = c * p[i, 0] - s * p[i, 1], s * p[i, 0] + c * p[i, 1], p[i, 2]
-            place = (x + t[0], y + t[1], z + t[2])
-            near[i], squares[i] = _nearest(place, marks_site, starts, limits)
-            owner = owners[near[i]] if near[i] >= 0 else i
-            if near[i] >= 0 and (owner < 0 or squares[i] < squares[owner]):
-                owners[near[i]] = i
-        for i in range(n):
-            if near[i] >= 0 and owners[near[i]] == i:
-                marks[h, i] = eastwards[near[i]]
-                scores[h] += 1.0 - squares[i] / limits[0] ** 2
-        for i in range(n):
-            if near[i] >= 0:
-                owners[near[i]] = -1
-    return scores
-
-
-@numba.njit(cache=True, nogil=True, error_model="numpy")
-def _nearest(
-    place: tuple[float, float, float],
-    marks: Array,
-    starts: Index,
-    limits: tuple[float, float, float, float],
-) -> tuple[int, float]:
-    """Return the nearest mark, in the order of the table, or -1; and the square of its distance.
-
-    ``limits`` are tolerance, slack of heights, where the first cell begins and how wide each is.
-    """
-    (x, y, z), (tolerance, slack, west, side) = place, limits
-    best, least = -1, tolerance * tolerance
-    cell = min(max(int((x - tolerance - west) / side), 0), len(starts) - 1)
-    for j in range(starts[cell], len(marks)):
-        if marks[j, 0] > x + tolerance:
-            break
-        dx, dy, dz = marks[j, 0] - x, marks[j, 1] - y, (marks[j, 2] - z) / slack
-        square = dx * dx + dy * dy + dz * dz
-        if square < least:
-            best, least = j, square
-    return best, least
 
 
 def _refined(
@@ -755,7 +541,7 @@ def _refined(
             return None
         T = solution.estimate
         placed = transform(T, scene.centres_base)
-        again, scores = _assigned(placed, _AS_IT_IS, scene.marks_site, config.match_tolerance, 1.0)
+        again, scores = assign(placed, AS_IT_IS, scene.marks_site, config.match_tolerance, 1.0)
         if np.array_equal(again[0], marks):
             residuals = solution.groups[0].residuals
             return float(scores[0]), Match(

@@ -134,12 +134,12 @@ def fit(
     -----
     Along the beam the residual of a known radius has one minimum (Franaszek, Cheok, Saidi,
     Witzgall, 2009), save for what the limb adds: there ranges bend so fast that they are linearised
-    over the width of the centre's own uncertainty (``passes.linearise``). A range of a sphere has
-    a likelihood only where the footprint meets the sphere: that bounds the centre from all sides
-    (``outline``). Iteratively reweighted least squares with Tukey's weight; the noise is pooled
-    over the stop, by reflectivity where returns are many, and laser biases are random effects of
-    all markers together, whose spread is estimated by expectation maximisation. Each step costs one
-    pass over the returns.
+    over the width of the centre's own uncertainty (``linearising.linearise``). A range of a sphere
+    has a likelihood only where the footprint meets the sphere: that bounds the centre from all
+    sides (``outline``). Iteratively reweighted least squares with Tukey's weight; the noise is
+    pooled over the stop, by reflectivity where returns are many, and laser biases are random
+    effects of all markers together, whose spread is estimated by expectation maximisation. Each
+    step costs one pass over the returns.
     """
     return _fit(cloud, found, config, radius, asks_outline=True)
 

@@ -23,7 +23,8 @@ from pipelines.errors import (
     SolveError,
 )
 from pipelines.geometry import levelling_rotation, rigid, transform
-from pipelines.matching import Spans, gather, match_marks, shared_variances, spans_between
+from pipelines.hypotheses import Spans, spans_between
+from pipelines.matching import gather, match_marks, shared_variances
 from pipelines.network.doubts import doubt
 from pipelines.network.values import LeftOut, Network, Refusal, Shared
 from pipelines.values import Array, ControlMarks, MarkerFits
