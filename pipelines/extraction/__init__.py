@@ -84,7 +84,7 @@ def extract(
     cells = cells_of(cloud, config)
     ball = Ball(marker_radius, cells.R_station_base[2], float(cloud.rig.divergence.max()))
     ground = ground_of(cloud, cells, config)
-    seeds = find_seeds(cloud.p_base, ground.rows_above, ball, config.n_points_min)
+    seeds = find_seeds(ground.points_above, ball, config.n_points_min)
     looks = distinct(look_at(cloud, cells, seeds, ball), config, marker_radius)
     found, refused = _judged(cloud, cells, looks, config, ball)
     return MarkerCandidates(

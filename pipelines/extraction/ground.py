@@ -28,13 +28,13 @@ class Ground(NamedTuple):
 
     Attributes
     ----------
-    rows_above : (m,) int32
-        Returns that are not known to be ground, ascending.
+    points_above : (m, 3) float32
+        Returns that are not known to be ground [m].
     height_max : float
         Highest ground return within 10 m, levelled [m].
     """
 
-    rows_above: NDArray[np.int32]
+    points_above: Column
     height_max: float
 
 
@@ -68,8 +68,8 @@ def ground_of(cloud: StitchedCloud, cells: Cells, config: ExtractionConfig) -> G
         ),
         len(cloud.p_base),
     )
-    rows = np.concatenate([rows for rows, _ in parts])
-    return Ground(rows, max(field_highest, *(highest for _, highest in parts)))
+    points = np.concatenate([points for points, _ in parts])
+    return Ground(points, max(field_highest, *(highest for _, highest in parts)))
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
@@ -188,21 +188,21 @@ def _above(
     cells: NDArray[np.int32],
     ground: Column,
     clearance: float,
-) -> tuple[NDArray[np.int32], float]:
-    """Return which of some rows are not known to be ground, and the highest ground among them.
+) -> tuple[Column, float]:
+    """Return those of some returns that are not known to be ground, and the highest ground there.
 
     Ground counts as such up to the edge of the study's field.
     """
-    above = np.empty(len(rows), np.int32)
+    above = np.empty((len(rows) + 1, 3), np.float32)
     n, highest = 0, -np.inf
     for i in range(len(rows)):
         x, y, z = p_base[rows[i], 0], p_base[rows[i], 1], p_base[rows[i], 2]
         height = np.float32(v_up[0] * x + v_up[1] * y + v_up[2] * z)
         below = ground[cells[i]]
         over = height - below
-        above[n] = rows[i]  # kept only if the next one does not take its place
+        above[n, 0], above[n, 1], above[n, 2] = x, y, z  # unless the next one takes its place
         n += (over > clearance) | (below == np.inf)
         is_field = x * x + y * y < _STUDY_FIELD**2
         if is_field and -np.inf < over < _GROUND_RISE and height > highest:
             highest = float(height)
-    return above[:n].copy(), highest
+    return above[:n], highest

@@ -38,17 +38,13 @@ class _Voxels(NamedTuple):
     edge: float
 
 
-def find_seeds(
-    p_base: Column, rows_above: NDArray[np.int32], ball: Ball, n_points_min: int
-) -> Array:
+def find_seeds(points: Column, ball: Ball, n_points_min: int) -> Array:
     """Return rough centres at which a ball may be looked for.
 
     Parameters
     ----------
-    p_base : (n, 3) float32
-        Returns [m].
-    rows_above : (m,) int32
-        Those that are not known to be ground.
+    points : (n, 3) float32
+        Returns that are not known to be ground [m].
     ball : Ball
         What is looked for.
     n_points_min : int
@@ -59,7 +55,7 @@ def find_seeds(
     (k, 3)
         Places, those with most returns first [m].
     """
-    voxels = _voxels(p_base, rows_above, ball.radius)
+    voxels = _voxels(points, ball.radius)
     ends = _free_ends(voxels, ball.up, ball.radius, n_points_min)
     ends = ends[np.lexsort((ends[:, 2], ends[:, 1], ends[:, 0], -ends[:, 3]))]
     return np.ascontiguousarray(thinned(ends, 0.5 * ball.radius)[:, :3])
@@ -83,25 +79,25 @@ def _voxel(x: float, y: float, z: float, edge: float) -> int:
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def _voxels(p_base: Column, rows: NDArray[np.int32], edge: float) -> _Voxels:
+def _voxels(points: Column, edge: float) -> _Voxels:
     """Return the voxels that some returns occupy."""
     size = 64
-    while size < 2 * len(rows):
+    while size < 2 * len(points):
         size *= 2
     keys, numbers = np.full(size, -1, np.int64), np.empty(size, np.int32)
-    sums = np.empty((len(rows), 4), np.float32)
+    sums = np.empty((len(points), 4), np.float32)
     n = 0
-    for i in rows:
-        key = _voxel(p_base[i, 0], p_base[i, 1], p_base[i, 2], edge)
+    for point in points:
+        key = _voxel(point[0], point[1], point[2], edge)
         slot = _slot(keys, key)
         if keys[slot] == -1:
             keys[slot], numbers[slot] = key, n
             sums[n] = 0.0
             n += 1
         own = sums[numbers[slot]]
-        own[0] += p_base[i, 0]
-        own[1] += p_base[i, 1]
-        own[2] += p_base[i, 2]
+        own[0] += point[0]
+        own[1] += point[1]
+        own[2] += point[2]
         own[3] += 1.0
     return _Voxels(keys, numbers, sums[:n], edge)
 
