@@ -13,7 +13,7 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from pipelines.extraction.cells import Cells, rows_in
+from pipelines.extraction.cells import Cells, Layout, rows_in
 from pipelines.threads import side_by_side
 from pipelines.values import Array, Column, Mask
 
@@ -73,7 +73,7 @@ def patches_about(p_base: Column, cells: Cells, seeds: Array, radius: float) -> 
     """
     reach, layout = _REACH * radius, cells.layout
     margin = int(np.ceil(reach / layout.edge)) + 1
-    is_wanted = _wanted(layout.n_side, _cells_at(seeds, cells), margin)
+    is_wanted = _wanted(layout, cells.R_station_base, seeds, margin)
     starts, points = _sorted(p_base, cells.ground, is_wanted)
     return Patches(starts, points, layout.n_side, layout.edge, cells.R_station_base, reach)
 
@@ -104,14 +104,6 @@ def _sorted(
         worth=2,
     )
     return starts, points
-
-
-def _cells_at(p_base: Array, cells: Cells) -> NDArray[np.int64]:
-    """Return the cells of some places; of a place beyond the grid, the nearest one."""
-    n_side, edge, _ = cells.layout
-    places = np.floor((p_base @ cells.R_station_base.T)[:, :2] / edge).astype(np.int64)
-    places = np.clip(places + n_side // 2, 0, n_side - 1)
-    return np.asarray(places[:, 0] * n_side + places[:, 1])
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
@@ -195,7 +187,7 @@ def _run(patches: Patches, row: int, low: int, high: int) -> tuple[int, int]:
 @numba.njit(cache=True, nogil=True, error_model="numpy")
 def _span(patches: Patches, v_axis: Array, c: Array) -> tuple[int, int]:
     """Return the first and the last cell along an axis that may hold returns within reach."""
-    place = v_axis[0] * c[0] + v_axis[1] * c[1] + v_axis[2] * c[2]
+    place = _along(v_axis, c)
     reach, half = patches.reach + _ROUNDED, patches.n_side // 2
     first = int(np.floor((place - reach) / patches.edge)) + half
     last = int(np.floor((place + reach) / patches.edge)) + half
@@ -203,13 +195,22 @@ def _span(patches: Patches, v_axis: Array, c: Array) -> tuple[int, int]:
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def _wanted(n_side: int, seed_cells: NDArray[np.int64], margin: int) -> Mask:
-    """Tell which cells are in and about the seeds' cells; what is beyond the grid is not."""
+def _along(v_axis: Array, c: Array) -> float:
+    """Return how far along an axis a place lies."""
+    return float(v_axis[0] * c[0] + v_axis[1] * c[1] + v_axis[2] * c[2])
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _wanted(layout: Layout, R_station_base: Array, places: Array, margin: int) -> Mask:
+    """Tell which cells are those of some places, or near them; what is beyond the grid is not."""
+    n_side, last = layout.n_side, layout.n_side - 1
     is_wanted = np.zeros(n_side * n_side + 1, np.bool_)
-    for cell in seed_cells:
-        row, column = cell // n_side, cell % n_side
-        for k in range(max(row - margin, 0), min(row + margin + 1, n_side)):
-            for m in range(max(column - margin, 0), min(column + margin + 1, n_side)):
+    for i in range(len(places)):
+        x, y = _along(R_station_base[0], places[i]), _along(R_station_base[1], places[i])
+        row = min(max(int(np.floor(x / layout.edge)) + n_side // 2, 0), last)
+        column = min(max(int(np.floor(y / layout.edge)) + n_side // 2, 0), last)
+        for k in range(max(row - margin, 0), min(row + margin, last) + 1):
+            for m in range(max(column - margin, 0), min(column + margin, last) + 1):
                 is_wanted[k * n_side + m] = True
     return is_wanted
 

@@ -169,10 +169,9 @@ def _cones(centres: Array, ball: Ball) -> Array:
     Their axes, not of unit length; and the square of how far a unit vector at the edge of one goes
     along its axis, in the axis's own length.
     """
-    distances = np.sqrt(np.sum(centres**2, axis=1))
-    blurs = np.array([blur_at(c, ball) for c in centres])
-    tangents = (_REACH * ball.radius + blurs) / distances
-    return np.column_stack([centres, distances**2 / (1.0 + tangents**2)])
+    distances2 = np.sum(centres**2, axis=1)
+    tangents = _REACH * ball.radius / np.sqrt(distances2) + 0.5 * ball.divergence
+    return np.column_stack([centres, distances2 / (1.0 + tangents**2)])
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
