@@ -444,8 +444,10 @@ def _normals(seen: Array, residuals: Array, weights: Array, radius: float) -> tu
         bb, bc, bd = bb + w * b * b, bc + w * b, bd + w * b * d
         cc, cd, dd = cc + w, cd + w * d, dd + w * d * d
         pa, pb, pc, pd = pa + r * a, pb + r * b, pc + r, pd + r * d
-    N = np.array([[aa, ab, ac, ad], [ab, bb, bc, bd], [ac, bc, cc, cd], [ad, bd, cd, dd]])
-    return N, np.array([pa, pb, pc, pd])
+    N, pull = np.empty((4, 4)), np.empty(4)  # quicker than from lists
+    N[0], N[1], N[2], N[3] = (aa, ab, ac, ad), (ab, bb, bc, bd), (ac, bc, cc, cd), (ad, bd, cd, dd)
+    pull[:] = pa, pb, pc, pd
+    return N, pull
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
