@@ -21,7 +21,7 @@ from pipelines.threads import side_by_side
 from pipelines.values import Nanos
 from storage.recordings.records import RECORD_HEAD, Octets, text, walk
 
-_STRETCH = 1 << 24  # [bytes] of chunks that are brought together
+_STRETCH = 1 << 26  # [bytes] of chunks that are brought together: to begin anew costs half a ms
 _CHUNK_LIMIT = 1 << 29  # [bytes] a larger decompressed chunk is refused, whatever it declares
 _HEAD = 8 + 8 + 8 + 4 + 4 + 64 + 8  # [bytes] before the records of a chunk, at the most
 _BROKEN = (ValueError, struct.error, zstandard.ZstdError, RuntimeError)
