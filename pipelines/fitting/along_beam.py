@@ -205,7 +205,7 @@ def _gather(
 ) -> tuple[_Shots, Array]:
     """Return the members of all candidates as one table of shots, and the sigmas of biases."""
     members = np.concatenate([c.members for c in candidates])
-    is_finite = np.isfinite(cloud.p_base[members].sum(axis=1))
+    is_finite = np.isfinite(cloud.p_base[members]).all(axis=1)
     ends = np.cumsum([0, *(len(c.members) for c in candidates)])
     together, firsts = members[is_finite], np.concatenate([[0], np.cumsum(is_finite)])[ends]
     table = beams(cloud, together)
