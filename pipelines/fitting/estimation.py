@@ -16,7 +16,7 @@ from pipelines.fitting.equations import Normals, normals_of, solve
 from pipelines.fitting.faces import N_MOUNTING, effects_on
 from pipelines.fitting.linearising import Linear, linearise
 from pipelines.fitting.noise import START, Noise, Weighed, weigh
-from pipelines.fitting.outline import Outline, outline_normals, outline_of
+from pipelines.fitting.outline import Outline, outline_before, outline_normals, outline_of
 from pipelines.fitting.radius import Weighing, free_radii
 from pipelines.fitting.rows import Rows, in_play, moved_faces
 from pipelines.values import Array, Mask
@@ -27,6 +27,7 @@ _MOUNTING_MIN = 1e-9  # of what is known of the mounting: likewise
 _N_STEPS = 8
 _N_STEPS_GATED = 5  # after these the choice of returns by their place stays as it is
 _N_STEPS_RANGES = 3  # without the outline
+_N_STEPS_SOFT = 6  # before it is known how returns end there
 _ROUGH = 0.1  # radii by which a rough centre may be off per axis
 _STEP_MAX = 0.25  # radii per step
 _GAP_SIGMAS = 3.0  # of its centre by which a return may pass a sphere by and still be its own
@@ -102,9 +103,9 @@ class Estimate(NamedTuple):
 
 
 class _Bounds(NamedTuple):
-    """How returns end at the outline, once that is known; what each says of it, (n, 2)."""
+    """How returns end at the outline, as far as it is known; what each says of it, (n, 2)."""
 
-    outline: Outline | None
+    outline: Outline
     sites: Array
 
 
@@ -133,7 +134,7 @@ def estimate(
     """
     state, radius = _start(rough, known), known.radius
     is_in = np.ones(len(rows.ranges), dtype=bool)
-    bounds = _Bounds(outline=None, sites=np.zeros((len(rows.ranges), 2)))
+    bounds = _Bounds(outline_before(radius), sites=np.zeros((len(rows.ranges), 2)))
     for step in range(_N_STEPS):
         linear = _linear(rows, state, is_in, radius)
         if step < _N_STEPS_GATED:
@@ -141,8 +142,11 @@ def estimate(
         now = _weighed(rows, state, linear, is_in)
         state = now.state._replace(has_biases=step >= _N_STEPS_GATED)
         N = _normals(rows, now)
+        if asks_outline and step == _N_STEPS_SOFT:
+            outline = outline_of(rows, linear, now.weighed.weights, radius)
+            bounds = bounds._replace(outline=outline)
         if asks_outline and step >= _N_STEPS_RANGES:
-            N, bounds = _bounded(rows, now, radius, N, bounds)
+            N, bounds = _bounded(rows, now, N, bounds)
         if told is not None and step >= _N_STEPS_RANGES:
             N = _with_told(N, state, told)
         state = _stepped(state, N, known)
@@ -204,21 +208,19 @@ def _normals(rows: Rows, now: Estimate) -> Normals:
     return normals_of(rows, now.linear, residuals, weights / sigmas**2, len(now.state.biases))
 
 
-def _bounded(
-    rows: Rows, now: Estimate, radius: float, N: Normals, known: _Bounds
-) -> tuple[Normals, _Bounds]:
-    """Return normal equations with what the outline adds, and what was learnt of it."""
+def _bounded(rows: Rows, now: Estimate, N: Normals, known: _Bounds) -> tuple[Normals, _Bounds]:
+    """Return normal equations with what the outline adds, and what each return says of it."""
     covs = now.state.cov_noise + now.state.cov_biases
-    met = (rows, now.linear, now.weighed.weights, covs)
-    outline = known.outline or outline_of(*met, radius)
-    centres, pull_centres, faces, pull_faces, sites = outline_normals(*met, outline, known.sites)
+    centres, pull_centres, faces, pull_faces, sites = outline_normals(
+        rows, now.linear, now.weighed.weights, covs, *known
+    )
     added = N._replace(
         centres=N.centres + centres,
         pull_centres=N.pull_centres + pull_centres,
         faces=N.faces + faces,
         pull_faces=N.pull_faces + pull_faces,
     )
-    return added, _Bounds(outline, sites)
+    return added, known._replace(sites=sites)
 
 
 def _with_told(N: Normals, state: State, told: Told) -> Normals:

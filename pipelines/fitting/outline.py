@@ -8,39 +8,31 @@ where returns are missing, or reach less far than their footprints would, nothin
 from __future__ import annotations
 
 import math
+from functools import cache
 from typing import NamedTuple
 
 import numba
 import numpy as np
+from scipy.special import ndtr
 
 from pipelines.fitting.linearising import Linear
 from pipelines.fitting.rows import Rows
 from pipelines.values import Array
 
-_EDGES = np.array([-0.5, -0.25, 0.0, 0.25, 0.5, 0.75, 1.0])  # half widths inside the outline
-_SOFTNESSES = np.array([0.07, 0.14, 0.28, 0.56, 1.12])  # half widths of the footprint
+_EDGES = np.arange(-0.5, 1.01, 0.05)  # half widths inside the outline
+_SOFTNESSES = 0.05 * 2.0 ** np.arange(0.0, 4.6, 0.5)  # half widths of the footprint
 _EDGE, _SIGMA_EDGE = 0.2, 0.4  # prior of where returns begin
 _SOFTNESS, _SPREAD = 0.2, 0.7  # prior of the softness, and its standard deviation in the logarithm
+_FROM, _BIN, _N_BINS = -2.0, 0.05, 75  # half widths inside: where returns are counted
+_POLE_BELOW, _POLE_HALF = 0.6, 0.25  # radii below the centre and to either side: beside the pole
+_SOFTNESS_MIN = 0.03
+_SIGMA_OWN = 0.05  # half widths by which the edge of one sphere may differ from that of all
+_POLE_BLUR = 0.3  # half widths by which returns from there may be its own, and not of the outline
 _LUCK = 0.01  # share of returns that are from the sphere by their range and yet did not meet it
-_NEAR = 1.75  # half widths inside the outline within which returns tell of it
 _CERTAIN = 4.0  # standard deviations inside the outline from where meeting is no news
 _CAVITY_MIN = 0.05  # of a centre's precision: the least that is not one return's own
-_N_PRODUCT = 25  # chances that are multiplied before the logarithm is taken
 _TINY = 1e-9  # [m]
-_NEVER = 8.0  # standard deviations outside from where only luck is left
-_PER_SIGMA = 64  # nodes of the normal distribution, between which a series is good to 1e-12
-_DENSITY = 1.0 / math.sqrt(2.0 * math.pi)
-
-
-def _normal() -> Array:
-    """Return nodes of a normal deviate, their chances, densities, and integrals, (n, 4)."""
-    z = np.arange(-_NEVER, _CERTAIN + 1.0 / _PER_SIGMA, 1.0 / _PER_SIGMA)
-    chance = np.array([0.5 * math.erfc(-math.sqrt(0.5) * at) for at in z])
-    density = _DENSITY * np.exp(-0.5 * z * z)
-    return np.column_stack([z, chance, density, z * chance + density])
-
-
-_NORMAL = _normal()
+_HALF, _DENSITY = math.sqrt(0.5), 1.0 / math.sqrt(2.0 * math.pi)
 
 
 class Outline(NamedTuple):
@@ -61,7 +53,23 @@ class Outline(NamedTuple):
     softness: float
 
 
-def outline_of(rows: Rows, linear: Linear, weights: Array, covs: Array, radius: float) -> Outline:
+def outline_before(radius: float) -> Outline:
+    """Return how returns may end before any are seen: as softly as is likely.
+
+    Parameters
+    ----------
+    radius : float
+        Radius of the spheres [m].
+
+    Returns
+    -------
+    Outline
+        To begin with.
+    """
+    return Outline(radius, _EDGE, _SOFTNESS * math.exp(_SPREAD))
+
+
+def outline_of(rows: Rows, linear: Linear, weights: Array, radius: float) -> Outline:
     """Return how returns end at the outline of the spheres of a stop.
 
     Parameters
@@ -69,11 +77,9 @@ def outline_of(rows: Rows, linear: Linear, weights: Array, covs: Array, radius: 
     rows : Rows
         Returns of all spheres.
     linear : Linear
-        Where they pass the centres, found from ranges alone.
+        Where they pass the centres, which outlines of some softness hold already.
     weights : (n,)
         Weights of the returns; those without any are not asked.
-    covs : (m, 3, 3)
-        Covariances of the centres [m^2].
     radius : float
         Radius of the spheres [m].
 
@@ -87,44 +93,49 @@ def outline_of(rows: Rows, linear: Linear, weights: Array, covs: Array, radius: 
     Returns lie evenly up to the edge: one that seems to reach inside of it by ``x``, give or take
     ``s``, has a density like ``Phi(x / s)``. Footprints that are wider or narrower than they are
     said to be move the edge; directions that are off, and what else carries returns across it, make
-    it soft, and then it says less. Mean over a grid, with a weak prior for few spheres.
+    it soft, and then it says less. Mean over a grid, with a weak prior for few spheres. Returns
+    from beside the pole are not asked: there footprints that miss the sphere return too.
     """
-    logs = _logarithms(rows, linear, weights, covs, radius)
-    logs -= 0.5 * ((_EDGES[:, None] - _EDGE) / _SIGMA_EDGE) ** 2
-    logs -= 0.5 * (np.log(_SOFTNESSES / _SOFTNESS) / _SPREAD) ** 2
+    counts, lateral2 = _counts(rows, linear, weights, radius)
+    logs = np.tensordot(counts, _logarithms(), axes=1) + _logarithms_before()
     chances = np.exp(logs - logs.max())
     chances /= chances.sum()
-    softness = np.exp(chances.sum(axis=0) @ np.log(_SOFTNESSES))
-    return Outline(radius, float(chances.sum(axis=1) @ _EDGES), float(softness))
+    softness2 = float(np.exp(2.0 * chances.sum(axis=0) @ np.log(_SOFTNESSES))) - lateral2
+    edge = float(chances.sum(axis=1) @ _EDGES)
+    return Outline(radius, edge, math.sqrt(max(softness2, _SOFTNESS_MIN**2)))
+
+
+@cache
+def _logarithms() -> Array:
+    """Return the log-density of returns of each bin, (b, e, s), for each edge and softness."""
+    inside = _FROM + _BIN * (np.arange(_N_BINS) + 0.5)
+    z = (inside[:, None, None] - _EDGES[:, None]) / _SOFTNESSES
+    t = (_FROM + _BIN * _N_BINS - _EDGES[:, None]) / _SOFTNESSES
+    length = t * ndtr(t) + _DENSITY * np.exp(-0.5 * t * t)
+    return np.asarray(np.log(_LUCK + (1.0 - _LUCK) * ndtr(z)) - np.log(_SOFTNESSES * length))
+
+
+@cache
+def _logarithms_before() -> Array:
+    """Return the log-density of each edge and softness before returns are seen, (e, s)."""
+    edges = ((_EDGES[:, None] - _EDGE) / _SIGMA_EDGE) ** 2
+    return np.asarray(-0.5 * (edges + (np.log(_SOFTNESSES / _SOFTNESS) / _SPREAD) ** 2))
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def _logarithms(rows: Rows, linear: Linear, weights: Array, covs: Array, radius: float) -> Array:
-    """Return the log-likelihood of each edge and softness."""
-    shape, n = (len(_EDGES), len(_SOFTNESSES)), 0
-    logs, product = np.zeros(shape), np.ones(shape)
-    for m in range(len(covs)):
-        for i in range(rows.firsts[m], rows.firsts[m + 1]):
-            half, inside = _reach(rows, linear, i, radius)
-            if weights[i] == 0.0 or inside > _NEAR * half:
-                continue
-            variance = _variance(covs[m], _towards(rows, linear, i)) + rows.lateral[i] ** 2
-            _multiply(inside / half, variance / (half * half), product)
-            n += 1
-            if n % _N_PRODUCT == 0:
-                logs += np.log(product)
-                product[:] = 1.0
-    return logs + np.log(product)
+def _counts(rows: Rows, linear: Linear, weights: Array, radius: float) -> tuple[Array, float]:
+    """Count returns by how many half widths of their footprints they reach inside, (b,).
 
-
-@numba.njit(cache=True, nogil=True, error_model="numpy")
-def _multiply(inside: float, variance: float, product: Array) -> None:
-    """Multiply densities of how far a footprint reaches inside, in its half widths."""
-    for k in range(len(_SOFTNESSES)):
-        per_sigma = 1.0 / math.sqrt(variance + _SOFTNESSES[k] ** 2)
-        for e in range(len(_EDGES)):
-            z, t = (inside - _EDGES[e]) * per_sigma, (_NEAR - _EDGES[e]) * per_sigma
-            product[e, k] *= _chance(z) * per_sigma / _length(t)
+    With them the mean square of what the noise of their directions is, in half widths too.
+    """
+    counts, lateral2 = np.zeros(_N_BINS), 0.0
+    for i in range(len(weights)):
+        half, inside = _reach(rows, linear, i, radius)
+        k = int(max((inside / half - _FROM) / _BIN, 0.0))
+        if weights[i] > 0.0 and k < _N_BINS and not _is_by_pole(rows, linear, i, radius):
+            counts[k] += 1.0
+            lateral2 += (rows.lateral[i] / half) ** 2
+    return counts, lateral2 / max(counts.sum(), 1.0)
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
@@ -173,31 +184,67 @@ def outline_normals(
     2001): each return is taken out of the present estimate, its truth that it reaches inside is
     multiplied in, and a normal distribution of the same mean and variance stands for the product.
     It speaks of the place across the line of sight alone: how large the outline looks would tell
-    the distance too, and would be trusted more than the footprint is known.
+    the distance too, and would be trusted more than the footprint is known. Where returns lie to
+    one side only, an edge that is not quite that of all spheres would pass for a place: each sphere
+    has an edge of its own, which is eliminated.
     """
     n, found = len(covs), np.zeros(sites.shape)
-    centres, pull_centres = np.zeros((n, 3, 3)), np.zeros((n, 3))
-    faces, pull_faces = np.zeros((n, 3, 3)), np.zeros((n, 3))
+    N, pulls, faces, pull_faces = (
+        np.zeros((n, 4, 4)),
+        np.zeros((n, 4)),
+        np.zeros((n, 4, 4)),
+        np.zeros((n, 4)),
+    )
     for m in range(n):
+        N[m, 3, 3] = 1.0 / _SIGMA_OWN**2
         widest = covs[m, 0, 0] + covs[m, 1, 1] + covs[m, 2, 2]
         for i in range(rows.firsts[m], rows.firsts[m + 1]):
             half, inside = _reach(rows, linear, i, outline.radius)
             inside -= outline.edge * half
-            blur = (outline.softness * half) ** 2 + rows.lateral[i] ** 2
+            blur = _blur(rows, linear, i, half, outline)
             if weights[i] == 0.0 or inside > _CERTAIN * math.sqrt(widest + blur):
                 continue
             towards = _towards(rows, linear, i)
             known = (_variance(covs[m], towards), blur)
             precision, pull = _site(inside, known, (sites[i, 0], sites[i, 1]))
-            precision, pull = weights[i] * precision, weights[i] * pull
-            found[i, 0], found[i, 1] = precision, pull
-            for p in range(3):
-                pull_centres[m, p] += (pull - precision * inside) * towards[p]
-                pull_faces[m, p] += rows.up[0, i] * (pull - precision * inside) * towards[p]
-                for q in range(3):
-                    centres[m, p, q] += precision * towards[p] * towards[q]
-                    faces[m, p, q] += rows.up[0, i] * precision * towards[p] * towards[q]
-    return centres, pull_centres, faces, pull_faces, found
+            found[i, 0], found[i, 1] = weights[i] * precision, weights[i] * pull
+            precision, pull = found[i, 0], found[i, 1] - found[i, 0] * inside
+            row, sign = (towards[0], towards[1], towards[2], -half), rows.up[0, i]
+            for p in range(4):
+                pulls[m, p] += pull * row[p]
+                pull_faces[m, p] += sign * pull * row[p]
+                for q in range(4):
+                    N[m, p, q] += precision * row[p] * row[q]
+                    faces[m, p, q] += sign * precision * row[p] * row[q]
+        _eliminate_edge(N[m], pulls[m], faces[m], pull_faces[m])
+    return (
+        N[:, :3, :3].copy(),
+        pulls[:, :3].copy(),
+        faces[:, :3, :3].copy(),
+        pull_faces[:, :3].copy(),
+        found,
+    )
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _eliminate_edge(N: Array, pull: Array, faces: Array, pull_faces: Array) -> None:
+    """Take the last unknown, a sphere's own edge, out of equations of it and the centre."""
+    gain, gain_faces = N[:3, 3] / N[3, 3], faces[:3, 3] / N[3, 3]
+    pull[:3] -= gain * pull[3]
+    pull_faces[:3] -= gain_faces * pull[3]
+    for p in range(3):
+        for q in range(3):
+            faces[p, q] -= gain[p] * faces[3, q]
+            N[p, q] -= gain[p] * N[3, q]
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _blur(rows: Rows, linear: Linear, i: int, half: float, outline: Outline) -> float:
+    """Return the variance of where a footprint must reach to return [m^2]."""
+    softness2 = outline.softness**2
+    if _is_by_pole(rows, linear, i, outline.radius):
+        softness2 += _POLE_BLUR**2
+    return float(softness2 * half * half + rows.lateral[i] ** 2)
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
@@ -222,23 +269,7 @@ def _chance(z: float) -> float:
     """Return the chance that a return which reaches so far inside has met the sphere."""
     if z > _CERTAIN:
         return 1.0
-    if not z > -_NEVER:
-        return _LUCK
-    node = _NORMAL[int((z + _NEVER) * _PER_SIGMA + 0.5)]
-    at, density, d = node[0], node[2], z - node[0]
-    bent = d * (at / 2.0 - d * ((at * at - 1.0) / 6.0 - d * (at * at - 3.0) * at / 24.0))
-    return float(_LUCK + (1.0 - _LUCK) * (node[1] + density * d * (1.0 - bent)))
-
-
-@numba.njit(cache=True, nogil=True, error_model="numpy")
-def _length(t: float) -> float:
-    """Return the integral of the chance of a normal deviate below its limit, up to ``t`` >= 0."""
-    if not t < _CERTAIN:
-        return t
-    node = _NORMAL[int((t + _NEVER) * _PER_SIGMA + 0.5)]
-    at, density, d = node[0], node[2], t - node[0]
-    bent = 0.5 - d * (at / 6.0 - d * (at * at - 1.0) / 24.0)
-    return float(node[3] + d * (node[1] + density * d * bent))
+    return _LUCK + (1.0 - _LUCK) * 0.5 * math.erfc(-_HALF * z)
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
@@ -249,6 +280,14 @@ def _reach(rows: Rows, linear: Linear, i: int, radius: float) -> tuple[float, fl
     a, b = rows.half_widths[0, i] * x, rows.half_widths[1, i] * y
     half = math.sqrt(a * a + b * b) / off
     return half, radius + half - off
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _is_by_pole(rows: Rows, linear: Linear, i: int, radius: float) -> bool:
+    """Tell whether a footprint lies so low and so near the vertical that it may be on the pole."""
+    x, y, up_x, up_y = linear.offsets[0, i], linear.offsets[1, i], rows.up[0, i], rows.up[1, i]
+    is_low = x * up_x + y * up_y < -_POLE_BELOW * radius
+    return bool(is_low and abs(x * up_y - y * up_x) < _POLE_HALF * radius + rows.blurs[1, i])
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
