@@ -189,21 +189,19 @@ def outline_normals(
     has an edge of its own, which is eliminated.
     """
     n, found = len(covs), np.zeros(sites.shape)
-    N, pulls, faces, pull_faces = (
-        np.zeros((n, 4, 4)),
-        np.zeros((n, 4)),
-        np.zeros((n, 4, 4)),
-        np.zeros((n, 4)),
-    )
+    N, faces = np.zeros((n, 4, 4)), np.zeros((n, 4, 4))  # of the centre and the sphere's own edge
+    pulls, pull_faces = np.zeros((n, 4)), np.zeros((n, 4))
     for m in range(n):
         N[m, 3, 3] = 1.0 / _SIGMA_OWN**2
         widest = covs[m, 0, 0] + covs[m, 1, 1] + covs[m, 2, 2]
         for i in range(rows.firsts[m], rows.firsts[m + 1]):
             half, inside = _reach(rows, linear, i, outline.radius)
             inside -= outline.edge * half
-            blur = _blur(rows, linear, i, half, outline)
+            blur = (outline.softness * half) ** 2 + rows.lateral[i] ** 2
             if weights[i] == 0.0 or inside > _CERTAIN * math.sqrt(widest + blur):
                 continue
+            if _is_by_pole(rows, linear, i, outline.radius):
+                blur += (_POLE_BLUR * half) ** 2
             towards = _towards(rows, linear, i)
             known = (_variance(covs[m], towards), blur)
             precision, pull = _site(inside, known, (sites[i, 0], sites[i, 1]))
@@ -217,13 +215,7 @@ def outline_normals(
                     N[m, p, q] += precision * row[p] * row[q]
                     faces[m, p, q] += sign * precision * row[p] * row[q]
         _eliminate_edge(N[m], pulls[m], faces[m], pull_faces[m])
-    return (
-        N[:, :3, :3].copy(),
-        pulls[:, :3].copy(),
-        faces[:, :3, :3].copy(),
-        pull_faces[:, :3].copy(),
-        found,
-    )
+    return N[:, :3, :3], pulls[:, :3], faces[:, :3, :3], pull_faces[:, :3], found
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
@@ -236,15 +228,6 @@ def _eliminate_edge(N: Array, pull: Array, faces: Array, pull_faces: Array) -> N
         for q in range(3):
             faces[p, q] -= gain[p] * faces[3, q]
             N[p, q] -= gain[p] * N[3, q]
-
-
-@numba.njit(cache=True, nogil=True, error_model="numpy")
-def _blur(rows: Rows, linear: Linear, i: int, half: float, outline: Outline) -> float:
-    """Return the variance of where a footprint must reach to return [m^2]."""
-    softness2 = outline.softness**2
-    if _is_by_pole(rows, linear, i, outline.radius):
-        softness2 += _POLE_BLUR**2
-    return float(softness2 * half * half + rows.lateral[i] ** 2)
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
