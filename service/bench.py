@@ -59,7 +59,7 @@ class Wish:
     The turn of the gimbal at the simulated stop [s] says how many returns there are.
     """
 
-    repeats: int = 5
+    repeats: int = 15
     is_quick: bool = False
     is_long: bool = False
     turn: float = _TURN

@@ -17,7 +17,7 @@ def bench(
     log: Annotated[
         Path | None, typer.Argument(exists=True, dir_okay=False, help="Log; simulated if missing.")
     ] = None,
-    repeats: Annotated[int, typer.Option(min=1, help="The best of so many counts.")] = 5,
+    repeats: Annotated[int, typer.Option(min=1, help="The best of so many counts.")] = 15,
     quick: Annotated[bool, typer.Option("--quick", help="Without the usual libraries.")] = False,
     long: Annotated[
         bool, typer.Option("--long", help="Also logs of 1, 3, 10 and 30 million returns.")
