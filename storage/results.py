@@ -130,6 +130,7 @@ _COLUMNS = {
 SCHEMAS = {name: pa.schema(list(columns.items())) for name, columns in _COLUMNS.items()}
 """Columns of the tables that a job writes, in the order of writing."""
 TABLES = tuple(SCHEMAS)
+"""Their names."""
 _COMPARED = ("marker_fits", "station_fixes", "resections")  # have errors against truth
 
 

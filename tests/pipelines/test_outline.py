@@ -78,12 +78,13 @@ def test_a_return_well_inside_says_nothing():
 
 
 def test_the_outline_does_not_tell_the_distance():
-    angles = np.linspace(0, 2 * np.pi, 40, endpoint=False)
+    angles = np.linspace(0, 2 * np.pi, 72, endpoint=False)
+    angles = angles[np.abs(np.sin(angles)) < 0.9]  # beside the pole, and above, nothing
     places = 0.115 * np.column_stack([np.cos(angles), np.sin(angles)])  # it seems too large
     rows, linear, weights, covs = passing(places, 0.003)
     outline = Outline(RADIUS, edge=0.0, softness=0.2)
-    N, pull, *_ = outline_normals(rows, linear, weights, covs, outline, np.zeros((40, 2)))
-    assert_allclose(pull[0, :2] / np.sqrt(np.trace(N[0])), 0, atol=0.01)
+    N, pull, *_ = outline_normals(rows, linear, weights, covs, outline, np.zeros((len(angles), 2)))
+    assert_allclose(pull[0] / np.sqrt(np.trace(N[0])), 0, atol=0.01)
     assert N[0, 0, 0] < 1e-6 * N[0, 1, 1]
 
 
