@@ -182,6 +182,19 @@ def test_a_file_that_is_no_log_is_refused_with_its_reason(visit, tmp_path):
     assert page.locator("#uploads li").count() == 1
 
 
+def test_the_page_of_a_job_says_when_it_began_without_being_loaded_again(visit):
+    one = visit()
+    order = {"kind": "adjust", "survey": "field"}
+    job = one.context.request.post(f"{one.address}/api/v1/jobs", data=order).json()
+    assert job["attempts"] == 0
+    page = one.open(f"/jobs/{job['job_id']}")
+    page.evaluate("document.body.dataset.isFirst = ''")
+    page.wait_for_selector("body[data-is-first] [data-part=attempts]:text-is('1')")
+    page.wait_for_selector("body:not([data-is-first]) .notice.bad")  # its log is not on this disk
+    began = page.locator("[data-part=started]").inner_text()
+    assert re.fullmatch(r"\d{4}-\d\d-\d\d \d\d:\d\d:\d\d UTC", began)
+
+
 def test_a_mark_that_is_dragged_moves_the_prediction_and_the_address(visit):
     page = visit().open("/plan?model=sensor&a=P01:6.5,0.5,1;P02:-1,6.5,1;P03:-6.5,-3,1")
     worst = page.locator(".plan .readout dd").first

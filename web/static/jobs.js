@@ -5,6 +5,10 @@ const places = new Map(
 );
 const isOpen = (place) => OPEN.has(place.dataset.status);
 
+function moment(instant) {
+  return `${new Date(instant).toISOString().slice(0, 19).replace("T", " ")} UTC`;
+}
+
 function show(place, job) {
   const part = (name) => place.querySelector(`[data-part="${name}"]`);
   const chip = document.createElement("span");
@@ -15,6 +19,10 @@ function show(place, job) {
   part("message").textContent = job.error_reason ?? job.message;
   const percent = part("percent");
   if (percent) percent.textContent = `${job.progress_percent.toFixed(0)} %`;
+  const started = part("started");
+  if (started && job.started_at) started.textContent = moment(job.started_at);
+  const attempts = part("attempts");
+  if (attempts) attempts.textContent = job.attempts;
   place.dataset.status = job.status;
 }
 
