@@ -581,11 +581,6 @@ class MarkerFit:
             return np.nan
         return float(np.sqrt(self.residuals @ self.residuals / self.n_points))
 
-    @property
-    def sigma_3d(self) -> float:
-        """Square root of the trace of the covariance [m]."""
-        return float(np.sqrt(np.trace(self.cov_p_base)))
-
     def cov_with_heading(self, sigma_heading: float) -> Array:
         """Return ``cov_p_base`` with what an unknown heading [rad] of the stop adds to it [m^2]."""
         sideways = np.array([-self.p_base[1], self.p_base[0], 0.0])

@@ -65,7 +65,7 @@ class Centres:
     error_station : (n, 3)
         Estimate minus truth towards the mark, to its left and upward [m].
     sigma_3d : (n,)
-        Predicted: square roots of the traces of the covariances [m].
+        Predicted: square roots of the traces of the covariances, with that of the heading [m].
     rms : (n,)
         Root mean squares of the residuals along the beam [m].
     """
@@ -307,7 +307,7 @@ def _rows(
                 n_points=fit.n_points,
                 incidence=mean_incidence(beams(cloud, fit.used), fit.p_base, fit.radius),
                 error_station=_sight(true[mark], cloud) @ error,
-                sigma_3d=fit.sigma_3d,
+                sigma_3d=float(np.sqrt(np.trace(fit.cov_with_heading(cloud.rig.sigma_heading)))),
                 rms=fit.rms,
             )
         )

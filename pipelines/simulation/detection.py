@@ -6,6 +6,7 @@ each, every marker by its returns and how much of it can be seen, every decoy by
 
 from __future__ import annotations
 
+import re
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -37,6 +38,7 @@ N_MANY, N_FEW, HALF = 20, 6, 0.5
 """Returns from which a marker must be found, from which it may be, and how much must be visible."""
 
 _ON = 0.07  # [m] of depth: within this of a marker's surface a return is one of its own
+_MEASURED = re.compile(r"\d+(\.\d+)?")  # what differs between reasons that are the same
 _NEAR_DECOY = 0.3  # [m] from a decoy within which a refusal is about it
 _CLASSES = (
     f"at least {N_MANY} returns, half visible",
@@ -244,17 +246,12 @@ def _class_of(n_on: int, share: float) -> str:
 
 
 def _reason_near(found: MarkerCandidates, place: Array) -> str:
-    """Return the beginning of the reason for which something at a place was refused."""
+    """Return how the reason begins for which something at a place was refused, less its figures."""
     gaps = [float(np.linalg.norm(r.p_base - place)) for r in found.rejected]
     if not gaps or min(gaps) > _NEAR_DECOY:
         return "Never looked like a marker"
-    reason = found.rejected[int(np.argmin(gaps))].reason
-    return reason.split(":")[0].split(",")[0].rstrip(".") if reason[0:3] != "Its" else _kind(reason)
-
-
-def _kind(reason: str) -> str:
-    """Return a reason that begins with a number as what was measured."""
-    return " ".join(reason.split()[:3])
+    clause = re.split("[:,(]", found.rejected[int(np.argmin(gaps))].reason)[0].rstrip(". ")
+    return _MEASURED.sub("…", clause)
 
 
 def _summed(names: Sequence[str], scores: Sequence[_Score]) -> Detection:

@@ -1,5 +1,6 @@
 """Precision and recall of extraction in worlds that the simulator has made."""
 
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -157,6 +158,7 @@ def test_markers_are_found_and_nothing_else_in_worlds_of_clutter():
     assert found.n_false["rock-field"] == found.n_false["range-lane"] == 0
     assert found.worst["clutter-field"] <= 1
     assert all(sum(t.reasons.values()) == t.n - t.n_found for t in found.tallies)
+    assert not any(re.search(r"\d", reason) for t in found.tallies for reason in t.reasons)
 
 
 def test_far_balls_of_the_right_size_are_not_refused_for_their_size():

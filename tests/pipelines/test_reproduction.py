@@ -29,6 +29,7 @@ from pipelines.reproduction import (
     table_4,
 )
 from pipelines.simulation import SimulationConfig, commensurability
+from pipelines.simulation.rig import nominal_rig
 from pipelines.study import SIGMA_RANGE, TABLE_2, TABLE_3
 from tests.reproduced import reproduction
 
@@ -78,6 +79,14 @@ def test_ours_is_within_the_tolerance_where_the_paper_is_several_times_worse(mad
     )
     assert ours.max() < 0.030
     assert paper.mean() > 2.5 * ours.mean()
+
+
+def test_predictions_hold_what_mounting_and_encoder_leave_of_the_heading(made):
+    keep = made.centres.of(OURS, made.series(CENTRE_REAL))
+    sideways = nominal_rig(SimulationConfig()).sigma_heading * made.centres.ranges[keep]
+    assert (made.centres.sigma_3d[keep] > 0.99 * sideways).all()  # spheres stand nearly level
+    within = made.centres.error_3d[keep] < 3.0 * made.centres.sigma_3d[keep]
+    assert within.all()
 
 
 def test_the_paper_errs_towards_the_scanner_and_upward(made):

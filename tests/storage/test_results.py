@@ -143,7 +143,7 @@ def test_the_sigma_of_a_centre_has_the_heading_at_its_distance():
         strict=True,
     ):
         sideways = np.hypot(*fit.p_base[:2]) * result.cloud.rig.sigma_heading
-        assert row["sigma_3d_m"] ** 2 == pytest.approx(fit.sigma_3d**2 + sideways**2)
+        assert row["sigma_3d_m"] ** 2 == pytest.approx(np.trace(fit.cov_p_base) + sideways**2)
 
 
 def test_a_pose_can_be_rebuilt_from_its_row():
