@@ -19,7 +19,7 @@ from __future__ import annotations
 import numpy as np
 
 from pipelines.config import ExtractionConfig
-from pipelines.extraction.ball import Ball, blur_at
+from pipelines.extraction.ball import Ball
 from pipelines.extraction.cells import Cells, cells_of
 from pipelines.extraction.ground import ground_of
 from pipelines.extraction.looks import NOISE_MIN, Look, look_at
@@ -130,7 +130,7 @@ def _sighted(looks: list[Look], seen: list[Sight], ball: Ball) -> list[str]:
     return [
         reason
         or _rivalled(look, sight, ball, peers.noise)
-        or verdict_among_peers(look, sight, peers, ball)
+        or verdict_among_peers(look, sight, peers)
         for look, sight, reason in zip(looks, seen, reasons, strict=True)
     ]
 
@@ -167,8 +167,7 @@ def _members(look: Look, sight: Sight, ball: Ball) -> Index:
     belong partly to what lies behind, would weigh more than the noise of all the others.
     """
     across, along, depth = sight.seen
-    blur = blur_at(look.p_base, ball)
-    reach = _MIDDLE * ball.radius if is_resolved(look, ball) else 1.5 * ball.radius + blur
+    reach = _MIDDLE * ball.radius if is_resolved(look, ball) else 1.5 * ball.radius + look.blur
     is_about = across * across + along * along < reach * reach
     is_level = (depth > -2.2 * ball.radius) & (depth < 1.6 * ball.radius)
     return np.asarray(sight.rows[is_about & is_level], dtype=np.intp)

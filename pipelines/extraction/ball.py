@@ -6,8 +6,9 @@ from typing import NamedTuple
 
 import numba
 import numpy as np
+from numpy.typing import NDArray
 
-from pipelines.values import Array
+from pipelines.values import Array, Column
 
 
 class Ball(NamedTuple):
@@ -74,37 +75,65 @@ def view_of(c: Array, up: Array) -> View:
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def passing(view: View, x: float, y: float, z: float) -> tuple[float, float, float]:
-    """Return how the beam of a return passes a centre.
+def rays_of(points: Column, rows: NDArray[np.integer]) -> Array:
+    """Return the rays to some returns.
+
+    Parameters
+    ----------
+    points : (m, 3) float32
+        Returns in the base frame [m].
+    rows : (n,)
+        Which of them.
+
+    Returns
+    -------
+    (4, n)
+        Unit vectors, and ranges [m].
+    """
+    rays = np.empty((4, len(rows)))
+    x, y, z, distances = rays[0], rays[1], rays[2], rays[3]
+    for i in range(len(rows)):
+        x[i], y[i], z[i] = points[rows[i], 0], points[rows[i], 1], points[rows[i], 2]
+    for i in range(len(rows)):
+        distances[i] = np.sqrt(x[i] * x[i] + y[i] * y[i] + z[i] * z[i])
+        share = 1.0 / distances[i]
+        x[i], y[i], z[i] = share * x[i], share * y[i], share * z[i]
+    return rays
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def passing(view: View, rays: Array, i: int) -> tuple[float, float, float]:
+    """Return how a ray passes a centre.
 
     Parameters
     ----------
     view : View
         How the centre is looked at.
-    x, y, z : float
-        The return [m].
+    rays : (4, n)
+        As ``rays_of`` says.
+    i : int
+        Which of them.
 
     Returns
     -------
     across, along, depth : float
-        Where the beam passes, across and up, and how much farther than that the return lies [m].
+        Where it passes, across and up, and how much farther than that the return lies [m].
     """
-    observed2 = x * x + y * y + z * z
-    share = (view.x * x + view.y * y + view.z * z) / observed2
-    dx, dy, dz = share * x - view.x, share * y - view.y, share * z - view.z
-    across = dx * view.across[0] + dy * view.across[1] + dz * view.across[2]
-    along = dx * view.up[0] + dy * view.up[1] + dz * view.up[2]
-    return across, along, np.sqrt(observed2) * (1.0 - share)
+    x, y, z = rays[0, i], rays[1, i], rays[2, i]
+    nearest = view.x * x + view.y * y + view.z * z
+    across = nearest * (x * view.across[0] + y * view.across[1] + z * view.across[2])
+    along = nearest * (x * view.up[0] + y * view.up[1] + z * view.up[2])
+    return across, along, rays[3, i] - nearest
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def seen_from(points: Array, view: View) -> Array:
-    """Return how the beams of some returns pass a centre.
+def seen_from(rays: Array, view: View) -> Array:
+    """Return how some rays pass a centre.
 
     Parameters
     ----------
-    points : (3, n)
-        Returns in the base frame [m].
+    rays : (4, n)
+        As ``rays_of`` says.
     view : View
         How the centre is looked at.
 
@@ -113,7 +142,7 @@ def seen_from(points: Array, view: View) -> Array:
     (3, n)
         As ``passing`` says.
     """
-    seen = np.empty(points.shape)
-    for i in range(points.shape[1]):
-        seen[0, i], seen[1, i], seen[2, i] = passing(view, points[0, i], points[1, i], points[2, i])
+    seen = np.empty((3, rays.shape[1]))
+    for i in range(rays.shape[1]):
+        seen[0, i], seen[1, i], seen[2, i] = passing(view, rays, i)
     return seen

@@ -14,7 +14,7 @@ import numpy as np
 
 from pipelines.extraction.ball import Ball, View, blur_at, passing, seen_from, view_of
 from pipelines.extraction.cells import Cells
-from pipelines.extraction.patches import Patches, n_about, patches_about, points_near
+from pipelines.extraction.patches import Patches, patches_about, rays_near, runs_about
 from pipelines.extraction.seeds import thinned
 from pipelines.threads import side_by_side
 from pipelines.values import Array, Mask, StitchedCloud
@@ -34,6 +34,7 @@ _N_WORTH = 20  # places that are worth a thread
 _N_SAMPLE = 1500  # returns in the cells about a seed that tell whether to look there
 _N_WHOLE = 2000  # returns there that are looked at at once
 _IN_ANY_ORDER = {"reassoc", "contract"}  # sums of many returns at once
+_NORMAL = 1.4826  # standard deviations of the normal distribution in a median deviation
 _STRAY_SIGMAS = 4.0
 _N_STEPS = 6  # of a fit that only has to tell what a group is
 
@@ -68,6 +69,8 @@ class Look(NamedTuple):
         How much of the ball's curvature across is missing: 0 a ball, 1 a plane.
     flat_along, sigma_along : float
         The same along the vertical: 0 a ball, 1 a post.
+    blur : float
+        Half the width of a beam there [m].
     """
 
     x: float
@@ -88,6 +91,7 @@ class Look(NamedTuple):
     sigma_across: float
     flat_along: float
     sigma_along: float
+    blur: float
 
     @property
     def p_base(self) -> Array:
@@ -139,9 +143,9 @@ def look_at(cloud: StitchedCloud, cells: Cells, seeds: Array, ball: Ball) -> lis
 def _shared(
     work: Callable[[Patches, Array, Ball], Array], patches: Patches, places: Array, ball: Ball
 ) -> Array:
-    """Do something at all places, dealt out to threads: those with most returns come first."""
-    n = len(places)
-    dealt = np.concatenate([np.arange(0, n, 2), np.arange(1, n, 2)])
+    """Do something at all places, dealt out to threads by azimuth: neighbours share returns."""
+    n, in_turn = len(places), np.argsort(np.arctan2(places[:, 1], places[:, 0]))
+    dealt = np.concatenate([in_turn[0::2], in_turn[1::2]])
     mine = places[dealt]
     parts = side_by_side(lambda first, end: work(patches, mine[first:end], ball), n, worth=_N_WORTH)
     rows = np.concatenate(parts)
@@ -158,41 +162,42 @@ def _approached(patches: Patches, seeds: Array, ball: Ball) -> Array:
     """
     out = np.zeros((len(seeds), 5))
     for k in range(len(seeds)):
-        n = n_about(patches, seeds[k])
+        runs = runs_about(patches, seeds[k])
+        n = np.sum(runs[:, 1] - runs[:, 0])
         if n > _N_WHOLE:
             every = n / _N_SAMPLE
-            points = points_near(patches, seeds[k], every)
-            if not _tried(points, seeds[k], ball, every)[2]:
+            rays = rays_near(patches, runs, seeds[k], every)
+            if not _tried(rays, seeds[k], ball, every)[2]:
                 continue
-        c, n, is_worth = _tried(points_near(patches, seeds[k], 1.0), seeds[k], ball, 1.0)
+        c, n, is_worth = _tried(rays_near(patches, runs, seeds[k], 1.0), seeds[k], ball, 1.0)
         out[k, :3], out[k, 3], out[k, 4] = c, n, is_worth
     return out
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def _tried(points: Array, seed: Array, ball: Ball, every: float) -> tuple[Array, int, bool]:
+def _tried(rays: Array, seed: Array, ball: Ball, every: float) -> tuple[Array, int, bool]:
     """Return where a seed's disc comes to rest, the returns in it, and whether to look there.
 
     Little lies about a free ball; one that is seen closely needs no free space to be believed. Of
     a sample, one return of so many, both are asked with room for chance.
     """
-    c, n = _shifted(points, seed, ball.up, ball.radius)
-    n_beside, n_below = _surroundings(points, c, ball)
+    c, n = _shifted(rays, seed, ball.up, ball.radius)
+    n_beside, n_below = _surroundings(rays, c, ball)
     n_about = n_beside + n_below
     room = 2.0 * np.sqrt(n + n_about) if every > 1.0 else 0.0
     is_free = n_about <= 2.0 + 0.6 * n + room
-    return c, n, is_free or (n * every >= N_RESOLVED and _is_resolved(points, c, ball, every))
+    return c, n, is_free or (n * every >= N_RESOLVED and _is_resolved(rays, c, ball, every))
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy", fastmath=_IN_ANY_ORDER)
-def _shifted(points: Array, c: Array, up: Array, radius: float) -> tuple[Array, int]:
+def _shifted(rays: Array, c: Array, up: Array, radius: float) -> tuple[Array, int]:
     """Return where a disc of the ball's size comes to rest, and how many returns it holds."""
     c, n = c.copy(), 0
     for _ in range(4):
         view = view_of(c, up)
         across, along, depth, n = 0.0, 0.0, 0.0, 0
-        for i in range(points.shape[1]):
-            a, b, d = passing(view, points[0, i], points[1, i], points[2, i])
+        for i in range(rays.shape[1]):
+            a, b, d = passing(view, rays, i)
             is_in = (
                 (a * a + b * b < (1.15 * radius) ** 2) & (d > -2.0 * radius) & (d < 0.8 * radius)
             )
@@ -210,15 +215,15 @@ def _shifted(points: Array, c: Array, up: Array, radius: float) -> tuple[Array, 
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def _surroundings(points: Array, c: Array, ball: Ball) -> tuple[int, int]:
+def _surroundings(rays: Array, c: Array, ball: Ball) -> tuple[int, int]:
     """Count the returns beside and below the outline that a free ball on a pole would not have."""
     n_beside, n_below, radius = 0, 0, ball.radius
     blur = blur_at(c, ball)
     inner2 = (1.1 * radius + blur) ** 2  # no footprint that touches the ball is farther out
     beside2, below2 = (2.2 * radius + blur) ** 2, (2.8 * radius + blur) ** 2
     view = view_of(c, ball.up)
-    for i in range(points.shape[1]):
-        across, along, depth = passing(view, points[0, i], points[1, i], points[2, i])
+    for i in range(rays.shape[1]):
+        across, along, depth = passing(view, rays, i)
         gap2, aside = across * across + along * along, abs(across)
         is_out = (gap2 >= inner2) & ~((along < 0.0) & (aside < 0.6 * radius + blur))
         is_high = along > -0.5 * radius
@@ -230,38 +235,37 @@ def _surroundings(points: Array, c: Array, ball: Ball) -> tuple[int, int]:
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def _is_resolved(points: Array, c: Array, ball: Ball, every: float) -> bool:
+def _is_resolved(rays: Array, c: Array, ball: Ball, every: float) -> bool:
     """Tell whether a ball fits so closely that it needs no free space about it to be believed."""
-    points, scatter, is_sample = _within(points, c, 2.0 * ball.radius), np.inf, every > 1.0
+    rays, scatter, is_sample = _within(rays, c, 2.0 * ball.radius), np.inf, every > 1.0
     for step_no in range(_N_STEPS):
         view = view_of(c, ball.up)
-        seen, residuals, scatter = _residuals_about(points, view, c, ball, ball.radius)
+        seen, residuals, scatter = _residuals_about(rays, view, c, ball, ball.radius)
         if step_no > is_sample and scatter > 4.0 * RESOLUTION * ball.radius:
             break  # it will not come to that any more
         weights = _weights(seen, residuals, ball.radius, blur_at(c, ball), scatter)
         N, pull = _normals(seen, residuals, weights, ball.radius)
-        step = np.dot(_inverse(N[:3, :3] + 1e-3 * np.eye(3)), pull[:3])
-        step *= min(1.0, 0.5 * ball.radius / (np.sqrt(np.sum(step**2)) + 1e-12))
-        c = _moved(c, view, step)
+        c = _moved(c, view, _solved(N, pull, 1e-3, 3, 0.5 * ball.radius)[0])
     return scatter < (2.5 if is_sample else 1.5) * RESOLUTION * ball.radius
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
 def _looked(patches: Patches, places: Array, ball: Ball) -> Array:
-    """Return what is seen near places, (k, 18), as ``Look`` names it; zeros if no ball is there."""
+    """Return what is seen near places, (k, 19), as ``Look`` names it; zeros if no ball is there."""
     out = np.zeros((len(places), _N_FIELDS))
     for k in range(len(places)):
-        _look(points_near(patches, places[k], 1.0), places[k], ball, out[k])
+        rays = rays_near(patches, runs_about(patches, places[k]), places[k], 1.0)
+        _look(rays, places[k], ball, out[k])
     return out
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def _look(points: Array, start: Array, ball: Ball, out: Array) -> None:
+def _look(rays: Array, start: Array, ball: Ball, out: Array) -> None:
     """Write what is seen near a place; nothing if hardly a return lies on a ball there."""
     radius = ball.radius
-    c, _, _ = _settled(points, start, ball, 3)
+    c, _, _ = _settled(rays, start, ball, 3)
     blur = blur_at(c, ball)
-    seen = seen_from(points, view_of(c, ball.up))
+    seen = seen_from(rays, view_of(c, ball.up))
     residuals = _residuals(seen, radius)
     scatter = max(_scatter(seen, residuals, radius), NOISE_MIN)
     weights = _weights(seen, residuals, radius, blur, scatter)
@@ -270,14 +274,14 @@ def _look(points: Array, start: Array, ball: Ball, out: Array) -> None:
     rms = np.sqrt(np.sum(weights * residuals**2) / np.sum(weights))
     noise = max(rms, NOISE_MIN)
     flat, cov_flat = _flatness(seen, residuals, weights, radius)
-    c_free, radius_free, cov_free = _settled(points, c, ball, 4)
-    seen_free = seen_from(points, view_of(c_free, ball.up))
+    c_free, radius_free, cov_free = _settled(rays, c, ball, 4)
+    seen_free = seen_from(rays, view_of(c_free, ball.up))
     residuals_free = _residuals(seen_free, radius_free)
     scatter_free = _scatter(seen_free, residuals_free, radius_free)
     weights_free = _weights(seen_free, residuals_free, radius_free, blur, scatter)
     out[:3] = c
     out[3], out[4] = np.sum(weights > 0.0), _n_strange(seen, weights, radius)
-    out[5], out[6] = _surroundings(points, c, ball)
+    out[5], out[6] = _surroundings(rays, c, ball)
     out[7], out[8], out[9] = rms, _extent(seen[0], weights), _extent(seen[1], weights)
     out[10], out[11] = radius_free, noise * np.sqrt(cov_free[3, 3])
     out[12] = scatter_free
@@ -285,6 +289,7 @@ def _look(points: Array, start: Array, ball: Ball, out: Array) -> None:
     out[13] = _gain(residuals, residuals_free, is_in, _STRAY_SIGMAS * max(scatter, scatter_free))
     out[14], out[15] = flat[3], noise * np.sqrt(cov_flat[3, 3])
     out[16], out[17] = flat[4], noise * np.sqrt(cov_flat[4, 4])
+    out[18] = blur
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
@@ -325,9 +330,7 @@ def _extent(places: Array, weights: Array) -> float:
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def _settled(
-    points: Array, start: Array, ball: Ball, n_unknowns: int
-) -> tuple[Array, float, Array]:
+def _settled(rays: Array, start: Array, ball: Ball, n_unknowns: int) -> tuple[Array, float, Array]:
     """Return the centre of the ball near a place, its radius, and the covariance for unit noise.
 
     With three unknowns the radius stays as it is, with four it is estimated too. The prior, a third
@@ -336,13 +339,11 @@ def _settled(
     c, radius, inverse = start.copy(), ball.radius, np.eye(n_unknowns)
     for _ in range(_N_STEPS):
         view = view_of(c, ball.up)
-        seen, residuals, scatter = _residuals_about(points, view, c, ball, radius)
+        seen, residuals, scatter = _residuals_about(rays, view, c, ball, radius)
         weights = _weights(seen, residuals, radius, blur_at(c, ball), scatter)
         N, pull = _normals(seen, residuals, weights, radius)
-        prior = (scatter / (_LOOSE * ball.radius)) ** 2 * np.eye(n_unknowns)
-        inverse = _inverse(N[:n_unknowns, :n_unknowns] + prior)
-        step = np.dot(inverse, pull[:n_unknowns])
-        step *= min(1.0, 0.5 * ball.radius / (np.sqrt(np.sum(step**2)) + 1e-12))
+        prior = (scatter / (_LOOSE * ball.radius)) ** 2
+        step, inverse = _solved(N, pull, prior, n_unknowns, 0.5 * ball.radius)
         c = _moved(c, view, step)
         if n_unknowns > 3:
             radius = min(max(radius + step[3], 0.3 * ball.radius), 3.0 * ball.radius)
@@ -351,10 +352,10 @@ def _settled(
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
 def _residuals_about(
-    points: Array, view: View, c: Array, ball: Ball, radius: float
+    rays: Array, view: View, c: Array, ball: Ball, radius: float
 ) -> tuple[Array, Array, float]:
     """Return how beams pass a ball about as near as its outline, residuals, and their scatter."""
-    seen = _about(points, view, radius + blur_at(c, ball))
+    seen = _about(rays, view, radius + blur_at(c, ball))
     residuals = _residuals(seen, radius)
     return seen, residuals, _scatter(seen, residuals, radius)
 
@@ -371,9 +372,28 @@ def _moved(c: Array, view: View, step: Array) -> Array:
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def _inverse(N: Array) -> Array:
-    """Return the inverse of a small positive definite matrix (Gauss, Jordan; no pivots needed)."""
-    n, inverse = len(N), N.copy()
+def _solved(N: Array, pull: Array, prior: float, n: int, longest: float) -> tuple[Array, Array]:
+    """Return the step of so many unknowns, shortened if need be, and the inverse normal matrix.
+
+    The prior is the weight of each unknown being zero.
+    """
+    inverse, step, length2 = np.empty((n, n)), np.zeros(n), 0.0
+    for i in range(n):
+        for j in range(n):
+            inverse[i, j] = N[i, j] + (prior if i == j else 0.0)
+    _invert(inverse)
+    for i in range(n):
+        for j in range(n):
+            step[i] += inverse[i, j] * pull[j]
+        length2 += step[i] * step[i]
+    step *= min(1.0, longest / (np.sqrt(length2) + 1e-12))
+    return step, inverse
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _invert(inverse: Array) -> None:
+    """Invert a small positive definite matrix in place (Gauss, Jordan; no pivots needed)."""
+    n = len(inverse)
     for k in range(n):
         pivot = 1.0 / inverse[k, k]
         inverse[k, k] = 1.0
@@ -385,25 +405,25 @@ def _inverse(N: Array) -> Array:
                 inverse[i, k] = 0.0
                 for j in range(n):
                     inverse[i, j] -= factor * inverse[k, j]
-    return inverse
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def _within(points: Array, c: Array, reach: float) -> Array:
-    """Return the points, (3, n), within reach of a place."""
-    kept = np.empty(points.shape)
+def _within(rays: Array, c: Array, reach: float) -> Array:
+    """Return the rays, (3, n), within reach of a place."""
+    kept = np.empty(rays.shape)
     n = 0
-    for i in range(points.shape[1]):
-        x, y, z = points[0, i], points[1, i], points[2, i]
-        kept[0, n], kept[1, n], kept[2, n] = x, y, z
-        n += (x - c[0]) ** 2 + (y - c[1]) ** 2 + (z - c[2]) ** 2 < reach * reach
+    for i in range(rays.shape[1]):
+        x, y, z, distance = rays[0, i], rays[1, i], rays[2, i], rays[3, i]
+        kept[0, n], kept[1, n], kept[2, n], kept[3, n] = x, y, z, distance
+        x, y, z = distance * x - c[0], distance * y - c[1], distance * z - c[2]
+        n += x * x + y * y + z * z < reach * reach
     return kept[:, :n].copy()
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def _about(points: Array, view: View, reach: float) -> Array:
+def _about(rays: Array, view: View, reach: float) -> Array:
     """Return how those beams pass a centre that do so within reach, (3, n)."""
-    seen: Array = seen_from(points, view)
+    seen: Array = seen_from(rays, view)
     n = 0
     for i in range(seen.shape[1]):
         across, along, depth = seen[0, i], seen[1, i], seen[2, i]
@@ -486,12 +506,17 @@ def _weights(seen: Array, residuals: Array, radius: float, blur: float, scatter:
 @numba.njit(cache=True, nogil=True, error_model="numpy")
 def _scatter(seen: Array, residuals: Array, radius: float) -> float:
     """Return the robust standard deviation of the residuals inside the outline [m]."""
-    inside = np.empty(len(residuals) + 1)
-    n = 0
+    inside, n, n_close, n_loose = np.empty(len(residuals) + 1), 0, 0, 0
+    close, loose = _CLOSE * radius / _NORMAL, _LOOSE * radius / _NORMAL
     for i in range(len(residuals)):
         x, y, off = seen[0, i], seen[1, i], abs(residuals[i])
+        is_inside = (x * x + y * y < (0.9 * radius) ** 2) & (off < 1.5 * radius)
         inside[n] = off  # kept only if the next one does not take its place
-        n += (x * x + y * y < (0.9 * radius) ** 2) & (off < 1.5 * radius)
-    if n < 3:
+        n += is_inside
+        n_close += is_inside & (off < close)
+        n_loose += is_inside & (off > loose)
+    if n < 3 or 2 * n_loose > n:
         return _LOOSE * radius
-    return min(max(1.4826 * np.median(inside[:n]), _CLOSE * radius), _LOOSE * radius)
+    if 2 * n_close > n:
+        return _CLOSE * radius
+    return min(max(_NORMAL * np.median(inside[:n]), _CLOSE * radius), _LOOSE * radius)

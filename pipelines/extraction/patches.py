@@ -13,6 +13,7 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
+from pipelines.extraction.ball import rays_of
 from pipelines.extraction.cells import Cells, Layout, rows_in
 from pipelines.threads import side_by_side
 from pipelines.values import Array, Column, Mask
@@ -107,33 +108,8 @@ def _sorted(
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def n_about(patches: Patches, c: Array) -> int:
-    """Return how many returns the cells hold that may hold some within reach of a place.
-
-    Parameters
-    ----------
-    patches : Patches
-        Returns by cell.
-    c : (3,)
-        The place [m].
-
-    Returns
-    -------
-    int
-        Their number.
-    """
-    bottom, top = _span(patches, patches.R_station_base[0], c)
-    low, high = _span(patches, patches.R_station_base[1], c)
-    n = 0
-    for k in range(bottom, top + 1):
-        first, end = _run(patches, k, low, high)
-        n += end - first
-    return n
-
-
-@numba.njit(cache=True, nogil=True, error_model="numpy")
-def points_near(patches: Patches, c: Array, every: float) -> Array:
-    """Return the returns within reach of a place, or a sample of them.
+def runs_about(patches: Patches, c: Array) -> NDArray[np.int32]:
+    """Return the returns in the cells that may hold some within reach of a place.
 
     Parameters
     ----------
@@ -141,47 +117,63 @@ def points_near(patches: Patches, c: Array, every: float) -> Array:
         Returns by cell.
     c : (3,)
         A place at most a cell from one that the patches are about [m].
+
+    Returns
+    -------
+    (k, 2) int32
+        The first of each row of the grid, and the one behind its last.
+    """
+    bottom, top = _span(patches, patches.R_station_base[0], c)
+    low, high = _span(patches, patches.R_station_base[1], c)
+    runs = np.empty((max(top + 1 - bottom, 0), 2), np.int32)
+    for k in range(len(runs)):
+        cell = (bottom + k) * patches.n_side
+        runs[k, 0], runs[k, 1] = patches.starts[cell + low], patches.starts[cell + high + 1]
+    return runs
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def rays_near(patches: Patches, runs: NDArray[np.int32], c: Array, every: float) -> Array:
+    """Return the rays to the returns within reach of a place, or to a sample of them.
+
+    Parameters
+    ----------
+    patches : Patches
+        Returns by cell.
+    runs : (m, 2) int32
+        Those in the cells about the place.
+    c : (3,)
+        The place [m].
     every : float
         One return of so many is taken, here and there so as not to prefer one laser; 1 takes all.
 
     Returns
     -------
-    (3, k)
-        Points [m].
+    (4, k)
+        As ``rays_of`` says.
     """
     points, x, y, z, reach2 = patches.points, c[0], c[1], c[2], patches.reach**2
-    bottom, top = _span(patches, patches.R_station_base[0], c)
-    low, high = _span(patches, patches.R_station_base[1], c)
-    out = np.empty((3, int(n_about(patches, c) / every) + 1))
-    n_out = 0
-    for k in range(bottom, top + 1):
-        first, end = _run(patches, k, low, high)
-        for i in _sampled(first, end, every):
-            p, q, r = np.float64(points[i, 0]), np.float64(points[i, 1]), np.float64(points[i, 2])
-            # kept only if the next one does not take its place
-            out[0, n_out], out[1, n_out], out[2, n_out] = p, q, r
-            n_out += (p - x) ** 2 + (q - y) ** 2 + (r - z) ** 2 < reach2
-    return out[:, :n_out].copy()
+    rows, n, n_near = np.empty(int(np.sum(runs[:, 1] - runs[:, 0]) / every), np.uint32), 0, 0
+    for k in range(len(runs)):
+        n_run = int((runs[k, 1] - runs[k, 0]) / every)
+        _sample(runs[k, 0], every, rows[n : n + n_run])
+        n += n_run
+    for i in range(n):
+        row = rows[i]
+        p, q, r = points[row, 0] - x, points[row, 1] - y, points[row, 2] - z
+        rows[n_near] = row  # kept only if the next one does not take its place
+        n_near += p * p + q * q + r * r < reach2
+    rays: Array = rays_of(points, rows[:n_near])
+    return rays
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def _sampled(first: int, end: int, every: float) -> NDArray[np.int32]:
-    """Return one of so many rows of a run, here and there; all of them with 1."""
-    rows = np.empty(int((end - first) / every), np.int32)
-    if every == 1.0:
-        rows[:] = np.arange(first, end)
-        return rows
+def _sample(first: int, every: float, rows: NDArray[np.uint32]) -> None:
+    """Write one of so many rows of a run, here and there; all of them with 1."""
     for j in range(len(rows)):
         aside = _GOLDEN * j
-        rows[j] = first + np.int32((j + aside - np.floor(aside)) * every)
-    return rows
-
-
-@numba.njit(cache=True, nogil=True, error_model="numpy")
-def _run(patches: Patches, row: int, low: int, high: int) -> tuple[int, int]:
-    """Return where the returns of neighbouring cells of a row of the grid begin and end."""
-    starts, cell = patches.starts, row * patches.n_side
-    return starts[cell + low], starts[cell + high + 1]
+        skipped = (j + aside - np.floor(aside)) * every if every > 1.0 else float(j)
+        rows[j] = first + np.int32(skipped)
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")

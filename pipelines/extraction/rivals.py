@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numba
 import numpy as np
 
-from pipelines.extraction.ball import Ball, blur_at
+from pipelines.extraction.ball import Ball
 from pipelines.extraction.looks import Look
 from pipelines.values import Array, Mask
 
@@ -89,7 +89,7 @@ def rivals(look: Look, seen: Array, spread: float, ball: Ball, noise: float) -> 
     by the area that they might have filled. The edge of an outline is that of wide beams, whose
     place is known only so well. Ranges are those to the part of a beam that is on the shape.
     """
-    blur = blur_at(look.p_base, ball) / ball.radius
+    blur = look.blur / ball.radius
     found = _compared(seen / ball.radius, blur, noise / ball.radius, spread)
     return Rivals(found[0], found[1], found[2] * ball.radius, found[3] * ball.radius)
 

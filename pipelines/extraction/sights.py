@@ -13,7 +13,7 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from pipelines.extraction.ball import Ball, blur_at, seen_from, view_of
+from pipelines.extraction.ball import Ball, blur_at, rays_of, seen_from, view_of
 from pipelines.extraction.cells import (
     N_DIRECTIONS,
     N_DIRECTIONS_SIDE,
@@ -181,7 +181,7 @@ def _counted(
     """Return the fields of a sight, from its returns."""
     radius = ball.radius
     blur = blur_at(c, ball) / radius
-    seen = seen_from(p_base[rows].T.astype(np.float64), view_of(c, ball.up))
+    seen = seen_from(rays_of(p_base, rows), view_of(c, ball.up))
     n_on, n_through, n_before, n_held, n_past, n_short = 0, 0, 0, 0, 0, 0
     gaps2, light, lit = 0.0, 0.0, 0.0
     half = int((1.0 + blur) / _PLACE) + 1

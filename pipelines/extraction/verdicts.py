@@ -10,7 +10,7 @@ from typing import NamedTuple
 import numpy as np
 
 from pipelines.config import ExtractionConfig
-from pipelines.extraction.ball import Ball, blur_at
+from pipelines.extraction.ball import Ball
 from pipelines.extraction.looks import N_RESOLVED, NOISE_MIN, RESOLUTION, Look
 from pipelines.extraction.rivals import Rivals
 from pipelines.extraction.seeds import thinned
@@ -175,8 +175,7 @@ def _not_round(look: Look, config: ExtractionConfig, ball: Ball) -> str:
 
 def _radius_slack(look: Look, ball: Ball) -> float:
     """Return by how much the free radius may be off: wide beams are taken for rays."""
-    blur: float = blur_at(look.p_base, ball)
-    return max(_SIGMAS * look.sigma_radius, _RADIUS_SLACK * ball.radius + blur)
+    return max(_SIGMAS * look.sigma_radius, _RADIUS_SLACK * ball.radius + look.blur)
 
 
 def verdict_on_sight(look: Look, sight: Sight, ball: Ball) -> str:
@@ -315,7 +314,7 @@ def _shared(values: Sequence[float]) -> float:
     return median(values) if len(values) >= _N_KNOWN else float("nan")
 
 
-def verdict_among_peers(look: Look, sight: Sight, peers: Peers, ball: Ball) -> str:
+def verdict_among_peers(look: Look, sight: Sight, peers: Peers) -> str:
     """Return why a group differs from the other markers of the scan.
 
     Parameters
@@ -326,8 +325,6 @@ def verdict_among_peers(look: Look, sight: Sight, peers: Peers, ball: Ball) -> s
         Where the beams towards and about it end.
     peers : Peers
         What the groups share that have passed the other tests, this one among them or not.
-    ball : Ball
-        What is looked for.
 
     Returns
     -------
@@ -343,12 +340,12 @@ def verdict_among_peers(look: Look, sight: Sight, peers: Peers, ball: Ball) -> s
     alike, and so does a crest that ends against the sky: where no beams show the pole, reflectivity
     must be as that of the others, and where it is hidden, scatter too.
     """
-    return _unlike_in_shape(look, peers, ball) or _unlike_in_paint(look, sight, peers)
+    return _unlike_in_shape(look, peers) or _unlike_in_paint(look, sight, peers)
 
 
-def _unlike_in_shape(look: Look, peers: Peers, ball: Ball) -> str:
+def _unlike_in_shape(look: Look, peers: Peers) -> str:
     """Return why a group is not curved as a ball, by the noise of the others."""
-    noise = hypot(peers.noise, _WIDE * blur_at(look.p_base, ball))
+    noise = hypot(peers.noise, _WIDE * look.blur)
     share = min(noise / max(look.scatter, NOISE_MIN), 1.0)
     flats = (look.flat_across, look.flat_along)
     sigmas = (share * look.sigma_across, share * look.sigma_along)
@@ -401,8 +398,7 @@ def spread_expected(look: Look, ball: Ball) -> float:
     float
         Mean square of the distances at which they pass its centre, in squared radii.
     """
-    blur: float = blur_at(look.p_base, ball) / ball.radius
-    return 0.5 * (1.0 + 0.3 * blur) ** 2
+    return 0.5 * (1.0 + 0.3 * look.blur / ball.radius) ** 2
 
 
 def is_resolved(look: Look, ball: Ball) -> bool:
