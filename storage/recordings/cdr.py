@@ -8,9 +8,10 @@ from __future__ import annotations
 
 import re
 import struct
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
+from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,6 +25,8 @@ _ENCAPSULATIONS = {0: (">", 8), 1: ("<", 8), 6: (">", 4), 7: ("<", 4)}  # identi
 _SIZES = {"B": 1, "i": 4, "I": 4, "d": 8}
 _ALIKE_MAX = 1 << 10  # messages that are compared with one at a time
 _LAYOUTS_MAX = 256  # layouts of one length on one channel; real topics have one to ten
+
+_Kind = TypeVar("_Kind", bound=np.generic)
 
 HEADER = """std_msgs/Header header
 """
@@ -116,11 +119,14 @@ class Layout:
         Where times begin.
     columns : tuple of (int, int)
         Where runs of float64 begin, and their lengths.
+    passed : tuple of (int, int)
+        The same of numbers that nobody wants.
     """
 
     names: tuple[tuple[str, ...], ...]
     stamps: tuple[int, ...]
     columns: tuple[tuple[int, int], ...]
+    passed: tuple[tuple[int, int], ...] = ()
 
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
@@ -157,7 +163,7 @@ class SmallMessages:
 
     def add(self, batch: Batch) -> None:
         """Copy the messages of a batch, by length."""
-        for length in sorted(set(batch.lengths.tolist())):
+        for length in np.unique(batch.lengths).tolist():
             mine = batch.lengths == length
             rows = windows(batch.octets, length)[batch.starts[mine]]
             self._rows.setdefault(length, []).append((rows, batch.log_times_ns[mine]))
@@ -167,8 +173,7 @@ class SmallMessages:
         tables: list[Table] = []
         self.n_broken, self.reason = 0, ""
         for parts in self._rows.values():
-            rows = np.concatenate([part[0] for part in parts])
-            log_times = np.concatenate([part[1] for part in parts])
+            rows, log_times = (_joined(column) for column in zip(*parts, strict=True))
             for _ in range(_LAYOUTS_MAX):
                 if not len(rows):
                     break
@@ -188,7 +193,8 @@ class SmallMessages:
             self._give_up(int(alike.sum()), str(error))
             return np.asarray(alike)
         alike = _alike(rows, layout)
-        tables.append(_decode(rows[alike], log_times[alike], layout, cursor_order))
+        mine = slice(None) if alike.all() else alike
+        tables.append(_decode(rows[mine], log_times[mine], layout, cursor_order))
         return alike
 
     def _give_up(self, n: int, reason: str) -> None:
@@ -271,12 +277,17 @@ def _fields(text: str) -> list[tuple[str, str]]:
     return [(kind.rsplit("/", 1)[-1], name) for kind, name, *_ in fields]
 
 
+def _joined(parts: Sequence[NDArray[_Kind]]) -> NDArray[_Kind]:
+    """Put arrays behind each other, without copying if there is only one."""
+    return np.concatenate(parts) if len(parts) > 1 else parts[0]
+
+
 def _alike(rows: Octets, layout: Layout) -> Mask:
     """Say which messages agree with the first one wherever the layout does not vary."""
     fixed = np.ones(rows.shape[1], np.bool_)
     for at in layout.stamps:
         fixed[at : at + 8] = False
-    for at, count in layout.columns:
+    for at, count in (*layout.columns, *layout.passed):
         fixed[at : at + 8 * count] = False
     return np.asarray((rows[:, fixed] == rows[0, fixed]).all(axis=1))
 
@@ -288,7 +299,7 @@ def _decode(rows: Octets, log_times: Nanos, layout: Layout, order: str) -> Table
         names=layout.names,
         stamps_ns=np.column_stack([np.empty((len(rows), 0), np.int64), *stamps]),
         columns=tuple(
-            numbers(rows, at, count, order + "f8").astype(np.float64)
+            numbers(rows, at, count, order + "f8").astype(np.float64, copy=False)
             for at, count in layout.columns
         ),
         log_times_ns=log_times,

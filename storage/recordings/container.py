@@ -38,8 +38,11 @@ from storage.recordings.records import (
     walk,
 )
 
-_OF_USE = np.array([FOOTER, SCHEMA, CHANNEL, MESSAGE, CHUNK, DATA_END])
-_ENDS = np.array([FOOTER, DATA_END])
+_OF_USE, _OF_CHUNKS, _ENDS = 1, 2, 3
+_USES = np.zeros(256, np.uint8)  # of records, by their opcodes
+_USES[[SCHEMA, CHANNEL, MESSAGE]] = _OF_USE
+_USES[CHUNK] = _OF_CHUNKS
+_USES[[FOOTER, DATA_END]] = _ENDS
 _KEEP_MAPPED = 1 << 25  # [bytes] pages behind this distance are given back
 _BLOCK = 1 << 22  # [bytes] read at a time for the digest
 _MORE = 1.1  # that a file may be larger than its first chunks promise
@@ -172,7 +175,7 @@ class Container:
         plain = False  # whether messages stand outside chunks
         while is_whole and position < self.size:
             rows, position, is_whole = walk(self.octets, position)
-            for alike in _runs(rows[np.isin(rows[:, 0], _OF_USE)]):
+            for alike in _runs(rows[_USES[rows[:, 0]] > 0]):
                 opcode, start, length = alike[0, :3].tolist()
                 if opcode == FOOTER:
                     return self._check_end(start + length)
@@ -205,7 +208,7 @@ class Container:
         self._last_ns = max(self._last_ns, int(rows[:, 4].max()))
         first = int(rows[:, 4].min())
         self._first_ns = first if self._first_ns is None else min(first, self._first_ns)
-        for identifier in sorted(set(rows[:, 3].tolist())):
+        for identifier in np.flatnonzero(np.bincount(rows[:, 3])).tolist():
             if (channel := self.channels.get(identifier)) is None:
                 continue
             mine = rows[rows[:, 3] == identifier]
@@ -319,6 +322,9 @@ def local_copy(url: str | Path) -> Iterator[Path]:
     NotFoundError
         If there is no such file.
     """
+    if "://" not in str(url) and (here := Path(url)).is_file():
+        yield here
+        return
     files, inner = fsspec.core.url_to_fs(str(url))
     try:
         details = files.info(inner)
@@ -386,6 +392,6 @@ def file_digest(url: str | Path) -> str:
 
 def _runs(rows: Nanos) -> Iterator[Nanos]:
     """Cut records into chunks that follow each other, ends, and all others."""
-    kinds = (rows[:, 0] == CHUNK) + 2 * np.isin(rows[:, 0], _ENDS)
-    is_new = (kinds[1:] != kinds[:-1]) | (kinds[1:] == 2)
+    uses = _USES[rows[:, 0]]
+    is_new = (uses[1:] != uses[:-1]) | (uses[1:] == _ENDS)
     yield from (run for run in np.split(rows, np.flatnonzero(is_new) + 1) if len(run))

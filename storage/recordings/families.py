@@ -164,7 +164,9 @@ def plausible(stamps_ns: Nanos, log_times_ns: Nanos) -> Mask:
         False for stamps more than a day off: of a node that had no time yet, for one.
     """
     late = log_times_ns.astype(np.float64) - stamps_ns.astype(np.float64)
-    return np.asarray(np.abs(late - np.median(late)) <= _FAR_NS) if len(late) else late > 0.0
+    if not len(late) or np.ptp(late) <= _FAR_NS:
+        return np.ones(len(late), np.bool_)
+    return np.asarray(np.abs(late - np.median(late)) <= _FAR_NS)
 
 
 def far_note(topic: str, n: int, what: str) -> str:

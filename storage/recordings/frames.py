@@ -5,9 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
-from pipelines.geometry import inverse, rigid
+from pipelines.geometry import inverse, rigid, skew
 from pipelines.rigs import vlp16
 from pipelines.values import Array, ImuMount, Rig
 from storage.recordings.families import Series
@@ -37,10 +36,12 @@ class FrameTree:
         if not series.topic.endswith("tf_static"):
             self.turning[child] = series
         elif len(series.values) and child not in self.parents:
-            *translation, x, y, z, w = series.values[-1].tolist()
-            quaternion = np.array([x, y, z, w])
-            if abs(np.linalg.norm(quaternion) - 1.0) < _UNIT:
-                R = Rotation.from_quat(quaternion).as_matrix()
+            translation, quaternion = np.split(series.values[-1], [3])
+            norm = np.linalg.norm(quaternion)
+            if abs(norm - 1.0) < _UNIT:
+                *axis, w = quaternion / norm
+                cross = skew(axis)
+                R = np.eye(3) + 2.0 * (w * cross + cross @ cross)
                 self.parents[child] = (parent, rigid(R, translation))
 
     def chain(self, frame: str) -> dict[str, Array]:

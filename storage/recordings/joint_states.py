@@ -59,8 +59,10 @@ def _layout(cursor: cdr.Cursor) -> cdr.Layout:
     names = tuple(cursor.text() for _ in range(cursor.count(4)))
     n_positions = cursor.count(8)
     positions = (cursor.skip("d", n_positions), n_positions)
-    rest = []
+    passed = []
     for _ in ("velocity", "effort"):
         n = cursor.count(8)
-        rest.append((cursor.skip("d", n), n))
-    return cdr.Layout(names=(names[:n_positions],), stamps=(stamp,), columns=(positions, *rest))
+        passed.append((cursor.skip("d", n), n))
+    return cdr.Layout(
+        names=(names[:n_positions],), stamps=(stamp,), columns=(positions,), passed=tuple(passed)
+    )

@@ -66,10 +66,11 @@ def _layout(cursor: cdr.Cursor) -> cdr.Layout:
     stamp = cursor.stamp()
     frame = cursor.text()
     orientation = cursor.skip("d", 4)
-    covariance = cursor.skip("d", 9)
-    rest = cursor.skip("d", 3 + 9 + 3 + 9)
+    variance = cursor.skip("d")
+    rest = cursor.skip("d", 8 + 3 + 9 + 3 + 9)
     return cdr.Layout(
         names=((frame,),),
         stamps=(stamp,),
-        columns=((orientation, 4), (covariance, 9), (rest, 24)),
+        columns=((orientation, 4), (variance, 1)),
+        passed=((rest, 32),),
     )

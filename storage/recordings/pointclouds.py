@@ -10,7 +10,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from pipelines.values import RING_UNKNOWN, Nanos
+from pipelines.values import RING_UNKNOWN, Mask, Nanos
 from storage.recordings import cdr
 from storage.recordings.container import Batch, Channel
 from storage.recordings.families import (
@@ -29,7 +29,14 @@ from storage.recordings.points import (
     unpack_clouds,
 )
 from storage.recordings.records import Octets
-from storage.recordings.shot_times import NO_FIELD, SHOTS_MIN, fault_of, plain_span, shot_times
+from storage.recordings.shot_times import (
+    NO_FIELD,
+    SHOTS_MIN,
+    fault_of,
+    plain_span,
+    plain_spans,
+    shot_times,
+)
 
 SCHEMA = "sensor_msgs/msg/PointCloud2"
 DEFINITION = f"""# A collection of N-dimensional points, possibly organised as an image.
@@ -173,29 +180,41 @@ class PointClouds:
         self._reserve(int(n_points.sum()))
         clouds[:, 3] = self._n + np.cumsum(n_points) - n_points
         seen = unpack_clouds(octets, clouds, self._layout, self._out)
-        pairs = zip(clouds.tolist(), seen, strict=True)
-        kept = np.array([self._judged(octets, cloud, one) for cloud, one in pairs], np.int64)
+        kept, is_plain = self._plain(seen)
+        for k in np.flatnonzero(~is_plain).tolist():
+            kept[k] = self._judged(octets, clouds[k].tolist(), seen, k)
+        self._has_bad_rings |= bool(seen.has_bad_ring.any())
         self._parts.append(_Messages(clouds[:, 2], log_times_ns, *kept.T))
         self._close_gaps(clouds[:, 3], kept[:, 0])
 
-    def _judged(self, octets: Octets, cloud: list[int], seen: Seen) -> tuple[int, ...]:
-        """Set the instants of a cloud right if its times are of no use; return what is kept."""
+    def _plain(self, seen: Seen) -> tuple[Nanos, Mask]:
+        """Return what is kept of clouds, and for which this holds: their times are as usual."""
+        n, low, high, n_zeros, is_ascending, _ = seen
+        kept = np.ones((len(n), 4), np.int64)
+        kept[:, 0], kept[:, 3] = n, is_ascending
+        if self._layout.time is None:
+            return kept, np.zeros(len(n), np.bool_)
+        kept[:, 1], is_plain = plain_spans(self._layout.time.kind, low, high, n_zeros, n)
+        return kept, is_plain
+
+    def _judged(self, octets: Octets, cloud: list[int], seen: Seen, k: int) -> tuple[int, ...]:
+        """Set the instants of cloud k right if its times are of no use; return what is kept."""
         begin, n_points, stamp, row = cloud
-        self._has_bad_rings |= seen.has_bad_ring
-        n, time, fault = seen.n_returns, self._layout.time, ""
+        n, low, high, n_zeros, is_ascending, _ = (column[k].item() for column in seen)
+        time, fault = self._layout.time, ""
         span: int | None = 0
         if n and time is None:
             fault = NO_FIELD
         elif n and time is not None:
-            fault = fault_of(seen.earliest, seen.latest, seen.n_zeros, n)
-            span = 0 if fault else plain_span(time.kind, seen.earliest, seen.latest)
+            fault = fault_of(low, high, n_zeros, n)
+            span = 0 if fault else plain_span(time.kind, low, high)
         if span is None:
             points = octets[begin : begin + n_points * self._layout.step]
             return self._unpack_one(points, stamp, row, n_points)
         if fault:
             self._out.stamps[row : row + n] = stamp
         has_times = self._has_times_of(n, span, fault)
-        return (n, span, has_times, bool(fault) or seen.is_ascending)
+        return (n, span, has_times, bool(fault) or is_ascending)
 
     def _close_gaps(self, rows: Nanos, counts: Nanos) -> None:
         """Move the returns of clouds together that hold points which are none."""

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipelines.threads import side_by_side
-from pipelines.values import RING_UNKNOWN, Column, Index, Nanos, Rings
+from pipelines.values import RING_UNKNOWN, Array, Column, Index, Mask, Nanos, Rings
 from storage.recordings import cdr
 from storage.recordings.families import BrokenMessageError
 from storage.recordings.records import Octets
@@ -55,12 +55,11 @@ class Columns(NamedTuple):
             Not filled.
         """
         p, others = _reserved(12 * n), _reserved(13 * n)  # who keeps these may let go of the points
-        stamps, intensities, rings = np.split(others, [8 * n, 12 * n])
         return cls(
             p.view(np.float32).reshape(n, 3),
-            intensities.view(np.float32),
-            rings,
-            stamps.view(np.int64),
+            others[8 * n : 12 * n].view(np.float32),
+            others[12 * n :],
+            others[: 8 * n].view(np.int64),
         )
 
     def taken(self, rows: slice | Index) -> Columns:
@@ -122,14 +121,14 @@ def _reserved(size: int) -> Octets:
 
 
 class Seen(NamedTuple):
-    """What unpacking saw in a cloud; times as they were recorded."""
+    """What unpacking saw in clouds, a column each; times as they were recorded."""
 
-    n_returns: int
-    earliest: float
-    latest: float  # infinite if a time is not finite
-    n_zeros: int
-    is_ascending: bool
-    has_bad_ring: bool
+    n_returns: Nanos
+    earliest: Array
+    latest: Array  # infinite if a time is not finite
+    n_zeros: Nanos
+    is_ascending: Mask
+    has_bad_ring: Mask
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -318,7 +317,7 @@ def unpack_any(
     return n, times, bool(layout.ring and not is_ring.all())
 
 
-def unpack_clouds(octets: Octets, clouds: Nanos, layout: Layout, out: Columns) -> list[Seen]:
+def unpack_clouds(octets: Octets, clouds: Nanos, layout: Layout, out: Columns) -> Seen:
     """Write the returns of clouds and their instants, each from a row of its own on.
 
     Parameters
@@ -334,7 +333,7 @@ def unpack_clouds(octets: Octets, clouds: Nanos, layout: Layout, out: Columns) -
 
     Returns
     -------
-    list of Seen
+    Seen
         What was seen in each.
     """
     told, compiled = np.empty((len(clouds), 6)), layout.compiled
@@ -346,10 +345,8 @@ def unpack_clouds(octets: Octets, clouds: Nanos, layout: Layout, out: Columns) -
         _clouds_kernel(octets, clouds[rows], compiled, columns, told[rows])
 
     side_by_side(unpack, len(clouds), worth=_WORTH)
-    return [
-        Seen(int(n), low, high, int(n_zeros), not n_descents, n_bad > 0)
-        for n, low, high, n_zeros, n_descents, n_bad in told.tolist()
-    ]
+    n, low, high, n_zeros, n_descents, n_bad = told.T
+    return Seen(n.astype(np.int64), low, high, n_zeros.astype(np.int64), n_descents == 0, n_bad > 0)
 
 
 @numba.njit(cache=True, nogil=True)

@@ -12,7 +12,7 @@ from math import isfinite
 import numpy as np
 from numpy.typing import NDArray
 
-from pipelines.values import Nanos
+from pipelines.values import Array, Mask, Nanos
 
 NO_FIELD = "there is no such field"
 SHOTS_MIN = 32  # points that a message needs before its times can be judged
@@ -89,6 +89,31 @@ def fault_of(low: float, high: float, n_zeros: int, n: int) -> str:
     if low == high:
         return f"its times are all {low:g}"
     return f"{n_zeros:,} of {n:,} times are 0" if n_zeros > _ZEROS_MAX * n else ""
+
+
+def plain_spans(kind: str, low: Array, high: Array, n_zeros: Nanos, n: Nanos) -> tuple[Nanos, Mask]:
+    """Return how long after their stamps messages end whose times are plainly counted from there.
+
+    Parameters
+    ----------
+    kind : str
+        Type of the times: whole nanoseconds or seconds.
+    low, high : (k,)
+        The earliest and the latest of each message.
+    n_zeros, n : (k,)
+        How many of its times are zero, and how many there are.
+
+    Returns
+    -------
+    spans_ns : (k,)
+        Of the latest; 0 where it is not plain.
+    is_plain : (k,) bool
+        Where there are enough times, and nothing is wrong with them.
+    """
+    scale = _scale(kind[0])
+    is_near = np.maximum(np.abs(low), np.abs(high)) * scale <= _REVOLUTION_LIMIT * 1e9
+    is_plain = is_near & (low < high) & (n >= SHOTS_MIN) & (n_zeros <= _ZEROS_MAX * n)
+    return np.rint(np.where(is_plain, high, 0.0) * scale).astype(np.int64), is_plain
 
 
 def plain_span(kind: str, low: float, high: float) -> int | None:
