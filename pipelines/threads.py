@@ -47,6 +47,46 @@ def side_by_side(
     return [own, *(other.result() for other in others)]
 
 
+def by_turns(
+    work: Callable[[int, int], _Part], n_rows: int, *, size: int, worth: int
+) -> list[_Part]:
+    """Do pieces of a range of rows, each by whichever of the threads is free.
+
+    Parameters
+    ----------
+    work : callable
+        As of ``side_by_side``; for what is not summed, so that it matters little if a thread starts
+        late or its processor is slow.
+    n_rows : int
+        Number of rows.
+    size : int
+        Rows of a piece.
+    worth : int
+        With fewer rows the work is done before a thread has started: one piece, then.
+
+    Returns
+    -------
+    list
+        What ``work`` returned for each piece, in the order of the rows.
+    """
+    if n_rows < worth:
+        return [work(0, n_rows)]
+    found: dict[int, _Part] = {}
+    begins = iter(range(0, n_rows, size))
+
+    def take() -> None:
+        for begin in begins:
+            found[begin] = work(begin, min(begin + size, n_rows))
+
+    other = _POOL.submit(take)
+    try:
+        take()
+    finally:
+        wait([other])
+    other.result()
+    return [found[begin] for begin in sorted(found)]
+
+
 def in_processes(
     work: Callable[[int], _Part],
     seeds: Sequence[int],

@@ -17,7 +17,7 @@ import numpy as np
 import zstandard
 from isal.isal_zlib import crc32
 
-from pipelines.threads import side_by_side
+from pipelines.threads import by_turns
 from pipelines.values import Nanos
 from storage.recordings.records import RECORD_HEAD, Octets, text, walk
 
@@ -126,7 +126,7 @@ class Chunks:
         def bring(begin: int, end: int) -> tuple[list[Nanos], tuple[int, str] | None]:
             return self._bring(chunks[begin:end], places[begin:end])
 
-        for rows, damaged in side_by_side(bring, len(chunks), worth=2):
+        for rows, damaged in by_turns(bring, len(chunks), size=1, worth=2):
             found += rows
             if damaged is not None:
                 damage = damaged

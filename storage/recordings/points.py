@@ -14,7 +14,7 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from pipelines.threads import side_by_side
+from pipelines.threads import by_turns
 from pipelines.values import RING_UNKNOWN, Array, Column, Index, Mask, Nanos, Rings
 from storage.recordings import cdr
 from storage.recordings.families import BrokenMessageError
@@ -27,6 +27,7 @@ _TIMES = ("time", "t", "timestamp", "time_stamp", "offset_time", "time_offset", 
 _FIELD_MIN = 13  # [bytes] of a field with an empty name
 _PAGE = 1 << 21  # [bytes] of a large page of memory: the fewer are touched, the fewer are faults
 _WORTH = 4  # clouds that two threads unpack sooner than one
+_PIECE = 8  # clouds that a thread takes at a time
 _BLOCK = 512  # points: few enough for the nearest cache
 _EXPONENT = np.uint32(0x7F800000)  # bits of a float32; all are set where it is not finite
 _MAGNITUDE = np.uint32(0x7FFFFFFF)
@@ -344,7 +345,7 @@ def unpack_clouds(octets: Octets, clouds: Nanos, layout: Layout, out: Columns) -
         rows = slice(begin, end)
         _clouds_kernel(octets, clouds[rows], compiled, columns, told[rows])
 
-    side_by_side(unpack, len(clouds), worth=_WORTH)
+    by_turns(unpack, len(clouds), size=_PIECE, worth=_WORTH)
     n, low, high, n_zeros, n_descents, n_bad = told.T
     return Seen(n.astype(np.int64), low, high, n_zeros.astype(np.int64), n_descents == 0, n_bad > 0)
 

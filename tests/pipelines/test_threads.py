@@ -7,7 +7,7 @@ import pytest
 
 from pipelines.config import StitchingConfig
 from pipelines.stitching import stitch
-from pipelines.threads import in_processes, side_by_side
+from pipelines.threads import by_turns, in_processes, side_by_side
 from tests.synthetic import crooked_rig, scan_log
 
 
@@ -29,6 +29,36 @@ def test_an_error_in_any_part_reaches_the_caller():
 
     with pytest.raises(ArithmeticError, match="the second part"):
         side_by_side(fail_late, 10, worth=2)
+
+
+@pytest.mark.parametrize("n_rows", [0, 1, 7, 64])
+def test_pieces_taken_by_turns_come_in_the_order_of_the_rows(n_rows):
+    parts = by_turns(lambda first, end: np.arange(first, end), n_rows, size=3, worth=2)
+    np.testing.assert_array_equal(np.concatenate(parts), np.arange(n_rows))
+    assert max(len(part) for part in parts) <= 3
+
+
+def test_a_late_thread_leaves_its_pieces_to_the_other():
+    done = threading.Event()
+
+    def work(first, end):
+        if first == 0:
+            return done.wait(10.0)
+        if end == 50:
+            done.set()
+        return True
+
+    assert all(by_turns(work, 50, size=1, worth=2))
+
+
+def test_what_fails_by_turns_is_told_when_both_threads_have_stopped():
+    with pytest.raises(ValueError, match="piece 7"):
+        by_turns(_fail_at_seven, 10, size=1, worth=2)
+
+
+def _fail_at_seven(first, _end):
+    if first == 7:
+        raise ValueError("piece 7")
 
 
 def test_returns_left_out_in_either_half_leave_no_gap():
