@@ -231,7 +231,8 @@ class Catalogue(Surveys):
         """
         check_tables(tables)
         with self.writing() as cursor:
-            if cursor.execute(_SUCCEED, [message, now(), job_id]).fetchall() == [(0,)]:
+            ending = [message, now(), job_id]
+            if cursor.execute(self._statement(_SUCCEED), ending).fetchall() == [(0,)]:
                 status = _standing(cursor, job_id)
                 if status is JobStatus.SUCCESSFUL:
                     return

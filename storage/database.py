@@ -62,7 +62,8 @@ class Database:
     Notes
     -----
     Safe to use from many threads. Once open, the database cannot reach files or the network,
-    and its configuration is locked.
+    and its configuration is locked. A query runs in the thread that asks: to share out the few rows
+    of a page or of a result among threads costs more than they do.
     """
 
     def __init__(self, path: Path, *, snapshots: Path, memory_limit: str = "1GB") -> None:
@@ -71,6 +72,7 @@ class Database:
         self._version = 0
         self._connection = _open(path, memory_limit)
         self._writer = self._connection.cursor()
+        self._statements: dict[str, duckdb.Statement] = {}
         self._snapshots = Snapshots(path, snapshots)
 
     def __enter__(self) -> Self:
@@ -205,14 +207,20 @@ class Database:
         with self._lock:
             cursor = self._writer
             try:
-                cursor.execute("BEGIN")
+                cursor.execute(self._statement("BEGIN"))
                 yield cursor
-                cursor.execute("COMMIT")
+                cursor.execute(self._statement("COMMIT"))
             except BaseException:
                 with suppress(duckdb.Error):
                     cursor.execute("ROLLBACK")
                 raise
             self._version += is_result
+
+    def _statement(self, sql: str) -> duckdb.Statement:
+        """Return a static statement for the cursor that writes; DuckDB reads its text only once."""
+        if sql not in self._statements:
+            (self._statements[sql],) = self._writer.extract_statements(sql)
+        return self._statements[sql]
 
 
 def _open(path: Path, memory_limit: str) -> duckdb.DuckDBPyConnection:
@@ -243,6 +251,7 @@ def _connect(path: Path, memory_limit: str) -> duckdb.DuckDBPyConnection:
         "autoinstall_known_extensions": "false",
         "autoload_known_extensions": "false",
         "memory_limit": memory_limit,
+        "threads": "1",
     }
     try:
         return duckdb.connect(str(path), config=config)
@@ -298,7 +307,7 @@ def _without_decimals(table: pa.Table) -> pa.Table:
 
 
 class Planned:
-    """A statement over rows that come again and again: hides that DuckDB plans it only once.
+    """A statement over rows that come again and again: hides that it is read and planned only once.
 
     Rows of many columns take longer to plan than to write.
 
@@ -309,8 +318,7 @@ class Planned:
     name : str
         What the statement is called among those of the cursor.
     sql : str
-        Static text that sees the rows as ``incoming_<name>``. An INSERT should end in RETURNING:
-        DuckDB then does not share out few rows among threads, which costs more than they do.
+        Static text that sees the rows as ``incoming_<name>``.
     schema : Schema
         Columns of the rows.
     """
@@ -319,10 +327,10 @@ class Planned:
         self, cursor: duckdb.DuckDBPyConnection, name: str, sql: str, schema: pa.Schema
     ) -> None:
         self._cursor = cursor
-        self._call = f"EXECUTE planned_{name}"
         self._incoming = _Incoming(schema)
         cursor.register(f"incoming_{name}", self._incoming)
         cursor.execute(f"PREPARE planned_{name} AS {sql}")
+        (self._call,) = cursor.extract_statements(f"EXECUTE planned_{name}")
 
     def run(self, rows: pa.Table) -> None:
         """Run the statement on some rows, on its cursor.

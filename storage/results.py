@@ -488,7 +488,7 @@ def _with_columns(table: pa.Table, errors: Sequence[Mapping[str, object]]) -> pa
 
 def _without_errors(table: pa.Table) -> pa.Table:
     """Return a table with nothing in its error columns."""
-    for i, name in enumerate(table.column_names):
+    for i, name in enumerate(table.schema.names):
         if name.startswith("error_") and table.column(i).null_count < len(table):
             table = table.set_column(i, name, pa.nulls(len(table), _REAL))
     return table

@@ -56,13 +56,13 @@ _RESULTS_OF_SURVEY = {
 }
 _TRUE_TABLES = ("true_marks", "true_stops")
 _INSERT_RESULTS = {
-    "runs": "INSERT INTO runs SELECT * FROM incoming_runs RETURNING 1",
-    "stops": "INSERT INTO stops SELECT * FROM incoming_stops RETURNING 1",
-    "marker_fits": "INSERT INTO marker_fits SELECT * FROM incoming_marker_fits RETURNING 1",
-    "rejections": "INSERT INTO rejections SELECT * FROM incoming_rejections RETURNING 1",
-    "station_fixes": "INSERT INTO station_fixes SELECT * FROM incoming_station_fixes RETURNING 1",
-    "observations": "INSERT INTO observations SELECT * FROM incoming_observations RETURNING 1",
-    "resections": "INSERT INTO resections SELECT * FROM incoming_resections RETURNING 1",
+    "runs": "INSERT INTO runs SELECT * FROM incoming_runs",
+    "stops": "INSERT INTO stops SELECT * FROM incoming_stops",
+    "marker_fits": "INSERT INTO marker_fits SELECT * FROM incoming_marker_fits",
+    "rejections": "INSERT INTO rejections SELECT * FROM incoming_rejections",
+    "station_fixes": "INSERT INTO station_fixes SELECT * FROM incoming_station_fixes",
+    "observations": "INSERT INTO observations SELECT * FROM incoming_observations",
+    "resections": "INSERT INTO resections SELECT * FROM incoming_resections",
 }
 _INSERT = {
     "adjustments": "INSERT INTO adjustments BY NAME SELECT * FROM incoming",
@@ -141,7 +141,7 @@ class Tables:
 
     Notes
     -----
-    A statement costs about a millisecond. Those for results are planned once, and what nobody else
+    A statement costs half a millisecond. Those for results are planned once, and what nobody else
     can have changed is not read again: rigs that are there, truths, and the surveys of jobs.
     """
 
@@ -176,9 +176,9 @@ class Tables:
 
     def _append_rigs(self, table: pa.Table) -> None:
         """Append those rigs that are not there; only of these does the database have to tell."""
-        rows = {row["rig_digest"]: row for row in table.to_pylist()}
-        if rows.keys() <= self._rigs:
+        if self._rigs.issuperset(table["rig_digest"].to_pylist()):
             return
+        rows = {row["rig_digest"]: row for row in table.to_pylist()}
         self._rigs = {digest for (digest,) in self._cursor.execute(_RIGS).fetchall()}
         for digest in rows.keys() - self._rigs:
             self._cursor.execute(_PUT_RIG, rows[digest])
