@@ -226,8 +226,8 @@ class Catalogue(Surveys):
         Notes
         -----
         Results are written once: finishing a successful job again changes nothing. Errors are
-        taken against the truth that is known now. Each statement costs half a millisecond or
-        more, almost whatever it writes.
+        taken against the truth that is known now. To write the rows of one scan takes some
+        milliseconds, almost whatever they are.
         """
         check_tables(tables)
         with self.writing() as cursor:
@@ -239,8 +239,7 @@ class Catalogue(Surveys):
                 _require(job_id, status, JobStatus.RUNNING)
             truth = self._tables.truth(self._tables.survey_of(job_id))
             compared = adjustments.with_errors(results.with_errors(tables, truth), truth)
-            for name, table in compared.items():
-                self._tables.append(name, table)
+            self._tables.append(compared)
 
     def fail_job(
         self, job_id: str, *, code: str, reason: str, traceback: str | None = None

@@ -318,34 +318,48 @@ class Planned:
     name : str
         What the statement is called among those of the cursor.
     sql : str
-        Static text that sees the rows as ``incoming_<name>``.
-    schema : Schema
-        Columns of the rows.
+        Static text that sees the rows of each table as ``incoming_<table>``.
+    schemas : mapping of str to Schema
+        Columns of the rows by table.
+
+    Attributes
+    ----------
+    names : set of str
+        The tables.
     """
 
     def __init__(
-        self, cursor: duckdb.DuckDBPyConnection, name: str, sql: str, schema: pa.Schema
+        self,
+        cursor: duckdb.DuckDBPyConnection,
+        name: str,
+        sql: str,
+        schemas: Mapping[str, pa.Schema],
     ) -> None:
         self._cursor = cursor
-        self._incoming = _Incoming(schema)
-        cursor.register(f"incoming_{name}", self._incoming)
+        self._incoming = {table: _Incoming(schema) for table, schema in schemas.items()}
+        self.names = set(schemas)
+        for table, incoming in self._incoming.items():
+            cursor.register(f"incoming_{table}", incoming)
         cursor.execute(f"PREPARE planned_{name} AS {sql}")
         (self._call,) = cursor.extract_statements(f"EXECUTE planned_{name}")
 
-    def run(self, rows: pa.Table) -> None:
-        """Run the statement on some rows, on its cursor.
+    def run(self, tables: Mapping[str, pa.Table]) -> None:
+        """Run the statement on some rows, on its cursor; without any do nothing.
 
         Parameters
         ----------
-        rows : Table
-            In the columns of the schema.
+        tables : mapping of str to Table
+            Rows by table, in the columns of the schemas; a table that is not named has none.
         """
-        schema = self._incoming.schema
-        self._incoming.rows = rows if rows.schema.equals(schema) else rows.cast(schema)
+        if not any(rows.num_rows for rows in tables.values()):
+            return
         try:
-            self._cursor.execute(self._call)
+            for table, rows in tables.items():
+                self._incoming[table].take(rows)
+            self._cursor.execute(self._call).fetchall()  # which ends it
         finally:
-            self._incoming.rows = None
+            for incoming in self._incoming.values():
+                incoming.rows = None
 
 
 class _Incoming:
@@ -354,6 +368,10 @@ class _Incoming:
     def __init__(self, schema: pa.Schema) -> None:
         self.schema = schema
         self.rows: pa.Table | None = None
+
+    def take(self, rows: pa.Table) -> None:
+        """Take rows in, with the types of the schema."""
+        self.rows = rows if rows.schema.equals(self.schema) else rows.cast(self.schema)
 
     def __arrow_c_stream__(self, requested_schema: object = None) -> object:
         """Return the rows as a stream; DuckDB asks for it, before there are any too."""

@@ -184,7 +184,7 @@ class Surveys(Lists):
         for axis, name in enumerate(("sigma_x_m", "sigma_y_m", "sigma_z_m")):
             table = table.append_column(name, pa.array(sigmas[:, axis]))
         with self.writing() as cursor:
-            self._tables.append("control_marks", table)
+            self._tables.append({"control_marks": table})
             cursor.execute(
                 "DELETE FROM control_marks WHERE survey_id = ? AND NOT list_contains(?, mark)",
                 [survey_id, list(marks.names)],
@@ -232,12 +232,12 @@ class Surveys(Lists):
         check_marks(truth.marks)
         survey_id = self.get_survey(survey).survey_id
         with self.writing() as cursor:
-            self._tables.append("true_marks", marks_table(survey_id, truth.marks))
+            self._tables.append({"true_marks": marks_table(survey_id, truth.marks)})
             cursor.execute(
                 "DELETE FROM true_marks WHERE survey_id = ? AND NOT list_contains(?, mark)",
                 [survey_id, list(truth.marks.names)],
             )
-            self._tables.append("true_stops", true_stops_table(survey_id, truth.stops))
+            self._tables.append({"true_stops": true_stops_table(survey_id, truth.stops)})
             cursor.execute(
                 "INSERT OR REPLACE INTO true_worlds VALUES (?, ?, ?)",
                 [survey_id, rig_text(truth), json_text(truth.about)],
@@ -389,7 +389,7 @@ class Surveys(Lists):
         digest = rig_digest(rig)
         row = {"rig_digest": digest, "name": rig.name, "rig": json_text(rig_to_mapping(rig))}
         with self.writing():
-            self._tables.append("rigs", pa.Table.from_pylist([row]))
+            self._tables.append({"rigs": pa.Table.from_pylist([row])})
         return digest
 
     def get_rig(self, digest: str) -> Rig:

@@ -55,15 +55,16 @@ _RESULTS_OF_SURVEY = {
     ),
 }
 _TRUE_TABLES = ("true_marks", "true_stops")
-_INSERT_RESULTS = {
-    "runs": "INSERT INTO runs SELECT * FROM incoming_runs",
-    "stops": "INSERT INTO stops SELECT * FROM incoming_stops",
-    "marker_fits": "INSERT INTO marker_fits SELECT * FROM incoming_marker_fits",
-    "rejections": "INSERT INTO rejections SELECT * FROM incoming_rejections",
-    "station_fixes": "INSERT INTO station_fixes SELECT * FROM incoming_station_fixes",
-    "observations": "INSERT INTO observations SELECT * FROM incoming_observations",
-    "resections": "INSERT INTO resections SELECT * FROM incoming_resections",
-}
+_INSERT_RESULTS = """
+WITH a AS (INSERT INTO runs SELECT * FROM incoming_runs),
+    b AS (INSERT INTO stops SELECT * FROM incoming_stops),
+    c AS (INSERT INTO marker_fits SELECT * FROM incoming_marker_fits),
+    d AS (INSERT INTO rejections SELECT * FROM incoming_rejections),
+    e AS (INSERT INTO station_fixes SELECT * FROM incoming_station_fixes),
+    f AS (INSERT INTO observations SELECT * FROM incoming_observations),
+    g AS (INSERT INTO resections SELECT * FROM incoming_resections)
+SELECT 1
+"""
 _INSERT = {
     "adjustments": "INSERT INTO adjustments BY NAME SELECT * FROM incoming",
     "adjusted_stations": "INSERT INTO adjusted_stations BY NAME SELECT * FROM incoming",
@@ -141,38 +142,33 @@ class Tables:
 
     Notes
     -----
-    A statement costs half a millisecond. Those for results are planned once, and what nobody else
-    can have changed is not read again: rigs that are there, truths, and the surveys of jobs.
+    A statement costs half a millisecond. Results are one, planned once, and what nobody else can
+    have changed is not read again: rigs that are there, truths, and the surveys of jobs.
     """
 
     def __init__(self, cursor: duckdb.DuckDBPyConnection) -> None:
         self._cursor = cursor
-        self._planned = {
-            name: Planned(cursor, name, sql, results.SCHEMAS[name])
-            for name, sql in _INSERT_RESULTS.items()
-        }
+        schemas = {name: one for name, one in results.SCHEMAS.items() if name != "rigs"}
+        self._results = Planned(cursor, "results", _INSERT_RESULTS, schemas)
         self._rigs: set[str] = set()
         self._truths: dict[str, Truth | None] = {}
         self._surveys: dict[str, str] = {}
 
-    def append(self, name: str, table: pa.Table) -> None:
-        """Append rows to a table.
+    def append(self, tables: Mapping[str, pa.Table]) -> None:
+        """Append rows to tables.
 
         Parameters
         ----------
-        name : str
-            The table.
-        table : Table
-            Its rows; a rig that is there already is not written again.
+        tables : mapping of str to Table
+            Rows by table; a rig that is there already is not written again.
         """
-        if not table.num_rows:
-            return
-        if name in self._planned:
-            self._planned[name].run(table)
-        elif name == "rigs":
-            self._append_rigs(table)
-        else:
-            execute_on(self._cursor, _INSERT[name], table)
+        ours = self._results.names
+        self._results.run({name: rows for name, rows in tables.items() if name in ours})
+        for name, rows in tables.items():
+            if name == "rigs":
+                self._append_rigs(rows)
+            elif name not in ours and rows.num_rows:
+                execute_on(self._cursor, _INSERT[name], rows)
 
     def _append_rigs(self, table: pa.Table) -> None:
         """Append those rigs that are not there; only of these does the database have to tell."""

@@ -341,6 +341,28 @@ def test_a_job_whose_results_cannot_be_written_writes_none_and_runs_on(catalogue
     assert count(catalogue, N_FITS) == 14
 
 
+def test_results_that_were_written_outlive_a_crash(tmp_path):
+    with opened(tmp_path) as catalogue:
+        catalogue.create_survey("lane")
+        done = finished(catalogue)
+        left = tmp_path / "left"  # what is on disk, with nothing closed
+        subprocess.run(["cp", "-r", str(tmp_path / "data"), str(left)], check=True)
+    with Catalogue(left / "results.duckdb", snapshots=tmp_path / "others") as again:
+        assert again.get_job(done.job_id) == done
+        given = made_tables(job_id=done.job_id)
+        written = {
+            "runs": again.rows("SELECT run_id FROM runs"),
+            "stops": again.rows("SELECT stop FROM stops"),
+            "marker_fits": again.rows("SELECT * FROM marker_fits ORDER BY rowid"),
+            "rejections": again.rows("SELECT * FROM rejections ORDER BY rowid"),
+            "station_fixes": again.rows("SELECT * FROM station_fixes"),
+            "observations": again.rows("SELECT * FROM observations ORDER BY rowid"),
+            "resections": again.rows("SELECT * FROM resections ORDER BY rowid"),
+        }
+    for name, rows in written.items():
+        assert rows == given[name].select(list(rows[0])).to_pylist()
+
+
 @pytest.mark.parametrize(
     ("table", "sql"),
     [
