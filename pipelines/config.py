@@ -281,12 +281,17 @@ class SurveyConfig:
     @property
     def text(self) -> str:
         """Canonical text: JSON with sorted keys."""
-        return json.dumps(self.to_mapping(), sort_keys=True, separators=(",", ":"))
+        return json.dumps(self, default=_values_of, sort_keys=True, separators=(",", ":"))
 
     @property
     def digest(self) -> str:
         """First 16 hexadecimal digits of the SHA-256 of the canonical text."""
         return digest_of(self.text)
+
+
+def _values_of(section: Any) -> dict[str, Any]:
+    """Return the values of a section by name, not copied as ``dataclasses.asdict`` does."""
+    return {one.name: getattr(section, one.name) for one in dataclasses.fields(section)}
 
 
 def digest_of(text: str) -> str:
