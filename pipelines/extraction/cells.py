@@ -120,10 +120,10 @@ def rows_in(
     n_rows = 0
     for low in range(first, end, _GROUP):
         group = cells[low : min(low + _GROUP, end)]
-        n_wanted = 0
+        is_any = False
         for cell in group:
-            n_wanted += is_wanted[np.uint32(cell)]
-        if n_wanted:
+            is_any |= is_wanted[np.uint32(cell)]
+        if is_any:
             for i in range(len(group)):
                 cell = np.uint32(group[i])
                 rows[n_rows], own[n_rows] = low + i, cell  # unless the next one takes its place

@@ -220,7 +220,8 @@ def _counts(cells: _Rows, n_cells: int) -> _Rows:
 def _place(p_base: Column, rows: _Rows, cells: _Rows, free: _Rows, points: Column) -> None:
     """Write some returns, each to the next free place of its cell."""
     for i in range(len(rows)):
-        row, place = rows[i], free[cells[i]]
-        free[cells[i]] = place + 1
+        row, cell = np.uint32(rows[i]), np.uint32(cells[i])
+        place = np.uint32(free[cell])
+        free[cell] += 1
         points[place, 0], points[place, 1] = p_base[row, 0], p_base[row, 1]
         points[place, 2] = p_base[row, 2]
