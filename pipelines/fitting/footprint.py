@@ -214,7 +214,7 @@ def depths_anywhere(places: Array, n: int, found: Array) -> None:
     Parameters
     ----------
     places : (5, k)
-        As of ``depths_inside`` [m].
+        As of ``depths_inside``; the axes are swapped where the second leads to the middle [m].
     n : int
         Number of footprints: of columns that are looked at.
     found : (2, k)
@@ -227,19 +227,16 @@ def depths_anywhere(places: Array, n: int, found: Array) -> None:
     strip that is not lit has no length.
     """
     found[:, :n] = 0.0
+    _turn_to_middle(places, n)
     for k in range(len(_STRIPS_FEW)):
         height, weight = _STRIPS_FEW[k, 0], _STRIPS_FEW[k, 1]
         for i in range(n):
             x0, y0, radius = places[0, i], places[1, i], places[2, i]
             half_x, half_y = places[3, i], places[4, i]
-            if abs(y0) > abs(x0):  # across the outline a strip is lit or not, along it in part
-                x0, y0, half_x, half_y = y0, x0, half_y, half_x
             dy, half = half_y * height - y0, half_x * weight
             h2 = max(radius * radius - dy * dy, 0.0)
-            h = np.sqrt(h2)
-            left, right = min(max(-half - x0, -h), h), min(max(half - x0, -h), h)
-            depth_left = np.sqrt(max(h2 - left * left, 0.0))
-            depth_right = np.sqrt(max(h2 - right * right, 0.0))
+            left, depth_left = _end(-half - x0, h2)
+            right, depth_right = _end(half - x0, h2)
             turn = _angle(
                 right * depth_left - left * depth_right, depth_left * depth_right + left * right
             )
@@ -247,6 +244,28 @@ def depths_anywhere(places: Array, n: int, found: Array) -> None:
             found[1, i] += weight * (right - left)
     for i in range(n):
         found[0, i] = found[0, i] / found[1, i] if found[1, i] > 0.0 else 0.0
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy", fastmath=_AT_ONCE)
+def _turn_to_middle(places: Array, n: int) -> None:
+    """Swap axes so that strips lie along the way to the middle: across it each is lit or not."""
+    for i in range(n):
+        x, y, half_x, half_y = places[0, i], places[1, i], places[3, i], places[4, i]
+        is_across = abs(y) > abs(x)
+        places[0, i], places[1, i] = (y, x) if is_across else (x, y)
+        places[3, i], places[4, i] = (half_y, half_x) if is_across else (half_x, half_y)
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy", fastmath=_AT_ONCE)
+def _end(x: float, h2: float) -> tuple[float, float]:
+    """Return where a strip ends, at the outline at most, and how deep the sphere is there.
+
+    ``h2`` is the square of half the sphere's width along the strip. One root serves both.
+    """
+    rest = h2 - x * x
+    root = np.sqrt(rest if rest > 0.0 else h2)
+    outline = root if x > 0.0 else -root
+    return (x, root) if rest > 0.0 else (outline, 0.0)
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy", fastmath=_AT_ONCE)

@@ -32,6 +32,7 @@ _LUCK = 0.01  # share of returns that are from the sphere by their range and yet
 _CERTAIN = 4.0  # standard deviations inside the outline from where meeting is no news
 _CAVITY_MIN = 0.05  # of a centre's precision: the least that is not one return's own
 _TINY = 1e-9  # [m]
+_Pair = tuple[float, float]  # across the beam, or along the axes of a footprint
 _HALF, _DENSITY = math.sqrt(0.5), 1.0 / math.sqrt(2.0 * math.pi)
 
 
@@ -130,9 +131,14 @@ def _counts(rows: Rows, linear: Linear, weights: Array, radius: float) -> tuple[
     """
     counts, lateral2 = np.zeros(_N_BINS), 0.0
     for i in range(len(weights)):
-        half, inside = _reach(rows, linear, i, radius)
+        passed, up = _pair(linear.offsets, i), _pair(rows.up, i)
+        half, inside = _reach(passed, _pair(rows.half_widths, i), radius)
         k = int(max((inside / half - _FROM) / _BIN, 0.0))
-        if weights[i] > 0.0 and k < _N_BINS and not _is_by_pole(rows, linear, i, radius):
+        if (
+            weights[i] > 0.0
+            and k < _N_BINS
+            and not _is_by_pole(passed, up, rows.blurs[1, i], radius)
+        ):
             counts[k] += 1.0
             lateral2 += (rows.lateral[i] / half) ** 2
     return counts, lateral2 / max(counts.sum(), 1.0)
@@ -191,23 +197,30 @@ def outline_normals(
     n, found = len(covs), np.zeros(sites.shape)
     N, faces = np.zeros((n, 4, 4)), np.zeros((n, 4, 4))  # of the centre and the sphere's own edge
     pulls, pull_faces = np.zeros((n, 4)), np.zeros((n, 4))
+    a, b, u = rows.firsts_axis, rows.seconds_axis, rows.directions
     for m in range(n):
         N[m, 3, 3] = 1.0 / _SIGMA_OWN**2
         widest = covs[m, 0, 0] + covs[m, 1, 1] + covs[m, 2, 2]
         for i in range(rows.firsts[m], rows.firsts[m + 1]):
-            half, inside = _reach(rows, linear, i, outline.radius)
+            passed, up = _pair(linear.offsets, i), _pair(rows.up, i)
+            half, inside = _reach(passed, _pair(rows.half_widths, i), outline.radius)
             inside -= outline.edge * half
             blur = (outline.softness * half) ** 2 + rows.lateral[i] ** 2
             if weights[i] == 0.0 or inside > _CERTAIN * math.sqrt(widest + blur):
                 continue
-            if _is_by_pole(rows, linear, i, outline.radius):
+            if _is_by_pole(passed, up, rows.blurs[1, i], outline.radius):
                 blur += (_POLE_BLUR * half) ** 2
-            towards = _towards(rows, linear, i)
-            known = (_variance(covs[m], towards), blur)
+            x, y, lean = _towards(passed, rows.ranges[i])
+            row = (
+                x * a[0, i] + y * b[0, i] + lean * u[0, i],
+                x * a[1, i] + y * b[1, i] + lean * u[1, i],
+                x * a[2, i] + y * b[2, i] + lean * u[2, i],
+                -half,
+            )
+            known = (_variance(covs[m], row[:3]), blur)
             precision, pull = _site(inside, known, (sites[i, 0], sites[i, 1]))
             found[i, 0], found[i, 1] = weights[i] * precision, weights[i] * pull
-            precision, pull = found[i, 0], found[i, 1] - found[i, 0] * inside
-            row, sign = (towards[0], towards[1], towards[2], -half), rows.up[0, i]
+            precision, pull, sign = found[i, 0], found[i, 1] - found[i, 0] * inside, up[0]
             for p in range(4):
                 pulls[m, p] += pull * row[p]
                 pull_faces[m, p] += sign * pull * row[p]
@@ -256,35 +269,41 @@ def _chance(z: float) -> float:
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def _reach(rows: Rows, linear: Linear, i: int, radius: float) -> tuple[float, float]:
-    """Return half of a footprint's width and how far it reaches inside the outline [m]."""
-    x, y = linear.offsets[0, i], linear.offsets[1, i]
+def _pair(columns: Array, i: int) -> _Pair:
+    """Return both numbers of a return."""
+    return columns[0, i], columns[1, i]
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _reach(passed: _Pair, half_widths: _Pair, radius: float) -> _Pair:
+    """Return half of a footprint's width and how far it reaches inside the outline [m].
+
+    It is told by where it passes the centre, and its half widths.
+    """
+    x, y = passed
     off = max(math.sqrt(x * x + y * y), _TINY)
-    a, b = rows.half_widths[0, i] * x, rows.half_widths[1, i] * y
+    a, b = half_widths[0] * x, half_widths[1] * y
     half = math.sqrt(a * a + b * b) / off
     return half, radius + half - off
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def _is_by_pole(rows: Rows, linear: Linear, i: int, radius: float) -> bool:
-    """Tell whether a footprint lies so low and so near the vertical that it may be on the pole."""
-    x, y, up_x, up_y = linear.offsets[0, i], linear.offsets[1, i], rows.up[0, i], rows.up[1, i]
+def _is_by_pole(passed: _Pair, up: _Pair, blur: float, radius: float) -> bool:
+    """Tell whether a footprint lies so low and so near the vertical that it may be on the pole.
+
+    It is told by where it passes the centre, the vertical, and its half width across that.
+    """
+    (x, y), (up_x, up_y) = passed, up
     is_low = x * up_x + y * up_y < -_POLE_BELOW * radius
-    return bool(is_low and abs(x * up_y - y * up_x) < _POLE_HALF * radius + rows.blurs[1, i])
+    return bool(is_low and abs(x * up_y - y * up_x) < _POLE_HALF * radius + blur)
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def _towards(rows: Rows, linear: Linear, i: int) -> tuple[float, float, float]:
+def _towards(passed: _Pair, away: float) -> tuple[float, float, float]:
     """Return the direction from a centre to a beam, square to the line of sight to the centre."""
-    x, y = linear.offsets[0, i], linear.offsets[1, i]
+    x, y = passed
     off = max(math.sqrt(x * x + y * y), _TINY)
-    x, y, lean = x / off, y / off, off / rows.ranges[i]
-    a, b, u = rows.firsts_axis, rows.seconds_axis, rows.directions
-    return (
-        x * a[0, i] + y * b[0, i] + lean * u[0, i],
-        x * a[1, i] + y * b[1, i] + lean * u[1, i],
-        x * a[2, i] + y * b[2, i] + lean * u[2, i],
-    )
+    return x / off, y / off, off / away
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
