@@ -472,7 +472,7 @@ def _meet(chosen, marks, measured, weights, p, cov, last):  # type: ignore[no-un
                 break
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@numba.njit(cache=True, nogil=True, error_model="numpy", inline="always")
 def _add_distances(mark, p, measured, weight, N, bend, gradient):  # type: ignore[no-untyped-def]  # noqa: ANN001, ANN202, PLR0913
     """Add what was measured to one mark to normal matrix, second derivative and gradient."""
     is_flat = len(measured) == 2
@@ -494,7 +494,7 @@ def _add_distances(mark, p, measured, weight, N, bend, gradient):  # type: ignor
         bend[2, 2] += beyond
 
 
-@numba.njit(cache=True, nogil=True)
+@numba.njit(cache=True, nogil=True, inline="always")
 def _add_height(off, off_flat, u, weight, N, gradient):  # type: ignore[no-untyped-def]  # noqa: ANN001, ANN202
     """Add a difference of height, which correlates with the horizontal distance beside it."""
     gradient[2] += weight[1, 1] * off + weight[1, 0] * off_flat

@@ -161,7 +161,7 @@ def _fixes(
     angles: tuple[Array, Array],
 ) -> SubsetFixes:
     """Return the subsets of one size whose positions are worth something."""
-    variances = found.cov[:, [0, 1, 2], [0, 1, 2]]
+    variances = found.cov.diagonal(axis1=1, axis2=2)
     sigma_3d = np.sqrt(variances.sum(axis=1))
     keep = found.is_settled & (sigma_3d < USELESS)
     rows = chosen[keep]
@@ -183,27 +183,27 @@ def _table(v: Array) -> Array:
 
 
 def _of_pairs(table: Array, chosen: Index) -> Array:
-    """Return what a table says of each two of each subset, (s, 1) or (s, 3)."""
+    """Return what a table says of each two of each subset, (1, s) or (3, s)."""
     pairs = combinations(range(chosen.shape[1]), 2)
-    return np.stack([table[chosen[:, i], chosen[:, j]] for i, j in pairs], axis=1)
+    return np.stack([table[chosen[:, i], chosen[:, j]] for i, j in pairs])
 
 
 def _spread(angles: Array) -> Array:
     """Return the smallest and the largest angle of each subset, (s, 2)."""
-    return np.stack([angles.min(axis=1), angles.max(axis=1)], axis=1)
+    return np.stack([angles.min(axis=0), angles.max(axis=0)], axis=1)
 
 
 def _with_heading(towards: Array, groups: Sequence[Index]) -> list[Index]:
     """Return the subsets of marks that do not stand on one plumb line."""
     squares = np.square(towards[:, None] - towards[None])
     across, whole = squares[..., :2].sum(axis=2), _UPRIGHT**2 * squares.sum(axis=2)
-    return [chosen[_of_pairs(across - whole, chosen).sum(axis=1) > 0.0] for chosen in groups]
+    return [chosen[_of_pairs(across - whole, chosen).sum(axis=0) > 0.0] for chosen in groups]
 
 
 def _cutting(towards: Array, groups: Sequence[Index]) -> list[Index]:
     """Return the subsets of marks about which circles through the station cut each other there."""
     cuts = np.sin(_table(towards * [1.0, 1.0, 0.0]))
-    return [chosen[_of_pairs(cuts, chosen).max(axis=1) > _FLAT] for chosen in groups]
+    return [chosen[_of_pairs(cuts, chosen).max(axis=0) > _FLAT] for chosen in groups]
 
 
 def _of_three(_towards: Array, groups: Sequence[Index]) -> list[Index]:

@@ -115,6 +115,7 @@ def normals_of(
     return N
 
 
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def normals_of_spheres(
     rows: Rows, linear: Linear, residuals: Array, per_square: Array, n_unknowns: int
 ) -> tuple[Array, Array]:
@@ -222,13 +223,13 @@ def solve(N: Normals, effects: Array, known: Array, pull_known: Array) -> Solved
     mixed, given = np.empty((m, 3, n + 1)), np.empty((m, 3, n + 1))  # last the right-hand sides
     reduced = _shared(N, effects, known, pull_known)
     for s in range(m):
-        inverses[s] = np.linalg.inv(N.centres[s] + eye)
+        inverses[s] = inverse(N.centres[s] + eye)
         mixed[s, :, :n_lasers] = N.mixed[s]
         mixed[s, :, n_lasers:n] = np.dot(N.faces[s], effects[s])
         mixed[s, :, n] = N.pull_centres[s]
         given[s] = np.dot(inverses[s], mixed[s])
         _add_product(-1.0, mixed[s], given[s], reduced)
-    cov_shared = np.linalg.inv(reduced[:n, :n].copy())
+    cov_shared = inverse(reduced[:n, :n].copy())
     by_shared = given[:, :, :n].copy()
     covs = np.empty((m, 3, 3))
     for s in range(m):
@@ -266,3 +267,32 @@ def _add_product(sign: float, a: Array, b: Array, out: Array) -> None:
         for p in range(a.shape[1]):
             for q in range(b.shape[1]):
                 out[p, q] += sign * a[k, p] * b[k, q]
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def inverse(N: Array) -> Array:
+    """Return the inverse of a small normal matrix.
+
+    Parameters
+    ----------
+    N : (k, k)
+        Symmetric and positive definite; is written over.
+
+    Returns
+    -------
+    (k, k)
+        Its inverse, by Gauss and Jordan: such a matrix needs no pivoting.
+    """
+    n, out = len(N), np.eye(len(N))
+    for i in range(n):
+        pivot = 1.0 / N[i, i]
+        for j in range(n):
+            N[i, j] *= pivot
+            out[i, j] *= pivot
+        for row in range(n):
+            factor = N[row, i]
+            if row != i:
+                for j in range(n):
+                    N[row, j] -= factor * N[i, j]
+                    out[row, j] -= factor * out[i, j]
+    return out

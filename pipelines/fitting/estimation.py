@@ -187,7 +187,8 @@ def _spheres(state: State, radius: float) -> tuple[Array, Array]:
 
 def _linear(rows: Rows, state: State, is_in: Mask, radius: float) -> Linear:
     """Return what the beams should measure, linearised over what is not known of the centres."""
-    return linearise(_placed(rows, state), *_spheres(state, radius), is_in)
+    linear: Linear = linearise(_placed(rows, state), *_spheres(state, radius), is_in)
+    return linear
 
 
 def _margins(state: State, radius: float) -> Array:

@@ -59,6 +59,7 @@ class Linear(NamedTuple):
     offsets: Array
 
 
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def linearise(rows: Rows, spheres: Array, covs: Array, is_in: Mask | None = None) -> Linear:
     """Predict ranges, linearised over the width of what is not known of the spheres.
 
@@ -95,13 +96,6 @@ def linearise(rows: Rows, spheres: Array, covs: Array, is_in: Mask | None = None
     n = len(rows.ranges)
     out = Linear(np.empty(n), np.empty((4, n)), np.empty(n), np.empty((2, n)))
     matters = np.ones(n, dtype=np.bool_) if is_in is None else is_in
-    _linearise(rows, spheres, covs, matters, out)
-    return out
-
-
-@numba.njit(cache=True, nogil=True, error_model="numpy")
-def _linearise(rows: Rows, spheres: Array, covs: Array, matters: Mask, out: Linear) -> None:
-    """Fill in ``Linear``."""
     longest = np.max(rows.firsts[1:] - rows.firsts[:-1])
     seen, some = np.empty((_N_SEEN, longest)), np.empty((_N_SEEN, longest))
     told, found = np.empty((_N_TOLD, longest)), np.empty((_N_TOLD, longest))
@@ -123,6 +117,7 @@ def _linearise(rows: Rows, spheres: Array, covs: Array, matters: Mask, out: Line
             _tell_anywhere(n_outer, n_places, some, work, found)
             _put_back(outer, n_outer, found, told)
         _combine(rows, first, n, seen, told, out)
+    return out
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")

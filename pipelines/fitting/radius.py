@@ -8,17 +8,20 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
+import numba
 import numpy as np
 
-from pipelines.fitting.equations import normals_of_spheres
+from pipelines.fitting.equations import inverse, normals_of_spheres
 from pipelines.fitting.linearising import Linear, linearise
-from pipelines.fitting.rows import Rows, in_play, rows_of
-from pipelines.values import Array, Beams, Mask
+from pipelines.fitting.rows import Rows, in_play, rows_of, rows_of_one
+from pipelines.threads import side_by_side
+from pipelines.values import Array, Beams
 
 _ASKED = 1.0  # standard deviations of one step, beyond which the greatest likelihood is sought
 _BETTER, _BETTER_OWN = 9.0, 14.0  # by which it must be greater, as a chi-square; noise unknown
 _CLIP = 9.0  # squared standard deviations beyond which a residual is a stray
 _WEAK_PRIOR = 5.0  # radii: the same as the prior where it only keeps equations solvable
+_N_WORTH = 6  # spheres for which a second thread gains
 _N_STEPS = 8
 _SETTLED = 1e-4  # [m] of a step: what is asked is millimetres
 _STEP_MAX = 0.25  # radii per step
@@ -85,83 +88,123 @@ def free_radii(
     step by the noise alone (a sandwich). Where the greatest likelihood is so much greater that the
     assumption must be wrong, its radius is the answer.
     """
-    steps, known, sigmas = _stepped(rows, weighing, spheres, covs, residuals)
-    radius, radii = spheres[:, 3], spheres[:, 3] + steps[:, 3]
-    is_asked = np.abs(steps[:, 3]) > _ASKED * sigmas
-    if is_asked.any():
-        limit = _STEP_MAX * radius[:, None]
-        start = spheres + np.clip(steps, -limit, limit)
-        found, known = _free(rows, weighing, start, known, is_asked)
-        is_in = (weighing.weights > 0.0) & np.repeat(is_asked, np.diff(rows.firsts))
-        better = weighing.ranges - linearise(rows, found, covs, is_in).ranges
-        gains = _misfits(rows, weighing, residuals) - _misfits(rows, weighing, better)
-        is_far = is_asked & (gains > _BETTER)
-        radii = np.where(is_far, found[:, 3], radii)
-        sigmas = np.where(is_far, np.sqrt(known[:, 3, 3]), sigmas)
-    return _known(radii, sigmas, radius)
+    radii, sigmas = np.empty(len(spheres)), np.empty(len(spheres))
+
+    def part(first: int, end: int) -> None:
+        _shown(rows, weighing, spheres, covs, residuals, (radii, sigmas, first, end))
+
+    side_by_side(part, len(spheres), worth=_N_WORTH)
+    return radii, sigmas
 
 
-def _known(radii: Array, sigmas: Array, radius: Array) -> tuple[Array, Array]:
-    """Return radii with sigmas, NaN where these say that nothing is known."""
-    is_known = (sigmas < _SIGMA_MAX * radius) & (radii < _RADIUS_MAX * radius) & (radii > 0.0)
-    return np.where(is_known, radii, np.nan), np.where(is_known, sigmas, np.nan)
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _shown(
+    rows: Rows,
+    weighing: Weighing,
+    spheres: Array,
+    covs: Array,
+    residuals: Array,
+    out: tuple[Array, Array, int, int],
+) -> None:
+    """Fill in radii and sigmas from one place among spheres to another."""
+    radii, sigmas, first, end = out
+    for m in range(first, end):
+        own = slice(rows.firsts[m], rows.firsts[m + 1])
+        told = Weighing(weighing.ranges[own], weighing.variances[own], weighing.weights[own])
+        radius, sigma = _shown_by_one(
+            rows_of_one(rows, m), told, spheres[m], covs[m], residuals[own]
+        )
+        radii[m], sigmas[m] = _known(radius, sigma, spheres[m, 3])
 
 
-def _with_radius(covs: Array, variances: Array | float) -> Array:
-    """Return covariances of centres as such of spheres, with a variance of the radius."""
-    wide = np.zeros((len(covs), 4, 4))
-    wide[:, :3, :3] = covs[:, :3, :3]
-    wide[:, 3, 3] = variances
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _shown_by_one(
+    rows: Rows, weighing: Weighing, sphere: Array, cov: Array, residuals: Array
+) -> tuple[float, float]:
+    """Return radius and sigma of one sphere."""
+    step, known, sigma = _stepped(rows, weighing, sphere, cov, residuals)
+    radius = sphere[3] + step[3]
+    if abs(step[3]) > _ASKED * sigma:
+        limit = _STEP_MAX * sphere[3]
+        found, known = _free(rows, weighing, sphere + np.clip(step, -limit, limit), known)
+        linear = linearise(rows, found.reshape(1, 4), cov.reshape(1, 4, 4), weighing.weights > 0.0)
+        better = weighing.ranges - linear.ranges
+        if _misfit(weighing, residuals) - _misfit(weighing, better) > _BETTER:
+            radius, sigma = found[3], np.sqrt(known[3, 3])
+    return radius, sigma
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _known(radius: float, sigma: float, assumed: float) -> tuple[float, float]:
+    """Return a radius with its sigma, NaN where these say that nothing is known."""
+    if sigma < _SIGMA_MAX * assumed and 0.0 < radius < _RADIUS_MAX * assumed:
+        return radius, sigma
+    return np.nan, np.nan
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _with_radius(cov: Array, variance: float) -> Array:
+    """Return the covariance of a centre as such of a sphere, with a variance of the radius."""
+    wide = np.zeros((4, 4))
+    wide[:3, :3] = cov[:3, :3]
+    wide[3, 3] = variance
     return wide
 
 
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def _stepped(
-    rows: Rows, weighing: Weighing, spheres: Array, covs: Array, residuals: Array
-) -> tuple[Array, Array, Array]:
-    """Return a step of centres and radii, (m, 4), what is known of these, and sigmas of radii."""
-    is_in, square = weighing.weights > 0.0, spheres[:, 3, None, None] ** -2.0 * np.eye(4)
-
-    def summed(wide: Array) -> tuple[Linear, Array, Array, Array]:
-        linear = linearise(rows, spheres, wide, is_in)
-        per_square = weighing.weights / (weighing.variances + linear.bends**2)
-        return linear, per_square, *normals_of_spheres(rows, linear, residuals, per_square, 4)
-
-    rough = _with_radius(covs, np.trace(covs[:, :3, :3], axis1=1, axis2=2))
-    cov: Array = np.asarray(np.linalg.inv(summed(rough)[2] + square / _PRIOR**2))
-    linear, per_square, N, pull = summed(cov)
-    by_pull = np.linalg.inv(N + square / _WEAK_PRIOR**2)
+    rows: Rows, weighing: Weighing, sphere: Array, cov: Array, residuals: Array
+) -> tuple[Array, Array, float]:
+    """Return a step of centre and radius, (4,), what is known of these, and sigma of the radius."""
+    weak = np.eye(4) / (_WEAK_PRIOR * sphere[3]) ** 2
+    known = _with_radius(cov, cov[0, 0] + cov[1, 1] + cov[2, 2])
+    N, _, _, _ = _summed(rows, weighing, sphere, known, residuals)
+    known = inverse(N + np.eye(4) / (_PRIOR * sphere[3]) ** 2)
+    N, pull, linear, per_square = _summed(rows, weighing, sphere, known, residuals)
+    by_pull = inverse(N + weak)
     of_noise = per_square**2 * weighing.variances
-    spread = by_pull @ normals_of_spheres(rows, linear, residuals, of_noise, 4)[0] @ by_pull
-    return (by_pull @ pull[..., None])[..., 0], cov, np.sqrt(spread[:, 3, 3])
+    spread = normals_of_spheres(rows, linear, residuals, of_noise, 4)[0][0]
+    variance = np.sum(by_pull[3] * np.sum(spread * by_pull[3], axis=1))
+    return np.sum(by_pull * pull, axis=1), known, np.sqrt(variance)
 
 
-def _misfits(rows: Rows, weighing: Weighing, residuals: Array) -> Array:
-    """Return the sums of squared residuals in units of the noise, strays counting as such."""
-    square = residuals**2 / weighing.variances
-    sums = np.cumsum(np.r_[0.0, weighing.weights * np.minimum(square, _CLIP)])
-    return np.asarray(np.diff(sums[rows.firsts]))
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _summed(
+    rows: Rows, weighing: Weighing, sphere: Array, cov: Array, residuals: Array
+) -> tuple[Array, Array, Linear, Array]:
+    """Return normal equations of a sphere whose radius is free, and what they are summed from."""
+    is_in = weighing.weights > 0.0
+    linear = linearise(rows, sphere.reshape(1, 4), cov.reshape(1, 4, 4), is_in)
+    per_square = weighing.weights / (weighing.variances + linear.bends**2)
+    N, pull = normals_of_spheres(rows, linear, residuals, per_square, 4)
+    return N[0], pull[0], linear, per_square
 
 
-def _free(
-    rows: Rows, weighing: Weighing, spheres: Array, covs: Array, moves: Mask
-) -> tuple[Array, Array]:
-    """Return centres with radii, (m, 4), and their covariances; some move until they settle."""
-    radius, counts, moves = spheres[:, 3], np.diff(rows.firsts), moves.copy()
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _misfit(weighing: Weighing, residuals: Array) -> float:
+    """Return the sum of squared residuals in units of the noise, strays counting as such."""
+    total = 0.0
+    for i in range(len(residuals)):
+        square = residuals[i] ** 2 / weighing.variances[i]
+        total += weighing.weights[i] * min(square, _CLIP)
+    return total
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _free(rows: Rows, weighing: Weighing, sphere: Array, cov: Array) -> tuple[Array, Array]:
+    """Return the centre with radius, (4,), where steps settle, and the covariance of these."""
+    prior, limit = np.eye(4) / (_PRIOR * sphere[3]) ** 2, _STEP_MAX * sphere[3]
+    is_in = weighing.weights > 0.0
     for _ in range(_N_STEPS):
-        is_in = (weighing.weights > 0.0) & np.repeat(moves, counts)
-        linear = linearise(rows, spheres, covs, is_in)
-        per_square = is_in * weighing.weights / (weighing.variances + linear.bends**2)
-        residuals = weighing.ranges - linear.ranges
-        N, pull = normals_of_spheres(rows, linear, residuals, per_square, 4)
-        inverse = np.linalg.inv(N + np.eye(4) / (_PRIOR * radius[:, None, None]) ** 2)
-        covs = np.where(moves[:, None, None], inverse, covs)
-        limit = _STEP_MAX * radius[:, None]
-        step = np.clip(np.einsum("mij,mj->mi", inverse, pull), -limit, limit)
-        spheres = np.where(moves[:, None], spheres + step, spheres)
-        moves &= np.abs(step).max(axis=1) >= _SETTLED
-        if not moves.any():
+        linear = linearise(rows, sphere.reshape(1, 4), cov.reshape(1, 4, 4), is_in)
+        per_square = weighing.weights / (weighing.variances + linear.bends**2)
+        N, pull = normals_of_spheres(rows, linear, weighing.ranges - linear.ranges, per_square, 4)
+        cov = inverse(N[0] + prior)
+        step = np.clip(np.sum(cov * pull[0], axis=1), -limit, limit)
+        sphere = sphere + step
+        if np.abs(step).max() < _SETTLED:
             break
-    return spheres, covs
+    return sphere, cov
 
 
 def own_radius(shots: Beams, radius: float, up: Array) -> tuple[float, float]:
@@ -194,32 +237,32 @@ def own_radius(shots: Beams, radius: float, up: Array) -> tuple[float, float]:
     rows = rows_of(shots, np.array([0, n]), up, nothing, (nothing, np.ones(n), 0.0))
     spanned = _spanned(shots)
     weighing, residuals, sphere, cov = _fitted(rows, spanned, radius)
-    steps, _, sigmas = _stepped(rows, weighing, sphere, cov, residuals)
-    radii = radius + steps[:, 3]
-    if np.abs(steps[0, 3]) > _ASKED * sigmas[0]:
+    step, _, sigma = _stepped(rows, weighing, sphere, cov, residuals)
+    radius_free = radius + step[3]
+    if abs(step[3]) > _ASKED * sigma:
         own, known, gain = _own_spanned(rows, spanned, sphere)
         if gain > _BETTER_OWN:
-            radii, sigmas = own[:, 3], np.sqrt(known[:, 3, 3])
-    radii, sigmas = _known(radii, sigmas, np.array([radius]))
-    return float(radii[0]), float(sigmas[0])
+            radius_free, sigma = own[3], np.sqrt(known[3, 3])
+    found: tuple[float, float] = _known(radius_free, sigma, radius)
+    return found
 
 
 def _fitted(rows: Rows, spanned: Array, radius: float) -> tuple[Weighing, Array, Array, Array]:
     """Return weights, residuals, the best sphere of a known radius, and its covariance."""
     axis = rows.directions.mean(axis=1)
-    shift = 2.0 / 3.0 * (radius - spanned[0, 3]) / float(np.linalg.norm(axis))
-    sphere = np.array([[*(spanned[0, :3] + shift * axis), radius]])
-    cov = _with_radius((_START * radius) ** 2 * np.eye(3)[None], 0.0)
+    shift = 2.0 / 3.0 * (radius - spanned[3]) / float(np.linalg.norm(axis))
+    sphere = np.array([*(spanned[:3] + shift * axis), radius])
+    cov = _with_radius((_START * radius) ** 2 * np.eye(3), 0.0)
     for _ in range(_N_STEPS):
-        linear = linearise(rows, sphere, cov)
+        linear = linearise(rows, sphere[None], cov[None])
         weighing, residuals = _gated(rows, linear, radius)
         per_square = weighing.weights / (weighing.variances + linear.bends**2)
         N, pull = normals_of_spheres(rows, linear, residuals, per_square, 3)
-        inverse: Array = np.asarray(np.linalg.inv(N + np.eye(3) / (_PRIOR * radius) ** 2))
+        known = inverse(N[0] + np.eye(3) / (_PRIOR * radius) ** 2)
         limit = _STEP_MAX * radius
-        sphere[0, :3] += np.clip(inverse[0] @ pull[0], -limit, limit)
-        cov = _with_radius(inverse, 0.0)
-    return *_gated(rows, linearise(rows, sphere, cov), radius), sphere, cov
+        sphere[:3] += np.clip(known @ pull[0], -limit, limit)
+        cov = _with_radius(known, 0.0)
+    return *_gated(rows, linearise(rows, sphere[None], cov[None]), radius), sphere, cov
 
 
 def _gated(rows: Rows, linear: Linear, radius: float) -> tuple[Weighing, Array]:
@@ -230,7 +273,7 @@ def _gated(rows: Rows, linear: Linear, radius: float) -> tuple[Weighing, Array]:
     is_in &= np.abs(residuals) < _STRAY_SIGMAS * sigma
     variance = sigma**2 * is_in.sum() / max(is_in.sum() - 4.0, 1.0)
     variances, weights = np.full(len(is_in), variance), is_in.astype(np.float64)
-    return Weighing(rows.ranges, variances, weights), residuals
+    return Weighing(rows.ranges.copy(), variances, weights), residuals
 
 
 def _own_spanned(rows: Rows, own: Array, assumed: Array) -> tuple[Array, Array, float]:
@@ -239,14 +282,15 @@ def _own_spanned(rows: Rows, own: Array, assumed: Array) -> tuple[Array, Array, 
     And by how much it explains them better than one of the assumed radius, as a chi-square: the
     noise is not known.
     """
-    known, moves = (_START * own[0, 3]) ** 2 * np.eye(4)[None], np.ones(1, dtype=bool)
+    known = (_START * own[3]) ** 2 * np.eye(4)
     for _ in range(_N_ROUNDS):
-        weighing = _gated(rows, linearise(rows, own, known), float(own[0, 3]))[0]
-        own, known = _free(rows, weighing, own, known, moves)
-        own[0, 3] = np.clip(own[0, 3], _SPAN_MIN, 2.0 * _RADIUS_MAX * assumed[0, 3])
-    linear = linearise(rows, own, known)
-    weighing, residuals = _gated(rows, linear, float(own[0, 3]))
-    others = rows.ranges - linearise(rows, assumed, _with_radius(known, 0.0)).ranges
+        weighing = _gated(rows, linearise(rows, own[None], known[None]), float(own[3]))[0]
+        own, known = _free(rows, weighing, own, known)
+        own[3] = np.clip(own[3], _SPAN_MIN, 2.0 * _RADIUS_MAX * assumed[3])
+    linear = linearise(rows, own[None], known[None])
+    weighing, residuals = _gated(rows, linear, float(own[3]))
+    same = linearise(rows, assumed[None], _with_radius(known, 0.0)[None])
+    others = rows.ranges - same.ranges
     is_in, limit = weighing.weights > 0.0, _STRAY_SIGMAS**2 * weighing.variances
     least = max(int(is_in.sum()), 1) * _SCATTER_MIN**2
     worse, better = (
@@ -256,7 +300,7 @@ def _own_spanned(rows: Rows, own: Array, assumed: Array) -> tuple[Array, Array, 
 
 
 def _spanned(shots: Beams) -> Array:
-    """Return the centre and radius, (1, 4), of a sphere that spans returns across the beam."""
+    """Return the centre and radius, (4,), of a sphere that spans returns across the beam."""
     axis = shots.directions_base.mean(axis=0)
     axis /= np.linalg.norm(axis)
     p = shots.origins_base + shots.ranges[:, None] * shots.directions_base
@@ -265,7 +309,7 @@ def _spanned(shots: Beams) -> Array:
     beside = np.linalg.norm(v - (v @ axis)[:, None] * axis, axis=1)
     radius = max(_OUTERMOST * float(np.quantile(beside, 0.9)), _SPAN_MIN)
     # seen evenly, the half of a sphere is two thirds of its radius deep
-    return np.array([[*(middle + 2.0 / 3.0 * radius * axis), radius]])
+    return np.array([*(middle + 2.0 / 3.0 * radius * axis), radius])
 
 
 def _scatter(residuals: Array) -> float:

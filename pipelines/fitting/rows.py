@@ -132,6 +132,40 @@ def _derived(
     return seconds, half_widths, ups, blurs
 
 
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def rows_of_one(rows: Rows, m: int) -> Rows:
+    """Return the returns of one marker.
+
+    Parameters
+    ----------
+    rows : Rows
+        Those of all.
+    m : int
+        Its place.
+
+    Returns
+    -------
+    Rows
+        The same columns, shorter.
+    """
+    first, behind = rows.firsts[m], rows.firsts[m + 1]
+    return Rows(
+        np.array([0, behind - first]),
+        rows.origins[:, first:behind].copy(),
+        rows.directions[:, first:behind].copy(),
+        rows.firsts_axis[:, first:behind].copy(),
+        rows.seconds_axis[:, first:behind].copy(),
+        rows.ranges[first:behind],
+        rows.half_widths[:, first:behind].copy(),
+        rows.up[:, first:behind].copy(),
+        rows.blurs[:, first:behind].copy(),
+        rows.lasers[first:behind],
+        rows.classes[first:behind],
+        rows.sigmas[first:behind],
+        rows.lateral[first:behind],
+    )
+
+
 def moved_faces(rows: Rows, moves: Array) -> Rows:
     """Return returns with what is swept upwards moved, and the other face against it.
 
