@@ -475,7 +475,7 @@ def _meet(chosen, marks, measured, weights, p, cov, last):  # type: ignore[no-un
 @numba.njit(cache=True, nogil=True, error_model="numpy", inline="always")
 def _add_distances(mark, p, measured, weight, N, bend, gradient):  # type: ignore[no-untyped-def]  # noqa: ANN001, ANN202, PLR0913
     """Add what was measured to one mark to normal matrix, second derivative and gradient."""
-    is_flat = len(measured) == 2
+    is_flat = len(measured) == 2  # inline: a call would count references of seven arrays
     v = mark[0] - p[0], mark[1] - p[1], 0.0 if is_flat else mark[2] - p[2]
     distance = np.sqrt(v[0] ** 2 + v[1] ** 2 + v[2] ** 2)
     u = v[0] / distance, v[1] / distance, v[2] / distance

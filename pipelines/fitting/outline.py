@@ -270,7 +270,7 @@ def _chance(z: float) -> float:
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
 def _pair(columns: Array, i: int) -> _Pair:
-    """Return both numbers of a return."""
+    """Return both numbers of a return: a call with whole arrays would count their references."""
     return columns[0, i], columns[1, i]
 
 
