@@ -27,6 +27,8 @@ from pipelines.extraction.rivals import rivals
 from pipelines.extraction.seeds import find_seeds
 from pipelines.extraction.sights import Sight, sights
 from pipelines.extraction.verdicts import (
+    Peers,
+    among_peers,
     distinct,
     is_resolved,
     peers_among,
@@ -108,31 +110,41 @@ def _judged(
     left = [look for look, reason in zip(looks, verdicts, strict=True) if not reason]
     centres = np.array([look.p_base for look in left]).reshape(-1, 3)
     seen = sights(cloud, cells.directions, centres, ball)
-    later = _sighted(left, seen, ball)
-    found = [
-        (look, sight) for look, sight, reason in zip(left, seen, later, strict=True) if not reason
-    ]
+    found, later = _sighted(left, seen, config, ball)
     in_turn = iter(later)
     reasons = [reason or next(in_turn) for reason in verdicts]
     return found, [(look, reason) for look, reason in zip(looks, reasons, strict=True) if reason]
 
 
-def _sighted(looks: list[Look], seen: list[Sight], ball: Ball) -> list[str]:
-    """Return the verdicts on groups by what is seen of them, of other shapes and of each other."""
-    reasons = [verdict_on_sight(look, sight, ball) for look, sight in zip(looks, seen, strict=True)]
-    peers = peers_among(
-        [
-            (look, sight)
-            for look, sight, reason in zip(looks, seen, reasons, strict=True)
-            if not reason
-        ]
-    )
-    return [
-        reason
+def _sighted(
+    looks: list[Look], seen: list[Sight], config: ExtractionConfig, ball: Ball
+) -> tuple[list[tuple[Look, Sight]], list[str]]:
+    """Return what may be a marker by all that is seen, and the verdicts on all.
+
+    First each by what is seen of it alone; then by other shapes and by those that are left, among
+    which none is seen more closely than the others.
+    """
+    groups = list(zip(looks, seen, strict=True))
+    reasons = [verdict_on_sight(look, sight, ball) for look, sight in groups]
+    peers = peers_among([one for one, reason in zip(groups, reasons, strict=True) if not reason])
+    groups = [(among_peers(look, peers), sight) for look, sight in groups]
+    reasons = [
+        reason or _verdict_again(look, sight, peers, config, ball)
+        for (look, sight), reason in zip(groups, reasons, strict=True)
+    ]
+    return [one for one, reason in zip(groups, reasons, strict=True) if not reason], reasons
+
+
+def _verdict_again(
+    look: Look, sight: Sight, peers: Peers, config: ExtractionConfig, ball: Ball
+) -> str:
+    """Return why a group that passed alone is refused among the others of the scan."""
+    return (
+        verdict(look, config, ball)
+        or verdict_on_sight(look, sight, ball)
         or _rivalled(look, sight, ball, peers.noise)
         or verdict_among_peers(look, sight, peers)
-        for look, sight, reason in zip(looks, seen, reasons, strict=True)
-    ]
+    )
 
 
 def _rivalled(look: Look, sight: Sight, ball: Ball, noise: float) -> str:

@@ -22,6 +22,9 @@ _SIGMAS = 3.5  # standard deviations at which a shape is refused
 _RADIUS_FAR = 0.6  # of the radius: beams that are wide and few never err by as much
 _RADIUS_SLACK = 0.12  # of the radius: less is no reason to refuse, the fit judges it
 _N_SHAPELY = 12  # returns that show the width of what they lie on
+_WIDTH_MIN = 0.5  # radii: what is less wide is none
+_WIDTH_SHOWN = 0.7  # radii: the same where enough returns show its whole width
+_SCREENED = 0.5  # as many returns before a ball as on it: a third of it is hidden
 _HEIGHT_MIN = 0.4  # radii: one line of a scan shows no ball
 _FLAT_UNKNOWN = 1.5  # of the curvature: known no better, it may be a ball, a plane or a hollow
 _SPREAD_SIGMAS = 4.0  # standard deviations of a spread: centres are estimated, lines not random
@@ -39,8 +42,9 @@ _N_TELLING = 30  # returns that show the noise of a scan
 _SIGMAS_UNLIKE = 3.0  # standard deviations at which a shape is refused where the noise is known
 _FLAT_UNLIKE = 0.25  # of the curvature: what may be missing where the noise is known from others
 _WIDE = 0.2  # half widths of a beam: what taking it for a ray adds to the noise
-_BETTER = 1.5  # logarithm of the likelihood ratio from which another shape is believed
-_HIDDEN = 3.0  # as many returns before a ball as on it: three quarters of it are hidden
+_BETTER_POST = 1.5  # logarithm of the likelihood ratio from which a post is believed
+_BETTER_SMALL = 3.0  # the same of a smaller ball: these are rarer than markers
+_HIDDEN = 2.0  # as many returns before a ball as on it: two thirds of it are hidden
 
 
 def distinct(looks: list[Look], config: ExtractionConfig, radius: float) -> list[Look]:
@@ -132,7 +136,6 @@ def _not_free(look: Look, ball: Ball) -> str:
 def _not_round(look: Look, config: ExtractionConfig, ball: Ball) -> str:
     """Return why the shape of a group is not that of the ball."""
     radius = ball.radius
-    width_min = (0.7 if look.n_points >= _N_SHAPELY else 0.5) * radius
     off = look.radius_free - radius
     tests = (
         (
@@ -141,9 +144,8 @@ def _not_round(look: Look, config: ExtractionConfig, ball: Ball) -> str:
             f"radius; at most {1e3 * config.scatter_max:.0f} mm are taken for noise.",
         ),
         (
-            look.width < width_min,
-            f"It is {1e3 * look.width:.0f} mm wide, too slim for a sphere of diameter "
-            f"{2e3 * radius:.0f} mm: a pole.",
+            look.width < _WIDTH_MIN * radius,
+            _slim(look, ball),
         ),
         (
             look.height < _HEIGHT_MIN * radius,
@@ -178,6 +180,14 @@ def _radius_slack(look: Look, ball: Ball) -> float:
     return max(_SIGMAS * look.sigma_radius, _RADIUS_SLACK * ball.radius + look.blur)
 
 
+def _slim(look: Look, ball: Ball) -> str:
+    """Return that a group is not wide enough."""
+    return (
+        f"It is {1e3 * look.width:.0f} mm wide, too slim for a sphere of diameter "
+        f"{2e3 * ball.radius:.0f} mm: a pole."
+    )
+
+
 def verdict_on_sight(look: Look, sight: Sight, ball: Ball) -> str:
     """Return why the beams about a group say that it is no free ball on a pole.
 
@@ -200,6 +210,7 @@ def verdict_on_sight(look: Look, sight: Sight, ball: Ball) -> str:
         _SPREAD_SIGMAS / float(np.sqrt(12.0 * max(sight.n_on, 1))), _SPREAD_SLACK
     )
     few = np.inf if is_resolved(look, ball) else 1.0 + _TOUCHING * _n_comparable(sight)
+    shows_width = look.n_points >= _N_SHAPELY and sight.n_before < _SCREENED * sight.n_on
     seems_like = ball.radius * float(np.sqrt(sight.spread / expected))
     n_below = sight.n_held + sight.n_past + sight.n_short
     tests = (
@@ -213,6 +224,7 @@ def verdict_on_sight(look: Look, sight: Sight, ball: Ball) -> str:
             f"Most of it is hidden: {sight.n_before} returns inside its outline lie before it, "
             f"where {sight.n_on} lie on it.",
         ),
+        (shows_width and look.width < _WIDTH_SHOWN * ball.radius, _slim(look, ball)),
         (
             sight.spread < spread_min,
             f"It is too small: its returns lie within {1e3 * seems_like:.0f} mm of its middle, not "
@@ -247,12 +259,12 @@ def verdict_on_rivals(rivals: Rivals) -> str:
     """
     tests = (
         (
-            rivals.post > _BETTER,
+            rivals.post > _BETTER_POST,
             f"It goes on below as it is: a post, {2e3 * rivals.half_width_post:.0f} mm wide, "
             f"explains its returns exp({rivals.post:.1f}) times better than a sphere.",
         ),
         (
-            rivals.small > _BETTER,
+            rivals.small > _BETTER_SMALL,
             f"It is too small: a ball of radius {1e3 * rivals.radius_small:.0f} mm explains its "
             f"returns exp({rivals.small:.1f}) times better.",
         ),
@@ -263,12 +275,11 @@ def verdict_on_rivals(rivals: Rivals) -> str:
 def _n_comparable(sight: Sight) -> float:
     """Return how many returns on a ball those below it are to be compared with.
 
-    Where something nearer hides more of the ball than of what is below it, as many as the ball
-    would have if as much of it were seen as of that.
+    As many as the ball would have if as much of it were seen as of what is below it: something
+    nearer may hide more of the one or of the other.
     """
     n_seen = sight.n_held + sight.n_past
-    share_below = n_seen / max(n_seen + sight.n_short, 1)
-    return max(share_below * sight.n_aimed, float(sight.n_on))
+    return sight.n_aimed * n_seen / max(n_seen + sight.n_short, 1)
 
 
 class Peers(NamedTuple):
@@ -278,11 +289,14 @@ class Peers(NamedTuple):
     ----------
     noise : float
         Standard deviation of ranges, as the surer groups show it [m].
+    scatter_free : float
+        What is left of it about balls of free radius [m].
     brightness, scatter : float
         Reflectivity, 0-255, and scatter [m] of those that are open below.
     """
 
     noise: float
+    scatter_free: float
     brightness: float
     scatter: float
 
@@ -300,10 +314,11 @@ def peers_among(groups: Sequence[tuple[Look, Sight]]) -> Peers:
     Peers
         Noise and paint.
     """
-    noises = [max(look.scatter, NOISE_MIN) for look, _ in groups if look.n_points >= _N_TELLING]
+    telling = [look for look, _ in groups if look.n_points >= _N_TELLING]
     known = [(look, sight) for look, sight in groups if sight.shows_below]
     return Peers(
-        _shared(noises),
+        _shared([max(look.scatter, NOISE_MIN) for look in telling]),
+        _shared([look.scatter_free for look in telling]),
         _shared([sight.brightness for _, sight in known]),
         _shared([max(look.scatter, NOISE_MIN) for look, _ in known]),
     )
@@ -312,6 +327,26 @@ def peers_among(groups: Sequence[tuple[Look, Sight]]) -> Peers:
 def _shared(values: Sequence[float]) -> float:
     """Return the median of what some groups show; NaN if they are too few to tell."""
     return median(values) if len(values) >= _N_KNOWN else float("nan")
+
+
+def among_peers(look: Look, peers: Peers) -> Look:
+    """Return a group that scatters no less than the others of the scan: less would be chance.
+
+    Parameters
+    ----------
+    look : Look
+        What the group looks like.
+    peers : Peers
+        What the groups share.
+
+    Returns
+    -------
+    Look
+        The same in all else.
+    """
+    if look.scatter_free < peers.scatter_free:
+        return look._replace(scatter_free=peers.scatter_free)
+    return look
 
 
 def verdict_among_peers(look: Look, sight: Sight, peers: Peers) -> str:
