@@ -43,7 +43,7 @@ _SIGMAS_UNLIKE = 3.0  # standard deviations at which a shape is refused where th
 _FLAT_UNLIKE = 0.25  # of the curvature: what may be missing where the noise is known from others
 _WIDE = 0.2  # half widths of a beam: what taking it for a ray adds to the noise
 _BETTER_POST = 1.5  # logarithm of the likelihood ratio from which a post is believed
-_BETTER_SMALL = 3.0  # the same of a smaller ball: these are rarer than markers
+_BETTER_SMALL = 4.0  # the same of a smaller ball: these are much rarer than markers
 _HIDDEN = 2.0  # as many returns before a ball as on it: two thirds of it are hidden
 
 
