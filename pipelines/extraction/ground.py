@@ -20,6 +20,7 @@ _STUDY_FIELD = 10.0  # [m] from the station: where the study looks for its highe
 _GROUND_WINDOW = 4  # cells each way of the opening: rocks up to twice this are not ground
 _GROUND_STEP = 0.10  # [m] that a cell's lowest point may lie above the opened surface
 _GROUND_CELLS_MIN = 9  # a marker seen alone covers at most 6 cells: that is not yet ground
+_N_WORTH = 100  # rows of the grid from which on a thread gains more than it takes to start
 _GROUND_RISE = 0.15  # [m] that ground may rise above its cell of the opened grid: tops of mounds
 
 
@@ -55,21 +56,26 @@ def ground_of(cloud: StitchedCloud, cells: Cells, config: ExtractionConfig) -> G
     Ground
         What rises above it.
     """
-    ground = _ground(cells.lowest, _GROUND_WINDOW)
     v_up, clearance = cells.R_station_base[2], config.ground_clearance
-    is_mixed, field_highest = _mixed(cells, ground, min(clearance, _GROUND_RISE))
+    rise_max, n_side = min(clearance, _GROUND_RISE), cells.layout.n_side
+    maps = side_by_side(
+        lambda first, end: _mapped(cells, rise_max, first, end), n_side, worth=_N_WORTH
+    )
+    ground = np.concatenate([ground for ground, _, _ in maps], axis=None)
+    is_mixed = np.concatenate([*(is_mixed for _, is_mixed, _ in maps), [False]], axis=None)
     parts = side_by_side(
         lambda first, end: _above(
             cloud.p_base,
             v_up,
             *rows_in(cells.ground, is_mixed, first, end),
-            ground.ravel(),
+            ground,
             clearance,
         ),
         len(cloud.p_base),
     )
     points = np.concatenate([points for points, _ in parts])
-    return Ground(points, max(field_highest, *(highest for _, highest in parts)))
+    highest = max(part[-1] for part in (*maps, *parts))
+    return Ground(points, highest)
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
@@ -154,19 +160,35 @@ def _ground(lowest: Column, window: int) -> Column:
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def _mixed(cells: Cells, ground: Column, rise_max: float) -> tuple[Mask, float]:
+def _mapped(cells: Cells, rise_max: float, first: int, end: int) -> tuple[Column, Mask, float]:
+    """Return ground and mixed cells of some rows of the grid, and the highest of the other cells.
+
+    The ground of a cell hangs on what is seen up to three windows away, as it is asked three times
+    what lies about a cell: about what is low, about the opened surface, and about the eroded one.
+    """
+    margin = 3 * _GROUND_WINDOW
+    low = max(first - margin, 0)
+    ground = _ground(cells.lowest[low : end + margin], _GROUND_WINDOW)[first - low : end - low]
+    is_mixed, field_highest = _mixed(cells, ground, rise_max, first)
+    return ground, is_mixed, field_highest
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _mixed(cells: Cells, ground: Column, rise_max: float, first: int) -> tuple[Mask, float]:
     """Tell the cells whose points must be looked at one by one; return the highest of the others.
 
     The others hold nothing but ground and lie on one side of the edge of the study's field, the
     highest counts where that is inside: an edge about the gimbal's axis, not about the plumb line,
-    which leave at most the sine of the lean between them. What is beyond the grid comes last.
+    which leave at most the sine of the lean between them. Asked of the rows that ground is given
+    of, from the first one on.
     """
     n, edge, _ = cells.layout
     lean = np.hypot(cells.R_station_base[2, 0], cells.R_station_base[2, 1])
-    is_mixed, field_highest = np.zeros(n * n + 1, np.bool_), -np.inf
-    for i in range(n):
+    is_mixed, field_highest = np.zeros(ground.shape, np.bool_), -np.inf
+    for k in range(len(ground)):
+        i = first + k
         for j in range(n):
-            low, high, base = cells.lowest[i, j], cells.highest[i, j], ground[i, j]
+            low, high, base = cells.lowest[i, j], cells.highest[i, j], ground[k, j]
             if low == np.inf:
                 continue
             x, y = i + 0.5 - 0.5 * n, j + 0.5 - 0.5 * n
@@ -174,7 +196,7 @@ def _mixed(cells: Cells, ground: Column, rise_max: float) -> tuple[Mask, float]:
             slack = edge + lean * (max(abs(low), abs(high)) + away + 1.0)
             is_known = high - base <= rise_max - 1e-4 and base < np.inf
             if not is_known or abs(away - _STUDY_FIELD) <= slack:
-                is_mixed[i * n + j] = True
+                is_mixed[k, j] = True
             elif away + slack < _STUDY_FIELD:
                 field_highest = max(field_highest, float(high))
     return is_mixed, field_highest
