@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from math import hypot, sqrt
+from math import hypot, inf, sqrt
 from statistics import median
 from typing import NamedTuple
 
@@ -70,11 +70,6 @@ def distinct(looks: list[Look], config: ExtractionConfig, radius: float) -> list
     return [worthy[int(i)] for i in thinned(places, 1.5 * radius)[:, 3]]
 
 
-def _first(tests: Sequence[tuple[bool, str]]) -> str:
-    """Return the reason of the first test that refuses; empty if none does."""
-    return next((reason for refuses, reason in tests if refuses), "")
-
-
 def _evidence(look: Look) -> float:
     """Return how much speaks for a ball: many returns that lie close to it."""
     return look.n_points / max(look.scatter, NOISE_MIN)
@@ -107,72 +102,67 @@ def verdict(look: Look, config: ExtractionConfig, ball: Ball) -> str:
     str
         The reason as a sentence for people; empty if it may be such a ball.
     """
-    return _not_free(look, ball) or _not_round(look, config, ball)
+    return _not_free(look, ball) or _not_round(look, config, ball) or _not_curved(look)
 
 
 def _not_free(look: Look, ball: Ball) -> str:
     """Return why a group does not stand free, or is not one surface."""
-    few = np.inf if is_resolved(look, ball) else 1.0 + _TOUCHING * look.n_points
-    tests = (
-        (
-            look.n_beside > few,
+    few = inf if is_resolved(look, ball) else 1.0 + _TOUCHING * look.n_points
+    if look.n_beside > few:
+        return (
             f"It does not stand free: {look.n_beside} returns beside or above its outline lie "
-            f"as far away, where {look.n_points} lie on it.",
-        ),
-        (
-            look.n_below > few,
+            f"as far away, where {look.n_points} lie on it."
+        )
+    if look.n_below > few:
+        return (
             f"It does not stand on a pole: {look.n_below} returns below its outline and beside "
-            "a pole's place lie as far away, as under a rock or a head.",
-        ),
-        (
-            look.n_strange > _STRANGE * (look.n_points + look.n_strange),
+            "a pole's place lie as far away, as under a rock or a head."
+        )
+    if look.n_strange > _STRANGE * (look.n_points + look.n_strange):
+        return (
             f"It is not one surface: {look.n_strange} returns inside its outline are off the "
-            f"sphere that {look.n_points} lie on.",
-        ),
-    )
-    return _first(tests)
+            f"sphere that {look.n_points} lie on."
+        )
+    return ""
 
 
 def _not_round(look: Look, config: ExtractionConfig, ball: Ball) -> str:
     """Return why the shape of a group is not that of the ball."""
     radius = ball.radius
     off = look.radius_free - radius
-    tests = (
-        (
-            look.scatter > config.scatter_max,
+    if look.scatter > config.scatter_max:
+        return (
             f"Its returns scatter by {1e3 * look.scatter:.0f} mm about a sphere of the known "
-            f"radius; at most {1e3 * config.scatter_max:.0f} mm are taken for noise.",
-        ),
-        (
-            look.width < _WIDTH_MIN * radius,
-            _slim(look, ball),
-        ),
-        (
-            look.height < _HEIGHT_MIN * radius,
+            f"radius; at most {1e3 * config.scatter_max:.0f} mm are taken for noise."
+        )
+    if look.width < _WIDTH_MIN * radius:
+        return _slim(look, ball)
+    if look.height < _HEIGHT_MIN * radius:
+        return (
             f"Its returns lie on one line, {1e3 * look.height:.0f} mm high: nothing shows whether "
-            "it is round.",
-        ),
-        (
-            abs(off) > _radius_slack(look, ball)
-            and (look.gain_free > _SIGMAS**2 or abs(off) > _RADIUS_FAR * radius),
+            "it is round."
+        )
+    is_clear = look.gain_free > _SIGMAS**2 or abs(off) > _RADIUS_FAR * radius
+    if is_clear and abs(off) > _radius_slack(look, ball):
+        return (
             f"Its own radius is {1e3 * look.radius_free:.0f} mm (standard deviation "
-            f"{1e3 * look.sigma_radius:.0f} mm), not {1e3 * radius:.0f} mm.",
-        ),
-        (
-            min(look.sigma_across, look.sigma_along) > _FLAT_UNKNOWN,
+            f"{1e3 * look.sigma_radius:.0f} mm), not {1e3 * radius:.0f} mm."
+        )
+    return ""
+
+
+def _not_curved(look: Look) -> str:
+    """Return why a group is not curved both ways, or does not show it."""
+    if min(look.sigma_across, look.sigma_along) > _FLAT_UNKNOWN:
+        return (
             f"Its {look.n_points} returns do not show whether it is curved at all: they lie on a "
-            "line or two.",
-        ),
-        (
-            look.flat_along > max(_SIGMAS * look.sigma_along, 0.5),
-            "It is not curved from top to bottom: a post or a panel.",
-        ),
-        (
-            look.flat_across > max(_SIGMAS * look.sigma_across, 0.5),
-            "It is not curved from side to side: a panel or a rail.",
-        ),
-    )
-    return _first(tests)
+            "line or two."
+        )
+    if look.flat_along > max(_SIGMAS * look.sigma_along, 0.5):
+        return "It is not curved from top to bottom: a post or a panel."
+    if look.flat_across > max(_SIGMAS * look.sigma_across, 0.5):
+        return "It is not curved from side to side: a panel or a rail."
+    return ""
 
 
 def _radius_slack(look: Look, ball: Ball) -> float:
@@ -205,43 +195,50 @@ def verdict_on_sight(look: Look, sight: Sight, ball: Ball) -> str:
     str
         The reason as a sentence for people; empty if it may be such a ball.
     """
+    return _not_seen_as_ball(look, sight, ball) or _not_on_pole(look, sight, ball)
+
+
+def _not_seen_as_ball(look: Look, sight: Sight, ball: Ball) -> str:
+    """Return why the beams towards a group do not end as on a ball."""
     expected = spread_expected(look, ball)
-    spread_min = expected - max(
-        _SPREAD_SIGMAS / float(np.sqrt(12.0 * max(sight.n_on, 1))), _SPREAD_SLACK
-    )
-    few = np.inf if is_resolved(look, ball) else 1.0 + _TOUCHING * _n_comparable(sight)
+    slack = max(_SPREAD_SIGMAS / sqrt(12.0 * max(sight.n_on, 1)), _SPREAD_SLACK)
     shows_width = look.n_points >= _N_SHAPELY and sight.n_before < _SCREENED * sight.n_on
-    seems_like = ball.radius * float(np.sqrt(sight.spread / expected))
-    n_below = sight.n_held + sight.n_past + sight.n_short
-    tests = (
-        (
-            sight.n_through > 1.0 + _TOUCHING * min(sight.n_aimed, 2 * sight.n_on),
+    if sight.n_through > 1.0 + _TOUCHING * min(sight.n_aimed, 2 * sight.n_on):
+        return (
             f"It lets beams through: {sight.n_through} returns inside its outline lie behind it, "
-            f"where {sight.n_on} lie on it.",
-        ),
-        (
-            sight.n_before > 2.0 + _HIDDEN * sight.n_on,
+            f"where {sight.n_on} lie on it."
+        )
+    if sight.n_before > 2.0 + _HIDDEN * sight.n_on:
+        return (
             f"Most of it is hidden: {sight.n_before} returns inside its outline lie before it, "
-            f"where {sight.n_on} lie on it.",
-        ),
-        (shows_width and look.width < _WIDTH_SHOWN * ball.radius, _slim(look, ball)),
-        (
-            sight.spread < spread_min,
+            f"where {sight.n_on} lie on it."
+        )
+    if shows_width and look.width < _WIDTH_SHOWN * ball.radius:
+        return _slim(look, ball)
+    if sight.spread < expected - slack:
+        seems_like = ball.radius * sqrt(sight.spread / expected)
+        return (
             f"It is too small: its returns lie within {1e3 * seems_like:.0f} mm of its middle, not "
-            f"{1e3 * ball.radius:.0f} mm.",
-        ),
-        (
-            sight.n_held > max(few - 1.0, 1.0),
+            f"{1e3 * ball.radius:.0f} mm."
+        )
+    return ""
+
+
+def _not_on_pole(look: Look, sight: Sight, ball: Ball) -> str:
+    """Return why the beams below a group do not go past a pole."""
+    few = inf if is_resolved(look, ball) else 1.0 + _TOUCHING * _n_comparable(sight)
+    if sight.n_held > max(few - 1.0, 1.0):
+        return (
             f"It does not stand on a pole: {sight.n_held} returns below it and beside a pole's "
-            "place lie about as far away, as on shoulders, a larger stone or the ground.",
-        ),
-        (
-            not (sight.is_open_below or _may_be_hidden(look, ball) or np.isinf(few)),
+            "place lie about as far away, as on shoulders, a larger stone or the ground."
+        )
+    if not (sight.is_open_below or _may_be_hidden(look, ball) or few == inf):
+        n_below = sight.n_held + sight.n_past + sight.n_short
+        return (
             f"It rests on the ground: of {n_below} beams that pass below it beside a pole's "
-            f"place, {sight.n_held + sight.n_short} end at its distance or nearer.",
-        ),
-    )
-    return _first(tests)
+            f"place, {sight.n_held + sight.n_short} end at its distance or nearer."
+        )
+    return ""
 
 
 def verdict_on_rivals(rivals: Rivals) -> str:
@@ -257,19 +254,17 @@ def verdict_on_rivals(rivals: Rivals) -> str:
     str
         The reason as a sentence for people; empty if none does.
     """
-    tests = (
-        (
-            rivals.post > _BETTER_POST,
+    if rivals.post > _BETTER_POST:
+        return (
             f"It goes on below as it is: a post, {2e3 * rivals.half_width_post:.0f} mm wide, "
-            f"explains its returns exp({rivals.post:.1f}) times better than a sphere.",
-        ),
-        (
-            rivals.small > _BETTER_SMALL,
+            f"explains its returns exp({rivals.post:.1f}) times better than a sphere."
+        )
+    if rivals.small > _BETTER_SMALL:
+        return (
             f"It is too small: a ball of radius {1e3 * rivals.radius_small:.0f} mm explains its "
-            f"returns exp({rivals.small:.1f}) times better.",
-        ),
-    )
-    return _first(tests)
+            f"returns exp({rivals.small:.1f}) times better."
+        )
+    return ""
 
 
 def _n_comparable(sight: Sight) -> float:
@@ -403,19 +398,17 @@ def _unlike_in_paint(look: Look, sight: Sight, peers: Peers) -> str:
     if sight.shows_below:
         return ""
     unlike = max(_SIGMAS * _SHADE / sqrt(max(sight.n_distinct, 1)), _UNLIKE)
-    tests = (
-        (
-            abs(sight.brightness - peers.brightness) > unlike * peers.brightness,
+    if abs(sight.brightness - peers.brightness) > unlike * peers.brightness:
+        return (
             f"What it stands on is not seen, and its reflectivity is {sight.brightness:.0f}, that "
-            f"of the markers {peers.brightness:.0f}.",
-        ),
-        (
-            not sight.is_open_below and look.scatter > _NOISIER * peers.scatter,
+            f"of the markers {peers.brightness:.0f}."
+        )
+    if not sight.is_open_below and look.scatter > _NOISIER * peers.scatter:
+        return (
             f"What it stands on is hidden, and its returns scatter by "
-            f"{1e3 * look.scatter:.0f} mm, those of the markers by {1e3 * peers.scatter:.0f} mm.",
-        ),
-    )
-    return _first(tests)
+            f"{1e3 * look.scatter:.0f} mm, those of the markers by {1e3 * peers.scatter:.0f} mm."
+        )
+    return ""
 
 
 def spread_expected(look: Look, ball: Ball) -> float:
