@@ -147,13 +147,15 @@ def _turn(v_head: Array, angles: Array) -> Array:
     return np.stack([c * x - s * y, s * x + c * y, z], axis=1)
 
 
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def _robust_direction(ups: Array) -> tuple[Array, float]:
     """Return the mean unit vector without outliers, and the scatter of one per axis [rad]."""
-    distances = np.linalg.norm(ups - np.median(ups, axis=0), axis=1)
+    middle = np.array([np.median(column) for column in ups.T])
+    distances = np.sqrt(np.sum((ups - middle) ** 2, axis=1))
     inliers = ups[distances <= 3.0 * 1.4826 * np.median(distances) + 1e-12]
-    up = inliers.mean(axis=0)
-    scatter = float(np.sqrt(np.mean(np.sum((inliers - up) ** 2, axis=1)) / 2.0))
-    return up / np.linalg.norm(up), scatter
+    up = np.sum(inliers, axis=0) / len(inliers)
+    scatter = float(np.sqrt(np.sum((inliers - up) ** 2) / len(inliers) / 2.0))
+    return up / np.sqrt(np.sum(up**2)), scatter
 
 
 def stitch(log: ScanLog, rig: Rig, config: StitchingConfig) -> StitchedCloud:
