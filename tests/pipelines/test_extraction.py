@@ -8,6 +8,8 @@ from numpy.testing import assert_allclose
 
 from pipelines.config import ExtractionConfig
 from pipelines.extraction import extract
+from pipelines.extraction.cells import cells_of
+from pipelines.extraction.ground import ground_of
 from pipelines.geometry import levelling_rotation
 from pipelines.values import RING_UNKNOWN, Levelling
 from tests.pipelines.synthetic_stop import RADIUS, World, ring_of_markers, scan
@@ -156,3 +158,15 @@ def test_an_empty_cloud_has_no_markers(cloud):
     found = extract(empty, CONFIG, RADIUS)
     assert found.candidates == ()
     assert found.rejected == ()
+
+
+def test_the_ground_is_the_same_however_its_rows_are_shared_out(cloud, monkeypatch):
+    cells = cells_of(cloud, CONFIG)
+    rough = GROUND + np.random.default_rng(5).normal(0.0, 0.1, cells.lowest.shape)
+    lowest = np.where(cells.lowest < np.inf, rough, np.inf).astype(np.float32)
+    cells = cells._replace(lowest=lowest, highest=lowest)
+    shared = ground_of(cloud, cells, CONFIG)
+    monkeypatch.setattr("pipelines.extraction.ground._N_WORTH", cells.layout.n_side + 1)
+    whole = ground_of(cloud, cells, CONFIG)
+    np.testing.assert_array_equal(shared.points_above, whole.points_above)
+    assert shared.height_max == whole.height_max
