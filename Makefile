@@ -31,7 +31,7 @@ setup: .venv/.ready .venv/.kernels
 .venv/.kernels: .venv/.ready $(shell git ls-files 'pipelines/*.py' 'storage/*.py')
 	@echo "Compiling the numerical kernels, once ..."
 	@find pipelines storage -name '*.nb[ic]' -delete
-	@$(BIN)/python -m service.tasks
+	@$(BIN)/python -m spheremark.service.jobs.worker
 	@touch $@
 
 demo: setup
@@ -47,7 +47,6 @@ check: setup
 	$(BIN)/ruff check .
 	$(BIN)/mypy
 	$(BIN)/lint-imports
-	@$(BIN)/numpydoc lint $(shell git ls-files 'pipelines/*.py' 'storage/*.py')
 	@$(BIN)/codespell $(shell git ls-files '*.py' '*.md' '*.sql' '*.html' '*.toml')
 
 bench: setup

@@ -8,8 +8,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.optimize import linear_sum_assignment
 
-from pipelines.geometry import inverse, transform, wrap
-from pipelines.values import (
+from spheremark.pipelines.geometry import inverse, transform, wrap
+from spheremark.pipelines.model import (
     Array,
     Beams,
     ControlMarks,

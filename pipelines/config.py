@@ -14,7 +14,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Self, TypeVar, get_type_hints
 
-from pipelines.errors import ConfigError
+from spheremark.pipelines.errors import ConfigError
 
 FITTING_METHODS = (
     "along_beam",

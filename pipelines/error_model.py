@@ -12,8 +12,8 @@ from typing import Literal, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
-from pipelines.errors import TooFewObservationsError
-from pipelines.values import Array, Index, _same_length, _seal
+from spheremark.pipelines.errors import TooFewObservationsError
+from spheremark.pipelines.model import Array, Index, same_length, seal
 
 Statistic = Literal["p95", "mean"]
 """What must be within a tolerance: the 95th percentile of the error, or, as in the study, its mean.
@@ -58,8 +58,8 @@ class ErrorSample:
 
     def __post_init__(self) -> None:
         names = ("ranges", "n_points", "incidences", "errors_3d", "scans")
-        _seal(self, **dict.fromkeys(names, (None,)))
-        _same_length(self, *names)
+        seal(self, **dict.fromkeys(names, (None,)))
+        same_length(self, *names)
 
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
@@ -107,7 +107,7 @@ class ErrorModel:
 
     def __post_init__(self) -> None:
         k = len(self.terms)
-        _seal(self, exponents=(k,), sigma_exponents=(k,), reference=(3,))
+        seal(self, exponents=(k,), sigma_exponents=(k,), reference=(3,))
 
     def exponent(self, term: str) -> float:
         """Return the power of one of ``TERMS``; 0 for one that the model is without."""

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.spatial.transform import Rotation
 
-from pipelines.values import Array, Levelling
+from spheremark.pipelines.model import Array, Levelling
 
 _SMALL = 1e-9  # [rad]; below it the series of the exponential is exact in float64
 _LINE = 0.05  # spread across over spread along of points on a line; 3 deg seen from the end
@@ -198,16 +198,6 @@ def log_motion(T: Array) -> Array:
 
 def left_jacobian(phi: Array) -> Array:
     """Return the left Jacobian of a rotation vector.
-
-    Parameters
-    ----------
-    phi : (3,)
-        Rotation vector [rad].
-
-    Returns
-    -------
-    (3, 3)
-        ``V`` in ``Exp(phi, rho) = (exp(phi), V rho)``.
 
     Notes
     -----

@@ -9,14 +9,10 @@ from time import perf_counter
 
 import numpy as np
 
-from pipelines.config import SurveyConfig
-from pipelines.errors import NoMarkersError, SolveError
-from pipelines.extraction import extract
-from pipelines.fitting import fit_markers
-from pipelines.resection import resect
-from pipelines.stitching import choose_rig, split_stops, stitch
-from pipelines.subsets import resect_subsets
-from pipelines.values import (
+from spheremark.pipelines.config import SurveyConfig
+from spheremark.pipelines.detection import extract
+from spheremark.pipelines.errors import NoMarkersError, SolveError
+from spheremark.pipelines.model import (
     ControlMarks,
     MarkerFits,
     NoFix,
@@ -27,6 +23,10 @@ from pipelines.values import (
     StopResult,
     SubsetFixes,
 )
+from spheremark.pipelines.positioning.resection import resect
+from spheremark.pipelines.positioning.subsets import resect_subsets
+from spheremark.pipelines.scan.stitching import choose_rig, split_stops, stitch
+from spheremark.pipelines.sphere import fit_markers
 
 Progress = Callable[[float, str], None]
 """Told the share of the work that is done, 0 to 1, and what comes next; may raise to cancel."""

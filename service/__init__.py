@@ -1,5 +1,5 @@
-"""The running program: assembles the rooms, schedules jobs, answers requests and commands.
+"""The running program: HTTP, jobs, commands, settings.
 
-Why so: the rooms below stay pure because everything with a life (database handle, cluster, server,
-process) begins and ends here.
+Why so: the packages below stay pure because everything with a life (database handle, cluster,
+server, process) begins and ends here.
 """

@@ -10,9 +10,9 @@ from collections.abc import Callable
 import uvicorn
 from fastapi import FastAPI
 
-from pipelines.errors import ConflictError
-from service.app import create_app
-from service.settings import Settings
+from spheremark.pipelines.errors import ConflictError
+from spheremark.service.http.app import create_app
+from spheremark.service.settings import Settings
 
 Ready = Callable[[str], None]
 _PATIENCE = 5  # [s] that open requests have when the server is told to stop

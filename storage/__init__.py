@@ -1,5 +1,5 @@
-"""Every byte at rest: recordings (MCAP), clouds (files named by digest), the catalogue (DuckDB).
+"""Every byte at rest: recordings (MCAP), clouds, the catalogue (DuckDB), files in and out.
 
-Nobody else opens a file of the product. Why so: formats change, numbers do not; a room that owns
-all bytes can read every version that was ever written and be tested by round trips alone.
+Why so: formats change, numbers do not. A package that owns all bytes can read every version that
+was ever written, and is tested by round trips alone.
 """

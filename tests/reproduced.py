@@ -2,8 +2,8 @@
 
 import numpy as np
 
-from pipelines.config import SurveyConfig
-from pipelines.reproduction import (
+from spheremark.pipelines.config import SurveyConfig
+from spheremark.pipelines.evaluation.reproduction import (
     CENTRE,
     CENTRE_REAL,
     DISTANCES,
@@ -19,7 +19,7 @@ from pipelines.reproduction import (
     Reproduction,
     Scan,
 )
-from pipelines.study import TABLE_2
+from spheremark.pipelines.published import TABLE_2
 
 SIGMA = {OURS: 0.001, PAPER: 0.003, FULL_SPHERE: 0.003, GROUND: 0.003}  # [m] per axis at 8 m
 BIAS = {OURS: 0.0, PAPER: -0.027, FULL_SPHERE: -0.06, GROUND: -0.012}  # [m] towards the scanner

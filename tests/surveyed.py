@@ -7,10 +7,17 @@ from pathlib import Path
 
 import numpy as np
 
-from pipelines.config import SurveyConfig
-from pipelines.geometry import exp_motion, included_angle, inverse, rigid, rot_z, skew, transform
-from pipelines.rigs import tilted_vlp16
-from pipelines.values import (
+from spheremark.pipelines.config import SurveyConfig
+from spheremark.pipelines.geometry import (
+    exp_motion,
+    included_angle,
+    inverse,
+    rigid,
+    rot_z,
+    skew,
+    transform,
+)
+from spheremark.pipelines.model import (
     ControlMarks,
     Levelling,
     MarkerFit,
@@ -24,9 +31,10 @@ from pipelines.values import (
     SubsetFixes,
     Truth,
 )
-from storage.catalogue import Catalogue
-from storage.clouds import write_cloud
-from storage.results import RunInfo, tables
+from spheremark.pipelines.scan.rigs import tilted_vlp16
+from spheremark.storage.catalogue.catalogue import Catalogue
+from spheremark.storage.catalogue.results import RunInfo, tables
+from spheremark.storage.clouds.stop import write_cloud
 
 RADIUS = 0.1
 NOISE = {"along_beam": 0.02, "paper": 0.02}  # [m] of one range

@@ -8,8 +8,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from pipelines.rigs import vlp16
-from pipelines.values import (
+from spheremark.pipelines.model import (
     ControlMarks,
     Levelling,
     MarkerFit,
@@ -18,6 +17,7 @@ from pipelines.values import (
     ScanLog,
     Status,
 )
+from spheremark.pipelines.scan.rigs import vlp16
 
 NS = 1_000_000_000
 

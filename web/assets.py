@@ -18,7 +18,7 @@ _TOKEN = re.compile(r"(--[\w-]+): ([^;]+);")
 
 def static_folder() -> Path:
     """Return the folder that is served at ``/static``."""
-    return Path(str(resources.files("web"))) / "static"
+    return Path(str(resources.files("spheremark.web"))) / "static"
 
 
 def plotly_script() -> Path:

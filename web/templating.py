@@ -13,7 +13,7 @@ from jinja2 import Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup
 from plotly.io.json import to_json_plotly
 
-from web import assets, theme
+from spheremark.web import assets, theme
 
 _MM = 1e3  # [mm/m]
 _UNKNOWN = "\N{EN DASH}"

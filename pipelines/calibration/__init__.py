@@ -19,17 +19,22 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from pipelines.calibration.estimation import Estimate, Inseparable, estimate, residual_rms
-from pipelines.calibration.faces import front_face, rig_from_faces
-from pipelines.calibration.gimbal import GIMBAL, Sights, sights, values
-from pipelines.calibration.outcome import BIAS, Calibration, Scan
-from pipelines.config import SurveyConfig
-from pipelines.errors import DegenerateGeometryError, RigError
-from pipelines.extraction import extract
-from pipelines.fitting import fit_markers
-from pipelines.rigs import rig_digest
-from pipelines.stitching import choose_rig, split_stops, stitch
-from pipelines.values import Array, Index, MarkerFits, Mask, Rig, ScanLog, Status
+from spheremark.pipelines.calibration.estimation import (
+    Estimate,
+    Inseparable,
+    estimate,
+    residual_rms,
+)
+from spheremark.pipelines.calibration.faces import front_face, rig_from_faces
+from spheremark.pipelines.calibration.gimbal import GIMBAL, Sights, sights, values
+from spheremark.pipelines.calibration.result import BIAS, Calibration, Scan
+from spheremark.pipelines.config import SurveyConfig
+from spheremark.pipelines.detection import extract
+from spheremark.pipelines.errors import DegenerateGeometryError, RigError
+from spheremark.pipelines.model import Array, Index, MarkerFits, Mask, Rig, ScanLog, Status
+from spheremark.pipelines.scan.rigs import rig_digest
+from spheremark.pipelines.scan.stitching import choose_rig, split_stops, stitch
+from spheremark.pipelines.sphere import fit_markers
 
 __all__ = ["Calibration", "Inseparable", "Scan", "calibrate"]
 

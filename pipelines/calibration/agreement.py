@@ -7,10 +7,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from pipelines.calibration.faces import both_faces
-from pipelines.config import SurveyConfig
-from pipelines.stitching import stitch
-from pipelines.values import Array, MarkerFit, Rig, ScanLog, _seal
+from spheremark.pipelines.calibration.faces import both_faces
+from spheremark.pipelines.config import SurveyConfig
+from spheremark.pipelines.model import Array, MarkerFit, Rig, ScanLog, seal
+from spheremark.pipelines.scan.stitching import stitch
 
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
@@ -36,28 +36,16 @@ class FaceGaps:
 
     def __post_init__(self) -> None:
         n = len(self.stops)
-        _seal(self, p_base=(n, 3), gap_base=(n, 3), cov_gap_base=(n, 3, 3))
+        seal(self, p_base=(n, 3), gap_base=(n, 3), cov_gap_base=(n, 3, 3))
 
     @property
     def rms(self) -> float:
-        """Root mean square length of the gaps.
-
-        Returns
-        -------
-        float
-            NaN without any [m].
-        """
+        """Root mean square length of the gaps."""
         return _rms(np.sum(self.gap_base**2, axis=1))
 
     @property
     def sigma(self) -> float:
-        """What ``rms`` should be by the covariances.
-
-        Returns
-        -------
-        float
-            NaN without any [m].
-        """
+        """What ``rms`` should be by the covariances."""
         return _rms(np.trace(self.cov_gap_base, axis1=1, axis2=2))
 
 

@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from pipelines.calibration.gimbal import (
+from spheremark.pipelines.calibration.gimbal import (
     GIMBAL,
     N_SHADES,
     Design,
@@ -15,8 +15,8 @@ from pipelines.calibration.gimbal import (
     design,
     moved,
 )
-from pipelines.errors import NotConvergedError
-from pipelines.values import RING_UNKNOWN, Array, Index, Mask, Rig, Rings
+from spheremark.pipelines.errors import NotConvergedError
+from spheremark.pipelines.model import RING_UNKNOWN, Array, Index, Mask, Rig, Rings
 
 _TUKEY = 6.0  # sigmas at which a return has no weight; 98 % efficient on clean data
 _EXPECTED_SQUARE = 0.8449  # mean of weight times square of normal residuals: 1 - 6/c^2 + 15/c^4
@@ -64,18 +64,7 @@ class Normals(NamedTuple):
     pull_centres: Array
 
     def centre_steps(self, steps: Array) -> Array:
-        """Return the steps of the centres that belong to steps of the parameters.
-
-        Parameters
-        ----------
-        steps : (p,)
-            Steps of the parameters.
-
-        Returns
-        -------
-        (m, 3)
-            Steps of the centres [m].
-        """
+        """Return the steps of the centres that belong to steps of the parameters."""
         return np.asarray(
             np.einsum("mij,mj->mi", self.inverses, self.pull_centres - self.mixed @ steps)
         )
@@ -83,24 +72,6 @@ class Normals(NamedTuple):
 
 def reduced(which: Index, J_centres: Array, J: Array, residuals: Array, weights: Array) -> Normals:
     """Sum the normal equations of centres and parameters, and eliminate the centres.
-
-    Parameters
-    ----------
-    which : (n,)
-        The centre of each observation; each centre occurs.
-    J_centres : (n, 3)
-        Derivatives by that centre.
-    J : (n, p)
-        Derivatives by the parameters.
-    residuals : (n,)
-        Observed minus computed.
-    weights : (n,)
-        Inverse variances.
-
-    Returns
-    -------
-    Normals
-        Schur's complement with what is needed to get the centres back.
 
     Notes
     -----
@@ -126,20 +97,6 @@ def reduced(which: Index, J_centres: Array, J: Array, residuals: Array, weights:
 
 def separable(N: Array, parameters: tuple[Parameter, ...]) -> tuple[Mask, tuple[Inseparable, ...]]:
     """Tell which parameters the observations can tell apart.
-
-    Parameters
-    ----------
-    N : (p, p)
-        Normal matrix with the centres eliminated.
-    parameters : tuple of Parameter
-        What its columns are, and the sigma at which each is as good as unknown.
-
-    Returns
-    -------
-    is_free : (p,)
-        Those to estimate.
-    held : tuple of Inseparable
-        The others, with the reason.
 
     Notes
     -----
@@ -320,31 +277,6 @@ def estimate(
 ) -> Estimate:
     """Adjust the rig and all centres to the recorded ranges.
 
-    Parameters
-    ----------
-    seen : Sights
-        Shots at the spheres.
-    rig : Rig
-        Where to start; what cannot be told stays as it is here.
-    centres : (m, 3)
-        Approximate centres, good to a centimetre [m].
-    covs : (m, 3, 3)
-        Their covariances, over whose width ranges are averaged [m^2].
-    radius : float
-        Radius of the spheres [m].
-    sigma_direction : float
-        Standard deviation of a beam's direction per axis [rad].
-
-    Returns
-    -------
-    Estimate
-        Rig and centres with the covariance of what was estimated.
-
-    Raises
-    ------
-    NotConvergedError
-        If the steps do not become small.
-
     Notes
     -----
     Gauss-Newton with Tukey's weights, each step shortened until it lowers the loss; noise is
@@ -377,18 +309,7 @@ def estimate(
 
 
 def tukey(scaled: Array) -> Array:
-    """Return Tukey's weights.
-
-    Parameters
-    ----------
-    scaled : (n,)
-        Residuals in units of their sigma.
-
-    Returns
-    -------
-    (n,)
-        1 in the middle, 0 from six sigmas outwards.
-    """
+    """Return Tukey's weights."""
     return np.where(np.abs(scaled) < _TUKEY, (1.0 - (scaled / _TUKEY) ** 2) ** 2, 0.0)
 
 
@@ -448,26 +369,7 @@ def _told(N: Array, chosen: Index) -> Array:
 
 
 def residual_rms(seen: Sights, rig: Rig, found: Estimate, covs: Array, radius: float) -> float:
-    """Return the root mean square residual of an estimate's returns with a rig.
-
-    Parameters
-    ----------
-    seen : Sights
-        Shots at the spheres.
-    rig : Rig
-        The rig; the centres are adjusted to it.
-    found : Estimate
-        Which returns to look at.
-    covs : (m, 3, 3)
-        Covariances of the centres [m^2].
-    radius : float
-        Radius of the spheres [m].
-
-    Returns
-    -------
-    float
-        Root mean square residual [m].
-    """
+    """Return the root mean square residual of an estimate's returns with a rig."""
     centres, weights = found.centres, found.is_used.astype(np.float64)
     nothing = np.zeros((len(weights), 0))
     for _ in range(_N_STEPS_CENTRES):

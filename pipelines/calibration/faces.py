@@ -12,14 +12,14 @@ from typing import NamedTuple
 
 import numpy as np
 
-from pipelines.calibration.estimation import separable
-from pipelines.calibration.gimbal import GIMBAL, MOUNTING, aimed, motions, moved, sights
-from pipelines.config import SurveyConfig
-from pipelines.errors import DegenerateGeometryError, RigError
-from pipelines.extraction import extract
-from pipelines.fitting import fit_markers
-from pipelines.stitching import stitch
-from pipelines.values import Array, Index, MarkerFit, Mask, Rig, ScanLog, StitchedCloud
+from spheremark.pipelines.calibration.estimation import separable
+from spheremark.pipelines.calibration.gimbal import GIMBAL, MOUNTING, aimed, motions, moved, sights
+from spheremark.pipelines.config import SurveyConfig
+from spheremark.pipelines.detection import extract
+from spheremark.pipelines.errors import DegenerateGeometryError, RigError
+from spheremark.pipelines.model import Array, Index, MarkerFit, Mask, Rig, ScanLog, StitchedCloud
+from spheremark.pipelines.scan.stitching import stitch
+from spheremark.pipelines.sphere import fit_markers
 
 _GATE = 0.05  # [m] and
 _GATE_SLOPE = 0.025  # [rad]: the two centres of one sphere may be so far apart at a distance
@@ -41,23 +41,7 @@ class _Pair(NamedTuple):
 
 
 def front_face(cloud: StitchedCloud) -> Mask:
-    """Tell which returns were made on the front of the head.
-
-    Parameters
-    ----------
-    cloud : StitchedCloud
-        A stop.
-
-    Returns
-    -------
-    (n,)
-        Whether the beam went to the side of gimbal axis times spin axis.
-
-    Raises
-    ------
-    RigError
-        If the spin axis is nearly the gimbal's own.
-    """
+    """Tell which returns were made on the front of the head."""
     spin = cloud.rig.T_head_lidar[:3, 2]
     side = np.array([-spin[1], spin[0]])
     if np.linalg.norm(side) < np.sin(_TILT_MIN):
@@ -73,25 +57,6 @@ def front_face(cloud: StitchedCloud) -> Mask:
 
 def rig_from_faces(stops: Iterable[ScanLog], start: Rig, config: SurveyConfig) -> Rig:
     """Estimate the mounting roughly, from a start that may be bad.
-
-    Parameters
-    ----------
-    stops : iterable of ScanLog
-        Stops with the same rig.
-    start : Rig
-        Where to start: good to about a degree and some centimetres.
-    config : SurveyConfig
-        How spheres are found.
-
-    Returns
-    -------
-    Rig
-        Good to some millimetres; what two faces do not tell is as in the start.
-
-    Raises
-    ------
-    DegenerateGeometryError
-        If fewer than three spheres are seen on both faces.
 
     Notes
     -----
@@ -119,20 +84,7 @@ def _pairs(log: ScanLog, cloud: StitchedCloud, config: SurveyConfig) -> list[_Pa
 
 
 def both_faces(cloud: StitchedCloud, config: SurveyConfig) -> list[tuple[MarkerFit, MarkerFit]]:
-    """Fit the spheres of a stop on either face apart.
-
-    Parameters
-    ----------
-    cloud : StitchedCloud
-        A stop.
-    config : SurveyConfig
-        How spheres are found.
-
-    Returns
-    -------
-    list of (MarkerFit, MarkerFit)
-        What the front and the back of the head show of each sphere that both see.
-    """
+    """Fit the spheres of a stop on either face apart."""
     front = front_face(cloud)
     sides = [_fits(cloud, rows, config) for rows in (np.flatnonzero(front), np.flatnonzero(~front))]
     if not all(sides):

@@ -12,9 +12,9 @@ from typing import NamedTuple
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from pipelines.fitting.footprint import predict
-from pipelines.stitching import beams
-from pipelines.values import Array, Beams, Index, Rig, Rings, ScanLog, StitchedCloud
+from spheremark.pipelines.model import Array, Beams, Index, Rig, Rings, ScanLog, StitchedCloud
+from spheremark.pipelines.scan.stitching import beams
+from spheremark.pipelines.sphere.footprint import predict
 
 _RATE_WINDOW = 0.05  # [s] over which the speed of the gimbal is taken: encoders jitter
 _NS = 1e-9  # [s] in a nanosecond
@@ -123,18 +123,7 @@ class Sights(NamedTuple):
 
     @classmethod
     def joined(cls, parts: list[Sights]) -> Sights:
-        """Return the shots of several stops as one table; spheres are numbered on.
-
-        Parameters
-        ----------
-        parts : list of Sights
-            At least one.
-
-        Returns
-        -------
-        Sights
-            All of them.
-        """
+        """Return the shots of several stops as one table; spheres are numbered on."""
         firsts = np.cumsum([0, *(part.which.max(initial=-1) + 1 for part in parts)])
         numbered = [
             part._replace(which=part.which + first)
@@ -147,24 +136,7 @@ class Sights(NamedTuple):
 
 
 def sights(log: ScanLog, cloud: StitchedCloud, rows: Index, which: Index) -> Sights:
-    """Undo the stitching of some returns.
-
-    Parameters
-    ----------
-    log : ScanLog
-        The stop.
-    cloud : StitchedCloud
-        The same, stitched.
-    rows : (n,)
-        Rows of the cloud.
-    which : (n,)
-        The sphere that each one met.
-
-    Returns
-    -------
-    Sights
-        The shots as recorded.
-    """
+    """Undo the stitching of some returns."""
     rig, table = cloud.rig, beams(cloud, rows)
     turned = cloud.gimbal_angles[rows].astype(np.float64)
     rates = _rates(log, rig, table.times)
@@ -214,40 +186,14 @@ def _turn(v: Array, angles: Array) -> Array:
 
 
 def angles_of(seen: Sights, rig: Rig) -> Array:
-    """Return the true gimbal angle of shots, if the rig is right.
-
-    Parameters
-    ----------
-    seen : Sights
-        Shots as recorded.
-    rig : Rig
-        Eccentricity and clock offset.
-
-    Returns
-    -------
-    (n,)
-        Angles [rad].
-    """
+    """Return the true gimbal angle of shots, if the rig is right."""
     cosine, sine = rig.encoder_eccentricity
     at_shot = seen.angles - seen.rates * rig.gimbal_clock_offset
     return np.asarray(at_shot + cosine * np.cos(at_shot) + sine * np.sin(at_shot))
 
 
 def aimed(seen: Sights, rig: Rig) -> Beams:
-    """Return shots as lines in the base frame.
-
-    Parameters
-    ----------
-    seen : Sights
-        Shots as recorded.
-    rig : Rig
-        The rig.
-
-    Returns
-    -------
-    Beams
-        As stitching them anew would give.
-    """
+    """Return shots as lines in the base frame."""
     angles, R = angles_of(seen, rig), rig.T_head_lidar[:3, :3]
     directions = _turn(seen.v_lidar @ R.T, angles)
     spin = _turn(R[:, 2], angles)
@@ -268,22 +214,7 @@ def aimed(seen: Sights, rig: Rig) -> Beams:
 
 
 def motions(seen: Sights, rig: Rig) -> tuple[Array, Array]:
-    """Return how each parameter moves each beam.
-
-    Parameters
-    ----------
-    seen : Sights
-        Shots as recorded.
-    rig : Rig
-        Where they are linearised.
-
-    Returns
-    -------
-    turns : (n, q, 3)
-        Rotation of the beam about its origin in base, by the parameters of ``GIMBAL`` [rad].
-    shifts : (n, q, 3)
-        Shift of its origin [m].
-    """
+    """Return how each parameter moves each beam."""
     angles = angles_of(seen, rig)
     table = aimed(seen, rig)
     R, z = rig.T_head_lidar[:3, :3], np.array([0.0, 0.0, 1.0])
@@ -346,24 +277,6 @@ class Design(NamedTuple):
 def design(seen: Sights, rig: Rig, centres: Array, covs: Array, radius: float) -> Design:
     """Compare shots with spheres.
 
-    Parameters
-    ----------
-    seen : Sights
-        Shots as recorded.
-    rig : Rig
-        The rig.
-    centres : (m, 3)
-        Centres of the spheres in base [m].
-    covs : (m, 3, 3)
-        Covariances of the centres, over whose width ranges are averaged and linearised [m^2].
-    radius : float
-        Their radius [m].
-
-    Returns
-    -------
-    Design
-        Residuals and derivatives.
-
     Notes
     -----
     With ``v`` from a beam's origin to the centre and ``J`` the derivative of its range by the
@@ -410,19 +323,7 @@ def _euler(rig: Rig) -> Array:
 
 
 def values(rig: Rig) -> Array:
-    """Return the parameters of a rig.
-
-    Parameters
-    ----------
-    rig : Rig
-        The rig.
-
-    Returns
-    -------
-    (q,)
-        In the order of ``GIMBAL``; what a rig does not hold, because it belongs to the station or
-        to the definition of base, is zero.
-    """
+    """Return the parameters of a rig."""
     heading, tilt, zero = _euler(rig)
     x, y = rig.T_head_lidar[:2, 3]
     known = {

@@ -6,11 +6,7 @@ then, because what was observed is worth looking at before it is judged: the ref
 the exported observations need no adjustment.
 """
 
-from pipelines.network.adjusting import adjust_network
-from pipelines.network.assembly import assemble
-from pipelines.network.comparison import NetworkErrors, compare
-from pipelines.network.repeats import Repeat, repeated_stops
-from pipelines.network.values import (
+from spheremark.pipelines.model.network import (
     RANGE_BIAS,
     AdjustedNetwork,
     BlockTests,
@@ -19,6 +15,10 @@ from pipelines.network.values import (
     Refusal,
     Shared,
 )
+from spheremark.pipelines.network.adjustment import adjust_network
+from spheremark.pipelines.network.assembly import assemble
+from spheremark.pipelines.network.comparison import NetworkErrors, compare
+from spheremark.pipelines.network.repeated_stops import Repeat, repeated_stops
 
 __all__ = [
     "RANGE_BIAS",

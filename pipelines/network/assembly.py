@@ -13,21 +13,21 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from scipy.spatial.distance import pdist
 
-from pipelines.calibration import Calibration
-from pipelines.config import ResectionConfig
-from pipelines.errors import (
+from spheremark.pipelines.calibration import Calibration
+from spheremark.pipelines.config import ResectionConfig
+from spheremark.pipelines.errors import (
     AmbiguousMatchError,
     DegenerateGeometryError,
     InputError,
     NoMatchError,
     SolveError,
 )
-from pipelines.geometry import levelling_rotation, rigid, transform
-from pipelines.hypotheses import Spans, spans_between
-from pipelines.matching import gather, match_marks, shared_variances
-from pipelines.network.doubts import doubt
-from pipelines.network.values import LeftOut, Network, Refusal, Shared
-from pipelines.values import Array, ControlMarks, MarkerFits
+from spheremark.pipelines.geometry import levelling_rotation, rigid, transform
+from spheremark.pipelines.model import Array, ControlMarks, MarkerFits
+from spheremark.pipelines.model.network import LeftOut, Network, Refusal, Shared
+from spheremark.pipelines.network.false_marks import doubt
+from spheremark.pipelines.positioning.hypotheses import Spans, spans_between
+from spheremark.pipelines.positioning.matching import gather, match_marks, shared_variances
 
 _EXACT = 1e-5  # [m] sigma of control marks that are given as exact: far below any survey's
 _NO_MARK, _DOUBTED = -1, -2  # in place of a mark: none is near; the one that is near may be false

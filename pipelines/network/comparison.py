@@ -7,10 +7,10 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from pipelines.errors import TruthError
-from pipelines.geometry import rigid, skew, transform
-from pipelines.network.values import AdjustedNetwork, seal
-from pipelines.values import Array, Index, Mask, Truth
+from spheremark.pipelines.errors import TruthError
+from spheremark.pipelines.geometry import rigid, skew, transform
+from spheremark.pipelines.model import Array, Index, Mask, Truth
+from spheremark.pipelines.model.network import AdjustedNetwork, seal
 
 _NEAR = 0.15  # [m] a mark of a network may be from the true mark that it is
 _N_DATUM = 6  # place and attitude, which only control and levelling give

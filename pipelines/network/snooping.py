@@ -7,8 +7,10 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.special import chdtrc
 
-from pipelines.errors import TooFewObservationsError
-from pipelines.network.equations import (
+from spheremark.pipelines.errors import TooFewObservationsError
+from spheremark.pipelines.model import Array, Mask
+from spheremark.pipelines.model.network import Network
+from spheremark.pipelines.network.normal_equations import (
     N_DEFECT,
     Cofactors,
     Linearised,
@@ -17,8 +19,6 @@ from pipelines.network.equations import (
     solve_network,
     start,
 )
-from pipelines.network.values import Network
-from pipelines.values import Array, Mask
 
 UNTESTABLE = 1e-7
 """Redundancy below which a bias cannot show."""
@@ -106,37 +106,12 @@ class Tested:
         return _common(self.cofactors, self.network)
 
     def passes(self, level: float) -> bool:
-        """Return whether the residuals are no larger than their sigmas promise.
-
-        Parameters
-        ----------
-        level : float
-            Probability with which good data are rejected.
-
-        Returns
-        -------
-        bool
-            Also where there is no redundancy.
-        """
+        """Return whether the residuals are no larger than their sigmas promise."""
         return self.dof == 0 or bool(chdtrc(self.dof, self.vtpv) >= level)
 
 
 def snoop(network: Network, critical: float, *, is_studentised: bool) -> tuple[Tested, Dropped]:
     """Leave out the worst block, one at a time, while its w-test fails.
-
-    Parameters
-    ----------
-    network : Network
-        What was observed, with approximate values.
-    critical : float
-        What w must not exceed.
-    is_studentised : bool
-        Whether w is divided by sigma0 where that is above 1 (Pope 1976).
-
-    Returns
-    -------
-    tuple
-        The last solution, and what was left out.
 
     Notes
     -----

@@ -12,11 +12,11 @@ Why so: an arrangement is judged in milliseconds, without simulating a scan, so 
 thousands can be compared; simulation is what the promises are tested against.
 """
 
-from pipelines.placement.candidates import Candidates, PlaceRules, find_candidates
-from pipelines.placement.centres import CentreModel, Provenance, sensor_model
-from pipelines.placement.evaluation import check_sizes, evaluate, field_eyes, field_map
-from pipelines.placement.learning import FitRows, fitted_model
-from pipelines.placement.optimising import (
+from spheremark.pipelines.placement.candidates import Candidates, PlaceRules, find_candidates
+from spheremark.pipelines.placement.centre_model import CentreModel, Provenance, sensor_model
+from spheremark.pipelines.placement.empirical_model import FitRows, fitted_model
+from spheremark.pipelines.placement.evaluation import check_sizes, evaluate, field_eyes, field_map
+from spheremark.pipelines.placement.optimisation import (
     Goal,
     Optimum,
     Proposal,
@@ -25,19 +25,7 @@ from pipelines.placement.optimising import (
     optimise,
     propose_mark,
 )
-from pipelines.placement.sensor import Sensor
-from pipelines.placement.sight import look
-from pipelines.placement.sites import marks_of_field, site_of_field, site_of_grid, stops_of_field
-from pipelines.placement.trials import (
-    Share,
-    Trial,
-    TrialResult,
-    by_number,
-    by_worst_angle,
-    errors_by_angle,
-    try_at_random,
-)
-from pipelines.placement.values import (
+from spheremark.pipelines.placement.plan import (
     PLAN_METHODS,
     Arrangement,
     Evaluation,
@@ -47,6 +35,23 @@ from pipelines.placement.values import (
     Site,
     Stops,
 )
+from spheremark.pipelines.placement.random_plans import (
+    Share,
+    Trial,
+    TrialResult,
+    by_number,
+    by_worst_angle,
+    errors_by_angle,
+    try_at_random,
+)
+from spheremark.pipelines.placement.sensor import Sensor
+from spheremark.pipelines.placement.sites import (
+    marks_of_field,
+    site_of_field,
+    site_of_grid,
+    stops_of_field,
+)
+from spheremark.pipelines.placement.visibility import look
 
 __all__ = [
     "PLAN_METHODS",

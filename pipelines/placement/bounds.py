@@ -5,25 +5,13 @@ from __future__ import annotations
 import numpy as np
 from scipy.stats import chi
 
-from pipelines.placement.positions import Sighting, independent_information
-from pipelines.placement.values import Requirement
-from pipelines.values import Array
+from spheremark.pipelines.model import Array
+from spheremark.pipelines.placement.plan import Requirement
+from spheremark.pipelines.placement.station_covariance import Sighting, independent_information
 
 
 def least_sigmas(sighting: Sighting, wish: Requirement) -> Array:
     """Return the 3-D sigmas that no arrangement of so many of the marks goes below.
-
-    Parameters
-    ----------
-    sighting : Sighting
-        All marks that might stand, as seen.
-    wish : Requirement
-        Method, and what is known of the marks.
-
-    Returns
-    -------
-    (s, n)
-        For each stop, with one mark, two and so on; infinite where nothing is seen [m].
 
     Notes
     -----
@@ -41,18 +29,5 @@ def least_sigmas(sighting: Sighting, wish: Requirement) -> Array:
 
 
 def widest_sigma(tolerance: float, probability: float) -> float:
-    """Return the largest 3-D sigma with which an error can be within a tolerance so probably.
-
-    Parameters
-    ----------
-    tolerance : float
-        The tolerance [m].
-    probability : float
-        The probability, 0 to 1.
-
-    Returns
-    -------
-    float
-        Of errors that are equal along one, two or three axes, whichever allows most [m].
-    """
+    """Return the largest 3-D sigma with which an error can be within a tolerance so probably."""
     return float(max(tolerance * np.sqrt(n) / chi(n).ppf(probability) for n in (1, 2, 3)))

@@ -7,9 +7,9 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.ndimage import distance_transform_edt
 
-from pipelines.errors import ConfigError, DegenerateGeometryError
-from pipelines.placement.values import Arrangement, Site, Stops, bilinear
-from pipelines.values import Array, Mask, _seal
+from spheremark.pipelines.errors import ConfigError, DegenerateGeometryError
+from spheremark.pipelines.model import Array, Mask, seal
+from spheremark.pipelines.placement.plan import Arrangement, Site, Stops, bilinear
 
 CANDIDATES_MAX = 20_000
 """Places that are compared at most."""
@@ -80,7 +80,7 @@ class Candidates:
     apart: float
 
     def __post_init__(self) -> None:
-        _seal(self, p_site=(None, 3), ground=(len(self.p_site),))
+        seal(self, p_site=(None, 3), ground=(len(self.p_site),))
 
     @property
     def arrangement(self) -> Arrangement:

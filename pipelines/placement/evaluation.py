@@ -5,12 +5,15 @@ from __future__ import annotations
 import numba
 import numpy as np
 
-from pipelines.errors import InputError
-from pipelines.placement.centres import CentreModel, Centres, expect_centres, is_found
-from pipelines.placement.positions import Positions, Sighting, predict_positions, reliability
-from pipelines.placement.probability import probability_within
-from pipelines.placement.sight import behind_others, look
-from pipelines.placement.values import (
+from spheremark.pipelines.errors import InputError
+from spheremark.pipelines.model import Array, Index, Mask
+from spheremark.pipelines.placement.centre_model import (
+    CentreModel,
+    Centres,
+    expect_centres,
+    is_found,
+)
+from spheremark.pipelines.placement.plan import (
     Arrangement,
     Evaluation,
     FieldMap,
@@ -19,7 +22,14 @@ from pipelines.placement.values import (
     Site,
     Stops,
 )
-from pipelines.values import Array, Index, Mask
+from spheremark.pipelines.placement.probability import probability_within
+from spheremark.pipelines.placement.station_covariance import (
+    Positions,
+    Sighting,
+    predict_positions,
+    reliability,
+)
+from spheremark.pipelines.placement.visibility import behind_others, look
 
 MARKS_MAX, STOPS_MAX, PLACES_MAX = 500, 5_000, 250_000
 """What one evaluation takes at most."""
@@ -217,28 +227,7 @@ def check_sizes(n_stops: int, n_marks: int) -> None:
 def sighting_of(
     eyes: Array, marks: Arrangement, model: CentreModel, wish: Requirement, sights: Sights
 ) -> tuple[Centres, Sighting]:
-    """Return what is to be expected of centres, and which marks are found.
-
-    Parameters
-    ----------
-    eyes : (e, 3)
-        Places of the LiDAR in the site frame [m].
-    marks : Arrangement
-        The marks.
-    model : CentreModel
-        How well centres will be known.
-    wish : Requirement
-        Returns that a sphere needs.
-    sights : Sights
-        What is seen of the marks.
-
-    Returns
-    -------
-    centres : Centres
-        Returns and covariances.
-    sighting : Sighting
-        What positions are predicted from.
-    """
+    """Return what is to be expected of centres, and which marks are found."""
     centres = expect_centres(model, eyes, marks, sights)
     sighting = Sighting(
         eyes_site=eyes,

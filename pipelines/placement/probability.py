@@ -7,7 +7,7 @@ import math
 import numba
 import numpy as np
 
-from pipelines.values import Array, Mask
+from spheremark.pipelines.model import Array, Mask
 
 _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(24)
 _FAR = 8.5  # standard deviations beyond which nothing is left
@@ -16,18 +16,6 @@ _THIN = 1e-9  # of the tolerance; a thinner ellipsoid is flat
 
 def probability_within(covs: Array, tolerance: float) -> Array:
     """Return how probable it is that errors are no longer than a tolerance.
-
-    Parameters
-    ----------
-    covs : (n, 3, 3)
-        Covariances of errors that are normal without bias [m^2].
-    tolerance : float
-        The length [m].
-
-    Returns
-    -------
-    (n,)
-        Probabilities; 0 for a covariance that is not finite.
 
     Notes
     -----

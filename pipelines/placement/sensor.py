@@ -12,11 +12,11 @@ from typing import NamedTuple
 
 import numpy as np
 
-from pipelines.errors import ConfigError
-from pipelines.fitting.footprint import Prediction, predict
-from pipelines.rigs import FIRING_CYCLE, N_LASERS
-from pipelines.simulation import SimulationConfig, commensurability, horizon_lines
-from pipelines.values import Array, Beams, _seal
+from spheremark.pipelines.errors import ConfigError
+from spheremark.pipelines.model import Array, Beams, seal
+from spheremark.pipelines.scan.rigs import FIRING_CYCLE, N_LASERS
+from spheremark.pipelines.simulation import SimulationConfig, commensurability, horizon_lines
+from spheremark.pipelines.sphere.footprint import Prediction, predict
 
 N_ROWS = 16
 """Rows that each strip of a disc is cut into."""
@@ -160,8 +160,8 @@ class Returns:
 
     def __post_init__(self) -> None:
         d = len(self.distances)
-        _seal(self, distances=(d,), areas=(d, None, None), information=(d, None, None, 6))
-        _seal(self, spread=(d, 3), worst_spread=(d, 3), worst_share=(d,), lost=(d, 2))
+        seal(self, distances=(d,), areas=(d, None, None), information=(d, None, None, 6))
+        seal(self, spread=(d, 3), worst_spread=(d, 3), worst_share=(d,), lost=(d, 2))
 
 
 class _Disc(NamedTuple):
@@ -185,20 +185,6 @@ class _Disc(NamedTuple):
 @lru_cache(maxsize=16)
 def returns_of(sensor: Sensor, radius: float, n_strips: int) -> Returns:
     """Return what a sensor's returns from a sphere are worth.
-
-    Parameters
-    ----------
-    sensor : Sensor
-        The sensor and how it is driven.
-    radius : float
-        Radius of the sphere [m].
-    n_strips : int
-        Strips that its disc is cut into.
-
-    Returns
-    -------
-    tables : Returns
-        Over distance.
 
     Notes
     -----

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 
-from pipelines.errors import InputError
-from pipelines.placement.values import Arrangement, Site, Stops
-from pipelines.simulation import Field
-from pipelines.simulation.rocks import ball
-from pipelines.simulation.scene import Mesh, caster
-from pipelines.values import Array
+from spheremark.pipelines.errors import InputError
+from spheremark.pipelines.model import Array
+from spheremark.pipelines.placement.plan import Arrangement, Site, Stops
+from spheremark.pipelines.simulation import Field
+from spheremark.pipelines.simulation.rocks import ball
+from spheremark.pipelines.simulation.scene import Mesh, caster
 
 CELLS_MAX = 16_000_000
 """Nodes of a terrain at most; a tenth of a metre over 400 m square."""

@@ -16,11 +16,11 @@ Why so: the pipeline is believed because it finds what this room hid. Nothing he
 the steps of the pipeline, and a log holds nothing of the truth.
 """
 
-from pipelines.simulation.field import Decoy, Field, Stop
-from pipelines.simulation.options import SimulationConfig
-from pipelines.simulation.rig import commensurability, horizon_lines
-from pipelines.simulation.scenarios import SCENARIOS, scenario
-from pipelines.simulation.stop import SimulatedStop, simulate_stop, survey_truth
+from spheremark.pipelines.simulation.field import Decoy, Field, Stop
+from spheremark.pipelines.simulation.options import SimulationConfig
+from spheremark.pipelines.simulation.rig import commensurability, horizon_lines
+from spheremark.pipelines.simulation.scenarios import SCENARIOS, scenario
+from spheremark.pipelines.simulation.stop import SimulatedStop, simulate_stop, survey_truth
 
 __all__ = [
     "SCENARIOS",

@@ -8,34 +8,17 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike
 
-from pipelines.geometry import rot_z
-from pipelines.simulation.rocks import ball
-from pipelines.simulation.scene import Mesh
-from pipelines.values import Array
+from spheremark.pipelines.geometry import rot_z
+from spheremark.pipelines.model import Array
+from spheremark.pipelines.simulation.rocks import ball
+from spheremark.pipelines.simulation.scene import Mesh
 
 _N_SIDES = 48  # of a cylinder: 0.6 mm inside a circle of 0.3 m
 _LEVEL = 3  # of an ellipsoid: 1280 triangles
 
 
 def box(centre: ArrayLike, sides: ArrayLike, heading: float, reflectivity: float) -> Mesh:
-    """Return an upright box.
-
-    Parameters
-    ----------
-    centre : (3,)
-        Its middle [m].
-    sides : (3,)
-        Its lengths along its own axes, the third upright [m].
-    heading : float
-        Heading of its first axis, counter-clockwise from x [rad].
-    reflectivity : float
-        Its diffuse reflectivity, 0 to 1.
-
-    Returns
-    -------
-    Mesh
-        Twelve triangles.
-    """
+    """Return an upright box."""
     signs = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)]) / 2
     corners = (signs * np.asarray(sides)) @ rot_z(heading).T + np.asarray(centre)
     faces = ((0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6, 4), (1, 5, 7, 3))
@@ -44,22 +27,7 @@ def box(centre: ArrayLike, sides: ArrayLike, heading: float, reflectivity: float
 
 
 def cylinder(start: ArrayLike, end: ArrayLike, radius: float, reflectivity: float) -> Mesh:
-    """Return a closed cylinder in any direction.
-
-    Parameters
-    ----------
-    start, end : (3,)
-        Ends of its axis [m].
-    radius : float
-        Its radius [m].
-    reflectivity : float
-        Its diffuse reflectivity, 0 to 1.
-
-    Returns
-    -------
-    Mesh
-        Jacket and caps.
-    """
+    """Return a closed cylinder in any direction."""
     low, high = np.asarray(start, dtype=np.float64), np.asarray(end, dtype=np.float64)
     axis = (high - low) / np.linalg.norm(high - low)
     aside = np.cross(axis, np.eye(3)[np.argmin(np.abs(axis))])
@@ -81,24 +49,7 @@ def _up(axis: Array, aside: Array) -> Array:
 
 
 def ellipsoid(centre: ArrayLike, axes: ArrayLike, heading: float, reflectivity: float) -> Mesh:
-    """Return an upright ellipsoid.
-
-    Parameters
-    ----------
-    centre : (3,)
-        Its middle [m].
-    axes : (3,)
-        Its half axes, the third upright [m].
-    heading : float
-        Heading of its first axis, counter-clockwise from x [rad].
-    reflectivity : float
-        Its diffuse reflectivity, 0 to 1.
-
-    Returns
-    -------
-    Mesh
-        1280 triangles.
-    """
+    """Return an upright ellipsoid."""
     directions, triangles = ball(_LEVEL)
     surface = (directions * np.asarray(axes)) @ rot_z(heading).T + np.asarray(centre)
     return Mesh.even(surface, triangles, reflectivity)
@@ -107,26 +58,7 @@ def ellipsoid(centre: ArrayLike, axes: ArrayLike, heading: float, reflectivity: 
 def leaves(
     rng: np.random.Generator, centre: ArrayLike, axes: ArrayLike, n: int, size: float
 ) -> Mesh:
-    """Return loose facets that fill an ellipsoid evenly, as leaves fill a crown.
-
-    Parameters
-    ----------
-    rng : numpy.random.Generator
-        Source of chance.
-    centre : (3,)
-        Middle of the crown [m].
-    axes : (3,)
-        Its half axes [m].
-    n : int
-        Number of leaves.
-    size : float
-        Length of a leaf [m].
-
-    Returns
-    -------
-    Mesh
-        One triangle per leaf, in any direction, each with its own reflectivity.
-    """
+    """Return loose facets that fill an ellipsoid evenly, as leaves fill a crown."""
     directions = rng.standard_normal((n, 3))
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
     places = directions * np.cbrt(rng.random((n, 1))) * np.asarray(axes) + np.asarray(centre)

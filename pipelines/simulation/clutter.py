@@ -12,13 +12,13 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from pipelines.geometry import rot_z
-from pipelines.simulation.bodies import box, cylinder, ellipsoid, leaves
-from pipelines.simulation.field import MARKER_RADIUS, Decoy, Field, paper_field
-from pipelines.simulation.rocks import round_rock
-from pipelines.simulation.scene import Mesh, Poles, Scene, Spheres, pole_mesh
-from pipelines.simulation.terrain import Terrain
-from pipelines.values import Array
+from spheremark.pipelines.geometry import rot_z
+from spheremark.pipelines.model import Array
+from spheremark.pipelines.simulation.bodies import box, cylinder, ellipsoid, leaves
+from spheremark.pipelines.simulation.field import MARKER_RADIUS, Decoy, Field, paper_field
+from spheremark.pipelines.simulation.rocks import round_rock
+from spheremark.pipelines.simulation.scene import Mesh, Poles, Scene, Spheres, pole_mesh
+from spheremark.pipelines.simulation.terrain import Terrain
 
 _STOP_CLEAR = 0.9  # [m] from a stop to the nearest item
 _MARK_CLEAR = 0.45  # [m] from a marker to the nearest item that is placed by chance
@@ -112,16 +112,6 @@ class _Ground:
 def clutter_field(seed: int) -> Field:
     """Return the study's field among everything that might be taken for a marker.
 
-    Parameters
-    ----------
-    seed : int
-        Source of chance.
-
-    Returns
-    -------
-    Field
-        The same markers and stops as ``paper-field`` of that seed, with decoys.
-
     Notes
     -----
     Panels stand 0.3 to 1 m behind four markers, and the edge of a screen hides 20 to 50 % of three
@@ -154,19 +144,7 @@ def clutter_field(seed: int) -> Field:
 
 
 def rock_field(seed: int) -> Field:
-    """Return the study's field among many nearly round rocks of marker size.
-
-    Parameters
-    ----------
-    seed : int
-        Source of chance.
-
-    Returns
-    -------
-    Field
-        The same markers and stops as ``paper-field`` of that seed; 200 rocks lie on the ground and
-        40 on top of others. They are its decoys.
-    """
+    """Return the study's field among many nearly round rocks of marker size."""
     world = paper_field(seed)
     rng = np.random.default_rng([seed, _ROCKS])
     ground = _Ground(world)

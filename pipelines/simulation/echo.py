@@ -12,9 +12,9 @@ from dataclasses import dataclass
 import numba
 import numpy as np
 
-from pipelines.rigs import N_LASERS
-from pipelines.simulation.scene import Caster, Scene, caster
-from pipelines.values import Array, Column, Mask, _seal
+from spheremark.pipelines.model import Array, Column, Mask, seal
+from spheremark.pipelines.scan.rigs import N_LASERS
+from spheremark.pipelines.simulation.scene import Caster, Scene, caster
 
 _N_RAYS = 61  # in a bundle
 _MERGE = 0.8  # [m] nearer returns of one pulse are one echo: half a pulse of some 5 ns
@@ -43,21 +43,10 @@ class Aims:
 
     def __post_init__(self) -> None:
         n = len(self.origins_site)
-        _seal(self, origins_site=(n, 3), directions_site=(n, 3), spin_axes_site=(n, 3))
+        seal(self, origins_site=(n, 3), directions_site=(n, 3), spin_axes_site=(n, 3))
 
     def rows(self, chosen: Mask) -> Aims:
-        """Return some of the beams.
-
-        Parameters
-        ----------
-        chosen : (n,)
-            Which ones.
-
-        Returns
-        -------
-        Aims
-            The chosen ones, in the same order.
-        """
+        """Return some of the beams."""
         return Aims(
             origins_site=self.origins_site[chosen],
             directions_site=self.directions_site[chosen],
@@ -81,46 +70,17 @@ class Echoes:
     reflectivities: Array
 
     def __post_init__(self) -> None:
-        _seal(self, ranges=(None,), reflectivities=(len(self.ranges),))
+        seal(self, ranges=(None,), reflectivities=(len(self.ranges),))
 
     def among(self, chosen: Mask) -> Echoes:
-        """Return these echoes among beams that have none.
-
-        Parameters
-        ----------
-        chosen : (n,)
-            Which of all beams these are of.
-
-        Returns
-        -------
-        Echoes
-            Of all beams.
-        """
+        """Return these echoes among beams that have none."""
         ranges, reflectivities = np.full(len(chosen), np.inf), np.zeros(len(chosen))
         ranges[chosen], reflectivities[chosen] = self.ranges, self.reflectivities
         return Echoes(ranges=ranges, reflectivities=reflectivities)
 
 
 def trace(scene: Scene, aims: Aims, divergence: Array, anyway: Mask | None = None) -> Echoes:
-    """Return the strongest echo of each beam.
-
-    Parameters
-    ----------
-    scene : Scene
-        What can be met.
-    aims : Aims
-        Beams in the order of firing, whole firings of all lasers.
-    divergence : (2,)
-        Full width of the footprint across and along the spin axis [rad].
-    anyway : (n,), optional
-        Beams that are cast in any case; of the others only those that pass a sphere closely have an
-        echo. All of them, if missing.
-
-    Returns
-    -------
-    Echoes
-        In the order of the beams.
-    """
+    """Return the strongest echo of each beam."""
     cast = caster(scene.mesh)
     ranges = np.full(len(aims.origins_site), np.inf)
     reflectivities = np.zeros(len(ranges))

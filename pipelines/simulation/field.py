@@ -6,11 +6,18 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from pipelines.errors import ConfigError, NotFoundError
-from pipelines.simulation.rocks import draw_rocks, rock_mesh
-from pipelines.simulation.scene import Mesh, Poles, Scene, Spheres, pole_mesh, terrain_mesh
-from pipelines.simulation.terrain import Terrain, rough_terrain, with_mounds
-from pipelines.values import Array, ControlMarks, _seal
+from spheremark.pipelines.errors import ConfigError, NotFoundError
+from spheremark.pipelines.model import Array, ControlMarks, seal
+from spheremark.pipelines.simulation.rocks import draw_rocks, rock_mesh
+from spheremark.pipelines.simulation.scene import (
+    Mesh,
+    Poles,
+    Scene,
+    Spheres,
+    pole_mesh,
+    terrain_mesh,
+)
+from spheremark.pipelines.simulation.terrain import Terrain, rough_terrain, with_mounds
 
 PAPER_DISTANCES = np.array(
     [6.84, 7.15, 7.19, 7.71, 7.76, 7.84, 7.90, 7.94, 7.99, 8.17, 8.27, 9.02, 9.13, 9.34]
@@ -55,7 +62,7 @@ class Stop:
     heading: float
 
     def __post_init__(self) -> None:
-        _seal(self, p_site=(3,))
+        seal(self, p_site=(3,))
 
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
@@ -77,7 +84,7 @@ class Decoy:
     p_site: Array
 
     def __post_init__(self) -> None:
-        _seal(self, p_site=(3,))
+        seal(self, p_site=(3,))
 
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
@@ -139,23 +146,7 @@ class Field:
 
 
 def checked_seed(seed: int) -> int:
-    """Return a seed that can be used.
-
-    Parameters
-    ----------
-    seed : int
-        Source of chance.
-
-    Returns
-    -------
-    int
-        The same.
-
-    Raises
-    ------
-    ConfigError
-        If it is negative.
-    """
+    """Return a seed that can be used."""
     if seed < 0:
         raise ConfigError(f"The seed is {seed}; it must be 0 or more.")
     return seed
@@ -163,16 +154,6 @@ def checked_seed(seed: int) -> int:
 
 def paper_field(seed: int) -> Field:
     """Return the study's field: 14 markers around five lanes of seven stops.
-
-    Parameters
-    ----------
-    seed : int
-        Source of chance.
-
-    Returns
-    -------
-    Field
-        The world.
 
     Notes
     -----
@@ -199,24 +180,7 @@ def paper_field(seed: int) -> Field:
 
 
 def marker_surfaces(p_site: Array, terrain: Terrain) -> tuple[Mesh, Spheres, Poles]:
-    """Return markers on their poles.
-
-    Parameters
-    ----------
-    p_site : (n, 3)
-        Centres of the spheres [m].
-    terrain : Terrain
-        The ground that the poles stand on.
-
-    Returns
-    -------
-    mesh : Mesh
-        The poles, each up to where it meets its sphere.
-    spheres : Spheres
-        The spheres.
-    poles : Poles
-        Axes of the poles.
-    """
+    """Return markers on their poles."""
     n = len(p_site)
     feet, tops = p_site.copy(), p_site.copy()
     feet[:, 2] = terrain.height_at(p_site)

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 
-from pipelines.simulation.field import MARKER_RADIUS, MAST, Field, Stop, marker_surfaces
-from pipelines.simulation.scene import Mesh, Scene, terrain_mesh
-from pipelines.simulation.terrain import Terrain
-from pipelines.values import Array, ControlMarks
+from spheremark.pipelines.model import Array, ControlMarks
+from spheremark.pipelines.simulation.field import MARKER_RADIUS, MAST, Field, Stop, marker_surfaces
+from spheremark.pipelines.simulation.scene import Mesh, Scene, terrain_mesh
+from spheremark.pipelines.simulation.terrain import Terrain
 
 LANE_DISTANCES = np.arange(5.0, 30.1, 2.5)
 """Distances from the LiDAR to the markers of the range lane [m]."""

@@ -7,9 +7,9 @@ import math
 from dataclasses import dataclass
 from typing import Any, ClassVar, Self
 
-from pipelines.errors import ConfigError
-from pipelines.rigs import AZIMUTH_STEP, RANGE_STEP
-from pipelines.values import ImuMount
+from spheremark.pipelines.errors import ConfigError
+from spheremark.pipelines.model import ImuMount
+from spheremark.pipelines.scan.rigs import AZIMUTH_STEP, RANGE_STEP
 
 _LONGEST = 3600.0  # [s] of a scan, as of an even turn
 
@@ -151,13 +151,7 @@ class SimulationConfig:
 
     @property
     def stepped_time(self) -> float:
-        """Return how long a turn with rests takes.
-
-        Returns
-        -------
-        float
-            Time of all rests and the movements between them [s].
-        """
+        """Return how long a turn with rests takes."""
         rest = self.rest_revolutions * 60.0 / self.spin_rpm
         return 2.0 * math.pi / self.step * (rest + self.move)
 

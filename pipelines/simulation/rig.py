@@ -10,10 +10,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from pipelines.geometry import exp_motion, rot_z
-from pipelines.rigs import tilted_vlp16
-from pipelines.simulation.options import SimulationConfig
-from pipelines.values import Array, ImuMount, Nanos, Rig, _seal
+from spheremark.pipelines.geometry import exp_motion, rot_z
+from spheremark.pipelines.model import Array, ImuMount, Nanos, Rig, seal
+from spheremark.pipelines.scan.rigs import tilted_vlp16
+from spheremark.pipelines.simulation.options import SimulationConfig
 
 _RATE = 100.0  # [Hz] of joint samples and orientations
 _LEAD = 0.05  # [s] that encoder and AHRS record before the first and after the last shot
@@ -38,39 +38,15 @@ class Motion:
     angles: Array
 
     def __post_init__(self) -> None:
-        _seal(self, times=(None,), angles=(len(self.times),))
+        seal(self, times=(None,), angles=(len(self.times),))
 
     def angle_at(self, times: Array) -> Array:
-        """Return the true angle at some instants.
-
-        Parameters
-        ----------
-        times : (n,)
-            The instants [s].
-
-        Returns
-        -------
-        (n,)
-            The angles, unwrapped [rad].
-        """
+        """Return the true angle at some instants."""
         return np.interp(times, self.times, self.angles)
 
 
 def recorded_time(config: SimulationConfig) -> float:
-    """Return how long the LiDAR records.
-
-    Parameters
-    ----------
-    config : SimulationConfig
-        Time of the turn, or of rests and moves, and speed of the LiDAR.
-
-    Returns
-    -------
-    float
-        Time from the first shot to the end of the last firing [s]: of all rests and moves; or of
-        the turn and half a revolution before and after it. Half a revolution looks into the sky:
-        without the surplus the returns might not span the turn.
-    """
+    """Return how long the LiDAR records."""
     if config.step:
         rest = config.rest_revolutions * 60.0 / config.spin_rpm
         return _n_steps(config) * (rest + config.move) + rest
@@ -78,39 +54,12 @@ def recorded_time(config: SimulationConfig) -> float:
 
 
 def turning(config: SimulationConfig, start: float) -> Motion:
-    """Return how the gimbal moves: evenly, or from rest to rest.
-
-    Parameters
-    ----------
-    config : SimulationConfig
-        Time of the turn; or step, revolutions per rest and time of a move.
-    start : float
-        Angle at the first shot [rad].
-
-    Returns
-    -------
-    Motion
-        Through 360 degrees.
-    """
+    """Return how the gimbal moves: evenly, or from rest to rest."""
     return stepped_turn(config, start) if config.step else even_turn(config, start)
 
 
 def stepped_turn(config: SimulationConfig, start: float) -> Motion:
-    """Return a movement that rests at every step, at the first and last angle too.
-
-    Parameters
-    ----------
-    config : SimulationConfig
-        Step, revolutions per rest and time of a move; a last step that would lead past 360 degrees
-        is shortened.
-    start : float
-        Angle of the first rest [rad].
-
-    Returns
-    -------
-    Motion
-        Begins with the first shot; the gimbal rests before it and after the last.
-    """
+    """Return a movement that rests at every step, at the first and last angle too."""
     rest = config.rest_revolutions * 60.0 / config.spin_rpm
     begins = np.arange(_n_steps(config) + 1) * (rest + config.move)
     angles = np.minimum(np.arange(len(begins)) * config.step, 2 * np.pi)
@@ -125,20 +74,7 @@ def _n_steps(config: SimulationConfig) -> int:
 
 
 def even_turn(config: SimulationConfig, start: float) -> Motion:
-    """Return a movement at constant speed, through 360 degrees in the time of the turn.
-
-    Parameters
-    ----------
-    config : SimulationConfig
-        Time of the turn.
-    start : float
-        Angle at the first shot [rad].
-
-    Returns
-    -------
-    Motion
-        The movement, which begins before the first shot and ends after the last.
-    """
+    """Return a movement at constant speed, through 360 degrees in the time of the turn."""
     times = np.array([-1.0, recorded_time(config) + 1.0])
     return Motion(times=times, angles=start + 2 * np.pi / config.turn * times)
 
@@ -161,20 +97,7 @@ def nominal_rig(config: SimulationConfig) -> Rig:
 
 
 def true_rig(config: SimulationConfig, rng: np.random.Generator) -> Rig:
-    """Return the rig as it really is, which no log tells.
-
-    Parameters
-    ----------
-    config : SimulationConfig
-        How far it may be from nominal.
-    rng : numpy.random.Generator
-        Source of chance.
-
-    Returns
-    -------
-    Rig
-        Misaligned, with range biases, an eccentric encoder and a clock offset.
-    """
+    """Return the rig as it really is, which no log tells."""
     rig = nominal_rig(config)
     T_head_lidar = rig.T_head_lidar.copy()
     twist = np.concatenate([rng.normal(0.0, config.sigma_misalignment, 3), np.zeros(3)])
@@ -193,26 +116,7 @@ def true_rig(config: SimulationConfig, rng: np.random.Generator) -> Rig:
 def joint_samples(
     motion: Motion, rig: Rig, config: SimulationConfig, rng: np.random.Generator
 ) -> tuple[Array, Nanos]:
-    """Return what the encoder of the gimbal records.
-
-    Parameters
-    ----------
-    motion : Motion
-        The true angle.
-    rig : Rig
-        The true rig: eccentricity and clock.
-    config : SimulationConfig
-        Quantisation and jitter.
-    rng : numpy.random.Generator
-        Source of chance.
-
-    Returns
-    -------
-    angles : (n,)
-        Joint angle, unwrapped [rad].
-    offsets_ns : (n,)
-        Instants on the gimbal's clock, since the first shot.
-    """
+    """Return what the encoder of the gimbal records."""
     times = _sample_times(config, rng)
     truth = motion.angle_at(times)
     c, s = rig.encoder_eccentricity
@@ -232,29 +136,7 @@ def ahrs_samples(
     config: SimulationConfig,
     rng: np.random.Generator,
 ) -> tuple[Array, Nanos]:
-    """Return what the AHRS records.
-
-    Parameters
-    ----------
-    motion : Motion
-        The true angle of the gimbal.
-    R_station_base : (3, 3)
-        How the base truly leans.
-    rig : Rig
-        Where the AHRS sits.
-    config : SimulationConfig
-        Its bias during a stop, and its noise.
-    rng : numpy.random.Generator
-        Source of chance.
-
-    Returns
-    -------
-    quaternions : (n, 4)
-        Orientation in the world, x y z w; its heading is that of a magnetic compass among motors,
-        that is, of no use.
-    offsets_ns : (n,)
-        Instants on the LiDAR's clock, since the first shot.
-    """
+    """Return what the AHRS records."""
     times = _sample_times(config, rng)
     lean = rng.normal(0.0, config.sigma_ahrs_bias, 3) * (1.0, 1.0, 0.0)
     shake = Rotation.from_rotvec(rng.normal(0.0, config.sigma_ahrs, (len(times), 3)))
@@ -305,20 +187,7 @@ def commensurability(config: SimulationConfig) -> str:
 
 
 def quantised(values: Array, step: float) -> Array:
-    """Return values rounded to multiples of a step.
-
-    Parameters
-    ----------
-    values : (n,)
-        The values.
-    step : float
-        The step, in their unit; 0 leaves them.
-
-    Returns
-    -------
-    (n,)
-        The rounded values.
-    """
+    """Return values rounded to multiples of a step."""
     return np.asarray(np.round(values / step) * step) if step else values
 
 

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from pipelines.simulation.scene import Mesh
-from pipelines.simulation.terrain import Terrain
-from pipelines.values import Array, Index
+from spheremark.pipelines.model import Array, Index
+from spheremark.pipelines.simulation.scene import Mesh
+from spheremark.pipelines.simulation.terrain import Terrain
 
 _COVER = 0.01  # share of the ground that rocks cover
 _DECAY = 4.0  # [1/m] of the exponential in size that the covered share falls with
@@ -23,18 +23,6 @@ _REFLECTIVITY = (0.10, 0.22)
 
 def draw_rocks(rng: np.random.Generator, keep_clear: Array) -> Array:
     """Return places and sizes of rocks.
-
-    Parameters
-    ----------
-    rng : numpy.random.Generator
-        Source of chance.
-    keep_clear : (n, 3)
-        Places, x and y, and radius where no rock may reach in [m].
-
-    Returns
-    -------
-    (m, 3)
-        Place, x and y, and diameter of each rock [m].
 
     Notes
     -----
@@ -60,22 +48,7 @@ def draw_rocks(rng: np.random.Generator, keep_clear: Array) -> Array:
 
 
 def rock_mesh(rng: np.random.Generator, rocks: Array, terrain: Terrain) -> Mesh:
-    """Return the surfaces of rocks that lie on the ground.
-
-    Parameters
-    ----------
-    rng : numpy.random.Generator
-        Source of chance.
-    rocks : (n, 3)
-        Place, x and y, and diameter of each rock [m].
-    terrain : Terrain
-        The ground.
-
-    Returns
-    -------
-    Mesh
-        All rocks together.
-    """
+    """Return the surfaces of rocks that lie on the ground."""
     levels = np.digitize(rocks[:, 2], [0.10, 0.20])  # small ones need few triangles
     balls = [ball(level) for level in range(3)]
     meshes = []
@@ -105,22 +78,7 @@ def _shape(rng: np.random.Generator, directions: Array, *, is_round: bool) -> Ar
 
 
 def round_rock(rng: np.random.Generator, centre: Array, radius: float) -> Mesh:
-    """Return a nearly round rock: a ball with flats and axes that differ by a few percent.
-
-    Parameters
-    ----------
-    rng : numpy.random.Generator
-        Source of chance.
-    centre : (3,)
-        Its middle [m].
-    radius : float
-        Its largest radius [m].
-
-    Returns
-    -------
-    Mesh
-        The rock.
-    """
+    """Return a nearly round rock: a ball with flats and axes that differ by a few percent."""
     directions, triangles = ball(_ROUND_LEVEL)
     shape = _shape(rng, directions, is_round=True) * radius
     return Mesh.even(shape + centre, triangles, rng.uniform(*_REFLECTIVITY))

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-from pipelines.errors import ConfigError
-from pipelines.simulation.clutter import clutter_field, rock_field
-from pipelines.simulation.field import Field, checked_seed, paper_field
-from pipelines.simulation.lane import range_lane
+from spheremark.pipelines.errors import ConfigError
+from spheremark.pipelines.simulation.clutter import clutter_field, rock_field
+from spheremark.pipelines.simulation.field import Field, checked_seed, paper_field
+from spheremark.pipelines.simulation.lane import range_lane
 
 SCENARIOS: dict[str, Callable[[int], Field]] = {
     "paper-field": paper_field,

@@ -13,8 +13,8 @@ from typing import Self
 import numpy as np
 from numpy.typing import ArrayLike
 
-from pipelines.simulation.terrain import Terrain, interpolated
-from pipelines.values import Array, Column, Index, _seal
+from spheremark.pipelines.model import Array, Column, Index, seal
+from spheremark.pipelines.simulation.terrain import Terrain, interpolated
 
 _N_SIDES = 24  # of a pole: its flats lie 0.1 mm inside the circle
 _REGOLITH = (0.10, 0.20)  # diffuse reflectivity at 905 nm
@@ -42,7 +42,7 @@ class Mesh:
     reflectivities: Array
 
     def __post_init__(self) -> None:
-        _seal(self, p_site=(None, 3), triangles=(None, 3), reflectivities=(len(self.triangles),))
+        seal(self, p_site=(None, 3), triangles=(None, 3), reflectivities=(len(self.triangles),))
 
     @classmethod
     def even(cls, p_site: Array, triangles: Index, reflectivity: float) -> Self:
@@ -108,7 +108,7 @@ class Spheres:
 
     def __post_init__(self) -> None:
         n = len(self.p_site)
-        _seal(self, p_site=(n, 3), radii=(n,), reflectivities=(n,))
+        seal(self, p_site=(n, 3), radii=(n,), reflectivities=(n,))
 
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
@@ -129,7 +129,7 @@ class Poles:
 
     def __post_init__(self) -> None:
         n = len(self.radii)
-        _seal(self, feet_site=(n, 3), tops_site=(n, 3), radii=(n,))
+        seal(self, feet_site=(n, 3), tops_site=(n, 3), radii=(n,))
 
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
@@ -152,20 +152,7 @@ class Scene:
 
 
 def terrain_mesh(rng: np.random.Generator, terrain: Terrain) -> Mesh:
-    """Return the ground as triangles, with a reflectivity that varies from patch to patch.
-
-    Parameters
-    ----------
-    rng : numpy.random.Generator
-        Source of chance.
-    terrain : Terrain
-        The ground.
-
-    Returns
-    -------
-    Mesh
-        Two triangles for each cell of the grid.
-    """
+    """Return the ground as triangles, with a reflectivity that varies from patch to patch."""
     n_rows, n_columns = terrain.heights.shape
     x, y = np.meshgrid(terrain.xs, terrain.ys)
     p_site = np.column_stack([x.ravel(), y.ravel(), terrain.heights.ravel()])
@@ -186,22 +173,7 @@ def terrain_mesh(rng: np.random.Generator, terrain: Terrain) -> Mesh:
 
 
 def pole_mesh(foot: ArrayLike, top: ArrayLike, radius: float, reflectivity: float) -> Mesh:
-    """Return an upright pole as a prism that is open at both ends.
-
-    Parameters
-    ----------
-    foot, top : (3,)
-        Ends of its axis, one above the other [m].
-    radius : float
-        Its radius [m].
-    reflectivity : float
-        Its diffuse reflectivity, 0 to 1.
-
-    Returns
-    -------
-    Mesh
-        The prism.
-    """
+    """Return an upright pole as a prism that is open at both ends."""
     angles = np.arange(_N_SIDES) * 2 * np.pi / _N_SIDES
     ring = radius * np.column_stack([np.cos(angles), np.sin(angles), np.zeros(_N_SIDES)])
     low = np.arange(_N_SIDES)

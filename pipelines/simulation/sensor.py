@@ -9,7 +9,8 @@ from typing import Self
 import numba
 import numpy as np
 
-from pipelines.rigs import (
+from spheremark.pipelines.model import Array, Column, Firings, Index, Mask, Nanos, Rig, Rings, seal
+from spheremark.pipelines.scan.rigs import (
     AZIMUTH_STEP,
     FIRING_CYCLE,
     FIRING_ORDER,
@@ -19,10 +20,9 @@ from pipelines.rigs import (
     N_LASERS,
     RANGE_STEP,
 )
-from pipelines.simulation.echo import Aims, Echoes
-from pipelines.simulation.options import SimulationConfig
-from pipelines.simulation.rig import Motion, quantised
-from pipelines.values import Array, Column, Firings, Index, Mask, Nanos, Rig, Rings, _seal
+from spheremark.pipelines.simulation.echo import Aims, Echoes
+from spheremark.pipelines.simulation.options import SimulationConfig
+from spheremark.pipelines.simulation.rig import Motion, quantised
 
 FIRINGS_PER_PACKET = N_BLOCKS * FIRINGS_PER_BLOCK
 """Firings of all lasers that the sensor sends at once."""
@@ -64,21 +64,10 @@ class Shots:
 
     def __post_init__(self) -> None:
         n = len(self.offsets_ns)
-        _seal(self, offsets_ns=(n,), rings=(n,), azimuths=(n,), gimbal_angles=(n,))
+        seal(self, offsets_ns=(n,), rings=(n,), azimuths=(n,), gimbal_angles=(n,))
 
     def rows(self, chosen: Mask) -> Shots:
-        """Return some of the shots.
-
-        Parameters
-        ----------
-        chosen : (n,)
-            Which ones.
-
-        Returns
-        -------
-        Shots
-            The chosen ones, in the same order.
-        """
+        """Return some of the shots."""
         return Shots(
             offsets_ns=self.offsets_ns[chosen],
             rings=self.rings[chosen],
@@ -113,24 +102,11 @@ class Recorded:
 
     def __post_init__(self) -> None:
         n = len(self.rings)
-        _seal(self, p_lidar=(n, 3), intensities=(n,), rings=(n,), offsets_ns=(n,))
+        seal(self, p_lidar=(n, 3), intensities=(n,), rings=(n,), offsets_ns=(n,))
 
     @classmethod
     def joined(cls, pieces: Sequence[Self], start_ns: int) -> Self:
-        """Return several pieces of one recording as one.
-
-        Parameters
-        ----------
-        pieces : sequence of Recorded
-            In the order of firing.
-        start_ns : int
-            Instant of the first shot.
-
-        Returns
-        -------
-        Recorded
-            All of them.
-        """
+        """Return several pieces of one recording as one."""
         return cls(
             p_lidar=np.concatenate([piece.p_lidar for piece in pieces]),
             intensities=np.concatenate([piece.intensities for piece in pieces]),
@@ -146,24 +122,7 @@ class Recorded:
 
 
 def fire(first: int, n: int, start_azimuth: float, motion: Motion, spin_rpm: float) -> Shots:
-    """Return some firings of all lasers.
-
-    Parameters
-    ----------
-    first, n : int
-        Place of the first firing within the stop, and number of firings.
-    start_azimuth : float
-        Azimuth at the first shot of the stop [rad].
-    motion : Motion
-        How the gimbal turns meanwhile.
-    spin_rpm : float
-        Revolutions of the LiDAR per minute.
-
-    Returns
-    -------
-    Shots
-        ``16 n`` shots.
-    """
+    """Return some firings of all lasers."""
     firings = np.arange(first, first + n, dtype=np.int64)
     offsets_ns = (firings[:, None] * _NS_CYCLE + np.arange(N_LASERS) * _NS_LASER).ravel()
     times = np.asarray(offsets_ns * 1e-9, dtype=np.float64)
@@ -176,22 +135,7 @@ def fire(first: int, n: int, start_azimuth: float, motion: Motion, spin_rpm: flo
 
 
 def aim(shots: Shots, rig: Rig, T_site_base: Array) -> Aims:
-    """Return where shots start and point.
-
-    Parameters
-    ----------
-    shots : Shots
-        The shots.
-    rig : Rig
-        The true rig.
-    T_site_base : (4, 4)
-        True pose of the base [m].
-
-    Returns
-    -------
-    Aims
-        In the order of firing.
-    """
+    """Return where shots start and point."""
     lasers = np.column_stack([rig.laser_elevations, rig.laser_heights])
     posed = _posed(rig.T_head_lidar, T_site_base)
     origins, directions, axes = _aim(
@@ -201,26 +145,7 @@ def aim(shots: Shots, rig: Rig, T_site_base: Array) -> Aims:
 
 
 def may_pass(shots: Shots, rig: Rig, T_site_base: Array, p_site: Array, near: float) -> Mask:
-    """Return which shots belong to firings of which one may pass a point closely.
-
-    Parameters
-    ----------
-    shots : Shots
-        The shots of whole firings.
-    rig : Rig
-        The true rig.
-    T_site_base : (4, 4)
-        True pose of the base [m].
-    p_site : (m, 3)
-        The points [m].
-    near : float
-        What closely means [m].
-
-    Returns
-    -------
-    (n,)
-        True for all shots of such a firing; some of them may still pass none.
-    """
+    """Return which shots belong to firings of which one may pass a point closely."""
     first = slice(None, None, N_LASERS)
     posed = _posed(rig.T_head_lidar, T_site_base)
     limits = (near, np.abs(rig.laser_elevations).max(), np.abs(rig.laser_heights).max())
@@ -231,26 +156,7 @@ def may_pass(shots: Shots, rig: Rig, T_site_base: Array, p_site: Array, near: fl
 def record(
     shots: Shots, echoes: Echoes, rig: Rig, config: SimulationConfig, rng: np.random.Generator
 ) -> Recorded:
-    """Return what is recorded of some shots.
-
-    Parameters
-    ----------
-    shots : Shots
-        The shots of whole packets: a multiple of 24 firings.
-    echoes : Echoes
-        What came back from each.
-    rig : Rig
-        The true rig; of it the recording has the range biases, and the maker's laser table.
-    config : SimulationConfig
-        Noise, drop-outs and quantisation.
-    rng : numpy.random.Generator
-        Source of chance.
-
-    Returns
-    -------
-    Recorded
-        In the order of firing.
-    """
+    """Return what is recorded of some shots."""
     seen = np.flatnonzero(_is_seen(echoes, config.drop_out, rng))
     rings, shades = shots.rings[seen], 100.0 * echoes.reflectivities[seen]
     sigma = range_noise(shades) if config.sigma_range is None else config.sigma_range
@@ -271,18 +177,6 @@ def record(
 
 def recorded_azimuths(azimuths: Array, step: float) -> Array:
     """Return the azimuths that a driver finds for all shots of whole packets.
-
-    Parameters
-    ----------
-    azimuths : (n,)
-        True azimuths of shots in the order of firing, unwrapped [rad].
-    step : float
-        Quantisation of azimuths [rad]; 0 for none.
-
-    Returns
-    -------
-    (n,)
-        Azimuths, 0 to a full turn [rad].
 
     Notes
     -----
@@ -315,18 +209,7 @@ def _firings(azimuths: Array, seen: Index, ranges: Array, intensities: Column) -
 
 
 def range_noise(reflectivities: Array) -> Array:
-    """Return the range noise of a VLP-16 as seen in real packets.
-
-    Parameters
-    ----------
-    reflectivities : (n,)
-        Calibrated reflectivities, 0-255.
-
-    Returns
-    -------
-    (n,)
-        Standard deviations [m].
-    """
+    """Return the range noise of a VLP-16 as seen in real packets."""
     return np.asarray(_NOISE[np.digitize(reflectivities, _NOISE_LIMITS)])
 
 

@@ -9,13 +9,14 @@ from typing import NamedTuple
 
 import numpy as np
 
-from pipelines.errors import InputError
-from pipelines.geometry import rigid, rot_x, rot_y, rot_z
-from pipelines.rigs import FIRING_CYCLE, N_LASERS, rig_digest
-from pipelines.simulation.echo import NEAR, Echoes, trace
-from pipelines.simulation.field import Field, checked_seed
-from pipelines.simulation.options import SimulationConfig
-from pipelines.simulation.rig import (
+from spheremark.pipelines.errors import InputError
+from spheremark.pipelines.geometry import rigid, rot_x, rot_y, rot_z
+from spheremark.pipelines.model import Array, Firings, Nanos, Origin, Rig, ScanLog, StopTruth, Truth
+from spheremark.pipelines.scan.rigs import FIRING_CYCLE, N_LASERS, rig_digest
+from spheremark.pipelines.simulation.echo import NEAR, Echoes, trace
+from spheremark.pipelines.simulation.field import Field, checked_seed
+from spheremark.pipelines.simulation.options import SimulationConfig
+from spheremark.pipelines.simulation.rig import (
     Motion,
     ahrs_samples,
     joint_samples,
@@ -24,8 +25,8 @@ from pipelines.simulation.rig import (
     true_rig,
     turning,
 )
-from pipelines.simulation.scene import Scene
-from pipelines.simulation.sensor import (
+from spheremark.pipelines.simulation.scene import Scene
+from spheremark.pipelines.simulation.sensor import (
     FIRINGS_PER_PACKET,
     Recorded,
     Shots,
@@ -34,8 +35,7 @@ from pipelines.simulation.sensor import (
     may_pass,
     record,
 )
-from pipelines.simulation.visibility import visible_shares
-from pipelines.values import Array, Firings, Nanos, Origin, Rig, ScanLog, StopTruth, Truth
+from spheremark.pipelines.simulation.visibility import visible_shares
 
 Progress = Callable[[float, str], None]
 

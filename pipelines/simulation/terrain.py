@@ -9,7 +9,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from pipelines.values import Array, _seal
+from spheremark.pipelines.model import Array, seal
 
 _N = 1024  # nodes of the periodic map that the roughness is made on, per side
 _CELL = 0.07  # [m] its spacing
@@ -44,54 +44,20 @@ class Terrain:
     heights: Array
 
     def __post_init__(self) -> None:
-        _seal(self, xs=(None,), ys=(None,), heights=(len(self.ys), len(self.xs)))
+        seal(self, xs=(None,), ys=(None,), heights=(len(self.ys), len(self.xs)))
 
     def height_at(self, p_site: Array) -> Array:
-        """Return the height of the ground under points.
-
-        Parameters
-        ----------
-        p_site : (..., 2 or 3)
-            The points [m].
-
-        Returns
-        -------
-        (...,)
-            The heights [m].
-        """
+        """Return the height of the ground under points."""
         return interpolated(self.xs, self.ys, self.heights, p_site)
 
     def highest_near(self, p_site: Array, radius: float) -> float:
-        """Return the height of the highest ground near a point.
-
-        Parameters
-        ----------
-        p_site : (2 or 3,)
-            The point [m].
-        radius : float
-            Horizontal distance within which is looked [m].
-
-        Returns
-        -------
-        float
-            Height of the highest node of the grid there [m].
-        """
+        """Return the height of the highest ground near a point."""
         away = np.hypot(self.xs[None, :] - p_site[0], self.ys[:, None] - p_site[1])
         return float(self.heights[away <= radius].max())
 
 
 def rough_terrain(rng: np.random.Generator) -> Terrain:
     """Return a patch of cratered regolith, 70 m square, about level around height zero.
-
-    Parameters
-    ----------
-    rng : numpy.random.Generator
-        Source of chance.
-
-    Returns
-    -------
-    Terrain
-        The ground.
 
     Notes
     -----
@@ -110,22 +76,7 @@ def rough_terrain(rng: np.random.Generator) -> Terrain:
 
 
 def with_mounds(terrain: Terrain, p_site: Array, radius: float) -> Terrain:
-    """Return the ground with a mound at each point, whose tops have the points' heights.
-
-    Parameters
-    ----------
-    terrain : Terrain
-        The ground without mounds.
-    p_site : (n, 3)
-        Tops of the mounds [m].
-    radius : float
-        Radius of their feet [m].
-
-    Returns
-    -------
-    Terrain
-        The ground with mounds, as heaps of dug regolith: smooth at top and foot.
-    """
+    """Return the ground with a mound at each point, whose tops have the points' heights."""
     heights = terrain.heights.copy()
     for top in p_site:
         away = np.hypot(terrain.xs[None, :] - top[0], terrain.ys[:, None] - top[1])
@@ -135,22 +86,7 @@ def with_mounds(terrain: Terrain, p_site: Array, radius: float) -> Terrain:
 
 
 def interpolated(xs: Array, ys: Array, grid: Array, p_site: Array) -> Array:
-    """Return the values of a grid at points, bilinear and clamped to its edge.
-
-    Parameters
-    ----------
-    xs, ys : (n,), (m,)
-        Lines of the grid, ascending [m].
-    grid : (m, n)
-        Values at its nodes.
-    p_site : (..., 2 or 3)
-        The points [m].
-
-    Returns
-    -------
-    (...,)
-        The values.
-    """
+    """Return the values of a grid at points, bilinear and clamped to its edge."""
     i, u = _cell(xs, p_site[..., 0])
     j, v = _cell(ys, p_site[..., 1])
     low = (1 - u) * grid[j, i] + u * grid[j, i + 1]

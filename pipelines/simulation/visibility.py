@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from pipelines.simulation.scene import Scene, caster
-from pipelines.values import Array
+from spheremark.pipelines.model import Array
+from spheremark.pipelines.simulation.scene import Scene, caster
 
 _N_SIGHTS = 400  # over the disc of a sphere: shares are good to a percent
 _TOUCH = 1e-3  # [m] what is this near is the sphere itself

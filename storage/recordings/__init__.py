@@ -6,10 +6,10 @@ into neutral columns (``families``): ``pointclouds``, ``joint_states``, ``transf
 recording, and no length that it declares is believed before it is checked.
 """
 
-from storage.recordings.container import file_digest, require_file
-from storage.recordings.preflight import Preflight, TopicReport, inspect_log
-from storage.recordings.reading import read_log
-from storage.recordings.writing import write_log
+from spheremark.storage.recordings.container import file_digest, require_file
+from spheremark.storage.recordings.preflight import Preflight, TopicReport, inspect_log
+from spheremark.storage.recordings.reading import read_log
+from spheremark.storage.recordings.writing import write_log
 
 __all__ = [
     "Preflight",

@@ -16,10 +16,10 @@ from typing import TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from pipelines.values import Mask, Nanos
-from storage.recordings.container import Batch, Channel
-from storage.recordings.families import BrokenMessageError
-from storage.recordings.records import Octets, windows
+from spheremark.pipelines.model import Mask, Nanos
+from spheremark.storage.recordings.container import Batch, Channel
+from spheremark.storage.recordings.families import BrokenMessageError
+from spheremark.storage.recordings.records import Octets, windows
 
 _ENCAPSULATIONS = {0: (">", 8), 1: ("<", 8), 6: (">", 4), 7: ("<", 4)}  # identifier: order, widest
 _SIZES = {"B": 1, "i": 4, "I": 4, "d": 8}
@@ -28,8 +28,7 @@ _LAYOUTS_MAX = 256  # layouts of one length on one channel; real topics have one
 
 _Kind = TypeVar("_Kind", bound=np.generic)
 
-HEADER = """std_msgs/Header header
-"""
+HEADER = """std_msgs/Header header"""
 HEADER_PARTS = """================================================================================
 MSG: std_msgs/Header
 # Standard metadata for higher-level stamped data types.
@@ -205,24 +204,7 @@ class SmallMessages:
 
 
 def heads_alike(batch: Batch, i: int, size: int, varying: Iterable[int]) -> Octets:
-    """Find messages that begin alike.
-
-    Parameters
-    ----------
-    batch : Batch
-        Messages of one channel.
-    i : int
-        The first of them.
-    size : int
-        How many bytes are compared.
-    varying : iterable of int
-        Which of these may differ.
-
-    Returns
-    -------
-    (n, size) uint8
-        The beginnings of message i and of those behind it that are like it.
-    """
+    """Find messages that begin alike."""
     rows = slice(i, i + _ALIKE_MAX)
     n = n_leading(batch.lengths[rows] >= size)
     heads = windows(batch.octets, size)[batch.starts[rows][:n]]
@@ -232,36 +214,12 @@ def heads_alike(batch: Batch, i: int, size: int, varying: Iterable[int]) -> Octe
 
 
 def n_leading(is_so: Mask) -> int:
-    """Count what is so before the first that is not.
-
-    Parameters
-    ----------
-    is_so : (n,) bool
-        What is so.
-
-    Returns
-    -------
-    int
-        From 0 to n.
-    """
+    """Count what is so before the first that is not."""
     return len(is_so) if is_so.all() else int(np.argmin(is_so))
 
 
 def definition_agrees(channel: Channel, expected: str) -> bool:
-    """Say whether the recorded definition has the fields that the decoder reads.
-
-    Parameters
-    ----------
-    channel : Channel
-        The channel; only definitions written as ``ros2msg`` are compared.
-    expected : str
-        The definition as ROS 2 ships it.
-
-    Returns
-    -------
-    bool
-        False when the top level has other fields or another order.
-    """
+    """Say whether the recorded definition has the fields that the decoder reads."""
     text = channel.definition.decode("utf-8", "replace")
     if channel.schema_encoding != "ros2msg" or not text.strip():
         return True
@@ -307,44 +265,12 @@ def _decode(rows: Octets, log_times: Nanos, layout: Layout, order: str) -> Table
 
 
 def stamps_ns(rows: Octets, at: int, order: str) -> Nanos:
-    """Read a time from each of some messages.
-
-    Parameters
-    ----------
-    rows : (n, size) uint8
-        Messages, or equally long beginnings of them.
-    at : int
-        Where it begins.
-    order : str
-        Of bytes: ``<`` or ``>``.
-
-    Returns
-    -------
-    (n,)
-        Times [ns].
-    """
+    """Read a time from each of some messages."""
     seconds = numbers(rows, at, 1, order + "i4")[:, 0].astype(np.int64)
     return seconds * 1_000_000_000 + numbers(rows, at + 4, 1, order + "u4")[:, 0].astype(np.int64)
 
 
 def numbers(rows: Octets, at: int, count: int, kind: str) -> NDArray[np.generic]:
-    """Read a run of numbers from each of some messages.
-
-    Parameters
-    ----------
-    rows : (n, size) uint8
-        Messages, or equally long beginnings of them.
-    at : int
-        Where the run begins.
-    count : int
-        How many numbers it has.
-    kind : str
-        Their type, with the order of bytes.
-
-    Returns
-    -------
-    (n, count)
-        The numbers.
-    """
+    """Read a run of numbers from each of some messages."""
     size = np.dtype(kind).itemsize * count
     return np.ascontiguousarray(rows[:, at : at + size]).view(kind).reshape(len(rows), count)

@@ -17,9 +17,9 @@ import numpy as np
 import zstandard
 from isal.isal_zlib import crc32
 
-from pipelines.threads import by_turns
-from pipelines.values import Nanos
-from storage.recordings.records import RECORD_HEAD, Octets, text, walk
+from spheremark.pipelines.model import Nanos
+from spheremark.pipelines.threads import by_turns
+from spheremark.storage.recordings.records import RECORD_HEAD, Octets, text, walk
 
 _STRETCH = 1 << 26  # [bytes] of chunks that are brought together: to begin anew costs half a ms
 _CHUNK_LIMIT = 1 << 29  # [bytes] a larger decompressed chunk is refused, whatever it declares
@@ -76,28 +76,11 @@ class Chunks:
 
     @property
     def swelling(self) -> float:
-        """Say how much longer chunks are unpacked, judged by those brought so far.
-
-        Returns
-        -------
-        float
-            Length of unpacked chunks over that of packed ones; 1 before the first.
-        """
+        """Say how much longer chunks are unpacked, judged by those brought so far."""
         return self._n_unpacked / self._n_packed
 
     def stretches(self, rows: Nanos) -> Iterator[Stretch]:
-        """Bring chunks, as many at a time as memory should hold.
-
-        Parameters
-        ----------
-        rows : (n, 5)
-            Records of chunks.
-
-        Yields
-        ------
-        Stretch
-            One or more of them; the last one if it holds damage.
-        """
+        """Bring chunks, as many at a time as memory should hold."""
         chunks: list[Chunk] = []
         n_octets = 0
         damage = None

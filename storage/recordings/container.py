@@ -20,10 +20,15 @@ import fsspec
 import numpy as np
 from isal.isal_zlib import crc32
 
-from pipelines.errors import NotFoundError, NotMcapError, RecordingError, TruncatedRecordingError
-from pipelines.values import Nanos
-from storage.recordings.chunks import Chunks
-from storage.recordings.records import (
+from spheremark.pipelines.errors import (
+    NotFoundError,
+    NotMcapError,
+    RecordingError,
+    TruncatedRecordingError,
+)
+from spheremark.pipelines.model import Nanos
+from spheremark.storage.recordings.chunks import Chunks
+from spheremark.storage.recordings.records import (
     CHANNEL,
     CHUNK,
     DATA_END,
@@ -159,18 +164,7 @@ class Container:
         return {channel.topic: channel.schema for channel in self.channels.values()}
 
     def batches(self) -> Iterator[Batch]:
-        """Give all messages, in the order of the file.
-
-        Yields
-        ------
-        Batch
-            Messages of one channel.
-
-        Raises
-        ------
-        TruncatedRecordingError
-            When the walk meets damage, after all that is readable before it.
-        """
+        """Give all messages, in the order of the file."""
         position, is_whole = len(MAGIC), True
         plain = False  # whether messages stand outside chunks
         while is_whole and position < self.size:
@@ -275,25 +269,7 @@ class Container:
 
 @contextmanager
 def opened(url: str | Path) -> Iterator[Container]:
-    """Open a recording for one walk.
-
-    Parameters
-    ----------
-    url : str or Path
-        A path, or any address that fsspec knows; what is not local is copied first.
-
-    Yields
-    ------
-    Container
-        The recording; its batches are valid as long as it is open.
-
-    Raises
-    ------
-    NotFoundError
-        If there is no such file.
-    NotMcapError
-        If it does not begin as an MCAP file.
-    """
+    """Open a recording for one walk."""
     with local_copy(url) as path, path.open("rb") as file:
         if path.stat().st_size == 0:
             raise NotMcapError(f"{path.name} is empty, not an MCAP file: was the upload cut?")
@@ -305,23 +281,7 @@ def opened(url: str | Path) -> Iterator[Container]:
 
 @contextmanager
 def local_copy(url: str | Path) -> Iterator[Path]:
-    """Give the path of a recording on this machine, copied for the time being if it is elsewhere.
-
-    Parameters
-    ----------
-    url : str or Path
-        A path, or any address that fsspec knows.
-
-    Yields
-    ------
-    Path
-        The local file.
-
-    Raises
-    ------
-    NotFoundError
-        If there is no such file.
-    """
+    """Give the path of a recording on this machine, copied if it is elsewhere."""
     if "://" not in str(url) and (here := Path(url)).is_file():
         yield here
         return
@@ -363,23 +323,7 @@ def require_file(path: Path) -> None:
 
 
 def file_digest(url: str | Path) -> str:
-    """Return the SHA-256 of a file's bytes, in hexadecimal.
-
-    Parameters
-    ----------
-    url : str or Path
-        A path, or any address that fsspec knows.
-
-    Returns
-    -------
-    str
-        64 hexadecimal digits.
-
-    Raises
-    ------
-    NotFoundError
-        If there is no such file.
-    """
+    """Return the SHA-256 of a file's bytes, in hexadecimal."""
     digest = hashlib.sha256()
     try:
         with fsspec.open(str(url), "rb") as file:

@@ -11,8 +11,8 @@ from typing import Protocol
 
 import numpy as np
 
-from pipelines.values import Array, Column, Mask, Nanos, Rings
-from storage.recordings.container import Batch
+from spheremark.pipelines.model import Array, Column, Mask, Nanos, Rings
+from spheremark.storage.recordings.container import Batch
 
 _FAR_NS = 86_400e9  # a day: clocks that differ differ for all, or by a mistake of decades
 
@@ -111,26 +111,7 @@ class SeriesDecoder(Decoder, Protocol):
 def series_of(
     topic: str, names: tuple[str, ...], stamps_ns: Nanos, log_times_ns: Nanos, values: Array
 ) -> Series:
-    """Build a series from samples as they were recorded.
-
-    Parameters
-    ----------
-    topic : str
-        Where they come from.
-    names : tuple of str
-        What they are.
-    stamps_ns : (n,)
-        Instants in any order; where all are zero, the times of recording count.
-    log_times_ns : (n,)
-        Times of recording.
-    values : (n, k)
-        Samples; those that are not finite are left out.
-
-    Returns
-    -------
-    Series
-        In the order of time, with the first of samples of one instant.
-    """
+    """Build a series from samples as they were recorded."""
     notes: list[str] = []
     if not stamps_ns.any():
         stamps_ns = log_times_ns
@@ -149,20 +130,7 @@ def series_of(
 
 
 def plausible(stamps_ns: Nanos, log_times_ns: Nanos) -> Mask:
-    """Say which stamps are about as late against the times of recording as the others.
-
-    Parameters
-    ----------
-    stamps_ns : (n,)
-        Stamps of messages.
-    log_times_ns : (n,)
-        When they were recorded.
-
-    Returns
-    -------
-    (n,) bool
-        False for stamps more than a day off: of a node that had no time yet, for one.
-    """
+    """Say which stamps are about as late against the times of recording as the others."""
     late = log_times_ns.astype(np.float64) - stamps_ns.astype(np.float64)
     if not len(late) or np.ptp(late) <= _FAR_NS:
         return np.ones(len(late), np.bool_)

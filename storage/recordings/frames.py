@@ -6,10 +6,10 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from pipelines.geometry import inverse, rigid, skew
-from pipelines.rigs import vlp16
-from pipelines.values import Array, ImuMount, Rig
-from storage.recordings.families import Series
+from spheremark.pipelines.geometry import inverse, rigid, skew
+from spheremark.pipelines.model import Array, ImuMount, Rig
+from spheremark.pipelines.scan.rigs import vlp16
+from spheremark.storage.recordings.families import Series
 
 HEAD, BASE, WORLDS = "gimbal_link", "base_link", ("map", "odom", "world", "earth")
 _UNIT = 1e-3  # how far the norm of a quaternion may be from 1
@@ -78,24 +78,7 @@ class FrameTree:
 def recorded_rig(
     tree: FrameTree, frame: str, imu_frame: str | None
 ) -> tuple[Rig | None, tuple[str, ...]]:
-    """Build the rig from the frames of a recording.
-
-    Parameters
-    ----------
-    tree : FrameTree
-        The frames.
-    frame : str
-        Frame of the LiDAR.
-    imu_frame : str or None
-        Frame of the AHRS, if there is one.
-
-    Returns
-    -------
-    rig : Rig or None
-        None when no chain of frames leads from the LiDAR to a turning head.
-    notes : tuple of str
-        What is missing, as sentences for people.
-    """
+    """Build the rig from the frames of a recording."""
     head = tree.head_of(frame)
     if head is None:
         known = ", ".join(sorted(set(tree.parents) | set(tree.turning))) or "none"

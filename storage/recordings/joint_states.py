@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from storage.recordings import cdr
-from storage.recordings.container import Batch, Channel
-from storage.recordings.families import Series, broken_note, series_of
+from spheremark.storage.recordings import cdr
+from spheremark.storage.recordings.container import Batch, Channel
+from spheremark.storage.recordings.families import Series, broken_note, series_of
 
 SCHEMA = "sensor_msgs/msg/JointState"
 DEFINITION = f"""# State of a set of torque controlled joints.

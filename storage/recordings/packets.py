@@ -18,7 +18,8 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from pipelines.rigs import (
+from spheremark.pipelines.model import Firings, Mask, Nanos, Rings
+from spheremark.pipelines.scan.rigs import (
     FIRING_CYCLE,
     FIRING_ORDER,
     FIRINGS_PER_BLOCK,
@@ -28,19 +29,18 @@ from pipelines.rigs import (
     RANGE_STEP,
     tilted_vlp16,
 )
-from pipelines.threads import side_by_side
-from pipelines.values import Firings, Mask, Nanos, Rings
-from storage.recordings import cdr
-from storage.recordings.container import Batch, Channel
-from storage.recordings.families import (
+from spheremark.pipelines.threads import side_by_side
+from spheremark.storage.recordings import cdr
+from spheremark.storage.recordings.container import Batch, Channel
+from spheremark.storage.recordings.families import (
     BrokenMessageError,
     Returns,
     broken_note,
     far_note,
     plausible,
 )
-from storage.recordings.points import Columns
-from storage.recordings.records import Octets
+from spheremark.storage.recordings.points import Columns
+from spheremark.storage.recordings.records import Octets
 
 SCHEMA = "velodyne_msgs/msg/VelodyneScan"
 DEFINITION = f"""# Velodyne LIDAR scan packets.
@@ -295,20 +295,6 @@ def _complaint(models: Octets) -> str:
 def punctual(stamps_ns: Nanos, micros: Nanos) -> tuple[Nanos, str]:
     """Return the instants of packets by the sensor's clock, set to the recorder's.
 
-    Parameters
-    ----------
-    stamps_ns : (n,)
-        When the recorder says that each packet began.
-    micros : (n,)
-        When the sensor says so: microseconds past an hour of its own.
-
-    Returns
-    -------
-    instants_ns : (n,)
-        The sensor's even clock, which the stamps follow on average, drift included.
-    note : str
-        Why the stamps are taken as they are; empty otherwise.
-
     Notes
     -----
     The sensor's clock is even, the recorder's stamps jitter by milliseconds; a sensor without GPS
@@ -460,22 +446,7 @@ def _put(out, n, aim, steps, reflectivity, sensor):  # type: ignore[no-untyped-d
 
 
 def scans(topic: str, frame: str, firings: Firings, revolution_ns: int) -> Iterator[Item]:
-    """Give one message per revolution, as the driver of a VLP-16 would publish them.
-
-    Parameters
-    ----------
-    topic, frame : str
-        Names of the topic and of the LiDAR's frame.
-    firings : Firings
-        All shots; what does not fill a packet at the end is left out.
-    revolution_ns : int
-        Time that one message spans.
-
-    Yields
-    ------
-    tuple of (int, str, bytes)
-        When it is complete [ns], the topic and the message, stamped with its first packet.
-    """
+    """Give one message per revolution, as the driver of a VLP-16 would publish them."""
     packets = encoded(firings)
     stamps = packets["sec"].astype(np.int64) * 1_000_000_000 + packets["nanosec"]
     turns = (stamps - stamps[0]) // revolution_ns if len(stamps) else stamps
@@ -490,18 +461,7 @@ def scans(topic: str, frame: str, firings: Firings, revolution_ns: int) -> Itera
 
 
 def encoded(firings: Firings) -> NDArray[np.void]:
-    """Return packets with their stamps, as they follow each other in a message.
-
-    Parameters
-    ----------
-    firings : Firings
-        All shots; what does not fill a packet at the end is left out.
-
-    Returns
-    -------
-    (n,) structured
-        ``sec``, ``nanosec``, the 1206 bytes ``data``, and two bytes of padding.
-    """
+    """Return packets with their stamps, as they follow each other in a message."""
     n = len(firings.azimuths) // N_BLOCKS
     rows = slice(n * N_BLOCKS)
     packets = np.zeros(n, _STAMPED)

@@ -10,17 +10,17 @@ from typing import NamedTuple
 
 import numpy as np
 
-from pipelines.values import RING_UNKNOWN, Mask, Nanos
-from storage.recordings import cdr
-from storage.recordings.container import Batch, Channel
-from storage.recordings.families import (
+from spheremark.pipelines.model import RING_UNKNOWN, Mask, Nanos
+from spheremark.storage.recordings import cdr
+from spheremark.storage.recordings.container import Batch, Channel
+from spheremark.storage.recordings.families import (
     BrokenMessageError,
     Returns,
     broken_note,
     far_note,
     plausible,
 )
-from storage.recordings.points import (
+from spheremark.storage.recordings.points import (
     Columns,
     Layout,
     Seen,
@@ -28,8 +28,8 @@ from storage.recordings.points import (
     unpack_any,
     unpack_clouds,
 )
-from storage.recordings.records import Octets
-from storage.recordings.shot_times import (
+from spheremark.storage.recordings.records import Octets
+from spheremark.storage.recordings.shot_times import (
     NO_FIELD,
     SHOTS_MIN,
     fault_of,

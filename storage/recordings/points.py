@@ -14,11 +14,11 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from pipelines.threads import by_turns
-from pipelines.values import RING_UNKNOWN, Array, Column, Index, Mask, Nanos, Rings
-from storage.recordings import cdr
-from storage.recordings.families import BrokenMessageError
-from storage.recordings.records import Octets
+from spheremark.pipelines.model import RING_UNKNOWN, Array, Column, Index, Mask, Nanos, Rings
+from spheremark.pipelines.threads import by_turns
+from spheremark.storage.recordings import cdr
+from spheremark.storage.recordings.families import BrokenMessageError
+from spheremark.storage.recordings.records import Octets
 
 _KINDS = ("", "i1", "u1", "i2", "u2", "i4", "u4", "f4", "f8")  # by PointField.datatype
 _INTENSITIES = ("intensity", "i", "reflectivity", "signal")
@@ -43,18 +43,7 @@ class Columns(NamedTuple):
 
     @classmethod
     def empty(cls, n: int) -> Columns:
-        """Reserve room; memory that is not written costs nothing.
-
-        Parameters
-        ----------
-        n : int
-            Number of returns.
-
-        Returns
-        -------
-        Columns
-            Not filled.
-        """
+        """Reserve room; memory that is not written costs nothing."""
         p, others = _reserved(12 * n), _reserved(13 * n)  # who keeps these may let go of the points
         return cls(
             p.view(np.float32).reshape(n, 3),
@@ -64,48 +53,18 @@ class Columns(NamedTuple):
         )
 
     def taken(self, rows: slice | Index) -> Columns:
-        """Return some of the returns.
-
-        Parameters
-        ----------
-        rows : slice or (n,)
-            Which.
-
-        Returns
-        -------
-        Columns
-            Views, if the rows are a slice.
-        """
+        """Return some of the returns."""
         p, intensities, rings, stamps = self
         return Columns(p[rows], intensities[rows], rings[rows], stamps[rows])
 
     def put(self, row: int, other: Columns) -> None:
-        """Write returns from a row on.
-
-        Parameters
-        ----------
-        row : int
-            The first row.
-        other : Columns
-            What is written; may be rows of these columns.
-        """
+        """Write returns from a row on."""
         rows = slice(row, row + len(other.rings))
         self.p[rows], self.intensities[rows] = other.p, other.intensities
         self.rings[rows], self.stamps[rows] = other.rings, other.stamps
 
     def in_order(self, counts: Index) -> Columns:
-        """Return the returns in the order of their instants; mostly they are in it.
-
-        Parameters
-        ----------
-        counts : (k,)
-            Lengths of stretches that are known to be in order, from the first row on.
-
-        Returns
-        -------
-        Columns
-            As many as the stretches have; views, if nothing had to be moved.
-        """
+        """Return the returns in the order of their instants; mostly they are in it."""
         ends = np.cumsum(counts)
         stamps = self.stamps[: int(counts.sum())]
         begins = (ends - counts)[(counts > 0) & (ends > counts)]
@@ -232,25 +191,7 @@ class Layout:
 
 
 def read_layout(cursor: cdr.Cursor, octets: Octets) -> Layout:
-    """Read the description of a point.
-
-    Parameters
-    ----------
-    cursor : Cursor
-        Before the fields; behind the length of a point afterwards.
-    octets : (size,) uint8
-        The message.
-
-    Returns
-    -------
-    Layout
-        What a point looks like.
-
-    Raises
-    ------
-    BrokenMessageError
-        If there are no coordinates, or a field cannot be.
-    """
+    """Read the description of a point."""
     begin = cursor.at
     fields = dict(_field(cursor) for _ in range(cursor.count(_FIELD_MIN)))
     order = ">" if cursor.number("B") else "<"
@@ -283,26 +224,7 @@ def _checked(fields: dict[str, Field], step: int) -> dict[str, Field]:
 def unpack_any(
     points: Octets, layout: Layout, out: Columns
 ) -> tuple[int, NDArray[np.generic] | None, bool]:
-    """Write the returns of one cloud of any layout, without their instants.
-
-    Parameters
-    ----------
-    points : (size,) uint8
-        Whole points.
-    layout : Layout
-        What they look like.
-    out : Columns
-        With room for all of them, from its first row on.
-
-    Returns
-    -------
-    n : int
-        Number of returns: points that are finite and not at the origin.
-    times : (n,) or None
-        As recorded; none when there is no such field.
-    has_bad_ring : bool
-        Whether one has a laser that cannot be.
-    """
+    """Write the returns of one cloud of any layout, without their instants."""
     rows = np.frombuffer(points, layout.structured)
     with np.errstate(over="ignore", invalid="ignore"):
         p = np.stack([rows[axis] for axis in "xyz"], axis=1).astype(np.float32)
@@ -319,24 +241,7 @@ def unpack_any(
 
 
 def unpack_clouds(octets: Octets, clouds: Nanos, layout: Layout, out: Columns) -> Seen:
-    """Write the returns of clouds and their instants, each from a row of its own on.
-
-    Parameters
-    ----------
-    octets : (size,) uint8
-        What holds the points.
-    clouds : (n, 4)
-        For each: first byte of its points, their number, its stamp [ns], its first row.
-    layout : Layout
-        What the points of all look like; one that can be compiled.
-    out : Columns
-        With room for all of their points.
-
-    Returns
-    -------
-    Seen
-        What was seen in each.
-    """
+    """Write the returns of clouds and their instants, each from a row of its own on."""
     told, compiled = np.empty((len(clouds), 6)), layout.compiled
     p, intensities, rings, stamps = out
     columns = (p.view(np.uint32).ravel(), intensities.view(np.uint32), rings, stamps)

@@ -12,12 +12,12 @@ from typing import Any
 
 import numpy as np
 
-from pipelines.config import StitchingConfig
-from pipelines.errors import InputError, MissingRigError, NotFoundError
-from pipelines.rigs import tilted_vlp16
-from pipelines.values import Array, Index, Nanos, Origin, Rig, ScanLog
-from storage.recordings.container import Batch, Channel, opened
-from storage.recordings.reading import Choice, Decoders, assemble, stem
+from spheremark.pipelines.config import StitchingConfig
+from spheremark.pipelines.errors import InputError, MissingRigError, NotFoundError
+from spheremark.pipelines.model import Array, Index, Nanos, Origin, Rig, ScanLog
+from spheremark.pipelines.scan.rigs import tilted_vlp16
+from spheremark.storage.recordings.container import Batch, Channel, opened
+from spheremark.storage.recordings.reading import Choice, Decoders, assemble, stem
 
 OK, WEAK, REFUSED = "ok", "weak", "refused"
 
@@ -237,7 +237,7 @@ def _described(report: Preflight, log: ScanLog) -> Preflight:
 
 def _judged(report: Preflight, log: ScanLog, skew: float | None) -> Preflight:
     """Return the report with stops, coverage, reasons and verdict."""
-    from pipelines.stitching import choose_rig, pause_notes, split_stops, stitch
+    from spheremark.pipelines.scan.stitching import choose_rig, pause_notes, split_stops, stitch
 
     reasons: list[str] = []
     refusal: InputError | None = None

@@ -12,13 +12,19 @@ from typing import TypeVar
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from pipelines.errors import MissingGimbalAngleError, MissingLidarError, RecordingError
-from pipelines.values import RING_UNKNOWN, ImuMount, Nanos, Origin, Rig, ScanLog
-from storage.recordings import joint_states, orientations, packets, pointclouds, transforms
-from storage.recordings.cdr import definition_agrees
-from storage.recordings.container import Batch, Channel, Container, file_digest, opened
-from storage.recordings.families import LidarDecoder, Returns, Series, SeriesDecoder
-from storage.recordings.frames import FrameTree, recorded_rig
+from spheremark.pipelines.errors import MissingGimbalAngleError, MissingLidarError, RecordingError
+from spheremark.pipelines.model import RING_UNKNOWN, ImuMount, Nanos, Origin, Rig, ScanLog
+from spheremark.storage.recordings import (
+    joint_states,
+    orientations,
+    packets,
+    pointclouds,
+    transforms,
+)
+from spheremark.storage.recordings.cdr import definition_agrees
+from spheremark.storage.recordings.container import Batch, Channel, Container, file_digest, opened
+from spheremark.storage.recordings.families import LidarDecoder, Returns, Series, SeriesDecoder
+from spheremark.storage.recordings.frames import FrameTree, recorded_rig
 
 # By encoding and message type: the decoder, and the definition that it reads. A new family is a
 # module and a line here.
@@ -189,45 +195,12 @@ def read_log(
 
 
 def stem(url: str | Path) -> str:
-    """Return the name of a recording: that of its file, without the ending.
-
-    Parameters
-    ----------
-    url : str or Path
-        Where it is.
-
-    Returns
-    -------
-    str
-        The name.
-    """
+    """Return the name of a recording: that of its file, without the ending."""
     return PurePosixPath(str(url)).stem
 
 
 def assemble(decoders: Decoders, found: dict[str, str], choice: Choice, origin: Origin) -> ScanLog:
-    """Choose among what was decoded and build the log.
-
-    Parameters
-    ----------
-    decoders : Decoders
-        What took the messages.
-    found : dict of str to str
-        Message type of each topic.
-    choice : Choice
-        What the caller wants of it.
-    origin : Origin
-        Name and digest of the recording.
-
-    Returns
-    -------
-    ScanLog
-        The log.
-
-    Raises
-    ------
-    RecordingError
-        As ``read_log`` says.
-    """
+    """Choose among what was decoded and build the log."""
     choice.check(found)
     returns, lidar_notes = _choose_lidar(choice.among(decoders.lidars), found)
     tree = FrameTree()

@@ -8,7 +8,7 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from pipelines.values import Nanos
+from spheremark.pipelines.model import Nanos
 
 Octets = NDArray[np.uint8]
 
@@ -20,70 +20,20 @@ _ROWS = 1 << 12  # records that one step of the walk reports
 
 
 def walk(octets: Octets, position: int) -> tuple[Nanos, int, bool]:
-    """Go on from record to record.
-
-    Parameters
-    ----------
-    octets : (size,) uint8
-        The file, or the records of a chunk.
-    position : int
-        Where a record begins.
-
-    Returns
-    -------
-    rows : (n, 5)
-        Opcode, first byte and length of the body, and of messages channel and log time [ns].
-    position : int
-        Behind the last of them.
-    is_whole : bool
-        False if the next record is cut.
-    """
+    """Go on from record to record."""
     rows = np.empty((min(_ROWS, (len(octets) - position) // RECORD_HEAD + 1), 5), np.int64)
     n, position, is_whole = _walk_kernel(octets, position, rows)
     return rows[:n], position, is_whole
 
 
 def windows(octets: Octets, size: int) -> Octets:
-    """Look at what follows each byte.
-
-    Parameters
-    ----------
-    octets : (n,) uint8
-        Bytes that follow each other in memory.
-    size : int
-        How many to look at.
-
-    Returns
-    -------
-    (n - size + 1, size) uint8
-        Views; NumPy's sliding windows take longer to make than most are used.
-    """
+    """Look at what follows each byte."""
     n = max(len(octets) - size + 1, 0)
     return np.ndarray((n, size), np.uint8, buffer=octets, strides=(1, 1))
 
 
 def text(body: bytes, at: int) -> tuple[str, int]:
-    """Read a string with its length before it.
-
-    Parameters
-    ----------
-    body : bytes
-        Of a record.
-    at : int
-        Where the length begins.
-
-    Returns
-    -------
-    text : str
-        The string.
-    at : int
-        The place behind it.
-
-    Raises
-    ------
-    ValueError
-        If it is longer than its record, or not UTF-8.
-    """
+    """Read a string with its length before it."""
     (length,) = struct.unpack_from("<I", body, at)
     end = at + 4 + length
     if end > len(body):

@@ -12,7 +12,7 @@ from math import isfinite
 import numpy as np
 from numpy.typing import NDArray
 
-from pipelines.values import Array, Mask, Nanos
+from spheremark.pipelines.model import Array, Mask, Nanos
 
 NO_FIELD = "there is no such field"
 SHOTS_MIN = 32  # points that a message needs before its times can be judged
@@ -23,24 +23,7 @@ _ZEROS_MAX = 0.25  # share of zero times that a message with times may have
 
 
 def shot_times(times: NDArray[np.generic] | None, stamp_ns: int, out: Nanos) -> tuple[int, str]:
-    """Write the instant of each return of a message.
-
-    Parameters
-    ----------
-    times : (n,) or None
-        Times as recorded, of any type; none when the points have no such field.
-    stamp_ns : int
-        Stamp of the message.
-    out : (n,)
-        Receives the instants; the stamp throughout when the times are of no use.
-
-    Returns
-    -------
-    span_ns : int
-        From the stamp to the latest instant.
-    fault : str
-        Why the times are of no use, as the end of a sentence; empty when they are of use.
-    """
+    """Write the instant of each return of a message."""
     fault = NO_FIELD
     if times is not None:
         if not len(times):
@@ -66,22 +49,7 @@ def _written(times: NDArray[np.generic], stamp_ns: int, out: Nanos) -> tuple[int
 
 
 def fault_of(low: float, high: float, n_zeros: int, n: int) -> str:
-    """Say what is wrong with the times of a message.
-
-    Parameters
-    ----------
-    low, high : float
-        The earliest and the latest; not finite if one is not.
-    n_zeros : int
-        How many are zero.
-    n : int
-        How many there are.
-
-    Returns
-    -------
-    str
-        The end of a sentence; empty when nothing is wrong.
-    """
+    """Say what is wrong with the times of a message."""
     if not isfinite(high - low):
         return "some of its times are not finite"
     if n < SHOTS_MIN:
@@ -92,24 +60,7 @@ def fault_of(low: float, high: float, n_zeros: int, n: int) -> str:
 
 
 def plain_spans(kind: str, low: Array, high: Array, n_zeros: Nanos, n: Nanos) -> tuple[Nanos, Mask]:
-    """Return how long after their stamps messages end whose times are plainly counted from there.
-
-    Parameters
-    ----------
-    kind : str
-        Type of the times: whole nanoseconds or seconds.
-    low, high : (k,)
-        The earliest and the latest of each message.
-    n_zeros, n : (k,)
-        How many of its times are zero, and how many there are.
-
-    Returns
-    -------
-    spans_ns : (k,)
-        Of the latest; 0 where it is not plain.
-    is_plain : (k,) bool
-        Where there are enough times, and nothing is wrong with them.
-    """
+    """Return how long after their stamps messages end whose times are counted from there."""
     scale = _scale(kind[0])
     is_near = np.maximum(np.abs(low), np.abs(high)) * scale <= _REVOLUTION_LIMIT * 1e9
     is_plain = is_near & (low < high) & (n >= SHOTS_MIN) & (n_zeros <= _ZEROS_MAX * n)
@@ -117,20 +68,7 @@ def plain_spans(kind: str, low: Array, high: Array, n_zeros: Nanos, n: Nanos) ->
 
 
 def plain_span(kind: str, low: float, high: float) -> int | None:
-    """Return how long after its stamp a message ends, if its times are counted from there.
-
-    Parameters
-    ----------
-    kind : str
-        Type of the times: whole nanoseconds or seconds.
-    low, high : float
-        The earliest and the latest.
-
-    Returns
-    -------
-    int or None
-        Of the latest [ns]; none when the times have another meaning.
-    """
+    """Return how long after its stamp a message ends, if its times are counted from there."""
     scale = _scale(kind[0])
     is_plain = max(abs(low), abs(high)) * scale <= _REVOLUTION_LIMIT * 1e9
     return round(high * scale) if is_plain else None

@@ -13,9 +13,15 @@ from mcap.writer import CompressionType, Writer
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from pipelines.errors import ConfigError, RecordingError
-from pipelines.values import Array, Firings, ImuMount, Nanos, Rig, ScanLog
-from storage.recordings import joint_states, orientations, packets, pointclouds, transforms
+from spheremark.pipelines.errors import ConfigError, RecordingError
+from spheremark.pipelines.model import Array, Firings, ImuMount, Nanos, Rig, ScanLog
+from spheremark.storage.recordings import (
+    joint_states,
+    orientations,
+    packets,
+    pointclouds,
+    transforms,
+)
 
 LIDAR_FRAME, IMU_FRAME, HEAD_FRAME, BASE_FRAME = "velodyne", "imu_link", "gimbal_link", "base_link"
 JOINT = "gimbal_joint"

@@ -9,9 +9,9 @@ import pytest
 import uvicorn
 from playwright.sync_api import sync_playwright
 
-from service.app import create_app
-from service.settings import Settings
-from storage.catalogue import Catalogue
+from spheremark.service.http.app import create_app
+from spheremark.service.settings import Settings
+from spheremark.storage.catalogue.catalogue import Catalogue
 from tests.surveyed import fill
 
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser")

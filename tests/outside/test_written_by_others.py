@@ -242,7 +242,7 @@ def log(tmp_path_factory):
 def process(log, *arguments):
     from typer.testing import CliRunner
 
-    from service.cli import app
+    from spheremark.service.cli.main import app
 
     folder, _ = log
     answer = CliRunner().invoke(

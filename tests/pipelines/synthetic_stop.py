@@ -9,9 +9,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from pipelines.geometry import levelling_rotation
-from pipelines.rigs import FIRING_CYCLE, FIRING_ORDER, LASER_CYCLE, tilted_vlp16
-from pipelines.values import Levelling, StitchedCloud
+from spheremark.pipelines.geometry import levelling_rotation
+from spheremark.pipelines.model import Levelling, StitchedCloud
+from spheremark.pipelines.scan.rigs import FIRING_CYCLE, FIRING_ORDER, LASER_CYCLE, tilted_vlp16
 
 RIG = tilted_vlp16("test", (0.05, 0.03))
 LEVEL = Levelling(roll=0.0, pitch=0.0, sigma=1e-3, is_measured=True)

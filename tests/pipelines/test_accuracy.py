@@ -2,9 +2,9 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
-from pipelines.accuracy import UNMATCHED, centre_errors, mean_incidence, summarise
-from pipelines.geometry import inverse, rigid, rot_x, rot_y, rot_z, transform
-from pipelines.values import Beams, ControlMarks, StopTruth
+from spheremark.pipelines.accuracy import UNMATCHED, centre_errors, mean_incidence, summarise
+from spheremark.pipelines.geometry import inverse, rigid, rot_x, rot_y, rot_z, transform
+from spheremark.pipelines.model import Beams, ControlMarks, StopTruth
 
 EXACT = 1e-12  # [m]
 

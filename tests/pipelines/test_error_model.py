@@ -3,8 +3,8 @@ import dataclasses
 import numpy as np
 import pytest
 
-from pipelines.error_model import Demand, ErrorSample, fit_error_model, limits
-from pipelines.errors import TooFewObservationsError
+from spheremark.pipelines.error_model import Demand, ErrorSample, fit_error_model, limits
+from spheremark.pipelines.errors import TooFewObservationsError
 
 EXACT = 1e-12  # [m]
 

@@ -3,7 +3,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from pipelines.geometry import (
+from spheremark.pipelines.geometry import (
     exp_motion,
     included_angle,
     inverse,
@@ -19,7 +19,7 @@ from pipelines.geometry import (
     wrap,
     yaw_pitch_roll,
 )
-from pipelines.values import Levelling
+from spheremark.pipelines.model import Levelling
 from tests.synthetic import lean_matrix, turn_z
 
 ROUNDING = 1e-12  # [rad] and [m] for numbers of the size of ten

@@ -4,12 +4,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from pipelines.accuracy import marker_errors, station_error
-from pipelines.config import SurveyConfig
-from pipelines.errors import MissingRigError, NoMarkersError
-from pipelines.simulation import SimulationConfig, scenario, simulate_stop
-from pipelines.survey import process
-from pipelines.values import ControlMarks, NoFix, Status
+from spheremark.pipelines.accuracy import marker_errors, station_error
+from spheremark.pipelines.config import SurveyConfig
+from spheremark.pipelines.errors import MissingRigError, NoMarkersError
+from spheremark.pipelines.model import ControlMarks, NoFix, Status
+from spheremark.pipelines.simulation import SimulationConfig, scenario, simulate_stop
+from spheremark.pipelines.survey import process
 
 OURS = ("along_beam", "free_station")
 CONFIG = SurveyConfig.from_mapping({"fitting": {"methods": ["along_beam"]}})

@@ -5,9 +5,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from pipelines.config import StitchingConfig
-from pipelines.stitching import stitch
-from pipelines.threads import by_turns, in_processes, side_by_side
+from spheremark.pipelines.config import StitchingConfig
+from spheremark.pipelines.scan.stitching import stitch
+from spheremark.pipelines.threads import by_turns, in_processes, side_by_side
 from tests.synthetic import crooked_rig, scan_log
 
 

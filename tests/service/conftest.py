@@ -6,10 +6,10 @@ import psutil
 import pytest
 from fastapi.testclient import TestClient
 
-from pipelines.simulation import SimulationConfig
-from service.app import create_app
-from service.fieldwork import Assignment, survey
-from service.settings import Settings
+from spheremark.pipelines.simulation import SimulationConfig
+from spheremark.service.cli.fieldwork import Assignment, survey
+from spheremark.service.http.app import create_app
+from spheremark.service.settings import Settings
 
 MCAP = {"Content-Type": "application/vnd.mcap"}
 

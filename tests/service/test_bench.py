@@ -8,11 +8,13 @@ import pytest
 from rich.console import Console
 from typer.testing import CliRunner
 
-from pipelines.errors import RecordingError
-from pipelines.simulation import SimulationConfig, scenario, simulate_stop
-from service import bench, growth, peers, tables, yardstick
-from service.cli import app
-from storage.recordings import read_log, write_log
+from spheremark.pipelines.errors import RecordingError
+from spheremark.pipelines.simulation import SimulationConfig, scenario, simulate_stop
+from spheremark.service.bench import growth, peers, yardstick
+from spheremark.service.bench import speed as bench
+from spheremark.service.cli import tables
+from spheremark.service.cli.main import app
+from spheremark.storage.recordings import read_log, write_log
 
 TURN = 4.0  # [s]: half a million returns
 

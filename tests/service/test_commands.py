@@ -15,11 +15,11 @@ import httpx
 import numpy as np
 import pytest
 
-from pipelines.geometry import levelling_rotation
-from pipelines.values import Levelling
-from service.cli import main
+from spheremark.pipelines.geometry import levelling_rotation
+from spheremark.pipelines.model import Levelling
+from spheremark.service.cli.main import main
 
-COMMAND = (sys.executable, "-m", "service.cli")
+COMMAND = (sys.executable, "-m", "spheremark.service.cli")
 
 
 def run(*arguments, code=0, **environment):

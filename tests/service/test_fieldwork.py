@@ -2,10 +2,10 @@
 
 import json
 
-from pipelines.simulation import SimulationConfig
-from service.fieldwork import Assignment, survey
-from storage.recordings import inspect_log, read_log
-from storage.site_files import read_truth
+from spheremark.pipelines.simulation import SimulationConfig
+from spheremark.service.cli.fieldwork import Assignment, survey
+from spheremark.storage.imports.survey_files import read_truth
+from spheremark.storage.recordings import inspect_log, read_log
 
 QUICK = SimulationConfig(turn=0.5, only_near_spheres=True)
 

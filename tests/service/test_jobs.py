@@ -14,9 +14,9 @@ from distributed import Security
 from distributed.comm import connect
 from fastapi.testclient import TestClient
 
-from service.app import create_app
-from service.settings import Settings
-from storage.recordings import read_log, write_log
+from spheremark.service.http.app import create_app
+from spheremark.service.settings import Settings
+from spheremark.storage.recordings import read_log, write_log
 
 
 def results(site, survey):

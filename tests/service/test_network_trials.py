@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 from rich.console import Console
 
-from pipelines.calibration.gimbal import GIMBAL, values
-from pipelines.network import adjust_network, assemble
-from pipelines.simulation import SimulationConfig
-from pipelines.simulation.rig import nominal_rig
-from service import network_trials
-from service.network_trials import Wish, is_gross_found, run, wrong_rig
+from spheremark.pipelines.calibration.gimbal import GIMBAL, values
+from spheremark.pipelines.network import adjust_network, assemble
+from spheremark.pipelines.simulation import SimulationConfig
+from spheremark.pipelines.simulation.rig import nominal_rig
+from spheremark.service.bench import networks as network_trials
+from spheremark.service.bench.networks import Wish, is_gross_found, run, wrong_rig
 from tests.synthetic import field, pose, sightings
 
 CONFIG = network_trials._CONFIG.resection

@@ -10,19 +10,19 @@ from xml.etree import ElementTree as ET
 import numpy as np
 import pytest
 
-from pipelines.config import SurveyConfig
-from pipelines.rigs import rig_from_mapping, rig_to_mapping
-from pipelines.simulation import SimulationConfig
-from service.cli import main
-from service.fieldwork import Assignment, survey
-from service.networks import (
+from spheremark.pipelines.config import SurveyConfig
+from spheremark.pipelines.scan.rigs import rig_from_mapping, rig_to_mapping
+from spheremark.pipelines.simulation import SimulationConfig
+from spheremark.service.cli.fieldwork import Assignment, survey
+from spheremark.service.cli.main import main
+from spheremark.service.serialise.network import (
     Fieldbook,
     adjust_scans,
     network_answer,
     read_scans,
     with_calibration,
 )
-from storage.site_files import read_control, read_truth
+from spheremark.storage.imports.survey_files import read_control, read_truth
 
 CONFIG = SurveyConfig.from_mapping({"fitting": {"methods": ["along_beam"]}})
 STOPS = ("lane2-stop2", "lane3-stop5", "lane4-stop3")

@@ -6,11 +6,11 @@ from datetime import timedelta
 import pytest
 from fastapi.testclient import TestClient
 
-from service.app import create_app
-from service.settings import Settings
-from storage.catalogue import Catalogue
+from spheremark.service.http.app import create_app
+from spheremark.service.settings import Settings
+from spheremark.storage.catalogue.catalogue import Catalogue
+from spheremark.web import assets
 from tests.surveyed import NOW, fill
-from web import assets
 
 WICKED = "<script>alert('x')</script> & \"more\""
 HTML = {"accept": "text/html"}

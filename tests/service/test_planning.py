@@ -10,16 +10,21 @@ import rasterio
 from rasterio.transform import Affine
 from typer.testing import CliRunner
 
-from pipelines.errors import ConfigError, DegenerateGeometryError, InputError, NotFoundError
-from pipelines.placement import Trial, errors_by_angle, sensor_model, try_at_random
-from pipelines.placement.sensor import Sensor
-from pipelines.study import TABLE_3
-from service.cli import app
-from service.planning import to_csv
-from service.trials import limits_of_results
-from storage.catalogue import Catalogue
-from storage.plan_files import read_keep_out, read_marks, read_stops
-from storage.terrain_files import read_terrain
+from spheremark.pipelines.errors import (
+    ConfigError,
+    DegenerateGeometryError,
+    InputError,
+    NotFoundError,
+)
+from spheremark.pipelines.placement import Trial, errors_by_angle, sensor_model, try_at_random
+from spheremark.pipelines.placement.sensor import Sensor
+from spheremark.pipelines.published import TABLE_3
+from spheremark.service.cli.main import app
+from spheremark.service.planning.random_plans import limits_of_results
+from spheremark.service.serialise.plans import to_csv
+from spheremark.storage.catalogue.catalogue import Catalogue
+from spheremark.storage.imports.plan_files import read_keep_out, read_marks, read_stops
+from spheremark.storage.imports.terrain import read_terrain
 from tests.storage.made_up import made_tables
 
 

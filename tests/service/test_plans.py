@@ -7,9 +7,9 @@ import rasterio
 from fastapi.testclient import TestClient
 from rasterio.transform import Affine
 
-from service.app import create_app
-from service.settings import Settings
-from storage.catalogue import Catalogue
+from spheremark.service.http.app import create_app
+from spheremark.service.settings import Settings
+from spheremark.storage.catalogue.catalogue import Catalogue
 from tests.surveyed import fill
 
 MARKS = [

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from service.precision import Case, Wish, accuracy_table, full_wish
+from spheremark.service.bench.precision import Case, Wish, accuracy_table, full_wish
 
 
 def silent(share, what):

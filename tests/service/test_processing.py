@@ -5,9 +5,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from pipelines.config import SurveyConfig
-from pipelines.values import ControlMarks
-from service.work.processing import summary
+from spheremark.pipelines.config import SurveyConfig
+from spheremark.pipelines.model import ControlMarks
+from spheremark.service.jobs.handlers.process import summary
 from tests.surveyed import marks, stop
 
 

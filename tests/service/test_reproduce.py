@@ -9,13 +9,13 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
-from pipelines.errors import NotFoundError
-from pipelines.reproduction import OURS, PAPER
-from pipelines.study import TABLE_2
-from service.reproduce import Wish, page_of, run
+from spheremark.pipelines.errors import NotFoundError
+from spheremark.pipelines.evaluation.reproduction import OURS, PAPER
+from spheremark.pipelines.published import TABLE_2
+from spheremark.service.bench.reproduce import Wish, page_of, run
+from spheremark.web import assets, theme
+from spheremark.web.pages import reproduction as drawing
 from tests.reproduced import reproduction
-from web import assets, theme
-from web import reproduction as drawing
 
 MM = 1e-9  # [mm]; figures only scale
 STUDY = (
@@ -117,7 +117,8 @@ def test_a_folder_without_real_scans_is_refused_before_anything_is_simulated(tmp
 @pytest.mark.slow
 def test_the_command_writes_page_tables_and_figures_and_says_the_same_as_json(tmp_path):
     done = subprocess.run(
-        [sys.executable, "-m", "service.cli", "reproduce", tmp_path / "out", "--quick", "--json"],
+        [sys.executable, "-m", "spheremark.service.cli", "reproduce", tmp_path / "out",
+         "--quick", "--json"],
         capture_output=True, text=True, check=True, cwd=ROOT,
     )  # fmt: skip
     report = json.loads(done.stdout)

@@ -11,9 +11,9 @@ import pytest
 import uvicorn
 from fastapi.testclient import TestClient
 
-from service.app import create_app
-from service.guard import Guard
-from service.settings import Settings
+from spheremark.service.http.app import create_app
+from spheremark.service.http.security import Guard
+from spheremark.service.settings import Settings
 
 DIGEST = "0" * 64
 WRONG = [  # method, path, arguments, status, code

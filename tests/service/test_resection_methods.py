@@ -6,7 +6,7 @@ from io import StringIO
 
 import pytest
 
-from service.cli import main
+from spheremark.service.cli.main import main
 
 METHODS = ("free_station", "ranges", "paper")
 

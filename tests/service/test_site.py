@@ -9,13 +9,13 @@ import pye57
 import pytest
 from typer.testing import CliRunner
 
-from pipelines.elevation import StationPose
-from pipelines.errors import SpheremarkError
-from service.cli import app
-from service.site import SiteWish, make_site
-from service.work.siting import scratch
-from storage.elevation_files import read_geotiff
-from storage.recordings import read_log, write_log
+from spheremark.pipelines.errors import SpheremarkError
+from spheremark.pipelines.ground_model import StationPose
+from spheremark.service.cli.main import app
+from spheremark.service.jobs.handlers.sites import scratch
+from spheremark.service.jobs.site import SiteWish, make_site
+from spheremark.storage.exports.ground_model import read_geotiff
+from spheremark.storage.recordings import read_log, write_log
 
 
 @pytest.fixture(scope="module")
@@ -193,8 +193,8 @@ def test_what_an_ended_worker_left_is_removed_and_what_is_in_use_is_not(tmp_path
 
 @pytest.mark.slow
 def test_the_command_puts_two_stops_into_one_frame(tmp_path):
-    from pipelines.simulation import SimulationConfig
-    from service.fieldwork import Assignment, survey
+    from spheremark.pipelines.simulation import SimulationConfig
+    from spheremark.service.cli.fieldwork import Assignment, survey
 
     wanted = Assignment(
         scenario="paper-field",

@@ -9,14 +9,14 @@ import numpy as np
 import pytest
 from fastapi.testclient import TestClient
 
-from pipelines.config import SurveyConfig
-from pipelines.simulation import SimulationConfig
-from service.app import create_app
-from service.fieldwork import Assignment, survey
-from service.settings import Settings
-from service.work.calibrating import logs_of
-from service.work.orders import JobKind, Log, Order
-from storage.recordings import read_log, write_log
+from spheremark.pipelines.config import SurveyConfig
+from spheremark.pipelines.simulation import SimulationConfig
+from spheremark.service.cli.fieldwork import Assignment, survey
+from spheremark.service.http.app import create_app
+from spheremark.service.jobs.handlers.calibrate import logs_of
+from spheremark.service.jobs.specification import JobKind, Log, Order
+from spheremark.service.settings import Settings
+from spheremark.storage.recordings import read_log, write_log
 
 STOPS = ("lane2-stop2", "lane4-stop3")
 

@@ -4,10 +4,10 @@ import asyncio
 import threading
 from types import SimpleNamespace
 
-from service.jobs import JobQueue
-from service.settings import Settings
-from service.work import Outcome
-from storage.catalogue import Catalogue
+from spheremark.service.jobs.handlers import Outcome
+from spheremark.service.jobs.queue import JobQueue
+from spheremark.service.settings import Settings
+from spheremark.storage.catalogue.catalogue import Catalogue
 
 STARTED = {"event": "started", "percent": 0.0, "message": "Started.", "worker": "tcp://far"}
 

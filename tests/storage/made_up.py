@@ -5,10 +5,9 @@ from datetime import UTC, datetime
 
 import numpy as np
 
-from pipelines.config import SurveyConfig
-from pipelines.geometry import levelling_rotation, rigid, rot_x, rot_y, rot_z, skew
-from pipelines.rigs import tilted_vlp16
-from pipelines.values import (
+from spheremark.pipelines.config import SurveyConfig
+from spheremark.pipelines.geometry import levelling_rotation, rigid, rot_x, rot_y, rot_z, skew
+from spheremark.pipelines.model import (
     Exclusion,
     Levelling,
     MarkerFits,
@@ -22,7 +21,8 @@ from pipelines.values import (
     SubsetFixes,
     Truth,
 )
-from storage.results import RunInfo, tables
+from spheremark.pipelines.scan.rigs import tilted_vlp16
+from spheremark.storage.catalogue.results import RunInfo, tables
 from tests.synthetic import field, marker_fit
 
 ROLL, PITCH, YAW = 0.02, -0.03, 0.7

@@ -4,7 +4,7 @@ import numpy as np
 from mcap.writer import CompressionType, Writer
 from rosbags.typesys import Stores, get_typestore
 
-from storage.recordings import joint_states, orientations, pointclouds, transforms
+from spheremark.storage.recordings import joint_states, orientations, pointclouds, transforms
 
 STORE = get_typestore(Stores.ROS2_HUMBLE)
 DEFINITIONS = {

@@ -4,17 +4,24 @@ import duckdb
 import numpy as np
 import pytest
 
-from pipelines.errors import NotFoundError
-from pipelines.geometry import exp_motion, inverse, rigid, rot_z, transform, yaw_pitch_roll
-from pipelines.rigs import rig_digest, rig_to_mapping, tilted_vlp16
-from pipelines.values import ControlMarks, StopTruth, Truth
-from storage.adjustments import SCHEMAS, tables, with_errors
-from storage.calibrations import SCHEMAS as CALIBRATION_SCHEMAS
-from storage.calibrations import tables as calibration_tables
-from storage.catalogue import Catalogue
-from storage.centres import read_centres
-from storage.documents import documents
-from storage.migrations import migrate, released
+from spheremark.pipelines.errors import NotFoundError
+from spheremark.pipelines.geometry import (
+    exp_motion,
+    inverse,
+    rigid,
+    rot_z,
+    transform,
+    yaw_pitch_roll,
+)
+from spheremark.pipelines.model import ControlMarks, StopTruth, Truth
+from spheremark.pipelines.scan.rigs import rig_digest, rig_to_mapping, tilted_vlp16
+from spheremark.storage.catalogue.adjustments import SCHEMAS, tables, with_errors
+from spheremark.storage.catalogue.calibrations import SCHEMAS as CALIBRATION_SCHEMAS
+from spheremark.storage.catalogue.calibrations import tables as calibration_tables
+from spheremark.storage.catalogue.catalogue import Catalogue
+from spheremark.storage.catalogue.centres import read_centres
+from spheremark.storage.catalogue.documents import documents
+from spheremark.storage.catalogue.migrations import migrate, released
 from tests.storage.made_up import made_tables, stop
 
 AWAY = rigid(rot_z(1.1), [40.0, -3.0, 2.0])  # where the free network lies

@@ -11,12 +11,12 @@ import numpy as np
 import pyarrow as pa
 import pytest
 
-from pipelines.errors import ConflictError, ControlError, InputError, NotFoundError
-from pipelines.rigs import rig_to_mapping
-from pipelines.values import ControlMarks
-from storage.catalogue import Catalogue
-from storage.migrations import SchemaConflictError
-from storage.records import JobStatus
+from spheremark.pipelines.errors import ConflictError, ControlError, InputError, NotFoundError
+from spheremark.pipelines.model import ControlMarks
+from spheremark.pipelines.scan.rigs import rig_to_mapping
+from spheremark.storage.catalogue.catalogue import Catalogue
+from spheremark.storage.catalogue.migrations import SchemaConflictError
+from spheremark.storage.catalogue.records import JobStatus
 from tests.storage.made_up import MARKS, made_tables, truth
 
 ROOT = Path(__file__).parents[2]
@@ -71,8 +71,9 @@ N_FITS = "SELECT count(*) AS n FROM marker_fits"
 def test_a_database_that_another_process_has_open_is_refused(tmp_path):
     with opened(tmp_path) as catalogue:
         code = (
-            "import sys; from pathlib import Path; from storage.catalogue import Catalogue\n"
-            "from pipelines.errors import ConflictError\n"
+            "import sys; from pathlib import Path\n"
+            "from spheremark.storage.catalogue.catalogue import Catalogue\n"
+            "from spheremark.pipelines.errors import ConflictError\n"
             "try: Catalogue(Path(sys.argv[1]), snapshots=Path(sys.argv[2]))\n"
             "except ConflictError as error: print(error)"
         )

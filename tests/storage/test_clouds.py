@@ -6,8 +6,8 @@ import open3d as o3d
 import pyarrow.parquet as pq
 import pytest
 
-from pipelines.errors import InputError, NotFoundError
-from storage.clouds import NO_MARKER, read_cloud, to_ply, view, write_cloud
+from spheremark.pipelines.errors import InputError, NotFoundError
+from spheremark.storage.clouds.stop import NO_MARKER, read_cloud, to_ply, view, write_cloud
 from tests.storage.made_up import R_station_base, stop
 
 MEMBERS = 60  # ten on each of six marks

@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 import rasterio
 
-from pipelines.elevation import ElevationModel
-from pipelines.errors import InputError, NotFoundError
-from storage.elevation_files import read_geotiff, write_geotiff
+from spheremark.pipelines.errors import InputError, NotFoundError
+from spheremark.pipelines.ground_model import ElevationModel
+from spheremark.storage.exports.ground_model import read_geotiff, write_geotiff
 
 
 @pytest.fixture

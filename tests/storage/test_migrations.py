@@ -4,7 +4,12 @@ from dataclasses import replace
 import duckdb
 import pytest
 
-from storage.migrations import Migration, SchemaConflictError, migrate, released
+from spheremark.storage.catalogue.migrations import (
+    Migration,
+    SchemaConflictError,
+    migrate,
+    released,
+)
 
 N = len(released())
 NEXT = Migration(number=N + 1, name="next", sql="CREATE TABLE extra (x_m DOUBLE);")

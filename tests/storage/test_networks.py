@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 from scipy.optimize import least_squares
 
-from pipelines.config import ResectionConfig
-from pipelines.network import adjust_network, assemble
-from storage.networks import format_coordinates, format_gama, write_gama
+from spheremark.pipelines.config import ResectionConfig
+from spheremark.pipelines.network import adjust_network, assemble
+from spheremark.storage.exports.network import format_coordinates, format_gama, write_gama
 from tests.synthetic import field, pose, sightings
 
 CONFIG = ResectionConfig(sigma_common=0.0, sigma_range=0.0)

@@ -12,12 +12,12 @@ from mcap_ros2.decoder import DecoderFactory
 from numpy.testing import assert_allclose, assert_array_equal
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
-from pipelines.errors import MissingLidarError
-from pipelines.rigs import FIRING_ORDER
-from pipelines.simulation import SimulationConfig, scenario, simulate_stop
-from pipelines.values import Firings
-from storage.recordings import inspect_log, read_log, write_log
-from storage.recordings.packets import DEFINITION, SCHEMA, encoded, punctual
+from spheremark.pipelines.errors import MissingLidarError
+from spheremark.pipelines.model import Firings
+from spheremark.pipelines.scan.rigs import FIRING_ORDER
+from spheremark.pipelines.simulation import SimulationConfig, scenario, simulate_stop
+from spheremark.storage.recordings import inspect_log, read_log, write_log
+from spheremark.storage.recordings.packets import DEFINITION, SCHEMA, encoded, punctual
 from tests.storage.recorder import DEFINITIONS, T0, cloud, joints, record, turning, velodyne
 
 REAL = Path(__file__).parents[3] / "shared" / "real" / "vlp16_packets"

@@ -18,12 +18,12 @@ from numpy.testing import assert_allclose, assert_array_equal
 from rosbags.highlevel import AnyReader
 from scipy.spatial.transform import Rotation
 
-from pipelines.errors import ConfigError
-from pipelines.geometry import rigid, rot_x, rot_y, rot_z
-from pipelines.rigs import tilted_vlp16, vlp16
-from pipelines.values import RING_UNKNOWN, ImuMount, Origin, ScanLog
-from storage.recordings import file_digest, read_log, write_log
-from storage.recordings.container import Container, opened
+from spheremark.pipelines.errors import ConfigError
+from spheremark.pipelines.geometry import rigid, rot_x, rot_y, rot_z
+from spheremark.pipelines.model import RING_UNKNOWN, ImuMount, Origin, ScanLog
+from spheremark.pipelines.scan.rigs import tilted_vlp16, vlp16
+from spheremark.storage.recordings import file_digest, read_log, write_log
+from spheremark.storage.recordings.container import Container, opened
 from tests.storage.recorder import (
     DEFINITIONS,
     STORE,

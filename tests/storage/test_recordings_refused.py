@@ -14,7 +14,7 @@ from mcap.writer import CompressionType
 from numpy.testing import assert_allclose
 from scipy.spatial.transform import Rotation
 
-from pipelines.errors import (
+from spheremark.pipelines.errors import (
     MissingGimbalAngleError,
     MissingLidarError,
     NotFoundError,
@@ -23,11 +23,11 @@ from pipelines.errors import (
     SpheremarkError,
     TruncatedRecordingError,
 )
-from pipelines.rigs import tilted_vlp16
-from pipelines.values import Origin, ScanLog
-from storage.recordings import inspect_log, read_log, write_log
-from storage.recordings.container import opened
-from storage.recordings.records import MAGIC
+from spheremark.pipelines.model import Origin, ScanLog
+from spheremark.pipelines.scan.rigs import tilted_vlp16
+from spheremark.storage.recordings import inspect_log, read_log, write_log
+from spheremark.storage.recordings.container import opened
+from spheremark.storage.recordings.records import MAGIC
 from tests.storage.recorder import T0, cloud, joints, record, small_log, turning, velodyne
 
 

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
-from pipelines.errors import RecordingError
-from storage.reference_scans import read_packets, read_points
+from spheremark.pipelines.errors import RecordingError
+from spheremark.storage.imports.reference_scans import read_packets, read_points
 
 
 def packet(distances):

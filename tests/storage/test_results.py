@@ -5,10 +5,10 @@ import duckdb
 import numpy as np
 import pytest
 
-from pipelines.errors import InputError
-from pipelines.rigs import rig_digest, rig_from_mapping
-from storage.migrations import migrate, released
-from storage.results import TABLES, tables, with_errors
+from spheremark.pipelines.errors import InputError
+from spheremark.pipelines.scan.rigs import rig_digest, rig_from_mapping
+from spheremark.storage.catalogue.migrations import migrate, released
+from spheremark.storage.catalogue.results import TABLES, tables, with_errors
 from tests.storage.made_up import (
     LEVELLING,
     MARKS,

@@ -7,8 +7,8 @@ from pathlib import Path
 import psutil
 import pytest
 
-from storage.catalogue import Catalogue
-from storage.sandbox import (
+from spheremark.storage.catalogue.catalogue import Catalogue
+from spheremark.storage.catalogue.sandbox import (
     QueryLimits,
     QueryRejectedError,
     QueryTimeoutError,
@@ -194,7 +194,7 @@ def test_a_query_that_runs_too_long_is_ended_and_its_process_gone(ask):
     with pytest.raises(QueryTimeoutError, match=r"ended after 0\.6 s, its time limit"):
         ask(endless, seconds=0.6)
     left = [child.cmdline() for child in psutil.Process().children(recursive=True)]
-    assert not [line for line in left if "storage.sandbox" in line]
+    assert not [line for line in left if "spheremark.storage.catalogue.sandbox" in line]
 
 
 def test_the_process_of_a_query_sees_no_settings_of_the_service(ask, monkeypatch):

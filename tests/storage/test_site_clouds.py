@@ -14,10 +14,10 @@ import numpy as np
 import pye57
 import pytest
 
-from pipelines.elevation import StationPoints
-from pipelines.errors import InputError
-from pipelines.geometry import rigid, rot_y, rot_z
-from storage.site_clouds import E57File, LazFile
+from spheremark.pipelines.errors import InputError
+from spheremark.pipelines.geometry import rigid, rot_y, rot_z
+from spheremark.pipelines.ground_model import StationPoints
+from spheremark.storage.clouds.site import E57File, LazFile
 
 DAY = date(2026, 5, 11)
 

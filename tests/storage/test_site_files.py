@@ -8,11 +8,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 from numpy.testing import assert_allclose, assert_array_equal
 
-from pipelines.errors import ControlError, NotFoundError, RigError, TruthError
-from pipelines.geometry import rigid, rot_x, rot_z
-from pipelines.rigs import rig_to_mapping, tilted_vlp16
-from pipelines.values import ControlMarks, StopTruth, Truth
-from storage.site_files import (
+from spheremark.pipelines.errors import ControlError, NotFoundError, RigError, TruthError
+from spheremark.pipelines.geometry import rigid, rot_x, rot_z
+from spheremark.pipelines.model import ControlMarks, StopTruth, Truth
+from spheremark.pipelines.scan.rigs import rig_to_mapping, tilted_vlp16
+from spheremark.storage.imports.survey_files import (
     CONTROL_COLUMNS,
     ControlLayout,
     format_control,

@@ -2,8 +2,9 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
-from pipelines.subsets import angles_that_keep, theory_of_pairs
-from web import angles, theme
+from spheremark.pipelines.positioning.subsets import angles_that_keep, theory_of_pairs
+from spheremark.web import theme
+from spheremark.web.figures import included_angle as angles
 
 MM = 1e-9  # [mm]; figures only scale
 TOLERANCE = 0.03

@@ -2,10 +2,12 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
-from pipelines.config import FITTING_METHODS
-from pipelines.study import TABLE_2
-from web import figures, maps, theme
-from web.assets import static_folder
+from spheremark.pipelines.config import FITTING_METHODS
+from spheremark.pipelines.published import TABLE_2
+from spheremark.web import theme
+from spheremark.web.assets import static_folder
+from spheremark.web.figures import maps
+from spheremark.web.figures import survey as figures
 
 MM = 1e-9  # [mm]; figures only scale
 

@@ -1,8 +1,8 @@
 import numpy as np
 import pytest
 
-from pipelines.errors import InputError
-from web.filters import Filters
+from spheremark.pipelines.errors import InputError
+from spheremark.web.pages.filters import Filters
 
 TABLE = {
     "stop": np.array(["lane1-stop1", "lane1-stop2", "lane2-stop1"], dtype=object),

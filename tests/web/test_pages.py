@@ -3,7 +3,9 @@ import json
 import numpy as np
 import pytest
 
-from web import assets, pages, readouts, templating
+from spheremark.web import assets, templating
+from spheremark.web.pages import readouts
+from spheremark.web.pages import results as pages
 
 
 def rows(errors, sigmas, marks, method="along_beam"):

@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
-from web import scene
+from spheremark.web.figures import scene
 
 CENTRE = np.array([6.0, 0.0, 0.5])
 RADIUS = 0.1

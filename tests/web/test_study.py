@@ -1,8 +1,8 @@
 import numpy as np
 import pytest
 
-from pipelines.error_model import Bound
-from web import study
+from spheremark.pipelines.error_model import Bound
+from spheremark.web.pages import statements as study
 
 
 def fits(n_stops=8, *, with_errors=True):

@@ -1,11 +1,11 @@
 import numpy as np
 import pytest
 
-from pipelines.simulation import Field, SimulationConfig, Stop, scenario, simulate_stop
-from pipelines.simulation.field import marker_surfaces
-from pipelines.simulation.scene import Mesh, Scene, terrain_mesh
-from pipelines.simulation.terrain import Terrain
-from pipelines.values import ControlMarks
+from spheremark.pipelines.model import ControlMarks
+from spheremark.pipelines.simulation import Field, SimulationConfig, Stop, scenario, simulate_stop
+from spheremark.pipelines.simulation.field import marker_surfaces
+from spheremark.pipelines.simulation.scene import Mesh, Scene, terrain_mesh
+from spheremark.pipelines.simulation.terrain import Terrain
 
 MARKS = np.array([[4.0, 1.0, 1.1], [-1.0, 5.0, 0.9], [-3.0, -2.5, 1.3]])
 

@@ -2,8 +2,8 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
-from pipelines.simulation.echo import Aims, trace
-from pipelines.simulation.scene import Mesh, Poles, Scene, Spheres
+from spheremark.pipelines.simulation.echo import Aims, trace
+from spheremark.pipelines.simulation.scene import Mesh, Poles, Scene, Spheres
 
 DIVERGENCE = np.array([3.0e-3, 1.5e-3])
 RADIUS, DISTANCE = 0.100, 7.5

@@ -2,11 +2,11 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
-from pipelines.errors import ConfigError
-from pipelines.simulation import SimulationConfig, scenario, simulate_stop
-from pipelines.simulation.field import PAPER_DISTANCES
-from pipelines.simulation.rocks import draw_rocks
-from pipelines.simulation.terrain import rough_terrain
+from spheremark.pipelines.errors import ConfigError
+from spheremark.pipelines.simulation import SimulationConfig, scenario, simulate_stop
+from spheremark.pipelines.simulation.field import PAPER_DISTANCES
+from spheremark.pipelines.simulation.rocks import draw_rocks
+from spheremark.pipelines.simulation.terrain import rough_terrain
 
 FIRED = 16 * 13.3 / 55.296e-6  # half a revolution before and after the turn included
 

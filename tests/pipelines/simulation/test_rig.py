@@ -3,9 +3,10 @@ import pytest
 from numpy.testing import assert_allclose
 from scipy.spatial.transform import Rotation
 
-from pipelines.errors import ConfigError
-from pipelines.simulation import SimulationConfig, commensurability
-from pipelines.simulation.rig import (
+from spheremark.pipelines.errors import ConfigError
+from spheremark.pipelines.model import ImuMount
+from spheremark.pipelines.simulation import SimulationConfig, commensurability
+from spheremark.pipelines.simulation.rig import (
     ahrs_samples,
     even_turn,
     joint_samples,
@@ -14,7 +15,6 @@ from pipelines.simulation.rig import (
     true_rig,
     turning,
 )
-from pipelines.values import ImuMount
 
 
 @pytest.mark.parametrize("turn", [18.0, 12.0, 36.0, 9.0])

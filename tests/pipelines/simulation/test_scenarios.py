@@ -5,11 +5,11 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
-from pipelines.simulation import SimulationConfig, scenario, simulate_stop, survey_truth
-from pipelines.simulation.bodies import box, cylinder, ellipsoid, leaves
-from pipelines.simulation.lane import LANE_DISTANCES
-from pipelines.simulation.scene import Mesh, Poles, Scene, Spheres, caster
-from pipelines.simulation.visibility import visible_shares
+from spheremark.pipelines.simulation import SimulationConfig, scenario, simulate_stop, survey_truth
+from spheremark.pipelines.simulation.bodies import box, cylinder, ellipsoid, leaves
+from spheremark.pipelines.simulation.lane import LANE_DISTANCES
+from spheremark.pipelines.simulation.scene import Mesh, Poles, Scene, Spheres, caster
+from spheremark.pipelines.simulation.visibility import visible_shares
 
 
 @pytest.fixture(scope="module")

@@ -4,11 +4,11 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
-from pipelines.geometry import rigid, rot_z
-from pipelines.simulation import SimulationConfig
-from pipelines.simulation.echo import Echoes
-from pipelines.simulation.rig import even_turn, nominal_rig
-from pipelines.simulation.sensor import aim, fire, may_pass, record
+from spheremark.pipelines.geometry import rigid, rot_z
+from spheremark.pipelines.simulation import SimulationConfig
+from spheremark.pipelines.simulation.echo import Echoes
+from spheremark.pipelines.simulation.rig import even_turn, nominal_rig
+from spheremark.pipelines.simulation.sensor import aim, fire, may_pass, record
 
 N_FIRINGS = 4008
 CONFIG = SimulationConfig()

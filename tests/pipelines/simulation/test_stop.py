@@ -5,12 +5,12 @@ import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 from scipy.spatial.transform import Rotation
 
-from pipelines.config import StitchingConfig
-from pipelines.errors import InputError, NotFoundError
-from pipelines.rigs import rig_digest, tilted_vlp16
-from pipelines.simulation import SimulationConfig, simulate_stop, survey_truth
-from pipelines.stitching import stitch
-from pipelines.values import ImuMount
+from spheremark.pipelines.config import StitchingConfig
+from spheremark.pipelines.errors import InputError, NotFoundError
+from spheremark.pipelines.model import ImuMount
+from spheremark.pipelines.scan.rigs import rig_digest, tilted_vlp16
+from spheremark.pipelines.scan.stitching import stitch
+from spheremark.pipelines.simulation import SimulationConfig, simulate_stop, survey_truth
 
 FLOAT32 = 2e-6  # [m] what is left of a range of up to 30 m in single precision
 POLE_FLAT = 2e-4  # [m] a pole is a prism of 24 sides

@@ -1,0 +1,1 @@
+"""Station positions from spherical markers and a gimbal-mounted LiDAR."""

@@ -1,0 +1,180 @@
+"""The returns about some places.
+
+Hides how neighbours are found: returns sorted by the cells of the ground grid, only those that
+matter.
+"""
+
+from __future__ import annotations
+
+from itertools import accumulate
+from typing import NamedTuple
+
+import numba
+import numpy as np
+from numpy.typing import NDArray
+
+from spheremark.pipelines.detection.cells import Cells, Layout, rows_in
+from spheremark.pipelines.detection.target import rays_of
+from spheremark.pipelines.model import Array, Column, Mask
+from spheremark.pipelines.threads import side_by_side
+
+_REACH = 4.5  # radii about a seed whose returns decide whether a ball stands free there
+
+_GOLDEN = 0.5 * (np.sqrt(5.0) - 1.0)  # its multiples are spread evenly and never in step
+_ROUNDED = 1e-4  # [m]: more than a cell's edge may be off by rounding
+
+_Rows = NDArray[np.int32]
+
+
+class Patches(NamedTuple):
+    """Returns sorted by cell, for the cells about the seeds.
+
+    Attributes
+    ----------
+    starts : (n_side ** 2 + 2,) int32
+        The returns of a cell are ``points[starts[cell]:starts[cell + 1]]``.
+    points : (m, 3) float32
+        The returns themselves [m].
+    n_side : int
+        Cells along one side.
+    edge : float
+        Edge of a cell [m].
+    R_station_base : (3, 3)
+        Levelling.
+    reach : float
+        How far about a seed returns are looked at [m].
+    """
+
+    starts: NDArray[np.int32]
+    points: Column
+    n_side: int
+    edge: float
+    R_station_base: Array
+    reach: float
+
+
+def patches_about(p_base: Column, cells: Cells, seeds: Array, radius: float) -> Patches:
+    """Return the returns about some places, by cell."""
+    reach, layout = _REACH * radius, cells.layout
+    margin = int(np.ceil(reach / layout.edge)) + 1
+    is_wanted = _wanted(layout, cells.R_station_base, seeds, margin)
+    starts, points = _sorted(p_base, cells.ground, is_wanted)
+    return Patches(starts, points, layout.n_side, layout.edge, cells.R_station_base, reach)
+
+
+def _sorted(
+    p_base: Column, cells: NDArray[np.int32], is_wanted: Mask
+) -> tuple[NDArray[np.int32], Column]:
+    """Sort the returns in some cells by cell, by counting; those of a cell stay in their order.
+
+    Each part of the returns is counted on its own, and later finds its places behind those of the
+    parts before.
+    """
+
+    def counted(first: int, end: int) -> tuple[_Rows, _Rows, _Rows]:
+        rows, own = rows_in(cells, is_wanted, first, end)
+        return rows, own, _counts(own, len(is_wanted))
+
+    parts = side_by_side(counted, len(p_base))
+    counts = [each for _, _, each in parts]
+    starts = np.zeros(len(is_wanted) + 1, np.int32)
+    np.cumsum(sum(counts), out=starts[1:])
+    points = np.empty((starts[-1], 3), np.float32)
+    places = accumulate(counts[:-1], initial=starts[:-1].copy())
+    jobs = [(rows, own, free) for (rows, own, _), free in zip(parts, places, strict=True)]
+    side_by_side(
+        lambda first, end: [_place(p_base, *job, points) for job in jobs[first:end]],
+        len(jobs),
+        worth=2,
+    )
+    return starts, points
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def runs_about(patches: Patches, c: Array) -> NDArray[np.int32]:
+    """Return the returns in the cells that may hold some within reach of a place."""
+    bottom, top = _span(patches, patches.R_station_base[0], c)
+    low, high = _span(patches, patches.R_station_base[1], c)
+    runs = np.empty((max(top + 1 - bottom, 0), 2), np.int32)
+    for k in range(len(runs)):
+        cell = (bottom + k) * patches.n_side
+        runs[k, 0], runs[k, 1] = patches.starts[cell + low], patches.starts[cell + high + 1]
+    return runs
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def rays_near(patches: Patches, runs: NDArray[np.int32], c: Array, every: float) -> Array:
+    """Return the rays to the returns within reach of a place, or to a sample of them."""
+    points, x, y, z, reach2 = patches.points, c[0], c[1], c[2], patches.reach**2
+    rows, n, n_near = np.empty(int(np.sum(runs[:, 1] - runs[:, 0]) / every), np.uint32), 0, 0
+    for k in range(len(runs)):
+        n_run = int((runs[k, 1] - runs[k, 0]) / every)
+        _sample(runs[k, 0], every, rows[n : n + n_run])
+        n += n_run
+    for i in range(n):
+        row = rows[i]
+        p, q, r = points[row, 0] - x, points[row, 1] - y, points[row, 2] - z
+        rows[n_near] = row  # kept only if the next one does not take its place
+        n_near += p * p + q * q + r * r < reach2
+    rays: Array = rays_of(points, rows[:n_near])
+    return rays
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _sample(first: int, every: float, rows: NDArray[np.uint32]) -> None:
+    """Write one of so many rows of a run, here and there; all of them with 1."""
+    for j in range(len(rows)):
+        aside = _GOLDEN * j
+        skipped = (j + aside - np.floor(aside)) * every if every > 1.0 else float(j)
+        rows[j] = first + np.int32(skipped)
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _span(patches: Patches, v_axis: Array, c: Array) -> tuple[int, int]:
+    """Return the first and the last cell along an axis that may hold returns within reach."""
+    place = _along(v_axis, c)
+    reach, half = patches.reach + _ROUNDED, patches.n_side // 2
+    first = int(np.floor((place - reach) / patches.edge)) + half
+    last = int(np.floor((place + reach) / patches.edge)) + half
+    return max(first, 0), min(last, patches.n_side - 1)
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _along(v_axis: Array, c: Array) -> float:
+    """Return how far along an axis a place lies."""
+    return float(v_axis[0] * c[0] + v_axis[1] * c[1] + v_axis[2] * c[2])
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _wanted(layout: Layout, R_station_base: Array, places: Array, margin: int) -> Mask:
+    """Tell which cells are those of some places, or near them; what is beyond the grid is not."""
+    n_side, last = layout.n_side, layout.n_side - 1
+    is_wanted = np.zeros(n_side * n_side + 1, np.bool_)
+    for i in range(len(places)):
+        x, y = _along(R_station_base[0], places[i]), _along(R_station_base[1], places[i])
+        row = min(max(int(np.floor(x / layout.edge)) + n_side // 2, 0), last)
+        column = min(max(int(np.floor(y / layout.edge)) + n_side // 2, 0), last)
+        for k in range(max(row - margin, 0), min(row + margin, last) + 1):
+            for m in range(max(column - margin, 0), min(column + margin, last) + 1):
+                is_wanted[k * n_side + m] = True
+    return is_wanted
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _counts(cells: _Rows, n_cells: int) -> _Rows:
+    """Return how often each cell occurs."""
+    counts = np.zeros(n_cells, np.int32)
+    for cell in cells:
+        counts[cell] += 1
+    return counts
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _place(p_base: Column, rows: _Rows, cells: _Rows, free: _Rows, points: Column) -> None:
+    """Write some returns, each to the next free place of its cell."""
+    for i in range(len(rows)):
+        row, cell = np.uint32(rows[i]), np.uint32(cells[i])
+        place = np.uint32(free[cell])
+        free[cell] += 1
+        points[place, 0], points[place, 1] = p_base[row, 0], p_base[row, 1]
+        points[place, 2] = p_base[row, 2]

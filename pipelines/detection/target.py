@@ -1,0 +1,81 @@
+"""What is looked for, and how beams pass it."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numba
+import numpy as np
+from numpy.typing import NDArray
+
+from spheremark.pipelines.model import Array, Column
+
+
+class Ball(NamedTuple):
+    """What is looked for: radius [m], upward unit vector, full width of the beams [rad]."""
+
+    radius: float
+    up: Array
+    divergence: float
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def blur_at(c: Array, ball: Ball) -> float:
+    """Return half the width of a beam at a place."""
+    return float(0.5 * ball.divergence * np.sqrt(c[0] ** 2 + c[1] ** 2 + c[2] ** 2))
+
+
+class View(NamedTuple):
+    """A centre [m], and unit vectors across and up the view of it."""
+
+    x: float
+    y: float
+    z: float
+    across: tuple[float, float, float]
+    up: tuple[float, float, float]
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def view_of(c: Array, up: Array) -> View:
+    """Return how a centre is looked at."""
+    distance = np.sqrt(c[0] ** 2 + c[1] ** 2 + c[2] ** 2)
+    x, y, z = c[0] / distance, c[1] / distance, c[2] / distance
+    along = up[0] * x + up[1] * y + up[2] * z
+    p, q, r = up[0] - along * x, up[1] - along * y, up[2] - along * z
+    length = np.sqrt(p * p + q * q + r * r) + 1e-12
+    p, q, r = p / length, q / length, r / length
+    across = (q * z - r * y, r * x - p * z, p * y - q * x)
+    return View(c[0], c[1], c[2], across, (p, q, r))
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def rays_of(points: Column, rows: NDArray[np.integer]) -> Array:
+    """Return the rays to some returns."""
+    rays = np.empty((4, len(rows)))
+    x, y, z, distances = rays[0], rays[1], rays[2], rays[3]
+    for i in range(len(rows)):
+        x[i], y[i], z[i] = points[rows[i], 0], points[rows[i], 1], points[rows[i], 2]
+    for i in range(len(rows)):
+        distances[i] = np.sqrt(x[i] * x[i] + y[i] * y[i] + z[i] * z[i])
+        share = 1.0 / distances[i]
+        x[i], y[i], z[i] = share * x[i], share * y[i], share * z[i]
+    return rays
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def passing(view: View, rays: Array, i: int) -> tuple[float, float, float]:
+    """Return how a ray passes a centre."""
+    x, y, z = rays[0, i], rays[1, i], rays[2, i]
+    nearest = view.x * x + view.y * y + view.z * z
+    across = nearest * (x * view.across[0] + y * view.across[1] + z * view.across[2])
+    along = nearest * (x * view.up[0] + y * view.up[1] + z * view.up[2])
+    return across, along, rays[3, i] - nearest
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def seen_from(rays: Array, view: View) -> Array:
+    """Return how some rays pass a centre."""
+    seen = np.empty((3, rays.shape[1]))
+    for i in range(rays.shape[1]):
+        seen[0, i], seen[1, i], seen[2, i] = passing(view, rays, i)
+    return seen

@@ -1,0 +1,1 @@
+"""Linear algebra, least squares and statistical tests: the only place that solves."""

@@ -1,0 +1,1 @@
+"""Experiments: simulated worlds through the methods, into tables. Rests on everything else."""

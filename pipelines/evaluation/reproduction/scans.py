@@ -1,0 +1,384 @@
+"""Scans simulated and fitted: errors of all centres against the truth."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from spheremark.pipelines.accuracy import UNMATCHED, marker_errors, mean_incidence
+from spheremark.pipelines.config import FittingConfig, SurveyConfig
+from spheremark.pipelines.detection import extract
+from spheremark.pipelines.error_model import ErrorSample
+from spheremark.pipelines.evaluation.reproduction.noise import RangeNoise, range_noise
+from spheremark.pipelines.evaluation.reproduction.plan import (
+    CENTRE,
+    CENTRE_REAL,
+    FULL_SPHERE,
+    GROUND,
+    OURS,
+    PAPER,
+    Scan,
+)
+from spheremark.pipelines.geometry import inverse, levelling_rotation, transform
+from spheremark.pipelines.model import (
+    Array,
+    Index,
+    MarkerCandidates,
+    MarkerFits,
+    Mask,
+    StitchedCloud,
+    same_length,
+    seal,
+)
+from spheremark.pipelines.published import GREATEST_DISTANCE
+from spheremark.pipelines.scan.stitching import beams, choose_rig, stitch
+from spheremark.pipelines.simulation import (
+    Field,
+    SimulatedStop,
+    SimulationConfig,
+    scenario,
+    simulate_stop,
+)
+from spheremark.pipelines.sphere import fit_markers
+
+Progress = Callable[[float, str], None]
+
+_N_THREADS = 2  # a scan in simulation and one in the pipeline
+
+
+@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
+class Centres:
+    """Fitted centres with their errors, one row for each scan, marker and method.
+
+    Attributes
+    ----------
+    scans : (n,)
+        Place of the scan among those of the plan.
+    methods, marks : tuple of str
+        Fitting method and true mark of each row.
+    ranges : (n,)
+        True distances from the origin of the base to the marks [m].
+    n_points : (n,)
+        Numbers of returns that carry the estimates.
+    incidences : (n,)
+        Mean angles between beam and normal of the sphere [rad].
+    error_station : (n, 3)
+        Estimate minus truth towards the mark, to its left and upward [m].
+    sigma_3d : (n,)
+        Predicted: square roots of the traces of the covariances, with that of the heading [m].
+    rms : (n,)
+        Root mean squares of the residuals along the beam [m].
+    """
+
+    scans: Index
+    methods: tuple[str, ...]
+    marks: tuple[str, ...]
+    ranges: Array
+    n_points: Array
+    incidences: Array
+    error_station: Array
+    sigma_3d: Array
+    rms: Array
+
+    def __post_init__(self) -> None:
+        n = len(self.methods)
+        columns = ("scans", "ranges", "n_points", "incidences", "sigma_3d", "rms")
+        seal(self, **dict.fromkeys(columns, (n,)), error_station=(n, 3))
+        same_length(self, "methods", "marks", *columns)
+
+    @property
+    def error_3d(self) -> Array:
+        """Lengths of the errors, (n,) [m]."""
+        return np.asarray(np.linalg.norm(self.error_station, axis=1))
+
+    def of(self, method: str, scans: ArrayLike) -> Mask:
+        """Tell which rows are of a method and of some scans, (n,)."""
+        return np.asarray((np.array(self.methods) == method) & np.isin(self.scans, scans))
+
+    def sample(self, keep: Mask) -> ErrorSample:
+        """Return some rows as the errors that a model is fitted to."""
+        return ErrorSample(
+            ranges=self.ranges[keep],
+            n_points=self.n_points[keep],
+            incidences=self.incidences[keep],
+            errors_3d=self.error_3d[keep],
+            scans=self.scans[keep],
+        )
+
+
+@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
+class Example:
+    """One marker as it was simulated, seen along its line of sight (Figures 3 and 9).
+
+    Attributes
+    ----------
+    mark : str
+        Its name.
+    distance : float
+        How far away it is [m].
+    points_station : (n, 3)
+        Returns about it: beyond the true centre, to its left, above it [m].
+    is_left : (n,)
+        Whether the study's method uses the return: it lies above the cut and near the ball.
+    cut, ground : float
+        Heights above the true centre of the cut, and of the highest ground point of the scan [m].
+    radius : float
+        Radius of the sphere [m].
+    centres_station : mapping of str to (3,)
+        Fitted centre by method, in the same coordinates [m].
+    """
+
+    mark: str
+    distance: float
+    points_station: Array
+    is_left: Mask
+    cut: float
+    ground: float
+    radius: float
+    centres_station: dict[str, Array]
+
+    def __post_init__(self) -> None:
+        seal(self, points_station=(None, 3), is_left=(None,))
+        same_length(self, "points_station", "is_left")
+
+
+@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
+class Reproduction:
+    """All that was simulated and fitted.
+
+    Attributes
+    ----------
+    scans : tuple of Scan
+        The plan.
+    n_marks : (n,)
+        Marks of each scan's world, to tell how many were found.
+    centres : Centres
+        Centres with errors.
+    example : Example
+        A marker of the first scan.
+    noise : RangeNoise
+        Noise of the ranges of the first scan that simulates a real sensor.
+    config : SurveyConfig
+        What they were fitted with.
+    """
+
+    scans: tuple[Scan, ...]
+    n_marks: Index
+    centres: Centres
+    example: Example
+    noise: RangeNoise
+    config: SurveyConfig
+
+    def series(self, *names: str) -> Index:
+        """Return the places of the scans of some series."""
+        return np.flatnonzero([scan.series in names for scan in self.scans])
+
+
+class _Row(NamedTuple):
+    """One row of ``Centres`` but for its scan."""
+
+    method: str
+    mark: str
+    range: float
+    n_points: int
+    incidence: float
+    error_station: Array
+    sigma_3d: float
+    rms: float
+
+
+class _Measured(NamedTuple):
+    """What one scan gave."""
+
+    rows: list[_Row]
+    n_marks: int
+    example: Example | None
+    noise: RangeNoise | None
+
+
+def reproduce(
+    scans: Sequence[Scan],
+    config: SurveyConfig,
+    *,
+    progress: Progress = lambda _share, _what: None,
+) -> Reproduction:
+    """Simulate and fit all scans of a plan.
+
+    Parameters
+    ----------
+    scans : sequence of Scan
+        The plan; the first is of the study's field.
+    config : SurveyConfig
+        How markers are found and fitted.
+    progress : callable
+        Told the share of the work that is done, 0 to 1, and what comes next; may raise to cancel.
+
+    Returns
+    -------
+    Reproduction
+        Errors of all centres.
+
+    Notes
+    -----
+    The scans are independent: two are worked at side by side. Those of the study's field are
+    simulated whole, because a cut may need the ground. Cost grows linearly with the time of all
+    turns.
+    """
+    worlds = {key: scenario(*key) for key in dict.fromkeys((s.scenario, s.seed) for s in scans)}
+    found: list[_Measured] = []
+    shows_noise = next((i for i, scan in enumerate(scans) if scan.sigma_range is None), 0)
+
+    def measured(i: int) -> _Measured:
+        scan = scans[i]
+        shown = _Shown(example=i == 0, noise=i == shows_noise)
+        return _measure(worlds[scan.scenario, scan.seed], scan, config, shown)
+
+    with ThreadPoolExecutor(_N_THREADS) as pool:
+        for scan, result in zip(scans, pool.map(measured, range(len(scans))), strict=True):
+            found.append(result)
+            progress(len(found) / len(scans), f"{scan.stop}, world {scan.seed}, {scan.turn:g} s")
+    (example,) = (one.example for one in found if one.example is not None)
+    (noise,) = (one.noise for one in found if one.noise is not None)
+    return Reproduction(
+        scans=tuple(scans),
+        n_marks=np.array([one.n_marks for one in found], dtype=np.intp),
+        centres=_joined([one.rows for one in found]),
+        example=example,
+        noise=noise,
+        config=config,
+    )
+
+
+class _Shown(NamedTuple):
+    """What of a scan is shown beside its errors."""
+
+    example: bool
+    noise: bool
+
+
+def _measure(field: Field, scan: Scan, config: SurveyConfig, shown: _Shown) -> _Measured:
+    """Simulate one scan and fit its markers by every method."""
+    sensor = SimulationConfig(
+        turn=scan.turn, sigma_range=scan.sigma_range, only_near_spheres=not scan.needs_ground
+    )
+    stop = simulate_stop(field, scan.stop, sensor, seed=scan.seed)
+    cloud = stitch(stop.log, choose_rig(stop.log, None), config.stitching)
+    found = extract(cloud, config.extraction, config.marker_radius)
+    fits = _fits(cloud, found, scan, config)
+    rows = [row for name, one in fits.items() for row in _rows(name, one, cloud, field, stop)]
+    return _Measured(
+        rows=rows,
+        n_marks=len(field.marks.names),
+        example=_example(fits, cloud, found, field, stop) if shown.example else None,
+        noise=_noise(stop) if shown.noise else None,
+    )
+
+
+def _fits(
+    cloud: StitchedCloud, found: MarkerCandidates, scan: Scan, config: SurveyConfig
+) -> dict[str, MarkerFits]:
+    """Fit the markers of one scan by ours, the study's, and where it counts by its variants."""
+    fitting = config.fitting
+    ways: dict[str, tuple[str, FittingConfig]] = {m: (m, fitting) for m in (OURS, PAPER)}
+    if scan.series in (CENTRE, CENTRE_REAL):
+        ways[FULL_SPHERE] = (PAPER, dataclasses.replace(fitting, paper_model="sphere"))
+        ways[GROUND] = (PAPER, dataclasses.replace(fitting, paper_cut="ground"))
+    return {
+        name: fit_markers(method, cloud, found, how, config.marker_radius)
+        for name, (method, how) in ways.items()
+    }
+
+
+def _rows(
+    method: str, fits: MarkerFits, cloud: StitchedCloud, field: Field, stop: SimulatedStop
+) -> list[_Row]:
+    """Compare the fits of one method with the truth; a fit that stands on no mark is left out."""
+    errors = marker_errors(fits, stop.truth, field.marks)
+    true = transform(inverse(stop.truth.T_site_base), field.marks.p_site)
+    rows = []
+    for fit, mark, error in zip(fits.fits, errors.marks, errors.error_base, strict=True):
+        if mark == UNMATCHED:
+            continue
+        rows.append(
+            _Row(
+                method=method,
+                mark=field.marks.names[mark],
+                range=float(np.linalg.norm(true[mark])),
+                n_points=fit.n_points,
+                incidence=mean_incidence(beams(cloud, fit.used), fit.p_base, fit.radius),
+                error_station=_sight(true[mark], cloud) @ error,
+                sigma_3d=float(np.sqrt(np.trace(fit.cov_with_heading(cloud.rig.sigma_heading)))),
+                rms=fit.rms,
+            )
+        )
+    return rows
+
+
+def _sight(p_base: Array, cloud: StitchedCloud) -> Array:
+    """Return the rotation from base to: towards a place, to its left, upward, (3, 3)."""
+    up = levelling_rotation(cloud.levelling)[2]
+    towards = p_base - (p_base @ up) * up
+    towards = towards / np.linalg.norm(towards)
+    return np.stack([towards, np.cross(up, towards), up])
+
+
+def _joined(rows_of_scans: Sequence[Sequence[_Row]]) -> Centres:
+    """Put the rows of all scans into columns."""
+    rows = [row for rows in rows_of_scans for row in rows]
+    scans = np.repeat(np.arange(len(rows_of_scans)), [len(rows) for rows in rows_of_scans])
+    return Centres(
+        scans=scans.astype(np.intp),
+        methods=tuple(row.method for row in rows),
+        marks=tuple(row.mark for row in rows),
+        ranges=np.array([row.range for row in rows]),
+        n_points=np.array([float(row.n_points) for row in rows]),
+        incidences=np.array([row.incidence for row in rows]),
+        error_station=np.array([row.error_station for row in rows]).reshape(-1, 3),
+        sigma_3d=np.array([row.sigma_3d for row in rows]),
+        rms=np.array([row.rms for row in rows]),
+    )
+
+
+def _example(
+    fits: dict[str, MarkerFits],
+    cloud: StitchedCloud,
+    found: MarkerCandidates,
+    field: Field,
+    stop: SimulatedStop,
+) -> Example:
+    """Choose a marker about as far as the study's claim, and show it from aside."""
+    true = transform(inverse(stop.truth.T_site_base), field.marks.p_site)
+    fits = {name: one for name, one in fits.items() if name != GROUND}
+    marks = {name: marker_errors(one, stop.truth, field.marks).marks for name, one in fits.items()}
+    up = levelling_rotation(cloud.levelling)[2]
+    distances = np.linalg.norm(true, axis=1)
+    chosen = [m for m in marks[PAPER] if m != UNMATCHED and all(m in own for own in marks.values())]
+    mark = min(chosen, key=lambda m: abs(distances[m] - GREATEST_DISTANCE))
+    fit = {n: one.fits[int(np.flatnonzero(marks[n] == mark)[0])] for n, one in fits.items()}
+    members = np.union1d(fit[PAPER].used, fit[PAPER].rejected)
+    is_left = np.isin(members, fit[PAPER].used)
+    R = _sight(true[mark], cloud)
+    points = (cloud.p_base[members] - true[mark]) @ R.T
+    return Example(
+        mark=field.marks.names[mark],
+        distance=float(distances[mark]),
+        points_station=points,
+        is_left=is_left,
+        cut=float(points[is_left, 2].min()),
+        ground=float(found.ground_height_max - true[mark] @ up),
+        radius=field.marker_radius,
+        centres_station={n: R @ (one.p_base - true[mark]) for n, one in fit.items()},
+    )
+
+
+def _noise(stop: SimulatedStop) -> RangeNoise:
+    """Return the noise of the ranges of a simulated log, as it would be seen in a real one."""
+    log = stop.log
+    offsets = log.stamps_lidar_ns - log.stamps_lidar_ns.min()
+    return range_noise(np.linalg.norm(log.p_lidar, axis=1), log.rings, offsets, log.intensities)

@@ -1,0 +1,163 @@
+"""What an elevation model is made from, and what it says."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from spheremark.pipelines.errors import ConfigError
+from spheremark.pipelines.model import Array, Column, Mask, StationFix, seal
+from spheremark.pipelines.network import AdjustedNetwork
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ElevationConfig:
+    """How ground becomes a model of its heights.
+
+    Attributes
+    ----------
+    cell : float
+        Edge of a cell [m]. 0.25: a turn leaves some ten returns in such a cell at 10 m.
+    range_max : float
+        Horizontal distance from a station within which ground is used [m]. 15: beyond, beams graze
+        at less than 4 degrees and see crests only.
+    object_max : float
+        Width up to which what stands on the ground is taken off [m]. 0.6: rocks, poles, markers,
+        legs; wider things are left out where they rise steeply.
+    sigma_range : float
+        Noise of a range [m]. 10.7 mm: a VLP-16 on dark ground.
+    sigma_laser_bias : float
+        What each laser measures too long, standard deviation [m].
+    sigma_direction : float
+        What a direction is off in all of a stop, after two faces are averaged [rad].
+    gap_max : float
+        Holes up to this distance from ground that was seen are interpolated [m]; 0: none.
+    """
+
+    cell: float = 0.25
+    range_max: float = 15.0
+    object_max: float = 0.6
+    sigma_range: float = 0.0107
+    sigma_laser_bias: float = 0.003
+    sigma_direction: float = 1e-4
+    gap_max: float = 0.0
+
+    def __post_init__(self) -> None:
+        bounds = {
+            "cell": (0.05, 10.0),
+            "range_max": (1.0, 100.0),
+            "object_max": (0.1, 10.0),
+            "sigma_range": (1e-4, 0.1),
+            "sigma_laser_bias": (0.0, 0.1),
+            "sigma_direction": (0.0, 0.01),
+            "gap_max": (0.0, 10.0),
+        }
+        for name, (low, high) in bounds.items():
+            value = getattr(self, name)
+            if not low <= value <= high or not math.isfinite(value):
+                raise ConfigError(
+                    f"elevation.{name} is {value!r}; it must be a number from {low:g} to {high:g}."
+                )
+
+
+@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
+class StationPose:
+    """Where a stop's returns belong on the site.
+
+    Attributes
+    ----------
+    name : str
+        Name of the stop.
+    T_site_station : (4, 4)
+        Pose of the levelled frame [m].
+    cov_T_site_station : (6, 6)
+        Covariance of a small motion (rotation [rad], translation [m]) on the left.
+    """
+
+    name: str
+    T_site_station: Array
+    cov_T_site_station: Array
+
+    def __post_init__(self) -> None:
+        seal(self, T_site_station=(4, 4), cov_T_site_station=(6, 6))
+
+
+def poses_of_network(result: AdjustedNetwork) -> tuple[StationPose, ...]:
+    """Return the poses of an adjusted network.
+
+    Parameters
+    ----------
+    result : AdjustedNetwork
+        The network.
+
+    Returns
+    -------
+    tuple of StationPose
+        In the order of its stations.
+    """
+    return tuple(
+        StationPose(name=name, T_site_station=T.copy(), cov_T_site_station=cov.copy())
+        for name, T, cov in zip(
+            result.network.stations,
+            result.T_site_station,
+            result.cov_T_site_station,
+            strict=True,
+        )
+    )
+
+
+def pose_of_fix(name: str, fix: StationFix) -> StationPose:
+    """Return the pose of a station that was positioned alone."""
+    return StationPose(
+        name=name, T_site_station=fix.T_site_station, cov_T_site_station=fix.cov_T_site_station
+    )
+
+
+@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
+class ElevationModel:
+    """Mean height of the ground in each cell of a grid, and how sure it is.
+
+    Attributes
+    ----------
+    corner : (2,)
+        South-western corner of the first cell, x and y in the site frame [m].
+    cell : float
+        Edge of a cell [m].
+    heights : (rows, columns) float32
+        Mean height of the ground; NaN where none was seen; rows run north [m].
+    sigmas : (rows, columns) float32
+        Standard deviation of that height; NaN likewise [m].
+    counts : (rows, columns) int32
+        Returns that carry it; 0 where it is interpolated or missing.
+    is_filled : (rows, columns) bool
+        Whether it is interpolated from cells around.
+    """
+
+    corner: Array
+    cell: float
+    heights: Column
+    sigmas: Column
+    counts: NDArray[np.int32]
+    is_filled: Mask
+
+    def __post_init__(self) -> None:
+        shape = self.heights.shape
+        seal(self, corner=(2,), heights=shape, sigmas=shape, counts=shape, is_filled=shape)
+
+    @property
+    def xs(self) -> Array:
+        """Centres of the columns [m]."""
+        return np.asarray(self.corner[0] + (np.arange(self.heights.shape[1]) + 0.5) * self.cell)
+
+    @property
+    def ys(self) -> Array:
+        """Centres of the rows [m]."""
+        return np.asarray(self.corner[1] + (np.arange(self.heights.shape[0]) + 0.5) * self.cell)
+
+    @property
+    def share_known(self) -> float:
+        """Share of the cells in which ground was seen."""
+        return float(np.mean(self.counts > 0)) if self.counts.size else 0.0

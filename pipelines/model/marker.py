@@ -1,0 +1,222 @@
+"""Spheres in a scan: candidates, fitted centres, and groups that were refused."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import StrEnum
+
+import numpy as np
+
+from spheremark.pipelines.model.arrays import Array, Index, same_length, seal
+from spheremark.pipelines.model.scan import Levelling
+
+
+class Status(StrEnum):
+    """How far a result can be relied on."""
+
+    OK = "ok"
+    WEAK = "weak"
+
+
+@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
+class MarkerCandidate:
+    """A group of returns that may be a marker.
+
+    Attributes
+    ----------
+    name : str
+        What its marker is called at this stop, whatever method fits it.
+    members : (n,)
+        Rows of the stitched cloud, ascending: the sphere, and what of its pole touches it.
+    p_base_rough : (3,)
+        Rough centre, good to a few centimetres [m].
+    score : float
+        0 (hardly a sphere) to 1 (all tests passed with ease).
+    """
+
+    name: str
+    members: Index
+    p_base_rough: Array
+    score: float
+
+    def __post_init__(self) -> None:
+        seal(self, members=(None,), p_base_rough=(3,))
+
+
+def marker_name(place: int) -> str:
+    """Return what the marker at a place among those of a stop is called: M01, M02, ...
+
+    Parameters
+    ----------
+    place : int
+        From 0.
+
+    Returns
+    -------
+    str
+        Its name within one stop.
+    """
+    return f"M{place + 1:02d}"
+
+
+@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
+class Rejection:
+    """A group of returns that was looked at and is not used as a marker.
+
+    Attributes
+    ----------
+    p_base : (3,)
+        Where it is [m].
+    n_points : int
+        Number of its returns.
+    reason : str
+        Why it was refused, as a sentence for people.
+    """
+
+    p_base: Array
+    n_points: int
+    reason: str
+
+    def __post_init__(self) -> None:
+        seal(self, p_base=(3,))
+
+
+@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
+class MarkerCandidates:
+    """What one stitched cloud shows that may be, or looked like, a marker.
+
+    Attributes
+    ----------
+    candidates : tuple of MarkerCandidate
+        Groups that may be markers.
+    rejected : tuple of Rejection
+        Groups that looked like one at first, with the reason against.
+    ground_height_max : float
+        Height of the highest ground point near the station in the levelled frame, the level of the
+        study's cut [m]; minus infinity when no ground was seen.
+    """
+
+    candidates: tuple[MarkerCandidate, ...]
+    rejected: tuple[Rejection, ...]
+    ground_height_max: float
+
+
+@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
+class MarkerFit:
+    """A marker centre with covariance.
+
+    Attributes
+    ----------
+    name : str
+        What the marker is called at this stop: that of its candidate.
+    p_base : (3,)
+        Centre [m].
+    cov_p_base : (3, 3)
+        Covariance of the centre, without levelling and heading [m^2].
+    method : str
+        Name of the fitting method.
+    status : Status
+        Whether the fit can be relied on.
+    reason : str
+        Why it is weak; empty when it is not.
+    radius : float
+        Radius that was assumed [m].
+    radius_free : float
+        Radius when estimated together with the centre; NaN when the points do not tell [m].
+    sigma_radius_free : float
+        Standard deviation of ``radius_free``; NaN likewise [m].
+    mean_range : float
+        Distance from the mean beam origin to the centre [m].
+    mean_intensity : float
+        Mean reflectivity of the used returns, 0-255.
+    used : (n,)
+        Rows of the stitched cloud that carry the estimate.
+    rejected : (m,)
+        Rows of the candidate that were set aside.
+    residuals : (n,)
+        Observed minus computed, along the beam, of the used returns [m].
+    sigma0 : float
+        Square root of the a-posteriori variance factor; 1 means noise as assumed.
+    n_rings : int
+        Number of different lasers among the used returns; 0 when rings are not recorded.
+    coverage : float
+        Share of the visible half of the sphere that has returns, 0 to 1.
+    incidence : float
+        Mean angle between the used beams and the sphere's normals; NaN when not told [rad].
+    variant : str
+        Which form of its method ran, where it has several; else empty.
+    sigma_range_shared : float
+        How much of its error along the line of sight all centres of the stop have in common, as its
+        covariance has it; NaN when not told [m].
+    """
+
+    name: str
+    p_base: Array
+    cov_p_base: Array
+    method: str
+    status: Status
+    reason: str
+    radius: float
+    radius_free: float
+    sigma_radius_free: float
+    mean_range: float
+    mean_intensity: float
+    used: Index
+    rejected: Index
+    residuals: Array
+    sigma0: float
+    n_rings: int
+    coverage: float
+    incidence: float = np.nan
+    variant: str = ""
+    sigma_range_shared: float = np.nan
+
+    def __post_init__(self) -> None:
+        seal(
+            self,
+            p_base=(3,),
+            cov_p_base=(3, 3),
+            used=(None,),
+            rejected=(None,),
+            residuals=(None,),
+        )
+        same_length(self, "used", "residuals")
+
+    @property
+    def n_points(self) -> int:
+        """Number of returns that carry the estimate."""
+        return len(self.used)
+
+    @property
+    def rms(self) -> float:
+        """Root mean square of the residuals [m]."""
+        if not self.n_points:
+            return np.nan
+        return float(np.sqrt(self.residuals @ self.residuals / self.n_points))
+
+    def cov_with_heading(self, sigma_heading: float) -> Array:
+        """Return ``cov_p_base`` with what an unknown heading [rad] of the stop adds to it [m^2]."""
+        sideways = np.array([-self.p_base[1], self.p_base[0], 0.0])
+        return self.cov_p_base + sigma_heading**2 * np.outer(sideways, sideways)
+
+
+@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
+class MarkerFits:
+    """All markers of one stop, fitted by one method.
+
+    Attributes
+    ----------
+    method : str
+        Name of the fitting method.
+    fits : tuple of MarkerFit
+        Markers in the order of their azimuth in the base frame, from -pi.
+    rejected : tuple of Rejection
+        Candidates that this method or the extraction refused.
+    levelling : Levelling
+        How the base leans.
+    """
+
+    method: str
+    fits: tuple[MarkerFit, ...]
+    rejected: tuple[Rejection, ...]
+    levelling: Levelling

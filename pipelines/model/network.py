@@ -1,0 +1,504 @@
+"""What goes into the adjustment of a network, and what comes out of it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from spheremark.pipelines.errors import InputError
+from spheremark.pipelines.model import Array, Index, Mask
+
+RANGE_BIAS = "common_range_bias"
+"""The shared unknown that is what all ranges are too long [m]."""
+
+HEIGHT_BIAS = "common_height_bias"
+"""The shared unknown that is what all centres are too high [m]."""
+
+
+@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
+class Refusal:
+    """A station that is not in the network.
+
+    Attributes
+    ----------
+    station : str
+        Its name.
+    code : str
+        Stable code of the error.
+    reason : str
+        Why, as a sentence for people.
+    """
+
+    station: str
+    code: str
+    reason: str
+
+
+@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
+class LeftOut:
+    """An observation that is not used.
+
+    Attributes
+    ----------
+    kind : str
+        ``centre``, ``gravity`` or ``control``.
+    station : str
+        Whose observation; empty for a control mark.
+    marker : str
+        What the marker is called at the station; empty where it is no centre.
+    mark : str
+        Name of the mark; empty where none is known.
+    reason : str
+        Why, as a sentence for people.
+    """
+
+    kind: str
+    station: str
+    marker: str
+    mark: str
+    reason: str
+
+
+@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
+class Shared:
+    """Unknowns that all stations share: what the rig does to every centre, and no centre tells.
+
+    Attributes
+    ----------
+    names : tuple of str
+        What they are; ``RANGE_BIAS`` is what all ranges are too long, ``HEIGHT_BIAS`` what all
+        centres are too high.
+    effects : (n, 3, k)
+        How much a unit of each moves each observed centre in base.
+    weights : (k, k)
+        What is known of them beside the centres: the inverse of a covariance about zero; singular
+        where nothing is known.
+    """
+
+    names: tuple[str, ...]
+    effects: Array
+    weights: Array
+
+    def __post_init__(self) -> None:
+        k = len(self.names)
+        seal(self, {"effects": (len(self.effects), 3, k), "weights": (k, k)})
+
+    @classmethod
+    def none(cls, n: int) -> Shared:
+        """Return no unknowns of n centres.
+
+        Parameters
+        ----------
+        n : int
+            Number of centres.
+
+        Returns
+        -------
+        Shared
+            Without names.
+        """
+        return cls(names=(), effects=np.zeros((n, 3, 0)), weights=np.zeros((0, 0)))
+
+    @classmethod
+    def of_rig(
+        cls, p_base: Array, ups_base: Array, sigma_range: float, sigma_height: float
+    ) -> Shared:
+        """Return what all ranges of a survey are too long, and all centres too high.
+
+        Parameters
+        ----------
+        p_base : (n, 3)
+            Observed centres [m].
+        ups_base : (n, 3)
+            The up direction in base, for each.
+        sigma_range, sigma_height : float
+            Standard deviations before anything is seen; 0 for no such unknown [m].
+
+        Returns
+        -------
+        Shared
+            With two names, one or none.
+        """
+        towards = p_base / np.linalg.norm(p_base, axis=1)[:, None]
+        known = [
+            (name, effect, sigma)
+            for name, effect, sigma in (
+                (RANGE_BIAS, towards, sigma_range),
+                (HEIGHT_BIAS, ups_base, sigma_height),
+            )
+            if sigma > 0.0
+        ]
+        if not known:
+            return cls.none(len(p_base))
+        return cls(
+            names=tuple(name for name, _, _ in known),
+            effects=np.stack([effect for _, effect, _ in known], axis=-1),
+            weights=np.diag([sigma**-2.0 for _, _, sigma in known]),
+        )
+
+
+@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
+class Network:
+    """Stations, marks and what was observed between them, with approximate values.
+
+    Attributes
+    ----------
+    stations : tuple of str
+        Names, all different.
+    marks : tuple of str
+        Names, all different.
+    sightings : (n, 2)
+        Place of station and mark of each observed centre, by station, each pair once.
+    fits : (n,)
+        Place of each centre among the fits of its station.
+    markers : (n,) tuple of str
+        What each is called at its station.
+    p_base : (n, 3)
+        Observed centres in the base frames of their stations [m].
+    cov_p_base : (n, 3, 3)
+        Their covariances, what all centres have in common included [m^2].
+    R_station_base : (s, 3, 3)
+        Measured levelling; the last row is the up direction in base.
+    cov_up_base : (s, 3, 3)
+        Covariance of that direction in base, of rank two [rad^2].
+    sigma_headings : (s,)
+        Standard deviation of what mounting and encoder leave unknown of each heading [rad].
+    controls : (c,)
+        Places of the control marks among the marks.
+    p_control_site : (c, 3)
+        Their given coordinates [m]; none make a free network.
+    cov_control_site : (c, 3, 3)
+        Their covariances, regular [m^2].
+    T_site_base : (s, 4, 4)
+        Approximate poses [m].
+    p_site : (m, 3)
+        Approximate marks [m].
+    shared : Shared
+        What all stations have in common.
+    doubts : (m,) tuple of str
+        Why each mark may be false, as a sentence for people; empty where there is no reason.
+    refused : tuple of Refusal
+        Stations that share too little with the others.
+    left_out : tuple of LeftOut
+        Centres that are no marks of the network, control marks that nobody saw.
+    """
+
+    stations: tuple[str, ...]
+    marks: tuple[str, ...]
+    sightings: Index
+    fits: Index
+    markers: tuple[str, ...]
+    p_base: Array
+    cov_p_base: Array
+    R_station_base: Array
+    cov_up_base: Array
+    sigma_headings: Array
+    controls: Index
+    p_control_site: Array
+    cov_control_site: Array
+    T_site_base: Array
+    p_site: Array
+    shared: Shared
+    doubts: tuple[str, ...]
+    refused: tuple[Refusal, ...] = ()
+    left_out: tuple[LeftOut, ...] = ()
+
+    def __post_init__(self) -> None:
+        n, s, m, c = (len(x) for x in (self.sightings, self.stations, self.marks, self.controls))
+        seal(
+            self,
+            {
+                "sightings": (n, 2),
+                "fits": (n,),
+                "p_base": (n, 3),
+                "cov_p_base": (n, 3, 3),
+                "R_station_base": (s, 3, 3),
+                "cov_up_base": (s, 3, 3),
+                "sigma_headings": (s,),
+                "controls": (c,),
+                "p_control_site": (c, 3),
+                "cov_control_site": (c, 3, 3),
+                "T_site_base": (s, 4, 4),
+                "p_site": (m, 3),
+            },
+        )
+        if len(self.shared.effects) != n:
+            raise InputError(f"There are {n} centres, but effects on {len(self.shared.effects)}.")
+        if len(self.markers) != n:
+            raise InputError(f"There are {n} centres, but names of {len(self.markers)}.")
+        if len(self.doubts) != m:
+            raise InputError(f"There are {m} marks, but doubts about {len(self.doubts)}.")
+
+    @property
+    def sigma_range(self) -> float:
+        """What the range bias is known to beforehand; 0 where there is no such unknown [m]."""
+        if RANGE_BIAS not in self.shared.names:
+            return 0.0
+        place = self.shared.names.index(RANGE_BIAS)
+        return float(self.shared.weights[place, place] ** -0.5)
+
+    @property
+    def is_free(self) -> bool:
+        """Whether nothing but the marks themselves tells where and how the network lies."""
+        return len(self.controls) == 0
+
+    @property
+    def n_blocks(self) -> int:
+        """Number of blocks of observations: centres, gravity of each station, control marks."""
+        return len(self.sightings) + len(self.stations) + len(self.controls)
+
+
+@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
+class BlockTests:
+    """Statistics of blocks of observations, one row per block.
+
+    Attributes
+    ----------
+    residuals : (b, k)
+        Observed minus computed, in the site frame [m], or of the up direction [rad].
+    redundancies : (b,)
+        Redundancy of the block's observations together; NaN where it is not used.
+    w_statistics : (b,)
+        Largest absolute w-statistic of the block; NaN where not testable or not used.
+    detectable_biases : (b,)
+        Minimal detectable bias along the weakest axis; infinite if none is, NaN if not used.
+    """
+
+    residuals: Array
+    redundancies: Array
+    w_statistics: Array
+    detectable_biases: Array
+
+    def __post_init__(self) -> None:
+        b = len(self.residuals)
+        columns = dict.fromkeys(("redundancies", "w_statistics", "detectable_biases"), (b,))
+        seal(self, {"residuals": self.residuals.shape, **columns})
+
+
+@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
+class Parts:
+    """What the joint covariance of stations, marks and shared unknowns is made of.
+
+    Attributes
+    ----------
+    own : (s, 6, 6)
+        Covariance of each station's motion if marks and shared unknowns were known.
+    coupling : (s, 6, 3m + k)
+        How much a station moves, with the sign turned, when marks and shared unknowns move.
+    cov_common : (3m + k, 3m + k)
+        Covariance of marks and shared unknowns.
+    """
+
+    own: Array
+    coupling: Array
+    cov_common: Array
+
+    def __post_init__(self) -> None:
+        s, u = len(self.own), len(self.cov_common)
+        seal(self, {"own": (s, 6, 6), "coupling": (s, 6, u), "cov_common": (u, u)})
+
+
+@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
+class AdjustedNetwork:
+    """All stations and marks of a survey, adjusted together.
+
+    Attributes
+    ----------
+    network : Network
+        What was observed.
+    T_site_station : (s, 4, 4)
+        Poses of the levelled frames [m].
+    cov_T_site_station : (s, 6, 6)
+        Covariance of a small motion of each, (rotation [rad], translation [m]) on the left.
+    station_covariances : (s, 3, 3)
+        Covariance of each station's position: far from the origin that of the motion has no digits
+        left to tell it from [m^2].
+    p_site : (m, 3)
+        Marks [m].
+    cov_p_site : (3m, 3m)
+        Their joint covariance [m^2].
+    used : (b,)
+        Whether each block is used: centres, then gravity, then control marks.
+    centres : BlockTests
+        Of the observed centres.
+    gravity : BlockTests
+        Of the stations' levelling.
+    control : BlockTests
+        Of the control marks.
+    station_shifts : (n,)
+        External reliability: largest shift of its station that a just undetectable bias of each
+        centre causes; infinite where a bias cannot be detected, NaN where not used [m].
+    mark_shifts : (n,)
+        The same of its mark [m].
+    shared : (k,)
+        The unknowns that all stations share, as estimated.
+    cov_shared : (k, k)
+        Their covariance.
+    parts : Parts
+        What the joint covariance of all is made of.
+    control_predictions : (c, 3)
+        Where each control mark would be by all else, minus where it is given; NaN where nothing
+        else tells [m].
+    cov_control_predictions : (c, 3, 3)
+        Covariances of these differences [m^2].
+    mark_weaknesses : tuple of str
+        Why each mark should be used with care, as a sentence for people; empty where there is no
+        reason.
+    dof : int
+        Degrees of freedom: observations minus unknowns plus the datum's defect.
+    vtpv : float
+        Weighted sum of squares of the residuals.
+    sigma0 : float
+        Square root of the a-posteriori variance factor (a priori 1); NaN without redundancy.
+    passes_global_test : bool
+        Whether the residuals are no larger than the sigmas promise.
+    limit_vtpv : float
+        Largest ``vtpv`` that passes.
+    variance_factors : (3,)
+        Sum of squares over redundancy of centres, gravity and control; NaN without redundancy.
+    critical_w : float
+        Largest w that is not a gross error.
+    noncentrality : float
+        How many sigmas a bias must move w to be found with the power of the test.
+    left_out : tuple of LeftOut
+        All observations that are not used.
+    warnings : tuple of str
+        Why the network cannot be relied on, in sentences; empty when it can.
+    """
+
+    network: Network
+    T_site_station: Array
+    cov_T_site_station: Array
+    station_covariances: Array
+    p_site: Array
+    cov_p_site: Array
+    used: Mask
+    centres: BlockTests
+    gravity: BlockTests
+    control: BlockTests
+    station_shifts: Array
+    mark_shifts: Array
+    shared: Array
+    cov_shared: Array
+    parts: Parts
+    control_predictions: Array
+    cov_control_predictions: Array
+    mark_weaknesses: tuple[str, ...]
+    dof: int
+    vtpv: float
+    sigma0: float
+    passes_global_test: bool
+    limit_vtpv: float
+    variance_factors: Array
+    critical_w: float
+    noncentrality: float
+    left_out: tuple[LeftOut, ...]
+    warnings: tuple[str, ...]
+
+    def __post_init__(self) -> None:
+        s, m = len(self.network.stations), len(self.network.marks)
+        n = len(self.network.sightings)
+        seal(
+            self,
+            {
+                "T_site_station": (s, 4, 4),
+                "cov_T_site_station": (s, 6, 6),
+                "station_covariances": (s, 3, 3),
+                "p_site": (m, 3),
+                "cov_p_site": (3 * m, 3 * m),
+                "used": (self.network.n_blocks,),
+                "station_shifts": (n,),
+                "mark_shifts": (n,),
+                "shared": (len(self.network.shared.names),),
+                "control_predictions": self.network.p_control_site.shape,
+                "cov_control_predictions": self.network.cov_control_site.shape,
+                "variance_factors": (3,),
+            },
+        )
+
+    @property
+    def range_bias(self) -> float:
+        """What all ranges of the survey are too long; 0 where the network has no such unknown."""
+        names = self.network.shared.names
+        return float(self.shared[names.index(RANGE_BIAS)]) if RANGE_BIAS in names else 0.0
+
+    @property
+    def sigma_range_bias(self) -> float:
+        """Standard deviation of the range bias [m]."""
+        names = self.network.shared.names
+        if RANGE_BIAS not in names:
+            return 0.0
+        place = names.index(RANGE_BIAS)
+        return float(np.sqrt(self.cov_shared[place, place]))
+
+    @property
+    def p_base(self) -> Array:
+        """Observed centres less what all have in common, (n, 3) [m]."""
+        return np.asarray(self.network.p_base - self.network.shared.effects @ self.shared)
+
+    @property
+    def cov_positions(self) -> Array:
+        """Joint covariance of all stations' positions, then all marks, (3s + 3m, 3s + 3m) [m^2].
+
+        Grows with the square of the stations: for networks of tens of them.
+        """
+        s, m = len(self.T_site_station), len(self.p_site)
+        J = position_by_motion(self.T_site_station)
+        coupled = (J @ self.parts.coupling).reshape(3 * s, -1)
+        own = J @ self.parts.own @ np.swapaxes(J, -1, -2)
+        stations = coupled @ self.parts.cov_common @ coupled.T
+        for i, cov in enumerate(own):
+            stations[3 * i : 3 * i + 3, 3 * i : 3 * i + 3] += cov
+        between = -coupled @ self.parts.cov_common[:, : 3 * m]
+        return np.block([[stations, between], [between.T, self.cov_p_site]])
+
+    @property
+    def mark_covariances(self) -> Array:
+        """Covariance of each mark, (m, 3, 3) [m^2]."""
+        m = len(self.p_site)
+        return np.asarray(np.einsum("iaib->iab", self.cov_p_site.reshape(m, 3, m, 3)))
+
+
+def position_by_motion(T: Array) -> Array:
+    """Return the derivative of the positions of poses by small motions on the left.
+
+    Parameters
+    ----------
+    T : (..., 4, 4)
+        Poses [m].
+
+    Returns
+    -------
+    (..., 3, 6)
+        ``[-[p]x, 1]``.
+    """
+    x, y, z = np.moveaxis(T[..., :3, 3], -1, 0)
+    J = np.zeros((*T.shape[:-2], 3, 6))
+    J[..., 0, 1], J[..., 1, 2], J[..., 2, 0] = z, x, y
+    J[..., 1, 0], J[..., 2, 1], J[..., 0, 2] = -z, -x, -y
+    J[..., [0, 1, 2], [3, 4, 5]] = 1.0
+    return J
+
+
+def seal(value: object, shapes: dict[str, tuple[int, ...]]) -> None:
+    """Check the shape of each named array and make it read-only.
+
+    Parameters
+    ----------
+    value : object
+        Whose arrays.
+    shapes : dict
+        Expected shape by name.
+
+    Raises
+    ------
+    InputError
+        If an array has another shape.
+    """
+    for name, shape in shapes.items():
+        array = getattr(value, name)
+        if array.shape != shape:
+            kind = type(value).__name__
+            raise InputError(f"{kind}.{name} has shape {array.shape}, not {shape}.")
+        array.flags.writeable = False

@@ -1,0 +1,370 @@
+"""What a LiDAR on a gimbal recorded, and what stitching makes of it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import StrEnum
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from spheremark.pipelines.model.arrays import (
+    Array,
+    Column,
+    Index,
+    Mask,
+    Nanos,
+    Rings,
+    Shape,
+    same_length,
+    seal,
+)
+
+
+class ImuMount(StrEnum):
+    """Which part of the gimbal carries the AHRS."""
+
+    BASE = "base"
+    HEAD = "head"
+
+
+@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
+class Origin:
+    """Where a recording came from.
+
+    Attributes
+    ----------
+    name : str
+        Stem of the log's file name.
+    digest : str
+        SHA-256 of the file's bytes, in hexadecimal; empty when the log never was a file.
+    """
+
+    name: str
+    digest: str
+
+
+@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
+class Rig:
+    """How the LiDAR sits on the gimbal, and what its beams look like.
+
+    Attributes
+    ----------
+    name : str
+        What results call this rig.
+    T_head_lidar : (4, 4)
+        Mounting of the LiDAR on the turning head: tilt and axis offset [m]. Its vertical
+        translation is zero by the definition of the base frame.
+    R_mount_imu : (3, 3)
+        Mounting of the AHRS on the part that carries it.
+    imu_mount : ImuMount
+        The part that carries the AHRS: the fixed base or the turning head.
+    laser_elevations : (k,)
+        Elevation of each laser, lowest first [rad].
+    laser_heights : (k,)
+        Where each beam leaves the spin axis, along it [m].
+    laser_range_biases : (k,)
+        What each laser measures too long [m]; subtracted when stitching.
+    cloud_carries_heights : bool
+        Whether recorded coordinates already include ``laser_heights``.
+    divergence : (2,)
+        Full width of the evenly lit elliptic footprint across and along the spin axis [rad].
+    encoder_eccentricity : (2,)
+        Cosine and sine amplitude that are added to the recorded joint angle [rad].
+    gimbal_clock_offset : float
+        What is added to a gimbal stamp to get the LiDAR's clock [s].
+    sigma_heading : float
+        Standard deviation of the angle about the gimbal axis that mounting and encoder leave
+        unknown: it turns all centres of a stop together [rad].
+    """
+
+    name: str
+    T_head_lidar: Array
+    R_mount_imu: Array
+    imu_mount: ImuMount
+    laser_elevations: Array
+    laser_heights: Array
+    laser_range_biases: Array
+    cloud_carries_heights: bool
+    divergence: Array
+    encoder_eccentricity: Array
+    gimbal_clock_offset: float
+    sigma_heading: float
+
+    def __post_init__(self) -> None:
+        seal(
+            self,
+            T_head_lidar=(4, 4),
+            R_mount_imu=(3, 3),
+            laser_elevations=(None,),
+            laser_heights=(None,),
+            laser_range_biases=(None,),
+            divergence=(2,),
+            encoder_eccentricity=(2,),
+        )
+        same_length(self, "laser_elevations", "laser_heights", "laser_range_biases")
+
+
+@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
+class ScanLog:
+    """What was recorded, each sensor on its own clock.
+
+    Attributes
+    ----------
+    p_lidar : (n, 3) float32
+        Returns as recorded, without those that are not finite or at the origin [m].
+    intensities : (n,) float32
+        Calibrated reflectivity as recorded, 0-255.
+    rings : (n,) uint8
+        Laser of each return, 0 the lowest; ``RING_UNKNOWN`` throughout when not recorded.
+    stamps_lidar_ns : (n,)
+        Instant of each shot; that of its message when the points carry no time.
+    has_shot_times : bool
+        Whether the points carry a time of their own.
+    gimbal_angles : (m,)
+        Joint angle, unwrapped, positive counter-clockwise seen from above [rad].
+    stamps_gimbal_ns : (m,)
+        Instant of each joint sample, strictly increasing.
+    quaternions_imu : (k, 4)
+        Orientation of the AHRS in the world, x y z w; no rows when there is none.
+    stamps_imu_ns : (k,)
+        Instant of each orientation.
+    rig : Rig or None
+        The rig that the recording describes; none when it does not.
+    origin : Origin
+        Name and digest of the recording.
+    notes : tuple of str
+        What the recording cannot give, as sentences for people.
+    has_heights : bool or None
+        Whether the coordinates include the heights of the lasers; none where only a rig can tell.
+    """
+
+    p_lidar: Column
+    intensities: Column
+    rings: Rings
+    stamps_lidar_ns: Nanos
+    has_shot_times: bool
+    gimbal_angles: Array
+    stamps_gimbal_ns: Nanos
+    quaternions_imu: Array
+    stamps_imu_ns: Nanos
+    rig: Rig | None
+    origin: Origin
+    notes: tuple[str, ...] = ()
+    has_heights: bool | None = None
+
+    def __post_init__(self) -> None:
+        seal(
+            self,
+            p_lidar=(None, 3),
+            intensities=(None,),
+            rings=(None,),
+            stamps_lidar_ns=(None,),
+            gimbal_angles=(None,),
+            stamps_gimbal_ns=(None,),
+            quaternions_imu=(None, 4),
+            stamps_imu_ns=(None,),
+        )
+        same_length(self, "p_lidar", "intensities", "rings", "stamps_lidar_ns")
+        same_length(self, "gimbal_angles", "stamps_gimbal_ns")
+        same_length(self, "quaternions_imu", "stamps_imu_ns")
+
+
+@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
+class Firings:
+    """All shots of a VLP-16 as its packets hold them, with and without a return.
+
+    Attributes
+    ----------
+    azimuths : (n,) uint16
+        Azimuth of the first shot of each block of two firings, in hundredths of a degree,
+        clockwise from x seen from +z.
+    distances : (n, 32) uint16
+        Distance of each shot in units of 2 mm, in the order of firing; 0 without a return.
+    reflectivities : (n, 32) uint8
+        Calibrated reflectivity of each shot; 0 without a return.
+    start_ns : int
+        Instant of the first shot; blocks follow each other without a pause.
+    """
+
+    azimuths: NDArray[np.uint16]
+    distances: NDArray[np.uint16]
+    reflectivities: NDArray[np.uint8]
+    start_ns: int
+
+    def __post_init__(self) -> None:
+        n = len(self.azimuths)
+        seal(self, azimuths=(n,), distances=(n, 32), reflectivities=(n, 32))
+
+
+@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
+class Levelling:
+    """How the base leans, as the AHRS tells, and what all centres of a stop have in common.
+
+    Attributes
+    ----------
+    roll, pitch : float
+        Angles of ``R_station_base = Ry(pitch) Rx(roll)`` [rad].
+    sigma : float
+        Standard deviation of each of the two angles [rad].
+    is_measured : bool
+        False when no AHRS was recorded and the base is only assumed to be about level.
+    sigma_heading : float
+        Standard deviation of the heading that mounting and encoder leave unknown [rad].
+    """
+
+    roll: float
+    pitch: float
+    sigma: float
+    is_measured: bool
+    sigma_heading: float = 0.0
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Timed:
+    """A column that changes evenly between samples: found for the rows that are asked for.
+
+    Attributes
+    ----------
+    stamps_ns : (n,)
+        Instant of each row.
+    samples_ns : (m,)
+        Instants of the samples, increasing; what is asked for is not before the first.
+    values : (m,)
+        What was sampled.
+    rates : (m,)
+        Change from each sample on [1/ns].
+    is_angle : bool
+        Whether to reduce to [-pi, pi) [rad].
+
+    Notes
+    -----
+    Of millions of shots a few thousand are asked for; ``column[:]`` gives all of them.
+    """
+
+    stamps_ns: Nanos
+    samples_ns: Nanos
+    values: Array
+    rates: Array
+    is_angle: bool = False
+
+    def __post_init__(self) -> None:
+        seal(self, stamps_ns=(None,), samples_ns=(None,), values=(None,), rates=(None,))
+        same_length(self, "samples_ns", "values", "rates")
+
+    def __len__(self) -> int:
+        """Return the number of rows."""
+        return len(self.stamps_ns)
+
+    def __getitem__(self, rows: slice | Index | Mask) -> Column:
+        """Return some rows, float32."""
+        stamps_ns = self.stamps_ns[rows]
+        sample: Any = 0  # where there is but one, millions of rows need not be told theirs
+        if len(self.samples_ns) > 1:
+            sample = np.searchsorted(self.samples_ns, stamps_ns, side="right") - 1
+        found = self.values[sample] + self.rates[sample] * (stamps_ns - self.samples_ns[sample])
+        if self.is_angle:
+            turns = found * (0.5 / np.pi)
+            found = 2.0 * np.pi * (turns - np.floor(turns + 0.5))
+        column = np.asarray(found, np.float32)
+        column.flags.writeable = False  # like an array's own: compiled loops tell the two apart
+        return column
+
+    def __array__(self, dtype: Any = None, copy: object = None) -> NDArray[Any]:
+        """Return all rows, for NumPy's own functions; they are always new."""
+        return np.asarray(self[:], dtype)
+
+
+@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
+class StitchedCloud:
+    """One stop's returns as points in the base frame, with what is needed to rebuild their beams.
+
+    Attributes
+    ----------
+    p_base : (n, 3) float32
+        Returns [m].
+    gimbal_angles : (n,) float32
+        Gimbal angle at each shot, eccentricity applied, reduced to [-pi, pi) [rad]. Like the times,
+        an array, or what finds the rows that are asked for.
+    intensities : (n,) float32
+        Calibrated reflectivity, 0-255.
+    rings : (n,) uint8
+        Laser of each return; ``RING_UNKNOWN`` when neither recorded nor told by the elevations.
+    times : (n,) float32
+        Instant of each shot since the first one of the stop [s].
+    levelling : Levelling
+        How the base leans.
+    rig : Rig
+        The rig that was used.
+    coverage : float
+        Angle that the gimbal turned through, at most a full turn [rad].
+    duration : float
+        Time from the first shot to the last [s].
+    name : str
+        Name of the stop.
+    notes : tuple of str
+        What weakens the result, as sentences for people.
+    """
+
+    p_base: Column
+    gimbal_angles: Column | Timed
+    intensities: Column
+    rings: Rings
+    times: Column | Timed
+    levelling: Levelling
+    rig: Rig
+    coverage: float
+    duration: float
+    name: str
+    notes: tuple[str, ...] = ()
+
+    def __post_init__(self) -> None:
+        columns = ("gimbal_angles", "intensities", "rings", "times")
+        arrays = (name for name in columns if not isinstance(getattr(self, name), Timed))
+        seal(self, p_base=(None, 3), **dict.fromkeys(arrays, (None,)))
+        same_length(self, "p_base", *columns)
+
+
+@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
+class Beams:
+    """Some shots of a stitched cloud as lines in the base frame.
+
+    Attributes
+    ----------
+    origins_base : (n, 3)
+        Where each beam leaves the spin axis of the LiDAR [m].
+    directions_base : (n, 3)
+        Unit vectors from origin to return.
+    ranges : (n,)
+        Distance from origin to return [m].
+    across_base : (n, 3)
+        Unit vectors across the beam, along the sweep of the LiDAR: the footprint's first axis.
+    rings : (n,) uint8
+        Laser of each shot.
+    intensities : (n,)
+        Calibrated reflectivity, 0-255.
+    times : (n,)
+        Instant of each shot since the first one of the stop [s].
+    divergence : (2,)
+        Full width of the footprint along ``across_base`` and square to it [rad].
+    """
+
+    origins_base: Array
+    directions_base: Array
+    ranges: Array
+    across_base: Array
+    rings: Rings
+    intensities: Array
+    times: Array
+    divergence: Array
+
+    def __post_init__(self) -> None:
+        vectors: dict[str, Shape] = dict.fromkeys(
+            ("origins_base", "directions_base", "across_base"), (None, 3)
+        )
+        columns: dict[str, Shape] = dict.fromkeys(
+            ("ranges", "rings", "intensities", "times"), (None,)
+        )
+        seal(self, **vectors, **columns, divergence=(2,))
+        same_length(self, *vectors, *columns)

@@ -1,0 +1,285 @@
+"""Stations and the marks that they are positioned from, and the truth to compare with."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from spheremark.pipelines.model.arrays import Array, Index, Shape, same_length, seal
+from spheremark.pipelines.model.marker import MarkerFits, Status
+from spheremark.pipelines.model.scan import Rig, StitchedCloud
+
+
+@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
+class ControlMarks:
+    """Marks at known places.
+
+    Attributes
+    ----------
+    names : tuple of str
+        What the surveyor calls them, all different.
+    p_site : (n, 3)
+        Centres of the spheres [m].
+    cov_p_site : (n, 3, 3)
+        Their covariances; zero where the coordinates are taken as exact [m^2].
+    """
+
+    names: tuple[str, ...]
+    p_site: Array
+    cov_p_site: Array
+
+    def __post_init__(self) -> None:
+        seal(self, p_site=(len(self.names), 3), cov_p_site=(len(self.names), 3, 3))
+
+
+@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
+class Exclusion:
+    """A marker that a fix left out.
+
+    Attributes
+    ----------
+    fit : int
+        Its place among the fits.
+    reason : str
+        Why, as a sentence for people.
+    """
+
+    fit: int
+    reason: str
+
+
+@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
+class StationFix:
+    """The pose of a station in the site frame, with its uncertainty.
+
+    Attributes
+    ----------
+    method : str
+        Name of the resection method.
+    T_site_station : (4, 4)
+        Maps station coordinates to site coordinates [m].
+    cov_T_site_station : (6, 6)
+        Covariance of a small motion (rotation [rad], translation [m]) applied on the left:
+        ``T_true = Exp(xi) T_site_station``, expressed in the site frame.
+    cov_p_site : (3, 3)
+        Covariance of the position: far from the site's origin that of the motion has no digits
+        left to tell it from [m^2].
+    matches : (n, 2)
+        Pairs of (place among the fits, place among the control marks), the used ones.
+    residuals_site : (n, 3)
+        Observed minus computed mark positions, in the order of ``matches`` [m].
+    redundancies : (n,)
+        Redundancy of each marker's three coordinates together, 0 (none) to 3.
+    w_statistics : (n,)
+        Largest w-statistic among each marker's three coordinates; NaN where not testable.
+    detectable_biases : (n,)
+        Minimal detectable bias along the weakest axis of each marker; infinite if none is [m].
+    external_reliabilities : (n,)
+        Largest shift of the station that a bias of each marker would cause unseen; infinite
+        likewise [m].
+    dof : int
+        Degrees of freedom: observations, gravity included, minus unknowns.
+    sigma0 : float
+        Square root of the a-posteriori variance factor; NaN without redundancy.
+    passes_global_test : bool
+        Whether the variance factor agrees with 1 at the level of the configuration; true without
+        redundancy, when nothing can be tested.
+    included_angles : (2,)
+        Smallest and largest 3-D angle at the station between two used marks [rad].
+    status : Status
+        Whether the fix can be relied on.
+    reason : str
+        Why it is weak; empty when it is not.
+    excluded : tuple of Exclusion
+        Markers that were left out.
+    """
+
+    method: str
+    T_site_station: Array
+    cov_T_site_station: Array
+    cov_p_site: Array
+    matches: Index
+    residuals_site: Array
+    redundancies: Array
+    w_statistics: Array
+    detectable_biases: Array
+    external_reliabilities: Array
+    dof: int
+    sigma0: float
+    passes_global_test: bool
+    included_angles: Array
+    status: Status
+    reason: str
+    excluded: tuple[Exclusion, ...] = ()
+
+    def __post_init__(self) -> None:
+        columns: dict[str, Shape] = {
+            name: (len(self.matches),)
+            for name in (
+                "redundancies",
+                "w_statistics",
+                "detectable_biases",
+                "external_reliabilities",
+            )
+        }
+        seal(
+            self,
+            T_site_station=(4, 4),
+            cov_T_site_station=(6, 6),
+            cov_p_site=(3, 3),
+            matches=(None, 2),
+            residuals_site=(len(self.matches), 3),
+            included_angles=(2,),
+            **columns,
+        )
+
+    @property
+    def p_site(self) -> Array:
+        """Position of the station, the origin of the station frame, in the site frame [m]."""
+        return self.T_site_station[:3, 3]
+
+    @property
+    def yaw(self) -> float:
+        """Heading of the station's x axis in the site frame, counter-clockwise from x [rad]."""
+        return float(np.arctan2(self.T_site_station[1, 0], self.T_site_station[0, 0]))
+
+    @property
+    def sigma_yaw(self) -> float:
+        """Standard deviation of ``yaw`` [rad]."""
+        return float(np.sqrt(self.cov_T_site_station[2, 2]))
+
+    @property
+    def sigma_3d(self) -> float:
+        """Square root of the trace of the position's covariance [m]."""
+        return float(np.sqrt(np.trace(self.cov_p_site)))
+
+
+@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
+class SubsetFixes:
+    """The station positioned from every k of its marks alone, one row per subset.
+
+    Attributes
+    ----------
+    method : str
+        Name of the resection method.
+    marks : (n, k)
+        Places of the marks among the control marks; k is 2 for pairs, 3 for triples.
+    included_angles : (n, 2)
+        Smallest and largest 3-D angle at the station between two of the centres; equal for pairs
+        [rad].
+    included_angles_horizontal : (n, 2)
+        The same in the levelled plane [rad].
+    p_site : (n, 3)
+        Position of the station [m].
+    sigma_horizontal : (n,)
+        Square root of the trace of the covariance of x and y [m].
+    sigma_3d : (n,)
+        Square root of the trace of the position's covariance [m].
+    """
+
+    method: str
+    marks: Index
+    included_angles: Array
+    included_angles_horizontal: Array
+    p_site: Array
+    sigma_horizontal: Array
+    sigma_3d: Array
+
+    def __post_init__(self) -> None:
+        angles: dict[str, Shape] = dict.fromkeys(
+            ("included_angles", "included_angles_horizontal"), (None, 2)
+        )
+        sigmas: dict[str, Shape] = dict.fromkeys(("sigma_horizontal", "sigma_3d"), (None,))
+        seal(self, marks=(None, None), p_site=(None, 3), **angles, **sigmas)
+        same_length(self, "marks", "p_site", *angles, *sigmas)
+
+
+@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
+class NoFix:
+    """A station that could not be positioned by one method.
+
+    Attributes
+    ----------
+    method : str
+        Name of the resection method.
+    code : str
+        Stable code of the error.
+    reason : str
+        Why, as a sentence for people.
+    """
+
+    method: str
+    code: str
+    reason: str
+
+
+@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
+class StopResult:
+    """All that one stop gave.
+
+    Attributes
+    ----------
+    name : str
+        Name of the stop.
+    cloud : StitchedCloud
+        Its returns in the base frame.
+    fits : mapping of str to MarkerFits
+        By fitting method.
+    fixes : mapping of (str, str) to StationFix or NoFix
+        By fitting and resection method; empty when there are no control marks.
+    subsets : mapping of (str, str) to tuple of SubsetFixes
+        The station from each pair and each triple of its marks, by fitting and resection method.
+    timings : mapping of str to float
+        Time that each step took [s].
+    """
+
+    name: str
+    cloud: StitchedCloud
+    fits: Mapping[str, MarkerFits]
+    fixes: Mapping[tuple[str, str], StationFix | NoFix]
+    subsets: Mapping[tuple[str, str], tuple[SubsetFixes, ...]]
+    timings: Mapping[str, float] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
+class StopTruth:
+    """What a simulated stop really was: for comparison only, never an input of the pipeline.
+
+    Attributes
+    ----------
+    name : str
+        Name of the stop.
+    T_site_base : (4, 4)
+        True pose of the base frame [m].
+    """
+
+    name: str
+    T_site_base: Array
+
+    def __post_init__(self) -> None:
+        seal(self, T_site_base=(4, 4))
+
+
+@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
+class Truth:
+    """The truth of a survey: for comparison only, never an input of the pipeline.
+
+    Attributes
+    ----------
+    marks : ControlMarks
+        True centres, with zero covariance.
+    stops : tuple of StopTruth
+        True poses.
+    rig : Rig or None
+        True rig, when known.
+    about : mapping
+        Seed, scenario and the like, for people.
+    """
+
+    marks: ControlMarks
+    stops: tuple[StopTruth, ...]
+    rig: Rig | None
+    about: Mapping[str, Any] = field(default_factory=dict)

@@ -1,0 +1,423 @@
+"""The study's own procedure: marks at random, an error on every centre, pass or fail.
+
+Marks are drawn round a station, the three whose circles cut best give its position, and errors are
+attached to their centres first: of random sign and fixed size, as in the study, or as the model of
+centres has them. The station is taken as level, as the study takes it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from itertools import pairwise
+from typing import Any, NamedTuple
+
+import numba
+import numpy as np
+
+from spheremark.pipelines.errors import ConfigError
+from spheremark.pipelines.model import Array, Index, Mask, same_length, seal
+from spheremark.pipelines.placement.centre_model import CentreModel, expect_centres
+from spheremark.pipelines.placement.plan import Arrangement, Sights
+from spheremark.pipelines.placement.visibility import N_STRIPS
+from spheremark.pipelines.threads import side_by_side
+
+ARRANGEMENTS_MAX = 5_000_000
+"""Arrangements that are tried at most."""
+
+BINS_DEG = (0, 10, 20, 30, 40, 50, 60)
+"""Edges of the classes of worst included angle [deg]; of three directions one pair is within 60."""
+
+_HALF_HEIGHT = 0.3  # [m] by which centres stand above or below the LiDAR at most
+_N_STEPS = 8  # of Gauss and Newton; three or four settle
+_SETTLED = 1e-8  # [m] length of the last step
+_TABLE = 60  # distances at which the model of centres is tabulated
+_FIRST, _THIRD = np.radians(105.0), np.radians(10.0)  # where the study's marks seem to stand
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Trial:
+    """What is tried.
+
+    Attributes
+    ----------
+    n_arrangements : int
+        Number of arrangements.
+    n_marks : tuple of int
+        Least and greatest number of marks; all are equally frequent.
+    distances : tuple of float
+        Nearest and farthest that a mark stands [m]. 7.5: the study's greatest distance.
+    angles : tuple of float
+        Window of included angles that the marks used must keep [rad]; 0 and pi allow all.
+    error : float or None
+        Size of the error on each axis of each centre, of random sign [m]. 0.017: the study's, 0.03
+        in space; none takes normal errors of the model of centres.
+    tolerance : float
+        3-D error that passes [m].
+    seed : int
+        Source of chance.
+    """
+
+    n_arrangements: int = 100_000
+    n_marks: tuple[int, int] = (3, 14)
+    distances: tuple[float, float] = (2.0, 7.5)
+    angles: tuple[float, float] = (0.0, float(np.pi))
+    error: float | None = 0.017
+    tolerance: float = 0.03
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        if not 1 <= self.n_arrangements <= ARRANGEMENTS_MAX:
+            raise ConfigError(
+                f"{self.n_arrangements:,} arrangements; from 1 to {ARRANGEMENTS_MAX:,} are tried."
+            )
+        low, high = self.n_marks
+        if not 3 <= low <= high <= 40:
+            raise ConfigError(f"{low} to {high} marks; three circles need 3, and 40 are the most.")
+        if not 0.5 <= self.distances[0] < self.distances[1] <= 45.0:
+            raise ConfigError(
+                f"Distances from {self.distances[0]:g} to {self.distances[1]:g} m; they must "
+                "ascend within 0.5 to 45 m."
+            )
+        if not 0.0 <= self.angles[0] < self.angles[1] <= np.pi + 1e-9:
+            raise ConfigError(
+                f"Included angles from {np.degrees(self.angles[0]):g} to "
+                f"{np.degrees(self.angles[1]):g} deg; they must ascend within 0 to 180."
+            )
+        if self.tolerance <= 0 or (self.error is not None and not 0.0 < self.error <= 1.0):
+            raise ConfigError("The tolerance and the error on each axis must be above 0 m.")
+
+
+@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
+class TrialResult:
+    """What came of each arrangement.
+
+    Attributes
+    ----------
+    trial : Trial
+        What was tried.
+    n_marks : (n,)
+        Marks of each arrangement.
+    worst_angles : (n,)
+        Of the three marks used, the included angle that is farthest from a right one, as its
+        distance from 0 or 180 degrees, whichever is nearer; at most 90 [rad].
+    errors_3d : (n,)
+        3-D error of each position [m].
+    is_in_window : (n,)
+        Whether the included angles of the three keep the window.
+    """
+
+    trial: Trial
+    n_marks: Index
+    worst_angles: Array
+    errors_3d: Array
+    is_in_window: Mask
+
+    def __post_init__(self) -> None:
+        names = ("n_marks", "worst_angles", "errors_3d", "is_in_window")
+        seal(self, **dict.fromkeys(names, (None,)))
+        same_length(self, *names)
+
+    @property
+    def passes(self) -> Mask:
+        """Whether each position is within the tolerance."""
+        return np.asarray(self.errors_3d <= self.trial.tolerance)
+
+
+class Share(NamedTuple):
+    """How many of a class of arrangements pass.
+
+    Attributes
+    ----------
+    low, high : float
+        Edges of the class: number of marks, or worst included angle [deg].
+    n : int
+        Arrangements in it.
+    share : float
+        Share of them that passes; NaN for none.
+    median : float
+        Median 3-D error [m].
+    p95 : float
+        95th percentile of the 3-D error [m].
+    """
+
+    low: float
+    high: float
+    n: int
+    share: float
+    median: float
+    p95: float
+
+
+def try_at_random(trial: Trial, model: CentreModel | None = None) -> TrialResult:
+    """Draw arrangements and position a station from each.
+
+    Parameters
+    ----------
+    trial : Trial
+        What is tried.
+    model : CentreModel, optional
+        How well centres are known; needed where the trial gives no error of its own.
+
+    Returns
+    -------
+    TrialResult
+        One row per arrangement; with a window of angles, arrangements that no three marks of keep
+        it use the three that cut best all the same and are marked.
+
+    Raises
+    ------
+    ConfigError
+        If neither the trial nor a model says how large errors are.
+
+    Notes
+    -----
+    Places are even over the ring between the two distances, heights even within 0.3 m of the
+    LiDAR's. Three circles of true radius about the wrong centres are met by least squares
+    (Gauss-Newton from the true place); the height is the mean of theirs. Cost grows linearly with
+    arrangements, and with the third power of marks for the choice of the three.
+    """
+    sigmas = _sigmas(trial, model)
+    low, high = trial.n_marks
+    n = trial.n_arrangements
+    counts = np.random.default_rng(trial.seed).integers(low, high + 1, n)
+    worst, errors, inside = np.empty(n), np.empty(n), np.empty(n, dtype=np.bool_)
+    window = (np.cos(trial.angles[0]), np.cos(trial.angles[1]))
+
+    def part(first: int, last: int) -> None:
+        _try(
+            np.random.default_rng([trial.seed, first]),
+            (counts[first:last], trial.distances, window, trial.error or 0.0, sigmas),
+            (worst[first:last], errors[first:last], inside[first:last]),
+        )
+
+    side_by_side(part, n, worth=1_000)
+    return TrialResult(
+        trial=trial,
+        n_marks=counts.astype(np.intp),
+        worst_angles=worst,
+        errors_3d=errors,
+        is_in_window=inside,
+    )
+
+
+def by_number(result: TrialResult) -> tuple[Share, ...]:
+    """Return how many pass by the number of marks.
+
+    Parameters
+    ----------
+    result : TrialResult
+        What came of the trials; only those within the window count.
+
+    Returns
+    -------
+    tuple of Share
+        One for each number.
+    """
+    low, high = result.trial.n_marks
+    keep = result.is_in_window
+    return tuple(
+        _share(result, keep & (result.n_marks == k), float(k), float(k))
+        for k in range(low, high + 1)
+    )
+
+
+def by_worst_angle(result: TrialResult) -> tuple[Share, ...]:
+    """Return how many pass by the worst included angle.
+
+    Parameters
+    ----------
+    result : TrialResult
+        What came of the trials; all of them count, so that the window shows.
+
+    Returns
+    -------
+    tuple of Share
+        One for each class of ``BINS_DEG``.
+    """
+    angles = np.degrees(result.worst_angles)
+    return tuple(
+        _share(result, (angles >= a) & (angles < b), float(a), float(b))
+        for a, b in pairwise(BINS_DEG)
+    )
+
+
+def _share(result: TrialResult, keep: Mask, low: float, high: float) -> Share:
+    """Return how many of some arrangements pass."""
+    errors = result.errors_3d[keep]
+    if not len(errors):
+        return Share(low, high, 0, np.nan, np.nan, np.nan)
+    return Share(
+        low,
+        high,
+        len(errors),
+        float(np.mean(errors <= result.trial.tolerance)),
+        float(np.median(errors)),
+        float(np.quantile(errors, 0.95)),
+    )
+
+
+def errors_by_angle(angles: Array, error: float, distance: float) -> Array:
+    """Return the error of a position against the included angle of its marks, as the study has it.
+
+    Parameters
+    ----------
+    angles : (n,)
+        Included angles between the first and the second mark [rad].
+    error : float
+        Size of the error on each axis of each centre [m].
+    distance : float
+        Distance of the marks [m].
+
+    Returns
+    -------
+    (n,)
+        Median 3-D error over all 512 patterns of signs [m].
+
+    Notes
+    -----
+    The first mark stands at a heading of 105 degrees, the third 10 degrees further, the height is
+    off by the error of one axis: of the many readings of the study's Table 3 that were tried, this
+    one gives its seven values within 2 mm (root mean square); plausible, not proven.
+    """
+    signs = np.array(np.meshgrid(*[[-1.0, 1.0]] * 9)).reshape(9, -1).T.reshape(-1, 3, 3)
+    out = []
+    for angle in angles:
+        headings = np.array([_FIRST, _FIRST + angle, _FIRST + _THIRD])
+        marks = distance * np.column_stack([np.cos(headings), np.sin(headings), np.zeros(3)])
+        off = three_circle_errors(marks, error * signs)
+        off[:, 2] = error
+        out.append(np.median(np.linalg.norm(off, axis=1)))
+    return np.array(out)
+
+
+def three_circle_errors(marks_site: Array, errors: Array) -> Array:
+    """Return the errors of a level station at the origin from three circles."""
+    out = np.empty((len(errors), 3))
+    _meet_all(np.ascontiguousarray(marks_site), np.ascontiguousarray(errors), out)
+    return out
+
+
+def _sigmas(trial: Trial, model: CentreModel | None) -> Array:
+    """Return distances with sigmas towards, left and up there, (k, 4) [m]; one row for none."""
+    if trial.error is not None:
+        return np.zeros((1, 4))
+    if model is None:
+        raise ConfigError("Neither an error on each axis nor a model of centres was given.")
+    distances = np.linspace(*trial.distances, _TABLE)
+    marks = Arrangement(
+        names=tuple(str(i) for i in range(_TABLE)),
+        p_site=np.column_stack([distances, np.zeros((_TABLE, 2))]),
+    )
+    sights = Sights.open(1, _TABLE, N_STRIPS)
+    covs = expect_centres(model, np.zeros((1, 3)), marks, sights).cov_site[0]
+    variances = np.einsum("nii->ni", covs)
+    worst = np.nanmax(np.where(np.isfinite(variances), variances, np.nan), axis=0)
+    variances = np.where(np.isfinite(variances), variances, worst)
+    return np.column_stack([distances, np.sqrt(variances)])
+
+
+@numba.njit(cache=True, nogil=True)
+def _meet(p: Array, off: Array, found: Array) -> None:
+    """Fill in where three circles about wrong centres meet best; the station is at the origin."""
+    x, y = 0.0, 0.0
+    for _ in range(_N_STEPS):
+        a, b, c, gx, gy = 0.0, 0.0, 0.0, 0.0, 0.0
+        for i in range(3):
+            dx, dy = x - p[i, 0] - off[i, 0], y - p[i, 1] - off[i, 1]
+            d = max(np.hypot(dx, dy), 1e-9)
+            v = np.hypot(p[i, 0], p[i, 1]) - d
+            ux, uy = dx / d, dy / d
+            a, b, c = a + ux * ux, b + ux * uy, c + uy * uy
+            gx, gy = gx + ux * v, gy + uy * v
+        det = max(a * c - b * b, 1e-9)
+        sx, sy = (c * gx - b * gy) / det, (a * gy - b * gx) / det
+        length = np.hypot(sx, sy)
+        cut = min(1.0, 0.5 / max(length, 1e-12))  # a step is half a metre at most
+        x, y = x + cut * sx, y + cut * sy
+        if length < _SETTLED:
+            break
+    found[0], found[1] = x, y
+    found[2] = (off[0, 2] + off[1, 2] + off[2, 2]) / 3.0
+
+
+@numba.njit(cache=True, nogil=True)
+def _meet_all(p: Array, offs: Array, out: Array) -> None:
+    """Fill in the errors of all patterns."""
+    for i in range(len(offs)):
+        _meet(p, offs[i], out[i])
+
+
+@numba.njit(cache=True, nogil=True)
+def _three(units: Array, n: int, window: tuple[float, float], three: Index) -> bool:
+    """Choose the three marks that cut best, in the window if any; false if none are in it."""
+    best_in, best_any = np.inf, np.inf
+    widest, narrowest = window
+    kept = np.zeros(3, np.intp)
+    for i in range(n):
+        for j in range(i + 1, n):
+            ij = units[i, 0] * units[j, 0] + units[i, 1] * units[j, 1]
+            xx = units[i, 0] ** 2 + units[j, 0] ** 2
+            xy = units[i, 0] * units[i, 1] + units[j, 0] * units[j, 1]
+            for k in range(j + 1, n):
+                a, b = xx + units[k, 0] ** 2, xy + units[k, 0] * units[k, 1]
+                spread = 3.0 / max(a * (3.0 - a) - b * b, 1e-12)
+                if spread < best_any:
+                    best_any = spread
+                    three[0], three[1], three[2] = i, j, k
+                if spread < best_in:
+                    ik = units[i, 0] * units[k, 0] + units[i, 1] * units[k, 1]
+                    jk = units[j, 0] * units[k, 0] + units[j, 1] * units[k, 1]
+                    if max(ij, ik, jk) <= widest and min(ij, ik, jk) >= narrowest:
+                        best_in = spread
+                        kept[0], kept[1], kept[2] = i, j, k
+    if best_in < np.inf:
+        three[:] = kept
+        return True
+    return False
+
+
+@numba.njit(cache=True, nogil=True)
+def _attach(rng: np.random.Generator, p: Array, error: float, sigmas: Array, off: Array) -> None:
+    """Fill in the errors of three centres."""
+    for i in range(3):
+        if error > 0.0:
+            for axis in range(3):
+                off[i, axis] = error if rng.random() < 0.5 else -error
+            continue
+        flat = np.hypot(p[i, 0], p[i, 1])
+        place = (flat - sigmas[0, 0]) / (sigmas[1, 0] - sigmas[0, 0])
+        row = min(max(int(place + 0.5), 0), len(sigmas) - 1)
+        towards, left = sigmas[row, 1] * rng.normal(), sigmas[row, 2] * rng.normal()
+        ux, uy = p[i, 0] / flat, p[i, 1] / flat
+        off[i, 0], off[i, 1] = towards * ux - left * uy, towards * uy + left * ux
+        off[i, 2] = sigmas[row, 3] * rng.normal()
+
+
+@numba.njit(cache=True, nogil=True)
+def _try(rng: np.random.Generator, plan: tuple[Any, ...], out: tuple[Any, ...]) -> None:
+    """Fill in worst angle, error and window of each arrangement."""
+    counts, distances, window, error, sigmas = plan
+    worst, errors, inside = out
+    units, p = np.empty((64, 2)), np.empty((64, 3))
+    used, off, found = np.empty((3, 3)), np.empty((3, 3)), np.empty(3)
+    three = np.zeros(3, np.intp)
+    near2, far2 = distances[0] ** 2, distances[1] ** 2
+    for i in range(len(counts)):
+        n = counts[i]
+        for m in range(n):
+            bearing = 2.0 * np.pi * rng.random()
+            d = np.sqrt(near2 + (far2 - near2) * rng.random())
+            units[m, 0], units[m, 1] = np.cos(bearing), np.sin(bearing)
+            p[m, 0], p[m, 1] = d * units[m, 0], d * units[m, 1]
+            p[m, 2] = _HALF_HEIGHT * (2.0 * rng.random() - 1.0)
+        inside[i] = _three(units, n, window, three)
+        low = 1.0
+        for a in range(3):
+            used[a] = p[three[a]]
+            for b in range(a):
+                u, v = units[three[a]], units[three[b]]
+                low = min(low, abs(u[0] * v[1] - u[1] * v[0]))
+        worst[i] = np.arcsin(min(low, 1.0))
+        _attach(rng, used, error, sigmas, off)
+        _meet(used, off, found)
+        errors[i] = np.sqrt(found[0] ** 2 + found[1] ** 2 + found[2] ** 2)

@@ -1,0 +1,289 @@
+"""How much of a sphere the ground and what stands on it leave to be seen.
+
+Hides the marching of rays. A sphere's disc is cut into upright strips; for each the highest line
+of sight that something between eye and sphere touches is found. Where even the highest surface
+nearby lies below the lowest line of sight, which is the rule, one coarse march settles it. Where
+the surfaces themselves are known, what the grid would hide is looked at among them.
+"""
+
+from __future__ import annotations
+
+from functools import lru_cache
+
+import numba
+import numpy as np
+from scipy.ndimage import maximum_filter
+
+from spheremark.pipelines.model import Array, Mask
+from spheremark.pipelines.placement.plan import Arrangement, Sights, Site
+from spheremark.pipelines.simulation.scene import Caster, Mesh, caster
+from spheremark.pipelines.threads import side_by_side
+
+N_STRIPS = 8
+"""Strips that a disc is cut into."""
+
+_COARSE = 5  # cells from one step of the coarse march to the next
+_BEHIND = 0.05  # [m] something nearer to the sphere than this is its own foot
+_MANY = 400  # pairs of eye and mark that are worth a second thread
+_HIDDEN, _SEEN = 1.0, -1.0
+_N_HEIGHTS = 12  # rays to each strip of a disc
+_REACH = 0.9  # [m] behind a centre that is looked for a surface
+_N_PAIRS = 10_000  # of eye and mark whose rays are cast at a time: some 50 MB
+_TOUCH = 1e-3  # [m] what is this near to a sphere does not hide it
+
+Ray = tuple[float, float, float, float, float, float]
+"""Origin, level direction and length [m]."""
+
+
+def look(site: Site, eyes_site: Array, marks: Arrangement) -> Sights:
+    """Tell what can be seen of marks, each as if it stood there alone.
+
+    Parameters
+    ----------
+    site : Site
+        Ground and what stands on it.
+    eyes_site : (e, 3)
+        Places of the LiDAR [m].
+    marks : Arrangement
+        The marks.
+
+    Returns
+    -------
+    Sights
+        For each eye, mark and strip of the disc.
+
+    Notes
+    -----
+    Cost grows linearly with eyes, marks and distance over cell size. A mark that moves costs only
+    its own column (``Sights.with_mark``).
+    """
+    lowest = np.empty((len(eyes_site), len(marks.names), N_STRIPS), np.float32)
+    gaps = np.empty(lowest.shape[:2], np.float32)
+    grids = (site.surface, _highest_near(site))
+    frame = (site.xs[0], site.ys[0], site.cell)
+    eyes, p_site = np.ascontiguousarray(eyes_site), np.ascontiguousarray(marks.p_site)
+
+    def part(first: int, last: int) -> None:
+        _look(grids, frame, (eyes[first:last], p_site), site.marker_radius, lowest[first:last])
+
+    side_by_side(part, len(eyes), worth=max(2, _MANY // max(len(p_site), 1)))
+    if site.bodies is not None:
+        _look_again(site.bodies, (eyes, p_site), site.marker_radius, lowest)
+    _look_behind(site.surface, frame, (eyes, p_site), gaps)
+    return Sights(lowest=lowest, gaps=gaps)
+
+
+def _look_again(
+    bodies: Mesh, places: tuple[Array, Array], radius: float, lowest: np.ndarray
+) -> None:
+    """Replace what the grid seems to hide by what the surfaces themselves do.
+
+    A strip of which a share is seen counts as seen from so high on that as much of it is left:
+    under a canopy the upper part hides, which is worth as much.
+    """
+    eyes, marks = places
+    lefts = (2.0 * np.arange(N_STRIPS) + 1.0) / N_STRIPS - 1.0
+    chords = np.sqrt(1.0 - lefts**2)
+    parts = (2.0 * np.arange(_N_HEIGHTS) + 1.0) / _N_HEIGHTS - 1.0
+    disc = radius * np.stack(np.broadcast_arrays(lefts[:, None], chords[:, None] * parts), axis=-1)
+    e, m = np.nonzero((lowest > _SEEN).any(axis=2))
+    is_far = np.hypot(*(marks[m] - eyes[e])[:, :2].T) >= 2.0 * radius
+    for first in range(0, int(is_far.sum()), _N_PAIRS):
+        some = slice(first, first + _N_PAIRS)
+        i, k = e[is_far][some], m[is_far][some]
+        seen = _open_lines(bodies, eyes[i], marks[k], disc.reshape(-1, 2), radius)
+        shares = seen.reshape(len(i), N_STRIPS, _N_HEIGHTS).mean(axis=2)
+        part = np.where(shares == 1.0, _SEEN, chords * (1.0 - 2.0 * shares))
+        lowest[i, k] = np.where(shares == 0.0, _HIDDEN, part)
+
+
+def _open_lines(bodies: Mesh, eyes: Array, marks: Array, disc: Array, radius: float) -> Mask:
+    """Return which lines of sight to points of marks' discs meet nothing before them, (n, k)."""
+    ahead = marks - eyes
+    distances = np.linalg.norm(ahead, axis=1)
+    ahead = ahead / distances[:, None]
+    left = np.column_stack([-ahead[:, 1], ahead[:, 0], np.zeros(len(ahead))])
+    left = left / np.linalg.norm(left, axis=1, keepdims=True)
+    up = np.cross(ahead, left)
+    lines = (marks - eyes)[:, None] + disc[:, :1] * left[:, None] + disc[:, 1:] * up[:, None]
+    rays = np.empty((*lines.shape[:2], 6), np.float32)
+    rays[..., :3] = eyes[:, None]
+    rays[..., 3:] = lines / np.linalg.norm(lines, axis=2, keepdims=True)
+    met, _ = _caster(bodies)(rays.reshape(-1, 6))
+    return np.asarray(met.reshape(lines.shape[:2]) >= distances[:, None] - radius - _TOUCH)
+
+
+@lru_cache(maxsize=4)
+def _caster(bodies: Mesh) -> Caster:
+    """Return what casts rays against surfaces; growing its search tree takes a second."""
+    return caster.__wrapped__(bodies)
+
+
+def behind_others(site: Site, eyes_site: Array, marks: Arrangement, sights: Sights) -> Sights:
+    """Tell what is seen of marks that also stand in each other's way.
+
+    Notes
+    -----
+    Whatever of a strip lies below the top of a sphere before it counts as hidden.
+    """
+    lowest = sights.lowest.copy()
+    sizes = (site.marker_radius, site.pole_radius)
+    _shade(np.ascontiguousarray(eyes_site), np.ascontiguousarray(marks.p_site), sizes, lowest)
+    return Sights(lowest=lowest, gaps=sights.gaps.copy())
+
+
+@lru_cache(maxsize=4)
+def _highest_near(site: Site) -> Array:
+    """Return the height of the highest surface within a coarse step of each node [m]."""
+    surface = np.where(np.isfinite(site.surface), site.surface, -np.inf)
+    reach = _COARSE + int(np.ceil(1.5 * site.marker_radius / site.cell)) + 1
+    return np.asarray(maximum_filter(surface, size=2 * reach + 1, mode="nearest"))
+
+
+@numba.njit(cache=True, nogil=True)
+def _height(grid: Array, u: float, v: float) -> float:
+    """Return a grid's bilinear value; far below the ground off the grid or where unknown."""
+    i, j = int(np.floor(u)), int(np.floor(v))
+    if u < 0.0 or v < 0.0 or j > grid.shape[0] - 2 or i > grid.shape[1] - 2:
+        return -1e9
+    u, v = u - i, v - j
+    low = (1.0 - u) * grid[j, i] + u * grid[j, i + 1]
+    high = (1.0 - u) * grid[j + 1, i] + u * grid[j + 1, i + 1]
+    height = (1.0 - v) * low + v * high
+    return height if height == height else -1e9
+
+
+@numba.njit(cache=True, nogil=True)
+def _clears(coarse: Array, frame: tuple[float, float, float], ray: Ray, slope: float) -> bool:
+    """Return whether a ray of some slope stays above the highest surface nearby."""
+    x, y, z, dx, dy, length = ray
+    x0, y0, cell = frame
+    n_y, n_x = coarse.shape
+    n = int(length / (_COARSE * cell)) + 1
+    for k in range(n + 1):
+        s = min(k * _COARSE * cell, length)
+        i = round((x + s * dx - x0) / cell)
+        j = round((y + s * dy - y0) / cell)
+        i, j = min(max(i, 0), n_x - 1), min(max(j, 0), n_y - 1)
+        before = max(s - _COARSE * cell, 0.0)
+        if coarse[j, i] > z + min(slope * s, slope * before):
+            return False
+    return True
+
+
+@numba.njit(cache=True, nogil=True)
+def _horizon(surface: Array, frame: tuple[float, float, float], ray: Ray) -> float:
+    """Return the steepest slope at which something along a ray is met."""
+    x, y, z, dx, dy, length = ray
+    x0, y0, cell = frame
+    n = max(int(2.0 * length / cell), 1)
+    step = length / n
+    steepest = -1e9
+    for k in range(1, n + 1):
+        s = k * step
+        rise = _height(surface, (x + s * dx - x0) / cell, (y + s * dy - y0) / cell) - z
+        steepest = max(steepest, rise / s)
+    return steepest
+
+
+@numba.njit(cache=True, nogil=True)
+def _look(
+    grids: tuple[Array, Array],
+    frame: tuple[float, float, float],
+    places: tuple[Array, Array],
+    radius: float,
+    lowest: np.ndarray,
+) -> None:
+    """Fill in the lowest height, in radii, from which on each strip of each disc is seen."""
+    surface, coarse = grids
+    eyes, marks = places
+    n_strips = lowest.shape[2]
+    for e in range(len(eyes)):
+        x, y, z = eyes[e, 0], eyes[e, 1], eyes[e, 2]
+        for m in range(len(marks)):
+            dx, dy, dz = marks[m, 0] - x, marks[m, 1] - y, marks[m, 2] - z
+            flat = np.hypot(dx, dy)
+            if flat < 2.0 * radius:  # overhead or below: the fan does not reach
+                lowest[e, m] = _HIDDEN
+                continue
+            dx, dy = dx / flat, dy / flat
+            length = max(flat - radius - _BEHIND, 0.5 * flat)
+            ray = (x, y, z, dx, dy, length)
+            if _clears(coarse, frame, ray, (dz - 1.1 * radius) / flat):
+                lowest[e, m] = _SEEN
+                continue
+            tilt = flat / np.sqrt(flat * flat + dz * dz)
+            for c in range(n_strips):
+                aside = radius * ((2.0 * c + 1.0) / n_strips - 1.0)
+                far = np.hypot(flat, aside)
+                bx, by = (flat * dx - aside * dy) / far, (flat * dy + aside * dx) / far
+                slope = _horizon(surface, frame, (x, y, z, bx, by, length))
+                height = tilt * (slope * flat - dz) / radius
+                lowest[e, m, c] = min(max(height, _SEEN), _HIDDEN)
+
+
+@numba.njit(cache=True, nogil=True)
+def _look_behind(
+    surface: Array,
+    frame: tuple[float, float, float],
+    places: tuple[Array, Array],
+    gaps: np.ndarray,
+) -> None:
+    """Fill in how far behind each centre the line of sight to it meets the surface."""
+    eyes, marks = places
+    x0, y0, cell = frame
+    step = min(0.5 * cell, 0.1)
+    for e in range(len(eyes)):
+        for m in range(len(marks)):
+            dx, dy, dz = (
+                marks[m, 0] - eyes[e, 0],
+                marks[m, 1] - eyes[e, 1],
+                marks[m, 2] - eyes[e, 2],
+            )
+            flat = max(np.hypot(dx, dy), 1e-9)
+            gaps[e, m] = np.inf
+            for k in range(1, int(_REACH / step) + 1):
+                s = k * step
+                x, y = marks[m, 0] + s * dx / flat, marks[m, 1] + s * dy / flat
+                if (
+                    _height(surface, (x - x0) / cell, (y - y0) / cell)
+                    >= marks[m, 2] + s * dz / flat
+                ):
+                    gaps[e, m] = s
+                    break
+
+
+@numba.njit(cache=True, nogil=True)
+def _shade(eyes: Array, marks: Array, sizes: tuple[float, float], lowest: np.ndarray) -> None:
+    """Raise the lowest seen heights by the spheres and poles that stand before a mark."""
+    radius, pole = sizes
+    n_strips = lowest.shape[2]
+    for e in range(len(eyes)):
+        x, y, z = eyes[e, 0], eyes[e, 1], eyes[e, 2]
+        for m in range(len(marks)):
+            dx, dy, dz = marks[m, 0] - x, marks[m, 1] - y, marks[m, 2] - z
+            flat = np.hypot(dx, dy)
+            if flat < 2.0 * radius:
+                continue
+            dx, dy = dx / flat, dy / flat
+            for other in range(len(marks)):
+                ox, oy = marks[other, 0] - x, marks[other, 1] - y
+                along = ox * dx + oy * dy
+                if other == m or along < 2.0 * radius or along > flat - radius:
+                    continue
+                scale = flat / along
+                aside = scale * (oy * dx - ox * dy)
+                if abs(aside) > radius * (1.0 + scale):
+                    continue
+                rise = scale * (marks[other, 2] - z) - dz
+                for c in range(n_strips):
+                    off = abs(radius * ((2.0 * c + 1.0) / n_strips - 1.0) - aside)
+                    top = -1e9
+                    if off < scale * radius:
+                        half = np.sqrt((scale * radius) ** 2 - off * off)
+                        is_below = rise + half < -radius
+                        top = rise + half if not is_below and rise - half < radius else -1e9
+                    if off < scale * pole:
+                        top = max(top, rise)
+                    height = min(max(top / radius, _SEEN), _HIDDEN)
+                    lowest[e, m, c] = max(lowest[e, m, c], height)

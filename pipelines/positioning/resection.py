@@ -1,0 +1,365 @@
+"""MarkerFits + control marks -> StationFix: hides the adjustment and what weakens it.
+
+A free station: the unknown is the full pose of ``base`` in ``site``; centres are observed in
+``base``, gravity is observed by the AHRS. Beside it positions from distances alone (``ranging``).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from functools import partial
+
+import numpy as np
+
+from spheremark.pipelines.config import ResectionConfig
+from spheremark.pipelines.errors import ConfigError, DegenerateGeometryError, NoMarkersError
+from spheremark.pipelines.estimation.least_squares import (
+    Adjustment,
+    adjust,
+    external_reliabilities,
+    snoop,
+)
+from spheremark.pipelines.geometry import (
+    cross,
+    included_angle,
+    inverse,
+    is_on_a_line,
+    rigid,
+    skew,
+    transform,
+)
+from spheremark.pipelines.model import (
+    Array,
+    ControlMarks,
+    Exclusion,
+    Index,
+    MarkerFits,
+    Mask,
+    StationFix,
+    Status,
+)
+from spheremark.pipelines.positioning.matching import (
+    Match,
+    Scene,
+    contradiction,
+    cov_of_shared,
+    gather,
+    match_marks,
+    moved,
+    observe,
+)
+from spheremark.pipelines.positioning.trilateration import fix_by_ranges
+
+_UPRIGHT = 0.05  # spread across over spread along of marks on a plumb line: no heading
+_MANY_LEFT_OUT = 1.0 / 3.0  # of the matched markers: not they are bad, but the sigmas too small
+_TELLING = 4  # markers that agree: with fewer, the one that was left out may be the good one
+
+
+def resect(
+    method: str, fits: MarkerFits, marks: ControlMarks, config: ResectionConfig
+) -> StationFix:
+    """Position a station from its markers and the control marks.
+
+    Parameters
+    ----------
+    method : str
+        One of ``RESECTION_METHODS``.
+    fits : MarkerFits
+        Centres in base with covariances; nobody knows which mark is which.
+    marks : ControlMarks
+        Known places of spheres; may be more or fewer than the fits.
+    config : ResectionConfig
+        Tolerance of matching, levels of the tests.
+
+    Returns
+    -------
+    StationFix
+        Pose, covariance, residuals, tests; weak with a reason where it cannot be relied on.
+
+    Raises
+    ------
+    NoMarkersError
+        If there is no fit at all.
+    DegenerateGeometryError
+        If there is only one marker or mark, or all stand on one plumb line.
+    NoMatchError
+        If the markers do not agree with the marks better than chance.
+    AmbiguousMatchError
+        If they agree in two different ways equally well.
+    """
+    if method not in _METHODS:
+        raise ConfigError(f"There is no resection method {method!r}; known: {', '.join(_METHODS)}.")
+    return _METHODS[method](fits, marks, config)
+
+
+def free_station(fits: MarkerFits, marks: ControlMarks, config: ResectionConfig) -> StationFix:
+    """Position a station by adjusting its full pose to the centres and to gravity.
+
+    Notes
+    -----
+    Residuals are ``T_site_base p_base - p_mark`` with the covariances of both in the site frame,
+    and the horizontal part of the measured up direction, turned into the site, with that of the
+    AHRS. To each centre ``sigma_common`` is added per axis and independently: a fit's covariance
+    knows the noise of its returns, lasers and the mounting, not what changes from direction to
+    direction and moves both faces alike; the part that all centres share is a motion
+    of the pose and cannot be told from it. Where data snooping would leave out more than a third of
+    the markers, the sigmas are to blame: it is done again with w divided by sigma0. Gravity that
+    contradicts three or more marks is left out like a bad marker, and the fix is weak.
+    """
+    _refuse_too_few(fits, marks)
+    scene = gather(fits, marks, config)
+    match = match_marks(scene, config)
+    pairs = match.pairs
+
+    def adjusted(keep: Mask) -> Adjustment[Array]:
+        return adjust(
+            lambda T: observe(scene, pairs[keep[:-1]], T)[: 1 + int(keep[-1])],
+            moved,
+            match.T_site_base,
+            test_level=config.test_level,
+            test_power=config.test_power,
+        )
+
+    def may_drop(keep: Mask, block: int) -> bool:
+        rest = keep.copy()
+        rest[block] = False
+        if not rest[-1]:
+            return not is_on_a_line(scene.marks_site[pairs[rest[:-1], 1]])
+        return int(rest[:-1].sum()) >= 2 and _has_heading(scene, pairs[rest[:-1]])
+
+    adjustment, keep, dropped = snoop(adjusted, len(pairs) + 1, may_drop)
+    if len(dropped) > _MANY_LEFT_OUT * len(pairs):
+        adjustment, keep, dropped = snoop(adjusted, len(pairs) + 1, may_drop, is_studentised=True)
+    used = pairs[keep[:-1]]
+    excluded = _exclusions(match, dropped, scene, adjustment, config)
+    reasons = _weaknesses(scene, match, used, adjustment, dropped)
+    return _fix(scene, match, used, adjustment, excluded, reasons)
+
+
+def _refuse_too_few(fits: MarkerFits, marks: ControlMarks) -> None:
+    """Raise where no station can come out."""
+    if not fits.fits:
+        raise NoMarkersError(
+            f"No marker was found by {fits.method!r} ({len(fits.rejected)} candidates were "
+            "refused); a station needs two, better three or more."
+        )
+    for n, kind in ((len(fits.fits), "marker"), (len(marks.names), "control mark")):
+        if n < 2:
+            raise DegenerateGeometryError(
+                f"{'One' if n else 'No'} {kind} gives no position: the heading stays open. At "
+                "least two are needed, better three or more."
+            )
+
+
+def _has_heading(scene: Scene, pairs: Index) -> bool:
+    """Return whether the marks are far enough from one plumb line to tell a heading."""
+    off = scene.marks_site[pairs[:, 1]]
+    off = off - off.mean(axis=0)
+    return bool(np.linalg.norm(off[:, :2]) > _UPRIGHT * np.linalg.norm(off))
+
+
+def _exclusions(
+    match: Match,
+    dropped: tuple[tuple[int, float], ...],
+    scene: Scene,
+    adjustment: Adjustment[Array],
+    config: ResectionConfig,
+) -> tuple[Exclusion, ...]:
+    """Say which markers were left out, and why."""
+    pairs = match.pairs
+    placed = transform(adjustment.estimate, scene.centres_base)
+    excluded = _false_markers(match, scene, adjustment.estimate, config)
+    for block, w in dropped:
+        if block < len(pairs):
+            fit, mark = pairs[block]
+            off = float(np.linalg.norm(scene.marks_site[mark] - placed[fit]))
+            reason = (
+                f"w = {w:.1f} (good data stay below {adjustment.critical_w:.1f}): it is {off:.3f} "
+                f"m from mark {scene.names[mark]}."
+            )
+            excluded.append(Exclusion(fit=int(fit), reason=reason))
+    return tuple(sorted(excluded, key=lambda exclusion: exclusion.fit))
+
+
+def _false_markers(
+    match: Match, scene: Scene, T: Array, config: ResectionConfig
+) -> list[Exclusion]:
+    """Say which markers are no control marks at a pose of base."""
+    placed = transform(T, scene.centres_base)
+    excluded = []
+    for fit in np.flatnonzero(match.marks < 0):
+        off = float(np.linalg.norm(scene.marks_site - placed[fit], axis=1).min())
+        reason = f"It is {off:.2f} m from the nearest control mark"
+        nearer = off <= config.match_tolerance
+        reason += ", which another marker is nearer to." if nearer else ": a false marker."
+        excluded.append(Exclusion(fit=int(fit), reason=reason))
+    return excluded
+
+
+def _weaknesses(
+    scene: Scene,
+    match: Match,
+    used: Index,
+    adjustment: Adjustment[Array],
+    dropped: tuple[tuple[int, float], ...],
+) -> list[str]:
+    """Say why a fix cannot be relied on."""
+    reasons = []
+    if len(match.rivals):
+        reasons.append(_other_places(scene, match))
+    if against := contradiction(match, scene):
+        reasons.append(against)
+    if len(used) < 3:
+        reasons.append(
+            "only two marks: solved with gravity, and an error in one of them would not show"
+        )
+    elif is_on_a_line(scene.marks_site[used[:, 1]]):
+        reasons.append("the marks lie on one line: the turn about it rests on gravity alone")
+    if not adjustment.passes_global_test:
+        reasons.append(
+            f"the global test fails (sigma0 = {adjustment.sigma0:.2f}): residuals are larger than "
+            "their sigmas promise"
+        )
+    reasons += [
+        f"the levelling contradicts the marks (w = {w:.1f}) and was left out"
+        for block, w in dropped
+        if block == match.n
+    ]
+    n_dropped = sum(block < match.n for block, _ in dropped)
+    if n_dropped and n_dropped >= _MANY_LEFT_OUT * match.n:
+        reasons.append(f"{n_dropped} of {match.n} matched markers had to be left out")
+    elif n_dropped and len(used) < _TELLING:
+        reasons.append(
+            f"{n_dropped} of {match.n} matched markers contradicts the others and was left out: "
+            "with so few it may be one of the others that is wrong"
+        )
+    if not scene.is_levelled:
+        reasons.append("no AHRS: the levelling is only assumed")
+    return reasons
+
+
+def _other_places(scene: Scene, match: Match) -> str:
+    """Say where else the station may stand, when two markers fit two marks in several ways."""
+    places = match.rivals + scene.middle
+    text = ", ".join(f"({x:.2f}, {y:.2f}, {z:.2f})" for x, y, z in places[:3])
+    more = f" and {len(places) - 3} more places" if len(places) > 3 else ""
+    return (
+        f"two markers fit the marks in {len(places) + 1} ways about equally well: the station may "
+        f"as well stand at {text}{more} m; a third mark would tell"
+    )
+
+
+def _fix(
+    scene: Scene,
+    match: Match,
+    used: Index,
+    adjustment: Adjustment[Array],
+    excluded: tuple[Exclusion, ...],
+    reasons: list[str],
+) -> StationFix:
+    """Assemble a fix, back in the unshifted site frame."""
+    T, n = adjustment.estimate, len(used)
+    shift = np.eye(6)
+    shift[3:, :3] = skew(scene.middle)
+    T_site_base = rigid(T[:3, :3], T[:3, 3] + scene.middle)
+    first, second = np.triu_indices(n, 1)
+    centres = scene.centres_base[used[:, 0]]
+    angles = included_angle(centres[first], centres[second])
+    cov, J = adjustment.cov + _cov_shared(scene, used, adjustment), _position_by_motion(T)
+    shifts = _shifts_of_choice(scene, match, T_site_base)
+    return StationFix(
+        method="free_station",
+        T_site_station=T_site_base @ inverse(rigid(scene.R_station_base, np.zeros(3))),
+        cov_T_site_station=shift @ cov @ shift.T
+        + _cov_heading(scene, T_site_base)
+        + _cov_choice(scene, shifts, T_site_base),
+        cov_p_site=J @ cov @ J.T + shifts.T @ shifts / (len(shifts) + 1),
+        matches=used,
+        residuals_site=adjustment.groups[0].residuals,
+        redundancies=adjustment.redundancies[:n],
+        w_statistics=adjustment.w_statistics[:n],
+        detectable_biases=adjustment.detectable_biases[:n],
+        external_reliabilities=external_reliabilities(adjustment, J)[:n],
+        dof=adjustment.dof,
+        sigma0=adjustment.sigma0,
+        passes_global_test=adjustment.passes_global_test,
+        included_angles=np.array([angles.min(), angles.max()]),
+        status=Status.WEAK if reasons else Status.OK,
+        reason="; ".join(reasons),
+        excluded=excluded,
+    )
+
+
+def _cov_shared(scene: Scene, used: Index, adjustment: Adjustment[Array]) -> Array:
+    """Return what errors that all centres share change in the covariance of a motion, (6, 6)."""
+    R, group = adjustment.estimate[:3, :3], adjustment.groups[0]
+    p_base = scene.centres_base[used[:, 0]]
+    lines = (p_base / np.linalg.norm(p_base, axis=1, keepdims=True)) @ R.T
+    gains = adjustment.cov @ np.swapaxes(np.linalg.solve(group.cov, group.J), 1, 2)  # up to sign
+    of_ranges = (gains @ lines[..., None])[..., 0]
+    of_heights = gains.sum(axis=0) @ (R @ scene.R_station_base[2])
+    return cov_of_shared(scene, scene.shared[used[:, 0]], of_ranges, of_heights)
+
+
+def _cov_heading(scene: Scene, T_site_base: Array) -> Array:
+    """Return the covariance of a pose that turns about its own plumb line, (6, 6).
+
+    The heading of base is where its joint angle is zero, which mounting and encoder blur; the
+    position does not move.
+    """
+    turn = _turn(scene, T_site_base)
+    return np.asarray(scene.sigma_heading**2 * np.outer(turn, turn))
+
+
+def _shifts_of_choice(scene: Scene, match: Match, T_site_base: Array) -> Array:
+    """Return how far off the other places are where the station may stand as well, (k, 3) [m]."""
+    return np.asarray(match.rivals + scene.middle - T_site_base[:3, 3])
+
+
+def _cov_choice(scene: Scene, shifts: Array, T_site_base: Array) -> Array:
+    """Return what it adds to the covariance, (6, 6), that the station may as well stand elsewhere.
+
+    Each of the other places is as likely as the chosen one, and lies half a turn away.
+    """
+    cov = np.zeros((6, 6))
+    n = len(shifts)
+    if n:
+        turn = np.pi * _turn(scene, T_site_base)
+        cov[3:, 3:] = shifts.T @ shifts / (n + 1)
+        cov += n / (n + 1) * np.outer(turn, turn)
+    return cov
+
+
+def _turn(scene: Scene, T_site_base: Array) -> Array:
+    """Return the small motion, (6,), that turns a station about its own plumb line by 1 rad."""
+    up = T_site_base[:3, :3] @ scene.R_station_base[2]
+    return np.concatenate([up, cross(T_site_base[:3, 3], up)])
+
+
+def _position_by_motion(T: Array) -> Array:
+    """Return the derivative of the positions of poses, (..., 4, 4), by small motions."""
+    p = T[..., :3, 3]
+    return np.concatenate([-skew(p), np.broadcast_to(np.eye(3), (*p.shape, 3))], axis=-1)
+
+
+def _by_ranges(
+    name: str, fits: MarkerFits, marks: ControlMarks, config: ResectionConfig
+) -> StationFix:
+    """Position a station from distances; which marker is which comes from the centres."""
+    _refuse_too_few(fits, marks)
+    scene = gather(fits, marks, config)
+    match = match_marks(scene, config)
+    excluded = _false_markers(match, scene, match.T_site_base, config)
+    fix = fix_by_ranges(name, scene, match, config, tuple(excluded))
+    if not (against := contradiction(match, scene)):
+        return fix
+    reason = "; ".join(filter(None, (against, fix.reason)))
+    return replace(fix, status=Status.WEAK, reason=reason)
+
+
+_METHODS: dict[str, Callable[[MarkerFits, ControlMarks, ResectionConfig], StationFix]] = {
+    "free_station": free_station,
+    "ranges": partial(_by_ranges, "ranges"),
+    "paper": partial(_by_ranges, "paper"),
+}

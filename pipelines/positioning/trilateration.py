@@ -1,0 +1,302 @@
+"""Positions from ranges: hides how a station comes from distances instead of centres.
+
+Two methods beside the free station: ``ranges`` meets the slope distances to all marks, ``paper``
+the horizontal distances to three, as the study's three circles do, and takes the height from
+theirs. Both are yaw-invariant functions of a levelled centre, so the heading comes afterwards, from
+the directions at the position that was found.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from itertools import combinations
+from typing import NamedTuple
+
+import numpy as np
+
+from spheremark.pipelines.config import ResectionConfig
+from spheremark.pipelines.errors import DegenerateGeometryError, NotConvergedError
+from spheremark.pipelines.estimation.least_squares import (
+    Adjustment,
+    Observations,
+    adjust,
+    external_reliabilities,
+    snoop,
+)
+from spheremark.pipelines.geometry import included_angle, is_on_a_line, rigid, rot_z, skew
+from spheremark.pipelines.model import Array, Exclusion, Index, Mask, StationFix, Status
+from spheremark.pipelines.positioning.matching import Match, Scene, cov_of_shared
+
+Measure = Callable[[Array], tuple[Array, Array]]
+"""Gives what is measured of vectors, (..., 3), and its derivative by them."""
+
+_LOOSE = 0.1  # [m] a position that is worse than this is weak
+_FAINT = 0.05  # change of distances, RMS, by a unit of way that they cannot tell
+_STEEP = 0.9  # of a way that is nearly the vertical
+
+
+class Influences(NamedTuple):
+    """What each marker adds to the gradient of a position from distances.
+
+    Attributes
+    ----------
+    noise : (k, 3, 3)
+        Its covariance by the errors of centre and mark alone.
+    ranges, heights : (k, 3)
+        The gradient by a unit of the centre's range, and of its height.
+    leans : (k, 3, 2)
+        The gradient by a sigma of roll and of pitch.
+    """
+
+    noise: Array
+    ranges: Array
+    heights: Array
+    leans: Array
+
+
+def slope_ranges(v: Array) -> tuple[Array, Array]:
+    """Return the lengths of vectors."""
+    r = np.linalg.norm(v, axis=-1)[..., None]
+    return r, (v / r)[..., None, :]
+
+
+def circles(v: Array) -> tuple[Array, Array]:
+    """Return horizontal lengths and heights of vectors."""
+    flat = np.hypot(v[..., 0], v[..., 1])
+    J = np.zeros((*v.shape[:-1], 2, 3))
+    J[..., 0, 0], J[..., 0, 1], J[..., 1, 2] = v[..., 0] / flat, v[..., 1] / flat, 1.0
+    return np.stack([flat, v[..., 2]], axis=-1), J
+
+
+def fix_by_ranges(
+    name: str, scene: Scene, match: Match, config: ResectionConfig, excluded: tuple[Exclusion, ...]
+) -> StationFix:
+    """Position a station from distances to matched marks.
+
+    Notes
+    -----
+    ``paper`` takes the three marks whose circles cut best, weighs them by their sigmas and leaves
+    nothing out: three circles give no answer to which is wrong. The covariance of the pose is that
+    of all centres, marks and the levelling carried to first order through position and heading,
+    and so are the errors of range and height that all centres share.
+    """
+    if match.n < 3:
+        raise DegenerateGeometryError(
+            f"{match.n} marks were matched; three are needed to position a station from distances."
+        )
+    measure = circles if name == "paper" else slope_ranges
+    pairs = match.pairs if name == "ranges" else _best_three(scene, match)
+
+    def adjusted(keep: Mask) -> Adjustment[Array]:
+        return adjust(
+            lambda p: (observe_distances(measure, scene, pairs[keep], p),),
+            lambda p, dp: np.asarray(p + dp),
+            match.T_site_base[:3, 3],
+            test_level=config.test_level,
+            test_power=config.test_power,
+        )
+
+    try:
+        adjustment, keep, dropped = snoop(
+            adjusted, len(pairs), lambda rest, _block: name == "ranges" and int(rest.sum()) > 4
+        )
+    except NotConvergedError as error:
+        raise _unsettled(measure, scene, pairs, match.T_site_base[:3, 3]) or error from error
+    out = [
+        Exclusion(
+            fit=int(pairs[block, 0]),
+            reason=f"w = {w:.1f} (good data stay below {adjustment.critical_w:.1f}): its distance "
+            f"to mark {scene.names[pairs[block, 1]]} contradicts the others.",
+        )
+        for block, w in dropped
+    ]
+    unused = [
+        Exclusion(fit=int(fit), reason="Three circles are met, and three other marks cut better.")
+        for fit in match.pairs[:, 0]
+        if fit not in pairs[:, 0]
+    ]
+    every = tuple(sorted((*excluded, *out, *unused), key=lambda one: one.fit))
+    return _fix(name, measure, scene, pairs[keep], adjustment, every)
+
+
+def _unsettled(
+    measure: Measure, scene: Scene, pairs: Index, p: Array
+) -> DegenerateGeometryError | None:
+    """Say which way distances leave a position open; none if they should tell all of it."""
+    J = measure(scene.marks_site[pairs[:, 1]] - p)[1].reshape(-1, 3)
+    _, strengths, ways = np.linalg.svd(J)
+    if strengths[-1] > _FAINT * np.sqrt(len(pairs)):
+        return None
+    way = "the height" if abs(ways[-1, 2]) > _STEEP else "the position across their plane"
+    return DegenerateGeometryError(
+        f"The distances to {len(pairs)} marks leave {way} open: the marks stand about in one plane "
+        "with the station, and on either side of it the distances are the same. Use the method "
+        "free_station, or add a mark well above or below the others."
+    )
+
+
+def observe_distances(measure: Measure, scene: Scene, pairs: Index, p: Array) -> Observations:
+    """Linearise what is measured at positions."""
+    levelled, cov_levelled = _levelled(scene, pairs)
+    marks = scene.marks_site[pairs[..., 1]]
+    measured, by_centre = measure(levelled)
+    computed, by_mark = measure(marks - p[..., None, :])
+    cov = by_centre @ cov_levelled @ np.swapaxes(by_centre, -1, -2)
+    cov = cov + by_mark @ scene.cov_marks[pairs[..., 1]] @ np.swapaxes(by_mark, -1, -2)
+    leaned = by_centre @ _leaned(levelled)
+    cov = cov + scene.sigma_level**2 * leaned @ np.swapaxes(leaned, -1, -2)
+    return Observations(residuals=measured - computed, J=by_mark, cov=cov)
+
+
+def influences(measure: Measure, scene: Scene, pairs: Index, p: Array) -> Influences:
+    """Return what errors of each marker add to the gradient of a position from distances."""
+    levelled, cov_levelled = _levelled(scene, pairs)
+    seen, (_, by_centre) = observe_distances(measure, scene, pairs, p), measure(levelled)
+    pull = np.swapaxes(seen.J, -1, -2) @ np.linalg.inv(seen.cov)
+    of_centre, of_mark = pull @ by_centre, pull @ seen.J
+    own = of_centre @ cov_levelled @ np.swapaxes(of_centre, -1, -2)
+    own += of_mark @ scene.cov_marks[pairs[:, 1]] @ np.swapaxes(of_mark, -1, -2)
+    return Influences(
+        noise=own,
+        ranges=(of_centre @ _lines(levelled)[..., None])[..., 0],
+        heights=of_centre[..., 2],
+        leans=scene.sigma_level * of_centre @ _leaned(levelled),
+    )
+
+
+def _levelled(scene: Scene, pairs: Index) -> tuple[Array, Array]:
+    """Return centres and their covariances in the measured levelled frame."""
+    R = scene.R_station_base
+    return scene.centres_base[pairs[..., 0]] @ R.T, R @ scene.cov_centres[pairs[..., 0]] @ R.T
+
+
+def _leaned(p: Array) -> Array:
+    """Return the derivative of levelled points by small turns about x and y, (..., 3, 2)."""
+    return -skew(p)[..., :2]
+
+
+def _best_three(scene: Scene, match: Match) -> Index:
+    """Return the three matches whose circles cut best: least sum of horizontal variances."""
+    triples = np.array(list(combinations(range(match.n), 3)), dtype=np.intp)
+    _, J = circles(scene.marks_site[match.pairs[:, 1]] - match.T_site_base[:3, 3])
+    towards = J[triples, 0, :2]
+    normal = np.swapaxes(towards, 1, 2) @ towards
+    traces = np.trace(normal, axis1=1, axis2=2)
+    spread = traces / np.maximum(np.linalg.det(normal), 1e-12)  # trace of the inverse
+    return np.asarray(match.pairs[triples[int(np.argmin(spread))]])
+
+
+def _pose(
+    scene: Scene, measure: Measure, pairs: Index, adjustment: Adjustment[Array]
+) -> tuple[float, Array]:
+    """Return the heading, and the covariance of (rotation, position) at the station.
+
+    Every input has a first-order effect on position and heading: the columns of ``effects``.
+    """
+    p = adjustment.estimate
+    levelled, cov_levelled = _levelled(scene, pairs)
+    towards = scene.marks_site[pairs[:, 1]] - p
+    seen, aimed = (np.arctan2(v[:, 1], v[:, 0]) for v in (levelled, towards))
+    by_centre, by_mark = (_azimuth_by_place(v) for v in (levelled, towards))
+    weights = 1.0 / np.einsum("ki,kij,kj->k", by_centre, cov_levelled, by_centre)
+    weights = weights / weights.sum()
+    turns = aimed - seen
+    yaw = float(np.arctan2(weights @ np.sin(turns), weights @ np.cos(turns)))
+    _, measured_by_centre = measure(levelled)
+    group = adjustment.groups[0]
+    gain = -adjustment.cov @ np.swapaxes(group.J, 1, 2) @ np.linalg.inv(group.cov)
+    effects = np.zeros((2, len(pairs), 4, 3))  # of centres and of marks on heading and position
+    effects[0, :, 1:] = gain @ measured_by_centre
+    effects[1, :, 1:] = -gain @ group.J
+    effects[:, :, 0] = -(weights @ by_mark) @ effects[:, :, 1:]
+    effects[0, :, 0] -= weights[:, None] * by_centre
+    effects[1, :, 0] += weights[:, None] * by_mark
+    covs = np.stack([cov_levelled, scene.cov_marks[pairs[:, 1]]])
+    cov = np.einsum("ekab,ekbc,ekdc->ad", effects, covs, effects)
+    of_ranges = (effects[0] @ _lines(levelled)[..., None])[..., 0]
+    cov += cov_of_shared(
+        scene, scene.shared[pairs[:, 0]], of_ranges, effects[0, ..., 2].sum(axis=0)
+    )
+    lean = np.zeros((6, 2))  # of the measured levelling
+    lean[2:] = -np.einsum("kab,kbc->ac", effects[0], _leaned(levelled))
+    lean[:2] = -rot_z(yaw)[:2, :2]
+    full = np.zeros((6, 6))
+    full[2:, 2:] = cov
+    full[2, 2] += scene.sigma_heading**2
+    return yaw, full + scene.sigma_level**2 * lean @ lean.T
+
+
+def _lines(v: Array) -> Array:
+    """Return the unit vectors of vectors."""
+    return np.asarray(v / np.linalg.norm(v, axis=-1, keepdims=True))
+
+
+def _azimuth_by_place(v: Array) -> Array:
+    """Return the derivative of the azimuths of vectors, (k, 3)."""
+    flat = np.sum(v[:, :2] ** 2, axis=1)
+    return np.stack([-v[:, 1] / flat, v[:, 0] / flat, np.zeros(len(v))], axis=1)
+
+
+def _fix(
+    name: str,
+    measure: Measure,
+    scene: Scene,
+    pairs: Index,
+    adjustment: Adjustment[Array],
+    excluded: tuple[Exclusion, ...],
+) -> StationFix:
+    """Assemble a fix, back in the unshifted site frame."""
+    p = adjustment.estimate + scene.middle
+    yaw, cov = _pose(scene, measure, pairs, adjustment)
+    shift = np.eye(6)
+    shift[3:, :3] = skew(p)  # a rotation about the station moves the site's origin
+    first, second = np.triu_indices(len(pairs), 1)
+    centres = scene.centres_base[pairs[:, 0]]
+    angles = included_angle(centres[first], centres[second])
+    reasons = _weaknesses(pairs, adjustment, cov, scene)
+    group = adjustment.groups[0]
+    return StationFix(
+        method=name,
+        T_site_station=rigid(rot_z(yaw), p),
+        cov_T_site_station=shift @ cov @ shift.T,
+        cov_p_site=cov[3:, 3:].copy(),
+        matches=np.array(pairs),
+        residuals_site=np.einsum("km,kmi->ki", group.residuals, group.J),
+        redundancies=adjustment.redundancies,
+        w_statistics=adjustment.w_statistics,
+        detectable_biases=adjustment.detectable_biases,
+        external_reliabilities=external_reliabilities(adjustment, np.eye(3)),
+        dof=adjustment.dof,
+        sigma0=adjustment.sigma0,
+        passes_global_test=adjustment.passes_global_test,
+        included_angles=np.array([angles.min(), angles.max()]),
+        status=Status.WEAK if reasons else Status.OK,
+        reason="; ".join(reasons),
+        excluded=excluded,
+    )
+
+
+def _weaknesses(pairs: Index, adjustment: Adjustment[Array], cov: Array, scene: Scene) -> list[str]:
+    """Say why a fix cannot be relied on."""
+    reasons = []
+    if adjustment.dof == 0:
+        reasons.append(f"{len(pairs)} distances: an error in one of them would not show")
+    if is_on_a_line(scene.marks_site[pairs[:, 1]]):
+        reasons.append(
+            "the marks lie on one line: on the other side of it the distances are the same, and "
+            "only the directions of the markers tell the side"
+        )
+    if not adjustment.passes_global_test:
+        reasons.append(
+            f"the global test fails (sigma0 = {adjustment.sigma0:.2f}): residuals are larger than "
+            "their sigmas promise"
+        )
+    sigmas = np.sqrt(np.diag(cov)[3:])
+    if sigmas.max() > _LOOSE:
+        reasons.append(
+            f"the distances leave {'xyz'[int(np.argmax(sigmas))]} open to {sigmas.max():.2f} m: "
+            "the marks stand too much in one plane with the station"
+        )
+    if not scene.is_levelled:
+        reasons.append("no AHRS: the levelling is only assumed")
+    return reasons

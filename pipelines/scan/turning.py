@@ -1,0 +1,250 @@
+"""Returns of a turning LiDAR -> points in the base frame: the loops, run by run.
+
+Hides how a return finds its gimbal angle and how many are turned at once. A run is what was shot
+between two joint samples; the loop over it does all that is usual in one go, and looks nothing up,
+so that the compiler can do it to many returns at a time.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numba
+import numpy as np
+
+from spheremark.pipelines.model import Array, Column, Index, Mask, Nanos, Rings
+from spheremark.pipelines.threads import side_by_side
+
+_BLOCK = 512  # returns of a run at the most: what is looked up for them stays in the nearest cache
+_SMALL_TURN = 0.1  # [rad]; below it the series in `_turn_run` are good to 1.4e-9
+
+
+class Joints(NamedTuple):
+    """Gimbal on the LiDAR's clock; its rate [rad/ns] from each sample on is NaN if not known."""
+
+    stamps_ns: Nanos
+    angles: Array
+    rates: Array
+
+
+class Lidar(NamedTuple):
+    """Rig for the kernel: mounting, bias and height [m] of every ring, and wanted ranges [m]."""
+
+    T_head_lidar: tuple[float, ...]  # twelve numbers, row by row
+    biases: Array
+    heights: Array
+    has_biases: bool
+    height_share: float  # of the heights that coordinates in the cloud have: 0 or 1
+    range_limits: tuple[float, float]
+
+
+class Shots(NamedTuple):
+    """Returns, in the frame of the LiDAR or in the base frame."""
+
+    p: Column
+    intensities: Column
+    rings: Rings
+    stamps_ns: Nanos
+
+
+class Seen(NamedTuple):
+    """What was seen of all returns: how many were kept or not and why, first and last instant."""
+
+    n_kept: int
+    n_without_angle: int
+    n_not_finite: int
+    n_out_of_range: int
+    first_ns: int
+    last_ns: int
+
+
+def turned(shots: Shots, joints: Joints, lidar: Lidar) -> tuple[Shots, Seen]:
+    """Turn returns into points in the base frame."""
+    n = len(shots.rings)
+    p_lidar, p_base = shots.p.reshape(-1), np.empty(3 * n, np.float32)
+    keep = np.ones(n, np.bool_)
+    knots_ns, table = _knots(joints)
+
+    def turn(first: int, end: int) -> Index:
+        rows = slice(first, end)
+        every = slice(3 * first, 3 * end)
+        columns = (p_lidar[every], shots.rings[rows], shots.stamps_ns[rows])
+        told: Index = _turn_part(columns, knots_ns, table, lidar, p_base[every], keep[rows])
+        return told
+
+    told = np.array(side_by_side(turn, n))
+    counts = told[:, :4].sum(axis=0).tolist()
+    seen = Seen._make([*counts, int(told[:, 4].min()), int(told[:, 5].max())])
+    found = shots._replace(p=p_base.reshape(n, 3))
+    return (found if seen.n_kept == n else _closed_up(found, keep)), seen
+
+
+def _knots(joints: Joints) -> tuple[Nanos, Array]:
+    """Cut time where the rate changes, and so finely that the gimbal turns little in between.
+
+    Returns instants from the beginning of time to its end, and angle, cosine, sine and rate from
+    each on.
+    """
+    spans = np.diff(joints.stamps_ns, append=joints.stamps_ns[-1:] + 1)
+    turns = np.nan_to_num(np.abs(joints.rates * spans))
+    n_pieces = np.ceil(turns / _SMALL_TURN).astype(np.intp).clip(1)
+    sample = np.repeat(np.arange(len(spans)), n_pieces)
+    piece = np.arange(len(sample)) - np.repeat(np.cumsum(n_pieces) - n_pieces, n_pieces)
+    since = (piece * (spans / n_pieces)[sample]).astype(np.int64)
+    knots_ns = joints.stamps_ns[sample] + since
+    angles, rates = joints.angles[sample] + joints.rates[sample] * since, joints.rates[sample]
+    ends = np.iinfo(np.int64)
+    knots_ns = np.concatenate([[ends.min], knots_ns, joints.stamps_ns[-1:] + 1, [ends.max]])
+    table = np.full((len(knots_ns), 3), np.nan)
+    table[1:-2] = np.stack([np.cos(angles), np.sin(angles), rates], axis=1)
+    return knots_ns, table
+
+
+def _closed_up(shots: Shots, keep: Mask) -> Shots:
+    """Return the returns that are kept; their points are moved in place.
+
+    The first part is filled from its last row down, the second from its first row up: what they
+    keep meets in the middle, and nothing has to be moved to close a gap.
+    """
+    n = len(keep)
+    out = Shots(shots.p, np.empty(n, np.float32), np.empty(n, np.uint8), np.empty(n, np.int64))
+
+    def part(first: int, end: int) -> tuple[int, int]:
+        is_upward = first > 0 or end == n
+        n_kept = _close_up(shots, keep, out, first, end, is_upward)
+        return (first, first + n_kept) if is_upward else (end - n_kept, end)
+
+    parts = side_by_side(part, n)
+    rows = slice(parts[0][0], parts[-1][1])
+    return Shots(out.p[rows], out.intensities[rows], out.rings[rows], out.stamps_ns[rows])
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _close_up(shots, keep, out, first, end, is_upward):  # type: ignore[no-untyped-def]  # noqa: ANN001, ANN202
+    """Copy what is kept of a part to its first rows, or to its last; return how many these are."""
+    step = 1 if is_upward else -1
+    start = first if is_upward else end - 1
+    k = start
+    for i in range(start, start + step * (end - first), step):
+        if keep[i]:
+            out.p[k, 0], out.p[k, 1], out.p[k, 2] = shots.p[i, 0], shots.p[i, 1], shots.p[i, 2]
+            out.intensities[k], out.rings[k] = shots.intensities[i], shots.rings[i]
+            out.stamps_ns[k] = shots.stamps_ns[i]
+            k += step
+    return abs(k - start)
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _turn_part(columns, knots_ns, table, lidar, p_base, keep):  # type: ignore[no-untyped-def]  # noqa: ANN001, ANN202
+    """Turn some returns, tell which to keep, and see what ``Seen`` has."""
+    p, rings, stamps = columns
+    seen = np.array([0, 0, 0, 0, np.iinfo(np.int64).max, np.iinfo(np.int64).min])
+    heights, scales = np.empty(_BLOCK), np.ones(_BLOCK)
+    begin, n = 0, len(rings)
+    while begin < n:
+        j = min(np.searchsorted(knots_ns, stamps[begin], side="right"), len(table) - 1) - 1
+        most = min(n, begin + _BLOCK)
+        end = _run_end(stamps, begin, most, knots_ns[j], knots_ns[j + 1])
+        seen[4], seen[5] = _first_and_last(stamps, begin, end, seen[4], seen[5])
+        if np.isnan(table[j, 2]):
+            keep[begin:end] = False
+            seen[1] += end - begin
+        else:
+            _look_up(lidar.heights, rings, begin, end, heights)
+            if lidar.has_biases:
+                _look_up(lidar.biases, rings, begin, end, scales)
+                _find_scales(p, begin, end, lidar.height_share, heights, scales)
+            at = (knots_ns[j], table[j, 0], table[j, 1], table[j, 2])
+            n_kept = _turn_run(p, stamps, begin, end, at, lidar, heights, scales, p_base)
+            if n_kept < end - begin:
+                _judge(p, begin, end, lidar, heights, keep, seen)
+            seen[0] += n_kept
+        begin = end
+    return seen
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _run_end(stamps, begin, most, since, until):  # type: ignore[no-untyped-def]  # noqa: ANN001, ANN202
+    """Return where the shots end that were made in the same interval as the first one."""
+    end = begin + 1
+    while end + 64 <= most:
+        n_inside = 0
+        for i in range(np.uint64(end), np.uint64(end + 64)):
+            n_inside += (since <= stamps[i]) & (stamps[i] < until)
+        if n_inside < 64:
+            break
+        end += 64
+    while end < most and since <= stamps[end] < until:
+        end += 1
+    return end
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _first_and_last(stamps, begin, end, first, last):  # type: ignore[no-untyped-def]  # noqa: ANN001, ANN202
+    """Find the first and the last instant, known ones among them."""
+    for i in range(np.uint64(begin), np.uint64(end)):
+        first, last = min(first, stamps[i]), max(last, stamps[i])
+    return first, last
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _look_up(table, rings, begin, end, out):  # type: ignore[no-untyped-def]  # noqa: ANN001, ANN202
+    """Find what a table says of the laser of each return."""
+    first = np.uint64(begin)
+    for i in range(np.uint64(end - begin)):
+        out[i] = table[rings[first + i]]
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _beam(p, row, lowered):  # type: ignore[no-untyped-def]  # noqa: ANN001, ANN202
+    """Return a point as seen from where its beam begins, and its squared range."""
+    x, y = np.float64(p[np.uint64(3) * row]), np.float64(p[np.uint64(3) * row + np.uint64(1)])
+    z = p[np.uint64(3) * row + np.uint64(2)] - lowered
+    return x, y, z, x * x + y * y + z * z
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _find_scales(p, begin, end, height_share, heights, scales):  # type: ignore[no-untyped-def]  # noqa: ANN001, ANN202
+    """Put what the coordinates are multiplied by in place of the biases that this takes off."""
+    first = np.uint64(begin)
+    for i in range(np.uint64(end - begin)):
+        _, _, _, reach2 = _beam(p, first + i, height_share * heights[i])
+        scales[i] = 1.0 - scales[i] / np.sqrt(reach2)
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _turn_run(p, stamps, begin, end, at, lidar, heights, scales, p_base):  # type: ignore[no-untyped-def]  # noqa: ANN001, ANN202, PLR0913
+    """Move the returns of a run to the head and turn it; count those within the limits of range."""
+    xx, xy, xz, dx, yx, yy, yz, dy, zx, zy, zz, dz = lidar.T_head_lidar
+    least2, most2, share = (
+        lidar.range_limits[0] ** 2,
+        lidar.range_limits[1] ** 2,
+        lidar.height_share,
+    )
+    since, cosine, sine, rate = at
+    first, n_within = np.uint64(begin), 0
+    for i in range(np.uint64(end - begin)):
+        row = first + i
+        a, b, c, reach2 = _beam(p, row, share * heights[i])
+        n_within += (least2 <= reach2) & (reach2 <= most2)
+        a, b, c = scales[i] * a, scales[i] * b, scales[i] * c + heights[i]
+        u, v = xx * a + xy * b + xz * c + dx, yx * a + yy * b + yz * c + dy
+        step = rate * (stamps[row] - since)
+        square = step * step
+        less = 1.0 - square * (0.5 - square * (1.0 / 24.0))
+        more = step * (1.0 - square * (1.0 / 6.0 - square * (1.0 / 120.0)))
+        cos, sin = cosine * less - sine * more, sine * less + cosine * more
+        p_base[np.uint64(3) * row] = cos * u - sin * v
+        p_base[np.uint64(3) * row + np.uint64(1)] = sin * u + cos * v
+        p_base[np.uint64(3) * row + np.uint64(2)] = zx * a + zy * b + zz * c + dz
+    return n_within
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _judge(p, begin, end, lidar, heights, keep, seen):  # type: ignore[no-untyped-def]  # noqa: ANN001, ANN202, PLR0913
+    """Tell which returns of a run to keep; count those not finite and out of range."""
+    for i in range(begin, end):
+        _, _, _, reach2 = _beam(p, np.uint64(i), lidar.height_share * heights[i - begin])
+        keep[i] = lidar.range_limits[0] ** 2 <= reach2 <= lidar.range_limits[1] ** 2
+        seen[2] += not np.isfinite(reach2)
+        seen[3] += np.isfinite(reach2) and not keep[i]

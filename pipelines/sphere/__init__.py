@@ -1,0 +1,87 @@
+"""Candidate -> marker centre with covariance, by named methods.
+
+Hides how a centre is estimated. A method takes all candidates of a stop together, because they
+share the noise and the lasers of one sensor:
+
+- ``along_beam`` is maximum likelihood with the range of each beam's footprint, which exists only
+  where the footprint meets the sphere,
+- ``silhouette`` adds which shots passed by, of those that ``shots`` tells,
+- ``astm_e3125`` is the surveyors' standard: cone, cylinder, 3 sigma,
+- ``free_radius`` and ``algebraic`` estimate the radius too, for comparison,
+- ``paper`` is the study's registration of a hemisphere by ICP.
+
+``bound`` says how well ranges can tell a centre at all: only comparisons with truth use it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+from spheremark.pipelines.config import FittingConfig
+from spheremark.pipelines.errors import ConfigError
+from spheremark.pipelines.model import (
+    MarkerCandidates,
+    MarkerFit,
+    MarkerFits,
+    Rejection,
+    StitchedCloud,
+)
+from spheremark.pipelines.sphere.methods import along_beam, astm, paper, silhouette
+from spheremark.pipelines.sphere.methods import free_radius as free
+
+Method = Callable[
+    [StitchedCloud, MarkerCandidates, FittingConfig, float],
+    tuple[tuple[MarkerFit, ...], tuple[Rejection, ...]],
+]
+METHODS: dict[str, Method] = {
+    along_beam.NAME: along_beam.fit,
+    silhouette.NAME: silhouette.fit,
+    astm.NAME: astm.fit,
+    free.GEOMETRIC: free.fit_geometric,
+    free.ALGEBRAIC: free.fit_algebraic,
+    paper.NAME: paper.fit,
+}
+
+
+def fit_markers(
+    method: str,
+    cloud: StitchedCloud,
+    candidates: MarkerCandidates,
+    config: FittingConfig,
+    marker_radius: float,
+) -> MarkerFits:
+    """Estimate the centres of a stop's markers by one method.
+
+    Parameters
+    ----------
+    method : str
+        One of ``METHODS``.
+    cloud : StitchedCloud
+        The stop.
+    candidates : MarkerCandidates
+        What extraction found in it.
+    config : FittingConfig
+        Prior noise.
+    marker_radius : float
+        Radius of the spheres [m].
+
+    Returns
+    -------
+    MarkerFits
+        Centres in the order of the candidates; refused candidates, of the extraction and of the
+        method, with reasons. There may be no fits at all.
+
+    Raises
+    ------
+    ConfigError
+        If the method is unknown.
+    """
+    if method not in METHODS:
+        raise ConfigError(f"Fitting method {method!r} is unknown; known: {', '.join(METHODS)}.")
+    fits, rejected = METHODS[method](cloud, candidates, config, marker_radius)
+    return MarkerFits(
+        method=method,
+        fits=fits,
+        rejected=candidates.rejected + rejected,
+        levelling=cloud.levelling,
+    )

@@ -1,0 +1,165 @@
+"""What is said of a centre whatever method found it: residuals, coverage, incidence, verdict."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from typing import Any
+
+import numba
+import numpy as np
+
+from spheremark.pipelines.geometry import levelling_rotation
+from spheremark.pipelines.model import (
+    RING_UNKNOWN,
+    Array,
+    Index,
+    MarkerCandidate,
+    MarkerFit,
+    Mask,
+    Rejection,
+    Status,
+    StitchedCloud,
+)
+from spheremark.pipelines.scan.stitching import beams
+from spheremark.pipelines.sphere.footprint import predict, share_of_outline
+from spheremark.pipelines.sphere.radius import other_radius, own_radius
+
+N_GOOD = 20
+"""Returns below which a centre is called weak."""
+
+COVERAGE_GOOD = 0.6
+"""Share of the outline below which a centre is called weak."""
+
+WITHOUT_RINGS = "rings unknown: laser heights and biases not applied"
+"""What is said of a fit to returns without rings."""
+
+_SEGMENT = 1.35  # radii about the rough centre within which a return may be the sphere
+_NEARBY = 1.6  # the same where the radius is asked, which may be larger
+
+Fits = tuple[tuple[MarkerFit, ...], tuple[Rejection, ...]]
+
+
+def each(
+    candidates: tuple[MarkerCandidate, ...],
+    fit_one: Callable[[MarkerCandidate], MarkerFit | Rejection],
+) -> Fits:
+    """Fit candidates one by one."""
+    results = [fit_one(candidate) for candidate in candidates]
+    fits = tuple(r for r in results if isinstance(r, MarkerFit))
+    return fits, tuple(r for r in results if isinstance(r, Rejection))
+
+
+def on_sphere(
+    cloud: StitchedCloud, candidate: MarkerCandidate, radius: float, reach: float = _SEGMENT
+) -> Index:
+    """Return a candidate's rows that may be its sphere by their place."""
+    away = np.linalg.norm(
+        cloud.p_base[candidate.members].astype(np.float64) - candidate.p_base_rough, axis=1
+    )
+    return np.asarray(candidate.members[away < reach * radius])
+
+
+def refused(candidate: MarkerCandidate, reason: str) -> Rejection:
+    """Return a candidate as a rejection."""
+    return Rejection(
+        p_base=candidate.p_base_rough.copy(), n_points=len(candidate.members), reason=reason
+    )
+
+
+def described(
+    cloud: StitchedCloud,
+    candidate: MarkerCandidate,
+    used: Index,
+    p_base: Array,
+    cov_p_base: Array,
+    **known: float | str,
+) -> MarkerFit:
+    """Return a fit with what its returns say of it."""
+    shots = beams(cloud, used)
+    radius = float(known["radius"])
+    which = np.zeros(len(used), dtype=np.intp)
+    found = predict(shots, p_base[None], np.array([radius]), which)
+    rings = shots.rings[shots.rings != RING_UNKNOWN]
+    n_rings = len(np.unique(rings))
+    directions, across, offsets = (
+        np.ascontiguousarray(vectors.T)
+        for vectors in (shots.directions_base, shots.across_base, found.offsets)
+    )
+    coverage = share_of_outline(directions, across, offsets, radius)
+    residuals = shots.ranges - found.ranges
+    nearby = beams(cloud, on_sphere(cloud, candidate, radius, _NEARBY))
+    own = own_radius(nearby, radius, levelling_rotation(cloud.levelling)[2])
+    variants = (known.get("variant"), "" if n_rings else WITHOUT_RINGS)
+    fields: dict[str, Any] = {
+        "radius_free": own[0],
+        "sigma_radius_free": own[1],
+        "sigma0": 1.0,
+        **known,
+        "variant": "; ".join(str(said) for said in variants if said),
+    }
+    reasons = weaknesses(len(used), n_rings, coverage)
+    reasons += other_radius(radius, fields["radius_free"], fields["sigma_radius_free"])
+    reason = sentence(reasons)
+    return MarkerFit(
+        name=candidate.name,
+        p_base=np.array(p_base),
+        cov_p_base=np.array(cov_p_base),
+        status=Status.WEAK if reason else Status.OK,
+        reason=reason,
+        mean_range=float(np.linalg.norm(shots.origins_base.mean(axis=0) - p_base)),
+        mean_intensity=float(shots.intensities.mean()),
+        used=used,
+        rejected=left_out(candidate.members, used),
+        residuals=residuals,
+        n_rings=n_rings,
+        coverage=coverage,
+        incidence=incidence(offsets, radius),
+        **fields,
+    )
+
+
+def left_out(members: Index, used: Index) -> Index:
+    """Return the rows of a candidate that do not carry its centre."""
+    is_left = np.ones(len(members), dtype=bool)
+    is_left[np.searchsorted(members, used)] = False
+    return np.asarray(members[is_left])
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def incidence(offsets: Array, radius: float) -> float:
+    """Return the mean angle between beams and the normals of a sphere."""
+    total = 0.0
+    for i in range(offsets.shape[1]):
+        off = math.sqrt(offsets[0, i] ** 2 + offsets[1, i] ** 2) / radius
+        total += math.asin(min(off, 1.0))
+    return float(total / offsets.shape[1])
+
+
+def weaknesses(n_points: int, n_rings: int, coverage: float) -> list[str]:
+    """Say what weakens a centre whatever method found it."""
+    tests = (
+        (n_points < N_GOOD, f"only {n_points} returns (at least {N_GOOD} are good)"),
+        (n_rings == 1, "all returns are of one laser"),
+        (coverage < COVERAGE_GOOD, f"only {100 * coverage:.0f} % of it is seen"),
+    )
+    return [reason for is_so, reason in tests if is_so]
+
+
+def sentence(reasons: list[str]) -> str:
+    """Return reasons as one sentence; empty if there are none."""
+    text = ", ".join(reasons)
+    return text[:1].upper() + text[1:] + "." if reasons else ""
+
+
+def spread_of(normals: Array, residuals: Array, n_unknowns: int) -> Array:
+    """Return the formal covariance of a least-squares fit with equal weights."""
+    variance = float(residuals @ residuals) / max(len(residuals) - n_unknowns, 1)
+    return np.asarray(variance * np.linalg.inv(normals + 1e-9 * np.eye(len(normals))))
+
+
+def is_undetermined(normals: Array, n: int) -> Mask | bool:
+    """Tell whether a fit's normal equations have no answer worth having."""
+    if not np.all(np.isfinite(normals)):
+        return True
+    return bool(np.linalg.eigvalsh(normals)[0] < 1e-3 * np.sqrt(max(n, 1)))

@@ -1,0 +1,1 @@
+"""Benchmarks and experiments of ``spheremark bench`` and ``spheremark reproduce``."""

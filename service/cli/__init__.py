@@ -1,0 +1,1 @@
+"""The command ``spheremark``: one module for each group of commands."""

@@ -1,0 +1,327 @@
+"""The command ``spheremark``: each verb is one call of what the service calls too.
+
+Answers go to standard output, as tables for people or JSON for programs; progress and errors go
+to standard error. Exit codes: 0 done, 1 failed, 2 misused. Heavy imports are inside the commands.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import sys
+from enum import StrEnum
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from spheremark.pipelines.errors import ConfigError, SpheremarkError
+from spheremark.service.cli.bench import bench
+from spheremark.service.cli.plan import plan
+from spheremark.service.cli.site import site
+from spheremark.service.cli.survey import (
+    Axes,
+    ControlAxes,
+    ControlFile,
+    ControlUnit,
+    TargetHeight,
+    Unit,
+    adjust,
+    calibrate,
+    read_control,
+)
+from spheremark.service.cli.terminal import err, out
+from spheremark.service.cli.terminal import print_json as _print_json
+from spheremark.service.cli.terminal import progress as _progress
+from spheremark.service.cli.terminal import settings as _settings
+
+app = typer.Typer(
+    help="Station positions from spherical markers and a gimbal-mounted LiDAR.",
+    no_args_is_help=True,
+    pretty_exceptions_enable=False,
+    add_completion=False,
+)
+app.add_typer(plan, name="plan")
+
+AsJson = Annotated[bool, typer.Option("--json", help="JSON for programs.")]
+LogFile = Annotated[Path, typer.Argument(exists=True, dir_okay=False, help="Log (MCAP).")]
+
+
+class Format(StrEnum):
+    """What simulated LiDARs write."""
+
+    POINTS = "points"
+    PACKETS = "packets"
+
+
+class Compression(StrEnum):
+    """How the chunks of a log can be compressed."""
+
+    NONE = "none"
+    LZ4 = "lz4"
+    ZSTD = "zstd"
+
+
+class Frame(StrEnum):
+    """Frames in which centres can be given."""
+
+    STATION = "station"
+    BASE = "base"
+
+
+def main() -> None:
+    """Run the command line; an error of ours becomes one sentence, or a problem as JSON."""
+    try:
+        app()
+    except SpheremarkError as error:
+        if "--json" in sys.argv:
+            from spheremark.service.http.errors import problem_of
+
+            _print_json(problem_of(error, " ".join(sys.argv[1:2])).model_dump(exclude_none=True))
+        _print_error(str(error))
+        raise SystemExit(2 if isinstance(error, ConfigError) else 1) from None
+    except OSError as error:
+        if error.filename is None:
+            raise
+        _print_error(f"{error.filename}: {error.strerror}.")
+        raise SystemExit(1) from None
+    except KeyboardInterrupt:
+        raise SystemExit(130) from None
+
+
+def _print_error(sentence: str) -> None:
+    """Print what went wrong; nothing in it is markup."""
+    err.print("[bold red]Error:[/] ", end="")
+    err.print(sentence, markup=False, emoji=False, highlight=False, soft_wrap=True)
+
+
+@app.command()
+def demo() -> None:
+    """Simulate, upload, process and serve one lane of the study's field."""
+    from spheremark.service.cli.demo import run
+
+    run(_settings(), out)
+
+
+@app.command()
+def serve(
+    host: Annotated[str | None, typer.Option(help="Address to listen on.")] = None,
+    port: Annotated[int | None, typer.Option(help="Port; 0 takes a free one.")] = None,
+    data: Annotated[Path | None, typer.Option(help="Folder of database, logs and clouds.")] = None,
+) -> None:
+    """Run the service; every setting can come from the environment (SPHEREMARK_...)."""
+    from spheremark.service.serving import serve as run
+
+    given = {"host": host, "port": port, "data": data}
+    settings = _settings(**{name: value for name, value in given.items() if value is not None})
+    run(settings, ready=lambda address: err.print(f"Serving on [bold]{address}[/]"))
+
+
+@app.command()
+def simulate(
+    folder: Annotated[Path, typer.Argument(metavar="OUT", help="Folder for the logs.")],
+    scenario: Annotated[
+        str,
+        typer.Option(help="World: paper-field, clutter-field, rock-field or range-lane."),
+    ] = "paper-field",
+    stops: Annotated[
+        str,
+        typer.Option(
+            help="Names, lanes (lane3), numbers or ranges (1-7), or all.",
+            show_default="lane3, or all where there are no lanes",
+        ),
+    ] = "",
+    seed: Annotated[int, typer.Option(min=0, help="Source of chance.")] = 0,
+    turn_s: Annotated[float, typer.Option(help="Time of a full turn of the gimbal \\[s].")] = 13.2,
+    rpm: Annotated[float, typer.Option(help="Speed of the LiDAR [1/min].")] = 600.0,
+    sigma_mm: Annotated[
+        float | None, typer.Option(help="Noise of ranges \\[mm]; by reflectivity if not given.")
+    ] = None,
+    step_deg: Annotated[
+        float, typer.Option(help="Angle between rests of the gimbal \\[deg]; 0 turns evenly.")
+    ] = 0.0,
+    shot_times: Annotated[
+        bool, typer.Option(help="Whether the points of a cloud carry a time each.")
+    ] = True,
+    form: Annotated[
+        Format, typer.Option("--format", help="Point clouds, or raw packets of a VLP-16.")
+    ] = Format.POINTS,
+    compression: Annotated[Compression, typer.Option(help="Of the chunks.")] = Compression.NONE,
+    as_json: AsJson = False,
+) -> None:
+    """Write logs as a recorder would (STOP.mcap), their truth (STOP.truth.json) and control.csv."""
+    from spheremark.pipelines.simulation import SimulationConfig, commensurability
+    from spheremark.service.cli.fieldwork import Assignment, survey
+
+    sigma = None if sigma_mm is None else sigma_mm / 1000.0
+    config = SimulationConfig(
+        turn=turn_s,
+        spin_rpm=rpm,
+        sigma_range=sigma,
+        step=math.radians(step_deg),
+        shot_times=shot_times,
+    )
+    if warning := commensurability(config):
+        err.print(f"[yellow]Warning:[/] {warning}", soft_wrap=True)
+    wanted = Assignment(
+        scenario=scenario,
+        stops=stops,
+        seed=seed,
+        config=config,
+        compression=compression,
+        packets=form is Format.PACKETS,
+    )
+    with _progress() as progress:
+        for made in survey(folder, wanted, progress=progress):
+            paths = {"stop": made.name, "log": str(made.log), "truth": str(made.truth)}
+            sys.stdout.write((json.dumps(paths) if as_json else paths["log"]) + "\n")
+            sys.stdout.flush()
+
+
+@app.command()
+def inspect(log: LogFile, as_json: AsJson = False) -> None:
+    """Say what a log holds and lacks, and whether it can be processed."""
+    from spheremark.service.cli import tables
+    from spheremark.storage.recordings import inspect_log
+
+    report = inspect_log(log)
+    if as_json:
+        _print_json(report.to_mapping())
+    else:
+        tables.print_preflight(out, log.name, report)
+    if report.verdict == "refused":
+        raise typer.Exit(1)
+
+
+@app.command()
+def process(
+    logs: Annotated[list[Path], typer.Argument(metavar="LOG...", exists=True, dir_okay=False)],
+    control: ControlFile = None,
+    control_axes: ControlAxes = Axes.ENU,
+    control_unit: ControlUnit = Unit.METRE,
+    target_height_m: TargetHeight = 0.0,
+    rig: Annotated[
+        Path | None, typer.Option(exists=True, dir_okay=False, help="Rig (JSON), if not the log's.")
+    ] = None,
+    method: Annotated[
+        list[str] | None, typer.Option(help="Fitting method; again for more. The first counts.")
+    ] = None,
+    resection: Annotated[
+        list[str] | None,
+        typer.Option(help="free_station, ranges or paper; again for more. The first counts."),
+    ] = None,
+    frame: Annotated[Frame, typer.Option(help="Frame of the centres.")] = Frame.STATION,
+    tolerance_m: Annotated[float, typer.Option(help="Error that is accepted \\[m].")] = 0.03,
+    radius_m: Annotated[float, typer.Option(help="Radius of the spheres \\[m].")] = 0.100,
+    truth: Annotated[
+        Path | None,
+        typer.Option(exists=True, dir_okay=False, help="Truth (JSON); adds errors, no more."),
+    ] = None,
+    as_json: AsJson = False,
+) -> None:
+    """Find the markers of logs and position their stations."""
+    from spheremark.pipelines.config import SurveyConfig
+    from spheremark.service.cli import tables
+    from spheremark.service.serialise.stops import Inputs, answer_log
+    from spheremark.storage.imports import survey_files as site_files
+
+    config = SurveyConfig.from_mapping(
+        {
+            "marker_radius": radius_m,
+            "tolerance": tolerance_m,
+            "fitting": {"methods": method or ["along_beam"]},
+            "resection": {"methods": resection or ["free_station"]},
+        }
+    )
+    inputs = Inputs(
+        config=config,
+        rig=site_files.read_rig(rig) if rig else None,
+        marks=read_control(control, control_axes, control_unit, target_height_m),
+        truth=site_files.read_truth(truth) if truth else None,
+        frame=frame.value,
+    )
+    answers = []
+    for log in logs:
+        with _progress() as progress:
+            answers.append(answer_log(log, inputs, progress))
+        if not as_json:
+            tables.print_answer(out, answers[-1])
+    if as_json:
+        _print_json(answers[0] if len(answers) == 1 else answers)
+
+
+app.command()(adjust)
+app.command()(calibrate)
+app.command()(site)
+app.command()(bench)
+
+
+@app.command()
+def query(
+    sql: Annotated[str, typer.Argument(help="One SELECT.")],
+    url: Annotated[str | None, typer.Option(help="Address of a running service.")] = None,
+    data: Annotated[Path | None, typer.Option(help="Data folder that no service uses.")] = None,
+    as_json: AsJson = False,
+    as_csv: Annotated[bool, typer.Option("--csv", help="CSV for programs.")] = False,
+) -> None:
+    """Ask in SQL: a running service, or a data folder that none uses."""
+    from spheremark.service.cli import tables
+    from spheremark.service.cli.source import Source
+
+    source = Source(_settings(**({"data": data} if data else {})), url, folder=data)
+    answer = source.ask(sql)
+    if as_json:
+        _print_json(answer)
+    elif as_csv:
+        sys.stdout.write(tables.to_csv(answer))
+    else:
+        tables.print_rows(out, answer)
+    if answer["truncated"]:
+        err.print(f"[yellow]Truncated:[/] only the first {answer['row_limit']:,} rows are here.")
+
+
+@app.command()
+def export(
+    target: Annotated[Path, typer.Argument(metavar="OUT", help="results.duckdb or a .csv.")],
+    url: Annotated[str | None, typer.Option(help="Address of a running service.")] = None,
+    data: Annotated[Path | None, typer.Option(help="Data folder that no service uses.")] = None,
+    survey: Annotated[str | None, typer.Option(help="Only this survey (CSV).")] = None,
+) -> None:
+    """Copy the database (OUT.duckdb), or stations and marks as coordinates (OUT.csv)."""
+    from spheremark.service.cli.source import Source
+
+    Source(_settings(**({"data": data} if data else {})), url, folder=data).export(target, survey)
+    err.print(f"Wrote {target}.")
+
+
+@app.command()
+def reproduce(
+    folder: Annotated[
+        Path, typer.Argument(metavar="[OUT]", help="Folder for page, tables and figures.")
+    ] = Path("reproduction"),
+    quick: Annotated[
+        bool, typer.Option("--quick", help="Fewer worlds: about a minute, with wider intervals.")
+    ] = False,
+    seed: Annotated[int, typer.Option(min=0, help="Source of chance.")] = 0,
+    real: Annotated[
+        Path | None,
+        typer.Option(exists=True, file_okay=False, help="Folder of real scans to set beside."),
+    ] = None,
+    tolerance_m: Annotated[float, typer.Option(help="Error that is accepted \\[m].")] = 0.03,
+    as_json: AsJson = False,
+) -> None:
+    """Regenerate the study's tables and figures in simulation, both methods side by side."""
+    from spheremark.service.bench import reproduce as reproduction
+    from spheremark.service.cli import tables
+
+    wish = reproduction.Wish(seed=seed, is_quick=quick, real=real, tolerance=tolerance_m)
+    with _progress() as progress:
+        report = reproduction.run(folder, wish, progress)
+    if as_json:
+        _print_json(report)
+    else:
+        tables.print_reproduction(out, report)
+
+
+if __name__ == "__main__":
+    main()

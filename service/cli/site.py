@@ -1,0 +1,110 @@
+"""``spheremark site``: the stops of a survey in one frame, as a cloud and as ground."""
+
+from __future__ import annotations
+
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from spheremark.service.cli.survey import (
+    AsJson,
+    Axes,
+    ControlAxes,
+    ControlFile,
+    ControlUnit,
+    Logs,
+    RigFile,
+    TargetHeight,
+    Unit,
+    read_control,
+)
+from spheremark.service.cli.terminal import err, out, print_json, progress
+
+Laz = Annotated[
+    Path | None, typer.Option(dir_okay=False, help="Write the cloud in the site frame (LAZ).")
+]
+E57 = Annotated[
+    Path | None,
+    typer.Option(dir_okay=False, help="Write the cloud as scans with their poses (E57)."),
+]
+GeoTiff = Annotated[
+    Path | None,
+    typer.Option(dir_okay=False, help="Write the ground's heights and sigmas (GeoTIFF)."),
+]
+
+
+def site(
+    logs: Logs,
+    control: ControlFile = None,
+    control_axes: ControlAxes = Axes.ENU,
+    control_unit: ControlUnit = Unit.METRE,
+    target_height_m: TargetHeight = 0.0,
+    rig: RigFile = None,
+    laz: Laz = None,
+    e57: E57 = None,
+    geotiff: GeoTiff = None,
+    cell_m: Annotated[float, typer.Option(help="Edge of a cell of the ground \\[m].")] = 0.25,
+    ground_range_m: Annotated[
+        float, typer.Option(help="How far from a station ground is used \\[m].")
+    ] = 15.0,
+    gap_m: Annotated[
+        float, typer.Option(help="Fill holes of the ground up to this \\[m]; 0: none.")
+    ] = 0.0,
+    range_m: Annotated[float, typer.Option(help="How far the cloud reaches \\[m].")] = 30.0,
+    voxel_m: Annotated[
+        float, typer.Option(help="Keep a return in cubes of this edge \\[m]; 0: all.")
+    ] = 0.0,
+    radius_m: Annotated[float, typer.Option(help="Radius of the spheres \\[m].")] = 0.100,
+    as_json: AsJson = False,
+) -> None:
+    """Put all stops into one frame: a cloud, and a model of the ground with its uncertainty."""
+    from spheremark.pipelines.config import SurveyConfig
+    from spheremark.service.jobs import site as sites
+    from spheremark.service.provenance import code_version
+    from spheremark.storage.imports import survey_files as site_files
+
+    given = {"laz": laz, "e57": e57, "geotiff": geotiff}
+    targets = {kind: path for kind, path in given.items() if path is not None}
+    if not targets:
+        err.print("[bold red]Error:[/] name at least one of --laz, --e57 and --geotiff.")
+        raise typer.Exit(2)
+    options = {"cell_m": cell_m, "ground_range_m": ground_range_m, "gap_m": gap_m}
+    wish = sites.SiteWish(
+        targets=targets,
+        elevation=sites.elevation_of(options),
+        range_max=range_m,
+        voxel=voxel_m,
+        software=f"spheremark {code_version()}",
+        day=datetime.now(UTC).date(),
+    )
+    config = SurveyConfig.from_mapping(
+        {"marker_radius": radius_m, "fitting": {"methods": ["along_beam"]}}
+    )
+    marks = read_control(control, control_axes, control_unit, target_height_m)
+    with progress() as told:
+        made, network = sites.of_logs(
+            logs, marks, site_files.read_rig(rig) if rig else None, config, wish, told
+        )
+    answer = sites.site_answer(made, wish, network)
+    if as_json:
+        print_json(answer)
+    else:
+        _print(answer)
+
+
+def _print(answer: dict[str, Any]) -> None:
+    """Say what was written."""
+    kind = "a free network" if answer["poses"] == "free" else "a network with control"
+    out.print(f"{answer['n_stations']} stations, by {kind}.")
+    for one in answer["refused"]:
+        out.print(f"Without {one['station']}: {one['reason']}", markup=False, soft_wrap=True)
+    for file in answer["files"]:
+        text = f"{file['path']}: {file['n_points']:,} returns"
+        if "cell_m" in file:
+            text += (
+                f" in cells of {file['cell_m']:g} m, {100 * file['share_known']:.0f} % of them "
+                f"seen, median sigma {1000 * file['sigma_median_m']:.1f} mm"
+            )
+        out.print(text, soft_wrap=True, highlight=False)

@@ -1,0 +1,116 @@
+"""Where the command line finds results: a running service, or a data folder that none uses."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from shutil import copyfile
+from typing import Any, ClassVar
+
+import httpx
+
+from spheremark.pipelines.errors import InputError, SpheremarkError
+from spheremark.service.http.api import sql as routes
+from spheremark.service.http.state import DATABASE, query_limits
+from spheremark.service.serving import address_of
+from spheremark.service.settings import Settings
+from spheremark.storage.catalogue.catalogue import Catalogue
+
+
+class RemoteError(SpheremarkError):
+    """A running service refused or failed to answer."""
+
+    code: ClassVar[str] = "remote"
+
+
+class Source:
+    """Results, wherever they are: at an address, in a folder, or at what the settings name."""
+
+    def __init__(self, settings: Settings, url: str | None, *, folder: Path | None) -> None:
+        if url and folder:
+            raise InputError("Give either --url or --data: results come from one place.")
+        self._settings = settings
+        self._url = url or ("" if folder else self._running())
+
+    def ask(self, sql: str) -> dict[str, Any]:
+        """Answer one SELECT."""
+        if self._url:
+            with _spoken(self._url), self._http() as http:
+                answer: dict[str, Any] = _checked(http.post("/sql", json={"sql": sql})).json()
+                return answer
+        with self._catalogue() as catalogue:
+            found = routes.ask(catalogue, query_limits(self._settings), sql)
+            return found.model_dump(mode="json")
+
+    def export(self, target: Path, survey: str | None) -> None:
+        """Write the database or a table of coordinates to a file, by its ending."""
+        if target.suffix not in (".duckdb", ".csv"):
+            raise InputError(f"{target.name} must end in .duckdb (everything) or .csv.")
+        if self._url:
+            with _spoken(self._url):
+                self._download(target, survey)
+            return
+        with self._catalogue() as catalogue:
+            if target.suffix == ".csv":
+                target.write_bytes(routes.coordinates(catalogue, survey))
+            else:
+                copyfile(catalogue.snapshot(), target)
+
+    def _download(self, target: Path, survey: str | None) -> None:
+        """Stream a file from the service."""
+        name = "coordinates.csv" if target.suffix == ".csv" else "results.duckdb"
+        query = {"survey": survey} if survey and target.suffix == ".csv" else {}
+        with self._http() as http, http.stream("GET", f"/export/{name}", params=query) as answer:
+            if answer.is_error:
+                answer.read()
+            _checked(answer)
+            with target.open("wb") as file:
+                file.writelines(answer.iter_bytes())
+
+    def _running(self) -> str:
+        """Return the address of the settings if a service answers there."""
+        address = address_of(self._settings, self._settings.port)
+        try:
+            httpx.get(f"{address}/healthz", timeout=2.0)
+        except httpx.HTTPError:
+            return ""
+        return address
+
+    def _http(self) -> httpx.Client:
+        """Return a connection to the service."""
+        token = self._settings.token.get_secret_value() if self._settings.token else ""
+        headers = {"Authorization": f"Bearer {token}"} if token else {}
+        return httpx.Client(base_url=f"{self._url}/api/v1", headers=headers, timeout=120.0)
+
+    @contextmanager
+    def _catalogue(self) -> Iterator[Catalogue]:
+        """Open the database of the data folder, which nobody else may have open."""
+        path = self._settings.data / DATABASE
+        if not path.exists():
+            raise InputError(
+                f"No service answers and there is no database in {self._settings.data}; start "
+                "`spheremark serve`, or name a place with --url or --data."
+            )
+        with Catalogue(path, snapshots=self._settings.data / "snapshots") as catalogue:
+            yield catalogue
+
+
+@contextmanager
+def _spoken(url: str) -> Iterator[None]:
+    """Say in a sentence that nobody answers."""
+    try:
+        yield
+    except httpx.HTTPError as error:
+        raise RemoteError(
+            f"No service answers at {url} ({error}); start `spheremark serve` there, or "
+            "name another address with --url."
+        ) from error
+
+
+def _checked(answer: httpx.Response) -> httpx.Response:
+    """Return an answer; raise one that is a problem."""
+    if answer.is_error:
+        is_problem = "json" in answer.headers.get("content-type", "")
+        raise RemoteError(answer.json()["detail"] if is_problem else answer.reason_phrase)
+    return answer

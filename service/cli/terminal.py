@@ -1,0 +1,51 @@
+"""Standard output and standard error of the commands: answers go to one, progress to the other."""
+
+from __future__ import annotations
+
+import json
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import TYPE_CHECKING, Any
+
+import typer
+from rich.console import Console
+
+if TYPE_CHECKING:
+    from spheremark.pipelines.survey import Progress
+    from spheremark.service.settings import Settings
+
+_WIDE = 160  # columns of a table that goes into a file or a pipe
+out = Console(width=None if sys.stdout.isatty() else _WIDE)
+err = Console(stderr=True)
+
+
+@contextmanager
+def progress() -> Iterator[Progress]:
+    """Show a bar on standard error while something long runs."""
+    from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
+
+    columns = (BarColumn(), TextColumn("{task.description}"), TimeElapsedColumn())
+    with Progress(*columns, console=err, transient=True, disable=not err.is_terminal) as bar:
+        task = bar.add_task("", total=1.0)
+        yield lambda share, what: bar.update(task, completed=share, description=what)
+
+
+def print_json(value: Any) -> None:
+    """Write JSON to standard output."""
+    sys.stdout.write(json.dumps(value, indent=2, allow_nan=False) + "\n")
+
+
+def settings(**given: Any) -> Settings:
+    """Read the settings; a wrong one is a misuse, said in a sentence."""
+    from pydantic import ValidationError
+
+    from spheremark.service.settings import Settings
+
+    try:
+        return Settings(**given)
+    except ValidationError as error:
+        for one in error.errors():
+            name = "_".join(["SPHEREMARK", *(str(part).upper() for part in one["loc"])])
+            err.print(f"[bold red]Error:[/] {name}: {one['msg']}", highlight=False, soft_wrap=True)
+        raise typer.Exit(2) from None

@@ -1,0 +1,1 @@
+"""The HTTP side: application, security, REST under ``api/`` and pages under ``pages/``."""

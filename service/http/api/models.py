@@ -1,0 +1,321 @@
+"""The wire format: what requests carry and responses answer. Units are in the names."""
+
+from __future__ import annotations
+
+from datetime import datetime
+from typing import Any, Generic, Literal, Self, TypeVar
+
+from pydantic import BaseModel, ConfigDict, Field, model_validator
+
+from spheremark.pipelines.model import ControlMarks, Rig
+from spheremark.pipelines.scan.rigs import rig_digest, rig_to_mapping
+from spheremark.service.jobs.handlers import KINDS, JobKind
+from spheremark.storage.catalogue.records import (
+    JobRecord,
+    JobStatus,
+    RecordingRecord,
+    RunRecord,
+    SurveyRecord,
+)
+
+Item = TypeVar("Item")
+SurveyKey = str  # id or name
+
+
+class Strict(BaseModel):
+    """A request body: a field that nobody knows is an error, not a wish."""
+
+    model_config = ConfigDict(extra="forbid")
+
+
+class Listing(BaseModel, Generic[Item]):
+    """A part of a list."""
+
+    items: list[Item]
+    next: str | None = Field(default=None, description="Pass it as 'after' for what follows.")
+
+
+class NewSurvey(Strict):
+    """A survey to create."""
+
+    name: str = Field(min_length=1, max_length=200, description="Unique name.")
+    tolerance_m: float = Field(default=0.03, gt=0, le=1, description="Error that it accepts [m].")
+
+
+class Survey(BaseModel):
+    """A field with its control marks and logs."""
+
+    survey_id: str
+    name: str
+    tolerance_m: float
+    created_at: datetime
+    rig_digest: str | None = Field(description="Rig that its jobs use where they name none.")
+    n_control_marks: int
+    n_true_stops: int
+    n_recordings: int
+
+    @classmethod
+    def of(cls, record: SurveyRecord) -> Self:
+        """Return a record in the wire format."""
+        return cls(
+            survey_id=record.survey_id,
+            name=record.name,
+            tolerance_m=record.tolerance,
+            created_at=record.created_at,
+            rig_digest=record.rig_digest,
+            n_control_marks=record.n_control_marks,
+            n_true_stops=record.n_true_stops,
+            n_recordings=record.n_recordings,
+        )
+
+
+class Mark(Strict):
+    """A known sphere centre in the site frame."""
+
+    mark: str
+    x_m: float
+    y_m: float
+    z_m: float
+    sigma_x_m: float = Field(default=0.0, ge=0.0)
+    sigma_y_m: float = Field(default=0.0, ge=0.0)
+    sigma_z_m: float = Field(default=0.0, ge=0.0)
+
+
+class Control(Strict):
+    """The control marks of a survey."""
+
+    marks: list[Mark]
+
+    @classmethod
+    def of(cls, marks: ControlMarks | None) -> Self:
+        """Return control marks in the wire format."""
+        if marks is None:
+            return cls(marks=[])
+        return cls(
+            marks=[
+                Mark(
+                    mark=name,
+                    **dict(zip(("x_m", "y_m", "z_m"), map(float, p), strict=True)),
+                    **{f"sigma_{axis}_m": float(cov[i, i] ** 0.5) for i, axis in enumerate("xyz")},
+                )
+                for name, p, cov in zip(marks.names, marks.p_site, marks.cov_p_site, strict=True)
+            ]
+        )
+
+
+class ChosenRig(Strict):
+    """The rig that later jobs of a survey use."""
+
+    rig_digest: str | None = Field(
+        description="Digest of a rig; null for the one that each log describes."
+    )
+
+
+class StoredRig(BaseModel):
+    """A rig that is kept."""
+
+    rig_digest: str
+    rig: dict[str, Any] = Field(description="As in a rig file.")
+
+    @classmethod
+    def of(cls, rig: Rig) -> Self:
+        """Return a rig in the wire format."""
+        return cls(rig_digest=rig_digest(rig), rig=rig_to_mapping(rig))
+
+
+class TruthSummary(BaseModel):
+    """What is known of the truth of a survey; for comparison only."""
+
+    n_marks: int
+    n_stops: int
+
+
+class Recording(BaseModel):
+    """An uploaded log."""
+
+    model_config = ConfigDict(from_attributes=True)
+
+    recording_id: str = Field(description="SHA-256 of its bytes.")
+    name: str
+    size_bytes: int
+    uploaded_at: datetime
+    verdict: Literal["ok", "weak", "refused"]
+    preflight: dict[str, Any] = Field(description="What the log holds and lacks, with reasons.")
+
+    @classmethod
+    def of(cls, record: RecordingRecord) -> Self:
+        """Return a record in the wire format."""
+        return cls.model_validate(record)
+
+
+class NewJob(Strict):
+    """Work to do."""
+
+    kind: JobKind = JobKind.PROCESS
+    survey: SurveyKey = Field(description="Id or name of the survey.")
+    recording: str | None = Field(
+        default=None, description="Id of the recording; kinds that read several take 'recordings'."
+    )
+    recordings: list[str] | None = Field(
+        default=None,
+        min_length=1,
+        description="Ids of recordings, for kinds that read several; all of the survey by default.",
+    )
+    rig: str | dict[str, Any] | None = Field(
+        default=None,
+        description="Digest of a rig, or a rig file's JSON; by default the rig of the survey, "
+        "and the one that each log describes where it has none.",
+    )
+    config: dict[str, Any] = Field(
+        default_factory=dict,
+        description="What differs from the default configuration, nested as GET /config shows it.",
+    )
+    options: dict[str, Any] = Field(
+        default_factory=dict, description="What the kind lets one choose."
+    )
+
+    @model_validator(mode="after")
+    def _check_logs(self) -> Self:
+        """Refuse logs that the kind does not take."""
+        if not KINDS[self.kind].takes_one_log:
+            if self.recording is not None and self.recordings is not None:
+                raise ValueError("name the logs in 'recordings' alone, not in 'recording' too")
+            return self
+        if self.recording is None:
+            raise ValueError(f"a job of the kind {self.kind} needs a recording")
+        if self.recordings is not None:
+            raise ValueError(f"a job of the kind {self.kind} reads one recording")
+        return self
+
+
+class Job(BaseModel):
+    """Work that was asked for, and where it stands."""
+
+    model_config = ConfigDict(from_attributes=True)
+
+    job_id: str
+    kind: str
+    survey_id: str
+    survey: str
+    recording_id: str | None
+    recording: str | None
+    config: dict[str, Any]
+    options: dict[str, Any]
+    status: JobStatus
+    progress_percent: float
+    message: str
+    attempts: int
+    created_at: datetime
+    started_at: datetime | None
+    finished_at: datetime | None
+    error_code: str | None
+    error_reason: str | None
+
+    @classmethod
+    def of(cls, record: JobRecord) -> Self:
+        """Return a record in the wire format; the traceback stays in the database."""
+        return cls.model_validate(record)
+
+
+class Upload(Recording):
+    """An uploaded log and the job that reads it."""
+
+    job: Job | None = Field(default=None, description="The job, where process=true asked for one.")
+
+
+class Run(BaseModel):
+    """A recording processed with one configuration by one version of the code."""
+
+    run_id: str
+    job_id: str
+    survey_id: str
+    recording_id: str
+    config: dict[str, Any]
+    config_digest: str
+    code_version: str
+    rig_digest: str
+    finished_at: datetime
+    duration_s: float
+    peak_memory_bytes: int | None
+
+    @classmethod
+    def of(cls, record: RunRecord) -> Self:
+        """Return a record in the wire format."""
+        return cls(
+            run_id=record.run_id,
+            job_id=record.job_id,
+            survey_id=record.survey_id,
+            recording_id=record.recording_id,
+            config=dict(record.config),
+            config_digest=record.config_digest,
+            code_version=record.code_version,
+            rig_digest=record.rig_digest,
+            finished_at=record.finished_at,
+            duration_s=record.duration,
+            peak_memory_bytes=record.peak_memory_bytes,
+        )
+
+
+class Row(BaseModel):
+    """One row of a table of the database, columns as they are named and documented there."""
+
+    model_config = ConfigDict(extra="allow")
+
+    run_id: str
+    survey: str
+    stop: str
+    fit_method: str
+    status: str
+
+
+class ProblemKind(BaseModel):
+    """A kind of problem."""
+
+    code: str
+    title: str
+    status: int
+
+
+class Query(Strict):
+    """A question in SQL."""
+
+    sql: str = Field(min_length=1, max_length=100_000, description="One SELECT.")
+    format: Literal["json", "csv"] = Field(default="json", description="Shape of the answer.")
+
+
+class Column(BaseModel):
+    """A column of an answer."""
+
+    model_config = ConfigDict(from_attributes=True)
+
+    name: str
+    type: str
+    unit: str
+
+
+class DescribedColumn(Column):
+    """A column that can be asked for."""
+
+    comment: str
+
+
+class Table(BaseModel):
+    """A table or view that can be asked."""
+
+    model_config = ConfigDict(from_attributes=True)
+
+    name: str
+    kind: Literal["table", "view"]
+    comment: str
+    columns: list[DescribedColumn]
+
+
+class Answer(BaseModel):
+    """The answer to a question in SQL."""
+
+    columns: list[Column]
+    rows: list[list[Any]]
+    truncated: bool = Field(description="Whether rows are missing because of the row limit.")
+    row_limit: int
+    elapsed_ms: float
+    snapshot_at: datetime = Field(description="Results committed later are not in the answer.")

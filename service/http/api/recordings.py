@@ -1,0 +1,114 @@
+"""Routes of recordings: uploaded logs, what their preflight says, and their bytes."""
+
+from __future__ import annotations
+
+import asyncio
+from typing import Annotated, Any
+
+from fastapi import APIRouter, Path, Query, Request, Response
+from fastapi.responses import FileResponse
+
+from spheremark.pipelines.errors import InputError
+from spheremark.service.http.api.jobs import start
+from spheremark.service.http.api.models import Job, Listing, NewJob, Recording, Upload
+from spheremark.service.http.api.surveys import After, Limit
+from spheremark.service.http.errors import MediaTypeError, TooLargeError
+from spheremark.service.http.state import Current, Service
+from spheremark.service.http.uploads import take_in
+from spheremark.storage.catalogue.records import RecordingRecord
+
+router = APIRouter(prefix="/recordings", tags=["recordings"])
+
+Digest = Annotated[str, Path(description="SHA-256 of the log.", pattern="^[0-9a-f]{64}$")]
+MCAP = "application/vnd.mcap"
+_MEDIA_TYPES = (MCAP, "application/octet-stream")
+_BODY = {
+    "requestBody": {
+        "required": True,
+        "content": {
+            one: {"schema": {"type": "string", "format": "binary"}} for one in _MEDIA_TYPES
+        },
+    }
+}
+
+
+@router.post(
+    "",
+    name="upload_recording",
+    status_code=201,
+    openapi_extra=_BODY,
+    responses={200: {"model": Upload, "description": "The same log was here already."}},
+)
+async def upload_recording(
+    request: Request,
+    response: Response,
+    service: Current,
+    name: Annotated[str, Query(min_length=1, max_length=200, description="Name of the log.")],
+    survey: Annotated[str | None, Query(description="Id or name of its survey.")] = None,
+    process: Annotated[bool, Query(description="Whether to start a job at once.")] = False,  # noqa: FBT002
+) -> Upload:
+    """Take in a log: the body is the file, streamed to disk; a refused log is kept as well."""
+    _check_upload(request, service.settings.max_upload_bytes)
+    if process or survey is not None:
+        await asyncio.to_thread(_check_survey, service, survey)
+    received = await service.inbox.receive(request.stream(), service.settings.max_upload_bytes)
+    recording, is_new = await asyncio.to_thread(take_in, service.catalogue, received, name)
+    response.status_code = 201 if is_new else 200
+    response.headers["Location"] = f"/api/v1/recordings/{recording.recording_id}"
+    if survey is not None:
+        await asyncio.to_thread(service.catalogue.add_to_survey, survey, recording.recording_id)
+    job = await asyncio.to_thread(_start, service, survey, recording) if process else None
+    return Upload(**Recording.of(recording).model_dump(), job=job)
+
+
+@router.get("", name="list_recordings")
+def list_recordings(
+    service: Current, after: After = None, limit: Limit = 100
+) -> Listing[Recording]:
+    """List uploaded logs, newest first."""
+    page = service.catalogue.list_recordings(after=after, limit=limit)
+    return Listing(items=[Recording.of(record) for record in page.items], next=page.next)
+
+
+@router.get("/{recording}", name="get_recording")
+def get_recording(recording: Digest, service: Current) -> Recording:
+    """Return an uploaded log."""
+    return Recording.of(service.catalogue.get_recording(recording))
+
+
+@router.get("/{recording}/preflight", name="get_preflight")
+def get_preflight(recording: Digest, service: Current) -> dict[str, Any]:
+    """Return what a log holds and lacks."""
+    return dict(service.catalogue.get_recording(recording).preflight)
+
+
+@router.get("/{recording}/file", name="download_recording", response_class=FileResponse)
+def download_recording(recording: Digest, service: Current) -> FileResponse:
+    """Return the bytes of a log, as they were uploaded."""
+    known = service.catalogue.get_recording(recording)
+    return FileResponse(known.url, media_type=MCAP, filename=f"{known.name}.mcap")
+
+
+def _check_upload(request: Request, max_bytes: int) -> None:
+    """Refuse a body by its headers, before a byte of it is read."""
+    media_type = request.headers.get("content-type", "").partition(";")[0].strip().lower()
+    if media_type not in _MEDIA_TYPES:
+        raise MediaTypeError(
+            f"The body is {media_type or 'of no type'}; send the log itself as {MCAP}."
+        )
+    declared = request.headers.get("content-length", "")
+    if declared.isdecimal() and int(declared) > max_bytes:
+        raise TooLargeError(f"The log has {int(declared):,} bytes; {max_bytes:,} are accepted.")
+
+
+def _check_survey(service: Service, survey: str | None) -> str:
+    """Return the survey that a job shall belong to."""
+    if survey is None:
+        raise InputError("process=true needs survey=<id or name>: results belong to a survey.")
+    return service.catalogue.get_survey(survey).survey_id
+
+
+def _start(service: Service, survey: str | None, recording: RecordingRecord) -> Job:
+    """Start a job for a log that just came."""
+    survey_id = _check_survey(service, survey)
+    return start(service, NewJob(survey=survey_id, recording=recording.recording_id))

@@ -1,0 +1,31 @@
+"""Routes of rigs: mounting, laser table and offsets that jobs may name by their digest."""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+from fastapi import APIRouter, Path, Response
+
+from spheremark.service.http.api.models import StoredRig
+from spheremark.service.http.api.surveys import File, bodies
+from spheremark.service.http.state import Current
+from spheremark.storage.imports.survey_files import parse_rig
+
+router = APIRouter(prefix="/rigs", tags=["rigs"])
+
+RigDigest = Annotated[str, Path(description="Digest of the rig.")]
+
+
+@router.post("", name="put_rig", status_code=201, openapi_extra=bodies("application/json"))
+def put_rig(file: File, service: Current, response: Response) -> StoredRig:
+    """Keep a rig file (JSON), so that jobs can name it; the same rig twice is one."""
+    rig = parse_rig(file.text)
+    digest = service.catalogue.put_rig(rig)
+    response.headers["Location"] = f"/api/v1/rigs/{digest}"
+    return StoredRig.of(rig)
+
+
+@router.get("/{rig}", name="get_rig")
+def get_rig(rig: RigDigest, service: Current) -> StoredRig:
+    """Return a rig; its ``rig`` is what a rig file holds."""
+    return StoredRig.of(service.catalogue.get_rig(rig))

@@ -1,0 +1,146 @@
+"""Routes of surveys: their control marks and, for comparison only, their truth."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Annotated, Any
+
+import numpy as np
+from fastapi import APIRouter, Depends, Path, Query, Request, Response
+from fastapi.exceptions import RequestValidationError
+from fastapi.responses import PlainTextResponse
+from pydantic import ValidationError
+
+from spheremark.pipelines.errors import InputError, NotFoundError
+from spheremark.pipelines.model import ControlMarks
+from spheremark.service.http.api.models import (
+    ChosenRig,
+    Control,
+    Listing,
+    Mark,
+    NewSurvey,
+    Survey,
+    TruthSummary,
+)
+from spheremark.service.http.errors import EmptyBodyError, MediaTypeError
+from spheremark.service.http.state import Current
+from spheremark.storage.imports.survey_files import format_control, parse_control, parse_truth
+
+router = APIRouter(prefix="/surveys", tags=["surveys"])
+
+Key = Annotated[str, Path(description="Id or name of the survey.")]
+After = Annotated[str | None, Query(description="The 'next' of the part before.")]
+Limit = Annotated[int, Query(ge=1, le=1000, description="Items in one part.")]
+
+
+@dataclass(frozen=True, slots=True)
+class Document:
+    """A body that is a file: its media type and its text."""
+
+    media_type: str
+    text: str
+
+
+async def document(request: Request) -> Document:
+    """Read a body that is a file."""
+    media_type = request.headers.get("content-type", "").partition(";")[0].strip().lower()
+    body = await request.body()
+    if not body.strip():
+        raise EmptyBodyError("The body is empty; send the file itself as the body.")
+    try:
+        return Document(media_type, body.decode("utf-8-sig"))
+    except UnicodeDecodeError as error:
+        raise InputError(f"The body is not UTF-8 text: {error}.") from error
+
+
+def bodies(*media_types: str) -> dict[str, Any]:
+    """Describe in OpenAPI a body that is a file of one of these types."""
+    content = {one: {"schema": {"type": "string"}} for one in media_types}
+    return {"requestBody": {"required": True, "content": content}}
+
+
+File = Annotated[Document, Depends(document)]
+
+
+@router.post("", status_code=201, name="create_survey")
+def create_survey(new: NewSurvey, service: Current, response: Response) -> Survey:
+    """Create a survey."""
+    survey = service.catalogue.create_survey(new.name, tolerance=new.tolerance_m)
+    response.headers["Location"] = f"/api/v1/surveys/{survey.survey_id}"
+    return Survey.of(survey)
+
+
+@router.get("", name="list_surveys")
+def list_surveys(service: Current, after: After = None, limit: Limit = 100) -> Listing[Survey]:
+    """List surveys, newest first."""
+    page = service.catalogue.list_surveys(after=after, limit=limit)
+    return Listing(items=[Survey.of(record) for record in page.items], next=page.next)
+
+
+@router.get("/{survey}", name="get_survey")
+def get_survey(survey: Key, service: Current) -> Survey:
+    """Return a survey."""
+    return Survey.of(service.catalogue.get_survey(survey))
+
+
+@router.put(
+    "/{survey}/control", name="put_control", openapi_extra=bodies("text/csv", "application/json")
+)
+def put_control(survey: Key, file: File, service: Current) -> Control:
+    """Give a survey its control marks, as CSV or JSON; a survey of that name is made if missing."""
+    marks = _read_control(file)
+    try:
+        service.catalogue.get_survey(survey)
+    except NotFoundError:
+        service.catalogue.create_survey(survey)
+    service.catalogue.put_control_marks(survey, marks)
+    return Control.of(service.catalogue.control_marks(survey))
+
+
+@router.get("/{survey}/control", name="get_control")
+def get_control(survey: Key, request: Request, service: Current) -> Response:
+    """Return the control marks of a survey, as JSON, or as CSV where text/csv is asked for."""
+    marks = service.catalogue.control_marks(survey)
+    if "text/csv" in request.headers.get("accept", "") and marks is not None:
+        return PlainTextResponse(format_control(marks), media_type="text/csv")
+    return Response(Control.of(marks).model_dump_json(), media_type="application/json")
+
+
+@router.put("/{survey}/rig", name="choose_rig")
+def choose_rig(survey: Key, chosen: ChosenRig, service: Current) -> Survey:
+    """Let later jobs of a survey use a rig where they name none."""
+    return Survey.of(service.catalogue.choose_rig(survey, chosen.rig_digest))
+
+
+@router.put("/{survey}/truth", name="put_truth", openapi_extra=bodies("application/json"))
+def put_truth(survey: Key, file: File, service: Current) -> TruthSummary:
+    """Give a survey its truth: for comparison only, no job ever sees it."""
+    service.catalogue.put_truth(survey, parse_truth(file.text))
+    truth = service.catalogue.truth(survey)
+    n_marks, n_stops = (len(truth.marks.names), len(truth.stops)) if truth else (0, 0)
+    return TruthSummary(n_marks=n_marks, n_stops=n_stops)
+
+
+def _read_control(file: Document) -> ControlMarks:
+    """Read control marks from CSV or JSON."""
+    if file.media_type in ("text/csv", "text/plain", "application/csv"):
+        return parse_control(file.text)
+    if file.media_type != "application/json":
+        raise MediaTypeError(
+            f"The body is {file.media_type or 'of no type'}; send text/csv or application/json."
+        )
+    try:
+        marks = _to_marks(Control.model_validate_json(file.text).marks)
+    except ValidationError as error:
+        raise RequestValidationError(error.errors()) from error
+    return parse_control(format_control(marks))  # one set of checks for both forms
+
+
+def _to_marks(marks: list[Mark]) -> ControlMarks:
+    """Return marks of the wire as values."""
+    sigmas = np.array([[m.sigma_x_m, m.sigma_y_m, m.sigma_z_m] for m in marks]).reshape(-1, 3)
+    return ControlMarks(
+        names=tuple(mark.mark for mark in marks),
+        p_site=np.array([[m.x_m, m.y_m, m.z_m] for m in marks], dtype=np.float64).reshape(-1, 3),
+        cov_p_site=np.eye(3) * np.square(sigmas)[:, None, :],
+    )

@@ -1,0 +1,98 @@
+"""The application: rooms put together, with one lifespan and one shape of errors."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import AsyncIterator
+from contextlib import asynccontextmanager
+from importlib import metadata, resources
+from pathlib import Path
+from typing import Any
+
+from fastapi import APIRouter, FastAPI, Request, Response
+from fastapi.responses import RedirectResponse
+from fastapi.staticfiles import StaticFiles
+
+from spheremark.service.http import api, errors
+from spheremark.service.http import security as guard
+from spheremark.service.http.errors import UnauthorizedError
+from spheremark.service.http.pages import networks as result_pages
+from spheremark.service.http.pages import plans as plan_pages
+from spheremark.service.http.pages import results as pages
+from spheremark.service.http.pages import sites as site_pages
+from spheremark.service.http.state import Current, opened
+from spheremark.service.settings import Settings
+
+ROOT = "/api/v1"
+STATIC = Path(str(resources.files("spheremark.web"))) / "static"
+
+about = APIRouter(include_in_schema=False)
+
+
+def create_app(settings: Settings) -> FastAPI:
+    """Return the service as an application; it opens its files and its cluster when it starts."""
+
+    @asynccontextmanager
+    async def lifespan(app: FastAPI) -> AsyncIterator[None]:
+        logging.getLogger("spheremark").setLevel(settings.log_level.upper())
+        try:
+            async with opened(settings) as service:
+                app.state.service = service
+                yield
+        except BaseException as error:
+            app.state.failure = error  # for the one who started us; servers only log it
+            raise
+
+    app = FastAPI(
+        title="spheremark",
+        version=metadata.version("spheremark"),
+        summary="Station positions from spherical markers and a gimbal-mounted LiDAR.",
+        lifespan=lifespan,
+        openapi_url=f"{ROOT}/openapi.json",
+        docs_url=None,  # FastAPI's pages load their scripts from another host
+        redoc_url=None,
+        generate_unique_id_function=lambda route: route.name,
+        responses={"default": {"model": errors.Problem, "description": "What went wrong."}},
+    )
+    app.add_middleware(guard.Guard, settings=settings)
+    app.include_router(api.router, prefix=ROOT)
+    app.include_router(about)
+    app.include_router(site_pages.router)  # before the survey, whose name takes slashes
+    app.include_router(pages.router)
+    app.include_router(plan_pages.router)
+    app.include_router(result_pages.router)
+    app.mount("/static", StaticFiles(directory=STATIC), name="static")
+    errors.install(app, pages.error_page)
+    return app
+
+
+@about.get("/healthz")
+def health(service: Current, response: Response) -> dict[str, Any]:
+    """Say whether each part of the service runs."""
+    workers = service.jobs.n_workers()
+    service.catalogue.rows("SELECT 1 AS one")
+    response.status_code = 200 if workers else 503
+    return {
+        "status": "ok" if workers else "degraded",
+        "version": metadata.version("spheremark"),
+        "database": "ok",
+        "cluster": {"status": "ok" if workers else "no workers", "workers": workers},
+    }
+
+
+@about.get("/login")
+def login(request: Request, service: Current, token: str = "") -> Response:
+    """Give a browser that knows the token a cookie in its place."""
+    known = service.settings.token.get_secret_value() if service.settings.token else ""
+    if known and not guard.is_token(token, known):
+        raise UnauthorizedError("That is not the token; open /login?token=<token>.")
+    response = RedirectResponse("/", status_code=303)
+    if known:
+        response.set_cookie(
+            guard.COOKIE,
+            guard.cookie_value(known),
+            httponly=True,
+            samesite="strict",
+            secure=request.url.scheme == "https",
+        )
+    return response

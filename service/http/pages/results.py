@@ -1,0 +1,401 @@
+"""Routes of pages: static SELECTs through the catalogue, handed to the functions that draw them."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from dataclasses import asdict, replace
+from typing import Annotated, Any
+
+from fastapi import APIRouter, Query, Request
+from fastapi.responses import FileResponse, HTMLResponse
+
+from spheremark.pipelines.errors import NotFoundError
+from spheremark.service.http.errors import Problem
+from spheremark.service.http.state import Current, Service
+from spheremark.storage.clouds import stop as clouds
+from spheremark.web import assets
+from spheremark.web.figures import scene
+from spheremark.web.figures.survey import Columns, texts
+from spheremark.web.pages import results as pages
+from spheremark.web.pages.filters import Filters
+
+router = APIRouter(include_in_schema=False, default_response_class=HTMLResponse)
+
+_N_JOBS = 100  # in one page; the API lists all
+_N_RECORDINGS = 50
+_N_POINTS = 250_000  # of a cloud; the page thins them further
+_A_YEAR = "public, max-age=31536000, immutable"
+
+_SURVEY_NAMES = "SELECT name FROM surveys ORDER BY created_at DESC, name"
+_NEWEST_SURVEY = """
+SELECT s.name FROM runs AS r JOIN surveys AS s USING (survey_id)
+ORDER BY r.finished_at DESC LIMIT 1
+"""
+_SURVEYS = """
+SELECT s.name, s.tolerance_m, s.created_at,
+    (SELECT count(*) FROM control_marks AS c WHERE c.survey_id = s.survey_id) AS n_control_marks,
+    (SELECT count(*) FROM true_stops AS t WHERE t.survey_id = s.survey_id) AS n_true_stops,
+    (SELECT count(DISTINCT x.stop) FROM stops AS x JOIN latest_runs AS r USING (run_id)
+        WHERE r.survey_id = s.survey_id) AS n_stops,
+    (SELECT sqrt(avg(f.sigma_3d_m ^ 2)) FROM latest_station_fixes AS f
+        WHERE f.survey_id = s.survey_id AND f.fit_method = 'along_beam') AS station_sigma_rms_m,
+    (SELECT sqrt(avg(f.error_3d_m ^ 2)) FROM latest_station_fixes AS f
+        WHERE f.survey_id = s.survey_id AND f.fit_method = 'along_beam') AS station_error_rms_m
+FROM surveys AS s ORDER BY s.created_at DESC, s.name
+"""
+_RECORDINGS = """
+SELECT recording_id, name, size_bytes, uploaded_at, verdict
+FROM recordings ORDER BY uploaded_at DESC, recording_id LIMIT $n
+"""
+_RECORDING = """
+SELECT recording_id, name, size_bytes, uploaded_at, verdict, preflight
+FROM recordings WHERE recording_id = $id
+"""
+_JOBS = """
+SELECT j.*, s.name AS survey, r.name AS recording
+FROM jobs AS j JOIN surveys AS s USING (survey_id) LEFT JOIN recordings AS r USING (recording_id)
+WHERE ($job IS NULL OR j.job_id = $job)
+    AND ($recording IS NULL OR j.recording_id = $recording)
+    AND ($survey IS NULL OR j.survey_id = $survey)
+    AND (NOT $is_active OR j.status IN ('accepted', 'running'))
+ORDER BY j.created_at DESC, j.job_id LIMIT $n
+"""
+_N_ACTIVE = "SELECT count(*) AS n FROM jobs WHERE status IN ('accepted', 'running')"
+_SURVEY = """
+SELECT survey_id, name, tolerance_m, rig_digest FROM surveys WHERE name = $key OR survey_id = $key
+"""
+_MARKS = "SELECT mark, x_m, y_m, z_m FROM control_marks WHERE survey_id = $id ORDER BY mark"
+_TRUE_STOPS = "SELECT stop, x_m, y_m, z_m FROM true_stops WHERE survey_id = $id ORDER BY stop"
+_FITS = """
+SELECT m.stop, m.fit_method, m.marker, m.mark, m.status, m.reason, m.range_m, m.n_points,
+    m.sigma_3d_m, m.error_3d_m,
+    sqrt(greatest(0, m.sigma_3d_m ^ 2
+        - (radians(x.sigma_heading_deg) * m.range_m * cos(radians(m.elevation_deg))) ^ 2) / 3)
+        AS sigma_axis_m
+FROM latest_marker_fits AS m JOIN stops AS x USING (run_id, stop)
+WHERE survey_id = $id ORDER BY m.stop, m.fit_method, m.marker
+"""
+_FIXES = """
+SELECT stop, fit_method, resection_method, status, reason, x_m, y_m, z_m, sigma_3d_m,
+    sqrt(cov_xx_m2 + cov_yy_m2) AS sigma_horizontal_m,
+    ellipse_major_95_m, ellipse_minor_95_m, ellipse_bearing_deg, n_markers,
+    included_angle_min_deg, included_angle_max_deg, error_horizontal_m, error_3d_m
+FROM latest_station_fixes WHERE survey_id = $id ORDER BY stop, fit_method
+"""
+_SUBSETS = """
+SELECT x.stop, x.fit_method, x.marks, x.included_angle_deg, x.included_angle_max_deg,
+    x.sigma_horizontal_m, x.error_horizontal_m
+FROM resections AS x JOIN latest_runs AS r USING (run_id)
+WHERE r.survey_id = $id AND x.n_marks = $n_marks AND x.resection_method = $resection
+ORDER BY x.stop, x.fit_method, x.marks
+"""
+_SUBSET_METHODS = """
+SELECT DISTINCT x.resection_method FROM resections AS x JOIN latest_runs AS r USING (run_id)
+WHERE r.survey_id = $id ORDER BY x.resection_method
+"""
+_STOP_NAMES = """
+SELECT DISTINCT x.stop FROM stops AS x JOIN latest_runs AS r USING (run_id)
+WHERE r.survey_id = $id ORDER BY x.stop
+"""
+_STOP = """
+SELECT x.*, r.job_id, r.recording_id, c.name AS recording, r.finished_at, r.code_version,
+    r.config_digest, r.rig_digest
+FROM stops AS x JOIN latest_runs AS r USING (run_id) JOIN recordings AS c USING (recording_id)
+WHERE r.survey_id = $id AND x.stop = $stop ORDER BY r.finished_at DESC
+"""
+_STOP_METHODS = """
+SELECT DISTINCT fit_method FROM (
+    SELECT fit_method, run_id, stop FROM marker_fits UNION ALL
+    SELECT fit_method, run_id, stop FROM station_fixes UNION ALL
+    SELECT fit_method, run_id, stop FROM rejections
+) WHERE run_id = $run AND stop = $stop ORDER BY fit_method
+"""
+_STOP_FITS = """
+SELECT * FROM marker_fits
+WHERE run_id = $run AND stop = $stop AND fit_method = $method ORDER BY marker
+"""
+_STOP_REJECTIONS = """
+SELECT * FROM rejections
+WHERE run_id = $run AND stop = $stop AND fit_method = $method ORDER BY n_points DESC
+"""
+_STOP_FIXES = "SELECT * FROM station_fixes WHERE run_id = $run AND stop = $stop ORDER BY fit_method"
+_STOP_OBSERVATIONS = """
+SELECT o.*,
+    sqrt(m.cov_xx_m2 * cos(radians(f.yaw_deg)) ^ 2 + m.cov_yy_m2 * sin(radians(f.yaw_deg)) ^ 2
+        - 2 * m.cov_xy_m2 * sin(radians(f.yaw_deg)) * cos(radians(f.yaw_deg))) AS sigma_x_m,
+    sqrt(m.cov_xx_m2 * sin(radians(f.yaw_deg)) ^ 2 + m.cov_yy_m2 * cos(radians(f.yaw_deg)) ^ 2
+        + 2 * m.cov_xy_m2 * sin(radians(f.yaw_deg)) * cos(radians(f.yaw_deg))) AS sigma_y_m,
+    sqrt(m.cov_zz_m2) AS sigma_z_m
+FROM observations AS o
+JOIN marker_fits AS m USING (run_id, stop, fit_method, marker)
+JOIN station_fixes AS f USING (run_id, stop, fit_method, resection_method)
+WHERE o.run_id = $run AND o.stop = $stop AND o.fit_method = $method ORDER BY o.marker
+"""
+_JOB_STOPS = """
+SELECT x.stop, x.n_returns,
+    (SELECT count(DISTINCT m.marker) FROM marker_fits AS m
+        WHERE m.run_id = x.run_id AND m.stop = x.stop AND m.fit_method = 'along_beam') AS n_markers
+FROM stops AS x JOIN runs AS r USING (run_id) WHERE r.job_id = $id ORDER BY x.stop
+"""
+
+_JOB_MADE = """
+SELECT '/adjustments/' || adjustment_id AS address,
+    'Network of ' || n_stations || ' stations and ' || n_marks || ' marks' AS what
+FROM adjustments WHERE job_id = $id
+UNION ALL
+SELECT '/calibrations/' || calibration_id, 'Calibration of the gimbal'
+FROM calibrations WHERE job_id = $id
+"""
+_ADJUSTMENTS = """
+SELECT a.adjustment_id, a.datum, a.status, a.n_stations, a.n_marks, a.passes_global_test, a.sigma0,
+    a.finished_at,
+    (SELECT sqrt(avg(x.sigma_3d_m ^ 2)) FROM adjusted_stations AS x
+        WHERE x.adjustment_id = a.adjustment_id) AS station_sigma_rms_m,
+    (SELECT sqrt(avg(x.difference_3d_m ^ 2)) FROM control_checks AS x
+        WHERE x.adjustment_id = a.adjustment_id) AS control_rms_m
+FROM adjustments AS a WHERE a.survey_id = $id ORDER BY a.finished_at DESC LIMIT $n
+"""
+_CALIBRATIONS = """
+SELECT calibration_id, rig_digest, len(stops) AS n_stops, gap_rms_before_m, gap_rms_after_m,
+    finished_at
+FROM calibrations WHERE survey_id = $id ORDER BY finished_at DESC LIMIT $n
+"""
+_N_RESULTS = 20  # networks and calibrations in the page of their survey
+
+
+@router.get(assets.plotly_url())
+def plotly_script() -> FileResponse:
+    """Return Plotly's script from the installed package."""
+    return FileResponse(
+        assets.plotly_script(), media_type="text/javascript", headers={"Cache-Control": _A_YEAR}
+    )
+
+
+@router.get("/")
+def overview(request: Request, service: Current) -> str:
+    """Show what there is and how to bring more."""
+    rows = service.catalogue.rows
+    newest = rows(_NEWEST_SURVEY)
+    return pages.overview_page(
+        pages.OverviewPage(
+            frame=frame_of(service),
+            address=_address(request),
+            newest=_survey_data(service, newest[0]["name"], Filters()) if newest else None,
+            surveys=tuple(rows(_SURVEYS)),
+            recordings=tuple(rows(_RECORDINGS, {"n": _N_RECORDINGS})),
+            n_active_jobs=rows(_N_ACTIVE)[0]["n"],
+        )
+    )
+
+
+@router.get("/surveys/{name:path}/stops/{stop:path}")
+def stop(
+    name: str,
+    stop: str,
+    service: Current,
+    method: Annotated[str, Query()] = "",
+    marker: Annotated[str, Query()] = "",
+    recording: Annotated[str, Query()] = "",
+) -> str:
+    """Show one stop; where several logs have one of this name, that of the newest results."""
+    survey = _survey(service, name)
+    found = service.catalogue.rows(_STOP, {"id": survey["survey_id"], "stop": stop})
+    if not found:
+        raise NotFoundError(f"The survey {survey['name']} has no results of a stop {stop!r}.")
+    chosen = next((row for row in found if row["recording_id"] == recording), found[0])
+    page = _stop_page(service, survey, chosen, method, marker)
+    return pages.stop_page(replace(page, namesakes=tuple(found) if len(found) > 1 else ()))
+
+
+@router.get("/surveys/{name:path}")
+def survey(name: str, request: Request, service: Current) -> str:
+    """Show the dashboard of a survey."""
+    found = _survey(service, name)
+    query = {key: request.query_params.getlist(key) for key in request.query_params}
+    filters = Filters.from_query(query)
+    return pages.survey_page(
+        pages.SurveyPage(
+            frame=frame_of(service, found["name"]),
+            data=_survey_data(service, name, filters),
+            results=_survey_results(service, found),
+            filters=filters,
+            jobs=_jobs(service, survey=found["survey_id"], is_active=True),
+            address=_address(request),
+            n_logs=len(service.catalogue.recordings_of_survey(found["survey_id"])),
+        )
+    )
+
+
+@router.get("/jobs")
+def jobs(service: Current) -> str:
+    """Show the newest jobs."""
+    return pages.jobs_page(pages.JobsPage(frame=frame_of(service), jobs=_jobs(service)))
+
+
+@router.get("/jobs/{job_id}")
+def job(job_id: str, service: Current) -> str:
+    """Show one job."""
+    found = _jobs(service, job=job_id)
+    if not found:
+        raise NotFoundError(f"There is no job {job_id!r}.")
+    stops = service.catalogue.rows(_JOB_STOPS, {"id": job_id})
+    frame = frame_of(service, found[0]["survey"])
+    made = service.catalogue.rows(_JOB_MADE, {"id": job_id})
+    return pages.job_page(
+        pages.JobPage(frame=frame, job=found[0], stops=tuple(stops), made=tuple(made))
+    )
+
+
+@router.get("/recordings/{recording_id}")
+def recording(recording_id: str, request: Request, service: Current) -> str:
+    """Show one recording."""
+    found = service.catalogue.rows(_RECORDING, {"id": recording_id})
+    if not found:
+        raise NotFoundError(f"There is no recording {recording_id!r}.")
+    return pages.recording_page(
+        pages.RecordingPage(
+            frame=frame_of(service),
+            recording=found[0],
+            preflight=json.loads(found[0]["preflight"]),
+            jobs=_jobs(service, recording=recording_id),
+            address=_address(request),
+        )
+    )
+
+
+@router.get("/sql")
+def sql(service: Current, q: Annotated[str, Query(max_length=100_000)] = "") -> str:
+    """Show the workbench for queries."""
+    limits = service.limits
+    return pages.sql_page(
+        pages.SqlPage(
+            frame=frame_of(service),
+            query=q or pages.EXAMPLES[0][1],
+            tables=tuple(asdict(table) for table in service.catalogue.schema()),
+            seconds=limits.seconds,
+            rows=limits.rows,
+            memory_bytes=limits.memory_bytes,
+        )
+    )
+
+
+def error_page(_: Request, problem: Problem) -> HTMLResponse:
+    """Return a problem as a page, for those who asked with a browser."""
+    text = pages.error_page(
+        pages.ErrorPage(
+            frame=pages.Frame(),
+            status=problem.status,
+            title=problem.title,
+            detail=problem.detail,
+            code=problem.code,
+        )
+    )
+    return HTMLResponse(text, status_code=problem.status)
+
+
+def frame_of(service: Service, survey: str = "") -> pages.Frame:
+    """Return what every page shows around itself."""
+    names = tuple(row["name"] for row in service.catalogue.rows(_SURVEY_NAMES))
+    return pages.Frame(surveys=names, survey=survey)
+
+
+def _address(request: Request) -> str:
+    """Return the address that the reader uses for this service."""
+    return str(request.base_url).rstrip("/")
+
+
+def _survey(service: Service, key: str) -> Mapping[str, Any]:
+    """Return the survey of that name or id."""
+    found = service.catalogue.rows(_SURVEY, {"key": key})
+    if not found:
+        raise NotFoundError(f"There is no survey {key!r}; the overview lists those there are.")
+    return found[0]
+
+
+def _survey_data(service: Service, key: str, filters: Filters) -> pages.SurveyData:
+    """Return the newest results of a survey, with those from few marks that are wanted."""
+    survey = _survey(service, key)
+    few = {"n_marks": filters.n_marks, "resection": filters.resection}
+
+    def columns(sql: str, **more: object) -> Columns:
+        return service.catalogue.columns(sql, {"id": survey["survey_id"], **more})
+
+    return pages.SurveyData(
+        name=survey["name"],
+        tolerance_m=survey["tolerance_m"],
+        marks=columns(_MARKS),
+        true_stops=columns(_TRUE_STOPS),
+        fits=columns(_FITS),
+        fixes=columns(_FIXES),
+        subsets=columns(_SUBSETS, **few),
+        subset_methods=tuple(texts(columns(_SUBSET_METHODS), "resection_method")),
+    )
+
+
+def _survey_results(service: Service, survey: Mapping[str, Any]) -> pages.SurveyResults:
+    """Return what was made of a survey as a whole."""
+    rows, key = service.catalogue.rows, {"id": survey["survey_id"]}
+    return pages.SurveyResults(
+        adjustments=tuple(rows(_ADJUSTMENTS, {**key, "n": _N_RESULTS})),
+        calibrations=tuple(rows(_CALIBRATIONS, {**key, "n": _N_RESULTS})),
+        rig_digest=survey["rig_digest"],
+    )
+
+
+def _stop_page(
+    service: Service, survey: Mapping[str, Any], row: Mapping[str, Any], method: str, marker: str
+) -> pages.StopPage:
+    """Gather what is known of a stop by one method."""
+    catalogue = service.catalogue
+    key = {"run": row["run_id"], "stop": row["stop"]}
+    methods = tuple(one["fit_method"] for one in catalogue.rows(_STOP_METHODS, key))
+    chosen = method if method in methods else next(iter(methods), "")
+    by_method = {**key, "method": chosen}
+    names = catalogue.rows(_STOP_NAMES, {"id": survey["survey_id"]})
+    return pages.StopPage(
+        frame=frame_of(service, survey["name"]),
+        survey=survey["name"],
+        tolerance_m=survey["tolerance_m"],
+        stop=row,
+        run=row,
+        stops=tuple(one["stop"] for one in names),
+        method=chosen,
+        methods=methods,
+        marker=marker,
+        fits=catalogue.columns(_STOP_FITS, by_method),
+        rejections=catalogue.columns(_STOP_REJECTIONS, by_method),
+        fixes=tuple(catalogue.rows(_STOP_FIXES, key)),
+        observations=catalogue.columns(_STOP_OBSERVATIONS, by_method),
+        scan=_scan(row["cloud_url"]),
+    )
+
+
+def _scan(url: str | None) -> scene.Scan | None:
+    """Read the cloud of a stop, if it was kept and is still there."""
+    if url is None:
+        return None
+    try:
+        cloud = clouds.read_cloud(url, n_max=_N_POINTS)
+    except NotFoundError:
+        return None
+    return scene.Scan(
+        p_station=cloud.p_station,
+        markers=cloud.markers,
+        residuals=cloud.residuals,
+        names=cloud.names,
+        fit_method=cloud.fit_method,
+    )
+
+
+def _jobs(
+    service: Service,
+    *,
+    job: str | None = None,
+    recording: str | None = None,
+    survey: str | None = None,
+    is_active: bool = False,
+) -> tuple[Mapping[str, Any], ...]:
+    """Return the newest jobs, of one recording or survey if named."""
+    wanted = {"job": job, "recording": recording, "survey": survey, "is_active": is_active}
+    return tuple(service.catalogue.rows(_JOBS, {**wanted, "n": _N_JOBS}))

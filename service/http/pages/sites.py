@@ -1,0 +1,95 @@
+"""Routes of two pages: a site with its clouds and its ground, and whether error bars hold."""
+
+from __future__ import annotations
+
+from fastapi import APIRouter
+from fastapi.responses import HTMLResponse, RedirectResponse
+
+from spheremark.pipelines.errors import InputError, NotFoundError
+from spheremark.pipelines.ground_model import ElevationModel
+from spheremark.service.bench import ellipse_coverage as coverage
+from spheremark.service.http.api.jobs import start
+from spheremark.service.http.api.models import NewJob
+from spheremark.service.http.api.sites import Product, products_of
+from spheremark.service.http.pages.networks import Fields
+from spheremark.service.http.pages.results import frame_of
+from spheremark.service.http.state import Current, Service
+from spheremark.service.jobs.handlers import JobKind
+from spheremark.web.pages import ellipse_coverage as web_coverage
+from spheremark.web.pages import site
+
+router = APIRouter(include_in_schema=False, default_response_class=HTMLResponse)
+
+_MARKS = """
+SELECT mark, x_m, y_m FROM control_marks JOIN surveys AS s USING (survey_id)
+WHERE s.survey_id = $id ORDER BY mark
+"""
+_STATIONS = """
+SELECT station AS name, x_m, y_m FROM adjusted_stations WHERE adjustment_id = $adjustment
+UNION ALL
+SELECT DISTINCT stop AS name, x_m, y_m FROM latest_station_fixes
+WHERE $adjustment IS NULL AND survey_id = $id AND x_m IS NOT NULL
+    AND fit_method = 'along_beam' AND resection_method = 'free_station'
+ORDER BY name
+"""
+_JOBS = """
+SELECT job_id FROM jobs
+WHERE survey_id = $id AND kind = 'site' AND status IN ('accepted', 'running') ORDER BY created_at
+"""
+
+
+@router.get("/coverage")
+def coverage_page(service: Current) -> str:
+    """Show whether error ellipses hold what they promise."""
+    report = coverage.kept(service.settings.data)
+    return web_coverage.coverage_page(
+        web_coverage.CoveragePage(frame=frame_of(service), report=report)
+    )
+
+
+@router.get("/surveys/{name:path}/site")
+def site_page(name: str, service: Current) -> str:
+    """Show what was made of all stops of a survey."""
+    survey = service.catalogue.get_survey(name)
+    products = products_of(service, name)
+    newest = next((one for one in products if one.kind == "geotiff"), None)
+    key = {"id": survey.survey_id}
+    adjustment = {"adjustment": newest.adjustment_id if newest else None}
+    return site.site_page(
+        site.SitePage(
+            frame=frame_of(service, survey.name),
+            survey=survey.name,
+            products=tuple(one.model_dump() for one in products),
+            model=_model(service, newest),
+            marks=service.catalogue.columns(_MARKS, key),
+            stations=service.catalogue.columns(_STATIONS, key | adjustment),
+            jobs=tuple(row["job_id"] for row in service.catalogue.rows(_JOBS, key)),
+        )
+    )
+
+
+@router.post("/surveys/{name:path}/site")
+def ask(name: str, fields: Fields, service: Current) -> RedirectResponse:
+    """Start a job that makes cloud and ground, and show it."""
+    try:
+        options = {key: float(value) for key, value in fields.items()}
+    except ValueError as error:
+        raise InputError(f"The form has a value that is no number: {error}.") from error
+    job = start(service, NewJob(kind=JobKind.SITE, survey=name, options=options))
+    return RedirectResponse(f"/jobs/{job.job_id}", status_code=303)
+
+
+def _model(service: Service, newest: Product | None) -> ElevationModel | None:
+    """Read the newest model of the ground, if it is there."""
+    from spheremark.storage.exports.ground_model import read_geotiff
+
+    if newest is None:
+        return None
+    rows = service.catalogue.rows(
+        "SELECT url FROM site_products WHERE product_id = $id AND kind = 'geotiff'",
+        {"id": newest.product_id},
+    )
+    try:
+        return read_geotiff(rows[0]["url"])
+    except NotFoundError:
+        return None

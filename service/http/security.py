@@ -1,0 +1,221 @@
+"""What every request passes first: host, origin and token are checked, headers are set.
+
+Hides how a browser can be turned against a service on this machine, and what stops it.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import hashlib
+import hmac
+import ipaddress
+from collections.abc import Mapping
+from http.cookies import CookieError, SimpleCookie
+from urllib.parse import urlsplit
+
+from fastapi import Request
+from starlette.datastructures import Headers, MutableHeaders
+from starlette.exceptions import HTTPException
+from starlette.types import ASGIApp, Message, Receive, Scope, Send
+
+from spheremark.pipelines.errors import SpheremarkError
+from spheremark.service.http.errors import (
+    ForbiddenError,
+    TooLargeError,
+    UnauthorizedError,
+    problem_of,
+    problem_response,
+)
+from spheremark.service.settings import Settings
+
+COOKIE = "spheremark_token"
+OPEN_PATHS = ("/healthz", "/login", "/static/")  # answered without the token
+LONG_PATHS = ("/api/v1/recordings", "/api/v1/terrains")  # streamed, with a limit of their own
+BODY_MAX = 16 << 20  # [bytes] of any other body
+UNREAD_MAX = 1 << 30  # [bytes] of a refused body that are read before its sender is answered
+UNREAD_SECONDS = 30.0
+SAFE_METHODS = ("GET", "HEAD", "OPTIONS")
+
+POLICY = "; ".join(
+    (
+        "default-src 'none'",
+        "script-src 'self'",
+        "style-src 'self' 'sha256-47DEQpj8HBSa+/TImW+5JCeuQeRkm5NMpJWZG3hSuFU='",  # see below
+        "style-src-attr 'unsafe-inline'",
+        "img-src 'self' data: blob:",
+        "font-src 'self'",
+        "connect-src 'self'",
+        "frame-ancestors 'none'",
+        "base-uri 'none'",
+        "form-action 'self'",
+    )
+)
+"""Plotly fills one style element, empty as the policy sees it (its hash), and sets attributes."""
+
+HEADERS: Mapping[str, str] = {
+    "Content-Security-Policy": POLICY,
+    "X-Content-Type-Options": "nosniff",
+    "X-Frame-Options": "DENY",
+    "Referrer-Policy": "same-origin",
+    "Cross-Origin-Opener-Policy": "same-origin",
+    "Cross-Origin-Resource-Policy": "same-origin",
+}
+
+
+class Guard:
+    """Wraps an application: refuses what another site or a stranger sent, sets the headers."""
+
+    def __init__(self, app: ASGIApp, settings: Settings) -> None:
+        self.app = app
+        self.own_host = settings.host
+        self.token = settings.token.get_secret_value() if settings.token else ""
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """Answer one request."""
+        if scope["type"] != "http":
+            await self.app(scope, receive, send)
+            return
+
+        request = Request(scope)
+        body = _Body(receive, request)
+
+        async def send_with_headers(message: Message) -> None:
+            if message["type"] == "http.response.start":
+                if message["status"] >= 400:
+                    await body.read_to_its_end()
+                headers = MutableHeaders(scope=message)
+                for name, value in HEADERS.items():
+                    headers.setdefault(name, value)
+            await send(message)
+
+        try:
+            self.check(request)
+        except SpheremarkError as error:
+            response = problem_response(problem_of(error, request.url.path), _challenge(error))
+            await response(scope, receive, send_with_headers)
+            return
+        await self.app(scope, body.receive, send_with_headers)
+
+    def check(self, request: Request) -> None:
+        """Raise unless the request may pass."""
+        headers = request.headers
+        host = headers.get("host", "")
+        if not (self.token or is_trustworthy(host, self.own_host)):
+            raise ForbiddenError(
+                f"The request is for the host {host!r}, a name that others can point at this "
+                "machine; use 127.0.0.1 or localhost."
+            )
+        if request.method not in SAFE_METHODS and is_cross_site(headers):
+            raise ForbiddenError(
+                "A page of another site sent this request; only pages of this service may change "
+                "things here."
+            )
+        declared = headers.get("content-length", "")
+        is_bounded = request.url.path not in LONG_PATHS
+        if is_bounded and declared.isdecimal() and int(declared) > BODY_MAX:
+            raise _too_large(f"{int(declared):,}")
+        is_open = request.url.path.startswith(OPEN_PATHS)
+        if self.token and not is_open and not carries_token(request, self.token):
+            raise UnauthorizedError(
+                "This service needs its token: send 'Authorization: Bearer <token>', or open "
+                "/login?token=<token> once in a browser."
+            )
+
+
+def is_trustworthy(host: str, own_host: str) -> bool:
+    """Whether nobody else can make this Host header lead to this machine (DNS rebinding).
+
+    Addresses and names without a dot cannot be registered by others; a name with one can.
+    """
+    name = urlsplit(f"//{host}").hostname or ""
+    if name == own_host or "." not in name or name.endswith(".localhost"):
+        return bool(name)
+    try:
+        ipaddress.ip_address(name)
+    except ValueError:
+        return False
+    return True
+
+
+def is_cross_site(headers: Headers) -> bool:
+    """Whether a browser says that a page of another origin sent this."""
+    if headers.get("sec-fetch-site", "none") not in ("same-origin", "none"):
+        return True
+    origin = headers.get("origin")
+    return origin is not None and urlsplit(origin).netloc != headers.get("host", "")
+
+
+def carries_token(request: Request, token: str) -> bool:
+    """Whether the request carries the token in its header, or what stands for it in a cookie."""
+    scheme, _, given = request.headers.get("authorization", "").partition(" ")
+    if scheme.lower() == "bearer":
+        return is_token(given.strip(), token)
+    try:
+        cookie = SimpleCookie(request.headers.get("cookie", "")).get(COOKIE)
+    except CookieError:
+        return False
+    return cookie is not None and is_token(cookie.value, cookie_value(token))
+
+
+def is_token(given: str, token: str) -> bool:
+    """Whether this is the token, in a time that does not tell how nearly."""
+    return hmac.compare_digest(given.encode(), token.encode())
+
+
+def cookie_value(token: str) -> str:
+    """Return what a browser keeps in place of the token itself."""
+    return hmac.new(token.encode(), b"spheremark cookie", hashlib.sha256).hexdigest()
+
+
+class _Body:
+    """The body of a request: bounded, and read to its end before a refusal is answered.
+
+    A sender that is still sending reads no answer, and finds its connection reset instead.
+    """
+
+    def __init__(self, receive: Receive, request: Request) -> None:
+        headers = request.headers
+        self._receive = receive
+        self._n_bytes = 0
+        self._is_bounded = request.url.path not in LONG_PATHS
+        self._is_asking = "expect" in headers  # and sends nothing before it is told to
+        self._is_open = headers.get("content-length", "0") != "0" or "transfer-encoding" in headers
+
+    async def receive(self) -> Message:
+        """Return the next part; HTTPException once it is more than any route reads."""
+        message = await self._next()
+        if self._is_bounded and self._n_bytes > BODY_MAX:
+            error = _too_large(f"over {BODY_MAX:,}")
+            raise HTTPException(413, str(error))  # the one kind that passes FastAPI while it reads
+        return message
+
+    async def read_to_its_end(self) -> None:
+        """Throw away what is still to come, within reason."""
+        if self._is_asking and not self._n_bytes:
+            return
+        n_most = self._n_bytes + UNREAD_MAX
+        with contextlib.suppress(TimeoutError):
+            async with asyncio.timeout(UNREAD_SECONDS):
+                while self._is_open and self._n_bytes < n_most:
+                    await self._next()
+
+    async def _next(self) -> Message:
+        """Return the next part, counted."""
+        message = await self._receive()
+        self._n_bytes += len(message.get("body", b""))
+        self._is_open = bool(message.get("more_body", False))
+        return message
+
+
+def _too_large(found: str) -> TooLargeError:
+    """Return the refusal of a body that no route reads."""
+    return TooLargeError(
+        f"The body has {found} bytes; {BODY_MAX:,} are the most that this address takes. Send less "
+        f"at a time; files go whole to {' and '.join(LONG_PATHS)}."
+    )
+
+
+def _challenge(error: SpheremarkError) -> dict[str, str]:
+    """Return the header that a 401 must have."""
+    return {"WWW-Authenticate": "Bearer"} if isinstance(error, UnauthorizedError) else {}

@@ -1,0 +1,94 @@
+"""What lives as long as the service, and how a request gets at it."""
+
+from __future__ import annotations
+
+import threading
+from collections import OrderedDict
+from collections.abc import AsyncIterator, Callable
+from contextlib import asynccontextmanager
+from dataclasses import dataclass, field
+from typing import Annotated
+
+from fastapi import Depends, Request
+
+from spheremark.service.http.errors import ReusedKeyError
+from spheremark.service.http.uploads import Inbox
+from spheremark.service.jobs.queue import JobQueue
+from spheremark.service.planning.requests import Planner
+from spheremark.service.settings import Settings
+from spheremark.storage.catalogue.catalogue import Catalogue
+from spheremark.storage.catalogue.sandbox import QueryLimits
+
+_KEYS_KEPT = 10_000
+DATABASE = "spheremark.duckdb"  # in the data folder
+
+
+class Idempotency:
+    """Which request made which thing, by the key that the client chose; of this life only."""
+
+    def __init__(self) -> None:
+        self._lock = threading.Lock()
+        self._known: OrderedDict[str, tuple[str, str]] = OrderedDict()
+
+    def once(self, key: str | None, request: str, make: Callable[[], str]) -> str:
+        """Return the id of what a request makes, making it only the first time."""
+        if key is None:
+            return make()
+        with self._lock:
+            if key not in self._known:
+                self._known[key] = (request, make())
+            known, made = self._known[key]
+            if len(self._known) > _KEYS_KEPT:
+                self._known.popitem(last=False)
+        if known != request:
+            raise ReusedKeyError(f"The Idempotency-Key {key!r} was used with another request.")
+        return made
+
+
+@dataclass(frozen=True, slots=True)
+class Service:
+    """Everything with a life that requests use."""
+
+    settings: Settings
+    catalogue: Catalogue
+    inbox: Inbox
+    terrains: Inbox
+    jobs: JobQueue
+    planner: Planner
+    idempotency: Idempotency = field(default_factory=Idempotency)
+
+    @property
+    def limits(self) -> QueryLimits:
+        """Limits of people's queries."""
+        return query_limits(self.settings)
+
+
+def query_limits(settings: Settings) -> QueryLimits:
+    """Return the limits of people's queries."""
+    return QueryLimits(
+        seconds=settings.sql_seconds,
+        rows=settings.sql_rows,
+        memory_bytes=settings.sql_memory_bytes,
+    )
+
+
+@asynccontextmanager
+async def opened(settings: Settings) -> AsyncIterator[Service]:
+    """Open the database, the inbox and the cluster; close them in the opposite order."""
+    data = settings.data.resolve()
+    inbox, terrains = Inbox(data / "recordings"), Inbox(data / "terrains")
+    for one in (inbox, terrains):
+        one.open()
+    with Catalogue(data / DATABASE, snapshots=data / "snapshots") as catalogue:
+        async with JobQueue(settings, catalogue, data / "clouds") as jobs:
+            planner = Planner(catalogue)
+            yield Service(settings, catalogue, inbox, terrains, jobs, planner)
+
+
+def current(request: Request) -> Service:
+    """Return the service that a request is for."""
+    service: Service = request.app.state.service
+    return service
+
+
+Current = Annotated[Service, Depends(current)]

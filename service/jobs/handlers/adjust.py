@@ -1,0 +1,266 @@
+"""Jobs of the kind ``adjust``: all stations and marks of a survey together.
+
+Centres that were fitted before in the same way are taken from their rows; only the logs for which
+there are none are processed, and that gives the rows that a job of its own would have given.
+"""
+
+from __future__ import annotations
+
+import json
+import secrets
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field, replace
+from datetime import UTC, datetime
+from time import perf_counter
+from typing import TYPE_CHECKING, Any
+
+from pydantic import Field
+
+from spheremark.pipelines.errors import RigError, SolveError, SpheremarkError
+from spheremark.pipelines.scan.rigs import rig_digest
+from spheremark.service.jobs.handlers import calibrate as calibrating
+from spheremark.service.jobs.handlers import process as processing
+from spheremark.service.jobs.specification import Log, Options, Order, Outcome
+from spheremark.service.provenance import code_version
+
+if TYPE_CHECKING:
+    import pyarrow as pa
+
+    from spheremark.pipelines.calibration import Calibration
+    from spheremark.pipelines.model import MarkerFits
+    from spheremark.pipelines.network import AdjustedNetwork, Refusal
+    from spheremark.pipelines.survey import Progress
+    from spheremark.storage.catalogue.catalogue import Catalogue
+
+Row = dict[str, Any]
+
+_SCANS = 0.9  # share of the work that the scans take
+_RUNS = """
+SELECT r.run_id, r.recording_id, r.rig_digest, r.config, r.code_version
+FROM runs AS r JOIN jobs AS j USING (job_id)
+WHERE r.survey_id = $survey AND list_contains($recordings::VARCHAR[], r.recording_id)
+    AND (json_extract_string(j.options, '$.rig') IS NOT DISTINCT FROM $rig::VARCHAR)
+ORDER BY r.finished_at DESC
+"""
+_STOPS = "SELECT * FROM stops WHERE list_contains($runs::VARCHAR[], run_id) ORDER BY run_id, stop"
+_FITS = "SELECT * FROM marker_fits WHERE list_contains($runs::VARCHAR[], run_id)"
+
+
+class AdjustOptions(Options):
+    """What one can choose about an adjustment."""
+
+    control: bool = Field(
+        default=True, description="Use the survey's control marks, if it has any; else free."
+    )
+    calibrate: bool = Field(
+        default=False, description="Estimate the rig in the same adjustment; reads all logs anew."
+    )
+    reprocess: bool = Field(
+        default=False, description="Fit all centres anew, even those that were fitted before."
+    )
+
+
+def gather(catalogue: Catalogue, order: Order) -> Mapping[str, pa.Table]:
+    """Return the runs whose centres are those that this job would fit, newest first, with rows.
+
+    Which of them this version of the code made, the worker sees.
+    """
+    wanted = {
+        "survey": order.survey_id,
+        "recordings": [log.recording_id for log in order.logs],
+        "rig": None if order.rig is None else rig_digest(order.rig),
+    }
+    runs = catalogue.table(_RUNS, wanted)
+    if order.options.get("reprocess"):
+        runs = runs.slice(0, 0)
+    keep = [row["run_id"] for row in runs.to_pylist() if _is_alike(row, order)]
+    return {
+        "runs": runs,
+        "stops": catalogue.table(_STOPS, {"runs": keep}),
+        "marker_fits": catalogue.table(_FITS, {"runs": keep}),
+    }
+
+
+def _is_alike(run: Row, order: Order) -> bool:
+    """Whether a run fitted centres as this order asks for."""
+    done, wanted = json.loads(run["config"]), order.config.to_mapping()
+    method = wanted["fitting"]["methods"][0]
+    return method in done["fitting"]["methods"] and _way(done) == _way(wanted)
+
+
+def _way(config: Mapping[str, Any]) -> str:
+    """Return all of a configuration that centres depend on, but for the method's name."""
+    fitting = {key: value for key, value in config["fitting"].items() if key != "methods"}
+    parts = {key: config[key] for key in ("marker_radius", "stitching", "extraction")}
+    return json.dumps(parts | {"fitting": fitting}, sort_keys=True)
+
+
+@dataclass(slots=True)
+class _Book:
+    """Stations as they come in: centres, where they are from, and who gave none."""
+
+    scans: list[tuple[str, MarkerFits]] = field(default_factory=list)
+    sources: dict[str, Row] = field(default_factory=dict)
+    refused: list[Refusal] = field(default_factory=list)
+    tables: list[dict[str, pa.Table]] = field(default_factory=list)
+
+    def enter(self, name: str, stop: str, fits: MarkerFits, source: Row) -> None:
+        """Add a station, of a name of its own, at a stop."""
+        self.scans.append((name, fits))
+        self.sources[name] = {"station": name, "stop": stop, **source}
+
+
+def work(order: Order, progress: Progress) -> Outcome:
+    """Adjust the stations of all logs of an order."""
+    from spheremark.service.jobs.handlers.network_rows import network_rows
+    from spheremark.service.serialise import network as networks
+    from spheremark.storage.catalogue import adjustments
+    from spheremark.storage.catalogue.documents import documents
+
+    start = perf_counter()
+    with_rig = bool(order.options.get("calibrate"))
+    book = _read(order, _share(progress, 0.0, 0.5 * _SCANS if with_rig else _SCANS))
+    rig, why = None, ""
+    if with_rig:
+        rig, why = _rig(order, book, _share(progress, 0.5 * _SCANS, 0.8))
+    progress(_SCANS, f"Adjusting {len(book.scans)} stations")
+    marks = order.marks if order.options.get("control", True) else None
+    scans = networks.Fieldbook(
+        scans=tuple(book.scans), refused=tuple(book.refused), calibration=rig, uncalibrated=why
+    )
+    result = networks.adjust_scans(scans, marks, order.config)
+    answer = networks.network_answer(result, order.config, scans)
+    rows = network_rows(answer, book.sources)
+    rows["adjustments"][0] |= {
+        "job_id": order.job_id,
+        "survey_id": order.survey_id,
+        "finished_at": datetime.now(UTC),
+        "config": order.config.text,
+        "config_digest": order.config.digest,
+        "code_version": code_version(),
+        "duration_s": perf_counter() - start,
+    }
+    made = [*book.tables, adjustments.tables(order.result_id, rows)]
+    files, message = _files(result, answer), _summary(answer, rows["control_checks"])
+    if rig is not None:
+        found = networks.calibrated(result, rig)
+        left = _share(progress, _SCANS, 1.0)
+        tables, more, sentence = calibrating.results(order, found, left, start)
+        made, files, message = [*made, tables], files | more, f"{message} {sentence}"
+    made.append({"documents": documents(order.result_id, files)})
+    return Outcome(tables=_joined(made), message=message)
+
+
+def _rig(order: Order, book: _Book, progress: Progress) -> tuple[Calibration | None, str]:
+    """Calibrate the rig of the logs that gave stations, or say why they do not tell it."""
+    from spheremark.pipelines.calibration import calibrate
+
+    used = {source["recording_id"] for source in book.sources.values()}
+    named = zip(order.logs, order.log_names, strict=True)
+    good = tuple(replace(log, name=name) for log, name in named if log.recording_id in used)
+    logs = calibrating.logs_of(replace(order, logs=good))
+    try:
+        return calibrate(logs, config=order.config, rig=order.rig, progress=progress), ""
+    except (SolveError, RigError) as error:
+        return None, str(error)
+
+
+def _joined(parts: list[dict[str, pa.Table]]) -> dict[str, pa.Table]:
+    """Return the rows of several results as one table each."""
+    import pyarrow as pa
+
+    names = dict.fromkeys(name for part in parts for name in part)
+    return {
+        name: pa.concat_tables([part[name] for part in parts if name in part]) for name in names
+    }
+
+
+def _read(order: Order, progress: Progress) -> _Book:
+    """Bring in the centres of each log; one that gives none costs no other."""
+    from spheremark.pipelines.network import Refusal
+
+    book, first = _Book(), None
+    for i, (log, name) in enumerate(zip(order.logs, order.log_names, strict=True)):
+        try:
+            part = _share(progress, i / len(order.logs), (i + 1) / len(order.logs))
+            for stop, fits, source in _centres(order, log, book, part):
+                book.enter(name + stop.removeprefix(log.name), stop, fits, source)
+        except SpheremarkError as error:
+            first = first or error
+            book.refused.append(Refusal(station=name, code=error.code, reason=str(error)))
+    if not book.scans and first is not None:
+        raise first
+    return book
+
+
+def _centres(
+    order: Order, log: Log, book: _Book, progress: Progress
+) -> Iterator[tuple[str, MarkerFits, Row]]:
+    """Yield the stops of a log with their centres: those of an earlier run, or new ones."""
+    from spheremark.storage.catalogue.centres import read_centres
+
+    method = order.config.fitting.methods[0]
+    known = set(order.known["stops"].column("run_id").to_pylist())
+    wanted = (log.recording_id, code_version())
+    run = next(
+        (
+            row
+            for row in order.known["runs"].to_pylist()
+            if row["run_id"] in known and (row["recording_id"], row["code_version"]) == wanted
+        ),
+        None,
+    )
+    if run is not None:
+        progress(0.0, f"Taking the centres of {log.name} from an earlier run")
+        source = {key: run[key] for key in ("run_id", "recording_id", "rig_digest")}
+        stops, fits = order.known["stops"], order.known["marker_fits"]
+        for stop, found in read_centres(stops, fits, run["run_id"], method):
+            yield stop, found, source
+        return
+    run_id = secrets.token_hex(8)
+    done, tables = processing.process_log(order, log, run_id, progress)
+    book.tables.append(tables)
+    for one in done:
+        digest = rig_digest(one.cloud.rig)
+        source = {"run_id": run_id, "recording_id": log.recording_id, "rig_digest": digest}
+        yield one.name, one.fits[method], source
+
+
+def _share(progress: Progress, begin: float, end: float) -> Progress:
+    """Return the progress of a part of the work as a share of the whole."""
+    return lambda share, what: progress(begin + (end - begin) * share, what)
+
+
+def _files(result: AdjustedNetwork, answer: Row) -> dict[str, str]:
+    """Return what a network can be downloaded as."""
+    from spheremark.service.serialise.network_report import report
+    from spheremark.storage.exports.network import format_coordinates, format_gama
+
+    return {
+        "adjustment.json": json.dumps(answer),
+        "report.txt": report(answer),
+        "coordinates.csv": format_coordinates(result),
+        "gama.xml": format_gama(result),
+    }
+
+
+def _summary(answer: Row, checks: list[Row]) -> str:
+    """Say in some sentences what an adjustment gave, and what is missing or weak."""
+    kind = "with control" if answer["datum"]["kind"] == "control" else "as a free network"
+    sigmas = [one["sigma_3d_m"] for one in answer["stations"]]
+    n = len(sigmas)
+    test = "passed" if answer["passes_global_test"] else "FAILED"
+    parts = [
+        f"{n} station{'' if n == 1 else 's'} and {len(answer['marks'])} marks adjusted {kind}: "
+        f"stations with sigmas to {1000 * max(sigmas):.1f} mm (3-D), global test {test}."
+    ]
+    if checks:
+        worst = max(checks, key=lambda row: float(row["difference_3d_m"]))
+        parts.append(
+            f"Left out in turn, control marks are met to {1000 * worst['difference_3d_m']:.1f} mm."
+        )
+    if dropped := [one["mark"] for one in answer["excluded"] if one["kind"] == "control"]:
+        parts.append(f"Control that contradicts the rest was left out: {', '.join(dropped)}.")
+    if answer["refused"]:
+        parts.append("Without " + ", ".join(one["station"] for one in answer["refused"]) + ".")
+    return " ".join([*parts, *answer["warnings"]])

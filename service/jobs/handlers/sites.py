@@ -1,0 +1,226 @@
+"""Jobs of the kind ``site``: all stops of a survey in one frame, as clouds and as ground.
+
+Poses are those of the newest adjustment, one with control before a free one; where there is none,
+of each station alone.
+"""
+
+from __future__ import annotations
+
+import fcntl
+import hashlib
+import json
+import shutil
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager, suppress
+from dataclasses import replace
+from datetime import UTC, datetime
+from pathlib import Path
+from tempfile import TemporaryDirectory, gettempdir
+from typing import TYPE_CHECKING, Any
+
+from pydantic import Field
+
+from spheremark.pipelines.model import Origin
+from spheremark.pipelines.scan.rigs import rig_from_mapping
+from spheremark.service.jobs.specification import Options, Order, Outcome
+from spheremark.service.provenance import code_version
+
+if TYPE_CHECKING:
+    import pyarrow as pa
+
+    from spheremark.pipelines.ground_model import StationPose
+    from spheremark.pipelines.model import Rig, StitchedCloud
+    from spheremark.pipelines.survey import Progress
+    from spheremark.storage.catalogue.catalogue import Catalogue
+
+Row = dict[str, Any]
+Key = tuple[str, str]  # recording and stop
+
+_SCRATCH, _IN_USE = "spheremark-site-", "in-use"  # names of folders, and of the file that is locked
+
+_ADJUSTED = """
+SELECT x.recording_id, x.stop, x.rig_digest, x.x_m, x.y_m, x.z_m, x.rotation, x.cov_motion,
+    a.datum AS poses, a.adjustment_id
+FROM adjusted_stations AS x JOIN adjustments AS a USING (adjustment_id)
+WHERE a.adjustment_id = (
+    SELECT adjustment_id FROM adjustments WHERE survey_id = $survey
+    ORDER BY datum = 'free', finished_at DESC LIMIT 1
+)
+ORDER BY x.station
+"""
+_FIXED = """
+SELECT f.recording_id, f.stop, r.rig_digest, f.x_m, f.y_m, f.z_m, f.rotation, f.cov_motion,
+    'fixes' AS poses, NULL::VARCHAR AS adjustment_id
+FROM latest_station_fixes AS f JOIN runs AS r USING (run_id)
+WHERE f.survey_id = $survey AND f.rotation IS NOT NULL
+QUALIFY row_number() OVER (
+    PARTITION BY f.recording_id, f.stop
+    ORDER BY f.fit_method <> 'along_beam', f.resection_method <> 'free_station'
+) = 1
+ORDER BY f.stop
+"""
+_RIGS = "SELECT rig_digest, rig FROM rigs WHERE list_contains($digests::VARCHAR[], rig_digest)"
+
+
+class SiteOptions(Options):
+    """What one can choose about the products of a site."""
+
+    cell_m: float = Field(default=0.25, ge=0.05, le=10, description="Edge of a cell [m].")
+    ground_range_m: float = Field(
+        default=15.0, ge=1, le=100, description="How far from a station ground is used [m]."
+    )
+    gap_m: float = Field(
+        default=0.0, ge=0, le=10, description="Holes of the ground up to this are filled in [m]."
+    )
+    range_m: float = Field(
+        default=30.0, gt=0, le=1000, description="How far the cloud reaches [m]."
+    )
+    voxel_m: float = Field(
+        default=0.0,
+        ge=0,
+        le=100,
+        description="A stop keeps one return in cubes of this edge [m]; 0: all.",
+    )
+    clouds: bool = Field(default=True, description="Make the clouds, beside the ground.")
+
+
+def gather(catalogue: Catalogue, order: Order) -> Mapping[str, pa.Table]:
+    """Return the poses of the survey's stations and the rigs that they were found with."""
+    wanted = {"survey": order.survey_id}
+    poses = catalogue.table(_ADJUSTED, wanted)
+    if not len(poses):
+        poses = catalogue.table(_FIXED, wanted)
+    digests = sorted({digest for digest in poses.column("rig_digest").to_pylist() if digest})
+    return {"poses": poses, "rigs": catalogue.table(_RIGS, {"digests": digests})}
+
+
+def work(order: Order, progress: Progress) -> Outcome:
+    """Make the products of a site."""
+    from spheremark.service.jobs.site import ENDINGS, KINDS, SiteWish, make_site
+    from spheremark.storage.catalogue.products import keep_file, product_rows
+
+    own = {key: order.options[key] for key in SiteOptions.model_fields if key in order.options}
+    options = SiteOptions.model_validate(own).model_dump()
+    rows = {(row["recording_id"], row["stop"]): row for row in order.known["poses"].to_pylist()}
+    poses = _poses(order, rows)
+    with scratch() as folder:
+        kinds = KINDS if options["clouds"] else ("geotiff",)
+        wish = _wish(SiteWish, {k: folder / f"site{ENDINGS[k]}" for k in kinds}, options)
+        stops = _stops(order, rows, poses, progress)
+        site = make_site(stops, tuple(poses.values()), wish)
+        progress(0.95, "Keeping the files")
+        kept = {kind: keep_file(path, order.clouds_url) for kind, path in wish.targets.items()}
+    made = _rows(site, kept, _common(order, options, next(iter(rows.values())), site.n_stations))
+    found = {recording for recording, _ in poses}
+    missing = [log.name for log in order.logs if log.recording_id not in found]
+    return Outcome(tables={"site_products": product_rows(made)}, message=_summary(made, missing))
+
+
+@contextmanager
+def scratch() -> Iterator[Path]:
+    """Lend a folder; remove those of workers that were ended before they could do so."""
+    for left in Path(gettempdir()).glob(f"{_SCRATCH}*"):
+        with suppress(OSError), (left / _IN_USE).open() as lock:
+            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)  # refused while its owner lives
+            shutil.rmtree(left)
+    with TemporaryDirectory(prefix=_SCRATCH) as folder, (Path(folder) / _IN_USE).open("w") as lock:
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        yield Path(folder)
+
+
+def _poses(order: Order, rows: Mapping[Key, Row]) -> dict[Key, StationPose]:
+    """Return the poses of the logs that are wanted."""
+    from spheremark.service.jobs.site import pose_from_row, require_poses
+
+    wanted = {log.recording_id for log in order.logs}
+    poses = {key: pose_from_row(key[1], row) for key, row in rows.items() if key[0] in wanted}
+    require_poses(poses)
+    return poses
+
+
+def _wish(kind: Any, targets: Mapping[str, Path], options: Row) -> Any:
+    """Return what is wanted of a site."""
+    from spheremark.service.jobs.site import elevation_of
+
+    return kind(
+        targets=targets,
+        elevation=elevation_of(options),
+        range_max=options["range_m"],
+        voxel=options["voxel_m"],
+        software=f"spheremark {code_version()}",
+    )
+
+
+def _stops(
+    order: Order, rows: Mapping[Key, Row], poses: Mapping[Key, StationPose], progress: Progress
+) -> Iterator[tuple[StitchedCloud, StationPose]]:
+    """Yield the stops that have poses, log by log."""
+    from spheremark.service.jobs.site import stitched
+    from spheremark.storage.recordings import read_log
+
+    rigs = {
+        row["rig_digest"]: rig_from_mapping(json.loads(row["rig"]))
+        for row in order.known["rigs"].to_pylist()
+    }
+    for i, log in enumerate(order.logs):
+        progress(0.95 * i / len(order.logs), f"Adding {log.name} to the site")
+        own = {stop: pose for (key, stop), pose in poses.items() if key == log.recording_id}
+        if own:
+            read = read_log(log.url, digest=log.recording_id)
+            named = replace(read, origin=Origin(name=log.name, digest=log.recording_id))
+
+            def rig_of(stop: str, key: str = log.recording_id) -> Rig | None:
+                return rigs.get(rows[key, stop]["rig_digest"], order.rig)
+
+            yield from stitched((named,), order.config, rig_of, own)
+
+
+def _common(order: Order, options: Row, source: Row, n_stations: int) -> Row:
+    """Return what all products of a job share."""
+    from spheremark.service.jobs.site import options_text
+
+    text = f"{order.config.text}\n{options_text(options)}"
+    return {
+        "product_id": order.result_id,
+        "job_id": order.job_id,
+        "survey_id": order.survey_id,
+        "n_stations": n_stations,
+        "poses": source["poses"],
+        "adjustment_id": source["adjustment_id"],
+        "config_digest": hashlib.sha256(text.encode()).hexdigest()[:16],
+        "code_version": code_version(),
+        "finished_at": datetime.now(UTC),
+    }
+
+
+def _rows(site: Any, kept: Mapping[str, Any], common: Row) -> list[Row]:
+    """Return the rows of the products."""
+    from spheremark.service.jobs.site import extent_row, model_row
+
+    about = {kind: extent_row(extent) for kind, extent in site.clouds.items()}
+    about["geotiff"] = model_row(site.model)
+    return [
+        {
+            **common,
+            "kind": kind,
+            "url": file.url,
+            "sha256": file.sha256,
+            "size_bytes": file.size,
+            **about[kind],
+        }
+        for kind, file in kept.items()
+    ]
+
+
+def _summary(rows: list[Row], missing: list[str]) -> str:
+    """Say in some sentences what was made, and what it lacks."""
+    ground = next(row for row in rows if row["kind"] == "geotiff")
+    poses = {"fixes": "each station alone", "free": "a free network", "control": "a network"}
+    text = (
+        f"{ground['n_stations']} stations by the poses of {poses[ground['poses']]}: ground in "
+        f"cells of {ground['cell_m']:g} m, {100 * ground['share_known']:.0f} % of them seen, "
+        f"median sigma {1000 * ground['sigma_median_m']:.1f} mm."
+    )
+    if clouds := [row for row in rows if row["kind"] != "geotiff"]:
+        text += f" Cloud of {clouds[0]['n_points']:,} returns."
+    return f"{text} Without {', '.join(missing)}, of which there is no pose." if missing else text

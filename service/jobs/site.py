@@ -1,0 +1,249 @@
+"""The stops of a survey in one frame: a cloud of the whole site, and a model of its ground.
+
+What a job and the command have in common: given clouds one by one with their poses, files.
+"""
+
+from __future__ import annotations
+
+import json
+import secrets
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import ExitStack, closing, contextmanager
+from dataclasses import dataclass, field, replace
+from datetime import UTC, date, datetime
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from spheremark.pipelines.errors import ConfigError, InputError, NotFoundError
+from spheremark.pipelines.ground_model import (
+    ElevationConfig,
+    ElevationModel,
+    StationPose,
+    Terrain,
+    poses_of_network,
+    station_points,
+)
+from spheremark.storage.clouds.site import CloudExtent, E57File, LazFile
+
+if TYPE_CHECKING:
+    from spheremark.pipelines.config import SurveyConfig
+    from spheremark.pipelines.model import ControlMarks, Rig, ScanLog, StitchedCloud
+    from spheremark.pipelines.network import Network
+    from spheremark.pipelines.survey import Progress
+
+KINDS = ("laz", "e57", "geotiff")
+ENDINGS = {"laz": ".laz", "e57": ".e57", "geotiff": ".tif"}
+MEDIA_TYPES = {
+    "laz": "application/vnd.laszip",
+    "e57": "model/e57",
+    "geotiff": "image/tiff",
+}
+
+Stops = Iterable[tuple["StitchedCloud", StationPose]]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SiteWish:
+    """What is wanted: where each file goes, how far the cloud reaches and is thinned [m]."""
+
+    targets: Mapping[str, Path]
+    elevation: ElevationConfig = field(default_factory=ElevationConfig)
+    range_max: float = 30.0
+    voxel: float = 0.0
+    software: str = "spheremark"
+    day: date = field(default_factory=lambda: datetime.now(UTC).date())
+
+    def __post_init__(self) -> None:
+        unknown = set(self.targets) - set(KINDS)
+        if unknown or not self.targets:
+            raise ConfigError(f"Name one or more of {', '.join(KINDS)}, and nothing else.")
+        for path in self.targets.values():
+            if not path.parent.is_dir():
+                raise InputError(f"There is no folder {path.parent} for {path.name}; make it.")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Site:
+    """What was made: what each cloud holds, and the model of the ground, if it was wanted."""
+
+    clouds: Mapping[str, CloudExtent]
+    model: ElevationModel | None
+    n_stations: int
+
+
+def make_site(stops: Stops, poses: Sequence[StationPose], wish: SiteWish) -> Site:
+    """Write the files that are wanted, all or none; one stop at a time is held."""
+    with _completed(wish.targets) as parts:
+        return _make_site(stops, poses, replace(wish, targets=parts))
+
+
+@contextmanager
+def _completed(targets: Mapping[str, Path]) -> Iterator[Mapping[str, Path]]:
+    """Lend places beside the targets; what is complete moves there, of anything else none stays."""
+    parts = {
+        kind: path.with_name(f".{secrets.token_hex(4)}.part{path.suffix}")
+        for kind, path in targets.items()
+    }
+    try:
+        yield parts
+        for kind, part in parts.items():
+            part.replace(targets[kind])
+    finally:
+        for part in parts.values():
+            part.unlink(missing_ok=True)
+
+
+def _make_site(stops: Stops, poses: Sequence[StationPose], wish: SiteWish) -> Site:
+    """Write the files that are wanted."""
+    from spheremark.storage.exports.ground_model import write_geotiff
+
+    terrain = Terrain(poses, wish.elevation) if "geotiff" in wish.targets else None
+    n = 0
+    with ExitStack() as stack:
+        files = {kind: stack.enter_context(closing(file)) for kind, file in _opened(wish)}
+        for cloud, pose in stops:
+            n += 1
+            if files:
+                points = station_points(cloud, pose, range_max=wish.range_max, voxel=wish.voxel)
+                for file in files.values():
+                    file.add(points)
+            if terrain is not None:
+                terrain.add(cloud, pose)
+        clouds = {kind: file.finish() for kind, file in files.items()}
+    model = None if terrain is None else terrain.model()
+    if model is not None:
+        write_geotiff(model, wish.targets["geotiff"], software=wish.software)
+    return Site(clouds=clouds, model=model, n_stations=n)
+
+
+def _opened(wish: SiteWish) -> Iterator[tuple[str, LazFile | E57File]]:
+    """Open the files of clouds that are wanted."""
+    if target := wish.targets.get("laz"):
+        yield "laz", LazFile(target, software=wish.software, day=wish.day)
+    if target := wish.targets.get("e57"):
+        yield "e57", E57File(target, software=wish.software)
+
+
+def stitched(
+    logs: Iterable[ScanLog],
+    config: SurveyConfig,
+    rig_of: Callable[[str], Rig | None],
+    poses: Mapping[str, StationPose],
+) -> Iterator[tuple[StitchedCloud, StationPose]]:
+    """Yield the cloud of each stop that has a pose, with it."""
+    from spheremark.pipelines.scan.stitching import choose_rig, split_stops, stitch
+
+    for log in logs:
+        for stop in split_stops(log, config.stitching):
+            pose = poses.get(stop.origin.name)
+            if pose is not None:
+                rig = choose_rig(stop, rig_of(stop.origin.name))
+                yield stitch(stop, rig, config.stitching), pose
+
+
+def of_logs(
+    logs: Sequence[Path],
+    marks: ControlMarks | None,
+    rig: Rig | None,
+    config: SurveyConfig,
+    wish: SiteWish,
+    progress: Progress,
+) -> tuple[Site, Network]:
+    """Adjust the stations of logs and make what is wanted; a log that gives none costs no other."""
+    from spheremark.service.serialise.network import adjust_scans, read_scans
+    from spheremark.storage.recordings import read_log
+
+    book = read_scans(logs, config, rig, lambda share, what: progress(0.5 * share, what))
+    result = adjust_scans(book, marks, config)
+    poses = {pose.name: pose for pose in poses_of_network(result)}
+    refused = {one.station for one in book.refused}
+    good = [path for path in logs if path.stem not in refused]
+
+    def read() -> Iterator[ScanLog]:
+        for i, path in enumerate(good):
+            progress(0.5 + 0.5 * i / len(good), f"Adding {path.stem} to the site")
+            yield read_log(path)
+
+    stops = stitched(read(), config, lambda _name: rig, poses)
+    site = make_site(stops, tuple(poses.values()), wish)
+    return site, result.network
+
+
+def site_answer(site: Site, wish: SiteWish, network: Network) -> dict[str, Any]:
+    """Return what was made, by the poses of a network, as plain values."""
+    answer: dict[str, Any] = {
+        "poses": "free" if network.is_free else "control",
+        "n_stations": site.n_stations,
+        "refused": [
+            {"station": one.station, "code": one.code, "reason": one.reason}
+            for one in network.refused
+        ],
+        "files": [],
+    }
+    for kind, extent in site.clouds.items():
+        path = wish.targets[kind]
+        answer["files"].append({"kind": kind, "path": str(path), **extent_row(extent)})
+    if site.model is not None:
+        path = wish.targets["geotiff"]
+        answer["files"].append({"kind": "geotiff", "path": str(path), **model_row(site.model)})
+    return answer
+
+
+def extent_row(extent: CloudExtent) -> dict[str, Any]:
+    """Return what a cloud holds as plain values."""
+    low, high = extent.bounds
+    return {
+        "n_points": extent.n_points,
+        **{f"min_{axis}_m": float(low[i]) for i, axis in enumerate("xyz")},
+        **{f"max_{axis}_m": float(high[i]) for i, axis in enumerate("xyz")},
+    }
+
+
+def model_row(model: ElevationModel) -> dict[str, Any]:
+    """Return what a model of the ground holds as plain values."""
+    rows, columns = model.heights.shape
+    west, south = (float(value) for value in model.corner)
+    return {
+        "n_points": int(model.counts.sum()),
+        "min_x_m": west,
+        "min_y_m": south,
+        "min_z_m": float(np.nanmin(model.heights)),
+        "max_x_m": west + columns * model.cell,
+        "max_y_m": south + rows * model.cell,
+        "max_z_m": float(np.nanmax(model.heights)),
+        "cell_m": model.cell,
+        "share_known": model.share_known,
+        "sigma_median_m": float(np.nanmedian(model.sigmas)),
+    }
+
+
+def elevation_of(options: Mapping[str, Any]) -> ElevationConfig:
+    """Return how ground becomes a model, from what was chosen."""
+    return ElevationConfig(
+        cell=options["cell_m"], range_max=options["ground_range_m"], gap_max=options["gap_m"]
+    )
+
+
+def options_text(options: Mapping[str, Any]) -> str:
+    """Return what was chosen as canonical text."""
+    return json.dumps(dict(options), sort_keys=True, separators=(",", ":"))
+
+
+def pose_from_row(name: str, row: Mapping[str, Any]) -> StationPose:
+    """Return the pose that a row of stations holds."""
+    T = np.eye(4)
+    T[:3, :3] = np.reshape(row["rotation"], (3, 3))
+    T[:3, 3] = [row[f"{axis}_m"] for axis in "xyz"]
+    cov = np.reshape(np.asarray(row["cov_motion"], dtype=np.float64), (6, 6)).copy()
+    return StationPose(name=name, T_site_station=T, cov_T_site_station=cov)
+
+
+def require_poses(poses: Mapping[Any, StationPose]) -> None:
+    """Refuse a survey whose stations have no poses."""
+    if not poses:
+        raise NotFoundError(
+            "No station of these logs has a pose: adjust the survey's stations first, or give it "
+            "control marks and process its logs."
+        )

@@ -1,0 +1,140 @@
+"""What a worker process does: it takes an order, does it, and tells how far it is.
+
+Runs in processes of the cluster: takes paths and small values, returns Arrow tables. Nothing here
+writes to the catalogue; what goes wrong is raised and recorded by the service.
+"""
+
+from __future__ import annotations
+
+import signal
+import threading
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from time import perf_counter
+from typing import TYPE_CHECKING
+
+from distributed import WorkerPlugin, get_worker
+
+from spheremark.pipelines.config import SurveyConfig
+from spheremark.service.jobs.handlers import KINDS, Order, Outcome
+from spheremark.service.jobs.memory import keep_memory
+
+if TYPE_CHECKING:
+    from distributed import Worker
+
+TOPIC = "spheremark"  # of the events by which workers tell how far they are
+_TICK = 0.1  # [s] between two reports of progress
+
+
+class DismissedError(Exception):
+    """The job was dismissed while it ran."""
+
+
+class Reporter:
+    """Tells the service how far a job is, and stops it between steps once it is dismissed."""
+
+    def __init__(self, job_id: str) -> None:
+        self._worker = get_worker()
+        self._key = self._worker.get_current_task()
+        self._job_id = job_id
+        self._last = 0.0
+
+    def tell(self, event: str, share: float = 0.0, message: str = "") -> None:
+        """Send one event to the service."""
+        self._worker.log_event(
+            TOPIC,
+            {
+                "job": self._job_id,
+                "event": event,
+                "percent": round(100 * share, 1),
+                "message": message,
+                "worker": self._worker.address,
+            },
+        )
+
+    def progress(self, share: float, message: str) -> None:
+        """Report a step; raise DismissedError if nobody wants the result any more."""
+        task = self._worker.state.tasks.get(self._key)
+        if task is None or task.state == "cancelled":
+            raise DismissedError(self._job_id)
+        if perf_counter() - self._last >= _TICK:
+            self._last = perf_counter()
+            self.tell("progress", share, message)
+
+
+def do(order: Order) -> Outcome:
+    """Do what an order asks for, and tell the service how far it is."""
+    reporter = Reporter(order.job_id)
+    reporter.tell("started", 0.0, "Started.")
+    try:
+        return KINDS[order.kind].work(order, reporter.progress)
+    finally:
+        reporter.tell("stopped")
+
+
+class WarmUp(WorkerPlugin):  # type: ignore[misc]  # distributed ships no types
+    """Makes a new worker ready beside its first job: imports and compiled kernels."""
+
+    name = "spheremark-warm-up"
+    idempotent = True
+
+    def __init__(self, *, is_ours: bool) -> None:
+        self.is_ours = is_ours
+
+    def setup(self, worker: Worker) -> None:  # noqa: ARG002  the protocol of Dask
+        """Begin, without keeping the worker from work."""
+        keep_memory()
+        if self.is_ours:  # Ctrl-C is for the service, which then ends its workers
+            signal.signal(signal.SIGINT, signal.SIG_IGN)
+        threading.Thread(target=warm_up, name="warm-up", daemon=True).start()
+
+
+def warm_up() -> None:
+    """Load what a job needs beside the first one."""
+    import open3d  # noqa: F401
+
+    from spheremark.pipelines import survey  # noqa: F401
+    from spheremark.storage.catalogue import results  # noqa: F401
+
+
+def compile_kernels() -> None:
+    """Run the whole chain on a small simulated log, so that later runs find compiled kernels."""
+    from spheremark.pipelines.simulation import SimulationConfig, scenario, simulate_stop
+    from spheremark.pipelines.survey import process
+    from spheremark.storage.clouds.stop import view
+    from spheremark.storage.recordings import inspect_log, read_log, write_log
+
+    field = scenario("paper-field", 0)
+    quick = SimulationConfig(only_near_spheres=True)
+    stop = simulate_stop(field, field.stops[0].name, quick)
+    with TemporaryDirectory() as folder:
+        path = Path(folder) / "small.mcap"
+        write_log(stop.log, path, firings=stop.firings)
+        inspect_log(path)
+        write_log(stop.log, path)
+        inspect_log(path)
+        for result in process(read_log(path), config=SurveyConfig(), marks=field.marks):
+            view(result, 1000)
+    _compile_planner()
+
+
+def _compile_planner() -> None:
+    """Judge and better a small plan, so that the planner's page answers at once."""
+    from spheremark.pipelines.placement import Goal, PlaceRules, Requirement, Sensor, sensor_model
+    from spheremark.service.planning import plans as siting
+    from spheremark.service.planning.requests import Asked, simulated_ground
+
+    ground = simulated_ground("paper-field")
+    asked = Asked(
+        ground=ground,
+        stops=ground.stops,
+        marks=ground.marks,
+        model=sensor_model(Sensor(), ground.site.marker_radius),
+        wish=Requirement(),
+    )
+    siting.evaluate(asked)
+    siting.optimise(asked, PlaceRules(spacing=4.0), Goal(n_marks=3))
+
+
+if __name__ == "__main__":
+    compile_kernels()

@@ -1,0 +1,1 @@
+"""Plans of marker positions: what is requested, its evaluation and its optimisation."""

@@ -1,0 +1,1 @@
+"""Results as plain values for JSON, every number with its unit; nothing is computed here."""

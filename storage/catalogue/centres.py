@@ -1,0 +1,113 @@
+"""Centres of earlier runs, read back from their rows as the values that they were.
+
+So that what was fitted once need not be fitted again. Returns and residuals are not kept in rows;
+a centre that was read back has none.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+import pyarrow as pa
+
+from spheremark.pipelines.geometry import levelling_rotation
+from spheremark.pipelines.model import Array, Levelling, MarkerFit, MarkerFits, Status
+from spheremark.storage.catalogue.rows import Row
+
+_COV = ("xx", "xy", "xz", "xy", "yy", "yz", "xz", "yz", "zz")
+_NO_ROWS = np.zeros(0, dtype=np.intp)
+
+
+def read_centres(
+    stops: pa.Table, marker_fits: pa.Table, run_id: str, method: str
+) -> Iterator[tuple[str, MarkerFits]]:
+    """Yield the centres of each stop of a run by one method.
+
+    Parameters
+    ----------
+    stops : Table
+        Rows of ``stops``.
+    marker_fits : Table
+        Rows of ``marker_fits`` of the same runs.
+    run_id : str
+        The run.
+    method : str
+        Fitting method.
+
+    Yields
+    ------
+    str, MarkerFits
+        Name of the stop, and centres in the base frame with covariances that hold neither levelling
+        nor heading, as a fit gives them, in the order of their names. Without rejections.
+    """
+    fits = [
+        row
+        for row in marker_fits.to_pylist()
+        if row["run_id"] == run_id and row["fit_method"] == method
+    ]
+    for stop in stops.to_pylist():
+        if stop["run_id"] == run_id:
+            levelling = _levelling(stop)
+            own = sorted(
+                (row for row in fits if row["stop"] == stop["stop"]),
+                key=lambda row: int(row["marker"][1:]),
+            )
+            found = tuple(_fit(row, levelling) for row in own)
+            yield (
+                stop["stop"],
+                MarkerFits(method=method, fits=found, rejected=(), levelling=levelling),
+            )
+
+
+def _levelling(row: Row) -> Levelling:
+    """Return how the base leant at a stop, from its row."""
+    roll, pitch, sigma, heading = (
+        float(np.radians(row[f"{name}_deg"]))
+        for name in ("roll", "pitch", "sigma_levelling", "sigma_heading")
+    )
+    return Levelling(roll=roll, pitch=pitch, sigma=sigma, is_measured=True, sigma_heading=heading)
+
+
+def _fit(row: Row, levelling: Levelling) -> MarkerFit:
+    """Return a centre as it was before it was levelled, and before its stop's heading was added."""
+    R = levelling_rotation(levelling)
+    p_base = R.T @ np.array([row["x_m"], row["y_m"], row["z_m"]])
+    return MarkerFit(
+        name=row["marker"],
+        p_base=p_base,
+        cov_p_base=_without_heading(R.T @ _cov(row) @ R, p_base, levelling.sigma_heading),
+        method=row["fit_method"],
+        status=Status(row["status"]),
+        reason=row["reason"],
+        radius=row["radius_m"],
+        radius_free=_number(row["radius_free_m"]),
+        sigma_radius_free=_number(row["sigma_radius_free_m"]),
+        mean_range=row["range_m"],
+        mean_intensity=_number(row["mean_intensity"]),
+        used=_NO_ROWS,
+        rejected=_NO_ROWS,
+        residuals=np.zeros(0),
+        sigma0=_number(row["sigma0"]),
+        n_rings=row["n_rings"],
+        coverage=_number(row["coverage"]),
+        incidence=np.radians(_number(row["incidence_deg"])),
+        variant=row["variant"] or "",
+        sigma_range_shared=_number(row["sigma_range_shared_m"]),
+    )
+
+
+def _cov(row: Row) -> Array:
+    """Return the covariance of a row, (3, 3) [m^2]."""
+    return np.array([_number(row[f"cov_{axes}_m2"]) for axes in _COV]).reshape(3, 3)
+
+
+def _without_heading(cov: Array, p_base: Array, sigma_heading: float) -> Array:
+    """Return a covariance without what the heading [rad] of the stop adds to it."""
+    sideways = np.array([-p_base[1], p_base[0], 0.0])
+    return cov - sigma_heading**2 * np.outer(sideways, sideways)
+
+
+def _number(value: float | None) -> float:
+    """Return a number; what is NULL is NaN."""
+    return np.nan if value is None else float(value)

@@ -1,0 +1,387 @@
+"""SQL of people: each query in a process of its own, on a snapshot, behind hard limits.
+
+Why a process: DuckDB in the owner's process is no sandbox (a SELECT can insert, an interrupt is no
+time limit, the memory limit is everybody's). What holds is that the file is opened for reading
+only, nothing outside it can be reached, the operating system bounds memory and forbids written
+files, and its timer ends the process at the deadline. That a query must be one SELECT is advice on
+top.
+
+The child is this module run as a program: a request as JSON on its standard input, an answer as
+JSON on its standard output. It must stay light to import.
+"""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+import math
+import os
+import resource
+import signal
+import subprocess
+import sys
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from time import perf_counter
+from typing import Any, ClassVar
+
+import duckdb
+
+from spheremark.pipelines.errors import InputError, SpheremarkError
+
+_WHOLE_TYPES = ("TINYINT", "SMALLINT", "INTEGER", "BIGINT")
+_PLAIN_TYPES = frozenset(
+    ("BOOLEAN", "FLOAT", "DOUBLE", "VARCHAR", *_WHOLE_TYPES, *(f"U{kind}" for kind in _WHOLE_TYPES))
+)
+_INSTANT_TYPES = ("TIMESTAMP", "TIMESTAMP WITH TIME ZONE")
+_INSTANT_FORMAT = "%Y-%m-%dT%H:%M:%S.%f"
+_HEADROOM = 1 << 30  # [bytes] of addresses for Python and DuckDB themselves, beyond the limit
+_MESSAGE_MAX = 600  # characters of DuckDB's own message
+_START_MAX = 20.0  # [s] until a process may have started on a machine that is busy
+_KINDS = ("SELECT", "EXPLAIN")
+
+
+class QueryRejectedError(InputError):
+    """The query cannot be run."""
+
+    code: ClassVar[str] = "query.rejected"
+
+
+class QueryTimeoutError(InputError):
+    """The query ran into its time limit."""
+
+    code: ClassVar[str] = "query.timeout"
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class QueryLimits:
+    """What one query may use.
+
+    Attributes
+    ----------
+    seconds : float
+        From its start to its killing, the start of the process included [s].
+    memory_bytes : int
+        Memory of DuckDB for the query.
+    rows : int
+        Rows that are returned; what is beyond is cut, and the result says so.
+    result_bytes : int
+        Length of the result as JSON, cut likewise.
+    """
+
+    seconds: float = 10.0
+    memory_bytes: int = 512 << 20
+    rows: int = 10_000
+    result_bytes: int = 32 << 20
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class QueryColumn:
+    """A column of a result.
+
+    Attributes
+    ----------
+    name : str
+        As the query names it; names may repeat.
+    type : str
+        DuckDB's name of its type.
+    """
+
+    name: str
+    type: str
+
+
+@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
+class QueryResult:
+    """What a query gave.
+
+    Attributes
+    ----------
+    columns : tuple of QueryColumn
+        Its columns.
+    rows : tuple of tuple
+        Values that JSON can hold: instants in ISO 8601, lists and objects as such, and None for
+        NULL, NaN and infinite numbers.
+    truncated : bool
+        Whether rows were cut at a limit.
+    elapsed_ms : float
+        Time that the query took inside its process.
+    """
+
+    columns: tuple[QueryColumn, ...]
+    rows: tuple[tuple[Any, ...], ...]
+    truncated: bool
+    elapsed_ms: float
+
+
+def run_query(
+    snapshot: Path,
+    sql: str,
+    limits: QueryLimits,
+    parameters: Mapping[str, Any] | None = None,
+) -> QueryResult:
+    """Run one query of people on a snapshot.
+
+    Parameters
+    ----------
+    snapshot : Path
+        A DuckDB file that nobody writes to.
+    sql : str
+        One SELECT or EXPLAIN; ``$name`` stands for a parameter.
+    limits : QueryLimits
+        What it may use.
+    parameters : mapping, optional
+        Values of its parameters, plain.
+
+    Returns
+    -------
+    QueryResult
+        Rows up to the limits.
+
+    Raises
+    ------
+    QueryRejectedError
+        If the query is not allowed, wrong, or needs more memory than it may use.
+    QueryTimeoutError
+        If it is not done at the deadline.
+
+    Notes
+    -----
+    Takes about 0.15 s more than the query itself, for the process.
+    """
+    request = {
+        "snapshot": str(snapshot),
+        "sql": sql,
+        "parameters": dict(parameters or {}),
+        "limits": asdict(limits),
+    }
+    answer = _ask(json.dumps(request), limits)
+    if "rejected" in answer:
+        raise QueryRejectedError(answer["rejected"])
+    return QueryResult(
+        columns=tuple(QueryColumn(name=name, type=kind) for name, kind in answer["columns"]),
+        rows=tuple(tuple(row) for row in answer["rows"]),
+        truncated=answer["truncated"],
+        elapsed_ms=answer["elapsed_ms"],
+    )
+
+
+def to_csv(result: QueryResult) -> str:
+    """Return a result as CSV (RFC 4180) with a header.
+
+    Parameters
+    ----------
+    result : QueryResult
+        What a query gave.
+
+    Returns
+    -------
+    str
+        NULL is an empty field, lists and objects are JSON. When rows were cut, the last line says
+        so: it begins with ``# truncated``.
+    """
+    text = io.StringIO()
+    writer = csv.writer(text)
+    writer.writerow([column.name for column in result.columns])
+    writer.writerows([_csv_field(value) for value in row] for row in result.rows)
+    if result.truncated:
+        text.write(f"# truncated: only the first {len(result.rows)} rows are here\r\n")
+    return text.getvalue()
+
+
+def _csv_field(value: object) -> object:
+    """Return a value as a field of CSV."""
+    return json.dumps(value) if isinstance(value, list | dict | bool) else value
+
+
+def _ask(request: str, limits: QueryLimits) -> dict[str, Any]:
+    """Start a child, hand it the request, and return its answer.
+
+    It ends itself at the deadline, which begins with its query: on a machine that is busy, to start
+    takes longer than most queries.
+    """
+    with subprocess.Popen(
+        [sys.executable, "-m", "spheremark.storage.catalogue.sandbox"],
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        cwd=os.sep,
+        env={"PATH": os.defpath},  # no settings, so no secrets
+        text=True,
+    ) as child:
+        try:
+            answer, complaint = child.communicate(request, timeout=limits.seconds + _START_MAX)
+        except subprocess.TimeoutExpired as error:
+            child.kill()
+            raise QueryTimeoutError(
+                f"The query did not begin within {_START_MAX:g} s: the machine is too busy. "
+                "Try again later."
+            ) from error
+    if child.returncode == -signal.SIGALRM:
+        raise QueryTimeoutError(
+            f"The query was ended after {limits.seconds:g} s, its time limit. "
+            "Ask for less: filter earlier, aggregate, or add a LIMIT."
+        )
+    if child.returncode < 0:  # the allocator gave up, or the operating system ended it
+        sentence = f"It ended with {signal.Signals(-child.returncode).name}."
+        return {"rejected": f"{_too_much_memory(limits.memory_bytes)} {sentence}"}
+    if child.returncode:
+        raise SpheremarkError(f"The process of the query failed: {complaint[-_MESSAGE_MAX:]}")
+    found: dict[str, Any] = json.loads(answer)
+    return found
+
+
+def _too_much_memory(limit: int) -> str:
+    """Return the sentence for a query that needed too much memory."""
+    return (
+        f"The query needed more than {limit >> 20} MiB, its memory limit. "
+        "Ask for less: filter earlier, aggregate, or add a LIMIT."
+    )
+
+
+# What follows runs in the child.
+
+
+def _main() -> None:
+    """Answer the request on standard input."""
+    request = json.load(sys.stdin)
+    limits = QueryLimits(**request["limits"])
+    _confine(limits)
+    signal.setitimer(signal.ITIMER_REAL, limits.seconds)  # nobody handles it: it ends the process
+    try:
+        answer = _answer(Path(request["snapshot"]), request["sql"], request["parameters"], limits)
+    except (duckdb.OutOfMemoryException, MemoryError):
+        answer = {"rejected": _too_much_memory(limits.memory_bytes)}
+    except duckdb.Error as error:
+        answer = {"rejected": _shortened(str(error))}
+    except QueryRejectedError as error:
+        answer = {"rejected": str(error)}
+    json.dump(answer, sys.stdout, allow_nan=False)
+
+
+def _confine(limits: QueryLimits) -> None:
+    """Let the operating system bound this process."""
+    bounds = {
+        resource.RLIMIT_AS: limits.memory_bytes + _HEADROOM,
+        resource.RLIMIT_FSIZE: 0,
+        resource.RLIMIT_CORE: 0,
+        resource.RLIMIT_CPU: math.ceil(limits.seconds) + 1,
+    }
+    for what, bound in bounds.items():
+        resource.setrlimit(what, (bound, bound))
+
+
+def _answer(
+    snapshot: Path, sql: str, parameters: Mapping[str, Any], limits: QueryLimits
+) -> dict[str, Any]:
+    """Run the query and return what there is to say."""
+    statement = _one_statement(sql)
+    connection = _open(snapshot, limits)
+    begin = perf_counter()
+    relation = connection.sql(statement, params=dict(parameters) or None)
+    kinds = [str(kind) for kind in relation.types]
+    plain = relation.project(", ".join(_plain_sql(i, kind) for i, kind in enumerate(kinds, 1)))
+    rows, truncated = _fetch(plain, kinds, limits)
+    return {
+        "columns": list(zip(relation.columns, kinds, strict=True)),
+        "rows": rows,
+        "truncated": truncated,
+        "elapsed_ms": 1e3 * (perf_counter() - begin),
+    }
+
+
+def _open(snapshot: Path, limits: QueryLimits) -> duckdb.DuckDBPyConnection:
+    """Open the snapshot for reading, with every door shut and the key thrown away."""
+    connection = duckdb.connect(
+        str(snapshot),
+        read_only=True,
+        config={
+            "enable_external_access": "false",
+            "autoinstall_known_extensions": "false",
+            "autoload_known_extensions": "false",
+            "memory_limit": f"{limits.memory_bytes}B",
+            "temp_directory": "",
+            "threads": "1",
+        },
+    )
+    connection.execute("SET TimeZone = 'UTC'")
+    connection.execute("SET lock_configuration = true")
+    return connection
+
+
+def _one_statement(sql: str) -> str:
+    """Return the only statement of a text if it is one that reads."""
+    statements = duckdb.extract_statements(sql)
+    if len(statements) != 1:
+        found = "no statement" if not statements else f"{len(statements)} statements"
+        raise QueryRejectedError(f"The text holds {found}; send one SELECT at a time.")
+    kind = statements[0].type.name
+    if kind == "MULTI":
+        raise QueryRejectedError(
+            "Say which columns the PIVOT gives: PIVOT t ON c IN ('a', 'b') USING sum(x)."
+        )
+    if kind not in _KINDS:
+        raise QueryRejectedError(
+            f"{kind} is not possible here: the database can only be read. "
+            "Use SELECT, EXPLAIN, DESCRIBE or SUMMARIZE."
+        )
+    return _without_end(str(statements[0].query))
+
+
+def _without_end(statement: str) -> str:
+    """Return a statement without its semicolon and what follows, so that SQL can wrap it."""
+    text = statement.encode()  # positions of tokens count bytes
+    ends = [at for at, _ in duckdb.tokenize(statement) if text[at : at + 1] == b";"]
+    return text[: ends[0]].decode() if ends else statement
+
+
+def _plain_sql(place: int, kind: str) -> str:
+    """Return SQL that turns a column into text or numbers that Python and JSON can hold."""
+    if kind in _PLAIN_TYPES:
+        return f"#{place}"
+    if kind in _INSTANT_TYPES:
+        zone = "Z" if kind == "TIMESTAMP WITH TIME ZONE" else ""
+        return f"strftime(#{place}, '{_INSTANT_FORMAT}{zone}')"
+    return f"CAST(to_json(#{place}) AS VARCHAR)"
+
+
+def _fetch(
+    relation: duckdb.DuckDBPyRelation, kinds: Sequence[str], limits: QueryLimits
+) -> tuple[list[list[Any]], bool]:
+    """Return rows up to the limits, and whether there were more."""
+    is_json = [kind not in _PLAIN_TYPES and kind not in _INSTANT_TYPES for kind in kinds]
+    rows: list[list[Any]] = []
+    size = 0
+    for row in relation.limit(limits.rows + 1).fetchall():
+        values = [
+            _finite(json.loads(value) if parse and value is not None else value)
+            for value, parse in zip(row, is_json, strict=True)
+        ]
+        size += len(json.dumps(values))
+        if len(rows) == limits.rows or size > limits.result_bytes:
+            return rows, True
+        rows.append(values)
+    return rows, False
+
+
+def _finite(value: Any) -> Any:
+    """Return a value with None in place of numbers that JSON cannot hold."""
+    if isinstance(value, float):
+        return value if math.isfinite(value) else None
+    if isinstance(value, list):
+        return [_finite(item) for item in value]
+    if isinstance(value, dict):
+        return {key: _finite(item) for key, item in value.items()}
+    return value
+
+
+def _shortened(message: str) -> str:
+    """Return DuckDB's message without its tail."""
+    text = message.strip()
+    return text if len(text) <= _MESSAGE_MAX else f"{text[:_MESSAGE_MAX]} ..."
+
+
+if __name__ == "__main__":
+    _main()

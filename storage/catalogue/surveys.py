@@ -1,0 +1,247 @@
+"""What is kept of surveys, their marks, truth and logs, and of rigs: typed put and get."""
+
+from __future__ import annotations
+
+import json
+import re
+import secrets
+from collections.abc import Mapping
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+
+from spheremark.pipelines.errors import ConflictError, InputError
+from spheremark.pipelines.model import ControlMarks, Rig, Truth
+from spheremark.pipelines.scan.rigs import rig_digest, rig_from_mapping, rig_to_mapping
+from spheremark.storage.catalogue.database import fetch
+from spheremark.storage.catalogue.lists import Lists, page_of
+from spheremark.storage.catalogue.records import (
+    Page,
+    RecordingRecord,
+    SurveyRecord,
+    check_marks,
+    coordinates_of,
+    json_text,
+    marks_table,
+    recording_of,
+    rig_text,
+    survey_of,
+    true_stops_table,
+)
+from spheremark.storage.catalogue.tables import Tables, read_truth
+
+_DIGEST = re.compile(r"[0-9a-f]{64}")
+_VERDICTS = ("ok", "weak", "refused")
+
+_SURVEYS = """
+SELECT s.survey_id, s.name, s.tolerance_m, s.created_at, s.rig_digest,
+    (SELECT count(*) FROM control_marks AS c WHERE c.survey_id = s.survey_id) AS n_control_marks,
+    (SELECT count(*) FROM true_stops AS t WHERE t.survey_id = s.survey_id) AS n_true_stops,
+    (SELECT count(*) FROM (
+        SELECT j.recording_id FROM jobs AS j
+        WHERE j.survey_id = s.survey_id AND j.recording_id IS NOT NULL
+        UNION SELECT o.recording_id FROM survey_recordings AS o WHERE o.survey_id = s.survey_id
+    )) AS n_recordings
+FROM surveys AS s
+"""
+_SURVEY_BY_KEY = _SURVEYS + "WHERE s.survey_id = $key OR s.name = $key ORDER BY s.survey_id <> $key"
+_SURVEYS_AFTER = (
+    _SURVEYS
+    + """
+WHERE ($at::TIMESTAMPTZ IS NULL OR (s.created_at, s.survey_id) < ($at::TIMESTAMPTZ, $id))
+ORDER BY s.created_at DESC, s.survey_id DESC LIMIT $n
+"""
+)
+_RECORDING = "SELECT * FROM recordings WHERE recording_id = $id"
+_RECORDINGS_AFTER = """
+SELECT * FROM recordings
+WHERE ($at::TIMESTAMPTZ IS NULL OR (uploaded_at, recording_id) < ($at::TIMESTAMPTZ, $id))
+ORDER BY uploaded_at DESC, recording_id DESC LIMIT $n
+"""
+_RIG = "SELECT rig FROM rigs WHERE rig_digest = $digest"
+_RECORDINGS_OF_SURVEY = """
+SELECT recording_id, name FROM recordings WHERE recording_id IN (
+    SELECT recording_id FROM jobs WHERE survey_id = $id AND status <> 'dismissed'
+    UNION SELECT recording_id FROM runs WHERE survey_id = $id
+    UNION SELECT recording_id FROM survey_recordings WHERE survey_id = $id
+) ORDER BY uploaded_at, recording_id
+"""
+_CONTROL = "SELECT * FROM control_marks WHERE survey_id = $id ORDER BY place"
+
+
+class Surveys(Lists):
+    """What people gave: surveys with their marks and truth, logs, rigs.
+
+    Parameters
+    ----------
+    path : Path
+        The DuckDB file, as for a ``Database``.
+    snapshots : Path
+        Folder for the copies that others read.
+    memory_limit : str
+        What DuckDB may use before it spills to disk, in its own words.
+    """
+
+    def __init__(self, path: Path, *, snapshots: Path, memory_limit: str = "1GB") -> None:
+        super().__init__(path, snapshots=snapshots, memory_limit=memory_limit)
+        self._tables = Tables(self._writer)
+
+    # Surveys, their marks and their truth
+
+    def create_survey(self, name: str, *, tolerance: float = 0.03) -> SurveyRecord:
+        """Make a survey."""
+        check_name("The name of a survey", name)
+        if not 0.0 < tolerance <= 1.0:
+            raise InputError(f"The tolerance is {tolerance!r} m; it must be above 0 and at most 1.")
+        with self.writing() as cursor:
+            if fetch(cursor, _SURVEY_BY_KEY, {"key": name}).num_rows:
+                raise ConflictError(f"There is already a survey called {name!r}; choose another.")
+            survey_id = secrets.token_hex(8)
+            cursor.execute(
+                "INSERT INTO surveys (survey_id, name, tolerance_m, created_at) "
+                "VALUES (?, ?, ?, ?)",
+                [survey_id, name, tolerance, now()],
+            )
+        return self.get_survey(survey_id)
+
+    def get_survey(self, key: str) -> SurveyRecord:
+        """Return a survey by its id or its name; NotFoundError if there is none."""
+        return survey_of(self._one(_SURVEY_BY_KEY, {"key": key}, f"survey {key!r}"))
+
+    def list_surveys(self, *, after: str | None = None, limit: int = 100) -> Page[SurveyRecord]:
+        """Return a part of the surveys, newest first; ``after`` is ``next`` of the part before."""
+        rows = self._part(_SURVEYS_AFTER, {}, after, limit)
+        return page_of(rows, limit, "created_at", "survey_id", survey_of)
+
+    def put_control_marks(self, survey: str, marks: ControlMarks) -> None:
+        """Give a survey its control marks, in place of those that it had."""
+        check_marks(marks)
+        sigmas = np.sqrt(np.diagonal(marks.cov_p_site, axis1=1, axis2=2))
+        survey_id = self.get_survey(survey).survey_id
+        table = marks_table(survey_id, marks)
+        for axis, name in enumerate(("sigma_x_m", "sigma_y_m", "sigma_z_m")):
+            table = table.append_column(name, pa.array(sigmas[:, axis]))
+        with self.writing() as cursor:
+            self._tables.append({"control_marks": table})
+            cursor.execute(
+                "DELETE FROM control_marks WHERE survey_id = ? AND NOT list_contains(?, mark)",
+                [survey_id, list(marks.names)],
+            )
+
+    def control_marks(self, survey: str) -> ControlMarks | None:
+        """Return the control marks of a survey (id or name), as they were put; None without."""
+        rows = self.rows(_CONTROL, {"id": self.get_survey(survey).survey_id})
+        if not rows:
+            return None
+        sigmas = np.array([[row[f"sigma_{axis}_m"] for axis in "xyz"] for row in rows])
+        return ControlMarks(
+            names=tuple(row["mark"] for row in rows),
+            p_site=coordinates_of(rows),
+            cov_p_site=np.eye(3) * np.square(sigmas)[:, None, :],
+        )
+
+    def put_truth(self, survey: str, truth: Truth) -> None:
+        """Give a survey its truth, and all its results their errors."""
+        check_marks(truth.marks)
+        survey_id = self.get_survey(survey).survey_id
+        with self.writing() as cursor:
+            self._tables.append({"true_marks": marks_table(survey_id, truth.marks)})
+            cursor.execute(
+                "DELETE FROM true_marks WHERE survey_id = ? AND NOT list_contains(?, mark)",
+                [survey_id, list(truth.marks.names)],
+            )
+            self._tables.append({"true_stops": true_stops_table(survey_id, truth.stops)})
+            cursor.execute(
+                "INSERT OR REPLACE INTO true_worlds VALUES (?, ?, ?)",
+                [survey_id, rig_text(truth), json_text(truth.about)],
+            )
+            self._tables.refresh_errors(survey_id)
+
+    def truth(self, survey: str) -> Truth | None:
+        """Return the truth of a survey (id or name); None when it is not known."""
+        survey_id = self.get_survey(survey).survey_id
+        with self.reading() as cursor:
+            return read_truth(cursor, survey_id)
+
+    # Recordings
+
+    def add_recording(
+        self, digest: str, *, name: str, size_bytes: int, url: str, preflight: Mapping[str, Any]
+    ) -> RecordingRecord:
+        """Enter an uploaded log; the same bytes twice are one recording, as first entered."""
+        check_name("The name of a recording", name)
+        verdict = str(preflight.get("verdict"))
+        if not _DIGEST.fullmatch(digest):
+            raise InputError(f"The digest {digest!r} is not a SHA-256: 64 lower-case hex digits.")
+        if verdict not in _VERDICTS or size_bytes < 0:
+            raise InputError(
+                f"The recording {name} has the verdict {verdict!r} and {size_bytes} bytes; a "
+                f"verdict is one of {', '.join(_VERDICTS)}, and a size is not negative."
+            )
+        row = [digest, name, size_bytes, now(), url, verdict, json_text(preflight)]
+        with self.writing() as cursor:
+            cursor.execute("INSERT OR IGNORE INTO recordings VALUES (?, ?, ?, ?, ?, ?, ?)", row)
+        return self.get_recording(digest)
+
+    def get_recording(self, recording_id: str) -> RecordingRecord:
+        """Return a recording by its digest; NotFoundError if there is none."""
+        row = self._one(_RECORDING, {"id": recording_id}, f"recording {recording_id!r}")
+        return recording_of(row)
+
+    def list_recordings(
+        self, *, after: str | None = None, limit: int = 100
+    ) -> Page[RecordingRecord]:
+        """Return a part of the recordings, newest first."""
+        rows = self._part(_RECORDINGS_AFTER, {}, after, limit)
+        return page_of(rows, limit, "uploaded_at", "recording_id", recording_of)
+
+    def add_to_survey(self, survey: str, recording_id: str) -> None:
+        """Note that a log belongs to a survey; twice is once."""
+        row = [self.get_survey(survey).survey_id, self.get_recording(recording_id).recording_id]
+        with self.writing() as cursor:
+            cursor.execute("INSERT OR IGNORE INTO survey_recordings VALUES (?, ?)", row)
+
+    def recordings_of_survey(self, survey: str) -> tuple[str, ...]:
+        """Return the logs that were uploaded for a survey (id or name), or read by its jobs."""
+        rows = self.rows(_RECORDINGS_OF_SURVEY, {"id": self.get_survey(survey).survey_id})
+        return tuple(row["recording_id"] for row in rows)
+
+    # Rigs
+
+    def put_rig(self, rig: Rig) -> str:
+        """Keep a rig; the same rig twice is one."""
+        digest = rig_digest(rig)
+        row = {"rig_digest": digest, "name": rig.name, "rig": json_text(rig_to_mapping(rig))}
+        with self.writing():
+            self._tables.append({"rigs": pa.Table.from_pylist([row])})
+        return digest
+
+    def get_rig(self, digest: str) -> Rig:
+        """Return a rig by its digest; NotFoundError if there is none."""
+        row = self._one(_RIG, {"digest": digest}, f"rig {digest!r}")
+        return rig_from_mapping(json.loads(row["rig"]))
+
+    def choose_rig(self, survey: str, digest: str | None) -> SurveyRecord:
+        """Let the jobs of a survey use a rig where they name none."""
+        survey_id = self.get_survey(survey).survey_id
+        if digest is not None:
+            self.get_rig(digest)
+        with self.writing() as cursor:
+            cursor.execute(
+                "UPDATE surveys SET rig_digest = ? WHERE survey_id = ?", [digest, survey_id]
+            )
+        return self.get_survey(survey_id)
+
+
+def check_name(what: str, name: str) -> None:
+    """Refuse a name that people could not read or type."""
+    if not name.strip() or len(name) > 200 or not name.isprintable():
+        raise InputError(f"{what} is {name!r}; it must have 1 to 200 printable characters.")
+
+
+def now() -> datetime:
+    """Return this instant."""
+    return datetime.now(UTC)

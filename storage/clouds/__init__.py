@@ -1,0 +1,1 @@
+"""Clouds of stops and of whole sites, as files."""

@@ -1,0 +1,351 @@
+"""Clouds of a whole site as files that other programs read: LAZ, and E57 with a pose per scan.
+
+Both are written stop by stop, so that memory holds one stop. LAZ has the returns in the site frame,
+to the millimetre; E57 has them in the frame of their station, with the pose that leads to the site.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import uuid
+from dataclasses import dataclass
+from datetime import date
+from pathlib import Path
+from typing import Any
+
+import laspy
+import numpy as np
+from pye57 import libe57
+from scipy.spatial.transform import Rotation
+
+from spheremark.pipelines.errors import InputError
+from spheremark.pipelines.ground_model import StationPoints
+from spheremark.pipelines.model import Array, Column, Rings
+
+_SCALE = 0.001  # [m] of a LAZ coordinate
+_FULL = 65535 / 255  # LAS wants intensities to fill 16 bits
+_CHUNK = 500_000  # returns at a time
+_SITE = 'LOCAL_CS["site",LOCAL_DATUM["site",0],UNIT["metre",1],AXIS["x",EAST],AXIS["y",NORTH]]'
+_STATIONS = "stations: name, number (point_source_id), T_site_station, rows first [m]"
+_RECORD = 1  # of our own records in a LAZ file
+
+
+@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
+class CloudExtent:
+    """What a file of a cloud holds.
+
+    Attributes
+    ----------
+    n_points : int
+        Number of returns.
+    bounds : (2, 3)
+        Least and greatest coordinates in the site frame [m].
+    """
+
+    n_points: int
+    bounds: Array
+
+
+class LazFile:
+    """The returns of stops in one LAZ file (LAS 1.4, point format 6), written stop by stop.
+
+    A return has ``point_source_id``, the number of its station from 1, ``intensity`` with 0-255
+    stretched to 16 bits, ``gps_time``, seconds since the first return of its stop, and as an extra
+    dimension ``ring``. Names and poses of the stations are in an extended record of user
+    ``spheremark``. Coordinates are those of the site: a local system without a place on Earth.
+
+    Parameters
+    ----------
+    path : Path
+        The file.
+    software : str
+        What makes it.
+    day : date
+        Day that the header names.
+    """
+
+    def __init__(self, path: Path, *, software: str, day: date) -> None:
+        self._path, self._software, self._day = path, software, day
+        self._writer: laspy.LasWriter | None = None
+        self._extents: list[CloudExtent] = []
+        self._stations: list[dict[str, Any]] = []
+
+    def add(self, stop: StationPoints) -> None:
+        """Write the returns of one stop.
+
+        Parameters
+        ----------
+        stop : StationPoints
+            The stop.
+
+        Raises
+        ------
+        InputError
+            If there are more stops than a LAZ file can number.
+        """
+        number, p_site = len(self._stations) + 1, stop.p_site
+        if number > np.iinfo(np.uint16).max:
+            raise InputError(f"A LAZ file can number {number - 1} stations and no more.")
+        if self._writer is None:
+            header = _laz_header(stop.T_site_station[:3, 3], self._software, self._day)
+            backend = laspy.LazBackend.Lazrs
+            self._writer = laspy.open(self._path, mode="w", header=header, laz_backend=backend)
+        for first in range(0, len(p_site), _CHUNK):
+            rows = slice(first, first + _CHUNK)
+            points = _laz_points(stop, p_site, rows, number, self._writer.header)
+            self._writer.write_points(points)
+        self._extents.append(_extent(p_site))
+        self._stations.append(_station(number, stop))
+
+    def finish(self) -> CloudExtent:
+        """Write what stands at the end of the file.
+
+        Returns
+        -------
+        CloudExtent
+            What was written.
+
+        Raises
+        ------
+        InputError
+            If there is no return.
+        """
+        extent = _joined(self._extents)
+        if self._writer is not None:
+            self._writer.write_evlrs(_stations_record(self._stations))
+        return extent
+
+    def close(self) -> None:
+        """Let go of the file."""
+        if self._writer is not None:
+            self._writer.close()
+
+
+class E57File:
+    """The returns of stops in one E57 file (ASTM E2807-11), a scan with a pose for each stop.
+
+    Coordinates are single precision in the station frame; ``pose`` is ``T_site_station``;
+    ``rowIndex`` is the laser. Identifiers follow from the contents, so that the same survey gives
+    the same file.
+
+    Parameters
+    ----------
+    path : Path
+        The file.
+    software : str
+        What makes it.
+    """
+
+    def __init__(self, path: Path, *, software: str) -> None:
+        path.unlink(missing_ok=True)
+        self._image = libe57.ImageFile(str(path), "w")
+        self._scans = _e57_root(self._image, software)
+        self._extents: list[CloudExtent] = []
+
+    def add(self, stop: StationPoints) -> None:
+        """Write the returns of one stop.
+
+        Parameters
+        ----------
+        stop : StationPoints
+            The stop.
+        """
+        self._extents.append(_e57_scan(self._image, self._scans, stop))
+
+    def finish(self) -> CloudExtent:
+        """Say what was written.
+
+        Returns
+        -------
+        CloudExtent
+            What was written, in the site frame.
+
+        Raises
+        ------
+        InputError
+            If there is no return.
+        """
+        return _joined(self._extents)
+
+    def close(self) -> None:
+        """Let go of the file."""
+        self._image.close()
+
+
+def _laz_header(p_site: Array, software: str, day: date) -> laspy.LasHeader:
+    """Return a header whose origin is near a station, at whole metres."""
+    header = laspy.LasHeader(version="1.4", point_format=6)
+    header.scales = np.full(3, _SCALE)
+    header.offsets = np.round(p_site)
+    header.system_identifier = "spheremark"
+    header.generating_software = software[:32]
+    header.creation_date = day
+    header.add_extra_dim(
+        laspy.ExtraBytesParams(name="ring", type=np.uint8, description="laser, 0 the lowest")
+    )
+    header.vlrs.append(laspy.vlrs.known.WktCoordinateSystemVlr(_SITE))
+    header.global_encoding.wkt = True
+    return header
+
+
+def _laz_points(
+    stop: StationPoints, p_site: Array, rows: slice, number: int, header: laspy.LasHeader
+) -> laspy.ScaleAwarePointRecord:
+    """Return some returns of a stop as LAZ keeps them."""
+    part = p_site[rows]
+    record = laspy.ScaleAwarePointRecord.zeros(len(part), header=header)
+    record.x, record.y, record.z = part.T
+    record.intensity = np.round(np.clip(stop.intensities[rows], 0, 255) * _FULL).astype(np.uint16)
+    record.return_number[:] = 1
+    record.number_of_returns[:] = 1
+    record.point_source_id[:] = number
+    record.gps_time = stop.times[rows].astype(np.float64)
+    record.ring = stop.rings[rows]
+    return record
+
+
+def _station(number: int, stop: StationPoints) -> dict[str, Any]:
+    """Return what a LAZ file says of a station."""
+    return {"number": number, "name": stop.name, "T_site_station": stop.T_site_station.tolist()}
+
+
+def _stations_record(stations: list[dict[str, Any]]) -> laspy.vlrs.vlrlist.VLRList:
+    """Return the stations as an extended record."""
+    text = json.dumps({"about": _STATIONS, "stations": stations})
+    record = laspy.VLR(
+        user_id="spheremark", record_id=_RECORD, description="stations", record_data=text.encode()
+    )
+    return laspy.vlrs.vlrlist.VLRList([record])
+
+
+def _extent(p_site: Array) -> CloudExtent:
+    """Return what a stop adds."""
+    bounds = (
+        np.array([p_site.min(axis=0), p_site.max(axis=0)])
+        if len(p_site)
+        else np.array([[np.inf] * 3, [-np.inf] * 3])
+    )
+    return CloudExtent(n_points=len(p_site), bounds=bounds)
+
+
+def _joined(extents: list[CloudExtent]) -> CloudExtent:
+    """Return the extent of all stops; refuse a cloud without returns."""
+    n_points = sum(extent.n_points for extent in extents)
+    if not n_points:
+        raise InputError("The stops have no return within the wanted distance: there is no cloud.")
+    return CloudExtent(
+        n_points=n_points,
+        bounds=np.array(
+            [
+                np.min([extent.bounds[0] for extent in extents], axis=0),
+                np.max([extent.bounds[1] for extent in extents], axis=0),
+            ]
+        ),
+    )
+
+
+def _e57_root(image: Any, software: str) -> Any:
+    """Write what stands at the head of a file; return the list of its scans."""
+    image.extensionsAdd("", libe57.E57_V1_0_URI)
+    scans = libe57.VectorNode(image, True)
+    created = _structure(image, dateTimeValue=0.0, isAtomicClockReferenced=0)
+    values = {
+        "formatName": "ASTM E57 3D Imaging Data File",
+        "guid": _guid(software),
+        "versionMajor": libe57.E57_FORMAT_MAJOR,
+        "versionMinor": libe57.E57_FORMAT_MINOR,
+        "e57LibraryVersion": libe57.E57_LIBRARY_ID,
+        "coordinateMetadata": "",
+    }
+    for name, value in values.items():
+        image.root().set(name, _node(image, value))
+    image.root().set("creationDateTime", created)
+    image.root().set("data3D", scans)
+    image.root().set("images2D", libe57.VectorNode(image, True))
+    return scans
+
+
+def _guid(text: str) -> str:
+    """Return an identifier that follows from a text."""
+    return "{" + str(uuid.uuid5(uuid.NAMESPACE_URL, f"spheremark/{text}")) + "}"
+
+
+def _node(image: Any, value: str | int | float) -> Any:
+    """Return a value as a node of an E57 file."""
+    if isinstance(value, str):
+        return libe57.StringNode(image, value)
+    if isinstance(value, int):
+        return libe57.IntegerNode(image, value)
+    return libe57.FloatNode(image, value)
+
+
+def _structure(image: Any, **values: str | int | float) -> Any:
+    """Return values as a structure of an E57 file."""
+    node = libe57.StructureNode(image)
+    for name, value in values.items():
+        node.set(name, _node(image, value))
+    return node
+
+
+def _e57_scan(image: Any, scans: Any, stop: StationPoints) -> CloudExtent:
+    """Write one stop."""
+    scan = _structure(
+        image,
+        guid=_guid(f"{stop.name}/{len(scans)}/{stop.p_station.sum(dtype=np.float64)!r}"),
+        name=stop.name,
+        description="returns in the levelled frame of the station",
+    )
+    scan.set("pose", _pose(image, stop.T_site_station))
+    scans.append(scan)
+    if len(stop.p_station):
+        low, high = stop.p_station.min(axis=0), stop.p_station.max(axis=0)
+        scan.set("cartesianBounds", _bounds(image, low, high))
+        limits = {"intensityMinimum": 0.0, "intensityMaximum": 255.0}
+        scan.set("intensityLimits", _structure(image, **limits))
+    _e57_points(image, scan, stop)
+    return _extent(stop.p_site)
+
+
+def _pose(image: Any, T: Array) -> Any:
+    """Return a pose as E57 keeps it: a unit quaternion and a translation."""
+    x, y, z, w = (float(value) for value in Rotation.from_matrix(T[:3, :3]).as_quat())
+    pose = libe57.StructureNode(image)
+    pose.set("rotation", _structure(image, w=w, x=x, y=y, z=z))
+    translation = {name: float(T[i, 3]) for i, name in enumerate("xyz")}
+    pose.set("translation", _structure(image, **translation))
+    return pose
+
+
+def _bounds(image: Any, low: Array, high: Array) -> Any:
+    """Return the bounds of a scan in its own frame."""
+    values = {f"{name}Minimum": float(low[i]) for i, name in enumerate("xyz")}
+    values |= {f"{name}Maximum": float(high[i]) for i, name in enumerate("xyz")}
+    return _structure(image, **values)
+
+
+def _e57_points(image: Any, scan: Any, stop: StationPoints) -> None:
+    """Write the returns of one stop, a part at a time."""
+    reach = float(np.abs(stop.p_station).max(initial=1.0))
+    limit = math.ceil(reach)
+    prototype = libe57.StructureNode(image)
+    for name in ("cartesianX", "cartesianY", "cartesianZ"):
+        prototype.set(name, libe57.FloatNode(image, 0.0, libe57.E57_SINGLE, -limit, limit))
+    prototype.set("intensity", libe57.FloatNode(image, 0.0, libe57.E57_SINGLE, 0.0, 255.0))
+    prototype.set("rowIndex", libe57.IntegerNode(image, 0, 0, 255))
+    points = libe57.CompressedVectorNode(image, prototype, libe57.VectorNode(image, True))
+    scan.set("points", points)
+    x, y, z = stop.p_station.T
+    columns: dict[str, Column | Rings] = {"cartesianX": x, "cartesianY": y, "cartesianZ": z}
+    columns |= {"intensity": np.clip(stop.intensities, 0, 255), "rowIndex": stop.rings}
+    parts = {name: np.empty(_CHUNK, column.dtype) for name, column in columns.items()}
+    buffers = libe57.VectorSourceDestBuffer()
+    for name, part in parts.items():
+        buffers.append(libe57.SourceDestBuffer(image, name, part, _CHUNK, True, True))
+    writer = points.writer(buffers)
+    for first in range(0, len(stop.p_station), _CHUNK):
+        n = min(_CHUNK, len(stop.p_station) - first)
+        for name, column in columns.items():
+            parts[name][:n] = column[first : first + n]
+        writer.write(n)
+    writer.close()

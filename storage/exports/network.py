@@ -1,0 +1,240 @@
+"""Adjusted networks as files of other programs: GNU Gama XML and a table of coordinates."""
+
+from __future__ import annotations
+
+import csv
+import io
+from pathlib import Path
+from xml.etree import ElementTree as ET
+
+import numpy as np
+
+from spheremark.pipelines.geometry import rot_z, yaw_pitch_roll
+from spheremark.pipelines.model import Array
+from spheremark.pipelines.network import AdjustedNetwork
+
+_NAMESPACE = "http://www.gnu.org/software/gama/gama-local"
+_GON = 200.0 / np.pi
+_CC = 1e4 * _GON  # [cc/rad] centesimal seconds, in which Gama has sigmas of angles
+_MM = 1e3
+_EXACT = 2e-5  # [m] control that is better than this was given as exact
+_UNLEVELLED = 0.2  # [rad] sigma of a levelling that was left out
+COORDINATE_COLUMNS = (
+    "kind", "name", "x_m", "y_m", "z_m", "sigma_x_m", "sigma_y_m", "sigma_z_m",
+    "cov_xy_m2", "cov_xz_m2", "cov_yz_m2", "n_observations",
+)  # fmt: skip
+
+
+def format_coordinates(result: AdjustedNetwork) -> str:
+    """Return stations and marks of a network as CSV.
+
+    Parameters
+    ----------
+    result : AdjustedNetwork
+        The network.
+
+    Returns
+    -------
+    str
+        One row per station and mark, with the columns ``COORDINATE_COLUMNS``.
+    """
+    network, n = result.network, len(result.network.sightings)
+    station, mark = network.sightings[result.used[:n]].T
+    kinds = ["mark"] * len(network.marks)
+    for place in network.controls:
+        kinds[place] = "control"
+    parts = (
+        (["station"] * len(network.stations), network.stations, result.T_site_station[:, :3, 3],
+         result.station_covariances, np.bincount(station, minlength=len(network.stations))),
+        (kinds, network.marks, result.p_site, result.mark_covariances,
+         np.bincount(mark, minlength=len(network.marks))),
+    )  # fmt: skip
+    text = io.StringIO()
+    writer = csv.writer(text)
+    writer.writerow(COORDINATE_COLUMNS)
+    for part in parts:
+        for kind, name, p, cov, count in zip(*part, strict=True):
+            sigmas = np.sqrt(np.diag(cov))
+            others = (cov[0, 1], cov[0, 2], cov[1, 2])
+            numbers = (*(f"{x:.5f}" for x in p), *(f"{x:.6f}" for x in sigmas))
+            writer.writerow((kind, name, *numbers, *(f"{x:.4e}" for x in others), count))
+    return text.getvalue()
+
+
+def write_coordinates(result: AdjustedNetwork, path: str | Path) -> None:
+    """Write stations and marks of a network as CSV.
+
+    Parameters
+    ----------
+    result : AdjustedNetwork
+        The network.
+    path : str or Path
+        Where to.
+    """
+    Path(path).write_text(format_coordinates(result), encoding="utf-8")
+
+
+def format_gama(result: AdjustedNetwork, description: str = "") -> str:
+    """Return a network's observations as input of GNU Gama's ``gama-local``.
+
+    Parameters
+    ----------
+    result : AdjustedNetwork
+        The network; what its tests left out is left out here too.
+    description : str
+        A sentence for people.
+
+    Returns
+    -------
+    str
+        XML: points with adjusted coordinates as approximate values, and for each station a set of
+        directions (counter-clockwise), zenith angles [gon] and slope distances [m] in the levelled
+        frame, with their full covariance [cc, mm].
+
+    Notes
+    -----
+    Gama knows levelled instruments only. What the levelling leaves uncertain turns all centres of
+    a station together and is in the covariance of the set, so that Gama solves the same problem. It
+    is linearised where the network ended: by half a degree of levelling a free network would else
+    lean by a millimetre. A set's orientation is the heading of the station. Distances are without
+    the range bias that the network found. Exact control marks are fixed, others are observed
+    coordinates; in a free network the marks define the datum (``adj="XYZ"``).
+    """
+    root = ET.Element("gama-local", xmlns=_NAMESPACE)
+    frame = {"axes-xy": "en", "angles": "right-handed"}
+    network = ET.SubElement(root, "network", frame)
+    ET.SubElement(network, "description").text = description or "Written by spheremark."
+    parameters = {"sigma-apr": "1", "conf-pr": "0.95", "tol-abs": "1000", "sigma-act": "apriori"}
+    ET.SubElement(network, "parameters", parameters)
+    observed = ET.SubElement(network, "points-observations")
+    fixed = _fixed(result)
+    _add_points(observed, result, fixed)
+    for station in range(len(result.network.stations)):
+        _add_set(observed, result, station)
+    _add_control(observed, result, fixed)
+    ET.indent(root)
+    return '<?xml version="1.0" ?>\n' + ET.tostring(root, encoding="unicode") + "\n"
+
+
+def write_gama(result: AdjustedNetwork, path: str | Path, description: str = "") -> None:
+    """Write a network's observations as input of GNU Gama's ``gama-local``.
+
+    Parameters
+    ----------
+    result : AdjustedNetwork
+        The network.
+    path : str or Path
+        Where to.
+    description : str
+        A sentence for people.
+    """
+    Path(path).write_text(format_gama(result, description), encoding="utf-8")
+
+
+def _used_controls(result: AdjustedNetwork) -> list[tuple[int, int]]:
+    """Return row and mark of each control mark that was used."""
+    network = result.network
+    used = result.used[len(network.sightings) + len(network.stations) :]
+    return [(row, int(mark)) for row, mark in enumerate(network.controls) if used[row]]
+
+
+def _fixed(result: AdjustedNetwork) -> dict[int, Array]:
+    """Return the coordinates of the marks that were given as exact."""
+    network = result.network
+    return {
+        mark: network.p_control_site[row]
+        for row, mark in _used_controls(result)
+        if np.sqrt(np.trace(network.cov_control_site[row]) / 3) < _EXACT
+    }
+
+
+def _add_points(parent: ET.Element, result: AdjustedNetwork, fixed: dict[int, Array]) -> None:
+    """Add marks and stations with approximate coordinates."""
+    network = result.network
+    for mark, name in enumerate(network.marks):
+        status = {"fix": "xyz"} if mark in fixed else {"adj": "XYZ" if network.is_free else "xyz"}
+        _add_point(parent, name, fixed.get(mark, result.p_site[mark]), status)
+    for name, T in zip(network.stations, result.T_site_station, strict=True):
+        _add_point(parent, name, T[:3, 3], {"adj": "xyz"})
+
+
+def _add_point(parent: ET.Element, name: str, p: Array, status: dict[str, str]) -> None:
+    """Add a point."""
+    x, y, z = (f"{value:.6f}" for value in p)
+    ET.SubElement(parent, "point", {"id": name, "x": x, "y": y, "z": z, **status})
+
+
+def _add_set(parent: ET.Element, result: AdjustedNetwork, station: int) -> None:
+    """Add what was observed from a station."""
+    network, n = result.network, len(result.network.sightings)
+    rows = np.flatnonzero((network.sightings[:, 0] == station) & result.used[:n])
+    level = _level(result.T_site_station[station, :3, :3])
+    R = level @ network.R_station_base[station]
+    p = result.p_base[rows] @ R.T
+    values, J = _polar(p)
+    cov = np.zeros((len(rows), 3, len(rows), 3))
+    cov[np.arange(len(rows)), :, np.arange(len(rows)), :] = (
+        J @ R @ network.cov_p_base[rows] @ R.T @ np.swapaxes(J, 1, 2)
+    )
+    cov_up = R @ network.cov_up_base[station] @ R.T
+    if not result.used[n + station]:
+        cov_up = _UNLEVELLED**2 * np.diag([1.0, 1.0, 0.0])
+    leaned = np.stack([-p[:, 2:] * [1, 0, 0], -p[:, 2:] * [0, 1, 0]], axis=2)
+    leaned[:, 2, 0], leaned[:, 2, 1] = p[:, 0], p[:, 1]
+    leaned = J @ leaned  # by the two horizontal coordinates of the up direction
+    values = values + leaned @ level[:2, 2]
+    cov += np.einsum("iak,kl,jbl->iajb", leaned, cov_up[:2, :2], leaned)
+    group = ET.SubElement(parent, "obs", {"from": network.stations[station]})
+    for (azimuth, zenith, distance), row in zip(values, rows, strict=True):
+        to = network.marks[network.sightings[row, 1]]
+        gon = azimuth * _GON % 400.0
+        ET.SubElement(group, "direction", {"to": to, "val": f"{gon:.9f}"})
+        ET.SubElement(group, "z-angle", {"to": to, "val": f"{zenith * _GON:.9f}"})
+        ET.SubElement(group, "s-distance", {"to": to, "val": f"{distance:.7f}"})
+    scale = np.tile([_CC, _CC, _MM], len(rows))
+    _add_covariance(group, cov.reshape(3 * len(rows), -1) * np.outer(scale, scale))
+
+
+def _level(R_site_station: Array) -> Array:
+    """Return the rotation that makes a station as level as it was found to be, heading kept."""
+    yaw = yaw_pitch_roll(R_site_station)[0]
+    return np.asarray(rot_z(-yaw) @ R_site_station)
+
+
+def _polar(p: Array) -> tuple[Array, Array]:
+    """Return azimuth, zenith angle and distance of points, (k, 3), and their derivative."""
+    x, y, z = p.T
+    flat, r = np.hypot(x, y), np.linalg.norm(p, axis=1)
+    o = np.zeros_like(x)
+    J = np.stack(
+        [
+            np.stack([-y / flat**2, x / flat**2, o], axis=1),
+            np.stack([x * z / flat, y * z / flat, -flat], axis=1) / r[:, None] ** 2,
+            p / r[:, None],
+        ],
+        axis=1,
+    )
+    return np.stack([np.arctan2(y, x), np.arctan2(flat, z), r], axis=1), J
+
+
+def _add_control(parent: ET.Element, result: AdjustedNetwork, fixed: dict[int, Array]) -> None:
+    """Add control marks with sigmas as observed coordinates."""
+    network = result.network
+    loose = [(row, mark) for row, mark in _used_controls(result) if mark not in fixed]
+    if not loose:
+        return
+    group = ET.SubElement(parent, "coordinates")
+    cov = np.zeros((len(loose), 3, len(loose), 3))
+    for k, (row, mark) in enumerate(loose):
+        x, y, z = (f"{value:.6f}" for value in network.p_control_site[row])
+        ET.SubElement(group, "point", {"id": network.marks[mark], "x": x, "y": y, "z": z})
+        cov[k, :, k] = network.cov_control_site[row] * _MM**2
+    _add_covariance(group, cov.reshape(3 * len(loose), -1))
+
+
+def _add_covariance(parent: ET.Element, cov: Array) -> None:
+    """Add the upper triangle of a covariance."""
+    n = len(cov)
+    rows = [" ".join(f"{value:.9e}" for value in cov[i, i:]) for i in range(n)]
+    matrix = ET.SubElement(parent, "cov-mat", {"dim": str(n), "band": str(n - 1)})
+    matrix.text = "\n" + "\n".join(rows) + "\n"

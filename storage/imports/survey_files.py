@@ -1,0 +1,613 @@
+"""Files that come with a survey: control marks (CSV), truth and rig (JSON).
+
+A table or an object that cannot be used is refused with the row, the column and what was expected;
+nothing is repaired silently.
+"""
+
+from __future__ import annotations
+
+import csv
+import json
+import math
+import re
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, TypeVar
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from spheremark.pipelines.errors import (
+    ControlError,
+    InputError,
+    NotFoundError,
+    RigError,
+    TruthError,
+)
+from spheremark.pipelines.geometry import rigid
+from spheremark.pipelines.model import Array, ControlMarks, Rig, StopTruth, Truth
+from spheremark.pipelines.scan.rigs import rig_from_mapping, rig_to_mapping
+
+CONTROL_COLUMNS = ("mark", "x_m", "y_m", "z_m", "sigma_x_m", "sigma_y_m", "sigma_z_m")
+TRUTH_FORMAT = "spheremark-truth/1"
+
+_ALIASES = {
+    "mark": ("mark", "name", "id", "point", "label", "marker", "p"),
+    "x_m": ("x", "e", "east", "easting"),
+    "y_m": ("y", "n", "north", "northing"),
+    "z_m": ("z", "h", "height", "elevation", "up"),
+    "sigma_x_m": ("sigma_x", "sigma_e", "sx"),
+    "sigma_y_m": ("sigma_y", "sigma_n", "sy"),
+    "sigma_z_m": ("sigma_z", "sigma_h", "sz"),
+    "sigma_m": ("sigma",),
+    "target_height_m": ("target_height", "th"),
+    "down_m": ("down", "d"),
+    "note": ("description", "desc", "code", "note"),
+}
+_NAMES = {
+    spelling: column
+    for column, aliases in _ALIASES.items()
+    for alias in aliases
+    for spelling in (alias, f"{alias}_m")
+}
+_AXES = {
+    "enu": ("x_m", "y_m", "z_m"),
+    "neu": ("y_m", "x_m", "z_m"),
+    "ned": ("y_m", "x_m", "down_m"),
+}
+_UNITS = {"m": 1.0, "mm": 1e-3, "ft": 0.3048, "us-ft": 1200.0 / 3937.0}
+_ROWS_MAX = 10_000
+_SIZE_MAX = 4_000_000  # characters; far more than so many rows need
+_APART_MIN = 0.01  # [m] marks nearer than this are one mark twice
+_COORDINATE_MAX = 1e8  # [m] larger than any national grid
+_EXPECTED = "expected mark,x_m,y_m,z_m and, if known, sigma_x_m,sigma_y_m,sigma_z_m [m]"
+_HEIGHT_MAX = 100.0  # [m] of a target above its mark
+_RIGID_TOLERANCE = 1e-6  # how far a rotation matrix may be from orthonormal
+
+_T = TypeVar("_T")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ControlLayout:
+    """How to read a table of control marks where it does not say so itself.
+
+    Attributes
+    ----------
+    axes : str
+        What three coordinates without names, or called x, y and z, are: ``enu`` (east, north, up),
+        ``neu`` or ``ned`` (down). Columns called easting, northing or the like say it themselves.
+    unit : str
+        Unit of coordinates and their sigmas: ``m``, ``mm``, ``ft`` or ``us-ft``.
+    target_height : float
+        Height of the centres above the given points, where a column of the table does not give it
+        mark by mark [m].
+    """
+
+    axes: str = "enu"
+    unit: str = "m"
+    target_height: float = 0.0
+
+    def __post_init__(self) -> None:
+        for what, value, known in (("axes", self.axes, _AXES), ("unit", self.unit, _UNITS)):
+            if value not in known:
+                raise ControlError(
+                    f"The {what} of the control table are given as {value!r}; known: "
+                    f"{', '.join(known)}."
+                )
+        if not abs(self.target_height) < _HEIGHT_MAX:
+            raise ControlError(
+                f"The target height is {self.target_height:g} m; it must be below {_HEIGHT_MAX:g}."
+            )
+
+
+_PLAIN = ControlLayout()
+
+
+def parse_control(text: str, layout: ControlLayout = _PLAIN) -> ControlMarks:
+    """Read a table of control marks.
+
+    Parameters
+    ----------
+    text : str
+        CSV with comma, semicolon or tab. Columns are found by their usual names in any order and
+        case (``P,N,E,Z,D`` too, whose last is a description); without a header they are mark, three
+        coordinates and, if there are seven, three sigmas, or a description if there are five. Empty
+        lines and what follows a ``#`` are skipped.
+    layout : ControlLayout
+        What the table does not say itself.
+
+    Returns
+    -------
+    ControlMarks
+        The marks in the order of the table; without sigmas they count as exact.
+
+    Raises
+    ------
+    ControlError
+        If a column is missing or unknown, a value is not a number, or two marks share a name or
+        a place.
+    """
+    if len(text) > _SIZE_MAX:
+        raise ControlError(
+            f"The control table has {len(text):,} characters; at most {_SIZE_MAX:,} are read."
+        )
+    rows = list(_rows(text))
+    if not rows:
+        raise ControlError(f"The control table is empty; {_EXPECTED}.")
+    columns, body = _columns(rows, layout.axes)
+    if not body:
+        raise ControlError(f"The control table has a header but no marks; {_EXPECTED}.")
+    if len(body) > _ROWS_MAX:
+        raise ControlError(f"The control table has more than {_ROWS_MAX:,} marks.")
+    return _marks([_Row(line=n, columns=columns, cells=cells) for n, cells in body], layout)
+
+
+def format_control(marks: ControlMarks) -> str:
+    """Return control marks as CSV text with the columns of ``CONTROL_COLUMNS``.
+
+    Parameters
+    ----------
+    marks : ControlMarks
+        Marks; of their covariances only the diagonal is written.
+
+    Returns
+    -------
+    str
+        The table; numbers as exact as they are.
+    """
+    sigmas = np.sqrt(np.diagonal(marks.cov_p_site, axis1=1, axis2=2))
+    lines = [",".join(CONTROL_COLUMNS)]
+    for name, p, sigma in zip(marks.names, marks.p_site.tolist(), sigmas.tolist(), strict=True):
+        lines.append(",".join([_quoted(name), *map(repr, (*p, *sigma))]))
+    return "\n".join(lines) + "\n"
+
+
+def parse_truth(text: str) -> Truth:
+    """Read the truth of a survey.
+
+    Parameters
+    ----------
+    text : str
+        JSON as ``format_truth`` writes it.
+
+    Returns
+    -------
+    Truth
+        True marks, stops and rig.
+
+    Raises
+    ------
+    TruthError
+        If it is not such a JSON object.
+    """
+    values = _object(text, TruthError, "The truth file")
+    if values.get("format") != TRUTH_FORMAT:
+        raise TruthError(
+            f"The truth file has the format {values.get('format')!r}; expected {TRUTH_FORMAT!r}."
+        )
+    try:
+        return _truth(values)
+    except (KeyError, TypeError, ValueError, AttributeError) as error:
+        raise TruthError(
+            f"The truth file does not hold what it should ({type(error).__name__}: {error}); "
+            "expected marks with name and position_m, and stops with name, position_m and "
+            "rotation_site_base."
+        ) from error
+
+
+def format_truth(truth: Truth) -> str:
+    """Return a truth as JSON text."""
+    values = {
+        "format": TRUTH_FORMAT,
+        "marks": [
+            {"name": name, "position_m": p}
+            for name, p in zip(truth.marks.names, truth.marks.p_site.tolist(), strict=True)
+        ],
+        "stops": [
+            {
+                "name": stop.name,
+                "position_m": stop.T_site_base[:3, 3].tolist(),
+                "rotation_site_base": stop.T_site_base[:3, :3].tolist(),
+            }
+            for stop in truth.stops
+        ],
+        "rig": None if truth.rig is None else rig_to_mapping(truth.rig),
+        "about": dict(truth.about),
+    }
+    return json.dumps(values, indent=1, allow_nan=False) + "\n"
+
+
+def parse_rig(text: str) -> Rig:
+    """Read a rig.
+
+    Parameters
+    ----------
+    text : str
+        JSON of a rig, or any JSON object that has one under the key ``rig``.
+
+    Returns
+    -------
+    Rig
+        The rig.
+
+    Raises
+    ------
+    RigError
+        If it is not such a JSON object.
+    """
+    values = _object(text, RigError, "The rig file")
+    inner = values.get("rig", values)
+    if not isinstance(inner, Mapping):
+        raise RigError(f"The rig file's rig is {inner!r}; it must be an object with T_head_lidar.")
+    return rig_from_mapping(inner)
+
+
+def format_rig(rig: Rig) -> str:
+    """Return a rig as JSON text.
+
+    Parameters
+    ----------
+    rig : Rig
+        The rig.
+
+    Returns
+    -------
+    str
+        Its mapping, as ``pipelines.scan.rigs`` defines it.
+    """
+    return json.dumps(rig_to_mapping(rig), indent=1, allow_nan=False) + "\n"
+
+
+def read_control(path: str | Path, layout: ControlLayout = _PLAIN) -> ControlMarks:
+    """Read control marks from a file, as ``parse_control`` does.
+
+    Parameters
+    ----------
+    path : str or Path
+        The file.
+    layout : ControlLayout
+        What the file does not say itself.
+
+    Returns
+    -------
+    ControlMarks
+        The marks.
+
+    Raises
+    ------
+    NotFoundError
+        If there is no such file.
+    ControlError
+        If it cannot be used.
+    """
+    return _read(path, lambda text: parse_control(text, layout), ControlError)
+
+
+def write_control(marks: ControlMarks, path: str | Path) -> None:
+    """Write control marks to a CSV file.
+
+    Parameters
+    ----------
+    marks : ControlMarks
+        The marks.
+    path : str or Path
+        The file; replaced if it exists.
+    """
+    Path(path).write_text(format_control(marks), encoding="utf-8")
+
+
+def read_truth(path: str | Path) -> Truth:
+    """Read the truth of a survey from a file, as ``parse_truth`` does.
+
+    Parameters
+    ----------
+    path : str or Path
+        The file.
+
+    Returns
+    -------
+    Truth
+        The truth.
+
+    Raises
+    ------
+    NotFoundError
+        If there is no such file.
+    TruthError
+        If it cannot be used.
+    """
+    return _read(path, parse_truth, TruthError)
+
+
+def write_truth(truth: Truth, path: str | Path) -> None:
+    """Write the truth of a survey to a JSON file.
+
+    Parameters
+    ----------
+    truth : Truth
+        The truth.
+    path : str or Path
+        The file; replaced if it exists.
+    """
+    Path(path).write_text(format_truth(truth), encoding="utf-8")
+
+
+def read_rig(path: str | Path) -> Rig:
+    """Read a rig from a file, as ``parse_rig`` does.
+
+    Parameters
+    ----------
+    path : str or Path
+        The file.
+
+    Returns
+    -------
+    Rig
+        The rig.
+
+    Raises
+    ------
+    NotFoundError
+        If there is no such file.
+    RigError
+        If it cannot be used.
+    """
+    return _read(path, parse_rig, RigError)
+
+
+def write_rig(rig: Rig, path: str | Path) -> None:
+    """Write a rig to a JSON file.
+
+    Parameters
+    ----------
+    rig : Rig
+        The rig.
+    path : str or Path
+        The file; replaced if it exists.
+    """
+    Path(path).write_text(format_rig(rig), encoding="utf-8")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _Row:
+    """One line of a control table."""
+
+    line: int
+    columns: Sequence[str]
+    cells: Sequence[str]
+
+    def __post_init__(self) -> None:
+        if len(self.cells) != len(self.columns):
+            raise ControlError(
+                f"Line {self.line} of the control table has {len(self.cells)} values and must "
+                f"have {len(self.columns)} ({', '.join(self.columns)}); {_EXPECTED}."
+            )
+
+    def number(self, column: str) -> float:
+        """Return the number in a column."""
+        cell = self.cells[self.columns.index(column)]
+        try:
+            number = float(cell)
+        except ValueError:
+            number = math.nan
+        if not abs(number) < _COORDINATE_MAX:
+            raise ControlError(
+                f"Line {self.line}, column {column} of the control table is {cell!r}; it must be "
+                f"a number of metres below {_COORDINATE_MAX:g}."
+            )
+        return number
+
+    def name(self) -> str:
+        """Return the name of the mark."""
+        name = self.cells[self.columns.index("mark")]
+        if not name:
+            raise ControlError(f"Line {self.line} of the control table has a mark without a name.")
+        return name
+
+    def position(self, layout: ControlLayout) -> list[float]:
+        """Return the place of the centre [m]."""
+        unit = _UNITS[layout.unit]
+        is_down = "down_m" in self.columns
+        x, y = unit * self.number("x_m"), unit * self.number("y_m")
+        z = unit * (-self.number("down_m") if is_down else self.number("z_m"))
+        height = layout.target_height
+        if "target_height_m" in self.columns:
+            height = unit * self.number("target_height_m")
+        return [x, y, z + height]
+
+    def sigmas(self) -> list[float]:
+        """Return the standard deviations of the coordinates [m]."""
+        if "sigma_m" in self.columns:
+            columns = ["sigma_m"] * 3
+        elif "sigma_x_m" in self.columns:
+            columns = ["sigma_x_m", "sigma_y_m", "sigma_z_m"]
+        else:
+            return [0.0, 0.0, 0.0]
+        sigmas = [self.number(column) for column in columns]
+        if min(sigmas) < 0.0:
+            raise ControlError(
+                f"Line {self.line}, column {columns[int(np.argmin(sigmas))]} of the control table "
+                f"is {min(sigmas):g}; a standard deviation cannot be negative."
+            )
+        return sigmas
+
+
+def _rows(text: str) -> Iterator[tuple[int, list[str]]]:
+    """Give number and cells of each line that holds something."""
+    lines = [_without_comment(line).strip() for line in text.lstrip("\ufeff").splitlines()]
+    first = next((line for line in lines if line), "")
+    separator = max("\t;,", key=first.count)
+    for number, line in enumerate(lines, start=1):
+        if line:
+            (cells,) = csv.reader([line], delimiter=separator)
+            yield number, [cell.strip() for cell in cells]
+
+
+def _without_comment(line: str) -> str:
+    """Return a line up to the first ``#`` that is not in quotes."""
+    found = re.match(r'(?:[^"#]|"[^"]*"?)*', line)
+    return found[0] if found else ""
+
+
+def _columns(
+    rows: list[tuple[int, list[str]]], axes: str
+) -> tuple[list[str], list[tuple[int, list[str]]]]:
+    """Return the names of the columns, and the rows below the header if there is one."""
+    first = rows[0][1]
+    if len(first) in (4, 5, 7) and all(_is_number(cell) for cell in first[1:4]):
+        sigmas = [f"sigma_{axis}" for axis in _AXES["neu" if axes == "ned" else axes]]
+        rest = {4: [], 5: ["note"], 7: sigmas}[len(first)]
+        return ["mark", *_AXES[axes], *rest], rows
+    columns = _named(first, axes)
+    _require_columns(columns, first)
+    return columns, rows[1:]
+
+
+def _named(header: list[str], axes: str) -> list[str]:
+    """Return what each column of a header is."""
+    words = [cell.lower() for cell in header]
+    columns = [_NAMES.get(word, "") for word in words]
+    unknown = [cell for cell, column in zip(header, columns, strict=True) if not column]
+    if unknown:
+        raise ControlError(
+            f"The control table has the unknown column {unknown[0]!r} ({', '.join(header)}); "
+            f"{_EXPECTED}."
+        )
+    if "z_m" in columns:  # a d beside a height is the description of P,N,E,Z,D
+        columns = ["note" if column == "down_m" else column for column in columns]
+    turned = dict(zip(("x", "y", "z"), _AXES[axes], strict=True))
+    if axes != "enu":
+        turned |= {"sigma_x": "sigma_y_m", "sx": "sigma_y_m"}
+        turned |= {"sigma_y": "sigma_x_m", "sy": "sigma_x_m"}
+    return [
+        turned.get(word.removesuffix("_m"), column)
+        for word, column in zip(words, columns, strict=True)
+    ]
+
+
+def _require_columns(columns: list[str], header: list[str]) -> None:
+    """Refuse a header that lacks something or has it twice."""
+    doubled = [column for column in columns if columns.count(column) > 1 and column != "note"]
+    third = "down_m" if "down_m" in columns else "z_m"
+    missing = [column for column in ("mark", "x_m", "y_m", third) if column not in columns]
+    sigmas = [column for column in columns if column.startswith("sigma")]
+    if sigmas not in ([], ["sigma_m"]) and sorted(sigmas) != list(CONTROL_COLUMNS[4:]):
+        missing += ["all three of sigma_x_m, sigma_y_m, sigma_z_m, or sigma_m alone"]
+    if doubled or missing:
+        fault = f"has {doubled[0]} twice" if doubled else f"lacks {missing[0]}"
+        raise ControlError(f"The control table {fault} ({', '.join(header)}); {_EXPECTED}.")
+
+
+def _is_number(cell: str) -> bool:
+    """Say whether a cell reads as a number, be it finite or not."""
+    try:
+        float(cell)
+    except ValueError:
+        return False
+    return True
+
+
+def _marks(rows: list[_Row], layout: ControlLayout) -> ControlMarks:
+    """Build the marks, all different in name and place."""
+    lines: dict[str, int] = {}
+    for row in rows:
+        if row.name() in lines:
+            raise ControlError(
+                f"Lines {lines[row.name()]} and {row.line} of the control table both name the mark "
+                f"{row.name()!r}; names must differ."
+            )
+        lines[row.name()] = row.line
+    p = np.array([row.position(layout) for row in rows])
+    sigmas = np.array([row.sigmas() for row in rows]) * _UNITS[layout.unit]
+    _require_apart(p, rows)
+    return ControlMarks(
+        names=tuple(lines), p_site=p, cov_p_site=sigmas[:, :, None] ** 2 * np.eye(3)
+    )
+
+
+def _require_apart(p: Array, rows: list[_Row]) -> None:
+    """Refuse two marks at one place; only neighbours in x can be."""
+    order = np.argsort(p[:, 0], kind="stable")
+    for step in range(1, len(p)):
+        near = p[order[step:], 0] - p[order[:-step], 0] < _APART_MIN
+        if not near.any():
+            return
+        apart = np.linalg.norm(p[order[step:]] - p[order[:-step]], axis=1)
+        if (apart < _APART_MIN).any():
+            place = int(np.argmin(apart))
+            first, second = sorted((int(order[place]), int(order[place + step])))
+            raise ControlError(
+                f"Lines {rows[first].line} and {rows[second].line} of the control table place "
+                f"{rows[first].name()!r} and {rows[second].name()!r} {apart[place] * 1e3:.1f} mm "
+                f"apart; marks must be at least {_APART_MIN * 1e3:.0f} mm apart."
+            )
+
+
+def _quoted(name: str) -> str:
+    """Return a name as a CSV cell."""
+    escaped = name.replace('"', '""')
+    return f'"{escaped}"' if any(mark in name for mark in ',;\t"#') else name
+
+
+def _truth(values: Mapping[str, Any]) -> Truth:
+    """Build the truth from a JSON object."""
+    names = tuple(str(mark["name"]) for mark in values["marks"])
+    p = np.array([_vector(mark["position_m"]) for mark in values["marks"]]).reshape(-1, 3)
+    stops = tuple(
+        StopTruth(
+            name=str(stop["name"]),
+            T_site_base=rigid(_rotation(stop["rotation_site_base"]), _vector(stop["position_m"])),
+        )
+        for stop in values["stops"]
+    )
+    for what, found in (("marks", names), ("stops", tuple(stop.name for stop in stops))):
+        if len(set(found)) < len(found):
+            raise ValueError(f"two {what} have one name")
+    rig = values.get("rig")
+    return Truth(
+        marks=ControlMarks(names=names, p_site=p, cov_p_site=np.zeros((len(names), 3, 3))),
+        stops=stops,
+        rig=None if rig is None else rig_from_mapping(rig),
+        about=dict(values.get("about") or {}),
+    )
+
+
+def _vector(values: ArrayLike) -> Array:
+    """Return a position."""
+    vector = np.array(values, np.float64)
+    if vector.shape != (3,) or not np.isfinite(vector).all():
+        raise ValueError(f"{values!r} is not a position of three numbers")
+    return vector
+
+
+def _rotation(values: ArrayLike) -> Array:
+    """Return a rotation matrix."""
+    R = np.array(values, np.float64)
+    if R.shape != (3, 3) or not np.abs(R @ R.T - np.eye(3)).max() < _RIGID_TOLERANCE:
+        raise ValueError("a rotation_site_base is not a rotation of three rows")
+    if np.linalg.det(R) < 0:
+        raise ValueError("a rotation_site_base is a reflection")
+    return R
+
+
+def _object(text: str, error_class: type[InputError], what: str) -> dict[str, Any]:
+    """Read a JSON object."""
+    try:
+        values = json.loads(text.lstrip("\ufeff"))
+    except (json.JSONDecodeError, RecursionError) as error:
+        raise error_class(f"{what} is not JSON: {error}.") from error
+    if not isinstance(values, dict):
+        raise error_class(f"{what} holds a {type(values).__name__}; it must be a JSON object.")
+    return values
+
+
+def _read(path: str | Path, parse: Callable[[str], _T], error_class: type[InputError]) -> _T:
+    """Read a text file and parse it."""
+    try:
+        text = Path(path).read_text(encoding="utf-8")
+    except FileNotFoundError as error:
+        raise NotFoundError(f"There is no file {path}.") from error
+    except UnicodeDecodeError as error:
+        raise error_class(f"{path} is not a text file in UTF-8: {error}.") from error
+    return parse(text)

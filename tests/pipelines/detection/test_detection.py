@@ -1,0 +1,172 @@
+"""Markers among what looks like them, in one small crowded world."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose
+
+from spheremark.pipelines.config import ExtractionConfig
+from spheremark.pipelines.detection import extract
+from spheremark.pipelines.detection.cells import cells_of
+from spheremark.pipelines.detection.ground import ground_of
+from spheremark.pipelines.geometry import levelling_rotation
+from spheremark.pipelines.model import RING_UNKNOWN, Levelling
+from tests.pipelines.synthetic_stop import RADIUS, World, ring_of_markers, scan
+
+CONFIG = ExtractionConfig()
+GROUND = -0.8
+MARKERS = np.vstack(
+    [
+        ring_of_markers(),
+        [[13.9, 1.4, 0.3], [4.8, 17.3, 0.3]],  # 35 and 20 returns
+        [[2.9, -1.6, GROUND + 0.45]],  # lower than the study's, and near
+    ]
+)
+POST, SLIM = (3.0, 3.0, GROUND), (-4.0, -3.0, GROUND)  # ends of posts of radius 0.1 and 0.03 m
+BIG, SMALL = (-1.5, 4.5, 0.2), (2.0, 5.0, 0.1)  # balls of radius 0.16 and 0.06 m
+PERCHED = (5.5, -3.0, GROUND + 0.2)  # a stone of a marker's own size, half a radius off the ground
+
+
+@pytest.fixture(scope="module")
+def cloud():
+    rng = np.random.default_rng(1)
+    phi, d = rng.uniform(0, 2 * np.pi, 250), rng.uniform(3, 20, 250)
+    radii = np.minimum(rng.exponential(0.12, 250) + 0.03, 0.5)
+    z = GROUND + radii * rng.uniform(-0.2, 0.8, 250)
+    stones = np.column_stack([d * np.cos(phi), d * np.sin(phi), z])
+    # a stone in front of or upon a marker would be a different test
+    azimuths = np.arctan2(MARKERS[:, 1], MARKERS[:, 0])
+    off = np.abs((phi[:, None] - azimuths + np.pi) % (2 * np.pi) - np.pi) * d[:, None]
+    clear = off.min(axis=1) > radii + 0.35
+    world = World(
+        balls=(*((tuple(p), RADIUS) for p in MARKERS), (BIG, 0.16), (SMALL, 0.06)),
+        boulders=(
+            *((tuple(p), r) for p, r in zip(stones[clear], radii[clear], strict=True)),
+            (PERCHED, RADIUS),
+        ),
+        posts=((POST, 0.1, 1.4), (SLIM, 0.03, 1.0)),
+        ground=GROUND,
+    )
+    return scan(world, rng, sigma=0.01)
+
+
+@pytest.fixture(scope="module")
+def found(cloud):
+    return extract(cloud, CONFIG, RADIUS)
+
+
+def gaps(found, places):
+    """Distance from each candidate to the nearest of some places."""
+    rough = np.array([c.p_base_rough for c in found.candidates])
+    return np.linalg.norm(rough[:, None] - np.atleast_2d(places)[None], axis=2)
+
+
+def test_every_marker_is_found_and_nothing_else(found):
+    assert_allclose(gaps(found, MARKERS).min(axis=0), 0, atol=0.025)
+    assert len(found.candidates) == len(MARKERS)
+
+
+def test_candidates_come_in_the_order_of_azimuth(found):
+    rough = np.array([c.p_base_rough for c in found.candidates])
+    assert (np.diff(np.arctan2(rough[:, 1], rough[:, 0])) > 0).all()
+
+
+def test_no_marker_loses_points_to_the_ground(cloud, found):
+    for candidate in found.candidates:
+        gap = np.linalg.norm(cloud.p_base - candidate.p_base_rough, axis=1)
+        on_it = np.flatnonzero(np.abs(gap - RADIUS) < 0.03)
+        assert np.isin(on_it, candidate.members).all()
+        assert (np.diff(candidate.members) > 0).all()
+
+
+def test_scores_are_between_hardly_and_surely(found):
+    scores = np.array([c.score for c in found.candidates])
+    assert ((scores >= 0) & (scores <= 1)).all()
+    assert np.median(scores) > 0.7
+
+
+@pytest.mark.parametrize(
+    ("place", "words"),
+    [
+        ((*POST[:2], GROUND + 1.3), "free|pole|curved|radius"),
+        ((*SLIM[:2], GROUND + 0.9), "slim|free|curved"),
+        (BIG, "radius|free"),
+        (SMALL, "radius"),
+    ],
+)
+def test_what_looks_like_a_marker_is_refused_with_a_reason(found, place, words):
+    near = [r for r in found.rejected if np.linalg.norm(r.p_base - place) < 0.2]
+    assert near
+    assert any(word in near[0].reason for word in words.split("|"))
+
+
+def test_a_ball_of_another_size_is_no_marker(found):
+    assert gaps(found, [BIG, SMALL]).min() > 0.3
+
+
+def test_the_highest_ground_is_that_of_the_plane(found):
+    # low stones count as ground: their tops are cut by the study's method too
+    assert GROUND < found.ground_height_max < GROUND + CONFIG.ground_clearance
+
+
+def test_rings_and_times_are_not_needed(cloud, found):
+    bare = replace(
+        cloud,
+        rings=np.full(len(cloud.rings), RING_UNKNOWN, np.uint8),
+        times=np.zeros_like(cloud.times),
+        intensities=np.zeros_like(cloud.intensities),
+    )
+    again = extract(bare, CONFIG, RADIUS)
+    for one, two in zip(found.candidates, again.candidates, strict=True):
+        assert_allclose(two.p_base_rough, one.p_base_rough, rtol=0, atol=0)
+
+
+def test_the_order_of_returns_does_not_matter(cloud, found):
+    mixed = np.random.default_rng(2).permutation(len(cloud.p_base))
+    names = ("p_base", "gimbal_angles", "intensities", "rings", "times")
+    other = replace(cloud, **{name: getattr(cloud, name)[mixed] for name in names})
+    again = extract(other, CONFIG, RADIUS)
+    assert_allclose(gaps(again, MARKERS).min(axis=0), 0, atol=0.025)
+    for one, two in zip(found.candidates, again.candidates, strict=True):
+        assert np.array_equal(np.sort(mixed[two.members]), one.members)
+
+
+def test_a_leaning_base_changes_nothing():
+    lean = Levelling(roll=0.08, pitch=-0.05, sigma=1e-3, is_measured=True)
+    places = ring_of_markers(n=5)
+    world = World(balls=tuple((tuple(p), RADIUS) for p in places), ground=GROUND)
+    found = extract(scan(world, np.random.default_rng(3), levelling=lean), CONFIG, RADIUS)
+    rough = np.array([c.p_base_rough for c in found.candidates])
+    level = rough @ levelling_rotation(lean).T
+    assert len(level) == 5
+    assert np.linalg.norm(level[:, None] - places[None], axis=2).min(axis=0).max() < 0.025
+
+
+def test_a_marker_in_the_air_with_no_ground_in_sight_is_kept(cloud):
+    near = np.linalg.norm(cloud.p_base - MARKERS[5], axis=1) < 0.3
+    names = ("p_base", "gimbal_angles", "intensities", "rings", "times")
+    alone = replace(cloud, **{name: getattr(cloud, name)[near] for name in names})
+    found = extract(alone, CONFIG, RADIUS)
+    assert len(found.candidates) == 1
+    assert found.ground_height_max == -np.inf
+
+
+def test_an_empty_cloud_has_no_markers(cloud):
+    names = ("p_base", "gimbal_angles", "intensities", "rings", "times")
+    empty = replace(cloud, **{name: getattr(cloud, name)[:0] for name in names})
+    found = extract(empty, CONFIG, RADIUS)
+    assert found.candidates == ()
+    assert found.rejected == ()
+
+
+def test_the_ground_is_the_same_however_its_rows_are_shared_out(cloud, monkeypatch):
+    cells = cells_of(cloud, CONFIG)
+    rough = GROUND + np.random.default_rng(5).normal(0.0, 0.1, cells.lowest.shape)
+    lowest = np.where(cells.lowest < np.inf, rough, np.inf).astype(np.float32)
+    cells = cells._replace(lowest=lowest, highest=lowest)
+    shared = ground_of(cloud, cells, CONFIG)
+    monkeypatch.setattr("spheremark.pipelines.detection.ground._N_WORTH", cells.layout.n_side + 1)
+    whole = ground_of(cloud, cells, CONFIG)
+    np.testing.assert_array_equal(shared.points_above, whole.points_above)
+    assert shared.height_max == whole.height_max

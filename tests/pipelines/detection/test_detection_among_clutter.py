@@ -1,0 +1,178 @@
+"""Precision and recall of extraction in worlds that the simulator has made."""
+
+import re
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from spheremark.pipelines.config import ExtractionConfig, StitchingConfig
+from spheremark.pipelines.detection import extract
+from spheremark.pipelines.evaluation.detection import DETECTION_PLAN, detection
+from spheremark.pipelines.scan.stitching import choose_rig, stitch
+from spheremark.pipelines.simulation import SimulationConfig, simulate_stop
+from spheremark.pipelines.simulation.lane import range_lane
+from tests.pipelines.synthetic_stop import RADIUS, World, ring_of_markers, scan
+
+COLUMNS = ("p_base", "gimbal_angles", "intensities", "rings", "times")
+
+
+@pytest.fixture(scope="module")
+def few():
+    world = World(balls=tuple((tuple(p), RADIUS) for p in ring_of_markers(n=5)), ground=-0.8)
+    return scan(world, np.random.default_rng(5))
+
+
+def near(places):
+    gaps = np.linalg.norm(places[:, None] - ring_of_markers(n=5)[None], axis=2)
+    return gaps.min(axis=0) < 0.03
+
+
+def rough(found):
+    return np.array([c.p_base_rough for c in found.candidates]).reshape(-1, 3)
+
+
+def test_returns_that_are_none_change_nothing(few):
+    p = np.vstack([few.p_base, np.full((50, 3), np.nan), np.full((50, 3), np.inf)])
+    p[-1] = (3.0, np.nan, 0.0)
+    columns = {name: np.append(getattr(few, name), np.zeros(100)) for name in COLUMNS[1:]}
+    columns = {k: v.astype(getattr(few, k).dtype) for k, v in columns.items()}
+    spoilt = replace(few, p_base=p.astype(np.float32), **columns)
+    again = extract(spoilt, ExtractionConfig(), RADIUS)
+    np.testing.assert_array_equal(rough(again), rough(extract(few, ExtractionConfig(), RADIUS)))
+
+
+def test_markers_are_found_without_any_ground(few):
+    high = few.p_base[:, 2] > -0.60
+    alone = replace(few, **{name: getattr(few, name)[high] for name in COLUMNS})
+    found = extract(alone, ExtractionConfig(), RADIUS)
+    assert near(rough(found)).all()
+
+
+def test_a_marker_half_of_which_is_hidden_is_found(few):
+    place = ring_of_markers(n=5)[0]
+    side = np.cross([0.0, 0.0, 1.0], place)
+    hidden = (few.p_base @ side > 0.0) & (few.p_base @ place > 0.8 * place @ place)
+    half = replace(few, **{name: getattr(few, name)[~hidden] for name in COLUMNS})
+    assert near(rough(extract(half, ExtractionConfig(), RADIUS)))[0]
+
+
+def aside(cloud, place):
+    """How far to a side of a centre each beam passes, in radii; far for those behind."""
+    side = np.cross([0.0, 0.0, 1.0], place)
+    along = cloud.p_base @ place
+    passes = (cloud.p_base @ (side / np.linalg.norm(side))) / along * (place @ place) / RADIUS
+    return np.where(along > 0.0, passes, -np.inf)
+
+
+@pytest.mark.parametrize(("seen_to", "is_found"), [(0.5, True), (0.0, True), (-0.5, False)])
+def test_a_marker_at_the_edge_of_a_partial_turn_is_found_if_half_of_it_is_seen(
+    few, seen_to, is_found
+):
+    place = ring_of_markers(n=5)[0]
+    seen = aside(few, place) <= seen_to
+    found = extract(
+        replace(few, **{name: getattr(few, name)[seen] for name in COLUMNS}),
+        ExtractionConfig(),
+        RADIUS,
+    )
+    assert near(rough(found))[0] == is_found
+    refused = [r.reason for r in found.rejected if np.linalg.norm(r.p_base - place) < 2 * RADIUS]
+    assert bool(refused) != is_found
+    assert all("slim" in reason for reason in refused)
+
+
+def test_a_marker_most_of_which_is_behind_something_is_refused_with_a_reason(few):
+    place = ring_of_markers(n=5)[0]
+    passes, p = aside(few, place), few.p_base.copy()
+    is_behind = (passes > -0.4) & (passes < 2.0)  # 70 % of its width
+    p[is_behind] *= 0.5
+    found = extract(replace(few, p_base=p), ExtractionConfig(), RADIUS)
+    assert not near(rough(found))[0]
+    assert any(np.linalg.norm(r.p_base - place) < 2 * RADIUS for r in found.rejected)
+    assert near(rough(found))[1:].all()
+
+
+@pytest.mark.parametrize("towards", ["left", "right", "up", "down"])
+def test_a_marker_with_a_part_behind_something_nearer_is_found_beside_its_whole_ground(
+    few, towards
+):
+    place = ring_of_markers(n=5)[0]  # four radii above the ground, which most beams still reach
+    turn = {"left": (-1.0, 0.0), "right": (1.0, 0.0), "up": (0.0, 1.0), "down": (0.0, -1.0)}
+    p = few.p_base.astype(np.float64)
+    distance = np.linalg.norm(place)
+    side = np.cross([0.0, 0.0, 1.0], place)
+    side /= np.linalg.norm(side)
+    up = np.cross(place, side) / distance
+    passes = (
+        np.column_stack([p @ side, p @ up]) * (distance / (p @ place) * distance / RADIUS)[:, None]
+    )
+    is_near = (p @ place > 0.0) & (np.hypot(*passes.T) < 1.5)
+    for hidden_from in (0.5, 0.1):  # radii from its middle: a fifth of its disc, and 44 %
+        is_behind = is_near & (passes @ turn[towards] > hidden_from)
+        q = few.p_base.copy()
+        q[is_behind] *= 0.5 * distance / np.linalg.norm(p[is_behind], axis=1)[:, None]
+        found = extract(replace(few, p_base=q), ExtractionConfig(), RADIUS)
+        assert near(rough(found)).all()
+        assert len(found.candidates) == 5
+
+
+@pytest.mark.parametrize(("dimmed", "is_found"), [(1.0, True), (0.4, False)])
+def test_what_nothing_shows_a_pole_of_must_be_painted_as_the_markers(few, dimmed, is_found):
+    place = ring_of_markers(n=5)[0]
+    own = np.linalg.norm(few.p_base - place, axis=1) < 1.5 * RADIUS
+    height = few.p_base[:, 2] / np.linalg.norm(few.p_base, axis=1)
+    is_below = height < place[2] / np.linalg.norm(place)
+    left = own | ~(is_below & (np.abs(aside(few, place)) < 4.0))  # against the sky
+    painted = np.where(own, dimmed, 1.0) * few.intensities
+    cloud = replace(few, intensities=painted.astype(few.intensities.dtype))
+    found = extract(
+        replace(cloud, **{name: getattr(cloud, name)[left] for name in COLUMNS}),
+        ExtractionConfig(),
+        RADIUS,
+    )
+    assert near(rough(found))[0] == is_found
+    refused = [r.reason for r in found.rejected if np.linalg.norm(r.p_base - place) < 2 * RADIUS]
+    assert any("reflectivity" in reason for reason in refused) != is_found
+
+
+@pytest.mark.slow
+def test_a_stepped_scan_takes_no_crest_for_a_marker():
+    found = detection(
+        {"paper-field": DETECTION_PLAN["clutter-field"]},
+        (930, 931),
+        SimulationConfig(step=np.radians(5.0)),
+    )
+    assert found.n_false["paper-field"] == 0
+    # a ball that one line of a stepped scan meets at its limb alone shows no shape
+    assert found.recall("paper-field", 0) > 0.97
+
+
+@pytest.mark.slow
+def test_markers_are_found_and_nothing_else_in_worlds_of_clutter():
+    found = detection(DETECTION_PLAN, (22,), SimulationConfig())
+    assert found.recall("clutter-field", 0) > 0.97
+    assert found.recall("rock-field", 0) == 1.0
+    assert found.recall("range-lane", 0) == 1.0
+    assert found.recall("range-lane", 1) > 0.7
+    assert found.n_false["rock-field"] == found.n_false["range-lane"] == 0
+    assert found.worst["clutter-field"] <= 1
+    assert all(sum(t.reasons.values()) == t.n - t.n_found for t in found.tallies)
+    assert not any(re.search(r"\d", reason) for t in found.tallies for reason in t.reasons)
+
+
+def test_far_balls_of_the_right_size_are_not_refused_for_their_size():
+    """Of 20 to 60 returns, beams as wide as half a radius: size is told badly, and not surely."""
+    n_lost = n_balls = 0
+    for seed in range(940, 944):
+        world = range_lane(seed, np.array([12.5, 15.0, 17.5]), 30)
+        simulated = simulate_stop(
+            world, "centre", SimulationConfig(only_near_spheres=True, sigma_range=0.02)
+        )
+        cloud = stitch(simulated.log, choose_rig(simulated.log, None), StitchingConfig())
+        found = extract(cloud, ExtractionConfig(), world.marker_radius)
+        reasons = [rejection.reason for rejection in found.rejected]
+        n_lost += sum(reason.startswith("Its own radius") for reason in reasons)
+        n_balls += len(found.candidates)
+    assert n_balls > 350
+    assert n_lost <= 1

@@ -1,0 +1,275 @@
+import numpy as np
+import pytest
+from scipy.stats import chi2, norm
+
+from spheremark.pipelines.errors import (
+    DegenerateGeometryError,
+    NotConvergedError,
+    TooFewObservationsError,
+)
+from spheremark.pipelines.estimation.least_squares import (
+    Observations,
+    adjust,
+    external_reliabilities,
+    snoop,
+    solve,
+)
+
+LEVELS = {"test_level": 0.001, "test_power": 0.80}
+
+
+@pytest.fixture
+def rng():
+    return np.random.default_rng(5)
+
+
+def covariances(rng, k, m):
+    roots = rng.normal(size=(k, m, m))
+    return roots @ np.swapaxes(roots, 1, 2) + 0.1 * np.eye(m)
+
+
+def line(rng, n=12, noise=1.0):
+    """Straight line through n correlated pairs of readings: linear, two unknowns."""
+    design = np.stack([np.ones(2 * n), np.linspace(-1, 1, 2 * n)], axis=1).reshape(n, 2, 2)
+    cov = covariances(rng, n, 2)
+    errors = np.stack([rng.multivariate_normal(np.zeros(2), Q) for Q in cov])
+    return design, design @ [3.0, -2.0] + noise * errors, cov
+
+
+def linear(design, readings, cov):
+    def linearise(x):
+        # computed = design x, so residual = reading - design x
+        return (Observations(residuals=readings - design @ x, J=-design, cov=cov),)
+
+    return linearise
+
+
+def add(x, step):
+    return x + step
+
+
+def dense(design, readings, cov):
+    """The textbook: one big design matrix, one big covariance, written out."""
+    n, m, p = design.shape
+    full = np.zeros((n * m, n * m))
+    for k in range(n):
+        full[m * k : m * k + m, m * k : m * k + m] = cov[k]
+    weights = np.linalg.inv(full)
+    design, y = design.reshape(-1, p), readings.ravel()
+    cov_x = np.linalg.inv(design.T @ weights @ design)
+    x = cov_x @ design.T @ weights @ y
+    v = y - design @ x
+    return x, cov_x, v, weights, full - design @ cov_x @ design.T
+
+
+def test_estimate_and_statistics_are_those_of_the_textbook(rng):
+    problem = line(rng)
+    result = adjust(linear(*problem), add, np.zeros(2), **LEVELS)
+    x, cov_x, v, weights, cov_v = dense(*problem)
+    np.testing.assert_allclose(result.estimate, x, rtol=1e-9)
+    np.testing.assert_allclose(result.cov, cov_x, rtol=1e-9)
+    assert result.dof == 22
+    assert result.vtpv == pytest.approx(v @ weights @ v)
+    assert result.sigma0 == pytest.approx(np.sqrt(v @ weights @ v / 22))
+    assert result.passes_global_test == (chi2.sf(v @ weights @ v, 22) >= 0.001)
+    np.testing.assert_allclose(
+        result.redundancies, np.diag(cov_v @ weights).reshape(-1, 2).sum(axis=1), rtol=1e-8
+    )
+    tested = weights @ cov_v @ weights
+    w = np.abs(weights @ v) / np.sqrt(np.diag(tested))
+    np.testing.assert_allclose(result.w_statistics, w.reshape(-1, 2).max(axis=1), rtol=1e-8)
+    assert result.noncentrality**2 == pytest.approx(17.07, abs=0.01)  # Baarda's table
+    for k in range(12):
+        weakest = np.linalg.eigvalsh(tested[2 * k : 2 * k + 2, 2 * k : 2 * k + 2])[0]
+        assert result.detectable_biases[k] == pytest.approx(np.sqrt(17.075 / weakest), rel=1e-3)
+
+
+def test_redundancies_add_up_to_the_degrees_of_freedom(rng):
+    result = adjust(linear(*line(rng)), add, np.zeros(2), **LEVELS)
+    assert result.redundancies.sum() == pytest.approx(result.dof)
+
+
+def test_scaling_all_sigmas_scales_the_covariance_by_the_square(rng):
+    design, readings, cov = line(rng)
+    one = adjust(linear(design, readings, cov), add, np.zeros(2), **LEVELS)
+    ten = adjust(linear(design, readings, 100 * cov), add, np.zeros(2), **LEVELS)
+    np.testing.assert_allclose(ten.estimate, one.estimate, rtol=1e-9)
+    np.testing.assert_allclose(ten.cov, 100 * one.cov, rtol=1e-9)
+    assert ten.sigma0 == pytest.approx(one.sigma0 / 10)
+
+
+def test_no_unseen_bias_moves_the_estimate_farther_than_external_reliability_says(rng):
+    design, readings, cov = line(rng, noise=0.0)
+    result = adjust(linear(design, readings, cov), add, np.zeros(2), **LEVELS)
+    limits = external_reliabilities(result, np.eye(2))
+    _, _, _, weights, cov_v = dense(design, readings, cov)
+    tested = weights @ cov_v @ weights
+    for k in range(12):
+        block = tested[2 * k : 2 * k + 2, 2 * k : 2 * k + 2]
+        shifts = []
+        for turn in np.linspace(0, np.pi, 181):
+            direction = np.array([np.cos(turn), np.sin(turn)])
+            bias = direction * result.noncentrality / np.sqrt(direction @ block @ direction)
+            wrong = readings.copy()
+            wrong[k] += bias
+            x, *_ = dense(design, wrong, cov)
+            shifts.append(np.linalg.norm(x - result.estimate))
+        assert max(shifts) == pytest.approx(limits[k], rel=2e-3)
+        assert max(shifts) <= limits[k] * (1 + 1e-9)
+
+
+@pytest.mark.slow
+def test_the_detectable_bias_is_found_with_the_promised_power(rng):
+    design, _, cov = line(rng)
+    found = 0
+    trials = 3000
+    for _ in range(trials):
+        errors = np.stack([rng.multivariate_normal(np.zeros(2), Q) for Q in cov])
+        readings = design @ [3.0, -2.0] + errors
+        result = adjust(linear(design, readings, cov), add, np.zeros(2), **LEVELS)
+        _, _, _, weights, cov_v = dense(design, readings, cov)
+        values, vectors = np.linalg.eigh((weights @ cov_v @ weights)[:2, :2])
+        readings[0] += vectors[:, 0] * result.detectable_biases[0]
+        _, _, v, _, _ = dense(design, readings, cov)
+        w = vectors[:, 0] @ (weights @ v)[:2] / np.sqrt(values[0])
+        found += abs(w) > norm.ppf(0.9995)
+    assert found / trials == pytest.approx(0.80, abs=0.03)
+
+
+def test_global_test_and_w_tests_reject_good_data_at_their_level(rng):
+    design, _, cov = line(rng)
+    levels = {"test_level": 0.05, "test_power": 0.8}
+    roots = np.linalg.cholesky(cov)
+    results = []
+    for _ in range(600):
+        errors = np.einsum("kij,kj->ki", roots, rng.normal(size=(12, 2)))
+        results.append(adjust(linear(design, errors, cov), add, np.zeros(2), **levels))
+    assert np.mean([not r.passes_global_test for r in results]) == pytest.approx(0.05, abs=0.03)
+    exceeded = np.mean([r.w_statistics > r.critical_w for r in results])
+    assert 0.05 < exceeded < 0.10  # the larger of two correlated tests at 5 %
+
+
+def test_an_observation_without_redundancy_is_said_to_be_untestable():
+    design = np.array([[[1.0, 0.0]], [[1.0, 0.0]], [[0.0, 1.0]]])
+    readings = np.array([[1.0], [1.1], [5.0]])
+    result = adjust(linear(design, readings, np.ones((3, 1, 1))), add, np.zeros(2), **LEVELS)
+    np.testing.assert_allclose(result.redundancies, [0.5, 0.5, 0.0], atol=1e-12)
+    assert np.isnan(result.w_statistics[2])
+    assert np.isinf(result.detectable_biases[2])
+    assert np.isinf(external_reliabilities(result, np.eye(2))[2])
+    assert np.all(np.isfinite(result.detectable_biases[:2]))
+
+
+def test_without_redundancy_nothing_is_tested():
+    design, readings = np.eye(2)[:, None], np.array([[1.0], [2.0]])
+    result = adjust(linear(design, readings, np.ones((2, 1, 1))), add, np.zeros(2), **LEVELS)
+    np.testing.assert_allclose(result.estimate, [1, 2])
+    assert result.dof == 0
+    assert result.passes_global_test
+    assert np.isnan(result.sigma0)
+
+
+def test_many_problems_are_solved_at_once_as_one_by_one(rng):
+    problems = [line(rng) for _ in range(5)]
+    design, readings, cov = (np.stack(part) for part in zip(*problems, strict=True))
+
+    def linearise(x):
+        residuals = readings - np.einsum("bkmp,bp->bkm", design, x)
+        return (Observations(residuals=residuals, J=-design, cov=cov),)
+
+    together = solve(linearise, add, np.zeros((5, 2)))
+    for k, problem in enumerate(problems):
+        x, cov_x, *_ = dense(*problem)
+        np.testing.assert_allclose(together.estimate[k], x, rtol=1e-9)
+        np.testing.assert_allclose(together.cov[k], cov_x, rtol=1e-9)
+
+
+def test_a_curved_problem_is_solved_from_afar():
+    towers = np.array([[0.0, 0.0], [10.0, 0.0], [3.0, 9.0]])
+    truth = np.array([4.0, 3.0])
+    ranges = np.linalg.norm(towers - truth, axis=1)
+
+    def linearise(p):
+        v = p - towers
+        computed = np.linalg.norm(v, axis=1)
+        J = -(v / computed[:, None])[:, None, :]
+        return (
+            Observations(residuals=(ranges - computed)[:, None], J=J, cov=np.full((3, 1, 1), 1e-4)),
+        )
+
+    result = adjust(linearise, add, np.array([8.0, 8.0]), **LEVELS)
+    np.testing.assert_allclose(result.estimate, truth, rtol=0, atol=1e-9)
+
+
+def test_snooping_finds_the_bad_ones_and_keeps_the_good(rng):
+    design, readings, cov = line(rng, n=20)
+    readings[4] += 30 * np.sqrt(np.diagonal(cov[4]))
+    readings[11] -= 20 * np.sqrt(np.diagonal(cov[11]))
+
+    def kept(keep):
+        return adjust(linear(design[keep], readings[keep], cov[keep]), add, np.zeros(2), **LEVELS)
+
+    result, keep, dropped = snoop(kept, 20, lambda _keep, _block: True)
+    assert {block for block, _ in dropped} == {4, 11}
+    assert all(w > result.critical_w for _, w in dropped)
+    np.testing.assert_array_equal(np.flatnonzero(~keep), [4, 11])
+    assert result.passes_global_test
+
+
+def test_a_good_reading_that_bad_ones_made_look_bad_is_taken_back():
+    n, bad = 8, [0, 1, 3]
+    design = np.stack([np.ones(n), np.linspace(0.0, 1.0, n)], axis=1)[:, None]
+    readings, cov = design @ np.array([1.0, 2.0]), np.full((n, 1, 1), 1e-4)
+    readings[bad, 0] += [-0.8, 0.5, 0.5]
+    tried = []
+
+    def kept(keep):
+        tried.append(set(np.flatnonzero(~keep)))
+        return adjust(linear(design[keep], readings[keep], cov[keep]), add, np.zeros(2), **LEVELS)
+
+    result, keep, dropped = snoop(kept, n, lambda _keep, _block: True)
+    assert {0, 1, 2, 3} in tried  # the third, good one was out in between
+    assert sorted(block for block, _ in dropped) == bad
+    np.testing.assert_array_equal(np.flatnonzero(~keep), bad)
+    np.testing.assert_allclose(result.estimate, [1.0, 2.0], atol=1e-9)
+
+
+def test_snooping_keeps_what_may_not_be_dropped(rng):
+    design, readings, cov = line(rng, n=6)
+    readings[2] += 100
+
+    def kept(keep):
+        return adjust(linear(design[keep], readings[keep], cov[keep]), add, np.zeros(2), **LEVELS)
+
+    result, keep, dropped = snoop(kept, 6, lambda _keep, _block: False)
+    assert keep.all()
+    assert dropped == ()
+    assert not result.passes_global_test
+
+
+def test_an_unknown_that_nothing_touches_is_refused():
+    design = np.array([[[1.0, 0.0]], [[1.0, 0.0]]])
+    with pytest.raises(DegenerateGeometryError, match="touch"):
+        adjust(linear(design, np.ones((2, 1)), np.ones((2, 1, 1))), add, np.zeros(2), **LEVELS)
+
+
+def test_unknowns_that_cannot_be_told_apart_are_refused():
+    design = np.array([[[1.0, 1.0]], [[2.0, 2.0]], [[3.0, 3.0]]])
+    with pytest.raises(DegenerateGeometryError, match="undetermined"):
+        adjust(linear(design, np.ones((3, 1)), np.ones((3, 1, 1))), add, np.zeros(2), **LEVELS)
+
+
+def test_fewer_observations_than_unknowns_are_refused(rng):
+    design = rng.normal(size=(1, 1, 2))
+    with pytest.raises(TooFewObservationsError, match="1 observations cannot determine 2"):
+        adjust(linear(design, np.ones((1, 1)), np.ones((1, 1, 1))), add, np.zeros(2), **LEVELS)
+
+
+def test_steps_that_do_not_settle_are_refused():
+    def linearise(x):
+        root = np.sign(x) * np.sqrt(np.abs(x))  # Newton's steps jump between -x and x
+        slope = 0.5 / np.sqrt(np.abs(x))
+        return (Observations(residuals=root[None], J=slope[None, :, None], cov=np.eye(1)[None]),)
+
+    with pytest.raises(NotConvergedError, match="50 steps"):
+        solve(linearise, add, np.array([1.0]))

@@ -1,0 +1,83 @@
+"""Centres of scans whose two faces do not sample a sphere alike, with a mounting that is wrong."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose
+
+from spheremark.pipelines.accuracy import marker_errors
+from spheremark.pipelines.config import SurveyConfig
+from spheremark.pipelines.geometry import rot_z
+from spheremark.pipelines.simulation import SimulationConfig, scenario, simulate_stop
+from spheremark.pipelines.sphere.faces import N_MOUNTING, effects_on, sigmas_of
+from spheremark.pipelines.survey import process
+
+CONFIG = SurveyConfig.from_mapping({"fitting": {"methods": ["along_beam"]}})
+STEPPED = SimulationConfig(step=np.radians(2.0), only_near_spheres=True)
+
+
+@pytest.fixture(scope="module")
+def field():
+    return scenario("paper-field", 71)
+
+
+@pytest.fixture(scope="module")
+def stops(field):
+    return [simulate_stop(field, name, STEPPED) for name in ("lane2-stop3", "lane4-stop6")]
+
+
+def across(stops, marks, config):
+    """Lateral and upward errors of centres after heading and lean are taken out, and sigmas [m]."""
+    found = []
+    for stop in stops:
+        fits = process(stop.log, config=config)[0].fits["along_beam"]
+        errors = marker_errors(fits, stop.truth, marks)
+        p = np.array([fit.p_base for fit in fits.fits])
+        flat = np.hypot(p[:, 0], p[:, 1])
+        aside = np.stack([-p[:, 1] / flat, p[:, 0] / flat, 0 * flat], axis=1)
+        lateral = np.einsum("ni,ni->n", aside, errors.error_base)
+        covs = np.array([fit.cov_p_base for fit in fits.fits])
+        sigma = np.sqrt(np.einsum("ni,nij,nj->n", aside, covs, aside))
+        known = np.isfinite(lateral)
+        turn = np.sum(lateral * flat / sigma**2, where=known) / np.sum(
+            (flat / sigma) ** 2, where=known
+        )
+        found.append(np.stack([lateral - turn * flat, sigma])[:, known])
+    return np.concatenate(found, axis=1)
+
+
+def test_the_mounting_moves_faces_square_to_the_sight_or_by_the_offsets():
+    centres = np.array([[5.0, 2.0, 0.5], [-3.0, 7.0, -1.0]])
+    effects = effects_on(centres)
+    assert effects.shape == (2, 3, N_MOUNTING)
+    for k in (0, 1, 3, 4, 5):
+        assert_allclose(np.einsum("mi,mi->m", effects[:, :, k], centres), 0, atol=1e-12)
+    distances = np.linalg.norm(centres, axis=1)
+    assert_allclose(np.linalg.norm(effects[:, :, 0], axis=1), distances)
+    assert_allclose(np.linalg.norm(effects[:, :, 1], axis=1), distances)
+    assert_allclose(effects[:, 2, 2], 0)
+    assert_allclose(
+        np.hypot(*np.linalg.norm(effects[:, :, 4:], axis=1).T), np.hypot(*centres[:, :2].T)
+    )
+
+
+def test_turning_the_base_turns_the_effects_and_mixes_the_amplitudes_of_the_encoder():
+    centres, R = np.array([[5.0, 2.0, 0.5]]), rot_z(0.7)
+    turned, plain = effects_on(centres @ R.T), effects_on(centres)
+    assert_allclose(turned[0, :, :4], R @ plain[0, :, :4], atol=1e-12)
+    assert_allclose(turned[0, :, 4:], R @ plain[0, :, 4:] @ R[:2, :2].T, atol=1e-12)
+
+
+def test_a_mounting_that_is_taken_as_exact_has_no_sigma():
+    assert not sigmas_of(0.0, 0.0).any()
+
+
+def test_lines_of_rests_that_fall_together_give_centres_as_good_as_promised(field, stops):
+    errors, sigmas = across(stops, field.marks, CONFIG)
+    assert len(errors) > 20
+    assert np.mean((errors / sigmas) ** 2) < 2.0
+    trusting = replace(CONFIG.fitting, sigma_mounting=0.0, sigma_offset=0.0)
+    before, promised = across(stops, field.marks, replace(CONFIG, fitting=trusting))
+    assert np.mean((before / promised) ** 2) > 3.0
+    assert np.mean(errors**2) < 0.5 * np.mean(before**2)

@@ -1,0 +1,1 @@
+"""Plotly figures: from columns, named and in the units of the database."""

@@ -1,0 +1,177 @@
+"""The map of a field: marks, stations, and their ellipses with the true places, enlarged alike."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+import plotly.graph_objects as go
+from numpy.typing import NDArray
+
+from spheremark.web import theme
+from spheremark.web.figures.survey import (
+    Columns,
+    blank_figure,
+    by_method,
+    details,
+    floats,
+    known_values,
+    largest,
+    texts,
+)
+
+_MM = 1e3  # [mm/m]
+_ELLIPSE_SHARE = 0.08  # the largest ellipse is drawn at most this large, as a share of the field
+
+
+def site_map(marks: Columns, fixes: Columns, true_stops: Columns) -> go.Figure:
+    """Draw marks, stations and their 95 % ellipses, exaggerated alike with the true places."""
+    figure = blank_figure("Field, stations and 95 % ellipses")
+    factor = ellipse_factor(marks, fixes)
+    _add_marks(figure, marks)
+    for method, rows in by_method(fixes):
+        _add_stations(figure, method, rows, factor, true_stops)
+    figure.update_xaxes(title_text="x, site [m]", constrain="domain")
+    figure.update_yaxes(title_text="y, site [m]", scaleanchor="x", scaleratio=1)
+    if factor:
+        what = "ellipses and errors" if len(true_stops["stop"]) else "ellipses"
+        add_note(figure, f"{what} \N{MULTIPLICATION SIGN}{factor:g}")
+    return figure
+
+
+def ellipse_factor(marks: Columns, fixes: Columns) -> float:
+    """Return by how much ellipses are enlarged: 1, 2 or 5 times a power of ten; 0 for none."""
+    widest = largest(floats(fixes, "ellipse_major_95_m"))
+    across = [
+        np.ptp(known) if len(known) else 0.0
+        for axis in ("x_m", "y_m")
+        for known in [known_values(np.concatenate([floats(marks, axis), floats(fixes, axis)]))]
+    ]
+    if not widest or not max(across):
+        return 0.0
+    wanted = _ELLIPSE_SHARE * float(max(across)) / widest
+    power = 10.0 ** np.floor(np.log10(wanted))
+    return float(power * max(step for step in (1, 2, 5) if step * power <= wanted))
+
+
+def ellipse_outline(
+    fixes: Columns, i: int, factor: float, *, size: str = "_95"
+) -> NDArray[np.float64]:
+    """Return the outline of an ellipse, enlarged; the bearing is from y to x.
+
+    ``size`` is ``_95`` for the 95 % ellipse, nothing for the standard one.
+    """
+    turn = np.linspace(0.0, 2.0 * np.pi, 61)
+    major = factor * floats(fixes, f"ellipse_major{size}_m")[i] * np.cos(turn)
+    minor = factor * floats(fixes, f"ellipse_minor{size}_m")[i] * np.sin(turn)
+    bearing = np.radians(floats(fixes, "ellipse_bearing_deg")[i])
+    x = floats(fixes, "x_m")[i] + major * np.sin(bearing) + minor * np.cos(bearing)
+    y = floats(fixes, "y_m")[i] + major * np.cos(bearing) - minor * np.sin(bearing)
+    return np.column_stack([x, y])
+
+
+def _add_marks(figure: go.Figure, marks: Columns) -> None:
+    """Draw the control marks with their names."""
+    figure.add_scatter(
+        x=floats(marks, "x_m"),
+        y=floats(marks, "y_m"),
+        mode="markers+text",
+        name="control mark",
+        text=texts(marks, "mark"),
+        textposition="top center",
+        textfont={"size": 11, "color": theme.MUTED},
+        marker={"color": theme.MARK, "size": 10, "symbol": "circle-cross-open"},
+        cliponaxis=False,
+        customdata=floats(marks, "z_m").tolist(),
+        hovertemplate="<b>%{text}</b><br>x %{x:.3f} m<br>y %{y:.3f} m<br>z %{customdata:.3f} m"
+        "<extra>control mark</extra>",
+    )
+
+
+def _add_stations(
+    figure: go.Figure, method: str, rows: Columns, factor: float, true_stops: Columns
+) -> None:
+    """Draw the stations of one method with their ellipses and, enlarged alike, their errors."""
+    style = theme.method_style(method)
+    x, y = floats(rows, "x_m"), floats(rows, "y_m")
+    about = details(rows, ("stop", "status"), ("sigma_3d_m", "error_3d_m", "n_markers", "z_m"))
+    figure.add_scatter(
+        x=x,
+        y=y,
+        mode="markers",
+        name=style.label,
+        legendgroup=style.label,
+        marker={"color": style.colour, "size": 6, "symbol": style.symbol},
+        customdata=[[row[0], row[1], row[2] * _MM, row[4], row[5]] for row in about],
+        hovertemplate="<b>%{customdata[0]}</b> %{customdata[1]}<br>x %{x:.3f} m<br>y %{y:.3f} m<br>"
+        "z %{customdata[4]:.3f} m<br>sigma %{customdata[2]:.1f} mm, %{customdata[3]:.0f} marks"
+        f"<extra>{style.label}</extra>",
+    )
+    outlines = [ellipse_outline(rows, i, factor) for i in range(len(x))]
+    _add_strokes(figure, outlines, style, dash="solid", width=1.5)
+    _add_strokes(figure, _errors(rows, true_stops, factor), style, dash="solid", width=1)
+
+
+def _errors(rows: Columns, true_stops: Columns, factor: float) -> list[NDArray[np.float64]]:
+    """Return a line from each station towards its true place, enlarged like the ellipses."""
+    truth = dict(
+        zip(
+            texts(true_stops, "stop"),
+            zip(floats(true_stops, "x_m"), floats(true_stops, "y_m"), strict=True),
+            strict=True,
+        )
+    )
+    lines = []
+    for stop, x, y in zip(
+        texts(rows, "stop"), floats(rows, "x_m"), floats(rows, "y_m"), strict=True
+    ):
+        if stop in truth:
+            start = np.array([x, y])
+            lines.append(np.stack([start, start + factor * (np.array(truth[stop]) - start)]))
+    return lines
+
+
+def _add_strokes(
+    figure: go.Figure,
+    strokes: Sequence[NDArray[np.float64]],
+    style: theme.MethodStyle,
+    *,
+    dash: str,
+    width: float,
+) -> None:
+    """Draw many lines as one trace."""
+    if not strokes:
+        return
+    joined = joined_strokes(strokes)
+    figure.add_scatter(
+        x=joined[:, 0],
+        y=joined[:, 1],
+        mode="lines",
+        legendgroup=style.label,
+        showlegend=False,
+        line={"color": style.colour, "width": width, "dash": dash},
+        hoverinfo="skip",
+    )
+
+
+def joined_strokes(strokes: Sequence[NDArray[np.float64]]) -> NDArray[np.float64]:
+    """Return many lines as one with gaps, (n, 2)."""
+    gap = np.full((1, 2), np.nan)
+    parts = [part for stroke in strokes for part in (stroke, gap)]
+    return np.concatenate(parts) if parts else gap
+
+
+def add_note(figure: go.Figure, text: str) -> None:
+    """Write a remark into the lower right corner."""
+    figure.add_annotation(
+        text=text,
+        x=1,
+        y=0,
+        xref="x domain",
+        yref="y domain",
+        xanchor="right",
+        yanchor="bottom",
+        showarrow=False,
+        font={"size": 12, "color": theme.MUTED},
+        bgcolor=theme.RAISED,
+    )

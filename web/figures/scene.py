@@ -1,0 +1,306 @@
+"""One stop in space: its cloud, the fitted spheres, and how far each return is from its sphere."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import plotly.graph_objects as go
+from numpy.typing import NDArray
+
+from spheremark.pipelines.model import Array, Column, Index
+from spheremark.web import theme
+from spheremark.web.figures.survey import Columns, floats, on_marks, select, texts
+
+_MM = 1e3  # [mm/m]
+_CELLS = (0.15, 0.2, 0.3, 0.4)  # [m]; of the surroundings one return is shown in each cell
+_N_SHOWN = 30_000  # returns of the surroundings; more makes a browser without a GPU slow
+_MARGIN = 2.0  # [m] of surroundings shown beyond the farthest marker that stands on a mark
+_REACH = 1.3  # returns within so many radii of a centre are shown with it
+_LEAST = 8.0  # [m] that a scene shows at least, before the margin
+_COLOUR_SIGMAS = 3.0  # the colours of residuals end here
+_N_MERIDIANS, _N_PARALLELS = 18, 8  # of a drawn sphere
+
+
+@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
+class Scan:
+    """What was kept of a stop's cloud: points in the station frame and the markers they made.
+
+    ``markers`` is the place of a point's marker in ``names``, or negative; ``residuals`` are along
+    the beam, by the method ``fit_method``, in metres, and NaN where there is none.
+    """
+
+    p_station: Column
+    markers: Index
+    residuals: Column
+    names: tuple[str, ...]
+    fit_method: str
+
+
+@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
+class MarkerReturns:
+    """The returns about one sphere, their residuals, and whether the fit used them."""
+
+    p_station: Array
+    residuals: Array
+    is_used: NDArray[np.bool_]
+
+
+def stop_scene(scan: Scan, fits: Columns, rejections: Columns) -> go.Figure:
+    """Draw a stop: surroundings by height, spheres, and returns coloured by their residual."""
+    figure = _figure_3d(f"Scan, spheres and {_what(scan, fits).lower()}")
+    reach = _reach(fits)
+    fits = select(fits, floats(fits, "range_m") <= reach)
+    shown = scan.p_station[_surroundings(scan, reach)]
+    figure.add_scatter3d(
+        **_xyz(shown),
+        mode="markers",
+        name="surroundings",
+        marker={"size": 1.6, "color": shown[:, 2], "colorscale": theme.HEIGHTS},
+        hoverinfo="skip",
+    )
+    returns = [marker_returns(scan, fits, i) for i in range(len(fits["marker"]))]
+    if returns:
+        _add_returns(figure, returns, floats(fits, "rms_m"), _what(scan, fits), size=2.5)
+        _add_labels(figure, fits)
+    _add_rejections(figure, rejections)
+    return figure
+
+
+def marker_close_up(scan: Scan, fits: Columns, i: int) -> go.Figure:
+    """Draw one marker from near: its sphere, and its returns coloured by their residual."""
+    name, mark = texts(fits, "marker")[i], texts(fits, "mark")[i]
+    figure = _figure_3d(f"Marker {name}{f' on mark {mark}' if mark else ''} and its returns")
+    _add_sphere(figure, _centre(fits, i), float(floats(fits, "radius_m")[i]))
+    returns = marker_returns(scan, fits, i)
+    _add_left_out(figure, returns)
+    _add_returns(figure, [returns], floats(fits, "rms_m")[[i]], _what(scan, fits), size=5)
+    towards = -_centre(fits, i) / np.linalg.norm(_centre(fits, i))
+    eye = 1.7 * towards + np.array([0.5 * towards[1], -0.5 * towards[0], 0.5])
+    figure.update_scenes(camera_eye=dict(zip("xyz", eye.tolist(), strict=True)))
+    return figure
+
+
+def marker_residuals(scan: Scan, fits: Columns, i: int) -> go.Figure:
+    """Draw the residuals of one marker's returns across the sphere, with their sigma."""
+    returns = marker_returns(scan, fits, i)
+    sigma_mm = float(floats(fits, "rms_m")[i]) * _MM
+    style = theme.method_style(texts(fits, "fit_method")[i])
+    figure = go.Figure(
+        layout={
+            "template": theme.template(),
+            "title": {"text": f"{_what(scan, fits)} of marker {texts(fits, 'marker')[i]}"},
+        }
+    )
+    figure.add_hrect(y0=-sigma_mm, y1=sigma_mm, fillcolor=style.band, line_width=0, layer="below")
+    figure.add_hline(y=0, line={"color": theme.LINE, "width": 1}, layer="below")
+    across = _across(returns.p_station - _centre(fits, i), _centre(fits, i))
+    figure.add_scatter(
+        x=across[returns.is_used] * _MM,
+        y=returns.residuals[returns.is_used] * _MM,
+        mode="markers",
+        name=f"return; band: ±sigma, {sigma_mm:.1f} mm",
+        showlegend=True,
+        marker={"color": style.colour, "size": 6, "opacity": 0.7, "symbol": style.symbol},
+        hovertemplate="%{y:.1f} mm at %{x:.0f} mm<extra></extra>",
+    )
+    figure.update_xaxes(title_text="Right of the line of sight [mm]")
+    figure.update_yaxes(title_text=f"{_what(scan, fits)} [mm]")
+    return figure
+
+
+def marker_returns(scan: Scan, fits: Columns, i: int) -> MarkerReturns:
+    """Return what the LiDAR saw of one fitted sphere and close about it."""
+    centre, radius = _centre(fits, i), float(floats(fits, "radius_m")[i])
+    members = _within(scan.p_station, centre, _REACH * radius)
+    p_station = scan.p_station[members].astype(np.float64)
+    name = texts(fits, "marker")[i]
+    if _is_along_beam(scan, fits) and name in scan.names:
+        own = scan.markers[members] == scan.names.index(name)
+        residuals = np.where(own, scan.residuals[members].astype(np.float64), np.nan)
+    else:
+        residuals = np.linalg.norm(p_station - centre, axis=1) - radius
+    return MarkerReturns(p_station=p_station, residuals=residuals, is_used=np.isfinite(residuals))
+
+
+def _is_along_beam(scan: Scan, fits: Columns) -> bool:
+    """Whether the residuals that were kept with the cloud are those of these fits."""
+    return set(texts(fits, "fit_method")) <= {scan.fit_method}
+
+
+def _what(scan: Scan, fits: Columns) -> str:
+    """Return what the colours of returns mean."""
+    return "Residual along the beam" if _is_along_beam(scan, fits) else "Distance from the sphere"
+
+
+def _across(p: Array, centre: Array) -> Array:
+    """Return how far points are to the right of the line of sight [m]."""
+    right = np.array([centre[1], -centre[0]]) / np.hypot(centre[0], centre[1])
+    return np.asarray(p[:, :2] @ right)
+
+
+def _within(p: NDArray[np.float32], centre: Array, reach: float) -> Index:
+    """Return the points within reach of a place."""
+    near = np.flatnonzero(np.abs(p[:, 0] - np.float32(centre[0])) < reach)
+    distances = np.linalg.norm(p[near] - centre, axis=1)
+    return np.asarray(near[distances < reach], dtype=np.intp)
+
+
+def _reach(fits: Columns) -> float:
+    """Return how far a scene goes: beyond the farthest fit that stands on a mark [m]."""
+    return float(np.max(floats(fits, "range_m")[on_marks(fits)], initial=_LEAST)) + _MARGIN
+
+
+def _surroundings(scan: Scan, reach: float) -> Index:
+    """Choose one return in each cell of space, in the finest grid that keeps few enough."""
+    is_near = np.linalg.norm(scan.p_station, axis=1) < reach
+    near = np.flatnonzero(is_near & (scan.markers < 0))
+    chosen = near
+    for cell in _CELLS:
+        cells = np.floor(scan.p_station[near] / cell).astype(np.int64) + 1000
+        keys = (cells[:, 0] * 10_000 + cells[:, 1]) * 10_000 + cells[:, 2]
+        chosen = near[np.unique(keys, return_index=True)[1]]
+        if len(chosen) <= _N_SHOWN:
+            break
+    return np.asarray(chosen, dtype=np.intp)
+
+
+def _figure_3d(title: str) -> go.Figure:
+    """Return an empty scene with equal axes in the station frame."""
+    axes = {
+        f"{axis}axis": {"title": {"text": f"{axis}, station [m]"}, "nticks": 6} for axis in "xyz"
+    }
+    figure = go.Figure(layout={"template": theme.template(), "title": {"text": title}})
+    figure.update_layout(
+        scene={
+            **axes,
+            "aspectmode": "data",
+            "camera": {
+                "eye": {"x": 0.95, "y": -1.1, "z": 0.7},
+                "center": {"x": 0, "y": 0, "z": -0.1},
+            },
+            "dragmode": "turntable",
+        },
+        margin={"l": 0, "r": 0, "t": 36, "b": 0},
+    )
+    return figure
+
+
+def _add_returns(
+    figure: go.Figure,
+    returns: list[MarkerReturns],
+    rms: NDArray[np.float64],
+    what: str,
+    *,
+    size: float,
+) -> None:
+    """Draw the returns that fits used, coloured by residual: too near, right, too far."""
+    residuals_mm = np.concatenate([one.residuals[one.is_used] for one in returns]) * _MM
+    end = max(1.0, float(np.ceil(_COLOUR_SIGMAS * np.nanmedian(rms) * _MM)))
+    figure.add_scatter3d(
+        **_xyz(np.concatenate([one.p_station[one.is_used] for one in returns])),
+        mode="markers",
+        name="returns of markers",
+        customdata=residuals_mm,
+        hovertemplate="%{customdata:.1f} mm<extra></extra>",
+        marker={
+            "size": size,
+            "color": residuals_mm,
+            "colorscale": theme.DIVERGING,
+            "cmin": -end,
+            "cmax": end,
+            "colorbar": {
+                "title": {"text": f"{what} [mm], to ±{_COLOUR_SIGMAS:g} sigma", "side": "right"},
+                "thickness": 10,
+                "len": 0.7,
+                "outlinewidth": 0,
+                "tickfont": {"family": theme.MONO, "size": 11},
+            },
+        },
+    )
+
+
+def _add_left_out(figure: go.Figure, returns: MarkerReturns) -> None:
+    """Draw the returns near a sphere that its fit did not use."""
+    figure.add_scatter3d(
+        **_xyz(returns.p_station[~returns.is_used]),
+        mode="markers",
+        name="left out: pole, edges",
+        hoverinfo="skip",
+        marker={"size": 4, "color": theme.FAINT, "symbol": "cross"},
+    )
+
+
+def _add_labels(figure: go.Figure, fits: Columns) -> None:
+    """Draw the centres with their names."""
+    style = theme.method_style(texts(fits, "fit_method")[0])
+    centres = np.column_stack([floats(fits, f"{axis}_m") for axis in "xyz"])
+    names = zip(texts(fits, "marker"), texts(fits, "mark"), strict=True)
+    figure.add_scatter3d(
+        **_xyz(centres),
+        mode="markers+text",
+        name=f"centres, {style.label}",
+        text=[f"{marker} · {mark}" if mark else marker for marker, mark in names],
+        textposition="top center",
+        textfont={"size": 11, "color": theme.TEXT},
+        marker={"size": 5, "color": style.colour, "symbol": "circle-open"},
+        customdata=np.column_stack([floats(fits, "range_m"), floats(fits, "n_points")]),
+        hovertemplate="<b>%{text}</b><br>%{customdata[0]:.2f} m, %{customdata[1]:.0f} returns"
+        "<extra></extra>",
+    )
+
+
+def _add_rejections(figure: go.Figure, rejections: Columns) -> None:
+    """Draw what was rejected, with the reason."""
+    if not len(rejections["reason"]):
+        return
+    figure.add_scatter3d(
+        **_xyz(np.column_stack([floats(rejections, f"{axis}_m") for axis in "xyz"])),
+        mode="markers",
+        name="rejected",
+        visible="legendonly",
+        text=texts(rejections, "reason"),
+        hovertemplate="%{text}<extra>rejected</extra>",
+        marker={"size": 4, "color": theme.MUTED, "symbol": "cross"},
+    )
+
+
+def _add_sphere(figure: go.Figure, centre: Array, radius: float) -> None:
+    """Draw a sphere as its graticule."""
+    turn = np.linspace(0.0, 2.0 * np.pi, 73)
+    half = np.linspace(-np.pi / 2.0, np.pi / 2.0, 37)
+    lines = [
+        _on_sphere(np.full(len(half), longitude), half)
+        for longitude in np.linspace(0.0, 2.0 * np.pi, _N_MERIDIANS, endpoint=False)
+    ]
+    lines += [
+        _on_sphere(turn, np.full(len(turn), latitude))
+        for latitude in np.linspace(-np.pi / 2.0, np.pi / 2.0, _N_PARALLELS + 2)[1:-1]
+    ]
+    gap = np.full((1, 3), np.nan)
+    joined = np.concatenate([part for line in lines for part in (line, gap)])
+    figure.add_scatter3d(
+        **_xyz(centre + radius * joined),
+        mode="lines",
+        name="sphere",
+        line={"color": theme.CLOUD, "width": 1.5},
+        hoverinfo="skip",
+    )
+
+
+def _on_sphere(longitudes: Array, latitudes: Array) -> Array:
+    """Return points on the unit sphere, (n, 3)."""
+    level = np.cos(latitudes)
+    return np.column_stack(
+        [level * np.cos(longitudes), level * np.sin(longitudes), np.sin(latitudes)]
+    )
+
+
+def _centre(fits: Columns, i: int) -> Array:
+    """Return the centre of one fit in the station frame, (3,) [m]."""
+    return np.array([floats(fits, f"{axis}_m")[i] for axis in "xyz"])
+
+
+def _xyz(p: NDArray[np.floating]) -> dict[str, NDArray[np.float32]]:
+    """Return points as the columns that Plotly takes, no finer than one can see."""
+    return {axis: np.asarray(p[:, i], dtype=np.float32) for i, axis in enumerate("xyz")}

@@ -1,0 +1,1 @@
+"""Pages: from rows of the catalogue to HTML, through the templates."""

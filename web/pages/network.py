@@ -1,0 +1,167 @@
+"""The page of an adjusted network: what surveyors look for in a report, in that order."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from spheremark.web.figures import network as figures
+from spheremark.web.figures.survey import Columns, floats, has_errors, select
+from spheremark.web.pages.readouts import Readout
+from spheremark.web.pages.results import Frame, Panel, plain_rows
+from spheremark.web.templating import number, render
+
+Row = Mapping[str, Any]
+_MM = 1e3  # [mm/m]
+_N_WORST = 40  # observations in the table of the page; all are in the database and in the files
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class AdjustmentPage:
+    """An adjusted network with all that belongs to it."""
+
+    frame: Frame
+    adjustment: Row
+    stations: Columns
+    marks: Columns
+    observations: Columns
+    checks: Columns
+    repeats: tuple[Row, ...]
+    refused: tuple[Row, ...]
+    files: tuple[str, ...]
+
+
+def adjustment_page(page: AdjustmentPage) -> str:
+    """Return the page of a network."""
+    centres = select(page.observations, page.observations["kind"] == "centre")
+    return render(
+        "adjustment.html",
+        page,
+        here="survey",
+        readouts=_readouts(page),
+        panels=_panels(page, centres),
+        station_rows=plain_rows(page.stations),
+        mark_rows=plain_rows(page.marks),
+        worst=_worst(plain_rows(page.observations)),
+        n_worst=_N_WORST,
+        left_out=[row for row in plain_rows(page.observations) if not row["used"]],
+        n_centres=len(centres["kind"]),
+        has_truth=has_errors(page.stations),
+    )
+
+
+def _readouts(page: AdjustmentPage) -> tuple[Readout, ...]:
+    """Return the few numbers that judge a network."""
+    one = page.adjustment
+    verdict = "passes" if one["passes_global_test"] else "fails"
+    a_posteriori = None if one["sigma0"] is None else one["sigma0"] ** 2
+    found = [
+        Readout(
+            label="Global test",
+            value=verdict,
+            unit="",
+            note=f"v'Pv {number(one['vtpv'], 1)}, limit {number(one['vtpv_limit'], 1)} "
+            f"(chi-square, one-sided, level {one['test_level']:g})",
+        ),
+        Readout(
+            label="Variance factor",
+            value=number(a_posteriori, 3),
+            unit="a posteriori",
+            note=f"1 a priori; sigma0 {number(one['sigma0'], 3)}",
+        ),
+        Readout(
+            label="Degrees of freedom",
+            value=str(one["dof"]),
+            unit="",
+            note=f"{one['n_observations']} observations, {one['n_unknowns']} unknowns",
+        ),
+        _sizes("Stations", page.stations, page),
+        _sizes("Marks", page.marks, page),
+    ]
+    if len(page.checks["mark"]):
+        found.append(_left_out(page.checks))
+    return tuple(found)
+
+
+def _sizes(what: str, rows: Columns, page: AdjustmentPage) -> Readout:
+    """Say how good stations or marks are: against truth where it is known, else as predicted."""
+    sigma, error = floats(rows, "sigma_3d_m"), floats(rows, "error_3d_m")
+    known = error[np.isfinite(error)]
+    largest = f"largest {number(float(sigma.max()) * _MM, 2)} mm"
+    if not len(known):
+        return Readout(
+            label=f"{what}, predicted",
+            value=number(_rms(sigma) * _MM, 2),
+            unit="mm RMS sigma",
+            note=f"{largest}; truth not known",
+        )
+    laid = ", after it was laid on the truth" if page.adjustment["datum"] == "free" else ""
+    return Readout(
+        label=f"{what}, against truth",
+        value=number(_rms(known) * _MM, 2),
+        unit="mm RMS error",
+        note=f"predicted {number(_rms(sigma) * _MM, 2)} mm RMS, {largest}{laid}",
+    )
+
+
+def _left_out(checks: Columns) -> Readout:
+    """Say how near the network comes to control marks that it was not given."""
+    difference, sigma = floats(checks, "difference_3d_m"), floats(checks, "sigma_3d_m")
+    worst = int(difference.argmax())
+    largest = f"largest {number(float(difference[worst]) * _MM, 1)} mm at {checks['mark'][worst]}"
+    return Readout(
+        label="Control left out in turn",
+        value=number(_rms(difference) * _MM, 2),
+        unit="mm RMS",
+        note=f"predicted minus given; sigma {number(_rms(sigma) * _MM, 2)} mm, {largest}",
+    )
+
+
+def _rms(values: Any) -> float:
+    """Return the root mean square."""
+    return float(np.sqrt(np.mean(np.square(values))))
+
+
+def _panels(page: AdjustmentPage, centres: Columns) -> tuple[Panel, ...]:
+    """Return the figures of a network."""
+    panels = [
+        Panel(
+            name="map",
+            figure=figures.network_map(page.stations, page.marks),
+            caption="Solid: the ellipse that holds the place in 95 of 100 cases; dotted: the "
+            "standard one (39 of 100). The fill is the mean redundancy of the centres: 0 is "
+            "unchecked, 3 is wholly checked by the others.",
+        ),
+        Panel(
+            name="residuals",
+            figure=figures.residuals(centres),
+            caption="Along the axes of the network; crosses are left out.",
+        ),
+        Panel(
+            name="tests",
+            figure=figures.tests(
+                select(centres, np.isfinite(floats(centres, "w"))), page.adjustment["w_limit"]
+            ),
+            caption="A centre above the limit would be a gross error. Far left, gross errors "
+            "could hide: the detectable bias grows.",
+        ),
+    ]
+    if len(page.checks["mark"]):
+        panels.append(
+            Panel(
+                name="checks",
+                figure=figures.control_differences(page.checks),
+                caption="Where the network puts each mark without its coordinates; bars are twice "
+                "the sigma of the difference.",
+            )
+        )
+    return tuple(panels)
+
+
+def _worst(observations: list[dict[str, Any]]) -> list[dict[str, Any]]:
+    """Return the centres that say most: those left out, then by the size of their test."""
+    centres = [row for row in observations if row["kind"] == "centre"]
+    return sorted(centres, key=lambda row: (row["used"], -(row["w"] or 0.0)))[:_N_WORST]

@@ -1,0 +1,85 @@
+"""The few numbers that matter, as a person reads them at a glance."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from spheremark.pipelines.accuracy import ErrorSummary, summarise
+from spheremark.web import theme
+from spheremark.web.figures.survey import Columns, by_method, floats, has_errors, on_marks, select
+from spheremark.web.templating import number
+
+_MM = 1e3  # [mm/m]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Readout:
+    """A number that matters, with its unit and what it means."""
+
+    label: str
+    value: str
+    unit: str
+    note: str
+    method: str = ""
+
+
+def headline(fits: Columns, fixes: Columns, tolerance_m: float) -> tuple[Readout, ...]:
+    """Return the few numbers that matter: centres and stations, each method, and the sigma."""
+    readouts = []
+    for method, rows in by_method(fits):
+        real = on_marks(rows)
+        n_others = int(np.count_nonzero(~real))
+        readouts.append(
+            _quality("Centres", method, select(rows, real), tolerance_m, n_others=n_others)
+        )
+    for method, rows in by_method(fixes):
+        readouts.append(_quality("Stations", method, rows, tolerance_m))
+    ours = [rows for method, rows in by_method(fits) if method == "along_beam"]
+    return (*readouts, *(_predicted(rows) for rows in ours if has_errors(rows)))
+
+
+def _quality(
+    what: str, method: str, rows: Columns, tolerance_m: float, *, n_others: int = 0
+) -> Readout:
+    """Return the error of one method against truth; without truth its predicted sigma."""
+    style = theme.method_style(method)
+    is_error = has_errors(rows)
+    summary = summarise(floats(rows, "error_3d_m" if is_error else "sigma_3d_m"), tolerance_m)
+    return Readout(
+        label=f"{what}, {style.label}",
+        value=number(summary.rms * _MM, 1),
+        unit="mm RMS error" if is_error else "mm predicted sigma",
+        note=_share(summary, tolerance_m, is_error=is_error)
+        + (f"; {n_others} on no mark" if n_others else ""),
+        method=method,
+    )
+
+
+def _share(summary: ErrorSummary, tolerance_m: float, *, is_error: bool) -> str:
+    """Say how many are within the tolerance, and how large the largest is."""
+    if not summary.n:
+        return "none yet"
+    within = round(summary.share_within * summary.n)
+    what = "within" if is_error else "with a sigma within"
+    return (
+        f"{within} of {summary.n} {what} {tolerance_m * _MM:g} mm, "
+        f"largest {summary.largest * _MM:.1f} mm"
+    )
+
+
+def _predicted(rows: Columns) -> Readout:
+    """Say what our sigma promised, and how that compares with the error."""
+    error, sigma = floats(rows, "error_3d_m"), floats(rows, "sigma_3d_m")
+    known = np.isfinite(error)
+    sigma_rms = float(np.sqrt(np.mean(sigma[known] ** 2)))
+    ratio = float(np.sqrt(np.mean(error[known] ** 2))) / sigma_rms if sigma_rms else math.nan
+    return Readout(
+        label="Centres, predicted by us",
+        value=number(sigma_rms * _MM, 1),
+        unit="mm sigma",
+        note=f"error over sigma {ratio:.2f}; 1 is honest",
+        method="along_beam",
+    )

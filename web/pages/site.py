@@ -1,0 +1,169 @@
+"""The page of a site: its ground with what stands on it, and the files to take away."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import plotly.graph_objects as go
+from numpy.typing import NDArray
+
+from spheremark.pipelines.ground_model import ElevationModel
+from spheremark.web import theme
+from spheremark.web.figures.survey import Columns, blank_figure, floats, texts
+from spheremark.web.pages.results import Frame, Panel
+from spheremark.web.templating import render
+
+_CELLS_MAX = 400  # cells along an edge that a picture shows
+_SUN = (np.radians(315.0), np.radians(40.0))  # azimuth, clockwise from y, and height of the light
+_STEEPER = 3.0  # times that slopes are shaded
+_TAIL = 0.02  # share of the cells below and above the colours: a mound does not take them all
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SitePage:
+    """What was made of all stops of a survey, newest first, and its newest ground."""
+
+    frame: Frame
+    survey: str
+    products: tuple[Mapping[str, Any], ...]
+    model: ElevationModel | None
+    marks: Columns
+    stations: Columns
+    jobs: tuple[str, ...]
+
+
+def site_page(page: SitePage) -> str:
+    """Return the page of a site."""
+    panels = []
+    if page.model is not None:
+        panels = [
+            Panel(
+                name="ground",
+                figure=ground_figure(page.model, page.marks, page.stations),
+                caption="Mean height of the ground in each cell; rocks, poles and markers are "
+                "taken off. Blank cells were not seen.",
+                kind="tall",
+            ),
+            Panel(
+                name="sigma",
+                figure=sigma_figure(page.model, page.marks, page.stations),
+                caption="Standard deviation of those heights, in steps of the same ratio: noise "
+                "and grazing beams, poses, roughness, and what lies in shadow.",
+                kind="tall",
+            ),
+        ]
+    return render("site.html", page, here="surveys", panels=panels)
+
+
+def ground_figure(model: ElevationModel, marks: Columns, stations: Columns) -> go.Figure:
+    """Draw heights as colours and their slopes as shade, with stations and marks."""
+    step = _step(model)
+    heights = _thinned(model.heights, step)
+    figure = blank_figure("Ground of the site")
+    xs, ys = model.xs[::step], model.ys[::step]
+    bar = {"title": {"text": "Height [m]", "side": "right"}, "thickness": 12, "outlinewidth": 0}
+    figure.add_heatmap(
+        x=xs,
+        y=ys,
+        z=np.round(heights, 4),
+        zmin=float(np.nanquantile(heights, _TAIL)),
+        zmax=float(np.nanquantile(heights, 1.0 - _TAIL)),
+        colorscale=list(theme.HEIGHTS),
+        colorbar=bar,
+        hovertemplate="x %{x:.2f} m, y %{y:.2f} m<br>height %{z:.3f} m<extra></extra>",
+    )
+    figure.add_heatmap(
+        x=xs,
+        y=ys,
+        z=np.round(hillshade(heights, model.cell * step), 2),
+        colorscale=[
+            [0.0, "rgba(0,0,0,0.55)"],
+            [0.5, "rgba(0,0,0,0)"],
+            [1.0, "rgba(255,255,255,0.45)"],
+        ],
+        zmin=0.0,
+        zmax=1.0,
+        showscale=False,
+        hoverinfo="skip",
+    )
+    return _with_places(figure, marks, stations)
+
+
+def sigma_figure(model: ElevationModel, marks: Columns, stations: Columns) -> go.Figure:
+    """Draw how sure each height is."""
+    step = _step(model)
+    sigmas = 1e3 * _thinned(model.sigmas, step)
+    figure = blank_figure("How sure the ground is")
+    ticks = [value for value in (0.5, 1, 2, 5, 10, 20, 50, 100, 200) if _spans(sigmas, value)]
+    bar = {
+        "title": {"text": "Sigma [mm]", "side": "right"},
+        "thickness": 12,
+        "outlinewidth": 0,
+        "tickvals": np.log10(ticks),
+        "ticktext": [f"{value:g}" for value in ticks],
+    }
+    figure.add_heatmap(
+        x=model.xs[::step],
+        y=model.ys[::step],
+        z=np.round(np.log10(sigmas), 3),
+        customdata=np.round(sigmas, 1),
+        colorscale=list(theme.HEIGHTS),
+        colorbar=bar,
+        hovertemplate="x %{x:.2f} m, y %{y:.2f} m<br>sigma %{customdata:.1f} mm<extra></extra>",
+    )
+    return _with_places(figure, marks, stations)
+
+
+def hillshade(heights: NDArray[Any], cell: float) -> NDArray[np.float64]:
+    """Return how brightly a surface is lit from the north-west, level ground 0.5; NaN stays."""
+    along_y, along_x = np.gradient(np.asarray(heights, dtype=np.float64), cell)
+    azimuth, height = _SUN
+    light = np.array([np.sin(azimuth) * np.cos(height), np.cos(azimuth) * np.cos(height)])
+    sloped = -_STEEPER * (along_x * light[0] + along_y * light[1]) + np.sin(height)
+    lit = sloped / np.sqrt(1.0 + _STEEPER**2 * (along_x**2 + along_y**2))
+    return np.asarray(np.clip(0.5 + 0.5 * (lit - np.sin(height)), 0.0, 1.0))
+
+
+def _step(model: ElevationModel) -> int:
+    """Return every how many cells a picture shows one."""
+    return int(np.ceil(max(model.heights.shape) / _CELLS_MAX))
+
+
+def _thinned(values: NDArray[Any], step: int) -> NDArray[np.float64]:
+    """Return one cell in so many each way."""
+    return np.asarray(values[::step, ::step], dtype=np.float64)
+
+
+def _spans(values: NDArray[np.float64], value: float) -> bool:
+    """Whether a value lies within a sample."""
+    return bool(np.nanmin(values) <= value <= np.nanmax(values))
+
+
+def _with_places(figure: go.Figure, marks: Columns, stations: Columns) -> go.Figure:
+    """Add stations and marks to a map, and give it equal axes."""
+    places = (
+        ("stations", stations, "name", "circle", theme.OURS),
+        ("control marks", marks, "mark", "triangle-up", theme.MARK),
+    )
+    for label, rows, name, symbol, colour in places:
+        if len(rows["x_m"]):
+            figure.add_scatter(
+                x=floats(rows, "x_m"),
+                y=floats(rows, "y_m"),
+                text=texts(rows, name),
+                mode="markers",
+                name=label,
+                marker={
+                    "symbol": symbol,
+                    "size": 9,
+                    "color": colour,
+                    "line": {"width": 1.5, "color": theme.RAISED},
+                },
+                hovertemplate="%{text}<extra></extra>",
+            )
+    figure.update_xaxes(title_text="x, site [m]", constrain="domain")
+    figure.update_yaxes(title_text="y, site [m]", scaleanchor="x", scaleratio=1)
+    return figure

@@ -1,0 +1,124 @@
+"""What keeps the tolerance, in words: greatest distance, smallest count, and how sure that is."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from spheremark.pipelines.error_model import (
+    Bound,
+    Demand,
+    ErrorModel,
+    ErrorSample,
+    Limits,
+    Statistic,
+    fit_error_model,
+    limits,
+)
+from spheremark.pipelines.errors import TooFewObservationsError
+from spheremark.web.figures.survey import Columns, by_method, floats, has_errors, texts
+from spheremark.web.templating import signed
+
+_SEED = 20  # of the resamples: the same rows give the same page
+_N_RESAMPLES = 200
+_STATISTICS: tuple[Statistic, ...] = ("p95", "mean")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Statement:
+    """What one method keeps, with the model behind it; or why nothing can be said."""
+
+    method: str
+    place: str
+    model: ErrorModel | None
+    p95: Limits | None
+    mean: Limits | None
+    reason: str = ""
+
+    @property
+    def distance(self) -> str:
+        """Up to where 95 of 100 errors are within the tolerance."""
+        return distance_words(self.p95.greatest_distance) if self.p95 else self.reason
+
+    @property
+    def count(self) -> str:
+        """From how many returns they are."""
+        return count_words(self.p95.smallest_count) if self.p95 else ""
+
+    @property
+    def mean_distance(self) -> str:
+        """Up to where the mean error, the study's measure, is within it."""
+        return distance_words(self.mean.greatest_distance) if self.mean else ""
+
+    @property
+    def mean_count(self) -> str:
+        """From how many returns it is."""
+        return count_words(self.mean.smallest_count) if self.mean else ""
+
+    def power(self, term: str) -> str:
+        """Return the power of one of the model's terms with its standard deviation."""
+        if self.model is None or term not in self.model.terms:
+            return "\N{EN DASH}"
+        power, sigma = self.model.exponent(term), self.model.sigma(term)
+        return f"{signed(power)} ± {sigma:.2f}"
+
+
+def statements(fits: Columns, tolerance_m: float, *, place: str = "") -> tuple[Statement, ...]:
+    """Say for each method of a table of fits what keeps the tolerance; nothing without truth."""
+    if not has_errors(fits):
+        return ()
+    return tuple(_statement(method, rows, tolerance_m, place) for method, rows in by_method(fits))
+
+
+def _statement(method: str, rows: Columns, tolerance_m: float, place: str) -> Statement:
+    """Say what one method keeps."""
+    _, scans = np.unique(np.array(texts(rows, "stop"), dtype=str), return_inverse=True)
+    sample = ErrorSample(
+        ranges=floats(rows, "range_m").copy(),
+        n_points=floats(rows, "n_points").copy(),
+        incidences=np.full(len(scans), np.nan),
+        errors_3d=floats(rows, "error_3d_m").copy(),
+        scans=scans.astype(np.intp),
+    )
+    found: dict[Statistic, Limits] = {}
+    try:
+        model = fit_error_model(sample)
+        for statistic in _STATISTICS:
+            demand = Demand(tolerance=tolerance_m, statistic=statistic)
+            rng = np.random.default_rng(_SEED)
+            found[statistic] = limits(sample, demand, rng, n_resamples=_N_RESAMPLES)
+    except TooFewObservationsError as error:
+        return Statement(
+            method=method, place=place, model=None, p95=None, mean=None, reason=str(error)
+        )
+    return Statement(method=method, place=place, model=model, p95=found["p95"], mean=found["mean"])
+
+
+def distance_words(bound: Bound) -> str:
+    """Write a greatest distance with its interval, never beyond what was seen."""
+    low, high = (_distance(value, bound.seen) for value in (bound.low, bound.high))
+    value = _distance(bound.value, bound.seen)
+    return value if low == high == value else f"{value} ({low} to {high})"
+
+
+def count_words(bound: Bound) -> str:
+    """Write a smallest count with its interval, never beyond what was seen."""
+    low, high = (_count(value, bound.seen) for value in (bound.low, bound.high))
+    value = _count(bound.value, bound.seen)
+    return value if low == high == value else f"{value} ({low} to {high})"
+
+
+def _distance(value: float, seen: tuple[float, float]) -> str:
+    """Write one distance."""
+    if value == 0:
+        return "nowhere"
+    return f"≥ {seen[1]:.1f} m" if math.isinf(value) else f"{value:.1f} m"
+
+
+def _count(value: float, seen: tuple[float, float]) -> str:
+    """Write one count."""
+    if math.isinf(value):
+        return f"> {seen[1]:.0f}"
+    return f"≤ {seen[0]:.0f}" if value == 0 else f"{math.ceil(value)}"
