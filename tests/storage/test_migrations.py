@@ -54,6 +54,15 @@ def test_a_changed_migration_is_refused():
         migrate(connection, (*released(), changed))
 
 
+def test_a_database_of_an_unreleased_version_is_refused():
+    connection = duckdb.connect()
+    (first, *_) = released()
+    migrate(connection, (replace(first, name="first", sql="CREATE TABLE surveys (name VARCHAR);"),))
+    with pytest.raises(SchemaConflictError, match=r"1 \(first\) .* or another data folder"):
+        migrate(connection, released())
+    assert tables(connection) == {"schema_migrations", "surveys"}
+
+
 def test_a_database_of_a_newer_version_is_refused():
     connection = duckdb.connect()
     migrate(connection, (*released(), NEXT))
