@@ -1,35 +1,41 @@
 # make demo   set everything up, survey the study's field in simulation, and serve the results
 # make test   all tests: the quick ones, then the slow ones
-# make check  format, lint, types, import contracts, docstrings, spelling
+# make check  format, lint, types, import contracts, spelling, lock files
 # make bench  speed and memory as ratios against a peer in the same run
-# make lock   renew requirements.lock from pyproject.toml
+# make lock   renew the lock files from pyproject.toml
+# make clean  remove what the other targets made
+# With PYTHON=python3.13 VENV=.venv-3.13 they use another Python and keep its packages apart.
 
-PYTHON ?= $(shell command -v python3.11 || command -v python3)
-BIN := .venv/bin
+VENV ?= .venv
+PYTHON ?= $(shell for v in 3.11 3.12 3.13 3.14; do command -v python$$v && exit; done; command -v python3)
+BIN := $(VENV)/bin
+KERNELS := $(shell git ls-files 'pipelines/*.py' 'storage/*.py' 2>/dev/null)
 export OPENBLAS_NUM_THREADS ?= 1
 SIDE_BY_SIDE := --numprocesses 2 --dist loadfile
 
-.PHONY: help demo test check bench lock setup clean
+.PHONY: help setup setup-dev demo test check bench lock lock-check clean
 
 help:
 	@sed -n 's/^# //p' Makefile
 
-setup: .venv/.ready .venv/.kernels
+setup: $(VENV)/.ready $(VENV)/.kernels
 
-.venv/.ready: requirements.lock pyproject.toml
-	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info[:2] != (3, 11))' || \
-		{ echo "spheremark needs Python 3.11; $(PYTHON) is $$($(PYTHON) --version 2>&1). Set PYTHON=/path/to/python3.11."; exit 1; }
-	@test -x $(BIN)/python || $(PYTHON) -m venv .venv || \
-		{ echo "Python could not make .venv. On Debian: apt-get install python3-venv"; rm -rf .venv; exit 1; }
+setup-dev: setup $(VENV)/.dev
+
+$(VENV)/.ready: requirements.lock pyproject.toml .ci/install
 	@.ci/system-packages libraries
-	@echo "Installing the pinned packages into .venv (a few minutes the first time) ..."
-	@$(BIN)/python -m pip install --quiet --disable-pip-version-check -r requirements.lock
-	@$(BIN)/python -m pip install --quiet --disable-pip-version-check --no-deps --editable .
+	@echo "Installing the locked packages into $(VENV) ..."
+	@.ci/install "$(PYTHON)" $(VENV) requirements.lock
+	@touch $@
+
+$(VENV)/.dev: $(VENV)/.ready requirements-dev.lock
+	@echo "Installing what the checks and tests need into $(VENV) ..."
+	@.ci/install "$(PYTHON)" $(VENV) requirements-dev.lock
 	@touch $@
 
 # numba's cache does not see that a kernel calls another one which has changed
-.venv/.kernels: .venv/.ready $(shell git ls-files 'pipelines/*.py' 'storage/*.py')
-	@echo "Compiling the numerical kernels, once ..."
+$(VENV)/.kernels: $(VENV)/.ready $(KERNELS)
+	@echo "Compiling the numerical kernels, once (a minute or two) ..."
 	@find pipelines storage -name '*.nb[ic]' -delete
 	@$(BIN)/python -m spheremark.service.jobs.worker
 	@touch $@
@@ -37,25 +43,30 @@ setup: .venv/.ready .venv/.kernels
 demo: setup
 	@$(BIN)/spheremark demo
 
-test: setup
+test: setup-dev
 	@.ci/system-packages browser
 	$(BIN)/pytest $(SIDE_BY_SIDE)
 	$(BIN)/pytest $(SIDE_BY_SIDE) -m slow
 
-check: setup
+check: setup-dev
 	$(BIN)/ruff format --check .
 	$(BIN)/ruff check .
 	$(BIN)/mypy
 	$(BIN)/lint-imports
 	@$(BIN)/codespell $(shell git ls-files '*.py' '*.md' '*.sql' '*.html' '*.toml')
 
-bench: setup
+bench: setup-dev
 	@$(BIN)/spheremark bench
 
-lock: setup
-	$(BIN)/pip-compile --quiet --upgrade --extra dev --strip-extras --no-header \
-		--no-emit-index-url --no-emit-find-links --no-emit-trusted-host \
-		--output-file requirements.lock pyproject.toml
+COMPILE := $(BIN)/uv pip compile --quiet --universal --no-header \
+	--no-emit-index-url --no-emit-find-links pyproject.toml
+
+lock: setup-dev
+	$(COMPILE) --upgrade --python-version 3.11 --output-file requirements.lock
+	$(COMPILE) --upgrade --python-version 3.11 --extra dev --constraint requirements.lock \
+		--output-file requirements-dev.lock
 
 clean:
-	rm -rf .venv build *.egg-info .mypy_cache .ruff_cache .pytest_cache .hypothesis
+	rm -rf .venv .venv-* build dist *.egg-info .mypy_cache .ruff_cache .pytest_cache .hypothesis \
+		.import_linter_cache
+	find . -name __pycache__ -type d -prune -exec rm -rf {} +

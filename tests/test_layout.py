@@ -175,16 +175,29 @@ def test_every_setting_and_command_is_in_the_readme():
     assert not missing
 
 
-def test_the_lock_file_names_no_place_of_a_package():
-    lock = (ROOT / "requirements.lock").read_text()
+@pytest.mark.parametrize("name", ["requirements.lock", "requirements-dev.lock"])
+def test_a_lock_file_names_no_place_of_a_package(name):
+    lock = (ROOT / name).read_text()
     assert not re.search(
         r"^[^#]*(https?:|file:)|--index-url|--find-links|--extra-index-url", lock, re.M
     )
 
 
-def test_every_dependency_is_locked():
-    locked = set(re.findall(r"^([a-z0-9-]+)==", (ROOT / "requirements.lock").read_text(), re.M))
+def locked(name):
+    return dict(re.findall(r"^([a-z0-9-]+)==(\S+)", (ROOT / name).read_text(), re.M))
+
+
+def test_every_dependency_is_locked_and_has_a_lower_bound():
     project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
-    wanted = (*project["dependencies"], *project["optional-dependencies"]["dev"])
-    packages = {one.partition("[")[0] for one in wanted}
-    assert packages <= locked, packages - locked
+    run, dev = project["dependencies"], project["optional-dependencies"]["dev"]
+    for requirement in (*run, *dev):
+        assert ">=" in requirement, requirement
+    needed = {re.match(r"[a-z0-9-]+", one).group() for one in run}
+    assert needed <= locked("requirements.lock").keys()
+    extra = {re.match(r"[a-z0-9-]+", one).group() for one in dev}
+    assert extra <= locked("requirements-dev.lock").keys()
+
+
+def test_tests_run_with_the_versions_that_the_service_runs_with():
+    run, dev = locked("requirements.lock"), locked("requirements-dev.lock")
+    assert run.items() <= dev.items()
