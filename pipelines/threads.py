@@ -10,6 +10,7 @@ from multiprocessing import get_context
 from typing import TypeVar
 
 _Part = TypeVar("_Part")
+_World = TypeVar("_World")
 
 _N_PARTS = 2  # always: sums are taken part by part, and must not depend on the machine
 _N_CALLERS = 32  # that may wait for each other's parts; a thread starts when none is idle
@@ -88,20 +89,20 @@ def by_turns(
 
 
 def in_processes(
-    work: Callable[[int], _Part],
-    seeds: Sequence[int],
+    work: Callable[[_World], _Part],
+    worlds: Sequence[_World],
     *,
     n_processes: int | None = None,
     progress: Callable[[float, str], None] = lambda _share, _what: None,
 ) -> list[_Part]:
-    """Do the same for many seeds, each in one of some fresh processes.
+    """Do the same for many worlds, each in one of some fresh processes.
 
     Parameters
     ----------
     work : callable
-        Told a seed; a function of a module, or part of one, so that another process finds it.
-    seeds : sequence of int
-        What to tell it.
+        Takes a world; a function of a module, or a partial of one: another process must find it.
+    worlds : sequence
+        Arguments of ``work``: seeds, for instance. They are pickled.
     n_processes : int, optional
         How many at a time; as many as there are processors by default. With 1 there is none but
         this one.
@@ -111,9 +112,9 @@ def in_processes(
     Returns
     -------
     list
-        What ``work`` returned for each seed, in their order.
+        What ``work`` returned for each world, in their order.
     """
-    n, found = len(seeds), dict[int, _Part]()
+    n, found = len(worlds), dict[int, _Part]()
 
     def enter(place: int, part: _Part) -> None:
         found[place] = part
@@ -122,11 +123,11 @@ def in_processes(
     n_processes = min(n_processes or os.cpu_count() or 1, n)
     progress(0.0, f"0 of {n} done")
     if n_processes <= 1:
-        for place, seed in enumerate(seeds):
-            enter(place, work(seed))
+        for place, world in enumerate(worlds):
+            enter(place, work(world))
         return [found[place] for place in range(n)]
     with ProcessPoolExecutor(n_processes, get_context("spawn")) as pool:
-        places = {pool.submit(work, seed): place for place, seed in enumerate(seeds)}
+        places = {pool.submit(work, world): place for place, world in enumerate(worlds)}
         try:
             for done in as_completed(places):
                 enter(places[done], done.result())

@@ -42,6 +42,8 @@ from spheremark.pipelines.placement.random_plans import (
     by_number,
     by_worst_angle,
     errors_by_angle,
+    marks_at_angle,
+    three_circle_errors,
     try_at_random,
 )
 from spheremark.pipelines.placement.sensor import Sensor
@@ -86,6 +88,7 @@ __all__ = [
     "find_candidates",
     "fitted_model",
     "look",
+    "marks_at_angle",
     "marks_of_field",
     "optimise",
     "propose_mark",
@@ -93,5 +96,6 @@ __all__ = [
     "site_of_field",
     "site_of_grid",
     "stops_of_field",
+    "three_circle_errors",
     "try_at_random",
 ]

@@ -282,16 +282,47 @@ def errors_by_angle(angles: Array, error: float, distance: float) -> Array:
     signs = np.array(np.meshgrid(*[[-1.0, 1.0]] * 9)).reshape(9, -1).T.reshape(-1, 3, 3)
     out = []
     for angle in angles:
-        headings = np.array([_FIRST, _FIRST + angle, _FIRST + _THIRD])
-        marks = distance * np.column_stack([np.cos(headings), np.sin(headings), np.zeros(3)])
-        off = three_circle_errors(marks, error * signs)
+        off = three_circle_errors(marks_at_angle(float(angle), distance), error * signs)
         off[:, 2] = error
         out.append(np.median(np.linalg.norm(off, axis=1)))
     return np.array(out)
 
 
+def marks_at_angle(angle: float, distance: float) -> Array:
+    """Return the three marks of the study's Table 3 about a station at the origin.
+
+    Parameters
+    ----------
+    angle : float
+        Included angle between the first and the second mark [rad].
+    distance : float
+        Distance of the marks [m].
+
+    Returns
+    -------
+    (3, 3)
+        Marks at the height of the station [m].
+    """
+    headings = _FIRST + np.array([0.0, angle, _THIRD])
+    flat = [np.cos(headings), np.sin(headings), np.zeros(3)]
+    return np.asarray(distance * np.stack(flat, axis=1))
+
+
 def three_circle_errors(marks_site: Array, errors: Array) -> Array:
-    """Return the errors of a level station at the origin from three circles."""
+    """Return the errors of a level station at the origin from three circles.
+
+    Parameters
+    ----------
+    marks_site : (3, 3)
+        True places of the marks; the radii of the circles come from these [m].
+    errors : (n, 3, 3)
+        Errors of the marks in each of n cases [m].
+
+    Returns
+    -------
+    (n, 3)
+        Estimate minus truth of the station [m].
+    """
     out = np.empty((len(errors), 3))
     _meet_all(np.ascontiguousarray(marks_site), np.ascontiguousarray(errors), out)
     return out
