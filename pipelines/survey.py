@@ -35,7 +35,7 @@ Progress = Callable[[float, str], None]
 def process(
     log: ScanLog,
     *,
-    config: SurveyConfig,
+    config: SurveyConfig = SurveyConfig(),  # noqa: B008  frozen
     rig: Rig | None = None,
     marks: ControlMarks | None = None,
     progress: Progress = lambda _share, _what: None,

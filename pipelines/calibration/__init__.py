@@ -50,7 +50,7 @@ _N_SPHERES = 3  # seen on both faces: fewer leave offset and eccentricity undete
 def calibrate(
     logs: Iterable[ScanLog],
     *,
-    config: SurveyConfig,
+    config: SurveyConfig = SurveyConfig(),  # noqa: B008  frozen
     rig: Rig | None = None,
     progress: Progress = lambda _share, _what: None,
 ) -> Calibration:

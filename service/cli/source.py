@@ -6,22 +6,17 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from shutil import copyfile
-from typing import Any, ClassVar
+from typing import Any
 
 import httpx
 
-from spheremark.pipelines.errors import InputError, SpheremarkError
+from spheremark.pipelines.errors import InputError
+from spheremark.service.client import checked, reached
 from spheremark.service.http.api import sql as routes
 from spheremark.service.http.state import DATABASE, query_limits
 from spheremark.service.serving import address_of
 from spheremark.service.settings import Settings
 from spheremark.storage.catalogue.catalogue import Catalogue
-
-
-class RemoteError(SpheremarkError):
-    """A running service refused or failed to answer."""
-
-    code: ClassVar[str] = "remote"
 
 
 class Source:
@@ -36,8 +31,8 @@ class Source:
     def ask(self, sql: str) -> dict[str, Any]:
         """Answer one SELECT."""
         if self._url:
-            with _spoken(self._url), self._http() as http:
-                answer: dict[str, Any] = _checked(http.post("/sql", json={"sql": sql})).json()
+            with reached(self._url), self._http() as http:
+                answer: dict[str, Any] = checked(http.post("/sql", json={"sql": sql})).json()
                 return answer
         with self._catalogue() as catalogue:
             found = routes.ask(catalogue, query_limits(self._settings), sql)
@@ -48,7 +43,7 @@ class Source:
         if target.suffix not in (".duckdb", ".csv"):
             raise InputError(f"{target.name} must end in .duckdb (everything) or .csv.")
         if self._url:
-            with _spoken(self._url):
+            with reached(self._url):
                 self._download(target, survey)
             return
         with self._catalogue() as catalogue:
@@ -64,7 +59,7 @@ class Source:
         with self._http() as http, http.stream("GET", f"/export/{name}", params=query) as answer:
             if answer.is_error:
                 answer.read()
-            _checked(answer)
+            checked(answer)
             with target.open("wb") as file:
                 file.writelines(answer.iter_bytes())
 
@@ -94,23 +89,3 @@ class Source:
             )
         with Catalogue(path, snapshots=self._settings.data / "snapshots") as catalogue:
             yield catalogue
-
-
-@contextmanager
-def _spoken(url: str) -> Iterator[None]:
-    """Say in a sentence that nobody answers."""
-    try:
-        yield
-    except httpx.HTTPError as error:
-        raise RemoteError(
-            f"No service answers at {url} ({error}); start `spheremark serve` there, or "
-            "name another address with --url."
-        ) from error
-
-
-def _checked(answer: httpx.Response) -> httpx.Response:
-    """Return an answer; raise one that is a problem."""
-    if answer.is_error:
-        is_problem = "json" in answer.headers.get("content-type", "")
-        raise RemoteError(answer.json()["detail"] if is_problem else answer.reason_phrase)
-    return answer
