@@ -21,6 +21,7 @@ from spheremark.pipelines.detection.neighbourhoods import (
 )
 from spheremark.pipelines.detection.seeds import thinned
 from spheremark.pipelines.detection.target import Ball, View, blur_at, passing, seen_from, view_of
+from spheremark.pipelines.estimation.linear_algebra import invert
 from spheremark.pipelines.model import Array, Mask, StitchedCloud
 from spheremark.pipelines.threads import side_by_side
 
@@ -359,34 +360,16 @@ def _solved(N: Array, pull: Array, prior: float, n: int, longest: float) -> tupl
 
     The prior is the weight of each unknown being zero.
     """
-    inverse, step, length2 = np.empty((n, n)), np.zeros(n), 0.0
+    inverse, step, length2 = N[:n, :n].copy(), np.zeros(n), 0.0
     for i in range(n):
-        for j in range(n):
-            inverse[i, j] = N[i, j] + (prior if i == j else 0.0)
-    _invert(inverse)
+        inverse[i, i] += prior
+    invert(inverse, inverse)
     for i in range(n):
         for j in range(n):
             step[i] += inverse[i, j] * pull[j]
         length2 += step[i] * step[i]
     step *= min(1.0, longest / (np.sqrt(length2) + 1e-12))
     return step, inverse
-
-
-@numba.njit(cache=True, nogil=True, error_model="numpy")
-def _invert(inverse: Array) -> None:
-    """Invert a small positive definite matrix in place (Gauss, Jordan; no pivots needed)."""
-    n = len(inverse)
-    for k in range(n):
-        pivot = 1.0 / inverse[k, k]
-        inverse[k, k] = 1.0
-        for j in range(n):
-            inverse[k, j] *= pivot
-        for i in range(n):
-            if i != k:
-                factor = inverse[i, k]
-                inverse[i, k] = 0.0
-                for j in range(n):
-                    inverse[i, j] -= factor * inverse[k, j]
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")

@@ -18,6 +18,7 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
+from spheremark.pipelines.estimation.linear_algebra import solve
 from spheremark.pipelines.ground_model.grid import SUB, Grid
 from spheremark.pipelines.ground_model.values import ElevationConfig
 from spheremark.pipelines.model import Array
@@ -68,31 +69,6 @@ def ground_heights(grid: Grid, config: ElevationConfig) -> Ground:
     stands = _standing(grid, sizes, surfaces)
     _estimate(grid, sizes, common, surfaces, stands, heights, sigmas, counts)
     return Ground(heights, sigmas, counts)
-
-
-@numba.njit(cache=True, nogil=True)
-def _solve(normal, b, k):  # type: ignore[no-untyped-def]  # noqa: ANN001, ANN202
-    """Solve the first ``k`` of some symmetric positive equations in place (Cholesky)."""
-    for i in range(k):
-        for j in range(i + 1):
-            total = normal[i, j]
-            for m in range(j):
-                total -= normal[i, m] * normal[j, m]
-            if i == j:
-                if total <= 1e-12:
-                    return False
-                normal[i, i] = np.sqrt(total)
-            else:
-                normal[i, j] = total / normal[j, j]
-    for i in range(k):
-        for m in range(i):
-            b[i] -= normal[i, m] * b[m]
-        b[i] /= normal[i, i]
-    for i in range(k - 1, -1, -1):
-        for m in range(i + 1, k):
-            b[i] -= normal[m, i] * b[m]
-        b[i] /= normal[i, i]
-    return True
 
 
 @numba.njit(cache=True, nogil=True)
@@ -151,7 +127,7 @@ def _robust(points, n, b):  # type: ignore[no-untyped-def]  # noqa: ANN001, ANN2
                     normal[a, c] += weight * terms[a] * terms[c]
         for a in range(1, wanted):
             normal[a, a] += 1e-3
-        if not _solve(normal, right, wanted):
+        if not solve(normal[:wanted, :wanted], right):
             return 0
         b[:], k = right, wanted
     b[0] += lowest
@@ -326,7 +302,7 @@ def _mean(own, n, roughness, cell):  # type: ignore[no-untyped-def]  # noqa: ANN
             if a > 1:
                 normal[a, 2] += weight * value * own[p, 1]
     b[0] = 1.0
-    _solve(normal, b, 3)  # first row of the inverse: the estimate's weights follow from it
+    solve(normal, b)  # first row of the inverse: the estimate's weights follow from it
     offset = variance = lean_x = lean_y = 0.0
     for p in range(n):
         c = (b[0] + b[1] * own[p, 0] + b[2] * own[p, 1]) / (roughness + own[p, 3])

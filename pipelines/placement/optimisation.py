@@ -16,6 +16,7 @@ import numba
 import numpy as np
 
 from spheremark.pipelines.errors import ConfigError, DegenerateGeometryError
+from spheremark.pipelines.estimation.linear_algebra import invert
 from spheremark.pipelines.model import Array, Index
 from spheremark.pipelines.placement.bounds import least_sigmas, widest_sigma
 from spheremark.pipelines.placement.candidates import Candidates
@@ -27,7 +28,6 @@ from spheremark.pipelines.placement.station_covariance import (
     Information,
     Sighting,
     information,
-    inverted,
     predict_positions,
     shared_variance,
 )
@@ -765,7 +765,7 @@ def _sigma_of(
     N: Array, spread: Array, pull: Array, shared2: tuple[float, float], inverse: Array
 ) -> float:
     """Return the 3-D sigma of one stop; large without a position."""
-    if not inverted(N, inverse) or inverse[3, 3] + inverse[4, 4] + inverse[5, 5] > LOOSE2:
+    if not invert(N, inverse) or inverse[3, 3] + inverse[4, 4] + inverse[5, 5] > LOOSE2:
         return _LOST
     total = shared2[1]
     for i in range(3, 6):

@@ -12,13 +12,13 @@ import numba
 import numpy as np
 from scipy.special import ndtri
 
+from spheremark.pipelines.estimation.linear_algebra import invert
 from spheremark.pipelines.model import Array, Index, Mask
 from spheremark.pipelines.placement.plan import Requirement
 from spheremark.pipelines.scan.rigs import N_LASERS
 
 _BIAS_LEFT = 0.22  # of the spread of laser biases: what a survey leaves to each centre, simulated
 _SIGMA_AIM = 1.5e-5  # [rad] of each direction, by mounting and encoder, after both faces; simulated
-_SINGULAR = 1e-11  # pivot over diagonal below which an unknown is undetermined
 LOOSE2 = 1.0
 """Variance of a position above which it is none [m^2]."""
 
@@ -133,49 +133,6 @@ def _claimed(cov: Array, v: Vector, extra: Group, known: Array, true: Array) -> 
 
 
 @numba.njit(cache=True, nogil=True)
-def _rooted(N: Array, root: Array) -> bool:
-    """Fill in the inverse of the lower Cholesky root; false if the matrix is singular."""
-    n = len(N)
-    for i in range(n):
-        for j in range(i + 1):
-            s = N[i, j]
-            for k in range(j):
-                s -= root[i, k] * root[j, k]
-            if i == j:
-                if not s > _SINGULAR * N[i, i]:
-                    return False
-                s = np.sqrt(s)
-                root[i, i] = s
-            else:
-                root[i, j] = s / root[j, j]
-    for i in range(n):
-        root[i, i] = 1.0 / root[i, i]
-        for j in range(i):
-            s = 0.0
-            for k in range(j, i):
-                s -= root[i, k] * root[k, j]
-            root[i, j] = s * root[i, i]
-    return True
-
-
-@numba.njit(cache=True, nogil=True)
-def inverted(N: Array, out: Array) -> bool:
-    """Invert a symmetric positive matrix into another; false if it is singular."""
-    n = len(N)
-    root = np.zeros((n, n))
-    if not _rooted(N, root):
-        return False
-    for i in range(n):
-        for j in range(i + 1):
-            s = 0.0
-            for k in range(i, n):
-                s += root[k, i] * root[k, j]
-            out[i, j] = s
-            out[j, i] = s
-    return True
-
-
-@numba.njit(cache=True, nogil=True)
 def _inform(cov: Array, v: Vector, extra: Group, out: Group) -> bool:
     """Fill in what one mark adds to normal matrix, spread and pull; false if it adds nothing."""
     N, spread, pull = out
@@ -184,7 +141,7 @@ def _inform(cov: Array, v: Vector, extra: Group, out: Group) -> bool:
     known, true = np.empty((3, 3)), np.empty((3, 3))
     x, y, z = v
     _claimed(cov, v, extra, known, true)
-    if not inverted(known, weight):
+    if not invert(known, weight):
         return False
     J[0, 1], J[0, 2], J[1, 0], J[1, 2], J[2, 0], J[2, 1] = z, -y, -z, x, y, -x
     J[0, 3] = J[1, 4] = J[2, 5] = 1.0
@@ -225,7 +182,7 @@ def _by_motion(
                 spread += one[1]
                 pull += one[2]
         inverse = cofactor[e]
-        ok = inverted(N, inverse)
+        ok = invert(N, inverse)
         if not ok or inverse[3, 3] + inverse[4, 4] + inverse[5, 5] > LOOSE2:
             inverse[:] = np.diag(np.full(6, np.inf))
             cov_motion[e] = inverse
@@ -380,7 +337,7 @@ def _by_circles(seen: Group, extra: Group, level2: float, used: Mask, out: Group
             v = (marks[m, 0] - eyes[e, 0], marks[m, 1] - eyes[e, 1], marks[m, 2] - eyes[e, 2])
             rows = (design, errors, weights, lean, excess)
             yaw2 += _circle(covs[e, m], v, (extra, level2), 2 * r, rows) / 9.0
-        if not inverted(design.T @ weights @ design, inverse):
+        if not invert(design.T @ weights @ design, inverse):
             continue
         gain = inverse @ design.T @ weights
         tilt = gain @ lean

@@ -12,6 +12,7 @@ from typing import NamedTuple
 import numba
 import numpy as np
 
+from spheremark.pipelines.estimation.linear_algebra import invert
 from spheremark.pipelines.model import Array, Index, Mask
 
 USELESS = 1.0
@@ -219,7 +220,9 @@ def _adjust(chosen, p_base, cov_base, marks, cov_marks, up_base, J_up, T, cov, l
                 _weigh(T[s], cov_base[k], cov_marks[k], weight)
                 _add_centre(q, weight, N)
                 _add_slope(q, T[s, :3, 3], marks[k], weight, gradient)
-            _invert(N, cov[s])
+            if not invert(N, cov[s]):
+                last[s] = np.inf
+                break
             if last[s] < _STILL:
                 break
             last[s] = 0.0
@@ -251,7 +254,7 @@ def _weigh(T, cov_base, cov_mark, weight):  # type: ignore[no-untyped-def]  # no
         cov[i] = _times(T, cov[i])
         for j in range(3):
             cov[i, j] += cov_mark[i, j]
-    _invert(cov, weight)
+    invert(cov, weight)
 
 
 @numba.njit(cache=True, nogil=True)
@@ -273,7 +276,7 @@ def _place(chosen, q, goals, weights, up, of_gravity, motions, cov, last):  # ty
         _add_gravity(up, of_gravity, N)
         for k in chosen[s]:
             _add_centre(q[k], weights[k], N)
-        _invert(N, cov[s])
+        invert(N, cov[s])
         for _ in range(_N_STEPS):
             _rotation(motions[s], R)
             _lean(_times(R, up), of_gravity, gradient)
@@ -381,26 +384,6 @@ def _rotation(motion, R):  # type: ignore[no-untyped-def]  # noqa: ANN001, ANN20
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def _invert(N, out):  # type: ignore[no-untyped-def]  # noqa: ANN001, ANN202
-    """Find the inverse of a positive definite matrix, which is lost; of others there is none."""
-    n = len(N)
-    out[:] = 0.0
-    for i in range(n):
-        out[i, i] = 1.0
-    for i in range(n):
-        pivot = 1.0 / N[i, i]
-        for j in range(n):
-            N[i, j] *= pivot
-            out[i, j] *= pivot
-        for row in range(n):
-            factor = N[row, i]
-            if row != i:
-                for j in range(n):
-                    N[row, j] -= factor * N[i, j]
-                    out[row, j] -= factor * out[i, j]
-
-
-@numba.njit(cache=True, nogil=True, error_model="numpy")
 def _meet(chosen, marks, measured, weights, p, cov, last):  # type: ignore[no-untyped-def]  # noqa: ANN001, ANN202, PLR0913
     """Move each station until its steps are small; tell the largest part of the last."""
     N, bend, gradient = np.empty((3, 3)), np.empty((3, 3)), np.empty(3)
@@ -414,7 +397,7 @@ def _meet(chosen, marks, measured, weights, p, cov, last):  # type: ignore[no-un
                 bend[i, i] += damping
             bend += N
             if step == 0 and _exceeds(N, 1.0 / USELESS**2):
-                _invert(N, cov[s])
+                invert(N, cov[s])
             change = _solved(bend, gradient)
             last[s] = 0.0
             for i in range(3):

@@ -11,6 +11,7 @@ from typing import NamedTuple
 import numba
 import numpy as np
 
+from spheremark.pipelines.estimation.linear_algebra import inverse
 from spheremark.pipelines.model import Array, Index
 from spheremark.pipelines.sphere.linearisation import Linear
 from spheremark.pipelines.sphere.returns import Rows
@@ -211,21 +212,3 @@ def _add_product(sign: float, a: Array, b: Array, out: Array) -> None:
         for p in range(a.shape[1]):
             for q in range(b.shape[1]):
                 out[p, q] += sign * a[k, p] * b[k, q]
-
-
-@numba.njit(cache=True, nogil=True, error_model="numpy")
-def inverse(N: Array) -> Array:
-    """Return the inverse of a small normal matrix."""
-    n, out = len(N), np.eye(len(N))
-    for i in range(n):
-        pivot = 1.0 / N[i, i]
-        for j in range(n):
-            N[i, j] *= pivot
-            out[i, j] *= pivot
-        for row in range(n):
-            factor = N[row, i]
-            if row != i:
-                for j in range(n):
-                    N[row, j] -= factor * N[i, j]
-                    out[row, j] -= factor * out[i, j]
-    return out

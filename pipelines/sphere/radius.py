@@ -11,9 +11,10 @@ from typing import NamedTuple
 import numba
 import numpy as np
 
+from spheremark.pipelines.estimation.linear_algebra import inverse
 from spheremark.pipelines.model import Array, Beams
 from spheremark.pipelines.sphere.linearisation import Linear, linearise
-from spheremark.pipelines.sphere.normal_equations import inverse, normals_of_spheres
+from spheremark.pipelines.sphere.normal_equations import normals_of_spheres
 from spheremark.pipelines.sphere.returns import Rows, in_play, rows_of, rows_of_one
 from spheremark.pipelines.threads import side_by_side
 
