@@ -8,10 +8,10 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
+from spheremark.pipelines.compilation import compiled
 from spheremark.pipelines.config import ExtractionConfig
 from spheremark.pipelines.geometry import levelling_rotation
 from spheremark.pipelines.model import Array, Column, Mask, StitchedCloud
@@ -81,7 +81,7 @@ def cells_of(cloud: StitchedCloud, config: ExtractionConfig) -> Cells:
     return Cells(layout, R, ground, directions, lowest, highest)
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@compiled
 def rows_in(
     cells: NDArray[np.integer], is_wanted: Mask, first: int, end: int
 ) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
@@ -101,7 +101,7 @@ def rows_in(
     return rows[:n_rows], own[:n_rows]
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@compiled
 def direction_cells(x: Column, y: Column, z: Column, cells: NDArray[np.uint16]) -> None:
     """Write the cells of some directions: the octahedron seen from above and from below."""
     half, side = np.float32(0.4999 * N_DIRECTIONS_SIDE), np.int32(N_DIRECTIONS_SIDE)
@@ -113,7 +113,7 @@ def direction_cells(x: Column, y: Column, z: Column, cells: NDArray[np.uint16]) 
         cells[i] = cell if scale > 0.0 else np.int32(0)
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@compiled
 def _sort(
     flat: Column,
     R: Column,
@@ -142,7 +142,7 @@ def _sort(
     return extremes
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@compiled
 def _joined(extremes: Column, others: Column, n_side: int) -> tuple[Column, Column]:
     """Return the lowest and the highest per cell of the ground, of two parts of the returns."""
     lowest = np.empty((n_side, n_side), np.float32)
@@ -154,14 +154,14 @@ def _joined(extremes: Column, others: Column, n_side: int) -> tuple[Column, Colu
     return lowest, highest
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@compiled
 def _unpack(flat: Column, x: Column, y: Column, z: Column) -> None:
     """Write the coordinates of a few returns side by side."""
     for i in range(len(x)):
         x[i], y[i], z[i] = flat[3 * i], flat[3 * i + 1], flat[3 * i + 2]
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@compiled
 def _level(R: Column, x: Column, y: Column, z: Column) -> None:
     """Level a few returns."""
     a, b, c, d, e, f = R[0, 0], R[0, 1], R[0, 2], R[1, 0], R[1, 1], R[1, 2]
@@ -172,7 +172,7 @@ def _level(R: Column, x: Column, y: Column, z: Column) -> None:
         z[i] = g * p + h * q + k * r
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@compiled
 def _ground_cells(
     x: Column, y: Column, z: Column, layout: Layout, cells: NDArray[np.int32]
 ) -> None:

@@ -9,10 +9,10 @@ from __future__ import annotations
 from itertools import chain
 from typing import NamedTuple
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
+from spheremark.pipelines.compilation import compiled
 from spheremark.pipelines.detection.cells import (
     N_DIRECTIONS,
     N_DIRECTIONS_SIDE,
@@ -140,7 +140,7 @@ def _cones(centres: Array, ball: Ball) -> Array:
     return np.column_stack([centres, distances2 / (1.0 + tangents**2)])
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@compiled
 def _counted(
     p_base: Column, intensities: Column, rows: NDArray[np.int32], c: Array, ball: Ball
 ) -> tuple[int, int, int, float, int, int, int, float, int, NDArray[np.int32], Array]:
@@ -176,14 +176,14 @@ def _counted(
     return (*counts, brightness, int(np.sum(is_met)), rows, seen)
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@compiled
 def _lit_share(inside: float) -> float:
     """Return what share of a beam is inside an outline that it enters by so many half widths."""
     inside = min(max(inside, -1.0), 1.0)
     return float((np.arccos(-inside) + inside * np.sqrt(1.0 - inside * inside)) / np.pi)
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@compiled
 def _towards(
     p_base: Column,
     rows: NDArray[np.int32],
@@ -210,7 +210,7 @@ def _towards(
     return groups
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@compiled
 def _centres_by_direction(centres: Array, up: Array, reach: float) -> _Groups:
     """Return the centres that beams in each cell of directions may pass within a reach.
 
@@ -233,7 +233,7 @@ def _centres_by_direction(centres: Array, up: Array, reach: float) -> _Groups:
     return groups
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@compiled
 def _directions_about(c: Array, up: Array, reach: float, n: int) -> NDArray[np.uint16]:
     """Return the cells of directions about a centre on a lattice, so many each way."""
     v_across = np.cross(up, c)
@@ -248,7 +248,7 @@ def _directions_about(c: Array, up: Array, reach: float, n: int) -> NDArray[np.u
     return cells.reshape(-1)
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@compiled
 def _grouped(items: NDArray[np.int32], groups: NDArray[np.integer], n_groups: int) -> _Groups:
     """Sort items by group, by counting: where those of each group begin, and the items."""
     starts = np.zeros(n_groups + 2, np.int64)  # of the group before, until they have moved on

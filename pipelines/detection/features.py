@@ -9,9 +9,9 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import NamedTuple
 
-import numba
 import numpy as np
 
+from spheremark.pipelines.compilation import REASSOCIATED, compiled, compiled_with
 from spheremark.pipelines.detection.cells import Cells
 from spheremark.pipelines.detection.neighbourhoods import (
     Patches,
@@ -39,7 +39,6 @@ _N_LOOK = 4  # returns without which there is nothing to look at
 _N_WORTH = 20  # places that are worth a thread
 _N_SAMPLE = 1500  # returns in the cells about a seed that tell whether to look there
 _N_WHOLE = 2000  # returns there that are looked at at once
-_IN_ANY_ORDER = {"reassoc", "contract"}  # sums of many returns at once
 _NORMAL = 1.4826  # standard deviations of the normal distribution in a median deviation
 _STRAY_SIGMAS = 4.0
 _N_STEPS = 6  # of a fit that only has to tell what a group is
@@ -137,7 +136,7 @@ def _shared(
     return found
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@compiled
 def _approached(patches: Patches, seeds: Array, ball: Ball) -> Array:
     """Return where seeds' discs came to rest, the returns in them, and 1 if worth a look, (k, 5).
 
@@ -157,7 +156,7 @@ def _approached(patches: Patches, seeds: Array, ball: Ball) -> Array:
     return out
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@compiled
 def _tried(rays: Array, seed: Array, ball: Ball, every: float) -> tuple[Array, int, bool]:
     """Return where a seed's disc comes to rest, the returns in it, and whether to look there.
 
@@ -172,7 +171,7 @@ def _tried(rays: Array, seed: Array, ball: Ball, every: float) -> tuple[Array, i
     return c, n, is_free or (n * every >= N_RESOLVED and _is_resolved(rays, c, ball, every))
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy", fastmath=_IN_ANY_ORDER)
+@compiled_with(fastmath=REASSOCIATED)
 def _shifted(rays: Array, c: Array, up: Array, radius: float) -> tuple[Array, int]:
     """Return where a disc of the ball's size comes to rest, and how many returns it holds."""
     c, n = c.copy(), 0
@@ -197,7 +196,7 @@ def _shifted(rays: Array, c: Array, up: Array, radius: float) -> tuple[Array, in
     return c, n
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@compiled
 def _surroundings(rays: Array, c: Array, ball: Ball) -> tuple[int, int]:
     """Count the returns beside and below the outline that a free ball on a pole would not have."""
     n_beside, n_below, radius = 0, 0, ball.radius
@@ -217,7 +216,7 @@ def _surroundings(rays: Array, c: Array, ball: Ball) -> tuple[int, int]:
     return n_beside, n_below
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@compiled
 def _is_resolved(rays: Array, c: Array, ball: Ball, every: float) -> bool:
     """Tell whether a ball fits so closely that it needs no free space about it to be believed."""
     rays, scatter, is_sample = _within(rays, c, 2.0 * ball.radius), np.inf, every > 1.0
@@ -232,7 +231,7 @@ def _is_resolved(rays: Array, c: Array, ball: Ball, every: float) -> bool:
     return scatter < (2.5 if is_sample else 1.5) * RESOLUTION * ball.radius
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@compiled
 def _looked(patches: Patches, places: Array, ball: Ball) -> Array:
     """Return what is seen near places, (k, 19), as ``Look`` names it; zeros if no ball is there."""
     out = np.zeros((len(places), _N_FIELDS))
@@ -242,7 +241,7 @@ def _looked(patches: Patches, places: Array, ball: Ball) -> Array:
     return out
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@compiled
 def _look(rays: Array, start: Array, ball: Ball, out: Array) -> None:
     """Write what is seen near a place; nothing if hardly a return lies on a ball there."""
     radius = ball.radius
@@ -275,7 +274,7 @@ def _look(rays: Array, start: Array, ball: Ball, out: Array) -> None:
     out[18] = blur
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@compiled
 def _gain(residuals: Array, others: Array, is_in: Mask, limit: float) -> float:
     """Return how much better the others explain the returns: of few, the noise is not known either.
 
@@ -291,7 +290,7 @@ def _gain(residuals: Array, others: Array, is_in: Mask, limit: float) -> float:
     return max(n - 4, 0) * float(np.log(max(known, least) / max(free, least)))
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@compiled
 def _n_strange(seen: Array, weights: Array, radius: float) -> int:
     """Count the returns inside the outline, about as far away, that the ball does not explain."""
     n = 0
@@ -302,7 +301,7 @@ def _n_strange(seen: Array, weights: Array, radius: float) -> int:
     return n
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@compiled
 def _extent(places: Array, weights: Array) -> float:
     """Return how far apart the places are that have a weight [m]."""
     low, high = np.inf, -np.inf
@@ -312,7 +311,7 @@ def _extent(places: Array, weights: Array) -> float:
     return high - low
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@compiled
 def _settled(rays: Array, start: Array, ball: Ball, n_unknowns: int) -> tuple[Array, float, Array]:
     """Return the centre of the ball near a place, its radius, and the covariance for unit noise.
 
@@ -333,7 +332,7 @@ def _settled(rays: Array, start: Array, ball: Ball, n_unknowns: int) -> tuple[Ar
     return c, radius, inverse
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@compiled
 def _residuals_about(
     rays: Array, view: View, c: Array, ball: Ball, radius: float
 ) -> tuple[Array, Array, float]:
@@ -343,7 +342,7 @@ def _residuals_about(
     return seen, residuals, _scatter(seen, residuals, radius)
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@compiled
 def _moved(c: Array, view: View, step: Array) -> Array:
     """Return a centre after a step across, up and away from the sensor."""
     moved = c.copy()
@@ -354,7 +353,7 @@ def _moved(c: Array, view: View, step: Array) -> Array:
     return moved
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@compiled
 def _solved(N: Array, pull: Array, prior: float, n: int, longest: float) -> tuple[Array, Array]:
     """Return the step of so many unknowns, shortened if need be, and the inverse normal matrix.
 
@@ -372,7 +371,7 @@ def _solved(N: Array, pull: Array, prior: float, n: int, longest: float) -> tupl
     return step, inverse
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@compiled
 def _within(rays: Array, c: Array, reach: float) -> Array:
     """Return the rays, (3, n), within reach of a place."""
     kept = np.empty(rays.shape)
@@ -385,7 +384,7 @@ def _within(rays: Array, c: Array, reach: float) -> Array:
     return kept[:, :n].copy()
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@compiled
 def _about(rays: Array, view: View, reach: float) -> Array:
     """Return how those beams pass a centre that do so within reach, (3, n)."""
     seen: Array = seen_from(rays, view)
@@ -397,7 +396,7 @@ def _about(rays: Array, view: View, reach: float) -> Array:
     return seen[:, :n].copy()
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@compiled
 def _residuals(seen: Array, radius: float) -> Array:
     """Return residuals along the beams; a beam that misses is expected at the outline."""
     residuals = np.empty(seen.shape[1])
@@ -407,7 +406,7 @@ def _residuals(seen: Array, radius: float) -> Array:
     return residuals
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@compiled
 def _slopes(x: float, y: float, radius: float) -> tuple[float, float, float]:
     """Return the derivatives of a residual by the centre across and up, and by the radius."""
     h2 = radius * radius - x * x - y * y
@@ -417,7 +416,7 @@ def _slopes(x: float, y: float, radius: float) -> tuple[float, float, float]:
     return -x * share, -y * share, -radius * share
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy", fastmath=_IN_ANY_ORDER)
+@compiled_with(fastmath=REASSOCIATED)
 def _normals(seen: Array, residuals: Array, weights: Array, radius: float) -> tuple[Array, Array]:
     """Return normal matrix and right-hand side of centre across, up, along the beam, and radius."""
     aa, ab, ac, ad, bb, bc, bd, cc, cd, dd = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
@@ -435,7 +434,7 @@ def _normals(seen: Array, residuals: Array, weights: Array, radius: float) -> tu
     return N, pull
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@compiled
 def _flatness(seen: Array, residuals: Array, weights: Array, radius: float) -> tuple[Array, Array]:
     """Return centre and missing curvatures, and their covariance for unit noise."""
     N, pull, J = 1e-6 * np.eye(5), np.zeros(5), np.zeros(5)
@@ -456,7 +455,7 @@ def _flatness(seen: Array, residuals: Array, weights: Array, radius: float) -> t
     return flat, np.asarray(inverse, dtype=np.float64)
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@compiled
 def _weights(seen: Array, residuals: Array, radius: float, blur: float, scatter: float) -> Array:
     """Return Tukey's weights of the returns that may belong to the ball."""
     weights = np.empty(len(residuals))
@@ -468,7 +467,7 @@ def _weights(seen: Array, residuals: Array, radius: float, blur: float, scatter:
     return weights
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@compiled
 def _scatter(seen: Array, residuals: Array, radius: float) -> float:
     """Return the robust standard deviation of the residuals inside the outline [m]."""
     inside, n, n_close, n_loose = np.empty(len(residuals) + 1), 0, 0, 0

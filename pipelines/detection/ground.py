@@ -7,10 +7,10 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
+from spheremark.pipelines.compilation import compiled
 from spheremark.pipelines.config import ExtractionConfig
 from spheremark.pipelines.detection.cells import Cells, rows_in
 from spheremark.pipelines.model import Array, Column, Mask, StitchedCloud
@@ -63,7 +63,7 @@ def ground_of(cloud: StitchedCloud, cells: Cells, config: ExtractionConfig) -> G
     return Ground(points, highest)
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@compiled
 def _lowest_about(values: Column, window: int) -> Column:
     """Return the lowest of the square window about each cell."""
     n, m = values.shape
@@ -82,7 +82,7 @@ def _lowest_about(values: Column, window: int) -> Column:
     return lowest
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@compiled
 def _n_about(mask: Mask, window: int) -> NDArray[np.uint8]:
     """Return how many cells of a mask are set in the square window about each cell."""
     n, m = mask.shape
@@ -101,7 +101,7 @@ def _n_about(mask: Mask, window: int) -> NDArray[np.uint8]:
     return counts
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@compiled
 def _where(mask: Mask, values: Column, other: float) -> Column:
     """Return values where a mask is set, another elsewhere: many times as quick as ``np.where``."""
     chosen = np.empty_like(values)
@@ -111,14 +111,14 @@ def _where(mask: Mask, values: Column, other: float) -> Column:
     return chosen
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@compiled
 def _highest_about(values: Column, window: int) -> Column:
     """Return the highest of the square window about each cell."""
     highest: Column = -_lowest_about(-values, window)
     return highest
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@compiled
 def _opened(lowest: Column, window: int) -> Column:
     """Return the morphological opening of the lowest points; -inf where too little is near.
 
@@ -130,7 +130,7 @@ def _opened(lowest: Column, window: int) -> Column:
     return opened
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@compiled
 def _ground(lowest: Column, window: int) -> Column:
     """Return the ground's height per cell; infinite where no ground was seen in or beside it.
 
@@ -144,7 +144,7 @@ def _ground(lowest: Column, window: int) -> Column:
     return ground
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@compiled
 def _mapped(cells: Cells, rise_max: float, first: int, end: int) -> tuple[Column, Mask, float]:
     """Return ground and mixed cells of some rows of the grid, and the highest of the other cells.
 
@@ -158,7 +158,7 @@ def _mapped(cells: Cells, rise_max: float, first: int, end: int) -> tuple[Column
     return ground, is_mixed, field_highest
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@compiled
 def _mixed(cells: Cells, ground: Column, rise_max: float, first: int) -> tuple[Mask, float]:
     """Tell the cells whose points must be looked at one by one; return the highest of the others.
 
@@ -187,7 +187,7 @@ def _mixed(cells: Cells, ground: Column, rise_max: float, first: int) -> tuple[M
     return is_mixed, field_highest
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@compiled
 def _above(
     p_base: Column,
     v_up: Array,

@@ -9,9 +9,9 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-import numba
 import numpy as np
 
+from spheremark.pipelines.compilation import compiled
 from spheremark.pipelines.detection.features import Look
 from spheremark.pipelines.detection.target import Ball
 from spheremark.pipelines.model import Array, Mask
@@ -111,7 +111,7 @@ _IS_BALL, _IS_POST = 0, 1
 _STEPS = np.array([0.2, 0.2, 0.1, 0.1, 0.3, 0.1, 0.3])
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@compiled
 def _compared(
     seen: Array, blur: float, noise: float, spread: float
 ) -> tuple[float, float, float, float]:
@@ -139,7 +139,7 @@ def _compared(
     return post, small, half_width, radius
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@compiled
 def _sorted_out(seen: Array, blur: float, noise: float) -> _Beams:
     """Return beams by what they say of a shape."""
     n = seen.shape[1]
@@ -173,7 +173,7 @@ def _sorted_out(seen: Array, blur: float, noise: float) -> _Beams:
     )
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@compiled
 def _goes_on_below(beams: _Beams) -> bool:
     """Tell whether returns below a ball are about as dense as at its height."""
     n_middle, n_low, begins = 0, 0, -1.1 - beams.blur
@@ -184,7 +184,7 @@ def _goes_on_below(beams: _Beams) -> bool:
     return n_low * 2.0 * _HELD > _AS_DENSE * n_middle * (begins - _LOW)
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@compiled
 def _best(
     beams: _Beams, shape: Array, radii: tuple[float, float], kind: int
 ) -> tuple[float, Array]:
@@ -209,7 +209,7 @@ def _best(
     return best, shape
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@compiled
 def _likelihood(beams: _Beams, shape: Array, kind: int) -> float:
     """Return the logarithm of the likelihood of a shape."""
     total, product = -0.5 * ((shape[_EDGED] - _EDGE) / _SIGMA_EDGE) ** 2, 1.0
@@ -236,7 +236,7 @@ def _likelihood(beams: _Beams, shape: Array, kind: int) -> float:
     return float(total)
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@compiled
 def _chance(x: float, y: float, shape: Array, blur: float, kind: int) -> float:
     """Return the probability that a beam hits which passes so far from a shape's centre."""
     soft = _SOFT[0] + _SOFT[1] * blur
@@ -251,7 +251,7 @@ def _chance(x: float, y: float, shape: Array, blur: float, kind: int) -> float:
     return _LUCK + (1.0 - 2.0 * _LUCK) * share
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@compiled
 def _depth(gap: float, radius: float, half: float) -> tuple[float, float]:
     """Return the mean depth of the part of a beam on a round shape, and how far off that may be."""
     if gap + half < radius:
@@ -262,7 +262,7 @@ def _depth(gap: float, radius: float, half: float) -> tuple[float, float]:
     return -0.5 * area / (high - low), _LIMB
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@compiled
 def _dark_area(beams: _Beams, shape: Array, kind: int) -> float:
     """Return the area where beams would hit a shape, of the bands that show nothing else."""
     outer = shape[_RADIUS] + shape[_EDGED] * beams.blur

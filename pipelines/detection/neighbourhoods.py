@@ -9,10 +9,10 @@ from __future__ import annotations
 from itertools import accumulate
 from typing import NamedTuple
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
+from spheremark.pipelines.compilation import compiled
 from spheremark.pipelines.detection.cells import Cells, Layout, rows_in
 from spheremark.pipelines.detection.target import rays_of
 from spheremark.pipelines.model import Array, Column, Mask
@@ -90,7 +90,7 @@ def _sorted(
     return starts, points
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@compiled
 def runs_about(patches: Patches, c: Array) -> NDArray[np.int32]:
     """Return the returns in the cells that may hold some within reach of a place."""
     bottom, top = _span(patches, patches.R_station_base[0], c)
@@ -102,7 +102,7 @@ def runs_about(patches: Patches, c: Array) -> NDArray[np.int32]:
     return runs
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@compiled
 def rays_near(patches: Patches, runs: NDArray[np.int32], c: Array, every: float) -> Array:
     """Return the rays to the returns within reach of a place, or to a sample of them."""
     points, x, y, z, reach2 = patches.points, c[0], c[1], c[2], patches.reach**2
@@ -120,7 +120,7 @@ def rays_near(patches: Patches, runs: NDArray[np.int32], c: Array, every: float)
     return rays
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@compiled
 def _sample(first: int, every: float, rows: NDArray[np.uint32]) -> None:
     """Write one of so many rows of a run, here and there; all of them with 1."""
     for j in range(len(rows)):
@@ -129,7 +129,7 @@ def _sample(first: int, every: float, rows: NDArray[np.uint32]) -> None:
         rows[j] = first + np.int32(skipped)
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@compiled
 def _span(patches: Patches, v_axis: Array, c: Array) -> tuple[int, int]:
     """Return the first and the last cell along an axis that may hold returns within reach."""
     place = _along(v_axis, c)
@@ -139,13 +139,13 @@ def _span(patches: Patches, v_axis: Array, c: Array) -> tuple[int, int]:
     return max(first, 0), min(last, patches.n_side - 1)
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@compiled
 def _along(v_axis: Array, c: Array) -> float:
     """Return how far along an axis a place lies."""
     return float(v_axis[0] * c[0] + v_axis[1] * c[1] + v_axis[2] * c[2])
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@compiled
 def _wanted(layout: Layout, R_station_base: Array, places: Array, margin: int) -> Mask:
     """Tell which cells are those of some places, or near them; what is beyond the grid is not."""
     n_side, last = layout.n_side, layout.n_side - 1
@@ -160,7 +160,7 @@ def _wanted(layout: Layout, R_station_base: Array, places: Array, margin: int) -
     return is_wanted
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@compiled
 def _counts(cells: _Rows, n_cells: int) -> _Rows:
     """Return how often each cell occurs."""
     counts = np.zeros(n_cells, np.int32)
@@ -169,7 +169,7 @@ def _counts(cells: _Rows, n_cells: int) -> _Rows:
     return counts
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@compiled
 def _place(p_base: Column, rows: _Rows, cells: _Rows, free: _Rows, points: Column) -> None:
     """Write some returns, each to the next free place of its cell."""
     for i in range(len(rows)):

@@ -7,10 +7,10 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
+from spheremark.pipelines.compilation import compiled
 from spheremark.pipelines.detection.target import Ball
 from spheremark.pipelines.model import Array, Column
 
@@ -46,7 +46,7 @@ def find_seeds(points: Column, ball: Ball, n_points_min: int) -> Array:
     return np.ascontiguousarray(thinned(ends, 0.5 * ball.radius)[:, :3])
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@compiled
 def _slot(keys: NDArray[np.int64], key: int) -> int:
     """Return the place of a key in an open hash table, or the free place where it belongs."""
     mask = len(keys) - 1
@@ -56,14 +56,14 @@ def _slot(keys: NDArray[np.int64], key: int) -> int:
     return place
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@compiled
 def _voxel(x: float, y: float, z: float, edge: float) -> int:
     """Return the key of the voxel that holds a point within some kilometres."""
     i, j, k = np.floor(x / edge), np.floor(y / edge), np.floor(z / edge)
     return ((int(i) + 500_000) * 1_000_000 + int(j) + 500_000) * 1_000_000 + int(k) + 500_000
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@compiled
 def _voxels(points: Column, edge: float) -> _Voxels:
     """Return the voxels that some returns occupy."""
     size = 64
@@ -87,7 +87,7 @@ def _voxels(points: Column, edge: float) -> _Voxels:
     return _Voxels(keys, numbers, sums[:n], edge)
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@compiled
 def _is_free(voxels: _Voxels, p: _Vector, step: _Vector, beam: _Vector) -> bool:
     """Tell whether nothing lies one step away, at the same depth give or take a voxel."""
     edge = voxels.edge
@@ -99,7 +99,7 @@ def _is_free(voxels: _Voxels, p: _Vector, step: _Vector, beam: _Vector) -> bool:
     return True
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@compiled
 def _around(voxels: _Voxels, p: _Vector) -> tuple[float, float, float, float]:
     """Return sums of x, y, z and count over the 27 voxels about a point."""
     x, y, z, n, edge = 0.0, 0.0, 0.0, 0.0, voxels.edge
@@ -114,7 +114,7 @@ def _around(voxels: _Voxels, p: _Vector) -> tuple[float, float, float, float]:
     return x, y, z, n
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@compiled
 def _axes(p: _Vector, up: Array) -> tuple[_Vector, _Vector]:
     """Return the direction of a place, and the unit vector across it, to the left."""
     distance = np.sqrt(p[0] * p[0] + p[1] * p[1] + p[2] * p[2])
@@ -124,7 +124,7 @@ def _axes(p: _Vector, up: Array) -> tuple[_Vector, _Vector]:
     return (x, y, z), (a / length, b / length, c / length)
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@compiled
 def _free_ends(voxels: _Voxels, up: Array, radius: float, n_points_min: int) -> Array:
     """Return centres and counts, (k, 4), of what ends upward and to at least one side."""
     out = np.empty((len(voxels.sums), 4))
@@ -150,7 +150,7 @@ def _free_ends(voxels: _Voxels, up: Array, radius: float, n_points_min: int) -> 
     return out[:n_out]
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@compiled
 def thinned(seeds: Array, gap: float) -> Array:
     """Return the places that have no earlier one within a gap."""
     kept, places = np.empty_like(seeds), np.empty((3, len(seeds)))

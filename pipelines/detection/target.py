@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
+from spheremark.pipelines.compilation import compiled
 from spheremark.pipelines.model import Array, Column
 
 
@@ -19,7 +19,7 @@ class Ball(NamedTuple):
     divergence: float
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@compiled
 def blur_at(c: Array, ball: Ball) -> float:
     """Return half the width of a beam at a place."""
     return float(0.5 * ball.divergence * np.sqrt(c[0] ** 2 + c[1] ** 2 + c[2] ** 2))
@@ -35,7 +35,7 @@ class View(NamedTuple):
     up: tuple[float, float, float]
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@compiled
 def view_of(c: Array, up: Array) -> View:
     """Return how a centre is looked at."""
     distance = np.sqrt(c[0] ** 2 + c[1] ** 2 + c[2] ** 2)
@@ -48,7 +48,7 @@ def view_of(c: Array, up: Array) -> View:
     return View(c[0], c[1], c[2], across, (p, q, r))
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@compiled
 def rays_of(points: Column, rows: NDArray[np.integer]) -> Array:
     """Return the rays to some returns."""
     rays = np.empty((4, len(rows)))
@@ -62,7 +62,7 @@ def rays_of(points: Column, rows: NDArray[np.integer]) -> Array:
     return rays
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@compiled
 def passing(view: View, rays: Array, i: int) -> tuple[float, float, float]:
     """Return how a ray passes a centre."""
     x, y, z = rays[0, i], rays[1, i], rays[2, i]
@@ -72,7 +72,7 @@ def passing(view: View, rays: Array, i: int) -> tuple[float, float, float]:
     return across, along, rays[3, i] - nearest
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@compiled
 def seen_from(rays: Array, view: View) -> Array:
     """Return how some rays pass a centre."""
     seen = np.empty((3, rays.shape[1]))

@@ -6,16 +6,16 @@ of an argument is read. Elsewhere ``np.linalg`` serves, on stacks of matrices to
 
 from __future__ import annotations
 
-import numba
 import numpy as np
 
+from spheremark.pipelines.compilation import compiled
 from spheremark.pipelines.model import Array
 
 SINGULAR = 1e-11
 """Pivot over diagonal below which an unknown is undetermined; rounding leaves about 1e-15."""
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@compiled
 def factorise(N: Array, root: Array) -> bool:
     """Write the Cholesky factor of a matrix into the lower triangle of another.
 
@@ -46,7 +46,7 @@ def factorise(N: Array, root: Array) -> bool:
     return True
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@compiled
 def solve(N: Array, b: Array) -> bool:
     """Solve a system in place.
 
@@ -76,7 +76,7 @@ def solve(N: Array, b: Array) -> bool:
     return True
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@compiled
 def invert(N: Array, out: Array) -> bool:
     """Write the inverse of a matrix into another.
 
@@ -112,7 +112,7 @@ def invert(N: Array, out: Array) -> bool:
     return True
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@compiled
 def inverse(N: Array) -> Array:
     """Return the inverse of a matrix.
 

@@ -9,10 +9,10 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
+from spheremark.pipelines.compilation import compiled
 from spheremark.pipelines.errors import ConfigError
 from spheremark.pipelines.geometry import levelling_rotation, rigid, skew
 from spheremark.pipelines.ground_model.values import ElevationConfig, StationPose
@@ -133,7 +133,7 @@ def _cov_of_places(
     return np.ascontiguousarray(cov[..., [0, 0, 0, 1, 1, 2], [0, 1, 2, 1, 2, 2]])
 
 
-@numba.njit(cache=True, nogil=True)
+@compiled
 def _lowest_returns(p_base, T, shape, limits):  # type: ignore[no-untyped-def]  # noqa: ANN001, ANN202
     """Return count and sums of x, y, z of each sub-cell's lowest returns, (4r, 4c, 4).
 
@@ -169,7 +169,7 @@ def _lowest_returns(p_base, T, shape, limits):  # type: ignore[no-untyped-def]  
     return sums
 
 
-@numba.njit(cache=True, nogil=True)
+@compiled
 def _join(grid, window, sums, covs, station, noise):  # type: ignore[no-untyped-def]  # noqa: ANN001, ANN202
     """Join the sums of one stop to the grid.
 
@@ -219,7 +219,7 @@ def _join(grid, window, sums, covs, station, noise):  # type: ignore[no-untyped-
                 grid.poses[window[0] + row, window[1] + column, a] += square * covs[row, column, a]
 
 
-@numba.njit(cache=True, nogil=True)
+@compiled
 def _add_products(sums, weight, x, y, z):  # type: ignore[no-untyped-def]  # noqa: ANN001, ANN202
     """Add weighted products of a vector's components."""
     sums[0] += weight * x * x

@@ -14,10 +14,10 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
+from spheremark.pipelines.compilation import compiled
 from spheremark.pipelines.estimation.linear_algebra import solve
 from spheremark.pipelines.ground_model.grid import SUB, Grid
 from spheremark.pipelines.ground_model.values import ElevationConfig
@@ -71,7 +71,7 @@ def ground_heights(grid: Grid, config: ElevationConfig) -> Ground:
     return Ground(heights, sigmas, counts)
 
 
-@numba.njit(cache=True, nogil=True)
+@compiled
 def _window(grid, row, column, cell, reach, points):  # type: ignore[no-untyped-def]  # noqa: ANN001, ANN202
     """Collect x, y from a cell's centre in units of ``reach``, height and noise; count them."""
     middle_x, middle_y = (column + 0.5) * cell, (row + 0.5) * cell
@@ -94,14 +94,14 @@ def _window(grid, row, column, cell, reach, points):  # type: ignore[no-untyped-
     return n
 
 
-@numba.njit(cache=True, nogil=True)
+@compiled
 def _terms(x, y, terms):  # type: ignore[no-untyped-def]  # noqa: ANN001, ANN202
     """Write the terms of a curved surface."""
     terms[0], terms[1], terms[2] = 1.0, x, y
     terms[3], terms[4], terms[5] = x * x, x * y, y * y
 
 
-@numba.njit(cache=True, nogil=True)
+@compiled
 def _robust(points, n, b):  # type: ignore[no-untyped-def]  # noqa: ANN001, ANN202
     """Fit a surface to points of which some stand above it; return the number of its terms."""
     normal, terms = np.zeros((6, 6)), np.zeros(6)
@@ -134,7 +134,7 @@ def _robust(points, n, b):  # type: ignore[no-untyped-def]  # noqa: ANN001, ANN2
     return k
 
 
-@numba.njit(cache=True, nogil=True)
+@compiled
 def _fit_surfaces(grid, sizes, surfaces, first, end):  # type: ignore[no-untyped-def]  # noqa: ANN001, ANN202
     """Write of each cell: height, two slopes, three curvatures, roughness variance, shape of beams.
 
@@ -163,7 +163,7 @@ def _fit_surfaces(grid, sizes, surfaces, first, end):  # type: ignore[no-untyped
                 surfaces[row, column, 6], surfaces[row, column, 7] = roughness, shape
 
 
-@numba.njit(cache=True, nogil=True)
+@compiled
 def _roughness(points, n, b, k, variance):  # type: ignore[no-untyped-def]  # noqa: ANN001, ANN202
     """Return the variance of points about their surface beyond noise; 0 if too few are near it."""
     terms = np.zeros(6)
@@ -182,7 +182,7 @@ def _roughness(points, n, b, k, variance):  # type: ignore[no-untyped-def]  # no
     return max((squares - noise) / max(n_near - k, 1), _ROUGHNESS_MIN**2)
 
 
-@numba.njit(cache=True, nogil=True)
+@compiled
 def _met(products, share, slope_x, slope_y):  # type: ignore[no-untyped-def]  # noqa: ANN001, ANN202
     """Return the mean of ``(n . d)^2 / n_z^2`` over beams with directions d; n is the normal."""
     total = products[0] * slope_x**2 + products[3] * slope_y**2 + products[5]
@@ -190,7 +190,7 @@ def _met(products, share, slope_x, slope_y):  # type: ignore[no-untyped-def]  # 
     return max(total / share, 1e-6)
 
 
-@numba.njit(cache=True, nogil=True)
+@compiled
 def _stands_out(heights, cell):  # type: ignore[no-untyped-def]  # noqa: ANN001, ANN202
     """Tell the cells that lie above lower ground near by more steeply than ground can."""
     out = np.zeros(heights.shape, dtype=np.bool_)
@@ -206,7 +206,7 @@ def _stands_out(heights, cell):  # type: ignore[no-untyped-def]  # noqa: ANN001,
     return out
 
 
-@numba.njit(cache=True, nogil=True)
+@compiled
 def _off(grid, i, j, cell, surface):  # type: ignore[no-untyped-def]  # noqa: ANN001, ANN202
     """Return x, y of a sub-cell from its cell's centre, and its height above the surface."""
     weight = grid.weights[i, j]
@@ -216,7 +216,7 @@ def _off(grid, i, j, cell, surface):  # type: ignore[no-untyped-def]  # noqa: AN
     return x, y, off - surface[3] * x * x - surface[4] * x * y - surface[5] * y * y
 
 
-@numba.njit(cache=True, nogil=True)
+@compiled
 def _standing(grid, sizes, surfaces):  # type: ignore[no-untyped-def]  # noqa: ANN001, ANN202
     """Tell the sub-cells of what stands on the ground."""
     out = np.zeros(grid.weights.shape, dtype=np.bool_)
@@ -228,7 +228,7 @@ def _standing(grid, sizes, surfaces):  # type: ignore[no-untyped-def]  # noqa: A
     return out
 
 
-@numba.njit(cache=True, nogil=True)
+@compiled
 def _estimate(grid, sizes, common, surfaces, stands, heights, sigmas, counts):  # type: ignore[no-untyped-def]  # noqa: ANN001, ANN202, PLR0913
     """Write height, standard deviation and number of returns of each cell."""
     cell = sizes[0]
@@ -254,7 +254,7 @@ def _estimate(grid, sizes, common, surfaces, stands, heights, sigmas, counts):  
             counts[row, column] = n_returns
 
 
-@numba.njit(cache=True, nogil=True)
+@compiled
 def _hidden(n, roughness, shape, cell):  # type: ignore[no-untyped-def]  # noqa: ANN001, ANN202
     """Return by how much the mean of a cell is lower for what of it is in shadow [m]."""
     rough = np.sqrt(roughness)
@@ -263,7 +263,7 @@ def _hidden(n, roughness, shape, cell):  # type: ignore[no-untyped-def]  # noqa:
     return depth * (SUB * SUB - n) / (SUB * SUB)
 
 
-@numba.njit(cache=True, nogil=True)
+@compiled
 def _own(grid, row, column, sizes, surface, stands, own):  # type: ignore[no-untyped-def]  # noqa: ANN001, ANN202, PLR0913
     """Collect the sub-cells of a cell that are ground; return how many, and their returns.
 
@@ -283,7 +283,7 @@ def _own(grid, row, column, sizes, surface, stands, own):  # type: ignore[no-unt
     return n, n_returns
 
 
-@numba.njit(cache=True, nogil=True)
+@compiled
 def _mean(own, n, roughness, cell):  # type: ignore[no-untyped-def]  # noqa: ANN001, ANN202
     """Return the mean over all sub-cells of a cell from those that were seen, and its variance.
 

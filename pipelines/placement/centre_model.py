@@ -11,9 +11,9 @@ import json
 from dataclasses import asdict, dataclass, field
 from typing import Any
 
-import numba
 import numpy as np
 
+from spheremark.pipelines.compilation import compiled
 from spheremark.pipelines.model import Array, seal
 from spheremark.pipelines.placement.plan import Arrangement, Sights
 from spheremark.pipelines.placement.sensor import Returns, Sensor, returns_of
@@ -223,7 +223,7 @@ def is_found(centres: Centres, n_points_min: float, share_min: float) -> np.ndar
     return np.asarray(is_shown & (centres.lost <= _LOST_MAX))
 
 
-@numba.njit(cache=True, nogil=True)
+@compiled
 def _seen(
     table: Group, place: float, lowest: np.ndarray, share: float, info: Array
 ) -> tuple[float, float]:
@@ -253,7 +253,7 @@ def _seen(
     return seen, whole
 
 
-@numba.njit(cache=True, nogil=True)
+@compiled
 def _local(info: Array, density: float, out: Array) -> bool:
     """Fill in the covariance towards, left and up; false where nothing determines it."""
     a, b, c = density * info[0] + 1.0, density * info[1], density * info[2]
@@ -269,7 +269,7 @@ def _local(info: Array, density: float, out: Array) -> bool:
     return True
 
 
-@numba.njit(cache=True, nogil=True)
+@compiled
 def _axes(v: Array, d: float, flat: float, out: Array) -> None:
     """Fill in the axes towards, left and up, in columns."""
     out[:, 0] = v / d
@@ -278,7 +278,7 @@ def _axes(v: Array, d: float, flat: float, out: Array) -> None:
     out[2, 2] = flat / d
 
 
-@numba.njit(cache=True, nogil=True)
+@compiled
 def _expect(places: Group, table: Group, factors: Group, constants: Group, out: Group) -> None:
     """Fill in shares, counts, chances of loss and covariances of every eye and mark."""
     eyes, marks, lowest = places

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-import numba
 import numpy as np
 
+from spheremark.pipelines.compilation import compiled
 from spheremark.pipelines.errors import InputError
 from spheremark.pipelines.model import Array, Index, Mask
 from spheremark.pipelines.placement.centre_model import (
@@ -239,7 +239,7 @@ def sighting_of(
     return centres, sighting
 
 
-@numba.njit(cache=True, nogil=True)
+@compiled
 def _angles(eyes: Array, marks: Array, used: Mask) -> Array:
     """Return the least and the greatest included angle between used marks; 0 with fewer than 2."""
     out = np.zeros((len(eyes), 2))

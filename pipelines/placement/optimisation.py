@@ -12,9 +12,9 @@ from dataclasses import dataclass, replace
 from itertools import combinations
 from typing import NamedTuple
 
-import numba
 import numpy as np
 
+from spheremark.pipelines.compilation import compiled
 from spheremark.pipelines.errors import ConfigError, DegenerateGeometryError
 from spheremark.pipelines.estimation.linear_algebra import invert
 from spheremark.pipelines.model import Array, Index
@@ -727,7 +727,7 @@ def _impossible(task: _Task, stops: Stops, best: Optimum, goal: Goal) -> str:
     return text
 
 
-@numba.njit(cache=True, nogil=True)
+@compiled
 def _log_det(N: Array) -> float:
     """Return the logarithm of the determinant of a positive (6, 6) matrix, which is spoilt."""
     total = 0.0
@@ -745,7 +745,7 @@ def _log_det(N: Array) -> float:
     return total
 
 
-@numba.njit(cache=True, nogil=True)
+@compiled
 def _gains(normal: Array, added: Array) -> Array:
     """Return what each candidate adds to the log-determinants of all stops together."""
     gains = np.zeros(added.shape[1])
@@ -760,7 +760,7 @@ def _gains(normal: Array, added: Array) -> Array:
     return gains
 
 
-@numba.njit(cache=True, nogil=True)
+@compiled
 def _sigma_of(
     N: Array, spread: Array, pull: Array, shared2: tuple[float, float], inverse: Array
 ) -> float:
@@ -778,7 +778,7 @@ def _sigma_of(
     return float(np.sqrt(total))
 
 
-@numba.njit(cache=True, nogil=True)
+@compiled
 def _sigmas_of(sums: tuple[Array, Array, Array], shared2: tuple[float, float]) -> Array:
     """Return the 3-D sigma of each stop; large without a position."""
     normal, spread, pull = sums
@@ -789,7 +789,7 @@ def _sigmas_of(sums: tuple[Array, Array, Array], shared2: tuple[float, float]) -
     return out
 
 
-@numba.njit(cache=True, nogil=True)
+@compiled
 def _judge(  # noqa: PLR0913  a kernel takes what it needs
     sums: tuple[Array, Array, Array],
     added: tuple[Array, Array, Array],

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import math
 
-import numba
 import numpy as np
 
+from spheremark.pipelines.compilation import compiled
 from spheremark.pipelines.model import Array, Mask
 
 _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(24)
@@ -30,7 +30,7 @@ def probability_within(covs: Array, tolerance: float) -> Array:
     return np.where(is_known, found, 0.0)
 
 
-@numba.njit(cache=True, nogil=True)
+@compiled
 def _within(sigmas: Array, nodes: Array, weights: Array) -> Array:
     """Integrate over the unit ball, sigmas ascending."""
     out = np.empty(len(sigmas))

@@ -11,9 +11,9 @@ from dataclasses import dataclass
 from itertools import pairwise
 from typing import Any, NamedTuple
 
-import numba
 import numpy as np
 
+from spheremark.pipelines.compilation import compiled
 from spheremark.pipelines.errors import ConfigError
 from spheremark.pipelines.model import Array, Index, Mask, same_length, seal
 from spheremark.pipelines.placement.centre_model import CentreModel, expect_centres
@@ -347,7 +347,7 @@ def _sigmas(trial: Trial, model: CentreModel | None) -> Array:
     return np.column_stack([distances, np.sqrt(variances)])
 
 
-@numba.njit(cache=True, nogil=True)
+@compiled
 def _meet(p: Array, off: Array, found: Array) -> None:
     """Fill in where three circles about wrong centres meet best; the station is at the origin."""
     x, y = 0.0, 0.0
@@ -371,14 +371,14 @@ def _meet(p: Array, off: Array, found: Array) -> None:
     found[2] = (off[0, 2] + off[1, 2] + off[2, 2]) / 3.0
 
 
-@numba.njit(cache=True, nogil=True)
+@compiled
 def _meet_all(p: Array, offs: Array, out: Array) -> None:
     """Fill in the errors of all patterns."""
     for i in range(len(offs)):
         _meet(p, offs[i], out[i])
 
 
-@numba.njit(cache=True, nogil=True)
+@compiled
 def _three(units: Array, n: int, window: tuple[float, float], three: Index) -> bool:
     """Choose the three marks that cut best, in the window if any; false if none are in it."""
     best_in, best_any = np.inf, np.inf
@@ -407,7 +407,7 @@ def _three(units: Array, n: int, window: tuple[float, float], three: Index) -> b
     return False
 
 
-@numba.njit(cache=True, nogil=True)
+@compiled
 def _attach(rng: np.random.Generator, p: Array, error: float, sigmas: Array, off: Array) -> None:
     """Fill in the errors of three centres."""
     for i in range(3):
@@ -424,7 +424,7 @@ def _attach(rng: np.random.Generator, p: Array, error: float, sigmas: Array, off
         off[i, 2] = sigmas[row, 3] * rng.normal()
 
 
-@numba.njit(cache=True, nogil=True)
+@compiled
 def _try(rng: np.random.Generator, plan: tuple[Any, ...], out: tuple[Any, ...]) -> None:
     """Fill in worst angle, error and window of each arrangement."""
     counts, distances, window, error, sigmas = plan

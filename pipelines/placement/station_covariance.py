@@ -8,10 +8,10 @@ from __future__ import annotations
 
 from typing import Any, NamedTuple
 
-import numba
 import numpy as np
 from scipy.special import ndtri
 
+from spheremark.pipelines.compilation import compiled
 from spheremark.pipelines.estimation.linear_algebra import invert
 from spheremark.pipelines.model import Array, Index, Mask
 from spheremark.pipelines.placement.plan import Requirement
@@ -118,7 +118,7 @@ def shared_variance(sigma_laser_bias: float) -> float:
     return sigma_laser_bias**2 / N_LASERS
 
 
-@numba.njit(cache=True, nogil=True)
+@compiled
 def _claimed(cov: Array, v: Vector, extra: Group, known: Array, true: Array) -> None:
     """Fill in a centre's covariance as a survey takes it, and as it is, shared excess apart."""
     bias2, common2, aim2 = extra
@@ -132,7 +132,7 @@ def _claimed(cov: Array, v: Vector, extra: Group, known: Array, true: Array) -> 
         true[i, i] += aim2 * d2
 
 
-@numba.njit(cache=True, nogil=True)
+@compiled
 def _inform(cov: Array, v: Vector, extra: Group, out: Group) -> bool:
     """Fill in what one mark adds to normal matrix, spread and pull; false if it adds nothing."""
     N, spread, pull = out
@@ -160,7 +160,7 @@ def _inform(cov: Array, v: Vector, extra: Group, out: Group) -> bool:
     return True
 
 
-@numba.njit(cache=True, nogil=True)
+@compiled
 def _by_motion(
     seen: tuple[Array, Array, Array, Mask], extra: Group, gravity: float, out: Group
 ) -> None:
@@ -239,7 +239,7 @@ def _extra(sighting: Sighting, wish: Requirement) -> tuple[float, float, float]:
     return bias2, wish.resection.sigma_common**2, _SIGMA_AIM**2
 
 
-@numba.njit(cache=True, nogil=True)
+@compiled
 def _informed(seen: tuple[Array, Array, Array, Mask], extra: Group, out: Group) -> None:
     """Fill in what each seen mark adds."""
     eyes, marks, covs, is_seen = seen
@@ -250,7 +250,7 @@ def _informed(seen: tuple[Array, Array, Array, Mask], extra: Group, out: Group) 
                 _inform(covs[e, m], v, extra, (out[0][e, m], out[1][e, m], out[2][e, m]))
 
 
-@numba.njit(cache=True, nogil=True)
+@compiled
 def _product(design: Array, circle: Array, out: Array) -> None:
     """Fill in the product of a (3, 3) and a (3, 6) matrix."""
     for i in range(3):
@@ -262,7 +262,7 @@ def _product(design: Array, circle: Array, out: Array) -> None:
             )
 
 
-@numba.njit(cache=True, nogil=True)
+@compiled
 def _best_three(eye: Array, marks: Array, is_seen: Mask, units: Array, three: Index) -> bool:
     """Find the three seen marks whose circles cut best; false if there are none."""
     least = np.inf
@@ -291,7 +291,7 @@ def _best_three(eye: Array, marks: Array, is_seen: Mask, units: Array, three: In
     return least < 1e6
 
 
-@numba.njit(cache=True, nogil=True)
+@compiled
 def _circle(cov: Array, v: Vector, rules: tuple[Group, float], row: int, out: Group) -> float:
     """Fill in one mark's circle and height: two rows of all; return the variance of its azimuth.
 
@@ -318,7 +318,7 @@ def _circle(cov: Array, v: Vector, rules: tuple[Group, float], row: int, out: Gr
     return float(side2 / (flat * flat))
 
 
-@numba.njit(cache=True, nogil=True)
+@compiled
 def _by_circles(seen: Group, extra: Group, level2: float, used: Mask, out: Group) -> None:
     """Fill in the covariances of positions by three circles, and how a common excess moves them."""
     eyes, marks, covs, is_seen = seen

@@ -10,10 +10,10 @@ from __future__ import annotations
 
 from functools import lru_cache
 
-import numba
 import numpy as np
 from scipy.ndimage import maximum_filter
 
+from spheremark.pipelines.compilation import compiled
 from spheremark.pipelines.model import Array, Mask
 from spheremark.pipelines.placement.plan import Arrangement, Sights, Site
 from spheremark.pipelines.simulation.scene import Caster, Mesh, caster
@@ -140,7 +140,7 @@ def _highest_near(site: Site) -> Array:
     return np.asarray(maximum_filter(surface, size=2 * reach + 1, mode="nearest"))
 
 
-@numba.njit(cache=True, nogil=True)
+@compiled
 def _height(grid: Array, u: float, v: float) -> float:
     """Return a grid's bilinear value; far below the ground off the grid or where unknown."""
     i, j = int(np.floor(u)), int(np.floor(v))
@@ -153,7 +153,7 @@ def _height(grid: Array, u: float, v: float) -> float:
     return height if height == height else -1e9
 
 
-@numba.njit(cache=True, nogil=True)
+@compiled
 def _clears(coarse: Array, frame: tuple[float, float, float], ray: Ray, slope: float) -> bool:
     """Return whether a ray of some slope stays above the highest surface nearby."""
     x, y, z, dx, dy, length = ray
@@ -171,7 +171,7 @@ def _clears(coarse: Array, frame: tuple[float, float, float], ray: Ray, slope: f
     return True
 
 
-@numba.njit(cache=True, nogil=True)
+@compiled
 def _horizon(surface: Array, frame: tuple[float, float, float], ray: Ray) -> float:
     """Return the steepest slope at which something along a ray is met."""
     x, y, z, dx, dy, length = ray
@@ -186,7 +186,7 @@ def _horizon(surface: Array, frame: tuple[float, float, float], ray: Ray) -> flo
     return steepest
 
 
-@numba.njit(cache=True, nogil=True)
+@compiled
 def _look(
     grids: tuple[Array, Array],
     frame: tuple[float, float, float],
@@ -222,7 +222,7 @@ def _look(
                 lowest[e, m, c] = min(max(height, _SEEN), _HIDDEN)
 
 
-@numba.njit(cache=True, nogil=True)
+@compiled
 def _look_behind(
     surface: Array,
     frame: tuple[float, float, float],
@@ -253,7 +253,7 @@ def _look_behind(
                     break
 
 
-@numba.njit(cache=True, nogil=True)
+@compiled
 def _shade(eyes: Array, marks: Array, sizes: tuple[float, float], lowest: np.ndarray) -> None:
     """Raise the lowest seen heights by the spheres and poles that stand before a mark."""
     radius, pole = sizes

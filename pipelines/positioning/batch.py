@@ -9,9 +9,9 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-import numba
 import numpy as np
 
+from spheremark.pipelines.compilation import compiled, compiled_with
 from spheremark.pipelines.estimation.linear_algebra import invert
 from spheremark.pipelines.model import Array, Index, Mask
 
@@ -202,7 +202,7 @@ def share(chosen: Index, errors: SharedErrors, cov: Array) -> Array:
     return out
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@compiled
 def _adjust(chosen, p_base, cov_base, marks, cov_marks, up_base, J_up, T, cov, last):  # type: ignore[no-untyped-def]  # noqa: ANN001, ANN202, PLR0913
     """Move each station by steps of Gauss and Newton; tell the square of the last in sigmas."""
     N, gradient, weight = np.empty((6, 6)), np.empty(6), np.empty((3, 3))
@@ -234,7 +234,7 @@ def _adjust(chosen, p_base, cov_base, marks, cov_marks, up_base, J_up, T, cov, l
             _move(step, T[s])
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@compiled
 def _weigh_gravity(T, J_up, of_gravity):  # type: ignore[no-untyped-def]  # noqa: ANN001, ANN202
     """Find the inverse of the covariance of the horizontal part of the up direction."""
     a, b = _times(T, J_up[:, 0]), _times(T, J_up[:, 1])
@@ -244,7 +244,7 @@ def _weigh_gravity(T, J_up, of_gravity):  # type: ignore[no-untyped-def]  # noqa
     of_gravity[0, 1] = of_gravity[1, 0] = -xy / square
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@compiled
 def _weigh(T, cov_base, cov_mark, weight):  # type: ignore[no-untyped-def]  # noqa: ANN001, ANN202
     """Find the inverse of the covariance of a centre's difference from its mark."""
     cov = np.empty((3, 3))
@@ -257,7 +257,7 @@ def _weigh(T, cov_base, cov_mark, weight):  # type: ignore[no-untyped-def]  # no
     invert(cov, weight)
 
 
-@numba.njit(cache=True, nogil=True)
+@compiled
 def _move(step, T):  # type: ignore[no-untyped-def]  # noqa: ANN001, ANN202
     """Turn a pose about its own place, and shift it."""
     R = np.empty((3, 3))
@@ -267,7 +267,7 @@ def _move(step, T):  # type: ignore[no-untyped-def]  # noqa: ANN001, ANN202
         T[j, 3] += step[3 + j]
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@compiled
 def _place(chosen, q, goals, weights, up, of_gravity, motions, cov, last):  # type: ignore[no-untyped-def]  # noqa: ANN001, ANN202, PLR0913
     """Move each station by steps of Newton until these are small; tell the size of the last."""
     R, N, gradient = np.empty((3, 3)), np.empty((6, 6)), np.empty(6)
@@ -294,7 +294,7 @@ def _place(chosen, q, goals, weights, up, of_gravity, motions, cov, last):  # ty
                 break
 
 
-@numba.njit(cache=True, nogil=True)
+@compiled
 def _add_centre(q, weight, N):  # type: ignore[no-untyped-def]  # noqa: ANN001, ANN202
     """Add one centre to the normal matrix of small motions about the station."""
     columns = _cross(q, weight[0]), _cross(q, weight[1]), _cross(q, weight[2])
@@ -308,7 +308,7 @@ def _add_centre(q, weight, N):  # type: ignore[no-untyped-def]  # noqa: ANN001, 
             N[3 + i, 3 + j] += weight[i, j]
 
 
-@numba.njit(cache=True, nogil=True)
+@compiled
 def _add_gravity(up, of_gravity, N):  # type: ignore[no-untyped-def]  # noqa: ANN001, ANN202
     """Add gravity to the normal matrix of small motions about the station."""
     ways = (0.0, up[2], -up[1]), (-up[2], 0.0, up[0])  # crossed with the two axes
@@ -319,7 +319,7 @@ def _add_gravity(up, of_gravity, N):  # type: ignore[no-untyped-def]  # noqa: AN
                     N[i, j] += of_gravity[a, b] * ways[a][i] * ways[b][j]
 
 
-@numba.njit(cache=True, nogil=True)
+@compiled
 def _lean(up, of_gravity, gradient):  # type: ignore[no-untyped-def]  # noqa: ANN001, ANN202
     """Find the gradient of gravity's weighted square."""
     x = up[0] * of_gravity[0, 0] + up[1] * of_gravity[1, 0]
@@ -329,7 +329,7 @@ def _lean(up, of_gravity, gradient):  # type: ignore[no-untyped-def]  # noqa: AN
         gradient[i], gradient[3 + i] = turn[i], 0.0
 
 
-@numba.njit(cache=True, nogil=True)
+@compiled
 def _add_slope(q, shift, goal, weight, gradient):  # type: ignore[no-untyped-def]  # noqa: ANN001, ANN202
     """Add the gradient of one centre's weighted square."""
     off = q[0] + shift[0] - goal[0], q[1] + shift[1] - goal[1], q[2] + shift[2] - goal[2]
@@ -340,7 +340,7 @@ def _add_slope(q, shift, goal, weight, gradient):  # type: ignore[no-untyped-def
         gradient[3 + i] += pull[i]
 
 
-@numba.njit(cache=True, nogil=True)
+@compiled
 def _times(M, v):  # type: ignore[no-untyped-def]  # noqa: ANN001, ANN202, N803
     """Return the product of a matrix and a vector as three numbers: no array is made."""
     x = M[0, 0] * v[0] + M[0, 1] * v[1] + M[0, 2] * v[2]
@@ -348,14 +348,14 @@ def _times(M, v):  # type: ignore[no-untyped-def]  # noqa: ANN001, ANN202, N803
     return x, y, M[2, 0] * v[0] + M[2, 1] * v[1] + M[2, 2] * v[2]
 
 
-@numba.njit(cache=True, nogil=True)
+@compiled
 def _cross(v, w):  # type: ignore[no-untyped-def]  # noqa: ANN001, ANN202
     """Return the cross product as three numbers."""
     x, y = v[1] * w[2] - v[2] * w[1], v[2] * w[0] - v[0] * w[2]
     return x, y, v[0] * w[1] - v[1] * w[0]
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@compiled
 def _solved(M, v):  # type: ignore[no-untyped-def]  # noqa: ANN001, ANN202, N803
     """Return the solution of three equations as three numbers."""
     a, b, c = _cross(M[1], M[2]), _cross(M[2], M[0]), _cross(M[0], M[1])
@@ -365,7 +365,7 @@ def _solved(M, v):  # type: ignore[no-untyped-def]  # noqa: ANN001, ANN202, N803
     return x, y, (v[0] * a[2] + v[1] * b[2] + v[2] * c[2]) / size
 
 
-@numba.njit(cache=True, nogil=True)
+@compiled
 def _rotation(motion, R):  # type: ignore[no-untyped-def]  # noqa: ANN001, ANN202
     """Find the rotation of a small motion by the formula of Rodrigues."""
     x, y, z = motion[0], motion[1], motion[2]
@@ -383,7 +383,7 @@ def _rotation(motion, R):  # type: ignore[no-untyped-def]  # noqa: ANN001, ANN20
     R[1, 2], R[2, 1] = b * y * z - a * x, b * y * z + a * x
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@compiled
 def _meet(chosen, marks, measured, weights, p, cov, last):  # type: ignore[no-untyped-def]  # noqa: ANN001, ANN202, PLR0913
     """Move each station until its steps are small; tell the largest part of the last."""
     N, bend, gradient = np.empty((3, 3)), np.empty((3, 3)), np.empty(3)
@@ -408,7 +408,7 @@ def _meet(chosen, marks, measured, weights, p, cov, last):  # type: ignore[no-un
                 break
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy", inline="always")
+@compiled_with(inline="always")
 def _add_distances(mark, p, measured, weight, N, bend, gradient):  # type: ignore[no-untyped-def]  # noqa: ANN001, ANN202, PLR0913
     """Add what was measured to one mark to normal matrix, second derivative and gradient."""
     is_flat = len(measured) == 2  # inline: a call would count references of seven arrays
@@ -430,7 +430,7 @@ def _add_distances(mark, p, measured, weight, N, bend, gradient):  # type: ignor
         bend[2, 2] += beyond
 
 
-@numba.njit(cache=True, nogil=True, inline="always")
+@compiled_with(inline="always")
 def _add_height(off, off_flat, u, weight, N, gradient):  # type: ignore[no-untyped-def]  # noqa: ANN001, ANN202
     """Add a difference of height, which correlates with the horizontal distance beside it."""
     gradient[2] += weight[1, 1] * off + weight[1, 0] * off_flat
@@ -441,7 +441,7 @@ def _add_height(off, off_flat, u, weight, N, gradient):  # type: ignore[no-untyp
         N[2, i] += u[i] * weight[1, 0]
 
 
-@numba.njit(cache=True, nogil=True)
+@compiled
 def _exceeds(N, limit):  # type: ignore[no-untyped-def]  # noqa: ANN001, ANN202
     """Tell whether all eigenvalues of a symmetric matrix exceed a limit: by its pivots."""
     rest = N.copy()
@@ -457,7 +457,7 @@ def _exceeds(N, limit):  # type: ignore[no-untyped-def]  # noqa: ANN001, ANN202
     return True
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@compiled
 def _carry(chosen, noise, leans, cov, out):  # type: ignore[no-untyped-def]  # noqa: ANN001, ANN202
     """Find the covariances of positions whose gradients have errors."""
     spread, leant = np.empty((3, 3)), np.empty((3, 2))
@@ -476,7 +476,7 @@ def _carry(chosen, noise, leans, cov, out):  # type: ignore[no-untyped-def]  # n
                         out[s, i, j] += cov[s, i, a] * spread[a, b] * cov[s, b, j]
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@compiled
 def _share(chosen, by_ranges, by_heights, variances, sigma_range, sigma_height, cov, out):  # type: ignore[no-untyped-def]  # noqa: ANN001, ANN202, PLR0913
     """Add what errors that all centres share change in the covariances of positions."""
     n = cov.shape[1]

@@ -8,10 +8,10 @@ from __future__ import annotations
 from functools import lru_cache
 from typing import NamedTuple
 
-import numba
 import numpy as np
 from scipy.spatial import cKDTree
 
+from spheremark.pipelines.compilation import compiled
 from spheremark.pipelines.model import Array, Index
 
 _N_CANDIDATES = 300_000  # pairs of pairs that are compared at most; more find nothing new
@@ -107,7 +107,7 @@ def _laid(
     return Hypotheses(*_aligned(fits, (low, low + counts), goals, marks_site))
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@compiled
 def _aligned(
     fits: tuple[Array, Array, Array], ranges: tuple[Index, Index], goals: Spans, marks_site: Array
 ) -> tuple[Array, Array]:
@@ -183,7 +183,7 @@ def assign(
     return marks, _assign(p, hypotheses, table, (tolerance, slack, west, side), marks)
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@compiled
 def _assign(
     p: Array,
     hypotheses: Hypotheses,
@@ -219,7 +219,7 @@ def _assign(
     return scores
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@compiled
 def _nearest(
     place: tuple[float, float, float],
     marks: Array,
@@ -243,7 +243,7 @@ def _nearest(
     return best, least
 
 
-@numba.njit(cache=True, nogil=True)
+@compiled
 def agreements(marks: Index, others: Index) -> Index:
     """Count the fits that have the same mark in each of many matches and in another one."""
     counts = np.zeros(len(marks), dtype=np.intp)

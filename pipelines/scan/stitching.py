@@ -9,10 +9,10 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-import numba
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from spheremark.pipelines.compilation import compiled
 from spheremark.pipelines.config import StitchingConfig
 from spheremark.pipelines.errors import (
     MissingGimbalAngleError,
@@ -133,7 +133,7 @@ def _turn(v_head: Array, angles: Array) -> Array:
     return np.stack([c * x - s * y, s * x + c * y, z], axis=1)
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@compiled
 def _robust_direction(ups: Array) -> tuple[Array, float]:
     """Return the mean unit vector without outliers, and the scatter of one per axis [rad]."""
     middle = np.array([np.median(column) for column in ups.T])
@@ -431,7 +431,7 @@ def beams(cloud: StitchedCloud, members: Index) -> Beams:
     )
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@compiled
 def _beams(
     p_base: Column, turns: tuple[Array, Array], heights: Array, T_head_lidar: Array
 ) -> tuple[Array, Array, Array, Array]:

@@ -9,9 +9,9 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-import numba
 import numpy as np
 
+from spheremark.pipelines.compilation import compiled
 from spheremark.pipelines.model import Array, Column, Index, Mask, Nanos, Rings
 from spheremark.pipelines.threads import side_by_side
 
@@ -119,7 +119,7 @@ def _closed_up(shots: Shots, keep: Mask) -> Shots:
     return Shots(out.p[rows], out.intensities[rows], out.rings[rows], out.stamps_ns[rows])
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@compiled
 def _close_up(shots, keep, out, first, end, is_upward):  # type: ignore[no-untyped-def]  # noqa: ANN001, ANN202
     """Copy what is kept of a part to its first rows, or to its last; return how many these are."""
     step = 1 if is_upward else -1
@@ -134,7 +134,7 @@ def _close_up(shots, keep, out, first, end, is_upward):  # type: ignore[no-untyp
     return abs(k - start)
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@compiled
 def _turn_part(columns, knots_ns, table, lidar, p_base, keep):  # type: ignore[no-untyped-def]  # noqa: ANN001, ANN202
     """Turn some returns, tell which to keep, and see what ``Seen`` has."""
     p, rings, stamps = columns
@@ -163,7 +163,7 @@ def _turn_part(columns, knots_ns, table, lidar, p_base, keep):  # type: ignore[n
     return seen
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@compiled
 def _run_end(stamps, begin, most, since, until):  # type: ignore[no-untyped-def]  # noqa: ANN001, ANN202
     """Return where the shots end that were made in the same interval as the first one."""
     end = begin + 1
@@ -179,7 +179,7 @@ def _run_end(stamps, begin, most, since, until):  # type: ignore[no-untyped-def]
     return end
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@compiled
 def _first_and_last(stamps, begin, end, first, last):  # type: ignore[no-untyped-def]  # noqa: ANN001, ANN202
     """Find the first and the last instant, known ones among them."""
     for i in range(np.uint64(begin), np.uint64(end)):
@@ -187,7 +187,7 @@ def _first_and_last(stamps, begin, end, first, last):  # type: ignore[no-untyped
     return first, last
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@compiled
 def _look_up(table, rings, begin, end, out):  # type: ignore[no-untyped-def]  # noqa: ANN001, ANN202
     """Find what a table says of the laser of each return."""
     first = np.uint64(begin)
@@ -195,7 +195,7 @@ def _look_up(table, rings, begin, end, out):  # type: ignore[no-untyped-def]  # 
         out[i] = table[rings[first + i]]
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@compiled
 def _beam(p, row, lowered):  # type: ignore[no-untyped-def]  # noqa: ANN001, ANN202
     """Return a point as seen from where its beam begins, and its squared range."""
     x, y = np.float64(p[np.uint64(3) * row]), np.float64(p[np.uint64(3) * row + np.uint64(1)])
@@ -203,7 +203,7 @@ def _beam(p, row, lowered):  # type: ignore[no-untyped-def]  # noqa: ANN001, ANN
     return x, y, z, x * x + y * y + z * z
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@compiled
 def _find_scales(p, begin, end, height_share, heights, scales):  # type: ignore[no-untyped-def]  # noqa: ANN001, ANN202
     """Put what the coordinates are multiplied by in place of the biases that this takes off."""
     first = np.uint64(begin)
@@ -212,7 +212,7 @@ def _find_scales(p, begin, end, height_share, heights, scales):  # type: ignore[
         scales[i] = 1.0 - scales[i] / np.sqrt(reach2)
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@compiled
 def _turn_run(p, stamps, begin, end, at, lidar, heights, scales, p_base):  # type: ignore[no-untyped-def]  # noqa: ANN001, ANN202, PLR0913
     """Move the returns of a run to the head and turn it; count those within the limits of range."""
     xx, xy, xz, dx, yx, yy, yz, dy, zx, zy, zz, dz = lidar.T_head_lidar
@@ -240,7 +240,7 @@ def _turn_run(p, stamps, begin, end, at, lidar, heights, scales, p_base):  # typ
     return n_within
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@compiled
 def _judge(p, begin, end, lidar, heights, keep, seen):  # type: ignore[no-untyped-def]  # noqa: ANN001, ANN202, PLR0913
     """Tell which returns of a run to keep; count those not finite and out of range."""
     for i in range(begin, end):

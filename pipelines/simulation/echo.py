@@ -9,9 +9,9 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-import numba
 import numpy as np
 
+from spheremark.pipelines.compilation import compiled
 from spheremark.pipelines.model import Array, Column, Mask, seal
 from spheremark.pipelines.scan.rigs import N_LASERS
 from spheremark.pipelines.simulation.scene import Caster, Scene, caster
@@ -142,7 +142,7 @@ def _disc(n: int) -> Array:
     return np.column_stack([radii * np.cos(angles), radii * np.sin(angles)])
 
 
-@numba.njit(cache=True, nogil=True)
+@compiled
 def _passes_axes(
     origins: Array, directions: Array, feet: Array, axes: Array, radii: Array, half_width: float
 ) -> Mask:  # pragma: no cover
@@ -169,7 +169,7 @@ def _passes_axes(
     return found
 
 
-@numba.njit(cache=True, nogil=True)
+@compiled
 def _sees_step(ranges: Array, stride: int) -> Mask:  # pragma: no cover
     """Return which beams differ from the plane through the beams before and after them.
 
@@ -187,7 +187,7 @@ def _sees_step(ranges: Array, stride: int) -> Mask:  # pragma: no cover
     return found
 
 
-@numba.njit(cache=True, nogil=True)
+@compiled
 def _bundles(
     directions: Array, across: Array, along: Array, offsets: Array
 ) -> Array:  # pragma: no cover
@@ -203,7 +203,7 @@ def _bundles(
     return out
 
 
-@numba.njit(cache=True, nogil=True)
+@compiled
 def _echoes(
     origins: Array,
     directions: Array,
@@ -234,7 +234,7 @@ def _echoes(
     return ranges, reflectivities
 
 
-@numba.njit(cache=True, nogil=True)
+@compiled
 def _strongest(t: Array, shade: Array) -> tuple[float, float]:  # pragma: no cover
     """Return range and reflectivity of the strongest group of returns of one pulse."""
     for i in range(1, len(t)):  # in place: sorted by range, the few rays of a bundle

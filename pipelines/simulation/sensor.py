@@ -6,9 +6,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Self
 
-import numba
 import numpy as np
 
+from spheremark.pipelines.compilation import compiled
 from spheremark.pipelines.model import Array, Column, Firings, Index, Mask, Nanos, Rig, Rings, seal
 from spheremark.pipelines.scan.rigs import (
     AZIMUTH_STEP,
@@ -241,7 +241,7 @@ def _posed(T_head_lidar: Array, T_site_base: Array) -> Array:
     return np.ascontiguousarray((T_site_base @ turning @ T_head_lidar)[:, :3])
 
 
-@numba.njit(cache=True, nogil=True)
+@compiled
 def _may_pass(
     azimuths: Array,
     gimbal_angles: Array,
@@ -282,7 +282,7 @@ def _may_pass(
     return found
 
 
-@numba.njit(cache=True, nogil=True)
+@compiled
 def _aim(
     azimuths: Array, gimbal_angles: Array, rings: Rings, lasers: Array, posed: Array
 ) -> tuple[Array, Array, Array]:  # pragma: no cover

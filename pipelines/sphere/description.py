@@ -6,9 +6,9 @@ import math
 from collections.abc import Callable
 from typing import Any
 
-import numba
 import numpy as np
 
+from spheremark.pipelines.compilation import compiled
 from spheremark.pipelines.geometry import levelling_rotation
 from spheremark.pipelines.model import (
     RING_UNKNOWN,
@@ -126,7 +126,7 @@ def left_out(members: Index, used: Index) -> Index:
     return np.asarray(members[is_left])
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@compiled
 def incidence(offsets: Array, radius: float) -> float:
     """Return the mean angle between beams and the normals of a sphere."""
     total = 0.0

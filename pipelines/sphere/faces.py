@@ -8,9 +8,9 @@ that is not full, do not, and then this has to be estimated.
 
 from __future__ import annotations
 
-import numba
 import numpy as np
 
+from spheremark.pipelines.compilation import compiled
 from spheremark.pipelines.model import Array
 
 N_MOUNTING = 6
@@ -25,7 +25,7 @@ def sigmas_of(sigma_direction: float, sigma_offset: float) -> Array:
     return np.concatenate([angles, np.full(2, sigma_offset), amplitudes])
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@compiled
 def effects_on(centres: Array) -> Array:
     """Return how the mounting moves what is swept upwards; the other face moves against it."""
     effects = np.zeros((len(centres), 3, N_MOUNTING))

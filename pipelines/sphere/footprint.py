@@ -9,10 +9,10 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-import numba
 import numpy as np
 from numpy.polynomial import Chebyshev, Polynomial
 
+from spheremark.pipelines.compilation import FUSED, compiled, compiled_with
 from spheremark.pipelines.model import Array, Beams, Index
 
 _N_STRIPS = 8  # strips of the ellipse; with 8 the mean is good to 0.01 mm of a 0.1 m ball at 8 m
@@ -20,7 +20,6 @@ _N_STRIPS_FEW = 6  # along the way to the middle, so that the outline cuts them 
 _MIDDLE = 0.3  # radii: returns nearer to the middle belong to no side
 _THIN = 1e-6  # [m]; a thinner footprint is a ray, and this one differs from it by nothing
 _TINY = 1e-300
-_AT_ONCE = {"contract"}  # products and sums
 
 
 def _strips(n: int) -> Array:
@@ -101,7 +100,7 @@ def predict(beams: Beams, centres: Array, radii: Array, which: Index) -> Predict
     return Prediction(*_predict(aim, np.maximum(half_widths, _THIN), centres, radii, which))
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@compiled
 def share_of_outline(directions: Array, across: Array, offsets: Array, radius: float) -> float:
     """Tell how much of a sphere's visible half has returns."""
     n = directions.shape[1]
@@ -126,7 +125,7 @@ def share_of_outline(directions: Array, across: Array, offsets: Array, radius: f
     return np.sum(is_seen) / 8.0
 
 
-@numba.njit(cache=True, nogil=True)
+@compiled
 def _predict(
     aim: tuple[Array, Array, Array], half_widths: Array, centres: Array, radii: Array, which: Index
 ) -> tuple[Array, Array, Array, Array]:
@@ -158,7 +157,7 @@ def _predict(
     return ranges, J, lit, offsets
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy", fastmath=_AT_ONCE)
+@compiled_with(fastmath=FUSED)
 def depths_inside(places: Array, n: int, found: Array) -> None:
     """Find ``_mean_depth`` where footprints lie well inside the outline.
 
@@ -181,7 +180,7 @@ def depths_inside(places: Array, n: int, found: Array) -> None:
         found[0, i], found[1, i], found[2, i], found[3, i] = mean, by_x, by_y, by_radius
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy", fastmath=_AT_ONCE)
+@compiled_with(fastmath=FUSED)
 def depths_anywhere(places: Array, n: int, found: Array) -> None:
     """Find ``_mean_depth`` without derivatives, at a small fraction of its cost.
 
@@ -210,7 +209,7 @@ def depths_anywhere(places: Array, n: int, found: Array) -> None:
         found[0, i] = found[0, i] / found[1, i] if found[1, i] > 0.0 else 0.0
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy", fastmath=_AT_ONCE)
+@compiled_with(fastmath=FUSED)
 def _turn_to_middle(places: Array, n: int) -> None:
     """Swap axes so that strips lie along the way to the middle: across it each is lit or not."""
     for i in range(n):
@@ -220,7 +219,7 @@ def _turn_to_middle(places: Array, n: int) -> None:
         places[3, i], places[4, i] = (half_y, half_x) if is_across else (half_x, half_y)
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy", fastmath=_AT_ONCE)
+@compiled_with(fastmath=FUSED)
 def _end(x: float, h2: float) -> tuple[float, float]:
     """Return where a strip ends, at the outline at most, and how deep the sphere is there.
 
@@ -232,7 +231,7 @@ def _end(x: float, h2: float) -> tuple[float, float]:
     return (x, root) if rest > 0.0 else (outline, 0.0)
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy", fastmath=_AT_ONCE)
+@compiled_with(fastmath=FUSED)
 def _angle(y: float, x: float) -> float:
     """Return ``arctan2(y, x)`` for y not below zero, to 1e-8, without a branch."""
     away = abs(x)
@@ -245,7 +244,7 @@ def _angle(y: float, x: float) -> float:
     return np.pi - angle if x < 0.0 else angle
 
 
-@numba.njit(cache=True, nogil=True)
+@compiled
 def _mean_depth(
     x0: float, y0: float, radius: float, half_x: float, half_y: float
 ) -> tuple[float, float, float, float, float]:

@@ -11,10 +11,10 @@ import math
 from functools import cache
 from typing import NamedTuple
 
-import numba
 import numpy as np
 from scipy.special import ndtr
 
+from spheremark.pipelines.compilation import compiled
 from spheremark.pipelines.model import Array
 from spheremark.pipelines.sphere.linearisation import Linear
 from spheremark.pipelines.sphere.returns import Rows
@@ -96,7 +96,7 @@ def _logarithms_before() -> Array:
     return np.asarray(-0.5 * (edges + (np.log(_SOFTNESSES / _SOFTNESS) / _SPREAD) ** 2))
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@compiled
 def _counts(rows: Rows, linear: Linear, weights: Array, radius: float) -> tuple[Array, float]:
     """Count returns by how many half widths of their footprints they reach inside, (b,).
 
@@ -117,7 +117,7 @@ def _counts(rows: Rows, linear: Linear, weights: Array, radius: float) -> tuple[
     return counts, lateral2 / max(counts.sum(), 1.0)
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@compiled
 def outline_normals(
     rows: Rows,
     linear: Linear,
@@ -175,7 +175,7 @@ def outline_normals(
     return N[:, :3, :3], pulls[:, :3], faces[:, :3, :3], pull_faces[:, :3], found
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@compiled
 def _eliminate_edge(N: Array, pull: Array, faces: Array, pull_faces: Array) -> None:
     """Take the last unknown, a sphere's own edge, out of equations of it and the centre."""
     gain, gain_faces = N[:3, 3] / N[3, 3], faces[:3, 3] / N[3, 3]
@@ -187,7 +187,7 @@ def _eliminate_edge(N: Array, pull: Array, faces: Array, pull_faces: Array) -> N
             N[p, q] -= gain[p] * N[3, q]
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@compiled
 def _site(inside, known, site):  # type: ignore[no-untyped-def]  # noqa: ANN001, ANN202
     """Return precision, and that times the mean, which stand for one return's reaching inside."""
     (variance, blur), (own, own_pull) = known, site
@@ -204,7 +204,7 @@ def _site(inside, known, site):  # type: ignore[no-untyped-def]  # noqa: ANN001,
     return given, (precision + given) * mean - pull
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@compiled
 def _chance(z: float) -> float:
     """Return the chance that a return which reaches so far inside has met the sphere."""
     if z > _CERTAIN:
@@ -212,13 +212,13 @@ def _chance(z: float) -> float:
     return _LUCK + (1.0 - _LUCK) * 0.5 * math.erfc(-_HALF * z)
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@compiled
 def _pair(columns: Array, i: int) -> _Pair:
     """Return both numbers of a return: a call with whole arrays would count their references."""
     return columns[0, i], columns[1, i]
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@compiled
 def _reach(passed: _Pair, half_widths: _Pair, radius: float) -> _Pair:
     """Return half of a footprint's width and how far it reaches inside the outline [m].
 
@@ -231,7 +231,7 @@ def _reach(passed: _Pair, half_widths: _Pair, radius: float) -> _Pair:
     return half, radius + half - off
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@compiled
 def _is_by_pole(passed: _Pair, up: _Pair, blur: float, radius: float) -> bool:
     """Tell whether a footprint lies so low and so near the vertical that it may be on the pole.
 
@@ -242,7 +242,7 @@ def _is_by_pole(passed: _Pair, up: _Pair, blur: float, radius: float) -> bool:
     return bool(is_low and abs(x * up_y - y * up_x) < _POLE_HALF * radius + blur)
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@compiled
 def _towards(passed: _Pair, away: float) -> tuple[float, float, float]:
     """Return the direction from a centre to a beam, square to the line of sight to the centre."""
     x, y = passed
@@ -250,7 +250,7 @@ def _towards(passed: _Pair, away: float) -> tuple[float, float, float]:
     return x / off, y / off, off / away
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@compiled
 def _variance(cov: Array, v: tuple[float, float, float]) -> float:
     """Return the variance along a vector."""
     x, y, z = v

@@ -9,9 +9,9 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-import numba
 import numpy as np
 
+from spheremark.pipelines.compilation import FUSED, compiled, compiled_with
 from spheremark.pipelines.model import Array, Index, Mask
 from spheremark.pipelines.sphere.footprint import depths_anywhere, depths_inside
 from spheremark.pipelines.sphere.returns import Rows
@@ -20,7 +20,6 @@ _INNER = 0.9  # radii from the middle within which the range hardly bends
 _THIN = 1e-6  # [m] of a spread: keeps what is divided by it finite
 _WIDTH = np.sqrt(3.0)  # standard deviations to either side: has the fourth moment of a normal one
 
-_AT_ONCE = {"contract"}  # products and sums
 
 # Columns of how a sphere is seen along beams: its place along the footprint's axes, its radius, and
 # half widths of the footprint; its place along the beam, how far the beam passes it by, and how far
@@ -59,7 +58,7 @@ class Linear(NamedTuple):
     offsets: Array
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@compiled
 def linearise(rows: Rows, spheres: Array, covs: Array, is_in: Mask | None = None) -> Linear:
     """Predict ranges, linearised over the width of what is not known of the spheres.
 
@@ -104,7 +103,7 @@ def linearise(rows: Rows, spheres: Array, covs: Array, is_in: Mask | None = None
     return out
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@compiled
 def _part(
     matters: Mask, first: int, n: int, seen: Array, parts: tuple[Index, Index]
 ) -> tuple[int, int]:
@@ -119,7 +118,7 @@ def _part(
     return n_inner, n_outer
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy", fastmath=_AT_ONCE)
+@compiled_with(fastmath=FUSED)
 def _see(rows: Rows, first: int, n: int, sphere: Array, seen: Array) -> None:
     """Fill in where a sphere is along beams, and their footprints."""
     o, u, a, b = rows.origins, rows.directions, rows.firsts_axis, rows.seconds_axis
@@ -136,7 +135,7 @@ def _see(rows: Rows, first: int, n: int, sphere: Array, seen: Array) -> None:
         seen[_HALF_Y, k] = rows.half_widths[1, first + k]
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy", fastmath=_AT_ONCE)
+@compiled_with(fastmath=FUSED)
 def _spread(rows: Rows, first: int, n: int, cov: Array, seen: Array) -> None:
     """Fill in a sphere's covariance along the axes of footprints."""
     a, b = rows.firsts_axis, rows.seconds_axis
@@ -160,7 +159,7 @@ def _spread(rows: Rows, first: int, n: int, cov: Array, seen: Array) -> None:
         seen[_XR, k], seen[_YR, k] = ax * xr + ay * yr + az * zr, bx * xr + by * yr + bz * zr
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy", fastmath=_AT_ONCE)
+@compiled_with(fastmath=FUSED)
 def _factor(n: int, variance: float, seen: Array) -> None:
     """Replace covariances by their factor away, aside and of the radius, whose variance is told."""
     least = _THIN * _THIN
@@ -183,7 +182,7 @@ def _factor(n: int, variance: float, seen: Array) -> None:
         seen[_RA, k], seen[_RB, k], seen[_RR, k] = ra, rb, rr
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@compiled
 def _pick(which: Index, n: int, table: Array, some: Array) -> None:
     """Copy some rows of columns."""
     for j in range(len(table)):
@@ -191,7 +190,7 @@ def _pick(which: Index, n: int, table: Array, some: Array) -> None:
             some[j, k] = table[j, which[k]]
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@compiled
 def _put_back(which: Index, n: int, some: Array, table: Array) -> None:
     """Copy what was found of some rows to where they are among all."""
     for j in range(len(table)):
@@ -199,7 +198,7 @@ def _put_back(which: Index, n: int, some: Array, table: Array) -> None:
             table[j, which[k]] = some[j, k]
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy", fastmath=_AT_ONCE)
+@compiled_with(fastmath=FUSED)
 def _tell_inside(n: int, seen: Array, depths: Array, told: Array) -> None:
     """Fill in what beams well inside the outline tell: exact slopes, and the bend of a ray."""
     depths_inside(seen, n, depths)
@@ -216,7 +215,7 @@ def _tell_inside(n: int, seen: Array, depths: Array, told: Array) -> None:
         told[_BY_RADIUS, k] = depths[3, k]
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy", fastmath=_AT_ONCE)
+@compiled_with(fastmath=FUSED)
 def _tell_anywhere(
     n: int, n_places: int, seen: Array, work: tuple[Array, Array], told: Array
 ) -> None:
@@ -253,7 +252,7 @@ def _tell_anywhere(
         told[_BY_RADIUS, k] = by_r
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy", fastmath=_AT_ONCE)
+@compiled_with(fastmath=FUSED)
 def _lay_out(n: int, n_places: int, seen: Array, places: Array) -> None:
     """Fill in the present places, and those to either side along each column of the factor."""
     for j in range(5):
@@ -271,7 +270,7 @@ def _lay_out(n: int, n_places: int, seen: Array, places: Array) -> None:
             places[_RADIUS, p * n + k] += width * seen[_RA + axis, k]
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy", fastmath=_AT_ONCE)
+@compiled_with(fastmath=FUSED)
 def _combine(rows: Rows, first: int, n: int, seen: Array, told: Array, out: Linear) -> None:
     """Fill in ``Linear`` for the returns of one sphere."""
     u, a, b = rows.directions, rows.firsts_axis, rows.seconds_axis

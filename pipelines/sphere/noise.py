@@ -8,9 +8,9 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-import numba
 import numpy as np
 
+from spheremark.pipelines.compilation import compiled
 from spheremark.pipelines.model import Array, Index, Mask
 from spheremark.pipelines.sphere.linearisation import Linear
 from spheremark.pipelines.sphere.returns import Rows
@@ -89,7 +89,7 @@ def weigh(rows: Rows, linear: Linear, biases: Array, noise: Noise, is_in: Mask) 
     return Weighed(*_weigh(rows, linear, biases, noise, is_in))
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@compiled
 def _weigh(
     rows: Rows, linear: Linear, biases: Array, noise: Noise, is_in: Mask
 ) -> tuple[Array, Array, Array, Noise]:
@@ -113,7 +113,7 @@ def _weigh(
     return residuals, sigmas, weights, found
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@compiled
 def _beside(rows: Rows, linear: Linear, variances: Array) -> None:
     """Fill in the variances of what is not noise of the range: directions on a slope, the bend."""
     J, u = linear.J, rows.directions
@@ -124,7 +124,7 @@ def _beside(rows: Rows, linear: Linear, variances: Array) -> None:
         variances[i] = lateral * lateral * max(square - along * along, 0.0) + bend * bend
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@compiled
 def _against(
     rows: Rows, residuals: Array, beside: Array, factors: Array, sigmas: Array, weights: Array
 ) -> None:
@@ -138,7 +138,7 @@ def _against(
         weights[i] = rest * rest
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@compiled
 def _pooled(squares: Array, counts: Array, n_unknowns: float) -> Noise:
     """Return the noise from sums of squares and numbers of returns by class."""
     n = max(np.sum(counts), 1.0)

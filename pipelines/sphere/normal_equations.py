@@ -8,9 +8,9 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-import numba
 import numpy as np
 
+from spheremark.pipelines.compilation import FUSED, REASSOCIATED, compiled, compiled_with
 from spheremark.pipelines.estimation.linear_algebra import inverse
 from spheremark.pipelines.model import Array, Index
 from spheremark.pipelines.sphere.linearisation import Linear
@@ -97,7 +97,7 @@ def normals_of(
     return N
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@compiled
 def normals_of_spheres(
     rows: Rows, linear: Linear, residuals: Array, per_square: Array, n_unknowns: int
 ) -> tuple[Array, Array]:
@@ -108,7 +108,7 @@ def normals_of_spheres(
     return N, pull
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@compiled
 def _sum_up(rows: Rows, J: Array, residuals: Array, per_square: Array, N: Normals) -> None:
     """Fill in the sums of ``Normals``, which are zero."""
     signed = rows.up[0] * per_square
@@ -124,7 +124,7 @@ def _sum_up(rows: Rows, J: Array, residuals: Array, per_square: Array, N: Normal
                 N.mixed_faces[s, p, laser] += signed[i] * J[p, i]
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@compiled
 def _sum_spheres(
     firsts: Index, J: Array, residuals: Array, weights: Array, out: tuple[Array, Array]
 ) -> None:
@@ -139,7 +139,7 @@ def _sum_spheres(
                 N[s, p, q] = N[s, q, p] = sums[p * (p + 1) // 2 + q]
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy", fastmath={"reassoc", "contract"})
+@compiled_with(fastmath=REASSOCIATED)
 def _products(first, behind, J, residuals, weights):  # type: ignore[no-untyped-def]  # noqa: ANN001, ANN202
     """Return sums of the ten products of derivatives, by rows, and of those with residuals."""
     xx = yx = yy = zx = zy = zz = rx = ry = rz = rr = x_pull = y_pull = z_pull = r_pull = 0.0
@@ -154,7 +154,7 @@ def _products(first, behind, J, residuals, weights):  # type: ignore[no-untyped-
     return xx, yx, yy, zx, zy, zz, rx, ry, rz, rr, x_pull, y_pull, z_pull, r_pull
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@compiled
 def solve(N: Normals, effects: Array, known: Array, pull_known: Array) -> Solved:
     """Solve the equations of all centres together with what they share.
 
@@ -183,7 +183,7 @@ def solve(N: Normals, effects: Array, known: Array, pull_known: Array) -> Solved
     return Solved(given[:, :, n].copy(), step_shared, inverses, cov_shared, by_shared, covs)
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@compiled
 def _shared(N: Normals, effects: Array, known: Array, pull_known: Array) -> Array:
     """Return the equations, (k + 1, k + 1), of what centres share, last the right-hand side."""
     n_lasers, n = len(N.biases), len(known)
@@ -205,7 +205,7 @@ def _shared(N: Normals, effects: Array, known: Array, pull_known: Array) -> Arra
     return reduced
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract"})
+@compiled_with(fastmath=FUSED)
 def _add_product(sign: float, a: Array, b: Array, out: Array) -> None:
     """Add ``a' b`` with a sign."""
     for k in range(len(a)):

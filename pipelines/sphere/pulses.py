@@ -9,10 +9,10 @@ from __future__ import annotations
 from itertools import pairwise
 from typing import NamedTuple
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
+from spheremark.pipelines.compilation import compiled
 from spheremark.pipelines.geometry import levelling_rotation
 from spheremark.pipelines.model import (
     RING_UNKNOWN,
@@ -182,7 +182,7 @@ def firings_of(cloud: StitchedCloud, pattern: Pattern) -> Firings:
     )
 
 
-@numba.njit(cache=True, nogil=True)
+@compiled
 def _numbered(times: Column, rings: Rings, phase: float, delays: Array) -> tuple[int, Rows]:
     """Return the number of the first firing, and the row of each shot from there on."""
     low, high = 1 << 60, -(1 << 60)
@@ -228,7 +228,7 @@ def passing_of(
     ]
 
 
-@numba.njit(cache=True, nogil=True)
+@compiled
 def _aimed(
     sights: Array,
     turns: tuple[Array, Array],
@@ -316,7 +316,7 @@ def _plane(sight: Array, up: Array) -> Array:
     return np.stack([side, np.cross(side, sight)])
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@compiled
 def _steadiest(times: Array, azimuths: Array, rates: Array) -> int:
     """Return which rate leaves the azimuths least spread about a mean."""
     best, most = 0, -1.0

@@ -8,9 +8,9 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-import numba
 import numpy as np
 
+from spheremark.pipelines.compilation import compiled
 from spheremark.pipelines.estimation.linear_algebra import inverse
 from spheremark.pipelines.model import Array, Beams
 from spheremark.pipelines.sphere.linearisation import Linear, linearise
@@ -80,7 +80,7 @@ def free_radii(
     return radii, sigmas
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@compiled
 def _shown(
     rows: Rows,
     weighing: Weighing,
@@ -100,7 +100,7 @@ def _shown(
         radii[m], sigmas[m] = _known(radius, sigma, spheres[m, 3])
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@compiled
 def _shown_by_one(
     rows: Rows, weighing: Weighing, sphere: Array, cov: Array, residuals: Array
 ) -> tuple[float, float]:
@@ -117,7 +117,7 @@ def _shown_by_one(
     return radius, sigma
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@compiled
 def _known(radius: float, sigma: float, assumed: float) -> tuple[float, float]:
     """Return a radius with its sigma, NaN where these say that nothing is known."""
     if sigma < _SIGMA_MAX * assumed and 0.0 < radius < _RADIUS_MAX * assumed:
@@ -125,7 +125,7 @@ def _known(radius: float, sigma: float, assumed: float) -> tuple[float, float]:
     return np.nan, np.nan
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@compiled
 def _with_radius(cov: Array, variance: float) -> Array:
     """Return the covariance of a centre as such of a sphere, with a variance of the radius."""
     wide = np.zeros((4, 4))
@@ -134,7 +134,7 @@ def _with_radius(cov: Array, variance: float) -> Array:
     return wide
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@compiled
 def _stepped(
     rows: Rows, weighing: Weighing, sphere: Array, cov: Array, residuals: Array
 ) -> tuple[Array, Array, float]:
@@ -151,7 +151,7 @@ def _stepped(
     return np.sum(by_pull * pull, axis=1), known, np.sqrt(variance)
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@compiled
 def _summed(
     rows: Rows, weighing: Weighing, sphere: Array, cov: Array, residuals: Array
 ) -> tuple[Array, Array, Linear, Array]:
@@ -163,7 +163,7 @@ def _summed(
     return N[0], pull[0], linear, per_square
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@compiled
 def _misfit(weighing: Weighing, residuals: Array) -> float:
     """Return the sum of squared residuals in units of the noise, strays counting as such."""
     total = 0.0
@@ -173,7 +173,7 @@ def _misfit(weighing: Weighing, residuals: Array) -> float:
     return total
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@compiled
 def _free(rows: Rows, weighing: Weighing, sphere: Array, cov: Array) -> tuple[Array, Array]:
     """Return the centre with radius, (4,), where steps settle, and the covariance of these."""
     prior, limit = np.eye(4) / (_PRIOR * sphere[3]) ** 2, _STEP_MAX * sphere[3]

@@ -9,9 +9,9 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-import numba
 import numpy as np
 
+from spheremark.pipelines.compilation import compiled
 from spheremark.pipelines.model import Array, Beams, Index, Mask
 
 _THIN = 1e-6  # [m]; a thinner footprint is a ray, and this one differs from it by nothing
@@ -88,7 +88,7 @@ def rows_of(
     )
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@compiled
 def _derived(
     directions: Array, across: Array, ranges: Array, divergence: Array, up: Array
 ) -> tuple[Array, Array, Array, Array]:
@@ -113,7 +113,7 @@ def _derived(
     return seconds, half_widths, ups, blurs
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@compiled
 def rows_of_one(rows: Rows, m: int) -> Rows:
     """Return the returns of one marker."""
     first, behind = rows.firsts[m], rows.firsts[m + 1]
@@ -139,7 +139,7 @@ def moved_faces(rows: Rows, moves: Array) -> Rows:
     return rows._replace(origins=_moved(rows, moves))
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@compiled
 def _moved(rows: Rows, moves: Array) -> Array:
     """Return the origins."""
     origins = np.empty(rows.origins.shape)
@@ -150,7 +150,7 @@ def _moved(rows: Rows, moves: Array) -> Array:
     return origins
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@compiled
 def in_play(rows: Rows, offsets: Array, margins: Array, radius: float) -> Mask:
     """Tell which returns may be the sphere by their place: on its outline, and not on its pole.
 

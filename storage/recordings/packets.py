@@ -14,10 +14,10 @@ from functools import cache
 from itertools import pairwise
 from typing import NamedTuple
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
+from spheremark.pipelines.compilation import compiled, compiled_with
 from spheremark.pipelines.model import Firings, Mask, Nanos, Rings
 from spheremark.pipelines.scan.rigs import (
     FIRING_CYCLE,
@@ -333,7 +333,7 @@ def _stamps_of_messages(
     return messages_ns, np.concatenate([start + one for start, one in pairs])
 
 
-@numba.njit(cache=True, nogil=True)
+@compiled
 def _number(octets, at, size, is_little):  # type: ignore[no-untyped-def]  # noqa: ANN001, ANN202
     """Read an unsigned number of so many bytes."""
     value = np.int64(0)
@@ -342,13 +342,13 @@ def _number(octets, at, size, is_little):  # type: ignore[no-untyped-def]  # noq
     return value
 
 
-@numba.njit(cache=True, nogil=True)
+@compiled
 def _short(octets, at):  # type: ignore[no-untyped-def]  # noqa: ANN001, ANN202
     """Read two bytes, little endian; unsigned places spare the test for negative ones."""
     return np.uint32(octets[at]) | np.uint32(octets[at + np.uint64(1)]) << np.uint32(8)
 
 
-@numba.njit(cache=True, nogil=True)
+@compiled
 def _heads_kernel(octets, places, is_little, heads):  # type: ignore[no-untyped-def]  # noqa: ANN001, ANN202
     """Fill stamp, micros, mode and number of returns of packets that begin at places.
 
@@ -376,7 +376,7 @@ def _heads_kernel(octets, places, is_little, heads):  # type: ignore[no-untyped-
         heads[k, 3] = n
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@compiled
 def _packets_kernel(octets, places, rows, heads, sensor, out):  # type: ignore[no-untyped-def]  # noqa: ANN001, ANN202
     """Write the returns of packets that begin at places, of each from its row on."""
     for k in range(len(places)):
@@ -395,7 +395,7 @@ def _packets_kernel(octets, places, rows, heads, sensor, out):  # type: ignore[n
             n = _unpack_block(octets, (block, strongest), place, sensor, out, n)
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@compiled
 def _unpack_block(octets, blocks, place, sensor, out, n):  # type: ignore[no-untyped-def]  # noqa: ANN001, ANN202
     """Append the returns of one block, or of a pair of them with dual returns; return the rows.
 
@@ -427,7 +427,7 @@ def _unpack_block(octets, blocks, place, sensor, out, n):  # type: ignore[no-unt
     return n
 
 
-@numba.njit(cache=True, nogil=True, inline="always")
+@compiled_with(inline="always")
 def _put(out, n, aim, steps, reflectivity, sensor):  # type: ignore[no-untyped-def]  # noqa: ANN001, ANN202
     """Write one return to a row."""
     turn, laser, instant = aim

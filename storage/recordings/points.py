@@ -10,10 +10,10 @@ from dataclasses import dataclass
 from functools import cached_property
 from typing import NamedTuple
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
+from spheremark.pipelines.compilation import compiled
 from spheremark.pipelines.model import RING_UNKNOWN, Array, Column, Index, Mask, Nanos, Rings
 from spheremark.pipelines.threads import by_turns
 from spheremark.storage.recordings import cdr
@@ -255,7 +255,7 @@ def unpack_clouds(octets: Octets, clouds: Nanos, layout: Layout, out: Columns) -
     return Seen(n.astype(np.int64), low, high, n_zeros.astype(np.int64), n_descents == 0, n_bad > 0)
 
 
-@numba.njit(cache=True, nogil=True)
+@compiled
 def _word(octets, at):  # type: ignore[no-untyped-def]  # noqa: ANN001, ANN202
     """Read four bytes, little endian, at any address; unsigned places let it be one load."""
     return (
@@ -266,7 +266,7 @@ def _word(octets, at):  # type: ignore[no-untyped-def]  # noqa: ANN001, ANN202
     )
 
 
-@numba.njit(cache=True, nogil=True)
+@compiled
 def _clouds_kernel(octets, clouds, layout, columns, told):  # type: ignore[no-untyped-def]  # noqa: ANN001, ANN202
     """Unpack clouds; tell their returns, extreme times, zero times, descents and bad rings."""
     times = np.empty(_BLOCK, np.uint32)
@@ -276,7 +276,7 @@ def _clouds_kernel(octets, clouds, layout, columns, told):  # type: ignore[no-un
         )
 
 
-@numba.njit(cache=True, nogil=True)
+@compiled
 def _cloud_kernel(octets, cloud, layout, columns, times):  # type: ignore[no-untyped-def]  # noqa: ANN001, ANN202
     """Copy the bits of finite returns away from the origin, and add their times to the stamp.
 
@@ -302,7 +302,7 @@ def _cloud_kernel(octets, cloud, layout, columns, times):  # type: ignore[no-unt
     return end - row, _time(low, is_whole), _time(high, is_whole), n_zeros, n_descents, n_bad
 
 
-@numba.njit(cache=True, nogil=True)
+@compiled
 def _copy_block(octets, at, layout, columns, row, n):  # type: ignore[no-untyped-def]  # noqa: ANN001, ANN202
     """Copy n points to columns, whether or not they are returns."""
     step, x, y, z, intensity, ring, time, is_wide, _ = layout
@@ -318,7 +318,7 @@ def _copy_block(octets, at, layout, columns, row, n):  # type: ignore[no-untyped
         times[:n] = 0
 
 
-@numba.njit(cache=True, nogil=True)
+@compiled
 def _copy_coordinates(octets, places, step, p, first, n):  # type: ignore[no-untyped-def]  # noqa: ANN001, ANN202
     """Copy coordinates that begin at some places and come every so many bytes."""
     x, y, z = np.uint64(places[0]), np.uint64(places[1]), np.uint64(places[2])
@@ -331,7 +331,7 @@ def _copy_coordinates(octets, places, step, p, first, n):  # type: ignore[no-unt
         z += np.uint64(step)
 
 
-@numba.njit(cache=True, nogil=True)
+@compiled
 def _copy_others(octets, places, step, is_wide, columns, row, n):  # type: ignore[no-untyped-def]  # noqa: ANN001, ANN202, PLR0913
     """Copy what is not a coordinate; a ring that cannot be becomes the unknown one."""
     intensities, rings, times = columns
@@ -350,7 +350,7 @@ def _copy_others(octets, places, step, is_wide, columns, row, n):  # type: ignor
         second += np.uint64(step)
 
 
-@numba.njit(cache=True, nogil=True)
+@compiled
 def _may_be_none(p, row, n):  # type: ignore[no-untyped-def]  # noqa: ANN001, ANN202
     """Say whether a coordinate is zero or not finite: then some points may be no returns."""
     n_odd = 0
@@ -359,7 +359,7 @@ def _may_be_none(p, row, n):  # type: ignore[no-untyped-def]  # noqa: ANN001, AN
     return n_odd > 0
 
 
-@numba.njit(cache=True, nogil=True)
+@compiled
 def _close_up(p, intensities, rings, times, row, n):  # type: ignore[no-untyped-def]  # noqa: ANN001, ANN202
     """Move the returns of a block to its first rows; return their number."""
     kept = 0
@@ -374,7 +374,7 @@ def _close_up(p, intensities, rings, times, row, n):  # type: ignore[no-untyped-
     return kept
 
 
-@numba.njit(cache=True, nogil=True)
+@compiled
 def _void(intensities, row, n):  # type: ignore[no-untyped-def]  # noqa: ANN001, ANN202
     """Put zero in place of what is not finite."""
     for i in range(np.uint64(row), np.uint64(row + n)):
@@ -382,7 +382,7 @@ def _void(intensities, row, n):  # type: ignore[no-untyped-def]  # noqa: ANN001,
         intensities[i] = np.uint32(0) if (value & _EXPONENT) == _EXPONENT else value
 
 
-@numba.njit(cache=True, nogil=True)
+@compiled
 def _date(times, n, is_whole, stamp, stamps, row):  # type: ignore[no-untyped-def]  # noqa: ANN001, ANN202
     """Find instants from times since a stamp: whole nanoseconds, or the bits of seconds."""
     first = np.uint64(row)
@@ -395,7 +395,7 @@ def _date(times, n, is_whole, stamp, stamps, row):  # type: ignore[no-untyped-de
         stamps[first + i] = stamp + np.int64(np.rint(np.float64(seconds[i]) * 1e9))
 
 
-@numba.njit(cache=True, nogil=True)
+@compiled
 def _extremes(times, n, is_whole, low, high):  # type: ignore[no-untyped-def]  # noqa: ANN001, ANN202
     """Find the extreme times as numbers of the same order, not finite ones outermost; count zeros.
 
@@ -409,7 +409,7 @@ def _extremes(times, n, is_whole, low, high):  # type: ignore[no-untyped-def]  #
     return low, high, n_zeros
 
 
-@numba.njit(cache=True, nogil=True)
+@compiled
 def _ordered(bits, is_whole):  # type: ignore[no-untyped-def]  # noqa: ANN001, ANN202
     """Turn the bits of an unsigned or floating number to one of the same order, and back."""
     if is_whole:
@@ -417,7 +417,7 @@ def _ordered(bits, is_whole):  # type: ignore[no-untyped-def]  # noqa: ANN001, A
     return bits ^ ((bits >> np.int32(31)) & np.int32(0x7FFFFFFF))
 
 
-@numba.njit(cache=True, nogil=True)
+@compiled
 def _time(order, is_whole):  # type: ignore[no-untyped-def]  # noqa: ANN001, ANN202
     """Return the time, as it was recorded, that stands at a place of the order."""
     bits = np.empty(1, np.uint32)
@@ -425,7 +425,7 @@ def _time(order, is_whole):  # type: ignore[no-untyped-def]  # noqa: ANN001, ANN
     return np.float64(bits[0]) if is_whole else np.float64(bits.view(np.float32)[0])
 
 
-@numba.njit(cache=True, nogil=True)
+@compiled
 def _n_descents(stamps, begin, end):  # type: ignore[no-untyped-def]  # noqa: ANN001, ANN202
     """Count the instants that are before the one in front of them."""
     n = 0
@@ -434,7 +434,7 @@ def _n_descents(stamps, begin, end):  # type: ignore[no-untyped-def]  # noqa: AN
     return n
 
 
-@numba.njit(cache=True, nogil=True)
+@compiled
 def _n_unknown(rings, row, n):  # type: ignore[no-untyped-def]  # noqa: ANN001, ANN202
     """Count the rings that are not known."""
     n_unknown = 0

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import struct
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
+from spheremark.pipelines.compilation import compiled
 from spheremark.pipelines.model import Nanos
 
 Octets = NDArray[np.uint8]
@@ -41,7 +41,7 @@ def text(body: bytes, at: int) -> tuple[str, int]:
     return body[at + 4 : end].decode(), end
 
 
-@numba.njit(cache=True, nogil=True)
+@compiled
 def _walk_kernel(octets, position, rows):  # type: ignore[no-untyped-def]  # noqa: ANN001, ANN202
     """Fill rows with records until they are full, the footer is met, or a record is cut."""
     size = len(octets)

@@ -8,9 +8,9 @@ from __future__ import annotations
 
 from typing import Any, NamedTuple
 
-import numba
 import numpy as np
 
+from spheremark.pipelines.compilation import compiled
 from spheremark.pipelines.config import FittingConfig
 from spheremark.pipelines.geometry import levelling_rotation
 from spheremark.pipelines.model import (
@@ -192,7 +192,7 @@ def _tallied(shots: _Shots, best: Estimate, radius: float) -> _Tally:
     return tally._replace(sigma0=factors)
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@compiled
 def _tally(
     rows: Rows,
     centres: Array,

@@ -9,9 +9,9 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import NamedTuple
 
-import numba
 import numpy as np
 
+from spheremark.pipelines.compilation import compiled
 from spheremark.pipelines.config import FittingConfig
 from spheremark.pipelines.model import (
     Array,
@@ -144,7 +144,7 @@ def _without_outline(fit: MarkerFit, why_not: str) -> MarkerFit:
     )
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@compiled
 def _entered(places: Array, half_widths: Array, radius: float, shifts: Array) -> Array:
     """Return how far footprints are inside the outline, in their half widths, (k, n).
 
@@ -162,7 +162,7 @@ def _entered(places: Array, half_widths: Array, radius: float, shifts: Array) ->
     return entered
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@compiled
 def _logarithms(entered: Array, has_hit: Mask, edges: Array, softness: float) -> Array:
     """Return the log-likelihood of what hit and what did not, (k, e), for edges and a softness.
 
