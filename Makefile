@@ -2,6 +2,7 @@
 # make test   all tests: the quick ones, then the slow ones
 # make check  format, lint, types, import contracts, spelling, lock files
 # make bench  speed and memory as ratios against a peer in the same run
+# make reference  renew REFERENCE.md from the commands and the settings
 # make lock   renew the lock files from pyproject.toml
 # make clean  remove what the other targets made
 # With PYTHON=python3.13 VENV=.venv-3.13 they use another Python and keep its packages apart.
@@ -13,7 +14,7 @@ KERNELS := $(shell git ls-files 'pipelines/*.py' 'storage/*.py' 2>/dev/null)
 export OPENBLAS_NUM_THREADS ?= 1
 SIDE_BY_SIDE := --numprocesses 2 --dist loadfile
 
-.PHONY: help setup setup-dev demo test check bench lock lock-check clean
+.PHONY: help setup setup-dev demo test check bench reference lock lock-check clean
 
 help:
 	@sed -n 's/^# //p' Makefile
@@ -57,6 +58,9 @@ check: setup-dev
 
 bench: setup-dev
 	@$(BIN)/spheremark bench
+
+reference: setup
+	@$(BIN)/python -m spheremark.service.cli.reference > REFERENCE.md
 
 COMPILE := $(BIN)/uv pip compile --quiet --universal --no-header \
 	--no-emit-index-url --no-emit-find-links pyproject.toml
