@@ -2,34 +2,55 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from time import perf_counter
 
 import numpy as np
 
+from spheremark.pipelines.accuracy import MarkerErrors, StationError, marker_errors, station_error
 from spheremark.pipelines.config import SurveyConfig
 from spheremark.pipelines.detection import extract
 from spheremark.pipelines.errors import NoMarkersError, SolveError
 from spheremark.pipelines.model import (
     ControlMarks,
+    DistanceChecks,
     MarkerFits,
     NoFix,
     Rig,
     ScanLog,
     StationFix,
+    StationQuality,
     Status,
     StopResult,
     SubsetFixes,
+    Truth,
 )
+from spheremark.pipelines.positioning.quality_control import check_distances, station_quality
 from spheremark.pipelines.positioning.resection import resect
 from spheremark.pipelines.positioning.subsets import resect_subsets
 from spheremark.pipelines.scan.stitching import choose_rig, split_stops, stitch
 from spheremark.pipelines.sphere import fit_markers
 
 Progress = Callable[[float, str], None]
-"""Told the share of the work that is done, 0 to 1, and what comes next; may raise to cancel."""
+"""Takes the finished share of the computation, 0 to 1, and the next step; may raise to cancel."""
+
+
+@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
+class StopErrors:
+    """Errors of a stop's results against truth.
+
+    Attributes
+    ----------
+    markers : mapping of str to MarkerErrors
+        By fitting method.
+    stations : mapping of (str, str) to StationError
+        By fitting and resection method, of each station that was positioned.
+    """
+
+    markers: Mapping[str, MarkerErrors]
+    stations: Mapping[tuple[str, str], StationError]
 
 
 def process(
@@ -53,7 +74,7 @@ def process(
     marks : ControlMarks, optional
         Marks at known places; without them there are centres, but no positions.
     progress : callable
-        Told the share of the work that is done, 0 to 1, and what comes next.
+        Takes the finished share of the computation, 0 to 1, and the next step.
 
     Returns
     -------
@@ -63,7 +84,7 @@ def process(
     Raises
     ------
     MissingRigError
-        If neither the log nor the caller tells how the LiDAR is mounted.
+        If neither the log nor the caller gives the mounting of the LiDAR.
     NoMarkersError
         If not one marker was found in any stop.
     RecordingError
@@ -71,9 +92,9 @@ def process(
 
     Notes
     -----
-    A station that cannot be positioned does not cost its markers: its fix is a ``NoFix`` with the
-    reason. Cost grows linearly with the returns. A log is let go as soon as it is stitched: who
-    keeps no reference to it, as in ``process(read_log(path), ...)``, needs less memory.
+    A station that cannot be positioned has a ``NoFix`` with the reason; its markers are kept. Cost
+    grows linearly with the returns. The log is released as soon as it is stitched: a caller without
+    a reference to it, as in ``process(read_log(path), ...)``, needs less memory.
     """
     rig = choose_rig(log, rig)
     stops = list(split_stops(log, config.stitching))
@@ -86,6 +107,36 @@ def process(
     if not any(fits.fits for result in results for fits in result.fits.values()):
         raise NoMarkersError(_why_no_markers(results, config))
     return tuple(results)
+
+
+def stop_errors(stop: StopResult, truth: Truth) -> StopErrors | None:
+    """Compare the results of a stop with the truth.
+
+    Parameters
+    ----------
+    stop : StopResult
+        The results.
+    truth : Truth
+        True marks, and the true poses of some stops.
+
+    Returns
+    -------
+    StopErrors or None
+        None if the true pose of the stop is not known.
+    """
+    pose = next((one for one in truth.stops if one.name == stop.name), None)
+    if pose is None:
+        return None
+    return StopErrors(
+        markers={
+            method: marker_errors(fits, pose, truth.marks) for method, fits in stop.fits.items()
+        },
+        stations={
+            methods: station_error(fix, pose)
+            for methods, fix in stop.fixes.items()
+            if isinstance(fix, StationFix)
+        },
+    )
 
 
 def _process_stop(
@@ -118,9 +169,19 @@ def _process_stop(
         fixes = _position(fits, marks, config, cloud.coverage)
     with _timed(timings, "subsets"):
         subsets = _subsets(fits, fixes, marks, config)
+    with _timed(timings, "quality_control"):
+        quality = _quality(fits, fixes, marks, config)
+        distances = _distances(next(iter(fits.values())), marks, config)
     progress(1.0, f"{name} done")
     return StopResult(
-        name=name, cloud=cloud, fits=fits, fixes=fixes, subsets=subsets, timings=timings
+        name=name,
+        cloud=cloud,
+        fits=fits,
+        fixes=fixes,
+        subsets=subsets,
+        quality=quality,
+        distances=distances,
+        timings=timings,
     )
 
 
@@ -165,6 +226,34 @@ def _subsets(
         by_method = resect_subsets(methods, fix, centres, marks, config.resection)
         found |= {(fit_method, method): sizes for method, sizes in by_method.items()}
     return found
+
+
+def _quality(
+    fits: dict[str, MarkerFits],
+    fixes: dict[tuple[str, str], StationFix | NoFix],
+    marks: ControlMarks | None,
+    config: SurveyConfig,
+) -> dict[tuple[str, str], StationQuality]:
+    """Return the quality of each station that was positioned."""
+    if marks is None:
+        return {}
+    return {
+        (fit_method, method): station_quality(fix, fits[fit_method], marks, config.resection)
+        for (fit_method, method), fix in fixes.items()
+        if isinstance(fix, StationFix)
+    }
+
+
+def _distances(
+    fits: MarkerFits, marks: ControlMarks | None, config: SurveyConfig
+) -> DistanceChecks | None:
+    """Compare distances between markers with the control; None with fewer than two of either."""
+    if marks is None or len(fits.fits) < 2 or len(marks.names) < 2:
+        return None
+    try:
+        return check_distances(fits, marks, config.resection, config.tolerance)
+    except SolveError as error:
+        return DistanceChecks.none(str(error))
 
 
 def _qualified(fix: StationFix, coverage: float) -> StationFix:

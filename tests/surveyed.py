@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from spheremark.pipelines.config import SurveyConfig
+from spheremark.pipelines.config import ResectionConfig, SurveyConfig
 from spheremark.pipelines.geometry import (
     exp_motion,
     included_angle,
@@ -31,6 +31,7 @@ from spheremark.pipelines.model import (
     SubsetFixes,
     Truth,
 )
+from spheremark.pipelines.positioning.quality_control import station_quality
 from spheremark.pipelines.scan.rigs import tilted_vlp16
 from spheremark.storage.catalogue.catalogue import Catalogue
 from spheremark.storage.catalogue.results import RunInfo, tables
@@ -62,7 +63,18 @@ def stop(name, p_site, control, rng):
     fixes = {(m, "free_station"): _fix(truth, control, fits[m], rng) for m in fits}
     subsets = {(m, "free_station"): _subsets(truth, centres, m, rng) for m in fits}
     result = StopResult(
-        name=name, cloud=cloud, fits=fits, fixes=fixes, subsets=subsets, timings={"stitch": 0.4}
+        name=name,
+        cloud=cloud,
+        fits=fits,
+        fixes=fixes,
+        subsets=subsets,
+        quality={
+            (m, "free_station"): station_quality(
+                fixes[m, "free_station"], fits[m], control, ResectionConfig()
+            )
+            for m in fits
+        },
+        timings={"stitch": 0.4},
     )
     return result, truth
 

@@ -15,6 +15,7 @@ from spheremark.pipelines.model.arrays import (
     same_length,
     seal,
 )
+from spheremark.pipelines.model.ellipse import ErrorEllipse
 from spheremark.pipelines.model.marker import (
     MarkerCandidate,
     MarkerCandidates,
@@ -37,9 +38,12 @@ from spheremark.pipelines.model.scan import (
 )
 from spheremark.pipelines.model.station import (
     ControlMarks,
+    DistanceChecks,
     Exclusion,
     NoFix,
+    Omissions,
     StationFix,
+    StationQuality,
     StopResult,
     StopTruth,
     SubsetFixes,
@@ -52,6 +56,8 @@ __all__ = [
     "Beams",
     "Column",
     "ControlMarks",
+    "DistanceChecks",
+    "ErrorEllipse",
     "Exclusion",
     "Firings",
     "ImuMount",
@@ -64,6 +70,7 @@ __all__ = [
     "Mask",
     "Nanos",
     "NoFix",
+    "Omissions",
     "Origin",
     "Rejection",
     "Rig",
@@ -71,6 +78,7 @@ __all__ = [
     "ScanLog",
     "Shape",
     "StationFix",
+    "StationQuality",
     "Status",
     "StitchedCloud",
     "StopResult",

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
 from spheremark.pipelines.errors import InputError
-from spheremark.pipelines.model import Array, Index, Mask
+from spheremark.pipelines.model import Array, ErrorEllipse, Index, Mask
 
 RANGE_BIAS = "common_range_bias"
 """The shared unknown that is what all ranges are too long [m]."""
@@ -299,6 +300,30 @@ class Parts:
         seal(self, {"own": (s, 6, 6), "coupling": (s, 6, u), "cov_common": (u, u)})
 
 
+class Repeat(NamedTuple):
+    """Two stations at one place, each with its own centres alone.
+
+    Attributes
+    ----------
+    stations : (2,)
+        Places among the stations.
+    apart : (3,)
+        How far the second stands from the first, after the adjustment [m].
+    n_marks : int
+        Marks that both saw.
+    rms : float
+        Root mean square 3-D difference of the centres, laid on each other by a rigid motion [m].
+    predicted_rms : float
+        What their covariances promise [m].
+    """
+
+    stations: tuple[int, int]
+    apart: Array
+    n_marks: int
+    rms: float
+    predicted_rms: float
+
+
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class AdjustedNetwork:
     """All stations and marks of a survey, adjusted together.
@@ -365,6 +390,8 @@ class AdjustedNetwork:
         All observations that are not used.
     warnings : tuple of str
         Why the network cannot be relied on, in sentences; empty when it can.
+    repeats : tuple of Repeat
+        Stations that stand at one place, compared with each other.
     """
 
     network: Network
@@ -395,6 +422,7 @@ class AdjustedNetwork:
     noncentrality: float
     left_out: tuple[LeftOut, ...]
     warnings: tuple[str, ...]
+    repeats: tuple[Repeat, ...] = ()
 
     def __post_init__(self) -> None:
         s, m = len(self.network.stations), len(self.network.marks)
@@ -433,6 +461,30 @@ class AdjustedNetwork:
         return float(np.sqrt(self.cov_shared[place, place]))
 
     @property
+    def shared_redundancies(self) -> Array:
+        """Redundancy number of the prior of each shared unknown, (k,)."""
+        return np.asarray(1.0 - np.diag(self.network.shared.weights @ self.cov_shared))
+
+    @property
+    def n_observations(self) -> int:
+        """Observed coordinates and angles that are used, priors of shared unknowns included."""
+        n, s = len(self.network.sightings), len(self.network.stations)
+        centres, gravity, control = (int(part.sum()) for part in np.split(self.used, [n, n + s]))
+        return 3 * centres + 2 * gravity + 3 * control + len(self.network.shared.names)
+
+    @property
+    def n_unknowns(self) -> int:
+        """Coordinates, angles and shared unknowns that are estimated."""
+        network = self.network
+        return 6 * len(network.stations) + 3 * len(network.marks) + len(network.shared.names)
+
+    @property
+    def sightings_used(self) -> Index:
+        """Station and mark of each centre that is used, (k, 2)."""
+        sightings = self.network.sightings
+        return np.asarray(sightings[self.used[: len(sightings)]])
+
+    @property
     def p_base(self) -> Array:
         """Observed centres less what all have in common, (n, 3) [m]."""
         return np.asarray(self.network.p_base - self.network.shared.effects @ self.shared)
@@ -458,6 +510,16 @@ class AdjustedNetwork:
         """Covariance of each mark, (m, 3, 3) [m^2]."""
         m = len(self.p_site)
         return np.asarray(np.einsum("iaib->iab", self.cov_p_site.reshape(m, 3, m, 3)))
+
+    @property
+    def station_ellipses(self) -> tuple[ErrorEllipse, ...]:
+        """Error ellipse of the horizontal position of each station."""
+        return tuple(ErrorEllipse.of(cov) for cov in self.station_covariances)
+
+    @property
+    def mark_ellipses(self) -> tuple[ErrorEllipse, ...]:
+        """Error ellipse of the horizontal position of each mark."""
+        return tuple(ErrorEllipse.of(cov) for cov in self.mark_covariances)
 
 
 def position_by_motion(T: Array) -> Array:

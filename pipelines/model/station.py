@@ -4,11 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 
-from spheremark.pipelines.model.arrays import Array, Index, Shape, same_length, seal
+from spheremark.pipelines.model.arrays import Array, Index, Mask, Shape, same_length, seal
+from spheremark.pipelines.model.ellipse import ErrorEllipse
 from spheremark.pipelines.model.marker import MarkerFits, Status
 from spheremark.pipelines.model.scan import Rig, StitchedCloud
 
@@ -156,6 +157,11 @@ class StationFix:
         """Square root of the trace of the position's covariance [m]."""
         return float(np.sqrt(np.trace(self.cov_p_site)))
 
+    @property
+    def ellipse(self) -> ErrorEllipse:
+        """Error ellipse of the horizontal position."""
+        return ErrorEllipse.of(self.cov_p_site)
+
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class SubsetFixes:
@@ -217,6 +223,114 @@ class NoFix:
 
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
+class DistanceChecks:
+    """Distances between the marks of one scan, as measured against as given, one row per pair.
+
+    Attributes
+    ----------
+    fits : (n, 2)
+        Places of the two among the fits.
+    marks : (n, 2)
+        Places of the two among the control marks.
+    measured, given : (n,)
+        Distance between the centres, and between the control marks [m].
+    sigmas : (n,)
+        Standard deviation of their difference [m].
+    is_off : (n,) bool
+        Whether they differ by more than the tolerance, or by more than 3.29 sigma.
+    suspects : tuple of int
+        Places among the control marks of those without which no distance would be off, or that most
+        of the distances that are off share.
+    reason : str
+        Why nothing could be compared; empty when it was.
+    """
+
+    fits: Index
+    marks: Index
+    measured: Array
+    given: Array
+    sigmas: Array
+    is_off: Mask
+    suspects: tuple[int, ...]
+    reason: str = ""
+
+    def __post_init__(self) -> None:
+        n = len(self.fits)
+        columns: dict[str, Shape] = dict.fromkeys(("measured", "given", "sigmas", "is_off"), (n,))
+        seal(self, fits=(n, 2), marks=(n, 2), **columns)
+
+    @classmethod
+    def none(cls, reason: str) -> Self:
+        """Return no comparison, with the reason."""
+        pairs, values = np.zeros((0, 2), dtype=np.intp), np.zeros(0)
+        return cls(
+            fits=pairs,
+            marks=pairs,
+            measured=values,
+            given=values,
+            sigmas=values,
+            is_off=np.zeros(0, dtype=np.bool_),
+            suspects=(),
+            reason=reason,
+        )
+
+
+@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
+class Omissions:
+    """A station without each of its markers, one row per used marker, in the order of its matches.
+
+    Attributes
+    ----------
+    shifts : (n, 3)
+        Position of the station without the marker, minus its position with all; NaN, as all else of
+        the row, where the other marks stand on one plumb line and tell no heading, or contradict
+        each other so that they tell no position [m].
+    predictions : (n, 3)
+        Where the scan puts the mark when the others alone position the station, minus where it is
+        given [m].
+    cov_predictions : (n, 3, 3)
+        Covariances of these differences [m^2].
+    """
+
+    shifts: Array
+    predictions: Array
+    cov_predictions: Array
+
+    def __post_init__(self) -> None:
+        n = len(self.shifts)
+        seal(self, shifts=(n, 3), predictions=(n, 3), cov_predictions=(n, 3, 3))
+
+    @classmethod
+    def none(cls) -> Self:
+        """Return no rows."""
+        none = np.zeros((0, 3))
+        return cls(shifts=none, predictions=none, cov_predictions=np.zeros((0, 3, 3)))
+
+    @property
+    def sigma_predictions(self) -> Array:
+        """Standard deviations of ``predictions``, (n, 3) [m]."""
+        return np.asarray(np.sqrt(np.diagonal(self.cov_predictions, axis1=1, axis2=2)))
+
+
+@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
+class StationQuality:
+    """What the scan and the control tell of a station's quality, without truth.
+
+    Attributes
+    ----------
+    dilution_of_precision : float
+        3-D sigma of the position where each observation has a sigma of 1; infinite where these
+        leave it open.
+    without_each : Omissions
+        The station without each of its markers; no rows where the method is not ``free_station`` or
+        fewer than three markers were used.
+    """
+
+    dilution_of_precision: float
+    without_each: Omissions
+
+
+@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class StopResult:
     """All that one stop gave.
 
@@ -232,6 +346,11 @@ class StopResult:
         By fitting and resection method; empty when there are no control marks.
     subsets : mapping of (str, str) to tuple of SubsetFixes
         The station from each pair and each triple of its marks, by fitting and resection method.
+    quality : mapping of (str, str) to StationQuality
+        Of each ``StationFix`` in ``fixes``.
+    distances : DistanceChecks or None
+        Distances between markers of the first fitting method against the control; None without
+        control marks, or with fewer than two of either.
     timings : mapping of str to float
         Time that each step took [s].
     """
@@ -241,6 +360,8 @@ class StopResult:
     fits: Mapping[str, MarkerFits]
     fixes: Mapping[tuple[str, str], StationFix | NoFix]
     subsets: Mapping[tuple[str, str], tuple[SubsetFixes, ...]]
+    quality: Mapping[tuple[str, str], StationQuality]
+    distances: DistanceChecks | None = None
     timings: Mapping[str, float] = field(default_factory=dict)
 
 

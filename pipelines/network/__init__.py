@@ -13,12 +13,13 @@ from spheremark.pipelines.model.network import (
     LeftOut,
     Network,
     Refusal,
+    Repeat,
     Shared,
 )
 from spheremark.pipelines.network.adjustment import adjust_network
 from spheremark.pipelines.network.assembly import assemble
 from spheremark.pipelines.network.comparison import NetworkErrors, compare
-from spheremark.pipelines.network.repeated_stops import Repeat, repeated_stops
+from spheremark.pipelines.network.repeated_stops import repeated_stops
 
 __all__ = [
     "RANGE_BIAS",

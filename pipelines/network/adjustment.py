@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 from scipy.special import chdtri, ndtri
 
@@ -17,6 +19,7 @@ from spheremark.pipelines.model.network import (
     position_by_motion,
 )
 from spheremark.pipelines.network.normal_equations import middle_of
+from spheremark.pipelines.network.repeated_stops import repeated_stops
 from spheremark.pipelines.network.snooping import UNTESTABLE, Dropped, Tested, snoop
 
 _FALSE_ALARM = 0.05  # probability that a network without gross errors loses an observation
@@ -70,7 +73,8 @@ def adjust_network(network: Network, config: ResectionConfig) -> AdjustedNetwork
     if sum(block < n for block, _ in dropped) > _MANY_LEFT_OUT * n:
         tested, dropped = snoop(network, critical, is_studentised=True)
     noncentrality = critical + float(ndtri(config.test_power))
-    return _adjusted(network, tested, dropped, (critical, noncentrality), config)
+    result = _adjusted(network, tested, dropped, (critical, noncentrality), config)
+    return replace(result, repeats=repeated_stops(result))
 
 
 def _shifts(network: Network, tested: Tested, noncentrality: float) -> tuple[Array, Array]:
@@ -118,6 +122,7 @@ def _adjusted(
     station_shifts, mark_shifts = _shifts(network, tested, noncentrality)
     left_out = _left_out(network, tested, dropped, critical)
     predictions, cov_predictions = _predicted_control(network, tested)
+    tests = _columns(network, tested, noncentrality)
     parts = tested.cofactors.parts
     J = position_by_motion(tested.state.T_site_base)
     return AdjustedNetwork(
@@ -128,7 +133,9 @@ def _adjusted(
         p_site=tested.state.p_site + middle,
         cov_p_site=tested.cofactors.marks,
         used=tested.used,
-        **_columns(network, tested, noncentrality),
+        centres=tests["centres"],
+        gravity=tests["gravity"],
+        control=tests["control"],
         station_shifts=station_shifts,
         mark_shifts=mark_shifts,
         shared=tested.state.shared,

@@ -2,40 +2,14 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
-
 import numpy as np
 
 from spheremark.pipelines.geometry import skew
 from spheremark.pipelines.model import Array, Index
-from spheremark.pipelines.model.network import AdjustedNetwork
+from spheremark.pipelines.model.network import AdjustedNetwork, Repeat
 
 _NEAR = 0.5  # [m] within which two stations stand at the same stop
 _N_MARKS = 3  # that both must see
-
-
-class Repeat(NamedTuple):
-    """Two stations at one place, each with its own centres alone.
-
-    Attributes
-    ----------
-    stations : (2,)
-        Places among the stations.
-    apart : (3,)
-        How far the second stands from the first, after the adjustment [m].
-    n_marks : int
-        Marks that both saw.
-    rms : float
-        Root mean square 3-D difference of the centres, laid on each other by a rigid motion [m].
-    predicted_rms : float
-        What their covariances promise [m].
-    """
-
-    stations: tuple[int, int]
-    apart: Array
-    n_marks: int
-    rms: float
-    predicted_rms: float
 
 
 def repeated_stops(result: AdjustedNetwork) -> tuple[Repeat, ...]:

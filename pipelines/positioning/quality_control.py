@@ -6,8 +6,6 @@ site. A station is then tried without each of its markers, and each mark predict
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 
 from spheremark.pipelines.config import ResectionConfig
@@ -15,11 +13,13 @@ from spheremark.pipelines.geometry import rigid, transform
 from spheremark.pipelines.model import (
     Array,
     ControlMarks,
+    DistanceChecks,
     Index,
     MarkerFits,
     Mask,
+    Omissions,
     StationFix,
-    seal,
+    StationQuality,
 )
 from spheremark.pipelines.positioning.batch import Sightings, adjust
 from spheremark.pipelines.positioning.matching import Match, Scene, gather, match_marks
@@ -34,67 +34,32 @@ _OPEN = 1e-9  # of the largest eigenvalue of a normal matrix: what is smaller te
 _UNKNOWN = 1.0  # [rad] of a levelling that was left out
 
 
-@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
-class DistanceChecks:
-    """Distances between the marks of one scan, as measured against as given, one row per pair.
+def station_quality(
+    fix: StationFix, fits: MarkerFits, marks: ControlMarks, config: ResectionConfig
+) -> StationQuality:
+    """Return what the scan and the control tell of a station's quality, without truth.
 
-    Attributes
+    Parameters
     ----------
-    fits : (n, 2)
-        Places of the two among the fits.
-    marks : (n, 2)
-        Places of the two among the control marks.
-    measured, given : (n,)
-        Distance between the centres, and between the control marks [m].
-    sigmas : (n,)
-        Standard deviation of their difference [m].
-    is_off : (n,) bool
-        Whether they differ by more than the tolerance, or by more than 3.29 sigma.
-    suspects : tuple of int
-        Places among the control marks of those without which no distance would be off, or that most
-        of the distances that are off share.
+    fix : StationFix
+        The station.
+    fits : MarkerFits
+        The fits that it came from.
+    marks : ControlMarks
+        The marks that it came from.
+    config : ResectionConfig
+        As for the fix.
+
+    Returns
+    -------
+    StationQuality
+        Dilution of precision, and for a free station the fix without each of its markers.
     """
-
-    fits: Index
-    marks: Index
-    measured: Array
-    given: Array
-    sigmas: Array
-    is_off: Mask
-    suspects: tuple[int, ...]
-
-    def __post_init__(self) -> None:
-        n = len(self.fits)
-        columns: dict[str, tuple[int | None, ...]] = dict.fromkeys(
-            ("measured", "given", "sigmas", "is_off"), (n,)
-        )
-        seal(self, fits=(n, 2), marks=(n, 2), **columns)
-
-
-@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
-class Omissions:
-    """A station without each of its markers, one row per used marker, in the order of its matches.
-
-    Attributes
-    ----------
-    shifts : (n, 3)
-        Position of the station without the marker, minus its position with all; NaN, as all else of
-        the row, where the other marks stand on one plumb line and tell no heading, or contradict
-        each other so that they tell no position [m].
-    predictions : (n, 3)
-        Where the scan puts the mark when the others alone position the station, minus where it is
-        given [m].
-    cov_predictions : (n, 3, 3)
-        Covariances of these differences [m^2].
-    """
-
-    shifts: Array
-    predictions: Array
-    cov_predictions: Array
-
-    def __post_init__(self) -> None:
-        n = len(self.shifts)
-        seal(self, shifts=(n, 3), predictions=(n, 3), cov_predictions=(n, 3, 3))
+    is_free = fix.method == "free_station"
+    return StationQuality(
+        dilution_of_precision=dilution_of_precision(fix, marks),
+        without_each=leave_each_out(fix, fits, marks, config) if is_free else Omissions.none(),
+    )
 
 
 def check_distances(
@@ -257,11 +222,7 @@ def leave_each_out(
     """
     n = len(fix.matches)
     if n < _N_LEFT:
-        return Omissions(
-            shifts=np.zeros((0, 3)),
-            predictions=np.zeros((0, 3)),
-            cov_predictions=np.zeros((0, 3, 3)),
-        )
+        return Omissions.none()
     scene = gather(fits, marks, config)
     sigma_level = _UNKNOWN if fix.dof == 3 * n - _N_POSE else scene.sigma_level
     fit, mark = fix.matches.T

@@ -222,7 +222,8 @@ def process(
     """Find the markers of logs and position their stations."""
     from spheremark.pipelines.config import SurveyConfig
     from spheremark.service.cli import tables
-    from spheremark.service.serialise.stops import Inputs, answer_log
+    from spheremark.service.log_files import process_file
+    from spheremark.service.serialise.stops import serialise_log
     from spheremark.storage.imports import survey_files as site_files
 
     config = SurveyConfig.from_mapping(
@@ -233,17 +234,14 @@ def process(
             "resection": {"methods": resection or ["free_station"]},
         }
     )
-    inputs = Inputs(
-        config=config,
-        rig=site_files.read_rig(rig) if rig else None,
-        marks=read_control(control, control_axes, control_unit, target_height_m),
-        truth=site_files.read_truth(truth) if truth else None,
-        frame=frame.value,
-    )
+    given_rig = site_files.read_rig(rig) if rig else None
+    marks = read_control(control, control_axes, control_unit, target_height_m)
+    true = site_files.read_truth(truth) if truth else None
     answers = []
     for log in logs:
         with _progress() as progress:
-            answers.append(answer_log(log, inputs, progress))
+            found = process_file(log, config, progress, rig=given_rig, marks=marks, truth=true)
+        answers.append(serialise_log(found, frame=frame.value, truth=true))
         if not as_json:
             tables.print_answer(out, answers[-1])
     if as_json:

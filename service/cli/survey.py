@@ -91,8 +91,11 @@ def adjust(
 ) -> None:
     """Adjust all stations and marks of a survey together."""
     from spheremark.pipelines.config import SurveyConfig
+    from spheremark.pipelines.network import compare
+    from spheremark.service import log_files
     from spheremark.service.cli import tables
-    from spheremark.service.serialise import network as networks
+    from spheremark.service.serialise import network as serialise
+    from spheremark.service.serialise.network_report import report as format_report
     from spheremark.storage.exports.network import write_coordinates, write_gama
     from spheremark.storage.imports import survey_files as site_files
 
@@ -102,19 +105,22 @@ def adjust(
     marks = read_control(control, control_axes, control_unit, target_height_m)
     given = site_files.read_rig(rig) if rig else None
     with progress() as told:
-        book = networks.read_scans(logs, config, given, told)
+        book = log_files.read_scans(logs, config, given, told)
         if calibrating:
-            book = networks.with_calibration(book, logs, config, given, told)
-    result = networks.adjust_scans(book, marks, config)
-    answer = networks.network_answer(result, config, book)
+            book = log_files.with_calibration(book, logs, config, given, told)
+    result = log_files.adjust_scans(book, marks, config)
+    found = log_files.adjusted_rig(result, book)
+    answer = serialise.serialise_network(result, config, rig=found, uncalibrated=book.uncalibrated)
     if truth:
-        answer["errors"] = networks.error_answer(result, [site_files.read_truth(f) for f in truth])
+        true = log_files.merged_truth([site_files.read_truth(path) for path in truth])
+        errors = compare(result, true)
+        answer["errors"] = serialise.serialise_network_errors(result, errors, true.marks.names)
     if gama:
         write_gama(result, gama)
     if csv:
         write_coordinates(result, csv)
     if report:
-        report.write_text(networks.report(answer), encoding="utf-8")
+        report.write_text(format_report(answer), encoding="utf-8")
     if as_json:
         print_json(answer)
     else:
@@ -138,16 +144,17 @@ def calibrate(
     """Estimate the rig from the two faces of the spheres in logs."""
     from spheremark.pipelines.config import SurveyConfig
     from spheremark.service.cli import tables
-    from spheremark.service.serialise import calibration as calibrations
+    from spheremark.service.log_files import calibrate_files
+    from spheremark.service.serialise.calibration import serialise_calibration
     from spheremark.storage.imports import survey_files as site_files
 
     config = SurveyConfig.from_mapping({"marker_radius": radius_m})
     start = site_files.read_rig(rig) if rig else None
     with progress() as told:
-        found = calibrations.calibrate_logs(logs, config, start, told)
+        found = calibrate_files(logs, config, start, told)
     if target:
         site_files.write_rig(found.rig, target)
-    answer = calibrations.calibration_answer(found)
+    answer = serialise_calibration(found)
     if as_json:
         print_json(answer)
     else:

@@ -152,7 +152,7 @@ def of_logs(
     progress: Progress,
 ) -> tuple[Site, Network]:
     """Adjust the stations of logs and make what is wanted; a log that gives none costs no other."""
-    from spheremark.service.serialise.network import adjust_scans, read_scans
+    from spheremark.service.log_files import adjust_scans, read_scans
     from spheremark.storage.recordings import read_log
 
     book = read_scans(logs, config, rig, lambda share, what: progress(0.5 * share, what))

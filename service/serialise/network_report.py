@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import Any
 
-Plain = dict[str, Any]
+from spheremark.service.serialise.plain import Plain
 
 
 def report(answer: Plain, title: str = "") -> str:

@@ -21,22 +21,22 @@ from spheremark.pipelines.geometry import levelling_rotation, rigid
 from spheremark.pipelines.model import (
     Array,
     ControlMarks,
+    ErrorEllipse,
     Levelling,
     MarkerFit,
     MarkerFits,
     NoFix,
     StationFix,
+    StationQuality,
     Status,
     StopResult,
     StopTruth,
     Truth,
 )
-from spheremark.pipelines.positioning.quality_control import dilution_of_precision, leave_each_out
 from spheremark.pipelines.scan.rigs import rig_digest, rig_to_mapping
 from spheremark.storage.catalogue.resections import resections_table, resections_with_errors
 from spheremark.storage.catalogue.rows import Row, plain, table_of
 
-_TO_95 = float(np.sqrt(-2.0 * np.log(0.05)))  # from the standard ellipse to the 95 % ellipse
 _UPPER = np.triu_indices(3)
 _TEXT, _REAL, _WHOLE, _LONG = pa.string(), pa.float64(), pa.int32(), pa.int64()
 _INSTANT = pa.timestamp("us", "UTC")
@@ -208,14 +208,11 @@ def tables(
         raise InputError(f"Run {run.run_id} has no stop; a run has at least one.")
     if marks is None and any(stop.fixes for stop in stops):
         raise InputError(f"Run {run.run_id} has fixes; give the control marks that they refer to.")
-    rows = _run_rows(run, stops)
+    rows, names = _run_rows(run, stops), () if marks is None else marks.names
     for stop in stops:
-        for table, found in _stop_rows(
-            stop, marks, run.config, (clouds or {}).get(stop.name)
-        ).items():
+        for table, found in _stop_rows(stop, names, (clouds or {}).get(stop.name)).items():
             rows[table] += [{"run_id": run.run_id, "stop": stop.name, **row} for row in found]
     made = {name: _table(name, rows[name]) for name in TABLES}
-    names = () if marks is None else marks.names
     made["resections"] = resections_table(run.run_id, stops, names, made["resections"].schema)
     return made if truth is None else with_errors(made, truth)
 
@@ -268,10 +265,9 @@ def _run_rows(run: RunInfo, stops: tuple[StopResult, ...]) -> dict[str, list[Row
 
 
 def _stop_rows(
-    stop: StopResult, marks: ControlMarks | None, config: SurveyConfig, cloud_url: str | None
+    stop: StopResult, names: tuple[str, ...], cloud_url: str | None
 ) -> dict[str, list[Row]]:
     """Return the rows of one stop by table, without what names run and stop."""
-    names = () if marks is None else marks.names
     rows: dict[str, list[Row]] = {name: [] for name in TABLES[2:]}
     rows["stops"].append(_stop_row(stop, cloud_url))
     R, sigma_heading = levelling_rotation(stop.cloud.levelling), stop.cloud.rig.sigma_heading
@@ -287,25 +283,13 @@ def _stop_rows(
     for (fit_method, method), fix in stop.fixes.items():
         label = {"fit_method": fit_method, "resection_method": method}
         station: Row = label | _fix_row(fix)
-        if isinstance(fix, StationFix) and marks is not None:
-            fits = stop.fits[fit_method]
-            station["dop"] = dilution_of_precision(fix, marks)
-            shifts = _shifts_without_each(fix, fits, marks, config)
-            observed = _observation_rows(fix, fits, names, shifts)
+        if isinstance(fix, StationFix):
+            quality = stop.quality[fit_method, method]
+            station["dop"] = quality.dilution_of_precision
+            observed = _observation_rows(fix, quality, stop.fits[fit_method], names)
             rows["observations"] += [label | one for one in observed]
         rows["station_fixes"].append(station)
     return rows
-
-
-def _shifts_without_each(
-    fix: StationFix, fits: MarkerFits, marks: ControlMarks, config: SurveyConfig
-) -> Array:
-    """Return how far the station moves without each of its markers; NaN where that is not told."""
-    found = np.full(len(fix.matches), np.nan)
-    if fix.method == "free_station":
-        shifts = leave_each_out(fix, fits, marks, config.resection).shifts
-        found[: len(shifts)] = np.linalg.norm(shifts, axis=1)
-    return found
 
 
 def _stop_row(stop: StopResult, cloud_url: str | None) -> Row:
@@ -377,7 +361,7 @@ def _fix_row(fix: StationFix | NoFix) -> Row:
         "cov_motion": fix.cov_T_site_station.ravel().tolist(),
         "sigma_3d_m": fix.sigma_3d,
         "sigma_yaw_deg": np.degrees(fix.sigma_yaw),
-        **ellipse(fix.cov_p_site[:2, :2]),
+        **_ellipse(fix.ellipse),
         "n_markers": len(fix.matches),
         "dof": fix.dof,
         "sigma0": fix.sigma0,
@@ -387,34 +371,22 @@ def _fix_row(fix: StationFix | NoFix) -> Row:
     }
 
 
-def ellipse(cov_horizontal: Array) -> Row:
-    """Return the ellipse of a horizontal covariance, standard and 95 %.
-
-    Parameters
-    ----------
-    cov_horizontal : (2, 2)
-        Covariance of x and y [m^2].
-
-    Returns
-    -------
-    dict
-        Semi-axes [m] and the bearing of the major one, clockwise from y [deg].
-    """
-    variances, axes = np.linalg.eigh(cov_horizontal)
-    minor, major = np.sqrt(np.maximum(variances, 0.0))
+def _ellipse(ellipse: ErrorEllipse) -> Row:
+    """Return an error ellipse as columns, standard and 95 %."""
     return {
-        "ellipse_major_m": major,
-        "ellipse_minor_m": minor,
-        "ellipse_bearing_deg": np.degrees(np.arctan2(axes[0, 1], axes[1, 1])) % 180.0,
-        "ellipse_major_95_m": _TO_95 * major,
-        "ellipse_minor_95_m": _TO_95 * minor,
+        "ellipse_major_m": ellipse.major,
+        "ellipse_minor_m": ellipse.minor,
+        "ellipse_bearing_deg": np.degrees(ellipse.bearing),
+        "ellipse_major_95_m": ellipse.major_95,
+        "ellipse_minor_95_m": ellipse.minor_95,
     }
 
 
 def _observation_rows(
-    fix: StationFix, fits: MarkerFits, names: tuple[str, ...], shifts: Array
+    fix: StationFix, quality: StationQuality, fits: MarkerFits, names: tuple[str, ...]
 ) -> list[Row]:
     """Return one row of ``observations`` for each marker of the stop."""
+    shifts = np.linalg.norm(quality.without_each.shifts, axis=1)
     excluded = {exclusion.fit: exclusion.reason for exclusion in fix.excluded}
     rows: list[Row] = [
         {"marker": fit.name, "used": False, "reason": excluded.get(i, "Not matched.")}
@@ -435,7 +407,7 @@ def _observation_rows(
             "w": fix.w_statistics[k],
             "minimal_detectable_bias_m": fix.detectable_biases[k],
             "external_reliability_m": fix.external_reliabilities[k],
-            "shift_without_m": shifts[k],
+            "shift_without_m": shifts[k] if len(shifts) else None,
         }
     return rows
 

@@ -15,13 +15,8 @@ from spheremark.pipelines.scan.rigs import rig_from_mapping, rig_to_mapping
 from spheremark.pipelines.simulation import SimulationConfig
 from spheremark.service.cli.fieldwork import Assignment, survey
 from spheremark.service.cli.main import main
-from spheremark.service.serialise.network import (
-    Fieldbook,
-    adjust_scans,
-    network_answer,
-    read_scans,
-    with_calibration,
-)
+from spheremark.service.log_files import Fieldbook, adjust_scans, read_scans, with_calibration
+from spheremark.service.serialise.network import serialise_network
 from spheremark.storage.imports.survey_files import read_control, read_truth
 
 CONFIG = SurveyConfig.from_mapping({"fitting": {"methods": ["along_beam"]}})
@@ -235,7 +230,9 @@ def test_a_rig_that_the_logs_do_not_tell_stays_and_the_network_stands(logs):
     told = with_calibration(
         book, logs[:2], CONFIG, rig_from_mapping(upright), lambda _share, _what: None
     )
-    answer = network_answer(adjust_scans(told, None, CONFIG), CONFIG, told)
+    answer = serialise_network(
+        adjust_scans(told, None, CONFIG), CONFIG, uncalibrated=told.uncalibrated
+    )
     assert answer["calibration"] is None
     assert any("two faces" in warning for warning in answer["warnings"])
     assert len(answer["stations"]) == 2

@@ -7,6 +7,7 @@ import pytest
 
 from spheremark.pipelines.config import SurveyConfig
 from spheremark.pipelines.model import ControlMarks
+from spheremark.pipelines.positioning.quality_control import check_distances
 from spheremark.service.jobs.handlers.process import summary
 from tests.surveyed import marks, stop
 
@@ -28,12 +29,20 @@ def moved(control, place, shift):
     return ControlMarks(names=control.names, p_site=p, cov_p_site=control.cov_p_site)
 
 
+def checked(seen, control):
+    config = SurveyConfig()
+    fits = next(iter(seen.fits.values()))
+    return replace(
+        seen, distances=check_distances(fits, control, config.resection, config.tolerance)
+    )
+
+
 @pytest.mark.parametrize("shift", [0.08, 0.4])
 def test_a_control_mark_that_the_distances_contradict_is_named(seen, control, shift):
-    said = summary([seen], moved(control, 2, [shift, 0.0, 0.0]), SurveyConfig())
-    assert f"look at {control.names[2]}." in said
+    wrong = moved(control, 2, [shift, 0.0, 0.0])
+    assert f"look at {control.names[2]}." in summary([checked(seen, wrong)], wrong)
 
 
 def test_control_that_agrees_and_no_control_are_not_spoken_of(seen, control):
-    assert "look at" not in summary([seen], control, SurveyConfig())
-    assert "look at" not in summary([replace(seen, fixes={})], None, SurveyConfig())
+    assert "look at" not in summary([checked(seen, control)], control)
+    assert "look at" not in summary([replace(seen, fixes={})], None)

@@ -5,7 +5,7 @@ from datetime import UTC, datetime
 
 import numpy as np
 
-from spheremark.pipelines.config import SurveyConfig
+from spheremark.pipelines.config import ResectionConfig, SurveyConfig
 from spheremark.pipelines.geometry import levelling_rotation, rigid, rot_x, rot_y, rot_z, skew
 from spheremark.pipelines.model import (
     Exclusion,
@@ -21,6 +21,7 @@ from spheremark.pipelines.model import (
     SubsetFixes,
     Truth,
 )
+from spheremark.pipelines.positioning.quality_control import station_quality
 from spheremark.pipelines.scan.rigs import tilted_vlp16
 from spheremark.storage.catalogue.results import RunInfo, tables
 from tests.synthetic import field, marker_fit
@@ -144,16 +145,23 @@ def stop(name="L1S1", seed=3):
         sigma_horizontal=np.array([0.006]),
         sigma_3d=np.array([0.013]),
     )
+    found = {
+        "along_beam": fits("along_beam", SHIFT_BASE, points.p_base, rng),
+        "paper": fits("paper", 5 * SHIFT_BASE, points.p_base, rng),
+    }
+    station = fix(rng)
     no = NoFix(method="free_station", code="solve.no_match", reason="No match.")
     return StopResult(
         name=name,
         cloud=points,
-        fits={
-            "along_beam": fits("along_beam", SHIFT_BASE, points.p_base, rng),
-            "paper": fits("paper", 5 * SHIFT_BASE, points.p_base, rng),
-        },
-        fixes={("along_beam", "free_station"): fix(rng), ("paper", "free_station"): no},
+        fits=found,
+        fixes={("along_beam", "free_station"): station, ("paper", "free_station"): no},
         subsets={("along_beam", "free_station"): (pairs, triples)},
+        quality={
+            ("along_beam", "free_station"): station_quality(
+                station, found["along_beam"], MARKS, ResectionConfig()
+            )
+        },
         timings={"stitching": 0.1},
     )
 

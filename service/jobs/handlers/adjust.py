@@ -113,7 +113,8 @@ class _Book:
 def work(order: Order, progress: Progress) -> Outcome:
     """Adjust the stations of all logs of an order."""
     from spheremark.service.jobs.handlers.network_rows import network_rows
-    from spheremark.service.serialise import network as networks
+    from spheremark.service.log_files import Fieldbook, adjust_scans, adjusted_rig
+    from spheremark.service.serialise.network import serialise_network
     from spheremark.storage.catalogue import adjustments
     from spheremark.storage.catalogue.documents import documents
 
@@ -125,11 +126,10 @@ def work(order: Order, progress: Progress) -> Outcome:
         rig, why = _rig(order, book, _share(progress, 0.5 * _SCANS, 0.8))
     progress(_SCANS, f"Adjusting {len(book.scans)} stations")
     marks = order.marks if order.options.get("control", True) else None
-    scans = networks.Fieldbook(
-        scans=tuple(book.scans), refused=tuple(book.refused), calibration=rig, uncalibrated=why
-    )
-    result = networks.adjust_scans(scans, marks, order.config)
-    answer = networks.network_answer(result, order.config, scans)
+    scans = Fieldbook(scans=tuple(book.scans), refused=tuple(book.refused), calibration=rig)
+    result = adjust_scans(scans, marks, order.config)
+    found = adjusted_rig(result, scans)
+    answer = serialise_network(result, order.config, rig=found, uncalibrated=why)
     rows = network_rows(answer, book.sources)
     rows["adjustments"][0] |= {
         "job_id": order.job_id,
@@ -142,8 +142,7 @@ def work(order: Order, progress: Progress) -> Outcome:
     }
     made = [*book.tables, adjustments.tables(order.result_id, rows)]
     files, message = _files(result, answer), _summary(answer, rows["control_checks"])
-    if rig is not None:
-        found = networks.calibrated(result, rig)
+    if found is not None:
         left = _share(progress, _SCANS, 1.0)
         tables, more, sentence = calibrating.results(order, found, left, start)
         made, files, message = [*made, tables], files | more, f"{message} {sentence}"

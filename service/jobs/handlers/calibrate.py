@@ -68,11 +68,11 @@ def results(
     order: Order, found: Calibration, progress: Progress, start: float
 ) -> tuple[dict[str, pa.Table], dict[str, str], str]:
     """Return the tables of a calibration, its files, and a sentence."""
-    from spheremark.service.serialise.calibration import calibration_answer
+    from spheremark.service.serialise.calibration import serialise_calibration
     from spheremark.storage.catalogue import calibrations
     from spheremark.storage.imports.survey_files import format_rig
 
-    answer = calibration_answer(found)
+    answer = serialise_calibration(found)
     gaps = [_gaps(order, rig, _half(progress, i)) for i, rig in enumerate((found.start, found.rig))]
     rows = calibration_rows(answer, *gaps)
     rows["rigs"] = [_rig_row(rig) for rig in (found.start, found.rig)]

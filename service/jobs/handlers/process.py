@@ -8,7 +8,6 @@ from datetime import UTC, datetime
 from time import perf_counter
 from typing import TYPE_CHECKING
 
-from spheremark.pipelines.errors import SolveError
 from spheremark.pipelines.model import (
     ControlMarks,
     NoFix,
@@ -24,14 +23,13 @@ from spheremark.service.provenance import code_version, forget_peak_memory, peak
 if TYPE_CHECKING:
     import pyarrow as pa
 
-    from spheremark.pipelines.config import SurveyConfig
     from spheremark.pipelines.survey import Progress
 
 
 def work(order: Order, progress: Progress) -> Outcome:
     """Process the one log of an order."""
     stops, rows = process_log(order, order.logs[0], order.result_id, progress)
-    return Outcome(tables=rows, message=summary(stops, order.marks, order.config))
+    return Outcome(tables=rows, message=summary(stops, order.marks))
 
 
 def process_log(
@@ -68,12 +66,12 @@ def process_log(
     return stops, tables(run, stops, marks=order.marks, clouds=clouds)
 
 
-def summary(stops: Sequence[StopResult], marks: ControlMarks | None, config: SurveyConfig) -> str:
+def summary(stops: Sequence[StopResult], marks: ControlMarks | None) -> str:
     """Say in a sentence or two what a log gave, and what is missing, weak or contradicted."""
-    said = [_stop_summary(stop) for stop in stops]
+    sentences = [_stop_summary(stop) for stop in stops]
     if marks is not None:
-        said += [text for stop in stops if (text := _contradiction(stop, marks, config))]
-    return " ".join(said)
+        sentences += [text for stop in stops if (text := _contradiction(stop, marks))]
+    return " ".join(sentences)
 
 
 def _stop_summary(stop: StopResult) -> str:
@@ -92,18 +90,11 @@ def _stop_summary(stop: StopResult) -> str:
     return f"{sigma}; weak: {fix.reason}" if fix.status is Status.WEAK else f"{sigma}."
 
 
-def _contradiction(stop: StopResult, marks: ControlMarks, config: SurveyConfig) -> str:
+def _contradiction(stop: StopResult, marks: ControlMarks) -> str:
     """Say which control marks the distances in a scan contradict, if any."""
-    from spheremark.pipelines.positioning.quality_control import check_distances
-
-    fitted = [key[0] for key, fix in stop.fixes.items() if isinstance(fix, StationFix)]
-    if not fitted:
-        return ""
-    try:
-        checks = check_distances(stop.fits[fitted[0]], marks, config.resection, config.tolerance)
-    except SolveError:  # another method was needed, and has been told why
-        return ""
-    if not checks.suspects:
+    checks = stop.distances
+    is_fixed = any(isinstance(fix, StationFix) for fix in stop.fixes.values())
+    if checks is None or not checks.suspects or not is_fixed:
         return ""
     names = ", ".join(marks.names[mark] for mark in checks.suspects)
     return (
