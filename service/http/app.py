@@ -12,6 +12,7 @@ from typing import Any
 from fastapi import APIRouter, FastAPI, Request, Response
 from fastapi.responses import RedirectResponse
 from fastapi.staticfiles import StaticFiles
+from starlette.types import ASGIApp
 
 from spheremark.service.http import api, errors
 from spheremark.service.http import security as guard
@@ -29,6 +30,14 @@ STATIC = Path(str(resources.files("spheremark.web"))) / "static"
 about = APIRouter(include_in_schema=False)
 
 
+class _Application(FastAPI):
+    """FastAPI whose answers to unforeseen errors, outside all middleware, carry the headers too."""
+
+    def build_middleware_stack(self) -> ASGIApp:
+        """Return the whole application."""
+        return guard.SecureHeaders(super().build_middleware_stack())
+
+
 def create_app(settings: Settings) -> FastAPI:
     """Return the service as an application; it opens its files and its cluster when it starts."""
 
@@ -43,7 +52,7 @@ def create_app(settings: Settings) -> FastAPI:
             app.state.failure = error  # for the one who started us; servers only log it
             raise
 
-    app = FastAPI(
+    app = _Application(
         title="spheremark",
         version=metadata.version("spheremark"),
         summary="Station positions from spherical markers and a gimbal-mounted LiDAR.",

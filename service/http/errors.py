@@ -35,6 +35,12 @@ class TooLargeError(InputError):
     code: ClassVar[str] = "input.too_large"
 
 
+class MalformedHeaderError(InputError):
+    """A header of the request does not have the form that HTTP gives it."""
+
+    code: ClassVar[str] = "input.header"
+
+
 class MediaTypeError(InputError):
     """The request's body is of a type that this route does not read."""
 

@@ -10,9 +10,9 @@ import contextlib
 import hashlib
 import hmac
 import ipaddress
+import re
 from collections.abc import Mapping
 from http.cookies import CookieError, SimpleCookie
-from urllib.parse import urlsplit
 
 from fastapi import Request
 from starlette.datastructures import Headers, MutableHeaders
@@ -22,6 +22,7 @@ from starlette.types import ASGIApp, Message, Receive, Scope, Send
 from spheremark.pipelines.errors import SpheremarkError
 from spheremark.service.http.errors import (
     ForbiddenError,
+    MalformedHeaderError,
     TooLargeError,
     UnauthorizedError,
     problem_of,
@@ -35,6 +36,7 @@ LONG_PATHS = ("/api/v1/recordings", "/api/v1/terrains")  # streamed, with a limi
 BODY_MAX = 16 << 20  # [bytes] of any other body
 UNREAD_MAX = 1 << 30  # [bytes] of a refused body that are read before its sender is answered
 UNREAD_SECONDS = 30.0
+_SHOWN = 80  # characters of a malformed header that its refusal repeats
 SAFE_METHODS = ("GET", "HEAD", "OPTIONS")
 
 POLICY = "; ".join(
@@ -63,8 +65,33 @@ HEADERS: Mapping[str, str] = {
 }
 
 
+_NAME = r"[^\s/?#@:\[\]\\]+"
+_HOST = re.compile(rf"(?P<name>{_NAME}|\[(?P<ipv6>[0-9A-Fa-f:.]+)\])(:\d{{1,5}})?", re.ASCII)
+_ORIGIN = re.compile(r"null|[A-Za-z][A-Za-z0-9+.-]*://(?P<host>.*)", re.ASCII)
+_LENGTH = re.compile(r"\d{1,18}", re.ASCII)
+
+
+class SecureHeaders:
+    """Wraps an application and all its middleware: every answer carries the headers."""
+
+    def __init__(self, app: ASGIApp) -> None:
+        self.app = app
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """Answer one request."""
+
+        async def send_with_headers(message: Message) -> None:
+            if message["type"] == "http.response.start":
+                headers = MutableHeaders(scope=message)
+                for name, value in HEADERS.items():
+                    headers.setdefault(name, value)
+            await send(message)
+
+        await self.app(scope, receive, send_with_headers)
+
+
 class Guard:
-    """Wraps an application: refuses what another site or a stranger sent, sets the headers."""
+    """Wraps an application: refuses malformed and foreign requests, and those without the token."""
 
     def __init__(self, app: ASGIApp, settings: Settings) -> None:
         self.app = app
@@ -80,26 +107,23 @@ class Guard:
         request = Request(scope)
         body = _Body(receive, request)
 
-        async def send_with_headers(message: Message) -> None:
-            if message["type"] == "http.response.start":
-                if message["status"] >= 400:
-                    await body.read_to_its_end()
-                headers = MutableHeaders(scope=message)
-                for name, value in HEADERS.items():
-                    headers.setdefault(name, value)
+        async def send_after_body(message: Message) -> None:
+            if message["type"] == "http.response.start" and message["status"] >= 400:
+                await body.read_to_its_end()
             await send(message)
 
         try:
             self.check(request)
         except SpheremarkError as error:
-            response = problem_response(problem_of(error, request.url.path), _challenge(error))
-            await response(scope, receive, send_with_headers)
+            response = problem_response(problem_of(error, scope["path"]), _challenge(error))
+            await response(scope, receive, send_after_body)
             return
-        await self.app(scope, body.receive, send_with_headers)
+        await self.app(scope, body.receive, send_after_body)
 
     def check(self, request: Request) -> None:
         """Raise unless the request may pass."""
-        headers = request.headers
+        headers, path = request.headers, request.scope["path"]
+        check_form(headers)
         host = headers.get("host", "")
         if not (self.token or is_trustworthy(host, self.own_host)):
             raise ForbiddenError(
@@ -111,11 +135,10 @@ class Guard:
                 "A page of another site sent this request; only pages of this service may change "
                 "things here."
             )
-        declared = headers.get("content-length", "")
-        is_bounded = request.url.path not in LONG_PATHS
-        if is_bounded and declared.isdecimal() and int(declared) > BODY_MAX:
-            raise _too_large(f"{int(declared):,}")
-        is_open = request.url.path.startswith(OPEN_PATHS)
+        declared = int(headers.get("content-length", "0"))
+        if path not in LONG_PATHS and declared > BODY_MAX:
+            raise _too_large(f"{declared:,}")
+        is_open = path.startswith(OPEN_PATHS)
         if self.token and not is_open and not carries_token(request, self.token):
             raise UnauthorizedError(
                 "This service needs its token: send 'Authorization: Bearer <token>', or open "
@@ -123,12 +146,43 @@ class Guard:
             )
 
 
+def check_form(headers: Headers) -> None:
+    """Raise MalformedHeaderError unless Host, Origin and Content-Length have the form of HTTP."""
+    for name, expected, is_well_formed in (
+        ("host", "one host and perhaps a port, such as localhost:8000", _is_host),
+        ("origin", "null or scheme://host:port", _is_origin),
+        ("content-length", "one number of bytes", _LENGTH.fullmatch),
+    ):
+        values = headers.getlist(name)
+        if len(values) > 1 or not all(is_well_formed(value) for value in values):
+            found = ", ".join(repr(value[:_SHOWN]) for value in values)
+            raise MalformedHeaderError(f"The header {name} is {found}; {expected} is expected.")
+
+
+def _is_host(text: str) -> bool:
+    """Whether this is a host with or without a port; no text is well-formed, too (RFC 9110)."""
+    found = _HOST.fullmatch(text)
+    if found is None:
+        return not text
+    try:
+        return not found["ipv6"] or bool(ipaddress.IPv6Address(found["ipv6"]))
+    except ValueError:
+        return False
+
+
+def _is_origin(text: str) -> bool:
+    """Whether this is an origin as browsers send it."""
+    found = _ORIGIN.fullmatch(text)
+    return found is not None and _is_host(found["host"] or "")
+
+
 def is_trustworthy(host: str, own_host: str) -> bool:
-    """Whether nobody else can make this Host header lead to this machine (DNS rebinding).
+    """Whether nobody else can make this well-formed Host lead to this machine (DNS rebinding).
 
     Addresses and names without a dot cannot be registered by others; a name with one can.
     """
-    name = urlsplit(f"//{host}").hostname or ""
+    found = _HOST.fullmatch(host)
+    name = (found["ipv6"] or found["name"]).lower() if found else ""
     if name == own_host or "." not in name or name.endswith(".localhost"):
         return bool(name)
     try:
@@ -143,7 +197,7 @@ def is_cross_site(headers: Headers) -> bool:
     if headers.get("sec-fetch-site", "none") not in ("same-origin", "none"):
         return True
     origin = headers.get("origin")
-    return origin is not None and urlsplit(origin).netloc != headers.get("host", "")
+    return origin is not None and origin.partition("://")[2] != headers.get("host", "")
 
 
 def carries_token(request: Request, token: str) -> bool:
@@ -178,7 +232,7 @@ class _Body:
         headers = request.headers
         self._receive = receive
         self._n_bytes = 0
-        self._is_bounded = request.url.path not in LONG_PATHS
+        self._is_bounded = request.scope["path"] not in LONG_PATHS
         self._is_asking = "expect" in headers  # and sends nothing before it is told to
         self._is_open = headers.get("content-length", "0") != "0" or "transfer-encoding" in headers
 

@@ -12,7 +12,7 @@ import uvicorn
 from fastapi.testclient import TestClient
 
 from spheremark.service.http.app import create_app
-from spheremark.service.http.security import Guard
+from spheremark.service.http.security import HEADERS, Guard, SecureHeaders
 from spheremark.service.settings import Settings
 
 DIGEST = "0" * 64
@@ -153,6 +153,55 @@ def test_every_answer_carries_the_policy(site, path):
     assert policy["script-src"] == "'self'"
     assert policy["frame-ancestors"] == "'none'"
     assert headers["x-content-type-options"] == "nosniff"
+
+
+MALFORMED = [
+    {"Host": "[::1"}, {"Host": "::1]"}, {"Host": "[::1]]"}, {"Host": "[localhost]"},
+    {"Host": "[v1.x]:80"}, {"Host": "localhost:port"}, {"Host": "localhost:8000:8000"},
+    {"Host": "elsewhere.example@localhost"}, {"Host": "localhost/static/"}, {"Host": "a b"},
+    {"Host": "localhost?"}, {"Host": "localhost\\x"}, {"Host": "[" * 10_000},
+    {"Origin": "http://["}, {"Origin": "http://[::1"}, {"Origin": "http://a/b"}, {"Origin": ""},
+    {"Origin": "127.0.0.1:8000"}, {"Origin": "http://a b"}, {"Origin": "http://a@127.0.0.1"},
+    {"Content-Length": "-1"}, {"Content-Length": "+1"}, {"Content-Length": "1_0"},
+    {"Content-Length": "0x10"}, {"Content-Length": "9" * 5000}, {"Content-Length": "1,1"},
+    {"Content-Length": b"\xb2"}, {"Content-Length": ""},
+]  # fmt: skip
+
+
+@pytest.mark.parametrize("headers", MALFORMED, ids=lambda h: str(h)[:40])
+@pytest.mark.parametrize("method", ["GET", "POST"])
+def test_a_malformed_header_is_refused_with_the_one_shape_and_the_policy(site, method, headers):
+    answer = site.client.request(method, "/api/v1/surveys", headers=headers)
+    assert (answer.status_code, answer.json()["code"]) == (400, "input.header"), answer.text
+    assert answer.headers["content-type"] == "application/problem+json"
+    assert len(answer.text) < 1000
+    for name, value in HEADERS.items():
+        assert answer.headers[name] == value
+
+
+def test_two_hosts_are_refused(site):
+    headers = [("Host", "127.0.0.1:8000"), ("Host", "elsewhere.example")]
+    answer = site.client.get("/api/v1/surveys", headers=headers)
+    assert (answer.status_code, answer.json()["code"]) == (400, "input.header")
+
+
+@pytest.mark.parametrize(
+    "host", ["127.0.0.1", "localhost:1", "[::1]:8000", "[::ffff:127.0.0.1]", "LOCALHOST", "rover"]
+)
+def test_hosts_of_this_machine_are_answered(site, host):
+    headers = {"Host": host, "Origin": f"http://{host}"}
+    answer = site.client.post("/api/v1/surveys", headers=headers, json={})
+    assert answer.json()["code"] == "input.validation"  # it passed the guard
+
+
+@pytest.mark.parametrize("cookie", ['spheremark_token="\\', "=;=,\xff", "a[]=1; spheremark_token"])
+def test_an_odd_cookie_is_no_token_and_no_failure(tmp_path, cookie):
+    settings = Settings(data=tmp_path, workers=1, token="secret")
+    guarded = SecureHeaders(Guard(None, settings))  # what passes would fail at the call of None
+    client = TestClient(guarded, base_url="http://127.0.0.1:8000")
+    answer = client.get("/api/v1/surveys", headers={"Cookie": cookie.encode("latin-1")})
+    assert (answer.status_code, answer.json()["code"]) == (401, "unauthorized")
+    assert answer.headers["content-security-policy"] == HEADERS["Content-Security-Policy"]
 
 
 @pytest.mark.parametrize(
@@ -328,13 +377,20 @@ def test_settings_come_from_the_environment_and_are_described(monkeypatch):
     assert all(field.description for field in Settings.model_fields.values())
 
 
-def test_an_unforeseen_error_tells_no_secrets(site):
+@pytest.mark.parametrize("path", ["/api/v1/surveys", "/"])
+def test_an_unforeseen_error_tells_no_secrets_and_carries_the_policy(site, path):
     app = site.client.app
     quiet = TestClient(app, raise_server_exceptions=False, base_url="http://127.0.0.1:8000")
     catalogue, app.state.service = app.state.service, None
     try:
-        answer = quiet.get("/api/v1/surveys")
+        answer = quiet.get(path, headers={"Accept": "text/html" if path == "/" else "*/*"})
     finally:
         app.state.service = catalogue
-    assert (answer.status_code, answer.json()["code"]) == (500, "internal")
+    assert answer.status_code == 500
+    assert answer.headers["content-type"].startswith(
+        "text/html" if path == "/" else "application/problem+json"
+    )
+    assert "internal" in answer.text
     assert "NoneType" not in answer.text
+    for name, value in HEADERS.items():
+        assert answer.headers[name] == value
