@@ -10,7 +10,8 @@ import hashlib
 import os
 import tempfile
 from collections.abc import AsyncIterator
-from dataclasses import dataclass
+from contextlib import asynccontextmanager
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import IO, ClassVar
 
@@ -53,21 +54,27 @@ class Inbox:
         for left in self._partial.iterdir():
             left.unlink()
 
-    async def receive(
-        self, chunks: AsyncIterator[bytes], max_bytes: int, ending: str = ".mcap"
-    ) -> Received:
-        """Keep a body as ``<sha256><ending>``; the same bytes twice are one file."""
-        handle, name = tempfile.mkstemp(suffix=ending, dir=self._partial)
+    async def receive(self, chunks: AsyncIterator[bytes], max_bytes: int) -> Received:
+        """Keep a log as ``<sha256>.mcap``; the same bytes twice are one file."""
+        async with self.received(chunks, max_bytes) as part:
+            target = await asyncio.to_thread(self._keep, part.path, f"{part.digest}.mcap")
+        return replace(part, path=target)
+
+    @asynccontextmanager
+    async def received(
+        self, chunks: AsyncIterator[bytes], max_bytes: int
+    ) -> AsyncIterator[Received]:
+        """Have a body as a file without a name of its own, which is removed at the end."""
+        handle, name = tempfile.mkstemp(dir=self._partial)
         path = Path(name)
         try:
             with os.fdopen(handle, "wb") as file:
                 digest, size = await _write_and_hash(chunks, file, max_bytes)
             if size == 0:
                 raise EmptyBodyError("The body is empty; send the file itself as the body.")
-            target = await asyncio.to_thread(self._keep, path, f"{digest}{ending}")
+            yield Received(path=path, digest=digest, size_bytes=size)
         finally:
             await asyncio.to_thread(path.unlink, missing_ok=True)
-        return Received(path=target, digest=digest, size_bytes=size)
 
     def _keep(self, path: Path, name: str) -> Path:
         """Give a complete file its name."""

@@ -41,6 +41,7 @@ from spheremark.service.planning.centre_models import model_of_surveys
 from spheremark.service.serialise.plans import Plain, evaluation_answer, field_answer
 from spheremark.storage.catalogue import plans as kept
 from spheremark.storage.catalogue.catalogue import Catalogue
+from spheremark.storage.imports.terrain import open_terrain
 
 SCENARIOS = {
     "paper-field": "the study's field (simulated)",
@@ -131,10 +132,8 @@ def _simulated(name: str, seed: int) -> Ground:
 
 @lru_cache(maxsize=_GROUNDS_KEPT)
 def terrain_ground(key: str, name: str, path: Path) -> Ground:
-    """Return an uploaded terrain, with stops spread over its middle and no mark yet."""
-    from spheremark.storage.imports.terrain import read_terrain
-
-    site = read_terrain(path, name=name)
+    """Return a terrain of a file, with stops spread over its middle and no mark yet."""
+    site = open_terrain(path, name)
     return Ground(key, site, _spread_stops(site), Arrangement.numbered(np.empty((0, 3))))
 
 

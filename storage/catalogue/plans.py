@@ -34,6 +34,9 @@ ORDER BY p.created_at DESC, p.placement_id LIMIT $n
 _STOPS = "SELECT * FROM placements WHERE placement_id = $id"
 _TERRAINS = "SELECT * FROM terrains ORDER BY uploaded_at DESC, terrain_id LIMIT $n"
 _TERRAIN = "SELECT * FROM terrains WHERE terrain_id = $id"
+_ENTER_TERRAIN = """
+INSERT INTO terrains VALUES (?, ?, ?, ?, ?) ON CONFLICT DO UPDATE SET url = excluded.url
+"""
 _MOST = 1000  # of one list
 
 
@@ -201,8 +204,10 @@ def get_plan(database: Database, placement_id: str) -> dict[str, Any]:
     }
 
 
-def keep_terrain(database: Database, digest: str, *, name: str, size_bytes: int, url: str) -> None:
-    """Enter a terrain that was uploaded; the same bytes twice are one terrain.
+def keep_terrain(
+    database: Database, digest: str, *, name: str, size_bytes: int, url: str
+) -> dict[str, Any]:
+    """Enter a terrain that was uploaded; the same bytes twice are one terrain, with its first name.
 
     Parameters
     ----------
@@ -215,11 +220,17 @@ def keep_terrain(database: Database, digest: str, *, name: str, size_bytes: int,
     size_bytes : int
         Length of the file.
     url : str
-        Where the bytes are.
+        Where its grid is.
+
+    Returns
+    -------
+    dict
+        The row of ``terrains``.
     """
     row = [digest, name, size_bytes, url, datetime.now(UTC)]
     with database.writing() as cursor:
-        cursor.execute("INSERT OR IGNORE INTO terrains VALUES (?, ?, ?, ?, ?)", row)
+        cursor.execute(_ENTER_TERRAIN, row)
+    return get_terrain(database, digest)
 
 
 def list_terrains(database: Database) -> list[dict[str, Any]]:

@@ -17,7 +17,6 @@ import io
 import json
 import math
 import os
-import resource
 import signal
 import subprocess
 import sys
@@ -30,6 +29,7 @@ from typing import Any, ClassVar
 import duckdb
 
 from spheremark.pipelines.errors import InputError, SpheremarkError
+from spheremark.storage.confinement import limit_resources
 
 _WHOLE_TYPES = ("TINYINT", "SMALLINT", "INTEGER", "BIGINT")
 _PLAIN_TYPES = frozenset(
@@ -248,8 +248,8 @@ def _main() -> None:
     """Answer the request on standard input."""
     request = json.load(sys.stdin)
     limits = QueryLimits(**request["limits"])
-    _confine(limits)
-    signal.setitimer(signal.ITIMER_REAL, limits.seconds)  # nobody handles it: it ends the process
+    memory = limits.memory_bytes + _HEADROOM
+    limit_resources(memory_bytes=memory, seconds=limits.seconds, file_bytes=0)
     try:
         answer = _answer(Path(request["snapshot"]), request["sql"], request["parameters"], limits)
     except (duckdb.OutOfMemoryException, MemoryError):
@@ -259,18 +259,6 @@ def _main() -> None:
     except QueryRejectedError as error:
         answer = {"rejected": str(error)}
     json.dump(answer, sys.stdout, allow_nan=False)
-
-
-def _confine(limits: QueryLimits) -> None:
-    """Let the operating system bound this process."""
-    bounds = {
-        resource.RLIMIT_AS: limits.memory_bytes + _HEADROOM,
-        resource.RLIMIT_FSIZE: 0,
-        resource.RLIMIT_CORE: 0,
-        resource.RLIMIT_CPU: math.ceil(limits.seconds) + 1,
-    }
-    for what, bound in bounds.items():
-        resource.setrlimit(what, (bound, bound))
 
 
 def _answer(

@@ -1,48 +1,91 @@
 """Terrains to plan on: elevation models (GeoTIFF, ESRI ASCII grid) and clouds of earlier scans.
 
-A cloud becomes two grids: the ground is the lowest return of each cell where that is no bump, what
-hides is the highest.
+Hides which file is read how: a format is known by its first bytes, with which the ending of the
+name must agree; its one reader runs in a confined process and returns a grid. What is kept of a
+terrain is that grid, never the file.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+import secrets
+from collections.abc import Mapping
 from pathlib import Path
+from typing import Any, NamedTuple
 
-import laspy
 import numpy as np
-import rasterio
-from rasterio.errors import RasterioError
-from scipy.ndimage import distance_transform_edt, grey_opening
+from numpy.typing import NDArray
 
 from spheremark.pipelines.errors import InputError, NotFoundError
-from spheremark.pipelines.model import Array
 from spheremark.pipelines.placement import Site, site_of_grid
 from spheremark.pipelines.placement.sites import CELLS_MAX
-from spheremark.storage.clouds.stop import read_cloud
+from spheremark.storage.imports.confined import Limits, UnreadableFileError, run_confined
 
-RASTERS = (".tif", ".tiff", ".asc")
-"""Endings of elevation models."""
+LIMITS = Limits(seconds=120.0, memory_bytes=3 << 30, result_bytes=17 * CELLS_MAX)
+"""Of one terrain: two grids of the most cells, and what it takes to make them."""
 
-CLOUDS = (".laz", ".las", ".ply", ".parquet")
-"""Endings of clouds; Parquet is a cloud that this service has kept."""
+KEPT = ".npz"
+"""Ending of a grid that this service has kept."""
 
-_CELL = 0.10  # [m] of a grid that is made from a cloud
-_CHUNK = 1_000_000  # points at a time
-_BUMP = 0.25  # [m] a lowest return this far above its surroundings is no ground
-_OPENING = 1.0  # [m] width of what is taken for a bump
-_GAP = 1.5  # [m] from the nearest return beyond which the ground is not known
+_GRID_WORDS = (
+    *(b"ncols", b"nrows", b"xllcorner", b"yllcorner", b"xllcenter", b"yllcenter"),
+    *(b"cellsize", b"dx", b"dy", b"nodata"),
+)
+_HEIGHT_MAX = 1e5  # [m] beyond any height on Earth or Moon
+_NOTHING = np.zeros(0)
+_HEAD = 64  # [bytes] that show a format
+
+
+class _Format(NamedTuple):
+    """A format: its name for people, its endings, how a file begins, and its reader."""
+
+    name: str
+    kind: str
+    endings: tuple[str, ...]
+    beginnings: tuple[bytes, ...]
+    reader: str
+
+
+_MODEL, _CLOUD = "elevation model", "cloud"
+_FORMATS = (
+    _Format(
+        "GeoTIFF",
+        _MODEL,
+        (".tif", ".tiff"),
+        (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+"),
+        "spheremark.storage.imports.rasters:read_geotiff",
+    ),
+    _Format(
+        "ESRI ASCII grid",
+        _MODEL,
+        (".asc",),
+        _GRID_WORDS,
+        "spheremark.storage.imports.ascii_grids:read_ascii_grid",
+    ),
+    _Format(
+        "LAS", _CLOUD, (".laz", ".las"), (b"LASF",), "spheremark.storage.imports.clouds:read_las"
+    ),
+    _Format(
+        "PLY", _CLOUD, (".ply",), (b"ply\n", b"ply\r"), "spheremark.storage.imports.clouds:read_ply"
+    ),
+    _Format(
+        "Parquet",
+        _CLOUD,
+        (".parquet",),
+        (b"PAR1",),
+        "spheremark.storage.imports.clouds:read_parquet",
+    ),
+)
 
 
 def read_terrain(path: str | Path, *, name: str = "") -> Site:
-    """Read a terrain.
+    """Read a terrain from a foreign file, in a confined process.
 
     Parameters
     ----------
     path : str or Path
         Elevation model (.tif, .asc) or cloud (.laz, .las, .ply, .parquet) in metres, z up.
     name : str
-        What it is called; the name of the file by default.
+        What it is called, with its ending; the name of the file by default.
 
     Returns
     -------
@@ -54,136 +97,132 @@ def read_terrain(path: str | Path, *, name: str = "") -> Site:
     NotFoundError
         If there is no such file.
     InputError
-        If it cannot be read, is too large, is in degrees, or holds no ground.
+        If its ending and its first bytes are not of one known format, or it cannot be read, is too
+        large, is in degrees, or holds no ground.
 
     Notes
     -----
-    Of an elevation model the first band is taken; cells without data stay unknown. A cloud is
-    gridded at 0.1 m, unknown more than 1.5 m from its nearest return.
+    Of an elevation model the first band is taken; cells without data stay unknown. Files beside it
+    (.tfw, .prj, .aux.xml) are not read. A cloud is gridded at 0.1 m, unknown more than 1.5 m from
+    its nearest return. A file declares at most what its size can hold, in compressed formats 4,000
+    times that, and at most 16 million cells or 200 million points.
     """
     path = Path(path)
+    name = name or path.name
     if not path.is_file():
         raise NotFoundError(f"There is no terrain {path}.")
-    suffix = path.suffix.lower()
-    if suffix in RASTERS:
-        return _raster(path, name or path.name)
-    if suffix in CLOUDS:
-        return _gridded(path, name or path.name)
-    raise InputError(
-        f"{path.name} is no terrain that can be read; an elevation model ({', '.join(RASTERS)}) or "
-        f"a cloud ({', '.join(CLOUDS)}) is expected."
-    )
+    reader = _format_of(path, name).reader
+    return _site(name, run_confined(reader, path, LIMITS, name=name, cells_max=CELLS_MAX))
 
 
-def _raster(path: Path, name: str) -> Site:
-    """Read an elevation model."""
+def check_ending(name: str) -> None:
+    """Raise InputError if no terrain has a name of this ending.
+
+    Parameters
+    ----------
+    name : str
+        Name of a file.
+    """
+    _by_ending(name)
+
+
+def keep_grid(site: Site, folder: Path, digest: str) -> Path:
+    """Write the grid of a terrain as ``<digest>.npz``.
+
+    Parameters
+    ----------
+    site : Site
+        What ``read_terrain`` returned.
+    folder : Path
+        Where.
+    digest : str
+        SHA-256 of the foreign file.
+
+    Returns
+    -------
+    Path
+        The file.
+    """
+    path = folder / f"{digest}{KEPT}"
+    arrays = {"xs": site.xs, "ys": site.ys, "ground": site.ground}
+    if not np.array_equal(site.surface, site.ground, equal_nan=True):
+        arrays["surface"] = site.surface
+    part = folder / f"{digest}.{secrets.token_hex(4)}.part"  # no reader finds half a file
     try:
-        with rasterio.open(path) as file:
-            if file.width * file.height > CELLS_MAX:
-                raise InputError(
-                    f"{name} has {file.width:,} x {file.height:,} cells; {CELLS_MAX:,} are the "
-                    "most. Cut out the field (gdal_translate -projwin) or take wider cells."
-                )
-            if file.crs is not None and file.crs.is_geographic:
-                raise InputError(
-                    f"{name} is in degrees ({file.crs.to_string()}); metres are needed. Reproject "
-                    "it (gdalwarp -t_srs)."
-                )
-            turn = file.transform
-            heights = file.read(1, masked=True).astype(np.float64).filled(np.nan)
-    except RasterioError as error:
-        said = (
-            str(error).replace(str(path), name).rstrip(".")
-        )  # where it is kept is nobody's business
-        raise InputError(f"{name} is no elevation model that can be read: {said}.") from error
-    if turn.b or turn.d or turn.a <= 0 or turn.e == 0:
-        raise InputError(
-            f"The rows of {name} do not run from west to east; straighten it (gdalwarp)."
-        )
-    ys = turn.f + (np.arange(heights.shape[0]) + 0.5) * turn.e
-    xs = turn.c + (np.arange(heights.shape[1]) + 0.5) * turn.a
-    if turn.e < 0:
-        ys, heights = ys[::-1], heights[::-1]
-    heights[~(np.abs(heights) < 1e5)] = np.nan  # what is no height on Earth or Moon
-    return site_of_grid(name, xs, ys, heights)
+        with part.open("wb") as file:
+            np.savez(file, allow_pickle=False, **arrays)
+        part.replace(path)
+    finally:
+        part.unlink(missing_ok=True)
+    return path
 
 
-def _gridded(path: Path, name: str) -> Site:
-    """Make grids of a cloud."""
+def open_terrain(path: Path, name: str) -> Site:
+    """Return a terrain that this service keeps.
+
+    Parameters
+    ----------
+    path : Path
+        A grid, or the foreign file itself, which earlier versions kept: that is read again.
+    name : str
+        Name of the foreign file.
+
+    Returns
+    -------
+    Site
+        Ground, and what hides.
+    """
+    if path.suffix != KEPT:
+        return read_terrain(path, name=name)
     try:
-        low, high = _extent(path)
-    except (laspy.LaspyException, ValueError, EOFError, OSError) as error:
-        raise InputError(
-            f"{name} is no cloud that can be read: {str(error).rstrip('.')}."
+        with np.load(path, allow_pickle=False) as file:
+            return _site(name, dict(file))
+    except FileNotFoundError as error:
+        raise NotFoundError(
+            f"The grid of {name} is not there any more; upload it again."
         ) from error
-    if not np.isfinite([low, high]).all():
-        raise InputError(f"{name} holds no terrain: it has no points.")
-    shape = np.floor((high - low) / _CELL).astype(np.int64) + 1
-    if int(shape[0]) * int(shape[1]) > CELLS_MAX:
+
+
+def _format_of(path: Path, name: str) -> _Format:
+    """Return the format of which both the ending and the first bytes are."""
+    wanted = _by_ending(name)
+    with path.open("rb") as file:
+        head = file.read(_HEAD)
+    if not _begins(head, wanted):
+        others = [one.name for one in _FORMATS if _begins(head, one)]
+        found = f"those of {others[0]}" if others else f"{head[:8]!r}"
         raise InputError(
-            f"{name} spreads over {high[0] - low[0]:,.0f} x {high[1] - low[1]:,.0f} m; at "
-            f"{_CELL:g} m a cell that is more than {CELLS_MAX:,} cells. Cut out the field."
+            f"{name} is no {wanted.kind} that can be read: its ending is that of {wanted.name}, "
+            f"its first bytes are {found}."
         )
-    lowest = np.full((shape[1], shape[0]), np.inf)
-    highest = np.full((shape[1], shape[0]), -np.inf)
-    for points in _pieces(path):
-        i, j = ((points[:, axis] - low[axis]) / _CELL for axis in range(2))
-        cells = (j.astype(np.intp), i.astype(np.intp))
-        np.minimum.at(lowest, cells, points[:, 2])
-        np.maximum.at(highest, cells, points[:, 2])
-    ground = _ground(np.where(np.isfinite(lowest), lowest, np.nan))
-    lines = [low[axis] + (np.arange(shape[axis]) + 0.5) * _CELL for axis in range(2)]
-    surface = np.where(np.isfinite(highest), highest, np.nan)
-    return site_of_grid(name, lines[0], lines[1], ground, surface=surface)
+    return wanted
 
 
-def _ground(lowest: Array) -> Array:
-    """Return the ground of lowest returns: bumps taken away, small gaps filled with the nearest."""
-    is_hole = np.isnan(lowest)
-    if is_hole.all():
-        return lowest
-    distance, nearest = distance_transform_edt(is_hole, return_indices=True)
-    filled = lowest[tuple(nearest)]
-    width = max(3, round(_OPENING / _CELL) | 1)
-    opened = grey_opening(filled, size=(width, width))
-    ground = np.where(filled - opened > _BUMP, opened, filled)
-    return np.where(distance * _CELL <= _GAP, ground, np.nan)
+def _begins(head: bytes, wanted: _Format) -> bool:
+    """Whether a file begins as those of a format do; words of a text may be in any case."""
+    return any(text.startswith(wanted.beginnings) for text in (head, head.lstrip().lower()))
 
 
-def _extent(path: Path) -> tuple[Array, Array]:
-    """Return the least and greatest x and y of a cloud [m]."""
-    if path.suffix.lower() in (".laz", ".las"):
-        with laspy.open(path) as file:
-            header = file.header
-            if not header.point_count:
-                return np.full(2, np.nan), np.full(2, np.nan)
-            return np.array(header.mins[:2]), np.array(header.maxs[:2])
-    lows, highs = [np.full(2, np.inf)], [np.full(2, -np.inf)]
-    for points in _pieces(path):
-        lows.append(points[:, :2].min(axis=0))
-        highs.append(points[:, :2].max(axis=0))
-    return np.min(lows, axis=0), np.max(highs, axis=0)
+def _by_ending(name: str) -> _Format:
+    """Return the format that has the ending of a name."""
+    found = [one for one in _FORMATS if name.lower().endswith(one.endings)]
+    if not found:
+        known = "; ".join(f"{one.name} ({', '.join(one.endings)})" for one in _FORMATS)
+        raise InputError(
+            f"{name} is no terrain that can be read; one of these is expected: {known}."
+        )
+    return found[0]
 
 
-def _pieces(path: Path) -> Iterator[Array]:
-    """Return the points of a cloud piece by piece, (n, 3), if finite [m]."""
-    suffix = path.suffix.lower()
-    if suffix in (".laz", ".las"):
-        with laspy.open(path) as file:
-            for chunk in file.chunk_iterator(_CHUNK):
-                yield np.column_stack([chunk.x, chunk.y, chunk.z]).astype(np.float64)
-        return
-    points = _ply(path) if suffix == ".ply" else read_cloud(str(path)).p_station
-    points = np.asarray(points, dtype=np.float64)
-    points = points[np.isfinite(points).all(axis=1)]
-    if len(points):
-        yield points
-
-
-def _ply(path: Path) -> Array:
-    """Return the vertices of a PLY file [m]."""
-    import open3d as o3d
-
-    if not path.read_bytes()[:4].startswith(b"ply"):
-        raise ValueError("its first line is not 'ply'")
-    return np.asarray(o3d.io.read_point_cloud(path).points, dtype=np.float64)
+def _site(name: str, arrays: Mapping[str, NDArray[Any]]) -> Site:
+    """Return the site of grids; a reader that a file has overcome may have forged them."""
+    known = dict(arrays)
+    xs, ys, ground = (known.pop(one, _NOTHING) for one in ("xs", "ys", "ground"))
+    surface = known.pop("surface", ground)
+    is_whole = not known and xs.ndim == ys.ndim == 1
+    is_whole = is_whole and (len(ys), len(xs)) == ground.shape == surface.shape
+    if not is_whole or not np.isfinite(np.concatenate([xs, ys])).all():
+        raise UnreadableFileError(f"{name} cannot be read: its reader gave no grid.")
+    for heights in (ground, surface):
+        heights[~(np.abs(heights) < _HEIGHT_MAX)] = np.nan
+    return site_of_grid(name, xs, ys, ground, surface=surface)

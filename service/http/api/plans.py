@@ -12,7 +12,6 @@ from fastapi import APIRouter, Path, Query, Request, Response
 from fastapi.responses import JSONResponse, PlainTextResponse
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
-from spheremark.pipelines.errors import InputError
 from spheremark.pipelines.placement import Requirement, Sensor
 from spheremark.pipelines.placement.candidates import PlaceRules
 from spheremark.pipelines.placement.optimisation import MARKS_MOST, Goal
@@ -28,17 +27,16 @@ from spheremark.service.planning.requests import (
     Place,
     marks_at,
     stops_at,
-    terrain_ground,
 )
 from spheremark.service.serialise.plans import Plain, site_answer, to_csv, to_geojson
 from spheremark.storage.catalogue import plans as kept
+from spheremark.storage.imports.terrain import check_ending, keep_grid, read_terrain
 
 router = APIRouter(tags=["plans"])
 
 GEOJSON = "application/geo+json"
 _MARKER_RADIUS = 0.100  # [m]
 _GROUND_ACROSS = 150  # places of the ground's heights that a map shows
-_ENDINGS = (".tif", ".tiff", ".asc", ".laz", ".las", ".ply")
 
 SiteKey = Annotated[
     str, Path(description="paper-field, paper-field@3 (another seed), or terrain:<id>.")
@@ -325,31 +323,26 @@ async def upload_terrain(
     service: Current,
     name: Annotated[str, Query(min_length=1, max_length=200, description="Name of the file.")],
 ) -> Said:
-    """Take in a terrain to plan on: GeoTIFF, ESRI ASCII grid, or a cloud (LAS, LAZ, PLY)."""
-    ending = next((e for e in _ENDINGS if name.lower().endswith(e)), None)
-    if ending is None:
-        raise InputError(f"{name} ends in none of {', '.join(_ENDINGS)}: send a file of those.")
+    """Keep the grid of a terrain to plan on: GeoTIFF, ESRI ASCII grid, or cloud (LAS, LAZ, PLY)."""
+    check_ending(name)
     most = service.settings.max_upload_bytes
-    received = await service.terrains.receive(request.stream(), most, ending)
-    return await asyncio.to_thread(_enter_terrain, service, received, name)
+    async with service.terrains.received(request.stream(), most) as received:
+        return await asyncio.to_thread(_enter_terrain, service, received, name)
 
 
 def _enter_terrain(service: Service, received: Received, name: str) -> Said:
-    """Enter a terrain once it has shown that it can be read."""
-    key = TERRAIN + received.digest
-    try:
-        ground = terrain_ground(key, name, received.path)
-    except InputError:
-        received.path.unlink(missing_ok=True)
-        raise
-    kept.keep_terrain(
+    """Keep the grid of a terrain and enter it; the file itself is not kept."""
+    grid = keep_grid(
+        read_terrain(received.path, name=name), service.terrains.folder, received.digest
+    )
+    entered = kept.keep_terrain(
         service.catalogue,
         received.digest,
         name=name,
         size_bytes=received.size_bytes,
-        url=str(received.path),
+        url=str(grid),
     )
-    return Said.model_validate({"key": key, "name": ground.site.name})
+    return Said.model_validate({"key": TERRAIN + received.digest, "name": entered["name"]})
 
 
 def _evaluated(service: Service, plan: Plan, *, field_cells: int = 0) -> Plain:

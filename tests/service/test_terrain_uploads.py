@@ -1,0 +1,138 @@
+"""Foreign terrains over HTTP: each is read, or refused with a reason, and leaves nothing behind."""
+
+import hashlib
+import socket
+from concurrent.futures import ThreadPoolExecutor
+
+import pytest
+from fastapi.testclient import TestClient
+
+from spheremark.service.http.app import create_app
+from spheremark.service.settings import Settings
+from spheremark.storage.catalogue import plans
+from tests.storage import hostile_terrains as made
+
+URL = "/api/v1/terrains"
+REFERENCES = [name for name, _, _ in made.references("", "", "")]
+OTHERS = {
+    name: (ending, body)
+    for source in (made.clouds, made.rasters, made.disguised)
+    for name, ending, body in source()
+}
+
+
+class Uploads:
+    """A service, a file that it must not show, and an address that it must not reach."""
+
+    def __init__(self, client, data, folder):
+        self.client, self.data, self.folder = client, data, folder
+        self.secret = folder / "secret.txt"
+        self.secret.write_text(made.SECRET)
+        self.listener = socket.create_server(("127.0.0.1", 0))
+        self.listener.setblocking(False)
+
+    def send(self, body, name):
+        """Upload, and check what must be true of every answer."""
+        answer = self.client.post(URL, params={"name": name}, content=body)
+        assert answer.status_code == 201 or 400 <= answer.status_code < 500, answer.text
+        if answer.status_code != 201:
+            problem = answer.json()
+            assert answer.headers["content-type"] == "application/problem+json"
+            assert problem["code"].startswith("input")
+            assert problem["detail"].rstrip().endswith((".", ")"))
+            assert len(problem["detail"]) < 2000
+            assert str(self.data) not in answer.text
+        return answer
+
+    def check(self):
+        """Check that files and rows agree, and that nothing was reached or made."""
+        rows = plans.list_terrains(self.client.app.state.service.catalogue)
+        files = {str(one) for one in (self.data / "terrains").rglob("*") if one.is_file()}
+        assert files == {row["url"] for row in rows}
+        assert list(self.folder.iterdir()) == [self.secret]
+        assert self.secret.read_text() == made.SECRET
+        with pytest.raises(BlockingIOError):
+            self.listener.accept()
+        return rows
+
+
+@pytest.fixture(scope="module")
+def uploads(tmp_path_factory):
+    data = tmp_path_factory.mktemp("data")
+    app = create_app(Settings(data=data, workers=1))
+    with TestClient(app, base_url="http://127.0.0.1:8000") as client:
+        found = Uploads(client, data, tmp_path_factory.mktemp("elsewhere"))
+        yield found
+        found.listener.close()
+
+
+@pytest.mark.parametrize("name", REFERENCES)
+def test_a_file_that_refers_elsewhere_is_refused_and_nothing_is_reached(uploads, name):
+    address = f"http://127.0.0.1:{uploads.listener.getsockname()[1]}"
+    cases = made.references(uploads.secret, address, uploads.folder)
+    ending, body = {one: (ending, body) for one, ending, body in cases}[name]
+    answer = uploads.send(body, f"x{ending}")
+    assert 400 <= answer.status_code < 500
+    assert made.SECRET not in answer.text
+    uploads.check()
+
+
+@pytest.mark.parametrize("name", OTHERS)
+def test_a_file_that_is_made_to_harm_is_refused(uploads, name):
+    ending, body = OTHERS[name]
+    answer = uploads.send(body, f"x{ending}")
+    assert 400 <= answer.status_code < 500, answer.text
+    uploads.check()
+
+
+@pytest.mark.parametrize("ending", [".laz", ".tif", ".ply", ".asc", ".parquet"])
+def test_damaged_files_are_read_or_refused(uploads, ending):
+    kinds = {".laz": "laz", ".tif": "big tif", ".ply": "ply", ".asc": "asc", ".parquet": "parquet"}
+    body = made.valid()[kinds[ending]][1]
+    bodies = list(made.mutants(body, 40 if ending == ".laz" else 10))
+    with ThreadPoolExecutor(2) as pool:
+        answers = list(pool.map(lambda one: uploads.send(one, f"x{ending}"), bodies))
+    rows = {row["terrain_id"] for row in uploads.check()}
+    for one, answer in zip(bodies, answers, strict=True):
+        assert (hashlib.sha256(one).hexdigest() in rows) == (answer.status_code == 201)
+
+
+@pytest.mark.parametrize("kind", made.valid())
+def test_a_terrain_becomes_a_grid_and_the_same_one_twice_is_one(uploads, kind):
+    ending, body = made.valid()[kind]
+    first = uploads.send(body, f"first{ending}").json()
+    again = uploads.send(body, f"again{ending}").json()
+    assert first == again
+    assert first["name"] == f"first{ending}"
+    (row,) = [row for row in uploads.check() if row["terrain_id"] in first["key"]]
+    assert row["url"].endswith(".npz")
+    assert row["size_bytes"] == len(body)
+    site = uploads.client.get(f"/api/v1/plans/sites/{first['key']}").json()
+    assert site["name"] == f"first{ending}"
+
+
+def test_a_terrain_that_an_earlier_version_kept_whole_still_opens(uploads):
+    ending, body = made.valid()["tif in whole metres"]
+    body += b" "  # a terrain of its own
+    digest = hashlib.sha256(body).hexdigest()
+    path = uploads.data / "terrains" / f"{digest}{ending}"
+    path.write_bytes(body)
+    catalogue = uploads.client.app.state.service.catalogue
+    plans.keep_terrain(catalogue, digest, name="old.tif", size_bytes=len(body), url=str(path))
+    site = uploads.client.get(f"/api/v1/plans/sites/terrain:{digest}")
+    assert (site.status_code, site.json()["name"]) == (200, "old.tif")
+    assert uploads.send(body, "again.tif").json()["name"] == "old.tif"  # and is a grid from now on
+    path.unlink()
+    assert uploads.client.get(f"/api/v1/plans/sites/terrain:{digest}").status_code == 200
+    uploads.check()
+
+
+def test_a_grid_that_is_gone_is_said_so(uploads):
+    ending, body = made.valid()["asc"]
+    key = uploads.send(body + b"\n \n", f"gone{ending}").json()["key"]
+    path = uploads.data / "terrains" / f"{key.removeprefix('terrain:')}.npz"
+    path.rename(path.with_suffix(".away"))
+    answer = uploads.client.get(f"/api/v1/plans/sites/{key}")
+    path.with_suffix(".away").rename(path)
+    assert (answer.status_code, answer.json()["code"]) == (404, "not_found")
+    assert str(uploads.data) not in answer.text

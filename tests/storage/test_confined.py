@@ -1,0 +1,120 @@
+import json
+import socket
+import time
+from pathlib import Path
+
+import psutil
+import pytest
+
+from spheremark.pipelines.errors import InputError
+from spheremark.storage.imports.confined import Limits, UnreadableFileError, run_confined
+
+LIMITS = Limits(seconds=10.0, memory_bytes=256 << 20, result_bytes=1 << 20)
+SHORT = Limits(seconds=1.0, memory_bytes=256 << 20, result_bytes=1 << 20)
+
+
+@pytest.fixture
+def run(tmp_path):
+    path = tmp_path / "file"
+    path.write_bytes(b"12345")
+
+    def confined(reader, limits=LIMITS, **options):
+        return run_confined(
+            f"tests.storage.confined_readers:{reader}", path, limits, name="file.x", **options
+        )
+
+    return confined
+
+
+def test_a_reader_gets_the_file_and_its_arrays_come_back(run):
+    found = run("size_of")
+    assert found["size"].tolist() == [5]
+    assert found["nothing"].shape == (0, 3)
+
+
+def test_a_reader_can_do_nothing_but_read_its_file(run, tmp_path, monkeypatch):
+    monkeypatch.setenv("SPHEREMARK_TOKEN", "secret")
+    (tmp_path / "secret").write_text("secret")
+    before = sorted(tmp_path.iterdir())
+    with (
+        socket.create_server(("127.0.0.1", 0)) as stream,
+        socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as datagrams,
+    ):
+        datagrams.bind(stream.getsockname())
+        found = run("try_escapes", folder=str(tmp_path), port=stream.getsockname()[1])
+        for one in (stream, datagrams):
+            one.setblocking(False)
+        with pytest.raises(BlockingIOError):
+            stream.accept()
+        with pytest.raises(BlockingIOError):
+            datagrams.recv(1)
+    assert found["worked"].tolist() == []
+    assert sorted(tmp_path.iterdir()) == before
+    assert (tmp_path / "secret").read_text() == "secret"
+
+
+@pytest.mark.parametrize(
+    ("reader", "limits", "reason"),
+    [
+        ("take_memory", LIMITS, "needs more than 256 MiB"),
+        ("take_memory_in_c", LIMITS, "SIGABRT.*or needs more than 256 MiB"),
+        ("take_time", SHORT, "took more than 1 s"),
+        ("crash", LIMITS, "ended with SIGSEGV"),
+        ("fail", LIMITS, r"about file\.x \[31m x{100}"),
+        ("leave", LIMITS, "no sensible answer"),
+        ("give_much", LIMITS, "cannot be read"),
+        ("give_objects", LIMITS, "no sensible answer"),
+        ("refuse", LIMITS, r"file\.x is refused \.$"),
+        ("nothing_of_this_name", LIMITS, "cannot be read"),
+    ],
+)
+def test_a_reader_that_fails_is_an_error_with_its_reason(run, reader, limits, reason):
+    with pytest.raises(InputError, match=reason) as found:
+        run(reader, limits)
+    assert len(str(found.value)) < 1000
+    assert str(found.value).isprintable()
+
+
+def test_what_a_library_prints_is_no_part_of_the_answer(run):
+    assert run("print_much")["x"].tolist() == [0.0]
+
+
+def test_a_reader_that_ignores_its_timer_is_killed(run, monkeypatch):
+    monkeypatch.setattr("spheremark.storage.imports.confined._START_MAX", 1.0)
+    begin = time.monotonic()
+    with pytest.raises(UnreadableFileError, match="took more than 1 s"):
+        run("sleep", SHORT)
+    assert time.monotonic() - begin < 15
+    assert not [one for one in psutil.Process().children() if "confined" in str(one.cmdline())]
+
+
+@pytest.mark.parametrize(
+    "answer",
+    [
+        "", "{}", "[]", "3", '"refused"', "[" * 60_000, "x" * 100_000, '{"arrays": 3}',
+        '{"arrays": [{"name": "x", "dtype": "|O", "shape": [1]}]}\n12345678',
+        '{"arrays": [{"name": "x", "dtype": "<f8", "shape": [1]}]}\n1234567',
+        '{"arrays": [{"name": "x", "dtype": "<f8", "shape": [-1]}]}\n12345678',
+        '{"arrays": [{"name": "x", "dtype": "<f8", "shape": [true]}]}\n12345678',
+        '{"arrays": [{"name": "x", "dtype": "<f8", "shape": [1e0]}]}\n12345678',
+        '{"arrays": [{"name": "x", "dtype": "<f8", "shape": 1}]}\n12345678',
+        '{"arrays": [{"name": "x", "dtype": "<f8", "shape": [1, 1, 1, 1]}]}\n12345678',
+        json.dumps({"arrays": [{"name": "x", "dtype": "<f8", "shape": [1 << 40]}]}) + "\n",
+        json.dumps({"arrays": [{"name": "x", "dtype": "<f8", "shape": [1 << 62, 4]}]}) + "\n",
+    ],
+    ids=lambda text: text[:60],
+)  # fmt: skip
+def test_a_forged_answer_is_refused(run, answer):
+    with pytest.raises(UnreadableFileError, match="no sensible answer"):
+        run("forge", answer=answer)
+
+
+def test_no_descriptor_stays_open(run):
+    run("size_of")
+    before = len(list(Path("/proc/self/fd").iterdir()))
+    for reader in ("size_of", "fail"):
+        try:
+            run(reader)
+        except UnreadableFileError:
+            assert reader == "fail"
+    assert len(list(Path("/proc/self/fd").iterdir())) == before
