@@ -20,7 +20,7 @@ from spheremark.pipelines.placement import Site, site_of_grid
 from spheremark.pipelines.placement.sites import CELLS_MAX
 from spheremark.storage.imports.confined import Limits, UnreadableFileError, run_confined
 
-LIMITS = Limits(seconds=120.0, memory_bytes=3 << 30, result_bytes=17 * CELLS_MAX)
+LIMITS = Limits(seconds=120.0, memory_bytes=2 << 30, result_bytes=17 * CELLS_MAX)
 """Of one terrain: two grids of the most cells, and what it takes to make them."""
 
 KEPT = ".npz"
@@ -62,17 +62,25 @@ _FORMATS = (
         "spheremark.storage.imports.ascii_grids:read_ascii_grid",
     ),
     _Format(
-        "LAS", _CLOUD, (".laz", ".las"), (b"LASF",), "spheremark.storage.imports.clouds:read_las"
+        "LAS",
+        _CLOUD,
+        (".laz", ".las"),
+        (b"LASF",),
+        "spheremark.storage.imports.cloud_files:read_las",
     ),
     _Format(
-        "PLY", _CLOUD, (".ply",), (b"ply\n", b"ply\r"), "spheremark.storage.imports.clouds:read_ply"
+        "PLY",
+        _CLOUD,
+        (".ply",),
+        (b"ply\n", b"ply\r"),
+        "spheremark.storage.imports.cloud_files:read_ply",
     ),
     _Format(
         "Parquet",
         _CLOUD,
         (".parquet",),
         (b"PAR1",),
-        "spheremark.storage.imports.clouds:read_parquet",
+        "spheremark.storage.imports.cloud_files:read_parquet",
     ),
 )
 
