@@ -57,8 +57,7 @@ class Inbox:
     async def receive(self, chunks: AsyncIterator[bytes], max_bytes: int) -> Received:
         """Keep a log as ``<sha256>.mcap``; the same bytes twice are one file."""
         async with self.received(chunks, max_bytes) as part:
-            target = await asyncio.to_thread(self._keep, part.path, f"{part.digest}.mcap")
-        return replace(part, path=target)
+            return replace(part, path=await asyncio.to_thread(self.keep, part, ".mcap"))
 
     @asynccontextmanager
     async def received(
@@ -76,11 +75,11 @@ class Inbox:
         finally:
             await asyncio.to_thread(path.unlink, missing_ok=True)
 
-    def _keep(self, path: Path, name: str) -> Path:
-        """Give a complete file its name."""
-        target = self.folder / name
-        path.chmod(0o644)
-        path.replace(target)
+    def keep(self, part: Received, ending: str) -> Path:
+        """Name a file by the digest of what was received."""
+        target = self.folder / f"{part.digest}{ending}"
+        part.path.chmod(0o644)
+        part.path.replace(target)
         return target
 
 

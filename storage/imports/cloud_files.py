@@ -56,7 +56,7 @@ def read_ply(file: IO[bytes], *, name: str, cells_max: int) -> dict[str, Array]:
 
 def read_parquet(file: IO[bytes], *, name: str, cells_max: int) -> dict[str, Array]:
     """Return the grid of a cloud that spheremark has written, as the other readers do."""
-    table = pq.ParquetFile(file)
+    table = pq.ParquetFile(file, pre_buffer=False)  # which would need threads
     if b"spheremark.cloud" not in (table.schema_arrow.metadata or {}):
         raise InputError(f"{name} is no cloud of spheremark; other Parquet files are not read.")
     n_points = table.metadata.num_rows
@@ -65,8 +65,9 @@ def read_parquet(file: IO[bytes], *, name: str, cells_max: int) -> dict[str, Arr
 
     def pieces() -> Pieces:
         columns = ["x_m", "y_m", "z_m"]
-        for batch in table.iter_batches(_CHUNK, columns=columns, use_threads=False):
-            yield np.column_stack([batch.column(one).to_numpy() for one in columns])
+        for number in range(table.num_row_groups):
+            group = table.read_row_group(number, columns=columns, use_threads=False)
+            yield np.column_stack([group.column(one).to_numpy() for one in columns])
 
     return _gridded(pieces(), *_extent(pieces()), name, cells_max)
 

@@ -14,6 +14,7 @@ import importlib
 import json
 import math
 import os
+import re
 import resource
 import signal
 import subprocess
@@ -38,6 +39,7 @@ _DTYPES = ("<f8", "<f4", "<i8", "|u1")  # of results
 _DIMENSIONS_MAX = 3
 _HEAD_MAX = 1 << 16  # [bytes] of the line before the arrays
 _MESSAGE_MAX = 400  # characters of a message out of the child
+_EXCEPTION = re.compile(r"^[\w.]+: ")  # the name of a class before its message
 _START_MAX = 20.0  # [s] until a process may have started on a machine that is busy
 _AT_ONCE = threading.BoundedSemaphore(2)  # children; others wait, and so memory is bounded too
 _ENVIRONMENT = {  # no settings, so no secrets; no threads, whose memory would count
@@ -157,14 +159,10 @@ def _reason(code: int, log: IO[bytes], limits: Limits, name: str) -> str:
     log.seek(0, os.SEEK_END)
     log.seek(max(0, log.tell() - _HEAD_MAX))
     lines = log.read().decode(errors="replace").strip().splitlines()
-    last = lines[-1].rpartition("Error: ")[2] if lines else "its reader failed"
-    return f"{name} cannot be read: {_plain(last, name)}."
-
-
-def _plain(message: str, name: str) -> str:
-    """Return a message of a library as a part of a sentence."""
-    text = "".join(c if c.isprintable() else " " for c in message).strip().rstrip(".")
-    return text.replace("/proc/self/fd/0", name)[:_MESSAGE_MAX]
+    last = _EXCEPTION.sub("", lines[-1]) if lines else ""
+    if not last or "/" in last:  # paths of this machine concern no one else
+        last = "its reader failed at it; the file is damaged, or of a kind that is not known"
+    return f"{name} cannot be read: {_printable(last, _MESSAGE_MAX).strip(' .')}."
 
 
 def _arrays(result: IO[bytes], limits: Limits, name: str) -> Arrays:
@@ -173,7 +171,7 @@ def _arrays(result: IO[bytes], limits: Limits, name: str) -> Arrays:
     try:
         head = json.loads(result.readline(_HEAD_MAX))
         if "refused" in head:
-            raise InputError(_sentence(str(head["refused"])))
+            raise InputError(_printable(str(head["refused"]), 4 * _MESSAGE_MAX))
         return {
             str(one["name"]): _array(result, str(one["dtype"]), one["shape"], limits)
             for one in head["arrays"]
@@ -184,9 +182,9 @@ def _arrays(result: IO[bytes], limits: Limits, name: str) -> Arrays:
         ) from error
 
 
-def _sentence(text: str) -> str:
-    """Return a refusal of a reader in printable characters."""
-    return "".join(c if c.isprintable() else " " for c in text)[: 4 * _MESSAGE_MAX]
+def _printable(text: str, n_most: int) -> str:
+    """Return a text out of the child without control characters, and not too long."""
+    return "".join(c if c.isprintable() else " " for c in text)[:n_most]
 
 
 def _array(result: IO[bytes], dtype: str, shape: Any, limits: Limits) -> NDArray[Any]:
@@ -222,6 +220,7 @@ def _main() -> None:
         seconds=limits.seconds,
         file_bytes=limits.result_bytes + _HEAD_MAX,
     )
+    resource.setrlimit(resource.RLIMIT_NPROC, (0, 0))  # no thread or process more; root is exempt
     forbid_files([file.fileno()])
     try:
         arrays = reader(file, **request["options"])

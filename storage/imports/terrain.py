@@ -7,7 +7,6 @@ terrain is that grid, never the file.
 
 from __future__ import annotations
 
-import secrets
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -134,35 +133,21 @@ def check_ending(name: str) -> None:
     _by_ending(name)
 
 
-def keep_grid(site: Site, folder: Path, digest: str) -> Path:
-    """Write the grid of a terrain as ``<digest>.npz``.
+def write_grid(site: Site, path: Path) -> None:
+    """Write the grid of a terrain over a file.
 
     Parameters
     ----------
     site : Site
         What ``read_terrain`` returned.
-    folder : Path
-        Where.
-    digest : str
-        SHA-256 of the foreign file.
-
-    Returns
-    -------
-    Path
-        The file.
+    path : Path
+        The file; ``open_terrain`` knows it once its ending is ``KEPT``.
     """
-    path = folder / f"{digest}{KEPT}"
     arrays = {"xs": site.xs, "ys": site.ys, "ground": site.ground}
     if not np.array_equal(site.surface, site.ground, equal_nan=True):
         arrays["surface"] = site.surface
-    part = folder / f"{digest}.{secrets.token_hex(4)}.part"  # no reader finds half a file
-    try:
-        with part.open("wb") as file:
-            np.savez(file, allow_pickle=False, **arrays)
-        part.replace(path)
-    finally:
-        part.unlink(missing_ok=True)
-    return path
+    with path.open("wb") as file:
+        np.savez(file, allow_pickle=False, **arrays)
 
 
 def open_terrain(path: Path, name: str) -> Site:

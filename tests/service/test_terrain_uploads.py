@@ -122,7 +122,7 @@ def test_a_terrain_that_an_earlier_version_kept_whole_still_opens(uploads):
     site = uploads.client.get(f"/api/v1/plans/sites/terrain:{digest}")
     assert (site.status_code, site.json()["name"]) == (200, "old.tif")
     assert uploads.send(body, "again.tif").json()["name"] == "old.tif"  # and is a grid from now on
-    path.unlink()
+    assert not path.exists()
     assert uploads.client.get(f"/api/v1/plans/sites/terrain:{digest}").status_code == 200
     uploads.check()
 

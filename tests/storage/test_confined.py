@@ -60,7 +60,7 @@ def test_a_reader_can_do_nothing_but_read_its_file(run, tmp_path, monkeypatch):
         ("take_memory_in_c", LIMITS, "SIGABRT.*or needs more than 256 MiB"),
         ("take_time", SHORT, "took more than 1 s"),
         ("crash", LIMITS, "ended with SIGSEGV"),
-        ("fail", LIMITS, r"about file\.x \[31m x{100}"),
+        ("fail", LIMITS, r"file\.x cannot be read: about \[31m x{100}"),
         ("leave", LIMITS, "no sensible answer"),
         ("give_much", LIMITS, "cannot be read"),
         ("give_objects", LIMITS, "no sensible answer"),

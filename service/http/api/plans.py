@@ -30,7 +30,7 @@ from spheremark.service.planning.requests import (
 )
 from spheremark.service.serialise.plans import Plain, site_answer, to_csv, to_geojson
 from spheremark.storage.catalogue import plans as kept
-from spheremark.storage.imports.terrain import check_ending, keep_grid, read_terrain
+from spheremark.storage.imports.terrain import KEPT, check_ending, read_terrain, write_grid
 
 router = APIRouter(tags=["plans"])
 
@@ -332,9 +332,8 @@ async def upload_terrain(
 
 def _enter_terrain(service: Service, received: Received, name: str) -> Said:
     """Keep the grid of a terrain and enter it; the file itself is not kept."""
-    grid = keep_grid(
-        read_terrain(received.path, name=name), service.terrains.folder, received.digest
-    )
+    write_grid(read_terrain(received.path, name=name), received.path)
+    grid = service.terrains.keep(received, KEPT)
     entered = kept.keep_terrain(
         service.catalogue,
         received.digest,
@@ -342,6 +341,9 @@ def _enter_terrain(service: Service, received: Received, name: str) -> Said:
         size_bytes=received.size_bytes,
         url=str(grid),
     )
+    for older in grid.parent.glob(f"{received.digest}.*"):
+        if older != grid:
+            older.unlink(missing_ok=True)  # the file itself, which earlier versions kept
     return Said.model_validate({"key": TERRAIN + received.digest, "name": entered["name"]})
 
 
