@@ -34,7 +34,6 @@ from spheremark.storage.confinement import forbid_files, leave_network, limit_re
 Arrays = dict[str, NDArray[Any]]
 Reader = Callable[..., Mapping[str, NDArray[Any]]]
 
-_ROOT = Path(__file__).resolve().parents[2]
 _DTYPES = ("<f8", "<f4", "<i8", "|u1")  # of results
 _DIMENSIONS_MAX = 3
 _HEAD_MAX = 1 << 16  # [bytes] of the line before the arrays
@@ -43,7 +42,6 @@ _EXCEPTION = re.compile(r"^[\w.]+: ")  # the name of a class before its message
 _START_MAX = 20.0  # [s] until a process may have started on a machine that is busy
 _AT_ONCE = threading.BoundedSemaphore(2)  # children; others wait, and so memory is bounded too
 _ENVIRONMENT = {  # no settings, so no secrets; no threads, whose memory would count
-    "PYTHONPATH": str(_ROOT),
     "PATH": os.defpath,
     "OPENBLAS_NUM_THREADS": "1",
     "OMP_NUM_THREADS": "1",
@@ -132,7 +130,7 @@ def _wait_for_child(request: str, files: tuple[IO[bytes], ...], limits: Limits) 
         stdout=files[1],
         stderr=files[2],
         cwd="/",
-        env=_ENVIRONMENT,
+        env={**_ENVIRONMENT, "PYTHONPATH": os.pathsep.join(filter(None, sys.path))},
         start_new_session=True,
     ) as child:
         try:
