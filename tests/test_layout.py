@@ -27,6 +27,7 @@ FRAMELESS = {  # counts, clocks, scalars per row, and tables of the sensor: no c
     "sigma_horizontal",
     "divergence", "laser_elevations", "laser_heights", "laser_range_biases",
     "encoder_eccentricity", "stamps_ns", "samples_ns", "values", "rates",
+    "fits", "measured", "given", "sigmas", "is_off",
 }  # fmt: skip
 
 

@@ -281,35 +281,37 @@ class Omissions:
 
     Attributes
     ----------
-    shifts : (n, 3)
+    shifts_site : (n, 3)
         Position of the station without the marker, minus its position with all; NaN, as all else of
         the row, where the other marks stand on one plumb line and tell no heading, or contradict
         each other so that they tell no position [m].
-    predictions : (n, 3)
+    predictions_site : (n, 3)
         Where the scan puts the mark when the others alone position the station, minus where it is
         given [m].
-    cov_predictions : (n, 3, 3)
+    cov_predictions_site : (n, 3, 3)
         Covariances of these differences [m^2].
     """
 
-    shifts: Array
-    predictions: Array
-    cov_predictions: Array
+    shifts_site: Array
+    predictions_site: Array
+    cov_predictions_site: Array
 
     def __post_init__(self) -> None:
-        n = len(self.shifts)
-        seal(self, shifts=(n, 3), predictions=(n, 3), cov_predictions=(n, 3, 3))
+        n = len(self.shifts_site)
+        seal(self, shifts_site=(n, 3), predictions_site=(n, 3), cov_predictions_site=(n, 3, 3))
 
     @classmethod
     def none(cls) -> Self:
         """Return no rows."""
         none = np.zeros((0, 3))
-        return cls(shifts=none, predictions=none, cov_predictions=np.zeros((0, 3, 3)))
+        return cls(
+            shifts_site=none, predictions_site=none, cov_predictions_site=np.zeros((0, 3, 3))
+        )
 
     @property
-    def sigma_predictions(self) -> Array:
-        """Standard deviations of ``predictions``, (n, 3) [m]."""
-        return np.asarray(np.sqrt(np.diagonal(self.cov_predictions, axis1=1, axis2=2)))
+    def sigma_predictions_site(self) -> Array:
+        """Standard deviations of ``predictions_site``, (n, 3) [m]."""
+        return np.asarray(np.sqrt(np.diagonal(self.cov_predictions_site, axis1=1, axis2=2)))
 
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)

@@ -246,9 +246,9 @@ def leave_each_out(
     cov = R @ seen.cov_base @ np.swapaxes(R, 1, 2) + seen.cov_marks
     J = _by_motion(q)
     return Omissions(
-        shifts=t - with_all.T[0, :3, 3],
-        predictions=q + t - seen.marks,
-        cov_predictions=J @ without.cov @ np.swapaxes(J, 1, 2) + cov,
+        shifts_site=t - with_all.T[0, :3, 3],
+        predictions_site=q + t - seen.marks,
+        cov_predictions_site=J @ without.cov @ np.swapaxes(J, 1, 2) + cov,
     )
 
 

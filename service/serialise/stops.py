@@ -205,7 +205,7 @@ def _without_each(
     fix: StationFix, omissions: Omissions, fits: MarkerFits, marks: ControlMarks
 ) -> list[Plain]:
     """Return the station without each of its markers, and each mark as the others predict it."""
-    columns = (omissions.shifts, omissions.predictions, omissions.sigma_predictions)
+    columns = (omissions.shifts_site, omissions.predictions_site, omissions.sigma_predictions_site)
     return [
         {
             "marker": fits.fits[fit].name,

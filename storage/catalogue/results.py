@@ -386,7 +386,7 @@ def _observation_rows(
     fix: StationFix, quality: StationQuality, fits: MarkerFits, names: tuple[str, ...]
 ) -> list[Row]:
     """Return one row of ``observations`` for each marker of the stop."""
-    shifts = np.linalg.norm(quality.without_each.shifts, axis=1)
+    shifts = np.linalg.norm(quality.without_each.shifts_site, axis=1)
     excluded = {exclusion.fit: exclusion.reason for exclusion in fix.excluded}
     rows: list[Row] = [
         {"marker": fit.name, "used": False, "reason": excluded.get(i, "Not matched.")}

@@ -120,10 +120,10 @@ def test_leaving_a_marker_out_is_positioning_without_it(rng):
     fits = seen(rng, marks)
     fix = resect("free_station", fits, marks, CONFIG)
     omissions = leave_each_out(fix, fits, marks, CONFIG)
-    assert len(omissions.shifts) == 6
+    assert len(omissions.shifts_site) == 6
     for row, (_, mark) in enumerate(fix.matches):
         anew = resect("free_station", *without(fits, marks, mark), CONFIG)
-        np.testing.assert_allclose(omissions.shifts[row], anew.p_site - fix.p_site, atol=1e-6)
+        np.testing.assert_allclose(omissions.shifts_site[row], anew.p_site - fix.p_site, atol=1e-6)
 
 
 def test_what_the_others_predict_for_a_mark_is_off_by_as_much_as_is_said(rng):
@@ -133,7 +133,7 @@ def test_what_the_others_predict_for_a_mark_is_off_by_as_much_as_is_said(rng):
         fits = seen(rng, marks)
         fix = resect("free_station", fits, marks, replace(CONFIG, test_level=1e-6))
         omissions = leave_each_out(fix, fits, marks, CONFIG)
-        d, cov = omissions.predictions, omissions.cov_predictions
+        d, cov = omissions.predictions_site, omissions.cov_predictions_site
         squares.append(np.einsum("ni,nij,nj->n", d, np.linalg.inv(cov), d))
     assert np.mean(np.concatenate(squares)) / 3 == pytest.approx(1.0, abs=0.15)
 
@@ -142,7 +142,7 @@ def test_of_two_markers_none_can_be_left_out(rng):
     marks = control([[6, 0, 0.7], [-5, 2, 1.4]])
     fits = seen(rng, marks)
     fix = resect("free_station", fits, marks, CONFIG)
-    assert len(leave_each_out(fix, fits, marks, CONFIG).shifts) == 0
+    assert len(leave_each_out(fix, fits, marks, CONFIG).shifts_site) == 0
 
 
 def test_a_marker_whose_others_stand_on_one_pole_cannot_be_left_out(rng):
@@ -151,7 +151,11 @@ def test_a_marker_whose_others_stand_on_one_pole_cannot_be_left_out(rng):
     fix = resect("free_station", fits, marks, CONFIG)
     omissions = leave_each_out(fix, fits, marks, CONFIG)
     first = list(fix.matches[:, 1]).index(0)
-    for column in (omissions.shifts, omissions.predictions, omissions.cov_predictions):
+    for column in (
+        omissions.shifts_site,
+        omissions.predictions_site,
+        omissions.cov_predictions_site,
+    ):
         assert np.isnan(column[first]).all()
         assert np.isfinite(np.delete(column, first, axis=0)).all()
 
@@ -164,8 +168,8 @@ def test_a_levelling_that_the_fix_left_out_does_not_tilt_what_the_others_predict
     fix = resect("free_station", fits, marks, CONFIG)
     assert "levelling contradicts" in fix.reason
     omissions = leave_each_out(fix, fits, marks, CONFIG)
-    assert np.linalg.norm(omissions.predictions, axis=1).max() < 8 * SIGMA
-    assert np.linalg.norm(omissions.shifts, axis=1).max() < 4 * SIGMA
+    assert np.linalg.norm(omissions.predictions_site, axis=1).max() < 8 * SIGMA
+    assert np.linalg.norm(omissions.shifts_site, axis=1).max() < 4 * SIGMA
 
 
 @pytest.mark.parametrize(
