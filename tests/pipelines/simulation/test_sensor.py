@@ -105,8 +105,14 @@ def test_ranges_are_multiples_of_2_mm(shots):
 
 def test_azimuths_are_multiples_of_a_hundredth_of_a_degree(shots):
     returns = recorded(shots, 7.0, 0.5, azimuth_step=np.radians(0.01))
-    hundredths = np.degrees(np.arctan2(-returns.p_lidar[:, 1], returns.p_lidar[:, 0])) * 100
-    assert_allclose(hundredths, np.round(hundredths), rtol=0, atol=2e-3)
+    x, y = returns.p_lidar[:, :2].astype(np.float64).T
+    hundredths = np.degrees(np.arctan2(-y, x)) * 100
+    # Rounding moves each float32 coordinate by at most half an ulp of the horizontal distance
+    # and the point across the beam by at most 0.71 ulp.
+    distances = np.hypot(x, y)
+    one_ulp = np.degrees(np.spacing(distances.astype(np.float32)) / distances) * 100
+    assert np.all(np.abs(hundredths - np.round(hundredths)) <= one_ulp)
+    assert np.max(one_ulp) < 0.01  # else a hundredth could be missed
 
 
 @pytest.mark.parametrize(
