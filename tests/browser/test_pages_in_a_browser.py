@@ -51,7 +51,7 @@ def address(tmp_path_factory):
         time.sleep(0.05)
     yield f"http://127.0.0.1:{server.servers[0].sockets[0].getsockname()[1]}"
     server.should_exit = True
-    thread.join(timeout=30)
+    thread.join(timeout=120)
 
 
 @pytest.fixture(scope="module")

@@ -10,6 +10,8 @@ from spheremark.pipelines.scan.stitching import stitch
 from spheremark.pipelines.threads import by_turns, in_processes, side_by_side
 from tests.synthetic import crooked_rig, scan_log
 
+PATIENCE = 120.0  # [s] ends a test that would hang; one that passes never waits for it
+
 
 @pytest.mark.parametrize("n_rows", [0, 1, 7, 49_999, 50_000, 100_001])
 def test_every_row_is_done_once_and_in_order(n_rows):
@@ -18,7 +20,7 @@ def test_every_row_is_done_once_and_in_order(n_rows):
 
 
 def test_parts_are_done_at_the_same_time():
-    meeting = threading.Barrier(2, timeout=10.0)  # breaks unless both parts get there
+    meeting = threading.Barrier(2, timeout=PATIENCE)  # breaks unless both parts get there
     assert len(side_by_side(lambda _first, _end: meeting.wait(), 10, worth=2)) == 2
 
 
@@ -43,7 +45,7 @@ def test_a_late_thread_leaves_its_pieces_to_the_other():
 
     def work(first, end):
         if first == 0:
-            return done.wait(10.0)
+            return done.wait(PATIENCE)
         if end == 50:
             done.set()
         return True

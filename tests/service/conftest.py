@@ -11,6 +11,7 @@ from spheremark.service.cli.fieldwork import Assignment, survey
 from spheremark.service.http.app import create_app
 from spheremark.service.settings import Settings
 
+PATIENCE = 300.0  # [s] ends a test that would hang; one that passes never waits for it
 MCAP = {"Content-Type": "application/vnd.mcap"}
 
 
@@ -43,15 +44,23 @@ class Site:
         children = psutil.Process().children(recursive=True)
         return [one for one in children if "spawn_main" in " ".join(one.cmdline())]
 
-    def ended(self, job_id, seconds=60):
+    def begun(self, job_id):
+        """Wait for the beginning of a job, which on a busy machine may be seen after its end."""
+        deadline = time.monotonic() + PATIENCE
+        while self.client.get(f"/api/v1/jobs/{job_id}").json()["status"] == "accepted":
+            if time.monotonic() > deadline:
+                raise TimeoutError(f"job {job_id} did not begin within {PATIENCE} s")
+            time.sleep(0.005)
+
+    def ended(self, job_id):
         """Wait for the end of a job."""
-        deadline = time.monotonic() + seconds
+        deadline = time.monotonic() + PATIENCE
         while time.monotonic() < deadline:
             job = self.client.get(f"/api/v1/jobs/{job_id}").json()
             if job["status"] not in ("accepted", "running"):
                 return job
             time.sleep(0.05)
-        raise TimeoutError(f"job {job_id} did not end within {seconds} s")
+        raise TimeoutError(f"job {job_id} did not end within {PATIENCE} s")
 
 
 @pytest.fixture(scope="session")

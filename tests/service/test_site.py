@@ -36,7 +36,7 @@ def made(site, too_early):
     assert site.ended(job)["status"] == "successful"
     wanted = {"kind": "site", "survey": "quarry", "options": {"cell_m": 1.0, "voxel_m": 0.02}}
     answer = site.client.post("/api/v1/jobs", json=wanted)
-    done = site.ended(answer.json()["job_id"], seconds=120)
+    done = site.ended(answer.json()["job_id"])
     assert done["status"] == "successful", done
     listed = site.client.get("/api/v1/surveys/quarry/products").json()["items"]
     return {one["kind"]: one for one in listed}
@@ -108,7 +108,7 @@ def test_a_log_without_a_pose_is_named_as_missing(made, site, tmp_path):
         "options": {"cell_m": 2.0, "clouds": False},
     }
     job = site.client.post("/api/v1/jobs", json=wanted).json()["job_id"]
-    message = site.ended(job, seconds=120)["message"]
+    message = site.ended(job)["message"]
     assert message.startswith(f"{made['laz']['n_stations']} station")
     assert "Without again, of which there is no pose." in message
 
@@ -132,7 +132,7 @@ def test_the_form_of_a_site_starts_a_job(made, site):
     )
     assert answer.status_code == 303
     job = answer.headers["location"].rpartition("/")[2]
-    assert site.ended(job, seconds=120)["status"] == "successful"
+    assert site.ended(job)["status"] == "successful"
 
 
 def test_a_survey_without_poses_is_refused_with_what_to_do(too_early):

@@ -58,7 +58,7 @@ def run(site):
     def asked(kind, survey="field", **more):
         answer = site.client.post("/api/v1/jobs", json={"kind": kind, "survey": survey, **more})
         assert answer.status_code == 202, answer.text
-        return site.ended(answer.json()["job_id"], seconds=120)
+        return site.ended(answer.json()["job_id"])
 
     return asked
 

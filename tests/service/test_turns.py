@@ -9,6 +9,7 @@ from spheremark.service.jobs.queue import JobQueue
 from spheremark.service.settings import Settings
 from spheremark.storage.catalogue.catalogue import Catalogue
 
+PATIENCE = 120.0  # [s] ends a test that would hang; one that passes never waits for it
 STARTED = {"event": "started", "percent": 0.0, "message": "Started.", "worker": "tcp://far"}
 
 
@@ -19,10 +20,10 @@ def hold(catalogue, until):
     def write():
         with catalogue.writing():
             has_begun.set()
-            until.wait(10)
+            until.wait(PATIENCE)
 
     threading.Thread(target=write).start()
-    assert has_begun.wait(10)
+    assert has_begun.wait(PATIENCE)
 
 
 async def outrun(queue, catalogue, job):

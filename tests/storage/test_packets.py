@@ -2,7 +2,6 @@
 
 import sqlite3
 from itertools import pairwise
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -18,9 +17,10 @@ from spheremark.pipelines.scan.rigs import FIRING_ORDER
 from spheremark.pipelines.simulation import SimulationConfig, scenario, simulate_stop
 from spheremark.storage.recordings import inspect_log, read_log, write_log
 from spheremark.storage.recordings.packets import DEFINITION, SCHEMA, encoded, punctual
+from tests.real_scans import REAL, needs
 from tests.storage.recorder import DEFINITIONS, T0, cloud, joints, record, turning, velodyne
 
-REAL = Path(__file__).parents[3] / "shared" / "real" / "vlp16_packets"
+PACKETS = REAL / "vlp16_packets"
 SINGLE = 1e-4  # [m] of a range of 100 m with the decoder's seven digits of an elevation
 CLOCK = 2e-6  # [s] the decoder counts by the sensor's clock of whole microseconds
 HOUR = 3_600_000_000_000
@@ -28,7 +28,7 @@ PACKET = 24 * 55_296  # [ns]
 STORE = get_typestore(Stores.ROS2_HUMBLE)
 STORE.register(get_types_from_msg(DEFINITION, SCHEMA))
 
-needs_real = pytest.mark.skipif(not REAL.exists(), reason=f"{REAL} is absent")
+needs_real = needs("vlp16_packets")
 
 
 @pytest.fixture
@@ -170,7 +170,7 @@ def test_made_up_packets_decode_as_velodyne_decoder_does(rng, tmp_path, little_e
 
 @needs_real
 def test_real_strongest_returns_decode_as_velodyne_decoder_does(tmp_path):
-    data = np.fromfile(REAL / "strongest_1000_packets.bin", np.uint8).reshape(-1, 1206)
+    data = np.fromfile(PACKETS / "strongest_1000_packets.bin", np.uint8).reshape(-1, 1206)
     packets = encoded(firings(np.random.default_rng(0), n_packets=1000))
     packets["data"] = data.view(packets["data"].dtype).ravel()
     stamps = T0 // HOUR * HOUR + packets["data"]["micros"].astype(np.int64) * 1000
@@ -188,7 +188,8 @@ def by_shot(rings, instants, p):
 
 @needs_real
 def test_real_dual_returns_decode_as_velodyne_decoder_does(tmp_path):
-    with sqlite3.connect(f"file:{REAL / 'dual_return_603_packets.db3'}?mode=ro", uri=True) as base:
+    file = PACKETS / "dual_return_603_packets.db3"
+    with sqlite3.connect(f"file:{file}?mode=ro", uri=True) as base:
         rows = base.execute("select data from messages order by timestamp").fetchall()
     for (data,) in rows:
         scan = STORE.deserialize_cdr(data, SCHEMA)

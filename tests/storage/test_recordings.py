@@ -4,7 +4,6 @@ import json
 import math
 import struct
 from itertools import product
-from pathlib import Path
 
 import fsspec
 import numpy as np
@@ -24,6 +23,7 @@ from spheremark.pipelines.model import RING_UNKNOWN, ImuMount, Origin, ScanLog
 from spheremark.pipelines.scan.rigs import tilted_vlp16, vlp16
 from spheremark.storage.recordings import file_digest, read_log, write_log
 from spheremark.storage.recordings.container import Container, opened
+from tests.real_scans import recordings
 from tests.storage.recorder import (
     DEFINITIONS,
     STORE,
@@ -39,7 +39,6 @@ from tests.storage.recorder import (
     velodyne,
 )
 
-REAL = Path(__file__).parents[3] / "shared" / "real"
 FLOAT_TIME = 10  # [ns] of a float32 time within a revolution
 TURN = Rotation.from_euler("y", 90, degrees=True).as_quat()
 STILL = (0.0, 0.0, 0.0, 1.0)
@@ -631,15 +630,8 @@ def test_a_known_digest_is_believed(tmp_path):
     assert read_log(path, digest="abc").origin.digest == "abc"
 
 
-def real(folder, pattern):
-    files = sorted((REAL / folder).glob(pattern))
-    return files or [
-        pytest.param(None, marks=pytest.mark.skip(reason=f"{REAL / folder} is absent"))
-    ]
-
-
 @pytest.mark.parametrize(
-    "path", real("mcap_container", "*.mcap"), ids=lambda p: getattr(p, "stem", "none")
+    "path", recordings("mcap_container", "*.mcap"), ids=lambda p: getattr(p, "stem", "none")
 )
 def test_the_container_suite_gives_its_messages(path):
     records = json.loads(path.with_suffix(".json").read_text())["records"]
@@ -654,7 +646,7 @@ def test_the_container_suite_gives_its_messages(path):
 
 
 @pytest.mark.parametrize(
-    "path", real("ros2_bags", "*.mcap"), ids=lambda p: getattr(p, "stem", "none")
+    "path", recordings("ros2_bags", "*.mcap"), ids=lambda p: getattr(p, "stem", "none")
 )
 def test_real_bags_give_as_many_messages_as_the_library_finds(path):
     with path.open("rb") as file:

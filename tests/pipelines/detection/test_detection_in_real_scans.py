@@ -1,7 +1,6 @@
 """Spheres in scans that others have made, nearer, denser and larger or smaller than ours."""
 
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -13,9 +12,7 @@ from spheremark.pipelines.detection import extract
 from spheremark.pipelines.model import RING_UNKNOWN, Levelling, StitchedCloud
 from spheremark.pipelines.scan.rigs import vlp16
 from spheremark.pipelines.sphere import fit_markers
-
-REAL = Path(__file__).parents[4] / "shared" / "real"
-pytestmark = pytest.mark.skipif(not REAL.is_dir(), reason=f"There are no real scans at {REAL}.")
+from tests.real_scans import REAL, needs
 
 # where an exhaustive search with free radius finds the sphere: to a few centimetres [m]
 SPHERES = {
@@ -52,6 +49,7 @@ def at_rest(points, rig):
     )
 
 
+@needs("vlp16_spheres")
 @pytest.mark.parametrize("name", SPHERES)
 def test_the_sphere_is_found_among_people_and_furniture_and_nothing_else(name):
     cloud = at_rest(points_of(REAL / f"vlp16_spheres/{name}.xyz"), vlp16("upright", np.eye(4)))
@@ -61,6 +59,7 @@ def test_the_sphere_is_found_among_people_and_furniture_and_nothing_else(name):
     assert all(rejection.reason for rejection in found.rejected)
 
 
+@needs("tls_spheres")
 @pytest.mark.parametrize("name", TARGETS)
 def test_a_target_of_a_terrestrial_scanner_is_fitted_as_nist_segments_it(name):
     rig = replace(vlp16("tls", np.eye(4)), laser_heights=np.zeros(16), divergence=np.full(2, 1e-4))

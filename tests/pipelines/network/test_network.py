@@ -1,8 +1,12 @@
 """The network against a world whose truth is known, and against a dense solution of its own."""
 
 import re
+import sys
 import time
+import tracemalloc
+from contextlib import contextmanager
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -548,14 +552,49 @@ def wide(rng, n_stations, n_marks=200, n_seen=14):
     )
 
 
+@contextmanager
+def counted():
+    """Count calls of functions and the peak of memory: what neither load nor processor changes."""
+    cost = SimpleNamespace(calls=0, peak_bytes=0)
+
+    def count(*_):
+        cost.calls += 1
+
+    tracemalloc.start()
+    sys.setprofile(count)
+    try:
+        yield cost
+    finally:
+        sys.setprofile(None)
+        cost.peak_bytes = tracemalloc.get_traced_memory()[1]
+        tracemalloc.stop()
+
+
 @pytest.mark.slow
 def test_a_thousand_stations_and_two_hundred_marks_are_adjusted_at_a_cost_that_grows_linearly(rng):
-    seconds = []
+    adjust_network(wide(rng, 20), CONFIG)  # compiles
+    costs = []
     for n in (250, 1000):
         net = wide(rng, n)
-        begin = time.perf_counter()
-        result = adjust_network(net, CONFIG)
-        seconds.append(time.perf_counter() - begin)
+        with counted() as cost:
+            result = adjust_network(net, CONFIG)
+        costs.append(cost)
         assert result.dof == 3 * 14 * n + 2 * n - 6 * n - 600 + 4
         assert 0.9 < result.sigma0 < 1.1
-    assert seconds[1] < 6 * seconds[0]  # four times the stations
+    few, many = costs
+    # four times the stations: n gives at most 4, n log n gives 5 and n^2 gives 16
+    assert many.calls < 5 * few.calls
+    assert many.peak_bytes < 5 * few.peak_bytes
+
+
+@pytest.mark.benchmark
+def test_the_time_of_an_adjustment_grows_more_slowly_than_the_stations_to_the_power_1_5(rng):
+    nets = [wide(rng, n) for n in (250, 1000)]
+
+    def cost(net):
+        begin = time.thread_time()
+        adjust_network(net, CONFIG)
+        return time.thread_time() - begin
+
+    few, many = np.min([[cost(net) for net in nets] for _ in range(5)], axis=0)
+    assert many < 4**1.5 * few
