@@ -5,6 +5,7 @@ import pytest
 
 from spheremark.pipelines.error_model import Demand, ErrorSample, fit_error_model, limits
 from spheremark.pipelines.errors import TooFewObservationsError
+from tests import chance
 
 EXACT = 1e-12  # [m]
 
@@ -62,11 +63,16 @@ def test_a_few_gross_errors_move_the_model_little():
 
 def test_the_prediction_holds_ninety_five_of_a_hundred_errors():
     rng = np.random.default_rng(9)
-    model, fresh = fit_error_model(sample(rng, n_scans=80)), sample(rng, n_scans=200)
-    within = fresh.errors_3d <= model.predict(fresh.ranges, fresh.n_points)
-    assert np.mean(within) == pytest.approx(0.95, abs=0.01)
-    mean = np.mean(fresh.errors_3d / model.predict(fresh.ranges, fresh.n_points, "mean"))
-    assert mean == pytest.approx(1.0, abs=0.03)
+    within, means = [], []
+    for _ in range(100):
+        model, fresh = fit_error_model(sample(rng, n_scans=80)), sample(rng, n_scans=200)
+        within.append(np.mean(fresh.errors_3d <= model.predict(fresh.ranges, fresh.n_points)))
+        mean = model.predict(fresh.ranges, fresh.n_points, "mean")
+        means.append(np.mean(fresh.errors_3d / mean))
+    # A model of 1120 errors spreads by 0.9 % of coverage and 1.6 % of size; what it is off on
+    # average is of second order in them, and below half of one spread.
+    assert abs(np.mean(within) - 0.95) < 0.0045 + chance.of_mean(within)
+    assert abs(np.mean(means) - 1.0) < 0.008 + chance.of_mean(means)
 
 
 def test_the_greatest_distance_and_smallest_count_are_those_of_the_law():

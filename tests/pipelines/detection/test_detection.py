@@ -92,7 +92,7 @@ def test_scores_are_between_hardly_and_surely(found):
         ((*POST[:2], GROUND + 1.3), "free|pole|curved|radius"),
         ((*SLIM[:2], GROUND + 0.9), "slim|free|curved"),
         (BIG, "radius|free"),
-        (SMALL, "radius"),
+        (SMALL, "radius|small"),
     ],
 )
 def test_what_looks_like_a_marker_is_refused_with_a_reason(found, place, words):

@@ -14,6 +14,7 @@ from spheremark.pipelines.estimation.least_squares import (
     snoop,
     solve,
 )
+from tests import chance
 
 LEVELS = {"test_level": 0.001, "test_power": 0.80}
 
@@ -144,9 +145,13 @@ def test_global_test_and_w_tests_reject_good_data_at_their_level(rng):
     for _ in range(600):
         errors = np.einsum("kij,kj->ki", roots, rng.normal(size=(12, 2)))
         results.append(adjust(linear(design, errors, cov), add, np.zeros(2), **levels))
-    assert np.mean([not r.passes_global_test for r in results]) == pytest.approx(0.05, abs=0.03)
-    exceeded = np.mean([r.w_statistics > r.critical_w for r in results])
-    assert 0.05 < exceeded < 0.10  # the larger of two correlated tests at 5 %
+    low, high = chance.of_share(0.05, len(results))
+    assert low <= np.mean([not r.passes_global_test for r in results]) <= high
+    # the larger of two tests at 5 % that are anything between the same and independent
+    exceeded = np.mean([r.w_statistics > r.critical_w for r in results], axis=1)
+    slack = chance.of_mean(exceeded)
+    assert slack < 0.02
+    assert 0.05 - slack < np.mean(exceeded) < 1 - 0.95**2 + slack
 
 
 def test_an_observation_without_redundancy_is_said_to_be_untestable():
@@ -205,9 +210,10 @@ def test_snooping_finds_the_bad_ones_and_keeps_the_good(rng):
     design, readings, cov = line(rng, n=20)
     readings[4] += 30 * np.sqrt(np.diagonal(cov[4]))
     readings[11] -= 20 * np.sqrt(np.diagonal(cov[11]))
+    levels = LEVELS | {"test_level": 1e-6}  # 40 good readings: one is dropped once in 25,000 runs
 
     def kept(keep):
-        return adjust(linear(design[keep], readings[keep], cov[keep]), add, np.zeros(2), **LEVELS)
+        return adjust(linear(design[keep], readings[keep], cov[keep]), add, np.zeros(2), **levels)
 
     result, keep, dropped = snoop(kept, 20, lambda _keep, _block: True)
     assert {block for block, _ in dropped} == {4, 11}

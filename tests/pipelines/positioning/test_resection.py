@@ -11,6 +11,7 @@ from spheremark.pipelines.errors import ConfigError, DegenerateGeometryError, No
 from spheremark.pipelines.geometry import inverse, levelling_rotation, log_motion, rigid
 from spheremark.pipelines.model import Levelling, Status
 from spheremark.pipelines.positioning.resection import resect
+from tests import chance
 from tests.synthetic import control, field, lean_matrix, marker_fit, pose, sightings, turn_z
 
 EXACT = 1e-7  # [m] and [rad] noise-free in, truth out
@@ -144,11 +145,13 @@ def whitened(rng, n_marks, trials):
 
 
 def test_the_covariance_of_the_pose_is_honest(rng):
-    errors, squares = whitened(rng, 5, 250)
+    errors, squares = whitened(rng, 5, 500)
     eigenvalues = np.linalg.eigvalsh(errors.T @ errors / len(errors))
-    assert eigenvalues[0] > 0.7  # chance alone gives 0.72 to 1.33
-    assert eigenvalues[-1] < 1.4
-    assert np.mean(squares) / 3 == pytest.approx(1.0, abs=0.2)
+    least, greatest = chance.of_eigenvalues(*errors.shape)  # 0.69 and 1.39
+    assert least < eigenvalues[0]
+    assert eigenvalues[-1] < greatest
+    low, high = chance.of_mean_square(3 * len(squares))
+    assert low < np.mean(squares) / 3 < high
 
 
 @pytest.mark.slow

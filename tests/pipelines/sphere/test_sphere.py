@@ -6,6 +6,7 @@ from itertools import pairwise
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose
+from scipy.stats import chi2
 
 from spheremark.pipelines.accuracy import marker_errors
 from spheremark.pipelines.config import (
@@ -31,6 +32,7 @@ from spheremark.pipelines.sphere import METHODS, fit_markers
 from spheremark.pipelines.sphere.bound import cramer_rao, hits
 from spheremark.pipelines.sphere.footprint import predict
 from spheremark.pipelines.sphere.methods.along_beam import fit_ranges
+from tests import chance
 from tests.pipelines.synthetic_stop import (
     RADIUS,
     RIG,
@@ -63,6 +65,13 @@ def found(*groups, ground=-10.0):
 def fit_one(cloud, rough, method="along_beam", ground=-10.0, config=CONFIG):
     rows = np.arange(len(cloud.p_base))
     return fit_markers(method, cloud, found((rows, rough), ground=ground), config, RADIUS)
+
+
+def why_not_good(result):
+    """Return the reason for which the only candidate has no good centre: it is weak or refused."""
+    (outcome,) = (*result.fits, *result.rejected)
+    assert all(fit.status is Status.WEAK for fit in result.fits)
+    return outcome.reason
 
 
 def joined(*parts):
@@ -201,13 +210,22 @@ def test_covariances_hold_at_every_distance(distance, sigma, low, high):
 
 def test_pole_and_strays_are_set_aside():
     rng = np.random.default_rng(3)
-    shots, ranges = returns(*marker_shots(CENTRE, rng, sigma=0.008, pole=0.03))
-    strays = rng.random(len(ranges)) < 0.08
-    ranges = ranges + np.where(strays, rng.uniform(0.06, 0.2, len(ranges)), 0.0)
-    fit = fit_one(cloud_of(shots, ranges), CENTRE + 0.015).fits[0]
-    assert np.linalg.norm(fit.p_base - CENTRE) < 0.005
-    assert not np.isin(fit.used, np.flatnonzero(strays & (ranges < 9))).any()
-    assert_allclose(np.sort(np.r_[fit.used, fit.rejected]), np.arange(len(ranges)))
+    n_strays = n_used = 0
+    for _ in range(20):
+        shots, ranges = returns(*marker_shots(CENTRE, rng, sigma=0.008, pole=0.03))
+        strays = rng.random(len(ranges)) < 0.04
+        ranges = ranges + np.where(strays, rng.uniform(0.06, 0.2, len(ranges)), 0.0)
+        fit = fit_one(cloud_of(shots, ranges), CENTRE + 0.015).fits[0]
+        error = fit.p_base - CENTRE
+        assert np.linalg.norm(error) < 0.005
+        # of 20 centres one is farther off by chance once in 10,000 runs
+        assert error @ np.linalg.solve(fit.cov_p_base, error) < chi2.isf(1e-4 / 20, 3)
+        assert_allclose(np.sort(np.r_[fit.used, fit.rejected]), np.arange(len(ranges)))
+        n_strays += strays.sum()
+        n_used += strays[fit.used].sum()
+    # the nearest, at 60 mm of noise of 8 mm, are sometimes used: one of 200
+    assert n_strays > 60
+    assert n_used < 0.05 * n_strays
 
 
 def test_laser_biases_are_seen_and_taken_off():
@@ -232,12 +250,16 @@ def test_the_error_of_range_that_all_centres_share_is_told():
     def told(bias):
         draw, _ = stop_of(rng, 8.0, 8, sigma=0.006, bias=bias)
         fits = fit_markers("along_beam", *draw(rng), CONFIG, RADIUS).fits
-        return np.array([fit.sigma_range_shared for fit in fits])
+        sigmas = np.array([fit.sigma_range_shared for fit in fits])
+        assert np.ptp(sigmas) < 0.05 * sigmas.mean()
+        return sigmas.mean()
 
-    rough, even = told(0.01), told(0.0)
-    # a mean over at most 16 lasers of 10 mm each; how far they spread is known to a fifth
-    assert np.all((rough > 0.7 * 0.01 / 4.0) & (rough < 1.8 * 0.01 / 4.0))
-    assert even.max() < 0.4 * rough.min()
+    rough = np.array([told(0.01) for _ in range(6)])
+    # a mean over 16 lasers of 10 mm each; how far these spread has 15 degrees of freedom a stop
+    low, high = chance.of_mean_square(15 * len(rough))
+    typical = np.sqrt(np.mean(rough**2))
+    assert np.sqrt(low) < typical / (0.01 / 4.0) < np.sqrt(high)
+    assert told(0.0) < 0.4 * typical
 
 
 def test_three_returns_are_refused_with_the_reason():
@@ -262,9 +284,8 @@ def test_returns_on_one_line_are_weak_or_refused():
     shots, ranges = returns(*marker_shots(CENTRE, np.random.default_rng(2), sigma=0.005))
     ring = shots.rings == np.argmax(np.bincount(shots.rings))
     first = ring & (np.abs(shots.times - shots.times[np.flatnonzero(ring)[0]]) < 0.02)
-    result = fit_one(cloud_of(shots.take(first), ranges[first]), CENTRE)
-    assert all(fit.status is Status.WEAK and "one laser" in fit.reason for fit in result.fits)
-    assert len(result.fits) + len(result.rejected) == 1
+    reason = why_not_good(fit_one(cloud_of(shots.take(first), ranges[first]), CENTRE))
+    assert "one line" in reason or "one laser" in reason
 
 
 def test_half_a_ball_is_weak_and_says_so():
@@ -281,8 +302,8 @@ def test_a_ball_of_another_size_is_weak_or_refused():
     shots = towards(fire(), CENTRE, 0.3)
     ranges, lit = lit_ranges(shots, CENTRE, 0.14, RIG.divergence)
     ranges = ranges + 0.006 * np.random.default_rng(5).standard_normal(len(ranges))
-    result = fit_one(cloud_of(shots, np.where(lit > 0.5, ranges, np.inf)), CENTRE)
-    assert all(fit.status is Status.WEAK for fit in result.fits)
+    reason = why_not_good(fit_one(cloud_of(shots, np.where(lit > 0.5, ranges, np.inf)), CENTRE))
+    assert "own radius" in reason or "no sphere of radius" in reason
 
 
 def test_the_free_radius_is_the_true_one_within_its_sigma():
@@ -432,8 +453,8 @@ def test_a_radius_that_is_not_there_is_weak_or_refused(method, radius):
     cloud = cloud_of(*marker_shots(CENTRE * 0.7, np.random.default_rng(22), sigma=0.006))
     rows = np.arange(len(cloud.p_base))
     result = fit_markers(method, cloud, found((rows, CENTRE * 0.7)), CONFIG, radius)
-    assert all(fit.status is Status.WEAK and "own radius" in fit.reason for fit in result.fits)
-    assert len(result.fits) + len(result.rejected) == 1
+    reason = why_not_good(result)
+    assert "own radius" in reason or "no sphere of radius" in reason
 
 
 @pytest.mark.parametrize("method", METHODS)
@@ -466,8 +487,8 @@ def test_one_ring_alone_is_weak_or_refused_by_every_method(method):
     shots, ranges = returns(*marker_shots(CENTRE, np.random.default_rng(23), sigma=0.005))
     ring = shots.rings == np.argmax(np.bincount(shots.rings))
     result = fit_one(cloud_of(shots.take(ring), ranges[ring]), CENTRE, method)
-    assert all(fit.status is Status.WEAK and "one laser" in fit.reason for fit in result.fits)
-    assert len(result.fits) + len(result.rejected) == 1
+    reason = why_not_good(result)
+    assert "one laser" in reason if result.fits else reason
 
 
 @pytest.mark.parametrize("missing", ["rings", "times"])
@@ -497,6 +518,8 @@ def test_the_outline_sharpens_the_centre_and_what_passed_by_no_less():
             (fit,), _ = method(cloud, candidate, CONFIG, RADIUS)
             squares[k] += np.sum((fit.p_base - CENTRE) ** 2)
     by_ranges, by_returns, by_both = squares
+    # Of 240 draws the shares are 0.50 and 0.42; those of 24 draws spread by 0.04 about them, so
+    # that these limits are missed by chance once in more than 10^9 times.
     assert by_returns < 0.8 * by_ranges
     assert by_both < 0.75 * by_ranges
 
