@@ -210,22 +210,22 @@ def test_covariances_hold_at_every_distance(distance, sigma, low, high):
 
 def test_pole_and_strays_are_set_aside():
     rng = np.random.default_rng(3)
-    n_strays = n_used = 0
+    errors, n_misled = [], 0
     for _ in range(20):
         shots, ranges = returns(*marker_shots(CENTRE, rng, sigma=0.008, pole=0.03))
         strays = rng.random(len(ranges)) < 0.04
         ranges = ranges + np.where(strays, rng.uniform(0.06, 0.2, len(ranges)), 0.0)
         fit = fit_one(cloud_of(shots, ranges), CENTRE + 0.015).fits[0]
         error = fit.p_base - CENTRE
-        assert np.linalg.norm(error) < 0.005
+        errors.append(np.linalg.norm(error))
         # of 20 centres one is farther off by chance once in 10,000 runs
         assert error @ np.linalg.solve(fit.cov_p_base, error) < chi2.isf(1e-4 / 20, 3)
         assert_allclose(np.sort(np.r_[fit.used, fit.rejected]), np.arange(len(ranges)))
-        n_strays += strays.sum()
-        n_used += strays[fit.used].sum()
-    # the nearest, at 60 mm of noise of 8 mm, are sometimes used: one of 200
-    assert n_strays > 60
-    assert n_used < 0.05 * n_strays
+        n_misled += strays[fit.used].sum() > 1
+    # noise of 8 mm on 140 returns leaves 1.5 mm; strays that are used leave 5 to 14 mm
+    assert np.median(errors) < 0.003
+    # strays mislead one fit in 100: more than three of 20 once in 20,000 runs
+    assert n_misled <= 3
 
 
 def test_laser_biases_are_seen_and_taken_off():
