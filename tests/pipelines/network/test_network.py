@@ -573,10 +573,9 @@ def counted():
 
 @pytest.mark.slow
 def test_a_thousand_stations_and_two_hundred_marks_are_adjusted_at_a_cost_that_grows_linearly(rng):
-    adjust_network(wide(rng, 20), CONFIG)  # compiles
-    costs = []
-    for n in (250, 1000):
-        net = wide(rng, n)
+    nets, costs = {n: wide(rng, n) for n in (250, 1000)}, []
+    adjust_network(nets[250], CONFIG)  # compiles
+    for n, net in nets.items():
         with counted() as cost:
             result = adjust_network(net, CONFIG)
         costs.append(cost)
