@@ -1,4 +1,4 @@
-"""Running the application: a server that says why it cannot start, and goes quietly when told."""
+"""The server process: start-up with a reason for each failure, and shutdown on a signal."""
 
 from __future__ import annotations
 
@@ -9,17 +9,18 @@ from collections.abc import Callable
 
 import uvicorn
 from fastapi import FastAPI
+from uvicorn.importer import import_from_string
 
 from spheremark.pipelines.errors import ConflictError
-from spheremark.service.http.app import create_app
 from spheremark.service.settings import Settings
 
 Ready = Callable[[str], None]
-_PATIENCE = 5  # [s] that open requests have when the server is told to stop
+_APPLICATION = "spheremark.service.http.app:create_app"  # by name: commands do not import it
+_PATIENCE = 5  # [s] that open requests have at shutdown
 
 
 class _Server(uvicorn.Server):
-    """A server that tells when it is ready, and ends streams that would never end themselves."""
+    """A server that calls back when it is ready, and closes event streams at shutdown."""
 
     def __init__(self, config: uvicorn.Config, app: FastAPI, ready: Callable[[], None]) -> None:
         super().__init__(config)
@@ -27,7 +28,7 @@ class _Server(uvicorn.Server):
         self._ready = ready
 
     async def startup(self, sockets: list[socket.socket] | None = None) -> None:
-        """Open the service, then the doors."""
+        """Open the service, then accept requests."""
         await super().startup(sockets)
         self._ready()
 
@@ -38,11 +39,11 @@ class _Server(uvicorn.Server):
 
 
 def serve(settings: Settings, *, ready: Ready) -> None:
-    """Serve until SIGINT or SIGTERM; tell the address once requests are answered."""
+    """Serve until SIGINT or SIGTERM; ``ready`` gets the address once requests are accepted."""
     logging.basicConfig(level=logging.WARNING, format="%(levelname)s %(name)s: %(message)s")
-    app = create_app(settings)
+    app: FastAPI = import_from_string(_APPLICATION)(settings)
     with _listener(settings) as listener:
-        address = address_of(settings, listener.getsockname()[1])
+        address = settings.address(listener.getsockname()[1])
         config = uvicorn.Config(
             app,
             log_level="critical",  # what goes wrong is logged once, by the service
@@ -56,12 +57,6 @@ def serve(settings: Settings, *, ready: Ready) -> None:
             _Server(config, app, lambda: ready(address)).run(sockets=[listener])
         except SystemExit:
             raise app.state.failure from None
-
-
-def address_of(settings: Settings, port: int) -> str:
-    """Return the address that a browser on this machine opens."""
-    host = {"0.0.0.0": "127.0.0.1", "::": "[::1]", "::1": "[::1]"}.get(settings.host, settings.host)
-    return f"http://{host}:{port}"
 
 
 def _listener(settings: Settings) -> socket.socket:

@@ -5,11 +5,15 @@ from __future__ import annotations
 import ipaddress
 import os
 from pathlib import Path
-from typing import Literal, Self
+from typing import TYPE_CHECKING, Literal, Self
 
 from pydantic import Field, SecretStr, model_validator
 from pydantic_settings import BaseSettings, SettingsConfigDict
 
+if TYPE_CHECKING:
+    from spheremark.storage.catalogue.sandbox import QueryLimits
+
+DATABASE = "spheremark.duckdb"  # in the data folder
 _KNOWN_SCHEMES = ("tcp://", "tls://")
 
 
@@ -77,6 +81,30 @@ class Settings(BaseSettings):
     log_level: Literal["debug", "info", "warning", "error"] = Field(
         default="info", description="Least severity that is logged."
     )
+
+    def address(self, port: int | None = None) -> str:
+        """Return the address that a browser on this machine opens."""
+        known = {"0.0.0.0": "127.0.0.1", "::": "[::1]", "::1": "[::1]"}
+        return f"http://{known.get(self.host, self.host)}:{self.port if port is None else port}"
+
+    @property
+    def database(self) -> Path:
+        """File of the database."""
+        return self.data / DATABASE
+
+    @property
+    def snapshots(self) -> Path:
+        """Folder of the copies of the database that queries read."""
+        return self.data / "snapshots"
+
+    @property
+    def query_limits(self) -> QueryLimits:
+        """Limits of one query of people."""
+        from spheremark.storage.catalogue.sandbox import QueryLimits
+
+        return QueryLimits(
+            seconds=self.sql_seconds, rows=self.sql_rows, memory_bytes=self.sql_memory_bytes
+        )
 
     @model_validator(mode="after")
     def _is_safe(self) -> Self:

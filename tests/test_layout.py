@@ -26,13 +26,13 @@ FRAMELESS = {  # counts, clocks, scalars per row, and tables of the sensor: no c
     "external_reliabilities", "included_angles", "included_angles_horizontal", "sigma_3d",
     "sigma_horizontal",
     "divergence", "laser_elevations", "laser_heights", "laser_range_biases",
-    "encoder_eccentricity", "stamps_ns", "samples_ns", "values", "rates",
     "fits", "measured", "given", "sigmas", "is_off",
+    "encoder_eccentricity", "stamps_ns", "samples_ns", "values", "rates",
 }  # fmt: skip
 
 
 def all_errors(root=errors.SpheremarkError):
-    import spheremark.service.http.errors
+    import spheremark.service.errors
     import spheremark.storage.catalogue.sandbox  # noqa: F401
 
     found = [root]

@@ -75,7 +75,7 @@ def main() -> None:
         app()
     except SpheremarkError as error:
         if "--json" in sys.argv:
-            from spheremark.service.http.errors import problem_of
+            from spheremark.service.errors import problem_of
 
             _print_json(problem_of(error, " ".join(sys.argv[1:2])).model_dump(exclude_none=True))
         _print_error(str(error))

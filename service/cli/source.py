@@ -12,11 +12,11 @@ import httpx
 
 from spheremark.pipelines.errors import InputError
 from spheremark.service.client import checked, reached
-from spheremark.service.http.api import sql as routes
-from spheremark.service.http.state import DATABASE, query_limits
-from spheremark.service.serving import address_of
+from spheremark.service.serialise.queries import serialise_query
 from spheremark.service.settings import Settings
 from spheremark.storage.catalogue.catalogue import Catalogue
+from spheremark.storage.catalogue.coordinates import coordinates_csv
+from spheremark.storage.catalogue.sandbox import run_query
 
 
 class Source:
@@ -29,14 +29,14 @@ class Source:
         self._url = url or ("" if folder else self._running())
 
     def ask(self, sql: str) -> dict[str, Any]:
-        """Answer one SELECT."""
+        """Run one SELECT."""
         if self._url:
             with reached(self._url), self._http() as http:
                 answer: dict[str, Any] = checked(http.post("/sql", json={"sql": sql})).json()
                 return answer
         with self._catalogue() as catalogue:
-            found = routes.ask(catalogue, query_limits(self._settings), sql)
-            return found.model_dump(mode="json")
+            snapshot, limits = catalogue.snapshot(), self._settings.query_limits
+            return serialise_query(run_query(snapshot, sql, limits), limits, snapshot)
 
     def export(self, target: Path, survey: str | None) -> None:
         """Write the database or a table of coordinates to a file, by its ending."""
@@ -48,7 +48,7 @@ class Source:
             return
         with self._catalogue() as catalogue:
             if target.suffix == ".csv":
-                target.write_bytes(routes.coordinates(catalogue, survey))
+                target.write_bytes(coordinates_csv(catalogue, survey))
             else:
                 copyfile(catalogue.snapshot(), target)
 
@@ -65,7 +65,7 @@ class Source:
 
     def _running(self) -> str:
         """Return the address of the settings if a service answers there."""
-        address = address_of(self._settings, self._settings.port)
+        address = self._settings.address()
         try:
             httpx.get(f"{address}/healthz", timeout=2.0)
         except httpx.HTTPError:
@@ -80,12 +80,12 @@ class Source:
 
     @contextmanager
     def _catalogue(self) -> Iterator[Catalogue]:
-        """Open the database of the data folder, which nobody else may have open."""
-        path = self._settings.data / DATABASE
+        """Open the database of the data folder, which no other process may have open."""
+        path = self._settings.database
         if not path.exists():
             raise InputError(
                 f"No service answers and there is no database in {self._settings.data}; start "
                 "`spheremark serve`, or name a place with --url or --data."
             )
-        with Catalogue(path, snapshots=self._settings.data / "snapshots") as catalogue:
+        with Catalogue(path, snapshots=self._settings.snapshots) as catalogue:
             yield catalogue

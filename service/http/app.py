@@ -14,9 +14,8 @@ from fastapi.responses import RedirectResponse
 from fastapi.staticfiles import StaticFiles
 from starlette.types import ASGIApp
 
-from spheremark.service.http import api, errors
-from spheremark.service.http import security as guard
-from spheremark.service.http.errors import UnauthorizedError
+from spheremark.service.errors import Problem, UnauthorizedError
+from spheremark.service.http import api, errors, security
 from spheremark.service.http.pages import networks as result_pages
 from spheremark.service.http.pages import plans as plan_pages
 from spheremark.service.http.pages import results as pages
@@ -35,7 +34,7 @@ class _Application(FastAPI):
 
     def build_middleware_stack(self) -> ASGIApp:
         """Return the whole application."""
-        return guard.SecureHeaders(super().build_middleware_stack())
+        return security.SecureHeaders(super().build_middleware_stack())
 
 
 def create_app(settings: Settings) -> FastAPI:
@@ -61,9 +60,9 @@ def create_app(settings: Settings) -> FastAPI:
         docs_url=None,  # FastAPI's pages load their scripts from another host
         redoc_url=None,
         generate_unique_id_function=lambda route: route.name,
-        responses={"default": {"model": errors.Problem, "description": "What went wrong."}},
+        responses={"default": {"model": Problem, "description": "What went wrong."}},
     )
-    app.add_middleware(guard.Guard, settings=settings)
+    app.add_middleware(security.SecurityMiddleware, settings=settings)
     app.include_router(api.router, prefix=ROOT)
     app.include_router(about)
     app.include_router(site_pages.router)  # before the survey, whose name takes slashes
@@ -93,13 +92,13 @@ def health(service: Current, response: Response) -> dict[str, Any]:
 def login(request: Request, service: Current, token: str = "") -> Response:
     """Give a browser that knows the token a cookie in its place."""
     known = service.settings.token.get_secret_value() if service.settings.token else ""
-    if known and not guard.is_token(token, known):
+    if known and not security.is_token(token, known):
         raise UnauthorizedError("That is not the token; open /login?token=<token>.")
     response = RedirectResponse("/", status_code=303)
     if known:
         response.set_cookie(
-            guard.COOKIE,
-            guard.cookie_value(known),
+            security.COOKIE,
+            security.cookie_value(known),
             httponly=True,
             samesite="strict",
             secure=request.url.scheme == "https",

@@ -20,14 +20,14 @@ from starlette.exceptions import HTTPException
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from spheremark.pipelines.errors import SpheremarkError
-from spheremark.service.http.errors import (
+from spheremark.service.errors import (
     ForbiddenError,
     MalformedHeaderError,
     TooLargeError,
     UnauthorizedError,
     problem_of,
-    problem_response,
 )
+from spheremark.service.http.errors import problem_response
 from spheremark.service.settings import Settings
 
 COOKIE = "spheremark_token"
@@ -90,7 +90,7 @@ class SecureHeaders:
         await self.app(scope, receive, send_with_headers)
 
 
-class Guard:
+class SecurityMiddleware:
     """Wraps an application: refuses malformed and foreign requests, and those without the token."""
 
     def __init__(self, app: ASGIApp, settings: Settings) -> None:

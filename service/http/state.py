@@ -11,16 +11,14 @@ from typing import Annotated
 
 from fastapi import Depends, Request
 
-from spheremark.service.http.errors import ReusedKeyError
+from spheremark.service.errors import ReusedKeyError
 from spheremark.service.http.uploads import Inbox
 from spheremark.service.jobs.queue import JobQueue
 from spheremark.service.planning.requests import Planner
 from spheremark.service.settings import Settings
 from spheremark.storage.catalogue.catalogue import Catalogue
-from spheremark.storage.catalogue.sandbox import QueryLimits
 
 _KEYS_KEPT = 10_000
-DATABASE = "spheremark.duckdb"  # in the data folder
 
 
 class Idempotency:
@@ -57,29 +55,16 @@ class Service:
     planner: Planner
     idempotency: Idempotency = field(default_factory=Idempotency)
 
-    @property
-    def limits(self) -> QueryLimits:
-        """Limits of people's queries."""
-        return query_limits(self.settings)
-
-
-def query_limits(settings: Settings) -> QueryLimits:
-    """Return the limits of people's queries."""
-    return QueryLimits(
-        seconds=settings.sql_seconds,
-        rows=settings.sql_rows,
-        memory_bytes=settings.sql_memory_bytes,
-    )
-
 
 @asynccontextmanager
 async def opened(settings: Settings) -> AsyncIterator[Service]:
     """Open the database, the inbox and the cluster; close them in the opposite order."""
-    data = settings.data.resolve()
+    settings = settings.model_copy(update={"data": settings.data.resolve()})
+    data = settings.data
     inbox, terrains = Inbox(data / "recordings"), Inbox(data / "terrains")
     for one in (inbox, terrains):
         one.open()
-    with Catalogue(data / DATABASE, snapshots=data / "snapshots") as catalogue:
+    with Catalogue(settings.database, snapshots=settings.snapshots) as catalogue:
         async with JobQueue(settings, catalogue, data / "clouds") as jobs:
             planner = Planner(catalogue)
             yield Service(settings, catalogue, inbox, terrains, jobs, planner)

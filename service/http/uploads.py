@@ -18,7 +18,7 @@ from typing import IO, ClassVar
 from starlette.requests import ClientDisconnect
 
 from spheremark.pipelines.errors import InputError, NotFoundError
-from spheremark.service.http.errors import EmptyBodyError, RefusedRecordingError, TooLargeError
+from spheremark.service.errors import EmptyBodyError, RefusedRecordingError, TooLargeError
 from spheremark.storage.catalogue.catalogue import Catalogue
 from spheremark.storage.catalogue.records import RecordingRecord
 from spheremark.storage.recordings import inspect_log

@@ -12,7 +12,7 @@ import uvicorn
 from fastapi.testclient import TestClient
 
 from spheremark.service.http.app import create_app
-from spheremark.service.http.security import HEADERS, Guard, SecureHeaders
+from spheremark.service.http.security import HEADERS, SecureHeaders, SecurityMiddleware
 from spheremark.service.settings import Settings
 
 DIGEST = "0" * 64
@@ -197,7 +197,9 @@ def test_hosts_of_this_machine_are_answered(site, host):
 @pytest.mark.parametrize("cookie", ['spheremark_token="\\', "=;=,\xff", "a[]=1; spheremark_token"])
 def test_an_odd_cookie_is_no_token_and_no_failure(tmp_path, cookie):
     settings = Settings(data=tmp_path, workers=1, token="secret")
-    guarded = SecureHeaders(Guard(None, settings))  # what passes would fail at the call of None
+    guarded = SecureHeaders(
+        SecurityMiddleware(None, settings)
+    )  # what passes would fail at the call of None
     client = TestClient(guarded, base_url="http://127.0.0.1:8000")
     answer = client.get("/api/v1/surveys", headers={"Cookie": cookie.encode("latin-1")})
     assert (answer.status_code, answer.json()["code"]) == (401, "unauthorized")
@@ -265,7 +267,7 @@ class Listening:
             await send({"type": "http.response.start", "status": 404, "headers": []})
             await send({"type": "http.response.body", "body": b"{}"})
 
-        guarded = Guard(refuse, Settings(data=tmp_path))
+        guarded = SecurityMiddleware(refuse, Settings(data=tmp_path))
         self.server = uvicorn.Server(uvicorn.Config(guarded, port=0, log_level="critical"))
         self.thread = threading.Thread(target=self.server.run)
 

@@ -15,9 +15,9 @@ from starlette.exceptions import HTTPException
 from spheremark.pipelines.config import SurveyConfig
 from spheremark.pipelines.errors import InputError
 from spheremark.pipelines.scan.rigs import rig_digest
+from spheremark.service.errors import RefusedRecordingError
 from spheremark.service.http.api.models import Job, Listing, NewJob
 from spheremark.service.http.api.surveys import After, Limit
-from spheremark.service.http.errors import RefusedRecordingError
 from spheremark.service.http.state import Current, Service
 from spheremark.service.jobs.events import JobEvent
 from spheremark.service.jobs.handlers import KINDS, Kind

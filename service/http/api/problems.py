@@ -8,7 +8,7 @@ from fastapi import APIRouter
 
 from spheremark.pipelines.config import SurveyConfig
 from spheremark.pipelines.errors import NotFoundError
-from spheremark.service.http import errors
+from spheremark.service import errors
 from spheremark.service.http.api.models import Listing, ProblemKind
 
 router = APIRouter(tags=["about"])

@@ -9,10 +9,10 @@ from fastapi import APIRouter, Path, Query, Request, Response
 from fastapi.responses import FileResponse
 
 from spheremark.pipelines.errors import InputError
+from spheremark.service.errors import MediaTypeError, TooLargeError
 from spheremark.service.http.api.jobs import start
 from spheremark.service.http.api.models import Job, Listing, NewJob, Recording, Upload
 from spheremark.service.http.api.surveys import After, Limit
-from spheremark.service.http.errors import MediaTypeError, TooLargeError
 from spheremark.service.http.state import Current, Service
 from spheremark.service.http.uploads import take_in
 from spheremark.storage.catalogue.records import RecordingRecord

@@ -13,6 +13,7 @@ from pydantic import ValidationError
 
 from spheremark.pipelines.errors import InputError, NotFoundError
 from spheremark.pipelines.model import ControlMarks
+from spheremark.service.errors import EmptyBodyError, MediaTypeError
 from spheremark.service.http.api.models import (
     ChosenRig,
     Control,
@@ -22,7 +23,6 @@ from spheremark.service.http.api.models import (
     Survey,
     TruthSummary,
 )
-from spheremark.service.http.errors import EmptyBodyError, MediaTypeError
 from spheremark.service.http.state import Current
 from spheremark.storage.imports.survey_files import format_control, parse_control, parse_truth
 

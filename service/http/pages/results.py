@@ -11,7 +11,7 @@ from fastapi import APIRouter, Query, Request
 from fastapi.responses import FileResponse, HTMLResponse
 
 from spheremark.pipelines.errors import NotFoundError
-from spheremark.service.http.errors import Problem
+from spheremark.service.errors import Problem
 from spheremark.service.http.state import Current, Service
 from spheremark.storage.clouds import stop as clouds
 from spheremark.web import assets
@@ -267,7 +267,7 @@ def recording(recording_id: str, request: Request, service: Current) -> str:
 @router.get("/sql")
 def sql(service: Current, q: Annotated[str, Query(max_length=100_000)] = "") -> str:
     """Show the workbench for queries."""
-    limits = service.limits
+    limits = service.settings.query_limits
     return pages.sql_page(
         pages.SqlPage(
             frame=frame_of(service),
