@@ -1,1 +1,1 @@
-"""The one owner of DuckDB: schema, surveys, jobs, results, snapshots, SQL for people."""
+"""The one owner of DuckDB: schema, surveys, jobs, results, snapshots, SQL of users."""

@@ -1,7 +1,6 @@
-"""Centres of earlier runs, read back from their rows as the values that they were.
+"""Centres of earlier runs as values again, so that they need not be fitted twice.
 
-So that what was fitted once need not be fitted again. Returns and residuals are not kept in rows;
-a centre that was read back has none.
+Rows hold no returns and residuals: a centre from a row has none.
 """
 
 from __future__ import annotations
@@ -38,8 +37,8 @@ def read_centres(
     Yields
     ------
     str, MarkerFits
-        Name of the stop, and centres in the base frame with covariances that hold neither levelling
-        nor heading, as a fit gives them, in the order of their names. Without rejections.
+        Name of the stop, and centres in the base frame in the order of their names, with
+        covariances without levelling and heading, as a fit gives them. Without rejections.
     """
     fits = [
         row
@@ -61,7 +60,7 @@ def read_centres(
 
 
 def _levelling(row: Row) -> Levelling:
-    """Return how the base leant at a stop, from its row."""
+    """Return the levelling of a stop from its row."""
     roll, pitch, sigma, heading = (
         float(np.radians(row[f"{name}_deg"]))
         for name in ("roll", "pitch", "sigma_levelling", "sigma_heading")
@@ -70,7 +69,7 @@ def _levelling(row: Row) -> Levelling:
 
 
 def _fit(row: Row, levelling: Levelling) -> MarkerFit:
-    """Return a centre as it was before it was levelled, and before its stop's heading was added."""
+    """Return a centre without levelling, and without the covariance of the heading."""
     R = levelling_rotation(levelling)
     p_base = R.T @ np.array([row["x_m"], row["y_m"], row["z_m"]])
     return MarkerFit(
@@ -103,7 +102,7 @@ def _cov(row: Row) -> Array:
 
 
 def _without_heading(cov: Array, p_base: Array, sigma_heading: float) -> Array:
-    """Return a covariance without what the heading [rad] of the stop adds to it."""
+    """Return a covariance without the part of the heading of the stop [rad]."""
     sideways = np.array([-p_base[1], p_base[0], 0.0])
     return cov - sigma_heading**2 * np.outer(sideways, sideways)
 

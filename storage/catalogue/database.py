@@ -1,9 +1,9 @@
-"""The owner of the DuckDB file: opening, transactions, our own queries, and snapshots.
+"""The owner of the DuckDB file: opening, transactions, static queries, and snapshots.
 
-While it is open no other process can open the file, not even for reading (DuckDB allows one owner),
-so workers return Arrow tables and people query snapshots (``sandbox``). Every read has a
-cursor of its own and may run in any thread; writes take turns. The file is never opened and closed
-again by this process: that would drop the lock that DuckDB holds on it.
+While it is open no other process can open the file, not even for reading (DuckDB allows one owner):
+workers return Arrow tables, and queries of users run on snapshots (``sandbox``). Every read has its
+own cursor and may run in any thread; writes take turns. This process must not open and close the
+file again: that would drop the lock that DuckDB holds on it.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from spheremark.storage.catalogue import migrations
 from spheremark.storage.catalogue.records import TableInfo, tables_of
 from spheremark.storage.catalogue.snapshots import Snapshots
 
-_N_ROWS_MAX = 200_000  # of one of our own queries; a page that needs more should aggregate
+_N_ROWS_MAX = 200_000  # of one static query; a page that needs more should aggregate
 _COLUMNS = """
 SELECT c.table_name, c.column_name, c.data_type, c.comment, t.kind, t.comment AS table_comment
 FROM duckdb_columns() AS c JOIN (
@@ -44,11 +44,11 @@ class Database:
     Parameters
     ----------
     path : Path
-        The DuckDB file; it and its folder are made when missing.
+        The DuckDB file; it and its folder are created when missing.
     snapshots : Path
-        Folder for the copies that others read; on the same disk, so that a copy costs little.
+        Folder of the snapshots; on the same disk, so that a copy costs little.
     memory_limit : str
-        What DuckDB may use before it spills to disk, in its own words.
+        Memory that DuckDB may use before it spills to disk, in its notation.
 
     Raises
     ------
@@ -62,8 +62,8 @@ class Database:
     Notes
     -----
     Safe to use from many threads. Once open, the database cannot reach files or the network,
-    and its configuration is locked. A query runs in the thread that asks: to share out the few rows
-    of a page or of a result among threads costs more than they do.
+    and its configuration is locked. A query uses one thread: the rows of a page or of a result are
+    too few for more.
     """
 
     def __init__(self, path: Path, *, snapshots: Path, memory_limit: str = "1GB") -> None:
@@ -87,7 +87,7 @@ class Database:
         self.close()
 
     def close(self) -> None:
-        """Give the file back; the catalogue cannot be used any more."""
+        """Close the file."""
         with self._lock:
             self._writer.close()
             self._connection.close()
@@ -95,21 +95,21 @@ class Database:
     def columns(
         self, sql: str, parameters: Mapping[str, Any] | None = None
     ) -> dict[str, NDArray[Any]]:
-        """Run one of our own static queries, for a figure."""
+        """Run a static query and return its columns as arrays."""
         table = self.table(sql, parameters)
         return {name: _to_numpy(table.column(name)) for name in table.column_names}
 
     def rows(self, sql: str, parameters: Mapping[str, Any] | None = None) -> list[dict[str, Any]]:
-        """Run one of our own static queries like ``columns``, for a list: one mapping per row."""
+        """Run a static query and return one mapping per row."""
         return list(self.table(sql, parameters).to_pylist())
 
     def table(self, sql: str, parameters: Mapping[str, Any] | None = None) -> pa.Table:
-        """Run one of our own static queries like ``columns``, for a file: an Arrow table."""
+        """Run a static query and return an Arrow table."""
         with self.reading() as cursor:
             return fetch(cursor, sql, parameters or {})
 
     def schema(self) -> tuple[TableInfo, ...]:
-        """Return the views and tables that people may query, with units and comments."""
+        """Return the tables and views that may be queried, with units and comments."""
         return tables_of(self.rows(_COLUMNS))
 
     def snapshot(self) -> Path:
@@ -117,21 +117,21 @@ class Database:
 
         Notes
         -----
-        Made only when something but progress was committed since the last one. The copy is
-        made by another process: opening and closing the file here would drop DuckDB's lock.
+        Copied only when more than progress was committed since the last copy, and by another
+        process: opening and closing the file here would drop DuckDB's lock.
         """
         with self._lock:
             return self._snapshots.take(self._connection, self._version)
 
     @contextmanager
     def reading(self) -> Iterator[duckdb.DuckDBPyConnection]:
-        """Lend a cursor of its own, for this thread."""
+        """Give this thread its own cursor."""
         with closing(self._connection.cursor()) as cursor:
             yield cursor
 
     @contextmanager
     def writing(self, *, is_result: bool = True) -> Iterator[duckdb.DuckDBPyConnection]:
-        """Hold the write lock and a transaction: all that is done in it is done, or nothing."""
+        """Hold the write lock and a transaction."""
         with self._lock:
             cursor = self._writer
             try:
@@ -145,14 +145,14 @@ class Database:
             self._version += is_result
 
     def _statement(self, sql: str) -> duckdb.Statement:
-        """Return a static statement for the cursor that writes; DuckDB reads its text only once."""
+        """Return a static statement for the writing cursor, parsed only once."""
         if sql not in self._statements:
             (self._statements[sql],) = self._writer.extract_statements(sql)
         return self._statements[sql]
 
 
 def _open(path: Path, memory_limit: str) -> duckdb.DuckDBPyConnection:
-    """Open the file as its owner, bring its schema up to date, and shut the doors."""
+    """Open the file as its owner, update its schema, and cut it off from files and network."""
     path.parent.mkdir(parents=True, exist_ok=True)
     connection = _connect(path, memory_limit)
     try:
@@ -168,13 +168,13 @@ def _open(path: Path, memory_limit: str) -> duckdb.DuckDBPyConnection:
 
 
 def _require_alone(connection: duckdb.DuckDBPyConnection, path: Path) -> None:
-    """Refuse a file that this process has open: DuckDB would share it, locked doors and all."""
+    """Refuse a file that this process has open: DuckDB would share the instance."""
     if connection.sql("SELECT current_setting('lock_configuration')").fetchall()[0][0]:
         raise ConflictError(f"{path} is already open in this process; close that first.")
 
 
 def _connect(path: Path, memory_limit: str) -> duckdb.DuckDBPyConnection:
-    """Open the file, or say in plain words why that is not possible."""
+    """Open the file; translate the errors of DuckDB."""
     config: dict[str, str | bool | int | float | list[str]] = {
         "autoinstall_known_extensions": "false",
         "autoload_known_extensions": "false",
@@ -188,7 +188,7 @@ def _connect(path: Path, memory_limit: str) -> duckdb.DuckDBPyConnection:
             owner = re.search(r"PID (\d+)", str(error))
             raise ConflictError(
                 f"{path} is in use by another process{f' ({owner[0]})' if owner else ''}. "
-                "One spheremark serves one data folder: stop the other one, or use another folder."
+                "One service owns one data folder: stop the other one, or use another folder."
             ) from error
         raise InputError(f"{path} is not a database of spheremark: {error}") from error
     except duckdb.ConnectionException as error:
@@ -196,17 +196,17 @@ def _connect(path: Path, memory_limit: str) -> duckdb.DuckDBPyConnection:
 
 
 def fetch(cursor: duckdb.DuckDBPyConnection, sql: str, parameters: Mapping[str, Any]) -> pa.Table:
-    """Run a SELECT of ours and return at most the rows that one answer may have."""
+    """Run a static SELECT; refuse a result of too many rows."""
     table = cursor.sql(sql, params=dict(parameters)).to_arrow_table()
     if table.num_rows > _N_ROWS_MAX:
         raise InputError(
-            f"The answer has {table.num_rows} rows; the limit is {_N_ROWS_MAX}. Narrow the filter."
+            f"The result has {table.num_rows} rows; the limit is {_N_ROWS_MAX}. Narrow the filter."
         )
     return _without_decimals(table)
 
 
 def _without_decimals(table: pa.Table) -> pa.Table:
-    """Return a table with plain numbers; DuckDB sums whole numbers to 128 bits, a decimal here."""
+    """Return a table with plain numbers; sums of integers are 128-bit, a decimal in Arrow."""
     for i, field in enumerate(table.schema):
         if pa.types.is_decimal(field.type):
             plain = pa.float64() if field.type.scale else pa.int64()
@@ -215,25 +215,18 @@ def _without_decimals(table: pa.Table) -> pa.Table:
 
 
 class Planned:
-    """A statement over rows that come again and again: hides that it is read and planned only once.
-
-    Rows of many columns take longer to plan than to write.
+    """A statement that is planned once and run on different rows; planning costs more than writing.
 
     Parameters
     ----------
     cursor : DuckDBPyConnection
-        On which it will run; not inside a transaction, which might take the names back.
+        Runs the statement; not in a transaction now, whose rollback would drop the names.
     name : str
-        What the statement is called among those of the cursor.
+        Name of the statement on the cursor.
     sql : str
-        Static text that sees the rows of each table as ``incoming_<table>``.
+        Static text that reads the rows of each table as ``incoming_<table>``.
     schemas : mapping of str to Schema
         Columns of the rows by table.
-
-    Attributes
-    ----------
-    names : set of str
-        The tables.
     """
 
     def __init__(
@@ -245,44 +238,43 @@ class Planned:
     ) -> None:
         self._cursor = cursor
         self._incoming = {table: _Incoming(schema) for table, schema in schemas.items()}
-        self.names = set(schemas)
         for table, incoming in self._incoming.items():
             cursor.register(f"incoming_{table}", incoming)
         cursor.execute(f"PREPARE planned_{name} AS {sql}")
         (self._call,) = cursor.extract_statements(f"EXECUTE planned_{name}")
 
     def run(self, tables: Mapping[str, pa.Table]) -> None:
-        """Run the statement on some rows, on its cursor; without any do nothing."""
+        """Run the statement; without any rows do nothing."""
         if not any(rows.num_rows for rows in tables.values()):
             return
         try:
             for table, rows in tables.items():
                 self._incoming[table].take(rows)
-            self._cursor.execute(self._call).fetchall()  # which ends it
+            self._cursor.execute(self._call).fetchall()  # fetching ends the statement
         finally:
             for incoming in self._incoming.values():
                 incoming.rows = None
 
 
 class _Incoming:
-    """Rows that are others each time, in the same columns."""
+    """An Arrow stream of the present rows, in fixed columns."""
 
     def __init__(self, schema: pa.Schema) -> None:
         self.schema = schema
         self.rows: pa.Table | None = None
 
     def take(self, rows: pa.Table) -> None:
-        """Take rows in, with the types of the schema."""
+        """Set the rows, with the types of the schema."""
         self.rows = rows if rows.schema.equals(self.schema) else rows.cast(self.schema)
 
     def __arrow_c_stream__(self, requested_schema: object = None) -> object:
-        """Return the rows as a stream; DuckDB asks for it, before there are any too."""
+        """Return the rows as a stream; DuckDB also reads it while there are none."""
         rows = self.schema.empty_table() if self.rows is None else self.rows
         return rows.__arrow_c_stream__(requested_schema)
 
 
 def execute_on(cursor: duckdb.DuckDBPyConnection, sql: str, table: pa.Table) -> None:
-    """Run SQL that sees an Arrow table as ``incoming``."""
+    """Run SQL that reads an Arrow table as ``incoming``."""
     cursor.register("incoming", table)
     cursor.execute(sql)
     cursor.unregister("incoming")
@@ -291,5 +283,5 @@ def execute_on(cursor: duckdb.DuckDBPyConnection, sql: str, table: pa.Table) -> 
 def _to_numpy(column: pa.ChunkedArray) -> NDArray[Any]:
     """Return a column as an array; NULL becomes NaN among numbers and None among objects."""
     if pa.types.is_timestamp(column.type):
-        column = column.cast(pa.timestamp("us"))  # NumPy's instants carry no zone; ours are UTC
+        column = column.cast(pa.timestamp("us"))  # NumPy's instants have no zone; these are UTC
     return np.asarray(column.to_numpy())

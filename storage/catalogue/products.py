@@ -1,22 +1,15 @@
-"""What is made of a survey as files: kept by digest, listed in the table ``site_products``."""
+"""Rows of files: the products of a whole survey, and the documents of one result."""
 
 from __future__ import annotations
 
-import hashlib
-import posixpath
-import secrets
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
-from pathlib import Path
+from collections.abc import Mapping, Sequence
+from pathlib import PurePath
 
-import fsspec
 import pyarrow as pa
 
-from spheremark.pipelines.errors import NotFoundError
 from spheremark.storage.catalogue.rows import Row, table_of
 
 _TEXT, _REAL, _WHOLE = pa.string(), pa.float64(), pa.int64()
-_BLOCK = 1 << 20  # bytes at a time
 
 SCHEMA: Mapping[str, pa.DataType] = {
     **dict.fromkeys(("product_id", "job_id", "survey_id", "kind", "url", "sha256"), _TEXT),
@@ -32,24 +25,13 @@ SCHEMA: Mapping[str, pa.DataType] = {
 }
 """Columns of ``site_products``, in the order of the database."""
 
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class KeptFile:
-    """A file under the name of its digest.
-
-    Attributes
-    ----------
-    url : str
-        Path or URL.
-    sha256 : str
-        Digest of its bytes, in hexadecimal.
-    size : int
-        Number of its bytes.
-    """
-
-    url: str
-    sha256: str
-    size: int
+_DOCUMENT = dict.fromkeys(("result_id", "name", "media_type", "text"), _TEXT)
+_MEDIA_TYPES = {
+    ".json": "application/json",
+    ".csv": "text/csv",
+    ".txt": "text/plain",
+    ".xml": "application/xml",
+}
 
 
 def product_rows(rows: Sequence[Row]) -> pa.Table:
@@ -58,7 +40,7 @@ def product_rows(rows: Sequence[Row]) -> pa.Table:
     Parameters
     ----------
     rows : sequence of dict
-        One for each product; what a row does not tell is NULL.
+        One for each product; a missing column is NULL.
 
     Returns
     -------
@@ -68,54 +50,22 @@ def product_rows(rows: Sequence[Row]) -> pa.Table:
     return table_of(SCHEMA, rows)
 
 
-def keep_file(path: Path, folder: str) -> KeptFile:
-    """Copy a file to where files are kept, under the name of its digest.
+def documents(result_id: str, texts: Mapping[str, str]) -> pa.Table:
+    """Return the downloadable files of a result as rows of ``documents``.
 
     Parameters
     ----------
-    path : Path
-        A local file.
-    folder : str
-        Path or fsspec URL of a folder; it is made when missing.
+    result_id : str
+        The result that they belong to.
+    texts : mapping of str to str
+        Content by file name; its ending, json, csv, txt or xml, decides the media type.
 
     Returns
     -------
-    KeptFile
-        ``<folder>/<SHA-256><ending>``; the same bytes give the same.
+    Table
+        One row for each.
     """
-    with path.open("rb") as file:
-        digest = hashlib.file_digest(file, "sha256").hexdigest()
-    url = posixpath.join(folder, f"{digest}{path.suffix}")
-    files, target = fsspec.core.url_to_fs(url)
-    if not files.exists(target):
-        files.makedirs(posixpath.dirname(target), exist_ok=True)
-        part = f"{target}.{secrets.token_hex(4)}.part"  # nobody sees half a file
-        files.put_file(str(path), part)
-        files.mv(part, target)
-    return KeptFile(url=url, sha256=digest, size=path.stat().st_size)
-
-
-def read_file(url: str) -> Iterator[bytes]:
-    """Read a kept file, a part at a time.
-
-    Parameters
-    ----------
-    url : str
-        What ``keep_file`` returned.
-
-    Yields
-    ------
-    bytes
-        Its bytes, in order.
-
-    Raises
-    ------
-    NotFoundError
-        If it is not there.
-    """
-    files, path = fsspec.core.url_to_fs(url)
-    if not files.exists(path):
-        raise NotFoundError(f"The file {url} is not there any more; make it again.")
-    with files.open(path, "rb") as file:
-        while block := file.read(_BLOCK):
-            yield block
+    values = ((name, _MEDIA_TYPES[PurePath(name).suffix], text) for name, text in texts.items())
+    return table_of(
+        _DOCUMENT, [dict(zip(_DOCUMENT, (result_id, *row), strict=True)) for row in values]
+    )

@@ -1,10 +1,10 @@
-"""Rows of the catalogue as values: what the typed verbs of ``catalogue`` take and give."""
+"""Rows of the catalogue as values, and values as rows."""
 
 from __future__ import annotations
 
 import json
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from datetime import datetime
 from enum import StrEnum
 from typing import Any, Generic, TypeVar
@@ -18,6 +18,8 @@ from spheremark.pipelines.model import Array, ControlMarks, StopTruth, Truth
 from spheremark.pipelines.scan.rigs import rig_to_mapping
 
 _Record = TypeVar("_Record")
+_SI_COLUMNS = {"tolerance": "tolerance_m", "duration": "duration_s"}  # field to column
+_JSON = ("config", "options", "preflight")
 
 _UNITS = {
     "m2": "m²",
@@ -28,11 +30,11 @@ _UNITS = {
     "percent": "%",
     "at": "UTC",
 }
-"""What people read for the ending of a column's name."""
+"""Printed unit by the ending of a column's name."""
 
 
 class JobStatus(StrEnum):
-    """Where a job stands; the words are those of OGC API - Processes."""
+    """Status of a job, in the words of OGC API - Processes."""
 
     ACCEPTED = "accepted"
     RUNNING = "running"
@@ -42,21 +44,13 @@ class JobStatus(StrEnum):
 
     @property
     def is_final(self) -> bool:
-        """Whether a job that stands here never changes again."""
+        """Whether a job with this status never changes again."""
         return self not in (JobStatus.ACCEPTED, JobStatus.RUNNING)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Page(Generic[_Record]):
-    """A part of a list.
-
-    Attributes
-    ----------
-    items : tuple
-        The records, newest first.
-    next : str or None
-        What to pass as ``after`` to get the part that follows; none at the end.
-    """
+    """One page of a list, newest first; ``next`` is the ``after`` of the page that follows."""
 
     items: tuple[_Record, ...]
     next: str | None
@@ -68,22 +62,16 @@ class SurveyRecord:
 
     Attributes
     ----------
-    survey_id : str
-        Given by the catalogue, never reused.
-    name : str
-        Given by people, unique.
+    survey_id, name : str
+        Identifier from the catalogue, never reused, and the user's name for it, unique.
     tolerance : float
-        Error that the survey accepts [m].
+        3-D error that the survey accepts [m].
     created_at : datetime
-        When it was made, in UTC.
+        Instant of creation, in UTC.
     rig_digest : str or None
-        Rig that its jobs use where they name none; none: the one that each log describes.
-    n_control_marks : int
-        Number of its control marks.
-    n_true_stops : int
-        Number of its stops whose truth is known.
-    n_recordings : int
-        Number of different logs that jobs of this survey have asked for.
+        Rig of its jobs where they name none; without, the rig that each log describes.
+    n_control_marks, n_true_stops, n_recordings : int
+        Number of control marks, of stops with a known truth, and of logs.
     """
 
     survey_id: str
@@ -103,19 +91,19 @@ class RecordingRecord:
     Attributes
     ----------
     recording_id : str
-        SHA-256 of its bytes, in hexadecimal.
+        SHA-256 of the file, in hexadecimal.
     name : str
-        Stem of the name that it was uploaded under.
+        Stem of the file name at upload.
     size_bytes : int
         Length of the file.
     uploaded_at : datetime
-        When it came, in UTC.
+        Instant of the upload, in UTC.
     url : str
-        Where its bytes are.
+        Location of the file.
     verdict : str
-        Outcome of the preflight: ``ok``, ``weak`` or ``refused``.
+        Result of the preflight: ``ok``, ``weak`` or ``refused``.
     preflight : mapping
-        The whole report.
+        The preflight report.
     """
 
     recording_id: str
@@ -129,36 +117,34 @@ class RecordingRecord:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class JobRecord:
-    """Work that was asked for.
+    """A job.
 
     Attributes
     ----------
-    job_id : str
-        Given by the catalogue.
-    kind : str
-        What is done, for instance ``process``.
+    job_id, kind : str
+        Identifier from the catalogue, and its kind, for instance ``process``.
     survey_id, survey : str
-        The survey that it belongs to: id and name.
+        Identifier and name of its survey.
     recording_id, recording : str or None
-        The log that it reads: digest and name; none for work on the survey as a whole.
+        Digest and name of the log; none for a job on the survey as a whole.
     config : mapping
         The effective configuration.
     options : mapping
-        What was chosen beside it: ``rig`` (a digest), ``recordings``, and what its kind knows.
+        Options beside it: ``rig`` (a digest), ``recordings``, and those of its kind.
     status : JobStatus
-        Where it stands.
+        Its status.
     progress_percent : float
         0 to 100.
     message : str
-        What is being done, as a sentence for people.
+        The present step, as a sentence.
     attempts : int
-        How often it was started.
+        Number of starts.
     created_at : datetime
-        When it was asked for, in UTC.
+        Instant of the request, in UTC.
     started_at, finished_at : datetime or None
-        When its last attempt began, and when it came to its end.
+        Start of the last attempt, and end of the job.
     error_code, error_reason, error_traceback : str or None
-        Why it failed: stable code, sentence, and where in the code.
+        Stable code, sentence and traceback of the failure.
     """
 
     job_id: str
@@ -188,19 +174,19 @@ class RunRecord:
     Attributes
     ----------
     run_id : str
-        Names the rows of this run in every table.
+        Identifier of the run in every table.
     job_id, survey_id, recording_id : str
-        Where it belongs.
+        Its job, survey and log.
     config : mapping
         The effective configuration.
     config_digest, code_version, rig_digest : str
-        What the numbers depend on.
+        Provenance of the numbers.
     finished_at : datetime
-        When, in UTC.
+        End of the run, in UTC.
     duration : float
-        Time that the run took [s].
+        Duration of the run [s].
     peak_memory_bytes : int or None
-        Largest resident size of the worker's process.
+        Largest resident size of the worker process.
     """
 
     run_id: str
@@ -216,21 +202,12 @@ class RunRecord:
     peak_memory_bytes: int | None
 
 
+_Kind = TypeVar("_Kind", SurveyRecord, RecordingRecord, JobRecord, RunRecord)
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ColumnInfo:
-    """A column of a table or view.
-
-    Attributes
-    ----------
-    name : str
-        Its name, which carries the unit.
-    type : str
-        DuckDB's name of its type.
-    unit : str
-        Unit for people, from the name; empty for numbers without one and for text.
-    comment : str
-        What it is; empty where the name says it.
-    """
+    """A column of a table or view, with its unit from the name and its comment."""
 
     name: str
     type: str
@@ -240,19 +217,7 @@ class ColumnInfo:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class TableInfo:
-    """A table or view that people may query.
-
-    Attributes
-    ----------
-    name : str
-        Its name.
-    kind : str
-        ``table`` or ``view``.
-    comment : str
-        What its rows are.
-    columns : tuple of ColumnInfo
-        Its columns, in their order.
-    """
+    """A ``table`` or ``view`` that may be queried, with its columns in order."""
 
     name: str
     kind: str
@@ -261,7 +226,7 @@ class TableInfo:
 
 
 def unit_of(column: str) -> str:
-    """Return the unit that the name of a column carries, for people; empty when it carries none.
+    """Return the printed unit of a column.
 
     Parameters
     ----------
@@ -271,7 +236,7 @@ def unit_of(column: str) -> str:
     Returns
     -------
     str
-        The unit as it is printed.
+        The unit that the name carries; empty when it carries none.
     """
     ending = next((end for end in _UNITS if column.endswith(f"_{end}")), None)
     return "" if ending is None else _UNITS[ending]
@@ -303,29 +268,17 @@ def tables_of(rows: list[dict[str, Any]]) -> tuple[TableInfo, ...]:
     )
 
 
-def survey_of(row: dict[str, Any]) -> SurveyRecord:
-    """Build a record from a row."""
-    return SurveyRecord(tolerance=row.pop("tolerance_m"), **row)
-
-
-def recording_of(row: dict[str, Any]) -> RecordingRecord:
-    """Build a record from a row."""
-    return RecordingRecord(**{**row, "preflight": json.loads(row["preflight"])})
-
-
-def job_of(row: dict[str, Any]) -> JobRecord:
-    """Build a record from a row."""
-    texts = {name: json.loads(row[name] or "{}") for name in ("config", "options")}
-    return JobRecord(**{**row, **texts, "status": JobStatus(row["status"])})
-
-
-def run_of(row: dict[str, Any]) -> RunRecord:
-    """Build a record from a row."""
-    return RunRecord(duration=row.pop("duration_s"), **{**row, "config": json.loads(row["config"])})
+def record_of(kind: type[_Kind], row: Mapping[str, Any]) -> _Kind:
+    """Build a record from a row; JSON becomes a mapping, and SI fields have no unit in the name."""
+    values = {f.name: row[_SI_COLUMNS.get(f.name, f.name)] for f in fields(kind)}
+    values |= {name: json.loads(values[name] or "{}") for name in _JSON if name in values}
+    if "status" in values:
+        values["status"] = JobStatus(values["status"])
+    return kind(**values)
 
 
 def pose_of(row: Mapping[str, Any]) -> Array:
-    """Return the pose that a row of ``true_stops`` tells."""
+    """Return the pose of a row of ``true_stops``."""
     yaw, pitch, roll = (np.radians(row[f"{name}_deg"]) for name in ("yaw", "pitch", "roll"))
     return rigid(rot_z(yaw) @ rot_y(pitch) @ rot_x(roll), [row["x_m"], row["y_m"], row["z_m"]])
 

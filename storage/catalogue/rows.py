@@ -1,4 +1,4 @@
-"""Rows as Arrow tables: what is not known or not finite becomes NULL."""
+"""Rows as Arrow tables: unknown and non-finite values become NULL."""
 
 from __future__ import annotations
 

@@ -1,13 +1,12 @@
-"""SQL of people: each query in a process of its own, on a snapshot, behind hard limits.
+"""SQL of users: each query in its own process, on a snapshot, with hard limits.
 
 Why a process: DuckDB in the owner's process is no sandbox (a SELECT can insert, an interrupt is no
-time limit, the memory limit is everybody's). What holds is that the file is opened for reading
-only, nothing outside it can be reached, the operating system bounds memory and forbids written
-files, and its timer ends the process at the deadline. That a query must be one SELECT is advice on
-top.
+time limit, the memory limit is shared). The isolation rests on four things: the file is opened
+read-only, nothing outside it can be reached, the operating system limits memory and forbids writing
+files, and its timer ends the process at the deadline. The check for one SELECT only gives advice.
 
-The child is this module run as a program: a request as JSON on its standard input, an answer as
-JSON on its standard output. It must stay light to import.
+The child runs this module as a program, with a JSON request on standard input and a JSON response
+on standard output. The module must stay light to import.
 """
 
 from __future__ import annotations
@@ -57,18 +56,16 @@ class QueryTimeoutError(InputError):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class QueryLimits:
-    """What one query may use.
+    """Limits of one query.
 
     Attributes
     ----------
     seconds : float
-        From its start to its killing, the start of the process included [s].
+        Time until the process is ended [s].
     memory_bytes : int
         Memory of DuckDB for the query.
-    rows : int
-        Rows that are returned; what is beyond is cut, and the result says so.
-    result_bytes : int
-        Length of the result as JSON, cut likewise.
+    rows, result_bytes : int
+        Number of rows, and length of the result as JSON; more is cut, and ``truncated`` is set.
     """
 
     seconds: float = 10.0
@@ -79,15 +76,7 @@ class QueryLimits:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class QueryColumn:
-    """A column of a result.
-
-    Attributes
-    ----------
-    name : str
-        As the query names it; names may repeat.
-    type : str
-        DuckDB's name of its type.
-    """
+    """A column of a result: its name, which may repeat, and DuckDB's name of its type."""
 
     name: str
     type: str
@@ -95,7 +84,7 @@ class QueryColumn:
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class QueryResult:
-    """What a query gave.
+    """The result of a query.
 
     Attributes
     ----------
@@ -107,7 +96,7 @@ class QueryResult:
     truncated : bool
         Whether rows were cut at a limit.
     elapsed_ms : float
-        Time that the query took inside its process.
+        Time of the query inside its process.
     """
 
     columns: tuple[QueryColumn, ...]
@@ -122,16 +111,16 @@ def run_query(
     limits: QueryLimits,
     parameters: Mapping[str, Any] | None = None,
 ) -> QueryResult:
-    """Run one query of people on a snapshot.
+    """Run one query of a user on a snapshot.
 
     Parameters
     ----------
     snapshot : Path
-        A DuckDB file that nobody writes to.
+        A DuckDB file that does not change.
     sql : str
         One SELECT or EXPLAIN; ``$name`` stands for a parameter.
     limits : QueryLimits
-        What it may use.
+        Its limits.
     parameters : mapping, optional
         Values of its parameters, plain.
 
@@ -143,9 +132,9 @@ def run_query(
     Raises
     ------
     QueryRejectedError
-        If the query is not allowed, wrong, or needs more memory than it may use.
+        If the query is not allowed, is wrong, or needs too much memory.
     QueryTimeoutError
-        If it is not done at the deadline.
+        If it does not end before the deadline.
 
     Notes
     -----
@@ -157,14 +146,14 @@ def run_query(
         "parameters": dict(parameters or {}),
         "limits": asdict(limits),
     }
-    answer = _ask(json.dumps(request), limits)
-    if "rejected" in answer:
-        raise QueryRejectedError(answer["rejected"])
+    response = _in_child(json.dumps(request), limits)
+    if "rejected" in response:
+        raise QueryRejectedError(response["rejected"])
     return QueryResult(
-        columns=tuple(QueryColumn(name=name, type=kind) for name, kind in answer["columns"]),
-        rows=tuple(tuple(row) for row in answer["rows"]),
-        truncated=answer["truncated"],
-        elapsed_ms=answer["elapsed_ms"],
+        columns=tuple(QueryColumn(name=name, type=kind) for name, kind in response["columns"]),
+        rows=tuple(tuple(row) for row in response["rows"]),
+        truncated=response["truncated"],
+        elapsed_ms=response["elapsed_ms"],
     )
 
 
@@ -174,13 +163,13 @@ def to_csv(result: QueryResult) -> str:
     Parameters
     ----------
     result : QueryResult
-        What a query gave.
+        The result of a query.
 
     Returns
     -------
     str
-        NULL is an empty field, lists and objects are JSON. When rows were cut, the last line says
-        so: it begins with ``# truncated``.
+        NULL is an empty field, lists and objects are JSON. When rows were cut, the last line
+        begins with ``# truncated``.
     """
     text = io.StringIO()
     writer = csv.writer(text)
@@ -196,12 +185,8 @@ def _csv_field(value: object) -> object:
     return json.dumps(value) if isinstance(value, list | dict | bool) else value
 
 
-def _ask(request: str, limits: QueryLimits) -> dict[str, Any]:
-    """Start a child, hand it the request, and return its answer.
-
-    It ends itself at the deadline, which begins with its query: on a machine that is busy, to start
-    takes longer than most queries.
-    """
+def _in_child(request: str, limits: QueryLimits) -> dict[str, Any]:
+    """Return the response of a child, whose timer starts with the query: a start can take long."""
     with subprocess.Popen(
         [sys.executable, "-m", "spheremark.storage.catalogue.sandbox"],
         stdin=subprocess.PIPE,
@@ -212,7 +197,7 @@ def _ask(request: str, limits: QueryLimits) -> dict[str, Any]:
         text=True,
     ) as child:
         try:
-            answer, complaint = child.communicate(request, timeout=limits.seconds + _START_MAX)
+            text, trace = child.communicate(request, timeout=limits.seconds + _START_MAX)
         except subprocess.TimeoutExpired as error:
             child.kill()
             raise QueryTimeoutError(
@@ -222,49 +207,51 @@ def _ask(request: str, limits: QueryLimits) -> dict[str, Any]:
     if child.returncode == -signal.SIGALRM:
         raise QueryTimeoutError(
             f"The query was ended after {limits.seconds:g} s, its time limit. "
-            "Ask for less: filter earlier, aggregate, or add a LIMIT."
+            "Reduce it: filter earlier, aggregate, or add a LIMIT."
         )
-    if child.returncode < 0:  # the allocator gave up, or the operating system ended it
+    if child.returncode < 0:  # ended by the allocator or the operating system
         sentence = f"It ended with {signal.Signals(-child.returncode).name}."
         return {"rejected": f"{_too_much_memory(limits.memory_bytes)} {sentence}"}
     if child.returncode:
-        raise SpheremarkError(f"The process of the query failed: {complaint[-_MESSAGE_MAX:]}")
-    found: dict[str, Any] = json.loads(answer)
-    return found
+        raise SpheremarkError(f"The process of the query failed: {trace[-_MESSAGE_MAX:]}")
+    response: dict[str, Any] = json.loads(text)
+    return response
 
 
 def _too_much_memory(limit: int) -> str:
-    """Return the sentence for a query that needed too much memory."""
+    """Return the message for a query that needed too much memory."""
     return (
         f"The query needed more than {limit >> 20} MiB, its memory limit. "
-        "Ask for less: filter earlier, aggregate, or add a LIMIT."
+        "Reduce it: filter earlier, aggregate, or add a LIMIT."
     )
 
 
-# What follows runs in the child.
+# The functions below run in the child.
 
 
 def _main() -> None:
-    """Answer the request on standard input."""
+    """Respond to the request on standard input."""
     request = json.load(sys.stdin)
     limits = QueryLimits(**request["limits"])
     memory = limits.memory_bytes + _HEADROOM
     limit_resources(memory_bytes=memory, seconds=limits.seconds, file_bytes=0)
     try:
-        answer = _answer(Path(request["snapshot"]), request["sql"], request["parameters"], limits)
+        response = _respond(
+            Path(request["snapshot"]), request["sql"], request["parameters"], limits
+        )
     except (duckdb.OutOfMemoryException, MemoryError):
-        answer = {"rejected": _too_much_memory(limits.memory_bytes)}
+        response = {"rejected": _too_much_memory(limits.memory_bytes)}
     except duckdb.Error as error:
-        answer = {"rejected": _shortened(str(error))}
+        response = {"rejected": _shortened(str(error))}
     except QueryRejectedError as error:
-        answer = {"rejected": str(error)}
-    json.dump(answer, sys.stdout, allow_nan=False)
+        response = {"rejected": str(error)}
+    json.dump(response, sys.stdout, allow_nan=False)
 
 
-def _answer(
+def _respond(
     snapshot: Path, sql: str, parameters: Mapping[str, Any], limits: QueryLimits
 ) -> dict[str, Any]:
-    """Run the query and return what there is to say."""
+    """Run the query and return the response."""
     statement = _one_statement(sql)
     connection = _open(snapshot, limits)
     begin = perf_counter()
@@ -281,7 +268,7 @@ def _answer(
 
 
 def _open(snapshot: Path, limits: QueryLimits) -> duckdb.DuckDBPyConnection:
-    """Open the snapshot for reading, with every door shut and the key thrown away."""
+    """Open the snapshot read-only, without files, network and changes of the configuration."""
     connection = duckdb.connect(
         str(snapshot),
         read_only=True,
@@ -300,7 +287,7 @@ def _open(snapshot: Path, limits: QueryLimits) -> duckdb.DuckDBPyConnection:
 
 
 def _one_statement(sql: str) -> str:
-    """Return the only statement of a text if it is one that reads."""
+    """Return the only statement of a text; refuse statements that do not read."""
     statements = duckdb.extract_statements(sql)
     if len(statements) != 1:
         found = "no statement" if not statements else f"{len(statements)} statements"
@@ -319,14 +306,14 @@ def _one_statement(sql: str) -> str:
 
 
 def _without_end(statement: str) -> str:
-    """Return a statement without its semicolon and what follows, so that SQL can wrap it."""
+    """Return a statement without its semicolon and the text behind, as a subquery needs it."""
     text = statement.encode()  # positions of tokens count bytes
     ends = [at for at, _ in duckdb.tokenize(statement) if text[at : at + 1] == b";"]
     return text[: ends[0]].decode() if ends else statement
 
 
 def _plain_sql(place: int, kind: str) -> str:
-    """Return SQL that turns a column into text or numbers that Python and JSON can hold."""
+    """Return SQL that makes a column text or numbers that JSON can hold."""
     if kind in _PLAIN_TYPES:
         return f"#{place}"
     if kind in _INSTANT_TYPES:
@@ -366,7 +353,7 @@ def _finite(value: Any) -> Any:
 
 
 def _shortened(message: str) -> str:
-    """Return DuckDB's message without its tail."""
+    """Return the beginning of a message of DuckDB."""
     text = message.strip()
     return text if len(text) <= _MESSAGE_MAX else f"{text[:_MESSAGE_MAX]} ..."
 

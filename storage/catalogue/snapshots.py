@@ -1,4 +1,4 @@
-"""Copies of the database file for everybody who is not its owner."""
+"""Snapshots of the database file, for processes that do not own it."""
 
 from __future__ import annotations
 
@@ -10,21 +10,13 @@ import duckdb
 
 from spheremark.pipelines.errors import ConflictError
 
-_PATIENCE = 10.0  # [s] to wait for readers: a query of ours takes milliseconds
+_PATIENCE = 10.0  # [s] to wait for readers; a static query takes milliseconds
 _PAUSE = 0.002  # [s] between two tries
 _N_KEPT = 3  # one may still be being opened while the next two are made
 
 
 class Snapshots:
-    """The copies of one database file in a folder of their own.
-
-    Parameters
-    ----------
-    path : Path
-        The database file.
-    folder : Path
-        Where the copies go; made when missing, and emptied of copies from an earlier life.
-    """
+    """Snapshots of one database file in a folder; those of an earlier process are deleted."""
 
     def __init__(self, path: Path, folder: Path) -> None:
         self._path = path
@@ -35,7 +27,7 @@ class Snapshots:
             stale.unlink(missing_ok=True)
 
     def take(self, connection: duckdb.DuckDBPyConnection, version: int) -> Path:
-        """Return the newest copy if it has this version, else make it; the caller holds writers."""
+        """Return the snapshot of a version, new if needed; the caller holds the write lock."""
         files = self._files()
         if files and version == self._version:
             return files[-1]
@@ -49,12 +41,12 @@ class Snapshots:
         return target
 
     def _files(self) -> list[Path]:
-        """Return the copies that are there, oldest first."""
+        """Return the present snapshots, oldest first."""
         return sorted(self._folder.glob("snapshot-*.duckdb"))
 
 
 def _checkpoint(connection: duckdb.DuckDBPyConnection) -> None:
-    """Write everything into the file; DuckDB refuses while somebody still reads an older state."""
+    """Write the log into the file; DuckDB refuses while a reader is on an older state."""
     deadline = monotonic() + _PATIENCE
     while True:
         try:
@@ -68,7 +60,7 @@ def _checkpoint(connection: duckdb.DuckDBPyConnection) -> None:
 
 
 def _copy(source: Path, target: Path) -> None:
-    """Copy a file in a process of its own, sharing blocks where the file system can."""
+    """Copy a file in another process, sharing blocks where the file system can."""
     part = target.with_suffix(".part")
     command = ["cp", "--reflink=auto", "--", str(source), str(part)]
     done = subprocess.run(command, capture_output=True, text=True, check=False)

@@ -1,4 +1,4 @@
-"""What is kept of surveys, their marks, truth and logs, and of rigs: typed put and get."""
+"""Surveys with their marks, truth and logs, and rigs: typed put and get."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from spheremark.pipelines.errors import ConflictError, InputError
 from spheremark.pipelines.model import ControlMarks, Rig, Truth
 from spheremark.pipelines.scan.rigs import rig_digest, rig_from_mapping, rig_to_mapping
 from spheremark.storage.catalogue.database import fetch
-from spheremark.storage.catalogue.lists import Lists, page_of
+from spheremark.storage.catalogue.lists import Lists
 from spheremark.storage.catalogue.records import (
     Page,
     RecordingRecord,
@@ -26,12 +26,11 @@ from spheremark.storage.catalogue.records import (
     coordinates_of,
     json_text,
     marks_table,
-    recording_of,
+    record_of,
     rig_text,
-    survey_of,
     true_stops_table,
 )
-from spheremark.storage.catalogue.tables import Tables, read_truth
+from spheremark.storage.catalogue.tables import TableWriter, read_truth
 
 _DIGEST = re.compile(r"[0-9a-f]{64}")
 _VERDICTS = ("ok", "weak", "refused")
@@ -73,26 +72,16 @@ _CONTROL = "SELECT * FROM control_marks WHERE survey_id = $id ORDER BY place"
 
 
 class Surveys(Lists):
-    """What people gave: surveys with their marks and truth, logs, rigs.
-
-    Parameters
-    ----------
-    path : Path
-        The DuckDB file, as for a ``Database``.
-    snapshots : Path
-        Folder for the copies that others read.
-    memory_limit : str
-        What DuckDB may use before it spills to disk, in its own words.
-    """
+    """The inputs of jobs: surveys with marks and truth, logs, rigs. Opened like ``Database``."""
 
     def __init__(self, path: Path, *, snapshots: Path, memory_limit: str = "1GB") -> None:
         super().__init__(path, snapshots=snapshots, memory_limit=memory_limit)
-        self._tables = Tables(self._writer)
+        self._tables = TableWriter(self._writer)
 
     # Surveys, their marks and their truth
 
     def create_survey(self, name: str, *, tolerance: float = 0.03) -> SurveyRecord:
-        """Make a survey."""
+        """Create a survey."""
         check_name("The name of a survey", name)
         if not 0.0 < tolerance <= 1.0:
             raise InputError(f"The tolerance is {tolerance!r} m; it must be above 0 and at most 1.")
@@ -109,15 +98,15 @@ class Surveys(Lists):
 
     def get_survey(self, key: str) -> SurveyRecord:
         """Return a survey by its id or its name; NotFoundError if there is none."""
-        return survey_of(self._one(_SURVEY_BY_KEY, {"key": key}, f"survey {key!r}"))
+        row = self._one(_SURVEY_BY_KEY, {"key": key}, f"survey {key!r}")
+        return record_of(SurveyRecord, row)
 
     def list_surveys(self, *, after: str | None = None, limit: int = 100) -> Page[SurveyRecord]:
-        """Return a part of the surveys, newest first; ``after`` is ``next`` of the part before."""
-        rows = self._part(_SURVEYS_AFTER, {}, after, limit)
-        return page_of(rows, limit, "created_at", "survey_id", survey_of)
+        """Return a page of the surveys, newest first; ``after`` is ``next`` of the page before."""
+        return self._page(SurveyRecord, _SURVEYS_AFTER, {}, after, limit)
 
     def put_control_marks(self, survey: str, marks: ControlMarks) -> None:
-        """Give a survey its control marks, in place of those that it had."""
+        """Set the control marks of a survey, in place of those before."""
         check_marks(marks)
         sigmas = np.sqrt(np.diagonal(marks.cov_p_site, axis1=1, axis2=2))
         survey_id = self.get_survey(survey).survey_id
@@ -132,7 +121,7 @@ class Surveys(Lists):
             )
 
     def control_marks(self, survey: str) -> ControlMarks | None:
-        """Return the control marks of a survey (id or name), as they were put; None without."""
+        """Return the control marks of a survey (id or name); None without."""
         rows = self.rows(_CONTROL, {"id": self.get_survey(survey).survey_id})
         if not rows:
             return None
@@ -144,7 +133,7 @@ class Surveys(Lists):
         )
 
     def put_truth(self, survey: str, truth: Truth) -> None:
-        """Give a survey its truth, and all its results their errors."""
+        """Set the truth of a survey, and compute the errors of all its results."""
         check_marks(truth.marks)
         survey_id = self.get_survey(survey).survey_id
         with self.writing() as cursor:
@@ -161,7 +150,7 @@ class Surveys(Lists):
             self._tables.refresh_errors(survey_id)
 
     def truth(self, survey: str) -> Truth | None:
-        """Return the truth of a survey (id or name); None when it is not known."""
+        """Return the truth of a survey (id or name); None without."""
         survey_id = self.get_survey(survey).survey_id
         with self.reading() as cursor:
             return read_truth(cursor, survey_id)
@@ -171,7 +160,7 @@ class Surveys(Lists):
     def add_recording(
         self, digest: str, *, name: str, size_bytes: int, url: str, preflight: Mapping[str, Any]
     ) -> RecordingRecord:
-        """Enter an uploaded log; the same bytes twice are one recording, as first entered."""
+        """Add an uploaded log; the same bytes twice are one recording, as first added."""
         check_name("The name of a recording", name)
         verdict = str(preflight.get("verdict"))
         if not _DIGEST.fullmatch(digest):
@@ -189,30 +178,29 @@ class Surveys(Lists):
     def get_recording(self, recording_id: str) -> RecordingRecord:
         """Return a recording by its digest; NotFoundError if there is none."""
         row = self._one(_RECORDING, {"id": recording_id}, f"recording {recording_id!r}")
-        return recording_of(row)
+        return record_of(RecordingRecord, row)
 
     def list_recordings(
         self, *, after: str | None = None, limit: int = 100
     ) -> Page[RecordingRecord]:
-        """Return a part of the recordings, newest first."""
-        rows = self._part(_RECORDINGS_AFTER, {}, after, limit)
-        return page_of(rows, limit, "uploaded_at", "recording_id", recording_of)
+        """Return a page of the recordings, newest first."""
+        return self._page(RecordingRecord, _RECORDINGS_AFTER, {}, after, limit)
 
     def add_to_survey(self, survey: str, recording_id: str) -> None:
-        """Note that a log belongs to a survey; twice is once."""
+        """Assign a log to a survey."""
         row = [self.get_survey(survey).survey_id, self.get_recording(recording_id).recording_id]
         with self.writing() as cursor:
             cursor.execute("INSERT OR IGNORE INTO survey_recordings VALUES (?, ?)", row)
 
     def recordings_of_survey(self, survey: str) -> tuple[str, ...]:
-        """Return the logs that were uploaded for a survey (id or name), or read by its jobs."""
+        """Return the logs that are assigned to a survey (id or name) or read by its jobs."""
         rows = self.rows(_RECORDINGS_OF_SURVEY, {"id": self.get_survey(survey).survey_id})
         return tuple(row["recording_id"] for row in rows)
 
     # Rigs
 
     def put_rig(self, rig: Rig) -> str:
-        """Keep a rig; the same rig twice is one."""
+        """Add a rig; the same rig twice is one."""
         digest = rig_digest(rig)
         row = {"rig_digest": digest, "name": rig.name, "rig": json_text(rig_to_mapping(rig))}
         with self.writing():
@@ -225,7 +213,7 @@ class Surveys(Lists):
         return rig_from_mapping(json.loads(row["rig"]))
 
     def choose_rig(self, survey: str, digest: str | None) -> SurveyRecord:
-        """Let the jobs of a survey use a rig where they name none."""
+        """Set the rig of those jobs of a survey that name none."""
         survey_id = self.get_survey(survey).survey_id
         if digest is not None:
             self.get_rig(digest)
@@ -237,7 +225,7 @@ class Surveys(Lists):
 
 
 def check_name(what: str, name: str) -> None:
-    """Refuse a name that people could not read or type."""
+    """Refuse a name that cannot be read or typed."""
     if not name.strip() or len(name) > 200 or not name.isprintable():
         raise InputError(f"{what} is {name!r}; it must have 1 to 200 printable characters.")
 

@@ -1,7 +1,7 @@
-"""Clouds of a whole site as files that other programs read: LAZ, and E57 with a pose per scan.
+"""Clouds of a whole site as LAZ, and as E57 with a pose per scan.
 
 Both are written stop by stop, so that memory holds one stop. LAZ has the returns in the site frame,
-to the millimetre; E57 has them in the frame of their station, with the pose that leads to the site.
+to the millimetre; E57 has them in the station frame, with the pose of the station in the site.
 """
 
 from __future__ import annotations
@@ -22,26 +22,18 @@ from scipy.spatial.transform import Rotation
 from spheremark.pipelines.errors import InputError
 from spheremark.pipelines.ground_model import StationPoints
 from spheremark.pipelines.model import Array, Column, Rings
+from spheremark.storage.exports.ground_model import SITE_WKT
 
 _SCALE = 0.001  # [m] of a LAZ coordinate
 _FULL = 65535 / 255  # LAS wants intensities to fill 16 bits
 _CHUNK = 500_000  # returns at a time
-_SITE = 'LOCAL_CS["site",LOCAL_DATUM["site",0],UNIT["metre",1],AXIS["x",EAST],AXIS["y",NORTH]]'
 _STATIONS = "stations: name, number (point_source_id), T_site_station, rows first [m]"
 _RECORD = 1  # of our own records in a LAZ file
 
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class CloudExtent:
-    """What a file of a cloud holds.
-
-    Attributes
-    ----------
-    n_points : int
-        Number of returns.
-    bounds : (2, 3)
-        Least and greatest coordinates in the site frame [m].
-    """
+    """Number of returns of a cloud, and their bounds in the site frame, (2, 3) [m]."""
 
     n_points: int
     bounds: Array
@@ -51,18 +43,18 @@ class LazFile:
     """The returns of stops in one LAZ file (LAS 1.4, point format 6), written stop by stop.
 
     A return has ``point_source_id``, the number of its station from 1, ``intensity`` with 0-255
-    stretched to 16 bits, ``gps_time``, seconds since the first return of its stop, and as an extra
+    stretched to 16 bits, ``gps_time``, seconds since the first return of its stop, and the extra
     dimension ``ring``. Names and poses of the stations are in an extended record of user
-    ``spheremark``. Coordinates are those of the site: a local system without a place on Earth.
+    ``spheremark``. The coordinate system of the site is local, without a place on Earth.
 
     Parameters
     ----------
     path : Path
         The file.
     software : str
-        What makes it.
+        Name of the writing program.
     day : date
-        Day that the header names.
+        Day in the header.
     """
 
     def __init__(self, path: Path, *, software: str, day: date) -> None:
@@ -72,18 +64,7 @@ class LazFile:
         self._stations: list[dict[str, Any]] = []
 
     def add(self, stop: StationPoints) -> None:
-        """Write the returns of one stop.
-
-        Parameters
-        ----------
-        stop : StationPoints
-            The stop.
-
-        Raises
-        ------
-        InputError
-            If there are more stops than a LAZ file can number.
-        """
+        """Write the returns of one stop; InputError beyond the 65,535th stop."""
         number, p_site = len(self._stations) + 1, stop.p_site
         if number > np.iinfo(np.uint16).max:
             raise InputError(f"A LAZ file can number {number - 1} stations and no more.")
@@ -99,25 +80,14 @@ class LazFile:
         self._stations.append(_station(number, stop))
 
     def finish(self) -> CloudExtent:
-        """Write what stands at the end of the file.
-
-        Returns
-        -------
-        CloudExtent
-            What was written.
-
-        Raises
-        ------
-        InputError
-            If there is no return.
-        """
+        """Write the end of the file and return its extent; InputError without any return."""
         extent = _joined(self._extents)
         if self._writer is not None:
             self._writer.write_evlrs(_stations_record(self._stations))
         return extent
 
     def close(self) -> None:
-        """Let go of the file."""
+        """Close the file."""
         if self._writer is not None:
             self._writer.close()
 
@@ -126,15 +96,15 @@ class E57File:
     """The returns of stops in one E57 file (ASTM E2807-11), a scan with a pose for each stop.
 
     Coordinates are single precision in the station frame; ``pose`` is ``T_site_station``;
-    ``rowIndex`` is the laser. Identifiers follow from the contents, so that the same survey gives
-    the same file.
+    ``rowIndex`` is the laser. Identifiers are computed from the contents, so that the same survey
+    gives the same file.
 
     Parameters
     ----------
     path : Path
         The file.
     software : str
-        What makes it.
+        Name of the writing program.
     """
 
     def __init__(self, path: Path, *, software: str) -> None:
@@ -144,32 +114,15 @@ class E57File:
         self._extents: list[CloudExtent] = []
 
     def add(self, stop: StationPoints) -> None:
-        """Write the returns of one stop.
-
-        Parameters
-        ----------
-        stop : StationPoints
-            The stop.
-        """
+        """Write the returns of one stop."""
         self._extents.append(_e57_scan(self._image, self._scans, stop))
 
     def finish(self) -> CloudExtent:
-        """Say what was written.
-
-        Returns
-        -------
-        CloudExtent
-            What was written, in the site frame.
-
-        Raises
-        ------
-        InputError
-            If there is no return.
-        """
+        """Return the extent of the file; InputError without any return."""
         return _joined(self._extents)
 
     def close(self) -> None:
-        """Let go of the file."""
+        """Close the file."""
         self._image.close()
 
 
@@ -184,7 +137,7 @@ def _laz_header(p_site: Array, software: str, day: date) -> laspy.LasHeader:
     header.add_extra_dim(
         laspy.ExtraBytesParams(name="ring", type=np.uint8, description="laser, 0 the lowest")
     )
-    header.vlrs.append(laspy.vlrs.known.WktCoordinateSystemVlr(_SITE))
+    header.vlrs.append(laspy.vlrs.known.WktCoordinateSystemVlr(SITE_WKT))
     header.global_encoding.wkt = True
     return header
 
@@ -192,7 +145,7 @@ def _laz_header(p_site: Array, software: str, day: date) -> laspy.LasHeader:
 def _laz_points(
     stop: StationPoints, p_site: Array, rows: slice, number: int, header: laspy.LasHeader
 ) -> laspy.ScaleAwarePointRecord:
-    """Return some returns of a stop as LAZ keeps them."""
+    """Return some returns of a stop as LAZ points."""
     part = p_site[rows]
     record = laspy.ScaleAwarePointRecord.zeros(len(part), header=header)
     record.x, record.y, record.z = part.T
@@ -206,12 +159,12 @@ def _laz_points(
 
 
 def _station(number: int, stop: StationPoints) -> dict[str, Any]:
-    """Return what a LAZ file says of a station."""
+    """Return the entry of a station in the extended record."""
     return {"number": number, "name": stop.name, "T_site_station": stop.T_site_station.tolist()}
 
 
 def _stations_record(stations: list[dict[str, Any]]) -> laspy.vlrs.vlrlist.VLRList:
-    """Return the stations as an extended record."""
+    """Return the extended record of the stations."""
     text = json.dumps({"about": _STATIONS, "stations": stations})
     record = laspy.VLR(
         user_id="spheremark", record_id=_RECORD, description="stations", record_data=text.encode()
@@ -220,7 +173,7 @@ def _stations_record(stations: list[dict[str, Any]]) -> laspy.vlrs.vlrlist.VLRLi
 
 
 def _extent(p_site: Array) -> CloudExtent:
-    """Return what a stop adds."""
+    """Return the extent of one stop."""
     bounds = (
         np.array([p_site.min(axis=0), p_site.max(axis=0)])
         if len(p_site)
@@ -233,7 +186,7 @@ def _joined(extents: list[CloudExtent]) -> CloudExtent:
     """Return the extent of all stops; refuse a cloud without returns."""
     n_points = sum(extent.n_points for extent in extents)
     if not n_points:
-        raise InputError("The stops have no return within the wanted distance: there is no cloud.")
+        raise InputError("The stops have no return within the maximum distance: there is no cloud.")
     return CloudExtent(
         n_points=n_points,
         bounds=np.array(
@@ -246,7 +199,7 @@ def _joined(extents: list[CloudExtent]) -> CloudExtent:
 
 
 def _e57_root(image: Any, software: str) -> Any:
-    """Write what stands at the head of a file; return the list of its scans."""
+    """Write the head of a file and return the node of its scans."""
     image.extensionsAdd("", libe57.E57_V1_0_URI)
     scans = libe57.VectorNode(image, True)
     created = _structure(image, dateTimeValue=0.0, isAtomicClockReferenced=0)
@@ -267,7 +220,7 @@ def _e57_root(image: Any, software: str) -> Any:
 
 
 def _guid(text: str) -> str:
-    """Return an identifier that follows from a text."""
+    """Return an identifier computed from a text."""
     return "{" + str(uuid.uuid5(uuid.NAMESPACE_URL, f"spheremark/{text}")) + "}"
 
 
@@ -308,7 +261,7 @@ def _e57_scan(image: Any, scans: Any, stop: StationPoints) -> CloudExtent:
 
 
 def _pose(image: Any, T: Array) -> Any:
-    """Return a pose as E57 keeps it: a unit quaternion and a translation."""
+    """Return a pose as an E57 node: a unit quaternion and a translation."""
     x, y, z, w = (float(value) for value in Rotation.from_matrix(T[:3, :3]).as_quat())
     pose = libe57.StructureNode(image)
     pose.set("rotation", _structure(image, w=w, x=x, y=y, z=z))

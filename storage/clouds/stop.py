@@ -1,18 +1,14 @@
-"""Clouds of stops as Parquet files named by the SHA-256 of their bytes, for pages and downloads.
+"""Clouds of stops as Parquet files, for display; results are computed from recordings.
 
-A file holds a uniform part of a stop's returns in the station frame and all that is near a marker,
-with each marker's members and their residuals. It is a picture, not an input: results are computed
-from recordings. Folders are fsspec URLs or paths, so that a cluster can share them.
+A file holds a uniform sample of a stop's returns in the station frame, and all returns near a
+marker with the members of the marker and their residuals.
 """
 
 from __future__ import annotations
 
-import hashlib
 import io
 import itertools
 import json
-import posixpath
-import secrets
 from collections.abc import Mapping
 from dataclasses import dataclass
 
@@ -25,9 +21,10 @@ from numpy.typing import NDArray
 from spheremark.pipelines.errors import InputError, NotFoundError
 from spheremark.pipelines.geometry import levelling_rotation
 from spheremark.pipelines.model import Array, Column, Index, MarkerFits, Mask, StopResult
+from spheremark.storage.files import keep_bytes
 
-NO_MARKER = -1  # the marker of a return that belongs to none
-_FORMAT = "1"  # version of the file format; a reader knows every version that was ever written
+NO_MARKER = -1  # marker of a return without one
+_FORMAT = "1"  # version of the file format; readers support all released versions
 _NEAR = 0.5  # [m] around a centre, within which every return is kept
 _CELLS = 256  # cells of 1 m along an edge of the grid; the outermost ones reach to infinity
 _GOLDEN = (np.sqrt(5.0) - 1.0) / 2.0
@@ -35,7 +32,7 @@ _GOLDEN = (np.sqrt(5.0) - 1.0) / 2.0
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class CloudView:
-    """A part of a stop's cloud, to be looked at.
+    """A sample of a stop's cloud, for display.
 
     Attributes
     ----------
@@ -52,9 +49,9 @@ class CloudView:
     is_near : (n,)
         Whether the return is within half a metre of a fitted centre.
     markers : (n,)
-        Place of the return's marker in ``names``; ``NO_MARKER`` for those of none.
+        Index of the return's marker in ``names``; ``NO_MARKER`` without one.
     residuals : (n,) float32
-        Observed minus computed along the beam; NaN where the return carries no estimate [m].
+        Observed minus computed along the beam; NaN for returns that no fit used [m].
     names : tuple of str
         Markers in the order of the fits.
     """
@@ -82,24 +79,24 @@ class CloudView:
 
 
 def view(stop: StopResult, n_max: int) -> CloudView:
-    """Choose what of a stop is worth looking at.
+    """Sample the cloud of a stop for display.
 
     Parameters
     ----------
     stop : StopResult
         A stop; its first fitting method names the markers.
     n_max : int
-        Number of returns away from markers that are kept.
+        Number of returns away from markers.
 
     Returns
     -------
     CloudView
-        All returns within half a metre of a fitted centre, and a uniform choice of the others.
+        All returns within half a metre of a fitted centre, and a uniform sample of the others.
 
     Notes
     -----
-    Return ``i`` is kept where the fraction of ``i`` times the golden ratio is below the share to
-    keep (Weyl's sequence): even in time, repeatable, and blind to the period of the lasers.
+    Return ``i`` is kept where the fraction of ``i`` times the golden ratio is below the sampling
+    ratio (Weyl's sequence): even in time, repeatable, and independent of the period of the lasers.
     """
     cloud = stop.cloud
     method, found = next(iter(stop.fits.items()))
@@ -123,16 +120,16 @@ def view(stop: StopResult, n_max: int) -> CloudView:
 
 
 def write_cloud(stop: StopResult, folder: str, *, n_max: int = 200_000) -> str:
-    """Write what of a stop is worth looking at.
+    """Write a sample of the cloud of a stop.
 
     Parameters
     ----------
     stop : StopResult
         A stop.
     folder : str
-        Path or fsspec URL of a folder; it is made when missing.
+        Path or fsspec URL of a folder; created when missing.
     n_max : int
-        Number of returns away from markers that are kept.
+        Number of returns away from markers.
 
     Returns
     -------
@@ -143,15 +140,7 @@ def write_cloud(stop: StopResult, folder: str, *, n_max: int = 200_000) -> str:
     table = _to_table(view(stop, n_max))
     split = dict.fromkeys(("x_m", "y_m", "z_m", "residual_m"), "BYTE_STREAM_SPLIT")
     pq.write_table(table, buffer, compression="zstd", use_dictionary=False, column_encoding=split)
-    content = buffer.getvalue()
-    url = posixpath.join(folder, f"{hashlib.sha256(content).hexdigest()}.parquet")
-    files, path = fsspec.core.url_to_fs(url)
-    if not files.exists(path):
-        files.makedirs(posixpath.dirname(path), exist_ok=True)
-        part = f"{path}.{secrets.token_hex(4)}.part"  # nobody sees half a file
-        files.pipe_file(part, content)
-        files.mv(part, path)
-    return url
+    return keep_bytes(buffer.getvalue(), ".parquet", folder)
 
 
 def read_cloud(url: str, *, n_max: int | None = None) -> CloudView:
@@ -160,10 +149,10 @@ def read_cloud(url: str, *, n_max: int | None = None) -> CloudView:
     Parameters
     ----------
     url : str
-        What ``write_cloud`` returned.
+        Result of ``write_cloud``.
     n_max : int, optional
-        Returns at most. Members of markers are kept first, then what is near a marker, then the
-        rest, each chosen uniformly where not all have room.
+        Largest number of returns. Members of markers come first, then returns near a marker, then
+        the others; the group that exceeds the limit is sampled uniformly.
 
     Returns
     -------
@@ -190,32 +179,8 @@ def read_cloud(url: str, *, n_max: int | None = None) -> CloudView:
     return _from_table(table if n_max is None else table.take(_chosen(table, n_max)), about)
 
 
-def to_ply(cloud: CloudView) -> bytes:
-    """Return a cloud as a binary PLY file."""
-    vertices = np.zeros(
-        len(cloud),
-        dtype=[(n, "<f4") for n in ("x", "y", "z", "intensity", "residual")] + [("marker", "<i4")],
-    )
-    for axis, name in enumerate(("x", "y", "z")):
-        vertices[name] = cloud.p_station[:, axis]
-    vertices["intensity"] = cloud.intensities
-    vertices["residual"] = cloud.residuals
-    vertices["marker"] = cloud.markers
-    header = [
-        "ply",
-        "format binary_little_endian 1.0",
-        f"comment spheremark, stop {cloud.stop}, station frame, metres",
-        f"element vertex {len(cloud)}",
-        *(f"property float {n}" for n in ("x", "y", "z", "intensity", "residual")),
-        "property int marker",
-        "end_header",
-        "",
-    ]
-    return "\n".join(header).encode() + vertices.tobytes()
-
-
 def _near(p: Column, centres: Array) -> Mask:
-    """Return which points are near a centre, looking closely only at those in a cell near one."""
+    """Return which points are near a centre; distances are computed only in cells near one."""
     cells = np.clip(np.floor(p[:, :2]) + _CELLS // 2, 0, _CELLS - 1).astype(np.intp)
     may_be_near = np.zeros((_CELLS, _CELLS), dtype=np.bool_)
     for corner in itertools.product((-_NEAR, _NEAR), repeat=2):
@@ -240,7 +205,7 @@ def _members(found: MarkerFits, n_returns: int) -> tuple[Index, Column]:
 
 
 def _thinned(rows: Index, n_max: int) -> Index:
-    """Return a uniform choice of at most so many rows, in their order."""
+    """Return a uniform sample of rows, in their order."""
     if len(rows) <= n_max:
         return rows
     kept: Index = rows[(np.arange(len(rows)) * _GOLDEN) % 1.0 < n_max / len(rows)]
@@ -248,7 +213,7 @@ def _thinned(rows: Index, n_max: int) -> Index:
 
 
 def _chosen(table: pa.Table, n_max: int) -> Index:
-    """Return the rows to show when there is room for so many."""
+    """Return at most so many rows: members of markers first, then returns near one, then others."""
     is_member = table.column("marker").to_numpy() != NO_MARKER
     is_near = table.column("is_near").to_numpy()
     chosen: Index = np.zeros(0, dtype=np.intp)
@@ -259,7 +224,7 @@ def _chosen(table: pa.Table, n_max: int) -> Index:
 
 
 def _to_table(cloud: CloudView) -> pa.Table:
-    """Return a cloud as a table whose metadata say what it is."""
+    """Return a cloud as a table with its names and frame in the metadata."""
     about = {"stop": cloud.stop, "fit_method": cloud.fit_method, "names": cloud.names}
     columns: dict[str, Column | Mask | NDArray[np.int16]]
     columns = {name: cloud.p_station[:, axis] for axis, name in enumerate(("x_m", "y_m", "z_m"))}
@@ -277,7 +242,7 @@ def _to_table(cloud: CloudView) -> pa.Table:
 
 
 def _from_table(table: pa.Table, metadata: Mapping[bytes, bytes]) -> CloudView:
-    """Return the cloud that a table holds."""
+    """Return the cloud of a table."""
     about = json.loads(metadata[b"spheremark.about"])
     columns = {name: table.column(name).to_numpy().copy() for name in table.column_names}
     return CloudView(

@@ -1,7 +1,4 @@
-"""Elevation models as GeoTIFF: heights, their standard deviations, counts, and what was filled in.
-
-The coordinate system is that of the site: local, in metres, without a place on Earth.
-"""
+"""Elevation models as GeoTIFF: heights, standard deviations, counts and interpolated cells."""
 
 from __future__ import annotations
 
@@ -23,8 +20,8 @@ BANDS = (
     ("filled", "", "1 where the height is interpolated from cells around"),
 )
 """Name, unit and meaning of each band."""
-
-_SITE = 'LOCAL_CS["site",LOCAL_DATUM["site",0],UNIT["metre",1],AXIS["x",EAST],AXIS["y",NORTH]]'
+SITE_WKT = 'LOCAL_CS["site",LOCAL_DATUM["site",0],UNIT["metre",1],AXIS["x",EAST],AXIS["y",NORTH]]'
+"""Coordinate system of a site: local, without a place on Earth."""
 
 
 def write_geotiff(model: ElevationModel, path: Path, *, software: str) -> None:
@@ -37,7 +34,7 @@ def write_geotiff(model: ElevationModel, path: Path, *, software: str) -> None:
     path : Path
         The file.
     software : str
-        What made it.
+        Name of the writing program.
 
     Notes
     -----
@@ -56,7 +53,7 @@ def write_geotiff(model: ElevationModel, path: Path, *, software: str) -> None:
         height=rows,
         count=len(BANDS),
         dtype="float32",
-        crs=CRS.from_wkt(_SITE),
+        crs=CRS.from_wkt(SITE_WKT),
         transform=Affine(model.cell, 0.0, float(model.corner[0]), 0.0, -model.cell, north),
         nodata=np.nan,
         compress="deflate",
@@ -76,7 +73,7 @@ def read_geotiff(path: str | Path) -> ElevationModel:
     Parameters
     ----------
     path : str or Path
-        What ``write_geotiff`` wrote.
+        A file of ``write_geotiff``.
 
     Returns
     -------
@@ -88,12 +85,12 @@ def read_geotiff(path: str | Path) -> ElevationModel:
     NotFoundError
         If there is no such file.
     InputError
-        If it is no elevation model of ours.
+        If it is not such a file.
     """
     if not Path(path).exists():
         raise NotFoundError(f"The elevation model {path} is not there any more; make it again.")
     try:
-        with rasterio.open(path) as file:
+        with rasterio.open(path, driver="GTiff") as file:
             names = file.descriptions
             transform, bands = file.transform, file.read()
     except RasterioIOError as error:

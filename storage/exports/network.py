@@ -17,7 +17,7 @@ _NAMESPACE = "http://www.gnu.org/software/gama/gama-local"
 _GON = 200.0 / np.pi
 _CC = 1e4 * _GON  # [cc/rad] centesimal seconds, in which Gama has sigmas of angles
 _MM = 1e3
-_EXACT = 2e-5  # [m] control that is better than this was given as exact
+_EXACT = 2e-5  # [m] control with a smaller sigma is exact
 _UNLEVELLED = 0.2  # [rad] sigma of a levelling that was left out
 COORDINATE_COLUMNS = (
     "kind", "name", "x_m", "y_m", "z_m", "sigma_x_m", "sigma_y_m", "sigma_z_m",
@@ -69,7 +69,7 @@ def write_coordinates(result: AdjustedNetwork, path: str | Path) -> None:
     result : AdjustedNetwork
         The network.
     path : str or Path
-        Where to.
+        The file.
     """
     Path(path).write_text(format_coordinates(result), encoding="utf-8")
 
@@ -80,9 +80,9 @@ def format_gama(result: AdjustedNetwork, description: str = "") -> str:
     Parameters
     ----------
     result : AdjustedNetwork
-        The network; what its tests left out is left out here too.
+        The network; observations that its tests excluded are not written.
     description : str
-        A sentence for people.
+        A sentence for the reader of the file.
 
     Returns
     -------
@@ -93,11 +93,11 @@ def format_gama(result: AdjustedNetwork, description: str = "") -> str:
 
     Notes
     -----
-    Gama knows levelled instruments only. What the levelling leaves uncertain turns all centres of
-    a station together and is in the covariance of the set, so that Gama solves the same problem. It
-    is linearised where the network ended: by half a degree of levelling a free network would else
-    lean by a millimetre. A set's orientation is the heading of the station. Distances are without
-    the range bias that the network found. Exact control marks are fixed, others are observed
+    Gama has levelled instruments only. The uncertainty of the levelling rotates all centres of a
+    station together and is in the covariance of the set, so that Gama solves the same problem. It
+    is linearised at the adjusted network: otherwise half a degree of levelling would tilt a free
+    network by a millimetre. The orientation of a set is the heading of the station. Distances are
+    corrected for the range bias of the network. Exact control marks are fixed, others are observed
     coordinates; in a free network the marks define the datum (``adj="XYZ"``).
     """
     root = ET.Element("gama-local", xmlns=_NAMESPACE)
@@ -124,9 +124,9 @@ def write_gama(result: AdjustedNetwork, path: str | Path, description: str = "")
     result : AdjustedNetwork
         The network.
     path : str or Path
-        Where to.
+        The file.
     description : str
-        A sentence for people.
+        A sentence for the reader of the file.
     """
     Path(path).write_text(format_gama(result, description), encoding="utf-8")
 
@@ -139,7 +139,7 @@ def _used_controls(result: AdjustedNetwork) -> list[tuple[int, int]]:
 
 
 def _fixed(result: AdjustedNetwork) -> dict[int, Array]:
-    """Return the coordinates of the marks that were given as exact."""
+    """Return the coordinates of exact control marks."""
     network = result.network
     return {
         mark: network.p_control_site[row]
@@ -165,7 +165,7 @@ def _add_point(parent: ET.Element, name: str, p: Array, status: dict[str, str]) 
 
 
 def _add_set(parent: ET.Element, result: AdjustedNetwork, station: int) -> None:
-    """Add what was observed from a station."""
+    """Add the observations of a station."""
     network, n = result.network, len(result.network.sightings)
     rows = np.flatnonzero((network.sightings[:, 0] == station) & result.used[:n])
     level = _level(result.T_site_station[station, :3, :3])
@@ -181,7 +181,7 @@ def _add_set(parent: ET.Element, result: AdjustedNetwork, station: int) -> None:
         cov_up = _UNLEVELLED**2 * np.diag([1.0, 1.0, 0.0])
     leaned = np.stack([-p[:, 2:] * [1, 0, 0], -p[:, 2:] * [0, 1, 0]], axis=2)
     leaned[:, 2, 0], leaned[:, 2, 1] = p[:, 0], p[:, 1]
-    leaned = J @ leaned  # by the two horizontal coordinates of the up direction
+    leaned = J @ leaned  # derivative by the horizontal coordinates of the up direction
     values = values + leaned @ level[:2, 2]
     cov += np.einsum("iak,kl,jbl->iajb", leaned, cov_up[:2, :2], leaned)
     group = ET.SubElement(parent, "obs", {"from": network.stations[station]})
@@ -196,7 +196,7 @@ def _add_set(parent: ET.Element, result: AdjustedNetwork, station: int) -> None:
 
 
 def _level(R_site_station: Array) -> Array:
-    """Return the rotation that makes a station as level as it was found to be, heading kept."""
+    """Return the levelling rotation of an adjusted station, without its heading."""
     yaw = yaw_pitch_roll(R_site_station)[0]
     return np.asarray(rot_z(-yaw) @ R_site_station)
 

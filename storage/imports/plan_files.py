@@ -1,4 +1,4 @@
-"""Files that go into a plan: marks, stops, and polygons where nothing may stand."""
+"""Input files of a plan: marks, stops, and polygons where no mark may stand."""
 
 from __future__ import annotations
 
@@ -26,8 +26,8 @@ def read_marks(path: str | Path) -> Arrangement:
     Parameters
     ----------
     path : str or Path
-        JSON with ``marks[]`` of ``name`` and ``position_m``, as ``spheremark plan`` writes it; or
-        CSV, of a plan or as control marks are.
+        JSON of ``spheremark plan`` with ``marks[]`` of ``name`` and ``position_m``; CSV of a plan,
+        or of control marks.
 
     Returns
     -------
@@ -37,7 +37,7 @@ def read_marks(path: str | Path) -> Arrangement:
     Raises
     ------
     InputError
-        If it holds no marks.
+        If it has no marks.
     """
     text = _text(path)
     if text.lstrip()[:1] in "[{":
@@ -52,20 +52,20 @@ def read_stops(path: str | Path) -> tuple[tuple[str, ...], Array]:
     Parameters
     ----------
     path : str or Path
-        CSV with columns for name, x, y and, if known, z; of a plan's CSV the rows of its stops; or
-        JSON with ``stops[]`` of ``name`` and ``position_m``.
+        CSV with columns for name, x, y and, if known, z; CSV of a plan, whose rows of stops are
+        read; or JSON with ``stops[]`` of ``name`` and ``position_m``.
 
     Returns
     -------
     names : tuple of str
-        What they are called.
+        Names of the stops.
     p_site : (s, 3)
-        Places of the LiDAR; NaN for a height that is not given [m].
+        Positions of the LiDAR; NaN for an unknown height [m].
 
     Raises
     ------
     InputError
-        If it holds no stops, or a number is none.
+        If it has no stops, or a value is not a number.
     """
     text, name = _text(path), Path(path).name
     if text.lstrip()[:1] in "[{":
@@ -83,7 +83,7 @@ def read_keep_out(path: str | Path) -> tuple[Array, ...]:
     Parameters
     ----------
     path : str or Path
-        GeoJSON with polygons in metres of the site frame; holes are not left out.
+        GeoJSON with polygons in metres of the site frame; holes are ignored.
 
     Returns
     -------
@@ -93,7 +93,7 @@ def read_keep_out(path: str | Path) -> tuple[Array, ...]:
     Raises
     ------
     InputError
-        If it is no GeoJSON, or holds no polygon.
+        If it is no GeoJSON, or has no polygon.
     """
     name = Path(path).name
     try:
@@ -106,7 +106,7 @@ def read_keep_out(path: str | Path) -> tuple[Array, ...]:
 
 
 def _text(path: str | Path) -> str:
-    """Return the text of a file of a sensible size."""
+    """Return the text of a file; refuse one that is too large."""
     path = Path(path)
     if path.stat().st_size > _SIZE_MAX:
         raise InputError(f"{path.name} has more than {_SIZE_MAX // 10**6} MB; that is no plan.")
@@ -117,7 +117,7 @@ def _text(path: str | Path) -> str:
 
 
 def _named_places(file: str, text: str, key: str) -> list[tuple[str, list[float]]]:
-    """Return names and places of a JSON answer."""
+    """Return names and positions of a JSON response."""
     try:
         values = json.loads(text)
         rows = values[key] if isinstance(values, Mapping) else values
@@ -136,7 +136,7 @@ def _named_places(file: str, text: str, key: str) -> list[tuple[str, list[float]
 
 
 def _marks_of_json(file: str, text: str) -> Arrangement:
-    """Return the marks of a JSON answer."""
+    """Return the marks of a JSON response."""
     rows = _named_places(file, text, "marks")
     return Arrangement(
         names=tuple(row[0] for row in rows), p_site=np.array([row[1] for row in rows])
@@ -144,7 +144,7 @@ def _marks_of_json(file: str, text: str) -> Arrangement:
 
 
 def _marks_of_plan(text: str) -> str:
-    """Return the marks of a plan's CSV as a table of control marks; other tables as they are."""
+    """Return the marks of a plan's CSV as a table of control marks; other tables unchanged."""
     rows = list(csv.DictReader(io.StringIO(text)))
     if not rows or "kind" not in rows[0]:
         return text

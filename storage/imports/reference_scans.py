@@ -1,7 +1,7 @@
-"""Real scans in the formats in which others publish them, for comparison with simulated ones.
+"""Published real scans, for comparison with simulated ones.
 
-Two formats: raw packets of a VLP-16, one after the other and nothing else (``.bin``), and points as
-text, x y z in a row (``.xyz``).
+Two formats: a sequence of raw packets of a VLP-16 (``.bin``), and points as text, x y z in a row
+(``.xyz``).
 """
 
 from __future__ import annotations
@@ -23,26 +23,26 @@ from spheremark.pipelines.scan.rigs import (
     RANGE_STEP,
 )
 
-_SHOT = np.dtype([("distance", "<u2"), ("reflectivity", "u1")])
+_RETURN = np.dtype([("distance", "<u2"), ("reflectivity", "u1")])
 _BLOCK = np.dtype(
-    [("flag", "<u2"), ("azimuth", "<u2"), ("shots", _SHOT, (FIRINGS_PER_BLOCK, N_LASERS))]
+    [("flag", "<u2"), ("azimuth", "<u2"), ("returns", _RETURN, (FIRINGS_PER_BLOCK, N_LASERS))]
 )
 _PACKET = np.dtype([("blocks", _BLOCK, N_BLOCKS), ("tail", "V6")])
 _FLAG = 0xEEFF
 
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
-class Shots:
-    """Returns of a real LiDAR as it measured them, in the order of firing.
+class MeasuredReturns:
+    """Measured returns of a real LiDAR, in the order of its pulses.
 
     Attributes
     ----------
     ranges : (n,)
         Measured distances [m].
     rings : (n,) uint8
-        Laser of each, 0 the lowest.
+        Laser of each return, 0 the lowest.
     offsets_ns : (n,)
-        Instants since the first shot, as if no packet were missing.
+        Instants since the first pulse, without gaps between packets.
     intensities : (n,)
         Reflectivity, 0-255.
     """
@@ -53,8 +53,8 @@ class Shots:
     intensities: Array
 
 
-def read_packets(path: Path) -> Shots:
-    """Read single-return packets of a VLP-16 that follow one another in a file.
+def read_packets(path: Path) -> MeasuredReturns:
+    """Read a file of single-return packets of a VLP-16.
 
     Parameters
     ----------
@@ -63,8 +63,8 @@ def read_packets(path: Path) -> Shots:
 
     Returns
     -------
-    Shots
-        What returned.
+    MeasuredReturns
+        The returns.
 
     Raises
     ------
@@ -79,24 +79,24 @@ def read_packets(path: Path) -> Shots:
             f"{path.name} holds {len(octets):,} bytes that are no VLP-16 packets of "
             f"{_PACKET.itemsize} bytes with 12 blocks each; give a file of whole packets."
         )
-    shots = packets["blocks"]["shots"].reshape(-1, N_LASERS)
-    firings, lasers = np.nonzero(shots["distance"])
+    returns = packets["blocks"]["returns"].reshape(-1, N_LASERS)
+    firings, lasers = np.nonzero(returns["distance"])
     seconds = firings * FIRING_CYCLE + lasers * LASER_CYCLE
-    return Shots(
-        ranges=shots["distance"][firings, lasers] * RANGE_STEP,
+    return MeasuredReturns(
+        ranges=returns["distance"][firings, lasers] * RANGE_STEP,
         rings=FIRING_ORDER[lasers].astype(np.uint8),
         offsets_ns=np.rint(seconds * 1e9).astype(np.int64),
-        intensities=shots["reflectivity"][firings, lasers].astype(np.float64),
+        intensities=returns["reflectivity"][firings, lasers].astype(np.float64),
     )
 
 
 def read_points(path: Path) -> Column:
-    """Read points that are written as text.
+    """Read points from text.
 
     Parameters
     ----------
     path : Path
-        One point in a row: x y z in metres; more columns are left out.
+        One point in a row: x y z in metres; further columns are ignored.
 
     Returns
     -------

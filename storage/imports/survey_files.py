@@ -1,7 +1,6 @@
-"""Files that come with a survey: control marks (CSV), truth and rig (JSON).
+"""Input files of a survey: control marks (CSV), truth and rig (JSON).
 
-A table or an object that cannot be used is refused with the row, the column and what was expected;
-nothing is repaired silently.
+An error names the row, the column and what was expected; nothing is repaired silently.
 """
 
 from __future__ import annotations
@@ -58,8 +57,8 @@ _AXES = {
 }
 _UNITS = {"m": 1.0, "mm": 1e-3, "ft": 0.3048, "us-ft": 1200.0 / 3937.0}
 _ROWS_MAX = 10_000
-_SIZE_MAX = 4_000_000  # characters; far more than so many rows need
-_APART_MIN = 0.01  # [m] marks nearer than this are one mark twice
+_SIZE_MAX = 4_000_000  # characters; far more than 10,000 rows need
+_APART_MIN = 0.01  # [m] nearer marks are one mark entered twice
 _COORDINATE_MAX = 1e8  # [m] larger than any national grid
 _EXPECTED = "expected mark,x_m,y_m,z_m and, if known, sigma_x_m,sigma_y_m,sigma_z_m [m]"
 _HEIGHT_MAX = 100.0  # [m] of a target above its mark
@@ -70,18 +69,17 @@ _T = TypeVar("_T")
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ControlLayout:
-    """How to read a table of control marks where it does not say so itself.
+    """Layout of a table of control marks, for what its header does not specify.
 
     Attributes
     ----------
     axes : str
-        What three coordinates without names, or called x, y and z, are: ``enu`` (east, north, up),
-        ``neu`` or ``ned`` (down). Columns called easting, northing or the like say it themselves.
+        Axes of three coordinates without names, or named x, y and z: ``enu`` (east, north, up),
+        ``neu`` or ``ned`` (down). Columns named easting, northing and the like specify them.
     unit : str
         Unit of coordinates and their sigmas: ``m``, ``mm``, ``ft`` or ``us-ft``.
     target_height : float
-        Height of the centres above the given points, where a column of the table does not give it
-        mark by mark [m].
+        Height of the centres above the given points, without a column for it [m].
     """
 
     axes: str = "enu"
@@ -110,17 +108,17 @@ def parse_control(text: str, layout: ControlLayout = _PLAIN) -> ControlMarks:
     Parameters
     ----------
     text : str
-        CSV with comma, semicolon or tab. Columns are found by their usual names in any order and
-        case (``P,N,E,Z,D`` too, whose last is a description); without a header they are mark, three
-        coordinates and, if there are seven, three sigmas, or a description if there are five. Empty
-        lines and what follows a ``#`` are skipped.
+        CSV with comma, semicolon or tab. Columns have their usual names in any order and case
+        (also ``P,N,E,Z,D`` with a description as the last); without a header they are mark, three
+        coordinates and, of seven, three sigmas, or, of five, a description. Empty lines and
+        comments after ``#`` are skipped.
     layout : ControlLayout
-        What the table does not say itself.
+        The layout where the header does not specify it.
 
     Returns
     -------
     ControlMarks
-        The marks in the order of the table; without sigmas they count as exact.
+        The marks in the order of the table; exact without sigmas.
 
     Raises
     ------
@@ -154,7 +152,7 @@ def format_control(marks: ControlMarks) -> str:
     Returns
     -------
     str
-        The table; numbers as exact as they are.
+        The table, with all digits of the numbers.
     """
     sigmas = np.sqrt(np.diagonal(marks.cov_p_site, axis1=1, axis2=2))
     lines = [",".join(CONTROL_COLUMNS)]
@@ -169,7 +167,7 @@ def parse_truth(text: str) -> Truth:
     Parameters
     ----------
     text : str
-        JSON as ``format_truth`` writes it.
+        JSON of ``format_truth``.
 
     Returns
     -------
@@ -190,7 +188,7 @@ def parse_truth(text: str) -> Truth:
         return _truth(values)
     except (KeyError, TypeError, ValueError, AttributeError) as error:
         raise TruthError(
-            f"The truth file does not hold what it should ({type(error).__name__}: {error}); "
+            f"The truth file is incomplete ({type(error).__name__}: {error}); "
             "expected marks with name and position_m, and stops with name, position_m and "
             "rotation_site_base."
         ) from error
@@ -254,7 +252,7 @@ def format_rig(rig: Rig) -> str:
     Returns
     -------
     str
-        Its mapping, as ``pipelines.scan.rigs`` defines it.
+        The mapping of ``rig_to_mapping``.
     """
     return json.dumps(rig_to_mapping(rig), indent=1, allow_nan=False) + "\n"
 
@@ -267,19 +265,12 @@ def read_control(path: str | Path, layout: ControlLayout = _PLAIN) -> ControlMar
     path : str or Path
         The file.
     layout : ControlLayout
-        What the file does not say itself.
+        The layout where the header does not specify it.
 
     Returns
     -------
     ControlMarks
         The marks.
-
-    Raises
-    ------
-    NotFoundError
-        If there is no such file.
-    ControlError
-        If it cannot be used.
     """
     return _read(path, lambda text: parse_control(text, layout), ControlError)
 
@@ -298,25 +289,7 @@ def write_control(marks: ControlMarks, path: str | Path) -> None:
 
 
 def read_truth(path: str | Path) -> Truth:
-    """Read the truth of a survey from a file, as ``parse_truth`` does.
-
-    Parameters
-    ----------
-    path : str or Path
-        The file.
-
-    Returns
-    -------
-    Truth
-        The truth.
-
-    Raises
-    ------
-    NotFoundError
-        If there is no such file.
-    TruthError
-        If it cannot be used.
-    """
+    """Read the truth of a survey from a file, as ``parse_truth`` does."""
     return _read(path, parse_truth, TruthError)
 
 
@@ -334,38 +307,12 @@ def write_truth(truth: Truth, path: str | Path) -> None:
 
 
 def read_rig(path: str | Path) -> Rig:
-    """Read a rig from a file, as ``parse_rig`` does.
-
-    Parameters
-    ----------
-    path : str or Path
-        The file.
-
-    Returns
-    -------
-    Rig
-        The rig.
-
-    Raises
-    ------
-    NotFoundError
-        If there is no such file.
-    RigError
-        If it cannot be used.
-    """
+    """Read a rig from a file, as ``parse_rig`` does."""
     return _read(path, parse_rig, RigError)
 
 
 def write_rig(rig: Rig, path: str | Path) -> None:
-    """Write a rig to a JSON file.
-
-    Parameters
-    ----------
-    rig : Rig
-        The rig.
-    path : str or Path
-        The file; replaced if it exists.
-    """
+    """Write a rig to a JSON file."""
     Path(path).write_text(format_rig(rig), encoding="utf-8")
 
 
@@ -406,7 +353,7 @@ class _Row:
         return name
 
     def position(self, layout: ControlLayout) -> list[float]:
-        """Return the place of the centre [m]."""
+        """Return the position of the centre [m]."""
         unit = _UNITS[layout.unit]
         is_down = "down_m" in self.columns
         x, y = unit * self.number("x_m"), unit * self.number("y_m")
@@ -434,7 +381,7 @@ class _Row:
 
 
 def _rows(text: str) -> Iterator[tuple[int, list[str]]]:
-    """Give number and cells of each line that holds something."""
+    """Yield the number and the cells of each line that is not empty."""
     lines = [_without_comment(line).strip() for line in text.lstrip("\ufeff").splitlines()]
     first = next((line for line in lines if line), "")
     separator = max("\t;,", key=first.count)
@@ -465,7 +412,7 @@ def _columns(
 
 
 def _named(header: list[str], axes: str) -> list[str]:
-    """Return what each column of a header is."""
+    """Return the column of each name in a header."""
     words = [cell.lower() for cell in header]
     columns = [_NAMES.get(word, "") for word in words]
     unknown = [cell for cell, column in zip(header, columns, strict=True) if not column]
@@ -474,7 +421,7 @@ def _named(header: list[str], axes: str) -> list[str]:
             f"The control table has the unknown column {unknown[0]!r} ({', '.join(header)}); "
             f"{_EXPECTED}."
         )
-    if "z_m" in columns:  # a d beside a height is the description of P,N,E,Z,D
+    if "z_m" in columns:  # the D of P,N,E,Z,D is a description
         columns = ["note" if column == "down_m" else column for column in columns]
     turned = dict(zip(("x", "y", "z"), _AXES[axes], strict=True))
     if axes != "enu":
@@ -487,7 +434,7 @@ def _named(header: list[str], axes: str) -> list[str]:
 
 
 def _require_columns(columns: list[str], header: list[str]) -> None:
-    """Refuse a header that lacks something or has it twice."""
+    """Refuse a header with a missing or a repeated column."""
     doubled = [column for column in columns if columns.count(column) > 1 and column != "note"]
     third = "down_m" if "down_m" in columns else "z_m"
     missing = [column for column in ("mark", "x_m", "y_m", third) if column not in columns]
@@ -500,7 +447,7 @@ def _require_columns(columns: list[str], header: list[str]) -> None:
 
 
 def _is_number(cell: str) -> bool:
-    """Say whether a cell reads as a number, be it finite or not."""
+    """Return whether a cell is a number, finite or not."""
     try:
         float(cell)
     except ValueError:
@@ -509,7 +456,7 @@ def _is_number(cell: str) -> bool:
 
 
 def _marks(rows: list[_Row], layout: ControlLayout) -> ControlMarks:
-    """Build the marks, all different in name and place."""
+    """Return the marks; refuse equal names or positions."""
     lines: dict[str, int] = {}
     for row in rows:
         if row.name() in lines:
@@ -527,7 +474,7 @@ def _marks(rows: list[_Row], layout: ControlLayout) -> ControlMarks:
 
 
 def _require_apart(p: Array, rows: list[_Row]) -> None:
-    """Refuse two marks at one place; only neighbours in x can be."""
+    """Refuse two marks at one position; only neighbours in x are compared."""
     order = np.argsort(p[:, 0], kind="stable")
     for step in range(1, len(p)):
         near = p[order[step:], 0] - p[order[:-step], 0] < _APART_MIN
@@ -551,7 +498,7 @@ def _quoted(name: str) -> str:
 
 
 def _truth(values: Mapping[str, Any]) -> Truth:
-    """Build the truth from a JSON object."""
+    """Return the truth of a JSON object."""
     names = tuple(str(mark["name"]) for mark in values["marks"])
     p = np.array([_vector(mark["position_m"]) for mark in values["marks"]]).reshape(-1, 3)
     stops = tuple(

@@ -20,8 +20,8 @@ from spheremark.storage.catalogue.calibrations import SCHEMAS as CALIBRATION_SCH
 from spheremark.storage.catalogue.calibrations import tables as calibration_tables
 from spheremark.storage.catalogue.catalogue import Catalogue
 from spheremark.storage.catalogue.centres import read_centres
-from spheremark.storage.catalogue.documents import documents
 from spheremark.storage.catalogue.migrations import migrate, released
+from spheremark.storage.catalogue.products import documents
 from tests.storage.made_up import made_tables, stop
 
 AWAY = rigid(rot_z(1.1), [40.0, -3.0, 2.0])  # where the free network lies

@@ -2,12 +2,11 @@ from dataclasses import replace
 
 import fsspec
 import numpy as np
-import open3d as o3d
 import pyarrow.parquet as pq
 import pytest
 
 from spheremark.pipelines.errors import InputError, NotFoundError
-from spheremark.storage.clouds.stop import NO_MARKER, read_cloud, to_ply, view, write_cloud
+from spheremark.storage.clouds.stop import NO_MARKER, read_cloud, view, write_cloud
 from tests.storage.made_up import R_station_base, stop
 
 MEMBERS = 60  # ten on each of six marks
@@ -118,13 +117,3 @@ def test_others_can_read_the_parquet_file(tmp_path):
     assert table.column_names == [
         "x_m", "y_m", "z_m", "intensity", "is_near", "marker", "residual_m",
     ]  # fmt: skip
-
-
-def test_others_can_read_the_ply_file(tmp_path):
-    cloud = view(stop(), 500)
-    (tmp_path / "cloud.ply").write_bytes(to_ply(cloud))
-    found = o3d.t.io.read_point_cloud(str(tmp_path / "cloud.ply")).point
-    np.testing.assert_array_equal(found.positions.numpy(), cloud.p_station)
-    np.testing.assert_array_equal(found.intensity.numpy()[:, 0], cloud.intensities)
-    np.testing.assert_array_equal(found.marker.numpy()[:, 0], cloud.markers)
-    np.testing.assert_array_equal(found.residual.numpy()[:, 0], cloud.residuals)

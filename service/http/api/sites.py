@@ -15,7 +15,7 @@ from spheremark.service.http.api.models import Listing
 from spheremark.service.http.api.surveys import Key
 from spheremark.service.http.state import Current, Service
 from spheremark.service.jobs.site import ENDINGS, MEDIA_TYPES
-from spheremark.storage.catalogue.products import read_file
+from spheremark.storage.files import read_file
 
 router = APIRouter(tags=["products"])
 

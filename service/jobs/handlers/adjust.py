@@ -116,7 +116,7 @@ def work(order: Order, progress: Progress) -> Outcome:
     from spheremark.service.log_files import Fieldbook, adjust_scans, adjusted_rig
     from spheremark.service.serialise.network import serialise_network
     from spheremark.storage.catalogue import adjustments
-    from spheremark.storage.catalogue.documents import documents
+    from spheremark.storage.catalogue.products import documents
 
     start = perf_counter()
     with_rig = bool(order.options.get("calibrate"))

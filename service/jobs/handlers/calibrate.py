@@ -50,7 +50,7 @@ def logs_of(order: Order) -> Iterable[ScanLog]:
 def work(order: Order, progress: Progress) -> Outcome:
     """Calibrate the rig of the logs of an order."""
     from spheremark.pipelines.calibration import calibrate
-    from spheremark.storage.catalogue.documents import documents
+    from spheremark.storage.catalogue.products import documents
 
     start = perf_counter()
     found = calibrate(

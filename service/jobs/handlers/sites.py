@@ -97,7 +97,8 @@ def gather(catalogue: Catalogue, order: Order) -> Mapping[str, pa.Table]:
 def work(order: Order, progress: Progress) -> Outcome:
     """Make the products of a site."""
     from spheremark.service.jobs.site import ENDINGS, KINDS, SiteWish, make_site
-    from spheremark.storage.catalogue.products import keep_file, product_rows
+    from spheremark.storage.catalogue.products import product_rows
+    from spheremark.storage.files import keep_file
 
     own = {key: order.options[key] for key in SiteOptions.model_fields if key in order.options}
     options = SiteOptions.model_validate(own).model_dump()

@@ -35,17 +35,7 @@ class SchemaConflictError(ConflictError):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Migration:
-    """One numbered step of the schema.
-
-    Attributes
-    ----------
-    number : int
-        Its place, from 1.
-    name : str
-        What it is about.
-    sql : str
-        Its statements.
-    """
+    """One numbered step of the schema, from 1: its name and its statements."""
 
     number: int
     name: str
@@ -58,7 +48,7 @@ class Migration:
 
 
 def released() -> tuple[Migration, ...]:
-    """Return the migrations that come with this version, in their order."""
+    """Return the migrations of this version, in order."""
     files = (f for f in resources.files(__name__).iterdir() if f.name.endswith(".sql"))
     return tuple(
         Migration(
@@ -73,7 +63,7 @@ def released() -> tuple[Migration, ...]:
 def migrate(
     connection: duckdb.DuckDBPyConnection, migrations: tuple[Migration, ...]
 ) -> tuple[int, ...]:
-    """Bring a database to the newest schema."""
+    """Apply the missing migrations to a database and return their numbers."""
     connection.execute(_LEDGER)
     applied = {
         int(number): (str(name), str(sha256))
@@ -89,7 +79,7 @@ def migrate(
 
 
 def _check(applied: dict[int, tuple[str, str]], known: dict[int, Migration]) -> None:
-    """Refuse a database whose applied migrations are not the first ones of the known."""
+    """Refuse a database whose applied migrations are unknown or changed."""
     for number, (name, sha256) in applied.items():
         if number not in known:
             raise SchemaConflictError(
