@@ -8,10 +8,11 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.spatial.transform import Rotation
 
-from spheremark.pipelines.model import Array, Levelling
+from spheremark.pipelines.model import Array, Levelling, Mask
 
 _SMALL = 1e-9  # [rad]; below it the series of the exponential is exact in float64
 _LINE = 0.05  # spread across over spread along of points on a line; 3 deg seen from the end
+_PLUMB = 0.05  # the same of points on a plumb line, which give no heading
 
 
 def skew(v: ArrayLike) -> Array:
@@ -286,6 +287,43 @@ def is_on_a_line(p: ArrayLike) -> bool:
         return True
     spreads = np.linalg.svd(points - points.mean(axis=0), compute_uv=False)
     return bool(spreads[1] < _LINE * spreads[0])
+
+
+def has_heading(p: Array) -> Mask:
+    """Return whether points are far enough from one plumb line to give a heading.
+
+    Parameters
+    ----------
+    p : (..., n, 3)
+        Groups of points in a levelled frame [m].
+
+    Returns
+    -------
+    (...) bool
+        True where they spread across the plumb line by more than a twentieth of their spread.
+    """
+    off = p - p.mean(axis=-2, keepdims=True)
+    across = np.linalg.norm(off[..., :2], axis=(-2, -1))
+    return np.asarray(across > _PLUMB * np.linalg.norm(off, axis=(-2, -1)))
+
+
+def by_motion(p: Array) -> Array:
+    """Return the derivative of points by a small motion on the left.
+
+    Parameters
+    ----------
+    p : (..., 3)
+        Points [m].
+
+    Returns
+    -------
+    (..., 3, 6)
+        ``[-[p]x, 1]``.
+    """
+    J = np.zeros((*p.shape, 6))
+    J[..., :3] = -skew(p)
+    J[..., 0, 3] = J[..., 1, 4] = J[..., 2, 5] = 1.0
+    return J
 
 
 def wrap(angle: ArrayLike) -> Array:

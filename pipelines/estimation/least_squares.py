@@ -1,34 +1,35 @@
-"""Weighted least squares with the statistics of geodesy: the one place where they are solved.
+"""Weighted least squares of dense problems, one or many at once.
 
 Observations come in groups of equal blocks; blocks do not correlate with each other, the
 coordinates within a block do. Residual = observed - computed. Unknowns may live on a manifold:
 the caller says how a small change moves the state. Letters: ``J`` derivative of the residuals by
-the unknowns, ``Q`` cofactor (covariance), ``P`` its inverse, ``N`` normal matrix, after Teunissen,
-Testing Theory (2006).
+the unknowns, ``Q`` cofactor (covariance), ``P`` its inverse, ``N`` normal matrix.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Generic, TypeVar
 
 import numpy as np
-from scipy.special import chdtrc, ndtri
 
 from spheremark.pipelines.errors import (
     DegenerateGeometryError,
     NotConvergedError,
     TooFewObservationsError,
 )
+from spheremark.pipelines.estimation.linear_algebra import SINGULAR, invert_each
+from spheremark.pipelines.estimation.statistical_tests import (
+    BlockStatistics,
+    block_statistics,
+    critical_w,
+    noncentrality,
+    passes_global_test,
+)
 from spheremark.pipelines.model import Array, Index, Mask
-
-State = TypeVar("State")
 
 _STEPS = 50  # three to six suffice; more mean that the start was useless
 _SETTLED = 1e-12  # square of the last step in standard deviations
-_SINGULAR = 1e-11  # eigenvalue of the normal matrix with unit diagonal
-_UNTESTABLE = 1e-7  # redundancy below which a bias cannot show
 
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
@@ -52,37 +53,71 @@ class Observations:
     cov: Array
 
 
+Groups = tuple[Observations, ...]
+Move = Callable[[Array, Array], Array]
+"""Gives states after small changes, (..., p), of the unknowns."""
+
+
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
-class Solution(Generic[State]):
+class Solution:
     """Where the weighted sum of squares is least.
 
     Attributes
     ----------
-    estimate : State
+    estimate : array
         The unknowns.
-    cov : (..., p, p)
+    cov : (p, p)
         Covariance of a small change of the estimate.
     groups : tuple of Observations
         The observations at the estimate.
     """
 
-    estimate: State
+    estimate: Array
     cov: Array
-    groups: tuple[Observations, ...]
+    groups: Groups
+
+    @property
+    def vtpv(self) -> float:
+        """Weighted sum of squares of the residuals."""
+        return sum(
+            float(np.einsum("km,kmn,kn->", g.residuals, invert_each(g.cov)[0], g.residuals))
+            for g in self.groups
+        )
 
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
-class Adjustment(Generic[State]):
+class Solutions:
+    """Solutions of independent problems.
+
+    Attributes
+    ----------
+    estimates : (s, ...)
+        The unknowns of each problem.
+    covs : (s, p, p)
+        Covariances of small changes; NaN where the unknowns are undetermined.
+    is_settled : (s,)
+        Whether the steps became small.
+    """
+
+    estimates: Array
+    covs: Array
+    is_settled: Mask
+
+
+@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
+class Adjustment:
     """An estimate with the statistics of its blocks, in the order of the groups.
 
     Attributes
     ----------
-    estimate : State
+    estimate : array
         The unknowns.
     cov : (p, p)
         Covariance of a small change of the estimate, by the a-priori sigmas.
     groups : tuple of Observations
         The observations at the estimate.
+    statistics : tuple of BlockStatistics
+        Tests of the blocks of each group.
     dof : int
         Degrees of freedom: observations minus unknowns.
     vtpv : float
@@ -90,8 +125,7 @@ class Adjustment(Generic[State]):
     sigma0 : float
         Square root of the a-posteriori variance factor; NaN without redundancy.
     passes_global_test : bool
-        Whether ``vtpv`` is no larger than the sigmas promise, at the level of the test; true
-        without redundancy.
+        Whether ``vtpv`` is no larger than the sigmas promise, at the level of the test.
     redundancies : (b,)
         Redundancy of each block's observations together.
     w_statistics : (b,)
@@ -104,9 +138,10 @@ class Adjustment(Generic[State]):
         Largest w that good data have, at the level of the test.
     """
 
-    estimate: State
+    estimate: Array
     cov: Array
-    groups: tuple[Observations, ...]
+    groups: Groups
+    statistics: tuple[BlockStatistics, ...]
     dof: int
     vtpv: float
     sigma0: float
@@ -117,12 +152,98 @@ class Adjustment(Generic[State]):
     noncentrality: float
     critical_w: float
 
+    def external_reliabilities(self, J_of_interest: Array) -> Array:
+        """Return how far a bias that stays unseen can move something of interest.
 
-def solve(
-    linearise: Callable[[State], tuple[Observations, ...]],
-    move: Callable[[State, Array], State],
-    start: State,
-) -> Solution[State]:
+        Parameters
+        ----------
+        J_of_interest : (q, p)
+            Derivative of what is of interest by a small change of the unknowns.
+
+        Returns
+        -------
+        (b,)
+            Length of the largest shift by a bias of just detectable size in each block; infinite
+            where a bias in some direction cannot be detected.
+
+        Notes
+        -----
+        A bias ``b`` moves the unknowns by ``Q_x J' P b`` (Baarda 1968).
+        """
+        gain, shifts = J_of_interest @ self.cov, []
+        for group, statistics in zip(self.groups, self.statistics, strict=True):
+            effects = gain @ np.swapaxes(group.J, -1, -2) @ invert_each(group.cov)[0]
+            shifts.append(statistics.external_reliabilities(effects, self.noncentrality))
+        return np.concatenate(shifts)
+
+
+def normal_equations(groups: Groups) -> tuple[Array, Array]:
+    """Sum the normal equations of groups of observations.
+
+    Parameters
+    ----------
+    groups : tuple of Observations
+        Groups of the same problem, or of the same problems.
+
+    Returns
+    -------
+    tuple
+        Normal matrices, (..., p, p), and right-hand sides, (..., p), of the step that makes the
+        weighted sum of squares least.
+    """
+    summed: Array = np.zeros(())
+    for group in groups:
+        *problems, k, m, p = group.J.shape
+        columns = np.concatenate([group.J, group.residuals[..., None]], axis=-1)
+        weighted = (invert_each(group.cov)[0] @ columns).reshape(*problems, k * m, p + 1)
+        J = group.J.reshape(*problems, k * m, p)
+        summed = summed + np.swapaxes(J, -1, -2) @ weighted
+    return summed[..., :-1], -summed[..., -1]
+
+
+def solve_each(linearise: Callable[[Array, Index], Groups], move: Move, start: Array) -> Solutions:
+    """Solve independent problems of the same shape.
+
+    Parameters
+    ----------
+    linearise : callable
+        Gives the observations of some of the problems: at their states, and with their places.
+    move : callable
+        Gives states after small changes.
+    start : (s, ...)
+        Approximate unknowns of each problem.
+
+    Returns
+    -------
+    Solutions
+        What each problem gives; one that is singular or does not settle spoils no other.
+
+    Notes
+    -----
+    Gauss-Newton; covariances may depend on the state and are taken anew at each step. A problem
+    that has settled is not touched any more. Cost per step grows linearly with the blocks and with
+    the third power of the unknowns.
+    """
+    states, rows = np.array(start), np.arange(len(start))
+    covs, is_settled = np.zeros((0, 0, 0)), np.zeros(len(start), dtype=np.bool_)
+    for step in range(_STEPS):
+        N, rhs = normal_equations(linearise(states[rows], rows))
+        cov, is_regular = invert_each(N)
+        steps = np.where(is_regular[:, None], np.einsum("spq,sq->sp", cov, rhs), 0.0)
+        states[rows] = move(states[rows], steps)
+        if step == 0:
+            covs = cov
+        else:
+            covs[rows] = cov
+        squares = np.einsum("sp,sp->s", steps, rhs)
+        is_settled[rows] = is_regular & (squares < _SETTLED)
+        rows = rows[is_regular & (squares >= _SETTLED)]  # NaN is neither
+        if not len(rows):
+            break
+    return Solutions(estimates=states, covs=covs, is_settled=is_settled)
+
+
+def solve(linearise: Callable[[Array], Groups], move: Move, start: Array) -> Solution:
     """Find the unknowns for which the weighted sum of squares is least.
 
     Parameters
@@ -130,14 +251,14 @@ def solve(
     linearise : callable
         Gives the observations at a state.
     move : callable
-        Gives the state after a small change, (..., p), of the unknowns.
-    start : State
+        Gives the state after a small change, (p,), of the unknowns.
+    start : array
         Approximate unknowns.
 
     Returns
     -------
     Solution
-        Estimate and covariance; of every problem, when there are leading dimensions.
+        Estimate and covariance.
 
     Raises
     ------
@@ -148,75 +269,49 @@ def solve(
 
     Notes
     -----
-    Gauss-Newton; covariances may depend on the state and are taken anew at each step. Cost per
-    step grows linearly with the blocks and with the third power of the unknowns.
+    As ``solve_each``.
     """
-    return _solve(linearise, move, start, linearise(start))
+
+    def alone(states: Array, _rows: Index) -> Groups:
+        return tuple(
+            Observations(residuals=g.residuals[None], J=g.J[None], cov=g.cov[None])
+            for g in linearise(states[0])
+        )
+
+    found = solve_each(alone, lambda states, steps: move(states[0], steps[0])[None], start[None])
+    groups = linearise(found.estimates[0])
+    N, _ = normal_equations(groups)
+    cov, is_regular = invert_each(N)
+    if not (found.is_settled[0] and is_regular):
+        raise _why_unsettled(N, is_regular=bool(is_regular))
+    return Solution(estimate=found.estimates[0], cov=cov, groups=groups)
 
 
-def _solve(
-    linearise: Callable[[State], tuple[Observations, ...]],
-    move: Callable[[State, Array], State],
-    state: State,
-    groups: tuple[Observations, ...],
-) -> Solution[State]:
-    """Return the solution from a state and the observations at it."""
-    for _ in range(_STEPS):
-        N, gradient = _normal_equations(groups)
-        step = -(_inverse(_regular(N)) @ gradient[..., None])[..., 0]
-        state = move(state, step)
-        groups = linearise(state)
-        if np.all(np.einsum("...p,...pq,...q->...", step, N, step) < _SETTLED):
-            return Solution(
-                estimate=state, cov=_inverse(_normal_equations(groups)[0]), groups=groups
-            )
-    raise NotConvergedError(
-        f"The adjustment did not settle within {_STEPS} steps; the approximate values are too far "
-        "off or the observations contradict each other."
+def _why_unsettled(N: Array, *, is_regular: bool) -> DegenerateGeometryError | NotConvergedError:
+    """Return why there is no solution, from the last normal matrix."""
+    if is_regular:
+        return NotConvergedError(
+            f"The adjustment did not settle within {_STEPS} steps; the approximate values are too "
+            "far off or the observations contradict each other."
+        )
+    scale = np.sqrt(np.diag(N))
+    if not np.all(scale > 0.0):
+        return DegenerateGeometryError("The observations do not touch every unknown.")
+    smallest = float(np.linalg.eigvalsh(N / np.outer(scale, scale))[0])
+    return DegenerateGeometryError(
+        "The observations leave an unknown undetermined (smallest eigenvalue of the scaled normal "
+        f"matrix {smallest:.1e}, at least {SINGULAR:.0e} is needed)."
     )
 
 
-def _normal_equations(groups: tuple[Observations, ...]) -> tuple[Array, Array]:
-    """Return the normal matrix and the gradient of half the weighted sum of squares."""
-    summed: Array = np.zeros(())
-    for group in groups:
-        *problems, k, m, p = group.J.shape
-        columns = np.concatenate([group.J, group.residuals[..., None]], axis=-1)
-        weighted = np.linalg.solve(group.cov, columns).reshape(*problems, k * m, p + 1)
-        J = group.J.reshape(*problems, k * m, p)
-        summed = summed + np.swapaxes(J, -1, -2) @ weighted
-    return summed[..., :-1], summed[..., -1]
-
-
-def _inverse(matrix: Array) -> Array:
-    """Return the inverse of the last two dimensions."""
-    return np.asarray(np.linalg.inv(matrix), dtype=np.float64)
-
-
-def _regular(N: Array) -> Array:
-    """Return the normal matrix if it has an inverse."""
-    scale = np.sqrt(np.einsum("...pp->...p", N))
-    with np.errstate(divide="ignore", invalid="ignore"):
-        scaled = N / (scale[..., None] * scale[..., None, :])
-    if not np.all(np.isfinite(scaled)):
-        raise DegenerateGeometryError("The observations do not touch every unknown.")
-    smallest = float(np.linalg.eigvalsh(scaled).min())
-    if smallest < _SINGULAR:
-        raise DegenerateGeometryError(
-            "The observations leave an unknown undetermined (smallest eigenvalue of the scaled "
-            f"normal matrix {smallest:.1e}, at least {_SINGULAR:.0e} is needed)."
-        )
-    return N
-
-
 def adjust(
-    linearise: Callable[[State], tuple[Observations, ...]],
-    move: Callable[[State, Array], State],
-    start: State,
+    linearise: Callable[[Array], Groups],
+    move: Move,
+    start: Array,
     *,
     test_level: float,
     test_power: float,
-) -> Adjustment[State]:
+) -> Adjustment:
     """Solve one problem and test it.
 
     Parameters
@@ -225,7 +320,7 @@ def adjust(
         Gives the observations at a state.
     move : callable
         Gives the state after a small change, (p,), of the unknowns.
-    start : State
+    start : array
         Approximate unknowns.
     test_level : float
         Probability with which the global test and each w-test reject good data.
@@ -245,184 +340,38 @@ def adjust(
         If the observations leave an unknown undetermined.
     NotConvergedError
         If the steps do not become small.
-
-    Notes
-    -----
-    The global test is one-sided: residuals that are too small do no harm. With
-    ``Q_v = Q - J Q_x J'``, a block has redundancy ``trace(Q_v P)`` and a coordinate
-    ``w = (P v) / sqrt((P Q_v P))``, elementwise on vector and diagonal (Teunissen 2006, section
-    4.3); the minimal detectable bias along the weakest axis is ``sqrt(lambda0 / e)``, ``e`` the
-    smallest eigenvalue of the block of ``P Q_v P`` (Baarda 1968).
     """
-    first = linearise(start)
-    dof = _degrees_of_freedom(first)
-    solution = _solve(linearise, move, start, first)
-    vtpv = sum(_vtpv(group) for group in solution.groups)
-    noncentrality = float(ndtri(1.0 - test_level / 2.0) + ndtri(test_power))
-    statistics = [_block_statistics(group, solution.cov) for group in solution.groups]
-    redundancies, w_statistics, weakest = (np.concatenate(c) for c in zip(*statistics, strict=True))
-    with np.errstate(divide="ignore"):
-        detectable = noncentrality / np.sqrt(weakest)
+    dof = _degrees_of_freedom(linearise(start))
+    solution = solve(linearise, move, start)
+    vtpv, shift = solution.vtpv, noncentrality(test_level, test_power)
+    statistics = tuple(
+        block_statistics(
+            g.residuals,
+            invert_each(g.cov)[0],
+            g.J @ solution.cov @ np.swapaxes(g.J, -1, -2),
+        )
+        for g in solution.groups
+    )
     return Adjustment(
         estimate=solution.estimate,
         cov=solution.cov,
         groups=solution.groups,
+        statistics=statistics,
         dof=dof,
         vtpv=vtpv,
         sigma0=float(np.sqrt(vtpv / dof)) if dof else np.nan,
-        passes_global_test=dof == 0 or bool(chdtrc(dof, vtpv) >= test_level),
-        redundancies=redundancies,
-        w_statistics=w_statistics,
-        detectable_biases=detectable,
-        noncentrality=noncentrality,
-        critical_w=float(ndtri(1.0 - test_level / 2.0)),
+        passes_global_test=passes_global_test(vtpv, dof, test_level),
+        redundancies=np.concatenate([s.redundancies for s in statistics]),
+        w_statistics=np.concatenate([s.w for s in statistics]),
+        detectable_biases=np.concatenate([s.detectable_biases(shift) for s in statistics]),
+        noncentrality=shift,
+        critical_w=critical_w(test_level),
     )
 
 
-def _degrees_of_freedom(groups: tuple[Observations, ...]) -> int:
+def _degrees_of_freedom(groups: Groups) -> int:
     """Return the number of observations minus that of the unknowns, if it is not negative."""
     n, p = sum(group.residuals.size for group in groups), int(groups[0].J.shape[-1])
     if n < p:
         raise TooFewObservationsError(f"{n} observations cannot determine {p} unknowns.")
     return n - p
-
-
-def _vtpv(group: Observations) -> float:
-    """Return the weighted sum of squares of a group."""
-    v = group.residuals
-    return float(np.einsum("km,kmn,kn->", v, _inverse(group.cov), v))
-
-
-def _testability(group: Observations, cov: Array) -> tuple[Array, Array]:
-    """Return each block's ``P`` and ``P Q_v P``."""
-    weights = _inverse(group.cov)
-    weighted = weights @ group.J
-    return weights, weights - weighted @ cov @ np.swapaxes(weighted, -1, -2)
-
-
-def _block_statistics(group: Observations, cov: Array) -> tuple[Array, Array, Array]:
-    """Return redundancy, largest w and weakest testability (0 if untestable) of each block."""
-    weights, tested = _testability(group, cov)
-    redundancies = np.einsum("kmn,knm->k", tested, group.cov)
-    squares = np.einsum("kmm->km", tested)
-    testable = squares > _UNTESTABLE * np.einsum("kmm->km", weights)
-    weighted = np.abs(np.einsum("kmn,kn->km", weights, group.residuals))
-    w = np.where(testable, weighted / np.sqrt(np.where(testable, squares, 1.0)), -1.0).max(axis=1)
-    weakest = np.asarray(np.linalg.eigvalsh(tested)[:, 0], dtype=np.float64)
-    weakest[weakest < _UNTESTABLE * np.linalg.eigvalsh(weights)[:, 0]] = 0.0
-    return redundancies, np.where(w < 0, np.nan, w), weakest
-
-
-def external_reliabilities(adjustment: Adjustment[State], J_of_interest: Array) -> Array:
-    """Return how far a bias that stays unseen can move something of interest.
-
-    Parameters
-    ----------
-    adjustment : Adjustment
-        What the observations gave.
-    J_of_interest : (q, p)
-        Derivative of what is of interest by a small change of the unknowns.
-
-    Returns
-    -------
-    (b,)
-        Length of the largest shift, over all directions of a bias of just detectable size in each
-        block; infinite where a bias in some direction cannot be detected.
-
-    Notes
-    -----
-    A bias ``b`` moves the unknowns by ``Q_x J' P b`` and is just detectable when
-    ``b' P Q_v P b = lambda0`` (Baarda 1968).
-    """
-    shifts, first = [], 0
-    for group in adjustment.groups:
-        weights, tested = _testability(group, adjustment.cov)
-        biases = adjustment.detectable_biases[first : first + len(tested)]
-        first, is_open = first + len(tested), np.isinf(biases)
-        effects = J_of_interest @ adjustment.cov @ np.swapaxes(group.J, -1, -2) @ weights
-        tested[is_open] = np.eye(tested.shape[-1])
-        moved = effects @ np.linalg.solve(tested, np.swapaxes(effects, -1, -2))
-        worst = np.where(is_open, np.inf, np.linalg.eigvalsh(moved)[:, -1])
-        shifts.append(adjustment.noncentrality * np.sqrt(worst))
-    return np.concatenate(shifts)
-
-
-def snoop(
-    adjust_kept: Callable[[Mask], Adjustment[State]],
-    n_blocks: int,
-    may_drop: Callable[[Mask, int], bool],
-    *,
-    is_studentised: bool = False,
-) -> tuple[Adjustment[State], Mask, tuple[tuple[int, float], ...]]:
-    """Leave out the worst block, one at a time, while its w-test fails.
-
-    Parameters
-    ----------
-    adjust_kept : callable
-        Adjusts with the blocks of a mask, (n_blocks,), only.
-    n_blocks : int
-        Number of all blocks.
-    may_drop : callable
-        Whether, of the blocks of a mask, the given one can be spared.
-    is_studentised : bool
-        Whether w is divided by ``sigma0`` where that is above 1: for sigmas that are too small
-        throughout, which would otherwise cost good blocks.
-
-    Returns
-    -------
-    tuple
-        The last adjustment, the mask of the blocks in it, and the dropped blocks with their w.
-
-    Notes
-    -----
-    Baarda's data snooping, iterated: after each removal all others are tested anew, since one bad
-    block makes its neighbours look bad. For the same reason each that was left out before the last
-    is tried again at the end, and kept if no test fails with it. Studentised after Pope (1976).
-    """
-    keep = np.ones(n_blocks, dtype=np.bool_)
-    dropped: list[tuple[int, float]] = []
-    while True:
-        adjustment = adjust_kept(keep)
-        places: Index = np.flatnonzero(keep)
-        w = _w_of(adjustment, is_studentised=is_studentised)
-        for worst in np.argsort(-w):
-            if w[worst] <= adjustment.critical_w:
-                return _readmitted(
-                    adjust_kept, adjustment, keep, dropped, is_studentised=is_studentised
-                )
-            if may_drop(keep, int(places[worst])):
-                break
-        else:
-            return _readmitted(
-                adjust_kept, adjustment, keep, dropped, is_studentised=is_studentised
-            )
-        dropped.append((int(places[worst]), float(w[worst])))
-        keep = keep.copy()
-        keep[places[worst]] = False
-
-
-def _w_of(adjustment: Adjustment[State], *, is_studentised: bool) -> Array:
-    """Return the w-statistics of the blocks, 0 where there is none."""
-    w = np.nan_to_num(adjustment.w_statistics, nan=0.0)
-    return w / max(1.0, adjustment.sigma0) if is_studentised else w
-
-
-def _readmitted(
-    adjust_kept: Callable[[Mask], Adjustment[State]],
-    adjustment: Adjustment[State],
-    keep: Mask,
-    dropped: list[tuple[int, float]],
-    *,
-    is_studentised: bool,
-) -> tuple[Adjustment[State], Mask, tuple[tuple[int, float], ...]]:
-    """Take back the blocks that only bad ones dropped after them had made look bad."""
-    left = list(dropped)
-    for one in dropped[:-1]:  # the last was judged with all the others out
-        again = keep.copy()
-        again[one[0]] = True
-        tried = adjust_kept(again)
-        worst = float(_w_of(tried, is_studentised=is_studentised).max())
-        if worst <= tried.critical_w:
-            adjustment, keep = tried, again
-            left.remove(one)
-    return adjustment, keep, tuple(left)

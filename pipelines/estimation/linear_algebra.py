@@ -1,15 +1,19 @@
-"""Small symmetric positive definite matrices in compiled loops: factor, solve, invert.
+"""Symmetric positive definite matrices: factor, solve, invert, eliminate.
 
-For kernels that need thousands of systems of up to a few tens of unknowns. Only the lower triangle
-of an argument is read. Elsewhere ``np.linalg`` serves, on stacks of matrices too.
+The compiled loops are for thousands of systems of up to a few tens of unknowns, inside other
+kernels or as a stack; only the lower triangle of an argument is read. ``np.linalg`` serves the
+single large system.
 """
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 
 from spheremark.pipelines.compilation import compiled
-from spheremark.pipelines.model import Array
+from spheremark.pipelines.errors import DegenerateGeometryError
+from spheremark.pipelines.model import Array, Mask
 
 SINGULAR = 1e-11
 """Pivot over diagonal below which an unknown is undetermined; rounding leaves about 1e-15."""
@@ -129,3 +133,108 @@ def inverse(N: Array) -> Array:
     out = np.empty_like(N)
     invert(N, out)
     return out
+
+
+@compiled
+def _invert_each(N: Array, out: Array, is_regular: Mask) -> None:
+    """Invert each matrix of a stack."""
+    for s in range(len(N)):
+        is_regular[s] = invert(N[s], out[s])
+
+
+def invert_each(N: Array) -> tuple[Array, Mask]:
+    """Invert matrices.
+
+    Parameters
+    ----------
+    N : (..., n, n)
+        Symmetric positive definite matrices.
+
+    Returns
+    -------
+    tuple
+        Inverses, (..., n, n), NaN where a matrix is not positive definite, and whether each is.
+    """
+    n = N.shape[-1]
+    stack = np.ascontiguousarray(N).reshape(-1, n, n)
+    out, is_regular = np.empty(stack.shape), np.empty(len(stack), dtype=np.bool_)
+    _invert_each(stack, out, is_regular)
+    return out.reshape(N.shape), is_regular.reshape(N.shape[:-2])
+
+
+class Reduced(NamedTuple):
+    """Normal equations of common unknowns, those of local ones eliminated.
+
+    Attributes
+    ----------
+    N : (q, q)
+        Normal matrix of the common unknowns: the Schur complement.
+    rhs : (q,)
+        Right-hand side.
+    own : (s, a, a)
+        Covariance of each set of local unknowns if the common ones were known.
+    gains : (s, a, q)
+        By how much a unit of each common unknown moves the local ones, with the sign turned.
+    steps : (s, a)
+        Solution of the local unknowns if the common ones stay where they are.
+    """
+
+    N: Array
+    rhs: Array
+    own: Array
+    gains: Array
+    steps: Array
+
+    def local_steps(self, common: Array) -> Array:
+        """Return the solution, (s, a), of the local unknowns for one of the common ones."""
+        return np.asarray(self.steps - self.gains @ common)
+
+    def local_covariances(self, cov_common: Array) -> Array:
+        """Return covariances, (s, a, a), of the local unknowns for that of the common ones."""
+        return np.asarray(self.own + self.gains @ cov_common @ np.swapaxes(self.gains, 1, 2))
+
+
+def eliminate(
+    local: Array, mixed: Array, rhs_local: Array, common: Array, rhs_common: Array
+) -> Reduced:
+    """Eliminate sets of local unknowns that meet each other only through common ones.
+
+    Parameters
+    ----------
+    local : (s, a, a)
+        Normal matrix of each set of local unknowns.
+    mixed : (s, a, q)
+        Between local and common unknowns.
+    rhs_local : (s, a)
+        Right-hand sides of the local unknowns.
+    common : (q, q)
+        Normal matrix of the common unknowns if the local ones were known.
+    rhs_common : (q,)
+        Right-hand side of the common unknowns.
+
+    Returns
+    -------
+    Reduced
+        Equations of the common unknowns, and how the local ones follow from them.
+
+    Raises
+    ------
+    DegenerateGeometryError
+        If a set of local unknowns is undetermined though the common ones were known.
+
+    Notes
+    -----
+    Schur complement (Triggs et al., Bundle Adjustment, 2000, section 6). Cost grows linearly with
+    the sets and with the square of the common unknowns.
+    """
+    own, is_regular = invert_each(local)
+    if not is_regular.all():
+        raise DegenerateGeometryError(
+            f"The observations leave {np.sum(~is_regular)} of {len(local)} sets of local unknowns "
+            "undetermined, even with all others known."
+        )
+    gains, steps = own @ mixed, np.einsum("sab,sb->sa", own, rhs_local)
+    n_sets, n_own, n_common = mixed.shape
+    flat = mixed.reshape(n_sets * n_own, n_common)
+    N = common - flat.T @ gains.reshape(flat.shape)
+    return Reduced((N + N.T) / 2.0, rhs_common - flat.T @ steps.ravel(), own, gains, steps)

@@ -19,6 +19,7 @@ from spheremark.pipelines.model import Array, Index, Mask, same_length, seal
 from spheremark.pipelines.placement.centre_model import CentreModel, expect_centres
 from spheremark.pipelines.placement.plan import Arrangement, Sights
 from spheremark.pipelines.placement.visibility import N_STRIPS
+from spheremark.pipelines.positioning.trilateration import best_three, meet, meet_one
 from spheremark.pipelines.threads import side_by_side
 
 ARRANGEMENTS_MAX = 5_000_000
@@ -28,8 +29,6 @@ BINS_DEG = (0, 10, 20, 30, 40, 50, 60)
 """Edges of the classes of worst included angle [deg]; of three directions one pair is within 60."""
 
 _HALF_HEIGHT = 0.3  # [m] by which centres stand above or below the LiDAR at most
-_N_STEPS = 8  # of Gauss and Newton; three or four settle
-_SETTLED = 1e-8  # [m] length of the last step
 _TABLE = 60  # distances at which the model of centres is tabulated
 _FIRST, _THIRD = np.radians(105.0), np.radians(10.0)  # where the study's marks seem to stand
 
@@ -173,7 +172,7 @@ def try_at_random(trial: Trial, model: CentreModel | None = None) -> TrialResult
     -----
     Places are even over the ring between the two distances, heights even within 0.3 m of the
     LiDAR's. Three circles of true radius about the wrong centres are met by least squares
-    (Gauss-Newton from the true place); the height is the mean of theirs. Cost grows linearly with
+    (from the true place); the height is the mean of theirs. Cost grows linearly with
     arrangements, and with the third power of marks for the choice of the three.
     """
     sigmas = _sigmas(trial, model)
@@ -323,9 +322,11 @@ def three_circle_errors(marks_site: Array, errors: Array) -> Array:
     (n, 3)
         Estimate minus truth of the station [m].
     """
-    out = np.empty((len(errors), 3))
-    _meet_all(np.ascontiguousarray(marks_site), np.ascontiguousarray(errors), out)
-    return out
+    measured = np.column_stack([np.hypot(marks_site[:, 0], marks_site[:, 1]), marks_site[:, 2]])
+    n = len(errors)
+    chosen, weights = np.arange(3 * n).reshape(n, 3), np.tile(np.eye(2), (3 * n, 1, 1))
+    marks = (marks_site + errors).reshape(-1, 3)
+    return meet(chosen, marks, np.tile(measured, (n, 1)), weights, np.zeros(3)).p
 
 
 def _sigmas(trial: Trial, model: CentreModel | None) -> Array:
@@ -345,66 +346,6 @@ def _sigmas(trial: Trial, model: CentreModel | None) -> Array:
     worst = np.nanmax(np.where(np.isfinite(variances), variances, np.nan), axis=0)
     variances = np.where(np.isfinite(variances), variances, worst)
     return np.column_stack([distances, np.sqrt(variances)])
-
-
-@compiled
-def _meet(p: Array, off: Array, found: Array) -> None:
-    """Fill in where three circles about wrong centres meet best; the station is at the origin."""
-    x, y = 0.0, 0.0
-    for _ in range(_N_STEPS):
-        a, b, c, gx, gy = 0.0, 0.0, 0.0, 0.0, 0.0
-        for i in range(3):
-            dx, dy = x - p[i, 0] - off[i, 0], y - p[i, 1] - off[i, 1]
-            d = max(np.hypot(dx, dy), 1e-9)
-            v = np.hypot(p[i, 0], p[i, 1]) - d
-            ux, uy = dx / d, dy / d
-            a, b, c = a + ux * ux, b + ux * uy, c + uy * uy
-            gx, gy = gx + ux * v, gy + uy * v
-        det = max(a * c - b * b, 1e-9)
-        sx, sy = (c * gx - b * gy) / det, (a * gy - b * gx) / det
-        length = np.hypot(sx, sy)
-        cut = min(1.0, 0.5 / max(length, 1e-12))  # a step is half a metre at most
-        x, y = x + cut * sx, y + cut * sy
-        if length < _SETTLED:
-            break
-    found[0], found[1] = x, y
-    found[2] = (off[0, 2] + off[1, 2] + off[2, 2]) / 3.0
-
-
-@compiled
-def _meet_all(p: Array, offs: Array, out: Array) -> None:
-    """Fill in the errors of all patterns."""
-    for i in range(len(offs)):
-        _meet(p, offs[i], out[i])
-
-
-@compiled
-def _three(units: Array, n: int, window: tuple[float, float], three: Index) -> bool:
-    """Choose the three marks that cut best, in the window if any; false if none are in it."""
-    best_in, best_any = np.inf, np.inf
-    widest, narrowest = window
-    kept = np.zeros(3, np.intp)
-    for i in range(n):
-        for j in range(i + 1, n):
-            ij = units[i, 0] * units[j, 0] + units[i, 1] * units[j, 1]
-            xx = units[i, 0] ** 2 + units[j, 0] ** 2
-            xy = units[i, 0] * units[i, 1] + units[j, 0] * units[j, 1]
-            for k in range(j + 1, n):
-                a, b = xx + units[k, 0] ** 2, xy + units[k, 0] * units[k, 1]
-                spread = 3.0 / max(a * (3.0 - a) - b * b, 1e-12)
-                if spread < best_any:
-                    best_any = spread
-                    three[0], three[1], three[2] = i, j, k
-                if spread < best_in:
-                    ik = units[i, 0] * units[k, 0] + units[i, 1] * units[k, 1]
-                    jk = units[j, 0] * units[k, 0] + units[j, 1] * units[k, 1]
-                    if max(ij, ik, jk) <= widest and min(ij, ik, jk) >= narrowest:
-                        best_in = spread
-                        kept[0], kept[1], kept[2] = i, j, k
-    if best_in < np.inf:
-        three[:] = kept
-        return True
-    return False
 
 
 @compiled
@@ -431,7 +372,8 @@ def _try(rng: np.random.Generator, plan: tuple[Any, ...], out: tuple[Any, ...]) 
     worst, errors, inside = out
     units, p = np.empty((64, 2)), np.empty((64, 3))
     used, off, found = np.empty((3, 3)), np.empty((3, 3)), np.empty(3)
-    three = np.zeros(3, np.intp)
+    three, measured, weights = np.zeros(3, np.intp), np.empty((3, 2)), np.zeros((3, 2, 2))
+    weights[:, 0, 0] = weights[:, 1, 1] = 1.0
     near2, far2 = distances[0] ** 2, distances[1] ** 2
     for i in range(len(counts)):
         n = counts[i]
@@ -441,7 +383,7 @@ def _try(rng: np.random.Generator, plan: tuple[Any, ...], out: tuple[Any, ...]) 
             units[m, 0], units[m, 1] = np.cos(bearing), np.sin(bearing)
             p[m, 0], p[m, 1] = d * units[m, 0], d * units[m, 1]
             p[m, 2] = _HALF_HEIGHT * (2.0 * rng.random() - 1.0)
-        inside[i] = _three(units, n, window, three)
+        _, inside[i] = best_three(units[:n], window[1], window[0], three)
         low = 1.0
         for a in range(3):
             used[a] = p[three[a]]
@@ -450,5 +392,8 @@ def _try(rng: np.random.Generator, plan: tuple[Any, ...], out: tuple[Any, ...]) 
                 low = min(low, abs(u[0] * v[1] - u[1] * v[0]))
         worst[i] = np.arcsin(min(low, 1.0))
         _attach(rng, used, error, sigmas, off)
-        _meet(used, off, found)
+        for a in range(3):
+            measured[a, 0], measured[a, 1] = np.hypot(used[a, 0], used[a, 1]), used[a, 2]
+        found[:] = 0.0
+        meet_one(np.arange(3), used + off, measured, weights, found)
         errors[i] = np.sqrt(found[0] ** 2 + found[1] ** 2 + found[2] ** 2)

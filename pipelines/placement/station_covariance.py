@@ -9,12 +9,14 @@ from __future__ import annotations
 from typing import Any, NamedTuple
 
 import numpy as np
-from scipy.special import ndtri
 
 from spheremark.pipelines.compilation import compiled
-from spheremark.pipelines.estimation.linear_algebra import invert
+from spheremark.pipelines.estimation.linear_algebra import invert, invert_each
+from spheremark.pipelines.estimation.statistical_tests import block_statistics, noncentrality
+from spheremark.pipelines.geometry import by_motion
 from spheremark.pipelines.model import Array, Index, Mask
 from spheremark.pipelines.placement.plan import Requirement
+from spheremark.pipelines.positioning.trilateration import best_three, circles
 from spheremark.pipelines.scan.rigs import N_LASERS
 
 _BIAS_LEFT = 0.22  # of the spread of laser biases: what a survey leaves to each centre, simulated
@@ -22,7 +24,7 @@ _SIGMA_AIM = 1.5e-5  # [rad] of each direction, by mounting and encoder, after b
 LOOSE2 = 1.0
 """Variance of a position above which it is none [m^2]."""
 
-_UNTESTABLE = 1e-7  # redundancy below which a bias cannot show
+_PARALLEL = 1e6  # cofactor of a position from circles that touch
 
 
 Group = tuple[Any, ...]
@@ -263,32 +265,18 @@ def _product(design: Array, circle: Array, out: Array) -> None:
 
 
 @compiled
-def _best_three(eye: Array, marks: Array, is_seen: Mask, units: Array, three: Index) -> bool:
-    """Find the three seen marks whose circles cut best; false if there are none."""
-    least = np.inf
-    n = len(marks)
-    for m in range(n):
-        x, y = marks[m, 0] - eye[0], marks[m, 1] - eye[1]
+def _best_of(eye: Array, marks: Array, is_seen: Mask, lines: Array, three: Index) -> bool:
+    """Find the three seen marks whose circles cut best; false if no three cut at all."""
+    seen = np.flatnonzero(is_seen)
+    for k in range(len(seen)):
+        x, y = marks[seen[k], 0] - eye[0], marks[seen[k], 1] - eye[1]
         flat = max(np.hypot(x, y), 1e-9)
-        units[m, 0], units[m, 1] = x / flat, y / flat
-    for i in range(n):
-        if not is_seen[i]:
-            continue
-        for j in range(i + 1, n):
-            if not is_seen[j]:
-                continue
-            xx = units[i, 0] ** 2 + units[j, 0] ** 2
-            xy = units[i, 0] * units[i, 1] + units[j, 0] * units[j, 1]
-            for k in range(j + 1, n):
-                if not is_seen[k]:
-                    continue
-                a = xx + units[k, 0] ** 2
-                b = xy + units[k, 0] * units[k, 1]
-                spread = 3.0 / max(a * (3.0 - a) - b * b, 1e-12)
-                if spread < least:
-                    least = spread
-                    three[0], three[1], three[2] = i, j, k
-    return least < 1e6
+        lines[k, 0], lines[k, 1] = x / flat, y / flat
+    spread, _ = best_three(lines[: len(seen)], -1.0, 1.0, three)
+    if not spread < _PARALLEL:
+        return False
+    three[:] = seen[three]
+    return True
 
 
 @compiled
@@ -323,13 +311,13 @@ def _by_circles(seen: Group, extra: Group, level2: float, used: Mask, out: Group
     """Fill in the covariances of positions by three circles, and how a common excess moves them."""
     eyes, marks, covs, is_seen = seen
     cov_motion, cofactor, moved = out
-    units, three = np.empty((len(marks), 2)), np.empty(3, np.intp)
+    lines, three = np.empty((len(marks), 2)), np.empty(3, np.intp)
     design, lean, excess = np.zeros((6, 3)), np.zeros((6, 2)), np.empty(6)
     errors, weights, inverse = np.zeros((6, 6)), np.zeros((6, 6)), np.empty((3, 3))
     for e in range(len(eyes)):
         cov_motion[e] = np.diag(np.full(6, np.inf))
         cofactor[e] = cov_motion[e]
-        if not _best_three(eyes[e], marks, is_seen[e], units, three):
+        if not _best_of(eyes[e], marks, is_seen[e], lines, three):
             continue
         yaw2 = 0.0
         for r in range(3):
@@ -393,48 +381,25 @@ def reliability(sighting: Sighting, found: Positions, wish: Requirement) -> Reli
         inverse = inverse[:, 3:, 3:]
         to_position = np.eye(3)
     else:
-        J = _motion_equations(v)
+        J = by_motion(v)
         to_position = np.eye(6)[3:]
-    weight = np.linalg.inv(covs)
-    weighted = weight @ J
-    tested = weight - weighted @ inverse[:, None] @ np.swapaxes(weighted, -1, -2)
-    redundancies = np.einsum("enij,enji->en", tested, covs)
-    weakest = np.linalg.eigvalsh(tested)[..., 0]
-    is_open = weakest < _UNTESTABLE * np.linalg.eigvalsh(weight)[..., 0]
-    power = wish.resection.test_power
-    noncentrality = float(ndtri(1.0 - wish.resection.test_level / 2.0) + ndtri(power))
-    biases = noncentrality / np.sqrt(np.where(is_open, 1.0, weakest))
-    effects = to_position @ inverse[:, None] @ np.swapaxes(weighted, -1, -2)
-    safe = np.where(is_open[..., None, None], np.eye(covs.shape[-1]), tested)
-    shifts = effects @ np.linalg.solve(safe, np.swapaxes(effects, -1, -2))
-    external = noncentrality * np.sqrt(np.maximum(np.linalg.eigvalsh(shifts)[..., -1], 0.0))
-    none = ~used | is_open
-    return Reliability(
-        redundancies=np.where(used, redundancies, 0.0),
-        detectable_biases=np.where(none, np.inf, biases),
-        external=np.where(none, np.inf, external),
+    weights = invert_each(covs)[0]
+    weighted = np.swapaxes(weights @ J, -1, -2)
+    tests = block_statistics(
+        np.zeros(J.shape[:-1]), weights, J @ inverse[:, None] @ np.swapaxes(J, -1, -2)
     )
-
-
-def _motion_equations(v: Array) -> Array:
-    """Return ``[-[v]x, 1]`` of vectors from stations to marks, (e, n, 3, 6)."""
-    J = np.zeros((*v.shape[:-1], 3, 6))
-    x, y, z = np.moveaxis(v, -1, 0)
-    J[..., 0, 1], J[..., 0, 2], J[..., 1, 0] = z, -y, -z
-    J[..., 1, 2], J[..., 2, 0], J[..., 2, 1] = x, y, -x
-    J[..., :, 3:] = np.eye(3)
-    return J
+    shift = noncentrality(wish.resection.test_level, wish.resection.test_power)
+    effects = to_position @ inverse[:, None] @ weighted
+    return Reliability(
+        redundancies=np.where(used, tests.redundancies, 0.0),
+        detectable_biases=np.where(used, tests.detectable_biases(shift), np.inf),
+        external=np.where(used, tests.external_reliabilities(effects, shift), np.inf),
+    )
 
 
 def _circle_equations(v: Array, covs: Array, wish: Requirement) -> tuple[Array, Array]:
     """Return derivatives, (e, n, 2, 3), and covariances of horizontal distances and heights."""
-    flat = np.maximum(np.hypot(v[..., 0], v[..., 1]), 1e-9)
-    circle = np.zeros((*v.shape[:-1], 2, 3))
-    circle[..., 0, 0], circle[..., 0, 1], circle[..., 1, 2] = (
-        v[..., 0] / flat,
-        v[..., 1] / flat,
-        1.0,
-    )
-    lean = circle @ _motion_equations(v)[..., :2]
+    circle = circles(v)[1]
+    lean = circle @ by_motion(v)[..., :2]
     cov = circle @ covs @ np.swapaxes(circle, -1, -2)
     return circle, cov + wish.sigma_levelling**2 * lean @ np.swapaxes(lean, -1, -2)

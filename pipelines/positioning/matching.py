@@ -18,8 +18,21 @@ from spheremark.pipelines.errors import (
     NoMatchError,
     SolveError,
 )
-from spheremark.pipelines.estimation.least_squares import Observations, Solution, solve
-from spheremark.pipelines.geometry import levelling_rotation, rigid, rot_z, skew, transform
+from spheremark.pipelines.estimation.least_squares import (
+    Observations,
+    Solution,
+    Solutions,
+    solve,
+    solve_each,
+)
+from spheremark.pipelines.geometry import (
+    by_motion,
+    levelling_rotation,
+    rigid,
+    rot_z,
+    skew,
+    transform,
+)
 from spheremark.pipelines.model import Array, ControlMarks, Index, MarkerFits
 from spheremark.pipelines.positioning.hypotheses import (
     AS_IT_IS,
@@ -313,7 +326,7 @@ def observe(scene: Scene, pairs: Index, T: Array) -> tuple[Observations, Observa
     p_site = scene.centres_base[pairs[..., 0]] @ back + t[..., None, :]
     centres = Observations(
         residuals=p_site - scene.marks_site[pairs[..., 1]],
-        J=_by_motion(p_site),
+        J=by_motion(p_site),
         cov=turned @ scene.cov_centres[pairs[..., 0]] @ back[..., None, :, :]
         + scene.cov_marks[pairs[..., 1]],
     )
@@ -327,14 +340,6 @@ def observe(scene: Scene, pairs: Index, T: Array) -> tuple[Observations, Observa
         cov=(J_up @ np.swapaxes(J_up, -1, -2))[..., None, :, :],
     )
     return centres, gravity
-
-
-def _by_motion(p: Array) -> Array:
-    """Return the derivative of places, (..., 3), by a small motion on the left, (..., 3, 6)."""
-    J = np.zeros((*p.shape, 6))
-    J[..., :3] = -skew(p)
-    J[..., 0, 3] = J[..., 1, 4] = J[..., 2, 5] = 1.0
-    return J
 
 
 def moved(T: Array, xi: Array) -> Array:
@@ -360,9 +365,15 @@ def moved(T: Array, xi: Array) -> Array:
     return out
 
 
-def solve_pose(scene: Scene, pairs: Index, start: Array) -> Solution[Array]:
-    """Find the pose of base from some pairs and gravity."""
+def solve_pose(scene: Scene, pairs: Index, start: Array) -> Solution:
+    """Find the pose of base, (4, 4), from some pairs, (k, 2), and gravity."""
     return solve(lambda T: observe(scene, pairs, T), moved, start)
+
+
+def solve_poses(scene: Scene, pairs: Index, start: Array) -> Solutions:
+    """Find a pose of base from each of many sets of pairs, (s, k, 2), all from one start."""
+    starts = np.tile(start, (len(pairs), 1, 1))
+    return solve_each(lambda T, rows: observe(scene, pairs[rows], T), moved, starts)
 
 
 def _refuse_plumb_line(p: Array, kind: str, config: ResectionConfig) -> None:
@@ -395,7 +406,7 @@ def _matched_pair(levelled: Array, scene: Scene, config: ResectionConfig) -> Mat
     return Match(
         marks=marks,
         T_site_base=solution.estimate,
-        vtpv=_weighted_square(solution),
+        vtpv=solution.vtpv,
         dof=2,
         largest_residual=float(np.linalg.norm(solution.groups[0].residuals, axis=1).max()),
         rivals=np.array([T[:3, 3] for T in poses[1:]]).reshape(-1, 3),
@@ -488,20 +499,12 @@ def _refined(
             return float(scores[0]), Match(
                 marks=marks,
                 T_site_base=T,
-                vtpv=_weighted_square(solution),
+                vtpv=solution.vtpv,
                 dof=3 * len(fits) - 4,
                 largest_residual=float(np.linalg.norm(residuals, axis=1).max()),
             )
         marks = again[0]
     return None
-
-
-def _weighted_square(solution: Solution[Array]) -> float:
-    """Return the weighted sum of squares at a solution."""
-    return sum(
-        float(np.einsum("km,kmn,kn->", g.residuals, np.linalg.inv(g.cov), g.residuals))
-        for g in solution.groups
-    )
 
 
 def _is_rival(other: Match, best: Match) -> bool:

@@ -6,29 +6,34 @@ site. A station is then tried without each of its markers, and each mark predict
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
 from spheremark.pipelines.config import ResectionConfig
-from spheremark.pipelines.geometry import rigid, transform
+from spheremark.pipelines.geometry import by_motion, has_heading, rigid, transform
 from spheremark.pipelines.model import (
     Array,
     ControlMarks,
     DistanceChecks,
     Index,
     MarkerFits,
-    Mask,
     Omissions,
     StationFix,
     StationQuality,
 )
-from spheremark.pipelines.positioning.batch import Sightings, adjust
-from spheremark.pipelines.positioning.matching import Match, Scene, gather, match_marks
-from spheremark.pipelines.positioning.trilateration import circles, slope_ranges
+from spheremark.pipelines.positioning.matching import (
+    Match,
+    Scene,
+    gather,
+    match_marks,
+    solve_poses,
+)
+from spheremark.pipelines.positioning.trilateration import circles, slope_ranges, unit
 
 _SURPRISE = 3.29  # sigmas that one in a thousand normal residuals exceeds
 _N_LEFT = 3  # markers at least, of which one can be left out
 _DISPLACED = 1.0  # [m] from a marker that is no mark: a mark without one may be given wrongly
-_UPRIGHT = 0.05  # spread across over spread along a plumb line of marks that tell no heading
 _N_POSE = 6  # unknowns: with as many more observations of centres, the levelling was left out
 _OPEN = 1e-9  # of the largest eigenvalue of a normal matrix: what is smaller tells nothing
 _UNKNOWN = 1.0  # [rad] of a levelling that was left out
@@ -108,7 +113,7 @@ def check_distances(
     along_site = (goals[:, 1] - goals[:, 0]) / given[:, None]
     cov = _cov_own(scene)[places[..., 0]].sum(axis=1)
     cov_given = scene.cov_marks[places[..., 1]].sum(axis=1)
-    opening = np.sum(along * (_unit(q) - _unit(p)), axis=1) * config.sigma_range
+    opening = np.sum(along * (unit(q) - unit(p)), axis=1) * config.sigma_range
     sigmas = np.sqrt(_projected(cov, along) + _projected(cov_given, along_site) + opening**2)
     off = np.abs(measured - given)
     is_off = (off > tolerance) | (off > _SURPRISE * sigmas)
@@ -142,13 +147,8 @@ def _displaced(scene: Scene, match: Match) -> Index:
 
 def _cov_own(scene: Scene) -> Array:
     """Return the covariances of centres without the error of range that all of them share."""
-    v = _unit(scene.centres_base)
+    v = unit(scene.centres_base)
     return scene.cov_centres - scene.shared[:, None, None] * v[:, :, None] * v[:, None, :]
-
-
-def _unit(v: Array) -> Array:
-    """Return vectors of length one."""
-    return np.asarray(v / np.linalg.norm(v, axis=-1, keepdims=True))
 
 
 def _projected(cov: Array, direction: Array) -> Array:
@@ -224,46 +224,22 @@ def leave_each_out(
     if n < _N_LEFT:
         return Omissions.none()
     scene = gather(fits, marks, config)
-    sigma_level = _UNKNOWN if fix.dof == 3 * n - _N_POSE else scene.sigma_level
-    fit, mark = fix.matches.T
-    seen = Sightings(
-        p_base=scene.centres_base[fit],
-        cov_base=scene.cov_centres[fit],
-        marks=scene.marks_site[mark],
-        cov_marks=scene.cov_marks[mark],
-        up_base=scene.R_station_base[2],
-        J_up=sigma_level * scene.J_up,
-    )
+    if fix.dof == 3 * n - _N_POSE:
+        scene = replace(scene, sigma_level=_UNKNOWN)
     start = fix.T_site_station @ rigid(scene.R_station_base, np.zeros(3))
     start[:3, 3] -= scene.middle
-    every = np.arange(n)
-    others = np.tile(every, (n, 1))[~np.eye(n, dtype=np.bool_)].reshape(n, n - 1)
-    with_all, without = (adjust(chosen, seen, start) for chosen in (every[None], others))
-    is_told = without.is_settled & with_all.is_settled & _have_heading(seen.marks[others])
-    T = np.where(is_told[:, None, None], without.T, np.nan)
+    others = fix.matches[np.nonzero(~np.eye(n, dtype=np.bool_))[1].reshape(n, n - 1)]
+    with_all, without = (solve_poses(scene, pairs, start) for pairs in (fix.matches[None], others))
+    is_known = without.is_settled & with_all.is_settled
+    is_known &= has_heading(scene.marks_site[others[..., 1]])
+    T = np.where(is_known[:, None, None], without.estimates, np.nan)
+    fit, mark = fix.matches.T
     R, t = T[:, :3, :3], T[:, :3, 3]
-    q = (R @ seen.p_base[:, :, None])[:, :, 0]
-    cov = R @ seen.cov_base @ np.swapaxes(R, 1, 2) + seen.cov_marks
-    J = _by_motion(q)
+    p_site = np.einsum("nij,nj->ni", R, scene.centres_base[fit]) + t
+    cov = R @ scene.cov_centres[fit] @ np.swapaxes(R, 1, 2) + scene.cov_marks[mark]
+    J = by_motion(p_site)
     return Omissions(
-        shifts_site=t - with_all.T[0, :3, 3],
-        predictions_site=q + t - seen.marks,
-        cov_predictions_site=J @ without.cov @ np.swapaxes(J, 1, 2) + cov,
+        shifts_site=t - with_all.estimates[0, :3, 3],
+        predictions_site=p_site - scene.marks_site[mark],
+        cov_predictions_site=J @ without.covs @ np.swapaxes(J, 1, 2) + cov,
     )
-
-
-def _have_heading(p: Array) -> Mask:
-    """Tell which groups of marks, (n, k, 3), do not stand on one plumb line."""
-    off = p - p.mean(axis=1, keepdims=True)
-    across = np.linalg.norm(off[..., :2], axis=(1, 2))
-    return np.asarray(across > _UPRIGHT * np.linalg.norm(off, axis=(1, 2)))
-
-
-def _by_motion(p: Array) -> Array:
-    """Return the derivative of places, (n, 3), by a small motion on the left, (n, 3, 6)."""
-    J = np.zeros((len(p), 3, 6))
-    x, y, z = p.T
-    J[:, 0, 1], J[:, 1, 2], J[:, 2, 0] = z, x, y
-    J[:, 1, 0], J[:, 2, 1], J[:, 0, 2] = -z, -x, -y
-    J[:, [0, 1, 2], [3, 4, 5]] = 1.0
-    return J

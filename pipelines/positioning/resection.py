@@ -14,14 +14,12 @@ import numpy as np
 
 from spheremark.pipelines.config import ResectionConfig
 from spheremark.pipelines.errors import ConfigError, DegenerateGeometryError, NoMarkersError
-from spheremark.pipelines.estimation.least_squares import (
-    Adjustment,
-    adjust,
-    external_reliabilities,
-    snoop,
-)
+from spheremark.pipelines.estimation.least_squares import Adjustment, adjust
+from spheremark.pipelines.estimation.statistical_tests import Dropped, snoop
 from spheremark.pipelines.geometry import (
+    by_motion,
     cross,
+    has_heading,
     included_angle,
     inverse,
     is_on_a_line,
@@ -51,7 +49,6 @@ from spheremark.pipelines.positioning.matching import (
 )
 from spheremark.pipelines.positioning.trilateration import fix_by_ranges
 
-_UPRIGHT = 0.05  # spread across over spread along of marks on a plumb line: no heading
 _MANY_LEFT_OUT = 1.0 / 3.0  # of the matched markers: not they are bad, but the sigmas too small
 _TELLING = 4  # markers that agree: with fewer, the one that was left out may be the good one
 
@@ -112,7 +109,7 @@ def free_station(fits: MarkerFits, marks: ControlMarks, config: ResectionConfig)
     match = match_marks(scene, config)
     pairs = match.pairs
 
-    def adjusted(keep: Mask) -> Adjustment[Array]:
+    def adjusted(keep: Mask) -> Adjustment:
         return adjust(
             lambda T: observe(scene, pairs[keep[:-1]], T)[: 1 + int(keep[-1])],
             moved,
@@ -126,7 +123,9 @@ def free_station(fits: MarkerFits, marks: ControlMarks, config: ResectionConfig)
         rest[block] = False
         if not rest[-1]:
             return not is_on_a_line(scene.marks_site[pairs[rest[:-1], 1]])
-        return int(rest[:-1].sum()) >= 2 and _has_heading(scene, pairs[rest[:-1]])
+        return int(rest[:-1].sum()) >= 2 and bool(
+            has_heading(scene.marks_site[pairs[rest[:-1], 1]])
+        )
 
     adjustment, keep, dropped = snoop(adjusted, len(pairs) + 1, may_drop)
     if len(dropped) > _MANY_LEFT_OUT * len(pairs):
@@ -152,18 +151,11 @@ def _refuse_too_few(fits: MarkerFits, marks: ControlMarks) -> None:
             )
 
 
-def _has_heading(scene: Scene, pairs: Index) -> bool:
-    """Return whether the marks are far enough from one plumb line to tell a heading."""
-    off = scene.marks_site[pairs[:, 1]]
-    off = off - off.mean(axis=0)
-    return bool(np.linalg.norm(off[:, :2]) > _UPRIGHT * np.linalg.norm(off))
-
-
 def _exclusions(
     match: Match,
-    dropped: tuple[tuple[int, float], ...],
+    dropped: Dropped,
     scene: Scene,
-    adjustment: Adjustment[Array],
+    adjustment: Adjustment,
     config: ResectionConfig,
 ) -> tuple[Exclusion, ...]:
     """Say which markers were left out, and why."""
@@ -201,8 +193,8 @@ def _weaknesses(
     scene: Scene,
     match: Match,
     used: Index,
-    adjustment: Adjustment[Array],
-    dropped: tuple[tuple[int, float], ...],
+    adjustment: Adjustment,
+    dropped: Dropped,
 ) -> list[str]:
     """Say why a fix cannot be relied on."""
     reasons = []
@@ -254,7 +246,7 @@ def _fix(
     scene: Scene,
     match: Match,
     used: Index,
-    adjustment: Adjustment[Array],
+    adjustment: Adjustment,
     excluded: tuple[Exclusion, ...],
     reasons: list[str],
 ) -> StationFix:
@@ -266,7 +258,7 @@ def _fix(
     first, second = np.triu_indices(n, 1)
     centres = scene.centres_base[used[:, 0]]
     angles = included_angle(centres[first], centres[second])
-    cov, J = adjustment.cov + _cov_shared(scene, used, adjustment), _position_by_motion(T)
+    cov, J = adjustment.cov + _cov_shared(scene, used, adjustment), by_motion(T[:3, 3])
     shifts = _shifts_of_choice(scene, match, T_site_base)
     return StationFix(
         method="free_station",
@@ -280,7 +272,7 @@ def _fix(
         redundancies=adjustment.redundancies[:n],
         w_statistics=adjustment.w_statistics[:n],
         detectable_biases=adjustment.detectable_biases[:n],
-        external_reliabilities=external_reliabilities(adjustment, J)[:n],
+        external_reliabilities=adjustment.external_reliabilities(J)[:n],
         dof=adjustment.dof,
         sigma0=adjustment.sigma0,
         passes_global_test=adjustment.passes_global_test,
@@ -291,7 +283,7 @@ def _fix(
     )
 
 
-def _cov_shared(scene: Scene, used: Index, adjustment: Adjustment[Array]) -> Array:
+def _cov_shared(scene: Scene, used: Index, adjustment: Adjustment) -> Array:
     """Return what errors that all centres share change in the covariance of a motion, (6, 6)."""
     R, group = adjustment.estimate[:3, :3], adjustment.groups[0]
     p_base = scene.centres_base[used[:, 0]]
@@ -335,12 +327,6 @@ def _turn(scene: Scene, T_site_base: Array) -> Array:
     """Return the small motion, (6,), that turns a station about its own plumb line by 1 rad."""
     up = T_site_base[:3, :3] @ scene.R_station_base[2]
     return np.concatenate([up, cross(T_site_base[:3, 3], up)])
-
-
-def _position_by_motion(T: Array) -> Array:
-    """Return the derivative of the positions of poses, (..., 4, 4), by small motions."""
-    p = T[..., :3, 3]
-    return np.concatenate([-skew(p), np.broadcast_to(np.eye(3), (*p.shape, 3))], axis=-1)
 
 
 def _by_ranges(

@@ -15,7 +15,9 @@ import numpy as np
 
 from spheremark.pipelines.config import ResectionConfig
 from spheremark.pipelines.errors import ConfigError
-from spheremark.pipelines.geometry import cross, included_angle, rigid
+from spheremark.pipelines.estimation.least_squares import normal_equations
+from spheremark.pipelines.estimation.linear_algebra import invert_each
+from spheremark.pipelines.geometry import by_motion, has_heading, included_angle, rigid, transform
 from spheremark.pipelines.model import (
     Array,
     ControlMarks,
@@ -24,28 +26,28 @@ from spheremark.pipelines.model import (
     StationFix,
     SubsetFixes,
 )
-from spheremark.pipelines.positioning.batch import (
-    USELESS,
-    Positions,
-    SharedErrors,
-    carry,
-    meet,
-    place,
-    share,
+from spheremark.pipelines.positioning.matching import (
+    Scene,
+    cov_of_shared,
+    gather,
+    observe,
+    solve_poses,
 )
-from spheremark.pipelines.positioning.matching import Scene, gather, observe
 from spheremark.pipelines.positioning.trilateration import (
+    USELESS,
     Measure,
+    Positions,
     circles,
     influences,
+    meet,
     observe_distances,
     slope_ranges,
+    unit,
 )
 
 SIZES = (2, 3)
 """How many markers a subset has."""
 
-_UPRIGHT = 0.05  # spread across over spread along a plumb line that tells no heading
 _FLAT = 0.05  # [rad] 3 deg: circles that cut at less than this touch rather than cut
 
 _Usable = Callable[[Array, Sequence[Index]], list[Index]]
@@ -216,9 +218,7 @@ def _spread(angles: Array) -> Array:
 
 def _with_heading(towards: Array, groups: Sequence[Index]) -> list[Index]:
     """Return the subsets of marks that do not stand on one plumb line."""
-    squares = np.square(towards[:, None] - towards[None])
-    across, whole = squares[..., :2].sum(axis=2), _UPRIGHT**2 * squares.sum(axis=2)
-    return [chosen[_of_pairs(across - whole, chosen).sum(axis=0) > 0.0] for chosen in groups]
+    return [chosen[has_heading(towards[chosen])] for chosen in groups]
 
 
 def _cutting(towards: Array, groups: Sequence[Index]) -> list[Index]:
@@ -236,28 +236,23 @@ def _by_pose(
     scene: Scene, matches: Index, groups: Sequence[Index], start: Array
 ) -> list[Positions]:
     """Position subsets by their full poses: centres and gravity, as the free station does."""
-    R, t = start[:3, :3], start[:3, 3]
-    centres, gravity = observe(scene, matches, start)
-    q = scene.centres_base[matches[:, 0]] @ R.T
-    goals = scene.marks_site[matches[:, 1]] - t
-    up, of_gravity = R @ scene.R_station_base[2], _inverses(gravity.cov[0])
-    weights = _inverses(centres.cov)
-    lines = np.asarray(q / np.linalg.norm(q, axis=1, keepdims=True), dtype=np.float64)
-    errors = _shared_errors(
-        scene, matches, _by_motion(q, weights, lines), _by_motion(q, weights, up)
-    )
+    R = start[:3, :3]
+    p_site = transform(start, scene.centres_base[matches[:, 0]])
+    weighted = invert_each(observe(scene, matches, start)[0].cov)[0]
+    weighted = np.swapaxes(by_motion(p_site), 1, 2) @ weighted  # J' P
+    by_ranges = (weighted @ unit(p_site - start[:3, 3])[..., None])[..., 0]
+    by_heights = weighted @ (R @ scene.R_station_base[2])
+    J = by_motion(start[:3, 3])
     found = []
     for chosen in groups:
-        one = place(chosen, q, goals, weights, up, of_gravity)
-        cov = one.cov[:, 3:, 3:] + share(chosen, errors, one.cov)
-        found.append(Positions(t + one.p, cov, one.is_settled))
+        solved = solve_poses(scene, matches[chosen], start)
+        cov, _ = invert_each(normal_equations(observe(scene, matches[chosen], start))[0])
+        gains = J @ cov
+        cov = gains @ J.T + _cov_shared(
+            scene, matches[chosen, 0], gains, by_ranges[chosen], by_heights[chosen]
+        )
+        found.append(Positions(solved.estimates[:, :3, 3], cov, solved.is_settled))
     return found
-
-
-def _by_motion(q: Array, weights: Array, off: Array) -> Array:
-    """Return the gradient by small motions of weighted centres that are off, (n, 6)."""
-    pull = (weights @ off[..., None])[..., 0]
-    return np.concatenate([cross(q, pull), pull], axis=1)
 
 
 def _by_distances(
@@ -267,32 +262,31 @@ def _by_distances(
     p_start = start[:3, 3]
     seen = observe_distances(measure, scene, matches, p_start)
     marks = scene.marks_site[matches[:, 1]]
-    measured, weights = seen.residuals + measure(marks - p_start)[0], _inverses(seen.cov)
-    told = influences(measure, scene, matches, p_start)
-    errors = _shared_errors(scene, matches, told.ranges, told.heights)
+    measured, weights = seen.residuals + measure(marks - p_start)[0], invert_each(seen.cov)[0]
+    own = influences(measure, scene, matches, p_start)
     found = []
     for chosen in groups:
         one = meet(chosen, marks, measured, weights, p_start)
-        cov = carry(chosen, told.noise, told.leans, one.cov) + share(chosen, errors, one.cov)
+        lean = own.leans[chosen].sum(axis=1)
+        spread = own.noise[chosen].sum(axis=1) + lean @ np.swapaxes(lean, 1, 2)
+        cov = one.cov @ spread @ one.cov + _cov_shared(
+            scene, matches[chosen, 0], one.cov, own.ranges[chosen], own.heights[chosen]
+        )
         found.append(one._replace(cov=cov))
     return found
 
 
-def _inverses(matrices: Array) -> Array:
-    """Return the inverses of the last two dimensions."""
-    return np.asarray(np.linalg.inv(matrices), dtype=np.float64)
+def _cov_shared(
+    scene: Scene, fits: Index, gains: Array, by_ranges: Array, by_heights: Array
+) -> Array:
+    """Return what shared errors change in covariances of positions, (s, 3, 3).
 
-
-def _shared_errors(
-    scene: Scene, matches: Index, by_ranges: Array, by_heights: Array
-) -> SharedErrors:
-    """Return what all centres have in common, and what it does to the gradient."""
-    return SharedErrors(
-        by_ranges=np.ascontiguousarray(by_ranges),
-        by_heights=np.ascontiguousarray(by_heights),
-        variances=scene.shared[matches[:, 0]],
-        sigma_range=scene.sigma_range,
-        sigma_height=scene.sigma_height,
+    ``by_ranges`` and ``by_heights``, (s, k, p), are what a unit of range or height of each centre
+    adds to the right-hand side, ``gains``, (s, 3, p), what that does to the position.
+    """
+    back = np.swapaxes(gains, 1, 2)
+    return cov_of_shared(
+        scene, scene.shared[fits], by_ranges @ back, (by_heights @ back).sum(axis=1)
     )
 
 

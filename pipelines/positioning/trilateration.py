@@ -9,20 +9,16 @@ the directions at the position that was found.
 from __future__ import annotations
 
 from collections.abc import Callable
-from itertools import combinations
 from typing import NamedTuple
 
 import numpy as np
 
+from spheremark.pipelines.compilation import compiled
 from spheremark.pipelines.config import ResectionConfig
 from spheremark.pipelines.errors import DegenerateGeometryError, NotConvergedError
-from spheremark.pipelines.estimation.least_squares import (
-    Adjustment,
-    Observations,
-    adjust,
-    external_reliabilities,
-    snoop,
-)
+from spheremark.pipelines.estimation.least_squares import Adjustment, Observations, adjust
+from spheremark.pipelines.estimation.linear_algebra import factorise, invert, invert_each, solve
+from spheremark.pipelines.estimation.statistical_tests import snoop
 from spheremark.pipelines.geometry import included_angle, is_on_a_line, rigid, rot_z, skew
 from spheremark.pipelines.model import Array, Exclusion, Index, Mask, StationFix, Status
 from spheremark.pipelines.positioning.matching import Match, Scene, cov_of_shared
@@ -30,6 +26,14 @@ from spheremark.pipelines.positioning.matching import Match, Scene, cov_of_share
 Measure = Callable[[Array], tuple[Array, Array]]
 """Gives what is measured of vectors, (..., 3), and its derivative by them."""
 
+USELESS = 1.0
+"""A position worse than this says nothing of its geometry [m]."""
+
+_N_STEPS = 40
+_MET = 1e-9  # [m] of a step between circles, which may shrink slowly
+_USABLE = 1e-4  # [m] of the last step, for positions that hardly move any more
+_DAMPING = 1e-9  # of the trace of the normal matrix; keeps singular ones solvable
+_NEAREST = 1e-9  # [m] of a mark on the plumb line of the station, whose circle has no direction
 _LOOSE = 0.1  # [m] a position that is worse than this is weak
 _FAINT = 0.05  # change of distances, RMS, by a unit of way that they cannot tell
 _STEEP = 0.9  # of a way that is nearly the vertical
@@ -64,7 +68,8 @@ def circles(v: Array) -> tuple[Array, Array]:
     """Return horizontal lengths and heights of vectors."""
     flat = np.hypot(v[..., 0], v[..., 1])
     J = np.zeros((*v.shape[:-1], 2, 3))
-    J[..., 0, 0], J[..., 0, 1], J[..., 1, 2] = v[..., 0] / flat, v[..., 1] / flat, 1.0
+    J[..., 0, :2] = v[..., :2] / np.maximum(flat, _NEAREST)[..., None]
+    J[..., 1, 2] = 1.0
     return np.stack([flat, v[..., 2]], axis=-1), J
 
 
@@ -87,7 +92,7 @@ def fix_by_ranges(
     measure = circles if name == "paper" else slope_ranges
     pairs = match.pairs if name == "ranges" else _best_three(scene, match)
 
-    def adjusted(keep: Mask) -> Adjustment[Array]:
+    def adjusted(keep: Mask) -> Adjustment:
         return adjust(
             lambda p: (observe_distances(measure, scene, pairs[keep], p),),
             lambda p, dp: np.asarray(p + dp),
@@ -152,13 +157,13 @@ def influences(measure: Measure, scene: Scene, pairs: Index, p: Array) -> Influe
     """Return what errors of each marker add to the gradient of a position from distances."""
     levelled, cov_levelled = _levelled(scene, pairs)
     seen, (_, by_centre) = observe_distances(measure, scene, pairs, p), measure(levelled)
-    pull = np.swapaxes(seen.J, -1, -2) @ np.linalg.inv(seen.cov)
+    pull = np.swapaxes(seen.J, -1, -2) @ invert_each(seen.cov)[0]
     of_centre, of_mark = pull @ by_centre, pull @ seen.J
     own = of_centre @ cov_levelled @ np.swapaxes(of_centre, -1, -2)
     own += of_mark @ scene.cov_marks[pairs[:, 1]] @ np.swapaxes(of_mark, -1, -2)
     return Influences(
         noise=own,
-        ranges=(of_centre @ _lines(levelled)[..., None])[..., 0],
+        ranges=(of_centre @ unit(levelled)[..., None])[..., 0],
         heights=of_centre[..., 2],
         leans=scene.sigma_level * of_centre @ _leaned(levelled),
     )
@@ -176,18 +181,15 @@ def _leaned(p: Array) -> Array:
 
 
 def _best_three(scene: Scene, match: Match) -> Index:
-    """Return the three matches whose circles cut best: least sum of horizontal variances."""
-    triples = np.array(list(combinations(range(match.n), 3)), dtype=np.intp)
-    _, J = circles(scene.marks_site[match.pairs[:, 1]] - match.T_site_base[:3, 3])
-    towards = J[triples, 0, :2]
-    normal = np.swapaxes(towards, 1, 2) @ towards
-    traces = np.trace(normal, axis1=1, axis2=2)
-    spread = traces / np.maximum(np.linalg.det(normal), 1e-12)  # trace of the inverse
-    return np.asarray(match.pairs[triples[int(np.argmin(spread))]])
+    """Return the three matches whose circles cut best."""
+    towards = scene.marks_site[match.pairs[:, 1], :2] - match.T_site_base[:2, 3]
+    three = np.zeros(3, dtype=np.intp)
+    best_three(unit(towards), -1.0, 1.0, three)
+    return np.asarray(match.pairs[three])
 
 
 def _pose(
-    scene: Scene, measure: Measure, pairs: Index, adjustment: Adjustment[Array]
+    scene: Scene, measure: Measure, pairs: Index, adjustment: Adjustment
 ) -> tuple[float, Array]:
     """Return the heading, and the covariance of (rotation, position) at the station.
 
@@ -204,7 +206,7 @@ def _pose(
     yaw = float(np.arctan2(weights @ np.sin(turns), weights @ np.cos(turns)))
     _, measured_by_centre = measure(levelled)
     group = adjustment.groups[0]
-    gain = -adjustment.cov @ np.swapaxes(group.J, 1, 2) @ np.linalg.inv(group.cov)
+    gain = -adjustment.cov @ np.swapaxes(group.J, 1, 2) @ invert_each(group.cov)[0]
     effects = np.zeros((2, len(pairs), 4, 3))  # of centres and of marks on heading and position
     effects[0, :, 1:] = gain @ measured_by_centre
     effects[1, :, 1:] = -gain @ group.J
@@ -213,7 +215,7 @@ def _pose(
     effects[1, :, 0] += weights[:, None] * by_mark
     covs = np.stack([cov_levelled, scene.cov_marks[pairs[:, 1]]])
     cov = np.einsum("ekab,ekbc,ekdc->ad", effects, covs, effects)
-    of_ranges = (effects[0] @ _lines(levelled)[..., None])[..., 0]
+    of_ranges = (effects[0] @ unit(levelled)[..., None])[..., 0]
     cov += cov_of_shared(
         scene, scene.shared[pairs[:, 0]], of_ranges, effects[0, ..., 2].sum(axis=0)
     )
@@ -226,8 +228,8 @@ def _pose(
     return yaw, full + scene.sigma_level**2 * lean @ lean.T
 
 
-def _lines(v: Array) -> Array:
-    """Return the unit vectors of vectors."""
+def unit(v: Array) -> Array:
+    """Return vectors of length one."""
     return np.asarray(v / np.linalg.norm(v, axis=-1, keepdims=True))
 
 
@@ -242,7 +244,7 @@ def _fix(
     measure: Measure,
     scene: Scene,
     pairs: Index,
-    adjustment: Adjustment[Array],
+    adjustment: Adjustment,
     excluded: tuple[Exclusion, ...],
 ) -> StationFix:
     """Assemble a fix, back in the unshifted site frame."""
@@ -265,7 +267,7 @@ def _fix(
         redundancies=adjustment.redundancies,
         w_statistics=adjustment.w_statistics,
         detectable_biases=adjustment.detectable_biases,
-        external_reliabilities=external_reliabilities(adjustment, np.eye(3)),
+        external_reliabilities=adjustment.external_reliabilities(np.eye(3)),
         dof=adjustment.dof,
         sigma0=adjustment.sigma0,
         passes_global_test=adjustment.passes_global_test,
@@ -276,7 +278,7 @@ def _fix(
     )
 
 
-def _weaknesses(pairs: Index, adjustment: Adjustment[Array], cov: Array, scene: Scene) -> list[str]:
+def _weaknesses(pairs: Index, adjustment: Adjustment, cov: Array, scene: Scene) -> list[str]:
     """Say why a fix cannot be relied on."""
     reasons = []
     if adjustment.dof == 0:
@@ -300,3 +302,172 @@ def _weaknesses(pairs: Index, adjustment: Adjustment[Array], cov: Array, scene: 
     if not scene.is_levelled:
         reasons.append("no AHRS: the levelling is only assumed")
     return reasons
+
+
+@compiled
+def best_three(lines: Array, least: float, greatest: float, three: Index) -> tuple[float, bool]:
+    """Find the three marks whose circles cut best.
+
+    Parameters
+    ----------
+    lines : (n, 2)
+        Horizontal unit vectors from the station to the marks.
+    least, greatest : float
+        Cosines that the angles between the three should keep to; -1 and 1 allow all.
+    three : (3,)
+        Receives their places: of those that keep to it, or of all where none do.
+
+    Returns
+    -------
+    tuple
+        Trace of the cofactor of the horizontal position, and whether the three keep to the window;
+        infinite for fewer than three marks.
+    """
+    best, best_inside = np.inf, np.inf
+    n, a, b, c = len(lines), 0, 0, 0
+    for i in range(n):
+        xi, yi = lines[i, 0], lines[i, 1]
+        for j in range(i + 1, n):
+            xj, yj = lines[j, 0], lines[j, 1]
+            xx, xy, ij = xi * xi + xj * xj, xi * yi + xj * yj, xi * xj + yi * yj
+            for k in range(j + 1, n):
+                xk, yk = lines[k, 0], lines[k, 1]
+                p, q = xx + xk * xk, xy + xk * yk
+                spread = 3.0 / max(p * (3.0 - p) - q * q, 1e-12)  # trace over determinant
+                if spread < best:
+                    best = spread
+                    three[0], three[1], three[2] = i, j, k
+                if spread < best_inside:
+                    ik, jk = xi * xk + yi * yk, xj * xk + yj * yk
+                    if max(ij, ik, jk) <= greatest and min(ij, ik, jk) >= least:
+                        best_inside, a, b, c = spread, i, j, k
+    if best_inside < np.inf:
+        three[0], three[1], three[2] = a, b, c
+        return best_inside, True
+    return best, False
+
+
+class Positions(NamedTuple):
+    """Positions of independent stations.
+
+    Attributes
+    ----------
+    p : (s, 3)
+        Positions [m].
+    cov : (s, 3, 3)
+        Their covariances [m^2].
+    is_settled : (s,) bool
+        Whether the steps became small and the covariance is finite.
+    """
+
+    p: Array
+    cov: Array
+    is_settled: Mask
+
+
+def meet(chosen: Index, marks: Array, measured: Array, weights: Array, start: Array) -> Positions:
+    """Find the stations that meet the distances to some marks best.
+
+    Parameters
+    ----------
+    chosen : (s, k)
+        Which marks each station has.
+    marks : (n, 3)
+        Marks [m].
+    measured : (n, m)
+        Slope distance to each, m = 1, or horizontal distance and difference of height, m = 2 [m].
+    weights : (n, m, m)
+        Inverses of their covariances.
+    start : (3,)
+        Approximate position, common to all; it chooses between intersections [m].
+
+    Returns
+    -------
+    Positions
+        With covariances at ``start``; zero where the geometry leaves a position open there.
+    """
+    p, cov = np.tile(start, (len(chosen), 1)), np.empty((len(chosen), 3, 3))
+    last = np.empty(len(chosen))
+    _meet_all(chosen, marks, measured, weights, p, cov, last)
+    return Positions(p, cov, (last < _USABLE) & (cov[:, 0, 0] > 0.0))
+
+
+@compiled
+def _meet_all(chosen, marks, measured, weights, p, cov, last):  # type: ignore[no-untyped-def]  # noqa: ANN001, ANN202, PLR0913
+    """Fill in positions, covariances at the start, and the sizes of the last steps."""
+    N, bent, gradient = np.empty((3, 3)), np.empty((3, 3)), np.empty(3)
+    for s in range(len(chosen)):
+        N[:], gradient[:] = 0.0, 0.0
+        for k in chosen[s]:
+            _add_distances(marks[k], p[s], measured[k], weights[k], N, bent, gradient)
+        cov[s] = N
+        for i in range(3):
+            bent[i] = N[i]
+            bent[i, i] -= 1.0 / USELESS**2
+        if not (factorise(bent, bent) and invert(N, cov[s])):
+            cov[s] = 0.0
+        last[s] = meet_one(chosen[s], marks, measured, weights, p[s])
+
+
+@compiled
+def meet_one(chosen: Index, marks: Array, measured: Array, weights: Array, p: Array) -> float:
+    """Move a station to where it meets the distances to some marks best.
+
+    Parameters
+    ----------
+    chosen, marks, measured, weights
+        As of ``meet``, of one station.
+    p : (3,)
+        Approximate position; replaced by the one that was found [m].
+
+    Returns
+    -------
+    float
+        Largest part of the last step [m]; infinite if the equations cannot be solved.
+
+    Notes
+    -----
+    Gauss-Newton, with that part of the second derivative that is never negative: circles that miss
+    each other are met where they are nearest, and the normal matrix alone is singular there.
+    """
+    N, bend, gradient, last = np.empty((3, 3)), np.empty((3, 3)), np.empty(3), np.inf
+    for _ in range(_N_STEPS):
+        N[:], bend[:], gradient[:] = 0.0, 0.0, 0.0
+        for k in chosen:
+            _add_distances(marks[k], p, measured[k], weights[k], N, bend, gradient)
+        damping = _DAMPING * (N[0, 0] + N[1, 1] + N[2, 2])
+        for i in range(3):
+            bend[i, i] += damping
+        bend += N
+        if not solve(bend, gradient):
+            return np.inf
+        p += gradient
+        last = np.abs(gradient).max()
+        if last < _MET:
+            break
+    return last
+
+
+@compiled
+def _add_distances(mark, p, measured, weight, N, bend, gradient):  # type: ignore[no-untyped-def]  # noqa: ANN001, ANN202, PLR0913
+    """Add what was measured to one mark to normal matrix, second derivative and right-hand side."""
+    is_flat = len(measured) == 2
+    v = mark[0] - p[0], mark[1] - p[1], 0.0 if is_flat else mark[2] - p[2]
+    distance = np.sqrt(v[0] ** 2 + v[1] ** 2 + v[2] ** 2)
+    u = v[0] / distance, v[1] / distance, v[2] / distance
+    off = distance - measured[0]
+    beyond = max(off / distance, 0.0) * weight[0, 0]
+    for i in range(3):
+        gradient[i] += u[i] * weight[0, 0] * off
+        for j in range(3):
+            N[i, j] += weight[0, 0] * u[i] * u[j]
+            bend[i, j] -= beyond * u[i] * u[j]
+        bend[i, i] += beyond if i < 2 or not is_flat else 0.0
+    if is_flat:  # the height, which correlates with the horizontal distance beside it
+        rise = mark[2] - p[2] - measured[1]
+        gradient[2] += weight[1, 1] * rise + weight[1, 0] * off
+        N[2, 2] += weight[1, 1]
+        for i in range(2):
+            gradient[i] += u[i] * weight[0, 1] * rise
+            N[i, 2] += u[i] * weight[0, 1]
+            N[2, i] += u[i] * weight[1, 0]

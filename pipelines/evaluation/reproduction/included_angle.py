@@ -18,8 +18,9 @@ from itertools import product
 import numpy as np
 
 from spheremark.pipelines.model import Array, seal
-from spheremark.pipelines.positioning.batch import meet, place
+from spheremark.pipelines.positioning.matching import Scene, solve_poses
 from spheremark.pipelines.positioning.subsets import angles_that_keep
+from spheremark.pipelines.positioning.trilateration import meet
 from spheremark.pipelines.published import GRANTED_DISTANCE, GRANTED_ERROR, TABLE_3
 
 CIRCLES, PAIR, TRIPLE = "three circles", "two centres", "three centres"
@@ -208,12 +209,26 @@ def _by_circles(marks: Array) -> Array:
 
 
 def _by_centres(centres: Array, marks: Array, sigma: float = GRANTED_ERROR) -> Array:
-    """Return where the free station stands whose centres, (s, k, 3), are those of marks, (s, 3)."""
-    chosen = np.arange(centres[..., 0].size).reshape(centres.shape[:2])
-    goals = np.tile(marks, (len(centres), 1))
-    weights = np.tile(np.eye(3) / sigma**2, (chosen.size, 1, 1))
-    gravity, up = np.eye(2) / _SIGMA_UP**2, np.array([0.0, 0.0, 1.0])
-    return place(chosen, centres.reshape(-1, 3), goals, weights, up, gravity).p
+    """Return where the free station stands whose centres, (s, k, 3), are those of marks, (k, 3)."""
+    (s, k, _), n = centres.shape, centres[..., 0].size
+    scene = Scene(
+        names=(),
+        centres_base=centres.reshape(-1, 3),
+        cov_centres=np.tile(sigma**2 * np.eye(3), (n, 1, 1)),
+        marks_site=marks,
+        cov_marks=np.zeros((k, 3, 3)),
+        middle=np.zeros(3),
+        R_station_base=np.eye(3),
+        J_up=np.array([[0.0, -1.0], [1.0, 0.0], [0.0, 0.0]]),
+        sigma_level=_SIGMA_UP,
+        is_levelled=True,
+        sigma_heading=0.0,
+        sigma_range=0.0,
+        shared=np.zeros(n),
+        sigma_height=0.0,
+    )
+    pairs = np.stack([np.arange(n).reshape(s, k), np.tile(np.arange(k), (s, 1))], axis=2)
+    return solve_poses(scene, pairs, np.eye(4)).estimates[:, :3, 3]
 
 
 def _limit(sigma: float, tolerance: float, rng: np.random.Generator) -> AngleLimit:

@@ -7,13 +7,8 @@ from spheremark.pipelines.errors import (
     NotConvergedError,
     TooFewObservationsError,
 )
-from spheremark.pipelines.estimation.least_squares import (
-    Observations,
-    adjust,
-    external_reliabilities,
-    snoop,
-    solve,
-)
+from spheremark.pipelines.estimation.least_squares import Observations, adjust, solve, solve_each
+from spheremark.pipelines.estimation.statistical_tests import snoop
 from tests import chance
 
 LEVELS = {"test_level": 0.001, "test_power": 0.80}
@@ -102,7 +97,7 @@ def test_scaling_all_sigmas_scales_the_covariance_by_the_square(rng):
 def test_no_unseen_bias_moves_the_estimate_farther_than_external_reliability_says(rng):
     design, readings, cov = line(rng, noise=0.0)
     result = adjust(linear(design, readings, cov), add, np.zeros(2), **LEVELS)
-    limits = external_reliabilities(result, np.eye(2))
+    limits = result.external_reliabilities(np.eye(2))
     _, _, _, weights, cov_v = dense(design, readings, cov)
     tested = weights @ cov_v @ weights
     for k in range(12):
@@ -161,7 +156,7 @@ def test_an_observation_without_redundancy_is_said_to_be_untestable():
     np.testing.assert_allclose(result.redundancies, [0.5, 0.5, 0.0], atol=1e-12)
     assert np.isnan(result.w_statistics[2])
     assert np.isinf(result.detectable_biases[2])
-    assert np.isinf(external_reliabilities(result, np.eye(2))[2])
+    assert np.isinf(result.external_reliabilities(np.eye(2))[2])
     assert np.all(np.isfinite(result.detectable_biases[:2]))
 
 
@@ -178,15 +173,32 @@ def test_many_problems_are_solved_at_once_as_one_by_one(rng):
     problems = [line(rng) for _ in range(5)]
     design, readings, cov = (np.stack(part) for part in zip(*problems, strict=True))
 
-    def linearise(x):
-        residuals = readings - np.einsum("bkmp,bp->bkm", design, x)
-        return (Observations(residuals=residuals, J=-design, cov=cov),)
+    def linearise(x, rows):
+        residuals = readings[rows] - np.einsum("bkmp,bp->bkm", design[rows], x)
+        return (Observations(residuals=residuals, J=-design[rows], cov=cov[rows]),)
 
-    together = solve(linearise, add, np.zeros((5, 2)))
+    together = solve_each(linearise, add, np.zeros((5, 2)))
+    assert together.is_settled.all()
     for k, problem in enumerate(problems):
         x, cov_x, *_ = dense(*problem)
-        np.testing.assert_allclose(together.estimate[k], x, rtol=1e-9)
-        np.testing.assert_allclose(together.cov[k], cov_x, rtol=1e-9)
+        np.testing.assert_allclose(together.estimates[k], x, rtol=1e-9)
+        np.testing.assert_allclose(together.covs[k], cov_x, rtol=1e-9)
+
+
+def test_a_problem_without_a_solution_spoils_no_other(rng):
+    problems = [line(rng) for _ in range(4)]
+    design, readings, cov = (np.stack(part) for part in zip(*problems, strict=True))
+    readings[0, 0], design[2, ..., 1] = np.nan, design[2, ..., 0]
+
+    def linearise(x, rows):
+        residuals = readings[rows] - np.einsum("bkmp,bp->bkm", design[rows], x)
+        return (Observations(residuals=residuals, J=-design[rows], cov=cov[rows]),)
+
+    found = solve_each(linearise, add, np.zeros((4, 2)))
+    assert found.is_settled.tolist() == [False, True, False, True]
+    assert np.isnan(found.covs[2]).all()
+    for k in (1, 3):
+        np.testing.assert_allclose(found.estimates[k], dense(*problems[k])[0], rtol=1e-9)
 
 
 def test_a_curved_problem_is_solved_from_afar():
@@ -279,3 +291,25 @@ def test_steps_that_do_not_settle_are_refused():
 
     with pytest.raises(NotConvergedError, match="50 steps"):
         solve(linearise, add, np.array([1.0]))
+
+
+def test_the_w_statistic_is_the_jump_of_the_fit_when_the_reading_is_left_out(rng):
+    design, readings, cov = line(rng)
+    design, readings = design.reshape(-1, 1, 2), readings.reshape(-1, 1)
+    cov = np.diagonal(cov, axis1=1, axis2=2).reshape(-1, 1, 1)
+    result = adjust(linear(design, readings, cov), add, np.zeros(2), **LEVELS)
+    for k in range(len(readings)):
+        rest = np.arange(len(readings)) != k
+        x, cov_x, *_ = dense(design[rest], readings[rest], cov[rest])
+        off = (readings[k] - design[k] @ x) / np.sqrt(cov[k, 0] + design[k] @ cov_x @ design[k].T)
+        assert result.w_statistics[k] == pytest.approx(abs(off.item()), rel=1e-8)
+
+
+def test_the_order_of_the_observations_does_not_matter(rng):
+    design, readings, cov = line(rng)
+    order = rng.permutation(len(readings))
+    one = adjust(linear(design, readings, cov), add, np.zeros(2), **LEVELS)
+    other = adjust(linear(design[order], readings[order], cov[order]), add, np.zeros(2), **LEVELS)
+    np.testing.assert_allclose(other.estimate, one.estimate, rtol=1e-9)
+    np.testing.assert_allclose(other.cov, one.cov, rtol=1e-9)
+    np.testing.assert_allclose(other.w_statistics, one.w_statistics[order], rtol=1e-7)

@@ -7,7 +7,15 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from spheremark.pipelines.estimation.linear_algebra import factorise, inverse, invert, solve
+from spheremark.pipelines.errors import DegenerateGeometryError
+from spheremark.pipelines.estimation.linear_algebra import (
+    eliminate,
+    factorise,
+    inverse,
+    invert,
+    invert_each,
+    solve,
+)
 
 
 def _positive_definite(seed: int, n: int) -> np.ndarray:
@@ -73,3 +81,47 @@ def test_what_is_not_positive_definite_has_no_inverse_and_no_solution(N):
     assert np.isnan(inverse(N)).all()
     assert not solve(N.copy(), b)
     np.testing.assert_array_equal(b, [1.0, 2.0])
+
+
+def test_one_singular_matrix_of_a_stack_spoils_no_other():
+    stack = np.stack([_positive_definite(k, 3) for k in range(4)]).reshape(2, 2, 3, 3)
+    stack[1, 0] = 1.0
+    found, is_regular = invert_each(stack)
+    assert is_regular.tolist() == [[True, True], [False, True]]
+    assert np.isnan(found[1, 0]).all()
+    np.testing.assert_array_equal(found[0, 1], inverse(stack[0, 1]))
+
+
+@settings(deadline=None)
+@given(seed=st.integers(0, 10_000), s=st.integers(1, 5), a=st.integers(1, 6), q=st.integers(0, 7))
+def test_elimination_gives_what_the_dense_system_gives(seed, s, a, q):
+    rng, n = np.random.default_rng(seed), s * a + q
+    locals_of = np.repeat(np.arange(s), a)
+    J = rng.normal(size=(4 * n, n))
+    J[:, : s * a] *= rng.integers(0, s, 4 * n)[:, None] == locals_of  # each row one set
+    N, rhs = J.T @ J + 0.1 * np.eye(n), rng.normal(size=n)
+    local = np.array([N[a * k : a * k + a, a * k : a * k + a] for k in range(s)])
+    mixed = N[: s * a, s * a :].reshape(s, a, q)
+    reduced = eliminate(local, mixed, rhs[: s * a].reshape(s, a), N[s * a :, s * a :], rhs[s * a :])
+    dense, expected = np.linalg.inv(N), np.linalg.solve(N, rhs)
+    cov = np.linalg.inv(reduced.N)
+    np.testing.assert_allclose(cov, dense[s * a :, s * a :], rtol=1e-8, atol=1e-10)
+    common = cov @ reduced.rhs
+    np.testing.assert_allclose(common, expected[s * a :], rtol=1e-8, atol=1e-10)
+    np.testing.assert_allclose(
+        reduced.local_steps(common).ravel(), expected[: s * a], rtol=1e-8, atol=1e-10
+    )
+    for k, found in enumerate(reduced.local_covariances(cov)):
+        own = dense[a * k : a * k + a, a * k : a * k + a]
+        np.testing.assert_allclose(found, own, rtol=1e-8, atol=1e-10)
+
+
+def test_a_set_of_local_unknowns_that_nothing_determines_is_refused():
+    with pytest.raises(DegenerateGeometryError, match="1 of 2 sets"):
+        eliminate(
+            np.stack([np.eye(2), np.ones((2, 2))]),
+            np.zeros((2, 2, 1)),
+            np.zeros((2, 2)),
+            np.eye(1),
+            np.zeros(1),
+        )

@@ -1,4 +1,5 @@
 from dataclasses import replace
+from itertools import combinations
 from time import thread_time
 
 import numpy as np
@@ -6,7 +7,15 @@ import pytest
 
 from spheremark.pipelines.config import ResectionConfig
 from spheremark.pipelines.errors import AmbiguousMatchError, NoMatchError
-from spheremark.pipelines.positioning.matching import gather, match_marks, moved, observe
+from spheremark.pipelines.geometry import rigid, rot_z
+from spheremark.pipelines.positioning.matching import (
+    gather,
+    match_marks,
+    moved,
+    observe,
+    solve_pose,
+    solve_poses,
+)
 from tests.synthetic import control, field, marker_fit, pose, sightings
 
 CONFIG = ResectionConfig()
@@ -211,3 +220,37 @@ def test_the_covariance_of_gravity_is_that_of_roll_and_pitch():
     ]
     J = np.stack([column[0] for column in columns], axis=1)
     np.testing.assert_allclose(up(*lean).cov[0], 2e-3**2 * J @ J.T, rtol=1e-6)
+
+
+def _scene_of(rng, n=8):
+    """A scene whose marks are their markers' in turn, and a pose near the truth."""
+    lean = (0.06, -0.04)
+    marks, T = field(rng, n), pose((0.7, -1.2, 0.4), 2.2, lean)
+    fits = sightings(marks, T, lean=lean, noise=rng.normal(0, 4e-3, (n, 3)))
+    scene = gather(fits, marks, ResectionConfig())
+    start = T @ rigid(scene.R_station_base @ rot_z(0.02), [0.05, -0.03, 0.02])
+    start[:3, 3] -= scene.middle
+    return scene, start
+
+
+def test_many_poses_at_once_are_those_of_each_alone(rng):
+    scene, start = _scene_of(rng)
+    chosen = np.array(list(combinations(range(8), 5)))
+    pairs = np.stack([chosen, chosen], axis=2)
+    found = solve_poses(scene, pairs, start)
+    assert found.is_settled.all()
+    for one, T, cov in zip(pairs, found.estimates, found.covs, strict=True):
+        alone = solve_pose(scene, one, start)
+        np.testing.assert_allclose(T, alone.estimate, rtol=0, atol=1e-9)
+        np.testing.assert_allclose(cov, alone.cov, rtol=1e-6, atol=1e-14)
+
+
+def test_a_mark_that_is_no_number_spoils_no_other_pose(rng):
+    scene, start = _scene_of(rng)
+    chosen = np.array([[0, 1, 2], [1, 2, 3], [3, 4, 5]])
+    pairs, spoilt = np.stack([chosen, chosen], axis=2), scene.marks_site.copy()
+    spoilt[0] = np.nan
+    found = solve_poses(replace(scene, marks_site=spoilt), pairs, start)
+    assert found.is_settled.tolist() == [False, True, True]
+    alone = solve_poses(scene, pairs[1:], start)
+    np.testing.assert_allclose(found.estimates[1:], alone.estimates, rtol=0, atol=1e-12)

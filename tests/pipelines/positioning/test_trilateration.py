@@ -1,6 +1,7 @@
 """Positions from distances, beside the free station."""
 
 from dataclasses import replace
+from itertools import combinations
 
 import numpy as np
 import pytest
@@ -9,7 +10,13 @@ from spheremark.pipelines.config import ResectionConfig
 from spheremark.pipelines.errors import DegenerateGeometryError
 from spheremark.pipelines.geometry import inverse, levelling_rotation, log_motion, rigid
 from spheremark.pipelines.positioning.resection import resect
-from spheremark.pipelines.positioning.trilateration import circles, slope_ranges
+from spheremark.pipelines.positioning.trilateration import (
+    best_three,
+    circles,
+    meet,
+    slope_ranges,
+    unit,
+)
 from tests import chance
 from tests.synthetic import control, field, pose, sightings
 
@@ -160,3 +167,51 @@ def test_two_marks_are_refused(method):
     fits = sightings(marks, pose([0, 0, 0.8], 0.3))
     with pytest.raises(DegenerateGeometryError, match="three are needed"):
         resect(method, fits, marks, CONFIG)
+
+
+def test_a_mark_that_is_no_number_spoils_no_other_station(rng):
+    marks, start = rng.uniform(-6, 6, (8, 3)), np.array([0.3, -0.2, 0.1])
+    distances = np.linalg.norm(marks, axis=1)[:, None]
+    spoilt = marks.copy()
+    spoilt[0] = np.nan
+    chosen = np.array([[0, 1, 2, 3], [1, 2, 3, 4], [3, 4, 5, 6]])
+    found = meet(chosen, spoilt, distances, np.full((8, 1, 1), 1e4), start)
+    assert found.is_settled.tolist() == [False, True, True]
+    np.testing.assert_allclose(found.p[1:], 0.0, rtol=0, atol=1e-6)
+
+
+def test_circles_that_miss_each_other_are_met_where_the_sum_of_squares_is_least():
+    headings = np.radians([[0.0, 1.0, 180.5], [10.0, 130.0, 250.0]])
+    marks = 5.0 * np.stack([np.cos(headings), np.sin(headings), 0.0 * headings], axis=2)
+    marks = marks.reshape(-1, 3)
+    measured = np.stack([np.full(6, 4.7), np.zeros(6)], axis=1)
+    chosen, weights = np.arange(6).reshape(2, 3), np.tile(np.eye(2), (6, 1, 1))
+    found = meet(chosen, marks, measured, weights, np.zeros(3))
+    for p, three in zip(found.p, chosen, strict=True):
+        squares = [
+            np.sum((np.linalg.norm(marks[three, :2] - p[:2] - d, axis=1) - 4.7) ** 2)
+            for d in ([0.0, 0.0], [1e-4, 0.0], [-1e-4, 0.0], [0.0, 1e-4], [0.0, -1e-4])
+        ]
+        assert np.argmin(squares) == 0
+
+
+@pytest.mark.parametrize("window", [(-1.0, 1.0), (-0.9, 0.9)])
+def test_the_best_three_have_the_least_cofactor_of_all_in_the_window(rng, window):
+    lines, three = unit(rng.normal(size=(9, 2))), np.zeros(3, dtype=np.intp)
+    spread, is_inside = best_three(lines, *window, three)
+    traces = {}
+    for triple in combinations(range(9), 3):
+        J = lines[list(triple)]
+        cosines = [J[i] @ J[j] for i, j in combinations(range(3), 2)]
+        if window[0] <= min(cosines) and max(cosines) <= window[1]:
+            traces[triple] = np.trace(np.linalg.inv(J.T @ J))
+    assert is_inside
+    assert tuple(three) == min(traces, key=traces.get)
+    assert spread == pytest.approx(min(traces.values()))
+
+
+def test_without_three_in_the_window_the_best_of_all_are_taken():
+    lines, three = unit(np.array([[1.0, 0.0], [1.0, 0.1], [1.0, -0.1]])), np.zeros(3, np.intp)
+    _, is_inside = best_three(lines, -0.5, 0.5, three)
+    assert not is_inside
+    assert tuple(three) == (0, 1, 2)
