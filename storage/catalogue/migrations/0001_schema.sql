@@ -14,9 +14,9 @@ CREATE TABLE surveys (
 );
 COMMENT ON TABLE surveys IS 'A field with its control marks and the logs that were recorded there.';
 COMMENT ON COLUMN surveys.survey_id IS 'Given by the catalogue; the same in every table.';
-COMMENT ON COLUMN surveys.name IS 'Given by people, unique.';
+COMMENT ON COLUMN surveys.name IS 'Name of the user, unique.';
 COMMENT ON COLUMN surveys.tolerance_m IS '3-D error that the survey accepts.';
-COMMENT ON COLUMN surveys.created_at IS 'When it was made (UTC).';
+COMMENT ON COLUMN surveys.created_at IS 'Instant of creation (UTC).';
 COMMENT ON COLUMN surveys.rig_digest IS 'Rig that its jobs use where they name none; NULL: the one that each log describes.';
 
 CREATE TABLE control_marks (
@@ -32,7 +32,7 @@ CREATE TABLE control_marks (
     PRIMARY KEY (survey_id, mark)
 );
 COMMENT ON TABLE control_marks IS 'Known sphere centres in the site frame.';
-COMMENT ON COLUMN control_marks.mark IS 'What the surveyor calls it.';
+COMMENT ON COLUMN control_marks.mark IS 'Name of the mark.';
 COMMENT ON COLUMN control_marks.place IS 'Its place in the file, from 0.';
 COMMENT ON COLUMN control_marks.x_m IS 'Centre of the sphere in the site frame.';
 COMMENT ON COLUMN control_marks.y_m IS 'Centre of the sphere in the site frame.';
@@ -46,7 +46,7 @@ CREATE TABLE rigs (
     name VARCHAR NOT NULL,
     rig JSON NOT NULL
 );
-COMMENT ON TABLE rigs IS 'Every rig that a run used, that a calibration gave or that somebody entered, as JSON.';
+COMMENT ON TABLE rigs IS 'Rigs of runs, of calibrations and of users, as JSON.';
 COMMENT ON COLUMN rigs.rig_digest IS 'First 16 hexadecimal digits of the SHA-256 of the canonical rig.';
 COMMENT ON COLUMN rigs.rig IS 'Mounting, laser table and offsets, with units in the keys.';
 
@@ -63,8 +63,8 @@ COMMENT ON TABLE recordings IS 'Uploaded logs; recording_id is the SHA-256 of th
 COMMENT ON COLUMN recordings.recording_id IS 'SHA-256 of the bytes of the log.';
 COMMENT ON COLUMN recordings.name IS 'Stem of the name of the uploaded file.';
 COMMENT ON COLUMN recordings.size_bytes IS 'Length of the file.';
-COMMENT ON COLUMN recordings.uploaded_at IS 'When it came (UTC).';
-COMMENT ON COLUMN recordings.url IS 'Where the bytes are.';
+COMMENT ON COLUMN recordings.uploaded_at IS 'Instant of the upload (UTC).';
+COMMENT ON COLUMN recordings.url IS 'Location of the file.';
 COMMENT ON COLUMN recordings.verdict IS 'ok, weak or refused.';
 COMMENT ON COLUMN recordings.preflight IS 'The whole preflight report.';
 
@@ -87,7 +87,7 @@ CREATE TABLE true_marks (
     PRIMARY KEY (survey_id, mark)
 );
 COMMENT ON TABLE true_marks IS 'True sphere centres in the site frame; for comparison only, never an input of a job.';
-COMMENT ON COLUMN true_marks.mark IS 'What the simulator calls it.';
+COMMENT ON COLUMN true_marks.mark IS 'Name of the mark in the simulator.';
 COMMENT ON COLUMN true_marks.place IS 'Its place in the file, from 0.';
 
 CREATE TABLE true_stops (
@@ -112,7 +112,7 @@ CREATE TABLE true_worlds (
     rig JSON,
     about JSON NOT NULL
 );
-COMMENT ON TABLE true_worlds IS 'What else is known of a simulated world: its rig, seed and scenario; for comparison only, never an input of a job.';
+COMMENT ON TABLE true_worlds IS 'Rig, seed and scenario of a simulated world; for comparison only, never an input of a job.';
 COMMENT ON COLUMN true_worlds.rig IS 'The true rig, NULL when unknown.';
 COMMENT ON COLUMN true_worlds.about IS 'Seed, scenario and the like.';
 
@@ -136,20 +136,20 @@ CREATE TABLE jobs (
     error_traceback VARCHAR,
     options JSON DEFAULT '{}'
 );
-COMMENT ON TABLE jobs IS 'Work asked for; status is accepted, running, successful, failed or dismissed.';
-COMMENT ON COLUMN jobs.kind IS 'What is done, for instance process.';
+COMMENT ON TABLE jobs IS 'Jobs; status is accepted, running, successful, failed or dismissed.';
+COMMENT ON COLUMN jobs.kind IS 'Kind of the job, for instance process.';
 COMMENT ON COLUMN jobs.config IS 'The effective configuration.';
 COMMENT ON COLUMN jobs.status IS 'accepted, running, successful, failed or dismissed.';
 COMMENT ON COLUMN jobs.progress_percent IS '0 to 100, as of this snapshot.';
-COMMENT ON COLUMN jobs.message IS 'What was being done last, for people.';
-COMMENT ON COLUMN jobs.attempts IS 'How often it was started.';
-COMMENT ON COLUMN jobs.created_at IS 'When it was asked for (UTC).';
-COMMENT ON COLUMN jobs.started_at IS 'When its last attempt began (UTC).';
-COMMENT ON COLUMN jobs.finished_at IS 'When it came to its end (UTC).';
+COMMENT ON COLUMN jobs.message IS 'Last step, as a sentence.';
+COMMENT ON COLUMN jobs.attempts IS 'Number of starts.';
+COMMENT ON COLUMN jobs.created_at IS 'Instant of the request (UTC).';
+COMMENT ON COLUMN jobs.started_at IS 'Start of the last attempt (UTC).';
+COMMENT ON COLUMN jobs.finished_at IS 'End of the job (UTC).';
 COMMENT ON COLUMN jobs.error_code IS 'Stable code of the error, for programs.';
-COMMENT ON COLUMN jobs.error_reason IS 'Why it failed, for people.';
-COMMENT ON COLUMN jobs.error_traceback IS 'Where in the code it failed.';
-COMMENT ON COLUMN jobs.options IS 'What was chosen beside the configuration: rig (a digest), recordings (where the job reads several), and what its kind lets one choose.';
+COMMENT ON COLUMN jobs.error_reason IS 'Reason of the failure, as a sentence.';
+COMMENT ON COLUMN jobs.error_traceback IS 'Traceback of the failure.';
+COMMENT ON COLUMN jobs.options IS 'Options beside the configuration: rig (a digest), recordings (of a job that reads several), and those of its kind.';
 
 CREATE TABLE runs (
     run_id VARCHAR PRIMARY KEY,
@@ -169,9 +169,9 @@ COMMENT ON COLUMN runs.run_id IS 'The same in every table of results.';
 COMMENT ON COLUMN runs.config IS 'The effective configuration.';
 COMMENT ON COLUMN runs.config_digest IS 'First 16 hexadecimal digits of the SHA-256 of the canonical configuration.';
 COMMENT ON COLUMN runs.code_version IS 'Version of spheremark.';
-COMMENT ON COLUMN runs.finished_at IS 'When the numbers were there (UTC).';
+COMMENT ON COLUMN runs.finished_at IS 'End of the run (UTC).';
 COMMENT ON COLUMN runs.duration_s IS 'Time from the log to the numbers.';
-COMMENT ON COLUMN runs.peak_memory_bytes IS 'Largest resident size of the process that made it.';
+COMMENT ON COLUMN runs.peak_memory_bytes IS 'Largest resident size of the worker process.';
 
 -- Results of a run.
 
@@ -190,18 +190,18 @@ CREATE TABLE stops (
     timings_s JSON NOT NULL,
     PRIMARY KEY (run_id, stop)
 );
-COMMENT ON TABLE stops IS 'One full scan of a run: how it was made and what weakens it.';
+COMMENT ON TABLE stops IS 'One full scan of a run: its acquisition and its weaknesses.';
 COMMENT ON COLUMN stops.stop IS 'Name of the stop: that of the log, numbered when the log holds several.';
 COMMENT ON COLUMN stops.n_returns IS 'Returns that were stitched.';
-COMMENT ON COLUMN stops.coverage_deg IS 'Angle that the gimbal turned through, at most 360.';
-COMMENT ON COLUMN stops.duration_s IS 'Time from the first shot to the last.';
-COMMENT ON COLUMN stops.roll_deg IS 'Lean of the base in R_station_base = Ry(pitch) Rx(roll).';
-COMMENT ON COLUMN stops.pitch_deg IS 'Lean of the base in R_station_base = Ry(pitch) Rx(roll).';
+COMMENT ON COLUMN stops.coverage_deg IS 'Rotation of the gimbal during the scan, at most 360.';
+COMMENT ON COLUMN stops.duration_s IS 'Time from the first pulse to the last.';
+COMMENT ON COLUMN stops.roll_deg IS 'Rotation of the base in R_station_base = Ry(pitch) Rx(roll).';
+COMMENT ON COLUMN stops.pitch_deg IS 'Rotation of the base in R_station_base = Ry(pitch) Rx(roll).';
 COMMENT ON COLUMN stops.sigma_levelling_deg IS 'Standard deviation of roll and of pitch.';
-COMMENT ON COLUMN stops.sigma_heading_deg IS 'Standard deviation of the heading that mounting and encoder leave unknown; it turns all centres of the stop together and is part of their covariances.';
-COMMENT ON COLUMN stops.cloud_url IS 'Where the thinned cloud is; NULL when it was not kept.';
-COMMENT ON COLUMN stops.notes IS 'What weakens the results, for people.';
-COMMENT ON COLUMN stops.timings_s IS 'Time that each step took.';
+COMMENT ON COLUMN stops.sigma_heading_deg IS 'Standard deviation of the heading from mounting and encoder; it rotates all centres of the stop together and is part of their covariances.';
+COMMENT ON COLUMN stops.cloud_url IS 'Location of the thinned cloud; NULL without one.';
+COMMENT ON COLUMN stops.notes IS 'Weaknesses of the scan, as sentences.';
+COMMENT ON COLUMN stops.timings_s IS 'Duration of each step.';
 
 CREATE TABLE marker_fits (
     run_id VARCHAR NOT NULL,
@@ -263,14 +263,14 @@ COMMENT ON COLUMN marker_fits.sigma_3d_m IS 'Square root of the trace of the cov
 COMMENT ON COLUMN marker_fits.range_m IS 'From the mean beam origin to the centre.';
 COMMENT ON COLUMN marker_fits.azimuth_deg IS 'Direction to the centre in the station frame, counter-clockwise from x.';
 COMMENT ON COLUMN marker_fits.elevation_deg IS 'Direction to the centre above the horizon of the station.';
-COMMENT ON COLUMN marker_fits.n_points IS 'Returns that carry the estimate.';
-COMMENT ON COLUMN marker_fits.n_rejected IS 'Returns of the candidate that were set aside.';
-COMMENT ON COLUMN marker_fits.n_rings IS 'Different lasers among the used returns; 0 when the log does not tell them.';
+COMMENT ON COLUMN marker_fits.n_points IS 'Returns that the fit used.';
+COMMENT ON COLUMN marker_fits.n_rejected IS 'Returns of the candidate that the fit did not use.';
+COMMENT ON COLUMN marker_fits.n_rings IS 'Different lasers among the used returns; 0 when the log has no lasers.';
 COMMENT ON COLUMN marker_fits.coverage IS 'Share of the visible half of the sphere that has returns, 0 to 1.';
 COMMENT ON COLUMN marker_fits.rms_m IS 'Root mean square of the residuals (observed minus computed along the beam).';
 COMMENT ON COLUMN marker_fits.sigma0 IS 'Square root of the variance factor; 1 means noise as assumed.';
-COMMENT ON COLUMN marker_fits.radius_m IS 'Radius that was assumed.';
-COMMENT ON COLUMN marker_fits.radius_free_m IS 'Radius when estimated together with the centre; NULL when the returns do not tell.';
+COMMENT ON COLUMN marker_fits.radius_m IS 'Assumed radius.';
+COMMENT ON COLUMN marker_fits.radius_free_m IS 'Radius when estimated together with the centre; NULL when the returns do not determine it.';
 COMMENT ON COLUMN marker_fits.sigma_radius_free_m IS 'Standard deviation of radius_free_m.';
 COMMENT ON COLUMN marker_fits.mean_intensity IS 'Mean reflectivity of the used returns, 0 to 255.';
 COMMENT ON COLUMN marker_fits.incidence_deg IS 'Mean angle between the used beams and the normals of the sphere.';
@@ -280,7 +280,7 @@ COMMENT ON COLUMN marker_fits.error_y_m IS 'Estimate minus truth along y of the 
 COMMENT ON COLUMN marker_fits.error_z_m IS 'Estimate minus truth along z of the station frame, up.';
 COMMENT ON COLUMN marker_fits.error_radial_m IS 'Estimate minus truth along the line of sight; positive is too far.';
 COMMENT ON COLUMN marker_fits.error_3d_m IS 'Length of the error.';
-COMMENT ON COLUMN marker_fits.sigma_range_shared_m IS 'Standard deviation of what all centres of the stop are too far together, as their covariances have it; NULL where the method does not tell.';
+COMMENT ON COLUMN marker_fits.sigma_range_shared_m IS 'Standard deviation of the range error that all centres of the stop share, part of their covariances; NULL where the method gives none.';
 
 CREATE TABLE rejections (
     run_id VARCHAR NOT NULL,
@@ -292,12 +292,12 @@ CREATE TABLE rejections (
     n_points INTEGER NOT NULL,
     reason VARCHAR NOT NULL
 );
-COMMENT ON TABLE rejections IS 'What looked like a marker at first, and the reason against.';
-COMMENT ON COLUMN rejections.x_m IS 'Where it is, in the station frame.';
-COMMENT ON COLUMN rejections.y_m IS 'Where it is, in the station frame.';
-COMMENT ON COLUMN rejections.z_m IS 'Where it is, in the station frame.';
+COMMENT ON TABLE rejections IS 'Candidates that are no markers, with the reason.';
+COMMENT ON COLUMN rejections.x_m IS 'Position in the station frame.';
+COMMENT ON COLUMN rejections.y_m IS 'Position in the station frame.';
+COMMENT ON COLUMN rejections.z_m IS 'Position in the station frame.';
 COMMENT ON COLUMN rejections.n_points IS 'Number of its returns.';
-COMMENT ON COLUMN rejections.reason IS 'Why it is not used, for people.';
+COMMENT ON COLUMN rejections.reason IS 'Reason of the rejection, as a sentence.';
 
 CREATE TABLE station_fixes (
     run_id VARCHAR NOT NULL,
@@ -341,7 +341,7 @@ CREATE TABLE station_fixes (
     PRIMARY KEY (run_id, stop, fit_method, resection_method)
 );
 COMMENT ON TABLE station_fixes IS 'Station poses in the site frame, one row per stop, fitting and resection method; status is ok, weak or failed.';
-COMMENT ON COLUMN station_fixes.resection_method IS 'How the station was positioned from its markers.';
+COMMENT ON COLUMN station_fixes.resection_method IS 'Method of positioning from the markers.';
 COMMENT ON COLUMN station_fixes.status IS 'ok, weak or failed.';
 COMMENT ON COLUMN station_fixes.reason IS 'Why it is weak or failed; empty when it is ok.';
 COMMENT ON COLUMN station_fixes.x_m IS 'Position of the station in the site frame; NULL when failed.';
@@ -363,7 +363,7 @@ COMMENT ON COLUMN station_fixes.ellipse_minor_m IS 'Semi-minor axis of the horiz
 COMMENT ON COLUMN station_fixes.ellipse_bearing_deg IS 'Bearing of the major axis, clockwise from y of the site frame, 0 to 180.';
 COMMENT ON COLUMN station_fixes.ellipse_major_95_m IS 'Semi-major axis of the horizontal 95 % ellipse.';
 COMMENT ON COLUMN station_fixes.ellipse_minor_95_m IS 'Semi-minor axis of the horizontal 95 % ellipse.';
-COMMENT ON COLUMN station_fixes.n_markers IS 'Markers that carry the fix.';
+COMMENT ON COLUMN station_fixes.n_markers IS 'Markers used for the fix.';
 COMMENT ON COLUMN station_fixes.dof IS 'Observations, gravity included, minus unknowns.';
 COMMENT ON COLUMN station_fixes.sigma0 IS 'Square root of the variance factor; NULL without redundancy.';
 COMMENT ON COLUMN station_fixes.passes_global_test IS 'Whether the variance factor agrees with 1; true without redundancy.';
@@ -375,7 +375,7 @@ COMMENT ON COLUMN station_fixes.error_z_m IS 'Estimate minus truth along z of th
 COMMENT ON COLUMN station_fixes.error_yaw_deg IS 'Estimate minus truth of the heading.';
 COMMENT ON COLUMN station_fixes.error_horizontal_m IS 'Length of the horizontal error.';
 COMMENT ON COLUMN station_fixes.error_3d_m IS 'Length of the error.';
-COMMENT ON COLUMN station_fixes.dop IS 'Dilution of precision: 3-D sigma of the position, levelled, for observations that all have a sigma of 1; NULL where there is none, and for rows of older versions.';
+COMMENT ON COLUMN station_fixes.dop IS 'Dilution of precision: 3-D sigma of the position, levelled, for observations that all have a sigma of 1; NULL where there is none.';
 
 CREATE TABLE observations (
     run_id VARCHAR NOT NULL,
@@ -397,16 +397,16 @@ CREATE TABLE observations (
     PRIMARY KEY (run_id, stop, fit_method, resection_method, marker)
 );
 COMMENT ON TABLE observations IS 'One row per marker and fix: residuals in the site frame (observed minus computed), redundancy (of 3) and reliability.';
-COMMENT ON COLUMN observations.used IS 'Whether the marker carries the fix.';
-COMMENT ON COLUMN observations.reason IS 'Why it does not; empty when it does.';
+COMMENT ON COLUMN observations.used IS 'Whether the fix uses the marker.';
+COMMENT ON COLUMN observations.reason IS 'Reason of the omission; empty when it is used.';
 COMMENT ON COLUMN observations.residual_x_m IS 'Observed minus computed along x of the site frame; NULL when not used.';
 COMMENT ON COLUMN observations.residual_y_m IS 'Observed minus computed along y of the site frame.';
 COMMENT ON COLUMN observations.residual_z_m IS 'Observed minus computed along z of the site frame.';
 COMMENT ON COLUMN observations.redundancy IS 'Redundancy of its three coordinates together, 0 to 3.';
 COMMENT ON COLUMN observations.w IS 'Largest w-statistic of its coordinates; NULL where not testable.';
 COMMENT ON COLUMN observations.minimal_detectable_bias_m IS 'Smallest bias that the w-test would find with the power of the configuration; NULL where none is.';
-COMMENT ON COLUMN observations.external_reliability_m IS 'Shift of the station by a bias of that size, unseen; NULL where none is found.';
-COMMENT ON COLUMN observations.shift_without_m IS 'How far the station moves when this marker is left out; NULL for markers that are not used, methods by ranges, and rows of older versions.';
+COMMENT ON COLUMN observations.external_reliability_m IS 'Shift of the station by an undetected bias of that size; NULL where none is found.';
+COMMENT ON COLUMN observations.shift_without_m IS 'How far the station moves when this marker is left out; NULL for markers that are not used, and for trilateration.';
 
 CREATE TABLE resections (
     run_id VARCHAR NOT NULL,
@@ -437,8 +437,8 @@ COMMENT ON COLUMN resections.y_m IS 'Position of the station in the site frame.'
 COMMENT ON COLUMN resections.z_m IS 'Position of the station in the site frame, up.';
 COMMENT ON COLUMN resections.error_3d_m IS 'Length of estimate minus truth; NULL without truth.';
 COMMENT ON COLUMN resections.included_angle_max_deg IS 'The same; of three the largest of the three angles.';
-COMMENT ON COLUMN resections.sigma_horizontal_m IS 'Square root of the trace of the covariance of x and y; NULL for rows of versions before triples.';
-COMMENT ON COLUMN resections.error_horizontal_m IS 'Length of estimate minus truth in the plane; NULL without truth, and for rows of versions before triples.';
+COMMENT ON COLUMN resections.sigma_horizontal_m IS 'Square root of the trace of the covariance of x and y.';
+COMMENT ON COLUMN resections.error_horizontal_m IS 'Length of estimate minus truth in the plane; NULL without truth.';
 
 -- Calibrations.
 
@@ -473,19 +473,19 @@ COMMENT ON COLUMN calibrations.calibration_id IS 'The same in every table of its
 COMMENT ON COLUMN calibrations.rig_digest IS 'The resulting rig.';
 COMMENT ON COLUMN calibrations.parameters IS 'Names of the parameters, in SI units.';
 COMMENT ON COLUMN calibrations.covariance IS 'Their covariance, rows in the order of parameters.';
-COMMENT ON COLUMN calibrations.start_rig_digest IS 'The rig that it began with.';
+COMMENT ON COLUMN calibrations.start_rig_digest IS 'The rig before the calibration.';
 COMMENT ON COLUMN calibrations.stops IS 'Names of the stops that were used.';
-COMMENT ON COLUMN calibrations.n_spheres IS 'Spheres, each counted at every stop that saw it.';
-COMMENT ON COLUMN calibrations.n_two_faced IS 'Those of them that were seen on both faces.';
-COMMENT ON COLUMN calibrations.n_returns IS 'Returns that the estimate rests on.';
+COMMENT ON COLUMN calibrations.n_spheres IS 'Spheres, counted once per stop.';
+COMMENT ON COLUMN calibrations.n_two_faced IS 'Spheres with returns on both faces.';
+COMMENT ON COLUMN calibrations.n_returns IS 'Returns of the estimate.';
 COMMENT ON COLUMN calibrations.dof IS 'Returns minus unknowns.';
-COMMENT ON COLUMN calibrations.sigma0 IS 'Square root of the variance factor; 1 means that ranges are as noisy as a VLP-16 usually has them.';
-COMMENT ON COLUMN calibrations.residual_rms_before_m IS 'Root mean square residual of the returns with the rig that it began with, the centres adjusted to it.';
+COMMENT ON COLUMN calibrations.sigma0 IS 'Square root of the variance factor; 1 means range noise as usual for a VLP-16.';
+COMMENT ON COLUMN calibrations.residual_rms_before_m IS 'Root mean square residual of the returns with the rig before the calibration, the centres adjusted to it.';
 COMMENT ON COLUMN calibrations.residual_rms_after_m IS 'The same with the estimated rig.';
 COMMENT ON COLUMN calibrations.n_gaps IS 'Spheres whose two faces were compared with the estimated rig.';
-COMMENT ON COLUMN calibrations.gap_rms_before_m IS 'Root mean square distance between the centres that the two faces of a sphere give, with the rig that it began with; NULL where none could be compared.';
+COMMENT ON COLUMN calibrations.gap_rms_before_m IS 'Root mean square distance between the centres that the two faces of a sphere give, with the rig before the calibration; NULL where none could be compared.';
 COMMENT ON COLUMN calibrations.gap_rms_after_m IS 'The same with the estimated rig.';
-COMMENT ON COLUMN calibrations.gap_sigma_after_m IS 'What it should be by the covariances of the centres.';
+COMMENT ON COLUMN calibrations.gap_sigma_after_m IS 'Its prediction from the covariances of the centres.';
 COMMENT ON COLUMN calibrations.config IS 'The effective configuration.';
 COMMENT ON COLUMN calibrations.config_digest IS 'First 16 hexadecimal digits of the SHA-256 of the canonical configuration.';
 COMMENT ON COLUMN calibrations.code_version IS 'Version of spheremark.';
@@ -503,12 +503,12 @@ CREATE TABLE calibrated_parameters (
     reason VARCHAR NOT NULL,
     PRIMARY KEY (calibration_id, parameter)
 );
-COMMENT ON TABLE calibrated_parameters IS 'Each parameter of a rig before and after a calibration; and those that the scans do not tell, with the reason.';
-COMMENT ON COLUMN calibrated_parameters.place IS 'Its place in the covariance, from 0; what is not estimated follows.';
+COMMENT ON TABLE calibrated_parameters IS 'Each parameter of a rig before and after a calibration; parameters that the scans do not determine have a reason.';
+COMMENT ON COLUMN calibrated_parameters.place IS 'Index in the covariance, from 0; parameters that are not estimated follow.';
 COMMENT ON COLUMN calibrated_parameters.unit IS 'Unit of its numbers; empty where it was not estimated.';
-COMMENT ON COLUMN calibrated_parameters.is_estimated IS 'Whether the scans tell it.';
-COMMENT ON COLUMN calibrated_parameters.start_value IS 'Value in the rig that it began with, in the unit of the row.';
-COMMENT ON COLUMN calibrated_parameters.estimate IS 'Value in the resulting rig, in the unit of the row.';
+COMMENT ON COLUMN calibrated_parameters.is_estimated IS 'Whether the scans determine it.';
+COMMENT ON COLUMN calibrated_parameters.start_value IS 'Value before the calibration, in the unit of the row.';
+COMMENT ON COLUMN calibrated_parameters.estimate IS 'Value after the calibration, in the unit of the row.';
 COMMENT ON COLUMN calibrated_parameters.sigma IS 'Its standard deviation, in the unit of the row.';
 COMMENT ON COLUMN calibrated_parameters.reason IS 'Why it was not estimated; empty when it was.';
 
@@ -525,8 +525,8 @@ CREATE TABLE calibration_gaps (
     gap_3d_m DOUBLE NOT NULL,
     sigma_3d_m DOUBLE NOT NULL
 );
-COMMENT ON TABLE calibration_gaps IS 'How far apart the two faces of a scan put the centre of each sphere, front minus back, in the base frame.';
-COMMENT ON COLUMN calibration_gaps.is_after IS 'Whether with the estimated rig, or with the one that the calibration began with.';
+COMMENT ON TABLE calibration_gaps IS 'Difference of the centre of each sphere from the two faces of a scan, front minus back, in the base frame.';
+COMMENT ON COLUMN calibration_gaps.is_after IS 'Whether with the estimated rig, or with the rig before.';
 COMMENT ON COLUMN calibration_gaps.marker IS 'M01, M02 ... by azimuth, within one stop and rig.';
 COMMENT ON COLUMN calibration_gaps.range_m IS 'From the base to the middle of both centres.';
 COMMENT ON COLUMN calibration_gaps.azimuth_deg IS 'Direction to it, counter-clockwise from x.';
@@ -534,7 +534,7 @@ COMMENT ON COLUMN calibration_gaps.gap_radial_m IS 'Along the line of sight; pos
 COMMENT ON COLUMN calibration_gaps.gap_across_m IS 'Horizontally across it, counter-clockwise.';
 COMMENT ON COLUMN calibration_gaps.gap_up_m IS 'Across both, up.';
 COMMENT ON COLUMN calibration_gaps.gap_3d_m IS 'Length of the gap.';
-COMMENT ON COLUMN calibration_gaps.sigma_3d_m IS 'What it should be by the covariances of both centres.';
+COMMENT ON COLUMN calibration_gaps.sigma_3d_m IS 'Its prediction from the covariances of both centres.';
 
 -- Adjusted networks.
 
@@ -579,22 +579,22 @@ COMMENT ON COLUMN adjustments.dof IS 'Observations minus unknowns.';
 COMMENT ON COLUMN adjustments.sigma0 IS 'Square root of the variance factor (a priori 1); NULL without redundancy.';
 COMMENT ON COLUMN adjustments.passes_global_test IS 'Whether the variance factor agrees with 1.';
 COMMENT ON COLUMN adjustments.status IS 'ok or weak.';
-COMMENT ON COLUMN adjustments.warnings IS 'Why it is weak, for people.';
+COMMENT ON COLUMN adjustments.warnings IS 'Reasons of a weak status, as sentences.';
 COMMENT ON COLUMN adjustments.datum IS 'free (place and heading of the first station) or control.';
-COMMENT ON COLUMN adjustments.datum_text IS 'What place and heading rest on, for people.';
+COMMENT ON COLUMN adjustments.datum_text IS 'Origin of position and heading, as a sentence.';
 COMMENT ON COLUMN adjustments.fit_method IS 'Fitting method of the centres.';
-COMMENT ON COLUMN adjustments.n_control_marks IS 'Control marks that it rests on.';
+COMMENT ON COLUMN adjustments.n_control_marks IS 'Control marks in use.';
 COMMENT ON COLUMN adjustments.n_observations IS 'Observed coordinates and angles that were used.';
 COMMENT ON COLUMN adjustments.n_left_out IS 'Observed centres, levellings and control marks that were not used.';
-COMMENT ON COLUMN adjustments.n_refused IS 'Stations that could not be tied to the others.';
+COMMENT ON COLUMN adjustments.n_refused IS 'Stations that could not be connected to the others.';
 COMMENT ON COLUMN adjustments.vtpv IS 'Weighted sum of squares of the residuals.';
 COMMENT ON COLUMN adjustments.vtpv_limit IS 'Largest sum that passes the global test.';
 COMMENT ON COLUMN adjustments.test_level IS 'Probability with which the tests reject good data.';
-COMMENT ON COLUMN adjustments.w_limit IS 'Largest w that is no gross error.';
+COMMENT ON COLUMN adjustments.w_limit IS 'Limit of w for gross errors.';
 COMMENT ON COLUMN adjustments.variance_factor_centres IS 'Sum of squares over redundancy of the centres; NULL without redundancy.';
 COMMENT ON COLUMN adjustments.variance_factor_gravity IS 'The same of the levelling.';
 COMMENT ON COLUMN adjustments.variance_factor_control IS 'The same of the control marks.';
-COMMENT ON COLUMN adjustments.range_bias_m IS 'What all ranges are too long, as estimated; NULL where it was no unknown.';
+COMMENT ON COLUMN adjustments.range_bias_m IS 'Estimated bias of all ranges, positive is too long; NULL where it was no unknown.';
 COMMENT ON COLUMN adjustments.sigma_range_bias_m IS 'Its standard deviation.';
 COMMENT ON COLUMN adjustments.rig_digest IS 'The rig of all its stations; NULL where they differ.';
 COMMENT ON COLUMN adjustments.config IS 'The effective configuration.';
@@ -656,7 +656,7 @@ COMMENT ON COLUMN adjusted_stations.ellipse_minor_m IS 'Semi-minor axis of the h
 COMMENT ON COLUMN adjusted_stations.ellipse_bearing_deg IS 'Bearing of the major axis, clockwise from y, 0 to 180.';
 COMMENT ON COLUMN adjusted_stations.ellipse_major_95_m IS 'Semi-major axis of the horizontal 95 % ellipse.';
 COMMENT ON COLUMN adjusted_stations.ellipse_minor_95_m IS 'Semi-minor axis of the horizontal 95 % ellipse.';
-COMMENT ON COLUMN adjusted_stations.n_observations IS 'Centres that carry it.';
+COMMENT ON COLUMN adjusted_stations.n_observations IS 'Centres used for it.';
 COMMENT ON COLUMN adjusted_stations.mean_redundancy IS 'Mean redundancy of those centres, 0 to 3.';
 COMMENT ON COLUMN adjusted_stations.error_x_m IS 'Estimate minus truth along x of the true site frame; NULL without truth.';
 COMMENT ON COLUMN adjusted_stations.error_y_m IS 'Estimate minus truth along y.';
@@ -735,13 +735,13 @@ CREATE TABLE adjusted_observations (
     external_reliability_station_m DOUBLE,
     external_reliability_mark_m DOUBLE
 );
-COMMENT ON TABLE adjusted_observations IS 'What a network rests on, and what it left out: observed centres, levelling of the stations, control marks; residuals are observed minus computed, along the axes of the network.';
+COMMENT ON TABLE adjusted_observations IS 'Observations of a network, used or left out: centres, levelling of the stations, control marks; residuals are observed minus computed, along the axes of the network.';
 COMMENT ON COLUMN adjusted_observations.kind IS 'centre, gravity or control.';
-COMMENT ON COLUMN adjusted_observations.station IS 'Who observed it; NULL for a control mark.';
-COMMENT ON COLUMN adjusted_observations.marker IS 'Which of its markers; NULL where it is no centre.';
-COMMENT ON COLUMN adjusted_observations.mark IS 'Which mark it is; NULL where none is known.';
-COMMENT ON COLUMN adjusted_observations.used IS 'Whether it carries the network.';
-COMMENT ON COLUMN adjusted_observations.reason IS 'Why it does not; empty when it does.';
+COMMENT ON COLUMN adjusted_observations.station IS 'The observing station; NULL for a control mark.';
+COMMENT ON COLUMN adjusted_observations.marker IS 'The observed marker; NULL where it is no centre.';
+COMMENT ON COLUMN adjusted_observations.mark IS 'The mark; NULL where none is known.';
+COMMENT ON COLUMN adjusted_observations.used IS 'Whether the network uses it.';
+COMMENT ON COLUMN adjusted_observations.reason IS 'Reason of the omission; empty when it is used.';
 COMMENT ON COLUMN adjusted_observations.residual_x_m IS 'Residual of a centre or a control mark; NULL of a marker that is no mark.';
 COMMENT ON COLUMN adjusted_observations.residual_y_m IS 'The same along y.';
 COMMENT ON COLUMN adjusted_observations.residual_z_m IS 'The same along z, up.';
@@ -751,8 +751,8 @@ COMMENT ON COLUMN adjusted_observations.redundancy IS 'Redundancy of its coordin
 COMMENT ON COLUMN adjusted_observations.w IS 'Largest w-statistic of its coordinates; NULL where not testable or not used.';
 COMMENT ON COLUMN adjusted_observations.minimal_detectable_bias_m IS 'Smallest bias that the w-test would find with the power of the configuration; NULL where none is.';
 COMMENT ON COLUMN adjusted_observations.minimal_detectable_bias_deg IS 'The same of a levelling.';
-COMMENT ON COLUMN adjusted_observations.external_reliability_station_m IS 'Shift of the station by a bias of that size, unseen.';
-COMMENT ON COLUMN adjusted_observations.external_reliability_mark_m IS 'Shift of the mark by a bias of that size, unseen.';
+COMMENT ON COLUMN adjusted_observations.external_reliability_station_m IS 'Shift of the station by an undetected bias of that size.';
+COMMENT ON COLUMN adjusted_observations.external_reliability_mark_m IS 'Shift of the mark by an undetected bias of that size.';
 
 CREATE TABLE refused_stations (
     adjustment_id VARCHAR NOT NULL,
@@ -760,10 +760,10 @@ CREATE TABLE refused_stations (
     code VARCHAR NOT NULL,
     reason VARCHAR NOT NULL
 );
-COMMENT ON TABLE refused_stations IS 'Stations and logs that a network does without, and why.';
-COMMENT ON COLUMN refused_stations.station IS 'Name of the stop, or of the log where it gave none.';
+COMMENT ON TABLE refused_stations IS 'Stations and logs that are not part of a network, with the reason.';
+COMMENT ON COLUMN refused_stations.station IS 'Name of the stop, or of a log without stops.';
 COMMENT ON COLUMN refused_stations.code IS 'Stable code of the error, for programs.';
-COMMENT ON COLUMN refused_stations.reason IS 'Why, for people.';
+COMMENT ON COLUMN refused_stations.reason IS 'The reason, as a sentence.';
 
 CREATE TABLE control_checks (
     adjustment_id VARCHAR NOT NULL,
@@ -779,7 +779,7 @@ CREATE TABLE control_checks (
     sigma_3d_m DOUBLE NOT NULL,
     PRIMARY KEY (adjustment_id, mark)
 );
-COMMENT ON TABLE control_checks IS 'Each control mark left out in turn: where the network puts it without its coordinates, minus what was given. No error against truth: both have sigmas. A mark that nothing else tells has no row.';
+COMMENT ON TABLE control_checks IS 'Each control mark left out in turn: its position from the network without its coordinates, minus the given one. No error against truth: both have sigmas. A mark that the others do not determine has no row.';
 COMMENT ON COLUMN control_checks.n_observations IS 'Stations that observed it.';
 COMMENT ON COLUMN control_checks.difference_x_m IS 'Predicted minus given along x of the site frame.';
 COMMENT ON COLUMN control_checks.difference_y_m IS 'Predicted minus given along y of the site frame.';
@@ -801,18 +801,18 @@ CREATE TABLE repeated_stops (
     predicted_rms_m DOUBLE NOT NULL,
     PRIMARY KEY (adjustment_id, station, again)
 );
-COMMENT ON TABLE repeated_stops IS 'Stations of a network that stand at one place: their centres laid on each other. No error against truth: what both have in common does not show.';
-COMMENT ON COLUMN repeated_stops.again IS 'The station that stands beside it.';
-COMMENT ON COLUMN repeated_stops.n_marks IS 'Marks that both saw.';
-COMMENT ON COLUMN repeated_stops.apart_x_m IS 'How far the second stands from the first, along x.';
+COMMENT ON TABLE repeated_stops IS 'Stations of a network at one position: their centres after a rigid motion. No error against truth: errors that both share do not show.';
+COMMENT ON COLUMN repeated_stops.again IS 'The second station.';
+COMMENT ON COLUMN repeated_stops.n_marks IS 'Marks that both observed.';
+COMMENT ON COLUMN repeated_stops.apart_x_m IS 'Position of the second station minus the first, along x.';
 COMMENT ON COLUMN repeated_stops.apart_y_m IS 'The same along y.';
 COMMENT ON COLUMN repeated_stops.apart_z_m IS 'The same along z, up.';
-COMMENT ON COLUMN repeated_stops.apart_3d_m IS 'How far apart they stand.';
+COMMENT ON COLUMN repeated_stops.apart_3d_m IS 'Distance of the two stations.';
 COMMENT ON COLUMN repeated_stops.difference_rms_m IS 'Root mean square 3-D difference of their centres after a rigid motion.';
-COMMENT ON COLUMN repeated_stops.predicted_rms_m IS 'What the covariances of the centres promise.';
+COMMENT ON COLUMN repeated_stops.predicted_rms_m IS 'Its prediction from the covariances of the centres.';
 
--- Plans of where markers shall stand: what a plan promised is kept; what came of it is read from the
--- newest results of its survey by the view placements.
+-- Plans of marker placements: predictions are stored; the view placements reads the achieved
+-- accuracy from the newest results of the survey.
 
 CREATE TABLE terrains (
     terrain_id VARCHAR PRIMARY KEY,
@@ -825,8 +825,8 @@ COMMENT ON TABLE terrains IS 'Elevation models and clouds that were uploaded to 
 COMMENT ON COLUMN terrains.terrain_id IS 'SHA-256 of the bytes of the file.';
 COMMENT ON COLUMN terrains.name IS 'Name of the uploaded file.';
 COMMENT ON COLUMN terrains.size_bytes IS 'Length of the file.';
-COMMENT ON COLUMN terrains.url IS 'Where the bytes are.';
-COMMENT ON COLUMN terrains.uploaded_at IS 'When it came (UTC).';
+COMMENT ON COLUMN terrains.url IS 'Location of the file.';
+COMMENT ON COLUMN terrains.uploaded_at IS 'Instant of the upload (UTC).';
 
 CREATE TABLE plans (
     placement_id VARCHAR PRIMARY KEY,
@@ -842,19 +842,19 @@ CREATE TABLE plans (
     request JSON NOT NULL,
     created_at TIMESTAMPTZ NOT NULL
 );
-COMMENT ON TABLE plans IS 'Arrangements of marks that were kept, and for what.';
+COMMENT ON TABLE plans IS 'Stored arrangements of marks.';
 COMMENT ON COLUMN plans.placement_id IS 'Given by the catalogue; the same in planned_stops and placements.';
-COMMENT ON COLUMN plans.name IS 'Given by people.';
-COMMENT ON COLUMN plans.survey_id IS 'Survey that it was made for; NULL when for none yet.';
-COMMENT ON COLUMN plans.site_name IS 'Terrain on which it was made.';
+COMMENT ON COLUMN plans.name IS 'Name of the user.';
+COMMENT ON COLUMN plans.survey_id IS 'Survey of the plan; NULL without one.';
+COMMENT ON COLUMN plans.site_name IS 'Terrain of the plan.';
 COMMENT ON COLUMN plans.resection_method IS 'free_station, or paper (three circles).';
 COMMENT ON COLUMN plans.tolerance_m IS '3-D error that was accepted.';
 COMMENT ON COLUMN plans.marks IS 'The arrangement: names, centres in the site frame [m] and heights of poles [m].';
-COMMENT ON COLUMN plans.n_marks IS 'How many marks it has.';
+COMMENT ON COLUMN plans.n_marks IS 'Number of marks.';
 COMMENT ON COLUMN plans.model_version IS 'Digest of the model of centres behind the prediction.';
 COMMENT ON COLUMN plans.model_source IS 'sensor, or fitted (from the marker_fits of own surveys).';
-COMMENT ON COLUMN plans.request IS 'All that was asked, so that it can be asked again.';
-COMMENT ON COLUMN plans.created_at IS 'When it was kept (UTC).';
+COMMENT ON COLUMN plans.request IS 'The complete request.';
+COMMENT ON COLUMN plans.created_at IS 'Instant of storage (UTC).';
 
 CREATE TABLE planned_stops (
     placement_id VARCHAR NOT NULL,
@@ -873,19 +873,19 @@ CREATE TABLE planned_stops (
     reason VARCHAR NOT NULL,
     PRIMARY KEY (placement_id, stop)
 );
-COMMENT ON TABLE planned_stops IS 'What a kept plan promises at each of its stops.';
+COMMENT ON TABLE planned_stops IS 'Predictions of a stored plan at each of its stops.';
 COMMENT ON COLUMN planned_stops.place IS 'Its place in the plan, from 0.';
 COMMENT ON COLUMN planned_stops.x_m IS 'Planned place of the LiDAR in the site frame.';
 COMMENT ON COLUMN planned_stops.y_m IS 'Planned place of the LiDAR in the site frame.';
 COMMENT ON COLUMN planned_stops.z_m IS 'Planned place of the LiDAR in the site frame, up.';
-COMMENT ON COLUMN planned_stops.n_seen IS 'Marks that will be found from there.';
-COMMENT ON COLUMN planned_stops.n_used IS 'Marks that carry the position.';
+COMMENT ON COLUMN planned_stops.n_seen IS 'Marks that can be found from there.';
+COMMENT ON COLUMN planned_stops.n_used IS 'Marks used for the position.';
 COMMENT ON COLUMN planned_stops.sigma_3d_m IS 'Predicted: square root of the trace of the covariance of the position; NULL where there is none.';
 COMMENT ON COLUMN planned_stops.probability_within_tolerance IS 'Predicted probability that the 3-D error is within the tolerance, 0 to 1.';
 COMMENT ON COLUMN planned_stops.included_angle_min_deg IS 'Least angle between two used marks.';
 COMMENT ON COLUMN planned_stops.included_angle_max_deg IS 'Greatest angle between two used marks.';
 COMMENT ON COLUMN planned_stops.dop IS 'Dilution of precision; NULL where there is no position.';
-COMMENT ON COLUMN planned_stops.reason IS 'Why there is no position, or a weak one; empty when all is well.';
+COMMENT ON COLUMN planned_stops.reason IS 'Reason of a missing or weak position; else empty.';
 
 -- Files: products of all stops of a survey, and documents of one result.
 
@@ -918,12 +918,12 @@ CREATE TABLE site_products (
 COMMENT ON TABLE site_products IS 'Files made of all stops of a survey: clouds in the site frame and elevation models.';
 COMMENT ON COLUMN site_products.product_id IS 'The same for all files of one job.';
 COMMENT ON COLUMN site_products.kind IS 'laz, e57 or geotiff.';
-COMMENT ON COLUMN site_products.url IS 'Where the file is kept.';
+COMMENT ON COLUMN site_products.url IS 'Location of the file.';
 COMMENT ON COLUMN site_products.sha256 IS 'Digest of its bytes.';
 COMMENT ON COLUMN site_products.size_bytes IS 'Length of the file.';
-COMMENT ON COLUMN site_products.n_points IS 'Returns in the cloud, or returns that carry the heights.';
+COMMENT ON COLUMN site_products.n_points IS 'Returns of the cloud, or of the heights.';
 COMMENT ON COLUMN site_products.n_stations IS 'Stations whose returns are in it.';
-COMMENT ON COLUMN site_products.poses IS 'Where the poses are from: control or free (an adjustment), or fixes (each station alone).';
+COMMENT ON COLUMN site_products.poses IS 'Origin of the poses: control or free (an adjustment), or fixes (each station alone).';
 COMMENT ON COLUMN site_products.adjustment_id IS 'The adjustment that the poses are from; NULL where each station was positioned alone.';
 COMMENT ON COLUMN site_products.min_x_m IS 'Least coordinate in the site frame.';
 COMMENT ON COLUMN site_products.min_y_m IS 'Least coordinate in the site frame.';
@@ -932,7 +932,7 @@ COMMENT ON COLUMN site_products.max_x_m IS 'Greatest coordinate in the site fram
 COMMENT ON COLUMN site_products.max_y_m IS 'Greatest coordinate in the site frame.';
 COMMENT ON COLUMN site_products.max_z_m IS 'Greatest coordinate in the site frame, up.';
 COMMENT ON COLUMN site_products.cell_m IS 'Edge of a cell of an elevation model.';
-COMMENT ON COLUMN site_products.share_known IS 'Share of its cells in which ground was seen.';
+COMMENT ON COLUMN site_products.share_known IS 'Share of its cells with observed ground.';
 COMMENT ON COLUMN site_products.sigma_median_m IS 'Median of the standard deviations of its heights.';
 
 CREATE TABLE documents (
@@ -1072,7 +1072,7 @@ COMMENT ON COLUMN accuracy_by_stop.marker_error_3d_mean_m IS 'Mean error of its 
 COMMENT ON COLUMN accuracy_by_stop.marker_error_3d_max_m IS 'Largest error of its sphere centres.';
 COMMENT ON COLUMN accuracy_by_stop.marker_sigma_3d_rms_m IS 'Predicted: root mean square of sigma_3d_m of its centres.';
 COMMENT ON COLUMN accuracy_by_stop.status IS 'Status of the station: ok, weak or failed.';
-COMMENT ON COLUMN accuracy_by_stop.n_markers IS 'Markers that carry the station.';
+COMMENT ON COLUMN accuracy_by_stop.n_markers IS 'Markers used for the station.';
 COMMENT ON COLUMN accuracy_by_stop.station_sigma_3d_m IS 'Predicted error of the station.';
 COMMENT ON COLUMN accuracy_by_stop.station_error_3d_m IS 'Error of the station.';
 
@@ -1088,9 +1088,9 @@ LEFT JOIN surveys AS s USING (survey_id)
 LEFT JOIN latest_station_fixes AS f ON f.survey_id = p.survey_id AND f.stop = x.stop
     AND f.fit_method = 'along_beam' AND f.resection_method = p.resection_method
 ORDER BY p.created_at DESC, p.placement_id, x.place;
-COMMENT ON VIEW placements IS 'Per stop what a kept plan promised and, once a stop of that name is surveyed, what came of it.';
+COMMENT ON VIEW placements IS 'Prediction of a stored plan per stop and, once a stop of that name is surveyed, the result.';
 COMMENT ON COLUMN placements.run_id IS 'Run that surveyed the stop; NULL until then.';
-COMMENT ON COLUMN placements.n_markers IS 'Markers that carried the position once surveyed.';
+COMMENT ON COLUMN placements.n_markers IS 'Markers used for the position once surveyed.';
 COMMENT ON COLUMN placements.achieved_sigma_3d_m IS 'Sigma of the position once surveyed.';
 COMMENT ON COLUMN placements.error_3d_m IS 'Error of the position once surveyed; NULL without truth.';
-COMMENT ON COLUMN placements.is_within_tolerance IS 'Whether that error keeps the tolerance.';
+COMMENT ON COLUMN placements.is_within_tolerance IS 'Whether that error is within the tolerance.';
