@@ -32,7 +32,7 @@ _ENDINGS = {
 def environment() -> Environment:
     """Return the templates with the filters that they use."""
     made = Environment(
-        loader=PackageLoader("web"),
+        loader=PackageLoader("spheremark.web"),
         autoescape=True,
         undefined=StrictUndefined,
         trim_blocks=True,

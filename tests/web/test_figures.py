@@ -6,7 +6,8 @@ from spheremark.pipelines.config import FITTING_METHODS
 from spheremark.pipelines.published import TABLE_2
 from spheremark.web import theme
 from spheremark.web.assets import static_folder
-from spheremark.web.figures import maps
+from spheremark.web.columns import lane_and_number
+from spheremark.web.figures import elements, maps
 from spheremark.web.figures import survey as figures
 
 MM = 1e-9  # [mm]; figures only scale
@@ -109,7 +110,7 @@ def test_a_fit_without_error_is_not_drawn_among_errors():
 
 
 def test_bins_give_the_root_mean_square_of_what_is_known():
-    middles, values = figures.binned_rms(
+    middles, values = elements.binned_rms(
         np.array([1.2, 1.4, 2.5, 2.6]), np.array([3.0, 4.0, 2.0, np.nan]), 1.0
     )
     assert_allclose(middles, [1.3, 2.5])
@@ -153,7 +154,7 @@ def test_values_are_moved_apart_as_little_as_it_takes():
     [("lane3-stop5", "lane3", 5), ("A 12", "A", 12), ("stop7", "lane", 7), ("gate", "gate", None)],
 )
 def test_lanes_and_numbers_are_read_from_names(stop, lane, number):
-    assert figures.lane_and_number(stop) == (lane, number)
+    assert lane_and_number(stop) == (lane, number)
 
 
 def test_the_map_has_equal_axes_and_says_how_much_it_enlarges():

@@ -3,9 +3,8 @@ import json
 import numpy as np
 import pytest
 
-from spheremark.web import assets, templating
+from spheremark.web import assets, pages, templating
 from spheremark.web.pages import readouts
-from spheremark.web.pages import results as pages
 
 
 def rows(errors, sigmas, marks, method="along_beam"):

@@ -9,9 +9,9 @@ import plotly.graph_objects as go
 from plotly.subplots import make_subplots
 
 from spheremark.web import theme
-from spheremark.web.figures.survey import Columns, blank_figure, floats, texts
+from spheremark.web.columns import MM, Columns, floats, texts
+from spheremark.web.figures.elements import blank_figure
 
-_MM = 1e3  # [mm/m]
 _BEYOND = 2.0  # sigmas
 _WAYS = {"radial": "along the sight", "across": "across it", "up": "up"}
 _STYLES = (("before", theme.MUTED, "circle-open"), ("after", theme.OURS, "circle"))
@@ -47,7 +47,7 @@ def _add_gaps(
     )
     figure.add_scatter(
         x=floats(rows, "azimuth_deg"),
-        y=_MM * floats(rows, f"gap_{way}_m"),
+        y=MM * floats(rows, f"gap_{way}_m"),
         mode="markers",
         name=name,
         legendgroup=name,
@@ -68,13 +68,13 @@ def laser_biases(parameters: Columns) -> go.Figure:
     for (name, colour, symbol), column in zip(_STYLES, ("start_value", "estimate"), strict=True):
         figure.add_scatter(
             x=lasers,
-            y=_MM * floats(parameters, column),
+            y=MM * floats(parameters, column),
             mode="markers",
             name=name,
             marker={"color": colour, "symbol": symbol, "size": 8},
             error_y={
                 "type": "data",
-                "array": _BEYOND * _MM * floats(parameters, "sigma"),
+                "array": _BEYOND * MM * floats(parameters, "sigma"),
                 "color": colour,
                 "thickness": 1.5,
                 "width": 3,

@@ -18,21 +18,10 @@ from spheremark.pipelines.evaluation.reproduction.included_angle import CIRCLES,
 from spheremark.pipelines.positioning.subsets import angles_that_keep, theory_of_pairs
 from spheremark.pipelines.published import LEAST_ANGLE, TABLE_3, WIDEST_ANGLE
 from spheremark.web import theme
-from spheremark.web.figures.survey import (
-    ANGLE_BIN,
-    Columns,
-    add_binned,
-    add_tolerance,
-    blank_figure,
-    by_method,
-    floats,
-    known_values,
-    make_log,
-    select,
-    texts,
-)
+from spheremark.web.columns import MM, Columns, by_method, floats, known_values, rms, select, texts
+from spheremark.web.figures.elements import add_binned, add_tolerance, blank_figure, make_log
+from spheremark.web.figures.survey import ANGLE_BIN
 
-_MM = 1e3  # [mm/m]
 _N_DRAWN = 3000  # points of one method; more are one blot, and make a page slow
 _ANGLES = np.radians(np.concatenate([np.arange(2.0, 178.5, 0.5), [179.0]]))
 _COUNTS = {2: "two marks", 3: "three marks"}
@@ -81,7 +70,7 @@ def error_against_angle(shown: Subsets, tolerance_m: float, *, is_log: bool = Fa
     if is_log:
         make_log(figure)
     elif len(worst):
-        top = 1.3 * max(float(np.quantile(worst, 0.97)), tolerance_m) * _MM
+        top = 1.3 * max(float(np.quantile(worst, 0.97)), tolerance_m) * MM
         figure.update_yaxes(range=[0.0, top])
     which = "" if shown.n_marks == 2 else ", the widest of three"
     figure.update_xaxes(title_text=f"Included angle{which} [deg]", range=[0, 180], dtick=30)
@@ -95,9 +84,9 @@ def add_theory(figure: go.Figure, sigma_axis_m: float) -> None:
     for method, (name, colour, dash) in _THEORIES.items():
         figure.add_scatter(
             x=np.degrees(_ANGLES),
-            y=theory_of_pairs(method, sigma_axis_m, _ANGLES) * _MM,
+            y=theory_of_pairs(method, sigma_axis_m, _ANGLES) * MM,
             mode="lines",
-            name=f"{name}, {sigma_axis_m * _MM:.2g} mm",
+            name=f"{name}, {sigma_axis_m * MM:.2g} mm",
             line={"color": colour, "width": 1.5, "dash": dash},
             hovertemplate=f"{name}: %{{y:.1f}} mm at %{{x:.0f}} deg<extra></extra>",
         )
@@ -126,7 +115,7 @@ def _add_rows(figure: go.Figure, method: str, rows: Columns, shown: Subsets) -> 
     """Draw the station from each few marks, and the RMS of bins."""
     style = theme.method_style(method)
     x = floats(rows, "included_angle_max_deg")
-    y = floats(rows, f"{shown.quality}_horizontal_m") * _MM
+    y = floats(rows, f"{shown.quality}_horizontal_m") * MM
     drawn = np.zeros(len(x), dtype=np.bool_)
     drawn[:: max(1, -(-len(x) // _N_DRAWN))] = True
     few = select(rows, drawn)
@@ -156,12 +145,12 @@ def _add_all_marks(figure: go.Figure, method: str, rows: Columns, shown: Subsets
     known = known_values(floats(rows, f"{shown.quality}_horizontal_m"))
     if not len(known):
         return
-    rms = float(np.sqrt(np.mean(known**2))) * _MM
+    level = rms(known) * MM
     figure.add_scatter(
         x=[0.0, 180.0],
-        y=[rms, rms],
+        y=[level, level],
         mode="lines",
-        name=f"{style.label}, all marks: {rms:.1f} mm",
+        name=f"{style.label}, all marks: {level:.1f} mm",
         line={"color": style.colour, "width": 1.5, "dash": "dashdot"},
         hovertemplate=f"RMS of {len(known)} stations from all their marks: %{{y:.2f}} mm"
         f"<extra>{style.label}</extra>",
@@ -175,7 +164,7 @@ def centres_sigma(fits: Columns) -> float:
     known: NDArray[np.float64] = (
         np.zeros(0) if first is None else known_values(floats(first, "sigma_axis_m"))
     )
-    return float(np.sqrt(np.mean(known**2))) if len(known) else np.nan
+    return rms(known) if len(known) else np.nan
 
 
 _WAYS = (
@@ -191,7 +180,7 @@ def station_by_angle(made: AngleExperiment) -> go.Figure:
     for name, colour, dash in _WAYS:
         figure.add_scatter(
             x=np.degrees(made.angles),
-            y=made.curves[name] * _MM,
+            y=made.curves[name] * MM,
             mode="lines",
             name=f"{name} ({'study' if name == CIRCLES else 'free station'})",
             line={"color": colour, "width": 2.5 if dash == "solid" else 1.75, "dash": dash},
@@ -204,7 +193,7 @@ def station_by_angle(made: AngleExperiment) -> go.Figure:
     ):
         figure.add_scatter(
             x=np.degrees(TABLE_3.included_angles[keep]),
-            y=TABLE_3.errors[keep] * _MM,
+            y=TABLE_3.errors[keep] * MM,
             mode="markers",
             name=said,
             marker={"symbol": "x", "size": 9, "color": colour},
@@ -219,14 +208,14 @@ def station_by_angle(made: AngleExperiment) -> go.Figure:
 
 def limit_by_sigma(limits: Sequence[AngleLimit], tolerance_m: float) -> go.Figure:
     """Draw between which angles two marks keep the tolerance, by how good the centres are."""
-    figure = blank_figure(f"Angles at which two marks keep {tolerance_m * _MM:g} mm")
+    figure = blank_figure(f"Angles at which two marks keep {tolerance_m * MM:g} mm")
     widest = tolerance_m / np.sqrt(2.0)  # beyond which circles keep it nowhere
     sigmas = np.sort(np.append(np.linspace(0.0005, tolerance_m, 200), widest * (1.0 - 1e-9)))
     for method, (name, colour, dash) in _THEORIES.items():
         known = np.array([angles_that_keep(method, float(s), tolerance_m) for s in sigmas])
         for bounds, is_first in ((known[:, 0], True), (known[:, 1], False)):
             figure.add_scatter(
-                x=sigmas * _MM,
+                x=sigmas * MM,
                 y=np.degrees(bounds),
                 mode="lines",
                 name=name,
@@ -237,7 +226,7 @@ def limit_by_sigma(limits: Sequence[AngleLimit], tolerance_m: float) -> go.Figur
             )
     tried = [one for one in limits if np.isfinite(one.least)]
     figure.add_scatter(
-        x=[one.sigma * _MM for one in tried],
+        x=[one.sigma * MM for one in tried],
         y=[np.degrees(one.least) for one in tried],
         mode="markers+text",
         text=[f"{np.degrees(one.least):.0f}" for one in tried],
@@ -245,10 +234,10 @@ def limit_by_sigma(limits: Sequence[AngleLimit], tolerance_m: float) -> go.Figur
         textfont={"size": 11, "color": theme.OURS},
         name="free station, tried there",
         marker={"color": theme.OURS, "size": 8},
-        customdata=[one.rms * _MM for one in tried],
+        customdata=[one.rms * MM for one in tried],
         hovertemplate="%{y:.1f} deg at %{x:.0f} mm: RMS %{customdata:.1f} mm<extra></extra>",
     )
-    figure.update_xaxes(title_text="Sigma of a centre per axis [mm]", range=[0, tolerance_m * _MM])
+    figure.update_xaxes(title_text="Sigma of a centre per axis [mm]", range=[0, tolerance_m * MM])
     figure.update_yaxes(title_text="Included angle [deg]", range=[-16, 185], dtick=30)
     return figure
 
@@ -273,12 +262,12 @@ def circles_of_study(arcs: Arcs) -> go.Figure:
     ):
         look = {"color": colour, "size": 9, "symbol": symbol, "line": {"color": colour, "width": 2}}
         for column in columns:
-            x, y = p.T * (1.0 if column == 1 else _MM)
+            x, y = p.T * (1.0 if column == 1 else MM)
             figure.add_scatter(
                 x=x, y=y, mode="markers", name=name, legendgroup=name, showlegend=column == 1,
                 marker=look, hovertemplate=f"{name}<extra></extra>", row=1, col=column,
             )  # fmt: skip
-    reach = 1.6 * float(np.linalg.norm(arcs.p_site)) * _MM + 25.0
+    reach = 1.6 * float(np.linalg.norm(arcs.p_site)) * MM + 25.0
     near = {"range": [-reach, reach], "constrain": "domain", "col": 2}
     figure.update_xaxes(title_text="x [m]", scaleanchor="y", constrain="domain", col=1)
     figure.update_yaxes(title_text="y [m]", constrain="domain", col=1)
@@ -292,7 +281,7 @@ def _add_circle(figure: go.Figure, arcs: Arcs, i: int) -> None:
     mark, radius = arcs.shifted_site[i], arcs.radii[i]
     whole = np.linspace(0.0, 2.0 * np.pi, 181)
     by_station = np.arctan2(-mark[1], -mark[0]) + np.linspace(-0.02, 0.02, 41)
-    for column, turn, unit in ((1, whole, 1.0), (2, by_station, _MM)):
+    for column, turn, unit in ((1, whole, 1.0), (2, by_station, MM)):
         figure.add_scatter(
             x=(mark[0] + radius * np.cos(turn)) * unit,
             y=(mark[1] + radius * np.sin(turn)) * unit,

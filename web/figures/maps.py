@@ -9,18 +9,15 @@ import plotly.graph_objects as go
 from numpy.typing import NDArray
 
 from spheremark.web import theme
-from spheremark.web.figures.survey import (
-    Columns,
+from spheremark.web.columns import MM, Columns, by_method, floats, known_values, largest, texts
+from spheremark.web.figures.elements import (
+    add_note,
     blank_figure,
-    by_method,
     details,
-    floats,
-    known_values,
-    largest,
-    texts,
+    joined_strokes,
+    make_map,
 )
 
-_MM = 1e3  # [mm/m]
 _ELLIPSE_SHARE = 0.08  # the largest ellipse is drawn at most this large, as a share of the field
 
 
@@ -31,8 +28,7 @@ def site_map(marks: Columns, fixes: Columns, true_stops: Columns) -> go.Figure:
     _add_marks(figure, marks)
     for method, rows in by_method(fixes):
         _add_stations(figure, method, rows, factor, true_stops)
-    figure.update_xaxes(title_text="x, site [m]", constrain="domain")
-    figure.update_yaxes(title_text="y, site [m]", scaleanchor="x", scaleratio=1)
+    make_map(figure, ", site")
     if factor:
         what = "ellipses and errors" if len(true_stops["stop"]) else "ellipses"
         add_note(figure, f"{what} \N{MULTIPLICATION SIGN}{factor:g}")
@@ -102,7 +98,7 @@ def _add_stations(
         name=style.label,
         legendgroup=style.label,
         marker={"color": style.colour, "size": 6, "symbol": style.symbol},
-        customdata=[[row[0], row[1], row[2] * _MM, row[4], row[5]] for row in about],
+        customdata=[[row[0], row[1], row[2] * MM, row[4], row[5]] for row in about],
         hovertemplate="<b>%{customdata[0]}</b> %{customdata[1]}<br>x %{x:.3f} m<br>y %{y:.3f} m<br>"
         "z %{customdata[4]:.3f} m<br>sigma %{customdata[2]:.1f} mm, %{customdata[3]:.0f} marks"
         f"<extra>{style.label}</extra>",
@@ -151,27 +147,4 @@ def _add_strokes(
         showlegend=False,
         line={"color": style.colour, "width": width, "dash": dash},
         hoverinfo="skip",
-    )
-
-
-def joined_strokes(strokes: Sequence[NDArray[np.float64]]) -> NDArray[np.float64]:
-    """Return many lines as one with gaps, (n, 2)."""
-    gap = np.full((1, 2), np.nan)
-    parts = [part for stroke in strokes for part in (stroke, gap)]
-    return np.concatenate(parts) if parts else gap
-
-
-def add_note(figure: go.Figure, text: str) -> None:
-    """Write a remark into the lower right corner."""
-    figure.add_annotation(
-        text=text,
-        x=1,
-        y=0,
-        xref="x domain",
-        yref="y domain",
-        xanchor="right",
-        yanchor="bottom",
-        showarrow=False,
-        font={"size": 12, "color": theme.MUTED},
-        bgcolor=theme.RAISED,
     )

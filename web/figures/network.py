@@ -10,10 +10,16 @@ import plotly.graph_objects as go
 from numpy.typing import NDArray
 
 from spheremark.web import theme
-from spheremark.web.figures.maps import add_note, ellipse_factor, ellipse_outline, joined_strokes
-from spheremark.web.figures.survey import Columns, blank_figure, floats, select, texts
+from spheremark.web.columns import MM, Columns, floats, select, texts
+from spheremark.web.figures.elements import (
+    add_note,
+    blank_figure,
+    group_by_axis,
+    joined_strokes,
+    make_map,
+)
+from spheremark.web.figures.maps import ellipse_factor, ellipse_outline
 
-_MM = 1e3  # [mm/m]
 _BEYOND = 2.0  # sigmas that a difference may have and still be no surprise
 _AXES = ("x", "y", "z")
 _ELLIPSES = (("95 %", "_95", 1.5, "solid"), ("standard", "", 1.0, "dot"))
@@ -42,8 +48,7 @@ def network_map(stations: Columns, marks: Columns) -> go.Figure:
             )
     _add_points(figure, stations, "station", "circle", 9)
     _add_points(figure, marks, "mark", "diamond", 9)
-    figure.update_xaxes(title_text="x [m]", constrain="domain")
-    figure.update_yaxes(title_text="y [m]", scaleanchor="x", scaleratio=1)
+    make_map(figure)
     if factor:
         add_note(figure, f"ellipses \N{MULTIPLICATION SIGN}{factor:g}")
     return figure
@@ -59,7 +64,7 @@ def _add_points(figure: go.Figure, rows: Columns, kind: str, symbol: str, size: 
     """Draw stations or marks, coloured by the mean redundancy of their centres."""
     names = texts(rows, kind)
     about = [
-        [name, _MM * sigma, n, redundancy]
+        [name, MM * sigma, n, redundancy]
         for name, sigma, n, redundancy in zip(
             names,
             floats(rows, "sigma_3d_m"),
@@ -115,10 +120,8 @@ def residuals(observations: Columns) -> go.Figure:
             rows = select(observations, used == is_used)
             if len(rows["station"]):
                 _add_residuals(figure, rows, axis, is_used=is_used)
-    figure.add_hline(y=0, line={"color": theme.LINE, "width": 1}, layer="below")
-    figure.update_xaxes(type="category", title_text="Station", tickangle=-40)
-    figure.update_yaxes(title_text="Observed - computed [mm]")
-    figure.update_layout(scattermode="group", scattergap=0.4)
+    group_by_axis(figure, "Station", "Observed - computed [mm]", 0.4)
+    figure.update_xaxes(tickangle=-40)
     return figure
 
 
@@ -126,7 +129,7 @@ def _add_residuals(figure: go.Figure, rows: Columns, axis: str, *, is_used: bool
     """Draw the residuals along one axis."""
     figure.add_scatter(
         x=texts(rows, "station"),
-        y=_MM * floats(rows, f"residual_{axis}_m"),
+        y=MM * floats(rows, f"residual_{axis}_m"),
         mode="markers",
         name=axis if is_used else f"{axis}, left out",
         offsetgroup=axis,
@@ -155,7 +158,7 @@ def tests(observations: Columns, w_limit: float) -> go.Figure:
         showlegend=False,
         marker={"color": theme.OURS, "size": 7, "opacity": 0.7},
         customdata=[
-            [station, marker, mark, _MM * bias]
+            [station, marker, mark, MM * bias]
             for station, marker, mark, bias in zip(
                 *(texts(observations, name) for name in ("station", "marker", "mark")),
                 floats(observations, "minimal_detectable_bias_m"),
@@ -188,22 +191,19 @@ def control_differences(checks: Columns) -> go.Figure:
     for axis in _AXES:
         figure.add_scatter(
             x=names,
-            y=_MM * floats(checks, f"difference_{axis}_m"),
+            y=MM * floats(checks, f"difference_{axis}_m"),
             mode="markers",
             name=axis,
             offsetgroup=axis,
             marker={"color": theme.AXES[axis], "size": 8},
             error_y={
                 "type": "data",
-                "array": _BEYOND * _MM * floats(checks, f"sigma_{axis}_m"),
+                "array": _BEYOND * MM * floats(checks, f"sigma_{axis}_m"),
                 "color": theme.BAR,
                 "thickness": 3,
                 "width": 0,
             },
             hovertemplate=f"<b>%{{x}}</b><br>{axis} %{{y:.1f}} mm<extra></extra>",
         )
-    figure.add_hline(y=0, line={"color": theme.LINE, "width": 1}, layer="below")
-    figure.update_xaxes(type="category", title_text="Control mark")
-    figure.update_yaxes(title_text="Predicted - given [mm]")
-    figure.update_layout(scattermode="group", scattergap=0.35)
+    group_by_axis(figure, "Control mark", "Predicted - given [mm]", 0.35)
     return figure

@@ -10,7 +10,7 @@ import plotly.graph_objects as go
 
 from spheremark.pipelines.published import LEAST_ANGLE, TABLE_3, WIDEST_ANGLE
 from spheremark.web import theme
-from spheremark.web.figures.survey import add_tolerance
+from spheremark.web.figures.elements import add_tolerance
 
 _MM = 1e3  # [mm/m]
 

@@ -10,9 +10,9 @@ from numpy.typing import NDArray
 
 from spheremark.pipelines.model import Array, Column, Index
 from spheremark.web import theme
-from spheremark.web.figures.survey import Columns, floats, on_marks, select, texts
+from spheremark.web.columns import MM, Columns, floats, on_marks, select, texts
+from spheremark.web.figures.elements import add_zero, blank_figure
 
-_MM = 1e3  # [mm/m]
 _CELLS = (0.15, 0.2, 0.3, 0.4)  # [m]; of the surroundings one return is shown in each cell
 _N_SHOWN = 30_000  # returns of the surroundings; more makes a browser without a GPU slow
 _MARGIN = 2.0  # [m] of surroundings shown beyond the farthest marker that stands on a mark
@@ -84,20 +84,15 @@ def marker_close_up(scan: Scan, fits: Columns, i: int) -> go.Figure:
 def marker_residuals(scan: Scan, fits: Columns, i: int) -> go.Figure:
     """Draw the residuals of one marker's returns across the sphere, with their sigma."""
     returns = marker_returns(scan, fits, i)
-    sigma_mm = float(floats(fits, "rms_m")[i]) * _MM
+    sigma_mm = float(floats(fits, "rms_m")[i]) * MM
     style = theme.method_style(texts(fits, "fit_method")[i])
-    figure = go.Figure(
-        layout={
-            "template": theme.template(),
-            "title": {"text": f"{_what(scan, fits)} of marker {texts(fits, 'marker')[i]}"},
-        }
-    )
+    figure = blank_figure(f"{_what(scan, fits)} of marker {texts(fits, 'marker')[i]}")
     figure.add_hrect(y0=-sigma_mm, y1=sigma_mm, fillcolor=style.band, line_width=0, layer="below")
-    figure.add_hline(y=0, line={"color": theme.LINE, "width": 1}, layer="below")
+    add_zero(figure)
     across = _across(returns.p_station - _centre(fits, i), _centre(fits, i))
     figure.add_scatter(
-        x=across[returns.is_used] * _MM,
-        y=returns.residuals[returns.is_used] * _MM,
+        x=across[returns.is_used] * MM,
+        y=returns.residuals[returns.is_used] * MM,
         mode="markers",
         name=f"return; band: ±sigma, {sigma_mm:.1f} mm",
         showlegend=True,
@@ -170,7 +165,7 @@ def _figure_3d(title: str) -> go.Figure:
     axes = {
         f"{axis}axis": {"title": {"text": f"{axis}, station [m]"}, "nticks": 6} for axis in "xyz"
     }
-    figure = go.Figure(layout={"template": theme.template(), "title": {"text": title}})
+    figure = blank_figure(title)
     figure.update_layout(
         scene={
             **axes,
@@ -195,8 +190,8 @@ def _add_returns(
     size: float,
 ) -> None:
     """Draw the returns that fits used, coloured by residual: too near, right, too far."""
-    residuals_mm = np.concatenate([one.residuals[one.is_used] for one in returns]) * _MM
-    end = max(1.0, float(np.ceil(_COLOUR_SIGMAS * np.nanmedian(rms) * _MM)))
+    residuals_mm = np.concatenate([one.residuals[one.is_used] for one in returns]) * MM
+    end = max(1.0, float(np.ceil(_COLOUR_SIGMAS * np.nanmedian(rms) * MM)))
     figure.add_scatter3d(
         **_xyz(np.concatenate([one.p_station[one.is_used] for one in returns])),
         mode="markers",

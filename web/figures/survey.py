@@ -6,9 +6,7 @@ truth; where there is none, the same figure shows the predicted sigma and says s
 
 from __future__ import annotations
 
-import re
-from collections.abc import Iterable, Iterator, Mapping, Sequence
-from typing import Any
+from collections.abc import Iterable, Sequence
 
 import numpy as np
 import plotly.graph_objects as go
@@ -17,56 +15,36 @@ from scipy.optimize import isotonic_regression
 
 from spheremark.pipelines.published import TABLE_2
 from spheremark.web import theme
+from spheremark.web.columns import (
+    MM,
+    Columns,
+    by_method,
+    floats,
+    has_errors,
+    known_values,
+    lane_and_number,
+    lane_order,
+    largest,
+    select,
+    texts,
+)
+from spheremark.web.figures.elements import (
+    RATIO_AXIS,
+    add_binned,
+    add_tolerance,
+    binned_rms,
+    blank_figure,
+    details,
+    group_by_axis,
+    make_log,
+)
 
-Columns = Mapping[str, NDArray[Any]]
-
-_MM = 1e3  # [mm/m]
 _RANGE_BIN = 1.0  # [m]; as the view accuracy_by_distance
 _COUNT_BIN = 20  # as the view accuracy_by_point_count
 ANGLE_BIN = 10.0  # [deg]; as the view accuracy_by_included_angle
-_RATIOS = [step * 10.0**power for power in range(-2, 5) for step in (1, 2, 5)]
-_RATIO_AXIS = {
-    "type": "log",
-    "tickvals": _RATIOS,
-    "ticktext": [f"{value:g}" for value in _RATIOS],
-}
+
+
 _LABEL_GAP = 0.05  # between names of lanes, as a share of the largest error
-_STOP_NUMBER = re.compile(r"^(.*?)[\s._-]*(?:[A-Za-z]*)(\d+)$")
-
-
-def floats(columns: Columns, name: str) -> NDArray[np.float64]:
-    """Return a column as floats; NULL is NaN."""
-    return np.asarray(columns[name], dtype=np.float64)
-
-
-def texts(columns: Columns, name: str) -> list[str]:
-    """Return a column as texts; NULL is nothing."""
-    return ["" if value is None else str(value) for value in columns[name]]
-
-
-def select(columns: Columns, keep: NDArray[np.bool_]) -> dict[str, NDArray[Any]]:
-    """Return the rows of a table that are to be kept."""
-    return {name: column[keep] for name, column in columns.items()}
-
-
-def has_errors(columns: Columns) -> bool:
-    """Whether anything is known about the truth of these rows."""
-    return bool(np.isfinite(floats(columns, "error_3d_m")).any())
-
-
-def on_marks(columns: Columns) -> NDArray[np.bool_]:
-    """Tell which fits stand on a mark; all of them where no mark is known."""
-    known = np.isfinite(floats(columns, "error_3d_m"))
-    if known.any():
-        return known
-    matched = np.array([mark != "" for mark in texts(columns, "mark")], dtype=np.bool_)
-    return matched if matched.any() else np.ones(len(matched), dtype=np.bool_)
-
-
-def lane_and_number(stop: str) -> tuple[str, int | None]:
-    """Split the name of a stop into its lane and its number along it: ``lane-2-stop-5``."""
-    found = _STOP_NUMBER.match(stop)
-    return (found[1] or "lane", int(found[2])) if found else (stop, None)
 
 
 def error_against_distance(fits: Columns, tolerance_m: float, *, is_log: bool = False) -> go.Figure:
@@ -84,7 +62,7 @@ def error_against_count(fits: Columns, tolerance_m: float, *, is_log: bool = Fal
     _add_fits(figure, fits, floats(fits, "n_points"), _COUNT_BIN)
     _add_study(figure, fits, TABLE_2.n_points)
     _scale(figure, "Returns on the sphere", is_log=is_log)
-    figure.update_xaxes(**_RATIO_AXIS)
+    figure.update_xaxes(**RATIO_AXIS)
     return figure
 
 
@@ -122,23 +100,8 @@ def station_residuals(observations: Columns, tolerance_m: float) -> go.Figure:
         _add_residuals(figure, observations, names, axis, symbol)
     if len(names) and largest(floats(observations, "residual_x_m")) > tolerance_m / 2:
         add_tolerance(figure, tolerance_m)
-    figure.add_hline(y=0, line={"color": theme.LINE, "width": 1}, layer="below")
-    figure.update_xaxes(title_text="Mark", type="category")
-    figure.update_yaxes(title_text="Observed - computed [mm]")
-    figure.update_layout(scattermode="group", scattergap=0.35)
+    group_by_axis(figure, "Mark", "Observed - computed [mm]", 0.35)
     return figure
-
-
-def by_method(columns: Columns) -> Iterator[tuple[str, dict[str, NDArray[Any]]]]:
-    """Return the rows of each fitting method, the one that counts first."""
-    methods = np.array(texts(columns, "fit_method"), dtype=object)
-    for method in sorted(set(methods.tolist()), key=lambda name: (name != "along_beam", name)):
-        yield method, select(columns, methods == method)
-
-
-def blank_figure(title: str) -> go.Figure:
-    """Return an empty figure that looks like all others."""
-    return go.Figure(layout={"template": theme.template(), "title": {"text": title}})
 
 
 def _quality_figure(columns: Columns, what: str, tolerance_m: float) -> go.Figure:
@@ -150,43 +113,19 @@ def _quality_figure(columns: Columns, what: str, tolerance_m: float) -> go.Figur
     return figure
 
 
-def add_tolerance(figure: go.Figure, tolerance_m: float) -> None:
-    """Draw the tolerance: one look, everywhere."""
-    figure.add_hline(
-        y=tolerance_m * _MM,
-        line={"color": theme.TOLERANCE, "width": 1.5, "dash": "dash"},
-        annotation={
-            "text": f"tolerance {tolerance_m * _MM:g} mm",
-            "font": {"size": 12, "color": theme.TOLERANCE},
-            "bgcolor": theme.RAISED,
-            "borderpad": 1,
-            "yshift": 2,
-        },
-        annotation_position="top right",
-    )
-
-
 def _scale(figure: go.Figure, x_title: str, *, is_log: bool) -> None:
     """Choose the axes of a scatter: from zero, or both logarithmic."""
     kind = "log" if is_log else "linear"
     figure.update_xaxes(title_text=x_title, type=kind)
     figure.update_yaxes(type=kind, rangemode="normal" if is_log else "tozero")
     if is_log:
-        figure.update_xaxes(**_RATIO_AXIS)
+        figure.update_xaxes(**RATIO_AXIS)
         make_log(figure)
-
-
-def make_log(figure: go.Figure) -> None:
-    """Make the axis of errors logarithmic; Plotly wants logarithms of annotations, not of lines."""
-    figure.update_yaxes(**_RATIO_AXIS, rangemode="normal")
-    for line, note in zip(figure.layout.shapes, figure.layout.annotations, strict=False):
-        if note.yref == "y":
-            note.y = float(np.log10(line.y0))
 
 
 def _quality_mm(columns: Columns) -> NDArray[np.float64]:
     """Return the error, or the predicted sigma where there is no truth [mm]."""
-    return floats(columns, "error_3d_m" if has_errors(columns) else "sigma_3d_m") * _MM
+    return floats(columns, "error_3d_m" if has_errors(columns) else "sigma_3d_m") * MM
 
 
 def _add_fits(figure: go.Figure, fits: Columns, x: NDArray[np.float64], width: float) -> None:
@@ -195,12 +134,12 @@ def _add_fits(figure: go.Figure, fits: Columns, x: NDArray[np.float64], width: f
     methods = np.array(texts(fits, "fit_method"), dtype=object)
     for method, rows in by_method(fits):
         style, own_x = theme.method_style(method), x[methods == method]
-        y = floats(rows, "error_3d_m" if is_error else "sigma_3d_m") * _MM
+        y = floats(rows, "error_3d_m" if is_error else "sigma_3d_m") * MM
         _add_points(figure, style, own_x, y, rows)
         add_binned(figure, style, own_x, y, width)
         if is_error and method == "along_beam":
             known = np.isfinite(y)
-            sigma = floats(rows, "sigma_3d_m")[known] * _MM
+            sigma = floats(rows, "sigma_3d_m")[known] * MM
             _add_prediction(figure, style, own_x[known], sigma, width)
 
 
@@ -237,47 +176,19 @@ def _add_points(
     )
 
 
-def details(rows: Columns, words: Sequence[str], numbers: Sequence[str]) -> list[list[Any]]:
-    """Return what a person reads when pointing at a row."""
-    columns: list[Iterable[Any]] = [texts(rows, name) for name in words]
-    columns += [floats(rows, name).round(4).tolist() for name in numbers]
-    return [list(row) for row in zip(*columns, strict=True)]
-
-
 def _add_study(figure: go.Figure, fits: Columns, x: NDArray[np.float64]) -> None:
     """Lay the study's own Table 2 over errors; a click on its name in the legend takes it away."""
     if not has_errors(fits):
         return
     figure.add_scatter(
         x=x,
-        y=TABLE_2.errors_3d * _MM,
+        y=TABLE_2.errors_3d * MM,
         mode="markers",
         name="study, Table 2",
         marker={"symbol": "x-thin", "size": 8, "line": {"color": theme.TEXT, "width": 1.5}},
         customdata=np.column_stack([TABLE_2.ranges, TABLE_2.n_points]),
         hovertemplate="%{y:.1f} mm at %{customdata[0]:.2f} m, %{customdata[1]:.0f} returns"
         "<extra>study, Table 2</extra>",
-    )
-
-
-def add_binned(
-    figure: go.Figure,
-    style: theme.MethodStyle,
-    x: NDArray[np.float64],
-    y: NDArray[np.float64],
-    width: float,
-) -> None:
-    """Draw the RMS of each bin as a line."""
-    middles, values = binned_rms(x, y, width)
-    figure.add_scatter(
-        x=middles,
-        y=values,
-        mode="lines",
-        name=f"{style.label}: RMS of bins",
-        legendgroup=style.label,
-        showlegend=False,
-        line={"color": style.colour, "width": 2.5, "dash": style.dash},
-        hovertemplate=f"RMS %{{y:.1f}} mm about %{{x:.4g}}<extra>{style.label}</extra>",
     )
 
 
@@ -302,29 +213,9 @@ def _add_prediction(
     )
 
 
-def binned_rms(
-    x: NDArray[np.float64], y: NDArray[np.float64], width: float
-) -> tuple[list[float], list[float]]:
-    """Return the mean place and the RMS of y in bins of x, leaving out what is not known."""
-    known = np.isfinite(x) & np.isfinite(y)
-    x, y = x[known], y[known]
-    bins = np.floor(x / width)
-    members = [bins == value for value in np.unique(bins)]
-    return (
-        [float(np.mean(x[member])) for member in members],
-        [float(np.sqrt(np.mean(y[member] ** 2))) for member in members],
-    )
-
-
 def _in_lane_order(stops: Iterable[str]) -> list[str]:
     """Return the stops once each, lane by lane, in the order of their numbers."""
-    return sorted(set(stops), key=lambda stop: (lane_and_number(stop)[0], _number(stop), stop))
-
-
-def _number(stop: str) -> int:
-    """Return the number of a stop along its lane; one without comes first."""
-    number = lane_and_number(stop)[1]
-    return -1 if number is None else number
+    return sorted(set(stops), key=lane_order)
 
 
 def _add_lanes(
@@ -409,8 +300,8 @@ def _add_residuals(
     figure: go.Figure, observations: Columns, names: Sequence[str], axis: str, symbol: str
 ) -> None:
     """Draw the residuals of one axis with bars of twice their sigma about zero."""
-    sigma = floats(observations, f"sigma_{axis}_m") * _MM
-    values = floats(observations, f"residual_{axis}_m") * _MM
+    sigma = floats(observations, f"sigma_{axis}_m") * MM
+    values = floats(observations, f"residual_{axis}_m") * MM
     figure.add_scatter(
         x=list(names),
         y=np.where(np.isfinite(values), 0.0, np.nan),
@@ -434,14 +325,3 @@ def _add_residuals(
         hovertemplate=f"<b>%{{x}}</b><br>{axis} %{{y:.1f}} mm, sigma %{{customdata:.1f}} mm"
         "<extra></extra>",
     )
-
-
-def known_values(values: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return what is known of a column."""
-    return values[np.isfinite(values)]
-
-
-def largest(values: NDArray[np.float64]) -> float:
-    """Return the largest magnitude that is known, or zero."""
-    known = known_values(values)
-    return float(np.abs(known).max()) if len(known) else 0.0

@@ -9,14 +9,13 @@ from typing import Any
 
 import numpy as np
 
+from spheremark.web.columns import MM, Columns, plain_rows, select, texts
 from spheremark.web.figures import calibration as figures
-from spheremark.web.figures.survey import Columns, select, texts
+from spheremark.web.pages.base import Frame, Panel
 from spheremark.web.pages.readouts import Readout
-from spheremark.web.pages.results import Frame, Panel, plain_rows
 from spheremark.web.templating import number, render
 
 Row = Mapping[str, Any]
-_MM = 1e3  # [mm/m]
 _LASER = "laser_range_bias_"
 _SHOWN = {"m": ("mm", 1e3, 2), "rad": ("deg", math.degrees(1.0), 4), "s": ("ms", 1e3, 3)}
 """Unit, factor and decimals in which people read a parameter, by its unit."""
@@ -106,7 +105,7 @@ def _readouts(one: Row) -> tuple[Readout, ...]:
 
 def _mm(value: float | None) -> str:
     """Write a length in millimetres."""
-    return number(None if value is None else value * _MM, 1)
+    return number(None if value is None else value * MM, 1)
 
 
 def _panels(page: CalibrationPage) -> tuple[Panel, ...]:

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from spheremark.pipelines.config import RESECTION_METHODS
 from spheremark.pipelines.errors import InputError
-from spheremark.web.figures.survey import Columns, floats, lane_and_number, select, texts
+from spheremark.web.columns import Columns, floats, lane_and_number, select, texts
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -8,14 +8,13 @@ from typing import Any
 
 import numpy as np
 
+from spheremark.web.columns import MM, Columns, floats, has_errors, plain_rows, rms, select
 from spheremark.web.figures import network as figures
-from spheremark.web.figures.survey import Columns, floats, has_errors, select
+from spheremark.web.pages.base import Frame, Panel
 from spheremark.web.pages.readouts import Readout
-from spheremark.web.pages.results import Frame, Panel, plain_rows
 from spheremark.web.templating import number, render
 
 Row = Mapping[str, Any]
-_MM = 1e3  # [mm/m]
 _N_WORST = 40  # observations in the table of the page; all are in the database and in the files
 
 
@@ -90,20 +89,20 @@ def _sizes(what: str, rows: Columns, page: AdjustmentPage) -> Readout:
     """Say how good stations or marks are: against truth where it is known, else as predicted."""
     sigma, error = floats(rows, "sigma_3d_m"), floats(rows, "error_3d_m")
     known = error[np.isfinite(error)]
-    largest = f"largest {number(float(sigma.max()) * _MM, 2)} mm"
+    largest = f"largest {number(float(sigma.max()) * MM, 2)} mm"
     if not len(known):
         return Readout(
             label=f"{what}, predicted",
-            value=number(_rms(sigma) * _MM, 2),
+            value=number(rms(sigma) * MM, 2),
             unit="mm RMS sigma",
             note=f"{largest}; truth not known",
         )
     laid = ", after it was laid on the truth" if page.adjustment["datum"] == "free" else ""
     return Readout(
         label=f"{what}, against truth",
-        value=number(_rms(known) * _MM, 2),
+        value=number(rms(known) * MM, 2),
         unit="mm RMS error",
-        note=f"predicted {number(_rms(sigma) * _MM, 2)} mm RMS, {largest}{laid}",
+        note=f"predicted {number(rms(sigma) * MM, 2)} mm RMS, {largest}{laid}",
     )
 
 
@@ -111,18 +110,13 @@ def _left_out(checks: Columns) -> Readout:
     """Say how near the network comes to control marks that it was not given."""
     difference, sigma = floats(checks, "difference_3d_m"), floats(checks, "sigma_3d_m")
     worst = int(difference.argmax())
-    largest = f"largest {number(float(difference[worst]) * _MM, 1)} mm at {checks['mark'][worst]}"
+    largest = f"largest {number(float(difference[worst]) * MM, 1)} mm at {checks['mark'][worst]}"
     return Readout(
         label="Control left out in turn",
-        value=number(_rms(difference) * _MM, 2),
+        value=number(rms(difference) * MM, 2),
         unit="mm RMS",
-        note=f"predicted minus given; sigma {number(_rms(sigma) * _MM, 2)} mm, {largest}",
+        note=f"predicted minus given; sigma {number(rms(sigma) * MM, 2)} mm, {largest}",
     )
-
-
-def _rms(values: Any) -> float:
-    """Return the root mean square."""
-    return float(np.sqrt(np.mean(np.square(values))))
 
 
 def _panels(page: AdjustmentPage, centres: Columns) -> tuple[Panel, ...]:

@@ -11,8 +11,8 @@ import plotly.graph_objects as go
 
 from spheremark.web import theme
 from spheremark.web.figures import random_plans as trials
-from spheremark.web.figures.survey import blank_figure
-from spheremark.web.pages.results import Frame, Panel
+from spheremark.web.figures.elements import blank_figure
+from spheremark.web.pages.base import Frame, Panel
 from spheremark.web.templating import render
 
 Row = Mapping[str, Any]

@@ -9,10 +9,8 @@ import numpy as np
 
 from spheremark.pipelines.accuracy import ErrorSummary, summarise
 from spheremark.web import theme
-from spheremark.web.figures.survey import Columns, by_method, floats, has_errors, on_marks, select
+from spheremark.web.columns import MM, Columns, by_method, floats, has_errors, on_marks, rms, select
 from spheremark.web.templating import number
-
-_MM = 1e3  # [mm/m]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -50,7 +48,7 @@ def _quality(
     summary = summarise(floats(rows, "error_3d_m" if is_error else "sigma_3d_m"), tolerance_m)
     return Readout(
         label=f"{what}, {style.label}",
-        value=number(summary.rms * _MM, 1),
+        value=number(summary.rms * MM, 1),
         unit="mm RMS error" if is_error else "mm predicted sigma",
         note=_share(summary, tolerance_m, is_error=is_error)
         + (f"; {n_others} on no mark" if n_others else ""),
@@ -65,8 +63,8 @@ def _share(summary: ErrorSummary, tolerance_m: float, *, is_error: bool) -> str:
     within = round(summary.share_within * summary.n)
     what = "within" if is_error else "with a sigma within"
     return (
-        f"{within} of {summary.n} {what} {tolerance_m * _MM:g} mm, "
-        f"largest {summary.largest * _MM:.1f} mm"
+        f"{within} of {summary.n} {what} {tolerance_m * MM:g} mm, "
+        f"largest {summary.largest * MM:.1f} mm"
     )
 
 
@@ -74,11 +72,11 @@ def _predicted(rows: Columns) -> Readout:
     """Say what our sigma promised, and how that compares with the error."""
     error, sigma = floats(rows, "error_3d_m"), floats(rows, "sigma_3d_m")
     known = np.isfinite(error)
-    sigma_rms = float(np.sqrt(np.mean(sigma[known] ** 2)))
-    ratio = float(np.sqrt(np.mean(error[known] ** 2))) / sigma_rms if sigma_rms else math.nan
+    sigma_rms = rms(sigma[known])
+    ratio = rms(error[known]) / sigma_rms if sigma_rms else math.nan
     return Readout(
         label="Centres, predicted by us",
-        value=number(sigma_rms * _MM, 1),
+        value=number(sigma_rms * MM, 1),
         unit="mm sigma",
         note=f"error over sigma {ratio:.2f}; 1 is honest",
         method="along_beam",

@@ -38,18 +38,15 @@ from spheremark.pipelines.evaluation.reproduction import (
 from spheremark.pipelines.evaluation.reproduction.included_angle import CIRCLES, PAIR, TRIPLE
 from spheremark.pipelines.published import GREATEST_DISTANCE, SMALLEST_COUNT, TABLE_2
 from spheremark.web import theme
+from spheremark.web.columns import Columns, by_method, floats, texts
 from spheremark.web.figures.included_angle import circles_of_study, limit_by_sigma, station_by_angle
 from spheremark.web.figures.survey import (
-    Columns,
-    by_method,
     error_against_count,
     error_against_distance,
     error_along_lane,
-    floats,
-    texts,
 )
+from spheremark.web.pages.base import Panel
 from spheremark.web.pages.readouts import Readout
-from spheremark.web.pages.results import Panel
 from spheremark.web.pages.statements import Statement
 from spheremark.web.templating import environment, number
 

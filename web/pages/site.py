@@ -12,8 +12,9 @@ from numpy.typing import NDArray
 
 from spheremark.pipelines.ground_model import ElevationModel
 from spheremark.web import theme
-from spheremark.web.figures.survey import Columns, blank_figure, floats, texts
-from spheremark.web.pages.results import Frame, Panel
+from spheremark.web.columns import Columns, floats, texts
+from spheremark.web.figures.elements import blank_figure, make_map
+from spheremark.web.pages.base import Frame, Panel
 from spheremark.web.templating import render
 
 _CELLS_MAX = 400  # cells along an edge that a picture shows
@@ -164,6 +165,5 @@ def _with_places(figure: go.Figure, marks: Columns, stations: Columns) -> go.Fig
                 },
                 hovertemplate="%{text}<extra></extra>",
             )
-    figure.update_xaxes(title_text="x, site [m]", constrain="domain")
-    figure.update_yaxes(title_text="y, site [m]", scaleanchor="x", scaleratio=1)
+    make_map(figure, ", site")
     return figure

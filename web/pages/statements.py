@@ -18,7 +18,7 @@ from spheremark.pipelines.error_model import (
     limits,
 )
 from spheremark.pipelines.errors import TooFewObservationsError
-from spheremark.web.figures.survey import Columns, by_method, floats, has_errors, texts
+from spheremark.web.columns import Columns, by_method, floats, has_errors, texts
 from spheremark.web.templating import signed
 
 _SEED = 20  # of the resamples: the same rows give the same page

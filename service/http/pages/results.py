@@ -14,10 +14,9 @@ from spheremark.pipelines.errors import NotFoundError
 from spheremark.service.errors import Problem
 from spheremark.service.http.state import Current, Service
 from spheremark.storage.clouds import stop as clouds
-from spheremark.web import assets
+from spheremark.web import assets, pages
+from spheremark.web.columns import Columns, texts
 from spheremark.web.figures import scene
-from spheremark.web.figures.survey import Columns, texts
-from spheremark.web.pages import results as pages
 from spheremark.web.pages.filters import Filters
 
 router = APIRouter(include_in_schema=False, default_response_class=HTMLResponse)

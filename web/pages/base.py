@@ -1,0 +1,52 @@
+"""What all pages share: the frame, panels of figures, and the page of an error."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import plotly.graph_objects as go
+
+from spheremark.web.templating import render
+
+Row = Mapping[str, Any]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Frame:
+    """What every page shows around itself."""
+
+    surveys: tuple[str, ...] = ()
+    survey: str = ""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Panel:
+    """A figure with what the page says about it."""
+
+    name: str
+    figure: go.Figure
+    caption: str
+    kind: str = ""
+
+    @property
+    def title(self) -> str:
+        """The title of the figure."""
+        return str(self.figure.layout.title.text)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ErrorPage:
+    """What went wrong, for people."""
+
+    frame: Frame
+    status: int
+    title: str
+    detail: str
+    code: str
+
+
+def error_page(page: ErrorPage) -> str:
+    """Return what went wrong in the look of all pages."""
+    return render("error.html", page, here="")

@@ -1,0 +1,88 @@
+"""The page for queries."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import plotly.graph_objects as go
+
+from spheremark.web import theme
+from spheremark.web.pages.base import Frame, Row
+from spheremark.web.templating import render
+
+EXAMPLES: tuple[tuple[str, str], ...] = (
+    (
+        "Error by distance",
+        "SELECT fit_method, range_from_m, n_errors,\n"
+        "    round(error_3d_rms_m * 1000, 1) AS rms_mm,\n"
+        "    round(error_3d_p95_m * 1000, 1) AS p95_mm,\n"
+        "    round(sigma_3d_rms_m * 1000, 1) AS predicted_mm\n"
+        "FROM accuracy_by_distance\nORDER BY fit_method, range_from_m;",
+    ),
+    (
+        "Worst markers",
+        "SELECT survey, stop, marker, mark, fit_method, range_m, n_points,\n"
+        "    coalesce(error_3d_m, sigma_3d_m) * 1000 AS error_or_sigma_mm, status, reason\n"
+        "FROM latest_marker_fits\nORDER BY error_or_sigma_mm DESC\nLIMIT 20;",
+    ),
+    (
+        "Stations",
+        "SELECT survey, stop, fit_method, x_m, y_m, z_m,\n"
+        "    sigma_3d_m * 1000 AS sigma_mm, error_3d_m * 1000 AS error_mm, n_markers, sigma0\n"
+        "FROM latest_station_fixes\nORDER BY survey, stop, fit_method;",
+    ),
+    (
+        "Error by included angle",
+        "SELECT fit_method, included_angle_from_deg, n_resections,\n"
+        "    error_3d_rms_m * 1000 AS rms_mm, sigma_3d_rms_m * 1000 AS predicted_mm,\n"
+        "    resection_method, n_marks\n"
+        "FROM accuracy_by_included_angle\n"
+        "ORDER BY n_marks, resection_method, fit_method, included_angle_from_deg;",
+    ),
+    (
+        "Are the sigmas honest?",
+        "SELECT survey, fit_method, count(error_3d_m) AS n,\n"
+        "    sqrt(avg(error_3d_m ^ 2)) * 1000 AS error_rms_mm,\n"
+        "    sqrt(avg(sigma_3d_m ^ 2)) * 1000 AS predicted_mm,\n"
+        "    sqrt(avg(error_3d_m ^ 2) / avg(sigma_3d_m ^ 2)) AS error_over_sigma\n"
+        "FROM latest_marker_fits\nWHERE error_3d_m IS NOT NULL\nGROUP BY ALL\nORDER BY ALL;",
+    ),
+    (
+        "Time of each step",
+        "SELECT stop, n_returns, timings_s\nFROM stops\nORDER BY stop;",
+    ),
+)
+"""Queries to begin with, by what they answer."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SqlPage:
+    """The workbench for queries: schema, limits, and the query of the address."""
+
+    frame: Frame
+    query: str
+    tables: tuple[Row, ...]
+    seconds: float
+    rows: int
+    memory_bytes: int
+
+
+def sql_page(page: SqlPage) -> str:
+    """Return the workbench for queries."""
+    schema = {table["name"]: [row["name"] for row in table["columns"]] for table in page.tables}
+    return render(
+        "sql.html",
+        page,
+        here="sql",
+        schema=schema,
+        examples=EXAMPLES,
+        chart_template=_chart_template(),
+    )
+
+
+def _chart_template() -> dict[str, Any]:
+    """Return the look of a chart of a query's result, and the colour of each method."""
+    layout = go.Figure(layout={"template": theme.template()}).to_plotly_json()["layout"]
+    colours = {name: theme.method_style(name).colour for name in ("along_beam", "paper")}
+    return {"layout": layout, "colours": colours}
