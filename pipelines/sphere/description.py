@@ -1,14 +1,12 @@
-"""What is said of a centre whatever method found it: residuals, coverage, incidence, verdict."""
+"""Diagnostics of a fitted sphere by any method: residuals, coverage, incidence, status."""
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable
 from typing import Any
 
 import numpy as np
 
-from spheremark.pipelines.compilation import compiled
 from spheremark.pipelines.geometry import levelling_rotation
 from spheremark.pipelines.model import (
     RING_UNKNOWN,
@@ -22,20 +20,21 @@ from spheremark.pipelines.model import (
     StitchedCloud,
 )
 from spheremark.pipelines.scan.stitching import beams
-from spheremark.pipelines.sphere.footprint import predict, share_of_outline
+from spheremark.pipelines.sphere.footprint import predict
 from spheremark.pipelines.sphere.radius import other_radius, own_radius
 
 N_GOOD = 20
 """Returns below which a centre is called weak."""
 
 COVERAGE_GOOD = 0.6
-"""Share of the outline below which a centre is called weak."""
+"""Share of the limb below which a centre is called weak."""
 
 WITHOUT_RINGS = "rings unknown: laser heights and biases not applied"
-"""What is said of a fit to returns without rings."""
+"""Variant of a fit to returns without rings."""
 
 _SEGMENT = 1.35  # radii about the rough centre within which a return may be the sphere
-_NEARBY = 1.6  # the same where the radius is asked, which may be larger
+_NEARBY = 1.6  # the same for the test of the radius, which may be larger
+_MIDDLE = 0.3  # radii: returns nearer to the middle belong to no octant of the limb
 
 Fits = tuple[tuple[MarkerFit, ...], tuple[Rejection, ...]]
 
@@ -75,19 +74,15 @@ def described(
     cov_p_base: Array,
     **known: float | str,
 ) -> MarkerFit:
-    """Return a fit with what its returns say of it."""
-    shots = beams(cloud, used)
+    """Return a fit with its diagnostics; ``known`` are fields that the method sets itself."""
+    pulses = beams(cloud, used)
     radius = float(known["radius"])
     which = np.zeros(len(used), dtype=np.intp)
-    found = predict(shots, p_base[None], np.array([radius]), which)
-    rings = shots.rings[shots.rings != RING_UNKNOWN]
+    found = predict(pulses, p_base[None], np.array([radius]), which)
+    rings = pulses.rings[pulses.rings != RING_UNKNOWN]
     n_rings = len(np.unique(rings))
-    directions, across, offsets = (
-        np.ascontiguousarray(vectors.T)
-        for vectors in (shots.directions_base, shots.across_base, found.offsets)
-    )
-    coverage = share_of_outline(directions, across, offsets, radius)
-    residuals = shots.ranges - found.ranges
+    coverage = limb_coverage(pulses.directions_base, pulses.across_base, found.offsets, radius)
+    residuals = pulses.ranges - found.ranges
     nearby = beams(cloud, on_sphere(cloud, candidate, radius, _NEARBY))
     own = own_radius(nearby, radius, levelling_rotation(cloud.levelling)[2])
     variants = (known.get("variant"), "" if n_rings else WITHOUT_RINGS)
@@ -96,7 +91,7 @@ def described(
         "sigma_radius_free": own[1],
         "sigma0": 1.0,
         **known,
-        "variant": "; ".join(str(said) for said in variants if said),
+        "variant": "; ".join(str(variant) for variant in variants if variant),
     }
     reasons = weaknesses(len(used), n_rings, coverage)
     reasons += other_radius(radius, fields["radius_free"], fields["sigma_radius_free"])
@@ -107,37 +102,44 @@ def described(
         cov_p_base=np.array(cov_p_base),
         status=Status.WEAK if reason else Status.OK,
         reason=reason,
-        mean_range=float(np.linalg.norm(shots.origins_base.mean(axis=0) - p_base)),
-        mean_intensity=float(shots.intensities.mean()),
+        mean_range=float(np.linalg.norm(pulses.origins_base.mean(axis=0) - p_base)),
+        mean_intensity=float(pulses.intensities.mean()),
         used=used,
         rejected=left_out(candidate.members, used),
         residuals=residuals,
         n_rings=n_rings,
         coverage=coverage,
-        incidence=incidence(offsets, radius),
+        incidence=incidence(found.offsets, radius),
         **fields,
     )
 
 
 def left_out(members: Index, used: Index) -> Index:
-    """Return the rows of a candidate that do not carry its centre."""
+    """Return the rows of a candidate that its fit does not use."""
     is_left = np.ones(len(members), dtype=bool)
     is_left[np.searchsorted(members, used)] = False
     return np.asarray(members[is_left])
 
 
-@compiled
+def limb_coverage(directions: Array, across: Array, offsets: Array, radius: float) -> float:
+    """Return the share of the octants of a sphere's limb that have returns; arrays are (n, k)."""
+    middle = directions.mean(axis=0)
+    # the footprint's axes are turned over between the two faces of the scan, these are not
+    first = np.cross(middle, np.eye(3)[np.argmin(np.abs(middle))])
+    first /= np.linalg.norm(first)
+    passed = offsets[:, :1] * across + offsets[:, 1:] * np.cross(directions, across)
+    x, y = np.stack([first, np.cross(middle, first)]) @ passed.T
+    octants = 4 * (y < 0.0) + 2 * (x < 0.0) + (np.abs(y) > np.abs(x))
+    return len(np.unique(octants[x * x + y * y > (_MIDDLE * radius) ** 2])) / 8.0
+
+
 def incidence(offsets: Array, radius: float) -> float:
-    """Return the mean angle between beams and the normals of a sphere."""
-    total = 0.0
-    for i in range(offsets.shape[1]):
-        off = math.sqrt(offsets[0, i] ** 2 + offsets[1, i] ** 2) / radius
-        total += math.asin(min(off, 1.0))
-    return float(total / offsets.shape[1])
+    """Return the mean angle between beams and the normals of a sphere, from offsets (n, 2)."""
+    return float(np.mean(np.arcsin(np.minimum(np.hypot(*offsets.T) / radius, 1.0))))
 
 
 def weaknesses(n_points: int, n_rings: int, coverage: float) -> list[str]:
-    """Say what weakens a centre whatever method found it."""
+    """Return the reasons to call a centre weak that hold for every method."""
     tests = (
         (n_points < N_GOOD, f"only {n_points} returns (at least {N_GOOD} are good)"),
         (n_rings == 1, "all returns are of one laser"),
@@ -159,7 +161,7 @@ def spread_of(normals: Array, residuals: Array, n_unknowns: int) -> Array:
 
 
 def is_undetermined(normals: Array, n: int) -> Mask | bool:
-    """Tell whether a fit's normal equations have no answer worth having."""
+    """Tell whether normal equations of unit rows leave an unknown undetermined."""
     if not np.all(np.isfinite(normals)):
         return True
     return bool(np.linalg.eigvalsh(normals)[0] < 1e-3 * np.sqrt(max(n, 1)))

@@ -1,8 +1,7 @@
-"""Where the spheres of a stop are, all of them together: hides the steps of the estimate.
+"""Joint least-squares estimate of the spheres of a stop.
 
-The spheres of a stop share what one of them alone cannot tell: the noise of this sensor today, what
-each laser measures too long, what is wrong in the mounting, and how sharply returns end at the
-outline.
+The spheres share what one of them cannot determine: the noise of the sensor, the range bias of each
+laser, the errors of the mounting, and how sharply returns end at the limb.
 """
 
 from __future__ import annotations
@@ -13,43 +12,43 @@ from typing import NamedTuple
 import numpy as np
 
 from spheremark.pipelines.model import Array, Mask
-from spheremark.pipelines.sphere.faces import N_MOUNTING, effects_on
-from spheremark.pipelines.sphere.limb import Outline, outline_before, outline_normals, outline_of
+from spheremark.pipelines.sphere.limb import Edge, edge_before, edge_of, limb_normals
 from spheremark.pipelines.sphere.linearisation import Linear, linearise
+from spheremark.pipelines.sphere.mounting import N_MOUNTING, effects_on
 from spheremark.pipelines.sphere.noise import START, Noise, Weighed, weigh
 from spheremark.pipelines.sphere.normal_equations import Normals, normals_of, solve
-from spheremark.pipelines.sphere.radius import Weighing, free_radii
-from spheremark.pipelines.sphere.returns import Rows, in_play, moved_faces
+from spheremark.pipelines.sphere.radius import Ranges, free_radii
+from spheremark.pipelines.sphere.returns import Returns, may_be_sphere, moved_faces
 
 _EFFICIENCY = 0.9753  # variance of the estimate over the inverse normal matrix
-_SPREAD_MIN = 1e-5  # [m] of the laser biases: keeps their prior invertible
-_MOUNTING_MIN = 1e-9  # of what is known of the mounting: likewise
+_SIGMA_BIAS_MIN = 1e-5  # [m] of the laser biases: keeps their prior invertible
+_MOUNTING_MIN = 1e-9  # of the unknowns of the mounting: likewise
 _N_STEPS = 8
-_N_STEPS_GATED = 5  # after these the choice of returns by their place stays as it is
-_N_STEPS_RANGES = 3  # without the outline
-_N_STEPS_SOFT = 6  # before it is known how returns end there
-_ROUGH = 0.1  # radii by which a rough centre may be off per axis
+_N_STEPS_GATED = 5  # after these the choice of returns by their place is fixed
+_N_STEPS_RANGES = 3  # without the limb
+_N_STEPS_SOFT = 6  # before the edge at the limb is estimated
+_ROUGH = 0.1  # radii: standard deviation per axis of a rough centre
 _STEP_MAX = 0.25  # radii per step
-_GAP_SIGMAS = 3.0  # of its centre by which a return may pass a sphere by and still be its own
+_GAP_SIGMAS = 3.0  # of its centre by which a return may lie outside a sphere and still be its own
 _GAP_MIN, _GAP_MAX = 0.02, 0.3  # radii: least and most of that
-_DOF_BIAS = 2.0  # lasers that the prior of the biases is worth when their spread is estimated
+_DOF_BIAS = 2.0  # lasers that the prior counts for in the estimate of the biases' spread
 
-Told = Callable[[Array, Array], tuple[Array, Array]]
-"""What else is told of centres, (m, 3) [m] with covariances (m, 3, 3) [m^2]: what it adds to their
-normal equations, (m, 3, 3) [1/m^2], and to the right-hand sides, (m, 3) [1/m]."""
+Observe = Callable[[Array, Array], tuple[Array, Array]]
+"""Further observations of the centres. Called with centres, (m, 3), and their covariances; returns
+the normal matrices, (m, 3, 3) [1/m^2], and right-hand sides, (m, 3) [1/m], that they add."""
 
 
-class Known(NamedTuple):
-    """What is known before the returns are seen.
+class Prior(NamedTuple):
+    """What is known before the scan.
 
     Attributes
     ----------
     radius : float
         Radius of the spheres [m].
     sigma_biases : (k,)
-        Standard deviation of what each laser that occurs measures too long [m].
+        Standard deviations of the range biases of the lasers that occur [m].
     sigma_mounting : (6,)
-        That of the unknowns of the mounting.
+        Standard deviations of the unknowns of the mounting.
     """
 
     radius: float
@@ -58,179 +57,162 @@ class Known(NamedTuple):
 
 
 class State(NamedTuple):
-    """Where the estimate stands.
+    """Unknowns with their covariances after some steps.
 
     Attributes
     ----------
     centres : (m, 3)
         Centres [m].
     biases : (k,)
-        What each laser measures too long [m].
+        Range biases of the lasers [m].
     mounting : (6,)
-        What is wrong in the mounting, as ``faces.effects_on`` has it.
-    spread : (k,)
+        Errors of the mounting, in the order of ``mounting.effects_on``.
+    sigma_biases : (k,)
         Standard deviations of the biases, as estimated [m].
     has_biases : bool
-        Whether biases are estimated already.
+        Whether the shared unknowns are estimated already.
     noise : Noise
         That of the stop.
-    cov_noise, cov_biases : (m, 3, 3)
-        Covariances of the centres by noise and by biases [m^2].
+    cov_noise, cov_shared_part : (m, 3, 3)
+        Covariances of the centres by the noise, and by the shared unknowns [m^2].
     by_shared : (m, 3, k + 6)
-        How far a unit of each bias, or of the mounting, moves each centre, with the sign turned.
+        Derivatives of the centres by the shared unknowns, with the sign turned.
     cov_shared : (k + 6, k + 6)
-        Covariance of the biases [m^2] and of the mounting.
+        Covariance of the biases and of the mounting.
     """
 
     centres: Array
     biases: Array
     mounting: Array
-    spread: Array
+    sigma_biases: Array
     has_biases: bool
     noise: Noise
     cov_noise: Array
-    cov_biases: Array
+    cov_shared_part: Array
     by_shared: Array
     cov_shared: Array
 
+    @property
+    def covs(self) -> Array:
+        """Covariances of the centres, (m, 3, 3) [m^2]."""
+        return np.asarray(self.cov_noise + self.cov_shared_part)
+
 
 class Estimate(NamedTuple):
-    """A state with what each return says of it: prediction, residuals [m], sigmas [m], weights."""
+    """A state with the predictions, residuals and weights of all returns."""
 
     state: State
     linear: Linear
     weighed: Weighed
 
 
-class _Bounds(NamedTuple):
-    """How returns end at the outline, as far as it is known; what each says of it, (n, 2)."""
-
-    outline: Outline
-    sites: Array
-
-
 def estimate(
-    rows: Rows, rough: Array, known: Known, told: Told | None, *, asks_outline: bool
+    returns: Returns, rough: Array, prior: Prior, observe: Observe | None, *, uses_limb: bool
 ) -> Estimate:
-    """Return the estimate of all centres, biases and the mounting."""
-    state, radius = _start(rough, known), known.radius
-    is_in = np.ones(len(rows.ranges), dtype=bool)
-    bounds = _Bounds(outline_before(radius), sites=np.zeros((len(rows.ranges), 2)))
+    """Estimate all centres, the laser biases and the mounting, from rough centres, (m, 3)."""
+    state, radius = _start(rough, prior), prior.radius
+    is_used = np.ones(len(returns.ranges), dtype=bool)
+    edge, sites = edge_before(radius), np.zeros((len(returns.ranges), 2))
     for step in range(_N_STEPS):
-        linear = _linear(rows, state, is_in, radius)
+        linear = _linear(returns, state, is_used, radius)
         if step < _N_STEPS_GATED:
-            is_in = in_play(rows, linear.offsets, _margins(state, radius), radius)
-        now = _weighed(rows, state, linear, is_in)
+            is_used = may_be_sphere(returns, linear.offsets, _margins(state, radius), radius)
+        now = _weighed(returns, state, linear, is_used)
         state = now.state._replace(has_biases=step >= _N_STEPS_GATED)
-        N = _normals(rows, now)
-        if asks_outline and step == _N_STEPS_SOFT:
-            outline = outline_of(rows, linear, now.weighed.weights, radius)
-            bounds = bounds._replace(outline=outline)
-        if asks_outline and step >= _N_STEPS_RANGES:
-            N, bounds = _bounded(rows, now, N, bounds)
-        if told is not None and step >= _N_STEPS_RANGES:
-            N = _with_told(N, state, told)
-        state = _stepped(state, N, known)
-    return _weighed(rows, state, _linear(rows, state, is_in, radius), is_in)
+        residuals, sigmas, weights, _ = now.weighed
+        N = normals_of(returns, linear, residuals, weights / sigmas**2, len(state.biases))
+        if uses_limb and step == _N_STEPS_SOFT:
+            edge = edge_of(returns, linear, weights, radius)
+        if uses_limb and step >= _N_STEPS_RANGES:
+            sites = _add_limb(N, returns, now, edge, sites)
+        if observe is not None and step >= _N_STEPS_RANGES:
+            centres, rhs = observe(state.centres, state.covs)
+            N.products[:, :3, :3] += centres
+            N.products[:, :3, -1] += rhs
+        state = _stepped(state, N, prior)
+    return _weighed(returns, state, _linear(returns, state, is_used, radius), is_used)
 
 
-def _start(rough: Array, known: Known) -> State:
-    """Return where the estimate begins."""
-    nothing, sigmas = np.zeros((len(rough), 3, 3)), known.sigma_biases
+def _start(rough: Array, prior: Prior) -> State:
+    """Return the state before the first step."""
+    nothing, sigmas = np.zeros((len(rough), 3, 3)), prior.sigma_biases
     return State(
         centres=rough,
         biases=np.zeros(len(sigmas)),
         mounting=np.zeros(N_MOUNTING),
-        spread=sigmas,
+        sigma_biases=sigmas,
         has_biases=False,
         noise=START,
-        cov_noise=nothing + (_ROUGH * known.radius) ** 2 * np.eye(3),
-        cov_biases=nothing,
+        cov_noise=nothing + (_ROUGH * prior.radius) ** 2 * np.eye(3),
+        cov_shared_part=nothing,
         by_shared=np.zeros((len(rough), 3, len(sigmas) + N_MOUNTING)),
-        cov_shared=np.diag(np.concatenate([sigmas, known.sigma_mounting]) ** 2),
+        cov_shared=np.diag(np.concatenate([sigmas, prior.sigma_mounting]) ** 2),
     )
 
 
-def _placed(rows: Rows, state: State) -> Rows:
-    """Return the returns with their beams where the mounting, as it is known, has them."""
+def _corrected(returns: Returns, state: State) -> Returns:
+    """Return the returns with their beams corrected for the errors of the mounting."""
     if not state.mounting.any():
-        return rows
-    return moved_faces(rows, effects_on(state.centres) @ state.mounting)
+        return returns
+    return moved_faces(returns, effects_on(state.centres) @ state.mounting)
 
 
 def _spheres(state: State, radius: float) -> tuple[Array, Array]:
     """Return spheres, (m, 4), of a known radius, and their covariances, (m, 4, 4)."""
     spheres, covs = np.full((len(state.centres), 4), radius), np.zeros((len(state.centres), 4, 4))
-    spheres[:, :3] = state.centres
-    covs[:, :3, :3] = state.cov_noise + state.cov_biases
+    spheres[:, :3], covs[:, :3, :3] = state.centres, state.covs
     return spheres, covs
 
 
-def _linear(rows: Rows, state: State, is_in: Mask, radius: float) -> Linear:
-    """Return what the beams should measure, linearised over what is not known of the centres."""
-    linear: Linear = linearise(_placed(rows, state), *_spheres(state, radius), is_in)
-    return linear
+def _linear(returns: Returns, state: State, is_used: Mask, radius: float) -> Linear:
+    """Return predicted ranges, linearised over the uncertainty of the centres."""
+    return linearise(_corrected(returns, state), *_spheres(state, radius), is_used)
 
 
 def _margins(state: State, radius: float) -> Array:
-    """Return by how much a footprint may pass each sphere by and still be its own [m]."""
+    """Return how far a footprint may lie outside each sphere and still be its own [m]."""
     sigma = np.sqrt(np.trace(state.cov_noise, axis1=1, axis2=2))
     return np.asarray(np.clip(_GAP_SIGMAS * sigma, _GAP_MIN * radius, _GAP_MAX * radius))
 
 
-def _weighed(rows: Rows, state: State, linear: Linear, is_in: Mask) -> Estimate:
-    """Return a state with the noise that its residuals show, and these."""
-    weighed = weigh(rows, linear, state.biases, state.noise, is_in)
+def _weighed(returns: Returns, state: State, linear: Linear, is_used: Mask) -> Estimate:
+    """Return a state with its residuals, and the noise that they show."""
+    weighed = weigh(returns, linear, state.biases, state.noise, is_used)
     return Estimate(state._replace(noise=weighed.noise), linear, weighed)
 
 
-def _normals(rows: Rows, now: Estimate) -> Normals:
-    """Sum the normal equations of centres and biases."""
-    residuals, sigmas, weights, _ = now.weighed
-    return normals_of(rows, now.linear, residuals, weights / sigmas**2, len(now.state.biases))
+def _add_limb(N: Normals, returns: Returns, now: Estimate, edge: Edge, sites: Array) -> Array:
+    """Add the observations of the limb to normal equations; return the sites of the returns."""
+    limb = limb_normals(returns, now.linear, now.weighed.weights, now.state.covs, edge, sites)
+    N.products[:, :3, :3] += limb.centres
+    N.products[:, :3, -1] += limb.rhs
+    N.by_face[:, :, :3] += limb.faces
+    N.by_face[:, :, -1] += limb.rhs_faces
+    return limb.sites
 
 
-def _bounded(rows: Rows, now: Estimate, N: Normals, known: _Bounds) -> tuple[Normals, _Bounds]:
-    """Return normal equations with what the outline adds, and what each return says of it."""
-    covs = now.state.cov_noise + now.state.cov_biases
-    centres, pull_centres, faces, pull_faces, sites = outline_normals(
-        rows, now.linear, now.weighed.weights, covs, *known
-    )
-    added = N._replace(
-        centres=N.centres + centres,
-        pull_centres=N.pull_centres + pull_centres,
-        faces=N.faces + faces,
-        pull_faces=N.pull_faces + pull_faces,
-    )
-    return added, known._replace(sites=sites)
-
-
-def _with_told(N: Normals, state: State, told: Told) -> Normals:
-    """Return normal equations with what else is told of the centres."""
-    centres, pull_centres = told(state.centres, state.cov_noise + state.cov_biases)
-    return N._replace(centres=N.centres + centres, pull_centres=N.pull_centres + pull_centres)
-
-
-def _stepped(state: State, N: Normals, known: Known) -> State:
+def _stepped(state: State, N: Normals, prior: Prior) -> State:
     """Return the state after one Gauss-Newton step of centres, biases and mounting together."""
-    n, prior2 = len(state.biases), float(np.mean(known.sigma_biases**2))
-    sigmas = np.maximum(np.concatenate([state.spread, known.sigma_mounting]), _MOUNTING_MIN)
-    sigmas[:n] = np.maximum(sigmas[:n], _SPREAD_MIN)
+    n, prior2 = len(state.biases), float(np.mean(prior.sigma_biases**2))
+    sigmas = np.maximum(np.concatenate([state.sigma_biases, prior.sigma_mounting]), _MOUNTING_MIN)
+    sigmas[:n] = np.maximum(sigmas[:n], _SIGMA_BIAS_MIN)
     shared = np.concatenate([state.biases, state.mounting])
-    solved = solve(N, effects_on(state.centres), sigmas**-2.0, -shared / sigmas**2)
-    step = solved.step_shared * state.has_biases
+    solution = solve(N, effects_on(state.centres), sigmas**-2.0, -shared / sigmas**2)
+    step = solution.step_shared * state.has_biases
     biases = state.biases + step[:n]
-    known2 = (biases**2 + np.diag(solved.cov_shared)[:n]).sum() + _DOF_BIAS * prior2
-    spread = known.sigma_biases * np.sqrt(known2 / (_DOF_BIAS + n) / prior2)
+    # spread of the biases by expectation maximisation
+    squares = (biases**2 + np.diag(solution.cov_shared)[:n]).sum() + _DOF_BIAS * prior2
+    spread = prior.sigma_biases * np.sqrt(squares / (_DOF_BIAS + n) / prior2)
     return state._replace(
-        centres=state.centres + _shortened(solved.steps - solved.by_shared @ step, known.radius),
+        centres=state.centres
+        + _shortened(solution.steps - solution.by_shared @ step, prior.radius),
         biases=biases,
         mounting=state.mounting + step[n:],
-        spread=spread if state.has_biases else known.sigma_biases,
-        cov_noise=_EFFICIENCY * solved.inverses,
-        cov_biases=solved.covs_by_shared,
-        by_shared=solved.by_shared,
-        cov_shared=solved.cov_shared,
+        sigma_biases=spread if state.has_biases else prior.sigma_biases,
+        cov_noise=_EFFICIENCY * solution.covs,
+        cov_shared_part=solution.covs_by_shared,
+        by_shared=solution.by_shared,
+        cov_shared=solution.cov_shared,
     )
 
 
@@ -240,22 +222,22 @@ def _shortened(steps: Array, radius: float) -> Array:
     return np.asarray(steps * np.minimum(1.0, _STEP_MAX * radius / np.maximum(lengths, 1e-12)))
 
 
-def radii_shown(rows: Rows, found: Estimate, radius: float) -> tuple[Array, Array]:
-    """Return radii estimated together with the centres, and their standard deviations."""
+def estimate_radii(returns: Returns, found: Estimate, radius: float) -> tuple[Array, Array]:
+    """Estimate radii together with the centres; return them with their standard deviations."""
     state, (residuals, sigmas, weights, _) = found.state, found.weighed
-    weighing = Weighing(
-        ranges=rows.ranges - state.biases[rows.lasers],
+    observed = Ranges(
+        ranges=returns.ranges - state.biases[returns.lasers],
         variances=np.maximum(sigmas**2 - found.linear.bends**2, 1e-12),
         weights=weights,
     )
-    return free_radii(_placed(rows, state), weighing, *_spheres(state, radius), residuals)
+    return free_radii(_corrected(returns, state), observed, *_spheres(state, radius), residuals)
 
 
-def sigmas_shared(state: State) -> Array:
-    """Return how much of each centre's error along its line of sight all have in common."""
+def shared_range_sigmas(state: State) -> Array:
+    """Return the part of each centre's sigma along its line of sight that all have in common."""
     lines = state.centres / np.linalg.norm(state.centres, axis=1, keepdims=True)
-    pulls = np.einsum("mi,mik->mk", lines, state.by_shared)
-    cov = pulls @ state.cov_shared @ pulls.T
+    by_shared = np.einsum("mi,mik->mk", lines, state.by_shared)
+    cov = by_shared @ state.cov_shared @ by_shared.T
     own = np.diag(cov)
-    together = (cov.sum(axis=1) - own) / (len(cov) - 1) if len(cov) > 1 else own
-    return np.asarray(np.sqrt(np.maximum(together, 0.0)))
+    common = (cov.sum(axis=1) - own) / (len(cov) - 1) if len(cov) > 1 else own
+    return np.asarray(np.sqrt(np.maximum(common, 0.0)))

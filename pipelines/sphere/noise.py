@@ -1,7 +1,6 @@
-"""How noisy the returns of a stop are, and which of them are none of a sphere.
+"""Range noise of a stop, estimated from the residuals of all its spheres, and robust weights.
 
-Hides the noise of a range by reflectivity, of which only the ratio is known beforehand, and the
-robust weights. All spheres of a stop tell of the noise together.
+Of the noise by reflectivity only the ratios are known beforehand; its size is estimated.
 """
 
 from __future__ import annotations
@@ -10,10 +9,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from spheremark.pipelines.compilation import compiled
 from spheremark.pipelines.model import Array, Index, Mask
 from spheremark.pipelines.sphere.linearisation import Linear
-from spheremark.pipelines.sphere.returns import Rows
+from spheremark.pipelines.sphere.returns import Returns
 
 # Range noise of a VLP-16 by reflectivity, from recorded packets [m]: a prior, for the ratio between
 # dark and bright; its size is estimated from the stop.
@@ -28,37 +26,29 @@ EXPECTED_SQUARE = 0.9099
 """Mean of weight times square of normal residuals in units of their sigma."""
 
 _TUKEY = 8.0  # sigmas at which a return has no weight; 99 % efficient on clean data
-_DOF_CLASS = 30.0  # returns that the common noise is worth when that of a class is estimated
+_DOF_CLASS = 30.0  # returns that the pooled noise counts for in the estimate of a class
 
 
 class Noise(NamedTuple):
-    """The noise of a stop in units of the prior.
-
-    Attributes
-    ----------
-    factor : float
-        Of all returns.
-    factors : (c,)
-        By class of reflectivity.
-    """
+    """The noise of a stop in units of the prior: of all returns, and by reflectivity class."""
 
     factor: float
     factors: Array
 
 
 class Weighed(NamedTuple):
-    """What returns leave after what they should measure.
+    """Residuals of the returns with their weights.
 
     Attributes
     ----------
     residuals : (n,)
-        Observed minus computed, the bias of each laser taken off [m].
+        Observed minus computed, corrected for the laser biases [m].
     sigmas : (n,)
         Their standard deviations [m].
     weights : (n,)
         Robust weights, 0 to 1.
     noise : Noise
-        As these residuals have it.
+        Estimated from these residuals.
     """
 
     residuals: Array
@@ -68,7 +58,7 @@ class Weighed(NamedTuple):
 
 
 START = Noise(_FACTOR_START, np.full(len(_SIGMAS), _FACTOR_START))
-"""The noise before a residual is seen."""
+"""The noise before the first residuals."""
 
 
 def classes_of(intensities: Array) -> tuple[Index, Array]:
@@ -77,72 +67,45 @@ def classes_of(intensities: Array) -> tuple[Index, Array]:
     return classes, _SIGMAS[classes]
 
 
-def weigh(rows: Rows, linear: Linear, biases: Array, noise: Noise, is_in: Mask) -> Weighed:
+def weigh(returns: Returns, linear: Linear, biases: Array, noise: Noise, is_used: Mask) -> Weighed:
     """Weigh returns, and estimate the noise of their stop.
 
     Notes
     -----
-    The noise of a range is its own, that of the direction on a slope, and the bend. A class is
-    believed to have the factor of all until it has returns enough to speak for itself. Weights are
-    Tukey's.
+    The variance of a residual is that of the range, that of the direction on a sloping surface, and
+    that of the bend. The noise of a reflectivity class is shrunk towards that of all returns
+    (``_pooled``). Weights are Tukey's biweight.
     """
-    return Weighed(*_weigh(rows, linear, biases, noise, is_in))
+    residuals = returns.ranges - linear.ranges - biases[returns.lasers]
+    gradient = linear.J[:3]
+    along = np.sum(gradient * returns.directions, axis=0)
+    slope2 = np.maximum(np.sum(gradient * gradient, axis=0) - along * along, 0.0)
+    others = returns.sigmas_lateral**2 * slope2 + linear.bends**2
+
+    def weighed(factors: Array) -> tuple[Array, Array]:
+        """Return sigmas and weights for noise factors by class."""
+        sigmas = np.sqrt((factors[returns.classes] * returns.sigmas) ** 2 + others)
+        return sigmas, np.maximum(1.0 - (residuals / (_TUKEY * sigmas)) ** 2, 0.0) ** 2
+
+    sigmas, weights = weighed(noise.factors)
+    classes, n_classes = returns.classes, len(_SIGMAS)
+    counted = is_used & (weights > 0.0)
+    squares = counted * weights * (noise.factors[classes] * residuals / sigmas) ** 2
+    found = _pooled(
+        np.bincount(classes, squares, n_classes) / EXPECTED_SQUARE,
+        np.bincount(classes[counted], minlength=n_classes),
+        3.0 * (len(returns.starts) - 1),
+    )
+    sigmas, weights = weighed(found.factors)
+    return Weighed(residuals, sigmas, weights * is_used, found)
 
 
-@compiled
-def _weigh(
-    rows: Rows, linear: Linear, biases: Array, noise: Noise, is_in: Mask
-) -> tuple[Array, Array, Array, Noise]:
-    """Return the fields of ``Weighed``."""
-    n = len(rows.ranges)
-    residuals, beside, sigmas, weights = np.empty(n), np.empty(n), np.empty(n), np.empty(n)
-    for i in range(n):
-        residuals[i] = rows.ranges[i] - linear.ranges[i] - biases[rows.lasers[i]]
-    _beside(rows, linear, beside)
-    _against(rows, residuals, beside, noise.factors, sigmas, weights)
-    squares, counts = np.zeros(len(noise.factors)), np.zeros(len(noise.factors))
-    for i in range(n):
-        if is_in[i] and weights[i] > 0.0:
-            c = rows.classes[i]
-            squares[c] += weights[i] * (noise.factors[c] * residuals[i] / sigmas[i]) ** 2
-            counts[c] += 1.0
-    found = _pooled(squares / EXPECTED_SQUARE, counts, 3.0 * (len(rows.firsts) - 1.0))
-    _against(rows, residuals, beside, found.factors, sigmas, weights)
-    for i in range(n):
-        weights[i] *= is_in[i]
-    return residuals, sigmas, weights, found
-
-
-@compiled
-def _beside(rows: Rows, linear: Linear, variances: Array) -> None:
-    """Fill in the variances of what is not noise of the range: directions on a slope, the bend."""
-    J, u = linear.J, rows.directions
-    for i in range(len(variances)):
-        along = J[0, i] * u[0, i] + J[1, i] * u[1, i] + J[2, i] * u[2, i]
-        square = J[0, i] * J[0, i] + J[1, i] * J[1, i] + J[2, i] * J[2, i]
-        lateral, bend = rows.lateral[i], linear.bends[i]
-        variances[i] = lateral * lateral * max(square - along * along, 0.0) + bend * bend
-
-
-@compiled
-def _against(
-    rows: Rows, residuals: Array, beside: Array, factors: Array, sigmas: Array, weights: Array
-) -> None:
-    """Fill in sigmas, and Tukey's weights of residuals in units of them."""
-    for i in range(len(sigmas)):
-        own = factors[rows.classes[i]] * rows.sigmas[i]
-        sigmas[i] = np.sqrt(own * own + beside[i])
-    for i in range(len(sigmas)):
-        scaled = residuals[i] / (_TUKEY * sigmas[i])
-        rest = max(1.0 - scaled * scaled, 0.0)
-        weights[i] = rest * rest
-
-
-@compiled
-def _pooled(squares: Array, counts: Array, n_unknowns: float) -> Noise:
+def _pooled(squares: Array, counts: Index, n_unknowns: float) -> Noise:
     """Return the noise from sums of squares and numbers of returns by class."""
-    n = max(np.sum(counts), 1.0)
+    n = max(float(counts.sum()), 1.0)
     dof = max(n - n_unknowns, 0.0)
-    factor2 = (np.sum(squares) + 1.0) / (dof + 1.0)
-    own = (squares + _DOF_CLASS * factor2) / (counts * dof / n + _DOF_CLASS)
-    return Noise(max(np.sqrt(factor2), FACTOR_MIN), np.maximum(np.sqrt(own), FACTOR_MIN))
+    factor2 = (float(squares.sum()) + 1.0) / (dof + 1.0)
+    by_class = (squares + _DOF_CLASS * factor2) / (counts * dof / n + _DOF_CLASS)
+    return Noise(
+        max(float(np.sqrt(factor2)), FACTOR_MIN), np.maximum(np.sqrt(by_class), FACTOR_MIN)
+    )

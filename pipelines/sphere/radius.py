@@ -1,7 +1,7 @@
-"""The radius that a sphere's returns show by themselves: the test of the one that is assumed.
+"""The radius that a sphere's returns show by themselves: a test of the assumed one.
 
-Hides its estimate along the beams together with the centre. The scatter of residuals passes a ball
-of another size that is seen at the wrong range; this does not.
+The radius is estimated along the beams together with the centre. The scatter of residuals does not
+reveal a sphere of another size that is seen at a wrong range; this does.
 """
 
 from __future__ import annotations
@@ -10,43 +10,39 @@ from typing import NamedTuple
 
 import numpy as np
 
-from spheremark.pipelines.compilation import compiled
-from spheremark.pipelines.estimation.linear_algebra import inverse
-from spheremark.pipelines.model import Array, Beams
+from spheremark.pipelines.model import Array, Beams, Mask
 from spheremark.pipelines.sphere.linearisation import Linear, linearise
-from spheremark.pipelines.sphere.normal_equations import normals_of_spheres
-from spheremark.pipelines.sphere.returns import Rows, in_play, rows_of, rows_of_one
-from spheremark.pipelines.threads import side_by_side
+from spheremark.pipelines.sphere.normal_equations import inverses, sums_of_products
+from spheremark.pipelines.sphere.returns import Returns, may_be_sphere, of_markers, returns_of
 
-_ASKED = 1.0  # standard deviations of one step, beyond which the greatest likelihood is sought
-_BETTER, _BETTER_OWN = 9.0, 14.0  # by which it must be greater, as a chi-square; noise unknown
-_CLIP = 9.0  # squared standard deviations beyond which a residual is a stray
-_WEAK_PRIOR = 5.0  # radii: the same as the prior where it only keeps equations solvable
-_N_WORTH = 6  # spheres for which a second thread gains
+_ITERATED = 1.0  # standard deviations of one step, beyond which the steps are iterated
+_BETTER, _BETTER_OWN = 9.0, 14.0  # chi-square in favour of another radius; noise unknown
+_CLIP = 9.0  # squared standard deviations beyond which a residual is an outlier
+_WEAK_PRIOR = 5.0  # radii: sigma of a prior that only keeps equations solvable
 _N_STEPS = 8
-_SETTLED = 1e-4  # [m] of a step: what is asked is millimetres
+_SETTLED = 1e-4  # [m] of a step: radii are compared to millimetres
 _STEP_MAX = 0.25  # radii per step
-_PRIOR = 0.5  # radii: standard deviation of centre and radius that no return tells
-_MARGIN = 0.1  # radii by which a footprint may pass a sphere by and still be its own
-_START = 0.1  # radii by which a centre may be off per axis
-_SIGMA_MAX, _RADIUS_MAX = 0.4, 5.0  # radii: what is worse or larger is no answer
+_PRIOR = 0.5  # radii: prior standard deviation of centre and radius
+_MARGIN = 0.1  # radii by which a footprint may lie outside a sphere and still be its own
+_START = 0.1  # radii: standard deviation per axis of the first centre
+_SIGMA_MAX, _RADIUS_MAX = 0.4, 5.0  # radii: a larger sigma or radius is no answer
 _N_ROUNDS = 3
-_SPAN_MIN = 0.001  # [m] returns that lie in one place have no span
+_SPAN_MIN = 0.001  # [m] least radius that returns span
 _OUTERMOST = 1.2  # radii over the ninth tenth of the returns' distances from the middle
 _NORMAL = 1.4826  # standard deviation of a normal spread over its median of absolute values
 _SCATTER_MIN = 0.001  # [m] 2 mm quantisation alone gives as much
-_STRAY_SIGMAS = 4.0
+_OUTLIER_SIGMAS = 4.0
 _SIGMAS = 3.0  # by which a free radius may be off, and
 _SLACK = 0.006  # [m] by which it may whatever its sigma
 
 
-class Weighing(NamedTuple):
-    """What is known of the ranges of some returns.
+class Ranges(NamedTuple):
+    """Ranges of some returns with their noise.
 
     Attributes
     ----------
     ranges : (n,)
-        Measured ranges without the biases of their lasers [m].
+        Measured ranges, corrected for the laser biases [m].
     variances : (n,)
         Of their noise [m^2].
     weights : (n,)
@@ -59,220 +55,203 @@ class Weighing(NamedTuple):
 
 
 def free_radii(
-    rows: Rows, weighing: Weighing, spheres: Array, covs: Array, residuals: Array
+    returns: Returns, observed: Ranges, spheres: Array, covs: Array, residuals: Array
 ) -> tuple[Array, Array]:
-    """Return radii estimated together with the centres, and their standard deviations.
+    """Estimate radii together with the centres; return them with their standard deviations.
+
+    NaN where the returns do not determine a radius.
 
     Notes
     -----
-    One step of Gauss and Newton from the assumed radius (Rao's score): linear in the noise, so that
-    it is unbiased and its sigma holds if the assumption is true, however few returns there are.
-    The radius of greatest likelihood is not: small spheres look precise. The sigma is that of the
-    step by the noise alone (a sandwich). Where the greatest likelihood is so much greater that the
-    assumption must be wrong, its radius is the answer.
+    One Gauss-Newton step from the assumed radius (Rao's score): linear in the noise, so that it is
+    unbiased and its sigma holds if the assumption is true, however few returns there are. The
+    maximum-likelihood radius is not: small spheres look precise. The sigma is that of the step by
+    the noise alone (sandwich form). Where the likelihood of another radius is so much greater that
+    the assumption must be wrong, the maximum-likelihood radius is returned.
     """
-    radii, sigmas = np.empty(len(spheres)), np.empty(len(spheres))
-
-    def part(first: int, end: int) -> None:
-        _shown(rows, weighing, spheres, covs, residuals, (radii, sigmas, first, end))
-
-    side_by_side(part, len(spheres), worth=_N_WORTH)
-    return radii, sigmas
-
-
-@compiled
-def _shown(
-    rows: Rows,
-    weighing: Weighing,
-    spheres: Array,
-    covs: Array,
-    residuals: Array,
-    out: tuple[Array, Array, int, int],
-) -> None:
-    """Fill in radii and sigmas from one place among spheres to another."""
-    radii, sigmas, first, end = out
-    for m in range(first, end):
-        own = slice(rows.firsts[m], rows.firsts[m + 1])
-        told = Weighing(weighing.ranges[own], weighing.variances[own], weighing.weights[own])
-        radius, sigma = _shown_by_one(
-            rows_of_one(rows, m), told, spheres[m], covs[m], residuals[own]
-        )
-        radii[m], sigmas[m] = _known(radius, sigma, spheres[m, 3])
+    assumed = spheres[:, 3]
+    steps, prior_covs, sigmas = _score_steps(returns, observed, spheres, covs, residuals)
+    radii = assumed + steps[:, 3]
+    doubtful = np.flatnonzero(np.abs(steps[:, 3]) > _ITERATED * sigmas)
+    if len(doubtful):
+        some, rows = of_markers(returns, doubtful)
+        ranges = Ranges(*(column[rows] for column in observed))
+        limits = _STEP_MAX * assumed[doubtful, None]
+        started = spheres[doubtful] + np.clip(steps[doubtful], -limits, limits)
+        found, found_covs = _iterated(some, ranges, started, prior_covs[doubtful])
+        linear = linearise(some, found, covs[doubtful], ranges.weights > 0.0)
+        gains = _misfits(some, ranges, residuals[rows])
+        gains -= _misfits(some, ranges, ranges.ranges - linear.ranges)
+        better = gains > _BETTER
+        radii[doubtful[better]] = found[better, 3]
+        sigmas[doubtful[better]] = np.sqrt(found_covs[better, 3, 3])
+    return _determined(radii, sigmas, assumed)
 
 
-@compiled
-def _shown_by_one(
-    rows: Rows, weighing: Weighing, sphere: Array, cov: Array, residuals: Array
-) -> tuple[float, float]:
-    """Return radius and sigma of one sphere."""
-    step, known, sigma = _stepped(rows, weighing, sphere, cov, residuals)
-    radius = sphere[3] + step[3]
-    if abs(step[3]) > _ASKED * sigma:
-        limit = _STEP_MAX * sphere[3]
-        found, known = _free(rows, weighing, sphere + np.clip(step, -limit, limit), known)
-        linear = linearise(rows, found.reshape(1, 4), cov.reshape(1, 4, 4), weighing.weights > 0.0)
-        better = weighing.ranges - linear.ranges
-        if _misfit(weighing, residuals) - _misfit(weighing, better) > _BETTER:
-            radius, sigma = found[3], np.sqrt(known[3, 3])
-    return radius, sigma
+def _determined(radii: Array, sigmas: Array, assumed: Array) -> tuple[Array, Array]:
+    """Return radii and sigmas, NaN where the returns do not determine them."""
+    has_sigma = (sigmas > 0.0) & (sigmas < _SIGMA_MAX * assumed)
+    is_determined = has_sigma & (radii > 0.0) & (radii < _RADIUS_MAX * assumed)
+    return np.where(is_determined, radii, np.nan), np.where(is_determined, sigmas, np.nan)
 
 
-@compiled
-def _known(radius: float, sigma: float, assumed: float) -> tuple[float, float]:
-    """Return a radius with its sigma, NaN where these say that nothing is known."""
-    if sigma < _SIGMA_MAX * assumed and 0.0 < radius < _RADIUS_MAX * assumed:
-        return radius, sigma
-    return np.nan, np.nan
+def _prior(radii: Array, sigma: float) -> Array:
+    """Return the normal matrices, (m, 4, 4), of a prior with a sigma in radii."""
+    return np.eye(4) / (sigma * radii[:, None, None]) ** 2
 
 
-@compiled
-def _with_radius(cov: Array, variance: float) -> Array:
-    """Return the covariance of a centre as such of a sphere, with a variance of the radius."""
-    wide = np.zeros((4, 4))
-    wide[:3, :3] = cov[:3, :3]
-    wide[3, 3] = variance
+def _with_radius(covs: Array, variances: Array | float) -> Array:
+    """Return covariances of spheres, (m, 4, 4), from those of centres and variances of radii."""
+    wide = np.zeros((len(covs), 4, 4))
+    wide[:, :3, :3] = covs[:, :3, :3]
+    wide[:, 3, 3] = variances
     return wide
 
 
-@compiled
-def _stepped(
-    rows: Rows, weighing: Weighing, sphere: Array, cov: Array, residuals: Array
-) -> tuple[Array, Array, float]:
-    """Return a step of centre and radius, (4,), what is known of these, and sigma of the radius."""
-    weak = np.eye(4) / (_WEAK_PRIOR * sphere[3]) ** 2
-    known = _with_radius(cov, cov[0, 0] + cov[1, 1] + cov[2, 2])
-    N, _, _, _ = _summed(rows, weighing, sphere, known, residuals)
-    known = inverse(N + np.eye(4) / (_PRIOR * sphere[3]) ** 2)
-    N, pull, linear, per_square = _summed(rows, weighing, sphere, known, residuals)
-    by_pull = inverse(N + weak)
-    of_noise = per_square**2 * weighing.variances
-    spread = normals_of_spheres(rows, linear, residuals, of_noise, 4)[0][0]
-    variance = np.sum(by_pull[3] * np.sum(spread * by_pull[3], axis=1))
-    return np.sum(by_pull * pull, axis=1), known, np.sqrt(variance)
+def _score_steps(
+    returns: Returns, observed: Ranges, spheres: Array, covs: Array, residuals: Array
+) -> tuple[Array, Array, Array]:
+    """Return steps of centre and radius, (m, 4), their covariances, and sigmas of the radii."""
+    is_used, radii = observed.weights > 0.0, spheres[:, 3]
+    wide = _with_radius(covs, np.trace(covs[:, :3, :3], axis1=1, axis2=2))
+    linear = linearise(returns, spheres, wide, is_used)
+    N = _normals(returns, linear, residuals, _weights(observed, linear))
+    covs_free = inverses(N[:, :, :4] + _prior(radii, _PRIOR))
+    linear = linearise(returns, spheres, covs_free, is_used)
+    weights = _weights(observed, linear)
+    N = _normals(returns, linear, residuals, weights)
+    by_rhs = inverses(N[:, :, :4] + _prior(radii, _WEAK_PRIOR))
+    of_noise = _normals(returns, linear, residuals, weights**2 * observed.variances)
+    row = by_rhs[:, 3]
+    variances = np.einsum("mi,mij,mj->m", row, of_noise[:, :, :4], row)
+    steps = np.einsum("mij,mj->mi", by_rhs, N[:, :, 4])
+    return steps, covs_free, np.sqrt(np.maximum(variances, 0.0))
 
 
-@compiled
-def _summed(
-    rows: Rows, weighing: Weighing, sphere: Array, cov: Array, residuals: Array
-) -> tuple[Array, Array, Linear, Array]:
-    """Return normal equations of a sphere whose radius is free, and what they are summed from."""
-    is_in = weighing.weights > 0.0
-    linear = linearise(rows, sphere.reshape(1, 4), cov.reshape(1, 4, 4), is_in)
-    per_square = weighing.weights / (weighing.variances + linear.bends**2)
-    N, pull = normals_of_spheres(rows, linear, residuals, per_square, 4)
-    return N[0], pull[0], linear, per_square
+def _weights(observed: Ranges, linear: Linear) -> Array:
+    """Return weights over variances, those of the bends included [1/m^2]."""
+    return observed.weights / (observed.variances + linear.bends**2)
 
 
-@compiled
-def _misfit(weighing: Weighing, residuals: Array) -> float:
-    """Return the sum of squared residuals in units of the noise, strays counting as such."""
-    total = 0.0
-    for i in range(len(residuals)):
-        square = residuals[i] ** 2 / weighing.variances[i]
-        total += weighing.weights[i] * min(square, _CLIP)
-    return total
+def _normals(returns: Returns, linear: Linear, residuals: Array, weights: Array) -> Array:
+    """Return normal equations of centre and radius, (m, 4, 5), last the right-hand sides."""
+    columns = np.vstack([linear.J, residuals])
+    return sums_of_products(returns.starts, weights * linear.J, columns)
 
 
-@compiled
-def _free(rows: Rows, weighing: Weighing, sphere: Array, cov: Array) -> tuple[Array, Array]:
-    """Return the centre with radius, (4,), where steps settle, and the covariance of these."""
-    prior, limit = np.eye(4) / (_PRIOR * sphere[3]) ** 2, _STEP_MAX * sphere[3]
-    is_in = weighing.weights > 0.0
+def _misfits(returns: Returns, observed: Ranges, residuals: Array) -> Array:
+    """Return the sums of squared residuals in units of the noise, outliers clipped, (m,)."""
+    squares = observed.weights * np.minimum(residuals**2 / observed.variances, _CLIP)
+    return np.asarray(np.bincount(returns.markers, squares, len(returns.starts) - 1), np.float64)
+
+
+def _iterated(
+    returns: Returns, observed: Ranges, spheres: Array, covs: Array
+) -> tuple[Array, Array]:
+    """Return centres with radii, (m, 4), where Gauss-Newton steps settle, and covariances."""
+    spheres, covs = spheres.copy(), covs.copy()
+    prior, limits = _prior(spheres[:, 3], _PRIOR), _STEP_MAX * spheres[:, 3, None]
+    active = np.ones(len(spheres), dtype=np.bool_)
     for _ in range(_N_STEPS):
-        linear = linearise(rows, sphere.reshape(1, 4), cov.reshape(1, 4, 4), is_in)
-        per_square = weighing.weights / (weighing.variances + linear.bends**2)
-        N, pull = normals_of_spheres(rows, linear, weighing.ranges - linear.ranges, per_square, 4)
-        cov = inverse(N[0] + prior)
-        step = np.clip(np.sum(cov * pull[0], axis=1), -limit, limit)
-        sphere = sphere + step
-        if np.abs(step).max() < _SETTLED:
+        is_used = (observed.weights > 0.0) & active[returns.markers]
+        linear = linearise(returns, spheres, covs, is_used)
+        residuals = observed.ranges - linear.ranges
+        N = _normals(returns, linear, residuals, _weights(observed, linear))[active]
+        covs[active] = inverses(N[:, :, :4] + prior[active])
+        steps = np.einsum("mij,mj->mi", covs[active], N[:, :, 4])
+        steps = np.clip(steps, -limits[active], limits[active])
+        spheres[active] += steps
+        active[active] = np.abs(steps).max(axis=1) >= _SETTLED
+        if not active.any():
             break
-    return sphere, cov
+    return spheres, covs
 
 
-def own_radius(shots: Beams, radius: float, up: Array) -> tuple[float, float]:
+def own_radius(pulses: Beams, radius: float, up: Array) -> tuple[float, float]:
     """Return the radius that one sphere's returns show, all with the same noise, and its sigma.
 
     Notes
     -----
-    A centre is fitted with the radius that is assumed, then one step is made from it. Where that
-    says that another radius is true, it starts again with the sphere that the returns span: from a
-    smaller one the beams at the outline would be taken for such that pass by. The noise is that of
-    the residuals, and what is off by more than some sigmas has no weight: both are found again each
-    round.
+    The centre is fitted with the assumed radius, then one step is made from it. Where that suggests
+    another radius, the fit starts again with the sphere that the returns span: from a smaller one
+    the beams at the limb would be taken for ones that miss. Noise and outliers are found from the
+    residuals, again in each round.
     """
-    n = len(shots.ranges)
+    n = len(pulses.ranges)
     nothing = np.zeros(n, dtype=np.intp)
-    rows = rows_of(shots, np.array([0, n]), up, nothing, (nothing, np.ones(n), 0.0))
-    spanned = _spanned(shots)
-    weighing, residuals, sphere, cov = _fitted(rows, spanned, radius)
-    step, _, sigma = _stepped(rows, weighing, sphere, cov, residuals)
-    radius_free = radius + step[3]
-    if abs(step[3]) > _ASKED * sigma:
-        own, known, gain = _own_spanned(rows, spanned, sphere)
+    returns = returns_of(pulses, np.array([0, n]), up, nothing, (nothing, np.ones(n), 0.0))
+    spanned = _spanned(pulses)
+    observed, residuals, sphere, cov = _with_assumed(returns, spanned, radius)
+    steps, _, sigmas = _score_steps(returns, observed, sphere, cov, residuals)
+    found = radius + steps[:, 3]
+    if abs(steps[0, 3]) > _ITERATED * sigmas[0]:
+        own, known, gain = _most_likely(returns, spanned, sphere)
         if gain > _BETTER_OWN:
-            radius_free, sigma = own[3], np.sqrt(known[3, 3])
-    found: tuple[float, float] = _known(radius_free, sigma, radius)
-    return found
+            found, sigmas = own[:, 3], np.sqrt(known[:, 3, 3])
+    radii, sigmas = _determined(found, sigmas, sphere[:, 3])
+    return float(radii[0]), float(sigmas[0])
 
 
-def _fitted(rows: Rows, spanned: Array, radius: float) -> tuple[Weighing, Array, Array, Array]:
-    """Return weights, residuals, the best sphere of a known radius, and its covariance."""
-    axis = rows.directions.mean(axis=1)
+def _with_assumed(
+    returns: Returns, spanned: Array, radius: float
+) -> tuple[Ranges, Array, Array, Array]:
+    """Return ranges, residuals, the best sphere of the assumed radius, and its covariance."""
+    axis = returns.directions.mean(axis=1)
     shift = 2.0 / 3.0 * (radius - spanned[3]) / float(np.linalg.norm(axis))
-    sphere = np.array([*(spanned[:3] + shift * axis), radius])
-    cov = _with_radius((_START * radius) ** 2 * np.eye(3), 0.0)
+    sphere = np.array([[*(spanned[:3] + shift * axis), radius]])
+    cov = _with_radius((_START * radius) ** 2 * np.eye(3)[None], 0.0)
+    limit = _STEP_MAX * radius
     for _ in range(_N_STEPS):
-        linear = linearise(rows, sphere[None], cov[None])
-        weighing, residuals = _gated(rows, linear, radius)
-        per_square = weighing.weights / (weighing.variances + linear.bends**2)
-        N, pull = normals_of_spheres(rows, linear, residuals, per_square, 3)
-        known = inverse(N[0] + np.eye(3) / (_PRIOR * radius) ** 2)
-        limit = _STEP_MAX * radius
-        sphere[:3] += np.clip(known @ pull[0], -limit, limit)
-        cov = _with_radius(known, 0.0)
-    return *_gated(rows, linearise(rows, sphere[None], cov[None]), radius), sphere, cov
+        linear = linearise(returns, sphere, cov)
+        observed, residuals = _gated(returns, linear, radius)
+        N = _normals(returns, linear, residuals, _weights(observed, linear))[0, :3]
+        known = inverses(N[:, :3] + np.eye(3) / (_PRIOR * radius) ** 2)
+        sphere[0, :3] += np.clip(known @ N[:, 4], -limit, limit)
+        cov = _with_radius(known[None], 0.0)
+    return *_gated(returns, linearise(returns, sphere, cov), radius), sphere, cov
 
 
-def _gated(rows: Rows, linear: Linear, radius: float) -> tuple[Weighing, Array]:
-    """Return the weights of what lies on a sphere and not on its pole, and residuals."""
-    residuals = rows.ranges - linear.ranges
-    is_in = in_play(rows, linear.offsets, np.array([_MARGIN * radius]), radius)
+def _gated(returns: Returns, linear: Linear, radius: float) -> tuple[Ranges, Array]:
+    """Return ranges weighted 1 on a sphere and 0 off it or on its pole, and residuals."""
+    residuals = returns.ranges - linear.ranges
+    is_in = may_be_sphere(returns, linear.offsets, np.array([_MARGIN * radius]), radius)
     sigma = _scatter(residuals[is_in])
-    is_in &= np.abs(residuals) < _STRAY_SIGMAS * sigma
-    variance = sigma**2 * is_in.sum() / max(is_in.sum() - 4.0, 1.0)
+    is_in &= np.abs(residuals) < _OUTLIER_SIGMAS * sigma
+    n = int(is_in.sum())
+    variance = sigma**2 * max(n, 1) / max(n - 4, 1)
     variances, weights = np.full(len(is_in), variance), is_in.astype(np.float64)
-    return Weighing(rows.ranges.copy(), variances, weights), residuals
+    return Ranges(returns.ranges, variances, weights), residuals
 
 
-def _own_spanned(rows: Rows, own: Array, assumed: Array) -> tuple[Array, Array, float]:
-    """Return the sphere of greatest likelihood and its covariance, from that which returns span.
+def _most_likely(returns: Returns, spanned: Array, assumed: Array) -> tuple[Array, Array, float]:
+    """Return the maximum-likelihood sphere, its covariance, and its gain over the assumed one.
 
-    And by how much it explains them better than one of the assumed radius, as a chi-square: the
-    noise is not known.
+    The gain is a chi-square for an unknown noise.
     """
-    known = (_START * own[3]) ** 2 * np.eye(4)
+    own, known = spanned[None], (_START * spanned[3]) ** 2 * np.eye(4)[None]
     for _ in range(_N_ROUNDS):
-        weighing = _gated(rows, linearise(rows, own[None], known[None]), float(own[3]))[0]
-        own, known = _free(rows, weighing, own, known)
-        own[3] = np.clip(own[3], _SPAN_MIN, 2.0 * _RADIUS_MAX * assumed[3])
-    linear = linearise(rows, own[None], known[None])
-    weighing, residuals = _gated(rows, linear, float(own[3]))
-    same = linearise(rows, assumed[None], _with_radius(known, 0.0)[None])
-    others = rows.ranges - same.ranges
-    is_in, limit = weighing.weights > 0.0, _STRAY_SIGMAS**2 * weighing.variances
-    least = max(int(is_in.sum()), 1) * _SCATTER_MIN**2
-    worse, better = (
-        max(float(np.minimum(off**2, limit)[is_in].sum()), least) for off in (others, residuals)
-    )
+        observed = _gated(returns, linearise(returns, own, known), float(own[0, 3]))[0]
+        own, known = _iterated(returns, observed, own, known)
+        own[0, 3] = np.clip(own[0, 3], _SPAN_MIN, 2.0 * _RADIUS_MAX * assumed[0, 3])
+    observed, residuals = _gated(returns, linearise(returns, own, known), float(own[0, 3]))
+    same = linearise(returns, assumed, _with_radius(known, 0.0))
+    is_in, limits = observed.weights > 0.0, _OUTLIER_SIGMAS**2 * observed.variances
+    worse = _sum_clipped(returns.ranges - same.ranges, limits, is_in)
+    better = _sum_clipped(residuals, limits, is_in)
     return own, known, max(int(is_in.sum()) - 4, 0) * float(np.log(worse / better))
 
 
-def _spanned(shots: Beams) -> Array:
+def _sum_clipped(residuals: Array, limits: Array, is_in: Mask) -> float:
+    """Return the sum of squares up to limits; at least that of the least scatter."""
+    least = max(int(is_in.sum()), 1) * _SCATTER_MIN**2
+    return max(float(np.minimum(residuals**2, limits)[is_in].sum()), least)
+
+
+def _spanned(pulses: Beams) -> Array:
     """Return the centre and radius, (4,), of a sphere that spans returns across the beam."""
-    axis = shots.directions_base.mean(axis=0)
+    axis = pulses.directions_base.mean(axis=0)
     axis /= np.linalg.norm(axis)
-    p = shots.origins_base + shots.ranges[:, None] * shots.directions_base
+    p = pulses.origins_base + pulses.ranges[:, None] * pulses.directions_base
     middle = np.median(p, axis=0)
     v = p - middle
     beside = np.linalg.norm(v - (v @ axis)[:, None] * axis, axis=1)
@@ -289,7 +268,7 @@ def _scatter(residuals: Array) -> float:
 
 
 def other_radius(radius: float, radius_free: float, sigma: float) -> list[str]:
-    """Say whether returns show a sphere of another radius."""
+    """Return the reason, if any, to call a fit weak: its returns show another radius."""
     if abs(radius_free - radius) > max(_SIGMAS * sigma, _SLACK):
         return [f"its own radius is {1e3 * radius_free:.0f} mm"]
     return []

@@ -10,7 +10,7 @@ from spheremark.pipelines.accuracy import marker_errors
 from spheremark.pipelines.config import SurveyConfig
 from spheremark.pipelines.geometry import rot_z
 from spheremark.pipelines.simulation import SimulationConfig, scenario, simulate_stop
-from spheremark.pipelines.sphere.faces import N_MOUNTING, effects_on, sigmas_of
+from spheremark.pipelines.sphere.mounting import N_MOUNTING, effects_on, sigmas_of
 from spheremark.pipelines.survey import process
 
 CONFIG = SurveyConfig.from_mapping({"fitting": {"methods": ["along_beam"]}})
