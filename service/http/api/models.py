@@ -1,4 +1,4 @@
-"""The wire format: what requests carry and responses answer. Units are in the names."""
+"""The wire format: requests and responses. Units are in the names."""
 
 from __future__ import annotations
 
@@ -17,13 +17,14 @@ from spheremark.storage.catalogue.records import (
     RunRecord,
     SurveyRecord,
 )
+from spheremark.storage.recordings.preflight import Preflight
 
 Item = TypeVar("Item")
 SurveyKey = str  # id or name
 
 
 class Strict(BaseModel):
-    """A request body: a field that nobody knows is an error, not a wish."""
+    """A request: an unknown field is an error."""
 
     model_config = ConfigDict(extra="forbid")
 
@@ -39,7 +40,7 @@ class NewSurvey(Strict):
     """A survey to create."""
 
     name: str = Field(min_length=1, max_length=200, description="Unique name.")
-    tolerance_m: float = Field(default=0.03, gt=0, le=1, description="Error that it accepts [m].")
+    tolerance_m: float = Field(default=0.03, gt=0, le=1, description="Accepted error [m].")
 
 
 class Survey(BaseModel):
@@ -49,7 +50,7 @@ class Survey(BaseModel):
     name: str
     tolerance_m: float
     created_at: datetime
-    rig_digest: str | None = Field(description="Rig that its jobs use where they name none.")
+    rig_digest: str | None = Field(description="Rig of its jobs that name none.")
     n_control_marks: int
     n_true_stops: int
     n_recordings: int
@@ -112,7 +113,7 @@ class ChosenRig(Strict):
 
 
 class StoredRig(BaseModel):
-    """A rig that is kept."""
+    """A stored rig."""
 
     rig_digest: str
     rig: dict[str, Any] = Field(description="As in a rig file.")
@@ -124,7 +125,7 @@ class StoredRig(BaseModel):
 
 
 class TruthSummary(BaseModel):
-    """What is known of the truth of a survey; for comparison only."""
+    """Extent of the truth of a survey; for comparison only."""
 
     n_marks: int
     n_stops: int
@@ -140,7 +141,7 @@ class Recording(BaseModel):
     size_bytes: int
     uploaded_at: datetime
     verdict: Literal["ok", "weak", "refused"]
-    preflight: dict[str, Any] = Field(description="What the log holds and lacks, with reasons.")
+    preflight: Preflight = Field(description="What the log holds and lacks, with reasons.")
 
     @classmethod
     def of(cls, record: RecordingRecord) -> Self:
@@ -149,7 +150,7 @@ class Recording(BaseModel):
 
 
 class NewJob(Strict):
-    """Work to do."""
+    """A job to start."""
 
     kind: JobKind = JobKind.PROCESS
     survey: SurveyKey = Field(description="Id or name of the survey.")
@@ -170,9 +171,7 @@ class NewJob(Strict):
         default_factory=dict,
         description="What differs from the default configuration, nested as GET /config shows it.",
     )
-    options: dict[str, Any] = Field(
-        default_factory=dict, description="What the kind lets one choose."
-    )
+    options: dict[str, Any] = Field(default_factory=dict, description="Options of the kind.")
 
     @model_validator(mode="after")
     def _check_logs(self) -> Self:
@@ -189,7 +188,7 @@ class NewJob(Strict):
 
 
 class Job(BaseModel):
-    """Work that was asked for, and where it stands."""
+    """A job and its state."""
 
     model_config = ConfigDict(from_attributes=True)
 
@@ -220,7 +219,7 @@ class Job(BaseModel):
 class Upload(Recording):
     """An uploaded log and the job that reads it."""
 
-    job: Job | None = Field(default=None, description="The job, where process=true asked for one.")
+    job: Job | None = Field(default=None, description="The job, where process=true was set.")
 
 
 class Run(BaseModel):
@@ -256,18 +255,6 @@ class Run(BaseModel):
         )
 
 
-class Row(BaseModel):
-    """One row of a table of the database, columns as they are named and documented there."""
-
-    model_config = ConfigDict(extra="allow")
-
-    run_id: str
-    survey: str
-    stop: str
-    fit_method: str
-    status: str
-
-
 class ProblemKind(BaseModel):
     """A kind of problem."""
 
@@ -277,14 +264,14 @@ class ProblemKind(BaseModel):
 
 
 class Query(Strict):
-    """A question in SQL."""
+    """A query in SQL."""
 
     sql: str = Field(min_length=1, max_length=100_000, description="One SELECT.")
-    format: Literal["json", "csv"] = Field(default="json", description="Shape of the answer.")
+    format: Literal["json", "csv"] = Field(default="json", description="Format of the response.")
 
 
 class Column(BaseModel):
-    """A column of an answer."""
+    """A column of a query result."""
 
     model_config = ConfigDict(from_attributes=True)
 
@@ -294,13 +281,13 @@ class Column(BaseModel):
 
 
 class DescribedColumn(Column):
-    """A column that can be asked for."""
+    """A column of a table or view."""
 
     comment: str
 
 
 class Table(BaseModel):
-    """A table or view that can be asked."""
+    """A table or view."""
 
     model_config = ConfigDict(from_attributes=True)
 
@@ -310,12 +297,12 @@ class Table(BaseModel):
     columns: list[DescribedColumn]
 
 
-class Answer(BaseModel):
-    """The answer to a question in SQL."""
+class QueryResponse(BaseModel):
+    """The result of a query in SQL."""
 
     columns: list[Column]
     rows: list[list[Any]]
     truncated: bool = Field(description="Whether rows are missing because of the row limit.")
     row_limit: int
     elapsed_ms: float
-    snapshot_at: datetime = Field(description="Results committed later are not in the answer.")
+    snapshot_at: datetime = Field(description="Results committed later are not included.")

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 from fastapi import APIRouter
 
 from spheremark.pipelines.config import SurveyConfig
@@ -16,7 +14,7 @@ router = APIRouter(tags=["about"])
 
 @router.get("/problems", name="list_problems")
 def list_problems() -> Listing[ProblemKind]:
-    """List the kinds of problems that an answer may name."""
+    """List the kinds of problems that a response may name."""
     return Listing(items=_kinds())
 
 
@@ -30,9 +28,9 @@ def get_problem(code: str) -> ProblemKind:
 
 
 @router.get("/config", name="get_config")
-def get_config() -> dict[str, Any]:
-    """Return the default configuration of a job: every scientific knob."""
-    return SurveyConfig().to_mapping()
+def get_config() -> SurveyConfig:
+    """Return the default configuration of a job: every scientific parameter."""
+    return SurveyConfig()
 
 
 def _kinds() -> list[ProblemKind]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import asyncio
-from typing import Annotated, Any
+from typing import Annotated
 
 from fastapi import APIRouter, Path, Query, Request, Response
 from fastapi.responses import FileResponse
@@ -16,6 +16,7 @@ from spheremark.service.http.api.surveys import After, Limit
 from spheremark.service.http.state import Current, Service
 from spheremark.service.http.uploads import take_in
 from spheremark.storage.catalogue.records import RecordingRecord
+from spheremark.storage.recordings.preflight import Preflight
 
 router = APIRouter(prefix="/recordings", tags=["recordings"])
 
@@ -77,12 +78,17 @@ def get_recording(recording: Digest, service: Current) -> Recording:
 
 
 @router.get("/{recording}/preflight", name="get_preflight")
-def get_preflight(recording: Digest, service: Current) -> dict[str, Any]:
+def get_preflight(recording: Digest, service: Current) -> Preflight:
     """Return what a log holds and lacks."""
-    return dict(service.catalogue.get_recording(recording).preflight)
+    return Recording.of(service.catalogue.get_recording(recording)).preflight
 
 
-@router.get("/{recording}/file", name="download_recording", response_class=FileResponse)
+@router.get(
+    "/{recording}/file",
+    name="download_recording",
+    response_class=FileResponse,
+    responses={200: {"content": {MCAP: {}}}},
+)
 def download_recording(recording: Digest, service: Current) -> FileResponse:
     """Return the bytes of a log, as they were uploaded."""
     known = service.catalogue.get_recording(recording)

@@ -1,17 +1,18 @@
-"""Routes of results: runs, sphere centres and stations, as rows of the database."""
+"""Routes of results as rows of the database: runs, centres, stations, networks, calibrations."""
 
 from __future__ import annotations
 
-from typing import Annotated
+from typing import Annotated, Any
 
-from fastapi import APIRouter, Path, Query
+from fastapi import APIRouter, Path, Query, Response
 from pydantic import Field
 
-from spheremark.pipelines.errors import NotFoundError
-from spheremark.service.http.api.models import Listing, Row, Run, Strict
+from spheremark.service.http.api import rows
+from spheremark.service.http.api.models import Listing, Run, Strict
+from spheremark.service.http.api.rows import FileName, Plain, ResultFilter, listing_of
 from spheremark.service.http.state import Current, Service
 
-router = APIRouter(tags=["results"])
+router = APIRouter()
 
 _FILTERS = """
 WHERE ($survey::VARCHAR IS NULL OR s.survey_id = $survey OR s.name = $survey)
@@ -55,11 +56,41 @@ SELECT * FROM observations WHERE concat_ws('~', run_id, stop, fit_method, resect
 ORDER BY marker
 """
 
+_RESULTS = """
+SELECT s.name AS survey, x.* FROM {table} AS x JOIN surveys AS s USING (survey_id)
+WHERE ($survey::VARCHAR IS NULL OR s.survey_id = $survey)
+ORDER BY x.finished_at DESC, x.{key} LIMIT $n OFFSET $after
+"""
+_RESULT = """
+SELECT s.name AS survey, x.* FROM {table} AS x JOIN surveys AS s USING (survey_id)
+WHERE x.{key} = $id
+"""
+_ADJUSTMENT = {"table": "adjustments", "key": "adjustment_id"}
+_CALIBRATION = {"table": "calibrations", "key": "calibration_id"}
+_ADJUSTMENT_PARTS = {
+    "stations": "SELECT * FROM adjusted_stations WHERE adjustment_id = $id ORDER BY station",
+    "marks": "SELECT * FROM adjusted_marks WHERE adjustment_id = $id ORDER BY mark",
+    "control_checks": "SELECT * FROM control_checks WHERE adjustment_id = $id ORDER BY mark",
+    "repeated_stops": "SELECT * FROM repeated_stops WHERE adjustment_id = $id ORDER BY ALL",
+    "refused": "SELECT * FROM refused_stations WHERE adjustment_id = $id ORDER BY station",
+}
+_CALIBRATION_PARTS = {
+    "values": "SELECT * FROM calibrated_parameters WHERE calibration_id = $id ORDER BY place",
+    "gaps": """
+        SELECT * FROM calibration_gaps WHERE calibration_id = $id ORDER BY is_after, stop, marker
+    """,
+}
+
 RowId = Annotated[str, Path(description="Id of the row, as the list gives it.")]
+AdjustmentId = Annotated[str, Path(description="Id of the adjustment.")]
+CalibrationId = Annotated[str, Path(description="Id of the calibration.")]
+_FILE: dict[int | str, dict[str, Any]] = {
+    200: {"content": {"application/octet-stream": {}}, "description": "The file."}
+}
 
 
 class RowFilter(Strict):
-    """Which rows of a list of results are wanted."""
+    """Which rows of a list of results are requested."""
 
     survey: str | None = Field(default=None, description="Id or name of a survey.")
     run: str | None = Field(default=None, description="Id of a run, even if a newer one exists.")
@@ -72,7 +103,7 @@ class RowFilter(Strict):
 
 
 class RunFilter(Strict):
-    """Which runs are wanted."""
+    """Which runs are requested."""
 
     survey: str | None = Field(default=None, description="Id or name of a survey.")
     recording: str | None = Field(default=None, description="Id of a recording.")
@@ -81,66 +112,141 @@ class RunFilter(Strict):
     limit: int = Field(default=100, ge=1, le=1000, description="Items in one part.")
 
 
-@router.get("/runs", name="list_runs")
-def list_runs(wanted: Annotated[RunFilter, Query()], service: Current) -> Listing[Run]:
+@router.get("/runs", name="list_runs", tags=["results"])
+def list_runs(chosen: Annotated[RunFilter, Query()], service: Current) -> Listing[Run]:
     """List runs, newest first."""
     page = service.catalogue.list_runs(
-        survey=wanted.survey,
-        recording_id=wanted.recording,
-        job_id=wanted.job,
-        after=wanted.after,
-        limit=wanted.limit,
+        survey=chosen.survey,
+        recording_id=chosen.recording,
+        job_id=chosen.job,
+        after=chosen.after,
+        limit=chosen.limit,
     )
     return Listing(items=[Run.of(record) for record in page.items], next=page.next)
 
 
-@router.get("/runs/{run}", name="get_run")
+@router.get("/runs/{run}", name="get_run", tags=["results"])
 def get_run(run: Annotated[str, Path(description="Id of the run.")], service: Current) -> Run:
     """Return a run."""
     return Run.of(service.catalogue.get_run(run))
 
 
-@router.get("/marker-fits", name="list_marker_fits")
-def list_marker_fits(wanted: Annotated[RowFilter, Query()], service: Current) -> Listing[Row]:
+@router.get(
+    "/marker-fits",
+    name="list_marker_fits",
+    tags=["results"],
+    response_model=listing_of(rows.MarkerFit),
+)
+def list_marker_fits(chosen: Annotated[RowFilter, Query()], service: Current) -> Plain:
     """List sphere centres in the station frame: one per stop, marker and fitting method."""
-    return _list(service, _FITS, wanted)
+    return rows.listed(service, _FITS, chosen.model_dump())
 
 
-@router.get("/marker-fits/{row:path}", name="get_marker_fit")
-def get_marker_fit(row: RowId, service: Current) -> Row:
+@router.get(
+    "/marker-fits/{row:path}",
+    name="get_marker_fit",
+    tags=["results"],
+    response_model=rows.MarkerFit,
+)
+def get_marker_fit(row: RowId, service: Current) -> Plain:
     """Return one sphere centre."""
-    return _one(service, _FIT, row, "marker fit")
+    return rows.one_of(service, _FIT, row, "marker fit")
 
 
-@router.get("/station-fixes", name="list_station_fixes")
-def list_station_fixes(wanted: Annotated[RowFilter, Query()], service: Current) -> Listing[Row]:
+@router.get(
+    "/station-fixes",
+    name="list_station_fixes",
+    tags=["results"],
+    response_model=listing_of(rows.StationFix),
+)
+def list_station_fixes(chosen: Annotated[RowFilter, Query()], service: Current) -> Plain:
     """List stations in the site frame: one per stop, fitting and resection method."""
-    return _list(service, _FIXES, wanted)
+    return rows.listed(service, _FIXES, chosen.model_dump())
 
 
-@router.get("/station-fixes/{row:path}", name="get_station_fix")
-def get_station_fix(row: RowId, service: Current) -> Row:
+@router.get(
+    "/station-fixes/{row:path}",
+    name="get_station_fix",
+    tags=["results"],
+    response_model=rows.StationFixDetail,
+)
+def get_station_fix(row: RowId, service: Current) -> Plain:
     """Return one station with its observations: residuals, redundancy, reliability."""
-    fix = _one(service, _FIX, row, "station fix")
-    observations = service.catalogue.rows(_OBSERVATIONS, {"id": row})
-    return Row.model_validate(fix.model_dump() | {"observations": observations})
+    fix = rows.one_of(service, _FIX, row, "station fix")
+    return fix | {"observations": service.catalogue.rows(_OBSERVATIONS, {"id": row})}
 
 
-def _list(service: Service, sql: str, wanted: RowFilter) -> Listing[Row]:
-    """Return a part of the rows that are wanted."""
-    rows = service.catalogue.rows(
-        sql, wanted.model_dump(exclude={"limit"}) | {"n": wanted.limit + 1}
-    )
-    end = wanted.after + wanted.limit
-    return Listing(
-        items=[Row.model_validate(row) for row in rows[: wanted.limit]],
-        next=str(end) if len(rows) > wanted.limit else None,
-    )
+@router.get(
+    "/adjustments",
+    name="list_adjustments",
+    tags=["adjustments"],
+    response_model=listing_of(rows.Adjustment),
+)
+def list_adjustments(chosen: Annotated[ResultFilter, Query()], service: Current) -> Plain:
+    """List adjusted networks, newest first."""
+    return _results(service, _ADJUSTMENT, chosen)
 
 
-def _one(service: Service, sql: str, row: str, what: str) -> Row:
-    """Return the row with an id."""
-    rows = service.catalogue.rows(sql, {"id": row})
-    if not rows:
-        raise NotFoundError(f"There is no {what} {row!r}.")
-    return Row.model_validate(rows[0])
+@router.get(
+    "/adjustments/{adjustment}",
+    name="get_adjustment",
+    tags=["adjustments"],
+    response_model=rows.AdjustmentDetail,
+)
+def get_adjustment(adjustment: AdjustmentId, service: Current) -> Plain:
+    """Return a network with its stations, marks, and control marks left out in turn."""
+    row = rows.one_of(service, _RESULT.format(**_ADJUSTMENT), adjustment, "adjustment")
+    return rows.detailed(service, row, _ADJUSTMENT_PARTS, adjustment)
+
+
+@router.get(
+    "/adjustments/{adjustment}/files/{name}",
+    name="download_adjustment",
+    tags=["adjustments"],
+    response_class=Response,
+    responses=_FILE,
+)
+def download_adjustment(adjustment: AdjustmentId, name: FileName, service: Current) -> Response:
+    """Return a network as a file: JSON, report, CSV or GNU Gama XML."""
+    return rows.document(service, adjustment, name)
+
+
+@router.get(
+    "/calibrations",
+    name="list_calibrations",
+    tags=["calibrations"],
+    response_model=listing_of(rows.Calibration),
+)
+def list_calibrations(chosen: Annotated[ResultFilter, Query()], service: Current) -> Plain:
+    """List calibrations, newest first."""
+    return _results(service, _CALIBRATION, chosen)
+
+
+@router.get(
+    "/calibrations/{calibration}",
+    name="get_calibration",
+    tags=["calibrations"],
+    response_model=rows.CalibrationDetail,
+)
+def get_calibration(calibration: CalibrationId, service: Current) -> Plain:
+    """Return a calibration with each parameter before and after, and the gaps of the faces."""
+    row = rows.one_of(service, _RESULT.format(**_CALIBRATION), calibration, "calibration")
+    return rows.detailed(service, row, _CALIBRATION_PARTS, calibration)
+
+
+@router.get(
+    "/calibrations/{calibration}/files/{name}",
+    name="download_calibration",
+    tags=["calibrations"],
+    response_class=Response,
+    responses=_FILE,
+)
+def download_calibration(calibration: CalibrationId, name: FileName, service: Current) -> Response:
+    """Return a calibration as a file: JSON, or the rig alone."""
+    return rows.document(service, calibration, name)
+
+
+def _results(service: Service, table: dict[str, str], chosen: ResultFilter) -> Plain:
+    """Return a part of the results over a whole survey."""
+    survey = chosen.survey and service.catalogue.get_survey(chosen.survey).survey_id
+    return rows.listed(service, _RESULTS.format(**table), chosen.model_dump() | {"survey": survey})

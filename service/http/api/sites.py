@@ -86,7 +86,12 @@ def products_of(service: Service, survey: str) -> list[Product]:
     ]
 
 
-@router.get("/products/{product}/{kind}", name="download_product", response_class=StreamingResponse)
+@router.get(
+    "/products/{product}/{kind}",
+    name="download_product",
+    response_class=StreamingResponse,
+    responses={200: {"content": {one: {} for one in MEDIA_TYPES.values()}}},
+)
 def download_product(product: ProductId, kind: ProductKind, service: Current) -> StreamingResponse:
     """Return a file, to be saved."""
     rows = service.catalogue.rows(_FILE, {"id": product, "kind": kind.value})

@@ -8,7 +8,7 @@ from fastapi import APIRouter, Request, Response
 from fastapi import Query as QueryParameter
 from fastapi.responses import FileResponse, PlainTextResponse
 
-from spheremark.service.http.api.models import Answer, Listing, Query, Table
+from spheremark.service.http.api.models import Listing, Query, QueryResponse, Table
 from spheremark.service.http.state import Current, Service
 from spheremark.service.serialise.queries import serialise_query
 from spheremark.storage.catalogue.coordinates import coordinates_csv
@@ -18,7 +18,10 @@ router = APIRouter(tags=["sql"])
 
 
 @router.post(
-    "/sql", name="query", response_model=Answer, responses={200: {"content": {"text/csv": {}}}}
+    "/sql",
+    name="query",
+    response_model=QueryResponse,
+    responses={200: {"content": {"text/csv": {}}}},
 )
 def query(body: Query, request: Request, service: Current) -> Any:
     """Run one SELECT on a snapshot of the database, as JSON or CSV, within announced limits."""
@@ -28,7 +31,7 @@ def query(body: Query, request: Request, service: Current) -> Any:
 @router.get(
     "/sql",
     name="query_by_link",
-    response_model=Answer,
+    response_model=QueryResponse,
     responses={200: {"content": {"text/csv": {}}}},
 )
 def query_by_link(
@@ -46,7 +49,12 @@ def get_schema(service: Current) -> Listing[Table]:
     return Listing(items=[Table.model_validate(table) for table in service.catalogue.schema()])
 
 
-@router.get("/export/results.duckdb", name="export_database", response_class=FileResponse)
+@router.get(
+    "/export/results.duckdb",
+    name="export_database",
+    response_class=FileResponse,
+    responses={200: {"content": {"application/vnd.duckdb": {}}}},
+)
 def export_database(service: Current) -> FileResponse:
     """Return a consistent copy of the database, for one's own DuckDB."""
     return FileResponse(
@@ -56,7 +64,12 @@ def export_database(service: Current) -> FileResponse:
     )
 
 
-@router.get("/export/coordinates.csv", name="export_coordinates")
+@router.get(
+    "/export/coordinates.csv",
+    name="export_coordinates",
+    response_class=Response,
+    responses={200: {"content": {"text/csv": {}}}},
+)
 def export_coordinates(
     service: Current,
     survey: Annotated[str | None, QueryParameter(description="Id or name of a survey.")] = None,
@@ -65,13 +78,13 @@ def export_coordinates(
     return Response(coordinates_csv(service.catalogue, survey), media_type="text/csv")
 
 
-def _run(service: Service, request: Query, accept: str) -> Answer | Response:
+def _run(service: Service, request: Query, accept: str) -> QueryResponse | Response:
     """Run a query on a snapshot; return CSV where the body or the Accept header requests it."""
     limits, snapshot = service.settings.query_limits, service.catalogue.snapshot()
     result = run_query(snapshot, request.sql, limits)
     if request.format == "csv" or accept.startswith("text/csv"):
         return _csv(result, limits.rows)
-    return Answer.model_validate(serialise_query(result, limits, snapshot))
+    return QueryResponse.model_validate(serialise_query(result, limits, snapshot))
 
 
 def _csv(result: QueryResult, row_limit: int) -> Response:

@@ -97,13 +97,18 @@ def put_control(survey: Key, file: File, service: Current) -> Control:
     return Control.of(service.catalogue.control_marks(survey))
 
 
-@router.get("/{survey}/control", name="get_control")
-def get_control(survey: Key, request: Request, service: Current) -> Response:
-    """Return the control marks of a survey, as JSON, or as CSV where text/csv is asked for."""
+@router.get(
+    "/{survey}/control",
+    name="get_control",
+    response_model=Control,
+    responses={200: {"content": {"text/csv": {}}}},
+)
+def get_control(survey: Key, request: Request, service: Current) -> Response | Control:
+    """Return the control marks of a survey as JSON, or as CSV where the request accepts it."""
     marks = service.catalogue.control_marks(survey)
     if "text/csv" in request.headers.get("accept", "") and marks is not None:
         return PlainTextResponse(format_control(marks), media_type="text/csv")
-    return Response(Control.of(marks).model_dump_json(), media_type="application/json")
+    return Control.of(marks)
 
 
 @router.put("/{survey}/rig", name="choose_rig")
