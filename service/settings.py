@@ -73,7 +73,7 @@ class Settings(BaseSettings):
         default=10_000,
         ge=1,
         le=1_000_000,
-        description="Rows after which a result is cut, and says so.",
+        description="Rows after which a result is truncated.",
     )
     sql_memory_bytes: int = Field(
         default=512 << 20, ge=64 << 20, description="Memory that one query may use [bytes]."

@@ -71,7 +71,7 @@ def site(
         err.print("[bold red]Error:[/] name at least one of --laz, --e57 and --geotiff.")
         raise typer.Exit(2)
     options = {"cell_m": cell_m, "ground_range_m": ground_range_m, "gap_m": gap_m}
-    wish = sites.SiteWish(
+    request = sites.SiteRequest(
         targets=targets,
         elevation=sites.elevation_of(options),
         range_max=range_m,
@@ -83,24 +83,24 @@ def site(
         {"marker_radius": radius_m, "fitting": {"methods": ["along_beam"]}}
     )
     marks = read_control(control, control_axes, control_unit, target_height_m)
-    with progress() as told:
+    with progress() as track:
         made, network = sites.of_logs(
-            logs, marks, site_files.read_rig(rig) if rig else None, config, wish, told
+            logs, marks, site_files.read_rig(rig) if rig else None, config, request, track
         )
-    answer = sites.site_answer(made, wish, network)
+    plain = sites.serialise_site(made, request, network)
     if as_json:
-        print_json(answer)
+        print_json(plain)
     else:
-        _print(answer)
+        _print(plain)
 
 
-def _print(answer: dict[str, Any]) -> None:
-    """Say what was written."""
-    kind = "a free network" if answer["poses"] == "free" else "a network with control"
-    out.print(f"{answer['n_stations']} stations, by {kind}.")
-    for one in answer["refused"]:
+def _print(plain: dict[str, Any]) -> None:
+    """Print the files that were written."""
+    kind = "a free network" if plain["poses"] == "free" else "a network with control"
+    out.print(f"{plain['n_stations']} stations, by {kind}.")
+    for one in plain["refused"]:
         out.print(f"Without {one['station']}: {one['reason']}", markup=False, soft_wrap=True)
-    for file in answer["files"]:
+    for file in plain["files"]:
         text = f"{file['path']}: {file['n_points']:,} returns"
         if "cell_m" in file:
             text += (

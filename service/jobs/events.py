@@ -1,6 +1,6 @@
-"""What happened to each job, in order, for those who listen: replayed, then live.
+"""The events of each job in order: replayed, then live.
 
-Hides how listeners wait and how they catch up. Identifiers are milliseconds since 1970 that only
+Hides how listeners wait and catch up. Identifiers are milliseconds since 1970 that only
 grow, so that they stay in order after a restart of the service without being stored.
 """
 
@@ -14,20 +14,20 @@ from dataclasses import dataclass
 
 from spheremark.storage.catalogue.records import JobRecord
 
-_JOBS_KEPT = 500  # jobs whose events are kept for those who come back
+_JOBS_KEPT = 500  # jobs whose events are kept for listeners that reconnect
 _EVENTS_KEPT = 200  # of each job; its end is always among them
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class JobEvent:
-    """One thing that happened to a job: how it stood then."""
+    """An event: the state of a job at that time."""
 
     number: int
     job: JobRecord
 
 
 class EventLog:
-    """The events of this life of the service; used on its event loop alone."""
+    """The events since the service started; used on its event loop alone."""
 
     def __init__(self) -> None:
         self._events: OrderedDict[str, deque[JobEvent]] = OrderedDict()
@@ -36,7 +36,7 @@ class EventLog:
         self._closed = False
 
     async def add(self, job: JobRecord) -> None:
-        """Append how a job stands now and wake those who listen."""
+        """Append the state of a job and wake the listeners."""
         self._number = max(self._number + 1, time.time_ns() // 1_000_000)
         event = JobEvent(number=self._number, job=job)
         self._events.setdefault(job.job_id, deque(maxlen=_EVENTS_KEPT)).append(event)
@@ -46,7 +46,7 @@ class EventLog:
             self._bell.notify_all()
 
     async def close(self) -> None:
-        """Send everybody home."""
+        """End all listeners."""
         self._closed = True
         async with self._bell:
             self._bell.notify_all()

@@ -1,8 +1,7 @@
-"""Jobs: accepted in the catalogue, done by a Dask cluster, recorded once.
+"""Jobs: accepted in the catalogue, run by a Dask cluster, recorded once.
 
-Hides the cluster: how work reaches it, how far it is, what happens when a worker dies, when a job
-is dismissed or when the service itself is restarted. Everything but ``submit`` runs on the event
-loop of the service.
+Hides the cluster: submission, progress, the death of a worker, dismissal, and the restart of the
+service. Everything but ``submit`` runs on the event loop of the service.
 """
 
 from __future__ import annotations
@@ -27,7 +26,7 @@ from spheremark.pipelines.config import SurveyConfig
 from spheremark.pipelines.errors import ConflictError, SpheremarkError
 from spheremark.service.jobs import worker as tasks
 from spheremark.service.jobs.events import EventLog
-from spheremark.service.jobs.handlers import KINDS, JobKind, Log, Order, Outcome
+from spheremark.service.jobs.handlers import KINDS, JobKind, JobResult, JobSpecification, Log
 from spheremark.service.settings import Settings
 from spheremark.storage.catalogue.catalogue import Catalogue
 from spheremark.storage.catalogue.records import JobRecord
@@ -42,7 +41,7 @@ _GRACE = 1.0  # [s] that a dismissed job has to stop between two steps
 
 @dataclass(slots=True)
 class _Live:
-    """What the queue knows of a job that it handed out."""
+    """The state of a job that was submitted to the cluster."""
 
     job: JobRecord
     future: Future | None = None
@@ -55,15 +54,15 @@ class _Live:
 
     @property
     def is_over(self) -> bool:
-        """Whether its work is done, so that news of it come too late."""
+        """Whether its handler has ended, so that later events are ignored."""
         return self.future is not None and self.future.done()
 
 
 class JobQueue:
-    """The jobs of one service and the cluster that does them.
+    """The jobs of one service and the cluster that runs them.
 
-    Use as an asynchronous context manager: entering starts the cluster and takes up what an
-    earlier life of the service left open; leaving ends the cluster and leaves open jobs open.
+    Use as an asynchronous context manager: entering starts the cluster and resumes the open jobs
+    of an earlier process; leaving ends the cluster and keeps open jobs open.
     """
 
     def __init__(self, settings: Settings, catalogue: Catalogue, clouds: Path) -> None:
@@ -73,18 +72,20 @@ class JobQueue:
         self._clouds = clouds
         self._live: dict[str, _Live] = {}
         self._followers: set[asyncio.Task[None]] = set()
-        self._heard: asyncio.Queue[dict[str, Any]] = asyncio.Queue()
+        self._events_in: asyncio.Queue[dict[str, Any]] = asyncio.Queue()
         self._stack = AsyncExitStack()
 
     async def __aenter__(self) -> Self:
         self._loop = asyncio.get_running_loop()
         self._client = await self._connect()
-        self._client.subscribe_topic(tasks.TOPIC, lambda event: self._heard.put_nowait(event[1]))
+        self._client.subscribe_topic(
+            tasks.TOPIC, lambda event: self._events_in.put_nowait(event[1])
+        )
         await self._client.register_plugin(tasks.WarmUp(is_ours=not self._settings.scheduler))
         recorder = asyncio.create_task(self._record())
         self._stack.callback(recorder.cancel)
         for job in await asyncio.to_thread(self._catalogue.take_up_jobs):
-            self._hand_out(job)
+            self._start(job)
         return self
 
     async def __aexit__(self, *_: object) -> None:
@@ -95,7 +96,7 @@ class JobQueue:
         await self._stack.aclose()
 
     async def _connect(self) -> Client:
-        """Start a cluster of our own, or use the one that the settings name."""
+        """Start a cluster, or use the one that the settings name."""
         address: str | LocalCluster = self._settings.scheduler
         if not address:
             self._stack.enter_context(
@@ -104,7 +105,7 @@ class JobQueue:
                         "distributed.scheduler.allowed-failures": self._settings.job_attempts - 1,
                         # one task per worker: a worker that dies takes no waiting job with it
                         "distributed.scheduler.worker-saturation": 1.0,
-                        # nothing of Dask answers to a browser
+                        # no pages of Dask
                         "distributed.scheduler.http.routes": [],
                         "distributed.worker.http.routes": [],
                     }
@@ -117,7 +118,7 @@ class JobQueue:
                     processes=True,
                     host="127.0.0.1",
                     protocol="tls://",
-                    security=Security.temporary(),  # others on this machine may not give it tasks
+                    security=Security.temporary(),  # for this service alone
                     dashboard_address="127.0.0.1:0",
                     worker_dashboard_address="127.0.0.1:0",
                     asynchronous=True,
@@ -132,11 +133,11 @@ class JobQueue:
         return len(self._client.scheduler_info(n_workers=-1)["workers"])
 
     def submit(self, job: JobRecord) -> None:
-        """Hand an accepted job to the cluster; may be called from any thread."""
-        self._loop.call_soon_threadsafe(self._hand_out, job)
+        """Submit an accepted job to the cluster; may be called from any thread."""
+        self._loop.call_soon_threadsafe(self._start, job)
 
     async def dismiss(self, job_id: str) -> JobRecord:
-        """Give a job up: between two steps if it stops by itself, else with its worker."""
+        """Dismiss a job: it stops between two steps, or its worker process is ended."""
         job = await asyncio.to_thread(self._catalogue.dismiss_job, job_id)
         await self.events.add(job)
         live = self._live.get(job_id)
@@ -147,38 +148,38 @@ class JobQueue:
         return job
 
     async def _stop(self, live: _Live) -> None:
-        """Wait a little for a dismissed job to stop, then end the process that runs it."""
+        """Wait for a dismissed job to stop, then end the process that runs it."""
         with suppress(asyncio.TimeoutError):
             await asyncio.wait_for(live.stopped.wait(), _GRACE)
             return
         logger.warning("Ending a worker", extra={"job": live.job.job_id, "worker": live.worker})
         await self._client.run(os._exit, 1, workers=[live.worker], on_error="ignore")
 
-    def _hand_out(self, job: JobRecord) -> None:
+    def _start(self, job: JobRecord) -> None:
         """Follow a job from here to its end."""
         self._live[job.job_id] = _Live(job)
         self._keep(self._follow(self._live[job.job_id]))
 
-    def _keep(self, work: Any) -> None:
-        """Run something beside everything else, and remember it until it is done."""
-        task = asyncio.create_task(work)
+    def _keep(self, coroutine: Any) -> None:
+        """Run a coroutine as a task and hold a reference to it until it ends."""
+        task = asyncio.create_task(coroutine)
         self._followers.add(task)
         task.add_done_callback(self._followers.discard)
 
     async def _follow(self, live: _Live) -> None:
-        """Have a job done and record how it ended: the one place where every error is caught."""
+        """Run a job and record its end: the one place where every error is caught."""
         job = live.job
         try:
             await self.events.add(job)
-            order = await asyncio.to_thread(self._order, job)
+            spec = await asyncio.to_thread(self._specification, job)
             live.future = self._client.submit(
-                tasks.do, order, key=f"{job.job_id}-{order.result_id}", pure=False
+                tasks.run, spec, key=f"{job.job_id}-{spec.result_id}", pure=False
             )
-            outcome = await live.future
+            result = await live.future
             async with live.turn:
                 if not live.has_begun:
                     await self._begin(live)
-                ended = await asyncio.to_thread(self._finish, live, outcome)
+                ended = await asyncio.to_thread(self._finish, live, result)
         except FutureCancelledError:
             ended = await asyncio.to_thread(self._catalogue.get_job, job.job_id)
         except KilledWorker:
@@ -193,11 +194,11 @@ class JobQueue:
         if ended.status.is_final:
             await self.events.add(ended)
 
-    def _order(self, job: JobRecord) -> Order:
-        """Put together what a worker needs for a job."""
+    def _specification(self, job: JobRecord) -> JobSpecification:
+        """Return the input of a worker for a job."""
         catalogue, kind = self._catalogue, JobKind(job.kind)
         rig = job.options.get("rig")
-        order = Order(
+        spec = JobSpecification(
             job_id=job.job_id,
             kind=kind,
             result_id=secrets.token_hex(8),
@@ -209,10 +210,10 @@ class JobQueue:
             clouds_url=str(self._clouds),
             options=job.options,
         )
-        return replace(order, known=KINDS[kind].gather(catalogue, order))
+        return replace(spec, known=KINDS[kind].gather(catalogue, spec))
 
     def _log(self, recording_id: str) -> Log:
-        """Return where a log is and what it is called."""
+        """Return address and name of a log."""
         known = self._catalogue.get_recording(recording_id)
         return Log(recording_id=recording_id, name=known.name, url=known.url)
 
@@ -225,11 +226,11 @@ class JobQueue:
         live.has_begun = True
         live.job = await asyncio.to_thread(self._catalogue.start_job, job_id)
 
-    def _finish(self, live: _Live, outcome: Outcome) -> JobRecord:
+    def _finish(self, live: _Live, result: JobResult) -> JobRecord:
         """Write results and end of a job in one transaction; a dismissed job keeps none."""
         job_id = live.job.job_id
         with suppress(ConflictError):
-            self._catalogue.finish_job(job_id, outcome.tables, message=outcome.message)
+            self._catalogue.finish_job(job_id, result.tables, message=result.message)
         return self._catalogue.get_job(job_id)
 
     async def _fail(
@@ -245,48 +246,48 @@ class JobQueue:
             return await asyncio.to_thread(self._catalogue.get_job, job_id)
 
     def _why_killed(self) -> str:
-        """Say what is known of a job whose workers died."""
+        """Return the reason for a job whose workers died."""
         return (
             f"The worker process died {self._settings.job_attempts} times at this job, most likely "
-            "for want of memory; give the machine more of it, or use fewer workers."
+            "because memory ran out; add memory to the machine, or use fewer workers."
         )
 
     async def _record(self) -> None:
-        """Take down what workers tell, one thing after the other."""
+        """Record the events of workers, one after the other."""
         while True:
-            heard = await self._heard.get()
-            live = self._live.get(heard["job"])
+            event = await self._events_in.get()
+            live = self._live.get(event["job"])
             if live is not None:
                 with suppress(ConflictError):  # dismissed in the meantime
-                    await self._note(live, heard)
+                    await self._note(live, event)
 
-    async def _note(self, live: _Live, heard: dict[str, Any]) -> None:
-        """Take down one thing that a worker told."""
-        live.is_running = heard["event"] != "stopped"
-        live.worker = heard["worker"]
-        if heard["event"] == "stopped":
+    async def _note(self, live: _Live, event: dict[str, Any]) -> None:
+        """Record one event of a worker."""
+        live.is_running = event["event"] != "stopped"
+        live.worker = event["worker"]
+        if event["event"] == "stopped":
             live.stopped.set()
             return
-        if heard["event"] == "started":
+        if event["event"] == "started":
             async with live.turn:
-                if not live.is_over:  # else whoever awaits it has begun it
+                if not live.is_over:  # else the coroutine that awaits it has begun it
                     await self._begin(live)
         if live.is_over:
             return
-        live.job = replace(live.job, progress_percent=heard["percent"], message=heard["message"])
+        live.job = replace(live.job, progress_percent=event["percent"], message=event["message"])
         await self.events.add(live.job)
         if monotonic() - live.recorded_at >= _RECORD_EVERY:
             live.recorded_at = monotonic()
             await asyncio.to_thread(
                 self._catalogue.report_progress,
                 live.job.job_id,
-                heard["percent"],
-                heard["message"],
+                event["percent"],
+                event["message"],
             )
 
 
 def recordings_of(job: JobRecord) -> tuple[str, ...]:
-    """Return the logs that a job reads, in the order in which they were named."""
+    """Return the logs that a job reads, in the order of the request."""
     if job.recording_id is not None:
         return (job.recording_id,)
     return tuple(job.options.get("recordings", ()))

@@ -1,6 +1,6 @@
 """The stops of a survey in one frame: a cloud of the whole site, and a model of its ground.
 
-What a job and the command have in common: given clouds one by one with their poses, files.
+Shared by the job and the command: clouds with their poses, one by one, to files.
 """
 
 from __future__ import annotations
@@ -45,8 +45,8 @@ Stops = Iterable[tuple["StitchedCloud", StationPose]]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class SiteWish:
-    """What is wanted: where each file goes, how far the cloud reaches and is thinned [m]."""
+class SiteRequest:
+    """Target of each file, reach of the cloud and edge of its voxels [m]."""
 
     targets: Mapping[str, Path]
     elevation: ElevationConfig = field(default_factory=ElevationConfig)
@@ -66,22 +66,22 @@ class SiteWish:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Site:
-    """What was made: what each cloud holds, and the model of the ground, if it was wanted."""
+    """The extent of each cloud written, and the model of the ground if it was requested."""
 
     clouds: Mapping[str, CloudExtent]
     model: ElevationModel | None
     n_stations: int
 
 
-def make_site(stops: Stops, poses: Sequence[StationPose], wish: SiteWish) -> Site:
-    """Write the files that are wanted, all or none; one stop at a time is held."""
-    with _completed(wish.targets) as parts:
-        return _make_site(stops, poses, replace(wish, targets=parts))
+def make_site(stops: Stops, poses: Sequence[StationPose], request: SiteRequest) -> Site:
+    """Write the requested files, all or none; one stop at a time is in memory."""
+    with _completed(request.targets) as parts:
+        return _make_site(stops, poses, replace(request, targets=parts))
 
 
 @contextmanager
 def _completed(targets: Mapping[str, Path]) -> Iterator[Mapping[str, Path]]:
-    """Lend places beside the targets; what is complete moves there, of anything else none stays."""
+    """Yield paths beside the targets; complete files move there, others are removed."""
     parts = {
         kind: path.with_name(f".{secrets.token_hex(4)}.part{path.suffix}")
         for kind, path in targets.items()
@@ -95,18 +95,20 @@ def _completed(targets: Mapping[str, Path]) -> Iterator[Mapping[str, Path]]:
             part.unlink(missing_ok=True)
 
 
-def _make_site(stops: Stops, poses: Sequence[StationPose], wish: SiteWish) -> Site:
-    """Write the files that are wanted."""
+def _make_site(stops: Stops, poses: Sequence[StationPose], request: SiteRequest) -> Site:
+    """Write the requested files."""
     from spheremark.storage.exports.ground_model import write_geotiff
 
-    terrain = Terrain(poses, wish.elevation) if "geotiff" in wish.targets else None
+    terrain = Terrain(poses, request.elevation) if "geotiff" in request.targets else None
     n = 0
     with ExitStack() as stack:
-        files = {kind: stack.enter_context(closing(file)) for kind, file in _opened(wish)}
+        files = {kind: stack.enter_context(closing(file)) for kind, file in _opened(request)}
         for cloud, pose in stops:
             n += 1
             if files:
-                points = station_points(cloud, pose, range_max=wish.range_max, voxel=wish.voxel)
+                points = station_points(
+                    cloud, pose, range_max=request.range_max, voxel=request.voxel
+                )
                 for file in files.values():
                     file.add(points)
             if terrain is not None:
@@ -114,16 +116,16 @@ def _make_site(stops: Stops, poses: Sequence[StationPose], wish: SiteWish) -> Si
         clouds = {kind: file.finish() for kind, file in files.items()}
     model = None if terrain is None else terrain.model()
     if model is not None:
-        write_geotiff(model, wish.targets["geotiff"], software=wish.software)
+        write_geotiff(model, request.targets["geotiff"], software=request.software)
     return Site(clouds=clouds, model=model, n_stations=n)
 
 
-def _opened(wish: SiteWish) -> Iterator[tuple[str, LazFile | E57File]]:
-    """Open the files of clouds that are wanted."""
-    if target := wish.targets.get("laz"):
-        yield "laz", LazFile(target, software=wish.software, day=wish.day)
-    if target := wish.targets.get("e57"):
-        yield "e57", E57File(target, software=wish.software)
+def _opened(request: SiteRequest) -> Iterator[tuple[str, LazFile | E57File]]:
+    """Open the requested files of clouds."""
+    if target := request.targets.get("laz"):
+        yield "laz", LazFile(target, software=request.software, day=request.day)
+    if target := request.targets.get("e57"):
+        yield "e57", E57File(target, software=request.software)
 
 
 def stitched(
@@ -148,10 +150,10 @@ def of_logs(
     marks: ControlMarks | None,
     rig: Rig | None,
     config: SurveyConfig,
-    wish: SiteWish,
+    request: SiteRequest,
     progress: Progress,
 ) -> tuple[Site, Network]:
-    """Adjust the stations of logs and make what is wanted; a log that gives none costs no other."""
+    """Adjust the stations of logs and write the requested files; logs that fail are refused."""
     from spheremark.service.log_files import adjust_scans, read_scans
     from spheremark.storage.recordings import read_log
 
@@ -167,13 +169,13 @@ def of_logs(
             yield read_log(path)
 
     stops = stitched(read(), config, lambda _name: rig, poses)
-    site = make_site(stops, tuple(poses.values()), wish)
+    site = make_site(stops, tuple(poses.values()), request)
     return site, result.network
 
 
-def site_answer(site: Site, wish: SiteWish, network: Network) -> dict[str, Any]:
+def serialise_site(site: Site, request: SiteRequest, network: Network) -> dict[str, Any]:
     """Return what was made, by the poses of a network, as plain values."""
-    answer: dict[str, Any] = {
+    plain: dict[str, Any] = {
         "poses": "free" if network.is_free else "control",
         "n_stations": site.n_stations,
         "refused": [
@@ -183,16 +185,16 @@ def site_answer(site: Site, wish: SiteWish, network: Network) -> dict[str, Any]:
         "files": [],
     }
     for kind, extent in site.clouds.items():
-        path = wish.targets[kind]
-        answer["files"].append({"kind": kind, "path": str(path), **extent_row(extent)})
+        path = request.targets[kind]
+        plain["files"].append({"kind": kind, "path": str(path), **extent_row(extent)})
     if site.model is not None:
-        path = wish.targets["geotiff"]
-        answer["files"].append({"kind": "geotiff", "path": str(path), **model_row(site.model)})
-    return answer
+        path = request.targets["geotiff"]
+        plain["files"].append({"kind": "geotiff", "path": str(path), **model_row(site.model)})
+    return plain
 
 
 def extent_row(extent: CloudExtent) -> dict[str, Any]:
-    """Return what a cloud holds as plain values."""
+    """Return the extent of a cloud as plain values."""
     low, high = extent.bounds
     return {
         "n_points": extent.n_points,
@@ -202,7 +204,7 @@ def extent_row(extent: CloudExtent) -> dict[str, Any]:
 
 
 def model_row(model: ElevationModel) -> dict[str, Any]:
-    """Return what a model of the ground holds as plain values."""
+    """Return the extent of a model of the ground as plain values."""
     rows, columns = model.heights.shape
     west, south = (float(value) for value in model.corner)
     return {
@@ -220,19 +222,19 @@ def model_row(model: ElevationModel) -> dict[str, Any]:
 
 
 def elevation_of(options: Mapping[str, Any]) -> ElevationConfig:
-    """Return how ground becomes a model, from what was chosen."""
+    """Return the configuration of the ground model of a job's options."""
     return ElevationConfig(
         cell=options["cell_m"], range_max=options["ground_range_m"], gap_max=options["gap_m"]
     )
 
 
 def options_text(options: Mapping[str, Any]) -> str:
-    """Return what was chosen as canonical text."""
+    """Return options as canonical text."""
     return json.dumps(dict(options), sort_keys=True, separators=(",", ":"))
 
 
 def pose_from_row(name: str, row: Mapping[str, Any]) -> StationPose:
-    """Return the pose that a row of stations holds."""
+    """Return the pose of a row of stations."""
     T = np.eye(4)
     T[:3, :3] = np.reshape(row["rotation"], (3, 3))
     T[:3, 3] = [row[f"{axis}_m"] for axis in "xyz"]

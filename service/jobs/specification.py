@@ -1,4 +1,4 @@
-"""What the service asks of a worker, and what it gets back: the same for every kind of job."""
+"""What the service sends to a worker and what comes back, the same for every kind of job."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
 
 class JobKind(StrEnum):
-    """What can be asked for."""
+    """Kinds of jobs."""
 
     PROCESS = "process"
     ADJUST = "adjust"
@@ -30,7 +30,7 @@ class JobKind(StrEnum):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Log:
-    """An uploaded log: its digest, what it is called, and where its bytes are."""
+    """An uploaded log: its digest, its name, and the address of its bytes."""
 
     recording_id: str
     name: str
@@ -38,11 +38,11 @@ class Log:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Order:
-    """What a worker is asked to do: values and places, never arrays of a scan, never truth.
+class JobSpecification:
+    """The input of a worker: values and addresses, never arrays of a scan, never truth.
 
-    ``result_id`` is new for each attempt and names the rows that it gives; ``rig`` is the one to
-    use in place of the logs' own; ``known`` are rows of the database that the kind asked for.
+    ``result_id`` is new for each attempt and identifies its rows; ``rig`` replaces those of the
+    logs; ``known`` are the rows of the database that the kind gathered.
     """
 
     job_id: str
@@ -59,7 +59,7 @@ class Order:
 
     @property
     def log_names(self) -> tuple[str, ...]:
-        """What each log is called in the job: one that has the name of another gets a number."""
+        """Name of each log in the job: one that has the name of another gets a number."""
         names: list[str] = []
         for log in self.logs:
             name, again = log.name, 1
@@ -71,20 +71,20 @@ class Order:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Outcome:
-    """What a job gave: rows named as the tables of the database, and a sentence for people."""
+class JobResult:
+    """The output of a worker: rows by table of the database, and a sentence for people."""
 
     tables: dict[str, pa.Table]
     message: str
 
 
 class Options(BaseModel):
-    """What a kind lets one choose, beside logs, rig and configuration; here nothing."""
+    """Options of a kind beside logs, rig and configuration; none by default."""
 
     model_config = ConfigDict(extra="forbid")
 
 
-def _nothing(_catalogue: Catalogue, _order: Order) -> Mapping[str, pa.Table]:
+def _nothing(_catalogue: Catalogue, _spec: JobSpecification) -> Mapping[str, pa.Table]:
     """Return no rows."""
     return {}
 
@@ -93,12 +93,12 @@ def _nothing(_catalogue: Catalogue, _order: Order) -> Mapping[str, pa.Table]:
 class Kind:
     """One kind of job.
 
-    ``work`` runs in a worker process and imports what is heavy itself; it may be stopped wherever
-    it reports progress. ``gather`` runs in the service and reads the rows that ``work`` needs.
+    ``handle`` runs in a worker process and imports heavy modules itself; it can be stopped wherever
+    it reports progress. ``gather`` runs in the service and reads the rows that ``handle`` needs.
     """
 
-    work: Callable[[Order, Progress], Outcome]
+    handle: Callable[[JobSpecification, Progress], JobResult]
     takes_one_log: bool = False
     begins_with_rig_of_survey: bool = True
     options: type[Options] = Options
-    gather: Callable[[Catalogue, Order], Mapping[str, pa.Table]] = _nothing
+    gather: Callable[[Catalogue, JobSpecification], Mapping[str, pa.Table]] = _nothing

@@ -1,7 +1,7 @@
-"""What a worker process does: it takes an order, does it, and tells how far it is.
+"""The worker process: runs the handler of a job and reports its progress.
 
 Runs in processes of the cluster: takes paths and small values, returns Arrow tables. Nothing here
-writes to the catalogue; what goes wrong is raised and recorded by the service.
+writes to the catalogue; errors are raised here and recorded by the service.
 """
 
 from __future__ import annotations
@@ -16,13 +16,13 @@ from typing import TYPE_CHECKING
 from distributed import WorkerPlugin, get_worker
 
 from spheremark.pipelines.config import SurveyConfig
-from spheremark.service.jobs.handlers import KINDS, Order, Outcome
+from spheremark.service.jobs.handlers import KINDS, JobResult, JobSpecification
 from spheremark.service.jobs.memory import keep_memory
 
 if TYPE_CHECKING:
     from distributed import Worker
 
-TOPIC = "spheremark"  # of the events by which workers tell how far they are
+TOPIC = "spheremark"  # of the events that report progress
 _TICK = 0.1  # [s] between two reports of progress
 
 
@@ -31,7 +31,7 @@ class DismissedError(Exception):
 
 
 class Reporter:
-    """Tells the service how far a job is, and stops it between steps once it is dismissed."""
+    """Reports the progress of a job, and stops it between steps once it is dismissed."""
 
     def __init__(self, job_id: str) -> None:
         self._worker = get_worker()
@@ -39,7 +39,7 @@ class Reporter:
         self._job_id = job_id
         self._last = 0.0
 
-    def tell(self, event: str, share: float = 0.0, message: str = "") -> None:
+    def send(self, event: str, share: float = 0.0, message: str = "") -> None:
         """Send one event to the service."""
         self._worker.log_event(
             TOPIC,
@@ -53,27 +53,27 @@ class Reporter:
         )
 
     def progress(self, share: float, message: str) -> None:
-        """Report a step; raise DismissedError if nobody wants the result any more."""
+        """Report a step; raise DismissedError if the job was dismissed."""
         task = self._worker.state.tasks.get(self._key)
         if task is None or task.state == "cancelled":
             raise DismissedError(self._job_id)
         if perf_counter() - self._last >= _TICK:
             self._last = perf_counter()
-            self.tell("progress", share, message)
+            self.send("progress", share, message)
 
 
-def do(order: Order) -> Outcome:
-    """Do what an order asks for, and tell the service how far it is."""
-    reporter = Reporter(order.job_id)
-    reporter.tell("started", 0.0, "Started.")
+def run(spec: JobSpecification) -> JobResult:
+    """Run the handler of a job and report its progress."""
+    reporter = Reporter(spec.job_id)
+    reporter.send("started", 0.0, "Started.")
     try:
-        return KINDS[order.kind].work(order, reporter.progress)
+        return KINDS[spec.kind].handle(spec, reporter.progress)
     finally:
-        reporter.tell("stopped")
+        reporter.send("stopped")
 
 
 class WarmUp(WorkerPlugin):  # type: ignore[misc]  # distributed ships no types
-    """Makes a new worker ready beside its first job: imports and compiled kernels."""
+    """Loads modules and compiled kernels in a new worker, beside its first job."""
 
     name = "spheremark-warm-up"
     idempotent = True
@@ -82,7 +82,7 @@ class WarmUp(WorkerPlugin):  # type: ignore[misc]  # distributed ships no types
         self.is_ours = is_ours
 
     def setup(self, worker: Worker) -> None:  # noqa: ARG002  the protocol of Dask
-        """Begin, without keeping the worker from work."""
+        """Begin, without delaying the first job."""
         keep_memory()
         if self.is_ours:  # Ctrl-C is for the service, which then ends its workers
             signal.signal(signal.SIGINT, signal.SIG_IGN)
@@ -90,7 +90,7 @@ class WarmUp(WorkerPlugin):  # type: ignore[misc]  # distributed ships no types
 
 
 def warm_up() -> None:
-    """Load what a job needs beside the first one."""
+    """Load the modules of a job."""
     import open3d  # noqa: F401
 
     from spheremark.pipelines import survey  # noqa: F401
@@ -119,7 +119,7 @@ def compile_kernels() -> None:
 
 
 def _compile_planner() -> None:
-    """Judge and better a small plan, so that the planner's page answers at once."""
+    """Evaluate and optimise a small plan, so that the planner's page responds at once."""
     from spheremark.pipelines.placement import Goal, PlaceRules, Requirement, Sensor, sensor_model
     from spheremark.service.planning import plans as siting
     from spheremark.service.planning.requests import Asked, simulated_ground

@@ -80,9 +80,8 @@ def _unit(column: str) -> str | None:
 def _columns_of(table: str) -> Columns:
     """Return the columns of a table that a job writes."""
     if table in results.SCHEMAS:
-        schema = results.SCHEMAS[table]
-        return zip(schema.names, schema.types, strict=True)
-    return (adjustments.SCHEMAS | calibrations.SCHEMAS)[table].items()
+        return [(field.name, field.type) for field in results.SCHEMAS[table]]
+    return {**adjustments.SCHEMAS, **calibrations.SCHEMAS}[table].items()
 
 
 def _table(name: str, about: str, table: str, **more: Any) -> type[Row]:

@@ -1,24 +1,26 @@
-"""The kinds of jobs: what each one does in a worker process, from an order to rows.
+"""The kinds of jobs: one module for each, with a handler that runs in a worker process.
 
-``orders`` is what all have in common; each kind has a module of its own. A new kind is a member of
-``JobKind``, a module with its work, and a line in ``KINDS``; its tables are named in ``storage``.
+A new kind is a member of ``JobKind``, a module with its handler, and a line in ``KINDS``; its
+tables are named in ``storage``.
 """
 
 from collections.abc import Mapping
 
-from spheremark.service.jobs.handlers import adjust as adjusting
-from spheremark.service.jobs.handlers import calibrate as calibrating
-from spheremark.service.jobs.handlers import process as processing
-from spheremark.service.jobs.handlers import sites as siting
-from spheremark.service.jobs.specification import JobKind, Kind, Log, Options, Order, Outcome
+from spheremark.service.jobs.handlers import adjust, calibrate, process, sites
+from spheremark.service.jobs.specification import (
+    JobKind,
+    JobResult,
+    JobSpecification,
+    Kind,
+    Log,
+    Options,
+)
 
-__all__ = ["KINDS", "JobKind", "Kind", "Log", "Options", "Order", "Outcome"]
+__all__ = ["KINDS", "JobKind", "JobResult", "JobSpecification", "Kind", "Log", "Options"]
 
 KINDS: Mapping[JobKind, Kind] = {
-    JobKind.PROCESS: Kind(work=processing.work, takes_one_log=True),
-    JobKind.ADJUST: Kind(
-        work=adjusting.work, options=adjusting.AdjustOptions, gather=adjusting.gather
-    ),
-    JobKind.CALIBRATE: Kind(work=calibrating.work, begins_with_rig_of_survey=False),
-    JobKind.SITE: Kind(work=siting.work, options=siting.SiteOptions, gather=siting.gather),
+    JobKind.PROCESS: Kind(handle=process.handle, takes_one_log=True),
+    JobKind.ADJUST: Kind(handle=adjust.handle, options=adjust.AdjustOptions, gather=adjust.gather),
+    JobKind.CALIBRATE: Kind(handle=calibrate.handle, begins_with_rig_of_survey=False),
+    JobKind.SITE: Kind(handle=sites.handle, options=sites.SiteOptions, gather=sites.gather),
 }

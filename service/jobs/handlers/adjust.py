@@ -1,7 +1,7 @@
 """Jobs of the kind ``adjust``: all stations and marks of a survey together.
 
-Centres that were fitted before in the same way are taken from their rows; only the logs for which
-there are none are processed, and that gives the rows that a job of its own would have given.
+Centres of an earlier run with the same configuration, rig and code are taken from its rows; other
+logs are processed, with the rows that a job of the kind ``process`` gives.
 """
 
 from __future__ import annotations
@@ -18,9 +18,9 @@ from pydantic import Field
 
 from spheremark.pipelines.errors import RigError, SolveError, SpheremarkError
 from spheremark.pipelines.scan.rigs import rig_digest
-from spheremark.service.jobs.handlers import calibrate as calibrating
-from spheremark.service.jobs.handlers import process as processing
-from spheremark.service.jobs.specification import Log, Options, Order, Outcome
+from spheremark.service.jobs.handlers.calibrate import calibration_results, logs_of
+from spheremark.service.jobs.handlers.process import process_log
+from spheremark.service.jobs.specification import JobResult, JobSpecification, Log, Options
 from spheremark.service.provenance import code_version
 
 if TYPE_CHECKING:
@@ -34,7 +34,7 @@ if TYPE_CHECKING:
 
 Row = dict[str, Any]
 
-_SCANS = 0.9  # share of the work that the scans take
+_SCANS = 0.9  # share of the time that the scans take
 _RUNS = """
 SELECT r.run_id, r.recording_id, r.rig_digest, r.config, r.code_version
 FROM runs AS r JOIN jobs AS j USING (job_id)
@@ -47,7 +47,7 @@ _FITS = "SELECT * FROM marker_fits WHERE list_contains($runs::VARCHAR[], run_id)
 
 
 class AdjustOptions(Options):
-    """What one can choose about an adjustment."""
+    """Options of an adjustment."""
 
     control: bool = Field(
         default=True, description="Use the survey's control marks, if it has any; else free."
@@ -60,20 +60,20 @@ class AdjustOptions(Options):
     )
 
 
-def gather(catalogue: Catalogue, order: Order) -> Mapping[str, pa.Table]:
-    """Return the runs whose centres are those that this job would fit, newest first, with rows.
+def gather(catalogue: Catalogue, spec: JobSpecification) -> Mapping[str, pa.Table]:
+    """Return the runs with the centres that this job would fit, newest first, and their rows.
 
-    Which of them this version of the code made, the worker sees.
+    The worker chooses among them those of its own version of the code.
     """
-    wanted = {
-        "survey": order.survey_id,
-        "recordings": [log.recording_id for log in order.logs],
-        "rig": None if order.rig is None else rig_digest(order.rig),
+    parameters = {
+        "survey": spec.survey_id,
+        "recordings": [log.recording_id for log in spec.logs],
+        "rig": None if spec.rig is None else rig_digest(spec.rig),
     }
-    runs = catalogue.table(_RUNS, wanted)
-    if order.options.get("reprocess"):
+    runs = catalogue.table(_RUNS, parameters)
+    if spec.options.get("reprocess"):
         runs = runs.slice(0, 0)
-    keep = [row["run_id"] for row in runs.to_pylist() if _is_alike(row, order)]
+    keep = [row["run_id"] for row in runs.to_pylist() if _is_alike(row, spec)]
     return {
         "runs": runs,
         "stops": catalogue.table(_STOPS, {"runs": keep}),
@@ -81,15 +81,15 @@ def gather(catalogue: Catalogue, order: Order) -> Mapping[str, pa.Table]:
     }
 
 
-def _is_alike(run: Row, order: Order) -> bool:
-    """Whether a run fitted centres as this order asks for."""
-    done, wanted = json.loads(run["config"]), order.config.to_mapping()
-    method = wanted["fitting"]["methods"][0]
-    return method in done["fitting"]["methods"] and _way(done) == _way(wanted)
+def _is_alike(run: Row, spec: JobSpecification) -> bool:
+    """Whether a run fitted centres with the method and configuration of this job."""
+    done, own = json.loads(run["config"]), spec.config.to_mapping()
+    method = own["fitting"]["methods"][0]
+    return method in done["fitting"]["methods"] and _fit_options(done) == _fit_options(own)
 
 
-def _way(config: Mapping[str, Any]) -> str:
-    """Return all of a configuration that centres depend on, but for the method's name."""
+def _fit_options(config: Mapping[str, Any]) -> str:
+    """Return all options that centres depend on, but for the names of methods."""
     fitting = {key: value for key, value in config["fitting"].items() if key != "methods"}
     parts = {key: config[key] for key in ("marker_radius", "stitching", "extraction")}
     return json.dumps(parts | {"fitting": fitting}, sort_keys=True)
@@ -97,21 +97,21 @@ def _way(config: Mapping[str, Any]) -> str:
 
 @dataclass(slots=True)
 class _Book:
-    """Stations as they come in: centres, where they are from, and who gave none."""
+    """Stations so far: centres, their runs, refused logs, and the tables of new runs."""
 
     scans: list[tuple[str, MarkerFits]] = field(default_factory=list)
     sources: dict[str, Row] = field(default_factory=dict)
     refused: list[Refusal] = field(default_factory=list)
     tables: list[dict[str, pa.Table]] = field(default_factory=list)
 
-    def enter(self, name: str, stop: str, fits: MarkerFits, source: Row) -> None:
-        """Add a station, of a name of its own, at a stop."""
+    def add(self, name: str, stop: str, fits: MarkerFits, source: Row) -> None:
+        """Add a station under a unique name."""
         self.scans.append((name, fits))
         self.sources[name] = {"station": name, "stop": stop, **source}
 
 
-def work(order: Order, progress: Progress) -> Outcome:
-    """Adjust the stations of all logs of an order."""
+def handle(spec: JobSpecification, progress: Progress) -> JobResult:
+    """Adjust the stations of all logs of a job."""
     from spheremark.service.jobs.handlers.network_rows import network_rows
     from spheremark.service.log_files import Fieldbook, adjust_scans, adjusted_rig
     from spheremark.service.serialise.network import serialise_network
@@ -119,47 +119,47 @@ def work(order: Order, progress: Progress) -> Outcome:
     from spheremark.storage.catalogue.products import documents
 
     start = perf_counter()
-    with_rig = bool(order.options.get("calibrate"))
-    book = _read(order, _share(progress, 0.0, 0.5 * _SCANS if with_rig else _SCANS))
+    with_rig = bool(spec.options.get("calibrate"))
+    book = _read(spec, _share(progress, 0.0, 0.5 * _SCANS if with_rig else _SCANS))
     rig, why = None, ""
     if with_rig:
-        rig, why = _rig(order, book, _share(progress, 0.5 * _SCANS, 0.8))
+        rig, why = _rig(spec, book, _share(progress, 0.5 * _SCANS, 0.8))
     progress(_SCANS, f"Adjusting {len(book.scans)} stations")
-    marks = order.marks if order.options.get("control", True) else None
+    marks = spec.marks if spec.options.get("control", True) else None
     scans = Fieldbook(scans=tuple(book.scans), refused=tuple(book.refused), calibration=rig)
-    result = adjust_scans(scans, marks, order.config)
+    result = adjust_scans(scans, marks, spec.config)
     found = adjusted_rig(result, scans)
-    answer = serialise_network(result, order.config, rig=found, uncalibrated=why)
-    rows = network_rows(answer, book.sources)
+    plain = serialise_network(result, spec.config, rig=found, uncalibrated=why)
+    rows = network_rows(plain, book.sources)
     rows["adjustments"][0] |= {
-        "job_id": order.job_id,
-        "survey_id": order.survey_id,
+        "job_id": spec.job_id,
+        "survey_id": spec.survey_id,
         "finished_at": datetime.now(UTC),
-        "config": order.config.text,
-        "config_digest": order.config.digest,
+        "config": spec.config.text,
+        "config_digest": spec.config.digest,
         "code_version": code_version(),
         "duration_s": perf_counter() - start,
     }
-    made = [*book.tables, adjustments.tables(order.result_id, rows)]
-    files, message = _files(result, answer), _summary(answer, rows["control_checks"])
+    made = [*book.tables, adjustments.tables(spec.result_id, rows)]
+    files, message = _files(result, plain), _summary(plain, rows["control_checks"])
     if found is not None:
         left = _share(progress, _SCANS, 1.0)
-        tables, more, sentence = calibrating.results(order, found, left, start)
+        tables, more, sentence = calibration_results(spec, found, left, start)
         made, files, message = [*made, tables], files | more, f"{message} {sentence}"
-    made.append({"documents": documents(order.result_id, files)})
-    return Outcome(tables=_joined(made), message=message)
+    made.append({"documents": documents(spec.result_id, files)})
+    return JobResult(tables=_joined(made), message=message)
 
 
-def _rig(order: Order, book: _Book, progress: Progress) -> tuple[Calibration | None, str]:
-    """Calibrate the rig of the logs that gave stations, or say why they do not tell it."""
+def _rig(spec: JobSpecification, book: _Book, progress: Progress) -> tuple[Calibration | None, str]:
+    """Calibrate the rig of the logs with stations; return the reason where they cannot."""
     from spheremark.pipelines.calibration import calibrate
 
     used = {source["recording_id"] for source in book.sources.values()}
-    named = zip(order.logs, order.log_names, strict=True)
+    named = zip(spec.logs, spec.log_names, strict=True)
     good = tuple(replace(log, name=name) for log, name in named if log.recording_id in used)
-    logs = calibrating.logs_of(replace(order, logs=good))
+    logs = logs_of(replace(spec, logs=good))
     try:
-        return calibrate(logs, config=order.config, rig=order.rig, progress=progress), ""
+        return calibrate(logs, config=spec.config, rig=spec.rig, progress=progress), ""
     except (SolveError, RigError) as error:
         return None, str(error)
 
@@ -174,16 +174,16 @@ def _joined(parts: list[dict[str, pa.Table]]) -> dict[str, pa.Table]:
     }
 
 
-def _read(order: Order, progress: Progress) -> _Book:
-    """Bring in the centres of each log; one that gives none costs no other."""
+def _read(spec: JobSpecification, progress: Progress) -> _Book:
+    """Return the centres of each log; refuse logs that fail, and raise if all do."""
     from spheremark.pipelines.network import Refusal
 
     book, first = _Book(), None
-    for i, (log, name) in enumerate(zip(order.logs, order.log_names, strict=True)):
+    for i, (log, name) in enumerate(zip(spec.logs, spec.log_names, strict=True)):
         try:
-            part = _share(progress, i / len(order.logs), (i + 1) / len(order.logs))
-            for stop, fits, source in _centres(order, log, book, part):
-                book.enter(name + stop.removeprefix(log.name), stop, fits, source)
+            part = _share(progress, i / len(spec.logs), (i + 1) / len(spec.logs))
+            for stop, fits, source in _centres(spec, log, book, part):
+                book.add(name + stop.removeprefix(log.name), stop, fits, source)
         except SpheremarkError as error:
             first = first or error
             book.refused.append(Refusal(station=name, code=error.code, reason=str(error)))
@@ -193,31 +193,31 @@ def _read(order: Order, progress: Progress) -> _Book:
 
 
 def _centres(
-    order: Order, log: Log, book: _Book, progress: Progress
+    spec: JobSpecification, log: Log, book: _Book, progress: Progress
 ) -> Iterator[tuple[str, MarkerFits, Row]]:
     """Yield the stops of a log with their centres: those of an earlier run, or new ones."""
     from spheremark.storage.catalogue.centres import read_centres
 
-    method = order.config.fitting.methods[0]
-    known = set(order.known["stops"].column("run_id").to_pylist())
-    wanted = (log.recording_id, code_version())
+    method = spec.config.fitting.methods[0]
+    known = set(spec.known["stops"].column("run_id").to_pylist())
+    own = (log.recording_id, code_version())
     run = next(
         (
             row
-            for row in order.known["runs"].to_pylist()
-            if row["run_id"] in known and (row["recording_id"], row["code_version"]) == wanted
+            for row in spec.known["runs"].to_pylist()
+            if row["run_id"] in known and (row["recording_id"], row["code_version"]) == own
         ),
         None,
     )
     if run is not None:
         progress(0.0, f"Taking the centres of {log.name} from an earlier run")
         source = {key: run[key] for key in ("run_id", "recording_id", "rig_digest")}
-        stops, fits = order.known["stops"], order.known["marker_fits"]
+        stops, fits = spec.known["stops"], spec.known["marker_fits"]
         for stop, found in read_centres(stops, fits, run["run_id"], method):
             yield stop, found, source
         return
     run_id = secrets.token_hex(8)
-    done, tables = processing.process_log(order, log, run_id, progress)
+    done, tables = process_log(spec, log, run_id, progress)
     book.tables.append(tables)
     for one in done:
         digest = rig_digest(one.cloud.rig)
@@ -226,31 +226,31 @@ def _centres(
 
 
 def _share(progress: Progress, begin: float, end: float) -> Progress:
-    """Return the progress of a part of the work as a share of the whole."""
+    """Return the progress of a part as a share of the whole."""
     return lambda share, what: progress(begin + (end - begin) * share, what)
 
 
-def _files(result: AdjustedNetwork, answer: Row) -> dict[str, str]:
-    """Return what a network can be downloaded as."""
+def _files(result: AdjustedNetwork, plain: Row) -> dict[str, str]:
+    """Return the files of a network by name."""
     from spheremark.service.serialise.network_report import report
     from spheremark.storage.exports.network import format_coordinates, format_gama
 
     return {
-        "adjustment.json": json.dumps(answer),
-        "report.txt": report(answer),
+        "adjustment.json": json.dumps(plain),
+        "report.txt": report(plain),
         "coordinates.csv": format_coordinates(result),
         "gama.xml": format_gama(result),
     }
 
 
-def _summary(answer: Row, checks: list[Row]) -> str:
-    """Say in some sentences what an adjustment gave, and what is missing or weak."""
-    kind = "with control" if answer["datum"]["kind"] == "control" else "as a free network"
-    sigmas = [one["sigma_3d_m"] for one in answer["stations"]]
+def _summary(plain: Row, checks: list[Row]) -> str:
+    """Return the results of an adjustment in sentences, and what is missing or weak."""
+    kind = "with control" if plain["datum"]["kind"] == "control" else "as a free network"
+    sigmas = [one["sigma_3d_m"] for one in plain["stations"]]
     n = len(sigmas)
-    test = "passed" if answer["passes_global_test"] else "FAILED"
+    test = "passed" if plain["passes_global_test"] else "FAILED"
     parts = [
-        f"{n} station{'' if n == 1 else 's'} and {len(answer['marks'])} marks adjusted {kind}: "
+        f"{n} station{'' if n == 1 else 's'} and {len(plain['marks'])} marks adjusted {kind}: "
         f"stations with sigmas to {1000 * max(sigmas):.1f} mm (3-D), global test {test}."
     ]
     if checks:
@@ -258,8 +258,8 @@ def _summary(answer: Row, checks: list[Row]) -> str:
         parts.append(
             f"Left out in turn, control marks are met to {1000 * worst['difference_3d_m']:.1f} mm."
         )
-    if dropped := [one["mark"] for one in answer["excluded"] if one["kind"] == "control"]:
+    if dropped := [one["mark"] for one in plain["excluded"] if one["kind"] == "control"]:
         parts.append(f"Control that contradicts the rest was left out: {', '.join(dropped)}.")
-    if answer["refused"]:
-        parts.append("Without " + ", ".join(one["station"] for one in answer["refused"]) + ".")
-    return " ".join([*parts, *answer["warnings"]])
+    if plain["refused"]:
+        parts.append("Without " + ", ".join(one["station"] for one in plain["refused"]) + ".")
+    return " ".join([*parts, *plain["warnings"]])

@@ -13,7 +13,7 @@ import numpy as np
 
 from spheremark.pipelines.model import Origin, Rig, ScanLog, marker_name
 from spheremark.pipelines.scan.rigs import rig_digest, rig_to_mapping
-from spheremark.service.jobs.specification import Order, Outcome
+from spheremark.service.jobs.specification import JobResult, JobSpecification
 from spheremark.service.provenance import code_version
 
 if TYPE_CHECKING:
@@ -25,82 +25,82 @@ if TYPE_CHECKING:
 
 Row = dict[str, Any]
 
-_ESTIMATE = 0.7  # share of the work that the estimate takes; comparing the faces takes the rest
+_ESTIMATE = 0.7  # share of the time that the estimate takes; comparing the faces takes the rest
 
 
 @dataclass(frozen=True, slots=True)
 class _Logs:
-    """Logs that are read anew each time: a calibration goes through them often, one by one."""
+    """Logs that are read one by one in each pass of a calibration."""
 
-    order: Order
+    spec: JobSpecification
 
     def __iter__(self) -> Iterator[ScanLog]:
         from spheremark.storage.recordings import read_log
 
-        for one, name in zip(self.order.logs, self.order.log_names, strict=True):
+        for one, name in zip(self.spec.logs, self.spec.log_names, strict=True):
             log = read_log(one.url, digest=one.recording_id)
             yield replace(log, origin=Origin(name=name, digest=one.recording_id))
 
 
-def logs_of(order: Order) -> Iterable[ScanLog]:
-    """Return the logs of an order, to be gone through as often as one likes."""
-    return _Logs(order)
+def logs_of(spec: JobSpecification) -> Iterable[ScanLog]:
+    """Return the logs of a job; each iteration reads them again."""
+    return _Logs(spec)
 
 
-def work(order: Order, progress: Progress) -> Outcome:
-    """Calibrate the rig of the logs of an order."""
+def handle(spec: JobSpecification, progress: Progress) -> JobResult:
+    """Calibrate the rig of the logs of a job."""
     from spheremark.pipelines.calibration import calibrate
     from spheremark.storage.catalogue.products import documents
 
     start = perf_counter()
     found = calibrate(
-        logs_of(order),
-        config=order.config,
-        rig=order.rig,
+        logs_of(spec),
+        config=spec.config,
+        rig=spec.rig,
         progress=lambda share, what: progress(_ESTIMATE * share, what),
     )
-    tables, files, message = results(order, found, _part(progress, _ESTIMATE), start)
-    tables["documents"] = documents(order.result_id, files)
-    return Outcome(tables=tables, message=message)
+    tables, files, message = calibration_results(spec, found, _part(progress, _ESTIMATE), start)
+    tables["documents"] = documents(spec.result_id, files)
+    return JobResult(tables=tables, message=message)
 
 
-def results(
-    order: Order, found: Calibration, progress: Progress, start: float
+def calibration_results(
+    spec: JobSpecification, found: Calibration, progress: Progress, start: float
 ) -> tuple[dict[str, pa.Table], dict[str, str], str]:
     """Return the tables of a calibration, its files, and a sentence."""
     from spheremark.service.serialise.calibration import serialise_calibration
     from spheremark.storage.catalogue import calibrations
     from spheremark.storage.imports.survey_files import format_rig
 
-    answer = serialise_calibration(found)
-    gaps = [_gaps(order, rig, _half(progress, i)) for i, rig in enumerate((found.start, found.rig))]
-    rows = calibration_rows(answer, *gaps)
+    plain = serialise_calibration(found)
+    gaps = [_gaps(spec, rig, _half(progress, i)) for i, rig in enumerate((found.start, found.rig))]
+    rows = calibration_rows(plain, *gaps)
     rows["rigs"] = [_rig_row(rig) for rig in (found.start, found.rig)]
     rows["calibrations"][0] |= {
-        "job_id": order.job_id,
-        "survey_id": order.survey_id,
+        "job_id": spec.job_id,
+        "survey_id": spec.survey_id,
         "finished_at": datetime.now(UTC),
-        "config": order.config.text,
-        "config_digest": order.config.digest,
+        "config": spec.config.text,
+        "config_digest": spec.config.digest,
         "code_version": code_version(),
         "duration_s": perf_counter() - start,
     }
-    tables = calibrations.tables(order.result_id, rows)
-    files = {"calibration.json": json.dumps(answer), "rig.json": format_rig(found.rig)}
-    return tables, files, _summary(answer, *gaps)
+    tables = calibrations.tables(spec.result_id, rows)
+    files = {"calibration.json": json.dumps(plain), "rig.json": format_rig(found.rig)}
+    return tables, files, _summary(plain, *gaps)
 
 
-def _gaps(order: Order, rig: Rig, progress: Callable[[float], None]) -> FaceGaps:
-    """Compare what the two faces show with a rig."""
+def _gaps(spec: JobSpecification, rig: Rig, progress: Callable[[float], None]) -> FaceGaps:
+    """Compare the centres of the two faces with a rig."""
     from spheremark.pipelines.calibration.agreement import face_gaps
     from spheremark.pipelines.scan.stitching import split_stops
 
     def stops() -> Iterator[ScanLog]:
-        for i, log in enumerate(logs_of(order)):
-            progress(i / len(order.logs))
-            yield from split_stops(log, order.config.stitching)
+        for i, log in enumerate(logs_of(spec)):
+            progress(i / len(spec.logs))
+            yield from split_stops(log, spec.config.stitching)
 
-    return face_gaps(stops(), rig, order.config)
+    return face_gaps(stops(), rig, spec.config)
 
 
 def _half(progress: Progress, i: int) -> Callable[[float], None]:
@@ -110,12 +110,12 @@ def _half(progress: Progress, i: int) -> Callable[[float], None]:
 
 
 def _part(progress: Progress, begin: float) -> Progress:
-    """Return the progress of what is left of the work."""
+    """Return the progress of the rest as a share of the whole."""
     return lambda share, what: progress(begin + (1.0 - begin) * share, what)
 
 
-def calibration_rows(answer: Row, before: FaceGaps, after: FaceGaps) -> dict[str, list[Row]]:
-    """Return the rows of a calibration by table, without what names and made it."""
+def calibration_rows(plain: Row, before: FaceGaps, after: FaceGaps) -> dict[str, list[Row]]:
+    """Return the rows of a calibration by table, without the columns of its job."""
     held = [
         {
             "parameter": one["name"],
@@ -123,9 +123,9 @@ def calibration_rows(answer: Row, before: FaceGaps, after: FaceGaps) -> dict[str
             "is_estimated": False,
             "reason": one["reason"],
         }
-        for one in answer["not_separable"]
+        for one in plain["not_separable"]
     ]
-    told = [
+    estimated = [
         {
             "parameter": one["name"],
             "unit": one["unit"],
@@ -135,26 +135,26 @@ def calibration_rows(answer: Row, before: FaceGaps, after: FaceGaps) -> dict[str
             "sigma": one["sigma"],
             "reason": "",
         }
-        for one in answer["parameters"]
+        for one in plain["parameters"]
     ]
     return {
-        "calibrations": [_calibration(answer, before, after)],
+        "calibrations": [_calibration(plain, before, after)],
         "calibrated_parameters": [
-            {"place": place, **row} for place, row in enumerate((*told, *held))
+            {"place": place, **row} for place, row in enumerate((*estimated, *held))
         ],
         "calibration_gaps": [*_gap_rows(before, is_after=False), *_gap_rows(after, is_after=True)],
     }
 
 
-def _calibration(answer: Row, before: FaceGaps, after: FaceGaps) -> Row:
+def _calibration(plain: Row, before: FaceGaps, after: FaceGaps) -> Row:
     """Return the row of the calibration as a whole."""
     kept = ("rig_digest", "start_rig_digest", "stops", "n_spheres", "n_two_faced", "n_returns")
     return {
-        **{key: answer[key] for key in kept},
-        **{key: answer[key] for key in ("dof", "sigma0")},
-        **{key: answer[key] for key in ("residual_rms_before_m", "residual_rms_after_m")},
-        "parameters": [one["name"] for one in answer["parameters"]],
-        "covariance": json.dumps(answer["covariance"]),
+        **{key: plain[key] for key in kept},
+        **{key: plain[key] for key in ("dof", "sigma0")},
+        **{key: plain[key] for key in ("residual_rms_before_m", "residual_rms_after_m")},
+        "parameters": [one["name"] for one in plain["parameters"]],
+        "covariance": json.dumps(plain["covariance"]),
         "n_gaps": len(after.stops),
         "gap_rms_before_m": before.rms,
         "gap_rms_after_m": after.rms,
@@ -163,7 +163,7 @@ def _calibration(answer: Row, before: FaceGaps, after: FaceGaps) -> Row:
 
 
 def _gap_rows(gaps: FaceGaps, *, is_after: bool) -> Iterator[Row]:
-    """Yield how far apart the faces put each sphere: along the sight, across it, up."""
+    """Yield the gap between the faces of each sphere: along the line of sight, across it, up."""
     counts: dict[str, int] = {}
     azimuths = np.arctan2(gaps.p_base[:, 1], gaps.p_base[:, 0])
     for k in np.lexsort((azimuths, np.array(gaps.stops))):
@@ -190,13 +190,13 @@ def _rig_row(rig: Rig) -> Row:
     return {"rig_digest": rig_digest(rig), "name": rig.name, "rig": text}
 
 
-def _summary(answer: Row, before: FaceGaps, after: FaceGaps) -> str:
-    """Say in some sentences what a calibration gave, and what it could not tell."""
-    held = [one["name"].replace("_", " ") for one in answer["not_separable"]]
-    n = len(answer["stops"])
+def _summary(plain: Row, before: FaceGaps, after: FaceGaps) -> str:
+    """Return the results of a calibration in sentences, and what is not separable."""
+    held = [one["name"].replace("_", " ") for one in plain["not_separable"]]
+    n = len(plain["stops"])
     sentence = (
-        f"{len(answer['parameters'])} parameters from {answer['n_two_faced']} spheres seen on both "
+        f"{len(plain['parameters'])} parameters from {plain['n_two_faced']} spheres seen on both "
         f"faces in {n} scan{'' if n == 1 else 's'}: the faces "
         f"were {1000 * before.rms:.1f} mm apart and are {1000 * after.rms:.1f} mm (RMS)."
     )
-    return f"{sentence} Not told: {', '.join(held)}." if held else sentence
+    return f"{sentence} Not separable: {', '.join(held)}." if held else sentence

@@ -1,4 +1,4 @@
-"""A network's answer as rows of the database."""
+"""The JSON of a network as rows of the database."""
 
 from __future__ import annotations
 
@@ -15,14 +15,14 @@ _COV = [
 ]
 
 
-def network_rows(answer: Row, sources: Mapping[str, Row]) -> dict[str, list[Row]]:
-    """Return the rows of a network's answer by table, without what names and made it.
+def network_rows(network: Row, sources: Mapping[str, Row]) -> dict[str, list[Row]]:
+    """Return the rows of a network by table, without the columns of its job.
 
-    ``sources`` says of each station which stop of which run its centres are from.
+    ``sources`` gives for each station the stop and the run of its centres.
     """
-    seen = [row for row in answer["observations"] if row["used"]]
+    seen = [row for row in network["observations"] if row["used"]]
     return {
-        "adjustments": [_adjustment(answer, sources)],
+        "adjustments": [_adjustment(network, sources)],
         "adjusted_stations": [
             sources[row["name"]]
             | _placed(row, row["position_covariance_m2"])
@@ -33,42 +33,42 @@ def network_rows(answer: Row, sources: Mapping[str, Row]) -> dict[str, list[Row]
                 "rotation": [value for line in row["rotation"] for value in line],
                 "cov_motion": [value for line in row["covariance"] for value in line],
             }
-            for row in answer["stations"]
+            for row in network["stations"]
         ],
         "adjusted_marks": [
             {"mark": row["name"]}
             | {key: row[key] for key in ("is_control", "status", "reason")}
             | _placed(row, row["covariance_m2"])
             | _mean_redundancy(seen, "mark", row["name"])
-            for row in answer["marks"]
+            for row in network["marks"]
         ],
-        "adjusted_observations": list(_observations(answer)),
-        "refused_stations": answer["refused"],
-        "control_checks": list(_checks(answer)),
-        "repeated_stops": list(_repeats(answer)),
+        "adjusted_observations": list(_observations(network)),
+        "refused_stations": network["refused"],
+        "control_checks": list(_checks(network)),
+        "repeated_stops": list(_repeats(network)),
     }
 
 
-def _adjustment(answer: Row, sources: Mapping[str, Row]) -> Row:
+def _adjustment(network: Row, sources: Mapping[str, Row]) -> Row:
     """Return the row of the adjustment as a whole."""
-    bias = answer["range_bias"] or {}
-    rigs = {sources[row["name"]]["rig_digest"] for row in answer["stations"]}
+    bias = network["range_bias"] or {}
+    rigs = {sources[row["name"]]["rig_digest"] for row in network["stations"]}
     return {
-        **{key: answer[key] for key in ("status", "warnings", "dof", "sigma0")},
-        **{key: answer[key] for key in ("n_observations", "n_unknowns", "passes_global_test")},
-        "n_stations": len(answer["stations"]),
-        "n_marks": len(answer["marks"]),
-        "n_left_out": len(answer["excluded"]),
-        "n_refused": len(answer["refused"]),
-        "n_control_marks": len(answer["datum"]["control_marks"]),
-        "datum": answer["datum"]["kind"],
-        "datum_text": answer["datum"]["text"],
-        "fit_method": answer["method"],
-        "vtpv": answer["global_test"]["vtpv"],
-        "vtpv_limit": answer["global_test"]["limit"],
-        "test_level": answer["global_test"]["level"],
-        "w_limit": answer["critical_w"],
-        **{f"variance_factor_{key}": value for key, value in answer["variance_factors"].items()},
+        **{key: network[key] for key in ("status", "warnings", "dof", "sigma0")},
+        **{key: network[key] for key in ("n_observations", "n_unknowns", "passes_global_test")},
+        "n_stations": len(network["stations"]),
+        "n_marks": len(network["marks"]),
+        "n_left_out": len(network["excluded"]),
+        "n_refused": len(network["refused"]),
+        "n_control_marks": len(network["datum"]["control_marks"]),
+        "datum": network["datum"]["kind"],
+        "datum_text": network["datum"]["text"],
+        "fit_method": network["method"],
+        "vtpv": network["global_test"]["vtpv"],
+        "vtpv_limit": network["global_test"]["limit"],
+        "test_level": network["global_test"]["level"],
+        "w_limit": network["critical_w"],
+        **{f"variance_factor_{key}": value for key, value in network["variance_factors"].items()},
         "range_bias_m": bias.get("value_m"),
         "sigma_range_bias_m": bias.get("sigma_m"),
         "rig_digest": next(iter(rigs)) if len(rigs) == 1 else None,
@@ -92,14 +92,14 @@ def _mean_redundancy(observations: Sequence[Row], key: str, name: str) -> Row:
     return {"mean_redundancy": sum(known) / len(known) if known else None}
 
 
-def _observations(answer: Row) -> Iterator[Row]:
+def _observations(network: Row) -> Iterator[Row]:
     """Yield the row of each centre, levelling and control mark, used or not."""
     reasons = {
         (one["kind"], one["station"], one["marker"] or one["mark"]): one
-        for one in answer["excluded"]
+        for one in network["excluded"]
     }
 
-    def judged(kind: str, row: Row) -> Row:
+    def tested(kind: str, row: Row) -> Row:
         own = row.get("marker") or (row.get("mark") if kind == "control" else None)
         left = reasons.pop((kind, row.get("station"), own), None)
         left = left or reasons.pop((kind, row.get("station"), row.get("mark")), None)
@@ -107,9 +107,9 @@ def _observations(answer: Row) -> Iterator[Row]:
         names = {key: row.get(key) for key in ("station", "marker", "mark")}
         return names | {"kind": kind, "used": row["used"], "reason": reason} | _tests(row)
 
-    yield from (judged("centre", row) for row in answer["observations"])
-    yield from (judged("gravity", row) for row in answer["gravity"])
-    yield from (judged("control", row) for row in answer["control"])
+    yield from (tested("centre", row) for row in network["observations"])
+    yield from (tested("gravity", row) for row in network["gravity"])
+    yield from (tested("control", row) for row in network["control"])
     for (kind, station, _), one in reasons.items():
         yield {
             "kind": kind,
@@ -140,10 +140,10 @@ def _tests(row: Row) -> Row:
     }
 
 
-def _checks(answer: Row) -> Iterator[Row]:
+def _checks(network: Row) -> Iterator[Row]:
     """Yield, for each control mark, where all else puts it, minus where it was given."""
-    counts = {one["name"]: one["n_observations"] for one in answer["marks"]}
-    for row in answer["control"]:
+    counts = {one["name"]: one["n_observations"] for one in network["marks"]}
+    for row in network["control"]:
         if row["predicted_minus_given_m"] is None:
             continue
         yield {"mark": row["mark"], "n_observations": counts[row["mark"]]} | {
@@ -156,9 +156,9 @@ def _checks(answer: Row) -> Iterator[Row]:
         }
 
 
-def _repeats(answer: Row) -> Iterator[Row]:
+def _repeats(network: Row) -> Iterator[Row]:
     """Yield the stations that stand at one place."""
-    for one in answer["repeated_stops"]:
+    for one in network["repeated_stops"]:
         station, again = one["stations"]
         yield {"station": station, "again": again} | {
             **{f"apart_{axis}_m": value for axis, value in zip(_AXES, one["apart_m"], strict=True)},

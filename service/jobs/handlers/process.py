@@ -17,7 +17,7 @@ from spheremark.pipelines.model import (
     Status,
     StopResult,
 )
-from spheremark.service.jobs.specification import Log, Order, Outcome
+from spheremark.service.jobs.specification import JobResult, JobSpecification, Log
 from spheremark.service.provenance import code_version, forget_peak_memory, peak_memory
 
 if TYPE_CHECKING:
@@ -26,14 +26,14 @@ if TYPE_CHECKING:
     from spheremark.pipelines.survey import Progress
 
 
-def work(order: Order, progress: Progress) -> Outcome:
-    """Process the one log of an order."""
-    stops, rows = process_log(order, order.logs[0], order.result_id, progress)
-    return Outcome(tables=rows, message=summary(stops, order.marks))
+def handle(spec: JobSpecification, progress: Progress) -> JobResult:
+    """Process the one log of a job."""
+    stops, rows = process_log(spec, spec.logs[0], spec.result_id, progress)
+    return JobResult(tables=rows, message=summary(stops, spec.marks))
 
 
 def process_log(
-    order: Order, recording: Log, run_id: str, progress: Progress
+    spec: JobSpecification, recording: Log, run_id: str, progress: Progress
 ) -> tuple[tuple[StopResult, ...], dict[str, pa.Table]]:
     """Read a log, run the chain, store the clouds, make the tables of a run."""
     from spheremark.pipelines.survey import process
@@ -44,30 +44,30 @@ def process_log(
     forget_peak_memory()
     progress(0.0, f"Reading {recording.name}")
     stops = process(
-        _read(recording),  # and not kept: it is let go once it is stitched
-        config=order.config,
-        rig=order.rig,
-        marks=order.marks,
+        _read(recording),  # released once it is stitched: no reference is kept
+        config=spec.config,
+        rig=spec.rig,
+        marks=spec.marks,
         progress=lambda share, what: progress(0.1 + 0.8 * share, what),
     )
     progress(0.9, "Storing the results")
-    clouds = {stop.name: write_cloud(stop, order.clouds_url) for stop in stops}
+    clouds = {stop.name: write_cloud(stop, spec.clouds_url) for stop in stops}
     run = RunInfo(
         run_id=run_id,
-        job_id=order.job_id,
-        survey_id=order.survey_id,
+        job_id=spec.job_id,
+        survey_id=spec.survey_id,
         recording_id=recording.recording_id,
-        config=order.config,
+        config=spec.config,
         code_version=code_version(),
         finished_at=datetime.now(UTC),
         duration=perf_counter() - start,
         peak_memory_bytes=peak_memory(),
     )
-    return stops, tables(run, stops, marks=order.marks, clouds=clouds)
+    return stops, tables(run, stops, marks=spec.marks, clouds=clouds)
 
 
 def summary(stops: Sequence[StopResult], marks: ControlMarks | None) -> str:
-    """Say in a sentence or two what a log gave, and what is missing, weak or contradicted."""
+    """Return the results of a log in sentences: markers, station, contradictions with control."""
     sentences = [_stop_summary(stop) for stop in stops]
     if marks is not None:
         sentences += [text for stop in stops if (text := _contradiction(stop, marks))]
@@ -75,7 +75,7 @@ def summary(stops: Sequence[StopResult], marks: ControlMarks | None) -> str:
 
 
 def _stop_summary(stop: StopResult) -> str:
-    """Say what one stop gave, by the first methods."""
+    """Return the result of one stop by the first methods in a sentence."""
     n_markers = len(next(iter(stop.fits.values())).fits)
     text = f"{stop.name}: {n_markers} marker{'' if n_markers == 1 else 's'}"
     if not stop.fixes:
@@ -91,7 +91,7 @@ def _stop_summary(stop: StopResult) -> str:
 
 
 def _contradiction(stop: StopResult, marks: ControlMarks) -> str:
-    """Say which control marks the distances in a scan contradict, if any."""
+    """Name the control marks that the distances in a scan contradict, if any."""
     checks = stop.distances
     is_fixed = any(isinstance(fix, StationFix) for fix in stop.fixes.values())
     if checks is None or not checks.suspects or not is_fixed:
@@ -104,7 +104,7 @@ def _contradiction(stop: StopResult, marks: ControlMarks) -> str:
 
 
 def _read(recording: Log) -> ScanLog:
-    """Read a log; it is called as the service calls the recording."""
+    """Read a log, with the name of its recording."""
     from spheremark.storage.recordings import read_log
 
     log = read_log(recording.url, digest=recording.recording_id)

@@ -1,7 +1,7 @@
 """Jobs of the kind ``site``: all stops of a survey in one frame, as clouds and as ground.
 
-Poses are those of the newest adjustment, one with control before a free one; where there is none,
-of each station alone.
+Poses are those of the newest adjustment, one with control before a free one; without any, those of
+each station alone.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from pydantic import Field
 
 from spheremark.pipelines.model import Origin
 from spheremark.pipelines.scan.rigs import rig_from_mapping
-from spheremark.service.jobs.specification import Options, Order, Outcome
+from spheremark.service.jobs.specification import JobResult, JobSpecification, Options
 from spheremark.service.provenance import code_version
 
 if TYPE_CHECKING:
@@ -63,7 +63,7 @@ _RIGS = "SELECT rig_digest, rig FROM rigs WHERE list_contains($digests::VARCHAR[
 
 
 class SiteOptions(Options):
-    """What one can choose about the products of a site."""
+    """Options of the products of a site."""
 
     cell_m: float = Field(default=0.25, ge=0.05, le=10, description="Edge of a cell [m].")
     ground_range_m: float = Field(
@@ -84,42 +84,42 @@ class SiteOptions(Options):
     clouds: bool = Field(default=True, description="Make the clouds, beside the ground.")
 
 
-def gather(catalogue: Catalogue, order: Order) -> Mapping[str, pa.Table]:
-    """Return the poses of the survey's stations and the rigs that they were found with."""
-    wanted = {"survey": order.survey_id}
-    poses = catalogue.table(_ADJUSTED, wanted)
+def gather(catalogue: Catalogue, spec: JobSpecification) -> Mapping[str, pa.Table]:
+    """Return the poses of the survey's stations and the rigs that they were computed with."""
+    survey = {"survey": spec.survey_id}
+    poses = catalogue.table(_ADJUSTED, survey)
     if not len(poses):
-        poses = catalogue.table(_FIXED, wanted)
+        poses = catalogue.table(_FIXED, survey)
     digests = sorted({digest for digest in poses.column("rig_digest").to_pylist() if digest})
     return {"poses": poses, "rigs": catalogue.table(_RIGS, {"digests": digests})}
 
 
-def work(order: Order, progress: Progress) -> Outcome:
+def handle(spec: JobSpecification, progress: Progress) -> JobResult:
     """Make the products of a site."""
-    from spheremark.service.jobs.site import ENDINGS, KINDS, SiteWish, make_site
+    from spheremark.service.jobs.site import ENDINGS, KINDS, SiteRequest, make_site
     from spheremark.storage.catalogue.products import product_rows
     from spheremark.storage.files import keep_file
 
-    own = {key: order.options[key] for key in SiteOptions.model_fields if key in order.options}
+    own = {key: spec.options[key] for key in SiteOptions.model_fields if key in spec.options}
     options = SiteOptions.model_validate(own).model_dump()
-    rows = {(row["recording_id"], row["stop"]): row for row in order.known["poses"].to_pylist()}
-    poses = _poses(order, rows)
+    rows = {(row["recording_id"], row["stop"]): row for row in spec.known["poses"].to_pylist()}
+    poses = _poses(spec, rows)
     with scratch() as folder:
         kinds = KINDS if options["clouds"] else ("geotiff",)
-        wish = _wish(SiteWish, {k: folder / f"site{ENDINGS[k]}" for k in kinds}, options)
-        stops = _stops(order, rows, poses, progress)
-        site = make_site(stops, tuple(poses.values()), wish)
+        request = _request(SiteRequest, {k: folder / f"site{ENDINGS[k]}" for k in kinds}, options)
+        stops = _stops(spec, rows, poses, progress)
+        site = make_site(stops, tuple(poses.values()), request)
         progress(0.95, "Keeping the files")
-        kept = {kind: keep_file(path, order.clouds_url) for kind, path in wish.targets.items()}
-    made = _rows(site, kept, _common(order, options, next(iter(rows.values())), site.n_stations))
+        kept = {kind: keep_file(path, spec.clouds_url) for kind, path in request.targets.items()}
+    made = _rows(site, kept, _common(spec, options, next(iter(rows.values())), site.n_stations))
     found = {recording for recording, _ in poses}
-    missing = [log.name for log in order.logs if log.recording_id not in found]
-    return Outcome(tables={"site_products": product_rows(made)}, message=_summary(made, missing))
+    missing = [log.name for log in spec.logs if log.recording_id not in found]
+    return JobResult(tables={"site_products": product_rows(made)}, message=_summary(made, missing))
 
 
 @contextmanager
 def scratch() -> Iterator[Path]:
-    """Lend a folder; remove those of workers that were ended before they could do so."""
+    """Yield a folder; remove those of workers that were ended before they could do so."""
     for left in Path(gettempdir()).glob(f"{_SCRATCH}*"):
         with suppress(OSError), (left / _IN_USE).open() as lock:
             fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)  # refused while its owner lives
@@ -129,18 +129,18 @@ def scratch() -> Iterator[Path]:
         yield Path(folder)
 
 
-def _poses(order: Order, rows: Mapping[Key, Row]) -> dict[Key, StationPose]:
-    """Return the poses of the logs that are wanted."""
+def _poses(spec: JobSpecification, rows: Mapping[Key, Row]) -> dict[Key, StationPose]:
+    """Return the poses of the stations of the job's logs."""
     from spheremark.service.jobs.site import pose_from_row, require_poses
 
-    wanted = {log.recording_id for log in order.logs}
-    poses = {key: pose_from_row(key[1], row) for key, row in rows.items() if key[0] in wanted}
+    recordings = {log.recording_id for log in spec.logs}
+    poses = {key: pose_from_row(key[1], row) for key, row in rows.items() if key[0] in recordings}
     require_poses(poses)
     return poses
 
 
-def _wish(kind: Any, targets: Mapping[str, Path], options: Row) -> Any:
-    """Return what is wanted of a site."""
+def _request(kind: Any, targets: Mapping[str, Path], options: Row) -> Any:
+    """Return the request for a site."""
     from spheremark.service.jobs.site import elevation_of
 
     return kind(
@@ -153,7 +153,10 @@ def _wish(kind: Any, targets: Mapping[str, Path], options: Row) -> Any:
 
 
 def _stops(
-    order: Order, rows: Mapping[Key, Row], poses: Mapping[Key, StationPose], progress: Progress
+    spec: JobSpecification,
+    rows: Mapping[Key, Row],
+    poses: Mapping[Key, StationPose],
+    progress: Progress,
 ) -> Iterator[tuple[StitchedCloud, StationPose]]:
     """Yield the stops that have poses, log by log."""
     from spheremark.service.jobs.site import stitched
@@ -161,30 +164,30 @@ def _stops(
 
     rigs = {
         row["rig_digest"]: rig_from_mapping(json.loads(row["rig"]))
-        for row in order.known["rigs"].to_pylist()
+        for row in spec.known["rigs"].to_pylist()
     }
-    for i, log in enumerate(order.logs):
-        progress(0.95 * i / len(order.logs), f"Adding {log.name} to the site")
+    for i, log in enumerate(spec.logs):
+        progress(0.95 * i / len(spec.logs), f"Adding {log.name} to the site")
         own = {stop: pose for (key, stop), pose in poses.items() if key == log.recording_id}
         if own:
             read = read_log(log.url, digest=log.recording_id)
             named = replace(read, origin=Origin(name=log.name, digest=log.recording_id))
 
             def rig_of(stop: str, key: str = log.recording_id) -> Rig | None:
-                return rigs.get(rows[key, stop]["rig_digest"], order.rig)
+                return rigs.get(rows[key, stop]["rig_digest"], spec.rig)
 
-            yield from stitched((named,), order.config, rig_of, own)
+            yield from stitched((named,), spec.config, rig_of, own)
 
 
-def _common(order: Order, options: Row, source: Row, n_stations: int) -> Row:
-    """Return what all products of a job share."""
+def _common(spec: JobSpecification, options: Row, source: Row, n_stations: int) -> Row:
+    """Return the columns that all products of a job share."""
     from spheremark.service.jobs.site import options_text
 
-    text = f"{order.config.text}\n{options_text(options)}"
+    text = f"{spec.config.text}\n{options_text(options)}"
     return {
-        "product_id": order.result_id,
-        "job_id": order.job_id,
-        "survey_id": order.survey_id,
+        "product_id": spec.result_id,
+        "job_id": spec.job_id,
+        "survey_id": spec.survey_id,
         "n_stations": n_stations,
         "poses": source["poses"],
         "adjustment_id": source["adjustment_id"],
@@ -214,7 +217,7 @@ def _rows(site: Any, kept: Mapping[str, Any], common: Row) -> list[Row]:
 
 
 def _summary(rows: list[Row], missing: list[str]) -> str:
-    """Say in some sentences what was made, and what it lacks."""
+    """Return the products in sentences, and the logs without a pose."""
     ground = next(row for row in rows if row["kind"] == "geotiff")
     poses = {"fixes": "each station alone", "free": "a free network", "control": "a network"}
     text = (
