@@ -5,6 +5,7 @@ from __future__ import annotations
 import resource
 import subprocess
 from contextlib import suppress
+from datetime import UTC, datetime
 from functools import lru_cache
 from importlib import metadata
 from pathlib import Path
@@ -38,3 +39,9 @@ def code_version() -> str:
         if done.returncode == 0:
             return f"{release}+g{done.stdout.strip().replace('-', '.')}"
     return release
+
+
+def made_now() -> dict[str, str]:
+    """Return the time and the version of the code, for a report that is made now."""
+    now = datetime.now(UTC).isoformat(timespec="seconds")
+    return {"made_at": now, "code_version": code_version()}

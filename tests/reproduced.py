@@ -3,7 +3,8 @@
 import numpy as np
 
 from spheremark.pipelines.config import SurveyConfig
-from spheremark.pipelines.evaluation.reproduction import (
+from spheremark.pipelines.evaluation.reproduction.noise import RangeNoise
+from spheremark.pipelines.evaluation.reproduction.plan import (
     CENTRE,
     CENTRE_REAL,
     DISTANCES,
@@ -13,12 +14,9 @@ from spheremark.pipelines.evaluation.reproduction import (
     LANE_2,
     OURS,
     PAPER,
-    Centres,
-    Example,
-    RangeNoise,
-    Reproduction,
     Scan,
 )
+from spheremark.pipelines.evaluation.reproduction.scans import Centres, Example, Reproduction
 from spheremark.pipelines.published import TABLE_2
 
 SIGMA = {OURS: 0.001, PAPER: 0.003, FULL_SPHERE: 0.003, GROUND: 0.003}  # [m] per axis at 8 m

@@ -1,29 +1,23 @@
-"""How surely markers are found, and nothing else is: precision and recall against the truth.
-
-The only room that may compare extraction with what was hidden: worlds by seed, several stops of
-each, every marker by its returns and how much of it can be seen, every decoy by its kind.
-"""
+"""Precision and recall of extraction against the truth, by class of marker and kind of decoy."""
 
 from __future__ import annotations
 
 import re
 from collections import Counter
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
-from typing import Any
+from functools import partial
+from typing import NamedTuple
 
 import numpy as np
 
 from spheremark.pipelines.config import ExtractionConfig, StitchingConfig
 from spheremark.pipelines.detection import extract
+from spheremark.pipelines.evaluation.experiment import Column, Experiment, Plain, Table
 from spheremark.pipelines.geometry import inverse, transform
 from spheremark.pipelines.model import Array, MarkerCandidates, StitchedCloud
 from spheremark.pipelines.scan.stitching import stitch
-from spheremark.pipelines.simulation.field import Field
-from spheremark.pipelines.simulation.options import SimulationConfig
+from spheremark.pipelines.simulation import SimulationConfig, scenario, simulate_stop
 from spheremark.pipelines.simulation.rig import nominal_rig
-from spheremark.pipelines.simulation.scenarios import scenario
-from spheremark.pipelines.simulation.stop import Progress, simulate_stop
 from spheremark.pipelines.simulation.visibility import visible_shares
 
 _FIELD_STOPS = ("lane3-stop4", "lane1-stop1", "lane5-stop6")
@@ -37,100 +31,42 @@ DETECTION_PLAN: Mapping[str, Sequence[str]] = {
 N_MANY, N_FEW, HALF = 20, 6, 0.5
 """Returns from which a marker must be found, from which it may be, and how much must be visible."""
 
-_ON = 0.07  # [m] of depth: within this of a marker's surface a return is one of its own
-_MEASURED = re.compile(r"\d+(\.\d+)?")  # what differs between reasons that are the same
-_NEAR_DECOY = 0.3  # [m] from a decoy within which a refusal is about it
-_CLASSES = (
+CLASSES = (
     f"at least {N_MANY} returns, half visible",
     f"{N_FEW} to {N_MANY - 1} returns, half visible",
     "fewer returns, or mostly hidden",
 )
+"""Classes of markers by returns and visible share."""
+
+_ON = 0.07  # [m] of depth: within this of a marker's surface a return is one of its own
+_NEAR_DECOY = 0.3  # [m] from a decoy within which a rejection is about it
+_MEASURED = re.compile(r"\d+(\.\d+)?")  # figures, in which equal reasons differ
+_N_REASONS = 3  # the most frequent reasons that a table shows
 
 
-@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
-class Tally:
-    """How many things of one kind a scenario held, and what became of them.
+class _Thing(NamedTuple):
+    """A marker or a decoy in one scan, and why it was not taken for a marker."""
 
-    Attributes
-    ----------
-    scenario : str
-        The world.
-    kind : str
-        Class of marker, or kind of decoy.
-    is_marker : bool
-        Whether finding it is right.
-    n : int
-        How often it stood in a scan.
-    n_found : int
-        How often it was taken for a marker.
-    reasons : mapping of str to int
-        Beginning of each reason for which it was refused, and how often.
-    """
-
-    scenario: str
     kind: str
     is_marker: bool
-    n: int
-    n_found: int
-    reasons: Mapping[str, int] = field(default_factory=dict)
+    is_found: bool
+    reason: str
 
 
-@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
-class Detection:
-    """Precision and recall of extraction over many scans.
+class _Score(NamedTuple):
+    """One scan against the truth."""
 
-    Attributes
-    ----------
-    tallies : tuple of Tally
-        By scenario and kind.
-    n_scans : mapping of str to int
-        Scans of each scenario.
-    n_false : mapping of str to int
-        Candidates of each scenario that are no marker.
-    worst : mapping of str to int
-        The most of them in one scan.
-    """
-
-    tallies: tuple[Tally, ...]
-    n_scans: Mapping[str, int]
-    n_false: Mapping[str, int]
-    worst: Mapping[str, int]
-
-    def recall(self, name: str, place: int) -> float:
-        """Return the share of the markers of a class that was found."""
-        mine = [t for t in self.tallies if t.scenario == name and t.kind == _CLASSES[place]]
-        return mine[0].n_found / mine[0].n if mine else float("nan")
-
-    def to_mapping(self) -> dict[str, Any]:
-        """Return plain values, for JSON."""
-        return {name: self._scenario(name) for name in self.n_scans}
-
-    def _scenario(self, name: str) -> dict[str, Any]:
-        """Return the plain values of one scenario."""
-        mine = [t for t in self.tallies if t.scenario == name]
-        n_true = sum(t.n_found for t in mine if t.is_marker)
-        n_all = n_true + self.n_false[name]
-        rows = [
-            {"kind": t.kind, "n": t.n, "n_found": t.n_found, "reasons": dict(t.reasons)}
-            for t in mine
-        ]
-        return {
-            "n_scans": self.n_scans[name],
-            "precision": n_true / n_all if n_all else None,
-            "n_false": self.n_false[name],
-            "n_false_worst_scan": self.worst[name],
-            "markers": [r for r, t in zip(rows, mine, strict=True) if t.is_marker],
-            "decoys": [r for r, t in zip(rows, mine, strict=True) if not t.is_marker],
-        }
+    scenario: str
+    things: list[_Thing]
+    n_false: int
 
 
-def detection(
+def extraction(
     plan: Mapping[str, Sequence[str]],
     seeds: Sequence[int],
-    config: SimulationConfig,
-    progress: Progress | None = None,
-) -> Detection:
-    """Measure how surely extraction finds markers in worlds of known truth.
+    config: SimulationConfig | None = None,
+) -> Experiment[tuple[str, int, str], _Score, Plain]:
+    """Return the experiment that measures extraction in worlds of known truth.
 
     Parameters
     ----------
@@ -138,67 +74,99 @@ def detection(
         Scenarios, and the stops of each, as ``DETECTION_PLAN``.
     seeds : sequence of int
         A world of each scenario is made for each.
-    config : SimulationConfig
+    config : SimulationConfig, optional
         How the rig moves and measures.
-    progress : callable
-        Is told the fraction done, 0 to 1, and what is being done; may raise to cancel.
 
     Returns
     -------
-    Detection
-        Counts by scenario and kind.
+    Experiment
+        Its report has precision, false candidates, and rows of markers and decoys by scenario.
 
     Notes
     -----
     A marker counts as found if a candidate's rough centre lies within its radius. Candidates near
     no marker are false; each is charged to the nearest decoy. Truth is used for the score alone.
     """
-    scans = [(name, seed, stop) for name in plan for seed in seeds for stop in plan[name]]
-    scores = []
-    for i, (name, seed, stop) in enumerate(scans):
-        if progress:
-            progress(i / len(scans), f"{name} {seed}, {stop}")
-        scores.append(_score(scenario(name, seed), stop, config))
-    return _summed(tuple(plan), scores)
+    return Experiment(
+        worlds=[(name, seed, stop) for name in plan for seed in seeds for stop in plan[name]],
+        run_world=partial(_score, config=config or SimulationConfig()),
+        pool=lambda scores: {
+            "seeds": list(seeds),
+            "scenarios": {name: _summary(name, scores) for name in plan},
+        },
+    )
 
 
-@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
-class _Score:
-    """One scan: each thing's kind, whether it is a marker and was found, and why it was not."""
+def extraction_tables(report: Plain) -> tuple[Table, ...]:
+    """Return a table of markers and decoys for each scenario.
 
-    scenario: str
-    things: tuple[tuple[str, bool, bool, str], ...]
-    n_false: int
+    Parameters
+    ----------
+    report : dict
+        Report of ``extraction``.
 
-
-def _score(world: Field, stop: str, config: SimulationConfig) -> _Score:
-    """Simulate one stop and compare what is found there with the truth."""
-    simulated = simulate_stop(world, stop, config)
-    cloud = stitch(simulated.log, nominal_rig(config), StitchingConfig())
-    found = extract(cloud, ExtractionConfig(), world.marker_radius)
-    T_base_site = inverse(simulated.truth.T_site_base)
-    marks = transform(T_base_site, world.marks.p_site)
-    decoys = transform(T_base_site, np.array([d.p_site for d in world.decoys]).reshape(-1, 3))
-    eye = simulated.truth.T_site_base[:3, 3]
-    shares = visible_shares(world.scene, world.marks.p_site, world.marker_radius, eye)
-    rough = np.array([c.p_base_rough for c in found.candidates]).reshape(-1, 3)
-    gaps = np.linalg.norm(rough[:, None] - marks[None], axis=2)
-    is_true = (gaps < world.marker_radius).any(axis=1)
-    is_found = (gaps < world.marker_radius).any(axis=0)
-    things = [
-        (
-            _class_of(_n_on(cloud, p, world.marker_radius), share),
-            True,
-            bool(hit),
-            "" if hit else _reason_near(found, p),
+    Returns
+    -------
+    tuple of Table
+        In the order of the scenarios.
+    """
+    columns = (
+        Column("kind", "what"),
+        Column("n", "in scans", "", ",d"),
+        Column("n_found", "taken for a marker", "", ",d"),
+        Column(lambda row: f"{row['n_found'] / row['n']:.3f}", "share", "", ">"),
+        Column(_main_reasons, "why not"),
+    )
+    tables = []
+    for name, one in report["scenarios"].items():
+        precision = "none found" if one["precision"] is None else f"{one['precision']:.4f}"
+        title = (
+            f"{name}: {one['n_scans']} scans, precision {precision}, {one['n_false']} false, "
+            f"at most {one['n_false_worst_scan']} in one scan"
         )
-        for p, share, hit in zip(marks, shares, is_found, strict=True)
+        rows = one["markers"] + one["decoys"]
+        tables.append(Table(title=title, columns=columns, rows=rows))
+    return tuple(tables)
+
+
+def _main_reasons(row: Plain) -> str:
+    """Return the most frequent reasons of a row with their counts."""
+    return "; ".join(f"{why} ({n})" for why, n in list(row["reasons"].items())[:_N_REASONS])
+
+
+def _score(world: tuple[str, int, str], *, config: SimulationConfig) -> _Score:
+    """Simulate one stop and compare the candidates with the truth."""
+    name, seed, stop = world
+    field = scenario(name, seed)
+    simulated = simulate_stop(field, stop, config)
+    cloud = stitch(simulated.log, nominal_rig(config), StitchingConfig())
+    found = extract(cloud, ExtractionConfig(), field.marker_radius)
+    T_base_site = inverse(simulated.truth.T_site_base)
+    marks = transform(T_base_site, field.marks.p_site)
+    decoys = transform(T_base_site, np.array([d.p_site for d in field.decoys]).reshape(-1, 3))
+    origin = simulated.truth.T_site_base[:3, 3]
+    shares = visible_shares(field.scene, field.marks.p_site, field.marker_radius, origin)
+    rough = np.array([c.p_base_rough for c in found.candidates]).reshape(-1, 3)
+    is_near = np.linalg.norm(rough[:, None] - marks[None], axis=2) < field.marker_radius
+    is_false = ~is_near.any(axis=1)
+    charged = _nearest(decoys, rough[is_false])
+    kinds = [
+        _class_of(_n_on(cloud, p, field.marker_radius), share)
+        for p, share in zip(marks, shares, strict=True)
     ]
-    taken = _nearest(decoys, rough[~is_true])
-    for i, decoy in enumerate(world.decoys):
-        reason = "" if i in taken else _reason_near(found, decoys[i])
-        things.append((decoy.kind, False, i in taken, reason))
-    return _Score(scenario=world.scenario, things=tuple(things), n_false=int((~is_true).sum()))
+    is_found = [*is_near.any(axis=0).tolist(), *(i in charged for i in range(len(decoys)))]
+    things = [
+        _Thing(kind, place < len(marks), hit, "" if hit else _reason_near(found, p))
+        for place, (kind, hit, p) in enumerate(
+            zip(
+                [*kinds, *(decoy.kind for decoy in field.decoys)],
+                is_found,
+                [*marks, *decoys],
+                strict=True,
+            )
+        )
+    ]
+    return _Score(field.scenario, things, int(is_false.sum()))
 
 
 def _nearest(decoys: Array, places: Array) -> set[int]:
@@ -222,12 +190,12 @@ def _n_on(cloud: StitchedCloud, centre: Array, radius: float) -> int:
 def _class_of(n_on: int, share: float) -> str:
     """Return the class of a marker by its returns and its visible share."""
     if share < HALF or n_on < N_FEW:
-        return _CLASSES[2]
-    return _CLASSES[0] if n_on >= N_MANY else _CLASSES[1]
+        return CLASSES[2]
+    return CLASSES[0] if n_on >= N_MANY else CLASSES[1]
 
 
 def _reason_near(found: MarkerCandidates, place: Array) -> str:
-    """Return how the reason begins for which something at a place was refused, less its figures."""
+    """Return the beginning of the reason for a rejection near a place, without figures."""
     gaps = [float(np.linalg.norm(r.p_base - place)) for r in found.rejected]
     if not gaps or min(gaps) > _NEAR_DECOY:
         return "Never looked like a marker"
@@ -235,28 +203,34 @@ def _reason_near(found: MarkerCandidates, place: Array) -> str:
     return _MEASURED.sub("…", clause)
 
 
-def _summed(names: Sequence[str], scores: Sequence[_Score]) -> Detection:
-    """Return the counts over all scans."""
-    tallies = []
-    for name in names:
-        things = [thing for score in scores if score.scenario == name for thing in score.things]
-        kinds = sorted({(not is_marker, kind) for kind, is_marker, _, _ in things})
-        for is_decoy, kind in kinds:
-            mine = [t for t in things if t[0] == kind and t[1] is not is_decoy]
-            tallies.append(
-                Tally(
-                    scenario=name,
-                    kind=kind,
-                    is_marker=not is_decoy,
-                    n=len(mine),
-                    n_found=sum(hit for _, _, hit, _ in mine),
-                    reasons=dict(Counter(reason for *_, reason in mine if reason).most_common()),
-                )
-            )
-    false = {name: [s.n_false for s in scores if s.scenario == name] for name in names}
-    return Detection(
-        tallies=tuple(tallies),
-        n_scans={name: len(counts) for name, counts in false.items()},
-        n_false={name: sum(counts) for name, counts in false.items()},
-        worst={name: max(counts, default=0) for name, counts in false.items()},
-    )
+def _summary(name: str, scores: Sequence[_Score]) -> Plain:
+    """Return precision and counts of one scenario."""
+    own = [score for score in scores if score.scenario == name]
+    things = [thing for score in own for thing in score.things]
+    false = [score.n_false for score in own]
+    n_true = sum(thing.is_found for thing in things if thing.is_marker)
+    n_all = n_true + sum(false)
+    return {
+        "n_scans": len(own),
+        "precision": n_true / n_all if n_all else None,
+        "n_false": sum(false),
+        "n_false_worst_scan": max(false, default=0),
+        "markers": _counts([thing for thing in things if thing.is_marker]),
+        "decoys": _counts([thing for thing in things if not thing.is_marker]),
+    }
+
+
+def _counts(things: Sequence[_Thing]) -> list[Plain]:
+    """Return how many things of each kind there were, were found, and why not."""
+    rows = []
+    for kind in sorted({thing.kind for thing in things}):
+        own = [thing for thing in things if thing.kind == kind]
+        rows.append(
+            {
+                "kind": kind,
+                "n": len(own),
+                "n_found": sum(thing.is_found for thing in own),
+                "reasons": dict(Counter(one.reason for one in own if one.reason).most_common()),
+            }
+        )
+    return rows

@@ -1,41 +1,47 @@
-"""Do stations lie where their ellipses say? Whole simulated surveys against their own promises.
+"""Coverage of error ellipses: whole simulated surveys against their own covariances.
 
 Each survey has a field, a rig and sensors of its own: noise of ranges, biases of lasers, encoder,
 misalignment, axis offset, levelling and tilt are all drawn anew. Its stops share the rig, so they
-are not independent: intervals are made by drawing whole surveys again.
+are not independent: intervals come from resampling whole surveys.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from functools import partial
+from typing import NamedTuple
 
 import numpy as np
 from scipy.stats import chi2
 
 from spheremark.pipelines.config import SurveyConfig
 from spheremark.pipelines.errors import ConfigError, SolveError, TooFewObservationsError
+from spheremark.pipelines.evaluation.experiment import Column, Experiment, Plain, Table
 from spheremark.pipelines.geometry import inverse, levelling_rotation, log_motion, rigid
 from spheremark.pipelines.model import Array, ControlMarks, Index, MarkerFits, Mask, StopTruth, seal
 from spheremark.pipelines.network import adjust_network, assemble
 from spheremark.pipelines.positioning.resection import resect
-from spheremark.pipelines.simulation import Field, SimulationConfig, scenario, simulate_stop
-from spheremark.pipelines.survey import Progress, process
-from spheremark.pipelines.threads import in_processes
+from spheremark.pipelines.simulation import SimulationConfig, scenario, simulate_stop
+from spheremark.pipelines.survey import process
 
 QUANTITIES = {"horizontal": 2, "position": 3, "pose": 6}
-"""What is compared, with its dimensions: position in the plane, in space, with rotation too."""
+"""Compared quantities with their dimensions: position in the plane, in space, with rotation too."""
 
 METHODS = ("free_station", "network")
 """Each station alone on control marks, and all of a survey together."""
 
 LEVELS = (0.50, 0.68, 0.95)
-"""Shares that are asked for first."""
+"""Confidence levels of the table."""
 
 _N_RESAMPLES = 2000
 _CONFIDENCE = (0.025, 0.975)
 _SURVEYS_MIN = 2
+_CURVE = tuple(np.round(np.arange(0.05, 1.0, 0.05), 2).tolist())
+_BINS = np.arange(0.0, 20.5, 0.5)
+
+_Scan = tuple[str, MarkerFits]
+_Pose = tuple[Array, Array] | None  # T_site_station and its covariance
 
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
@@ -64,20 +70,19 @@ class Draws:
         seal(self, surveys=(None,))
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Coverage:
-    """How often something lies within what was promised.
+class Coverage(NamedTuple):
+    """Share of stations within an ellipse of one confidence level.
 
     Attributes
     ----------
     method, quantity : str
         Of ``METHODS`` and ``QUANTITIES``.
     level : float
-        Share that is promised.
+        Nominal share.
     share : float
         Share that was found.
     low, high : float
-        95 % interval of that share, by drawing whole surveys again.
+        95 % interval of that share, from resampled surveys.
     n : int
         Number of stations.
     """
@@ -91,6 +96,137 @@ class Coverage:
     n: int
 
 
+def ellipse_coverage(
+    n_surveys: int, n_stops: int, seed: int, *, simulation: SimulationConfig | None = None
+) -> Experiment[int, Draws, Draws]:
+    """Return the experiment that compares stations of whole surveys with their covariances.
+
+    Parameters
+    ----------
+    n_surveys : int
+        Number of surveys; two or more.
+    n_stops : int
+        Stops of each.
+    seed : int
+        Seed of the first survey; the others follow.
+    simulation : SimulationConfig, optional
+        How the rig errs; the default one, with only the beams near spheres, if missing.
+
+    Returns
+    -------
+    Experiment
+        Its result has one row for each station.
+    """
+    return Experiment(
+        worlds=range(seed, seed + n_surveys),
+        run_world=partial(survey_draws, n_stops=n_stops, simulation=simulation),
+        pool=joined,
+    )
+
+
+def coverage_report(draws: Draws, seed: int) -> Plain:
+    """Return shares, curves and histograms of squared errors as plain values.
+
+    Parameters
+    ----------
+    draws : Draws
+        Stations of many surveys.
+    seed : int
+        Seed of the first survey.
+
+    Returns
+    -------
+    dict
+        For JSON.
+    """
+    return {
+        "seed": seed,
+        "n_surveys": len(np.unique(draws.surveys)),
+        "n_stations": len(draws.surveys),
+        "config": SurveyConfig().to_mapping()["resection"],
+        "simulation": SimulationConfig(only_near_spheres=True).to_mapping(),
+        "levels": [one._asdict() for one in coverage(draws, LEVELS)],
+        "curve": [one._asdict() for one in coverage(draws, _CURVE)],
+        "methods": [
+            {
+                "method": method,
+                "n": int(np.isfinite(draws.sigmas[method]).sum()),
+                "error_3d_rms_m": _rms(np.linalg.norm(draws.errors[method], axis=1)),
+                "sigma_3d_rms_m": _rms(draws.sigmas[method]),
+            }
+            for method in METHODS
+        ],
+        "nees": [
+            {
+                "method": method,
+                "quantity": quantity,
+                "dimensions": QUANTITIES[quantity],
+                "per_dimension": value,
+                "counts": _counts(draws.squares[method, quantity]),
+            }
+            for (method, quantity), value in nees(draws).items()
+        ],
+        "bins": _BINS.tolist(),
+    }
+
+
+def coverage_tables(report: Plain) -> tuple[Table, ...]:
+    """Return the shares within ellipses as a table.
+
+    Parameters
+    ----------
+    report : dict
+        What ``coverage_report`` gave.
+
+    Returns
+    -------
+    tuple of Table
+        One table.
+    """
+    return (
+        Table(
+            title=f"Share of {report['n_stations']} stations of {report['n_surveys']} simulated "
+            "surveys within their ellipses (95 % interval from resampled surveys)",
+            columns=(
+                Column("method", "stations by"),
+                Column("quantity", "of"),
+                *(
+                    Column(partial(_share, report, level), f"{100 * level:.0f} %", "", ">")
+                    for level in LEVELS
+                ),
+                Column("per_dimension", "mean square", "", ".2f"),
+            ),
+            rows=report["nees"],
+            notes=[
+                f"{one['method']}: error {1000 * one['error_3d_rms_m']:.2f} mm, predicted "
+                f"{1000 * one['sigma_3d_rms_m']:.2f} mm (3-D, RMS)"
+                for one in report["methods"]
+            ],
+        ),
+    )
+
+
+def _share(report: Plain, level: float, row: Plain) -> str:
+    """Return the share at one level with its interval [%]."""
+    (one,) = (
+        one
+        for one in report["levels"]
+        if (one["method"], one["quantity"], one["level"]) == (row["method"], row["quantity"], level)
+    )
+    return f"{100 * one['share']:.1f} ({100 * one['low']:.0f}-{100 * one['high']:.0f})"
+
+
+def _rms(values: Array) -> float:
+    """Return the root mean square of the values that are known."""
+    return float(np.sqrt(np.nanmean(values**2)))
+
+
+def _counts(squares: Array) -> list[int]:
+    """Return the histogram of squares; those beyond the last bin are in the last."""
+    known = np.minimum(squares[np.isfinite(squares)], _BINS[-1] - 1e-9)
+    return [int(n) for n in np.histogram(known, _BINS)[0]]
+
+
 def survey_draws(
     seed: int,
     *,
@@ -98,38 +234,31 @@ def survey_draws(
     config: SurveyConfig | None = None,
     simulation: SimulationConfig | None = None,
 ) -> Draws:
-    """Simulate one survey, position its stations in both ways, and compare with the truth."""
+    """Simulate one survey, position its stations by both methods, and compare with the truth."""
     config = config or SurveyConfig.from_mapping({"fitting": {"methods": ["along_beam"]}})
     simulation = simulation or SimulationConfig(only_near_spheres=True)
     field = scenario("paper-field", seed)
     if not 1 <= n_stops <= len(field.stops):
         raise ConfigError(f"{n_stops} stops are wanted; a survey has 1 to {len(field.stops)}.")
+    places = np.round((np.arange(n_stops) + 0.5) * len(field.stops) / n_stops - 0.5).astype(int)
     scans, truths = [], []
-    for name in _spread(field, n_stops):
+    for name in (field.stops[place].name for place in places):
         stop = simulate_stop(field, name, simulation)
         (result,) = process(stop.log, config=config)
         scans.append((name, result.fits[config.fitting.methods[0]]))
         truths.append(stop.truth)
-    found = {
-        "free_station": _alone(scans, field.marks, config),
-        "network": _together(scans, field.marks, config),
+    poses = {
+        "free_station": _free_stations(scans, field.marks, config),
+        "network": _network(scans, field.marks, config),
     }
-    return _compared(seed, scans, truths, found)
+    return _compared(seed, scans, truths, poses)
 
 
-def _spread(field: Field, n: int) -> list[str]:
-    """Return the names of stops that are spread evenly over the order of driving."""
-    places = np.round((np.arange(n) + 0.5) * len(field.stops) / n - 0.5).astype(int)
-    return [field.stops[place].name for place in places]
-
-
-Scan = tuple[str, MarkerFits]
-Pose = tuple[Array, Array] | None  # T_site_station and its covariance
-
-
-def _alone(scans: list[Scan], marks: ControlMarks, config: SurveyConfig) -> list[Pose]:
+def _free_stations(
+    scans: Sequence[_Scan], marks: ControlMarks, config: SurveyConfig
+) -> list[_Pose]:
     """Return the pose of each station by itself."""
-    poses: list[Pose] = []
+    poses: list[_Pose] = []
     for _, fits in scans:
         try:
             fix = resect("free_station", fits, marks, config.resection)
@@ -140,23 +269,19 @@ def _alone(scans: list[Scan], marks: ControlMarks, config: SurveyConfig) -> list
     return poses
 
 
-def _together(scans: list[Scan], marks: ControlMarks, config: SurveyConfig) -> list[Pose]:
+def _network(scans: list[_Scan], marks: ControlMarks, config: SurveyConfig) -> list[_Pose]:
     """Return the pose of each station of a network on the same control marks."""
     try:
         result = adjust_network(assemble(scans, marks, config.resection), config.resection)
     except SolveError:
         return [None] * len(scans)
-    places = {name: i for i, name in enumerate(result.network.stations)}
-    return [
-        (result.T_site_station[places[name]], result.cov_T_site_station[places[name]])
-        if name in places
-        else None
-        for name, _ in scans
-    ]
+    found = zip(result.T_site_station, result.cov_T_site_station, strict=True)
+    poses = dict(zip(result.network.stations, found, strict=True))
+    return [poses.get(name) for name, _ in scans]
 
 
 def _compared(
-    seed: int, scans: list[Scan], truths: list[StopTruth], found: dict[str, list[Pose]]
+    seed: int, scans: list[_Scan], truths: list[StopTruth], found: dict[str, list[_Pose]]
 ) -> Draws:
     """Compare poses with the truth, in units of their covariances."""
     n = len(scans)
@@ -170,10 +295,10 @@ def _compared(
             T, cov = pose
             R = levelling_rotation(scans[i][1].levelling)
             truth = truths[i].T_site_base @ inverse(rigid(R, np.zeros(3)))
-            error, own = T[:3, 3] - truth[:3, 3], _cov_of_position(T, cov)
-            errors[method][i], sigmas[method][i] = error, np.sqrt(np.trace(own))
-            squares[method, "horizontal"][i] = _square(error[:2], own[:2, :2])
-            squares[method, "position"][i] = _square(error, own)
+            error, cov_p = T[:3, 3] - truth[:3, 3], _cov_of_position(T, cov)
+            errors[method][i], sigmas[method][i] = error, np.sqrt(np.trace(cov_p))
+            squares[method, "horizontal"][i] = _square(error[:2], cov_p[:2, :2])
+            squares[method, "position"][i] = _square(error, cov_p)
             squares[method, "pose"][i] = _square(log_motion(truth @ inverse(T)), cov)
     return Draws(
         surveys=np.full(n, seed, dtype=np.intp), squares=squares, errors=errors, sigmas=sigmas
@@ -192,12 +317,11 @@ def _square(error: Array, cov: Array) -> float:
     return float(error @ np.linalg.solve(cov, error))
 
 
-def joined(parts: Iterable[Draws]) -> Draws:
+def joined(parts: Sequence[Draws]) -> Draws:
     """Return the draws of many surveys as one."""
-    parts = tuple(parts)
     if len(parts) < _SURVEYS_MIN:
         raise TooFewObservationsError(
-            f"{len(parts)} survey tells nothing about chance; simulate two or more."
+            f"{len(parts)} survey shows no spread; simulate two surveys or more."
         )
     first = parts[0]
     return Draws(
@@ -211,16 +335,16 @@ def joined(parts: Iterable[Draws]) -> Draws:
 def coverage(
     draws: Draws, levels: Iterable[float] = LEVELS, *, seed: int = 0
 ) -> tuple[Coverage, ...]:
-    """Say how often stations lie within ellipses scaled to some shares.
+    """Return the shares of stations within ellipses of some confidence levels.
 
     Parameters
     ----------
     draws : Draws
         Stations of many surveys.
     levels : iterable of float
-        Shares that the ellipses are scaled to, by the chi-square distribution of their dimension.
+        Levels that the ellipses are scaled to, by the chi-square distribution of their dimension.
     seed : int
-        Source of chance of the intervals.
+        Seed of the resamples.
 
     Returns
     -------
@@ -240,18 +364,9 @@ def coverage(
         own = own[own.any(axis=1)]  # surveys without a station may be all that is drawn
         for level in levels:
             inside = squares[known] <= chi2.ppf(level, QUANTITIES[quantity])
-            low, high = np.quantile((own @ inside) / own.sum(axis=1), _CONFIDENCE)
-            found.append(
-                Coverage(
-                    method=method,
-                    quantity=quantity,
-                    level=float(level),
-                    share=float(inside.mean()),
-                    low=float(low),
-                    high=float(high),
-                    n=int(known.sum()),
-                )
-            )
+            low, high = np.quantile((own @ inside) / own.sum(axis=1), _CONFIDENCE).tolist()
+            share, n = float(inside.mean()), int(known.sum())
+            found.append(Coverage(method, quantity, float(level), share, low, high, n))
     return tuple(found)
 
 
@@ -280,50 +395,14 @@ def nees(draws: Draws) -> dict[tuple[str, str], float]:
 
 
 def _known(draws: Draws, method: str, quantity: str) -> Mask:
-    """Tell which stations a method positioned; at least one."""
+    """Return which stations a method positioned; at least one."""
     known: Mask = np.isfinite(draws.squares[method, quantity])
     if not known.any():
         raise TooFewObservationsError(
-            f"None of {len(known)} stations was positioned by {method!r}: nothing is known of its "
-            "errors. Simulate more surveys, or such that have marks enough."
+            f"None of {len(known)} stations was positioned by {method!r}, so its errors are not "
+            "known. Simulate more surveys, or fields with more marks."
         )
     return known
-
-
-def simulate_surveys(
-    n_surveys: int,
-    n_stops: int,
-    seed: int,
-    *,
-    simulation: SimulationConfig | None = None,
-    n_processes: int | None = None,
-    progress: Progress = lambda _share, _what: None,
-) -> Draws:
-    """Simulate many surveys, some at a time.
-
-    Parameters
-    ----------
-    n_surveys : int
-        How many; two or more.
-    n_stops : int
-        Stops of each.
-    seed : int
-        Source of chance of the first; the others follow.
-    simulation : SimulationConfig, optional
-        How the rig errs; the default one, with only the beams near spheres, if missing.
-    n_processes : int, optional
-        How many at a time; as many as there are processors by default.
-    progress : callable
-        Told the share of the work that is done, 0 to 1, and what comes next; may raise to cancel.
-
-    Returns
-    -------
-    Draws
-        One row for each station.
-    """
-    survey = partial(survey_draws, n_stops=n_stops, simulation=simulation)
-    seeds = range(seed, seed + n_surveys)
-    return joined(in_processes(survey, seeds, n_processes=n_processes, progress=progress))
 
 
 def _resampled(surveys: Index, rng: np.random.Generator) -> Array:

@@ -1,7 +1,7 @@
-"""How cost grows: scans of a million returns to thirty, networks of a hundred stations and more.
+"""How cost grows: scans of one to thirty million returns, networks of a hundred stations and more.
 
-A straight line through times against sizes tells whether cost is linear: what stays fixed, what
-each return or station costs, and how far the worst size is from the line.
+A straight line is fitted to times against sizes: the fixed part, the cost of each return or
+station, and the greatest distance of a size from the line.
 """
 
 from __future__ import annotations
@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from spheremark.pipelines.config import ResectionConfig
+from spheremark.pipelines.evaluation.experiment import Column, Plain, Progress, Table
 from spheremark.pipelines.geometry import inverse, rigid, rot_z, transform
 from spheremark.pipelines.model import (
     Array,
@@ -27,29 +28,26 @@ from spheremark.pipelines.model import (
     Status,
 )
 from spheremark.pipelines.network import adjust_network, assemble
-from spheremark.pipelines.survey import Progress
-from spheremark.service.bench.speed import Scan, measure
+from spheremark.service.bench.chain import CHAIN, Scan, measure
 from spheremark.storage.recordings import read_log, write_log
 
 _SIZES = (1, 2, 3, 6, 10, 20, 30)  # [millions of returns]
 _REPEATS = 2
-_CHAIN = "log to rows committed"
 _STATIONS, _MARKS = (100, 200, 500, 1000), 200
 _SMALL = ((35, 14), (300, 60))  # stations and marks of other networks
 _AREA = 72.0  # [m^2] for each mark: 120 m by 120 m for 200 of them
 _SEEN = 14  # marks that a station sees: the nearest
 _SIGMA, _SIGMA_LEVEL, _SIGMA_CONTROL = 4e-3, 3e-3, 5e-3  # [m], [rad], [m]
 _CONTROL = 4  # every so many marks one is control
-Plain = dict[str, Any]
 
 
 def grown(scan: Scan, folder: Path, progress: Progress) -> Plain:
-    """Return what the chain costs on ever longer logs, and adjustment on ever larger networks."""
+    """Return the costs of the chain on longer logs, and of adjustment on larger networks."""
     log = read_log(scan.log, digest="0" * 64)
     sizes = []
     for i, millions in enumerate(_SIZES):
         progress(0.8 + 0.15 * i / len(_SIZES), f"A log of {millions} million returns")
-        sizes.append(measured(log, millions * 1_000_000, scan, folder))
+        sizes.append(_measured(log, millions * 1_000_000, scan, folder))
     progress(0.95, "Networks")
     small = [adjust(*size) for size in (_SMALL[0], *_SMALL)]  # the first compiles
     large = [adjust(n, _MARKS) for n in _STATIONS]
@@ -68,13 +66,13 @@ def grown(scan: Scan, folder: Path, progress: Progress) -> Plain:
     }
 
 
-def measured(log: ScanLog, n_returns: int, scan: Scan, folder: Path) -> Plain:
-    """Return what the chain costs on a log of so many returns."""
+def _measured(log: ScanLog, n_returns: int, scan: Scan, folder: Path) -> Plain:
+    """Return the cost of the chain on a log of so many returns."""
     path = folder / f"{n_returns}.mcap"
     write_log(_stretched(log, n_returns), path)
     read, found = measure({"": replace(scan, log=path)}, folder, _REPEATS, lambda *_: None)
     path.unlink()
-    cost = found[""].costs[_CHAIN]
+    cost = found[""].costs[CHAIN]
     return {
         "n_returns": n_returns,
         "seconds": cost.seconds,
@@ -85,8 +83,72 @@ def measured(log: ScanLog, n_returns: int, scan: Scan, folder: Path) -> Plain:
     }
 
 
+_SIZE_COLUMNS = (
+    Column("n_returns", "returns", "", ",d"),
+    Column("seconds", "log to rows", "s", ".3f"),
+    Column("ns_per_return", "ns a return", "", ".0f"),
+    Column("cpu_ns_per_return", "CPU [ns]", "", ".0f"),
+    Column("ratio", "x read+CRC", "", ".1f"),
+)
+
+
+def _per_station(step: str) -> Column:
+    """Return the column of the CPU time of a step for each station."""
+    key = f"{step}_cpu_seconds"
+    return Column(
+        lambda row: f"{1e3 * row[key] / row['n_stations']:.2f}",
+        f"{step} a station",
+        "ms CPU",
+        ">",
+    )
+
+
+_NETWORK_COLUMNS = (
+    Column(lambda row: f"{row['n_stations']:,} x {row['n_marks']}", "stations x marks"),
+    Column("assembly_seconds", "assembly", "s", ".2f"),
+    Column("adjustment_seconds", "adjustment", "s", ".2f"),
+    _per_station("assembly"),
+    _per_station("adjustment"),
+)
+
+
+def growth_tables(report: Plain) -> list[Table]:
+    """Return costs by returns and by stations, with the straight lines through them."""
+    sizes, lines = report["linearity"], report["network_linearity"]
+    return [
+        Table(
+            columns=_SIZE_COLUMNS,
+            rows=sizes["sizes"],
+            notes=[
+                _line_note(what, f"{1e9 * fit['line_seconds_each']:.1f} ns a return", fit)
+                for what, fit in (("Time", sizes), ("CPU", sizes["cpu"]))
+            ],
+        ),
+        Table(
+            columns=_NETWORK_COLUMNS,
+            rows=report["network"],
+            notes=[
+                _line_note(
+                    f"CPU of {step} with {lines['n_marks']} marks",
+                    f"{1e3 * lines[step]['line_seconds_each']:.2f} ms a station",
+                    lines[step],
+                )
+                for step in ("assembly", "adjustment")
+            ],
+        ),
+    ]
+
+
+def _line_note(what: str, each: str, fit: Plain) -> str:
+    """Return a straight line through costs in words."""
+    return (
+        f"{what} in a straight line: {1e3 * fit['fixed_seconds']:.1f} ms and {each}; no size is "
+        f"farther from it than {100 * fit['worst_share_off_line']:.0f} %."
+    )
+
+
 def line(sizes: Sequence[Plain], size: str, cost: str) -> Plain:
-    """Fit a straight line to costs against sizes, all of them by their relative error alike."""
+    """Fit a straight line to costs against sizes, with equal relative weights."""
     n, seconds = (np.array([one[key] for one in sizes]) for key in (size, cost))
     rows = np.column_stack([np.ones(len(n)), n]) / seconds[:, None]
     (fixed, each), *_ = np.linalg.lstsq(rows, np.ones(len(n)), rcond=None)
@@ -98,7 +160,7 @@ def line(sizes: Sequence[Plain], size: str, cost: str) -> Plain:
 
 
 def _stretched(log: ScanLog, n: int) -> ScanLog:
-    """Return a log of n returns: the beginning of one, or one turned again and again."""
+    """Return a log of n returns: the beginning of one, or repeated turns."""
     repeats = -(-n // len(log.p_lidar))
     span = int(log.stamps_gimbal_ns[-1] - log.stamps_gimbal_ns[0])
     span += int(np.median(np.diff(log.stamps_gimbal_ns)))
@@ -121,7 +183,7 @@ def _stretched(log: ScanLog, n: int) -> ScanLog:
 
 
 def adjust(n_stations: int, n_marks: int) -> Plain:
-    """Return what it costs to assemble and adjust a network of so many stations and marks."""
+    """Return the cost of assembling and adjusting a network of so many stations and marks."""
     rng = np.random.default_rng(0)
     marks, scans = _network(rng, n_stations, n_marks)
     known = np.arange(0, n_marks, _CONTROL)
@@ -151,7 +213,7 @@ def adjust(n_stations: int, n_marks: int) -> Plain:
 def _network(
     rng: np.random.Generator, n_stations: int, n_marks: int
 ) -> tuple[ControlMarks, list[tuple[str, MarkerFits]]]:
-    """Return marks over a field, and what stations among them make of the nearest ones."""
+    """Return marks over a field, and the centres of the nearest ones at stations among them."""
     side = float(np.sqrt(_AREA * n_marks))
     p_site = np.column_stack([rng.uniform(0, side, (n_marks, 2)), rng.uniform(0.6, 1.5, n_marks)])
     marks = ControlMarks(
@@ -169,7 +231,7 @@ def _network(
 
 
 def _fits(rng: np.random.Generator, p_base: Array) -> MarkerFits:
-    """Return centres with as much error as they say."""
+    """Return centres whose errors agree with their covariances."""
     noisy = p_base + rng.normal(0, _SIGMA, p_base.shape)
     level = Levelling(roll=0.0, pitch=0.0, sigma=_SIGMA_LEVEL, is_measured=True)
     return MarkerFits(

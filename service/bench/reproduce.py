@@ -1,14 +1,11 @@
 """The study reproduced into a folder: a page, tables as CSV, figures as JSON.
 
-Hides how simulation, real scans and pages fit together. Nothing of a real scan is copied: what
-comes out of it are a noise and the residuals of a fit.
+Nothing of a real scan is copied: only a noise and the residuals of a fit are reported.
 """
 
 from __future__ import annotations
 
-import csv
-import shutil
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
@@ -22,7 +19,10 @@ from spheremark.pipelines.config import SurveyConfig
 from spheremark.pipelines.detection import extract
 from spheremark.pipelines.error_model import Bound
 from spheremark.pipelines.errors import NotFoundError
-from spheremark.pipelines.evaluation.reproduction import (
+from spheremark.pipelines.evaluation.experiment import Column, Plain, Progress, Table, to_json
+from spheremark.pipelines.evaluation.reproduction.included_angle import angle_experiment
+from spheremark.pipelines.evaluation.reproduction.noise import RangeNoise, range_noise
+from spheremark.pipelines.evaluation.reproduction.plan import (
     CENTRE,
     CENTRE_REAL,
     DISTANCES,
@@ -30,36 +30,27 @@ from spheremark.pipelines.evaluation.reproduction import (
     LANE_2,
     OURS,
     PAPER,
-    AngleLimit,
-    RangeNoise,
-    Reading,
-    Reproduction,
-    Table2Row,
-    Table3Row,
-    Table4Row,
-    angle_experiment,
+    plan,
+)
+from spheremark.pipelines.evaluation.reproduction.scans import Reproduction, reproduction
+from spheremark.pipelines.evaluation.reproduction.tables import (
     findings,
     models_of_icp,
-    plan,
-    range_noise,
     readings,
-    reproduce,
     table_2,
     table_4,
 )
-from spheremark.pipelines.evaluation.reproduction.included_angle import CIRCLES
-from spheremark.pipelines.model import RING_UNKNOWN, Column, Index, Levelling, StitchedCloud
+from spheremark.pipelines.model import RING_UNKNOWN, Index, Levelling, StitchedCloud
+from spheremark.pipelines.model import Column as Points
 from spheremark.pipelines.scan.rigs import vlp16
 from spheremark.pipelines.sphere import fit_markers
-from spheremark.pipelines.survey import Progress
 from spheremark.service.provenance import code_version
+from spheremark.storage.exports.reports import write_csv, write_pages
 from spheremark.storage.imports.reference_scans import read_packets, read_points
 from spheremark.web import assets
 from spheremark.web.pages.reproduction import ReproductionPage, panels, reproduction_page
 from spheremark.web.pages.statements import Statement
 from spheremark.web.theme import coloured
-
-Plain = dict[str, Any]
 
 _REAL_RADIUS = 0.30  # [m] of the sphere in the real scans
 _REAL_NEAR = 5.0  # [m]; the real sphere stands nearer
@@ -68,8 +59,8 @@ _SIMULATED, _REAL = "simulated", "real VLP-16"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Wish:
-    """What to reproduce: how much of it, from which seed, beside which real scans."""
+class ReproductionOptions:
+    """How much is reproduced, from which seed, and a folder of real scans to set beside."""
 
     seed: int = 0
     is_quick: bool = False
@@ -78,40 +69,51 @@ class Wish:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Real:
-    """What was measured in real scans: noise by sensor, and one row for each sphere."""
+class RealScans:
+    """Results from real scans: noise by sensor, and one row for each sphere."""
 
     noises: Mapping[str, RangeNoise] = field(default_factory=dict)
     spheres: Sequence[Plain] = ()
 
 
-def run(folder: Path, wish: Wish, progress: Progress) -> Plain:
-    """Simulate, fit, and write the page with its tables and figures; return the statements."""
+def reproduce(folder: Path, options: ReproductionOptions, progress: Progress) -> Plain:
+    """Simulate, fit, and write the page with its tables and figures; return the report."""
     config = SurveyConfig.from_mapping(
-        {"tolerance": wish.tolerance, "fitting": {"methods": [OURS, PAPER]}}
+        {"tolerance": options.tolerance, "fitting": {"methods": [OURS, PAPER]}}
     )
-    real = _real(wish.real, config) if wish.real else None
-    made = reproduce(plan(wish.seed, is_quick=wish.is_quick), config, progress=progress)
-    page = page_of(made, wish, real)
-    folder.mkdir(parents=True, exist_ok=True)
-    (folder / "index.html").write_text(reproduction_page(page), "utf-8")
-    shutil.copyfile(assets.plotly_script(), folder / assets.plotly_script().name)
-    _write_figures(folder / "figures", page)
-    _write_tables(folder, made, page)
+    real = _real_scans(options.real, config) if options.real else RealScans()
+    scans = plan(options.seed, is_quick=options.is_quick)
+    made = reproduction(scans, config).run(progress)
+    page = page_of(made, options.seed, real)
+    figures = {f"figures/{panel.name}.json": _portable(panel.figure) for panel in panels(page)}
+    write_pages(
+        folder, {"index.html": reproduction_page(page), **figures}, [assets.plotly_script()]
+    )
+    for name, rows in _csv_tables(made, page).items():
+        write_csv(folder / f"{name}.csv", [_rounded(row) for row in rows])
     return _report(folder, made, page)
 
 
-def page_of(made: Reproduction, wish: Wish, real: Real | None = None) -> ReproductionPage:
-    """Put everything into the shape of the page."""
-    real = real or Real()
+def page_of(made: Reproduction, seed: int, real: RealScans | None = None) -> ReproductionPage:
+    """Put a reproduction into the form of the page."""
+    real = real or RealScans()
     return ReproductionPage(
         tolerance_m=made.config.tolerance,
         scans=[asdict(scan) for scan in made.scans],
-        statements=_statements(made, wish.seed),
+        statements=tuple(
+            Statement(
+                method=one.method,
+                place=one.place,
+                model=one.model,
+                p95=one.limits["p95"],
+                mean=one.limits["mean"],
+            )
+            for one in findings(made, np.random.default_rng(seed))
+        ),
         table_2=table_2(made),
         table_4=table_4(made),
         readings=readings(made),
-        angles=angle_experiment(made.config.tolerance, np.random.default_rng(wish.seed)),
+        angles=angle_experiment(made.config.tolerance, np.random.default_rng(seed)),
         icp=models_of_icp(made),
         example=made.example,
         centre=_columns(made, made.series(CENTRE)),
@@ -122,21 +124,7 @@ def page_of(made: Reproduction, wish: Wish, real: Real | None = None) -> Reprodu
         spheres=[_simulated_spheres(made), *real.spheres],
         code_version=code_version(),
         config_digest=made.config.digest,
-        seed=wish.seed,
-    )
-
-
-def _statements(made: Reproduction, seed: int) -> tuple[Statement, ...]:
-    """Say what each method keeps in each place."""
-    return tuple(
-        Statement(
-            method=one.method,
-            place=one.place,
-            model=one.model,
-            p95=one.limits["p95"],
-            mean=one.limits["mean"],
-        )
-        for one in findings(made, np.random.default_rng(seed))
+        seed=seed,
     )
 
 
@@ -169,7 +157,7 @@ def _columns(made: Reproduction, scans: Index) -> dict[str, NDArray[Any]]:
 
 
 def _simulated_spheres(made: Reproduction) -> Plain:
-    """Return what the fits of the simulated spheres leave, as one row beside the real ones."""
+    """Return the residuals of the simulated spheres as one row beside the real ones."""
     keep = made.centres.of(OURS, made.series(CENTRE_REAL))
     return {
         "name": f"{int(keep.sum())} simulated, median",
@@ -180,7 +168,7 @@ def _simulated_spheres(made: Reproduction) -> Plain:
     }
 
 
-def _real(folder: Path, config: SurveyConfig) -> Real:
+def _real_scans(folder: Path, config: SurveyConfig) -> RealScans:
     """Measure the real scans of a folder: packets (.bin) for noise, points (.xyz) with a sphere."""
     packets = sorted(folder.glob("vlp16_packets/*.bin"))
     points = sorted(folder.glob("vlp16_spheres/*.xyz"))
@@ -190,14 +178,16 @@ def _real(folder: Path, config: SurveyConfig) -> Real:
         )
     noises = {}
     for path in packets[:1]:
-        shots = read_packets(path)
-        noises[_REAL] = range_noise(shots.ranges, shots.rings, shots.offsets_ns, shots.intensities)
+        pulses = read_packets(path)
+        noises[_REAL] = range_noise(
+            pulses.ranges, pulses.rings, pulses.offsets_ns, pulses.intensities
+        )
     spheres = [_real_sphere(path.stem, read_points(path), config) for path in points]
-    return Real(noises=noises, spheres=spheres)
+    return RealScans(noises=noises, spheres=spheres)
 
 
-def _real_sphere(name: str, p: Column, config: SurveyConfig) -> Plain:
-    """Fit the sphere of one real scan, the best seen that stands near; NaN where none is found."""
+def _real_sphere(name: str, p: Points, config: SurveyConfig) -> Plain:
+    """Fit the sphere of one real scan, the near one with most returns; NaN where none is found."""
     cloud = _upright_cloud(name, p)
     found = extract(cloud, config.extraction, _REAL_RADIUS)
     fits = fit_markers(OURS, cloud, found, config.fitting, _REAL_RADIUS).fits
@@ -212,7 +202,7 @@ def _real_sphere(name: str, p: Column, config: SurveyConfig) -> Plain:
     }
 
 
-def _upright_cloud(name: str, p: Column) -> StitchedCloud:
+def _upright_cloud(name: str, p: Points) -> StitchedCloud:
     """Return a single scan of a LiDAR that stands upright as a stitched cloud."""
     n = len(p)
     return StitchedCloud(
@@ -229,94 +219,24 @@ def _upright_cloud(name: str, p: Column) -> StitchedCloud:
     )
 
 
-def _write_figures(folder: Path, page: ReproductionPage) -> None:
-    """Write each figure as Plotly's JSON, in the colours of the light theme."""
-    folder.mkdir(exist_ok=True)
-    for panel in panels(page):
-        figure = coloured(panel.figure.to_plotly_json(), assets.tokens("light"))
-        (folder / f"{panel.name}.json").write_text(str(to_json_plotly(figure)), "utf-8")
+def _portable(figure: Any) -> str:
+    """Return a figure as Plotly's JSON, in the colours of the light theme."""
+    return str(to_json_plotly(coloured(figure.to_plotly_json(), assets.tokens("light"))))
 
 
-def _write_tables(folder: Path, made: Reproduction, page: ReproductionPage) -> None:
-    """Write the tables of the study, the statements and all centres as CSV."""
-    _write(folder / "table2.csv", [_row_2(row) for row in page.table_2])
-    _write(folder / "table4.csv", [_row_4(row) for row in page.table_4])
-    _write(folder / "table3.csv", [_row_3(row) for row in page.angles.rows])
-    _write(folder / "angle_limits.csv", [_limit(one) for one in page.angles.limits])
-    _write(folder / "readings.csv", [_reading(one) for one in page.readings])
-    _write(folder / "statements.csv", [_statement(one) for one in page.statements])
+def _csv_tables(made: Reproduction, page: ReproductionPage) -> dict[str, Sequence[Plain]]:
+    """Return the tables of the study, the statements and all centres, by name."""
     everything = _columns(made, np.arange(len(made.scans)))
-    rows = zip(*(column.tolist() for column in everything.values()), strict=True)
-    _write(folder / "centres.csv", [dict(zip(everything, row, strict=True)) for row in rows])
-
-
-def _row_2(row: Table2Row) -> Plain:
-    """Return one row of Table 2 as plain values."""
-    found: Plain = {
-        "distance_m": row.distance,
-        "study_n_points": row.published_n_points,
-        "study_error_3d_m": row.published_error,
-    }
-    for method, errors in row.errors.items():
-        found[f"{method}_n_points_mean"] = row.n_points[method]
-        found[f"{method}_error_3d_mean_m"] = errors.mean
-        found[f"{method}_error_3d_max_m"] = errors.largest
-        found[f"{method}_n"] = errors.n
-    return found | {
-        "paper_minus_study_m": row.errors[PAPER].mean - row.published_error,
-    }
-
-
-def _row_3(row: Table3Row) -> Plain:
-    """Return one row of Table 3 as plain values."""
-    errors = {f"{_key(name)}_error_m": error for name, error in row.errors.items()}
+    centres = zip(*(column.tolist() for column in everything.values()), strict=True)
     return {
-        "included_angle_deg": round(float(np.degrees(row.included_angle)), 2),
-        "study_error_m": row.published,
-        **errors,
-        "three_circles_minus_study_m": row.errors[CIRCLES] - row.published,
+        "table2": page.table_2,
+        "table4": page.table_4,
+        "table3": page.angles.rows,
+        "angle_limits": page.angles.limits,
+        "readings": page.readings,
+        "statements": [_statement(one) for one in page.statements],
+        "centres": [dict(zip(everything, row, strict=True)) for row in centres],
     }
-
-
-def _limit(one: AngleLimit) -> Plain:
-    """Return the angles that keep the tolerance for one sigma as plain values."""
-    return {
-        "sigma_axis_m": one.sigma,
-        "two_centres_from_deg": float(np.degrees(one.least)),
-        "two_circles_from_deg": float(np.degrees(one.least_circles)),
-        "two_circles_to_deg": float(np.degrees(one.widest_circles)),
-        "two_centres_error_horizontal_rms_m": one.rms,
-    }
-
-
-def _reading(one: Reading) -> Plain:
-    """Return one reading of the study's method as plain values."""
-    return {
-        "series": one.series,
-        "fit_method": one.method,
-        "n": one.errors.n,
-        "n_points_mean": one.n_points,
-        "error_3d_mean_m": one.errors.mean,
-        "error_3d_min_m": one.least,
-        "error_3d_max_m": one.errors.largest,
-        "bias_beyond_m": float(one.bias_station[0]),
-        "bias_up_m": float(one.bias_station[2]),
-    }
-
-
-def _key(name: str) -> str:
-    """Return a name as part of a column's."""
-    return name.replace(" ", "_")
-
-
-def _row_4(row: Table4Row) -> Plain:
-    """Return one row of Table 4 as plain values."""
-    found: Plain = {"stop": row.stop, "n_marks": row.n_marks, "range_mean_m": row.mean_range}
-    for method, errors in row.errors.items():
-        found[f"{method}_n"] = errors.n
-        found[f"{method}_error_3d_mean_m"] = errors.mean
-        found[f"{method}_error_3d_p95_m"] = errors.p95
-    return found
 
 
 def _statement(one: Statement) -> Plain:
@@ -325,9 +245,9 @@ def _statement(one: Statement) -> Plain:
     assert one.mean is not None
     assert one.model is not None
     found: Plain = {"place": one.place, "fit_method": one.method}
-    for name, found_limits in (("p95", one.p95), ("mean", one.mean)):
-        found |= _bound(f"{name}_distance", found_limits.greatest_distance, "_m")
-        found |= _bound(f"{name}_n_points", found_limits.smallest_count, "")
+    for name, limits in (("p95", one.p95), ("mean", one.mean)):
+        found |= _bound(f"{name}_distance", limits.greatest_distance, "_m")
+        found |= _bound(f"{name}_n_points", limits.smallest_count, "")
     for term in ("distance", "count", "incidence"):
         found[f"power_of_{term}"] = one.model.exponent(term)
         found[f"sigma_power_of_{term}"] = one.model.sigma(term)
@@ -335,67 +255,59 @@ def _statement(one: Statement) -> Plain:
 
 
 def _bound(name: str, bound: Bound, unit: str) -> Plain:
-    """Return a bound as plain values; what lies beyond the sample is null."""
-    found = {"": bound.value, "_low": bound.low, "_high": bound.high}
-    return {f"{name}{part}{unit}": value for part, value in found.items()}
+    """Return a bound with its interval as plain values."""
+    values = {"": bound.value, "_low": bound.low, "_high": bound.high}
+    return {f"{name}{part}{unit}": value for part, value in values.items()}
 
 
-def _write(path: Path, rows: Sequence[Plain]) -> None:
-    """Write rows as CSV."""
-    with path.open("w", newline="", encoding="utf-8") as file:
-        writer = csv.DictWriter(file, list(rows[0]))
-        writer.writeheader()
-        writer.writerows({key: _plain(value) for key, value in row.items()} for row in rows)
-
-
-def _plain(value: object) -> object:
-    """Return a value of a table; numbers to a hundredth of a millimetre."""
-    if isinstance(value, float):
-        return round(value, 5) if np.isfinite(value) else ("" if np.isnan(value) else "inf")
-    return value
-
-
-def _report(folder: Path, made: Reproduction, page: ReproductionPage) -> Plain:
-    """Return what the command prints."""
-    published = study.TABLE_2.errors_3d
+def _rounded(row: Plain) -> Plain:
+    """Return a row for CSV: numbers to a hundredth of a millimetre, empty where unknown."""
     return {
-        "page": str(folder / "index.html"),
-        "n_scans": len(made.scans),
-        "seed": page.seed,
-        "code_version": page.code_version,
-        "config_digest": page.config_digest,
-        "tolerance_m": page.tolerance_m,
-        "study": {
-            "greatest_distance_m": study.GREATEST_DISTANCE,
-            "smallest_count": study.SMALLEST_COUNT,
-            "table2_error_3d_mean_m": float(published.mean()),
-            "table2_error_3d_range_m": [float(published.min()), float(published.max())],
-        },
-        "table2": _json(_row_2(row) for row in page.table_2),
-        "table2_paper_minus_study_m": _difference(page.table_2),
-        "readings": _json(_reading(one) for one in page.readings),
-        "table3": _json(_row_3(row) for row in page.angles.rows),
-        "table3_rms_from_study_m": page.angles.rms_from_published,
-        "angle_limits": _json(_limit(one) for one in page.angles.limits),
-        "table4": _json(_row_4(row) for row in page.table_4),
-        "statements": _json(_statement(one) | {"said": _said(one)} for one in page.statements),
-        "icp_models": {name: asdict(errors) for name, errors in page.icp.items()},
-        "range_noise_m": {
-            name: [None if np.isnan(s) else float(s) for s in noise.sigmas]
-            for name, noise in page.noises.items()
-        },
-        "spheres": _json(dict(row) for row in page.spheres),
+        key: value
+        if not isinstance(value, float)
+        else round(value, 5)
+        if np.isfinite(value)
+        else ("" if np.isnan(value) else "inf")
+        for key, value in row.items()
     }
 
 
-def _difference(rows: Sequence[Table2Row]) -> float:
-    """Return the mean of Table 2 by the study's method minus that which the study prints [m]."""
-    ours = float(np.nanmean([row.errors[PAPER].mean for row in rows]))
-    return ours - float(study.TABLE_2.errors_3d.mean())
+def _report(folder: Path, made: Reproduction, page: ReproductionPage) -> Plain:
+    """Return the tables and statements of a reproduction for JSON."""
+    published = study.TABLE_2.errors_3d
+    paper = float(np.nanmean([row["paper_error_3d_mean_m"] for row in page.table_2]))
+    report: Plain = to_json(
+        {
+            "page": str(folder / "index.html"),
+            "n_scans": len(made.scans),
+            "seed": page.seed,
+            "code_version": page.code_version,
+            "config_digest": page.config_digest,
+            "tolerance_m": page.tolerance_m,
+            "study": {
+                "greatest_distance_m": study.GREATEST_DISTANCE,
+                "smallest_count": study.SMALLEST_COUNT,
+                "table2_error_3d_mean_m": float(published.mean()),
+                "table2_error_3d_range_m": [float(published.min()), float(published.max())],
+            },
+            "table2": page.table_2,
+            "table2_paper_minus_study_m": paper - float(published.mean()),
+            "readings": page.readings,
+            "table3": page.angles.rows,
+            "table3_rms_from_study_m": page.angles.rms_from_published,
+            "angle_limits": page.angles.limits,
+            "table4": page.table_4,
+            "statements": [_statement(one) | {"said": _words(one)} for one in page.statements],
+            "icp_models": {name: asdict(errors) for name, errors in page.icp.items()},
+            "range_noise_m": {name: one.sigmas.tolist() for name, one in page.noises.items()},
+            "spheres": page.spheres,
+        }
+    )
+    return report
 
 
-def _said(one: Statement) -> dict[str, str]:
-    """Return a statement as people read it."""
+def _words(one: Statement) -> dict[str, str]:
+    """Return the limits of a statement in words."""
     return {
         "distance": one.distance,
         "count": one.count,
@@ -404,12 +316,72 @@ def _said(one: Statement) -> dict[str, str]:
     }
 
 
-def _json(rows: Iterable[Plain]) -> list[Plain]:
-    """Return rows with null for what JSON has no number for."""
-    return [
-        {
-            key: None if isinstance(value, float) and not np.isfinite(value) else value
-            for key, value in row.items()
-        }
-        for row in rows
-    ]
+_TABLE_2 = (
+    Column("distance_m", "distance", "m", ".2f"),
+    Column("study_n_points", "study: returns", "", "d"),
+    Column("study_error_3d_m", "error", "mm", ".1f"),
+    Column("paper_n_points_mean", "paper: returns", "", ".0f"),
+    Column("paper_error_3d_mean_m", "error", "mm", ".1f"),
+    Column("paper_minus_study_m", "- study", "mm", "+.1f"),
+    Column("along_beam_n_points_mean", "along_beam: returns", "", ".0f"),
+    Column("along_beam_error_3d_mean_m", "error", "mm", ".1f"),
+)
+_TABLE_3 = (
+    Column("included_angle_deg", "angle", "deg", ".2f"),
+    Column("study_error_m", "study", "mm", ".1f"),
+    Column("three_circles_error_m", "circles", "mm", ".1f"),
+    Column("three_circles_minus_study_m", "- study", "mm", "+.1f"),
+    Column("two_centres_error_m", "free station: two", "mm", ".1f"),
+    Column("three_centres_error_m", "three", "mm", ".1f"),
+)
+_TABLE_4 = (
+    Column("stop", "stop"),
+    Column("paper_error_3d_mean_m", "paper", "mm", ".1f"),
+    Column("along_beam_error_3d_mean_m", "along_beam", "mm", ".1f"),
+)
+_STATEMENTS = (
+    Column("place", "where"),
+    Column("fit_method", "method"),
+    Column(lambda row: row["said"]["distance"], "p95: distance", "", ">"),
+    Column(lambda row: row["said"]["count"], "p95: returns", "", ">"),
+    Column(lambda row: row["said"]["mean_distance"], "mean: distance", "", ">"),
+    Column(lambda row: row["said"]["mean_count"], "mean: returns", "", ">"),
+)
+
+
+def reproduction_tables(report: Plain) -> tuple[Table, ...]:
+    """Return the study's tables again, and the limits that keep the tolerance."""
+    published = report["study"]
+    mean = f"{1e3 * published['table2_error_3d_mean_m']:.1f} mm"
+    low, high = (1e3 * error for error in published["table2_error_3d_range_m"])
+    return (
+        Table(
+            title="Table 2: centres by distance; mean errors over the simulated worlds",
+            columns=_TABLE_2,
+            rows=report["table2"],
+            notes=(
+                f"Mean of the paper's method minus the study's {mean}: "
+                f"{1e3 * report['table2_paper_minus_study_m']:+.1f} mm, with the noise and the cut "
+                "that the page names",
+            ),
+        ),
+        Table(
+            title="Table 3: the station by included angle, 17 mm granted to each axis of each mark",
+            columns=_TABLE_3,
+            rows=report["table3"],
+        ),
+        Table(
+            title="Table 4: mean error of the centres at each stop of lane 2",
+            columns=_TABLE_4,
+            rows=report["table4"],
+        ),
+        Table(
+            title=f"Limits that keep {1e3 * report['tolerance_m']:g} mm (95 % confidence); the "
+            f"study's, by its mean of {mean} ({low:.1f} to {high:.1f}): up to "
+            f"{published['greatest_distance_m']:g} m and from {published['smallest_count']} "
+            "returns",
+            columns=_STATEMENTS,
+            rows=report["statements"],
+            notes=(f"{report['n_scans']} scans, seed {report['seed']}. Page: {report['page']}",),
+        ),
+    )

@@ -1,14 +1,21 @@
-"""The command ``spheremark bench``: how quick it is, and how good."""
+"""The commands ``spheremark bench`` and ``spheremark reproduce``: speed, accuracy, the study."""
 
 from __future__ import annotations
 
 import os
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from spheremark.service.cli.terminal import err, out, print_json, progress, settings
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterable
+
+    from spheremark.pipelines.evaluation.experiment import Experiment, Plain, Table
+
+_STOPS_OF_COVERAGE = 15  # of each survey
 
 AsJson = Annotated[bool, typer.Option("--json", help="JSON for programs.")]
 
@@ -50,92 +57,117 @@ def bench(
 ) -> None:
     """Measure each step against one read of the file with a checksum, in the same run."""
     if extraction:
-        _bench_extraction(worlds, seed, as_json=as_json)
-        return
-    if coverage:
-        _bench_coverage(coverage, seed, as_json=as_json)
-        return
-    if networks:
-        _bench_networks(networks, seed, is_rig_wrong=wrong_rig, as_json=as_json)
-        return
-    if plans:
-        _bench_plans(plans, seed, as_json=as_json)
-        return
-    if accuracy:
-        _bench_accuracy(stops, seed, is_full=full, as_json=as_json)
-        return
-    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # as for workers; NumPy reads it when loaded
-    from spheremark.service.bench import speed as benches
-    from spheremark.service.cli import tables
-
-    with progress() as told:
-        wish = benches.Wish(repeats=repeats, is_quick=quick, is_long=long)
-        report = benches.run(log, wish, told)
-    if as_json:
-        print_json(report)
+        _extraction(worlds, seed, as_json=as_json)
+    elif coverage:
+        _coverage(coverage, seed, as_json=as_json)
+    elif networks:
+        _networks(networks, seed, is_rig_wrong=wrong_rig, as_json=as_json)
+    elif plans:
+        _plans(plans, seed, as_json=as_json)
+    elif accuracy:
+        _accuracy(stops, seed, is_full=full, as_json=as_json)
     else:
-        tables.print_bench(out, report)
+        os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # as in workers, before NumPy's import
+        from spheremark.service.bench.speed import SpeedOptions, speed, speed_tables
+
+        options = SpeedOptions(repeats=repeats, is_quick=quick, is_long=long)
+        with progress() as show:
+            report = speed(log, options, show)
+        _print(report, speed_tables, as_json=as_json)
 
 
-def _bench_coverage(n_surveys: int, seed: int, *, as_json: bool) -> None:
-    """Measure how often stations of simulated surveys lie within their ellipses; keep it."""
-    from spheremark.service.bench import ellipse_coverage as coverage
+def reproduce(
+    folder: Annotated[
+        Path, typer.Argument(metavar="[OUT]", help="Folder for page, tables and figures.")
+    ] = Path("reproduction"),
+    quick: Annotated[
+        bool, typer.Option("--quick", help="Fewer worlds: about a minute, with wider intervals.")
+    ] = False,
+    seed: Annotated[int, typer.Option(min=0, help="Source of chance.")] = 0,
+    real: Annotated[
+        Path | None,
+        typer.Option(exists=True, file_okay=False, help="Folder of real scans to set beside."),
+    ] = None,
+    tolerance_m: Annotated[float, typer.Option(help="Error that is accepted \\[m].")] = 0.03,
+    as_json: AsJson = False,
+) -> None:
+    """Regenerate the study's tables and figures in simulation, both methods side by side."""
+    from spheremark.service.bench import reproduce as study
 
-    with progress() as told:
-        report = coverage.run(n_surveys, seed, told)
-    path = coverage.keep(report, settings().data)
-    if as_json:
-        print_json(report)
-    else:
-        coverage.print_report(out, report)
+    options = study.ReproductionOptions(seed=seed, is_quick=quick, real=real, tolerance=tolerance_m)
+    with progress() as show:
+        report = study.reproduce(folder, options, show)
+    _print(report, study.reproduction_tables, as_json=as_json)
+
+
+def _coverage(n_surveys: int, seed: int, *, as_json: bool) -> None:
+    """Measure the coverage of error ellipses, and keep the report for the service."""
+    from spheremark.pipelines.evaluation import ellipse_coverage as coverage
+    from spheremark.service.provenance import made_now
+    from spheremark.storage.exports.reports import keep_coverage
+
+    with progress() as show:
+        draws = coverage.ellipse_coverage(n_surveys, _STOPS_OF_COVERAGE, seed).run(show)
+    report = made_now() | coverage.coverage_report(draws, seed)
+    path = keep_coverage(report, settings().data)
+    _print(report, coverage.coverage_tables, as_json=as_json)
+    if not as_json:
         err.print(f"Kept as {path}; the service shows it at /coverage.")
 
 
-def _bench_networks(n_surveys: int, seed: int, *, is_rig_wrong: bool, as_json: bool) -> None:
-    """Measure the accuracy of adjusted surveys, and how honest it is said."""
-    from spheremark.service.bench import networks as network_trials
+def _networks(n_surveys: int, seed: int, *, is_rig_wrong: bool, as_json: bool) -> None:
+    """Measure the accuracy of adjusted surveys, and the honesty of their covariances."""
+    from spheremark.pipelines.evaluation.networks import network_tables, networks
 
-    wish = network_trials.Wish(n_surveys=n_surveys, seed=seed, is_rig_wrong=is_rig_wrong)
-    with progress() as told:
-        report = network_trials.run(wish, told)
-    if as_json:
-        print_json(report)
-    else:
-        network_trials.print_report(out, report)
+    experiment = networks(n_surveys, seed=seed, is_rig_wrong=is_rig_wrong)
+    _run(experiment, network_tables, as_json=as_json)
 
 
-def _bench_plans(n_drawn: int, seed: int, *, as_json: bool) -> None:
-    """Measure how much better optimised marks are than chance, and how near to the best."""
-    from spheremark.service.bench import plans as plan_bench
+def _plans(n_drawn: int, seed: int, *, as_json: bool) -> None:
+    """Compare optimised marks with marks at random, and with the best of all."""
+    from spheremark.pipelines.evaluation.plans import plan_tables, plans
 
-    with progress() as told:
-        report = plan_bench.run(n_drawn, seed, told)
-    if as_json:
-        print_json(report)
-    else:
-        plan_bench.print_report(out, report)
+    _run(plans(n_drawn, seed), plan_tables, as_json=as_json)
 
 
-def _bench_extraction(worlds: int, seed: int, *, as_json: bool) -> None:
+def _extraction(worlds: int, seed: int, *, as_json: bool) -> None:
     """Measure precision and recall of extraction in simulated worlds."""
-    from spheremark.service.bench import detection
+    from spheremark.pipelines.evaluation import detection
 
-    with progress() as told:
-        report = detection.run(worlds, seed, told)
-    if as_json:
-        print_json(report)
-    else:
-        detection.print_report(out, report)
+    seeds = range(seed, seed + worlds)
+    experiment = detection.extraction(detection.DETECTION_PLAN, seeds)
+    _run(experiment, detection.extraction_tables, as_json=as_json)
 
 
-def _bench_accuracy(stops: int, seed: int, *, is_full: bool, as_json: bool) -> None:
+def _accuracy(stops: int, seed: int, *, is_full: bool, as_json: bool) -> None:
     """Measure the precision of centres against distance, by every method."""
-    from spheremark.service.bench import precision
+    from spheremark.pipelines.evaluation.precision import (
+        full_precision,
+        precision,
+        precision_tables,
+    )
 
-    with progress() as told:
-        few = precision.Wish(n_stops=stops, seed=seed)
-        report = precision.run(precision.full_wish(seed) if is_full else few, told)
+    experiment = full_precision(seed) if is_full else precision(stops, seed)
+    _run(experiment, precision_tables, as_json=as_json)
+
+
+def _run(
+    experiment: Experiment[Any, Any, Plain],
+    tables: Callable[[Plain], Iterable[Table]],
+    *,
+    as_json: bool,
+) -> None:
+    """Run an experiment and print its report."""
+    with progress() as show:
+        report = experiment.run(show)
+    _print(report, tables, as_json=as_json)
+
+
+def _print(report: Plain, tables: Callable[[Plain], Iterable[Table]], *, as_json: bool) -> None:
+    """Print a report as JSON or as tables."""
+    from spheremark.service.bench.report import print_tables
+
     if as_json:
         print_json(report)
     else:
-        precision.print_report(out, report)
+        print_tables(out, tables(report))

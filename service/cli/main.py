@@ -16,7 +16,7 @@ from typing import Annotated
 import typer
 
 from spheremark.pipelines.errors import ConfigError, SpheremarkError
-from spheremark.service.cli.bench import bench
+from spheremark.service.cli.bench import bench, reproduce
 from spheremark.service.cli.plan import plan
 from spheremark.service.cli.site import site
 from spheremark.service.cli.survey import (
@@ -292,33 +292,7 @@ def export(
     err.print(f"Wrote {target}.")
 
 
-@app.command()
-def reproduce(
-    folder: Annotated[
-        Path, typer.Argument(metavar="[OUT]", help="Folder for page, tables and figures.")
-    ] = Path("reproduction"),
-    quick: Annotated[
-        bool, typer.Option("--quick", help="Fewer worlds: about a minute, with wider intervals.")
-    ] = False,
-    seed: Annotated[int, typer.Option(min=0, help="Source of chance.")] = 0,
-    real: Annotated[
-        Path | None,
-        typer.Option(exists=True, file_okay=False, help="Folder of real scans to set beside."),
-    ] = None,
-    tolerance_m: Annotated[float, typer.Option(help="Error that is accepted \\[m].")] = 0.03,
-    as_json: AsJson = False,
-) -> None:
-    """Regenerate the study's tables and figures in simulation, both methods side by side."""
-    from spheremark.service.bench import reproduce as reproduction
-    from spheremark.service.cli import tables
-
-    wish = reproduction.Wish(seed=seed, is_quick=quick, real=real, tolerance=tolerance_m)
-    with _progress() as progress:
-        report = reproduction.run(folder, wish, progress)
-    if as_json:
-        _print_json(report)
-    else:
-        tables.print_reproduction(out, report)
+app.command()(reproduce)
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""The benchmark on a short scan: what it says must hang together; how quick it is, is not asked."""
+"""The benchmark of speed on a short scan: the parts of its report are consistent."""
 
 import json
 import os
@@ -10,10 +10,9 @@ from typer.testing import CliRunner
 
 from spheremark.pipelines.errors import RecordingError
 from spheremark.pipelines.simulation import SimulationConfig, scenario, simulate_stop
-from spheremark.service.bench import growth, peers, yardstick
-from spheremark.service.bench import speed as bench
+from spheremark.service.bench import chain, growth, peers, speed, yardstick
+from spheremark.service.bench.report import print_tables
 from spheremark.service.bench.yardstick import Cost
-from spheremark.service.cli import tables
 from spheremark.service.cli.main import app
 from spheremark.storage.recordings import read_log, write_log
 
@@ -22,10 +21,10 @@ TURN = 4.0  # [s]: half a million returns
 
 @pytest.fixture(scope="module")
 def report():
-    said = []
-    wish = bench.Wish(repeats=1, turn=TURN)
-    found = bench.run(None, wish, lambda share, what: said.append((share, what)))
-    assert all(0.0 <= share <= 1.0 for share, _ in said)
+    shares = []
+    options = speed.SpeedOptions(repeats=1, turn=TURN)
+    found = speed.speed(None, options, lambda share, _what: shares.append(share))
+    assert all(0.0 <= share <= 1.0 for share in shares)
     return found
 
 
@@ -41,7 +40,7 @@ def written(tmp_path_factory):
     return paths
 
 
-def test_one_scan_is_measured_in_three_dresses_against_one_yardstick(report):
+def test_one_scan_is_measured_in_three_formats_against_one_yardstick(report):
     variants = {one["name"]: one for one in report["variants"]}
     assert {name: one["bar_ratio"] for name, one in variants.items()} == {
         "points": 8.0, "packets": 8.0, "points in zstd": 20.0,
@@ -80,14 +79,14 @@ def test_ratios_are_the_cost_over_that_of_a_read_and_factors_the_cost_of_the_pee
     log = tmp_path / "log.mcap"
     log.write_bytes(b"12345")
     costs = {"read log": Cost(2.0, 3.0), "log to rows committed": Cost(12.0, 20.0)}
-    measured = bench.Measured(costs=costs, result=None, n_returns=1)
-    one = bench._variant("points", log, measured, Cost(4.0, 5.0))
+    measured = chain.Measured(costs=costs, result=None, n_returns=1)
+    one = speed._variant("points", log, measured, Cost(4.0, 5.0))
     assert (one["ratio"], one["cpu_ratio"]) == (3.0, 4.0)
     assert (one["read_log_ratio"], one["read_log_cpu_ratio"]) == (0.5, 0.6)
     assert (one["bar_ratio"], one["size_bytes"]) == (8.0, 5)
     seconds = {"rows": 1.0, "commit": 3.0, "fitting.along_beam": 5.0, "log to rows committed": 12.0}
     steps = [{"step": name, "seconds": cost} for name, cost in seconds.items()]
-    beside = bench._steps_of_peers(steps, {"fitting": 10.0, "rows and commit": 2.0})
+    beside = speed._steps_of_peers(steps, {"fitting": 10.0, "rows and commit": 2.0})
     assert [row["factor"] for row in beside] == [2.0, 0.5, 1.0]
 
 
@@ -107,17 +106,17 @@ def test_the_centres_of_all_are_held_against_the_truth(report):
 
 def test_the_report_is_a_table_and_json(report):
     out = Console(record=True, width=160)
-    tables.print_bench(out, report)
+    print_tables(out, speed.speed_tables(report))
     text = out.export_text()
     for word in ("read log", "packets", "points in zstd", "usual libraries", "Memory"):
         assert word in text
     assert json.loads(json.dumps(report)) == report
 
 
-@pytest.mark.parametrize("dress", ["points", "zstd", "packets"])
-def test_the_usual_libraries_read_the_same_returns(written, dress):
-    log = read_log(written[dress])
-    points, instants, joints = peers._decode(written[dress])
+@pytest.mark.parametrize("form", ["points", "zstd", "packets"])
+def test_the_usual_libraries_read_the_same_returns(written, form):
+    log = read_log(written[form])
+    points, instants, joints = peers._decode(written[form])
     assert np.abs(points - log.p_lidar).max() < 1e-4
     ours = (log.stamps_lidar_ns - log.stamps_gimbal_ns[0]) * 1e-9
     assert np.abs(instants - ours).max() < 3e-6  # the decoder counts whole microseconds
@@ -135,7 +134,9 @@ def test_a_log_of_ones_own_is_measured_without_truth(written):
 def test_a_log_that_is_no_file_is_refused(tmp_path):
     os.mkfifo(tmp_path / "log.mcap")
     with pytest.raises(RecordingError, match="no regular file"):
-        bench.run(tmp_path / "log.mcap", bench.Wish(is_quick=True), lambda _share, _what: None)
+        speed.speed(
+            tmp_path / "log.mcap", speed.SpeedOptions(is_quick=True), lambda _share, _what: None
+        )
 
 
 def test_the_yardstick_is_measured_in_a_process_of_its_own(tmp_path):
@@ -179,10 +180,14 @@ def test_a_network_is_assembled_and_adjusted_as_it_is_timed():
 
 def test_growth_is_printed_with_its_lines():
     costs = {"fixed_seconds": 0.2, "line_seconds_each": 5e-3, "worst_share_off_line": 0.07}
-    network = [growth.adjust(n, 20) for n in (12, 24)]
-    lines = {"n_marks": 20, "assembly": costs, "adjustment": costs}
+    sizes = {"n_returns": 2, "seconds": 1.0, "ns_per_return": 1, "cpu_ns_per_return": 1, "ratio": 2}
+    report = {
+        "linearity": {"sizes": [sizes], **costs, "cpu": costs},
+        "network": [growth.adjust(n, 20) for n in (12, 24)],
+        "network_linearity": {"n_marks": 20, "assembly": costs, "adjustment": costs},
+    }
     out = Console(record=True, width=160)
-    tables._print_growth(out, {"network": network, "network_linearity": lines})
+    print_tables(out, growth.growth_tables(report))
     text = out.export_text()
     assert "24 x 20" in text
     assert "CPU of adjustment with 20 marks in a straight line: 200.0 ms and 5.00 ms" in text

@@ -10,9 +10,9 @@ import pytest
 from numpy.testing import assert_allclose
 
 from spheremark.pipelines.errors import NotFoundError
-from spheremark.pipelines.evaluation.reproduction import OURS, PAPER
+from spheremark.pipelines.evaluation.reproduction.plan import OURS, PAPER
 from spheremark.pipelines.published import TABLE_2
-from spheremark.service.bench.reproduce import Wish, page_of, run
+from spheremark.service.bench.reproduce import ReproductionOptions, page_of, reproduce
 from spheremark.web import assets, theme
 from spheremark.web.pages import reproduction as drawing
 from tests.reproduced import reproduction
@@ -26,7 +26,7 @@ ROOT = Path(__file__).parents[2]
 
 @pytest.fixture(scope="module")
 def page():
-    return page_of(reproduction(), Wish(seed=3))
+    return page_of(reproduction(), 3)
 
 
 @pytest.fixture(scope="module")
@@ -91,7 +91,7 @@ def test_the_page_has_the_published_table_and_what_was_found_beside_it(page):
     text = drawing.reproduction_page(page)
     for error in TABLE_2.errors_3d:
         assert f">{1e3 * error:.1f}<" in text
-    assert f"{page.table_2[0].errors[PAPER].mean * 1e3:.1f}" in text
+    assert f"{page.table_2[0]['paper_error_3d_mean_m'] * 1e3:.1f}" in text
     assert "the study, as published" in text
 
 
@@ -110,7 +110,7 @@ def test_a_portable_figure_has_colours_and_no_names_of_variables(panels):
 
 def test_a_folder_without_real_scans_is_refused_before_anything_is_simulated(tmp_path):
     with pytest.raises(NotFoundError, match=r"holds no real scans; vlp16_packets/\*\.bin"):
-        run(tmp_path / "out", Wish(real=tmp_path), lambda _share, _what: None)
+        reproduce(tmp_path / "out", ReproductionOptions(real=tmp_path), lambda _share, _what: None)
     assert not (tmp_path / "out").exists()
 
 

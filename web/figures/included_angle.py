@@ -1,22 +1,19 @@
-"""What the included angle between marks does to a station: figures against it, with theory.
+"""The error of a station against the included angle between its marks, with theory.
 
 Horizontal errors, because the theory is one of the plane: heights rest on the levelling.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
 import plotly.graph_objects as go
 from numpy.typing import NDArray
-from plotly.subplots import make_subplots
 
-from spheremark.pipelines.evaluation.reproduction import AngleExperiment, AngleLimit, Arcs
-from spheremark.pipelines.evaluation.reproduction.included_angle import CIRCLES, PAIR, TRIPLE
-from spheremark.pipelines.positioning.subsets import angles_that_keep, theory_of_pairs
-from spheremark.pipelines.published import LEAST_ANGLE, TABLE_3, WIDEST_ANGLE
+from spheremark.pipelines.positioning.subsets import theory_of_pairs
+from spheremark.pipelines.published import LEAST_ANGLE, WIDEST_ANGLE
 from spheremark.web import theme
 from spheremark.web.columns import MM, Columns, by_method, floats, known_values, rms, select, texts
 from spheremark.web.figures.elements import add_binned, add_tolerance, blank_figure, make_log
@@ -26,10 +23,11 @@ _N_DRAWN = 3000  # points of one method; more are one blot, and make a page slow
 _ANGLES = np.radians(np.concatenate([np.arange(2.0, 178.5, 0.5), [179.0]]))
 _COUNTS = {2: "two marks", 3: "three marks"}
 _HOW = {"free_station": "3-D centres", "paper": "circles", "ranges": "slope distances"}
-_THEORIES = {
+THEORIES = {
     "free_station": ("theory, two centres", theme.TEXT, "solid"),
     "paper": ("theory, two circles", theme.MUTED, "dash"),
 }
+"""Name, colour and dash of each theory, by resection method."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -78,10 +76,10 @@ def error_against_angle(shown: Subsets, tolerance_m: float, *, is_log: bool = Fa
 
 
 def add_theory(figure: go.Figure, sigma_axis_m: float) -> None:
-    """Draw what two marks give in theory, by centres and by circles; nothing without a sigma."""
+    """Draw the theory of two marks, by centres and by circles; nothing without a sigma."""
     if not np.isfinite(sigma_axis_m):
         return
-    for method, (name, colour, dash) in _THEORIES.items():
+    for method, (name, colour, dash) in THEORIES.items():
         figure.add_scatter(
             x=np.degrees(_ANGLES),
             y=theory_of_pairs(method, sigma_axis_m, _ANGLES) * MM,
@@ -140,7 +138,7 @@ def _add_rows(figure: go.Figure, method: str, rows: Columns, shown: Subsets) -> 
 
 
 def _add_all_marks(figure: go.Figure, method: str, rows: Columns, shown: Subsets) -> None:
-    """Draw the RMS of the stations from all their marks as a line: it has no angle of its own."""
+    """Draw the RMS of the stations from all their marks as a level line."""
     style = theme.method_style(method)
     known = known_values(floats(rows, f"{shown.quality}_horizontal_m"))
     if not len(known):
@@ -158,139 +156,10 @@ def _add_all_marks(figure: go.Figure, method: str, rows: Columns, shown: Subsets
 
 
 def centres_sigma(fits: Columns) -> float:
-    """Return what the centres that count are predicted to be good to, per axis [m]; or NaN."""
+    """Return the predicted sigma of the centres of the first method, per axis [m]; or NaN."""
     counts: Mapping[str, Columns] = dict(by_method(fits))
     first = next(iter(counts.values()), None)
     known: NDArray[np.float64] = (
         np.zeros(0) if first is None else known_values(floats(first, "sigma_axis_m"))
     )
     return rms(known) if len(known) else np.nan
-
-
-_WAYS = (
-    (CIRCLES, theme.PAPER, "solid"),
-    (PAIR, theme.OURS, "dot"),
-    (TRIPLE, theme.OURS, "solid"),
-)
-
-
-def station_by_angle(made: AngleExperiment) -> go.Figure:
-    """Draw the study's Figure 10 again: the station's error by included angle, both methods."""
-    figure = blank_figure("Error of the station by included angle, 17 mm granted to each axis")
-    for name, colour, dash in _WAYS:
-        figure.add_scatter(
-            x=np.degrees(made.angles),
-            y=made.curves[name] * MM,
-            mode="lines",
-            name=f"{name} ({'study' if name == CIRCLES else 'free station'})",
-            line={"color": colour, "width": 2.5 if dash == "solid" else 1.75, "dash": dash},
-            hovertemplate=f"{name}: %{{y:.1f}} mm at %{{x:.0f}} deg<extra></extra>",
-        )
-    within = made.tolerance >= TABLE_3.errors
-    for keep, said, colour in (
-        (within, "study, Table 3: within", "var(--below)"),
-        (~within, "study, Table 3: beyond", "var(--above)"),
-    ):
-        figure.add_scatter(
-            x=np.degrees(TABLE_3.included_angles[keep]),
-            y=TABLE_3.errors[keep] * MM,
-            mode="markers",
-            name=said,
-            marker={"symbol": "x", "size": 9, "color": colour},
-            hovertemplate="study: %{y:.1f} mm at %{x:.2f} deg<extra></extra>",
-        )
-    add_tolerance(figure, made.tolerance)
-    add_limits_of_study(figure, is_shaded=True)
-    figure.update_yaxes(title_text="Error, median over signs [mm]", range=[0.0, 80.0])
-    figure.update_xaxes(title_text="Included angle [deg]", range=[0, 180], dtick=30)
-    return figure
-
-
-def limit_by_sigma(limits: Sequence[AngleLimit], tolerance_m: float) -> go.Figure:
-    """Draw between which angles two marks keep the tolerance, by how good the centres are."""
-    figure = blank_figure(f"Angles at which two marks keep {tolerance_m * MM:g} mm")
-    widest = tolerance_m / np.sqrt(2.0)  # beyond which circles keep it nowhere
-    sigmas = np.sort(np.append(np.linspace(0.0005, tolerance_m, 200), widest * (1.0 - 1e-9)))
-    for method, (name, colour, dash) in _THEORIES.items():
-        known = np.array([angles_that_keep(method, float(s), tolerance_m) for s in sigmas])
-        for bounds, is_first in ((known[:, 0], True), (known[:, 1], False)):
-            figure.add_scatter(
-                x=sigmas * MM,
-                y=np.degrees(bounds),
-                mode="lines",
-                name=name,
-                legendgroup=name,
-                showlegend=is_first,
-                line={"color": colour, "width": 2, "dash": dash},
-                hovertemplate=f"{name}: %{{y:.0f}} deg at %{{x:.1f}} mm<extra></extra>",
-            )
-    tried = [one for one in limits if np.isfinite(one.least)]
-    figure.add_scatter(
-        x=[one.sigma * MM for one in tried],
-        y=[np.degrees(one.least) for one in tried],
-        mode="markers+text",
-        text=[f"{np.degrees(one.least):.0f}" for one in tried],
-        textposition="bottom right",
-        textfont={"size": 11, "color": theme.OURS},
-        name="free station, tried there",
-        marker={"color": theme.OURS, "size": 8},
-        customdata=[one.rms * MM for one in tried],
-        hovertemplate="%{y:.1f} deg at %{x:.0f} mm: RMS %{customdata:.1f} mm<extra></extra>",
-    )
-    figure.update_xaxes(title_text="Sigma of a centre per axis [mm]", range=[0, tolerance_m * MM])
-    figure.update_yaxes(title_text="Included angle [deg]", range=[-16, 185], dtick=30)
-    return figure
-
-
-def circles_of_study(arcs: Arcs) -> go.Figure:
-    """Draw the study's Figure 4 again: three circles through the station, and from near."""
-    degrees = np.degrees(arcs.included_angle)
-    figure = make_subplots(cols=2, horizontal_spacing=0.2, column_titles=["Field", "From near"])
-    figure.update_layout(
-        template=theme.template(),
-        title={"text": f"Position from three circles, included angle {degrees:.2f} deg"},
-        margin={"t": 92},
-        legend={"y": 1.14},
-    )
-    figure.update_annotations(font={"size": 13, "color": theme.MUTED})
-    for i in range(len(arcs.radii)):
-        _add_circle(figure, arcs, i)
-    for name, p, colour, symbol, columns in (
-        ("marks", arcs.marks_site, theme.MARK, "circle", (1,)),
-        ("true station", np.zeros((1, 2)), theme.TEXT, "cross-thin", (1, 2)),
-        ("where they meet best", arcs.p_site[None], theme.PAPER, "diamond", (1, 2)),
-    ):
-        look = {"color": colour, "size": 9, "symbol": symbol, "line": {"color": colour, "width": 2}}
-        for column in columns:
-            x, y = p.T * (1.0 if column == 1 else MM)
-            figure.add_scatter(
-                x=x, y=y, mode="markers", name=name, legendgroup=name, showlegend=column == 1,
-                marker=look, hovertemplate=f"{name}<extra></extra>", row=1, col=column,
-            )  # fmt: skip
-    reach = 1.6 * float(np.linalg.norm(arcs.p_site)) * MM + 25.0
-    near = {"range": [-reach, reach], "constrain": "domain", "col": 2}
-    figure.update_xaxes(title_text="x [m]", scaleanchor="y", constrain="domain", col=1)
-    figure.update_yaxes(title_text="y [m]", constrain="domain", col=1)
-    figure.update_xaxes(title_text="x [mm]", scaleanchor="y2", **near)
-    figure.update_yaxes(title_text="y [mm]", **near)
-    return figure
-
-
-def _add_circle(figure: go.Figure, arcs: Arcs, i: int) -> None:
-    """Draw one circle whole, and its arc by the station."""
-    mark, radius = arcs.shifted_site[i], arcs.radii[i]
-    whole = np.linspace(0.0, 2.0 * np.pi, 181)
-    by_station = np.arctan2(-mark[1], -mark[0]) + np.linspace(-0.02, 0.02, 41)
-    for column, turn, unit in ((1, whole, 1.0), (2, by_station, MM)):
-        figure.add_scatter(
-            x=(mark[0] + radius * np.cos(turn)) * unit,
-            y=(mark[1] + radius * np.sin(turn)) * unit,
-            mode="lines",
-            name="circles about the shifted marks",
-            legendgroup="circles",
-            showlegend=i == 0 and column == 1,
-            hoverinfo="skip",
-            line={"color": theme.PAPER, "width": 1.5},
-            row=1,
-            col=column,
-        )

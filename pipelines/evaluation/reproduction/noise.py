@@ -1,4 +1,4 @@
-"""The noise of single ranges, as it can be seen in any log, simulated or real."""
+"""The noise of single ranges, estimated from any log, simulated or real."""
 
 from __future__ import annotations
 
@@ -14,10 +14,10 @@ from spheremark.pipelines.scan.rigs import FIRING_CYCLE
 REFLECTIVITY_BINS = (1.0, 5.0, 15.0, 40.0, 100.0, 256.0)
 """Edges within which the noise of ranges is given."""
 
-_RUN = 12  # shots of one laser in a row
+_RUN = 12  # pulses of one laser in a row
 _DOF = _RUN - 3  # once the parabola is taken off
 _MEDIAN = float(np.sqrt(chdtri(_DOF, 0.5) / _DOF))  # of the estimates of a sigma of 1, if normal
-_N_RUNS_MIN = 30  # that tell a noise
+_N_RUNS_MIN = 30  # for an estimate of the noise
 _STEP_MAX = 0.10  # [m] off the parabola: more is an edge
 _SIMILAR = 0.2  # relative difference of reflectivity within one surface
 
@@ -31,7 +31,7 @@ class RangeNoise:
     sigmas : (k,)
         Standard deviation in each of ``REFLECTIVITY_BINS``; NaN where too little was seen [m].
     n : (k,)
-        Number of runs of shots behind each.
+        Number of runs of pulses behind each.
     """
 
     sigmas: Array
@@ -45,16 +45,16 @@ class RangeNoise:
 def range_noise(
     ranges: ArrayLike, rings: Rings, offsets_ns: ArrayLike, intensities: ArrayLike
 ) -> RangeNoise:
-    """Estimate the noise of single ranges from neighbouring shots of each laser.
+    """Estimate the noise of single ranges from neighbouring pulses of each laser.
 
     Parameters
     ----------
     ranges : (n,)
         Measured distances [m].
     rings : (n,)
-        Laser of each shot.
+        Laser of each pulse.
     offsets_ns : (n,)
-        Instants of the shots since any start [ns].
+        Instants of the pulses since any start [ns].
     intensities : (n,)
         Reflectivity, 0-255.
 
@@ -65,11 +65,11 @@ def range_noise(
 
     Notes
     -----
-    Runs of twelve shots in a row of one laser on one surface (equal reflectivity within a fifth)
-    are freed of a parabola, which takes slope and curvature away; the median over runs of the
-    standard deviation of the rest, over what that median is for normal noise of 1: with nine
-    degrees of freedom 4 % less. Long enough to hold the slow part of noise that is not white:
-    real VLP-16 oscillate over five or six shots.
+    A parabola, which holds slope and curvature, is subtracted from each run of twelve pulses of one
+    laser on one surface (equal reflectivity within a fifth). The estimate is the median over runs
+    of the standard deviation of the rest, over that median for normal noise of 1: with nine degrees
+    of freedom 4 % less. A run is long enough for noise that is not white: ranges of a real VLP-16
+    oscillate over five or six pulses.
     """
     seconds = np.asarray(offsets_ns, dtype=np.float64) * 1e-9
     order = np.lexsort((seconds, rings))
@@ -80,7 +80,7 @@ def range_noise(
     runs = order[starts[is_run][:, None] + np.arange(_RUN)]
     shades = np.asarray(intensities, dtype=np.float64)[runs]
     middle = np.median(shades, axis=1)
-    rest = np.asarray(ranges, dtype=np.float64)[runs] @ _free_of_parabola()
+    rest = np.asarray(ranges, dtype=np.float64)[runs] @ _without_parabola()
     is_alike = (np.abs(shades - middle[:, None]) <= _SIMILAR * middle[:, None] + 1.0).all(axis=1)
     is_good = is_alike & (np.abs(rest).max(axis=1) < _STEP_MAX)
     places = np.digitize(middle[is_good], REFLECTIVITY_BINS) - 1
@@ -94,7 +94,7 @@ def range_noise(
     )
 
 
-def _free_of_parabola() -> Array:
-    """Return the projection that takes the best parabola from a run, (12, 12)."""
+def _without_parabola() -> Array:
+    """Return the projection that subtracts the best parabola from a run, (12, 12)."""
     powers = np.vander(np.linspace(-1.0, 1.0, _RUN), 3)
     return np.asarray(np.eye(_RUN) - powers @ np.linalg.pinv(powers))

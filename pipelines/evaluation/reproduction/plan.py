@@ -1,9 +1,8 @@
-"""Which scans are simulated, and what each series of them is for."""
+"""The scans to simulate, in series by purpose."""
 
 from __future__ import annotations
 
-import dataclasses
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from spheremark.pipelines.published import SIGMA_RANGE
 
@@ -34,7 +33,7 @@ class Scan:
     Attributes
     ----------
     series : str
-        What it is for.
+        Its purpose.
     scenario : str
         World to simulate.
     stop : str
@@ -86,26 +85,28 @@ def plan(seed: int, *, is_quick: bool = False) -> tuple[Scan, ...]:
         turn=TURN,
         sigma_range=SIGMA_RANGE,
     )
-    found = [dataclasses.replace(centre, seed=seed + i) for i in range(n_worlds)]
-    found += [
-        dataclasses.replace(centre, series=CENTRE_REAL, seed=seed + i, sigma_range=None)
-        for i in range(n_real)
-    ]
-    found += [
-        dataclasses.replace(centre, series=LANE_2, stop=stop, seed=seed + i)
-        for i in range(n_lanes)
-        for stop in STOPS_OF_LANE_2
-    ]
-    found += [
-        dataclasses.replace(centre, series=TURNS, seed=seed + i, turn=turn)
-        for i in range(n_turned)
-        for turn in turns
-    ]
-    lane = dataclasses.replace(centre, scenario=_LANE, stop="centre")
-    found += [
-        dataclasses.replace(lane, series=series, seed=seed + i, turn=turn, sigma_range=sigma)
-        for series, sigma in ((DISTANCES, SIGMA_RANGE), (DISTANCES_REAL, None))
-        for i in range(n_distances)
-        for turn in sorted((*(_OTHER_TURNS[:2] if is_quick else _OTHER_TURNS), TURN))
-    ]
-    return tuple(found)
+    lane = replace(centre, scenario=_LANE, stop="centre")
+    far_turns = sorted((*(_OTHER_TURNS[:2] if is_quick else _OTHER_TURNS), TURN))
+    return (
+        *(replace(centre, seed=seed + i) for i in range(n_worlds)),
+        *(
+            replace(centre, series=CENTRE_REAL, seed=seed + i, sigma_range=None)
+            for i in range(n_real)
+        ),
+        *(
+            replace(centre, series=LANE_2, stop=stop, seed=seed + i)
+            for i in range(n_lanes)
+            for stop in STOPS_OF_LANE_2
+        ),
+        *(
+            replace(centre, series=TURNS, seed=seed + i, turn=turn)
+            for i in range(n_turned)
+            for turn in turns
+        ),
+        *(
+            replace(lane, series=series, seed=seed + i, turn=turn, sigma_range=sigma)
+            for series, sigma in ((DISTANCES, SIGMA_RANGE), (DISTANCES_REAL, None))
+            for i in range(n_distances)
+            for turn in far_turns
+        ),
+    )

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import lru_cache, partial
 from typing import NamedTuple
 
 import numpy as np
@@ -15,6 +15,7 @@ from spheremark.pipelines.accuracy import UNMATCHED, marker_errors, mean_inciden
 from spheremark.pipelines.config import FittingConfig, SurveyConfig
 from spheremark.pipelines.detection import extract
 from spheremark.pipelines.error_model import ErrorSample
+from spheremark.pipelines.evaluation.experiment import Experiment
 from spheremark.pipelines.evaluation.reproduction.noise import RangeNoise, range_noise
 from spheremark.pipelines.evaluation.reproduction.plan import (
     CENTRE,
@@ -46,10 +47,6 @@ from spheremark.pipelines.simulation import (
     simulate_stop,
 )
 from spheremark.pipelines.sphere import fit_markers
-
-Progress = Callable[[float, str], None]
-
-_N_THREADS = 2  # a scan in simulation and one in the pipeline
 
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
@@ -202,13 +199,10 @@ class _Measured(NamedTuple):
     noise: RangeNoise | None
 
 
-def reproduce(
-    scans: Sequence[Scan],
-    config: SurveyConfig,
-    *,
-    progress: Progress = lambda _share, _what: None,
-) -> Reproduction:
-    """Simulate and fit all scans of a plan.
+def reproduction(
+    scans: Sequence[Scan], config: SurveyConfig
+) -> Experiment[int, _Measured, Reproduction]:
+    """Return the experiment that simulates and fits all scans of a plan.
 
     Parameters
     ----------
@@ -216,54 +210,39 @@ def reproduce(
         The plan; the first is of the study's field.
     config : SurveyConfig
         How markers are found and fitted.
-    progress : callable
-        Told the share of the work that is done, 0 to 1, and what comes next; may raise to cancel.
 
     Returns
     -------
-    Reproduction
-        Errors of all centres.
+    Experiment
+        Its result has the errors of all centres.
 
     Notes
     -----
-    The scans are independent: two are worked at side by side. Those of the study's field are
-    simulated whole, because a cut may need the ground. Cost grows linearly with the time of all
-    turns.
+    Scans of the study's field are simulated whole, because a cut may need the ground. Cost grows
+    linearly with the time of all turns.
     """
-    worlds = {key: scenario(*key) for key in dict.fromkeys((s.scenario, s.seed) for s in scans)}
-    found: list[_Measured] = []
-    shows_noise = next((i for i, scan in enumerate(scans) if scan.sigma_range is None), 0)
-
-    def measured(i: int) -> _Measured:
-        scan = scans[i]
-        shown = _Shown(example=i == 0, noise=i == shows_noise)
-        return _measure(worlds[scan.scenario, scan.seed], scan, config, shown)
-
-    with ThreadPoolExecutor(_N_THREADS) as pool:
-        for scan, result in zip(scans, pool.map(measured, range(len(scans))), strict=True):
-            found.append(result)
-            progress(len(found) / len(scans), f"{scan.stop}, world {scan.seed}, {scan.turn:g} s")
-    (example,) = (one.example for one in found if one.example is not None)
-    (noise,) = (one.noise for one in found if one.noise is not None)
-    return Reproduction(
-        scans=tuple(scans),
-        n_marks=np.array([one.n_marks for one in found], dtype=np.intp),
-        centres=_joined([one.rows for one in found]),
-        example=example,
-        noise=noise,
-        config=config,
+    return Experiment(
+        worlds=range(len(scans)),
+        run_world=partial(_measure, scans=tuple(scans), config=config),
+        pool=lambda found: Reproduction(
+            scans=tuple(scans),
+            n_marks=np.array([one.n_marks for one in found], dtype=np.intp),
+            centres=_joined([one.rows for one in found]),
+            example=next(one.example for one in found if one.example is not None),
+            noise=next(one.noise for one in found if one.noise is not None),
+            config=config,
+        ),
     )
 
 
-class _Shown(NamedTuple):
-    """What of a scan is shown beside its errors."""
-
-    example: bool
-    noise: bool
+_field = lru_cache(maxsize=2)(scenario)  # scans of one world follow one another
 
 
-def _measure(field: Field, scan: Scan, config: SurveyConfig, shown: _Shown) -> _Measured:
+def _measure(place: int, *, scans: Sequence[Scan], config: SurveyConfig) -> _Measured:
     """Simulate one scan and fit its markers by every method."""
+    scan = scans[place]
+    shows_noise = next((i for i, one in enumerate(scans) if one.sigma_range is None), 0)
+    field = _field(scan.scenario, scan.seed)
     sensor = SimulationConfig(
         turn=scan.turn, sigma_range=scan.sigma_range, only_near_spheres=not scan.needs_ground
     )
@@ -271,34 +250,33 @@ def _measure(field: Field, scan: Scan, config: SurveyConfig, shown: _Shown) -> _
     cloud = stitch(stop.log, choose_rig(stop.log, None), config.stitching)
     found = extract(cloud, config.extraction, config.marker_radius)
     fits = _fits(cloud, found, scan, config)
-    rows = [row for name, one in fits.items() for row in _rows(name, one, cloud, field, stop)]
     return _Measured(
-        rows=rows,
+        rows=[row for name, one in fits.items() for row in _rows(name, one, cloud, field, stop)],
         n_marks=len(field.marks.names),
-        example=_example(fits, cloud, found, field, stop) if shown.example else None,
-        noise=_noise(stop) if shown.noise else None,
+        example=_example(fits, cloud, found, field, stop) if place == 0 else None,
+        noise=_noise(stop) if place == shows_noise else None,
     )
 
 
 def _fits(
     cloud: StitchedCloud, found: MarkerCandidates, scan: Scan, config: SurveyConfig
 ) -> dict[str, MarkerFits]:
-    """Fit the markers of one scan by ours, the study's, and where it counts by its variants."""
+    """Fit the markers of one scan by ours and the study's; at the centre by its variants too."""
     fitting = config.fitting
-    ways: dict[str, tuple[str, FittingConfig]] = {m: (m, fitting) for m in (OURS, PAPER)}
+    methods: dict[str, tuple[str, FittingConfig]] = {m: (m, fitting) for m in (OURS, PAPER)}
     if scan.series in (CENTRE, CENTRE_REAL):
-        ways[FULL_SPHERE] = (PAPER, dataclasses.replace(fitting, paper_model="sphere"))
-        ways[GROUND] = (PAPER, dataclasses.replace(fitting, paper_cut="ground"))
+        methods[FULL_SPHERE] = (PAPER, dataclasses.replace(fitting, paper_model="sphere"))
+        methods[GROUND] = (PAPER, dataclasses.replace(fitting, paper_cut="ground"))
     return {
         name: fit_markers(method, cloud, found, how, config.marker_radius)
-        for name, (method, how) in ways.items()
+        for name, (method, how) in methods.items()
     }
 
 
 def _rows(
     method: str, fits: MarkerFits, cloud: StitchedCloud, field: Field, stop: SimulatedStop
 ) -> list[_Row]:
-    """Compare the fits of one method with the truth; a fit that stands on no mark is left out."""
+    """Compare the fits of one method with the truth; fits of no mark are left out."""
     errors = marker_errors(fits, stop.truth, field.marks)
     true = transform(inverse(stop.truth.T_site_base), field.marks.p_site)
     rows = []
@@ -352,7 +330,7 @@ def _example(
     field: Field,
     stop: SimulatedStop,
 ) -> Example:
-    """Choose a marker about as far as the study's claim, and show it from aside."""
+    """Choose a marker about as far as the study's limit, and turn it into the line of sight."""
     true = transform(inverse(stop.truth.T_site_base), field.marks.p_site)
     fits = {name: one for name, one in fits.items() if name != GROUND}
     marks = {name: marker_errors(one, stop.truth, field.marks).marks for name, one in fits.items()}
@@ -378,7 +356,7 @@ def _example(
 
 
 def _noise(stop: SimulatedStop) -> RangeNoise:
-    """Return the noise of the ranges of a simulated log, as it would be seen in a real one."""
+    """Return the noise of the ranges of a simulated log, estimated as in a real one."""
     log = stop.log
     offsets = log.stamps_lidar_ns - log.stamps_lidar_ns.min()
     return range_noise(np.linalg.norm(log.p_lidar, axis=1), log.rings, offsets, log.intensities)

@@ -7,7 +7,6 @@ from fastapi.responses import HTMLResponse, RedirectResponse
 
 from spheremark.pipelines.errors import InputError, NotFoundError
 from spheremark.pipelines.ground_model import ElevationModel
-from spheremark.service.bench import ellipse_coverage as coverage
 from spheremark.service.http.api.jobs import start
 from spheremark.service.http.api.models import NewJob
 from spheremark.service.http.api.sites import Product, products_of
@@ -15,6 +14,7 @@ from spheremark.service.http.pages.networks import Fields
 from spheremark.service.http.pages.results import frame_of
 from spheremark.service.http.state import Current, Service
 from spheremark.service.jobs.handlers import JobKind
+from spheremark.storage.exports.reports import kept_coverage
 from spheremark.web.pages import ellipse_coverage as web_coverage
 from spheremark.web.pages import site
 
@@ -40,8 +40,8 @@ WHERE survey_id = $id AND kind = 'site' AND status IN ('accepted', 'running') OR
 
 @router.get("/coverage")
 def coverage_page(service: Current) -> str:
-    """Show whether error ellipses hold what they promise."""
-    report = coverage.kept(service.settings.data)
+    """Show the coverage of error ellipses."""
+    report = kept_coverage(service.settings.data)
     return web_coverage.coverage_page(
         web_coverage.CoveragePage(frame=frame_of(service), report=report)
     )

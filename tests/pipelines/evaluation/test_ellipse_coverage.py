@@ -10,9 +10,9 @@ from spheremark.pipelines.evaluation.ellipse_coverage import (
     QUANTITIES,
     Draws,
     coverage,
+    ellipse_coverage,
     joined,
     nees,
-    simulate_surveys,
     survey_draws,
 )
 
@@ -88,7 +88,7 @@ def test_a_method_that_positions_few_stations_has_an_interval_and_one_that_posit
 
 
 def test_one_survey_and_no_stop_are_refused():
-    with pytest.raises(TooFewObservationsError, match="two or more"):
+    with pytest.raises(TooFewObservationsError, match="two surveys or more"):
         joined([drawn(np.random.default_rng(5), 1)])
     with pytest.raises(ConfigError, match="stops"):
         survey_draws(1, n_stops=0)
@@ -103,7 +103,7 @@ def test_ellipses_of_whole_simulated_surveys_hold_their_shares():
     wrong by an eighth) 68 %, by 8.5 points 14 %. With 660 stations, for which a test is no place,
     the shares were within 3.2 points.
     """
-    draws = simulate_surveys(30, 15, seed=9000)
+    draws = ellipse_coverage(30, 15, seed=9000).run()
     assert all(np.isfinite(squares).all() for squares in draws.squares.values())
     for one in coverage(draws):
         if one.quantity != "pose":

@@ -5,33 +5,34 @@ import pytest
 from numpy.testing import assert_allclose
 
 from spheremark.pipelines.config import SurveyConfig
-from spheremark.pipelines.evaluation.reproduction import (
+from spheremark.pipelines.evaluation.reproduction.included_angle import angle_experiment
+from spheremark.pipelines.evaluation.reproduction.noise import REFLECTIVITY_BINS, range_noise
+from spheremark.pipelines.evaluation.reproduction.plan import (
     CENTRE,
     CENTRE_REAL,
-    FIELD,
     FULL_SPHERE,
     GROUND,
-    LANE,
     LANE_2,
     OURS,
     PAPER,
-    REAL,
-    REFLECTIVITY_BINS,
     Scan,
-    angle_experiment,
+    plan,
+)
+from spheremark.pipelines.evaluation.reproduction.scans import reproduction
+from spheremark.pipelines.evaluation.reproduction.tables import (
+    FIELD,
+    LANE,
+    REAL,
     findings,
     models_of_icp,
-    plan,
-    range_noise,
     readings,
-    reproduce,
     table_2,
     table_4,
 )
 from spheremark.pipelines.published import SIGMA_RANGE, TABLE_2, TABLE_3
 from spheremark.pipelines.simulation import SimulationConfig, commensurability
 from spheremark.pipelines.simulation.rig import nominal_rig
-from tests.reproduced import reproduction
+from tests.reproduced import reproduction as known_reproduction
 
 MM = 1e-3  # [m]
 
@@ -45,7 +46,7 @@ def made():
     )  # fmt: skip
     lane = replace(centre, series=LANE_2, stop="lane2-stop1", turn=4.2)
     real = replace(centre, series=CENTRE_REAL, sigma_range=None)
-    return reproduce((centre, lane, real), SurveyConfig())
+    return reproduction((centre, lane, real), SurveyConfig()).run(n_processes=1)
 
 
 def test_no_turn_of_a_plan_puts_scan_lines_on_scan_lines():
@@ -97,13 +98,14 @@ def test_the_paper_errs_towards_the_scanner_and_upward(made):
 
 
 def test_the_paper_errs_by_as_much_as_it_prints_with_the_cut_and_the_noise_assumed(made):
-    found = {(one.series, one.method): one for one in readings(made)}
+    found = {(one["series"], one["fit_method"]): one for one in readings(made)}
     assert set(found) == {(s, m) for s in (CENTRE, CENTRE_REAL) for m in (PAPER, GROUND)}
     assumed = found[CENTRE, PAPER]
-    assert assumed.errors.mean == pytest.approx(TABLE_2.errors_3d.mean(), abs=5 * MM)  # of 14
-    assert found[CENTRE, GROUND].errors.mean < 0.8 * assumed.errors.mean
-    assert found[CENTRE_REAL, PAPER].errors.mean < assumed.errors.mean
-    assert assumed.n_points < found[CENTRE, GROUND].n_points
+    error = assumed["error_3d_mean_m"]
+    assert error == pytest.approx(TABLE_2.errors_3d.mean(), abs=5 * MM)  # of 14
+    assert found[CENTRE, GROUND]["error_3d_mean_m"] < 0.8 * error
+    assert found[CENTRE_REAL, PAPER]["error_3d_mean_m"] < error
+    assert assumed["n_points_mean"] < found[CENTRE, GROUND]["n_points_mean"]
 
 
 def test_a_full_sphere_as_model_is_worse_than_a_hemisphere(made):
@@ -151,25 +153,26 @@ def test_runs_of_shots_that_miss_one_or_meet_two_surfaces_tell_no_noise():
 
 
 def test_table_2_puts_each_centre_to_its_distance():
-    made = reproduction()
+    made = known_reproduction()
     rows = table_2(made)
-    assert [row.distance for row in rows] == TABLE_2.ranges.tolist()
+    assert [row["distance_m"] for row in rows] == TABLE_2.ranges.tolist()
     centres = made.centres
-    first = centres.of(PAPER, made.series(CENTRE)) & (centres.ranges == rows[0].distance)
-    assert rows[0].errors[PAPER].n == first.sum() == 2
-    assert rows[0].errors[PAPER].mean == pytest.approx(centres.error_3d[first].mean())
-    assert rows[0].n_points[OURS] == np.ceil(6800.0 / 6.84**2)
+    first = centres.of(PAPER, made.series(CENTRE)) & (centres.ranges == rows[0]["distance_m"])
+    assert rows[0]["paper_n"] == first.sum() == 2
+    assert rows[0]["paper_error_3d_mean_m"] == pytest.approx(centres.error_3d[first].mean())
+    assert rows[0]["along_beam_n_points_mean"] == np.ceil(6800.0 / 6.84**2)
 
 
 def test_table_4_goes_along_the_lane_and_counts_what_was_found():
-    rows = table_4(reproduction())
-    assert [row.stop for row in rows] == [f"lane2-stop{i + 1}" for i in range(7)]
-    assert all(row.n_marks == row.errors[OURS].n == 14 for row in rows)
-    assert all(row.errors[PAPER].mean > 0.02 > row.errors[OURS].mean for row in rows)
+    rows = table_4(known_reproduction())
+    assert [row["stop"] for row in rows] == [f"lane2-stop{i + 1}" for i in range(7)]
+    assert all(row["n_marks"] == row["along_beam_n"] == 14 for row in rows)
+    for row in rows:
+        assert row["paper_error_3d_mean_m"] > 0.02 > row["along_beam_error_3d_mean_m"]
 
 
 def test_a_biased_method_keeps_the_tolerance_by_its_mean_and_not_by_its_percentile():
-    made = reproduction()
+    made = known_reproduction()
     found = {(one.place, one.method): one for one in findings(made, np.random.default_rng(4))}
     assert set(found) == {
         (place, method) for place in (FIELD, LANE, REAL) for method in (OURS, PAPER)
@@ -184,20 +187,22 @@ def test_a_biased_method_keeps_the_tolerance_by_its_mean_and_not_by_its_percenti
 
 def test_the_granted_errors_give_the_printed_errors_of_the_station():
     made = angle_experiment(0.03, np.random.default_rng(6))
-    assert [row.published for row in made.rows] == TABLE_3.errors.tolist()
+    assert [row["study_error_m"] for row in made.rows] == TABLE_3.errors.tolist()
     assert made.rms_from_published < 3 * MM
     near, far = made.rows[0], made.rows[-1]
-    assert min(near.errors.values()) > 0.05  # too narrow for any method
-    assert far.errors["three circles"] > 0.03 > far.errors["two centres"]
+    methods = ("three_circles", "two_centres", "three_centres")
+    assert min(near[f"{method}_error_m"] for method in methods) > 0.05  # too narrow for any method
+    assert far["three_circles_error_m"] > 0.03 > far["two_centres_error_m"]
 
 
 def test_the_free_station_has_a_lower_limit_that_falls_with_sigma_and_no_upper_one():
     made = angle_experiment(0.03, np.random.default_rng(7))
-    least = {round(1e3 * one.sigma): np.degrees(one.least) for one in made.limits}
+    least = {round(1e3 * one["sigma_axis_m"]): one["two_centres_from_deg"] for one in made.limits}
     assert least[17] == pytest.approx(52.0, abs=0.5)
     assert least[10] == pytest.approx(28.0, abs=0.5)
     for one in made.limits:
-        assert one.rms == pytest.approx(0.03, rel=0.04)  # the code, where theory says so
+        rms = one["two_centres_error_horizontal_rms_m"]
+        assert rms == pytest.approx(0.03, rel=0.04)  # simulated at the limit of the theory
     for name in ("two centres", "three centres"):
         wide = made.curves[name][made.angles > np.radians(60)]
         assert wide.max() < 0.03
@@ -214,5 +219,5 @@ def test_the_drawn_circles_are_those_of_the_solution():
 
 
 def test_the_same_reproduction_gives_the_same_statements():
-    first, second = (findings(reproduction(), np.random.default_rng(4)) for _ in range(2))
+    first, second = (findings(known_reproduction(), np.random.default_rng(4)) for _ in range(2))
     assert [one.limits for one in first] == [one.limits for one in second]

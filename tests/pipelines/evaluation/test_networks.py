@@ -7,22 +7,28 @@ import pytest
 from rich.console import Console
 
 from spheremark.pipelines.calibration.gimbal import GIMBAL, values
+from spheremark.pipelines.config import ResectionConfig
+from spheremark.pipelines.evaluation.networks import (
+    is_gross_found,
+    network_tables,
+    networks,
+    wrong_rig,
+)
 from spheremark.pipelines.network import adjust_network, assemble
 from spheremark.pipelines.simulation import SimulationConfig
 from spheremark.pipelines.simulation.rig import nominal_rig
-from spheremark.service.bench import networks as network_trials
-from spheremark.service.bench.networks import Wish, is_gross_found, run, wrong_rig
+from spheremark.service.bench.report import print_tables
 from tests.synthetic import field, pose, sightings
 
-CONFIG = network_trials._CONFIG.resection
+CONFIG = ResectionConfig()
 
 
 @pytest.fixture(scope="module")
 def report():
-    told = []
-    wish = Wish(n_surveys=2, n_stops=3, is_rig_wrong=True, seed=40)
-    found = run(wish, lambda share, _what: told.append(share), n_processes=1)
-    assert told == [0.0, 0.5, 1.0]
+    shares = []
+    experiment = networks(2, seed=40, n_stops=3, is_rig_wrong=True)
+    found = experiment.run(lambda share, _what: shares.append(share), n_processes=1)
+    assert shares == [0.0, 0.5, 1.0]
     return found
 
 
@@ -38,7 +44,7 @@ def test_surveys_with_wrong_rigs_are_compared_with_their_truth(report):
 
 def test_the_report_is_a_table_and_json(report):
     out = Console(record=True, width=160)
-    network_trials.print_report(out, report)
+    print_tables(out, network_tables(report))
     text = out.export_text()
     for word in ("wrong rigs", "marks, 3-D error RMS", "0.85 to 1.2", "found and named in"):
         assert word in text

@@ -3,23 +3,22 @@
 import numpy as np
 import pytest
 
-from spheremark.service.bench.precision import Case, Wish, accuracy_table, full_wish
+from spheremark.pipelines.evaluation.precision import Case, full_precision, precision
 
 
-def silent(share, what):
-    """Tell nobody."""
-
-
-def rows_of(**wish):
-    return accuracy_table(Wish(**wish), silent)
+def rows_of(n_stops, seed=0, **options):
+    return precision(n_stops, seed, **options).run()["rows"]
 
 
 def test_the_full_sample_is_a_thousand_fits_at_each_distance_and_has_a_long_turn():
-    wish = full_wish(5)
-    assert wish.n_stops * 20 > 1.2 * 1000  # a few of the far markers are not found
-    assert {case.sigma for case in wish.cases} == {0.01, 0.02}
-    assert max(case.turn for case in wish.cases) >= 20.0
-    assert wish.seed == 5
+    worlds = full_precision(5).worlds
+    seeds = {case: [seed for one, seed in worlds if one == case] for case, _ in worlds}
+    for own in seeds.values():
+        assert len(set(own)) == len(own)
+        assert 20 * len(own) > 1.2 * 1000  # a few of the far markers are not found
+        assert min(own) == 5
+    assert {case.sigma for case in seeds} == {0.01, 0.02}
+    assert max(case.turn for case in seeds) >= 20.0
 
 
 @pytest.mark.slow

@@ -1,23 +1,22 @@
-"""``spheremark bench --networks``: whole simulated surveys, adjusted and compared with the truth.
+"""Accuracy of adjusted surveys: whole simulated surveys without control, against the truth.
 
-Every survey has a field, a rig and sensors of its own, and no control: place and attitude are taken
-out before anything is compared. Then one observation gets a gross error, which must be found.
+Every survey has a field, a rig and sensors of its own. Place and attitude (the datum) are taken out
+before anything is compared. Then one observation gets a gross error, which must be found.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from collections.abc import Sequence
+from dataclasses import replace
 from functools import partial
 from time import process_time
-from typing import Any
 
 import numpy as np
-from rich.console import Console
-from rich.table import Table
 
 from spheremark.pipelines.calibration import Calibration, calibrate
 from spheremark.pipelines.calibration.gimbal import GIMBAL, moved
 from spheremark.pipelines.config import FittingConfig, SurveyConfig
+from spheremark.pipelines.evaluation.experiment import Column, Experiment, Plain, Table
 from spheremark.pipelines.model import MarkerFits, Rig, Truth
 from spheremark.pipelines.network import AdjustedNetwork, Network, adjust_network, assemble, compare
 from spheremark.pipelines.simulation import (
@@ -27,16 +26,16 @@ from spheremark.pipelines.simulation import (
     scenario,
     simulate_stop,
 )
-from spheremark.pipelines.survey import Progress, process
-from spheremark.pipelines.threads import in_processes
-
-Plain = dict[str, Any]
+from spheremark.pipelines.survey import process
 
 BARS = {"rms_marks_m": 0.0007, "rms_stations_m": 0.0015}
-"""What the mean error over surveys of all stops may be [m]."""
+"""Greatest mean error over surveys of all stops that is accepted [m]."""
 
 BARS_NEES = (0.85, 1.2)
-"""Between which the mean of squared errors in units of their covariance is to lie."""
+"""Least and greatest mean square of errors in units of their covariance that are accepted."""
+
+N_STOPS = 35
+"""Stops of a whole survey."""
 
 _METHOD = "along_beam"
 _CONFIG = SurveyConfig(fitting=FittingConfig(methods=(_METHOD,)))
@@ -44,37 +43,104 @@ _SIGMA_RANGE = 0.020  # [m]
 _GROSS = 0.05  # [m]
 _WRONG = {"axis_offset_x": 0.010, "axis_offset_y": 0.008, "spin_zero": np.radians(0.2)}
 _WRONG_LASER = 0.005  # [m]
-_MEASURES = (*BARS, "nees_marks", "nees_stations")
+_MEASURES = {
+    "rms_marks_m": ("marks, 3-D error RMS [mm]", 1e3),
+    "rms_stations_m": ("stations, 3-D error RMS [mm]", 1e3),
+    "nees_marks": ("marks, NEES per degree of freedom", 1.0),
+    "nees_stations": ("stations, NEES per degree of freedom", 1.0),
+}
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Wish:
-    """How many surveys of how many stops, and whether the rigs are wrong and calibrated."""
+def networks(
+    n_surveys: int, *, seed: int = 0, n_stops: int = N_STOPS, is_rig_wrong: bool = False
+) -> Experiment[int, Plain, Plain]:
+    """Return the experiment that adjusts whole surveys.
 
-    n_surveys: int
-    n_stops: int = 35
-    is_rig_wrong: bool = False
-    seed: int = 0
+    Parameters
+    ----------
+    n_surveys : int
+        Number of surveys.
+    seed : int
+        Seed of the first survey; the others follow.
+    n_stops : int
+        Stops of each.
+    is_rig_wrong : bool
+        Whether the rig is wrong and calibrated.
+
+    Returns
+    -------
+    Experiment
+        Its report has the errors of each survey and their means.
+    """
+    return Experiment(
+        worlds=range(seed, seed + n_surveys),
+        run_world=partial(_survey, n_stops=n_stops, is_rig_wrong=is_rig_wrong),
+        pool=lambda rows: {
+            "n_surveys": n_surveys,
+            "n_stops": n_stops,
+            "is_rig_wrong": is_rig_wrong,
+            "seed": seed,
+            **_report(rows),
+        },
+    )
 
 
-def run(wish: Wish, progress: Progress, n_processes: int | None = None) -> Plain:
-    """Simulate and adjust surveys; return each one's errors, and their means."""
-    seeds = range(wish.seed, wish.seed + wish.n_surveys)
-    work = partial(survey, n_stops=wish.n_stops, is_rig_wrong=wish.is_rig_wrong)
-    rows = in_processes(work, seeds, n_processes=n_processes, progress=progress)
+def network_tables(report: Plain) -> tuple[Table, ...]:
+    """Return the means over surveys beside the accepted ones.
+
+    Parameters
+    ----------
+    report : dict
+        Report of ``networks``.
+
+    Returns
+    -------
+    tuple of Table
+        One table.
+    """
+    rigs = (
+        "wrong rigs, calibrated in the same adjustment" if report["is_rig_wrong"] else "as set up"
+    )
+    low, high = report["bars_nees"]
+    rows = []
+    for name, (what, factor) in _MEASURES.items():
+        bar = f"{factor * report['bars'][name]:.1f}" if name in BARS else f"{low} to {high}"
+        scaled = {k: v and factor * v for k, v in report["summary"][name].items()}
+        rows.append(scaled | {"what": what, "bar": bar})
+    return (
+        Table(
+            title=f"{report['n_surveys']} surveys of {report['n_stops']} stops, ranges with sigma "
+            f"{1e3 * report['sigma_range_m']:.0f} mm, {rigs}; free networks, datum taken out.",
+            columns=(
+                Column("what", ""),
+                Column("mean", "mean", "", ".2f"),
+                Column("sigma_mean", "+-", "", ".2f"),
+                Column("least", "least", "", ".2f"),
+                Column("greatest", "greatest", "", ".2f"),
+                Column("bar", "bar", "", ">"),
+            ),
+            rows=rows,
+            notes=(
+                f"A gross error of {100 * report['gross_error_m']:.0f} cm was found and named in "
+                f"{report['n_gross_found']} of {report['n_surveys']} surveys. Left out without "
+                f"one: {report['n_left_out']} of {report['n_observations']:,} centres, gravity "
+                f"included; false marks: {report['n_false_marks']}. Assembly and adjustment: "
+                f"{report['adjustment_cpu_seconds']:.2f} s of CPU each.",
+            ),
+        ),
+    )
+
+
+def _report(rows: Sequence[Plain]) -> Plain:
+    """Return the errors of all surveys, their means and sums."""
+    sums = ("n_false_marks", "n_left_out", "n_observations")
     return {
-        "n_surveys": wish.n_surveys,
-        "n_stops": wish.n_stops,
-        "is_rig_wrong": wish.is_rig_wrong,
-        "seed": wish.seed,
         "sigma_range_m": _SIGMA_RANGE,
         "gross_error_m": _GROSS,
         "bars": BARS,
         "bars_nees": BARS_NEES,
         "summary": {name: _summary([row[name] for row in rows]) for name in _MEASURES},
-        "n_false_marks": sum(row["n_false_marks"] for row in rows),
-        "n_left_out": sum(row["n_left_out"] for row in rows),
-        "n_observations": sum(row["n_observations"] for row in rows),
+        **{name: sum(row[name] for row in rows) for name in sums},
         "n_gross_found": sum(row["is_gross_found"] for row in rows),
         "adjustment_cpu_seconds": float(np.mean([row["adjustment_cpu_seconds"] for row in rows])),
         "surveys": rows,
@@ -92,7 +158,7 @@ def _summary(values: list[float]) -> Plain:
     }
 
 
-def survey(seed: int, *, n_stops: int, is_rig_wrong: bool) -> Plain:
+def _survey(seed: int, *, n_stops: int, is_rig_wrong: bool) -> Plain:
     """Simulate one survey, adjust it, and compare it with its truth."""
     field, rng = scenario("paper-field", seed), np.random.default_rng([seed, 1])
     simulation = SimulationConfig(only_near_spheres=True, sigma_range=_SIGMA_RANGE)
@@ -112,7 +178,7 @@ def survey(seed: int, *, n_stops: int, is_rig_wrong: bool) -> Plain:
 def _scans(
     stops: list[SimulatedStop], wrong: Rig | None
 ) -> tuple[list[tuple[str, MarkerFits]], Calibration | None]:
-    """Return the centres of all stops, and what their calibration tells if the rig is wrong."""
+    """Return the centres of all stops, and the calibration of the rig if it is wrong."""
     found = [
         (stop.truth.name, process(stop.log, config=_CONFIG, rig=wrong)[0].fits[_METHOD])
         for stop in stops
@@ -149,7 +215,7 @@ def _row(field: Field, stops: list[SimulatedStop], result: AdjustedNetwork) -> P
 
 
 def is_gross_found(network: Network, rng: np.random.Generator) -> bool:
-    """Whether an observation that is wrong by 5 cm is named as the first to leave out."""
+    """Return whether an observation that is wrong by 5 cm is the first to be left out."""
     place = int(rng.integers(len(network.sightings)))
     away, p_base = rng.normal(size=3), network.p_base.copy()
     p_base[place] += _GROSS * away / np.linalg.norm(away)
@@ -161,40 +227,4 @@ def is_gross_found(network: Network, rng: np.random.Generator) -> bool:
     return worst is not None and (worst.station, worst.mark) == (
         network.stations[station],
         network.marks[mark],
-    )
-
-
-_SAID = {
-    "rms_marks_m": ("marks, 3-D error RMS [mm]", 1e3),
-    "rms_stations_m": ("stations, 3-D error RMS [mm]", 1e3),
-    "nees_marks": ("marks, NEES per degree of freedom", 1.0),
-    "nees_stations": ("stations, NEES per degree of freedom", 1.0),
-}
-
-
-def print_report(out: Console, report: Plain) -> None:
-    """Print the means over surveys beside what is asked of them."""
-    rigs = (
-        "wrong rigs, calibrated in the same adjustment" if report["is_rig_wrong"] else "as set up"
-    )
-    out.print(
-        f"{report['n_surveys']} surveys of {report['n_stops']} stops, ranges with sigma "
-        f"{1e3 * report['sigma_range_m']:.0f} mm, {rigs}; free networks, datum taken out."
-    )
-    table = Table("")
-    for name in ("mean", "+-", "least", "greatest", "bar"):
-        table.add_column(name, justify="right")
-    for name, (said, factor) in _SAID.items():
-        one = report["summary"][name]
-        cells = [one["mean"], one["sigma_mean"], one["least"], one["greatest"]]
-        low, high = report["bars_nees"]
-        bar = f"{factor * report['bars'][name]:.1f}" if factor != 1.0 else f"{low} to {high}"
-        table.add_row(said, *("-" if c is None else f"{factor * c:.2f}" for c in cells), bar)
-    out.print(table)
-    out.print(
-        f"A gross error of {100 * report['gross_error_m']:.0f} cm was found and named in "
-        f"{report['n_gross_found']} of {report['n_surveys']} surveys. Left out without one: "
-        f"{report['n_left_out']} of {report['n_observations']:,} centres, gravity included; false "
-        f"marks: {report['n_false_marks']}. Assembly and adjustment: "
-        f"{report['adjustment_cpu_seconds']:.2f} s of CPU each."
     )
