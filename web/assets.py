@@ -1,4 +1,4 @@
-"""Files that pages load, and the addresses that change when they do."""
+"""Static files of pages, with addresses that change with their content."""
 
 from __future__ import annotations
 
@@ -22,18 +22,18 @@ def static_folder() -> Path:
 
 
 def plotly_script() -> Path:
-    """Return Plotly's script, as the installed package brings it."""
+    """Return the path of Plotly's script in the installed package."""
     return Path(str(resources.files("plotly"))) / "package_data" / "plotly.min.js"
 
 
 def plotly_url() -> str:
-    """Return the address of Plotly's script: another one for each version."""
+    """Return the address of Plotly's script, which changes with its version."""
     return f"{STATIC}/plotly-{metadata.version('plotly')}.min.js"
 
 
 @cache
 def digest() -> str:
-    """Return a short digest of all own static files."""
+    """Return a short digest of all static files."""
     total = hashlib.sha256()
     for path in sorted(static_folder().rglob("*")):
         if path.is_file():
@@ -42,29 +42,29 @@ def digest() -> str:
 
 
 def url(name: str) -> str:
-    """Return the address of an own static file, with what makes it new when any has changed."""
+    """Return the address of a static file, which changes when any file changes."""
     return f"{STATIC}/{name}?v={digest()}"
 
 
 @cache
 def map_style_id() -> str:
-    """Return the id under which Plotly looks for the style sheet of its maps.
+    """Return the id of the style sheet of Plotly's maps.
 
-    We draw none: an element of that id keeps 80 kB of inline style out of every page.
+    No page has a map of Plotly: an element of this id avoids 80 kB of inline style.
     """
     found = re.search(r'getElementById\("([0-9a-f]{64})"\)', plotly_script().read_text("utf-8"))
     return found[1] if found else "no-map-style"
 
 
 def inline_styles() -> Markup:
-    """Return all own styles, fonts included, for a page that stands alone."""
+    """Return all styles with the fonts, for a page in one file."""
     folder = static_folder()
     text = "".join((folder / name).read_text("utf-8") for name in ("tokens.css", "site.css"))
     return Markup(_FONT.sub(lambda found: _data_url(folder / found[1]), text))
 
 
 def inline_script(name: str) -> Markup:
-    """Return an own script for a page that stands alone."""
+    """Return a script for a page in one file."""
     return Markup((static_folder() / name).read_text("utf-8"))
 
 
@@ -77,5 +77,5 @@ def tokens(mode: str) -> dict[str, str]:
 
 
 def _data_url(path: Path) -> str:
-    """Return a font as an address that holds it."""
+    """Return a font as a data URL."""
     return f'url("data:font/woff2;base64,{base64.b64encode(path.read_bytes()).decode()}")'

@@ -1,4 +1,4 @@
-"""Tables as columns of the database, and what pages and figures read from them."""
+"""Tables as columns, named as in the database: the input of figures and pages."""
 
 from __future__ import annotations
 
@@ -22,22 +22,22 @@ def floats(columns: Columns, name: str) -> NDArray[np.float64]:
 
 
 def texts(columns: Columns, name: str) -> list[str]:
-    """Return a column as texts; NULL is nothing."""
+    """Return a column as texts; NULL is empty."""
     return ["" if value is None else str(value) for value in columns[name]]
 
 
 def select(columns: Columns, keep: NDArray[np.bool_]) -> dict[str, NDArray[Any]]:
-    """Return the rows of a table that are to be kept."""
+    """Return the rows of a table where ``keep`` is true."""
     return {name: column[keep] for name, column in columns.items()}
 
 
 def known_values(values: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return what is known of a column."""
+    """Return the finite values of a column."""
     return values[np.isfinite(values)]
 
 
 def largest(values: NDArray[np.float64]) -> float:
-    """Return the largest magnitude that is known, or zero."""
+    """Return the largest known magnitude, or zero."""
     known = known_values(values)
     return float(np.abs(known).max()) if len(known) else 0.0
 
@@ -48,12 +48,12 @@ def rms(values: NDArray[np.float64]) -> float:
 
 
 def has_errors(columns: Columns) -> bool:
-    """Whether anything is known about the truth of these rows."""
+    """Whether the error of any row is known."""
     return bool(np.isfinite(floats(columns, "error_3d_m")).any())
 
 
 def on_marks(columns: Columns) -> NDArray[np.bool_]:
-    """Tell which fits stand on a mark; all of them where no mark is known."""
+    """Return which fits belong to a mark; all where no mark is known."""
     known = np.isfinite(floats(columns, "error_3d_m"))
     if known.any():
         return known
@@ -62,7 +62,7 @@ def on_marks(columns: Columns) -> NDArray[np.bool_]:
 
 
 def by_method(columns: Columns) -> Iterator[tuple[str, dict[str, NDArray[Any]]]]:
-    """Return the rows of each fitting method, the one that counts first."""
+    """Yield the rows of each fitting method, ``along_beam`` first."""
     methods = np.array(texts(columns, "fit_method"), dtype=object)
     for method in sorted(set(methods.tolist()), key=lambda name: (name != "along_beam", name)):
         yield method, select(columns, methods == method)
@@ -81,7 +81,7 @@ def lane_order(stop: str) -> tuple[str, int, str]:
 
 
 def plain_rows(columns: Columns) -> list[dict[str, Any]]:
-    """Return columns as rows of plain values."""
+    """Return columns as rows of plain values; unknown numbers are None."""
     lists: list[list[Any]] = [_plain(column) for column in columns.values()]
     return [dict(zip(columns, row, strict=True)) for row in zip(*lists, strict=True)]
 

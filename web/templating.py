@@ -1,4 +1,4 @@
-"""The templates: their filters, and how numbers, units, instants and JSON are written."""
+"""The templates and their filters: formats of numbers, units, instants and JSON."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ _ENDINGS = {
 
 @cache
 def environment() -> Environment:
-    """Return the templates with the filters that they use."""
+    """Return the templates with their filters."""
     made = Environment(
         loader=PackageLoader("spheremark.web"),
         autoescape=True,
@@ -56,23 +56,23 @@ def environment() -> Environment:
 
 
 def render(template: str, page: Any, **more: Any) -> str:
-    """Fill a template with the fields of a page and what was made of them."""
+    """Render a template with the fields of a page and further values."""
     context = {field.name: getattr(page, field.name) for field in fields(page)}
     return environment().get_template(template).render(**context, **more)
 
 
 def json_block(value: Any) -> Markup:
-    """Return a value as JSON that may stand inside a script element."""
+    """Return a value as JSON for a script element."""
     return _as_block(json.dumps(value))
 
 
 def _as_block(text: str) -> Markup:
-    """Mark JSON as safe, once nothing in it can end the element that holds it."""
+    """Mark JSON as safe after escaping what could end its element."""
     return Markup(text.replace("<", "\\u003c").replace("&", "\\u0026"))
 
 
 def heading(name: str) -> str:
-    """Return the name of a column or key as people write it, with its unit in brackets."""
+    """Return the name of a column or key as a heading, with its unit in brackets."""
     for ending, unit in _ENDINGS.items():
         if name.endswith(ending):
             return f"{_words(name.removesuffix(ending))} [{unit}]"
@@ -86,19 +86,19 @@ def _words(name: str) -> str:
 
 
 def signed(value: float, decimals: int = 2) -> str:
-    """Write a number with its sign, a true minus; or a dash for what is not known."""
+    """Format a number with its sign, a true minus; a dash for an unknown one."""
     if not math.isfinite(value):
         return _UNKNOWN
     return f"{value:+.{decimals}f}".replace("-", "\N{MINUS SIGN}")
 
 
 def number(value: float | None, decimals: int = 2) -> str:
-    """Write a number, or a dash for what is not known."""
+    """Format a number; a dash for an unknown one."""
     if value is None or not math.isfinite(value):
         return _UNKNOWN
     return f"{value:.{decimals}f}"
 
 
 def _moment(value: datetime | None) -> str:
-    """Write an instant in UTC."""
+    """Format an instant in UTC."""
     return _UNKNOWN if value is None else f"{value.astimezone(UTC):%Y-%m-%d %H:%M:%S} UTC"

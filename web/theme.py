@@ -1,7 +1,7 @@
-"""How things look: colours by role, one Plotly template, one style per method.
+"""Colours by role, the Plotly template, and one style per method.
 
-Colours are names of CSS variables (``var(--ours)``): static/tokens.css gives each its value for
-light and dark, and the page's script puts the values in when it draws. So there is one palette.
+Colours are names of CSS variables (``var(--ours)``). static/tokens.css has the values for light and
+dark; the script of the page substitutes them when it draws.
 """
 
 from __future__ import annotations
@@ -38,14 +38,14 @@ DIVERGING = (
     (0.5, "var(--middle)"),
     (1.0, "var(--above)"),
 )
-"""From too near to too far, neutral at zero; told apart without red and green."""
+"""From too near to too far, neutral at zero; distinguishable without red and green."""
 
 HEIGHTS = ((0.0, "var(--low)"), (1.0, "var(--high)"))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class MethodStyle:
-    """How one fitting method is drawn, everywhere."""
+    """Style of one fitting method in all figures."""
 
     label: str
     colour: str
@@ -71,7 +71,7 @@ _OTHERS = {
 
 
 def method_style(method: str) -> MethodStyle:
-    """Return how a method is drawn: each in a colour and with a symbol of its own."""
+    """Return the style of a method; each has its own colour and symbol."""
     colour, symbol = _OTHERS.get(method, (MUTED, "hexagon"))
     return _METHODS.get(method) or MethodStyle(
         label=method.replace("_", " "),
@@ -83,7 +83,7 @@ def method_style(method: str) -> MethodStyle:
 
 
 def template() -> go.layout.Template:
-    """Return the look of every figure: quiet axes, hairline grid, figures in a monospace."""
+    """Return the template of all figures: hairline grid, monospaced tick labels."""
     axis = {
         "gridcolor": GRID,
         "linecolor": LINE,
@@ -126,7 +126,7 @@ def template() -> go.layout.Template:
 
 
 def _axis_3d() -> dict[str, object]:
-    """Return the look of an axis in space: hardly there."""
+    """Return the style of an axis of a 3-D scene."""
     return {
         "gridcolor": GRID,
         "zerolinecolor": LINE,
@@ -139,7 +139,7 @@ def _axis_3d() -> dict[str, object]:
 
 
 def coloured(value: object, tokens: Mapping[str, str]) -> object:
-    """Return a figure's plain values with colours in the place of the names of CSS variables."""
+    """Return the values of a figure with CSS variables replaced by their colours."""
     if isinstance(value, str):
         name = value.removeprefix("var(").removesuffix(")")
         return tokens.get(name, value) if value.startswith("var(") else value

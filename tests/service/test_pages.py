@@ -68,7 +68,7 @@ def test_a_filter_in_the_address_narrows_the_dashboard(client):
 
 def test_a_filter_that_nothing_passes_says_what_to_do(client):
     text = page(client, "/surveys/field?range_from_m=90")
-    assert "Nothing passes these filters" in text
+    assert "No fit passes these filters" in text
     assert 'id="figure-distance"' not in text
 
 

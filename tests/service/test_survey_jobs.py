@@ -286,7 +286,7 @@ def test_the_page_of_a_free_network_leaves_out_no_control(site, free, rows):
     (whole,) = rows("adjustments", free)
     text = page(site, f"/adjustments/{whole['adjustment_id']}")
     assert 'id="figure-checks"' not in text
-    assert "after it was laid on the truth" in text
+    assert "after a fit to the truth" in text
 
 
 def test_where_truth_is_not_known_no_page_of_a_network_speaks_of_errors(site, run, rows):
@@ -307,7 +307,7 @@ def test_the_page_of_a_calibration_lets_one_use_its_rig(site, calibrated, rows):
     path = f"/calibrations/{whole['calibration_id']}"
     text = page(site, path)
     assert 'id="figure-gaps"' in text
-    assert "What these scans do not tell" in text
+    assert "Not determined by these scans" in text
     fields = {"rig": whole["rig_digest"], "back": path}
     answer = site.client.post("/surveys/field/rig", data=fields, follow_redirects=False)
     assert (answer.status_code, answer.headers["location"]) == (303, path)

@@ -1,1 +1,1 @@
-"""Plotly figures: from columns, named and in the units of the database."""
+"""Plotly figures from columns in the units of the database; lengths are drawn in millimetres."""

@@ -1,7 +1,4 @@
-"""Figures of a calibration: how the two faces of spheres agree, before and after, and the lasers.
-
-Columns are named as the database names them; metres come in, millimetres are drawn.
-"""
+"""Figures of a calibration: differences of the two faces before and after, biases of lasers."""
 
 from __future__ import annotations
 
@@ -13,12 +10,12 @@ from spheremark.web.columns import MM, Columns, floats, texts
 from spheremark.web.figures.elements import blank_figure
 
 _BEYOND = 2.0  # sigmas
-_WAYS = {"radial": "along the sight", "across": "across it", "up": "up"}
+_WAYS = {"radial": "along the line of sight", "across": "across it", "up": "up"}
 _STYLES = (("before", theme.MUTED, "circle-open"), ("after", theme.OURS, "circle"))
 
 
 def face_gaps(before: Columns, after: Columns) -> go.Figure:
-    """Draw how far apart the two faces put each sphere, before and after a calibration."""
+    """Draw the difference of the two faces of each sphere, before and after a calibration."""
     figure = make_subplots(
         rows=len(_WAYS), cols=1, shared_xaxes=True, vertical_spacing=0.06, figure=_blank()
     )
@@ -33,7 +30,7 @@ def face_gaps(before: Columns, after: Columns) -> go.Figure:
 
 
 def _blank() -> go.Figure:
-    """Return the figure of the gaps without anything in it."""
+    """Return the blank figure of the gaps."""
     return blank_figure("Front minus back of each sphere")
 
 

@@ -21,12 +21,12 @@ RATIO_AXIS = {
 
 
 def blank_figure(title: str) -> go.Figure:
-    """Return an empty figure that looks like all others."""
+    """Return an empty figure with the template and a title."""
     return go.Figure(layout={"template": theme.template(), "title": {"text": title}})
 
 
 def add_tolerance(figure: go.Figure, tolerance_m: float) -> None:
-    """Draw the tolerance: one look, everywhere."""
+    """Draw the tolerance as a dashed line."""
     figure.add_hline(
         y=tolerance_m * MM,
         line={"color": theme.TOLERANCE, "width": 1.5, "dash": "dash"},
@@ -47,7 +47,7 @@ def add_zero(figure: go.Figure) -> None:
 
 
 def add_note(figure: go.Figure, text: str) -> None:
-    """Write a remark into the lower right corner."""
+    """Write a note into the lower right corner."""
     figure.add_annotation(
         text=text,
         x=1,
@@ -77,7 +77,7 @@ def group_by_axis(figure: go.Figure, x_title: str, y_title: str, gap: float) -> 
 
 
 def make_log(figure: go.Figure) -> None:
-    """Make the axis of errors logarithmic; Plotly wants logarithms of annotations, not of lines."""
+    """Make the axis of errors logarithmic; Plotly takes annotations as logarithms, lines not."""
     figure.update_yaxes(**RATIO_AXIS, rangemode="normal")
     for line, note in zip(figure.layout.shapes, figure.layout.annotations, strict=False):
         if note.yref == "y":
@@ -85,7 +85,7 @@ def make_log(figure: go.Figure) -> None:
 
 
 def details(rows: Columns, words: Sequence[str], numbers: Sequence[str]) -> list[list[Any]]:
-    """Return what a person reads when pointing at a row."""
+    """Return the values that the hover text of each row shows."""
     columns: list[Iterable[Any]] = [texts(rows, name) for name in words]
     columns += [floats(rows, name).round(4).tolist() for name in numbers]
     return [list(row) for row in zip(*columns, strict=True)]
@@ -115,7 +115,7 @@ def add_binned(
 def binned_rms(
     x: NDArray[np.float64], y: NDArray[np.float64], width: float
 ) -> tuple[list[float], list[float]]:
-    """Return the mean place and the RMS of y in bins of x, leaving out what is not known."""
+    """Return the mean of x and the RMS of the known y in bins of x."""
     known = np.isfinite(x) & np.isfinite(y)
     x, y = x[known], y[known]
     bins = np.floor(x / width)
@@ -127,7 +127,6 @@ def binned_rms(
 
 
 def joined_strokes(strokes: Sequence[NDArray[np.float64]]) -> NDArray[np.float64]:
-    """Return many lines as one with gaps, (n, 2)."""
-    gap = np.full((1, 2), np.nan)
-    parts = [part for stroke in strokes for part in (stroke, gap)]
-    return np.concatenate(parts) if parts else gap
+    """Return many lines as one with gaps, (n, dimensions)."""
+    gap = np.full((1, strokes[0].shape[1] if strokes else 2), np.nan)
+    return np.concatenate([part for stroke in strokes for part in (stroke, gap)] or [gap])

@@ -1,6 +1,6 @@
-"""The error of a station against the included angle between its marks, with theory.
+"""Figures of the error of a station against the included angle of its marks, with theory.
 
-Horizontal errors, because the theory is one of the plane: heights rest on the levelling.
+Errors are horizontal, as the theory is: heights depend on the levelling.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from spheremark.web.columns import MM, Columns, by_method, floats, known_values,
 from spheremark.web.figures.elements import add_binned, add_tolerance, blank_figure, make_log
 from spheremark.web.figures.survey import ANGLE_BIN
 
-_N_DRAWN = 3000  # points of one method; more are one blot, and make a page slow
+_N_DRAWN = 3000  # points of one method; more overlap and slow the page
 _ANGLES = np.radians(np.concatenate([np.arange(2.0, 178.5, 0.5), [179.0]]))
 _COUNTS = {2: "two marks", 3: "three marks"}
 _HOW = {"free_station": "3-D centres", "paper": "circles", "ranges": "slope distances"}
@@ -32,7 +32,7 @@ THEORIES = {
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Subsets:
-    """Positions from pairs or triples by one resection method, and what they are compared with."""
+    """Positions from pairs or triples by one resection method, and those from all marks."""
 
     rows: Columns
     fixes: Columns
@@ -42,12 +42,12 @@ class Subsets:
 
     @property
     def has_errors(self) -> bool:
-        """Whether anything is known about the truth of these rows."""
+        """Whether the error of any row is known."""
         return bool(np.isfinite(floats(self.rows, "error_horizontal_m")).any())
 
     @property
     def quality(self) -> str:
-        """Name of the column that is drawn, but for its end."""
+        """Prefix of the column that is drawn."""
         return "error" if self.has_errors else "sigma"
 
 
@@ -91,7 +91,7 @@ def add_theory(figure: go.Figure, sigma_axis_m: float) -> None:
 
 
 def add_limits_of_study(figure: go.Figure, *, is_shaded: bool) -> None:
-    """Mark the angles that the study recommends, shaded outside where its own method is shown."""
+    """Mark the recommended angles of the study; shade the others where its method is shown."""
     low, high = np.degrees([LEAST_ANGLE, WIDEST_ANGLE])
     for x in (low, high):
         figure.add_vline(x=x, line={"color": theme.MUTED, "width": 1, "dash": "dot"}, layer="below")
@@ -110,7 +110,7 @@ def add_limits_of_study(figure: go.Figure, *, is_shaded: bool) -> None:
 
 
 def _add_rows(figure: go.Figure, method: str, rows: Columns, shown: Subsets) -> None:
-    """Draw the station from each few marks, and the RMS of bins."""
+    """Draw the station from each pair or triple, and the RMS of bins."""
     style = theme.method_style(method)
     x = floats(rows, "included_angle_max_deg")
     y = floats(rows, f"{shown.quality}_horizontal_m") * MM
@@ -138,7 +138,7 @@ def _add_rows(figure: go.Figure, method: str, rows: Columns, shown: Subsets) -> 
 
 
 def _add_all_marks(figure: go.Figure, method: str, rows: Columns, shown: Subsets) -> None:
-    """Draw the RMS of the stations from all their marks as a level line."""
+    """Draw the RMS of the stations from all marks as a level line."""
     style = theme.method_style(method)
     known = known_values(floats(rows, f"{shown.quality}_horizontal_m"))
     if not len(known):

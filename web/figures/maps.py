@@ -1,4 +1,4 @@
-"""The map of a field: marks, stations, and their ellipses with the true places, enlarged alike."""
+"""The map of a field: marks, stations, and their ellipses and errors with one scale factor."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ _ELLIPSE_SHARE = 0.08  # the largest ellipse is drawn at most this large, as a s
 
 
 def site_map(marks: Columns, fixes: Columns, true_stops: Columns) -> go.Figure:
-    """Draw marks, stations and their 95 % ellipses, exaggerated alike with the true places."""
+    """Draw marks, stations, and their 95 % ellipses and errors with one scale factor."""
     figure = blank_figure("Field, stations and 95 % ellipses")
     factor = ellipse_factor(marks, fixes)
     _add_marks(figure, marks)
@@ -36,7 +36,7 @@ def site_map(marks: Columns, fixes: Columns, true_stops: Columns) -> go.Figure:
 
 
 def ellipse_factor(marks: Columns, fixes: Columns) -> float:
-    """Return by how much ellipses are enlarged: 1, 2 or 5 times a power of ten; 0 for none."""
+    """Return the scale factor of ellipses: 1, 2 or 5 times a power of ten; 0 without any."""
     widest = largest(floats(fixes, "ellipse_major_95_m"))
     across = [
         np.ptp(known) if len(known) else 0.0
@@ -45,18 +45,15 @@ def ellipse_factor(marks: Columns, fixes: Columns) -> float:
     ]
     if not widest or not max(across):
         return 0.0
-    wanted = _ELLIPSE_SHARE * float(max(across)) / widest
-    power = 10.0 ** np.floor(np.log10(wanted))
-    return float(power * max(step for step in (1, 2, 5) if step * power <= wanted))
+    limit = _ELLIPSE_SHARE * float(max(across)) / widest
+    power = 10.0 ** np.floor(np.log10(limit))
+    return float(power * max(step for step in (1, 2, 5) if step * power <= limit))
 
 
 def ellipse_outline(
     fixes: Columns, i: int, factor: float, *, size: str = "_95"
 ) -> NDArray[np.float64]:
-    """Return the outline of an ellipse, enlarged; the bearing is from y to x.
-
-    ``size`` is ``_95`` for the 95 % ellipse, nothing for the standard one.
-    """
+    """Return the scaled outline of an ellipse; ``size`` is empty for the standard one."""
     turn = np.linspace(0.0, 2.0 * np.pi, 61)
     major = factor * floats(fixes, f"ellipse_major{size}_m")[i] * np.cos(turn)
     minor = factor * floats(fixes, f"ellipse_minor{size}_m")[i] * np.sin(turn)
@@ -87,7 +84,7 @@ def _add_marks(figure: go.Figure, marks: Columns) -> None:
 def _add_stations(
     figure: go.Figure, method: str, rows: Columns, factor: float, true_stops: Columns
 ) -> None:
-    """Draw the stations of one method with their ellipses and, enlarged alike, their errors."""
+    """Draw the stations of one method with their scaled ellipses and errors."""
     style = theme.method_style(method)
     x, y = floats(rows, "x_m"), floats(rows, "y_m")
     about = details(rows, ("stop", "status"), ("sigma_3d_m", "error_3d_m", "n_markers", "z_m"))
@@ -104,12 +101,12 @@ def _add_stations(
         f"<extra>{style.label}</extra>",
     )
     outlines = [ellipse_outline(rows, i, factor) for i in range(len(x))]
-    _add_strokes(figure, outlines, style, dash="solid", width=1.5)
-    _add_strokes(figure, _errors(rows, true_stops, factor), style, dash="solid", width=1)
+    _add_strokes(figure, outlines, style, 1.5)
+    _add_strokes(figure, _errors(rows, true_stops, factor), style, 1.0)
 
 
 def _errors(rows: Columns, true_stops: Columns, factor: float) -> list[NDArray[np.float64]]:
-    """Return a line from each station towards its true place, enlarged like the ellipses."""
+    """Return the scaled line from each station towards its true position."""
     truth = dict(
         zip(
             texts(true_stops, "stop"),
@@ -131,8 +128,6 @@ def _add_strokes(
     figure: go.Figure,
     strokes: Sequence[NDArray[np.float64]],
     style: theme.MethodStyle,
-    *,
-    dash: str,
     width: float,
 ) -> None:
     """Draw many lines as one trace."""
@@ -145,6 +140,6 @@ def _add_strokes(
         mode="lines",
         legendgroup=style.label,
         showlegend=False,
-        line={"color": style.colour, "width": width, "dash": dash},
+        line={"color": style.colour, "width": width},
         hoverinfo="skip",
     )

@@ -1,7 +1,4 @@
-"""Figures of an adjusted network: its map, its residuals and tests, control left out in turn.
-
-Columns are named as the database names them; metres come in, millimetres are drawn.
-"""
+"""Figures of an adjusted network: map, residuals, tests, and control marks left out in turn."""
 
 from __future__ import annotations
 
@@ -20,14 +17,14 @@ from spheremark.web.figures.elements import (
 )
 from spheremark.web.figures.maps import ellipse_factor, ellipse_outline
 
-_BEYOND = 2.0  # sigmas that a difference may have and still be no surprise
+_BEYOND = 2.0  # sigmas of the bars
 _AXES = ("x", "y", "z")
 _ELLIPSES = (("95 %", "_95", 1.5, "solid"), ("standard", "", 1.0, "dot"))
 _N_NAMES = 60  # marks whose names can be read on one map
 
 
 def network_map(stations: Columns, marks: Columns) -> go.Figure:
-    """Draw stations and marks by redundancy, with standard and 95 % ellipses enlarged alike."""
+    """Draw stations and marks by redundancy, with scaled standard and 95 % ellipses."""
     figure = blank_figure("Network: ellipses and redundancy")
     factor = ellipse_factor(marks, _both(stations, marks))
     for rows, colour in ((stations, theme.OURS), (marks, theme.MARK)):
@@ -55,7 +52,7 @@ def network_map(stations: Columns, marks: Columns) -> go.Figure:
 
 
 def _both(stations: Columns, marks: Columns) -> dict[str, NDArray[np.float64]]:
-    """Return places and ellipses of stations and marks together."""
+    """Return positions and ellipses of stations and marks together."""
     names = ("x_m", "y_m", "ellipse_major_95_m")
     return {name: np.concatenate([floats(stations, name), floats(marks, name)]) for name in names}
 
@@ -112,7 +109,7 @@ def _add_points(figure: go.Figure, rows: Columns, kind: str, symbol: str, size: 
 
 
 def residuals(observations: Columns) -> go.Figure:
-    """Draw the residuals of the centres by station, those that were left out apart."""
+    """Draw the residuals of the centres by station; excluded ones have another symbol."""
     figure = blank_figure("Residuals of the centres")
     used = np.asarray(observations["used"], dtype=bool)
     for axis in _AXES:
@@ -185,7 +182,7 @@ def tests(observations: Columns, w_limit: float) -> go.Figure:
 
 
 def control_differences(checks: Columns) -> go.Figure:
-    """Draw where the network puts each control mark without its coordinates, minus those."""
+    """Draw the position of each control mark from the network without it, minus the given one."""
     figure = blank_figure("Control marks left out in turn")
     names = texts(checks, "mark")
     for axis in _AXES:

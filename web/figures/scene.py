@@ -1,4 +1,4 @@
-"""One stop in space: its cloud, the fitted spheres, and how far each return is from its sphere."""
+"""One stop in 3-D: its cloud, the fitted spheres, and the residuals of their returns."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from spheremark.pipelines.model import Array, Column, Index
 from spheremark.web import theme
 from spheremark.web.columns import MM, Columns, floats, on_marks, select, texts
-from spheremark.web.figures.elements import add_zero, blank_figure
+from spheremark.web.figures.elements import add_zero, blank_figure, joined_strokes
 
 _CELLS = (0.15, 0.2, 0.3, 0.4)  # [m]; of the surroundings one return is shown in each cell
 _N_SHOWN = 30_000  # returns of the surroundings; more makes a browser without a GPU slow
@@ -24,10 +24,10 @@ _N_MERIDIANS, _N_PARALLELS = 18, 8  # of a drawn sphere
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class Scan:
-    """What was kept of a stop's cloud: points in the station frame and the markers they made.
+    """A sample of a stop's cloud in the station frame.
 
-    ``markers`` is the place of a point's marker in ``names``, or negative; ``residuals`` are along
-    the beam, by the method ``fit_method``, in metres, and NaN where there is none.
+    ``markers`` is the index of a point's marker in ``names``, or negative; ``residuals`` are along
+    the beam by ``fit_method`` [m], NaN for returns that it did not use.
     """
 
     p_station: Column
@@ -39,7 +39,7 @@ class Scan:
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class MarkerReturns:
-    """The returns about one sphere, their residuals, and whether the fit used them."""
+    """The returns near one sphere, their residuals, and whether the fit used them."""
 
     p_station: Array
     residuals: Array
@@ -68,7 +68,7 @@ def stop_scene(scan: Scan, fits: Columns, rejections: Columns) -> go.Figure:
 
 
 def marker_close_up(scan: Scan, fits: Columns, i: int) -> go.Figure:
-    """Draw one marker from near: its sphere, and its returns coloured by their residual."""
+    """Draw one marker in detail: its sphere, and its returns coloured by their residual."""
     name, mark = texts(fits, "marker")[i], texts(fits, "mark")[i]
     figure = _figure_3d(f"Marker {name}{f' on mark {mark}' if mark else ''} and its returns")
     _add_sphere(figure, _centre(fits, i), float(floats(fits, "radius_m")[i]))
@@ -105,7 +105,7 @@ def marker_residuals(scan: Scan, fits: Columns, i: int) -> go.Figure:
 
 
 def marker_returns(scan: Scan, fits: Columns, i: int) -> MarkerReturns:
-    """Return what the LiDAR saw of one fitted sphere and close about it."""
+    """Return the returns near one fitted sphere."""
     centre, radius = _centre(fits, i), float(floats(fits, "radius_m")[i])
     members = _within(scan.p_station, centre, _REACH * radius)
     p_station = scan.p_station[members].astype(np.float64)
@@ -119,12 +119,12 @@ def marker_returns(scan: Scan, fits: Columns, i: int) -> MarkerReturns:
 
 
 def _is_along_beam(scan: Scan, fits: Columns) -> bool:
-    """Whether the residuals that were kept with the cloud are those of these fits."""
+    """Whether the residuals in the cloud are those of these fits."""
     return set(texts(fits, "fit_method")) <= {scan.fit_method}
 
 
 def _what(scan: Scan, fits: Columns) -> str:
-    """Return what the colours of returns mean."""
+    """Return the quantity of the colours of returns."""
     return "Residual along the beam" if _is_along_beam(scan, fits) else "Distance from the sphere"
 
 
@@ -135,19 +135,19 @@ def _across(p: Array, centre: Array) -> Array:
 
 
 def _within(p: NDArray[np.float32], centre: Array, reach: float) -> Index:
-    """Return the points within reach of a place."""
+    """Return the points within a distance of a position."""
     near = np.flatnonzero(np.abs(p[:, 0] - np.float32(centre[0])) < reach)
     distances = np.linalg.norm(p[near] - centre, axis=1)
     return np.asarray(near[distances < reach], dtype=np.intp)
 
 
 def _reach(fits: Columns) -> float:
-    """Return how far a scene goes: beyond the farthest fit that stands on a mark [m]."""
+    """Return the radius of a scene: beyond the farthest fit on a mark [m]."""
     return float(np.max(floats(fits, "range_m")[on_marks(fits)], initial=_LEAST)) + _MARGIN
 
 
 def _surroundings(scan: Scan, reach: float) -> Index:
-    """Choose one return in each cell of space, in the finest grid that keeps few enough."""
+    """Return one return per cell, in the finest grid with few enough cells."""
     is_near = np.linalg.norm(scan.p_station, axis=1) < reach
     near = np.flatnonzero(is_near & (scan.markers < 0))
     chosen = near
@@ -261,7 +261,7 @@ def _add_rejections(figure: go.Figure, rejections: Columns) -> None:
 
 
 def _add_sphere(figure: go.Figure, centre: Array, radius: float) -> None:
-    """Draw a sphere as its graticule."""
+    """Draw a sphere as meridians and parallels."""
     turn = np.linspace(0.0, 2.0 * np.pi, 73)
     half = np.linspace(-np.pi / 2.0, np.pi / 2.0, 37)
     lines = [
@@ -272,10 +272,8 @@ def _add_sphere(figure: go.Figure, centre: Array, radius: float) -> None:
         _on_sphere(turn, np.full(len(turn), latitude))
         for latitude in np.linspace(-np.pi / 2.0, np.pi / 2.0, _N_PARALLELS + 2)[1:-1]
     ]
-    gap = np.full((1, 3), np.nan)
-    joined = np.concatenate([part for line in lines for part in (line, gap)])
     figure.add_scatter3d(
-        **_xyz(centre + radius * joined),
+        **_xyz(centre + radius * joined_strokes(lines)),
         mode="lines",
         name="sphere",
         line={"color": theme.CLOUD, "width": 1.5},
@@ -297,5 +295,5 @@ def _centre(fits: Columns, i: int) -> Array:
 
 
 def _xyz(p: NDArray[np.floating]) -> dict[str, NDArray[np.float32]]:
-    """Return points as the columns that Plotly takes, no finer than one can see."""
+    """Return points as single-precision columns of Plotly."""
     return {axis: np.asarray(p[:, i], dtype=np.float32) for i, axis in enumerate("xyz")}

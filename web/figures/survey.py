@@ -1,7 +1,7 @@
-"""Figures of a survey: from columns, named and in the units of the database, to Plotly.
+"""Figures of a survey: errors of sphere centres, and residuals of a station.
 
-Metres come in and millimetres are drawn where that is what one reads. Errors exist only against
-truth; where there is none, the same figure shows the predicted sigma and says so in its title.
+Errors exist only against truth; without truth the figure shows the predicted sigma, and its title
+names it.
 """
 
 from __future__ import annotations
@@ -57,7 +57,7 @@ def error_against_distance(fits: Columns, tolerance_m: float, *, is_log: bool = 
 
 
 def error_against_count(fits: Columns, tolerance_m: float, *, is_log: bool = False) -> go.Figure:
-    """Draw the error of each sphere centre against the number of its returns, always by ratio."""
+    """Draw the error of each sphere centre against its returns, on a logarithmic axis."""
     figure = _quality_figure(fits, "sphere centres against point count", tolerance_m)
     _add_fits(figure, fits, floats(fits, "n_points"), _COUNT_BIN)
     _add_study(figure, fits, TABLE_2.n_points)
@@ -88,7 +88,7 @@ def error_along_lane(fits: Columns, tolerance_m: float) -> go.Figure:
 
 
 def station_residuals(observations: Columns, tolerance_m: float) -> go.Figure:
-    """Draw what each marker disagrees with the station, by axis, with twice its sigma."""
+    """Draw the residuals of each marker by axis, with twice their sigma."""
     figure = blank_figure("Residuals of the station, by marker and axis")
     names = [
         mark or marker
@@ -114,7 +114,7 @@ def _quality_figure(columns: Columns, what: str, tolerance_m: float) -> go.Figur
 
 
 def _scale(figure: go.Figure, x_title: str, *, is_log: bool) -> None:
-    """Choose the axes of a scatter: from zero, or both logarithmic."""
+    """Set the axes of a scatter: from zero, or both logarithmic."""
     kind = "log" if is_log else "linear"
     figure.update_xaxes(title_text=x_title, type=kind)
     figure.update_yaxes(type=kind, rangemode="normal" if is_log else "tozero")
@@ -129,7 +129,7 @@ def _quality_mm(columns: Columns) -> NDArray[np.float64]:
 
 
 def _add_fits(figure: go.Figure, fits: Columns, x: NDArray[np.float64], width: float) -> None:
-    """Draw the centres of each method, the RMS of each bin, and what was predicted."""
+    """Draw the centres of each method, the RMS of each bin, and the predicted sigma."""
     is_error = has_errors(fits)
     methods = np.array(texts(fits, "fit_method"), dtype=object)
     for method, rows in by_method(fits):
@@ -177,7 +177,7 @@ def _add_points(
 
 
 def _add_study(figure: go.Figure, fits: Columns, x: NDArray[np.float64]) -> None:
-    """Lay the study's own Table 2 over errors; a click on its name in the legend takes it away."""
+    """Draw the published Table 2 over errors."""
     if not has_errors(fits):
         return
     figure.add_scatter(
@@ -199,7 +199,7 @@ def _add_prediction(
     sigma_mm: NDArray[np.float64],
     width: float,
 ) -> None:
-    """Draw the predicted sigma of each bin, as the area that it fills."""
+    """Draw the predicted sigma of each bin as an area."""
     middles, values = binned_rms(x, sigma_mm, width)
     figure.add_scatter(
         x=middles,
@@ -235,7 +235,7 @@ def _add_lanes(
 
 
 def _name_lanes(figure: go.Figure) -> None:
-    """Write the name of each lane before its first stop, one above the other."""
+    """Write the name of each lane before its first stop, without overlap."""
     lines = figure.data
     ends = np.array([line.y[0] for line in lines])
     top = max(float(np.max(np.add(line.y, line.error_y.array))) for line in lines)
@@ -254,7 +254,7 @@ def _name_lanes(figure: go.Figure) -> None:
 
 
 def apart(values: NDArray[np.float64], gap: float) -> NDArray[np.float64]:
-    """Return values moved as little as it takes to leave a gap between any two."""
+    """Return the values nearest to the given ones with a gap between any two."""
     order = np.argsort(values)
     steps = gap * np.arange(len(values))
     moved = np.empty(len(values))

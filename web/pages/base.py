@@ -15,7 +15,7 @@ Row = Mapping[str, Any]
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Frame:
-    """What every page shows around itself."""
+    """The frame of every page: all surveys, and the present one."""
 
     surveys: tuple[str, ...] = ()
     survey: str = ""
@@ -23,7 +23,7 @@ class Frame:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Panel:
-    """A figure with what the page says about it."""
+    """A figure with its caption."""
 
     name: str
     figure: go.Figure
@@ -38,7 +38,7 @@ class Panel:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ErrorPage:
-    """What went wrong, for people."""
+    """The page of an error."""
 
     frame: Frame
     status: int
@@ -48,5 +48,5 @@ class ErrorPage:
 
 
 def error_page(page: ErrorPage) -> str:
-    """Return what went wrong in the look of all pages."""
+    """Return the page of an error."""
     return render("error.html", page, here="")

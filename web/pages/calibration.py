@@ -1,4 +1,4 @@
-"""The page of a calibration: each parameter before and after, and what the scans cannot tell."""
+"""The page of a calibration: each parameter before and after, with its reason if not estimated."""
 
 from __future__ import annotations
 
@@ -18,12 +18,12 @@ from spheremark.web.templating import number, render
 Row = Mapping[str, Any]
 _LASER = "laser_range_bias_"
 _SHOWN = {"m": ("mm", 1e3, 2), "rad": ("deg", math.degrees(1.0), 4), "s": ("ms", 1e3, 3)}
-"""Unit, factor and decimals in which people read a parameter, by its unit."""
+"""Displayed unit, factor and decimals by the unit of a parameter."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class CalibrationPage:
-    """A calibration with all that belongs to it; ``is_chosen`` if the survey uses its rig."""
+    """A calibration; ``is_chosen`` if the survey uses its rig."""
 
     frame: Frame
     calibration: Row
@@ -36,21 +36,21 @@ class CalibrationPage:
 def calibration_page(page: CalibrationPage) -> str:
     """Return the page of a calibration."""
     rows = [_readable(row) for row in plain_rows(page.parameters)]
-    told = [row for row in rows if row["is_estimated"]]
+    estimated = [row for row in rows if row["is_estimated"]]
     return render(
         "calibration.html",
         page,
         here="survey",
         readouts=_readouts(page.calibration),
         panels=_panels(page),
-        told=[row for row in told if not row["parameter"].startswith(_LASER)],
-        lasers=[row for row in told if row["parameter"].startswith(_LASER)],
+        estimated=[row for row in estimated if not row["parameter"].startswith(_LASER)],
+        lasers=[row for row in estimated if row["parameter"].startswith(_LASER)],
         held=[row for row in rows if not row["is_estimated"]],
     )
 
 
 def _readable(row: Row) -> dict[str, Any]:
-    """Return a parameter in the unit in which people read it, with its change in sigmas."""
+    """Return a parameter in its displayed unit, with its change in sigmas."""
     if not row["is_estimated"]:
         return {**row, "label": _label(row)}
     unit, factor, decimals = _SHOWN.get(row["unit"], (row["unit"], 1.0, 6))
@@ -63,7 +63,7 @@ def _readable(row: Row) -> dict[str, Any]:
 
 
 def _label(row: Row) -> str:
-    """Return what people call a parameter."""
+    """Return the displayed name of a parameter."""
     name = str(row["parameter"])
     if name.startswith(_LASER):
         return f"laser {name.removeprefix(_LASER)}"
@@ -71,7 +71,7 @@ def _label(row: Row) -> str:
 
 
 def _readouts(one: Row) -> tuple[Readout, ...]:
-    """Return the few numbers that judge a calibration."""
+    """Return the key numbers of a calibration."""
     before, after = one["residual_rms_before_m"], one["residual_rms_after_m"]
     return (
         Readout(
@@ -84,7 +84,7 @@ def _readouts(one: Row) -> tuple[Readout, ...]:
             label="Faces apart, after",
             value=_mm(one["gap_rms_after_m"]),
             unit="mm RMS",
-            note=f"{_mm(one['gap_sigma_after_m'])} mm is what the noise of the centres explains",
+            note=f"{_mm(one['gap_sigma_after_m'])} mm predicted from the noise of the centres",
             method="along_beam",
         ),
         Readout(
@@ -104,7 +104,7 @@ def _readouts(one: Row) -> tuple[Readout, ...]:
 
 
 def _mm(value: float | None) -> str:
-    """Write a length in millimetres."""
+    """Format a length in millimetres."""
     return number(None if value is None else value * MM, 1)
 
 
@@ -117,8 +117,8 @@ def _panels(page: CalibrationPage) -> tuple[Panel, ...]:
             Panel(
                 name="gaps",
                 figure=figures.face_gaps(select(page.gaps, ~is_after), select(page.gaps, is_after)),
-                caption="Each face is fitted apart, with the rig before (hollow) and after "
-                "(filled). What remains should scatter about zero without a pattern.",
+                caption="Each face is fitted alone, with the rig before (hollow) and after "
+                "(filled). Afterwards the differences should scatter about zero without a pattern.",
                 kind="tall",
             )
         )
@@ -129,8 +129,8 @@ def _panels(page: CalibrationPage) -> tuple[Panel, ...]:
             Panel(
                 name="lasers",
                 figure=figures.laser_biases(select(page.parameters, lasers)),
-                caption="Against the mean of all lasers, which no sphere tells; bars are twice "
-                "the sigma.",
+                caption="Against the mean of all lasers, which spheres do not determine. Bars are "
+                "twice the sigma.",
             )
         )
     return tuple(panels)

@@ -1,4 +1,4 @@
-"""What a dashboard shows, as it stands in the address: a link reproduces the view."""
+"""Filters of the page of a survey, which its address holds: a link reproduces the view."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from spheremark.web.columns import Columns, floats, lane_and_number, select, tex
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Filters:
-    """Which rows are shown, and on which axes; what is empty does not restrict."""
+    """Which rows are shown, and on which axes; an empty filter does not restrict."""
 
     methods: tuple[str, ...] = ()
     lane: str = ""
@@ -31,7 +31,7 @@ class Filters:
 
     @classmethod
     def from_query(cls, query: Mapping[str, Sequence[str]]) -> Self:
-        """Read the query of an address; InputError names what cannot be read."""
+        """Read the query of an address; InputError names the wrong value."""
         first = {name: values[-1] for name, values in query.items() if values}
         axes = first.get("axes", "linear")
         if axes not in ("linear", "log"):
@@ -67,16 +67,8 @@ class Filters:
         pairs += [("resection", self.resection)] if self.resection != "free_station" else []
         return urlencode(pairs)
 
-    @property
-    def is_restricting(self) -> bool:
-        """Whether anything is left out."""
-        return any((self.methods, self.lane, self.stop, self.status)) or (
-            self.range_from_m,
-            self.range_to_m,
-        ) != (None, None)
-
     def apply(self, columns: Columns) -> dict[str, NDArray[Any]]:
-        """Return the rows to show of any table; what it has no column for does not restrict it."""
+        """Return the rows of any table that pass; filters of missing columns do not restrict."""
         keep = np.ones(len(next(iter(columns.values()))), dtype=np.bool_)
         if self.methods and "fit_method" in columns:
             keep &= np.isin(texts(columns, "fit_method"), self.methods)
@@ -89,7 +81,7 @@ class Filters:
         return select(columns, keep)
 
     def _stops(self, stops: Sequence[str]) -> NDArray[np.bool_]:
-        """Tell which rows are of the wanted lane and stop."""
+        """Return which rows are of the selected lane and stop."""
         return np.array(
             [
                 (not self.stop or stop == self.stop)
@@ -100,14 +92,14 @@ class Filters:
         )
 
     def _ranges(self, ranges: NDArray[np.float64]) -> NDArray[np.bool_]:
-        """Tell which rows are in the wanted interval of distance."""
+        """Return which rows are in the selected interval of distance."""
         low = -np.inf if self.range_from_m is None else self.range_from_m
         high = np.inf if self.range_to_m is None else self.range_to_m
         return np.asarray((ranges >= low) & (ranges <= high))
 
 
 def _number(query: Mapping[str, str], name: str) -> float | None:
-    """Read a number in metres, or nothing."""
+    """Read a number in metres, if given."""
     text = query.get(name, "").strip()
     if not text:
         return None

@@ -21,7 +21,7 @@ class JobsPage:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class JobPage:
-    """One job, the stops that it gave, and what it made of a survey as a whole."""
+    """One job with its stops, and its results on the whole survey."""
 
     frame: Frame
     job: Row

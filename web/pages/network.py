@@ -1,4 +1,4 @@
-"""The page of an adjusted network: what surveyors look for in a report, in that order."""
+"""The page of an adjusted network, in the order of a survey report."""
 
 from __future__ import annotations
 
@@ -15,12 +15,12 @@ from spheremark.web.pages.readouts import Readout
 from spheremark.web.templating import number, render
 
 Row = Mapping[str, Any]
-_N_WORST = 40  # observations in the table of the page; all are in the database and in the files
+_N_WORST = 40  # observations in the table; all are in the database and in the files
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class AdjustmentPage:
-    """An adjusted network with all that belongs to it."""
+    """An adjusted network with its tables and files."""
 
     frame: Frame
     adjustment: Row
@@ -53,14 +53,14 @@ def adjustment_page(page: AdjustmentPage) -> str:
 
 
 def _readouts(page: AdjustmentPage) -> tuple[Readout, ...]:
-    """Return the few numbers that judge a network."""
+    """Return the key numbers of a network."""
     one = page.adjustment
-    verdict = "passes" if one["passes_global_test"] else "fails"
+    test = "passes" if one["passes_global_test"] else "fails"
     a_posteriori = None if one["sigma0"] is None else one["sigma0"] ** 2
     found = [
         Readout(
             label="Global test",
-            value=verdict,
+            value=test,
             unit="",
             note=f"v'Pv {number(one['vtpv'], 1)}, limit {number(one['vtpv_limit'], 1)} "
             f"(chi-square, one-sided, level {one['test_level']:g})",
@@ -86,7 +86,7 @@ def _readouts(page: AdjustmentPage) -> tuple[Readout, ...]:
 
 
 def _sizes(what: str, rows: Columns, page: AdjustmentPage) -> Readout:
-    """Say how good stations or marks are: against truth where it is known, else as predicted."""
+    """Return the accuracy of stations or marks: against truth if known, else predicted."""
     sigma, error = floats(rows, "sigma_3d_m"), floats(rows, "error_3d_m")
     known = error[np.isfinite(error)]
     largest = f"largest {number(float(sigma.max()) * MM, 2)} mm"
@@ -97,17 +97,17 @@ def _sizes(what: str, rows: Columns, page: AdjustmentPage) -> Readout:
             unit="mm RMS sigma",
             note=f"{largest}; truth not known",
         )
-    laid = ", after it was laid on the truth" if page.adjustment["datum"] == "free" else ""
+    fitted = ", after a fit to the truth" if page.adjustment["datum"] == "free" else ""
     return Readout(
         label=f"{what}, against truth",
         value=number(rms(known) * MM, 2),
         unit="mm RMS error",
-        note=f"predicted {number(rms(sigma) * MM, 2)} mm RMS, {largest}{laid}",
+        note=f"predicted {number(rms(sigma) * MM, 2)} mm RMS, {largest}{fitted}",
     )
 
 
 def _left_out(checks: Columns) -> Readout:
-    """Say how near the network comes to control marks that it was not given."""
+    """Return the differences of control marks that were left out in turn."""
     difference, sigma = floats(checks, "difference_3d_m"), floats(checks, "sigma_3d_m")
     worst = int(difference.argmax())
     largest = f"largest {number(float(difference[worst]) * MM, 1)} mm at {checks['mark'][worst]}"
@@ -125,22 +125,22 @@ def _panels(page: AdjustmentPage, centres: Columns) -> tuple[Panel, ...]:
         Panel(
             name="map",
             figure=figures.network_map(page.stations, page.marks),
-            caption="Solid: the ellipse that holds the place in 95 of 100 cases; dotted: the "
-            "standard one (39 of 100). The fill is the mean redundancy of the centres: 0 is "
-            "unchecked, 3 is wholly checked by the others.",
+            caption="Solid: the 95 % ellipse; dotted: the standard ellipse (39 %). The fill is the "
+            "mean redundancy of the centres: 0 is uncontrolled, 3 is controlled completely by the "
+            "others.",
         ),
         Panel(
             name="residuals",
             figure=figures.residuals(centres),
-            caption="Along the axes of the network; crosses are left out.",
+            caption="Along the axes of the network. Crosses are left out.",
         ),
         Panel(
             name="tests",
             figure=figures.tests(
                 select(centres, np.isfinite(floats(centres, "w"))), page.adjustment["w_limit"]
             ),
-            caption="A centre above the limit would be a gross error. Far left, gross errors "
-            "could hide: the detectable bias grows.",
+            caption="A centre above the limit is a gross error. With little redundancy, on the "
+            "left, the minimal detectable bias is large.",
         ),
     ]
     if len(page.checks["mark"]):
@@ -148,14 +148,14 @@ def _panels(page: AdjustmentPage, centres: Columns) -> tuple[Panel, ...]:
             Panel(
                 name="checks",
                 figure=figures.control_differences(page.checks),
-                caption="Where the network puts each mark without its coordinates; bars are twice "
-                "the sigma of the difference.",
+                caption="Position of each mark from the network without its coordinates. Bars are "
+                "twice the sigma of the difference.",
             )
         )
     return tuple(panels)
 
 
 def _worst(observations: list[dict[str, Any]]) -> list[dict[str, Any]]:
-    """Return the centres that say most: those left out, then by the size of their test."""
+    """Return the most critical centres: those left out, then by w."""
     centres = [row for row in observations if row["kind"] == "centre"]
     return sorted(centres, key=lambda row: (row["used"], -(row["w"] or 0.0)))[:_N_WORST]

@@ -1,4 +1,4 @@
-"""The few numbers that matter, as a person reads them at a glance."""
+"""Key numbers at the head of a page."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from spheremark.web.templating import number
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Readout:
-    """A number that matters, with its unit and what it means."""
+    """A key number with its unit and a note."""
 
     label: str
     value: str
@@ -25,7 +25,7 @@ class Readout:
 
 
 def headline(fits: Columns, fixes: Columns, tolerance_m: float) -> tuple[Readout, ...]:
-    """Return the few numbers that matter: centres and stations, each method, and the sigma."""
+    """Return the quality of centres and stations by method, and the predicted sigma."""
     readouts = []
     for method, rows in by_method(fits):
         real = on_marks(rows)
@@ -57,7 +57,7 @@ def _quality(
 
 
 def _share(summary: ErrorSummary, tolerance_m: float, *, is_error: bool) -> str:
-    """Say how many are within the tolerance, and how large the largest is."""
+    """Return the note on the share within the tolerance and the largest."""
     if not summary.n:
         return "none yet"
     within = round(summary.share_within * summary.n)
@@ -69,7 +69,7 @@ def _share(summary: ErrorSummary, tolerance_m: float, *, is_error: bool) -> str:
 
 
 def _predicted(rows: Columns) -> Readout:
-    """Say what our sigma promised, and how that compares with the error."""
+    """Return the predicted sigma and its ratio to the error."""
     error, sigma = floats(rows, "error_3d_m"), floats(rows, "sigma_3d_m")
     known = np.isfinite(error)
     sigma_rms = rms(sigma[known])

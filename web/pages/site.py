@@ -1,4 +1,4 @@
-"""The page of a site: its ground with what stands on it, and the files to take away."""
+"""The page of a site: its ground with marks and stations, and its files."""
 
 from __future__ import annotations
 
@@ -17,15 +17,15 @@ from spheremark.web.figures.elements import blank_figure, make_map
 from spheremark.web.pages.base import Frame, Panel
 from spheremark.web.templating import render
 
-_CELLS_MAX = 400  # cells along an edge that a picture shows
+_CELLS_MAX = 400  # displayed cells along an edge
 _SUN = (np.radians(315.0), np.radians(40.0))  # azimuth, clockwise from y, and height of the light
-_STEEPER = 3.0  # times that slopes are shaded
-_TAIL = 0.02  # share of the cells below and above the colours: a mound does not take them all
+_STEEPER = 3.0  # exaggeration of slopes in the shading
+_TAIL = 0.02  # share of the cells below and above the colour scale
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SitePage:
-    """What was made of all stops of a survey, newest first, and its newest ground."""
+    """The products of all stops of a survey, newest first, and the newest ground."""
 
     frame: Frame
     survey: str
@@ -44,15 +44,15 @@ def site_page(page: SitePage) -> str:
             Panel(
                 name="ground",
                 figure=ground_figure(page.model, page.marks, page.stations),
-                caption="Mean height of the ground in each cell; rocks, poles and markers are "
-                "taken off. Blank cells were not seen.",
+                caption="Mean height of the ground in each cell, without rocks, poles and markers. "
+                "Blank cells have no returns.",
                 kind="tall",
             ),
             Panel(
                 name="sigma",
                 figure=sigma_figure(page.model, page.marks, page.stations),
-                caption="Standard deviation of those heights, in steps of the same ratio: noise "
-                "and grazing beams, poses, roughness, and what lies in shadow.",
+                caption="Standard deviation of these heights on a logarithmic scale: noise, "
+                "grazing beams, poses, roughness and interpolation.",
                 kind="tall",
             ),
         ]
@@ -94,10 +94,10 @@ def ground_figure(model: ElevationModel, marks: Columns, stations: Columns) -> g
 
 
 def sigma_figure(model: ElevationModel, marks: Columns, stations: Columns) -> go.Figure:
-    """Draw how sure each height is."""
+    """Draw the standard deviation of each height."""
     step = _step(model)
     sigmas = 1e3 * _thinned(model.sigmas, step)
-    figure = blank_figure("How sure the ground is")
+    figure = blank_figure("Standard deviation of the ground")
     ticks = [value for value in (0.5, 1, 2, 5, 10, 20, 50, 100, 200) if _spans(sigmas, value)]
     bar = {
         "title": {"text": "Sigma [mm]", "side": "right"},
@@ -119,7 +119,7 @@ def sigma_figure(model: ElevationModel, marks: Columns, stations: Columns) -> go
 
 
 def hillshade(heights: NDArray[Any], cell: float) -> NDArray[np.float64]:
-    """Return how brightly a surface is lit from the north-west, level ground 0.5; NaN stays."""
+    """Return the brightness of a surface lit from the north-west; level ground is 0.5."""
     along_y, along_x = np.gradient(np.asarray(heights, dtype=np.float64), cell)
     azimuth, height = _SUN
     light = np.array([np.sin(azimuth) * np.cos(height), np.cos(azimuth) * np.cos(height)])
@@ -129,12 +129,12 @@ def hillshade(heights: NDArray[Any], cell: float) -> NDArray[np.float64]:
 
 
 def _step(model: ElevationModel) -> int:
-    """Return every how many cells a picture shows one."""
+    """Return the step between displayed cells."""
     return int(np.ceil(max(model.heights.shape) / _CELLS_MAX))
 
 
 def _thinned(values: NDArray[Any], step: int) -> NDArray[np.float64]:
-    """Return one cell in so many each way."""
+    """Return every ``step``-th cell in both directions."""
     return np.asarray(values[::step, ::step], dtype=np.float64)
 
 

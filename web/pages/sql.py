@@ -53,12 +53,12 @@ EXAMPLES: tuple[tuple[str, str], ...] = (
         "SELECT stop, n_returns, timings_s\nFROM stops\nORDER BY stop;",
     ),
 )
-"""Queries to begin with, by what they answer."""
+"""Example queries by title."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SqlPage:
-    """The workbench for queries: schema, limits, and the query of the address."""
+    """The page for queries: schema, limits, and the query of the address."""
 
     frame: Frame
     query: str
@@ -69,7 +69,7 @@ class SqlPage:
 
 
 def sql_page(page: SqlPage) -> str:
-    """Return the workbench for queries."""
+    """Return the page for queries."""
     schema = {table["name"]: [row["name"] for row in table["columns"]] for table in page.tables}
     return render(
         "sql.html",
@@ -82,7 +82,7 @@ def sql_page(page: SqlPage) -> str:
 
 
 def _chart_template() -> dict[str, Any]:
-    """Return the look of a chart of a query's result, and the colour of each method."""
+    """Return the layout of the chart of a result, and the colours of methods."""
     layout = go.Figure(layout={"template": theme.template()}).to_plotly_json()["layout"]
     colours = {name: theme.method_style(name).colour for name in ("along_beam", "paper")}
     return {"layout": layout, "colours": colours}

@@ -1,4 +1,4 @@
-"""What keeps the tolerance, in words: greatest distance, smallest count, and how sure that is."""
+"""Greatest distance and smallest count that keep the tolerance, with their confidence."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ _STATISTICS: tuple[Statistic, ...] = ("p95", "mean")
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Statement:
-    """What one method keeps, with the model behind it; or why nothing can be said."""
+    """The limits of one method with their error model, or the reason for their absence."""
 
     method: str
     place: str
@@ -39,22 +39,22 @@ class Statement:
 
     @property
     def distance(self) -> str:
-        """Up to where 95 of 100 errors are within the tolerance."""
+        """Greatest distance at which 95 % of the errors are within the tolerance."""
         return distance_words(self.p95.greatest_distance) if self.p95 else self.reason
 
     @property
     def count(self) -> str:
-        """From how many returns they are."""
+        """Smallest count at which they are."""
         return count_words(self.p95.smallest_count) if self.p95 else ""
 
     @property
     def mean_distance(self) -> str:
-        """Up to where the mean error, the study's measure, is within it."""
+        """Greatest distance at which the mean error, the measure of the study, is within it."""
         return distance_words(self.mean.greatest_distance) if self.mean else ""
 
     @property
     def mean_count(self) -> str:
-        """From how many returns it is."""
+        """Smallest count at which it is."""
         return count_words(self.mean.smallest_count) if self.mean else ""
 
     def power(self, term: str) -> str:
@@ -66,14 +66,14 @@ class Statement:
 
 
 def statements(fits: Columns, tolerance_m: float, *, place: str = "") -> tuple[Statement, ...]:
-    """Say for each method of a table of fits what keeps the tolerance; nothing without truth."""
+    """Return the limits of each method of a table of fits; none without truth."""
     if not has_errors(fits):
         return ()
     return tuple(_statement(method, rows, tolerance_m, place) for method, rows in by_method(fits))
 
 
 def _statement(method: str, rows: Columns, tolerance_m: float, place: str) -> Statement:
-    """Say what one method keeps."""
+    """Return the limits of one method."""
     _, scans = np.unique(np.array(texts(rows, "stop"), dtype=str), return_inverse=True)
     sample = ErrorSample(
         ranges=floats(rows, "range_m").copy(),
@@ -97,28 +97,28 @@ def _statement(method: str, rows: Columns, tolerance_m: float, place: str) -> St
 
 
 def distance_words(bound: Bound) -> str:
-    """Write a greatest distance with its interval, never beyond what was seen."""
+    """Format a greatest distance with its interval, within the observed range."""
     low, high = (_distance(value, bound.seen) for value in (bound.low, bound.high))
     value = _distance(bound.value, bound.seen)
     return value if low == high == value else f"{value} ({low} to {high})"
 
 
 def count_words(bound: Bound) -> str:
-    """Write a smallest count with its interval, never beyond what was seen."""
+    """Format a smallest count with its interval, within the observed range."""
     low, high = (_count(value, bound.seen) for value in (bound.low, bound.high))
     value = _count(bound.value, bound.seen)
     return value if low == high == value else f"{value} ({low} to {high})"
 
 
 def _distance(value: float, seen: tuple[float, float]) -> str:
-    """Write one distance."""
+    """Format one distance."""
     if value == 0:
         return "nowhere"
     return f"≥ {seen[1]:.1f} m" if math.isinf(value) else f"{value:.1f} m"
 
 
 def _count(value: float, seen: tuple[float, float]) -> str:
-    """Write one count."""
+    """Format one count."""
     if math.isinf(value):
         return f"> {seen[1]:.0f}"
     return f"≤ {seen[0]:.0f}" if value == 0 else f"{math.ceil(value)}"

@@ -15,9 +15,9 @@ from spheremark.web.templating import render
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class StopPage:
-    """One stop by one method; ``marker`` is the one to look at from near, if any.
+    """One stop by one method; ``marker`` is shown in detail, if any.
 
-    ``namesakes`` are this stop and others of its name, from other logs of the survey.
+    ``namesakes`` are all stops of this name, from several logs of the survey.
     """
 
     frame: Frame
@@ -73,15 +73,14 @@ def _stop_panels(page: StopPage) -> dict[str, Panel]:
         panels["returns"] = Panel(
             name="returns",
             figure=scene.marker_residuals(page.scan, page.fits, place),
-            caption="Returns that the fit used, as one sees them from the LiDAR: a pattern "
-            "across the sphere would mean a wrong radius or beams that met an edge.",
+            caption="Returns that the fit used, seen from the LiDAR. A pattern across the sphere "
+            "indicates a wrong radius or beams that hit an edge.",
         )
     else:
         panels["scene"] = Panel(
             name="scene",
             figure=scene.stop_scene(page.scan, page.fits, page.rejections),
-            caption="Drag to turn, scroll to come nearer; choose a marker in the table to see it "
-            "from near.",
+            caption="Drag to rotate, scroll to zoom. Choose a marker in the table for its details.",
             kind="tall",
         )
     return panels
@@ -96,7 +95,7 @@ def _residual_panel(page: StopPage) -> dict[str, Panel]:
         "residuals": Panel(
             name="residuals",
             figure=figures.station_residuals(used, page.tolerance_m),
-            caption="In the site frame, observed minus computed; grey bars are twice the sigma of "
+            caption="In the site frame, observed minus computed. Grey bars are twice the sigma of "
             "the centre.",
         )
     }

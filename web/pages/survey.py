@@ -1,7 +1,4 @@
-"""Pages: from what was asked of the catalogue to HTML; every text is escaped by the templates.
-
-Each page is a frozen context and a function. Rows are mappings named as the database names them.
-"""
+"""The overview, and the page of a survey: figures and a table of its stops under filters."""
 
 from __future__ import annotations
 
@@ -50,7 +47,7 @@ class SurveyData:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class OverviewPage:
-    """What there is: the newest survey with results, all surveys, the newest recordings."""
+    """The newest survey with results, all surveys, the newest recordings."""
 
     frame: Frame
     address: str
@@ -62,7 +59,7 @@ class OverviewPage:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SurveyResults:
-    """What was made of a survey as a whole, and the rig that its jobs use."""
+    """Results on the whole survey, and the rig of its jobs."""
 
     adjustments: tuple[Row, ...] = ()
     calibrations: tuple[Row, ...] = ()
@@ -71,7 +68,7 @@ class SurveyResults:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SurveyPage:
-    """The dashboard of a survey; ``n_logs`` belong to it, with results or not yet."""
+    """The page of a survey; ``n_logs`` counts logs with and without results."""
 
     frame: Frame
     data: SurveyData
@@ -83,14 +80,14 @@ class SurveyPage:
 
 
 def overview_page(page: OverviewPage) -> str:
-    """Return the first page."""
+    """Return the overview."""
     newest = page.newest
     readouts = headline(newest.fits, newest.fixes, newest.tolerance_m) if newest else ()
     return render("overview.html", page, here="overview", readouts=readouts)
 
 
 def survey_page(page: SurveyPage) -> str:
-    """Return the dashboard of a survey under its filters."""
+    """Return the page of a survey under its filters."""
     data, keep = page.data, page.filters.apply
     shown = SurveyData(
         name=data.name,
@@ -122,7 +119,7 @@ def survey_page(page: SurveyPage) -> str:
 
 
 def _survey_panels(data: SurveyData, filters: Filters) -> tuple[Panel, ...]:
-    """Return the figures of the dashboard; none of an empty table."""
+    """Return the figures of a survey; none of an empty table."""
     if not len(data.fits["stop"]):
         return ()
     is_log = filters.is_log
@@ -159,23 +156,23 @@ def _angle_panel(data: SurveyData, filters: Filters) -> tuple[Panel, ...]:
         sigma_axis_m=angles.centres_sigma(data.fits),
     )
     caption = (
-        "Each point is a stop from a few of its marks alone, lines their RMS in bins of 10 deg; "
-        "level lines: from all marks. Theory: two marks, centres as good as ours are predicted, "
-        "per axis. Circles touch instead of cutting near 0 and 180 deg, which gives the study its "
-        "limits; 3-D centres lose nothing towards 180 deg."
+        "Each point is a stop from two or three of its marks, lines are their RMS in bins of "
+        "10 deg, level lines are from all marks. The theory is for two marks with the predicted "
+        "sigma of our centres per axis. Two circles touch near 0 and 180 deg, hence the limits of "
+        "the study; 3-D centres lose nothing towards 180 deg."
     )
     figure = angles.error_against_angle(shown, data.tolerance_m, is_log=filters.is_log)
     return (Panel(name="angle", figure=figure, caption=caption, kind="keyed"),)
 
 
 def _map_panel(data: SurveyData) -> tuple[Panel, ...]:
-    """Return the map of the field, if there is anything to place on it."""
+    """Return the map of the field, if it has a mark or a station."""
     placed = np.isfinite(floats(data.fixes, "x_m"))
     if not len(data.marks["mark"]) and not placed.any():
         return ()
     caption = "Ellipses are those of 95 % probability"
     if len(data.true_stops["stop"]):
-        caption += "; the line from each station ends at its true place, enlarged alike"
+        caption += "; the line from each station points to its true position, with the same scale"
     return (
         Panel(
             name="map",

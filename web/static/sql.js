@@ -1,4 +1,4 @@
-// The workbench: an editor, the address that holds its query, the answer as table, files and chart.
+// The page for queries: an editor, the address with its query, the result as table, files and chart.
 const KEY = "spheremark-queries";
 const KEPT = 30;
 const SHOWN = 1000; // rows in the page; files hold them all
@@ -41,7 +41,7 @@ async function run({ keep = true } = {}) {
     else showError(body.detail);
     if (response.ok) remember(sql);
   } catch {
-    showError("The service did not answer; is it still running?");
+    showError("The service did not respond; is it still running?");
   } finally {
     byId("run").disabled = false;
     byId("run").textContent = "Run";
@@ -181,7 +181,7 @@ async function drawChart() {
 for (const name of ["chart-x", "chart-y", "chart-by"]) byId(name).addEventListener("change", drawChart);
 document.addEventListener("themechange", () => { if (answer && !byId("chart").hidden) drawChart(); });
 
-// What was asked before, in this browser only
+// Earlier queries, in this browser only
 
 const earlier = () => JSON.parse(localStorage.getItem(KEY) ?? "[]");
 

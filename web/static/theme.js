@@ -1,4 +1,4 @@
-// Light or dark: what the system prefers, unless the reader chose. Runs before the page is drawn.
+// Light or dark: the setting of the system or of the user. Runs before the page is drawn.
 const KEY = "spheremark-theme";
 const system = matchMedia("(prefers-color-scheme: dark)");
 

@@ -1,4 +1,4 @@
-// Uploads dropped or chosen logs one after another, each with its progress and its outcome.
+// Uploads dropped or chosen logs one after another, each with its progress and its result.
 const drop = document.getElementById("drop");
 const files = document.getElementById("files");
 const list = document.getElementById("uploads");
@@ -57,7 +57,7 @@ async function upload(file) {
       parts.progress.value = parts.progress.max;
     } else {
       parts.outcome.classList.add("bad");
-      parts.outcome.textContent = answer?.detail ?? "The service did not answer.";
+      parts.outcome.textContent = answer?.detail ?? "The service did not respond.";
     }
   });
 }
