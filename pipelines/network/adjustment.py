@@ -5,10 +5,16 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-from scipy.special import chdtri, ndtri
+from scipy.special import chdtri
 
 from spheremark.pipelines.config import ResectionConfig
-from spheremark.pipelines.geometry import skew
+from spheremark.pipelines.estimation.statistical_tests import (
+    UNTESTABLE,
+    Dropped,
+    critical_w,
+    noncentrality,
+)
+from spheremark.pipelines.geometry import by_motion, skew
 from spheremark.pipelines.model import Array
 from spheremark.pipelines.model.network import (
     AdjustedNetwork,
@@ -16,11 +22,10 @@ from spheremark.pipelines.model.network import (
     LeftOut,
     Network,
     Parts,
-    position_by_motion,
 )
 from spheremark.pipelines.network.normal_equations import middle_of
 from spheremark.pipelines.network.repeated_stops import repeated_stops
-from spheremark.pipelines.network.snooping import UNTESTABLE, Dropped, Tested, snoop
+from spheremark.pipelines.network.snooping import Tested, own_marks, snoop_network
 
 _FALSE_ALARM = 0.05  # probability that a network without gross errors loses an observation
 _UNTOLD = 1e-9  # the same below which nothing else tells where a control mark is
@@ -67,40 +72,34 @@ def adjust_network(network: Network, config: ResectionConfig) -> AdjustedNetwork
     of the marks.
     """
     level = min(config.test_level, _FALSE_ALARM / (3 * network.n_blocks))
-    critical = float(ndtri(1.0 - level / 2.0))
-    tested, dropped = snoop(network, critical, is_studentised=False)
+    critical = critical_w(level)
+    tested, dropped = snoop_network(network, critical, is_studentised=False)
     n = len(network.sightings)
     if sum(block < n for block, _ in dropped) > _MANY_LEFT_OUT * n:
-        tested, dropped = snoop(network, critical, is_studentised=True)
-    noncentrality = critical + float(ndtri(config.test_power))
-    result = _adjusted(network, tested, dropped, (critical, noncentrality), config)
+        tested, dropped = snoop_network(network, critical, is_studentised=True)
+    shift_w = noncentrality(level, config.test_power)
+    result = _adjusted(network, tested, dropped, (critical, shift_w), config)
     return replace(result, repeats=repeated_stops(result))
 
 
-def _shifts(network: Network, tested: Tested, noncentrality: float) -> tuple[Array, Array]:
+def _shifts(network: Network, tested: Tested, shift_w: float) -> tuple[Array, Array]:
     """Return how far a just undetectable bias of each centre moves its station and its mark.
 
-    A bias ``b`` moves the unknowns by ``Q_x J' P b`` and is just detectable when
-    ``b' P Q_v P b = lambda0`` (Baarda 1968).
+    A bias ``b`` moves the unknowns by ``Q_x J' P b`` (Baarda 1968).
     """
     lin, cofactors = tested.lin, tested.cofactors
     station = network.sightings[:, 0]
-    own, between = tested.common
+    own, between = cofactors.of_centres(network)
     J_turned, J_common = np.swapaxes(lin.J_centres, 1, 2), np.swapaxes(lin.J_common, 1, 2)
-    J_place = position_by_motion(tested.state.T_site_base)[station]
-    by_station = cofactors.stations[station] @ J_turned + between @ J_common
-    by_station = J_place @ by_station @ lin.P_centres
+    J_place = by_motion(tested.state.T_site_base[station, :3, 3])
+    by_station = J_place @ (cofactors.stations[station] @ J_turned + between @ J_common)
     by_mark = np.swapaxes(between, 1, 2)[:, :3] @ J_turned + own[:, :3] @ J_common
-    by_mark = by_mark @ lin.P_centres
-    n = len(network.sightings)
-    used, is_open = tested.used[:n], tested.weakest[:n] == 0.0
-    solid = np.where((used & ~is_open)[:, None, None], tested.tested[0], np.eye(3))
-    out = []
-    for effect in (by_station, by_mark):
-        worst = np.linalg.eigvalsh(effect @ np.linalg.solve(solid, np.swapaxes(effect, 1, 2)))
-        shift = noncentrality * np.sqrt(np.maximum(worst[:, -1], 0.0))
-        out.append(np.where(used, np.where(is_open, np.inf, shift), np.nan))
-    return out[0], out[1]
+    used, blocks = tested.used[: len(station)], tested.blocks[0]
+    of_station, of_mark = (
+        np.where(used, blocks.external_reliabilities(gain @ lin.P_centres, shift_w), np.nan)
+        for gain in (by_station, by_mark)
+    )
+    return of_station, of_mark
 
 
 def _adjusted(
@@ -111,27 +110,27 @@ def _adjusted(
     config: ResectionConfig,
 ) -> AdjustedNetwork:
     """Assemble the result, back in the unshifted site frame."""
-    critical, noncentrality = limits
-    middle = middle_of(network)
+    critical, shift_w = limits
+    m, middle = len(network.marks), middle_of(network)
     shift = np.eye(6)
     shift[3:, :3] = skew(middle)
     T = np.array(tested.state.T_site_base)
     T[:, :3, 3] += middle
     T[:, :3, :3] = T[:, :3, :3] @ np.swapaxes(network.R_station_base, 1, 2)
     dof = tested.dof
-    station_shifts, mark_shifts = _shifts(network, tested, noncentrality)
+    station_shifts, mark_shifts = _shifts(network, tested, shift_w)
     left_out = _left_out(network, tested, dropped, critical)
     predictions, cov_predictions = _predicted_control(network, tested)
-    tests = _columns(network, tested, noncentrality)
+    tests = _columns(network, tested, shift_w)
     parts = tested.cofactors.parts
-    J = position_by_motion(tested.state.T_site_base)
+    J = by_motion(tested.state.T_site_base[:, :3, 3])
     return AdjustedNetwork(
         network=network,
         T_site_station=T,
         cov_T_site_station=shift @ tested.cofactors.stations @ shift.T + _cov_heading(network, T),
         station_covariances=J @ tested.cofactors.stations @ np.swapaxes(J, 1, 2),
         p_site=tested.state.p_site + middle,
-        cov_p_site=tested.cofactors.marks,
+        cov_p_site=tested.cofactors.common[: 3 * m, : 3 * m].copy(),
         used=tested.used,
         centres=tests["centres"],
         gravity=tests["gravity"],
@@ -139,7 +138,7 @@ def _adjusted(
         station_shifts=station_shifts,
         mark_shifts=mark_shifts,
         shared=tested.state.shared,
-        cov_shared=tested.cofactors.shared,
+        cov_shared=tested.cofactors.common[3 * m :, 3 * m :].copy(),
         parts=Parts(
             own=shift @ parts.own @ shift.T,
             coupling=shift @ parts.coupling,
@@ -155,7 +154,7 @@ def _adjusted(
         limit_vtpv=float(chdtri(dof, config.test_level)) if dof else 0.0,
         variance_factors=_variance_factors(network, tested),
         critical_w=critical,
-        noncentrality=noncentrality,
+        noncentrality=shift_w,
         left_out=(*network.left_out, *left_out),
         warnings=_warnings(network, tested, critical, left_out, config.test_level),
     )
@@ -168,9 +167,9 @@ def _predicted_control(network: Network, tested: Tested) -> tuple[Array, Array]:
     inverse its covariance (Baarda 1968): no adjustment has to be done again.
     """
     first = len(network.sightings) + len(network.stations)
-    own = tested.own_marks[network.controls]
+    own = own_marks(network, tested.cofactors)[network.controls]
     shifts, covs = -tested.lin.v_control, own + network.cov_control_site
-    weights, solid = tested.lin.P_control, tested.tested[2]
+    weights, solid = tested.lin.P_control, tested.blocks[2].testability
     for row in np.flatnonzero(tested.used[first:]):
         eigenvalues = np.linalg.eigvalsh(solid[row])
         if eigenvalues[0] <= _UNTOLD * np.linalg.eigvalsh(weights[row])[0]:
@@ -203,21 +202,25 @@ def _cov_heading(network: Network, T: Array) -> Array:
     )
 
 
-def _columns(network: Network, tested: Tested, noncentrality: float) -> dict[str, BlockTests]:
+def _columns(network: Network, tested: Tested, shift_w: float) -> dict[str, BlockTests]:
     """Return the statistics of each kind of block."""
     n, s = len(network.sightings), len(network.stations)
-    lin, parts = tested.lin, np.split(np.arange(network.n_blocks), [n, n + s])
-    with np.errstate(divide="ignore"):
-        detectable = np.where(tested.used, noncentrality / np.sqrt(tested.weakest), np.nan)
-    residuals = (lin.v_centres, lin.v_gravity, lin.v_control)
+    lin, redundancies = tested.lin, np.split(tested.redundancies, [n, n + s])
+    columns = zip(
+        ("centres", "gravity", "control"),
+        (lin.v_centres, lin.v_gravity, lin.v_control),
+        tested.blocks,
+        redundancies,
+        strict=True,
+    )
     return {
         kind: BlockTests(
             residuals=v,
-            redundancies=tested.redundancies[part],
-            w_statistics=tested.w[part],
-            detectable_biases=detectable[part],
+            redundancies=r,
+            w_statistics=block.w,
+            detectable_biases=np.where(np.isnan(r), np.nan, block.detectable_biases(shift_w)),
         )
-        for kind, v, part in zip(("centres", "gravity", "control"), residuals, parts, strict=True)
+        for kind, v, block, r in columns
     }
 
 

@@ -1,11 +1,8 @@
 """Normal equations of a network: hides their structure.
 
-A station meets others only through marks, so the stations are eliminated one by one and what
-remains is a dense system of the marks alone (Schur complement; Triggs et al., Bundle Adjustment,
-2000, section 6). Cost and memory grow linearly with the stations.
-
-All coordinates are relative to the middle of the approximate marks. Letters as in ``adjustment``:
-``J`` derivative of the residuals, ``P`` weight, ``N`` normal matrix, ``Q`` cofactor.
+A station meets others only through marks, so the stations are eliminated and what remains is a
+dense system of the marks and of what all stations share. All coordinates are relative to the middle
+of the approximate marks.
 """
 
 from __future__ import annotations
@@ -15,8 +12,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from spheremark.pipelines.errors import DegenerateGeometryError, NotConvergedError
-from spheremark.pipelines.geometry import skew
-from spheremark.pipelines.model import Array, Index, Mask
+from spheremark.pipelines.estimation.linear_algebra import Reduced, eliminate, invert_each
+from spheremark.pipelines.geometry import by_motion, skew
+from spheremark.pipelines.model import Array, Mask
 from spheremark.pipelines.model.network import Network, Parts
 from spheremark.pipelines.positioning.matching import moved
 
@@ -78,33 +76,37 @@ class Linearised:
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class Cofactors:
-    """Covariances of a solution.
+    """Covariances of a solution; q common unknowns: 3 m of the marks, then what all share.
 
     Attributes
     ----------
     stations : (s, 6, 6)
         Of small motions of the stations.
-    between : (s, 6, m, 3)
-        Between stations and marks.
-    marks : (3m, 3m)
-        Of the marks.
-    with_shared : (s, 6, k)
-        Between stations and what all share.
-    shared_and_marks : (m, 3, k)
-        Between marks and what all share.
-    shared : (k, k)
-        Of what all share.
+    between : (s, 6, q)
+        Between stations and common unknowns.
+    common : (q, q)
+        Of the common unknowns.
     parts : Parts
         What these were made of.
     """
 
     stations: Array
     between: Array
-    marks: Array
-    with_shared: Array
-    shared_and_marks: Array
-    shared: Array
+    common: Array
     parts: Parts
+
+    def of_centres(self, network: Network) -> tuple[Array, Array]:
+        """Return, per centre, the covariance of its mark and what all share, and to its station.
+
+        Shapes are (n, 3 + k, 3 + k) and (n, 6, 3 + k).
+        """
+        station, mark = network.sightings.T
+        m, q = len(network.marks), len(self.common)
+        shared = np.broadcast_to(np.arange(3 * m, q), (len(mark), q - 3 * m))
+        columns = np.concatenate([3 * mark[:, None] + np.arange(3), shared], axis=1)
+        between = self.between[station[:, None], :, columns]
+        own = self.common[columns[:, :, None], columns[:, None, :]]
+        return own, np.swapaxes(between, 1, 2)
 
 
 def middle_of(network: Network) -> Array:
@@ -139,92 +141,53 @@ def linearise(network: Network, state: State, used: Mask) -> Linearised:
     effects = R_each @ network.shared.effects
     p = np.einsum("nij,nj->ni", R_each, network.p_base) + t[station] - effects @ state.shared
     J_mark = np.broadcast_to(-np.eye(3), (n, 3, 3))
-    weights = R_each @ np.linalg.inv(network.cov_p_base) @ np.swapaxes(R_each, 1, 2)
+    weights = R_each @ invert_each(network.cov_p_base)[0] @ np.swapaxes(R_each, 1, 2)
     up = np.einsum("sij,sj->si", R, network.R_station_base[:, 2])
     cov_up = (R @ network.cov_up_base @ np.swapaxes(R, 1, 2))[:, :2, :2]
     control = network.p_control_site - middle_of(network)
     return Linearised(
         v_centres=p - state.p_site[mark],
         P_centres=weights * used[:n, None, None],
-        J_centres=np.concatenate([-skew(p), np.broadcast_to(np.eye(3), (n, 3, 3))], axis=2),
+        J_centres=by_motion(p),
         J_common=np.concatenate([J_mark, -effects], axis=2),
         v_gravity=up[:, :2],
-        P_gravity=np.asarray(np.linalg.inv(cov_up)) * used[n : n + s, None, None],
+        P_gravity=invert_each(cov_up)[0] * used[n : n + s, None, None],
         J_gravity=np.concatenate([-skew(up)[:, :2], np.zeros((s, 2, 3))], axis=2),
         v_control=control - state.p_site[network.controls],
-        P_control=np.asarray(np.linalg.inv(network.cov_control_site)) * used[n + s :, None, None],
+        P_control=invert_each(network.cov_control_site)[0] * used[n + s :, None, None],
     )
 
 
-@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
-class _Reduced:
-    """Normal equations after the stations are eliminated.
-
-    ``A`` (s, 6, 6) are the stations' own blocks, ``K`` (s, 6, 3m + k) is ``A^-1`` times their
-    coupling to marks and shared unknowns, zero but in the ``columns`` of each station; ``S``
-    (3m + k, 3m + k) is the Schur complement; ``g`` and ``r`` are the right sides.
-    """
-
-    A: Array
-    K: Array
-    S: Array
-    g: Array
-    r: Array
-    columns: tuple[Index, ...]
-
-
-def _reduce(network: Network, lin: Linearised, shared: Array) -> _Reduced:
-    """Set up the normal equations and eliminate the stations."""
-    s, m = len(network.stations), len(network.marks)
-    station = network.sightings[:, 0]
-    pressed = np.swapaxes(lin.J_centres, 1, 2) @ lin.P_centres
+def _reduce(network: Network, lin: Linearised, shared: Array) -> tuple[Reduced, Array]:
+    """Return the normal equations without the stations, and the right-hand sides of these."""
+    s, m, k = len(network.stations), len(network.marks), len(shared)
+    station, mark = network.sightings.T
+    weighted = np.swapaxes(lin.J_centres, 1, 2) @ lin.P_centres
     levelled = np.swapaxes(lin.J_gravity, 1, 2) @ lin.P_gravity
-    stations, g = levelled @ lin.J_gravity, np.einsum("sij,sj->si", levelled, lin.v_gravity)
-    np.add.at(stations, station, pressed @ lin.J_centres)
-    np.add.at(g, station, np.einsum("nij,nj->ni", pressed, lin.v_centres))
-    to_marks = pressed @ lin.J_common[..., :3]
-    to_shared = np.zeros((s, 6, len(shared)))
-    np.add.at(to_shared, station, pressed @ lin.J_common[..., 3:])
-    reduced, h = _marks_alone(network, lin, shared)
-    solved, r, columns = np.zeros((s, 6, 3 * m + len(shared))), -h, []
-    for each, rows in enumerate(_rows_of_stations(network)):
-        own = np.swapaxes(to_marks[rows], 0, 1).reshape(6, -1)
-        coupling = np.concatenate([own, to_shared[each]], axis=1)
-        there = _columns(network.sightings[rows, 1], m, len(shared))
-        part = np.linalg.solve(stations[each], coupling)
-        reduced[there[:, None], there] -= coupling.T @ part
-        r[there] += part.T @ g[each]
-        solved[each][:, there] = part
-        columns.append(there)
-    reduced = (reduced + reduced.T) / 2.0
-    return _Reduced(A=stations, K=solved, S=reduced, g=g, r=r, columns=tuple(columns))
+    local, rhs = levelled @ lin.J_gravity, -np.einsum("sij,sj->si", levelled, lin.v_gravity)
+    np.add.at(local, station, weighted @ lin.J_centres)
+    np.add.at(rhs, station, -np.einsum("nij,nj->ni", weighted, lin.v_centres))
+    coupling = weighted @ lin.J_common
+    to_marks, to_shared = np.zeros((s, m, 6, 3)), np.zeros((s, 6, k))
+    np.add.at(to_marks, (station, mark), coupling[..., :3])
+    np.add.at(to_shared, station, coupling[..., 3:])
+    to_marks = np.swapaxes(to_marks, 1, 2).reshape(s, 6, 3 * m)
+    mixed = np.concatenate([to_marks, to_shared], axis=2)
+    return eliminate(local, mixed, rhs, *_common_alone(network, lin, shared)), rhs
 
 
-def _rows_of_stations(network: Network) -> list[Index]:
-    """Return the sightings of each station."""
-    station = network.sightings[:, 0]
-    ends = np.cumsum(np.bincount(station, minlength=len(network.stations)))
-    return np.split(np.argsort(station, kind="stable"), ends[:-1])
-
-
-def _columns(marks: Index, n_marks: int, n_shared: int) -> Index:
-    """Return where the unknowns of some marks, and all that are shared, stand."""
-    own = 3 * marks[:, None] + np.arange(3)
-    return np.concatenate([own.ravel(), 3 * n_marks + np.arange(n_shared)])
-
-
-def _marks_alone(network: Network, lin: Linearised, shared: Array) -> tuple[Array, Array]:
-    """Return normal matrix and gradient of marks and shared unknowns where no station moves."""
+def _common_alone(network: Network, lin: Linearised, shared: Array) -> tuple[Array, Array]:
+    """Return the normal equations of marks and shared unknowns where no station moves."""
     m, k = len(network.marks), len(shared)
     mark = network.sightings[:, 1]
-    pressed = np.swapaxes(lin.J_common, 1, 2) @ lin.P_centres
-    squares = pressed @ lin.J_common
-    gradient = np.einsum("nij,nj->ni", pressed, lin.v_centres)
-    blocks, h = np.zeros((m, 3, 3 + k)), np.zeros((m, 3))
+    weighted = np.swapaxes(lin.J_common, 1, 2) @ lin.P_centres
+    squares = weighted @ lin.J_common
+    products = -np.einsum("nij,nj->ni", weighted, lin.v_centres)
+    blocks, rhs = np.zeros((m, 3, 3 + k)), np.zeros((m, 3))
     np.add.at(blocks, mark, squares[:, :3])
-    np.add.at(h, mark, gradient[:, :3])
+    np.add.at(rhs, mark, products[:, :3])
     np.add.at(blocks[:, :, :3], network.controls, lin.P_control)
-    np.add.at(h, network.controls, -np.einsum("nij,nj->ni", lin.P_control, lin.v_control))
+    np.add.at(rhs, network.controls, np.einsum("nij,nj->ni", lin.P_control, lin.v_control))
     N = np.zeros((3 * m + k, 3 * m + k))
     diagonal = np.zeros((m, 3, m, 3))
     diagonal[np.arange(m), :, np.arange(m), :] = blocks[:, :, :3]
@@ -233,8 +196,8 @@ def _marks_alone(network: Network, lin: Linearised, shared: Array) -> tuple[Arra
     N[3 * m :, : 3 * m] = N[: 3 * m, 3 * m :].T
     weights = network.shared.weights
     N[3 * m :, 3 * m :] = squares[:, 3:, 3:].sum(axis=0) + weights
-    tail = gradient[:, 3:].sum(axis=0) + weights @ shared
-    return N, np.concatenate([h.ravel(), tail])
+    tail = products[:, 3:].sum(axis=0) - weights @ shared
+    return N, np.concatenate([rhs.ravel(), tail])
 
 
 def _datum(network: Network, state: State) -> Array:
@@ -281,34 +244,26 @@ def solve_network(network: Network, state: State, used: Mask) -> tuple[State, Co
     """
     m = len(network.marks)
     for _ in range(_STEPS):
-        reduced = _reduce(network, linearise(network, state, used), state.shared)
-        cov_marks = _inverse(reduced.S, _datum(network, state))
-        dp = cov_marks @ reduced.r
-        own = np.linalg.solve(reduced.A, reduced.g[..., None])[..., 0]
-        xi = -own - reduced.K @ dp
-        state = step_to(state, xi, dp[: 3 * m].reshape(m, 3), dp[3 * m :])
-        size = np.einsum("si,si->", own, reduced.g) + reduced.r @ dp
-        if size < _SETTLED:
-            return state, _cofactors(reduced, cov_marks, m)
+        reduced, rhs = _reduce(network, linearise(network, state, used), state.shared)
+        cov = _inverse(reduced.N, _datum(network, state))
+        common = cov @ reduced.rhs
+        stations = reduced.local_steps(common)
+        state = step_to(state, stations, common[: 3 * m].reshape(m, 3), common[3 * m :])
+        if np.sum(reduced.steps * rhs) + reduced.rhs @ common < _SETTLED:
+            return state, _cofactors(reduced, cov)
     raise NotConvergedError(
         f"The network did not settle within {_STEPS} steps; the approximate values are too far "
         "off or the observations contradict each other."
     )
 
 
-def _cofactors(reduced: _Reduced, cov_marks: Array, m: int) -> Cofactors:
-    """Return the covariances of stations, marks and what all share."""
-    between = np.empty_like(reduced.K)
-    for each, there in enumerate(reduced.columns):
-        between[each] = -reduced.K[each][:, there] @ cov_marks[there]
-    own = np.asarray(np.linalg.inv(reduced.A), dtype=np.float64)
-    stations = own - between @ np.swapaxes(reduced.K, 1, 2)
+def _cofactors(reduced: Reduced, cov_common: Array) -> Cofactors:
+    """Return the covariances of stations and common unknowns."""
+    between = -reduced.gains @ cov_common
+    stations = reduced.own - between @ np.swapaxes(reduced.gains, 1, 2)
     return Cofactors(
         stations=(stations + np.swapaxes(stations, 1, 2)) / 2.0,
-        between=between[:, :, : 3 * m].reshape(len(between), 6, m, 3),
-        marks=cov_marks[: 3 * m, : 3 * m].copy(),
-        with_shared=between[:, :, 3 * m :],
-        shared_and_marks=cov_marks[: 3 * m, 3 * m :].reshape(m, 3, -1),
-        shared=cov_marks[3 * m :, 3 * m :].copy(),
-        parts=Parts(own=own, coupling=reduced.K, cov_common=cov_marks),
+        between=between,
+        common=cov_common,
+        parts=Parts(own=reduced.own, coupling=reduced.gains, cov_common=cov_common),
     )
