@@ -16,6 +16,7 @@ from spheremark.pipelines.calibration.gimbal import (
     moved,
 )
 from spheremark.pipelines.errors import NotConvergedError
+from spheremark.pipelines.estimation.linear_algebra import Reduced, eliminate
 from spheremark.pipelines.model import RING_UNKNOWN, Array, Index, Mask, Rig, Rings
 
 _TUKEY = 6.0  # sigmas at which a return has no weight; 98 % efficient on clean data
@@ -40,59 +41,23 @@ class Inseparable(NamedTuple):
     reason: str
 
 
-class Normals(NamedTuple):
-    """Normal equations with the centres eliminated.
-
-    Attributes
-    ----------
-    N : (p, p)
-        Of the parameters alone.
-    pull : (p,)
-        Right-hand side.
-    inverses : (m, 3, 3)
-        Of the centres' own blocks.
-    mixed : (m, 3, p)
-        Between centres and parameters.
-    pull_centres : (m, 3)
-        Right-hand sides of the centres.
-    """
-
-    N: Array
-    pull: Array
-    inverses: Array
-    mixed: Array
-    pull_centres: Array
-
-    def centre_steps(self, steps: Array) -> Array:
-        """Return the steps of the centres that belong to steps of the parameters."""
-        return np.asarray(
-            np.einsum("mij,mj->mi", self.inverses, self.pull_centres - self.mixed @ steps)
-        )
-
-
-def reduced(which: Index, J_centres: Array, J: Array, residuals: Array, weights: Array) -> Normals:
-    """Sum the normal equations of centres and parameters, and eliminate the centres.
-
-    Notes
-    -----
-    Cost grows linearly with observations and centres.
-    """
+def reduced(which: Index, J_centres: Array, J: Array, residuals: Array, weights: Array) -> Reduced:
+    """Sum the normal equations of centres and parameters, and eliminate the centres."""
     order = np.argsort(which, kind="stable")
-    J_centres, J = J_centres[order], J[order]
-    weighted = weights[order, None] * np.column_stack([J_centres, residuals[order]])
+    J_centres, J, weights = J_centres[order], J[order], weights[order, None]
+    weighted = weights * np.column_stack([J_centres, residuals[order]])
     starts = np.searchsorted(which[order], np.arange(which.max() + 1))
 
     def summed(products: Array) -> Array:
         return np.asarray(np.add.reduceat(products, starts, axis=0))
 
-    own = summed(weighted[:, :3, None] * J_centres[:, None, :])
-    mixed = summed(weighted[:, :3, None] * J[:, None, :])
-    pull_centres = summed(weighted[:, 3:] * J_centres)
-    inverses = np.asarray(np.linalg.inv(own + np.eye(3) / _PRIOR**2))
-    by_parameter = inverses @ mixed
-    N = (J.T * weights[order]) @ J - np.einsum("mip,miq->pq", mixed, by_parameter)
-    pull = J.T @ weighted[:, 3] - np.einsum("mip,mi->p", by_parameter, pull_centres)
-    return Normals(N, pull, inverses, mixed, pull_centres)
+    return eliminate(
+        summed(weighted[:, :3, None] * J_centres[:, None, :]) + np.eye(3) / _PRIOR**2,
+        summed(weighted[:, :3, None] * J[:, None, :]),
+        summed(weighted[:, 3:] * J_centres),
+        (J * weights).T @ J,
+        J.T @ weighted[:, 3],
+    )
 
 
 def separable(N: Array, parameters: tuple[Parameter, ...]) -> tuple[Mask, tuple[Inseparable, ...]]:
@@ -248,21 +213,21 @@ class _Problem(NamedTuple):
         own = by_shade[shades] * (ratios / (dofs + _DOF_NOISE))[which]
         return np.asarray(np.maximum(np.sqrt(own), _NOISE_MIN))
 
-    def equations(self, state: _State, sigmas: Array) -> Normals:
+    def equations(self, state: _State, sigmas: Array) -> Reduced:
         """Return the normal equations of all parameters and biases."""
         sight = state.sight
         J = np.column_stack([sight.J_rig, self.basis[self.seen.rings]])
         weights = tukey(sight.residuals / sigmas) / sigmas**2
         return reduced(self.seen.which, sight.J_centres, J, sight.residuals, weights)
 
-    def ahead(self, state: _State, equations: Normals, chosen: Index, sigmas: Array) -> _State:
+    def ahead(self, state: _State, equations: Reduced, chosen: Index, sigmas: Array) -> _State:
         """Return the state after the longest share of a step that lowers the loss, or the last."""
         steps = np.zeros(len(equations.N))
         N = equations.N[np.ix_(chosen, chosen)]
-        steps[chosen] = np.linalg.solve(N, equations.pull[chosen])
+        steps[chosen] = np.linalg.solve(N, equations.rhs[chosen])
         by_rig, by_laser = np.split(steps, [len(GIMBAL)])
         biases = (self.basis @ by_laser)[: len(state.rig.laser_range_biases)]
-        by_centre = equations.centre_steps(steps)
+        by_centre = equations.local_steps(steps)
         loss, trial = _loss(state.sight.residuals / sigmas), state
         for share in _SHARES:
             rig = moved(state.rig, share * by_rig, share * biases)
@@ -352,8 +317,8 @@ def _estimate(
         dof=int(is_used.sum()) - 3 * len(state.centres) - len(chosen),
         basis=J,
         weights=_told(equations.N, chosen) / _EFFICIENCY,
-        effects=equations.inverses @ equations.mixed[:, :, chosen],
-        cov_centres=_EFFICIENCY * equations.inverses,
+        effects=equations.gains[:, :, chosen],
+        cov_centres=_EFFICIENCY * equations.own,
     )
 
 
@@ -375,7 +340,7 @@ def residual_rms(seen: Sights, rig: Rig, found: Estimate, covs: Array, radius: f
     for _ in range(_N_STEPS_CENTRES):
         sight = design(seen, rig, centres, covs, radius)
         equations = reduced(seen.which, sight.J_centres, nothing, sight.residuals, weights)
-        centres = centres + equations.centre_steps(np.zeros(0))
+        centres = centres + equations.local_steps(np.zeros(0))
     residuals = design(seen, rig, centres, covs, radius).residuals
     return float(np.sqrt(np.mean(residuals[found.is_used] ** 2)))
 
