@@ -171,8 +171,8 @@ def _reduce(network: Network, lin: Linearised, shared: Array) -> tuple[Reduced, 
     to_marks, to_shared = np.zeros((s, m, 6, 3)), np.zeros((s, 6, k))
     np.add.at(to_marks, (station, mark), coupling[..., :3])
     np.add.at(to_shared, station, coupling[..., 3:])
-    to_marks = np.swapaxes(to_marks, 1, 2).reshape(s, 6, 3 * m)
-    mixed = np.concatenate([to_marks, to_shared], axis=2)
+    flat = np.swapaxes(to_marks, 1, 2).reshape(s, 6, 3 * m)
+    mixed = np.concatenate([flat, to_shared], axis=2)
     return eliminate(local, mixed, rhs, *_common_alone(network, lin, shared)), rhs
 
 

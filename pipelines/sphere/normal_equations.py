@@ -11,6 +11,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from spheremark.pipelines.estimation.linear_algebra import eliminate, inverse
 from spheremark.pipelines.model import Array, Index
 from spheremark.pipelines.sphere.linearisation import Linear
 from spheremark.pipelines.sphere.returns import Returns
@@ -69,11 +70,6 @@ def sums_of_products(starts: Index, left: Array, right: Array) -> Array:
     return sums
 
 
-def inverses(matrices: Array) -> Array:
-    """Return the inverses of a stack of matrices, as float64."""
-    return np.asarray(np.linalg.inv(matrices), dtype=np.float64)
-
-
 def normals_of(
     returns: Returns, linear: Linear, residuals: Array, weights: Array, n_lasers: int
 ) -> Normals:
@@ -114,20 +110,16 @@ def solve(N: Normals, effects: Array, precisions: Array, rhs_prior: Array) -> So
     shared[:, :-1] += np.diag(precisions)
     shared[:, -1] += rhs_prior
 
-    mixed = np.concatenate(
-        [N.products[:, centre, laser], N.by_face[:, :, :3] @ effects, N.products[:, :3, rhs, None]],
-        axis=2,
+    mixed = np.concatenate([N.products[:, centre, laser], N.by_face[:, :, :3] @ effects], axis=2)
+    reduced = eliminate(
+        own + np.eye(3), mixed, N.products[:, centre, rhs], shared[:, :-1], shared[:, -1]
     )
-    covs = inverses(own + np.eye(3))
-    gains = covs @ mixed
-    by_shared = gains[:, :, :-1]
-    reduced = shared - np.sum(mixed[:, :, :-1].transpose(0, 2, 1) @ gains, axis=0)
-    cov_shared = inverses(reduced[:, :-1])
+    cov_shared = inverse(reduced.N)
     return Solution(
-        steps=gains[:, :, -1],
-        step_shared=cov_shared @ reduced[:, -1],
-        covs=covs,
+        steps=reduced.steps,
+        step_shared=cov_shared @ reduced.rhs,
+        covs=reduced.own,
         cov_shared=cov_shared,
-        by_shared=by_shared,
-        covs_by_shared=by_shared @ cov_shared @ by_shared.transpose(0, 2, 1),
+        by_shared=reduced.gains,
+        covs_by_shared=reduced.gains @ cov_shared @ reduced.gains.transpose(0, 2, 1),
     )

@@ -10,9 +10,10 @@ from typing import NamedTuple
 
 import numpy as np
 
+from spheremark.pipelines.estimation.linear_algebra import invert_each
 from spheremark.pipelines.model import Array, Beams, Mask
 from spheremark.pipelines.sphere.linearisation import Linear, linearise
-from spheremark.pipelines.sphere.normal_equations import inverses, sums_of_products
+from spheremark.pipelines.sphere.normal_equations import sums_of_products
 from spheremark.pipelines.sphere.returns import Returns, may_be_sphere, of_markers, returns_of
 
 _ITERATED = 1.0  # standard deviations of one step, beyond which the steps are iterated
@@ -116,11 +117,11 @@ def _score_steps(
     wide = _with_radius(covs, np.trace(covs[:, :3, :3], axis1=1, axis2=2))
     linear = linearise(returns, spheres, wide, is_used)
     N = _normals(returns, linear, residuals, _weights(observed, linear))
-    covs_free = inverses(N[:, :, :4] + _prior(radii, _PRIOR))
+    covs_free = invert_each(N[:, :, :4] + _prior(radii, _PRIOR))[0]
     linear = linearise(returns, spheres, covs_free, is_used)
     weights = _weights(observed, linear)
     N = _normals(returns, linear, residuals, weights)
-    by_rhs = inverses(N[:, :, :4] + _prior(radii, _WEAK_PRIOR))
+    by_rhs = invert_each(N[:, :, :4] + _prior(radii, _WEAK_PRIOR))[0]
     of_noise = _normals(returns, linear, residuals, weights**2 * observed.variances)
     row = by_rhs[:, 3]
     variances = np.einsum("mi,mij,mj->m", row, of_noise[:, :, :4], row)
@@ -157,7 +158,7 @@ def _iterated(
         linear = linearise(returns, spheres, covs, is_used)
         residuals = observed.ranges - linear.ranges
         N = _normals(returns, linear, residuals, _weights(observed, linear))[active]
-        covs[active] = inverses(N[:, :, :4] + prior[active])
+        covs[active] = invert_each(N[:, :, :4] + prior[active])[0]
         steps = np.einsum("mij,mj->mi", covs[active], N[:, :, 4])
         steps = np.clip(steps, -limits[active], limits[active])
         spheres[active] += steps
@@ -205,7 +206,7 @@ def _with_assumed(
         linear = linearise(returns, sphere, cov)
         observed, residuals = _gated(returns, linear, radius)
         N = _normals(returns, linear, residuals, _weights(observed, linear))[0, :3]
-        known = inverses(N[:, :3] + np.eye(3) / (_PRIOR * radius) ** 2)
+        known = invert_each(N[:, :3] + np.eye(3) / (_PRIOR * radius) ** 2)[0]
         sphere[0, :3] += np.clip(known @ N[:, 4], -limit, limit)
         cov = _with_radius(known[None], 0.0)
     return *_gated(returns, linearise(returns, sphere, cov), radius), sphere, cov
