@@ -159,9 +159,12 @@ def test_the_covariance_of_the_pose_is_honest(rng):
 def test_the_covariance_of_the_pose_is_honest_at_length(n_marks):
     errors, squares = whitened(np.random.default_rng(n_marks), n_marks, 2500)
     eigenvalues = np.linalg.eigvalsh(errors.T @ errors / len(errors))
-    np.testing.assert_allclose(eigenvalues, 1.0, rtol=0, atol=0.12)
-    assert np.mean(chi2.sf(np.sum(errors**2, axis=1), 6) > 0.01) == pytest.approx(0.99, abs=0.006)
-    assert np.mean(chi2.sf(squares, 3) > 0.05) == pytest.approx(0.95, abs=0.013)
+    least, greatest = chance.of_eigenvalues(*errors.shape)  # 0.85 and 1.17
+    assert least < eigenvalues[0]
+    assert eigenvalues[-1] < greatest
+    for squared, dof, probability in ((np.sum(errors**2, axis=1), 6, 0.99), (squares, 3, 0.95)):
+        low, high = chance.of_share(probability, len(squared))
+        assert low <= np.mean(chi2.cdf(squared, dof) < probability) <= high
 
 
 @pytest.mark.parametrize("method", ["free_station", "ranges", "paper"])
