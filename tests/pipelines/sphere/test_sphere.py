@@ -208,12 +208,18 @@ def test_covariances_hold_at_every_distance(distance, sigma, low, high):
     assert low < squares.mean() < high
 
 
-def test_pole_and_strays_are_set_aside():
+@pytest.mark.parametrize(
+    "share",
+    [0.04, pytest.param(0.08, marks=pytest.mark.xfail(
+        strict=True, reason="with twice as many strays, two fits in five keep some and say ok"
+    ))],
+)  # fmt: skip
+def test_pole_and_strays_are_set_aside(share):
     rng = np.random.default_rng(3)
     errors, n_misled = [], 0
     for _ in range(20):
         shots, ranges = returns(*marker_shots(CENTRE, rng, sigma=0.008, pole=0.03))
-        strays = rng.random(len(ranges)) < 0.04
+        strays = rng.random(len(ranges)) < share
         ranges = ranges + np.where(strays, rng.uniform(0.06, 0.2, len(ranges)), 0.0)
         fit = fit_one(cloud_of(shots, ranges), CENTRE + 0.015).fits[0]
         error = fit.p_base - CENTRE
