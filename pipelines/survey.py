@@ -1,4 +1,4 @@
-"""The whole chain in memory: a scan log goes in, an honest position comes out."""
+"""The whole chain in memory: from a scan log to positions with covariances."""
 
 from __future__ import annotations
 
@@ -269,7 +269,7 @@ def _qualified(fix: StationFix, coverage: float) -> StationFix:
 
 
 def _why_no_markers(results: list[StopResult], config: SurveyConfig) -> str:
-    """Say what was seen instead of markers."""
+    """Return the reason: the returns, and the largest refused group."""
     returns = sum(len(result.cloud.p_base) for result in results)
     refused = [r for result in results for fits in result.fits.values() for r in fits.rejected]
     closest = max(refused, key=lambda rejection: rejection.n_points, default=None)

@@ -114,7 +114,7 @@ class Client:
         self._ensure_survey(survey)
         query = {"name": name or path.stem, "survey": survey, "process": str(process).lower()}
         with path.open("rb") as file:
-            return self._json(
+            return self.request(
                 "POST", "/recordings", params=query, content=file, headers={"Content-Type": _MCAP}
             )
 
@@ -141,7 +141,7 @@ class Client:
         path = Path(marks)
         kind = {"Content-Type": _TYPES.get(path.suffix.lower(), "text/csv")}
         url = f"/surveys/{survey}/control"
-        return self._json("PUT", url, content=path.read_bytes(), headers=kind)
+        return self.request("PUT", url, content=path.read_bytes(), headers=kind)
 
     def start(self, kind: str, survey: str, **options: Any) -> dict[str, Any]:
         """Start a job of a whole survey.
@@ -165,7 +165,7 @@ class Client:
         RemoteError
             If the service refuses the job or does not answer.
         """
-        return self._json(
+        return self.request(
             "POST", "/jobs", json={"kind": kind, "survey": survey, "options": options}
         )
 
@@ -192,7 +192,7 @@ class Client:
         if not isinstance(job, str):
             job = str((job.get("job") or job)["job_id"])
         deadline = time.monotonic() + timeout
-        while (state := self._json("GET", f"/jobs/{job}"))["status"] in _ACTIVE:
+        while (state := self.request("GET", f"/jobs/{job}"))["status"] in _ACTIVE:
             if time.monotonic() > deadline:
                 raise RemoteError(f"Job {job} did not end within {timeout:g} s; it goes on.")
             time.sleep(_POLL)
@@ -223,7 +223,7 @@ class Client:
         """
         import pandas as pd
 
-        answer = self._json("POST", "/sql", json={"sql": sql})
+        answer = self.request("POST", "/sql", json={"sql": sql})
         if answer["truncated"]:
             warnings.warn(
                 f"The service cut the answer at {answer['row_limit']} rows; aggregate or filter, "
@@ -273,12 +273,59 @@ class Client:
                 found = self._http.post(f"{_API}/surveys", json={"name": survey})
         checked(found)
 
-    def _json(self, method: str, path: str, **request: Any) -> dict[str, Any]:
-        """Send a request and return its answer."""
+    def request(self, method: str, path: str, **request: Any) -> dict[str, Any]:
+        """Send a request and return the JSON of its response.
+
+        Parameters
+        ----------
+        method : str
+            Method of HTTP.
+        path : str
+            Path below ``/api/v1``.
+        **request
+            Further arguments of ``httpx.Client.request``.
+
+        Returns
+        -------
+        dict
+            The body of the response.
+
+        Raises
+        ------
+        RemoteError
+            If the service refuses the request or does not answer.
+        """
         with reached(self.url):
             response = self._http.request(method, f"{_API}{path}", **request)
         found: dict[str, Any] = checked(response).json()
         return found
+
+    def download(self, path: str, target: Path, **query: str) -> None:
+        """Stream a file of the service to a file on disk.
+
+        Parameters
+        ----------
+        path : str
+            Path below ``/api/v1``.
+        target : Path
+            File to write.
+        **query
+            Parameters of the request.
+
+        Raises
+        ------
+        RemoteError
+            If the service refuses the request or does not answer.
+        """
+        with (
+            reached(self.url),
+            self._http.stream("GET", f"{_API}{path}", params=query) as response,
+        ):
+            if response.is_error:
+                response.read()
+            checked(response)
+            with target.open("wb") as file:
+                file.writelines(response.iter_bytes())
 
 
 @contextmanager

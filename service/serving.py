@@ -40,8 +40,9 @@ class _Server(uvicorn.Server):
 
 def serve(settings: Settings, *, ready: Ready) -> None:
     """Serve until SIGINT or SIGTERM; ``ready`` gets the address once requests are accepted."""
+    create_app = import_from_string(_APPLICATION)  # Dask, which it imports, configures logging too
     logging.basicConfig(level=logging.WARNING, format="%(levelname)s %(name)s: %(message)s")
-    app: FastAPI = import_from_string(_APPLICATION)(settings)
+    app: FastAPI = create_app(settings)
     with _listener(settings) as listener:
         address = settings.address(listener.getsockname()[1])
         config = uvicorn.Config(

@@ -88,6 +88,11 @@ class Settings(BaseSettings):
         return f"http://{known.get(self.host, self.host)}:{self.port if port is None else port}"
 
     @property
+    def token_text(self) -> str:
+        """The token; empty without one."""
+        return self.token.get_secret_value() if self.token else ""
+
+    @property
     def database(self) -> Path:
         """File of the database."""
         return self.data / DATABASE
@@ -109,7 +114,7 @@ class Settings(BaseSettings):
     @model_validator(mode="after")
     def _is_safe(self) -> Self:
         """Refuse an open address without a token, and an address that is no scheduler."""
-        if not is_loopback(self.host) and not (self.token and self.token.get_secret_value()):
+        if not is_loopback(self.host) and not self.token_text:
             raise ValueError(
                 f"host is {self.host}, which others can reach; set SPHEREMARK_TOKEN to a secret, "
                 "or listen on 127.0.0.1"

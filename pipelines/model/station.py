@@ -21,7 +21,7 @@ class ControlMarks:
     Attributes
     ----------
     names : tuple of str
-        What the surveyor calls them, all different.
+        Unique names.
     p_site : (n, 3)
         Centres of the spheres [m].
     cov_p_site : (n, 3, 3)
@@ -67,7 +67,7 @@ class StationFix:
         ``T_true = Exp(xi) T_site_station``, expressed in the site frame.
     cov_p_site : (3, 3)
         Covariance of the position: far from the site's origin that of the motion has no digits
-        left to tell it from [m^2].
+        left for it [m^2].
     matches : (n, 2)
         Pairs of (place among the fits, place among the control marks), the used ones.
     residuals_site : (n, 3)
@@ -283,8 +283,8 @@ class Omissions:
     ----------
     shifts_site : (n, 3)
         Position of the station without the marker, minus its position with all; NaN, as all else of
-        the row, where the other marks stand on one plumb line and tell no heading, or contradict
-        each other so that they tell no position [m].
+        the row, where the other marks stand on one plumb line and determine no heading, or
+        contradict each other and determine no position [m].
     predictions_site : (n, 3)
         Where the scan puts the mark when the others alone position the station, minus where it is
         given [m].
@@ -316,7 +316,7 @@ class Omissions:
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class StationQuality:
-    """What the scan and the control tell of a station's quality, without truth.
+    """Quality of a station from scan and control, without truth.
 
     Attributes
     ----------
@@ -334,7 +334,7 @@ class StationQuality:
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class StopResult:
-    """All that one stop gave.
+    """The results of one stop.
 
     Attributes
     ----------

@@ -42,7 +42,7 @@ _UNKNOWN = 1.0  # [rad] of a levelling that was left out
 def station_quality(
     fix: StationFix, fits: MarkerFits, marks: ControlMarks, config: ResectionConfig
 ) -> StationQuality:
-    """Return what the scan and the control tell of a station's quality, without truth.
+    """Return the quality of a station from scan and control, without truth.
 
     Parameters
     ----------

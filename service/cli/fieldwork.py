@@ -29,7 +29,7 @@ _LANE = "lane3"  # the middle one
 class Assignment:
     """What to simulate, and how to write it: as points or as raw packets.
 
-    No stops ask for the middle lane of a field with lanes, and for all stops of any other.
+    Without stops: the middle lane of a field with lanes, all stops of any other.
     """
 
     scenario: str
@@ -50,7 +50,7 @@ class WrittenStop:
 
 
 def chosen_stops(field: Field, text: str) -> tuple[str, ...]:
-    """Return the names of the stops that a text asks for.
+    """Return the names of the stops of a text.
 
     It is ``all`` or a list with commas of names, lanes (``lane3``), numbers from 1 and ranges of
     them (``1-7``), in the order of driving.
@@ -81,33 +81,33 @@ def _named(part: str, names: Sequence[str]) -> Sequence[str]:
 
 
 def survey(
-    folder: Path, wanted: Assignment, *, progress: Progress = lambda _share, _what: None
+    folder: Path, assignment: Assignment, *, progress: Progress = lambda _share, _what: None
 ) -> Iterator[WrittenStop]:
     """Simulate stop after stop into a folder; yield each one when its files are complete."""
-    field = scenario(wanted.scenario, wanted.seed)
+    field = scenario(assignment.scenario, assignment.seed)
     has_lanes = any(stop.name.startswith(_LANE) for stop in field.stops)
-    names = chosen_stops(field, wanted.stops or (_LANE if has_lanes else "all"))
+    names = chosen_stops(field, assignment.stops or (_LANE if has_lanes else "all"))
     folder.mkdir(parents=True, exist_ok=True)
     write_control(field.marks, folder / "control.csv")
     for i, name in enumerate(names):
-        yield _write(folder, field, name, wanted, _part(progress, i, len(names)))
+        yield _write(folder, field, name, assignment, _part(progress, i, len(names)))
 
 
 def _write(
-    folder: Path, field: Field, name: str, wanted: Assignment, progress: Progress
+    folder: Path, field: Field, name: str, assignment: Assignment, progress: Progress
 ) -> WrittenStop:
     """Simulate one stop and write its log and, into a file of its own, its truth."""
     made = WrittenStop(name=name, log=folder / f"{name}.mcap", truth=folder / f"{name}.truth.json")
-    stop = simulate_stop(field, name, wanted.config, progress=progress)
+    stop = simulate_stop(field, name, assignment.config, progress=progress)
     part = made.log.with_suffix(".part")
     write_log(
         stop.log,
         part,
-        revolution=60.0 / wanted.config.spin_rpm,
-        compression=wanted.compression,
-        firings=stop.firings if wanted.packets else None,
+        revolution=60.0 / assignment.config.spin_rpm,
+        compression=assignment.compression,
+        firings=stop.firings if assignment.packets else None,
     )
-    write_truth(survey_truth(field, [stop], wanted.config, field.seed), made.truth)
+    write_truth(survey_truth(field, [stop], assignment.config, field.seed), made.truth)
     part.replace(made.log)
     return made
 

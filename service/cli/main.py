@@ -1,6 +1,6 @@
-"""The command ``spheremark``: each verb is one call of what the service calls too.
+"""The command ``spheremark``: each verb is one call of a function that the service calls too.
 
-Answers go to standard output, as tables for people or JSON for programs; progress and errors go
+Results go to standard output, as tables for people or JSON for programs; progress and errors go
 to standard error. Exit codes: 0 done, 1 failed, 2 misused. Heavy imports are inside the commands.
 """
 
@@ -163,7 +163,7 @@ def simulate(
     )
     if warning := commensurability(config):
         err.print(f"[yellow]Warning:[/] {warning}", soft_wrap=True)
-    wanted = Assignment(
+    assignment = Assignment(
         scenario=scenario,
         stops=stops,
         seed=seed,
@@ -172,7 +172,7 @@ def simulate(
         packets=form is Format.PACKETS,
     )
     with _progress() as progress:
-        for made in survey(folder, wanted, progress=progress):
+        for made in survey(folder, assignment, progress=progress):
             paths = {"stop": made.name, "log": str(made.log), "truth": str(made.truth)}
             sys.stdout.write((json.dumps(paths) if as_json else paths["log"]) + "\n")
             sys.stdout.flush()
@@ -180,15 +180,15 @@ def simulate(
 
 @app.command()
 def inspect(log: LogFile, as_json: AsJson = False) -> None:
-    """Say what a log holds and lacks, and whether it can be processed."""
-    from spheremark.service.cli import tables
+    """Report what a log holds and lacks, and whether it can be processed."""
+    from spheremark.service.cli import render
     from spheremark.storage.recordings import inspect_log
 
     report = inspect_log(log)
     if as_json:
         _print_json(report.to_mapping())
     else:
-        tables.print_preflight(out, log.name, report)
+        render.print_preflight(out, log.name, report)
     if report.verdict == "refused":
         raise typer.Exit(1)
 
@@ -221,7 +221,7 @@ def process(
 ) -> None:
     """Find the markers of logs and position their stations."""
     from spheremark.pipelines.config import SurveyConfig
-    from spheremark.service.cli import tables
+    from spheremark.service.cli import render
     from spheremark.service.log_files import process_file
     from spheremark.service.serialise.stops import serialise_log
     from spheremark.storage.imports import survey_files as site_files
@@ -237,15 +237,15 @@ def process(
     given_rig = site_files.read_rig(rig) if rig else None
     marks = read_control(control, control_axes, control_unit, target_height_m)
     true = site_files.read_truth(truth) if truth else None
-    answers = []
+    results = []
     for log in logs:
         with _progress() as progress:
             found = process_file(log, config, progress, rig=given_rig, marks=marks, truth=true)
-        answers.append(serialise_log(found, frame=frame.value, truth=true))
+        results.append(serialise_log(found, frame=frame.value, truth=true))
         if not as_json:
-            tables.print_answer(out, answers[-1])
+            render.print_log(out, results[-1])
     if as_json:
-        _print_json(answers[0] if len(answers) == 1 else answers)
+        _print_json(results[0] if len(results) == 1 else results)
 
 
 app.command()(adjust)
@@ -262,20 +262,20 @@ def query(
     as_json: AsJson = False,
     as_csv: Annotated[bool, typer.Option("--csv", help="CSV for programs.")] = False,
 ) -> None:
-    """Ask in SQL: a running service, or a data folder that none uses."""
-    from spheremark.service.cli import tables
+    """Run a query in SQL: in a running service, or on a data folder that none uses."""
+    from spheremark.service.cli import render
     from spheremark.service.cli.source import Source
 
     source = Source(_settings(**({"data": data} if data else {})), url, folder=data)
-    answer = source.ask(sql)
+    result = source.query(sql)
     if as_json:
-        _print_json(answer)
+        _print_json(result)
     elif as_csv:
-        sys.stdout.write(tables.to_csv(answer))
+        sys.stdout.write(render.to_csv(result))
     else:
-        tables.print_rows(out, answer)
-    if answer["truncated"]:
-        err.print(f"[yellow]Truncated:[/] only the first {answer['row_limit']:,} rows are here.")
+        render.print_rows(out, result)
+    if result["truncated"]:
+        err.print(f"[yellow]Truncated:[/] only the first {result['row_limit']:,} rows are here.")
 
 
 @app.command()

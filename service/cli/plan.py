@@ -293,7 +293,7 @@ def _ask(data: Path | None, server: str | None, survey: str) -> Any:
     from spheremark.service.settings import Settings
 
     settings = Settings(data=data) if data else Settings()
-    ask = Source(settings, server, folder=data).ask
+    ask = Source(settings, server, folder=data).query
     require_survey(ask, survey)
     return ask
 

@@ -11,7 +11,7 @@ from typing import Any
 import httpx
 
 from spheremark.pipelines.errors import InputError
-from spheremark.service.client import checked, reached
+from spheremark.service.client import Client
 from spheremark.service.serialise.queries import serialise_query
 from spheremark.service.settings import Settings
 from spheremark.storage.catalogue.catalogue import Catalogue
@@ -28,12 +28,11 @@ class Source:
         self._settings = settings
         self._url = url or ("" if folder else self._running())
 
-    def ask(self, sql: str) -> dict[str, Any]:
+    def query(self, sql: str) -> dict[str, Any]:
         """Run one SELECT."""
         if self._url:
-            with reached(self._url), self._http() as http:
-                answer: dict[str, Any] = checked(http.post("/sql", json={"sql": sql})).json()
-                return answer
+            with self._client() as client:
+                return client.request("POST", "/sql", json={"sql": sql})
         with self._catalogue() as catalogue:
             snapshot, limits = catalogue.snapshot(), self._settings.query_limits
             return serialise_query(run_query(snapshot, sql, limits), limits, snapshot)
@@ -42,26 +41,18 @@ class Source:
         """Write the database or a table of coordinates to a file, by its ending."""
         if target.suffix not in (".duckdb", ".csv"):
             raise InputError(f"{target.name} must end in .duckdb (everything) or .csv.")
+        is_table = target.suffix == ".csv"
         if self._url:
-            with reached(self._url):
-                self._download(target, survey)
+            name = "coordinates.csv" if is_table else "results.duckdb"
+            with self._client() as client:
+                query = {"survey": survey} if survey and is_table else {}
+                client.download(f"/export/{name}", target, **query)
             return
         with self._catalogue() as catalogue:
-            if target.suffix == ".csv":
+            if is_table:
                 target.write_bytes(coordinates_csv(catalogue, survey))
             else:
                 copyfile(catalogue.snapshot(), target)
-
-    def _download(self, target: Path, survey: str | None) -> None:
-        """Stream a file from the service."""
-        name = "coordinates.csv" if target.suffix == ".csv" else "results.duckdb"
-        query = {"survey": survey} if survey and target.suffix == ".csv" else {}
-        with self._http() as http, http.stream("GET", f"/export/{name}", params=query) as answer:
-            if answer.is_error:
-                answer.read()
-            checked(answer)
-            with target.open("wb") as file:
-                file.writelines(answer.iter_bytes())
 
     def _running(self) -> str:
         """Return the address of the settings if a service answers there."""
@@ -72,11 +63,9 @@ class Source:
             return ""
         return address
 
-    def _http(self) -> httpx.Client:
+    def _client(self) -> Client:
         """Return a connection to the service."""
-        token = self._settings.token.get_secret_value() if self._settings.token else ""
-        headers = {"Authorization": f"Bearer {token}"} if token else {}
-        return httpx.Client(base_url=f"{self._url}/api/v1", headers=headers, timeout=120.0)
+        return Client(self._url, token=self._settings.token_text, timeout=120.0)
 
     @contextmanager
     def _catalogue(self) -> Iterator[Catalogue]:

@@ -52,7 +52,7 @@ RigFile = Annotated[
 def read_control(
     path: Path | None, axes: Axes, unit: Unit, target_height_m: float
 ) -> ControlMarks | None:
-    """Read control marks as the options say."""
+    """Read control marks in the given axes and unit."""
     from spheremark.storage.imports.survey_files import ControlLayout
     from spheremark.storage.imports.survey_files import read_control as read
 
@@ -93,7 +93,7 @@ def adjust(
     from spheremark.pipelines.config import SurveyConfig
     from spheremark.pipelines.network import compare
     from spheremark.service import log_files
-    from spheremark.service.cli import tables
+    from spheremark.service.cli import render
     from spheremark.service.serialise import network as serialise
     from spheremark.service.serialise.network_report import report as format_report
     from spheremark.storage.exports.network import write_coordinates, write_gama
@@ -104,27 +104,27 @@ def adjust(
     )
     marks = read_control(control, control_axes, control_unit, target_height_m)
     given = site_files.read_rig(rig) if rig else None
-    with progress() as told:
-        book = log_files.read_scans(logs, config, given, told)
+    with progress() as track:
+        book = log_files.read_scans(logs, config, given, track)
         if calibrating:
-            book = log_files.with_calibration(book, logs, config, given, told)
+            book = log_files.with_calibration(book, logs, config, given, track)
     result = log_files.adjust_scans(book, marks, config)
     found = log_files.adjusted_rig(result, book)
-    answer = serialise.serialise_network(result, config, rig=found, uncalibrated=book.uncalibrated)
+    plain = serialise.serialise_network(result, config, rig=found, uncalibrated=book.uncalibrated)
     if truth:
         true = log_files.merged_truth([site_files.read_truth(path) for path in truth])
         errors = compare(result, true)
-        answer["errors"] = serialise.serialise_network_errors(result, errors, true.marks.names)
+        plain["errors"] = serialise.serialise_network_errors(result, errors, true.marks.names)
     if gama:
         write_gama(result, gama)
     if csv:
         write_coordinates(result, csv)
     if report:
-        report.write_text(format_report(answer), encoding="utf-8")
+        report.write_text(format_report(plain), encoding="utf-8")
     if as_json:
-        print_json(answer)
+        print_json(plain)
     else:
-        tables.print_network(out, answer)
+        render.print_network(out, plain)
 
 
 def calibrate(
@@ -143,19 +143,19 @@ def calibrate(
 ) -> None:
     """Estimate the rig from the two faces of the spheres in logs."""
     from spheremark.pipelines.config import SurveyConfig
-    from spheremark.service.cli import tables
+    from spheremark.service.cli import render
     from spheremark.service.log_files import calibrate_files
     from spheremark.service.serialise.calibration import serialise_calibration
     from spheremark.storage.imports import survey_files as site_files
 
     config = SurveyConfig.from_mapping({"marker_radius": radius_m})
     start = site_files.read_rig(rig) if rig else None
-    with progress() as told:
-        found = calibrate_files(logs, config, start, told)
+    with progress() as track:
+        found = calibrate_files(logs, config, start, track)
     if target:
         site_files.write_rig(found.rig, target)
-    answer = serialise_calibration(found)
+    plain = serialise_calibration(found)
     if as_json:
-        print_json(answer)
+        print_json(plain)
     else:
-        tables.print_calibration(out, answer)
+        render.print_calibration(out, plain)

@@ -1,4 +1,4 @@
-"""Standard output and standard error of the commands: answers go to one, progress to the other."""
+"""Standard output and standard error of the commands: one for results, the other for progress."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ def print_json(value: Any) -> None:
 
 
 def settings(**given: Any) -> Settings:
-    """Read the settings; a wrong one is a misuse, said in a sentence."""
+    """Read the settings; exit with a sentence if one is wrong."""
     from pydantic import ValidationError
 
     from spheremark.service.settings import Settings

@@ -1,4 +1,4 @@
-"""The application: rooms put together, with one lifespan and one shape of errors."""
+"""The application: routes, middleware, lifespan and error handlers."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ about = APIRouter(include_in_schema=False)
 
 
 class _Application(FastAPI):
-    """FastAPI whose answers to unforeseen errors, outside all middleware, carry the headers too."""
+    """FastAPI whose responses to unexpected errors, outside all middleware, have the headers."""
 
     def build_middleware_stack(self) -> ASGIApp:
         """Return the whole application."""
@@ -48,7 +48,7 @@ def create_app(settings: Settings) -> FastAPI:
                 app.state.service = service
                 yield
         except BaseException as error:
-            app.state.failure = error  # for the one who started us; servers only log it
+            app.state.failure = error  # for the server process; uvicorn only logs it
             raise
 
     app = _Application(
@@ -60,7 +60,7 @@ def create_app(settings: Settings) -> FastAPI:
         docs_url=None,  # FastAPI's pages load their scripts from another host
         redoc_url=None,
         generate_unique_id_function=lambda route: route.name,
-        responses={"default": {"model": Problem, "description": "What went wrong."}},
+        responses={"default": {"model": Problem, "description": "The problem."}},
     )
     app.add_middleware(security.SecurityMiddleware, settings=settings)
     app.include_router(api.router, prefix=ROOT)
@@ -76,7 +76,7 @@ def create_app(settings: Settings) -> FastAPI:
 
 @about.get("/healthz")
 def health(service: Current, response: Response) -> dict[str, Any]:
-    """Say whether each part of the service runs."""
+    """Report whether each part of the service runs."""
     workers = service.jobs.n_workers()
     service.catalogue.rows("SELECT 1 AS one")
     response.status_code = 200 if workers else 503
@@ -90,8 +90,8 @@ def health(service: Current, response: Response) -> dict[str, Any]:
 
 @about.get("/login")
 def login(request: Request, service: Current, token: str = "") -> Response:
-    """Give a browser that knows the token a cookie in its place."""
-    known = service.settings.token.get_secret_value() if service.settings.token else ""
+    """Exchange the token for a cookie."""
+    known = service.settings.token_text
     if known and not security.is_token(token, known):
         raise UnauthorizedError("That is not the token; open /login?token=<token>.")
     response = RedirectResponse("/", status_code=303)

@@ -27,29 +27,29 @@ ErrorPage = Callable[[Request, Problem], Response]
 
 
 def install(app: FastAPI, page: ErrorPage | None = None) -> None:
-    """Let an application answer every error as a problem, or as a page where one was asked for."""
+    """Let an application return every error as a problem, or as a page to browsers."""
 
-    def answer(request: Request, problem: Problem, headers: Mapping[str, str] | None) -> Response:
+    def respond(request: Request, problem: Problem, headers: Mapping[str, str] | None) -> Response:
         if page is not None and _wants_page(request):
             return page(request, problem)
         return problem_response(problem, headers)
 
     def ours(request: Request, error: Exception) -> Response:
-        return answer(request, problem_of(cast(SpheremarkError, error), request.url.path), None)
+        return respond(request, problem_of(cast(SpheremarkError, error), request.url.path), None)
 
     def http(request: Request, error: Exception) -> Response:
         known = cast(HTTPException, error)
         if known.status_code in (204, 304):
             return Response(status_code=known.status_code, headers=known.headers)
-        return answer(request, _http_problem(request, known), known.headers)
+        return respond(request, _http_problem(request, known), known.headers)
 
     def invalid(request: Request, error: Exception) -> Response:
         found = cast(RequestValidationError, error).errors()
-        return answer(request, _validation_problem(request, found), None)
+        return respond(request, _validation_problem(request, found), None)
 
     def unexpected(request: Request, error: Exception) -> Response:
         logger.error("%s %s failed", request.method, request.url.path, exc_info=error)
-        return answer(request, _internal_problem(request), None)
+        return respond(request, _internal_problem(request), None)
 
     app.add_exception_handler(SpheremarkError, ours)
     app.add_exception_handler(HTTPException, http)
@@ -68,7 +68,7 @@ def problem_response(problem: Problem, headers: Mapping[str, str] | None = None)
 
 
 def _wants_page(request: Request) -> bool:
-    """Whether a person with a browser asked, and not a program."""
+    """Whether the request accepts a page, as those of browsers do."""
     return "text/html" in request.headers.get("accept", "") and not request.url.path.startswith(
         "/api/"
     )
@@ -80,7 +80,7 @@ def _http_problem(request: Request, error: HTTPException) -> Problem:
     code = HTTP_CODES.get(error.status_code, f"http_{error.status_code}")
     detail = {
         404: f"There is nothing at {request.url.path}; /api/v1/openapi.json lists the routes.",
-        405: f"{request.url.path} does not answer to {request.method}.",
+        405: f"{request.url.path} does not support {request.method}.",
     }.get(error.status_code, str(error.detail))
     return Problem(
         type=f"/api/v1/problems/{code}",
@@ -110,12 +110,12 @@ def _validation_problem(request: Request, found: Sequence[Any]) -> Problem:
 
 
 def _internal_problem(request: Request) -> Problem:
-    """Return what a caller learns of an error that nobody foresaw."""
+    """Return an unexpected error as a problem."""
     return Problem(
         type="/api/v1/problems/internal",
         title="The service failed at this request.",
         status=500,
-        detail="Something that nobody foresaw went wrong; the log of the service says what.",
+        detail="An unexpected error; the log of the service has the details.",
         instance=request.url.path,
         code="internal",
     )

@@ -31,10 +31,10 @@ from spheremark.service.http.errors import problem_response
 from spheremark.service.settings import Settings
 
 COOKIE = "spheremark_token"
-OPEN_PATHS = ("/healthz", "/login", "/static/")  # answered without the token
+OPEN_PATHS = ("/healthz", "/login", "/static/")  # open without the token
 LONG_PATHS = ("/api/v1/recordings", "/api/v1/terrains")  # streamed, with a limit of their own
 BODY_MAX = 16 << 20  # [bytes] of any other body
-UNREAD_MAX = 1 << 30  # [bytes] of a refused body that are read before its sender is answered
+UNREAD_MAX = 1 << 30  # [bytes] of a refused body that are read before the response is sent
 UNREAD_SECONDS = 30.0
 _SHOWN = 80  # characters of a malformed header that its refusal repeats
 SAFE_METHODS = ("GET", "HEAD", "OPTIONS")
@@ -72,13 +72,13 @@ _LENGTH = re.compile(r"\d{1,18}", re.ASCII)
 
 
 class SecureHeaders:
-    """Wraps an application and all its middleware: every answer carries the headers."""
+    """Wraps an application and all its middleware: every response carries the headers."""
 
     def __init__(self, app: ASGIApp) -> None:
         self.app = app
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        """Answer one request."""
+        """Handle one request."""
 
         async def send_with_headers(message: Message) -> None:
             if message["type"] == "http.response.start":
@@ -96,10 +96,10 @@ class SecurityMiddleware:
     def __init__(self, app: ASGIApp, settings: Settings) -> None:
         self.app = app
         self.own_host = settings.host
-        self.token = settings.token.get_secret_value() if settings.token else ""
+        self.token = settings.token_text
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        """Answer one request."""
+        """Handle one request."""
         if scope["type"] != "http":
             await self.app(scope, receive, send)
             return
@@ -177,7 +177,7 @@ def _is_origin(text: str) -> bool:
 
 
 def is_trustworthy(host: str, own_host: str) -> bool:
-    """Whether nobody else can make this well-formed Host lead to this machine (DNS rebinding).
+    """Whether no other party can make this well-formed Host lead here (DNS rebinding).
 
     Addresses and names without a dot cannot be registered by others; a name with one can.
     """
@@ -193,7 +193,7 @@ def is_trustworthy(host: str, own_host: str) -> bool:
 
 
 def is_cross_site(headers: Headers) -> bool:
-    """Whether a browser says that a page of another origin sent this."""
+    """Whether the headers of a browser name a page of another origin."""
     if headers.get("sec-fetch-site", "none") not in ("same-origin", "none"):
         return True
     origin = headers.get("origin")
@@ -213,7 +213,7 @@ def carries_token(request: Request, token: str) -> bool:
 
 
 def is_token(given: str, token: str) -> bool:
-    """Whether this is the token, in a time that does not tell how nearly."""
+    """Whether this is the token, compared in constant time."""
     return hmac.compare_digest(given.encode(), token.encode())
 
 
@@ -223,9 +223,9 @@ def cookie_value(token: str) -> str:
 
 
 class _Body:
-    """The body of a request: bounded, and read to its end before a refusal is answered.
+    """The body of a request: bounded, and read to its end before a refusal is sent.
 
-    A sender that is still sending reads no answer, and finds its connection reset instead.
+    A sender that is still sending reads no response: its connection is reset.
     """
 
     def __init__(self, receive: Receive, request: Request) -> None:
@@ -233,7 +233,7 @@ class _Body:
         self._receive = receive
         self._n_bytes = 0
         self._is_bounded = request.scope["path"] not in LONG_PATHS
-        self._is_asking = "expect" in headers  # and sends nothing before it is told to
+        self._expects_continue = "expect" in headers  # sends nothing before 100 Continue
         self._is_open = headers.get("content-length", "0") != "0" or "transfer-encoding" in headers
 
     async def receive(self) -> Message:
@@ -246,7 +246,7 @@ class _Body:
 
     async def read_to_its_end(self) -> None:
         """Throw away what is still to come, within reason."""
-        if self._is_asking and not self._n_bytes:
+        if self._expects_continue and not self._n_bytes:
             return
         n_most = self._n_bytes + UNREAD_MAX
         with contextlib.suppress(TimeoutError):

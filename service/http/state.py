@@ -1,4 +1,4 @@
-"""What lives as long as the service, and how a request gets at it."""
+"""The state of the running service, and its dependency for routes."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ _KEYS_KEPT = 10_000
 
 
 class Idempotency:
-    """Which request made which thing, by the key that the client chose; of this life only."""
+    """The result of each request with an Idempotency-Key, since the service started."""
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
@@ -45,7 +45,7 @@ class Idempotency:
 
 @dataclass(frozen=True, slots=True)
 class Service:
-    """Everything with a life that requests use."""
+    """The parts of the running service that requests use."""
 
     settings: Settings
     catalogue: Catalogue

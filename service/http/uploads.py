@@ -49,7 +49,7 @@ class Inbox:
         self._partial = folder / ".partial"
 
     def open(self) -> None:
-        """Make the folders, and remove what uploads of an earlier life left."""
+        """Make the folders, and remove unfinished uploads of an earlier process."""
         self._partial.mkdir(parents=True, exist_ok=True)
         for left in self._partial.iterdir():
             left.unlink()

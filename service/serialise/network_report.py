@@ -1,4 +1,4 @@
-"""A network as a text in the order in which surveyors read, from its JSON."""
+"""A network as a text report, from its JSON."""
 
 from __future__ import annotations
 
@@ -8,47 +8,47 @@ from collections.abc import Sequence
 from spheremark.service.serialise.plain import Plain
 
 
-def report(answer: Plain, title: str = "") -> str:
-    """Return a network as a text that surveyors read, from its JSON."""
+def report(network: Plain, title: str = "") -> str:
+    """Return the report of a network, from its JSON."""
     parts = [
-        *_summary(answer, title),
-        *_coordinates("ADJUSTED STATIONS", answer["stations"]),
-        *_coordinates("ADJUSTED MARKS (* control)", answer["marks"]),
-        *_centres(answer),
-        *_others(answer),
-        *_checks(answer),
-        *_rig(answer["calibration"]),
-        *_not_used(answer),
+        *_summary(network, title),
+        *_coordinates("ADJUSTED STATIONS", network["stations"]),
+        *_coordinates("ADJUSTED MARKS (* control)", network["marks"]),
+        *_centres(network),
+        *_others(network),
+        *_checks(network),
+        *_rig(network["calibration"]),
+        *_not_used(network),
     ]
     return "\n".join(parts) + "\n"
 
 
-def _summary(answer: Plain, title: str) -> list[str]:
+def _summary(network: Plain, title: str) -> list[str]:
     """Return what the adjustment is and whether it holds."""
-    test, factors = answer["global_test"], answer["variance_factors"]
-    verdict = "passed" if answer["passes_global_test"] else "FAILED"
+    test, factors = network["global_test"], network["variance_factors"]
+    verdict = "passed" if network["passes_global_test"] else "FAILED"
     lines = [
         f"NETWORK ADJUSTMENT{'  ' + title if title else ''}",
         "=" * 78,
-        f"Stations                        {len(answer['stations']):8d}",
-        f"Marks                           {len(answer['marks']):8d}",
-        f"Observations (coordinates)      {answer['n_observations']:8d}",
-        f"Unknowns                        {answer['n_unknowns']:8d}",
-        f"Defect of the datum             {answer['datum']['defect']:8d}",
-        f"Degrees of freedom              {answer['dof']:8d}",
+        f"Stations                        {len(network['stations']):8d}",
+        f"Marks                           {len(network['marks']):8d}",
+        f"Observations (coordinates)      {network['n_observations']:8d}",
+        f"Unknowns                        {network['n_unknowns']:8d}",
+        f"Defect of the datum             {network['datum']['defect']:8d}",
+        f"Degrees of freedom              {network['dof']:8d}",
         "",
         "Variance factor a priori           1.000",
-        f"Variance factor a posteriori    {_fixed(_square(answer['sigma0']), 3, 8)}",
-        f"Sigma0 a posteriori             {_fixed(answer['sigma0'], 3, 8)}",
+        f"Variance factor a posteriori    {_fixed(_square(network['sigma0']), 3, 8)}",
+        f"Sigma0 a posteriori             {_fixed(network['sigma0'], 3, 8)}",
         *(f"  of {kind:<8}                   {_fixed(factors[kind], 3, 8)}  (variance factor)"
           for kind in ("centres", "gravity", "control")),
         f"Global test (chi-square, one-sided, level {test['level']:g}): v'Pv = {test['vtpv']:.1f}, "
         f"limit {test['limit']:.1f}: {verdict}",
-        f"Local test (w): limit {answer['critical_w']:.2f}",
-        *_bias_line(answer["range_bias"]),
-        f"Datum: {answer['datum']['text']}",
+        f"Local test (w): limit {network['critical_w']:.2f}",
+        *_bias_line(network["range_bias"]),
+        f"Datum: {network['datum']['text']}",
     ]  # fmt: skip
-    return [*lines, *(f"WARNING: {one}" for one in answer["warnings"]), ""]
+    return [*lines, *(f"WARNING: {one}" for one in network["warnings"]), ""]
 
 
 def _bias_line(bias: Plain | None) -> list[str]:
@@ -84,7 +84,7 @@ def _coordinates(title: str, rows: Sequence[Plain]) -> list[str]:
     return [*lines, ""]
 
 
-def _centres(answer: Plain) -> list[str]:
+def _centres(network: Plain) -> list[str]:
     """Return observed centres with residuals and reliability, the worst first."""
     lines = [
         "OBSERVED CENTRES, largest w first (v observed - computed, r of 3, EX: shift by an MDB)",
@@ -94,7 +94,7 @@ def _centres(answer: Plain) -> list[str]:
         f"{'':<30} {'[mm]':>6} {'[mm]':>6} {'[mm]':>6} {'':>5} {'':>5} {'[mm]':>6} {'[mm]':>7} "
         f"{'[mm]':>8}",
     ]
-    rows = sorted(answer["observations"], key=lambda row: -(row["w"] or 0.0))
+    rows = sorted(network["observations"], key=lambda row: -(row["w"] or 0.0))
     for row in rows:
         v = " ".join(f"{1e3 * value:6.1f}" for value in row["residual_m"])
         reach = " ".join(
@@ -113,45 +113,45 @@ def _centres(answer: Plain) -> list[str]:
     return [*lines, ""]
 
 
-def _others(answer: Plain) -> list[str]:
+def _others(network: Plain) -> list[str]:
     """Return residuals of levelling and control."""
     lines = ["OBSERVED LEVELLING", "-" * 78, "Station          vX [deg]  vY [deg]     r     w"]
-    for row in answer["gravity"]:
+    for row in network["gravity"]:
         v = " ".join(f"{math.degrees(value):9.3f}" for value in row["residual_rad"])
         lines.append(
             f"{row['station']:<14} {v} {_fixed(row['redundancy'], 2, 5)} {_fixed(row['w'], 2, 5)}"
         )
-    if answer["control"]:
+    if network["control"]:
         lines += ["", "CONTROL MARKS", "-" * 78, "Mark            vX [mm]  vY [mm]  vZ [mm]     w"]
-    for row in answer["control"]:
+    for row in network["control"]:
         v = " ".join(f"{1e3 * value:8.2f}" for value in row["residual_m"])
         lines.append(f"{row['mark']:<14} {v} {_fixed(row['w'], 2, 5)}")
     return [*lines, ""]
 
 
-def _checks(answer: Plain) -> list[str]:
+def _checks(network: Plain) -> list[str]:
     """Return what is known of the accuracy without truth."""
     lines = ["CHECKS WITHOUT TRUTH", "-" * 78]
-    lines += [f"Mark {row['name']}: {row['reason']}" for row in answer["marks"] if row["reason"]]
-    for row in answer["control"]:
+    lines += [f"Mark {row['name']}: {row['reason']}" for row in network["marks"] if row["reason"]]
+    for row in network["control"]:
         if row["predicted_minus_given_m"] is None:
-            lines.append(f"Control {row['mark']} left out: nothing else tells where it is.")
+            lines.append(f"Control {row['mark']} left out: nothing else determines it.")
             continue
         off = " ".join(f"{1e3 * value:7.2f}" for value in row["predicted_minus_given_m"])
         sigma = " ".join(f"{1e3 * value:6.2f}" for value in row["sigma_predicted_minus_given_m"])
         lines.append(f"Control {row['mark']} left out: predicted - given {off} mm, sigma {sigma}")
-    for row in answer["repeated_stops"]:
+    for row in network["repeated_stops"]:
         lines.append(
             f"{' and '.join(row['stations'])}: {1e3 * row['apart_3d_m']:.1f} mm apart, centres of "
             f"{row['n_marks']} marks agree to {1e3 * row['difference_rms_m']:.2f} mm RMS "
             f"(predicted {1e3 * row['predicted_rms_m']:.2f})"
         )
-    nothing = "No control mark and no repeated stop: only sigmas speak of the accuracy."
+    nothing = "No control mark and no repeated stop: the accuracy is known by sigmas only."
     return [*lines, *([nothing] if len(lines) == 2 else []), ""]
 
 
 def _rig(calibration: Plain | None) -> list[str]:
-    """Return what the network tells of the rig, if it was asked."""
+    """Return the rig, if it was adjusted with the network."""
     if calibration is None:
         return []
     lines = ["RIG, ADJUSTED WITH THE NETWORK", "-" * 78]
@@ -162,11 +162,11 @@ def _rig(calibration: Plain | None) -> list[str]:
     return [*lines, ""]
 
 
-def _not_used(answer: Plain) -> list[str]:
+def _not_used(network: Plain) -> list[str]:
     """Return what was left out, and why."""
     lines = ["NOT USED", "-" * 78]
-    lines += [f"Station {one['station']}: {one['reason']}" for one in answer["refused"]]
-    for one in answer["excluded"]:
+    lines += [f"Station {one['station']}: {one['reason']}" for one in network["refused"]]
+    for one in network["excluded"]:
         named = [one["station"], one["marker"], one["mark"]]
         what = " ".join(part for part in named if part)
         lines.append(f"{one['kind'].capitalize()} {what}: {one['reason']}")

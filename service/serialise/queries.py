@@ -1,4 +1,4 @@
-"""The JSON of a query of people: columns with units, rows, and the limits that applied."""
+"""The JSON of a query: columns with units, rows, and the limits that applied."""
 
 from __future__ import annotations
 

@@ -1,7 +1,7 @@
 """Adjusted networks as Arrow tables, named and shaped like the tables of the database.
 
-Rows come from those who adjusted; here are their columns, and their errors against truth. A free
-network has a place and a heading of its own: it is laid on the truth before it is compared.
+Rows come from the job; here are their columns, and their errors against truth. A free network has
+its own place and heading: it is moved onto the truth before it is compared.
 """
 
 from __future__ import annotations
@@ -137,7 +137,7 @@ def tables(adjustment_id: str, rows: Mapping[str, Sequence[Row]]) -> dict[str, p
 
 
 def with_errors(known: Mapping[str, pa.Table], truth: Truth | None) -> dict[str, pa.Table]:
-    """Take the errors of adjusted networks anew.
+    """Compute the errors of adjusted networks against a truth.
 
     Notes
     -----

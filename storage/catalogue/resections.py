@@ -73,7 +73,7 @@ def _measures(found: Sequence[SubsetFixes]) -> dict[str, Array]:
 
 
 def resections_with_errors(known: pa.Table, truths: Mapping[str, StopTruth]) -> pa.Table:
-    """Take the errors of rows of ``resections`` anew."""
+    """Compute the errors of rows of ``resections`` against the true stops."""
     p_true = np.full((len(known), 3), np.nan)
     for stop in pc.unique(known["stop"]).to_pylist():
         if stop in truths:

@@ -136,7 +136,7 @@ _COMPARED = ("marker_fits", "station_fixes", "resections")  # have errors agains
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RunInfo:
-    """What a run was, beside its numbers.
+    """A run: its origin and configuration.
 
     Attributes
     ----------
@@ -218,7 +218,7 @@ def tables(
 
 
 def with_errors(known: Mapping[str, pa.Table], truth: Truth | None) -> dict[str, pa.Table]:
-    """Take the errors of results anew."""
+    """Compute the errors of results against a truth."""
     if truth is None:
         return {
             name: _without_errors(table) if name in _COMPARED else table
@@ -267,7 +267,7 @@ def _run_rows(run: RunInfo, stops: tuple[StopResult, ...]) -> dict[str, list[Row
 def _stop_rows(
     stop: StopResult, names: tuple[str, ...], cloud_url: str | None
 ) -> dict[str, list[Row]]:
-    """Return the rows of one stop by table, without what names run and stop."""
+    """Return the rows of one stop by table, without the columns of run and stop."""
     rows: dict[str, list[Row]] = {name: [] for name in TABLES[2:]}
     rows["stops"].append(_stop_row(stop, cloud_url))
     R, sigma_heading = levelling_rotation(stop.cloud.levelling), stop.cloud.rig.sigma_heading
@@ -325,7 +325,7 @@ def _fit_rows(fits: Sequence[MarkerFit], R: Array, sigma_heading: float) -> list
 
 
 def _fit_row(fit: MarkerFit) -> Row:
-    """Return what a fit says of itself."""
+    """Return the columns of a fit beside its centre."""
     return {
         "marker": fit.name,
         "status": str(fit.status),
@@ -436,7 +436,7 @@ def _table(name: str, rows: Sequence[Row]) -> pa.Table:
 
 
 def _with_columns(table: pa.Table, errors: Sequence[Mapping[str, object]]) -> pa.Table:
-    """Return a table with its error columns replaced; what a row does not tell is NULL."""
+    """Return a table with its error columns replaced; missing values are NULL."""
     for i, name in enumerate(table.column_names):
         if name.startswith("error_"):
             values = pa.array([plain(row.get(name)) for row in errors], _REAL)
@@ -453,7 +453,7 @@ def _without_errors(table: pa.Table) -> pa.Table:
 
 
 def _levellings(known: Mapping[str, pa.Table]) -> dict[tuple[str, str], Levelling]:
-    """Return how the base leant at each stop of each run."""
+    """Return the levelling of each stop of each run."""
     return {
         (row["run_id"], row["stop"]): Levelling(
             roll=np.radians(row["roll_deg"]),

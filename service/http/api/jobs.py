@@ -1,4 +1,4 @@
-"""Routes of jobs: work asked for, followed live, dismissed."""
+"""Routes of jobs: started, followed live, dismissed."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ def create_job(
     response: Response,
     idempotency_key: Annotated[str | None, Header(min_length=1, max_length=200)] = None,
 ) -> Job:
-    """Ask for work; the same Idempotency-Key with the same request is the same job."""
+    """Start a job; the same Idempotency-Key with the same request is the same job."""
     job = service.idempotency.once(
         idempotency_key, new.model_dump_json(), lambda: start(service, new).job_id
     )
@@ -107,7 +107,7 @@ async def dismiss_job(job: JobId, service: Current) -> Job:
 
 
 def start(service: Service, new: NewJob) -> Job:
-    """Accept work and hand it to the cluster."""
+    """Accept a job and submit it to the cluster."""
     survey = service.catalogue.get_survey(new.survey)
     kind = KINDS[new.kind]
     recordings = _recordings(service, new, survey)
@@ -168,5 +168,5 @@ def _event(event: JobEvent) -> ServerSentEvent:
 
 
 def _end_of(job: JobRecord) -> int:
-    """Return the number of the event that ended a job, for those who missed it [ms since 1970]."""
+    """Return the number of the event that ended a job [ms since 1970]."""
     return int(job.finished_at.timestamp() * 1000) if job.finished_at else 0

@@ -1,4 +1,4 @@
-"""Routes of recordings: uploaded logs, what their preflight says, and their bytes."""
+"""Routes of recordings: uploaded logs, their preflight reports and their bytes."""
 
 from __future__ import annotations
 

@@ -101,7 +101,7 @@ def download_product(product: ProductId, kind: ProductKind, service: Current) ->
         c if c.isascii() and (c.isalnum() or c in "-_.") else "-" for c in rows[0]["survey"]
     )
     blocks = read_file(rows[0]["url"])
-    first = next(blocks, b"")  # what is not there is said before the answer begins
+    first = next(blocks, b"")  # a missing file is an error before the response begins
 
     def body() -> object:
         yield first

@@ -1,4 +1,4 @@
-"""Routes of the pages of networks and calibrations, and the forms by which people ask for them."""
+"""Routes of the pages of networks and calibrations, and the forms that start their jobs."""
 
 from __future__ import annotations
 
@@ -93,7 +93,7 @@ Fields = Annotated[dict[str, str], Depends(form)]
 
 
 @router.post("/surveys/{name:path}/jobs")
-def ask(name: str, fields: Fields, service: Current) -> RedirectResponse:
+def start_job(name: str, fields: Fields, service: Current) -> RedirectResponse:
     """Start a job on a survey as a whole, and show it."""
     kinds = {kind.value: kind for kind, about in KINDS.items() if not about.takes_one_log}
     kind = kinds.get(fields.get("kind", ""))

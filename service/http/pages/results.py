@@ -280,7 +280,7 @@ def sql(service: Current, q: Annotated[str, Query(max_length=100_000)] = "") -> 
 
 
 def error_page(_: Request, problem: Problem) -> HTMLResponse:
-    """Return a problem as a page, for those who asked with a browser."""
+    """Return a problem as a page, for browsers."""
     text = pages.error_page(
         pages.ErrorPage(
             frame=pages.Frame(),
@@ -313,7 +313,7 @@ def _survey(service: Service, key: str) -> Mapping[str, Any]:
 
 
 def _survey_data(service: Service, key: str, filters: Filters) -> pages.SurveyData:
-    """Return the newest results of a survey, with those from few marks that are wanted."""
+    """Return the newest results of a survey, with stations from the chosen number of marks."""
     survey = _survey(service, key)
     few = {"n_marks": filters.n_marks, "resection": filters.resection}
 
@@ -396,5 +396,5 @@ def _jobs(
     is_active: bool = False,
 ) -> tuple[Mapping[str, Any], ...]:
     """Return the newest jobs, of one recording or survey if named."""
-    wanted = {"job": job, "recording": recording, "survey": survey, "is_active": is_active}
-    return tuple(service.catalogue.rows(_JOBS, {**wanted, "n": _N_JOBS}))
+    parameters = {"job": job, "recording": recording, "survey": survey, "is_active": is_active}
+    return tuple(service.catalogue.rows(_JOBS, {**parameters, "n": _N_JOBS}))

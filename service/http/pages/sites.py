@@ -69,7 +69,7 @@ def site_page(name: str, service: Current) -> str:
 
 
 @router.post("/surveys/{name:path}/site")
-def ask(name: str, fields: Fields, service: Current) -> RedirectResponse:
+def start_job(name: str, fields: Fields, service: Current) -> RedirectResponse:
     """Start a job that makes cloud and ground, and show it."""
     try:
         options = {key: float(value) for key, value in fields.items()}

@@ -1,4 +1,4 @@
-"""Answers as tables for people; lengths in metres or millimetres, as the heads say."""
+"""Results as tables for the terminal; the heads of columns carry the units."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from rich.text import Text
 
 from spheremark.storage.recordings import Preflight
 
-_ROWS_SHOWN = 100  # of an answer in SQL; programs get all
+_ROWS_SHOWN = 100  # of a query; programs get all
 _WIDEST = 100_000  # [characters]; no row is wider
 _COLOURS = {"ok": "green", "weak": "yellow", "refused": "red", "failed": "red"}
 
@@ -24,7 +24,7 @@ Plain = Mapping[str, Any]
 
 
 def print_preflight(out: Console, name: str, report: Preflight) -> None:
-    """Print what a log holds and lacks."""
+    """Print the preflight report of a log."""
     out.print(f"[bold]{escape(name)}[/]: {_coloured(report.verdict)}")
     for reason in (*report.reasons, *report.notes):
         out.print(f"  {escape(reason)}", highlight=False)
@@ -51,9 +51,9 @@ def print_preflight(out: Console, name: str, report: Preflight) -> None:
     out.print(_table(("fact", "value"), list(facts.items())))
 
 
-def print_answer(out: Console, answer: Plain) -> None:
+def print_log(out: Console, result: Plain) -> None:
     """Print markers and station of each stop of a log."""
-    for stop in answer["stops"]:
+    for stop in result["stops"]:
         out.print(f"[bold]{escape(stop['name'])}[/]  (centres in the {stop['frame']} frame)")
         out.print(_markers(stop["markers"]))
         for one in stop["markers"]:
@@ -87,36 +87,36 @@ def _print_distances(out: Console, distances: Plain | None) -> None:
     out.print(text, highlight=False, markup=False, soft_wrap=True)
 
 
-def print_calibration(out: Console, answer: Plain) -> None:
-    """Print what scans tell of a rig: lengths in millimetres, angles in degrees."""
+def print_calibration(out: Console, result: Plain) -> None:
+    """Print a calibration: lengths in millimetres, angles in degrees."""
     scales = {"m": (1e3, "mm"), "rad": (math.degrees(1.0), "deg"), "s": (1e3, "ms")}
     rows = []
-    for parameter in answer["parameters"]:
+    for parameter in result["parameters"]:
         scale, unit = scales[parameter["unit"]]
         numbers = [scale * parameter[key] for key in ("start", "estimate", "sigma")]
         rows.append((parameter["name"], unit, *(f"{number:.4f}" for number in numbers)))
     out.print(_table(("parameter", "unit", "start", "estimate", "sigma"), rows, left=2))
     out.print(
-        f"{answer['n_two_faced']} of {answer['n_spheres']} spheres on both faces, "
-        f"{answer['n_returns']:,} returns; residuals {1e3 * answer['residual_rms_before_m']:.1f} "
-        f"-> {1e3 * answer['residual_rms_after_m']:.1f} mm; rig {answer['rig_digest']}"
+        f"{result['n_two_faced']} of {result['n_spheres']} spheres on both faces, "
+        f"{result['n_returns']:,} returns; residuals {1e3 * result['residual_rms_before_m']:.1f} "
+        f"-> {1e3 * result['residual_rms_after_m']:.1f} mm; rig {result['rig_digest']}"
     )
-    for held in answer["not_separable"]:
+    for held in result["not_separable"]:
         out.print(f"  {held['name']} stays as it was. {held['reason']}", highlight=False)
 
 
-def print_rows(out: Console, answer: Plain) -> None:
-    """Print an answer in SQL."""
-    heads = [column["name"] for column in answer["columns"]]
-    rows = [["" if v is None else _short(v) for v in row] for row in answer["rows"][:_ROWS_SHOWN]]
+def print_rows(out: Console, result: Plain) -> None:
+    """Print the result of a query."""
+    heads = [column["name"] for column in result["columns"]]
+    rows = [["" if v is None else _short(v) for v in row] for row in result["rows"][:_ROWS_SHOWN]]
     table = _table(heads, rows, left=len(heads))
     if Measurement.get(out, out.options.update(max_width=_WIDEST), table).maximum <= out.width:
         out.print(table)
     else:
         _print_one_by_one(out, heads, rows)
-    shown, n = len(rows), len(answer["rows"])
+    shown, n = len(rows), len(result["rows"])
     more = f", {shown} shown (--json or --csv for all)" if shown < n else ""
-    out.print(f"{n:,} rows in {answer['elapsed_ms']:.1f} ms{more}")
+    out.print(f"{n:,} rows in {result['elapsed_ms']:.1f} ms{more}")
 
 
 def _print_one_by_one(out: Console, heads: Sequence[str], rows: Sequence[Sequence[str]]) -> None:
@@ -126,16 +126,16 @@ def _print_one_by_one(out: Console, heads: Sequence[str], rows: Sequence[Sequenc
         out.print(_table(("column", "value"), list(zip(heads, row, strict=True)), left=2))
 
 
-def print_network(out: Console, answer: Plain) -> None:
-    """Print stations and marks of a network, and what it rests on."""
-    verdict = "passed" if answer["passes_global_test"] else "[red]failed[/]"
+def print_network(out: Console, result: Plain) -> None:
+    """Print stations, marks and datum of a network."""
+    verdict = "passed" if result["passes_global_test"] else "[red]failed[/]"
     out.print(
-        f"[bold]Network[/]: {_coloured(answer['status'])}  {len(answer['stations'])} stations, "
-        f"{len(answer['marks'])} marks, {answer['dof']} degrees of freedom, sigma0 "
-        f"{_fixed(answer['sigma0'], 2)}, global test {verdict}"
+        f"[bold]Network[/]: {_coloured(result['status'])}  {len(result['stations'])} stations, "
+        f"{len(result['marks'])} marks, {result['dof']} degrees of freedom, sigma0 "
+        f"{_fixed(result['sigma0'], 2)}, global test {verdict}"
     )
-    out.print(answer["datum"]["text"], highlight=False, soft_wrap=True)
-    for warning in answer["warnings"]:
+    out.print(result["datum"]["text"], highlight=False, soft_wrap=True)
+    for warning in result["warnings"]:
         out.print(f"[yellow]Warning:[/] {escape(warning)}", highlight=False, soft_wrap=True)
     for kind in ("stations", "marks"):
         rows = [
@@ -146,24 +146,24 @@ def print_network(out: Console, answer: Plain) -> None:
                 f"{1e3 * row['ellipse_major_95_m']:.1f} x {1e3 * row['ellipse_minor_95_m']:.1f}",
                 str(row["n_observations"]),
             )
-            for row in answer[kind]
+            for row in result[kind]
         ]
         heads = ("x [m]", "y [m]", "z [m]", "sigma [mm]", "95 % ellipse [mm]", "centres")
         out.print(_table((kind[:-1], *heads), rows))
-    _print_checks(out, answer)
-    for one in answer["refused"]:
+    _print_checks(out, result)
+    for one in result["refused"]:
         out.print(
             f"  {escape(one['station'])}: {escape(one['reason'])}", highlight=False, soft_wrap=True
         )
-    for one in answer["excluded"]:
+    for one in result["excluded"]:
         what = " ".join(part for part in (one["station"], one["marker"], one["mark"]) if part)
         text = f"  {one['kind'].capitalize()} {what}: {escape(one['reason'])}"
         out.print(text, highlight=False, soft_wrap=True)
 
 
-def _print_checks(out: Console, answer: Plain) -> None:
-    """Print what is known of a network's accuracy without truth."""
-    for row in answer["marks"]:
+def _print_checks(out: Console, result: Plain) -> None:
+    """Print the checks of a network that need no truth."""
+    for row in result["marks"]:
         if row["status"] != "ok":
             out.print(f"  Mark {escape(row['name'])}: {escape(row['reason'])}", highlight=False)
     rows = [
@@ -172,22 +172,22 @@ def _print_checks(out: Console, answer: Plain) -> None:
             *(f"{1e3 * value:+.1f}" for value in row["predicted_minus_given_m"]),
             *(f"{1e3 * value:.1f}" for value in row["sigma_predicted_minus_given_m"]),
         )
-        for row in answer["control"]
+        for row in result["control"]
         if row["predicted_minus_given_m"] is not None
     ]
     if rows:
         heads = ("control left out", "dx [mm]", "dy", "dz", "sigma x [mm]", "y", "z")
         out.print(_table(heads, rows))
-    for row in answer["repeated_stops"]:
+    for row in result["repeated_stops"]:
         out.print(
             f"  {' and '.join(row['stations'])} stand {1e3 * row['apart_3d_m']:.1f} mm apart; "
             f"their centres agree to {1e3 * row['difference_rms_m']:.1f} mm (RMS; predicted "
             f"{1e3 * row['predicted_rms_m']:.1f})",
             highlight=False,
         )
-    if answer["calibration"]:
-        print_calibration(out, answer["calibration"])
-    if errors := answer.get("errors"):
+    if result["calibration"]:
+        print_calibration(out, result["calibration"])
+    if errors := result.get("errors"):
         out.print(
             f"Against truth, place and attitude apart: marks {1e3 * errors['rms_marks_m']:.2f} mm "
             f"RMS, stations {1e3 * errors['rms_stations_m']:.2f} mm RMS; normalised squared error "
@@ -197,17 +197,17 @@ def _print_checks(out: Console, answer: Plain) -> None:
         )  # fmt: skip
 
 
-def to_csv(answer: Plain) -> str:
-    """Return an answer in SQL as CSV."""
+def to_csv(result: Plain) -> str:
+    """Return the result of a query as CSV."""
     text = io.StringIO()
     writer = csv.writer(text)
-    writer.writerow([column["name"] for column in answer["columns"]])
-    writer.writerows(answer["rows"])
+    writer.writerow([column["name"] for column in result["columns"]])
+    writer.writerows(result["rows"])
     return text.getvalue()
 
 
 def _print_station(out: Console, station: Plain) -> None:
-    """Print a station and how far it can be relied on."""
+    """Print a station with its status."""
     methods = f"{station['fit_method']}, {station['method']}"
     if station.get("position_m") is None:
         out.print(f"  Station ({methods}): [red]none[/]; {station['reason']}", highlight=False)
@@ -242,7 +242,7 @@ def _markers(markers: Sequence[Plain]) -> Table:
 
 
 def _table(heads: Sequence[str], rows: Sequence[Sequence[str | Text]], left: int = 1) -> Table:
-    """Return a table whose first columns are flush left; strings stand as they are."""
+    """Return a table whose first columns are flush left; strings are not markup."""
     table = Table(box=None, pad_edge=False, header_style="bold")
     for i, head in enumerate(heads):
         table.add_column(escape(head), justify="left" if i < left else "right")
@@ -262,10 +262,10 @@ def _mm(length: float | None) -> str:
 
 
 def _fixed(value: float | None, digits: int) -> str:
-    """Return a number, or what stands for one that is not known."""
+    """Return a number, or a dash for null."""
     return "-" if value is None else f"{value:.{digits}f}"
 
 
 def _short(value: object) -> str:
-    """Return a value of an answer, numbers to six digits."""
+    """Return a value of a query, numbers to six digits."""
     return f"{value:.6g}" if isinstance(value, float) else str(value)
