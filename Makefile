@@ -38,6 +38,7 @@ $(VENV)/.dev: $(VENV)/.ready requirements-dev.lock
 $(VENV)/.kernels: $(VENV)/.ready $(KERNELS)
 	@echo "Compiling the numerical kernels, once (a minute or two) ..."
 	@find pipelines storage -name '*.nb[ic]' -delete
+	@$(BIN)/python -m compileall -q __init__.py pipelines service storage web
 	@$(BIN)/python -m spheremark.service.jobs.worker
 	@touch $@
 

@@ -1,4 +1,4 @@
-"""Compiled loops: hides numba and the options that all kernels share."""
+"""Compiled loops: hides numba, the options that all kernels share, and how they are optimised."""
 
 from __future__ import annotations
 
@@ -6,13 +6,15 @@ from collections.abc import Callable
 from typing import Any, Literal
 
 import numba
+from numba.core import event
 
 # A product and the sum that follows are rounded once
 FUSED: frozenset[str] = frozenset({"contract"})
 # ... and sums of many terms are taken in any order
 REASSOCIATED: frozenset[str] = frozenset({"contract", "reassoc"})
 
-_OPTIONS = {"cache": True, "nogil": True, "error_model": "numpy"}
+# Without `no_cfunc_wrapper` each kernel is compiled a second time, for callers in C
+_OPTIONS = {"cache": True, "nogil": True, "error_model": "numpy", "no_cfunc_wrapper": True}
 
 
 def compiled(function: Callable[..., Any]) -> Any:
@@ -57,3 +59,34 @@ def compiled_with(
         return numba.njit(**options)(function)
 
     return decorate
+
+
+class _OptimiseOnce(event.Listener):  # type: ignore[misc]  # numba ships no types
+    """Optimises a kernel in full only where Python calls it.
+
+    LLVM optimises a kernel again as a part of each kernel that calls it. For the inner ones the
+    first level is enough: the code of the outermost is the same, in two thirds of the time.
+    """
+
+    def __init__(self) -> None:
+        self._levels: list[Any] = []  # of the kernels that are being compiled, outermost first
+        self._is_ours = False
+
+    def on_start(self, event: Any) -> None:
+        """Lower the level for what is compiled on behalf of a kernel of this package."""
+        if not self._levels:
+            module = event.data["dispatcher"].py_func.__module__
+            self._is_ours = module.startswith("spheremark.")
+        elif self._is_ours:
+            numba.config.OPT = _INNER_LEVEL
+        self._levels.append(numba.config.OPT)
+
+    def on_end(self, event: Any) -> None:  # noqa: ARG002  the protocol of numba
+        """Restore the level of the kernel around it."""
+        self._levels.pop()
+        numba.config.OPT = self._levels[-1] if self._levels else _LEVEL
+
+
+_LEVEL = numba.config.OPT
+_INNER_LEVEL = min(_LEVEL, type(_LEVEL)(1))
+event.register("numba:compile", _OptimiseOnce())
