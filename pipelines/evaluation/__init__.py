@@ -1,1 +1,10 @@
-"""Experiments: simulated worlds through the methods, into tables. Rests on everything else."""
+"""Experiments: worlds of known truth, the methods on them, and tables of the errors.
+
+``experiment`` is the frame: an ``Experiment`` has worlds, runs each in a process, pools what they
+gave into a report of plain values, and lays it out in tables. Experiments are ``detection``
+(precision and recall of extraction), ``precision`` (centres against the bound), ``networks``
+(adjusted surveys), ``ellipse_coverage`` (stations against their covariances), ``plans`` (optimised
+marks against chance) and ``reproduction`` (the study's tables and figures).
+
+This package rests on all others of the core; only the command line imports it.
+"""

@@ -94,22 +94,12 @@ def extraction(
             "seeds": list(seeds),
             "scenarios": {name: _summary(name, scores) for name in plan},
         },
+        tables=_tables,
     )
 
 
-def extraction_tables(report: Plain) -> tuple[Table, ...]:
-    """Return a table of markers and decoys for each scenario.
-
-    Parameters
-    ----------
-    report : dict
-        Report of ``extraction``.
-
-    Returns
-    -------
-    tuple of Table
-        In the order of the scenarios.
-    """
+def _tables(report: Plain) -> list[Table]:
+    """Return a table of markers and decoys for each scenario."""
     columns = (
         Column("kind", "what"),
         Column("n", "in scans", "", ",d"),
@@ -126,7 +116,7 @@ def extraction_tables(report: Plain) -> tuple[Table, ...]:
         )
         rows = one["markers"] + one["decoys"]
         tables.append(Table(title=title, columns=columns, rows=rows))
-    return tuple(tables)
+    return tables
 
 
 def _main_reasons(row: Plain) -> str:

@@ -39,6 +39,8 @@ _CONFIDENCE = (0.025, 0.975)
 _SURVEYS_MIN = 2
 _CURVE = tuple(np.round(np.arange(0.05, 1.0, 0.05), 2).tolist())
 _BINS = np.arange(0.0, 20.5, 0.5)
+_CONFIG = SurveyConfig.from_mapping({"fitting": {"methods": ["along_beam"]}})
+_SIMULATION = SimulationConfig(only_near_spheres=True)
 
 _Scan = tuple[str, MarkerFits]
 _Pose = tuple[Array, Array] | None  # T_site_station and its covariance
@@ -46,19 +48,10 @@ _Pose = tuple[Array, Array] | None  # T_site_station and its covariance
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class Draws:
-    """Errors of stations in units of their own covariance.
+    """Errors of stations, one row for each of n stations.
 
-    Attributes
-    ----------
-    surveys : (n,)
-        Survey of each station.
-    squares : (n,) by (method, quantity)
-        Square of the error, weighted by the inverse of its covariance; NaN where there is no
-        station.
-    errors : (n, 3) by method
-        Errors of the positions in the site frame [m].
-    sigmas : (n,) by method
-        Square root of the trace of the covariance of each position [m].
+    ``squares`` are in units of the covariance, by method and quantity, NaN where there is no
+    station; ``errors`` (n, 3) and ``sigmas`` of the positions are by method [m].
     """
 
     surveys: Index
@@ -71,21 +64,7 @@ class Draws:
 
 
 class Coverage(NamedTuple):
-    """Share of stations within an ellipse of one confidence level.
-
-    Attributes
-    ----------
-    method, quantity : str
-        Of ``METHODS`` and ``QUANTITIES``.
-    level : float
-        Nominal share.
-    share : float
-        Share that was found.
-    low, high : float
-        95 % interval of that share, from resampled surveys.
-    n : int
-        Number of stations.
-    """
+    """Share of n stations within an ellipse of one level, with its 95 % interval."""
 
     method: str
     quantity: str
@@ -96,9 +75,7 @@ class Coverage(NamedTuple):
     n: int
 
 
-def ellipse_coverage(
-    n_surveys: int, n_stops: int, seed: int, *, simulation: SimulationConfig | None = None
-) -> Experiment[int, Draws, Draws]:
+def ellipse_coverage(n_surveys: int, n_stops: int, seed: int) -> Experiment[int, Draws, Plain]:
     """Return the experiment that compares stations of whole surveys with their covariances.
 
     Parameters
@@ -109,42 +86,27 @@ def ellipse_coverage(
         Stops of each.
     seed : int
         Seed of the first survey; the others follow.
-    simulation : SimulationConfig, optional
-        How the rig errs; the default one, with only the beams near spheres, if missing.
 
     Returns
     -------
     Experiment
-        Its result has one row for each station.
+        Its report has shares, curves and histograms of squared errors, by method and quantity.
     """
     return Experiment(
         worlds=range(seed, seed + n_surveys),
-        run_world=partial(survey_draws, n_stops=n_stops, simulation=simulation),
-        pool=joined,
+        run_world=partial(survey_draws, n_stops=n_stops),
+        pool=lambda parts: {"seed": seed, **_report(joined(parts))},
+        tables=_tables,
     )
 
 
-def coverage_report(draws: Draws, seed: int) -> Plain:
-    """Return shares, curves and histograms of squared errors as plain values.
-
-    Parameters
-    ----------
-    draws : Draws
-        Stations of many surveys.
-    seed : int
-        Seed of the first survey.
-
-    Returns
-    -------
-    dict
-        For JSON.
-    """
+def _report(draws: Draws) -> Plain:
+    """Return shares, curves and histograms of squared errors as plain values."""
     return {
-        "seed": seed,
         "n_surveys": len(np.unique(draws.surveys)),
         "n_stations": len(draws.surveys),
         "config": SurveyConfig().to_mapping()["resection"],
-        "simulation": SimulationConfig(only_near_spheres=True).to_mapping(),
+        "simulation": _SIMULATION.to_mapping(),
         "levels": [one._asdict() for one in coverage(draws, LEVELS)],
         "curve": [one._asdict() for one in coverage(draws, _CURVE)],
         "methods": [
@@ -170,40 +132,27 @@ def coverage_report(draws: Draws, seed: int) -> Plain:
     }
 
 
-def coverage_tables(report: Plain) -> tuple[Table, ...]:
-    """Return the shares within ellipses as a table.
-
-    Parameters
-    ----------
-    report : dict
-        What ``coverage_report`` gave.
-
-    Returns
-    -------
-    tuple of Table
-        One table.
-    """
-    return (
-        Table(
-            title=f"Share of {report['n_stations']} stations of {report['n_surveys']} simulated "
-            "surveys within their ellipses (95 % interval from resampled surveys)",
-            columns=(
-                Column("method", "stations by"),
-                Column("quantity", "of"),
-                *(
-                    Column(partial(_share, report, level), f"{100 * level:.0f} %", "", ">")
-                    for level in LEVELS
-                ),
-                Column("per_dimension", "mean square", "", ".2f"),
-            ),
-            rows=report["nees"],
-            notes=[
-                f"{one['method']}: error {1000 * one['error_3d_rms_m']:.2f} mm, predicted "
-                f"{1000 * one['sigma_3d_rms_m']:.2f} mm (3-D, RMS)"
-                for one in report["methods"]
-            ],
-        ),
+def _tables(report: Plain) -> list[Table]:
+    """Return the shares within ellipses as a table."""
+    title = (
+        f"Share of {report['n_stations']} stations of {report['n_surveys']} simulated surveys "
+        "within their ellipses (95 % interval from resampled surveys)"
     )
+    shares = (
+        Column(partial(_share, report, level), f"{100 * level:.0f} %", "", ">") for level in LEVELS
+    )
+    columns = (
+        Column("method", "stations by"),
+        Column("quantity", "of"),
+        *shares,
+        Column("per_dimension", "mean square", "", ".2f"),
+    )
+    notes = [
+        f"{one['method']}: error {1000 * one['error_3d_rms_m']:.2f} mm, predicted "
+        f"{1000 * one['sigma_3d_rms_m']:.2f} mm (3-D, RMS)"
+        for one in report["methods"]
+    ]
+    return [Table(title=title, columns=columns, rows=report["nees"], notes=notes)]
 
 
 def _share(report: Plain, level: float, row: Plain) -> str:
@@ -227,41 +176,31 @@ def _counts(squares: Array) -> list[int]:
     return [int(n) for n in np.histogram(known, _BINS)[0]]
 
 
-def survey_draws(
-    seed: int,
-    *,
-    n_stops: int,
-    config: SurveyConfig | None = None,
-    simulation: SimulationConfig | None = None,
-) -> Draws:
+def survey_draws(seed: int, *, n_stops: int) -> Draws:
     """Simulate one survey, position its stations by both methods, and compare with the truth."""
-    config = config or SurveyConfig.from_mapping({"fitting": {"methods": ["along_beam"]}})
-    simulation = simulation or SimulationConfig(only_near_spheres=True)
     field = scenario("paper-field", seed)
     if not 1 <= n_stops <= len(field.stops):
         raise ConfigError(f"{n_stops} stops are wanted; a survey has 1 to {len(field.stops)}.")
     places = np.round((np.arange(n_stops) + 0.5) * len(field.stops) / n_stops - 0.5).astype(int)
     scans, truths = [], []
     for name in (field.stops[place].name for place in places):
-        stop = simulate_stop(field, name, simulation)
-        (result,) = process(stop.log, config=config)
-        scans.append((name, result.fits[config.fitting.methods[0]]))
+        stop = simulate_stop(field, name, _SIMULATION)
+        (result,) = process(stop.log, config=_CONFIG)
+        scans.append((name, result.fits[_CONFIG.fitting.methods[0]]))
         truths.append(stop.truth)
     poses = {
-        "free_station": _free_stations(scans, field.marks, config),
-        "network": _network(scans, field.marks, config),
+        "free_station": _free_stations(scans, field.marks),
+        "network": _network(scans, field.marks),
     }
     return _compared(seed, scans, truths, poses)
 
 
-def _free_stations(
-    scans: Sequence[_Scan], marks: ControlMarks, config: SurveyConfig
-) -> list[_Pose]:
+def _free_stations(scans: Sequence[_Scan], marks: ControlMarks) -> list[_Pose]:
     """Return the pose of each station by itself."""
     poses: list[_Pose] = []
     for _, fits in scans:
         try:
-            fix = resect("free_station", fits, marks, config.resection)
+            fix = resect("free_station", fits, marks, _CONFIG.resection)
         except SolveError:
             poses.append(None)
         else:
@@ -269,10 +208,10 @@ def _free_stations(
     return poses
 
 
-def _network(scans: list[_Scan], marks: ControlMarks, config: SurveyConfig) -> list[_Pose]:
+def _network(scans: list[_Scan], marks: ControlMarks) -> list[_Pose]:
     """Return the pose of each station of a network on the same control marks."""
     try:
-        result = adjust_network(assemble(scans, marks, config.resection), config.resection)
+        result = adjust_network(assemble(scans, marks, _CONFIG.resection), _CONFIG.resection)
     except SolveError:
         return [None] * len(scans)
     found = zip(result.T_site_station, result.cov_T_site_station, strict=True)
@@ -335,27 +274,7 @@ def joined(parts: Sequence[Draws]) -> Draws:
 def coverage(
     draws: Draws, levels: Iterable[float] = LEVELS, *, seed: int = 0
 ) -> tuple[Coverage, ...]:
-    """Return the shares of stations within ellipses of some confidence levels.
-
-    Parameters
-    ----------
-    draws : Draws
-        Stations of many surveys.
-    levels : iterable of float
-        Levels that the ellipses are scaled to, by the chi-square distribution of their dimension.
-    seed : int
-        Seed of the resamples.
-
-    Returns
-    -------
-    tuple of Coverage
-        By method, quantity and level.
-
-    Raises
-    ------
-    TooFewObservationsError
-        If a method positioned no station.
-    """
+    """Return the shares of stations within ellipses scaled to some levels by chi-square."""
     weights = _resampled(draws.surveys, np.random.default_rng(seed))
     found = []
     for (method, quantity), squares in draws.squares.items():
@@ -371,23 +290,7 @@ def coverage(
 
 
 def nees(draws: Draws) -> dict[tuple[str, str], float]:
-    """Return the mean square of errors in units of their covariance, per dimension; 1 is honest.
-
-    Parameters
-    ----------
-    draws : Draws
-        Stations of many surveys.
-
-    Returns
-    -------
-    dict
-        By method and quantity.
-
-    Raises
-    ------
-    TooFewObservationsError
-        If a method positioned no station.
-    """
+    """Return the mean square of errors in units of their covariance, per dimension; 1 is honest."""
     return {
         key: float(np.mean(squares[_known(draws, *key)])) / QUANTITIES[key[1]]
         for key, squares in draws.squares.items()

@@ -13,26 +13,18 @@ from spheremark.pipelines.threads import in_processes
 Plain = dict[str, Any]
 Progress = Callable[[float, str], None]
 
-_World = TypeVar("_World")
-_Found = TypeVar("_Found")
-_Pooled = TypeVar("_Pooled")
+World = TypeVar("World")
+Found = TypeVar("Found")
+Report = TypeVar("Report")
 
 _PER_SI = {"mm": 1e3, "ms": 1e3, "ns": 1e9, "MB": 1e-6, "%": 100.0}  # units that scale a cell
 
 
 class Column(NamedTuple):
-    """One column of a table.
+    """One column of a table: a key of the rows, or a function from a row to the cell's text.
 
-    Attributes
-    ----------
-    key : str or callable
-        Key of the rows, whose values are SI; or a function that gives the cell's text from a row.
-    title : str
-        Its heading, without the unit.
-    unit : str
-        Unit in which numbers are shown.
-    form : str
-        Format of numbers; a column without one holds text and is flush left.
+    Values of the rows are SI, and ``unit`` is the one shown. A column with a format is flush right;
+    ``>`` does that for text.
     """
 
     key: str | Callable[[Plain], str]
@@ -57,19 +49,7 @@ class Column(NamedTuple):
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class Table:
-    """Rows of an experiment with what is needed to show them.
-
-    Attributes
-    ----------
-    title : str
-        What the rows are.
-    columns : sequence of Column
-        What is shown of them.
-    rows : sequence of dict
-        Plain values by names that carry the unit, as JSON and CSV have them.
-    notes : sequence of str
-        Sentences below the table.
-    """
+    """Rows of plain values with the columns to show, and sentences above and below."""
 
     title: str = ""
     columns: Sequence[Column] = ()
@@ -78,7 +58,7 @@ class Table:
 
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
-class Experiment(Generic[_World, _Found, _Pooled]):
+class Experiment(Generic[World, Found, Report]):
     """Worlds of known truth, what is measured in each, and how that is pooled.
 
     Attributes
@@ -90,18 +70,21 @@ class Experiment(Generic[_World, _Found, _Pooled]):
         or a partial of one, since it may run in another process.
     pool : callable
         Makes the report from what all worlds gave, in their order.
+    tables : callable
+        Lays the report out in tables.
     """
 
-    worlds: Sequence[_World]
-    run_world: Callable[[_World], _Found]
-    pool: Callable[[list[_Found]], _Pooled]
+    worlds: Sequence[World]
+    run_world: Callable[[World], Found]
+    pool: Callable[[list[Found]], Report]
+    tables: Callable[[Report], Sequence[Table]] = lambda _report: ()
 
     def run(
         self,
         progress: Progress = lambda _share, _what: None,
         *,
         n_processes: int | None = None,
-    ) -> _Pooled:
+    ) -> Report:
         """Run all worlds, some at a time, and pool them.
 
         Parameters
@@ -114,7 +97,7 @@ class Experiment(Generic[_World, _Found, _Pooled]):
         Returns
         -------
         object
-            What ``pool`` makes of them; the same whatever the number of processes.
+            The report; the same whatever the number of processes.
         """
         found = in_processes(
             self.run_world, self.worlds, n_processes=n_processes, progress=progress
@@ -123,18 +106,7 @@ class Experiment(Generic[_World, _Found, _Pooled]):
 
 
 def to_json(value: Any) -> Any:
-    """Return plain values with null for numbers that are not finite, which JSON has not.
-
-    Parameters
-    ----------
-    value : object
-        Mappings and sequences of plain values.
-
-    Returns
-    -------
-    object
-        The same as dicts and lists.
-    """
+    """Return plain values with null for numbers that are not finite, which JSON does not have."""
     if isinstance(value, Mapping):
         return {key: to_json(one) for key, one in value.items()}
     if isinstance(value, Iterable) and not isinstance(value, str):

@@ -82,22 +82,12 @@ def networks(
             "seed": seed,
             **_report(rows),
         },
+        tables=_tables,
     )
 
 
-def network_tables(report: Plain) -> tuple[Table, ...]:
-    """Return the means over surveys beside the accepted ones.
-
-    Parameters
-    ----------
-    report : dict
-        Report of ``networks``.
-
-    Returns
-    -------
-    tuple of Table
-        One table.
-    """
+def _tables(report: Plain) -> list[Table]:
+    """Return the means over surveys beside the accepted ones."""
     rigs = (
         "wrong rigs, calibrated in the same adjustment" if report["is_rig_wrong"] else "as set up"
     )
@@ -107,28 +97,24 @@ def network_tables(report: Plain) -> tuple[Table, ...]:
         bar = f"{factor * report['bars'][name]:.1f}" if name in BARS else f"{low} to {high}"
         scaled = {k: v and factor * v for k, v in report["summary"][name].items()}
         rows.append(scaled | {"what": what, "bar": bar})
-    return (
-        Table(
-            title=f"{report['n_surveys']} surveys of {report['n_stops']} stops, ranges with sigma "
-            f"{1e3 * report['sigma_range_m']:.0f} mm, {rigs}; free networks, datum taken out.",
-            columns=(
-                Column("what", ""),
-                Column("mean", "mean", "", ".2f"),
-                Column("sigma_mean", "+-", "", ".2f"),
-                Column("least", "least", "", ".2f"),
-                Column("greatest", "greatest", "", ".2f"),
-                Column("bar", "bar", "", ">"),
-            ),
-            rows=rows,
-            notes=(
-                f"A gross error of {100 * report['gross_error_m']:.0f} cm was found and named in "
-                f"{report['n_gross_found']} of {report['n_surveys']} surveys. Left out without "
-                f"one: {report['n_left_out']} of {report['n_observations']:,} centres, gravity "
-                f"included; false marks: {report['n_false_marks']}. Assembly and adjustment: "
-                f"{report['adjustment_cpu_seconds']:.2f} s of CPU each.",
-            ),
-        ),
+    title = (
+        f"{report['n_surveys']} surveys of {report['n_stops']} stops, ranges with sigma "
+        f"{1e3 * report['sigma_range_m']:.0f} mm, {rigs}; free networks, datum taken out."
     )
+    note = (
+        f"A gross error of {100 * report['gross_error_m']:.0f} cm was found and named in "
+        f"{report['n_gross_found']} of {report['n_surveys']} surveys. Left out without one: "
+        f"{report['n_left_out']} of {report['n_observations']:,} centres, gravity included; false "
+        f"marks: {report['n_false_marks']}. Assembly and adjustment: "
+        f"{report['adjustment_cpu_seconds']:.2f} s of CPU each."
+    )
+    numbers = {"mean": "mean", "sigma_mean": "+-", "least": "least", "greatest": "greatest"}
+    columns = (
+        Column("what", ""),
+        *(Column(key, title, "", ".2f") for key, title in numbers.items()),
+        Column("bar", "bar", "", ">"),
+    )
+    return [Table(title=title, columns=columns, rows=rows, notes=[note])]
 
 
 def _report(rows: Sequence[Plain]) -> Plain:

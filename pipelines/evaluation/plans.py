@@ -61,40 +61,26 @@ def plans(n_drawn: int, seed: int) -> Experiment[_Case, Plain, Plain]:
         worlds=large + small,
         run_world=partial(_case, n_drawn=n_drawn, seed=seed),
         pool=lambda rows: _report(rows, n_drawn, seed),
+        tables=_tables,
     )
 
 
-def plan_tables(report: Plain) -> tuple[Table, ...]:
-    """Return a table of numbers of marks, with the small cases below it.
-
-    Parameters
-    ----------
-    report : dict
-        Report of ``plans``.
-
-    Returns
-    -------
-    tuple of Table
-        One table.
-    """
-    return (
-        Table(
-            title=f"{report['site']}: 3-D sigma at the worst stop",
-            columns=(
-                Column("method", "method"),
-                Column("n_marks", "marks", "", "d"),
-                Column("optimised_sigma_3d_m", "optimised", "mm", ".3f"),
-                Column("drawn_sigma_3d_m", f"best of {report['n_drawn']:,}", "mm", ".3f"),
-                Column("ratio", "ratio", "", ".3f"),
-            ),
-            rows=report["against_chance"],
-            notes=(
-                f"{len(report['small_cases'])} small cases ({_MARKS_SMALL} of {_PLACES_SMALL} "
-                "places, every choice judged): best over found "
-                f"{report['least_ratio_to_brute_force']:.3f} at the least.",
-            ),
-        ),
+def _tables(report: Plain) -> list[Table]:
+    """Return a table of numbers of marks, with the small cases below it."""
+    title = f"{report['site']}: 3-D sigma at the worst stop"
+    columns = (
+        Column("method", "method"),
+        Column("n_marks", "marks", "", "d"),
+        Column("optimised_sigma_3d_m", "optimised", "mm", ".3f"),
+        Column("drawn_sigma_3d_m", f"best of {report['n_drawn']:,}", "mm", ".3f"),
+        Column("ratio", "ratio", "", ".3f"),
     )
+    note = (
+        f"{len(report['small_cases'])} small cases ({_MARKS_SMALL} of {_PLACES_SMALL} places, "
+        "every choice judged): best over found "
+        f"{report['least_ratio_to_brute_force']:.3f} at the least."
+    )
+    return [Table(title=title, columns=columns, rows=report["against_chance"], notes=[note])]
 
 
 @lru_cache(maxsize=1)

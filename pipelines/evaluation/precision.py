@@ -101,67 +101,44 @@ def precision(
             "seed": seed,
             "rows": _pooled([row for rows in stops for row in rows], methods),
         },
+        tables=_tables,
     )
 
 
 def full_precision(seed: int) -> Experiment[tuple[Case, int], list[_Row], Plain]:
-    """Return the experiment with over a thousand fits at each distance, by the main methods.
-
-    Parameters
-    ----------
-    seed : int
-        As of ``precision``.
-
-    Returns
-    -------
-    Experiment
-        As of ``precision``, with a long turn too.
-    """
+    """Return ``precision`` with over a thousand fits at each distance, a long turn, two methods."""
     cases = (*CASES, Case(0.02, _LONG_TURN))
     return precision(_N_STOPS_FULL, seed, cases=cases, methods=("along_beam", "silhouette"))
 
 
-def precision_tables(report: Plain) -> tuple[Table, ...]:
-    """Return the rows as a table: millimetres, and the share of the bound that is reached.
+_COLUMNS = (
+    Column("method", "method"),
+    Column("sigma_m", "sigma", "mm", ".0f"),
+    Column("turn_s", "turn", "s", ".1f"),
+    Column("distance_m", "distance", "m", ".0f"),
+    Column("n", "n", "", "d"),
+    Column("mean_hits", "hits", "", ".0f"),
+    Column("bound_m", "bound", "mm", ".2f"),
+    Column("rms_m", "RMS", "mm", ".2f"),
+    Column("bound_over_rms", "bound/RMS", "", ".2f"),
+    Column("bound_clear_over_rms", "clear/RMS", "", ".2f"),
+    Column("median_m", "median", "mm", ".1f"),
+    Column("p95_m", "p95", "mm", ".1f"),
+    Column("radial_bias_m", "radial", "mm", ".1f"),
+    Column("mean_nees", "NEES", "", ".1f"),
+)
+_NOTE = (
+    "The bound is that of Cramer and Rao for ranges alone, over the beams that hit; clear: without "
+    "the beams of which less than a fiftieth hit, whose derivative has no limit. along_beam also "
+    "uses that what returned has met the sphere, and silhouette which beams passed by: both may go "
+    "below the bound."
+)
 
-    Parameters
-    ----------
-    report : dict
-        Report of ``precision``.
 
-    Returns
-    -------
-    tuple of Table
-        One table.
-    """
-    return (
-        Table(
-            title=f"{report['stops']} stops of {report['per_distance']} markers at each distance",
-            columns=(
-                Column("method", "method"),
-                Column("sigma_m", "sigma", "mm", ".0f"),
-                Column("turn_s", "turn", "s", ".1f"),
-                Column("distance_m", "distance", "m", ".0f"),
-                Column("n", "n", "", "d"),
-                Column("mean_hits", "hits", "", ".0f"),
-                Column("bound_m", "bound", "mm", ".2f"),
-                Column("rms_m", "RMS", "mm", ".2f"),
-                Column("bound_over_rms", "bound/RMS", "", ".2f"),
-                Column("bound_clear_over_rms", "clear/RMS", "", ".2f"),
-                Column("median_m", "median", "mm", ".1f"),
-                Column("p95_m", "p95", "mm", ".1f"),
-                Column("radial_bias_m", "radial", "mm", ".1f"),
-                Column("mean_nees", "NEES", "", ".1f"),
-            ),
-            rows=report["rows"],
-            notes=(
-                "The bound is that of Cramer and Rao for ranges alone, over the beams that hit; "
-                "clear: without the beams of which less than a fiftieth hit, whose derivative has "
-                "no limit. along_beam also uses that what returned has met the sphere, and "
-                "silhouette which beams passed by: both may go below the bound.",
-            ),
-        ),
-    )
+def _tables(report: Plain) -> list[Table]:
+    """Return the rows as a table: millimetres, and the share of the bound that is reached."""
+    title = f"{report['stops']} stops of {report['per_distance']} markers at each distance"
+    return [Table(title=title, columns=_COLUMNS, rows=report["rows"], notes=[_NOTE])]
 
 
 def _stop(world: tuple[Case, int], *, methods: Sequence[str]) -> list[_Row]:

@@ -57,15 +57,24 @@ def bench(
 ) -> None:
     """Measure each step against one read of the file with a checksum, in the same run."""
     if extraction:
-        _extraction(worlds, seed, as_json=as_json)
+        from spheremark.pipelines.evaluation import detection
+
+        seeds = range(seed, seed + worlds)
+        _run(detection.extraction(detection.DETECTION_PLAN, seeds), as_json=as_json)
     elif coverage:
         _coverage(coverage, seed, as_json=as_json)
     elif networks:
-        _networks(networks, seed, is_rig_wrong=wrong_rig, as_json=as_json)
+        from spheremark.pipelines.evaluation import networks as surveys
+
+        _run(surveys.networks(networks, seed=seed, is_rig_wrong=wrong_rig), as_json=as_json)
     elif plans:
-        _plans(plans, seed, as_json=as_json)
+        from spheremark.pipelines.evaluation import plans as planning
+
+        _run(planning.plans(plans, seed), as_json=as_json)
     elif accuracy:
-        _accuracy(stops, seed, is_full=full, as_json=as_json)
+        from spheremark.pipelines.evaluation.precision import full_precision, precision
+
+        _run(full_precision(seed) if full else precision(stops, seed), as_json=as_json)
     else:
         os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # as in workers, before NumPy's import
         from spheremark.service.bench.speed import SpeedOptions, speed, speed_tables
@@ -102,65 +111,24 @@ def reproduce(
 
 def _coverage(n_surveys: int, seed: int, *, as_json: bool) -> None:
     """Measure the coverage of error ellipses, and keep the report for the service."""
-    from spheremark.pipelines.evaluation import ellipse_coverage as coverage
+    from spheremark.pipelines.evaluation.ellipse_coverage import ellipse_coverage
     from spheremark.service.provenance import made_now
     from spheremark.storage.exports.reports import keep_coverage
 
+    experiment = ellipse_coverage(n_surveys, _STOPS_OF_COVERAGE, seed)
     with progress() as show:
-        draws = coverage.ellipse_coverage(n_surveys, _STOPS_OF_COVERAGE, seed).run(show)
-    report = made_now() | coverage.coverage_report(draws, seed)
+        report = made_now() | experiment.run(show)
     path = keep_coverage(report, settings().data)
-    _print(report, coverage.coverage_tables, as_json=as_json)
+    _print(report, experiment.tables, as_json=as_json)
     if not as_json:
         err.print(f"Kept as {path}; the service shows it at /coverage.")
 
 
-def _networks(n_surveys: int, seed: int, *, is_rig_wrong: bool, as_json: bool) -> None:
-    """Measure the accuracy of adjusted surveys, and the honesty of their covariances."""
-    from spheremark.pipelines.evaluation.networks import network_tables, networks
-
-    experiment = networks(n_surveys, seed=seed, is_rig_wrong=is_rig_wrong)
-    _run(experiment, network_tables, as_json=as_json)
-
-
-def _plans(n_drawn: int, seed: int, *, as_json: bool) -> None:
-    """Compare optimised marks with marks at random, and with the best of all."""
-    from spheremark.pipelines.evaluation.plans import plan_tables, plans
-
-    _run(plans(n_drawn, seed), plan_tables, as_json=as_json)
-
-
-def _extraction(worlds: int, seed: int, *, as_json: bool) -> None:
-    """Measure precision and recall of extraction in simulated worlds."""
-    from spheremark.pipelines.evaluation import detection
-
-    seeds = range(seed, seed + worlds)
-    experiment = detection.extraction(detection.DETECTION_PLAN, seeds)
-    _run(experiment, detection.extraction_tables, as_json=as_json)
-
-
-def _accuracy(stops: int, seed: int, *, is_full: bool, as_json: bool) -> None:
-    """Measure the precision of centres against distance, by every method."""
-    from spheremark.pipelines.evaluation.precision import (
-        full_precision,
-        precision,
-        precision_tables,
-    )
-
-    experiment = full_precision(seed) if is_full else precision(stops, seed)
-    _run(experiment, precision_tables, as_json=as_json)
-
-
-def _run(
-    experiment: Experiment[Any, Any, Plain],
-    tables: Callable[[Plain], Iterable[Table]],
-    *,
-    as_json: bool,
-) -> None:
+def _run(experiment: Experiment[Any, Any, Plain], *, as_json: bool) -> None:
     """Run an experiment and print its report."""
     with progress() as show:
         report = experiment.run(show)
-    _print(report, tables, as_json=as_json)
+    _print(report, experiment.tables, as_json=as_json)
 
 
 def _print(report: Plain, tables: Callable[[Plain], Iterable[Table]], *, as_json: bool) -> None:

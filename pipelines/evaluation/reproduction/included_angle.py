@@ -31,18 +31,10 @@ _N_DRAWS = 4000  # RMS good to a hundredth
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class Arcs:
-    """The three circles of one pattern of signs (the study's Figure 4); the true station is zero.
+    """The three circles of one pattern of errors (the study's Figure 4); the true station is zero.
 
-    Attributes
-    ----------
-    included_angle : float
-        Between the first two marks [rad].
-    marks_site, shifted_site : (3, 2)
-        True places of the marks, and with the errors that were granted [m].
-    radii : (3,)
-        Of the circles about the shifted marks [m].
-    p_site : (2,)
-        Where they meet best [m].
+    ``marks_site`` are true, ``shifted_site`` have the granted errors, ``p_site`` is where the
+    circles of ``radii`` about these meet best [m].
     """
 
     included_angle: float

@@ -51,26 +51,20 @@ from spheremark.pipelines.sphere import fit_markers
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class Centres:
-    """Fitted centres with their errors, one row for each scan, marker and method.
+    """Fitted centres with their errors, one of n rows for each scan, marker and method.
 
     Attributes
     ----------
     scans : (n,)
-        Place of the scan among those of the plan.
+        Place of the scan in the plan.
     methods, marks : tuple of str
         Fitting method and true mark of each row.
-    ranges : (n,)
-        True distances from the origin of the base to the marks [m].
-    n_points : (n,)
-        Numbers of returns that carry the estimates.
-    incidences : (n,)
-        Mean angles between beam and normal of the sphere [rad].
+    ranges, n_points, incidences : (n,)
+        True distance to the mark [m], number of returns, mean angle of incidence [rad].
     error_station : (n, 3)
         Estimate minus truth towards the mark, to its left and upward [m].
-    sigma_3d : (n,)
-        Predicted: square roots of the traces of the covariances, with that of the heading [m].
-    rms : (n,)
-        Root mean squares of the residuals along the beam [m].
+    sigma_3d, rms : (n,)
+        Predicted sigma, that of the heading included, and RMS of the residuals along the beam [m].
     """
 
     scans: Index
@@ -95,7 +89,7 @@ class Centres:
         return np.asarray(np.linalg.norm(self.error_station, axis=1))
 
     def of(self, method: str, scans: ArrayLike) -> Mask:
-        """Tell which rows are of a method and of some scans, (n,)."""
+        """Return which rows are of a method and of some scans, (n,)."""
         return np.asarray((np.array(self.methods) == method) & np.isin(self.scans, scans))
 
     def sample(self, keep: Mask) -> ErrorSample:
@@ -111,22 +105,18 @@ class Centres:
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class Example:
-    """One marker as it was simulated, seen along its line of sight (Figures 3 and 9).
+    """One marker as it was simulated, in its line of sight (Figures 3 and 9).
 
     Attributes
     ----------
-    mark : str
-        Its name.
-    distance : float
-        How far away it is [m].
+    mark, distance, radius : str, float, float
+        Name, distance [m] and radius [m] of the marker.
     points_station : (n, 3)
         Returns about it: beyond the true centre, to its left, above it [m].
     is_left : (n,)
-        Whether the study's method uses the return: it lies above the cut and near the ball.
+        Whether the study's method uses the return: it lies above the cut and near the sphere.
     cut, ground : float
         Heights above the true centre of the cut, and of the highest ground point of the scan [m].
-    radius : float
-        Radius of the sphere [m].
     centres_station : mapping of str to (3,)
         Fitted centre by method, in the same coordinates [m].
     """
@@ -147,22 +137,10 @@ class Example:
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class Reproduction:
-    """All that was simulated and fitted.
+    """The scans of a plan, the marks of each, and the errors of all centres.
 
-    Attributes
-    ----------
-    scans : tuple of Scan
-        The plan.
-    n_marks : (n,)
-        Marks of each scan's world, to tell how many were found.
-    centres : Centres
-        Centres with errors.
-    example : Example
-        A marker of the first scan.
-    noise : RangeNoise
-        Noise of the ranges of the first scan that simulates a real sensor.
-    config : SurveyConfig
-        What they were fitted with.
+    ``example`` is a marker of the first scan, ``noise`` that of the ranges of the first scan that
+    simulates a real sensor.
     """
 
     scans: tuple[Scan, ...]
@@ -178,7 +156,7 @@ class Reproduction:
 
 
 class _Row(NamedTuple):
-    """One row of ``Centres`` but for its scan."""
+    """One row of ``Centres`` without its scan."""
 
     method: str
     mark: str
@@ -191,7 +169,7 @@ class _Row(NamedTuple):
 
 
 class _Measured(NamedTuple):
-    """What one scan gave."""
+    """The results of one scan."""
 
     rows: list[_Row]
     n_marks: int

@@ -43,20 +43,9 @@ _STATISTICS: tuple[Statistic, ...] = ("p95", "mean")
 
 
 class Finding(NamedTuple):
-    """The limits within which one method keeps the tolerance in one place.
+    """The error model of one method in one place, and the limits that keep the tolerance.
 
-    Attributes
-    ----------
-    place : str
-        ``FIELD``, ``LANE`` or ``REAL``.
-    method : str
-        Fitting method.
-    model : ErrorModel
-        How its errors depend on distance, count and incidence.
-    limits : mapping of str to Limits
-        Limits by statistic: ``p95`` and the study's ``mean``.
-    errors : ErrorSummary
-        The errors themselves.
+    The limits are by statistic: ``p95``, and ``mean``, the study's.
     """
 
     place: str
@@ -67,18 +56,7 @@ class Finding(NamedTuple):
 
 
 def table_2(made: Reproduction) -> list[Plain]:
-    """Return the study's Table 2 again: errors by distance at the centre stop.
-
-    Parameters
-    ----------
-    made : Reproduction
-        The scans.
-
-    Returns
-    -------
-    list of dict
-        In the order of the distances; NaN where a marker was never found.
-    """
+    """Return the study's Table 2 again: errors by distance; NaN where a marker was never found."""
     centres, scans = made.centres, made.series(CENTRE)
     nearest = np.argmin(np.abs(centres.ranges[:, None] - TABLE_2.ranges), axis=1)
     rows = []
@@ -102,18 +80,7 @@ def table_2(made: Reproduction) -> list[Plain]:
 
 
 def table_4(made: Reproduction) -> list[Plain]:
-    """Return the study's Table 4 again: mean error per stop of lane 2.
-
-    Parameters
-    ----------
-    made : Reproduction
-        The scans.
-
-    Returns
-    -------
-    list of dict
-        In the order of the stops, those that were scanned.
-    """
+    """Return the study's Table 4 again: mean error per stop of lane 2."""
     centres, rows = made.centres, []
     for stop in STOPS_OF_LANE_2:
         scans = np.array([i for i in made.series(LANE_2) if made.scans[i].stop == stop], np.intp)
@@ -135,18 +102,7 @@ def table_4(made: Reproduction) -> list[Plain]:
 
 
 def readings(made: Reproduction) -> list[Plain]:
-    """Return the errors of the study's method by the noise and the cut, which it leaves open.
-
-    Parameters
-    ----------
-    made : Reproduction
-        The scans.
-
-    Returns
-    -------
-    list of dict
-        The noise of the study's simulator first, the cut at the equator first.
-    """
+    """Return the errors of the study's method by the noise and the cut, which it leaves open."""
     centres, rows = made.centres, []
     for series in (CENTRE, CENTRE_REAL):
         for method in (PAPER, GROUND):
@@ -169,41 +125,16 @@ def readings(made: Reproduction) -> list[Plain]:
 
 
 def models_of_icp(made: Reproduction) -> dict[str, ErrorSummary]:
-    """Compare the hemisphere and the full sphere as models of the study's ICP (Figure 3).
-
-    Parameters
-    ----------
-    made : Reproduction
-        The scans.
-
-    Returns
-    -------
-    dict
-        Errors at the centre stop by method: ``paper`` (hemisphere) and ``paper_sphere``.
-    """
+    """Compare the hemisphere and the full sphere as models of the study's ICP (Figure 3)."""
     scans = made.series(CENTRE)
     return {m: _summary(made, made.centres.of(m, scans)) for m in (PAPER, FULL_SPHERE)}
 
 
 def findings(made: Reproduction, rng: np.random.Generator) -> tuple[Finding, ...]:
-    """Return the limits within which each method keeps the tolerance, in the field and to 30 m.
+    """Return the limits of each method in each place: field first, ours first.
 
-    Parameters
-    ----------
-    made : Reproduction
-        The scans.
-    rng : numpy.random.Generator
-        Draws the resamples of the confidence intervals.
-
-    Returns
-    -------
-    tuple of Finding
-        Field first, ours first.
-
-    Notes
-    -----
     Greatest distances are for the default time of a turn, smallest counts for 7.5 m, the distance
-    of the study's own limit.
+    of the study's own limit. ``rng`` draws the resamples of the confidence intervals.
     """
     places = {
         FIELD: made.series(CENTRE, LANE_2, TURNS),

@@ -10,7 +10,6 @@ from spheremark.pipelines.calibration.gimbal import GIMBAL, values
 from spheremark.pipelines.config import ResectionConfig
 from spheremark.pipelines.evaluation.networks import (
     is_gross_found,
-    network_tables,
     networks,
     wrong_rig,
 )
@@ -21,13 +20,13 @@ from spheremark.service.bench.report import print_tables
 from tests.synthetic import field, pose, sightings
 
 CONFIG = ResectionConfig()
+EXPERIMENT = networks(2, seed=40, n_stops=3, is_rig_wrong=True)
 
 
 @pytest.fixture(scope="module")
 def report():
     shares = []
-    experiment = networks(2, seed=40, n_stops=3, is_rig_wrong=True)
-    found = experiment.run(lambda share, _what: shares.append(share), n_processes=1)
+    found = EXPERIMENT.run(lambda share, _what: shares.append(share), n_processes=1)
     assert shares == [0.0, 0.5, 1.0]
     return found
 
@@ -44,7 +43,7 @@ def test_surveys_with_wrong_rigs_are_compared_with_their_truth(report):
 
 def test_the_report_is_a_table_and_json(report):
     out = Console(record=True, width=160)
-    print_tables(out, network_tables(report))
+    print_tables(out, EXPERIMENT.tables(report))
     text = out.export_text()
     for word in ("wrong rigs", "marks, 3-D error RMS", "0.85 to 1.2", "found and named in"):
         assert word in text
