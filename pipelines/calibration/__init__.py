@@ -1,15 +1,15 @@
 """The rig from what spheres show on both faces of a scan: no plane and no coordinate is needed.
 
 A LiDAR whose spin axis is tilted sweeps every direction twice in a full turn of the gimbal, once on
-either side of its head. Errors of the rig move the two sights of one sphere apart; ``calibrate``
-makes them meet. Inside,
+either side of its head. Errors of the rig separate the two images of a sphere; ``calibrate`` brings
+them together.
 
-- ``gimbal`` says how the parameters of a rig move its beams,
-- ``faces`` gets a rough rig from each sphere's two centres, however bad the start,
-- ``estimation`` adjusts rig and centres to the ranges, and holds what they do not tell.
+- ``gimbal``: how the parameters of a rig move its beams
+- ``faces``: a rough rig from the two centres of each sphere, however bad the start
+- ``estimation``: adjustment of rig and centres to the ranges
 
-Why so: the two faces are looked at apart first, because a rig that is wrong by a tenth of a degree
-tears spheres in two, and no extraction would know them.
+Each face is processed apart first, because a rig that is wrong by a tenth of a degree splits
+spheres in two, and the detection would miss them.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from spheremark.pipelines.calibration.estimation import (
     residual_rms,
 )
 from spheremark.pipelines.calibration.faces import front_face, rig_from_faces
-from spheremark.pipelines.calibration.gimbal import GIMBAL, Sights, sights, values
+from spheremark.pipelines.calibration.gimbal import GIMBAL, Pulses, recorded_pulses, values
 from spheremark.pipelines.calibration.result import BIAS, Calibration, Scan
 from spheremark.pipelines.config import SurveyConfig
 from spheremark.pipelines.detection import extract
@@ -66,19 +66,19 @@ def calibrate(
     rig : Rig, optional
         Where to start; by default the one that the logs describe.
     progress : callable
-        Told the share of the work that is done, 0 to 1, and what comes next; may raise to cancel.
+        Receives the share that is done, 0 to 1, and the next step; may raise to cancel.
 
     Returns
     -------
     Calibration
-        The rig with covariance, and what these scans do not tell.
+        The rig with covariance, and the parameters that were held.
 
     Raises
     ------
     DegenerateGeometryError
         If fewer than three spheres are seen on both faces.
     MissingRigError
-        If neither the logs nor the caller tell how the LiDAR is mounted.
+        If neither the logs nor the caller give the mounting of the LiDAR.
     NotConvergedError
         If the adjustment does not settle.
     RigError
@@ -87,8 +87,8 @@ def calibrate(
     Notes
     -----
     Offsets of the axis, tilt and zero of the spin axis, eccentricity of the encoder and biases of
-    the lasers are estimated without priors as far as the ranges tell them. Cost grows linearly with
-    returns and with scans.
+    the lasers are estimated without priors as far as the ranges determine them. Cost grows linearly
+    with returns and with scans.
     """
     start = _start(logs, rig)
     progress(0.0, "Looking at both faces of each sphere")
@@ -108,7 +108,7 @@ def _passed(logs: Iterable[ScanLog], rig: Rig, config: SurveyConfig) -> tuple[_S
     """Find all spheres with a rig, and adjust it to them."""
     seen = _see(logs, rig, config)
     return seen, estimate(
-        *(seen.sights, rig, seen.centres, seen.covs),
+        *(seen.pulses, rig, seen.centres, seen.covs),
         config.marker_radius,
         config.fitting.sigma_direction,
     )
@@ -135,12 +135,12 @@ def _stops(logs: Iterable[ScanLog], config: SurveyConfig) -> Iterable[ScanLog]:
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class _Seen:
-    """What all stops show with one rig: shots at spheres, and rough centres.
+    """What all stops show with one rig: pulses at spheres, and rough centres.
 
     ``scans`` are the markers of each stop, ``places``, (m, 2), stop and place of each sphere.
     """
 
-    sights: Sights
+    pulses: Pulses
     centres: Array
     covs: Array
     scans: tuple[tuple[str, MarkerFits], ...]
@@ -164,7 +164,7 @@ def _see(logs: Iterable[ScanLog], rig: Rig, config: SurveyConfig) -> _Seen:
         rows = np.concatenate([fit.used for fit in good])
         which = np.repeat(np.arange(len(good)), [len(fit.used) for fit in good])
         n_two_faced += _n_two_faced(front_face(cloud)[rows], which)
-        parts.append(sights(log, cloud, rows, which))
+        parts.append(recorded_pulses(log, cloud, rows, which))
         fits += good
         places += [(len(scans), k) for k in chosen]
         scans.append((log.origin.name, found))
@@ -174,7 +174,7 @@ def _see(logs: Iterable[ScanLog], rig: Rig, config: SurveyConfig) -> _Seen:
             f"{_N_SPHERES}. Turn the gimbal by 360 degrees among more markers, or give more scans."
         )
     return _Seen(
-        sights=Sights.joined(parts),
+        pulses=Pulses.joined(parts),
         centres=np.array([fit.p_base for fit in fits]),
         covs=np.array([fit.cov_p_base for fit in fits]),
         scans=tuple(scans),
@@ -209,11 +209,11 @@ def _chosen(rig: Rig, found: Estimate) -> Array:
 
 
 def _calibration(start: Rig, seen: _Seen, found: Estimate, config: SurveyConfig) -> Calibration:
-    """Put the result together."""
+    """Assemble the result."""
     free = [parameter for parameter, is_free in zip(GIMBAL, found.is_free, strict=True) if is_free]
     names = [p.name for p in free] + [f"{BIAS}{k}" for k in found.lasers]
     before, after = (
-        residual_rms(seen.sights, rig, found, seen.covs, config.marker_radius)
+        residual_rms(seen.pulses, rig, found, seen.covs, config.marker_radius)
         for rig in (start, found.rig)
     )
     return Calibration(

@@ -1,4 +1,4 @@
-"""The adjustment of rig and centres: hides elimination, separability and robust weights."""
+"""Adjustment of rig and centres to the ranges, with robust weights."""
 
 from __future__ import annotations
 
@@ -9,10 +9,10 @@ import numpy as np
 from spheremark.pipelines.calibration.gimbal import (
     GIMBAL,
     N_SHADES,
-    Design,
+    Linearised,
     Parameter,
-    Sights,
-    design,
+    Pulses,
+    linearise,
     moved,
 )
 from spheremark.pipelines.errors import NotConvergedError
@@ -61,13 +61,13 @@ def reduced(which: Index, J_centres: Array, J: Array, residuals: Array, weights:
 
 
 def separable(N: Array, parameters: tuple[Parameter, ...]) -> tuple[Mask, tuple[Inseparable, ...]]:
-    """Tell which parameters the observations can tell apart.
+    """Return which parameters the observations determine, and why the others are held.
 
     Notes
     -----
-    In units of those sigmas, an eigenvalue under 1 belongs to a combination that stays unknown.
-    While there is one, the parameter with the largest part in its vector is held. What rests on
-    more than geometry is held in any case.
+    In units of ``Parameter.unknown``, an eigenvalue of the normal matrix under 1 belongs to a
+    combination that is undetermined. While there is one, the parameter with the largest part in
+    its eigenvector is held. Parameters with a caution are held in any case.
     """
     scales = np.array([parameter.unknown for parameter in parameters])
     scaled = N * np.outer(scales, scales)
@@ -98,7 +98,7 @@ def separable(N: Array, parameters: tuple[Parameter, ...]) -> tuple[Mask, tuple[
 
 
 def _held_back(parameter: Parameter, sigma: float) -> Inseparable:
-    """Say why a parameter is held although the observations tell it."""
+    """Return why a parameter is held although the observations determine it."""
     return Inseparable(
         parameter.name,
         f"These scans seem to tell it to {sigma:.2g} {parameter.unit} (1 sigma), but "
@@ -107,7 +107,7 @@ def _held_back(parameter: Parameter, sigma: float) -> Inseparable:
 
 
 def _reason(parameter: Parameter, eigenvalue: float, partners: list[str]) -> str:
-    """Say why a parameter is held."""
+    """Return why a parameter is held."""
     together = f" apart from {', '.join(partners)}" if partners else ""
     if eigenvalue < 1e-4:
         return f"These scans do not tell it{together}: {parameter.twin}."
@@ -140,12 +140,11 @@ class Estimate(NamedTuple):
     dof : int
         Their number minus that of the unknowns.
     basis : (p, k)
-        The parameters of ``cov`` by independent unknowns: biases are told only against their mean.
+        The parameters of ``cov`` by independent unknowns: biases have their mean held.
     weights : (k, k)
-        What the two faces tell of these unknowns, whatever all ranges are too long; inverse of a
-        covariance.
+        Normal matrix of these unknowns, the common range bias eliminated.
     effects : (m, 3, k)
-        How much an unknown that is wrong moves each centre.
+        Derivative of each centre by an error of these unknowns.
     cov_centres : (m, 3, 3)
         Covariances of the centres if the rig were known [m^2].
     """
@@ -165,17 +164,17 @@ class Estimate(NamedTuple):
 
 
 class _State(NamedTuple):
-    """Where the estimate stands: rig, centres [m], and what the shots say of them."""
+    """Rig and centres [m], with the pulses linearised there."""
 
     rig: Rig
     centres: Array
-    sight: Design
+    lin: Linearised
 
 
 class _Problem(NamedTuple):
-    """What stays the same from step to step; ``basis``, (256, k - 1), is that of the biases."""
+    """What stays the same from step to step; ``basis``, (256, k - 1), spans the laser biases."""
 
-    seen: Sights
+    seen: Pulses
     covs: Array
     radius: float
     sigma_direction: float
@@ -183,23 +182,20 @@ class _Problem(NamedTuple):
 
     def at(self, rig: Rig, centres: Array) -> _State:
         """Return the state at a rig and centres."""
-        return _State(rig, centres, design(self.seen, rig, centres, self.covs, self.radius))
+        return _State(rig, centres, linearise(self.seen, rig, centres, self.covs, self.radius))
 
     def extra(self, state: _State) -> Array:
         """Return the noise that directions and bends add to each range [m]."""
-        return np.asarray(np.hypot(self.sigma_direction * state.sight.slopes, state.sight.bends))
+        return np.asarray(np.hypot(self.sigma_direction * state.lin.slopes, state.lin.bends))
 
     def sigmas(self, state: _State, noises: Array) -> Array:
         """Return the standard deviation of each range, given its noise [m]."""
         return np.asarray(np.hypot(noises, self.extra(state)))
 
     def noises(self, state: _State, before: Array) -> Array:
-        """Return the noise of each return [m]: of its reflectivity, times that of its sphere.
-
-        Either is drawn towards the noise of all.
-        """
+        """Return the noise of each return [m]: of its reflectivity, times that of its sphere."""
         which, shades, m = self.seen.which, self.seen.shades, len(state.centres)
-        scaled = state.sight.residuals / self.sigmas(state, before)
+        scaled = state.lin.residuals / self.sigmas(state, before)
         weights = tukey(scaled)
         squares = weights * (scaled * before) ** 2 / _EXPECTED_SQUARE
         counts = np.bincount(shades, weights > 0.0, N_SHADES)
@@ -215,10 +211,10 @@ class _Problem(NamedTuple):
 
     def equations(self, state: _State, sigmas: Array) -> Reduced:
         """Return the normal equations of all parameters and biases."""
-        sight = state.sight
-        J = np.column_stack([sight.J_rig, self.basis[self.seen.rings]])
-        weights = tukey(sight.residuals / sigmas) / sigmas**2
-        return reduced(self.seen.which, sight.J_centres, J, sight.residuals, weights)
+        lin = state.lin
+        J = np.column_stack([lin.J_rig, self.basis[self.seen.rings]])
+        weights = tukey(lin.residuals / sigmas) / sigmas**2
+        return reduced(self.seen.which, lin.J_centres, J, lin.residuals, weights)
 
     def ahead(self, state: _State, equations: Reduced, chosen: Index, sigmas: Array) -> _State:
         """Return the state after the longest share of a step that lowers the loss, or the last."""
@@ -228,25 +224,25 @@ class _Problem(NamedTuple):
         by_rig, by_laser = np.split(steps, [len(GIMBAL)])
         biases = (self.basis @ by_laser)[: len(state.rig.laser_range_biases)]
         by_centre = equations.local_steps(steps)
-        loss, trial = _loss(state.sight.residuals / sigmas), state
+        loss, trial = _loss(state.lin.residuals / sigmas), state
         for share in _SHARES:
             rig = moved(state.rig, share * by_rig, share * biases)
             trial = self.at(rig, state.centres + share * by_centre)
-            if _loss(trial.sight.residuals / sigmas) < loss:
+            if _loss(trial.lin.residuals / sigmas) < loss:
                 break
         return trial
 
 
 def estimate(
-    seen: Sights, rig: Rig, centres: Array, covs: Array, radius: float, sigma_direction: float
+    seen: Pulses, rig: Rig, centres: Array, covs: Array, radius: float, sigma_direction: float
 ) -> Estimate:
     """Adjust the rig and all centres to the recorded ranges.
 
     Notes
     -----
-    Gauss-Newton with Tukey's weights, each step shortened until it lowers the loss; noise is
-    estimated by reflectivity and by sphere, each drawn towards the noise of all: beams that graze
-    an outline, which tell most of a centre across, answer weakly and are noisy.
+    Gauss-Newton with Tukey's weights, each step shortened until it lowers the loss. Noise is
+    estimated by reflectivity and by sphere, each shrunk towards the noise of all: beams that graze
+    the limb, which determine a centre across the line of sight, return weakly and are noisy.
     """
     lasers, basis = _contrasts(seen.rings)
     problem = _Problem(seen, covs, radius, sigma_direction, basis)
@@ -263,7 +259,7 @@ def estimate(
             is_free, held = separable(equations.N[: len(GIMBAL), : len(GIMBAL)], GIMBAL)
         chosen = np.flatnonzero(np.append(is_free, np.ones(basis.shape[1], dtype=np.bool_)))
         better = problem.ahead(state, equations, chosen, sigmas)
-        saved = _loss(state.sight.residuals / sigmas) - _loss(better.sight.residuals / sigmas)
+        saved = _loss(state.lin.residuals / sigmas) - _loss(better.lin.residuals / sigmas)
         if number >= _N_STEPS_NOISE and saved < _SETTLED:
             return _estimate(problem, state, sigmas, is_free, held, lasers)
         state = better
@@ -279,7 +275,7 @@ def tukey(scaled: Array) -> Array:
 
 
 def _contrasts(rings: Rings) -> tuple[Index, Array]:
-    """Return the lasers whose biases can be told, and a basis, (256, k - 1), of mean zero."""
+    """Return the lasers with returns enough, and a basis, (256, k - 1), of biases of mean zero."""
     counts = np.bincount(rings, minlength=256)
     counts[RING_UNKNOWN] = 0
     lasers = np.flatnonzero(counts >= _N_LASER)
@@ -298,14 +294,14 @@ def _estimate(
     held: tuple[Inseparable, ...],
     lasers: Index,
 ) -> Estimate:
-    """Put the estimate together."""
+    """Assemble the estimate."""
     n_free, k = int(is_free.sum()), problem.basis.shape[1]
     chosen = np.flatnonzero(np.append(is_free, np.ones(k, dtype=np.bool_)))
     equations = problem.equations(state, sigmas)
     J = np.zeros((n_free + len(lasers), n_free + k))
     J[:n_free, :n_free] = np.eye(n_free)
     J[n_free:, n_free:] = problem.basis[lasers]
-    is_used = tukey(state.sight.residuals / sigmas) > 0.0
+    is_used = tukey(state.lin.residuals / sigmas) > 0.0
     return Estimate(
         rig=state.rig,
         centres=state.centres,
@@ -316,32 +312,32 @@ def _estimate(
         is_used=is_used,
         dof=int(is_used.sum()) - 3 * len(state.centres) - len(chosen),
         basis=J,
-        weights=_told(equations.N, chosen) / _EFFICIENCY,
+        weights=_without_bias(equations.N, chosen) / _EFFICIENCY,
         effects=equations.gains[:, :, chosen],
         cov_centres=_EFFICIENCY * equations.own,
     )
 
 
-def _told(N: Array, chosen: Index) -> Array:
-    """Return what is told of some unknowns whatever the common range bias is.
+def _without_bias(N: Array, chosen: Index) -> Array:
+    """Return the normal matrix of some unknowns, the common range bias eliminated.
 
-    The size that near spheres seem to have speaks of that bias too, but rests on the width of the
-    beams that is assumed.
+    The apparent size of near spheres would determine that bias too, but depends on the assumed
+    width of the beams.
     """
     bias = [parameter.name for parameter in GIMBAL].index("common_range_bias")
     across = N[chosen, bias]
     return np.asarray(N[np.ix_(chosen, chosen)] - np.outer(across, across) / N[bias, bias])
 
 
-def residual_rms(seen: Sights, rig: Rig, found: Estimate, covs: Array, radius: float) -> float:
+def residual_rms(seen: Pulses, rig: Rig, found: Estimate, covs: Array, radius: float) -> float:
     """Return the root mean square residual of an estimate's returns with a rig."""
     centres, weights = found.centres, found.is_used.astype(np.float64)
     nothing = np.zeros((len(weights), 0))
     for _ in range(_N_STEPS_CENTRES):
-        sight = design(seen, rig, centres, covs, radius)
-        equations = reduced(seen.which, sight.J_centres, nothing, sight.residuals, weights)
+        lin = linearise(seen, rig, centres, covs, radius)
+        equations = reduced(seen.which, lin.J_centres, nothing, lin.residuals, weights)
         centres = centres + equations.local_steps(np.zeros(0))
-    residuals = design(seen, rig, centres, covs, radius).residuals
+    residuals = linearise(seen, rig, centres, covs, radius).residuals
     return float(np.sqrt(np.mean(residuals[found.is_used] ** 2)))
 
 

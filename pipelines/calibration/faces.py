@@ -1,4 +1,4 @@
-"""A rough rig from each sphere's two centres: hides how bad the start may be.
+"""A rough rig from the two centres of each sphere.
 
 Each face of a scan is whole in itself, whatever the rig: it is found and fitted apart, and what
 separates the two centres of a sphere is put down to the rig.
@@ -13,7 +13,14 @@ from typing import NamedTuple
 import numpy as np
 
 from spheremark.pipelines.calibration.estimation import separable
-from spheremark.pipelines.calibration.gimbal import GIMBAL, MOUNTING, aimed, motions, moved, sights
+from spheremark.pipelines.calibration.gimbal import (
+    GIMBAL,
+    MOUNTING,
+    aimed,
+    motions,
+    moved,
+    recorded_pulses,
+)
 from spheremark.pipelines.config import SurveyConfig
 from spheremark.pipelines.detection import extract
 from spheremark.pipelines.errors import DegenerateGeometryError, RigError
@@ -41,7 +48,7 @@ class _Pair(NamedTuple):
 
 
 def front_face(cloud: StitchedCloud) -> Mask:
-    """Tell which returns were made on the front of the head."""
+    """Return which returns were made on the front of the head."""
     spin = cloud.rig.T_head_lidar[:3, 2]
     side = np.array([-spin[1], spin[0]])
     if np.linalg.norm(side) < np.sin(_TILT_MIN):
@@ -100,7 +107,7 @@ def _fits(cloud: StitchedCloud, rows: Index, config: SurveyConfig) -> list[Marke
     """Return the fits of one face, with their rows in the whole cloud."""
     face = replace(cloud, **{name: getattr(cloud, name)[rows] for name in _COLUMNS})
     candidates = extract(face, config.extraction, config.marker_radius)
-    alone = replace(config.fitting, sigma_mounting=0.0, sigma_offset=0.0)  # is what is asked here
+    alone = replace(config.fitting, sigma_mounting=0.0, sigma_offset=0.0)  # are estimated here
     fits = fit_markers("along_beam", face, candidates, alone, config.marker_radius).fits
     return [replace(fit, used=rows[fit.used], rejected=rows[fit.rejected]) for fit in fits]
 
@@ -109,7 +116,7 @@ def _pair(log: ScanLog, cloud: StitchedCloud, fits: tuple[MarkerFit, MarkerFit])
     """Return two centres of a sphere with how the rig moves each."""
     effects = []
     for fit in fits:
-        seen = sights(log, cloud, fit.used, np.zeros(len(fit.used), dtype=np.intp))
+        seen = recorded_pulses(log, cloud, fit.used, np.zeros(len(fit.used), dtype=np.intp))
         turns, shifts = motions(seen, cloud.rig)
         arms = cloud.p_base[fit.used] - aimed(seen, cloud.rig).origins_base
         effects.append((shifts + np.cross(turns, arms[:, None])).mean(axis=0).T)
@@ -131,8 +138,8 @@ def _solved(pairs: list[_Pair]) -> Array:
         N = np.einsum("k,kip,kij,kjq->pq", trust, J, weights, J)
         is_free, _ = separable(N, MOUNTING)
         free = np.flatnonzero(is_free)
-        pull = np.einsum("k,kip,kij,kj->p", trust, J, weights, gaps)
-        changes[free] = np.linalg.solve(N[np.ix_(free, free)], pull[free])
+        rhs = np.einsum("k,kip,kij,kj->p", trust, J, weights, gaps)
+        changes[free] = np.linalg.solve(N[np.ix_(free, free)], rhs[free])
         left = gaps - J @ changes[: len(MOUNTING)]
         squares = np.einsum("ki,kij,kj->k", left, weights, left)
         trust = 1.0 / (1.0 + squares / (3.0 * max(float(np.median(squares)), 1.0)))

@@ -1,4 +1,4 @@
-"""How shots depend on the rig: hides its parameters, their order and their derivatives.
+"""How pulses depend on the rig: its parameters, their order and their derivatives.
 
 A parameter moves a beam as a rigid body: it turns it about its origin and shifts the origin. The
 range to a sphere changes by what the same motion of the sphere the other way would change it.
@@ -21,11 +21,11 @@ _NS = 1e-9  # [s] in a nanosecond
 _REFLECTIVITIES = np.array([5.0, 15.0, 40.0, 100.0])  # limits between classes of noise
 
 N_SHADES = len(_REFLECTIVITIES) + 1
-"""Classes of reflectivity: a VLP-16 measures what answers weakly with twice the noise."""
+"""Classes of reflectivity: weak returns of a VLP-16 have twice the noise."""
 
 
 class Parameter(NamedTuple):
-    """One number of a rig: what it is, and what to say when it is not estimated.
+    """One number of a rig, with the reasons for holding it.
 
     Attributes
     ----------
@@ -36,7 +36,7 @@ class Parameter(NamedTuple):
     twin : str
         What else does the same to the observations.
     caution : str
-        Why it is held even where observations tell it; empty if it is not.
+        Why it is held even where observations determine it; empty if it is not.
     """
 
     name: str
@@ -56,7 +56,7 @@ MOUNTING = (
     Parameter("encoder_cosine", "rad", _ANGLE, "the spheres stand in too few directions"),
     Parameter("encoder_sine", "rad", _ANGLE, "the spheres stand in too few directions"),
 )
-"""What the difference between the two faces tells."""
+"""Determined by the differences between the two faces."""
 
 OTHERS = (
     Parameter(
@@ -81,13 +81,13 @@ OTHERS = (
         "the beams that is assumed; compare distances between marks with known ones",
     ),
 )
-"""What coordinates of the spheres, or a varying speed, would be needed for."""
+"""Determined only by coordinates of the spheres, or by a varying speed of the gimbal."""
 
 GIMBAL = MOUNTING + OTHERS
 
 
-class Sights(NamedTuple):
-    """Shots at spheres as the rig recorded them, before anything of the rig was applied.
+class Pulses(NamedTuple):
+    """Pulses at spheres as recorded, before anything of the rig was applied.
 
     Attributes
     ----------
@@ -98,7 +98,7 @@ class Sights(NamedTuple):
     ranges : (n,)
         Ranges, bias included [m].
     angles : (n,)
-        Recorded gimbal angle at the instant of the shot on the gimbal's own clock [rad].
+        Recorded gimbal angle at the instant of the pulse on the gimbal's own clock [rad].
     rates : (n,)
         Speed of the gimbal [rad/s].
     rings : (n,) uint8
@@ -122,8 +122,8 @@ class Sights(NamedTuple):
     divergence: Array
 
     @classmethod
-    def joined(cls, parts: list[Sights]) -> Sights:
-        """Return the shots of several stops as one table; spheres are numbered on."""
+    def joined(cls, parts: list[Pulses]) -> Pulses:
+        """Return the pulses of several stops as one table; spheres are numbered on."""
         firsts = np.cumsum([0, *(part.which.max(initial=-1) + 1 for part in parts)])
         numbered = [
             part._replace(which=part.which + first)
@@ -135,7 +135,7 @@ class Sights(NamedTuple):
         )
 
 
-def sights(log: ScanLog, cloud: StitchedCloud, rows: Index, which: Index) -> Sights:
+def recorded_pulses(log: ScanLog, cloud: StitchedCloud, rows: Index, which: Index) -> Pulses:
     """Undo the stitching of some returns."""
     rig, table = cloud.rig, beams(cloud, rows)
     turned = cloud.gimbal_angles[rows].astype(np.float64)
@@ -145,7 +145,7 @@ def sights(log: ScanLog, cloud: StitchedCloud, rows: Index, which: Index) -> Sig
     biases[: len(rig.laser_range_biases)] = rig.laser_range_biases
     heights = np.zeros(256)
     heights[: len(rig.laser_heights)] = rig.laser_heights
-    return Sights(
+    return Pulses(
         v_lidar=v_head @ rig.T_head_lidar[:3, :3],
         heights=heights[table.rings],
         ranges=table.ranges + biases[table.rings],
@@ -159,7 +159,7 @@ def sights(log: ScanLog, cloud: StitchedCloud, rows: Index, which: Index) -> Sig
 
 
 def _rates(log: ScanLog, rig: Rig, times: Array) -> Array:
-    """Return the speed of the gimbal [rad/s] at times since the stop's first shot."""
+    """Return the speed of the gimbal [rad/s] at times since the stop's first pulse."""
     first = int(log.stamps_lidar_ns.min())
     joints = (log.stamps_gimbal_ns - first) * _NS + rig.gimbal_clock_offset
     later, earlier = times + 0.5 * _RATE_WINDOW, times - 0.5 * _RATE_WINDOW
@@ -185,15 +185,15 @@ def _turn(v: Array, angles: Array) -> Array:
     return np.stack([c * x - s * y, s * x + c * y, z], axis=1)
 
 
-def angles_of(seen: Sights, rig: Rig) -> Array:
-    """Return the true gimbal angle of shots, if the rig is right."""
+def angles_of(seen: Pulses, rig: Rig) -> Array:
+    """Return the true gimbal angles of pulses, if the rig is right."""
     cosine, sine = rig.encoder_eccentricity
-    at_shot = seen.angles - seen.rates * rig.gimbal_clock_offset
-    return np.asarray(at_shot + cosine * np.cos(at_shot) + sine * np.sin(at_shot))
+    at_pulse = seen.angles - seen.rates * rig.gimbal_clock_offset
+    return np.asarray(at_pulse + cosine * np.cos(at_pulse) + sine * np.sin(at_pulse))
 
 
-def aimed(seen: Sights, rig: Rig) -> Beams:
-    """Return shots as lines in the base frame."""
+def aimed(seen: Pulses, rig: Rig) -> Beams:
+    """Return pulses as lines in the base frame."""
     angles, R = angles_of(seen, rig), rig.T_head_lidar[:3, :3]
     directions = _turn(seen.v_lidar @ R.T, angles)
     spin = _turn(R[:, 2], angles)
@@ -213,7 +213,7 @@ def aimed(seen: Sights, rig: Rig) -> Beams:
     )
 
 
-def motions(seen: Sights, rig: Rig) -> tuple[Array, Array]:
+def motions(seen: Pulses, rig: Rig) -> tuple[Array, Array]:
     """Return how each parameter moves each beam."""
     angles = angles_of(seen, rig)
     table = aimed(seen, rig)
@@ -231,10 +231,10 @@ def motions(seen: Sights, rig: Rig) -> tuple[Array, Array]:
     turns["spin_axis_heading"] = np.tile(z, (n, 1))
     for name in ("spin_axis_tilt", "spin_axis_heading"):
         shifts[name] = seen.heights[:, None] * np.cross(turns[name], turns["spin_zero"])
-    at_shot = seen.angles - seen.rates * rig.gimbal_clock_offset
+    at_pulse = seen.angles - seen.rates * rig.gimbal_clock_offset
     by_angle = {
-        "encoder_cosine": np.cos(at_shot),
-        "encoder_sine": np.sin(at_shot),
+        "encoder_cosine": np.cos(at_pulse),
+        "encoder_sine": np.sin(at_pulse),
         "gimbal_clock_offset": -seen.rates,
     }
     for name, factors in by_angle.items():
@@ -250,8 +250,8 @@ def motions(seen: Sights, rig: Rig) -> tuple[Array, Array]:
     )
 
 
-class Design(NamedTuple):
-    """Residuals of shots with their derivatives.
+class Linearised(NamedTuple):
+    """Residuals of pulses with their derivatives.
 
     Attributes
     ----------
@@ -274,8 +274,8 @@ class Design(NamedTuple):
     bends: Array
 
 
-def design(seen: Sights, rig: Rig, centres: Array, covs: Array, radius: float) -> Design:
-    """Compare shots with spheres.
+def linearise(seen: Pulses, rig: Rig, centres: Array, covs: Array, radius: float) -> Linearised:
+    """Compare pulses with spheres.
 
     Notes
     -----
@@ -293,7 +293,7 @@ def design(seen: Sights, rig: Rig, centres: Array, covs: Array, radius: float) -
     J_rig[:, -1] = 1.0  # a range that is measured too long
     along = np.einsum("ni,ni->n", J, table.directions_base)
     slopes2 = np.maximum(np.einsum("ni,ni->n", J, J) - along**2, 0.0)
-    return Design(
+    return Linearised(
         residuals=table.ranges - ranges,
         J_centres=J,
         J_rig=J_rig,

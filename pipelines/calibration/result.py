@@ -41,7 +41,7 @@ class Calibration:
     Attributes
     ----------
     rig : Rig
-        The estimated rig; what the scans do not tell is as in the start rig.
+        The estimated rig; what was held is as in the start rig.
     start : Rig
         The rig that it began with.
     names : tuple of str
@@ -53,7 +53,7 @@ class Calibration:
     cov : (p, p)
         Covariance of the estimates; singular, because the mean of the laser biases is held.
     inseparable : tuple of Inseparable
-        Parameters that the scans do not tell, with reasons.
+        Parameters that the scans do not determine, with reasons.
     stops : tuple of str
         Names of the stops that were used.
     n_spheres : int
@@ -71,9 +71,9 @@ class Calibration:
         Root mean square residual of the same returns with the start rig and with the estimated
         one, the centres adjusted to either [m].
     basis : (p, k)
-        The parameters by independent unknowns: biases of lasers are told only against their mean.
+        The parameters by independent unknowns: biases of lasers have their mean held.
     weights : (k, k)
-        What the two faces tell of those unknowns, whatever all ranges are too long.
+        Normal matrix of those unknowns, the common range bias eliminated.
     scans : mapping of str to Scan
         The centres of each stop, adjusted together with the rig.
     """
@@ -146,7 +146,7 @@ class Calibration:
         return np.asarray(self.scans[stop].effects[fit])
 
     def corrected(self, changes: Array, cov: Array) -> Calibration:
-        """Return the calibration after more was learnt of the rig.
+        """Return the calibration after a correction of the rig.
 
         Parameters
         ----------

@@ -177,7 +177,7 @@ class Network:
         Approximate marks [m].
     shared : Shared
         What all stations have in common.
-    doubts : (m,) tuple of str
+    suspicions : (m,) tuple of str
         Why each mark may be false, as a sentence for people; empty where there is no reason.
     refused : tuple of Refusal
         Stations that share too little with the others.
@@ -201,7 +201,7 @@ class Network:
     T_site_base: Array
     p_site: Array
     shared: Shared
-    doubts: tuple[str, ...]
+    suspicions: tuple[str, ...]
     refused: tuple[Refusal, ...] = ()
     left_out: tuple[LeftOut, ...] = ()
 
@@ -228,8 +228,8 @@ class Network:
             raise InputError(f"There are {n} centres, but effects on {len(self.shared.effects)}.")
         if len(self.markers) != n:
             raise InputError(f"There are {n} centres, but names of {len(self.markers)}.")
-        if len(self.doubts) != m:
-            raise InputError(f"There are {m} marks, but doubts about {len(self.doubts)}.")
+        if len(self.suspicions) != m:
+            raise InputError(f"There are {m} marks, but suspicions about {len(self.suspicions)}.")
 
     @property
     def sigma_range(self) -> float:

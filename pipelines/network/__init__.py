@@ -1,9 +1,11 @@
 """Many stations and marks, adjusted together.
 
-Hides which marker of which station is which mark (``assembly``), the structure of the normal
-equations (``equations``) and the tests (``adjusting``). A network is assembled first and adjusted
-then, because what was observed is worth looking at before it is judged: the refused stations and
-the exported observations need no adjustment.
+- ``assembly``: which marker of which station is which mark, and approximate values
+- ``normal_equations``, ``snooping``: solution and tests
+- ``adjustment``: the result with reliability and warnings
+
+A network is assembled first and adjusted then: refused stations and exported observations need no
+adjustment.
 """
 
 from spheremark.pipelines.model.network import (

@@ -1,4 +1,4 @@
-"""Network -> AdjustedNetwork: hides reliability, predictions, and what is said of the result."""
+"""Network -> AdjustedNetwork: adjustment, reliability, predictions and warnings."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ from spheremark.pipelines.network.repeated_stops import repeated_stops
 from spheremark.pipelines.network.snooping import Tested, own_marks, snoop_network
 
 _FALSE_ALARM = 0.05  # probability that a network without gross errors loses an observation
-_UNTOLD = 1e-9  # the same below which nothing else tells where a control mark is
+_UNCHECKED = 1e-9  # redundancy below which a control mark is determined by itself alone
 _N_CHECKED = 3  # marks of which a station shows an error in one
 _MANY_LEFT_OUT = 1.0 / 3.0  # of the centres: not they are bad, but the sigmas; or of control
 
@@ -172,7 +172,7 @@ def _predicted_control(network: Network, tested: Tested) -> tuple[Array, Array]:
     weights, solid = tested.lin.P_control, tested.blocks[2].testability
     for row in np.flatnonzero(tested.used[first:]):
         eigenvalues = np.linalg.eigvalsh(solid[row])
-        if eigenvalues[0] <= _UNTOLD * np.linalg.eigvalsh(weights[row])[0]:
+        if eigenvalues[0] <= _UNCHECKED * np.linalg.eigvalsh(weights[row])[0]:
             shifts[row], covs[row] = np.nan, np.nan
             continue
         covs[row] = np.linalg.inv(solid[row])
@@ -181,12 +181,12 @@ def _predicted_control(network: Network, tested: Tested) -> tuple[Array, Array]:
 
 
 def _mark_weaknesses(network: Network, tested: Tested) -> tuple[str, ...]:
-    """Say of each mark why it should be used with care."""
+    """Return why each mark should be used with care."""
     n = len(network.sightings)
     counts = np.bincount(network.sightings[tested.used[:n], 1], minlength=len(network.marks))
     out = []
-    for mark, doubt in enumerate(network.doubts):
-        reasons = [doubt] if doubt else []
+    for mark, suspicion in enumerate(network.suspicions):
+        reasons = [suspicion] if suspicion else []
         if counts[mark] == 1 and mark not in network.controls:
             reasons.append("Seen from one station only, and so unchecked.")
         out.append(" ".join(reasons))
@@ -236,7 +236,7 @@ def _variance_factors(network: Network, tested: Tested) -> Array:
 def _left_out(
     network: Network, tested: Tested, dropped: Dropped, critical: float
 ) -> tuple[LeftOut, ...]:
-    """Say which blocks the tests left out, and why."""
+    """Return which blocks the tests left out, and why."""
     n, s = len(network.sightings), len(network.stations)
     out = []
     for block, w in dropped:
@@ -278,7 +278,7 @@ def _warnings(
     left_out: tuple[LeftOut, ...],
     level: float,
 ) -> tuple[str, ...]:
-    """Say why the network cannot be relied on."""
+    """Return why the network is weak."""
     n, s = len(network.sightings), len(network.stations)
     warnings = []
     if not tested.passes(level):
@@ -308,16 +308,20 @@ def _warnings(
     if n_bad and n_bad > _MANY_LEFT_OUT * n:
         warnings.append(f"{n_bad} of {n} centres had to be left out.")
     per_mark = np.bincount(network.sightings[tested.used[:n], 1], minlength=len(network.marks))
-    lonely = [network.marks[m] for m in np.flatnonzero(per_mark == 1) if m not in network.controls]
-    if lonely:
-        warnings.append(f"Seen from one station only, and so unchecked: {', '.join(lonely)}.")
+    unchecked = [
+        network.marks[m] for m in np.flatnonzero(per_mark == 1) if m not in network.controls
+    ]
+    if unchecked:
+        warnings.append(f"Seen from one station only, and so unchecked: {', '.join(unchecked)}.")
     per_station = np.bincount(network.sightings[tested.used[:n], 0], minlength=s)
     loose = [network.stations[i] for i in np.flatnonzero(per_station < _N_CHECKED)]
     if loose:
         warnings.append(
             f"Held by two marks only, where an error in one would not show: {', '.join(loose)}."
         )
-    doubtful = [name for name, doubt in zip(network.marks, network.doubts, strict=True) if doubt]
-    if doubtful:
-        warnings.append(f"Marks that may be false: {', '.join(doubtful)}; the reasons stand there.")
+    suspect = [
+        name for name, suspicion in zip(network.marks, network.suspicions, strict=True) if suspicion
+    ]
+    if suspect:
+        warnings.append(f"Marks that may be false: {', '.join(suspect)}; the reasons stand there.")
     return tuple(warnings)

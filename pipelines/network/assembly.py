@@ -1,6 +1,6 @@
-"""Fits of many stations -> Network: hides which marker is which mark, and approximate values.
+"""Fits of many stations -> Network: which marker is which mark, and approximate values.
 
-Nobody labels a sphere. A map of marks grows from the control marks, or from one station: each
+Markers carry no labels. A map of marks grows from the control marks, or from one station: each
 station is matched to the map as it is, and its markers that are not in the map yet enlarge it.
 """
 
@@ -25,12 +25,12 @@ from spheremark.pipelines.errors import (
 from spheremark.pipelines.geometry import levelling_rotation, rigid, transform
 from spheremark.pipelines.model import Array, ControlMarks, MarkerFits
 from spheremark.pipelines.model.network import LeftOut, Network, Refusal, Shared
-from spheremark.pipelines.network.false_marks import doubt
+from spheremark.pipelines.network.false_marks import suspect_marks
 from spheremark.pipelines.positioning.hypotheses import Spans, spans_between
 from spheremark.pipelines.positioning.matching import gather, match_marks, shared_variances
 
 _EXACT = 1e-5  # [m] sigma of control marks that are given as exact: far below any survey's
-_NO_MARK, _DOUBTED = -1, -2  # in place of a mark: none is near; the one that is near may be false
+_NO_MARK, _SUSPECT = -1, -2  # in place of a mark: none is near; the one that is near may be false
 _STEEP = 1e-3  # of a line of sight that is nearly the gimbal axis: across is no direction there
 _NEAR_CONTROL = 1.0  # [m] how far a mark can be from a control mark and still be worth a remark
 
@@ -95,7 +95,7 @@ def assemble(
     config: ResectionConfig,
     calibration: Calibration | None = None,
 ) -> Network:
-    """Find out which markers of a survey's stations are the same, and where all stand roughly.
+    """Match the markers of all stations, and find approximate values.
 
     Parameters
     ----------
@@ -107,8 +107,8 @@ def assemble(
     config : ResectionConfig
         Tolerance of matching.
     calibration : Calibration, optional
-        The rig as both faces of the spheres tell it: its parameters become unknowns of the network.
-        Centres that it adjusted take the place of those of ``scans``.
+        The rig as estimated from both faces of the spheres: its parameters become unknowns of the
+        network. Centres that it adjusted take the place of those of ``scans``.
 
     Returns
     -------
@@ -137,33 +137,33 @@ def assemble(
     if calibration is not None:
         scans = [(name, calibration.adjusted(name, fits)) for name, fits in scans]
     found, reasons = _grow(scans, control, config)
-    used, lonely = _shared(found)
-    doubts, dropped = doubt(scans, found, used)
+    used, unshared = _shared(found)
+    suspicions, dropped = suspect_marks(scans, found, used)
     for i, fit in dropped:
-        found.marks_of[i][fit] = _DOUBTED
+        found.marks_of[i][fit] = _SUSPECT
     if dropped:
-        used, lonely = _shared(found)
+        used, unshared = _shared(found)
     refused = tuple(
         Refusal(station=names[i], code=DegenerateGeometryError.code, reason=reason)
         if isinstance(reason, str)
         else Refusal(station=names[i], code=reason.code, reason=_why(scans[i][1], found, reason))
         for i, reason in _refused(len(scans), used, reasons)
     )
-    _refuse_nothing(used, found, control, _telling(refused, [names[i] for i in reasons]))
-    network = _network(scans, found, used, doubts)
+    _refuse_nothing(used, found, control, _foremost(refused, [names[i] for i in reasons]))
+    network = _network(scans, found, used, suspicions)
     cov_p_base = network.cov_p_base + config.sigma_common**2 * np.eye(3)
     if calibration is None:
         fits = {name: found_there.fits for name, found_there in scans}
         rows = zip(network.sightings[:, 0], network.fits, strict=True)
-        told = [fits[network.stations[i]][fit].sigma_range_shared for i, fit in rows]
-        cov_p_base = _own(network.p_base, cov_p_base, np.array(told), config)
+        sigmas = [fits[network.stations[i]][fit].sigma_range_shared for i, fit in rows]
+        cov_p_base = _own(network.p_base, cov_p_base, np.array(sigmas), config)
     network = replace(
         network,
         cov_p_base=cov_p_base,
         shared=_in_common(network, config, calibration),
         refused=refused,
     )
-    return replace(network, left_out=_unseen(scans, found, used, lonely, dropped))
+    return replace(network, left_out=_unseen(scans, found, used, unshared, dropped))
 
 
 def _grow(
@@ -217,7 +217,7 @@ def _chain(
                 marks, spans = found.as_control()
                 scene = gather(fits, marks, config)
                 match = match_marks(scene, config, spans)
-                if len(match.rivals):
+                if len(match.alternatives):
                     raise AmbiguousMatchError("Two markers fit the map in several ways.")
             except SolveError as error:
                 failed[i] = error
@@ -249,11 +249,11 @@ def _shared(found: _Map) -> tuple[dict[int, list[tuple[int, int]]], dict[int, li
         if not weak:
             break
         stations -= weak
-    lonely = {
+    unshared = {
         i: [f for f in range(len(found.marks_of[i])) if f not in {fit for fit, _ in pairs}]
         for i, pairs in used.items()
     }
-    return used, lonely
+    return used, unshared
 
 
 def _refused(
@@ -265,7 +265,7 @@ def _refused(
 
 
 def _why(fits: MarkerFits, found: _Map, error: SolveError) -> str:
-    """Say why a station could not be matched to the network."""
+    """Return why a station could not be matched to the network."""
     n, m = len(fits.fits), len(found.names)
     if n < 2:
         seen = "One marker was" if n else "No marker was"
@@ -285,8 +285,8 @@ def _why(fits: MarkerFits, found: _Map, error: SolveError) -> str:
     return f"It cannot be tied to the network: {error}"
 
 
-def _telling(refused: tuple[Refusal, ...], unmatched: list[str]) -> Refusal | None:
-    """Return the refusal that tells most: that of a station which could not be matched."""
+def _foremost(refused: tuple[Refusal, ...], unmatched: list[str]) -> Refusal | None:
+    """Return the most informative refusal: that of a station which could not be matched."""
     return next((one for one in refused if one.station in unmatched), next(iter(refused), None))
 
 
@@ -296,7 +296,7 @@ def _refuse_nothing(
     control: ControlMarks | None,
     refused: Refusal | None,
 ) -> None:
-    """Raise where no network is left, with what a refused station tells of it."""
+    """Raise where no network is left, with the reason of a refused station."""
     first = f" {refused.station}: {refused.reason}" if refused else ""
     if not used or (control is None and len(used) < 2):
         ties = "no two stations share two marks; give more scans, or control marks"
@@ -321,12 +321,12 @@ def _unseen(
     scans: Sequence[Scan],
     found: _Map,
     used: dict[int, list[tuple[int, int]]],
-    lonely: dict[int, list[int]],
+    unshared: dict[int, list[int]],
     dropped: dict[tuple[int, int], str],
 ) -> tuple[LeftOut, ...]:
-    """Say which centres are no marks of the network, and which control marks nobody saw."""
+    """Return which centres are no marks of the network, and which control marks were not seen."""
     out = []
-    for i, fits in lonely.items():
+    for i, fits in unshared.items():
         for fit in fits:
             reason = "No other station sees it: it ties nothing, and may be false."
             if found.marks_of[i][fit] == _NO_MARK:
@@ -344,7 +344,7 @@ def _unseen(
 
 
 def _beside(found: _Map, mark: int, seen: set[int]) -> str:
-    """Name the seen mark that stands beside a control mark which nobody saw."""
+    """Return the seen mark that stands beside a control mark which was not seen."""
     new = [other for other in seen if other >= found.n_control]
     if not new:
         return ""
@@ -362,7 +362,7 @@ def _network(
     scans: Sequence[Scan],
     found: _Map,
     used: dict[int, list[tuple[int, int]]],
-    doubts: dict[int, str],
+    suspicions: dict[int, str],
 ) -> Network:
     """Bring stations and marks that are used into columns."""
     places = sorted({mark for pairs in used.values() for _, mark in pairs})
@@ -392,23 +392,23 @@ def _network(
         T_site_base=np.array([found.poses[i] for i in used]),
         p_site=np.array([found.p_site[mark] for mark in places]),
         shared=Shared.none(len(fits)),
-        doubts=tuple(doubts.get(mark, "") for mark in places),
+        suspicions=tuple(suspicions.get(mark, "") for mark in places),
     )
 
 
-def _own(p_base: Array, cov_p_base: Array, told: Array, config: ResectionConfig) -> Array:
+def _own(p_base: Array, cov_p_base: Array, sigmas: Array, config: ResectionConfig) -> Array:
     """Return the covariances of centres without the error of range that all of them share."""
     v = p_base / np.linalg.norm(p_base, axis=1, keepdims=True)
-    variances = shared_variances(p_base, cov_p_base, told, config)
+    variances = shared_variances(p_base, cov_p_base, sigmas, config)
     return np.asarray(cov_p_base - variances[:, None, None] * v[:, :, None] * v[:, None, :])
 
 
 def _symmetric(p_base: Array, cov_p_base: Array) -> Array:
     """Return the covariances of centres without what correlates along, across and above.
 
-    A sphere looks alike on all sides of the line of sight. What correlation its returns show comes
-    from where the centre happened to be put, and as a weight would turn errors across the line of
-    sight into errors along it: over many stations the ring of marks swells by 0.2 mm.
+    A sphere is symmetric about the line of sight. A correlation in its returns comes from where the
+    centre was linearised, and as a weight would turn errors across the line of sight into errors
+    along it: over many stations the ring of marks swells by 0.2 mm.
     """
     along = p_base / np.linalg.norm(p_base, axis=1, keepdims=True)
     across = np.column_stack([-along[:, 1], along[:, 0], np.zeros(len(along))])

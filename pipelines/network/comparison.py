@@ -1,4 +1,4 @@
-"""A network against truth: hides which mark is which, and how the datum is taken out."""
+"""A network against truth, without the datum."""
 
 from __future__ import annotations
 

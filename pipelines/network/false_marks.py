@@ -1,4 +1,4 @@
-"""Marks that may be false: hides what is expected of a true one."""
+"""Marks that may be false."""
 
 from __future__ import annotations
 
@@ -14,21 +14,21 @@ if TYPE_CHECKING:
 
 _FEW = 2.0  # fewer than one in so many of the stations that stand near: a mark may be false
 _VERY_FEW = 4.0  # and then it most likely is
-_N_HOLD = 3  # marks that a station keeps, doubtful ones included
+_N_HOLD = 3  # marks that a station keeps, suspect ones included
 _ODD_SIGMAS, _ODD_SLACK = 3.29, 0.006  # [m] by which the mean radius of a sphere may be off
 
 Scan = tuple[str, MarkerFits]
 
 
-def doubt(
+def suspect_marks(
     scans: Sequence[Scan], found: _Map, used: dict[int, list[tuple[int, int]]]
 ) -> tuple[dict[int, str], dict[tuple[int, int], str]]:
-    """Say which marks may be false, and which centres go because theirs most likely is.
+    """Return which marks may be false, and which centres are dropped because theirs most likely is.
 
     A sphere is seen from all around. What only a few see, of all the stations that stand as near to
     it, is no mark for the network, unless a station would stand on too few others.
     """
-    doubts: dict[int, str] = {}
+    suspicions: dict[int, str] = {}
     dropped: dict[tuple[int, int], str] = {}
     n_marks = {i: len(pairs) for i, pairs in used.items()}
     places = np.array([found.poses[i][:3, 3] for i in used])
@@ -49,8 +49,8 @@ def doubt(
             for i, _ in seen:
                 n_marks[i] -= 1
         elif reason:
-            doubts[mark] = reason.strip()
-    return doubts, dropped
+            suspicions[mark] = reason.strip()
+    return suspicions, dropped
 
 
 def _sightings(used: dict[int, list[tuple[int, int]]]) -> dict[int, list[tuple[int, int]]]:
@@ -71,7 +71,7 @@ def _as_near(
 
 
 def _odd_radius(fits: list[MarkerFit]) -> str:
-    """Say that the sightings of a mark agree on another radius; empty if they do not."""
+    """Return that the sightings of a mark agree on another radius; empty if they do not."""
     known = [fit for fit in fits if np.isfinite(fit.radius_free) and fit.sigma_radius_free > 0.0]
     if not known:
         return ""

@@ -1,4 +1,4 @@
-"""Normal equations of a network: hides their structure.
+"""Normal equations of a network.
 
 A station meets others only through marks, so the stations are eliminated and what remains is a
 dense system of the marks and of what all stations share. All coordinates are relative to the middle

@@ -1,4 +1,4 @@
-"""Stops that were made twice: hides how two scans of one place are laid on each other."""
+"""Stops that were made twice: two scans of one place, compared."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Network -> Tested: hides the solution, its tests, and which observations they leave out."""
+"""Solution of a network with its tests and data snooping."""
 
 from __future__ import annotations
 

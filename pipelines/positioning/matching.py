@@ -1,6 +1,6 @@
-"""Which marker is which control mark: hides rivals, refinement and the tests of a match.
+"""Which marker is which control mark, with the tests of a match.
 
-Nobody labels a sphere. All is computed in a site frame that is shifted to the middle of the
+Markers carry no labels. All is computed in a site frame that is shifted to the middle of the
 control marks, so that large coordinates cost no digits.
 """
 
@@ -44,10 +44,12 @@ from spheremark.pipelines.positioning.hypotheses import (
     pairs_far_first,
 )
 
-_N_SOLUTIONS = 6  # that are refined: the best, and rivals enough to see that it is ambiguous
+_N_SOLUTIONS = 6  # that are refined: the best, and alternatives enough to see an ambiguity
 _N_ROUNDS = 8  # of adjusting and matching again; two or three are the rule
-_RIVAL = 14.0  # -2 ln(0.001): how much better, in the weighted sum of squares, the best must be
-_RIVAL_SHARE = 0.5  # of what the best holds, at least, that a rival must hold before it is refined
+_ALTERNATIVE = (
+    14.0  # -2 ln(0.001): how much better, in the weighted sum of squares, the best must be
+)
+_ALTERNATIVE_SHARE = 0.5  # of the matches of the best that an alternative needs to be refined
 _N_DISSENT = 3  # other markers that agree on another place: control contradicts itself
 _PAIR = 25.0  # weighted sum of squares (2 dof) above which two markers are not those two marks
 _CHANCE = 0.01  # expected number of chance agreements above which a match is none
@@ -57,7 +59,7 @@ _SHARE = 0.4  # of markers or marks, the fewer: of mirrored fields five in fourt
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class Scene:
-    """All that a station is positioned from, as arrays.
+    """The observations and control of a station, as arrays.
 
     Attributes
     ----------
@@ -123,7 +125,7 @@ class Match:
         Degrees of freedom.
     largest_residual : float
         Of the matched fits [m].
-    rivals : (k, 3)
+    alternatives : (k, 3)
         Where base would stand, relative to the middle of the marks, by other matches of two
         markers that explain them about as well; no rows for three or more [m].
     dissent : (k, 4)
@@ -136,7 +138,7 @@ class Match:
     vtpv: float
     dof: int
     largest_residual: float
-    rivals: Array = field(default_factory=lambda: np.zeros((0, 3)))
+    alternatives: Array = field(default_factory=lambda: np.zeros((0, 3)))
     dissent: Array = field(default_factory=lambda: np.zeros((0, 4)))
 
     @property
@@ -152,7 +154,7 @@ class Match:
 
 
 def gather(fits: MarkerFits, marks: ControlMarks, config: ResectionConfig) -> Scene:
-    """Gather what is known about a station.
+    """Gather observations and control of a station.
 
     Parameters
     ----------
@@ -166,7 +168,7 @@ def gather(fits: MarkerFits, marks: ControlMarks, config: ResectionConfig) -> Sc
     Returns
     -------
     Scene
-        The same as arrays.
+        Both as arrays.
     """
     levelling = fits.levelling
     R_station_base = levelling_rotation(levelling)
@@ -176,7 +178,7 @@ def gather(fits: MarkerFits, marks: ControlMarks, config: ResectionConfig) -> Sc
     p_base = np.stack([fit.p_base for fit in fits.fits])
     cov_p_base = np.stack([fit.cov_p_base for fit in fits.fits])
     cov_p_base += config.sigma_common**2 * np.eye(3)
-    told = np.array([fit.sigma_range_shared for fit in fits.fits])
+    sigmas_shared = np.array([fit.sigma_range_shared for fit in fits.fits])
     return Scene(
         names=marks.names,
         centres_base=p_base,
@@ -190,13 +192,13 @@ def gather(fits: MarkerFits, marks: ControlMarks, config: ResectionConfig) -> Sc
         is_levelled=levelling.is_measured,
         sigma_heading=levelling.sigma_heading,
         sigma_range=config.sigma_range,
-        shared=shared_variances(p_base, cov_p_base, told, config),
+        shared=shared_variances(p_base, cov_p_base, sigmas_shared, config),
         sigma_height=config.sigma_height,
     )
 
 
 def shared_variances(
-    p_base: Array, cov_p_base: Array, told: Array, config: ResectionConfig
+    p_base: Array, cov_p_base: Array, sigmas_shared: Array, config: ResectionConfig
 ) -> Array:
     """Return how much of the variance of centres is an error of range that they all share.
 
@@ -206,10 +208,10 @@ def shared_variances(
         Centres [m].
     cov_p_base : (n, 3, 3)
         Their covariances [m^2].
-    told : (n,)
-        The sigma that they share, as their fits have it; NaN where these do not tell [m].
+    sigmas_shared : (n,)
+        The sigma of range that they share, from their fits; NaN where these have none [m].
     config : ResectionConfig
-        The same for those that do not.
+        The same sigma for those without.
 
     Returns
     -------
@@ -225,7 +227,7 @@ def shared_variances(
     """
     v = p_base / np.linalg.norm(p_base, axis=1, keepdims=True)
     own = 1.0 / np.einsum("ni,ni->n", v, np.linalg.solve(cov_p_base, v[..., None])[..., 0])
-    sigmas = np.where(np.isfinite(told), told, config.sigma_range_shared)
+    sigmas = np.where(np.isfinite(sigmas_shared), sigmas_shared, config.sigma_range_shared)
     return np.asarray(np.minimum(sigmas**2, _SHARED * own))
 
 
@@ -244,7 +246,7 @@ def cov_of_shared(scene: Scene, variances: Array, of_ranges: Array, of_heights: 
 
 
 def match_marks(scene: Scene, config: ResectionConfig, spans: Spans | None = None) -> Match:
-    """Find out which fit is which mark.
+    """Match fits to marks.
 
     Parameters
     ----------
@@ -253,8 +255,8 @@ def match_marks(scene: Scene, config: ResectionConfig, spans: Spans | None = Non
     config : ResectionConfig
         How far a marker may be from its mark.
     spans : Spans, optional
-        Of these marks, at least as long as the fits are apart and a tolerance more; who matches
-        many stations to the same marks lists them once.
+        Distances between these marks, up to the largest between fits plus a tolerance; computed
+        once where many stations are matched to the same marks.
 
     Returns
     -------
@@ -275,9 +277,9 @@ def match_marks(scene: Scene, config: ResectionConfig, spans: Spans | None = Non
     Two fits and two marks with the same distance and the same difference of height give a heading
     and a translation; a mirror image never does. The poses with most votes are tried on all fits,
     the best are refined and compared. Two marks, or two markers, have one distance and one
-    difference of height: the pair that keeps both best is taken, and where else it would fit stands
-    in ``Match.rivals``. Cost grows with the square of the fits times the pairs of marks that are no
-    farther apart than they, to 300,000 pairs of pairs, then no more.
+    difference of height: the pair that keeps both best is taken, and ``Match.alternatives`` holds
+    where else it would fit. Cost grows with the square of the fits times the pairs of marks that
+    are no farther apart than they, to 300,000 pairs of pairs, then no more.
     """
     levelled = scene.centres_base @ scene.R_station_base.T
     _refuse_plumb_line(levelled, "markers", config)
@@ -296,10 +298,10 @@ def match_marks(scene: Scene, config: ResectionConfig, spans: Spans | None = Non
         )
     best = solutions[0]
     _refuse_chance(best, scene, config)
-    rivals = [other for other in solutions[1:] if _is_rival(other, best)]
-    if rivals:
+    n_others = sum(_is_alternative(other, best) for other in solutions[1:])
+    if n_others:
         raise AmbiguousMatchError(
-            f"{best.n} of {len(levelled)} markers fit the control marks in {len(rivals) + 1} or "
+            f"{best.n} of {len(levelled)} markers fit the control marks in {n_others + 1} or "
             "more different ways equally well: several pairs of marks have the same distances "
             "(a symmetric field). Survey more markers, or move one so that no distance repeats."
         )
@@ -307,7 +309,7 @@ def match_marks(scene: Scene, config: ResectionConfig, spans: Spans | None = Non
 
 
 def contradiction(match: Match, scene: Scene) -> str:
-    """Say that other markers agree on another place of the station."""
+    """Return that other markers agree on another place of the station; empty if none do."""
     if not len(match.dissent):
         return ""
     n, *place = match.dissent[0]
@@ -377,7 +379,7 @@ def solve_poses(scene: Scene, pairs: Index, start: Array) -> Solutions:
 
 
 def _refuse_plumb_line(p: Array, kind: str, config: ResectionConfig) -> None:
-    """Raise DegenerateGeometryError if no two points are apart enough to tell a heading."""
+    """Raise DegenerateGeometryError if no two points are apart enough to give a heading."""
     apart = float(np.linalg.norm(np.ptp(p[:, :2], axis=0)))
     if apart <= 2.0 * config.match_tolerance:
         raise DegenerateGeometryError(
@@ -398,8 +400,10 @@ def _matched_pair(levelled: Array, scene: Scene, config: ResectionConfig) -> Mat
             f"{config.match_tolerance} m, and what their sigmas allow): these are marks of another "
             "field, or false markers."
         )
-    rivals = np.flatnonzero(misfits <= misfits[best] + _RIVAL)
-    poses = [_pair_pose(levelled, scene, pairs[k]) for k in (best, *rivals[rivals != best])]
+    alternatives = np.flatnonzero(misfits <= misfits[best] + _ALTERNATIVE)
+    poses = [
+        _pair_pose(levelled, scene, pairs[k]) for k in (best, *alternatives[alternatives != best])
+    ]
     solution = solve_pose(scene, pairs[best], poses[0])
     marks = np.full(len(levelled), -1, dtype=np.intp)
     marks[pairs[best, :, 0]] = pairs[best, :, 1]
@@ -409,7 +413,7 @@ def _matched_pair(levelled: Array, scene: Scene, config: ResectionConfig) -> Mat
         vtpv=solution.vtpv,
         dof=2,
         largest_residual=float(np.linalg.norm(solution.groups[0].residuals, axis=1).max()),
-        rivals=np.array([T[:3, 3] for T in poses[1:]]).reshape(-1, 3),
+        alternatives=np.array([T[:3, 3] for T in poses[1:]]).reshape(-1, 3),
     )
 
 
@@ -466,7 +470,7 @@ def _solutions(
         if scores[best] <= 0:
             break
         refined = None
-        if counts[best] >= _RIVAL_SHARE * max((m.n for _, m in solutions), default=0):
+        if counts[best] >= _ALTERNATIVE_SHARE * max((m.n for _, m in solutions), default=0):
             yaw, translation = hypotheses.yaws[best], hypotheses.translations[best]
             T = rigid(rot_z(yaw) @ scene.R_station_base, translation)
             refined = _refined(marks[best], T, scene, config)
@@ -507,13 +511,13 @@ def _refined(
     return None
 
 
-def _is_rival(other: Match, best: Match) -> bool:
-    """Return whether another match explains the same markers about as well and differs."""
+def _is_alternative(other: Match, best: Match) -> bool:
+    """Return whether another match differs and explains as many markers about as well."""
     if _n_others(other, best) * 2 > other.n:
         return False
     shared = int(np.sum((other.marks == best.marks) & (best.marks >= 0)))
     worse = (other.vtpv - best.vtpv) / max(1.0, best.vtpv / best.dof)
-    return other.n >= best.n and 2 * shared < best.n and worse <= _RIVAL
+    return other.n >= best.n and 2 * shared < best.n and worse <= _ALTERNATIVE
 
 
 def _dissent(best: Match, others: list[Match], scene: Scene) -> Array:

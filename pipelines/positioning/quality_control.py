@@ -1,7 +1,7 @@
-"""What can be known of accuracy where no truth is: hides which comparisons are fair.
+"""Quality of a station without truth.
 
-Distances between marks in one scan need no station at all: they are the first thing to look at on
-site. A station is then tried without each of its markers, and each mark predicted from the others.
+Distances between marks in one scan need no station: they are the first check on site. A station is
+then computed without each of its markers, and each mark predicted from the others.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ _SURPRISE = 3.29  # sigmas that one in a thousand normal residuals exceeds
 _N_LEFT = 3  # markers at least, of which one can be left out
 _DISPLACED = 1.0  # [m] from a marker that is no mark: a mark without one may be given wrongly
 _N_POSE = 6  # unknowns: with as many more observations of centres, the levelling was left out
-_OPEN = 1e-9  # of the largest eigenvalue of a normal matrix: what is smaller tells nothing
+_OPEN = 1e-9  # of the largest eigenvalue of a normal matrix: what is smaller is undetermined
 _UNKNOWN = 1.0  # [rad] of a levelling that was left out
 
 
@@ -75,7 +75,7 @@ def check_distances(
     Parameters
     ----------
     fits : MarkerFits
-        Centres in base; nobody knows which mark is which.
+        Centres in base, not labelled.
     marks : ControlMarks
         Known places.
     config : ResectionConfig
@@ -131,7 +131,7 @@ def check_distances(
 def _displaced(scene: Scene, match: Match) -> Index:
     """Return markers and marks, (k, 2), that have no other and are nearest to each other.
 
-    Where fewer than three others agree, nothing tells that these belong together.
+    None where fewer than three others agree: then nothing shows that these belong together.
     """
     fits = np.flatnonzero(match.marks < 0)
     marks = np.setdiff1d(np.arange(len(scene.marks_site)), match.marks)

@@ -1,7 +1,7 @@
-"""MarkerFits + control marks -> StationFix: hides the adjustment and what weakens it.
+"""MarkerFits + control marks -> StationFix.
 
 A free station: the unknown is the full pose of ``base`` in ``site``; centres are observed in
-``base``, gravity is observed by the AHRS. Beside it positions from distances alone (``ranging``).
+``base``, gravity is observed by the AHRS. ``trilateration`` positions from distances alone.
 """
 
 from __future__ import annotations
@@ -63,7 +63,7 @@ def resect(
     method : str
         One of ``RESECTION_METHODS``.
     fits : MarkerFits
-        Centres in base with covariances; nobody knows which mark is which.
+        Centres in base with covariances, not labelled.
     marks : ControlMarks
         Known places of spheres; may be more or fewer than the fits.
     config : ResectionConfig
@@ -99,9 +99,9 @@ def free_station(fits: MarkerFits, marks: ControlMarks, config: ResectionConfig)
     and the horizontal part of the measured up direction, turned into the site, with that of the
     AHRS. To each centre ``sigma_common`` is added per axis and independently: a fit's covariance
     knows the noise of its returns, lasers and the mounting, not what changes from direction to
-    direction and moves both faces alike; the part that all centres share is a motion
-    of the pose and cannot be told from it. Where data snooping would leave out more than a third of
-    the markers, the sigmas are to blame: it is done again with w divided by sigma0. Gravity that
+    direction and moves both faces alike; the part that all centres share is a motion of the pose
+    and cannot be separated from it. Where data snooping would leave out more than a third of the
+    markers, the sigmas are to blame: it is done again with w divided by sigma0. Gravity that
     contradicts three or more marks is left out like a bad marker, and the fix is weak.
     """
     _refuse_too_few(fits, marks)
@@ -158,7 +158,7 @@ def _exclusions(
     adjustment: Adjustment,
     config: ResectionConfig,
 ) -> tuple[Exclusion, ...]:
-    """Say which markers were left out, and why."""
+    """Return which markers were left out, and why."""
     pairs = match.pairs
     placed = transform(adjustment.estimate, scene.centres_base)
     excluded = _false_markers(match, scene, adjustment.estimate, config)
@@ -177,7 +177,7 @@ def _exclusions(
 def _false_markers(
     match: Match, scene: Scene, T: Array, config: ResectionConfig
 ) -> list[Exclusion]:
-    """Say which markers are no control marks at a pose of base."""
+    """Return which markers are no control marks at a pose of base."""
     placed = transform(T, scene.centres_base)
     excluded = []
     for fit in np.flatnonzero(match.marks < 0):
@@ -196,9 +196,9 @@ def _weaknesses(
     adjustment: Adjustment,
     dropped: Dropped,
 ) -> list[str]:
-    """Say why a fix cannot be relied on."""
+    """Return why a fix is weak."""
     reasons = []
-    if len(match.rivals):
+    if len(match.alternatives):
         reasons.append(_other_places(scene, match))
     if against := contradiction(match, scene):
         reasons.append(against)
@@ -232,8 +232,8 @@ def _weaknesses(
 
 
 def _other_places(scene: Scene, match: Match) -> str:
-    """Say where else the station may stand, when two markers fit two marks in several ways."""
-    places = match.rivals + scene.middle
+    """Return where else the station may stand, when two markers fit two marks in several ways."""
+    places = match.alternatives + scene.middle
     text = ", ".join(f"({x:.2f}, {y:.2f}, {z:.2f})" for x, y, z in places[:3])
     more = f" and {len(places) - 3} more places" if len(places) > 3 else ""
     return (
@@ -306,7 +306,7 @@ def _cov_heading(scene: Scene, T_site_base: Array) -> Array:
 
 def _shifts_of_choice(scene: Scene, match: Match, T_site_base: Array) -> Array:
     """Return how far off the other places are where the station may stand as well, (k, 3) [m]."""
-    return np.asarray(match.rivals + scene.middle - T_site_base[:3, 3])
+    return np.asarray(match.alternatives + scene.middle - T_site_base[:3, 3])
 
 
 def _cov_choice(scene: Scene, shifts: Array, T_site_base: Array) -> Array:

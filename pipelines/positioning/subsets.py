@@ -1,8 +1,6 @@
-"""The station from every two and every three of its markers: hides a solver of hundreds at once.
+"""The station from each pair and each triple of its markers.
 
-Each subset is a small resection of its own, with gravity. All start at the pose from all markers,
-which is right to centimetres, so that the weights can stay as they are there and only the
-geometry is taken anew at each step.
+Each subset is a small resection of its own, with gravity. All start at the pose from all markers.
 """
 
 from __future__ import annotations
@@ -79,7 +77,7 @@ def resect_subsets(
     Returns
     -------
     dict of str to tuple of SubsetFixes
-        By method: pairs, then triples. Left out are subsets that tell no position: on a plumb line
+        By method: pairs, then triples. Left out are subsets that give no position: on a plumb line
         (``free_station``), circles that touch rather than cut (``paper``), pairs of slope distances
         (``ranges``), and all whose sigma is above a metre.
 
@@ -91,7 +89,7 @@ def resect_subsets(
     Notes
     -----
     Predicted sigmas are those at the pose from all markers. Cost: 14 markers have 91 pairs and 364
-    triples, which take less than a millisecond; it grows with the third power of the markers.
+    triples, which take a few milliseconds; it grows with the third power of the markers.
     """
     for method in methods:
         if method not in _METHODS:
@@ -183,7 +181,7 @@ def _fixes(
     found: Positions,
     angles: tuple[Array, Array],
 ) -> SubsetFixes:
-    """Return the subsets of one size whose positions are worth something."""
+    """Return the subsets of one size whose positions are determined."""
     variances = found.cov.diagonal(axis1=1, axis2=2)
     sigma_3d = np.sqrt(variances.sum(axis=1))
     keep = found.is_settled & (sigma_3d < USELESS)
@@ -206,7 +204,7 @@ def _table(v: Array) -> Array:
 
 
 def _of_pairs(table: Array, chosen: Index) -> Array:
-    """Return what a table says of each two of each subset, (1, s) or (3, s)."""
+    """Return the entries of a table for the pairs of each subset, (1, s) or (3, s)."""
     pairs = combinations(range(chosen.shape[1]), 2)
     return np.stack([table[chosen[:, i], chosen[:, j]] for i, j in pairs])
 

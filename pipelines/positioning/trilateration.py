@@ -1,9 +1,8 @@
-"""Positions from ranges: hides how a station comes from distances instead of centres.
+"""Trilateration: positions from distances.
 
-Two methods beside the free station: ``ranges`` meets the slope distances to all marks, ``paper``
-the horizontal distances to three, as the study's three circles do, and takes the height from
-theirs. Both are yaw-invariant functions of a levelled centre, so the heading comes afterwards, from
-the directions at the position that was found.
+``ranges`` takes the slope distances to all marks, ``paper`` the horizontal distances to three (the
+three circles of the published method) and the height from the same three. Both are yaw-invariant
+functions of a levelled centre; the heading follows from the directions at the position.
 """
 
 from __future__ import annotations
@@ -35,8 +34,8 @@ _USABLE = 1e-4  # [m] of the last step, for positions that hardly move any more
 _DAMPING = 1e-9  # of the trace of the normal matrix; keeps singular ones solvable
 _NEAREST = 1e-9  # [m] of a mark on the plumb line of the station, whose circle has no direction
 _LOOSE = 0.1  # [m] a position that is worse than this is weak
-_FAINT = 0.05  # change of distances, RMS, by a unit of way that they cannot tell
-_STEEP = 0.9  # of a way that is nearly the vertical
+_FAINT = 0.05  # change of distances, RMS, by a unit of an undetermined motion
+_STEEP = 0.9  # vertical part of a motion that is about the height
 
 
 class Influences(NamedTuple):
@@ -81,7 +80,7 @@ def fix_by_ranges(
     Notes
     -----
     ``paper`` takes the three marks whose circles cut best, weighs them by their sigmas and leaves
-    nothing out: three circles give no answer to which is wrong. The covariance of the pose is that
+    nothing out: three circles do not show which is wrong. The covariance of the pose is that
     of all centres, marks and the levelling carried to first order through position and heading,
     and so are the errors of range and height that all centres share.
     """
@@ -127,7 +126,7 @@ def fix_by_ranges(
 def _unsettled(
     measure: Measure, scene: Scene, pairs: Index, p: Array
 ) -> DegenerateGeometryError | None:
-    """Say which way distances leave a position open; none if they should tell all of it."""
+    """Return which direction of a position distances leave undetermined, if any."""
     J = measure(scene.marks_site[pairs[:, 1]] - p)[1].reshape(-1, 3)
     _, strengths, ways = np.linalg.svd(J)
     if strengths[-1] > _FAINT * np.sqrt(len(pairs)):
@@ -157,8 +156,8 @@ def influences(measure: Measure, scene: Scene, pairs: Index, p: Array) -> Influe
     """Return what errors of each marker add to the gradient of a position from distances."""
     levelled, cov_levelled = _levelled(scene, pairs)
     seen, (_, by_centre) = observe_distances(measure, scene, pairs, p), measure(levelled)
-    pull = np.swapaxes(seen.J, -1, -2) @ invert_each(seen.cov)[0]
-    of_centre, of_mark = pull @ by_centre, pull @ seen.J
+    weighted = np.swapaxes(seen.J, -1, -2) @ invert_each(seen.cov)[0]
+    of_centre, of_mark = weighted @ by_centre, weighted @ seen.J
     own = of_centre @ cov_levelled @ np.swapaxes(of_centre, -1, -2)
     own += of_mark @ scene.cov_marks[pairs[:, 1]] @ np.swapaxes(of_mark, -1, -2)
     return Influences(
@@ -279,7 +278,7 @@ def _fix(
 
 
 def _weaknesses(pairs: Index, adjustment: Adjustment, cov: Array, scene: Scene) -> list[str]:
-    """Say why a fix cannot be relied on."""
+    """Return why a fix is weak."""
     reasons = []
     if adjustment.dof == 0:
         reasons.append(f"{len(pairs)} distances: an error in one of them would not show")

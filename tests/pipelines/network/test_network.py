@@ -549,7 +549,7 @@ def wide(rng, n_stations, n_marks=200, n_seen=14):
         T_site_base=T,
         p_site=p + rng.normal(0, 0.01, p.shape),
         shared=Shared.none(n),
-        doubts=("",) * n_marks,
+        suspicions=("",) * n_marks,
     )
 
 

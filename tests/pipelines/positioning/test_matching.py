@@ -148,7 +148,7 @@ def test_two_marks_at_one_height_can_be_swapped_and_the_other_place_is_named():
     marks, place = control([[6, 0, 1], [-5, 2, 1]]), np.array([0.5, 1.0, 0.8])
     scene = gather(sightings(marks, pose(place, 1.0)), marks, CONFIG)
     match = match_marks(scene, CONFIG)
-    places = np.vstack([match.T_site_base[:3, 3], match.rivals]) + scene.middle
+    places = np.vstack([match.T_site_base[:3, 3], match.alternatives]) + scene.middle
     swapped = 2 * np.array([0.5, 1.0, 1.0]) - place  # half a turn about the middle of the marks
     swapped[2] = place[2]
     for expected in (place, swapped):
