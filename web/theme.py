@@ -51,35 +51,24 @@ class MethodStyle:
     colour: str
     band: str
     symbol: str
-    dash: str
 
 
-_METHODS = {
-    "along_beam": MethodStyle(
-        label="along beam (ours)", colour=OURS, band=OURS_BAND, symbol="circle", dash="solid"
-    ),
-    "paper": MethodStyle(
-        label="paper's method", colour=PAPER, band=PAPER_BAND, symbol="diamond", dash="solid"
-    ),
+_STYLES = {
+    "along_beam": (OURS, OURS_BAND, "circle"),
+    "paper": (PAPER, PAPER_BAND, "diamond"),
+    "silhouette": (GREEN, GREEN_BAND, "square"),
+    "astm_e3125": ("var(--fourth)", GREEN_BAND, "triangle-up"),
+    "free_radius": ("var(--fifth)", GREEN_BAND, "triangle-down"),
+    "algebraic": ("var(--sixth)", GREEN_BAND, "pentagon"),
 }
-_OTHERS = {
-    "silhouette": (GREEN, "square"),
-    "astm_e3125": ("var(--fourth)", "triangle-up"),
-    "free_radius": ("var(--fifth)", "triangle-down"),
-    "algebraic": ("var(--sixth)", "pentagon"),
-}
+_LABELS = {"along_beam": "along beam (ours)", "paper": "paper's method"}
 
 
 def method_style(method: str) -> MethodStyle:
     """Return the style of a method; each has its own colour and symbol."""
-    colour, symbol = _OTHERS.get(method, (MUTED, "hexagon"))
-    return _METHODS.get(method) or MethodStyle(
-        label=method.replace("_", " "),
-        colour=colour,
-        band=GREEN_BAND,
-        symbol=symbol,
-        dash="solid",
-    )
+    colour, band, symbol = _STYLES.get(method, (MUTED, GREEN_BAND, "hexagon"))
+    label = _LABELS.get(method, method.replace("_", " "))
+    return MethodStyle(label=label, colour=colour, band=band, symbol=symbol)
 
 
 def template() -> go.layout.Template:

@@ -7,7 +7,7 @@ from plotly.subplots import make_subplots
 
 from spheremark.web import theme
 from spheremark.web.columns import MM, Columns, floats, texts
-from spheremark.web.figures.elements import blank_figure
+from spheremark.web.figures.elements import blank_figure, details
 
 _BEYOND = 2.0  # sigmas
 _WAYS = {"radial": "along the line of sight", "across": "across it", "up": "up"}
@@ -16,9 +16,8 @@ _STYLES = (("before", theme.MUTED, "circle-open"), ("after", theme.OURS, "circle
 
 def face_gaps(before: Columns, after: Columns) -> go.Figure:
     """Draw the difference of the two faces of each sphere, before and after a calibration."""
-    figure = make_subplots(
-        rows=len(_WAYS), cols=1, shared_xaxes=True, vertical_spacing=0.06, figure=_blank()
-    )
+    figure = blank_figure("Front minus back of each sphere")
+    make_subplots(len(_WAYS), 1, shared_xaxes=True, vertical_spacing=0.06, figure=figure)
     for row, (way, label) in enumerate(_WAYS.items(), start=1):
         for columns, style in zip((before, after), _STYLES, strict=True):
             _add_gaps(figure, columns, way, style, row)
@@ -29,19 +28,11 @@ def face_gaps(before: Columns, after: Columns) -> go.Figure:
     return figure
 
 
-def _blank() -> go.Figure:
-    """Return the blank figure of the gaps."""
-    return blank_figure("Front minus back of each sphere")
-
-
 def _add_gaps(
     figure: go.Figure, rows: Columns, way: str, style: tuple[str, str, str], row: int
 ) -> None:
     """Draw the gaps along one direction with one rig."""
     name, colour, symbol = style
-    about = zip(
-        texts(rows, "stop"), texts(rows, "marker"), floats(rows, "range_m").tolist(), strict=True
-    )
     figure.add_scatter(
         x=floats(rows, "azimuth_deg"),
         y=MM * floats(rows, f"gap_{way}_m"),
@@ -50,7 +41,7 @@ def _add_gaps(
         legendgroup=name,
         showlegend=row == 1,
         marker={"color": colour, "symbol": symbol, "size": 6},
-        customdata=[list(one) for one in about],
+        customdata=details(rows, ("stop", "marker"), ("range_m",)),
         hovertemplate="<b>%{customdata[0]}</b> %{customdata[1]}, %{customdata[2]:.1f} m<br>"
         f"%{{y:.1f}} mm {_WAYS[way]}<extra>{name}</extra>",
         row=row,

@@ -84,10 +84,13 @@ def make_log(figure: go.Figure) -> None:
             note.y = float(np.log10(line.y0))
 
 
-def details(rows: Columns, words: Sequence[str], numbers: Sequence[str]) -> list[list[Any]]:
-    """Return the values that the hover text of each row shows."""
+def details(
+    rows: Columns, words: Sequence[str], numbers: Sequence[str] = (), in_mm: Sequence[str] = ()
+) -> list[list[Any]]:
+    """Return the values of the hover text of each row: words, numbers, lengths in millimetres."""
     columns: list[Iterable[Any]] = [texts(rows, name) for name in words]
     columns += [floats(rows, name).round(4).tolist() for name in numbers]
+    columns += [(MM * floats(rows, name)).tolist() for name in in_mm]
     return [list(row) for row in zip(*columns, strict=True)]
 
 
@@ -107,7 +110,7 @@ def add_binned(
         name=f"{style.label}: RMS of bins",
         legendgroup=style.label,
         showlegend=False,
-        line={"color": style.colour, "width": 2.5, "dash": style.dash},
+        line={"color": style.colour, "width": 2.5},
         hovertemplate=f"RMS %{{y:.1f}} mm about %{{x:.4g}}<extra>{style.label}</extra>",
     )
 

@@ -15,8 +15,14 @@ from numpy.typing import NDArray
 from spheremark.pipelines.positioning.subsets import theory_of_pairs
 from spheremark.pipelines.published import LEAST_ANGLE, WIDEST_ANGLE
 from spheremark.web import theme
-from spheremark.web.columns import MM, Columns, by_method, floats, known_values, rms, select, texts
-from spheremark.web.figures.elements import add_binned, add_tolerance, blank_figure, make_log
+from spheremark.web.columns import MM, Columns, by_method, floats, known_values, rms, select
+from spheremark.web.figures.elements import (
+    add_binned,
+    add_tolerance,
+    blank_figure,
+    details,
+    make_log,
+)
 from spheremark.web.figures.survey import ANGLE_BIN
 
 _N_DRAWN = 3000  # points of one method; more overlap and slow the page
@@ -117,7 +123,7 @@ def _add_rows(figure: go.Figure, method: str, rows: Columns, shown: Subsets) -> 
     drawn = np.zeros(len(x), dtype=np.bool_)
     drawn[:: max(1, -(-len(x) // _N_DRAWN))] = True
     few = select(rows, drawn)
-    marks = [" + ".join(str(mark) for mark in names) for names in few["marks"]]
+    marks = np.array([" + ".join(map(str, names)) for names in few["marks"]], dtype=object)
     figure.add_scatter(
         x=x[drawn],
         y=y[drawn],
@@ -125,14 +131,9 @@ def _add_rows(figure: go.Figure, method: str, rows: Columns, shown: Subsets) -> 
         name=f"{style.label}, {_COUNTS[shown.n_marks]}",
         legendgroup=style.label,
         marker={"color": style.colour, "size": 4, "opacity": 0.3, "symbol": style.symbol},
-        customdata=[
-            list(row)
-            for row in zip(
-                texts(few, "stop"), marks, floats(few, "included_angle_deg").round(1), strict=True
-            )
-        ],
+        customdata=details(few | {"marks": marks}, ("stop", "marks"), ("included_angle_deg",)),
         hovertemplate="<b>%{customdata[0]}</b> from %{customdata[1]}<br>%{y:.1f} mm at "
-        f"%{{x:.1f}} deg, smallest %{{customdata[2]}} deg<extra>{style.label}</extra>",
+        f"%{{x:.1f}} deg, smallest %{{customdata[2]:.1f}} deg<extra>{style.label}</extra>",
     )
     add_binned(figure, style, x, y, ANGLE_BIN)
 

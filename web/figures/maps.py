@@ -9,7 +9,7 @@ import plotly.graph_objects as go
 from numpy.typing import NDArray
 
 from spheremark.web import theme
-from spheremark.web.columns import MM, Columns, by_method, floats, known_values, largest, texts
+from spheremark.web.columns import Columns, by_method, floats, known_values, largest, texts
 from spheremark.web.figures.elements import (
     add_note,
     blank_figure,
@@ -87,7 +87,6 @@ def _add_stations(
     """Draw the stations of one method with their scaled ellipses and errors."""
     style = theme.method_style(method)
     x, y = floats(rows, "x_m"), floats(rows, "y_m")
-    about = details(rows, ("stop", "status"), ("sigma_3d_m", "error_3d_m", "n_markers", "z_m"))
     figure.add_scatter(
         x=x,
         y=y,
@@ -95,9 +94,9 @@ def _add_stations(
         name=style.label,
         legendgroup=style.label,
         marker={"color": style.colour, "size": 6, "symbol": style.symbol},
-        customdata=[[row[0], row[1], row[2] * MM, row[4], row[5]] for row in about],
+        customdata=details(rows, ("stop", "status"), ("n_markers", "z_m"), ("sigma_3d_m",)),
         hovertemplate="<b>%{customdata[0]}</b> %{customdata[1]}<br>x %{x:.3f} m<br>y %{y:.3f} m<br>"
-        "z %{customdata[4]:.3f} m<br>sigma %{customdata[2]:.1f} mm, %{customdata[3]:.0f} marks"
+        "z %{customdata[3]:.3f} m<br>sigma %{customdata[4]:.1f} mm, %{customdata[2]:.0f} marks"
         f"<extra>{style.label}</extra>",
     )
     outlines = [ellipse_outline(rows, i, factor) for i in range(len(x))]

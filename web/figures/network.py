@@ -11,6 +11,7 @@ from spheremark.web.columns import MM, Columns, floats, select, texts
 from spheremark.web.figures.elements import (
     add_note,
     blank_figure,
+    details,
     group_by_axis,
     joined_strokes,
     make_map,
@@ -60,16 +61,6 @@ def _both(stations: Columns, marks: Columns) -> dict[str, NDArray[np.float64]]:
 def _add_points(figure: go.Figure, rows: Columns, kind: str, symbol: str, size: int) -> None:
     """Draw stations or marks, coloured by the mean redundancy of their centres."""
     names = texts(rows, kind)
-    about = [
-        [name, MM * sigma, n, redundancy]
-        for name, sigma, n, redundancy in zip(
-            names,
-            floats(rows, "sigma_3d_m"),
-            floats(rows, "n_observations"),
-            floats(rows, "mean_redundancy"),
-            strict=True,
-        )
-    ]
     figure.add_scatter(
         x=floats(rows, "x_m"),
         y=floats(rows, "y_m"),
@@ -101,10 +92,10 @@ def _add_points(figure: go.Figure, rows: Columns, kind: str, symbol: str, size: 
                 "dtick": 1,
             },
         },
-        customdata=about,
-        hovertemplate="<b>%{customdata[0]}</b><br>x %{x:.4f} m<br>y %{y:.4f} m<br>"
-        "sigma %{customdata[1]:.1f} mm, %{customdata[2]:.0f} centres, redundancy "
-        f"%{{customdata[3]:.2f}}<extra>{kind}</extra>",
+        customdata=details(rows, (), ("n_observations", "mean_redundancy"), ("sigma_3d_m",)),
+        hovertemplate="<b>%{text}</b><br>x %{x:.4f} m<br>y %{y:.4f} m<br>"
+        "sigma %{customdata[2]:.1f} mm, %{customdata[0]:.0f} centres, redundancy "
+        f"%{{customdata[1]:.2f}}<extra>{kind}</extra>",
     )
 
 
@@ -137,7 +128,7 @@ def _add_residuals(figure: go.Figure, rows: Columns, axis: str, *, is_used: bool
             "opacity": 0.75,
             "line": {"width": 0 if is_used else 2},
         },
-        customdata=list(zip(texts(rows, "marker"), texts(rows, "mark"), strict=True)),
+        customdata=details(rows, ("marker", "mark")),
         hovertemplate="<b>%{x}</b> %{customdata[0]} on %{customdata[1]}<br>%{y:.1f} mm"
         f"<extra>{axis}</extra>",
     )
@@ -154,14 +145,9 @@ def tests(observations: Columns, w_limit: float) -> go.Figure:
         name="centre",
         showlegend=False,
         marker={"color": theme.OURS, "size": 7, "opacity": 0.7},
-        customdata=[
-            [station, marker, mark, MM * bias]
-            for station, marker, mark, bias in zip(
-                *(texts(observations, name) for name in ("station", "marker", "mark")),
-                floats(observations, "minimal_detectable_bias_m"),
-                strict=True,
-            )
-        ],
+        customdata=details(
+            observations, ("station", "marker", "mark"), in_mm=("minimal_detectable_bias_m",)
+        ),
         hovertemplate="<b>%{customdata[0]}</b> %{customdata[1]} on %{customdata[2]}<br>w %{y:.2f}, "
         "redundancy %{x:.2f}<br>detectable bias %{customdata[3]:.0f} mm<extra></extra>",
     )

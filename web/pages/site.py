@@ -64,21 +64,18 @@ def ground_figure(model: ElevationModel, marks: Columns, stations: Columns) -> g
     step = _step(model)
     heights = _thinned(model.heights, step)
     figure = blank_figure("Ground of the site")
-    xs, ys = model.xs[::step], model.ys[::step]
-    bar = {"title": {"text": "Height [m]", "side": "right"}, "thickness": 12, "outlinewidth": 0}
+    cells = {"x": model.xs[::step], "y": model.ys[::step]}
     figure.add_heatmap(
-        x=xs,
-        y=ys,
+        **cells,
         z=np.round(heights, 4),
         zmin=float(np.nanquantile(heights, _TAIL)),
         zmax=float(np.nanquantile(heights, 1.0 - _TAIL)),
         colorscale=list(theme.HEIGHTS),
-        colorbar=bar,
+        colorbar=_bar("Height [m]"),
         hovertemplate="x %{x:.2f} m, y %{y:.2f} m<br>height %{z:.3f} m<extra></extra>",
     )
     figure.add_heatmap(
-        x=xs,
-        y=ys,
+        **cells,
         z=np.round(hillshade(heights, model.cell * step), 2),
         colorscale=[
             [0.0, "rgba(0,0,0,0.55)"],
@@ -98,21 +95,17 @@ def sigma_figure(model: ElevationModel, marks: Columns, stations: Columns) -> go
     step = _step(model)
     sigmas = 1e3 * _thinned(model.sigmas, step)
     figure = blank_figure("Standard deviation of the ground")
-    ticks = [value for value in (0.5, 1, 2, 5, 10, 20, 50, 100, 200) if _spans(sigmas, value)]
-    bar = {
-        "title": {"text": "Sigma [mm]", "side": "right"},
-        "thickness": 12,
-        "outlinewidth": 0,
-        "tickvals": np.log10(ticks),
-        "ticktext": [f"{value:g}" for value in ticks],
-    }
+    low, high = np.nanmin(sigmas), np.nanmax(sigmas)
+    ticks = [value for value in (0.5, 1, 2, 5, 10, 20, 50, 100, 200) if low <= value <= high]
     figure.add_heatmap(
         x=model.xs[::step],
         y=model.ys[::step],
         z=np.round(np.log10(sigmas), 3),
         customdata=np.round(sigmas, 1),
         colorscale=list(theme.HEIGHTS),
-        colorbar=bar,
+        colorbar=_bar(
+            "Sigma [mm]", tickvals=np.log10(ticks), ticktext=[f"{value:g}" for value in ticks]
+        ),
         hovertemplate="x %{x:.2f} m, y %{y:.2f} m<br>sigma %{customdata:.1f} mm<extra></extra>",
     )
     return _with_places(figure, marks, stations)
@@ -128,6 +121,11 @@ def hillshade(heights: NDArray[Any], cell: float) -> NDArray[np.float64]:
     return np.asarray(np.clip(0.5 + 0.5 * (lit - np.sin(height)), 0.0, 1.0))
 
 
+def _bar(title: str, **ticks: object) -> dict[str, object]:
+    """Return the colour bar of a map."""
+    return {"title": {"text": title, "side": "right"}, "thickness": 12, "outlinewidth": 0, **ticks}
+
+
 def _step(model: ElevationModel) -> int:
     """Return the step between displayed cells."""
     return int(np.ceil(max(model.heights.shape) / _CELLS_MAX))
@@ -136,11 +134,6 @@ def _step(model: ElevationModel) -> int:
 def _thinned(values: NDArray[Any], step: int) -> NDArray[np.float64]:
     """Return every ``step``-th cell in both directions."""
     return np.asarray(values[::step, ::step], dtype=np.float64)
-
-
-def _spans(values: NDArray[np.float64], value: float) -> bool:
-    """Whether a value lies within a sample."""
-    return bool(np.nanmin(values) <= value <= np.nanmax(values))
 
 
 def _with_places(figure: go.Figure, marks: Columns, stations: Columns) -> go.Figure:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -89,16 +89,7 @@ def overview_page(page: OverviewPage) -> str:
 def survey_page(page: SurveyPage) -> str:
     """Return the page of a survey under its filters."""
     data, keep = page.data, page.filters.apply
-    shown = SurveyData(
-        name=data.name,
-        tolerance_m=data.tolerance_m,
-        marks=data.marks,
-        true_stops=data.true_stops,
-        fits=keep(data.fits),
-        fixes=keep(data.fixes),
-        subsets=keep(data.subsets),
-        subset_methods=data.subset_methods,
-    )
+    shown = replace(data, fits=keep(data.fits), fixes=keep(data.fixes), subsets=keep(data.subsets))
     stops = sorted(set(texts(data.fits, "stop")), key=lane_order)
     return render(
         "survey.html",
