@@ -16,7 +16,7 @@ from spheremark.pipelines.calibration.gimbal import (
     moved,
 )
 from spheremark.pipelines.errors import NotConvergedError
-from spheremark.pipelines.estimation.linear_algebra import Reduced, eliminate
+from spheremark.pipelines.estimation.linear_algebra import Reduced, eliminate, inverse
 from spheremark.pipelines.model import RING_UNKNOWN, Array, Index, Mask, Rig, Rings
 
 _TUKEY = 6.0  # sigmas at which a return has no weight; 98 % efficient on clean data
@@ -90,7 +90,7 @@ def separable(N: Array, parameters: tuple[Parameter, ...]) -> tuple[Mask, tuple[
     for place in np.flatnonzero(is_free):
         if parameters[place].caution:
             free = np.flatnonzero(is_free)
-            variances = np.diag(np.linalg.inv(N[np.ix_(free, free)]))
+            variances = np.diag(inverse(N[np.ix_(free, free)]))
             sigma = float(np.sqrt(variances[np.searchsorted(free, place)]))
             is_free[place] = False
             held.append(_held_back(parameters[place], sigma))
@@ -219,8 +219,7 @@ class _Problem(NamedTuple):
     def ahead(self, state: _State, equations: Reduced, chosen: Index, sigmas: Array) -> _State:
         """Return the state after the longest share of a step that lowers the loss, or the last."""
         steps = np.zeros(len(equations.N))
-        N = equations.N[np.ix_(chosen, chosen)]
-        steps[chosen] = np.linalg.solve(N, equations.rhs[chosen])
+        steps[chosen] = inverse(equations.N[np.ix_(chosen, chosen)]) @ equations.rhs[chosen]
         by_rig, by_laser = np.split(steps, [len(GIMBAL)])
         biases = (self.basis @ by_laser)[: len(state.rig.laser_range_biases)]
         by_centre = equations.local_steps(steps)
@@ -308,7 +307,7 @@ def _estimate(
         is_free=is_free,
         held=held,
         lasers=lasers,
-        cov=_EFFICIENCY * J @ np.linalg.inv(equations.N[np.ix_(chosen, chosen)]) @ J.T,
+        cov=_EFFICIENCY * J @ inverse(equations.N[np.ix_(chosen, chosen)]) @ J.T,
         is_used=is_used,
         dof=int(is_used.sum()) - 3 * len(state.centres) - len(chosen),
         basis=J,

@@ -24,6 +24,7 @@ from spheremark.pipelines.calibration.gimbal import (
 from spheremark.pipelines.config import SurveyConfig
 from spheremark.pipelines.detection import extract
 from spheremark.pipelines.errors import DegenerateGeometryError, RigError
+from spheremark.pipelines.estimation.linear_algebra import inverse, invert_each
 from spheremark.pipelines.model import Array, Index, MarkerFit, Mask, Rig, ScanLog, StitchedCloud
 from spheremark.pipelines.scan.stitching import stitch
 from spheremark.pipelines.sphere import fit_markers
@@ -131,7 +132,7 @@ def _pair(log: ScanLog, cloud: StitchedCloud, fits: tuple[MarkerFit, MarkerFit])
 def _solved(pairs: list[_Pair]) -> Array:
     """Return the changes of the parameters that bring the pairs together best."""
     gaps, covs, J = (np.array(column) for column in zip(*pairs, strict=True))
-    weights = np.linalg.inv(covs)
+    weights, _ = invert_each(covs)
     trust = np.ones(len(pairs))
     changes = np.zeros(len(GIMBAL))
     for _ in range(_N_ROBUST):
@@ -139,7 +140,7 @@ def _solved(pairs: list[_Pair]) -> Array:
         is_free, _ = separable(N, MOUNTING)
         free = np.flatnonzero(is_free)
         rhs = np.einsum("k,kip,kij,kj->p", trust, J, weights, gaps)
-        changes[free] = np.linalg.solve(N[np.ix_(free, free)], rhs[free])
+        changes[free] = inverse(N[np.ix_(free, free)]) @ rhs[free]
         left = gaps - J @ changes[: len(MOUNTING)]
         squares = np.einsum("ki,kij,kj->k", left, weights, left)
         trust = 1.0 / (1.0 + squares / (3.0 * max(float(np.median(squares)), 1.0)))

@@ -8,6 +8,7 @@ import numpy as np
 from scipy.special import chdtri
 
 from spheremark.pipelines.config import ResectionConfig
+from spheremark.pipelines.estimation.linear_algebra import inverse
 from spheremark.pipelines.estimation.statistical_tests import (
     UNTESTABLE,
     Dropped,
@@ -175,7 +176,7 @@ def _predicted_control(network: Network, tested: Tested) -> tuple[Array, Array]:
         if eigenvalues[0] <= _UNCHECKED * np.linalg.eigvalsh(weights[row])[0]:
             shifts[row], covs[row] = np.nan, np.nan
             continue
-        covs[row] = np.linalg.inv(solid[row])
+        covs[row] = inverse(solid[row])
         shifts[row] = -covs[row] @ weights[row] @ tested.lin.v_control[row]
     return shifts, covs
 

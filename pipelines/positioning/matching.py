@@ -25,6 +25,7 @@ from spheremark.pipelines.estimation.least_squares import (
     solve,
     solve_each,
 )
+from spheremark.pipelines.estimation.linear_algebra import invert_each
 from spheremark.pipelines.geometry import (
     by_motion,
     levelling_rotation,
@@ -226,7 +227,7 @@ def shared_variances(
     among marks on all sides, where they cancel.
     """
     v = p_base / np.linalg.norm(p_base, axis=1, keepdims=True)
-    own = 1.0 / np.einsum("ni,ni->n", v, np.linalg.solve(cov_p_base, v[..., None])[..., 0])
+    own = 1.0 / np.einsum("ni,ni->n", v, (invert_each(cov_p_base)[0] @ v[..., None])[..., 0])
     sigmas = np.where(np.isfinite(sigmas_shared), sigmas_shared, config.sigma_range_shared)
     return np.asarray(np.minimum(sigmas**2, _SHARED * own))
 

@@ -11,6 +11,7 @@ from dataclasses import replace
 import numpy as np
 
 from spheremark.pipelines.config import ResectionConfig
+from spheremark.pipelines.estimation.linear_algebra import invert_each
 from spheremark.pipelines.geometry import by_motion, has_heading, rigid, transform
 from spheremark.pipelines.model import (
     Array,
@@ -35,7 +36,6 @@ _SURPRISE = 3.29  # sigmas that one in a thousand normal residuals exceeds
 _N_LEFT = 3  # markers at least, of which one can be left out
 _DISPLACED = 1.0  # [m] from a marker that is no mark: a mark without one may be given wrongly
 _N_POSE = 6  # unknowns: with as many more observations of centres, the levelling was left out
-_OPEN = 1e-9  # of the largest eigenvalue of a normal matrix: what is smaller is undetermined
 _UNKNOWN = 1.0  # [rad] of a levelling that was left out
 
 
@@ -193,10 +193,8 @@ def dilution_of_precision(fix: StationFix, marks: ControlMarks) -> float:
     else:
         J = (slope_ranges if fix.method == "ranges" else circles)(v)[1]
     N = np.einsum("kmi,kmj->ij", J, J)
-    values = np.linalg.eigvalsh(N)
-    if values[0] < _OPEN * values[-1]:
-        return float("inf")
-    return float(np.sqrt(np.trace(np.linalg.inv(N)[-3:, -3:])))
+    cofactor, is_regular = invert_each(N)
+    return float(np.sqrt(np.trace(cofactor[-3:, -3:]))) if is_regular else float("inf")
 
 
 def leave_each_out(

@@ -15,6 +15,7 @@ import numpy as np
 from spheremark.pipelines.config import ResectionConfig
 from spheremark.pipelines.errors import ConfigError, DegenerateGeometryError, NoMarkersError
 from spheremark.pipelines.estimation.least_squares import Adjustment, adjust
+from spheremark.pipelines.estimation.linear_algebra import invert_each
 from spheremark.pipelines.estimation.statistical_tests import Dropped, snoop
 from spheremark.pipelines.geometry import (
     by_motion,
@@ -288,7 +289,7 @@ def _cov_shared(scene: Scene, used: Index, adjustment: Adjustment) -> Array:
     R, group = adjustment.estimate[:3, :3], adjustment.groups[0]
     p_base = scene.centres_base[used[:, 0]]
     lines = (p_base / np.linalg.norm(p_base, axis=1, keepdims=True)) @ R.T
-    gains = adjustment.cov @ np.swapaxes(np.linalg.solve(group.cov, group.J), 1, 2)  # up to sign
+    gains = adjustment.cov @ np.swapaxes(invert_each(group.cov)[0] @ group.J, 1, 2)  # up to sign
     of_ranges = (gains @ lines[..., None])[..., 0]
     of_heights = gains.sum(axis=0) @ (R @ scene.R_station_base[2])
     return cov_of_shared(scene, scene.shared[used[:, 0]], of_ranges, of_heights)

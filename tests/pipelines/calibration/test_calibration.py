@@ -8,7 +8,14 @@ from numpy.testing import assert_allclose
 from scipy.spatial.transform import Rotation
 
 from spheremark.pipelines.calibration import calibrate
-from spheremark.pipelines.calibration.gimbal import GIMBAL, aimed, design, moved, sights, values
+from spheremark.pipelines.calibration.gimbal import (
+    GIMBAL,
+    aimed,
+    linearise,
+    moved,
+    recorded_pulses,
+    values,
+)
 from spheremark.pipelines.config import SurveyConfig
 from spheremark.pipelines.detection import extract
 from spheremark.pipelines.errors import DegenerateGeometryError, RigError
@@ -48,7 +55,7 @@ def at_shot(log, rig):
     fits = fit_markers("along_beam", cloud, found, CONFIG.fitting, RADIUS).fits
     rows = np.concatenate([fit.used for fit in fits])
     which = np.repeat(np.arange(len(fits)), [len(fit.used) for fit in fits])
-    return sights(log, cloud, rows, which), np.array([fit.p_base for fit in fits]), rows
+    return recorded_pulses(log, cloud, rows, which), np.array([fit.p_base for fit in fits]), rows
 
 
 def centre_rms(field, stop, rig, config=CONFIG):
@@ -113,7 +120,7 @@ def test_shots_aimed_with_another_rig_are_those_of_stitching_anew(stop):
 def test_derivatives_agree_with_central_differences(stop):
     seen, centres, _ = at_shot(stop.log, stop.rig)
     thin = np.tile(1e-12 * np.eye(3), (len(centres), 1, 1))
-    exact = design(seen, stop.rig, centres, thin, RADIUS)
+    exact = linearise(seen, stop.rig, centres, thin, RADIUS)
     lit = predict(
         aimed(seen, stop.rig), centres, np.full(len(centres), RADIUS - 2e-4), seen.which
     ).lit
@@ -125,7 +132,7 @@ def test_derivatives_agree_with_central_differences(stop):
             continue
         step, nothing = changes(**{name: 1e-6}), np.zeros(16)
         up, down = (
-            design(seen, moved(stop.rig, sign * step, nothing), centres, thin, RADIUS).residuals
+            linearise(seen, moved(stop.rig, sign * step, nothing), centres, thin, RADIUS).residuals
             for sign in (1.0, -1.0)
         )
         numeric = -(up - down)[is_whole] / 2e-6
