@@ -127,8 +127,8 @@ def estimate(
             sites = _add_limb(N, returns, now, edge, sites)
         if observe is not None and step >= _N_STEPS_RANGES:
             centres, rhs = observe(state.centres, state.covs)
-            N.products[:, :3, :3] += centres
-            N.products[:, :3, -1] += rhs
+            N.centres[:, :, :3] += centres
+            N.centres[:, :, -1] += rhs
         state = _stepped(state, N, prior)
     return _weighed(returns, state, _linear(returns, state, is_used, radius), is_used)
 
@@ -184,8 +184,8 @@ def _weighed(returns: Returns, state: State, linear: Linear, is_used: Mask) -> E
 def _add_limb(N: Normals, returns: Returns, now: Estimate, edge: Edge, sites: Array) -> Array:
     """Add the observations of the limb to normal equations; return the sites of the returns."""
     limb = limb_normals(returns, now.linear, now.weighed.weights, now.state.covs, edge, sites)
-    N.products[:, :3, :3] += limb.centres
-    N.products[:, :3, -1] += limb.rhs
+    N.centres[:, :, :3] += limb.centres
+    N.centres[:, :, -1] += limb.rhs
     N.by_face[:, :, :3] += limb.faces
     N.by_face[:, :, -1] += limb.rhs_faces
     return limb.sites
