@@ -1,4 +1,4 @@
-"""Errors against truth: of centres, of stations, and what they come to."""
+"""Errors of centres and stations against truth, and their statistics."""
 
 from __future__ import annotations
 
@@ -19,10 +19,9 @@ from spheremark.pipelines.model import (
     StopTruth,
 )
 
-UNMATCHED = -1  # the true mark of a fit that stands near none
+UNMATCHED = -1  # the true mark of a fit that is near none
 
-_NEAR = 0.5  # [m]; a fit farther than this from every true mark shows something else
-_P95 = 0.95
+_NEAR = 0.5  # [m]; a fit farther than this from every true mark is a false marker
 
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
@@ -32,7 +31,7 @@ class MarkerErrors:
     Attributes
     ----------
     marks : (n,)
-        True mark of each fit; ``UNMATCHED`` for a fit that stands near none: a false marker.
+        True mark of each fit; ``UNMATCHED`` for a fit near none: a false marker.
     error_base : (n, 3)
         Estimate minus truth in the base frame; NaN for a false marker [m].
     error_radial : (n,)
@@ -72,7 +71,7 @@ class StationError:
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class ErrorSummary:
-    """A sample of error lengths in a few numbers.
+    """Statistics of a sample of error lengths.
 
     Attributes
     ----------
@@ -112,8 +111,7 @@ def marker_errors(fits: MarkerFits, stop: StopTruth, marks: ControlMarks) -> Mar
     Notes
     -----
     Each fit is paired with the true mark that makes the sum of distances least (Kuhn-Munkres), and
-    stays unmatched beyond half a metre. The base frame has no levelling in it, so neither have the
-    errors.
+    stays unmatched beyond half a metre. Base frame: errors of the levelling are not included.
     """
     return centre_errors(np.array([f.p_base for f in fits.fits]), stop, marks)
 
@@ -178,7 +176,7 @@ def station_error(fix: StationFix, stop: StopTruth) -> StationError:
 
 
 def summarise(errors_3d: ArrayLike, tolerance: float) -> ErrorSummary:
-    """Put a sample of error lengths into a few numbers.
+    """Summarise a sample of error lengths.
 
     Parameters
     ----------
@@ -208,12 +206,12 @@ def summarise(errors_3d: ArrayLike, tolerance: float) -> ErrorSummary:
     )
 
 
-def mean_incidence(shots: Beams, p_base: Array, radius: float) -> float:
+def mean_incidence(returns: Beams, p_base: Array, radius: float) -> float:
     """Return the mean angle between beams and the normals of a sphere where they meet it.
 
     Parameters
     ----------
-    shots : Beams
+    returns : Beams
         Beams that met the sphere.
     p_base : (3,)
         Its centre [m].
@@ -223,9 +221,9 @@ def mean_incidence(shots: Beams, p_base: Array, radius: float) -> float:
     Returns
     -------
     float
-        The angle; a beam whose axis passes the sphere by counts as grazing [rad].
+        The angle; a beam whose axis misses the sphere counts as grazing [rad].
     """
-    to_centre = p_base - shots.origins_base
-    along = np.sum(to_centre * shots.directions_base, axis=1)
+    to_centre = p_base - returns.origins_base
+    along = np.sum(to_centre * returns.directions_base, axis=1)
     beside = np.sqrt(np.maximum(np.sum(to_centre**2, axis=1) - along**2, 0.0))
     return float(np.mean(np.arcsin(np.minimum(beside / radius, 1.0))))

@@ -1,7 +1,7 @@
-"""How errors depend on distance, point count and incidence, and what that means for a tolerance.
+"""Dependence of errors on distance, point count and incidence, and limits that keep a tolerance.
 
-``fit_error_model`` fits a power law to errors; ``limits`` says how far, and with how few returns, a
-tolerance is kept, and how sure that is.
+``fit_error_model`` fits a power law to errors; ``limits`` gives the greatest distance and smallest
+point count that keep a tolerance, with confidence intervals.
 """
 
 from __future__ import annotations
@@ -20,34 +20,36 @@ Statistic = Literal["p95", "mean"]
 """
 
 TERMS = ("distance", "count", "incidence")
-"""What an error may depend on, in the order of a model's exponents."""
+"""Explanatory variables of an error, in the order of a model's exponents."""
 
-_LEAST_ERROR = 1e-5  # [m]; smaller ones are chance, and have no logarithm worth fitting
-_PER_TERM = 4  # errors wanted for each unknown of a model
+_LEAST_ERROR = (
+    1e-5  # [m]; smaller errors are raised to this: their logarithms would dominate the fit
+)
+_PER_TERM = 4  # errors required for each unknown of a model
 _SIGMA_EXPONENT = 3.0  # prior of every exponent about 0: physics gives -1/2 to 2
 _HUBER = 1.345  # scales beyond which a residual counts less: 95 % efficient for a normal sample
 _N_STEPS = 12  # of reweighting; three or four change the fourth digit
-_GROUPS_MIN = 5  # scans that can be drawn from; of fewer, the errors are drawn themselves
+_GROUPS_MIN = 5  # scans for a resampling by scans; with fewer, single errors are resampled
 _P95 = 0.95
 _CONFIDENCE = (0.025, 0.975)
 
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class ErrorSample:
-    """Errors of sphere centres with what they may depend on, one row per centre.
+    """Errors of sphere centres with explanatory variables, one row per centre.
 
     Attributes
     ----------
     ranges : (n,)
         Distances from the LiDAR to the centres [m].
     n_points : (n,)
-        Numbers of returns that carry them.
+        Numbers of returns that are used.
     incidences : (n,)
         Mean angles between beam and normal of the sphere; NaN where they are not known [rad].
     errors_3d : (n,)
         Lengths of the errors; NaN where they are not known [m].
     scans : (n,)
-        Number of the scan that each comes from: errors of one scan share the rig's.
+        Number of the scan of each: errors of one scan share those of the rig.
     """
 
     ranges: Array
@@ -64,31 +66,31 @@ class ErrorSample:
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class ErrorModel:
-    """How large errors are: a product of powers of distance, point count and sine of incidence.
+    """Power law of errors in distance, point count and sine of incidence.
 
     Attributes
     ----------
     terms : tuple of str
-        Those of ``TERMS`` that the sample let tell apart from a constant.
+        Those of ``TERMS`` that vary in the sample.
     exponents : (k,)
         Their powers.
     sigma_exponents : (k,)
         Standard deviations of the powers, robust, with the errors of one scan taken as dependent.
     correlation : float
-        Correlation of the powers of distance and count; near -1 or 1 they cannot be told apart,
+        Correlation of the powers of distance and count; near -1 or 1 they are not separable,
         as when all scans took the same time. NaN without both terms.
     typical : float
         Error at the reference [m].
     reference : (3,)
         Distance [m], count and sine of incidence in the middle of the sample.
     density : float
-        Median of count times squared distance: what one turn puts on a sphere [m^2].
+        Median of count times squared distance: returns of one turn on a sphere at 1 m [m^2].
     factor_p95, factor_mean : float
         95th percentile and mean of error over typical error.
     range_span, count_span : tuple of float
-        Least and greatest distance [m] and count of the sample: it knows nothing beyond.
+        Least and greatest distance [m] and count of the sample: the range of validity.
     n, n_scans : int
-        Errors and scans that it rests on.
+        Numbers of errors and scans in the sample.
     """
 
     terms: tuple[str, ...]
@@ -110,11 +112,11 @@ class ErrorModel:
         seal(self, exponents=(k,), sigma_exponents=(k,), reference=(3,))
 
     def exponent(self, term: str) -> float:
-        """Return the power of one of ``TERMS``; 0 for one that the model is without."""
+        """Return the power of one of ``TERMS``; 0 for a term that is not in the model."""
         return float(self.exponents[self.terms.index(term)]) if term in self.terms else 0.0
 
     def sigma(self, term: str) -> float:
-        """Return the standard deviation of that power; NaN for one that the model is without."""
+        """Return the standard deviation of that power; NaN for a term that is not in the model."""
         return float(self.sigma_exponents[self.terms.index(term)]) if term in self.terms else np.nan
 
     def predict(
@@ -145,12 +147,12 @@ class ErrorModel:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Bound:
-    """How far something may go until the tolerance is lost, and how sure that is.
+    """Limit of a variable up to which the tolerance is kept, with its confidence interval.
 
     Attributes
     ----------
     value, low, high : float
-        The bound and its 95 % confidence interval, in the unit of what is bounded. Distances: the
+        The limit and its 95 % confidence interval, in the unit of the variable. Distances: the
         tolerance is kept from the nearest up to here; 0 means that not even the nearest keeps it,
         infinity that all do. Counts: it is kept from here up to the most returns; 0 means that all
         keep it, infinity that not even the most do.
@@ -166,7 +168,7 @@ class Bound:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Demand:
-    """What is asked of errors.
+    """Tolerance of errors, and the conditions for which limits are computed.
 
     Attributes
     ----------
@@ -175,10 +177,10 @@ class Demand:
     statistic : {"p95", "mean"}
         What of the error must be within it; the study's is the mean.
     at_range : float or None
-        Distance at which the smallest count is asked for; the middle of the sample by default [m].
+        Distance of the smallest count; the middle of the sample by default [m].
     density : float or None
-        Count times squared distance of the turn for which the greatest distance is asked; that of
-        the middle of the sample by default [m^2].
+        Count times squared distance of the turn, for the greatest distance; that of the middle of
+        the sample by default [m^2].
     """
 
     tolerance: float
@@ -189,7 +191,7 @@ class Demand:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Limits:
-    """What keeps a tolerance.
+    """Limits that keep a tolerance.
 
     Attributes
     ----------
@@ -198,7 +200,7 @@ class Limits:
     smallest_count : Bound
         Number of returns from which it is kept at ``at_range``.
     at_range : float
-        Distance at which the count is asked for [m].
+        Distance of the smallest count [m].
     """
 
     greatest_distance: Bound
@@ -230,7 +232,7 @@ def fit_error_model(sample: ErrorSample) -> ErrorModel:
     median absolute deviation) with a weak prior of 0 +- 3 on each power, so that a sample in which
     nothing varies has an answer too, and a large sigma. The quantiles come from the residuals
     themselves, because the errors of a biased method are not chi-distributed. Standard deviations
-    are of the sandwich form, clustered by scan. Distance and count are told apart only where the
+    are of the sandwich form, clustered by scan. Distance and count are separable only where the
     count was varied at fixed distance, by the time of a turn.
     """
     return _solved(_regression(sample))
@@ -239,14 +241,14 @@ def fit_error_model(sample: ErrorSample) -> ErrorModel:
 def limits(
     sample: ErrorSample, demand: Demand, rng: np.random.Generator, *, n_resamples: int = 400
 ) -> Limits:
-    """Say up to which distance, and from how many returns, a tolerance is kept.
+    """Return the greatest distance and the smallest count of returns that keep a tolerance.
 
     Parameters
     ----------
     sample : ErrorSample
         Errors of one method.
     demand : Demand
-        What is asked of them.
+        Tolerance and conditions.
     rng : numpy.random.Generator
         Draws the resamples.
     n_resamples : int
@@ -255,7 +257,7 @@ def limits(
     Returns
     -------
     Limits
-        Bounds with 95 % confidence, never beyond what the sample saw.
+        Limits with 95 % confidence intervals, within the range of the sample.
 
     Raises
     ------
@@ -264,7 +266,7 @@ def limits(
 
     Notes
     -----
-    The model of ``fit_error_model`` without incidence, which nobody chooses and whose variation
+    The model of ``fit_error_model`` without incidence, which cannot be chosen and whose variation
     therefore counts among the errors, is fitted to the sample and again to resamples of whole scans
     (of single errors, where there are fewer than five scans); the interval is that of their bounds
     (percentile bootstrap). Cost grows linearly with errors times resamples.
@@ -306,8 +308,8 @@ def _regression(sample: ErrorSample, wanted: tuple[str, ...] = TERMS) -> _Regres
     least = _PER_TERM * (1 + len(TERMS))
     if is_known.sum() < least:
         raise TooFewObservationsError(
-            f"{int(is_known.sum())} known errors do not tell how errors depend on distance and "
-            f"count; {least} are needed."
+            f"{int(is_known.sum())} known errors are too few for a model of distance and count; "
+            f"{least} are needed."
         )
     ranges, counts = sample.ranges[is_known], sample.n_points[is_known].astype(np.float64)
     sines = np.sin(sample.incidences[is_known]) if has_incidence else np.ones(len(ranges))

@@ -1,16 +1,20 @@
 """Candidate -> marker centre with covariance, by named methods.
 
-Hides how a centre is estimated. A method takes all candidates of a stop together, because they
-share the noise and the lasers of one sensor:
+A method takes all candidates of a stop together, because they share the noise and the lasers of one
+sensor:
 
 - ``along_beam`` is maximum likelihood with the range of each beam's footprint, which exists only
   where the footprint meets the sphere,
-- ``silhouette`` adds which shots passed by, of those that ``shots`` tells,
+- ``silhouette`` adds the pulses that passed without a return (``pulses``),
 - ``astm_e3125`` is the surveyors' standard: cone, cylinder, 3 sigma,
 - ``free_radius`` and ``algebraic`` estimate the radius too, for comparison,
 - ``paper`` is the study's registration of a hemisphere by ICP.
 
-``bound`` says how well ranges can tell a centre at all: only comparisons with truth use it.
+The maximum-likelihood methods share ``estimation``: a joint least-squares adjustment of all centres
+(``normal_equations``), with ranges averaged over footprints (``footprint``) and linearised over the
+uncertainty of the centres (``linearisation``), robust weights (``noise``), the limb (``limb``),
+errors of the mounting (``mounting``) and a test of the assumed radius (``radius``). ``bound`` is
+the Cramer-Rao bound, for comparisons with truth.
 """
 
 from __future__ import annotations
@@ -59,7 +63,7 @@ def fit_markers(
     cloud : StitchedCloud
         The stop.
     candidates : MarkerCandidates
-        What extraction found in it.
+        The candidates found in it.
     config : FittingConfig
         Prior noise.
     marker_radius : float
@@ -68,8 +72,8 @@ def fit_markers(
     Returns
     -------
     MarkerFits
-        Centres in the order of the candidates; refused candidates, of the extraction and of the
-        method, with reasons. There may be no fits at all.
+        Centres in the order of the candidates; candidates refused by the detection and by the
+        method, with reasons. There may be no fits.
 
     Raises
     ------

@@ -81,7 +81,9 @@ def described(
     found = predict(pulses, p_base[None], np.array([radius]), which)
     rings = pulses.rings[pulses.rings != RING_UNKNOWN]
     n_rings = len(np.unique(rings))
-    coverage = limb_coverage(pulses.directions_base, pulses.across_base, found.offsets, radius)
+    u, a = pulses.directions_base, pulses.across_base
+    passed = found.offsets[:, :1] * a + found.offsets[:, 1:] * np.cross(u, a)
+    coverage = limb_coverage(u.T, passed.T, radius)
     residuals = pulses.ranges - found.ranges
     nearby = beams(cloud, on_sphere(cloud, candidate, radius, _NEARBY))
     own = own_radius(nearby, radius, levelling_rotation(cloud.levelling)[2])
@@ -121,14 +123,17 @@ def left_out(members: Index, used: Index) -> Index:
     return np.asarray(members[is_left])
 
 
-def limb_coverage(directions: Array, across: Array, offsets: Array, radius: float) -> float:
-    """Return the share of the octants of a sphere's limb that have returns; arrays are (n, k)."""
-    middle = directions.mean(axis=0)
+def limb_coverage(directions: Array, passed: Array, radius: float) -> float:
+    """Return the share of the octants of a sphere's limb that have returns.
+
+    ``passed``, (3, n), are the vectors from the centre to the beams [m].
+    """
+    x, y, z = middle = directions.mean(axis=1)
+    cross = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
     # the footprint's axes are turned over between the two faces of the scan, these are not
-    first = np.cross(middle, np.eye(3)[np.argmin(np.abs(middle))])
+    first = cross[:, np.argmin(np.abs(middle))]
     first /= np.linalg.norm(first)
-    passed = offsets[:, :1] * across + offsets[:, 1:] * np.cross(directions, across)
-    x, y = np.stack([first, np.cross(middle, first)]) @ passed.T
+    x, y = first @ passed, cross @ first @ passed
     octants = 4 * (y < 0.0) + 2 * (x < 0.0) + (np.abs(y) > np.abs(x))
     return len(np.unique(octants[x * x + y * y > (_MIDDLE * radius) ** 2])) / 8.0
 

@@ -10,15 +10,32 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
+from numpy.polynomial import Chebyshev, Polynomial
 
-from spheremark.pipelines.compilation import compiled
+from spheremark.pipelines.compilation import FUSED, compiled, compiled_with
 from spheremark.pipelines.model import Array, Beams, Index
 
 _N_STRIPS = 6  # of the ellipse; the mean is good to 0.01 mm for a sphere of 0.1 m at 8 m
 _ANGLES = np.pi * np.arange(1, _N_STRIPS + 1) / (_N_STRIPS + 1)
 _HEIGHTS, _WIDTHS = np.cos(_ANGLES), np.sin(_ANGLES)  # of strips of the unit disc
 _FULL = 2.0 * np.sum(_WIDTHS**2)
+_NEAR, _ASIDE, _FAR = np.sqrt([1.0 / 6.0, 1.0 / 2.0, 2.0 / 3.0])
+_RAYS_X = np.array([0.0, _FAR, -_FAR, _NEAR, -_NEAR, _NEAR, -_NEAR])  # in the unit disc
+_RAYS_Y = np.array([0.0, 0.0, 0.0, _ASIDE, _ASIDE, -_ASIDE, -_ASIDE])
+_RAYS_WEIGHT = np.array([0.25, *[0.125] * 6])
+_TINY = 1e-300
 _THIN = 1e-6  # [m]; a thinner footprint is treated as a ray
+
+
+def _arctan() -> Array:
+    """Return the series of arctan(t) / t in t squared up to t = 1, highest power first."""
+    series = Chebyshev.interpolate(
+        lambda square: np.arctan(np.sqrt(square)) / np.sqrt(square), 8, domain=[0.0, 1.0]
+    )
+    return np.array(series.convert(kind=Polynomial, domain=[-1, 1], window=[-1, 1]).coef[::-1])
+
+
+_ARCTAN = _arctan()
 
 
 class Prediction(NamedTuple):
@@ -144,3 +161,69 @@ def mean_depth(
     by_x, by_y = (total_x - mean * length_x) / length, (total_y - mean * length_y) / length
     by_radius, lit = (total_r - mean * length_r) / length, length / (_FULL * half_x)
     return mean, by_y if is_turned else by_x, by_x if is_turned else by_y, by_radius, lit
+
+
+@compiled
+def mean_depth_inside(
+    x0: float, y0: float, radius: float, half_x: float, half_y: float
+) -> tuple[float, float, float, float]:
+    """Like ``mean_depth``, for a footprint that ends 0.1 radii or more inside the limb.
+
+    Radon's rule of degree 5 for the disc (1948), good to 0.01 mm for a sphere of 0.1 m, at a
+    quarter of the cost of the strips.
+    """
+    mean, by_x, by_y, by_radius = 0.0, 0.0, 0.0, 0.0
+    for k in range(len(_RAYS_WEIGHT)):
+        dx, dy = half_x * _RAYS_X[k] - x0, half_y * _RAYS_Y[k] - y0
+        depth = np.sqrt(radius * radius - dx * dx - dy * dy)
+        slope = _RAYS_WEIGHT[k] / depth
+        mean += _RAYS_WEIGHT[k] * depth
+        by_x += slope * dx
+        by_y += slope * dy
+        by_radius += slope * radius
+    return mean, by_x, by_y, by_radius
+
+
+@compiled_with(fastmath=FUSED)
+def mean_depths_at(points: Array, found: Array) -> None:
+    """Fill in ``mean_depth`` without derivatives for several places of a centre.
+
+    ``points`` has x, y, radius and half widths, (5, p), and is overwritten; ``found`` is (2, p),
+    the second row for lit lengths. The inner loop has no branches, so that it runs on several
+    points at once: several times as fast.
+    """
+    for p in range(points.shape[1]):
+        found[0, p] = found[1, p] = 0.0
+        if abs(points[1, p]) > abs(points[0, p]):
+            points[0, p], points[1, p] = points[1, p], points[0, p]
+            points[3, p], points[4, p] = points[4, p], points[3, p]
+    for k in range(_N_STRIPS):
+        weight, height = _WIDTHS[k], _HEIGHTS[k]
+        for p in range(points.shape[1]):
+            x, radius, half = points[0, p], points[2, p], points[3, p] * weight
+            dy = points[4, p] * height - points[1, p]
+            h2 = max(radius * radius - dy * dy, 0.0)
+            h = np.sqrt(h2)
+            left, right = min(max(-half - x, -h), h), min(max(half - x, -h), h)
+            depth_left = np.sqrt(max(h2 - left * left, 0.0))
+            depth_right = np.sqrt(max(h2 - right * right, 0.0))
+            turn = _angle(
+                right * depth_left - left * depth_right, depth_left * depth_right + left * right
+            )
+            found[0, p] += weight * 0.5 * (right * depth_right - left * depth_left + h2 * turn)
+            found[1, p] += weight * (right - left)
+    for p in range(points.shape[1]):
+        found[0, p] = found[0, p] / found[1, p] if found[1, p] > 0.0 else 0.0
+
+
+@compiled_with(fastmath=FUSED)
+def _angle(y: float, x: float) -> float:
+    """Return ``arctan2(y, x)`` for y not below zero, to 1e-8, without branches."""
+    away = abs(x)
+    tangent = min(y, away) / max(y, away, _TINY)
+    square, series = tangent * tangent, 0.0
+    for k in range(len(_ARCTAN)):
+        series = series * square + _ARCTAN[k]
+    angle = tangent * series
+    angle = 0.5 * np.pi - angle if y > away else angle
+    return np.pi - angle if x < 0.0 else angle

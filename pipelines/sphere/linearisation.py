@@ -13,11 +13,12 @@ import numpy as np
 
 from spheremark.pipelines.compilation import compiled
 from spheremark.pipelines.model import Array, Index, Mask
-from spheremark.pipelines.sphere.footprint import mean_depth
+from spheremark.pipelines.sphere.footprint import mean_depth_inside, mean_depths_at
 from spheremark.pipelines.sphere.returns import Returns
 
 _INNER = 0.9  # radii from the middle within which the range hardly bends
 _THIN2 = 1e-12  # [m^2] least variance: keeps the factor invertible
+_N_POINTS = 8  # sigma points, padded to the width of vector registers
 _WIDTH = np.sqrt(3.0)  # sigmas to either side: two such points have a normal's fourth moment
 
 
@@ -77,7 +78,7 @@ def _linearise(
 ) -> None:
     """Fill in ``Linear``."""
     (origins, (u, a, b), half_widths), (states, covs) = beams, spheres
-    slopes = np.empty(3)
+    work = (np.empty((5, _N_POINTS)), np.empty((2, _N_POINTS)))
     for m in range(len(states)):
         cov, radius = covs[m], states[m, 3]
         for i in range(starts[m], starts[m + 1]):
@@ -101,11 +102,13 @@ def _linearise(
                 factor = _factor(cov, radial, tangential)
                 half = (half_widths[0, i], half_widths[1, i])
                 if _reach(away, max(half[0], half[1]), factor) < _INNER * radius:
-                    shorter, by_x, by_y, by_radius, _ = mean_depth(x, y, radius, half[0], half[1])
+                    shorter, by_x, by_y, by_radius = mean_depth_inside(
+                        x, y, radius, half[0], half[1]
+                    )
                     shorter -= 0.5 * _curvature(away, radius, factor)
                 else:
                     shorter, by_x, by_y, by_radius, bend = _over_sigma_points(
-                        (x, y, radius), half, (c, s), factor, slopes
+                        (x, y, radius), half, (c, s), factor, work
                     )
             for j in range(3):
                 out.J[j, i] = u[j, i] - by_x * a[j, i] - by_y * b[j, i]
@@ -158,31 +161,34 @@ def _curvature(away, radius, factor):  # type: ignore[no-untyped-def]  # noqa: A
 
 
 @compiled
-def _over_sigma_points(sphere, half, direction, factor, slopes):  # type: ignore[no-untyped-def]  # noqa: ANN001, ANN202
+def _over_sigma_points(sphere, half, direction, factor, work):  # type: ignore[no-untyped-def]  # noqa: ANN001, ANN202
     """Return mean depth, slopes by x, y and radius, and the deviation that is not linear."""
     (x, y, radius), (c, s), (aa, ab, bb, ar, br, rr) = sphere, direction, factor
-    depth = mean_depth(x, y, radius, half[0], half[1])[0]
     # columns of the factor in the footprint's axes: x, y and radius
     columns = (
         (aa * c - ab * s, aa * s + ab * c, ar),
         (-bb * s, bb * c, br),
         (0.0, 0.0, rr),
     )
-    mean, square = 0.0, 0.0
+    points, found = work
+    for p in range(_N_POINTS):
+        points[0, p], points[1, p], points[2, p] = x, y, radius
+        points[3, p], points[4, p] = half
     for k in range(3):
-        dx, dy, dr = columns[k]
-        plus, minus = depth, depth
-        if k < 2 or rr > 0.0:
-            dx, dy, dr = _WIDTH * dx, _WIDTH * dy, _WIDTH * dr
-            plus = mean_depth(x + dx, y + dy, radius + dr, half[0], half[1])[0]
-            minus = mean_depth(x - dx, y - dy, radius - dr, half[0], half[1])[0]
-        slopes[k] = (plus - minus) / (2.0 * _WIDTH)
-        mean += (plus + minus) / 6.0
-        square += (plus * plus + minus * minus) / 6.0
-    by_a, by_b, by_radius = slopes[0], slopes[1], slopes[2]
-    linear = by_a * by_a + by_b * by_b + by_radius * by_radius
+        for sign in range(-1, 2, 2):
+            p = 1 + k if sign > 0 else 4 + k
+            points[0, p] += sign * _WIDTH * columns[k][0]
+            points[1, p] += sign * _WIDTH * columns[k][1]
+            points[2, p] += sign * _WIDTH * columns[k][2]
+    mean_depths_at(points, found)
+    d, a, b, r = found[0, 0], found[0, 1], found[0, 2], found[0, 3]
+    minus_a, minus_b, minus_r = found[0, 4], found[0, 5], found[0, 6]
+    mean = (a + b + r + minus_a + minus_b + minus_r) / 6.0
+    square = (a * a + b * b + r * r + minus_a**2 + minus_b**2 + minus_r**2) / 6.0
+    by_a, by_b, by_radius = a - minus_a, b - minus_b, r - minus_r
+    linear = (by_a * by_a + by_b * by_b + by_radius * by_radius) / (2.0 * _WIDTH) ** 2
     bend = np.sqrt(max(square - mean * mean - linear, 0.0))
-    by_radius = by_radius / rr if rr > 0.0 else 0.0
-    by_b = (by_b - br * by_radius) / bb
-    by_a = (by_a - ab * by_b - ar * by_radius) / aa
-    return 2.0 * depth - mean, by_a * c - by_b * s, by_a * s + by_b * c, by_radius, bend
+    by_radius = by_radius / (2.0 * _WIDTH * rr) if rr > 0.0 else 0.0
+    by_b = (by_b / (2.0 * _WIDTH) - br * by_radius) / bb
+    by_a = (by_a / (2.0 * _WIDTH) - ab * by_b - ar * by_radius) / aa
+    return 2.0 * d - mean, by_a * c - by_b * s, by_a * s + by_b * c, by_radius, bend

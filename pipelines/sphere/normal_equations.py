@@ -62,8 +62,8 @@ def normals_of(
     return Normals(
         centres=rows(weighted),
         by_face=rows(returns.vertical[0] * weighted),
-        biases=np.bincount(lasers, weights, n_lasers),
-        rhs_biases=np.bincount(lasers, weights * residuals, n_lasers),
+        biases=np.asarray(np.bincount(lasers, weights, n_lasers), np.float64),
+        rhs_biases=np.asarray(np.bincount(lasers, weights * residuals, n_lasers), np.float64),
     )
 
 

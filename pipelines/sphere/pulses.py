@@ -1,7 +1,7 @@
-"""Which shots pass spheres: all that the lasers fired, also those that nobody recorded.
+"""All pulses that pass a sphere, including those without a recorded return.
 
-Hides the firing pattern. A driver drops what did not return, but lasers fire by the clock: ring,
-time and azimuth of the returns about a marker tell every shot between them.
+A driver drops pulses that did not return, but lasers fire by the clock: ring, time and azimuth of
+the returns about a marker determine every pulse between them.
 """
 
 from __future__ import annotations
@@ -14,37 +14,27 @@ from numpy.typing import NDArray
 
 from spheremark.pipelines.compilation import compiled
 from spheremark.pipelines.geometry import levelling_rotation
-from spheremark.pipelines.model import (
-    RING_UNKNOWN,
-    Array,
-    Column,
-    Index,
-    Mask,
-    Rings,
-    StitchedCloud,
-)
+from spheremark.pipelines.model import RING_UNKNOWN, Array, Index, Mask, StitchedCloud
 from spheremark.pipelines.scan.rigs import FIRING_CYCLE, FIRING_ORDER, LASER_CYCLE, N_LASERS
 from spheremark.pipelines.scan.stitching import beams
 
-Rows = NDArray[np.int32]
-
 _DELAYS = np.argsort(FIRING_ORDER) * LASER_CYCLE  # [s] of each laser within its firing
 _PHASE_MAX = 3e-6  # [s] scatter of the firing clock: one laser's share of a firing
-_N_TIMED = 20_000  # returns that tell the clock and the spin
-_THINNED = 8  # one in so many of them tells the mean rate of the spin
+_N_TIMED = 20_000  # returns from which the clock and the spin are estimated
+_THINNED = 8  # of these one in so many for the mean rate of the spin
 _SPIN_MAX = np.radians(0.2)  # scatter of azimuths about a steady spin
-_REACH = 1.5  # radii: shots that pass a centre closer are asked
+_REACH = 1.5  # radii: pulses that pass a centre closer are taken
 _DEPTH = 2.0  # radii before and behind the centre within which a return is the sphere's own
 _POLE_FROM, _POLE = 0.6, 0.35  # radii below the centre, and from the vertical: may be the pole
 _DRIFT = 0.05  # [s] over which the spin is steady
 _CLOSE = 0.02  # [s] between returns of the same part of a revolution
 _N_RATES = 10
-_SEARCHES = (1e-2, 1e-3, 1e-4, 1e-5, 1e-6)  # of the rate: ever finer about the best
-_MARGIN = np.radians(1.0)  # what the LiDAR's place off the axis does to directions
+_SEARCHES = (1e-2, 1e-3, 1e-4, 1e-5, 1e-6)  # half widths of the search for the rate, relative
+_MARGIN = np.radians(1.0)  # effect of the LiDAR's offset from the axis on directions
 
 
 class Pattern(NamedTuple):
-    """When and whither the lasers fire.
+    """Firing times and directions of the lasers.
 
     Attributes
     ----------
@@ -53,7 +43,7 @@ class Pattern(NamedTuple):
     spin : float
         Rate of the azimuth [rad/s].
     times, azimuths : (k,)
-        By how much a steady spin is off at some instants [s, rad].
+        Deviations from a steady spin at some instants [s, rad].
     """
 
     phase: float
@@ -63,7 +53,7 @@ class Pattern(NamedTuple):
 
 
 class Firings(NamedTuple):
-    """All firings of a stop, and which of their shots returned.
+    """All firings of a stop, and which of their pulses returned.
 
     Attributes
     ----------
@@ -72,25 +62,25 @@ class Firings(NamedTuple):
     spin, turn : float
         Rates of the two [rad/s].
     row_of : (m, 16)
-        Row of the cloud that each shot returned as; -1 where it did not.
+        Row of the cloud of each pulse's return; -1 without one.
     """
 
     azimuths: Array
     angles: Array
     spin: float
     turn: float
-    row_of: Rows
+    row_of: NDArray[np.int32]
 
 
 class Passing(NamedTuple):
-    """Shots that pass one sphere closely, in the plane square to the line of sight.
+    """Pulses that pass one sphere closely, in the plane across the line of sight.
 
     Attributes
     ----------
     places : (n, 2)
-        Where they pass [m].
+        Intersections with the plane [m].
     half_widths : (n, 2, 2)
-        Square roots of their footprints there: half widths times their axes [m].
+        Their footprints there: half widths times axes [m].
     has_hit : (n,)
         Whether they returned from the sphere.
     axes : (2, 3)
@@ -98,7 +88,7 @@ class Passing(NamedTuple):
     centre : (3,)
         Origin of the plane [m].
     distance : float
-        How far away it is [m].
+        From the base to the centre [m].
     """
 
     places: Array
@@ -110,7 +100,7 @@ class Passing(NamedTuple):
 
 
 def pattern_of(cloud: StitchedCloud) -> tuple[Pattern | None, str]:
-    """Return the firing pattern, or why it cannot be told."""
+    """Return the firing pattern, or the reason why it cannot be determined."""
     if len(cloud.rig.laser_elevations) != N_LASERS:
         return None, f"the rig has {len(cloud.rig.laser_elevations)} lasers, not a VLP-16's 16"
     if not len(cloud.rings) or np.any(cloud.rings == RING_UNKNOWN):
@@ -158,14 +148,19 @@ def _steady(times: Array, azimuths: Array) -> tuple[float, Array]:
     turns = np.exp(1j * azimuths)
     for width in _SEARCHES:
         trial = spin * (1.0 + width * np.linspace(-2.0, 2.0, 81))
-        spin = float(trial[_steadiest(times[::_THINNED], azimuths[::_THINNED], trial)])
+        phases = azimuths[::_THINNED] - trial[:, None] * times[::_THINNED]
+        spin = float(trial[np.argmax(np.abs(np.exp(1j * phases).sum(axis=1)))])
     mean = float(np.angle(np.mean(turns * np.exp(-1j * spin * times))))
     return spin, mean + np.angle(turns * np.exp(-1j * (spin * times + mean)))
 
 
 def firings_of(cloud: StitchedCloud, pattern: Pattern) -> Firings:
     """Return every firing between the first return and the last."""
-    first, row_of = _numbered(cloud.times[:], cloud.rings, pattern.phase, _DELAYS)
+    seconds = cloud.times[:] - _DELAYS[cloud.rings] - pattern.phase
+    numbers = np.rint(seconds / FIRING_CYCLE).astype(np.intp)
+    first = int(numbers.min())
+    row_of = np.full((int(numbers.max()) - first + 1, N_LASERS), -1, np.int32)
+    row_of[numbers - first, cloud.rings] = np.arange(len(numbers))
     numbered = np.arange(first, first + len(row_of), dtype=np.float64)
     times: Array = pattern.phase + FIRING_CYCLE * numbered
     thin = slice(None, None, max(len(cloud.times) // _N_TIMED, 1))
@@ -182,24 +177,10 @@ def firings_of(cloud: StitchedCloud, pattern: Pattern) -> Firings:
     )
 
 
-@compiled
-def _numbered(times: Column, rings: Rings, phase: float, delays: Array) -> tuple[int, Rows]:
-    """Return the number of the first firing, and the row of each shot from there on."""
-    low, high = 1 << 60, -(1 << 60)
-    for i in range(len(times)):
-        number = int(np.rint((times[i] - delays[rings[i]] - phase) / FIRING_CYCLE))
-        low, high = min(low, number), max(high, number)
-    row_of = np.full((high - low + 1, N_LASERS), -1, np.int32)
-    for i in range(len(times)):
-        number = int(np.rint((times[i] - delays[rings[i]] - phase) / FIRING_CYCLE))
-        row_of[number - low, rings[i]] = i
-    return low, row_of
-
-
 def passing_of(
     cloud: StitchedCloud, firings: Firings, centres: Array, radius: float
 ) -> list[Passing]:
-    """Return the shots that pass each sphere closely, save those its pole may have answered."""
+    """Return the pulses that pass each sphere closely, except those that may have met its pole."""
     rig, distances = cloud.rig, np.linalg.norm(centres, axis=1)
     sights = centres / distances[:, None]
     reaches = _REACH * radius / distances + _MARGIN
@@ -207,7 +188,7 @@ def passing_of(
         np.column_stack([sights, np.sin(reaches), np.cos(reaches)]),
         (firings.azimuths, firings.angles),
         rig.T_head_lidar[:3, :3].copy(),
-        np.stack([rig.laser_elevations, _DELAYS]),
+        rig.laser_elevations,
     )
     angles = firings.angles[m] + firings.turn * _DELAYS[ring]
     azimuths = firings.azimuths[m] + firings.spin * _DELAYS[ring]
@@ -218,10 +199,8 @@ def passing_of(
     across /= np.linalg.norm(across, axis=1, keepdims=True)
     rows = firings.row_of[m, ring]
     seen = np.where(rows < 0, np.inf, np.linalg.norm(cloud.p_base[rows] - origins, axis=1))
-    up, edges = (
-        levelling_rotation(cloud.levelling)[2],
-        np.searchsorted(which, range(len(centres) + 1)),
-    )
+    up = levelling_rotation(cloud.levelling)[2]
+    edges = np.searchsorted(which, range(len(centres) + 1))
     return [
         _past((p, radius), (origins[a:b], u[a:b], across[a:b], seen[a:b]), rig.divergence, up)
         for p, (a, b) in zip(centres, pairwise(edges), strict=True)
@@ -233,19 +212,19 @@ def _aimed(
     sights: Array,
     turns: tuple[Array, Array],
     R: Array,
-    lasers: Array,
+    elevations: Array,
 ) -> tuple[Index, Index, Index]:
-    """Return marker, firing and laser of the shots that aim near a sphere, marker by marker.
+    """Return marker, firing and laser of the pulses that aim near a sphere, marker by marker.
 
-    ``sights`` has the directions and the sine and cosine of how near, ``R`` is that of the LiDAR
-    in the head, ``lasers`` has elevations and delays.
+    ``sights`` are directions with the sine and cosine of their reach, ``turns`` azimuths and gimbal
+    angles, ``R`` the rotation of the LiDAR in the head, ``elevations`` those of the lasers.
     """
     n = len(turns[0])
-    sines, cosines = np.sin(lasers[0]), np.cos(lasers[0])
+    sines, cosines = np.sin(elevations), np.cos(elevations)
     found = [(0, 0, 0) for _ in range(0)]
     for m in range(n):
         c, s = np.cos(turns[1][m]), np.sin(turns[1][m])
-        # a firing lasts so short that head and spin stand still, within the margin of the reach
+        # within one firing the head and the spin move by less than the margin of the reach
         x, y = np.cos(turns[0][m]), -np.sin(turns[0][m])
         for k in range(len(sights)):
             hx, hy = c * sights[k, 0] + s * sights[k, 1], c * sights[k, 1] - s * sights[k, 0]
@@ -269,7 +248,7 @@ def _aimed(
 
 
 def _directions(cloud: StitchedCloud, azimuths: Array, angles: Array, elevations: Array) -> Array:
-    """Return the directions of shots in the base frame, (n, 3)."""
+    """Return the directions of pulses in the base frame, (n, 3)."""
     v_lidar = np.column_stack(
         [
             np.cos(elevations) * np.cos(azimuths),
@@ -289,12 +268,12 @@ def _turned(v_head: Array, angles: Array) -> Array:
 
 def _past(
     sphere: tuple[Array, float],
-    shots: tuple[Array, Array, Array, Array],
+    pulses: tuple[Array, Array, Array, Array],
     divergence: Array,
     up: Array,
 ) -> Passing:
-    """Return of the shots aimed near one sphere those that its outline may tell of."""
-    (p, radius), (origins, u, across, seen) = sphere, shots
+    """Return of the pulses aimed near one sphere those that may meet its limb."""
+    (p, radius), (origins, u, across, seen) = sphere, pulses
     distance = float(np.linalg.norm(p))
     along = np.einsum("ij,ij->i", p - origins, u)
     passed = origins + along[:, None] * u - p
@@ -304,28 +283,13 @@ def _past(
     half_widths = 0.5 * along[:, None, None] * divergence[:, None] * both
     is_pole = (places[:, 1] < -_POLE_FROM * radius) & (np.abs(places[:, 0]) < _POLE * radius)
     is_near = (along > 0.0) & (np.einsum("ij,ij->i", passed, passed) < (_REACH * radius) ** 2)
-    asked = is_near & (depth > -_DEPTH) & ~is_pole
-    has_hit = (depth < _DEPTH)[asked]
-    return Passing(places[asked], half_widths[asked], has_hit, axes, p, distance)
+    is_taken = is_near & (depth > -_DEPTH) & ~is_pole
+    has_hit = (depth < _DEPTH)[is_taken]
+    return Passing(places[is_taken], half_widths[is_taken], has_hit, axes, p, distance)
 
 
 def _plane(sight: Array, up: Array) -> Array:
-    """Return two unit vectors square to a line of sight, the second one upward, (2, 3)."""
+    """Return two unit vectors across a line of sight, the second one upward, (2, 3)."""
     side = np.cross(sight, up)
     side /= np.linalg.norm(side)
     return np.stack([side, np.cross(side, sight)])
-
-
-@compiled
-def _steadiest(times: Array, azimuths: Array, rates: Array) -> int:
-    """Return which rate leaves the azimuths least spread about a mean."""
-    best, most = 0, -1.0
-    for k in range(len(rates)):
-        x, y = 0.0, 0.0
-        for i in range(len(times)):
-            angle = azimuths[i] - rates[k] * times[i]
-            x += np.cos(angle)
-            y += np.sin(angle)
-        if x * x + y * y > most:
-            best, most = k, x * x + y * y
-    return best

@@ -174,9 +174,9 @@ def _result(
     sigma0 = max(state.noise.factor * ratio, FACTOR_MIN)
     rings, offsets = stop.beams.rings[used], best.linear.offsets[:, used].T
     n_rings = len(np.unique(rings[rings != RING_UNKNOWN]))
-    coverage = limb_coverage(
-        stop.beams.directions_base[used], stop.beams.across_base[used], offsets, radius
-    )
+    x, y = offsets.T
+    passed = x * stop.returns.first_axes[:, used] + y * stop.returns.second_axes[:, used]
+    coverage = limb_coverage(stop.returns.directions[:, used], passed, radius)
     reasons = weaknesses(n, n_rings, coverage)
     reasons += other_radius(radius, known["radius_free"], known["sigma_radius_free"])
     ratio = sigma0 / state.noise.factor

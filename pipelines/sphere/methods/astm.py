@@ -1,7 +1,7 @@
 """Centres as surveyors' standard ASTM E3125-17 has them: cone, cylinder, 3 sigma, known radius.
 
-Hides the standard's choice of returns, and what stands in for it where they are few: the standard
-is written for spheres with hundreds of them.
+The standard is written for spheres with hundreds of returns; with fewer a small-sample variant of
+its choice of returns applies.
 """
 
 from __future__ import annotations
@@ -51,7 +51,7 @@ _STRAY = 1.0  # radii by which a centre may leave its rough place
 
 
 class _Chosen(NamedTuple):
-    """Which returns carry the centre, and the centre [m]; none where too few are left."""
+    """The returns that are used, and the centre [m]."""
 
     is_used: Mask
     p: Array
@@ -87,8 +87,8 @@ def _fit_one(
         return refused(
             candidate, f"Only {len(rows)} returns lie near the sphere; a centre needs {_N_MIN}."
         )
-    shots, points = beams(cloud, rows), cloud.p_base[rows].astype(np.float64)
-    chosen = _passes(shots, points, radius)
+    returns, points = beams(cloud, rows), cloud.p_base[rows].astype(np.float64)
+    chosen = _passes(returns, points, radius)
     n = int(chosen.is_used.sum())
     if n < _N_MIN or np.linalg.norm(chosen.p - candidate.p_base_rough) > _STRAY * radius:
         return refused(
@@ -107,16 +107,16 @@ def _fit_one(
     )
 
 
-def _passes(shots: Beams, points: Array, radius: float) -> _Chosen:
-    """Return what the passes of choosing and fitting end with."""
+def _passes(returns: Beams, points: Array, radius: float) -> _Chosen:
+    """Choose returns and fit the centre, in turn."""
     is_small = len(points) < _N_DENSE
-    order = np.argsort(shots.ranges)
+    order = np.argsort(returns.ranges)
     nearest = order[: max(int(_NEAREST * len(points)), 3) if is_small else 1]
-    outward = shots.directions_base[nearest].mean(axis=0)
+    outward = returns.directions_base[nearest].mean(axis=0)
     p = points[nearest].mean(axis=0) + radius * outward / np.linalg.norm(outward)
     is_used = np.zeros(len(points), dtype=bool)
     for _ in range(_N_PASSES):
-        is_used = _in_view(shots, points, p, radius)
+        is_used = _in_view(returns, points, p, radius)
         if is_used.sum() < _N_MIN:
             break
         p = _centre(points[is_used], p, radius)
@@ -130,9 +130,9 @@ def _passes(shots: Beams, points: Array, radius: float) -> _Chosen:
     return _Chosen(is_used, p)
 
 
-def _in_view(shots: Beams, points: Array, p: Array, radius: float) -> Mask:
+def _in_view(returns: Beams, points: Array, p: Array, radius: float) -> Mask:
     """Tell which returns lie in the cone about the line to the LiDAR, and in the cylinder."""
-    axis = shots.origins_base - p
+    axis = returns.origins_base - p
     axis = axis / np.linalg.norm(axis, axis=1, keepdims=True)
     v = points - p
     along, away = np.einsum("ij,ij->i", v, axis), np.linalg.norm(v, axis=1)

@@ -1,7 +1,7 @@
-"""Spheres whose radius nobody tells: the geometric and the algebraic fit of the textbooks.
+"""Spheres with an unknown radius: the geometric and the algebraic fit of the textbooks.
 
-Hides two estimators that are here for comparison and as diagnostics: with returns as few as a
-sensor of this kind gives they have heavy tails and centimetres of bias.
+For comparison and as diagnostics: with as few returns as a VLP-16 gives they have heavy tails and
+centimetres of bias.
 """
 
 from __future__ import annotations

@@ -1,8 +1,8 @@
-"""Centres as the study estimates them: a hemisphere registered to what its cut leaves.
+"""Centres as the study estimates them: a hemisphere registered to the upper part of a sphere.
 
-Hides the study's method, kept as it is described (section b of its methodology) so that others can
-be compared with it: the lower part of the sphere is deleted, the model starts at the centroid of
-the rest, and point-to-point ICP moves it.
+The study's method as it is described (section b of its methodology), for comparison: the lower part
+of the sphere is deleted, the model starts at the centroid of the rest, and point-to-point ICP
+registers it.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ from spheremark.pipelines.sphere.description import (
 
 NAME = "paper"
 
-_N_HALF = 1000  # points of a hemisphere; the study does not tell, and 300 or 3000 change < 1 mm
+_N_HALF = 1000  # points of a hemisphere; not given in the study; 300 or 3000 change < 1 mm
 _N_MIN = 4  # returns: one more than unknowns
 _N_STEPS = 200
 _CUTS = {"ground": "the highest ground point", "equator": "the equator"}

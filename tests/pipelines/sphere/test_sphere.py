@@ -509,7 +509,7 @@ def test_without_rings_or_times_the_outline_is_not_used_and_that_is_said(missing
     fit = fit_one(less, CENTRE, "silhouette").fits[0]
     ranges_only = fit_one(less, CENTRE, "along_beam").fits[0]
     assert fit.status is Status.WEAK
-    assert "outline is not used" in fit.reason
+    assert "limb is not used" in fit.reason
     assert missing in fit.variant
     assert_allclose(fit.p_base, ranges_only.p_base)
 
