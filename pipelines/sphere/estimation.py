@@ -11,12 +11,13 @@ from typing import NamedTuple
 
 import numpy as np
 
+from spheremark.pipelines.estimation.linear_algebra import inverse
 from spheremark.pipelines.model import Array, Mask
 from spheremark.pipelines.sphere.limb import Edge, edge_before, edge_of, limb_normals
 from spheremark.pipelines.sphere.linearisation import Linear, linearise
 from spheremark.pipelines.sphere.mounting import N_MOUNTING, effects_on
 from spheremark.pipelines.sphere.noise import START, Noise, Weighed, weigh
-from spheremark.pipelines.sphere.normal_equations import Normals, normals_of, solve
+from spheremark.pipelines.sphere.normal_equations import Normals, normals_of, reduce
 from spheremark.pipelines.sphere.radius import Ranges, free_radii
 from spheremark.pipelines.sphere.returns import Returns, may_be_sphere, moved_faces
 
@@ -197,22 +198,22 @@ def _stepped(state: State, N: Normals, prior: Prior) -> State:
     sigmas = np.maximum(np.concatenate([state.sigma_biases, prior.sigma_mounting]), _MOUNTING_MIN)
     sigmas[:n] = np.maximum(sigmas[:n], _SIGMA_BIAS_MIN)
     shared = np.concatenate([state.biases, state.mounting])
-    solution = solve(N, effects_on(state.centres), sigmas**-2.0, -shared / sigmas**2)
-    step = solution.step_shared * state.has_biases
+    reduced = reduce(N, effects_on(state.centres), sigmas**-2.0, -shared / sigmas**2)
+    cov_shared: Array = inverse(reduced.N)
+    step = state.has_biases * (cov_shared @ reduced.rhs)
     biases = state.biases + step[:n]
     # spread of the biases by expectation maximisation
-    squares = (biases**2 + np.diag(solution.cov_shared)[:n]).sum() + _DOF_BIAS * prior2
+    squares = (biases**2 + np.diag(cov_shared)[:n]).sum() + _DOF_BIAS * prior2
     spread = prior.sigma_biases * np.sqrt(squares / (_DOF_BIAS + n) / prior2)
     return state._replace(
-        centres=state.centres
-        + _shortened(solution.steps - solution.by_shared @ step, prior.radius),
+        centres=state.centres + _shortened(reduced.local_steps(step), prior.radius),
         biases=biases,
         mounting=state.mounting + step[n:],
         sigma_biases=spread if state.has_biases else prior.sigma_biases,
-        cov_noise=_EFFICIENCY * solution.covs,
-        cov_shared_part=solution.covs_by_shared,
-        by_shared=solution.by_shared,
-        cov_shared=solution.cov_shared,
+        cov_noise=_EFFICIENCY * reduced.own,
+        cov_shared_part=reduced.gains @ cov_shared @ reduced.gains.transpose(0, 2, 1),
+        by_shared=reduced.gains,
+        cov_shared=cov_shared,
     )
 
 

@@ -69,4 +69,4 @@ def test_too_few_errors_are_said_in_place_of_a_statement():
     few = {name: column[[0, 1, 2]] for name, column in fits().items()}
     (only,) = study.statements(few, 0.03)
     assert only.model is None
-    assert only.distance.startswith("3 known errors do not tell")
+    assert only.distance.startswith("3 known errors are too few")
