@@ -16,10 +16,7 @@ from starlette.types import ASGIApp
 
 from spheremark.service.errors import Problem, UnauthorizedError
 from spheremark.service.http import api, errors, security
-from spheremark.service.http.pages import networks as result_pages
-from spheremark.service.http.pages import plans as plan_pages
-from spheremark.service.http.pages import results as pages
-from spheremark.service.http.pages import sites as site_pages
+from spheremark.service.http.pages import frame, jobs, networks, plans, sites, surveys
 from spheremark.service.http.state import Current, opened
 from spheremark.service.settings import Settings
 
@@ -65,12 +62,17 @@ def create_app(settings: Settings) -> FastAPI:
     app.add_middleware(security.SecurityMiddleware, settings=settings)
     app.include_router(api.router, prefix=ROOT)
     app.include_router(about)
-    app.include_router(site_pages.router)  # before the survey, whose name takes slashes
-    app.include_router(pages.router)
-    app.include_router(plan_pages.router)
-    app.include_router(result_pages.router)
+    for page in (
+        sites,
+        surveys,
+        jobs,
+        frame,
+        plans,
+        networks,
+    ):  # the name of a survey takes slashes
+        app.include_router(page.router)
     app.mount("/static", StaticFiles(directory=STATIC), name="static")
-    errors.install(app, pages.error_page)
+    errors.install(app, frame.error_page)
     return app
 
 

@@ -16,6 +16,7 @@ from spheremark.pipelines.simulation import SimulationConfig
 from spheremark.service.cli.fieldwork import Assignment, survey
 from spheremark.service.cli.main import main
 from spheremark.service.log_files import Fieldbook, adjust_scans, read_scans, with_calibration
+from spheremark.service.serialise.models import NetworkDocument
 from spheremark.service.serialise.network import serialise_network
 from spheremark.storage.imports.survey_files import read_control, read_truth
 
@@ -70,6 +71,12 @@ def true_places(logs):
     truths = [read_truth(log.with_name(f"{log.stem}.truth.json")) for log in logs]
     places = {stop.name: stop.T_site_base[:3, 3] for truth in truths for stop in truth.stops}
     return places, truths[0].marks
+
+
+def test_the_json_of_networks_has_the_declared_keys_and_no_others(free, tied):
+    for network in (free, tied):
+        declared = NetworkDocument.model_validate(network)
+        assert declared.model_dump(exclude_unset=True) == network
 
 
 def test_the_answer_has_the_keys_that_others_rely_on(free):
@@ -206,6 +213,7 @@ def test_the_joint_covariance_of_marks_has_theirs_on_its_diagonal(free):
 
 def test_a_rig_is_adjusted_with_the_network_and_serves_as_a_rig(logs, tmp_path):
     answer = json.loads(run(*logs[:2], "--calibrate", "--json").stdout)
+    assert NetworkDocument.model_validate(answer).calibration is not None
     rig = answer["calibration"]
     names = [row["name"] for row in rig["parameters"]]
     assert names[:2] == ["axis_offset_x", "axis_offset_y"]

@@ -11,6 +11,7 @@ from spheremark.service.http.api import rows
 from spheremark.service.http.api.models import Listing, Run, Strict
 from spheremark.service.http.api.rows import FileName, Plain, ResultFilter, listing_of
 from spheremark.service.http.state import Current, Service
+from spheremark.service.serialise.models import CalibrationDocument, NetworkDocument
 
 router = APIRouter()
 
@@ -84,9 +85,9 @@ _CALIBRATION_PARTS = {
 RowId = Annotated[str, Path(description="Id of the row, as the list gives it.")]
 AdjustmentId = Annotated[str, Path(description="Id of the adjustment.")]
 CalibrationId = Annotated[str, Path(description="Id of the calibration.")]
-_FILE: dict[int | str, dict[str, Any]] = {
-    200: {"content": {"application/octet-stream": {}}, "description": "The file."}
-}
+_FILE = {"content": {"application/octet-stream": {}}, "description": "The file."}
+_NETWORK_FILE: dict[int | str, dict[str, Any]] = {200: _FILE | {"model": NetworkDocument}}
+_CALIBRATION_FILE: dict[int | str, dict[str, Any]] = {200: _FILE | {"model": CalibrationDocument}}
 
 
 class RowFilter(Strict):
@@ -204,7 +205,7 @@ def get_adjustment(adjustment: AdjustmentId, service: Current) -> Plain:
     name="download_adjustment",
     tags=["adjustments"],
     response_class=Response,
-    responses=_FILE,
+    responses=_NETWORK_FILE,
 )
 def download_adjustment(adjustment: AdjustmentId, name: FileName, service: Current) -> Response:
     """Return a network as a file: JSON, report, CSV or GNU Gama XML."""
@@ -239,7 +240,7 @@ def get_calibration(calibration: CalibrationId, service: Current) -> Plain:
     name="download_calibration",
     tags=["calibrations"],
     response_class=Response,
-    responses=_FILE,
+    responses=_CALIBRATION_FILE,
 )
 def download_calibration(calibration: CalibrationId, name: FileName, service: Current) -> Response:
     """Return a calibration as a file: JSON, or the rig alone."""

@@ -125,7 +125,7 @@ CalibrationDetail = _table(
     "A calibrated rig with its parameters.",
     "calibrations",
     survey=str,
-    values=_many("Parameter", "A parameter before and after.", "calibrated_parameters"),
+    values=_many("CalibratedParameter", "A parameter before and after.", "calibrated_parameters"),
     gaps=_many("FaceGap", "The two faces of a sphere against each other.", "calibration_gaps"),
     files=list[str],
 )

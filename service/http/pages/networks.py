@@ -12,7 +12,7 @@ from fastapi.responses import HTMLResponse, RedirectResponse
 from spheremark.pipelines.errors import InputError, NotFoundError
 from spheremark.service.http.api.jobs import start
 from spheremark.service.http.api.models import NewJob
-from spheremark.service.http.pages.results import frame_of
+from spheremark.service.http.pages.frame import frame_of
 from spheremark.service.http.state import Current, Service
 from spheremark.service.jobs.handlers import KINDS
 from spheremark.web.pages import calibration as calibrations

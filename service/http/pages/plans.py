@@ -10,7 +10,7 @@ from pydantic import ValidationError
 
 from spheremark.pipelines.errors import InputError
 from spheremark.service.http.api.plans import RandomTrial, sites, tried
-from spheremark.service.http.pages.results import frame_of
+from spheremark.service.http.pages.frame import frame_of
 from spheremark.service.http.state import Current
 from spheremark.storage.catalogue import plans as kept
 from spheremark.web.pages import planner

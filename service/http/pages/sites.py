@@ -10,8 +10,8 @@ from spheremark.pipelines.ground_model import ElevationModel
 from spheremark.service.http.api.jobs import start
 from spheremark.service.http.api.models import NewJob
 from spheremark.service.http.api.sites import Product, products_of
+from spheremark.service.http.pages.frame import frame_of
 from spheremark.service.http.pages.networks import Fields
-from spheremark.service.http.pages.results import frame_of
 from spheremark.service.http.state import Current, Service
 from spheremark.service.jobs.handlers import JobKind
 from spheremark.storage.exports.reports import kept_coverage

@@ -1,32 +1,28 @@
-"""Routes of pages: static SELECTs through the catalogue, handed to the functions that draw them."""
+"""Pages of results: the overview, the dashboard of a survey, and its stops."""
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping
-from dataclasses import asdict, replace
+from dataclasses import replace
 from typing import Annotated, Any
 
 from fastapi import APIRouter, Query, Request
-from fastapi.responses import FileResponse, HTMLResponse
+from fastapi.responses import HTMLResponse
 
 from spheremark.pipelines.errors import NotFoundError
-from spheremark.service.errors import Problem
+from spheremark.service.http.pages.frame import address_of, frame_of
+from spheremark.service.http.pages.jobs import newest_jobs
 from spheremark.service.http.state import Current, Service
 from spheremark.storage.clouds import stop as clouds
-from spheremark.web import assets, pages
+from spheremark.web import pages
 from spheremark.web.columns import Columns, texts
 from spheremark.web.figures import scene
 from spheremark.web.pages.filters import Filters
 
 router = APIRouter(include_in_schema=False, default_response_class=HTMLResponse)
 
-_N_JOBS = 100  # in one page; the API lists all
 _N_RECORDINGS = 50
 _N_POINTS = 250_000  # of a cloud; the page thins them further
-_A_YEAR = "public, max-age=31536000, immutable"
-
-_SURVEY_NAMES = "SELECT name FROM surveys ORDER BY created_at DESC, name"
 _NEWEST_SURVEY = """
 SELECT s.name FROM runs AS r JOIN surveys AS s USING (survey_id)
 ORDER BY r.finished_at DESC LIMIT 1
@@ -46,19 +42,6 @@ FROM surveys AS s ORDER BY s.created_at DESC, s.name
 _RECORDINGS = """
 SELECT recording_id, name, size_bytes, uploaded_at, verdict
 FROM recordings ORDER BY uploaded_at DESC, recording_id LIMIT $n
-"""
-_RECORDING = """
-SELECT recording_id, name, size_bytes, uploaded_at, verdict, preflight
-FROM recordings WHERE recording_id = $id
-"""
-_JOBS = """
-SELECT j.*, s.name AS survey, r.name AS recording
-FROM jobs AS j JOIN surveys AS s USING (survey_id) LEFT JOIN recordings AS r USING (recording_id)
-WHERE ($job IS NULL OR j.job_id = $job)
-    AND ($recording IS NULL OR j.recording_id = $recording)
-    AND ($survey IS NULL OR j.survey_id = $survey)
-    AND (NOT $is_active OR j.status IN ('accepted', 'running'))
-ORDER BY j.created_at DESC, j.job_id LIMIT $n
 """
 _N_ACTIVE = "SELECT count(*) AS n FROM jobs WHERE status IN ('accepted', 'running')"
 _SURVEY = """
@@ -131,21 +114,6 @@ JOIN marker_fits AS m USING (run_id, stop, fit_method, marker)
 JOIN station_fixes AS f USING (run_id, stop, fit_method, resection_method)
 WHERE o.run_id = $run AND o.stop = $stop AND o.fit_method = $method ORDER BY o.marker
 """
-_JOB_STOPS = """
-SELECT x.stop, x.n_returns,
-    (SELECT count(DISTINCT m.marker) FROM marker_fits AS m
-        WHERE m.run_id = x.run_id AND m.stop = x.stop AND m.fit_method = 'along_beam') AS n_markers
-FROM stops AS x JOIN runs AS r USING (run_id) WHERE r.job_id = $id ORDER BY x.stop
-"""
-
-_JOB_MADE = """
-SELECT '/adjustments/' || adjustment_id AS address,
-    'Network of ' || n_stations || ' stations and ' || n_marks || ' marks' AS what
-FROM adjustments WHERE job_id = $id
-UNION ALL
-SELECT '/calibrations/' || calibration_id, 'Calibration of the gimbal'
-FROM calibrations WHERE job_id = $id
-"""
 _ADJUSTMENTS = """
 SELECT a.adjustment_id, a.datum, a.status, a.n_stations, a.n_marks, a.passes_global_test, a.sigma0,
     a.finished_at,
@@ -163,14 +131,6 @@ FROM calibrations WHERE survey_id = $id ORDER BY finished_at DESC LIMIT $n
 _N_RESULTS = 20  # networks and calibrations in the page of their survey
 
 
-@router.get(assets.plotly_url())
-def plotly_script() -> FileResponse:
-    """Return Plotly's script from the installed package."""
-    return FileResponse(
-        assets.plotly_script(), media_type="text/javascript", headers={"Cache-Control": _A_YEAR}
-    )
-
-
 @router.get("/")
 def overview(request: Request, service: Current) -> str:
     """Show what there is and how to bring more."""
@@ -179,7 +139,7 @@ def overview(request: Request, service: Current) -> str:
     return pages.overview_page(
         pages.OverviewPage(
             frame=frame_of(service),
-            address=_address(request),
+            address=address_of(request),
             newest=_survey_data(service, newest[0]["name"], Filters()) if newest else None,
             surveys=tuple(rows(_SURVEYS)),
             recordings=tuple(rows(_RECORDINGS, {"n": _N_RECORDINGS})),
@@ -219,89 +179,11 @@ def survey(name: str, request: Request, service: Current) -> str:
             data=_survey_data(service, name, filters),
             results=_survey_results(service, found),
             filters=filters,
-            jobs=_jobs(service, survey=found["survey_id"], is_active=True),
-            address=_address(request),
+            jobs=newest_jobs(service, survey=found["survey_id"], is_active=True),
+            address=address_of(request),
             n_logs=len(service.catalogue.recordings_of_survey(found["survey_id"])),
         )
     )
-
-
-@router.get("/jobs")
-def jobs(service: Current) -> str:
-    """Show the newest jobs."""
-    return pages.jobs_page(pages.JobsPage(frame=frame_of(service), jobs=_jobs(service)))
-
-
-@router.get("/jobs/{job_id}")
-def job(job_id: str, service: Current) -> str:
-    """Show one job."""
-    found = _jobs(service, job=job_id)
-    if not found:
-        raise NotFoundError(f"There is no job {job_id!r}.")
-    stops = service.catalogue.rows(_JOB_STOPS, {"id": job_id})
-    frame = frame_of(service, found[0]["survey"])
-    made = service.catalogue.rows(_JOB_MADE, {"id": job_id})
-    return pages.job_page(
-        pages.JobPage(frame=frame, job=found[0], stops=tuple(stops), made=tuple(made))
-    )
-
-
-@router.get("/recordings/{recording_id}")
-def recording(recording_id: str, request: Request, service: Current) -> str:
-    """Show one recording."""
-    found = service.catalogue.rows(_RECORDING, {"id": recording_id})
-    if not found:
-        raise NotFoundError(f"There is no recording {recording_id!r}.")
-    return pages.recording_page(
-        pages.RecordingPage(
-            frame=frame_of(service),
-            recording=found[0],
-            preflight=json.loads(found[0]["preflight"]),
-            jobs=_jobs(service, recording=recording_id),
-            address=_address(request),
-        )
-    )
-
-
-@router.get("/sql")
-def sql(service: Current, q: Annotated[str, Query(max_length=100_000)] = "") -> str:
-    """Show the workbench for queries."""
-    limits = service.settings.query_limits
-    return pages.sql_page(
-        pages.SqlPage(
-            frame=frame_of(service),
-            query=q or pages.EXAMPLES[0][1],
-            tables=tuple(asdict(table) for table in service.catalogue.schema()),
-            seconds=limits.seconds,
-            rows=limits.rows,
-            memory_bytes=limits.memory_bytes,
-        )
-    )
-
-
-def error_page(_: Request, problem: Problem) -> HTMLResponse:
-    """Return a problem as a page, for browsers."""
-    text = pages.error_page(
-        pages.ErrorPage(
-            frame=pages.Frame(),
-            status=problem.status,
-            title=problem.title,
-            detail=problem.detail,
-            code=problem.code,
-        )
-    )
-    return HTMLResponse(text, status_code=problem.status)
-
-
-def frame_of(service: Service, survey: str = "") -> pages.Frame:
-    """Return what every page shows around itself."""
-    names = tuple(row["name"] for row in service.catalogue.rows(_SURVEY_NAMES))
-    return pages.Frame(surveys=names, survey=survey)
-
-
-def _address(request: Request) -> str:
-    """Return the address that the reader uses for this service."""
-    return str(request.base_url).rstrip("/")
 
 
 def _survey(service: Service, key: str) -> Mapping[str, Any]:
@@ -385,16 +267,3 @@ def _scan(url: str | None) -> scene.Scan | None:
         names=cloud.names,
         fit_method=cloud.fit_method,
     )
-
-
-def _jobs(
-    service: Service,
-    *,
-    job: str | None = None,
-    recording: str | None = None,
-    survey: str | None = None,
-    is_active: bool = False,
-) -> tuple[Mapping[str, Any], ...]:
-    """Return the newest jobs, of one recording or survey if named."""
-    parameters = {"job": job, "recording": recording, "survey": survey, "is_active": is_active}
-    return tuple(service.catalogue.rows(_JOBS, {**parameters, "n": _N_JOBS}))
