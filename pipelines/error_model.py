@@ -13,6 +13,13 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from spheremark.pipelines.errors import TooFewObservationsError
+from spheremark.pipelines.estimation.linear_algebra import inverse
+from spheremark.pipelines.estimation.robust import (
+    HUBER,
+    huber_weights,
+    robust_sigma,
+    sandwich_covariance,
+)
 from spheremark.pipelines.model import Array, Index, same_length, seal
 
 Statistic = Literal["p95", "mean"]
@@ -27,7 +34,6 @@ _LEAST_ERROR = (
 )
 _PER_TERM = 4  # errors required for each unknown of a model
 _SIGMA_EXPONENT = 3.0  # prior of every exponent about 0: physics gives -1/2 to 2
-_HUBER = 1.345  # scales beyond which a residual counts less: 95 % efficient for a normal sample
 _N_STEPS = 12  # of reweighting; three or four change the fourth digit
 _GROUPS_MIN = 5  # scans for a resampling by scans; with fewer, single errors are resampled
 _P95 = 0.95
@@ -336,7 +342,7 @@ def _scale(data: _Regression) -> float:
     """Return the spread of the residuals about a first, plain fit."""
     beta = np.linalg.lstsq(data.X, data.y, rcond=None)[0]
     residuals = data.y - data.X @ beta
-    return max(1.4826 * float(np.median(np.abs(residuals - np.median(residuals)))), 1e-6)
+    return max(robust_sigma(residuals - np.median(residuals)), 1e-6)
 
 
 def _coefficients(data: _Regression, weights: Array) -> Array:
@@ -350,8 +356,7 @@ def _coefficients(data: _Regression, weights: Array) -> Array:
         normal = (robust @ products).reshape(-1, k, k) + prior
         right = robust @ (data.X * data.y[:, None])
         beta = np.asarray(np.linalg.solve(normal, right[..., None])[..., 0], dtype=np.float64)
-        sizes = np.abs(data.y - beta @ data.X.T) / data.scale
-        robust = weights / np.maximum(sizes / _HUBER, 1.0)
+        robust = weights * huber_weights((data.y - beta @ data.X.T) / data.scale)
     return beta
 
 
@@ -391,21 +396,14 @@ def _solved(data: _Regression) -> ErrorModel:
 
 
 def _covariance(data: _Regression, beta: Array) -> Array:
-    """Return the covariance of the coefficients: sandwich, clustered by scan where there are some.
-
-    Huber, Robust Statistics (1981), section 7.6, with the clusters of Liang and Zeger (1986).
-    """
+    """Return the covariance of the coefficients, clustered by scan where there are some."""
     residuals = data.y - data.X @ beta
-    psi = np.clip(residuals, -_HUBER * data.scale, _HUBER * data.scale)
-    is_inside = (np.abs(residuals) < _HUBER * data.scale).astype(np.float64)
+    psi = residuals * huber_weights(residuals / data.scale)
+    is_inside = (np.abs(residuals) < HUBER * data.scale).astype(np.float64)
     k = data.X.shape[1]
     prior = np.diag([0.0] + [(data.scale / _SIGMA_EXPONENT) ** 2] * (k - 1))
-    bread = np.linalg.inv((data.X * is_inside[:, None]).T @ data.X + prior)
-    clusters = _clusters(data.scans)
-    scores = np.zeros((int(clusters.max()) + 1, k))
-    np.add.at(scores, clusters, data.X * psi[:, None])
-    n = len(scores)
-    return np.asarray(bread @ (scores.T @ scores * n / (n - 1) + prior) @ bread)
+    bread = inverse((data.X * is_inside[:, None]).T @ data.X + prior)
+    return sandwich_covariance(bread, data.X * psi[:, None], _clusters(data.scans), prior)
 
 
 def _clusters(scans: Index) -> Index:

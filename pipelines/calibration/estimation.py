@@ -17,6 +17,7 @@ from spheremark.pipelines.calibration.gimbal import (
 )
 from spheremark.pipelines.errors import NotConvergedError
 from spheremark.pipelines.estimation.linear_algebra import Reduced, eliminate, inverse
+from spheremark.pipelines.estimation.robust import tukey_loss, tukey_weights
 from spheremark.pipelines.model import RING_UNKNOWN, Array, Index, Mask, Rig, Rings
 
 _TUKEY = 6.0  # sigmas at which a return has no weight; 98 % efficient on clean data
@@ -196,7 +197,7 @@ class _Problem(NamedTuple):
         """Return the noise of each return [m]: of its reflectivity, times that of its sphere."""
         which, shades, m = self.seen.which, self.seen.shades, len(state.centres)
         scaled = state.lin.residuals / self.sigmas(state, before)
-        weights = tukey(scaled)
+        weights = tukey_weights(scaled, _TUKEY)
         squares = weights * (scaled * before) ** 2 / _EXPECTED_SQUARE
         counts = np.bincount(shades, weights > 0.0, N_SHADES)
         share = max(1.0 - 3.0 * m / max(float(counts.sum()), 1.0), 0.01)
@@ -213,7 +214,7 @@ class _Problem(NamedTuple):
         """Return the normal equations of all parameters and biases."""
         lin = state.lin
         J = np.column_stack([lin.J_rig, self.basis[self.seen.rings]])
-        weights = tukey(lin.residuals / sigmas) / sigmas**2
+        weights = tukey_weights(lin.residuals / sigmas, _TUKEY) / sigmas**2
         return reduced(self.seen.which, lin.J_centres, J, lin.residuals, weights)
 
     def ahead(self, state: _State, equations: Reduced, chosen: Index, sigmas: Array) -> _State:
@@ -223,11 +224,11 @@ class _Problem(NamedTuple):
         by_rig, by_laser = np.split(steps, [len(GIMBAL)])
         biases = (self.basis @ by_laser)[: len(state.rig.laser_range_biases)]
         by_centre = equations.local_steps(steps)
-        loss, trial = _loss(state.lin.residuals / sigmas), state
+        loss, trial = _loss(state, sigmas), state
         for share in _SHARES:
             rig = moved(state.rig, share * by_rig, share * biases)
             trial = self.at(rig, state.centres + share * by_centre)
-            if _loss(trial.lin.residuals / sigmas) < loss:
+            if _loss(trial, sigmas) < loss:
                 break
         return trial
 
@@ -258,7 +259,7 @@ def estimate(
             is_free, held = separable(equations.N[: len(GIMBAL), : len(GIMBAL)], GIMBAL)
         chosen = np.flatnonzero(np.append(is_free, np.ones(basis.shape[1], dtype=np.bool_)))
         better = problem.ahead(state, equations, chosen, sigmas)
-        saved = _loss(state.lin.residuals / sigmas) - _loss(better.lin.residuals / sigmas)
+        saved = _loss(state, sigmas) - _loss(better, sigmas)
         if number >= _N_STEPS_NOISE and saved < _SETTLED:
             return _estimate(problem, state, sigmas, is_free, held, lasers)
         state = better
@@ -266,11 +267,6 @@ def estimate(
         f"The calibration did not settle within {_N_STEPS} steps; the start rig is too far off "
         "or what was taken for spheres is none."
     )
-
-
-def tukey(scaled: Array) -> Array:
-    """Return Tukey's weights."""
-    return np.where(np.abs(scaled) < _TUKEY, (1.0 - (scaled / _TUKEY) ** 2) ** 2, 0.0)
 
 
 def _contrasts(rings: Rings) -> tuple[Index, Array]:
@@ -300,7 +296,7 @@ def _estimate(
     J = np.zeros((n_free + len(lasers), n_free + k))
     J[:n_free, :n_free] = np.eye(n_free)
     J[n_free:, n_free:] = problem.basis[lasers]
-    is_used = tukey(state.lin.residuals / sigmas) > 0.0
+    is_used = tukey_weights(state.lin.residuals / sigmas, _TUKEY) > 0.0
     return Estimate(
         rig=state.rig,
         centres=state.centres,
@@ -340,7 +336,6 @@ def residual_rms(seen: Pulses, rig: Rig, found: Estimate, covs: Array, radius: f
     return float(np.sqrt(np.mean(residuals[found.is_used] ** 2)))
 
 
-def _loss(scaled: Array) -> float:
-    """Return Tukey's loss of residuals in units of their sigma: half their square if small."""
-    kept = 1.0 - np.minimum(np.abs(scaled) / _TUKEY, 1.0) ** 2
-    return float(np.sum(_TUKEY**2 / 6.0 * (1.0 - kept**3)))
+def _loss(state: _State, sigmas: Array) -> float:
+    """Return the loss of a state."""
+    return tukey_loss(state.lin.residuals / sigmas, _TUKEY)

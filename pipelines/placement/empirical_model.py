@@ -12,6 +12,12 @@ from typing import NamedTuple
 
 import numpy as np
 
+from spheremark.pipelines.estimation.linear_algebra import inverse
+from spheremark.pipelines.estimation.robust import (
+    huber_weights,
+    robust_sigma,
+    sandwich_covariance,
+)
 from spheremark.pipelines.model import Array, Index, Mask, same_length, seal
 from spheremark.pipelines.placement.centre_model import (
     AXES,
@@ -33,7 +39,6 @@ ROWS_LEAST, STOPS_LEAST = 24, 3
 _SIGMA_CONSTANT, _SIGMA_POWER = 1.0, 0.5  # priors of factors' logarithms and of powers about none
 _LEFT_LEAST = 0.1  # of a variance that must remain when known parts of it are taken off
 _DOF_PRIOR = 30.0  # degrees of freedom that a variance factor of one is worth
-_HUBER = 1.345
 _COLUMNS = ("ranges", "n_points", "incidences", "intensities", "turns", "stops", "dof", "sigma0")
 _N_STEPS = 12
 
@@ -224,19 +229,14 @@ def _regressed(data: _Data) -> tuple[Array, Array, float]:
     scatter, residuals, weights = 1.0, data.y, np.ones(len(data.y))
     for _ in range(_N_STEPS):
         weighted = data.design * (weights / scatter**2)[:, None]
-        beta = np.asarray(
-            np.linalg.solve(weighted.T @ data.design + prior, weighted.T @ data.y), dtype=np.float64
-        )
+        beta = inverse(weighted.T @ data.design + prior) @ (weighted.T @ data.y)
         residuals = data.y - data.design @ beta
-        scatter = max(1.4826 * float(np.median(np.abs(residuals))), 0.02)
-        weights = np.minimum(1.0, _HUBER * scatter / np.maximum(np.abs(residuals), 1e-12))
-    bread = np.linalg.inv((data.design * (weights / scatter**2)[:, None]).T @ data.design + prior)
+        scatter = max(robust_sigma(residuals), 0.02)
+        weights = huber_weights(residuals / scatter)
+    bread = inverse((data.design * (weights / scatter**2)[:, None]).T @ data.design + prior)
     _, clusters = np.unique(data.stops, return_inverse=True)
-    scores = np.zeros((int(clusters.max()) + 1, k))
-    np.add.at(scores, clusters, data.design * (weights * residuals / scatter**2)[:, None])
-    n = len(scores)
-    cov = bread @ (scores.T @ scores * n / (n - 1) + prior) @ bread
-    return np.asarray(beta, dtype=np.float64), np.asarray(cov, dtype=np.float64), scatter
+    scores = data.design * (weights * residuals / scatter**2)[:, None]
+    return beta, sandwich_covariance(bread, scores, clusters, prior), scatter
 
 
 def _middle(values: Array, stops: Index) -> tuple[float, float]:

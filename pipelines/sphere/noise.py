@@ -9,6 +9,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from spheremark.pipelines.estimation.robust import tukey_weights
 from spheremark.pipelines.model import Array, Index, Mask
 from spheremark.pipelines.sphere.linearisation import Linear
 from spheremark.pipelines.sphere.returns import Returns
@@ -85,7 +86,7 @@ def weigh(returns: Returns, linear: Linear, biases: Array, noise: Noise, is_used
     def weighed(factors: Array) -> tuple[Array, Array]:
         """Return sigmas and weights for noise factors by class."""
         sigmas = np.sqrt((factors[returns.classes] * returns.sigmas) ** 2 + others)
-        return sigmas, np.maximum(1.0 - (residuals / (_TUKEY * sigmas)) ** 2, 0.0) ** 2
+        return sigmas, tukey_weights(residuals / sigmas, _TUKEY)
 
     sigmas, weights = weighed(noise.factors)
     classes, n_classes = returns.classes, len(_SIGMAS)

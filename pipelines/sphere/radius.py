@@ -11,6 +11,7 @@ from typing import NamedTuple
 import numpy as np
 
 from spheremark.pipelines.estimation.linear_algebra import invert_each
+from spheremark.pipelines.estimation.robust import robust_sigma
 from spheremark.pipelines.model import Array, Beams, Mask
 from spheremark.pipelines.sphere.linearisation import Linear, linearise
 from spheremark.pipelines.sphere.normal_equations import sums_of_products
@@ -30,7 +31,6 @@ _SIGMA_MAX, _RADIUS_MAX = 0.4, 5.0  # radii: a larger sigma or radius is no answ
 _N_ROUNDS = 3
 _SPAN_MIN = 0.001  # [m] least radius that returns span
 _OUTERMOST = 1.2  # radii over the ninth tenth of the returns' distances from the middle
-_NORMAL = 1.4826  # standard deviation of a normal spread over its median of absolute values
 _SCATTER_MIN = 0.001  # [m] 2 mm quantisation alone gives as much
 _OUTLIER_SIGMAS = 4.0
 _SIGMAS = 3.0  # by which a free radius may be off, and
@@ -265,7 +265,7 @@ def _scatter(residuals: Array) -> float:
     """Return the robust standard deviation of residuals [m]; the least if there are none."""
     if not len(residuals):
         return _SCATTER_MIN
-    return max(_NORMAL * float(np.median(np.abs(residuals))), _SCATTER_MIN)
+    return max(robust_sigma(residuals), _SCATTER_MIN)
 
 
 def other_radius(radius: float, radius_free: float, sigma: float) -> list[str]:
