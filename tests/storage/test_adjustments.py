@@ -197,7 +197,7 @@ def test_a_survey_uses_the_rig_that_was_chosen_until_another_is(catalogue):
         catalogue.choose_rig("lane", "none")
 
 
-def test_the_logs_of_a_survey_are_those_that_its_jobs_were_asked_to_read(catalogue):
+def test_the_logs_of_a_survey_are_those_that_its_jobs_read(catalogue):
     catalogue.create_survey("other")
     for i, survey in enumerate(("lane", "lane", "other", "lane")):
         digest = f"{i:064x}"
@@ -220,7 +220,7 @@ def test_what_was_chosen_for_a_job_is_kept_beside_its_configuration(catalogue):
     assert json.loads(row["options"]) == options
 
 
-def test_a_file_of_a_result_says_what_type_it_is():
+def test_a_file_of_a_result_has_a_media_type():
     rows = documents("a", {"a.csv": "x", "b.json": "{}", "c.txt": "", "d.xml": "<a/>"}).to_pylist()
     assert [row["media_type"] for row in rows] == [
         "text/csv", "application/json", "text/plain", "application/xml",

@@ -78,11 +78,11 @@ def test_a_database_that_another_process_has_open_is_refused(tmp_path):
             "except ConflictError as error: print(error)"
         )
         snapshots = str(tmp_path / "other")
-        told = subprocess.run(
+        other = subprocess.run(
             [sys.executable, "-c", code, str(catalogue.path), snapshots],
             cwd=ROOT, capture_output=True, text=True, check=True,
         )  # fmt: skip
-    assert f"results.duckdb is in use by another process (PID {os.getpid()})" in told.stdout
+    assert f"results.duckdb is in use by another process (PID {os.getpid()})" in other.stdout
 
 
 def test_a_database_that_this_process_has_open_is_refused(tmp_path):
@@ -108,7 +108,7 @@ def test_a_database_of_a_newer_version_is_refused(tmp_path):
         opened(tmp_path)
 
 
-def test_the_owner_reaches_no_file_and_nobody_can_change_that(catalogue):
+def test_the_owner_reaches_no_file_and_its_configuration_is_locked(catalogue):
     with pytest.raises(duckdb.PermissionException):
         catalogue.rows("SELECT * FROM read_csv('/etc/passwd')")
     with pytest.raises(duckdb.InvalidInputException, match="locked"):
@@ -176,7 +176,7 @@ def test_a_list_comes_in_parts_that_together_are_the_whole(catalogue):
     assert found == names[::-1]
 
 
-def test_a_place_in_a_list_that_nobody_gave_is_refused(catalogue):
+def test_an_invented_place_in_a_list_is_refused(catalogue):
     for wrong in ("x", "aGVsbG8=", "aGVsbG8gd29ybGQ="):
         with pytest.raises(InputError, match="no place in this list"):
             catalogue.list_surveys(after=wrong)
@@ -400,7 +400,7 @@ def test_results_for_a_table_that_no_job_writes_are_refused(catalogue):
         catalogue.finish_job(begun.job_id, {"surveys": made_tables()["runs"]})
 
 
-def test_a_job_that_failed_says_why(catalogue):
+def test_a_failed_job_has_its_reason(catalogue):
     catalogue.create_survey("lane")
     begun = running(catalogue)
     catalogue.fail_job(begun.job_id, code="solve", reason="No markers.", traceback="line 1")
@@ -524,7 +524,7 @@ def test_views_show_the_newest_run_only(catalogue):
     assert counts == [{"n": 12}]
 
 
-def test_every_column_of_a_result_says_what_it_is(catalogue):
+def test_every_column_of_a_result_is_documented(catalogue):
     tables = {table.name: table for table in catalogue.schema()}
     obvious = {"run_id", "survey_id", "survey", "recording_id", "job_id", "stop", "fit_method"}
     obvious |= {"resection_method", "marker", "mark"}

@@ -137,7 +137,7 @@ def test_a_dense_solution_of_the_exported_observations_agrees(is_free, exact):
     assert read.is_fixed.any() == exact
 
 
-def test_the_export_says_how_its_axes_and_angles_run(tmp_path):
+def test_the_export_states_its_axes_and_angles(tmp_path):
     write_gama(adjusted(True), tmp_path / "network.xml", "Two <stations> & more")
     read = GamaNetwork((tmp_path / "network.xml").read_text())
     assert read.network.get("axes-xy") == "en"

@@ -57,7 +57,7 @@ def test_the_database_takes_every_table():
         assert count == [(table.num_rows,)]
 
 
-def test_a_run_tells_what_its_numbers_depend_on():
+def test_a_run_has_the_provenance_of_its_numbers():
     found = made_tables()
     (row,) = found["runs"].to_pylist()
     info = run()
@@ -179,7 +179,7 @@ def test_a_station_that_failed_is_a_row_with_its_reason_and_no_numbers():
     assert row["error_3d_m"] is None
 
 
-def test_every_marker_of_a_fix_has_an_observation_that_says_whether_it_was_used():
+def test_every_marker_of_a_fix_has_an_observation_used_or_not():
     found = rows(made_tables(), "observations")
     fix = stop().fixes["along_beam", "free_station"]
     assert len(found) == 7
@@ -194,7 +194,7 @@ def test_every_marker_of_a_fix_has_an_observation_that_says_whether_it_was_used(
     assert all(0.0 < row["shift_without_m"] < 0.05 for row in found[:5])
 
 
-def test_a_station_tells_how_its_geometry_dilutes_precision():
+def test_a_station_has_its_dilution_of_precision():
     found = {row["fit_method"]: row["dop"] for row in rows(made_tables(), "station_fixes")}
     assert 0.5 < found["along_beam"] < 3.0
     assert found["paper"] is None
@@ -226,7 +226,7 @@ def test_errors_of_pairs_and_triples_are_lengths_in_the_plane_and_in_space():
     assert [row["error_3d_m"] for row in elsewhere] == [None] * 3
 
 
-def test_a_stop_tells_how_it_was_made():
+def test_a_stop_has_its_acquisition():
     found = tables(run(), (stop(),), marks=MARKS, clouds={"L1S1": "/clouds/x.parquet"})
     (row,) = found["stops"].to_pylist()
     assert row["coverage_deg"] == pytest.approx(360.0)

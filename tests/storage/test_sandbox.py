@@ -30,7 +30,7 @@ def snapshot(tmp_path_factory):
 
 
 @pytest.fixture
-def ask(snapshot):
+def query(snapshot):
     def run(sql, parameters=None, **limits):
         wanted = {name: getattr(LIMITS, name) for name in QueryLimits.__slots__} | limits
         return run_query(snapshot, sql, QueryLimits(**wanted), parameters)
@@ -38,8 +38,8 @@ def ask(snapshot):
     return run
 
 
-def test_a_select_gives_columns_with_types_and_rows(ask):
-    found = ask("SELECT name, tolerance_m, created_at FROM surveys")
+def test_a_select_gives_columns_with_types_and_rows(query):
+    found = query("SELECT name, tolerance_m, created_at FROM surveys")
     assert [(c.name, c.type) for c in found.columns] == [
         ("name", "VARCHAR"),
         ("tolerance_m", "DOUBLE"),
@@ -51,7 +51,7 @@ def test_a_select_gives_columns_with_types_and_rows(ask):
     assert found.elapsed_ms > 0
 
 
-def test_every_type_becomes_what_json_can_hold(ask):
+def test_every_type_becomes_what_json_can_hold(query):
     cases = {
         "170141183460469231731687303715884105727::HUGEINT": 2**127 - 1,
         "340282366920938463463374607431768211455::UHUGEINT": 2**128 - 1,
@@ -79,43 +79,43 @@ def test_every_type_becomes_what_json_can_hold(ask):
         "TIMESTAMP_NS '2026-01-02 03:04:05.123456789'": "2026-01-02 03:04:05.123456789",
         "'0b9c6c0a-0000-4000-8000-000000000000'::UUID": "0b9c6c0a-0000-4000-8000-000000000000",
     }
-    (row,) = ask("SELECT " + ", ".join(cases)).rows
+    (row,) = query("SELECT " + ", ".join(cases)).rows
     assert dict(zip(cases, row, strict=True)) == cases
     json.dumps(row, allow_nan=False)
 
 
-def test_columns_of_one_name_and_the_order_of_rows_are_kept(ask):
-    found = ask("SELECT i AS a, -i AS a FROM range(300) AS t(i) ORDER BY i DESC")
+def test_columns_of_one_name_and_the_order_of_rows_are_kept(query):
+    found = query("SELECT i AS a, -i AS a FROM range(300) AS t(i) ORDER BY i DESC")
     assert [c.name for c in found.columns] == ["a", "a"]
     assert found.rows == tuple((i, -i) for i in range(299, -1, -1))
 
 
-def test_parameters_are_bound(ask):
+def test_parameters_are_bound(query):
     evil = "x'; DROP TABLE surveys; --"
-    assert ask("SELECT $a, $b + 1", {"a": evil, "b": 1}).rows == ((evil, 2),)
+    assert query("SELECT $a, $b + 1", {"a": evil, "b": 1}).rows == ((evil, 2),)
     with pytest.raises(QueryRejectedError, match="not provided for the following parameters: a"):
-        ask("SELECT $a")
+        query("SELECT $a")
 
 
-def test_rows_beyond_the_limit_are_cut_and_it_is_said(ask):
-    assert not ask("SELECT * FROM range(1000)").truncated
-    found = ask("SELECT * FROM range(1000000000000)")
+def test_rows_beyond_the_limit_are_cut_and_marked(query):
+    assert not query("SELECT * FROM range(1000)").truncated
+    found = query("SELECT * FROM range(1000000000000)")
     assert found.truncated
     assert len(found.rows) == 1000
 
 
-def test_a_result_that_is_too_long_is_cut_and_it_is_said(ask):
-    found = ask("SELECT repeat('x', 100000) FROM range(100)", result_bytes=1_000_000)
+def test_a_result_that_is_too_long_is_cut_and_marked(query):
+    found = query("SELECT repeat('x', 100000) FROM range(100)", result_bytes=1_000_000)
     assert found.truncated
     assert len(found.rows) == 9
 
 
-def test_csv_has_a_header_and_says_when_rows_are_missing(ask):
-    found = ask("SELECT i, NULL AS n, [i] AS l, 'a,\"b' AS s FROM range(5) AS t(i)", rows=2)
+def test_csv_has_a_header_and_marks_missing_rows(query):
+    found = query("SELECT i, NULL AS n, [i] AS l, 'a,\"b' AS s FROM range(5) AS t(i)", rows=2)
     *rows, last = list(csv.reader(io.StringIO(to_csv(found))))
     assert rows == [["i", "n", "l", "s"], ["0", "", "[0]", 'a,"b'], ["1", "", "[1]", 'a,"b']]
     assert last == ["# truncated: only the first 2 rows are here"]
-    assert "# truncated" not in to_csv(ask("SELECT 1"))
+    assert "# truncated" not in to_csv(query("SELECT 1"))
 
 
 @pytest.mark.parametrize(
@@ -131,8 +131,8 @@ def test_csv_has_a_header_and_says_when_rows_are_missing(ask):
         "SELECT 1 -- one",
     ],
 )
-def test_what_only_reads_is_allowed(ask, sql):
-    assert ask(sql).rows
+def test_what_only_reads_is_allowed(query, sql):
+    assert query(sql).rows
 
 
 @pytest.mark.parametrize(
@@ -166,10 +166,10 @@ def test_what_only_reads_is_allowed(ask, sql):
         ("SELECT * FROM nowhere", "nowhere does not exist"),
     ],
 )
-def test_what_is_not_a_question_to_the_snapshot_is_refused(ask, snapshot, sql, reason):
+def test_what_is_no_query_of_the_snapshot_is_refused(query, snapshot, sql, reason):
     before = hashlib.sha256(snapshot.read_bytes()).digest()
     with pytest.raises(QueryRejectedError, match=reason) as refusal:
-        ask(sql)
+        query(sql)
     assert len(str(refusal.value)) < 1000
     assert hashlib.sha256(snapshot.read_bytes()).digest() == before
     assert sorted(path.name for path in snapshot.parent.iterdir()) == [snapshot.name]
@@ -184,25 +184,25 @@ def test_what_is_not_a_question_to_the_snapshot_is_refused(ask, snapshot, sql, r
         "SELECT count(*) FROM (SELECT DISTINCT hash(i) FROM range(100000000) AS t(i))",
     ],
 )
-def test_a_query_that_needs_too_much_memory_is_told_so(ask, sql):
+def test_a_query_that_needs_too_much_memory_is_refused(query, sql):
     with pytest.raises(QueryRejectedError, match="more than 256 MiB, its memory limit"):
-        ask(sql)
+        query(sql)
 
 
-def test_a_query_that_runs_too_long_is_ended_and_its_process_gone(ask):
+def test_a_query_that_runs_too_long_is_ended_and_its_process_gone(query):
     endless = "SELECT sum(hash(a.range * b.range)) FROM range(1000000000) a, range(1000000) b"
     with pytest.raises(QueryTimeoutError, match=r"ended after 0\.6 s, its time limit"):
-        ask(endless, seconds=0.6)
+        query(endless, seconds=0.6)
     left = [child.cmdline() for child in psutil.Process().children(recursive=True)]
     assert not [line for line in left if "spheremark.storage.catalogue.sandbox" in line]
 
 
-def test_the_process_of_a_query_sees_no_settings_of_the_service(ask, monkeypatch):
+def test_the_process_of_a_query_sees_no_settings_of_the_service(query, monkeypatch):
     monkeypatch.setenv("SPHEREMARK_TOKEN", "secret")
     monkeypatch.setenv("TZ", "Asia/Tokyo")
-    assert ask("SELECT current_setting('TimeZone')").rows == (("UTC",),)
+    assert query("SELECT current_setting('TimeZone')").rows == (("UTC",),)
 
 
-def test_a_snapshot_that_is_gone_is_an_error_that_says_so(tmp_path):
+def test_a_missing_snapshot_is_an_error(tmp_path):
     with pytest.raises(QueryRejectedError, match="nowhere"):
         run_query(Path(tmp_path / "nowhere.duckdb"), "SELECT 1", LIMITS)

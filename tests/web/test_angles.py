@@ -53,7 +53,7 @@ def test_few_marks_are_drawn_at_their_widest_angle_and_all_marks_as_a_level_line
     assert figure.layout.yaxis.title.text == "Error, horizontal [mm]"
 
 
-def test_triples_say_which_of_their_angles_is_drawn():
+def test_the_axis_of_triples_names_the_widest_angle():
     figure = angles.error_against_angle(shown(n_marks=3), TOLERANCE)
     assert "widest of three" in figure.layout.xaxis.title.text
     assert trace(figure, theme.method_style("along_beam").label).name.endswith("three marks")

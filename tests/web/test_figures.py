@@ -75,7 +75,7 @@ def test_errors_in_metres_are_drawn_in_millimetres_against_metres():
     assert figure.layout.yaxis.title.text == "Error, 3-D [mm]"
 
 
-def test_without_truth_the_figure_shows_sigma_and_says_so():
+def test_without_truth_the_figure_shows_sigma_and_names_it():
     columns = fits(with_errors=False)
     figure = figures.error_against_count(columns, 0.03)
     drawn = trace(figure, theme.method_style("paper").label)
@@ -157,7 +157,7 @@ def test_lanes_and_numbers_are_read_from_names(stop, lane, number):
     assert lane_and_number(stop) == (lane, number)
 
 
-def test_the_map_has_equal_axes_and_says_how_much_it_enlarges():
+def test_the_map_has_equal_axes_and_names_its_scale_factor():
     figure = maps.site_map(marks(), fixes(), places([], [], []))
     factor = maps.ellipse_factor(marks(), fixes())
     assert figure.layout.yaxis.scaleanchor == "x"
@@ -207,7 +207,7 @@ def test_empty_tables_give_empty_figures():
     assert not figures.error_along_lane(columns, 0.03).data
 
 
-def test_methods_look_the_same_in_every_figure():
+def test_a_method_has_one_style_in_every_figure():
     style = theme.method_style("along_beam")
     drawn = [
         figures.error_against_distance(fits(), 0.03).data[0],
@@ -216,15 +216,15 @@ def test_methods_look_the_same_in_every_figure():
     assert {one.marker.color for one in drawn} == {style.colour}
 
 
-def test_no_two_methods_look_the_same():
+def test_no_two_methods_share_a_style():
     styles = [theme.method_style(method) for method in FITTING_METHODS]
     assert len({style.colour for style in styles}) == len(styles)
     assert len({style.symbol for style in styles}) == len(styles)
 
 
-def test_a_method_of_tomorrow_gets_a_look_of_its_own():
-    style = theme.method_style("next_year")
-    assert style.label == "next year"
+def test_an_unknown_method_has_another_style():
+    style = theme.method_style("other_method")
+    assert style.label == "other method"
     assert style.colour not in (theme.OURS, theme.PAPER)
 
 

@@ -17,7 +17,7 @@ def kept(**query):
     return filters.apply(TABLE)["range_m"].tolist()
 
 
-def test_nothing_asked_for_keeps_everything():
+def test_no_filter_keeps_every_row():
     assert kept() == [3.0, 7.0, 12.0]
 
 

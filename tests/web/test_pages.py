@@ -68,7 +68,7 @@ def test_json_in_a_page_cannot_end_the_element_that_holds_it():
     assert json.loads(block) == {"name": "</script><b>&"}
 
 
-def test_the_error_page_escapes_what_it_was_asked_for():
+def test_the_error_page_escapes_its_texts():
     text = pages.error_page(
         pages.ErrorPage(
             frame=pages.Frame(surveys=("<i>",)),
@@ -87,5 +87,5 @@ def test_addresses_of_files_change_with_their_content():
     assert assets.static_folder().joinpath("site.css").is_file()
 
 
-def test_plotly_is_told_that_its_map_styles_are_there():
+def test_the_element_of_map_styles_has_the_id_that_plotly_looks_for():
     assert f'getElementById("{assets.map_style_id()}")' in assets.plotly_script().read_text("utf-8")

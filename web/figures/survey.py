@@ -6,7 +6,7 @@ names it.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 
 import numpy as np
 import plotly.graph_objects as go
@@ -69,7 +69,7 @@ def error_against_count(fits: Columns, tolerance_m: float, *, is_log: bool = Fal
 def error_along_lane(fits: Columns, tolerance_m: float) -> go.Figure:
     """Draw the mean error of the centres at each stop along its lane (Figure 11 of the study)."""
     figure = _quality_figure(fits, "sphere centres along the lane, mean per stop", tolerance_m)
-    order = _in_lane_order(texts(fits, "stop"))
+    order = sorted(set(texts(fits, "stop")), key=lane_order)
     is_numbered = all(lane_and_number(stop)[1] is not None for stop in order)
     for method, rows in by_method(fits):
         _add_lanes(figure, method, rows, order, is_numbered=is_numbered)
@@ -211,11 +211,6 @@ def _add_prediction(
         fillcolor=style.band,
         hovertemplate="predicted %{y:.1f} mm about %{x:.4g}<extra></extra>",
     )
-
-
-def _in_lane_order(stops: Iterable[str]) -> list[str]:
-    """Return the stops once each, lane by lane, in the order of their numbers."""
-    return sorted(set(stops), key=lane_order)
 
 
 def _add_lanes(

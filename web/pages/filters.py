@@ -14,6 +14,9 @@ from spheremark.pipelines.config import RESECTION_METHODS
 from spheremark.pipelines.errors import InputError
 from spheremark.web.columns import Columns, floats, lane_and_number, select, texts
 
+_CHOICES = {"axes": ("linear", "log"), "marks": ("2", "3"), "resection": RESECTION_METHODS}
+"""Values of a query by name, the default first."""
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Filters:
@@ -33,15 +36,10 @@ class Filters:
     def from_query(cls, query: Mapping[str, Sequence[str]]) -> Self:
         """Read the query of an address; InputError names the wrong value."""
         first = {name: values[-1] for name, values in query.items() if values}
-        axes = first.get("axes", "linear")
-        if axes not in ("linear", "log"):
-            raise InputError(f"axes is {axes!r}; it must be linear or log.")
-        marks, resection = first.get("marks", "2"), first.get("resection", "free_station")
-        if marks not in ("2", "3"):
-            raise InputError(f"marks is {marks!r}; it must be 2 or 3.")
-        if resection not in RESECTION_METHODS:
-            known = ", ".join(RESECTION_METHODS)
-            raise InputError(f"resection is {resection!r}; it must be one of {known}.")
+        chosen = {name: first.get(name, known[0]) for name, known in _CHOICES.items()}
+        for name, value in chosen.items():
+            if value not in _CHOICES[name]:
+                raise InputError(f"{name} is {value!r}; it must be {' or '.join(_CHOICES[name])}.")
         return cls(
             methods=tuple(query.get("method", ())),
             lane=first.get("lane", ""),
@@ -49,9 +47,9 @@ class Filters:
             range_from_m=_number(first, "range_from_m"),
             range_to_m=_number(first, "range_to_m"),
             status=first.get("status", ""),
-            is_log=axes == "log",
-            n_marks=int(marks),
-            resection=resection,
+            is_log=chosen["axes"] == "log",
+            n_marks=int(chosen["marks"]),
+            resection=chosen["resection"],
         )
 
     def query(self) -> str:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -98,15 +99,17 @@ def _statement(method: str, rows: Columns, tolerance_m: float, place: str) -> St
 
 def distance_words(bound: Bound) -> str:
     """Format a greatest distance with its interval, within the observed range."""
-    low, high = (_distance(value, bound.seen) for value in (bound.low, bound.high))
-    value = _distance(bound.value, bound.seen)
-    return value if low == high == value else f"{value} ({low} to {high})"
+    return _with_interval(bound, _distance)
 
 
 def count_words(bound: Bound) -> str:
     """Format a smallest count with its interval, within the observed range."""
-    low, high = (_count(value, bound.seen) for value in (bound.low, bound.high))
-    value = _count(bound.value, bound.seen)
+    return _with_interval(bound, _count)
+
+
+def _with_interval(bound: Bound, write: Callable[[float, tuple[float, float]], str]) -> str:
+    """Format a bound and, where its ends differ, its interval."""
+    value, low, high = (write(one, bound.seen) for one in (bound.value, bound.low, bound.high))
     return value if low == high == value else f"{value} ({low} to {high})"
 
 
