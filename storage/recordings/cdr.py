@@ -28,7 +28,8 @@ _LAYOUTS_MAX = 256  # layouts of one length on one channel; real topics have one
 
 _Kind = TypeVar("_Kind", bound=np.generic)
 
-HEADER = """std_msgs/Header header"""
+HEADER = """std_msgs/Header header
+"""
 HEADER_PARTS = """================================================================================
 MSG: std_msgs/Header
 # Standard metadata for higher-level stamped data types.
