@@ -56,6 +56,7 @@ check: setup-dev
 	$(BIN)/mypy
 	$(BIN)/lint-imports
 	@$(BIN)/codespell $(shell git ls-files '*.py' '*.md' '*.sql' '*.html' '*.toml')
+	.ci/locks $(VENV)
 
 bench: setup-dev
 	@$(BIN)/spheremark bench
@@ -63,13 +64,8 @@ bench: setup-dev
 reference: setup
 	@$(BIN)/python -m spheremark.service.cli.reference > REFERENCE.md
 
-COMPILE := $(BIN)/uv pip compile --quiet --universal --no-header \
-	--no-emit-index-url --no-emit-find-links pyproject.toml
-
 lock: setup-dev
-	$(COMPILE) --upgrade --python-version 3.11 --output-file requirements.lock
-	$(COMPILE) --upgrade --python-version 3.11 --extra dev --constraint requirements.lock \
-		--output-file requirements-dev.lock
+	.ci/locks $(VENV) --renew
 
 clean:
 	rm -rf .venv .venv-* build dist *.egg-info .mypy_cache .ruff_cache .pytest_cache .hypothesis \
