@@ -1,4 +1,4 @@
-"""The chain with its defaults, for notebooks and scripts: one call a task, arrays and values."""
+"""The chain with its defaults, for notebooks and scripts: one call a problem, arrays and values."""
 
 from __future__ import annotations
 

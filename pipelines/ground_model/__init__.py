@@ -1,9 +1,9 @@
 """Ground heights of a site with their uncertainty, from the clouds of its stops.
 
-Hides how ground is told from what stands on it (``ground``) and how stops are joined (``grid``).
-The model is one of the *terrain*: rocks, poles, markers and people are taken off. Clouds come one
-at a time, so memory grows with the site and not with the survey. ``points`` holds what of a stop
-goes into a cloud of the whole site.
+Hides how ground is separated from objects (``ground``) and how stops are joined (``grid``). The
+model is one of the *terrain*, without rocks, poles, markers and people. Clouds come one at a time,
+so memory grows with the site and not with the survey. ``points`` chooses the returns of a stop for
+a cloud of the whole site.
 """
 
 from spheremark.pipelines.ground_model.model import Terrain

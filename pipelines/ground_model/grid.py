@@ -1,8 +1,8 @@
 """The grid in which the returns of one stop after another are gathered.
 
 Each cell has four by four sub-cells. A stop leaves in each sub-cell the mean of its lowest returns;
-stops are joined by weight, and where they differ by more than a step the lower one is believed:
-the other saw what stands there. Memory grows with the site, not with the returns.
+stops are joined by weight, and where they differ by more than a step the lower one is kept: the
+other one saw an object. Memory grows with the site, not with the returns.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ SUB = 4
 """Sub-cells along an edge of a cell."""
 
 _CELLS_MAX = 1_000_000  # some 400 MB
-_BAND = 0.03  # [m] above the lowest return of a sub-cell, noise apart, that is still ground
+_BAND = 0.03  # [m] above the lowest return of a sub-cell that is ground, beside noise
 _BAND_SIGMAS = 6.0
 _STEP = 0.05  # [m] by which two stops may differ in a sub-cell and mean the same ground
 _SLOPE = 0.1  # a usual slope, where the true one is not yet known
@@ -67,7 +67,7 @@ class Grid(NamedTuple):
 
 
 def empty_grid(p_site: Array, config: ElevationConfig) -> Grid:
-    """Return a grid that holds all ground about some stations."""
+    """Return an empty grid around stations."""
     low = np.floor((p_site[:, :2].min(axis=0) - config.range_max) / config.cell)
     high = np.ceil((p_site[:, :2].max(axis=0) + config.range_max) / config.cell)
     columns, rows = (int(n) for n in high - low)
@@ -91,12 +91,7 @@ def empty_grid(p_site: Array, config: ElevationConfig) -> Grid:
 
 
 def add_stop(grid: Grid, cloud: StitchedCloud, pose: StationPose, config: ElevationConfig) -> None:
-    """Gather the returns of one stop into a grid, in place.
-
-    Notes
-    -----
-    Linear in the returns, beside a window of the grid about the station.
-    """
+    """Gather the returns of one stop into a grid, in place."""
     T = pose.T_site_station @ rigid(levelling_rotation(cloud.levelling), np.zeros(3))
     place = (T[:2, 3] - grid.corner) / config.cell
     reach = config.range_max / config.cell
@@ -118,10 +113,7 @@ def add_stop(grid: Grid, cloud: StitchedCloud, pose: StationPose, config: Elevat
 def _cov_of_places(
     pose: StationPose, corner: Array, window: NDArray[np.intp], cell: float
 ) -> Array:
-    """Return what a pose's covariance makes of places, (rows, columns, 6): xx, xy, xz, yy, yz, zz.
-
-    The places are the centres of the cells of a window, a metre below the station.
-    """
+    """Return covariances by a pose, xx to zz, of a window's cells, a metre below the station."""
     row, column, n_rows, n_columns = window
     xs = corner[0] + (column + np.arange(n_columns) + 0.5) * cell
     ys = corner[1] + (row + np.arange(n_rows) + 0.5) * cell
@@ -137,8 +129,7 @@ def _cov_of_places(
 def _lowest_returns(p_base, T, shape, limits):  # type: ignore[no-untyped-def]  # noqa: ANN001, ANN202
     """Return count and sums of x, y, z of each sub-cell's lowest returns, (4r, 4c, 4).
 
-    ``T`` maps to the window, ``limits`` holds the edge of a sub-cell, the square of the greatest
-    distance and the variance of a range.
+    ``limits``: edge of a sub-cell, square of the greatest distance, variance of a range.
     """
     edge, reach2, variance = limits
     lowest = np.full(shape, np.inf)
@@ -171,11 +162,7 @@ def _lowest_returns(p_base, T, shape, limits):  # type: ignore[no-untyped-def]  
 
 @compiled
 def _join(grid, window, sums, covs, station, noise):  # type: ignore[no-untyped-def]  # noqa: ANN001, ANN202
-    """Join the sums of one stop to the grid.
-
-    ``station`` is the place of the station from the corner of the window, ``noise`` holds the edge
-    of a sub-cell and the variance of a range.
-    """
+    """Join the sums of one stop to the grid; ``noise``: edge of a sub-cell, variance of a range."""
     edge, variance = noise
     row0, column0 = window[0] * SUB, window[1] * SUB
     own = np.zeros((window[2], window[3]))

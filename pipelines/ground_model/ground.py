@@ -1,13 +1,11 @@
-"""Sub-cells -> mean height of the ground of each cell: hides how ground is told from what stands.
+"""Sub-cells -> mean height of the ground of each cell: hides how ground is separated from objects.
 
 About each cell a curved surface is fitted to the sub-cells of a window, and those above it lose
 their weight (robust interpolation: Kraus and Pfeifer, ISPRS J. 53, 1998). Sub-cells near that
 surface are ground. The mean height of the cell is then estimated from its own sub-cells, with the
-roughness that the sub-cells show as the uncertainty of what was not seen (block kriging with a
-nugget).
-
-What a beam does not see is lower than what it sees: it lies in the shadow of a crest. The grazing
-angle and the roughness say how much, and half of what is said there is doubt.
+roughness of the sub-cells as the uncertainty of those that were not seen (block kriging with a
+nugget). Sub-cells in the shadow of a crest are lower than those seen: the mean is corrected by
+grazing angle and roughness, and the correction is added to the standard deviation.
 """
 
 from __future__ import annotations
@@ -16,17 +14,18 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy import ndimage
 
 from spheremark.pipelines.compilation import compiled
 from spheremark.pipelines.estimation.linear_algebra import solve
 from spheremark.pipelines.ground_model.grid import SUB, Grid
 from spheremark.pipelines.ground_model.values import ElevationConfig
-from spheremark.pipelines.model import Array
+from spheremark.pipelines.model import Array, Mask
 from spheremark.pipelines.threads import side_by_side
 
 _HALF_WEIGHTS = (0.10, 0.05, 0.03, 0.02, 0.02, 0.02)  # [m] above the surface, in each pass
 _N_PLANE = 2  # passes with a plane; then curved
-_BELOW = 3.0  # times as far below it: what is too low is rare, but it happens
+_BELOW = 3.0  # times as far below it: outliers below are rare
 _NEAR = 0.05  # [m] from the surface that a sub-cell of the ground may be
 _N_CURVED, _N_FLAT = 12, 5  # sub-cells that a curved surface and a plane need
 _STEEPEST = 0.7  # slope that ground may have; 35 degrees
@@ -52,10 +51,10 @@ def ground_heights(grid: Grid, config: ElevationConfig) -> Ground:
 
     Notes
     -----
-    The variance of a height is the sum of: the roughness of sub-cells that were not seen, or count
-    too much; the noise of the ranges on the slope as the beams met it; the prior of the slope,
-    where the sub-cells lie to one side; what the poses of the stations, the biases of the lasers
-    and the directions have in common for all of a cell; and what lies in shadow.
+    The variance of a height is the sum of: the roughness of sub-cells that were not seen, or have
+    too much weight; the noise of the ranges on the slope; the prior of the slope, where the
+    sub-cells lie to one side; the common errors of a cell by poses, lasers and directions; and the
+    correction for shadow.
     """
     rows, columns = grid.shares.shape
     surfaces = np.full((rows, columns, 8), np.nan)
@@ -129,17 +128,19 @@ def _robust(points, n, b):  # type: ignore[no-untyped-def]  # noqa: ANN001, ANN2
             normal[a, a] += 1e-3
         if not solve(normal[:wanted, :wanted], right):
             return 0
-        b[:], k = right, wanted
+        for a in range(wanted):
+            b[a] = right[a]
+        k = wanted
     b[0] += lowest
     return k
 
 
 @compiled
 def _fit_surfaces(grid, sizes, surfaces, first, end):  # type: ignore[no-untyped-def]  # noqa: ANN001, ANN202
-    """Write of each cell: height, two slopes, three curvatures, roughness variance, shape of beams.
+    """Write of each cell: height, slopes (2), curvatures (3), roughness variance, shape of beams.
 
-    Slopes and curvatures are per metre; the shape of beams is the mean square of the cosine between
-    beam and normal over that between vertical and normal.
+    The shape of beams is the mean square of the cosine between beam and normal over that between
+    vertical and normal.
     """
     cell, reach = sizes[0], max(sizes[1], 1.5 * sizes[0])
     side = 2 * (int(np.ceil(reach / cell * SUB)) + SUB)
@@ -157,9 +158,9 @@ def _fit_surfaces(grid, sizes, surfaces, first, end):  # type: ignore[no-untyped
             shape = _met(beams, share, b[1] / reach, b[2] / reach)
             roughness = _roughness(points, n, b, k, sizes[2] * shape)
             if roughness > 0.0:
-                surfaces[row, column, 0] = b[0]
-                surfaces[row, column, 1:3] = b[1:3] / reach
-                surfaces[row, column, 3:6] = b[3:6] / reach**2
+                for a in range(6):
+                    scale = 1.0 if a == 0 else reach if a < 3 else reach * reach
+                    surfaces[row, column, a] = b[a] / scale
                 surfaces[row, column, 6], surfaces[row, column, 7] = roughness, shape
 
 
@@ -190,20 +191,13 @@ def _met(products, share, slope_x, slope_y):  # type: ignore[no-untyped-def]  # 
     return max(total / share, 1e-6)
 
 
-@compiled
-def _stands_out(heights, cell):  # type: ignore[no-untyped-def]  # noqa: ANN001, ANN202
-    """Tell the cells that lie above lower ground near by more steeply than ground can."""
-    out = np.zeros(heights.shape, dtype=np.bool_)
-    half = int(_RISE_WITHIN / cell)
-    rows, columns = heights.shape
-    for i in range(rows):
-        for j in range(columns):
-            for k in range(max(i - half, 0), min(i + half + 1, rows)):
-                for m in range(max(j - half, 0), min(j + half + 1, columns)):
-                    away = cell * np.sqrt(float((k - i) ** 2 + (m - j) ** 2))
-                    if heights[i, j] - heights[k, m] > _RISE + _STEEPEST * away:
-                        out[i, j] = True
-    return out
+def _stands_out(heights: Array, cell: float) -> Mask:
+    """Return the cells that lie above lower ground near by more steeply than ground can."""
+    steps = cell * np.arange(-int(_RISE_WITHIN / cell), int(_RISE_WITHIN / cell) + 1)
+    rises = _RISE + _STEEPEST * np.hypot(*np.meshgrid(steps, steps))
+    known = np.where(np.isnan(heights), np.inf, heights)
+    lowest = ndimage.grey_erosion(known, structure=-rises, mode="constant", cval=np.inf)
+    return np.asarray(heights > lowest)
 
 
 @compiled
@@ -218,7 +212,7 @@ def _off(grid, i, j, cell, surface):  # type: ignore[no-untyped-def]  # noqa: AN
 
 @compiled
 def _standing(grid, sizes, surfaces):  # type: ignore[no-untyped-def]  # noqa: ANN001, ANN202
-    """Tell the sub-cells of what stands on the ground."""
+    """Return the sub-cells of objects on the ground."""
     out = np.zeros(grid.weights.shape, dtype=np.bool_)
     for i in range(out.shape[0]):
         for j in range(out.shape[1]):
@@ -265,10 +259,7 @@ def _hidden(n, roughness, shape, cell):  # type: ignore[no-untyped-def]  # noqa:
 
 @compiled
 def _own(grid, row, column, sizes, surface, stands, own):  # type: ignore[no-untyped-def]  # noqa: ANN001, ANN202, PLR0913
-    """Collect the sub-cells of a cell that are ground; return how many, and their returns.
-
-    normal sub-cell beside something that stands may hold the foot of it, and is left out.
-    """
+    """Collect the sub-cells of a cell that are ground and not beside an object; count them."""
     n, n_returns = 0, 0
     for i in range(row * SUB, (row + 1) * SUB):
         for j in range(column * SUB, (column + 1) * SUB):
@@ -285,10 +276,7 @@ def _own(grid, row, column, sizes, surface, stands, own):  # type: ignore[no-unt
 
 @compiled
 def _mean(own, n, roughness, cell):  # type: ignore[no-untyped-def]  # noqa: ANN001, ANN202
-    """Return the mean over all sub-cells of a cell from those that were seen, and its variance.
-
-    The heights are a plane, whose slope is near zero, and the roughness of each sub-cell.
-    """
+    """Return the mean of a cell by its sub-cells seen, and its variance: plane and roughness."""
     of_slope = 4.0 * roughness / cell**2
     normal, b = np.zeros((3, 3)), np.zeros(3)
     normal[1, 1] = normal[2, 2] = 1.0 / of_slope

@@ -1,4 +1,4 @@
-"""Stop after stop into one elevation model; holes are filled only where that is wanted."""
+"""Stop after stop into one elevation model; small holes are filled on request."""
 
 from __future__ import annotations
 
@@ -15,12 +15,12 @@ from spheremark.pipelines.model import Array, StitchedCloud
 
 
 class Terrain:
-    """Gathers the ground of a site, one stop at a time.
+    """Ground of a site, gathered stop by stop.
 
     Parameters
     ----------
     poses : sequence of StationPose
-        All stations whose clouds will come: they say how large the grid is.
+        All stations whose clouds will be added: they determine the grid.
     config : ElevationConfig
         Edge of a cell, limits, noise.
     """
@@ -31,19 +31,11 @@ class Terrain:
         self._grid: Grid = empty_grid(places, config)
 
     def add(self, cloud: StitchedCloud, pose: StationPose) -> None:
-        """Add the returns of one stop.
-
-        Parameters
-        ----------
-        cloud : StitchedCloud
-            The stop.
-        pose : StationPose
-            Its pose.
-        """
+        """Add the returns of one stop at its pose."""
         add_stop(self._grid, cloud, pose, self._config)
 
     def model(self) -> ElevationModel:
-        """Return the ground as the stops so far saw it, cut to where it was seen.
+        """Return the ground that the stops saw so far, cut to its extent.
 
         Returns
         -------
@@ -82,9 +74,9 @@ def _filled(ground: Ground, config: ElevationConfig) -> tuple[Ground, np.ndarray
     """Fill small holes from the cells around; return which ones were filled.
 
     The height is the mean of the known cells around, weighted by the inverse square of their
-    distance. To the variance of that mean comes the one that such a mean has as a guess of the
-    cell, by how much known heights differ with distance: ``2 sum w_i g_i - sum w_i w_j g_ij`` with
-    the variogram ``g`` (Matheron, 1963). Where no two known heights tell it, nothing is filled.
+    distance. To the variance of that mean its variance as a prediction of the cell is added:
+    ``2 sum w_i g_i - sum w_i w_j g_ij`` with the variogram ``g`` (Matheron, 1963). Without two
+    known heights nothing is filled.
     """
     known = np.isfinite(ground.heights)
     distances = np.asarray(ndimage.distance_transform_edt(~known)) * config.cell
@@ -135,10 +127,7 @@ def _among(weights: Array, spectrum: Array) -> float:
 
 
 def _variogram(heights: Array, reach: int) -> Array:
-    """Return half the mean square of the difference of heights 1 ... ``reach`` cells apart.
-
-    NaN where no two heights are so far apart.
-    """
+    """Return half the mean square difference of heights 1 ... ``reach`` cells apart, or NaN."""
     squares = np.full(reach, np.nan)
     for lag in range(1, reach + 1):
         across = heights[:, lag:] - heights[:, :-lag]

@@ -1,4 +1,4 @@
-"""What of a stop goes into a cloud of the whole site."""
+"""The returns of a stop for a cloud of the whole site."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from spheremark.pipelines.model import (
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class StationPoints:
-    """Returns of one stop in the station frame, with the pose that leads to the site.
+    """Returns of one stop in the station frame, with its pose in the site.
 
     Attributes
     ----------
@@ -63,7 +63,7 @@ class StationPoints:
 def station_points(
     cloud: StitchedCloud, pose: StationPose, *, range_max: float = np.inf, voxel: float = 0.0
 ) -> StationPoints:
-    """Choose what of a stop goes into the cloud of its site.
+    """Choose the returns of a stop for the cloud of its site.
 
     Parameters
     ----------

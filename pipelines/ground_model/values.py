@@ -1,4 +1,4 @@
-"""What an elevation model is made from, and what it says."""
+"""Inputs and result of an elevation model."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from spheremark.pipelines.network import AdjustedNetwork
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ElevationConfig:
-    """How ground becomes a model of its heights.
+    """Options of an elevation model.
 
     Attributes
     ----------
@@ -25,16 +25,16 @@ class ElevationConfig:
         Horizontal distance from a station within which ground is used [m]. 15: beyond, beams graze
         at less than 4 degrees and see crests only.
     object_max : float
-        Width up to which what stands on the ground is taken off [m]. 0.6: rocks, poles, markers,
-        legs; wider things are left out where they rise steeply.
+        Width up to which objects are removed from the ground [m]. 0.6: rocks, poles, markers, legs;
+        wider ones are left out where they rise steeply.
     sigma_range : float
         Noise of a range [m]. 10.7 mm: a VLP-16 on dark ground.
     sigma_laser_bias : float
-        What each laser measures too long, standard deviation [m].
+        Standard deviation of the range bias of a laser [m].
     sigma_direction : float
-        What a direction is off in all of a stop, after two faces are averaged [rad].
+        Standard deviation of the directions of a whole stop, averaged over two faces [rad].
     gap_max : float
-        Holes up to this distance from ground that was seen are interpolated [m]; 0: none.
+        Distance from seen ground up to which holes are interpolated [m]; 0: none.
     """
 
     cell: float = 0.25
@@ -65,7 +65,7 @@ class ElevationConfig:
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class StationPose:
-    """Where a stop's returns belong on the site.
+    """Pose of a stop in the site.
 
     Attributes
     ----------
@@ -86,25 +86,11 @@ class StationPose:
 
 
 def poses_of_network(result: AdjustedNetwork) -> tuple[StationPose, ...]:
-    """Return the poses of an adjusted network.
-
-    Parameters
-    ----------
-    result : AdjustedNetwork
-        The network.
-
-    Returns
-    -------
-    tuple of StationPose
-        In the order of its stations.
-    """
+    """Return the poses of an adjusted network, in the order of its stations."""
     return tuple(
         StationPose(name=name, T_site_station=T.copy(), cov_T_site_station=cov.copy())
         for name, T, cov in zip(
-            result.network.stations,
-            result.T_site_station,
-            result.cov_T_site_station,
-            strict=True,
+            result.network.stations, result.T_site_station, result.cov_T_site_station, strict=True
         )
     )
 
@@ -118,7 +104,7 @@ def pose_of_fix(name: str, fix: StationFix) -> StationPose:
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class ElevationModel:
-    """Mean height of the ground in each cell of a grid, and how sure it is.
+    """Mean height of the ground in each cell of a grid, with its standard deviation.
 
     Attributes
     ----------

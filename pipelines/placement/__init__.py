@@ -1,21 +1,20 @@
-"""Where to put markers: what an arrangement promises, and which promises most.
+"""Where to put markers: predicted accuracy of an arrangement, and the best arrangement.
 
-- ``values`` says what a site, an arrangement and an evaluation are; ``sites`` makes sites,
-- ``sensor`` knows what a scan puts on a sphere, ``centres`` how well its centre will be known,
-- ``sight`` what hides it, ``positions`` and ``probability`` what centres make of a position,
-- ``evaluation`` puts these together for stops and for a grid over the field,
-- ``candidates`` says where marks may stand, ``optimising`` which of these places are best,
-- ``trials`` is the study's own procedure: marks at random, pass or fail,
-- ``learning`` fits the model of centres to one's own surveys.
+- ``plan`` has the types of a plan; ``sites`` makes sites, ``candidates`` where marks may stand,
+- ``sensor`` predicts the returns from a sphere, ``centre_model`` the accuracy of its centre,
+  ``empirical_model`` the same from one's own surveys, ``visibility`` what hides it,
+- ``station_covariance`` and ``probability`` propagate centres to positions,
+- ``evaluation`` joins these for stops and for a grid over the field, ``bounds`` limits them,
+- ``optimisation`` finds the best places, ``random_plans`` is the study's own procedure.
 
-Why so: an arrangement is judged in milliseconds, without simulating a scan, so that hundreds of
-thousands can be compared; simulation is what the promises are tested against.
+An arrangement is evaluated in milliseconds without simulating a scan, so that hundreds of thousands
+can be compared; simulated scans test the predictions.
 """
 
 from spheremark.pipelines.placement.candidates import Candidates, PlaceRules, find_candidates
 from spheremark.pipelines.placement.centre_model import CentreModel, Provenance, sensor_model
 from spheremark.pipelines.placement.empirical_model import FitRows, fitted_model
-from spheremark.pipelines.placement.evaluation import check_sizes, evaluate, field_eyes, field_map
+from spheremark.pipelines.placement.evaluation import check_sizes, evaluate, field_map, map_stations
 from spheremark.pipelines.placement.optimisation import (
     Goal,
     Optimum,
@@ -31,20 +30,20 @@ from spheremark.pipelines.placement.plan import (
     Evaluation,
     FieldMap,
     Requirement,
-    Sights,
     Site,
     Stops,
+    Visibility,
 )
 from spheremark.pipelines.placement.random_plans import (
-    Share,
-    Trial,
-    TrialResult,
+    PassRate,
+    RandomPlanResults,
+    RandomPlanSpec,
     by_number,
     by_worst_angle,
     errors_by_angle,
     marks_at_angle,
+    simulate_random_plans,
     three_circle_errors,
-    try_at_random,
 )
 from spheremark.pipelines.placement.sensor import Sensor
 from spheremark.pipelines.placement.sites import (
@@ -53,7 +52,7 @@ from spheremark.pipelines.placement.sites import (
     site_of_grid,
     stops_of_field,
 )
-from spheremark.pipelines.placement.visibility import look
+from spheremark.pipelines.placement.visibility import find_visibility
 
 __all__ = [
     "PLAN_METHODS",
@@ -65,17 +64,17 @@ __all__ = [
     "FitRows",
     "Goal",
     "Optimum",
+    "PassRate",
     "PlaceRules",
     "Proposal",
     "Provenance",
+    "RandomPlanResults",
+    "RandomPlanSpec",
     "Requirement",
     "Sensor",
-    "Share",
-    "Sights",
     "Site",
     "Stops",
-    "Trial",
-    "TrialResult",
+    "Visibility",
     "best_without_search",
     "by_number",
     "by_worst_angle",
@@ -83,19 +82,19 @@ __all__ = [
     "draw_arrangement",
     "errors_by_angle",
     "evaluate",
-    "field_eyes",
     "field_map",
     "find_candidates",
+    "find_visibility",
     "fitted_model",
-    "look",
+    "map_stations",
     "marks_at_angle",
     "marks_of_field",
     "optimise",
     "propose_mark",
     "sensor_model",
+    "simulate_random_plans",
     "site_of_field",
     "site_of_grid",
     "stops_of_field",
     "three_circle_errors",
-    "try_at_random",
 ]

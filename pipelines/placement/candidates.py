@@ -12,11 +12,11 @@ from spheremark.pipelines.model import Array, Mask, seal
 from spheremark.pipelines.placement.plan import Arrangement, Site, Stops, bilinear
 
 CANDIDATES_MAX = 20_000
-"""Places that are compared at most."""
+"""Most places of one comparison."""
 
 _SLOPE_BASE = 0.5  # [m] over which slope is measured: what a tripod or a stake stands on
 _BEHIND = 0.7  # [m] nearer than this, a surface behind a sphere mixes with the returns of its limb
-_DIGITS = 3  # of coordinates: nobody stakes out finer
+_DIGITS = 3  # of coordinates: millimetres, finer than staking out
 _LEVELS = 3  # heights of a centre that are tried at each place
 
 
@@ -84,7 +84,7 @@ class Candidates:
 
     @property
     def arrangement(self) -> Arrangement:
-        """All of them as if they stood there."""
+        """All of them as marks."""
         names = tuple(str(k) for k in range(len(self.p_site)))
         return Arrangement(names=names, p_site=self.p_site)
 
@@ -154,7 +154,7 @@ def _spacing(stops: Stops, rules: PlaceRules) -> float:
 
 
 def _masks(site: Site, stops: Stops, rules: PlaceRules, place: Array) -> dict[str, Mask]:
-    """Return which places each rule leaves, by what they then are."""
+    """Return which places satisfy each rule, by the text of the rule."""
     gaps = np.hypot(*(place[:, None] - stops.p_site[None, :, :2]).transpose(2, 0, 1)).min(axis=1)
     masks = {
         "within reach of a stop": gaps <= rules.reach,
@@ -169,7 +169,7 @@ def _masks(site: Site, stops: Stops, rules: PlaceRules, place: Array) -> dict[st
 
 
 def _inside(stops: Stops, rules: PlaceRules, place: Array) -> Mask:
-    """Return which places lie where the rover drives: in the hull of the stops and its margin."""
+    """Return which places lie in the hull of the stops and its margin, where the rover drives."""
     from shapely import MultiPoint, contains_xy
 
     if rules.is_inside_allowed or len(stops.names) < 3:
@@ -200,7 +200,7 @@ def _slopes(site: Site, place: Array) -> Array:
 
 
 def _is_free(site: Site, place: Array) -> Mask:
-    """Return at which places nothing is in the way of a pole, or close behind a sphere."""
+    """Return at which places no obstacle is under a pole or close behind a sphere."""
     rises = np.nan_to_num(site.surface - site.ground)
     above = bilinear(site, rises, place)
     is_tall = rises > site.pole_heights[0] - site.marker_radius

@@ -1,7 +1,7 @@
-"""How well a sphere's centre will be known from a place: the planner's model of accuracy.
+"""Accuracy of a sphere's centre from a station, before any scan.
 
 Two sources: what the sensor's returns are worth (``sensor_model``), and how the fits of a user's
-own surveys differ from that (``fitting_model.fitted_model``).
+own surveys differ from that (``empirical_model.fitted_model``).
 """
 
 from __future__ import annotations
@@ -9,13 +9,12 @@ from __future__ import annotations
 import hashlib
 import json
 from dataclasses import asdict, dataclass, field
-from typing import Any
 
 import numpy as np
 
 from spheremark.pipelines.compilation import compiled
-from spheremark.pipelines.model import Array, seal
-from spheremark.pipelines.placement.plan import Arrangement, Sights
+from spheremark.pipelines.model import Array, Column, Mask, seal
+from spheremark.pipelines.placement.plan import Arrangement, Visibility
 from spheremark.pipelines.placement.sensor import Returns, Sensor, returns_of
 from spheremark.pipelines.placement.visibility import N_STRIPS
 
@@ -23,15 +22,14 @@ AXES = ("towards", "left", "up")
 """The axes of a centre's uncertainty, as seen from the stop."""
 
 TERMS = ("distance", "count", "incidence", "reflectivity")
-"""What the fits of a survey may say otherwise than the sensor model, beside a factor by axis."""
+"""Causes by which fits of a survey may differ from the sensor model, beside a factor by axis."""
 
 REFERENCE_DISTANCE = 8.0
 """Distance at which the factors of a model hold [m]."""
 
 # Variance of fits by ``along_beam`` over the bound of their returns: towards, left, up. Pooled over
-# 700 simulated spheres from 2 to 16 m; the outline gives back what the pole and lost limbs cost.
+# 700 simulated spheres from 2 to 16 m; the limb gives back what the pole and lost edges cost.
 _EFFICIENCY = (0.85, 1.02, 0.93)
-Group = tuple[Any, ...]  # arrays and numbers that go together into a kernel
 # A surface close behind a sphere mixes with the returns of its limb, and touches it where it is too
 # near to be told apart. Over 130 simulated spheres at 0.2 to 0.85 m before a wall.
 _TOUCHING, _MIXING = 0.15, 0.85  # [m]
@@ -127,17 +125,17 @@ class CentreModel:
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class Centres:
-    """What is to be expected of each mark's centre from each eye.
+    """Prediction of each mark's centre from each station.
 
     Attributes
     ----------
-    shares : (e, n)
+    shares : (s, n)
         Share of the returns of a wholly visible sphere, 0 to 1.
-    n_points : (e, n)
+    n_points : (s, n)
         Expected returns.
-    lost : (e, n)
+    lost : (s, n)
         Probability that lines pass the sphere by; 1 where a surface touches it.
-    cov_site : (e, n, 3, 3)
+    cov_site : (s, n, 3, 3)
         Covariance of the centre by the noise of its returns, in the axes of the site; infinite on
         the diagonal where nothing is seen [m^2].
     """
@@ -179,136 +177,129 @@ def sensor_model(sensor: Sensor, marker_radius: float = 0.100) -> CentreModel:
 
 
 def expect_centres(
-    model: CentreModel, eyes_site: Array, marks: Arrangement, sights: Sights
+    model: CentreModel, stations_site: Array, marks: Arrangement, visibility: Visibility
 ) -> Centres:
-    """Say what is to be expected of marks' centres.
+    """Predict the centres of marks.
 
     Notes
     -----
-    The information of the returns of the visible part of a disc is inverted as it is: a sphere of
-    which only the top is seen has a height that hangs on its distance. Returns thicken with the
-    secant of elevation. Of a sphere before a surface a fifth fewer carry the centre, whose errors
-    are larger for what is mixed.
+    The information of the returns of the visible part of a disc is inverted whole: a sphere of
+    which only the top is seen has a height that is correlated with its distance. Returns thicken
+    with the secant of elevation. Of a sphere before a surface a fifth fewer carry the centre, whose
+    errors are larger by the mixed ones.
     """
-    table, sensor = model.returns, model.sensor
-    shape = (len(eyes_site), len(marks.names))
-    shares, n_points, lost = np.zeros(shape), np.zeros(shape), np.ones(shape)
-    covs = np.empty((*shape, 3, 3))
+    sensor, table = model.sensor, model.returns
+    v = marks.p_site[None] - stations_site[:, None]
+    flat = np.maximum(np.hypot(v[..., 0], v[..., 1]), 1e-9)
+    d = np.hypot(flat, v[..., 2])
+    first, second = np.log(table.distances[:2])
+    place = (np.log(d) - first) / (second - first)
+    sines = np.sin(sensor.elevations)
+    is_near = (place >= 0.0) & (place < len(table.distances) - 1.0)
+    is_near &= (v[..., 2] >= sines[0] * d) & (v[..., 2] <= sines[1] * d)
+    place = np.where(is_near, place, 0.0)
+    # the disc of the table is wider than the sphere, by what footprints reach
+    share_of_disc = model.marker_radius / (model.marker_radius + 0.5 * max(sensor.divergence) * d)
+    sums = np.zeros((*place.shape, 8))
+    areas, worth = table.areas, table.information
+    _add_visible(place, is_near, visibility.lowest, share_of_disc, (areas, worth), sums)
+    seen, whole = sums[..., 6], sums[..., 7]
+    density = float(np.exp(model.log_count[0])) / (sensor.line_spacing * sensor.pulse_spacing)
+    density = np.where(is_near, density / (d * flat), 0.0)
+    shares = np.where(is_near, seen / np.where(whole > 0.0, whole, 1.0), 0.0)
+    n_points, lost = density * seen, np.where(is_near, _at(table.lost[:, 1], place), 1.0)
+    local, is_known = _local_covariances(density[..., None] * sums[..., :6])
+    is_known &= shares > 1e-6
     factors = np.array(_EFFICIENCY) * np.exp(
         model.log_factors[:3] + model.log_factors[5:] @ model.at[2:]
     )
-    _expect(
-        (np.ascontiguousarray(eyes_site), np.ascontiguousarray(marks.p_site), sights.lowest),
-        (table.distances, table.areas, table.information, table.spread, table.lost[:, 1]),
-        (factors, model.log_factors[3], model.log_factors[4], float(np.exp(model.log_count[0]))),
-        (
-            1.0 / (sensor.line_spacing * sensor.shot_spacing),
-            np.sin(sensor.elevations[0]),
-            np.sin(sensor.elevations[1]),
-            model.marker_radius,
-            0.5 * max(sensor.divergence),
-        ),
-        (shares, n_points, lost, covs),
-    )
-    is_mixed = sights.gaps < _MIXING
+    factors = factors * _at(table.spread, place)
+    factors *= ((d / REFERENCE_DISTANCE) ** model.log_factors[3])[..., None]
+    factors *= (np.maximum(shares, 1e-3) ** model.log_factors[4])[..., None]
+    axes = _axes(v, d, flat) * np.sqrt(factors)[..., None, :]
+    covs = axes @ local @ np.swapaxes(axes, -1, -2)
+    is_mixed = visibility.gaps < _MIXING
     n_points[is_mixed] *= _MIXED_RETURNS
     covs[is_mixed] *= _MIXED_VARIANCE
-    lost[sights.gaps < _TOUCHING] = 1.0
+    covs[~is_known] = np.diag(np.full(3, np.inf))
+    lost[visibility.gaps < _TOUCHING] = 1.0
     return Centres(shares=shares, n_points=n_points, lost=lost, cov_site=covs)
 
 
-def is_found(centres: Centres, n_points_min: float, share_min: float) -> np.ndarray:
-    """Tell which spheres will be found."""
+def centres_ahead(model: CentreModel, distances: Array) -> tuple[Array, Array]:
+    """Return returns and variances towards, left and up at distances on open level ground [m^2]."""
+    n = len(distances)
+    marks = Arrangement.numbered(np.column_stack([distances, np.zeros((n, 2))]))
+    centres = expect_centres(model, np.zeros((1, 3)), marks, Visibility.open(1, n, N_STRIPS))
+    return centres.n_points[0], np.einsum("nii->ni", centres.cov_site[0])
+
+
+def is_found(centres: Centres, n_points_min: float, share_min: float) -> Mask:
+    """Return which spheres will be found."""
     is_shown = (centres.n_points >= n_points_min) & (centres.shares >= share_min)
     return np.asarray(is_shown & (centres.lost <= _LOST_MAX))
 
 
-@compiled
-def _seen(
-    table: Group, place: float, lowest: np.ndarray, share: float, info: Array
-) -> tuple[float, float]:
-    """Fill in the information of the visible part of a disc; return its area and that of all.
+def _at(column: Array, place: Array) -> Array:
+    """Interpolate a column of the table of returns."""
+    i = place.astype(np.intp)
+    t = (place - i).reshape(place.shape + (1,) * (column.ndim - 1))
+    return np.asarray((1.0 - t) * column[i] + t * column[i + 1])
 
-    The disc of the table is wider than the sphere, by what footprints reach: the sphere is a share
-    of it.
+
+def _local_covariances(info: Array) -> tuple[Array, Mask]:
+    """Return covariances towards, left and up from upper triangles, and where there is one.
+
+    A prior of 1 m keeps them finite.
     """
-    areas, information = table[1], table[2]
+    a, b, c, g, h, f = np.moveaxis(info + np.array([1.0, 0.0, 0.0, 1.0, 0.0, 1.0]), -1, 0)
+    xx, xy, xz = g * f - h * h, c * h - b * f, b * h - c * g
+    rows = (xx, xy, xz), (xy, a * f - c * c, b * c - a * h), (xz, b * c - a * h, a * g - b * b)
+    det = a * xx + b * xy + c * xz
+    adjugate = np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
+    return adjugate / np.where(det > 0.0, det, 1.0)[..., None, None], det > 0.0
+
+
+def _axes(v: Array, d: Array, flat: Array) -> Array:
+    """Return the axes towards, left and up of vectors, in columns."""
+    out = np.zeros((*v.shape, 3))
+    out[..., 0] = v / d[..., None]
+    out[..., 0, 1], out[..., 1, 1] = -v[..., 1] / flat, v[..., 0] / flat
+    out[..., :2, 2] = -v[..., 2:] * v[..., :2] / (d * flat)[..., None]
+    out[..., 2, 2] = flat / d
+    return out
+
+
+@compiled
+def _add_visible(
+    places: Array,
+    is_near: Mask,
+    lowest: Column,
+    share_of_disc: Array,
+    table: tuple[Array, Array],
+    sums: Array,
+) -> None:
+    """Add up the visible parts of discs: information (6), area, and the area of the whole disc."""
+    areas, information = table
     n_strips, n_rows = areas.shape[1], areas.shape[2] - 1
-    i = int(place)
-    seen, whole = 0.0, 0.0
-    info[:] = 0.0
-    for c in range(n_strips):
-        cut = lowest[c] if abs(lowest[c]) >= 1.0 else lowest[c] * share
-        rows = 0.5 * (1.0 - cut) * n_rows
-        k = min(int(rows), n_rows - 1)
-        w = rows - k
-        for side in range(2):
-            part = place - i if side == 1 else 1.0 - place + i
-            whole += part * areas[i + side, c, n_rows]
-            lower, upper = part * (1.0 - w), part * w
-            seen += lower * areas[i + side, c, k] + upper * areas[i + side, c, k + 1]
-            for q in range(6):
-                info[q] += lower * information[i + side, c, k, q]
-                info[q] += upper * information[i + side, c, k + 1, q]
-    return seen, whole
-
-
-@compiled
-def _local(info: Array, density: float, out: Array) -> bool:
-    """Fill in the covariance towards, left and up; false where nothing determines it."""
-    a, b, c = density * info[0] + 1.0, density * info[1], density * info[2]
-    g, h, f = density * info[3] + 1.0, density * info[4], density * info[5] + 1.0
-    det = a * (g * f - h * h) - b * (b * f - h * c) + c * (b * h - g * c)
-    if det <= 0.0:
-        return False
-    out[0, 0], out[1, 1], out[2, 2] = g * f - h * h, a * f - c * c, a * g - b * b
-    out[0, 1] = out[1, 0] = c * h - b * f
-    out[0, 2] = out[2, 0] = b * h - c * g
-    out[1, 2] = out[2, 1] = b * c - a * h
-    out /= det
-    return True
-
-
-@compiled
-def _axes(v: Array, d: float, flat: float, out: Array) -> None:
-    """Fill in the axes towards, left and up, in columns."""
-    out[:, 0] = v / d
-    out[0, 1], out[1, 1], out[2, 1] = -v[1] / flat, v[0] / flat, 0.0
-    out[0, 2], out[1, 2] = -v[2] * v[0] / (d * flat), -v[2] * v[1] / (d * flat)
-    out[2, 2] = flat / d
-
-
-@compiled
-def _expect(places: Group, table: Group, factors: Group, constants: Group, out: Group) -> None:
-    """Fill in shares, counts, chances of loss and covariances of every eye and mark."""
-    eyes, marks, lowest = places
-    distances, spread, lost_at = table[0], table[3], table[4]
-    axis_factors, by_distance, by_count, count_factor = factors
-    density, sine_min, sine_max, radius, flare = constants
-    shares, n_points, lost, covs = out
-    first, ratio = np.log(distances[0]), np.log(distances[1] / distances[0])
-    info, local, axes, v = np.empty(6), np.empty((3, 3)), np.empty((3, 3)), np.empty(3)
-    for e in range(len(eyes)):
-        for m in range(len(marks)):
-            covs[e, m] = np.diag(np.full(3, np.inf))
-            v[:] = marks[m] - eyes[e]
-            flat = max(np.hypot(v[0], v[1]), 1e-9)
-            d = np.hypot(flat, v[2])
-            place = (np.log(d) - first) / ratio
-            is_far = place < 0.0 or place >= len(distances) - 1.0
-            if is_far or v[2] < sine_min * d or v[2] > sine_max * d:
+    for e in range(places.shape[0]):
+        for m in range(places.shape[1]):
+            if not is_near[e, m]:
                 continue
-            i = int(place)
-            t = place - i
-            seen, whole = _seen(table, place, lowest[e, m], radius / (radius + flare * d), info)
-            here = count_factor * density / (d * flat)
-            shares[e, m] = seen / whole
-            n_points[e, m] = here * seen
-            lost[e, m] = (1.0 - t) * lost_at[i] + t * lost_at[i + 1]
-            if shares[e, m] <= 1e-6 or not _local(info, here, local):
-                continue
-            extra = (d / REFERENCE_DISTANCE) ** by_distance * max(shares[e, m], 1e-3) ** by_count
-            scale = np.sqrt(axis_factors * extra * ((1.0 - t) * spread[i] + t * spread[i + 1]))
-            _axes(v, d, flat, axes)
-            axes *= scale
-            covs[e, m] = axes @ local @ axes.T
+            i = int(places[e, m])
+            for c in range(n_strips):
+                cut = np.float64(lowest[e, m, c])
+                if abs(cut) < 1.0:
+                    cut *= share_of_disc[e, m]
+                rows = 0.5 * (1.0 - cut) * n_rows
+                k = min(int(rows), n_rows - 1)
+                w = rows - k
+                for side in range(2):
+                    part = places[e, m] - i if side == 1 else 1.0 - places[e, m] + i
+                    lower, upper = part * (1.0 - w), part * w
+                    for q in range(6):
+                        sums[e, m, q] += lower * information[i + side, c, k, q]
+                        sums[e, m, q] += upper * information[i + side, c, k + 1, q]
+                    sums[e, m, 6] += lower * areas[i + side, c, k]
+                    sums[e, m, 6] += upper * areas[i + side, c, k + 1]
+                    sums[e, m, 7] += part * areas[i + side, c, n_rows]

@@ -1,8 +1,8 @@
-"""The model of centres that the fits of one's own surveys tell.
+"""The model of centres from the fits of one's own surveys: hides the regression.
 
-Hides the regression: how the variances that fits had differ from those of the sensor model, axis by
-axis at a reference, and how that changes with distance, count, incidence and reflectivity. What few
-fits leave open stays with the sensor model.
+Variances of fits are compared with those of the sensor model, axis by axis at a reference, and by
+distance, count, incidence and reflectivity. What few fits do not determine stays with the sensor
+model.
 """
 
 from __future__ import annotations
@@ -25,13 +25,11 @@ from spheremark.pipelines.placement.centre_model import (
     TERMS,
     CentreModel,
     Provenance,
-    expect_centres,
+    centres_ahead,
     sensor_model,
 )
-from spheremark.pipelines.placement.plan import Arrangement, Sights
 from spheremark.pipelines.placement.sensor import Sensor
 from spheremark.pipelines.placement.station_covariance import claimed_bias_variance
-from spheremark.pipelines.placement.visibility import N_STRIPS
 
 ROWS_LEAST, STOPS_LEAST = 24, 3
 """Fits and stops below which the sensor model is kept."""
@@ -58,7 +56,7 @@ class FitRows:
     intensities : (n,)
         Mean reflectivity, 0 to 255; NaN where not known.
     variances : (n, 3)
-        Claimed variances towards, left and up, without that of the heading [m^2].
+        Stated variances towards, left and up, without that of the heading [m^2].
     turns : (n,)
         Times of the turns that saw them [s].
     stops : (n,)
@@ -71,7 +69,7 @@ class FitRows:
     fit_method : str
         Fitting method of all of them.
     newest : str
-        When the newest was made, ISO 8601.
+        Time of the newest, ISO 8601.
     """
 
     ranges: Array
@@ -123,8 +121,8 @@ def fitted_model(sensor: Sensor, marker_radius: float, rows: FitRows) -> CentreM
     Bayesian robust regression (Huber's psi) with priors of no difference from the sensor model, 1
     on each factor's logarithm and 0.5 on each power; covariances are of the sandwich form,
     clustered by stop. The variance factors of the stops' positions, pooled with a prior of 30
-    degrees of freedom, scale the variances: centres that contradict each other more than they claim
-    are not as good as they claim. The expected count is that of the surveys for a turn as long.
+    degrees of freedom, scale the variances. The expected count is that of the surveys for a turn of
+    the same time.
     """
     model = sensor_model(sensor, marker_radius)
     usable = _usable(rows, model)
@@ -135,7 +133,7 @@ def fitted_model(sensor: Sensor, marker_radius: float, rows: FitRows) -> CentreM
             f"{STOPS_LEAST} are needed): the bound of the sensor's returns is used."
         )
         return replace(model, provenance=Provenance(source="sensor", note=note))
-    expected, bound = _expected(model, rows.ranges[usable])
+    expected, bound = centres_ahead(model, rows.ranges[usable])
     counts = np.log(rows.n_points[usable] / expected * sensor.turn / rows.turns[usable])
     log_count, sigma_count = _middle(counts, rows.stops[usable])
     data = _data(
@@ -178,18 +176,6 @@ def _usable(rows: FitRows, model: CentreModel) -> Mask:
     is_known = np.isfinite(rows.variances).all(axis=1) & (rows.variances > 0).all(axis=1)
     is_near = (rows.ranges > distances[0]) & (rows.ranges < distances[-2])
     return np.asarray(is_known & is_near & (rows.n_points > 3) & (rows.turns > 0.1))
-
-
-def _expected(model: CentreModel, ranges: Array) -> tuple[Array, Array]:
-    """Return what the sensor model expects at distances: counts, and variances by axis [m^2]."""
-    n = len(ranges)
-    marks = Arrangement(
-        names=tuple(str(i) for i in range(n)),
-        p_site=np.column_stack([ranges, np.zeros(n), np.zeros(n)]),
-    )
-    sights = Sights.open(1, n, N_STRIPS)
-    centres = expect_centres(model, np.zeros((1, 3)), marks, sights)
-    return centres.n_points[0], np.einsum("nii->ni", centres.cov_site[0])
 
 
 def _data(rows: FitRows, usable: Mask, expected: Array, counts: Array, known: float) -> _Data:

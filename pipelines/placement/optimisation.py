@@ -1,8 +1,8 @@
-"""Where to put marks: greedy on information, then exchange on what is really wanted.
+"""Where to put marks: greedy on information, then exchanges on the accuracy of positions.
 
-What a free station knows is a sum over its marks, so that a mark can be added, taken away or
-exchanged in some hundred operations per stop. The study's method has no such sum; its arrangements
-are judged whole.
+The normal equations of a free station are a sum over its marks, so that a mark can be added,
+removed or exchanged in some hundred operations per stop. The study's method has no such sum; its
+arrangements are evaluated whole.
 """
 
 from __future__ import annotations
@@ -13,60 +13,61 @@ from itertools import combinations
 from typing import NamedTuple
 
 import numpy as np
+from scipy.spatial.distance import cdist
 
 from spheremark.pipelines.compilation import compiled
 from spheremark.pipelines.errors import ConfigError, DegenerateGeometryError
 from spheremark.pipelines.estimation.linear_algebra import invert
-from spheremark.pipelines.model import Array, Index
+from spheremark.pipelines.model import Array, Index, Mask
 from spheremark.pipelines.placement.bounds import least_sigmas, widest_sigma
 from spheremark.pipelines.placement.candidates import Candidates
 from spheremark.pipelines.placement.centre_model import CentreModel
-from spheremark.pipelines.placement.evaluation import check_sizes, evaluate, sighting_of
+from spheremark.pipelines.placement.evaluation import check_sizes, evaluate, predict_observables
 from spheremark.pipelines.placement.plan import Arrangement, Evaluation, Requirement, Site, Stops
 from spheremark.pipelines.placement.station_covariance import (
     LOOSE2,
     Information,
-    Sighting,
+    Observables,
     information,
     predict_positions,
     shared_variance,
 )
-from spheremark.pipelines.placement.visibility import look
+from spheremark.pipelines.placement.visibility import find_visibility
 
 MARKS_MOST = 40
 """Marks that are placed at most."""
 
 _LOST = 1e3  # [m] counts for a stop without a position: worse than any that has one
 _LOOSE_PRIOR = np.array([3.0, 3.0, 3.0, 10.0, 10.0, 10.0])  # [rad, m] before any mark is seen
-_SURE = 1.96  # sigmas within which an error of any shape lies with 95 %: 3-D sigma on one axis
-_ROUNDS = 30  # of exchanges; four to eight settle
-_STARTS, _STARTS_LEAST = 16, 2
+_Z_95 = 1.96  # sigmas within which an error of any shape lies with 95 %: 3-D sigma on one axis
+_ROUNDS_MAX = 30  # of exchanges; four to eight settle
+_STARTS_MAX, _STARTS_MIN = 16, 2
 _MARKS_STARTED = 96  # in all starts together: many marks leave little to chance
-_STARTS_WHOLE = 4  # of whole judgements
-_DRAWN, _DRAWN_KEPT = 1500, 40  # arrangements at random that these begin with, and judge in full
+_STARTS_PAPER = 4  # where arrangements are evaluated whole
+_DRAWN, _DRAWN_KEPT = 1500, 40  # random arrangements that these begin with, and evaluate in full
 _POWER = 12.0  # of the mean over stops that is as good as their largest, and smoother
-_SHAKEN = 0.4  # share of marks that such a start has elsewhere
+_SHARE_MOVED = 0.4  # share of marks that a later start has elsewhere
 _FEW = 10  # marks that are always searched in full
-_SLACK, _SLACK_WHOLE = 1.15, 2.0  # times the tolerance that a short search keeps: more helps none
-_WORSE = 1.3  # than now, at most, while a loss would break what is wanted
-_TRIED = 12  # candidates that are judged in full for each mark, the most promising first
-_SCREENED = 800  # places that whole judgements try in a round, for all marks together
+_SLACK, _SLACK_PAPER = 1.15, 2.0  # times the tolerance that a quick search keeps: more is hopeless
+_WORSE_MOST = 1.3  # than now, at most, while the loss of a mark would break the tolerance
+_TRIED_MAX = 12  # candidates that are evaluated in full for each mark, the most promising first
+_SCREENED = 800  # candidates of a round by whole evaluation, for all marks together
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Goal:
-    """What is to be found.
+    """Number of marks, or the accuracy that decides it.
 
     Attributes
     ----------
     n_marks : int or None
-        Number of marks; none asks for the least number that keeps the tolerance.
+        Number of marks; by default the least number that keeps the tolerance.
     probability : float
-        With which the tolerance shall be kept at every stop.
+        Required probability that the tolerance is kept at every stop.
     is_robust : bool
-        Whether it shall be kept after the loss of any one mark too; only for three marks or more.
+        Whether this shall hold after the loss of any one mark too; only for three marks or more.
     most : int
-        Marks that there are at most when the least number is asked for.
+        Largest number of marks when the least number is searched.
     """
 
     n_marks: int | None = None
@@ -77,7 +78,7 @@ class Goal:
     def __post_init__(self) -> None:
         if self.n_marks is not None and not 2 <= self.n_marks <= MARKS_MOST:
             raise ConfigError(
-                f"{self.n_marks} marks were asked for; from 2 to {MARKS_MOST} can be placed."
+                f"{self.n_marks} marks are requested; from 2 to {MARKS_MOST} can be placed."
             )
         if not 2 <= self.most <= MARKS_MOST:
             raise ConfigError(f"At most {self.most} marks; it must be from 2 to {MARKS_MOST}.")
@@ -92,18 +93,17 @@ class Optimum:
     Attributes
     ----------
     evaluation : Evaluation
-        What they promise; its marks are the answer.
+        Its marks are the best places.
     ground : (k,)
         Height of the ground under each mark [m].
     worst_after_loss : float
         Largest 3-D sigma over all stops after the loss of any one mark; infinite where a stop
         would have no position [m].
     is_kept : bool
-        Whether the tolerance is kept at every stop with the probability that was asked for, after
-        a loss too if that was asked for.
+        Whether the goal is reached.
     log_det, log_det_bound : float
-        Information gained, as the sum over stops of the logarithm of its determinant, and what no
-        arrangement of as many marks can exceed; NaN for a method that has no such sum.
+        Information gained, as the sum over stops of the logarithm of its determinant, and its upper
+        bound over all arrangements of as many marks; NaN for a method that has no such sum.
     n_candidates : int
         Places that were compared.
     n_exchanges : int
@@ -131,7 +131,7 @@ class Proposal:
     ground : float
         Height of the ground under it [m].
     before, after : Evaluation
-        What the arrangement promises without and with it; its name is the last.
+        The arrangement without and with it; it is the last mark.
     """
 
     p_site: Array
@@ -140,32 +140,43 @@ class Proposal:
     after: Evaluation
 
 
-class _Task(NamedTuple):
-    """Candidates as the stops see them.
+class _Problem(NamedTuple):
+    """All candidates as observed from all stops.
 
     Attributes
     ----------
-    sighting : Sighting
-        All candidates, marks that stand already behind them.
+    site, stops, candidates, model, requirement
+        As given to ``optimise``.
+    observables : Observables
+        All candidates, marks that stand already after them.
     added : Information
-        What each adds.
+        Contribution of each to the normal equations.
     prior : (6, 6)
-        What gravity tells.
+        Information of the AHRS.
     shared2 : tuple of float
-        Variances of what all ranges are too long, and of what all centres are too high [m^2].
+        Variances of the common errors of all ranges and of all heights of centres [m^2].
     near : (c, c)
         Which candidates are too near to each other.
-    wish : Requirement
-        Tolerance and method.
+    power : float
+        Of the mean over stops that stands for their largest sigma.
     """
 
-    sighting: Sighting
+    site: Site
+    stops: Stops
+    candidates: Candidates
+    model: CentreModel
+    requirement: Requirement
+    observables: Observables
     added: Information
     prior: Array
     shared2: tuple[float, float]
-    near: np.ndarray
-    wish: Requirement
+    near: Mask
     power: float = np.inf
+
+    @property
+    def is_paper(self) -> bool:
+        """Whether arrangements have to be evaluated whole."""
+        return self.requirement.method == "paper"
 
 
 def optimise(  # noqa: PLR0913  all that a plan is made of
@@ -173,7 +184,7 @@ def optimise(  # noqa: PLR0913  all that a plan is made of
     stops: Stops,
     candidates: Candidates,
     model: CentreModel,
-    wish: Requirement,
+    requirement: Requirement,
     goal: Goal,
     rng: np.random.Generator,
 ) -> Optimum:
@@ -184,69 +195,63 @@ def optimise(  # noqa: PLR0913  all that a plan is made of
     site : Site
         Ground and what hides marks.
     stops : Stops
-        Places of the LiDAR; all of them count at once.
+        Positions of the LiDAR; all of them count at once.
     candidates : Candidates
         Where a mark may stand.
     model : CentreModel
-        How well centres will be known.
-    wish : Requirement
+        Accuracy of centres.
+    requirement : Requirement
         Tolerance and method.
     goal : Goal
-        Number of marks, or what shall be kept.
+        Number of marks, or the accuracy that decides it.
     rng : numpy.random.Generator
-        Shakes the later starts.
+        Perturbs the later starts.
 
     Returns
     -------
     Optimum
-        Marks and what they promise.
+        Marks and their evaluation.
 
     Raises
     ------
     DegenerateGeometryError
-        If no number of marks keeps the tolerance, with the bound that nothing exceeds.
+        If no number of marks keeps the tolerance, with the bound that shows it.
 
     Notes
     -----
     Greedy on the regularised logarithm of the determinant of the information, summed over stops,
     which is monotone and submodular: at least 63 % of the greatest gain (Nemhauser, Wolsey, Fisher,
-    1978), and the bound is their sum of the largest gains that are left. Then marks are exchanged
-    one at a time while that lowers, in this order, what a loss would break, the largest 3-D sigma
+    1978); the bound adds the largest remaining gains. Then marks are exchanged one at a time while
+    that lowers, in this order, the excess over the tolerance after a loss, the largest 3-D sigma
     over all stops, and their mean. Cost of a round grows with marks times candidates times stops.
     """
     check_sizes(len(stops.names), goal.n_marks or goal.most)
-    task = _task(site, stops, candidates, model, wish)
-    given = site, stops, candidates, model, task
-
-    def tried(k: int) -> Optimum:
-        return _optimum(*given, _best(task, k, goal, rng), goal)
-
+    problem = _problem(site, stops, candidates, model, requirement)
     if goal.n_marks is not None:
-        return tried(goal.n_marks)
-    least = _least(task, stops, goal)
-
-    def is_kept(chosen: Index, slack: float) -> bool:
-        wider = replace(wish, tolerance=slack * wish.tolerance)
-        marks = Arrangement.numbered(candidates.p_site[chosen])
-        return _keeps(site, stops, marks, model, wider, goal)
-
-    slack = _SLACK_WHOLE if wish.method == "paper" else _SLACK
-    most = _glance(task, goal.most, goal, rng)
-    if most is not None and not is_kept(most, 1.0):
-        is_near = is_kept(most, slack)
-        found = tried(goal.most) if is_near else _optimum(*given, (most, 0), goal)
+        return _optimum(problem, _search(problem, goal.n_marks, goal, rng), goal)
+    least = _least(problem, goal)
+    slack = _SLACK_PAPER if problem.is_paper else _SLACK
+    most = _quick_search(problem, goal.most, goal, rng)
+    if most is not None and not _keeps(problem, most, goal):
+        is_near = _keeps(problem, most, goal, slack)
+        best = _search(problem, goal.most, goal, rng) if is_near else (most, 0)
+        found = _optimum(problem, best, goal)
         if not found.is_kept:
-            raise DegenerateGeometryError(_impossible(task, stops, found, goal))
+            raise DegenerateGeometryError(_impossible(problem, found, goal))
     for k in range(least, goal.most):
-        some = _glance(task, k, goal, rng)
-        if some is not None and is_kept(some, 1.0):  # a better sigma may have a worse shape
-            found = tried(k)
-            return found if found.is_kept else _optimum(*given, (some, 0), goal)
-        if (some is None or is_kept(some, slack)) and (found := tried(k)).is_kept:
-            return found
-    if (found := tried(goal.most)).is_kept:
+        some = _quick_search(problem, k, goal, rng)
+        if some is not None and _keeps(problem, some, goal):
+            found = _optimum(problem, _search(problem, k, goal, rng), goal)
+            # a smaller sigma may come with an error ellipsoid of worse shape
+            return found if found.is_kept else _optimum(problem, (some, 0), goal)
+        if some is None or _keeps(problem, some, goal, slack):
+            found = _optimum(problem, _search(problem, k, goal, rng), goal)
+            if found.is_kept:
+                return found
+    found = _optimum(problem, _search(problem, goal.most, goal, rng), goal)
+    if found.is_kept:
         return found
-    raise DegenerateGeometryError(_impossible(task, stops, found, goal))
+    raise DegenerateGeometryError(_impossible(problem, found, goal))
 
 
 def propose_mark(
@@ -255,32 +260,31 @@ def propose_mark(
     present: Arrangement,
     candidates: Candidates,
     model: CentreModel,
-    wish: Requirement,
+    requirement: Requirement,
 ) -> Proposal:
-    """Name the one more mark that would help most.
+    """Return the one more mark with the least power mean of 3-D sigmas over all stops.
 
-    It has the least power mean of 3-D sigmas over all stops: the worst count most, and where no
-    place helps them, the next ones do.
+    The worst stops count most, and where no place helps them, the next ones do.
 
     Parameters
     ----------
     site : Site
         Ground and what hides marks.
     stops : Stops
-        Places of the LiDAR.
+        Positions of the LiDAR.
     present : Arrangement
         Marks that stand already.
     candidates : Candidates
         Where one more may stand.
     model : CentreModel
-        How well centres will be known.
-    wish : Requirement
+        Accuracy of centres.
+    requirement : Requirement
         Tolerance and method.
 
     Returns
     -------
     Proposal
-        Its place, and what it changes.
+        Its place, and the evaluations without and with it.
 
     Raises
     ------
@@ -288,19 +292,18 @@ def propose_mark(
         If no candidate is far enough from the marks that stand.
     """
     gaps = np.linalg.norm(candidates.p_site[:, None] - present.p_site[None], axis=2)
-    free = gaps.min(axis=1, initial=np.inf) >= candidates.apart
-    if not free.any():
+    places = np.flatnonzero(gaps.min(axis=1, initial=np.inf) >= candidates.apart)
+    n = len(places)
+    if not n:
         raise DegenerateGeometryError(
             f"No place for one more mark is {candidates.apart:g} m from those that stand."
         )
-    places = np.flatnonzero(free)
-    n = len(places)
     p_site = np.concatenate([candidates.p_site[places], present.p_site])
     ground = np.concatenate([candidates.ground[places], np.zeros(len(present.names))])
-    all_of_them = Candidates(p_site=p_site, ground=ground, apart=1e-6)
-    task = _task(site, stops, all_of_them, model, wish)._replace(power=_POWER)
+    joined = Candidates(p_site=p_site, ground=ground, apart=1e-6)
+    problem = _problem(site, stops, joined, model, requirement)._replace(power=_POWER)
     fixed = np.arange(n, n + len(present.names))
-    scores = [_score(task, np.append(fixed, c)) for c in range(n)]
+    scores = [_score(problem, np.append(fixed, c)) for c in range(n)]
     best = min(range(n), key=scores.__getitem__)
     name = next(f"P{i:02d}" for i in range(1, 1000) if f"P{i:02d}" not in present.names)
     wider = Arrangement(
@@ -309,21 +312,20 @@ def propose_mark(
     return Proposal(
         p_site=p_site[best].copy(),
         ground=float(ground[best]),
-        before=evaluate(site, stops, present, model, wish),
-        after=evaluate(site, stops, wider, model, wish),
+        before=evaluate(site, stops, present, model, requirement),
+        after=evaluate(site, stops, wider, model, requirement),
     )
 
 
 def draw_arrangement(candidates: Candidates, n_marks: int, rng: np.random.Generator) -> Arrangement:
     """Return marks at random among the places where they may stand."""
-    chosen: list[int] = []
-    for c in rng.permutation(len(candidates.p_site)):
-        gaps = np.linalg.norm(candidates.p_site[chosen] - candidates.p_site[c], axis=1)
-        if not chosen or gaps.min() >= candidates.apart:
-            chosen.append(int(c))
-        if len(chosen) == n_marks:
-            return Arrangement.numbered(candidates.p_site[chosen])
-    raise DegenerateGeometryError(_no_room(candidates, n_marks, len(chosen)))
+    chosen = _draw(_near(candidates), n_marks, rng)
+    if len(chosen) < n_marks:
+        raise DegenerateGeometryError(
+            f"There is room for {len(chosen)} of {n_marks} marks {candidates.apart:g} m apart on "
+            f"{len(candidates.p_site)} places; allow more places or marks nearer to each other."
+        )
+    return Arrangement.numbered(candidates.p_site[chosen])
 
 
 def best_without_search(  # noqa: PLR0913  all that a plan is made of
@@ -331,181 +333,191 @@ def best_without_search(  # noqa: PLR0913  all that a plan is made of
     stops: Stops,
     candidates: Candidates,
     model: CentreModel,
-    wish: Requirement,
+    requirement: Requirement,
     n_marks: int,
     drawn: tuple[int, np.random.Generator] | None,
 ) -> float:
-    """Return the least 3-D sigma at the worst stop that chance finds, or of all arrangements.
+    """Return the least 3-D sigma at the worst stop of random arrangements, or of all there are.
 
     Parameters
     ----------
     site : Site
         Ground and what hides marks.
     stops : Stops
-        Places of the LiDAR.
+        Positions of the LiDAR.
     candidates : Candidates
         Where a mark may stand.
     model : CentreModel
-        How well centres will be known.
-    wish : Requirement
+        Accuracy of centres.
+    requirement : Requirement
         Tolerance and method.
     n_marks : int
         Number of marks.
     drawn : tuple of int and numpy.random.Generator, optional
-        How many arrangements are drawn; without it all that there are are judged.
+        How many arrangements are drawn; by default every arrangement is evaluated.
 
     Returns
     -------
     float
-        What an optimised arrangement is measured by [m].
+        Reference for optimised arrangements [m].
     """
-    task = _task(site, stops, candidates, model, wish)
+    problem = _problem(site, stops, candidates, model, requirement)
+    near = problem.near
     some: Iterable[Index]
     if drawn is not None:
-        some = (_drawn(task, n_marks, drawn[1]) for _ in range(drawn[0]))
+        some = (_draw(near, n_marks, drawn[1]) for _ in range(drawn[0]))
     else:
-        every = combinations(range(len(task.near)), n_marks)
-        some = (c for c in map(np.array, every) if task.near[np.ix_(c, c)].sum() == n_marks)
-    return min(_score(task, chosen)[0] for chosen in some)
+        every = map(np.array, combinations(range(len(near)), n_marks))
+        some = (c for c in every if near[np.ix_(c, c)].sum() == n_marks)
+    return min(_score(problem, chosen)[0] for chosen in some)
 
 
-def _no_room(candidates: Candidates, wanted: int, found: int) -> str:
-    """Say that there are too few places."""
-    return (
-        f"There is room for {found} of {wanted} marks {candidates.apart:g} m apart on "
-        f"{len(candidates.p_site)} places; allow more places or marks nearer to each other."
-    )
-
-
-def _task(
-    site: Site, stops: Stops, candidates: Candidates, model: CentreModel, wish: Requirement
-) -> _Task:
-    """Look at every candidate from every stop."""
+def _problem(
+    site: Site, stops: Stops, candidates: Candidates, model: CentreModel, requirement: Requirement
+) -> _Problem:
+    """Predict all candidates from all stops."""
     marks = candidates.arrangement
-    alone = look(site, stops.p_site, marks)
-    _, sighting = sighting_of(stops.p_site, marks, model, wish, alone)
-    gaps = np.linalg.norm(candidates.p_site[:, None] - candidates.p_site[None], axis=2)
-    prior = np.zeros((6, 6))
-    prior[0, 0] = prior[1, 1] = wish.sigma_levelling**-2
-    return _Task(
-        sighting=sighting,
-        added=information(sighting, wish),
-        prior=prior,
+    visibility = find_visibility(site, stops.p_site, marks)
+    _, observables = predict_observables(stops.p_site, marks, model, requirement, visibility)
+    return _Problem(
+        site=site,
+        stops=stops,
+        candidates=candidates,
+        model=model,
+        requirement=requirement,
+        observables=observables,
+        added=information(observables, requirement),
+        prior=np.diag([requirement.sigma_levelling**-2.0] * 2 + [0.0] * 4),
         shared2=(
             shared_variance(model.sensor.sigma_range_bias),
-            wish.resection.sigma_height**2,
+            requirement.resection.sigma_height**2,
         ),
-        near=gaps < candidates.apart,
-        wish=wish,
+        near=_near(candidates),
     )
 
 
-def _sums(task: _Task, chosen: Index) -> tuple[Array, Array, Array]:
-    """Return what stops know with some candidates: normal matrix, spread and pull."""
-    normal, spread, pull = (part[:, chosen].sum(axis=1) for part in task.added)
-    return normal + task.prior, spread + task.prior, pull
+def _near(candidates: Candidates) -> Mask:
+    """Return which candidates are too near to each other, (c, c)."""
+    return np.asarray(cdist(candidates.p_site, candidates.p_site) < candidates.apart)
 
 
-def _best(task: _Task, k: int, goal: Goal, rng: np.random.Generator) -> tuple[Index, int]:
-    """Return the best places of k marks that several starts led to, and exchanges made.
+def _sums(problem: _Problem, chosen: Index) -> tuple[Array, Array, Array]:
+    """Return the normal equations of all stops with some candidates."""
+    normal, cov_rhs, bias_rhs = (part[:, chosen].sum(axis=1) for part in problem.added)
+    return normal + problem.prior, cov_rhs + problem.prior, bias_rhs
 
-    The first start is greedy, or the best of many at random where information says little; the
-    second goes on from it with places at random, the others shake what is best so far (iterated
-    local search: Lourenco, Martin, Stuetzle, 2003). Each goes down on a high power mean over the
-    stops, which has fewer dead ends than their largest, then on that.
+
+def _search(problem: _Problem, k: int, goal: Goal, rng: np.random.Generator) -> tuple[Index, int]:
+    """Return the best k places of several starts, and the number of exchanges.
+
+    The first start is greedy, or the best of many random ones where information is no sum; the
+    second is random, the others perturb the best so far (iterated local search: Lourenco, Martin,
+    Stuetzle, 2003). Each descends on a high power mean over the stops, which has fewer local
+    minima than their largest, then on that.
     """
-    smooth = task._replace(power=_POWER)
-    best, score, n_exchanges = _greedy(task, k), (np.inf, np.inf, np.inf), 0
-    is_whole = task.wish.method == "paper"
-    if is_whole:
-        best = _best_drawn(task, best, goal, rng)
-    n_starts = max(_STARTS_LEAST, min(_STARTS, _MARKS_STARTED // k))
-    for i in range(_STARTS_WHOLE if is_whole else n_starts):
-        start = best if i == 0 else _shaken(task, best, 1.0 if i == 1 else _SHAKEN, rng)
+    smooth = problem._replace(power=_POWER)
+    best, score, n_exchanges = _greedy(problem, k), (np.inf, np.inf, np.inf), 0
+    n_starts = max(_STARTS_MIN, min(_STARTS_MAX, _MARKS_STARTED // k))
+    if problem.is_paper:
+        best, n_starts = _best_drawn(problem, best, goal, rng), _STARTS_PAPER
+    for i in range(n_starts):
+        start = best if i == 0 else _perturbed(problem, best, 1.0 if i == 1 else _SHARE_MOVED, rng)
         found, n = _exchanged(smooth, start, goal, rng)
-        found, m = _exchanged(task, found, goal, rng)
+        found, m = _exchanged(problem, found, goal, rng)
         n_exchanges += n + m
-        if (other := _wanted(task, found, goal)) < score:
+        if (other := _objective(problem, found, goal)) < score:
             best, score = found, other
     return best, n_exchanges
 
 
-def _best_drawn(task: _Task, other: Index, goal: Goal, rng: np.random.Generator) -> Index:
-    """Return the best of many arrangements at random, and of another with as many marks."""
-    drawn = [other, *(_drawn(task, len(other), rng) for _ in range(_DRAWN))]
+def _quick_search(problem: _Problem, k: int, goal: Goal, rng: np.random.Generator) -> Index | None:
+    """Return k places of a short search; none without room, and for few marks of a free station."""
+    if k <= _FEW and not problem.is_paper:
+        return None
+    try:
+        chosen = _greedy(problem, k)
+    except DegenerateGeometryError:
+        return None
+    if problem.is_paper:
+        return _best_drawn(problem, chosen, goal, rng)
+    quick = replace(goal, is_robust=False)  # evaluating losses takes ten times as long
+    return _exchanged(problem._replace(power=_POWER), chosen, quick, rng)[0]
+
+
+def _best_drawn(problem: _Problem, other: Index, goal: Goal, rng: np.random.Generator) -> Index:
+    """Return the best of many random arrangements and of another with as many marks."""
+    drawn = [other, *(_draw(problem.near, len(other), rng) for _ in range(_DRAWN))]
     drawn = [chosen for chosen in drawn if len(chosen) == len(other)]
-    drawn.sort(key=lambda chosen: _score(task, chosen))
-    return min(drawn[:_DRAWN_KEPT], key=lambda chosen: _wanted(task, chosen, goal))
+    drawn.sort(key=lambda chosen: _score(problem, chosen))
+    return min(drawn[:_DRAWN_KEPT], key=lambda chosen: _objective(problem, chosen, goal))
 
 
-def _drawn(task: _Task, k: int, rng: np.random.Generator) -> Index:
-    """Return k candidates at random that are not too near to each other; fewer without room."""
+def _draw(near: Mask, k: int, rng: np.random.Generator) -> Index:
+    """Return k random candidates that are not too near to each other; fewer without room."""
     chosen: list[int] = []
-    for c in rng.permutation(len(task.near)):
+    for c in rng.permutation(len(near)):
         if len(chosen) == k:
             break
-        if not task.near[c, chosen].any():
+        if not near[c, chosen].any():
             chosen.append(int(c))
     return np.array(chosen, dtype=np.intp)
 
 
-def _greedy(task: _Task, k: int) -> Index:
+def _greedy(problem: _Problem, k: int) -> Index:
     """Return k candidates, each the one that adds most information to those before it."""
     chosen: list[int] = []
-    allowed = task.sighting.is_seen.any(axis=0)
-    normal = np.tile(task.prior + np.diag(_LOOSE_PRIOR**-2.0), (len(task.sighting.eyes_site), 1, 1))
+    allowed = problem.observables.is_seen.any(axis=0)
+    added = problem.added.normal
+    normal = np.tile(problem.prior + np.diag(_LOOSE_PRIOR**-2.0), (len(added), 1, 1))
     for _ in range(k):
         if not allowed.any():
             raise DegenerateGeometryError(
                 f"There is room for {len(chosen)} of {k} marks that a stop can see; allow more "
                 "places, or marks nearer to each other."
             )
-        gains = np.where(allowed, _gains(normal, task.added.normal), -np.inf)
-        best = int(np.argmax(gains))
+        best = int(np.argmax(np.where(allowed, _gains(normal, added), -np.inf)))
         chosen.append(best)
-        normal += task.added.normal[:, best]
-        allowed &= ~task.near[best]
+        normal += added[:, best]
+        allowed &= ~problem.near[best]
     return np.array(chosen, dtype=np.intp)
 
 
-def _bound(task: _Task, chosen: Index) -> tuple[float, float]:
-    """Return the information gained, and what no arrangement of as many marks can exceed."""
-    start = task.prior + np.diag(_LOOSE_PRIOR**-2.0)
-    normal = start + task.added.normal[:, chosen].sum(axis=1)
+def _bound(problem: _Problem, chosen: Index) -> tuple[float, float]:
+    """Return the information gained, and its upper bound over arrangements of as many marks."""
+    start, added = problem.prior + np.diag(_LOOSE_PRIOR**-2.0), problem.added.normal
+    normal = start + added[:, chosen].sum(axis=1)
     gained = float((np.linalg.slogdet(normal)[1] - np.linalg.slogdet(start)[1]).sum())
-    gains = np.sort(_gains(normal, task.added.normal))[::-1]
-    nothing = np.tile(start, (len(normal), 1, 1))
-    singles = np.sort(_gains(nothing, task.added.normal))[::-1]
-    return gained, min(
-        gained + float(gains[: len(chosen)].sum()), float(singles[: len(chosen)].sum())
+    further, singles = (
+        float(np.sort(_gains(before, added))[::-1][: len(chosen)].sum())
+        for before in (normal, np.tile(start, (len(normal), 1, 1)))
     )
+    return gained, min(gained + further, singles)
 
 
-def _shaken(task: _Task, chosen: Index, share: float, rng: np.random.Generator) -> Index:
+def _perturbed(problem: _Problem, chosen: Index, share: float, rng: np.random.Generator) -> Index:
     """Return an arrangement of which a share of the marks stands elsewhere."""
     out = chosen.copy()
     for i in rng.choice(len(out), max(1, round(share * len(out))), replace=False):
-        others = np.delete(out, i)
-        free = np.flatnonzero(~task.near[others].any(axis=0))
+        free = np.flatnonzero(~problem.near[np.delete(out, i)].any(axis=0))
         out[i] = rng.choice(free) if len(free) else out[i]
     return out
 
 
 def _exchanged(
-    task: _Task, start: Index, goal: Goal, rng: np.random.Generator
+    problem: _Problem, start: Index, goal: Goal, rng: np.random.Generator
 ) -> tuple[Index, int]:
-    """Exchange marks one at a time while that improves what is wanted."""
+    """Exchange marks one at a time while that improves the objective."""
     chosen, n_exchanges = start.copy(), 0
-    score = _wanted(task, chosen, goal)
-    for _ in range(_ROUNDS):
+    score = _objective(problem, chosen, goal)
+    for _ in range(_ROUNDS_MAX):
         is_better = False
         for i in rng.permutation(len(chosen)):
-            for c in _promising(task, chosen, int(i), score, rng):
-                trial = chosen.copy()
-                trial[i] = c
-                found = _wanted(task, trial, goal, score[0])
+            for c in _promising(problem, chosen, int(i), score, rng):
+                changed = chosen.copy()
+                changed[i] = c
+                found = _objective(problem, changed, goal, score[0])
                 if found < score:
-                    chosen, score, is_better = trial, found, True
+                    chosen, score, is_better = changed, found, True
                     n_exchanges += 1
                     break
         if not is_better:
@@ -514,111 +526,94 @@ def _exchanged(
 
 
 def _promising(
-    task: _Task,
+    problem: _Problem,
     chosen: Index,
     i: int,
     score: tuple[float, float, float],
     rng: np.random.Generator,
 ) -> Index:
-    """Return the candidates that would be better in place i than what stands there, best first."""
+    """Return the candidates that would be better as mark i than the present one, best first."""
     others = np.delete(chosen, i)
-    free = np.array(~task.near[others].any(axis=0))
+    free = np.array(~problem.near[others].any(axis=0))
     free[chosen] = False
-    if task.wish.method == "paper":
-        places = np.flatnonzero(free)
+    places = np.flatnonzero(free)
+    if problem.is_paper:
         places = rng.permutation(places)[: max(_SCREENED // len(chosen), 30)]
-        worsts = np.array([_score(task, np.append(others, c)) for c in places]).reshape(-1, 2)
+        scores = np.array([_score(problem, np.append(others, c)) for c in places]).reshape(-1, 2)
     else:
-        places = np.flatnonzero(free)
-        worsts = np.empty((len(places), 2))
-        limit = score[1] if score[0] == 0.0 else _WORSE * score[1]
-        stops = np.argsort(-_sigmas(task, chosen))
-        _judge(
-            _sums(task, others),
-            tuple(task.added),
-            task.shared2,
-            places,
-            stops,
-            (limit, task.power),
-            worsts,
-        )
-    order = np.lexsort((worsts[:, 1], worsts[:, 0]))
+        scores = np.empty((len(places), 2))
+        limit = score[1] if score[0] == 0.0 else _WORSE_MOST * score[1]
+        stops = np.argsort(-_sigmas(problem, chosen))
+        sums, rule = _sums(problem, others), (limit, problem.power)
+        _score_each(sums, tuple(problem.added), problem.shared2, places, stops, rule, scores)
+    order = np.lexsort((scores[:, 1], scores[:, 0]))
     if score[0] == 0.0:
-        order = order[[tuple(worsts[o]) < score[1:] for o in order]]
-    return places[order[:_TRIED]]
+        order = order[[tuple(scores[o]) < score[1:] for o in order]]
+    return places[order[:_TRIED_MAX]]
 
 
-def _wanted(
-    task: _Task, chosen: Index, goal: Goal, most: float = np.inf
+def _objective(
+    problem: _Problem, chosen: Index, goal: Goal, most: float = np.inf
 ) -> tuple[float, float, float]:
-    """Return what an arrangement is judged by, the less the better.
+    """Return the objective, the less the better.
 
-    By how much the loss of a mark would break the tolerance, looked at until that is more than some
-    length, the largest sigma over all stops, and their mean [m].
+    The excess over the tolerance after the loss of a mark, evaluated up to some length, the largest
+    sigma over all stops, and their mean [m].
     """
     if not goal.is_robust or len(chosen) < 3:
-        return 0.0, *_score(task, chosen)
-    sure = task.wish.tolerance / _SURE
-    broken = max(_after_loss(task, chosen, most + sure) - sure, 0.0)
-    return (broken, np.inf, np.inf) if broken > most else (broken, *_score(task, chosen))
+        return 0.0, *_score(problem, chosen)
+    sigma = problem.requirement.tolerance / _Z_95
+    excess = max(_after_loss(problem, chosen, most + sigma) - sigma, 0.0)
+    return (excess, np.inf, np.inf) if excess > most else (excess, *_score(problem, chosen))
 
 
-def _sigmas(task: _Task, chosen: Index) -> Array:
+def _sigmas(problem: _Problem, chosen: Index) -> Array:
     """Return the 3-D sigma at each stop; large where there is no position [m]."""
-    if task.wish.method == "paper":
-        some = task.sighting._replace(
-            marks_site=task.sighting.marks_site[chosen],
-            cov_centres=task.sighting.cov_centres[:, chosen],
-            is_seen=task.sighting.is_seen[:, chosen],
-        )
-        variances = np.trace(
-            predict_positions(some, task.wish).cov_motion[:, 3:, 3:], axis1=1, axis2=2
-        )
-        return np.asarray(np.minimum(np.sqrt(variances), _LOST), dtype=np.float64)
-    return np.asarray(_sigmas_of(_sums(task, chosen), task.shared2), dtype=np.float64)
+    if not problem.is_paper:
+        return np.asarray(_sigma_each(_sums(problem, chosen), problem.shared2), dtype=np.float64)
+    every = problem.observables
+    some = every._replace(
+        marks_site=every.marks_site[chosen],
+        cov_centres=every.cov_centres[:, chosen],
+        is_seen=every.is_seen[:, chosen],
+    )
+    cov = predict_positions(some, problem.requirement).cov_motion[:, 3:, 3:]
+    return np.minimum(np.sqrt(np.trace(cov, axis1=1, axis2=2)), _LOST)
 
 
-def _score(task: _Task, chosen: Index) -> tuple[float, float]:
+def _score(problem: _Problem, chosen: Index) -> tuple[float, float]:
     """Return the largest sigma over all stops, or their power mean, and their mean [m]."""
-    sigmas = _sigmas(task, chosen)
+    sigmas = _sigmas(problem, chosen)
     worst = float(sigmas.max())
-    if np.isfinite(task.power):
-        worst *= float(np.mean((sigmas / worst) ** task.power)) ** (1.0 / task.power)
+    if np.isfinite(problem.power):
+        worst *= float(np.mean((sigmas / worst) ** problem.power)) ** (1.0 / problem.power)
     return worst, float(sigmas.mean())
 
 
-def _after_loss(task: _Task, chosen: Index, most: float = np.inf) -> float:
+def _after_loss(problem: _Problem, chosen: Index, most: float = np.inf) -> float:
     """Return the largest sigma over all stops after the loss of any one mark, or one above most."""
     worst = 0.0
     for i in range(len(chosen)):
-        worst = max(worst, float(_sigmas(task, np.delete(chosen, i)).max()))
+        worst = max(worst, float(_sigmas(problem, np.delete(chosen, i)).max()))
         if worst > most:
             break
     return worst
 
 
-def _optimum(  # noqa: PLR0913  all that an answer is made of
-    site: Site,
-    stops: Stops,
-    candidates: Candidates,
-    model: CentreModel,
-    task: _Task,
-    found: tuple[Index, int],
-    goal: Goal,
-) -> Optimum:
-    """Assemble the answer; marks are named by azimuth about the middle of the stops."""
+def _optimum(problem: _Problem, found: tuple[Index, int], goal: Goal) -> Optimum:
+    """Assemble the result; marks are named by azimuth about the middle of the stops."""
+    site, stops, candidates, model, requirement, *_ = problem
     chosen, n_exchanges = found
     off = candidates.p_site[chosen, :2] - stops.p_site[:, :2].mean(axis=0)
     chosen = chosen[np.argsort(np.arctan2(off[:, 1], off[:, 0]))]
     marks = Arrangement.numbered(candidates.p_site[chosen])
-    promised = evaluate(site, stops, marks, model, task.wish)
-    after = _after_loss(task, chosen) if len(chosen) > 2 else np.inf
-    gained, bound = (np.nan, np.nan) if task.wish.method == "paper" else _bound(task, chosen)
+    after = _after_loss(problem, chosen) if len(chosen) > 2 else np.inf
+    gained, bound = (np.nan, np.nan) if problem.is_paper else _bound(problem, chosen)
     return Optimum(
-        evaluation=promised,
+        evaluation=evaluate(site, stops, marks, model, requirement),
         ground=candidates.ground[chosen].copy(),
         worst_after_loss=after if after < _LOST else np.inf,
-        is_kept=_keeps(site, stops, marks, model, task.wish, goal),
+        is_kept=_keeps(problem, chosen, goal),
         log_det=gained,
         log_det_bound=bound,
         n_candidates=len(candidates.p_site),
@@ -626,110 +621,105 @@ def _optimum(  # noqa: PLR0913  all that an answer is made of
     )
 
 
-def _keeps(
-    site: Site,
-    stops: Stops,
-    marks: Arrangement,
-    model: CentreModel,
-    wish: Requirement,
-    goal: Goal,
-) -> bool:
-    """Return whether marks keep the tolerance at every stop, after a loss too if that counts."""
-    n = len(marks.names)
-    keeps = [np.arange(n)]
+def _keeps(problem: _Problem, chosen: Index, goal: Goal, slack: float = 1.0) -> bool:
+    """Return whether marks reach the goal for a multiple of the tolerance."""
+    site, stops, candidates, model, requirement, *_ = problem
+    wider = replace(requirement, tolerance=slack * requirement.tolerance)
+    marks, n = Arrangement.numbered(candidates.p_site[chosen]), len(chosen)
+    remaining = [np.arange(n)]
     if goal.is_robust and n >= 3:
-        keeps += [np.delete(np.arange(n), i) for i in range(n)]
-    sights = look(site, stops.p_site, marks)
+        remaining += [np.delete(np.arange(n), i) for i in range(n)]
+    visibility = find_visibility(site, stops.p_site, marks)
     return all(
         evaluate(
-            site, stops, marks.rows(keep), model, wish, sights=sights.rows(keep)
+            site, stops, marks.rows(keep), model, wider, visibility=visibility.rows(keep)
         ).worst_probability
         >= goal.probability
-        for keep in keeps
+        for keep in remaining
     )
 
 
-def _least(task: _Task, stops: Stops, goal: Goal) -> int:
-    """Return a number of marks that fewer cannot keep the tolerance with; raise if none can."""
-    least = 3 if task.wish.method == "paper" or goal.is_robust else 2
+def _least(problem: _Problem, goal: Goal) -> int:
+    """Return a lower bound of the number of marks; raise if no number keeps the tolerance."""
+    least = 3 if problem.is_paper or goal.is_robust else 2
     if goal.most < least:
-        raise ConfigError(f"At most {goal.most} marks; {least} are needed for what is asked.")
-    _refuse_impossible(task, stops)
-    sigmas = least_sigmas(task.sighting, task.wish)[:, : goal.most]
-    wanted = widest_sigma(task.wish.tolerance, goal.probability)
-    enough = np.flatnonzero(sigmas.max(axis=0) <= wanted) + 1 + goal.is_robust
+        raise ConfigError(f"At most {goal.most} marks; {least} are needed for this goal.")
+    _refuse_impossible(problem)
+    requirement = problem.requirement
+    sigmas = least_sigmas(problem.observables, requirement)[:, : goal.most]
+    widest = widest_sigma(requirement.tolerance, goal.probability)
+    enough = np.flatnonzero(sigmas.max(axis=0) <= widest) + 1 + goal.is_robust
     if len(enough) and enough[0] <= goal.most:
         return max(least, int(enough[0]))
     place = sigmas.shape[1] - 1 - (goal.is_robust and sigmas.shape[1] > 1)
     worst = int(np.argmax(sigmas[:, place]))
     raise DegenerateGeometryError(
-        f"No arrangement of {goal.most} marks keeps {_asked(task, goal)}: wherever they stood, the "
-        f"3-D sigma at {stops.names[worst]} would be {1e3 * sigmas[worst, place]:.2g} mm or more, "
-        f"and {1e3 * wanted:.2g} mm is the most with which that can be. Ask for a larger "
-        "tolerance, or allow more places."
+        f"No arrangement of {goal.most} marks keeps {_goal_text(problem, goal)}: wherever they "
+        f"stood, the 3-D sigma at {problem.stops.names[worst]} would be "
+        f"{1e3 * sigmas[worst, place]:.2g} mm or more, and {1e3 * widest:.2g} mm is the most with "
+        "which that can be. Ask for a larger tolerance, or allow more places."
     )
 
 
-def _asked(task: _Task, goal: Goal) -> str:
-    """Say what shall be kept."""
+def _goal_text(problem: _Problem, goal: Goal) -> str:
+    """Return the goal as a part of a sentence."""
     after = " after the loss of any one" if goal.is_robust else ""
     return (
-        f"{1e3 * task.wish.tolerance:g} mm with {100 * goal.probability:g} % at every stop{after}"
+        f"{1e3 * problem.requirement.tolerance:g} mm with {100 * goal.probability:g} % at every "
+        f"stop{after}"
     )
 
 
-def _refuse_impossible(task: _Task, stops: Stops) -> None:
+def _sigmas_of_all(problem: _Problem) -> Array:
+    """Return the 3-D sigma at each stop with a mark at every candidate [m]."""
+    return _sigmas(problem, np.flatnonzero(problem.observables.is_seen.any(axis=0)))
+
+
+def _refuse_impossible(problem: _Problem) -> None:
     """Raise if not even all marks at once would bring the 3-D sigma below the tolerance."""
-    if task.wish.method == "paper":
+    if problem.is_paper:
         return
-    sigmas = _sigmas(task, np.flatnonzero(task.sighting.is_seen.any(axis=0)))
+    sigmas, tolerance = _sigmas_of_all(problem), problem.requirement.tolerance
     worst = int(np.argmax(sigmas))
-    if sigmas[worst] > task.wish.tolerance:
+    if sigmas[worst] > tolerance:
         best = f"{1e3 * sigmas[worst]:.2g} mm (3-D sigma)" if sigmas[worst] < _LOST else "nothing"
         raise DegenerateGeometryError(
-            f"No arrangement keeps {1e3 * task.wish.tolerance:g} mm: even a mark at each of "
-            f"{task.near.shape[0]} places at once would leave {best} at {stops.names[worst]}. Ask "
-            "for a larger tolerance, or allow more places."
+            f"No arrangement keeps {1e3 * tolerance:g} mm: even a mark at each of "
+            f"{len(problem.near)} places at once would leave {best} at "
+            f"{problem.stops.names[worst]}. Ask for a larger tolerance, or allow more places."
         )
 
 
-def _glance(task: _Task, k: int, goal: Goal, rng: np.random.Generator) -> Index | None:
-    """Return the best places of k marks that a short search finds.
-
-    None where there is no room, and for few marks, of which a short search tells too little.
-    """
-    if k <= _FEW and task.wish.method != "paper":
-        return None
-    try:
-        chosen = _greedy(task, k)
-    except DegenerateGeometryError:
-        return None
-    if task.wish.method == "paper":
-        return _best_drawn(task, chosen, goal, rng)
-    quick = replace(goal, is_robust=False)  # judging losses takes ten times as long
-    return _exchanged(task._replace(power=_POWER), chosen, quick, rng)[0]
-
-
-def _impossible(task: _Task, stops: Stops, best: Optimum, goal: Goal) -> str:
-    """Say that no number of marks keeps the tolerance, and what nothing can exceed."""
-    text = f"{goal.most} marks do not keep {_asked(task, goal)}"
+def _impossible(problem: _Problem, best: Optimum, goal: Goal) -> str:
+    """Return the message that no number of marks keeps the tolerance, with the bound."""
     worst = int(np.argmax(best.evaluation.sigma_3d))
-    text += (
-        f": the best that was found leaves {1e3 * best.evaluation.sigma_3d[worst]:.3g} mm (3-D "
-        f"sigma) at {stops.names[worst]}."
+    text = (
+        f"{goal.most} marks do not keep {_goal_text(problem, goal)}: the best that was found "
+        f"leaves {1e3 * best.evaluation.sigma_3d[worst]:.3g} mm (3-D sigma) at "
+        f"{problem.stops.names[worst]}."
     )
-    if task.wish.method != "paper":
-        sigmas = _sigmas(task, np.flatnonzero(task.sighting.is_seen.any(axis=0)))
+    if not problem.is_paper:
         text += (
             f" Even a mark at each of {best.n_candidates} places at once would leave "
-            f"{1e3 * float(sigmas.max()):.2g} mm: ask for a larger tolerance."
+            f"{1e3 * float(_sigmas_of_all(problem).max()):.2g} mm: ask for a larger tolerance."
         )
     return text
 
 
 @compiled
+def _add(a: Array, b: Array, out: Array) -> None:
+    """Write the sum of two (6, 6) matrices."""
+    for i in range(6):
+        for j in range(6):
+            out[i, j] = a[i, j] + b[i, j]
+
+
+@compiled
 def _log_det(N: Array) -> float:
-    """Return the logarithm of the determinant of a positive (6, 6) matrix, which is spoilt."""
+    """Return the logarithm of the determinant of a positive (6, 6) matrix; overwrites the matrix.
+
+    Without the limit of ``factorise``: a loose prior beside precise marks is no singularity.
+    """
     total = 0.0
     for i in range(6):
         for k in range(i):
@@ -748,21 +738,20 @@ def _log_det(N: Array) -> float:
 @compiled
 def _gains(normal: Array, added: Array) -> Array:
     """Return what each candidate adds to the log-determinants of all stops together."""
-    gains = np.zeros(added.shape[1])
-    work = np.empty((6, 6))
+    gains, work, nothing = np.zeros(added.shape[1]), np.empty((6, 6)), np.zeros((6, 6))
     for e in range(len(normal)):
-        work[:] = normal[e]
+        _add(normal[e], nothing, work)
         before = _log_det(work)
         for c in range(added.shape[1]):
             if added[e, c, 3, 3] + added[e, c, 4, 4] + added[e, c, 5, 5] > 0.0:
-                work[:] = normal[e] + added[e, c]
+                _add(normal[e], added[e, c], work)
                 gains[c] += _log_det(work) - before
     return gains
 
 
 @compiled
-def _sigma_of(
-    N: Array, spread: Array, pull: Array, shared2: tuple[float, float], inverse: Array
+def _sigma(
+    N: Array, cov_rhs: Array, bias_rhs: Array, shared2: tuple[float, float], inverse: Array
 ) -> float:
     """Return the 3-D sigma of one stop; large without a position."""
     if not invert(N, inverse) or inverse[3, 3] + inverse[4, 4] + inverse[5, 5] > LOOSE2:
@@ -771,26 +760,25 @@ def _sigma_of(
     for i in range(3, 6):
         moved = 0.0
         for j in range(6):
-            moved += inverse[i, j] * pull[j]
+            moved += inverse[i, j] * bias_rhs[j]
             for k in range(6):
-                total += inverse[i, j] * spread[j, k] * inverse[k, i]
+                total += inverse[i, j] * cov_rhs[j, k] * inverse[k, i]
         total += shared2[0] * moved * moved
     return float(np.sqrt(total))
 
 
 @compiled
-def _sigmas_of(sums: tuple[Array, Array, Array], shared2: tuple[float, float]) -> Array:
+def _sigma_each(sums: tuple[Array, Array, Array], shared2: tuple[float, float]) -> Array:
     """Return the 3-D sigma of each stop; large without a position."""
-    normal, spread, pull = sums
-    inverse = np.empty((6, 6))
-    out = np.empty(len(normal))
+    normal, cov_rhs, bias_rhs = sums
+    inverse, out = np.empty((6, 6)), np.empty(len(normal))
     for e in range(len(normal)):
-        out[e] = _sigma_of(normal[e], spread[e], pull[e], shared2, inverse)
+        out[e] = _sigma(normal[e], cov_rhs[e], bias_rhs[e], shared2, inverse)
     return out
 
 
 @compiled
-def _judge(  # noqa: PLR0913  a kernel takes what it needs
+def _score_each(  # noqa: PLR0913  a kernel takes what it needs
     sums: tuple[Array, Array, Array],
     added: tuple[Array, Array, Array],
     shared2: tuple[float, float],
@@ -799,22 +787,25 @@ def _judge(  # noqa: PLR0913  a kernel takes what it needs
     rule: tuple[float, float],
     out: Array,
 ) -> None:
-    """Fill in the largest sigma, or power mean, and the mean with each candidate added.
+    """Write the largest sigma, or power mean, and the mean with each candidate added.
 
-    Beyond a limit it is not looked any further.
+    Stops are left out once a candidate exceeds the limit of the rule.
     """
     limit, power = rule
     is_smooth = np.isfinite(power)
     beyond = len(stops) * limit**power if is_smooth and np.isfinite(limit) else np.inf
-    N, spread, pull, inverse = np.empty((6, 6)), np.empty((6, 6)), np.empty(6), np.empty((6, 6))
+    N, cov_rhs, bias_rhs = np.empty((6, 6)), np.empty((6, 6)), np.empty(6)
+    inverse = np.empty((6, 6))
     for i in range(len(places)):
         c = places[i]
         worst, total, powers = 0.0, 0.0, 0.0
-        for e in stops:
-            N[:] = sums[0][e] + added[0][e, c]
-            spread[:] = sums[1][e] + added[1][e, c]
-            pull[:] = sums[2][e] + added[2][e, c]
-            sigma = _sigma_of(N, spread, pull, shared2, inverse)
+        for s in range(len(stops)):
+            e = stops[s]
+            _add(sums[0][e], added[0][e, c], N)
+            _add(sums[1][e], added[1][e, c], cov_rhs)
+            for k in range(6):
+                bias_rhs[k] = sums[2][e, k] + added[2][e, c, k]
+            sigma = _sigma(N, cov_rhs, bias_rhs, shared2, inverse)
             total += sigma
             if is_smooth:
                 powers += sigma**power

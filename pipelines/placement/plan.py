@@ -1,6 +1,6 @@
-"""The types of a plan: where marks may stand, where stops are, and what is to be expected there.
+"""The types of a plan: site, stops, marks, requirement, and the evaluation.
 
-All lengths are metres in the site frame, z up.
+Lengths are in the site frame, z up.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from spheremark.pipelines.model import Array, Index, Mask, same_length, seal
 from spheremark.pipelines.simulation.scene import Mesh
 
 PLAN_METHODS = ("free_station", "paper")
-"""Resection methods whose accuracy can be predicted."""
+"""Positioning methods whose accuracy can be predicted."""
 
 _LIMITS: dict[str, tuple[float, float]] = {
     "tolerance": (1e-5, 10.0),
@@ -36,7 +36,7 @@ class Site:
     Attributes
     ----------
     name : str
-        Where it comes from, for people.
+        Origin, for people.
     xs, ys : (n,), (m,)
         Lines of an even grid, ascending [m].
     ground : (m, n)
@@ -53,9 +53,9 @@ class Site:
     pole_radius : float
         Radius of the poles that carry them [m].
     mast : float
-        Height of the LiDAR above the ground where a stop does not say [m].
+        Height of the LiDAR above the ground, unless a stop has its own [m].
     bodies : Mesh, optional
-        Surfaces of all that hides, where they are known better than on the grid.
+        Surfaces of everything that hides, if known better than on the grid.
     """
 
     name: str
@@ -90,18 +90,7 @@ class Site:
         return float(self.xs[1] - self.xs[0])
 
     def ground_at(self, p_site: Array) -> Array:
-        """Return the height of the ground under points.
-
-        Parameters
-        ----------
-        p_site : (..., 2 or 3)
-            The points [m].
-
-        Returns
-        -------
-        (...,)
-            Heights, bilinear; NaN off the grid and where the ground is not known [m].
-        """
+        """Return the height of the ground under points, bilinear; NaN where it is not known [m]."""
         return bilinear(self, self.ground, p_site)
 
 
@@ -124,12 +113,12 @@ def bilinear(site: Site, grid: Array, p_site: Array) -> Array:
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class Stops:
-    """Places where the LiDAR scans.
+    """Stops: positions of the LiDAR.
 
     Attributes
     ----------
     names : tuple of str
-        What they are called.
+        Unique.
     p_site : (s, 3)
         Origins of the base: on the gimbal's axis at the height of the LiDAR [m].
     """
@@ -150,7 +139,7 @@ class Arrangement:
     Attributes
     ----------
     names : tuple of str
-        What they are called.
+        Unique.
     p_site : (n, 3)
         Centres of the spheres [m].
     """
@@ -165,34 +154,12 @@ class Arrangement:
 
     @classmethod
     def numbered(cls, p_site: Array) -> Self:
-        """Return marks that are called P01, P02 and so on.
-
-        Parameters
-        ----------
-        p_site : (n, 3)
-            Centres of the spheres [m].
-
-        Returns
-        -------
-        Arrangement
-            In the same order.
-        """
+        """Return marks named P01, P02 and so on."""
         names = tuple(f"P{k + 1:02d}" for k in range(len(p_site)))
         return cls(names=names, p_site=np.array(p_site, dtype=np.float64))
 
     def rows(self, keep: Index | Mask) -> Self:
-        """Return some of the marks.
-
-        Parameters
-        ----------
-        keep : (k,) or (n,)
-            Their places, or a mask.
-
-        Returns
-        -------
-        Arrangement
-            Those.
-        """
+        """Return some of the marks, by index or mask."""
         places = np.arange(len(self.names))[keep]
         return replace(
             self, names=tuple(self.names[k] for k in places), p_site=self.p_site[places].copy()
@@ -208,7 +175,7 @@ def _refuse_doubles(what: str, names: tuple[str, ...]) -> None:
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class Requirement:
-    """What is asked of positions, and how they will be found.
+    """Required accuracy of positions, and how they will be determined.
 
     Attributes
     ----------
@@ -221,9 +188,9 @@ class Requirement:
     sigma_levelling : float
         Standard deviation of roll and of pitch [rad].
     n_points_min : float
-        Returns that a sphere needs to be found. 20: with fewer extraction begins to miss some.
+        Returns that a sphere needs to be found. 20: with fewer detection begins to miss some.
     share_min : float
-        Share of a sphere that must be seen for it to be found. 0.5: with less extraction finds
+        Share of a sphere that must be seen for it to be found. 0.5: with less detection finds
         every second one.
     resection : ResectionConfig
         Levels of the tests, and what every centre has beyond its own covariance.
@@ -250,15 +217,15 @@ class Requirement:
 
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
-class Sights:
-    """What can be seen of each mark from each eye.
+class Visibility:
+    """Visible part of each mark from each station.
 
     Attributes
     ----------
-    lowest : (e, n, c) float32
+    lowest : (s, n, c) float32
         For each upright strip of the sphere's disc, from left to right, the height above the centre
-        from which on it is seen, in units of half the disc's height: -1 all of it, 1 nothing.
-    gaps : (e, n) float32
+        above which it is visible, in units of half the disc's height: -1 all of it, 1 nothing.
+    gaps : (s, n) float32
         From the centre on to the surface behind it; infinite where none is near [m].
     """
 
@@ -269,80 +236,29 @@ class Sights:
         seal(self, lowest=(None, None, None), gaps=self.lowest.shape[:2])
 
     @classmethod
-    def open(cls, n_eyes: int, n_marks: int, n_strips: int) -> Self:
-        """Return the sights of marks before which and behind which nothing stands.
-
-        Parameters
-        ----------
-        n_eyes, n_marks, n_strips : int
-            How many there are.
-
-        Returns
-        -------
-        Sights
-            All of every disc is seen.
-        """
+    def open(cls, n_stations: int, n_marks: int, n_strips: int) -> Self:
+        """Return the visibility of marks with nothing before or behind them."""
         return cls(
-            lowest=np.full((n_eyes, n_marks, n_strips), -1.0, np.float32),
-            gaps=np.full((n_eyes, n_marks), np.inf, np.float32),
+            lowest=np.full((n_stations, n_marks, n_strips), -1.0, np.float32),
+            gaps=np.full((n_stations, n_marks), np.inf, np.float32),
         )
 
     @classmethod
     def joined(cls, parts: Sequence[Self]) -> Self:
-        """Return the sights of the marks of several, one after the other.
-
-        Parameters
-        ----------
-        parts : sequence of Sights
-            From the same eyes.
-
-        Returns
-        -------
-        Sights
-            Of all marks.
-        """
+        """Return the visibility of the marks of several parts, from the same stations."""
         return cls(
             lowest=np.concatenate([one.lowest for one in parts], axis=1),
             gaps=np.concatenate([one.gaps for one in parts], axis=1),
         )
 
-    def with_mark(self, k: int, sights: Self) -> Self:
-        """Return the sights after one mark has moved.
-
-        Parameters
-        ----------
-        k : int
-            Place of the mark; its number puts it behind the last.
-        sights : Sights
-            Of that mark alone.
-
-        Returns
-        -------
-        Sights
-            Of all marks.
-        """
-        places = np.arange(self.gaps.shape[1])
-        return self.joined([self.rows(places[:k]), sights, self.rows(places[k + 1 :])])
-
     def rows(self, keep: Index | Mask) -> Self:
-        """Return the sights of some of the marks.
-
-        Parameters
-        ----------
-        keep : (k,) or (n,)
-            Their places, or a mask.
-
-        Returns
-        -------
-        Sights
-            Of those.
-        """
+        """Return the visibility of some of the marks, by index or mask."""
         return replace(self, lowest=self.lowest[:, keep].copy(), gaps=self.gaps[:, keep].copy())
 
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class Evaluation:
-    """What an arrangement promises at each stop.
+    """Predicted accuracy of an arrangement at each stop.
 
     Attributes
     ----------
@@ -351,7 +267,7 @@ class Evaluation:
     marks : Arrangement
         The marks.
     requirement : Requirement
-        What was asked.
+        The requirement.
     version, source : str
         Which model of centres was used: its digest, and ``sensor`` or ``fitted``.
     is_seen : (s, n)
@@ -389,7 +305,7 @@ class Evaluation:
     external_reliabilities : (s, n)
         Largest shift of the position by a bias of that size; infinite where none is found [m].
     reasons : tuple of str
-        Why a stop has no position, or a weak one; empty where all is well.
+        Why a stop has no position, or a weak one; empty otherwise.
     """
 
     stops: Stops
@@ -436,7 +352,7 @@ class Evaluation:
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class FieldMap:
-    """What an arrangement promises on a grid of places.
+    """Predicted accuracy of an arrangement on a grid of places.
 
     Attributes
     ----------

@@ -1,8 +1,8 @@
-"""The study's own procedure: marks at random, an error on every centre, pass or fail.
+"""The study's own procedure: random arrangements, an error on every centre, pass or fail.
 
-Marks are drawn round a station, the three whose circles cut best give its position, and errors are
-attached to their centres first: of random sign and fixed size, as in the study, or as the model of
-centres has them. The station is taken as level, as the study takes it.
+Marks are drawn round a station, errors are added to their centres (of random sign and fixed size,
+as in the study, or by the model of centres), and the three circles that cut best give the position.
+The station is taken as level, as in the study.
 """
 
 from __future__ import annotations
@@ -16,44 +16,42 @@ import numpy as np
 from spheremark.pipelines.compilation import compiled
 from spheremark.pipelines.errors import ConfigError
 from spheremark.pipelines.model import Array, Index, Mask, same_length, seal
-from spheremark.pipelines.placement.centre_model import CentreModel, expect_centres
-from spheremark.pipelines.placement.plan import Arrangement, Sights
-from spheremark.pipelines.placement.visibility import N_STRIPS
+from spheremark.pipelines.placement.centre_model import CentreModel, centres_ahead
 from spheremark.pipelines.positioning.trilateration import best_three, meet, meet_one
 from spheremark.pipelines.threads import side_by_side
 
 ARRANGEMENTS_MAX = 5_000_000
-"""Arrangements that are tried at most."""
+"""Most arrangements of one run."""
 
 BINS_DEG = (0, 10, 20, 30, 40, 50, 60)
 """Edges of the classes of worst included angle [deg]; of three directions one pair is within 60."""
 
 _HALF_HEIGHT = 0.3  # [m] by which centres stand above or below the LiDAR at most
 _TABLE = 60  # distances at which the model of centres is tabulated
-_FIRST, _THIRD = np.radians(105.0), np.radians(10.0)  # where the study's marks seem to stand
+_FIRST, _THIRD = np.radians(105.0), np.radians(10.0)  # headings of the study's first and third mark
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Trial:
-    """What is tried.
+class RandomPlanSpec:
+    """Distribution of random arrangements and of their errors.
 
     Attributes
     ----------
     n_arrangements : int
         Number of arrangements.
     n_marks : tuple of int
-        Least and greatest number of marks; all are equally frequent.
+        Least and greatest number of marks; all numbers are equally frequent.
     distances : tuple of float
         Nearest and farthest that a mark stands [m]. 7.5: the study's greatest distance.
     angles : tuple of float
         Window of included angles that the marks used must keep [rad]; 0 and pi allow all.
     error : float or None
         Size of the error on each axis of each centre, of random sign [m]. 0.017: the study's, 0.03
-        in space; none takes normal errors of the model of centres.
+        in space; by default normal errors of the model of centres.
     tolerance : float
         3-D error that passes [m].
     seed : int
-        Source of chance.
+        Of the random numbers.
     """
 
     n_arrangements: int = 100_000
@@ -67,7 +65,7 @@ class Trial:
     def __post_init__(self) -> None:
         if not 1 <= self.n_arrangements <= ARRANGEMENTS_MAX:
             raise ConfigError(
-                f"{self.n_arrangements:,} arrangements; from 1 to {ARRANGEMENTS_MAX:,} are tried."
+                f"{self.n_arrangements:,} arrangements; 1 to {ARRANGEMENTS_MAX:,} are possible."
             )
         low, high = self.n_marks
         if not 3 <= low <= high <= 40:
@@ -87,13 +85,13 @@ class Trial:
 
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
-class TrialResult:
-    """What came of each arrangement.
+class RandomPlanResults:
+    """Result of each arrangement.
 
     Attributes
     ----------
-    trial : Trial
-        What was tried.
+    spec : RandomPlanSpec
+        Their distribution.
     n_marks : (n,)
         Marks of each arrangement.
     worst_angles : (n,)
@@ -105,7 +103,7 @@ class TrialResult:
         Whether the included angles of the three keep the window.
     """
 
-    trial: Trial
+    spec: RandomPlanSpec
     n_marks: Index
     worst_angles: Array
     errors_3d: Array
@@ -119,11 +117,11 @@ class TrialResult:
     @property
     def passes(self) -> Mask:
         """Whether each position is within the tolerance."""
-        return np.asarray(self.errors_3d <= self.trial.tolerance)
+        return np.asarray(self.errors_3d <= self.spec.tolerance)
 
 
-class Share(NamedTuple):
-    """How many of a class of arrangements pass.
+class PassRate(NamedTuple):
+    """Pass rate of a class of arrangements.
 
     Attributes
     ----------
@@ -147,51 +145,53 @@ class Share(NamedTuple):
     p95: float
 
 
-def try_at_random(trial: Trial, model: CentreModel | None = None) -> TrialResult:
+def simulate_random_plans(
+    spec: RandomPlanSpec, model: CentreModel | None = None
+) -> RandomPlanResults:
     """Draw arrangements and position a station from each.
 
     Parameters
     ----------
-    trial : Trial
-        What is tried.
+    spec : RandomPlanSpec
+        Distribution of arrangements and errors.
     model : CentreModel, optional
-        How well centres are known; needed where the trial gives no error of its own.
+        Accuracy of centres; needed if the distribution has no error of its own.
 
     Returns
     -------
-    TrialResult
-        One row per arrangement; with a window of angles, arrangements that no three marks of keep
-        it use the three that cut best all the same and are marked.
+    RandomPlanResults
+        One row per arrangement. Where no three marks keep the window of included angles, the three
+        that cut best are used, and the row is marked.
 
     Raises
     ------
     ConfigError
-        If neither the trial nor a model says how large errors are.
+        If neither the distribution nor a model gives the size of errors.
 
     Notes
     -----
     Places are even over the ring between the two distances, heights even within 0.3 m of the
-    LiDAR's. Three circles of true radius about the wrong centres are met by least squares
+    LiDAR's. Three circles of true radius about the wrong centres are intersected by least squares
     (from the true place); the height is the mean of theirs. Cost grows linearly with
     arrangements, and with the third power of marks for the choice of the three.
     """
-    sigmas = _sigmas(trial, model)
-    low, high = trial.n_marks
-    n = trial.n_arrangements
-    counts = np.random.default_rng(trial.seed).integers(low, high + 1, n)
+    sigmas = _sigmas(spec, model)
+    low, high = spec.n_marks
+    n = spec.n_arrangements
+    counts = np.random.default_rng(spec.seed).integers(low, high + 1, n)
     worst, errors, inside = np.empty(n), np.empty(n), np.empty(n, dtype=np.bool_)
-    window = (np.cos(trial.angles[0]), np.cos(trial.angles[1]))
+    window = (np.cos(spec.angles[0]), np.cos(spec.angles[1]))
 
     def part(first: int, last: int) -> None:
-        _try(
-            np.random.default_rng([trial.seed, first]),
-            (counts[first:last], trial.distances, window, trial.error or 0.0, sigmas),
+        _simulate(
+            np.random.default_rng([spec.seed, first]),
+            (counts[first:last], spec.distances, window, spec.error or 0.0, sigmas),
             (worst[first:last], errors[first:last], inside[first:last]),
         )
 
     side_by_side(part, n, worth=1_000)
-    return TrialResult(
-        trial=trial,
+    return RandomPlanResults(
+        spec=spec,
         n_marks=counts.astype(np.intp),
         worst_angles=worst,
         errors_3d=errors,
@@ -199,64 +199,40 @@ def try_at_random(trial: Trial, model: CentreModel | None = None) -> TrialResult
     )
 
 
-def by_number(result: TrialResult) -> tuple[Share, ...]:
-    """Return how many pass by the number of marks.
-
-    Parameters
-    ----------
-    result : TrialResult
-        What came of the trials; only those within the window count.
-
-    Returns
-    -------
-    tuple of Share
-        One for each number.
-    """
-    low, high = result.trial.n_marks
-    keep = result.is_in_window
+def by_number(results: RandomPlanResults) -> tuple[PassRate, ...]:
+    """Return the pass rate for each number of marks, of arrangements within the window."""
+    low, high = results.spec.n_marks
+    keep = results.is_in_window
     return tuple(
-        _share(result, keep & (result.n_marks == k), float(k), float(k))
-        for k in range(low, high + 1)
+        _pass_rate(results, keep & (results.n_marks == k), k, k) for k in range(low, high + 1)
     )
 
 
-def by_worst_angle(result: TrialResult) -> tuple[Share, ...]:
-    """Return how many pass by the worst included angle.
-
-    Parameters
-    ----------
-    result : TrialResult
-        What came of the trials; all of them count, so that the window shows.
-
-    Returns
-    -------
-    tuple of Share
-        One for each class of ``BINS_DEG``.
-    """
-    angles = np.degrees(result.worst_angles)
+def by_worst_angle(results: RandomPlanResults) -> tuple[PassRate, ...]:
+    """Return the pass rate for each class of ``BINS_DEG``, of all arrangements."""
+    angles = np.degrees(results.worst_angles)
     return tuple(
-        _share(result, (angles >= a) & (angles < b), float(a), float(b))
-        for a, b in pairwise(BINS_DEG)
+        _pass_rate(results, (angles >= a) & (angles < b), a, b) for a, b in pairwise(BINS_DEG)
     )
 
 
-def _share(result: TrialResult, keep: Mask, low: float, high: float) -> Share:
-    """Return how many of some arrangements pass."""
-    errors = result.errors_3d[keep]
+def _pass_rate(results: RandomPlanResults, keep: Mask, low: float, high: float) -> PassRate:
+    """Return the pass rate of some arrangements."""
+    errors = results.errors_3d[keep]
     if not len(errors):
-        return Share(low, high, 0, np.nan, np.nan, np.nan)
-    return Share(
-        low,
-        high,
+        return PassRate(float(low), float(high), 0, np.nan, np.nan, np.nan)
+    return PassRate(
+        float(low),
+        float(high),
         len(errors),
-        float(np.mean(errors <= result.trial.tolerance)),
+        float(np.mean(errors <= results.spec.tolerance)),
         float(np.median(errors)),
         float(np.quantile(errors, 0.95)),
     )
 
 
 def errors_by_angle(angles: Array, error: float, distance: float) -> Array:
-    """Return the error of a position against the included angle of its marks, as the study has it.
+    """Return the error of a position against the included angle of its marks, as in the study.
 
     Parameters
     ----------
@@ -329,48 +305,43 @@ def three_circle_errors(marks_site: Array, errors: Array) -> Array:
     return meet(chosen, marks, np.tile(measured, (n, 1)), weights, np.zeros(3)).p
 
 
-def _sigmas(trial: Trial, model: CentreModel | None) -> Array:
+def _sigmas(spec: RandomPlanSpec, model: CentreModel | None) -> Array:
     """Return distances with sigmas towards, left and up there, (k, 4) [m]; one row for none."""
-    if trial.error is not None:
+    if spec.error is not None:
         return np.zeros((1, 4))
     if model is None:
         raise ConfigError("Neither an error on each axis nor a model of centres was given.")
-    distances = np.linspace(*trial.distances, _TABLE)
-    marks = Arrangement(
-        names=tuple(str(i) for i in range(_TABLE)),
-        p_site=np.column_stack([distances, np.zeros((_TABLE, 2))]),
-    )
-    sights = Sights.open(1, _TABLE, N_STRIPS)
-    covs = expect_centres(model, np.zeros((1, 3)), marks, sights).cov_site[0]
-    variances = np.einsum("nii->ni", covs)
+    distances = np.linspace(*spec.distances, _TABLE)
+    _, variances = centres_ahead(model, distances)
     worst = np.nanmax(np.where(np.isfinite(variances), variances, np.nan), axis=0)
-    variances = np.where(np.isfinite(variances), variances, worst)
-    return np.column_stack([distances, np.sqrt(variances)])
+    return np.column_stack([distances, np.sqrt(np.where(np.isfinite(variances), variances, worst))])
 
 
 @compiled
-def _attach(rng: np.random.Generator, p: Array, error: float, sigmas: Array, off: Array) -> None:
-    """Fill in the errors of three centres."""
+def _draw_errors(
+    rng: np.random.Generator, p: Array, error: float, sigmas: Array, out: Array
+) -> None:
+    """Write the errors of three centres."""
     for i in range(3):
         if error > 0.0:
             for axis in range(3):
-                off[i, axis] = error if rng.random() < 0.5 else -error
+                out[i, axis] = error if rng.random() < 0.5 else -error
             continue
         flat = np.hypot(p[i, 0], p[i, 1])
         place = (flat - sigmas[0, 0]) / (sigmas[1, 0] - sigmas[0, 0])
         row = min(max(int(place + 0.5), 0), len(sigmas) - 1)
         towards, left = sigmas[row, 1] * rng.normal(), sigmas[row, 2] * rng.normal()
         ux, uy = p[i, 0] / flat, p[i, 1] / flat
-        off[i, 0], off[i, 1] = towards * ux - left * uy, towards * uy + left * ux
-        off[i, 2] = sigmas[row, 3] * rng.normal()
+        out[i, 0], out[i, 1] = towards * ux - left * uy, towards * uy + left * ux
+        out[i, 2] = sigmas[row, 3] * rng.normal()
 
 
 @compiled
-def _try(rng: np.random.Generator, plan: tuple[Any, ...], out: tuple[Any, ...]) -> None:
-    """Fill in worst angle, error and window of each arrangement."""
-    counts, distances, window, error, sigmas = plan
+def _simulate(rng: np.random.Generator, spec: tuple[Any, ...], out: tuple[Any, ...]) -> None:
+    """Write worst angle, error and window of each arrangement."""
+    counts, distances, window, error, sigmas = spec
     worst, errors, inside = out
-    units, p = np.empty((64, 2)), np.empty((64, 3))
+    units, p, every = np.empty((64, 2)), np.empty((64, 3)), np.arange(3)
     used, off, found = np.empty((3, 3)), np.empty((3, 3)), np.empty(3)
     three, measured, weights = np.zeros(3, np.intp), np.empty((3, 2)), np.zeros((3, 2, 2))
     weights[:, 0, 0] = weights[:, 1, 1] = 1.0
@@ -386,14 +357,15 @@ def _try(rng: np.random.Generator, plan: tuple[Any, ...], out: tuple[Any, ...]) 
         _, inside[i] = best_three(units[:n], window[1], window[0], three)
         low = 1.0
         for a in range(3):
-            used[a] = p[three[a]]
+            for axis in range(3):
+                used[a, axis] = p[three[a], axis]
             for b in range(a):
                 u, v = units[three[a]], units[three[b]]
                 low = min(low, abs(u[0] * v[1] - u[1] * v[0]))
         worst[i] = np.arcsin(min(low, 1.0))
-        _attach(rng, used, error, sigmas, off)
+        _draw_errors(rng, used, error, sigmas, off)
         for a in range(3):
             measured[a, 0], measured[a, 1] = np.hypot(used[a, 0], used[a, 1]), used[a, 2]
-        found[:] = 0.0
-        meet_one(np.arange(3), used + off, measured, weights, found)
+            found[a] = 0.0
+        meet_one(every, used + off, measured, weights, found)
         errors[i] = np.sqrt(found[0] ** 2 + found[1] ** 2 + found[2] ** 2)

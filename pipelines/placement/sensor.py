@@ -1,7 +1,7 @@
-"""What a scan puts on a sphere: hides the firing pattern, its gaps, and the worth of each return.
+"""The returns of a scan from a sphere: hides the pulse pattern, its gaps, and their information.
 
-A turn of the gimbal draws upright lines of shots round the horizon. How many cross a sphere, and
-where, depends on distance, and on where between the lines the sphere happens to stand.
+A turn of the gimbal draws upright lines of pulses round the horizon. How many cross a sphere, and
+where, depends on distance, and on the sphere's position between the lines.
 """
 
 from __future__ import annotations
@@ -55,12 +55,11 @@ class Sensor:
         Calibrated reflectivity of the spheres, 0 to 255. 42: red paint that sends half of the light
         back, the mean over a sphere.
     noise : float or None
-        Noise of a range to a sphere [m]; none takes what real packets of a VLP-16 show at the
-        reflectivity.
+        Noise of a range to a sphere [m]; by default that of a real VLP-16 at the reflectivity.
     sigma_direction : float
         Standard deviation of a beam's direction per axis [rad].
     sigma_range_bias : float
-        Spread of what each laser measures too long [m].
+        Standard deviation of the range bias of a laser [m].
     divergence : tuple of float
         Full width of the footprint along the sweep and square to it [rad].
     elevations : tuple of float
@@ -96,7 +95,7 @@ class Sensor:
 
     @property
     def scan(self) -> SimulationConfig:
-        """The same speeds as a simulation has them."""
+        """The same speeds as options of the simulation."""
         return SimulationConfig(
             turn=self.turn,
             spin_rpm=self.spin_rpm,
@@ -108,7 +107,7 @@ class Sensor:
 
     @property
     def warning(self) -> str:
-        """What is wrong with the two speeds, for people; empty when the lines spread well."""
+        """Problem of the two speeds, for people; empty when the lines spread well."""
         return commensurability(self.scan)
 
     @property
@@ -119,14 +118,14 @@ class Sensor:
         return 2.0 * np.pi / (2.0 * N_LASERS * self.turn * self.spin_rpm / 60.0)
 
     @property
-    def shot_spacing(self) -> float:
-        """Angle from one shot of a line to the next [rad]."""
+    def pulse_spacing(self) -> float:
+        """Angle from one pulse of a line to the next [rad]."""
         return 2.0 * np.pi * self.spin_rpm / 60.0 * FIRING_CYCLE
 
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class Returns:
-    """What the returns of a sphere are worth, by distance, strip and rows from the top.
+    """Information of a sphere's returns, by distance, strip and rows from the top.
 
     Attributes
     ----------
@@ -138,9 +137,9 @@ class Returns:
         Fisher information that the same area gives for one return per square metre:
         towards-towards, towards-left, towards-up, left-left, left-up, up-up [1].
     spread : (d, 3)
-        By how much the lines' places make the variances of a centre larger than evenly spread
-        returns would: towards, left, up; as of one among some that share a position, over places
-        where they are found.
+        Factor of a centre's variances by the positions of the lines, against evenly spread returns:
+        towards, left, up; of one among some that share a position, over places where they are
+        found.
     worst_spread : (d, 3)
         The same for the 95th percentile of places.
     worst_share : (d,)
@@ -165,7 +164,7 @@ class Returns:
 
 
 class _Disc(NamedTuple):
-    """Beams over a sphere's disc at one distance, and what each is worth.
+    """Beams over a sphere's disc at one distance, and the information of each.
 
     Attributes
     ----------
@@ -184,13 +183,12 @@ class _Disc(NamedTuple):
 
 @lru_cache(maxsize=16)
 def returns_of(sensor: Sensor, radius: float, n_strips: int) -> Returns:
-    """Return what a sensor's returns from a sphere are worth.
+    """Return the information of a sensor's returns from a sphere.
 
     Notes
     -----
-    The worth of a return is that of the mean range over its footprint, linearised over the width of
-    what is not known of the centre, as the fit along the beam has it.
-    The spread comes from the true lines of one turn, tried at 400 places.
+    A return is the mean range over its footprint, linearised over the uncertainty of the centre, as
+    in the fit along the beam. The spread comes from the true lines of one turn at 400 places.
     """
     discs = [_disc(sensor, radius, n_strips, d) for d in _DISTANCES]
     shape = (len(_DISTANCES), n_strips, N_ROWS, _N_PER_ROW * _N_PER_STRIP)
@@ -226,7 +224,7 @@ def _reaches(sensor: Sensor, radius: float) -> Array:
 
 def _density(sensor: Sensor, distance: float) -> float:
     """Return the returns per square metre of a disc at the horizon [1/m^2]."""
-    return 1.0 / (sensor.line_spacing * sensor.shot_spacing * distance**2)
+    return 1.0 / (sensor.line_spacing * sensor.pulse_spacing * distance**2)
 
 
 def _disc(sensor: Sensor, radius: float, n_strips: int, distance: float) -> _Disc:
@@ -304,7 +302,7 @@ def _spread(
     np.add.at(worth, inverse, disc.information)
     counts = np.bincount(inverse, disc.returns)
     height = 2.0 * (columns[1] - columns[0]) * len(columns) / 2.0 / (N_ROWS * _N_PER_ROW)
-    per_line = height / (distance * sensor.shot_spacing)
+    per_line = height / (distance * sensor.pulse_spacing)
     crossings = _crossings(sensor, columns, distance)
     information = np.einsum("pc,cij->pij", crossings, worth) * per_line
     returns = crossings @ counts * per_line

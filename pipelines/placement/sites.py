@@ -25,7 +25,7 @@ _POLE_HEIGHTS = (0.62, 1.50)  # [m] the study's
 
 
 def site_of_field(world: Field) -> Site:
-    """Return the site of a simulated world: its ground and all that stands on it but its markers.
+    """Return the site of a simulated world: its ground and everything on it except its markers.
 
     Parameters
     ----------
@@ -41,8 +41,7 @@ def site_of_field(world: Field) -> Site:
     -----
     The surface is probed from above, so that what overhangs reaches down to the ground; upright
     faces, which a probe from above may miss, are sampled besides and raise the nodes around. It
-    hides too much rather than too little: what it does not hide is seen, and what it does is looked
-    at again among the triangles.
+    hides too much rather than too little; rays at the triangles decide what it hides.
     """
     lines = np.arange(-_HALF, _HALF + _CELL / 2, _CELL)
     x, y = np.meshgrid(lines, lines)
@@ -64,18 +63,7 @@ def site_of_field(world: Field) -> Site:
 
 
 def stops_of_field(world: Field) -> Stops:
-    """Return the stops of a simulated world.
-
-    Parameters
-    ----------
-    world : Field
-        The world.
-
-    Returns
-    -------
-    Stops
-        In the order of driving.
-    """
+    """Return the stops of a simulated world, in the order of driving."""
     return Stops(
         names=tuple(stop.name for stop in world.stops),
         p_site=np.array([stop.p_site for stop in world.stops]),
@@ -83,18 +71,7 @@ def stops_of_field(world: Field) -> Stops:
 
 
 def marks_of_field(world: Field) -> Arrangement:
-    """Return the marks of a simulated world as an arrangement.
-
-    Parameters
-    ----------
-    world : Field
-        The world.
-
-    Returns
-    -------
-    Arrangement
-        As they stand.
-    """
+    """Return the marks of a simulated world as an arrangement."""
     return Arrangement(names=world.marks.names, p_site=np.array(world.marks.p_site))
 
 
@@ -201,7 +178,7 @@ def site_of_grid(
     Returns
     -------
     Site
-        With its usual poles and markers.
+        With the usual poles and markers.
 
     Raises
     ------

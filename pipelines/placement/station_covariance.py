@@ -1,12 +1,12 @@
-"""Covariances of positions from those of centres, without any observation.
+"""Covariances of positions predicted from those of centres: hides the normal equations.
 
-Hides the normal equations of the resection methods at places where nobody has stood yet. Rotations
-are about the station itself, so that the translation block is the covariance of the position.
+Rotations are about the station itself, so that the translation block is the covariance of the
+position.
 """
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -19,32 +19,55 @@ from spheremark.pipelines.placement.plan import Requirement
 from spheremark.pipelines.positioning.trilateration import best_three, circles
 from spheremark.pipelines.scan.rigs import N_LASERS
 
+LOOSE2 = 1.0
+"""Variance of a position above which it counts as undetermined [m^2]."""
+
 _BIAS_LEFT = 0.22  # of the spread of laser biases: what a survey leaves to each centre, simulated
 _SIGMA_AIM = 1.5e-5  # [rad] of each direction, by mounting and encoder, after both faces; simulated
-LOOSE2 = 1.0
-"""Variance of a position above which it is none [m^2]."""
-
-_PARALLEL = 1e6  # cofactor of a position from circles that touch
+_TRACE_MOST = 1e6  # of the horizontal cofactor matrix of three circles that cut at all
+_ANY = 2.0  # beyond the cosine of any angle
 
 
-Group = tuple[Any, ...]
-"""Arrays and numbers that go together into a kernel."""
-
-Vector = tuple[float, float, float]
-"""Coordinates that go together into a kernel."""
-
-
-class Positions(NamedTuple):
-    """What centres make of positions.
+class Observables(NamedTuple):
+    """Marks as they can be observed from stations.
 
     Attributes
     ----------
-    cov_motion : (e, 6, 6)
+    stations_site : (s, 3)
+        Positions of the LiDAR [m].
+    marks_site : (n, 3)
+        Marks [m].
+    cov_centres : (s, n, 3, 3)
+        Covariances of their centres by noise, in the axes of the site [m^2].
+    sigma_laser_bias : float
+        Standard deviation of the range bias of a laser [m].
+    is_seen : (s, n)
+        Which are found.
+    """
+
+    stations_site: Array
+    marks_site: Array
+    cov_centres: Array
+    sigma_laser_bias: float
+    is_seen: Mask
+
+    @property
+    def vectors(self) -> Array:
+        """Vectors from stations to marks, (s, n, 3) [m]."""
+        return np.asarray(self.marks_site[None] - self.stations_site[:, None])
+
+
+class Positions(NamedTuple):
+    """Predicted positions.
+
+    Attributes
+    ----------
+    cov_motion : (s, 6, 6)
         Of a small motion about the station, rotation [rad] and translation [m]; infinite on the
         diagonal where there is no position.
-    cofactor : (e, 6, 6)
-        The same as the adjustment of the survey will claim it.
-    used : (e, n)
+    cofactor : (s, 6, 6)
+        The same as the adjustment of the survey will state it.
+    used : (s, n)
         Marks that carry each position.
     """
 
@@ -53,308 +76,34 @@ class Positions(NamedTuple):
     used: Mask
 
 
-class Sighting(NamedTuple):
-    """Marks as seen from eyes.
-
-    Attributes
-    ----------
-    eyes_site : (e, 3)
-        Places of the LiDAR [m].
-    marks_site : (n, 3)
-        Marks [m].
-    cov_centres : (e, n, 3, 3)
-        Covariances of their centres by noise, in the axes of the site [m^2].
-    sigma_laser_bias : float
-        Spread of what each laser measures too long [m].
-    is_seen : (e, n)
-        Which are found.
-    """
-
-    eyes_site: Array
-    marks_site: Array
-    cov_centres: Array
-    sigma_laser_bias: float
-    is_seen: Mask
-
-
-def predict_positions(sighting: Sighting, wish: Requirement) -> Positions:
-    """Predict the covariances of positions.
-
-    Notes
-    -----
-    ``free_station``: weights are those of the adjustment, ``Q = (sum J' P J + G)^-1`` with
-    ``J = [-[v]x, 1]`` of each mark and the AHRS's information ``G`` on roll and pitch; a survey
-    takes what lasers and gimbal leave as different at every mark. The covariance of what comes out
-    has them as they are: noise of each mark, what is left of its direction, and an excess of all
-    ranges together, which hardly moves a station that marks stand round: ``Q J' P C P J Q``. What
-    all centres are too high, a station is too low.
-    ``paper``: horizontal distances and heights of the three marks whose circles cut best, and the
-    lean carried through them as ``ranging`` does; its heading is that of the three directions.
-    """
-    eyes, marks = _places(sighting)
-    covs = sighting.cov_centres + wish.sigma_marks**2 * np.eye(3)
-    extra = _extra(sighting, wish)
-    shape = (len(eyes), 6, 6)
-    cofactor, moved, out = np.zeros(shape), np.zeros(shape[:2]), np.zeros(shape)
-    used = np.array(sighting.is_seen)
-    if wish.method == "paper":
-        used[:] = False
-        seen = (eyes, marks, covs, sighting.is_seen)
-        _by_circles(seen, extra, wish.sigma_levelling**2, used, (out, cofactor, moved))
-    else:
-        _by_motion(
-            (eyes, marks, covs, used), extra, wish.sigma_levelling**-2, (out, cofactor, moved)
-        )
-    out += shared_variance(sighting.sigma_laser_bias) * moved[:, :, None] * moved[:, None, :]
-    out[:, 5, 5] += wish.resection.sigma_height**2
-    return Positions(cov_motion=out, cofactor=cofactor, used=used)
-
-
-def claimed_bias_variance(sigma_laser_bias: float) -> float:
-    """Return the variance that a survey leaves to each centre's distance for the lasers' biases."""
-    return (_BIAS_LEFT * sigma_laser_bias) ** 2
-
-
-def shared_variance(sigma_laser_bias: float) -> float:
-    """Return the variance of what all ranges of a survey are too long: the lasers' mean."""
-    return sigma_laser_bias**2 / N_LASERS
-
-
-@compiled
-def _claimed(cov: Array, v: Vector, extra: Group, known: Array, true: Array) -> None:
-    """Fill in a centre's covariance as a survey takes it, and as it is, shared excess apart."""
-    bias2, common2, aim2 = extra
-    d2 = v[0] * v[0] + v[1] * v[1] + v[2] * v[2]
-    for i in range(3):
-        for j in range(3):
-            along = v[i] * v[j]
-            known[i, j] = cov[i, j] + bias2 * along / d2
-            true[i, j] = cov[i, j] - aim2 * along
-        known[i, i] += common2
-        true[i, i] += aim2 * d2
-
-
-@compiled
-def _inform(cov: Array, v: Vector, extra: Group, out: Group) -> bool:
-    """Fill in what one mark adds to normal matrix, spread and pull; false if it adds nothing."""
-    N, spread, pull = out
-    weight, J = np.empty((3, 3)), np.zeros((3, 6))
-    weighted, spread_by = np.empty((3, 6)), np.empty((3, 6))
-    known, true = np.empty((3, 3)), np.empty((3, 3))
-    x, y, z = v
-    _claimed(cov, v, extra, known, true)
-    if not invert(known, weight):
-        return False
-    J[0, 1], J[0, 2], J[1, 0], J[1, 2], J[2, 0], J[2, 1] = z, -y, -z, x, y, -x
-    J[0, 3] = J[1, 4] = J[2, 5] = 1.0
-    d = np.sqrt(x * x + y * y + z * z)
-    _product(weight, J, weighted)
-    _product(true, weighted, spread_by)
-    for i in range(6):
-        pull[i] = (weighted[0, i] * x + weighted[1, i] * y + weighted[2, i] * z) / d
-        for j in range(6):
-            N[i, j] = J[0, i] * weighted[0, j] + J[1, i] * weighted[1, j] + J[2, i] * weighted[2, j]
-            spread[i, j] = (
-                weighted[0, i] * spread_by[0, j]
-                + weighted[1, i] * spread_by[1, j]
-                + weighted[2, i] * spread_by[2, j]
-            )
-    return True
-
-
-@compiled
-def _by_motion(
-    seen: tuple[Array, Array, Array, Mask], extra: Group, gravity: float, out: Group
-) -> None:
-    """Fill in the covariances of free stations, and how a common excess of ranges moves them."""
-    eyes, marks, covs, is_seen = seen
-    cov_motion, cofactor, moved = out
-    N, spread, pull = np.empty((6, 6)), np.empty((6, 6)), np.empty(6)
-    one = (np.empty((6, 6)), np.empty((6, 6)), np.empty(6))
-    for e in range(len(eyes)):
-        N[:], pull[:] = 0.0, 0.0
-        N[0, 0] = N[1, 1] = gravity
-        spread[:] = N
-        for m in range(len(marks)):
-            if not is_seen[e, m]:
-                continue
-            v = (marks[m, 0] - eyes[e, 0], marks[m, 1] - eyes[e, 1], marks[m, 2] - eyes[e, 2])
-            if _inform(covs[e, m], v, extra, one):
-                N += one[0]
-                spread += one[1]
-                pull += one[2]
-        inverse = cofactor[e]
-        ok = invert(N, inverse)
-        if not ok or inverse[3, 3] + inverse[4, 4] + inverse[5, 5] > LOOSE2:
-            inverse[:] = np.diag(np.full(6, np.inf))
-            cov_motion[e] = inverse
-            continue
-        cov_motion[e] = inverse @ spread @ inverse
-        moved[e] = inverse @ pull
-
-
 class Information(NamedTuple):
-    """What each mark adds to what a free station knows; sums over marks are what it knows.
+    """Contributions of marks to the normal equations of a free station; they add up.
 
     Attributes
     ----------
-    normal : (e, n, 6, 6)
+    normal : (s, n, 6, 6)
         To the normal matrix by the weights of a survey.
-    spread : (e, n, 6, 6)
-        To the spread of its right-hand side.
-    pull : (e, n, 6)
-        To what a common excess of ranges does to that [1/m].
+    cov_rhs : (s, n, 6, 6)
+        To the covariance of the right-hand side.
+    bias_rhs : (s, n, 6)
+        To the right-hand side by a common error of all ranges of 1 m [1/m].
     """
 
     normal: Array
-    spread: Array
-    pull: Array
-
-
-def information(sighting: Sighting, wish: Requirement) -> Information:
-    """Return what each mark adds to what a free station knows."""
-    shape = sighting.is_seen.shape
-    out = Information(np.zeros((*shape, 6, 6)), np.zeros((*shape, 6, 6)), np.zeros((*shape, 6)))
-    covs = sighting.cov_centres + wish.sigma_marks**2 * np.eye(3)
-    eyes, marks = _places(sighting)
-    _informed((eyes, marks, covs, sighting.is_seen), _extra(sighting, wish), tuple(out))
-    return out
-
-
-def independent_information(sighting: Sighting, wish: Requirement) -> Array:
-    """Return what each mark tells of a station's position if its rotation were known."""
-    v = sighting.marks_site[None] - sighting.eyes_site[:, None]
-    across = np.sum(v**2, axis=2)[..., None, None] * np.eye(3) - v[..., :, None] * v[..., None, :]
-    covs = sighting.cov_centres + wish.sigma_marks**2 * np.eye(3) + _SIGMA_AIM**2 * across
-    is_seen = sighting.is_seen[..., None, None]
-    return np.where(is_seen, np.linalg.inv(np.where(is_seen, covs, np.eye(3))), 0.0)
-
-
-def _places(sighting: Sighting) -> tuple[Array, Array]:
-    """Return eyes and marks as the kernels want them."""
-    return np.ascontiguousarray(sighting.eyes_site), np.ascontiguousarray(sighting.marks_site)
-
-
-def _extra(sighting: Sighting, wish: Requirement) -> tuple[float, float, float]:
-    """Return the variances of what lasers and gimbal leave, as a survey takes it and as it is."""
-    bias2 = claimed_bias_variance(sighting.sigma_laser_bias)
-    return bias2, wish.resection.sigma_common**2, _SIGMA_AIM**2
-
-
-@compiled
-def _informed(seen: tuple[Array, Array, Array, Mask], extra: Group, out: Group) -> None:
-    """Fill in what each seen mark adds."""
-    eyes, marks, covs, is_seen = seen
-    for e in range(len(eyes)):
-        for m in range(len(marks)):
-            if is_seen[e, m]:
-                v = (marks[m, 0] - eyes[e, 0], marks[m, 1] - eyes[e, 1], marks[m, 2] - eyes[e, 2])
-                _inform(covs[e, m], v, extra, (out[0][e, m], out[1][e, m], out[2][e, m]))
-
-
-@compiled
-def _product(design: Array, circle: Array, out: Array) -> None:
-    """Fill in the product of a (3, 3) and a (3, 6) matrix."""
-    for i in range(3):
-        for j in range(6):
-            out[i, j] = (
-                design[i, 0] * circle[0, j]
-                + design[i, 1] * circle[1, j]
-                + design[i, 2] * circle[2, j]
-            )
-
-
-@compiled
-def _best_of(eye: Array, marks: Array, is_seen: Mask, lines: Array, three: Index) -> bool:
-    """Find the three seen marks whose circles cut best; false if no three cut at all."""
-    seen = np.flatnonzero(is_seen)
-    for k in range(len(seen)):
-        x, y = marks[seen[k], 0] - eye[0], marks[seen[k], 1] - eye[1]
-        flat = max(np.hypot(x, y), 1e-9)
-        lines[k, 0], lines[k, 1] = x / flat, y / flat
-    spread, _ = best_three(lines[: len(seen)], -1.0, 1.0, three)
-    if not spread < _PARALLEL:
-        return False
-    three[:] = seen[three]
-    return True
-
-
-@compiled
-def _circle(cov: Array, v: Vector, rules: tuple[Group, float], row: int, out: Group) -> float:
-    """Fill in one mark's circle and height: two rows of all; return the variance of its azimuth.
-
-    Filled in are derivative, covariance of errors, weights, effect of the lean, and that of a
-    common excess of ranges.
-    """
-    extra, level2 = rules
-    design, errors, weights, lean, excess = out
-    known, true, circle = np.empty((3, 3)), np.empty((3, 3)), np.zeros((2, 3))
-    x, y, z = v
-    _claimed(cov, v, extra, known, true)
-    flat = max(np.hypot(x, y), 1e-9)
-    ux, uy = x / flat, y / flat
-    circle[0, 0], circle[0, 1], circle[1, 2] = ux, uy, 1.0
-    s = slice(row, row + 2)
-    design[s] = circle
-    lean[row, 0], lean[row, 1] = -z * uy, z * ux  # the first two columns of -[v]x
-    lean[row + 1, 0], lean[row + 1, 1] = y, -x
-    errors[s, s] = circle @ true @ circle.T
-    weights[s, s] = np.linalg.inv(circle @ known @ circle.T + level2 * lean[s] @ lean[s].T)
-    d = np.sqrt(flat * flat + z * z)
-    excess[row], excess[row + 1] = flat / d, z / d
-    side2 = uy * uy * true[0, 0] - 2.0 * ux * uy * true[0, 1] + ux * ux * true[1, 1]
-    return float(side2 / (flat * flat))
-
-
-@compiled
-def _by_circles(seen: Group, extra: Group, level2: float, used: Mask, out: Group) -> None:
-    """Fill in the covariances of positions by three circles, and how a common excess moves them."""
-    eyes, marks, covs, is_seen = seen
-    cov_motion, cofactor, moved = out
-    lines, three = np.empty((len(marks), 2)), np.empty(3, np.intp)
-    design, lean, excess = np.zeros((6, 3)), np.zeros((6, 2)), np.empty(6)
-    errors, weights, inverse = np.zeros((6, 6)), np.zeros((6, 6)), np.empty((3, 3))
-    for e in range(len(eyes)):
-        cov_motion[e] = np.diag(np.full(6, np.inf))
-        cofactor[e] = cov_motion[e]
-        if not _best_of(eyes[e], marks, is_seen[e], lines, three):
-            continue
-        yaw2 = 0.0
-        for r in range(3):
-            m = three[r]
-            v = (marks[m, 0] - eyes[e, 0], marks[m, 1] - eyes[e, 1], marks[m, 2] - eyes[e, 2])
-            rows = (design, errors, weights, lean, excess)
-            yaw2 += _circle(covs[e, m], v, (extra, level2), 2 * r, rows) / 9.0
-        if not invert(design.T @ weights @ design, inverse):
-            continue
-        gain = inverse @ design.T @ weights
-        tilt = gain @ lean
-        position = gain @ errors @ gain.T + level2 * tilt @ tilt.T
-        if np.trace(position) > LOOSE2:
-            continue
-        for m in three:
-            used[e, m] = True
-        cov_motion[e] = 0.0
-        cov_motion[e, 3:, 3:] = position
-        cov_motion[e, 0, 0] = cov_motion[e, 1, 1] = level2
-        cov_motion[e, 2, 2] = yaw2
-        cov_motion[e, 3:, :2] = -level2 * tilt
-        cov_motion[e, :2, 3:] = -level2 * tilt.T
-        cofactor[e] = cov_motion[e]
-        cofactor[e, 3:, 3:] = inverse
-        moved[e, 3:] = gain @ excess
+    cov_rhs: Array
+    bias_rhs: Array
 
 
 class Reliability(NamedTuple):
-    """What would show of an error in one mark, and what would not.
+    """Internal and external reliability of each mark.
 
     Attributes
     ----------
-    redundancies : (e, n)
+    redundancies : (s, n)
         Redundancy of each mark's observations together; 0 where it is not used.
-    detectable_biases : (e, n)
+    detectable_biases : (s, n)
         Minimal detectable bias along the weakest axis [m].
-    external : (e, n)
+    external : (s, n)
         Largest shift of the position by a bias of that size [m].
     """
 
@@ -363,33 +112,88 @@ class Reliability(NamedTuple):
     external: Array
 
 
-def reliability(sighting: Sighting, found: Positions, wish: Requirement) -> Reliability:
-    """Say how large an error in one mark must be to be found, and what a smaller one does."""
-    v = sighting.marks_site[None] - sighting.eyes_site[:, None]
-    d2 = np.maximum(np.sum(v**2, axis=2), 1e-9)[..., None, None]
-    known = sighting.cov_centres + (wish.sigma_marks**2 + wish.resection.sigma_common**2) * np.eye(
-        3
-    )
-    bias2 = claimed_bias_variance(sighting.sigma_laser_bias)
-    known = known + bias2 * v[..., :, None] * v[..., None, :] / d2
-    covs = np.where(found.used[..., None, None], known, np.eye(3))
+def predict_positions(observables: Observables, requirement: Requirement) -> Positions:
+    """Predict the covariances of positions.
+
+    Notes
+    -----
+    ``free_station``: weights are those of the adjustment, ``Q = (sum J' P J + G)^-1`` with
+    ``J = [-[v]x, 1]`` of each mark and the AHRS's information ``G`` on roll and pitch; a survey
+    takes what lasers and gimbal leave as different at every mark. The covariance of the estimate
+    has them as they are: noise of each mark, the remaining error of its direction, and a common
+    error of all ranges, which hardly moves a station with marks all round: ``Q J' P C P J Q``. A
+    common error of the centres' heights goes to the height of the station.
+    ``paper``: horizontal distances and heights of the three marks whose circles cut best, and the
+    levelling error carried through them as in ``trilateration``; the heading is the mean of the
+    three directions.
+    """
+    if requirement.method == "paper":
+        found, moved = _three_circles(observables, requirement)
+    else:
+        found, moved = _free_stations(observables, requirement)
+    shared2 = shared_variance(observables.sigma_laser_bias)
+    found.cov_motion[:] += shared2 * moved[:, :, None] * moved[:, None, :]
+    found.cov_motion[:, 5, 5] += requirement.resection.sigma_height**2
+    return found
+
+
+def claimed_bias_variance(sigma_laser_bias: float) -> float:
+    """Return the variance that a survey leaves to each centre's distance for the lasers' biases."""
+    return (_BIAS_LEFT * sigma_laser_bias) ** 2
+
+
+def shared_variance(sigma_laser_bias: float) -> float:
+    """Return the variance of the common error of all ranges of a survey: the lasers' mean bias."""
+    return sigma_laser_bias**2 / N_LASERS
+
+
+def information(
+    observables: Observables, requirement: Requirement, *, is_summed: bool = False
+) -> Information:
+    """Return the contributions of marks, or (``is_summed``) their sum over the marks seen."""
+    n_stations, n_marks = observables.is_seen.shape
+    shape = (n_stations, 1 if is_summed else n_marks)
+    out = Information(np.zeros((*shape, 6, 6)), np.zeros((*shape, 6, 6)), np.zeros((*shape, 6)))
+    if n_marks:
+        v, covs, is_seen = observables.vectors, observables.cov_centres, observables.is_seen
+        sigma_bias = observables.sigma_laser_bias
+        _add_contributions(v, *_covariances(v, covs, sigma_bias, requirement), is_seen, tuple(out))
+    return out
+
+
+def independent_information(observables: Observables, requirement: Requirement) -> Array:
+    """Return the information of each mark about a station's position for a known rotation."""
+    v = observables.vectors
+    across = np.sum(v**2, axis=2)[..., None, None] * np.eye(3) - v[..., :, None] * v[..., None, :]
+    noise = observables.cov_centres + requirement.sigma_marks**2 * np.eye(3)
+    is_seen = observables.is_seen[..., None, None]
+    covs = np.where(is_seen, noise + _SIGMA_AIM**2 * across, np.eye(3))
+    return np.where(is_seen, np.linalg.inv(covs), 0.0)
+
+
+def reliability(
+    observables: Observables, found: Positions, requirement: Requirement
+) -> Reliability:
+    """Return the size of errors in a mark that tests find, and the effect of smaller ones."""
+    v = observables.vectors
+    sigma_bias = observables.sigma_laser_bias
+    stated, _ = _covariances(v, observables.cov_centres, sigma_bias, requirement)
+    covs = np.where(found.used[..., None, None], stated, np.eye(3))
     is_fixed: Mask = np.asarray(np.isfinite(found.cov_motion).all(axis=(1, 2)))
     used = np.asarray(found.used & is_fixed[:, None])
     inverse = np.where(is_fixed[:, None, None], found.cofactor, 0.0)
-    if wish.method == "paper":
-        J, covs = _circle_equations(v, covs, wish)
+    if requirement.method == "paper":
+        J, lean = _circle_equations(v)
+        covs = _on_circles(J, covs) + requirement.sigma_levelling**2 * lean @ _transposed(lean)
         inverse = inverse[:, 3:, 3:]
         to_position = np.eye(3)
     else:
         J = by_motion(v)
         to_position = np.eye(6)[3:]
     weights = invert_each(covs)[0]
-    weighted = np.swapaxes(weights @ J, -1, -2)
-    tests = block_statistics(
-        np.zeros(J.shape[:-1]), weights, J @ inverse[:, None] @ np.swapaxes(J, -1, -2)
-    )
-    shift = noncentrality(wish.resection.test_level, wish.resection.test_power)
-    effects = to_position @ inverse[:, None] @ weighted
+    tests = block_statistics(np.zeros(J.shape[:-1]), weights, J @ inverse[:, None] @ _transposed(J))
+    shift = noncentrality(requirement.resection.test_level, requirement.resection.test_power)
+    effects = to_position @ inverse[:, None] @ _transposed(weights @ J)
     return Reliability(
         redundancies=np.where(used, tests.redundancies, 0.0),
         detectable_biases=np.where(used, tests.detectable_biases(shift), np.inf),
@@ -397,9 +201,152 @@ def reliability(sighting: Sighting, found: Positions, wish: Requirement) -> Reli
     )
 
 
-def _circle_equations(v: Array, covs: Array, wish: Requirement) -> tuple[Array, Array]:
-    """Return derivatives, (e, n, 2, 3), and covariances of horizontal distances and heights."""
-    circle = circles(v)[1]
-    lean = circle @ by_motion(v)[..., :2]
-    cov = circle @ covs @ np.swapaxes(circle, -1, -2)
-    return circle, cov + wish.sigma_levelling**2 * lean @ np.swapaxes(lean, -1, -2)
+def _covariances(
+    v: Array, cov_centres: Array, sigma_laser_bias: float, requirement: Requirement
+) -> tuple[Array, Array]:
+    """Return the centres' covariances as a survey states them, and the true ones.
+
+    A survey takes the remaining laser biases as independent, along the ranges; true are noise and
+    the error of aiming across them, beside a range error that all centres share.
+    """
+    d2 = np.maximum(np.sum(v**2, axis=-1), 1e-9)[..., None, None]
+    along = v[..., :, None] * v[..., None, :]
+    noise = cov_centres + requirement.sigma_marks**2 * np.eye(3)
+    bias2 = claimed_bias_variance(sigma_laser_bias)
+    stated = noise + requirement.resection.sigma_common**2 * np.eye(3) + bias2 / d2 * along
+    return stated, noise + _SIGMA_AIM**2 * (d2 * np.eye(3) - along)
+
+
+def _free_stations(observables: Observables, requirement: Requirement) -> tuple[Positions, Array]:
+    """Return the positions of free stations, and their motion by a common range error of 1 m."""
+    parts = information(observables, requirement, is_summed=True)
+    normal, cov_rhs, bias_rhs = (part[:, 0] for part in parts)
+    for matrix in (normal, cov_rhs):
+        matrix[:, [0, 1], [0, 1]] += requirement.sigma_levelling**-2
+    cofactor, is_fixed = invert_each(normal)
+    is_fixed &= np.trace(cofactor[:, 3:, 3:], axis1=1, axis2=2) <= LOOSE2
+    cofactor[~is_fixed] = 0.0
+    cov, moved = cofactor @ cov_rhs @ cofactor, (cofactor @ bias_rhs[..., None])[..., 0]
+    cov[~is_fixed] = cofactor[~is_fixed] = np.diag(np.full(6, np.inf))
+    return Positions(cov, cofactor, np.array(observables.is_seen)), moved
+
+
+def _three_circles(observables: Observables, requirement: Requirement) -> tuple[Positions, Array]:
+    """Return positions by three circles, and their motion by a common range error of 1 m."""
+    level2 = requirement.sigma_levelling**2
+    is_cut, three = _choose_three(observables)
+    cov = np.tile(np.diag(np.full(6, np.inf)), (len(is_cut), 1, 1))
+    cofactor, moved = cov.copy(), np.zeros(cov.shape[:2])
+    used = np.zeros(observables.is_seen.shape, dtype=np.bool_)
+    rows = np.flatnonzero(is_cut)
+    pairs = rows[:, None], three[rows]
+    v = observables.vectors[pairs]
+    sigma_bias = observables.sigma_laser_bias
+    stated, true = _covariances(v, observables.cov_centres[pairs], sigma_bias, requirement)
+    J, lean = _circle_equations(v)
+    weights = np.linalg.inv(_on_circles(J, stated) + level2 * lean @ _transposed(lean))
+    weighted = _transposed(J) @ weights
+    inverse = np.linalg.inv((weighted @ J).sum(axis=1))
+    gain = inverse[:, None] @ weighted
+    tilt = (gain @ lean).sum(axis=1)
+    position = (gain @ _on_circles(J, true) @ _transposed(gain)).sum(axis=1)
+    position = position + level2 * tilt @ _transposed(tilt)
+    flat2 = np.sum(v[..., :2] ** 2, axis=2)
+    left = np.stack([-v[..., 1], v[..., 0], np.zeros(v.shape[:-1])], axis=-1) / flat2[..., None]
+    is_fixed = np.trace(position, axis1=1, axis2=2) <= LOOSE2
+    rows, (inverse, gain, tilt, position, left, true, v) = (
+        rows[is_fixed],
+        (part[is_fixed] for part in (inverse, gain, tilt, position, left, true, v)),
+    )
+    used[rows[:, None], three[rows]] = True
+    cov[rows] = 0.0
+    cov[rows, 0, 0] = cov[rows, 1, 1] = level2
+    cov[rows, 2, 2] = np.einsum("eki,ekij,ekj->e", left, true, left) / 9.0
+    cov[rows, 3:, :2] = -level2 * tilt
+    cov[rows, :2, 3:] = -level2 * _transposed(tilt)
+    cov[rows, 3:, 3:] = position
+    cofactor[rows] = cov[rows]
+    cofactor[rows, 3:, 3:] = inverse
+    towards = v / np.linalg.norm(v, axis=2, keepdims=True)
+    moved[rows, 3:] = np.einsum("ekij,ekjl,ekl->ei", gain, J[is_fixed], towards)
+    return Positions(cov, cofactor, used), moved
+
+
+def _choose_three(observables: Observables) -> tuple[Mask, Index]:
+    """Return at which stations three circles cut, and the three marks whose circles cut best."""
+    v = observables.vectors[..., :2]
+    lines = v / np.maximum(np.linalg.norm(v, axis=2, keepdims=True), 1e-9)
+    is_cut, three = np.zeros(len(v), dtype=np.bool_), np.zeros((len(v), 3), dtype=np.intp)
+    _choose_each(lines, observables.is_seen, is_cut, three)
+    return is_cut, three
+
+
+def _circle_equations(v: Array) -> tuple[Array, Array]:
+    """Return derivatives of horizontal distance and height by position, and by roll and pitch."""
+    J = circles(v)[1]
+    return J, J @ by_motion(v)[..., :2]
+
+
+def _on_circles(J: Array, covs: Array) -> Array:
+    """Return covariances of horizontal distances and heights."""
+    return np.asarray(J @ covs @ _transposed(J))
+
+
+def _transposed(stack: Array) -> Array:
+    """Return the transposes of a stack of matrices."""
+    return np.swapaxes(stack, -1, -2)
+
+
+@compiled
+def _choose_each(lines: Array, is_seen: Mask, is_cut: Mask, three: Index) -> None:
+    """Choose three marks for each station."""
+    places, seen = np.empty(lines.shape[1], np.intp), np.empty((lines.shape[1], 2))
+    for e in range(len(lines)):
+        n = 0
+        for m in range(lines.shape[1]):
+            if is_seen[e, m]:
+                places[n], seen[n, 0], seen[n, 1] = m, lines[e, m, 0], lines[e, m, 1]
+                n += 1
+        trace, _ = best_three(seen[:n], -_ANY, _ANY, three[e])
+        is_cut[e] = trace < _TRACE_MOST
+        if is_cut[e]:
+            for k in range(3):
+                three[e, k] = places[three[e, k]]
+
+
+@compiled
+def _add_contributions(
+    vectors: Array, stated: Array, true: Array, is_seen: Mask, out: tuple[Array, Array, Array]
+) -> None:
+    """Add the contribution of each mark to its own row of the output, or all to the only one."""
+    normal, cov_rhs, bias_rhs = out
+    weight, J = np.empty((3, 3)), np.zeros((3, 6))
+    weighted, propagated = np.empty((3, 6)), np.empty((3, 6))
+    J[0, 3] = J[1, 4] = J[2, 5] = 1.0
+    for e in range(len(vectors)):
+        for m in range(vectors.shape[1]):
+            if not is_seen[e, m] or not invert(stated[e, m], weight):
+                continue
+            k = min(m, normal.shape[1] - 1)
+            x, y, z = vectors[e, m, 0], vectors[e, m, 1], vectors[e, m, 2]
+            d = np.sqrt(x * x + y * y + z * z)
+            J[0, 1], J[0, 2], J[1, 0], J[1, 2], J[2, 0], J[2, 1] = z, -y, -z, x, y, -x
+            _multiply(weight, J, weighted)
+            _multiply(true[e, m], weighted, propagated)
+            for i in range(6):
+                along = weighted[0, i] * x + weighted[1, i] * y + weighted[2, i] * z
+                bias_rhs[e, k, i] += along / d
+                for j in range(6):
+                    for a in range(3):
+                        normal[e, k, i, j] += J[a, i] * weighted[a, j]
+                        cov_rhs[e, k, i, j] += weighted[a, i] * propagated[a, j]
+
+
+@compiled
+def _multiply(left: Array, right: Array, out: Array) -> None:
+    """Write the product of a (3, 3) and a (3, 6) matrix."""
+    for i in range(3):
+        for j in range(6):
+            out[i, j] = (
+                left[i, 0] * right[0, j] + left[i, 1] * right[1, j] + left[i, 2] * right[2, j]
+            )

@@ -1,9 +1,9 @@
-"""How much of a sphere the ground and what stands on it leave to be seen.
+"""How much of a sphere is visible over the ground and what stands on it: hides ray marching.
 
-Hides the marching of rays. A sphere's disc is cut into upright strips; for each the highest line
-of sight that something between eye and sphere touches is found. Where even the highest surface
-nearby lies below the lowest line of sight, which is the rule, one coarse march settles it. Where
-the surfaces themselves are known, what the grid would hide is looked at among them.
+A sphere's disc is cut into upright strips; for each the highest line of sight that something
+between station and sphere touches is found. Where even the highest surface nearby lies below the
+lowest line of sight, which is the rule, one coarse march decides. Where the surfaces themselves are
+known, rays are cast at them for what the grid would hide.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from scipy.ndimage import maximum_filter
 
 from spheremark.pipelines.compilation import compiled
 from spheremark.pipelines.model import Array, Mask
-from spheremark.pipelines.placement.plan import Arrangement, Sights, Site
+from spheremark.pipelines.placement.plan import Arrangement, Site, Visibility
 from spheremark.pipelines.simulation.scene import Caster, Mesh, caster
 from spheremark.pipelines.threads import side_by_side
 
@@ -24,90 +24,90 @@ N_STRIPS = 8
 
 _COARSE = 5  # cells from one step of the coarse march to the next
 _BEHIND = 0.05  # [m] something nearer to the sphere than this is its own foot
-_MANY = 400  # pairs of eye and mark that are worth a second thread
+_MANY = 400  # pairs of station and mark that are worth a second thread
 _HIDDEN, _SEEN = 1.0, -1.0
 _N_HEIGHTS = 12  # rays to each strip of a disc
-_REACH = 0.9  # [m] behind a centre that is looked for a surface
-_N_PAIRS = 10_000  # of eye and mark whose rays are cast at a time: some 50 MB
-_TOUCH = 1e-3  # [m] what is this near to a sphere does not hide it
+_REACH = 0.9  # [m] behind a centre that is searched for a surface
+_N_PAIRS = 10_000  # of station and mark whose rays are cast at a time: some 50 MB
+_TOUCH = 1e-3  # [m] from a sphere within which nothing hides it
 
 Ray = tuple[float, float, float, float, float, float]
 """Origin, level direction and length [m]."""
 
 
-def look(site: Site, eyes_site: Array, marks: Arrangement) -> Sights:
-    """Tell what can be seen of marks, each as if it stood there alone.
+def find_visibility(site: Site, stations_site: Array, marks: Arrangement) -> Visibility:
+    """Find what is visible of marks, each as if it stood alone.
 
     Parameters
     ----------
     site : Site
         Ground and what stands on it.
-    eyes_site : (e, 3)
-        Places of the LiDAR [m].
+    stations_site : (s, 3)
+        Positions of the LiDAR [m].
     marks : Arrangement
         The marks.
 
     Returns
     -------
-    Sights
-        For each eye, mark and strip of the disc.
+    Visibility
+        For each station, mark and strip of the disc.
 
     Notes
     -----
-    Cost grows linearly with eyes, marks and distance over cell size. A mark that moves costs only
-    its own column (``Sights.with_mark``).
+    Cost grows linearly with stations, marks and distance over cell size. A mark that moves costs
+    only its own column (``Visibility.joined``).
     """
-    lowest = np.empty((len(eyes_site), len(marks.names), N_STRIPS), np.float32)
+    lowest = np.empty((len(stations_site), len(marks.names), N_STRIPS), np.float32)
     gaps = np.empty(lowest.shape[:2], np.float32)
     grids = (site.surface, _highest_near(site))
     frame = (site.xs[0], site.ys[0], site.cell)
-    eyes, p_site = np.ascontiguousarray(eyes_site), np.ascontiguousarray(marks.p_site)
+    stations, p_site = np.ascontiguousarray(stations_site), np.ascontiguousarray(marks.p_site)
 
     def part(first: int, last: int) -> None:
-        _look(grids, frame, (eyes[first:last], p_site), site.marker_radius, lowest[first:last])
+        _march(grids, frame, (stations[first:last], p_site), site.marker_radius, lowest[first:last])
 
-    side_by_side(part, len(eyes), worth=max(2, _MANY // max(len(p_site), 1)))
+    side_by_side(part, len(stations), worth=max(2, _MANY // max(len(p_site), 1)))
     if site.bodies is not None:
-        _look_again(site.bodies, (eyes, p_site), site.marker_radius, lowest)
-    _look_behind(site.surface, frame, (eyes, p_site), gaps)
-    return Sights(lowest=lowest, gaps=gaps)
+        _refine_by_rays(site.bodies, (stations, p_site), site.marker_radius, lowest)
+    _find_gaps(site.surface, frame, (stations, p_site), gaps)
+    return Visibility(lowest=lowest, gaps=gaps)
 
 
-def _look_again(
+def _refine_by_rays(
     bodies: Mesh, places: tuple[Array, Array], radius: float, lowest: np.ndarray
 ) -> None:
-    """Replace what the grid seems to hide by what the surfaces themselves do.
+    """Replace what the grid hides by what the surfaces themselves hide.
 
-    A strip of which a share is seen counts as seen from so high on that as much of it is left:
-    under a canopy the upper part hides, which is worth as much.
+    A strip of which a share is visible counts as visible above the height that leaves as much of
+    it; under a canopy it is the lower part, which is worth as much.
     """
-    eyes, marks = places
+    stations, marks = places
     lefts = (2.0 * np.arange(N_STRIPS) + 1.0) / N_STRIPS - 1.0
     chords = np.sqrt(1.0 - lefts**2)
     parts = (2.0 * np.arange(_N_HEIGHTS) + 1.0) / _N_HEIGHTS - 1.0
     disc = radius * np.stack(np.broadcast_arrays(lefts[:, None], chords[:, None] * parts), axis=-1)
     e, m = np.nonzero((lowest > _SEEN).any(axis=2))
-    is_far = np.hypot(*(marks[m] - eyes[e])[:, :2].T) >= 2.0 * radius
+    is_far = np.hypot(*(marks[m] - stations[e])[:, :2].T) >= 2.0 * radius
     for first in range(0, int(is_far.sum()), _N_PAIRS):
         some = slice(first, first + _N_PAIRS)
         i, k = e[is_far][some], m[is_far][some]
-        seen = _open_lines(bodies, eyes[i], marks[k], disc.reshape(-1, 2), radius)
+        seen = _open_rays(bodies, stations[i], marks[k], disc.reshape(-1, 2), radius)
         shares = seen.reshape(len(i), N_STRIPS, _N_HEIGHTS).mean(axis=2)
         part = np.where(shares == 1.0, _SEEN, chords * (1.0 - 2.0 * shares))
         lowest[i, k] = np.where(shares == 0.0, _HIDDEN, part)
 
 
-def _open_lines(bodies: Mesh, eyes: Array, marks: Array, disc: Array, radius: float) -> Mask:
+def _open_rays(bodies: Mesh, stations: Array, marks: Array, disc: Array, radius: float) -> Mask:
     """Return which lines of sight to points of marks' discs meet nothing before them, (n, k)."""
-    ahead = marks - eyes
+    ahead = marks - stations
     distances = np.linalg.norm(ahead, axis=1)
     ahead = ahead / distances[:, None]
     left = np.column_stack([-ahead[:, 1], ahead[:, 0], np.zeros(len(ahead))])
     left = left / np.linalg.norm(left, axis=1, keepdims=True)
     up = np.cross(ahead, left)
-    lines = (marks - eyes)[:, None] + disc[:, :1] * left[:, None] + disc[:, 1:] * up[:, None]
+    lines = (marks - stations)[:, None] + disc[:, :1] * left[:, None] + disc[:, 1:] * up[:, None]
     rays = np.empty((*lines.shape[:2], 6), np.float32)
-    rays[..., :3] = eyes[:, None]
+    rays[..., :3] = stations[:, None]
     rays[..., 3:] = lines / np.linalg.norm(lines, axis=2, keepdims=True)
     met, _ = _caster(bodies)(rays.reshape(-1, 6))
     return np.asarray(met.reshape(lines.shape[:2]) >= distances[:, None] - radius - _TOUCH)
@@ -115,21 +115,18 @@ def _open_lines(bodies: Mesh, eyes: Array, marks: Array, disc: Array, radius: fl
 
 @lru_cache(maxsize=4)
 def _caster(bodies: Mesh) -> Caster:
-    """Return what casts rays against surfaces; growing its search tree takes a second."""
+    """Return the ray caster of surfaces; its search tree takes a second to build."""
     return caster.__wrapped__(bodies)
 
 
-def behind_others(site: Site, eyes_site: Array, marks: Arrangement, sights: Sights) -> Sights:
-    """Tell what is seen of marks that also stand in each other's way.
-
-    Notes
-    -----
-    Whatever of a strip lies below the top of a sphere before it counts as hidden.
-    """
-    lowest = sights.lowest.copy()
+def with_occlusion(
+    site: Site, stations_site: Array, marks: Arrangement, visibility: Visibility
+) -> Visibility:
+    """Return the visibility of marks that also hide each other, up to the top of a sphere."""
+    lowest = visibility.lowest.copy()
     sizes = (site.marker_radius, site.pole_radius)
-    _shade(np.ascontiguousarray(eyes_site), np.ascontiguousarray(marks.p_site), sizes, lowest)
-    return Sights(lowest=lowest, gaps=sights.gaps.copy())
+    _occlude(np.ascontiguousarray(stations_site), np.ascontiguousarray(marks.p_site), sizes, lowest)
+    return Visibility(lowest=lowest, gaps=visibility.gaps.copy())
 
 
 @lru_cache(maxsize=4)
@@ -187,7 +184,7 @@ def _horizon(surface: Array, frame: tuple[float, float, float], ray: Ray) -> flo
 
 
 @compiled
-def _look(
+def _march(
     grids: tuple[Array, Array],
     frame: tuple[float, float, float],
     places: tuple[Array, Array],
@@ -196,10 +193,10 @@ def _look(
 ) -> None:
     """Fill in the lowest height, in radii, from which on each strip of each disc is seen."""
     surface, coarse = grids
-    eyes, marks = places
+    stations, marks = places
     n_strips = lowest.shape[2]
-    for e in range(len(eyes)):
-        x, y, z = eyes[e, 0], eyes[e, 1], eyes[e, 2]
+    for e in range(len(stations)):
+        x, y, z = stations[e, 0], stations[e, 1], stations[e, 2]
         for m in range(len(marks)):
             dx, dy, dz = marks[m, 0] - x, marks[m, 1] - y, marks[m, 2] - z
             flat = np.hypot(dx, dy)
@@ -223,43 +220,37 @@ def _look(
 
 
 @compiled
-def _look_behind(
+def _find_gaps(
     surface: Array,
     frame: tuple[float, float, float],
     places: tuple[Array, Array],
     gaps: np.ndarray,
 ) -> None:
     """Fill in how far behind each centre the line of sight to it meets the surface."""
-    eyes, marks = places
+    stations, marks = places
     x0, y0, cell = frame
     step = min(0.5 * cell, 0.1)
-    for e in range(len(eyes)):
+    for e in range(len(stations)):
         for m in range(len(marks)):
-            dx, dy, dz = (
-                marks[m, 0] - eyes[e, 0],
-                marks[m, 1] - eyes[e, 1],
-                marks[m, 2] - eyes[e, 2],
-            )
+            mx, my, mz = marks[m, 0], marks[m, 1], marks[m, 2]
+            dx, dy, dz = mx - stations[e, 0], my - stations[e, 1], mz - stations[e, 2]
             flat = max(np.hypot(dx, dy), 1e-9)
             gaps[e, m] = np.inf
             for k in range(1, int(_REACH / step) + 1):
                 s = k * step
-                x, y = marks[m, 0] + s * dx / flat, marks[m, 1] + s * dy / flat
-                if (
-                    _height(surface, (x - x0) / cell, (y - y0) / cell)
-                    >= marks[m, 2] + s * dz / flat
-                ):
+                u, v = (mx + s * dx / flat - x0) / cell, (my + s * dy / flat - y0) / cell
+                if _height(surface, u, v) >= mz + s * dz / flat:
                     gaps[e, m] = s
                     break
 
 
 @compiled
-def _shade(eyes: Array, marks: Array, sizes: tuple[float, float], lowest: np.ndarray) -> None:
+def _occlude(stations: Array, marks: Array, sizes: tuple[float, float], lowest: np.ndarray) -> None:
     """Raise the lowest seen heights by the spheres and poles that stand before a mark."""
     radius, pole = sizes
     n_strips = lowest.shape[2]
-    for e in range(len(eyes)):
-        x, y, z = eyes[e, 0], eyes[e, 1], eyes[e, 2]
+    for e in range(len(stations)):
+        x, y, z = stations[e, 0], stations[e, 1], stations[e, 2]
         for m in range(len(marks)):
             dx, dy, dz = marks[m, 0] - x, marks[m, 1] - y, marks[m, 2] - z
             flat = np.hypot(dx, dy)

@@ -105,7 +105,7 @@ def evaluate(
     from spheremark.service.serialise import plans as planning
     from spheremark.storage.imports.plan_files import read_marks
 
-    wish = siting.Wanted(
+    requirement = siting.Wanted(
         tolerance=tolerance_m,
         method=method,
         sigma_marks=sigma_marks_m,
@@ -115,7 +115,9 @@ def evaluate(
         rest_revolutions=rest_revolutions,
     )
     ground = siting.ground_of(scenario, seed, terrain, stops)
-    asked = siting.put_together(ground, read_marks(marks), wish, _ask(data, server, survey), survey)
+    asked = siting.put_together(
+        ground, read_marks(marks), requirement, _ask(data, server, survey), survey
+    )
     answer = siting.evaluate(asked)
     if suggest:
         answer["one_more"] = siting.one_more(asked)
@@ -161,7 +163,7 @@ def optimise(
     from spheremark.service.planning import plans as siting
     from spheremark.service.serialise import plans as planning
 
-    wish = siting.Wanted(
+    requirement = siting.Wanted(
         tolerance=tolerance_m,
         method=method,
         sigma_marks=sigma_marks_m,
@@ -171,7 +173,7 @@ def optimise(
         rest_revolutions=rest_revolutions,
     )
     ground = siting.ground_of(scenario, seed, terrain, stops, keep_out=keep_out, poles=pole_m)
-    asked = siting.put_together(ground, None, wish, _ask(data, server, survey), survey)
+    asked = siting.put_together(ground, None, requirement, _ask(data, server, survey), survey)
     rules = siting.rules_of(reach_m, slope_deg, spacing_m, is_inside_allowed=inside)
     goal = siting.goal_of(marks, probability, is_robust=robust)
     _deliver(siting.optimise(asked, rules, goal), csv, geojson, as_json=as_json, planning=planning)

@@ -130,7 +130,7 @@ def _compile_planner() -> None:
         stops=ground.stops,
         marks=ground.marks,
         model=sensor_model(Sensor(), ground.site.marker_radius),
-        wish=Requirement(),
+        requirement=Requirement(),
     )
     siting.evaluate(asked)
     siting.optimise(asked, PlaceRules(spacing=4.0), Goal(n_marks=3))

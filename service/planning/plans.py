@@ -29,7 +29,7 @@ from spheremark.service.planning.requests import (
     stops_at,
     terrain_ground,
 )
-from spheremark.service.serialise.plans import Plain, evaluation_answer, marks_answer
+from spheremark.service.serialise.plans import Plain, evaluation_json, marks_json
 from spheremark.storage.imports.plan_files import read_keep_out, read_stops
 
 _SEED = 0  # of the optimiser's later starts
@@ -112,7 +112,7 @@ def put_together(
         stops=ground.stops,
         marks=Arrangement.numbered(np.zeros((0, 3))) if marks is None else marks,
         model=model,
-        wish=Requirement(
+        requirement=Requirement(
             tolerance=wanted.tolerance, method=wanted.method, sigma_marks=wanted.sigma_marks
         ),
     )
@@ -138,8 +138,8 @@ def goal_of(n_marks: int | None, probability: float, *, is_robust: bool) -> Goal
 def evaluate(asked: Asked) -> Plain:
     """Return what an arrangement promises."""
     site = asked.ground.site
-    found = placement.evaluate(site, asked.stops, asked.marks, asked.model, asked.wish)
-    return evaluation_answer(site, asked.model, found)
+    found = placement.evaluate(site, asked.stops, asked.marks, asked.model, asked.requirement)
+    return evaluation_json(site, asked.model, found)
 
 
 def optimise(asked: Asked, rules: PlaceRules, goal: Goal) -> Plain:
@@ -148,8 +148,8 @@ def optimise(asked: Asked, rules: PlaceRules, goal: Goal) -> Plain:
     placement.check_sizes(len(stops.names), goal.n_marks or 0)
     candidates = placement.find_candidates(site, stops, rules)
     rng = np.random.default_rng(_SEED)
-    found = placement.optimise(site, stops, candidates, asked.model, asked.wish, goal, rng)
-    answer = evaluation_answer(site, asked.model, found.evaluation)
+    found = placement.optimise(site, stops, candidates, asked.model, asked.requirement, goal, rng)
+    answer = evaluation_json(site, asked.model, found.evaluation)
     return answer | {"optimum": optimum_answer(found, goal), "notes": _notes(found, goal)}
 
 
@@ -199,9 +199,9 @@ def one_more(asked: Asked, rules: PlaceRules | None = None) -> Plain:
     placement.check_sizes(len(asked.stops.names), len(asked.marks.names) + 1)
     candidates = placement.find_candidates(site, asked.stops, rules or PlaceRules())
     found = placement.propose_mark(
-        site, asked.stops, asked.marks, candidates, asked.model, asked.wish
+        site, asked.stops, asked.marks, candidates, asked.model, asked.requirement
     )
-    mark = marks_answer(site, found.after.marks)[-1]
+    mark = marks_json(site, found.after.marks)[-1]
     return mark | {
         "worst_sigma_3d_before_m": _number(found.before.worst_sigma_3d),
         "worst_sigma_3d_m": _number(found.after.worst_sigma_3d),

@@ -14,16 +14,16 @@ from spheremark.pipelines import published as study
 from spheremark.pipelines.errors import InputError
 from spheremark.pipelines.placement import (
     CentreModel,
-    Share,
-    Trial,
+    PassRate,
+    RandomPlanSpec,
     by_number,
     by_worst_angle,
     errors_by_angle,
-    try_at_random,
+    simulate_random_plans,
 )
 from spheremark.pipelines.sphere import METHODS
 from spheremark.service.planning.centre_models import Ask, quoted
-from spheremark.service.serialise.plans import Plain, model_answer
+from spheremark.service.serialise.plans import Plain, model_json
 
 _ANGLES_DEG = np.arange(10.0, 171.0, 2.5)
 _BIN_DEG = 10  # of included angles of results
@@ -64,14 +64,14 @@ class Wanted:
     tolerance: float = 0.03
     seed: int = 0
 
-    def trial(self, limits: Plain) -> Trial:
+    def trial(self, limits: Plain) -> RandomPlanSpec:
         """Return the trial within the limits of results."""
         farthest = limits["greatest_distance_m"] if self.distance is None else self.distance
         low, high = (
             float(np.radians(limits[key])) if given is None else given
             for given, key in ((self.angle_min, "angle_min_deg"), (self.angle_max, "angle_max_deg"))
         )
-        return Trial(
+        return RandomPlanSpec(
             n_arrangements=self.n_arrangements,
             n_marks=self.n_marks,
             distances=(min(2.0, farthest / 2), farthest),
@@ -143,9 +143,9 @@ def _window(rows: list[Plain], tolerance: float) -> tuple[float, float] | None:
     return float(low), float(high + _BIN_DEG)
 
 
-def run(trial: Trial, model: CentreModel, limits: Plain) -> Plain:
+def run(trial: RandomPlanSpec, model: CentreModel, limits: Plain) -> Plain:
     """Try arrangements at random and say what came of them."""
-    result = try_at_random(trial, model)
+    result = simulate_random_plans(trial, model)
     error = trial.error or 0.017
     angles = np.radians(_ANGLES_DEG)
     curve = errors_by_angle(angles, error, study.GRANTED_DISTANCE)
@@ -156,7 +156,7 @@ def run(trial: Trial, model: CentreModel, limits: Plain) -> Plain:
         "seed": trial.seed,
         "tolerance_m": trial.tolerance,
         "error_per_axis_m": trial.error,
-        "model": model_answer(model) if trial.error is None else None,
+        "model": model_json(model) if trial.error is None else None,
         "distance_min_m": trial.distances[0],
         "distance_max_m": trial.distances[1],
         "angle_min_deg": float(np.degrees(trial.angles[0])),
@@ -197,7 +197,7 @@ def _kept_window(curve: np.ndarray, tolerance: float) -> list[float] | None:
     return [float(kept.min()), float(kept.max())] if len(kept) else None
 
 
-def _share(row: Share) -> Plain:
+def _share(row: PassRate) -> Plain:
     """Return how many of a class pass."""
     found = {
         "pass_rate": row.share,

@@ -24,13 +24,13 @@ from spheremark.pipelines.placement import (
     CentreModel,
     Requirement,
     Sensor,
-    Sights,
     Site,
     Stops,
+    Visibility,
     evaluate,
-    field_eyes,
     field_map,
-    look,
+    find_visibility,
+    map_stations,
     marks_of_field,
     sensor_model,
     site_of_field,
@@ -38,7 +38,7 @@ from spheremark.pipelines.placement import (
 )
 from spheremark.pipelines.simulation import scenario
 from spheremark.service.planning.centre_models import model_of_surveys
-from spheremark.service.serialise.plans import Plain, evaluation_answer, field_answer
+from spheremark.service.serialise.plans import Plain, evaluation_json, map_json
 from spheremark.storage.catalogue import plans as kept
 from spheremark.storage.catalogue.catalogue import Catalogue
 from spheremark.storage.imports.terrain import open_terrain
@@ -94,7 +94,7 @@ class Asked:
     stops: Stops
     marks: Arrangement
     model: CentreModel
-    wish: Requirement
+    requirement: Requirement
 
 
 class Place(NamedTuple):
@@ -203,24 +203,28 @@ class Lookout:
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
-        self._known: OrderedDict[tuple[str, bytes, bytes], Sights] = OrderedDict()
+        self._known: OrderedDict[tuple[str, bytes, bytes], Visibility] = OrderedDict()
 
-    def look(self, ground: Ground, eyes_site: Array, marks: Arrangement) -> Sights:
-        """Return what ``pipelines.placement.look`` does."""
-        eyes = hashlib.sha256(np.ascontiguousarray(eyes_site).tobytes()).digest()
-        keys = [(ground.key, eyes, p.tobytes()) for p in marks.p_site]
+    def find_visibility(
+        self, ground: Ground, stations_site: Array, marks: Arrangement
+    ) -> Visibility:
+        """Return what ``pipelines.placement.find_visibility`` does."""
+        stations = hashlib.sha256(np.ascontiguousarray(stations_site).tobytes()).digest()
+        keys = [(ground.key, stations, p.tobytes()) for p in marks.p_site]
         with self._lock:
             known = {key: self._known[key] for key in keys if key in self._known}
         new = [k for k, key in enumerate(keys) if key not in known]
         if new or not keys:
-            fresh = look(ground.site, eyes_site, marks.rows(np.array(new, dtype=np.intp)))
+            fresh = find_visibility(
+                ground.site, stations_site, marks.rows(np.array(new, dtype=np.intp))
+            )
             if not keys:
                 return fresh
             known |= {keys[k]: fresh.rows(np.array([i])) for i, k in enumerate(new)}
             self._remember({keys[k]: known[keys[k]] for k in new})
-        return Sights.joined([known[key] for key in keys])
+        return Visibility.joined([known[key] for key in keys])
 
-    def _remember(self, fresh: dict[tuple[str, bytes, bytes], Sights]) -> None:
+    def _remember(self, fresh: dict[tuple[str, bytes, bytes], Visibility]) -> None:
         """Keep what is new, and forget what is oldest."""
         with self._lock:
             self._known.update(fresh)
@@ -276,10 +280,12 @@ class Planner:
 
     def evaluate(self, asked: Asked) -> Plain:
         """Return what an arrangement promises at its stops."""
-        sights = self._lookout.look(asked.ground, asked.stops.p_site, asked.marks)
+        visibility = self._lookout.look(asked.ground, asked.stops.p_site, asked.marks)
         site = asked.ground.site
-        found = evaluate(site, asked.stops, asked.marks, asked.model, asked.wish, sights=sights)
-        return evaluation_answer(site, asked.model, found)
+        found = evaluate(
+            site, asked.stops, asked.marks, asked.model, asked.requirement, visibility=visibility
+        )
+        return evaluation_json(site, asked.model, found)
 
     def field(self, asked: Asked, n_across: int) -> Plain:
         """Return what an arrangement promises on a grid over the part that a map shows."""
@@ -287,8 +293,10 @@ class Planner:
         step = max(x1 - x0, y1 - y0) / n_across
         xs, ys = (np.arange(a + step / 2, b, step) for a, b in ((x0, x1), (y0, y1)))
         site = asked.ground.site
-        eyes, _ = field_eyes(site, xs, ys)
-        sights = self._lookout.look(asked.ground, eyes, asked.marks)
-        return field_answer(
-            field_map(site, xs, ys, asked.marks, asked.model, asked.wish, sights=sights)
+        stations, _ = map_stations(site, xs, ys)
+        visibility = self._lookout.look(asked.ground, stations, asked.marks)
+        return map_json(
+            field_map(
+                site, xs, ys, asked.marks, asked.model, asked.requirement, visibility=visibility
+            )
         )

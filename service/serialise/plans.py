@@ -26,16 +26,16 @@ from spheremark.pipelines.placement import (
 Plain = dict[str, Any]
 
 
-def evaluation_answer(site: Site, model: CentreModel, found: Evaluation) -> Plain:
+def evaluation_json(site: Site, model: CentreModel, found: Evaluation) -> Plain:
     """Return what an arrangement promises."""
     worst = int(np.argmax(np.where(np.isfinite(found.sigma_3d), found.sigma_3d, np.inf)))
     return {
         "site": {"name": site.name},
         "method": found.requirement.method,
         "tolerance_m": found.requirement.tolerance,
-        "model": model_answer(model),
-        "marks": marks_answer(site, found.marks),
-        "stops": [stop_answer(found, i) for i in range(len(found.stops.names))],
+        "model": model_json(model),
+        "marks": marks_json(site, found.marks),
+        "stops": [stop_json(found, i) for i in range(len(found.stops.names))],
         "worst_stop": found.stops.names[worst],
         "worst_sigma_3d_m": _number(found.worst_sigma_3d),
         "worst_probability_within_tolerance": found.worst_probability,
@@ -43,7 +43,7 @@ def evaluation_answer(site: Site, model: CentreModel, found: Evaluation) -> Plai
     }
 
 
-def marks_answer(site: Site, marks: Arrangement) -> list[Plain]:
+def marks_json(site: Site, marks: Arrangement) -> list[Plain]:
     """Return marks with the ground under them and the poles that they need."""
     ground = site.ground_at(marks.p_site)
     return [
@@ -57,7 +57,7 @@ def marks_answer(site: Site, marks: Arrangement) -> list[Plain]:
     ]
 
 
-def stop_answer(found: Evaluation, i: int) -> Plain:
+def stop_json(found: Evaluation, i: int) -> Plain:
     """Return what an arrangement promises at one stop."""
     marks = found.marks.names
     low, high = np.degrees(found.angles[i])
@@ -94,7 +94,7 @@ def _sighting(found: Evaluation, i: int, k: int) -> Plain:
     }
 
 
-def field_answer(field: FieldMap) -> Plain:
+def map_json(field: FieldMap) -> Plain:
     """Return what an arrangement promises on a grid of places, rows along y."""
     return {
         "x_m": _numbers(field.xs),
@@ -105,7 +105,7 @@ def field_answer(field: FieldMap) -> Plain:
     }
 
 
-def site_answer(site: Site, stops: Stops, marks: Arrangement, *, n_across: int) -> Plain:
+def site_json(site: Site, stops: Stops, marks: Arrangement, *, n_across: int) -> Plain:
     """Return a field to plan on: its ground, thinned, and what one may begin with."""
     step = max(1, math.ceil(max(site.ground.shape) / n_across))
     return {
@@ -124,11 +124,11 @@ def site_answer(site: Site, stops: Stops, marks: Arrangement, *, n_across: int) 
             {"name": name, "position_m": _numbers(p)}
             for name, p in zip(stops.names, stops.p_site, strict=True)
         ],
-        "marks": marks_answer(site, marks),
+        "marks": marks_json(site, marks),
     }
 
 
-def model_answer(model: CentreModel) -> Plain:
+def model_json(model: CentreModel) -> Plain:
     """Return which model of centres predicted, and which rows it came from."""
     origin = model.provenance
     return {

@@ -16,7 +16,12 @@ from spheremark.pipelines.errors import (
     InputError,
     NotFoundError,
 )
-from spheremark.pipelines.placement import Trial, errors_by_angle, sensor_model, try_at_random
+from spheremark.pipelines.placement import (
+    RandomPlanSpec,
+    errors_by_angle,
+    sensor_model,
+    simulate_random_plans,
+)
 from spheremark.pipelines.placement.sensor import Sensor
 from spheremark.pipelines.published import TABLE_3
 from spheremark.service.cli.main import app
@@ -196,16 +201,22 @@ def test_three_circles_give_the_study_s_table():
 
 def test_the_study_s_window_parts_what_passes_from_what_does_not():
     window = (np.radians(30.0), np.radians(150.0))
-    result = try_at_random(Trial(n_arrangements=30_000, n_marks=(3, 3), angles=window))
+    result = simulate_random_plans(
+        RandomPlanSpec(n_arrangements=30_000, n_marks=(3, 3), angles=window)
+    )
     inside = result.passes[result.is_in_window].mean()
     outside = result.passes[~result.is_in_window].mean()
     assert inside > 0.83 > 0.75 > outside
-    again = try_at_random(Trial(n_arrangements=30_000, n_marks=(3, 3), angles=window))
+    again = simulate_random_plans(
+        RandomPlanSpec(n_arrangements=30_000, n_marks=(3, 3), angles=window)
+    )
     np.testing.assert_array_equal(result.errors_3d, again.errors_3d)
 
 
 def test_centres_as_good_as_ours_pass_whatever_the_angles():
-    result = try_at_random(Trial(n_arrangements=5_000, error=None), sensor_model(Sensor()))
+    result = simulate_random_plans(
+        RandomPlanSpec(n_arrangements=5_000, error=None), sensor_model(Sensor())
+    )
     assert result.passes.mean() > 0.999
 
 

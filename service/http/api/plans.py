@@ -28,7 +28,7 @@ from spheremark.service.planning.requests import (
     marks_at,
     stops_at,
 )
-from spheremark.service.serialise.plans import Plain, site_answer, to_csv, to_geojson
+from spheremark.service.serialise.plans import Plain, site_json, to_csv, to_geojson
 from spheremark.storage.catalogue import plans as kept
 from spheremark.storage.imports.terrain import KEPT, check_ending, read_terrain, write_grid
 
@@ -229,7 +229,7 @@ def sites(service: Service) -> list[Plain]:
 def get_site(site: SiteKey, service: Current) -> Said:
     """Return a field: its ground, its stops, and marks to begin with."""
     ground = service.planner.ground(site)
-    answer = site_answer(ground.site, ground.stops, ground.marks, n_across=_GROUND_ACROSS)
+    answer = site_json(ground.site, ground.stops, ground.marks, n_across=_GROUND_ACROSS)
     return Said.model_validate({"key": ground.key, **answer, "extent_m": list(ground.view)})
 
 
@@ -366,7 +366,7 @@ def _asked(service: Service, plan: Plan) -> Asked:
         else stops_at(ground.site, [(one.name, one.x_m, one.y_m) for one in plan.stops]),
         marks=marks_at(ground.site, [_place(one) for one in plan.marks]),
         model=service.planner.model(plan.model, plan.to_sensor(), ground.site.marker_radius),
-        wish=Requirement(tolerance=plan.tolerance_m, method=plan.method),
+        requirement=Requirement(tolerance=plan.tolerance_m, method=plan.method),
     )
 
 

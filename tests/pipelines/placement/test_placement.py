@@ -22,13 +22,14 @@ from spheremark.pipelines.placement import (
     Sensor,
     Site,
     Stops,
+    Visibility,
     best_without_search,
     draw_arrangement,
     evaluate,
     field_map,
     find_candidates,
+    find_visibility,
     fitted_model,
-    look,
     marks_of_field,
     optimise,
     propose_mark,
@@ -39,7 +40,7 @@ from spheremark.pipelines.placement import (
 )
 from spheremark.pipelines.placement.bounds import least_sigmas, widest_sigma
 from spheremark.pipelines.placement.centre_model import expect_centres
-from spheremark.pipelines.placement.evaluation import sighting_of
+from spheremark.pipelines.placement.evaluation import predict_observables
 from spheremark.pipelines.placement.probability import probability_within
 from spheremark.pipelines.placement.station_covariance import (
     claimed_bias_variance,
@@ -126,9 +127,9 @@ def forecast_and_fix(method):
     marks = Arrangement.numbered(
         np.array([[6.0, 1.0, 1.2], [-1.5, 7.0, 0.9], [-6.5, -2.0, 1.4], [2.0, -7.5, 0.8]])
     )
-    stops, wish = one_stop((0.3, -0.2, 1.05)), Requirement(method=method)
-    sights = look(flat_site(), stops.p_site, marks)
-    centres, sighting = sighting_of(stops.p_site, marks, MODEL, wish, sights)
+    stops, requirement = one_stop((0.3, -0.2, 1.05)), Requirement(method=method)
+    visibility = find_visibility(flat_site(), stops.p_site, marks)
+    centres, observables = predict_observables(stops.p_site, marks, MODEL, requirement, visibility)
     v = marks.p_site - stops.p_site[0]
     along = v[:, :, None] * v[:, None, :] / np.sum(v**2, axis=1)[:, None, None]
     covs = centres.cov_site[0] + claimed_bias_variance(0.003) * along
@@ -136,12 +137,14 @@ def forecast_and_fix(method):
         method="along_beam",
         fits=fits_at(stops.p_site[0], marks, covs),
         rejected=(),
-        levelling=Levelling(roll=0.0, pitch=0.0, sigma=wish.sigma_levelling, is_measured=True),
+        levelling=Levelling(
+            roll=0.0, pitch=0.0, sigma=requirement.sigma_levelling, is_measured=True
+        ),
     )
     control = ControlMarks(
         names=marks.names, p_site=np.array(marks.p_site), cov_p_site=np.zeros((4, 3, 3))
     )
-    return predict_positions(sighting, wish), resect(method, fits, control, _OWN_ERRORS)
+    return predict_positions(observables, requirement), resect(method, fits, control, _OWN_ERRORS)
 
 
 def test_a_forecast_claims_what_the_resection_of_such_centres_claims():
@@ -217,7 +220,7 @@ def test_a_wall_hides_what_stands_behind_it_and_nothing_else():
 
 
 def test_a_ridge_hides_the_lower_half():
-    """A ridge whose top is on the line from the eye to the centre."""
+    """A ridge whose top is on the line from the station to the centre."""
     lines = np.arange(-30.0, 30.1, 0.2)
     surface = np.zeros((len(lines), len(lines)))
     surface[:, np.abs(lines - 4.0) < 0.35] = 1.025  # between heights 1.05 and 1.0 at 8 m
@@ -262,11 +265,11 @@ def test_a_wall_close_behind_a_sphere_makes_it_worse_and_one_that_touches_it_los
     site = site_of_grid("a wall", lines, lines.copy(), ground, surface=surface)
     marks = Arrangement.numbered(np.array([[7.85, 0.0, 1.0], [7.4, 0.0, 1.0], [6.5, 0.0, 1.0]]))
     stops = one_stop((0.0, 0.0, 1.05))
-    sights = look(site, stops.p_site, marks)
-    assert_allclose(sights.gaps[0, 1], 0.55, atol=0.06)
-    assert np.isinf(sights.gaps[0, 2])
-    alone = replace(sights, gaps=np.full((1, 3), np.inf, np.float32))
-    near, free = (expect_centres(MODEL, stops.p_site, marks, one) for one in (sights, alone))
+    visibility = find_visibility(site, stops.p_site, marks)
+    assert_allclose(visibility.gaps[0, 1], 0.55, atol=0.06)
+    assert np.isinf(visibility.gaps[0, 2])
+    alone = replace(visibility, gaps=np.full((1, 3), np.inf, np.float32))
+    near, free = (expect_centres(MODEL, stops.p_site, marks, one) for one in (visibility, alone))
     traces = np.trace(near.cov_site / free.cov_site, axis1=2, axis2=3)[0] / 3
     assert traces[1] > 2.0 > traces[2] == 1.0
     assert near.n_points[0, 1] < 0.9 * free.n_points[0, 1]
@@ -280,14 +283,16 @@ def test_a_mark_stands_in_the_way_of_one_behind_it():
     assert found.shares[0, 1] < 0.05
 
 
-def test_moving_one_mark_needs_a_look_at_that_mark_only():
+def test_a_moved_mark_needs_its_own_visibility_only():
     site, stops, marks = flat_site(), one_stop(), ring(5, 6.0)
     moved = np.array(marks.p_site)
     moved[2] += (0.5, 0.2, 0.1)
     other = Arrangement(names=marks.names, p_site=moved)
-    sights = look(site, stops.p_site, marks)
-    fresh = look(site, stops.p_site, other.rows(np.array([2])))
-    again = evaluate(site, stops, other, MODEL, Requirement(), sights=sights.with_mark(2, fresh))
+    visibility = find_visibility(site, stops.p_site, marks)
+    fresh = find_visibility(site, stops.p_site, other.rows(np.array([2])))
+    columns = [visibility.rows(np.arange(2)), fresh, visibility.rows(np.arange(3, 5))]
+    joined = Visibility.joined(columns)
+    again = evaluate(site, stops, other, MODEL, Requirement(), visibility=joined)
     whole = evaluate(site, stops, other, MODEL, Requirement())
     assert_allclose(again.cov_p_site, whole.cov_p_site, rtol=1e-12)
 
@@ -436,26 +441,26 @@ def test_a_small_case_comes_near_the_best_of_all():
 def test_the_least_number_keeps_the_tolerance_and_one_less_does_not():
     site, stops = flat_site(), one_stop((0.0, 0.0, 1.05), (4.0, 0.0, 1.05))
     candidates = find_candidates(site, stops, PlaceRules(reach=8.0, spacing=2.0))
-    wish, rng = Requirement(tolerance=0.0011), np.random.default_rng(0)
-    found = optimise(site, stops, candidates, MODEL, wish, Goal(), rng)
+    requirement, rng = Requirement(tolerance=0.0011), np.random.default_rng(0)
+    found = optimise(site, stops, candidates, MODEL, requirement, Goal(), rng)
     n = len(found.evaluation.marks.names)
     assert found.is_kept
     assert found.evaluation.worst_probability >= 0.95
-    fewer = optimise(site, stops, candidates, MODEL, wish, Goal(n_marks=n - 1), rng)
+    fewer = optimise(site, stops, candidates, MODEL, requirement, Goal(n_marks=n - 1), rng)
     assert not fewer.is_kept
 
 
 def test_a_robust_arrangement_survives_the_loss_of_any_mark():
     site, stops = flat_site(), one_stop((0.0, 0.0, 1.05), (4.0, 0.0, 1.05))
     candidates = find_candidates(site, stops, PlaceRules(reach=8.0, spacing=2.0))
-    wish = Requirement()
+    requirement = Requirement()
     found = optimise(
-        site, stops, candidates, MODEL, wish, Goal(n_marks=4), np.random.default_rng(0)
+        site, stops, candidates, MODEL, requirement, Goal(n_marks=4), np.random.default_rng(0)
     )
     marks = found.evaluation.marks
     for k in range(4):
         rest = marks.rows(np.delete(np.arange(4), k))
-        assert evaluate(site, stops, rest, MODEL, wish).worst_probability >= 0.95
+        assert evaluate(site, stops, rest, MODEL, requirement).worst_probability >= 0.95
 
 
 def test_an_impossible_tolerance_is_answered_with_the_bound():
@@ -479,18 +484,20 @@ def test_what_no_arrangement_can_is_refused_without_a_search():
     candidates = find_candidates(site, stops, PlaceRules(reach=8.0, spacing=2.0))
     rng = np.random.default_rng(1)
     for method in PLAN_METHODS:
-        wish = Requirement(method=method)
-        sights = look(site, stops.p_site, candidates.arrangement)
-        _, seen = sighting_of(stops.p_site, candidates.arrangement, MODEL, wish, sights)
-        bound = least_sigmas(seen, wish)
+        requirement = Requirement(method=method)
+        visibility = find_visibility(site, stops.p_site, candidates.arrangement)
+        _, seen = predict_observables(
+            stops.p_site, candidates.arrangement, MODEL, requirement, visibility
+        )
+        bound = least_sigmas(seen, requirement)
         for k in (3, 4, 7, 12):
             for _ in range(10):
                 drawn = draw_arrangement(candidates, k, rng)
-                found = evaluate(site, stops, drawn, MODEL, wish)
+                found = evaluate(site, stops, drawn, MODEL, requirement)
                 assert (found.sigma_3d >= bound[:, k - 1]).all()
-    wish = Requirement(tolerance=1.5 * float(bound[:, 39].max()))
+    requirement = Requirement(tolerance=1.5 * float(bound[:, 39].max()))
     with pytest.raises(DegenerateGeometryError, match="No arrangement of 3 marks keeps"):
-        optimise(site, stops, candidates, MODEL, wish, Goal(most=3), rng)
+        optimise(site, stops, candidates, MODEL, requirement, Goal(most=3), rng)
 
 
 def test_the_widest_sigma_is_that_of_an_even_error_for_high_probabilities():
@@ -562,12 +569,12 @@ def rows_of(n_stops, per_stop, factor, rng):
     marks = Arrangement(
         names=tuple(map(str, range(n))), p_site=np.column_stack([ranges, np.zeros((n, 2))])
     )
-    sights = look(
+    visibility = find_visibility(
         flat_site(),
         np.array([[0.0, 0.0, 1.0]]),
         Arrangement.numbered(np.column_stack([ranges, np.zeros(n), np.ones(n)])),
     )
-    centres = expect_centres(MODEL, np.zeros((1, 3)), marks, sights)
+    centres = expect_centres(MODEL, np.zeros((1, 3)), marks, visibility)
     variances = np.einsum("nii->ni", centres.cov_site[0]) * factor
     variances = variances * np.exp(rng.normal(0.0, 0.1, variances.shape))
     variances[:, 0] += claimed_bias_variance(0.003)
@@ -615,7 +622,7 @@ def test_few_fits_are_believed_less_than_many():
     assert sigmas[0] > sigmas[1]
 
 
-def test_wrong_wishes_are_refused():
+def test_wrong_requirements_are_refused():
     for wrong in ({"tolerance": 0.0}, {"method": "by magic"}, {"sigma_levelling": -1.0}):
         with pytest.raises(ConfigError):
             Requirement(**wrong)
