@@ -204,8 +204,8 @@ def expect_centres(
     areas, worth = table.areas, table.information
     _add_visible(place, is_near, visibility.lowest, share_of_disc, (areas, worth), sums)
     seen, whole = sums[..., 6], sums[..., 7]
-    density = float(np.exp(model.log_count[0])) / (sensor.line_spacing * sensor.pulse_spacing)
-    density = np.where(is_near, density / (d * flat), 0.0)
+    per_sr = float(np.exp(model.log_count[0])) / (sensor.line_spacing * sensor.pulse_spacing)
+    density = np.where(is_near, per_sr / (d * flat), 0.0)
     shares = np.where(is_near, seen / np.where(whole > 0.0, whole, 1.0), 0.0)
     n_points, lost = density * seen, np.where(is_near, _at(table.lost[:, 1], place), 1.0)
     local, is_known = _local_covariances(density[..., None] * sums[..., :6])

@@ -578,7 +578,7 @@ def _sigmas(problem: _Problem, chosen: Index) -> Array:
         is_seen=every.is_seen[:, chosen],
     )
     cov = predict_positions(some, problem.requirement).cov_motion[:, 3:, 3:]
-    return np.minimum(np.sqrt(np.trace(cov, axis1=1, axis2=2)), _LOST)
+    return np.asarray(np.minimum(np.sqrt(np.trace(cov, axis1=1, axis2=2)), _LOST))
 
 
 def _score(problem: _Problem, chosen: Index) -> tuple[float, float]:

@@ -280,7 +280,7 @@ class Planner:
 
     def evaluate(self, asked: Asked) -> Plain:
         """Return what an arrangement promises at its stops."""
-        visibility = self._lookout.look(asked.ground, asked.stops.p_site, asked.marks)
+        visibility = self._lookout.find_visibility(asked.ground, asked.stops.p_site, asked.marks)
         site = asked.ground.site
         found = evaluate(
             site, asked.stops, asked.marks, asked.model, asked.requirement, visibility=visibility
@@ -294,7 +294,7 @@ class Planner:
         xs, ys = (np.arange(a + step / 2, b, step) for a, b in ((x0, x1), (y0, y1)))
         site = asked.ground.site
         stations, _ = map_stations(site, xs, ys)
-        visibility = self._lookout.look(asked.ground, stations, asked.marks)
+        visibility = self._lookout.find_visibility(asked.ground, stations, asked.marks)
         return map_json(
             field_map(
                 site, xs, ys, asked.marks, asked.model, asked.requirement, visibility=visibility
