@@ -9,13 +9,7 @@ from datetime import datetime
 from enum import StrEnum
 from typing import Any, Generic, TypeVar
 
-import numpy as np
-import pyarrow as pa
-
-from spheremark.pipelines.errors import ControlError, InputError
-from spheremark.pipelines.geometry import rigid, rot_x, rot_y, rot_z, yaw_pitch_roll
-from spheremark.pipelines.model import Array, ControlMarks, StopTruth, Truth
-from spheremark.pipelines.scan.rigs import rig_to_mapping
+from spheremark.pipelines.errors import InputError
 
 _Record = TypeVar("_Record")
 _SI_COLUMNS = {"tolerance": "tolerance_m", "duration": "duration_s"}  # field to column
@@ -277,60 +271,9 @@ def record_of(kind: type[_Kind], row: Mapping[str, Any]) -> _Kind:
     return kind(**values)
 
 
-def pose_of(row: Mapping[str, Any]) -> Array:
-    """Return the pose of a row of ``true_stops``."""
-    yaw, pitch, roll = (np.radians(row[f"{name}_deg"]) for name in ("yaw", "pitch", "roll"))
-    return rigid(rot_z(yaw) @ rot_y(pitch) @ rot_x(roll), [row["x_m"], row["y_m"], row["z_m"]])
-
-
-def coordinates_of(rows: list[dict[str, Any]]) -> Array:
-    """Return the coordinates of rows, (n, 3) [m]."""
-    return np.array([[row["x_m"], row["y_m"], row["z_m"]] for row in rows]).reshape(-1, 3)
-
-
-def marks_table(survey_id: str, marks: ControlMarks) -> pa.Table:
-    """Return marks as rows, in their order."""
-    x, y, z = marks.p_site.T
-    n = len(marks.names)
-    columns = {"survey_id": [survey_id] * n, "mark": list(marks.names), "place": range(n)}
-    return pa.table(columns | {"x_m": x, "y_m": y, "z_m": z})
-
-
-def true_stops_table(survey_id: str, stops: tuple[StopTruth, ...]) -> pa.Table:
-    """Return true poses as rows."""
-    rows = []
-    for stop in stops:
-        yaw, pitch, roll = np.degrees(yaw_pitch_roll(stop.T_site_base[:3, :3]))
-        x, y, z = stop.T_site_base[:3, 3]
-        rows.append((survey_id, stop.name, x, y, z, yaw, pitch, roll))
-    names = ("survey_id", "stop", "x_m", "y_m", "z_m", "yaw_deg", "pitch_deg", "roll_deg")
-    types = [pa.string(), pa.string(), *[pa.float64()] * 6]
-    return pa.table(
-        [pa.array([row[i] for row in rows], kind) for i, kind in enumerate(types)], names=names
-    )
-
-
 def json_text(values: Mapping[str, Any]) -> str:
     """Return values as JSON; InputError if they are not plain or not finite."""
     try:
         return json.dumps(values, sort_keys=True, allow_nan=False)
     except (TypeError, ValueError) as error:
         raise InputError(f"Values for the catalogue must be plain and finite: {error}.") from error
-
-
-def rig_text(truth: Truth) -> str | None:
-    """Return the true rig as JSON, when known."""
-    return None if truth.rig is None else json_text(rig_to_mapping(truth.rig))
-
-
-def check_marks(marks: ControlMarks) -> None:
-    """Refuse marks that a table cannot hold or a survey cannot use."""
-    if len(set(marks.names)) < len(marks.names) or not all(marks.names):
-        raise ControlError("Marks must have names, all different.")
-    if not np.isfinite(marks.p_site).all():
-        raise ControlError("Marks must have finite coordinates [m].")
-    variances = np.diagonal(marks.cov_p_site, axis1=1, axis2=2)
-    if not (variances >= 0.0).all() or not np.isfinite(variances).all():
-        raise ControlError("Marks must have standard deviations that are finite and not negative.")
-    if (marks.cov_p_site != np.eye(3) * variances[:, None, :]).any():
-        raise ControlError("Marks must have independent coordinates: correlations are not kept.")

@@ -10,7 +10,6 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pyarrow as pa
 
 from spheremark.pipelines.errors import ConflictError, InputError
@@ -18,19 +17,23 @@ from spheremark.pipelines.model import ControlMarks, Rig, Truth
 from spheremark.pipelines.scan.rigs import rig_digest, rig_from_mapping, rig_to_mapping
 from spheremark.storage.catalogue.database import fetch
 from spheremark.storage.catalogue.lists import Lists
+from spheremark.storage.catalogue.marks import (
+    check_marks,
+    control_marks_of,
+    control_table,
+    marks_table,
+    read_truth,
+    rig_text,
+    true_stops_table,
+)
 from spheremark.storage.catalogue.records import (
     Page,
     RecordingRecord,
     SurveyRecord,
-    check_marks,
-    coordinates_of,
     json_text,
-    marks_table,
     record_of,
-    rig_text,
-    true_stops_table,
 )
-from spheremark.storage.catalogue.tables import TableWriter, read_truth
+from spheremark.storage.catalogue.tables import TableWriter
 
 _DIGEST = re.compile(r"[0-9a-f]{64}")
 _VERDICTS = ("ok", "weak", "refused")
@@ -108,13 +111,9 @@ class Surveys(Lists):
     def put_control_marks(self, survey: str, marks: ControlMarks) -> None:
         """Set the control marks of a survey, in place of those before."""
         check_marks(marks)
-        sigmas = np.sqrt(np.diagonal(marks.cov_p_site, axis1=1, axis2=2))
         survey_id = self.get_survey(survey).survey_id
-        table = marks_table(survey_id, marks)
-        for axis, name in enumerate(("sigma_x_m", "sigma_y_m", "sigma_z_m")):
-            table = table.append_column(name, pa.array(sigmas[:, axis]))
         with self.writing() as cursor:
-            self._tables.append({"control_marks": table})
+            self._tables.append({"control_marks": control_table(survey_id, marks)})
             cursor.execute(
                 "DELETE FROM control_marks WHERE survey_id = ? AND NOT list_contains(?, mark)",
                 [survey_id, list(marks.names)],
@@ -123,14 +122,7 @@ class Surveys(Lists):
     def control_marks(self, survey: str) -> ControlMarks | None:
         """Return the control marks of a survey (id or name); None without."""
         rows = self.rows(_CONTROL, {"id": self.get_survey(survey).survey_id})
-        if not rows:
-            return None
-        sigmas = np.array([[row[f"sigma_{axis}_m"] for axis in "xyz"] for row in rows])
-        return ControlMarks(
-            names=tuple(row["mark"] for row in rows),
-            p_site=coordinates_of(rows),
-            cov_p_site=np.eye(3) * np.square(sigmas)[:, None, :],
-        )
+        return control_marks_of(rows) if rows else None
 
     def put_truth(self, survey: str, truth: Truth) -> None:
         """Set the truth of a survey, and compute the errors of all its results."""

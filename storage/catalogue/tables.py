@@ -5,23 +5,17 @@ Names of tables and columns in the generated statements come from the schemas of
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping, Sequence
 
 import duckdb
-import numpy as np
 import pyarrow as pa
 
 from spheremark.pipelines.errors import InputError
-from spheremark.pipelines.model import ControlMarks, StopTruth, Truth
-from spheremark.pipelines.scan.rigs import rig_from_mapping
+from spheremark.pipelines.model import Truth
 from spheremark.storage.catalogue import adjustments, calibrations, results
 from spheremark.storage.catalogue.database import Planned, execute_on, fetch
-from spheremark.storage.catalogue.records import coordinates_of, pose_of
+from spheremark.storage.catalogue.marks import read_truth
 
-_TRUE_MARKS = "SELECT * FROM true_marks WHERE survey_id = $id ORDER BY place"
-_TRUE_STOPS = "SELECT * FROM true_stops WHERE survey_id = $id ORDER BY stop"
-_TRUE_WORLD = "SELECT rig, about FROM true_worlds WHERE survey_id = $id"
 _CALIBRATION_TABLES = tuple(name for name in calibrations.SCHEMAS if name != "rigs")
 _RUN_TABLES = tuple(name for name in results.TABLES if name != "rigs")
 _APPENDED = (*adjustments.SCHEMAS, *_CALIBRATION_TABLES, "site_products", "documents")
@@ -137,23 +131,3 @@ def _update_errors(table: str, columns: Sequence[str]) -> str:
     errors = ", ".join(f"{name} = i.{name}" for name in columns if name.startswith("error_"))
     same = " AND ".join(f"x.{name} = i.{name}" for name in _KEYS[table])
     return f"UPDATE {table} AS x SET {errors} FROM incoming AS i WHERE {same}"  # noqa: S608
-
-
-def read_truth(cursor: duckdb.DuckDBPyConnection, survey_id: str) -> Truth | None:
-    """Read the truth of a survey."""
-    worlds = cursor.execute(_TRUE_WORLD, {"id": survey_id}).fetchall()
-    if not worlds:
-        return None
-    rig, about = worlds[0]
-    marks = fetch(cursor, _TRUE_MARKS, {"id": survey_id}).to_pylist()
-    stops = fetch(cursor, _TRUE_STOPS, {"id": survey_id}).to_pylist()
-    return Truth(
-        marks=ControlMarks(
-            names=tuple(row["mark"] for row in marks),
-            p_site=coordinates_of(marks),
-            cov_p_site=np.zeros((len(marks), 3, 3)),
-        ),
-        stops=tuple(StopTruth(name=row["stop"], T_site_base=pose_of(row)) for row in stops),
-        rig=None if rig is None else rig_from_mapping(json.loads(rig)),
-        about=json.loads(about),
-    )

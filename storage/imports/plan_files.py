@@ -14,7 +14,7 @@ import numpy as np
 from spheremark.pipelines.errors import ControlError, InputError
 from spheremark.pipelines.model import Array
 from spheremark.pipelines.placement import Arrangement
-from spheremark.storage.imports.survey_files import parse_control
+from spheremark.storage.imports.survey_files import parse_control, table_rows
 
 _SIZE_MAX = 20_000_000  # characters of a file
 _STOP_COLUMNS = "name,x_m,y_m and, if known, z_m of the LiDAR [m]"
@@ -160,23 +160,20 @@ def _marks_of_plan(text: str) -> str:
 
 def _stop_rows(file: str, text: str) -> Iterator[tuple[str, list[float]]]:
     """Return the stops of a table."""
-    lines = [line for line in text.splitlines() if line.split("#")[0].strip()]
-    dialect = ";" if lines and lines[0].count(";") > lines[0].count(",") else ","
-    reader = csv.DictReader(lines, delimiter=dialect)
-    heads = {
-        (head or "").strip().lower().removesuffix("_m"): head for head in reader.fieldnames or ()
-    }
-    name = next((heads[key] for key in ("name", "stop", "id") if key in heads), None)
+    (_, head), *body = list(table_rows(text)) or [(0, [])]
+    heads = [cell.lower().removesuffix("_m") for cell in head]
+    name = next((key for key in ("name", "stop", "id") if key in heads), None)
     if name is None or "x" not in heads or "y" not in heads:
         raise InputError(
             f"{file} has the columns {', '.join(heads) or 'none'}; {_STOP_COLUMNS} are expected."
         )
-    for row in reader:
+    for line, cells in body:
+        row = dict(zip(heads, cells, strict=False))
         if row.get("kind", "stop") != "stop":
             continue
         place = []
         for axis in "xyz":
-            value = (row.get(heads.get(axis, "")) or "").strip()
+            value = row.get(axis, "")
             if not value and axis == "z":
                 place.append(np.nan)
                 continue
@@ -184,11 +181,11 @@ def _stop_rows(file: str, text: str) -> Iterator[tuple[str, list[float]]]:
                 place.append(float(value))
             except ValueError as error:
                 raise InputError(
-                    f"{file}, line {reader.line_num}: {axis} is {value!r}, not a number in metres."
+                    f"{file}, line {line}: {axis} is {value!r}, not a number in metres."
                 ) from error
         if not np.isfinite(place[:2]).all():
-            raise InputError(f"{file}, line {reader.line_num}: a place must be finite.")
-        yield (row[name] or "").strip(), place
+            raise InputError(f"{file}, line {line}: a place must be finite.")
+        yield row.get(name, ""), place
 
 
 def _rings(value: Any) -> Iterator[Array]:

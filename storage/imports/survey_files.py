@@ -130,7 +130,7 @@ def parse_control(text: str, layout: ControlLayout = _PLAIN) -> ControlMarks:
         raise ControlError(
             f"The control table has {len(text):,} characters; at most {_SIZE_MAX:,} are read."
         )
-    rows = list(_rows(text))
+    rows = list(table_rows(text))
     if not rows:
         raise ControlError(f"The control table is empty; {_EXPECTED}.")
     columns, body = _columns(rows, layout.axes)
@@ -380,8 +380,19 @@ class _Row:
         return sigmas
 
 
-def _rows(text: str) -> Iterator[tuple[int, list[str]]]:
-    """Yield the number and the cells of each line that is not empty."""
+def table_rows(text: str) -> Iterator[tuple[int, list[str]]]:
+    """Yield the rows of a table in CSV with comma, semicolon or tab, without comments.
+
+    Parameters
+    ----------
+    text : str
+        The table.
+
+    Yields
+    ------
+    int, list of str
+        Number of the line, from 1, and its cells.
+    """
     lines = [_without_comment(line).strip() for line in text.lstrip("\ufeff").splitlines()]
     first = next((line for line in lines if line), "")
     separator = max("\t;,", key=first.count)
