@@ -52,6 +52,22 @@ def cross(v: Array, w: Array) -> Array:
     return np.stack([y * c - z * b, z * a - x * c, x * b - y * a], axis=-1)
 
 
+def unit(v: Array) -> Array:
+    """Return vectors of length one.
+
+    Parameters
+    ----------
+    v : (..., n)
+        Vectors.
+
+    Returns
+    -------
+    (..., n)
+        Their directions.
+    """
+    return np.asarray(v / np.linalg.norm(v, axis=-1, keepdims=True))
+
+
 def rot_x(angle: float) -> Array:
     """Return the rotation about x by an angle.
 
@@ -226,6 +242,24 @@ def levelling_rotation(levelling: Levelling) -> Array:
         ``R_station_base = Ry(pitch) Rx(roll)``.
     """
     return np.asarray(rot_y(levelling.pitch) @ rot_x(levelling.roll))
+
+
+def up_by_lean(levelling: Levelling) -> Array:
+    """Return the derivative of the up direction in base by roll and pitch.
+
+    Parameters
+    ----------
+    levelling : Levelling
+        How the base leans.
+
+    Returns
+    -------
+    (3, 2)
+        Derivative of the last row of ``R_station_base``.
+    """
+    cr, sr = np.cos(levelling.roll), np.sin(levelling.roll)
+    cp, sp = np.cos(levelling.pitch), np.sin(levelling.pitch)
+    return np.array([[0.0, -cp], [cp * cr, -sp * sr], [-cp * sr, -sp * cr]])
 
 
 def yaw_pitch_roll(R: Array) -> tuple[float, float, float]:

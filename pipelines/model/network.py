@@ -8,6 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from spheremark.pipelines.errors import InputError
+from spheremark.pipelines.geometry import by_motion
 from spheremark.pipelines.model import Array, ErrorEllipse, Index, Mask
 
 RANGE_BIAS = "common_range_bias"
@@ -496,7 +497,7 @@ class AdjustedNetwork:
         Grows with the square of the stations: for networks of tens of them.
         """
         s, m = len(self.T_site_station), len(self.p_site)
-        J = position_by_motion(self.T_site_station)
+        J = by_motion(self.T_site_station[:, :3, 3])
         coupled = (J @ self.parts.coupling).reshape(3 * s, -1)
         own = J @ self.parts.own @ np.swapaxes(J, -1, -2)
         stations = coupled @ self.parts.cov_common @ coupled.T
@@ -520,27 +521,6 @@ class AdjustedNetwork:
     def mark_ellipses(self) -> tuple[ErrorEllipse, ...]:
         """Error ellipse of the horizontal position of each mark."""
         return tuple(ErrorEllipse.of(cov) for cov in self.mark_covariances)
-
-
-def position_by_motion(T: Array) -> Array:
-    """Return the derivative of the positions of poses by small motions on the left.
-
-    Parameters
-    ----------
-    T : (..., 4, 4)
-        Poses [m].
-
-    Returns
-    -------
-    (..., 3, 6)
-        ``[-[p]x, 1]``.
-    """
-    x, y, z = np.moveaxis(T[..., :3, 3], -1, 0)
-    J = np.zeros((*T.shape[:-2], 3, 6))
-    J[..., 0, 1], J[..., 1, 2], J[..., 2, 0] = z, x, y
-    J[..., 1, 0], J[..., 2, 1], J[..., 0, 2] = -z, -x, -y
-    J[..., [0, 1, 2], [3, 4, 5]] = 1.0
-    return J
 
 
 def seal(value: object, shapes: dict[str, tuple[int, ...]]) -> None:

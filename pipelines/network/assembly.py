@@ -22,12 +22,17 @@ from spheremark.pipelines.errors import (
     NoMatchError,
     SolveError,
 )
-from spheremark.pipelines.geometry import levelling_rotation, rigid, transform
+from spheremark.pipelines.geometry import levelling_rotation, rigid, transform, unit, up_by_lean
 from spheremark.pipelines.model import Array, ControlMarks, MarkerFits
 from spheremark.pipelines.model.network import LeftOut, Network, Refusal, Shared
 from spheremark.pipelines.network.false_marks import suspect_marks
 from spheremark.pipelines.positioning.hypotheses import Spans, spans_between
-from spheremark.pipelines.positioning.matching import gather, match_marks, shared_variances
+from spheremark.pipelines.positioning.matching import (
+    gather,
+    match_marks,
+    own_covariances,
+    shared_variances,
+)
 
 _EXACT = 1e-5  # [m] sigma of control marks that are given as exact: far below any survey's
 _NO_MARK, _SUSPECT = -1, -2  # in place of a mark: none is near; the one that is near may be false
@@ -156,7 +161,8 @@ def assemble(
         fits = {name: found_there.fits for name, found_there in scans}
         rows = zip(network.sightings[:, 0], network.fits, strict=True)
         sigmas = [fits[network.stations[i]][fit].sigma_range_shared for i, fit in rows]
-        cov_p_base = _own(network.p_base, cov_p_base, np.array(sigmas), config)
+        variances = shared_variances(network.p_base, cov_p_base, np.array(sigmas), config)
+        cov_p_base = own_covariances(network.p_base, cov_p_base, variances)
     network = replace(
         network,
         cov_p_base=cov_p_base,
@@ -371,6 +377,7 @@ def _network(
     columns = np.array(sightings, dtype=np.intp)
     fits = [scans[i][1].fits[f] for i in used for f, _ in used[i]]
     levellings = [scans[i][1].levelling for i in used]
+    leans = [(one, up_by_lean(one)) for one in levellings]
     controls = [mark for mark in places if mark < found.n_control]
     given = np.array([found.cov_p_site[mark] for mark in controls]).reshape(-1, 3, 3)
     return Network(
@@ -384,7 +391,7 @@ def _network(
             np.array([fit.p_base for fit in fits]), np.array([fit.cov_p_base for fit in fits])
         ),
         R_station_base=np.array([levelling_rotation(one) for one in levellings]),
-        cov_up_base=np.array([_cov_up(one.roll, one.pitch, one.sigma) for one in levellings]),
+        cov_up_base=np.array([one.sigma**2 * J @ J.T for one, J in leans]),
         sigma_headings=np.array([one.sigma_heading for one in levellings]),
         controls=np.array([row[mark] for mark in controls], dtype=np.intp),
         p_control_site=np.array([found.p_site[mark] for mark in controls]).reshape(-1, 3),
@@ -396,13 +403,6 @@ def _network(
     )
 
 
-def _own(p_base: Array, cov_p_base: Array, sigmas: Array, config: ResectionConfig) -> Array:
-    """Return the covariances of centres without the error of range that all of them share."""
-    v = p_base / np.linalg.norm(p_base, axis=1, keepdims=True)
-    variances = shared_variances(p_base, cov_p_base, sigmas, config)
-    return np.asarray(cov_p_base - variances[:, None, None] * v[:, :, None] * v[:, None, :])
-
-
 def _symmetric(p_base: Array, cov_p_base: Array) -> Array:
     """Return the covariances of centres without what correlates along, across and above.
 
@@ -410,7 +410,7 @@ def _symmetric(p_base: Array, cov_p_base: Array) -> Array:
     centre was linearised, and as a weight would turn errors across the line of sight into errors
     along it: over many stations the ring of marks swells by 0.2 mm.
     """
-    along = p_base / np.linalg.norm(p_base, axis=1, keepdims=True)
+    along = unit(p_base)
     across = np.column_stack([-along[:, 1], along[:, 0], np.zeros(len(along))])
     lengths = np.linalg.norm(across, axis=1, keepdims=True)
     is_steep = lengths < _STEEP
@@ -440,10 +440,3 @@ def _in_common(
         effects=np.concatenate([effects, bias.effects], axis=2),
         weights=known,
     )
-
-
-def _cov_up(roll: float, pitch: float, sigma: float) -> Array:
-    """Return the covariance of the up direction in base, of roll and pitch of one sigma."""
-    cr, sr, cp, sp = np.cos(roll), np.sin(roll), np.cos(pitch), np.sin(pitch)
-    J = sigma * np.array([[0.0, -cp], [cp * cr, -sp * sr], [-cp * sr, -sp * cr]])
-    return np.asarray(J @ J.T)

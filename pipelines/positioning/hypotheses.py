@@ -243,11 +243,6 @@ def _nearest(
     return best, least
 
 
-@compiled
 def agreements(marks: Index, others: Index) -> Index:
     """Count the fits that have the same mark in each of many matches and in another one."""
-    counts = np.zeros(len(marks), dtype=np.intp)
-    for h in range(len(marks)):
-        for i in range(len(others)):
-            counts[h] += others[i] >= 0 and marks[h, i] == others[i]
-    return counts
+    return np.asarray(np.sum((marks == others) & (others >= 0), axis=1))

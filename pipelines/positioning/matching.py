@@ -33,6 +33,8 @@ from spheremark.pipelines.geometry import (
     rot_z,
     skew,
     transform,
+    unit,
+    up_by_lean,
 )
 from spheremark.pipelines.model import Array, ControlMarks, Index, MarkerFits
 from spheremark.pipelines.positioning.hypotheses import (
@@ -172,9 +174,6 @@ def gather(fits: MarkerFits, marks: ControlMarks, config: ResectionConfig) -> Sc
         Both as arrays.
     """
     levelling = fits.levelling
-    R_station_base = levelling_rotation(levelling)
-    cr, sr = np.cos(levelling.roll), np.sin(levelling.roll)
-    cp, sp = np.cos(levelling.pitch), np.sin(levelling.pitch)
     middle = marks.p_site.mean(axis=0)
     p_base = np.stack([fit.p_base for fit in fits.fits])
     cov_p_base = np.stack([fit.cov_p_base for fit in fits.fits])
@@ -187,8 +186,8 @@ def gather(fits: MarkerFits, marks: ControlMarks, config: ResectionConfig) -> Sc
         marks_site=marks.p_site - middle,
         cov_marks=marks.cov_p_site,
         middle=middle,
-        R_station_base=R_station_base,
-        J_up=np.array([[0.0, -cp], [cp * cr, -sp * sr], [-cp * sr, -sp * cr]]),
+        R_station_base=levelling_rotation(levelling),
+        J_up=up_by_lean(levelling),
         sigma_level=levelling.sigma,
         is_levelled=levelling.is_measured,
         sigma_heading=levelling.sigma_heading,
@@ -226,10 +225,31 @@ def shared_variances(
     same for all centres: taken as independent, they would seem to blur the place of a station
     among marks on all sides, where they cancel.
     """
-    v = p_base / np.linalg.norm(p_base, axis=1, keepdims=True)
+    v = unit(p_base)
     own = 1.0 / np.einsum("ni,ni->n", v, (invert_each(cov_p_base)[0] @ v[..., None])[..., 0])
     sigmas = np.where(np.isfinite(sigmas_shared), sigmas_shared, config.sigma_range_shared)
     return np.asarray(np.minimum(sigmas**2, _SHARED * own))
+
+
+def own_covariances(p_base: Array, cov_p_base: Array, variances: Array) -> Array:
+    """Return the covariances of centres without the error of range that all of them share.
+
+    Parameters
+    ----------
+    p_base : (n, 3)
+        Centres [m].
+    cov_p_base : (n, 3, 3)
+        Their covariances in full [m^2].
+    variances : (n,)
+        How much of each is shared, from ``shared_variances`` [m^2].
+
+    Returns
+    -------
+    (n, 3, 3)
+        Covariances of what is each centre's own [m^2].
+    """
+    v = unit(p_base)
+    return np.asarray(cov_p_base - variances[:, None, None] * v[:, :, None] * v[:, None, :])
 
 
 def cov_of_shared(scene: Scene, variances: Array, of_ranges: Array, of_heights: Array) -> Array:

@@ -12,7 +12,7 @@ import numpy as np
 
 from spheremark.pipelines.config import ResectionConfig
 from spheremark.pipelines.estimation.linear_algebra import invert_each
-from spheremark.pipelines.geometry import by_motion, has_heading, rigid, transform
+from spheremark.pipelines.geometry import by_motion, has_heading, rigid, transform, unit
 from spheremark.pipelines.model import (
     Array,
     ControlMarks,
@@ -28,9 +28,10 @@ from spheremark.pipelines.positioning.matching import (
     Scene,
     gather,
     match_marks,
+    own_covariances,
     solve_poses,
 )
-from spheremark.pipelines.positioning.trilateration import circles, slope_ranges, unit
+from spheremark.pipelines.positioning.trilateration import circles, slope_ranges
 
 _SURPRISE = 3.29  # sigmas that one in a thousand normal residuals exceeds
 _N_LEFT = 3  # markers at least, of which one can be left out
@@ -111,7 +112,9 @@ def check_distances(
     given = np.linalg.norm(goals[:, 1] - goals[:, 0], axis=1)
     along = (q - p) / measured[:, None]
     along_site = (goals[:, 1] - goals[:, 0]) / given[:, None]
-    cov = _cov_own(scene)[places[..., 0]].sum(axis=1)
+    cov = own_covariances(scene.centres_base, scene.cov_centres, scene.shared)[places[..., 0]].sum(
+        axis=1
+    )
     cov_given = scene.cov_marks[places[..., 1]].sum(axis=1)
     opening = np.sum(along * (unit(q) - unit(p)), axis=1) * config.sigma_range
     sigmas = np.sqrt(_projected(cov, along) + _projected(cov_given, along_site) + opening**2)
@@ -143,12 +146,6 @@ def _displaced(scene: Scene, match: Match) -> Index:
     is_mutual = gaps.argmin(axis=0)[nearest] == np.arange(len(fits))
     rows = np.flatnonzero(is_mutual & (gaps.min(axis=1) < _DISPLACED))
     return np.stack([fits[rows], marks[nearest[rows]]], axis=1)
-
-
-def _cov_own(scene: Scene) -> Array:
-    """Return the covariances of centres without the error of range that all of them share."""
-    v = unit(scene.centres_base)
-    return scene.cov_centres - scene.shared[:, None, None] * v[:, :, None] * v[:, None, :]
 
 
 def _projected(cov: Array, direction: Array) -> Array:

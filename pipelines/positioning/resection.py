@@ -27,6 +27,7 @@ from spheremark.pipelines.geometry import (
     rigid,
     skew,
     transform,
+    unit,
 )
 from spheremark.pipelines.model import (
     Array,
@@ -288,7 +289,7 @@ def _cov_shared(scene: Scene, used: Index, adjustment: Adjustment) -> Array:
     """Return what errors that all centres share change in the covariance of a motion, (6, 6)."""
     R, group = adjustment.estimate[:3, :3], adjustment.groups[0]
     p_base = scene.centres_base[used[:, 0]]
-    lines = (p_base / np.linalg.norm(p_base, axis=1, keepdims=True)) @ R.T
+    lines = unit(p_base) @ R.T
     gains = adjustment.cov @ np.swapaxes(invert_each(group.cov)[0] @ group.J, 1, 2)  # up to sign
     of_ranges = (gains @ lines[..., None])[..., 0]
     of_heights = gains.sum(axis=0) @ (R @ scene.R_station_base[2])

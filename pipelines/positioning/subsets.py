@@ -15,7 +15,14 @@ from spheremark.pipelines.config import ResectionConfig
 from spheremark.pipelines.errors import ConfigError
 from spheremark.pipelines.estimation.least_squares import normal_equations
 from spheremark.pipelines.estimation.linear_algebra import invert_each
-from spheremark.pipelines.geometry import by_motion, has_heading, included_angle, rigid, transform
+from spheremark.pipelines.geometry import (
+    by_motion,
+    has_heading,
+    included_angle,
+    rigid,
+    transform,
+    unit,
+)
 from spheremark.pipelines.model import (
     Array,
     ControlMarks,
@@ -40,7 +47,6 @@ from spheremark.pipelines.positioning.trilateration import (
     meet,
     observe_distances,
     slope_ranges,
-    unit,
 )
 
 SIZES = (2, 3)

@@ -18,7 +18,7 @@ from spheremark.pipelines.errors import DegenerateGeometryError, NotConvergedErr
 from spheremark.pipelines.estimation.least_squares import Adjustment, Observations, adjust
 from spheremark.pipelines.estimation.linear_algebra import factorise, invert, invert_each, solve
 from spheremark.pipelines.estimation.statistical_tests import snoop
-from spheremark.pipelines.geometry import included_angle, is_on_a_line, rigid, rot_z, skew
+from spheremark.pipelines.geometry import included_angle, is_on_a_line, rigid, rot_z, skew, unit
 from spheremark.pipelines.model import Array, Exclusion, Index, Mask, StationFix, Status
 from spheremark.pipelines.positioning.matching import Match, Scene, cov_of_shared
 
@@ -225,11 +225,6 @@ def _pose(
     full[2:, 2:] = cov
     full[2, 2] += scene.sigma_heading**2
     return yaw, full + scene.sigma_level**2 * lean @ lean.T
-
-
-def unit(v: Array) -> Array:
-    """Return vectors of length one."""
-    return np.asarray(v / np.linalg.norm(v, axis=-1, keepdims=True))
 
 
 def _azimuth_by_place(v: Array) -> Array:

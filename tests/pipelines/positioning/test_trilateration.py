@@ -8,14 +8,13 @@ import pytest
 
 from spheremark.pipelines.config import ResectionConfig
 from spheremark.pipelines.errors import DegenerateGeometryError
-from spheremark.pipelines.geometry import inverse, levelling_rotation, log_motion, rigid
+from spheremark.pipelines.geometry import inverse, levelling_rotation, log_motion, rigid, unit
 from spheremark.pipelines.positioning.resection import resect
 from spheremark.pipelines.positioning.trilateration import (
     best_three,
     circles,
     meet,
     slope_ranges,
-    unit,
 )
 from tests import chance
 from tests.synthetic import control, field, pose, sightings
