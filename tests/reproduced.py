@@ -16,7 +16,7 @@ from spheremark.pipelines.evaluation.reproduction.plan import (
     PAPER,
     Scan,
 )
-from spheremark.pipelines.evaluation.reproduction.scans import Centres, Example, Reproduction
+from spheremark.pipelines.evaluation.reproduction.scans import Example, Reproduction, columns_of
 from spheremark.pipelines.published import TABLE_2
 
 SIGMA = {OURS: 0.001, PAPER: 0.003, FULL_SPHERE: 0.003, GROUND: 0.003}  # [m] per axis at 8 m
@@ -45,20 +45,11 @@ def scans():
 def reproduction(seed=3):
     rng = np.random.default_rng(seed)
     plan = scans()
-    tables = [_centres(i, scan, rng) for i, scan in enumerate(plan)]
-    joined = {
-        name: np.concatenate([table[name] for table in tables])
-        for name in ("scans", "ranges", "n_points", "incidences", "error_station", "rms")
-    }
+    rows = [row for i, scan in enumerate(plan) for row in _centres(i, scan, rng)]
     return Reproduction(
         scans=plan,
         n_marks=np.array([14] * 9 + [88] * 4 + [14]),
-        centres=Centres(
-            **joined,
-            sigma_3d=np.full(len(joined["scans"]), 0.002),
-            methods=tuple(name for table in tables for name in table["methods"]),
-            marks=tuple(name for table in tables for name in table["marks"]),
-        ),
+        centres=columns_of(rows),
         example=example(rng),
         noise=RangeNoise(
             sigmas=np.array([np.nan, 0.0107, 0.0089, np.nan, np.nan]), n=np.array([0, 90, 80, 3, 0])
@@ -78,16 +69,29 @@ def _centres(i, scan, rng):
     errors = rng.normal(size=(len(names), 3)) * sigmas[:, None]
     errors[:, 0] += [BIAS[name] for name in names]
     counts = np.tile(np.ceil(6800.0 * scan.turn / 13.2 / ranges**2), len(methods))
-    return {
-        "scans": np.full(len(names), i, dtype=np.intp),
-        "methods": names.tolist(),
-        "marks": [f"P{k % n + 1:02d}" for k in range(len(names))],
-        "ranges": np.tile(ranges, len(methods)),
-        "n_points": counts,
-        "incidences": rng.uniform(0.7, 0.9, len(names)),
-        "error_station": errors,
-        "rms": np.full(len(names), 0.009),
-    }
+    incidences = rng.uniform(0.7, 0.9, len(names))
+    origin = {"stop": scan.stop, "series": scan.series, "world": scan.seed, "turn_s": scan.turn}
+    return [
+        {
+            "scan": i,
+            **origin,
+            "fit_method": str(name),
+            "marker": f"P{k % n + 1:02d}",
+            "mark": f"P{k % n + 1:02d}",
+            "status": "ok",
+            "reason": "",
+            "range_m": ranges[k % n],
+            "n_points": int(counts[k]),
+            "incidence_deg": np.degrees(incidences[k]),
+            "sigma_3d_m": 0.002,
+            "rms_m": 0.009,
+            "error_towards_m": errors[k, 0],
+            "error_left_m": errors[k, 1],
+            "error_up_m": errors[k, 2],
+            "error_3d_m": np.linalg.norm(errors[k]),
+        }
+        for k, name in enumerate(names)
+    ]
 
 
 def example(rng):

@@ -44,7 +44,7 @@ class Column(NamedTuple):
             return "-"
         if not self.form or isinstance(value, str):
             return str(value)
-        return format(_PER_SI.get(self.unit, 1.0) * value, self.form)
+        return format(_PER_SI.get(self.unit, 1) * value, self.form)
 
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)

@@ -1,6 +1,6 @@
-"""The same job put together from the usual libraries, for comparison.
+"""The same chain from the usual libraries, for comparison.
 
-mcap-ros2-support decodes, and velodyne-decoder what packets hold; SciPy rotates, Open3D cuts the
+mcap-ros2-support decodes messages, velodyne-decoder packets; SciPy rotates, Open3D cuts the
 ground with a plane, clusters with DBSCAN and registers a hemisphere to each cluster; DuckDB takes
 the rows one by one. Each step is written as its documentation shows it, in arrays where the library
 allows, and with the parameters that suit the field. Where the tools of PCL are installed, they cut
@@ -31,21 +31,9 @@ _CLUSTER_MIN = 10  # neighbours of a point inside a cluster
 _N_POINTS = 20  # of a cluster that may be a marker
 _RMS_MAX = 0.03  # [m] about the sphere
 _N_MODEL = 1000  # points of the hemisphere
-_PCL = {  # the tools of PCL for each step, with what suits the field
-    "plane": (
-        "pcl_sac_segmentation_plane",
-        "-thresh",
-        str(_PLANE_NEAR),
-        "-max_it",
-        str(_PLANE_TRIALS),
-    ),
-    "clusters": (
-        "pcl_cluster_extraction",
-        "-tolerance",
-        str(_CLUSTER_GAP),
-        "-min",
-        str(_CLUSTER_MIN),
-    ),
+_PCL = {  # the tools of PCL for each step, with parameters that suit the field
+    "plane": f"pcl_sac_segmentation_plane -thresh {_PLANE_NEAR} -max_it {_PLANE_TRIALS}".split(),
+    "clusters": f"pcl_cluster_extraction -tolerance {_CLUSTER_GAP} -min {_CLUSTER_MIN}".split(),
 }
 _PCL_DONE = re.compile(r"\[done, ([\d.]+) ms(?:, plane has)? : (\d+) (?:points\]\s*Model|clusters)")
 _TYPES = ("PointCloud2", "VelodyneScan", "JointState")
@@ -62,22 +50,14 @@ class MissingPeerError(InputError):
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class PeerRun:
-    """What the usual libraries gave.
-
-    Attributes
-    ----------
-    seconds : dict of str to float
-        Time by step, under the names of our own steps [s].
-    centres : (n, 3)
-        Spheres that they found, in the base frame [m].
-    """
+    """Time by step of our own chain [s], and centres of spheres in the base frame, (n, 3) [m]."""
 
     seconds: dict[str, float] = field(default_factory=dict)
     centres: Array
 
 
 def run_peers(log: Path, rig: Rig, radius: float) -> PeerRun:
-    """Do the job once, from the file to committed rows."""
+    """Run the chain once, from the file to committed rows."""
     _require()
     seconds: dict[str, float] = {}
     p_lidar, stamps, joints = _timed(seconds, "read log", lambda: _decode(log))
@@ -112,7 +92,7 @@ def registered_centre(points: Array, radius: float) -> Array:
 
 
 def _require() -> None:
-    """Refuse to compare with what is not there."""
+    """Refuse to compare where a library is missing."""
     try:
         import mcap_ros2.decoder  # noqa: F401
         import velodyne_decoder  # noqa: F401
@@ -124,7 +104,7 @@ def _require() -> None:
 
 
 def _timed(seconds: dict[str, float], step: str, work: Callable[[], _Made]) -> _Made:
-    """Do a step and record how long it took [s]."""
+    """Run a step and record its time [s]."""
     start = perf_counter()
     made = work()
     seconds[step] = perf_counter() - start
@@ -135,12 +115,12 @@ def _decode(log: Path) -> tuple[Array, Array, Array]:
     """Return points, their instants and joint samples (instant, angle) [s from the first]."""
     points, stamps, joints = [], [], []
     unpack = _packet_decoder()
-    for kind, said in _messages(log):
-        stamp = said.header.stamp.sec * 1_000_000_000 + said.header.stamp.nanosec
+    for kind, message in _messages(log):
+        stamp = message.header.stamp.sec * 1_000_000_000 + message.header.stamp.nanosec
         if kind == "JointState":
-            joints.append((stamp, said.position[0]))
+            joints.append((stamp, message.position[0]))
             continue
-        p, times = _cloud(said) if kind == "PointCloud2" else unpack(said)
+        p, times = _cloud(message) if kind == "PointCloud2" else unpack(message)
         points.append(p)
         stamps.append(stamp + (times * 1e9).astype(np.int64))
     first = joints[0][0]
@@ -159,30 +139,31 @@ def _messages(log: Path) -> Iterator[tuple[str, Any]]:
         channels = summary.channels.values() if summary else ()
         kinds = {schema.id: schema.name for schema in summary.schemas.values()} if summary else {}
         topics = [one.topic for one in channels if kinds[one.schema_id].endswith(_TYPES)]
-        for _, channel, _, said in reader.iter_decoded_messages(topics):
-            yield kinds[channel.schema_id].rpartition("/")[2], said
+        for _, channel, _, message in reader.iter_decoded_messages(topics):
+            yield kinds[channel.schema_id].rpartition("/")[2], message
 
 
-def _cloud(said: Any) -> tuple[Array, Array]:
+def _cloud(message: Any) -> tuple[Array, Array]:
     """Return the points of a PointCloud2 and their times since its stamp [s]."""
-    rows = np.frombuffer(bytes(said.data), _layout(said))
+    rows = np.frombuffer(bytes(message.data), _layout(message))
     return np.stack([rows["x"], rows["y"], rows["z"]], axis=1).astype(np.float64), rows["time"]
 
 
 def _packet_decoder() -> Callable[[Any], tuple[Array, Array]]:
-    """Return what gives the points of a VelodyneScan and their times since its stamp [s]."""
+    """Return a function to the points of a VelodyneScan and their times since its stamp [s]."""
     import velodyne_decoder as vd
 
     config = vd.Config(model=vd.Model.VLP16, timestamp_first_packet=True)
     decoder = vd.ScanDecoder(config)
 
-    def unpack(said: Any) -> tuple[Array, Array]:
+    def unpack(message: Any) -> tuple[Array, Array]:
         packets = vd.PacketVector()
-        for one in said.packets:
+        for one in message.packets:
             instant = one.stamp.sec + one.stamp.nanosec * 1e-9
             packets.append(vd.VelodynePacket(instant, bytes(one.data)))
         start, points = decoder.decode(packets)
-        since = start.host - said.header.stamp.sec - said.header.stamp.nanosec * 1e-9
+        stamp = message.header.stamp
+        since = start.host - stamp.sec - stamp.nanosec * 1e-9
         return points[:, :3].astype(np.float64), points[:, 4].astype(np.float64) + since
 
     return unpack
@@ -211,7 +192,7 @@ def _stitch(p_lidar: Array, stamps: Array, joints: Array, rig: Rig) -> Array:
 
 
 def _clusters(p_base: Array) -> list[Array]:
-    """Return groups of points off the ground that are as large as a marker may be."""
+    """Return clusters of the points off the ground."""
     rest = _off_ground(p_base)
     labels = np.asarray(rest.cluster_dbscan(_CLUSTER_GAP, _CLUSTER_MIN))
     points = np.asarray(rest.points)[np.argsort(labels, kind="stable")]
@@ -229,9 +210,9 @@ def _off_ground(p_base: Array) -> Any:
 
 
 def pcl_seconds(p: Column) -> dict[str, float] | None:
-    """Return what PCL's tools need for plane and clusters, files not counted; None without them.
+    """Return the times of PCL's tools for plane and clusters, without files; None without PCL.
 
-    Its clusters are those of the points that Open3D leaves off the ground, as for the others.
+    Clusters are sought in the points that Open3D leaves off the ground, as for the others.
     """
     if not all(shutil.which(tool) for tool, *_ in _PCL.values()):
         return None
@@ -244,21 +225,21 @@ def pcl_seconds(p: Column) -> dict[str, float] | None:
             _write_pcd(folder / "in.pcd", clouds[step])
             command = [tool, str(folder / "in.pcd"), str(folder / "out.pcd"), *options]
             done = subprocess.run(command, capture_output=True, text=True, check=True)
-            if told := _PCL_DONE.search(done.stdout + done.stderr):
-                found[f"{step}_seconds"] = float(told[1]) * 1e-3
-                found[f"n_{step}"] = int(told[2])
+            if found_text := _PCL_DONE.search(done.stdout + done.stderr):
+                found[f"{step}_seconds"] = float(found_text[1]) * 1e-3
+                found[f"n_{step}"] = int(found_text[2])
     return found
 
 
 def _write_pcd(path: Path, p: Array) -> None:
-    """Write points as PCL takes them."""
+    """Write points in the format of PCL."""
     fields = "FIELDS x y z\nSIZE 4 4 4\nTYPE F F F\nCOUNT 1 1 1"
     head = f"VERSION 0.7\n{fields}\nWIDTH {len(p)}\nHEIGHT 1\nPOINTS {len(p)}\nDATA binary\n"
     path.write_bytes(head.encode() + p.astype("<f4").tobytes())
 
 
 def _fitted(clusters: list[Array], radius: float) -> Array:
-    """Return the centres of the clusters whose top a sphere of known radius explains."""
+    """Return the centres of the clusters whose top fits a sphere of known radius."""
     centres = []
     for points in clusters:
         top = points[points[:, 2] > points[:, 2].max() - 2.0 * radius]  # without the pole

@@ -40,7 +40,7 @@ from spheremark.pipelines.evaluation.reproduction.tables import (
     table_2,
     table_4,
 )
-from spheremark.pipelines.model import RING_UNKNOWN, Index, Levelling, StitchedCloud
+from spheremark.pipelines.model import RING_UNKNOWN, Levelling, StitchedCloud
 from spheremark.pipelines.model import Column as Points
 from spheremark.pipelines.scan.rigs import vlp16
 from spheremark.pipelines.sphere import fit_markers
@@ -116,10 +116,10 @@ def page_of(made: Reproduction, seed: int, real: RealScans | None = None) -> Rep
         angles=angle_experiment(made.config.tolerance, np.random.default_rng(seed)),
         icp=models_of_icp(made),
         example=made.example,
-        centre=_columns(made, made.series(CENTRE)),
-        lane=_columns(made, made.series(LANE_2)),
-        distances=_columns(made, made.series(DISTANCES)),
-        real=_columns(made, made.series(DISTANCES_REAL)),
+        centre=_columns(made, CENTRE),
+        lane=_columns(made, LANE_2),
+        distances=_columns(made, DISTANCES),
+        real=_columns(made, DISTANCES_REAL),
         noises={_SIMULATED: made.noise, **real.noises},
         spheres=[_simulated_spheres(made), *real.spheres],
         code_version=code_version(),
@@ -128,44 +128,20 @@ def page_of(made: Reproduction, seed: int, real: RealScans | None = None) -> Rep
     )
 
 
-def _columns(made: Reproduction, scans: Index) -> dict[str, NDArray[Any]]:
-    """Return the centres of some scans by both methods, named as the database names them."""
-    centres = made.centres
-    keep = centres.of(OURS, scans) | centres.of(PAPER, scans)
-    own = [made.scans[i] for i in centres.scans[keep]]
-    marks = np.array(centres.marks, dtype=object)[keep]
-    return {
-        "stop": np.array([scan.stop for scan in own], dtype=object),
-        "series": np.array([scan.series for scan in own], dtype=object),
-        "world": np.array([scan.seed for scan in own]),
-        "turn_s": np.array([scan.turn for scan in own]),
-        "fit_method": np.array(centres.methods, dtype=object)[keep],
-        "marker": marks,
-        "mark": marks,
-        "status": np.full(len(own), "ok", dtype=object),
-        "reason": np.full(len(own), "", dtype=object),
-        "range_m": centres.ranges[keep],
-        "n_points": centres.n_points[keep].astype(np.int64),
-        "incidence_deg": np.degrees(centres.incidences[keep]),
-        "sigma_3d_m": centres.sigma_3d[keep],
-        "rms_m": centres.rms[keep],
-        "error_towards_m": centres.error_station[keep, 0],
-        "error_left_m": centres.error_station[keep, 1],
-        "error_up_m": centres.error_station[keep, 2],
-        "error_3d_m": centres.error_3d[keep],
-    }
+def _columns(made: Reproduction, *series: str) -> dict[str, NDArray[Any]]:
+    """Return the centres of some series by ours and by the study's method."""
+    keep = made.of(OURS, *series) | made.of(PAPER, *series)
+    return {key: column[keep] for key, column in made.centres.items() if key != "scan"}
 
 
 def _simulated_spheres(made: Reproduction) -> Plain:
     """Return the residuals of the simulated spheres as one row beside the real ones."""
-    keep = made.centres.of(OURS, made.series(CENTRE_REAL))
-    return {
-        "name": f"{int(keep.sum())} simulated, median",
-        "radius_m": made.config.marker_radius,
-        "range_m": float(np.median(made.centres.ranges[keep])),
-        "n_points": float(np.median(made.centres.n_points[keep])),
-        "rms_m": float(np.median(made.centres.rms[keep])),
+    keep = made.of(OURS, CENTRE_REAL)
+    medians = {
+        key: float(np.median(made.centres[key][keep])) for key in ("range_m", "n_points", "rms_m")
     }
+    name = f"{int(keep.sum())} simulated, median"
+    return {"name": name, "radius_m": made.config.marker_radius, **medians}
 
 
 def _real_scans(folder: Path, config: SurveyConfig) -> RealScans:
@@ -226,7 +202,7 @@ def _portable(figure: Any) -> str:
 
 def _csv_tables(made: Reproduction, page: ReproductionPage) -> dict[str, Sequence[Plain]]:
     """Return the tables of the study, the statements and all centres, by name."""
-    everything = _columns(made, np.arange(len(made.scans)))
+    everything = _columns(made, *{scan.series for scan in made.scans})
     centres = zip(*(column.tolist() for column in everything.values()), strict=True)
     return {
         "table2": page.table_2,

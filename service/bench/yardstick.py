@@ -1,8 +1,8 @@
 """The yardstick of the benchmark: one read of a file with a checksum, in a process of its own.
 
-It is what any program must pay that looks at each byte. In a process that has done much before,
-the same loop costs anything between this and a third of it, as memory happens to be at hand: so
-it is run as ``python -m spheremark.service.bench.yardstick FILE``, which does nothing else.
+Any program that looks at each byte pays it. In a process with a long history the same loop costs
+anything between this and a third of it, depending on the state of its memory: so it runs as
+``python -m spheremark.service.bench.yardstick FILE``, which does nothing else.
 """
 
 from __future__ import annotations
@@ -25,14 +25,14 @@ _READS = 3  # of which the quickest counts
 
 
 class Cost(NamedTuple):
-    """What something took: time, and time of processors, which a busy machine changes less [s]."""
+    """Time, and time of processors, which a busy machine changes less [s]."""
 
     seconds: float
     cpu_seconds: float
 
 
 def read_cost(log: Path) -> Cost:
-    """Return what one read costs in a fresh process."""
+    """Return the cost of one read in a fresh process."""
     command = [sys.executable, "-m", "spheremark.service.bench.yardstick", str(log)]
     done = subprocess.run(command, capture_output=True, text=True, check=True)
     return Cost(*json.loads(done.stdout))
@@ -44,7 +44,7 @@ def least(costs: Iterable[Cost]) -> Cost:
 
 
 def _cost(log: Path) -> Cost:
-    """Read a file once; return what it cost."""
+    """Read a file once; return its cost."""
     start, cpu, crc = perf_counter(), process_time(), 0
     with log.open("rb") as file:
         while block := file.read(_BLOCK):

@@ -56,7 +56,7 @@ def test_the_steps_are_those_of_the_chain(report):
     seconds = {one["step"]: one["seconds"] for one in report["steps"]}
     assert list(seconds) == [
         "preflight", "read log", "stitching", "extraction", "fitting.along_beam", "resection",
-        "subsets", "rows", "commit", "log to rows committed",
+        "subsets", "quality_control", "rows", "commit", "log to rows committed",
     ]  # fmt: skip
     parts = list(seconds.values())[1:-1]
     assert min(parts) > 0.0

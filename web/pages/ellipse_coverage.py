@@ -1,4 +1,4 @@
-"""The page that shows whether error ellipses hold what they promise."""
+"""The page on the coverage of error ellipses."""
 
 from __future__ import annotations
 
@@ -15,20 +15,20 @@ from spheremark.web.figures.elements import blank_figure
 from spheremark.web.pages.base import Frame, Panel
 from spheremark.web.templating import render
 
-_SAID = {
+_LABELS = {
     "free_station": "each station alone",
     "network": "network",
     "horizontal": "horizontal ellipse (2-D)",
     "position": "ellipsoid (3-D)",
     "pose": "pose with heading and levelling (6-D)",
 }
-_LOOKS = {"free_station": (theme.OURS, "circle"), "network": (theme.PAPER, "diamond")}
-_WITHIN = 0.05  # what a share may be off
+_STYLES = {"free_station": (theme.OURS, "circle"), "network": (theme.PAPER, "diamond")}
+_WITHIN = 0.05  # by which a share may be off
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class CoveragePage:
-    """A report of many simulated surveys, if one was made here."""
+    """A report of many simulated surveys, if there is one."""
 
     frame: Frame
     report: Mapping[str, Any] | None
@@ -37,16 +37,39 @@ class CoveragePage:
 def coverage_page(page: CoveragePage) -> str:
     """Return the page."""
     report = page.report
-    panels = [] if report is None else [*_curves(report), *_histograms(report)]
     return render(
         "coverage.html",
         page,
         here="coverage",
-        panels=panels,
-        said=_SAID,
+        panels=() if report is None else _panels(report),
+        labels=_LABELS,
         rows=() if report is None else _rows(report),
         within=_WITHIN,
     )
+
+
+def _panels(report: Mapping[str, Any]) -> list[Panel]:
+    """Return curves of shares, then histograms of squared errors, for each quantity."""
+    quantities = ("horizontal", "position")
+    curves = [
+        Panel(
+            name=f"curve-{quantity}",
+            figure=calibration_figure(report, quantity),
+            caption="Share of stations inside, against the nominal share; the band is five points "
+            "wide each way, bars are 95 % intervals.",
+        )
+        for quantity in quantities
+    ]
+    histograms = [
+        Panel(
+            name=f"squares-{quantity}",
+            figure=squares_figure(report, quantity),
+            caption="Squared error in units of the covariance; the line is the chi-square "
+            "distribution that honest covariances give.",
+        )
+        for quantity in quantities
+    ]
+    return curves + histograms
 
 
 def _rows(report: Mapping[str, Any]) -> list[dict[str, Any]]:
@@ -64,22 +87,9 @@ def _rows(report: Mapping[str, Any]) -> list[dict[str, Any]]:
     ]
 
 
-def _curves(report: Mapping[str, Any]) -> list[Panel]:
-    """Draw promised against found shares, for each quantity."""
-    return [
-        Panel(
-            name=f"curve-{quantity}",
-            figure=calibration_figure(report, quantity),
-            caption="Share of stations inside, against the share that was promised; the band is "
-            "five points wide each way, bars are 95 % intervals.",
-        )
-        for quantity in ("horizontal", "position")
-    ]
-
-
 def calibration_figure(report: Mapping[str, Any], quantity: str) -> go.Figure:
-    """Draw found shares against promised ones."""
-    figure = blank_figure(f"Promise kept: {_SAID[quantity]}")
+    """Draw found shares against nominal ones."""
+    figure = blank_figure(f"Coverage: {_LABELS[quantity]}")
     line = np.array([0.0, 100.0])
     figure.add_scatter(
         x=[*line, *line[::-1]],
@@ -91,7 +101,7 @@ def calibration_figure(report: Mapping[str, Any], quantity: str) -> go.Figure:
         hoverinfo="skip",
         name="within 5 points",
     )
-    for method, (colour, symbol) in _LOOKS.items():
+    for method, (colour, symbol) in _STYLES.items():
         rows = [
             one for one in report["curve"] if (one["method"], one["quantity"]) == (method, quantity)
         ]
@@ -109,30 +119,17 @@ def calibration_figure(report: Mapping[str, Any], quantity: str) -> go.Figure:
             },
             mode="markers",
             marker={"symbol": symbol, "size": 8, "color": colour},
-            name=_SAID[method],
-            hovertemplate="promised %{x:.0f} %, found %{y:.1f} %<extra></extra>",
+            name=_LABELS[method],
+            hovertemplate="nominal %{x:.0f} %, found %{y:.1f} %<extra></extra>",
         )
-    figure.update_xaxes(title_text="Promised share [%]", range=[0, 101])
+    figure.update_xaxes(title_text="Nominal share [%]", range=[0, 101])
     figure.update_yaxes(title_text="Stations inside [%]", range=[0, 103])
     return figure
 
 
-def _histograms(report: Mapping[str, Any]) -> list[Panel]:
-    """Draw the squares of errors beside chi-square, for each quantity."""
-    return [
-        Panel(
-            name=f"squares-{quantity}",
-            figure=squares_figure(report, quantity),
-            caption="Squared error in units of the covariance; the line is the chi-square "
-            "distribution that honest covariances give.",
-        )
-        for quantity in ("horizontal", "position")
-    ]
-
-
 def squares_figure(report: Mapping[str, Any], quantity: str) -> go.Figure:
     """Draw the distribution of squared errors."""
-    figure = blank_figure(f"Squared errors: {_SAID[quantity]}")
+    figure = blank_figure(f"Squared errors: {_LABELS[quantity]}")
     edges = np.array(report["bins"])
     middle, width = (edges[1:] + edges[:-1]) / 2, float(edges[1] - edges[0])
     dimensions = 2
@@ -146,8 +143,8 @@ def squares_figure(report: Mapping[str, Any], quantity: str) -> go.Figure:
             y=counts / max(counts.sum(), 1.0) / width,
             width=width,
             opacity=0.55,
-            marker={"color": _LOOKS[row["method"]][0], "line": {"width": 0}},
-            name=_SAID[row["method"]],
+            marker={"color": _STYLES[row["method"]][0], "line": {"width": 0}},
+            name=_LABELS[row["method"]],
             hovertemplate="square %{x:.2f}, density %{y:.3f}<extra></extra>",
         )
     x = np.linspace(0.02, edges[-1], 300)

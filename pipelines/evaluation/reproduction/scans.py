@@ -3,19 +3,18 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache, partial
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import NDArray
 
 from spheremark.pipelines.accuracy import UNMATCHED, marker_errors, mean_incidence
 from spheremark.pipelines.config import FittingConfig, SurveyConfig
 from spheremark.pipelines.detection import extract
-from spheremark.pipelines.error_model import ErrorSample
-from spheremark.pipelines.evaluation.experiment import Experiment
+from spheremark.pipelines.evaluation.experiment import Experiment, Plain
 from spheremark.pipelines.evaluation.reproduction.noise import RangeNoise, range_noise
 from spheremark.pipelines.evaluation.reproduction.plan import (
     CENTRE,
@@ -47,60 +46,6 @@ from spheremark.pipelines.simulation import (
     simulate_stop,
 )
 from spheremark.pipelines.sphere import fit_markers
-
-
-@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
-class Centres:
-    """Fitted centres with their errors, one of n rows for each scan, marker and method.
-
-    Attributes
-    ----------
-    scans : (n,)
-        Place of the scan in the plan.
-    methods, marks : tuple of str
-        Fitting method and true mark of each row.
-    ranges, n_points, incidences : (n,)
-        True distance to the mark [m], number of returns, mean angle of incidence [rad].
-    error_station : (n, 3)
-        Estimate minus truth towards the mark, to its left and upward [m].
-    sigma_3d, rms : (n,)
-        Predicted sigma, that of the heading included, and RMS of the residuals along the beam [m].
-    """
-
-    scans: Index
-    methods: tuple[str, ...]
-    marks: tuple[str, ...]
-    ranges: Array
-    n_points: Array
-    incidences: Array
-    error_station: Array
-    sigma_3d: Array
-    rms: Array
-
-    def __post_init__(self) -> None:
-        n = len(self.methods)
-        columns = ("scans", "ranges", "n_points", "incidences", "sigma_3d", "rms")
-        seal(self, **dict.fromkeys(columns, (n,)), error_station=(n, 3))
-        same_length(self, "methods", "marks", *columns)
-
-    @property
-    def error_3d(self) -> Array:
-        """Lengths of the errors, (n,) [m]."""
-        return np.asarray(np.linalg.norm(self.error_station, axis=1))
-
-    def of(self, method: str, scans: ArrayLike) -> Mask:
-        """Return which rows are of a method and of some scans, (n,)."""
-        return np.asarray((np.array(self.methods) == method) & np.isin(self.scans, scans))
-
-    def sample(self, keep: Mask) -> ErrorSample:
-        """Return some rows as the errors that a model is fitted to."""
-        return ErrorSample(
-            ranges=self.ranges[keep],
-            n_points=self.n_points[keep],
-            incidences=self.incidences[keep],
-            errors_3d=self.error_3d[keep],
-            scans=self.scans[keep],
-        )
 
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
@@ -139,39 +84,39 @@ class Example:
 class Reproduction:
     """The scans of a plan, the marks of each, and the errors of all centres.
 
-    ``example`` is a marker of the first scan, ``noise`` that of the ranges of the first scan that
-    simulates a real sensor.
+    Attributes
+    ----------
+    scans : tuple of Scan
+        The plan.
+    n_marks : (n,)
+        Marks of each scan's world.
+    centres : mapping of str to array
+        Columns, named as the database names them, with one row for each scan, marker and method.
+    example : Example
+        A marker of the first scan.
+    noise : RangeNoise
+        Noise of the ranges of the first scan that simulates a real sensor.
+    config : SurveyConfig
+        Configuration of the fits.
     """
 
     scans: tuple[Scan, ...]
     n_marks: Index
-    centres: Centres
+    centres: Mapping[str, NDArray[Any]]
     example: Example
     noise: RangeNoise
     config: SurveyConfig
 
-    def series(self, *names: str) -> Index:
-        """Return the places of the scans of some series."""
-        return np.flatnonzero([scan.series in names for scan in self.scans])
-
-
-class _Row(NamedTuple):
-    """One row of ``Centres`` without its scan."""
-
-    method: str
-    mark: str
-    range: float
-    n_points: int
-    incidence: float
-    error_station: Array
-    sigma_3d: float
-    rms: float
+    def of(self, method: str, *series: str) -> Mask:
+        """Return which centres are by a method and from some series of scans."""
+        is_own = np.isin(self.centres["series"].astype(str), series)
+        return np.asarray(is_own & (self.centres["fit_method"] == method))
 
 
 class _Measured(NamedTuple):
     """The results of one scan."""
 
-    rows: list[_Row]
+    rows: list[Plain]
     n_marks: int
     example: Example | None
     noise: RangeNoise | None
@@ -205,7 +150,7 @@ def reproduction(
         pool=lambda found: Reproduction(
             scans=tuple(scans),
             n_marks=np.array([one.n_marks for one in found], dtype=np.intp),
-            centres=_joined([one.rows for one in found]),
+            centres=columns_of([row for one in found for row in one.rows]),
             example=next(one.example for one in found if one.example is not None),
             noise=next(one.noise for one in found if one.noise is not None),
             config=config,
@@ -228,8 +173,13 @@ def _measure(place: int, *, scans: Sequence[Scan], config: SurveyConfig) -> _Mea
     cloud = stitch(stop.log, choose_rig(stop.log, None), config.stitching)
     found = extract(cloud, config.extraction, config.marker_radius)
     fits = _fits(cloud, found, scan, config)
+    origin = {"stop": scan.stop, "series": scan.series, "world": scan.seed, "turn_s": scan.turn}
     return _Measured(
-        rows=[row for name, one in fits.items() for row in _rows(name, one, cloud, field, stop)],
+        rows=[
+            {"scan": place, **origin, "fit_method": name, **row}
+            for name, one in fits.items()
+            for row in _rows(one, cloud, field, stop)
+        ],
         n_marks=len(field.marks.names),
         example=_example(fits, cloud, found, field, stop) if place == 0 else None,
         noise=_noise(stop) if place == shows_noise else None,
@@ -251,9 +201,7 @@ def _fits(
     }
 
 
-def _rows(
-    method: str, fits: MarkerFits, cloud: StitchedCloud, field: Field, stop: SimulatedStop
-) -> list[_Row]:
+def _rows(fits: MarkerFits, cloud: StitchedCloud, field: Field, stop: SimulatedStop) -> list[Plain]:
     """Compare the fits of one method with the truth; fits of no mark are left out."""
     errors = marker_errors(fits, stop.truth, field.marks)
     true = transform(inverse(stop.truth.T_site_base), field.marks.p_site)
@@ -261,44 +209,44 @@ def _rows(
     for fit, mark, error in zip(fits.fits, errors.marks, errors.error_base, strict=True):
         if mark == UNMATCHED:
             continue
+        name = field.marks.names[mark]
+        towards, left, up = _line_of_sight(true[mark], cloud) @ error
+        cov = fit.cov_with_heading(cloud.rig.sigma_heading)
+        incidence = mean_incidence(beams(cloud, fit.used), fit.p_base, fit.radius)
         rows.append(
-            _Row(
-                method=method,
-                mark=field.marks.names[mark],
-                range=float(np.linalg.norm(true[mark])),
-                n_points=fit.n_points,
-                incidence=mean_incidence(beams(cloud, fit.used), fit.p_base, fit.radius),
-                error_station=_sight(true[mark], cloud) @ error,
-                sigma_3d=float(np.sqrt(np.trace(fit.cov_with_heading(cloud.rig.sigma_heading)))),
-                rms=fit.rms,
-            )
+            {
+                "marker": name,
+                "mark": name,
+                "status": "ok",
+                "reason": "",
+                "range_m": float(np.linalg.norm(true[mark])),
+                "n_points": fit.n_points,
+                "incidence_deg": float(np.degrees(incidence)),
+                "sigma_3d_m": float(np.sqrt(np.trace(cov))),
+                "rms_m": fit.rms,
+                "error_towards_m": float(towards),
+                "error_left_m": float(left),
+                "error_up_m": float(up),
+                "error_3d_m": float(np.linalg.norm(error)),
+            }
         )
     return rows
 
 
-def _sight(p_base: Array, cloud: StitchedCloud) -> Array:
+def columns_of(rows: Sequence[Plain]) -> dict[str, NDArray[Any]]:
+    """Return the columns of rows with the same keys; texts as objects."""
+    return {
+        key: np.array([row[key] for row in rows], dtype=object if isinstance(one, str) else None)
+        for key, one in rows[0].items()
+    }
+
+
+def _line_of_sight(p_base: Array, cloud: StitchedCloud) -> Array:
     """Return the rotation from base to: towards a place, to its left, upward, (3, 3)."""
     up = levelling_rotation(cloud.levelling)[2]
     towards = p_base - (p_base @ up) * up
     towards = towards / np.linalg.norm(towards)
     return np.stack([towards, np.cross(up, towards), up])
-
-
-def _joined(rows_of_scans: Sequence[Sequence[_Row]]) -> Centres:
-    """Put the rows of all scans into columns."""
-    rows = [row for rows in rows_of_scans for row in rows]
-    scans = np.repeat(np.arange(len(rows_of_scans)), [len(rows) for rows in rows_of_scans])
-    return Centres(
-        scans=scans.astype(np.intp),
-        methods=tuple(row.method for row in rows),
-        marks=tuple(row.mark for row in rows),
-        ranges=np.array([row.range for row in rows]),
-        n_points=np.array([float(row.n_points) for row in rows]),
-        incidences=np.array([row.incidence for row in rows]),
-        error_station=np.array([row.error_station for row in rows]).reshape(-1, 3),
-        sigma_3d=np.array([row.sigma_3d for row in rows]),
-        rms=np.array([row.rms for row in rows]),
-    )
 
 
 def _example(
@@ -319,7 +267,7 @@ def _example(
     fit = {n: one.fits[int(np.flatnonzero(marks[n] == mark)[0])] for n, one in fits.items()}
     members = np.union1d(fit[PAPER].used, fit[PAPER].rejected)
     is_left = np.isin(members, fit[PAPER].used)
-    R = _sight(true[mark], cloud)
+    R = _line_of_sight(true[mark], cloud)
     points = (cloud.p_base[members] - true[mark]) @ R.T
     return Example(
         mark=field.marks.names[mark],

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -11,6 +11,7 @@ from spheremark.pipelines.accuracy import ErrorSummary, summarise
 from spheremark.pipelines.error_model import (
     Demand,
     ErrorModel,
+    ErrorSample,
     Limits,
     Statistic,
     fit_error_model,
@@ -32,7 +33,7 @@ from spheremark.pipelines.evaluation.reproduction.plan import (
     TURNS,
 )
 from spheremark.pipelines.evaluation.reproduction.scans import Reproduction
-from spheremark.pipelines.model import Index, Mask
+from spheremark.pipelines.model import Mask
 from spheremark.pipelines.published import GREATEST_DISTANCE, TABLE_2
 
 FIELD, LANE, REAL = "field", "to 30 m", "to 30 m, noise of a real VLP-16"
@@ -57,8 +58,7 @@ class Finding(NamedTuple):
 
 def table_2(made: Reproduction) -> list[Plain]:
     """Return the study's Table 2 again: errors by distance; NaN where a marker was never found."""
-    centres, scans = made.centres, made.series(CENTRE)
-    nearest = np.argmin(np.abs(centres.ranges[:, None] - TABLE_2.ranges), axis=1)
+    nearest = np.argmin(np.abs(made.centres["range_m"][:, None] - TABLE_2.ranges), axis=1)
     rows = []
     for i, distance in enumerate(TABLE_2.ranges):
         published = float(TABLE_2.errors_3d[i])
@@ -68,9 +68,9 @@ def table_2(made: Reproduction) -> list[Plain]:
             "study_error_3d_m": published,
         }
         for method in (OURS, PAPER):
-            keep = centres.of(method, scans) & (nearest == i)
+            keep = made.of(method, CENTRE) & (nearest == i)
             errors = _summary(made, keep)
-            counts = centres.n_points[keep]
+            counts = made.centres["n_points"][keep]
             row[f"{method}_n_points_mean"] = float(counts.mean()) if keep.any() else np.nan
             row[f"{method}_error_3d_mean_m"] = errors.mean
             row[f"{method}_error_3d_max_m"] = errors.largest
@@ -81,19 +81,20 @@ def table_2(made: Reproduction) -> list[Plain]:
 
 def table_4(made: Reproduction) -> list[Plain]:
     """Return the study's Table 4 again: mean error per stop of lane 2."""
-    centres, rows = made.centres, []
+    rows = []
     for stop in STOPS_OF_LANE_2:
-        scans = np.array([i for i in made.series(LANE_2) if made.scans[i].stop == stop], np.intp)
-        if not len(scans):
+        scans = [i for i, one in enumerate(made.scans) if (one.series, one.stop) == (LANE_2, stop)]
+        if not scans:
             continue
-        ours = centres.ranges[centres.of(OURS, scans)]
+        at_stop = made.centres["stop"] == stop
+        ours = made.centres["range_m"][made.of(OURS, LANE_2) & at_stop]
         row: Plain = {
             "stop": stop,
             "n_marks": int(made.n_marks[scans].sum()),
             "range_mean_m": float(ours.mean()) if len(ours) else np.nan,
         }
         for method in (OURS, PAPER):
-            errors = _summary(made, centres.of(method, scans))
+            errors = _summary(made, made.of(method, LANE_2) & at_stop)
             row[f"{method}_n"] = errors.n
             row[f"{method}_error_3d_mean_m"] = errors.mean
             row[f"{method}_error_3d_p95_m"] = errors.p95
@@ -106,19 +107,19 @@ def readings(made: Reproduction) -> list[Plain]:
     centres, rows = made.centres, []
     for series in (CENTRE, CENTRE_REAL):
         for method in (PAPER, GROUND):
-            keep = centres.of(method, made.series(series))
-            errors, bias = _summary(made, keep), centres.error_station[keep].mean(axis=0)
+            keep = made.of(method, series)
+            errors = _summary(made, keep)
             rows.append(
                 {
                     "series": series,
                     "fit_method": method,
                     "n": errors.n,
-                    "n_points_mean": float(centres.n_points[keep].mean()),
+                    "n_points_mean": float(centres["n_points"][keep].mean()),
                     "error_3d_mean_m": errors.mean,
-                    "error_3d_min_m": float(centres.error_3d[keep].min(initial=np.inf)),
+                    "error_3d_min_m": float(centres["error_3d_m"][keep].min(initial=np.inf)),
                     "error_3d_max_m": errors.largest,
-                    "bias_beyond_m": float(bias[0]),
-                    "bias_up_m": float(bias[2]),
+                    "bias_beyond_m": float(centres["error_towards_m"][keep].mean()),
+                    "bias_up_m": float(centres["error_up_m"][keep].mean()),
                 }
             )
     return rows
@@ -126,8 +127,7 @@ def readings(made: Reproduction) -> list[Plain]:
 
 def models_of_icp(made: Reproduction) -> dict[str, ErrorSummary]:
     """Compare the hemisphere and the full sphere as models of the study's ICP (Figure 3)."""
-    scans = made.series(CENTRE)
-    return {m: _summary(made, made.centres.of(m, scans)) for m in (PAPER, FULL_SPHERE)}
+    return {method: _summary(made, made.of(method, CENTRE)) for method in (PAPER, FULL_SPHERE)}
 
 
 def findings(made: Reproduction, rng: np.random.Generator) -> tuple[Finding, ...]:
@@ -136,29 +136,35 @@ def findings(made: Reproduction, rng: np.random.Generator) -> tuple[Finding, ...
     Greatest distances are for the default time of a turn, smallest counts for 7.5 m, the distance
     of the study's own limit. ``rng`` draws the resamples of the confidence intervals.
     """
-    places = {
-        FIELD: made.series(CENTRE, LANE_2, TURNS),
-        LANE: made.series(DISTANCES),
-        REAL: made.series(DISTANCES_REAL),
-    }
+    places = {FIELD: (CENTRE, LANE_2, TURNS), LANE: (DISTANCES,), REAL: (DISTANCES_REAL,)}
     return tuple(
-        _finding(made, place, method, scans, rng)
-        for place, scans in places.items()
+        _finding(made, place, method, series, rng)
+        for place, series in places.items()
         for method in (OURS, PAPER)
     )
 
 
 def _finding(
-    made: Reproduction, place: str, method: str, scans: Index, rng: np.random.Generator
+    made: Reproduction, place: str, method: str, series: Sequence[str], rng: np.random.Generator
 ) -> Finding:
     """Return the limits of one method in one place."""
-    centres, tolerance = made.centres, made.config.tolerance
-    usual = centres.of(method, [i for i in scans if made.scans[i].turn == TURN])
-    density = float(np.median(centres.n_points[usual] * centres.ranges[usual] ** 2))
-    sample = centres.sample(centres.of(method, scans))
+    keep = made.of(method, *series)
+    usual = keep & (made.centres["turn_s"] == TURN)
+    own = {key: column[keep] for key, column in made.centres.items()}
+    sample = ErrorSample(
+        ranges=own["range_m"],
+        n_points=own["n_points"].astype(np.float64),
+        incidences=np.radians(own["incidence_deg"]),
+        errors_3d=own["error_3d_m"],
+        scans=own["scan"].astype(np.intp),
+    )
+    density = float(np.median((made.centres["n_points"] * made.centres["range_m"] ** 2)[usual]))
     demands = {
         statistic: Demand(
-            tolerance=tolerance, statistic=statistic, at_range=GREATEST_DISTANCE, density=density
+            tolerance=made.config.tolerance,
+            statistic=statistic,
+            at_range=GREATEST_DISTANCE,
+            density=density,
         )
         for statistic in _STATISTICS
     }
@@ -173,4 +179,4 @@ def _finding(
 
 def _summary(made: Reproduction, keep: Mask) -> ErrorSummary:
     """Summarise the errors of some rows."""
-    return summarise(made.centres.error_3d[keep], made.config.tolerance)
+    return summarise(made.centres["error_3d_m"][keep], made.config.tolerance)

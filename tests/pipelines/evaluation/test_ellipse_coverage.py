@@ -20,7 +20,7 @@ from spheremark.pipelines.threads import in_processes
 
 
 def drawn(rng, n_surveys=200, n_stops=7, scale=1.0, shared=0.0):
-    """Squares of normal errors, ``scale`` times as large as promised, partly shared by a survey."""
+    """Squares of normal errors, ``scale`` times as large as nominal, partly shared by a survey."""
     n = n_surveys * n_stops
     squares = {}
     for method in METHODS:

@@ -32,6 +32,7 @@ def test_cells_are_in_the_unit_of_the_heading():
     assert column.cell({"error_3d_m": 0.0123}) == "12.3"
     assert Column("range_m", "distance", "m", ".2f").cell({"range_m": 7.5}) == "7.50"
     assert Column("share", "share", "%", ".0f").cell({"share": 0.5}) == "50"
+    assert Column("n", "returns", "", ",d").cell({"n": 1200}) == "1,200"
 
 
 def test_cells_without_a_value_are_marked_and_texts_stand_as_they_are():

@@ -1,4 +1,4 @@
-"""The benchmark of whole surveys on very small ones: what it says must hang together."""
+"""The experiment with adjusted surveys, on very small ones."""
 
 import json
 
@@ -50,7 +50,7 @@ def test_the_report_is_a_table_and_json(report):
     assert json.loads(json.dumps(report))["surveys"] == report["surveys"]
 
 
-def test_a_wrong_rig_is_wrong_by_what_was_said():
+def test_a_wrong_rig_is_wrong_by_the_stated_amounts():
     rig = nominal_rig(SimulationConfig())
     wrong = wrong_rig(rig, np.random.default_rng(1))
     off = dict(zip([one.name for one in GIMBAL], np.abs(values(wrong) - values(rig)), strict=True))

@@ -68,33 +68,30 @@ def test_the_published_table_agrees_with_itself():
 
 
 def test_the_simulated_field_has_the_distances_of_the_study(made):
-    keep = made.centres.of(OURS, made.series(CENTRE))
+    keep = made.of(OURS, CENTRE)
     assert keep.sum() == 14
-    assert_allclose(np.sort(made.centres.ranges[keep]), TABLE_2.ranges, rtol=0, atol=2 * MM)
+    assert_allclose(np.sort(made.centres["range_m"][keep]), TABLE_2.ranges, rtol=0, atol=2 * MM)
 
 
 def test_ours_is_within_the_tolerance_where_the_paper_is_several_times_worse(made):
-    ours, paper = (
-        made.centres.error_3d[made.centres.of(method, made.series(CENTRE))]
-        for method in (OURS, PAPER)
-    )
+    ours, paper = (made.centres["error_3d_m"][made.of(method, CENTRE)] for method in (OURS, PAPER))
     assert ours.max() < 0.030
     assert paper.mean() > 2.5 * ours.mean()
 
 
 def test_predictions_hold_what_mounting_and_encoder_leave_of_the_heading(made):
-    keep = made.centres.of(OURS, made.series(CENTRE_REAL))
-    sideways = nominal_rig(SimulationConfig()).sigma_heading * made.centres.ranges[keep]
-    assert (made.centres.sigma_3d[keep] > 0.99 * sideways).all()  # spheres stand nearly level
-    within = made.centres.error_3d[keep] < 3.0 * made.centres.sigma_3d[keep]
+    keep = made.of(OURS, CENTRE_REAL)
+    sideways = nominal_rig(SimulationConfig()).sigma_heading * made.centres["range_m"][keep]
+    assert (made.centres["sigma_3d_m"][keep] > 0.99 * sideways).all()  # spheres stand nearly level
+    within = made.centres["error_3d_m"][keep] < 3.0 * made.centres["sigma_3d_m"][keep]
     assert within.all()
 
 
 def test_the_paper_errs_towards_the_scanner_and_upward(made):
-    errors = made.centres.error_station[made.centres.of(PAPER, made.series(CENTRE))]
-    assert errors[:, 0].mean() < -15 * MM
-    assert errors[:, 2].mean() > 8 * MM
-    assert abs(errors[:, 1].mean()) < 5 * MM
+    keep = made.of(PAPER, CENTRE)
+    assert made.centres["error_towards_m"][keep].mean() < -15 * MM
+    assert made.centres["error_up_m"][keep].mean() > 8 * MM
+    assert abs(made.centres["error_left_m"][keep].mean()) < 5 * MM
 
 
 def test_the_paper_errs_by_as_much_as_it_prints_with_the_cut_and_the_noise_assumed(made):
@@ -157,9 +154,9 @@ def test_table_2_puts_each_centre_to_its_distance():
     rows = table_2(made)
     assert [row["distance_m"] for row in rows] == TABLE_2.ranges.tolist()
     centres = made.centres
-    first = centres.of(PAPER, made.series(CENTRE)) & (centres.ranges == rows[0]["distance_m"])
+    first = made.of(PAPER, CENTRE) & (centres["range_m"] == rows[0]["distance_m"])
     assert rows[0]["paper_n"] == first.sum() == 2
-    assert rows[0]["paper_error_3d_mean_m"] == pytest.approx(centres.error_3d[first].mean())
+    assert rows[0]["paper_error_3d_mean_m"] == pytest.approx(centres["error_3d_m"][first].mean())
     assert rows[0]["along_beam_n_points_mean"] == np.ceil(6800.0 / 6.84**2)
 
 
