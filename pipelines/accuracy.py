@@ -6,7 +6,6 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike
-from scipy.optimize import linear_sum_assignment
 
 from spheremark.pipelines.geometry import inverse, transform, wrap
 from spheremark.pipelines.model import (
@@ -133,6 +132,8 @@ def centre_errors(p_base: ArrayLike, stop: StopTruth, marks: ControlMarks) -> Ma
     MarkerErrors
         In the order of the centres.
     """
+    from scipy.optimize import linear_sum_assignment  # slow to import
+
     found = np.asarray(p_base, dtype=np.float64).reshape(-1, 3)
     true = transform(inverse(stop.T_site_base), marks.p_site)
     distances = np.linalg.norm(found[:, None] - true[None], axis=2)

@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import cache
 from typing import Any, Literal
-
-import numba
-from numba.core import event
 
 # A product and the sum that follows are rounded once
 FUSED: frozenset[str] = frozenset({"contract"})
@@ -15,6 +13,7 @@ REASSOCIATED: frozenset[str] = frozenset({"contract", "reassoc"})
 
 # Without `no_cfunc_wrapper` each kernel is compiled a second time, for callers in C
 _OPTIONS = {"cache": True, "nogil": True, "error_model": "numpy", "no_cfunc_wrapper": True}
+_REPORTS: list[Callable[[int], None]] = []
 
 
 def compiled(function: Callable[..., Any]) -> Any:
@@ -31,7 +30,7 @@ def compiled(function: Callable[..., Any]) -> Any:
     callable
         The same function, compiled.
     """
-    return numba.njit(**_OPTIONS)(function)
+    return _njit()(**_OPTIONS)(function)
 
 
 def compiled_with(
@@ -56,37 +55,62 @@ def compiled_with(
 
     def decorate(function: Callable[..., Any]) -> Any:
         options = {**_OPTIONS, "fastmath": set(fastmath), "inline": inline}
-        return numba.njit(**options)(function)
+        return _njit()(**options)(function)
 
     return decorate
 
 
-class _OptimiseOnce(event.Listener):  # type: ignore[misc]  # numba ships no types
-    """Optimises a kernel in full only where Python calls it.
+@cache
+def _njit() -> Any:
+    """Import numba, of which commands that compute nothing have no need."""
+    import numba
+    from numba.core import event
+
+    event.Listener.register(_Compilations)
+    event.register("numba:compile", _Compilations(numba.config))
+    return numba.njit
+
+
+def watch_compilation(report: Callable[[int], None]) -> None:
+    """Have a function called before each compilation: of kernels that no earlier process kept.
+
+    Parameters
+    ----------
+    report : callable
+        Takes the number of kernels that this process has compiled, those inside others excepted.
+    """
+    _REPORTS.append(report)
+
+
+class _Compilations:
+    """Follows what is compiled; optimises a kernel in full only where Python calls it.
 
     LLVM optimises a kernel again as a part of each kernel that calls it. For the inner ones the
     first level is enough: the code of the outermost is the same, in two thirds of the time.
     """
 
-    def __init__(self) -> None:
-        self._levels: list[Any] = []  # of the kernels that are being compiled, outermost first
+    def __init__(self, config: Any) -> None:
+        self._config = config
+        self._levels = [config.OPT]  # before, and of the kernels being compiled, outermost first
+        self._inner_level = min(config.OPT, type(config.OPT)(1))
         self._is_ours = False
+        self._n_compiled = 0
 
-    def on_start(self, event: Any) -> None:
-        """Lower the level for what is compiled on behalf of a kernel of this package."""
-        if not self._levels:
-            module = event.data["dispatcher"].py_func.__module__
-            self._is_ours = module.startswith("spheremark.")
-        elif self._is_ours:
-            numba.config.OPT = _INNER_LEVEL
-        self._levels.append(numba.config.OPT)
+    def notify(self, event: Any) -> None:
+        """Set the level of a kernel that begins, or restore that of the kernel around it."""
+        if not event.is_start:
+            self._levels.pop()
+        elif len(self._levels) == 1:
+            self._is_ours = event.data["dispatcher"].py_func.__module__.startswith("spheremark.")
+            self._levels.append(self._levels[0])
+            self._report()
+        else:
+            self._levels.append(self._inner_level if self._is_ours else self._levels[-1])
+        self._config.OPT = self._levels[-1]
 
-    def on_end(self, event: Any) -> None:  # noqa: ARG002  the protocol of numba
-        """Restore the level of the kernel around it."""
-        self._levels.pop()
-        numba.config.OPT = self._levels[-1] if self._levels else _LEVEL
-
-
-_LEVEL = numba.config.OPT
-_INNER_LEVEL = min(_LEVEL, type(_LEVEL)(1))
-event.register("numba:compile", _OptimiseOnce())
+    def _report(self) -> None:
+        """Report the kernels compiled so far."""
+        if self._is_ours:
+            for report in _REPORTS:
+                report(self._n_compiled)
+            self._n_compiled += 1

@@ -30,7 +30,7 @@ from spheremark.service.cli.survey import (
     calibrate,
     read_control,
 )
-from spheremark.service.cli.terminal import err, out
+from spheremark.service.cli.terminal import announce_compilation, err, out
 from spheremark.service.cli.terminal import print_json as _print_json
 from spheremark.service.cli.terminal import progress as _progress
 from spheremark.service.cli.terminal import settings as _settings
@@ -71,6 +71,7 @@ class Frame(StrEnum):
 
 def main() -> None:
     """Run the command line; an error of ours becomes one sentence, or a problem as JSON."""
+    announce_compilation()
     try:
         app()
     except SpheremarkError as error:

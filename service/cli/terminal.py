@@ -11,10 +11,17 @@ from typing import TYPE_CHECKING, Any
 import typer
 from rich.console import Console
 
+from spheremark.pipelines.compilation import watch_compilation
+
 if TYPE_CHECKING:
     from spheremark.pipelines.survey import Progress
     from spheremark.service.settings import Settings
 
+_COMPILING = (
+    "Compiling numerical kernels. They are kept for later runs; "
+    "the first scan of a new version takes about a minute longer.\n"
+)
+_N_LINE = 10  # kernels between two lines; a first scan needs about 50
 _WIDE = 160  # columns of a table that goes into a file or a pipe
 out = Console(width=None if sys.stdout.isatty() else _WIDE)
 err = Console(stderr=True)
@@ -29,6 +36,19 @@ def progress() -> Iterator[Progress]:
     with Progress(*columns, console=err, transient=True, disable=not err.is_terminal) as bar:
         task = bar.add_task("", total=1.0)
         yield lambda share, what: bar.update(task, completed=share, description=what)
+
+
+def announce_compilation() -> None:
+    """Write to standard error when kernels are compiled, which the first command has to."""
+    watch_compilation(_announce)
+
+
+def _announce(n_compiled: int) -> None:
+    """Write a sentence before the first kernel, and then how many are compiled."""
+    if n_compiled == 0:
+        sys.stderr.write(_COMPILING)
+    elif n_compiled % _N_LINE == 0:
+        sys.stderr.write(f"{n_compiled} kernels compiled ...\n")
 
 
 def print_json(value: Any) -> None:

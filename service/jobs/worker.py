@@ -6,6 +6,7 @@ writes to the catalogue; errors are raised here and recorded by the service.
 
 from __future__ import annotations
 
+import logging
 import signal
 import threading
 from pathlib import Path
@@ -15,6 +16,7 @@ from typing import TYPE_CHECKING
 
 from distributed import WorkerPlugin, get_worker
 
+from spheremark.pipelines.compilation import watch_compilation
 from spheremark.pipelines.config import SurveyConfig
 from spheremark.service.jobs.handlers import KINDS, JobResult, JobSpecification
 from spheremark.service.jobs.memory import keep_memory
@@ -22,6 +24,7 @@ from spheremark.service.jobs.memory import keep_memory
 if TYPE_CHECKING:
     from distributed import Worker
 
+_LOG = logging.getLogger(__name__)
 TOPIC = "spheremark"  # of the events that report progress
 _TICK = 0.1  # [s] between two reports of progress
 
@@ -84,9 +87,16 @@ class WarmUp(WorkerPlugin):  # type: ignore[misc]  # distributed ships no types
     def setup(self, worker: Worker) -> None:  # noqa: ARG002  the protocol of Dask
         """Begin, without delaying the first job."""
         keep_memory()
+        watch_compilation(_log_compilation)
         if self.is_ours:  # Ctrl-C is for the service, which then ends its workers
             signal.signal(signal.SIGINT, signal.SIG_IGN)
         threading.Thread(target=warm_up, name="warm-up", daemon=True).start()
+
+
+def _log_compilation(n_compiled: int) -> None:
+    """Log why the first job of a new version takes longer."""
+    if n_compiled == 0:
+        _LOG.warning("Compiling numerical kernels, once: the first job takes a minute longer.")
 
 
 def warm_up() -> None:
