@@ -428,28 +428,30 @@ def _power(data: _Regression, coefficients: Array, term: str) -> Array:
     return np.asarray(coefficients[:, 1 + data.terms.index(term)])
 
 
+def _crossing(
+    slope: Array, room: Array, span: tuple[float, float], reference: float
+) -> tuple[Array, Array, Array]:
+    """Return where errors cross the tolerance within the span, and whether its ends keep it."""
+    low, high = np.log(np.array(span) / reference)
+    crossing = np.clip(room / np.where(slope == 0, 1.0, slope), low, high)
+    return reference * np.exp(crossing), slope * low <= room, slope * high <= room
+
+
 def _distances(data: _Regression, coefficients: Array, excess: Array) -> Array:
     """Return up to which distance each fit keeps the tolerance, with ``density`` returns at 1 m."""
     of_range, of_count = (_power(data, coefficients, term) for term in TERMS[:2])
-    slope = of_range - 2.0 * of_count
     turn = np.log(data.density / (data.reference[0] ** 2 * data.reference[1]))
-    room = excess - of_count * turn
-    low, high = np.log(np.array(data.range_span) / data.reference[0])
-    is_kept_near, is_kept_far = slope * low <= room, slope * high <= room
-    crossing = np.clip(room / np.where(slope == 0, 1.0, slope), low, high)
-    found = np.where(is_kept_far, np.inf, data.reference[0] * np.exp(crossing))
-    return np.where(is_kept_near, found, 0.0)
+    slope, room = of_range - 2.0 * of_count, excess - of_count * turn
+    found, near, far = _crossing(slope, room, data.range_span, float(data.reference[0]))
+    return np.where(near, np.where(far, np.inf, found), 0.0)
 
 
 def _counts(data: _Regression, coefficients: Array, excess: Array, at_range: float) -> Array:
     """Return from which count on each fit keeps the tolerance at a distance."""
     of_range, of_count = (_power(data, coefficients, term) for term in TERMS[:2])
     room = excess - of_range * np.log(at_range / data.reference[0])
-    low, high = np.log(np.array(data.count_span) / data.reference[1])
-    is_kept_few, is_kept_many = of_count * low <= room, of_count * high <= room
-    crossing = np.clip(room / np.where(of_count == 0, 1.0, of_count), low, high)
-    found = np.where(is_kept_few, 0.0, data.reference[1] * np.exp(crossing))
-    return np.where(is_kept_many, found, np.inf)
+    found, few, many = _crossing(of_count, room, data.count_span, float(data.reference[1]))
+    return np.where(many, np.where(few, 0.0, found), np.inf)
 
 
 def _bound(values: Array, seen: tuple[float, float]) -> Bound:

@@ -36,6 +36,8 @@ _SEGMENT = 1.35  # radii about the rough centre within which a return may be the
 _NEARBY = 1.6  # the same for the test of the radius, which may be larger
 _MIDDLE = 0.3  # radii: returns nearer to the middle belong to no octant of the limb
 
+_N_STEPS, _SETTLED = 30, 1e-7  # steps, [m]
+
 Fits = tuple[tuple[MarkerFit, ...], tuple[Rejection, ...]]
 
 
@@ -157,6 +159,24 @@ def sentence(reasons: list[str]) -> str:
     """Return reasons as one sentence; empty if there are none."""
     text = ", ".join(reasons)
     return text[:1].upper() + text[1:] + "." if reasons else ""
+
+
+def surface(points: Array, p: Array, radius: float) -> tuple[Array, Array]:
+    """Return unit vectors from a centre to points, and the points' distances from the surface."""
+    v = points - p
+    away = np.linalg.norm(v, axis=1)
+    return v / np.maximum(away, 1e-9)[:, None], away - radius
+
+
+def iterated(linearise: Callable[[Array], tuple[Array, Array]], x: Array, step_max: float) -> Array:
+    """Return where Gauss-Newton steps, none longer than ``step_max`` [m], settle."""
+    for _ in range(_N_STEPS):
+        step = np.linalg.lstsq(*linearise(x))[0]
+        step *= min(1.0, step_max / max(float(np.linalg.norm(step)), 1e-12))
+        x = x + step
+        if np.linalg.norm(step) < _SETTLED:
+            break
+    return x
 
 
 def spread_of(normals: Array, residuals: Array, n_unknowns: int) -> Array:

@@ -33,25 +33,6 @@ _SEARCHES = (1e-2, 1e-3, 1e-4, 1e-5, 1e-6)  # half widths of the search for the 
 _MARGIN = np.radians(1.0)  # effect of the LiDAR's offset from the axis on directions
 
 
-class Pattern(NamedTuple):
-    """Firing times and directions of the lasers.
-
-    Attributes
-    ----------
-    phase : float
-        Instant of the first laser of firing 0 [s].
-    spin : float
-        Rate of the azimuth [rad/s].
-    times, azimuths : (k,)
-        Deviations from a steady spin at some instants [s, rad].
-    """
-
-    phase: float
-    spin: float
-    times: Array
-    azimuths: Array
-
-
 class Firings(NamedTuple):
     """All firings of a stop, and which of their pulses returned.
 
@@ -99,8 +80,8 @@ class Passing(NamedTuple):
     distance: float
 
 
-def pattern_of(cloud: StitchedCloud) -> tuple[Pattern | None, str]:
-    """Return the firing pattern, or the reason why it cannot be determined."""
+def firings_of(cloud: StitchedCloud) -> tuple[Firings | None, str]:
+    """Return every firing between the first return and the last, or why they are not known."""
     if len(cloud.rig.laser_elevations) != N_LASERS:
         return None, f"the rig has {len(cloud.rig.laser_elevations)} lasers, not a VLP-16's 16"
     if not len(cloud.rings) or np.any(cloud.rings == RING_UNKNOWN):
@@ -124,7 +105,8 @@ def pattern_of(cloud: StitchedCloud) -> tuple[Pattern | None, str]:
     scatter = np.sqrt(np.mean((off - np.bincount(bins, off)[bins] / counts[bins]) ** 2))
     if not scatter < _SPIN_MAX:
         return None, "the azimuths of the returns do not follow a steady spin"
-    return Pattern(phase, spin, times.min() + seen * _DRIFT, drift), ""
+    drifts = (times.min() + seen * _DRIFT, drift)
+    return _all_firings(cloud, phase, spin, drifts), ""
 
 
 def _azimuths(cloud: StitchedCloud, rows: Index) -> Array:
@@ -154,24 +136,26 @@ def _steady(times: Array, azimuths: Array) -> tuple[float, Array]:
     return spin, mean + np.angle(turns * np.exp(-1j * (spin * times + mean)))
 
 
-def firings_of(cloud: StitchedCloud, pattern: Pattern) -> Firings:
-    """Return every firing between the first return and the last."""
-    seconds = cloud.times[:] - _DELAYS[cloud.rings] - pattern.phase
+def _all_firings(
+    cloud: StitchedCloud, phase: float, spin: float, drifts: tuple[Array, Array]
+) -> Firings:
+    """Return the firings for the instant of firing 0, and a spin with deviations at some times."""
+    seconds = cloud.times[:] - _DELAYS[cloud.rings] - phase
     numbers = np.rint(seconds / FIRING_CYCLE).astype(np.intp)
     first = int(numbers.min())
     row_of = np.full((int(numbers.max()) - first + 1, N_LASERS), -1, np.int32)
     row_of[numbers - first, cloud.rings] = np.arange(len(numbers))
     numbered = np.arange(first, first + len(row_of), dtype=np.float64)
-    times: Array = pattern.phase + FIRING_CYCLE * numbered
+    times: Array = phase + FIRING_CYCLE * numbered
     thin = slice(None, None, max(len(cloud.times) // _N_TIMED, 1))
     stamps, places = np.unique(cloud.times[thin], return_index=True)
     angles = np.unwrap(cloud.gimbal_angles[thin][places])
     gimbal = np.interp(times, stamps, angles.astype(np.float64))
-    azimuths = pattern.spin * times + np.interp(times, pattern.times, pattern.azimuths)
+    azimuths = spin * times + np.interp(times, *drifts)
     return Firings(
         azimuths=azimuths,
         angles=gimbal,
-        spin=pattern.spin,
+        spin=spin,
         turn=float(np.median(np.diff(gimbal))) / FIRING_CYCLE,
         row_of=row_of,
     )

@@ -28,9 +28,11 @@ from spheremark.pipelines.sphere.description import (
     described,
     each,
     is_undetermined,
+    iterated,
     on_sphere,
     refused,
     spread_of,
+    surface,
 )
 
 NAME = "astm_e3125"
@@ -45,8 +47,7 @@ _SIGMAS = 3.0
 _N_KEPT = 12  # returns that the small-sample variant does not thin out further by 3 sigma
 _NEAREST = 0.25  # share of the returns that starts the small-sample variant
 _N_MIN = 4  # returns: one more than unknowns
-_N_STEPS = 20
-_SETTLED = 1e-7  # [m]
+_STEP_MAX = 0.25  # radii
 _STRAY = 1.0  # radii by which a centre may leave its rough place
 
 
@@ -97,7 +98,7 @@ def _fit_one(
             f"needs {_N_MIN}.",
         )
     used: Index = rows[chosen.is_used]
-    normals, residuals = _surface(points[chosen.is_used], chosen.p, radius)
+    normals, residuals = surface(points[chosen.is_used], chosen.p, radius)
     if is_undetermined(normals.T @ normals, n):
         return refused(candidate, "Its returns leave the centre undetermined: they lie on a line.")
     cov = spread_of(normals.T @ normals, residuals, 3)
@@ -120,7 +121,7 @@ def _passes(returns: Beams, points: Array, radius: float) -> _Chosen:
         if is_used.sum() < _N_MIN:
             break
         p = _centre(points[is_used], p, radius)
-        residuals = _surface(points[is_used], p, radius)[1]
+        residuals = surface(points[is_used], p, radius)[1]
         n = len(residuals)
         sigma = float(np.sqrt(residuals @ residuals / (max(n - 3, 1) if is_small else n)))
         is_off = np.abs(residuals) > _SIGMAS * sigma
@@ -140,20 +141,6 @@ def _in_view(returns: Beams, points: Array, p: Array, radius: float) -> Mask:
     return np.asarray((along > _CONE * away) & (beside < _CYLINDER * radius))
 
 
-def _surface(points: Array, p: Array, radius: float) -> tuple[Array, Array]:
-    """Return unit vectors from the centre to returns and their distances from the surface [m]."""
-    v = points - p
-    away = np.linalg.norm(v, axis=1)
-    return v / np.maximum(away, 1e-9)[:, None], away - radius
-
-
 def _centre(points: Array, p: Array, radius: float) -> Array:
     """Return the centre of a sphere of known radius by least squares of the distances from it."""
-    for _ in range(_N_STEPS):
-        normals, residuals = _surface(points, p, radius)
-        step = np.linalg.lstsq(normals, residuals)[0]
-        step *= min(1.0, 0.25 * radius / max(float(np.linalg.norm(step)), 1e-12))
-        p = p + step
-        if np.linalg.norm(step) < _SETTLED:
-            break
-    return p
+    return iterated(lambda p: surface(points, p, radius), p, _STEP_MAX * radius)

@@ -22,18 +22,18 @@ from spheremark.pipelines.sphere.description import (
     described,
     each,
     is_undetermined,
+    iterated,
     on_sphere,
     refused,
     spread_of,
+    surface,
 )
 
 GEOMETRIC = "free_radius"
 ALGEBRAIC = "algebraic"
 
 _N_MIN = 5  # returns: one more than unknowns
-_N_STEPS = 30
 _STEP_MAX = 0.5  # radii
-_SETTLED = 1e-7  # [m]
 _STRAY = 2.0  # radii by which a centre may leave its rough place
 
 
@@ -77,7 +77,10 @@ def _fit_one(
         )
     points = cloud.p_base[used].astype(np.float64) - candidate.p_base_rough
     start = np.array([0.0, 0.0, 0.0, radius])
-    sphere = _linear(points) if method == ALGEBRAIC else _iterated(points, start, radius)
+    if method == ALGEBRAIC:
+        sphere = _linear(points)
+    else:
+        sphere = iterated(lambda x: _distances(points, x), start, _STEP_MAX * radius)
     J, residuals = _distances(points, sphere)
     is_away = not np.linalg.norm(sphere[:3]) < _STRAY * radius
     if is_away or is_undetermined(J.T @ J, len(used)):
@@ -106,19 +109,5 @@ def _linear(points: Array) -> Array:
 
 def _distances(points: Array, sphere: Array) -> tuple[Array, Array]:
     """Return derivatives, (n, 4), and residuals of the distances from a sphere [m]."""
-    v = points - sphere[:3]
-    away = np.linalg.norm(v, axis=1)
-    J = np.column_stack([-v / np.maximum(away, 1e-9)[:, None], -np.ones(len(v))])
-    return -J, away - sphere[3]
-
-
-def _iterated(points: Array, sphere: Array, radius: float) -> Array:
-    """Return centre and radius, (4,), by Gauss-Newton."""
-    for _ in range(_N_STEPS):
-        J, residuals = _distances(points, sphere)
-        step = np.linalg.lstsq(J, residuals)[0]
-        step *= min(1.0, _STEP_MAX * radius / max(float(np.linalg.norm(step)), 1e-12))
-        sphere = sphere + step
-        if np.linalg.norm(step) < _SETTLED:
-            break
-    return sphere
+    normals, distances = surface(points, sphere[:3], float(sphere[3]))
+    return np.column_stack([normals, np.ones(len(points))]), distances

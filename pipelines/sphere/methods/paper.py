@@ -27,6 +27,7 @@ from spheremark.pipelines.sphere.description import (
     on_sphere,
     refused,
     spread_of,
+    surface,
 )
 
 NAME = "paper"
@@ -82,10 +83,8 @@ def _fit_one(
     p = _registered(
         _model(-points.mean(axis=0), radius, is_whole=config.paper_model == "sphere"), points
     )
-    v = points - p
-    distances = np.linalg.norm(v, axis=1)
-    normals = v / distances[:, None]
-    cov = spread_of(normals.T @ normals, distances - radius, 3)
+    normals, residuals = surface(points, p, radius)
+    cov = spread_of(normals.T @ normals, residuals, 3)
     return described(cloud, candidate, used, p, cov, method=NAME, radius=radius)
 
 

@@ -23,7 +23,7 @@ from spheremark.pipelines.model import (
 )
 from spheremark.pipelines.sphere.description import Fits
 from spheremark.pipelines.sphere.methods import along_beam
-from spheremark.pipelines.sphere.pulses import Firings, Passing, firings_of, passing_of, pattern_of
+from spheremark.pipelines.sphere.pulses import Firings, Passing, firings_of, passing_of
 
 NAME = "silhouette"
 
@@ -113,11 +113,13 @@ def fit(
     linearised over the uncertainty that both leave, and its limb, whose moments are summed over
     places across the line of sight.
     """
-    pattern, why_not = pattern_of(cloud) if found.candidates else (None, "there is nothing to fit")
-    if pattern is None:
+    if not found.candidates:
+        return (), ()
+    firings, why_not = firings_of(cloud)
+    if firings is None:
         fits, rejected = along_beam.fit(cloud, found, config, radius)
         return tuple(_without_limb(fit, why_not) for fit in fits), rejected
-    limb = _Limb(cloud, firings_of(cloud, pattern), radius)
+    limb = _Limb(cloud, firings, radius)
     fits, rejected = along_beam.fit_ranges(cloud, found, config, radius, limb.observe)
     return tuple(_named(fit) for fit in fits), rejected
 
