@@ -15,10 +15,16 @@ from numpy.polynomial import Chebyshev, Polynomial
 from spheremark.pipelines.compilation import FUSED, compiled, compiled_with
 from spheremark.pipelines.model import Array, Beams, Index
 
-_N_STRIPS = 6  # of the ellipse; the mean is good to 0.01 mm for a sphere of 0.1 m at 8 m
-_ANGLES = np.pi * np.arange(1, _N_STRIPS + 1) / (_N_STRIPS + 1)
-_HEIGHTS, _WIDTHS = np.cos(_ANGLES), np.sin(_ANGLES)  # of strips of the unit disc
-_FULL = 2.0 * np.sum(_WIDTHS**2)
+
+def _strips(n: int) -> Array:
+    """Return heights and half widths of strips of the unit disc, (2, n)."""
+    angles = np.pi * np.arange(1, n + 1) / (n + 1)
+    return np.stack([np.cos(angles), np.sin(angles)])
+
+
+# Means are good to 0.01 mm for a sphere of 0.1 m at 8 m. Strips along the way to the middle, which
+# the limb cuts at one end only, may be fewer.
+_STRIPS, _STRIPS_TO_MIDDLE = _strips(8), _strips(6)
 _NEAR, _ASIDE, _FAR = np.sqrt([1.0 / 6.0, 1.0 / 2.0, 2.0 / 3.0])
 _RAYS_X = np.array([0.0, _FAR, -_FAR, _NEAR, -_NEAR, _NEAR, -_NEAR])  # in the unit disc
 _RAYS_Y = np.array([0.0, 0.0, 0.0, _ASIDE, _ASIDE, -_ASIDE, -_ASIDE])
@@ -99,32 +105,30 @@ def predict(beams: Beams, centres: Array, radii: Array, which: Index) -> Predict
 
 @compiled
 def _mean_depths(x: Array, y: Array, radii: Array, half_widths: Array) -> Array:
-    """Return ``mean_depth`` of many footprints, (5, n)."""
+    """Return ``_mean_depth`` of many footprints, (5, n)."""
     found = np.empty((5, len(x)))
     for i in range(len(x)):
-        depth = mean_depth(x[i], y[i], radii[i], half_widths[i, 0], half_widths[i, 1])
+        depth = _mean_depth(x[i], y[i], radii[i], half_widths[i, 0], half_widths[i, 1])
         found[0, i], found[1, i], found[2, i], found[3, i], found[4, i] = depth
     return found
 
 
 @compiled
-def mean_depth(
+def _mean_depth(
     x0: float, y0: float, radius: float, half_x: float, half_y: float
 ) -> tuple[float, float, float, float, float]:
     """Return how much nearer than its centre a sphere is on average under a footprint.
 
     ``x0, y0`` is the centre relative to the middle of the footprint. Returns the mean, its
-    derivatives by x0, y0 and radius, and the lit share. Strips lie along the larger of x0 and y0,
-    so that the limb cuts each at one end only.
+    derivatives by x0, y0 and radius, and the lit share.
     """
-    is_turned = abs(y0) > abs(x0)
-    if is_turned:
-        x0, y0, half_x, half_y = y0, x0, half_y, half_x
     total, total_x, total_y, total_r = 0.0, 0.0, 0.0, 0.0
     length, length_x, length_y, length_r = 0.0, 0.0, 0.0, 0.0
-    for k in range(_N_STRIPS):
-        weight = _WIDTHS[k]
-        dy, half = half_y * _HEIGHTS[k] - y0, half_x * weight
+    length_full = 0.0
+    for k in range(_STRIPS.shape[1]):
+        weight = _STRIPS[1, k]
+        dy, half = half_y * _STRIPS[0, k] - y0, half_x * weight
+        length_full += 2.0 * half * weight
         h2 = radius * radius - dy * dy
         if h2 <= 0.0:
             continue
@@ -159,15 +163,14 @@ def mean_depth(
         return 0.0, 0.0, 0.0, 0.0, 0.0
     mean = total / length
     by_x, by_y = (total_x - mean * length_x) / length, (total_y - mean * length_y) / length
-    by_radius, lit = (total_r - mean * length_r) / length, length / (_FULL * half_x)
-    return mean, by_y if is_turned else by_x, by_x if is_turned else by_y, by_radius, lit
+    return mean, by_x, by_y, (total_r - mean * length_r) / length, length / length_full
 
 
 @compiled
 def mean_depth_inside(
     x0: float, y0: float, radius: float, half_x: float, half_y: float
 ) -> tuple[float, float, float, float]:
-    """Like ``mean_depth``, for a footprint that ends 0.1 radii or more inside the limb.
+    """Like ``_mean_depth``, for a footprint that ends 0.1 radii or more inside the limb.
 
     Radon's rule of degree 5 for the disc (1948), good to 0.01 mm for a sphere of 0.1 m, at a
     quarter of the cost of the strips.
@@ -186,7 +189,7 @@ def mean_depth_inside(
 
 @compiled_with(fastmath=FUSED)
 def mean_depths_at(points: Array, found: Array) -> None:
-    """Fill in ``mean_depth`` without derivatives for several places of a centre.
+    """Fill in ``_mean_depth`` without derivatives for several places of a centre.
 
     ``points`` has x, y, radius and half widths, (5, p), and is overwritten; ``found`` is (2, p),
     the second row for lit lengths. The inner loop has no branches, so that it runs on several
@@ -197,8 +200,8 @@ def mean_depths_at(points: Array, found: Array) -> None:
         if abs(points[1, p]) > abs(points[0, p]):
             points[0, p], points[1, p] = points[1, p], points[0, p]
             points[3, p], points[4, p] = points[4, p], points[3, p]
-    for k in range(_N_STRIPS):
-        weight, height = _WIDTHS[k], _HEIGHTS[k]
+    for k in range(_STRIPS_TO_MIDDLE.shape[1]):
+        height, weight = _STRIPS_TO_MIDDLE[0, k], _STRIPS_TO_MIDDLE[1, k]
         for p in range(points.shape[1]):
             x, radius, half = points[0, p], points[2, p], points[3, p] * weight
             dy = points[4, p] * height - points[1, p]
