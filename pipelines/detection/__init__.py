@@ -2,13 +2,13 @@
 
 ``extract`` finds them. Inside,
 
-- ``ball`` says what is looked for,
+- ``target`` is the sphere that is searched for,
 - ``cells`` sorts returns by place and direction,
-- ``ground`` tells the ground, ``seeds`` picks the places that are worth a look,
-- ``patches`` gathers the returns about a place, ``looks`` measures what they look like,
-- ``sights`` counts where the beams towards and about a group end,
-- ``rivals`` compares the ball with other shapes that may have stopped them,
-- ``verdicts`` says why a group is no marker.
+- ``ground`` separates the ground, ``seeds`` picks the places to examine,
+- ``neighbourhoods`` gathers the returns about a place, ``features`` measures their shape,
+- ``evidence`` counts where the beams towards and about a group end,
+- ``hypotheses`` compares the sphere with other shapes,
+- ``decision`` gives the reasons why a group is no marker.
 
 Works in the base frame with the levelled vertical. The sensor is taken as one point (the origin of
 the base): a few centimetres of axis offset do not change which returns look like a sphere.
@@ -19,26 +19,26 @@ from __future__ import annotations
 import numpy as np
 
 from spheremark.pipelines.config import ExtractionConfig
-from spheremark.pipelines.detection.cells import Cells, cells_of
+from spheremark.pipelines.detection.cells import cells_of
 from spheremark.pipelines.detection.decision import (
-    Peers,
-    among_peers,
+    Reference,
     distinct,
     is_resolved,
-    peers_among,
+    reason_among_markers,
+    reason_by_evidence,
+    reason_by_features,
+    reason_by_hypotheses,
+    reference_of,
     score,
     spread_expected,
-    verdict,
-    verdict_among_peers,
-    verdict_on_rivals,
-    verdict_on_sight,
+    with_reference_scatter,
 )
-from spheremark.pipelines.detection.evidence import Sight, sights
-from spheremark.pipelines.detection.features import NOISE_MIN, Look, look_at
+from spheremark.pipelines.detection.evidence import Evidence, gather_evidence
+from spheremark.pipelines.detection.features import NOISE_MIN, Features, measure_features
 from spheremark.pipelines.detection.ground import ground_of
-from spheremark.pipelines.detection.hypotheses import rivals
+from spheremark.pipelines.detection.hypotheses import compare_hypotheses
 from spheremark.pipelines.detection.seeds import find_seeds
-from spheremark.pipelines.detection.target import Ball
+from spheremark.pipelines.detection.target import Target
 from spheremark.pipelines.model import (
     Index,
     MarkerCandidate,
@@ -52,6 +52,8 @@ __all__ = ["extract"]
 
 _MIDDLE = 0.87  # radii: incidence up to 60 degrees, as ASTM E3125-17 takes them
 _REJECTIONS_MAX = 200  # the most sphere-like groups that are kept with their reason
+
+_Group = tuple[Features, Evidence]
 
 
 def extract(
@@ -71,115 +73,109 @@ def extract(
     Returns
     -------
     MarkerCandidates
-        Candidates in the order of azimuth; of the groups that passed the first gate of size and
-        were then refused, the (at most 200) most like a ball, with the reason; and the height of
-        the highest ground point within 10 m, where the study cuts its clouds.
+        Candidates in the order of azimuth; of the groups that passed the first test of size and
+        were then rejected, the (at most 200) most like a sphere, with the reason; and the height of
+        the highest ground point within 10 m, where the published method cuts its clouds.
 
     Notes
     -----
-    A marker is a ball of known radius that stands free on a pole, so each place where something
-    ends upward and to a side is tried: mean shift of a disc of the ball's size, then a robust fit
-    along the beams, then the tests, which have their sentences in ``verdict``. Ground is the
-    opening of the lowest point per cell. Where no ground was seen it is unknown, and nothing is
-    cut. Cost grows linearly with the returns.
+    A marker is a sphere of known radius that stands free on a pole. Each place where a surface ends
+    upward and to a side is a seed: mean shift of a disc of the sphere's size, a robust fit along
+    the beams, then the tests of ``decision``. Ground is the opening of the lowest point per cell.
+    Where no ground was seen, nothing is cut. Cost grows linearly with the returns.
     """
     cells = cells_of(cloud, config)
-    ball = Ball(marker_radius, cells.R_station_base[2], float(cloud.rig.divergence.max()))
+    target = Target(marker_radius, cells.R_station_base[2], float(cloud.rig.divergence.max()))
     ground = ground_of(cloud, cells, config)
-    seeds = find_seeds(ground.points_above, ball, config.n_points_min)
-    looks = distinct(look_at(cloud, cells, seeds, ball), config, marker_radius)
-    found, refused = _judged(cloud, cells, looks, config, ball)
+    seeds = find_seeds(ground.points_above, target, config.n_points_min)
+    groups = distinct(measure_features(cloud, cells, seeds, target), config, marker_radius)
+    reasons = [reason_by_features(features, config, target) for features in groups]
+    passed = [features for features, reason in zip(groups, reasons, strict=True) if not reason]
+    centres = np.array([features.p_base for features in passed]).reshape(-1, 3)
+    evidence = gather_evidence(cloud, cells.directions, centres, target)
+    found, later = _decided(list(zip(passed, evidence, strict=True)), config, target)
+    following = iter(later)
+    reasons = [reason or next(following) for reason in reasons]
+    rejected = [one for one in zip(groups, reasons, strict=True) if one[1]]
     return MarkerCandidates(
-        candidates=_candidates(found, ball, config),
+        candidates=_candidates(found, target, config),
         rejected=tuple(
-            Rejection(p_base=look.p_base, n_points=look.n_points, reason=reason)
-            for look, reason in refused[:_REJECTIONS_MAX]
+            Rejection(p_base=features.p_base, n_points=features.n_points, reason=reason)
+            for features, reason in rejected[:_REJECTIONS_MAX]
         ),
         ground_height_max=ground.height_max,
     )
 
 
-def _judged(
-    cloud: StitchedCloud, cells: Cells, looks: list[Look], config: ExtractionConfig, ball: Ball
-) -> tuple[list[tuple[Look, Sight]], list[tuple[Look, str]]]:
-    """Return the groups that may be markers with what is seen of them, and why the others are not.
+def _decided(
+    groups: list[_Group], config: ExtractionConfig, target: Target
+) -> tuple[list[_Group], list[str]]:
+    """Return the groups that may be markers, and for every group the reason against it.
 
-    What is left after a first look is looked at again, at all beams towards and about it.
+    First each group by its own evidence; then against other shapes and the remaining groups, among
+    which none scatters less than the others.
     """
-    verdicts = [verdict(look, config, ball) for look in looks]
-    left = [look for look, reason in zip(looks, verdicts, strict=True) if not reason]
-    centres = np.array([look.p_base for look in left]).reshape(-1, 3)
-    seen = sights(cloud, cells.directions, centres, ball)
-    found, later = _sighted(left, seen, config, ball)
-    in_turn = iter(later)
-    reasons = [reason or next(in_turn) for reason in verdicts]
-    return found, [(look, reason) for look, reason in zip(looks, reasons, strict=True) if reason]
-
-
-def _sighted(
-    looks: list[Look], seen: list[Sight], config: ExtractionConfig, ball: Ball
-) -> tuple[list[tuple[Look, Sight]], list[str]]:
-    """Return what may be a marker by all that is seen, and the verdicts on all.
-
-    First each by what is seen of it alone; then by other shapes and by those that are left, among
-    which none is seen more closely than the others.
-    """
-    groups = list(zip(looks, seen, strict=True))
-    reasons = [verdict_on_sight(look, sight, ball) for look, sight in groups]
-    peers = peers_among([one for one, reason in zip(groups, reasons, strict=True) if not reason])
-    groups = [(among_peers(look, peers), sight) for look, sight in groups]
+    reasons = [reason_by_evidence(*group, target) for group in groups]
+    reference = reference_of(
+        [group for group, reason in zip(groups, reasons, strict=True) if not reason]
+    )
+    groups = [(with_reference_scatter(group[0], reference), group[1]) for group in groups]
     reasons = [
-        reason or _verdict_again(look, sight, peers, config, ball)
-        for (look, sight), reason in zip(groups, reasons, strict=True)
+        reason or _reason_in_context(*group, reference, config, target)
+        for group, reason in zip(groups, reasons, strict=True)
     ]
-    return [one for one, reason in zip(groups, reasons, strict=True) if not reason], reasons
+    return [group for group, reason in zip(groups, reasons, strict=True) if not reason], reasons
 
 
-def _verdict_again(
-    look: Look, sight: Sight, peers: Peers, config: ExtractionConfig, ball: Ball
+def _reason_in_context(
+    features: Features,
+    evidence: Evidence,
+    reference: Reference,
+    config: ExtractionConfig,
+    target: Target,
 ) -> str:
-    """Return why a group that passed alone is refused among the others of the scan."""
+    """Return why a group that passed alone is rejected among the others of the scan."""
     return (
-        verdict(look, config, ball)
-        or verdict_on_sight(look, sight, ball)
-        or _rivalled(look, sight, ball, peers.noise)
-        or verdict_among_peers(look, sight, peers)
+        reason_by_features(features, config, target)
+        or reason_by_evidence(features, evidence, target)
+        or _reason_by_shape(features, evidence, target, reference.noise)
+        or reason_among_markers(features, evidence, reference)
     )
 
 
-def _rivalled(look: Look, sight: Sight, ball: Ball, noise: float) -> str:
-    """Return why something else explains a group better; its own noise if there are no others."""
-    spread = sight.spread / spread_expected(look, ball)
-    own = max(look.scatter, NOISE_MIN)
-    return verdict_on_rivals(
-        rivals(look, sight.seen, spread, ball, own if np.isnan(noise) else noise)
-    )
+def _reason_by_shape(features: Features, evidence: Evidence, target: Target, noise: float) -> str:
+    """Return why another shape explains a group better; NaN noise stands for the group's own."""
+    spread = evidence.spread / spread_expected(features, target)
+    noise = max(features.scatter, NOISE_MIN) if np.isnan(noise) else noise
+    return reason_by_hypotheses(compare_hypotheses(features, evidence.seen, spread, target, noise))
 
 
 def _candidates(
-    found: list[tuple[Look, Sight]], ball: Ball, config: ExtractionConfig
+    found: list[_Group], target: Target, config: ExtractionConfig
 ) -> tuple[MarkerCandidate, ...]:
-    """Return candidates M01, M02 ... by azimuth, from looks and the returns about them."""
-    in_turn = sorted(found, key=lambda one: np.arctan2(one[0].y, one[0].x))
+    """Return candidates M01, M02 ... by azimuth."""
+    ordered = sorted(found, key=lambda group: np.arctan2(group[0].y, group[0].x))
     return tuple(
         MarkerCandidate(
             name=marker_name(place),
-            members=_members(look, sight, ball),
-            p_base_rough=look.p_base,
-            score=score(look, config, ball),
+            members=_members(features, evidence, target),
+            p_base_rough=features.p_base,
+            score=score(features, config, target),
         )
-        for place, (look, sight) in enumerate(in_turn)
+        for place, (features, evidence) in enumerate(ordered)
     )
 
 
-def _members(look: Look, sight: Sight, ball: Ball) -> Index:
-    """Return the rows on and about a ball, ascending: its outline, and what of its pole touches it.
+def _members(features: Features, evidence: Evidence, target: Target) -> Index:
+    """Return the rows on and about a sphere, ascending: its limb, and the pole that touches it.
 
-    Of a ball that is seen very closely, only its middle: there the returns at its outline, which
-    belong partly to what lies behind, would weigh more than the noise of all the others.
+    Of a resolved sphere, only its middle: the returns at its limb, which belong partly to the
+    background, would weigh more than the noise of all the others.
     """
-    across, along, depth = sight.seen
-    reach = _MIDDLE * ball.radius if is_resolved(look, ball) else 1.5 * ball.radius + look.blur
+    across, along, depth = evidence.seen
+    reach = 1.5 * target.radius + features.blur
+    if is_resolved(features, target):
+        reach = _MIDDLE * target.radius
     is_about = across * across + along * along < reach * reach
-    is_level = (depth > -2.2 * ball.radius) & (depth < 1.6 * ball.radius)
-    return np.asarray(sight.rows[is_about & is_level], dtype=np.intp)
+    is_level = (depth > -2.2 * target.radius) & (depth < 1.6 * target.radius)
+    return np.asarray(evidence.rows[is_about & is_level], dtype=np.intp)

@@ -1,7 +1,7 @@
 """Cells of the level ground and of directions: where each return of a stop lies.
 
-Hides the one pass over all returns. What comes later picks returns by their cells, which takes a
-small part of the time that looking at coordinates takes.
+Hides the one pass over all returns. Later steps select returns by their cells, which takes a small
+part of the time that computing with coordinates takes.
 """
 
 from __future__ import annotations
@@ -23,8 +23,8 @@ N_DIRECTIONS_SIDE = 128
 N_DIRECTIONS = 2 * N_DIRECTIONS_SIDE**2
 """Cells of directions."""
 
-_GROUP = 64  # returns that are asked at once whether one of them is wanted: mostly none is
-_BLOCK = 512  # returns at a time: the next ones are fetched while all is done with these
+_GROUP = 64  # returns that are tested at once: mostly none of them is wanted
+_BLOCK = 512  # returns at a time: they stay in the nearest cache
 
 
 class Layout(NamedTuple):
@@ -45,9 +45,9 @@ class Cells(NamedTuple):
     R_station_base : (3, 3)
         Levelling.
     ground : (n,) int32
-        Cell of each return on the level ground; ``n_side ** 2`` beyond the range looked at.
+        Cell of each return on the level ground; ``n_side ** 2`` beyond the grid.
     directions : (n,) uint16
-        Cell of each return's direction; of a return that is none, any.
+        Cell of each return's direction; any cell for a return that is not finite.
     lowest, highest : (n_side, n_side) float32
         Levelled heights of the lowest and highest return per cell; infinite without any [m].
     """
@@ -96,7 +96,7 @@ def rows_in(
         if is_any:
             for i in range(len(group)):
                 cell = np.uint32(group[i])
-                rows[n_rows], own[n_rows] = low + i, cell  # unless the next one takes its place
+                rows[n_rows], own[n_rows] = low + i, cell  # overwritten by the next unless counted
                 n_rows += is_wanted[cell]
     return rows[:n_rows], own[:n_rows]
 

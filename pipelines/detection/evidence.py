@@ -1,7 +1,7 @@
-"""What the beams towards and about a group show, at whatever depth they end.
+"""Evidence of all beams towards and about a group, at whatever depth they end.
 
-Hides how the beams of a direction are found. A ball on a pole stops the beams that are aimed at it
-and lets pass those beside it: a rock, a head or a crown of leaves does not.
+Hides how the beams of a direction are found. A sphere on a pole stops the beams that are aimed at
+it and lets pass those beside it: a rock, a head or a crown of leaves does not.
 """
 
 from __future__ import annotations
@@ -19,54 +19,54 @@ from spheremark.pipelines.detection.cells import (
     direction_cells,
     rows_in,
 )
-from spheremark.pipelines.detection.target import Ball, blur_at, rays_of, seen_from, view_of
+from spheremark.pipelines.detection.target import Target, blur_at, rays_of, seen_from, view_of
 from spheremark.pipelines.model import Array, Column, StitchedCloud
 from spheremark.pipelines.threads import side_by_side
 
-_STEP = 0.05  # [m] at most between the directions about a centre that are looked up
+_STEP = 0.05  # [m] at most between the directions about a centre whose cells are searched
 _REACH = 4.0  # radii about a centre: shoulders lie within three radii below a head
-_POLE = 0.5  # radii: half the width of what a ball may stand on
-_ASIDE = 1.9  # radii: what is farther to a side may stand there on its own
-_HELD = (-4.0, 1.5)  # radii of depth within which something belongs to what is looked at
-_ON = (-1.3, 0.3)  # radii of depth within which a return may lie on the ball
-_PLACE = 0.1  # radii: what passes nearer to another beam than this passes at the same place
+_POLE = 0.5  # radii: half the width of a pole
+_ASIDE = 1.9  # radii: anything farther to a side may be another object
+_HELD = (-4.0, 1.5)  # radii of depth within which a return may belong to the same object
+_ON = (-1.3, 0.3)  # radii of depth within which a return may lie on the sphere
+_PLACE = 0.1  # radii: beams nearer to each other than this pass at the same place
 _MEAN_WIDTH = 0.75  # of the greater half width of a beam: in any direction
 _TINY = 1e-6
-_UNSEEN = 3.0  # as many beams below it that end nearer as that go past: no more is known
+_OBSTRUCTED = 3.0  # ratio of beams below it that end nearer to those that go past
 
-_Groups = tuple[NDArray[np.int64], NDArray[np.int32]]  # where each one's begin, and what they hold
+_Groups = tuple[NDArray[np.int64], NDArray[np.int32]]  # start of each group, and the members
 
 
-class Sight(NamedTuple):
-    """Beams towards and about a group, counted by where they end.
+class Evidence(NamedTuple):
+    """Beams towards and about a group, counted by the depth at which they end.
 
     Attributes
     ----------
     n_on : int
-        Returns inside the outline at the depth of the ball.
+        Returns inside the limb at the depth of the sphere.
     n_through : int
-        Returns well inside the outline that lie behind the ball.
+        Returns well inside the limb that lie behind the sphere.
     n_before : int
-        Returns inside the outline that lie before the ball: beams that would have met it.
+        Returns inside the limb that lie before the sphere: beams that would have met it.
     spread : float
-        Mean square of the distances from the centre at which the first ones pass it, in units of
-        the radius squared: about a half for a ball of the known radius.
+        Mean square of the distances from the centre at which the beams of ``n_on`` pass it, in
+        units of the radius squared: about a half for a sphere of the known radius.
     n_held : int
-        Returns below it, beside a pole's place, that lie about as far away.
+        Returns below it and beside the pole, at about its distance.
     n_past : int
         Returns there that lie behind it.
     n_short : int
         Returns there that end long before it.
     brightness : float
-        Reflectivity of what the first ones lie on, 0-255: theirs by the shares of their beams that
-        are inside the outline, by least squares.
+        Reflectivity of the surface, 0-255: least squares over the beams of ``n_on``, weighted by
+        their shares inside the limb.
     n_distinct : int
-        Places, a tenth of the radius wide, where the first ones pass the centre: beams that are
-        repeated tell little that is new.
+        Number of places, a tenth of the radius wide, where the beams of ``n_on`` pass the centre:
+        repeated beams are not independent.
     rows : (m,) int32
         Returns of the cloud whose beams pass within four radii, ascending.
     seen : (3, m)
-        How these beams pass the centre, as ``passing`` says [m].
+        How these beams pass the centre, as from ``passing`` [m].
     """
 
     n_on: int
@@ -83,71 +83,68 @@ class Sight(NamedTuple):
 
     @property
     def is_open_below(self) -> bool:
-        """Tell whether most beams below it, beside a pole's place, go on past it.
+        """Whether most beams below it and beside the pole go past it.
 
-        Beams that something nearer stops show neither. If they are three in four, nothing is known:
-        what lies behind a crest at its own foot shows no more.
+        Beams that end nearer count for neither; if they are three in four, it is not open.
         """
-        n_nearer_max = _UNSEEN * (1 + self.n_past)
+        n_nearer_max = _OBSTRUCTED * (1 + self.n_past)
         return self.n_held <= 1 + self.n_past and self.n_short <= n_nearer_max
 
     @property
     def shows_below(self) -> bool:
-        """Tell whether most beams below it, beside a pole's place, are seen to go on past it."""
+        """Whether most of all beams below it and beside the pole go past it."""
         return self.n_past > 2 and self.n_past > self.n_held + self.n_short
 
     @property
     def n_aimed(self) -> int:
-        """Count the beams that would have met the ball if nothing were nearer."""
+        """Number of beams that would have met the sphere if nothing were nearer."""
         return self.n_on + self.n_before
 
 
-def sights(
-    cloud: StitchedCloud, directions: NDArray[np.uint16], centres: Array, ball: Ball
-) -> list[Sight]:
-    """Count the beams towards and about some centres by where they end."""
+def gather_evidence(
+    cloud: StitchedCloud, directions: NDArray[np.uint16], centres: Array, target: Target
+) -> list[Evidence]:
+    """Count the beams towards and about some centres by the depth at which they end."""
     if not len(centres):
         return []
-    starts, owners = _centres_by_direction(centres, ball.up, (_REACH + 0.5) * ball.radius + 0.05)
-    is_wanted, cones = starts[1:] > starts[:-1], _cones(centres, ball)
+    starts, owners = _centres_by_direction(
+        centres, target.up, (_REACH + 0.5) * target.radius + 0.05
+    )
+    is_wanted, cones = starts[1:] > starts[:-1], _cones(centres, target)
 
     def towards(first: int, end: int) -> _Groups:
         rows, own = rows_in(directions, is_wanted, first, end)
-        groups: _Groups = _towards(cloud.p_base, rows, own, starts, owners, cones)
+        groups: _Groups = _rows_in_cones(cloud.p_base, rows, own, starts, owners, cones)
         return groups
 
     parts = side_by_side(towards, len(directions))
 
-    def counted(first: int, end: int) -> list[Sight]:
+    def counted(first: int, end: int) -> list[Evidence]:
         found = []
         for i in range(first, end):
             rows = np.concatenate([rows[begin[i] : begin[i + 1]] for begin, rows in parts])
-            fields = _counted(cloud.p_base, cloud.intensities, rows, centres[i], ball)
-            found.append(Sight(*fields))
+            fields = _count_beams(cloud.p_base, cloud.intensities, rows, centres[i], target)
+            found.append(Evidence(*fields))
         return found
 
     return list(chain(*side_by_side(counted, len(centres), worth=4)))
 
 
-def _cones(centres: Array, ball: Ball) -> Array:
-    """Return the cones that are looked at, (k, 4).
-
-    Their axes, not of unit length; and the square of how far a unit vector at the edge of one goes
-    along its axis, in the axis's own length.
-    """
+def _cones(centres: Array, target: Target) -> Array:
+    """Return the cones about the centres, (k, 4): axis a, and (a . u)^2 of a unit u on the edge."""
     distances2 = np.sum(centres**2, axis=1)
-    tangents = _REACH * ball.radius / np.sqrt(distances2) + 0.5 * ball.divergence
+    tangents = _REACH * target.radius / np.sqrt(distances2) + 0.5 * target.divergence
     return np.column_stack([centres, distances2 / (1.0 + tangents**2)])
 
 
 @compiled
-def _counted(
-    p_base: Column, intensities: Column, rows: NDArray[np.int32], c: Array, ball: Ball
+def _count_beams(
+    p_base: Column, intensities: Column, rows: NDArray[np.int32], c: Array, target: Target
 ) -> tuple[int, int, int, float, int, int, int, float, int, NDArray[np.int32], Array]:
-    """Return the fields of a sight, from its returns."""
-    radius = ball.radius
-    blur = blur_at(c, ball) / radius
-    seen = seen_from(rays_of(p_base, rows), view_of(c, ball.up))
+    """Return the fields of ``Evidence`` of one group, from its returns."""
+    radius = target.radius
+    blur = blur_at(c, target) / radius
+    seen = seen_from(rays_of(p_base, rows), view_of(c, target.up))
     n_on, n_through, n_before, n_held, n_past, n_short = 0, 0, 0, 0, 0, 0
     gaps2, light, lit = 0.0, 0.0, 0.0
     half = int((1.0 + blur) / _PLACE) + 1
@@ -161,7 +158,7 @@ def _counted(
             gaps2 += gap * gap
             column = half + int(np.floor(seen[0, i] / radius / _PLACE))
             is_met[column, half + int(np.floor(along / _PLACE))] = True
-            share = _lit_share((1.0 - gap) / (_MEAN_WIDTH * blur))
+            share = _share_inside((1.0 - gap) / (_MEAN_WIDTH * blur))
             light += share * intensities[rows[i]]
             lit += share * share
         n_before += is_aimed and depth <= _ON[0]
@@ -177,14 +174,14 @@ def _counted(
 
 
 @compiled
-def _lit_share(inside: float) -> float:
-    """Return what share of a beam is inside an outline that it enters by so many half widths."""
+def _share_inside(inside: float) -> float:
+    """Return the share of a beam inside an outline that it enters by so many half widths."""
     inside = min(max(inside, -1.0), 1.0)
     return float((np.arccos(-inside) + inside * np.sqrt(1.0 - inside * inside)) / np.pi)
 
 
 @compiled
-def _towards(
+def _rows_in_cones(
     p_base: Column,
     rows: NDArray[np.int32],
     directions: NDArray[np.int32],
@@ -192,7 +189,7 @@ def _towards(
     owners: NDArray[np.int32],
     cones: Array,
 ) -> _Groups:
-    """Return which of some rows lie in each cone: where those of each begin, and the rows."""
+    """Return the rows that lie in each cone: the start of each cone's, and the rows."""
     n = 0
     for cell in directions:
         n += starts[cell + 1] - starts[cell]
@@ -204,7 +201,7 @@ def _towards(
         for i in range(starts[cell], starts[cell + 1]):
             owner = owners[i]
             along = cones[owner, 0] * x + cones[owner, 1] * y + cones[owner, 2] * z
-            near[n], whose[n] = row, owner  # kept only if the next one does not take its place
+            near[n], whose[n] = row, owner  # overwritten by the next one unless counted
             n += along > 0.0 and along * along > cones[owner, 3] * (x * x + y * y + z * z)
     groups: _Groups = _grouped(near[:n], whose[:n], len(cones))
     return groups
@@ -212,10 +209,7 @@ def _towards(
 
 @compiled
 def _centres_by_direction(centres: Array, up: Array, reach: float) -> _Groups:
-    """Return the centres that beams in each cell of directions may pass within a reach.
-
-    Where those of each cell begin, and the centres.
-    """
+    """Return the centres within reach of each cell of directions: starts, and the centres."""
     sides = np.empty(len(centres), np.int64)
     for k in range(len(centres)):
         n_fine = 1.5 * reach * N_DIRECTIONS_SIDE / np.sqrt(np.sum(centres[k] ** 2))
@@ -250,7 +244,7 @@ def _directions_about(c: Array, up: Array, reach: float, n: int) -> NDArray[np.u
 
 @compiled
 def _grouped(items: NDArray[np.int32], groups: NDArray[np.integer], n_groups: int) -> _Groups:
-    """Sort items by group, by counting: where those of each group begin, and the items."""
+    """Sort items by group, by counting: the start of each group, and the items."""
     starts = np.zeros(n_groups + 2, np.int64)  # of the group before, until they have moved on
     for group in groups:
         starts[group + 2] += 1

@@ -1,8 +1,8 @@
-"""What else a group may be: a post or a smaller ball, where these explain its returns better.
+"""Other hypotheses about a group: a post or a smaller sphere that explains its beams better.
 
-Hides the likelihood of what beams show of a shape: where the returns on it lie, where beams go past
-it, and how far away it is. A far group has too few returns to test one property after another; what
-two shapes say of all its beams together still differs.
+Hides the likelihood of the beams given a shape: the places and depths of the returns on it and the
+beams that pass it. A far group has too few returns to test one property after another; the
+likelihood of all its beams together still differs between shapes.
 """
 
 from __future__ import annotations
@@ -12,47 +12,48 @@ from typing import NamedTuple
 import numpy as np
 
 from spheremark.pipelines.compilation import compiled
-from spheremark.pipelines.detection.features import Look
-from spheremark.pipelines.detection.target import Ball
+from spheremark.pipelines.detection.features import Features
+from spheremark.pipelines.detection.target import Target
 from spheremark.pipelines.model import Array, Mask
 
-_SMALL = (0.3, 0.7)  # radii of a smaller ball: half way to a ball of 60 mm, the edge does the rest
+_SMALL = (0.3, 0.7)  # radii of a smaller sphere
 _POST = (0.05, 1.1)  # radii of a post
 _STARTS_POST = (0.25, 0.6, 1.0)
-_LOW, _HIGH = -3.0, 2.0  # radii below and above the centre that are looked at
+_LOW, _HIGH = -3.0, 2.0  # radii below and above the centre whose beams are used
 _ASIDE = 1.6  # radii to a side, beside half a beam
-_BAND = 0.5  # radii: height of the bands that are asked whether beams past a shape return there
+_BAND = 0.5  # radii: height of the bands in which beams past a shape may lack returns
 _N_BANDS = int((_HIGH - _LOW) / _BAND)
-_ON = (-2.0, 1.0)  # radii of depth of what may be the shape
-_PAST = 8.5  # radii of depth: what lies nearer may mix with the shape in one echo
-_LUCK = 0.02  # share of beams that hit and do not show it, or pass and seem to hit
+_ON = (-2.0, 1.0)  # radii of depth of returns that may lie on the shape
+_PAST = 8.5  # radii of depth: anything nearer may mix with the shape in one echo
+_OUTLIER_SHARE = 0.02  # share of beams that hit and do not show it, or pass and seem to hit
 _EDGE, _SIGMA_EDGE = 0.6, 0.4  # half widths of a beam outside the outline where half the beams hit
 _EDGES = (-0.5, 1.2)
 _SOFT = (0.1, 0.3)  # radii, and half widths besides, over which beams come to hit
 _POLE_FROM = 0.7  # radii below the centre a pole may be seen
-_HELD = 0.85  # radii: what lies lower may be the pole's return
+_HELD = 0.85  # radii: a lower return may be the pole's
 _MEAN_WIDTH = 0.75  # of the greater half width of a beam: in any direction
-_LIMB = 0.08  # radii by which what a beam at the outline measures is off
-_CLIP = 9.0  # squared standard deviations: farther off is a stray
-_TINY = 1e-200  # products of chances are taken the logarithm of below it
+_LIMB = 0.08  # radii: standard deviation of the depth of a beam at the limb
+_CLIP = 9.0  # squared standard deviations: anything farther off is an outlier
+_TINY = 1e-200  # products of probabilities below it are turned into logarithms
 _N_ROUNDS, _N_HALVINGS = 2, 4
-_AS_DENSE = 0.45  # of the returns at the height of a ball: as many below it as a post may have
-_SPREAD_SMALL = 0.75  # of the spread of a ball's returns: less may be that of a smaller ball
+_POST_DENSITY = (
+    0.45  # density of a post's returns below, at least, over that at the sphere's height
+)
+_SPREAD_SMALL = 0.75  # of the spread of a sphere's returns: less may be that of a smaller sphere
 _N_CLEAR = 60  # returns that show a shape by themselves
 
 
-class Rivals(NamedTuple):
-    """How much better other shapes explain a group than the ball that is looked for.
+class LikelihoodRatios(NamedTuple):
+    """Log likelihood ratios of other shapes against the sphere of the known radius.
 
     Attributes
     ----------
     post : float
-        Logarithm of the likelihood ratio of the best upright post; minus infinity if it was clear
-        at once that it is none.
+        That of the best upright post; minus infinity where a post was excluded beforehand.
     small : float
-        The same of the best smaller ball.
+        That of the best smaller sphere; minus infinity likewise.
     half_width_post, radius_small : float
-        What these measure [m].
+        Sizes of these two [m].
     """
 
     post: float
@@ -61,32 +62,34 @@ class Rivals(NamedTuple):
     radius_small: float
 
 
-def rivals(look: Look, seen: Array, spread: float, ball: Ball, noise: float) -> Rivals:
-    """Compare the ball that is looked for with a post and with smaller balls.
+def compare_hypotheses(
+    features: Features, seen: Array, spread: float, target: Target, noise: float
+) -> LikelihoodRatios:
+    """Compare the sphere of the known radius with a post and with smaller spheres.
 
     Notes
     -----
-    Returns on a shape are spread evenly over its outline, and so are beams past it over what is
-    around; where beams past it meet nothing, against the sky, only the former are known, and count
-    by the area that they might have filled. The edge of an outline is that of wide beams, whose
-    place is known only so well. Ranges are those to the part of a beam that is on the shape.
+    Beams are spread evenly over the outline of a shape and its surroundings. Against the sky beams
+    past it have no return: only the hits are known, and their density is that over the area of the
+    shape. The place where a wide beam begins to hit is an unknown with a prior. Ranges are those
+    to the part of a beam that is on the shape.
     """
-    blur = look.blur / ball.radius
-    found = _compared(seen / ball.radius, blur, noise / ball.radius, spread)
-    return Rivals(found[0], found[1], found[2] * ball.radius, found[3] * ball.radius)
+    blur = features.blur / target.radius
+    found = _log_ratios(seen / target.radius, blur, noise / target.radius, spread)
+    return LikelihoodRatios(found[0], found[1], found[2] * target.radius, found[3] * target.radius)
 
 
 class _Beams(NamedTuple):
-    """Beams about a group, in radii, sorted by what they say.
+    """Beams about a group, in radii.
 
     Attributes
     ----------
     hits : (3, n)
         Where returns at its depth pass the centre, across and up, and how much deeper they lie.
     on : (n,)
-        Which of them are on the ball that is looked for, and not on its pole.
+        Which of them are on the sphere of the known radius, and not on its pole.
     passes : (2, m)
-        Where beams go that end far behind.
+        Where beams that end far behind pass the centre.
     is_dark : (k,)
         Bands from low to high in which no beam goes past, and none ends before.
     n_dark : int
@@ -107,16 +110,16 @@ class _Beams(NamedTuple):
 # A shape is seven numbers: centre across, up, in depth; radius; edge in half widths of a beam; half
 # width of its pole, and the share of the beams there that hit. A post ends at its centre upwards.
 _X, _Y, _DEPTH, _RADIUS, _EDGED, _POLE, _SHARE = range(7)
-_IS_BALL, _IS_POST = 0, 1
+_IS_BALL, _IS_POST = np.int64(0), np.int64(1)  # no literals: one compiled form serves both
 _STEPS = np.array([0.2, 0.2, 0.1, 0.1, 0.3, 0.1, 0.3])
 
 
 @compiled
-def _compared(
+def _log_ratios(
     seen: Array, blur: float, noise: float, spread: float
 ) -> tuple[float, float, float, float]:
-    """Return the fields of ``Rivals``."""
-    beams = _sorted_out(seen, blur, noise)
+    """Return the fields of ``LikelihoodRatios``."""
+    beams = _sorted_beams(seen, blur, noise)
     is_few = np.sum(beams.on) < _N_CLEAR
     highest = np.max(beams.hits[1]) if beams.hits.shape[1] else 0.0
     may_be_post = is_few and _goes_on_below(beams)
@@ -140,8 +143,8 @@ def _compared(
 
 
 @compiled
-def _sorted_out(seen: Array, blur: float, noise: float) -> _Beams:
-    """Return beams by what they say of a shape."""
+def _sorted_beams(seen: Array, blur: float, noise: float) -> _Beams:
+    """Return the beams sorted into hits, passes and dark bands."""
     n = seen.shape[1]
     hits, passes, on = np.empty((3, n)), np.empty((2, n)), np.empty(n, np.bool_)
     is_dark, counts = np.ones(_N_BANDS, np.bool_), np.zeros(_N_BANDS, np.int64)
@@ -175,13 +178,13 @@ def _sorted_out(seen: Array, blur: float, noise: float) -> _Beams:
 
 @compiled
 def _goes_on_below(beams: _Beams) -> bool:
-    """Tell whether returns below a ball are about as dense as at its height."""
+    """Return whether returns below a sphere are about as dense as at its height."""
     n_middle, n_low, begins = 0, 0, -1.1 - beams.blur
     for i in range(beams.hits.shape[1]):
         is_near = abs(beams.hits[0, i]) < 1.0 + beams.blur
         n_middle += is_near and abs(beams.hits[1, i]) < _HELD
         n_low += is_near and beams.hits[1, i] < begins
-    return n_low * 2.0 * _HELD > _AS_DENSE * n_middle * (begins - _LOW)
+    return n_low * 2.0 * _HELD > _POST_DENSITY * n_middle * (begins - _LOW)
 
 
 @compiled
@@ -190,11 +193,10 @@ def _best(
 ) -> tuple[float, Array]:
     """Return the greatest likelihood of a kind of shape near a first guess, and that shape.
 
-    Each number is moved on its own as long as that helps, in ever smaller steps (Hooke, Jeeves,
-    1961): the likelihood has corners.
+    Pattern search (Hooke and Jeeves, 1961), because the likelihood is not smooth.
     """
-    low = np.array([-1.0, -1.0, -2.0, radii[0], _EDGES[0], 0.05, _LUCK])
-    high = np.array([1.0, _HIGH, 2.0, radii[1], _EDGES[1], 0.35, 1.0 - _LUCK])
+    low = np.array([-1.0, -1.0, -2.0, radii[0], _EDGES[0], 0.05, _OUTLIER_SHARE])
+    high = np.array([1.0, _HIGH, 2.0, radii[1], _EDGES[1], 0.35, 1.0 - _OUTLIER_SHARE])
     best, steps = _likelihood(beams, shape, kind), _STEPS.copy()
     for _ in range(_N_HALVINGS):
         for _ in range(_N_ROUNDS):
@@ -215,7 +217,7 @@ def _likelihood(beams: _Beams, shape: Array, kind: int) -> float:
     total, product = -0.5 * ((shape[_EDGED] - _EDGE) / _SIGMA_EDGE) ** 2, 1.0
     for i in range(beams.hits.shape[1]):
         x, y = beams.hits[0, i] - shape[_X], beams.hits[1, i] - shape[_Y]
-        product *= _chance(x, y, shape, beams.blur, kind)
+        product *= _hit_probability(x, y, shape, beams.blur, kind)
         if beams.on[i]:
             gap = abs(x) if kind == _IS_POST else np.hypot(x, y)
             depth, off = _depth(gap, shape[_RADIUS], _MEAN_WIDTH * beams.blur)
@@ -227,7 +229,7 @@ def _likelihood(beams: _Beams, shape: Array, kind: int) -> float:
             total, product = total + np.log(product), 1.0
     for i in range(beams.passes.shape[1]):
         x, y = beams.passes[0, i] - shape[_X], beams.passes[1, i] - shape[_Y]
-        product *= 1.0 - _chance(x, y, shape, beams.blur, kind)
+        product *= 1.0 - _hit_probability(x, y, shape, beams.blur, kind)
         if product < _TINY:
             total, product = total + np.log(product), 1.0
     total += np.log(product)
@@ -237,8 +239,8 @@ def _likelihood(beams: _Beams, shape: Array, kind: int) -> float:
 
 
 @compiled
-def _chance(x: float, y: float, shape: Array, blur: float, kind: int) -> float:
-    """Return the probability that a beam hits which passes so far from a shape's centre."""
+def _hit_probability(x: float, y: float, shape: Array, blur: float, kind: int) -> float:
+    """Return the probability that a beam hits a shape whose centre it passes at (x, y)."""
     soft = _SOFT[0] + _SOFT[1] * blur
     outer = shape[_RADIUS] + shape[_EDGED] * blur
     if kind == _IS_POST:
@@ -248,12 +250,12 @@ def _chance(x: float, y: float, shape: Array, blur: float, kind: int) -> float:
         if share < shape[_SHARE] and y < -_POLE_FROM * shape[_RADIUS]:
             inside = (shape[_POLE] + shape[_EDGED] * blur - abs(x)) / soft + 0.5
             share = max(share, shape[_SHARE] * min(max(inside, 0.0), 1.0))
-    return _LUCK + (1.0 - 2.0 * _LUCK) * share
+    return _OUTLIER_SHARE + (1.0 - 2.0 * _OUTLIER_SHARE) * share
 
 
 @compiled
 def _depth(gap: float, radius: float, half: float) -> tuple[float, float]:
-    """Return the mean depth of the part of a beam on a round shape, and how far off that may be."""
+    """Return the mean depth of the part of a beam on a round shape, and its standard deviation."""
     if gap + half < radius:
         return -np.sqrt(radius * radius - gap * gap), 0.0
     low, high = min(max(gap - half, 0.0), 0.99 * radius), min(gap + half, radius)
@@ -264,7 +266,7 @@ def _depth(gap: float, radius: float, half: float) -> tuple[float, float]:
 
 @compiled
 def _dark_area(beams: _Beams, shape: Array, kind: int) -> float:
-    """Return the area where beams would hit a shape, of the bands that show nothing else."""
+    """Return the area where beams would hit a shape, in the dark bands."""
     outer = shape[_RADIUS] + shape[_EDGED] * beams.blur
     pole = 2.0 * shape[_SHARE] * (shape[_POLE] + shape[_EDGED] * beams.blur)
     area = 0.0
@@ -272,7 +274,7 @@ def _dark_area(beams: _Beams, shape: Array, kind: int) -> float:
         if not beams.is_dark[band]:
             continue
         low = _LOW + band * _BAND - shape[_Y]
-        area += _BAND * _LUCK * 2.0 * (_ASIDE + beams.blur)
+        area += _BAND * _OUTLIER_SHARE * 2.0 * (_ASIDE + beams.blur)
         if kind == _IS_POST:
             area += 2.0 * max(outer, 0.0) * min(max(-low, 0.0), _BAND)
         else:

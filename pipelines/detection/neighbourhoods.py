@@ -1,7 +1,6 @@
 """The returns about some places.
 
-Hides how neighbours are found: returns sorted by the cells of the ground grid, only those that
-matter.
+Hides how neighbours are found: the returns in the cells about the seeds, sorted by cell.
 """
 
 from __future__ import annotations
@@ -18,7 +17,7 @@ from spheremark.pipelines.detection.target import rays_of
 from spheremark.pipelines.model import Array, Column, Mask
 from spheremark.pipelines.threads import side_by_side
 
-_REACH = 4.5  # radii about a seed whose returns decide whether a ball stands free there
+_REACH = 4.5  # radii about a seed whose returns decide whether a sphere stands free there
 
 _GOLDEN = 0.5 * (np.sqrt(5.0) - 1.0)  # its multiples are spread evenly and never in step
 _ROUNDED = 1e-4  # [m]: more than a cell's edge may be off by rounding
@@ -26,7 +25,7 @@ _ROUNDED = 1e-4  # [m]: more than a cell's edge may be off by rounding
 _Rows = NDArray[np.int32]
 
 
-class Patches(NamedTuple):
+class SortedReturns(NamedTuple):
     """Returns sorted by cell, for the cells about the seeds.
 
     Attributes
@@ -42,7 +41,7 @@ class Patches(NamedTuple):
     R_station_base : (3, 3)
         Levelling.
     reach : float
-        How far about a seed returns are looked at [m].
+        Radius about a seed within which returns are used [m].
     """
 
     starts: NDArray[np.int32]
@@ -53,23 +52,19 @@ class Patches(NamedTuple):
     reach: float
 
 
-def patches_about(p_base: Column, cells: Cells, seeds: Array, radius: float) -> Patches:
+def returns_about(p_base: Column, cells: Cells, seeds: Array, radius: float) -> SortedReturns:
     """Return the returns about some places, by cell."""
     reach, layout = _REACH * radius, cells.layout
     margin = int(np.ceil(reach / layout.edge)) + 1
-    is_wanted = _wanted(layout, cells.R_station_base, seeds, margin)
-    starts, points = _sorted(p_base, cells.ground, is_wanted)
-    return Patches(starts, points, layout.n_side, layout.edge, cells.R_station_base, reach)
+    is_wanted = _cells_about(layout, cells.R_station_base, seeds, margin)
+    starts, points = _sort_by_cell(p_base, cells.ground, is_wanted)
+    return SortedReturns(starts, points, layout.n_side, layout.edge, cells.R_station_base, reach)
 
 
-def _sorted(
+def _sort_by_cell(
     p_base: Column, cells: NDArray[np.int32], is_wanted: Mask
 ) -> tuple[NDArray[np.int32], Column]:
-    """Sort the returns in some cells by cell, by counting; those of a cell stay in their order.
-
-    Each part of the returns is counted on its own, and later finds its places behind those of the
-    parts before.
-    """
+    """Sort the returns in some cells by cell, by counting; those of a cell keep their order."""
 
     def counted(first: int, end: int) -> tuple[_Rows, _Rows, _Rows]:
         rows, own = rows_in(cells, is_wanted, first, end)
@@ -91,21 +86,21 @@ def _sorted(
 
 
 @compiled
-def runs_about(patches: Patches, c: Array) -> NDArray[np.int32]:
+def runs_about(nearby: SortedReturns, c: Array) -> NDArray[np.int32]:
     """Return the returns in the cells that may hold some within reach of a place."""
-    bottom, top = _span(patches, patches.R_station_base[0], c)
-    low, high = _span(patches, patches.R_station_base[1], c)
+    bottom, top = _span(nearby, nearby.R_station_base[0], c)
+    low, high = _span(nearby, nearby.R_station_base[1], c)
     runs = np.empty((max(top + 1 - bottom, 0), 2), np.int32)
     for k in range(len(runs)):
-        cell = (bottom + k) * patches.n_side
-        runs[k, 0], runs[k, 1] = patches.starts[cell + low], patches.starts[cell + high + 1]
+        cell = (bottom + k) * nearby.n_side
+        runs[k, 0], runs[k, 1] = nearby.starts[cell + low], nearby.starts[cell + high + 1]
     return runs
 
 
 @compiled
-def rays_near(patches: Patches, runs: NDArray[np.int32], c: Array, every: float) -> Array:
+def rays_near(nearby: SortedReturns, runs: NDArray[np.int32], c: Array, every: float) -> Array:
     """Return the rays to the returns within reach of a place, or to a sample of them."""
-    points, x, y, z, reach2 = patches.points, c[0], c[1], c[2], patches.reach**2
+    points, x, y, z, reach2 = nearby.points, c[0], c[1], c[2], nearby.reach**2
     rows, n, n_near = np.empty(int(np.sum(runs[:, 1] - runs[:, 0]) / every), np.uint32), 0, 0
     for k in range(len(runs)):
         n_run = int((runs[k, 1] - runs[k, 0]) / every)
@@ -114,7 +109,7 @@ def rays_near(patches: Patches, runs: NDArray[np.int32], c: Array, every: float)
     for i in range(n):
         row = rows[i]
         p, q, r = points[row, 0] - x, points[row, 1] - y, points[row, 2] - z
-        rows[n_near] = row  # kept only if the next one does not take its place
+        rows[n_near] = row  # overwritten by the next one unless counted
         n_near += p * p + q * q + r * r < reach2
     rays: Array = rays_of(points, rows[:n_near])
     return rays
@@ -122,7 +117,7 @@ def rays_near(patches: Patches, runs: NDArray[np.int32], c: Array, every: float)
 
 @compiled
 def _sample(first: int, every: float, rows: NDArray[np.uint32]) -> None:
-    """Write one of so many rows of a run, here and there; all of them with 1."""
+    """Write one row of every so many of a run, at irregular steps; all of them with 1."""
     for j in range(len(rows)):
         aside = _GOLDEN * j
         skipped = (j + aside - np.floor(aside)) * every if every > 1.0 else float(j)
@@ -130,13 +125,13 @@ def _sample(first: int, every: float, rows: NDArray[np.uint32]) -> None:
 
 
 @compiled
-def _span(patches: Patches, v_axis: Array, c: Array) -> tuple[int, int]:
+def _span(nearby: SortedReturns, v_axis: Array, c: Array) -> tuple[int, int]:
     """Return the first and the last cell along an axis that may hold returns within reach."""
     place = _along(v_axis, c)
-    reach, half = patches.reach + _ROUNDED, patches.n_side // 2
-    first = int(np.floor((place - reach) / patches.edge)) + half
-    last = int(np.floor((place + reach) / patches.edge)) + half
-    return max(first, 0), min(last, patches.n_side - 1)
+    reach, half = nearby.reach + _ROUNDED, nearby.n_side // 2
+    first = int(np.floor((place - reach) / nearby.edge)) + half
+    last = int(np.floor((place + reach) / nearby.edge)) + half
+    return max(first, 0), min(last, nearby.n_side - 1)
 
 
 @compiled
@@ -146,8 +141,8 @@ def _along(v_axis: Array, c: Array) -> float:
 
 
 @compiled
-def _wanted(layout: Layout, R_station_base: Array, places: Array, margin: int) -> Mask:
-    """Tell which cells are those of some places, or near them; what is beyond the grid is not."""
+def _cells_about(layout: Layout, R_station_base: Array, places: Array, margin: int) -> Mask:
+    """Return which cells hold some places or lie within a margin; the cell beyond the grid not."""
     n_side, last = layout.n_side, layout.n_side - 1
     is_wanted = np.zeros(n_side * n_side + 1, np.bool_)
     for i in range(len(places)):

@@ -1,4 +1,4 @@
-"""Where to look: places at which something ends upward and to a side.
+"""Seeds: places at which a surface ends upward and to a side.
 
 Hides how a few hundred places are picked from millions of returns.
 """
@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from spheremark.pipelines.compilation import compiled
-from spheremark.pipelines.detection.target import Ball
+from spheremark.pipelines.detection.target import Target
 from spheremark.pipelines.model import Array, Column
 
 _Vector = tuple[float, float, float]
@@ -38,12 +38,12 @@ class _Voxels(NamedTuple):
     edge: float
 
 
-def find_seeds(points: Column, ball: Ball, n_points_min: int) -> Array:
-    """Return rough centres at which a ball may be looked for."""
-    voxels = _voxels(points, ball.radius)
-    ends = _free_ends(voxels, ball.up, ball.radius, n_points_min)
+def find_seeds(points: Column, target: Target, n_points_min: int) -> Array:
+    """Return rough centres at which a sphere may stand."""
+    voxels = _voxels(points, target.radius)
+    ends = _free_ends(voxels, target.up, target.radius, n_points_min)
     ends = ends[np.lexsort((ends[:, 2], ends[:, 1], ends[:, 0], -ends[:, 3]))]
-    return np.ascontiguousarray(thinned(ends, 0.5 * ball.radius)[:, :3])
+    return np.ascontiguousarray(thinned(ends, 0.5 * target.radius)[:, :3])
 
 
 @compiled
@@ -89,7 +89,7 @@ def _voxels(points: Column, edge: float) -> _Voxels:
 
 @compiled
 def _is_free(voxels: _Voxels, p: _Vector, step: _Vector, beam: _Vector) -> bool:
-    """Tell whether nothing lies one step away, at the same depth give or take a voxel."""
+    """Return whether the voxels one step away, at the same depth or next to it, are empty."""
     edge = voxels.edge
     for depth in (-edge, 0.0, edge):
         x, y = p[0] + step[0] + depth * beam[0], p[1] + step[1] + depth * beam[1]
@@ -126,7 +126,7 @@ def _axes(p: _Vector, up: Array) -> tuple[_Vector, _Vector]:
 
 @compiled
 def _free_ends(voxels: _Voxels, up: Array, radius: float, n_points_min: int) -> Array:
-    """Return centres and counts, (k, 4), of what ends upward and to at least one side."""
+    """Return centres and counts, (k, 4), of surfaces that end upward and to one side at least."""
     out = np.empty((len(voxels.sums), 4))
     n_out, step = 0, 3.0 * radius
     upward = (step * up[0], step * up[1], step * up[2])
@@ -162,6 +162,9 @@ def thinned(seeds: Array, gap: float) -> Array:
             dz = seeds[i, 2] - places[2, j]
             n_near += dx * dx + dy * dy + dz * dz < gap * gap
         if not n_near:
-            kept[n_kept], places[:, n_kept] = seeds[i], seeds[i, :3]
+            for k in range(seeds.shape[1]):
+                kept[n_kept, k] = seeds[i, k]
+            for k in range(3):
+                places[k, n_kept] = seeds[i, k]
             n_kept += 1
     return kept[:n_kept]

@@ -1,4 +1,7 @@
-"""What is looked for, and how beams pass it."""
+"""The sphere that is searched for, and how beams pass it.
+
+A beam passes a centre across and up, square to the line of sight; depth is along it.
+"""
 
 from __future__ import annotations
 
@@ -11,8 +14,8 @@ from spheremark.pipelines.compilation import compiled
 from spheremark.pipelines.model import Array, Column
 
 
-class Ball(NamedTuple):
-    """What is looked for: radius [m], upward unit vector, full width of the beams [rad]."""
+class Target(NamedTuple):
+    """The sphere that is searched for: radius [m], upward unit vector, beam divergence [rad]."""
 
     radius: float
     up: Array
@@ -20,9 +23,9 @@ class Ball(NamedTuple):
 
 
 @compiled
-def blur_at(c: Array, ball: Ball) -> float:
+def blur_at(c: Array, target: Target) -> float:
     """Return half the width of a beam at a place."""
-    return float(0.5 * ball.divergence * np.sqrt(c[0] ** 2 + c[1] ** 2 + c[2] ** 2))
+    return float(0.5 * target.divergence * np.sqrt(c[0] ** 2 + c[1] ** 2 + c[2] ** 2))
 
 
 class View(NamedTuple):
@@ -37,7 +40,7 @@ class View(NamedTuple):
 
 @compiled
 def view_of(c: Array, up: Array) -> View:
-    """Return how a centre is looked at."""
+    """Return the view of a centre from the sensor."""
     distance = np.sqrt(c[0] ** 2 + c[1] ** 2 + c[2] ** 2)
     x, y, z = c[0] / distance, c[1] / distance, c[2] / distance
     along = up[0] * x + up[1] * y + up[2] * z
@@ -64,7 +67,7 @@ def rays_of(points: Column, rows: NDArray[np.integer]) -> Array:
 
 @compiled
 def passing(view: View, rays: Array, i: int) -> tuple[float, float, float]:
-    """Return how a ray passes a centre."""
+    """Return how far across and up a ray passes a centre, and how much deeper its return lies."""
     x, y, z = rays[0, i], rays[1, i], rays[2, i]
     nearest = view.x * x + view.y * y + view.z * z
     across = nearest * (x * view.across[0] + y * view.across[1] + z * view.across[2])
@@ -74,7 +77,7 @@ def passing(view: View, rays: Array, i: int) -> tuple[float, float, float]:
 
 @compiled
 def seen_from(rays: Array, view: View) -> Array:
-    """Return how some rays pass a centre."""
+    """Return how some rays pass a centre, (3, n), as ``passing``."""
     seen = np.empty((3, rays.shape[1]))
     for i in range(rays.shape[1]):
         seen[0, i], seen[1, i], seen[2, i] = passing(view, rays, i)

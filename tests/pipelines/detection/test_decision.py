@@ -5,24 +5,24 @@ import pytest
 
 from spheremark.pipelines.config import ExtractionConfig
 from spheremark.pipelines.detection.decision import (
-    among_peers,
     is_resolved,
-    peers_among,
-    verdict,
-    verdict_on_sight,
+    reason_by_evidence,
+    reason_by_features,
+    reference_of,
+    with_reference_scatter,
 )
-from spheremark.pipelines.detection.evidence import Sight
-from spheremark.pipelines.detection.features import Look
-from spheremark.pipelines.detection.target import Ball
+from spheremark.pipelines.detection.evidence import Evidence
+from spheremark.pipelines.detection.features import Features
+from spheremark.pipelines.detection.target import Target
 
-BALL = Ball(0.10, np.array([0.0, 0.0, 1.0]), 0.003)
+TARGET = Target(0.10, np.array([0.0, 0.0, 1.0]), 0.003)
 SHOULDERS = {"n_below": 14}
 
 
-def look(n_points=70, scatter_free=0.0075, **changes):
+def features(n_points=70, scatter_free=0.0075, **changes):
     """A ball of the known radius 10 m away, as a VLP-16 sees it."""
-    seen = Look(
-        x=10.0, y=0.0, z=0.5, n_points=n_points, n_strange=0, n_beside=0, n_below=0,
+    seen = Features(
+        x=10.0, y=0.0, z=0.5, n_points=n_points, n_unexplained=0, n_beside=0, n_below=0,
         scatter=0.0075, width=0.2, height=0.19, radius_free=0.1, sigma_radius=0.0009,
         scatter_free=scatter_free, gain_free=0.0, flat_across=0.0, sigma_across=0.05,
         flat_along=0.0, sigma_along=0.05, blur=0.015,
@@ -30,9 +30,9 @@ def look(n_points=70, scatter_free=0.0075, **changes):
     return seen._replace(**changes)
 
 
-def sight(**changes):
+def evidence(**changes):
     """A ball that stands on a pole before something far."""
-    seen = Sight(
+    seen = Evidence(
         n_on=70, n_through=0, n_before=0, spread=0.55, n_held=0, n_past=150, n_short=0,
         brightness=50.0, n_distinct=70, rows=np.empty(0, np.int32), seen=np.empty((3, 0)),
     )  # fmt: skip
@@ -40,60 +40,62 @@ def sight(**changes):
 
 
 def refusal(seen, about):
-    return verdict(seen, ExtractionConfig(), BALL) or verdict_on_sight(seen, about, BALL)
+    return reason_by_features(seen, ExtractionConfig(), TARGET) or reason_by_evidence(
+        seen, about, TARGET
+    )
 
 
 def test_a_ball_on_a_pole_passes_and_a_head_on_shoulders_does_not():
-    assert refusal(look(), sight()) == ""
-    assert "shoulders" in refusal(look(), sight(n_held=56, n_past=3))
-    assert "head" in refusal(look(**SHOULDERS), sight())
+    assert refusal(features(), evidence()) == ""
+    assert "shoulders" in refusal(features(), evidence(n_held=56, n_past=3))
+    assert "head" in refusal(features(**SHOULDERS), evidence())
 
 
 def test_a_ball_seen_more_closely_than_any_other_shape_may_stand_on_something():
-    close = look(scatter_free=0.003, **SHOULDERS)
-    assert is_resolved(close, BALL)
-    assert refusal(close, sight(n_held=56, n_past=3)) == ""
+    close = features(scatter_free=0.003, **SHOULDERS)
+    assert is_resolved(close, TARGET)
+    assert refusal(close, evidence(n_held=56, n_past=3)) == ""
 
 
 def test_among_markers_that_scatter_more_none_is_seen_closely():
     """Of seventy returns, a robust scatter is less by a third once in fifty."""
-    lucky = look(scatter_free=0.005, **SHOULDERS)
-    others = [(look(), sight()) for _ in range(3)]
-    assert is_resolved(lucky, BALL)
-    usual = among_peers(lucky, peers_among([*others, (lucky, sight())]))
+    lucky = features(scatter_free=0.005, **SHOULDERS)
+    others = [(features(), evidence()) for _ in range(3)]
+    assert is_resolved(lucky, TARGET)
+    usual = with_reference_scatter(lucky, reference_of([*others, (lucky, evidence())]))
     assert usual == lucky._replace(scatter_free=0.0075)
-    assert not is_resolved(usual, BALL)
-    assert "head" in refusal(usual, sight())
+    assert not is_resolved(usual, TARGET)
+    assert "head" in refusal(usual, evidence())
 
 
 def test_a_ball_alone_or_among_others_as_close_stays_close():
-    close = look(scatter_free=0.003)
-    alone = peers_among([(close, sight())] * 2)
+    close = features(scatter_free=0.003)
+    alone = reference_of([(close, evidence())] * 2)
     assert np.isnan(alone.scatter_free)
-    assert among_peers(close, alone) == close
-    among = peers_among([(look(scatter_free=s), sight()) for s in (0.002, 0.0032, 0.004)])
-    assert is_resolved(among_peers(close, among), BALL)
+    assert with_reference_scatter(close, alone) == close
+    among = reference_of([(features(scatter_free=s), evidence()) for s in (0.002, 0.0032, 0.004)])
+    assert is_resolved(with_reference_scatter(close, among), TARGET)
 
 
 @pytest.mark.parametrize("share_seen", [1.0, 0.5, 0.04])
 def test_what_is_held_below_counts_by_how_much_is_seen_there(share_seen):
     """A tenth of the returns that a ball there would have may be held, and one."""
     n_seen = round(100 * share_seen)
-    about = sight(n_on=120, n_short=100 - n_seen)
+    about = evidence(n_on=120, n_short=100 - n_seen)
     n_few = 1 + round(0.1 * 120 * share_seen)
     passes = about._replace(n_held=n_few - 1, n_past=n_seen - n_few + 1)
     held = about._replace(n_held=n_few + 2, n_past=n_seen - n_few - 2)
-    assert "pole" not in verdict_on_sight(look(n_points=120), passes, BALL)
-    assert "pole" in verdict_on_sight(look(n_points=120), held, BALL)
+    assert "pole" not in reason_by_evidence(features(n_points=120), passes, TARGET)
+    assert "pole" in reason_by_evidence(features(n_points=120), held, TARGET)
 
 
 def test_of_a_ball_two_thirds_may_be_hidden():
-    assert refusal(look(n_points=25), sight(n_on=25, n_before=50)) == ""
-    assert "hidden" in refusal(look(n_points=25), sight(n_on=25, n_before=55))
+    assert refusal(features(n_points=25), evidence(n_on=25, n_before=50)) == ""
+    assert "hidden" in refusal(features(n_points=25), evidence(n_on=25, n_before=55))
 
 
 def test_a_ball_of_which_something_hides_a_side_may_look_slim():
-    slim = look(n_points=34, width=0.056)
-    assert "slim" in refusal(slim, sight(n_on=34))
-    assert refusal(slim, sight(n_on=34, n_before=30)) == ""
-    assert "slim" in refusal(slim._replace(width=0.04), sight(n_on=34, n_before=30))
+    slim = features(n_points=34, width=0.056)
+    assert "slim" in refusal(slim, evidence(n_on=34))
+    assert refusal(slim, evidence(n_on=34, n_before=30)) == ""
+    assert "slim" in refusal(slim._replace(width=0.04), evidence(n_on=34, n_before=30))
