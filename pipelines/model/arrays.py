@@ -8,27 +8,14 @@ from numpy.typing import NDArray
 from spheremark.pipelines.errors import InputError
 
 Array = NDArray[np.float64]
-
-
 Column = NDArray[np.float32]
-
-
 Index = NDArray[np.intp]
-
-
 Nanos = NDArray[np.int64]
-
-
 Mask = NDArray[np.bool_]
-
-
 Rings = NDArray[np.uint8]
-
-
 Shape = tuple[int | None, ...]
 
-
-RING_UNKNOWN = 255  # the ring of a return whose recording does not tell
+RING_UNKNOWN = 255  # the ring of a return where the recording has none
 
 
 def seal(value: object, **shapes: Shape) -> None:

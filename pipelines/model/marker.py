@@ -25,9 +25,9 @@ class MarkerCandidate:
     Attributes
     ----------
     name : str
-        What its marker is called at this stop, whatever method fits it.
+        Name of the marker at this stop, the same for every method.
     members : (n,)
-        Rows of the stitched cloud, ascending: the sphere, and what of its pole touches it.
+        Rows of the stitched cloud, ascending: the sphere, and the part of its pole that touches it.
     p_base_rough : (3,)
         Rough centre, good to a few centimetres [m].
     score : float
@@ -44,7 +44,7 @@ class MarkerCandidate:
 
 
 def marker_name(place: int) -> str:
-    """Return what the marker at a place among those of a stop is called: M01, M02, ...
+    """Return the name of the marker at a place among those of a stop: M01, M02, ...
 
     Parameters
     ----------
@@ -61,7 +61,7 @@ def marker_name(place: int) -> str:
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class Rejection:
-    """A group of returns that was looked at and is not used as a marker.
+    """A group of returns that was examined and is not used as a marker.
 
     Attributes
     ----------
@@ -70,7 +70,7 @@ class Rejection:
     n_points : int
         Number of its returns.
     reason : str
-        Why it was refused, as a sentence for people.
+        Why it was rejected, as a sentence.
     """
 
     p_base: Array
@@ -83,17 +83,17 @@ class Rejection:
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class MarkerCandidates:
-    """What one stitched cloud shows that may be, or looked like, a marker.
+    """The groups of one stitched cloud that may be markers, and those that were rejected.
 
     Attributes
     ----------
     candidates : tuple of MarkerCandidate
         Groups that may be markers.
     rejected : tuple of Rejection
-        Groups that looked like one at first, with the reason against.
+        Groups that passed the first test, with the reason against them.
     ground_height_max : float
         Height of the highest ground point near the station in the levelled frame, the level of the
-        study's cut [m]; minus infinity when no ground was seen.
+        published method's cut [m]; minus infinity when no ground was seen.
     """
 
     candidates: tuple[MarkerCandidate, ...]
@@ -108,7 +108,7 @@ class MarkerFit:
     Attributes
     ----------
     name : str
-        What the marker is called at this stop: that of its candidate.
+        Name of the marker at this stop: that of its candidate.
     p_base : (3,)
         Centre [m].
     cov_p_base : (3, 3)
@@ -122,7 +122,7 @@ class MarkerFit:
     radius : float
         Radius that was assumed [m].
     radius_free : float
-        Radius when estimated together with the centre; NaN when the points do not tell [m].
+        Radius when estimated together with the centre; NaN when it is not determined [m].
     sigma_radius_free : float
         Standard deviation of ``radius_free``; NaN likewise [m].
     mean_range : float
@@ -142,12 +142,12 @@ class MarkerFit:
     coverage : float
         Share of the visible half of the sphere that has returns, 0 to 1.
     incidence : float
-        Mean angle between the used beams and the sphere's normals; NaN when not told [rad].
+        Mean angle between the used beams and the sphere's normals; NaN when not computed [rad].
     variant : str
         Which form of its method ran, where it has several; else empty.
     sigma_range_shared : float
-        How much of its error along the line of sight all centres of the stop have in common, as its
-        covariance has it; NaN when not told [m].
+        Part of its standard deviation along the line of sight that all centres of the stop have in
+        common, included in its covariance; NaN when not computed [m].
     """
 
     name: str
@@ -195,7 +195,7 @@ class MarkerFit:
         return float(np.sqrt(self.residuals @ self.residuals / self.n_points))
 
     def cov_with_heading(self, sigma_heading: float) -> Array:
-        """Return ``cov_p_base`` with what an unknown heading [rad] of the stop adds to it [m^2]."""
+        """Return ``cov_p_base`` with the effect of the stop's unknown heading [rad] added [m^2]."""
         sideways = np.array([-self.p_base[1], self.p_base[0], 0.0])
         return self.cov_p_base + sigma_heading**2 * np.outer(sideways, sideways)
 
@@ -211,7 +211,7 @@ class MarkerFits:
     fits : tuple of MarkerFit
         Markers in the order of their azimuth in the base frame, from -pi.
     rejected : tuple of Rejection
-        Candidates that this method or the extraction refused.
+        Groups that this method or the detection rejected.
     levelling : Levelling
         How the base leans.
     """

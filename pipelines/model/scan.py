@@ -1,4 +1,4 @@
-"""What a LiDAR on a gimbal recorded, and what stitching makes of it."""
+"""The log of a LiDAR on a gimbal, and the stitched cloud."""
 
 from __future__ import annotations
 
@@ -47,12 +47,12 @@ class Origin:
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class Rig:
-    """How the LiDAR sits on the gimbal, and what its beams look like.
+    """How the LiDAR sits on the gimbal, and the shape of its beams.
 
     Attributes
     ----------
     name : str
-        What results call this rig.
+        Name of the rig in results.
     T_head_lidar : (4, 4)
         Mounting of the LiDAR on the turning head: tilt and axis offset [m]. Its vertical
         translation is zero by the definition of the base frame.
@@ -65,7 +65,7 @@ class Rig:
     laser_heights : (k,)
         Where each beam leaves the spin axis, along it [m].
     laser_range_biases : (k,)
-        What each laser measures too long [m]; subtracted when stitching.
+        Range bias of each laser [m]; subtracted when stitching.
     cloud_carries_heights : bool
         Whether recorded coordinates already include ``laser_heights``.
     divergence : (2,)
@@ -73,10 +73,10 @@ class Rig:
     encoder_eccentricity : (2,)
         Cosine and sine amplitude that are added to the recorded joint angle [rad].
     gimbal_clock_offset : float
-        What is added to a gimbal stamp to get the LiDAR's clock [s].
+        Added to a gimbal stamp to get the LiDAR's clock [s].
     sigma_heading : float
-        Standard deviation of the angle about the gimbal axis that mounting and encoder leave
-        unknown: it turns all centres of a stop together [rad].
+        Standard deviation of the angle about the gimbal axis, from mounting and encoder: it turns
+        all centres of a stop together [rad].
     """
 
     name: str
@@ -108,7 +108,7 @@ class Rig:
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class ScanLog:
-    """What was recorded, each sensor on its own clock.
+    """The recording of one or more stops, each sensor on its own clock.
 
     Attributes
     ----------
@@ -119,7 +119,7 @@ class ScanLog:
     rings : (n,) uint8
         Laser of each return, 0 the lowest; ``RING_UNKNOWN`` throughout when not recorded.
     stamps_lidar_ns : (n,)
-        Instant of each shot; that of its message when the points carry no time.
+        Instant of each pulse; that of its message when the points carry no time.
     has_shot_times : bool
         Whether the points carry a time of their own.
     gimbal_angles : (m,)
@@ -135,9 +135,9 @@ class ScanLog:
     origin : Origin
         Name and digest of the recording.
     notes : tuple of str
-        What the recording cannot give, as sentences for people.
+        What the recording lacks, as sentences.
     has_heights : bool or None
-        Whether the coordinates include the heights of the lasers; none where only a rig can tell.
+        Whether the coordinates include the heights of the lasers; none where only a rig says it.
     """
 
     p_lidar: Column
@@ -173,19 +173,19 @@ class ScanLog:
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class Firings:
-    """All shots of a VLP-16 as its packets hold them, with and without a return.
+    """All pulses of a VLP-16 as its packets hold them, with and without a return.
 
     Attributes
     ----------
     azimuths : (n,) uint16
-        Azimuth of the first shot of each block of two firings, in hundredths of a degree,
+        Azimuth of the first pulse of each block of two firings, in hundredths of a degree,
         clockwise from x seen from +z.
     distances : (n, 32) uint16
-        Distance of each shot in units of 2 mm, in the order of firing; 0 without a return.
+        Distance of each pulse in units of 2 mm, in the order of firing; 0 without a return.
     reflectivities : (n, 32) uint8
-        Calibrated reflectivity of each shot; 0 without a return.
+        Calibrated reflectivity of each pulse; 0 without a return.
     start_ns : int
-        Instant of the first shot; blocks follow each other without a pause.
+        Instant of the first pulse; blocks follow each other without a pause.
     """
 
     azimuths: NDArray[np.uint16]
@@ -200,7 +200,7 @@ class Firings:
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class Levelling:
-    """How the base leans, as the AHRS tells, and what all centres of a stop have in common.
+    """How the base leans by the AHRS, and the heading error that all centres of a stop share.
 
     Attributes
     ----------
@@ -211,7 +211,7 @@ class Levelling:
     is_measured : bool
         False when no AHRS was recorded and the base is only assumed to be about level.
     sigma_heading : float
-        Standard deviation of the heading that mounting and encoder leave unknown [rad].
+        Standard deviation of the heading, from mounting and encoder [rad].
     """
 
     roll: float
@@ -223,16 +223,16 @@ class Levelling:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Timed:
-    """A column that changes evenly between samples: found for the rows that are asked for.
+    """A column that changes evenly between samples: computed for the rows that are read.
 
     Attributes
     ----------
     stamps_ns : (n,)
         Instant of each row.
     samples_ns : (m,)
-        Instants of the samples, increasing; what is asked for is not before the first.
+        Instants of the samples, increasing; no row is before the first.
     values : (m,)
-        What was sampled.
+        Values at the samples.
     rates : (m,)
         Change from each sample on [1/ns].
     is_angle : bool
@@ -240,7 +240,7 @@ class Timed:
 
     Notes
     -----
-    Of millions of shots a few thousand are asked for; ``column[:]`` gives all of them.
+    Of millions of rows a few thousand are needed; ``column[:]`` gives all of them.
     """
 
     stamps_ns: Nanos
@@ -260,7 +260,7 @@ class Timed:
     def __getitem__(self, rows: slice | Index | Mask) -> Column:
         """Return some rows, float32."""
         stamps_ns = self.stamps_ns[rows]
-        sample: Any = 0  # where there is but one, millions of rows need not be told theirs
+        sample: Any = 0  # a single sample serves all rows
         if len(self.samples_ns) > 1:
             sample = np.searchsorted(self.samples_ns, stamps_ns, side="right") - 1
         found = self.values[sample] + self.rates[sample] * (stamps_ns - self.samples_ns[sample])
@@ -268,7 +268,7 @@ class Timed:
             turns = found * (0.5 / np.pi)
             found = 2.0 * np.pi * (turns - np.floor(turns + 0.5))
         column = np.asarray(found, np.float32)
-        column.flags.writeable = False  # like an array's own: compiled loops tell the two apart
+        column.flags.writeable = False  # like a sealed array: compiled loops are specialised by it
         return column
 
     def __array__(self, dtype: Any = None, copy: object = None) -> NDArray[Any]:
@@ -278,21 +278,21 @@ class Timed:
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class StitchedCloud:
-    """One stop's returns as points in the base frame, with what is needed to rebuild their beams.
+    """One stop's returns as points in the base frame, and all that rebuilds their beams.
 
     Attributes
     ----------
     p_base : (n, 3) float32
         Returns [m].
     gimbal_angles : (n,) float32
-        Gimbal angle at each shot, eccentricity applied, reduced to [-pi, pi) [rad]. Like the times,
-        an array, or what finds the rows that are asked for.
+        Gimbal angle at each pulse, eccentricity applied, reduced to [-pi, pi) [rad]. Like the
+        times, an array or a ``Timed`` column.
     intensities : (n,) float32
         Calibrated reflectivity, 0-255.
     rings : (n,) uint8
-        Laser of each return; ``RING_UNKNOWN`` when neither recorded nor told by the elevations.
+        Laser of each return; ``RING_UNKNOWN`` when neither recorded nor inferred from elevations.
     times : (n,) float32
-        Instant of each shot since the first one of the stop [s].
+        Instant of each pulse since the first one of the stop [s].
     levelling : Levelling
         How the base leans.
     rig : Rig
@@ -300,11 +300,11 @@ class StitchedCloud:
     coverage : float
         Angle that the gimbal turned through, at most a full turn [rad].
     duration : float
-        Time from the first shot to the last [s].
+        Time from the first pulse to the last [s].
     name : str
         Name of the stop.
     notes : tuple of str
-        What weakens the result, as sentences for people.
+        What weakens the result, as sentences.
     """
 
     p_base: Column
@@ -328,7 +328,7 @@ class StitchedCloud:
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class Beams:
-    """Some shots of a stitched cloud as lines in the base frame.
+    """The beams of some returns of a stitched cloud, as lines in the base frame.
 
     Attributes
     ----------
@@ -341,11 +341,11 @@ class Beams:
     across_base : (n, 3)
         Unit vectors across the beam, along the sweep of the LiDAR: the footprint's first axis.
     rings : (n,) uint8
-        Laser of each shot.
+        Laser of each beam.
     intensities : (n,)
         Calibrated reflectivity, 0-255.
     times : (n,)
-        Instant of each shot since the first one of the stop [s].
+        Instant of each pulse since the first one of the stop [s].
     divergence : (2,)
         Full width of the footprint along ``across_base`` and square to it [rad].
     """

@@ -42,7 +42,7 @@ def vlp16(
     Parameters
     ----------
     name : str
-        What results call this rig.
+        Name of the rig in results.
     T_head_lidar : (4, 4)
         Mounting of the LiDAR on the gimbal's head; its vertical translation is set to zero [m].
     R_mount_imu : (3, 3), optional
@@ -57,8 +57,8 @@ def vlp16(
 
     Notes
     -----
-    Elevations and vertical offsets after the VLP-16 user manual (63-9243), section 9: the offset of
-    a laser is what the crossing of the beams 41.91 mm off the spin axis makes it.
+    Elevations and vertical offsets after the VLP-16 user manual (63-9243), section 9: the beams
+    cross 41.91 mm off the spin axis, which gives the offset of each laser.
     """
     elevations = np.radians(np.arange(-15.0, 16.0, 2.0))
     mounting = np.array(T_head_lidar, dtype=np.float64)
@@ -80,12 +80,12 @@ def vlp16(
 
 
 def tilted_vlp16(name: str, axis_offset: ArrayLike, tilt: float = np.pi / 2) -> Rig:
-    """Return the study's rig: a VLP-16 whose spin axis is tilted about y, with an axis offset.
+    """Return the published rig: a VLP-16 whose spin axis is tilted about y, with an axis offset.
 
     Parameters
     ----------
     name : str
-        What results call this rig.
+        Name of the rig in results.
     axis_offset : (2,)
         Position of the LiDAR's origin in the head frame, x and y [m].
     tilt : float
@@ -135,7 +135,7 @@ def rig_from_mapping(values: Mapping[str, Any]) -> Rig:
     Parameters
     ----------
     values : mapping
-        ``T_head_lidar`` is required; what else is missing is as the maker of the VLP-16 says.
+        ``T_head_lidar`` is required; other missing keys take the values of the VLP-16's maker.
 
     Returns
     -------
@@ -145,7 +145,7 @@ def rig_from_mapping(values: Mapping[str, Any]) -> Rig:
     Raises
     ------
     RigError
-        If a key is unknown or missing, or a value is not what it should be.
+        If a key is unknown or missing, or a value is of the wrong kind.
     """
     known = rig_to_mapping(tilted_vlp16("", (0.0, 0.0)))
     unknown = [key for key in values if key not in known]
@@ -200,7 +200,7 @@ def _checked(rig: Rig) -> Rig:
 
 
 def rig_digest(rig: Rig) -> str:
-    """Return what names a rig: 16 hexadecimal digits.
+    """Return the digest of a rig: 16 hexadecimal digits.
 
     Parameters
     ----------

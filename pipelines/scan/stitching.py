@@ -1,7 +1,7 @@
 """ScanLog -> StitchedCloud: hides clocks, the turning gimbal, the laser table and levelling.
 
 A return becomes ``p_base = Rz(angle) T_head_lidar p_lidar`` with the gimbal angle interpolated to
-the instant of its shot, after the beam's bias has been taken off along the beam.
+the instant of its pulse, after the laser's bias has been subtracted along the beam.
 Inside, ``stops`` cuts a log into stops, and ``turning`` has the loops.
 """
 
@@ -38,14 +38,14 @@ from spheremark.pipelines.model import (
     Timed,
 )
 from spheremark.pipelines.scan.stops import pause_notes, split_stops
-from spheremark.pipelines.scan.turning import Joints, Lidar, Seen, Shots, turned
+from spheremark.pipelines.scan.turning import Joints, Lidar, Pulses, Tally, turn_returns
 
 __all__ = ["beams", "choose_rig", "level", "pause_notes", "split_stops", "stitch"]
 
 _NS = 1e-9  # [s] in a nanosecond
 _FULL_TURN = 2.0 * np.pi
 _NEARLY_FULL = np.radians(359.0)  # a joint sample may be missing at either end
-_SMEAR = np.radians(0.05)  # 7 mm at 7.5 m: the most that a message without shot times may turn
+_SMEAR = np.radians(0.05)  # 7 mm at 7.5 m: largest turn during a message without pulse times
 _RESTS_MIN = 4  # fewer rests than this are those before and after an even turn
 _JOINT_GAP = 0.5  # [s]; over a longer gap of a moving gimbal the angle is a guess
 _JOINT_GAP_MOTION = np.radians(0.5)
@@ -62,12 +62,12 @@ def choose_rig(log: ScanLog, rig: Rig | None) -> Rig:
     log : ScanLog
         The recording.
     rig : Rig or None
-        A rig that somebody gave for it.
+        A rig that the user gave.
 
     Returns
     -------
     Rig
-        The rig to use; what raw packets say of the heights of the lasers goes before what it says.
+        The rig to use. Raw packets decide whether coordinates include the heights of the lasers.
 
     Raises
     ------
@@ -77,7 +77,7 @@ def choose_rig(log: ScanLog, rig: Rig | None) -> Rig:
     chosen = rig or log.rig
     if chosen is None:
         raise MissingRigError(
-            f"{log.origin.name} does not tell how the LiDAR sits on the gimbal: it has no "
+            f"{log.origin.name} does not describe how the LiDAR sits on the gimbal: it has no "
             "/tf_static from the LiDAR's frame to the gimbal's head. Give a rig (--rig rig.json) "
             "or record /tf_static."
         )
@@ -92,8 +92,8 @@ def level(log: ScanLog, rig: Rig, config: StitchingConfig) -> Levelling:
     Notes
     -----
     The up direction in base is the third row of ``R_world_base``, so the heading of the AHRS and
-    its magnetic troubles do not matter. Its mean is taken over the samples within three scaled
-    median deviations of the median. Errors of an AHRS hang together in time: the scatter of one
+    its magnetic disturbances do not matter. The mean is that of the samples within three scaled
+    median deviations of the median. Errors of an AHRS are correlated in time: the scatter of one
     sample, not of the mean, is added to the sigma of the configuration.
     """
     usable = np.linalg.norm(log.quaternions_imu, axis=1)
@@ -133,15 +133,13 @@ def _turn(v_head: Array, angles: Array) -> Array:
     return np.stack([c * x - s * y, s * x + c * y, z], axis=1)
 
 
-@compiled
 def _robust_direction(ups: Array) -> tuple[Array, float]:
     """Return the mean unit vector without outliers, and the scatter of one per axis [rad]."""
-    middle = np.array([np.median(column) for column in ups.T])
-    distances = np.sqrt(np.sum((ups - middle) ** 2, axis=1))
+    distances = np.linalg.norm(ups - np.median(ups, axis=0), axis=1)
     inliers = ups[distances <= 3.0 * 1.4826 * np.median(distances) + 1e-12]
-    up = np.sum(inliers, axis=0) / len(inliers)
+    up = inliers.mean(axis=0)
     scatter = float(np.sqrt(np.sum((inliers - up) ** 2) / len(inliers) / 2.0))
-    return up / np.sqrt(np.sum(up**2)), scatter
+    return up / np.linalg.norm(up), scatter
 
 
 def stitch(log: ScanLog, rig: Rig, config: StitchingConfig) -> StitchedCloud:
@@ -159,41 +157,41 @@ def stitch(log: ScanLog, rig: Rig, config: StitchingConfig) -> StitchedCloud:
     Returns
     -------
     StitchedCloud
-        Returns with their gimbal angles; its notes count what was left out and say what is weak.
+        Returns with their gimbal angles; its notes count the returns left out and list weaknesses.
 
     Raises
     ------
     MissingGimbalAngleError
         If the log has no joint sample.
     MissingShotTimesError
-        If the points carry no time of their own and the gimbal does not rest while they are made.
+        If the points carry no time of their own and the gimbal does not rest during a message.
     RecordingError
         If no return has a gimbal angle and a range within the limits.
 
     Notes
     -----
     The angle is interpolated linearly between joint samples, the eccentricity applied at the
-    samples. Sine and cosine are evaluated once per joint sample and carried to the shot by their
-    series, which is good to 0.1 micrometres at 60 m. One pass, linear in the number of returns.
-    Where nothing is left out, intensities and rings are those of the log; gimbal angles and times
-    are computed when they are asked for.
+    samples. Sine and cosine are evaluated once per joint sample and continued to the pulse by
+    their series, which is good to 0.1 micrometres at 60 m. One pass, linear in the number of
+    returns. Where no return is left out, intensities and rings are those of the log; gimbal angles
+    and times are computed on access.
     """
     rings, notes = _lasers_of(log, rig)
     joints = _joints(log, rig)
     joints, smear_note = _without_smear(log, joints)
-    shots = Shots(log.p_lidar, log.intensities, rings, log.stamps_lidar_ns)
-    kept, seen = turned(shots, joints, _lidar(rig, config))
-    _refuse_empty(log, joints, seen, config)
+    pulses = Pulses(log.p_lidar, log.intensities, rings, log.stamps_lidar_ns)
+    kept, tally = turn_returns(pulses, joints, _lidar(rig, config))
+    _refuse_empty(log, joints, tally, config)
     levelling = level(log, rig, config)
-    coverage, duration = _extent(seen, joints)
-    notes += smear_note + pause_notes(log) + _count_notes(seen)
+    coverage, duration = _extent(tally, joints)
+    notes += smear_note + pause_notes(log) + _count_notes(tally)
     notes += _level_notes(levelling) + _turn_notes(coverage)
     return StitchedCloud(
         p_base=kept.p,
         gimbal_angles=Timed(kept.stamps_ns, *joints, is_angle=True),
         intensities=kept.intensities,
         rings=kept.rings,
-        times=Timed(kept.stamps_ns, np.array([seen.first_ns]), np.zeros(1), np.array([_NS])),
+        times=Timed(kept.stamps_ns, np.array([tally.first_ns]), np.zeros(1), np.array([_NS])),
         levelling=levelling,
         rig=rig,
         coverage=coverage,
@@ -218,14 +216,14 @@ def _lasers_of(log: ScanLog, rig: Rig) -> tuple[Rings, tuple[str, ...]]:
     spacing = float(np.min(np.diff(rig.laser_elevations))) if n_lasers > 1 else np.pi
     if not np.nanquantile(off, 0.95) < _ELEVATION_CLEAN * spacing:
         return log.rings, (
-            "Rings are not recorded and elevations do not tell them: laser heights and biases "
-            "are not applied.",
+            "Rings are not recorded and cannot be inferred from the elevations: laser heights and "
+            "biases are not applied.",
         )
     return rings, ("Rings are not recorded; they were inferred from the elevations.",)
 
 
 def _nearest_lasers(p_lidar: Column, rig: Rig) -> tuple[Rings, Column]:
-    """Return for each point the laser whose elevation fits best, and by how much it is off."""
+    """Return for each point the laser of nearest elevation, and the difference [rad]."""
     horizontal = np.hypot(p_lidar[:, 0], p_lidar[:, 1])
     rings = np.full(len(p_lidar), RING_UNKNOWN, np.uint8)
     best = np.full(len(p_lidar), np.inf, np.float32)
@@ -255,14 +253,14 @@ def _joints(log: ScanLog, rig: Rig) -> Joints:
 
 
 def _without_smear(log: ScanLog, joints: Joints) -> tuple[Joints, tuple[str, ...]]:
-    """Void the angle where a message without shot times was made by a moving gimbal."""
+    """Void the angle during messages without pulse times in which the gimbal moved."""
     if log.has_shot_times or not len(log.stamps_lidar_ns):
         return joints, ()
     messages = np.unique(log.stamps_lidar_ns)
     if len(messages) > 1:
         edges = np.append(messages, 2 * messages[-1] - messages[-2])
         moved = np.abs(np.diff(_angles_at(joints, edges)))
-    else:  # nothing tells how long the only message took
+    else:  # the duration of the only message is unknown
         moved = np.ptp(joints.angles, keepdims=True)
     smeared, n_rests = _smeared(moved)
     if np.mean(smeared) > 0.5 and n_rests < _RESTS_MIN:
@@ -281,7 +279,7 @@ def _without_smear(log: ScanLog, joints: Joints) -> tuple[Joints, tuple[str, ...
 
 
 def _smeared(moved: Array) -> tuple[Mask, int]:
-    """Say which messages the gimbal moved in, and how often it rested, given its motion [rad].
+    """Return the messages in which the gimbal moved, and the number of rests, from its motion.
 
     A message is stamped with its start; some drivers stamp the end. The first message of a rest is
     therefore left out too, unless it is the only one.
@@ -301,7 +299,7 @@ def _voided(joints: Joints, stamps_ns: Nanos) -> Joints:
 
 
 def _lidar(rig: Rig, config: StitchingConfig) -> Lidar:
-    """Return the rig, and which ranges are wanted, as the loops need them."""
+    """Return the rig and the limits of range in the form of the kernels."""
     return Lidar(
         tuple(rig.T_head_lidar[:3].ravel().tolist()),
         _by_ring(rig.laser_range_biases),
@@ -313,19 +311,19 @@ def _lidar(rig: Rig, config: StitchingConfig) -> Lidar:
 
 
 def _by_ring(values: Array) -> Array:
-    """Return what is known of lasers for every ring; zero for unknown ones."""
+    """Return values of lasers as a table over all rings; zero for unknown ones."""
     table = np.zeros(RING_UNKNOWN + 1)
     table[: len(values)] = values
     return table
 
 
-def _refuse_empty(log: ScanLog, joints: Joints, seen: Seen, config: StitchingConfig) -> None:
-    """Raise RecordingError if nothing was kept, saying why."""
-    if seen.n_kept:
+def _refuse_empty(log: ScanLog, joints: Joints, tally: Tally, config: StitchingConfig) -> None:
+    """Raise RecordingError with the reason if no return was kept."""
+    if tally.n_kept:
         return
     if not len(log.stamps_lidar_ns):
         raise RecordingError(f"{log.origin.name} holds no LiDAR return.")
-    if seen.n_without_angle:
+    if tally.n_without_angle:
         away = (int(joints.stamps_ns[0]) - int(log.stamps_lidar_ns[0])) * _NS
         raise RecordingError(
             f"No return of {log.origin.name} has a gimbal angle: the joint samples begin "
@@ -335,14 +333,14 @@ def _refuse_empty(log: ScanLog, joints: Joints, seen: Seen, config: StitchingCon
         )
     raise RecordingError(
         f"No return of {log.origin.name} is from {config.range_min} to {config.range_max} m away "
-        f"({seen.n_not_finite} are not finite, {seen.n_out_of_range} are nearer or farther)."
+        f"({tally.n_not_finite} are not finite, {tally.n_out_of_range} are nearer or farther)."
     )
 
 
-def _extent(seen: Seen, joints: Joints) -> tuple[float, float]:
-    """Return the angle [rad] and the time [s] from the first shot with an angle to the last."""
-    first = max(seen.first_ns, int(joints.stamps_ns[0]))
-    final = min(seen.last_ns, int(joints.stamps_ns[-1]))
+def _extent(tally: Tally, joints: Joints) -> tuple[float, float]:
+    """Return the angle [rad] and the time [s] from the first pulse with an angle to the last."""
+    first = max(tally.first_ns, int(joints.stamps_ns[0]))
+    final = min(tally.last_ns, int(joints.stamps_ns[-1]))
     inside = joints.angles[(joints.stamps_ns >= first) & (joints.stamps_ns <= final)]
     times = joints.stamps_ns - first
     edges = np.interp([0, final - first], times, joints.angles)
@@ -350,21 +348,21 @@ def _extent(seen: Seen, joints: Joints) -> tuple[float, float]:
     return min(turned, _FULL_TURN), float((final - first) * _NS)
 
 
-def _count_notes(seen: Seen) -> tuple[str, ...]:
-    """Say how many shots were left out and why; range limits are no news."""
+def _count_notes(tally: Tally) -> tuple[str, ...]:
+    """Return notes on the returns left out; those beyond the range limits need none."""
     notes = []
-    if seen.n_without_angle:
+    if tally.n_without_angle:
         notes.append(
-            f"{seen.n_without_angle} returns have no gimbal angle (before, after or in a gap of "
+            f"{tally.n_without_angle} returns have no gimbal angle (before, after or in a gap of "
             "the joint samples) and are left out."
         )
-    if seen.n_not_finite:
-        notes.append(f"{seen.n_not_finite} returns are not finite and are left out.")
+    if tally.n_not_finite:
+        notes.append(f"{tally.n_not_finite} returns are not finite and are left out.")
     return tuple(notes)
 
 
 def _level_notes(levelling: Levelling) -> tuple[str, ...]:
-    """Say what is strange about the levelling."""
+    """Return notes on an implausible or missing levelling."""
     if not levelling.is_measured:
         return (
             "No AHRS: the base is assumed level to "
@@ -373,14 +371,14 @@ def _level_notes(levelling: Levelling) -> tuple[str, ...]:
     lean = np.arccos(np.cos(levelling.roll) * np.cos(levelling.pitch))
     if lean > _LEAN_STRANGE:
         return (
-            f"The AHRS says that the base leans by {np.degrees(lean):.0f} deg: check "
-            "R_mount_imu of the rig.",
+            f"By the AHRS the base leans by {np.degrees(lean):.0f} deg: check R_mount_imu of the "
+            "rig.",
         )
     return ()
 
 
 def _turn_notes(coverage: float) -> tuple[str, ...]:
-    """Say what a turn that is not full costs."""
+    """Return notes on a turn that is not full."""
     degrees = np.degrees(coverage)
     if coverage < np.pi:
         return (f"turn under 180 deg ({degrees:.0f} deg): parts of the scene are not seen: weak.",)

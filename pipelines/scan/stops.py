@@ -1,4 +1,4 @@
-"""Where a log is cut into stops: hides rests of the gimbal and pauses of the LiDAR."""
+"""Cut a log into stops: hides rests of the gimbal and pauses of the LiDAR."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ _STILL = np.radians(0.1)  # a gimbal at rest stays within this, encoder jitter i
 _NOT_TURNED = np.radians(1.0)  # less is not turning
 _SCRAP = np.radians(30.0)  # less after a stop is no scan but the gimbal finding its place
 _WINDOW = 12  # samples of the gimbal angle per rest when looking for rests
-_PROBES_PER_REST = 30  # shots that are looked at in the time of a gap when searching for gaps
+_PROBES_PER_REST = 30  # pulses that are tested in the time of a gap when searching for gaps
 _PAUSE = 0.3  # [s]; three revolutions without a return are a pause
 _PAUSE_TURN = np.radians(1.0)  # a pause of a gimbal at rest costs nothing
 
@@ -127,7 +127,7 @@ def _turned(log: ScanLog, start: int, end: int) -> float:
 
 
 def _cut(log: ScanLog, start: int, end: int) -> ScanLog:
-    """Return what was recorded from ``start`` to before ``end`` [ns]; views where time runs on."""
+    """Return the log from ``start`` to before ``end`` [ns]; views where the stamps ascend."""
     stamps = log.stamps_lidar_ns
     rows: slice | Mask
     if np.all(stamps[1:] >= stamps[:-1]):
@@ -135,7 +135,7 @@ def _cut(log: ScanLog, start: int, end: int) -> ScanLog:
     else:
         rows = (stamps >= start) & (stamps < end)
     low, high = np.searchsorted(log.stamps_gimbal_ns, (start, end))
-    joints = slice(max(low - 1, 0), high + 1)  # one more on either side covers the edge shots
+    joints = slice(max(low - 1, 0), high + 1)  # one more on either side covers the edge pulses
     imu = slice(*np.searchsorted(log.stamps_imu_ns, (start, end)))
     return replace(
         log,
@@ -151,7 +151,7 @@ def _cut(log: ScanLog, start: int, end: int) -> ScanLog:
 
 
 def pause_notes(log: ScanLog) -> tuple[str, ...]:
-    """Say where the LiDAR was silent while the gimbal turned.
+    """Return notes on the times without a return while the gimbal turned.
 
     Parameters
     ----------

@@ -1,8 +1,7 @@
-"""Returns of a turning LiDAR -> points in the base frame: the loops, run by run.
+"""Returns of a turning LiDAR -> points in the base frame: the compiled loops.
 
-Hides how a return finds its gimbal angle and how many are turned at once. A run is what was shot
-between two joint samples; the loop over it does all that is usual in one go, and looks nothing up,
-so that the compiler can do it to many returns at a time.
+A run is a series of pulses between two joint samples. The loop over a run needs no table, so that
+the compiler can vectorise it.
 """
 
 from __future__ import annotations
@@ -15,7 +14,7 @@ from spheremark.pipelines.compilation import compiled
 from spheremark.pipelines.model import Array, Column, Index, Mask, Nanos, Rings
 from spheremark.pipelines.threads import side_by_side
 
-_BLOCK = 512  # returns of a run at the most: what is looked up for them stays in the nearest cache
+_BLOCK = 512  # returns of a run at the most: their table values stay in the nearest cache
 _SMALL_TURN = 0.1  # [rad]; below it the series in `_turn_run` are good to 1.4e-9
 
 
@@ -38,7 +37,7 @@ class Lidar(NamedTuple):
     range_limits: tuple[float, float]
 
 
-class Shots(NamedTuple):
+class Pulses(NamedTuple):
     """Returns, in the frame of the LiDAR or in the base frame."""
 
     p: Column
@@ -47,8 +46,8 @@ class Shots(NamedTuple):
     stamps_ns: Nanos
 
 
-class Seen(NamedTuple):
-    """What was seen of all returns: how many were kept or not and why, first and last instant."""
+class Tally(NamedTuple):
+    """Counts of returns that were kept or left out, and the first and last instant."""
 
     n_kept: int
     n_without_angle: int
@@ -58,32 +57,30 @@ class Seen(NamedTuple):
     last_ns: int
 
 
-def turned(shots: Shots, joints: Joints, lidar: Lidar) -> tuple[Shots, Seen]:
-    """Turn returns into points in the base frame."""
-    n = len(shots.rings)
-    p_lidar, p_base = shots.p.reshape(-1), np.empty(3 * n, np.float32)
+def turn_returns(pulses: Pulses, joints: Joints, lidar: Lidar) -> tuple[Pulses, Tally]:
+    """Transform returns from the LiDAR's frame into the base frame."""
+    n = len(pulses.rings)
+    p_lidar, p_base = pulses.p.reshape(-1), np.empty(3 * n, np.float32)
     keep = np.ones(n, np.bool_)
     knots_ns, table = _knots(joints)
 
     def turn(first: int, end: int) -> Index:
-        rows = slice(first, end)
-        every = slice(3 * first, 3 * end)
-        columns = (p_lidar[every], shots.rings[rows], shots.stamps_ns[rows])
-        told: Index = _turn_part(columns, knots_ns, table, lidar, p_base[every], keep[rows])
-        return told
+        rows, flat = slice(first, end), slice(3 * first, 3 * end)
+        columns = (p_lidar[flat], pulses.rings[rows], pulses.stamps_ns[rows])
+        counts: Index = _turn_part(columns, knots_ns, table, lidar, p_base[flat], keep[rows])
+        return counts
 
-    told = np.array(side_by_side(turn, n))
-    counts = told[:, :4].sum(axis=0).tolist()
-    seen = Seen._make([*counts, int(told[:, 4].min()), int(told[:, 5].max())])
-    found = shots._replace(p=p_base.reshape(n, 3))
-    return (found if seen.n_kept == n else _closed_up(found, keep)), seen
+    parts = np.array(side_by_side(turn, n))
+    counts = parts[:, :4].sum(axis=0).tolist()
+    tally = Tally._make([*counts, int(parts[:, 4].min()), int(parts[:, 5].max())])
+    found = pulses._replace(p=p_base.reshape(n, 3))
+    return (found if tally.n_kept == n else _closed_up(found, keep)), tally
 
 
 def _knots(joints: Joints) -> tuple[Nanos, Array]:
-    """Cut time where the rate changes, and so finely that the gimbal turns little in between.
+    """Cut time at the joint samples, and so finely that the gimbal turns little in between.
 
-    Returns instants from the beginning of time to its end, and angle, cosine, sine and rate from
-    each on.
+    Returns the instants, and cosine, sine and rate from each on; NaN outside the samples.
     """
     spans = np.diff(joints.stamps_ns, append=joints.stamps_ns[-1:] + 1)
     turns = np.nan_to_num(np.abs(joints.rates * spans))
@@ -100,55 +97,55 @@ def _knots(joints: Joints) -> tuple[Nanos, Array]:
     return knots_ns, table
 
 
-def _closed_up(shots: Shots, keep: Mask) -> Shots:
+def _closed_up(pulses: Pulses, keep: Mask) -> Pulses:
     """Return the returns that are kept; their points are moved in place.
 
-    The first part is filled from its last row down, the second from its first row up: what they
-    keep meets in the middle, and nothing has to be moved to close a gap.
+    The first part is filled from its last row down, the second from its first row up, so that the
+    kept rows of both are contiguous.
     """
     n = len(keep)
-    out = Shots(shots.p, np.empty(n, np.float32), np.empty(n, np.uint8), np.empty(n, np.int64))
+    out = Pulses(pulses.p, np.empty(n, np.float32), np.empty(n, np.uint8), np.empty(n, np.int64))
 
     def part(first: int, end: int) -> tuple[int, int]:
         is_upward = first > 0 or end == n
-        n_kept = _close_up(shots, keep, out, first, end, is_upward)
+        n_kept = _close_up(pulses, keep, out, first, end, is_upward)
         return (first, first + n_kept) if is_upward else (end - n_kept, end)
 
     parts = side_by_side(part, n)
     rows = slice(parts[0][0], parts[-1][1])
-    return Shots(out.p[rows], out.intensities[rows], out.rings[rows], out.stamps_ns[rows])
+    return Pulses(out.p[rows], out.intensities[rows], out.rings[rows], out.stamps_ns[rows])
 
 
 @compiled
-def _close_up(shots, keep, out, first, end, is_upward):  # type: ignore[no-untyped-def]  # noqa: ANN001, ANN202
-    """Copy what is kept of a part to its first rows, or to its last; return how many these are."""
+def _close_up(pulses, keep, out, first, end, is_upward):  # type: ignore[no-untyped-def]  # noqa: ANN001, ANN202
+    """Copy the kept rows of a part to its first or its last rows; return their number."""
     step = 1 if is_upward else -1
     start = first if is_upward else end - 1
     k = start
     for i in range(start, start + step * (end - first), step):
         if keep[i]:
-            out.p[k, 0], out.p[k, 1], out.p[k, 2] = shots.p[i, 0], shots.p[i, 1], shots.p[i, 2]
-            out.intensities[k], out.rings[k] = shots.intensities[i], shots.rings[i]
-            out.stamps_ns[k] = shots.stamps_ns[i]
+            out.p[k, 0], out.p[k, 1], out.p[k, 2] = pulses.p[i, 0], pulses.p[i, 1], pulses.p[i, 2]
+            out.intensities[k], out.rings[k] = pulses.intensities[i], pulses.rings[i]
+            out.stamps_ns[k] = pulses.stamps_ns[i]
             k += step
     return abs(k - start)
 
 
 @compiled
 def _turn_part(columns, knots_ns, table, lidar, p_base, keep):  # type: ignore[no-untyped-def]  # noqa: ANN001, ANN202
-    """Turn some returns, tell which to keep, and see what ``Seen`` has."""
+    """Turn some returns, mark which to keep, and return the fields of ``Tally``."""
     p, rings, stamps = columns
-    seen = np.array([0, 0, 0, 0, np.iinfo(np.int64).max, np.iinfo(np.int64).min])
+    tally = np.array([0, 0, 0, 0, np.iinfo(np.int64).max, np.iinfo(np.int64).min])
     heights, scales = np.empty(_BLOCK), np.ones(_BLOCK)
     begin, n = 0, len(rings)
     while begin < n:
         j = min(np.searchsorted(knots_ns, stamps[begin], side="right"), len(table) - 1) - 1
         most = min(n, begin + _BLOCK)
         end = _run_end(stamps, begin, most, knots_ns[j], knots_ns[j + 1])
-        seen[4], seen[5] = _first_and_last(stamps, begin, end, seen[4], seen[5])
+        tally[4], tally[5] = _first_and_last(stamps, begin, end, tally[4], tally[5])
         if np.isnan(table[j, 2]):
             keep[begin:end] = False
-            seen[1] += end - begin
+            tally[1] += end - begin
         else:
             _look_up(lidar.heights, rings, begin, end, heights)
             if lidar.has_biases:
@@ -157,15 +154,15 @@ def _turn_part(columns, knots_ns, table, lidar, p_base, keep):  # type: ignore[n
             at = (knots_ns[j], table[j, 0], table[j, 1], table[j, 2])
             n_kept = _turn_run(p, stamps, begin, end, at, lidar, heights, scales, p_base)
             if n_kept < end - begin:
-                _judge(p, begin, end, lidar, heights, keep, seen)
-            seen[0] += n_kept
+                _select(p, begin, end, lidar, heights, keep, tally)
+            tally[0] += n_kept
         begin = end
-    return seen
+    return tally
 
 
 @compiled
 def _run_end(stamps, begin, most, since, until):  # type: ignore[no-untyped-def]  # noqa: ANN001, ANN202
-    """Return where the shots end that were made in the same interval as the first one."""
+    """Return the end of the run of pulses in the same interval as the first one."""
     end = begin + 1
     while end + 64 <= most:
         n_inside = 0
@@ -181,7 +178,7 @@ def _run_end(stamps, begin, most, since, until):  # type: ignore[no-untyped-def]
 
 @compiled
 def _first_and_last(stamps, begin, end, first, last):  # type: ignore[no-untyped-def]  # noqa: ANN001, ANN202
-    """Find the first and the last instant, known ones among them."""
+    """Return the first and the last instant, including the given ones."""
     for i in range(np.uint64(begin), np.uint64(end)):
         first, last = min(first, stamps[i]), max(last, stamps[i])
     return first, last
@@ -189,7 +186,7 @@ def _first_and_last(stamps, begin, end, first, last):  # type: ignore[no-untyped
 
 @compiled
 def _look_up(table, rings, begin, end, out):  # type: ignore[no-untyped-def]  # noqa: ANN001, ANN202
-    """Find what a table says of the laser of each return."""
+    """Write the table value of each return's laser."""
     first = np.uint64(begin)
     for i in range(np.uint64(end - begin)):
         out[i] = table[rings[first + i]]
@@ -197,7 +194,7 @@ def _look_up(table, rings, begin, end, out):  # type: ignore[no-untyped-def]  # 
 
 @compiled
 def _beam(p, row, lowered):  # type: ignore[no-untyped-def]  # noqa: ANN001, ANN202
-    """Return a point as seen from where its beam begins, and its squared range."""
+    """Return a point relative to the origin of its beam, and its squared range."""
     x, y = np.float64(p[np.uint64(3) * row]), np.float64(p[np.uint64(3) * row + np.uint64(1)])
     z = p[np.uint64(3) * row + np.uint64(2)] - lowered
     return x, y, z, x * x + y * y + z * z
@@ -205,7 +202,7 @@ def _beam(p, row, lowered):  # type: ignore[no-untyped-def]  # noqa: ANN001, ANN
 
 @compiled
 def _find_scales(p, begin, end, height_share, heights, scales):  # type: ignore[no-untyped-def]  # noqa: ANN001, ANN202
-    """Put what the coordinates are multiplied by in place of the biases that this takes off."""
+    """Replace range biases by the factors that remove them from the coordinates."""
     first = np.uint64(begin)
     for i in range(np.uint64(end - begin)):
         _, _, _, reach2 = _beam(p, first + i, height_share * heights[i])
@@ -214,7 +211,7 @@ def _find_scales(p, begin, end, height_share, heights, scales):  # type: ignore[
 
 @compiled
 def _turn_run(p, stamps, begin, end, at, lidar, heights, scales, p_base):  # type: ignore[no-untyped-def]  # noqa: ANN001, ANN202, PLR0913
-    """Move the returns of a run to the head and turn it; count those within the limits of range."""
+    """Transform the returns of a run to the base; count those within the limits of range."""
     xx, xy, xz, dx, yx, yy, yz, dy, zx, zy, zz, dz = lidar.T_head_lidar
     least2, most2, share = (
         lidar.range_limits[0] ** 2,
@@ -241,10 +238,10 @@ def _turn_run(p, stamps, begin, end, at, lidar, heights, scales, p_base):  # typ
 
 
 @compiled
-def _judge(p, begin, end, lidar, heights, keep, seen):  # type: ignore[no-untyped-def]  # noqa: ANN001, ANN202, PLR0913
-    """Tell which returns of a run to keep; count those not finite and out of range."""
+def _select(p, begin, end, lidar, heights, keep, tally):  # type: ignore[no-untyped-def]  # noqa: ANN001, ANN202, PLR0913
+    """Mark which returns of a run to keep; count those not finite and out of range."""
     for i in range(begin, end):
         _, _, _, reach2 = _beam(p, np.uint64(i), lidar.height_share * heights[i - begin])
         keep[i] = lidar.range_limits[0] ** 2 <= reach2 <= lidar.range_limits[1] ** 2
-        seen[2] += not np.isfinite(reach2)
-        seen[3] += np.isfinite(reach2) and not keep[i]
+        tally[2] += not np.isfinite(reach2)
+        tally[3] += np.isfinite(reach2) and not keep[i]
