@@ -3,17 +3,16 @@
 ``scenario`` makes a ``Field``: terrain, rocks, markers and stops. ``simulate_stop`` turns the
 gimbal at one of the stops and returns the log and, apart from it, the truth. Inside,
 
-- ``options`` says what can be chosen,
-- ``terrain`` and ``rocks`` make the ground, ``scene`` holds whatever a beam can meet,
-- ``field`` puts them together into the study's field; ``bodies`` and ``clutter`` add what is no
-  marker, ``lane`` spreads markers over distances, ``scenarios`` knows all worlds by name,
-- ``visibility`` says how much of each marker a stop can see,
+- ``options`` is the configuration,
+- ``terrain`` and ``rocks`` make the ground, ``scene`` holds all surfaces,
+- ``field`` is the published field; ``bodies`` and ``clutter`` add objects that are no markers,
+  ``lane`` spreads markers over distances, ``scenarios`` lists all worlds by name,
+- ``visibility`` computes the visible share of each marker from a stop,
 - ``rig`` moves the LiDAR and records encoder and AHRS,
 - ``sensor`` fires the lasers and records their echoes, which ``echo`` traces,
-- ``stop`` runs all of it for one stop.
+- ``stop`` simulates one stop.
 
-Why so: the pipeline is believed because it finds what this room hid. Nothing here is imported by
-the steps of the pipeline, and a log holds nothing of the truth.
+The steps of the pipeline import nothing from here, and a log holds nothing of the truth.
 """
 
 from spheremark.pipelines.simulation.field import Decoy, Field, Stop

@@ -1,6 +1,6 @@
-"""Shapes that things are built of: boxes, cylinders, ellipsoids and loose facets.
+"""Elementary shapes: boxes, cylinders, ellipsoids and loose facets.
 
-Flats of round bodies lie some tenths of a millimetre inside their circles.
+The facets of round bodies lie some tenths of a millimetre inside their circles.
 """
 
 from __future__ import annotations
@@ -9,7 +9,6 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from spheremark.pipelines.geometry import rot_z
-from spheremark.pipelines.model import Array
 from spheremark.pipelines.simulation.rocks import ball
 from spheremark.pipelines.simulation.scene import Mesh
 
@@ -32,8 +31,9 @@ def cylinder(start: ArrayLike, end: ArrayLike, radius: float, reflectivity: floa
     axis = (high - low) / np.linalg.norm(high - low)
     aside = np.cross(axis, np.eye(3)[np.argmin(np.abs(axis))])
     aside /= np.linalg.norm(aside)
+    up = np.cross(axis, aside)
     angles = np.arange(_N_SIDES) * 2 * np.pi / _N_SIDES
-    ring = radius * (np.outer(np.cos(angles), aside) + np.outer(np.sin(angles), _up(axis, aside)))
+    ring = radius * (np.outer(np.cos(angles), aside) + np.outer(np.sin(angles), up))
     i = np.arange(_N_SIDES)
     j = np.roll(i, -1)
     foot, top = np.full(_N_SIDES, 2 * _N_SIDES), np.full(_N_SIDES, 2 * _N_SIDES + 1)
@@ -41,11 +41,6 @@ def cylinder(start: ArrayLike, end: ArrayLike, radius: float, reflectivity: floa
     caps = ((j, i, foot), (i + _N_SIDES, j + _N_SIDES, top))
     triangles = np.concatenate([np.column_stack(columns) for columns in (*jacket, *caps)])
     return Mesh.even(np.vstack([ring + low, ring + high, low, high]), triangles, reflectivity)
-
-
-def _up(axis: Array, aside: Array) -> Array:
-    """Return the unit vector that completes two others."""
-    return np.asarray(np.cross(axis, aside))
 
 
 def ellipsoid(centre: ArrayLike, axes: ArrayLike, heading: float, reflectivity: float) -> Mesh:

@@ -1,6 +1,6 @@
-"""What is no marker: walls, panels, people, trees, poles, pipes, wrong balls and round rocks.
+"""Objects that are no markers: walls, panels, people, trees, poles, pipes, balls and round rocks.
 
-Each thing becomes an ``Item``: surfaces, and the place where it might be mistaken for a marker.
+Each one is an ``Item``: surfaces, and the place where it might be mistaken for a marker.
 Items stand clear of stops, of markers and of each other, and none but the screens stands between
 the centre stop and a marker; from other stops they may hide one.
 """
@@ -34,7 +34,7 @@ _HIDDEN = (0.2, 0.5)  # share of a marker that a screen hides from the centre st
 _WRONG_RADII = (0.06, 0.15, 0.25)  # [m] of balls that are no markers
 _HEAD_RADII = (0.10, 0.12)  # [m]
 _ROCK_RADII = (0.085, 0.12)  # [m] of rocks that are as large as a marker
-_CLUTTER, _ROCKS = 10, 11  # streams of chance
+_CLUTTER, _ROCKS = 10, 11  # random streams
 # Diffuse reflectivities at 905 nm.
 _WALL_SHADE, _CLOTH_SHADE, _SKIN_SHADE = 0.40, 0.30, 0.50
 _BARK_SHADE, _BALL_SHADE, _PIPE_SHADE = 0.25, 0.50, 0.35
@@ -42,12 +42,12 @@ _BARK_SHADE, _BALL_SHADE, _PIPE_SHADE = 0.25, 0.50, 0.35
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class Item:
-    """One thing that is no marker.
+    """One object that is no marker.
 
     Attributes
     ----------
     kind : str
-        What it is.
+        Kind of object.
     p_site : (3,)
         Where it might be mistaken for a marker [m].
     meshes : sequence of Mesh
@@ -55,7 +55,7 @@ class Item:
     balls : sequence of (p_site, radius, reflectivity)
         Exact spheres that belong to it.
     sticks : sequence of (foot, top, radius)
-        Axes of thin poles among the meshes, which beams look at closely.
+        Axes of thin poles among the meshes, on which beams are traced as bundles.
     """
 
     kind: str
@@ -70,7 +70,7 @@ Builder = Callable[[np.random.Generator, Array], Item]
 
 @dataclass(slots=True, eq=False)
 class _Ground:
-    """Who stands where: finds free places on a field."""
+    """The occupied places of a field: finds free ones."""
 
     world: Field
     taken: list[tuple[float, float, float]] = field(default_factory=list)  # x, y, radius [m]
@@ -83,7 +83,7 @@ class _Ground:
     def place(
         self, rng: np.random.Generator, ring: tuple[float, float], radius: float
     ) -> Array | None:
-        """Return a free place on the ground, (3,) [m], and take it; none if there is none."""
+        """Return a free place on the ground, (3,) [m], and occupy it; None if there is none."""
         for _ in range(_N_TRIES):
             distance = np.sqrt(rng.uniform(ring[0] ** 2, ring[1] ** 2))
             bearing = rng.uniform(-np.pi, np.pi)
@@ -94,7 +94,7 @@ class _Ground:
         return None
 
     def _is_free(self, xy: Array, radius: float) -> bool:
-        """Say whether nothing stands there, or would be hidden from the centre stop."""
+        """Return whether a place is free and hides no marker from the centre stop."""
         stops = np.array([stop.p_site[:2] for stop in self.world.stops])
         marks = self.world.marks.p_site[:, :2]
         taken = np.array(self.taken).reshape(-1, 3)
@@ -110,7 +110,7 @@ class _Ground:
 
 
 def clutter_field(seed: int) -> Field:
-    """Return the study's field among everything that might be taken for a marker.
+    """Return the published field among objects that might be mistaken for a marker.
 
     Notes
     -----
@@ -124,7 +124,7 @@ def clutter_field(seed: int) -> Field:
     rng = np.random.default_rng([seed, _CLUTTER])
     ground = _Ground(world)
     items = _beside_markers(rng, ground)
-    orders: list[tuple[int, tuple[float, float], float, Builder]] = [
+    kinds: list[tuple[int, tuple[float, float], float, Builder]] = [
         (2, _WALL_RING, 2.0, _wall),
         (1, _WALL_RING, 2.0, _corner),
         (3, _RING, 1.1, _tree),
@@ -138,13 +138,13 @@ def clutter_field(seed: int) -> Field:
         (15, _ROCK_RING, 0.2, _round_rock),
         (5, _ROCK_RING, 0.35, _perched_rock),
     ]
-    for n, ring, radius, builder in orders:
+    for n, ring, radius, builder in kinds:
         items += _placed(rng, ground, (n, ring, radius), builder)
     return _with_items(world, "clutter-field", items)
 
 
 def rock_field(seed: int) -> Field:
-    """Return the study's field among many nearly round rocks of marker size."""
+    """Return the published field among many nearly round rocks of marker size."""
     world = paper_field(seed)
     rng = np.random.default_rng([seed, _ROCKS])
     ground = _Ground(world)
@@ -156,17 +156,17 @@ def rock_field(seed: int) -> Field:
 def _placed(
     rng: np.random.Generator,
     ground: _Ground,
-    order: tuple[int, tuple[float, float], float],
+    number_ring_radius: tuple[int, tuple[float, float], float],
     builder: Builder,
 ) -> list[Item]:
-    """Return as many items of one kind as ordered, as far as there is room in their ring."""
-    n, ring, radius = order
+    """Return items of one kind, fewer than the number if their ring has no free place."""
+    n, ring, radius = number_ring_radius
     places = [ground.place(rng, ring, radius) for _ in range(n)]
     return [builder(rng, place) for place in places if place is not None]
 
 
 def _with_items(world: Field, scenario: str, items: Sequence[Item]) -> Field:
-    """Return a field with more things on it."""
+    """Return a field with more items on it."""
     scene = world.scene
     balls = [ball for item in items for ball in item.balls]
     sticks = [stick for item in items for stick in item.sticks]
@@ -236,7 +236,7 @@ def _screen(rng: np.random.Generator, world: Field, mark: Array) -> Item:
 
 
 def _above(place: Array, height: float) -> Array:
-    """Return the place so much higher."""
+    """Return a place raised by a height."""
     return np.asarray(place + np.array([0.0, 0.0, height]))
 
 
@@ -262,7 +262,7 @@ def _corner(rng: np.random.Generator, foot: Array) -> Item:
 
 
 def _person(rng: np.random.Generator, foot: Array) -> Item:
-    """Return somebody who stands: legs, trunk, arms, neck and a head about as wide as a marker."""
+    """Return a standing person: legs, trunk, arms, neck and a head about as wide as a marker."""
     tall, turn = rng.uniform(0.92, 1.08), rot_z(rng.uniform(-np.pi, np.pi))
 
     def at(x: float, y: float, z: float) -> Array:
@@ -320,7 +320,7 @@ def _pole(terrain: Terrain, top: Array, radius: float) -> tuple[Mesh, tuple[Arra
 
 
 def _bare_pole(terrain: Terrain) -> Builder:
-    """Return what builds poles without a ball."""
+    """Return the builder of poles without a ball."""
 
     def build(rng: np.random.Generator, foot: Array) -> Item:
         top = _above(foot, rng.uniform(0.6, 2.0))
@@ -331,7 +331,7 @@ def _bare_pole(terrain: Terrain) -> Builder:
 
 
 def _ball_on_pole(terrain: Terrain, radius: float) -> Builder:
-    """Return what builds balls of the wrong size on poles."""
+    """Return the builder of balls of the wrong size on poles."""
 
     def build(rng: np.random.Generator, foot: Array) -> Item:
         centre = _above(foot, rng.uniform(0.7, 1.4))
@@ -343,7 +343,7 @@ def _ball_on_pole(terrain: Terrain, radius: float) -> Builder:
 
 
 def _ball_on_ground(radius: float) -> Builder:
-    """Return what builds balls of the wrong size that lie on the ground."""
+    """Return the builder of balls of the wrong size on the ground."""
 
     def build(_rng: np.random.Generator, foot: Array) -> Item:
         centre = _above(foot, 0.95 * radius)

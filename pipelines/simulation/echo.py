@@ -1,8 +1,8 @@
-"""What comes back from a beam of finite width.
+"""The echo of a beam of finite width.
 
-One ray is cast along the centre of every beam. Beams that touch a sphere or a pole, or whose
-neighbours see a step, are cast again as a bundle that fills the footprint; the bundle's returns
-merge and split as those of one pulse do.
+One ray is cast along the centre of every beam. Beams that touch a sphere or a pole, or that lie at
+a step in range, are cast again as a bundle that fills the footprint; the bundle's returns merge
+and split like those of one pulse.
 """
 
 from __future__ import annotations
@@ -20,12 +20,12 @@ _N_RAYS = 61  # in a bundle
 _MERGE = 0.8  # [m] nearer returns of one pulse are one echo: half a pulse of some 5 ns
 _STEP = 0.10  # [m] departure of a range from the plane through its neighbours
 NEAR = 0.35
-"""What passes a sphere's centre closer than this is near it [m]."""
+"""Distance within which a beam passes near a sphere's centre [m]."""
 
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class Aims:
-    """Where beams start and point.
+    """Origins and directions of beams.
 
     Attributes
     ----------
@@ -34,7 +34,7 @@ class Aims:
     directions_site : (n, 3)
         Unit vectors along the beams.
     spin_axes_site : (n, 3)
-        Unit vectors along the spin axis at each shot.
+        Unit vectors along the spin axis at each pulse.
     """
 
     origins_site: Array
@@ -61,9 +61,9 @@ class Echoes:
     Attributes
     ----------
     ranges : (n,)
-        Energy-weighted mean distance along the beam; infinite where nothing answers [m].
+        Energy-weighted mean distance along the beam; infinite without an echo [m].
     reflectivities : (n,)
-        Reflectivity of what answers times its share of the footprint, 0 to 1.
+        Reflectivity of the surface times its share of the footprint, 0 to 1.
     """
 
     ranges: Array
@@ -73,14 +73,17 @@ class Echoes:
         seal(self, ranges=(None,), reflectivities=(len(self.ranges),))
 
     def among(self, chosen: Mask) -> Echoes:
-        """Return these echoes among beams that have none."""
+        """Return the echoes of all beams; those not chosen have none."""
         ranges, reflectivities = np.full(len(chosen), np.inf), np.zeros(len(chosen))
         ranges[chosen], reflectivities[chosen] = self.ranges, self.reflectivities
         return Echoes(ranges=ranges, reflectivities=reflectivities)
 
 
 def trace(scene: Scene, aims: Aims, divergence: Array, anyway: Mask | None = None) -> Echoes:
-    """Return the strongest echo of each beam."""
+    """Return the strongest echo of each beam.
+
+    With ``anyway``, only these beams and those near spheres are traced.
+    """
     cast = caster(scene.mesh)
     ranges = np.full(len(aims.origins_site), np.inf)
     reflectivities = np.zeros(len(ranges))
@@ -106,7 +109,7 @@ def _trace_bundles(
     across = np.cross(aims.directions_site, aims.spin_axes_site)
     across /= np.linalg.norm(across, axis=1, keepdims=True)
     along = np.cross(across, aims.directions_site)
-    directions = _bundles(aims.directions_site, across, along, _disc(_N_RAYS) * divergence / 2)
+    directions = _bundles(aims.directions_site, across, along, disc(_N_RAYS) * divergence / 2)
     rays = np.empty((n * _N_RAYS, 6), dtype=np.float32)
     rays[:, :3] = np.repeat(aims.origins_site, _N_RAYS, axis=0)
     rays[:, 3:] = directions.reshape(-1, 3)
@@ -135,7 +138,7 @@ def _passes(scene: Scene, aims: Aims, half_width: float, clearance: float) -> Ma
     return found
 
 
-def _disc(n: int) -> Array:
+def disc(n: int) -> Array:
     """Return points that fill the unit disc evenly, (n, 2) (Vogel, 1979)."""
     k = np.arange(n)
     radii, angles = np.sqrt((k + 0.5) / n), k * np.pi * (3 - np.sqrt(5))
@@ -174,7 +177,7 @@ def _sees_step(ranges: Array, stride: int) -> Mask:  # pragma: no cover
     """Return which beams differ from the plane through the beams before and after them.
 
     Along a sweep the inverse range of a plane is linear to first order, however it is tilted. The
-    first and last firing have no neighbour on one side, and are looked at closely for that.
+    first and last firing have no neighbour on one side and count as steps.
     """
     n = len(ranges)
     found = np.ones(n, dtype=np.bool_)

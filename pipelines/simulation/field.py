@@ -1,4 +1,4 @@
-"""The study's field: ground, rocks, markers and where the rover stops."""
+"""The published field: ground, rocks, markers and stops."""
 
 from __future__ import annotations
 
@@ -22,17 +22,17 @@ from spheremark.pipelines.simulation.terrain import Terrain, rough_terrain, with
 PAPER_DISTANCES = np.array(
     [6.84, 7.15, 7.19, 7.71, 7.76, 7.84, 7.90, 7.94, 7.99, 8.17, 8.27, 9.02, 9.13, 9.34]
 )
-"""Distances from the LiDAR to the 14 markers in the study, Table 2 [m]."""
+"""Published distances from the LiDAR to the 14 markers, Table 2 [m]."""
 
 MARKER_RADIUS = 0.100
-"""Radius of the study's spheres [m]."""
+"""Published radius of the spheres [m]."""
 
 _MARKER_SHADE = 0.50  # red paint at 905 nm
 _POLE_RADIUS = 0.015  # [m]
 _POLE_SHADE = 0.30
 _POLE_LENGTHS = (0.62, 1.50)  # [m] of a centre above the ground
 _CENTRES_ABOVE_CUT = (-0.02, 0.13)  # [m] above the highest ground near a stop
-_CUT_RADIUS = 10.0  # [m] within which the study looks for the highest ground
+_CUT_RADIUS = 10.0  # [m] within which the published method takes the highest ground
 _LANES, _STOPS = 5, 7
 _FIELD = (4.5, 4.0)  # [m] half sides of the rectangle of stops
 MAST = 1.05
@@ -40,7 +40,7 @@ MAST = 1.05
 
 _N_MOUNDS, _MOUND_DISTANCE, _MOUND_RADIUS, _MOUND_TOP = 5, 9.0, 2.0, 0.82  # the rest in [m]
 _STOP_CLEAR, _MARK_CLEAR = 0.9, 0.5  # [m] around which there are no rocks
-_TERRAIN, _LAYOUT, _ROCKS, _SHADES = range(4)  # streams of chance
+_TERRAIN, _LAYOUT, _ROCKS, _SHADES = range(4)  # random streams
 
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
@@ -50,7 +50,7 @@ class Stop:
     Attributes
     ----------
     name : str
-        What it is called.
+        Name of the stop.
     p_site : (3,)
         Origin of the base: on the gimbal's axis at the height of the LiDAR [m].
     heading : float
@@ -67,14 +67,14 @@ class Stop:
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class Decoy:
-    """Something that is no marker and might be taken for one.
+    """An object that is no marker and might be mistaken for one.
 
     Attributes
     ----------
     name : str
-        What it is called.
+        Name of the object.
     kind : str
-        What it is: ``person``, ``pole``, ``wrong ball`` and so on.
+        Kind of object: ``person``, ``pole``, ``wrong ball`` and so on.
     p_site : (3,)
         The place where it might be mistaken: the middle of a ball, a head, a crown [m].
     """
@@ -94,9 +94,9 @@ class Field:
     Attributes
     ----------
     scenario : str
-        Name of the scenario that it is one of.
+        Name of its scenario.
     seed : int
-        What it was drawn from.
+        Seed of its random numbers.
     terrain : Terrain
         The ground.
     scene : Scene
@@ -108,7 +108,7 @@ class Field:
     stops : tuple of Stop
         Where the rover stops, in the order of driving.
     decoys : tuple of Decoy
-        What might be taken for a marker; for comparison only.
+        Objects that might be mistaken for a marker; for comparison only.
     """
 
     scenario: str
@@ -126,7 +126,7 @@ class Field:
         Parameters
         ----------
         name : str
-            What it is called.
+            Name of the stop.
 
         Returns
         -------
@@ -146,20 +146,20 @@ class Field:
 
 
 def checked_seed(seed: int) -> int:
-    """Return a seed that can be used."""
+    """Return the seed; raise ConfigError if it is negative."""
     if seed < 0:
         raise ConfigError(f"The seed is {seed}; it must be 0 or more.")
     return seed
 
 
 def paper_field(seed: int) -> Field:
-    """Return the study's field: 14 markers around five lanes of seven stops.
+    """Return the published field: 14 markers around five lanes of seven stops.
 
     Notes
     -----
     The 3-D distances from the LiDAR at the centre stop to the markers are those of Table 2. A few
-    mounds between the markers reach up to the spheres, so that the study's cut at the highest
-    ground takes the lower part of most spheres, as it did there.
+    mounds between the markers reach up to the spheres, so that the published cut at the highest
+    ground removes the lower part of most spheres.
     """
     rng = np.random.default_rng([seed, _LAYOUT])
     bearings = _bearings(rng, len(PAPER_DISTANCES))

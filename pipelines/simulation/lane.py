@@ -1,4 +1,4 @@
-"""Markers at chosen distances about one stop: how the error grows with the distance."""
+"""Markers at chosen distances about one stop, to measure errors against distance."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ LANE_DISTANCES = np.arange(5.0, 30.1, 2.5)
 _PER_DISTANCE = 8
 _HEIGHTS = (0.7, 1.5)  # [m] of the centres above the ground
 _HALF = 40.0  # [m] half side of the ground
-_LANE = 20  # stream of chance
+_LANE = 20  # random stream
 
 
 def range_lane(
@@ -26,7 +26,7 @@ def range_lane(
     Parameters
     ----------
     seed : int
-        Source of chance: of directions, heights and heading.
+        Seed of directions, heights and heading.
     distances : (k,)
         Distances; eleven from 5 to 30 m by default [m].
     per_distance : int

@@ -1,4 +1,4 @@
-"""What can be chosen about a simulated rig and sensor: unit, default and reason."""
+"""Configuration of the simulated rig and sensor: unit, default and reason of each field."""
 
 from __future__ import annotations
 
@@ -27,25 +27,26 @@ class SimulationConfig:
         degree pitch of the channels, so that scan lines do not fall on scan lines.
     step : float
         Angle between the rests of a gimbal that steps instead of turning evenly; 0 turns evenly
-        [rad]. The study is read as having steps of 5 degrees. ``turn`` then means nothing.
+        [rad]. The published scans are taken as having steps of 5 degrees. ``turn`` is
+        then unused.
     rest_revolutions : int
         Revolutions of the LiDAR during each rest. 3: so that at least one whole message without
-        shot times lies well inside.
+        pulse times lies well inside.
     move : float
         Time of the movement from one rest to the next [s]; the LiDAR runs on.
     shot_times : bool
-        Whether the points carry a time each; if not, all points of a revolution have its start.
+        Whether each point carries its time; if not, all points of a revolution have its start.
     sigma_range : float or None
-        Noise of every range [m]; none takes the noise by reflectivity that was measured on real
-        packets of a VLP-16.
+        Noise of every range [m]; None stands for the noise by reflectivity that was measured on
+        real packets of a VLP-16.
     sigma_laser_bias : float
         Spread of the lasers' own range biases, drawn once per rig [m]. 3 mm: after the maker's
         calibration; 10 mm have been seen.
     drop_out : float
         Probability that a return is lost for no reason. 0.005: seen in real packets.
     divergence : (2,) of float
-        Full width of the evenly lit footprint across and along the spin axis [rad]. As the maker
-        says for this family of sensors.
+        Full width of the evenly lit footprint across and along the spin axis [rad]. The maker's
+        values for this family of sensors.
     range_step : float
         Quantisation of ranges [m]; 0 for none.
     azimuth_step : float
@@ -66,16 +67,16 @@ class SimulationConfig:
     sigma_misalignment : float
         Spread of the three small rotations of the LiDAR's mounting, unknown to the log [rad].
     axis_offset : (2,) of float
-        Nominal place of the LiDAR's origin in the head frame, x and y [m]. Centimetres, as in the
-        study.
+        Nominal place of the LiDAR's origin in the head frame, x and y [m]. Centimetres, as
+        published.
     sigma_axis_offset : float
         Spread of the error of that place, unknown to the log [m].
     gimbal_clock_offset : float
-        What must be added to a gimbal stamp to get the LiDAR's clock [s].
+        Added to a gimbal stamp to get the LiDAR's clock [s].
     imu_mount : ImuMount
         The part that carries the AHRS.
     only_near_spheres : bool
-        Trace only beams that pass close by a sphere: quick, and all that centres need.
+        Trace only beams that pass close by a sphere: quick, and sufficient for centres.
     """
 
     spin_rpm: float = 600.0
@@ -162,7 +163,7 @@ class SimulationConfig:
         Parameters
         ----------
         **changes : any
-            Fields that shall differ.
+            Fields with other values.
 
         Returns
         -------

@@ -1,6 +1,6 @@
-"""The rig that turns the LiDAR: what a log tells of it, what it truly is, how it moves.
+"""The rig that turns the LiDAR: nominal and true geometry, motion, encoder and AHRS.
 
-Times are seconds since the first shot, on the LiDAR's clock.
+Times are seconds since the first pulse, on the LiDAR's clock.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from spheremark.pipelines.scan.rigs import tilted_vlp16
 from spheremark.pipelines.simulation.options import SimulationConfig
 
 _RATE = 100.0  # [Hz] of joint samples and orientations
-_LEAD = 0.05  # [s] that encoder and AHRS record before the first and after the last shot
+_LEAD = 0.05  # [s] that encoder and AHRS record before the first and after the last pulse
 _MARKER_RADIUS = 0.100  # [m] of the sphere that scan lines must not miss ...
 _MARKER_RANGE = 15.0  # [m] ... at this distance
 _LINES_WANTED = 2  # scan lines over its diameter at the least
@@ -46,7 +46,7 @@ class Motion:
 
 
 def recorded_time(config: SimulationConfig) -> float:
-    """Return how long the LiDAR records."""
+    """Return the duration of the recording [s]."""
     if config.step:
         rest = config.rest_revolutions * 60.0 / config.spin_rpm
         return _n_steps(config) * (rest + config.move) + rest
@@ -54,7 +54,7 @@ def recorded_time(config: SimulationConfig) -> float:
 
 
 def turning(config: SimulationConfig, start: float) -> Motion:
-    """Return how the gimbal moves: evenly, or from rest to rest."""
+    """Return the motion of the gimbal: even, or from rest to rest."""
     return stepped_turn(config, start) if config.step else even_turn(config, start)
 
 
@@ -97,7 +97,7 @@ def nominal_rig(config: SimulationConfig) -> Rig:
 
 
 def true_rig(config: SimulationConfig, rng: np.random.Generator) -> Rig:
-    """Return the rig as it really is, which no log tells."""
+    """Return the true rig, which no log contains."""
     rig = nominal_rig(config)
     T_head_lidar = rig.T_head_lidar.copy()
     twist = np.concatenate([rng.normal(0.0, config.sigma_misalignment, 3), np.zeros(3)])
@@ -116,7 +116,7 @@ def true_rig(config: SimulationConfig, rng: np.random.Generator) -> Rig:
 def joint_samples(
     motion: Motion, rig: Rig, config: SimulationConfig, rng: np.random.Generator
 ) -> tuple[Array, Nanos]:
-    """Return what the encoder of the gimbal records."""
+    """Return the samples of the gimbal's encoder: angles [rad] and instants [ns]."""
     times = _sample_times(config, rng)
     truth = motion.angle_at(times)
     c, s = rig.encoder_eccentricity
@@ -136,7 +136,7 @@ def ahrs_samples(
     config: SimulationConfig,
     rng: np.random.Generator,
 ) -> tuple[Array, Nanos]:
-    """Return what the AHRS records."""
+    """Return the samples of the AHRS: quaternions and instants [ns]."""
     times = _sample_times(config, rng)
     lean = rng.normal(0.0, config.sigma_ahrs_bias, 3) * (1.0, 1.0, 0.0)
     shake = Rotation.from_rotvec(rng.normal(0.0, config.sigma_ahrs, (len(times), 3)))
@@ -149,7 +149,7 @@ def ahrs_samples(
 
 
 def commensurability(config: SimulationConfig) -> str:
-    """Say what is wrong when the speeds of gimbal and LiDAR make scan lines fall on scan lines.
+    """Return a warning when the speeds of gimbal and LiDAR make scan lines coincide.
 
     Parameters
     ----------
@@ -159,7 +159,7 @@ def commensurability(config: SimulationConfig) -> str:
     Returns
     -------
     str
-        A sentence for people; empty when the lines spread well.
+        A sentence; empty when the lines spread well.
 
     Notes
     -----
@@ -220,12 +220,12 @@ def _horizon_gaps(config: SimulationConfig) -> Array:
 
 
 def _sample_times(config: SimulationConfig, rng: np.random.Generator) -> Array:
-    """Return the instants of samples that bracket all shots, on either clock [s]."""
+    """Return the instants of samples that bracket all pulses, on either clock [s]."""
     lead = _LEAD + abs(config.gimbal_clock_offset)
     first = -lead - rng.uniform(0.0, 1.0 / _RATE)
     return np.arange(first, recorded_time(config) + lead, 1.0 / _RATE)
 
 
 def _nanoseconds(times: Array) -> Nanos:
-    """Return times since the first shot as whole nanoseconds."""
+    """Return times since the first pulse as whole nanoseconds."""
     return np.round(times * 1e9).astype(np.int64)

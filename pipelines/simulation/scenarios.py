@@ -15,7 +15,7 @@ SCENARIOS: dict[str, Callable[[int], Field]] = {
     "rock-field": rock_field,
     "range-lane": range_lane,
 }
-"""What ``scenario`` knows by name."""
+"""Worlds by the name of their scenario."""
 
 
 def scenario(name: str, seed: int) -> Field:
@@ -26,7 +26,7 @@ def scenario(name: str, seed: int) -> Field:
     name : str
         One of ``SCENARIOS``.
     seed : int
-        Source of chance, 0 or more: the same seed gives the same world.
+        Seed of the random numbers, 0 or more: the same seed gives the same world.
 
     Returns
     -------

@@ -1,7 +1,4 @@
-"""What stands in the world: triangles for ground, rocks and poles, and exact spheres.
-
-Anything may be added: a mesh for a wall, a person or a tree, a sphere of any size, a thin pole.
-"""
+"""All surfaces of a world: triangles for ground, rocks and poles, and exact spheres."""
 
 from __future__ import annotations
 
@@ -113,7 +110,7 @@ class Spheres:
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class Poles:
-    """Where thin poles stand: beams that touch them are looked at closely.
+    """Axes of thin poles: beams that touch them are traced as bundles.
 
     Attributes
     ----------
@@ -139,7 +136,7 @@ class Scene:
     Attributes
     ----------
     mesh : Mesh
-        Ground, rocks, poles and whatever else is made of triangles.
+        Ground, rocks, poles and all other triangles.
     spheres : Spheres
         Exact spheres, not part of the mesh.
     poles : Poles
@@ -196,7 +193,7 @@ def caster(mesh: Mesh) -> Caster:
     Parameters
     ----------
     mesh : Mesh
-        Triangles; the last mesh is kept ready, because its search tree takes a second to grow.
+        Triangles; the search tree of the last mesh is cached, because it takes a second to build.
 
     Returns
     -------

@@ -1,4 +1,4 @@
-"""The VLP-16, shot by shot: when each laser fires, and what is recorded of its echo."""
+"""The VLP-16, pulse by pulse: when each laser fires, and the record of its echo."""
 
 from __future__ import annotations
 
@@ -27,14 +27,14 @@ from spheremark.pipelines.simulation.rig import Motion, quantised
 FIRINGS_PER_PACKET = N_BLOCKS * FIRINGS_PER_BLOCK
 """Firings of all lasers that the sensor sends at once."""
 
-_SHOTS_PER_BLOCK = FIRINGS_PER_BLOCK * N_LASERS
+_PULSES_PER_BLOCK = FIRINGS_PER_BLOCK * N_LASERS
 _FULL_TURN = 36_000  # steps of an azimuth
 _RANGE_LIMITS = (0.9, 100.0)  # [m] the VLP-16's own
 _NOISE_LIMITS = (5.0, 15.0, 40.0, 100.0)  # calibrated reflectivity, 0-255
 _NOISE = np.array(
     [0.0137, 0.0107, 0.0089, 0.0067, 0.0064]
 )  # [m] seen in real packets, between them
-_HALF_SEEN = 0.10 / 50.0**2  # [1/m^2] reflectivity over squared range that answers half the time
+_HALF_SEEN = 0.10 / 50.0**2  # [1/m^2] reflectivity over squared range of an even detection chance
 _SOFTNESS = 0.15  # of that limit, in the logarithm of the energy
 _INTENSITY_NOISE = (1.0, 0.05)  # counts, and share of the value
 _TURN_WITHIN = 0.01  # [rad] more than the head turns within a firing, at 20 revolutions a second
@@ -42,15 +42,15 @@ _NS_CYCLE, _NS_LASER = round(FIRING_CYCLE * 1e9), round(LASER_CYCLE * 1e9)
 
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
-class Shots:
+class Pulses:
     """Some whole firings of all lasers, in the order of firing.
 
     Attributes
     ----------
     offsets_ns : (n,)
-        Instant of each shot since the first one of the stop.
+        Instant of each pulse since the first one of the stop.
     rings : (n,) uint8
-        Laser of each shot, 0 the lowest.
+        Laser of each pulse, 0 the lowest.
     azimuths : (n,)
         True azimuth of the spinning head, unwrapped, clockwise from x seen from +z [rad].
     gimbal_angles : (n,)
@@ -66,9 +66,9 @@ class Shots:
         n = len(self.offsets_ns)
         seal(self, offsets_ns=(n,), rings=(n,), azimuths=(n,), gimbal_angles=(n,))
 
-    def rows(self, chosen: Mask) -> Shots:
-        """Return some of the shots."""
-        return Shots(
+    def rows(self, chosen: Mask) -> Pulses:
+        """Return some of the pulses."""
+        return Pulses(
             offsets_ns=self.offsets_ns[chosen],
             rings=self.rings[chosen],
             azimuths=self.azimuths[chosen],
@@ -78,7 +78,7 @@ class Shots:
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class Recorded:
-    """What the sensor sends of some shots, and what a driver makes of it.
+    """The packets of some pulses, and the points that a driver computes from them.
 
     Attributes
     ----------
@@ -89,9 +89,9 @@ class Recorded:
     rings : (n,) uint8
         Laser of each return.
     offsets_ns : (n,)
-        Instant of each shot since the first one of the stop.
+        Instant of each return's pulse since the first one of the stop.
     firings : Firings
-        All shots, those without a return among them; its start is that of the stop.
+        All pulses, with and without a return; its start is that of the stop.
     """
 
     p_lidar: Column
@@ -121,12 +121,12 @@ class Recorded:
         )
 
 
-def fire(first: int, n: int, start_azimuth: float, motion: Motion, spin_rpm: float) -> Shots:
+def fire(first: int, n: int, start_azimuth: float, motion: Motion, spin_rpm: float) -> Pulses:
     """Return some firings of all lasers."""
     firings = np.arange(first, first + n, dtype=np.int64)
     offsets_ns = (firings[:, None] * _NS_CYCLE + np.arange(N_LASERS) * _NS_LASER).ravel()
     times = np.asarray(offsets_ns * 1e-9, dtype=np.float64)
-    return Shots(
+    return Pulses(
         offsets_ns=offsets_ns,
         rings=np.tile(FIRING_ORDER.astype(np.uint8), n),
         azimuths=start_azimuth + 2 * np.pi * spin_rpm / 60.0 * times,
@@ -134,35 +134,35 @@ def fire(first: int, n: int, start_azimuth: float, motion: Motion, spin_rpm: flo
     )
 
 
-def aim(shots: Shots, rig: Rig, T_site_base: Array) -> Aims:
-    """Return where shots start and point."""
+def aim(pulses: Pulses, rig: Rig, T_site_base: Array) -> Aims:
+    """Return origins and directions of the beams of some pulses."""
     lasers = np.column_stack([rig.laser_elevations, rig.laser_heights])
     posed = _posed(rig.T_head_lidar, T_site_base)
     origins, directions, axes = _aim(
-        shots.azimuths, shots.gimbal_angles, shots.rings, lasers, posed
+        pulses.azimuths, pulses.gimbal_angles, pulses.rings, lasers, posed
     )
     return Aims(origins_site=origins, directions_site=directions, spin_axes_site=axes)
 
 
-def may_pass(shots: Shots, rig: Rig, T_site_base: Array, p_site: Array, near: float) -> Mask:
-    """Return which shots belong to firings of which one may pass a point closely."""
+def may_pass(pulses: Pulses, rig: Rig, T_site_base: Array, p_site: Array, near: float) -> Mask:
+    """Return the pulses of all firings in which a beam may pass a point closely."""
     first = slice(None, None, N_LASERS)
     posed = _posed(rig.T_head_lidar, T_site_base)
     limits = (near, np.abs(rig.laser_elevations).max(), np.abs(rig.laser_heights).max())
-    found = _may_pass(shots.azimuths[first], shots.gimbal_angles[first], posed, p_site, limits)
+    found = _may_pass(pulses.azimuths[first], pulses.gimbal_angles[first], posed, p_site, limits)
     return np.asarray(np.repeat(found, N_LASERS))
 
 
 def record(
-    shots: Shots, echoes: Echoes, rig: Rig, config: SimulationConfig, rng: np.random.Generator
+    pulses: Pulses, echoes: Echoes, rig: Rig, config: SimulationConfig, rng: np.random.Generator
 ) -> Recorded:
-    """Return what is recorded of some shots."""
+    """Return the record of some pulses."""
     seen = np.flatnonzero(_is_seen(echoes, config.drop_out, rng))
-    rings, shades = shots.rings[seen], 100.0 * echoes.reflectivities[seen]
+    rings, shades = pulses.rings[seen], 100.0 * echoes.reflectivities[seen]
     sigma = range_noise(shades) if config.sigma_range is None else config.sigma_range
     ranges = echoes.ranges[seen] + rig.laser_range_biases[rings]
     ranges = quantised(ranges + sigma * rng.standard_normal(len(seen)), config.range_step)
-    azimuths = recorded_azimuths(shots.azimuths, config.azimuth_step)[seen]
+    azimuths = recorded_azimuths(pulses.azimuths, config.azimuth_step)[seen]
     floor, share = _INTENSITY_NOISE
     counts = shades + (floor + share * shades) * rng.standard_normal(len(seen))
     intensities = np.clip(np.round(counts), 0.0, 255.0).astype(np.float32)
@@ -170,21 +170,21 @@ def record(
         p_lidar=_points(ranges, azimuths, rig.laser_elevations[rings], rig.laser_heights[rings]),
         intensities=intensities,
         rings=rings,
-        offsets_ns=shots.offsets_ns[seen],
-        firings=_firings(shots.azimuths, seen, ranges, intensities),
+        offsets_ns=pulses.offsets_ns[seen],
+        firings=_firings(pulses.azimuths, seen, ranges, intensities),
     )
 
 
 def recorded_azimuths(azimuths: Array, step: float) -> Array:
-    """Return the azimuths that a driver finds for all shots of whole packets.
+    """Return the azimuths that a driver computes for all pulses of whole packets.
 
     Notes
     -----
-    A packet tells the azimuth of the first of 32 shots, rounded to the step; that of the others
+    A packet holds the azimuth of the first of 32 pulses, rounded to the step; that of the others
     follows from the mean speed within the packet and is rounded again, as drivers do.
     """
-    blocks = quantised(azimuths.reshape(-1, N_BLOCKS, _SHOTS_PER_BLOCK)[:, :, :1], step)
-    k = np.arange(_SHOTS_PER_BLOCK)
+    blocks = quantised(azimuths.reshape(-1, N_BLOCKS, _PULSES_PER_BLOCK)[:, :, :1], step)
+    k = np.arange(_PULSES_PER_BLOCK)
     times = k // N_LASERS * FIRING_CYCLE + k % N_LASERS * LASER_CYCLE
     lasting = (N_BLOCKS - 1) * FIRINGS_PER_BLOCK * FIRING_CYCLE
     speeds = (blocks[:, -1:] - blocks[:, :1]) / lasting
@@ -192,18 +192,18 @@ def recorded_azimuths(azimuths: Array, step: float) -> Array:
 
 
 def _firings(azimuths: Array, seen: Index, ranges: Array, intensities: Column) -> Firings:
-    """Return all shots as packets hold them, given the returns of some."""
+    """Return all pulses as packets hold them, given the returns of some."""
     distances, reflectivities = (
         np.zeros(len(azimuths), np.uint16),
         np.zeros(len(azimuths), np.uint8),
     )
     distances[seen] = np.round(np.maximum(ranges, RANGE_STEP) / RANGE_STEP)
     reflectivities[seen] = intensities
-    hundredths = np.round(azimuths[::_SHOTS_PER_BLOCK] / AZIMUTH_STEP) % _FULL_TURN
+    hundredths = np.round(azimuths[::_PULSES_PER_BLOCK] / AZIMUTH_STEP) % _FULL_TURN
     return Firings(
         azimuths=hundredths.astype(np.uint16),
-        distances=distances.reshape(-1, _SHOTS_PER_BLOCK),
-        reflectivities=reflectivities.reshape(-1, _SHOTS_PER_BLOCK),
+        distances=distances.reshape(-1, _PULSES_PER_BLOCK),
+        reflectivities=reflectivities.reshape(-1, _PULSES_PER_BLOCK),
         start_ns=0,
     )
 
@@ -230,10 +230,7 @@ def _points(ranges: Array, azimuths: Array, elevations: Array, heights: Array) -
 
 
 def _posed(T_head_lidar: Array, T_site_base: Array) -> Array:
-    """Return what cosine and sine of the gimbal angle, and 1, are multiplied with: (3, 3, 4).
-
-    Their sum is the upper part of ``T_site_base Rz(angle) T_head_lidar``.
-    """
+    """Return C, S and K, (3, 3, 4): T_site_base Rz(a) T_head_lidar is cos(a) C + sin(a) S + K."""
     turning = np.zeros((3, 4, 4))
     turning[0, :2, :2] = [[1.0, 0.0], [0.0, 1.0]]
     turning[1, :2, :2] = [[0.0, -1.0], [1.0, 0.0]]
@@ -286,9 +283,9 @@ def _may_pass(
 def _aim(
     azimuths: Array, gimbal_angles: Array, rings: Rings, lasers: Array, posed: Array
 ) -> tuple[Array, Array, Array]:  # pragma: no cover
-    """Return origins, directions and spin axes of shots in the site frame, (n, 3) each.
+    """Return origins, directions and spin axes of pulses in the site frame, (n, 3) each.
 
-    ``lasers`` holds elevation and height of each laser, (k, 2), ``posed`` what ``_posed`` returns.
+    ``lasers`` holds elevation and height of each laser, (k, 2); ``posed`` is that of ``_posed``.
     """
     n = len(azimuths)
     origins, directions, axes = np.empty((n, 3)), np.empty((n, 3)), np.empty((n, 3))

@@ -28,8 +28,8 @@ from spheremark.pipelines.simulation.rig import (
 from spheremark.pipelines.simulation.scene import Scene
 from spheremark.pipelines.simulation.sensor import (
     FIRINGS_PER_PACKET,
+    Pulses,
     Recorded,
-    Shots,
     aim,
     fire,
     may_pass,
@@ -44,23 +44,23 @@ _FIRST_STOP = datetime(2026, 5, 11, 9, 0, tzinfo=UTC)
 _BETWEEN_STOPS = timedelta(seconds=90)
 _HOME = np.radians(1.0)  # the gimbal starts within this of zero
 _THINNING = 128  # one firing in so many is traced in any case: every 7 ms
-_RIG, _STOP = 100, 101  # streams of chance
+_RIG, _STOP = 100, 101  # random streams
 
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class SimulatedStop:
-    """One stop: what was recorded, and what is true.
+    """One stop: the log, and the truth.
 
     Attributes
     ----------
     log : ScanLog
-        What was recorded, with the nominal rig; it holds nothing of the truth.
+        The recording, with the nominal rig; it holds nothing of the truth.
     truth : StopTruth
         True pose of the base.
     rig : Rig
         The true rig.
     firings : Firings
-        All shots of the LiDAR as its packets hold them; its returns are those of the log.
+        All pulses of the LiDAR as its packets hold them; its returns are those of the log.
     """
 
     log: ScanLog
@@ -70,7 +70,7 @@ class SimulatedStop:
 
 
 class _Run(NamedTuple):
-    """What the LiDAR goes through at one stop."""
+    """World, pose, motion and rig of the LiDAR at one stop."""
 
     scene: Scene
     T_site_base: Array
@@ -79,7 +79,7 @@ class _Run(NamedTuple):
 
 
 def _silent(fraction: float, message: str) -> None:
-    """Tell nobody."""
+    """Ignore the progress."""
 
 
 def simulate_stop(
@@ -90,7 +90,7 @@ def simulate_stop(
     seed: int | None = None,
     progress: Progress = _silent,
 ) -> SimulatedStop:
-    """Return what the rig records at one stop.
+    """Simulate the recording of one stop.
 
     Parameters
     ----------
@@ -99,12 +99,12 @@ def simulate_stop(
     name : str
         Name of the stop.
     config : SimulationConfig
-        How the rig moves, and how well it measures.
+        Motion of the rig, and errors of its sensors.
     seed : int, optional
-        Source of chance of rig and sensors; that of the field by default. All stops of a survey
-        take the same: they share the rig, and differ in noise, tilt and start.
+        Seed of rig and sensors; that of the field by default. All stops of a survey take the same:
+        they share the rig, and differ in noise, tilt and start.
     progress : callable
-        Is told the fraction done, 0 to 1, and what is being done; may raise to cancel.
+        Receives the fraction done, 0 to 1, and the current step; may raise to cancel.
 
     Returns
     -------
@@ -121,7 +121,7 @@ def simulate_stop(
     Notes
     -----
     Work grows linearly with the time of the scan, and takes about a fifth of it on two cores. The
-    points of the log are those that a driver makes of the packets.
+    points of the log are those that a driver computes from the packets.
     """
     stop = field.stop(name)
     seed = checked_seed(field.seed if seed is None else seed)
@@ -174,8 +174,8 @@ def survey_truth(
     Returns
     -------
     Truth
-        Marks, poses, the true rig, and what the survey was made from; of what else stands on the
-        field, the decoys, and how much of each marker each stop can see.
+        Marks, poses, the true rig, configuration and seeds, the decoys on the field, and the
+        visible share of each marker from each stop.
 
     Raises
     ------
@@ -222,13 +222,13 @@ def _lean(rng: np.random.Generator, sigma: float) -> Array:
 
 
 def _start_ns(place: int, rng: np.random.Generator) -> int:
-    """Return the instant of the first shot of a stop."""
+    """Return the instant of the first pulse of a stop."""
     second = int((_FIRST_STOP + place * _BETWEEN_STOPS).timestamp())
     return second * 10**9 + int(rng.integers(10**9))
 
 
 def _stamped(offsets_ns: Nanos, config: SimulationConfig) -> Nanos:
-    """Return the instants that points are recorded with: their own, or that of their revolution."""
+    """Return the recorded instants of points: their own, or that of their revolution."""
     revolution_ns = round(60e9 / config.spin_rpm)
     return offsets_ns if config.shot_times else offsets_ns // revolution_ns * revolution_ns
 
@@ -236,28 +236,28 @@ def _stamped(offsets_ns: Nanos, config: SimulationConfig) -> Nanos:
 def _scan(
     run: _Run, config: SimulationConfig, rng: np.random.Generator, progress: Progress
 ) -> list[Recorded]:
-    """Return what the LiDAR records during one turn, in pieces."""
+    """Return the record of the LiDAR during one turn, in pieces."""
     n = int(recorded_time(config) / FIRING_CYCLE) // FIRINGS_PER_PACKET * FIRINGS_PER_PACKET
     start_azimuth, rig = rng.uniform(0.0, 2 * np.pi), run.rig
     pieces = []
     for first in range(0, n, _CHUNK):
         progress(first / n, "Casting beams")
-        shots = fire(first, min(_CHUNK, n - first), start_azimuth, run.motion, config.spin_rpm)
+        pulses = fire(first, min(_CHUNK, n - first), start_azimuth, run.motion, config.spin_rpm)
         if config.only_near_spheres:
-            echoes = _near_spheres(run, shots)
+            echoes = _near_spheres(run, pulses)
         else:
-            echoes = trace(run.scene, aim(shots, rig, run.T_site_base), rig.divergence)
-        pieces.append(record(shots, echoes, rig, config, rng))
+            echoes = trace(run.scene, aim(pulses, rig, run.T_site_base), rig.divergence)
+        pieces.append(record(pulses, echoes, rig, config, rng))
     progress(1.0, "All beams cast")
     return pieces
 
 
-def _near_spheres(run: _Run, shots: Shots) -> Echoes:
-    """Return the echoes of shots that pass spheres closely, and of one firing in 128.
+def _near_spheres(run: _Run, pulses: Pulses) -> Echoes:
+    """Return the echoes of pulses that pass spheres closely, and of one firing in 128.
 
-    Those tell of the turn and of the ground.
+    The latter show the turn and the ground.
     """
-    anyway = np.arange(len(shots.rings)) // N_LASERS % _THINNING == 0
-    chosen = anyway | may_pass(shots, run.rig, run.T_site_base, run.scene.spheres.p_site, NEAR)
-    aims = aim(shots.rows(chosen), run.rig, run.T_site_base)
+    anyway = np.arange(len(pulses.rings)) // N_LASERS % _THINNING == 0
+    chosen = anyway | may_pass(pulses, run.rig, run.T_site_base, run.scene.spheres.p_site, NEAR)
+    aims = aim(pulses.rows(chosen), run.rig, run.T_site_base)
     return trace(run.scene, aims, run.rig.divergence, anyway[chosen]).among(chosen)
