@@ -50,7 +50,8 @@ class _Thing(NamedTuple):
     kind: str
     is_marker: bool
     is_found: bool
-    reason: str
+    p_base: Array
+    reason: str = ""
 
 
 class _Score(NamedTuple):
@@ -140,21 +141,16 @@ def _score(world: tuple[str, int, str], *, config: SimulationConfig) -> _Score:
     is_near = np.linalg.norm(rough[:, None] - marks[None], axis=2) < field.marker_radius
     is_false = ~is_near.any(axis=1)
     charged = _nearest(decoys, rough[is_false])
-    kinds = [
-        _class_of(_n_on(cloud, p, field.marker_radius), share)
-        for p, share in zip(marks, shares, strict=True)
+    markers = [
+        _Thing(_class_of(_n_on(cloud, p, field.marker_radius), share), True, bool(hit), p)
+        for p, share, hit in zip(marks, shares, is_near.any(axis=0), strict=True)
     ]
-    is_found = [*is_near.any(axis=0).tolist(), *(i in charged for i in range(len(decoys)))]
+    others = [
+        _Thing(decoy.kind, False, i in charged, decoys[i]) for i, decoy in enumerate(field.decoys)
+    ]
     things = [
-        _Thing(kind, place < len(marks), hit, "" if hit else _reason_near(found, p))
-        for place, (kind, hit, p) in enumerate(
-            zip(
-                [*kinds, *(decoy.kind for decoy in field.decoys)],
-                is_found,
-                [*marks, *decoys],
-                strict=True,
-            )
-        )
+        one._replace(reason="" if one.is_found else _reason_near(found, one.p_base))
+        for one in markers + others
     ]
     return _Score(field.scenario, things, int(is_false.sum()))
 

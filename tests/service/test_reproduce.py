@@ -8,11 +8,19 @@ from pathlib import Path
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose
+from rich.console import Console
 
 from spheremark.pipelines.errors import NotFoundError
 from spheremark.pipelines.evaluation.reproduction.plan import OURS, PAPER
 from spheremark.pipelines.published import TABLE_2
-from spheremark.service.bench.reproduce import ReproductionOptions, page_of, reproduce
+from spheremark.service.bench.report import print_tables
+from spheremark.service.bench.reproduce import (
+    ReproductionOptions,
+    _report,
+    page_of,
+    reproduce,
+    reproduction_tables,
+)
 from spheremark.web import assets, theme
 from spheremark.web.pages import reproduction as drawing
 from tests.reproduced import reproduction
@@ -93,6 +101,17 @@ def test_the_page_has_the_published_table_and_what_was_found_beside_it(page):
         assert f">{1e3 * error:.1f}<" in text
     assert f"{page.table_2[0]['paper_error_3d_mean_m'] * 1e3:.1f}" in text
     assert "the study, as published" in text
+
+
+def test_the_report_is_a_table_and_json(page, tmp_path):
+    report = _report(tmp_path, reproduction(), page)
+    json.dumps(report, allow_nan=False)
+    out = Console(record=True, width=160)
+    print_tables(out, reproduction_tables(report))
+    text = out.export_text()
+    for word in ("6.84", "165.05", "lane2-stop7", "to 30 m", str(tmp_path / "index.html")):
+        assert word in text
+    assert f"{1e3 * report['table2'][0]['paper_minus_study_m']:+.1f}" in text
 
 
 def test_inlined_scripts_and_styles_cannot_end_their_element():

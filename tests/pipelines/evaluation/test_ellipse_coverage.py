@@ -12,6 +12,7 @@ from spheremark.pipelines.evaluation.ellipse_coverage import (
     QUANTITIES,
     Draws,
     coverage,
+    ellipse_coverage,
     joined,
     nees,
     survey_draws,
@@ -87,6 +88,32 @@ def test_a_method_that_positions_few_stations_has_an_interval_and_one_that_posit
     for ask in (coverage, nees):
         with pytest.raises(TooFewObservationsError, match="None of 40 stations"):
             ask(few)
+
+
+def test_the_report_has_shares_with_intervals_for_each_method_and_quantity():
+    draws = drawn(np.random.default_rng(7), 40, 5)
+    experiment = ellipse_coverage(40, 5, seed=3)
+    assert list(experiment.worlds) == list(range(3, 43))
+    parts = [
+        Draws(
+            surveys=draws.surveys[own],
+            squares={key: value[own] for key, value in draws.squares.items()},
+            errors={key: value[own] for key, value in draws.errors.items()},
+            sigmas={key: value[own] for key, value in draws.sigmas.items()},
+        )
+        for own in (draws.surveys < 20, draws.surveys >= 20)
+    ]
+    report = experiment.pool(parts)
+    assert (report["seed"], report["n_surveys"], report["n_stations"]) == (3, 40, 200)
+    assert all(sum(row["counts"]) == 200 for row in report["nees"])
+    (table,) = experiment.tables(report)
+    (row,) = (row for row in table.rows if row["method"] == "network" and row["dimensions"] == 2)
+    (level,) = (
+        one for one in report["levels"]
+        if (one["method"], one["quantity"], one["level"]) == ("network", "horizontal", 0.95)
+    )  # fmt: skip
+    cells = {column.heading: column.cell(row) for column in table.columns}
+    assert cells["95 %"].startswith(f"{100 * level['share']:.1f} (")
 
 
 def test_one_survey_and_no_stop_are_refused():

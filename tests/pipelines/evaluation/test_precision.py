@@ -3,7 +3,13 @@
 import numpy as np
 import pytest
 
-from spheremark.pipelines.evaluation.precision import Case, full_precision, precision
+from spheremark.pipelines.evaluation.precision import (
+    Case,
+    _Bounds,
+    _Row,
+    full_precision,
+    precision,
+)
 
 
 def rows_of(n_stops, seed=0, **options):
@@ -19,6 +25,27 @@ def test_the_full_sample_is_a_thousand_fits_at_each_distance_and_has_a_long_turn
         assert min(own) == 5
     assert {case.sigma for case in seeds} == {0.01, 0.02}
     assert max(case.turn for case in seeds) >= 20.0
+
+
+def test_rows_are_pooled_by_case_distance_and_method_and_compared_with_the_bound():
+    experiment = precision(1, 0, cases=[Case(0.02, 13.2)], methods=("along_beam", "paper"))
+    bounds = _Bounds(every=4e-6, clear=9e-6, n_hits=50)
+    fit = _Row(
+        case=Case(0.02, 13.2), distance=10.0, method="along_beam", error=0.003, radial=0.001,
+        nees=3.0, bounds=bounds, is_weak=False,
+    )  # fmt: skip
+    worse = fit._replace(error=0.005, radial=-0.003, is_weak=True)
+    other = fit._replace(method="paper", error=0.02)
+    report = experiment.pool([[other, fit], [worse]])
+    ours, paper = report["rows"]
+    assert (ours["method"], ours["n"], ours["share_weak"]) == ("along_beam", 2, 0.5)
+    assert ours["rms_m"] == pytest.approx(np.sqrt((9 + 25) / 2) * 1e-3)
+    assert ours["radial_bias_m"] == pytest.approx(-0.001)
+    assert (ours["bound_m"], ours["bound_clear_m"]) == pytest.approx((0.002, 0.003))
+    assert paper["bound_over_rms"] == pytest.approx(0.1)
+    (table,) = experiment.tables(report)
+    cells = {column.title: column.cell(paper) for column in table.columns}
+    assert (cells["RMS"], cells["bound"], cells["distance"]) == ("20.00", "2.00", "10")
 
 
 @pytest.mark.slow
