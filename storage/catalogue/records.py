@@ -52,20 +52,9 @@ class Page(Generic[_Record]):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SurveyRecord:
-    """A field with its marks and logs.
+    """A survey: a row of ``surveys``, whose comments define the columns, with counts.
 
-    Attributes
-    ----------
-    survey_id, name : str
-        Identifier from the catalogue, never reused, and the user's name for it, unique.
-    tolerance : float
-        3-D error that the survey accepts [m].
-    created_at : datetime
-        Instant of creation, in UTC.
-    rig_digest : str or None
-        Rig of its jobs where they name none; without, the rig that each log describes.
-    n_control_marks, n_true_stops, n_recordings : int
-        Number of control marks, of stops with a known truth, and of logs.
+    ``tolerance`` is in metres; ``n_true_stops`` counts stops with a known truth.
     """
 
     survey_id: str
@@ -80,25 +69,7 @@ class SurveyRecord:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RecordingRecord:
-    """An uploaded log.
-
-    Attributes
-    ----------
-    recording_id : str
-        SHA-256 of the file, in hexadecimal.
-    name : str
-        Stem of the file name at upload.
-    size_bytes : int
-        Length of the file.
-    uploaded_at : datetime
-        Instant of the upload, in UTC.
-    url : str
-        Location of the file.
-    verdict : str
-        Result of the preflight: ``ok``, ``weak`` or ``refused``.
-    preflight : mapping
-        The preflight report.
-    """
+    """An uploaded log: a row of ``recordings``, whose comments define the columns."""
 
     recording_id: str
     name: str
@@ -111,34 +82,9 @@ class RecordingRecord:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class JobRecord:
-    """A job.
+    """A job: a row of ``jobs``, whose comments define the columns, with the names of its inputs.
 
-    Attributes
-    ----------
-    job_id, kind : str
-        Identifier from the catalogue, and its kind, for instance ``process``.
-    survey_id, survey : str
-        Identifier and name of its survey.
-    recording_id, recording : str or None
-        Digest and name of the log; none for a job on the survey as a whole.
-    config : mapping
-        The effective configuration.
-    options : mapping
-        Options beside it: ``rig`` (a digest), ``recordings``, and those of its kind.
-    status : JobStatus
-        Its status.
-    progress_percent : float
-        0 to 100.
-    message : str
-        The present step, as a sentence.
-    attempts : int
-        Number of starts.
-    created_at : datetime
-        Instant of the request, in UTC.
-    started_at, finished_at : datetime or None
-        Start of the last attempt, and end of the job.
-    error_code, error_reason, error_traceback : str or None
-        Stable code, sentence and traceback of the failure.
+    ``recording_id`` and ``recording`` are None for a job on the survey as a whole.
     """
 
     job_id: str
@@ -163,25 +109,7 @@ class JobRecord:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RunRecord:
-    """A recording processed with one configuration by one version of the code.
-
-    Attributes
-    ----------
-    run_id : str
-        Identifier of the run in every table.
-    job_id, survey_id, recording_id : str
-        Its job, survey and log.
-    config : mapping
-        The effective configuration.
-    config_digest, code_version, rig_digest : str
-        Provenance of the numbers.
-    finished_at : datetime
-        End of the run, in UTC.
-    duration : float
-        Duration of the run [s].
-    peak_memory_bytes : int or None
-        Largest resident size of the worker process.
-    """
+    """A run: a row of ``runs``, whose comments define the columns; ``duration`` is in seconds."""
 
     run_id: str
     job_id: str
