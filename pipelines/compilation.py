@@ -14,6 +14,7 @@ REASSOCIATED: frozenset[str] = frozenset({"contract", "reassoc"})
 # Without `no_cfunc_wrapper` each kernel is compiled a second time, for callers in C
 _OPTIONS = {"cache": True, "nogil": True, "error_model": "numpy", "no_cfunc_wrapper": True}
 _REPORTS: list[Callable[[int], None]] = []
+_KERNELS: list[Any] = []  # of the modules imported so far
 
 
 def compiled(function: Callable[..., Any]) -> Any:
@@ -30,7 +31,7 @@ def compiled(function: Callable[..., Any]) -> Any:
     callable
         The same function, compiled.
     """
-    return _njit()(**_OPTIONS)(function)
+    return _kept(_njit()(**_OPTIONS)(function))
 
 
 def compiled_with(
@@ -55,7 +56,7 @@ def compiled_with(
 
     def decorate(function: Callable[..., Any]) -> Any:
         options = {**_OPTIONS, "fastmath": set(fastmath), "inline": inline}
-        return _njit()(**options)(function)
+        return _kept(_njit()(**options)(function))
 
     return decorate
 
@@ -80,6 +81,36 @@ def watch_compilation(report: Callable[[int], None]) -> None:
         Takes the number of kernels that this process has compiled, those inside others excepted.
     """
     _REPORTS.append(report)
+
+
+def load_kernels(package: str = "spheremark") -> int:
+    """Load the machine code that earlier processes kept, so that first calls need not.
+
+    Parameters
+    ----------
+    package : str
+        Kernels of this package and those below it, of modules imported so far.
+
+    Returns
+    -------
+    int
+        Signatures loaded. A kernel without code on disk is left to its first call.
+    """
+    n = 0
+    for kernel in [one for one in _KERNELS if f"{one.__module__}.".startswith(f"{package}.")]:
+        cache, codegen = kernel._cache, kernel.targetctx.codegen()
+        known = cache._cache_file._load_index()  # numba has no public function
+        for signature, *_ in known:
+            if cache._index_key(signature, codegen) in known:  # else of another processor
+                kernel.compile(signature)
+                n += 1
+    return n
+
+
+def _kept(kernel: Any) -> Any:
+    """Enter a kernel into the list of kernels."""
+    _KERNELS.append(kernel)
+    return kernel
 
 
 class _Compilations:

@@ -66,8 +66,17 @@ async def opened(settings: Settings) -> AsyncIterator[Service]:
         one.open()
     with Catalogue(settings.database, snapshots=settings.snapshots) as catalogue:
         async with JobQueue(settings, catalogue, data / "clouds") as jobs:
+            threading.Thread(target=_warm_up, name="warm-up", daemon=True).start()
             planner = Planner(catalogue)
             yield Service(settings, catalogue, inbox, terrains, jobs, planner)
+
+
+def _warm_up() -> None:
+    """Load the compiled kernels that read a log, so that the first upload is as fast as others."""
+    from spheremark.pipelines.compilation import load_kernels
+
+    for package in ("spheremark.storage.recordings", "spheremark.pipelines.scan"):
+        load_kernels(package)
 
 
 def current(request: Request) -> Service:
