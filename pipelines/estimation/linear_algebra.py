@@ -189,10 +189,6 @@ class Reduced(NamedTuple):
         """Return the solution, (s, a), of the local unknowns for one of the common ones."""
         return np.asarray(self.steps - self.gains @ common)
 
-    def local_covariances(self, cov_common: Array) -> Array:
-        """Return covariances, (s, a, a), of the local unknowns for that of the common ones."""
-        return np.asarray(self.own + self.gains @ cov_common @ np.swapaxes(self.gains, 1, 2))
-
 
 def eliminate(
     local: Array, mixed: Array, rhs_local: Array, common: Array, rhs_common: Array

@@ -21,7 +21,6 @@ from spheremark.pipelines.geometry import (
     by_motion,
     cross,
     has_heading,
-    included_angle,
     inverse,
     is_on_a_line,
     rigid,
@@ -38,6 +37,12 @@ from spheremark.pipelines.model import (
     Mask,
     StationFix,
     Status,
+)
+from spheremark.pipelines.positioning.fix import (
+    Pose,
+    assumed_levelling,
+    failed_global_test,
+    station_fix,
 )
 from spheremark.pipelines.positioning.matching import (
     Match,
@@ -210,11 +215,7 @@ def _weaknesses(
         )
     elif is_on_a_line(scene.marks_site[used[:, 1]]):
         reasons.append("the marks lie on one line: the turn about it rests on gravity alone")
-    if not adjustment.passes_global_test:
-        reasons.append(
-            f"the global test fails (sigma0 = {adjustment.sigma0:.2f}): residuals are larger than "
-            "their sigmas promise"
-        )
+    reasons += failed_global_test(adjustment)
     reasons += [
         f"the levelling contradicts the marks (w = {w:.1f}) and was left out"
         for block, w in dropped
@@ -228,9 +229,7 @@ def _weaknesses(
             f"{n_dropped} of {match.n} matched markers contradicts the others and was left out: "
             "with so few it may be one of the others that is wrong"
         )
-    if not scene.is_levelled:
-        reasons.append("no AHRS: the levelling is only assumed")
-    return reasons
+    return reasons + assumed_levelling(scene)
 
 
 def _other_places(scene: Scene, match: Match) -> str:
@@ -253,36 +252,20 @@ def _fix(
     reasons: list[str],
 ) -> StationFix:
     """Assemble a fix, back in the unshifted site frame."""
-    T, n = adjustment.estimate, len(used)
+    T = adjustment.estimate
     shift = np.eye(6)
     shift[3:, :3] = skew(scene.middle)
     T_site_base = rigid(T[:3, :3], T[:3, 3] + scene.middle)
-    first, second = np.triu_indices(n, 1)
-    centres = scene.centres_base[used[:, 0]]
-    angles = included_angle(centres[first], centres[second])
     cov, J = adjustment.cov + _cov_shared(scene, used, adjustment), by_motion(T[:3, 3])
-    shifts = _shifts_of_choice(scene, match, T_site_base)
-    return StationFix(
-        method="free_station",
+    elsewhere = match.alternatives + scene.middle - T_site_base[:3, 3]
+    pose = Pose(
         T_site_station=T_site_base @ inverse(rigid(scene.R_station_base, np.zeros(3))),
-        cov_T_site_station=shift @ cov @ shift.T
-        + _cov_heading(scene, T_site_base)
-        + _cov_choice(scene, shifts, T_site_base),
-        cov_p_site=J @ cov @ J.T + shifts.T @ shifts / (len(shifts) + 1),
-        matches=used,
+        cov_T_site_station=shift @ cov @ shift.T + _cov_turn(scene, elsewhere, T_site_base),
+        cov_p_site=J @ cov @ J.T + _cov_choice(elsewhere),
+        J_position=J,
         residuals_site=adjustment.groups[0].residuals,
-        redundancies=adjustment.redundancies[:n],
-        w_statistics=adjustment.w_statistics[:n],
-        detectable_biases=adjustment.detectable_biases[:n],
-        external_reliabilities=adjustment.external_reliabilities(J)[:n],
-        dof=adjustment.dof,
-        sigma0=adjustment.sigma0,
-        passes_global_test=adjustment.passes_global_test,
-        included_angles=np.array([angles.min(), angles.max()]),
-        status=Status.WEAK if reasons else Status.OK,
-        reason="; ".join(reasons),
-        excluded=excluded,
     )
+    return station_fix("free_station", scene, used, adjustment, pose, (reasons, excluded))
 
 
 def _cov_shared(scene: Scene, used: Index, adjustment: Adjustment) -> Array:
@@ -296,39 +279,25 @@ def _cov_shared(scene: Scene, used: Index, adjustment: Adjustment) -> Array:
     return cov_of_shared(scene, scene.shared[used[:, 0]], of_ranges, of_heights)
 
 
-def _cov_heading(scene: Scene, T_site_base: Array) -> Array:
-    """Return the covariance of a pose that turns about its own plumb line, (6, 6).
+def _cov_choice(elsewhere: Array) -> Array:
+    """Return the covariance, (3, 3), of a position that may as well be elsewhere.
+
+    ``elsewhere``, (k, 3), are the shifts to the other places, each as likely as the chosen one.
+    """
+    return np.asarray(elsewhere.T @ elsewhere / (len(elsewhere) + 1))
+
+
+def _cov_turn(scene: Scene, elsewhere: Array, T_site_base: Array) -> Array:
+    """Return what an uncertain heading and the other places add to the covariance, (6, 6).
 
     The heading of base is where its joint angle is zero, which mounting and encoder blur; the
-    position does not move.
+    position does not move. The other places lie half a turn away.
     """
-    turn = _turn(scene, T_site_base)
-    return np.asarray(scene.sigma_heading**2 * np.outer(turn, turn))
-
-
-def _shifts_of_choice(scene: Scene, match: Match, T_site_base: Array) -> Array:
-    """Return how far off the other places are where the station may stand as well, (k, 3) [m]."""
-    return np.asarray(match.alternatives + scene.middle - T_site_base[:3, 3])
-
-
-def _cov_choice(scene: Scene, shifts: Array, T_site_base: Array) -> Array:
-    """Return what it adds to the covariance, (6, 6), that the station may as well stand elsewhere.
-
-    Each of the other places is as likely as the chosen one, and lies half a turn away.
-    """
-    cov = np.zeros((6, 6))
-    n = len(shifts)
-    if n:
-        turn = np.pi * _turn(scene, T_site_base)
-        cov[3:, 3:] = shifts.T @ shifts / (n + 1)
-        cov += n / (n + 1) * np.outer(turn, turn)
-    return cov
-
-
-def _turn(scene: Scene, T_site_base: Array) -> Array:
-    """Return the small motion, (6,), that turns a station about its own plumb line by 1 rad."""
-    up = T_site_base[:3, :3] @ scene.R_station_base[2]
-    return np.concatenate([up, cross(T_site_base[:3, 3], up)])
+    up, k = T_site_base[:3, :3] @ scene.R_station_base[2], len(elsewhere)
+    turn = np.concatenate([up, cross(T_site_base[:3, 3], up)])  # 1 rad about the plumb line
+    cov = (scene.sigma_heading**2 + np.pi**2 * k / (k + 1)) * np.outer(turn, turn)
+    cov[3:, 3:] += _cov_choice(elsewhere)
+    return np.asarray(cov)
 
 
 def _by_ranges(

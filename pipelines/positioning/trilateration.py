@@ -18,8 +18,14 @@ from spheremark.pipelines.errors import DegenerateGeometryError, NotConvergedErr
 from spheremark.pipelines.estimation.least_squares import Adjustment, Observations, adjust
 from spheremark.pipelines.estimation.linear_algebra import factorise, invert, invert_each, solve
 from spheremark.pipelines.estimation.statistical_tests import snoop
-from spheremark.pipelines.geometry import included_angle, is_on_a_line, rigid, rot_z, skew, unit
-from spheremark.pipelines.model import Array, Exclusion, Index, Mask, StationFix, Status
+from spheremark.pipelines.geometry import is_on_a_line, rigid, rot_z, skew, unit
+from spheremark.pipelines.model import Array, Exclusion, Index, Mask, StationFix
+from spheremark.pipelines.positioning.fix import (
+    Pose,
+    assumed_levelling,
+    failed_global_test,
+    station_fix,
+)
 from spheremark.pipelines.positioning.matching import Match, Scene, cov_of_shared
 
 Measure = Callable[[Array], tuple[Array, Array]]
@@ -246,30 +252,16 @@ def _fix(
     yaw, cov = _pose(scene, measure, pairs, adjustment)
     shift = np.eye(6)
     shift[3:, :3] = skew(p)  # a rotation about the station moves the site's origin
-    first, second = np.triu_indices(len(pairs), 1)
-    centres = scene.centres_base[pairs[:, 0]]
-    angles = included_angle(centres[first], centres[second])
-    reasons = _weaknesses(pairs, adjustment, cov, scene)
     group = adjustment.groups[0]
-    return StationFix(
-        method=name,
+    pose = Pose(
         T_site_station=rigid(rot_z(yaw), p),
         cov_T_site_station=shift @ cov @ shift.T,
         cov_p_site=cov[3:, 3:].copy(),
-        matches=np.array(pairs),
+        J_position=np.eye(3),
         residuals_site=np.einsum("km,kmi->ki", group.residuals, group.J),
-        redundancies=adjustment.redundancies,
-        w_statistics=adjustment.w_statistics,
-        detectable_biases=adjustment.detectable_biases,
-        external_reliabilities=adjustment.external_reliabilities(np.eye(3)),
-        dof=adjustment.dof,
-        sigma0=adjustment.sigma0,
-        passes_global_test=adjustment.passes_global_test,
-        included_angles=np.array([angles.min(), angles.max()]),
-        status=Status.WEAK if reasons else Status.OK,
-        reason="; ".join(reasons),
-        excluded=excluded,
     )
+    reasons = _weaknesses(pairs, adjustment, cov, scene)
+    return station_fix(name, scene, pairs, adjustment, pose, (reasons, excluded))
 
 
 def _weaknesses(pairs: Index, adjustment: Adjustment, cov: Array, scene: Scene) -> list[str]:
@@ -282,20 +274,14 @@ def _weaknesses(pairs: Index, adjustment: Adjustment, cov: Array, scene: Scene) 
             "the marks lie on one line: on the other side of it the distances are the same, and "
             "only the directions of the markers tell the side"
         )
-    if not adjustment.passes_global_test:
-        reasons.append(
-            f"the global test fails (sigma0 = {adjustment.sigma0:.2f}): residuals are larger than "
-            "their sigmas promise"
-        )
+    reasons += failed_global_test(adjustment)
     sigmas = np.sqrt(np.diag(cov)[3:])
     if sigmas.max() > _LOOSE:
         reasons.append(
             f"the distances leave {'xyz'[int(np.argmax(sigmas))]} open to {sigmas.max():.2f} m: "
             "the marks stand too much in one plane with the station"
         )
-    if not scene.is_levelled:
-        reasons.append("no AHRS: the levelling is only assumed")
-    return reasons
+    return reasons + assumed_levelling(scene)
 
 
 @compiled

@@ -1,5 +1,7 @@
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 from scipy.stats import chi2, norm
 
 from spheremark.pipelines.errors import (
@@ -80,13 +82,19 @@ def test_estimate_and_statistics_are_those_of_the_textbook(rng):
         assert result.detectable_biases[k] == pytest.approx(np.sqrt(17.075 / weakest), rel=1e-3)
 
 
-def test_redundancies_add_up_to_the_degrees_of_freedom(rng):
-    result = adjust(linear(*line(rng)), add, np.zeros(2), **LEVELS)
+@settings(deadline=None, max_examples=40)
+@given(seed=st.integers(0, 10_000), n=st.integers(3, 30))
+def test_redundancies_add_up_to_the_degrees_of_freedom(seed, n):
+    rng = np.random.default_rng(seed)
+    result = adjust(linear(*line(rng, n)), add, np.zeros(2), **LEVELS)
     assert result.redundancies.sum() == pytest.approx(result.dof)
 
 
-def test_scaling_all_sigmas_scales_the_covariance_by_the_square(rng):
-    design, readings, cov = line(rng)
+@settings(deadline=None, max_examples=40)
+@given(seed=st.integers(0, 10_000), n=st.integers(3, 30))
+def test_scaling_all_sigmas_scales_the_covariance_by_the_square(seed, n):
+    rng = np.random.default_rng(seed)
+    design, readings, cov = line(rng, n)
     one = adjust(linear(design, readings, cov), add, np.zeros(2), **LEVELS)
     ten = adjust(linear(design, readings, 100 * cov), add, np.zeros(2), **LEVELS)
     np.testing.assert_allclose(ten.estimate, one.estimate, rtol=1e-9)
@@ -293,8 +301,11 @@ def test_steps_that_do_not_settle_are_refused():
         solve(linearise, add, np.array([1.0]))
 
 
-def test_the_w_statistic_is_the_jump_of_the_fit_when_the_reading_is_left_out(rng):
-    design, readings, cov = line(rng)
+@settings(deadline=None, max_examples=40)
+@given(seed=st.integers(0, 10_000), n=st.integers(3, 30))
+def test_the_w_statistic_is_the_jump_of_the_fit_when_the_reading_is_left_out(seed, n):
+    rng = np.random.default_rng(seed)
+    design, readings, cov = line(rng, n)
     design, readings = design.reshape(-1, 1, 2), readings.reshape(-1, 1)
     cov = np.diagonal(cov, axis1=1, axis2=2).reshape(-1, 1, 1)
     result = adjust(linear(design, readings, cov), add, np.zeros(2), **LEVELS)
@@ -305,8 +316,11 @@ def test_the_w_statistic_is_the_jump_of_the_fit_when_the_reading_is_left_out(rng
         assert result.w_statistics[k] == pytest.approx(abs(off.item()), rel=1e-8)
 
 
-def test_the_order_of_the_observations_does_not_matter(rng):
-    design, readings, cov = line(rng)
+@settings(deadline=None, max_examples=40)
+@given(seed=st.integers(0, 10_000), n=st.integers(3, 30))
+def test_the_order_of_the_observations_does_not_matter(seed, n):
+    rng = np.random.default_rng(seed)
+    design, readings, cov = line(rng, n)
     order = rng.permutation(len(readings))
     one = adjust(linear(design, readings, cov), add, np.zeros(2), **LEVELS)
     other = adjust(linear(design[order], readings[order], cov[order]), add, np.zeros(2), **LEVELS)
