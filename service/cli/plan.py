@@ -16,7 +16,7 @@ from rich.table import Table
 from spheremark.pipelines.errors import ConfigError
 
 plan = typer.Typer(
-    help="Where to put markers: evaluate, optimise, try at random.", no_args_is_help=True
+    help="Where to put markers: evaluate, optimise, simulate at random.", no_args_is_help=True
 )
 
 _WIDE = 160  # columns of a table that goes into a file or a pipe
@@ -46,7 +46,7 @@ StepDeg = Annotated[
 Rests = Annotated[int, typer.Option(help="Revolutions of the LiDAR during each rest.")]
 Data = Annotated[
     Path | None,
-    typer.Option(file_okay=False, help="Data folder whose fits tell the accuracy of centres."),
+    typer.Option(file_okay=False, help="Data folder whose fits give the accuracy of centres."),
 ]
 Server = Annotated[
     str | None,
@@ -100,28 +100,20 @@ def evaluate(
     geojson: GeoJson = None,
     as_json: AsJson = False,
 ) -> None:
-    """Say what an arrangement of marks promises at every stop, without simulating a scan."""
-    from spheremark.service.planning import plans as siting
-    from spheremark.service.serialise import plans as planning
+    """Predict the accuracy of an arrangement of marks at every stop, without simulating a scan."""
+    from spheremark.pipelines.placement import Requirement
+    from spheremark.service.planning import plans
     from spheremark.storage.imports.plan_files import read_marks
 
-    requirement = siting.Wanted(
-        tolerance=tolerance_m,
-        method=method,
-        sigma_marks=sigma_marks_m,
-        turn=turn_s,
-        rpm=rpm,
-        step=math.radians(step_deg),
-        rest_revolutions=rest_revolutions,
-    )
-    ground = siting.ground_of(scenario, seed, terrain, stops)
-    asked = siting.put_together(
-        ground, read_marks(marks), requirement, _ask(data, server, survey), survey
-    )
-    answer = siting.evaluate(asked)
+    sensor = _sensor(turn_s, rpm, step_deg, rest_revolutions)
+    requirement = Requirement(tolerance=tolerance_m, method=method, sigma_marks=sigma_marks_m)
+    ground = plans.read_ground(f"{scenario}@{seed}", terrain, stops)
+    query = _query(data, server, survey)
+    assembled = plans.assemble(ground, read_marks(marks), sensor, requirement, query, survey)
+    found = plans.evaluate(assembled)
     if suggest:
-        answer["one_more"] = siting.one_more(asked)
-    _deliver(answer, csv, geojson, as_json=as_json, planning=planning)
+        found["one_more"] = plans.suggest(assembled)
+    _deliver(found, csv, geojson, as_json=as_json)
 
 
 @plan.command()
@@ -160,28 +152,28 @@ def optimise(
     as_json: AsJson = False,
 ) -> None:
     """Find the best places for a number of marks, or the fewest that keep the tolerance."""
-    from spheremark.service.planning import plans as siting
-    from spheremark.service.serialise import plans as planning
+    from spheremark.pipelines.placement import Goal, PlaceRules, Requirement
+    from spheremark.service.planning import plans
 
-    requirement = siting.Wanted(
-        tolerance=tolerance_m,
-        method=method,
-        sigma_marks=sigma_marks_m,
-        turn=turn_s,
-        rpm=rpm,
-        step=math.radians(step_deg),
-        rest_revolutions=rest_revolutions,
+    sensor = _sensor(turn_s, rpm, step_deg, rest_revolutions)
+    requirement = Requirement(tolerance=tolerance_m, method=method, sigma_marks=sigma_marks_m)
+    field = f"{scenario}@{seed}"
+    ground = plans.read_ground(field, terrain, stops, keep_out=keep_out, poles=pole_m)
+    query = _query(data, server, survey)
+    assembled = plans.assemble(ground, None, sensor, requirement, query, survey)
+    rules = PlaceRules(
+        reach=reach_m,
+        slope_max=math.radians(slope_deg),
+        spacing=spacing_m,
+        is_inside_allowed=inside,
     )
-    ground = siting.ground_of(scenario, seed, terrain, stops, keep_out=keep_out, poles=pole_m)
-    asked = siting.put_together(ground, None, requirement, _ask(data, server, survey), survey)
-    rules = siting.rules_of(reach_m, slope_deg, spacing_m, is_inside_allowed=inside)
-    goal = siting.goal_of(marks, probability, is_robust=robust)
-    _deliver(siting.optimise(asked, rules, goal), csv, geojson, as_json=as_json, planning=planning)
+    goal = Goal(n_marks=marks, probability=probability, is_robust=robust)
+    _deliver(plans.optimise(assembled, rules, goal), csv, geojson, as_json=as_json)
 
 
 @plan.command()
 def random(
-    arrangements: Annotated[int, typer.Option(min=1, help="How many are tried.")] = 100_000,
+    arrangements: Annotated[int, typer.Option(min=1, help="How many are simulated.")] = 100_000,
     least: Annotated[int, typer.Option(help="Least number of marks.")] = 3,
     most: Annotated[int, typer.Option(help="Greatest number of marks.")] = 14,
     distance_m: Annotated[
@@ -197,7 +189,7 @@ def random(
     tolerance_m: Tolerance = 0.03,
     seed: Seed = 0,
     fit_method: Annotated[
-        str, typer.Option(help="Fitting method whose results tell distance and window.")
+        str, typer.Option(help="Fitting method whose results give distance and window.")
     ] = "paper",
     turn_s: TurnS = 13.2,
     rpm: Rpm = 600.0,
@@ -211,65 +203,59 @@ def random(
     ] = None,
     as_json: AsJson = False,
 ) -> None:
-    """Try arrangements at random, as the study does: an error on every centre, pass or fail."""
-    from spheremark.pipelines.placement import Sensor, sensor_model
-    from spheremark.service.planning import random_plans as trials
+    """Simulate random arrangements as in the study: an error on every centre, pass or fail."""
+    from spheremark.pipelines.placement import RandomPlanSpec, sensor_model
+    from spheremark.service.planning import random_plans
     from spheremark.service.planning.centre_models import model_of_surveys
 
-    ask = _ask(data, server, survey)
-    limits = trials.limits_of_results(ask, fit_method, tolerance_m, survey)
-    window = (None, None) if angle_deg is None else (math.radians(v) for v in angle_deg)
-    angle_min, angle_max = window
-    trial = trials.Wanted(
+    query = _query(data, server, survey)
+    limits = random_plans.limits_of_results(query, fit_method, tolerance_m, survey)
+    low, high = (None, None) if angle_deg is None else map(math.radians, angle_deg)
+    spec = RandomPlanSpec(
         n_arrangements=arrangements,
         n_marks=(least, most),
-        distance=distance_m,
-        angle_min=angle_min,
-        angle_max=angle_max,
         error=error_m or None,
         tolerance=tolerance_m,
         seed=seed,
-    ).trial(limits)
-    sensor = Sensor(
-        turn=turn_s,
-        spin_rpm=rpm,
-        step=math.radians(step_deg),
-        rest_revolutions=rest_revolutions,
     )
+    spec = random_plans.within_limits(spec, limits, distance_m, (low, high))
+    sensor = _sensor(turn_s, rpm, step_deg, rest_revolutions)
     model = (
-        sensor_model(sensor) if ask is None else model_of_surveys(ask, sensor, 0.100, survey=survey)
+        sensor_model(sensor)
+        if query is None
+        else model_of_surveys(query, sensor, 0.100, survey=survey)
     )
-    answer = trials.run(trial, model, limits)
+    results = random_plans.run(spec, model, limits)
     if folder:
-        trials.write(folder, answer)
+        random_plans.write(folder, results)
     if as_json:
-        sys.stdout.write(json.dumps(answer, indent=2, allow_nan=False) + "\n")
+        sys.stdout.write(json.dumps(results, indent=2, allow_nan=False) + "\n")
     else:
-        _print_trials(answer)
+        _print_random(results)
 
 
-def _print_trials(answer: dict[str, Any]) -> None:
+def _print_random(results: dict[str, Any]) -> None:
     """Print how many arrangements pass."""
-    limits = answer["limits"]
+    limits = results["limits"]
     out.print(
-        f"{answer['n_arrangements']:,} arrangements from {answer['distance_min_m']:g} to "
-        f"{answer['distance_max_m']:g} m ({limits['distance_source']}), included angles from "
-        f"{answer['angle_min_deg']:g} to {answer['angle_max_deg']:g} deg "
-        f"({limits['angle_source']}): {answer['n_in_window']:,} in the window. "
-        f"Of these {_text(answer['pass_rate_in_window'], 100.0, 1)} % pass, of the others "
-        f"{_text(answer['pass_rate_outside'], 100.0, 1)} %.",
+        f"{results['n_arrangements']:,} arrangements from {results['distance_min_m']:g} to "
+        f"{results['distance_max_m']:g} m ({limits['distance_source']}), included angles from "
+        f"{results['angle_min_deg']:g} to {results['angle_max_deg']:g} deg "
+        f"({limits['angle_source']}): {results['n_in_window']:,} in the window. "
+        f"Of these {_text(results['pass_rate_in_window'], 100.0, 1)} % pass, of the others "
+        f"{_text(results['pass_rate_outside'], 100.0, 1)} %.",
         highlight=False,
     )
     table = _table("marks", "in the window", "pass [%]", "median [mm]", "p95 [mm]")
-    for row in answer["by_number_of_marks"]:
+    for row in results["by_number_of_marks"]:
         table.add_row(str(row["n_marks"]), *_passed(row))
     out.print(table)
     table = _table("worst angle [deg]", "all", "pass [%]", "median [mm]", "p95 [mm]")
-    for row in answer["by_worst_angle"]:
+    for row in results["by_worst_angle"]:
         table.add_row(f"{row['angle_from_deg']:g} - {row['angle_to_deg']:g}", *_passed(row))
     out.print(table)
     table = _table("included angle [deg]", "study [mm]", "here [mm]")
-    for row in answer["table3"]:
+    for row in results["table3"]:
         table.add_row(
             f"{row['included_angle_deg']:.2f}",
             _text(row["study_error_3d_m"], 1e3, 1),
@@ -284,8 +270,20 @@ def _passed(row: dict[str, Any]) -> tuple[str, ...]:
     return f"{row['n']:,}", _text(row["pass_rate"], 100.0, 1), *lengths
 
 
-def _ask(data: Path | None, server: str | None, survey: str) -> Any:
-    """Return what answers SQL, or nothing where no results were named."""
+def _sensor(turn_s: float, rpm: float, step_deg: float, rest_revolutions: int) -> Any:
+    """Return the sensor of the options."""
+    from spheremark.pipelines.placement import Sensor
+
+    return Sensor(
+        turn=turn_s,
+        spin_rpm=rpm,
+        step=math.radians(step_deg),
+        rest_revolutions=rest_revolutions,
+    )
+
+
+def _query(data: Path | None, server: str | None, survey: str) -> Any:
+    """Return the source of results that executes SQL, if one was named."""
     if data is None and server is None:
         if survey:
             raise ConfigError("--survey needs --data or --url, which say where its fits are.")
@@ -295,37 +293,39 @@ def _ask(data: Path | None, server: str | None, survey: str) -> Any:
     from spheremark.service.settings import Settings
 
     settings = Settings(data=data) if data else Settings()
-    ask = Source(settings, server, folder=data).query
-    require_survey(ask, survey)
-    return ask
+    query = Source(settings, server, folder=data).query
+    require_survey(query, survey)
+    return query
 
 
 def _deliver(
-    answer: dict[str, Any], csv: Path | None, geojson: Path | None, *, as_json: bool, planning: Any
+    found: dict[str, Any], csv: Path | None, geojson: Path | None, *, as_json: bool
 ) -> None:
-    """Write an answer to files and to standard output."""
+    """Write a plan to files and to standard output."""
+    from spheremark.service.serialise.plans import to_csv, to_geojson
+
     if csv:
-        csv.write_text(planning.to_csv(answer), encoding="utf-8")
+        csv.write_text(to_csv(found), encoding="utf-8")
     if geojson:
-        geojson.write_text(json.dumps(planning.to_geojson(answer)) + "\n", encoding="utf-8")
+        geojson.write_text(json.dumps(to_geojson(found)) + "\n", encoding="utf-8")
     if as_json:
-        sys.stdout.write(json.dumps(answer, indent=2, allow_nan=False) + "\n")
+        sys.stdout.write(json.dumps(found, indent=2, allow_nan=False) + "\n")
     else:
-        _print(answer)
+        _print(found)
 
 
-def _print(answer: dict[str, Any]) -> None:
+def _print(plan: dict[str, Any]) -> None:
     """Print marks and stops as tables."""
-    out.print(f"[bold]{escape(answer['site']['name'])}[/], method {answer['method']}")
-    out.print(answer["model"]["text"], markup=False, highlight=False)
+    out.print(f"[bold]{escape(plan['site']['name'])}[/], method {plan['method']}")
+    out.print(plan["model"]["text"], markup=False, highlight=False)
     table = _table("mark", "x [m]", "y [m]", "z [m]", "pole [m]")
-    for mark in answer["marks"]:
+    for mark in plan["marks"]:
         place = (f"{v:.3f}" for v in mark["position_m"])
         table.add_row(escape(mark["name"]), *place, _text(mark["pole_height_m"], 1, 2))
     out.print(table)
-    tolerance = f"P(<= {1e3 * answer['tolerance_m']:g} mm)"
+    tolerance = f"P(<= {1e3 * plan['tolerance_m']:g} mm)"
     table = _table("stop", "sigma 3-D [mm]", tolerance, "marks", "angles [deg]", "note")
-    for stop in answer["stops"]:
+    for stop in plan["stops"]:
         angles = (_text(stop[f"included_angle_{which}_deg"], 1, 0) for which in ("min", "max"))
         table.add_row(
             escape(stop["name"]),
@@ -336,9 +336,9 @@ def _print(answer: dict[str, Any]) -> None:
             escape(stop["reason"]),
         )
     out.print(table)
-    for line in answer.get("notes", ()):
+    for line in plan.get("notes", ()):
         out.print(line, markup=False, highlight=False)
-    if one := answer.get("one_more"):
+    if one := plan.get("one_more"):
         at = ", ".join(f"{v:.2f}" for v in one["position_m"])
         out.print(
             f"One more mark at {at} m (pole {one['pole_height_m']:.2f} m) would bring the worst "
@@ -356,5 +356,5 @@ def _table(*headings: str) -> Table:
 
 
 def _text(value: float | None, factor: float, digits: int) -> str:
-    """Return a number as people read it; a dash for none."""
+    """Return a number in a larger unit; a dash for none."""
     return "-" if value is None else f"{factor * value:.{digits}f}"

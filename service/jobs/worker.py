@@ -136,19 +136,19 @@ def compile_kernels() -> None:
 def _compile_planner() -> None:
     """Evaluate and optimise a small plan, so that the planner's page responds at once."""
     from spheremark.pipelines.placement import Goal, PlaceRules, Requirement, Sensor, sensor_model
-    from spheremark.service.planning import plans as siting
-    from spheremark.service.planning.requests import Asked, simulated_ground
+    from spheremark.service.planning import plans
+    from spheremark.service.planning.requests import Plan, simulated_ground
 
     ground = simulated_ground("paper-field")
-    asked = Asked(
+    plan = Plan(
         ground=ground,
         stops=ground.stops,
         marks=ground.marks,
         model=sensor_model(Sensor(), ground.site.marker_radius),
         requirement=Requirement(),
     )
-    siting.evaluate(asked)
-    siting.optimise(asked, PlaceRules(spacing=4.0), Goal(n_marks=3))
+    plans.evaluate(plan)
+    plans.optimise(plan, PlaceRules(spacing=4.0), Goal(n_marks=3))
 
 
 if __name__ == "__main__":

@@ -13,27 +13,13 @@ from spheremark.pipelines.placement import CentreModel, FitRows, Sensor, fitted_
 ROWS_MOST = 5_000
 """Fits that a model is made from at most: the newest."""
 
-Ask = Callable[[str], dict[str, Any]]
-"""Answers one SELECT with ``columns`` and ``rows``, as ``POST /api/v1/sql`` does."""
+Query = Callable[[str], dict[str, Any]]
+"""Executes one SELECT; returns ``columns`` and ``rows`` as ``POST /api/v1/sql`` does."""
 
 _NUMBERS = (
-    "range_m",
-    "n_points",
-    "incidence_deg",
-    "mean_intensity",
-    "x_m",
-    "y_m",
-    "z_m",
-    "cov_xx_m2",
-    "cov_xy_m2",
-    "cov_xz_m2",
-    "cov_yy_m2",
-    "cov_yz_m2",
-    "cov_zz_m2",
-    "sigma_heading_deg",
-    "duration_s",
-    "dof",
-    "sigma0",
+    *("range_m", "n_points", "incidence_deg", "mean_intensity", "x_m", "y_m", "z_m"),
+    *(f"cov_{axes}_m2" for axes in ("xx", "xy", "xz", "yy", "yz", "zz")),
+    *("sigma_heading_deg", "duration_s", "dof", "sigma0"),
 )
 _SQL = """
 WITH newest AS (
@@ -62,38 +48,36 @@ _NAME_MOST = 200  # characters
 
 
 def model_of_surveys(
-    ask: Ask,
+    query: Query,
     sensor: Sensor,
     radius: float,
     *,
     survey: str = "",
     fit_method: str = "along_beam",
 ) -> CentreModel:
-    """Return the model that surveys tell; that of the sensor where they hold too little."""
-    rows = read_fit_rows(ask, radius, survey=survey, fit_method=fit_method)
+    """Return the model of surveys; that of the sensor where they have too few fits."""
+    rows = read_fit_rows(query, radius, survey=survey, fit_method=fit_method)
     return sensor_model(sensor, radius) if rows is None else fitted_model(sensor, radius, rows)
 
 
-def require_survey(ask: Ask, survey: str) -> None:
-    """Refuse the name of a survey that is not there; no name is all surveys."""
-    name = quoted(survey)
-    if survey and not ask(_KNOWN.format(survey=name))["rows"]:
+def require_survey(query: Query, survey: str) -> None:
+    """Raise NotFoundError for a survey that does not exist; no name means all surveys."""
+    if survey and not query(_KNOWN.format(survey=quoted(survey)))["rows"]:
         raise NotFoundError(f"There is no survey {survey!r} whose fits could be taken.")
 
 
-def read_fit_rows(ask: Ask, radius: float, *, survey: str, fit_method: str) -> FitRows | None:
-    """Return the newest fits of surveys; none where there are none."""
+def read_fit_rows(query: Query, radius: float, *, survey: str, fit_method: str) -> FitRows | None:
+    """Return the newest fits of surveys, if there are any."""
     if len(survey) > _NAME_MOST:
         raise InputError(f"The name of the survey has {len(survey)} characters.")
     sql = _SQL.format(
         method=quoted(fit_method), survey=quoted(survey), radius=float(radius), most=ROWS_MOST
     )
-    answer = ask(sql)
-    names = [column["name"] for column in answer["columns"]]
-    rows = answer["rows"]
-    if not rows:
+    found = query(sql)
+    if not found["rows"]:
         return None
-    columns = dict(zip(names, zip(*rows, strict=True), strict=True))
+    names = [column["name"] for column in found["columns"]]
+    columns = dict(zip(names, zip(*found["rows"], strict=True), strict=True))
     numbers = {
         name: np.array([np.nan if v is None else v for v in columns[name]], dtype=np.float64)
         for name in _NUMBERS
@@ -116,12 +100,12 @@ def read_fit_rows(ask: Ask, radius: float, *, survey: str, fit_method: str) -> F
 
 
 def quoted(text: str) -> str:
-    """Return a text as it stands between the quotes of SQL."""
+    """Return a text escaped for a literal of SQL."""
     return text.replace("'", "''")
 
 
 def _variances(numbers: dict[str, np.ndarray]) -> np.ndarray:
-    """Return variances towards, left and up; that of the heading taken off [m^2]."""
+    """Return variances towards, left and up, without that of the heading [m^2]."""
     p = np.column_stack([numbers["x_m"], numbers["y_m"], numbers["z_m"]])
     keys = (("xx", "xy", "xz"), ("xy", "yy", "yz"), ("xz", "yz", "zz"))
     cov = np.stack(

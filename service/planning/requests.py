@@ -1,7 +1,7 @@
-"""Plans for pages and programs: what is asked, put together from what is kept.
+"""The parts of plans: fields, places, models, and the visibility of marks.
 
-Hides what makes a map follow a mark that is dragged: worlds are made once, and what can be seen of
-a mark is looked up again only for the mark that moved.
+Hides what makes a map follow a dragged mark: fields are made once, and the visibility is found
+again for the moved mark only.
 """
 
 from __future__ import annotations
@@ -27,10 +27,7 @@ from spheremark.pipelines.placement import (
     Site,
     Stops,
     Visibility,
-    evaluate,
-    field_map,
     find_visibility,
-    map_stations,
     marks_of_field,
     sensor_model,
     site_of_field,
@@ -38,7 +35,6 @@ from spheremark.pipelines.placement import (
 )
 from spheremark.pipelines.simulation import scenario
 from spheremark.service.planning.centre_models import model_of_surveys
-from spheremark.service.serialise.plans import Plain, evaluation_json, map_json
 from spheremark.storage.catalogue import plans as kept
 from spheremark.storage.catalogue.catalogue import Catalogue
 from spheremark.storage.imports.terrain import open_terrain
@@ -48,23 +44,23 @@ SCENARIOS = {
     "rock-field": "field of rocks (simulated)",
     "clutter-field": "field with clutter (simulated)",
 }
-"""Simulated fields that can be planned on, as their key and what people call them."""
+"""Keys and names of the simulated fields that can be planned on."""
 
 AUTOMATIC, SENSOR_ALONE, _SURVEY = "auto", "sensor", "survey:"
-TERRAIN = "terrain:"  # before the id of an uploaded one
+TERRAIN = "terrain:"  # before the id of an uploaded terrain
 _GROUNDS_KEPT = 6
 _MODELS_KEPT = 8
 _NEWEST = "SELECT max(finished_at) AS finished_at, count(*) AS n FROM runs"
-_SIGHTS_KEPT = 400  # marks; of a map of 64 x 64 places each takes 130 kB
+_COLUMNS_KEPT = 400  # marks; of a map of 64 x 64 places each takes 130 kB
 _ROUND_IT = 3.0  # [m] shown around the outermost marks
 _SEED_DIGITS = 18  # a seed of more digits is a mistake
 _POLE_MOST = 100.0  # [m] above the ground, beyond which the height of a mark is a mistake
-_STOPS_ACROSS = 3  # of a terrain for which nobody has said where the rover stops
+_STOPS_ACROSS = 3  # of a terrain without given stops
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Ground:
-    """A field to plan on, with the stops and the marks that one may begin with."""
+    """A field to plan on, with its own stops and marks."""
 
     key: str
     site: Site
@@ -87,8 +83,8 @@ class Ground:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Asked:
-    """A plan, put together: what is judged, by which model, and what is wanted of it."""
+class Plan:
+    """An arrangement on its field, with the model and the requirement of its evaluation."""
 
     ground: Ground
     stops: Stops
@@ -163,7 +159,7 @@ def stops_at(site: Site, places: Sequence[tuple[str, float, float]]) -> Stops:
 
 
 def marks_at(site: Site, places: Sequence[Place]) -> Arrangement:
-    """Return marks where they are said to stand."""
+    """Return marks at places on a site; refuse places off the terrain or at absurd heights."""
     xy = np.array([(place.x, place.y) for place in places], dtype=np.float64).reshape(-1, 2)
     ground = site.ground_at(xy)
     heights = np.empty(len(places))
@@ -176,8 +172,8 @@ def marks_at(site: Site, places: Sequence[Place]) -> Arrangement:
         heights[k] = place.z if place.z is not None else ground[k] + (place.pole or 0.0)
         if not heights[k] <= ground[k] + _POLE_MOST:
             raise InputError(
-                f"Mark {place.name} is {heights[k] - ground[k]:g} m above the ground; a pole of "
-                f"{_POLE_MOST:g} m is the highest that can be meant."
+                f"Mark {place.name} is {heights[k] - ground[k]:g} m above the ground; a pole has "
+                f"{_POLE_MOST:g} m at most."
             )
         if heights[k] < ground[k] + site.marker_radius:
             raise InputError(
@@ -191,24 +187,22 @@ def marks_at(site: Site, places: Sequence[Place]) -> Arrangement:
 
 
 def _extent_text(site: Site) -> str:
-    """Say how far a terrain reaches."""
+    """Return the extent of a terrain as a part of a sentence."""
     return (
         f"it reaches from {site.xs[0]:g} to {site.xs[-1]:g} m in x and from {site.ys[0]:g} to "
         f"{site.ys[-1]:g} m in y"
     )
 
 
-class Lookout:
-    """What can be seen of marks, each looked for once while it stands where it stands."""
+class VisibilityCache:
+    """Visibility of marks, found once for each position of a mark."""
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
         self._known: OrderedDict[tuple[str, bytes, bytes], Visibility] = OrderedDict()
 
-    def find_visibility(
-        self, ground: Ground, stations_site: Array, marks: Arrangement
-    ) -> Visibility:
-        """Return what ``pipelines.placement.find_visibility`` does."""
+    def find(self, ground: Ground, stations_site: Array, marks: Arrangement) -> Visibility:
+        """Return the result of ``placement.find_visibility``."""
         stations = hashlib.sha256(np.ascontiguousarray(stations_site).tobytes()).digest()
         keys = [(ground.key, stations, p.tobytes()) for p in marks.p_site]
         with self._lock:
@@ -225,31 +219,31 @@ class Lookout:
         return Visibility.joined([known[key] for key in keys])
 
     def _remember(self, fresh: dict[tuple[str, bytes, bytes], Visibility]) -> None:
-        """Keep what is new, and forget what is oldest."""
+        """Store new entries and drop the oldest."""
         with self._lock:
             self._known.update(fresh)
-            while len(self._known) > _SIGHTS_KEPT:
+            while len(self._known) > _COLUMNS_KEPT:
                 self._known.popitem(last=False)
 
 
 class Planner:
-    """What plans of a service have in common: its fields, its models, and what is in sight."""
+    """What the plans of a service share: its fields, its models, and the visibility of marks."""
 
     def __init__(self, catalogue: Catalogue) -> None:
         self._catalogue = catalogue
-        self._lookout = Lookout()
+        self.visibility = VisibilityCache()
         self._lock = threading.Lock()
         self._models: dict[tuple[Any, ...], CentreModel] = {}
 
     def ground(self, key: str) -> Ground:
-        """Return the field of a key; NotFoundError if there is none."""
+        """Return the field of a key; raise NotFoundError if there is none."""
         if not key.startswith(TERRAIN):
             return simulated_ground(key)
         known = kept.get_terrain(self._catalogue, key.removeprefix(TERRAIN))
         return terrain_ground(key, known["name"], Path(known["url"]))
 
     def model(self, key: str, sensor: Sensor, radius: float) -> CentreModel:
-        """Return the model of centres that was asked for, as of the newest results."""
+        """Return a model of centres by its key, from the newest results."""
         if key == SENSOR_ALONE:
             return sensor_model(sensor, radius)
         survey = key.removeprefix(_SURVEY)
@@ -263,40 +257,18 @@ class Planner:
         else:
             survey = ""
         (newest,) = self._catalogue.rows(_NEWEST)
-        asked = (survey, sensor, radius, newest["finished_at"], newest["n"])
+        version = (survey, sensor, radius, newest["finished_at"], newest["n"])
         with self._lock:
-            known = self._models.get(asked)
+            known = self._models.get(version)
         if known is None:
-            known = model_of_surveys(self.ask, sensor, radius, survey=survey)
+            known = model_of_surveys(self.query, sensor, radius, survey=survey)
             with self._lock:
-                self._models = {**dict(list(self._models.items())[-_MODELS_KEPT:]), asked: known}
+                newest_models = dict(list(self._models.items())[-_MODELS_KEPT:])
+                self._models = {**newest_models, version: known}
         return known
 
-    def ask(self, sql: str) -> Plain:
-        """Answer a SELECT of our own from the catalogue, as the SQL of people is answered."""
+    def query(self, sql: str) -> dict[str, Any]:
+        """Execute a SELECT on the catalogue, in the form of ``POST /api/v1/sql``."""
         table = self._catalogue.table(sql)
         rows = zip(*(column.to_pylist() for column in table.columns), strict=True)
         return {"columns": [{"name": name} for name in table.column_names], "rows": list(rows)}
-
-    def evaluate(self, asked: Asked) -> Plain:
-        """Return what an arrangement promises at its stops."""
-        visibility = self._lookout.find_visibility(asked.ground, asked.stops.p_site, asked.marks)
-        site = asked.ground.site
-        found = evaluate(
-            site, asked.stops, asked.marks, asked.model, asked.requirement, visibility=visibility
-        )
-        return evaluation_json(site, asked.model, found)
-
-    def field(self, asked: Asked, n_across: int) -> Plain:
-        """Return what an arrangement promises on a grid over the part that a map shows."""
-        x0, y0, x1, y1 = asked.ground.view
-        step = max(x1 - x0, y1 - y0) / n_across
-        xs, ys = (np.arange(a + step / 2, b, step) for a, b in ((x0, x1), (y0, y1)))
-        site = asked.ground.site
-        stations, _ = map_stations(site, xs, ys)
-        visibility = self._lookout.find_visibility(asked.ground, stations, asked.marks)
-        return map_json(
-            field_map(
-                site, xs, ys, asked.marks, asked.model, asked.requirement, visibility=visibility
-            )
-        )

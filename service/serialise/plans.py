@@ -1,7 +1,4 @@
-"""The JSON of plans: evaluations as plain values, every number with its unit.
-
-A public interface of ``spheremark plan`` and of ``/api/v1/plans``: what is unknown is null.
-"""
+"""The JSON of plans: a public interface of ``spheremark plan`` and of ``/api/v1/plans``."""
 
 from __future__ import annotations
 
@@ -19,15 +16,23 @@ from spheremark.pipelines.placement import (
     CentreModel,
     Evaluation,
     FieldMap,
+    Goal,
+    Optimum,
+    PassRate,
+    Proposal,
+    RandomPlanResults,
     Site,
     Stops,
+    by_number,
+    by_worst_angle,
 )
+from spheremark.pipelines.published import TABLE_3
 
 Plain = dict[str, Any]
 
 
 def evaluation_json(site: Site, model: CentreModel, found: Evaluation) -> Plain:
-    """Return what an arrangement promises."""
+    """Return the evaluation of an arrangement."""
     worst = int(np.argmax(np.where(np.isfinite(found.sigma_3d), found.sigma_3d, np.inf)))
     return {
         "site": {"name": site.name},
@@ -44,7 +49,7 @@ def evaluation_json(site: Site, model: CentreModel, found: Evaluation) -> Plain:
 
 
 def marks_json(site: Site, marks: Arrangement) -> list[Plain]:
-    """Return marks with the ground under them and the poles that they need."""
+    """Return marks with the ground under them and the heights of their poles."""
     ground = site.ground_at(marks.p_site)
     return [
         {
@@ -58,7 +63,7 @@ def marks_json(site: Site, marks: Arrangement) -> list[Plain]:
 
 
 def stop_json(found: Evaluation, i: int) -> Plain:
-    """Return what an arrangement promises at one stop."""
+    """Return the evaluation of one stop."""
     marks = found.marks.names
     low, high = np.degrees(found.angles[i])
     has_angle = found.n_used[i] >= 2
@@ -75,12 +80,12 @@ def stop_json(found: Evaluation, i: int) -> Plain:
         "dop": _number(found.dop[i]),
         "dof": int(found.dof[i]),
         "reason": found.reasons[i],
-        "marks": [_sighting(found, i, k) for k in range(len(marks))],
+        "marks": [_mark_at_stop(found, i, k) for k in range(len(marks))],
     }
 
 
-def _sighting(found: Evaluation, i: int, k: int) -> Plain:
-    """Return what one mark does for one stop."""
+def _mark_at_stop(found: Evaluation, i: int, k: int) -> Plain:
+    """Return the evaluation of one mark from one stop."""
     return {
         "name": found.marks.names[k],
         "is_seen": bool(found.is_seen[i, k]),
@@ -94,8 +99,122 @@ def _sighting(found: Evaluation, i: int, k: int) -> Plain:
     }
 
 
+def optimum_json(found: Optimum, goal: Goal) -> Plain:
+    """Return the quality of an optimum, beside its evaluation."""
+    share = found.log_det / found.log_det_bound
+    kept = f"with {100 * goal.probability:g} % at every stop"
+    if found.is_kept:
+        text = f"is kept {kept}" + ", after the loss of any one mark too" * goal.is_robust
+    elif found.evaluation.worst_probability >= goal.probability:
+        text = f"is kept {kept}, but NOT after the loss of any one mark"
+    else:
+        text = f"is NOT kept {kept}"
+    notes = [f"The tolerance {text}."]
+    if np.isfinite(found.worst_after_loss):
+        worst = 1e3 * found.worst_after_loss
+        notes[0] += f" Without its worst mark: {worst:.2f} mm (3-D sigma)."
+    if np.isfinite(found.log_det):
+        notes.append(
+            f"{found.n_candidates:,} places compared; {100 * share:.1f} % of the information that "
+            "no arrangement of as many marks can exceed."
+        )
+    return {
+        "optimum": {
+            "keeps_tolerance": found.is_kept,
+            "probability": goal.probability,
+            "is_robust": goal.is_robust,
+            "worst_sigma_3d_after_loss_m": _number(found.worst_after_loss),
+            "information_gain": _number(found.log_det),
+            "information_gain_bound": _number(found.log_det_bound),
+            "share_of_bound": _number(share),
+            "n_candidates": found.n_candidates,
+            "n_exchanges": found.n_exchanges,
+        },
+        "notes": notes,
+    }
+
+
+def proposal_json(site: Site, found: Proposal) -> Plain:
+    """Return one more mark, with the accuracy without and with it."""
+    before, after = found.before.sigma_3d, found.after.sigma_3d
+    return marks_json(site, found.after.marks)[-1] | {
+        "worst_sigma_3d_before_m": _number(before.max()),
+        "worst_sigma_3d_m": _number(after.max()),
+        "mean_sigma_3d_before_m": _number(before.mean()),
+        "mean_sigma_3d_m": _number(after.mean()),
+        "worst_probability_within_tolerance": found.after.worst_probability,
+        "stops": [
+            {"name": name, "sigma_3d_before_m": _number(a), "sigma_3d_m": _number(b)}
+            for name, a, b in zip(found.after.stops.names, before, after, strict=True)
+        ],
+    }
+
+
+def random_plans_json(
+    results: RandomPlanResults,
+    model: CentreModel | None,
+    limits: Plain,
+    by_angle: tuple[np.ndarray, np.ndarray],
+    table_3: np.ndarray,
+) -> Plain:
+    """Return pass rates of random plans, and the errors by included angle and of Table 3."""
+    spec, inside, passes = results.spec, results.is_in_window, results.passes
+    angles, curve = np.degrees(by_angle[0]), by_angle[1]
+    kept = angles[curve <= spec.tolerance]
+    return {
+        "n_arrangements": spec.n_arrangements,
+        "seed": spec.seed,
+        "tolerance_m": spec.tolerance,
+        "error_per_axis_m": spec.error,
+        "model": None if model is None else model_json(model),
+        "distance_min_m": spec.distances[0],
+        "distance_max_m": spec.distances[1],
+        "angle_min_deg": float(np.degrees(spec.angles[0])),
+        "angle_max_deg": float(np.degrees(spec.angles[1])),
+        "limits": limits,
+        "n_in_window": int(inside.sum()),
+        "pass_rate": float(passes.mean()),
+        "pass_rate_in_window": float(passes[inside].mean()) if inside.any() else None,
+        "pass_rate_outside": float(passes[~inside].mean()) if not inside.all() else None,
+        "by_number_of_marks": [
+            {"n_marks": int(row.low), **_pass_rate(row)} for row in by_number(results)
+        ],
+        "by_worst_angle": [
+            {"angle_from_deg": row.low, "angle_to_deg": row.high, **_pass_rate(row)}
+            for row in by_worst_angle(results)
+        ],
+        "by_included_angle": [
+            {"included_angle_deg": float(a), "median_error_3d_m": float(e)}
+            for a, e in zip(angles, curve, strict=True)
+        ],
+        "table3": [
+            {
+                "included_angle_deg": float(np.degrees(a)),
+                "study_error_3d_m": float(published),
+                "median_error_3d_m": float(e),
+            }
+            for a, published, e in zip(
+                TABLE_3.included_angles, TABLE_3.errors, table_3, strict=True
+            )
+        ],
+        "window_that_keeps_tolerance_deg": (
+            [float(kept.min()), float(kept.max())] if len(kept) else None
+        ),
+    }
+
+
+def _pass_rate(row: PassRate) -> Plain:
+    """Return the pass rate of a class."""
+    return {
+        "n": row.n,
+        "pass_rate": _number(row.share),
+        "median_error_3d_m": _number(row.median),
+        "p95_error_3d_m": _number(row.p95),
+    }
+
+
 def map_json(field: FieldMap) -> Plain:
-    """Return what an arrangement promises on a grid of places, rows along y."""
+    """Return an evaluation on a grid of places, rows along y."""
     return {
         "x_m": _numbers(field.xs),
         "y_m": _numbers(field.ys),
@@ -106,7 +225,7 @@ def map_json(field: FieldMap) -> Plain:
 
 
 def site_json(site: Site, stops: Stops, marks: Arrangement, *, n_across: int) -> Plain:
-    """Return a field to plan on: its ground, thinned, and what one may begin with."""
+    """Return a field to plan on: its ground, thinned, its stops and its marks."""
     step = max(1, math.ceil(max(site.ground.shape) / n_across))
     return {
         "name": site.name,
@@ -129,7 +248,7 @@ def site_json(site: Site, stops: Stops, marks: Arrangement, *, n_across: int) ->
 
 
 def model_json(model: CentreModel) -> Plain:
-    """Return which model of centres predicted, and which rows it came from."""
+    """Return a model of centres and its origin."""
     origin = model.provenance
     return {
         "version": model.version,
@@ -145,7 +264,7 @@ def model_json(model: CentreModel) -> Plain:
 
 
 def model_text(model: CentreModel) -> str:
-    """Say in a sentence or two where the accuracy of centres comes from."""
+    """Return the origin of the accuracy of centres, for people."""
     origin = model.provenance
     if origin.source == "sensor":
         text = "Accuracy of centres from the sensor."
@@ -171,12 +290,12 @@ _COLUMNS = (
 )
 
 
-def to_csv(answer: Mapping[str, Any]) -> str:
-    """Return marks to stake out, and what each stop may expect, as one table."""
+def to_csv(evaluation: Mapping[str, Any]) -> str:
+    """Return marks to stake out and the accuracy of each stop as one table."""
     text = io.StringIO()
     writer = csv.DictWriter(text, _COLUMNS, restval="", lineterminator="\n", extrasaction="ignore")
     writer.writeheader()
-    for kind, rows in (("mark", answer["marks"]), ("stop", answer["stops"])):
+    for kind, rows in (("mark", evaluation["marks"]), ("stop", evaluation["stops"])):
         for row in rows:
             place = dict(zip(("x_m", "y_m", "z_m"), row["position_m"], strict=True))
             writer.writerow({"kind": kind, **_short({**row, **place})})
@@ -184,21 +303,21 @@ def to_csv(answer: Mapping[str, Any]) -> str:
 
 
 def _short(row: Plain) -> Plain:
-    """Return a row with lengths to the micrometre, and probabilities as long as they are."""
+    """Return a row with lengths to the micrometre."""
     return {
         key: round(value, 6) if key.endswith("_m") and isinstance(value, float) else value
         for key, value in row.items()
     }
 
 
-def to_geojson(answer: Mapping[str, Any]) -> Plain:
-    """Return marks and stops of an answer as GeoJSON, in metres of the site frame."""
+def to_geojson(evaluation: Mapping[str, Any]) -> Plain:
+    """Return marks and stops as GeoJSON, in metres of the site frame."""
     features = [
-        _feature("mark", one, ("name", "ground_m", "pole_height_m")) for one in answer["marks"]
+        _feature("mark", one, ("name", "ground_m", "pole_height_m")) for one in evaluation["marks"]
     ]
     features += [
         _feature("stop", one, ("name", "sigma_3d_m", "probability_within_tolerance", "n_used"))
-        for one in answer["stops"]
+        for one in evaluation["stops"]
     ]
     return {"type": "FeatureCollection", "features": features}
 
@@ -218,13 +337,13 @@ def _number(value: float) -> float | None:
 
 
 def _numbers(values: ArrayLike) -> Any:
-    """Return an array as nested lists, with null where JSON has no number."""
+    """Return an array as nested lists; unknown is null."""
     array = np.asarray(values, dtype=np.float64)
     return array.tolist() if np.isfinite(array).all() else _with_nulls(array)
 
 
 def _rounded(grid: np.ndarray, digits: int) -> Any:
-    """Return a grid with as many digits as anybody reads."""
+    """Return a rounded grid."""
     return _with_nulls(np.round(grid, digits))
 
 

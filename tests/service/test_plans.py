@@ -7,6 +7,7 @@ import rasterio
 from fastapi.testclient import TestClient
 from rasterio.transform import Affine
 
+from spheremark.service.http.api.plan_models import MappedEvaluation
 from spheremark.service.http.app import create_app
 from spheremark.service.settings import Settings
 from spheremark.storage.catalogue.catalogue import Catalogue
@@ -53,7 +54,7 @@ def terrain(tmp_path, heights, cell=0.5):
     return path
 
 
-def test_an_answer_given_back_is_answered_alike(client):
+def test_marks_of_a_response_give_the_same_response(client):
     first = evaluated(client)
     again = evaluated(
         client, marks=[{k: m[k] for k in ("name", "position_m")} for m in first["marks"]]
@@ -63,13 +64,34 @@ def test_an_answer_given_back_is_answered_alike(client):
     assert all(0 < stop["sigma_3d_m"] < 0.03 for stop in first["stops"])
 
 
-def test_a_mark_that_moves_is_looked_for_anew_and_the_others_are_not_forgotten(client):
+def test_a_moved_mark_is_evaluated_like_a_new_one(client):
     evaluated(client)
     moved = evaluated(client, marks=[{**MARKS[0], "x_m": 7.5}, *MARKS[1:]])
     fresh = evaluated(client, marks=[*MARKS[1:], {**MARKS[0], "x_m": 7.5}])
     assert [s["sigma_3d_m"] for s in moved["stops"]] == pytest.approx(
         [s["sigma_3d_m"] for s in fresh["stops"]], rel=1e-9
     )
+
+
+def test_evaluations_are_as_documented(client):
+    """The other routes check their responses themselves; a map is too large for that."""
+    response = evaluated(client, field_cells=6, marks=[MARKS[0]])
+    found = MappedEvaluation.model_validate(response)
+    assert found.stops[0].sigma_3d_m is None
+    assert found.model_dump(mode="json") == response
+
+
+def test_the_interface_describes_what_every_route_of_plans_gives(client):
+    interface = client.get("/openapi.json").json()
+    routes = {path: one for path, one in interface["paths"].items() if "/plans" in path}
+    assert len(routes) == 7
+    for path, methods in routes.items():
+        for method in methods.values():
+            (code,) = {"200", "201"} & set(method["responses"])
+            schema = method["responses"][code]["content"]["application/json"]["schema"]
+            described = interface["components"]["schemas"][schema["$ref"].rsplit("/", 1)[-1]]
+            assert described["properties"], path
+            assert not described.get("additionalProperties"), path
 
 
 def test_the_map_agrees_with_a_stop_that_stands_on_it(client):
@@ -105,7 +127,7 @@ def test_optimised_marks_are_better_than_those_one_began_with(client):
     assert evaluated(client, marks=keep)["stops"] == best["stops"]
 
 
-def test_trials_at_random_take_the_speeds_of_the_scans(client):
+def test_random_plans_use_the_speeds_of_the_scans(client):
     """Coarser steps put fewer lines on spheres: larger errors of the model, fewer that pass."""
     trial = {"n_arrangements": 2_000, "error_per_axis_m": None, "model": "sensor"}
 
@@ -165,10 +187,12 @@ def test_one_more_mark_is_suggested_that_helps(client):
     assert answer["worst_sigma_3d_m"] < answer["worst_sigma_3d_before_m"]
 
 
-def test_a_kept_plan_stands_beside_what_came_of_it(client):
+def test_a_stored_plan_stands_beside_its_results(client):
     kept = client.post("/api/v1/plans", json={"marks": MARKS, "name": "first", "survey": "field"})
     assert kept.status_code == 201
     found = client.get(kept.headers["Location"]).json()
+    listed = client.get("/api/v1/plans", params={"survey": "field"}).json()["items"]
+    assert {key: found[key] for key in listed[0]} == listed[0]
     surveyed = [stop for stop in found["stops"] if stop["run_id"]]
     assert {stop["stop"] for stop in surveyed} == {"lane3-stop1", "lane3-stop2"}
     fix = client.get("/api/v1/station-fixes", params={"fit_method": "along_beam"}).json()["items"]
@@ -230,7 +254,7 @@ def test_what_cannot_be_planned_is_refused_with_the_reason(client, wrong, said):
     assert said in refused(client, **wrong)
 
 
-def test_marks_at_random_come_as_an_answer_and_as_a_page(client):
+def test_random_plans_come_as_json_and_as_a_page(client):
     wanted = {"n_arrangements": 3000, "n_marks_max": 5, "distance_max_m": 7.5}
     answer = client.post("/api/v1/plans/random", json=wanted).json()
     assert [row["n_marks"] for row in answer["by_number_of_marks"]] == [3, 4, 5]

@@ -1,4 +1,4 @@
-"""Figures of the study's procedure: how many arrangements at random pass, and why."""
+"""Figures of the study's procedure: pass rates of random arrangements, and their cause."""
 
 from __future__ import annotations
 
@@ -15,9 +15,9 @@ from spheremark.web.figures.elements import add_tolerance
 _MM = 1e3  # [mm/m]
 
 
-def pass_rate_by_number(answer: Mapping[str, Any]) -> go.Figure:
+def pass_rate_by_number(results: Mapping[str, Any]) -> go.Figure:
     """Draw the share of arrangements that pass against their number of marks."""
-    rows = answer["by_number_of_marks"]
+    rows = results["by_number_of_marks"]
     figure = go.Figure(
         go.Bar(
             x=[row["n_marks"] for row in rows],
@@ -30,9 +30,9 @@ def pass_rate_by_number(answer: Mapping[str, Any]) -> go.Figure:
     return _finished(figure, "Arrangements at random that keep the tolerance")
 
 
-def pass_rate_by_angle(answer: Mapping[str, Any]) -> go.Figure:
+def pass_rate_by_angle(results: Mapping[str, Any]) -> go.Figure:
     """Draw the share of arrangements that pass against their worst included angle."""
-    rows = [row for row in answer["by_worst_angle"] if row["n"]]
+    rows = [row for row in results["by_worst_angle"] if row["n"]]
     middles = [(row["angle_from_deg"] + row["angle_to_deg"]) / 2 for row in rows]
     figure = go.Figure(
         go.Bar(
@@ -48,9 +48,9 @@ def pass_rate_by_angle(answer: Mapping[str, Any]) -> go.Figure:
     return _finished(figure, "The same by the worst included angle of the three marks used")
 
 
-def error_by_angle(answer: Mapping[str, Any]) -> go.Figure:
+def error_by_angle(results: Mapping[str, Any]) -> go.Figure:
     """Draw the error of a position against the included angle, with what the study published."""
-    rows = answer["by_included_angle"]
+    rows = results["by_included_angle"]
     figure = go.Figure(
         go.Scatter(
             x=[row["included_angle_deg"] for row in rows],
@@ -67,7 +67,7 @@ def error_by_angle(answer: Mapping[str, Any]) -> go.Figure:
         name="the study, Table 3",
         marker={"color": theme.MUTED, "symbol": "diamond", "size": 9},
     )
-    add_tolerance(figure, answer["tolerance_m"])
+    add_tolerance(figure, results["tolerance_m"])
     figure.add_vrect(
         x0=float(np.degrees(LEAST_ANGLE)),
         x1=float(np.degrees(WIDEST_ANGLE)),

@@ -1,4 +1,4 @@
-"""Pages of plans: the planner itself, and a kept plan with what came of it."""
+"""Pages of plans: the planner, a stored plan with its results, and random plans."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from urllib.parse import urlencode
 import plotly.graph_objects as go
 
 from spheremark.web import theme
-from spheremark.web.figures import random_plans as trials
+from spheremark.web.figures import random_plans
 from spheremark.web.figures.elements import blank_figure
 from spheremark.web.pages.base import Frame, Panel
 from spheremark.web.templating import render
@@ -22,7 +22,7 @@ _WITHIN_95 = 0.95
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class PlannerPage:
-    """The planner: fields that can be planned on, as ``key`` and ``name``, and kept plans."""
+    """The planner: fields that can be planned on, as ``key`` and ``name``, and stored plans."""
 
     frame: Frame
     sites: Sequence[Row]
@@ -31,19 +31,19 @@ class PlannerPage:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class PlanPage:
-    """A kept plan, with its stops as rows of ``placements``."""
+    """A stored plan, with its stops as rows of ``placements``."""
 
     frame: Frame
     plan: Row
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class TrialsPage:
-    """Marks at random: what was wanted, by its names in the address, and what came of it."""
+class RandomPlansPage:
+    """Random arrangements: the options, named as in the address, and the results."""
 
     frame: Frame
-    wanted: Row
-    answer: Row
+    options: Row
+    results: Row
 
 
 def planner_page(page: PlannerPage) -> str:
@@ -52,7 +52,7 @@ def planner_page(page: PlannerPage) -> str:
 
 
 def plan_page(page: PlanPage) -> str:
-    """Return a kept plan: what it promised, and what came of it."""
+    """Return a stored plan: its prediction and its results."""
     stops = page.plan["stops"]
     known = [stop for stop in stops if stop["sigma_3d_m"] is not None]
     panels = (
@@ -64,31 +64,31 @@ def plan_page(page: PlanPage) -> str:
     )
 
 
-def trials_page(page: TrialsPage) -> str:
-    """Return what came of marks at random, as tables and figures."""
-    answer = page.answer
+def random_plans_page(page: RandomPlansPage) -> str:
+    """Return the results of random arrangements, as tables and figures."""
     panels = [
-        Panel(name=name, figure=draw(answer), caption=caption) for name, draw, caption in _TRIALS
+        Panel(name=name, figure=draw(page.results), caption=caption)
+        for name, draw, caption in _RANDOM_PLANS
     ]
     return render("random.html", page, here="plan", panels=panels)
 
 
-_TRIALS = (
+_RANDOM_PLANS = (
     (
         "by-angle",
-        trials.error_by_angle,
+        random_plans.error_by_angle,
         "Error of a position against the included angle of two marks, the third beside the first: "
         "median over all signs of the error. Grey: the window that the study recommends.",
     ),
     (
         "by-number",
-        trials.pass_rate_by_number,
+        random_plans.pass_rate_by_number,
         "Arrangements whose three best marks keep the window; more marks make it more likely that "
         "three cut well.",
     ),
     (
         "by-worst-angle",
-        trials.pass_rate_by_angle,
+        random_plans.pass_rate_by_angle,
         "All arrangements, inside the window and outside, by the angle that decides.",
     ),
 )
@@ -99,7 +99,7 @@ _CAPTION = (
 
 
 def outcomes(plans: Sequence[Row]) -> go.Figure:
-    """Draw what came of planned stops against what was promised."""
+    """Draw the results of planned stops against their predictions."""
     figure = blank_figure("Promised and achieved")
     stops = [stop for plan in plans for stop in plan["stops"] if stop["sigma_3d_m"] is not None]
     for key, name, symbol in (
@@ -131,28 +131,28 @@ def outcomes(plans: Sequence[Row]) -> go.Figure:
 
 
 def address(plan: Row) -> str:
-    """Return the address that opens a kept plan in the planner."""
-    asked = plan["request"]
+    """Return the address that opens a stored plan in the planner."""
+    request = plan["request"]
     query = {
-        "site": asked["site"],
-        "method": asked["method"],
-        "tolerance": f"{_MM * asked['tolerance_m']:g}",
-        "turn": f"{asked['turn_s']:g}",
-        "rpm": f"{asked['spin_rpm']:g}",
-        "step": f"{asked.get('step_deg', 0.0):g}",
-        "rests": f"{asked.get('rest_revolutions', 3)}",
-        "model": asked["model"],
+        "site": request["site"],
+        "method": request["method"],
+        "tolerance": f"{_MM * request['tolerance_m']:g}",
+        "turn": f"{request['turn_s']:g}",
+        "rpm": f"{request['spin_rpm']:g}",
+        "step": f"{request.get('step_deg', 0.0):g}",
+        "rests": f"{request.get('rest_revolutions', 3)}",
+        "model": request["model"],
         "a": ";".join(
             f"{mark['name']}:{mark['position_m'][0]:.3f},{mark['position_m'][1]:.3f},"
             f"{mark['pole_height_m']:.3f}"
             for mark in plan["marks"]
         ),
     }
-    if asked.get("stops"):
+    if request.get("stops"):
         query["stops"] = ";".join(
-            f"{stop['name']}:{stop['x_m']:.3f},{stop['y_m']:.3f}" for stop in asked["stops"]
+            f"{stop['name']}:{stop['x_m']:.3f},{stop['y_m']:.3f}" for stop in request["stops"]
         )
-    if asked.get("keep_out_m"):
-        areas = (";".join(f"{x:g},{y:g}" for x, y in area) for area in asked["keep_out_m"])
+    if request.get("keep_out_m"):
+        areas = (";".join(f"{x:g},{y:g}" for x, y in area) for area in request["keep_out_m"])
         query["keep"] = "|".join(areas)
     return f"/plan?{urlencode(query)}"

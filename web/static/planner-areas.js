@@ -53,8 +53,8 @@ export function drawAreas(map, on) {
     group.append(element("polygon", { class: "keep-out", points: points(area) }, element("title", {}, "No mark may stand here")));
   }
   areas.forEach((area, i) => {
-    const said = `Keep-out area ${i + 1}, ${sizeOf(area).toFixed(1)} m². Arrow keys move it, Delete removes it.`;
-    const glyph = element("polygon", { class: "keep-out own", points: points(area), tabindex: 0, role: "button", "aria-label": said, "data-key": `area ${i}` }, element("title", {}, said));
+    const label = `Keep-out area ${i + 1}, ${sizeOf(area).toFixed(1)} m². Arrow keys move it, Delete removes it.`;
+    const glyph = element("polygon", { class: "keep-out own", points: points(area), tabindex: 0, role: "button", "aria-label": label, "data-key": `area ${i}` }, element("title", {}, label));
     map.keys(glyph, [0, 0], {
       move: (dx, dy) => on.onChange(i, area.map(([x, y]) => [x + dx, y + dy]), true),
       end: () => {},
@@ -73,8 +73,8 @@ export function drawAreas(map, on) {
 
 function cornerOf(map, on, { area, i, corner, k }) {
   const [x, y] = [map.at.x(corner[0]), map.at.y(corner[1])];
-  const said = `Corner ${k + 1} of keep-out area ${i + 1}. Arrow keys move it, Delete removes it.`;
-  const glyph = element("g", { class: "corner", tabindex: 0, role: "button", "aria-label": said, "data-key": `corner ${i} ${k}` },
+  const label = `Corner ${k + 1} of keep-out area ${i + 1}. Arrow keys move it, Delete removes it.`;
+  const glyph = element("g", { class: "corner", tabindex: 0, role: "button", "aria-label": label, "data-key": `corner ${i} ${k}` },
     element("circle", { class: "reach", cx: x, cy: y, r: 14 }),
     element("rect", { x: x - 4, y: y - 4, width: 8, height: 8 }));
   const rest = area.filter((_, other) => other !== k);

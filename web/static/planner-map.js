@@ -160,12 +160,12 @@ export class PlanMap {
     return group;
   }
 
-  // Stops where they are now, with what is known of them from the last answer.
+  // Stops where they are now, with what is known of them from the last evaluation.
   currentStops() {
     const { evaluation, site, stops } = this.scene;
-    const answered = new Map((evaluation?.stops ?? []).map((stop) => [stop.name, stop]));
+    const evaluated = new Map((evaluation?.stops ?? []).map((stop) => [stop.name, stop]));
     if (!stops) return evaluation?.stops ?? site.stops;
-    return stops.map((stop) => ({ ...answered.get(stop.name), name: stop.name, position_m: [stop.x, stop.y] }));
+    return stops.map((stop) => ({ ...evaluated.get(stop.name), name: stop.name, position_m: [stop.x, stop.y] }));
   }
 
   chosen() {
@@ -193,12 +193,12 @@ export class PlanMap {
       const [x, y] = [this.at.x(stop.position_m[0]), this.at.y(stop.position_m[1])];
       const p = stop.probability_within_tolerance;
       const sigma = stop.sigma_3d_m;
-      const said = sigma === undefined ? stop.name
+      const label = sigma === undefined ? stop.name
         : sigma === null ? `${stop.name}: no position. ${stop.reason}`
         : `${stop.name}: sigma ${(1000 * sigma).toFixed(1)} mm, ${(100 * p).toFixed(1)} % within the tolerance`;
       const classes = ["stop", p !== undefined && p < 0.95 ? "bad" : "", stop.name === this.scene.stop ? "chosen" : ""];
-      const glyph = element("g", { class: classes.join(" "), tabindex: 0, role: "button", "aria-label": said, "data-key": `stop ${stop.name}` },
-        element("title", {}, said),
+      const glyph = element("g", { class: classes.join(" "), tabindex: 0, role: "button", "aria-label": label, "data-key": `stop ${stop.name}` },
+        element("title", {}, label),
         element("path", { d: `M${x} ${y - 6}l5.5 9.5h-11z` }));
       this.handle(glyph, `stop ${stop.name}`, stop.position_m, {
         move: (...to) => this.on.onMoveStop(stop.name, ...to),
@@ -217,8 +217,8 @@ export class PlanMap {
     this.scene.marks.forEach((mark, place) => {
       const [x, y] = [this.at.x(mark.x), this.at.y(mark.y)];
       const isHidden = stop && !stop.visible_marks.includes(mark.name);
-      const said = `Mark ${mark.name} at ${mark.x.toFixed(2)}, ${mark.y.toFixed(2)} m. Arrow keys move it, Delete removes it.`;
-      const glyph = element("g", { class: `mark${isHidden ? " hidden" : ""}`, tabindex: 0, role: "button", "aria-label": said, "data-key": `mark ${mark.name}` },
+      const label = `Mark ${mark.name} at ${mark.x.toFixed(2)}, ${mark.y.toFixed(2)} m. Arrow keys move it, Delete removes it.`;
+      const glyph = element("g", { class: `mark${isHidden ? " hidden" : ""}`, tabindex: 0, role: "button", "aria-label": label, "data-key": `mark ${mark.name}` },
         element("circle", { class: "reach", cx: x, cy: y, r: 16 }),
         element("circle", { cx: x, cy: y, r: 6.5 }),
         element("text", { x: x + 10, y: y + 4 }, mark.name));
@@ -325,8 +325,8 @@ export function paintScale(figure, shown, range, tolerance, field) {
     context.fillStyle = `rgba(${r}, ${g}, ${b}, 0.85)`;
     context.fillRect(i, 0, 1, 1);
   }
-  const said = (value) => `${(scale * value).toFixed(digits)} ${unit}`;
-  labels[0].textContent = said(range.low);
+  const label = (value) => `${(scale * value).toFixed(digits)} ${unit}`;
+  labels[0].textContent = label(range.low);
   labels[1].textContent = isPlain ? "" : besideScale(shown, field, tolerance);
-  labels[2].textContent = `${said(range.high)}${shown === "sigma" ? " and more" : ""}`;
+  labels[2].textContent = `${label(range.high)}${shown === "sigma" ? " and more" : ""}`;
 }

@@ -1,4 +1,4 @@
-// The planner: marks that move, the service that answers what they promise, the address that holds it all.
+// The planner: marks that can be moved, their evaluation by the service, and the state in the address.
 const { PlanMap, SHOWN, rangeOf, paintScale } = await import(document.getElementById("planner").dataset.map);
 const { parseAreas, areasText, square, isInside, fillTable } = await import(document.getElementById("planner").dataset.areas);
 const { fillSights } = await import(document.getElementById("planner").dataset.sights);
@@ -19,41 +19,36 @@ function readAddress() {
     const field = byId(name);
     if (value === null) continue;
     if (field.tagName === "SELECT" && ![...field.options].some((option) => option.value === value)) {
-      field.add(new Option(value, value)); // the service says if it knows none of that name
+      field.add(new Option(value, value)); // the service refuses an unknown name
     }
     field.value = value;
   }
   state.stop = query.get("stop") ?? "";
-  state.stops = query.get("stops") === null ? null : parseStops(query.get("stops"));
+  state.stops = query.get("stops") === null ? null : parsePlaces(query.get("stops"), STOP_KEYS);
   state.areas = parseAreas(query.get("keep") ?? "");
-  return ["a", "b"].map((key) => query.get(key)).filter((text) => text !== null).map(parseMarks);
+  return ["a", "b"].map((key) => query.get(key)).filter((text) => text !== null).map((text) => parsePlaces(text, MARK_KEYS));
 }
 
-function parseMarks(text) {
+// Places as the address has them: name:x,y;name:x,y with further numbers for some.
+function parsePlaces(text, keys) {
   return text.split(";").filter(Boolean).map((part) => {
     const [name, numbers] = part.split(":");
-    const [x, y, pole] = (numbers ?? "").split(",").map(Number);
-    return { name, x, y, pole };
-  }).filter((mark) => [mark.x, mark.y, mark.pole].every(Number.isFinite));
+    const values = (numbers ?? "").split(",").map(Number);
+    return { name, ...Object.fromEntries(keys.map((key, i) => [key, values[i]])) };
+  }).filter((place) => keys.every((key) => Number.isFinite(place[key])));
 }
 
-function parseStops(text) {
-  return text.split(";").filter(Boolean).map((part) => {
-    const [name, numbers] = part.split(":");
-    const [x, y] = (numbers ?? "").split(",").map(Number);
-    return { name, x, y };
-  }).filter((stop) => Number.isFinite(stop.x) && Number.isFinite(stop.y));
-}
-
+const MARK_KEYS = ["x", "y", "pole"];
+const STOP_KEYS = ["x", "y"];
 const round = (value, digits) => String(+value.toFixed(digits));
-const marksText = (marks) => marks.map((m) => `${m.name}:${round(m.x, 3)},${round(m.y, 3)},${round(m.pole, 3)}`).join(";");
+const placesText = (places, keys) => places.map((one) => `${one.name}:${keys.map((key) => round(one[key], 3)).join(",")}`).join(";");
 
 function writeAddress() {
   const query = new URLSearchParams();
   for (const name of controls) query.set(name, byId(name).value);
-  state.plans.forEach((plan, i) => query.set("ab"[i], marksText(plan.marks)));
+  state.plans.forEach((plan, i) => query.set("ab"[i], placesText(plan.marks, MARK_KEYS)));
   if (state.stop) query.set("stop", state.stop);
-  if (state.stops) query.set("stops", state.stops.map((s) => `${s.name}:${round(s.x, 3)},${round(s.y, 3)}`).join(";"));
+  if (state.stops) query.set("stops", placesText(state.stops, STOP_KEYS));
   if (state.areas.length) query.set("keep", areasText(state.areas));
   history.replaceState(null, "", `/plan?${query}`);
 }
@@ -87,36 +82,34 @@ async function post(path, body, accept = "application/json") {
   return accept === "application/json" ? response.json() : response.text();
 }
 
-function say(problem) {
-  byId("plan-problem").textContent = problem;
-  byId("plan-problem").hidden = !problem;
+function setText(id, text) {
+  byId(id).textContent = text;
+  byId(id).hidden = !text;
 }
 
-function tell(news) {
-  byId("plan-news").textContent = news;
-  byId("plan-news").hidden = !news;
-}
+const showProblem = (text) => setText("plan-problem", text);
+const showNews = (text) => setText("plan-news", text);
 
-// One question at a time for each plan; what moved in the meantime is asked next.
+// One request at a time for each plan; changes in the meantime are evaluated next.
 async function evaluate(plan, cells) {
-  plan.wanted = Math.max(plan.wanted ?? 0, cells);
-  if (plan.isAsking) return;
-  plan.isAsking = true;
+  plan.pending = Math.max(plan.pending ?? 0, cells);
+  if (plan.isRunning) return;
+  plan.isRunning = true;
   plan.map.box.classList.add("busy");
-  while (plan.wanted) {
-    const wanted = plan.wanted;
-    plan.wanted = 0;
+  while (plan.pending) {
+    const cellsNow = plan.pending;
+    plan.pending = 0;
     try {
-      const answer = await post("/evaluate", request(plan, { field_cells: wanted }));
-      Object.assign(plan, { evaluation: answer, field: answer.field });
-      say("");
+      const response = await post("/evaluate", request(plan, { field_cells: cellsNow }));
+      Object.assign(plan, { evaluation: response, field: response.field });
+      showProblem("");
     } catch (error) {
       Object.assign(plan, { evaluation: null, field: null });
-      say(error.message);
+      showProblem(error.message);
     }
     draw();
   }
-  plan.isAsking = false;
+  plan.isRunning = false;
   plan.map.box.classList.remove("busy");
 }
 
@@ -209,12 +202,12 @@ function drawMarks() {
 const known = (plan, mark) => plan.evaluation?.marks.find((one) => one.name === mark.name);
 
 function derived(plan, mark) {
-  const answer = known(plan, mark);
+  const found = known(plan, mark);
   const stops = plan.evaluation?.stops ?? [];
   const n = stops.filter((stop) => stop.visible_marks.includes(mark.name)).length;
   return [
-    answer ? fixed(answer.ground_m, 3) : "–",
-    answer ? fixed(answer.position_m[2], 3) : "–",
+    found ? fixed(found.ground_m, 3) : "–",
+    found ? fixed(found.position_m[2], 3) : "–",
     stops.length ? `${n} of ${stops.length}` : "–",
   ];
 }
@@ -313,7 +306,7 @@ function remember() {
 }
 
 function changed(plan, cells) {
-  tell("");
+  showNews("");
   writeAddress();
   draw();
   evaluate(plan, cells);
@@ -345,7 +338,7 @@ function ownStops() {
 }
 
 function stopsChanged(cells) {
-  tell("");
+  showNews("");
   writeAddress();
   draw();
   state.plans.forEach((plan) => evaluate(plan, cells));
@@ -413,7 +406,7 @@ function close() {
 }
 
 function setMarks(all, active) {
-  tell("");
+  showNews("");
   while (state.plans.length > all.length) close();
   while (state.plans.length < all.length) open([]);
   all.forEach((marks, i) => { state.plans[i].marks = marks; });
@@ -439,7 +432,7 @@ const onArea = {
     writeAddress();
     draw();
   },
-  onRefused: say,
+  onRefused: showProblem,
 };
 
 function addArea(area) {
@@ -448,7 +441,7 @@ function addArea(area) {
   setAdding("");
   writeAddress();
   draw();
-  tell("No mark will be put there by Optimise and by Best place for one more.");
+  showNews("No mark will be put there by Optimise and by Best place for one more.");
 }
 
 // A corner near the first one closes the area.
@@ -475,7 +468,7 @@ function setAdding(what) {
   }
   Object.assign(byId("finish-area"), { hidden: what !== "area", disabled: true });
   state.plans.forEach((plan) => { plan.map.adding = Boolean(what); });
-  tell(ADDING[what]);
+  showNews(ADDING[what]);
   draw();
   const { box } = state.plans[state.active].map;
   if (what && box.getBoundingClientRect().top > 0.7 * window.innerHeight) box.scrollIntoView({ block: "center" });
@@ -483,26 +476,26 @@ function setAdding(what) {
 
 const own = (mark) => ({ name: mark.name, x: mark.position_m[0], y: mark.position_m[1], pole: mark.pole_height_m });
 
-// What takes longer than a moment says so, and how long it has been at it.
+// A search shows how long it has been running.
 async function during(button, work, news = "") {
   const label = button.textContent;
   const began = performance.now();
-  const clock = news && setInterval(() => tell(`${news}: ${Math.round((performance.now() - began) / 1000)} s so far.`), 2000);
+  const clock = news && setInterval(() => showNews(`${news}: ${Math.round((performance.now() - began) / 1000)} s so far.`), 2000);
   Object.assign(button, { disabled: true, textContent: news ? "Searching" : "Working" });
-  if (news) tell(`${news}.`);
-  say("");
+  if (news) showNews(`${news}.`);
+  showProblem("");
   try {
     await work(state.plans[state.active]);
   } catch (error) {
-    if (news) tell("");
-    say(error.message);
+    if (news) showNews("");
+    showProblem(error.message);
   } finally {
     Object.assign(button, { disabled: false, textContent: label });
     clearInterval(clock);
   }
 }
 
-// ---- what people can do
+// ---- controls
 
 byId("add").addEventListener("click", () => setAdding(state.adding === "mark" ? "" : "mark"));
 byId("add-stop").addEventListener("click", () => setAdding(state.adding === "stop" ? "" : "stop"));
@@ -510,7 +503,7 @@ byId("add-area").addEventListener("click", (event) => {
   if (event.detail) { setAdding(state.adding === "area" ? "" : "area"); return; }
   const [x0, y0, x1, y1] = state.site.extent_m; // by keyboard: a square to begin with
   addArea(square([(x0 + x1) / 2, (y0 + y1) / 2]));
-  tell("A square of 2 m stands in the middle of the map: move it or its corners with the arrow keys.");
+  showNews("A square of 2 m stands in the middle of the map: move it or its corners with the arrow keys.");
   state.plans[state.active].map.svg.querySelector(`[data-key="area ${state.areas.length - 1}"]`)?.focus();
 });
 byId("finish-area").addEventListener("click", () => addArea(state.corners));
@@ -536,27 +529,27 @@ byId("compare").addEventListener("click", () => {
   setMarks(marks.length > 1 ? [marks[state.active]] : [marks[0], structuredClone(marks[0])], marks.length > 1 ? 0 : 1);
 });
 byId("optimise").addEventListener("click", (event) => byId("plan-controls").reportValidity() && during(event.currentTarget, async (plan) => {
-  const answer = await post("/optimise", request(plan, { n_marks: byId("count").valueAsNumber }));
+  const found = await post("/optimise", request(plan, { n_marks: byId("count").valueAsNumber }));
   remember();
-  plan.marks = answer.marks.map(own);
+  plan.marks = found.marks.map(own);
   changed(plan, CELLS.still);
-  tell(answer.notes.join(" "));
+  showNews(found.notes.join(" "));
 }, Number.isNaN(byId("count").valueAsNumber) ? "Searching the fewest marks that keep the tolerance" : "Searching the best places"));
 byId("suggest").addEventListener("click", (event) => byId("plan-controls").reportValidity() && during(event.currentTarget, async (plan) => {
-  const answer = await post("/suggest", request(plan));
+  const found = await post("/suggest", request(plan));
   remember();
-  plan.marks.push(own(answer));
+  plan.marks.push(own(found));
   changed(plan, CELLS.still);
-  const length = (key) => (answer[key] === null ? "no position" : `${(1000 * answer[key]).toFixed(3)} mm`);
+  const length = (key) => (found[key] === null ? "no position" : `${(1000 * found[key]).toFixed(3)} mm`);
   const [worst, mean] = ["worst", "mean"].map((which) => `from ${length(`${which}_sigma_3d_before_m`)} to ${length(`${which}_sigma_3d_m`)}`);
-  tell(`${answer.name} helps most: it brings the worst stop ${worst} (3-D sigma), the mean of all stops ${mean}.`);
+  showNews(`${found.name} helps most: it brings the worst stop ${worst} (3-D sigma), the mean of all stops ${mean}.`);
 }, "Searching the best place for one more"));
 byId("save").addEventListener("click", (event) => during(event.currentTarget, async (plan) => {
   const name = window.prompt("Name of the plan", `${plan.marks.length} marks`);
   if (!name) return;
   const survey = byId("model").value.startsWith("survey:") ? byId("model").value.slice(7) : null;
   const kept = await post("", { ...request(plan), name, survey });
-  tell("");
+  showNews("");
   const link = document.createElement("a");
   Object.assign(link, { href: `/plan/${kept.placement_id}`, textContent: name });
   byId("plan-news").replaceChildren("Kept as ", link, `: ${kept.stops.length} rows of placements.`);
@@ -578,17 +571,17 @@ byId("terrain-file").addEventListener("change", (event) => during(byId("terrain-
   const [file] = event.target.files;
   if (!file) return;
   const response = await fetch(`/api/v1/terrains?${new URLSearchParams({ name: file.name })}`, { method: "POST", body: file });
-  const answer = await response.json();
-  if (!response.ok) throw new Error(answer.detail);
+  const found = await response.json();
+  if (!response.ok) throw new Error(found.detail);
   const field = byId("site");
-  if (![...field.options].some((option) => option.value === answer.key)) field.add(new Option(answer.name, answer.key));
-  field.value = answer.key;
+  if (![...field.options].some((option) => option.value === found.key)) field.add(new Option(found.name, found.key));
+  field.value = found.key;
   await changeSite();
 }));
 for (const name of controls) {
   byId(name).addEventListener("change", () => {
     if (!byId(name).reportValidity()) return;
-    if (name === "site") { changeSite().catch((error) => say(error.message)); return; }
+    if (name === "site") { changeSite().catch((error) => showProblem(error.message)); return; }
     writeAddress();
     draw();
     if (name !== "show") evaluateAll();
@@ -598,12 +591,12 @@ byId("plan-controls").addEventListener("submit", (event) => event.preventDefault
 
 async function openSite(all) {
   const response = await fetch(`${API}/sites/${encodeURIComponent(byId("site").value)}`);
-  const answer = await response.json();
-  if (!response.ok) throw new Error(answer.detail);
-  state.site = answer;
+  const found = await response.json();
+  if (!response.ok) throw new Error(found.detail);
+  state.site = found;
   state.past = [];
   byId("undo").disabled = true;
-  setMarks(all.length ? all : [answer.marks.map(own)], 0);
+  setMarks(all.length ? all : [found.marks.map(own)], 0);
 }
 
 function changeSite() {
@@ -611,4 +604,4 @@ function changeSite() {
   return openSite([]);
 }
 
-openSite(readAddress()).catch((error) => say(error.message));
+openSite(readAddress()).catch((error) => showProblem(error.message));

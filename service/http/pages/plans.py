@@ -9,10 +9,11 @@ from fastapi.responses import HTMLResponse
 from pydantic import ValidationError
 
 from spheremark.pipelines.errors import InputError
-from spheremark.service.http.api.plans import RandomTrial, sites, tried
+from spheremark.service.http.api.plan_models import RandomPlansRequest
+from spheremark.service.http.api.plans import simulated, sites
 from spheremark.service.http.pages.frame import frame_of
 from spheremark.service.http.state import Current
-from spheremark.storage.catalogue import plans as kept
+from spheremark.storage.catalogue import plans as stored
 from spheremark.web.pages import planner
 
 router = APIRouter(include_in_schema=False, default_response_class=HTMLResponse)
@@ -25,44 +26,46 @@ def plan(service: Current) -> str:
         planner.PlannerPage(
             frame=frame_of(service),
             sites=sites(service),
-            plans=kept.list_plans(service.catalogue),
+            plans=stored.list_plans(service.catalogue),
         )
     )
 
 
 @router.get("/plan/random")
 def random_marks(request: Request, service: Current) -> str:
-    """Show what comes of marks at random: the study's own procedure."""
-    asked: dict[str, Any] = {key: text for key, text in request.query_params.items() if text}
-    if "error_per_axis_mm" in asked:
-        error = _number(asked.pop("error_per_axis_mm"))
-        asked["error_per_axis_m"] = error / 1000 if error else None
-    if "tolerance_mm" in asked:
-        asked["tolerance_m"] = _number(asked.pop("tolerance_mm")) / 1000
+    """Show the results of random arrangements: the study's own procedure."""
+    given: dict[str, Any] = {key: text for key, text in request.query_params.items() if text}
+    if "error_per_axis_mm" in given:
+        error = _number(given.pop("error_per_axis_mm"))
+        given["error_per_axis_m"] = error / 1000 if error else None
+    if "tolerance_mm" in given:
+        given["tolerance_m"] = _number(given.pop("tolerance_mm")) / 1000
     try:
-        wanted = RandomTrial.model_validate(asked)
+        options = RandomPlansRequest.model_validate(given)
     except ValidationError as error:
         first = error.errors()[0]
         raise InputError(f"{'.'.join(map(str, first['loc']))}: {first['msg']}.") from error
-    return planner.trials_page(
-        planner.TrialsPage(
-            frame=frame_of(service), wanted=wanted.model_dump(), answer=tried(service, wanted)
+    return planner.random_plans_page(
+        planner.RandomPlansPage(
+            frame=frame_of(service),
+            options=options.model_dump(),
+            results=simulated(service, options),
         )
     )
 
 
 def _number(text: str) -> float:
-    """Return a number that was typed."""
+    """Return a number of the form."""
     try:
         return float(text)
     except ValueError as error:
-        raise InputError(f"{text!r} is no number.") from error
+        raise InputError(f"{text!r} is not a number.") from error
 
 
 @router.get("/plan/{placement_id}")
-def kept_plan(placement_id: str, service: Current) -> str:
-    """Show a kept plan, and what came of it."""
-    found = kept.get_plan(service.catalogue, placement_id)
+def stored_plan(placement_id: str, service: Current) -> str:
+    """Show a stored plan and, once surveyed, its results."""
+    found = stored.get_plan(service.catalogue, placement_id)
     return planner.plan_page(
         planner.PlanPage(frame=frame_of(service, found["survey"] or ""), plan=found)
     )
