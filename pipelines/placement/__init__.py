@@ -20,7 +20,6 @@ from spheremark.pipelines.placement.optimisation import (
     Optimum,
     Proposal,
     best_without_search,
-    draw_arrangement,
     optimise,
     propose_mark,
 )
@@ -79,7 +78,6 @@ __all__ = [
     "by_number",
     "by_worst_angle",
     "check_sizes",
-    "draw_arrangement",
     "errors_by_angle",
     "evaluate",
     "field_map",

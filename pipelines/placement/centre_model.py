@@ -207,7 +207,7 @@ def expect_centres(
     per_sr = float(np.exp(model.log_count[0])) / (sensor.line_spacing * sensor.pulse_spacing)
     density = np.where(is_near, per_sr / (d * flat), 0.0)
     shares = np.where(is_near, seen / np.where(whole > 0.0, whole, 1.0), 0.0)
-    n_points, lost = density * seen, np.where(is_near, _at(table.lost[:, 1], place), 1.0)
+    n_points, lost = density * seen, np.where(is_near, _at(table.lost, place), 1.0)
     local, is_known = _local_covariances(density[..., None] * sums[..., :6])
     is_known &= shares > 1e-6
     factors = np.array(_EFFICIENCY) * np.exp(

@@ -317,17 +317,6 @@ def propose_mark(
     )
 
 
-def draw_arrangement(candidates: Candidates, n_marks: int, rng: np.random.Generator) -> Arrangement:
-    """Return marks at random among the places where they may stand."""
-    chosen = _draw(_near(candidates), n_marks, rng)
-    if len(chosen) < n_marks:
-        raise DegenerateGeometryError(
-            f"There is room for {len(chosen)} of {n_marks} marks {candidates.apart:g} m apart on "
-            f"{len(candidates.p_site)} places; allow more places or marks nearer to each other."
-        )
-    return Arrangement.numbered(candidates.p_site[chosen])
-
-
 def best_without_search(  # noqa: PLR0913  all that a plan is made of
     site: Site,
     stops: Stops,

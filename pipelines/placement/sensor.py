@@ -140,27 +140,20 @@ class Returns:
         Factor of a centre's variances by the positions of the lines, against evenly spread returns:
         towards, left, up; of one among some that share a position, over places where they are
         found.
-    worst_spread : (d, 3)
-        The same for the 95th percentile of places.
-    worst_share : (d,)
-        Returns at the least lucky place over those expected.
-    lost : (d, 2)
-        Share of places at which fewer than half the expected returns come, and at which a centre
-        cannot be found at all.
+    lost : (d,)
+        Share of places at which a centre cannot be found.
     """
 
     distances: Array
     areas: Array
     information: Array
     spread: Array
-    worst_spread: Array
-    worst_share: Array
     lost: Array
 
     def __post_init__(self) -> None:
         d = len(self.distances)
         seal(self, distances=(d,), areas=(d, None, None), information=(d, None, None, 6))
-        seal(self, spread=(d, 3), worst_spread=(d, 3), worst_share=(d,), lost=(d, 2))
+        seal(self, spread=(d, 3), lost=(d,))
 
 
 class _Disc(NamedTuple):
@@ -199,14 +192,12 @@ def returns_of(sensor: Sensor, radius: float, n_strips: int) -> Returns:
     upper = np.triu_indices(3)
     worth = worth[..., upper[0], upper[1]] * cell[..., None]
     spreads = [_spread(sensor, radius, disc, d) for disc, d in zip(discs, _DISTANCES, strict=True)]
-    mean, worst, share, lost = (np.array(column) for column in zip(*spreads, strict=True))
+    mean, lost = (np.array(column) for column in zip(*spreads, strict=True))
     return Returns(
         distances=_DISTANCES.copy(),
         areas=_from_top(areas.sum(axis=-1)),
         information=_from_top(worth.sum(axis=3)),
         spread=mean,
-        worst_spread=worst,
-        worst_share=share,
         lost=lost,
     )
 
@@ -253,7 +244,7 @@ def _disc(sensor: Sensor, radius: float, n_strips: int, distance: float) -> _Dis
 
 
 def _ranges(table: Beams, centre: Array, radius: float) -> Prediction:
-    """Return what beams measure to one sphere."""
+    """Return the ranges of beams to one sphere."""
     which = np.zeros(len(table.ranges), dtype=np.intp)
     return predict(table, centre[None], np.array([radius]), which)
 
@@ -261,10 +252,10 @@ def _ranges(table: Beams, centre: Array, radius: float) -> Prediction:
 def _slopes(
     table: Beams, ranges: Array, distance: float, radius: float, cov: Array
 ) -> tuple[Array, Array]:
-    """Return derivatives by the centre over the width of what is not known of it, and their bend.
+    """Return derivatives by the centre over its uncertainty, and the variance of second order.
 
-    The slope between places the square root of three standard deviations to either side, which for
-    a normal spread is the mean derivative, and the variance that the second order adds.
+    The slope between places the square root of three standard deviations to either side is the
+    mean derivative of a normal distribution.
     """
     J, bend2 = np.ones((len(ranges), 3)), np.zeros(len(ranges))
     for axis in (1, 2):
@@ -293,35 +284,26 @@ def _beams(sensor: Sensor, left: Array, up: Array, distance: float) -> Beams:
     )
 
 
-def _spread(
-    sensor: Sensor, radius: float, disc: _Disc, distance: float
-) -> tuple[Array, Array, float, Array]:
-    """Return mean and worst spread, worst share of returns, and shares of places that lose."""
+def _spread(sensor: Sensor, radius: float, disc: _Disc, distance: float) -> tuple[Array, float]:
+    """Return the mean spread, and the share of places at which a centre is lost."""
     columns, inverse = np.unique(np.round(disc.left, 9), return_inverse=True)
     worth = np.zeros((len(columns), 3, 3))
     np.add.at(worth, inverse, disc.information)
-    counts = np.bincount(inverse, disc.returns)
     height = 2.0 * (columns[1] - columns[0]) * len(columns) / 2.0 / (N_ROWS * _N_PER_ROW)
     per_line = height / (distance * sensor.pulse_spacing)
     crossings = _crossings(sensor, columns, distance)
     information = np.einsum("pc,cij->pij", crossings, worth) * per_line
-    returns = crossings @ counts * per_line
     even = information.mean(axis=0)
     floor = np.eye(3) / (0.3 * radius) ** 2
     variances = np.einsum("pii->pi", np.linalg.inv(information + floor))
     usual = np.diag(np.linalg.inv(even + floor))
     is_found = variances.sum(axis=1) < max(_LOST, 6.0 * float(usual.sum()))
     ratios = variances[is_found] / usual if is_found.any() else np.full((1, 3), 36.0)
-    lost = np.array([np.mean(returns < 0.5 * returns.mean()), np.mean(~is_found)])
-    share = float(returns.min() / max(returns.mean(), 1e-9))
-    return _together(ratios), np.quantile(ratios, 0.95, axis=0), share, lost
+    return _together(ratios), float(np.mean(~is_found))
 
 
 def _together(ratios: Array) -> Array:
-    """Return the spread of one centre among several that share a position: a lucky one weighs more.
-
-    The mean over chance of what the mean information of some centres is worth.
-    """
+    """Return the spread of one centre among several that share a position, by mean information."""
     rng = np.random.default_rng(0)
     worth = np.mean([1.0 / ratios[rng.permutation(len(ratios))] for _ in range(_TOGETHER)], axis=0)
     return np.asarray((1.0 / worth).mean(axis=0))

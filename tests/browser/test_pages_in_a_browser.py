@@ -218,10 +218,10 @@ def test_a_mark_that_is_dragged_moves_the_prediction_and_the_address(visit):
 def test_a_stop_that_is_chosen_shows_what_each_mark_does_for_it(visit):
     page = visit().open("/plan?model=sensor&a=P01:6.5,0.5,1;P02:-1,6.5,1;P03:-6.5,-3,1")
     page.get_by_role("button", name="lane3-stop4", exact=True).click()
-    table = page.locator("#sights tbody tr")
+    table = page.locator("#marks-at-stop tbody tr")
     table.nth(2).wait_for()
     redundancies = [float(row.locator("td").nth(5).inner_text()) for row in table.all()]
-    dof = int(re.search(r"(\d+) degrees", page.locator("#sights p").inner_text())[1])
+    dof = int(re.search(r"(\d+) degrees", page.locator("#marks-at-stop p").inner_text())[1])
     assert sum(redundancies) == pytest.approx(dof - 2, abs=0.1)  # two are those of levelling
     page.emulate_media(media="print")
     page.set_viewport_size({"width": 720, "height": 1000})

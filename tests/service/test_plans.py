@@ -82,9 +82,9 @@ def test_evaluations_are_as_documented(client):
 
 
 def test_the_interface_describes_what_every_route_of_plans_gives(client):
-    interface = client.get("/openapi.json").json()
+    interface = client.get("/api/v1/openapi.json").json()
     routes = {path: one for path, one in interface["paths"].items() if "/plans" in path}
-    assert len(routes) == 7
+    assert len(routes) == 8
     for path, methods in routes.items():
         for method in methods.values():
             (code,) = {"200", "201"} & set(method["responses"])
@@ -275,10 +275,10 @@ def test_limits_of_random_marks_are_those_of_the_survey_that_is_named(client):
     assert [one["angle_source"] == "study" for one in sources] == [False, False, True]
 
 
-def test_trials_that_cannot_be_are_refused_on_the_page(client):
+def test_impossible_random_plans_are_refused_on_the_page(client):
     for wrong, said in (
         ({"n_marks_min": "two"}, "n_marks_min"),
-        ({"tolerance_mm": "wide"}, "is no number"),
+        ({"tolerance_mm": "wide"}, "is not a number"),
         ({"angle_min_deg": 170, "angle_max_deg": 20}, "must ascend"),
     ):
         answer = client.get("/plan/random", params=wrong)

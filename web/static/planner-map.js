@@ -141,7 +141,7 @@ export class PlanMap {
   drawMarks() {
     const focused = this.svg.querySelector(":focus")?.dataset.key;
     this.svg.setAttribute("viewBox", `0 0 ${this.at.width} ${this.at.height}`);
-    this.svg.replaceChildren(this.axes(), drawAreas(this, this.on.area), this.sights(), this.stops(), this.marks());
+    this.svg.replaceChildren(this.axes(), drawAreas(this, this.on.area), this.sightLines(), this.stops(), this.marks());
     if (focused) this.svg.querySelector(`[data-key="${CSS.escape(focused)}"]`)?.focus();
   }
 
@@ -172,7 +172,7 @@ export class PlanMap {
     return this.scene.evaluation?.stops.find((stop) => stop.name === this.scene.stop);
   }
 
-  sights() {
+  sightLines() {
     const group = element("g", { "aria-hidden": "true" });
     const stop = this.chosen();
     if (!stop) return group;

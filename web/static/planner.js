@@ -1,7 +1,7 @@
 // The planner: marks that can be moved, their evaluation by the service, and the state in the address.
 const { PlanMap, SHOWN, rangeOf, paintScale } = await import(document.getElementById("planner").dataset.map);
 const { parseAreas, areasText, square, isInside, fillTable } = await import(document.getElementById("planner").dataset.areas);
-const { fillSights } = await import(document.getElementById("planner").dataset.sights);
+const { fillStop } = await import(document.getElementById("planner").dataset.stop);
 
 const API = "/api/v1/plans";
 const CELLS = { moving: 32, still: 64 }; // across the longer side of the map
@@ -130,7 +130,7 @@ function draw() {
   }
   drawMarks();
   drawStops();
-  fillSights(byId("sights"), state.plans[state.active].evaluation?.stops.find((stop) => stop.name === state.stop));
+  fillStop(byId("marks-at-stop"), state.plans[state.active].evaluation?.stops.find((stop) => stop.name === state.stop));
   byId("rests").disabled = !byId("step").valueAsNumber;
   byId("turn").disabled = !byId("rests").disabled;
   byId("areas").hidden = !state.areas.length;

@@ -24,7 +24,6 @@ from spheremark.pipelines.placement import (
     Stops,
     Visibility,
     best_without_search,
-    draw_arrangement,
     evaluate,
     field_map,
     find_candidates,
@@ -84,6 +83,15 @@ def ring(n, distance, height=1.0):
 def one_stop(*places):
     p = np.array(places or [(0.0, 0.0, 1.05)])
     return Stops(names=tuple(f"S{i}" for i in range(len(p))), p_site=p)
+
+
+def drawn_marks(candidates, n, rng):
+    """Return marks at random among the candidates, as far apart as they have to be."""
+    chosen = []
+    for p in rng.permutation(candidates.p_site):
+        if len(chosen) < n and all(np.linalg.norm(p - q) >= candidates.apart for q in chosen):
+            chosen.append(p)
+    return Arrangement.numbered(np.array(chosen))
 
 
 def fits_at(stop, marks, covs):
@@ -408,9 +416,7 @@ def test_optimised_marks_beat_marks_at_random(world):
     rng = np.random.default_rng(2)
     best = optimise(site, stops, candidates, MODEL, Requirement(), Goal(n_marks=5), rng)
     drawn = min(
-        evaluate(
-            site, stops, draw_arrangement(candidates, 5, rng), MODEL, Requirement()
-        ).worst_sigma_3d
+        evaluate(site, stops, drawn_marks(candidates, 5, rng), MODEL, Requirement()).worst_sigma_3d
         for _ in range(100)
     )
     assert best.evaluation.worst_sigma_3d < drawn
@@ -492,7 +498,7 @@ def test_what_no_arrangement_can_is_refused_without_a_search():
         bound = least_sigmas(seen, requirement)
         for k in (3, 4, 7, 12):
             for _ in range(10):
-                drawn = draw_arrangement(candidates, k, rng)
+                drawn = drawn_marks(candidates, k, rng)
                 found = evaluate(site, stops, drawn, MODEL, requirement)
                 assert (found.sigma_3d >= bound[:, k - 1]).all()
     requirement = Requirement(tolerance=1.5 * float(bound[:, 39].max()))

@@ -1,4 +1,4 @@
-// What each mark does for the stop that is chosen: rows of a table.
+// The marks as predicted from the chosen stop: rows of a table.
 const length = (value, digits = 2) => (value === null ? "none" : (1000 * value).toFixed(digits));
 
 function found(one) {
@@ -24,7 +24,7 @@ function cells(one) {
 const sigmas = (cov) => [0, 1, 2].map((k) => length(Math.sqrt(cov[k][k]))).join(", ");
 
 // Fill the section for a stop of an evaluation; hide it where none is chosen.
-export function fillSights(section, stop) {
+export function fillStop(section, stop) {
   section.hidden = !stop;
   if (!stop) return;
   section.querySelector("h2").textContent = `Marks from ${stop.name}`;
