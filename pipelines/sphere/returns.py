@@ -23,6 +23,8 @@ class Returns(NamedTuple):
     ----------
     starts : (m + 1,)
         First return of each candidate, and the end of the last.
+    markers : (n,)
+        Candidate of each return.
     origins, directions : (3, n)
         Beams in the base frame [m], [1].
     first_axes, second_axes : (3, n)
@@ -45,6 +47,7 @@ class Returns(NamedTuple):
     """
 
     starts: Index
+    markers: Index
     origins: Array
     directions: Array
     first_axes: Array
@@ -57,11 +60,6 @@ class Returns(NamedTuple):
     classes: Index
     sigmas: Array
     sigmas_lateral: Array
-
-    @property
-    def markers(self) -> Index:
-        """Candidate that each return belongs to, (n,)."""
-        return np.repeat(np.arange(len(self.starts) - 1), np.diff(self.starts))
 
 
 def returns_of(
@@ -79,6 +77,7 @@ def returns_of(
     vertical /= np.linalg.norm(vertical, axis=0)
     return Returns(
         starts=starts,
+        markers=np.repeat(np.arange(len(starts) - 1), np.diff(starts)),
         origins=origins,
         directions=directions,
         first_axes=first_axes,
@@ -101,15 +100,15 @@ def returns_of(
 
 def of_markers(returns: Returns, markers: Index) -> tuple[Returns, Index]:
     """Return the returns of some candidates, and their places among all returns."""
-    starts = returns.starts
-    rows = np.concatenate([np.arange(starts[m], starts[m + 1]) for m in markers])
-    counts = np.diff(starts)[markers]
+    rows, counts = np.flatnonzero(np.isin(returns.markers, markers)), np.diff(returns.starts)
     columns = {
         name: np.ascontiguousarray(column[..., rows])
         for name, column in returns._asdict().items()
-        if name != "starts"
+        if name not in {"starts", "markers"}
     }
-    return Returns(starts=np.concatenate([[0], np.cumsum(counts)]), **columns), rows
+    columns["starts"] = np.concatenate([[0], np.cumsum(counts[markers])])
+    columns["markers"] = np.repeat(np.arange(len(markers)), counts[markers])
+    return Returns(**columns), rows
 
 
 def moved_faces(returns: Returns, moves: Array) -> Returns:
