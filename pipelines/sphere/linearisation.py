@@ -7,6 +7,7 @@ linearised over the width of that uncertainty.
 
 from __future__ import annotations
 
+import math
 from typing import NamedTuple
 
 import numpy as np
@@ -19,7 +20,10 @@ from spheremark.pipelines.sphere.returns import Returns
 _INNER = 0.9  # radii from the middle within which the range hardly bends
 _THIN2 = 1e-12  # [m^2] least variance: keeps the factor invertible
 _N_POINTS = 8  # sigma points, padded to the width of vector registers
-_WIDTH = np.sqrt(3.0)  # sigmas to either side: two such points have a normal's fourth moment
+_WIDTH = math.sqrt(3.0)  # sigmas to either side: two such points have a normal's fourth moment
+
+_Vector = tuple[float, float, float]
+_Factor = tuple[float, float, float, float, float, float]
 
 
 class Linear(NamedTuple):
@@ -118,14 +122,14 @@ def _linearise(
 
 
 @compiled
-def _polar(x, y):  # type: ignore[no-untyped-def]  # noqa: ANN001, ANN202
+def _polar(x: float, y: float) -> _Vector:
     """Return cosine, sine and length of a vector."""
     away = max(np.sqrt(x * x + y * y), 1e-9)
     return x / away, y / away, away
 
 
 @compiled
-def _factor(cov, radial, tangential):  # type: ignore[no-untyped-def]  # noqa: ANN001, ANN202
+def _factor(cov: Array, radial: _Vector, tangential: _Vector) -> _Factor:
     """Return the Cholesky factor of a sphere's covariance (radial, tangential, radius), by rows."""
     aa, ab, bb, ar, br = 0.0, 0.0, 0.0, 0.0, 0.0
     for j in range(3):
@@ -143,25 +147,31 @@ def _factor(cov, radial, tangential):  # type: ignore[no-untyped-def]  # noqa: A
 
 
 @compiled
-def _reach(away, half, factor):  # type: ignore[no-untyped-def]  # noqa: ANN001, ANN202
+def _reach(away: float, half: float, factor: _Factor) -> float:
     """Return how far from the centre a footprint may reach within the sigma points [m]."""
     aa, ab, bb, ar, _, rr = factor
     outward, sideways = away + _WIDTH * aa, _WIDTH * (abs(ab) + bb)
-    return np.sqrt(outward**2 + sideways**2) + half + _WIDTH * (abs(ar) + rr)
+    return math.sqrt(outward**2 + sideways**2) + half + _WIDTH * (abs(ar) + rr)
 
 
 @compiled
-def _curvature(away, radius, factor):  # type: ignore[no-untyped-def]  # noqa: ANN001, ANN202
+def _curvature(away: float, radius: float, factor: _Factor) -> float:
     """Return the trace of a ray's second derivatives times the covariance [m]."""
     aa, ab, bb, ar, br, rr = factor
     square = radius * radius - away * away
     outward = radius * aa - away * ar
     bent = outward * outward + away * away * (br * br + rr * rr)
-    return -(bent / square + ab * ab + bb * bb) / np.sqrt(square)
+    return -(bent / square + ab * ab + bb * bb) / math.sqrt(square)
 
 
 @compiled
-def _over_sigma_points(sphere, half, direction, factor, work):  # type: ignore[no-untyped-def]  # noqa: ANN001, ANN202
+def _over_sigma_points(
+    sphere: _Vector,
+    half: tuple[float, float],
+    direction: tuple[float, float],
+    factor: _Factor,
+    work: tuple[Array, Array],
+) -> tuple[float, float, float, float, float]:
     """Return mean depth, slopes by x, y and radius, and the deviation that is not linear."""
     (x, y, radius), (c, s), (aa, ab, bb, ar, br, rr) = sphere, direction, factor
     # columns of the factor in the footprint's axes: x, y and radius

@@ -59,9 +59,9 @@ def test_free_radii_of_true_spheres_are_unbiased_with_a_sigma_that_holds(lane, m
 
 
 @pytest.mark.parametrize(("assumed", "reach"), [(0.075, 5.0), (0.12, 10.0), (0.14, 10.0)])
-def test_another_radius_than_the_true_one_is_said(lane, assumed, reach):
+def test_a_wrong_assumed_radius_is_reported(lane, assumed, reach):
     for distance in DISTANCES[reach >= DISTANCES]:
         fits = at(fits_of(lane, "along_beam", assumed), distance)
-        said = [fit for fit in fits if "own radius" in fit.reason]
-        assert len(said) > 0.8 * len(fits)
-        assert abs(np.median([fit.radius_free for fit in said]) - 0.1) < 0.006
+        reported = [fit for fit in fits if "own radius" in fit.reason]
+        assert len(reported) > 0.8 * len(fits)
+        assert abs(np.median([fit.radius_free for fit in reported]) - 0.1) < 0.006

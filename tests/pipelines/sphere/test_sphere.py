@@ -133,7 +133,7 @@ def test_rays_without_noise_give_the_true_centre():
     candidate = found((np.arange(len(cloud.p_base)), CENTRE + OFF))
     by_ranges = fit_ranges(cloud, candidate, CONFIG, RADIUS)[0][0]
     assert_allclose(by_ranges.p_base, CENTRE, rtol=0, atol=1e-5)
-    # the outermost rays hold the outline only as exactly as they lie on it
+    # the outermost rays hold the limb only as exactly as they lie on it
     assert_allclose(fit_one(cloud, CENTRE + OFF).fits[0].p_base, CENTRE, rtol=0, atol=4e-5)
 
 
@@ -192,7 +192,7 @@ def test_covariances_agree_with_errors_and_the_mean_is_not_biased():
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("distance", "sigma", "low", "high"),
-    # the outline of this world is the same at every distance and without blur: what few returns add
+    # the limb of this world is the same at every distance and without blur: what few returns add
     # to a covariance, found where neither holds, is more than they need here
     [(4, 0.01, 2.4, 3.6), (7.5, 0.02, 2.4, 3.6), (10, 0.01, 2.4, 3.6), (20, 0.02, 2.0, 4.5)],
 )
@@ -214,7 +214,7 @@ def test_covariances_hold_at_every_distance(distance, sigma, low, high):
         strict=True, reason="with twice as many strays, two fits in five keep some and say ok"
     ))],
 )  # fmt: skip
-def test_pole_and_strays_are_set_aside(share):
+def test_pole_and_outliers_are_rejected(share):
     rng = np.random.default_rng(3)
     errors, n_misled = [], 0
     for _ in range(20):
@@ -234,7 +234,7 @@ def test_pole_and_strays_are_set_aside(share):
     assert n_misled <= 3
 
 
-def test_laser_biases_are_seen_and_taken_off():
+def test_laser_biases_are_estimated_and_corrected():
     rng = np.random.default_rng(4)
     draw, centres = stop_of(rng, 9.0, 14, sigma=0.006, bias=0.01)
     cloud, candidates = draw(rng)
@@ -250,22 +250,22 @@ def test_laser_biases_are_seen_and_taken_off():
     assert spread(knowing) < 0.8 * spread(blind)
 
 
-def test_the_error_of_range_that_all_centres_share_is_told():
+def test_the_range_error_that_all_centres_share_has_a_sigma():
     rng = np.random.default_rng(21)
 
-    def told(bias):
+    def shared_sigma(bias):
         draw, _ = stop_of(rng, 8.0, 8, sigma=0.006, bias=bias)
         fits = fit_markers("along_beam", *draw(rng), CONFIG, RADIUS).fits
         sigmas = np.array([fit.sigma_range_shared for fit in fits])
         assert np.ptp(sigmas) < 0.05 * sigmas.mean()
         return sigmas.mean()
 
-    rough = np.array([told(0.01) for _ in range(6)])
+    rough = np.array([shared_sigma(0.01) for _ in range(6)])
     # a mean over 16 lasers of 10 mm each; how far these spread has 15 degrees of freedom a stop
     low, high = chance.of_mean_square(15 * len(rough))
     typical = np.sqrt(np.mean(rough**2))
     assert np.sqrt(low) < typical / (0.01 / 4.0) < np.sqrt(high)
-    assert told(0.0) < 0.4 * typical
+    assert shared_sigma(0.0) < 0.4 * typical
 
 
 def test_three_returns_are_refused_with_the_reason():
@@ -294,7 +294,7 @@ def test_returns_on_one_line_are_weak_or_refused():
     assert "one line" in reason or "one laser" in reason
 
 
-def test_half_a_ball_is_weak_and_says_so():
+def test_half_a_sphere_is_weak_with_the_reason():
     shots, ranges = returns(*marker_shots(CENTRE, np.random.default_rng(2), sigma=0.008))
     cloud = cloud_of(shots, ranges)
     side = np.cross([0, 0, 1.0], CENTRE / np.linalg.norm(CENTRE))
@@ -304,7 +304,7 @@ def test_half_a_ball_is_weak_and_says_so():
     assert "is seen" in fit.reason
 
 
-def test_a_ball_of_another_size_is_weak_or_refused():
+def test_a_sphere_of_another_size_is_weak_or_refused():
     shots = towards(fire(), CENTRE, 0.3)
     ranges, lit = lit_ranges(shots, CENTRE, 0.14, RIG.divergence)
     ranges = ranges + 0.006 * np.random.default_rng(5).standard_normal(len(ranges))
@@ -348,7 +348,7 @@ def test_turning_the_world_turns_the_centre_and_nothing_else(method):
     assert_allclose(second.p_base, R @ first.p_base, rtol=0, atol=atol)
 
 
-def test_unknown_lasers_are_fitted_with_less_and_said_so():
+def test_returns_of_unknown_lasers_are_fitted_without_rings():
     shots, ranges = marker_shots(CENTRE, np.random.default_rng(9), sigma=0.01)
     known = cloud_of(shots, ranges)
     unknown = replace(known, rings=np.full(len(known.rings), RING_UNKNOWN, np.uint8))
@@ -410,7 +410,7 @@ def test_an_unknown_model_is_refused_with_the_known_ones_named():
         FittingConfig(paper_cut="pole")
 
 
-def test_a_ball_below_the_cut_is_lost_to_the_study_and_said_so():
+def test_the_study_refuses_a_sphere_below_the_cut_with_the_reason():
     cloud = cloud_of(*marker_shots(CENTRE, np.random.default_rng(14), sigma=0.01))
     config = FittingConfig(paper_cut="ground")
     result = fit_one(cloud, CENTRE, "paper", ground=CENTRE[2] + 0.2, config=config)
@@ -464,7 +464,7 @@ def test_a_radius_that_is_not_there_is_weak_or_refused(method, radius):
 
 
 @pytest.mark.parametrize("method", METHODS)
-def test_every_method_says_all_that_its_returns_tell(method):
+def test_every_method_gives_all_diagnostics(method):
     cloud = cloud_of(*marker_shots(CENTRE * 0.7, np.random.default_rng(31), sigma=0.008, pole=0.02))
     config = FittingConfig(paper_cut="ground")
     fit = fit_one(cloud, CENTRE * 0.7, method, config=config).fits[0]
@@ -479,7 +479,7 @@ def test_every_method_says_all_that_its_returns_tell(method):
 
 
 @pytest.mark.parametrize("method", METHODS)
-def test_without_rings_every_method_fits_with_less_and_says_so(method):
+def test_without_rings_every_method_fits_and_names_the_variant(method):
     known = cloud_of(*marker_shots(CENTRE, np.random.default_rng(9), sigma=0.01))
     blank = np.full(len(known.rings), RING_UNKNOWN, np.uint8)
     fit = fit_one(replace(known, rings=blank), CENTRE, method).fits[0]
@@ -498,7 +498,7 @@ def test_one_ring_alone_is_weak_or_refused_by_every_method(method):
 
 
 @pytest.mark.parametrize("missing", ["rings", "times"])
-def test_without_rings_or_times_the_outline_is_not_used_and_that_is_said(missing):
+def test_without_rings_or_times_the_limb_is_not_used_with_the_reason(missing):
     cloud = cloud_of(*marker_shots(CENTRE, np.random.default_rng(24), sigma=0.01))
     n = len(cloud.rings)
     blank = {
@@ -514,7 +514,7 @@ def test_without_rings_or_times_the_outline_is_not_used_and_that_is_said(missing
     assert_allclose(fit.p_base, ranges_only.p_base)
 
 
-def test_the_outline_sharpens_the_centre_and_what_passed_by_no_less():
+def test_the_limb_sharpens_centres_with_missing_pulses_too():
     rng = np.random.default_rng(25)
     squares = np.zeros(3)
     for _ in range(24):
@@ -530,7 +530,7 @@ def test_the_outline_sharpens_the_centre_and_what_passed_by_no_less():
     assert by_both < 0.75 * by_ranges
 
 
-def test_the_outline_never_makes_a_centre_look_surer_than_samples_can_tell():
+def test_the_limb_never_lowers_a_covariance_below_what_samples_support():
     rng = np.random.default_rng(32)
     shares = []
     for _ in range(40):
@@ -542,7 +542,7 @@ def test_the_outline_never_makes_a_centre_look_surer_than_samples_can_tell():
     assert min(shares) > 0.2 * np.median(shares)
 
 
-def test_the_standard_says_which_variant_ran():
+def test_the_standard_names_its_variant():
     far = cloud_of(*marker_shots(CENTRE, np.random.default_rng(26), sigma=0.01))
     near = cloud_of(*marker_shots(CENTRE / 2, np.random.default_rng(26), sigma=0.01))
     assert "small sample" in fit_one(far, CENTRE, "astm_e3125").fits[0].variant
