@@ -51,14 +51,14 @@ class MissingGimbalAngleError(RecordingError):
     code: ClassVar[str] = "input.recording.no_gimbal_angle"
 
 
-class MissingShotTimesError(RecordingError):
+class MissingPulseTimesError(RecordingError):
     """The gimbal turns continuously, but the points carry no time of their own."""
 
     code: ClassVar[str] = "input.recording.no_shot_times"
 
 
 class MissingRigError(RecordingError):
-    """Nothing tells how the LiDAR is mounted on the gimbal."""
+    """The mounting of the LiDAR on the gimbal is not described."""
 
     code: ClassVar[str] = "input.recording.no_rig"
 

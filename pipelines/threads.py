@@ -1,4 +1,4 @@
-"""Work side by side: hides how rows of a scan and simulated worlds are shared among processors."""
+"""Parallel execution: rows of a scan on two threads, simulated worlds in processes."""
 
 from __future__ import annotations
 
@@ -13,31 +13,30 @@ _Part = TypeVar("_Part")
 _World = TypeVar("_World")
 
 _N_PARTS = 2  # always: sums are taken part by part, and must not depend on the machine
-_N_CALLERS = 32  # that may wait for each other's parts; a thread starts when none is idle
-_POOL = ThreadPoolExecutor(_N_CALLERS)  # kept: to start a thread costs more than many a part
+_POOL = ThreadPoolExecutor(32)  # kept: to start a thread costs more than many parts; for 32 callers
 
 
 def side_by_side(
-    work: Callable[[int, int], _Part], n_rows: int, *, worth: int = 50_000
+    work: Callable[[int, int], _Part], n_rows: int, *, threaded_from: int = 50_000
 ) -> list[_Part]:
-    """Do the parts of a range of rows at the same time.
+    """Run a function on the two halves of a range of rows at the same time.
 
     Parameters
     ----------
     work : callable
-        Told the first row of a part and the row behind its last; gains only as far as it runs
-        without Python's lock, as compiled loops with ``nogil`` do.
+        Takes the first row of a part and the row behind its last; compiled loops run in parallel,
+        because they release Python's lock.
     n_rows : int
         Number of rows.
-    worth : int
-        With fewer rows the work is done before a thread has started: one part, then.
+    threaded_from : int
+        With fewer rows there is only one part, because starting a thread would take longer.
 
     Returns
     -------
     list
-        What ``work`` returned for each part, in the order of the rows.
+        Results of ``work``, in the order of the rows.
     """
-    if n_rows < worth:
+    if n_rows < threaded_from:
         return [work(0, n_rows)]
     edges = [part * n_rows // _N_PARTS for part in range(_N_PARTS + 1)]
     others = [_POOL.submit(work, *span) for span in pairwise(edges[1:])]
@@ -49,28 +48,27 @@ def side_by_side(
 
 
 def by_turns(
-    work: Callable[[int, int], _Part], n_rows: int, *, size: int, worth: int
+    work: Callable[[int, int], _Part], n_rows: int, *, size: int, threaded_from: int
 ) -> list[_Part]:
-    """Do pieces of a range of rows, each by whichever of the threads is free.
+    """Run a function on pieces of a range of rows, each on the next free one of two threads.
 
     Parameters
     ----------
     work : callable
-        As of ``side_by_side``; for what is not summed, so that it matters little if a thread starts
-        late or its processor is slow.
+        As for ``side_by_side``; its results must not depend on the division into pieces.
     n_rows : int
         Number of rows.
     size : int
         Rows of a piece.
-    worth : int
-        With fewer rows the work is done before a thread has started: one piece, then.
+    threaded_from : int
+        With fewer rows there is only one piece.
 
     Returns
     -------
     list
-        What ``work`` returned for each piece, in the order of the rows.
+        Results of ``work``, in the order of the rows.
     """
-    if n_rows < worth:
+    if n_rows < threaded_from:
         return [work(0, n_rows)]
     found: dict[int, _Part] = {}
     begins = iter(range(0, n_rows, size))
@@ -95,24 +93,23 @@ def in_processes(
     n_processes: int | None = None,
     progress: Callable[[float, str], None] = lambda _share, _what: None,
 ) -> list[_Part]:
-    """Do the same for many worlds, each in one of some fresh processes.
+    """Run a function on many worlds in new processes.
 
     Parameters
     ----------
     work : callable
-        Takes a world; a function of a module, or a partial of one: another process must find it.
+        Takes a world; a function of a module, or a partial of one, so that it can be pickled.
     worlds : sequence
         Arguments of ``work``: seeds, for instance. They are pickled.
     n_processes : int, optional
-        How many at a time; as many as there are processors by default. With 1 there is none but
-        this one.
+        Number of processes; by default that of the processors. With 1 all runs in this process.
     progress : callable
-        Told the share of the work that is done, 0 to 1, and how much; may raise to cancel.
+        Receives the finished share, 0 to 1, and a text; may raise to cancel.
 
     Returns
     -------
     list
-        What ``work`` returned for each world, in their order.
+        Results of ``work``, in the order of the worlds.
     """
     n, found = len(worlds), dict[int, _Part]()
 

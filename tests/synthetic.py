@@ -88,7 +88,7 @@ def scan_log(rng, rig, *, n=3000, turn=2 * np.pi, duration=13.2, joint_rate=100.
         intensities=rng.uniform(1, 100, n).astype(np.float32),
         rings=rings,
         stamps_lidar_ns=stamps,
-        has_shot_times=True,
+        has_pulse_times=True,
         gimbal_angles=joint(stamps_joint),
         stamps_gimbal_ns=stamps_joint - offset,
         quaternions_imu=leaning(rng, rig, lean, joint(stamps_joint)),

@@ -127,7 +127,7 @@ def gather_evidence(
             found.append(Evidence(*fields))
         return found
 
-    return list(chain(*side_by_side(counted, len(centres), worth=4)))
+    return list(chain(*side_by_side(counted, len(centres), threaded_from=4)))
 
 
 def _cones(centres: Array, target: Target) -> Array:

@@ -136,7 +136,7 @@ def _by_azimuth(
     dealt = np.concatenate([by_azimuth[0::2], by_azimuth[1::2]])
     mine = places[dealt]
     parts = side_by_side(
-        lambda first, end: work(nearby, mine[first:end], target), n, worth=_N_THREADED
+        lambda first, end: work(nearby, mine[first:end], target), n, threaded_from=_N_THREADED
     )
     rows = np.concatenate(parts)
     found = np.empty_like(rows)

@@ -80,7 +80,7 @@ def _sort_by_cell(
     side_by_side(
         lambda first, end: [_place(p_base, *job, points) for job in jobs[first:end]],
         len(jobs),
-        worth=2,
+        threaded_from=2,
     )
     return starts, points
 

@@ -59,7 +59,9 @@ def ground_heights(grid: Grid, config: ElevationConfig) -> Ground:
     rows, columns = grid.shares.shape
     surfaces = np.full((rows, columns, 8), np.nan)
     sizes = np.array([config.cell, config.object_max, config.sigma_range**2])
-    side_by_side(lambda first, end: _fit_surfaces(grid, sizes, surfaces, first, end), rows, worth=1)
+    side_by_side(
+        lambda first, end: _fit_surfaces(grid, sizes, surfaces, first, end), rows, threaded_from=1
+    )
     steep = _stands_out(surfaces[..., 0], config.cell)
     surfaces[steep] = np.nan
     heights, sigmas = np.full((rows, columns), np.nan), np.full((rows, columns), np.nan)

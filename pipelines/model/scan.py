@@ -120,7 +120,7 @@ class ScanLog:
         Laser of each return, 0 the lowest; ``RING_UNKNOWN`` throughout when not recorded.
     stamps_lidar_ns : (n,)
         Instant of each pulse; that of its message when the points carry no time.
-    has_shot_times : bool
+    has_pulse_times : bool
         Whether the points carry a time of their own.
     gimbal_angles : (m,)
         Joint angle, unwrapped, positive counter-clockwise seen from above [rad].
@@ -144,7 +144,7 @@ class ScanLog:
     intensities: Column
     rings: Rings
     stamps_lidar_ns: Nanos
-    has_shot_times: bool
+    has_pulse_times: bool
     gimbal_angles: Array
     stamps_gimbal_ns: Nanos
     quaternions_imu: Array

@@ -189,7 +189,7 @@ def simulate_random_plans(
             (worst[first:last], errors[first:last], inside[first:last]),
         )
 
-    side_by_side(part, n, worth=1_000)
+    side_by_side(part, n, threaded_from=1_000)
     return RandomPlanResults(
         spec=spec,
         n_marks=counts.astype(np.intp),

@@ -66,7 +66,7 @@ def find_visibility(site: Site, stations_site: Array, marks: Arrangement) -> Vis
     def part(first: int, last: int) -> None:
         _march(grids, frame, (stations[first:last], p_site), site.marker_radius, lowest[first:last])
 
-    side_by_side(part, len(stations), worth=max(2, _MANY // max(len(p_site), 1)))
+    side_by_side(part, len(stations), threaded_from=max(2, _MANY // max(len(p_site), 1)))
     if site.bodies is not None:
         _refine_by_rays(site.bodies, (stations, p_site), site.marker_radius, lowest)
     _find_gaps(site.surface, frame, (stations, p_site), gaps)

@@ -12,12 +12,11 @@ from dataclasses import replace
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from spheremark.pipelines.compilation import compiled
 from spheremark.pipelines.config import StitchingConfig
 from spheremark.pipelines.errors import (
     MissingGimbalAngleError,
+    MissingPulseTimesError,
     MissingRigError,
-    MissingShotTimesError,
     RecordingError,
     RigError,
 )
@@ -163,7 +162,7 @@ def stitch(log: ScanLog, rig: Rig, config: StitchingConfig) -> StitchedCloud:
     ------
     MissingGimbalAngleError
         If the log has no joint sample.
-    MissingShotTimesError
+    MissingPulseTimesError
         If the points carry no time of their own and the gimbal does not rest during a message.
     RecordingError
         If no return has a gimbal angle and a range within the limits.
@@ -254,7 +253,7 @@ def _joints(log: ScanLog, rig: Rig) -> Joints:
 
 def _without_smear(log: ScanLog, joints: Joints) -> tuple[Joints, tuple[str, ...]]:
     """Void the angle during messages without pulse times in which the gimbal moved."""
-    if log.has_shot_times or not len(log.stamps_lidar_ns):
+    if log.has_pulse_times or not len(log.stamps_lidar_ns):
         return joints, ()
     messages = np.unique(log.stamps_lidar_ns)
     if len(messages) > 1:
@@ -264,7 +263,7 @@ def _without_smear(log: ScanLog, joints: Joints) -> tuple[Joints, tuple[str, ...
         moved = np.ptp(joints.angles, keepdims=True)
     smeared, n_rests = _smeared(moved)
     if np.mean(smeared) > 0.5 and n_rests < _RESTS_MIN:
-        raise MissingShotTimesError(
+        raise MissingPulseTimesError(
             f"The points of {log.origin.name} carry no time of their own, and the gimbal turns by "
             f"{np.degrees(np.median(moved)):.2f} deg during a message (at most "
             f"{np.degrees(_SMEAR):.2f} can be tolerated). Record a point cloud with the field "
@@ -411,47 +410,21 @@ def beams(cloud: StitchedCloud, members: Index) -> Beams:
     origin. Across is the spin axis times the direction: the tangent of the sweep.
     """
     rig = cloud.rig
-    heights = _by_ring(rig.laser_heights)[cloud.rings[members]]
+    heights = _by_ring(rig.laser_heights)[cloud.rings[members], None]
     angles = cloud.gimbal_angles[members].astype(np.float64)
-    turns = (np.cos(angles), np.sin(angles))
-    origins, directions, across, ranges = _beams(
-        cloud.p_base[members], turns, heights, rig.T_head_lidar
-    )
+    spin, centre = rig.T_head_lidar[:3, 2], rig.T_head_lidar[:3, 3]
+    origins = _turn(centre + heights * spin, angles)
+    along = cloud.p_base[members] - origins
+    ranges = np.linalg.norm(along, axis=1)
+    directions = along / ranges[:, None]
+    across = np.cross(_turn(np.broadcast_to(spin, origins.shape), angles), directions)
     return Beams(
         origins_base=origins,
         directions_base=directions,
         ranges=ranges,
-        across_base=across,
+        across_base=across / np.linalg.norm(across, axis=1, keepdims=True),
         rings=cloud.rings[members],
         intensities=cloud.intensities[members].astype(np.float64),
         times=cloud.times[members].astype(np.float64),
         divergence=rig.divergence,
     )
-
-
-@compiled
-def _beams(
-    p_base: Column, turns: tuple[Array, Array], heights: Array, T_head_lidar: Array
-) -> tuple[Array, Array, Array, Array]:
-    """Return origins, directions, tangents of the sweep, and ranges of returns.
-
-    ``turns`` are cosines and sines of the gimbal angles, heights those of the lasers.
-    """
-    n, T = len(p_base), T_head_lidar
-    origins, directions, across = np.empty((n, 3)), np.empty((n, 3)), np.empty((n, 3))
-    ranges, spin = np.empty(n), (T[0, 2], T[1, 2], T[2, 2])
-    for i in range(n):
-        c, s, o, u, a = turns[0][i], turns[1][i], origins[i], directions[i], across[i]
-        x, y = T[0, 3] + heights[i] * spin[0], T[1, 3] + heights[i] * spin[1]
-        o[0], o[1], o[2] = c * x - s * y, s * x + c * y, T[2, 3] + heights[i] * spin[2]
-        for j in range(3):
-            u[j] = p_base[i, j] - o[j]
-        ranges[i] = np.sqrt(u[0] * u[0] + u[1] * u[1] + u[2] * u[2])
-        for j in range(3):
-            u[j] /= ranges[i]
-        x, y, z = c * spin[0] - s * spin[1], s * spin[0] + c * spin[1], spin[2]
-        a[0], a[1], a[2] = y * u[2] - z * u[1], z * u[0] - x * u[2], x * u[1] - y * u[0]
-        length = np.sqrt(a[0] * a[0] + a[1] * a[1] + a[2] * a[2])
-        for j in range(3):
-            a[j] /= length
-    return origins, directions, across, ranges

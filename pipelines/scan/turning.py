@@ -70,9 +70,10 @@ def turn_returns(pulses: Pulses, joints: Joints, lidar: Lidar) -> tuple[Pulses, 
         counts: Index = _turn_part(columns, knots_ns, table, lidar, p_base[flat], keep[rows])
         return counts
 
-    parts = np.array(side_by_side(turn, n))
-    counts = parts[:, :4].sum(axis=0).tolist()
-    tally = Tally._make([*counts, int(parts[:, 4].min()), int(parts[:, 5].max())])
+    counts = np.sum(side_by_side(turn, n), axis=0).tolist()
+    limits, stamps_ns = np.iinfo(np.int64), pulses.stamps_ns
+    first, last = stamps_ns.min(initial=limits.max), stamps_ns.max(initial=limits.min)
+    tally = Tally._make([*counts, int(first), int(last)])
     found = pulses._replace(p=p_base.reshape(n, 3))
     return (found if tally.n_kept == n else _closed_up(found, keep)), tally
 
@@ -133,19 +134,18 @@ def _close_up(pulses, keep, out, first, end, is_upward):  # type: ignore[no-unty
 
 @compiled
 def _turn_part(columns, knots_ns, table, lidar, p_base, keep):  # type: ignore[no-untyped-def]  # noqa: ANN001, ANN202
-    """Turn some returns, mark which to keep, and return the fields of ``Tally``."""
+    """Turn some returns, mark which to keep, and count as ``Tally`` does."""
     p, rings, stamps = columns
-    tally = np.array([0, 0, 0, 0, np.iinfo(np.int64).max, np.iinfo(np.int64).min])
+    counts = np.zeros(4, np.int64)
     heights, scales = np.empty(_BLOCK), np.ones(_BLOCK)
     begin, n = 0, len(rings)
     while begin < n:
         j = min(np.searchsorted(knots_ns, stamps[begin], side="right"), len(table) - 1) - 1
         most = min(n, begin + _BLOCK)
         end = _run_end(stamps, begin, most, knots_ns[j], knots_ns[j + 1])
-        tally[4], tally[5] = _first_and_last(stamps, begin, end, tally[4], tally[5])
         if np.isnan(table[j, 2]):
             keep[begin:end] = False
-            tally[1] += end - begin
+            counts[1] += end - begin
         else:
             _look_up(lidar.heights, rings, begin, end, heights)
             if lidar.has_biases:
@@ -154,10 +154,10 @@ def _turn_part(columns, knots_ns, table, lidar, p_base, keep):  # type: ignore[n
             at = (knots_ns[j], table[j, 0], table[j, 1], table[j, 2])
             n_kept = _turn_run(p, stamps, begin, end, at, lidar, heights, scales, p_base)
             if n_kept < end - begin:
-                _select(p, begin, end, lidar, heights, keep, tally)
-            tally[0] += n_kept
+                _select(p, begin, end, lidar, heights, keep, counts)
+            counts[0] += n_kept
         begin = end
-    return tally
+    return counts
 
 
 @compiled
@@ -174,14 +174,6 @@ def _run_end(stamps, begin, most, since, until):  # type: ignore[no-untyped-def]
     while end < most and since <= stamps[end] < until:
         end += 1
     return end
-
-
-@compiled
-def _first_and_last(stamps, begin, end, first, last):  # type: ignore[no-untyped-def]  # noqa: ANN001, ANN202
-    """Return the first and the last instant, including the given ones."""
-    for i in range(np.uint64(begin), np.uint64(end)):
-        first, last = min(first, stamps[i]), max(last, stamps[i])
-    return first, last
 
 
 @compiled
@@ -238,10 +230,10 @@ def _turn_run(p, stamps, begin, end, at, lidar, heights, scales, p_base):  # typ
 
 
 @compiled
-def _select(p, begin, end, lidar, heights, keep, tally):  # type: ignore[no-untyped-def]  # noqa: ANN001, ANN202, PLR0913
+def _select(p, begin, end, lidar, heights, keep, counts):  # type: ignore[no-untyped-def]  # noqa: ANN001, ANN202, PLR0913
     """Mark which returns of a run to keep; count those not finite and out of range."""
     for i in range(begin, end):
         _, _, _, reach2 = _beam(p, np.uint64(i), lidar.height_share * heights[i - begin])
         keep[i] = lidar.range_limits[0] ** 2 <= reach2 <= lidar.range_limits[1] ** 2
-        tally[2] += not np.isfinite(reach2)
-        tally[3] += np.isfinite(reach2) and not keep[i]
+        counts[2] += not np.isfinite(reach2)
+        counts[3] += np.isfinite(reach2) and not keep[i]

@@ -143,7 +143,7 @@ def simulate_stop(
         intensities=returns.intensities,
         rings=returns.rings,
         stamps_lidar_ns=start_ns + _stamped(returns.offsets_ns, config),
-        has_shot_times=config.shot_times,
+        has_pulse_times=config.shot_times,
         gimbal_angles=joint[0],
         stamps_gimbal_ns=start_ns + joint[1],
         quaternions_imu=ahrs[0],

@@ -1,9 +1,9 @@
 """Scan logs: MCAP files to and from ``ScanLog``, and the preflight report.
 
 A recording is walked once (``container``); each message family is a module that turns its messages
-into neutral columns (``families``): ``pointclouds``, ``joint_states``, ``transforms``,
+into neutral columns (``families``): ``pointclouds``, ``packets``, ``joint_states``, ``transforms``,
 ``orientations``. ``reading`` chooses among topics and builds the log. Nothing is executed from a
-recording, and no length that it declares is believed before it is checked.
+recording, and every declared length is checked before use.
 """
 
 from spheremark.storage.recordings.container import file_digest, require_file

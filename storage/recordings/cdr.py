@@ -109,18 +109,18 @@ class Cursor:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Layout:
-    """Where the varying numbers of a small message are; all else is equal in messages alike.
+    """Places of the varying numbers in a small message; all other bytes are equal in its group.
 
     Attributes
     ----------
     names : tuple of tuple of str
-        The strings that tell what the numbers are.
+        Names of the quantities.
     stamps : tuple of int
         Where times begin.
     columns : tuple of (int, int)
         Where runs of float64 begin, and their lengths.
     passed : tuple of (int, int)
-        The same of numbers that nobody wants.
+        The same of numbers that are not read.
     """
 
     names: tuple[tuple[str, ...], ...]
@@ -183,7 +183,7 @@ class SmallMessages:
         return tables
 
     def _decode_alike(self, rows: Octets, log_times: Nanos, tables: list[Table]) -> Mask:
-        """Decode the first message and all that are laid out like it; say which."""
+        """Decode the first message and all of its layout; return which these are."""
         cursor_order, layout = "<", None
         try:
             cursor = Cursor(rows[0])
@@ -205,7 +205,7 @@ class SmallMessages:
 
 
 def heads_alike(batch: Batch, i: int, size: int, varying: Iterable[int]) -> Octets:
-    """Find messages that begin alike."""
+    """Return the heads of message i and those behind it that equal it except in varying bytes."""
     rows = slice(i, i + _ALIKE_MAX)
     n = n_leading(batch.lengths[rows] >= size)
     heads = windows(batch.octets, size)[batch.starts[rows][:n]]
@@ -215,12 +215,12 @@ def heads_alike(batch: Batch, i: int, size: int, varying: Iterable[int]) -> Octe
 
 
 def n_leading(is_so: Mask) -> int:
-    """Count what is so before the first that is not."""
+    """Count the leading true values."""
     return len(is_so) if is_so.all() else int(np.argmin(is_so))
 
 
 def definition_agrees(channel: Channel, expected: str) -> bool:
-    """Say whether the recorded definition has the fields that the decoder reads."""
+    """Return whether the recorded definition has the fields that the decoder reads."""
     text = channel.definition.decode("utf-8", "replace")
     if channel.schema_encoding != "ros2msg" or not text.strip():
         return True
@@ -237,12 +237,12 @@ def _fields(text: str) -> list[tuple[str, str]]:
 
 
 def _joined(parts: Sequence[NDArray[_Kind]]) -> NDArray[_Kind]:
-    """Put arrays behind each other, without copying if there is only one."""
+    """Concatenate arrays, without copying if there is only one."""
     return np.concatenate(parts) if len(parts) > 1 else parts[0]
 
 
 def _alike(rows: Octets, layout: Layout) -> Mask:
-    """Say which messages agree with the first one wherever the layout does not vary."""
+    """Return which messages equal the first one wherever the layout does not vary."""
     fixed = np.ones(rows.shape[1], np.bool_)
     for at in layout.stamps:
         fixed[at : at + 8] = False

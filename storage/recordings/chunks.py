@@ -1,7 +1,7 @@
-"""Chunks of an MCAP file: brought, unpacked and checked many at a time, by two threads.
+"""Chunks of an MCAP file: read, decompressed and checked many at a time, by two threads.
 
-All go into one buffer that is used again and again, packed or not: to read a block into it costs
-less than the page faults of mapping the block.
+All go into one buffer that is reused, compressed or not: to read a block into it costs less than
+the page faults of mapping the block.
 """
 
 from __future__ import annotations
@@ -21,35 +21,35 @@ from spheremark.pipelines.model import Nanos
 from spheremark.pipelines.threads import by_turns
 from spheremark.storage.recordings.records import RECORD_HEAD, Octets, text, walk
 
-_STRETCH = 1 << 26  # [bytes] of chunks that are brought together: to begin anew costs half a ms
+_STRETCH = 1 << 26  # [bytes] of chunks that are read together: each stretch costs half a ms
 _CHUNK_LIMIT = 1 << 29  # [bytes] a larger decompressed chunk is refused, whatever it declares
 _HEAD = 8 + 8 + 8 + 4 + 4 + 64 + 8  # [bytes] before the records of a chunk, at the most
 _BROKEN = (ValueError, struct.error, zstandard.ZstdError, RuntimeError)
 
 
 class Chunk(NamedTuple):
-    """What a chunk says of itself, and where it is."""
+    """The header of a chunk, and its place."""
 
     record: int  # where its record begins in the file
-    begin: int  # where its records begin, packed or not
-    length: int  # of them as they are in the file [bytes]
-    size: int  # of them unpacked [bytes]
-    crc: int  # of them unpacked; 0 when not known
+    begin: int  # where its records begin, compressed or not
+    length: int  # of them in the file [bytes]
+    size: int  # of them decompressed [bytes]
+    crc: int  # of them decompressed; 0 when not recorded
     compression: str
 
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class Stretch:
-    """Chunks that follow each other, unpacked.
+    """Chunks that follow each other, decompressed.
 
     Attributes
     ----------
     octets : (size,) uint8
-        Their records; valid until the next stretch is asked for.
+        Their records; valid until the next stretch.
     rows : (n, 5)
-        The records, as ``records.walk`` tells them.
+        The records, as from ``records.walk``.
     damage : (int, str) or None
-        Where the first damaged chunk begins and what is wrong; its records are left out.
+        First byte and fault of the first damaged chunk; its records are left out.
     """
 
     octets: Octets
@@ -72,15 +72,15 @@ class Chunks:
         self._octets = octets
         self._file = file
         self._buffer = np.empty(0, np.uint8)
-        self._n_packed = self._n_unpacked = 1
+        self._n_compressed = self._n_decompressed = 1
 
     @property
-    def swelling(self) -> float:
-        """Say how much longer chunks are unpacked, judged by those brought so far."""
-        return self._n_unpacked / self._n_packed
+    def expansion(self) -> float:
+        """Ratio of decompressed to compressed size of the chunks so far."""
+        return self._n_decompressed / self._n_compressed
 
     def stretches(self, rows: Nanos) -> Iterator[Stretch]:
-        """Bring chunks, as many at a time as memory should hold."""
+        """Yield the chunks, as many at a time as memory should hold."""
         chunks: list[Chunk] = []
         n_octets = 0
         damage = None
@@ -109,13 +109,13 @@ class Chunks:
         def bring(begin: int, end: int) -> tuple[list[Nanos], tuple[int, str] | None]:
             return self._bring(chunks[begin:end], places[begin:end])
 
-        for rows, damaged in by_turns(bring, len(chunks), size=1, worth=2):
+        for rows, damaged in by_turns(bring, len(chunks), size=1, threaded_from=2):
             found += rows
             if damaged is not None:
                 damage = damaged
                 break
-        self._n_packed += sum(chunk.length for chunk in chunks)
-        self._n_unpacked += places[-1]
+        self._n_compressed += sum(chunk.length for chunk in chunks)
+        self._n_decompressed += places[-1]
         octets = self._buffer[: places[-1]]
         octets.flags.writeable = False
         return Stretch(octets=octets, rows=np.concatenate(found), damage=damage)
@@ -166,7 +166,7 @@ class Chunks:
 
 
 def _described(body: Octets, start: int) -> Chunk:
-    """Return what a chunk says of itself, if it can be so."""
+    """Return the header of a chunk; raise if it cannot be true."""
     head = body[:_HEAD].tobytes()
     size, crc = struct.unpack_from("<QI", head, 16)
     compression, at = text(head, 28)

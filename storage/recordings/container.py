@@ -1,8 +1,8 @@
 """The MCAP container: from a file to batches of raw messages, one channel at a time.
 
-Hides: records, chunks, compression, checksums, and how far a damaged file can be believed. The file
-is walked once from front to back, so that an index is neither needed nor trusted; no declared
-length is used before it is checked.
+Hides records, chunks, compression, checksums, and the readable part of a damaged file. The file is
+walked once from front to back, so that an index is neither needed nor trusted; no declared length
+is used before it is checked.
 """
 
 from __future__ import annotations
@@ -50,8 +50,8 @@ _USES[CHUNK] = _OF_CHUNKS
 _USES[[FOOTER, DATA_END]] = _ENDS
 _KEEP_MAPPED = 1 << 25  # [bytes] pages behind this distance are given back
 _BLOCK = 1 << 22  # [bytes] read at a time for the digest
-_MORE = 1.1  # that a file may be larger than its first chunks promise
-_SWELLING_MAX = 10.0  # that is believed of a whole file before it is unpacked
+_MORE = 1.1  # margin of the expansion of a file over that of its first chunks
+_EXPANSION_MAX = 10.0  # largest expansion for which memory is reserved in advance
 _RECOVER = "recover what is readable with `mcap recover` and use the result"
 
 
@@ -89,7 +89,7 @@ class Batch:
     channel : Channel
         The channel.
     octets : (size,) uint8
-        The buffer; valid until the next batch is asked for.
+        The buffer; valid until the next batch.
     starts : (n,)
         First byte of each message's data.
     lengths : (n,)
@@ -105,7 +105,7 @@ class Batch:
     log_times_ns: Nanos
 
     def __iter__(self) -> Iterator[tuple[Octets, int]]:
-        """Give data and log time of each message."""
+        """Yield data and log time of each message."""
         for start, length, log_time in zip(
             self.starts.tolist(), self.lengths.tolist(), self.log_times_ns.tolist(), strict=True
         ):
@@ -114,7 +114,7 @@ class Batch:
 
 @dataclass(slots=True)
 class Container:
-    """A recording that is being walked; afterwards, what was seen on the way.
+    """A recording during and after its walk.
 
     Attributes
     ----------
@@ -155,8 +155,8 @@ class Container:
     @property
     def likely_size(self) -> int:
         """Length of the file if it were not compressed, judged by its first chunks [bytes]."""
-        swelling = self._source.swelling
-        likely = min(_MORE * swelling, _SWELLING_MAX) if swelling > 1.0 else 1.0
+        expansion = self._source.expansion
+        likely = min(_MORE * expansion, _EXPANSION_MAX) if expansion > 1.0 else 1.0
         return int(likely * self.size)
 
     def topics(self) -> dict[str, str]:
@@ -164,7 +164,7 @@ class Container:
         return {channel.topic: channel.schema for channel in self.channels.values()}
 
     def batches(self) -> Iterator[Batch]:
-        """Give all messages, in the order of the file."""
+        """Yield all messages, in the order of the file."""
         position, is_whole = len(MAGIC), True
         plain = False  # whether messages stand outside chunks
         while is_whole and position < self.size:
@@ -185,14 +185,14 @@ class Container:
         raise self._truncated(position, what)
 
     def _chunked(self, rows: Nanos) -> Iterator[Batch]:
-        """Give the messages of chunks that follow each other."""
+        """Yield the messages of chunks that follow each other."""
         for stretch in self._source.stretches(rows):
             yield from self._group(stretch.octets, stretch.rows)
             if stretch.damage is not None:
                 raise self._truncated(*stretch.damage)
 
     def _group(self, octets: Octets, rows: Nanos) -> Iterator[Batch]:
-        """Register schemas and channels of some records, then give their messages by channel."""
+        """Register schemas and channels of some records, then yield their messages by channel."""
         kinds = rows[:, 0]
         for opcode, start, length in rows[(kinds == SCHEMA) | (kinds == CHANNEL), :3].tolist():
             self._register(opcode, octets[start : start + length].tobytes())
@@ -215,7 +215,7 @@ class Container:
             )
 
     def _register(self, opcode: int, body: bytes) -> None:
-        """Remember a schema or a channel; a malformed one costs its channel, not the file."""
+        """Register a schema or a channel; a malformed one costs its channel, not the file."""
         try:
             if opcode == SCHEMA:
                 name, at = text(body, 2)
@@ -251,7 +251,7 @@ class Container:
             raise self._truncated(end, "the closing magic bytes are missing")
 
     def _release(self, position: int) -> None:
-        """Give pages that lie far behind back to the system, so that memory stays bounded."""
+        """Release pages that lie far behind, so that memory stays bounded."""
         if self.mapping is None or position - self._released < _KEEP_MAPPED:
             return
         end = position // mmap.PAGESIZE * mmap.PAGESIZE
@@ -259,7 +259,7 @@ class Container:
         self._released = end
 
     def _truncated(self, position: int, what: str) -> TruncatedRecordingError:
-        """Return the error that says how far the file is readable."""
+        """Return the error with the readable part of the file."""
         duration = 0.0 if self._first_ns is None else (self._last_ns - self._first_ns) / 1e9
         return TruncatedRecordingError(
             f"The recording is incomplete: {what}. It is readable up to byte {position:,} of "
@@ -275,13 +275,13 @@ def opened(url: str | Path) -> Iterator[Container]:
             raise NotMcapError(f"{path.name} is empty, not an MCAP file: was the upload cut?")
         mapping = mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ)
         mapping.madvise(mmap.MADV_SEQUENTIAL)
-        # Not closed by hand: views may outlive the walk, and the last one of them unmaps.
+        # Not closed here: views may outlive the walk, and the last one of them unmaps.
         yield Container(np.frombuffer(mapping, np.uint8), mapping, file.fileno())
 
 
 @contextmanager
 def local_copy(url: str | Path) -> Iterator[Path]:
-    """Give the path of a recording on this machine, copied if it is elsewhere."""
+    """Yield the path of a recording on this machine, copied if it is elsewhere."""
     if "://" not in str(url) and (here := Path(url)).is_file():
         yield here
         return

@@ -1,7 +1,7 @@
-"""What every message family gives: the neutral columns between decoders and the log.
+"""The interface of message families: neutral columns between decoders and the log.
 
-A family is a module with a decoder class per message type. It knows its encoding and its message
-type, nothing about files or about other families; whoever adds one lists it in ``reading.py``.
+A family is a module with a decoder class per message type. It depends on its encoding and message
+type alone; a new one is listed in ``reading.py``.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ _FAR_NS = 86_400e9  # a day: clocks that differ differ for all, or by a mistake 
 
 
 class BrokenMessageError(ValueError):
-    """A message does not hold what its type promises: it is left out and counted."""
+    """A message does not agree with its type: it is left out and counted."""
 
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
@@ -36,15 +36,15 @@ class Returns:
     rings : (n,) uint8
         As recorded; ``RING_UNKNOWN`` throughout when not.
     stamps_ns : (n,)
-        Instant of each shot, or of its message.
-    has_shot_times : bool
+        Instant of each pulse, or of its message.
+    has_pulse_times : bool
         Whether the points carry usable times.
     message_stamps_ns : (k,)
         Instant of each message, by its header.
     notes : tuple of str
-        What is missing, as sentences for people.
+        What is missing, as sentences.
     has_heights : bool or None
-        Whether the coordinates include the heights of the lasers; none where that is not known.
+        Whether the coordinates include the heights of the lasers; None where that is not known.
     """
 
     topic: str
@@ -53,7 +53,7 @@ class Returns:
     intensities: Column
     rings: Rings
     stamps_ns: Nanos
-    has_shot_times: bool
+    has_pulse_times: bool
     message_stamps_ns: Nanos
     notes: tuple[str, ...]
     has_heights: bool | None = None
@@ -66,7 +66,7 @@ class Series:
     Attributes
     ----------
     topic : str
-        Where it comes from.
+        Topic of the messages.
     names : tuple of str
         The joint; or parent and child of a transform; or the frame of an orientation.
     stamps_ns : (n,)
@@ -74,7 +74,7 @@ class Series:
     values : (n, k)
         Angle [rad]; or translation [m] and quaternion x y z w; or quaternion alone.
     notes : tuple of str
-        What is missing or was repaired, as sentences for people.
+        What is missing or was repaired, as sentences.
     """
 
     topic: str
@@ -95,17 +95,17 @@ class LidarDecoder(Decoder, Protocol):
     """Decoder of a LiDAR topic; made from its channel and the likely size of all [bytes]."""
 
     def returns(self) -> Returns:
-        """Give all that the messages held."""
+        """Return all returns of the messages."""
 
 
 class SeriesDecoder(Decoder, Protocol):
     """Decoder of a topic with signals; made from its channel."""
 
     def series(self) -> list[Series]:
-        """Give the signals that the messages held."""
+        """Return the signals of the messages."""
 
     def notes(self) -> tuple[str, ...]:
-        """Say, after that, what could not be decoded."""
+        """Return notes on messages that could not be decoded, after ``series``."""
 
 
 def series_of(
@@ -130,16 +130,16 @@ def series_of(
 
 
 def plausible(stamps_ns: Nanos, log_times_ns: Nanos) -> Mask:
-    """Say which stamps are about as late against the times of recording as the others."""
+    """Return which stamps lag the times of recording about as much as the others."""
     late = log_times_ns.astype(np.float64) - stamps_ns.astype(np.float64)
     if not len(late) or np.ptp(late) <= _FAR_NS:
         return np.ones(len(late), np.bool_)
     return np.asarray(np.abs(late - np.median(late)) <= _FAR_NS)
 
 
-def far_note(topic: str, n: int, what: str) -> str:
+def far_note(topic: str, n: int, unit: str) -> str:
     """Return the sentence about stamps that are not plausible."""
-    return f"{n} {what} of {topic} are left out: their stamps are more than a day off."
+    return f"{n} {unit} of {topic} are left out: their stamps are more than a day off."
 
 
 def broken_note(topic: str, n_broken: int, reason: str) -> tuple[str, ...]:

@@ -17,7 +17,7 @@ _UNIT = 1e-3  # how far the norm of a quaternion may be from 1
 
 @dataclass(slots=True)
 class FrameTree:
-    """Which frame hangs on which, by transforms that do not change.
+    """The frames and their parents, by transforms that do not change.
 
     Attributes
     ----------
@@ -31,7 +31,7 @@ class FrameTree:
     turning: dict[str, Series] = field(default_factory=dict)
 
     def add(self, series: Series) -> None:
-        """Hang a frame on its parent; a topic named ``tf_static`` tells what does not change."""
+        """Add a frame under its parent; transforms of a topic ``tf_static`` do not change."""
         parent, child = series.names
         if not series.topic.endswith("tf_static"):
             self.turning[child] = series
@@ -56,10 +56,10 @@ class FrameTree:
         return chain
 
     def head_of(self, frame: str) -> str | None:
-        """Return the turning head that a frame sits on, if the tree tells.
+        """Return the turning head that a frame sits on, or None.
 
-        It is the frame whose own transform changes; else ``gimbal_link``; else what is called a
-        gimbal; else the root, unless that is a base or a world, which do not turn.
+        It is the frame whose own transform changes; else ``gimbal_link``; else a frame named after
+        a gimbal; else the root, unless that is a base or a world, which do not turn.
         """
         chain = list(self.chain(frame))
         turning = [one for one in chain if one in self.turning]
@@ -83,7 +83,7 @@ def recorded_rig(
     if head is None:
         known = ", ".join(sorted(set(tree.parents) | set(tree.turning))) or "none"
         return None, (
-            f"No transform tells how {frame or 'the LiDAR'} sits on the gimbal "
+            f"No transform relates {frame or 'the LiDAR'} to the gimbal "
             f"(frames with a parent: {known}); give a rig.",
         )
     mount, R_mount_imu, notes = _imu_mounting(tree, head, imu_frame)
@@ -106,5 +106,5 @@ def _imu_mounting(
     if common:
         T_base_imu = inverse(base_chain[common[0]]) @ chain[common[0]]
         return ImuMount.BASE, T_base_imu[:3, :3], ()
-    note = f"No transform tells how {imu_frame} sits on {base}; it is taken as aligned with it."
+    note = f"No transform relates {imu_frame} to {base}; it is taken as aligned with it."
     return ImuMount.BASE, np.eye(3), (note,)

@@ -31,11 +31,11 @@ class JointStates:
         self._messages.add(batch)
 
     def notes(self) -> tuple[str, ...]:
-        """Say how many messages could not be decoded."""
+        """Return a note on messages that could not be decoded."""
         return broken_note(self._topic, self._messages.n_broken, self._messages.reason)
 
     def series(self) -> list[Series]:
-        """Give one series per joint, in the order of their names."""
+        """Return one series per joint, in the order of their names."""
         tables = self._messages.tables()
         joints = sorted({name for table in tables for name in table.names[0]})
         return [self._joint(joint, tables) for joint in joints]
@@ -53,7 +53,7 @@ class JointStates:
 
 
 def _layout(cursor: cdr.Cursor) -> cdr.Layout:
-    """Find the numbers of one joint state."""
+    """Return the places of the numbers in one joint state."""
     stamp = cursor.stamp()
     cursor.text()
     names = tuple(cursor.text() for _ in range(cursor.count(4)))

@@ -35,11 +35,11 @@ class Orientations:
         self._messages.add(batch)
 
     def notes(self) -> tuple[str, ...]:
-        """Say how many messages could not be decoded."""
+        """Return a note on messages that could not be decoded."""
         return broken_note(self._topic, self._messages.n_broken, self._messages.reason)
 
     def series(self) -> list[Series]:
-        """Give one series per frame; none when the device tells no orientation."""
+        """Return one series per frame; none when the device has no orientation."""
         tables = self._messages.tables()
         frames = sorted({table.names[0] for table in tables})
         found = (self._frame(frame, [t for t in tables if t.names[0] == frame]) for frame in frames)
@@ -62,7 +62,7 @@ class Orientations:
 
 
 def _layout(cursor: cdr.Cursor) -> cdr.Layout:
-    """Find the numbers of one IMU message."""
+    """Return the places of the numbers in one IMU message."""
     stamp = cursor.stamp()
     frame = cursor.text()
     orientation = cursor.skip("d", 4)

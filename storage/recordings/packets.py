@@ -1,9 +1,9 @@
 """velodyne_msgs/msg/VelodyneScan in CDR: raw packets of a VLP-16, read and written.
 
-A packet holds 12 blocks of 32 shots: distances in steps of 2 mm, reflectivities, and the azimuth of
-each block's first shot; the instant of its first shot in microseconds past the hour, by the
-sensor's clock; how many returns a shot can have, and the model. Coordinates are those that the
-maker's manual (63-9243, chapter 9) and velodyne-decoder give, heights of the lasers included.
+A packet holds 12 blocks of 32 pulses: distances in steps of 2 mm, reflectivities, and the azimuth
+of each block's first pulse; the instant of its first pulse in microseconds past the hour, by the
+sensor's clock; the return mode, and the model. Coordinates are those of the maker's manual
+(63-9243, chapter 9) and of velodyne-decoder, heights of the lasers included.
 """
 
 from __future__ import annotations
@@ -51,13 +51,13 @@ builtin_interfaces/Time stamp
 uint8[1206] data
 """
 
-_SHOTS = FIRINGS_PER_BLOCK * N_LASERS  # of a block
+_PULSES = FIRINGS_PER_BLOCK * N_LASERS  # of a block
 _STRIDE = 1216  # [bytes] of a packet in a message: its stamp, its data, and what aligns the next
 _USED = 1214  # [bytes] of it that are not padding
 _PADDING = _STRIDE - _USED
 _AT_MODEL = 1213  # [bytes] from the beginning of a packet
 _FULL_TURN = 36_000  # steps of an azimuth
-_MORE = 1.1  # returns that a log may hold beyond what its first packets promise
+_MORE = 1.1  # margin of the number of returns over that of the first packets
 _WORTH = 64  # packets that two threads unpack sooner than one
 _BLOCK_NS = round(FIRINGS_PER_BLOCK * FIRING_CYCLE * 1e9)
 _PACKET_NS = N_BLOCKS * _BLOCK_NS
@@ -66,14 +66,14 @@ _MODES = {_STRONGEST: "strongest return", 0x38: "last return", _DUAL: "dual retu
 _MODELS = {0x21: "an HDL-32E", 0x24: "a Puck Hi-Res", 0x28: "a VLP-32C", 0xA1: "a VLS-128"}
 _HOUR_NS = 3_600_000_000_000
 _CLOCK_STEP_NS = 1_000  # of the sensor's clock
-_LATE_MAX_NS = 20e6  # what a packet may be later than others when the computer is busy
+_LATE_MAX_NS = 20e6  # delay of a packet against others when the computer is busy
 _DRIFT_SPAN = 5.0  # [s] in less time two clocks drift apart by less than their stamps jitter
-_LATE_SHARE = 0.95  # of the packets must be that punctual before the sensor's clock is believed
+_LATE_SHARE = 0.95  # of the packets must be that punctual before the sensor's clock is used
 _BLOCK = np.dtype(
     [
         ("flag", "<u2"),
         ("azimuth", "<u2"),
-        ("shots", [("distance", "<u2"), ("reflectivity", "u1")], _SHOTS),
+        ("pulses", [("distance", "<u2"), ("reflectivity", "u1")], _PULSES),
     ]
 )
 _PACKET = np.dtype(
@@ -85,10 +85,10 @@ Item = tuple[int, str, bytes]  # log time [ns], topic, message
 
 
 class _Sensor(NamedTuple):
-    """What the kernel must know of a VLP-16.
+    """Tables of a VLP-16 for the kernel.
 
     Trigonometry of every azimuth, of the lasers in the order of firing with their heights [m] and
-    rings, and the times of shots since the first of their block [s] and of their packet [ns].
+    rings, and the times of pulses since the first of their block [s] and of their packet [ns].
     """
 
     turns: NDArray[np.float32]
@@ -105,10 +105,10 @@ def _sensor() -> _Sensor:
     rig = tilted_vlp16("", (0.0, 0.0))
     angles = np.radians(np.arange(_FULL_TURN) / 100.0)
     elevations = rig.laser_elevations[FIRING_ORDER]
-    k = np.arange(_SHOTS)
-    shots = k // N_LASERS * FIRING_CYCLE + k % N_LASERS * LASER_CYCLE
+    k = np.arange(_PULSES)
+    pulses = k // N_LASERS * FIRING_CYCLE + k % N_LASERS * LASER_CYCLE
     blocks = np.arange(N_BLOCKS) * FIRINGS_PER_BLOCK * FIRING_CYCLE
-    times = (blocks[:, None] + shots).astype(np.float32)
+    times = (blocks[:, None] + pulses).astype(np.float32)
     return _Sensor(
         turns=np.stack([np.cos(angles), np.sin(angles)], axis=1).astype(np.float32).ravel(),
         lasers=np.stack(
@@ -118,7 +118,7 @@ def _sensor() -> _Sensor:
         .ravel(),
         rings=FIRING_ORDER.astype(np.uint8),
         since_block=times - times[:, :1],
-        since_packet_ns=np.rint((blocks[:, None] + shots) * 1e9).astype(np.int64),
+        since_packet_ns=np.rint((blocks[:, None] + pulses) * 1e9).astype(np.int64),
         lasting=times[:, 0].copy(),
     )
 
@@ -184,7 +184,7 @@ class Packets:
         def count(begin: int, end: int) -> None:
             _heads_kernel(octets, places[begin:end], is_little, heads[begin:end])
 
-        side_by_side(count, len(places), worth=_WORTH)
+        side_by_side(count, len(places), threaded_from=_WORTH)
         self._reserve(int(heads[:, 3].sum()), len(heads))
         rows = self._n + np.cumsum(heads[:, 3]) - heads[:, 3]
         sensor, out = _sensor(), (self._out.p.reshape(-1), *self._out[1:])
@@ -193,7 +193,7 @@ class Packets:
             part = slice(begin, end)
             _packets_kernel(octets, places[part], rows[part], heads[part], sensor, out)
 
-        side_by_side(unpack, len(places), worth=_WORTH)
+        side_by_side(unpack, len(places), threaded_from=_WORTH)
         self._n += int(heads[:, 3].sum())
         self._heads.append(heads)
 
@@ -208,16 +208,16 @@ class Packets:
         self._out.put(0, old.taken(slice(self._n)))
 
     def returns(self) -> Returns:
-        """Give all returns, in the order of their instants; no message can follow."""
+        """Return all returns, in the order of their instants; no message can follow."""
         if self._returns is None:
             self._returns = self._settled()
         return self._returns
 
     def _settled(self) -> Returns:
-        """Bring all returns to their instants and into their order."""
+        """Set the instants of all returns, and sort them."""
         notes = [*broken_note(self._topic, self._n_broken, self._reason)]
         messages_ns, counts = self._settle(np.concatenate(self._heads), notes)
-        out = self._out.in_order(counts)  # shots follow each other in a packet
+        out = self._out.in_order(counts)  # pulses follow each other in a packet
         return Returns(
             topic=self._topic,
             frame=self._frame,
@@ -225,17 +225,14 @@ class Packets:
             intensities=out.intensities,
             rings=out.rings,
             stamps_ns=out.stamps,
-            has_shot_times=True,
+            has_pulse_times=True,
             message_stamps_ns=np.sort(messages_ns),
             notes=tuple(notes),
             has_heights=True,
         )
 
     def _settle(self, heads: Nanos, notes: list[str]) -> tuple[Nanos, Nanos]:
-        """Bring the returns to the instants of their shots.
-
-        Return the instants of the messages, and the numbers of returns of packets.
-        """
+        """Set the instants of the returns; return those of messages, and the counts of packets."""
         messages_ns, sizes = np.concatenate(self._message_stamps), np.concatenate(self._sizes)
         if not len(heads):
             return messages_ns, heads[:, 3]
@@ -283,7 +280,7 @@ def _n_of_ours(octets: Octets, places: Nanos, counts: Nanos) -> int:
 
 
 def _complaint(models: Octets) -> str:
-    """Say why packets of some models are not decoded."""
+    """Return the reason why packets of some models are not decoded."""
     others = sorted(set(models.tolist()) - {_VLP16})
     named = " and ".join(f"{_MODELS.get(one, 'another model')} (0x{one:02x})" for one in others)
     return (
@@ -298,8 +295,8 @@ def punctual(stamps_ns: Nanos, micros: Nanos) -> tuple[Nanos, str]:
     Notes
     -----
     The sensor's clock is even, the recorder's stamps jitter by milliseconds; a sensor without GPS
-    counts its hour from when it was switched on. Only how late the stamps are, modulo an hour, is
-    used, so that the turn of the hour does not matter.
+    counts its hour from power-on. Only the delay of the stamps, modulo an hour, is used, so that
+    the turn of the hour does not matter.
     """
     late = (stamps_ns - micros * 1_000) % _HOUR_NS
     half = _HOUR_NS // 2
@@ -446,7 +443,7 @@ def _put(out, n, aim, steps, reflectivity, sensor):  # type: ignore[no-untyped-d
 
 
 def scans(topic: str, frame: str, firings: Firings, revolution_ns: int) -> Iterator[Item]:
-    """Give one message per revolution, as the driver of a VLP-16 would publish them."""
+    """Yield one message per revolution, as the driver of a VLP-16 publishes them."""
     packets = encoded(firings)
     stamps = packets["sec"].astype(np.int64) * 1_000_000_000 + packets["nanosec"]
     turns = (stamps - stamps[0]) // revolution_ns if len(stamps) else stamps
@@ -470,8 +467,8 @@ def encoded(firings: Firings) -> NDArray[np.void]:
     blocks = packets["data"]["blocks"]
     blocks["flag"] = 0xEEFF
     blocks["azimuth"] = firings.azimuths[rows].reshape(n, N_BLOCKS)
-    blocks["shots"]["distance"] = firings.distances[rows].reshape(n, N_BLOCKS, _SHOTS)
-    blocks["shots"]["reflectivity"] = firings.reflectivities[rows].reshape(n, N_BLOCKS, _SHOTS)
+    blocks["pulses"]["distance"] = firings.distances[rows].reshape(n, N_BLOCKS, _PULSES)
+    blocks["pulses"]["reflectivity"] = firings.reflectivities[rows].reshape(n, N_BLOCKS, _PULSES)
     packets["data"]["micros"] = stamps % _HOUR_NS // 1_000
     packets["data"]["mode"], packets["data"]["model"] = _STRONGEST, _VLP16
     return packets

@@ -1,6 +1,6 @@
-"""sensor_msgs/msg/PointCloud2 in CDR: returns with whatever fields the driver wrote.
+"""sensor_msgs/msg/PointCloud2 in CDR: returns with any fields of the driver.
 
-Messages that begin alike are unpacked together, which costs a tenth of what one by one does.
+Messages with equal heads are unpacked together, at a tenth of the cost of one by one.
 """
 
 from __future__ import annotations
@@ -23,20 +23,20 @@ from spheremark.storage.recordings.families import (
 from spheremark.storage.recordings.points import (
     Columns,
     Layout,
-    Seen,
+    Tally,
     read_layout,
     unpack_any,
     unpack_clouds,
 )
-from spheremark.storage.recordings.records import Octets
-from spheremark.storage.recordings.shot_times import (
+from spheremark.storage.recordings.pulse_times import (
     NO_FIELD,
-    SHOTS_MIN,
+    PULSES_MIN,
     fault_of,
     plain_span,
     plain_spans,
-    shot_times,
+    pulse_times,
 )
+from spheremark.storage.recordings.records import Octets
 
 SCHEMA = "sensor_msgs/msg/PointCloud2"
 DEFINITION = f"""# A collection of N-dimensional points, possibly organised as an image.
@@ -69,7 +69,7 @@ _BAD_MAX = 0.05  # share of messages whose times may be unusable before all are
 
 
 class _Head(NamedTuple):
-    """What stands before the points of a message, and where it has numbers of its own."""
+    """The head of a message: order of bytes, and places of its own numbers and of the points."""
 
     order: str  # of bytes in its numbers
     at_shape: int  # where height and width are
@@ -78,7 +78,7 @@ class _Head(NamedTuple):
 
 
 class _Messages(NamedTuple):
-    """What is kept of messages until all are read, a column each."""
+    """Columns about messages, kept until all are read."""
 
     stamps_ns: Nanos
     log_times_ns: Nanos
@@ -96,7 +96,7 @@ class PointClouds:
         self._topic = channel.topic
         self._size = size
         self._frame = ""
-        self._layout = Layout(said=b"", fields={}, order="<", step=0)
+        self._layout = Layout(description=b"", fields={}, order="<", step=0)
         self._n = 0
         self._out = Columns.empty(0)
         self._parts = [_Messages(*(np.empty(0, np.int64),) * 6)]
@@ -117,7 +117,7 @@ class PointClouds:
                 self._reason = self._reason or str(error)
 
     def _add(self, batch: Batch, i: int) -> int:
-        """Append message i, and those behind it that are like it; return how many these are."""
+        """Append message i, and those behind it with an equal head; return their number."""
         octets = batch.octets[batch.starts[i] : batch.starts[i] + batch.lengths[i]]
         head = self._read_head(octets)
         clouds = np.empty((0, 4), np.int64)
@@ -130,19 +130,19 @@ class PointClouds:
         return len(clouds)
 
     def _read_head(self, octets: Octets) -> _Head:
-        """Read what stands before the points; their description only if it is a new one."""
+        """Read the head of a message; the description of points only if it is a new one."""
         cursor = cdr.Cursor(octets)
         cursor.stamp()
         self._frame, at_shape = cursor.text().lstrip("/"), cursor.skip("I", 2)
-        begin, said = cursor.at, self._layout.said
-        if said and octets[begin : begin + len(said)].tobytes() == said:
-            cursor.at = begin + len(said)
+        begin, description = cursor.at, self._layout.description
+        if description and octets[begin : begin + len(description)].tobytes() == description:
+            cursor.at = begin + len(description)
         else:
             self._layout = read_layout(cursor, octets)
         return _Head(cursor.order, at_shape, cursor.skip("I", 2), cursor.at)
 
     def _reserve(self, n: int) -> None:
-        """Make room for so many returns more."""
+        """Make room for n more returns."""
         old = self._out
         if self._n + n <= len(old.rings):
             return
@@ -155,41 +155,41 @@ class PointClouds:
         points, n = _points(octets, head, self._layout.step)
         self._reserve(n)
         stamp = int(cdr.stamps_ns(octets[None], 4, head.order)[0])
-        seen = self._unpack_one(points, stamp, self._n, n)
-        self._parts.append(_Messages(*np.array([[stamp, log_time, *seen]], np.int64).T))
-        self._n += seen[0]
+        tally = self._unpack_one(points, stamp, self._n, n)
+        self._parts.append(_Messages(*np.array([[stamp, log_time, *tally]], np.int64).T))
+        self._n += tally[0]
 
     def _unpack_one(self, points: Octets, stamp: int, row: int, n: int) -> tuple[int, ...]:
-        """Write the returns of n points from a row on; return what is kept of the message."""
+        """Write the returns of n points from a row on; return the columns about the message."""
         out = self._out.taken(slice(row, row + n))
         n, times, has_bad_ring = unpack_any(points, self._layout, out)
         self._has_bad_rings |= has_bad_ring
         stamps = out.stamps[:n]
-        span, fault = shot_times(times, stamp, stamps)
+        span, fault = pulse_times(times, stamp, stamps)
         is_ascending = bool((stamps[1:] >= stamps[:-1]).all())
         return (n, span, self._has_times_of(n, span, fault), is_ascending)
 
     def _has_times_of(self, n: int, span: int, fault: str) -> int:
-        """Say whether the times of a message are of use, if it has enough of them to tell."""
+        """Return 1 if the times of a message are usable, 0 if not, -1 if they are too few."""
         self._time_fault = self._time_fault or fault
-        return int(not fault) if n >= SHOTS_MIN or span else -1
+        return int(not fault) if n >= PULSES_MIN or span else -1
 
     def _add_clouds(self, octets: Octets, clouds: Nanos, log_times_ns: Nanos) -> None:
-        """Append the returns of messages that are laid out alike, in a layout that is compiled."""
+        """Append the returns of messages of one layout that the compiled loop reads."""
         n_points = clouds[:, 1]
         self._reserve(int(n_points.sum()))
         clouds[:, 3] = self._n + np.cumsum(n_points) - n_points
-        seen = unpack_clouds(octets, clouds, self._layout, self._out)
-        kept, is_plain = self._plain(seen)
+        tally = unpack_clouds(octets, clouds, self._layout, self._out)
+        kept, is_plain = self._plain(tally)
         for k in np.flatnonzero(~is_plain).tolist():
-            kept[k] = self._judged(octets, clouds[k].tolist(), seen, k)
-        self._has_bad_rings |= bool(seen.has_bad_ring.any())
+            kept[k] = self._corrected(octets, clouds[k].tolist(), tally, k)
+        self._has_bad_rings |= bool(tally.has_bad_ring.any())
         self._parts.append(_Messages(clouds[:, 2], log_times_ns, *kept.T))
         self._close_gaps(clouds[:, 3], kept[:, 0])
 
-    def _plain(self, seen: Seen) -> tuple[Nanos, Mask]:
-        """Return what is kept of clouds, and for which this holds: their times are as usual."""
-        n, low, high, n_zeros, is_ascending, _ = seen
+    def _plain(self, tally: Tally) -> tuple[Nanos, Mask]:
+        """Return the columns about clouds, and which of them have times since the stamp."""
+        n, low, high, n_zeros, is_ascending, _ = tally
         kept = np.ones((len(n), 4), np.int64)
         kept[:, 0], kept[:, 3] = n, is_ascending
         if self._layout.time is None:
@@ -197,10 +197,10 @@ class PointClouds:
         kept[:, 1], is_plain = plain_spans(self._layout.time.kind, low, high, n_zeros, n)
         return kept, is_plain
 
-    def _judged(self, octets: Octets, cloud: list[int], seen: Seen, k: int) -> tuple[int, ...]:
-        """Set the instants of cloud k right if its times are of no use; return what is kept."""
+    def _corrected(self, octets: Octets, cloud: list[int], tally: Tally, k: int) -> tuple[int, ...]:
+        """Correct the instants of cloud k if its times are unusable; return its columns."""
         begin, n_points, stamp, row = cloud
-        n, low, high, n_zeros, is_ascending, _ = (column[k].item() for column in seen)
+        n, low, high, n_zeros, is_ascending, _ = (column[k].item() for column in tally)
         time, fault = self._layout.time, ""
         span: int | None = 0
         if n and time is None:
@@ -217,14 +217,14 @@ class PointClouds:
         return (n, span, has_times, bool(fault) or is_ascending)
 
     def _close_gaps(self, rows: Nanos, counts: Nanos) -> None:
-        """Move the returns of clouds together that hold points which are none."""
+        """Close the gaps behind clouds with points that are no returns."""
         for row, n in zip(rows.tolist(), counts.tolist(), strict=True):
             if row != self._n:
                 self._out.put(self._n, self._out.taken(slice(row, row + n)))
             self._n += n
 
     def returns(self) -> Returns:
-        """Give all returns, in the order of their instants."""
+        """Return all returns, in the order of their instants."""
         notes = [*broken_note(self._topic, self._n_broken, self._reason)]
         messages = self._near(notes)
         self._parts = [messages := self._stamped(messages, notes)]
@@ -235,7 +235,7 @@ class PointClouds:
             self._out.rings[: self._n] = RING_UNKNOWN
             notes.append(f"{self._topic} has rings outside 0 to {RING_UNKNOWN - 1}; none is used.")
         elif self._layout.ring is None:
-            notes.append(f"The points of {self._topic} do not tell their laser (ring).")
+            notes.append(f"The points of {self._topic} have no field for their laser (ring).")
         is_known = not has_times or bool(messages.is_ascending.all())
         out = self._out.in_order(messages.counts if is_known else np.ones(self._n, np.int64))
         return Returns(
@@ -245,13 +245,13 @@ class PointClouds:
             intensities=out.intensities,
             rings=out.rings,
             stamps_ns=out.stamps,
-            has_shot_times=has_times,
+            has_pulse_times=has_times,
             message_stamps_ns=np.sort(messages.stamps_ns),
             notes=tuple(notes),
         )
 
     def _near(self, notes: list[str]) -> _Messages:
-        """Leave out messages whose stamps cannot be; return the others."""
+        """Leave out messages with implausible stamps; return the others."""
         messages = _Messages(*(np.concatenate(part) for part in zip(*self._parts, strict=True)))
         near = plausible(messages.stamps_ns, messages.log_times_ns)
         if near.all():
@@ -262,7 +262,7 @@ class PointClouds:
         return _Messages(*(column[near] for column in messages))
 
     def _stamped(self, messages: _Messages, notes: list[str]) -> _Messages:
-        """Put the times of recording in place of stamps where there are none."""
+        """Use the times of recording where there are no stamps."""
         shifts = messages.log_times_ns - messages.spans_ns
         if messages.stamps_ns.any() or not shifts.any():
             return messages
@@ -271,23 +271,24 @@ class PointClouds:
         return messages._replace(stamps_ns=shifts)
 
     def _has_times(self, messages: _Messages, notes: list[str]) -> bool:
-        """Judge the points' times as a whole; without them, each return has its message's stamp."""
-        telling = messages.has_times[messages.has_times >= 0]
-        if len(telling) and np.mean(telling == 0) <= _BAD_MAX:
+        """Return whether the times are usable; if not, set each return to its message's stamp."""
+        usable = messages.has_times[messages.has_times >= 0]
+        if len(usable) and np.mean(usable == 0) <= _BAD_MAX:
             return True
         if self._layout.time is None:
             fault = f"it has the fields {', '.join(self._layout.fields) or 'none'}"
         else:
-            fault = self._time_fault or "its messages are too small to tell"
+            fault = self._time_fault or "its messages have too few points to judge their times"
         notes.append(f"The points of {self._topic} carry no time of their own: {fault}.")
         self._out.stamps[: self._n] = np.repeat(messages.stamps_ns, messages.counts)
         return False
 
 
 def _alike(batch: Batch, i: int, head: _Head, step: int) -> Nanos:
-    """Return first byte of the points, their number and the stamp of message i and those behind it
-    that begin like it and hold their points without gaps; a fourth column is for the caller.
-    """  # noqa: D205
+    """Return message i and those behind it with an equal head and points without gaps, (n, 4).
+
+    Columns: first byte of the points, their number, the stamp; the last is for the caller.
+    """
     sizes_end, shape_end = head.at_sizes + 8, head.at_shape + 8
     varying = (*range(4, 12), *range(head.at_shape, shape_end), *range(head.at_sizes, sizes_end))
     rows = cdr.heads_alike(batch, i, head.at_points, varying)

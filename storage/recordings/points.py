@@ -1,4 +1,4 @@
-"""From the bytes of points to columns: what a point looks like, and how it is unpacked.
+"""From the bytes of points to columns.
 
 Fields are found by name, at any offset and of any type. The common layout (little endian, float32
 coordinates) is unpacked by one compiled loop, cloud by cloud on two threads; all others by NumPy.
@@ -25,7 +25,7 @@ _INTENSITIES = ("intensity", "i", "reflectivity", "signal")
 _RINGS = ("ring", "channel", "line", "laser_id", "laserid")
 _TIMES = ("time", "t", "timestamp", "time_stamp", "offset_time", "time_offset", "timeoffset")
 _FIELD_MIN = 13  # [bytes] of a field with an empty name
-_PAGE = 1 << 21  # [bytes] of a large page of memory: the fewer are touched, the fewer are faults
+_PAGE = 1 << 21  # [bytes] of a large page of memory: fewer pages, fewer page faults
 _WORTH = 4  # clouds that two threads unpack sooner than one
 _PIECE = 8  # clouds that a thread takes at a time
 _BLOCK = 512  # points: few enough for the nearest cache
@@ -44,7 +44,7 @@ class Columns(NamedTuple):
     @classmethod
     def empty(cls, n: int) -> Columns:
         """Reserve room; memory that is not written costs nothing."""
-        p, others = _reserved(12 * n), _reserved(13 * n)  # who keeps these may let go of the points
+        p, others = _reserved(12 * n), _reserved(13 * n)  # the others may outlive the points
         return cls(
             p.view(np.float32).reshape(n, 3),
             others[8 * n : 12 * n].view(np.float32),
@@ -64,7 +64,7 @@ class Columns(NamedTuple):
         self.rings[rows], self.stamps[rows] = other.rings, other.stamps
 
     def in_order(self, counts: Index) -> Columns:
-        """Return the returns in the order of their instants; mostly they are in it."""
+        """Return the returns in the order of their instants; mostly they are in it already."""
         ends = np.cumsum(counts)
         stamps = self.stamps[: int(counts.sum())]
         begins = (ends - counts)[(counts > 0) & (ends > counts)]
@@ -74,14 +74,14 @@ class Columns(NamedTuple):
 
 
 def _reserved(size: int) -> Octets:
-    """Return so many bytes from the beginning of a large page on."""
+    """Return bytes that begin at a large page."""
     block = np.empty(size + _PAGE, np.uint8)
     begin = -block.ctypes.data % _PAGE
     return block[begin : begin + size]
 
 
-class Seen(NamedTuple):
-    """What unpacking saw in clouds, a column each; times as they were recorded."""
+class Tally(NamedTuple):
+    """Counts and extreme times of clouds, a column each; times as they were recorded."""
 
     n_returns: Nanos
     earliest: Array
@@ -100,7 +100,7 @@ class Field:
     offset : int
         Its first byte in the point.
     kind : str
-        Its type, as NumPy calls it, without the order of bytes.
+        Its NumPy type, without the order of bytes.
     """
 
     offset: int
@@ -114,21 +114,21 @@ class Field:
 
 @dataclass(frozen=True, kw_only=True)
 class Layout:
-    """What a point looks like, and the bytes that said so.
+    """The fields of a point, and their description in a message.
 
     Attributes
     ----------
-    said : bytes
+    description : bytes
         The description as it stands in a message.
     fields : dict of str to Field
-        By the names that the driver gave them.
+        By the names of the driver.
     order : str
         Of bytes: ``<`` or ``>``.
     step : int
         From a point to the next [bytes].
     """
 
-    said: bytes
+    description: bytes
     fields: dict[str, Field]
     order: str
     step: int
@@ -155,7 +155,7 @@ class Layout:
 
     @cached_property
     def compiled(self) -> Nanos | None:
-        """What the compiled loop must know; none if it cannot do this layout."""
+        """Parameters of the compiled loop; None if it does not support this layout."""
         x, y, z = (self.fields[axis] for axis in "xyz")
         intensity, ring, time = self.intensity, self.ring, self.time
         allowed = (
@@ -172,7 +172,7 @@ class Layout:
 
     @cached_property
     def structured(self) -> np.dtype[np.void]:
-        """The type of a point under our own names for its fields."""
+        """The NumPy type of a point, with fixed names of the fields."""
         found = {
             **{axis: self.fields[axis] for axis in "xyz"},
             "intensity": self.intensity,
@@ -196,8 +196,8 @@ def read_layout(cursor: cdr.Cursor, octets: Octets) -> Layout:
     fields = dict(_field(cursor) for _ in range(cursor.count(_FIELD_MIN)))
     order = ">" if cursor.number("B") else "<"
     step = cursor.number("I")
-    said = octets[begin : cursor.at].tobytes()
-    return Layout(said=said, fields=_checked(fields, step), order=order, step=step)
+    description = octets[begin : cursor.at].tobytes()
+    return Layout(description=description, fields=_checked(fields, step), order=order, step=step)
 
 
 def _field(cursor: cdr.Cursor) -> tuple[str, Field]:
@@ -240,19 +240,20 @@ def unpack_any(
     return n, times, bool(layout.ring and not is_ring.all())
 
 
-def unpack_clouds(octets: Octets, clouds: Nanos, layout: Layout, out: Columns) -> Seen:
+def unpack_clouds(octets: Octets, clouds: Nanos, layout: Layout, out: Columns) -> Tally:
     """Write the returns of clouds and their instants, each from a row of its own on."""
-    told, compiled = np.empty((len(clouds), 6)), layout.compiled
+    tallies, parameters = np.empty((len(clouds), 6)), layout.compiled
     p, intensities, rings, stamps = out
     columns = (p.view(np.uint32).ravel(), intensities.view(np.uint32), rings, stamps)
 
     def unpack(begin: int, end: int) -> None:
         rows = slice(begin, end)
-        _clouds_kernel(octets, clouds[rows], compiled, columns, told[rows])
+        _clouds_kernel(octets, clouds[rows], parameters, columns, tallies[rows])
 
-    by_turns(unpack, len(clouds), size=_PIECE, worth=_WORTH)
-    n, low, high, n_zeros, n_descents, n_bad = told.T
-    return Seen(n.astype(np.int64), low, high, n_zeros.astype(np.int64), n_descents == 0, n_bad > 0)
+    by_turns(unpack, len(clouds), size=_PIECE, threaded_from=_WORTH)
+    n, low, high, zeros, n_descents, n_bad = tallies.T
+    n_returns, n_zeros = n.astype(np.int64), zeros.astype(np.int64)
+    return Tally(n_returns, low, high, n_zeros, n_descents == 0, n_bad > 0)
 
 
 @compiled
@@ -267,21 +268,23 @@ def _word(octets, at):  # type: ignore[no-untyped-def]  # noqa: ANN001, ANN202
 
 
 @compiled
-def _clouds_kernel(octets, clouds, layout, columns, told):  # type: ignore[no-untyped-def]  # noqa: ANN001, ANN202
-    """Unpack clouds; tell their returns, extreme times, zero times, descents and bad rings."""
+def _clouds_kernel(octets, clouds, layout, columns, tallies):  # type: ignore[no-untyped-def]  # noqa: ANN001, ANN202
+    """Unpack clouds; count their returns, zero times, descents and bad rings; extreme times."""
     times = np.empty(_BLOCK, np.uint32)
     for k in range(len(clouds)):
-        told[k, 0], told[k, 1], told[k, 2], told[k, 3], told[k, 4], told[k, 5] = _cloud_kernel(
+        n, low, high, n_zeros, n_descents, n_bad = _cloud_kernel(
             octets, clouds[k], layout, columns, times
         )
+        tallies[k, 0], tallies[k, 1], tallies[k, 2] = n, low, high
+        tallies[k, 3], tallies[k, 4], tallies[k, 5] = n_zeros, n_descents, n_bad
 
 
 @compiled
 def _cloud_kernel(octets, cloud, layout, columns, times):  # type: ignore[no-untyped-def]  # noqa: ANN001, ANN202
     """Copy the bits of finite returns away from the origin, and add their times to the stamp.
 
-    Works on bits, so that one compiled version serves any alignment, and block by block: each loop
-    does one thing to what is in the nearest cache, most of them to many points at a time.
+    Works on bits, so that one compiled version serves any alignment, and block by block, in loops
+    that the compiler can vectorise.
     """
     p, intensities, rings, stamps = columns
     is_whole = layout[8] != 0
@@ -320,7 +323,7 @@ def _copy_block(octets, at, layout, columns, row, n):  # type: ignore[no-untyped
 
 @compiled
 def _copy_coordinates(octets, places, step, p, first, n):  # type: ignore[no-untyped-def]  # noqa: ANN001, ANN202
-    """Copy coordinates that begin at some places and come every so many bytes."""
+    """Copy coordinates from strided bytes."""
     x, y, z = np.uint64(places[0]), np.uint64(places[1]), np.uint64(places[2])
     for i in range(np.uint64(first), np.uint64(first + 3 * n), np.uint64(3)):
         p[i] = _word(octets, x)
@@ -333,7 +336,7 @@ def _copy_coordinates(octets, places, step, p, first, n):  # type: ignore[no-unt
 
 @compiled
 def _copy_others(octets, places, step, is_wide, columns, row, n):  # type: ignore[no-untyped-def]  # noqa: ANN001, ANN202, PLR0913
-    """Copy what is not a coordinate; a ring that cannot be becomes the unknown one."""
+    """Copy intensities, rings and times; rings beyond the last become unknown."""
     intensities, rings, times = columns
     intensity, ring, time = np.uint64(places[0]), np.uint64(places[1]), np.uint64(places[2])
     second, shift = ring + np.uint64(is_wide), np.uint32(8 * is_wide)
@@ -352,7 +355,7 @@ def _copy_others(octets, places, step, is_wide, columns, row, n):  # type: ignor
 
 @compiled
 def _may_be_none(p, row, n):  # type: ignore[no-untyped-def]  # noqa: ANN001, ANN202
-    """Say whether a coordinate is zero or not finite: then some points may be no returns."""
+    """Return whether a coordinate is zero or not finite: then some points may be no returns."""
     n_odd = 0
     for i in range(np.uint64(3 * row), np.uint64(3 * (row + n))):
         n_odd += (p[i] & _MAGNITUDE) - np.uint32(1) >= _EXPONENT - np.uint32(1)
@@ -376,7 +379,7 @@ def _close_up(p, intensities, rings, times, row, n):  # type: ignore[no-untyped-
 
 @compiled
 def _void(intensities, row, n):  # type: ignore[no-untyped-def]  # noqa: ANN001, ANN202
-    """Put zero in place of what is not finite."""
+    """Replace intensities that are not finite by zero."""
     for i in range(np.uint64(row), np.uint64(row + n)):
         value = intensities[i]
         intensities[i] = np.uint32(0) if (value & _EXPONENT) == _EXPONENT else value
@@ -384,7 +387,7 @@ def _void(intensities, row, n):  # type: ignore[no-untyped-def]  # noqa: ANN001,
 
 @compiled
 def _date(times, n, is_whole, stamp, stamps, row):  # type: ignore[no-untyped-def]  # noqa: ANN001, ANN202
-    """Find instants from times since a stamp: whole nanoseconds, or the bits of seconds."""
+    """Write instants from times since a stamp: whole nanoseconds, or the bits of seconds."""
     first = np.uint64(row)
     if is_whole:
         for i in range(np.uint64(n)):
@@ -397,9 +400,9 @@ def _date(times, n, is_whole, stamp, stamps, row):  # type: ignore[no-untyped-de
 
 @compiled
 def _extremes(times, n, is_whole, low, high):  # type: ignore[no-untyped-def]  # noqa: ANN001, ANN202
-    """Find the extreme times as numbers of the same order, not finite ones outermost; count zeros.
+    """Return the extreme times as integers of the same order, not finite ones outermost, and zeros.
 
-    Whole numbers are many at a time compared sooner than floating ones.
+    Comparisons of integers vectorise better than those of floating numbers.
     """
     n_zeros, sign = 0, np.uint32(0) if is_whole else ~_MAGNITUDE
     for i in range(np.uint64(n)):
@@ -419,7 +422,7 @@ def _ordered(bits, is_whole):  # type: ignore[no-untyped-def]  # noqa: ANN001, A
 
 @compiled
 def _time(order, is_whole):  # type: ignore[no-untyped-def]  # noqa: ANN001, ANN202
-    """Return the time, as it was recorded, that stands at a place of the order."""
+    """Return the recorded time of an integer from ``_ordered``."""
     bits = np.empty(1, np.uint32)
     bits[0] = np.uint32(_ordered(order, is_whole))
     return np.float64(bits[0]) if is_whole else np.float64(bits.view(np.float32)[0])
@@ -427,7 +430,7 @@ def _time(order, is_whole):  # type: ignore[no-untyped-def]  # noqa: ANN001, ANN
 
 @compiled
 def _n_descents(stamps, begin, end):  # type: ignore[no-untyped-def]  # noqa: ANN001, ANN202
-    """Count the instants that are before the one in front of them."""
+    """Count the instants that are earlier than their predecessor."""
     n = 0
     for i in range(np.uint64(begin), np.uint64(end)):
         n += stamps[i] < stamps[i - np.uint64(1)]
@@ -436,7 +439,7 @@ def _n_descents(stamps, begin, end):  # type: ignore[no-untyped-def]  # noqa: AN
 
 @compiled
 def _n_unknown(rings, row, n):  # type: ignore[no-untyped-def]  # noqa: ANN001, ANN202
-    """Count the rings that are not known."""
+    """Count the unknown rings."""
     n_unknown = 0
     for i in range(np.uint64(row), np.uint64(row + n)):
         n_unknown += rings[i] == RING_UNKNOWN

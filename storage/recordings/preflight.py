@@ -1,7 +1,7 @@
-"""What a recording holds and lacks, and whether it can be processed: the preflight report.
+"""The preflight report: what a recording holds and lacks, and whether it can be processed.
 
-The report runs the real stitching on a thinned log, so that its verdict is what processing will
-say. A bad recording gets a report; only one that does not exist raises.
+The report runs the real stitching on a thinned log, so that its verdict is that of processing. A
+bad recording gets a report; only one that does not exist raises.
 """
 
 from __future__ import annotations
@@ -21,11 +21,9 @@ from spheremark.storage.recordings.reading import Choice, Decoders, assemble, st
 
 OK, WEAK, REFUSED = "ok", "weak", "refused"
 
-_SAMPLE = 40_000  # shots that the trial stitching looks at
-_PROBES = 4_000  # pairs of shots that tell the LiDAR's speed
-_PROBE_APART = (
-    1_000_000  # [ns] between the shots of a pair: far less than a turn, many azimuth steps
-)
+_SAMPLE = 40_000  # returns of the trial stitching
+_PROBES = 4_000  # pairs of returns that give the LiDAR's speed
+_PROBE_APART = 1_000_000  # [ns] between those of a pair: far less than a turn, many azimuth steps
 _GAP_WEAK = 0.2 / 15.0  # [rad]: a sphere of 0.2 m at 15 m is as wide
 _SKEW_WEAK = 1.0  # [s]; recorders are late by some tenths
 _TURN_WEAK = np.pi  # half a turn shows the whole scene to a tilted LiDAR
@@ -37,7 +35,7 @@ _CROSSING_MIN = 1e-6  # a laser whose plane is nearer to the horizontal never cr
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class TopicReport:
-    """What one topic holds.
+    """Type, number and rate of the messages of one topic.
 
     Attributes
     ----------
@@ -70,9 +68,9 @@ class Preflight:
     code : str
         Stable code of the error for which it is refused; empty otherwise.
     reasons : tuple of str
-        Why it is weak or refused, as sentences for people.
+        Why it is weak or refused, as sentences.
     notes : tuple of str
-        What is missing without harm, as sentences for people.
+        What is missing without harm, as sentences.
     size_bytes : int
         Length of the file.
     topics : tuple of TopicReport
@@ -88,7 +86,7 @@ class Preflight:
     duration_s : float
         From the first return to the last.
     clock_skew_s : float or None
-        By how much the LiDAR's messages are later than the gimbal's, each against its stamps.
+        Delay of the LiDAR's messages minus that of the gimbal's, each against its stamps.
     n_stops : int
         Stops found.
     gimbal_coverage_deg : float or None
@@ -127,7 +125,7 @@ class Preflight:
 
 @dataclass(slots=True)
 class _Times:
-    """When the messages of each topic were recorded."""
+    """Log times of the messages of each topic."""
 
     channels: dict[str, Channel] = field(default_factory=dict)
     parts: dict[str, list[Nanos]] = field(default_factory=dict)
@@ -187,7 +185,7 @@ def inspect_log(url: str | Path) -> Preflight:
 
 
 def _inspect(url: str | Path) -> Preflight:
-    """Walk the recording and judge it; not being MCAP is the only content error that leaves."""
+    """Walk the recording and return its report; only a file that is not MCAP raises."""
     damage: InputError | None = None
     times = _Times()
     with opened(url) as container:
@@ -209,7 +207,7 @@ def _inspect(url: str | Path) -> Preflight:
         log = assemble(decoders, found, Choice(), Origin(name=stem(url), digest=""))
     except InputError as error:
         return _refused(report, damage or error)
-    report = _judged(_described(report, log), log, _skew(decoders, times))
+    report = _with_verdict(_described(report, log), log, _skew(decoders, times))
     return report if damage is None else _refused(report, damage)
 
 
@@ -220,13 +218,13 @@ def _refused(report: Preflight, error: InputError) -> Preflight:
 
 
 def _described(report: Preflight, log: ScanLog) -> Preflight:
-    """Return the report with what the log itself shows."""
+    """Return the report with the contents of the log."""
     spin = _spin(log)
     return replace(
         report,
         notes=log.notes,
         n_returns=len(log.p_lidar),
-        has_shot_times=log.has_shot_times,
+        has_shot_times=log.has_pulse_times,
         has_orientation=len(log.quaternions_imu) > 0,
         rig=log.rig.name if log.rig else "",
         duration_s=_lasts(log),
@@ -235,7 +233,7 @@ def _described(report: Preflight, log: ScanLog) -> Preflight:
     )
 
 
-def _judged(report: Preflight, log: ScanLog, skew: float | None) -> Preflight:
+def _with_verdict(report: Preflight, log: ScanLog, skew: float | None) -> Preflight:
     """Return the report with stops, coverage, reasons and verdict."""
     from spheremark.pipelines.scan.stitching import choose_rig, pause_notes, split_stops, stitch
 
@@ -273,7 +271,7 @@ def _judged(report: Preflight, log: ScanLog, skew: float | None) -> Preflight:
 def _reasons(
     report: Preflight, coverage: float | None, gap: float | None, skew: float | None
 ) -> list[str]:
-    """Say what makes a result weak."""
+    """Return the reasons that make a result weak."""
     reasons = []
     if coverage is not None and coverage < _TURN_WEAK:
         reasons.append(
@@ -353,11 +351,11 @@ def _azimuths(log: ScanLog, rows: Index) -> Array:
 def _spin(log: ScanLog) -> tuple[float, float] | None:
     """Return the LiDAR's angular speed [rad/s] and its azimuth at the first return [rad].
 
-    The speed of pairs of shots is rough; the drift of the azimuth against it over the whole log
+    The speed of pairs of returns is rough; the drift of the azimuth against it over the whole log
     makes it exact.
     """
     stamps = log.stamps_lidar_ns
-    if not log.has_shot_times or len(stamps) < 2:
+    if not log.has_pulse_times or len(stamps) < 2:
         return None
     rows = _spread(len(stamps), _PROBES)
     later = np.searchsorted(stamps, stamps[rows] + _PROBE_APART)
@@ -388,8 +386,8 @@ def _lasts(log: ScanLog) -> float:
 def _horizon_gap(log: ScanLog, rig: Rig) -> float | None:
     """Return the largest angle along the base's horizon that no scan line crosses [rad].
 
-    A laser of elevation e and sensor azimuth a looks at ``R (cos e cos a, cos e sin a, sin e)`` in
-    the head; it crosses the horizon where the last row of R makes that zero, twice a revolution.
+    A laser of elevation e and sensor azimuth a points along ``R (cos e cos a, cos e sin a, sin e)``
+    in the head; it crosses the horizon where the last component is zero, twice a revolution.
     """
     spin = _spin(log)
     if spin is None or not _SPIN_MIN < abs(spin[0]) < _SPIN_MAX or _lasts(log) > _STOP_MAX:
@@ -422,7 +420,7 @@ def _horizon_gap(log: ScanLog, rig: Rig) -> float | None:
 
 
 def _horizon_azimuths(row: Array, elevation: float) -> tuple[float, ...]:
-    """Return the sensor azimuths at which a laser looks along the horizon [rad]."""
+    """Return the sensor azimuths at which a laser points along the horizon [rad]."""
     reach = float(np.hypot(row[0], row[1])) * np.cos(elevation)
     level = -float(row[2]) * np.sin(elevation)
     if reach < _CROSSING_MIN or abs(level) >= reach:

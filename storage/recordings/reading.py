@@ -1,4 +1,4 @@
-"""From a file to a ``ScanLog``: which topics count, and how they fit together."""
+"""From a file to a ``ScanLog``: chooses the topics of LiDAR, gimbal, frames and AHRS."""
 
 from __future__ import annotations
 
@@ -50,12 +50,12 @@ _UPRIGHT = 0.1  # sine of half the tilt that a gimbal's transform may have off i
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class Choice:
-    """What a caller wants of a recording.
+    """The topics and the joint that the caller chose.
 
     Attributes
     ----------
     topics : collection of str or None
-        Topics to use for the roles that they can play.
+        Topics to use for the roles that they can have.
     joint : str or None
         Name of the gimbal's joint.
     """
@@ -80,18 +80,18 @@ class Choice:
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class Decoders:
-    """What takes the messages of one recording, by role and topic.
+    """The decoders of one recording, by role and topic.
 
     Attributes
     ----------
     container : Container
-        The recording; it tells how much is to be expected.
+        The recording; its likely size reserves memory.
     lidars, joints, frames, ahrs : dict of str to decoder
         By topic.
     by_channel : dict of Channel to decoder or None
         None for channels of no use.
     notes : list of str
-        What was left out, as sentences for people.
+        What was left out, as sentences.
     """
 
     container: Container
@@ -103,7 +103,7 @@ class Decoders:
     notes: list[str] = field(default_factory=list)
 
     def add(self, batch: Batch) -> None:
-        """Hand a batch to the decoder of its channel, if its messages are of use."""
+        """Decode a batch, if its channel has a decoder."""
         if batch.channel not in self.by_channel:
             self.by_channel[batch.channel] = self._find(batch.channel)
         decoder = self.by_channel[batch.channel]
@@ -111,7 +111,7 @@ class Decoders:
             decoder.add(batch)
 
     def all_notes(self) -> tuple[str, ...]:
-        """Say what was left out: whole channels, and messages of signals."""
+        """Return notes on what was left out: whole channels, and messages of signals."""
         signals = (self.joints, self.frames, self.ahrs)
         return (*self.notes, *(n for role in signals for one in role.values() for n in one.notes()))
 
@@ -128,7 +128,7 @@ class Decoders:
         return None
 
     def _is_readable(self, channel: Channel, definition: str) -> bool:
-        """Say whether the messages are laid out as the decoder expects; note it if not."""
+        """Return whether the definition is that of the decoder; note it if not."""
         if definition_agrees(channel, definition):
             return True
         self.notes.append(
@@ -162,7 +162,7 @@ def read_log(
     -------
     ScanLog
         Returns in the order of their instants, gimbal angles, orientations, and the rig if the
-        recording tells it.
+        recording describes it.
 
     Raises
     ------
@@ -175,7 +175,7 @@ def read_log(
     MissingLidarError
         If no topic holds LiDAR returns.
     MissingGimbalAngleError
-        If nothing tells the gimbal's angle, or several joints could.
+        If no topic holds the gimbal's angle, or several joints could.
     RecordingError
         If a named topic is missing, or the clocks of LiDAR and gimbal do not overlap.
 
@@ -200,7 +200,7 @@ def stem(url: str | Path) -> str:
 
 
 def assemble(decoders: Decoders, found: dict[str, str], choice: Choice, origin: Origin) -> ScanLog:
-    """Choose among what was decoded and build the log."""
+    """Choose among the decoded topics and build the log."""
     choice.check(found)
     returns, lidar_notes = _choose_lidar(choice.among(decoders.lidars), found)
     tree = FrameTree()
@@ -227,7 +227,7 @@ def assemble(decoders: Decoders, found: dict[str, str], choice: Choice, origin: 
         intensities=returns.intensities,
         rings=returns.rings,
         stamps_lidar_ns=returns.stamps_ns,
-        has_shot_times=returns.has_shot_times,
+        has_pulse_times=returns.has_pulse_times,
         gimbal_angles=np.unwrap(gimbal.values[:, 0]),
         stamps_gimbal_ns=gimbal.stamps_ns,
         quaternions_imu=imu.values if imu else np.empty((0, 4)),
@@ -252,7 +252,7 @@ def _all_series(decoders: dict[str, SeriesDecoder]) -> list[Series]:
 def _choose_lidar(
     lidars: dict[str, LidarDecoder], found: dict[str, str]
 ) -> tuple[Returns, tuple[str, ...]]:
-    """Return the topic with the best returns: with shot times, with rings, with most."""
+    """Return the topic with the best returns: with pulse times, with rings, with most."""
     if not lidars:
         raise MissingLidarError(
             f"The recording holds no LiDAR topic. Found: {_listed(found)}. Expected one of: "
@@ -261,7 +261,7 @@ def _choose_lidar(
     all_returns = [lidar.returns() for lidar in lidars.values()]
     best = max(
         all_returns,
-        key=lambda r: (len(r.p_lidar) > 0, r.has_shot_times, _has_rings(r), len(r.p_lidar)),
+        key=lambda r: (len(r.p_lidar) > 0, r.has_pulse_times, _has_rings(r), len(r.p_lidar)),
     )
     if not len(best.p_lidar):
         reasons = " ".join(note for r in all_returns for note in r.notes)
@@ -275,7 +275,7 @@ def _choose_lidar(
 
 
 def _has_rings(returns: Returns) -> bool:
-    """Say whether the returns tell their lasers."""
+    """Return whether the lasers of the returns were recorded."""
     return len(returns.rings) > 0 and int(returns.rings[0]) != RING_UNKNOWN
 
 
@@ -328,9 +328,9 @@ def _angle_of_ahrs(
     """
     if imu is None or rig is None or rig.imu_mount is not ImuMount.HEAD:
         raise MissingGimbalAngleError(
-            "Nothing tells the angle of the gimbal. Expected a sensor_msgs/msg/JointState with its "
-            "joint, a transform that turns (tf2_msgs/msg/TFMessage), or a sensor_msgs/msg/Imu with "
-            f"orientation that /tf_static hangs on the head. Found: {_listed(found)}"
+            "No topic holds the angle of the gimbal. Expected a sensor_msgs/msg/JointState with "
+            "its joint, a transform that turns (tf2_msgs/msg/TFMessage), or a sensor_msgs/msg/Imu "
+            f"with orientation that /tf_static puts on the head. Found: {_listed(found)}"
             f"{f', with {len(joints)} joints' if joints else ''}."
         )
     R_world_head = Rotation.from_quat(imu.values).as_matrix() @ rig.R_mount_imu.T
@@ -343,7 +343,7 @@ def _angle_of_ahrs(
 
 
 def _require_overlap(returns: Returns, gimbal: Series) -> None:
-    """Refuse clocks that have no instant in common."""
+    """Raise RecordingError if the clocks have no instant in common."""
     lidar, other = returns.stamps_ns, gimbal.stamps_ns
     if lidar[0] <= other[-1] and other[0] <= lidar[-1]:
         return

@@ -20,14 +20,17 @@ _ROWS = 1 << 12  # records that one step of the walk reports
 
 
 def walk(octets: Octets, position: int) -> tuple[Nanos, int, bool]:
-    """Go on from record to record."""
+    """Return the next records, (n, 5), the position behind them, and whether the last is whole.
+
+    Columns: opcode, first byte and length of the body; of a message, channel and log time too.
+    """
     rows = np.empty((min(_ROWS, (len(octets) - position) // RECORD_HEAD + 1), 5), np.int64)
     n, position, is_whole = _walk_kernel(octets, position, rows)
     return rows[:n], position, is_whole
 
 
 def windows(octets: Octets, size: int) -> Octets:
-    """Look at what follows each byte."""
+    """Return a view of the bytes that follow each byte, (n, size)."""
     n = max(len(octets) - size + 1, 0)
     return np.ndarray((n, size), np.uint8, buffer=octets, strides=(1, 1))
 

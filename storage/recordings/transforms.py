@@ -1,4 +1,4 @@
-"""tf2_msgs/msg/TFMessage in CDR: how frames hang together, for good or in time."""
+"""tf2_msgs/msg/TFMessage in CDR: transforms between frames, static or changing."""
 
 from __future__ import annotations
 
@@ -37,11 +37,11 @@ class Transforms:
         self._messages.add(batch)
 
     def notes(self) -> tuple[str, ...]:
-        """Say how many messages could not be decoded."""
+        """Return a note on messages that could not be decoded."""
         return broken_note(self._topic, self._messages.n_broken, self._messages.reason)
 
     def series(self) -> list[Series]:
-        """Give one series per pair of parent and child."""
+        """Return one series per pair of parent and child."""
         tables = self._messages.tables()
         pairs = list(dict.fromkeys(pair for table in tables for pair in table.names))
         return [self._pair(pair, tables) for pair in pairs]
@@ -64,7 +64,7 @@ class Transforms:
 
 
 def _layout(cursor: cdr.Cursor) -> cdr.Layout:
-    """Find the numbers of one message with any number of transforms."""
+    """Return the places of the numbers in one message with any number of transforms."""
     names, stamps, columns = [], [], []
     for _ in range(cursor.count(_TRANSFORM_MIN)):
         stamps.append(cursor.stamp())

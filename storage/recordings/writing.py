@@ -72,14 +72,14 @@ def write_log(
     compression : str
         ``none``, ``lz4`` or ``zstd``.
     firings : Firings, optional
-        All shots of the LiDAR: they are written as raw packets, in place of the points.
+        All pulses of the LiDAR: they are written as raw packets, in place of the points.
 
     Raises
     ------
     ConfigError
         If the compression or the time is unknown or out of range.
     RecordingError
-        If an instant is negative, which ROS 2 cannot say.
+        If an instant is negative, which ROS 2 cannot represent.
 
     Notes
     -----
@@ -151,11 +151,11 @@ def _clouds(topic: str, log: ScanLog, revolution_ns: int) -> Iterator[Item]:
     points["intensity"], points["ring"] = log.intensities[order], log.rings[order]
     turns = (stamps - stamps[0]) // revolution_ns
     edges = [*(np.flatnonzero(np.diff(turns, prepend=-1))).tolist(), len(stamps)]
-    names = [name for name in _FIELDS if name != "time" or log.has_shot_times]
+    names = [name for name in _FIELDS if name != "time" or log.has_pulse_times]
     for begin, end in pairwise(edges):
         stamp = (
             int(stamps[0] + turns[begin] * revolution_ns)
-            if log.has_shot_times
+            if log.has_pulse_times
             else int(stamps[begin])
         )
         points["time"][begin:end] = (stamps[begin:end] - stamp) * 1e-9

@@ -21,7 +21,7 @@ def test_every_row_is_done_once_and_in_order(n_rows):
 
 def test_parts_are_done_at_the_same_time():
     meeting = threading.Barrier(2, timeout=PATIENCE)  # breaks unless both parts get there
-    assert len(side_by_side(lambda _first, _end: meeting.wait(), 10, worth=2)) == 2
+    assert len(side_by_side(lambda _first, _end: meeting.wait(), 10, threaded_from=2)) == 2
 
 
 def test_an_error_in_any_part_reaches_the_caller():
@@ -30,12 +30,12 @@ def test_an_error_in_any_part_reaches_the_caller():
             raise ArithmeticError("the second part")
 
     with pytest.raises(ArithmeticError, match="the second part"):
-        side_by_side(fail_late, 10, worth=2)
+        side_by_side(fail_late, 10, threaded_from=2)
 
 
 @pytest.mark.parametrize("n_rows", [0, 1, 7, 64])
 def test_pieces_taken_by_turns_come_in_the_order_of_the_rows(n_rows):
-    parts = by_turns(lambda first, end: np.arange(first, end), n_rows, size=3, worth=2)
+    parts = by_turns(lambda first, end: np.arange(first, end), n_rows, size=3, threaded_from=2)
     np.testing.assert_array_equal(np.concatenate(parts), np.arange(n_rows))
     assert max(len(part) for part in parts) <= 3
 
@@ -50,12 +50,12 @@ def test_a_late_thread_leaves_its_pieces_to_the_other():
             done.set()
         return True
 
-    assert all(by_turns(work, 50, size=1, worth=2))
+    assert all(by_turns(work, 50, size=1, threaded_from=2))
 
 
 def test_what_fails_by_turns_is_told_when_both_threads_have_stopped():
     with pytest.raises(ValueError, match="piece 7"):
-        by_turns(_fail_at_seven, 10, size=1, worth=2)
+        by_turns(_fail_at_seven, 10, size=1, threaded_from=2)
 
 
 def _fail_at_seven(first, _end):

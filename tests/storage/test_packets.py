@@ -123,7 +123,7 @@ def test_simulated_packets_are_the_same_points_as_the_simulated_cloud(stop, writ
     assert_array_equal(log.rings, stop.log.rings)
     assert_array_equal(log.intensities, stop.log.intensities)
     assert_allclose(log.stamps_lidar_ns, stop.log.stamps_lidar_ns, rtol=0, atol=1)
-    assert log.has_shot_times
+    assert log.has_pulse_times
     assert log.has_heights
 
 
@@ -142,13 +142,13 @@ def test_velodyne_decoder_finds_the_simulated_points_in_simulated_packets(stop, 
 
 def test_packets_hold_every_shot_and_zeros_where_nothing_answered(stop):
     packets = encoded(stop.firings)
-    shots = packets["data"]["blocks"]["shots"]
+    pulses = packets["data"]["blocks"]["pulses"]
     assert packets["data"].dtype.itemsize == 1206
-    assert shots["distance"].size == len(stop.firings.azimuths) // 12 * 384
-    silent = shots["distance"] == 0
+    assert pulses["distance"].size == len(stop.firings.azimuths) // 12 * 384
+    silent = pulses["distance"] == 0
     assert 0.2 < silent.mean() < 0.8  # the sky
     assert (~silent).sum() == len(stop.log.rings)
-    assert not shots["reflectivity"][silent].any()
+    assert not pulses["reflectivity"][silent].any()
     assert set(octets(packets)[:, 1204]) == {0x37}
     assert set(octets(packets)[:, 1205]) == {0x22}
 
@@ -180,8 +180,8 @@ def test_real_strongest_returns_decode_as_velodyne_decoder_does(tmp_path):
     require_equal(log, *decoded(stamps, data))
 
 
-def by_shot(rings, instants, p):
-    """Return points in the order of lasers, shots and ranges."""
+def by_pulse(rings, instants, p):
+    """Return points in the order of lasers, pulses and ranges."""
     keys = np.linalg.norm(p, axis=1), np.round((instants - instants.min()) * 1e5), rings
     return p[np.lexsort(keys)]
 
@@ -196,8 +196,8 @@ def test_real_dual_returns_decode_as_velodyne_decoder_does(tmp_path):
         stamps = [p.stamp.sec * 10**9 + p.stamp.nanosec for p in scan.packets]
         points, instants = decoded(stamps, np.array([p.data for p in scan.packets]))
         log = read(tmp_path, (SCHEMA, data), start_ns=stamps[0])
-        mine = by_shot(log.rings, log.stamps_lidar_ns * 1e-9, log.p_lidar)
-        assert_allclose(mine, by_shot(points[:, 6], instants, points[:, :3]), rtol=0, atol=SINGLE)
+        mine = by_pulse(log.rings, log.stamps_lidar_ns * 1e-9, log.p_lidar)
+        assert_allclose(mine, by_pulse(points[:, 6], instants, points[:, :3]), rtol=0, atol=SINGLE)
         since = np.sort(instants - instants.min())
         mine = (log.stamps_lidar_ns - log.stamps_lidar_ns[0]) * 1e-9
         assert_allclose(mine, since, rtol=0, atol=CLOCK)
@@ -210,10 +210,10 @@ def test_equal_dual_returns_are_one_and_different_ones_are_two(rng, tmp_path):
     packets["data"]["mode"] = 0x39
     blocks = packets["data"]["blocks"]
     blocks["azimuth"][0] = np.repeat(np.arange(6) * 40, 2)
-    blocks["shots"]["distance"] = 5000
+    blocks["pulses"]["distance"] = 5000
     log = read(tmp_path, message(packets))
     assert len(log.rings) == 6 * 32
-    blocks["shots"]["distance"][0, 1, 3] = 4000  # the strongest of the second ring fired
+    blocks["pulses"]["distance"][0, 1, 3] = 4000  # the strongest of the second ring fired
     log = read(tmp_path, message(packets))
     assert len(log.rings) == 6 * 32 + 1
     pair = np.linalg.norm(log.p_lidar[3:5], axis=1)
@@ -272,7 +272,7 @@ def test_packets_stamped_at_another_age_are_left_out_and_counted(rng, tmp_path):
     stamps = T0 + np.arange(4) * PACKET
     stamps[2] = 5
     log = read(tmp_path, message(packets, stamps_ns=stamps))
-    distances = packets["data"]["blocks"]["shots"]["distance"]
+    distances = packets["data"]["blocks"]["pulses"]["distance"]
     assert len(log.rings) == (distances[[0, 1, 3]] > 0).sum()
     assert any("more than a day off" in note for note in log.notes)
     assert inspect_log(tmp_path / "a.mcap").n_returns == len(log.rings)
@@ -299,7 +299,7 @@ def test_a_block_that_does_not_begin_as_one_ends_its_packet(rng, tmp_path):
     packets = encoded(firings(rng, n_packets=2))
     packets["data"]["blocks"]["flag"][0, 5] = 0xDDFF
     log = read(tmp_path, message(packets))
-    distances = packets["data"]["blocks"]["shots"]["distance"]
+    distances = packets["data"]["blocks"]["pulses"]["distance"]
     assert len(log.rings) == (distances[0, :5] > 0).sum() + (distances[1] > 0).sum()
 
 
@@ -307,7 +307,7 @@ def test_a_message_that_is_cut_is_left_out_and_counted(rng, tmp_path):
     packets = encoded(firings(rng))
     schema, data = message(packets)
     log = read(tmp_path, (schema, data), (schema, data[:-1300]))
-    assert len(log.rings) == (packets["data"]["blocks"]["shots"]["distance"] > 0).sum()
+    assert len(log.rings) == (packets["data"]["blocks"]["pulses"]["distance"] > 0).sum()
     assert any("declares 4 packets" in note for note in log.notes)
 
 

@@ -53,7 +53,7 @@ def scan_log(rng, n=3000, duration=0.75, **changes):
         "intensities": rng.integers(0, 256, n).astype(np.float32),
         "rings": rng.integers(0, 16, n).astype(np.uint8),
         "stamps_lidar_ns": stamps,
-        "has_shot_times": True,
+        "has_pulse_times": True,
         "gimbal_angles": 0.3 + 4.0 * (samples - T0) * 1e-9,
         "stamps_gimbal_ns": samples,
         "quaternions_imu": tilt.as_quat(),
@@ -76,7 +76,7 @@ def assert_same_log(found, expected):
         assert_array_equal(getattr(found, name), getattr(expected, name), err_msg=name)
     assert_allclose(found.stamps_lidar_ns - expected.stamps_lidar_ns, 0, rtol=0, atol=FLOAT_TIME)
     assert_allclose(found.quaternions_imu, expected.quaternions_imu, rtol=0, atol=1e-15)
-    assert found.has_shot_times == expected.has_shot_times
+    assert found.has_pulse_times == expected.has_pulse_times
 
 
 @pytest.mark.parametrize("compression", ["none", "lz4", "zstd"])
@@ -99,7 +99,7 @@ def test_a_log_without_ahrs_rig_and_shot_times_comes_back(tmp_path):
         rng,
         n=500,
         stamps_lidar_ns=stamps,
-        has_shot_times=False,
+        has_pulse_times=False,
         rig=None,
         quaternions_imu=np.empty((0, 4)),
         stamps_imu_ns=np.empty(0, np.int64),
@@ -269,7 +269,7 @@ def test_any_layout_of_points_is_read(
     assert_array_equal(log.p_lidar, expected)
     assert_array_equal(log.intensities, np.arange(40) if intensity else np.zeros(40))
     assert_array_equal(log.rings, np.arange(40) % 16 if ring else np.full(40, RING_UNKNOWN))
-    assert log.has_shot_times == (time is not None)
+    assert log.has_pulse_times == (time is not None)
     offsets = log.stamps_lidar_ns - T0
     assert_allclose(offsets, seconds * 1e9 if time else 0, rtol=0, atol=FLOAT_TIME)
 
@@ -292,7 +292,7 @@ def test_the_times_of_other_drivers_are_understood(tmp_path, name, kind, values)
     )
     points["x"], points[name] = 1.0, values(seconds)
     log = read_log(record(tmp_path / "a.mcap", [("/p", T0, cloud(points)), *turning()]))
-    assert log.has_shot_times
+    assert log.has_pulse_times
     found = log.stamps_lidar_ns - T0 + (100_000_000 if kind == "f4" else 0)
     assert_allclose(found, seconds * 1e9, rtol=0, atol=250)  # float64 seconds since 1970: 240 ns
 
@@ -320,7 +320,7 @@ def test_senseless_times_count_as_none_and_are_noted(tmp_path, kind):
     points = velodyne(np.random.default_rng(11))
     points["time"] = useless_times(kind)
     log = read_log(record(tmp_path / "a.mcap", [("/points", T0, cloud(points)), *turning()]))
-    assert not log.has_shot_times
+    assert not log.has_pulse_times
     assert set(log.stamps_lidar_ns.tolist()) == {T0}
     assert any("/points carry no time of their own" in note for note in log.notes)
 
@@ -405,7 +405,7 @@ def test_times_that_are_usable_are_not_lost_by_some_that_are_not(tmp_path, size)
         for k, points in enumerate(clouds)
     ]
     log = read_log(record(tmp_path / "a.mcap", [*items, *turning(n=400)]))
-    assert log.has_shot_times
+    assert log.has_pulse_times
     found = (log.stamps_lidar_ns - T0).reshape(30, size)
     times = np.stack([points["time"] for points in clouds]).astype(np.float64)
     expected = np.sort(np.arange(30)[:, None] * 1e8 + times * 1e9, axis=None).reshape(30, size)
@@ -458,7 +458,7 @@ def test_stamps_that_cannot_be_are_left_out(tmp_path):
     items.append(("/points", T0 + 200_000_000, cloud(velodyne(rng, n=40), ns=T0 + 100_000_000)))
     log = read_log(record(tmp_path / "a.mcap", items))
     assert (len(log.p_lidar), len(log.gimbal_angles)) == (104, 50)
-    assert log.has_shot_times
+    assert log.has_pulse_times
     assert sum("more than a day off" in note for note in log.notes) == 2
 
 

@@ -181,7 +181,7 @@ def test_clouds_without_coordinates_are_refused_with_their_fields(tmp_path):
 
 def test_a_recording_without_gimbal_angle_is_refused(tmp_path):
     path = record(tmp_path / "a.mcap", small_log(np.random.default_rng(7))[:1])
-    with pytest.raises(MissingGimbalAngleError, match="Nothing tells the angle"):
+    with pytest.raises(MissingGimbalAngleError, match="No topic holds the angle"):
         read_log(path)
     assert inspect_log(path).code == MissingGimbalAngleError.code
 
@@ -229,7 +229,7 @@ def turn_log(*, turn=10.0, share=1.0, spin=10.0, **changes):
         "intensities": np.zeros(len(times), np.float32),
         "rings": rings.astype(np.uint8),
         "stamps_lidar_ns": T0 + np.rint(times * 1e9).astype(np.int64),
-        "has_shot_times": True,
+        "has_pulse_times": True,
         "gimbal_angles": 2 * math.pi * samples / turn,
         "stamps_gimbal_ns": T0 + np.rint(samples * 1e9).astype(np.int64),
         "quaternions_imu": Rotation.identity(len(samples)).as_quat(),
@@ -306,6 +306,6 @@ def test_a_log_without_rig_or_level_is_weak(tmp_path):
 def test_a_continuous_turn_without_shot_times_is_refused(tmp_path):
     log = turn_log()
     stamps = T0 + (log.stamps_lidar_ns - T0) // 100_000_000 * 100_000_000
-    report = inspected(tmp_path, replace(log, stamps_lidar_ns=stamps, has_shot_times=False))
+    report = inspected(tmp_path, replace(log, stamps_lidar_ns=stamps, has_pulse_times=False))
     assert (report.verdict, report.code) == ("refused", "input.recording.no_shot_times")
     assert (report.lidar_speed_rpm, report.coverage_gap_deg) == (None, None)

@@ -9,8 +9,8 @@ from hypothesis import strategies as st
 from spheremark.pipelines.config import StitchingConfig
 from spheremark.pipelines.errors import (
     MissingGimbalAngleError,
+    MissingPulseTimesError,
     MissingRigError,
-    MissingShotTimesError,
     RecordingError,
     RigError,
 )
@@ -275,13 +275,13 @@ def by_message(log):
     """The log with the times of its messages only, ten a second."""
     begin = log.stamps_lidar_ns[0]
     stamps = begin + (log.stamps_lidar_ns - begin) // (NS // 10) * (NS // 10)
-    return replace(log, stamps_lidar_ns=stamps, has_shot_times=False)
+    return replace(log, stamps_lidar_ns=stamps, has_pulse_times=False)
 
 
 def test_a_continuous_turn_without_shot_times_is_refused(rng):
     rig = crooked_rig(rng)
     log, _ = scan_log(rng, rig)
-    with pytest.raises(MissingShotTimesError, match=r"2\.73 deg during a message"):
+    with pytest.raises(MissingPulseTimesError, match=r"2\.73 deg during a message"):
         stitch(by_message(log), rig, CONFIG)
 
 
@@ -334,7 +334,7 @@ def test_two_rests_around_a_turn_do_not_stand_for_a_scan(rng):
     log, _ = scan_log(rng, rig, duration=13.0, n=20000)
     times = np.arange(0, 13, 0.01)
     log = joints(by_message(log), times, np.interp(times, [1, 12], [0.0, 2 * np.pi]))
-    with pytest.raises(MissingShotTimesError, match="let the gimbal rest"):
+    with pytest.raises(MissingPulseTimesError, match="let the gimbal rest"):
         stitch(log, rig, CONFIG)
 
 

@@ -159,7 +159,7 @@ def test_a_stepping_scan_puts_every_point_on_a_surface(plain, stitched):
 def test_points_without_times_are_stamped_with_their_revolution(plain):
     with_times = simulate_stop(plain, "first", STEPPED).log
     without = simulate_stop(plain, "first", replace(STEPPED, shot_times=False)).log
-    assert not without.has_shot_times
+    assert not without.has_pulse_times
     assert_array_equal(without.p_lidar, with_times.p_lidar)
     late = with_times.stamps_lidar_ns - without.stamps_lidar_ns
     assert late.min() >= 0

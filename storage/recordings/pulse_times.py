@@ -1,8 +1,8 @@
-"""What drivers mean by the time of a point: told by type and size, and refused when senseless.
+"""The meaning of the time of a point, by its type and size; senseless times are refused.
 
 Float32 seconds since the message's stamp (Velodyne), whole nanoseconds since it (Ouster, Livox),
-absolute float64 seconds (Hesai, RoboSense) or nanoseconds. Simulators and drivers are known to
-leave the field zero, constant, or filled for half of the cloud only: that counts as no time.
+absolute float64 seconds (Hesai, RoboSense) or nanoseconds. Some simulators and drivers leave the
+field zero, constant, or filled for half of the cloud only: that counts as no time.
 """
 
 from __future__ import annotations
@@ -15,15 +15,15 @@ from numpy.typing import NDArray
 from spheremark.pipelines.model import Array, Mask, Nanos
 
 NO_FIELD = "there is no such field"
-SHOTS_MIN = 32  # points that a message needs before its times can be judged
+PULSES_MIN = 32  # points that a message needs before its times can be judged
 _REVOLUTION_LIMIT = 10.0  # [s] no message spans more; a larger time has another meaning
 _EPOCH = 1e6  # [s] a larger time is absolute
 _EPOCH_NS = 1e15  # the same in nanoseconds
 _ZEROS_MAX = 0.25  # share of zero times that a message with times may have
 
 
-def shot_times(times: NDArray[np.generic] | None, stamp_ns: int, out: Nanos) -> tuple[int, str]:
-    """Write the instant of each return of a message."""
+def pulse_times(times: NDArray[np.generic] | None, stamp_ns: int, out: Nanos) -> tuple[int, str]:
+    """Write the instant of each return of a message; return their span [ns], and the fault."""
     fault = NO_FIELD
     if times is not None:
         if not len(times):
@@ -36,7 +36,7 @@ def shot_times(times: NDArray[np.generic] | None, stamp_ns: int, out: Nanos) -> 
 
 
 def _written(times: NDArray[np.generic], stamp_ns: int, out: Nanos) -> tuple[int, str]:
-    """Write instants, and return their span and what is wrong with them."""
+    """Write instants, and return their span [ns] and the fault."""
     low, high = float(times.min()), float(times.max())
     fault = fault_of(low, high, int((times == 0).sum()), len(times))
     if fault:
@@ -49,10 +49,10 @@ def _written(times: NDArray[np.generic], stamp_ns: int, out: Nanos) -> tuple[int
 
 
 def fault_of(low: float, high: float, n_zeros: int, n: int) -> str:
-    """Say what is wrong with the times of a message."""
+    """Return the fault of the times of a message; empty if there is none."""
     if not isfinite(high - low):
         return "some of its times are not finite"
-    if n < SHOTS_MIN:
+    if n < PULSES_MIN:
         return ""
     if low == high:
         return f"its times are all {low:g}"
@@ -60,27 +60,27 @@ def fault_of(low: float, high: float, n_zeros: int, n: int) -> str:
 
 
 def plain_spans(kind: str, low: Array, high: Array, n_zeros: Nanos, n: Nanos) -> tuple[Nanos, Mask]:
-    """Return how long after their stamps messages end whose times are counted from there."""
+    """Return the spans [ns] of messages whose times count from the stamp, and which these are."""
     scale = _scale(kind[0])
     is_near = np.maximum(np.abs(low), np.abs(high)) * scale <= _REVOLUTION_LIMIT * 1e9
-    is_plain = is_near & (low < high) & (n >= SHOTS_MIN) & (n_zeros <= _ZEROS_MAX * n)
+    is_plain = is_near & (low < high) & (n >= PULSES_MIN) & (n_zeros <= _ZEROS_MAX * n)
     return np.rint(np.where(is_plain, high, 0.0) * scale).astype(np.int64), is_plain
 
 
 def plain_span(kind: str, low: float, high: float) -> int | None:
-    """Return how long after its stamp a message ends, if its times are counted from there."""
+    """Return the span [ns] of a message if its times count from the stamp."""
     scale = _scale(kind[0])
     is_plain = max(abs(low), abs(high)) * scale <= _REVOLUTION_LIMIT * 1e9
     return round(high * scale) if is_plain else None
 
 
 def _scale(kind: str) -> float:
-    """Return the nanoseconds that 1 means in times since a stamp."""
+    """Return the unit of times since a stamp [ns]."""
     return 1.0 if kind in "iu" else 1e9
 
 
 def _offsets_ns(times: NDArray[np.generic], low: float, high: float, stamp_ns: int) -> Nanos | None:
-    """Return nanoseconds since the stamp, or nothing if the times make no sense."""
+    """Return nanoseconds since the stamp, or None if the times are neither unit."""
     is_whole = times.dtype.kind in "iu"
     if low > (_EPOCH_NS if is_whole else _EPOCH):
         absolute = _absolute_ns(times, is_ns=low > _EPOCH_NS)
