@@ -6,7 +6,6 @@ Conventions are those of CONVENTIONS.md: ``T_a_b`` maps from ``b`` to ``a``; sma
 
 import numpy as np
 from numpy.typing import ArrayLike
-from scipy.spatial.transform import Rotation
 
 from spheremark.pipelines.model import Array, Levelling, Mask
 
@@ -192,6 +191,8 @@ def exp_motion(xi: ArrayLike) -> Array:
     -----
     Barfoot, State Estimation for Robotics, eq. 7.34 and 7.37, with rotation first.
     """
+    from scipy.spatial.transform import Rotation  # slow to import
+
     xi = np.asarray(xi, dtype=np.float64)
     return rigid(Rotation.from_rotvec(xi[:3]).as_matrix(), left_jacobian(xi[:3]) @ xi[3:])
 
@@ -209,6 +210,8 @@ def log_motion(T: Array) -> Array:
     (6,)
         Rotation [rad] and translation [m] of the twist.
     """
+    from scipy.spatial.transform import Rotation  # slow to import
+
     phi = Rotation.from_matrix(T[:3, :3]).as_rotvec()
     return np.concatenate([phi, np.linalg.solve(left_jacobian(phi), T[:3, 3])])
 
@@ -275,6 +278,8 @@ def yaw_pitch_roll(R: Array) -> tuple[float, float, float]:
     tuple of float
         Yaw, pitch and roll [rad].
     """
+    from scipy.spatial.transform import Rotation  # slow to import
+
     yaw, pitch, roll = Rotation.from_matrix(R).as_euler("ZYX")
     return float(yaw), float(pitch), float(roll)
 

@@ -1,6 +1,11 @@
-"""What the end of a test run names besides pytest's own summary."""
+"""Settings of all tests, and what the end of a run names besides pytest's own summary."""
+
+from hypothesis import settings
 
 from tests.real_scans import ABSENT
+
+settings.register_profile("spheremark", deadline=None)  # a first call imports or compiles
+settings.load_profile("spheremark")
 
 
 def pytest_terminal_summary(terminalreporter):

@@ -10,7 +10,6 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from spheremark.pipelines.config import StitchingConfig
 from spheremark.pipelines.errors import (
@@ -95,8 +94,8 @@ def level(log: ScanLog, rig: Rig, config: StitchingConfig) -> Levelling:
     median deviations of the median. Errors of an AHRS are correlated in time: the scatter of one
     sample, not of the mean, is added to the sigma of the configuration.
     """
-    usable = np.linalg.norm(log.quaternions_imu, axis=1)
-    usable = np.isfinite(usable) & (usable > 0.5)
+    norms = np.linalg.norm(log.quaternions_imu, axis=1)
+    usable = np.isfinite(norms) & (norms > 0.5)
     if not np.any(usable):
         return Levelling(
             roll=0.0,
@@ -105,8 +104,9 @@ def level(log: ScanLog, rig: Rig, config: StitchingConfig) -> Levelling:
             is_measured=False,
             sigma_heading=rig.sigma_heading,
         )
-    R_world_imu = Rotation.from_quat(log.quaternions_imu[usable]).as_matrix()
-    ups = R_world_imu[:, 2, :] @ rig.R_mount_imu.T
+    x, y, z, w = (log.quaternions_imu[usable] / norms[usable, None]).T
+    up_imu = np.stack([2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)], axis=1)
+    ups = up_imu @ rig.R_mount_imu.T
     if rig.imu_mount is ImuMount.HEAD:
         ups = _turn(ups, _angles_at(_joints(log, rig), log.stamps_imu_ns[usable]))
     up, scatter = _robust_direction(ups)

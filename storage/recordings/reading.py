@@ -10,7 +10,6 @@ from pathlib import Path, PurePosixPath
 from typing import TypeVar
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from spheremark.pipelines.errors import MissingGimbalAngleError, MissingLidarError, RecordingError
 from spheremark.pipelines.model import RING_UNKNOWN, ImuMount, Nanos, Origin, Rig, ScanLog
@@ -326,6 +325,8 @@ def _angle_of_ahrs(
     The axis of the gimbal is where the head's z axis points on average; the angle is the rotation
     about it, from the heading in which the AHRS's own x axis began.
     """
+    from scipy.spatial.transform import Rotation  # slow to import
+
     if imu is None or rig is None or rig.imu_mount is not ImuMount.HEAD:
         raise MissingGimbalAngleError(
             "No topic holds the angle of the gimbal. Expected a sensor_msgs/msg/JointState with "

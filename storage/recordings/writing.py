@@ -7,11 +7,11 @@ import struct
 from collections.abc import Iterator
 from itertools import pairwise
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 from mcap.writer import CompressionType, Writer
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 
 from spheremark.pipelines.errors import ConfigError, RecordingError
 from spheremark.pipelines.model import Array, Firings, ImuMount, Nanos, Rig, ScanLog
@@ -22,6 +22,9 @@ from spheremark.storage.recordings import (
     pointclouds,
     transforms,
 )
+
+if TYPE_CHECKING:
+    from scipy.spatial.transform import Rotation
 
 LIDAR_FRAME, IMU_FRAME, HEAD_FRAME, BASE_FRAME = "velodyne", "imu_link", "gimbal_link", "base_link"
 JOINT = "gimbal_joint"
@@ -192,6 +195,8 @@ def _joints(topic: str, log: ScanLog) -> Iterator[Item]:
 
 def _imus(topic: str, log: ScanLog) -> Iterator[Item]:
     """Give one IMU message per orientation, with the rates and the gravity that belong to it."""
+    from scipy.spatial.transform import Rotation  # slow to import
+
     rotations = Rotation.from_quat(log.quaternions_imu)
     rates = _rates(rotations, log.stamps_imu_ns)
     up = rotations.inv().apply([0.0, 0.0, _GRAVITY])
@@ -216,6 +221,8 @@ def _rates(rotations: Rotation, stamps_ns: Nanos) -> Array:
 
 def _static_transforms(rig: Rig, stamp: int) -> bytes:
     """Encode how LiDAR and AHRS are mounted."""
+    from scipy.spatial.transform import Rotation  # slow to import
+
     mount = HEAD_FRAME if rig.imu_mount is ImuMount.HEAD else BASE_FRAME
     T_mount_imu = np.eye(4)
     T_mount_imu[:3, :3] = rig.R_mount_imu
