@@ -129,12 +129,8 @@ def field_map(  # noqa: PLR0913  all that a map is made of
         Ground and what hides marks; the LiDAR stands ``site.mast`` above the ground.
     xs, ys : (n,), (m,)
         Lines of the grid [m].
-    marks : Arrangement
-        The marks.
-    model : CentreModel
-        Accuracy of centres.
-    requirement : Requirement
-        Tolerance and method.
+    marks, model, requirement
+        As of ``evaluate``.
     visibility : Visibility, optional
         Result of ``find_visibility`` for ``map_stations`` and these marks; found if not given.
 

@@ -268,18 +268,10 @@ def propose_mark(
 
     Parameters
     ----------
-    site : Site
-        Ground and what hides marks.
-    stops : Stops
-        Positions of the LiDAR.
     present : Arrangement
         Marks that stand already.
-    candidates : Candidates
-        Where one more may stand.
-    model : CentreModel
-        Accuracy of centres.
-    requirement : Requirement
-        Tolerance and method.
+    site, stops, candidates, model, requirement
+        As of ``optimise``.
 
     Returns
     -------
@@ -330,16 +322,8 @@ def best_without_search(  # noqa: PLR0913  all that a plan is made of
 
     Parameters
     ----------
-    site : Site
-        Ground and what hides marks.
-    stops : Stops
-        Positions of the LiDAR.
-    candidates : Candidates
-        Where a mark may stand.
-    model : CentreModel
-        Accuracy of centres.
-    requirement : Requirement
-        Tolerance and method.
+    site, stops, candidates, model, requirement
+        As of ``optimise``.
     n_marks : int
         Number of marks.
     drawn : tuple of int and numpy.random.Generator, optional
