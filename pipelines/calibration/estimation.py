@@ -102,7 +102,7 @@ def _held_back(parameter: Parameter, sigma: float) -> Inseparable:
     """Return why a parameter is held although the observations determine it."""
     return Inseparable(
         parameter.name,
-        f"These scans seem to tell it to {sigma:.2g} {parameter.unit} (1 sigma), but "
+        f"These scans seem to determine it to {sigma:.2g} {parameter.unit} (1 sigma), but "
         f"{parameter.caution}.",
     )
 
@@ -111,10 +111,10 @@ def _reason(parameter: Parameter, eigenvalue: float, partners: list[str]) -> str
     """Return why a parameter is held."""
     together = f" apart from {', '.join(partners)}" if partners else ""
     if eigenvalue < 1e-4:
-        return f"These scans do not tell it{together}: {parameter.twin}."
+        return f"These scans do not determine it{together}: {parameter.twin}."
     sigma = parameter.unknown / np.sqrt(eigenvalue)
     return (
-        f"These scans tell it{together} only to {sigma:.2g} {parameter.unit} (1 sigma): "
+        f"These scans determine it{together} only to {sigma:.2g} {parameter.unit} (1 sigma): "
         f"{parameter.twin}."
     )
 

@@ -64,7 +64,7 @@ OTHERS = (
         "s",
         _TIME,
         "at constant speed of the gimbal it turns all centres together, as a heading does; only a "
-        "gimbal that changes its speed while the LiDAR measures can tell it",
+        "gimbal that changes its speed while the LiDAR measures can determine it",
     ),
     Parameter(
         "spin_axis_heading", "rad", _ANGLE, "it turns all centres of a stop about the gimbal axis"

@@ -338,8 +338,8 @@ class AdjustedNetwork:
     cov_T_site_station : (s, 6, 6)
         Covariance of a small motion of each, (rotation [rad], translation [m]) on the left.
     station_covariances : (s, 3, 3)
-        Covariance of each station's position: far from the origin that of the motion has no digits
-        left to tell it from [m^2].
+        Covariance of each station's position [m^2]. Kept apart: far from the origin the one of the
+        motion has too few digits for it.
     p_site : (m, 3)
         Marks [m].
     cov_p_site : (3m, 3m)

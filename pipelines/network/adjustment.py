@@ -296,14 +296,14 @@ def _warnings(
     if bad:
         warnings.append(
             f"The control marks {', '.join(bad)} contradict each other or the scans, and too few "
-            "others stand to tell which is wrong."
+            "others remain to decide which is wrong."
         )
     against = [one.mark for one in left_out if one.kind == "control"]
     if len(against) > _MANY_LEFT_OUT * len(network.controls):
         warnings.append(
             f"{len(against)} of {len(network.controls)} control marks contradict the others and "
-            f"were left out ({', '.join(against)}): the scans cannot tell which of the two groups "
-            "is right."
+            f"were left out ({', '.join(against)}): the scans cannot decide which of the two "
+            "groups is right."
         )
     n_bad = sum(one.kind == "centre" for one in left_out)
     if n_bad and n_bad > _MANY_LEFT_OUT * n:

@@ -137,7 +137,7 @@ def assemble(
     names = [name for name, _ in scans]
     if twice := sorted(name for name, n in Counter(names).items() if n > 1):
         raise InputError(
-            f"Two logs are called {twice[0]!r}; stations are told apart by name. Rename one."
+            f"Two logs are called {twice[0]!r}; stations are identified by name. Rename one."
         )
     if calibration is not None:
         scans = [(name, calibration.adjusted(name, fits)) for name, fits in scans]
@@ -280,7 +280,7 @@ def _why(fits: MarkerFits, found: _Map, error: SolveError) -> str:
         return (
             f"Its {n} markers fit the {m} marks of the network in more than one way equally well: "
             "distances repeat (a symmetric field, or too few marks). Another mark, where no "
-            "distance repeats, tells them apart."
+            "distance repeats, resolves that."
         )
     if isinstance(error, NoMatchError):
         return (

@@ -1,4 +1,4 @@
-"""Poses that may lay some fits on some marks: hides how they are found, thinned out and scored.
+"""Candidate poses that lay some fits on some marks: how they are found, thinned out and scored.
 
 Two fits and two marks that are as far apart, and rise alike, give a heading and a translation.
 """

@@ -239,7 +239,7 @@ def _other_places(scene: Scene, match: Match) -> str:
     more = f" and {len(places) - 3} more places" if len(places) > 3 else ""
     return (
         f"two markers fit the marks in {len(places) + 1} ways about equally well: the station may "
-        f"as well stand at {text}{more} m; a third mark would tell"
+        f"as well stand at {text}{more} m; a third mark would decide"
     )
 
 

@@ -272,7 +272,7 @@ def _weaknesses(pairs: Index, adjustment: Adjustment, cov: Array, scene: Scene) 
     if is_on_a_line(scene.marks_site[pairs[:, 1]]):
         reasons.append(
             "the marks lie on one line: on the other side of it the distances are the same, and "
-            "only the directions of the markers tell the side"
+            "only the directions of the markers determine the side"
         )
     reasons += failed_global_test(adjustment)
     sigmas = np.sqrt(np.diag(cov)[3:])
