@@ -13,7 +13,7 @@ from spheremark.pipelines.errors import SpheremarkError
 from spheremark.pipelines.ground_model import StationPose
 from spheremark.service.cli.main import app
 from spheremark.service.jobs.handlers.sites import scratch
-from spheremark.service.jobs.site import SiteWish, make_site
+from spheremark.service.jobs.site import SiteRequest, make_site
 from spheremark.storage.exports.ground_model import read_geotiff
 from spheremark.storage.recordings import read_log, write_log
 
@@ -163,7 +163,7 @@ def test_a_site_that_fails_leaves_no_files_and_spoils_none(tmp_path):
     targets["e57"].write_text("of yesterday")
     pose = StationPose(name="S1", T_site_station=np.eye(4), cov_T_site_station=1e-6 * np.eye(6))
     with pytest.raises(SpheremarkError):
-        make_site((), (pose,), SiteWish(targets=targets))  # no stop, so that there is no return
+        make_site((), (pose,), SiteRequest(targets=targets))  # no stop, so that there is no return
     assert [path.name for path in tmp_path.iterdir()] == ["site.e57"]
     assert targets["e57"].read_text() == "of yesterday"
 

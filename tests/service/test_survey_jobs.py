@@ -14,7 +14,7 @@ from spheremark.pipelines.simulation import SimulationConfig
 from spheremark.service.cli.fieldwork import Assignment, survey
 from spheremark.service.http.app import create_app
 from spheremark.service.jobs.handlers.calibrate import logs_of
-from spheremark.service.jobs.specification import JobKind, Log, Order
+from spheremark.service.jobs.specification import JobKind, Log, JobSpecification
 from spheremark.service.settings import Settings
 from spheremark.storage.recordings import read_log, write_log
 
@@ -311,7 +311,7 @@ def test_the_page_of_a_calibration_lets_one_use_its_rig(site, calibrated, rows):
     fields = {"rig": whole["rig_digest"], "back": path}
     answer = site.client.post("/surveys/field/rig", data=fields, follow_redirects=False)
     assert (answer.status_code, answer.headers["location"]) == (303, path)
-    assert "Use each log's own rig again" in page(site, path)
+    assert "Use the rig of each log again" in page(site, path)
     site.client.post("/surveys/field/rig", data={"rig": "", "back": "//elsewhere"})
     assert site.client.get("/api/v1/surveys/field").json()["rig_digest"] is None
 
@@ -400,7 +400,7 @@ def test_logs_of_one_name_are_told_apart_alike_by_networks_and_calibrations(fiel
         Log(recording_id=str(i) * 64, name=name, url=str(field.stops[i % 2].log))
         for i, name in enumerate(("a", "a (2)", "a", "b", "a"))
     )
-    order = Order(
+    order = JobSpecification(
         job_id="j", kind=JobKind.ADJUST, result_id="r", survey_id="s", logs=logs,
         config=SurveyConfig(), marks=None, rig=None, clouds_url="",
     )  # fmt: skip
