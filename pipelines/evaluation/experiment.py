@@ -106,7 +106,18 @@ class Experiment(Generic[World, Found, Report]):
 
 
 def to_json(value: Any) -> Any:
-    """Return plain values with null for numbers that are not finite, which JSON does not have."""
+    """Return plain values with null for numbers that are not finite, which JSON does not have.
+
+    Parameters
+    ----------
+    value : object
+        Plain values in mappings and sequences.
+
+    Returns
+    -------
+    object
+        The same in dicts and lists.
+    """
     if isinstance(value, Mapping):
         return {key: to_json(one) for key, one in value.items()}
     if isinstance(value, Iterable) and not isinstance(value, str):

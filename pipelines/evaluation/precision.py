@@ -106,7 +106,18 @@ def precision(
 
 
 def full_precision(seed: int) -> Experiment[tuple[Case, int], list[_Row], Plain]:
-    """Return ``precision`` with over a thousand fits at each distance, a long turn, two methods."""
+    """Return ``precision`` with over a thousand fits at each distance, a long turn, two methods.
+
+    Parameters
+    ----------
+    seed : int
+        Seed of the first stop of each case; the others follow.
+
+    Returns
+    -------
+    Experiment
+        As of ``precision``.
+    """
     cases = (*CASES, Case(0.02, _LONG_TURN))
     return precision(_N_STOPS_FULL, seed, cases=cases, methods=("along_beam", "silhouette"))
 

@@ -33,13 +33,7 @@ from spheremark.pipelines.evaluation.reproduction.plan import (
     plan,
 )
 from spheremark.pipelines.evaluation.reproduction.scans import Reproduction, reproduction
-from spheremark.pipelines.evaluation.reproduction.tables import (
-    findings,
-    models_of_icp,
-    readings,
-    table_2,
-    table_4,
-)
+from spheremark.pipelines.evaluation.reproduction.tables import study_tables
 from spheremark.pipelines.model import RING_UNKNOWN, Levelling, StitchedCloud
 from spheremark.pipelines.model import Column as Points
 from spheremark.pipelines.scan.rigs import vlp16
@@ -97,6 +91,7 @@ def reproduce(folder: Path, options: ReproductionOptions, progress: Progress) ->
 def page_of(made: Reproduction, seed: int, real: RealScans | None = None) -> ReproductionPage:
     """Put a reproduction into the form of the page."""
     real = real or RealScans()
+    tables = study_tables(made, np.random.default_rng(seed))
     return ReproductionPage(
         tolerance_m=made.config.tolerance,
         scans=[asdict(scan) for scan in made.scans],
@@ -108,13 +103,13 @@ def page_of(made: Reproduction, seed: int, real: RealScans | None = None) -> Rep
                 p95=one.limits["p95"],
                 mean=one.limits["mean"],
             )
-            for one in findings(made, np.random.default_rng(seed))
+            for one in tables.findings
         ),
-        table_2=table_2(made),
-        table_4=table_4(made),
-        readings=readings(made),
+        table_2=tables.table_2,
+        table_4=tables.table_4,
+        readings=tables.readings,
         angles=angle_experiment(made.config.tolerance, np.random.default_rng(seed)),
-        icp=models_of_icp(made),
+        icp=tables.icp,
         example=made.example,
         centre=_columns(made, CENTRE),
         lane=_columns(made, LANE_2),

@@ -56,6 +56,41 @@ class Finding(NamedTuple):
     errors: ErrorSummary
 
 
+class StudyTables(NamedTuple):
+    """The study's tables from simulation; rows of plain values."""
+
+    table_2: list[Plain]
+    table_4: list[Plain]
+    readings: list[Plain]
+    icp: dict[str, ErrorSummary]
+    findings: tuple[Finding, ...]
+
+
+def study_tables(made: Reproduction, rng: np.random.Generator) -> StudyTables:
+    """Return the study's tables again, and the limits that keep its tolerance.
+
+    Parameters
+    ----------
+    made : Reproduction
+        The scans.
+    rng : numpy.random.Generator
+        Draws the resamples of the confidence intervals.
+
+    Returns
+    -------
+    StudyTables
+        Errors by distance, by stop, by what the study leaves open, and by model of its ICP; limits
+        by place and method.
+    """
+    return StudyTables(
+        table_2=table_2(made),
+        table_4=table_4(made),
+        readings=readings(made),
+        icp=models_of_icp(made),
+        findings=findings(made, rng),
+    )
+
+
 def table_2(made: Reproduction) -> list[Plain]:
     """Return the study's Table 2 again: errors by distance; NaN where a marker was never found."""
     nearest = np.argmin(np.abs(made.centres["range_m"][:, None] - TABLE_2.ranges), axis=1)
