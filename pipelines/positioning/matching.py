@@ -394,7 +394,22 @@ def solve_pose(scene: Scene, pairs: Index, start: Array) -> Solution:
 
 
 def solve_poses(scene: Scene, pairs: Index, start: Array) -> Solutions:
-    """Find a pose of base from each of many sets of pairs, (s, k, 2), all from one start."""
+    """Find a pose of base from each of many sets of pairs and gravity.
+
+    Parameters
+    ----------
+    scene : Scene
+        Centres and marks.
+    pairs : (s, k, 2)
+        Places among fits and marks of each set.
+    start : (4, 4)
+        Approximate pose of base, common to all, relative to the middle of the marks [m].
+
+    Returns
+    -------
+    Solutions
+        Poses with covariances of small motions on the left.
+    """
     starts = np.tile(start, (len(pairs), 1, 1))
     return solve_each(lambda T, rows: observe(scene, pairs[rows], T), moved, starts)
 

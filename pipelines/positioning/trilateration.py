@@ -70,7 +70,18 @@ def slope_ranges(v: Array) -> tuple[Array, Array]:
 
 
 def circles(v: Array) -> tuple[Array, Array]:
-    """Return horizontal lengths and heights of vectors."""
+    """Return horizontal lengths and heights of vectors.
+
+    Parameters
+    ----------
+    v : (..., 3)
+        Vectors from the station to centres or marks, levelled [m].
+
+    Returns
+    -------
+    tuple
+        Lengths and heights, (..., 2) [m], and their derivatives by the vectors, (..., 2, 3).
+    """
     flat = np.hypot(v[..., 0], v[..., 1])
     J = np.zeros((*v.shape[:-1], 2, 3))
     J[..., 0, :2] = v[..., :2] / np.maximum(flat, _NEAREST)[..., None]
