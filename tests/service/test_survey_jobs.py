@@ -14,7 +14,7 @@ from spheremark.pipelines.simulation import SimulationConfig
 from spheremark.service.cli.fieldwork import Assignment, survey
 from spheremark.service.http.app import create_app
 from spheremark.service.jobs.handlers.calibrate import logs_of
-from spheremark.service.jobs.specification import JobKind, Log, JobSpecification
+from spheremark.service.jobs.specification import JobKind, JobSpecification, Log
 from spheremark.service.settings import Settings
 from spheremark.storage.recordings import read_log, write_log
 
