@@ -16,7 +16,6 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 
-import fsspec
 import numpy as np
 from isal.isal_zlib import crc32
 
@@ -285,6 +284,8 @@ def local_copy(url: str | Path) -> Iterator[Path]:
     if "://" not in str(url) and (here := Path(url)).is_file():
         yield here
         return
+    import fsspec  # slow to import; a file on a disk needs none of it
+
     files, inner = fsspec.core.url_to_fs(str(url))
     try:
         details = files.info(inner)
@@ -324,6 +325,8 @@ def require_file(path: Path) -> None:
 
 def file_digest(url: str | Path) -> str:
     """Return the SHA-256 of a file's bytes, in hexadecimal."""
+    import fsspec
+
     digest = hashlib.sha256()
     try:
         with fsspec.open(str(url), "rb") as file:
