@@ -107,9 +107,8 @@ def gather_evidence(
     """Count the beams towards and about some centres by the depth at which they end."""
     if not len(centres):
         return []
-    starts, owners = _centres_by_direction(
-        centres, target.up, (_REACH + 0.5) * target.radius + 0.05
-    )
+    reach = (_REACH + 0.5) * target.radius + 0.05
+    starts, owners = _centres_by_direction(centres, _sides(centres, reach), target.up, reach)
     is_wanted, cones = starts[1:] > starts[:-1], _cones(centres, target)
 
     def towards(first: int, end: int) -> _Groups:
@@ -145,7 +144,7 @@ def _count_beams(
     radius = target.radius
     blur = blur_at(c, target) / radius
     seen = seen_from(rays_of(p_base, rows), view_of(c, target.up))
-    n_on, n_through, n_before, n_held, n_past, n_short = 0, 0, 0, 0, 0, 0
+    n_on, n_through, n_before, n_held, n_past, n_short, n_distinct = 0, 0, 0, 0, 0, 0, 0
     gaps2, light, lit = 0.0, 0.0, 0.0
     half = int((1.0 + blur) / _PLACE) + 1
     is_met = np.zeros((2 * half, 2 * half), np.bool_)
@@ -157,7 +156,9 @@ def _count_beams(
             n_on += 1
             gaps2 += gap * gap
             column = half + int(np.floor(seen[0, i] / radius / _PLACE))
-            is_met[column, half + int(np.floor(along / _PLACE))] = True
+            row = half + int(np.floor(along / _PLACE))
+            n_distinct += not is_met[column, row]
+            is_met[column, row] = True
             share = _share_inside((1.0 - gap) / (_MEAN_WIDTH * blur))
             light += share * intensities[rows[i]]
             lit += share * share
@@ -170,7 +171,7 @@ def _count_beams(
             n_held += _HELD[0] <= depth <= _HELD[1]
     spread, brightness = gaps2 / max(n_on, 1), light / max(lit, _TINY)
     counts = (n_on, n_through, n_before, spread, n_held, n_past, n_short)
-    return (*counts, brightness, int(np.sum(is_met)), rows, seen)
+    return (*counts, brightness, n_distinct, rows, seen)
 
 
 @compiled
@@ -207,14 +208,21 @@ def _rows_in_cones(
     return groups
 
 
+def _sides(centres: Array, reach: float) -> NDArray[np.int64]:
+    """Return the side of the lattice of directions about each centre that leaves out no cell."""
+    n_fine = 1.5 * reach * N_DIRECTIONS_SIDE / np.linalg.norm(centres, axis=1)
+    return np.asarray(2 * (2 + np.maximum(n_fine, reach / _STEP).astype(np.int64)) + 1)
+
+
 @compiled
-def _centres_by_direction(centres: Array, up: Array, reach: float) -> _Groups:
+def _centres_by_direction(
+    centres: Array, sides: NDArray[np.int64], up: Array, reach: float
+) -> _Groups:
     """Return the centres within reach of each cell of directions: starts, and the centres."""
-    sides = np.empty(len(centres), np.int64)
-    for k in range(len(centres)):
-        n_fine = 1.5 * reach * N_DIRECTIONS_SIDE / np.sqrt(np.sum(centres[k] ** 2))
-        sides[k] = 2 * (2 + int(max(n_fine, reach / _STEP))) + 1
-    owners = np.empty(np.sum(np.minimum(sides**2, N_DIRECTIONS)), np.int32)
+    most = 0
+    for side in sides:
+        most += min(side * side, N_DIRECTIONS)
+    owners = np.empty(most, np.int32)
     cells = np.empty(len(owners), np.uint16)
     latest = np.full(N_DIRECTIONS, -1, np.int64)
     n = 0
@@ -230,8 +238,9 @@ def _centres_by_direction(centres: Array, up: Array, reach: float) -> _Groups:
 @compiled
 def _directions_about(c: Array, up: Array, reach: float, n: int) -> NDArray[np.uint16]:
     """Return the cells of directions about a centre on a lattice, so many each way."""
-    v_across = np.cross(up, c)
-    v_across *= reach / (np.sqrt(np.sum(v_across**2)) + 1e-12)
+    x, y, z = up[1] * c[2] - up[2] * c[1], up[2] * c[0] - up[0] * c[2], up[0] * c[1] - up[1] * c[0]
+    scale = reach / (np.sqrt(x * x + y * y + z * z) + 1e-12)
+    v_across = (scale * x, scale * y, scale * z)
     xyz, cells, half = np.empty((3, n), np.float32), np.empty((n, n), np.uint16), n // 2
     for i in range(n):
         for j in range(n):

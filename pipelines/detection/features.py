@@ -15,6 +15,7 @@ from spheremark.pipelines.compilation import REASSOCIATED, compiled, compiled_wi
 from spheremark.pipelines.detection.cells import Cells
 from spheremark.pipelines.detection.neighbourhoods import (
     SortedReturns,
+    n_in,
     rays_near,
     returns_about,
     runs_about,
@@ -153,7 +154,7 @@ def _rest_discs(nearby: SortedReturns, seeds: Array, target: Target) -> Array:
     out = np.zeros((len(seeds), 5))
     for k in range(len(seeds)):
         runs = runs_about(nearby, seeds[k])
-        n = np.sum(runs[:, 1] - runs[:, 0])
+        n = n_in(runs)
         if n > _N_WHOLE:
             every = n / _N_SAMPLE
             rays = rays_near(nearby, runs, seeds[k], every)
@@ -261,9 +262,9 @@ def _measure(rays: Array, start: Array, target: Target, out: Array) -> None:
     residuals = _residuals(seen, radius)
     scatter = max(_scatter(seen, residuals, radius), NOISE_MIN)
     weights = _weights(seen, residuals, radius, blur, scatter)
-    if np.sum(weights > 0.0) < _N_FIT_MIN:
+    n, rms = _weighted_rms(residuals, weights)
+    if n < _N_FIT_MIN:
         return
-    rms = np.sqrt(np.sum(weights * residuals**2) / np.sum(weights))
     noise = max(rms, NOISE_MIN)
     flat, cov_flat = _flatness(seen, residuals, weights, radius)
     c_free, radius_free, cov_free = _fit(rays, c, target, _FREE_RADIUS)
@@ -272,7 +273,7 @@ def _measure(rays: Array, start: Array, target: Target, out: Array) -> None:
     scatter_free = _scatter(seen_free, residuals_free, radius_free)
     weights_free = _weights(seen_free, residuals_free, radius_free, blur, scatter)
     out[0], out[1], out[2] = c[0], c[1], c[2]
-    out[3], out[4] = np.sum(weights > 0.0), _count_unexplained(seen, weights, radius)
+    out[3], out[4] = n, _count_unexplained(seen, weights, radius)
     out[5], out[6] = _count_surroundings(rays, c, target)
     out[7], out[8], out[9] = rms, _extent(seen[0], weights), _extent(seen[1], weights)
     out[10], out[11] = radius_free, noise * np.sqrt(cov_free[3, 3])
@@ -282,6 +283,17 @@ def _measure(rays: Array, start: Array, target: Target, out: Array) -> None:
     out[14], out[15] = flat[3], noise * np.sqrt(cov_flat[3, 3])
     out[16], out[17] = flat[4], noise * np.sqrt(cov_flat[4, 4])
     out[18] = blur
+
+
+@compiled
+def _weighted_rms(residuals: Array, weights: Array) -> tuple[int, float]:
+    """Return the number of residuals with a weight, and their weighted root mean square."""
+    n, total, squares = 0, 0.0, 0.0
+    for i in range(len(weights)):
+        n += weights[i] > 0.0
+        total += weights[i]
+        squares += weights[i] * (residuals[i] * residuals[i])
+    return n, np.sqrt(squares / total)
 
 
 @compiled

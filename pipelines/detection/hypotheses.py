@@ -120,8 +120,11 @@ def _log_ratios(
 ) -> tuple[float, float, float, float]:
     """Return the fields of ``LikelihoodRatios``."""
     beams = _sorted_beams(seen, blur, noise)
-    is_few = np.sum(beams.on) < _N_CLEAR
-    highest = np.max(beams.hits[1]) if beams.hits.shape[1] else 0.0
+    n_on, highest = 0, 0.0
+    for i in range(beams.hits.shape[1]):
+        n_on += beams.on[i]
+        highest = beams.hits[1, i] if i == 0 else max(highest, beams.hits[1, i])
+    is_few = n_on < _N_CLEAR
     may_be_post = is_few and _goes_on_below(beams)
     may_be_small = is_few and spread < _SPREAD_SMALL
     post, small, half_width, radius = -np.inf, -np.inf, 0.0, 0.0

@@ -98,10 +98,19 @@ def runs_about(nearby: SortedReturns, c: Array) -> NDArray[np.int32]:
 
 
 @compiled
+def n_in(runs: NDArray[np.int32]) -> int:
+    """Return the number of returns in some runs."""
+    n = 0
+    for k in range(len(runs)):
+        n += runs[k, 1] - runs[k, 0]
+    return n
+
+
+@compiled
 def rays_near(nearby: SortedReturns, runs: NDArray[np.int32], c: Array, every: float) -> Array:
     """Return the rays to the returns within reach of a place, or to a sample of them."""
     points, x, y, z, reach2 = nearby.points, c[0], c[1], c[2], nearby.reach**2
-    rows, n, n_near = np.empty(int(np.sum(runs[:, 1] - runs[:, 0]) / every), np.uint32), 0, 0
+    rows, n, n_near = np.empty(int(n_in(runs) / every), np.uint32), 0, 0
     for k in range(len(runs)):
         n_run = int((runs[k, 1] - runs[k, 0]) / every)
         _sample(runs[k, 0], every, rows[n : n + n_run])
