@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from spheremark.pipelines.model import Mask, Nanos
 from spheremark.storage.recordings.container import Batch, Channel
-from spheremark.storage.recordings.families import BrokenMessageError
+from spheremark.storage.recordings.families import BrokenMessageError, broken_note
 from spheremark.storage.recordings.records import Octets, windows
 
 _ENCAPSULATIONS = {0: (">", 8), 1: ("<", 8), 6: (">", 4), 7: ("<", 4)}  # identifier: order, widest
@@ -202,6 +202,23 @@ class SmallMessages:
         if n:
             self.n_broken += n
             self.reason = self.reason or reason
+
+
+class SignalDecoder:
+    """Decoder of a topic of small messages: counts the broken ones; subclasses build the series."""
+
+    def __init__(self, channel: Channel, layout_of: Callable[[Cursor], Layout]) -> None:
+        """Start without messages."""
+        self._topic = channel.topic
+        self._messages = SmallMessages(layout_of)
+
+    def add(self, batch: Batch) -> None:
+        """Take some messages."""
+        self._messages.add(batch)
+
+    def notes(self) -> tuple[str, ...]:
+        """Return a note on messages that could not be decoded."""
+        return broken_note(self._topic, self._messages.n_broken, self._messages.reason)
 
 
 def heads_alike(batch: Batch, i: int, size: int, varying: Iterable[int]) -> Octets:

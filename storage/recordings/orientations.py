@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from spheremark.storage.recordings import cdr
-from spheremark.storage.recordings.container import Batch, Channel
-from spheremark.storage.recordings.families import Series, broken_note, series_of
+from spheremark.storage.recordings.container import Channel
+from spheremark.storage.recordings.families import Series, series_of
 
 SCHEMA = "sensor_msgs/msg/Imu"
 DEFINITION = f"""# Orientation, angular velocity [rad/s] and linear acceleration [m/s^2] of an IMU.
@@ -22,21 +22,12 @@ float64[9] linear_acceleration_covariance
 _UNIT = 0.1  # how far the norm of a quaternion may be from 1
 
 
-class Orientations:
+class Orientations(cdr.SignalDecoder):
     """Decoder of a topic of IMU messages."""
 
     def __init__(self, channel: Channel) -> None:
         """Start without messages."""
-        self._topic = channel.topic
-        self._messages = cdr.SmallMessages(_layout)
-
-    def add(self, batch: Batch) -> None:
-        """Take some messages."""
-        self._messages.add(batch)
-
-    def notes(self) -> tuple[str, ...]:
-        """Return a note on messages that could not be decoded."""
-        return broken_note(self._topic, self._messages.n_broken, self._messages.reason)
+        super().__init__(channel, _layout)
 
     def series(self) -> list[Series]:
         """Return one series per frame; none when the device has no orientation."""

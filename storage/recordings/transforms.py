@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from spheremark.storage.recordings import cdr
-from spheremark.storage.recordings.container import Batch, Channel
-from spheremark.storage.recordings.families import Series, broken_note, series_of
+from spheremark.storage.recordings.container import Channel
+from spheremark.storage.recordings.families import Series, series_of
 
 SCHEMA = "tf2_msgs/msg/TFMessage"
 DEFINITION = f"""geometry_msgs/TransformStamped[] transforms
@@ -24,21 +24,12 @@ Quaternion rotation
 _TRANSFORM_MIN = 70  # [bytes] of a transform with empty names
 
 
-class Transforms:
+class Transforms(cdr.SignalDecoder):
     """Decoder of a topic of transforms."""
 
     def __init__(self, channel: Channel) -> None:
         """Start without messages."""
-        self._topic = channel.topic
-        self._messages = cdr.SmallMessages(_layout)
-
-    def add(self, batch: Batch) -> None:
-        """Take some messages."""
-        self._messages.add(batch)
-
-    def notes(self) -> tuple[str, ...]:
-        """Return a note on messages that could not be decoded."""
-        return broken_note(self._topic, self._messages.n_broken, self._messages.reason)
+        super().__init__(channel, _layout)
 
     def series(self) -> list[Series]:
         """Return one series per pair of parent and child."""
