@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from time import perf_counter
@@ -30,11 +30,11 @@ from spheremark.pipelines.model import (
 from spheremark.pipelines.positioning.quality_control import check_distances, station_quality
 from spheremark.pipelines.positioning.resection import resect
 from spheremark.pipelines.positioning.subsets import resect_subsets
+from spheremark.pipelines.progress import Progress, part_of
 from spheremark.pipelines.scan.stitching import choose_rig, split_stops, stitch
 from spheremark.pipelines.sphere import fit_markers
 
-Progress = Callable[[float, str], None]
-"""Takes the finished share of the computation, 0 to 1, and the next step; may raise to cancel."""
+__all__ = ["Progress", "StopErrors", "process", "stop_errors"]
 
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
@@ -102,7 +102,7 @@ def process(
     results: list[StopResult] = []
     n = len(stops)
     while stops:
-        part = _part(progress, len(results), n)
+        part = part_of(progress, len(results) / n, (len(results) + 1) / n)
         results.append(_process_stop(stops.pop(0), rig, marks, config, part))
     if not any(fits.fits for result in results for fits in result.fits.values()):
         raise NoMarkersError(_why_no_markers(results, config))
@@ -277,11 +277,6 @@ def _why_no_markers(results: list[StopResult], config: SurveyConfig) -> str:
     if closest is None:
         return f"{seen} between {config.stitching.range_min} and {config.extraction.range_max} m."
     return f"{seen}; the largest of {len(refused)} refused groups: {closest.reason}"
-
-
-def _part(progress: Progress, i: int, n: int) -> Progress:
-    """Return the progress of part ``i`` of ``n`` as a share of the whole."""
-    return lambda share, what: progress((i + share) / n, what)
 
 
 @contextmanager

@@ -19,7 +19,8 @@ from spheremark.pipelines.model import (
     Truth,
 )
 from spheremark.pipelines.network import AdjustedNetwork, Refusal, adjust_network, assemble
-from spheremark.pipelines.survey import Progress, StopErrors, process, stop_errors
+from spheremark.pipelines.progress import Progress, part_of
+from spheremark.pipelines.survey import StopErrors, process, stop_errors
 from spheremark.storage.recordings import read_log
 
 _SCANS = 0.95  # share of the time of an adjustment that the scans take
@@ -87,7 +88,7 @@ def read_scans(
     first: SpheremarkError | None = None
     for i, path in enumerate(paths):
         try:
-            part = _part(progress, i, len(paths))
+            part = part_of(progress, _SCANS * i / len(paths), _SCANS * (i + 1) / len(paths))
             stops = process(read_log(path), config=config, rig=rig, progress=part)
             scans += [(stop.name, stop.fits[config.fitting.methods[0]]) for stop in stops]
         except SpheremarkError as error:
@@ -163,8 +164,3 @@ def _read(path: Path) -> ScanLog:
     except RecordingError as error:
         error.args = (f"{path.name}: {error}",)
         raise
-
-
-def _part(progress: Progress, i: int, n: int) -> Progress:
-    """Return the progress of log ``i`` of ``n`` as a share of the whole."""
-    return lambda share, step: progress(_SCANS * (i + share) / n, step)

@@ -11,6 +11,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from spheremark.pipelines.errors import ConfigError
+from spheremark.pipelines.progress import Progress, part_of
 from spheremark.pipelines.simulation import (
     Field,
     SimulationConfig,
@@ -18,7 +19,6 @@ from spheremark.pipelines.simulation import (
     simulate_stop,
     survey_truth,
 )
-from spheremark.pipelines.simulation.stop import Progress
 from spheremark.storage.imports.survey_files import write_control, write_truth
 from spheremark.storage.recordings import write_log
 
@@ -90,7 +90,9 @@ def survey(
     folder.mkdir(parents=True, exist_ok=True)
     write_control(field.marks, folder / "control.csv")
     for i, name in enumerate(names):
-        yield _write(folder, field, name, assignment, _part(progress, i, len(names)))
+        yield _write(
+            folder, field, name, assignment, part_of(progress, i / len(names), (i + 1) / len(names))
+        )
 
 
 def _write(
@@ -110,8 +112,3 @@ def _write(
     write_truth(survey_truth(field, [stop], assignment.config, field.seed), made.truth)
     part.replace(made.log)
     return made
-
-
-def _part(progress: Progress, i: int, n: int) -> Progress:
-    """Return the progress of part ``i`` of ``n`` as a share of the whole."""
-    return lambda share, what: progress((i + share) / n, what)

@@ -25,13 +25,13 @@ from spheremark.pipelines.ground_model import (
     poses_of_network,
     station_points,
 )
+from spheremark.pipelines.progress import Progress, part_of
 from spheremark.storage.clouds.site import CloudExtent, E57File, LazFile
 
 if TYPE_CHECKING:
     from spheremark.pipelines.config import SurveyConfig
     from spheremark.pipelines.model import ControlMarks, Rig, ScanLog, StitchedCloud
     from spheremark.pipelines.network import Network
-    from spheremark.pipelines.survey import Progress
 
 KINDS = ("laz", "e57", "geotiff")
 ENDINGS = {"laz": ".laz", "e57": ".e57", "geotiff": ".tif"}
@@ -157,7 +157,7 @@ def of_logs(
     from spheremark.service.log_files import adjust_scans, read_scans
     from spheremark.storage.recordings import read_log
 
-    book = read_scans(logs, config, rig, lambda share, what: progress(0.5 * share, what))
+    book = read_scans(logs, config, rig, part_of(progress, 0.0, 0.5))
     result = adjust_scans(book, marks, config)
     poses = {pose.name: pose for pose in poses_of_network(result)}
     refused = {one.station for one in book.refused}

@@ -4,19 +4,25 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
+from datetime import UTC, datetime
 from enum import StrEnum
+from time import perf_counter
 from typing import TYPE_CHECKING, Any
 
 from pydantic import BaseModel, ConfigDict
 
 from spheremark.pipelines.config import SurveyConfig
 from spheremark.pipelines.model import ControlMarks, Rig
+from spheremark.service.provenance import code_version
 
 if TYPE_CHECKING:
     import pyarrow as pa
 
     from spheremark.pipelines.survey import Progress
     from spheremark.storage.catalogue.catalogue import Catalogue
+
+
+Row = dict[str, Any]
 
 
 class JobKind(StrEnum):
@@ -56,6 +62,18 @@ class JobSpecification:
     clouds_url: str
     options: Mapping[str, Any] = field(default_factory=dict)
     known: Mapping[str, pa.Table] = field(default_factory=dict)
+
+    def columns(self, start: float) -> Row:
+        """Return the columns of every result of a job that began at this reading of the timer."""
+        return {
+            "job_id": self.job_id,
+            "survey_id": self.survey_id,
+            "finished_at": datetime.now(UTC),
+            "config": self.config.text,
+            "config_digest": self.config.digest,
+            "code_version": code_version(),
+            "duration_s": perf_counter() - start,
+        }
 
     @property
     def log_names(self) -> tuple[str, ...]:

@@ -10,13 +10,7 @@ from pydantic import BaseModel, ConfigDict, Field, model_validator
 from spheremark.pipelines.model import ControlMarks, Rig
 from spheremark.pipelines.scan.rigs import rig_digest, rig_to_mapping
 from spheremark.service.jobs.handlers import KINDS, JobKind
-from spheremark.storage.catalogue.records import (
-    JobRecord,
-    JobStatus,
-    RecordingRecord,
-    RunRecord,
-    SurveyRecord,
-)
+from spheremark.storage.catalogue.records import JobStatus
 from spheremark.storage.recordings.preflight import Preflight
 
 Item = TypeVar("Item")
@@ -36,6 +30,17 @@ class Listing(BaseModel, Generic[Item]):
     next: str | None = Field(default=None, description="Pass it as 'after' for what follows.")
 
 
+class Recorded(BaseModel):
+    """A record of the catalogue; fields without an alias are its attributes."""
+
+    model_config = ConfigDict(from_attributes=True)
+
+    @classmethod
+    def of(cls, record: object) -> Self:
+        """Return a record in the wire format."""
+        return cls.model_validate(record)
+
+
 class NewSurvey(Strict):
     """A survey to create."""
 
@@ -43,31 +48,17 @@ class NewSurvey(Strict):
     tolerance_m: float = Field(default=0.03, gt=0, le=1, description="Accepted error [m].")
 
 
-class Survey(BaseModel):
+class Survey(Recorded):
     """A field with its control marks and logs."""
 
     survey_id: str
     name: str
-    tolerance_m: float
+    tolerance_m: float = Field(validation_alias="tolerance")
     created_at: datetime
     rig_digest: str | None = Field(description="Rig of its jobs that name none.")
     n_control_marks: int
     n_true_stops: int
     n_recordings: int
-
-    @classmethod
-    def of(cls, record: SurveyRecord) -> Self:
-        """Return a record in the wire format."""
-        return cls(
-            survey_id=record.survey_id,
-            name=record.name,
-            tolerance_m=record.tolerance,
-            created_at=record.created_at,
-            rig_digest=record.rig_digest,
-            n_control_marks=record.n_control_marks,
-            n_true_stops=record.n_true_stops,
-            n_recordings=record.n_recordings,
-        )
 
 
 class Mark(Strict):
@@ -131,10 +122,8 @@ class TruthSummary(BaseModel):
     n_stops: int
 
 
-class Recording(BaseModel):
+class Recording(Recorded):
     """An uploaded log."""
-
-    model_config = ConfigDict(from_attributes=True)
 
     recording_id: str = Field(description="SHA-256 of its bytes.")
     name: str
@@ -142,11 +131,6 @@ class Recording(BaseModel):
     uploaded_at: datetime
     verdict: Literal["ok", "weak", "refused"]
     preflight: Preflight = Field(description="What the log holds and lacks, with reasons.")
-
-    @classmethod
-    def of(cls, record: RecordingRecord) -> Self:
-        """Return a record in the wire format."""
-        return cls.model_validate(record)
 
 
 class NewJob(Strict):
@@ -187,10 +171,8 @@ class NewJob(Strict):
         return self
 
 
-class Job(BaseModel):
-    """A job and its state."""
-
-    model_config = ConfigDict(from_attributes=True)
+class Job(Recorded):
+    """A job and its state; the traceback of an error stays in the database."""
 
     job_id: str
     kind: str
@@ -210,11 +192,6 @@ class Job(BaseModel):
     error_code: str | None
     error_reason: str | None
 
-    @classmethod
-    def of(cls, record: JobRecord) -> Self:
-        """Return a record in the wire format; the traceback stays in the database."""
-        return cls.model_validate(record)
-
 
 class Upload(Recording):
     """An uploaded log and the job that reads it."""
@@ -222,7 +199,7 @@ class Upload(Recording):
     job: Job | None = Field(default=None, description="The job, where process=true was set.")
 
 
-class Run(BaseModel):
+class Run(Recorded):
     """A recording processed with one configuration by one version of the code."""
 
     run_id: str
@@ -234,25 +211,8 @@ class Run(BaseModel):
     code_version: str
     rig_digest: str
     finished_at: datetime
-    duration_s: float
+    duration_s: float = Field(validation_alias="duration")
     peak_memory_bytes: int | None
-
-    @classmethod
-    def of(cls, record: RunRecord) -> Self:
-        """Return a record in the wire format."""
-        return cls(
-            run_id=record.run_id,
-            job_id=record.job_id,
-            survey_id=record.survey_id,
-            recording_id=record.recording_id,
-            config=dict(record.config),
-            config_digest=record.config_digest,
-            code_version=record.code_version,
-            rig_digest=record.rig_digest,
-            finished_at=record.finished_at,
-            duration_s=record.duration,
-            peak_memory_bytes=record.peak_memory_bytes,
-        )
 
 
 class ProblemKind(BaseModel):

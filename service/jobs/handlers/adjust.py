@@ -10,13 +10,13 @@ import json
 import secrets
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, replace
-from datetime import UTC, datetime
 from time import perf_counter
 from typing import TYPE_CHECKING, Any
 
 from pydantic import Field
 
 from spheremark.pipelines.errors import RigError, SolveError, SpheremarkError
+from spheremark.pipelines.progress import Progress, part_of
 from spheremark.pipelines.scan.rigs import rig_digest
 from spheremark.service.jobs.handlers.calibrate import calibration_results, logs_of
 from spheremark.service.jobs.handlers.process import process_log
@@ -29,7 +29,6 @@ if TYPE_CHECKING:
     from spheremark.pipelines.calibration import Calibration
     from spheremark.pipelines.model import MarkerFits
     from spheremark.pipelines.network import AdjustedNetwork, Refusal
-    from spheremark.pipelines.survey import Progress
     from spheremark.storage.catalogue.catalogue import Catalogue
 
 Row = dict[str, Any]
@@ -120,10 +119,10 @@ def handle(spec: JobSpecification, progress: Progress) -> JobResult:
 
     start = perf_counter()
     with_rig = bool(spec.options.get("calibrate"))
-    book = _read(spec, _share(progress, 0.0, 0.5 * _SCANS if with_rig else _SCANS))
+    book = _read(spec, part_of(progress, 0.0, 0.5 * _SCANS if with_rig else _SCANS))
     rig, why = None, ""
     if with_rig:
-        rig, why = _rig(spec, book, _share(progress, 0.5 * _SCANS, 0.8))
+        rig, why = _rig(spec, book, part_of(progress, 0.5 * _SCANS, 0.8))
     progress(_SCANS, f"Adjusting {len(book.scans)} stations")
     marks = spec.marks if spec.options.get("control", True) else None
     scans = Fieldbook(scans=tuple(book.scans), refused=tuple(book.refused), calibration=rig)
@@ -131,19 +130,11 @@ def handle(spec: JobSpecification, progress: Progress) -> JobResult:
     found = adjusted_rig(result, scans)
     plain = serialise_network(result, spec.config, rig=found, uncalibrated=why)
     rows = network_rows(plain, book.sources)
-    rows["adjustments"][0] |= {
-        "job_id": spec.job_id,
-        "survey_id": spec.survey_id,
-        "finished_at": datetime.now(UTC),
-        "config": spec.config.text,
-        "config_digest": spec.config.digest,
-        "code_version": code_version(),
-        "duration_s": perf_counter() - start,
-    }
+    rows["adjustments"][0] |= spec.columns(start)
     made = [*book.tables, adjustments.tables(spec.result_id, rows)]
     files, message = _files(result, plain), _summary(plain, rows["control_checks"])
     if found is not None:
-        left = _share(progress, _SCANS, 1.0)
+        left = part_of(progress, _SCANS, 1.0)
         tables, more, sentence = calibration_results(spec, found, left, start)
         made, files, message = [*made, tables], files | more, f"{message} {sentence}"
     made.append({"documents": documents(spec.result_id, files)})
@@ -181,7 +172,7 @@ def _read(spec: JobSpecification, progress: Progress) -> _Book:
     book, first = _Book(), None
     for i, (log, name) in enumerate(zip(spec.logs, spec.log_names, strict=True)):
         try:
-            part = _share(progress, i / len(spec.logs), (i + 1) / len(spec.logs))
+            part = part_of(progress, i / len(spec.logs), (i + 1) / len(spec.logs))
             for stop, fits, source in _centres(spec, log, book, part):
                 book.add(name + stop.removeprefix(log.name), stop, fits, source)
         except SpheremarkError as error:
@@ -223,11 +214,6 @@ def _centres(
         digest = rig_digest(one.cloud.rig)
         source = {"run_id": run_id, "recording_id": log.recording_id, "rig_digest": digest}
         yield one.name, one.fits[method], source
-
-
-def _share(progress: Progress, begin: float, end: float) -> Progress:
-    """Return the progress of a part as a share of the whole."""
-    return lambda share, what: progress(begin + (end - begin) * share, what)
 
 
 def _files(result: AdjustedNetwork, plain: Row) -> dict[str, str]:

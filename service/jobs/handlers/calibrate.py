@@ -5,23 +5,21 @@ from __future__ import annotations
 import json
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, replace
-from datetime import UTC, datetime
 from time import perf_counter
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from spheremark.pipelines.model import Origin, Rig, ScanLog, marker_name
+from spheremark.pipelines.progress import Progress, part_of
 from spheremark.pipelines.scan.rigs import rig_digest, rig_to_mapping
 from spheremark.service.jobs.specification import JobResult, JobSpecification
-from spheremark.service.provenance import code_version
 
 if TYPE_CHECKING:
     import pyarrow as pa
 
     from spheremark.pipelines.calibration import Calibration
     from spheremark.pipelines.calibration.agreement import FaceGaps
-    from spheremark.pipelines.survey import Progress
 
 Row = dict[str, Any]
 
@@ -57,9 +55,11 @@ def handle(spec: JobSpecification, progress: Progress) -> JobResult:
         logs_of(spec),
         config=spec.config,
         rig=spec.rig,
-        progress=lambda share, what: progress(_ESTIMATE * share, what),
+        progress=part_of(progress, 0.0, _ESTIMATE),
     )
-    tables, files, message = calibration_results(spec, found, _part(progress, _ESTIMATE), start)
+    tables, files, message = calibration_results(
+        spec, found, part_of(progress, _ESTIMATE, 1.0), start
+    )
     tables["documents"] = documents(spec.result_id, files)
     return JobResult(tables=tables, message=message)
 
@@ -76,15 +76,7 @@ def calibration_results(
     gaps = [_gaps(spec, rig, _half(progress, i)) for i, rig in enumerate((found.start, found.rig))]
     rows = calibration_rows(plain, *gaps)
     rows["rigs"] = [_rig_row(rig) for rig in (found.start, found.rig)]
-    rows["calibrations"][0] |= {
-        "job_id": spec.job_id,
-        "survey_id": spec.survey_id,
-        "finished_at": datetime.now(UTC),
-        "config": spec.config.text,
-        "config_digest": spec.config.digest,
-        "code_version": code_version(),
-        "duration_s": perf_counter() - start,
-    }
+    rows["calibrations"][0] |= spec.columns(start)
     tables = calibrations.tables(spec.result_id, rows)
     files = {"calibration.json": json.dumps(plain), "rig.json": format_rig(found.rig)}
     return tables, files, _summary(plain, *gaps)
@@ -107,11 +99,6 @@ def _half(progress: Progress, i: int) -> Callable[[float], None]:
     """Return the progress of the comparison with the rig before (0) or after (1)."""
     what = f"Comparing the faces of the spheres {('before', 'after')[i]} the calibration"
     return lambda share: progress((i + share) / 2.0, what)
-
-
-def _part(progress: Progress, begin: float) -> Progress:
-    """Return the progress of the rest as a share of the whole."""
-    return lambda share, what: progress(begin + (1.0 - begin) * share, what)
 
 
 def calibration_rows(plain: Row, before: FaceGaps, after: FaceGaps) -> dict[str, list[Row]]:

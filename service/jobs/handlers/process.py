@@ -17,13 +17,12 @@ from spheremark.pipelines.model import (
     Status,
     StopResult,
 )
+from spheremark.pipelines.progress import Progress, part_of
 from spheremark.service.jobs.specification import JobResult, JobSpecification, Log
 from spheremark.service.provenance import code_version, forget_peak_memory, peak_memory
 
 if TYPE_CHECKING:
     import pyarrow as pa
-
-    from spheremark.pipelines.survey import Progress
 
 
 def handle(spec: JobSpecification, progress: Progress) -> JobResult:
@@ -48,7 +47,7 @@ def process_log(
         config=spec.config,
         rig=spec.rig,
         marks=spec.marks,
-        progress=lambda share, what: progress(0.1 + 0.8 * share, what),
+        progress=part_of(progress, 0.1, 0.9),
     )
     progress(0.9, "Storing the results")
     clouds = {stop.name: write_cloud(stop, spec.clouds_url) for stop in stops}

@@ -31,6 +31,7 @@ if TYPE_CHECKING:
     from spheremark.pipelines.ground_model import StationPose
     from spheremark.pipelines.model import Rig, StitchedCloud
     from spheremark.pipelines.survey import Progress
+    from spheremark.service.jobs.site import SiteRequest
     from spheremark.storage.catalogue.catalogue import Catalogue
 
 Row = dict[str, Any]
@@ -96,7 +97,7 @@ def gather(catalogue: Catalogue, spec: JobSpecification) -> Mapping[str, pa.Tabl
 
 def handle(spec: JobSpecification, progress: Progress) -> JobResult:
     """Make the products of a site."""
-    from spheremark.service.jobs.site import ENDINGS, KINDS, SiteRequest, make_site
+    from spheremark.service.jobs.site import ENDINGS, KINDS, make_site
     from spheremark.storage.catalogue.products import product_rows
     from spheremark.storage.files import keep_file
 
@@ -106,7 +107,7 @@ def handle(spec: JobSpecification, progress: Progress) -> JobResult:
     poses = _poses(spec, rows)
     with scratch() as folder:
         kinds = KINDS if options["clouds"] else ("geotiff",)
-        request = _request(SiteRequest, {k: folder / f"site{ENDINGS[k]}" for k in kinds}, options)
+        request = _request({k: folder / f"site{ENDINGS[k]}" for k in kinds}, options)
         stops = _stops(spec, rows, poses, progress)
         site = make_site(stops, tuple(poses.values()), request)
         progress(0.95, "Keeping the files")
@@ -139,11 +140,11 @@ def _poses(spec: JobSpecification, rows: Mapping[Key, Row]) -> dict[Key, Station
     return poses
 
 
-def _request(kind: Any, targets: Mapping[str, Path], options: Row) -> Any:
+def _request(targets: Mapping[str, Path], options: Row) -> SiteRequest:
     """Return the request for a site."""
-    from spheremark.service.jobs.site import elevation_of
+    from spheremark.service.jobs.site import SiteRequest, elevation_of
 
-    return kind(
+    return SiteRequest(
         targets=targets,
         elevation=elevation_of(options),
         range_max=options["range_m"],
