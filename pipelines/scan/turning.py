@@ -11,7 +11,7 @@ from typing import NamedTuple
 import numpy as np
 
 from spheremark.pipelines.compilation import compiled
-from spheremark.pipelines.model import Array, Column, Index, Mask, Nanos, Rings
+from spheremark.pipelines.model import Array, Column, Index, Nanos, Rings
 from spheremark.pipelines.threads import side_by_side
 
 _BLOCK = 512  # returns of a run at the most: their table values stay in the nearest cache
@@ -75,7 +75,10 @@ def turn_returns(pulses: Pulses, joints: Joints, lidar: Lidar) -> tuple[Pulses, 
     first, last = stamps_ns.min(initial=limits.max), stamps_ns.max(initial=limits.min)
     tally = Tally._make([*counts, int(first), int(last)])
     found = pulses._replace(p=p_base.reshape(n, 3))
-    return (found if tally.n_kept == n else _closed_up(found, keep)), tally
+    if tally.n_kept < n:
+        rows = np.flatnonzero(keep)
+        found = Pulses._make(column.take(rows, axis=0) for column in found)
+    return found, tally
 
 
 def _knots(joints: Joints) -> tuple[Nanos, Array]:
@@ -96,40 +99,6 @@ def _knots(joints: Joints) -> tuple[Nanos, Array]:
     table = np.full((len(knots_ns), 3), np.nan)
     table[1:-2] = np.stack([np.cos(angles), np.sin(angles), rates], axis=1)
     return knots_ns, table
-
-
-def _closed_up(pulses: Pulses, keep: Mask) -> Pulses:
-    """Return the returns that are kept; their points are moved in place.
-
-    The first part is filled from its last row down, the second from its first row up, so that the
-    kept rows of both are contiguous.
-    """
-    n = len(keep)
-    out = Pulses(pulses.p, np.empty(n, np.float32), np.empty(n, np.uint8), np.empty(n, np.int64))
-
-    def part(first: int, end: int) -> tuple[int, int]:
-        is_upward = first > 0 or end == n
-        n_kept = _close_up(pulses, keep, out, first, end, is_upward)
-        return (first, first + n_kept) if is_upward else (end - n_kept, end)
-
-    parts = side_by_side(part, n)
-    rows = slice(parts[0][0], parts[-1][1])
-    return Pulses(out.p[rows], out.intensities[rows], out.rings[rows], out.stamps_ns[rows])
-
-
-@compiled
-def _close_up(pulses, keep, out, first, end, is_upward):  # type: ignore[no-untyped-def]  # noqa: ANN001, ANN202
-    """Copy the kept rows of a part to its first or its last rows; return their number."""
-    step = 1 if is_upward else -1
-    start = first if is_upward else end - 1
-    k = start
-    for i in range(start, start + step * (end - first), step):
-        if keep[i]:
-            out.p[k, 0], out.p[k, 1], out.p[k, 2] = pulses.p[i, 0], pulses.p[i, 1], pulses.p[i, 2]
-            out.intensities[k], out.rings[k] = pulses.intensities[i], pulses.rings[i]
-            out.stamps_ns[k] = pulses.stamps_ns[i]
-            k += step
-    return abs(k - start)
 
 
 @compiled

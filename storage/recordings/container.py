@@ -304,7 +304,7 @@ def local_copy(url: str | Path) -> Iterator[Path]:
 
 
 def require_file(path: Path) -> None:
-    """Refuse what is no file on a disk, before somebody waits for it to end.
+    """Raise an error for pipes and devices, which may never end.
 
     Parameters
     ----------

@@ -84,7 +84,7 @@ class _Messages(NamedTuple):
     log_times_ns: Nanos
     counts: Nanos  # of returns
     spans_ns: Nanos  # from the stamp to the latest instant
-    has_times: Nanos  # 1 or 0; -1 where there are too few to tell
+    has_times: Nanos  # 1 or 0; -1 where there are too few points
     is_ascending: Nanos  # 1 or 0: whether the instants within a message are
 
 
