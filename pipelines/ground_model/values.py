@@ -86,7 +86,18 @@ class StationPose:
 
 
 def poses_of_network(result: AdjustedNetwork) -> tuple[StationPose, ...]:
-    """Return the poses of an adjusted network, in the order of its stations."""
+    """Return the poses of an adjusted network, in the order of its stations.
+
+    Parameters
+    ----------
+    result : AdjustedNetwork
+        The network.
+
+    Returns
+    -------
+    tuple of StationPose
+        One for each station, with covariance.
+    """
     return tuple(
         StationPose(name=name, T_site_station=T.copy(), cov_T_site_station=cov.copy())
         for name, T, cov in zip(

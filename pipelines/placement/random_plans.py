@@ -200,7 +200,18 @@ def simulate_random_plans(
 
 
 def by_number(results: RandomPlanResults) -> tuple[PassRate, ...]:
-    """Return the pass rate for each number of marks, of arrangements within the window."""
+    """Return the pass rate for each number of marks, of arrangements within the window.
+
+    Parameters
+    ----------
+    results : RandomPlanResults
+        All arrangements; those outside the window of angles do not count.
+
+    Returns
+    -------
+    tuple of PassRate
+        One for each number of marks.
+    """
     low, high = results.spec.n_marks
     keep = results.is_in_window
     return tuple(
@@ -209,7 +220,18 @@ def by_number(results: RandomPlanResults) -> tuple[PassRate, ...]:
 
 
 def by_worst_angle(results: RandomPlanResults) -> tuple[PassRate, ...]:
-    """Return the pass rate for each class of ``BINS_DEG``, of all arrangements."""
+    """Return the pass rate for each class of ``BINS_DEG``, of all arrangements.
+
+    Parameters
+    ----------
+    results : RandomPlanResults
+        All arrangements; each counts, so that the window shows.
+
+    Returns
+    -------
+    tuple of PassRate
+        One for each class of worst included angle.
+    """
     angles = np.degrees(results.worst_angles)
     return tuple(
         _pass_rate(results, (angles >= a) & (angles < b), a, b) for a, b in pairwise(BINS_DEG)

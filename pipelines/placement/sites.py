@@ -63,7 +63,18 @@ def site_of_field(world: Field) -> Site:
 
 
 def stops_of_field(world: Field) -> Stops:
-    """Return the stops of a simulated world, in the order of driving."""
+    """Return the stops of a simulated world, in the order of driving.
+
+    Parameters
+    ----------
+    world : Field
+        The world.
+
+    Returns
+    -------
+    Stops
+        Positions of the LiDAR.
+    """
     return Stops(
         names=tuple(stop.name for stop in world.stops),
         p_site=np.array([stop.p_site for stop in world.stops]),
@@ -71,7 +82,18 @@ def stops_of_field(world: Field) -> Stops:
 
 
 def marks_of_field(world: Field) -> Arrangement:
-    """Return the marks of a simulated world as an arrangement."""
+    """Return the marks of a simulated world as an arrangement.
+
+    Parameters
+    ----------
+    world : Field
+        The world.
+
+    Returns
+    -------
+    Arrangement
+        Its marks.
+    """
     return Arrangement(names=world.marks.names, p_site=np.array(world.marks.p_site))
 
 
