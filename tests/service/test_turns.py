@@ -4,7 +4,7 @@ import asyncio
 import threading
 from types import SimpleNamespace
 
-from spheremark.service.jobs.handlers import Outcome
+from spheremark.service.jobs.handlers import JobResult
 from spheremark.service.jobs.queue import JobQueue
 from spheremark.service.settings import Settings
 from spheremark.storage.catalogue.catalogue import Catalogue
@@ -36,14 +36,14 @@ async def outrun(queue, catalogue, job):
         return done
 
     queue._client = SimpleNamespace(submit=submit)  # of Dask: the work is done elsewhere
-    queue._hand_out(job)
+    queue._start(job)
     await asked.wait()
     hold(catalogue, free)
     (followed,) = queue._followers
-    done.set_result(Outcome(tables={}, message="Found."))
+    done.set_result(JobResult(tables={}, message="Found."))
     await asyncio.sleep(0.1)
     recorder = asyncio.create_task(queue._record())
-    queue._heard.put_nowait(STARTED | {"job": job.job_id})
+    queue._events_in.put_nowait(STARTED | {"job": job.job_id})
     await asyncio.sleep(0.1)
     free.set()
     await followed
