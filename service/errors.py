@@ -49,6 +49,12 @@ class ReusedKeyError(InputError):
     code: ClassVar[str] = "input.idempotency_key"
 
 
+class BusyError(SpheremarkError):
+    """The service has as many requests of this kind as it serves at once; try again later."""
+
+    code: ClassVar[str] = "busy"
+
+
 class RefusedRecordingError(RecordingError):
     """The recording was kept, but its preflight says that it cannot be processed."""
 
@@ -89,6 +95,7 @@ STATUS: Mapping[type[SpheremarkError], int] = {
     TooLargeError: 413,
     MediaTypeError: 415,
     ReusedKeyError: 422,
+    BusyError: 429,
     RecordingError: 422,
     QueryTimeoutError: 504,
     SolveError: 422,

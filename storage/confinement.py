@@ -11,6 +11,7 @@ import os
 import resource
 import signal
 import struct
+import sys
 from collections.abc import Iterable
 
 _FILES_MAX = 64  # open files of the process
@@ -33,7 +34,7 @@ def limit_resources(*, memory_bytes: int, seconds: float, file_bytes: int) -> No
         Size of any file that it writes.
     """
     bounds = {
-        resource.RLIMIT_AS: memory_bytes,
+        resource.RLIMIT_AS: memory_bytes if sys.platform == "linux" else resource.RLIM_INFINITY,
         resource.RLIMIT_FSIZE: file_bytes,
         resource.RLIMIT_CORE: 0,
         resource.RLIMIT_CPU: math.ceil(seconds) + 1,
@@ -52,7 +53,28 @@ def leave_network() -> bool:
     bool
         Whether it could be: user namespaces must be allowed, and the process have one thread.
     """
+    if sys.platform != "linux":
+        return False
     return bool(ctypes.CDLL(None).unshare(_NEW_NAMESPACES) == 0)
+
+
+def leave_files() -> bool:
+    """Make the open files of this process the only ones that have a path: ``/0`` and so on.
+
+    Call it after ``leave_network``, whose namespace allows it. Sockets by path and the attributes
+    of files, which Landlock does not cover, are out of reach then.
+
+    Returns
+    -------
+    bool
+        Whether it could be.
+    """
+    try:
+        os.chroot("/proc/self/fd")
+        os.chdir("/")
+    except OSError:
+        return False
+    return True
 
 
 def forbid_files(readable: Iterable[int]) -> bool:
@@ -68,6 +90,8 @@ def forbid_files(readable: Iterable[int]) -> bool:
     bool
         Whether it is so: Linux 5.13 forbids files, 6.7 TCP, 6.12 signals.
     """
+    if sys.platform != "linux":
+        return False
     libc = ctypes.CDLL(None)
     version = libc.syscall(_CREATE_RULESET, None, ctypes.c_size_t(0), 1)
     if version < 1:

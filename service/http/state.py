@@ -2,23 +2,30 @@
 
 from __future__ import annotations
 
+import asyncio
 import threading
 from collections import OrderedDict
 from collections.abc import AsyncIterator, Callable
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import asynccontextmanager
 from dataclasses import dataclass, field
-from typing import Annotated
+from typing import Annotated, Any, TypeVar
 
 from fastapi import Depends, Request
 
-from spheremark.service.errors import ReusedKeyError
+from spheremark.service.errors import BusyError, ReusedKeyError
 from spheremark.service.http.uploads import Inbox
 from spheremark.service.jobs.queue import JobQueue
 from spheremark.service.planning.requests import Planner
 from spheremark.service.settings import Settings
 from spheremark.storage.catalogue.catalogue import Catalogue
+from spheremark.storage.imports.confined import end_children
+
+_Result = TypeVar("_Result")
 
 _KEYS_KEPT = 10_000
+_READERS = 2  # foreign files that are read at once, each in a process of its own
+_READERS_WAITING = 8  # uploads that wait for one of them; others are refused
 
 
 class Idempotency:
@@ -43,6 +50,38 @@ class Idempotency:
         return made
 
 
+class Readers:
+    """Threads that wait for the processes in which foreign files are read.
+
+    They are threads of their own: a slow file keeps neither jobs nor uploads of logs waiting.
+    """
+
+    def __init__(self) -> None:
+        self._threads = ThreadPoolExecutor(_READERS, "reader")
+        self._n = 0
+
+    async def run(self, function: Callable[..., _Result], *arguments: Any) -> _Result:
+        """Return what a function returns; raise BusyError where too many wait already."""
+        if self._n >= _READERS + _READERS_WAITING:
+            raise BusyError(
+                f"{self._n} files are being read or wait for it; {_READERS + _READERS_WAITING} are "
+                "the most. Try again in a minute."
+            )
+        self._n += 1
+        future = asyncio.get_running_loop().run_in_executor(self._threads, function, *arguments)
+        future.add_done_callback(self._leave)
+        return await future
+
+    def _leave(self, _: asyncio.Future[Any]) -> None:
+        """Count one less."""
+        self._n -= 1
+
+    def close(self) -> None:
+        """End what is being read, and start nothing that waits."""
+        self._threads.shutdown(wait=False, cancel_futures=True)
+        end_children()
+
+
 @dataclass(frozen=True, slots=True)
 class Service:
     """The parts of the running service that requests use."""
@@ -53,6 +92,7 @@ class Service:
     terrains: Inbox
     jobs: JobQueue
     planner: Planner
+    readers: Readers = field(default_factory=Readers)
     idempotency: Idempotency = field(default_factory=Idempotency)
 
 
@@ -68,7 +108,11 @@ async def opened(settings: Settings) -> AsyncIterator[Service]:
         async with JobQueue(settings, catalogue, data / "clouds") as jobs:
             threading.Thread(target=_warm_up, name="warm-up", daemon=True).start()
             planner = Planner(catalogue)
-            yield Service(settings, catalogue, inbox, terrains, jobs, planner)
+            service = Service(settings, catalogue, inbox, terrains, jobs, planner)
+            try:
+                yield service
+            finally:
+                service.readers.close()
 
 
 def _warm_up() -> None:

@@ -130,18 +130,29 @@ def _simulated(name: str, seed: int) -> Ground:
 def terrain_ground(key: str, name: str, path: Path) -> Ground:
     """Return a terrain of a file, with stops spread over its middle and no mark yet."""
     site = open_terrain(path, name)
-    return Ground(key, site, _spread_stops(site), Arrangement.numbered(np.empty((0, 3))))
+    return Ground(key, site, spread_stops(site), Arrangement.numbered(np.empty((0, 3))))
 
 
-def _spread_stops(site: Site) -> Stops:
+def spread_stops(site: Site) -> Stops:
     """Return stops on an even grid over the known part of a terrain."""
     shares = (np.arange(_STOPS_ACROSS) + 0.5) / _STOPS_ACROSS
     xs, ys = (lines[0] + shares * (lines[-1] - lines[0]) for lines in (site.xs, site.ys))
     places = [(x, y) for y in ys for x in xs if np.isfinite(site.ground_at(np.array([x, y])))]
     if not places:
-        rows, columns = np.nonzero(np.isfinite(site.ground))
+        known = np.isfinite(site.ground)
+        rows, columns = np.nonzero(
+            known[:-1, :-1] & known[1:, :-1] & known[:-1, 1:] & known[1:, 1:]
+        )
+        if not len(rows):
+            raise InputError(
+                f"{site.name} holds no terrain to plan on: no four neighbouring cells all have a "
+                "height."
+            )
         middle = len(rows) // 2
-        places = [(site.xs[columns[middle]], site.ys[rows[middle]])]
+        places = [
+            (site.xs[i : i + 2].mean(), site.ys[j : j + 2].mean())
+            for j, i in [(rows[middle], columns[middle])]
+        ]
     return stops_at(site, [(f"S{i + 1:02d}", *place) for i, place in enumerate(places)])
 
 

@@ -19,8 +19,10 @@ import resource
 import signal
 import subprocess
 import sys
+import tempfile
 import threading
 from collections.abc import Callable, Iterable, Mapping
+from contextlib import suppress
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import IO, Any, ClassVar
@@ -29,7 +31,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from spheremark.pipelines.errors import InputError
-from spheremark.storage.confinement import forbid_files, leave_network, limit_resources
+from spheremark.storage.confinement import (
+    forbid_files,
+    leave_files,
+    leave_network,
+    limit_resources,
+)
 
 Arrays = dict[str, NDArray[Any]]
 Reader = Callable[..., Mapping[str, NDArray[Any]]]
@@ -40,6 +47,7 @@ _HEAD_MAX = 1 << 16  # [bytes] of the line before the arrays
 _MESSAGE_MAX = 400  # characters of a message out of the child
 _EXCEPTION = re.compile(r"^[\w.]+: ")  # the name of a class before its message
 _START_MAX = 20.0  # [s] until a process may have started on a machine that is busy
+_CHILDREN: set[subprocess.Popen[bytes]] = set()
 _AT_ONCE = threading.BoundedSemaphore(2)  # children; others wait, and so memory is bounded too
 _ENVIRONMENT = {  # no settings, so no secrets; no threads, whose memory would count
     "PATH": os.defpath,
@@ -117,8 +125,17 @@ def run_confined(reader: str, path: Path, limits: Limits, *, name: str, **option
         return _arrays(result, limits, name)
 
 
+def end_children() -> None:
+    """End all readers that run, as at the end of the service."""
+    for child in tuple(_CHILDREN):
+        with suppress(ProcessLookupError):
+            os.killpg(child.pid, signal.SIGKILL)
+
+
 def _memory_file() -> IO[bytes]:
-    """Return a file without a name, in memory; a limit of file size bounds it."""
+    """Return a file without a name, in memory on Linux; a limit of file size bounds it."""
+    if sys.platform != "linux":
+        return tempfile.TemporaryFile()  # type: ignore[return-value]  # a file of bytes
     return os.fdopen(os.memfd_create("spheremark"), "w+b")
 
 
@@ -133,11 +150,13 @@ def _wait_for_child(request: str, files: tuple[IO[bytes], ...], limits: Limits) 
         env={**_ENVIRONMENT, "PYTHONPATH": os.pathsep.join(filter(None, sys.path))},
         start_new_session=True,
     ) as child:
+        _CHILDREN.add(child)
         try:
             return child.wait(limits.seconds + _START_MAX)
         except subprocess.TimeoutExpired:
             return -signal.SIGALRM
         finally:
+            _CHILDREN.discard(child)
             if child.returncode is None:
                 os.killpg(child.pid, signal.SIGKILL)
 
@@ -150,8 +169,9 @@ def _reason(code: int, log: IO[bytes], limits: Limits, name: str) -> str:
             "thin it out."
         )
     if code < 0:
+        known = {one.value: one.name for one in signal.Signals}
         return (
-            f"{name} cannot be read: the reader ended with {signal.Signals(-code).name}. The file "
+            f"{name} cannot be read: the reader ended with {known.get(-code, -code)}. The file "
             f"is damaged, or needs more than {limits.memory_bytes >> 20} MiB."
         )
     log.seek(0, os.SEEK_END)
@@ -209,7 +229,7 @@ def _main() -> None:
     limits = Limits(**request["limits"])
     answer = os.fdopen(os.dup(1), "wb")
     os.dup2(2, 1)  # what libraries print is no part of the answer
-    leave_network()
+    is_alone = leave_network()
     module, _, function = request["reader"].partition(":")
     reader: Reader = getattr(importlib.import_module(module), function)
     file = sys.stdin.buffer
@@ -219,6 +239,8 @@ def _main() -> None:
         file_bytes=limits.result_bytes + _HEAD_MAX,
     )
     resource.setrlimit(resource.RLIMIT_NPROC, (0, 0))  # no thread or process more; root is exempt
+    if is_alone:
+        leave_files()
     forbid_files([file.fileno()])
     try:
         arrays = reader(file, **request["options"])
@@ -246,6 +268,8 @@ def _write(answer: IO[bytes], head: Mapping[str, Any], arrays: Iterable[NDArray[
 
 def _memory_in_use() -> int:
     """Return the addresses that this process has taken [bytes]."""
+    if sys.platform != "linux":
+        return 0
     pages = int(Path("/proc/self/statm").read_text().split()[0])
     return pages * resource.getpagesize()
 

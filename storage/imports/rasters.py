@@ -5,6 +5,7 @@ GDAL reads them by its one driver, from the open file, without files beside it.
 
 from __future__ import annotations
 
+import os
 from typing import IO
 
 import numpy as np
@@ -25,7 +26,7 @@ from spheremark.storage.imports.declared import (
 )
 
 _BLOCK_MAX = 256 << 20  # [bytes] of a block, which is unpacked whole
-_THIS_FILE = "/proc/self/fd/0"  # a folder in which no file stands beside it
+_THIS_FILE = ("/0", "/dev/fd/0")  # once other files are out of reach, and before
 _OPTIONS = {
     "GDAL_DISABLE_READDIR_ON_OPEN": "EMPTY_DIR",
     "GDAL_GEOREF_SOURCES": "INTERNAL",
@@ -39,15 +40,16 @@ CRS.from_epsg(4326).to_wkt()  # opens PROJ's database, which cannot be opened on
 
 def read_geotiff(file: IO[bytes], *, name: str, cells_max: int) -> dict[str, Array]:
     """Return the grid of a GeoTIFF: ``xs``, ``ys`` and ``ground``."""
+    this_file = next(path for path in _THIS_FILE if os.path.exists(path))  # noqa: PTH110  no Path
     try:
-        with rasterio.Env(**_OPTIONS), rasterio.open(_THIS_FILE, driver="GTiff") as raster:
+        with rasterio.Env(**_OPTIONS), rasterio.open(this_file, driver="GTiff") as raster:
             check_cells(raster.width, raster.height, name, cells_max)
             _check_size(raster, size_of(file), name)
             _check_place(raster, name)
             turn = raster.transform
             heights = raster.read(1, masked=True).astype(np.float64).filled(np.nan)
     except RasterioError as error:
-        reason = str(error).replace(_THIS_FILE, name).rstrip(".")
+        reason = str(error).replace(this_file, name).rstrip(".")
         raise InputError(f"{name} is no elevation model that can be read: {reason}.") from error
     ys = turn.f + (np.arange(heights.shape[0]) + 0.5) * turn.e
     xs = turn.c + (np.arange(heights.shape[1]) + 0.5) * turn.a

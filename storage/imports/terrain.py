@@ -7,6 +7,8 @@ terrain is that grid, never the file.
 
 from __future__ import annotations
 
+import os
+import zipfile
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -146,8 +148,11 @@ def write_grid(site: Site, path: Path) -> None:
     arrays = {"xs": site.xs, "ys": site.ys, "ground": site.ground}
     if not np.array_equal(site.surface, site.ground, equal_nan=True):
         arrays["surface"] = site.surface
-    with path.open("wb") as file:
-        np.savez(file, allow_pickle=False, **arrays)
+    with path.open("r+b") as file:  # not made anew where an ended upload has removed it
+        file.truncate()
+        np.savez_compressed(file, allow_pickle=False, **arrays)
+        file.flush()
+        os.fsync(file.fileno())
 
 
 def open_terrain(path: Path, name: str) -> Site:
@@ -168,8 +173,12 @@ def open_terrain(path: Path, name: str) -> Site:
     if path.suffix != KEPT:
         return read_terrain(path, name=name)
     try:
-        with np.load(path, allow_pickle=False) as file:
-            return _site(name, dict(file))
+        with path.open("rb") as file, np.load(file, allow_pickle=False) as arrays:
+            return _site(name, dict(arrays))
+    except (EOFError, KeyError, ValueError, zipfile.BadZipFile) as error:
+        raise UnreadableFileError(
+            f"The grid of {name} is damaged on this disk; upload it again."
+        ) from error
     except FileNotFoundError as error:
         raise NotFoundError(
             f"The grid of {name} is not there any more; upload it again."
@@ -212,7 +221,8 @@ def _site(name: str, arrays: Mapping[str, NDArray[Any]]) -> Site:
     known = dict(arrays)
     xs, ys, ground = (known.pop(one, _NOTHING) for one in ("xs", "ys", "ground"))
     surface = known.pop("surface", ground)
-    is_whole = not known and xs.ndim == ys.ndim == 1
+    is_whole = all(one.dtype.kind == "f" for one in (xs, ys, ground, surface))
+    is_whole = is_whole and not known and xs.ndim == ys.ndim == 1
     is_whole = is_whole and (len(ys), len(xs)) == ground.shape == surface.shape
     if not is_whole or not np.isfinite(np.concatenate([xs, ys])).all():
         raise UnreadableFileError(f"{name} cannot be read: its reader gave no grid.")

@@ -206,6 +206,15 @@ def test_an_odd_cookie_is_no_token_and_no_failure(tmp_path, cookie):
     assert answer.headers["content-security-policy"] == HEADERS["Content-Security-Policy"]
 
 
+def test_a_long_cookie_takes_no_long_time(tmp_path):
+    settings = Settings(data=tmp_path, workers=1, token="secret")
+    client = TestClient(SecureHeaders(SecurityMiddleware(None, settings)), "http://127.0.0.1:8000")
+    begin = time.process_time()
+    answer = client.get("/api/v1/surveys", headers={"Cookie": 'a="' + '\\"' * 60_000 + '"'})
+    assert answer.status_code == 401
+    assert time.process_time() - begin < 2.0  # quadratic parsing takes 8 s, linear 1 ms
+
+
 @pytest.mark.parametrize(
     "headers",
     [

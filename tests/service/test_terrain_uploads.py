@@ -4,6 +4,7 @@ import hashlib
 import socket
 from concurrent.futures import ThreadPoolExecutor
 
+import numpy as np
 import pytest
 from fastapi.testclient import TestClient
 
@@ -124,6 +125,39 @@ def test_a_terrain_that_an_earlier_version_kept_whole_still_opens(uploads):
     assert uploads.send(body, "again.tif").json()["name"] == "old.tif"  # and is a grid from now on
     assert not path.exists()
     assert uploads.client.get(f"/api/v1/plans/sites/terrain:{digest}").status_code == 200
+    uploads.check()
+
+
+def test_a_grid_that_is_damaged_on_disk_is_said_so(uploads):
+    ending, body = made.valid()["asc"]
+    key = uploads.send(body + b"\n  \n", f"cut{ending}").json()["key"]
+    path = uploads.data / "terrains" / f"{key.removeprefix('terrain:')}.npz"
+    whole = path.read_bytes()
+    for left in (whole[:100], b""):
+        path.write_bytes(left)
+        answer = uploads.client.get(f"/api/v1/plans/sites/{key}")
+        assert (answer.status_code, answer.json()["code"]) == (400, "input.unreadable")
+    path.write_bytes(whole)
+    assert uploads.client.get(f"/api/v1/plans/sites/{key}").status_code == 200
+
+
+def test_a_terrain_on_which_nothing_can_stand_is_refused(uploads):
+    cells = np.full((10, 10), -9999)
+    cells[4, 4] = 1
+    text = "\n".join(" ".join(map(str, row)) for row in cells)
+    head = "ncols 10\nnrows 10\nxllcorner 0\nyllcorner 0\ncellsize 0.5\nNODATA_value -9999\n"
+    answer = uploads.send((head + text).encode(), "lone.asc")
+    assert answer.status_code == 400
+    assert "no terrain to plan on" in answer.json()["detail"]
+    uploads.check()
+
+
+def test_more_uploads_than_can_wait_are_refused(uploads, monkeypatch):
+    readers = uploads.client.app.state.service.readers
+    monkeypatch.setattr(readers, "_n", 10)
+    _, body = made.valid()["asc"]
+    answer = uploads.client.post(URL, params={"name": "one.asc"}, content=body + b"\n   \n")
+    assert (answer.status_code, answer.json()["code"]) == (429, "busy")
     uploads.check()
 
 

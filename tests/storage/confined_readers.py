@@ -27,6 +27,10 @@ def try_escapes(_file, *, name, folder, port):
             line.connect(address)
             line.send(b"x")
 
+    def connect_by_path(path):
+        with socket.socket(socket.AF_UNIX) as line:
+            line.connect(str(path))
+
     folder = Path(folder)
     attempts = [
         lambda: (folder / "secret").read_text(),
@@ -44,6 +48,10 @@ def try_escapes(_file, *, name, folder, port):
         lambda: os.kill(os.getppid(), 0),
         lambda: os.write(0, b"x"),
         lambda: os.environ["SPHEREMARK_TOKEN"],
+        lambda: connect_by_path(folder / "socket"),
+        lambda: (folder / "secret").chmod(0o777),
+        lambda: os.utime(folder / "secret"),
+        lambda: (folder / "secret").stat(),
     ]
     worked = []
     for number, attempt in enumerate(attempts):
@@ -83,6 +91,17 @@ def crash(_file, *, name):
 
 def fail(_file, *, name):
     raise RuntimeError(f"line one\nabout\x1b[31m {'x' * 10_000}")
+
+
+def give_whole_numbers(_file, *, name, cells_max):
+    line = np.arange(2.0)
+    return {"xs": line, "ys": line, "ground": np.zeros((2, 2), "<i8")}
+
+
+def end_by_a_signal_without_a_name(_file, *, name):
+    signal.signal(40, signal.SIG_DFL)
+    os.kill(os.getpid(), 40)
+    time.sleep(10)
 
 
 def leave(_file, *, name):

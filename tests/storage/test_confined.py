@@ -1,13 +1,19 @@
 import json
 import socket
 import time
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import psutil
 import pytest
 
 from spheremark.pipelines.errors import InputError
-from spheremark.storage.imports.confined import Limits, UnreadableFileError, run_confined
+from spheremark.storage.imports.confined import (
+    Limits,
+    UnreadableFileError,
+    end_children,
+    run_confined,
+)
 
 LIMITS = Limits(seconds=10.0, memory_bytes=256 << 20, result_bytes=1 << 20)
 SHORT = Limits(seconds=1.0, memory_bytes=256 << 20, result_bytes=1 << 20)
@@ -35,6 +41,10 @@ def test_a_reader_gets_the_file_and_its_arrays_come_back(run):
 def test_a_reader_can_do_nothing_but_read_its_file(run, tmp_path, monkeypatch):
     monkeypatch.setenv("SPHEREMARK_TOKEN", "secret")
     (tmp_path / "secret").write_text("secret")
+    monkeypatch.chdir(tmp_path)  # the path of a socket may have 107 characters
+    listener = socket.socket(socket.AF_UNIX)
+    listener.bind("socket")
+    listener.listen()
     before = sorted(tmp_path.iterdir())
     with (
         socket.create_server(("127.0.0.1", 0)) as stream,
@@ -48,6 +58,7 @@ def test_a_reader_can_do_nothing_but_read_its_file(run, tmp_path, monkeypatch):
             stream.accept()
         with pytest.raises(BlockingIOError):
             datagrams.recv(1)
+    listener.close()
     assert found["worked"].tolist() == []
     assert sorted(tmp_path.iterdir()) == before
     assert (tmp_path / "secret").read_text() == "secret"
@@ -62,6 +73,7 @@ def test_a_reader_can_do_nothing_but_read_its_file(run, tmp_path, monkeypatch):
         ("crash", LIMITS, "ended with SIGSEGV"),
         ("fail", LIMITS, r"file\.x cannot be read: about \[31m x{100}"),
         ("leave", LIMITS, "no sensible answer"),
+        ("end_by_a_signal_without_a_name", LIMITS, "ended with 40"),
         ("give_much", LIMITS, "cannot be read"),
         ("give_objects", LIMITS, "no sensible answer"),
         ("refuse", LIMITS, r"file\.x is refused \.$"),
@@ -73,6 +85,19 @@ def test_a_reader_that_fails_is_an_error_with_its_reason(run, reader, limits, re
         run(reader, limits)
     assert len(str(found.value)) < 1000
     assert str(found.value).isprintable()
+
+
+def test_the_end_of_the_service_ends_readers(run):
+    with ThreadPoolExecutor(1) as thread:
+        future = thread.submit(run, "sleep")
+        while not any(
+            "spheremark.storage.imports.confined" in " ".join(one.cmdline())
+            for one in psutil.Process().children()
+        ):
+            assert not future.done()
+        end_children()
+        with pytest.raises(UnreadableFileError, match="SIGKILL"):
+            future.result(timeout=60)
 
 
 def test_what_a_library_prints_is_no_part_of_the_answer(run):

@@ -31,7 +31,9 @@ def test_each_format_is_read_right_and_survives_being_kept(write, tmp_path, kind
     width = 0.5 if ending.lower().startswith(".tif") else 1.0 if ending.lower() == ".asc" else 0.1
     for line in (site.xs, site.ys):
         np.testing.assert_allclose(np.diff(line), width, rtol=0, atol=1e-9)
-    write_grid(site, tmp_path / "digest.npz")
+    kept = tmp_path / "digest.npz"
+    kept.touch()  # the upload, over which the grid is written
+    write_grid(site, kept)
     again = open_terrain(tmp_path / "digest.npz", site.name)
     for name in ("xs", "ys", "ground", "surface"):
         np.testing.assert_array_equal(getattr(again, name), getattr(site, name))

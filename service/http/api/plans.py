@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import asyncio
 import math
 from dataclasses import replace
 from typing import Annotated
@@ -33,7 +32,15 @@ from spheremark.service.http.api.plan_models import (
 from spheremark.service.http.state import Current, Service
 from spheremark.service.http.uploads import Received
 from spheremark.service.planning import plans, random_plans
-from spheremark.service.planning.requests import SCENARIOS, TERRAIN, Place, Plan, marks_at, stops_at
+from spheremark.service.planning.requests import (
+    SCENARIOS,
+    TERRAIN,
+    Place,
+    Plan,
+    marks_at,
+    spread_stops,
+    stops_at,
+)
 from spheremark.service.serialise.plans import Plain, site_json, to_csv, to_geojson
 from spheremark.storage.catalogue import plans as stored
 from spheremark.storage.imports.terrain import KEPT, check_ending, read_terrain, write_grid
@@ -166,12 +173,14 @@ async def upload_terrain(
     check_ending(name)
     most = service.settings.max_upload_bytes
     async with service.terrains.received(request.stream(), most) as received:
-        return await asyncio.to_thread(_enter_terrain, service, received, name)
+        return await service.readers.run(_enter_terrain, service, received, name)
 
 
 def _enter_terrain(service: Service, received: Received, name: str) -> Key:
     """Keep the grid of a terrain and enter it; the file itself is not stored."""
-    write_grid(read_terrain(received.path, name=name), received.path)
+    site = read_terrain(received.path, name=name)
+    spread_stops(site)  # raises where nothing can be planned
+    write_grid(site, received.path)
     grid = service.terrains.keep(received, KEPT)
     entered = stored.keep_terrain(
         service.catalogue,
