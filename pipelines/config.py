@@ -188,13 +188,13 @@ class ResectionConfig:
         Standard deviation per axis that every centre has beyond its own covariance: what changes
         from one direction to the next and both faces share, as the jitter of the encoder [m].
     sigma_range : float
-        Standard deviation of what all ranges of a survey are too long, an unknown of a network
-        [m]; 0 leaves it out. 1 mm: the mean of 16 lasers of 3 mm each, and the model of a beam.
+        Standard deviation of the common range bias, an unknown of a network [m]; 0 leaves it out.
+        1 mm: the mean of 16 lasers of 3 mm each, and the model of a beam.
     sigma_range_shared : float
-        How much of it is in the covariance of every centre already, as if it were its own, where
-        the fit does not tell, as ``along_beam`` does by the biases that it found [m]. 0.9 mm: the
-        mean of the 16 lasers, of 3 mm each, that a sphere is seen by, by simulation. At most about
-        half of a centre's variance along its line of sight is taken to be shared.
+        Part of ``sigma_range`` that the covariance of each centre already contains, for fits that
+        do not report it (``along_beam`` does, from the biases that it estimates) [m]. 0.9 mm: the
+        mean of the 16 lasers that see a sphere, of 3 mm each, by simulation. At most about half of
+        a centre's variance along its line of sight counts as shared.
     sigma_height : float
         Standard deviation of what all centres of a survey are too high, as the foot of their poles
         and the tilt of the spin axis leave [m]; 0 leaves it out. 0.12 mm, by simulation.

@@ -264,8 +264,8 @@ def estimate(
             return _estimate(problem, state, sigmas, is_free, held, lasers)
         state = better
     raise NotConvergedError(
-        f"The calibration did not settle within {_N_STEPS} steps; the start rig is too far off "
-        "or what was taken for spheres is none."
+        f"The calibration did not converge within {_N_STEPS} steps: the start rig is too far off, "
+        "or the detected objects are no spheres."
     )
 
 

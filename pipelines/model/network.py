@@ -12,10 +12,10 @@ from spheremark.pipelines.geometry import by_motion
 from spheremark.pipelines.model import Array, ErrorEllipse, Index, Mask
 
 RANGE_BIAS = "common_range_bias"
-"""The shared unknown that is what all ranges are too long [m]."""
+"""Name of the common range bias: the amount by which all ranges are too long [m]."""
 
 HEIGHT_BIAS = "common_height_bias"
-"""The shared unknown that is what all centres are too high [m]."""
+"""Name of the common height bias: the amount by which all centres are too high [m]."""
 
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
@@ -64,18 +64,16 @@ class LeftOut:
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class Shared:
-    """Unknowns that all stations share: what the rig does to every centre, and no centre tells.
+    """Systematic errors common to all stations, which no single centre reveals.
 
     Attributes
     ----------
     names : tuple of str
-        What they are; ``RANGE_BIAS`` is what all ranges are too long, ``HEIGHT_BIAS`` what all
-        centres are too high.
+        ``RANGE_BIAS``, ``HEIGHT_BIAS``, or parameters of the rig.
     effects : (n, 3, k)
-        How much a unit of each moves each observed centre in base.
+        Derivatives of each observed centre, in base, by each of them.
     weights : (k, k)
-        What is known of them beside the centres: the inverse of a covariance about zero; singular
-        where nothing is known.
+        Prior weights about zero: the inverse of a covariance, singular where nothing is known.
     """
 
     names: tuple[str, ...]

@@ -162,10 +162,10 @@ def _adjusted(
 
 
 def _predicted_control(network: Network, tested: Tested) -> tuple[Array, Array]:
-    """Return where all else would put each control mark, minus where it is given, with covariance.
+    """Return the predicted minus the given position of each control mark, with covariance.
 
-    With ``v`` and ``P`` of a block, ``(P Q_v P)^-1 P v`` is what the others predict for it, and the
-    inverse its covariance (Baarda 1968): no adjustment has to be done again.
+    The prediction is that of all other observations. With ``v`` and ``P`` of a block it is
+    ``(P Q_v P)^-1 P v``, and the inverse its covariance (Baarda 1968): nothing is adjusted again.
     """
     first = len(network.sightings) + len(network.stations)
     own = own_marks(network, tested.cofactors)[network.controls]

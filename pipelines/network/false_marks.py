@@ -23,10 +23,10 @@ Scan = tuple[str, MarkerFits]
 def suspect_marks(
     scans: Sequence[Scan], found: _Map, used: dict[int, list[tuple[int, int]]]
 ) -> tuple[dict[int, str], dict[tuple[int, int], str]]:
-    """Return which marks may be false, and which centres are dropped because theirs most likely is.
+    """Return the suspect marks, and the centres dropped because their mark is probably false.
 
-    A sphere is seen from all around. What only a few see, of all the stations that stand as near to
-    it, is no mark for the network, unless a station would stand on too few others.
+    A sphere is visible from all around. What only a few of the stations near it see is no mark for
+    the network, unless a station would be left with too few others.
     """
     suspicions: dict[int, str] = {}
     dropped: dict[tuple[int, int], str] = {}

@@ -629,8 +629,8 @@ def _least(problem: _Problem, goal: Goal) -> int:
     raise DegenerateGeometryError(
         f"No arrangement of {goal.most} marks keeps {_goal_text(problem, goal)}: wherever they "
         f"stood, the 3-D sigma at {problem.stops.names[worst]} would be "
-        f"{1e3 * sigmas[worst, place]:.2g} mm or more, and {1e3 * widest:.2g} mm is the most with "
-        "which that can be. Ask for a larger tolerance, or allow more places."
+        f"{1e3 * sigmas[worst, place]:.2g} mm or more; the tolerance allows at most "
+        f"{1e3 * widest:.2g} mm. Ask for a larger tolerance, or allow more places."
     )
 
 

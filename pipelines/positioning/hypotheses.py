@@ -53,8 +53,8 @@ class Hypotheses(NamedTuple):
     translations: Array
 
 
-AS_IT_IS = Hypotheses(np.zeros(1), np.zeros((1, 3)))
-"""The pose that leaves everything in its place."""
+IDENTITY = Hypotheses(np.zeros(1), np.zeros((1, 3)))
+"""The identity pose."""
 
 
 def spans_between(marks_site: Array, longest: float) -> Spans:

@@ -38,7 +38,7 @@ from spheremark.pipelines.geometry import (
 )
 from spheremark.pipelines.model import Array, ControlMarks, Index, MarkerFits
 from spheremark.pipelines.positioning.hypotheses import (
-    AS_IT_IS,
+    IDENTITY,
     Hypotheses,
     Spans,
     agreements,
@@ -253,7 +253,7 @@ def own_covariances(p_base: Array, cov_p_base: Array, variances: Array) -> Array
 
 
 def cov_of_shared(scene: Scene, variances: Array, of_ranges: Array, of_heights: Array) -> Array:
-    """Return what it changes in a covariance that some errors are shared by all centres.
+    """Return the correction of a covariance for errors common to all centres.
 
     Notes
     -----
@@ -326,7 +326,7 @@ def match_marks(scene: Scene, config: ResectionConfig, spans: Spans | None = Non
             "more different ways equally well: several pairs of marks have the same distances "
             "(a symmetric field). Survey more markers, or move one so that no distance repeats."
         )
-    return replace(best, dissent=_dissent(best, solutions[1:], scene))
+    return replace(best, dissent=_contradicting_matches(best, solutions[1:], scene))
 
 
 def contradiction(match: Match, scene: Scene) -> str:
@@ -533,7 +533,7 @@ def _refined(
             return None
         T = solution.estimate
         placed = transform(T, scene.centres_base)
-        again, scores = assign(placed, AS_IT_IS, scene.marks_site, config.match_tolerance, 1.0)
+        again, scores = assign(placed, IDENTITY, scene.marks_site, config.match_tolerance, 1.0)
         if np.array_equal(again[0], marks):
             residuals = solution.groups[0].residuals
             return float(scores[0]), Match(
@@ -556,8 +556,8 @@ def _is_alternative(other: Match, best: Match) -> bool:
     return other.n >= best.n and 2 * shared < best.n and worse <= _ALTERNATIVE
 
 
-def _dissent(best: Match, others: list[Match], scene: Scene) -> Array:
-    """Return number and place of matches of three or more other markers, (k, 4), by no chance."""
+def _contradicting_matches(best: Match, others: list[Match], scene: Scene) -> Array:
+    """Return number of markers and position of each significant contradicting match, (k, 4)."""
     rows = []
     for other in others:
         n = _n_others(other, best)

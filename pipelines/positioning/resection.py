@@ -260,8 +260,8 @@ def _fix(
     elsewhere = match.alternatives + scene.middle - T_site_base[:3, 3]
     pose = Pose(
         T_site_station=T_site_base @ inverse(rigid(scene.R_station_base, np.zeros(3))),
-        cov_T_site_station=shift @ cov @ shift.T + _cov_turn(scene, elsewhere, T_site_base),
-        cov_p_site=J @ cov @ J.T + _cov_choice(elsewhere),
+        cov_T_site_station=shift @ cov @ shift.T + _cov_of_heading(scene, elsewhere, T_site_base),
+        cov_p_site=J @ cov @ J.T + _cov_of_alternatives(elsewhere),
         J_position=J,
         residuals_site=adjustment.groups[0].residuals,
     )
@@ -269,7 +269,7 @@ def _fix(
 
 
 def _cov_shared(scene: Scene, used: Index, adjustment: Adjustment) -> Array:
-    """Return what errors that all centres share change in the covariance of a motion, (6, 6)."""
+    """Return the correction of a motion's covariance for errors common to all centres, (6, 6)."""
     R, group = adjustment.estimate[:3, :3], adjustment.groups[0]
     p_base = scene.centres_base[used[:, 0]]
     lines = unit(p_base) @ R.T
@@ -279,24 +279,24 @@ def _cov_shared(scene: Scene, used: Index, adjustment: Adjustment) -> Array:
     return cov_of_shared(scene, scene.shared[used[:, 0]], of_ranges, of_heights)
 
 
-def _cov_choice(elsewhere: Array) -> Array:
-    """Return the covariance, (3, 3), of a position that may as well be elsewhere.
+def _cov_of_alternatives(elsewhere: Array) -> Array:
+    """Return the covariance, (3, 3), of a position with equally good alternatives.
 
-    ``elsewhere``, (k, 3), are the shifts to the other places, each as likely as the chosen one.
+    ``elsewhere``, (k, 3), are the shifts to them, each as likely as the chosen one.
     """
     return np.asarray(elsewhere.T @ elsewhere / (len(elsewhere) + 1))
 
 
-def _cov_turn(scene: Scene, elsewhere: Array, T_site_base: Array) -> Array:
-    """Return what an uncertain heading and the other places add to the covariance, (6, 6).
+def _cov_of_heading(scene: Scene, elsewhere: Array, T_site_base: Array) -> Array:
+    """Return the covariance that an uncertain heading and alternative positions add, (6, 6).
 
-    The heading of base is where its joint angle is zero, which mounting and encoder blur; the
-    position does not move. The other places lie half a turn away.
+    Mounting and encoder leave the zero of the joint angle uncertain, and so the heading of base;
+    the position does not move. The alternatives lie half a turn away.
     """
     up, k = T_site_base[:3, :3] @ scene.R_station_base[2], len(elsewhere)
     turn = np.concatenate([up, cross(T_site_base[:3, 3], up)])  # 1 rad about the plumb line
     cov = (scene.sigma_heading**2 + np.pi**2 * k / (k + 1)) * np.outer(turn, turn)
-    cov[3:, 3:] += _cov_choice(elsewhere)
+    cov[3:, 3:] += _cov_of_alternatives(elsewhere)
     return np.asarray(cov)
 
 

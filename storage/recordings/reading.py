@@ -300,8 +300,8 @@ def _choose_gimbal(
     if pool:
         names = ", ".join(f"{one.names[0]} of {one.topic}" for one in moving or pool)
         raise MissingGimbalAngleError(
-            f"{len(moving or pool)} joints could be the gimbal: {names}. Name the topic, or the "
-            "joint, that is."
+            f"{len(moving or pool)} joints could be the gimbal: {names}. Name the joint of "
+            "the gimbal, or its topic."
         )
     return None
 
