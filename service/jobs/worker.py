@@ -26,6 +26,7 @@ if TYPE_CHECKING:
 
 _LOG = logging.getLogger(__name__)
 TOPIC = "spheremark"  # of the events that report progress
+_SHORT_TURN = 1.0  # [s] of the gimbal, where only the code that runs matters
 _TICK = 0.1  # [s] between two reports of progress
 
 
@@ -114,6 +115,7 @@ def warm_up() -> None:
 
 def compile_kernels() -> None:
     """Run the whole chain on a small simulated log, so that later runs find compiled kernels."""
+    from spheremark.pipelines.interface import adjust
     from spheremark.pipelines.simulation import SimulationConfig, scenario, simulate_stop
     from spheremark.pipelines.survey import process
     from spheremark.storage.clouds.stop import view
@@ -128,8 +130,11 @@ def compile_kernels() -> None:
         inspect_log(path)
         write_log(stop.log, path)
         inspect_log(path)
-        for result in process(read_log(path), config=SurveyConfig(), marks=field.marks):
-            view(result, 1000)
+        results = process(read_log(path), config=SurveyConfig(), marks=field.marks)
+    for result in results:
+        view(result, 1000)
+    adjust(results, field.marks)
+    simulate_stop(field, field.stops[0].name, SimulationConfig(turn=_SHORT_TURN))
     _compile_planner()
 
 
