@@ -8,6 +8,7 @@ import psutil
 import pytest
 
 from spheremark.pipelines.errors import InputError
+from spheremark.storage.imports import confined
 from spheremark.storage.imports.confined import (
     Limits,
     UnreadableFileError,
@@ -24,12 +25,12 @@ def run(tmp_path):
     path = tmp_path / "file"
     path.write_bytes(b"12345")
 
-    def confined(reader, limits=LIMITS, **options):
+    def read(reader, limits=LIMITS, **options):
         return run_confined(
             f"tests.storage.confined_readers:{reader}", path, limits, name="file.x", **options
         )
 
-    return confined
+    return read
 
 
 def test_a_reader_gets_the_file_and_its_arrays_come_back(run):
@@ -90,10 +91,7 @@ def test_a_reader_that_fails_is_an_error_with_its_reason(run, reader, limits, re
 def test_the_end_of_the_service_ends_readers(run):
     with ThreadPoolExecutor(1) as thread:
         future = thread.submit(run, "sleep")
-        while not any(
-            "spheremark.storage.imports.confined" in " ".join(one.cmdline())
-            for one in psutil.Process().children()
-        ):
+        while not confined._CHILDREN:  # it can be ended once it has begun
             assert not future.done()
         end_children()
         with pytest.raises(UnreadableFileError, match="SIGKILL"):
