@@ -14,7 +14,6 @@ from spheremark.pipelines.model import (
     ControlMarks,
     Index,
     MarkerFits,
-    StationFix,
     StopTruth,
 )
 
@@ -150,12 +149,12 @@ def centre_errors(p_base: ArrayLike, stop: StopTruth, marks: ControlMarks) -> Ma
     return MarkerErrors(marks=matched, error_base=errors, error_radial=radial)
 
 
-def station_error(fix: StationFix, stop: StopTruth) -> StationError:
+def station_error(T_site_station: Array, stop: StopTruth) -> StationError:
     """Compare a station with the truth.
 
     Parameters
     ----------
-    fix : StationFix
+    T_site_station : (4, 4)
         The estimate.
     stop : StopTruth
         True pose of the base frame, whose origin and heading are those of the station frame.
@@ -169,10 +168,10 @@ def station_error(fix: StationFix, stop: StopTruth) -> StationError:
     -----
     The heading of the base is the yaw of ``R_site_base = Rz(yaw) Ry(pitch) Rx(roll)``.
     """
-    yaw = np.arctan2(stop.T_site_base[1, 0], stop.T_site_base[0, 0])
+    yaw, true = (np.arctan2(T[1, 0], T[0, 0]) for T in (T_site_station, stop.T_site_base))
     return StationError(
-        error_site=fix.p_site - stop.T_site_base[:3, 3],
-        error_yaw=float(wrap(fix.yaw - yaw)),
+        error_site=T_site_station[:3, 3] - stop.T_site_base[:3, 3],
+        error_yaw=float(wrap(yaw - true)),
     )
 
 

@@ -132,7 +132,7 @@ def stop_errors(stop: StopResult, truth: Truth) -> StopErrors | None:
             method: marker_errors(fits, pose, truth.marks) for method, fits in stop.fits.items()
         },
         stations={
-            methods: station_error(fix, pose)
+            methods: station_error(fix.T_site_station, pose)
             for methods, fix in stop.fixes.items()
             if isinstance(fix, StationFix)
         },

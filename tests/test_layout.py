@@ -15,6 +15,7 @@ import pytest
 from numpydoc.docscrape import FunctionDoc
 
 from spheremark.pipelines import config, errors, model
+from spheremark.storage.catalogue.migrations import migrate, released
 from tests.documented import called_from_outside, modules_below
 
 ROOT = Path(__file__).parent.parent
@@ -55,8 +56,7 @@ def dataclasses_of_package(package):
 
 def tables():
     connection = duckdb.connect()
-    for migration in sorted((ROOT / "storage/catalogue/migrations").glob("*.sql")):
-        connection.execute(migration.read_text())
+    migrate(connection, released())
     return connection
 
 

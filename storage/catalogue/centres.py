@@ -12,7 +12,7 @@ import pyarrow as pa
 
 from spheremark.pipelines.geometry import levelling_rotation
 from spheremark.pipelines.model import Array, Levelling, MarkerFit, MarkerFits, Status
-from spheremark.storage.catalogue.rows import Row
+from spheremark.storage.catalogue.rows import Row, places
 
 _COV = ("xx", "xy", "xz", "xy", "yy", "yz", "xz", "yz", "zz")
 _NO_ROWS = np.zeros(0, dtype=np.intp)
@@ -47,7 +47,7 @@ def read_centres(
     ]
     for stop in stops.to_pylist():
         if stop["run_id"] == run_id:
-            levelling = _levelling(stop)
+            levelling = levelling_of(stop)
             own = sorted(
                 (row for row in fits if row["stop"] == stop["stop"]),
                 key=lambda row: int(row["marker"][1:]),
@@ -59,7 +59,7 @@ def read_centres(
             )
 
 
-def _levelling(row: Row) -> Levelling:
+def levelling_of(row: Row) -> Levelling:
     """Return the levelling of a stop from its row."""
     roll, pitch, sigma, heading = (
         float(np.radians(row[f"{name}_deg"]))
@@ -71,7 +71,7 @@ def _levelling(row: Row) -> Levelling:
 def _fit(row: Row, levelling: Levelling) -> MarkerFit:
     """Return a centre without levelling, and without the covariance of the heading."""
     R = levelling_rotation(levelling)
-    p_base = R.T @ np.array([row["x_m"], row["y_m"], row["z_m"]])
+    p_base = R.T @ places([row])[0]
     return MarkerFit(
         name=row["marker"],
         p_base=p_base,

@@ -16,13 +16,10 @@ from spheremark.pipelines.model import Array, ControlMarks, StopTruth, Truth
 from spheremark.pipelines.scan.rigs import rig_from_mapping, rig_to_mapping
 from spheremark.storage.catalogue.database import fetch
 from spheremark.storage.catalogue.records import json_text
-from spheremark.storage.catalogue.rows import table_of
+from spheremark.storage.catalogue.rows import PLACE, named, places
+from spheremark.storage.catalogue.schema import SCHEMAS, table_of
 
-_PLACE = ("x_m", "y_m", "z_m")
-_SIGMAS = tuple(f"sigma_{name}" for name in _PLACE)
-_STOP = dict.fromkeys(("survey_id", "stop"), pa.string()) | dict.fromkeys(
-    (*_PLACE, "yaw_deg", "pitch_deg", "roll_deg"), pa.float64()
-)
+_SIGMAS = tuple(f"sigma_{name}" for name in PLACE)
 _TRUE_MARKS = "SELECT * FROM true_marks WHERE survey_id = $id ORDER BY place"
 _TRUE_STOPS = "SELECT * FROM true_stops WHERE survey_id = $id ORDER BY stop"
 _TRUE_WORLD = "SELECT rig, about FROM true_worlds WHERE survey_id = $id"
@@ -70,8 +67,8 @@ def true_stops_table(survey_id: str, stops: tuple[StopTruth, ...]) -> pa.Table:
     for stop in stops:
         angles = np.degrees(yaw_pitch_roll(stop.T_site_base[:3, :3]))
         values = (survey_id, stop.name, *stop.T_site_base[:3, 3], *angles)
-        rows.append(dict(zip(_STOP, values, strict=True)))
-    return table_of(_STOP, rows)
+        rows.append(named(SCHEMAS["true_stops"].names, values))
+    return table_of("true_stops", rows)
 
 
 def rig_text(truth: Truth) -> str | None:
@@ -105,6 +102,6 @@ def _marks_of(rows: list[dict[str, Any]], cov_p_site: Array) -> ControlMarks:
     """Return the marks of rows with their covariances."""
     return ControlMarks(
         names=tuple(row["mark"] for row in rows),
-        p_site=np.array([[row[name] for name in _PLACE] for row in rows]).reshape(-1, 3),
+        p_site=places(rows),
         cov_p_site=cov_p_site,
     )

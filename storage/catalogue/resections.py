@@ -9,16 +9,16 @@ import pyarrow as pa
 import pyarrow.compute as pc
 
 from spheremark.pipelines.model import Array, StopResult, StopTruth, SubsetFixes
+from spheremark.storage.catalogue.rows import PLACE, named
+from spheremark.storage.catalogue.schema import SCHEMAS
 
 _LABELS = ("run_id", "stop", "fit_method", "resection_method")
-_PLACE = ("x_m", "y_m", "z_m")
 _ERRORS = ("error_horizontal_m", "error_3d_m")
 
 
-def resections_table(
-    run_id: str, stops: Iterable[StopResult], names: tuple[str, ...], schema: pa.Schema
-) -> pa.Table:
+def resections_table(run_id: str, stops: Iterable[StopResult], names: tuple[str, ...]) -> pa.Table:
     """Put the subsets of stops into the table ``resections``, without errors."""
+    schema = SCHEMAS["resections"]
     groups = [
         ((run_id, stop.name, *methods), subsets)
         for stop in stops
@@ -68,7 +68,7 @@ def _measures(found: Sequence[SubsetFixes]) -> dict[str, Array]:
         "included_angle_horizontal_deg": np.degrees(horizontal),
         "sigma_horizontal_m": np.concatenate([one.sigma_horizontal for one in found]),
         "sigma_3d_m": np.concatenate([one.sigma_3d for one in found]),
-        **dict(zip(_PLACE, np.concatenate([one.p_site for one in found]).T, strict=True)),
+        **named(PLACE, np.concatenate([one.p_site for one in found]).T),
     }
 
 
@@ -78,7 +78,7 @@ def resections_with_errors(known: pa.Table, truths: Mapping[str, StopTruth]) -> 
     for stop in pc.unique(known["stop"]).to_pylist():
         if stop in truths:
             p_true[pc.equal(known["stop"], stop).to_numpy()] = truths[stop].T_site_base[:3, 3]
-    places = [known[name].cast(pa.float64()).to_numpy() for name in _PLACE]
+    places = [known[name].cast(pa.float64()).to_numpy() for name in PLACE]
     errors = np.stack(places, axis=1) - p_true
     for name, values in zip(
         _ERRORS, (np.hypot(*errors[:, :2].T), np.linalg.norm(errors, axis=1)), strict=True

@@ -21,139 +21,44 @@ from spheremark.pipelines.geometry import levelling_rotation, rigid
 from spheremark.pipelines.model import (
     Array,
     ControlMarks,
-    ErrorEllipse,
     Levelling,
     MarkerFit,
     MarkerFits,
     NoFix,
     StationFix,
     StationQuality,
-    Status,
     StopResult,
     StopTruth,
     Truth,
 )
 from spheremark.pipelines.scan.rigs import rig_digest, rig_to_mapping
+from spheremark.storage.catalogue.centres import levelling_of
 from spheremark.storage.catalogue.resections import resections_table, resections_with_errors
-from spheremark.storage.catalogue.rows import Row, plain, table_of
+from spheremark.storage.catalogue.rows import COV, ERROR, PLACE, Row, named, places, plain
+from spheremark.storage.catalogue.schema import row_of, table_of
 
 _UPPER = np.triu_indices(3)
-_TEXT, _REAL, _WHOLE, _LONG = pa.string(), pa.float64(), pa.int32(), pa.int64()
-_INSTANT = pa.timestamp("us", "UTC")
-_STOP = {"run_id": _TEXT, "stop": _TEXT}
-_FIT = _STOP | {"fit_method": _TEXT}
-_FIX = _FIT | {"resection_method": _TEXT}
-_PLACE = {"x_m": _REAL, "y_m": _REAL, "z_m": _REAL}
-_COV = dict.fromkeys([f"cov_{axes}_m2" for axes in ("xx", "xy", "xz", "yy", "yz", "zz")], _REAL)
-_FIT_NUMBERS = (*_PLACE, *_COV, "sigma_3d_m", "azimuth_deg", "elevation_deg")
-_ERROR = {"error_x_m": _REAL, "error_y_m": _REAL, "error_z_m": _REAL}
-
-_COLUMNS = {
-    "rigs": {"rig_digest": _TEXT, "name": _TEXT, "rig": _TEXT},
-    "runs": {
-        **dict.fromkeys(("run_id", "job_id", "survey_id", "recording_id"), _TEXT),
-        **dict.fromkeys(("config", "config_digest", "code_version", "rig_digest"), _TEXT),
-        "finished_at": _INSTANT,
-        "duration_s": _REAL,
-        "peak_memory_bytes": _LONG,
-    },
-    "stops": {
-        **_STOP,
-        "n_returns": _LONG,
-        **dict.fromkeys(("coverage_deg", "duration_s", "roll_deg", "pitch_deg"), _REAL),
-        "sigma_levelling_deg": _REAL,
-        "sigma_heading_deg": _REAL,
-        "cloud_url": _TEXT,
-        "notes": pa.list_(_TEXT),
-        "timings_s": _TEXT,
-    },
-    "marker_fits": {
-        **_FIT,
-        **dict.fromkeys(("marker", "mark", "status", "reason"), _TEXT),
-        **_PLACE,
-        **_COV,
-        **dict.fromkeys(("sigma_3d_m", "range_m", "azimuth_deg", "elevation_deg"), _REAL),
-        **dict.fromkeys(("n_points", "n_rejected", "n_rings"), _WHOLE),
-        **dict.fromkeys(("coverage", "rms_m", "sigma0", "radius_m", "radius_free_m"), _REAL),
-        **dict.fromkeys(("sigma_radius_free_m", "mean_intensity", "incidence_deg"), _REAL),
-        "variant": _TEXT,
-        **_ERROR,
-        "error_radial_m": _REAL,
-        "error_3d_m": _REAL,
-        "sigma_range_shared_m": _REAL,
-    },
-    "rejections": {**_FIT, **_PLACE, "n_points": _WHOLE, "reason": _TEXT},
-    "station_fixes": {
-        **_FIX,
-        "status": _TEXT,
-        "reason": _TEXT,
-        **_PLACE,
-        "yaw_deg": _REAL,
-        "rotation": pa.list_(_REAL),
-        **_COV,
-        "cov_motion": pa.list_(_REAL),
-        **dict.fromkeys(("sigma_3d_m", "sigma_yaw_deg"), _REAL),
-        **dict.fromkeys(("ellipse_major_m", "ellipse_minor_m", "ellipse_bearing_deg"), _REAL),
-        **dict.fromkeys(("ellipse_major_95_m", "ellipse_minor_95_m"), _REAL),
-        "n_markers": _WHOLE,
-        "dof": _WHOLE,
-        "sigma0": _REAL,
-        "passes_global_test": pa.bool_(),
-        **dict.fromkeys(("included_angle_min_deg", "included_angle_max_deg"), _REAL),
-        **_ERROR,
-        **dict.fromkeys(("error_yaw_deg", "error_horizontal_m", "error_3d_m"), _REAL),
-        "dop": _REAL,
-    },
-    "observations": {
-        **_FIX,
-        "marker": _TEXT,
-        "mark": _TEXT,
-        "used": pa.bool_(),
-        "reason": _TEXT,
-        **dict.fromkeys(("residual_x_m", "residual_y_m", "residual_z_m"), _REAL),
-        **dict.fromkeys(("redundancy", "w"), _REAL),
-        **dict.fromkeys(("minimal_detectable_bias_m", "external_reliability_m"), _REAL),
-        "shift_without_m": _REAL,
-    },
-    "resections": {
-        **_FIX,
-        "marks": pa.list_(_TEXT),
-        "n_marks": _WHOLE,
-        **dict.fromkeys(("included_angle_deg", "included_angle_horizontal_deg"), _REAL),
-        "sigma_3d_m": _REAL,
-        **_PLACE,
-        "error_3d_m": _REAL,
-        **dict.fromkeys(("included_angle_max_deg", "sigma_horizontal_m"), _REAL),
-        "error_horizontal_m": _REAL,
-    },
-}
-SCHEMAS = {name: pa.schema(list(columns.items())) for name, columns in _COLUMNS.items()}
-"""Columns of the tables that a job writes, in the order of writing."""
-TABLES = tuple(SCHEMAS)
-"""Their names."""
+_FIT_NUMBERS = (*PLACE, *COV, "sigma_3d_m", "azimuth_deg", "elevation_deg")
 _COMPARED = ("marker_fits", "station_fixes", "resections")  # have errors against truth
+TABLES = (
+    "rigs",
+    "runs",
+    "stops",
+    "marker_fits",
+    "rejections",
+    "station_fixes",
+    "observations",
+    "resections",
+)
+"""Tables that a job writes, in the order of writing."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RunInfo:
     """A run: its origin and configuration.
 
-    Attributes
-    ----------
-    run_id : str
-        Names its rows in every table.
-    job_id, survey_id, recording_id : str
-        Where it belongs.
-    config : SurveyConfig
-        The effective configuration.
-    code_version : str
-        Version of spheremark.
-    finished_at : datetime
-        When the numbers were there, with a time zone.
-    duration : float
-        Time from the log to the numbers [s].
-    peak_memory_bytes : int or None
-        Largest resident size of the worker's process.
+    ``run_id`` names its rows in every table; ``duration`` is the time from the log to the numbers
+    [s], ``peak_memory_bytes`` the largest resident size of the worker's process.
     """
 
     run_id: str
@@ -212,8 +117,8 @@ def tables(
     for stop in stops:
         for table, found in _stop_rows(stop, names, (clouds or {}).get(stop.name)).items():
             rows[table] += [{"run_id": run.run_id, "stop": stop.name, **row} for row in found]
-    made = {name: _table(name, rows[name]) for name in TABLES}
-    made["resections"] = resections_table(run.run_id, stops, names, made["resections"].schema)
+    made = {name: table_of(name, rows[name]) for name in TABLES}
+    made["resections"] = resections_table(run.run_id, stops, names)
     return made if truth is None else with_errors(made, truth)
 
 
@@ -227,7 +132,10 @@ def with_errors(known: Mapping[str, pa.Table], truth: Truth | None) -> dict[str,
     truths = {stop.name: stop for stop in truth.stops}
     out = dict(known)
     if "marker_fits" in known:
-        errors = _marker_errors(known["marker_fits"], _levellings(known), truths, truth.marks)
+        levellings = {
+            (row["run_id"], row["stop"]): levelling_of(row) for row in known["stops"].to_pylist()
+        }
+        errors = _marker_errors(known["marker_fits"], levellings, truths, truth.marks)
         out["marker_fits"] = _with_columns(known["marker_fits"], errors)
     if "station_fixes" in known:
         fixes = known["station_fixes"].to_pylist()
@@ -248,17 +156,10 @@ def _run_rows(run: RunInfo, stops: tuple[StopResult, ...]) -> dict[str, list[Row
     )
     rows["runs"].append(
         {
-            "run_id": run.run_id,
-            "job_id": run.job_id,
-            "survey_id": run.survey_id,
-            "recording_id": run.recording_id,
+            **row_of("runs", run),
             "config": config,
             "config_digest": digest_of(config),
-            "code_version": run.code_version,
             "rig_digest": digest,
-            "finished_at": run.finished_at,
-            "duration_s": run.duration,
-            "peak_memory_bytes": run.peak_memory_bytes,
         }
     )
     return rows
@@ -277,7 +178,7 @@ def _stop_rows(
         for i, row in enumerate(_fit_rows(found.fits, R, sigma_heading)):
             rows["marker_fits"].append(label | {"mark": matched.get(i)} | row)
         rows["rejections"] += [
-            label | _place(R @ r.p_base) | {"n_points": r.n_points, "reason": r.reason}
+            label | named(PLACE, R @ r.p_base) | {"n_points": r.n_points, "reason": r.reason}
             for r in found.rejected
         ]
     for (fit_method, method), fix in stop.fixes.items():
@@ -296,15 +197,12 @@ def _stop_row(stop: StopResult, cloud_url: str | None) -> Row:
     """Return the row of ``stops``."""
     cloud = stop.cloud
     return {
+        **row_of("stops", cloud),
+        **row_of("stops", cloud.levelling),
         "n_returns": len(cloud.p_base),
-        "coverage_deg": np.degrees(cloud.coverage),
-        "duration_s": cloud.duration,
-        "roll_deg": np.degrees(cloud.levelling.roll),
-        "pitch_deg": np.degrees(cloud.levelling.pitch),
         "sigma_levelling_deg": np.degrees(cloud.levelling.sigma),
         "sigma_heading_deg": np.degrees(cloud.rig.sigma_heading),
         "cloud_url": cloud_url,
-        "notes": list(cloud.notes),
         "timings_s": json.dumps(dict(stop.timings)),
     }
 
@@ -319,32 +217,11 @@ def _fit_rows(fits: Sequence[MarkerFit], R: Array, sigma_heading: float) -> list
     elevations = np.degrees(np.arctan2(p[:, 2], np.hypot(p[:, 0], p[:, 1])))
     numbers = np.column_stack([p, cov, sigmas, azimuths, elevations]).tolist()
     return [
-        dict(zip(_FIT_NUMBERS, row, strict=True)) | _fit_row(fit)
+        row_of("marker_fits", fit)
+        | named(_FIT_NUMBERS, row)
+        | {"marker": fit.name, "range_m": fit.mean_range, "n_rejected": len(fit.rejected)}
         for fit, row in zip(fits, numbers, strict=True)
     ]
-
-
-def _fit_row(fit: MarkerFit) -> Row:
-    """Return the columns of a fit beside its centre."""
-    return {
-        "marker": fit.name,
-        "status": str(fit.status),
-        "reason": fit.reason,
-        "range_m": fit.mean_range,
-        "n_points": fit.n_points,
-        "n_rejected": len(fit.rejected),
-        "n_rings": fit.n_rings,
-        "coverage": fit.coverage,
-        "rms_m": fit.rms,
-        "sigma0": fit.sigma0,
-        "radius_m": fit.radius,
-        "radius_free_m": fit.radius_free,
-        "sigma_radius_free_m": fit.sigma_radius_free,
-        "mean_intensity": fit.mean_intensity,
-        "incidence_deg": np.degrees(fit.incidence),
-        "variant": fit.variant,
-        "sigma_range_shared_m": fit.sigma_range_shared,
-    }
 
 
 def _fix_row(fix: StationFix | NoFix) -> Row:
@@ -352,33 +229,15 @@ def _fix_row(fix: StationFix | NoFix) -> Row:
     if isinstance(fix, NoFix):
         return {"status": "failed", "reason": fix.reason, "n_markers": 0}
     return {
-        "status": str(fix.status),
-        "reason": fix.reason,
-        **_place(fix.p_site),
-        "yaw_deg": np.degrees(fix.yaw),
+        **row_of("station_fixes", fix),
+        **named(PLACE, fix.p_site),
         "rotation": fix.T_site_station[:3, :3].ravel().tolist(),
-        **_cov(fix.cov_p_site),
+        **named(COV, fix.cov_p_site[_UPPER]),
         "cov_motion": fix.cov_T_site_station.ravel().tolist(),
-        "sigma_3d_m": fix.sigma_3d,
-        "sigma_yaw_deg": np.degrees(fix.sigma_yaw),
-        **_ellipse(fix.ellipse),
+        **row_of("station_fixes", fix.ellipse, "ellipse_"),
         "n_markers": len(fix.matches),
-        "dof": fix.dof,
-        "sigma0": fix.sigma0,
-        "passes_global_test": fix.passes_global_test,
         "included_angle_min_deg": np.degrees(fix.included_angles[0]),
         "included_angle_max_deg": np.degrees(fix.included_angles[1]),
-    }
-
-
-def _ellipse(ellipse: ErrorEllipse) -> Row:
-    """Return an error ellipse as columns, standard and 95 %."""
-    return {
-        "ellipse_major_m": ellipse.major,
-        "ellipse_minor_m": ellipse.minor,
-        "ellipse_bearing_deg": np.degrees(ellipse.bearing),
-        "ellipse_major_95_m": ellipse.major_95,
-        "ellipse_minor_95_m": ellipse.minor_95,
     }
 
 
@@ -393,16 +252,11 @@ def _observation_rows(
         for i, fit in enumerate(fits.fits)
     ]
     for k, (i, mark) in enumerate(fix.matches):
-        residual = dict(
-            zip(
-                ("residual_x_m", "residual_y_m", "residual_z_m"), fix.residuals_site[k], strict=True
-            )
-        )
         rows[i] |= {
             "mark": names[mark],
             "used": True,
             "reason": "",
-            **residual,
+            **named([f"residual_{name}" for name in PLACE], fix.residuals_site[k]),
             "redundancy": fix.redundancies[k],
             "w": fix.w_statistics[k],
             "minimal_detectable_bias_m": fix.detectable_biases[k],
@@ -420,26 +274,11 @@ def _matched(stop: StopResult, fit_method: str, names: tuple[str, ...]) -> dict[
     return {}
 
 
-def _place(p: Array) -> Row:
-    """Return coordinates as columns."""
-    return dict(zip(("x_m", "y_m", "z_m"), p, strict=True))
-
-
-def _cov(cov: Array) -> Row:
-    """Return the upper triangle of a covariance as columns."""
-    return dict(zip(_COV, cov[_UPPER], strict=True))
-
-
-def _table(name: str, rows: Sequence[Row]) -> pa.Table:
-    """Return rows as an Arrow table in the shape of a table of the database."""
-    return table_of(_COLUMNS[name], rows)
-
-
 def _with_columns(table: pa.Table, errors: Sequence[Mapping[str, object]]) -> pa.Table:
     """Return a table with its error columns replaced; missing values are NULL."""
     for i, name in enumerate(table.column_names):
         if name.startswith("error_"):
-            values = pa.array([plain(row.get(name)) for row in errors], _REAL)
+            values = pa.array([plain(row.get(name)) for row in errors], pa.float64())
             table = table.set_column(i, name, values)
     return table
 
@@ -448,21 +287,8 @@ def _without_errors(table: pa.Table) -> pa.Table:
     """Return a table with nothing in its error columns."""
     for i, name in enumerate(table.schema.names):
         if name.startswith("error_") and table.column(i).null_count < len(table):
-            table = table.set_column(i, name, pa.nulls(len(table), _REAL))
+            table = table.set_column(i, name, pa.nulls(len(table), pa.float64()))
     return table
-
-
-def _levellings(known: Mapping[str, pa.Table]) -> dict[tuple[str, str], Levelling]:
-    """Return the levelling of each stop of each run."""
-    return {
-        (row["run_id"], row["stop"]): Levelling(
-            roll=np.radians(row["roll_deg"]),
-            pitch=np.radians(row["pitch_deg"]),
-            sigma=np.radians(row["sigma_levelling_deg"]),
-            is_measured=True,
-        )
-        for row in known["stops"].to_pylist()
-    }
 
 
 def _marker_errors(
@@ -479,14 +305,12 @@ def _marker_errors(
         groups.setdefault((row["run_id"], row["stop"], row["fit_method"]), []).append(i)
     for (run_id, stop, _), members in groups.items():
         if stop in truths:
-            p_station = np.array(
-                [[rows[i][axis] for axis in ("x_m", "y_m", "z_m")] for i in members]
-            )
+            p_station = places([rows[i] for i in members])
             R = levelling_rotation(levellings[run_id, stop])
             found = centre_errors(p_station @ R, truths[stop], marks)
             for k, i in enumerate(members):
                 errors[i] = {
-                    **_errors(R @ found.error_base[k]),
+                    **named(ERROR, R @ found.error_base[k]),
                     "error_radial_m": found.error_radial[k],
                     "error_3d_m": found.error_3d[k],
                 }
@@ -497,39 +321,10 @@ def _station_errors(row: Row, truth: StopTruth | None) -> Row:
     """Return the errors of a row of ``station_fixes``."""
     if truth is None or row["x_m"] is None:
         return {}
-    error = station_error(_fix_of(row), truth)
+    error = station_error(rigid(np.reshape(row["rotation"], (3, 3)), places([row])[0]), truth)
     return {
-        **_errors(error.error_site),
+        **named(ERROR, error.error_site),
         "error_yaw_deg": np.degrees(error.error_yaw),
         "error_horizontal_m": np.hypot(*error.error_site[:2]),
         "error_3d_m": error.error_3d,
     }
-
-
-def _errors(error: Array) -> Row:
-    """Return an error as columns."""
-    return dict(zip(_ERROR, error, strict=True))
-
-
-def _fix_of(row: Row) -> StationFix:
-    """Return the pose of a row of ``station_fixes``, without what made it."""
-    R = np.array(row["rotation"]).reshape(3, 3)
-    none = np.zeros(0)
-    return StationFix(
-        method=row["resection_method"],
-        T_site_station=rigid(R, [row["x_m"], row["y_m"], row["z_m"]]),
-        cov_T_site_station=np.full((6, 6), np.nan),
-        cov_p_site=np.full((3, 3), np.nan),
-        matches=np.zeros((0, 2), dtype=np.intp),
-        residuals_site=np.zeros((0, 3)),
-        redundancies=none,
-        w_statistics=none,
-        detectable_biases=none,
-        external_reliabilities=none,
-        dof=0,
-        sigma0=np.nan,
-        passes_global_test=True,
-        included_angles=np.full(2, np.nan),
-        status=Status(row["status"]),
-        reason=row["reason"],
-    )

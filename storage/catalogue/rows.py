@@ -1,26 +1,35 @@
-"""Rows as Arrow tables: unknown and non-finite values become NULL."""
+"""Rows of results: names of columns that several tables share, and values as Arrow takes them."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
-import pyarrow as pa
+
+from spheremark.pipelines.model import Array
 
 Row = dict[str, Any]
 
+PLACE = ("x_m", "y_m", "z_m")
+ERROR = tuple(f"error_{name}" for name in PLACE)
+COV = tuple(f"cov_{axes}_m2" for axes in ("xx", "xy", "xz", "yy", "yz", "zz"))
+"""The upper triangle of a covariance."""
 
-def table_of(columns: Mapping[str, pa.DataType], rows: Sequence[Row]) -> pa.Table:
-    """Return rows as an Arrow table."""
-    known = [{key: plain(value) for key, value in row.items()} for row in rows]
-    array = pa.array(known, pa.struct(list(columns.items())))  # half of what from_pylist costs
-    return pa.Table.from_batches([pa.RecordBatch.from_struct_array(array)])
+
+def places(rows: Sequence[Row]) -> Array:
+    """Return the coordinates of rows, (n, 3) [m]."""
+    return np.array([[row[name] for name in PLACE] for row in rows]).reshape(-1, 3)
+
+
+def named(names: Sequence[str], values: Any) -> Row:
+    """Return values as columns."""
+    return dict(zip(names, values, strict=True))
 
 
 def plain(value: object) -> object:
-    """Return a value as Arrow takes it."""
+    """Return a value as Arrow takes it: None where it is not finite."""
     if isinstance(value, float):  # NumPy's doubles are
         return value if math.isfinite(value) else None
     return plain(value.item()) if isinstance(value, np.generic) else value

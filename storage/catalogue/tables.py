@@ -12,13 +12,14 @@ import pyarrow as pa
 
 from spheremark.pipelines.errors import InputError
 from spheremark.pipelines.model import Truth
-from spheremark.storage.catalogue import adjustments, calibrations, results
+from spheremark.storage.catalogue import adjustments, results
 from spheremark.storage.catalogue.database import Planned, execute_on, fetch
 from spheremark.storage.catalogue.marks import read_truth
+from spheremark.storage.catalogue.schema import SCHEMAS
 
-_CALIBRATION_TABLES = tuple(name for name in calibrations.SCHEMAS if name != "rigs")
+CALIBRATION_TABLES = ("calibrations", "calibrated_parameters", "calibration_gaps")
 _RUN_TABLES = tuple(name for name in results.TABLES if name != "rigs")
-_APPENDED = (*adjustments.SCHEMAS, *_CALIBRATION_TABLES, "site_products", "documents")
+_APPENDED = (*adjustments.TABLES, *CALIBRATION_TABLES, "site_products", "documents")
 _OF_JOBS = (*results.TABLES, *_APPENDED)
 _REPLACED = ("control_marks", "true_marks", "true_stops")  # of a survey, by primary key
 _KEYS = {
@@ -57,7 +58,7 @@ class TableWriter:
 
     def __init__(self, cursor: duckdb.DuckDBPyConnection) -> None:
         self._cursor = cursor
-        schemas = {name: results.SCHEMAS[name] for name in _RUN_TABLES}
+        schemas = {name: SCHEMAS[name] for name in _RUN_TABLES}
         self._results = Planned(cursor, "results", _insert_run(), schemas)
         self._rigs: set[str] = set()
         self._truths: dict[str, Truth | None] = {}

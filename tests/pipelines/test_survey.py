@@ -54,7 +54,7 @@ def test_a_simulated_stop_is_positioned_within_what_its_covariances_say(field, s
     fix = result.fixes[OURS]
     assert (errors.marks >= 0).sum() == 14
     assert np.nanmax(errors.error_3d) < CONFIG.tolerance
-    error = station_error(fix, stop.truth).error_site
+    error = station_error(fix.T_site_station, stop.truth).error_site
     assert error @ np.linalg.solve(fix.cov_p_site, error) < 21.1  # 99.99 % of chi-square with 3
     assert fix.status is Status.OK
 
@@ -73,7 +73,7 @@ def test_two_control_marks_among_all_markers_give_a_weak_fix_near_the_truth(fiel
     fix = result.fixes[OURS]
     assert fix.status is Status.WEAK
     assert "only two marks" in fix.reason
-    assert station_error(fix, stop.truth).error_3d < 5 * fix.sigma_3d
+    assert station_error(fix.T_site_station, stop.truth).error_3d < 5 * fix.sigma_3d
 
 
 def test_one_control_mark_costs_the_position_and_no_marker(field, stop):

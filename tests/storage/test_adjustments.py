@@ -1,6 +1,5 @@
 import json
 
-import duckdb
 import numpy as np
 import pytest
 
@@ -15,13 +14,11 @@ from spheremark.pipelines.geometry import (
 )
 from spheremark.pipelines.model import ControlMarks, StopTruth, Truth
 from spheremark.pipelines.scan.rigs import rig_digest, rig_to_mapping, tilted_vlp16
-from spheremark.storage.catalogue.adjustments import SCHEMAS, tables, with_errors
-from spheremark.storage.catalogue.calibrations import SCHEMAS as CALIBRATION_SCHEMAS
-from spheremark.storage.catalogue.calibrations import tables as calibration_tables
+from spheremark.storage.catalogue.adjustments import TABLES, with_errors
 from spheremark.storage.catalogue.catalogue import Catalogue
 from spheremark.storage.catalogue.centres import read_centres
-from spheremark.storage.catalogue.migrations import migrate, released
 from spheremark.storage.catalogue.products import documents
+from spheremark.storage.catalogue.schema import table_of, tables_of
 from tests.storage.made_up import made_tables, stop
 
 AWAY = rigid(rot_z(1.1), [40.0, -3.0, 2.0])  # where the free network lies
@@ -71,8 +68,10 @@ def network(truth, datum, T=None, shift=(0.0, 0.0, 0.0)):
     whole = {"job_id": "job", "survey_id": "survey", "n_stations": len(stations), "datum": datum,
              "n_marks": len(marks), "dof": 9, "sigma0": np.nan, "passes_global_test": True,
              "finished_at": None, "warnings": []}  # fmt: skip
-    return tables(
-        "one", {"adjustments": [whole], "adjusted_stations": stations, "adjusted_marks": marks}
+    return tables_of(
+        TABLES,
+        {"adjustments": [whole], "adjusted_stations": stations, "adjusted_marks": marks},
+        adjustment_id="one",
     )
 
 
@@ -80,17 +79,6 @@ def errors(found, table, axes=("x", "y", "z")):
     return np.array(
         [[row[f"error_{a}_m"] for a in axes] for row in found[table].to_pylist()], dtype=float
     )
-
-
-def test_every_table_has_the_columns_of_the_database_in_their_order():
-    connection = duckdb.connect()
-    migrate(connection, released())
-    query = "SELECT column_name FROM duckdb_columns() WHERE table_name = ? ORDER BY column_index"
-    made = tables("a", {}) | calibration_tables("c", {}) | {"documents": documents("a", {})}
-    assert set(made) == {*SCHEMAS, *CALIBRATION_SCHEMAS, "documents"}
-    for name, table in made.items():
-        expected = [column for (column,) in connection.execute(query, [name]).fetchall()]
-        assert table.column_names == expected, name
 
 
 def test_a_free_network_has_no_error_of_place_and_heading():
@@ -171,7 +159,7 @@ def test_truth_that_comes_late_gives_networks_their_errors(catalogue):
     made = network(truth, "control", rigid(np.eye(3), [0.01, 0.0, 0.0]))
     rows = made["adjustments"].to_pylist()[0]
     rows |= {"survey_id": survey_id, "finished_at": job.created_at}
-    made["adjustments"] = tables("one", {"adjustments": [rows]})["adjustments"]
+    made["adjustments"] = table_of("adjustments", [{"adjustment_id": "one"} | rows])
     catalogue.finish_job(job.job_id, made)
     sql = "SELECT max(error_3d_m) AS error FROM latest_adjusted_stations"
     assert catalogue.rows(sql)[0]["error"] is None

@@ -1,4 +1,5 @@
 import hashlib
+import re
 from dataclasses import replace
 
 import duckdb
@@ -10,6 +11,19 @@ from spheremark.storage.catalogue.migrations import (
     migrate,
     released,
 )
+from spheremark.storage.catalogue.schema import SCHEMAS
+
+
+def kinds(schema):
+    same = {"extension<arrow.json>": "string", "list<l: string>": "list<item: string>"}
+    same["list<l: double>"] = "list<item: double>"
+    return [same.get(str(field.type), str(field.type)) for field in schema]
+
+
+def views(connection):
+    query = "SELECT view_name FROM duckdb_views() WHERE NOT internal"
+    return {name for (name,) in connection.execute(query).fetchall()}
+
 
 N = len(released())
 NEXT = Migration(number=N + 1, name="next", sql="CREATE TABLE extra (x_m DOUBLE);")
@@ -29,6 +43,32 @@ def test_a_new_database_gets_every_migration_and_an_entry_for_each():
     query = "SELECT number, name, sha256 FROM schema_migrations ORDER BY number"
     expected = [(m.number, m.name, hashlib.sha256(m.sql.encode()).hexdigest()) for m in released()]
     assert connection.execute(query).fetchall() == expected
+
+
+def test_the_columns_of_every_table_are_known_with_their_types():
+    connection = duckdb.connect()
+    migrate(connection, released())
+    connection.execute("SET TimeZone = 'UTC'")
+    assert set(SCHEMAS) == tables(connection) - {"schema_migrations"} - views(connection)
+    for name, schema in SCHEMAS.items():
+        found = connection.sql(f"SELECT * FROM {name}").to_arrow_table().schema  # noqa: S608
+        assert found.names == schema.names, name
+        assert kinds(found) == kinds(schema), name
+
+
+def test_a_comment_of_the_schema_is_one_of_the_database():
+    connection = duckdb.connect()
+    first, _ = released()[0], migrate(connection, released())
+    n_columns = len(re.findall(r"^    .*  -- .", first.sql, re.M))
+    query = "SELECT count(*) FROM duckdb_columns() WHERE comment IS NOT NULL"
+    assert connection.execute(query).fetchall() == [(n_columns,)]
+    query = "SELECT comment FROM duckdb_columns() WHERE table_name = ? AND column_name = ?"
+    for table, column, expected in (
+        ("control_marks", "z_m", "Centre of the sphere in the site frame, up."),
+        ("accuracy_by_distance", "mean_n_points", "Mean number of returns of a fit."),
+        ("accuracy_by_stop", "status", "Status of the station: ok, weak or failed."),
+    ):
+        assert connection.execute(query, [table, column]).fetchall() == [(expected,)]
 
 
 def test_a_second_opening_applies_nothing():

@@ -14,8 +14,8 @@ from pydantic import BaseModel, ConfigDict, Field, create_model
 from spheremark.pipelines.errors import NotFoundError
 from spheremark.service.http.api.models import Listing, Strict
 from spheremark.service.http.state import Service
-from spheremark.storage.catalogue import adjustments, calibrations, results
 from spheremark.storage.catalogue.records import unit_of
+from spheremark.storage.catalogue.schema import SCHEMAS
 
 Plain = dict[str, Any]
 Columns = Iterable[tuple[str, pa.DataType]]
@@ -79,9 +79,7 @@ def _unit(column: str) -> str | None:
 
 def _columns_of(table: str) -> Columns:
     """Return the columns of a table that a job writes."""
-    if table in results.SCHEMAS:
-        return [(field.name, field.type) for field in results.SCHEMAS[table]]
-    return {**adjustments.SCHEMAS, **calibrations.SCHEMAS}[table].items()
+    return [(field.name, field.type) for field in SCHEMAS[table]]
 
 
 def _table(name: str, about: str, table: str, **more: Any) -> type[Row]:

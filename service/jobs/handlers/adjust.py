@@ -114,8 +114,9 @@ def handle(spec: JobSpecification, progress: Progress) -> JobResult:
     from spheremark.service.jobs.handlers.network_rows import network_rows
     from spheremark.service.log_files import Fieldbook, adjust_scans, adjusted_rig
     from spheremark.service.serialise.network import serialise_network
-    from spheremark.storage.catalogue import adjustments
+    from spheremark.storage.catalogue.adjustments import TABLES
     from spheremark.storage.catalogue.products import documents
+    from spheremark.storage.catalogue.schema import tables_of
 
     start = perf_counter()
     with_rig = bool(spec.options.get("calibrate"))
@@ -131,7 +132,7 @@ def handle(spec: JobSpecification, progress: Progress) -> JobResult:
     plain = serialise_network(result, spec.config, rig=found, uncalibrated=why)
     rows = network_rows(plain, book.sources)
     rows["adjustments"][0] |= spec.columns(start)
-    made = [*book.tables, adjustments.tables(spec.result_id, rows)]
+    made = [*book.tables, tables_of(TABLES, rows, adjustment_id=spec.result_id)]
     files, message = _files(result, plain), _summary(plain, rows["control_checks"])
     if found is not None:
         left = part_of(progress, _SCANS, 1.0)

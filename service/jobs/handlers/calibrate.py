@@ -69,7 +69,8 @@ def calibration_results(
 ) -> tuple[dict[str, pa.Table], dict[str, str], str]:
     """Return the tables of a calibration, its files, and a sentence."""
     from spheremark.service.serialise.calibration import serialise_calibration
-    from spheremark.storage.catalogue import calibrations
+    from spheremark.storage.catalogue.schema import tables_of
+    from spheremark.storage.catalogue.tables import CALIBRATION_TABLES
     from spheremark.storage.imports.survey_files import format_rig
 
     plain = serialise_calibration(found)
@@ -77,7 +78,7 @@ def calibration_results(
     rows = calibration_rows(plain, *gaps)
     rows["rigs"] = [_rig_row(rig) for rig in (found.start, found.rig)]
     rows["calibrations"][0] |= spec.columns(start)
-    tables = calibrations.tables(spec.result_id, rows)
+    tables = tables_of(("rigs", *CALIBRATION_TABLES), rows, calibration_id=spec.result_id)
     files = {"calibration.json": json.dumps(plain), "rig.json": format_rig(found.rig)}
     return tables, files, _summary(plain, *gaps)
 

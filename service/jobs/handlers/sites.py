@@ -98,7 +98,7 @@ def gather(catalogue: Catalogue, spec: JobSpecification) -> Mapping[str, pa.Tabl
 def handle(spec: JobSpecification, progress: Progress) -> JobResult:
     """Make the products of a site."""
     from spheremark.service.jobs.site import ENDINGS, KINDS, make_site
-    from spheremark.storage.catalogue.products import product_rows
+    from spheremark.storage.catalogue.schema import tables_of
     from spheremark.storage.files import keep_file
 
     own = {key: spec.options[key] for key in SiteOptions.model_fields if key in spec.options}
@@ -115,7 +115,8 @@ def handle(spec: JobSpecification, progress: Progress) -> JobResult:
     made = _rows(site, kept, _common(spec, options, next(iter(rows.values())), site.n_stations))
     found = {recording for recording, _ in poses}
     missing = [log.name for log in spec.logs if log.recording_id not in found]
-    return JobResult(tables={"site_products": product_rows(made)}, message=_summary(made, missing))
+    rows_made = tables_of(("site_products",), {"site_products": made})
+    return JobResult(tables=rows_made, message=_summary(made, missing))
 
 
 @contextmanager

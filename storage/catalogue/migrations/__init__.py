@@ -15,6 +15,7 @@ from typing import ClassVar
 import duckdb
 
 from spheremark.pipelines.errors import ConflictError
+from spheremark.storage.catalogue.schema import comments
 
 _LEDGER = """
 CREATE TABLE IF NOT EXISTS schema_migrations (
@@ -100,7 +101,7 @@ def _apply(connection: duckdb.DuckDBPyConnection, migration: Migration) -> None:
     """Apply one migration and its entry in the ledger, both or neither."""
     connection.execute("BEGIN")
     try:
-        connection.execute(migration.sql)
+        connection.execute(migration.sql + comments(migration.sql))
         connection.execute(
             "INSERT INTO schema_migrations VALUES (?, ?, ?, ?)",
             [migration.number, migration.name, migration.sha256, datetime.now(UTC)],
