@@ -1,8 +1,8 @@
 """The echo of a beam of finite width.
 
 One ray is cast along the centre of every beam. Beams that touch a sphere or a pole, or that lie at
-a step in range, are cast again as a bundle that fills the footprint; the bundle's returns merge
-and split like those of one pulse.
+a step in range, are cast again as a bundle that fills the footprint, each ray with the same energy;
+the bundle's returns merge and split like those of one pulse.
 """
 
 from __future__ import annotations
@@ -12,15 +12,17 @@ from dataclasses import dataclass
 import numpy as np
 
 from spheremark.pipelines.compilation import compiled
-from spheremark.pipelines.model import Array, Column, Mask, seal
+from spheremark.pipelines.model import Array, Column, Index, Mask, seal
 from spheremark.pipelines.scan.rigs import N_LASERS
+from spheremark.pipelines.simulation.options import Optics, Pick, Profile
 from spheremark.pipelines.simulation.scene import Caster, Scene, caster
 
 _N_RAYS = 61  # in a bundle
-_MERGE = 0.8  # [m] nearer returns of one pulse are one echo: half a pulse of some 5 ns
 _STEP = 0.10  # [m] departure of a range from the plane through its neighbours
-NEAR = 0.35
-"""Distance within which a beam passes near a sphere's centre [m]."""
+_LOBE = 0.45  # half width of one of two lobes, in half widths of the footprint
+_PICKS = {Pick.STRONGEST: 0, Pick.FIRST: 1, Pick.LAST: 2}
+NEAR = 0.25
+"""Distance within which a beam passes near a sphere's surface [m]."""
 
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
@@ -56,7 +58,7 @@ class Aims:
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class Echoes:
-    """The strongest echo of each beam.
+    """The recorded echo of each beam.
 
     Attributes
     ----------
@@ -64,74 +66,96 @@ class Echoes:
         Energy-weighted mean distance along the beam; infinite without an echo [m].
     reflectivities : (n,)
         Reflectivity of the surface times its share of the footprint, 0 to 1.
+    spheres : (n,) or None
+        Sphere of the scene that at least half of the energy is from, -1 for none; by default -1.
     """
 
     ranges: Array
     reflectivities: Array
+    spheres: Index | None = None
 
     def __post_init__(self) -> None:
-        seal(self, ranges=(None,), reflectivities=(len(self.ranges),))
+        n = len(self.ranges)
+        if self.spheres is None:
+            object.__setattr__(self, "spheres", np.full(n, -1))
+        seal(self, ranges=(None,), reflectivities=(n,), spheres=(n,))
 
     def among(self, chosen: Mask) -> Echoes:
         """Return the echoes of all beams; those not chosen have none."""
         ranges, reflectivities = np.full(len(chosen), np.inf), np.zeros(len(chosen))
+        spheres = np.full(len(chosen), -1)
         ranges[chosen], reflectivities[chosen] = self.ranges, self.reflectivities
-        return Echoes(ranges=ranges, reflectivities=reflectivities)
+        spheres[chosen] = self.spheres
+        return Echoes(ranges=ranges, reflectivities=reflectivities, spheres=spheres)
 
 
-def trace(scene: Scene, aims: Aims, divergence: Array, anyway: Mask | None = None) -> Echoes:
-    """Return the strongest echo of each beam.
+def trace(
+    scene: Scene,
+    aims: Aims,
+    divergence: Array,
+    anyway: Mask | None = None,
+    optics: Optics = Optics(),  # noqa: B008  frozen
+) -> Echoes:
+    """Return the recorded echo of each beam.
 
     With ``anyway``, only these beams and those near spheres are traced.
     """
     cast = caster(scene.mesh)
     ranges = np.full(len(aims.origins_site), np.inf)
-    reflectivities = np.zeros(len(ranges))
+    reflectivities, of = np.zeros(len(ranges)), np.full(len(ranges), -1)
     is_cast = np.ones(len(ranges), dtype=np.bool_) if anyway is None else anyway
     chosen = aims.rows(is_cast)
     rays = np.hstack([chosen.origins_site, chosen.directions_site]).astype(np.float32)
-    ranges[is_cast], reflectivities[is_cast] = cast(rays)
+    ranges[is_cast], reflectivities[is_cast] = cast(rays, optics.incidence)
     if anyway is None:
-        is_wide = _passes(scene, aims, float(divergence.max()) / 2, 0.0)
+        reach = max(1.0, float(np.abs(footprint(optics.profile, _N_RAYS)).max()))
+        half_width = reach * float(divergence.max()) / 2
+        is_wide = _passes(scene, aims, half_width, reach * max(optics.window) / 2)
         is_wide |= _sees_step(ranges, N_LASERS)
     else:
         is_wide = _passes(scene, aims, 0.0, NEAR)
     wide = aims.rows(is_wide)
-    ranges[is_wide], reflectivities[is_wide] = _trace_bundles(scene, cast, wide, divergence)
-    return Echoes(ranges=ranges, reflectivities=reflectivities)
+    ranges[is_wide], reflectivities[is_wide], of[is_wide] = _trace_bundles(
+        scene, cast, wide, divergence, optics
+    )
+    return Echoes(ranges=ranges, reflectivities=reflectivities, spheres=of)
 
 
 def _trace_bundles(
-    scene: Scene, cast: Caster, aims: Aims, divergence: Array
-) -> tuple[Array, Array]:
-    """Return range and reflectivity of beams, each cast as a bundle of rays."""
+    scene: Scene, cast: Caster, aims: Aims, divergence: Array, optics: Optics
+) -> tuple[Array, Array, Index]:
+    """Return range, reflectivity and sphere of beams, each cast as a bundle of rays."""
     n = len(aims.origins_site)
     across = np.cross(aims.directions_site, aims.spin_axes_site)
     across /= np.linalg.norm(across, axis=1, keepdims=True)
     along = np.cross(across, aims.directions_site)
-    directions = _bundles(aims.directions_site, across, along, disc(_N_RAYS) * divergence / 2)
-    rays = np.empty((n * _N_RAYS, 6), dtype=np.float32)
-    rays[:, :3] = np.repeat(aims.origins_site, _N_RAYS, axis=0)
-    rays[:, 3:] = directions.reshape(-1, 3)
-    distances, shades = cast(rays)
+    offsets = footprint(optics.profile, _N_RAYS)
+    directions = _bundles(aims.directions_site, across, along, offsets * divergence / 2)
+    starts = offsets * np.array(optics.window) / 2
+    rays = np.empty((n, _N_RAYS, 6), dtype=np.float32)
+    for j, (u, v) in enumerate(starts):
+        rays[:, j, :3] = aims.origins_site + u * across + v * along
+    rays[:, :, 3:] = directions
+    distances, shades = cast(rays.reshape(-1, 6), optics.incidence)
     spheres = scene.spheres
-    found: tuple[Array, Array] = _echoes(
-        aims.origins_site,
+    found: tuple[Array, Array, Index] = _echoes(
+        (aims.origins_site, across, along, starts),
         directions,
         distances.reshape(n, _N_RAYS),
         shades.reshape(n, _N_RAYS),
         np.column_stack([spheres.p_site, spheres.radii, spheres.reflectivities]),
+        (optics.incidence, optics.gate, optics.energy_half * _N_RAYS, _PICKS[optics.pick]),
     )
     return found
 
 
 def _passes(scene: Scene, aims: Aims, half_width: float, clearance: float) -> Mask:
-    """Return which beams pass spheres (or poles, without a clearance) closely enough."""
+    """Return which beams pass spheres (or poles, with a half width) closely enough."""
     spheres, poles = scene.spheres, scene.poles
-    reach = np.maximum(spheres.radii, clearance)
-    feet = np.concatenate([spheres.p_site, poles.feet_site[: 0 if clearance else None]])
-    tops = np.concatenate([spheres.p_site, poles.tops_site[: 0 if clearance else None]])
-    radii = np.concatenate([reach, poles.radii[: 0 if clearance else None]])
+    n_poles = len(poles.radii) if half_width else 0
+    feet = np.concatenate([spheres.p_site, poles.feet_site[:n_poles]])
+    tops = np.concatenate([spheres.p_site, poles.tops_site[:n_poles]])
+    radii = np.concatenate([spheres.radii, poles.radii[:n_poles]]) + clearance
     found: Mask = _passes_axes(
         aims.origins_site, aims.directions_site, feet, tops - feet, radii, half_width
     )
@@ -143,6 +167,18 @@ def disc(n: int) -> Array:
     k = np.arange(n)
     radii, angles = np.sqrt((k + 0.5) / n), k * np.pi * (3 - np.sqrt(5))
     return np.column_stack([radii * np.cos(angles), radii * np.sin(angles)])
+
+
+def footprint(profile: Profile, n: int) -> Array:
+    """Return rays of equal energy, (n, 2): places across and along, in half widths."""
+    even = disc(n)
+    if profile is Profile.GAUSSIAN:  # within rho lies the share 1 - exp(-2 rho^2)
+        squares = (even**2).sum(axis=1, keepdims=True)
+        return even * np.sqrt(-0.5 * np.log1p(-squares) / squares)
+    if profile is Profile.TWO_LOBES:
+        side = np.where(np.arange(n) % 2, 1.0, -1.0)
+        return np.column_stack([_LOBE * even[:, 0] + (1.0 - _LOBE) * side, even[:, 1]])
+    return even
 
 
 @compiled
@@ -208,53 +244,78 @@ def _bundles(
 
 @compiled
 def _echoes(
-    origins: Array,
+    beams: tuple[Array, Array, Array, Array],
     directions: Array,
     distances: Column,
     shades: Column,
     spheres: Array,
-) -> tuple[Array, Array]:  # pragma: no cover
-    """Return the strongest echo of each bundle: range, and reflectivity times share."""
+    law: tuple[float, float, float, int],
+) -> tuple[Array, Array, Index]:  # pragma: no cover
+    """Return the echo of each bundle: range, reflectivity times share, and sphere.
+
+    ``beams`` are origins, axes across and along, and places of the rays on these at the window;
+    ``law`` is exponent of the cosine of incidence, gate, least energy and which echo is taken.
+    """
+    origins, across, along_spin, starts = beams
     n, k = distances.shape
     ranges, reflectivities = np.empty(n), np.empty(n)
-    t, shade = np.empty(k), np.empty(k)
+    of = np.empty(n, dtype=np.int64)
+    t, shade, label = np.empty(k), np.empty(k), np.empty(k, dtype=np.int64)
     for i in range(n):
         for j in range(k):
-            t[j], shade[j] = distances[i, j], shades[i, j]
+            t[j], shade[j], label[j] = distances[i, j], shades[i, j], -1
         for m in range(len(spheres)):
-            wx, wy = spheres[m, 0] - origins[i, 0], spheres[m, 1] - origins[i, 1]
-            wz, radius = spheres[m, 2] - origins[i, 2], spheres[m, 3]
-            distance = np.sqrt(wx * wx + wy * wy + wz * wz)
+            radius = spheres[m, 3]
             for j in range(k):
+                u, v = starts[j, 0], starts[j, 1]
+                wx = spheres[m, 0] - origins[i, 0] - u * across[i, 0] - v * along_spin[i, 0]
+                wy = spheres[m, 1] - origins[i, 1] - u * across[i, 1] - v * along_spin[i, 1]
+                wz = spheres[m, 2] - origins[i, 2] - u * across[i, 2] - v * along_spin[i, 2]
+                distance2 = wx * wx + wy * wy + wz * wz
                 dx, dy, dz = directions[i, j, 0], directions[i, j, 1], directions[i, j, 2]
                 along = wx * dx + wy * dy + wz * dz
-                if along < distance - 2.0 * radius:
+                if along < np.sqrt(distance2) - 2.0 * radius:
                     break  # well beside the bundle or behind it
-                inside = radius**2 - (distance**2 - along**2)
+                inside = radius**2 - (distance2 - along**2)
                 if inside >= 0.0 and 0.0 < along - np.sqrt(inside) < t[j]:
-                    t[j], shade[j] = along - np.sqrt(inside), spheres[m, 4]
-        ranges[i], reflectivities[i] = _strongest(t, shade)
-    return ranges, reflectivities
+                    t[j], shade[j], label[j] = along - np.sqrt(inside), spheres[m, 4], m
+                    if law[0] > 0.0:
+                        shade[j] *= (np.sqrt(inside) / radius) ** law[0]
+        ranges[i], reflectivities[i], of[i] = _picked(t, shade, label, law)
+    return ranges, reflectivities, of
 
 
 @compiled
-def _strongest(t: Array, shade: Array) -> tuple[float, float]:  # pragma: no cover
-    """Return range and reflectivity of the strongest group of returns of one pulse."""
+def _picked(
+    t: Array, shade: Array, label: Index, law: tuple[float, float, float, int]
+) -> tuple[float, float, int]:  # pragma: no cover
+    """Return range, reflectivity and sphere of the echo of a pulse that is recorded."""
+    _, gate, least, pick = law
     for i in range(1, len(t)):  # in place: sorted by range, the few rays of a bundle
-        ti, shade_i, j = t[i], shade[i], i
+        ti, shade_i, label_i, j = t[i], shade[i], label[i], i
         while j > 0 and t[j - 1] > ti:
-            t[j], shade[j] = t[j - 1], shade[j - 1]
+            t[j], shade[j], label[j] = t[j - 1], shade[j - 1], label[j - 1]
             j -= 1
-        t[j], shade[j] = ti, shade_i
-    best_energy, best_range, best_shade = 0.0, np.inf, 0.0
-    energy, moment, share = 0.0, 0.0, 0.0
-    for j in range(len(t)):
-        if np.isinf(t[j]):
-            break
-        if j and t[j] - t[j - 1] > _MERGE:
-            energy, moment, share = 0.0, 0.0, 0.0
-        weight = shade[j] / t[j] ** 2
-        energy, moment, share = energy + weight, moment + weight * t[j], share + shade[j]
-        if energy > best_energy:
+        t[j], shade[j], label[j] = ti, shade_i, label_i
+    best_energy, best_range, best_shade, best_of, begin = 0.0, np.inf, 0.0, -1, 0
+    while begin < len(t) and t[begin] < np.inf:
+        energy, moment, share, own, of, end = 0.0, 0.0, 0.0, 0.0, -1, begin
+        while end < len(t) and t[end] < np.inf and (end == begin or t[end] - t[end - 1] <= gate):
+            weight = shade[end] / t[end] ** 2
+            energy, moment, share = energy + weight, moment + weight * t[end], share + shade[end]
+            if of < 0:
+                of = label[end]
+            if of >= 0 and label[end] == of:
+                own += weight
+            end += 1
+        begin = end
+        if pick == 0 or (energy < least and best_energy < least):
+            takes = energy > best_energy
+        elif pick == 1:
+            takes = best_energy < least
+        else:
+            takes = energy >= least
+        if takes:
             best_energy, best_range, best_shade = energy, moment / energy, share / len(t)
-    return best_range, best_shade
+            best_of = of if 2.0 * own >= energy else -1
+    return best_range, best_shade, best_of

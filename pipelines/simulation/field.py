@@ -109,6 +109,8 @@ class Field:
         Where the rover stops, in the order of driving.
     decoys : tuple of Decoy
         Objects that might be mistaken for a marker; for comparison only.
+    family : str
+        What is particular about a random world; empty for the others.
     """
 
     scenario: str
@@ -119,6 +121,7 @@ class Field:
     marker_radius: float
     stops: tuple[Stop, ...]
     decoys: tuple[Decoy, ...] = ()
+    family: str = ""
 
     def stop(self, name: str) -> Stop:
         """Return the stop of a name.
@@ -179,22 +182,25 @@ def paper_field(seed: int) -> Field:
     )
 
 
-def marker_surfaces(p_site: Array, terrain: Terrain) -> tuple[Mesh, Spheres, Poles]:
+def marker_surfaces(
+    p_site: Array,
+    terrain: Terrain,
+    radius: float = MARKER_RADIUS,
+    pole_radius: float = _POLE_RADIUS,
+    shade: float = _MARKER_SHADE,
+) -> tuple[Mesh, Spheres, Poles]:
     """Return markers on their poles."""
     n = len(p_site)
     feet, tops = p_site.copy(), p_site.copy()
     feet[:, 2] = terrain.height_at(p_site)
-    tops[:, 2] -= np.sqrt(MARKER_RADIUS**2 - _POLE_RADIUS**2)
+    tops[:, 2] -= np.sqrt(radius**2 - pole_radius**2)
     meshes = [
-        pole_mesh(foot, top, _POLE_RADIUS, _POLE_SHADE)
-        for foot, top in zip(feet, tops, strict=True)
+        pole_mesh(foot, top, pole_radius, _POLE_SHADE) for foot, top in zip(feet, tops, strict=True)
     ]
     spheres = Spheres(
-        p_site=p_site.copy(),
-        radii=np.full(n, MARKER_RADIUS),
-        reflectivities=np.full(n, _MARKER_SHADE),
+        p_site=p_site.copy(), radii=np.full(n, radius), reflectivities=np.full(n, shade)
     )
-    poles = Poles(feet_site=feet, tops_site=tops, radii=np.full(n, _POLE_RADIUS))
+    poles = Poles(feet_site=feet, tops_site=tops, radii=np.full(n, pole_radius))
     return Mesh.merged(meshes), spheres, poles
 
 

@@ -12,10 +12,10 @@ from scipy.spatial.transform import Rotation
 
 from spheremark.pipelines.geometry import exp_motion, rot_z
 from spheremark.pipelines.model import Array, ImuMount, Nanos, Rig, seal
-from spheremark.pipelines.scan.rigs import tilted_vlp16
+from spheremark.pipelines.scan.rigs import N_LASERS, tilted_vlp16
 from spheremark.pipelines.simulation.options import SimulationConfig
 
-_RATE = 100.0  # [Hz] of joint samples and orientations
+_KNOT = 0.002  # [s] between the knots of a turn that ripples
 _LEAD = 0.05  # [s] that encoder and AHRS record before the first and after the last pulse
 _MARKER_RADIUS = 0.100  # [m] of the sphere that scan lines must not miss ...
 _MARKER_RANGE = 15.0  # [m] ... at this distance
@@ -50,7 +50,12 @@ def recorded_time(config: SimulationConfig) -> float:
     if config.step:
         rest = config.rest_revolutions * 60.0 / config.spin_rpm
         return _n_steps(config) * (rest + config.move) + rest
-    return config.turn + 60.0 / config.spin_rpm
+    return _turning_time(config) + 60.0 / config.spin_rpm
+
+
+def _turning_time(config: SimulationConfig) -> float:
+    """Return the time of an even turn through its sweep [s]."""
+    return float(config.turn * (config.sweep / (2 * np.pi)))
 
 
 def turning(config: SimulationConfig, start: float) -> Motion:
@@ -62,7 +67,7 @@ def stepped_turn(config: SimulationConfig, start: float) -> Motion:
     """Return a movement that rests at every step, at the first and last angle too."""
     rest = config.rest_revolutions * 60.0 / config.spin_rpm
     begins = np.arange(_n_steps(config) + 1) * (rest + config.move)
-    angles = np.minimum(np.arange(len(begins)) * config.step, 2 * np.pi)
+    angles = np.minimum(np.arange(len(begins)) * config.step, config.sweep)
     return Motion(
         times=np.column_stack([begins, begins + rest]).ravel(), angles=start + np.repeat(angles, 2)
     )
@@ -70,13 +75,17 @@ def stepped_turn(config: SimulationConfig, start: float) -> Motion:
 
 def _n_steps(config: SimulationConfig) -> int:
     """Return the number of steps of a turn."""
-    return int(np.ceil(2 * np.pi / config.step - 1e-9))
+    return int(np.ceil(config.sweep / config.step - 1e-9))
 
 
 def even_turn(config: SimulationConfig, start: float) -> Motion:
-    """Return a movement at constant speed, through 360 degrees in the time of the turn."""
-    times = np.array([-1.0, recorded_time(config) + 1.0])
-    return Motion(times=times, angles=start + 2 * np.pi / config.turn * times)
+    """Return a movement at constant speed, but for its ripples."""
+    end = recorded_time(config) + 1.0
+    n = int((end + 1.0) / _KNOT) if config.ripples else 1
+    times = np.linspace(-1.0, end, n + 1)
+    turned = 2 * np.pi / config.turn * times
+    sines = [amplitude * np.sin(periods * turned) for amplitude, periods in config.ripples]
+    return Motion(times=times, angles=start + turned + sum(sines))
 
 
 def nominal_rig(config: SimulationConfig) -> Rig:
@@ -103,11 +112,13 @@ def true_rig(config: SimulationConfig, rng: np.random.Generator) -> Rig:
     twist = np.concatenate([rng.normal(0.0, config.sigma_misalignment, 3), np.zeros(3)])
     T_head_lidar[:3, :3] = exp_motion(twist)[:3, :3] @ T_head_lidar[:3, :3]
     T_head_lidar[:2, 3] += rng.normal(0.0, config.sigma_axis_offset, 2)
+    optics, of_lasers = config.optics, rng.normal(0.0, config.sigma_laser_bias, N_LASERS)
     return replace(
         rig,
         name="true",
         T_head_lidar=T_head_lidar,
-        laser_range_biases=rng.normal(0.0, config.sigma_laser_bias, len(rig.laser_heights)),
+        laser_range_biases=optics.range_bias + of_lasers,
+        divergence=optics.divergence_scale * rig.divergence,
         encoder_eccentricity=rng.normal(0.0, config.sigma_eccentricity, 2),
         gimbal_clock_offset=config.gimbal_clock_offset,
     )
@@ -119,6 +130,10 @@ def joint_samples(
     """Return the samples of the gimbal's encoder: angles [rad] and instants [ns]."""
     times = _sample_times(config, rng)
     truth = motion.angle_at(times)
+    stamps = times - rig.gimbal_clock_offset
+    if config.sigma_joint_stamp:
+        late = np.abs(rng.normal(0.0, config.sigma_joint_stamp, len(times)))
+        stamps += np.minimum(late, 0.9 / config.joint_rate)
     c, s = rig.encoder_eccentricity
     angles = truth.copy()
     for _ in range(3):  # the amplitudes belong to the recorded angle; they are small
@@ -126,7 +141,7 @@ def joint_samples(
     angles = quantised(
         angles + rng.normal(0.0, config.sigma_encoder, len(times)), config.encoder_step
     )
-    return angles, _nanoseconds(times - rig.gimbal_clock_offset)
+    return angles, _nanoseconds(stamps)
 
 
 def ahrs_samples(
@@ -144,6 +159,9 @@ def ahrs_samples(
     if rig.imu_mount is ImuMount.HEAD:
         mount = Rotation.from_euler("z", motion.angle_at(times)[:, None]) * mount
     base = Rotation.from_matrix(rot_z(rng.uniform(-np.pi, np.pi))) * Rotation.from_rotvec(lean)
+    if config.sigma_ahrs_drift:
+        rates = rng.normal(0.0, config.sigma_ahrs_drift, 3)
+        base = base * Rotation.from_rotvec(times[:, None] * rates)
     orientations = base * shake * Rotation.from_matrix(R_station_base) * mount
     return orientations.as_quat(), _nanoseconds(times)
 
@@ -206,7 +224,8 @@ def horizon_lines(config: SimulationConfig) -> Array:
     """
     period = 60.0 / config.spin_rpm
     elevations = nominal_rig(config).laser_elevations
-    motion, end = turning(config, 0.0), recorded_time(config) if config.step else config.turn
+    motion = turning(config, 0.0)
+    end = recorded_time(config) if config.step else _turning_time(config)
     up, down = np.arange(0.0, end, period), np.arange(period / 2, end, period)
     front = motion.angle_at(up)[:, None] + np.pi / 2 - elevations
     back = motion.angle_at(down)[:, None] - np.pi / 2 + elevations
@@ -221,9 +240,10 @@ def _horizon_gaps(config: SimulationConfig) -> Array:
 
 def _sample_times(config: SimulationConfig, rng: np.random.Generator) -> Array:
     """Return the instants of samples that bracket all pulses, on either clock [s]."""
-    lead = _LEAD + abs(config.gimbal_clock_offset)
-    first = -lead - rng.uniform(0.0, 1.0 / _RATE)
-    return np.arange(first, recorded_time(config) + lead, 1.0 / _RATE)
+    period = 1.0 / config.joint_rate
+    lead = max(_LEAD, 2 * period) + abs(config.gimbal_clock_offset)
+    first = -lead - rng.uniform(0.0, period)
+    return np.arange(first, recorded_time(config) + lead, period)
 
 
 def _nanoseconds(times: Array) -> Nanos:

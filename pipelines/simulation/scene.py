@@ -17,7 +17,7 @@ _N_SIDES = 24  # of a pole: its flats lie 0.1 mm inside the circle
 _REGOLITH = (0.10, 0.20)  # diffuse reflectivity at 905 nm
 _PATCH = 0.5  # [m] regolith changes its reflectivity over about this length
 
-Caster = Callable[[Column], tuple[Column, Column]]
+Caster = Callable[..., tuple[Column, Column]]
 
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
@@ -198,11 +198,12 @@ def caster(mesh: Mesh) -> Caster:
     Returns
     -------
     callable
-        From rays, (n, 6) float32, origin and unit direction in the site frame [m], to distances,
-        (n,), infinite where nothing is met [m], and reflectivities, (n,), there zero.
+        From rays, (n, 6) float32, origin and unit direction in the site frame [m], and an exponent
+        of the cosine of incidence (0 by default) to distances, (n,), infinite where nothing is met
+        [m], and reflectivities times that power, (n,), there zero.
     """
     if not len(mesh.triangles):
-        return lambda rays: (
+        return lambda rays, _incidence=0.0: (
             np.full(len(rays), np.inf, np.float32),
             np.zeros(len(rays), np.float32),
         )
@@ -215,9 +216,14 @@ def caster(mesh: Mesh) -> Caster:
     )
     shades = np.append(mesh.reflectivities, 0.0).astype(np.float32)
 
-    def cast(rays: Column) -> tuple[Column, Column]:
+    def cast(rays: Column, incidence: float = 0.0) -> tuple[Column, Column]:
         hits = tree.cast_rays(o3d.core.Tensor.from_numpy(rays))
-        met = hits["primitive_ids"].numpy()
-        return hits["t_hit"].numpy(), shades[np.minimum(met, len(shades) - 1)]
+        met = np.minimum(hits["primitive_ids"].numpy(), len(shades) - 1)
+        dimmed = shades[met]
+        if incidence:
+            normals = hits["primitive_normals"].numpy()
+            cosines = np.abs(np.einsum("ij,ij->i", normals, rays[:, 3:]))
+            dimmed = dimmed * cosines**incidence
+        return hits["t_hit"].numpy(), dimmed
 
     return cast

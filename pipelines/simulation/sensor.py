@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from typing import Self
+from typing import Any, Self
 
 import numpy as np
+from numpy.typing import NDArray
 
 from spheremark.pipelines.compilation import compiled
 from spheremark.pipelines.model import Array, Column, Firings, Index, Mask, Nanos, Rig, Rings, seal
@@ -21,7 +22,7 @@ from spheremark.pipelines.scan.rigs import (
     RANGE_STEP,
 )
 from spheremark.pipelines.simulation.echo import Aims, Echoes
-from spheremark.pipelines.simulation.options import SimulationConfig
+from spheremark.pipelines.simulation.options import Optics, SimulationConfig
 from spheremark.pipelines.simulation.rig import Motion, quantised
 
 FIRINGS_PER_PACKET = N_BLOCKS * FIRINGS_PER_BLOCK
@@ -30,12 +31,11 @@ FIRINGS_PER_PACKET = N_BLOCKS * FIRINGS_PER_BLOCK
 _PULSES_PER_BLOCK = FIRINGS_PER_BLOCK * N_LASERS
 _FULL_TURN = 36_000  # steps of an azimuth
 _RANGE_LIMITS = (0.9, 100.0)  # [m] the VLP-16's own
+_DUST_REACH, _DUST_SHADE = 15.0, 0.05  # [m] up to which dust is detected, and its reflectivity
 _NOISE_LIMITS = (5.0, 15.0, 40.0, 100.0)  # calibrated reflectivity, 0-255
 _NOISE = np.array(
     [0.0137, 0.0107, 0.0089, 0.0067, 0.0064]
 )  # [m] seen in real packets, between them
-_HALF_SEEN = 0.10 / 50.0**2  # [1/m^2] reflectivity over squared range of an even detection chance
-_SOFTNESS = 0.15  # of that limit, in the logarithm of the energy
 _INTENSITY_NOISE = (1.0, 0.05)  # counts, and share of the value
 _TURN_WITHIN = 0.01  # [rad] more than the head turns within a firing, at 20 revolutions a second
 _NS_CYCLE, _NS_LASER = round(FIRING_CYCLE * 1e9), round(LASER_CYCLE * 1e9)
@@ -92,6 +92,10 @@ class Recorded:
         Instant of each return's pulse since the first one of the stop.
     firings : Firings
         All pulses, with and without a return; its start is that of the stop.
+    spheres : (n,)
+        Sphere of the scene that each return is from, -1 for none.
+    sigmas : (n,)
+        Standard deviation of each range [m].
     """
 
     p_lidar: Column
@@ -99,25 +103,28 @@ class Recorded:
     rings: Rings
     offsets_ns: Nanos
     firings: Firings
+    spheres: Index
+    sigmas: Array
 
     def __post_init__(self) -> None:
         n = len(self.rings)
-        seal(self, p_lidar=(n, 3), intensities=(n,), rings=(n,), offsets_ns=(n,))
+        columns = ("intensities", "rings", "offsets_ns", "spheres", "sigmas")
+        seal(self, p_lidar=(n, 3), **dict.fromkeys(columns, (n,)))
 
     @classmethod
     def joined(cls, pieces: Sequence[Self], start_ns: int) -> Self:
         """Return several pieces of one recording as one."""
+        def whole(parts: Iterable[NDArray[Any]]) -> NDArray[Any]:
+            return np.concatenate(list(parts))
+
+        columns = ("p_lidar", "intensities", "rings", "offsets_ns", "spheres", "sigmas")
+        firings = {
+            name: whole(getattr(piece.firings, name) for piece in pieces)
+            for name in ("azimuths", "distances", "reflectivities")
+        }
         return cls(
-            p_lidar=np.concatenate([piece.p_lidar for piece in pieces]),
-            intensities=np.concatenate([piece.intensities for piece in pieces]),
-            rings=np.concatenate([piece.rings for piece in pieces]),
-            offsets_ns=np.concatenate([piece.offsets_ns for piece in pieces]),
-            firings=Firings(
-                azimuths=np.concatenate([piece.firings.azimuths for piece in pieces]),
-                distances=np.concatenate([piece.firings.distances for piece in pieces]),
-                reflectivities=np.concatenate([piece.firings.reflectivities for piece in pieces]),
-                start_ns=start_ns,
-            ),
+            **{name: whole(getattr(piece, name) for piece in pieces) for name in columns},
+            firings=Firings(**firings, start_ns=start_ns),
         )
 
 
@@ -157,11 +164,17 @@ def record(
     pulses: Pulses, echoes: Echoes, rig: Rig, config: SimulationConfig, rng: np.random.Generator
 ) -> Recorded:
     """Return the record of some pulses."""
-    seen = np.flatnonzero(_is_seen(echoes, config.drop_out, rng))
+    optics = config.optics
+    echoes = _disturbed(echoes, optics, rng)
+    seen = np.flatnonzero(_is_seen(echoes, config, rng))
     rings, shades = pulses.rings[seen], 100.0 * echoes.reflectivities[seen]
-    sigma = range_noise(shades) if config.sigma_range is None else config.sigma_range
-    ranges = echoes.ranges[seen] + rig.laser_range_biases[rings]
-    ranges = quantised(ranges + sigma * rng.standard_normal(len(seen)), config.range_step)
+    sigmas = np.broadcast_to(
+        range_noise(shades) if config.sigma_range is None else config.sigma_range, len(seen)
+    )
+    if optics.sigma_weak:
+        sigmas = np.hypot(sigmas, optics.sigma_weak / _strengths(echoes, optics)[seen])
+    ranges = (1.0 + optics.range_scale) * echoes.ranges[seen] + rig.laser_range_biases[rings]
+    ranges = quantised(ranges + sigmas * rng.standard_normal(len(seen)), config.range_step)
     azimuths = recorded_azimuths(pulses.azimuths, config.azimuth_step)[seen]
     floor, share = _INTENSITY_NOISE
     counts = shades + (floor + share * shades) * rng.standard_normal(len(seen))
@@ -172,6 +185,8 @@ def record(
         rings=rings,
         offsets_ns=pulses.offsets_ns[seen],
         firings=_firings(pulses.azimuths, seen, ranges, intensities),
+        spheres=echoes.spheres[seen],
+        sigmas=np.array(sigmas),
     )
 
 
@@ -213,11 +228,32 @@ def range_noise(reflectivities: Array) -> Array:
     return np.asarray(_NOISE[np.digitize(reflectivities, _NOISE_LIMITS)])
 
 
-def _is_seen(echoes: Echoes, drop_out: float, rng: np.random.Generator) -> np.ndarray:
+def _disturbed(echoes: Echoes, optics: Optics, rng: np.random.Generator) -> Echoes:
+    """Return the echoes with those of dust, which come first, and with ranges that mean nothing."""
+    if not optics.dust and not optics.strays:
+        return echoes
+    ranges, shades = echoes.ranges.copy(), echoes.reflectivities.copy()
+    spheres, n = np.array(echoes.spheres), len(echoes.ranges)
+    dusty = rng.exponential(1.0 / optics.dust, n) if optics.dust else np.full(n, np.inf)
+    is_dust = dusty < np.minimum(ranges, _DUST_REACH)
+    is_stray = rng.random(n) < optics.strays
+    ranges[is_dust], shades[is_dust] = dusty[is_dust], _DUST_SHADE
+    ranges[is_stray] = rng.uniform(*_RANGE_LIMITS, is_stray.sum())
+    shades[is_stray] = 1.0
+    spheres[is_dust | is_stray] = -1
+    return Echoes(ranges=ranges, reflectivities=shades, spheres=spheres)
+
+
+def _strengths(echoes: Echoes, optics: Optics) -> Array:
+    """Return the energies of echoes over that of an even chance of detection."""
+    return np.asarray(echoes.reflectivities / echoes.ranges**2 / optics.energy_half)
+
+
+def _is_seen(echoes: Echoes, config: SimulationConfig, rng: np.random.Generator) -> Mask:
     """Return which echoes are strong enough and near enough, and not lost by chance."""
     is_seen = (echoes.ranges >= _RANGE_LIMITS[0]) & (echoes.ranges <= _RANGE_LIMITS[1])
-    strength = echoes.reflectivities[is_seen] / echoes.ranges[is_seen] ** 2 / _HALF_SEEN
-    chance = (1.0 - drop_out) / (1.0 + np.maximum(strength, 1e-12) ** (-1.0 / _SOFTNESS))
+    strength = np.maximum(_strengths(echoes, config.optics)[is_seen], 1e-12)
+    chance = (1.0 - config.drop_out) / (1.0 + strength ** (-1.0 / config.optics.softness))
     is_seen[is_seen] = rng.random(len(chance)) < chance
     return is_seen
 

@@ -11,11 +11,22 @@ import numpy as np
 
 from spheremark.pipelines.errors import InputError
 from spheremark.pipelines.geometry import rigid, rot_x, rot_y, rot_z
-from spheremark.pipelines.model import Array, Firings, Nanos, Origin, Rig, ScanLog, StopTruth, Truth
+from spheremark.pipelines.model import (
+    RING_UNKNOWN,
+    Array,
+    Firings,
+    Index,
+    Nanos,
+    Origin,
+    Rig,
+    ScanLog,
+    StopTruth,
+    Truth,
+)
 from spheremark.pipelines.scan.rigs import FIRING_CYCLE, N_LASERS, rig_digest
 from spheremark.pipelines.simulation.echo import NEAR, Echoes, trace
 from spheremark.pipelines.simulation.field import Field, checked_seed
-from spheremark.pipelines.simulation.options import SimulationConfig
+from spheremark.pipelines.simulation.options import Optics, SimulationConfig
 from spheremark.pipelines.simulation.rig import (
     Motion,
     ahrs_samples,
@@ -44,6 +55,7 @@ _FIRST_STOP = datetime(2026, 5, 11, 9, 0, tzinfo=UTC)
 _BETWEEN_STOPS = timedelta(seconds=90)
 _HOME = np.radians(1.0)  # the gimbal starts within this of zero
 _THINNING = 128  # one firing in so many is traced in any case: every 7 ms
+_LINE_NS = 10_000_000  # less than half a revolution at 20 in a second
 _RIG, _STOP = 100, 101  # random streams
 
 
@@ -61,12 +73,21 @@ class SimulatedStop:
         The true rig.
     firings : Firings
         All pulses of the LiDAR as its packets hold them; its returns are those of the log.
+    marks : (n,)
+        Mark of the field that each return of the log is from, -1 for none.
+    sigmas : (n,)
+        Standard deviation of each range [m].
+    counts : tuple of (int, int)
+        Returns and scan lines of each mark of the field.
     """
 
     log: ScanLog
     truth: StopTruth
     rig: Rig
     firings: Firings
+    marks: Index
+    sigmas: Array
+    counts: tuple[tuple[int, int], ...]
 
 
 class _Run(NamedTuple):
@@ -141,7 +162,7 @@ def simulate_stop(
     log = ScanLog(
         p_lidar=returns.p_lidar,
         intensities=returns.intensities,
-        rings=returns.rings,
+        rings=returns.rings if config.has_rings else np.full_like(returns.rings, RING_UNKNOWN),
         stamps_lidar_ns=start_ns + _stamped(returns.offsets_ns, config),
         has_pulse_times=config.shot_times,
         gimbal_angles=joint[0],
@@ -152,7 +173,16 @@ def simulate_stop(
         origin=Origin(name=name, digest=""),
     )
     truth = StopTruth(name=name, T_site_base=T_site_base)
-    return SimulatedStop(log=log, truth=truth, rig=rig, firings=returns.firings)
+    is_mark = (returns.spheres >= 0) & (returns.spheres < len(field.marks.names))
+    return SimulatedStop(
+        log=log,
+        truth=truth,
+        rig=rig,
+        firings=returns.firings,
+        marks=np.where(is_mark, returns.spheres, -1),
+        sigmas=returns.sigmas,
+        counts=_counts(returns, len(field.marks.names)),
+    )
 
 
 def survey_truth(
@@ -175,7 +205,7 @@ def survey_truth(
     -------
     Truth
         Marks, poses, the true rig, configuration and seeds, the decoys on the field, and the
-        visible share of each marker from each stop.
+        visible share, returns and scan lines of each marker from each stop.
 
     Raises
     ------
@@ -194,6 +224,7 @@ def survey_truth(
         rig=stops[0].rig,
         about={
             "scenario": field.scenario,
+            "family": field.family,
             "scenario_seed": field.seed,
             "seed": seed,
             "marker_radius_m": field.marker_radius,
@@ -203,6 +234,13 @@ def survey_truth(
                 for decoy in field.decoys
             ],
             "visible_shares": {stop.truth.name: _shares(field, stop) for stop in stops},
+            "returns": {
+                stop.truth.name: {
+                    name: {"n": n, "n_lines": n_lines}
+                    for name, (n, n_lines) in zip(field.marks.names, stop.counts, strict=True)
+                }
+                for stop in stops
+            },
         },
     )
 
@@ -213,6 +251,21 @@ def _shares(field: Field, stop: SimulatedStop) -> dict[str, float]:
         field.scene, field.marks.p_site, field.marker_radius, stop.truth.T_site_base[:3, 3]
     )
     return dict(zip(field.marks.names, np.round(shares, 3).tolist(), strict=True))
+
+
+def _counts(returns: Recorded, n_marks: int) -> tuple[tuple[int, int], ...]:
+    """Return how many returns each marker has, and on how many scan lines.
+
+    A line is one crossing of a laser; the next one is half a revolution later or more.
+    """
+    counts = []
+    for mark in range(n_marks):
+        own = np.flatnonzero(returns.spheres == mark)
+        own = own[np.argsort(returns.rings[own], kind="stable")]
+        rings, offsets_ns = returns.rings[own].astype(int), returns.offsets_ns[own]
+        is_next = (np.diff(rings) != 0) | (np.diff(offsets_ns) > _LINE_NS)
+        counts.append((len(own), int(is_next.sum()) + min(len(own), 1)))
+    return tuple(counts)
 
 
 def _lean(rng: np.random.Generator, sigma: float) -> Array:
@@ -244,20 +297,23 @@ def _scan(
         progress(first / n, "Casting beams")
         pulses = fire(first, min(_CHUNK, n - first), start_azimuth, run.motion, config.spin_rpm)
         if config.only_near_spheres:
-            echoes = _near_spheres(run, pulses)
+            echoes = _near_spheres(run, pulses, config.optics)
         else:
-            echoes = trace(run.scene, aim(pulses, rig, run.T_site_base), rig.divergence)
+            aims = aim(pulses, rig, run.T_site_base)
+            echoes = trace(run.scene, aims, rig.divergence, optics=config.optics)
         pieces.append(record(pulses, echoes, rig, config, rng))
     progress(1.0, "All beams cast")
     return pieces
 
 
-def _near_spheres(run: _Run, pulses: Pulses) -> Echoes:
+def _near_spheres(run: _Run, pulses: Pulses, optics: Optics) -> Echoes:
     """Return the echoes of pulses that pass spheres closely, and of one firing in 128.
 
     The latter show the turn and the ground.
     """
     anyway = np.arange(len(pulses.rings)) // N_LASERS % _THINNING == 0
-    chosen = anyway | may_pass(pulses, run.rig, run.T_site_base, run.scene.spheres.p_site, NEAR)
+    spheres = run.scene.spheres
+    near = float(spheres.radii.max(initial=0.0)) + NEAR
+    chosen = anyway | may_pass(pulses, run.rig, run.T_site_base, spheres.p_site, near)
     aims = aim(pulses.rows(chosen), run.rig, run.T_site_base)
-    return trace(run.scene, aims, run.rig.divergence, anyway[chosen]).among(chosen)
+    return trace(run.scene, aims, run.rig.divergence, anyway[chosen], optics).among(chosen)
