@@ -5,8 +5,9 @@ gimbal at one of the stops and returns the log and, apart from it, the truth. In
 
 - ``options`` is the configuration,
 - ``terrain`` and ``rocks`` make the ground, ``scene`` holds all surfaces,
-- ``field`` is the published field; ``bodies`` and ``clutter`` add objects that are no markers,
-  ``lane`` spreads markers over distances, ``scenarios`` lists all worlds by name,
+- ``field`` is the published field; ``bodies`` and ``objects`` make what is no marker, ``clutter``
+  places it, ``lane`` spreads markers over distances, ``worlds`` draws all of it and the physics at
+  random, ``scenarios`` lists all worlds by name,
 - ``visibility`` computes the visible share of each marker from a stop,
 - ``rig`` moves the LiDAR and records encoder and AHRS,
 - ``sensor`` fires the lasers and records their echoes, which ``echo`` traces,
@@ -20,16 +21,21 @@ from spheremark.pipelines.simulation.options import SimulationConfig
 from spheremark.pipelines.simulation.rig import commensurability, horizon_lines
 from spheremark.pipelines.simulation.scenarios import SCENARIOS, scenario
 from spheremark.pipelines.simulation.stop import SimulatedStop, simulate_stop, survey_truth
+from spheremark.pipelines.simulation.worlds import FAMILIES, RandomWorld, draw_world, random_world
 
 __all__ = [
+    "FAMILIES",
     "SCENARIOS",
     "Decoy",
     "Field",
+    "RandomWorld",
     "SimulatedStop",
     "SimulationConfig",
     "Stop",
     "commensurability",
+    "draw_world",
     "horizon_lines",
+    "random_world",
     "scenario",
     "simulate_stop",
     "survey_truth",

@@ -66,18 +66,16 @@ class Echoes:
         Energy-weighted mean distance along the beam; infinite without an echo [m].
     reflectivities : (n,)
         Reflectivity of the surface times its share of the footprint, 0 to 1.
-    spheres : (n,) or None
-        Sphere of the scene that at least half of the energy is from, -1 for none; by default -1.
+    spheres : (n,)
+        Sphere of the scene that at least half of the energy is from, -1 for none.
     """
 
     ranges: Array
     reflectivities: Array
-    spheres: Index | None = None
+    spheres: Index
 
     def __post_init__(self) -> None:
         n = len(self.ranges)
-        if self.spheres is None:
-            object.__setattr__(self, "spheres", np.full(n, -1))
         seal(self, ranges=(None,), reflectivities=(n,), spheres=(n,))
 
     def among(self, chosen: Mask) -> Echoes:
@@ -174,7 +172,7 @@ def footprint(profile: Profile, n: int) -> Array:
     even = disc(n)
     if profile is Profile.GAUSSIAN:  # within rho lies the share 1 - exp(-2 rho^2)
         squares = (even**2).sum(axis=1, keepdims=True)
-        return even * np.sqrt(-0.5 * np.log1p(-squares) / squares)
+        return np.asarray(even * np.sqrt(-0.5 * np.log1p(-squares) / squares))
     if profile is Profile.TWO_LOBES:
         side = np.where(np.arange(n) % 2, 1.0, -1.0)
         return np.column_stack([_LOBE * even[:, 0] + (1.0 - _LOBE) * side, even[:, 1]])

@@ -176,7 +176,7 @@ class SimulationConfig:
     move: float = 0.1
     shot_times: bool = True
     has_rings: bool = True
-    optics: Optics = Optics()  # noqa: RUF009  frozen
+    optics: Optics = Optics()
     sigma_range: float | None = None
     sigma_laser_bias: float = 0.003
     drop_out: float = 0.005

@@ -21,8 +21,8 @@ _BURIED = 0.3  # share of a rock's half height that its centre lies above ground
 _REFLECTIVITY = (0.10, 0.22)
 
 
-def draw_rocks(rng: np.random.Generator, keep_clear: Array) -> Array:
-    """Return places and sizes of rocks.
+def draw_rocks(rng: np.random.Generator, keep_clear: Array, cover: float = _COVER) -> Array:
+    """Return places and sizes of rocks that cover a share of the ground.
 
     Notes
     -----
@@ -32,7 +32,7 @@ def draw_rocks(rng: np.random.Generator, keep_clear: Array) -> Array:
     """
     sizes = np.linspace(*_SIZES, 2000)
     shares = _DECAY * np.exp(-_DECAY * sizes)  # of the ground, per metre of diameter
-    shares *= _COVER / np.ptp(np.exp(-_DECAY * sizes))
+    shares *= cover / np.ptp(np.exp(-_DECAY * sizes))
     density = shares / (np.pi / 4 * sizes**2)  # [1/m^3]
     cumulative = np.concatenate(
         [[0.0], np.cumsum(np.diff(sizes) * (density[1:] + density[:-1]) / 2)]

@@ -8,12 +8,14 @@ from spheremark.pipelines.errors import ConfigError
 from spheremark.pipelines.simulation.clutter import clutter_field, rock_field
 from spheremark.pipelines.simulation.field import Field, checked_seed, paper_field
 from spheremark.pipelines.simulation.lane import range_lane
+from spheremark.pipelines.simulation.worlds import random_field
 
 SCENARIOS: dict[str, Callable[[int], Field]] = {
     "paper-field": paper_field,
     "clutter-field": clutter_field,
     "rock-field": rock_field,
     "range-lane": range_lane,
+    "random": random_field,
 }
 """Worlds by the name of their scenario."""
 

@@ -114,6 +114,7 @@ class Recorded:
     @classmethod
     def joined(cls, pieces: Sequence[Self], start_ns: int) -> Self:
         """Return several pieces of one recording as one."""
+
         def whole(parts: Iterable[NDArray[Any]]) -> NDArray[Any]:
             return np.concatenate(list(parts))
 

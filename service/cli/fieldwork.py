@@ -22,6 +22,9 @@ from spheremark.pipelines.simulation import (
 from spheremark.storage.imports.survey_files import write_control, write_truth
 from spheremark.storage.recordings import write_log
 
+RANDOM = "random"
+"""Scenario whose physics are drawn too."""
+
 _LANE = "lane3"  # the middle one
 
 
@@ -29,7 +32,8 @@ _LANE = "lane3"  # the middle one
 class Assignment:
     """What to simulate, and how to write it: as points or as raw packets.
 
-    Without stops: the middle lane of a field with lanes, all stops of any other.
+    Without stops: the middle lane of a field with lanes, the first stop of a random world, and all
+    stops of any other.
     """
 
     scenario: str
@@ -84,9 +88,12 @@ def survey(
     folder: Path, assignment: Assignment, *, progress: Progress = lambda _share, _what: None
 ) -> Iterator[WrittenStop]:
     """Simulate stop after stop into a folder; yield each one when its files are complete."""
-    field = scenario(assignment.scenario, assignment.seed)
-    has_lanes = any(stop.name.startswith(_LANE) for stop in field.stops)
-    names = chosen_stops(field, assignment.stops or (_LANE if has_lanes else "all"))
+    field, usual = scenario(assignment.scenario, assignment.seed), _LANE
+    if assignment.scenario == RANDOM:
+        usual = field.stops[0].name
+    elif not any(stop.name.startswith(_LANE) for stop in field.stops):
+        usual = "all"
+    names = chosen_stops(field, assignment.stops or usual)
     folder.mkdir(parents=True, exist_ok=True)
     write_control(field.marks, folder / "control.csv")
     for i, name in enumerate(names):

@@ -9,9 +9,10 @@ from __future__ import annotations
 import json
 import math
 import sys
+from dataclasses import replace
 from enum import StrEnum
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
@@ -123,27 +124,43 @@ def simulate(
     folder: Annotated[Path, typer.Argument(metavar="OUT", help="Folder for the logs.")],
     scenario: Annotated[
         str,
-        typer.Option(help="World: paper-field, clutter-field, rock-field or range-lane."),
+        typer.Option(
+            "--scenario",
+            "--world",
+            help="World: paper-field, clutter-field, rock-field, range-lane; or random, "
+            "with optics, rig and motion drawn too, but for those given.",
+        ),
     ] = "paper-field",
     stops: Annotated[
         str,
         typer.Option(
             help="Names, lanes (lane3), numbers or ranges (1-7), or all.",
-            show_default="lane3, or all where there are no lanes",
+            show_default="lane3; stop1 of a random world; all of others",
         ),
     ] = "",
     seed: Annotated[int, typer.Option(min=0, help="Source of chance.")] = 0,
-    turn_s: Annotated[float, typer.Option(help="Time of a full turn of the gimbal \\[s].")] = 13.2,
-    rpm: Annotated[float, typer.Option(help="Speed of the LiDAR [1/min].")] = 600.0,
+    turn_s: Annotated[
+        float | None,
+        typer.Option(help="Time of a full turn of the gimbal \\[s].", show_default="13.2"),
+    ] = None,
+    rpm: Annotated[
+        float | None, typer.Option(help="Speed of the LiDAR [1/min].", show_default="600")
+    ] = None,
     sigma_mm: Annotated[
         float | None, typer.Option(help="Noise of ranges \\[mm]; by reflectivity if not given.")
     ] = None,
     step_deg: Annotated[
-        float, typer.Option(help="Angle between rests of the gimbal \\[deg]; 0 turns evenly.")
-    ] = 0.0,
+        float | None,
+        typer.Option(
+            help="Angle between rests of the gimbal \\[deg]; 0 turns evenly.", show_default="0"
+        ),
+    ] = None,
     shot_times: Annotated[
-        bool, typer.Option(help="Whether the points of a cloud carry a time each.")
-    ] = True,
+        bool | None,
+        typer.Option(
+            help="Whether the points of a cloud carry a time each.", show_default="shot-times"
+        ),
+    ] = None,
     form: Annotated[
         Format, typer.Option("--format", help="Point clouds, or raw packets of a VLP-16.")
     ] = Format.POINTS,
@@ -151,17 +168,18 @@ def simulate(
     as_json: AsJson = False,
 ) -> None:
     """Write logs as a recorder would (STOP.mcap), their truth (STOP.truth.json) and control.csv."""
-    from spheremark.pipelines.simulation import SimulationConfig, commensurability
-    from spheremark.service.cli.fieldwork import Assignment, survey
+    from spheremark.pipelines.simulation import SimulationConfig, commensurability, draw_world
+    from spheremark.service.cli.fieldwork import RANDOM, Assignment, survey
 
-    sigma = None if sigma_mm is None else sigma_mm / 1000.0
-    config = SimulationConfig(
-        turn=turn_s,
-        spin_rpm=rpm,
-        sigma_range=sigma,
-        step=math.radians(step_deg),
-        shot_times=shot_times,
-    )
+    given: dict[str, Any] = {
+        "turn": turn_s,
+        "spin_rpm": rpm,
+        "sigma_range": None if sigma_mm is None else sigma_mm / 1000.0,
+        "step": None if step_deg is None else math.radians(step_deg),
+        "shot_times": shot_times,
+    }
+    config = draw_world(seed).config if scenario == RANDOM else SimulationConfig()
+    config = replace(config, **{name: one for name, one in given.items() if one is not None})
     if warning := commensurability(config):
         err.print(f"[yellow]Warning:[/] {warning}", soft_wrap=True)
     assignment = Assignment(

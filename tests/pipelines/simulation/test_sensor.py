@@ -22,7 +22,9 @@ def pulses():
 def recorded(pulses, ranges, shade, **changes):
     config = SimulationConfig.perfect(**changes)
     n = len(pulses.rings)
-    echoes = Echoes(ranges=np.full(n, ranges), reflectivities=np.full(n, shade))
+    echoes = Echoes(
+        ranges=np.full(n, ranges), reflectivities=np.full(n, shade), spheres=np.full(n, -1)
+    )
     return record(pulses, echoes, nominal_rig(config), config, np.random.default_rng(4))
 
 
