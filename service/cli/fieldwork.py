@@ -19,7 +19,7 @@ from spheremark.pipelines.simulation import (
     simulate_stop,
     survey_truth,
 )
-from spheremark.storage.imports.survey_files import write_control, write_truth
+from spheremark.storage.imports.survey_files import format_control, format_truth
 from spheremark.storage.recordings import write_log
 
 RANDOM = "random"
@@ -95,7 +95,7 @@ def survey(
         usual = "all"
     names = chosen_stops(field, assignment.stops or usual)
     folder.mkdir(parents=True, exist_ok=True)
-    write_control(field.marks, folder / "control.csv")
+    (folder / "control.csv").write_text(format_control(field.marks), encoding="utf-8")
     for i, name in enumerate(names):
         yield _write(
             folder, field, name, assignment, part_of(progress, i / len(names), (i + 1) / len(names))
@@ -116,6 +116,7 @@ def _write(
         compression=assignment.compression,
         firings=stop.firings if assignment.packets else None,
     )
-    write_truth(survey_truth(field, [stop], assignment.config, field.seed), made.truth)
+    truth = survey_truth(field, [stop], assignment.config, field.seed)
+    made.truth.write_text(format_truth(truth), encoding="utf-8")
     part.replace(made.log)
     return made

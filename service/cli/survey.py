@@ -153,7 +153,7 @@ def calibrate(
     with progress() as track:
         found = calibrate_files(logs, config, start, track)
     if target:
-        site_files.write_rig(found.rig, target)
+        target.write_text(site_files.format_rig(found.rig), encoding="utf-8")
     plain = serialise_calibration(found)
     if as_json:
         print_json(plain)

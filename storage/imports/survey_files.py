@@ -62,6 +62,7 @@ _APART_MIN = 0.01  # [m] nearer marks are one mark entered twice
 _COORDINATE_MAX = 1e8  # [m] larger than any national grid
 _EXPECTED = "expected mark,x_m,y_m,z_m and, if known, sigma_x_m,sigma_y_m,sigma_z_m [m]"
 _HEIGHT_MAX = 100.0  # [m] of a target above its mark
+_NUMBER = re.compile(r"[-+.\d]|nan$|inf", re.IGNORECASE)  # how a cell that is no heading begins
 _RIGID_TOLERANCE = 1e-6  # how far a rotation matrix may be from orthonormal
 
 _T = TypeVar("_T")
@@ -138,7 +139,11 @@ def parse_control(text: str, layout: ControlLayout = _PLAIN) -> ControlMarks:
         raise ControlError(f"The control table has a header but no marks; {_EXPECTED}.")
     if len(body) > _ROWS_MAX:
         raise ControlError(f"The control table has more than {_ROWS_MAX:,} marks.")
-    return _marks([_Row(line=n, columns=columns, cells=cells) for n, cells in body], layout)
+    table = _table(columns, body)
+    p, sigmas = table.positions(layout), table.sigmas(_UNITS[layout.unit])
+    names = table.names()
+    _require_apart(p, names, table.lines)
+    return ControlMarks(names=names, p_site=p, cov_p_site=sigmas[:, :, None] ** 2 * np.eye(3))
 
 
 def format_control(marks: ControlMarks) -> str:
@@ -275,35 +280,9 @@ def read_control(path: str | Path, layout: ControlLayout = _PLAIN) -> ControlMar
     return _read(path, lambda text: parse_control(text, layout), ControlError)
 
 
-def write_control(marks: ControlMarks, path: str | Path) -> None:
-    """Write control marks to a CSV file.
-
-    Parameters
-    ----------
-    marks : ControlMarks
-        The marks.
-    path : str or Path
-        The file; replaced if it exists.
-    """
-    Path(path).write_text(format_control(marks), encoding="utf-8")
-
-
 def read_truth(path: str | Path) -> Truth:
     """Read the truth of a survey from a file, as ``parse_truth`` does."""
     return _read(path, parse_truth, TruthError)
-
-
-def write_truth(truth: Truth, path: str | Path) -> None:
-    """Write the truth of a survey to a JSON file.
-
-    Parameters
-    ----------
-    truth : Truth
-        The truth.
-    path : str or Path
-        The file; replaced if it exists.
-    """
-    Path(path).write_text(format_truth(truth), encoding="utf-8")
 
 
 def read_rig(path: str | Path) -> Rig:
@@ -311,73 +290,60 @@ def read_rig(path: str | Path) -> Rig:
     return _read(path, parse_rig, RigError)
 
 
-def write_rig(rig: Rig, path: str | Path) -> None:
-    """Write a rig to a JSON file."""
-    Path(path).write_text(format_rig(rig), encoding="utf-8")
-
-
 @dataclass(frozen=True, slots=True, kw_only=True)
-class _Row:
-    """One line of a control table."""
+class _Table:
+    """The cells of a control table by column, and the line of each row."""
 
-    line: int
-    columns: Sequence[str]
-    cells: Sequence[str]
+    lines: tuple[int, ...]
+    cells: Mapping[str, Sequence[str]]
 
-    def __post_init__(self) -> None:
-        if len(self.cells) != len(self.columns):
+    def numbers(self, column: str) -> Array:
+        """Return the numbers in a column."""
+        cells = self.cells[column]
+        numbers = np.array([_number(cell) for cell in cells])
+        if (wrong := np.flatnonzero(~(np.abs(numbers) < _COORDINATE_MAX))).size:
             raise ControlError(
-                f"Line {self.line} of the control table has {len(self.cells)} values and must "
-                f"have {len(self.columns)} ({', '.join(self.columns)}); {_EXPECTED}."
+                f"Line {self.lines[wrong[0]]}, column {column} of the control table is "
+                f"{cells[wrong[0]]!r}; it must be a number of metres below {_COORDINATE_MAX:g}."
             )
+        return numbers
 
-    def number(self, column: str) -> float:
-        """Return the number in a column."""
-        cell = self.cells[self.columns.index(column)]
-        try:
-            number = float(cell)
-        except ValueError:
-            number = math.nan
-        if not abs(number) < _COORDINATE_MAX:
-            raise ControlError(
-                f"Line {self.line}, column {column} of the control table is {cell!r}; it must be "
-                f"a number of metres below {_COORDINATE_MAX:g}."
-            )
-        return number
+    def names(self) -> tuple[str, ...]:
+        """Return the names of the marks, all different."""
+        lines: dict[str, int] = {}
+        for line, name in zip(self.lines, self.cells["mark"], strict=True):
+            if not name:
+                raise ControlError(f"Line {line} of the control table has a mark without a name.")
+            if name in lines:
+                raise ControlError(
+                    f"Lines {lines[name]} and {line} of the control table both name the mark "
+                    f"{name!r}; names must differ."
+                )
+            lines[name] = line
+        return tuple(lines)
 
-    def name(self) -> str:
-        """Return the name of the mark."""
-        name = self.cells[self.columns.index("mark")]
-        if not name:
-            raise ControlError(f"Line {self.line} of the control table has a mark without a name.")
-        return name
-
-    def position(self, layout: ControlLayout) -> list[float]:
-        """Return the position of the centre [m]."""
+    def positions(self, layout: ControlLayout) -> Array:
+        """Return the positions of the centres, (n, 3) [m]."""
         unit = _UNITS[layout.unit]
-        is_down = "down_m" in self.columns
-        x, y = unit * self.number("x_m"), unit * self.number("y_m")
-        z = unit * (-self.number("down_m") if is_down else self.number("z_m"))
-        height = layout.target_height
-        if "target_height_m" in self.columns:
-            height = unit * self.number("target_height_m")
-        return [x, y, z + height]
+        up = -self.numbers("down_m") if "down_m" in self.cells else self.numbers("z_m")
+        p = unit * np.column_stack([self.numbers("x_m"), self.numbers("y_m"), up])
+        has_heights = "target_height_m" in self.cells
+        p[:, 2] += unit * self.numbers("target_height_m") if has_heights else layout.target_height
+        return p
 
-    def sigmas(self) -> list[float]:
-        """Return the standard deviations of the coordinates [m]."""
-        if "sigma_m" in self.columns:
-            columns = ["sigma_m"] * 3
-        elif "sigma_x_m" in self.columns:
-            columns = ["sigma_x_m", "sigma_y_m", "sigma_z_m"]
-        else:
-            return [0.0, 0.0, 0.0]
-        sigmas = [self.number(column) for column in columns]
-        if min(sigmas) < 0.0:
+    def sigmas(self, unit: float) -> Array:
+        """Return the standard deviations of the coordinates, (n, 3) [m]."""
+        columns = [name for name in CONTROL_COLUMNS[4:] if name in self.cells] or ["sigma_m"] * 3
+        if columns[0] not in self.cells:
+            return np.zeros((len(self.lines), 3))
+        sigmas = np.column_stack([self.numbers(column) for column in columns])
+        if (sigmas < 0.0).any():
+            row, axis = np.argwhere(sigmas < 0.0)[0]
             raise ControlError(
-                f"Line {self.line}, column {columns[int(np.argmin(sigmas))]} of the control table "
-                f"is {min(sigmas):g}; a standard deviation cannot be negative."
+                f"Line {self.lines[row]}, column {columns[axis]} of the control table is "
+                f"{sigmas[row, axis]:g}; a standard deviation cannot be negative."
             )
-        return sigmas
+        return unit * sigmas
 
 
 def table_rows(text: str) -> Iterator[tuple[int, list[str]]]:
@@ -413,7 +379,7 @@ def _columns(
 ) -> tuple[list[str], list[tuple[int, list[str]]]]:
     """Return the names of the columns, and the rows below the header if there is one."""
     first = rows[0][1]
-    if len(first) in (4, 5, 7) and all(_is_number(cell) for cell in first[1:4]):
+    if len(first) in (4, 5, 7) and all(map(_NUMBER.match, first[1:4])):
         sigmas = [f"sigma_{axis}" for axis in _AXES["neu" if axes == "ned" else axes]]
         rest = {4: [], 5: ["note"], 7: sigmas}[len(first)]
         return ["mark", *_AXES[axes], *rest], rows
@@ -457,34 +423,28 @@ def _require_columns(columns: list[str], header: list[str]) -> None:
         raise ControlError(f"The control table {fault} ({', '.join(header)}); {_EXPECTED}.")
 
 
-def _is_number(cell: str) -> bool:
-    """Return whether a cell is a number, finite or not."""
+def _number(cell: str) -> float:
+    """Return the number in a cell; NaN where it holds none."""
     try:
-        float(cell)
+        return float(cell)
     except ValueError:
-        return False
-    return True
+        return math.nan
 
 
-def _marks(rows: list[_Row], layout: ControlLayout) -> ControlMarks:
-    """Return the marks; refuse equal names or positions."""
-    lines: dict[str, int] = {}
-    for row in rows:
-        if row.name() in lines:
+def _table(columns: Sequence[str], rows: Sequence[tuple[int, list[str]]]) -> _Table:
+    """Return the cells below a header by column."""
+    for line, cells in rows:
+        if len(cells) != len(columns):
             raise ControlError(
-                f"Lines {lines[row.name()]} and {row.line} of the control table both name the mark "
-                f"{row.name()!r}; names must differ."
+                f"Line {line} of the control table has {len(cells)} values and must have "
+                f"{len(columns)} ({', '.join(columns)}); {_EXPECTED}."
             )
-        lines[row.name()] = row.line
-    p = np.array([row.position(layout) for row in rows])
-    sigmas = np.array([row.sigmas() for row in rows]) * _UNITS[layout.unit]
-    _require_apart(p, rows)
-    return ControlMarks(
-        names=tuple(lines), p_site=p, cov_p_site=sigmas[:, :, None] ** 2 * np.eye(3)
-    )
+    by_column = zip(*(cells for _, cells in rows), strict=True)
+    lines = tuple(line for line, _ in rows)
+    return _Table(lines=lines, cells=dict(zip(columns, by_column, strict=True)))
 
 
-def _require_apart(p: Array, rows: list[_Row]) -> None:
+def _require_apart(p: Array, names: Sequence[str], lines: Sequence[int]) -> None:
     """Refuse two marks at one position; only neighbours in x are compared."""
     order = np.argsort(p[:, 0], kind="stable")
     for step in range(1, len(p)):
@@ -496,8 +456,8 @@ def _require_apart(p: Array, rows: list[_Row]) -> None:
             place = int(np.argmin(apart))
             first, second = sorted((int(order[place]), int(order[place + step])))
             raise ControlError(
-                f"Lines {rows[first].line} and {rows[second].line} of the control table place "
-                f"{rows[first].name()!r} and {rows[second].name()!r} {apart[place] * 1e3:.1f} mm "
+                f"Lines {lines[first]} and {lines[second]} of the control table place "
+                f"{names[first]!r} and {names[second]!r} {apart[place] * 1e3:.1f} mm "
                 f"apart; marks must be at least {_APART_MIN * 1e3:.0f} mm apart."
             )
 
