@@ -13,6 +13,7 @@ import signal
 import struct
 import sys
 from collections.abc import Iterable
+from pathlib import Path
 
 _FILES_MAX = 64  # open files of the process
 _NEW_NAMESPACES = 0x10000000 | 0x40000000 | 0x08000000  # of users, of networks, of shared memory
@@ -69,12 +70,20 @@ def leave_files() -> bool:
     bool
         Whether it could be.
     """
+    return enter_folder(Path("/proc/self/fd")) == Path("/")
+
+
+def enter_folder(folder: Path) -> Path:
+    """Make a folder the root of this process's files, where it may; return its path from now on.
+
+    Call it after ``leave_network``, whose namespace allows it.
+    """
     try:
-        os.chroot("/proc/self/fd")
+        os.chroot(folder)
         os.chdir("/")
     except OSError:
-        return False
-    return True
+        return folder
+    return Path("/")
 
 
 def forbid_files(readable: Iterable[int]) -> bool:

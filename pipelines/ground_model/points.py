@@ -39,6 +39,8 @@ class StationPoints:
         Laser of each return.
     times : (n,) float32
         Instant of each return since the first of the stop [s].
+    start_ns : int
+        Instant of that first one by the clock of the log [ns]; 0 where it is not known.
     """
 
     name: str
@@ -47,6 +49,7 @@ class StationPoints:
     intensities: Column
     rings: Rings
     times: Column
+    start_ns: int = 0
 
     def __post_init__(self) -> None:
         columns: dict[str, Shape] = dict.fromkeys(("intensities", "rings", "times"), (None,))
@@ -104,6 +107,7 @@ def station_points(
         intensities=cloud.intensities[rows],
         rings=cloud.rings[rows],
         times=cloud.times[rows],
+        start_ns=cloud.start_ns,
     )
 
 

@@ -325,6 +325,11 @@ class StitchedCloud:
         seal(self, p_base=(None, 3), **dict.fromkeys(arrays, (None,)))
         same_length(self, "p_base", *columns)
 
+    @property
+    def start_ns(self) -> int:
+        """Instant of the first pulse by the clock of the log [ns]; 0 where it is not known."""
+        return int(self.times.samples_ns[0]) if isinstance(self.times, Timed) else 0
+
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class Beams:

@@ -44,6 +44,7 @@ app = typer.Typer(
 )
 app.add_typer(plan, name="plan")
 
+_EXPORTS = "results.duckdb, or points as .csv, .dxf, .xml (LandXML) or .geojson."
 AsJson = Annotated[bool, typer.Option("--json", help="JSON for programs.")]
 LogFile = Annotated[Path, typer.Argument(exists=True, dir_okay=False, help="Log (MCAP).")]
 
@@ -299,15 +300,23 @@ def query(
 
 @app.command()
 def export(
-    target: Annotated[Path, typer.Argument(metavar="OUT", help="results.duckdb or a .csv.")],
+    target: Annotated[Path, typer.Argument(metavar="OUT", help=_EXPORTS)],
     url: Annotated[str | None, typer.Option(help="Address of a running service.")] = None,
     data: Annotated[Path | None, typer.Option(help="Data folder that no service uses.")] = None,
-    survey: Annotated[str | None, typer.Option(help="Only this survey (CSV).")] = None,
+    survey: Annotated[str | None, typer.Option(help="Only the points of this survey.")] = None,
+    origin: Annotated[
+        str | None,
+        typer.Option(
+            help="Origin of the site for GeoJSON: LON,LAT[,BEARING of y], WGS 84 \\[deg]."
+        ),
+    ] = None,
 ) -> None:
-    """Copy the database (OUT.duckdb), or stations and marks as coordinates (OUT.csv)."""
+    """Copy the database, or stations and marks as coordinates, by the ending of OUT."""
     from spheremark.service.cli.source import Source
 
-    Source(_settings(**({"data": data} if data else {})), url, folder=data).export(target, survey)
+    Source(_settings(**({"data": data} if data else {})), url, folder=data).export(
+        target, survey, origin
+    )
     err.print(f"Wrote {target}.")
 
 

@@ -55,7 +55,16 @@ Server = Annotated[
 Survey = Annotated[str, typer.Option(help="Only the fits of this survey.")]
 Csv = Annotated[Path | None, typer.Option(dir_okay=False, help="Write marks and stops (CSV).")]
 GeoJson = Annotated[
-    Path | None, typer.Option(dir_okay=False, help="Write marks and stops (GeoJSON).")
+    Path | None,
+    typer.Option(dir_okay=False, help="Write marks and stops (GeoJSON); needs --origin."),
+]
+Points = Annotated[
+    list[Path] | None,
+    typer.Option(dir_okay=False, help="Write marks and stops (.dxf or LandXML's .xml)."),
+]
+Origin = Annotated[
+    str | None,
+    typer.Option(help="Where the site is: LON,LAT[,BEARING of the y axis] in degrees (WGS 84)."),
 ]
 KeepOut = Annotated[
     Path | None,
@@ -98,6 +107,8 @@ def evaluate(
     ] = False,
     csv: Csv = None,
     geojson: GeoJson = None,
+    points: Points = None,
+    origin: Origin = None,
     as_json: AsJson = False,
 ) -> None:
     """Predict the accuracy of an arrangement of marks at every stop, without simulating a scan."""
@@ -113,7 +124,8 @@ def evaluate(
     found = plans.evaluate(assembled)
     if suggest:
         found["one_more"] = plans.suggest(assembled)
-    _deliver(found, csv, geojson, as_json=as_json)
+    _deliver(found, csv, [*(points or []), *filter(None, [geojson])], origin)
+    _show(found, as_json=as_json)
 
 
 @plan.command()
@@ -149,6 +161,8 @@ def optimise(
     survey: Survey = "",
     csv: Csv = None,
     geojson: GeoJson = None,
+    points: Points = None,
+    origin: Origin = None,
     as_json: AsJson = False,
 ) -> None:
     """Find the best places for a number of marks, or the fewest that keep the tolerance."""
@@ -168,7 +182,9 @@ def optimise(
         is_inside_allowed=inside,
     )
     goal = Goal(n_marks=marks, probability=probability, is_robust=robust)
-    _deliver(plans.optimise(assembled, rules, goal), csv, geojson, as_json=as_json)
+    found = plans.optimise(assembled, rules, goal)
+    _deliver(found, csv, [*(points or []), *filter(None, [geojson])], origin)
+    _show(found, as_json=as_json)
 
 
 @plan.command()
@@ -299,15 +315,21 @@ def _query(data: Path | None, server: str | None, survey: str) -> Any:
 
 
 def _deliver(
-    found: dict[str, Any], csv: Path | None, geojson: Path | None, *, as_json: bool
+    found: dict[str, Any], csv: Path | None, points: list[Path], origin: str | None
 ) -> None:
-    """Write a plan to files and to standard output."""
-    from spheremark.service.serialise.plans import to_csv, to_geojson
+    """Write a plan to files."""
+    from spheremark.service.serialise.plans import plan_points, to_csv
+    from spheremark.storage.exports.points import GeographicOrigin, format_points
 
+    place = GeographicOrigin.parse(origin) if origin else None
     if csv:
         csv.write_text(to_csv(found), encoding="utf-8")
-    if geojson:
-        geojson.write_text(json.dumps(to_geojson(found)) + "\n", encoding="utf-8")
+    for path in points:
+        path.write_text(format_points(plan_points(found), path.suffix, place), encoding="utf-8")
+
+
+def _show(found: dict[str, Any], *, as_json: bool) -> None:
+    """Write a plan to standard output."""
     if as_json:
         sys.stdout.write(json.dumps(found, indent=2, allow_nan=False) + "\n")
     else:

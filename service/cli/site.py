@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from datetime import UTC, datetime
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -77,7 +76,6 @@ def site(
         range_max=range_m,
         voxel=voxel_m,
         software=f"spheremark {code_version()}",
-        day=datetime.now(UTC).date(),
     )
     config = SurveyConfig.from_mapping(
         {"marker_radius": radius_m, "fitting": {"methods": ["along_beam"]}}

@@ -15,8 +15,11 @@ from spheremark.service.client import Client
 from spheremark.service.serialise.queries import serialise_query
 from spheremark.service.settings import Settings
 from spheremark.storage.catalogue.catalogue import Catalogue
-from spheremark.storage.catalogue.coordinates import coordinates_csv
+from spheremark.storage.catalogue.coordinates import coordinates_csv, named_points
 from spheremark.storage.catalogue.sandbox import run_query
+from spheremark.storage.exports.points import GeographicOrigin, format_points
+
+_EXPORTS = (".duckdb", ".csv", ".dxf", ".xml", ".geojson")
 
 
 class Source:
@@ -37,22 +40,26 @@ class Source:
             snapshot, limits = catalogue.snapshot(), self._settings.query_limits
             return serialise_query(run_query(snapshot, sql, limits), limits, snapshot)
 
-    def export(self, target: Path, survey: str | None) -> None:
-        """Write the database or a table of coordinates to a file, by its ending."""
-        if target.suffix not in (".duckdb", ".csv"):
-            raise InputError(f"{target.name} must end in .duckdb (everything) or .csv.")
-        is_table = target.suffix == ".csv"
+    def export(self, target: Path, survey: str | None, origin: str | None) -> None:
+        """Write the database, a table of coordinates or points to a file, by its ending."""
+        if target.suffix not in _EXPORTS:
+            raise InputError(f"{target.name} must end in one of {', '.join(_EXPORTS)}.")
+        given = {"survey": survey, "origin": origin} if target.suffix != ".duckdb" else {}
+        query = {name: value for name, value in given.items() if value}
         if self._url:
-            name = "coordinates.csv" if is_table else "results.duckdb"
+            name = "results" if target.suffix == ".duckdb" else "coordinates"
             with self._client() as client:
-                query = {"survey": survey} if survey and is_table else {}
-                client.download(f"/export/{name}", target, **query)
+                client.download(f"/export/{name}{target.suffix}", target, **query)
             return
         with self._catalogue() as catalogue:
-            if is_table:
+            if target.suffix == ".duckdb":
+                copyfile(catalogue.export(), target)
+            elif target.suffix == ".csv":
                 target.write_bytes(coordinates_csv(catalogue, survey))
             else:
-                copyfile(catalogue.snapshot(), target)
+                place = GeographicOrigin.parse(origin) if origin else None
+                points = named_points(catalogue, survey)
+                target.write_text(format_points(points, target.suffix, place), encoding="utf-8")
 
     def _running(self) -> str:
         """Return the address of the settings if a service answers there."""

@@ -96,7 +96,7 @@ def adjust(
     from spheremark.service.cli import render
     from spheremark.service.serialise import network as serialise
     from spheremark.service.serialise.network_report import report as format_report
-    from spheremark.storage.exports.network import write_coordinates, write_gama
+    from spheremark.storage.exports.network import format_coordinates, format_gama
     from spheremark.storage.imports import survey_files as site_files
 
     config = SurveyConfig.from_mapping(
@@ -116,9 +116,9 @@ def adjust(
         errors = compare(result, true)
         plain["errors"] = serialise.serialise_network_errors(result, errors, true.marks.names)
     if gama:
-        write_gama(result, gama)
+        gama.write_text(format_gama(result), encoding="utf-8")
     if csv:
-        write_coordinates(result, csv)
+        csv.write_text(format_coordinates(result), encoding="utf-8")
     if report:
         report.write_text(format_report(plain), encoding="utf-8")
     if as_json:

@@ -19,6 +19,7 @@ logger = logging.getLogger(__name__)
 
 MEDIA_TYPE = "application/problem+json"
 HTTP_CODES: Mapping[int, str] = {
+    400: "input.validation",  # FastAPI: the body cannot be parsed
     404: "not_found",
     405: "method_not_allowed",
     413: "input.too_large",

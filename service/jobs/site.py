@@ -10,7 +10,7 @@ import secrets
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, closing, contextmanager
 from dataclasses import dataclass, field, replace
-from datetime import UTC, date, datetime
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -53,7 +53,7 @@ class SiteRequest:
     range_max: float = 30.0
     voxel: float = 0.0
     software: str = "spheremark"
-    day: date = field(default_factory=lambda: datetime.now(UTC).date())
+    made: datetime = field(default_factory=lambda: datetime.now(UTC))
 
     def __post_init__(self) -> None:
         unknown = set(self.targets) - set(KINDS)
@@ -123,9 +123,9 @@ def _make_site(stops: Stops, poses: Sequence[StationPose], request: SiteRequest)
 def _opened(request: SiteRequest) -> Iterator[tuple[str, LazFile | E57File]]:
     """Open the requested files of clouds."""
     if target := request.targets.get("laz"):
-        yield "laz", LazFile(target, software=request.software, day=request.day)
+        yield "laz", LazFile(target, software=request.software, made=request.made)
     if target := request.targets.get("e57"):
-        yield "e57", E57File(target, software=request.software)
+        yield "e57", E57File(target, software=request.software, made=request.made)
 
 
 def stitched(

@@ -5,7 +5,7 @@ from __future__ import annotations
 import csv
 import io
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -27,6 +27,7 @@ from spheremark.pipelines.placement import (
     by_worst_angle,
 )
 from spheremark.pipelines.published import TABLE_3
+from spheremark.storage.exports.points import NamedPoint
 
 Plain = dict[str, Any]
 
@@ -310,25 +311,22 @@ def _short(row: Plain) -> Plain:
     }
 
 
-def to_geojson(evaluation: Mapping[str, Any]) -> Plain:
-    """Return marks and stops as GeoJSON, in metres of the site frame."""
-    features = [
-        _feature("mark", one, ("name", "ground_m", "pole_height_m")) for one in evaluation["marks"]
+def plan_points(evaluation: Mapping[str, Any]) -> list[NamedPoint]:
+    """Return marks and stops as named points, with what maps show of them."""
+    kinds = (
+        ("mark", evaluation["marks"], ("ground_m", "pole_height_m")),
+        ("stop", evaluation["stops"], ("sigma_3d_m", "probability_within_tolerance", "n_used")),
+    )
+    return [
+        NamedPoint(
+            kind=kind,
+            name=one["name"],
+            p_site=one["position_m"],
+            properties={name: one[name] for name in names},
+        )
+        for kind, rows, names in kinds
+        for one in rows
     ]
-    features += [
-        _feature("stop", one, ("name", "sigma_3d_m", "probability_within_tolerance", "n_used"))
-        for one in evaluation["stops"]
-    ]
-    return {"type": "FeatureCollection", "features": features}
-
-
-def _feature(kind: str, one: Mapping[str, Any], names: Sequence[str]) -> Plain:
-    """Return one point."""
-    return {
-        "type": "Feature",
-        "geometry": {"type": "Point", "coordinates": one["position_m"]},
-        "properties": {"kind": kind, **{name: one[name] for name in names}},
-    }
 
 
 def _number(value: float) -> float | None:

@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 from spheremark.pipelines.errors import ConflictError, InputError
 from spheremark.storage.catalogue import migrations
 from spheremark.storage.catalogue.records import TableInfo, tables_of
-from spheremark.storage.catalogue.snapshots import Snapshots
+from spheremark.storage.catalogue.snapshots import Snapshots, portable_copy
 
 _N_ROWS_MAX = 200_000  # of one static query; a page that needs more should aggregate
 _COLUMNS = """
@@ -122,6 +122,10 @@ class Database:
         """
         with self._lock:
             return self._snapshots.take(self._connection, self._version)
+
+    def export(self) -> Path:
+        """Return a copy like ``snapshot`` that DuckDB 1.0 and all later versions can open."""
+        return portable_copy(self.snapshot())
 
     @contextmanager
     def reading(self) -> Iterator[duckdb.DuckDBPyConnection]:

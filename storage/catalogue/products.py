@@ -15,6 +15,7 @@ _MEDIA_TYPES = {
     ".csv": "text/csv",
     ".txt": "text/plain",
     ".xml": "application/xml",
+    ".dxf": "image/vnd.dxf",
 }
 
 
@@ -26,7 +27,7 @@ def documents(result_id: str, texts: Mapping[str, str]) -> pa.Table:
     result_id : str
         The result that they belong to.
     texts : mapping of str to str
-        Content by file name; its ending, json, csv, txt or xml, decides the media type.
+        Content by file name; its ending, json, csv, txt, xml or dxf, decides the media type.
 
     Returns
     -------

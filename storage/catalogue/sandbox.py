@@ -28,7 +28,7 @@ from typing import Any, ClassVar
 import duckdb
 
 from spheremark.pipelines.errors import InputError, SpheremarkError
-from spheremark.storage.confinement import limit_resources
+from spheremark.storage.confinement import enter_folder, leave_network, limit_resources
 
 _WHOLE_TYPES = ("TINYINT", "SMALLINT", "INTEGER", "BIGINT")
 _PLAIN_TYPES = frozenset(
@@ -234,17 +234,22 @@ def _main() -> None:
     request = json.load(sys.stdin)
     limits = QueryLimits(**request["limits"])
     memory = limits.memory_bytes + _HEADROOM
+    snapshot = Path(request["snapshot"])
+    leave_network()
+    snapshot = enter_folder(snapshot.parent) / snapshot.name  # hides where the data folder is
     limit_resources(memory_bytes=memory, seconds=limits.seconds, file_bytes=0)
     try:
-        response = _respond(
-            Path(request["snapshot"]), request["sql"], request["parameters"], limits
-        )
+        response = _respond(snapshot, request["sql"], request["parameters"], limits)
     except (duckdb.OutOfMemoryException, MemoryError):
         response = {"rejected": _too_much_memory(limits.memory_bytes)}
     except duckdb.Error as error:
         response = {"rejected": _shortened(str(error))}
     except QueryRejectedError as error:
         response = {"rejected": str(error)}
+    except RecursionError:
+        response = {"rejected": "A value of the result is nested too deeply to be read."}
+    except (TypeError, ValueError) as error:
+        response = {"rejected": f"The query or its result cannot be read: {_shortened(str(error))}"}
     json.dump(response, sys.stdout, allow_nan=False)
 
 
@@ -292,7 +297,10 @@ def _one_statement(sql: str) -> str:
     if len(statements) != 1:
         found = "no statement" if not statements else f"{len(statements)} statements"
         raise QueryRejectedError(f"The text holds {found}; send one SELECT at a time.")
-    kind = statements[0].type.name
+    try:
+        kind = statements[0].type.name
+    except ValueError:  # a kind that DuckDB's own module does not know
+        kind = "This statement"
     if kind == "MULTI":
         raise QueryRejectedError(
             "Say which columns the PIVOT gives: PIVOT t ON c IN ('a', 'b') USING sum(x)."

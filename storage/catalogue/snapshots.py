@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import secrets
 import subprocess
 from pathlib import Path
 from time import monotonic, sleep
@@ -23,7 +24,7 @@ class Snapshots:
         self._folder = folder
         self._version: int | None = None
         folder.mkdir(parents=True, exist_ok=True)
-        for stale in self._files():
+        for stale in (*self._files(), *folder.glob("portable-*")):
             stale.unlink(missing_ok=True)
 
     def take(self, connection: duckdb.DuckDBPyConnection, version: int) -> Path:
@@ -43,6 +44,34 @@ class Snapshots:
     def _files(self) -> list[Path]:
         """Return the present snapshots, oldest first."""
         return sorted(self._folder.glob("snapshot-*.duckdb"))
+
+
+def portable_copy(snapshot: Path) -> Path:
+    """Return a copy of a snapshot that DuckDB 1.0 and all later versions can open.
+
+    DuckDB writes new files in the storage version of its own release, which older ones refuse.
+    """
+    target = snapshot.with_name(snapshot.name.replace("snapshot", "portable"))
+    if target.exists():
+        return target
+    part = target.with_suffix(f".{secrets.token_hex(4)}.part")
+    try:
+        with duckdb.connect(config={"threads": "1", "memory_limit": "1GB"}) as connection:
+            connection.execute(f"ATTACH '{_quoted(snapshot)}' AS source (READ_ONLY)")
+            connection.execute(f"ATTACH '{_quoted(part)}' AS target (STORAGE_VERSION 'v1.0.0')")
+            connection.execute("COPY FROM DATABASE source TO target")
+            connection.execute("DETACH target")
+        part.replace(target)
+    finally:
+        part.unlink(missing_ok=True)
+    for old in sorted(snapshot.parent.glob("portable-*.duckdb"))[:-_N_KEPT]:
+        old.unlink(missing_ok=True)
+    return target
+
+
+def _quoted(path: Path) -> str:
+    """Return a path as the inside of an SQL literal."""
+    return str(path).replace("'", "''")
 
 
 def _checkpoint(connection: duckdb.DuckDBPyConnection) -> None:

@@ -10,7 +10,7 @@ import json
 import math
 import uuid
 from dataclasses import dataclass
-from datetime import date
+from datetime import date, datetime
 from pathlib import Path
 from typing import Any
 
@@ -29,6 +29,9 @@ _FULL = 65535 / 255  # LAS wants intensities to fill 16 bits
 _CHUNK = 500_000  # returns at a time
 _STATIONS = "stations: name, number (point_source_id), T_site_station, rows first [m]"
 _RECORD = 1  # of our own records in a LAZ file
+_GPS_EPOCH = 315_964_800  # [s] 1980-01-06 in seconds since 1970
+_LEAP_SECONDS = 18  # [s] of GPS time before UTC, since 2017
+_LAS_EPOCH = 1_000_000_000  # [s] that adjusted standard GPS time of LAS leaves out
 
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
@@ -43,9 +46,12 @@ class LazFile:
     """The returns of stops in one LAZ file (LAS 1.4, point format 6), written stop by stop.
 
     A return has ``point_source_id``, the number of its station from 1, ``intensity`` with 0-255
-    stretched to 16 bits, ``gps_time``, seconds since the first return of its stop, and the extra
-    dimension ``ring``. Names and poses of the stations are in an extended record of user
-    ``spheremark``. The coordinate system of the site is local, without a place on Earth.
+    stretched to 16 bits, ``gps_time``, and the extra dimensions ``ring`` and ``stop_time``, seconds
+    since the first return of its stop. Names and poses of the stations are in an extended record of
+    user ``spheremark``. The coordinate system of the site is local, without a place on Earth.
+
+    The GPS time is adjusted standard time, where the clocks of the logs hold the time of day. Of a
+    log whose clock began later than 1980, it is counted from that beginning.
 
     Parameters
     ----------
@@ -53,12 +59,12 @@ class LazFile:
         The file.
     software : str
         Name of the writing program.
-    day : date
-        Day in the header.
+    made : datetime
+        Instant of writing; its day is in the header.
     """
 
-    def __init__(self, path: Path, *, software: str, day: date) -> None:
-        self._path, self._software, self._day = path, software, day
+    def __init__(self, path: Path, *, software: str, made: datetime) -> None:
+        self._path, self._software, self._day = path, software, made.date()
         self._writer: laspy.LasWriter | None = None
         self._extents: list[CloudExtent] = []
         self._stations: list[dict[str, Any]] = []
@@ -105,12 +111,14 @@ class E57File:
         The file.
     software : str
         Name of the writing program.
+    made : datetime
+        Instant of writing.
     """
 
-    def __init__(self, path: Path, *, software: str) -> None:
+    def __init__(self, path: Path, *, software: str, made: datetime) -> None:
         path.unlink(missing_ok=True)
         self._image = libe57.ImageFile(str(path), "w")
-        self._scans = _e57_root(self._image, software)
+        self._scans = _e57_root(self._image, software, made)
         self._extents: list[CloudExtent] = []
 
     def add(self, stop: StationPoints) -> None:
@@ -137,6 +145,12 @@ def _laz_header(p_site: Array, software: str, day: date) -> laspy.LasHeader:
     header.add_extra_dim(
         laspy.ExtraBytesParams(name="ring", type=np.uint8, description="laser, 0 the lowest")
     )
+    header.add_extra_dim(
+        laspy.ExtraBytesParams(
+            name="stop_time", type=np.float32, description="s since its stop began"
+        )
+    )
+    header.global_encoding.gps_time_type = laspy.header.GpsTimeType.STANDARD
     header.vlrs.append(laspy.vlrs.known.WktCoordinateSystemVlr(SITE_WKT))
     header.global_encoding.wkt = True
     return header
@@ -153,9 +167,16 @@ def _laz_points(
     record.return_number[:] = 1
     record.number_of_returns[:] = 1
     record.point_source_id[:] = number
-    record.gps_time = stop.times[rows].astype(np.float64)
+    record.gps_time = _gps_time(stop.start_ns) - _LAS_EPOCH + stop.times[rows].astype(np.float64)
+    record.stop_time = stop.times[rows]
     record.ring = stop.rings[rows]
     return record
+
+
+def _gps_time(stamp_ns: int) -> float:
+    """Return an instant of a log as GPS time [s]; where the clock is not set, as it stands."""
+    seconds = stamp_ns / 1e9
+    return seconds - _GPS_EPOCH + _LEAP_SECONDS if seconds > _GPS_EPOCH else seconds
 
 
 def _station(number: int, stop: StationPoints) -> dict[str, Any]:
@@ -198,25 +219,29 @@ def _joined(extents: list[CloudExtent]) -> CloudExtent:
     )
 
 
-def _e57_root(image: Any, software: str) -> Any:
+def _e57_root(image: Any, software: str, made: datetime) -> Any:
     """Write the head of a file and return the node of its scans."""
     image.extensionsAdd("", libe57.E57_V1_0_URI)
-    scans = libe57.VectorNode(image, True)
-    created = _structure(image, dateTimeValue=0.0, isAtomicClockReferenced=0)
-    values = {
+    head = {
         "formatName": "ASTM E57 3D Imaging Data File",
         "guid": _guid(software),
         "versionMajor": libe57.E57_FORMAT_MAJOR,
         "versionMinor": libe57.E57_FORMAT_MINOR,
         "e57LibraryVersion": libe57.E57_LIBRARY_ID,
         "coordinateMetadata": "",
+        "creationDateTime": _instant(int(made.timestamp() * 1e9)),
     }
-    for name, value in values.items():
+    for name, value in head.items():
         image.root().set(name, _node(image, value))
-    image.root().set("creationDateTime", created)
+    scans = libe57.VectorNode(image, True)
     image.root().set("data3D", scans)
     image.root().set("images2D", libe57.VectorNode(image, True))
     return scans
+
+
+def _instant(stamp_ns: int) -> dict[str, Any]:
+    """Return an instant as E57 has it: GPS time."""
+    return {"dateTimeValue": _gps_time(stamp_ns), "isAtomicClockReferenced": 0}
 
 
 def _guid(text: str) -> str:
@@ -224,57 +249,47 @@ def _guid(text: str) -> str:
     return "{" + str(uuid.uuid5(uuid.NAMESPACE_URL, f"spheremark/{text}")) + "}"
 
 
-def _node(image: Any, value: str | int | float) -> Any:
-    """Return a value as a node of an E57 file."""
-    if isinstance(value, str):
-        return libe57.StringNode(image, value)
-    if isinstance(value, int):
-        return libe57.IntegerNode(image, value)
-    return libe57.FloatNode(image, value)
-
-
-def _structure(image: Any, **values: str | int | float) -> Any:
-    """Return values as a structure of an E57 file."""
+def _node(image: Any, value: Any) -> Any:
+    """Return a value as a node of an E57 file; a mapping as a structure."""
+    kinds = {str: libe57.StringNode, int: libe57.IntegerNode, float: libe57.FloatNode}
+    if type(value) in kinds:
+        return kinds[type(value)](image, value)
     node = libe57.StructureNode(image)
-    for name, value in values.items():
-        node.set(name, _node(image, value))
+    for name, part in value.items():
+        node.set(name, _node(image, part))
     return node
 
 
 def _e57_scan(image: Any, scans: Any, stop: StationPoints) -> CloudExtent:
     """Write one stop."""
-    scan = _structure(
-        image,
-        guid=_guid(f"{stop.name}/{len(scans)}/{stop.p_station.sum(dtype=np.float64)!r}"),
-        name=stop.name,
-        description="returns in the levelled frame of the station",
-    )
-    scan.set("pose", _pose(image, stop.T_site_station))
-    scans.append(scan)
+    about: dict[str, Any] = {
+        "guid": _guid(f"{stop.name}/{len(scans)}/{stop.p_station.sum(dtype=np.float64)!r}"),
+        "name": stop.name,
+        "description": "returns in the levelled frame of the station",
+        "pose": _pose(stop.T_site_station),
+    }
     if len(stop.p_station):
         low, high = stop.p_station.min(axis=0), stop.p_station.max(axis=0)
-        scan.set("cartesianBounds", _bounds(image, low, high))
-        limits = {"intensityMinimum": 0.0, "intensityMaximum": 255.0}
-        scan.set("intensityLimits", _structure(image, **limits))
+        ends = (("Minimum", low), ("Maximum", high))
+        about["cartesianBounds"] = {
+            f"{axis}{end}": float(values[i]) for end, values in ends for i, axis in enumerate("xyz")
+        }
+        about["intensityLimits"] = {"intensityMinimum": 0.0, "intensityMaximum": 255.0}
+    if stop.start_ns and len(stop.times):
+        last_ns = stop.start_ns + int(float(stop.times.max()) * 1e9)
+        about["acquisitionStart"] = _instant(stop.start_ns)
+        about["acquisitionEnd"] = _instant(last_ns)
+    scan = _node(image, about)
+    scans.append(scan)
     _e57_points(image, scan, stop)
     return _extent(stop.p_site)
 
 
-def _pose(image: Any, T: Array) -> Any:
-    """Return a pose as an E57 node: a unit quaternion and a translation."""
+def _pose(T: Array) -> dict[str, Any]:
+    """Return a pose as E57 has it: a unit quaternion and a translation."""
     x, y, z, w = (float(value) for value in Rotation.from_matrix(T[:3, :3]).as_quat())
-    pose = libe57.StructureNode(image)
-    pose.set("rotation", _structure(image, w=w, x=x, y=y, z=z))
     translation = {name: float(T[i, 3]) for i, name in enumerate("xyz")}
-    pose.set("translation", _structure(image, **translation))
-    return pose
-
-
-def _bounds(image: Any, low: Array, high: Array) -> Any:
-    """Return the bounds of a scan in its own frame."""
-    values = {f"{name}Minimum": float(low[i]) for i, name in enumerate("xyz")}
-    values |= {f"{name}Maximum": float(high[i]) for i, name in enumerate("xyz")}
-    return _structure(image, **values)
+    return {"rotation": {"w": w, "x": x, "y": y, "z": z}, "translation": translation}
 
 
 def _e57_points(image: Any, scan: Any, stop: StationPoints) -> None:

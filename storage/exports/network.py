@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import csv
 import io
-from pathlib import Path
 from xml.etree import ElementTree as ET
 
 import numpy as np
@@ -12,6 +11,7 @@ import numpy as np
 from spheremark.pipelines.geometry import rot_z, yaw_pitch_roll
 from spheremark.pipelines.model import Array
 from spheremark.pipelines.network import AdjustedNetwork
+from spheremark.storage.exports.points import NamedPoint
 
 _NAMESPACE = "http://www.gnu.org/software/gama/gama-local"
 _GON = 200.0 / np.pi
@@ -40,38 +40,46 @@ def format_coordinates(result: AdjustedNetwork) -> str:
     """
     network, n = result.network, len(result.network.sightings)
     station, mark = network.sightings[result.used[:n]].T
-    kinds = ["mark"] * len(network.marks)
-    for place in network.controls:
-        kinds[place] = "control"
-    parts = (
-        (["station"] * len(network.stations), network.stations, result.T_site_station[:, :3, 3],
-         result.station_covariances, np.bincount(station, minlength=len(network.stations))),
-        (kinds, network.marks, result.p_site, result.mark_covariances,
-         np.bincount(mark, minlength=len(network.marks))),
-    )  # fmt: skip
+    counts = [
+        *np.bincount(station, minlength=len(network.stations)),
+        *np.bincount(mark, minlength=len(network.marks)),
+    ]
+    covs = np.concatenate([result.station_covariances, result.mark_covariances])
     text = io.StringIO()
     writer = csv.writer(text)
     writer.writerow(COORDINATE_COLUMNS)
-    for part in parts:
-        for kind, name, p, cov, count in zip(*part, strict=True):
-            sigmas = np.sqrt(np.diag(cov))
-            others = (cov[0, 1], cov[0, 2], cov[1, 2])
-            numbers = (*(f"{x:.5f}" for x in p), *(f"{x:.6f}" for x in sigmas))
-            writer.writerow((kind, name, *numbers, *(f"{x:.4e}" for x in others), count))
+    for point, cov, count in zip(network_points(result), covs, counts, strict=True):
+        sigmas = np.sqrt(np.diag(cov))
+        others = (cov[0, 1], cov[0, 2], cov[1, 2])
+        numbers = (*(f"{x:.5f}" for x in point.p_site), *(f"{x:.6f}" for x in sigmas))
+        writer.writerow((point.kind, point.name, *numbers, *(f"{x:.4e}" for x in others), count))
     return text.getvalue()
 
 
-def write_coordinates(result: AdjustedNetwork, path: str | Path) -> None:
-    """Write stations and marks of a network as CSV.
+def network_points(result: AdjustedNetwork) -> list[NamedPoint]:
+    """Return the stations of a network and its marks as named points.
 
     Parameters
     ----------
     result : AdjustedNetwork
         The network.
-    path : str or Path
-        The file.
+
+    Returns
+    -------
+    list of NamedPoint
+        Of the kinds station, control and mark.
     """
-    Path(path).write_text(format_coordinates(result), encoding="utf-8")
+    network = result.network
+    kinds = ["control" if i in network.controls else "mark" for i in range(len(network.marks))]
+    labels = [
+        *(("station", name) for name in network.stations),
+        *zip(kinds, network.marks, strict=True),
+    ]
+    places = np.concatenate([result.T_site_station[:, :3, 3], result.p_site]).tolist()
+    return [
+        NamedPoint(kind=kind, name=name, p_site=p)
+        for (kind, name), p in zip(labels, places, strict=True)
+    ]
 
 
 def format_gama(result: AdjustedNetwork, description: str = "") -> str:
@@ -114,21 +122,6 @@ def format_gama(result: AdjustedNetwork, description: str = "") -> str:
     _add_control(observed, result, fixed)
     ET.indent(root)
     return '<?xml version="1.0" ?>\n' + ET.tostring(root, encoding="unicode") + "\n"
-
-
-def write_gama(result: AdjustedNetwork, path: str | Path, description: str = "") -> None:
-    """Write a network's observations as input of GNU Gama's ``gama-local``.
-
-    Parameters
-    ----------
-    result : AdjustedNetwork
-        The network.
-    path : str or Path
-        The file.
-    description : str
-        A sentence for the reader of the file.
-    """
-    Path(path).write_text(format_gama(result, description), encoding="utf-8")
 
 
 def _used_controls(result: AdjustedNetwork) -> list[tuple[int, int]]:

@@ -62,7 +62,8 @@ def small(tmp_path):
 def test_what_optimise_answers_evaluate_answers_again(small, tmp_path):
     csv, geojson = tmp_path / "plan.csv", tmp_path / "plan.geojson"
     options = (*small, "--spacing-m", 2.0, "--json")
-    best = plan("optimise", "--marks", 4, "--csv", csv, "--geojson", geojson, *options)
+    best = plan("optimise", "--marks", 4, "--csv", csv, "--geojson", geojson,
+                "--origin", "16.37,48.21", *options)  # fmt: skip
     assert [stop["name"] for stop in best["stops"]] == ["A", "B"]
     assert len(best["marks"]) == 4
     file = tmp_path / "best.json"

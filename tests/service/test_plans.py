@@ -1,5 +1,6 @@
 import csv
 import io
+import xml.etree.ElementTree as ET
 
 import numpy as np
 import pytest
@@ -103,7 +104,7 @@ def test_the_map_agrees_with_a_stop_that_stands_on_it(client):
     assert field["n_seen"][j][i] == len(stop["visible_marks"])
 
 
-def test_a_plan_comes_as_csv_and_geojson_too(client):
+def test_a_plan_comes_as_csv_and_as_points_to_stake_out(client):
     def file(kind):
         return client.post(
             "/api/v1/plans/evaluate", json={"marks": MARKS}, headers={"Accept": kind}
@@ -112,10 +113,25 @@ def test_a_plan_comes_as_csv_and_geojson_too(client):
     rows = list(csv.DictReader(io.StringIO(file("text/csv").text)))
     assert [row["kind"] for row in rows].count("mark") == 3
     assert float(rows[0]["z_m"]) == pytest.approx(float(rows[0]["ground_m"]) + 1.0)
-    features = file("application/geo+json").json()["features"]
-    assert features[0]["geometry"]["coordinates"] == pytest.approx(
-        [float(rows[0][f"{axis}_m"]) for axis in "xyz"]
+    place = [float(rows[0][f"{axis}_m"]) for axis in "xyz"]
+    root = ET.fromstring(file("application/xml").text)
+    first = next(one for one in root.iter() if one.tag.endswith("CgPoint"))
+    assert [float(one) for one in first.text.split()] == pytest.approx(
+        [place[1], place[0], place[2]], abs=1e-5
     )
+    assert file("image/vnd.dxf").text.endswith("EOF\n")
+
+
+def test_a_plan_is_geojson_only_where_the_site_has_an_origin(client):
+    kind = {"Accept": "application/geo+json"}
+    url, plan = "/api/v1/plans/evaluate", {"marks": MARKS}
+    refused = client.post(url, json=plan, headers=kind)
+    assert refused.status_code == 400
+    assert "LON,LAT" in refused.json()["detail"]
+    found = client.post(url, json=plan, headers=kind, params={"origin": "16.37,48.21"})
+    (longitude, latitude) = found.json()["features"][0]["geometry"]["coordinates"]
+    assert abs(longitude - 16.37) < 1e-3
+    assert abs(latitude - 48.21) < 1e-3
 
 
 def test_optimised_marks_are_better_than_those_one_began_with(client):

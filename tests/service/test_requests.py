@@ -87,6 +87,20 @@ WRONG = [  # method, path, arguments, status, code
     ("POST", "/api/v1/sql", {"json": {"sql": "SELEKT 1"}}, 400, "query.rejected"),
     ("POST", "/api/v1/sql", {"json": {"sql": "DROP TABLE jobs"}}, 400, "query.rejected"),
     ("GET", "/api/v1/sql", {}, 422, "input.validation"),
+    ("GET", "/api/v1/export/coordinates.geojson", {}, 400, "input"),
+    ("GET", "/api/v1/export/coordinates.shp", {}, 422, "input.validation"),
+    ("GET", "/api/v1/export/coordinates.geojson?origin=here", {}, 400, "input"),
+    ("POST", "/api/v1/sql", {"json": {"sql": "UPDATE EXTENSIONS"}}, 400, "query.rejected"),
+    ("POST", "/api/v1/sql",
+     {"json": {"sql": "SELECT (repeat('[', 9999) || repeat(']', 9999))::JSON"}},
+     400, "query.rejected"),
+    ("POST", "/api/v1/surveys",
+     {"content": "[" * 10**6 + "]" * 10**6, "headers": {"Content-Type": "application/json"}},
+     400, "input.validation"),
+    ("POST", "/api/v1/rigs", {"content": '{"rig": ' * 900 + "1" + "}" * 900}, 400, "input.rig"),
+    ("POST", "/api/v1/jobs",
+     {"content": '{"survey": "a", "rig": ' + '{"rig": ' * 900 + "1" + "}" * 901,
+      "headers": {"Content-Type": "application/json"}}, 422, "input.validation"),
     ("GET", "/api/v1/plans/sites/nowhere", {}, 404, "not_found"),
     ("POST", "/api/v1/plans/evaluate", {"json": {"marks": [{"name": "A"}]}},
      422, "input.validation"),
@@ -133,8 +147,7 @@ def test_every_route_is_among_the_wrong_requests_or_takes_no_input(site):
     for path in {one.removeprefix("/api/v1") for one in paths} - harmless:
         parts = path.split("/")[1:]
         assert any(
-            len(parts) == len(t)
-            and all(a == b or a[0] == "{" for a, b in zip(parts, t, strict=True))
+            len(parts) == len(t) and all(a == b or "{" in a for a, b in zip(parts, t, strict=True))
             for t in tried
         ), path
 

@@ -161,7 +161,8 @@ def test_what_is_not_used_stands_in_the_rows_with_a_reason(tied, rows):
 def test_a_network_can_be_downloaded_in_four_forms(site, tied, rows):
     (whole,) = rows("adjustments", tied)
     url = f"/api/v1/adjustments/{whole['adjustment_id']}/files"
-    names = ("adjustment.json", "report.txt", "coordinates.csv", "gama.xml")
+    points = ("coordinates.csv", "coordinates.dxf", "coordinates.xml")
+    names = ("adjustment.json", "report.txt", *points, "gama.xml")
     texts = {name: site.client.get(f"{url}/{name}") for name in names}
     assert {answer.status_code for answer in texts.values()} == {200}
     assert len(json.loads(texts["adjustment.json"].text)["stations"]) == len(STOPS)

@@ -1,6 +1,9 @@
 import json
 import os
+import re
+import shutil
 import signal
+import struct
 import subprocess
 import sys
 import threading
@@ -570,6 +573,40 @@ def test_a_snapshot_does_not_open_the_door_to_other_owners(catalogue):
         [sys.executable, "-c", code], capture_output=True, text=True, check=False
     )
     assert "Could not set lock" in other.stderr
+
+
+def test_an_export_has_the_storage_version_that_duckdb_1_0_reads(catalogue):
+    catalogue.create_survey("lane")
+    copy = catalogue.export()
+    magic, version = struct.unpack_from("<4sQ", copy.read_bytes(), 8)
+    assert (magic, version) == (b"DUCK", 64)
+    assert catalogue.export() == copy
+    with duckdb.connect(str(copy), read_only=True) as found:
+        assert found.execute("SELECT name FROM surveys").fetchall() == [("lane",)]
+        assert found.execute("SELECT count(*) FROM placements").fetchall() == [(0,)]
+        query = "SELECT count(*) FROM duckdb_columns() WHERE comment IS NOT NULL"
+        assert found.execute(query).fetchall()[0][0] > 300
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("version", ["1.1.3", "1.2.2", "1.3.2", "1.4.1"])
+def test_older_releases_of_duckdb_open_an_export(catalogue, version):
+    catalogue.create_survey("lane")
+    code = (
+        "import duckdb, sys; c = duckdb.connect(sys.argv[1], read_only=True); "
+        "print(c.execute('SELECT name FROM surveys').fetchall(), "
+        "len(c.execute('SHOW TABLES').fetchall()))"
+    )
+    uv = shutil.which("uv", path=f"{Path(sys.executable).parent}:{os.environ['PATH']}")
+    if uv is None:
+        pytest.skip("Older releases of DuckDB cannot be had here: uv is not installed.")
+    command = [uv, "run", "--quiet", "--no-project", "--with", f"duckdb=={version}", "python", "-c"]
+    run = subprocess.run(
+        [*command, code, catalogue.export()], capture_output=True, text=True, check=False
+    )
+    if run.returncode and re.search(r"dns error|connect|timed out|network|resolve", run.stderr):
+        pytest.skip(f"DuckDB {version} cannot be had here: {run.stderr.strip()[-200:]}")
+    assert run.stdout.startswith("[('lane',)]"), run.stderr
 
 
 # Many at once, and sudden death

@@ -11,7 +11,7 @@ from scipy.optimize import least_squares
 
 from spheremark.pipelines.config import ResectionConfig
 from spheremark.pipelines.network import adjust_network, assemble
-from spheremark.storage.exports.network import format_coordinates, format_gama, write_gama
+from spheremark.storage.exports.network import format_coordinates, format_gama
 from tests.synthetic import field, pose, sightings
 
 CONFIG = ResectionConfig(sigma_common=0.0, sigma_range=0.0)
@@ -137,9 +137,8 @@ def test_a_dense_solution_of_the_exported_observations_agrees(is_free, exact):
     assert read.is_fixed.any() == exact
 
 
-def test_the_export_states_its_axes_and_angles(tmp_path):
-    write_gama(adjusted(True), tmp_path / "network.xml", "Two <stations> & more")
-    read = GamaNetwork((tmp_path / "network.xml").read_text())
+def test_the_export_states_its_axes_and_angles():
+    read = GamaNetwork(format_gama(adjusted(True), "Two <stations> & more"))
     assert read.network.get("axes-xy") == "en"
     assert read.network.get("angles") == "right-handed"
     (text,) = read.network.findall("g:description", GAMA)

@@ -206,3 +206,25 @@ def test_the_process_of_a_query_sees_no_settings_of_the_service(query, monkeypat
 def test_a_missing_snapshot_is_an_error(tmp_path):
     with pytest.raises(QueryRejectedError, match="nowhere"):
         run_query(Path(tmp_path / "nowhere.duckdb"), "SELECT 1", LIMITS)
+
+
+@pytest.mark.parametrize(
+    ("sql", "reason"),
+    [
+        ("UPDATE EXTENSIONS", "can only be read"),
+        ("SELECT (repeat('[', 9999) || repeat(']', 9999))::JSON", "nested too deeply"),
+        (f"SELECT {'(' * 5000}1{')' * 5000}", "depth"),
+        ("SELECT '\ud800'", "cannot be read"),
+    ],
+)
+def test_what_no_query_is_gets_a_reason(query, sql, reason):
+    with pytest.raises(QueryRejectedError, match=reason):
+        query(sql)
+
+
+def test_a_query_does_not_learn_where_the_data_folder_is(query, snapshot):
+    found = query("SELECT * FROM pragma_database_list")
+    assert snapshot.name in str(found.rows)
+    assert str(snapshot.parent) not in str(found.rows)
+    settings = query("SELECT value FROM duckdb_settings()")
+    assert str(snapshot.parent) not in str(settings.rows)

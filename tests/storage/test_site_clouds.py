@@ -6,7 +6,7 @@ import json
 import struct
 import xml.etree.ElementTree as ET
 from contextlib import closing
-from datetime import date
+from datetime import UTC, datetime
 
 import laspy
 import lazrs
@@ -19,7 +19,8 @@ from spheremark.pipelines.geometry import rigid, rot_y, rot_z
 from spheremark.pipelines.ground_model import StationPoints
 from spheremark.storage.clouds.site import E57File, LazFile
 
-DAY = date(2026, 5, 11)
+MADE = datetime(2026, 5, 11, 12, 30, tzinfo=UTC)
+START_NS = 1_778_500_000_123_456_789  # 2026-05-11T11:46:40 UTC
 
 
 def written(file, some):
@@ -30,12 +31,12 @@ def written(file, some):
         return file.finish()
 
 
-def write_laz(some, path, *, software, day):
-    return written(LazFile(path, software=software, day=day), some)
+def write_laz(some, path, *, software):
+    return written(LazFile(path, software=software, made=MADE), some)
 
 
 def write_e57(some, path, *, software):
-    return written(E57File(path, software=software), some)
+    return written(E57File(path, software=software, made=MADE), some)
 
 
 def stops(n=3, n_points=2000):
@@ -49,6 +50,7 @@ def stops(n=3, n_points=2000):
             intensities=rng.uniform(0, 255, n_points + i).astype(np.float32),
             rings=rng.integers(0, 16, n_points + i).astype(np.uint8),
             times=np.linspace(0, 13, n_points + i).astype(np.float32),
+            start_ns=START_NS + i * 60_000_000_000,
         )
 
 
@@ -61,7 +63,7 @@ def in_site(stop):
 @pytest.fixture(scope="module")
 def laz(tmp_path_factory):
     path = tmp_path_factory.mktemp("laz") / "site.laz"
-    extent = write_laz(stops(), path, software="spheremark 1.2.3", day=DAY)
+    extent = write_laz(stops(), path, software="spheremark 1.2.3")
     return path, extent
 
 
@@ -86,14 +88,17 @@ def test_every_return_of_a_laz_file_names_its_station_laser_and_brightness(laz):
         own = found.point_source_id == number
         np.testing.assert_array_equal(found.ring[own], stop.rings)
         np.testing.assert_allclose(found.intensity[own] / 257.0, stop.intensities, atol=0.002)
-        np.testing.assert_allclose(found.gps_time[own], stop.times)
+        np.testing.assert_allclose(found.stop_time[own], stop.times)
+        unix = found.gps_time[own] + 1e9 + datetime(1980, 1, 6, tzinfo=UTC).timestamp() - 18
+        np.testing.assert_allclose(unix, stop.start_ns / 1e9 + stop.times, atol=1e-5)
+    assert found.header.global_encoding.gps_time_type == laspy.header.GpsTimeType.STANDARD
 
 
 def test_a_laz_file_names_its_stations_their_poses_and_a_local_system(laz):
     found = laspy.read(laz[0])
     assert (found.header.generating_software, found.header.creation_date) == (
         "spheremark 1.2.3",
-        DAY,
+        MADE.date(),
     )
     np.testing.assert_array_equal(found.header.scales, 0.001)
     (record,) = found.evlrs
@@ -112,8 +117,8 @@ def test_a_laz_file_reads_the_same_by_its_specification(laz):
     form, size = struct.unpack_from("<BH", data, 104)
     scale, offset = struct.unpack_from("<3d3d", data, 131)[:3], struct.unpack_from("<3d", data, 155)
     (n_points,) = struct.unpack_from("<Q", data, 247)
-    assert (form & 0x7F, size) == (6, 31)
-    assert struct.unpack_from("<H", data, 6)[0] & 16  # the system is well-known text
+    assert (form & 0x7F, size) == (6, 35)
+    assert struct.unpack_from("<H", data, 6)[0] & 17 == 17  # well-known text, standard time
     at, laszip = header_size, b""
     for _ in range(n_records):
         user, record, length = struct.unpack_from("<16sHH", data, at + 2)
@@ -151,6 +156,19 @@ def test_an_e57_file_has_a_scan_with_a_pose_for_each_station(e57):
             np.testing.assert_allclose(moved["cartesianX"], in_site(stop)[:, 0], atol=1e-5)
 
 
+def test_an_e57_file_says_when_it_was_made_and_when_each_scan_was(e57):
+    with pye57.E57(str(e57[0])) as file:
+        made = file.root["creationDateTime"]["dateTimeValue"].value()
+        epoch = datetime(1980, 1, 6, tzinfo=UTC)
+        assert made == pytest.approx((MADE - epoch).total_seconds() + 18, abs=1e-3)
+        for i, stop in enumerate(stops()):
+            begun = file.get_header(i)["acquisitionStart"]["dateTimeValue"].value()
+            ended = file.get_header(i)["acquisitionEnd"]["dateTimeValue"].value()
+            unix = begun + epoch.timestamp() - 18
+            assert unix == pytest.approx(stop.start_ns / 1e9, abs=1e-5)
+            assert ended - begun == pytest.approx(13.0, abs=1e-5)
+
+
 def test_an_e57_file_reads_the_same_by_its_specification(e57):
     """ASTM E2807-11, 6.2 and 9: pages of 1020 bytes and a checksum; the rest is XML and packets."""
     data = e57[0].read_bytes()
@@ -182,7 +200,7 @@ def test_an_e57_file_reads_the_same_by_its_specification(e57):
 
 
 def test_the_same_stops_give_the_same_bytes(tmp_path, laz, e57):
-    write_laz(stops(), tmp_path / "again.laz", software="spheremark 1.2.3", day=DAY)
+    write_laz(stops(), tmp_path / "again.laz", software="spheremark 1.2.3")
     write_e57(stops(), tmp_path / "again.e57", software="spheremark 1.2.3")
     assert (tmp_path / "again.laz").read_bytes() == laz[0].read_bytes()
     assert (tmp_path / "again.e57").read_bytes() == e57[0].read_bytes()
@@ -191,6 +209,6 @@ def test_the_same_stops_give_the_same_bytes(tmp_path, laz, e57):
 @pytest.mark.parametrize("n", [0, 1])
 def test_a_cloud_without_returns_is_refused(tmp_path, n):
     with pytest.raises(InputError, match="no return"):
-        write_laz(stops(n, n_points=0), tmp_path / "a.laz", software="s", day=DAY)
+        write_laz(stops(n, n_points=0), tmp_path / "a.laz", software="s")
     with pytest.raises(InputError, match="no return"):
         write_e57(stops(n, n_points=0), tmp_path / "a.e57", software="s")

@@ -556,7 +556,7 @@ byId("save").addEventListener("click", (event) => during(event.currentTarget, as
   byId("plan-news").hidden = false;
 }));
 for (const button of document.querySelectorAll("[data-file]")) {
-  const [type, ending] = { csv: ["text/csv", "csv"], geojson: ["application/geo+json", "geojson"] }[button.dataset.file];
+  const [type, ending] = { csv: ["text/csv", "csv"], dxf: ["image/vnd.dxf", "dxf"], landxml: ["application/xml", "xml"] }[button.dataset.file];
   button.addEventListener("click", () => during(button, async (plan) => {
     const text = await post("/evaluate", request(plan), type);
     const link = document.createElement("a");

@@ -29,6 +29,7 @@ from spheremark.service.http.api.plan_models import (
     SuggestedMark,
     SuggestionRequest,
 )
+from spheremark.service.http.api.sql import ORIGIN, POINT_MEDIA
 from spheremark.service.http.state import Current, Service
 from spheremark.service.http.uploads import Received
 from spheremark.service.planning import plans, random_plans
@@ -41,13 +42,13 @@ from spheremark.service.planning.requests import (
     spread_stops,
     stops_at,
 )
-from spheremark.service.serialise.plans import Plain, site_json, to_csv, to_geojson
+from spheremark.service.serialise.plans import Plain, plan_points, site_json, to_csv
 from spheremark.storage.catalogue import plans as stored
+from spheremark.storage.exports.points import GeographicOrigin, format_points
 from spheremark.storage.imports.terrain import KEPT, check_ending, read_terrain, write_grid
 
 router = APIRouter(tags=["plans"])
 
-GEOJSON = "application/geo+json"
 _MARKER_RADIUS = 0.100  # [m]
 _GROUND_ACROSS = 150  # places of the ground's heights that a map shows
 
@@ -80,8 +81,14 @@ def get_site(site: SiteKey, service: Current) -> PlanSite:
 
 
 @router.post("/plans/evaluate", name="evaluate_plan", response_model=MappedEvaluation)
-def evaluate_plan(plan: EvaluationRequest, request: Request, service: Current) -> Response:
-    """Predict the accuracy of every stop, as JSON, CSV or GeoJSON, and on a map."""
+def evaluate_plan(
+    plan: EvaluationRequest,
+    request: Request,
+    service: Current,
+    origin: Annotated[str | None, Query(description=ORIGIN)] = None,
+) -> Response:
+    """Predict the accuracy of every stop, as JSON, CSV, DXF, LandXML or GeoJSON, and on a map."""
+    place = GeographicOrigin.parse(origin) if origin else None
     assembled = _assembled(service, plan)
     found = plans.evaluate(assembled, service.planner.visibility)
     if plan.field_cells:
@@ -90,8 +97,10 @@ def evaluate_plan(plan: EvaluationRequest, request: Request, service: Current) -
     accept = request.headers.get("accept", "")
     if accept.startswith("text/csv"):
         return PlainTextResponse(to_csv(found), media_type="text/csv")
-    if accept.startswith(GEOJSON):
-        return JSONResponse(to_geojson(found), media_type=GEOJSON)
+    for kind, media_type in POINT_MEDIA.items():
+        if accept.startswith(media_type):
+            text = format_points(plan_points(found), f".{kind}", place)
+            return Response(text, media_type=media_type)
     return JSONResponse(found)
 
 

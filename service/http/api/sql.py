@@ -2,19 +2,36 @@
 
 from __future__ import annotations
 
+from enum import StrEnum
 from typing import Annotated, Any
 
-from fastapi import APIRouter, Request, Response
+from fastapi import APIRouter, Path, Request, Response
 from fastapi import Query as QueryParameter
 from fastapi.responses import FileResponse, PlainTextResponse
 
 from spheremark.service.http.api.models import Listing, Query, QueryResponse, Table
 from spheremark.service.http.state import Current, Service
 from spheremark.service.serialise.queries import serialise_query
-from spheremark.storage.catalogue.coordinates import coordinates_csv
+from spheremark.storage.catalogue.coordinates import coordinates_csv, named_points
 from spheremark.storage.catalogue.sandbox import QueryResult, run_query, to_csv
+from spheremark.storage.exports.points import GeographicOrigin, format_points
 
 router = APIRouter(tags=["sql"])
+
+ORIGIN = "Where the site is: LON,LAT[,BEARING of the y axis] in degrees (WGS 84); for GeoJSON."
+POINT_MEDIA = {
+    "dxf": "image/vnd.dxf",
+    "xml": "application/xml",
+    "geojson": "application/geo+json",
+}
+
+
+class PointFile(StrEnum):
+    """Files of named points."""
+
+    DXF = "dxf"
+    XML = "xml"
+    GEOJSON = "geojson"
 
 
 @router.post(
@@ -56,9 +73,9 @@ def get_schema(service: Current) -> Listing[Table]:
     responses={200: {"content": {"application/vnd.duckdb": {}}}},
 )
 def export_database(service: Current) -> FileResponse:
-    """Return a consistent copy of the database, for one's own DuckDB."""
+    """Return a consistent copy of the database, for one's own DuckDB (1.0 and later)."""
     return FileResponse(
-        service.catalogue.snapshot(),
+        service.catalogue.export(),
         media_type="application/vnd.duckdb",
         filename="results.duckdb",
     )
@@ -76,6 +93,24 @@ def export_coordinates(
 ) -> Response:
     """Return the newest stations and the control marks as CSV, in the site frame."""
     return Response(coordinates_csv(service.catalogue, survey), media_type="text/csv")
+
+
+@router.get(
+    "/export/coordinates.{kind}",
+    name="export_points",
+    response_class=Response,
+    responses={200: {"content": {media: {} for media in POINT_MEDIA.values()}}},
+)
+def export_points(
+    service: Current,
+    kind: Annotated[PointFile, Path(description="DXF or LandXML to stake out, or GeoJSON.")],
+    survey: Annotated[str | None, QueryParameter(description="Id or name of a survey.")] = None,
+    origin: Annotated[str | None, QueryParameter(description=ORIGIN)] = None,
+) -> Response:
+    """Return the newest stations and the control marks for other programs."""
+    place = GeographicOrigin.parse(origin) if origin else None
+    text = format_points(named_points(service.catalogue, survey), f".{kind}", place)
+    return Response(text, media_type=POINT_MEDIA[kind])
 
 
 def _run(service: Service, request: Query, accept: str) -> QueryResponse | Response:

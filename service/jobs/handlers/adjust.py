@@ -220,12 +220,16 @@ def _centres(
 def _files(result: AdjustedNetwork, plain: Row) -> dict[str, str]:
     """Return the files of a network by name."""
     from spheremark.service.serialise.network_report import report
-    from spheremark.storage.exports.network import format_coordinates, format_gama
+    from spheremark.storage.exports.network import format_coordinates, format_gama, network_points
+    from spheremark.storage.exports.points import format_points
 
+    points = network_points(result)
     return {
         "adjustment.json": json.dumps(plain),
         "report.txt": report(plain),
         "coordinates.csv": format_coordinates(result),
+        "coordinates.dxf": format_points(points, ".dxf"),
+        "coordinates.xml": format_points(points, ".xml"),
         "gama.xml": format_gama(result),
     }
 
