@@ -4,6 +4,7 @@
 # make bench  speed and memory as ratios against a peer in the same run
 # make reference  renew REFERENCE.md from the commands and the settings
 # make lock   renew the lock files from pyproject.toml
+# make sbom   write the software bill of materials (CycloneDX) to build/sbom.json
 # make clean  remove what the other targets made
 # With PYTHON=python3.13 VENV=.venv-3.13 they use another Python and keep its packages apart.
 
@@ -14,7 +15,7 @@ KERNELS := $(shell git ls-files 'pipelines/*.py' 'storage/*.py' 2>/dev/null)
 export OPENBLAS_NUM_THREADS ?= 1
 SIDE_BY_SIDE := --numprocesses 2 --dist loadfile
 
-.PHONY: help setup setup-dev demo test check bench reference lock lock-check clean
+.PHONY: help setup setup-dev demo test check bench reference lock sbom clean
 
 help:
 	@sed -n 's/^# //p' Makefile
@@ -66,6 +67,11 @@ reference: setup
 
 lock: setup-dev
 	.ci/locks $(VENV) --renew
+
+sbom: setup-dev
+	@mkdir -p build
+	@$(BIN)/python -W ignore -m cyclonedx_py requirements --pyproject pyproject.toml \
+		--output-reproducible -o build/sbom.json requirements.lock
 
 clean:
 	rm -rf .venv .venv-* build dist *.egg-info .mypy_cache .ruff_cache .pytest_cache .hypothesis \

@@ -179,6 +179,13 @@ def test_a_lock_file_names_no_place_of_a_package(name):
     )
 
 
+@pytest.mark.parametrize("name", ["requirements.lock", "requirements-dev.lock"])
+def test_every_locked_package_has_the_digests_of_its_files(name):
+    packages = re.split(r"^(?=[a-z0-9-]+==)", (ROOT / name).read_text(), flags=re.M)[1:]
+    assert len(packages) > 100
+    assert all("--hash=sha256:" in package for package in packages)
+
+
 def locked(name):
     return dict(re.findall(r"^([a-z0-9-]+)==(\S+)", (ROOT / name).read_text(), re.M))
 
