@@ -137,6 +137,20 @@ class FittingConfig:
         0.02 deg, good workmanship. It parts the two faces of the scan.
     sigma_offset : float
         Standard deviation of where the LiDAR sits on the gimbal, per axis [m].
+    sigma_beam_width : float
+        Standard deviation of the beam's divergence, relative to the rig's. 0.35: sources for one
+        sensor differ by a factor of two; makers give contours of different energy.
+    sigma_beam_window : float
+        Standard deviation of the beam's width at the window, relative to the 12.7 x 9.5 mm of a
+        VLP-16; the rig assumes none.
+    sigma_echo_cosine : float
+        Standard deviation of the power of the cosine of incidence with which a part of the
+        footprint weighs in the range of its echo. 0 is even; 1 is the energy of a matt surface.
+    sigma_range_common : float
+        Standard deviation of what all lasers measure too long in common [m].
+    sigma_range_scale : float
+        Standard deviation of the scale of all ranges, relative. 3e-5: the oscillator of the
+        sensor's clock.
     paper_model : str
         What ``paper`` registers to the returns, of ``PAPER_MODELS``. hemisphere: as the study does;
         its Figure 3 shows the whole sphere instead.
@@ -153,6 +167,11 @@ class FittingConfig:
     sigma_direction: float = 1e-4
     sigma_mounting: float = 3.5e-4
     sigma_offset: float = 5e-4
+    sigma_beam_width: float = 0.35
+    sigma_beam_window: float = 0.5
+    sigma_echo_cosine: float = 0.7
+    sigma_range_common: float = 0.0005
+    sigma_range_scale: float = 3e-5
     paper_model: str = "hemisphere"
     paper_cut: str = "equator"
 
@@ -162,6 +181,11 @@ class FittingConfig:
         _check("fitting.sigma_direction", self.sigma_direction, 0.0, 0.01)
         _check("fitting.sigma_mounting", self.sigma_mounting, 0.0, 0.1)
         _check("fitting.sigma_offset", self.sigma_offset, 0.0, 0.1)
+        _check("fitting.sigma_beam_width", self.sigma_beam_width, 0.0, 1.0)
+        _check("fitting.sigma_beam_window", self.sigma_beam_window, 0.0, 2.0)
+        _check("fitting.sigma_echo_cosine", self.sigma_echo_cosine, 0.0, 2.0)
+        _check("fitting.sigma_range_common", self.sigma_range_common, 0.0, 0.1)
+        _check("fitting.sigma_range_scale", self.sigma_range_scale, 0.0, 0.01)
         _check_choice("fitting.paper_model", self.paper_model, PAPER_MODELS)
         _check_choice("fitting.paper_cut", self.paper_cut, PAPER_CUTS)
 
@@ -197,7 +221,8 @@ class ResectionConfig:
         a centre's variance along its line of sight counts as shared.
     sigma_height : float
         Standard deviation of what all centres of a survey are too high, as the foot of their poles
-        and the tilt of the spin axis leave [m]; 0 leaves it out. 0.12 mm, by simulation.
+        and the tilt of the spin axis leave [m]; 0 leaves it out. 0.3 mm, by simulation of beams
+        of several profiles: what stands behind the lower half of spheres moves its limb.
     """
 
     methods: tuple[str, ...] = ("free_station",)
@@ -208,7 +233,7 @@ class ResectionConfig:
     sigma_common: float = 0.00005
     sigma_range: float = 0.001
     sigma_range_shared: float = 0.0009
-    sigma_height: float = 0.00012
+    sigma_height: float = 0.0003
 
     def __post_init__(self) -> None:
         _check_methods("resection.methods", self.methods, RESECTION_METHODS)

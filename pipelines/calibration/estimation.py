@@ -186,8 +186,10 @@ class _Problem(NamedTuple):
         return _State(rig, centres, linearise(self.seen, rig, centres, self.covs, self.radius))
 
     def extra(self, state: _State) -> Array:
-        """Return the noise that directions and bends add to each range [m]."""
-        return np.asarray(np.hypot(self.sigma_direction * state.lin.slopes, state.lin.bends))
+        """Return the noise that directions and linearisation add to each range [m]."""
+        return np.asarray(
+            np.hypot(self.sigma_direction * state.lin.slopes, state.lin.sigmas_nonlinear)
+        )
 
     def sigmas(self, state: _State, noises: Array) -> Array:
         """Return the standard deviation of each range, given its noise [m]."""

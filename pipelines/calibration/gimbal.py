@@ -263,15 +263,15 @@ class Linearised(NamedTuple):
         The same by the parameters of ``GIMBAL``.
     slopes : (n,)
         How much the range changes with the direction of the beam [m/rad].
-    bends : (n,)
-        Standard deviation that the bend of the range leaves beside its linear part [m].
+    sigmas_nonlinear : (n,)
+        Standard deviation of the part of the range that is not linear [m].
     """
 
     residuals: Array
     J_centres: Array
     J_rig: Array
     slopes: Array
-    bends: Array
+    sigmas_nonlinear: Array
 
 
 def linearise(seen: Pulses, rig: Rig, centres: Array, covs: Array, radius: float) -> Linearised:
@@ -281,12 +281,12 @@ def linearise(seen: Pulses, rig: Rig, centres: Array, covs: Array, radius: float
     -----
     With ``v`` from a beam's origin to the centre and ``J`` the derivative of its range by the
     centre, a turn ``w`` of the beam changes the range by ``(J x v) w`` and a shift of its origin
-    by ``-J``: what counts is where the sphere is as seen from the beam. Near the outline the range
-    bends within less than a millimetre; its slope there is that between places to either side of
-    the centre (statistical linearisation by cubature).
+    by ``-J``: what counts is where the sphere is as seen from the beam. Near the limb the slope
+    of the range changes within less than a millimetre; there it is that between places to either
+    side of the centre (statistical linearisation by cubature).
     """
     table = aimed(seen, rig)
-    ranges, J, bends = _averaged(table, centres, covs, radius, seen.which)
+    ranges, J, nonlinear = _averaged(table, centres, covs, radius, seen.which)
     turns, shifts = motions(seen, rig)
     v = centres[seen.which] - table.origins_base
     J_rig = np.einsum("nqi,ni->nq", turns, np.cross(J, v)) - np.einsum("nqi,ni->nq", shifts, J)
@@ -298,14 +298,14 @@ def linearise(seen: Pulses, rig: Rig, centres: Array, covs: Array, radius: float
         J_centres=J,
         J_rig=J_rig,
         slopes=table.ranges * np.sqrt(slopes2),
-        bends=bends,
+        sigmas_nonlinear=nonlinear,
     )
 
 
 def _averaged(
     table: Beams, centres: Array, covs: Array, radius: float, which: Index
 ) -> tuple[Array, Array, Array]:
-    """Return mean ranges, derivatives by the centre and what bends, over the centres' widths."""
+    """Return mean ranges, derivatives by the centre and nonlinear part over the centres' widths."""
     radii = np.full(len(centres), radius)
     columns = np.sqrt(3.0) * np.linalg.cholesky(covs)
     places = [centres + side * columns[:, :, k] for k in range(3) for side in (1.0, -1.0)]
@@ -313,8 +313,8 @@ def _averaged(
     slopes = (ranges[0::2] - ranges[1::2]).T / 2.0
     J = np.asarray(np.einsum("nk,nki->ni", slopes, np.linalg.inv(columns)[which]))
     linear = np.array([np.einsum("ni,ni->n", J, (place - centres)[which]) for place in places])
-    bends = np.std(ranges - linear, axis=0)
-    return ranges.mean(axis=0), J, bends
+    nonlinear = np.std(ranges - linear, axis=0)
+    return ranges.mean(axis=0), J, nonlinear
 
 
 def _euler(rig: Rig) -> Array:

@@ -6,6 +6,7 @@ laser, the errors of the mounting, and how sharply returns end at the limb.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from typing import NamedTuple
 
@@ -13,26 +14,30 @@ import numpy as np
 
 from spheremark.pipelines.estimation.linear_algebra import inverse
 from spheremark.pipelines.model import Array, Mask
-from spheremark.pipelines.sphere.limb import Edge, edge_before, edge_of, limb_normals
+from spheremark.pipelines.sphere.limb import Edge, edge_of, limb_normals, prior_edge
 from spheremark.pipelines.sphere.linearisation import Linear, linearise
 from spheremark.pipelines.sphere.mounting import N_MOUNTING, effects_on
-from spheremark.pipelines.sphere.noise import START, Noise, Weighed, weigh
+from spheremark.pipelines.sphere.noise import Noise, Weighed, weigh
 from spheremark.pipelines.sphere.normal_equations import Normals, normals_of, reduce
+from spheremark.pipelines.sphere.optics import OPTICS, derivatives, with_widths
 from spheremark.pipelines.sphere.radius import Ranges, free_radii
 from spheremark.pipelines.sphere.returns import Returns, may_be_sphere, moved_faces
 
 _EFFICIENCY = 0.9753  # variance of the estimate over the inverse normal matrix
 _SIGMA_BIAS_MIN = 1e-5  # [m] of the laser biases: keeps their prior invertible
-_MOUNTING_MIN = 1e-9  # of the unknowns of the mounting: likewise
+_SIGMA_MIN = 1e-9  # of the other shared unknowns: likewise
 _N_STEPS = 8
 _N_STEPS_GATED = 5  # after these the choice of returns by their place is fixed
 _N_STEPS_RANGES = 3  # without the limb
-_N_STEPS_SOFT = 6  # before the edge at the limb is estimated
+_N_STEPS_ROBUST = 2  # after these the noise is that of the weighted residuals
+_N_STEPS_SOFT = 3  # before the edge at the limb is estimated
+_N_OPTICS = 4  # spheres, whose common radius is another unknown beside three of the optics
+_OPTICS_MAX = 15.1  # sum of squares over prior sigmas that optics exceed once in 100 scans
 _ROUGH = 0.1  # radii: standard deviation per axis of a rough centre
 _STEP_MAX = 0.25  # radii per step
 _GAP_SIGMAS = 3.0  # of its centre by which a return may lie outside a sphere and still be its own
 _GAP_MIN, _GAP_MAX = 0.02, 0.3  # radii: least and most of that
-_DOF_BIAS = 2.0  # lasers that the prior counts for in the estimate of the biases' spread
+_DOF_SPREAD = 2.0  # unknowns that the prior counts for in the estimate of their spread
 
 Observe = Callable[[Array, Array], tuple[Array, Array]]
 """Further observations of the centres. Called with centres, (m, 3), and their covariances; returns
@@ -48,13 +53,23 @@ class Prior(NamedTuple):
         Radius of the spheres [m].
     sigma_biases : (k,)
         Standard deviations of the range biases of the lasers that occur [m].
+    sigma_optics : (q,)
+        Standard deviations of ``OPTICS``.
     sigma_mounting : (6,)
         Standard deviations of the unknowns of the mounting.
     """
 
     radius: float
     sigma_biases: Array
+    sigma_optics: Array
     sigma_mounting: Array
+
+    @property
+    def sigmas(self) -> Array:
+        """Standard deviations of all shared unknowns, none of them zero."""
+        parts = (self.sigma_biases, self.sigma_optics, self.sigma_mounting)
+        least = np.repeat([_SIGMA_BIAS_MIN, _SIGMA_MIN, _SIGMA_MIN], [len(part) for part in parts])
+        return np.asarray(np.maximum(np.concatenate(parts), least))
 
 
 class State(NamedTuple):
@@ -64,34 +79,47 @@ class State(NamedTuple):
     ----------
     centres : (m, 3)
         Centres [m].
-    biases : (k,)
-        Range biases of the lasers [m].
-    mounting : (6,)
-        Errors of the mounting, in the order of ``mounting.effects_on``.
-    sigma_biases : (k,)
-        Standard deviations of the biases, as estimated [m].
-    has_biases : bool
+    shared : (k + q + 6,)
+        Range biases of the lasers [m], ``OPTICS``, and errors of the mounting in the order of
+        ``mounting.effects_on``.
+    sigmas : (k + q + 6,)
+        Their prior standard deviations, those of biases and mounting scaled as estimated.
+    has_shared : bool
         Whether the shared unknowns are estimated already.
-    noise : Noise
-        That of the stop.
+    noise : Noise or None
+        That of the stop; none before the first residuals.
     cov_noise, cov_shared_part : (m, 3, 3)
         Covariances of the centres by the noise, and by the shared unknowns [m^2].
-    by_shared : (m, 3, k + 6)
+    by_shared : (m, 3, k + q + 6)
         Derivatives of the centres by the shared unknowns, with the sign turned.
-    cov_shared : (k + 6, k + 6)
-        Covariance of the biases and of the mounting.
+    cov_shared : (k + q + 6, k + q + 6)
+        Covariance of the shared unknowns.
     """
 
     centres: Array
-    biases: Array
-    mounting: Array
-    sigma_biases: Array
-    has_biases: bool
-    noise: Noise
+    shared: Array
+    sigmas: Array
+    has_shared: bool
+    noise: Noise | None
     cov_noise: Array
     cov_shared_part: Array
     by_shared: Array
     cov_shared: Array
+
+    @property
+    def biases(self) -> Array:
+        """Range biases of the lasers [m]."""
+        return self.shared[: -N_MOUNTING - len(OPTICS)]
+
+    @property
+    def optics(self) -> Array:
+        """Values of ``OPTICS``."""
+        return self.shared[-N_MOUNTING - len(OPTICS) : -N_MOUNTING]
+
+    @property
+    def mounting(self) -> Array:
+        """Errors of the mounting."""
+        return self.shared[-N_MOUNTING:]
 
     @property
     def covs(self) -> Array:
@@ -113,49 +141,56 @@ def estimate(
     """Estimate all centres, the laser biases and the mounting, from rough centres, (m, 3)."""
     state, radius = _start(rough, prior), prior.radius
     is_used = np.ones(len(returns.ranges), dtype=bool)
-    edge, sites = edge_before(radius), np.zeros((len(returns.ranges), 2))
+    edge, factors = prior_edge(radius), np.zeros((len(returns.ranges), 2))
     for step in range(_N_STEPS):
         linear = _linear(returns, state, is_used, radius)
         if step < _N_STEPS_GATED:
             is_used = may_be_sphere(returns, linear.offsets, _margins(state, radius), radius)
-        now = _weighed(returns, state, linear, is_used)
-        state = now.state._replace(has_biases=step >= _N_STEPS_GATED)
+        now = _weighed(returns, state, linear, radius, is_used)
+        state = now.state._replace(has_shared=step >= _N_STEPS_GATED)
+        if step < _N_STEPS_ROBUST:
+            state = state._replace(noise=None)
         residuals, sigmas, weights, _ = now.weighed
-        N = normals_of(returns, linear, residuals, weights / sigmas**2, len(state.biases))
-        if uses_limb and step == _N_STEPS_SOFT:
-            edge = edge_of(returns, linear, weights, radius)
+        J = (linear.J[:3], derivatives(returns, linear))
+        N = normals_of(returns, J, residuals, weights / sigmas**2, len(state.biases))
+        seen = with_widths(returns, state.optics)
+        if uses_limb and step >= _N_STEPS_SOFT:
+            edge = edge_of(seen, linear, weights, radius)
         if uses_limb and step >= _N_STEPS_RANGES:
-            sites = _add_limb(N, returns, now, edge, sites)
+            factors = _add_limb(N, seen, now, edge, factors)
         if observe is not None and step >= _N_STEPS_RANGES:
             centres, rhs = observe(state.centres, state.covs)
             N.centres[:, :, :3] += centres
             N.centres[:, :, -1] += rhs
         state = _stepped(state, N, prior)
-    return _weighed(returns, state, _linear(returns, state, is_used, radius), is_used)
+    linear = _linear(returns, state, is_used, radius)
+    return _weighed(returns, state, linear, radius, is_used)
 
 
 def _start(rough: Array, prior: Prior) -> State:
     """Return the state before the first step."""
-    nothing, sigmas = np.zeros((len(rough), 3, 3)), prior.sigma_biases
+    nothing, sigmas = np.zeros((len(rough), 3, 3)), prior.sigmas
     return State(
         centres=rough,
-        biases=np.zeros(len(sigmas)),
-        mounting=np.zeros(N_MOUNTING),
-        sigma_biases=sigmas,
-        has_biases=False,
-        noise=START,
+        shared=np.zeros(len(sigmas)),
+        sigmas=sigmas,
+        has_shared=False,
+        noise=None,
         cov_noise=nothing + (_ROUGH * prior.radius) ** 2 * np.eye(3),
         cov_shared_part=nothing,
-        by_shared=np.zeros((len(rough), 3, len(sigmas) + N_MOUNTING)),
-        cov_shared=np.diag(np.concatenate([sigmas, prior.sigma_mounting]) ** 2),
+        by_shared=np.zeros((len(rough), 3, len(sigmas))),
+        cov_shared=np.diag(sigmas**2),
     )
 
 
 def _corrected(returns: Returns, state: State) -> Returns:
-    """Return the returns with their beams corrected for the errors of the mounting."""
-    if not state.mounting.any():
+    """Return the returns as mounting and optics say they are, less biases and scale of ranges."""
+    if not state.shared.any():
         return returns
-    return moved_faces(returns, effects_on(state.centres) @ state.mounting)
+    moved = moved_faces(returns, effects_on(state.centres) @ state.mounting)
+    bias, scale = state.optics[-2:]
+    excess = state.biases[returns.lasers] + bias + scale * returns.ranges
+    return with_widths(moved, state.optics)._replace(ranges=returns.ranges - excess)
 
 
 def _spheres(state: State, radius: float) -> tuple[Array, Array]:
@@ -176,45 +211,56 @@ def _margins(state: State, radius: float) -> Array:
     return np.asarray(np.clip(_GAP_SIGMAS * sigma, _GAP_MIN * radius, _GAP_MAX * radius))
 
 
-def _weighed(returns: Returns, state: State, linear: Linear, is_used: Mask) -> Estimate:
+def _weighed(
+    returns: Returns, state: State, linear: Linear, radius: float, is_used: Mask
+) -> Estimate:
     """Return a state with its residuals, and the noise that they show."""
-    weighed = weigh(returns, linear, state.biases, state.noise, is_used)
+    ranges = _corrected(returns, state).ranges - state.optics[2] * linear.J_optics[1]
+    weighed = weigh(returns._replace(ranges=ranges), linear, radius, state.noise, is_used)
     return Estimate(state._replace(noise=weighed.noise), linear, weighed)
 
 
-def _add_limb(N: Normals, returns: Returns, now: Estimate, edge: Edge, sites: Array) -> Array:
-    """Add the observations of the limb to normal equations; return the sites of the returns."""
-    limb = limb_normals(returns, now.linear, now.weighed.weights, now.state.covs, edge, sites)
+def _add_limb(N: Normals, returns: Returns, now: Estimate, edge: Edge, factors: Array) -> Array:
+    """Add the observations of the limb to normal equations; return the factors of the returns."""
+    limb = limb_normals(returns, now.linear, now.weighed.weights, now.state.covs, edge, factors)
     N.centres[:, :, :3] += limb.centres
     N.centres[:, :, -1] += limb.rhs
     N.by_face[:, :, :3] += limb.faces
     N.by_face[:, :, -1] += limb.rhs_faces
-    return limb.sites
+    return limb.factors
 
 
 def _stepped(state: State, N: Normals, prior: Prior) -> State:
-    """Return the state after one Gauss-Newton step of centres, biases and mounting together."""
-    n, prior2 = len(state.biases), float(np.mean(prior.sigma_biases**2))
-    sigmas = np.maximum(np.concatenate([state.sigma_biases, prior.sigma_mounting]), _MOUNTING_MIN)
-    sigmas[:n] = np.maximum(sigmas[:n], _SIGMA_BIAS_MIN)
-    shared = np.concatenate([state.biases, state.mounting])
-    reduced = reduce(N, effects_on(state.centres), sigmas**-2.0, -shared / sigmas**2)
+    """Return the state after one Gauss-Newton step of centres and shared unknowns together."""
+    n = len(state.biases)
+    reduced = reduce(
+        N, effects_on(state.centres), state.sigmas**-2.0, -state.shared / state.sigmas**2
+    )
     cov_shared: Array = inverse(reduced.N)
-    step = state.has_biases * (cov_shared @ reduced.rhs)
-    biases = state.biases + step[:n]
-    # spread of the biases by expectation maximisation
-    squares = (biases**2 + np.diag(cov_shared)[:n]).sum() + _DOF_BIAS * prior2
-    spread = prior.sigma_biases * np.sqrt(squares / (_DOF_BIAS + n) / prior2)
+    step = state.has_shared * (cov_shared @ reduced.rhs)
+    shared, sigmas = state.shared + step, prior.sigmas.copy()
+    if state.has_shared:
+        for part in (slice(n), slice(-N_MOUNTING, None)):
+            sigmas[part] *= _spread((shared[part], np.diag(cov_shared)[part]), sigmas[part])
     return state._replace(
         centres=state.centres + _shortened(reduced.local_steps(step), prior.radius),
-        biases=biases,
-        mounting=state.mounting + step[n:],
-        sigma_biases=spread if state.has_biases else prior.sigma_biases,
+        shared=shared,
+        sigmas=sigmas,
         cov_noise=_EFFICIENCY * reduced.own,
         cov_shared_part=reduced.gains @ cov_shared @ reduced.gains.transpose(0, 2, 1),
         by_shared=reduced.gains,
         cov_shared=cov_shared,
     )
+
+
+def _spread(found: tuple[Array, Array], sigmas: Array) -> float:
+    """Return by how much unknowns spread more than their prior, by expectation maximisation.
+
+    ``found`` are their estimates and variances.
+    """
+    estimates, variances = found
+    squares = float(np.sum((estimates**2 + variances) / sigmas**2))
+    return math.sqrt((squares + _DOF_SPREAD) / (len(sigmas) + _DOF_SPREAD))
 
 
 def _shortened(steps: Array, radius: float) -> Array:
@@ -224,14 +270,24 @@ def _shortened(steps: Array, radius: float) -> Array:
 
 
 def estimate_radii(returns: Returns, found: Estimate, radius: float) -> tuple[Array, Array]:
-    """Estimate radii together with the centres; return them with their standard deviations."""
-    state, (residuals, sigmas, weights, _) = found.state, found.weighed
+    """Estimate radii together with the centres; return them with their standard deviations.
+
+    With the optics as specified where spheres are few or the estimated ones unlikely: there they
+    take up what another radius does.
+    """
+    state, (_, sigmas, weights, _) = found.state, found.weighed
+    shared, optics = state.shared.copy(), slice(len(state.biases), -N_MOUNTING)
+    unlikely = float(np.sum((shared / state.sigmas)[optics] ** 2)) > _OPTICS_MAX
+    if len(state.centres) < _N_OPTICS or unlikely:
+        shared[optics] = 0.0
+    moved, spheres = _corrected(returns, state._replace(shared=shared)), _spheres(state, radius)
     observed = Ranges(
-        ranges=returns.ranges - state.biases[returns.lasers],
-        variances=np.maximum(sigmas**2 - found.linear.bends**2, 1e-12),
+        ranges=moved.ranges,
+        variances=np.maximum(sigmas**2 - found.linear.sigmas_nonlinear**2, 1e-12),
         weights=weights,
     )
-    return free_radii(_corrected(returns, state), observed, *_spheres(state, radius), residuals)
+    residuals = moved.ranges - linearise(moved, *spheres, weights > 0.0).ranges
+    return free_radii(moved, observed, *spheres, residuals)
 
 
 def shared_range_sigmas(state: State) -> Array:

@@ -169,34 +169,35 @@ def _mean_depth(
 @compiled
 def mean_depth_inside(
     x0: float, y0: float, radius: float, half_x: float, half_y: float
-) -> tuple[float, float, float, float]:
+) -> tuple[float, float, float, float, float]:
     """Like ``_mean_depth``, for a footprint that ends 0.1 radii or more inside the limb.
 
-    Radon's rule of degree 5 for the disc (1948), good to 0.01 mm for a sphere of 0.1 m, at a
-    quarter of the cost of the strips.
+    Last is the mean square of the depth in place of the lit share. Radon's rule of degree 5 for the
+    disc (1948), good to 0.01 mm for a sphere of 0.1 m, at a quarter of the cost of the strips.
     """
-    mean, by_x, by_y, by_radius = 0.0, 0.0, 0.0, 0.0
+    mean, by_x, by_y, by_radius, square = 0.0, 0.0, 0.0, 0.0, 0.0
     for k in range(len(_RAYS_WEIGHT)):
         dx, dy = half_x * _RAYS_X[k] - x0, half_y * _RAYS_Y[k] - y0
         depth = np.sqrt(radius * radius - dx * dx - dy * dy)
         slope = _RAYS_WEIGHT[k] / depth
         mean += _RAYS_WEIGHT[k] * depth
+        square += _RAYS_WEIGHT[k] * depth * depth
         by_x += slope * dx
         by_y += slope * dy
         by_radius += slope * radius
-    return mean, by_x, by_y, by_radius
+    return mean, by_x, by_y, by_radius, square
 
 
 @compiled_with(fastmath=FUSED)
 def mean_depths_at(points: Array, found: Array) -> None:
     """Fill in ``_mean_depth`` without derivatives for several places of a centre.
 
-    ``points`` has x, y, radius and half widths, (5, p), and is overwritten; ``found`` is (2, p),
-    the second row for lit lengths. The inner loop has no branches, so that it runs on several
+    ``points`` has x, y, radius and half widths, (5, p), and is overwritten; ``found``, (3, p), gets
+    means, lit lengths and mean squares. The inner loop has no branches, so that it runs on several
     points at once: several times as fast.
     """
     for p in range(points.shape[1]):
-        found[0, p] = found[1, p] = 0.0
+        found[0, p] = found[1, p] = found[2, p] = 0.0
         if abs(points[1, p]) > abs(points[0, p]):
             points[0, p], points[1, p] = points[1, p], points[0, p]
             points[3, p], points[4, p] = points[4, p], points[3, p]
@@ -215,8 +216,11 @@ def mean_depths_at(points: Array, found: Array) -> None:
             )
             found[0, p] += weight * 0.5 * (right * depth_right - left * depth_left + h2 * turn)
             found[1, p] += weight * (right - left)
+            cubes = right * right * right - left * left * left
+            found[2, p] += weight * (h2 * (right - left) - cubes / 3.0)
     for p in range(points.shape[1]):
         found[0, p] = found[0, p] / found[1, p] if found[1, p] > 0.0 else 0.0
+        found[2, p] = found[2, p] / found[1, p] if found[1, p] > 0.0 else 0.0
 
 
 @compiled_with(fastmath=FUSED)

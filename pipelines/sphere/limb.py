@@ -13,7 +13,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy.special import ndtr
 
-from spheremark.pipelines.model import Array, Mask
+from spheremark.pipelines.model import Array, Index, Mask
 from spheremark.pipelines.sphere.linearisation import Linear
 from spheremark.pipelines.sphere.normal_equations import sums_of_products
 from spheremark.pipelines.sphere.returns import Returns, distances_and_halves
@@ -40,15 +40,16 @@ class Edge(NamedTuple):
     ----------
     radius : float
         Radius of the spheres [m].
-    inside : float
-        How far inside the limb a footprint must reach to return, in its half widths.
-    softness : float
+    inside : (2,)
+        How far inside the limb a footprint must reach to return, in its half widths: at the lower
+        half of a sphere, where ground behind it may be the stronger echo, and at the upper.
+    softness : (2,)
         Standard deviation of that, in the same unit.
     """
 
     radius: float
-    inside: float
-    softness: float
+    inside: Array
+    softness: Array
 
 
 class LimbNormals(NamedTuple):
@@ -60,20 +61,21 @@ class LimbNormals(NamedTuple):
         Normal matrices and right-hand sides.
     faces, rhs_faces : (m, 3, 3), (m, 3)
         The same with returns of the downward sweep counted negative.
-    sites : (n, 2)
-        Precision, and precision times mean, of each return's normal approximation.
+    factors : (n, 2)
+        Precision, and precision times mean, of the normal approximation of each return's
+        likelihood.
     """
 
     centres: Array
     rhs: Array
     faces: Array
     rhs_faces: Array
-    sites: Array
+    factors: Array
 
 
-def edge_before(radius: float) -> Edge:
+def prior_edge(radius: float) -> Edge:
     """Return the edge that is assumed before returns are counted: one sigma softer than likely."""
-    return Edge(radius, _EDGE, _SOFTNESS * math.exp(_SPREAD))
+    return Edge(radius, np.full(2, _EDGE), np.full(2, _SOFTNESS * math.exp(_SPREAD)))
 
 
 def edge_of(returns: Returns, linear: Linear, weights: Array, radius: float) -> Edge:
@@ -91,14 +93,21 @@ def edge_of(returns: Returns, linear: Linear, weights: Array, radius: float) -> 
     inside = (radius + halves - distances) / halves
     bins = np.clip((inside - _FROM) / _BIN, 0.0, _N_BINS).astype(np.intp)
     counted = (weights > 0.0) & (bins < _N_BINS) & ~_is_by_pole(returns, linear.offsets, radius)
-    counts = np.bincount(bins[counted], minlength=_N_BINS)
-    lateral2 = np.sum((returns.sigmas_lateral / halves)[counted] ** 2) / max(counts.sum(), 1.0)
-    logs = np.tensordot(counts, _log_densities(), axes=1) + _log_prior()
-    posterior = np.exp(logs - logs.max())
-    posterior /= posterior.sum()
-    softness2 = float(np.exp(2.0 * posterior.sum(axis=0) @ np.log(_SOFTNESSES)) - lateral2)
-    edge = float(posterior.sum(axis=1) @ _EDGES)
-    return Edge(radius, edge, math.sqrt(max(softness2, _SOFTNESS_MIN**2)))
+    upper = _is_upper(returns, linear.offsets)[counted]
+    counts = np.bincount(bins[counted] + _N_BINS * upper, minlength=2 * _N_BINS)
+    blurs2 = (returns.sigmas_lateral / halves)[counted] ** 2
+    lateral2 = np.bincount(upper, blurs2, 2) / np.maximum(np.bincount(upper, minlength=2), 1.0)
+    logs = np.tensordot(counts.reshape(2, _N_BINS), _log_densities(), axes=1) + _log_prior()
+    posterior = np.exp(logs - logs.max(axis=(1, 2), keepdims=True))
+    posterior /= posterior.sum(axis=(1, 2), keepdims=True)
+    softness2 = np.exp(2.0 * posterior.sum(axis=1) @ np.log(_SOFTNESSES)) - lateral2
+    edges = posterior.sum(axis=2) @ _EDGES
+    return Edge(radius, edges, np.sqrt(np.maximum(softness2, _SOFTNESS_MIN**2)))
+
+
+def _is_upper(returns: Returns, offsets: Array) -> Index:
+    """Return 1 for beams that pass above the centre, else 0."""
+    return np.asarray(np.sum(offsets * returns.vertical, axis=0) > 0.0, dtype=np.intp)
 
 
 @cache
@@ -121,7 +130,7 @@ def _log_prior() -> Array:
 
 
 def limb_normals(
-    returns: Returns, linear: Linear, weights: Array, covs: Array, edge: Edge, sites: Array
+    returns: Returns, linear: Linear, weights: Array, covs: Array, edge: Edge, factors: Array
 ) -> LimbNormals:
     """Return what it adds to the normal equations that the beams of returns met their spheres.
 
@@ -136,8 +145,9 @@ def limb_normals(
     is eliminated.
     """
     distances, halves = distances_and_halves(returns, linear.offsets)
-    inside = edge.radius + halves - distances - edge.inside * halves
-    blur2 = (edge.softness * halves) ** 2 + returns.sigmas_lateral**2
+    upper = _is_upper(returns, linear.offsets)
+    inside = edge.radius + halves - distances - edge.inside[upper] * halves
+    blur2 = (edge.softness[upper] * halves) ** 2 + returns.sigmas_lateral**2
     widest = np.trace(covs, axis1=1, axis2=2)[returns.markers]
     used = np.flatnonzero((weights > 0.0) & (inside <= _CERTAIN * np.sqrt(widest + blur2)))
     by_pole = _is_by_pole(returns, linear.offsets, edge.radius)[used]
@@ -157,8 +167,8 @@ def limb_normals(
     columns[3] = -halves
     rows = columns[:3]
     variances = np.einsum("in,nij,jn->n", rows, covs[returns.markers[used]], rows)
-    found = np.zeros(sites.shape)
-    found[used] = weights[used, None] * _site(inside, (variances, blur2), sites[used])
+    found = np.zeros(factors.shape)
+    found[used] = weights[used, None] * _approximated(inside, (variances, blur2), factors[used])
 
     precisions, rhs = found[used, 0], found[used, 1] - found[used, 0] * inside
     starts, right = np.searchsorted(used, returns.starts), np.vstack([precisions * columns, rhs])
@@ -173,23 +183,23 @@ def limb_normals(
     return LimbNormals(N[:, :, :3], N[:, :, 4], reduced_faces, rhs_faces, found)
 
 
-def _site(inside: Array, variances: tuple[Array, Array], sites: Array) -> Array:
-    """Return the normal approximations, (n, 2), of the probabilities of reaching inside.
+def _approximated(inside: Array, variances: tuple[Array, Array], factors: Array) -> Array:
+    """Return the normal approximations, (n, 2), of the likelihoods of reaching inside.
 
     ``variances`` are those of the centre along the row, and of the blur of the edge.
     """
     variance, blur2 = variances
-    precision = np.maximum(1.0 / variance - sites[:, 0], _CAVITY_MIN / variance)
-    rhs = inside / variance - sites[:, 1]
+    precision = np.maximum(1.0 / variance - factors[:, 0], _CAVITY_MIN / variance)
+    rhs = inside / variance - factors[:, 1]
     spread = 1.0 / precision + blur2
     z = rhs / precision / np.sqrt(spread)
     chance = np.where(z > _CERTAIN, 1.0, _OUTLIERS + (1.0 - _OUTLIERS) * ndtr(z))
     ratio = (1.0 - _OUTLIERS) * _DENSITY * np.exp(-0.5 * z * z) / chance
-    bend = ratio * (z + ratio) / spread  # minus the second derivative of the log-likelihood
-    given = bend / (1.0 - bend / precision)
+    curvature = ratio * (z + ratio) / spread  # minus the second derivative of the log-likelihood
+    given = curvature / (1.0 - curvature / precision)
     mean = rhs / precision + ratio / np.sqrt(spread) / precision
     # not concave so far outside: the return is rather an outlier, and says nothing
-    is_concave = bend[:, None] > 0.0
+    is_concave = curvature[:, None] > 0.0
     return np.where(is_concave, np.column_stack([given, (precision + given) * mean - rhs]), 0.0)
 
 

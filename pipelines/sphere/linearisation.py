@@ -1,7 +1,7 @@
 """Ranges of beams to spheres, linearised over the uncertainty of the spheres.
 
-The range to a sphere bends within less than a millimetre near the limb. Its derivative at one place
-overstates what a beam says about a centre that is known to millimetres only, so that ranges are
+The slope of the range to a sphere changes within less than a millimetre near the limb. At one place
+it overstates what a beam says about a centre that is known to millimetres only, so that ranges are
 linearised over the width of that uncertainty.
 """
 
@@ -17,9 +17,11 @@ from spheremark.pipelines.model import Array, Index, Mask
 from spheremark.pipelines.sphere.footprint import mean_depth_inside, mean_depths_at
 from spheremark.pipelines.sphere.returns import Returns
 
-_INNER = 0.9  # radii from the middle within which the range hardly bends
+_INNER = 0.9  # radii from the middle within which the range is nearly linear
 _THIN2 = 1e-12  # [m^2] least variance: keeps the factor invertible
-_N_POINTS = 8  # sigma points, padded to the width of vector registers
+_N_POINTS = 8  # seven sigma points, and the middle one with a wider footprint
+_WIDENED = 0.1  # by which that is wider
+_THINNEST = 1e-9  # [m] of a depth
 _WIDTH = math.sqrt(3.0)  # sigmas to either side: two such points have a normal's fourth moment
 
 _Vector = tuple[float, float, float]
@@ -32,19 +34,23 @@ class Linear(NamedTuple):
     Attributes
     ----------
     ranges : (n,)
-        Predicted ranges, less the mean of what the bend adds over the uncertainty [m].
+        Predicted ranges, with the mean of their second-order term over the uncertainty [m].
     J : (4, n)
         Derivatives of the ranges by the centre and by the radius.
-    bends : (n,)
+    sigmas_nonlinear : (n,)
         Standard deviation of the part of the range that is not linear [m].
     offsets : (2, n)
         Offset of the beam's axis from the centre, along the footprint's two axes [m].
+    J_optics : (2, n)
+        Derivatives of the ranges by the logarithm of the footprint's width, and by the power of the
+        cosine of incidence with which an echo weighs [m].
     """
 
     ranges: Array
     J: Array
-    bends: Array
+    sigmas_nonlinear: Array
     offsets: Array
+    J_optics: Array
 
 
 def linearise(returns: Returns, spheres: Array, covs: Array, is_used: Mask | None = None) -> Linear:
@@ -58,14 +64,14 @@ def linearise(returns: Returns, spheres: Array, covs: Array, is_used: Mask | Non
     mean derivative (statistical linearisation by cubature: Garcia-Fernandez, Svensson, Morelande,
     Sarkka, Posterior linearization filter, 2015). Along the beam a range is linear in the centre,
     so that sigma points differ only across the beam, and in the radius where it is free. Well
-    inside the limb the exact derivative is taken, and the bend of a ray. The mean of the bend is
-    subtracted: without that least squares puts centres some millimetres too near where returns are
+    inside the limb the exact derivative is taken, and the second-order term of a ray. Without that
+    term least squares puts centres some millimetres too near where returns are
     few (Box, Bias in nonlinear estimation, 1971).
     """
     n = len(returns.ranges)
     if is_used is None:
         is_used = np.ones(n, dtype=np.bool_)
-    out = Linear(np.empty(n), np.empty((4, n)), np.zeros(n), np.empty((2, n)))
+    out = Linear(np.empty(n), np.empty((4, n)), np.zeros(n), np.empty((2, n)), np.zeros((2, n)))
     axes = (returns.directions, returns.first_axes, returns.second_axes)
     beams = (returns.origins, axes, returns.half_widths)
     _linearise(beams, returns.starts, (spheres, covs), is_used, out)
@@ -82,7 +88,7 @@ def _linearise(
 ) -> None:
     """Fill in ``Linear``."""
     (origins, (u, a, b), half_widths), (states, covs) = beams, spheres
-    work = (np.empty((5, _N_POINTS)), np.empty((2, _N_POINTS)))
+    work = (np.empty((5, _N_POINTS)), np.empty((3, _N_POINTS)))
     for m in range(len(states)):
         cov, radius = covs[m], states[m, 3]
         for i in range(starts[m], starts[m + 1]):
@@ -90,7 +96,8 @@ def _linearise(
             for j in range(3):
                 v = states[m, j] - origins[j, i]
                 x, y, along = x + v * a[j, i], y + v * b[j, i], along + v * u[j, i]
-            shorter, by_x, by_y, by_radius, bend = 0.0, 0.0, 0.0, 0.0, 0.0
+            shorter, by_x, by_y, by_radius, nonlinear = 0.0, 0.0, 0.0, 0.0, 0.0
+            wider, squared = 0.0, 0.0
             if is_used[i]:
                 c, s, away = _polar(x, y)
                 radial = (
@@ -106,19 +113,26 @@ def _linearise(
                 factor = _factor(cov, radial, tangential)
                 half = (half_widths[0, i], half_widths[1, i])
                 if _reach(away, max(half[0], half[1]), factor) < _INNER * radius:
-                    shorter, by_x, by_y, by_radius = mean_depth_inside(
+                    shorter, by_x, by_y, by_radius, squared = mean_depth_inside(
                         x, y, radius, half[0], half[1]
                     )
+                    # what the width adds grows with its square
+                    wider = 2.0 * (shorter - math.sqrt(radius * radius - away * away))
+                    squared = squared / shorter - shorter
                     shorter -= 0.5 * _curvature(away, radius, factor)
                 else:
-                    shorter, by_x, by_y, by_radius, bend = _over_sigma_points(
+                    shorter, by_x, by_y, by_radius, nonlinear = _over_sigma_points(
                         (x, y, radius), half, (c, s), factor, work
                     )
+                    found = work[1]
+                    wider = (found[0, _N_POINTS - 1] - found[0, 0]) / _WIDENED
+                    squared = found[2, 0] / max(found[0, 0], _THINNEST) - found[0, 0]
             for j in range(3):
                 out.J[j, i] = u[j, i] - by_x * a[j, i] - by_y * b[j, i]
-            out.J[3, i], out.bends[i] = -by_radius, bend
+            out.J[3, i], out.sigmas_nonlinear[i] = -by_radius, nonlinear
             out.ranges[i] = along - shorter
             out.offsets[0, i], out.offsets[1, i] = -x, -y
+            out.J_optics[0, i], out.J_optics[1, i] = -wider, -squared
 
 
 @compiled
@@ -184,6 +198,8 @@ def _over_sigma_points(
     for p in range(_N_POINTS):
         points[0, p], points[1, p], points[2, p] = x, y, radius
         points[3, p], points[4, p] = half
+    points[3, _N_POINTS - 1] *= 1.0 + _WIDENED
+    points[4, _N_POINTS - 1] *= 1.0 + _WIDENED
     for k in range(3):
         for sign in range(-1, 2, 2):
             p = 1 + k if sign > 0 else 4 + k
@@ -197,8 +213,8 @@ def _over_sigma_points(
     square = (a * a + b * b + r * r + minus_a**2 + minus_b**2 + minus_r**2) / 6.0
     by_a, by_b, by_radius = a - minus_a, b - minus_b, r - minus_r
     linear = (by_a * by_a + by_b * by_b + by_radius * by_radius) / (2.0 * _WIDTH) ** 2
-    bend = np.sqrt(max(square - mean * mean - linear, 0.0))
+    nonlinear = np.sqrt(max(square - mean * mean - linear, 0.0))
     by_radius = by_radius / (2.0 * _WIDTH * rr) if rr > 0.0 else 0.0
     by_b = (by_b / (2.0 * _WIDTH) - br * by_radius) / bb
     by_a = (by_a / (2.0 * _WIDTH) - ab * by_b - ar * by_radius) / aa
-    return 2.0 * d - mean, by_a * c - by_b * s, by_a * s + by_b * c, by_radius, bend
+    return 2.0 * d - mean, by_a * c - by_b * s, by_a * s + by_b * c, by_radius, nonlinear

@@ -1,7 +1,7 @@
 """Normal equations of the centres of a stop and of the unknowns that all centres share.
 
-Shared are the range biases of the lasers and the errors of the mounting. Each centre is eliminated
-first (Schur complement), so that the cost is linear in the markers.
+Shared are the range biases of the lasers, the optics and the errors of the mounting. Each centre is
+eliminated first (Schur complement), so that the cost is linear in the markers.
 """
 
 from __future__ import annotations
@@ -13,7 +13,6 @@ import numpy as np
 
 from spheremark.pipelines.estimation.linear_algebra import Reduced, eliminate
 from spheremark.pipelines.model import Array, Index
-from spheremark.pipelines.sphere.linearisation import Linear
 from spheremark.pipelines.sphere.returns import Returns
 
 
@@ -22,19 +21,19 @@ class Normals(NamedTuple):
 
     Attributes
     ----------
-    centres : (m, 3, 3 + k + 1)
-        Rows of the centres. Columns are the centre, the laser biases, and the right-hand side.
-    by_face : (m, 3, 3 + k + 1)
+    centres : (m, 3, 3 + k + q + 1)
+        Rows of the centres. Columns are the centre, the k laser biases, the q unknowns of the
+        optics, and the right-hand side.
+    by_face : (m, 3, 3 + k + q + 1)
         The same with returns of the downward sweep counted negative: the mounting moves the two
         faces of a sphere against each other.
-    biases, rhs_biases : (k,)
-        Diagonal and right-hand side of the laser biases.
+    shared : (k + q, k + q + 1)
+        Rows of the laser biases and of the optics, last the right-hand side.
     """
 
     centres: Array
     by_face: Array
-    biases: Array
-    rhs_biases: Array
+    shared: Array
 
 
 def sums_of_products(starts: Index, left: Array, right: Array) -> Array:
@@ -46,12 +45,16 @@ def sums_of_products(starts: Index, left: Array, right: Array) -> Array:
 
 
 def normals_of(
-    returns: Returns, linear: Linear, residuals: Array, weights: Array, n_lasers: int
+    returns: Returns, J: tuple[Array, Array], residuals: Array, weights: Array, n_lasers: int
 ) -> Normals:
-    """Sum the normal equations; ``weights`` are inverse variances [1/m^2]."""
-    m, lasers = len(returns.starts) - 1, returns.lasers
+    """Sum the normal equations.
+
+    ``J`` are the derivatives of ranges by the centre, (3, n), and by the optics, (q, n);
+    ``weights`` are inverse variances [1/m^2].
+    """
+    m, lasers, by_optics = len(returns.starts) - 1, returns.lasers, J[1]
     cells = n_lasers * returns.markers + lasers
-    columns, weighted = np.vstack([linear.J[:3], residuals]), weights * linear.J[:3]
+    columns, weighted = np.vstack([*J, residuals]), weights * J[0]
 
     def rows(weighted: Array) -> Array:
         """Return the rows of the centres from weighted derivatives, (3, n)."""
@@ -59,12 +62,14 @@ def normals_of(
         mixed = [np.bincount(cells, row, m * n_lasers).reshape(m, n_lasers) for row in weighted]
         return np.concatenate([own[:, :, :3], np.stack(mixed, axis=1), own[:, :, 3:]], axis=2)
 
-    return Normals(
-        centres=rows(weighted),
-        by_face=rows(returns.vertical[0] * weighted),
-        biases=np.asarray(np.bincount(lasers, weights, n_lasers), np.float64),
-        rhs_biases=np.asarray(np.bincount(lasers, weights * residuals, n_lasers), np.float64),
-    )
+    others = weights * np.vstack([by_optics, residuals])
+    crossed = np.array([np.bincount(lasers, row, n_lasers) for row in others])  # (q + 1, k)
+    q = len(by_optics)
+    shared = np.zeros((n_lasers + q, n_lasers + q + 1))
+    shared[:n_lasers, :n_lasers] = np.diag(np.bincount(lasers, weights, n_lasers))
+    shared[:n_lasers, n_lasers:], shared[n_lasers:, :n_lasers] = crossed.T, crossed[:q]
+    shared[n_lasers:, n_lasers:] = others[:q] @ np.vstack([by_optics, residuals]).T
+    return Normals(rows(weighted), rows(returns.vertical[0] * weighted), shared)
 
 
 def reduce(N: Normals, effects: Array, precisions: Array, rhs_prior: Array) -> Reduced:
@@ -72,18 +77,19 @@ def reduce(N: Normals, effects: Array, precisions: Array, rhs_prior: Array) -> R
 
     Notes
     -----
-    ``effects`` are the derivatives of the faces by the mounting, (m, 3, 6); ``precisions`` and
-    ``rhs_prior``, (k + 6,), are the prior of the shared unknowns. A prior of 1 m on each centre
-    keeps the equations solvable and is otherwise without effect.
+    Shared are the laser biases, the optics and the mounting, in this order. ``effects`` are the
+    derivatives of the faces by the mounting, (m, 3, 6); ``precisions`` and ``rhs_prior`` are the
+    prior of the shared unknowns. A prior of 1 m on each centre keeps the equations solvable and is
+    otherwise without effect.
     """
-    n_lasers, n_shared = len(N.biases), len(precisions)
     own, by_face, turned = N.centres[:, :, :3], N.by_face[:, :, :3], effects.transpose(0, 2, 1)
-    biases, mounting = slice(n_lasers), slice(n_lasers, n_shared)
-    shared = np.zeros((n_shared, n_shared + 1))  # last the right-hand side
-    shared[biases, biases], shared[biases, -1] = np.diag(N.biases), N.rhs_biases
+    others, n = slice(0, len(N.shared)), len(precisions)
+    mounting = slice(len(N.shared), n)
+    shared = np.zeros((n, n + 1))  # last the right-hand side
+    shared[others, others], shared[others, -1] = N.shared[:, :-1], N.shared[:, -1]
     between = np.sum(turned @ N.by_face[:, :, 3:], axis=0)
-    shared[mounting, biases], shared[mounting, -1] = between[:, :-1], between[:, -1]
-    shared[biases, mounting] = between[:, :-1].T
+    shared[mounting, others], shared[mounting, -1] = between[:, :-1], between[:, -1]
+    shared[others, mounting] = between[:, :-1].T
     shared[mounting, mounting] = np.sum(turned @ own @ effects, axis=0)
     shared[:, :-1] += np.diag(precisions)
     shared[:, -1] += rhs_prior

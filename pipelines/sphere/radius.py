@@ -130,8 +130,8 @@ def _score_steps(
 
 
 def _weights(observed: Ranges, linear: Linear) -> Array:
-    """Return weights over variances, those of the bends included [1/m^2]."""
-    return observed.weights / (observed.variances + linear.bends**2)
+    """Return weights over variances, those of the linearisation included [1/m^2]."""
+    return observed.weights / (observed.variances + linear.sigmas_nonlinear**2)
 
 
 def _normals(returns: Returns, linear: Linear, residuals: Array, weights: Array) -> Array:

@@ -128,7 +128,7 @@ def may_be_sphere(returns: Returns, offsets: Array, margins: Array, radius: floa
     x, y = offsets
     up_x, up_y = returns.vertical
     along, across = returns.vertical_half_widths
-    is_low = x * up_x + y * up_y + along < -_POLE_BEGINS * radius
+    is_low = x * up_x + y * up_y - along < -_POLE_BEGINS * radius
     is_middle = np.abs(x * up_y - y * up_x) < _POLE_HALF * radius + across
     distances, halves = distances_and_halves(returns, offsets)
     is_inside = distances - radius - halves < margins[returns.markers]

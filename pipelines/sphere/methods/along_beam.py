@@ -46,6 +46,7 @@ from spheremark.pipelines.sphere.estimation import (
 )
 from spheremark.pipelines.sphere.mounting import sigmas_of
 from spheremark.pipelines.sphere.noise import EXPECTED_SQUARE, FACTOR_MIN, classes_of
+from spheremark.pipelines.sphere.optics import prior_sigmas
 from spheremark.pipelines.sphere.radius import other_radius
 from spheremark.pipelines.sphere.returns import Returns, returns_of
 
@@ -110,7 +111,12 @@ def _fit(
     if not found.candidates:
         return (), ()
     stop, sigma_biases = _gather(cloud, found.candidates, config)
-    prior = Prior(radius, sigma_biases, sigmas_of(config.sigma_mounting, config.sigma_offset))
+    prior = Prior(
+        radius,
+        sigma_biases,
+        prior_sigmas(config),
+        sigmas_of(config.sigma_mounting, config.sigma_offset),
+    )
     rough = np.array([c.p_base_rough for c in found.candidates])
     best = estimate(stop.returns, rough, prior, observe, uses_limb=uses_limb)
     radii, sigmas = estimate_radii(stop.returns, best, radius)
@@ -171,7 +177,8 @@ def _result(
         return refused(candidate, reason)
     square = float(np.sum(weights[used - start] * (residuals / best.weighed.sigmas[used]) ** 2))
     ratio = math.sqrt(square / EXPECTED_SQUARE / max(n - 3, 1))
-    sigma0 = max(state.noise.factor * ratio, FACTOR_MIN)
+    factor = best.weighed.noise.factor
+    sigma0 = max(factor * ratio, FACTOR_MIN)
     rings, offsets = stop.beams.rings[used], best.linear.offsets[:, used].T
     n_rings = len(np.unique(rings[rings != RING_UNKNOWN]))
     x, y = offsets.T
@@ -179,7 +186,7 @@ def _result(
     coverage = limb_coverage(stop.returns.directions[:, used], passed, radius)
     reasons = weaknesses(n, n_rings, coverage)
     reasons += other_radius(radius, known["radius_free"], known["sigma_radius_free"])
-    ratio = sigma0 / state.noise.factor
+    ratio = sigma0 / factor
     if ratio > _NOISE_FACTOR:
         reasons.append(f"its residuals are {ratio:.1f} times those of the stop")
     members = stop.members[used]

@@ -66,8 +66,8 @@ class _Link(NamedTuple):
     softness: float
 
 
-class _Site(NamedTuple):
-    """What the limb says of a centre across the line of sight, as a normal distribution.
+class _Factor(NamedTuple):
+    """The likelihood of a limb across the line of sight, approximated by a normal distribution.
 
     Attributes
     ----------
@@ -185,7 +185,7 @@ class _Limb:
         self._step = 0
         self._link = _Link(_SHARE, _SOFTNESSES[-1])
         self._passing: list[Passing] = []
-        self._sites: list[_Site] = []
+        self._factors: list[_Factor] = []
 
     def observe(self, centres: Array, covs: Array) -> tuple[Array, Array]:
         """Return what the limbs add to the normal equations of centres, as ``Observe``."""
@@ -194,20 +194,20 @@ class _Limb:
             self._passing = [
                 _doubtful(*both, self._radius) for both in zip(near, covs, strict=True)
             ]
-            self._sites = [_Site(np.zeros((2, 2)), np.zeros(2)) for _ in near]
+            self._factors = [_Factor(np.zeros((2, 2)), np.zeros(2)) for _ in near]
         self._step += 1
         cavities = [
-            _cavity(*one) for one in zip(centres, covs, self._passing, self._sites, strict=True)
+            _cavity(*one) for one in zip(centres, covs, self._passing, self._factors, strict=True)
         ]
         if self._step <= _N_LINKS:
             self._link = _link(self._passing, cavities, self._radius)
         n_rounds = _N_ROUNDS if self._step == 1 else 1
         normals, rhs = np.empty((len(centres), 3, 3)), np.empty((len(centres), 3))
         for k, (pulses, cavity) in enumerate(zip(self._passing, cavities, strict=True)):
-            site = _site(pulses, cavity, self._link, self._radius, n_rounds)
-            normals[k] = pulses.axes.T @ site.precision @ pulses.axes
-            rhs[k] = pulses.axes.T @ (site.rhs - site.precision @ cavity.place)
-            self._sites[k] = site
+            factor = _factor(pulses, cavity, self._link, self._radius, n_rounds)
+            normals[k] = pulses.axes.T @ factor.precision @ pulses.axes
+            rhs[k] = pulses.axes.T @ (factor.rhs - factor.precision @ cavity.place)
+            self._factors[k] = factor
         return normals, rhs
 
 
@@ -224,14 +224,14 @@ def _doubtful(pulses: Passing, cov: Array, radius: float) -> Passing:
     )
 
 
-def _cavity(p: Array, cov: Array, pulses: Passing, site: _Site) -> _Cavity:
-    """Return a centre across the line of sight, with and without the site of its limb."""
+def _cavity(p: Array, cov: Array, pulses: Passing, factor: _Factor) -> _Cavity:
+    """Return a centre across the line of sight, with and without the factor of its limb."""
     place, cov_place = pulses.axes @ (p - pulses.centre), pulses.axes @ cov @ pulses.axes.T
     precision = np.linalg.inv(cov_place)
     least = _CAVITY_MIN * np.linalg.eigvalsh(precision)[0]
-    values, vectors = np.linalg.eigh(precision - site.precision)
+    values, vectors = np.linalg.eigh(precision - factor.precision)
     others = (vectors * np.maximum(values, least)) @ vectors.T
-    mean = np.linalg.solve(others, precision @ place - site.rhs)
+    mean = np.linalg.solve(others, precision @ place - factor.rhs)
     return _Cavity(place, cov_place, mean, others)
 
 
@@ -291,7 +291,7 @@ def _weights(logs: Array) -> Array:
         logs = _FLATTER * logs
 
 
-def _site(pulses: Passing, cavity: _Cavity, link: _Link, radius: float, n_rounds: int) -> _Site:
+def _factor(pulses: Passing, cavity: _Cavity, link: _Link, radius: float, n_rounds: int) -> _Factor:
     """Return the normal approximation of the limb's likelihood across the line of sight.
 
     Each round spreads the places by the last one's moments. The edge of a marker may deviate from
@@ -311,7 +311,7 @@ def _site(pulses: Passing, cavity: _Cavity, link: _Link, radius: float, n_rounds
     values, vectors = np.linalg.eigh(np.linalg.inv(cov) - cavity.precision)
     precision = (vectors * np.maximum(values, 0.0)) @ vectors.T
     both = cavity.precision + precision
-    return _Site(precision, both @ mean - cavity.precision @ cavity.mean)
+    return _Factor(precision, both @ mean - cavity.precision @ cavity.mean)
 
 
 def _named(fit: MarkerFit) -> MarkerFit:

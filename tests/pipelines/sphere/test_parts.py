@@ -1,5 +1,7 @@
 """Parts of the sphere fit against dense, finite-difference or one-by-one counterparts."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose
@@ -10,6 +12,7 @@ from spheremark.pipelines.sphere.footprint import predict
 from spheremark.pipelines.sphere.linearisation import linearise
 from spheremark.pipelines.sphere.mounting import effects_on
 from spheremark.pipelines.sphere.normal_equations import normals_of, reduce
+from spheremark.pipelines.sphere.optics import OPTICS, derivatives, with_widths
 from spheremark.pipelines.sphere.radius import Ranges, free_radii
 from spheremark.pipelines.sphere.returns import of_markers, returns_of
 
@@ -84,23 +87,63 @@ def test_the_eliminated_equations_have_the_solution_of_the_dense_ones(stop):
     linear = linearise(returns, *spheres_and_covs(0.002))
     residuals = SIGMA * rng.standard_normal(len(returns.ranges))
     weights = rng.uniform(0.2, 1.0, len(residuals)) / SIGMA**2
-    effects, precisions = effects_on(CENTRES), np.full(N_LASERS + 6, 1.0 / 0.01**2)
-    reduced = reduce(
-        normals_of(returns, linear, residuals, weights, N_LASERS), effects, precisions,
-        np.zeros(N_LASERS + 6),
-    )  # fmt: skip
+    by_optics = derivatives(returns, linear)
+    q = len(by_optics)
+    effects, precisions = effects_on(CENTRES), np.full(N_LASERS + q + 6, 1.0 / 0.01**2)
+    N = normals_of(returns, (linear.J[:3], by_optics), residuals, weights, N_LASERS)
+    reduced = reduce(N, effects, precisions, np.zeros(len(precisions)))
     shared = np.linalg.solve(reduced.N, reduced.rhs)
 
-    design = np.zeros((len(residuals), 9 + N_LASERS + 6))
+    design = np.zeros((len(residuals), 9 + N_LASERS + q + 6))
+    design[:, 9 + N_LASERS : -6] = by_optics.T
     for i, m in enumerate(returns.markers):
         design[i, 3 * m : 3 * m + 3] = linear.J[:3, i]
         design[i, 9 + returns.lasers[i]] = 1.0
-        design[i, 9 + N_LASERS :] = np.sign(returns.vertical[0, i]) * linear.J[:3, i] @ effects[m]
+        design[i, -6:] = np.sign(returns.vertical[0, i]) * linear.J[:3, i] @ effects[m]
     assert_allclose(np.abs(returns.vertical[0]), 1.0)
     N = design.T @ (weights[:, None] * design) + np.diag([1.0] * 9 + list(precisions))
     dense = np.linalg.solve(N, design.T @ (weights * residuals))
     assert_allclose(reduced.local_steps(shared).ravel(), dense[:9], rtol=0, atol=1e-9)
     assert_allclose(shared, dense[9:], rtol=0, atol=1e-9)
+
+
+def test_derivatives_by_the_optics_agree_with_wider_footprints_and_with_weighted_rays(stop):
+    pulses, returns = stop
+    spheres, covs = spheres_and_covs(1e-6)
+    linear, step = linearise(returns, spheres, covs), 0.1
+    exact = predict(pulses, CENTRES, spheres[:, 3], returns.markers)
+    by_optics = dict(zip(OPTICS, derivatives(returns, linear), strict=True))
+    optics = dict.fromkeys(OPTICS, 0.0)
+    seen = exact.lit > 0.3
+    for name, value in (("beam_width", step), ("beam_window", step)):
+        wide = with_widths(returns, np.array(list((optics | {name: value}).values())))
+        widths = (2.0 * wide.half_widths / returns.ranges).T
+        ranges = [
+            predict(replace(pulses, divergence=w), CENTRES, spheres[:, 3], returns.markers).ranges[
+                i
+            ]
+            for i, w in enumerate(widths)
+        ]
+        expected = (np.array(ranges) - exact.ranges)[seen] / step
+        # the limb cuts some of the few strips of a footprint only when it is wider, and the width
+        # at the window adds more to the narrow axis, which the derivative takes as both
+        assert np.linalg.norm(by_optics[name][seen] - expected) < 0.25 * np.linalg.norm(expected)
+    depths = rays_of(returns, spheres)[seen]
+    weighted = np.nansum(depths**2, axis=1) / np.nansum(depths, axis=1) - np.nanmean(depths, axis=1)
+    assert_allclose(by_optics["echo_cosine"][seen], -weighted, rtol=0.1, atol=1e-4)
+
+
+def rays_of(returns, spheres):
+    """Depths of spheres, (n, rays), under the rays that fill each footprint; NaN beside them."""
+    k = np.arange(1500)
+    radii, turns = np.sqrt((k + 0.5) / len(k)), k * np.pi * (3 - np.sqrt(5))
+    off = spheres[returns.markers, :3].T - returns.origins
+    x = returns.half_widths[0][:, None] * radii * np.cos(turns)
+    y = returns.half_widths[1][:, None] * radii * np.sin(turns)
+    x = x - np.sum(off * returns.first_axes, axis=0)[:, None]
+    y = y - np.sum(off * returns.second_axes, axis=0)[:, None]
+    squares = RADIUS**2 - x**2 - y**2
+    return np.sqrt(np.where(squares > 0.0, squares, np.nan))
 
 
 def test_radii_of_many_spheres_are_those_of_each_alone(stop):

@@ -1,0 +1,72 @@
+"""What is not known of a LiDAR's beams: unknowns that all returns of a scan share.
+
+Neither the width and profile of a beam nor what its echo weighs are published. They change the mean
+range of a footprint on a slope by millimetres, at all spheres alike: a scan determines some of it
+from the returns near the limb, the rest belongs to the covariance.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from spheremark.pipelines.config import FittingConfig
+from spheremark.pipelines.model import Array
+from spheremark.pipelines.sphere.linearisation import Linear
+from spheremark.pipelines.sphere.returns import Returns
+
+OPTICS = (
+    "beam_width",
+    "beam_window",
+    "echo_cosine",
+    "common_range_bias",
+    "range_scale",
+)
+"""Unknowns of the optics: relative excess of the divergence; width at the window in units of the
+VLP-16's; weight of an echo by this power of the cosine of incidence; bias [m] and scale of all
+ranges."""
+
+_WINDOW = np.array(
+    [12.7e-3, 9.5e-3]
+)  # [m] width of a VLP-16's beam at its window, across and along
+_NARROWEST = 0.02  # of the specified half widths: a ray
+
+
+def prior_sigmas(config: FittingConfig) -> Array:
+    """Return the prior standard deviations of ``OPTICS``."""
+    return np.array(
+        [
+            config.sigma_beam_width,
+            config.sigma_beam_window,
+            config.sigma_echo_cosine,
+            config.sigma_range_common,
+            config.sigma_range_scale,
+        ]
+    )
+
+
+def with_widths(returns: Returns, optics: Array) -> Returns:
+    """Return returns whose footprints have the widths that the optics say."""
+    if not optics[:2].any():
+        return returns
+    width, window = optics[:2]
+    specified = returns.half_widths
+    widened = (1.0 + width) * specified + 0.5 * window * _WINDOW[:, None]
+    factors = np.maximum(widened / specified, _NARROWEST)
+    along, across = returns.vertical_half_widths
+    mean = np.sqrt(factors[0] * factors[1])
+    return returns._replace(
+        half_widths=factors * specified,
+        vertical_half_widths=np.stack([mean * along, mean * across]),
+    )
+
+
+def derivatives(returns: Returns, linear: Linear) -> Array:
+    """Return the derivatives, (5, n), of predicted ranges by ``OPTICS``.
+
+    ``returns`` have the footprints as specified.
+    """
+    by_width, by_cosine = linear.J_optics
+    mean = np.sqrt(returns.half_widths[0] * returns.half_widths[1])
+    window = 0.5 * np.sqrt(_WINDOW[0] * _WINDOW[1])
+    ones = np.ones(len(returns.ranges))
+    return np.stack([by_width, by_width * window / mean, by_cosine, ones, returns.ranges])
