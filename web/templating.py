@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import math
-from dataclasses import fields
 from datetime import UTC, datetime
 from functools import cache
 from typing import Any
@@ -55,10 +54,9 @@ def environment() -> Environment:
     return made
 
 
-def render(template: str, page: Any, **more: Any) -> str:
-    """Render a template with the fields of a page and further values."""
-    context = {field.name: getattr(page, field.name) for field in fields(page)}
-    return environment().get_template(template).render(**context, **more)
+def render(template: str, **context: Any) -> str:
+    """Render a template."""
+    return environment().get_template(template).render(**context)
 
 
 def json_block(value: Any) -> Markup:

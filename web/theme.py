@@ -7,7 +7,7 @@ dark; the script of the page substitutes them when it draws.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import plotly.graph_objects as go
 
@@ -43,32 +43,28 @@ DIVERGING = (
 HEIGHTS = ((0.0, "var(--low)"), (1.0, "var(--high)"))
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class MethodStyle:
-    """Style of one fitting method in all figures."""
+class Style(NamedTuple):
+    """Style of a method or a part in all figures."""
 
     label: str
     colour: str
-    band: str
-    symbol: str
+    symbol: str = "circle"
+    band: str = ""
 
 
-_STYLES = {
-    "along_beam": (OURS, OURS_BAND, "circle"),
-    "paper": (PAPER, PAPER_BAND, "diamond"),
-    "silhouette": (GREEN, GREEN_BAND, "square"),
-    "astm_e3125": ("var(--fourth)", GREEN_BAND, "triangle-up"),
-    "free_radius": ("var(--fifth)", GREEN_BAND, "triangle-down"),
-    "algebraic": ("var(--sixth)", GREEN_BAND, "pentagon"),
+_METHODS = {
+    "along_beam": Style("along beam (ours)", OURS, "circle", OURS_BAND),
+    "paper": Style("paper's method", PAPER, "diamond", PAPER_BAND),
+    "silhouette": Style("silhouette", GREEN, "square", GREEN_BAND),
+    "astm_e3125": Style("astm e3125", "var(--fourth)", "triangle-up", GREEN_BAND),
+    "free_radius": Style("free radius", "var(--fifth)", "triangle-down", GREEN_BAND),
+    "algebraic": Style("algebraic", "var(--sixth)", "pentagon", GREEN_BAND),
 }
-_LABELS = {"along_beam": "along beam (ours)", "paper": "paper's method"}
 
 
-def method_style(method: str) -> MethodStyle:
+def method_style(method: str) -> Style:
     """Return the style of a method; each has its own colour and symbol."""
-    colour, band, symbol = _STYLES.get(method, (MUTED, GREEN_BAND, "hexagon"))
-    label = _LABELS.get(method, method.replace("_", " "))
-    return MethodStyle(label=label, colour=colour, band=band, symbol=symbol)
+    return _METHODS.get(method) or Style(method.replace("_", " "), MUTED, "hexagon", GREEN_BAND)
 
 
 def template() -> go.layout.Template:

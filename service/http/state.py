@@ -13,6 +13,7 @@ from typing import Annotated, Any, TypeVar
 
 from fastapi import Depends, Request
 
+from spheremark.pipelines.errors import NotFoundError
 from spheremark.service.errors import BusyError, ReusedKeyError
 from spheremark.service.http.uploads import Inbox
 from spheremark.service.jobs.queue import JobQueue
@@ -94,6 +95,13 @@ class Service:
     planner: Planner
     readers: Readers = field(default_factory=Readers)
     idempotency: Idempotency = field(default_factory=Idempotency)
+
+    def row(self, sql: str, key: str, what: str) -> dict[str, Any]:
+        """Return the row of a query that takes ``$id``; NotFoundError without one."""
+        rows = self.catalogue.rows(sql, {"id": key})
+        if not rows:
+            raise NotFoundError(f"There is no {what} {key!r}.")
+        return rows[0]
 
 
 @asynccontextmanager

@@ -5,7 +5,6 @@ import pytest
 
 from spheremark.web.pages.base import Frame
 from spheremark.web.pages.ellipse_coverage import (
-    CoveragePage,
     calibration_figure,
     coverage_page,
     squares_figure,
@@ -45,7 +44,7 @@ def report():
 
 
 def test_shares_that_miss_their_level_by_more_than_five_points_are_marked(report):
-    text = coverage_page(CoveragePage(frame=Frame(), report=report))
+    text = coverage_page(Frame(), report)
     assert text.count('class="over"') == 1
     assert '<span class="over">40.0</span>' in text
     assert "20 simulated surveys" in text
@@ -53,7 +52,7 @@ def test_shares_that_miss_their_level_by_more_than_five_points_are_marked(report
 
 
 def test_without_a_report_the_page_has_the_command_that_makes_one():
-    text = coverage_page(CoveragePage(frame=Frame(), report=None))
+    text = coverage_page(Frame(), None)
     assert "spheremark bench --coverage" in text
     assert "data-figure" not in text
 

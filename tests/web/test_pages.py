@@ -3,8 +3,9 @@ import json
 import numpy as np
 import pytest
 
-from spheremark.web import assets, pages, templating
+from spheremark.web import assets, templating
 from spheremark.web.pages import readouts
+from spheremark.web.pages.base import Frame
 
 
 def rows(errors, sigmas, marks, method="along_beam"):
@@ -69,15 +70,9 @@ def test_json_in_a_page_cannot_end_the_element_that_holds_it():
 
 
 def test_the_error_page_escapes_its_texts():
-    text = pages.error_page(
-        pages.ErrorPage(
-            frame=pages.Frame(surveys=("<i>",)),
-            status=404,
-            title="Not there.",
-            detail="There is no <script>.",
-            code="not_found",
-        )
-    )
+    problem = {"status": 404, "title": "Not there.", "code": "not_found"}
+    problem["detail"] = "There is no <script>."
+    text = templating.render("error.html", frame=Frame(surveys=("<i>",)), problem=problem)
     assert "There is no &lt;script&gt;." in text
     assert "<i>" not in text
 

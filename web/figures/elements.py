@@ -1,16 +1,20 @@
-"""Elements that several figures share: blank figures, tolerance, bins, notes, equal axes."""
+"""The parts of figures: traces with hover texts, levels, notes, bins, and axes of some kinds."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
+from string import Formatter
 from typing import Any
 
 import numpy as np
 import plotly.graph_objects as go
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from spheremark.web import theme
 from spheremark.web.columns import MM, Columns, floats, rms, texts
+from spheremark.web.theme import Style
+
+Look = dict[str, Any]  # arguments of a trace
 
 _RATIOS = [step * 10.0**power for power in range(-2, 5) for step in (1, 2, 5)]
 RATIO_AXIS = {
@@ -20,46 +24,104 @@ RATIO_AXIS = {
 }
 
 
-def blank_figure(title: str) -> go.Figure:
-    """Return an empty figure with the template and a title."""
-    return go.Figure(layout={"template": theme.template(), "title": {"text": title}})
+def blank_figure(title: str, x: str = "", y: str = "") -> go.Figure:
+    """Return an empty figure with the template, a title and the titles of its axes."""
+    figure = go.Figure(layout={"template": theme.template(), "title": {"text": title}})
+    if x:
+        figure.update_layout(xaxis_title_text=x, yaxis_title_text=y)
+    return figure
+
+
+def hover_of(template: str, style: Style, rows: Columns | None = None) -> dict[str, Any]:
+    """Return the hover text of a trace; none without a template.
+
+    ``{y:.1f}`` is a value of the trace and ``{range_m:.2f}`` one of a column of ``rows``;
+    ``{sigma_m:mm}`` is in millimetres.
+    """
+    if not template:
+        return {"hoverinfo": "skip"}
+    text, columns = "", []
+    for literal, name, form, _ in Formatter().parse(template):
+        text += literal
+        if name is not None and rows is not None and name in rows:
+            columns.append(_hover_column(rows, name, form or ""))
+            name = f"customdata[{len(columns) - 1}]"
+        if name is not None:
+            form = ".1f" if form == "mm" else form
+            text += f"%{{{name}:{form}}}" if form else f"%{{{name}}}"
+    found: dict[str, Any] = {"hovertemplate": f"{text}<extra>{style.label}</extra>"}
+    return found | ({"customdata": list(zip(*columns, strict=True))} if columns else {})
+
+
+def _hover_column(rows: Columns, name: str, form: str) -> list[Any]:
+    """Return a column for a hover text: texts without a format, else numbers."""
+    if not form:
+        return texts(rows, name)
+    values = floats(rows, name)
+    return list((MM * values if form == "mm" else values.round(4)).tolist())
+
+
+def add_points(
+    figure: go.Figure,
+    x: ArrayLike,
+    y: ArrayLike,
+    style: Style,
+    hover: Any = "",
+    rows: Any = None,
+    **more: Any,
+) -> None:
+    """Draw points; further arguments go to the trace."""
+    look: Look = {"mode": "markers", "name": style.label, "marker_size": 8}
+    look |= {"marker_color": style.colour, "marker_symbol": style.symbol}
+    look |= hover_of(hover, style, rows)
+    figure.add_scatter(x=x, y=y, **(look | more))
+
+
+def add_line(
+    figure: go.Figure, x: ArrayLike, y: ArrayLike, style: Style, hover: Any = "", **more: Any
+) -> None:
+    """Draw a line; further arguments go to the trace."""
+    look = {"mode": "lines", "line_color": style.colour, "name": style.label}
+    figure.add_scatter(x=x, y=y, **(look | hover_of(hover, style) | more))
+
+
+def add_strokes(
+    figure: go.Figure, strokes: Sequence[NDArray[np.float64]], style: Style, **more: Any
+) -> None:
+    """Draw many lines as one trace."""
+    if strokes:
+        x, y = joined_strokes(strokes).T
+        add_line(figure, x, y, style, **more)
 
 
 def add_tolerance(figure: go.Figure, tolerance_m: float) -> None:
     """Draw the tolerance as a dashed line."""
+    add_limit(figure, tolerance_m * MM, f"tolerance {tolerance_m * MM:g} mm", yshift=2)
+
+
+def add_limit(figure: go.Figure, y: float, text: str, **note: Any) -> None:
+    """Draw a limit as a dashed line with its name; further arguments go to the name."""
+    look = {"font": {"size": 12, "color": theme.TOLERANCE}, "bgcolor": theme.RAISED, "borderpad": 1}
     figure.add_hline(
-        y=tolerance_m * MM,
+        y=y,
         line={"color": theme.TOLERANCE, "width": 1.5, "dash": "dash"},
-        annotation={
-            "text": f"tolerance {tolerance_m * MM:g} mm",
-            "font": {"size": 12, "color": theme.TOLERANCE},
-            "bgcolor": theme.RAISED,
-            "borderpad": 1,
-            "yshift": 2,
-        },
-        annotation_position="top right",
+        annotation={"text": text} | look | note,
+        annotation_position="top left" if "x" in note else "top right",
     )
 
 
-def add_zero(figure: go.Figure) -> None:
+def add_zero(figure: go.Figure, **place: int) -> None:
     """Draw the zero of residuals."""
-    figure.add_hline(y=0, line={"color": theme.LINE, "width": 1}, layer="below")
+    line = {"color": theme.LINE, "width": 1}
+    figure.add_hline(y=0, line=line, layer="below", **place)
 
 
-def add_note(figure: go.Figure, text: str) -> None:
-    """Write a note into the lower right corner."""
-    figure.add_annotation(
-        text=text,
-        x=1,
-        y=0,
-        xref="x domain",
-        yref="y domain",
-        xanchor="right",
-        yanchor="bottom",
-        showarrow=False,
-        font={"size": 12, "color": theme.MUTED},
-        bgcolor=theme.RAISED,
-    )
+def add_note(figure: go.Figure, text: str, **place: Any) -> None:
+    """Write a note, by default into the lower right corner."""
+    corner = {"x": 1, "y": 0, "xref": "x domain", "xanchor": "right", "yanchor": "bottom"}
+    look = {"font": {"size": 12, "color": theme.MUTED}, "bgcolor": theme.RAISED}
+    shown = {"text": text, "yref": "y domain", "showarrow": False} | look | (place or corner)
+    figure.add_annotation(**shown)
 
 
 def make_map(figure: go.Figure, frame: str = "") -> None:
@@ -68,11 +130,10 @@ def make_map(figure: go.Figure, frame: str = "") -> None:
     figure.update_yaxes(title_text=f"y{frame} [m]", scaleanchor="x", scaleratio=1)
 
 
-def group_by_axis(figure: go.Figure, x_title: str, y_title: str, gap: float) -> None:
+def group_by_axis(figure: go.Figure, gap: float) -> None:
     """Set the axes of a figure with three coordinates beside each other in each category."""
     add_zero(figure)
-    figure.update_xaxes(title_text=x_title, type="category")
-    figure.update_yaxes(title_text=y_title)
+    figure.update_xaxes(type="category")
     figure.update_layout(scattermode="group", scattergap=gap)
 
 
@@ -84,35 +145,15 @@ def make_log(figure: go.Figure) -> None:
             note.y = float(np.log10(line.y0))
 
 
-def details(
-    rows: Columns, words: Sequence[str], numbers: Sequence[str] = (), in_mm: Sequence[str] = ()
-) -> list[list[Any]]:
-    """Return the values of the hover text of each row: words, numbers, lengths in millimetres."""
-    columns: list[Iterable[Any]] = [texts(rows, name) for name in words]
-    columns += [floats(rows, name).round(4).tolist() for name in numbers]
-    columns += [(MM * floats(rows, name)).tolist() for name in in_mm]
-    return [list(row) for row in zip(*columns, strict=True)]
-
-
 def add_binned(
-    figure: go.Figure,
-    style: theme.MethodStyle,
-    x: NDArray[np.float64],
-    y: NDArray[np.float64],
-    width: float,
+    figure: go.Figure, style: Style, x: NDArray[np.float64], y: NDArray[np.float64], width: float
 ) -> None:
     """Draw the RMS of each bin as a line."""
+    hover, group = "RMS {y:.1f} mm about {x:.4g}", {"legendgroup": style.label, "showlegend": False}
+    name = f"{style.label}: RMS of bins"
     middles, values = binned_rms(x, y, width)
-    figure.add_scatter(
-        x=middles,
-        y=values,
-        mode="lines",
-        name=f"{style.label}: RMS of bins",
-        legendgroup=style.label,
-        showlegend=False,
-        line={"color": style.colour, "width": 2.5},
-        hovertemplate=f"RMS %{{y:.1f}} mm about %{{x:.4g}}<extra>{style.label}</extra>",
-    )
+    add_line(figure, middles, values, style, hover, line_width=2.5, **group)
+    figure.data[-1].name = name
 
 
 def binned_rms(
@@ -133,3 +174,9 @@ def joined_strokes(strokes: Sequence[NDArray[np.float64]]) -> NDArray[np.float64
     """Return many lines as one with gaps, (n, dimensions)."""
     gap = np.full((1, strokes[0].shape[1] if strokes else 2), np.nan)
     return np.concatenate([part for stroke in strokes for part in (stroke, gap)] or [gap])
+
+
+def outline(radius: float, centre: Sequence[float] = (0.0, 0.0)) -> NDArray[np.float64]:
+    """Return a circle about a centre, (2, n)."""
+    turn = np.linspace(0.0, 2.0 * np.pi, 91)
+    return np.stack([centre[0] + radius * np.cos(turn), centre[1] + radius * np.sin(turn)])

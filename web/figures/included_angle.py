@@ -5,12 +5,10 @@ Errors are horizontal, as the theory is: heights depend on the levelling.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
 import plotly.graph_objects as go
-from numpy.typing import NDArray
 
 from spheremark.pipelines.positioning.subsets import theory_of_pairs
 from spheremark.pipelines.published import LEAST_ANGLE, WIDEST_ANGLE
@@ -18,9 +16,11 @@ from spheremark.web import theme
 from spheremark.web.columns import MM, Columns, by_method, floats, known_values, rms, select
 from spheremark.web.figures.elements import (
     add_binned,
+    add_line,
+    add_note,
+    add_points,
     add_tolerance,
     blank_figure,
-    details,
     make_log,
 )
 from spheremark.web.figures.survey import ANGLE_BIN
@@ -47,27 +47,27 @@ class Subsets:
     sigma_axis_m: float
 
     @property
-    def has_errors(self) -> bool:
-        """Whether the error of any row is known."""
-        return bool(np.isfinite(floats(self.rows, "error_horizontal_m")).any())
-
-    @property
     def quality(self) -> str:
-        """Prefix of the column that is drawn."""
-        return "error" if self.has_errors else "sigma"
+        """Prefix of the column that is drawn: errors where any is known."""
+        has_errors = np.isfinite(floats(self.rows, "error_horizontal_m")).any()
+        return "error" if has_errors else "sigma"
 
 
 def error_against_angle(shown: Subsets, tolerance_m: float, *, is_log: bool = False) -> go.Figure:
     """Draw the horizontal error of the station from few marks against their included angle."""
-    quality = "Error" if shown.has_errors else "Predicted sigma"
+    quality = {"error": "Error", "sigma": "Predicted sigma"}[shown.quality]
     few = f"{_COUNTS[shown.n_marks]} by {_HOW.get(shown.resection, shown.resection)}"
-    figure = blank_figure(f"{quality} of the station from {few}")
-    figure.update_yaxes(title_text=f"{quality}, horizontal [mm]")
+    which = "" if shown.n_marks == 2 else ", the widest of three"
+    figure = blank_figure(
+        f"{quality} of the station from {few}",
+        f"Included angle{which} [deg]",
+        f"{quality}, horizontal [mm]",
+    )
     add_tolerance(figure, tolerance_m)
     for method, rows in by_method(shown.rows):
-        _add_rows(figure, method, rows, shown)
+        _add_rows(figure, theme.method_style(method), rows, shown)
     for method, rows in by_method(shown.fixes):
-        _add_all_marks(figure, method, rows, shown)
+        _add_all_marks(figure, theme.method_style(method), rows, shown)
     add_theory(figure, shown.sigma_axis_m)
     add_limits_of_study(figure, is_shaded=shown.resection == "paper")
     worst = known_values(floats(shown.rows, f"{shown.quality}_horizontal_m"))
@@ -76,8 +76,7 @@ def error_against_angle(shown: Subsets, tolerance_m: float, *, is_log: bool = Fa
     elif len(worst):
         top = 1.3 * max(float(np.quantile(worst, 0.97)), tolerance_m) * MM
         figure.update_yaxes(range=[0.0, top])
-    which = "" if shown.n_marks == 2 else ", the widest of three"
-    figure.update_xaxes(title_text=f"Included angle{which} [deg]", range=[0, 180], dtick=30)
+    figure.update_xaxes(range=[0, 180], dtick=30)
     return figure
 
 
@@ -86,14 +85,10 @@ def add_theory(figure: go.Figure, sigma_axis_m: float) -> None:
     if not np.isfinite(sigma_axis_m):
         return
     for method, (name, colour, dash) in THEORIES.items():
-        figure.add_scatter(
-            x=np.degrees(_ANGLES),
-            y=theory_of_pairs(method, sigma_axis_m, _ANGLES) * MM,
-            mode="lines",
-            name=f"{name}, {sigma_axis_m * MM:.2g} mm",
-            line={"color": colour, "width": 1.5, "dash": dash},
-            hovertemplate=f"{name}: %{{y:.1f}} mm at %{{x:.0f}} deg<extra></extra>",
-        )
+        errors = theory_of_pairs(method, sigma_axis_m, _ANGLES) * MM
+        style = theme.Style(f"{name}, {sigma_axis_m * MM:.2g} mm", colour)
+        look = {"line_width": 1.5, "line_dash": dash}
+        add_line(figure, np.degrees(_ANGLES), errors, style, "{y:.1f} mm at {x:.0f} deg", **look)
 
 
 def add_limits_of_study(figure: go.Figure, *, is_shaded: bool) -> None:
@@ -103,64 +98,42 @@ def add_limits_of_study(figure: go.Figure, *, is_shaded: bool) -> None:
         figure.add_vline(x=x, line={"color": theme.MUTED, "width": 1, "dash": "dot"}, layer="below")
     for x0, x1 in ((0.0, low), (high, 180.0)) if is_shaded else ():
         figure.add_vrect(x0=x0, x1=x1, fillcolor=theme.SHADE, line_width=0, layer="below")
-    figure.add_annotation(
-        x=(low + high) / 2.0,
-        y=1,
-        yref="y domain",
-        yanchor="top",
-        showarrow=False,
-        text=f"study, for circles: {low:.0f} to {high:.0f} deg",
-        font={"size": 12, "color": theme.MUTED},
-        bgcolor=theme.RAISED,
-    )
+    text = f"study, for circles: {low:.0f} to {high:.0f} deg"
+    add_note(figure, text, x=(low + high) / 2.0, y=1, yanchor="top")
 
 
-def _add_rows(figure: go.Figure, method: str, rows: Columns, shown: Subsets) -> None:
+def _add_rows(figure: go.Figure, style: theme.Style, rows: Columns, shown: Subsets) -> None:
     """Draw the station from each pair or triple, and the RMS of bins."""
-    style = theme.method_style(method)
     x = floats(rows, "included_angle_max_deg")
     y = floats(rows, f"{shown.quality}_horizontal_m") * MM
     drawn = np.zeros(len(x), dtype=np.bool_)
     drawn[:: max(1, -(-len(x) // _N_DRAWN))] = True
     few = select(rows, drawn)
-    marks = np.array([" + ".join(map(str, names)) for names in few["marks"]], dtype=object)
-    figure.add_scatter(
-        x=x[drawn],
-        y=y[drawn],
-        mode="markers",
-        name=f"{style.label}, {_COUNTS[shown.n_marks]}",
-        legendgroup=style.label,
-        marker={"color": style.colour, "size": 4, "opacity": 0.3, "symbol": style.symbol},
-        customdata=details(few | {"marks": marks}, ("stop", "marks"), ("included_angle_deg",)),
-        hovertemplate="<b>%{customdata[0]}</b> from %{customdata[1]}<br>%{y:.1f} mm at "
-        f"%{{x:.1f}} deg, smallest %{{customdata[2]:.1f}} deg<extra>{style.label}</extra>",
+    few["marks"] = np.array([" + ".join(map(str, names)) for names in few["marks"]], dtype=object)
+    hover = (
+        "<b>{stop}</b> from {marks}<br>{y:.1f} mm at {x:.1f} deg, smallest "
+        "{included_angle_deg:.1f} deg"
     )
+    named = style._replace(label=f"{style.label}, {_COUNTS[shown.n_marks]}")
+    look = {"marker_size": 4, "marker_opacity": 0.3, "legendgroup": style.label}
+    add_points(figure, x[drawn], y[drawn], named, hover, few, **look)
     add_binned(figure, style, x, y, ANGLE_BIN)
 
 
-def _add_all_marks(figure: go.Figure, method: str, rows: Columns, shown: Subsets) -> None:
+def _add_all_marks(figure: go.Figure, style: theme.Style, rows: Columns, shown: Subsets) -> None:
     """Draw the RMS of the stations from all marks as a level line."""
-    style = theme.method_style(method)
     known = known_values(floats(rows, f"{shown.quality}_horizontal_m"))
     if not len(known):
         return
     level = rms(known) * MM
-    figure.add_scatter(
-        x=[0.0, 180.0],
-        y=[level, level],
-        mode="lines",
-        name=f"{style.label}, all marks: {level:.1f} mm",
-        line={"color": style.colour, "width": 1.5, "dash": "dashdot"},
-        hovertemplate=f"RMS of {len(known)} stations from all their marks: %{{y:.2f}} mm"
-        f"<extra>{style.label}</extra>",
-    )
+    named = style._replace(label=f"{style.label}, all marks: {level:.1f} mm")
+    hover = f"RMS of {len(known)} stations from all their marks: {{y:.2f}} mm"
+    look = {"line_width": 1.5, "line_dash": "dashdot"}
+    add_line(figure, [0.0, 180.0], [level, level], named, hover, **look)
 
 
 def centres_sigma(fits: Columns) -> float:
     """Return the predicted sigma of the centres of the first method, per axis [m]; or NaN."""
-    counts: Mapping[str, Columns] = dict(by_method(fits))
-    first = next(iter(counts.values()), None)
-    known: NDArray[np.float64] = (
-        np.zeros(0) if first is None else known_values(floats(first, "sigma_axis_m"))
-    )
+    first = next((rows for _, rows in by_method(fits)), {"sigma_axis_m": np.zeros(0)})
+    known = known_values(floats(first, "sigma_axis_m"))
     return rms(known) if len(known) else np.nan

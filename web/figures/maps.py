@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-
 import numpy as np
 import plotly.graph_objects as go
 from numpy.typing import NDArray
@@ -12,20 +10,26 @@ from spheremark.web import theme
 from spheremark.web.columns import Columns, by_method, floats, known_values, largest, texts
 from spheremark.web.figures.elements import (
     add_note,
+    add_points,
+    add_strokes,
     blank_figure,
-    details,
-    joined_strokes,
     make_map,
 )
 
 _ELLIPSE_SHARE = 0.08  # the largest ellipse is drawn at most this large, as a share of the field
+_MARK = theme.Style("control mark", theme.MARK, "circle-cross-open")
+NAMES = {"textposition": "top center", "textfont": {"size": 11, "color": theme.MUTED}}
+"""How names stand beside points of a map."""
 
 
 def site_map(marks: Columns, fixes: Columns, true_stops: Columns) -> go.Figure:
     """Draw marks, stations, and their 95 % ellipses and errors with one scale factor."""
     figure = blank_figure("Field, stations and 95 % ellipses")
     factor = ellipse_factor(marks, fixes)
-    _add_marks(figure, marks)
+    named = {"mode": "markers+text", "text": texts(marks, "mark"), "cliponaxis": False} | NAMES
+    hover = "<b>{text}</b><br>x {x:.3f} m<br>y {y:.3f} m<br>z {z_m:.3f} m"
+    x, y = floats(marks, "x_m"), floats(marks, "y_m")
+    add_points(figure, x, y, _MARK, hover, marks, marker_size=10, **named)
     for method, rows in by_method(fixes):
         _add_stations(figure, method, rows, factor, true_stops)
     make_map(figure, ", site")
@@ -63,82 +67,33 @@ def ellipse_outline(
     return np.column_stack([x, y])
 
 
-def _add_marks(figure: go.Figure, marks: Columns) -> None:
-    """Draw the control marks with their names."""
-    figure.add_scatter(
-        x=floats(marks, "x_m"),
-        y=floats(marks, "y_m"),
-        mode="markers+text",
-        name="control mark",
-        text=texts(marks, "mark"),
-        textposition="top center",
-        textfont={"size": 11, "color": theme.MUTED},
-        marker={"color": theme.MARK, "size": 10, "symbol": "circle-cross-open"},
-        cliponaxis=False,
-        customdata=floats(marks, "z_m").tolist(),
-        hovertemplate="<b>%{text}</b><br>x %{x:.3f} m<br>y %{y:.3f} m<br>z %{customdata:.3f} m"
-        "<extra>control mark</extra>",
-    )
-
-
 def _add_stations(
     figure: go.Figure, method: str, rows: Columns, factor: float, true_stops: Columns
 ) -> None:
     """Draw the stations of one method with their scaled ellipses and errors."""
     style = theme.method_style(method)
     x, y = floats(rows, "x_m"), floats(rows, "y_m")
-    figure.add_scatter(
-        x=x,
-        y=y,
-        mode="markers",
-        name=style.label,
-        legendgroup=style.label,
-        marker={"color": style.colour, "size": 6, "symbol": style.symbol},
-        customdata=details(rows, ("stop", "status"), ("n_markers", "z_m"), ("sigma_3d_m",)),
-        hovertemplate="<b>%{customdata[0]}</b> %{customdata[1]}<br>x %{x:.3f} m<br>y %{y:.3f} m<br>"
-        "z %{customdata[3]:.3f} m<br>sigma %{customdata[4]:.1f} mm, %{customdata[2]:.0f} marks"
-        f"<extra>{style.label}</extra>",
+    hover = (
+        "<b>{stop}</b> {status}<br>x {x:.3f} m<br>y {y:.3f} m<br>z {z_m:.3f} m<br>"
+        "sigma {sigma_3d_m:mm} mm, {n_markers:.0f} marks"
     )
+    add_points(figure, x, y, style, hover, rows, marker_size=6, legendgroup=style.label)
     outlines = [ellipse_outline(rows, i, factor) for i in range(len(x))]
-    _add_strokes(figure, outlines, style, 1.5)
-    _add_strokes(figure, _errors(rows, true_stops, factor), style, 1.0)
+    hidden = {"legendgroup": style.label, "showlegend": False}
+    add_strokes(figure, outlines, style, line_width=1.5, **hidden)
+    add_strokes(figure, _errors(rows, true_stops, factor), style, line_width=1.0, **hidden)
 
 
 def _errors(rows: Columns, true_stops: Columns, factor: float) -> list[NDArray[np.float64]]:
     """Return the scaled line from each station towards its true position."""
-    truth = dict(
-        zip(
-            texts(true_stops, "stop"),
-            zip(floats(true_stops, "x_m"), floats(true_stops, "y_m"), strict=True),
-            strict=True,
-        )
-    )
-    lines = []
-    for stop, x, y in zip(
-        texts(rows, "stop"), floats(rows, "x_m"), floats(rows, "y_m"), strict=True
-    ):
-        if stop in truth:
-            start = np.array([x, y])
-            lines.append(np.stack([start, start + factor * (np.array(truth[stop]) - start)]))
-    return lines
 
+    def places(columns: Columns) -> zip[tuple[str, NDArray[np.float64]]]:
+        xy = np.column_stack([floats(columns, "x_m"), floats(columns, "y_m")])
+        return zip(texts(columns, "stop"), xy, strict=True)
 
-def _add_strokes(
-    figure: go.Figure,
-    strokes: Sequence[NDArray[np.float64]],
-    style: theme.MethodStyle,
-    width: float,
-) -> None:
-    """Draw many lines as one trace."""
-    if not strokes:
-        return
-    joined = joined_strokes(strokes)
-    figure.add_scatter(
-        x=joined[:, 0],
-        y=joined[:, 1],
-        mode="lines",
-        legendgroup=style.label,
-        showlegend=False,
-        line={"color": style.colour, "width": width},
-        hoverinfo="skip",
-    )
+    truth = dict(places(true_stops))
+    return [
+        np.stack([start, start + factor * (truth[stop] - start)])
+        for stop, start in places(rows)
+        if stop in truth
+    ]

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -10,85 +10,64 @@ import plotly.graph_objects as go
 
 from spheremark.pipelines.published import LEAST_ANGLE, TABLE_3, WIDEST_ANGLE
 from spheremark.web import theme
-from spheremark.web.figures.elements import add_tolerance
-
-_MM = 1e3  # [mm/m]
+from spheremark.web.columns import MM
+from spheremark.web.figures.elements import (
+    add_line,
+    add_points,
+    add_tolerance,
+    blank_figure,
+    hover_of,
+)
 
 
 def pass_rate_by_number(results: Mapping[str, Any]) -> go.Figure:
     """Draw the share of arrangements that pass against their number of marks."""
     rows = results["by_number_of_marks"]
-    figure = go.Figure(
-        go.Bar(
-            x=[row["n_marks"] for row in rows],
-            y=[_percent(row["pass_rate"]) for row in rows],
-            marker_color=theme.MUTED,
-            hovertemplate="%{x} marks: %{y:.1f} % pass<extra></extra>",
-        )
-    )
-    figure.update_xaxes(title="Number of marks", dtick=1)
-    return _finished(figure, "Arrangements at random that keep the tolerance")
+    title = "Arrangements at random that keep the tolerance"
+    figure = _rates(title, "Number of marks", [row["n_marks"] for row in rows], rows)
+    return figure.update_xaxes(dtick=1)
 
 
 def pass_rate_by_angle(results: Mapping[str, Any]) -> go.Figure:
     """Draw the share of arrangements that pass against their worst included angle."""
     rows = [row for row in results["by_worst_angle"] if row["n"]]
     middles = [(row["angle_from_deg"] + row["angle_to_deg"]) / 2 for row in rows]
-    figure = go.Figure(
-        go.Bar(
-            x=middles,
-            y=[_percent(row["pass_rate"]) for row in rows],
-            width=[row["angle_to_deg"] - row["angle_from_deg"] for row in rows],
-            marker_color=theme.MUTED,
-            customdata=[row["n"] for row in rows],
-            hovertemplate="about %{x:.0f} deg: %{y:.1f} % of %{customdata:,} pass<extra></extra>",
-        )
-    )
-    figure.update_xaxes(title="Included angle farthest from a right one [deg]")
-    return _finished(figure, "The same by the worst included angle of the three marks used")
+    title = "The same by the worst included angle of the three marks used"
+    figure = _rates(title, "Included angle farthest from a right one [deg]", middles, rows)
+    widths = [row["angle_to_deg"] - row["angle_from_deg"] for row in rows]
+    return figure.update_traces(width=widths)
 
 
 def error_by_angle(results: Mapping[str, Any]) -> go.Figure:
     """Draw the error of a position against the included angle, with what the study published."""
     rows = results["by_included_angle"]
-    figure = go.Figure(
-        go.Scatter(
-            x=[row["included_angle_deg"] for row in rows],
-            y=[_MM * row["median_error_3d_m"] for row in rows],
-            mode="lines",
-            name="three circles, median over signs",
-            line={"color": theme.TEXT},
-        )
+    figure = blank_figure(
+        "What the included angle does to a position by three circles",
+        "Included angle of the first two marks [deg]",
+        "3-D error [mm]",
     )
-    figure.add_scatter(
-        x=np.degrees(TABLE_3.included_angles),
-        y=_MM * TABLE_3.errors,
-        mode="markers",
-        name="the study, Table 3",
-        marker={"color": theme.MUTED, "symbol": "diamond", "size": 9},
+    angles = [row["included_angle_deg"] for row in rows]
+    errors = [MM * row["median_error_3d_m"] for row in rows]
+    hover = "{y:.1f} mm at {x:.1f} deg"
+    add_line(
+        figure, angles, errors, theme.Style("three circles, median over signs", theme.TEXT), hover
     )
+    style = theme.Style("the study, Table 3", theme.MUTED, "diamond")
+    x, y = np.degrees(TABLE_3.included_angles), MM * TABLE_3.errors
+    add_points(figure, x, y, style, hover, marker_size=9)
     add_tolerance(figure, results["tolerance_m"])
-    figure.add_vrect(
-        x0=float(np.degrees(LEAST_ANGLE)),
-        x1=float(np.degrees(WIDEST_ANGLE)),
-        line_width=0,
-        fillcolor=theme.MUTED,
-        opacity=0.12,
-    )
-    figure.update_xaxes(title="Included angle of the first two marks [deg]")
-    figure.update_yaxes(title="3-D error [mm]", rangemode="tozero")
-    figure.update_layout(title="What the included angle does to a position by three circles")
-    figure.update_layout(template=theme.template())
-    return figure
+    low, high = np.degrees([LEAST_ANGLE, WIDEST_ANGLE]).tolist()
+    figure.add_vrect(x0=low, x1=high, line_width=0, fillcolor=theme.MUTED, opacity=0.12)
+    return figure.update_yaxes(rangemode="tozero")
 
 
-def _percent(share: float | None) -> float | None:
-    """Return a share in percent."""
-    return None if share is None else 100.0 * share
-
-
-def _finished(figure: go.Figure, title: str) -> go.Figure:
-    """Return a figure of shares with its axis and title."""
-    figure.update_yaxes(title="Share that passes [%]", range=[0, 100])
-    figure.update_layout(title=title, template=theme.template())
-    return figure
+def _rates(
+    title: str, x_title: str, x: Sequence[float], rows: Sequence[Mapping[str, Any]]
+) -> go.Figure:
+    """Draw the shares of classes of arrangements that pass."""
+    figure = blank_figure(title, x_title, "Share that passes [%]")
+    shares = [None if row["pass_rate"] is None else 100.0 * row["pass_rate"] for row in rows]
+    counts = {"n": np.array([row["n"] for row in rows])}
+    hover = hover_of("{x:.0f}: {y:.1f} % of {n:,.0f} pass", theme.Style("", theme.MUTED), counts)
+    figure.add_bar(x=x, y=shares, marker_color=theme.MUTED, **hover)
+    return figure.update_yaxes(range=[0, 100])

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import plotly.graph_objects as go
@@ -11,7 +12,13 @@ from numpy.typing import NDArray
 from spheremark.pipelines.model import Array, Column, Index
 from spheremark.web import theme
 from spheremark.web.columns import MM, Columns, floats, on_marks, select, texts
-from spheremark.web.figures.elements import add_zero, blank_figure, joined_strokes
+from spheremark.web.figures.elements import (
+    add_points,
+    add_zero,
+    blank_figure,
+    hover_of,
+    joined_strokes,
+)
 
 _CELLS = (0.15, 0.2, 0.3, 0.4)  # [m]; of the surroundings one return is shown in each cell
 _N_SHOWN = 30_000  # returns of the surroundings; more makes a browser without a GPU slow
@@ -20,6 +27,7 @@ _REACH = 1.3  # returns within so many radii of a centre are shown with it
 _LEAST = 8.0  # [m] that a scene shows at least, before the margin
 _COLOUR_SIGMAS = 3.0  # the colours of residuals end here
 _N_MERIDIANS, _N_PARALLELS = 18, 8  # of a drawn sphere
+_CAMERA = {"eye": {"x": 0.95, "y": -1.1, "z": 0.7}, "center": {"x": 0, "y": 0, "z": -0.1}}
 
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
@@ -52,30 +60,31 @@ def stop_scene(scan: Scan, fits: Columns, rejections: Columns) -> go.Figure:
     reach = _reach(fits)
     fits = select(fits, floats(fits, "range_m") <= reach)
     shown = scan.p_station[_surroundings(scan, reach)]
-    figure.add_scatter3d(
-        **_xyz(shown),
-        mode="markers",
-        name="surroundings",
-        marker={"size": 1.6, "color": shown[:, 2], "colorscale": theme.HEIGHTS},
-        hoverinfo="skip",
-    )
+    heights = {"size": 1.6, "color": shown[:, 2], "colorscale": theme.HEIGHTS}
+    _add_3d(figure, shown, "surroundings", marker=heights)
     returns = [marker_returns(scan, fits, i) for i in range(len(fits["marker"]))]
     if returns:
         _add_returns(figure, returns, floats(fits, "rms_m"), _what(scan, fits), size=2.5)
         _add_labels(figure, fits)
-    _add_rejections(figure, rejections)
+    if len(rejections["reason"]):
+        more = {"text": texts(rejections, "reason"), "visible": "legendonly"}
+        look = {"size": 4, "color": theme.MUTED, "symbol": "cross"}
+        _add_3d(figure, _centres(rejections), "rejected", "{text}", marker=look, **more)
     return figure
 
 
 def marker_close_up(scan: Scan, fits: Columns, i: int) -> go.Figure:
     """Draw one marker in detail: its sphere, and its returns coloured by their residual."""
-    name, mark = texts(fits, "marker")[i], texts(fits, "mark")[i]
+    name, mark, centre = texts(fits, "marker")[i], texts(fits, "mark")[i], _centres(fits)[i]
     figure = _figure_3d(f"Marker {name}{f' on mark {mark}' if mark else ''} and its returns")
-    _add_sphere(figure, _centre(fits, i), float(floats(fits, "radius_m")[i]))
+    sphere = centre + float(floats(fits, "radius_m")[i]) * joined_strokes(_graticule())
+    _add_3d(figure, sphere, "sphere", mode="lines", line={"color": theme.CLOUD, "width": 1.5})
     returns = marker_returns(scan, fits, i)
-    _add_left_out(figure, returns)
+    left_out = {"size": 4, "color": theme.FAINT, "symbol": "cross"}
+    rest = returns.p_station[~returns.is_used]
+    _add_3d(figure, rest, "left out: pole, edges", marker=left_out)
     _add_returns(figure, [returns], floats(fits, "rms_m")[[i]], _what(scan, fits), size=5)
-    towards = -_centre(fits, i) / np.linalg.norm(_centre(fits, i))
+    towards = -centre / np.linalg.norm(centre)
     eye = 1.7 * towards + np.array([0.5 * towards[1], -0.5 * towards[0], 0.5])
     figure.update_scenes(camera_eye=dict(zip("xyz", eye.tolist(), strict=True)))
     return figure
@@ -83,30 +92,25 @@ def marker_close_up(scan: Scan, fits: Columns, i: int) -> go.Figure:
 
 def marker_residuals(scan: Scan, fits: Columns, i: int) -> go.Figure:
     """Draw the residuals of one marker's returns across the sphere, with their sigma."""
-    returns = marker_returns(scan, fits, i)
+    returns, what, centre = marker_returns(scan, fits, i), _what(scan, fits), _centres(fits)[i]
     sigma_mm = float(floats(fits, "rms_m")[i]) * MM
     style = theme.method_style(texts(fits, "fit_method")[i])
-    figure = blank_figure(f"{_what(scan, fits)} of marker {texts(fits, 'marker')[i]}")
+    title = f"{what} of marker {texts(fits, 'marker')[i]}"
+    figure = blank_figure(title, "Right of the line of sight [mm]", f"{what} [mm]")
     figure.add_hrect(y0=-sigma_mm, y1=sigma_mm, fillcolor=style.band, line_width=0, layer="below")
     add_zero(figure)
-    across = _across(returns.p_station - _centre(fits, i), _centre(fits, i))
-    figure.add_scatter(
-        x=across[returns.is_used] * MM,
-        y=returns.residuals[returns.is_used] * MM,
-        mode="markers",
-        name=f"return; band: ±sigma, {sigma_mm:.1f} mm",
-        showlegend=True,
-        marker={"color": style.colour, "size": 6, "opacity": 0.7, "symbol": style.symbol},
-        hovertemplate="%{y:.1f} mm at %{x:.0f} mm<extra></extra>",
-    )
-    figure.update_xaxes(title_text="Right of the line of sight [mm]")
-    figure.update_yaxes(title_text=f"{_what(scan, fits)} [mm]")
+    right = np.array([centre[1], -centre[0]]) / np.hypot(centre[0], centre[1])
+    x = MM * (returns.p_station - centre)[returns.is_used, :2] @ right
+    y = returns.residuals[returns.is_used] * MM
+    named = style._replace(label=f"return; band: ±sigma, {sigma_mm:.1f} mm")
+    look = {"marker_size": 6, "marker_opacity": 0.7, "showlegend": True}
+    add_points(figure, x, y, named, "{y:.1f} mm at {x:.0f} mm", **look)
     return figure
 
 
 def marker_returns(scan: Scan, fits: Columns, i: int) -> MarkerReturns:
     """Return the returns near one fitted sphere."""
-    centre, radius = _centre(fits, i), float(floats(fits, "radius_m")[i])
+    centre, radius = _centres(fits)[i], float(floats(fits, "radius_m")[i])
     members = _within(scan.p_station, centre, _REACH * radius)
     p_station = scan.p_station[members].astype(np.float64)
     name = texts(fits, "marker")[i]
@@ -126,12 +130,6 @@ def _is_along_beam(scan: Scan, fits: Columns) -> bool:
 def _what(scan: Scan, fits: Columns) -> str:
     """Return the quantity of the colours of returns."""
     return "Residual along the beam" if _is_along_beam(scan, fits) else "Distance from the sphere"
-
-
-def _across(p: Array, centre: Array) -> Array:
-    """Return how far points are to the right of the line of sight [m]."""
-    right = np.array([centre[1], -centre[0]]) / np.hypot(centre[0], centre[1])
-    return np.asarray(p[:, :2] @ right)
 
 
 def _within(p: NDArray[np.float32], centre: Array, reach: float) -> Index:
@@ -162,23 +160,26 @@ def _surroundings(scan: Scan, reach: float) -> Index:
 
 def _figure_3d(title: str) -> go.Figure:
     """Return an empty scene with equal axes in the station frame."""
-    axes = {
-        f"{axis}axis": {"title": {"text": f"{axis}, station [m]"}, "nticks": 6} for axis in "xyz"
-    }
+    titles = {f"{axis}axis": {"title": {"text": f"{axis}, station [m]"}} for axis in "xyz"}
+    axes = {name: axis | {"nticks": 6} for name, axis in titles.items()}
+    scene = {"aspectmode": "data", "camera": _CAMERA, "dragmode": "turntable"}
     figure = blank_figure(title)
-    figure.update_layout(
-        scene={
-            **axes,
-            "aspectmode": "data",
-            "camera": {
-                "eye": {"x": 0.95, "y": -1.1, "z": 0.7},
-                "center": {"x": 0, "y": 0, "z": -0.1},
-            },
-            "dragmode": "turntable",
-        },
-        margin={"l": 0, "r": 0, "t": 36, "b": 0},
-    )
+    figure.update_layout(scene=axes | scene, margin={"l": 0, "r": 0, "t": 36, "b": 0})
     return figure
+
+
+def _add_3d(
+    figure: go.Figure,
+    p: NDArray[np.floating],
+    name: str,
+    hover: Any = "",
+    rows: Any = None,
+    **more: Any,
+) -> None:
+    """Draw points of a scene in single precision; further arguments go to the trace."""
+    xyz = {axis: np.asarray(p[:, i], dtype=np.float32) for i, axis in enumerate("xyz")}
+    look = {"mode": "markers", "name": name} | hover_of(hover, theme.Style(name, ""), rows)
+    figure.add_scatter3d(**(xyz | look | more))
 
 
 def _add_returns(
@@ -186,114 +187,46 @@ def _add_returns(
     returns: list[MarkerReturns],
     rms: NDArray[np.float64],
     what: str,
-    *,
     size: float,
 ) -> None:
     """Draw the returns that fits used, coloured by residual: too near, right, too far."""
-    residuals_mm = np.concatenate([one.residuals[one.is_used] for one in returns]) * MM
+    p = np.concatenate([one.p_station[one.is_used] for one in returns])
+    residuals = {"mm": np.concatenate([one.residuals[one.is_used] for one in returns]) * MM}
     end = max(1.0, float(np.ceil(_COLOUR_SIGMAS * np.nanmedian(rms) * MM)))
-    figure.add_scatter3d(
-        **_xyz(np.concatenate([one.p_station[one.is_used] for one in returns])),
-        mode="markers",
-        name="returns of markers",
-        customdata=residuals_mm,
-        hovertemplate="%{customdata:.1f} mm<extra></extra>",
-        marker={
-            "size": size,
-            "color": residuals_mm,
-            "colorscale": theme.DIVERGING,
-            "cmin": -end,
-            "cmax": end,
-            "colorbar": {
-                "title": {"text": f"{what} [mm], to ±{_COLOUR_SIGMAS:g} sigma", "side": "right"},
-                "thickness": 10,
-                "len": 0.7,
-                "outlinewidth": 0,
-                "tickfont": {"family": theme.MONO, "size": 11},
-            },
-        },
-    )
-
-
-def _add_left_out(figure: go.Figure, returns: MarkerReturns) -> None:
-    """Draw the returns near a sphere that its fit did not use."""
-    figure.add_scatter3d(
-        **_xyz(returns.p_station[~returns.is_used]),
-        mode="markers",
-        name="left out: pole, edges",
-        hoverinfo="skip",
-        marker={"size": 4, "color": theme.FAINT, "symbol": "cross"},
-    )
+    title = {"text": f"{what} [mm], to ±{_COLOUR_SIGMAS:g} sigma", "side": "right"}
+    ticks = {"tickfont": {"family": theme.MONO, "size": 11}}
+    bar = {"title": title, "thickness": 10, "len": 0.7, "outlinewidth": 0} | ticks
+    scale = {"colorscale": theme.DIVERGING, "cmin": -end, "cmax": end, "colorbar": bar}
+    look = {"size": size, "color": residuals["mm"]} | scale
+    _add_3d(figure, p, "returns of markers", "{mm:.1f} mm", residuals, marker=look)
 
 
 def _add_labels(figure: go.Figure, fits: Columns) -> None:
     """Draw the centres with their names."""
     style = theme.method_style(texts(fits, "fit_method")[0])
-    centres = np.column_stack([floats(fits, f"{axis}_m") for axis in "xyz"])
     names = zip(texts(fits, "marker"), texts(fits, "mark"), strict=True)
-    figure.add_scatter3d(
-        **_xyz(centres),
-        mode="markers+text",
-        name=f"centres, {style.label}",
-        text=[f"{marker} · {mark}" if mark else marker for marker, mark in names],
-        textposition="top center",
-        textfont={"size": 11, "color": theme.TEXT},
-        marker={"size": 5, "color": style.colour, "symbol": "circle-open"},
-        customdata=np.column_stack([floats(fits, "range_m"), floats(fits, "n_points")]),
-        hovertemplate="<b>%{text}</b><br>%{customdata[0]:.2f} m, %{customdata[1]:.0f} returns"
-        "<extra></extra>",
-    )
+    shown = [f"{marker} · {mark}" if mark else marker for marker, mark in names]
+    font = {"textposition": "top center", "textfont": {"size": 11, "color": theme.TEXT}}
+    look = {"size": 5, "color": style.colour, "symbol": "circle-open"}
+    hover = "<b>{text}</b><br>{range_m:.2f} m, {n_points:.0f} returns"
+    more = {"mode": "markers+text", "text": shown, "marker": look} | font
+    _add_3d(figure, _centres(fits), f"centres, {style.label}", hover, fits, **more)
 
 
-def _add_rejections(figure: go.Figure, rejections: Columns) -> None:
-    """Draw what was rejected, with the reason."""
-    if not len(rejections["reason"]):
-        return
-    figure.add_scatter3d(
-        **_xyz(np.column_stack([floats(rejections, f"{axis}_m") for axis in "xyz"])),
-        mode="markers",
-        name="rejected",
-        visible="legendonly",
-        text=texts(rejections, "reason"),
-        hovertemplate="%{text}<extra>rejected</extra>",
-        marker={"size": 4, "color": theme.MUTED, "symbol": "cross"},
-    )
-
-
-def _add_sphere(figure: go.Figure, centre: Array, radius: float) -> None:
-    """Draw a sphere as meridians and parallels."""
+def _graticule() -> list[Array]:
+    """Return meridians and parallels of the unit sphere."""
     turn = np.linspace(0.0, 2.0 * np.pi, 73)
     half = np.linspace(-np.pi / 2.0, np.pi / 2.0, 37)
-    lines = [
-        _on_sphere(np.full(len(half), longitude), half)
-        for longitude in np.linspace(0.0, 2.0 * np.pi, _N_MERIDIANS, endpoint=False)
+    meridians = np.linspace(0.0, 2.0 * np.pi, _N_MERIDIANS, endpoint=False)
+    parallels = np.linspace(-np.pi / 2.0, np.pi / 2.0, _N_PARALLELS + 2)[1:-1]
+    places = [(np.full_like(half, longitude), half) for longitude in meridians]
+    places += [(turn, np.full_like(turn, latitude)) for latitude in parallels]
+    return [
+        np.column_stack([np.cos(b) * np.cos(a), np.cos(b) * np.sin(a), np.sin(b)])
+        for a, b in places
     ]
-    lines += [
-        _on_sphere(turn, np.full(len(turn), latitude))
-        for latitude in np.linspace(-np.pi / 2.0, np.pi / 2.0, _N_PARALLELS + 2)[1:-1]
-    ]
-    figure.add_scatter3d(
-        **_xyz(centre + radius * joined_strokes(lines)),
-        mode="lines",
-        name="sphere",
-        line={"color": theme.CLOUD, "width": 1.5},
-        hoverinfo="skip",
-    )
 
 
-def _on_sphere(longitudes: Array, latitudes: Array) -> Array:
-    """Return points on the unit sphere, (n, 3)."""
-    level = np.cos(latitudes)
-    return np.column_stack(
-        [level * np.cos(longitudes), level * np.sin(longitudes), np.sin(latitudes)]
-    )
-
-
-def _centre(fits: Columns, i: int) -> Array:
-    """Return the centre of one fit in the station frame, (3,) [m]."""
-    return np.array([floats(fits, f"{axis}_m")[i] for axis in "xyz"])
-
-
-def _xyz(p: NDArray[np.floating]) -> dict[str, NDArray[np.float32]]:
-    """Return points as single-precision columns of Plotly."""
-    return {axis: np.asarray(p[:, i], dtype=np.float32) for i, axis in enumerate("xyz")}
+def _centres(rows: Columns) -> Array:
+    """Return the places of fits in the station frame, (n, 3) [m]."""
+    return np.column_stack([floats(rows, f"{axis}_m") for axis in "xyz"])

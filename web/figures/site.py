@@ -10,62 +10,50 @@ from numpy.typing import NDArray
 
 from spheremark.pipelines.ground_model import ElevationModel
 from spheremark.web import theme
-from spheremark.web.columns import Columns, floats, texts
-from spheremark.web.figures.elements import blank_figure, make_map
+from spheremark.web.columns import MM, Columns, floats, texts
+from spheremark.web.figures.elements import add_points, blank_figure, make_map
 
 _CELLS_MAX = 400  # displayed cells along an edge
 _SUN = (np.radians(315.0), np.radians(40.0))  # azimuth, clockwise from y, and height of the light
 _STEEPER = 3.0  # exaggeration of slopes in the shading
 _TAIL = 0.02  # share of the cells below and above the colour scale
+_SHADES = [[0.0, "rgba(0,0,0,0.55)"], [0.5, "rgba(0,0,0,0)"], [1.0, "rgba(255,255,255,0.45)"]]
+_STATIONS = theme.Style("stations", theme.OURS)
+_MARKS = theme.Style("control marks", theme.MARK, "triangle-up")
 
 
 def ground(model: ElevationModel, marks: Columns, stations: Columns) -> go.Figure:
     """Draw heights as colours and their slopes as shade, with stations and marks."""
     step = _step(model)
-    heights = _thinned(model.heights, step)
+    heights = np.asarray(model.heights[::step, ::step], dtype=np.float64)
     figure = blank_figure("Ground of the site")
+    low, high = (float(np.nanquantile(heights, share)) for share in (_TAIL, 1.0 - _TAIL))
+    scale = {"zmin": low, "zmax": high, "colorscale": list(theme.HEIGHTS)}
     cells = {"x": model.xs[::step], "y": model.ys[::step]}
-    figure.add_heatmap(
-        **cells,
-        z=np.round(heights, 4),
-        zmin=float(np.nanquantile(heights, _TAIL)),
-        zmax=float(np.nanquantile(heights, 1.0 - _TAIL)),
-        colorscale=list(theme.HEIGHTS),
-        colorbar=_bar("Height [m]"),
-        hovertemplate="x %{x:.2f} m, y %{y:.2f} m<br>height %{z:.3f} m<extra></extra>",
-    )
-    figure.add_heatmap(
-        **cells,
-        z=np.round(hillshade(heights, model.cell * step), 2),
-        colorscale=[
-            [0.0, "rgba(0,0,0,0.55)"],
-            [0.5, "rgba(0,0,0,0)"],
-            [1.0, "rgba(255,255,255,0.45)"],
-        ],
-        zmin=0.0,
-        zmax=1.0,
-        showscale=False,
-        hoverinfo="skip",
-    )
+    hover = "x %{x:.2f} m, y %{y:.2f} m<br>height %{z:.3f} m<extra></extra>"
+    bar = _bar("Height [m]")
+    figure.add_heatmap(**cells, z=np.round(heights, 4), **scale, colorbar=bar, hovertemplate=hover)
+    shade = np.round(hillshade(heights, model.cell * step), 2)
+    scale = {"zmin": 0.0, "zmax": 1.0, "colorscale": _SHADES}
+    figure.add_heatmap(**cells, z=shade, **scale, showscale=False, hoverinfo="skip")
     return _with_places(figure, marks, stations)
 
 
 def sigma(model: ElevationModel, marks: Columns, stations: Columns) -> go.Figure:
     """Draw the standard deviation of each height."""
     step = _step(model)
-    sigmas = 1e3 * _thinned(model.sigmas, step)
+    sigmas = MM * np.asarray(model.sigmas[::step, ::step], dtype=np.float64)
     figure = blank_figure("Standard deviation of the ground")
     low, high = np.nanmin(sigmas), np.nanmax(sigmas)
     ticks = [value for value in (0.5, 1, 2, 5, 10, 20, 50, 100, 200) if low <= value <= high]
+    names = [f"{value:g}" for value in ticks]
     figure.add_heatmap(
         x=model.xs[::step],
         y=model.ys[::step],
         z=np.round(np.log10(sigmas), 3),
         customdata=np.round(sigmas, 1),
         colorscale=list(theme.HEIGHTS),
-        colorbar=_bar(
-            "Sigma [mm]", tickvals=np.log10(ticks), ticktext=[f"{value:g}" for value in ticks]
-        ),
+        colorbar=_bar("Sigma [mm]", tickvals=np.log10(ticks), ticktext=names),
         hovertemplate="x %{x:.2f} m, y %{y:.2f} m<br>sigma %{customdata:.1f} mm<extra></extra>",
     )
     return _with_places(figure, marks, stations)
@@ -91,32 +79,12 @@ def _step(model: ElevationModel) -> int:
     return int(np.ceil(max(model.heights.shape) / _CELLS_MAX))
 
 
-def _thinned(values: NDArray[Any], step: int) -> NDArray[np.float64]:
-    """Return every ``step``-th cell in both directions."""
-    return np.asarray(values[::step, ::step], dtype=np.float64)
-
-
 def _with_places(figure: go.Figure, marks: Columns, stations: Columns) -> go.Figure:
     """Add stations and marks to a map, and give it equal axes."""
-    places = (
-        ("stations", stations, "name", "circle", theme.OURS),
-        ("control marks", marks, "mark", "triangle-up", theme.MARK),
-    )
-    for label, rows, name, symbol, colour in places:
+    edge = {"marker_line": {"width": 1.5, "color": theme.RAISED}, "marker_size": 9}
+    for rows, name, style in ((stations, "name", _STATIONS), (marks, "mark", _MARKS)):
         if len(rows["x_m"]):
-            figure.add_scatter(
-                x=floats(rows, "x_m"),
-                y=floats(rows, "y_m"),
-                text=texts(rows, name),
-                mode="markers",
-                name=label,
-                marker={
-                    "symbol": symbol,
-                    "size": 9,
-                    "color": colour,
-                    "line": {"width": 1.5, "color": theme.RAISED},
-                },
-                hovertemplate="%{text}<extra></extra>",
-            )
+            x, y = floats(rows, "x_m"), floats(rows, "y_m")
+            add_points(figure, x, y, style, "{text}", text=texts(rows, name), **edge)
     make_map(figure, ", site")
     return figure

@@ -1,14 +1,12 @@
-"""What all pages share: the frame, panels of figures, and the page of an error."""
+"""What all pages share: the frame, panels of figures, and key numbers."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import plotly.graph_objects as go
-
-from spheremark.web.templating import render
 
 Row = Mapping[str, Any]
 
@@ -21,8 +19,7 @@ class Frame:
     survey: str = ""
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Panel:
+class Panel(NamedTuple):
     """A figure with its caption."""
 
     name: str
@@ -36,17 +33,11 @@ class Panel:
         return str(self.figure.layout.title.text)
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class ErrorPage:
-    """The page of an error."""
+class Readout(NamedTuple):
+    """A key number with its unit and a note."""
 
-    frame: Frame
-    status: int
-    title: str
-    detail: str
-    code: str
-
-
-def error_page(page: ErrorPage) -> str:
-    """Return the page of an error."""
-    return render("error.html", page, here="")
+    label: str
+    value: str
+    unit: str
+    note: str
+    method: str = ""

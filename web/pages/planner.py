@@ -2,75 +2,39 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
-from typing import Any
+from collections.abc import Sequence
 from urllib.parse import urlencode
 
 import plotly.graph_objects as go
 
 from spheremark.web import theme
+from spheremark.web.columns import MM
 from spheremark.web.figures import random_plans
-from spheremark.web.figures.elements import blank_figure
-from spheremark.web.pages.base import Frame, Panel
+from spheremark.web.figures.elements import add_line, add_points, blank_figure
+from spheremark.web.pages.base import Frame, Panel, Row
 from spheremark.web.templating import render
 
-Row = Mapping[str, Any]
-_MM = 1e3  # [mm/m]
 _WITHIN_95 = 0.95
+_OUTCOMES = {
+    "achieved_sigma_3d_m": theme.Style("sigma of the survey", theme.OURS, "circle-open"),
+    "error_3d_m": theme.Style("error against truth", theme.OURS),
+}
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class PlannerPage:
-    """The planner: fields that can be planned on, as ``key`` and ``name``, and stored plans."""
-
-    frame: Frame
-    sites: Sequence[Row]
-    plans: Sequence[Row]
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class PlanPage:
-    """A stored plan, with its stops as rows of ``placements``."""
-
-    frame: Frame
-    plan: Row
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class RandomPlansPage:
-    """Random arrangements: the options, named as in the address, and the results."""
-
-    frame: Frame
-    options: Row
-    results: Row
-
-
-def planner_page(page: PlannerPage) -> str:
-    """Return the planner."""
-    return render("planner.html", page, here="plan")
-
-
-def plan_page(page: PlanPage) -> str:
-    """Return a stored plan: its prediction and its results."""
-    stops = page.plan["stops"]
-    known = [stop for stop in stops if stop["sigma_3d_m"] is not None]
-    panels = (
-        (Panel(name="outcome", figure=outcomes([page.plan]), caption=_CAPTION),) if known else ()
-    )
+def plan_page(frame: Frame, plan: Row) -> str:
+    """Return a stored plan: its prediction and, once surveyed, its results."""
+    stops = plan["stops"]
+    is_known = any(stop["sigma_3d_m"] is not None for stop in stops)
+    panels = (Panel("outcome", outcomes([plan]), _CAPTION),) if is_known else ()
     kept = sum(stop["probability_within_tolerance"] >= _WITHIN_95 for stop in stops)
-    return render(
-        "plan.html", page, here="plan", panels=panels, n_kept=kept, address=address(page.plan)
-    )
+    shown = {"panels": panels, "n_kept": kept, "address": address(plan)}
+    return render("plan.html", frame=frame, plan=plan, **shown)
 
 
-def random_plans_page(page: RandomPlansPage) -> str:
-    """Return the results of random arrangements, as tables and figures."""
-    panels = [
-        Panel(name=name, figure=draw(page.results), caption=caption)
-        for name, draw, caption in _RANDOM_PLANS
-    ]
-    return render("random.html", page, here="plan", panels=panels)
+def random_plans_page(frame: Frame, options: Row, results: Row) -> str:
+    """Return the results of random arrangements, with the options of the address."""
+    panels = [Panel(name, draw(results), caption) for name, draw, caption in _RANDOM_PLANS]
+    return render("random.html", frame=frame, options=options, results=results, panels=panels)
 
 
 _RANDOM_PLANS = (
@@ -100,34 +64,18 @@ _CAPTION = (
 
 def outcomes(plans: Sequence[Row]) -> go.Figure:
     """Draw the results of planned stops against their predictions."""
-    figure = blank_figure("Promised and achieved")
+    figure = blank_figure("Promised and achieved", "Promised 3-D sigma [mm]", "Achieved [mm]")
     stops = [stop for plan in plans for stop in plan["stops"] if stop["sigma_3d_m"] is not None]
-    for key, name, symbol in (
-        ("achieved_sigma_3d_m", "sigma of the survey", "circle-open"),
-        ("error_3d_m", "error against truth", "circle"),
-    ):
+    hover = "{text}<br>promised {x:.2f} mm<br>achieved {y:.2f} mm"
+    for key, style in _OUTCOMES.items():
         rows = [stop for stop in stops if stop[key] is not None]
-        figure.add_scatter(
-            x=[_MM * stop["sigma_3d_m"] for stop in rows],
-            y=[_MM * stop[key] for stop in rows],
-            text=[stop["stop"] for stop in rows],
-            name=name,
-            mode="markers",
-            marker={"symbol": symbol, "color": theme.OURS, "size": 8},
-            hovertemplate="%{text}<br>promised %{x:.2f} mm<br>achieved %{y:.2f} mm<extra></extra>",
-        )
-    most = _MM * max((stop["sigma_3d_m"] for stop in stops), default=1e-3)
-    figure.add_scatter(
-        x=[0, 1.1 * most],
-        y=[0, 1.1 * most],
-        mode="lines",
-        name="as promised",
-        line={"color": theme.FAINT, "width": 1, "dash": "dash"},
-        hoverinfo="skip",
-    )
-    figure.update_xaxes(title_text="Promised 3-D sigma [mm]", rangemode="tozero")
-    figure.update_yaxes(title_text="Achieved [mm]", rangemode="tozero")
-    return figure
+        x, y = ([MM * row[name] for row in rows] for name in ("sigma_3d_m", key))
+        add_points(figure, x, y, style, hover, text=[row["stop"] for row in rows])
+    ends = [0, 1.1 * MM * max((stop["sigma_3d_m"] for stop in stops), default=1e-3)]
+    style = theme.Style("as promised", theme.FAINT)
+    add_line(figure, ends, ends, style, line_width=1, line_dash="dash")
+    figure.update_xaxes(rangemode="tozero")
+    return figure.update_yaxes(rangemode="tozero")
 
 
 def address(plan: Row) -> str:
@@ -136,7 +84,7 @@ def address(plan: Row) -> str:
     query = {
         "site": request["site"],
         "method": request["method"],
-        "tolerance": f"{_MM * request['tolerance_m']:g}",
+        "tolerance": f"{MM * request['tolerance_m']:g}",
         "turn": f"{request['turn_s']:g}",
         "rpm": f"{request['spin_rpm']:g}",
         "step": f"{request.get('step_deg', 0.0):g}",

@@ -1,27 +1,16 @@
-"""Key numbers at the head of a page."""
+"""Key numbers of a survey."""
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 
 import numpy as np
 
 from spheremark.pipelines.accuracy import ErrorSummary, summarise
 from spheremark.web import theme
 from spheremark.web.columns import MM, Columns, by_method, floats, has_errors, on_marks, rms, select
+from spheremark.web.pages.base import Readout
 from spheremark.web.templating import number
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Readout:
-    """A key number with its unit and a note."""
-
-    label: str
-    value: str
-    unit: str
-    note: str
-    method: str = ""
 
 
 def headline(fits: Columns, fixes: Columns, tolerance_m: float) -> tuple[Readout, ...]:
@@ -30,8 +19,9 @@ def headline(fits: Columns, fixes: Columns, tolerance_m: float) -> tuple[Readout
     for method, rows in by_method(fits):
         real = on_marks(rows)
         n_others = int(np.count_nonzero(~real))
+        one = _quality("Centres", method, select(rows, real), tolerance_m)
         readouts.append(
-            _quality("Centres", method, select(rows, real), tolerance_m, n_others=n_others)
+            one._replace(note=f"{one.note}; {n_others} on no mark") if n_others else one
         )
     for method, rows in by_method(fixes):
         readouts.append(_quality("Stations", method, rows, tolerance_m))
@@ -39,21 +29,13 @@ def headline(fits: Columns, fixes: Columns, tolerance_m: float) -> tuple[Readout
     return (*readouts, *(_predicted(rows) for rows in ours if has_errors(rows)))
 
 
-def _quality(
-    what: str, method: str, rows: Columns, tolerance_m: float, *, n_others: int = 0
-) -> Readout:
+def _quality(what: str, method: str, rows: Columns, tolerance_m: float) -> Readout:
     """Return the error of one method against truth; without truth its predicted sigma."""
-    style = theme.method_style(method)
     is_error = has_errors(rows)
     summary = summarise(floats(rows, "error_3d_m" if is_error else "sigma_3d_m"), tolerance_m)
-    return Readout(
-        label=f"{what}, {style.label}",
-        value=number(summary.rms * MM, 1),
-        unit="mm RMS error" if is_error else "mm predicted sigma",
-        note=_share(summary, tolerance_m, is_error=is_error)
-        + (f"; {n_others} on no mark" if n_others else ""),
-        method=method,
-    )
+    label, value = f"{what}, {theme.method_style(method).label}", number(summary.rms * MM, 1)
+    unit = "mm RMS error" if is_error else "mm predicted sigma"
+    return Readout(label, value, unit, _share(summary, tolerance_m, is_error=is_error), method)
 
 
 def _share(summary: ErrorSummary, tolerance_m: float, *, is_error: bool) -> str:
@@ -74,10 +56,7 @@ def _predicted(rows: Columns) -> Readout:
     known = np.isfinite(error)
     sigma_rms = rms(sigma[known])
     ratio = rms(error[known]) / sigma_rms if sigma_rms else math.nan
+    note = f"error over sigma {ratio:.2f}; expected 1"
     return Readout(
-        label="Centres, predicted by us",
-        value=number(sigma_rms * MM, 1),
-        unit="mm sigma",
-        note=f"error over sigma {ratio:.2f}; 1 is honest",
-        method="along_beam",
+        "Centres, predicted by us", number(sigma_rms * MM, 1), "mm sigma", note, "along_beam"
     )

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass
 from typing import Any
 
 from spheremark.pipelines.ground_model import ElevationModel
@@ -12,38 +10,24 @@ from spheremark.web.figures import site as figures
 from spheremark.web.pages.base import Frame, Panel
 from spheremark.web.templating import render
 
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class SitePage:
-    """The products of all stops of a survey, newest first, and the newest ground."""
-
-    frame: Frame
-    survey: str
-    products: tuple[Mapping[str, Any], ...]
-    model: ElevationModel | None
-    marks: Columns
-    stations: Columns
-    jobs: tuple[str, ...]
+_GROUND = (
+    "Mean height of the ground in each cell, without rocks, poles and markers. Blank cells have no "
+    "returns."
+)
+_SIGMA = (
+    "Standard deviation of these heights on a logarithmic scale: noise, grazing beams, poses, "
+    "roughness and interpolation."
+)
 
 
-def site_page(page: SitePage) -> str:
-    """Return the page of a site."""
+def site_page(
+    frame: Frame, model: ElevationModel | None, marks: Columns, stations: Columns, **more: Any
+) -> str:
+    """Return the page of a site; ``more`` are its files, newest first, and its active jobs."""
     panels = []
-    if page.model is not None:
+    if model is not None:
         panels = [
-            Panel(
-                name="ground",
-                figure=figures.ground(page.model, page.marks, page.stations),
-                caption="Mean height of the ground in each cell, without rocks, poles and markers. "
-                "Blank cells have no returns.",
-                kind="tall",
-            ),
-            Panel(
-                name="sigma",
-                figure=figures.sigma(page.model, page.marks, page.stations),
-                caption="Standard deviation of these heights on a logarithmic scale: noise, "
-                "grazing beams, poses, roughness and interpolation.",
-                kind="tall",
-            ),
+            Panel("ground", figures.ground(model, marks, stations), _GROUND, "tall"),
+            Panel("sigma", figures.sigma(model, marks, stations), _SIGMA, "tall"),
         ]
-    return render("site.html", page, here="surveys", panels=panels)
+    return render("site.html", frame=frame, survey=frame.survey, panels=panels, **more)

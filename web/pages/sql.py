@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import plotly.graph_objects as go
@@ -56,33 +56,17 @@ EXAMPLES: tuple[tuple[str, str], ...] = (
 """Example queries by title."""
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class SqlPage:
-    """The page for queries: schema, limits, and the query of the address."""
-
-    frame: Frame
-    query: str
-    tables: tuple[Row, ...]
-    seconds: float
-    rows: int
-    memory_bytes: int
-
-
-def sql_page(page: SqlPage) -> str:
-    """Return the page for queries."""
-    schema = {table["name"]: [row["name"] for row in table["columns"]] for table in page.tables}
-    return render(
-        "sql.html",
-        page,
-        here="sql",
-        schema=schema,
-        examples=EXAMPLES,
-        chart_template=_chart_template(),
-    )
-
-
-def _chart_template() -> dict[str, Any]:
-    """Return the layout of the chart of a result, and the colours of methods."""
+def sql_page(frame: Frame, query: str, tables: Sequence[Row], limits: Mapping[str, Any]) -> str:
+    """Return the page for queries: schema, limits, and the query of the address."""
     layout = go.Figure(layout={"template": theme.template()}).to_plotly_json()["layout"]
     colours = {name: theme.method_style(name).colour for name in ("along_beam", "paper")}
-    return {"layout": layout, "colours": colours}
+    return render(
+        "sql.html",
+        frame=frame,
+        query=query or EXAMPLES[0][1],
+        tables=tables,
+        limits=limits,
+        schema={table["name"]: [row["name"] for row in table["columns"]] for table in tables},
+        examples=EXAMPLES,
+        chart_template={"layout": layout, "colours": colours},
+    )

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from typing import Any
 
 import numpy as np
 
@@ -12,90 +13,60 @@ from spheremark.web.figures import survey as figures
 from spheremark.web.pages.base import Frame, Panel, Row
 from spheremark.web.templating import render
 
+_CLOSE_UP = "Blue returns are too near, orange ones too far. Seen from the LiDAR."
+_RETURNS = (
+    "Returns that the fit used, seen from the LiDAR. A pattern across the sphere indicates a wrong "
+    "radius or beams that hit an edge."
+)
+_SCENE = "Drag to rotate, scroll to zoom. Choose a marker in the table for its details."
+_RESIDUALS = (
+    "In the site frame, observed minus computed. Grey bars are twice the sigma of the centre."
+)
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class StopPage:
-    """One stop by one method; ``marker`` is shown in detail, if any.
 
-    ``namesakes`` are all stops of this name, from several logs of the survey.
+def stop_page(
+    frame: Frame, stop: Row, tables: Mapping[str, Columns], scan: scene.Scan | None, **more: Any
+) -> str:
+    """Return one stop by one method: its scan, its markers, its position.
+
+    ``more`` are the tolerance, the names of all stops and methods, the method and the marker that
+    were chosen, the stations by all methods as ``fixes``, and the stops of this name as
+    ``namesakes`` where several logs have one.
     """
-
-    frame: Frame
-    survey: str
-    tolerance_m: float
-    stop: Row
-    run: Row
-    stops: tuple[str, ...]
-    method: str
-    methods: tuple[str, ...]
-    marker: str
-    fits: Columns
-    rejections: Columns
-    fixes: tuple[Row, ...]
-    observations: Columns
-    scan: scene.Scan | None
-    namesakes: tuple[Row, ...] = ()
-
-
-def stop_page(page: StopPage) -> str:
-    """Return one stop: its scan, its markers, its position."""
-    markers = plain_rows(page.fits)
-    place = page.stops.index(page.stop["stop"])
+    place = more["stops"].index(stop["stop"])
+    names = ("", *more["stops"], "")
     return render(
         "stop.html",
-        page,
-        here="survey",
-        markers=markers,
-        rejected=plain_rows(page.rejections),
-        used=plain_rows(page.observations),
-        panels=_stop_panels(page),
-        fix=next((fix for fix in page.fixes if fix["fit_method"] == page.method), None),
-        before=page.stops[place - 1] if place else "",
-        after=page.stops[place + 1] if place + 1 < len(page.stops) else "",
-        has_truth=has_errors(page.fits),
+        frame=frame,
+        survey=frame.survey,
+        stop=stop,
+        markers=plain_rows(tables["fits"]),
+        rejected=plain_rows(tables["rejections"]),
+        used=plain_rows(tables["observations"]),
+        panels=_panels(tables, scan, more["marker"], more["tolerance_m"]),
+        fix=next((fix for fix in more["fixes"] if fix["fit_method"] == more["method"]), None),
+        before=names[place],
+        after=names[place + 2],
+        has_truth=has_errors(tables["fits"]),
+        **more,
     )
 
 
-def _stop_panels(page: StopPage) -> dict[str, Panel]:
+def _panels(
+    tables: Mapping[str, Columns], scan: scene.Scan | None, marker: str, tolerance_m: float
+) -> dict[str, Panel]:
     """Return the figures of a stop by name."""
-    panels = _residual_panel(page)
-    names = texts(page.fits, "marker")
-    if page.scan is None:
-        return panels
-    if page.marker in names:
-        place = names.index(page.marker)
-        panels["scene"] = Panel(
-            name="scene",
-            figure=scene.marker_close_up(page.scan, page.fits, place),
-            caption="Blue returns are too near, orange ones too far. Seen from the LiDAR.",
-            kind="tall",
-        )
-        panels["returns"] = Panel(
-            name="returns",
-            figure=scene.marker_residuals(page.scan, page.fits, place),
-            caption="Returns that the fit used, seen from the LiDAR. A pattern across the sphere "
-            "indicates a wrong radius or beams that hit an edge.",
-        )
-    else:
-        panels["scene"] = Panel(
-            name="scene",
-            figure=scene.stop_scene(page.scan, page.fits, page.rejections),
-            caption="Drag to rotate, scroll to zoom. Choose a marker in the table for its details.",
-            kind="tall",
-        )
-    return panels
-
-
-def _residual_panel(page: StopPage) -> dict[str, Panel]:
-    """Return the residuals of the station, if it has any."""
-    used = select(page.observations, np.isfinite(floats(page.observations, "residual_x_m")))
-    if not len(used["marker"]):
-        return {}
-    return {
-        "residuals": Panel(
-            name="residuals",
-            figure=figures.station_residuals(used, page.tolerance_m),
-            caption="In the site frame, observed minus computed. Grey bars are twice the sigma of "
-            "the centre.",
-        )
-    }
+    panels = []
+    fits, observations = tables["fits"], tables["observations"]
+    used = select(observations, np.isfinite(floats(observations, "residual_x_m")))
+    if len(used["marker"]):
+        figure = figures.station_residuals(used, tolerance_m)
+        panels.append(Panel("residuals", figure, _RESIDUALS))
+    if scan is not None and marker in (names := texts(fits, "marker")):
+        i = names.index(marker)
+        panels.append(Panel("scene", scene.marker_close_up(scan, fits, i), _CLOSE_UP, "tall"))
+        panels.append(Panel("returns", scene.marker_residuals(scan, fits, i), _RETURNS))
+    elif scan is not None:
+        figure = scene.stop_scene(scan, fits, tables["rejections"])
+        panels.append(Panel("scene", figure, _SCENE, "tall"))
+    return {panel.name: panel for panel in panels}

@@ -142,10 +142,7 @@ def listed(service: Service, sql: str, parameters: Mapping[str, Any]) -> Plain:
 
 def one_of(service: Service, sql: str, key: str, what: str) -> Plain:
     """Return the row with an id."""
-    rows = service.catalogue.rows(sql, {"id": key})
-    if not rows:
-        raise NotFoundError(f"There is no {what} {key!r}.")
-    return _readable(rows[0])
+    return _readable(service.row(sql, key, what))
 
 
 def detailed(service: Service, row: Plain, parts: Mapping[str, str], key: str) -> Plain:

@@ -10,7 +10,10 @@ from fastapi.responses import FileResponse, HTMLResponse
 
 from spheremark.service.errors import Problem
 from spheremark.service.http.state import Current, Service
-from spheremark.web import assets, pages
+from spheremark.web import assets
+from spheremark.web.pages.base import Frame
+from spheremark.web.pages.sql import sql_page
+from spheremark.web.templating import render
 
 router = APIRouter(include_in_schema=False, default_response_class=HTMLResponse)
 
@@ -29,37 +32,20 @@ def plotly_script() -> FileResponse:
 @router.get("/sql")
 def sql(service: Current, q: Annotated[str, Query(max_length=100_000)] = "") -> str:
     """Show the workbench for queries."""
-    limits = service.settings.query_limits
-    return pages.sql_page(
-        pages.SqlPage(
-            frame=frame_of(service),
-            query=q or pages.EXAMPLES[0][1],
-            tables=tuple(asdict(table) for table in service.catalogue.schema()),
-            seconds=limits.seconds,
-            rows=limits.rows,
-            memory_bytes=limits.memory_bytes,
-        )
-    )
+    tables = [asdict(table) for table in service.catalogue.schema()]
+    return sql_page(frame_of(service), q, tables, asdict(service.settings.query_limits))
 
 
 def error_page(_: Request, problem: Problem) -> HTMLResponse:
     """Return a problem as a page, for browsers."""
-    text = pages.error_page(
-        pages.ErrorPage(
-            frame=pages.Frame(),
-            status=problem.status,
-            title=problem.title,
-            detail=problem.detail,
-            code=problem.code,
-        )
-    )
+    text = render("error.html", frame=Frame(), problem=problem)
     return HTMLResponse(text, status_code=problem.status)
 
 
-def frame_of(service: Service, survey: str = "") -> pages.Frame:
+def frame_of(service: Service, survey: str = "") -> Frame:
     """Return what every page shows around itself."""
     names = tuple(row["name"] for row in service.catalogue.rows(_SURVEY_NAMES))
-    return pages.Frame(surveys=names, survey=survey)
+    return Frame(surveys=names, survey=survey)
 
 
 def address_of(request: Request) -> str:

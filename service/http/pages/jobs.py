@@ -3,16 +3,16 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
-from fastapi import APIRouter, Request
+from fastapi import APIRouter
 from fastapi.responses import HTMLResponse
 
 from spheremark.pipelines.errors import NotFoundError
-from spheremark.service.http.pages.frame import address_of, frame_of
+from spheremark.service.http.pages.frame import frame_of
 from spheremark.service.http.state import Current, Service
-from spheremark.web import pages
+from spheremark.web.templating import render
 
 router = APIRouter(include_in_schema=False, default_response_class=HTMLResponse)
 
@@ -49,48 +49,39 @@ FROM recordings WHERE recording_id = $id
 @router.get("/jobs")
 def jobs(service: Current) -> str:
     """Show the newest jobs."""
-    return pages.jobs_page(pages.JobsPage(frame=frame_of(service), jobs=newest_jobs(service)))
+    return render("jobs.html", frame=frame_of(service), jobs=newest_jobs(service))
 
 
 @router.get("/jobs/{job_id}")
 def job(job_id: str, service: Current) -> str:
-    """Show one job."""
+    """Show one job with its stops, and its results on the whole survey."""
     found = newest_jobs(service, job=job_id)
     if not found:
         raise NotFoundError(f"There is no job {job_id!r}.")
-    stops = service.catalogue.rows(_JOB_STOPS, {"id": job_id})
-    frame = frame_of(service, found[0]["survey"])
-    made = service.catalogue.rows(_JOB_MADE, {"id": job_id})
-    return pages.job_page(
-        pages.JobPage(frame=frame, job=found[0], stops=tuple(stops), made=tuple(made))
+    rows, key = service.catalogue.rows, {"id": job_id}
+    return render(
+        "job.html",
+        frame=frame_of(service, found[0]["survey"]),
+        job=found[0],
+        stops=rows(_JOB_STOPS, key),
+        made=rows(_JOB_MADE, key),
+        config=json.dumps(json.loads(found[0]["config"]), indent=2),
+        options=json.loads(found[0]["options"] or "{}"),
     )
 
 
 @router.get("/recordings/{recording_id}")
-def recording(recording_id: str, request: Request, service: Current) -> str:
-    """Show one recording."""
-    found = service.catalogue.rows(_RECORDING, {"id": recording_id})
-    if not found:
-        raise NotFoundError(f"There is no recording {recording_id!r}.")
-    return pages.recording_page(
-        pages.RecordingPage(
-            frame=frame_of(service),
-            recording=found[0],
-            preflight=json.loads(found[0]["preflight"]),
-            jobs=newest_jobs(service, recording=recording_id),
-            address=address_of(request),
-        )
-    )
+def recording(recording_id: str, service: Current) -> str:
+    """Show one recording: its preflight report and its jobs."""
+    found = service.row(_RECORDING, recording_id, "recording")
+    preflight, own = json.loads(found["preflight"]), newest_jobs(service, recording=recording_id)
+    shown = {"recording": found, "preflight": preflight, "jobs": own}
+    return render("recording.html", frame=frame_of(service), **shown)
 
 
 def newest_jobs(
-    service: Service,
-    *,
-    job: str | None = None,
-    recording: str | None = None,
-    survey: str | None = None,
-    is_active: bool = False,
-) -> tuple[Mapping[str, Any], ...]:
-    """Return the newest jobs, of one recording or survey if named."""
-    parameters = {"job": job, "recording": recording, "survey": survey, "is_active": is_active}
-    return tuple(service.catalogue.rows(_JOBS, {**parameters, "n": _N_JOBS}))
+    service: Service, *, is_active: bool = False, **of: str
+) -> Sequence[Mapping[str, Any]]:
+    """Return the newest jobs; of one ``job``, ``recording`` or ``survey`` if named by its id."""
+    named = {"job": None, "recording": None, "survey": None} | of
+    return service.catalogue.rows(_JOBS, named | {"is_active": is_active, "n": _N_JOBS})

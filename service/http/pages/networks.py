@@ -2,21 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import Annotated, Any
+from typing import Annotated
 from urllib.parse import parse_qsl, quote
 
 from fastapi import APIRouter, Depends, Request
 from fastapi.responses import HTMLResponse, RedirectResponse
 
-from spheremark.pipelines.errors import InputError, NotFoundError
+from spheremark.pipelines.errors import InputError
 from spheremark.service.http.api.jobs import start
 from spheremark.service.http.api.models import NewJob
 from spheremark.service.http.pages.frame import frame_of
 from spheremark.service.http.state import Current, Service
 from spheremark.service.jobs.handlers import KINDS
-from spheremark.web.pages import calibration as calibrations
-from spheremark.web.pages import network as adjustments
+from spheremark.web.pages.calibration import calibration_page
+from spheremark.web.pages.network import adjustment_page
 
 router = APIRouter(include_in_schema=False, default_response_class=HTMLResponse)
 
@@ -26,14 +25,15 @@ FROM adjustments AS a JOIN surveys AS s USING (survey_id)
 LEFT JOIN calibrations AS c ON c.calibration_id = a.adjustment_id
 WHERE a.adjustment_id = $id
 """
-_STATIONS = "SELECT * FROM adjusted_stations WHERE adjustment_id = $id ORDER BY station"
-_MARKS = "SELECT * FROM adjusted_marks WHERE adjustment_id = $id ORDER BY mark"
-_OBSERVATIONS = """
-SELECT * FROM adjusted_observations WHERE adjustment_id = $id ORDER BY kind, station, marker, mark
-"""
-_CHECKS = "SELECT * FROM control_checks WHERE adjustment_id = $id ORDER BY mark"
-_REPEATS = "SELECT * FROM repeated_stops WHERE adjustment_id = $id ORDER BY station, again"
-_REFUSED = "SELECT * FROM refused_stations WHERE adjustment_id = $id ORDER BY station"
+_TABLES = {
+    "adjusted_stations": "station",
+    "adjusted_marks": "mark",
+    "adjusted_observations": "kind, station, marker, mark",
+    "control_checks": "mark",
+    "repeated_stops": "station, again",
+    "refused_stations": "station",
+}
+"""Tables of a network, and the order of their rows."""
 _CALIBRATION = """
 SELECT c.*, s.name AS survey, s.rig_digest AS chosen_rig
 FROM calibrations AS c JOIN surveys AS s USING (survey_id) WHERE c.calibration_id = $id
@@ -47,38 +47,25 @@ _FORM = "application/x-www-form-urlencoded"
 @router.get("/adjustments/{adjustment_id}")
 def adjustment(adjustment_id: str, service: Current) -> str:
     """Show an adjusted network."""
-    found = _found(service, _ADJUSTMENT, adjustment_id, "adjustment")
-    catalogue, key = service.catalogue, {"id": adjustment_id}
-    return adjustments.adjustment_page(
-        adjustments.AdjustmentPage(
-            frame=frame_of(service, found["survey"]),
-            adjustment=found,
-            stations=catalogue.columns(_STATIONS, key),
-            marks=catalogue.columns(_MARKS, key),
-            observations=catalogue.columns(_OBSERVATIONS, key),
-            checks=catalogue.columns(_CHECKS, key),
-            repeats=tuple(catalogue.rows(_REPEATS, key)),
-            refused=tuple(catalogue.rows(_REFUSED, key)),
-            files=_files(service, adjustment_id),
-        )
-    )
+    found = service.row(_ADJUSTMENT, adjustment_id, "adjustment")
+    sql = "SELECT * FROM {} WHERE adjustment_id = $id ORDER BY {}"
+    tables = {
+        table: service.catalogue.columns(sql.format(table, order), {"id": adjustment_id})
+        for table, order in _TABLES.items()
+    }
+    frame, files = frame_of(service, found["survey"]), _files(service, adjustment_id)
+    return adjustment_page(frame, found, tables, files)
 
 
 @router.get("/calibrations/{calibration_id}")
 def calibration(calibration_id: str, service: Current) -> str:
     """Show a calibration."""
-    found = _found(service, _CALIBRATION, calibration_id, "calibration")
-    catalogue, key = service.catalogue, {"id": calibration_id}
-    return calibrations.calibration_page(
-        calibrations.CalibrationPage(
-            frame=frame_of(service, found["survey"]),
-            calibration=found,
-            parameters=catalogue.columns(_PARAMETERS, key),
-            gaps=catalogue.columns(_GAPS, key),
-            files=_files(service, calibration_id),
-            is_chosen=found["chosen_rig"] == found["rig_digest"],
-        )
-    )
+    found = service.row(_CALIBRATION, calibration_id, "calibration")
+    columns, key = service.catalogue.columns, {"id": calibration_id}
+    more = {"is_chosen": found["chosen_rig"] == found["rig_digest"]}
+    more["files"] = _files(service, calibration_id)
+    frame = frame_of(service, found["survey"])
+    return calibration_page(frame, found, columns(_PARAMETERS, key), columns(_GAPS, key), **more)
 
 
 async def form(request: Request) -> dict[str, str]:
@@ -112,14 +99,6 @@ def choose_rig(name: str, fields: Fields, service: Current) -> RedirectResponse:
     is_ours = back.startswith("/calibrations/")
     target = back if is_ours else f"/surveys/{quote(survey.name, safe='')}"
     return RedirectResponse(target, status_code=303)
-
-
-def _found(service: Service, sql: str, key: str, what: str) -> Mapping[str, Any]:
-    """Return a result with the name of its survey."""
-    found = service.catalogue.rows(sql, {"id": key})
-    if not found:
-        raise NotFoundError(f"There is no {what} {key!r}.")
-    return found[0]
 
 
 def _files(service: Service, key: str) -> tuple[str, ...]:

@@ -15,6 +15,7 @@ from spheremark.service.http.pages.frame import frame_of
 from spheremark.service.http.state import Current
 from spheremark.storage.catalogue import plans as stored
 from spheremark.web.pages import planner
+from spheremark.web.templating import render
 
 router = APIRouter(include_in_schema=False, default_response_class=HTMLResponse)
 
@@ -22,13 +23,8 @@ router = APIRouter(include_in_schema=False, default_response_class=HTMLResponse)
 @router.get("/plan")
 def plan(service: Current) -> str:
     """Show the planner; its script reads the address."""
-    return planner.planner_page(
-        planner.PlannerPage(
-            frame=frame_of(service),
-            sites=sites(service),
-            plans=stored.list_plans(service.catalogue),
-        )
-    )
+    plans = stored.list_plans(service.catalogue)
+    return render("planner.html", frame=frame_of(service), sites=sites(service), plans=plans)
 
 
 @router.get("/plan/random")
@@ -45,13 +41,8 @@ def random_marks(request: Request, service: Current) -> str:
     except ValidationError as error:
         first = error.errors()[0]
         raise InputError(f"{'.'.join(map(str, first['loc']))}: {first['msg']}.") from error
-    return planner.random_plans_page(
-        planner.RandomPlansPage(
-            frame=frame_of(service),
-            options=options.model_dump(),
-            results=simulated(service, options),
-        )
-    )
+    results = simulated(service, options)
+    return planner.random_plans_page(frame_of(service), options.model_dump(), results)
 
 
 def _number(text: str) -> float:
@@ -66,6 +57,4 @@ def _number(text: str) -> float:
 def stored_plan(placement_id: str, service: Current) -> str:
     """Show a stored plan and, once surveyed, its results."""
     found = stored.get_plan(service.catalogue, placement_id)
-    return planner.plan_page(
-        planner.PlanPage(frame=frame_of(service, found["survey"] or ""), plan=found)
-    )
+    return planner.plan_page(frame_of(service, found["survey"] or ""), found)

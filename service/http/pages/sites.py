@@ -15,8 +15,8 @@ from spheremark.service.http.pages.networks import Fields
 from spheremark.service.http.state import Current, Service
 from spheremark.service.jobs.handlers import JobKind
 from spheremark.storage.exports.reports import kept_coverage
-from spheremark.web.pages import ellipse_coverage as web_coverage
-from spheremark.web.pages import site
+from spheremark.web.pages.ellipse_coverage import coverage_page
+from spheremark.web.pages.site import site_page
 
 router = APIRouter(include_in_schema=False, default_response_class=HTMLResponse)
 
@@ -39,32 +39,27 @@ WHERE survey_id = $id AND kind = 'site' AND status IN ('accepted', 'running') OR
 
 
 @router.get("/coverage")
-def coverage_page(service: Current) -> str:
+def coverage(service: Current) -> str:
     """Show the coverage of error ellipses."""
-    report = kept_coverage(service.settings.data)
-    return web_coverage.coverage_page(
-        web_coverage.CoveragePage(frame=frame_of(service), report=report)
-    )
+    return coverage_page(frame_of(service), kept_coverage(service.settings.data))
 
 
 @router.get("/surveys/{name:path}/site")
-def site_page(name: str, service: Current) -> str:
+def site(name: str, service: Current) -> str:
     """Show what was made of all stops of a survey."""
     survey = service.catalogue.get_survey(name)
     products = products_of(service, name)
     newest = next((one for one in products if one.kind == "geotiff"), None)
-    key = {"id": survey.survey_id}
+    key, rows = {"id": survey.survey_id}, service.catalogue.rows
     adjustment = {"adjustment": newest.adjustment_id if newest else None}
-    return site.site_page(
-        site.SitePage(
-            frame=frame_of(service, survey.name),
-            survey=survey.name,
-            products=tuple(one.model_dump() for one in products),
-            model=_model(service, newest),
-            marks=service.catalogue.columns(_MARKS, key),
-            stations=service.catalogue.columns(_STATIONS, key | adjustment),
-            jobs=tuple(row["job_id"] for row in service.catalogue.rows(_JOBS, key)),
-        )
+    columns = service.catalogue.columns
+    return site_page(
+        frame_of(service, survey.name),
+        _model(service, newest),
+        columns(_MARKS, key),
+        columns(_STATIONS, key | adjustment),
+        products=[one.model_dump() for one in products],
+        jobs=[row["job_id"] for row in rows(_JOBS, key)],
     )
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import replace
 from typing import Annotated, Any
 
 from fastapi import APIRouter, Query, Request
@@ -14,10 +13,11 @@ from spheremark.service.http.pages.frame import address_of, frame_of
 from spheremark.service.http.pages.jobs import newest_jobs
 from spheremark.service.http.state import Current, Service
 from spheremark.storage.clouds import stop as clouds
-from spheremark.web import pages
 from spheremark.web.columns import Columns, texts
 from spheremark.web.figures import scene
 from spheremark.web.pages.filters import Filters
+from spheremark.web.pages.stop import stop_page
+from spheremark.web.pages.survey import SurveyData, overview_page, survey_page
 
 router = APIRouter(include_in_schema=False, default_response_class=HTMLResponse)
 
@@ -45,7 +45,7 @@ FROM recordings ORDER BY uploaded_at DESC, recording_id LIMIT $n
 """
 _N_ACTIVE = "SELECT count(*) AS n FROM jobs WHERE status IN ('accepted', 'running')"
 _SURVEY = """
-SELECT survey_id, name, tolerance_m, rig_digest FROM surveys WHERE name = $key OR survey_id = $key
+SELECT survey_id, name, tolerance_m, rig_digest FROM surveys WHERE name = $id OR survey_id = $id
 """
 _MARKS = "SELECT mark, x_m, y_m, z_m FROM control_marks WHERE survey_id = $id ORDER BY mark"
 _TRUE_STOPS = "SELECT stop, x_m, y_m, z_m FROM true_stops WHERE survey_id = $id ORDER BY stop"
@@ -128,6 +128,11 @@ SELECT calibration_id, rig_digest, len(stops) AS n_stops, gap_rms_before_m, gap_
     finished_at
 FROM calibrations WHERE survey_id = $id ORDER BY finished_at DESC LIMIT $n
 """
+_STOP_TABLES = {
+    "fits": _STOP_FITS,
+    "rejections": _STOP_REJECTIONS,
+    "observations": _STOP_OBSERVATIONS,
+}
 _N_RESULTS = 20  # networks and calibrations in the page of their survey
 
 
@@ -136,15 +141,13 @@ def overview(request: Request, service: Current) -> str:
     """Show what there is and how to bring more."""
     rows = service.catalogue.rows
     newest = rows(_NEWEST_SURVEY)
-    return pages.overview_page(
-        pages.OverviewPage(
-            frame=frame_of(service),
-            address=address_of(request),
-            newest=_survey_data(service, newest[0]["name"], Filters()) if newest else None,
-            surveys=tuple(rows(_SURVEYS)),
-            recordings=tuple(rows(_RECORDINGS, {"n": _N_RECORDINGS})),
-            n_active_jobs=rows(_N_ACTIVE)[0]["n"],
-        )
+    return overview_page(
+        frame_of(service),
+        _survey_data(service, _survey(service, newest[0]["name"]), Filters()) if newest else None,
+        address=address_of(request),
+        surveys=rows(_SURVEYS),
+        recordings=rows(_RECORDINGS, {"n": _N_RECORDINGS}),
+        n_active_jobs=rows(_N_ACTIVE)[0]["n"],
     )
 
 
@@ -158,51 +161,63 @@ def stop(
     recording: Annotated[str, Query()] = "",
 ) -> str:
     """Show one stop; where several logs have one of this name, that of the newest results."""
-    survey = _survey(service, name)
-    found = service.catalogue.rows(_STOP, {"id": survey["survey_id"], "stop": stop})
+    survey, rows = _survey(service, name), service.catalogue.rows
+    found = rows(_STOP, {"id": survey["survey_id"], "stop": stop})
     if not found:
         raise NotFoundError(f"The survey {survey['name']} has no results of a stop {stop!r}.")
-    chosen = next((row for row in found if row["recording_id"] == recording), found[0])
-    page = _stop_page(service, survey, chosen, method, marker)
-    return pages.stop_page(replace(page, namesakes=tuple(found) if len(found) > 1 else ()))
+    shown = next((row for row in found if row["recording_id"] == recording), found[0])
+    key = {"run": shown["run_id"], "stop": shown["stop"]}
+    methods = [one["fit_method"] for one in rows(_STOP_METHODS, key)]
+    chosen = method if method in methods else next(iter(methods), "")
+    columns, by_method = service.catalogue.columns, key | {"method": chosen}
+    return stop_page(
+        frame_of(service, survey["name"]),
+        shown,
+        {name: columns(sql, by_method) for name, sql in _STOP_TABLES.items()},
+        _scan(shown["cloud_url"]),
+        tolerance_m=survey["tolerance_m"],
+        stops=[one["stop"] for one in rows(_STOP_NAMES, {"id": survey["survey_id"]})],
+        method=chosen,
+        methods=methods,
+        marker=marker,
+        fixes=rows(_STOP_FIXES, key),
+        namesakes=found if len(found) > 1 else (),
+    )
 
 
 @router.get("/surveys/{name:path}")
 def survey(name: str, request: Request, service: Current) -> str:
     """Show the dashboard of a survey."""
-    found = _survey(service, name)
+    found, rows = _survey(service, name), service.catalogue.rows
     query = {key: request.query_params.getlist(key) for key in request.query_params}
     filters = Filters.from_query(query)
-    return pages.survey_page(
-        pages.SurveyPage(
-            frame=frame_of(service, found["name"]),
-            data=_survey_data(service, name, filters),
-            results=_survey_results(service, found),
-            filters=filters,
-            jobs=newest_jobs(service, survey=found["survey_id"], is_active=True),
-            address=address_of(request),
-            n_logs=len(service.catalogue.recordings_of_survey(found["survey_id"])),
-        )
+    key = {"id": found["survey_id"], "n": _N_RESULTS}
+    return survey_page(
+        frame_of(service, found["name"]),
+        _survey_data(service, found, filters),
+        filters,
+        adjustments=rows(_ADJUSTMENTS, key),
+        calibrations=rows(_CALIBRATIONS, key),
+        rig_digest=found["rig_digest"],
+        jobs=newest_jobs(service, survey=found["survey_id"], is_active=True),
+        address=address_of(request),
+        n_logs=len(service.catalogue.recordings_of_survey(found["survey_id"])),
     )
 
 
 def _survey(service: Service, key: str) -> Mapping[str, Any]:
     """Return the survey of that name or id."""
-    found = service.catalogue.rows(_SURVEY, {"key": key})
-    if not found:
-        raise NotFoundError(f"There is no survey {key!r}; the overview lists those there are.")
-    return found[0]
+    return service.row(_SURVEY, key, "survey")
 
 
-def _survey_data(service: Service, key: str, filters: Filters) -> pages.SurveyData:
+def _survey_data(service: Service, survey: Mapping[str, Any], filters: Filters) -> SurveyData:
     """Return the newest results of a survey, with stations from the chosen number of marks."""
-    survey = _survey(service, key)
     few = {"n_marks": filters.n_marks, "resection": filters.resection}
 
     def columns(sql: str, **more: object) -> Columns:
         return service.catalogue.columns(sql, {"id": survey["survey_id"], **more})
 
-    return pages.SurveyData(
+    return SurveyData(
         name=survey["name"],
         tolerance_m=survey["tolerance_m"],
         marks=columns(_MARKS),
@@ -211,44 +226,6 @@ def _survey_data(service: Service, key: str, filters: Filters) -> pages.SurveyDa
         fixes=columns(_FIXES),
         subsets=columns(_SUBSETS, **few),
         subset_methods=tuple(texts(columns(_SUBSET_METHODS), "resection_method")),
-    )
-
-
-def _survey_results(service: Service, survey: Mapping[str, Any]) -> pages.SurveyResults:
-    """Return what was made of a survey as a whole."""
-    rows, key = service.catalogue.rows, {"id": survey["survey_id"]}
-    return pages.SurveyResults(
-        adjustments=tuple(rows(_ADJUSTMENTS, {**key, "n": _N_RESULTS})),
-        calibrations=tuple(rows(_CALIBRATIONS, {**key, "n": _N_RESULTS})),
-        rig_digest=survey["rig_digest"],
-    )
-
-
-def _stop_page(
-    service: Service, survey: Mapping[str, Any], row: Mapping[str, Any], method: str, marker: str
-) -> pages.StopPage:
-    """Gather what is known of a stop by one method."""
-    catalogue = service.catalogue
-    key = {"run": row["run_id"], "stop": row["stop"]}
-    methods = tuple(one["fit_method"] for one in catalogue.rows(_STOP_METHODS, key))
-    chosen = method if method in methods else next(iter(methods), "")
-    by_method = {**key, "method": chosen}
-    names = catalogue.rows(_STOP_NAMES, {"id": survey["survey_id"]})
-    return pages.StopPage(
-        frame=frame_of(service, survey["name"]),
-        survey=survey["name"],
-        tolerance_m=survey["tolerance_m"],
-        stop=row,
-        run=row,
-        stops=tuple(one["stop"] for one in names),
-        method=chosen,
-        methods=methods,
-        marker=marker,
-        fits=catalogue.columns(_STOP_FITS, by_method),
-        rejections=catalogue.columns(_STOP_REJECTIONS, by_method),
-        fixes=tuple(catalogue.rows(_STOP_FIXES, key)),
-        observations=catalogue.columns(_STOP_OBSERVATIONS, by_method),
-        scan=_scan(row["cloud_url"]),
     )
 
 
