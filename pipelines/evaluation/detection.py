@@ -106,7 +106,7 @@ def _tables(report: Plain) -> list[Table]:
         Column("n", "in scans", "", ",d"),
         Column("n_found", "taken for a marker", "", ",d"),
         Column(lambda row: f"{row['n_found'] / row['n']:.3f}", "share", "", ">"),
-        Column(_main_reasons, "why not"),
+        Column(main_reasons, "why not"),
     )
     tables = []
     for name, one in report["scenarios"].items():
@@ -120,7 +120,7 @@ def _tables(report: Plain) -> list[Table]:
     return tables
 
 
-def _main_reasons(row: Plain) -> str:
+def main_reasons(row: Plain) -> str:
     """Return the most frequent reasons of a row with their counts."""
     return "; ".join(f"{why} ({n})" for why, n in list(row["reasons"].items())[:_N_REASONS])
 
@@ -149,7 +149,7 @@ def _score(world: tuple[str, int, str], *, config: SimulationConfig) -> _Score:
         _Thing(decoy.kind, False, i in charged, decoys[i]) for i, decoy in enumerate(field.decoys)
     ]
     things = [
-        one._replace(reason="" if one.is_found else _reason_near(found, one.p_base))
+        one._replace(reason="" if one.is_found else reason_near(found, one.p_base))
         for one in markers + others
     ]
     return _Score(field.scenario, things, int(is_false.sum()))
@@ -180,7 +180,7 @@ def _class_of(n_on: int, share: float) -> str:
     return CLASSES[0] if n_on >= N_MANY else CLASSES[1]
 
 
-def _reason_near(found: MarkerCandidates, place: Array) -> str:
+def reason_near(found: MarkerCandidates, place: Array) -> str:
     """Return the beginning of the reason for a rejection near a place, without figures."""
     gaps = [float(np.linalg.norm(r.p_base - place)) for r in found.rejected]
     if not gaps or min(gaps) > _NEAR_DECOY:

@@ -19,7 +19,16 @@ from spheremark.pipelines.config import SurveyConfig
 from spheremark.pipelines.errors import ConfigError, SolveError, TooFewObservationsError
 from spheremark.pipelines.evaluation.experiment import Column, Experiment, Plain, Table
 from spheremark.pipelines.geometry import inverse, levelling_rotation, log_motion, rigid
-from spheremark.pipelines.model import Array, ControlMarks, Index, MarkerFits, Mask, StopTruth, seal
+from spheremark.pipelines.model import (
+    Array,
+    ControlMarks,
+    Index,
+    Levelling,
+    MarkerFits,
+    Mask,
+    StopTruth,
+    seal,
+)
 from spheremark.pipelines.network import adjust_network, assemble
 from spheremark.pipelines.positioning.resection import resect
 from spheremark.pipelines.simulation import SimulationConfig, scenario, simulate_stop
@@ -231,17 +240,29 @@ def _compared(
         for i, pose in enumerate(poses):
             if pose is None:
                 continue
-            T, cov = pose
-            R = levelling_rotation(scans[i][1].levelling)
-            truth = truths[i].T_site_base @ inverse(rigid(R, np.zeros(3)))
-            error, cov_p = T[:3, 3] - truth[:3, 3], _cov_of_position(T, cov)
-            errors[method][i], sigmas[method][i] = error, np.sqrt(np.trace(cov_p))
-            squares[method, "horizontal"][i] = _square(error[:2], cov_p[:2, :2])
-            squares[method, "position"][i] = _square(error, cov_p)
-            squares[method, "pose"][i] = _square(log_motion(truth @ inverse(T)), cov)
+            errors[method][i], sigmas[method][i], own = pose_errors(
+                pose, truths[i], scans[i][1].levelling
+            )
+            for quantity, square in own.items():
+                squares[method, quantity][i] = square
     return Draws(
         surveys=np.full(n, seed, dtype=np.intp), squares=squares, errors=errors, sigmas=sigmas
     )
+
+
+def pose_errors(
+    pose: tuple[Array, Array], stop: StopTruth, levelling: Levelling
+) -> tuple[Array, float, dict[str, float]]:
+    """Return error and 3-D sigma of a station's position [m], and squares by quantity."""
+    T, cov = pose
+    truth = stop.T_site_base @ inverse(rigid(levelling_rotation(levelling), np.zeros(3)))
+    error, cov_p = T[:3, 3] - truth[:3, 3], _cov_of_position(T, cov)
+    squares = {
+        "horizontal": _square(error[:2], cov_p[:2, :2]),
+        "position": _square(error, cov_p),
+        "pose": _square(log_motion(truth @ inverse(T)), cov),
+    }
+    return error, float(np.sqrt(np.trace(cov_p))), squares
 
 
 def _cov_of_position(T: Array, cov: Array) -> Array:

@@ -56,6 +56,21 @@ class Table:
     rows: Sequence[Plain] = ()
     notes: Sequence[str] = ()
 
+    def to_texts(self) -> Plain:
+        """Return the table as shown: headings with whether they are of numbers, rows of cells.
+
+        Returns
+        -------
+        dict
+            Plain values.
+        """
+        return {
+            "title": self.title,
+            "headings": [[column.heading, bool(column.form)] for column in self.columns],
+            "rows": [[column.cell(row) for column in self.columns] for row in self.rows],
+            "notes": list(self.notes),
+        }
+
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class Experiment(Generic[World, Found, Report]):

@@ -16,6 +16,7 @@ import numpy as np
 from spheremark.pipelines.calibration import Calibration, calibrate
 from spheremark.pipelines.calibration.gimbal import GIMBAL, moved
 from spheremark.pipelines.config import FittingConfig, SurveyConfig
+from spheremark.pipelines.errors import SpheremarkError
 from spheremark.pipelines.evaluation.experiment import Column, Experiment, Plain, Table
 from spheremark.pipelines.model import MarkerFits, Rig, Truth
 from spheremark.pipelines.network import AdjustedNetwork, Network, adjust_network, assemble, compare
@@ -23,6 +24,7 @@ from spheremark.pipelines.simulation import (
     Field,
     SimulatedStop,
     SimulationConfig,
+    draw_world,
     scenario,
     simulate_stop,
 )
@@ -84,6 +86,106 @@ def networks(
         },
         tables=_tables,
     )
+
+
+def random_networks(n_surveys: int, *, seed: int, n_stops: int) -> Experiment[int, Plain, Plain]:
+    """Return the experiment that adjusts surveys of random worlds, each without control.
+
+    Parameters
+    ----------
+    n_surveys : int
+        Number of worlds.
+    seed : int
+        Seed of the first world; every other one follows.
+    n_stops : int
+        Stops of each.
+
+    Returns
+    -------
+    Experiment
+        Its report has the errors of each survey, and their means by family of world.
+    """
+    return Experiment(
+        worlds=range(seed, seed + 2 * n_surveys, 2),
+        run_world=partial(_random_survey, n_stops=n_stops),
+        pool=lambda rows: {
+            "n_surveys": n_surveys,
+            "n_stops": n_stops,
+            "seed": seed,
+            "families": _by_family(rows),
+            "surveys": rows,
+        },
+        tables=_random_tables,
+    )
+
+
+def _random_survey(seed: int, *, n_stops: int) -> Plain:
+    """Simulate a survey of a random world, adjust it, and compare it with its truth."""
+    world = draw_world(seed)
+    field = world.field
+    config = replace(_CONFIG, marker_radius=field.marker_radius)
+    stops, scans = [], []
+    for place in field.stops[:n_stops]:
+        stop = simulate_stop(field, place.name, world.config)
+        stops.append(stop)
+        try:
+            (result,) = process(stop.log, config=config)
+        except SpheremarkError:
+            continue
+        scans.append((place.name, result.fits[_METHOD]))
+    row: Plain = {"seed": seed, "family": field.family, "failure": ""}
+    try:
+        network = assemble(scans, None, config.resection)
+        return row | _row(field, stops, adjust_network(network, config.resection))
+    except SpheremarkError as error:
+        return row | {"failure": str(error)}
+
+
+def _by_family(rows: Sequence[Plain]) -> list[Plain]:
+    """Return means over the surveys of each family, and over all."""
+    found = []
+    for family in (*dict.fromkeys(row["family"] for row in rows), ""):
+        own = [row for row in rows if family in ("", row["family"])]
+        adjusted = [row for row in own if not row["failure"]]
+        found.append(
+            {
+                "family": family or "all",
+                "n": len(own),
+                "n_adjusted": len(adjusted),
+                "n_marks": sum(row["n_marks"] for row in adjusted),
+                "n_false_marks": sum(row["n_false_marks"] for row in adjusted),
+                **{
+                    name: float(np.nanmean([row[name] for row in adjusted])) if adjusted else None
+                    for name in _MEASURES
+                },
+            }
+        )
+    return found
+
+
+def _random_tables(report: Plain) -> list[Table]:
+    """Return the means by family."""
+    title = (
+        f"{report['n_surveys']} surveys of {report['n_stops']} stops in random worlds, every other "
+        f"seed from {report['seed']}; free networks, datum taken out."
+    )
+    columns = (
+        Column("family", "family"),
+        Column("n", "surveys", "", "d"),
+        Column("n_adjusted", "adjusted", "", "d"),
+        Column("n_marks", "marks", "", "d"),
+        Column("n_false_marks", "false", "", "d"),
+        Column("rms_marks_m", "marks, RMS", "mm", ".2f"),
+        Column("nees_marks", "marks, NEES per degree", "", ".2f"),
+        Column("rms_stations_m", "stations, RMS", "mm", ".2f"),
+        Column("nees_stations", "stations, NEES per degree", "", ".2f"),
+    )
+    notes = [
+        f"Seed {row['seed']} ({row['family']}): {row['failure']}"
+        for row in report["surveys"]
+        if row["failure"]
+    ]
+    return [Table(title=title, columns=columns, rows=report["families"], notes=notes)]
 
 
 def _tables(report: Plain) -> list[Table]:

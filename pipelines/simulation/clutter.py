@@ -152,7 +152,7 @@ def with_items(world: Field, scenario: str, items: Sequence[Item]) -> Field:
     )
     mesh = Mesh.merged([scene.mesh, *(mesh for item in items for mesh in item.meshes)])
     decoys = tuple(
-        Decoy(name=f"X{i + 1:03d}", kind=item.kind, p_site=np.array(item.p_site))
+        Decoy(name=f"X{i + 1:03d}", kind=item.kind, p_site=np.array(item.p_site), reach=item.reach)
         for i, item in enumerate(items)
     )
     return replace(

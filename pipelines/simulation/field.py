@@ -77,11 +77,14 @@ class Decoy:
         Kind of object: ``person``, ``pole``, ``wrong ball`` and so on.
     p_site : (3,)
         The place where it might be mistaken: the middle of a ball, a head, a crown [m].
+    reach : float
+        Distance from there to its farthest corner [m].
     """
 
     name: str
     kind: str
     p_site: Array
+    reach: float = 0.0
 
     def __post_init__(self) -> None:
         seal(self, p_site=(3,))

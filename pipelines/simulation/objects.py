@@ -57,6 +57,13 @@ class Item:
     balls: Sequence[tuple[Array, float, float]] = ()
     sticks: Sequence[Stick] = ()
 
+    @property
+    def reach(self) -> float:
+        """Distance from its place to its farthest corner [m]."""
+        corners = [np.linalg.norm(mesh.p_site - self.p_site, axis=1) for mesh in self.meshes]
+        balls = [[np.linalg.norm(p - self.p_site) + radius] for p, radius, _ in self.balls]
+        return float(np.concatenate([*corners, *balls]).max())
+
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class Site:

@@ -230,7 +230,12 @@ def survey_truth(
             "marker_radius_m": field.marker_radius,
             "simulation": config.to_mapping(),
             "decoys": [
-                {"name": decoy.name, "kind": decoy.kind, "p_site_m": decoy.p_site.tolist()}
+                {
+                    "name": decoy.name,
+                    "kind": decoy.kind,
+                    "p_site_m": decoy.p_site.tolist(),
+                    "reach_m": decoy.reach,
+                }
                 for decoy in field.decoys
             ],
             "visible_shares": {stop.truth.name: _shares(field, stop) for stop in stops},

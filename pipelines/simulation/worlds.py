@@ -101,6 +101,7 @@ _IN_CONFIG = sorted(
 _WINDOW = np.array([12.7e-3, 9.5e-3])  # [m]
 _LATTICES = ((12.0, 600.0), (9.0, 600.0), (18.0, 600.0), (6.0, 1200.0), (12.0, 300.0), (7.2, 600.0))
 _RPM, _RPM_OFF = (300.0, 600.0, 600.0, 600.0, 900.0, 1200.0), 0.003
+_STEPS = (1.3, 1.7, 2.3, 3.1, 5.0)  # [deg] of a gimbal that rests
 _SLOWER = 1.7  # the turn of a scan of one face
 _CLOCK = (0.005, 0.1)  # [s] by which stamps are off in the family of that name
 _DUST = (1e-4, 5e-3)  # [1/m]
@@ -241,7 +242,6 @@ def _config(rng: np.random.Generator, values: _Values, family: str) -> Simulatio
         range_step=step,
         axis_offset=(float(rng.uniform(-0.1, 0.1)), float(rng.uniform(-0.1, 0.1))),
         optics=_optics(rng, values, family),
-        shot_times=family != "bare",
         has_rings=family != "bare",
     )
     return replace(config, **_motion(rng, values, family))
@@ -279,9 +279,11 @@ def _motion(rng: np.random.Generator, values: _Values, family: str) -> dict[str,
     if family == "lattice":
         turn, rpm = _LATTICES[rng.integers(len(_LATTICES))]
         return {"turn": turn, "spin_rpm": rpm, "ripples": ripples if rng.random() < 0.3 else ()}
-    if family == "step-and-shoot":
-        step = np.radians(rng.choice([1.3, 1.7, 2.3, 3.1, 5.0]))
-        return {"step": float(step), "rest_revolutions": int(rng.integers(1, 3)), "move": 0.05}
+    is_bare = family == "bare" and rng.random() < 0.5
+    if family == "step-and-shoot" or is_bare:  # without times, a message must lie within a rest
+        step = float(np.radians(rng.choice(_STEPS)))
+        rests = int(rng.integers(1, 3)) + 2 * is_bare
+        return {"step": step, "rest_revolutions": rests, "move": 0.05, "shot_times": not is_bare}
     sweep = float(np.radians(rng.uniform(180.0, 200.0))) if family == "one face" else 2 * np.pi
     rpm, turn = _speeds(rng, family)
     if family == "one face":

@@ -47,7 +47,7 @@ def hits(
     )
 
 
-def cramer_rao(returns: Beams, p_true: Array, radius: float, sigma: float) -> Array:
+def cramer_rao(returns: Beams, p_true: Array, radius: float, sigma: float | Array) -> Array:
     """Return the Cramer-Rao bound of a centre: the least covariance of unbiased estimates.
 
     Parameters
@@ -58,8 +58,8 @@ def cramer_rao(returns: Beams, p_true: Array, radius: float, sigma: float) -> Ar
         True centre in the base frame [m].
     radius : float
         Radius of the sphere, which is known [m].
-    sigma : float
-        Standard deviation of every range; directions are exact [m].
+    sigma : float or (n,)
+        Standard deviation of the ranges; directions are exact [m].
 
     Returns
     -------
@@ -74,8 +74,9 @@ def cramer_rao(returns: Beams, p_true: Array, radius: float, sigma: float) -> Ar
     """
     n = len(returns.ranges)
     expected = predict(returns, p_true[None], np.array([radius]), np.zeros(n, dtype=np.intp))
-    J = expected.J[expected.lit > 0.0, :3]
-    information = J.T @ J / sigma**2
+    is_lit = expected.lit > 0.0
+    J = expected.J[is_lit, :3] / np.broadcast_to(sigma, n)[is_lit, None]
+    information = J.T @ J
     if len(J) < _N_MIN or np.linalg.cond(information) > _CONDITION_MAX:
         raise DegenerateGeometryError(
             f"{len(J)} of {n} beams meet the sphere and leave its centre undetermined; at least "

@@ -30,6 +30,8 @@ _CLUSTER_GAP = 0.10  # [m] between neighbours in a cluster
 _CLUSTER_MIN = 10  # neighbours of a point inside a cluster
 _N_POINTS = 20  # of a cluster that may be a marker
 _RMS_MAX = 0.03  # [m] about the sphere
+_USUAL_RADIUS, _VOXEL = 0.1, 0.02  # [m] cubes that thin a cloud about markers of that radius
+_RADIUS_OFF, _INLIERS = 0.2, 0.8  # by which a radius may be off, and the share of inliers wanted
 _N_MODEL = 1000  # points of the hemisphere
 _PCL = {  # the tools of PCL for each step, with parameters that suit the field
     "plane": f"pcl_sac_segmentation_plane -thresh {_PLANE_NEAR} -max_it {_PLANE_TRIALS}".split(),
@@ -38,6 +40,9 @@ _PCL = {  # the tools of PCL for each step, with parameters that suit the field
 _PCL_DONE = re.compile(r"\[done, ([\d.]+) ms(?:, plane has)? : (\d+) (?:points\]\s*Model|clusters)")
 _TYPES = ("PointCloud2", "VelodyneScan", "JointState")
 _KINDS = ("", "i1", "u1", "i2", "u2", "i4", "u4", "f4", "f8")  # by PointField.datatype
+
+PEERS = ("Open3D", "pyransac3d")
+"""Libraries that find spheres, by the name of their column."""
 
 _Made = TypeVar("_Made")
 
@@ -77,6 +82,45 @@ def ransac_centre(points: Array) -> Array | None:
     np.random.seed(0)  # noqa: NPY002  the library draws from NumPy's global state
     centre, _, _ = pyransac3d.Sphere().fit(points, thresh=0.02, maxIteration=500)
     return np.asarray(centre, dtype=np.float64) if len(centre) == 3 else None
+
+
+def spheres_of_peers(p_base: Array, radius: float) -> dict[str, Array]:
+    """Return the centres that Open3D and pyransac3d find in a cloud, by name of the method.
+
+    Both take the compact clusters off the ground of the thinned cloud: a hemisphere registered to
+    each, and a sphere of free radius through it by RANSAC, which must come near the given one.
+    """
+    scale = radius / _USUAL_RADIUS
+    clusters = [
+        points
+        for points in _clusters(_thinned(p_base, _VOXEL * scale), scale)
+        if len(points) >= _CLUSTER_MIN and np.ptp(points[:, :2], axis=0).max() <= 4.0 * radius
+    ]
+    return {PEERS[0]: _fitted(clusters, radius, _CLUSTER_MIN), PEERS[1]: _ransac(clusters, radius)}
+
+
+def _thinned(p: Array, edge: float) -> Array:
+    """Return one mean point of each cube [m]."""
+    from open3d import geometry, utility
+
+    cloud = geometry.PointCloud(utility.Vector3dVector(p))
+    return np.asarray(cloud.voxel_down_sample(edge).points)
+
+
+def _ransac(clusters: list[Array], radius: float) -> Array:
+    """Return the centres of the spheres by RANSAC that are about as large as wanted."""
+    import pyransac3d
+
+    np.random.seed(0)  # noqa: NPY002  the library draws from NumPy's global state
+    centres = []
+    for points in clusters:
+        top = points[points[:, 2] > points[:, 2].max() - 2.0 * radius]
+        if len(top) < _CLUSTER_MIN:
+            continue
+        centre, found, inliers = pyransac3d.Sphere().fit(top, thresh=0.02, maxIteration=200)
+        if abs(found - radius) < _RADIUS_OFF * radius and len(inliers) > _INLIERS * len(top):
+            centres.append(centre)
+    return np.array(centres, dtype=np.float64).reshape(-1, 3)
 
 
 def registered_centre(points: Array, radius: float) -> Array:
@@ -191,10 +235,10 @@ def _stitch(p_lidar: Array, stamps: Array, joints: Array, rig: Rig) -> Array:
     return np.asarray(Rotation.from_euler("z", angles[:, None]).apply(p_head))
 
 
-def _clusters(p_base: Array) -> list[Array]:
-    """Return clusters of the points off the ground."""
+def _clusters(p_base: Array, scale: float = 1.0) -> list[Array]:
+    """Return clusters of the points off the ground, of markers of a scale."""
     rest = _off_ground(p_base)
-    labels = np.asarray(rest.cluster_dbscan(_CLUSTER_GAP, _CLUSTER_MIN))
+    labels = np.asarray(rest.cluster_dbscan(scale * _CLUSTER_GAP, _CLUSTER_MIN))
     points = np.asarray(rest.points)[np.argsort(labels, kind="stable")]
     return np.split(points, np.cumsum(np.bincount(labels + 1))[:-1])[1:]
 
@@ -238,12 +282,12 @@ def _write_pcd(path: Path, p: Array) -> None:
     path.write_bytes(head.encode() + p.astype("<f4").tobytes())
 
 
-def _fitted(clusters: list[Array], radius: float) -> Array:
+def _fitted(clusters: list[Array], radius: float, n_points: int = _N_POINTS) -> Array:
     """Return the centres of the clusters whose top fits a sphere of known radius."""
     centres = []
     for points in clusters:
         top = points[points[:, 2] > points[:, 2].max() - 2.0 * radius]  # without the pole
-        if len(top) < _N_POINTS or np.ptp(points[:, :2], axis=0).max() > 4.0 * radius:
+        if len(top) < n_points or np.ptp(points[:, :2], axis=0).max() > 4.0 * radius:
             continue
         centre = registered_centre(top, radius)
         off = np.linalg.norm(top - centre, axis=1) - radius

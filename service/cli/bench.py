@@ -16,6 +16,8 @@ if TYPE_CHECKING:
     from spheremark.pipelines.evaluation.experiment import Experiment, Plain, Table
 
 _STOPS_OF_COVERAGE = 15  # of each survey
+_STOPS_OF_ACCURACY = 3
+_WORLDS_OF_EXTRACTION = 3  # of each scenario
 
 AsJson = Annotated[bool, typer.Option("--json", help="JSON for programs.")]
 
@@ -32,7 +34,15 @@ def bench(
     extraction: Annotated[
         bool, typer.Option("--extraction", help="Precision and recall of extraction instead.")
     ] = False,
-    worlds: Annotated[int, typer.Option(min=1, help="Worlds of each scenario for that.")] = 3,
+    worlds: Annotated[
+        int,
+        typer.Option(
+            min=0,
+            help="Detection, centres and stations in so many random worlds instead; with "
+            "--extraction, worlds of each scenario.",
+            show_default="3 with --extraction",
+        ),
+    ] = 0,
     accuracy: Annotated[
         bool, typer.Option("--accuracy", help="Precision of centres by every method instead.")
     ] = False,
@@ -48,19 +58,36 @@ def bench(
     wrong_rig: Annotated[
         bool, typer.Option("--wrong-rig", help="With wrong rigs, calibrated, for --networks.")
     ] = False,
-    stops: Annotated[int, typer.Option(min=1, help="Stops of 120 markers for --accuracy.")] = 3,
+    stops: Annotated[
+        int,
+        typer.Option(
+            min=0,
+            help="Stops of 120 markers for --accuracy; with --worlds, surveys of so many stops.",
+            show_default="3 for --accuracy",
+        ),
+    ] = 0,
     full: Annotated[
         bool, typer.Option("--full", help="Over 1000 fits at each distance for --accuracy.")
     ] = False,
-    seed: Annotated[int, typer.Option(min=0, help="Seed of the first of them.")] = 0,
+    seed: Annotated[
+        int,
+        typer.Option(
+            "--seed",
+            "--first-seed",
+            min=0,
+            help="Seed of the first of them; of random worlds every other one follows.",
+        ),
+    ] = 0,
     as_json: AsJson = False,
 ) -> None:
     """Measure each step against one read of the file with a checksum, in the same run."""
     if extraction:
         from spheremark.pipelines.evaluation import detection
 
-        seeds = range(seed, seed + worlds)
+        seeds = range(seed, seed + (worlds or _WORLDS_OF_EXTRACTION))
         _run(detection.extraction(detection.DETECTION_PLAN, seeds), as_json=as_json)
+    elif worlds:
+        _worlds(worlds, seed, stops, is_quick=quick, as_json=as_json)
     elif coverage:
         _coverage(coverage, seed, as_json=as_json)
     elif networks:
@@ -74,7 +101,8 @@ def bench(
     elif accuracy:
         from spheremark.pipelines.evaluation.precision import full_precision, precision
 
-        _run(full_precision(seed) if full else precision(stops, seed), as_json=as_json)
+        n_stops = stops or _STOPS_OF_ACCURACY
+        _run(full_precision(seed) if full else precision(n_stops, seed), as_json=as_json)
     else:
         os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # as in workers, before NumPy's import
         from spheremark.service.bench.speed import SpeedOptions, speed, speed_tables
@@ -107,6 +135,28 @@ def reproduce(
     with progress() as show:
         report = study.reproduce(folder, options, show)
     _print(report, study.reproduction_tables, as_json=as_json)
+
+
+def _worlds(n: int, seed: int, n_stops: int, *, is_quick: bool, as_json: bool) -> None:
+    """Measure the chain in random worlds, and keep the report for the service."""
+    from spheremark.pipelines.evaluation import networks as surveys
+    from spheremark.pipelines.evaluation import worlds as chain
+    from spheremark.service.bench.peers import PEERS, spheres_of_peers
+    from spheremark.service.provenance import made_now
+    from spheremark.storage.exports.reports import keep_worlds
+
+    if n_stops:
+        _run(surveys.random_networks(n, seed=seed, n_stops=n_stops), as_json=as_json)
+        return
+    peers = None if is_quick else chain.Peers(PEERS, spheres_of_peers)
+    experiment = chain.worlds(n, seed, peers)
+    with progress() as show:
+        report = made_now() | experiment.run(show)
+    shown = [table.to_texts() for table in experiment.tables(report)]
+    path = keep_worlds(report | {"tables": shown}, settings().data)
+    _print(report, experiment.tables, as_json=as_json)
+    if not as_json:
+        err.print(f"Kept as {path}, with tables beside it; the service shows it at /worlds.")
 
 
 def _coverage(n_surveys: int, seed: int, *, as_json: bool) -> None:

@@ -9,7 +9,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-_COVERAGE = "coverage.json"  # in the data folder, with a table beside it
+_COVERAGE, _WORLDS = "coverage.json", "worlds.json"  # in the data folder, with tables beside them
 
 
 def write_csv(path: Path, rows: Sequence[Mapping[str, Any]]) -> None:
@@ -63,9 +63,30 @@ def keep_coverage(report: Mapping[str, Any], data: Path) -> Path:
     Path
         The report.
     """
-    write_pages(data, {_COVERAGE: json.dumps(report, indent=1)})
-    path = data / _COVERAGE
+    path = _keep(report, data / _COVERAGE)
     write_csv(path.with_suffix(".csv"), [*report["levels"], *report["curve"]])
+    return path
+
+
+def keep_worlds(report: Mapping[str, Any], data: Path) -> Path:
+    """Write the report on random worlds into a data folder.
+
+    Parameters
+    ----------
+    report : mapping
+        The report; each of its lists of rows goes into a CSV of its own too.
+    data : Path
+        The data folder.
+
+    Returns
+    -------
+    Path
+        The report.
+    """
+    path = _keep(report, data / _WORLDS)
+    for name in ("markers", "methods", "decoys", "curve", "families"):
+        if report[name]:
+            write_csv(path.with_name(f"{path.stem}-{name}.csv"), report[name])
     return path
 
 
@@ -82,5 +103,31 @@ def kept_coverage(data: Path) -> dict[str, Any] | None:
     dict or None
         What ``keep_coverage`` wrote.
     """
-    path = data / _COVERAGE
+    return _kept(data / _COVERAGE)
+
+
+def kept_worlds(data: Path) -> dict[str, Any] | None:
+    """Return the report on random worlds of a data folder, if there is one.
+
+    Parameters
+    ----------
+    data : Path
+        The data folder.
+
+    Returns
+    -------
+    dict or None
+        What ``keep_worlds`` wrote.
+    """
+    return _kept(data / _WORLDS)
+
+
+def _keep(report: Mapping[str, Any], path: Path) -> Path:
+    """Write a report."""
+    write_pages(path.parent, {path.name: json.dumps(report, indent=1)})
+    return path
+
+
+def _kept(path: Path) -> dict[str, Any] | None:
+    """Return a report, if there is one."""
     return json.loads(path.read_text("utf-8")) if path.exists() else None

@@ -14,9 +14,10 @@ from spheremark.service.http.pages.frame import frame_of
 from spheremark.service.http.pages.networks import Fields
 from spheremark.service.http.state import Current, Service
 from spheremark.service.jobs.handlers import JobKind
-from spheremark.storage.exports.reports import kept_coverage
+from spheremark.storage.exports.reports import kept_coverage, kept_worlds
 from spheremark.web.pages.ellipse_coverage import coverage_page
 from spheremark.web.pages.site import site_page
+from spheremark.web.pages.worlds import worlds_page
 
 router = APIRouter(include_in_schema=False, default_response_class=HTMLResponse)
 
@@ -42,6 +43,12 @@ WHERE survey_id = $id AND kind = 'site' AND status IN ('accepted', 'running') OR
 def coverage(service: Current) -> str:
     """Show the coverage of error ellipses."""
     return coverage_page(frame_of(service), kept_coverage(service.settings.data))
+
+
+@router.get("/worlds")
+def worlds(service: Current) -> str:
+    """Show detection and errors in random worlds."""
+    return worlds_page(frame_of(service), kept_worlds(service.settings.data))
 
 
 @router.get("/surveys/{name:path}/site")

@@ -1,0 +1,556 @@
+"""Random worlds against their truth: detection, centres and stations, by family of world.
+
+Each world is scanned once and processed with the rig that its log describes. Markers count by their
+true returns, so that what a scan cannot show is asked of nobody. Other methods of detection can be
+run on the same scans.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
+from functools import partial
+from time import perf_counter
+from typing import Any, NamedTuple
+
+import numpy as np
+from scipy.stats import chi2
+
+from spheremark.pipelines.config import SurveyConfig
+from spheremark.pipelines.detection import extract
+from spheremark.pipelines.errors import DegenerateGeometryError, InputError, SolveError
+from spheremark.pipelines.evaluation.detection import (
+    N_MANY,
+    main_reasons,
+    reason_near,
+)
+from spheremark.pipelines.evaluation.ellipse_coverage import pose_errors
+from spheremark.pipelines.evaluation.experiment import Column, Experiment, Plain, Table
+from spheremark.pipelines.geometry import inverse, transform
+from spheremark.pipelines.model import (
+    Array,
+    Index,
+    MarkerCandidates,
+    MarkerFits,
+    Rig,
+    StitchedCloud,
+)
+from spheremark.pipelines.positioning.resection import resect
+from spheremark.pipelines.scan.stitching import beams, choose_rig, stitch
+from spheremark.pipelines.simulation import random_world
+from spheremark.pipelines.simulation.worlds import Scan
+from spheremark.pipelines.sphere import fit_markers
+from spheremark.pipelines.sphere.bound import cramer_rao
+
+
+class Peers(NamedTuple):
+    """Other methods: their names, and a function of a module that runs them.
+
+    It goes from points, (n, 3), and the radius [m] to centres, (k, 3), by name.
+    """
+
+    names: tuple[str, ...]
+    find: Callable[[Array, float], Mapping[str, Array]]
+
+
+N_FEW, N_LINES, HALF = 8, 2, 0.5
+"""Returns and scan lines from which a marker should be found, and how much must be visible."""
+
+CLASSES = (
+    f"{N_MANY} returns or more, half visible",
+    f"{N_FEW} to {N_MANY - 1} returns, half visible",
+    "fewer returns, or mostly hidden",
+)
+"""Classes of markers by returns and visible share; those of the first lie on two lines or more."""
+
+LEVELS = (0.50, 0.68, 0.95)
+"""Levels of the ellipsoids that errors are compared with."""
+
+RATES = (0.003, 0.01, 0.03, 0.1, 0.3, 1.0, 3.0)
+"""False markers in a scan for which the curve gives precision and recall."""
+
+_OURS = ("ok", "weak", "possible")
+_METHOD, _RESECTION = "along_beam", "free_station"
+_MEAN_DEPTH = 2.0 / 3.0  # of a sphere's radius: mean height of its surface over its disc
+_NEAREST_MATCH = 0.06  # [m] at the least, within which a candidate is at a marker
+_DECOY_REACH = 0.1  # [m] beyond a decoy and a marker's radius, within which a false one is at it
+_NOWHERE = "ground, scattered rocks"
+
+
+class Centre(NamedTuple):
+    """A fitted marker: squared error [m^2], its bound [m^2], and that error over its covariance."""
+
+    status: str
+    error2: float
+    bound2: float
+    square: float
+
+
+class Seen(NamedTuple):
+    """A true marker in a scan: its class, who found it, why it was missed, and its centre."""
+
+    kind: str
+    found: tuple[str, ...]
+    reason: str
+    centre: Centre | None
+
+
+class Call(NamedTuple):
+    """What was taken for a marker: by whom, how surely, the marker it is, or what it is at."""
+
+    by: str
+    score: float
+    mark: int
+    decoy: str
+
+
+class Station(NamedTuple):
+    """A station: squared error of the position [m^2] and of the pose over its covariance."""
+
+    status: str
+    error2: float
+    square: float
+
+
+class Score(NamedTuple):
+    """One scan against its truth."""
+
+    seed: int
+    family: str
+    seen: list[Seen]
+    calls: list[Call]
+    decoys: list[str]
+    station: Station | None
+    failure: str
+    seconds: float
+
+
+def worlds(
+    n_worlds: int, first_seed: int = 0, peers: Peers | None = None
+) -> Experiment[int, Score, Plain]:
+    """Return the experiment that measures the whole chain in random worlds.
+
+    Parameters
+    ----------
+    n_worlds : int
+        Number of worlds, one scan of each.
+    first_seed : int
+        Seed of the first; every other one follows, so that even and odd ones are apart.
+    peers : Peers, optional
+        Other methods to run on the same scans.
+
+    Returns
+    -------
+    Experiment
+        Its report has recall by class of marker, false markers by kind of decoy, the curve of
+        precision and recall, and errors over bound and covariance by family of world.
+    """
+    return Experiment(
+        worlds=range(first_seed, first_seed + 2 * n_worlds, 2),
+        run_world=partial(_score, peers=peers),
+        pool=lambda scores: report_of(scores, first_seed, peers.names if peers else ()),
+        tables=tables,
+    )
+
+
+def _score(seed: int, *, peers: Peers | None) -> Score:
+    """Simulate one world, process its scan, and compare with the truth."""
+    scan = random_world(seed)
+    field, config = scan.world.field, SurveyConfig()
+    decoys = [decoy.kind for decoy in field.decoys]
+    try:
+        cloud, rows = _tagged(scan, choose_rig(scan.log, None))
+    except InputError as error:
+        n_marks = len(field.marks.names)
+        seen = [Seen(_class_of(scan, i), (), error.code, None) for i in range(n_marks)]
+        return Score(seed, field.family, seen, [], decoys, None, str(error), 0.0)
+    start = perf_counter()
+    found = extract(cloud, config.extraction, field.marker_radius)
+    fits = fit_markers(_METHOD, cloud, found, config.fitting, field.marker_radius)
+    seconds = perf_counter() - start
+    places = _places(scan, cloud, rows)
+    calls, matched = _calls(scan, found, fits, places)
+    if peers:
+        by_name = peers.find(cloud.p_base.astype(np.float64), field.marker_radius)
+        for name, centres in by_name.items():
+            calls += _matched(scan, places, [(name, 1.0, p) for p in centres])
+    centres_of = _centres(scan, fits, matched)
+    seen = [
+        Seen(
+            kind=_class_of(scan, i),
+            found=tuple(sorted({call.by for call in calls if call.mark == i})),
+            reason="" if i in centres_of else reason_near(found, places[i]),
+            centre=centres_of.get(i),
+        )
+        for i in range(len(places))
+    ]
+    station = _station(scan, fits, config)
+    return Score(seed, field.family, seen, calls, decoys, station, "", seconds)
+
+
+def _tagged(scan: Scan, rig: Rig) -> tuple[StitchedCloud, Index]:
+    """Return the stitched cloud, and the row of the log that each of its returns is."""
+    numbers = np.arange(len(scan.log.rings), dtype=np.float32)  # exact: fewer than 2^24 returns
+    cloud = stitch(replace(scan.log, intensities=numbers), rig, SurveyConfig().stitching)
+    rows = cloud.intensities.astype(np.intp)
+    return replace(cloud, intensities=scan.log.intensities[rows]), rows
+
+
+def _class_of(scan: Scan, mark: int) -> str:
+    """Return the class of a marker by its true returns, lines and visible share."""
+    n, n_lines = scan.stop.counts[mark]
+    about, name = scan.truth.about, scan.world.field.marks.names[mark]
+    if about["visible_shares"][scan.stop.truth.name][name] < HALF or n < N_FEW:
+        return CLASSES[2]
+    return CLASSES[0] if n >= N_MANY and n_lines >= N_LINES else CLASSES[1]
+
+
+def _places(scan: Scan, cloud: StitchedCloud, rows: Index) -> Array:
+    """Return where the scan shows each marker: its true returns say it, whatever the rig does."""
+    field = scan.world.field
+    places = transform(inverse(scan.stop.truth.T_site_base), field.marks.p_site)
+    labels = scan.stop.marks[rows]
+    for mark in range(len(places)):
+        own = cloud.p_base[labels == mark].astype(np.float64)
+        if len(own):
+            middle = own.mean(axis=0)
+            reach = float(np.linalg.norm(middle))
+            places[mark] = middle * (1.0 + _MEAN_DEPTH * field.marker_radius / reach)
+    return places
+
+
+def _matched(scan: Scan, places: Array, found: Sequence[tuple[str, float, Array]]) -> list[Call]:
+    """Return what was taken for markers with the markers they are, each at most once."""
+    field, taken = scan.world.field, set[int]()
+    reach = max(field.marker_radius, _NEAREST_MATCH)
+    T_base_site = inverse(scan.stop.truth.T_site_base)
+    decoys = transform(T_base_site, np.array([d.p_site for d in field.decoys]).reshape(-1, 3))
+    reaches = np.array([decoy.reach for decoy in field.decoys]) + field.marker_radius + _DECOY_REACH
+    calls = []
+    for by, score, p in found:
+        gaps = np.linalg.norm(places - p, axis=1)
+        mark = int(np.argmin(gaps)) if len(gaps) else -1
+        if mark < 0 or gaps[mark] > reach or mark in taken:
+            beyond = np.linalg.norm(decoys - p, axis=1) - reaches
+            is_near = beyond.min(initial=np.inf) <= 0.0
+            at = field.decoys[int(beyond.argmin())].kind if is_near else _NOWHERE
+            if mark >= 0 and gaps[mark] <= 2.0 * reach:
+                at = "a marker again"
+            calls.append(Call(by, score, -1, at))
+        else:
+            taken.add(mark)
+            calls.append(Call(by, score, mark, ""))
+    return calls
+
+
+def _calls(
+    scan: Scan, found: MarkerCandidates, fits: MarkerFits, places: Array
+) -> tuple[list[Call], list[int]]:
+    """Return our markers, sure ones first, and the mark of each fit."""
+    scores = {one.name: float(getattr(one, "probability", one.score)) for one in found.candidates}
+    fitted = [(fit.status.value, scores[fit.name], fit.p_base) for fit in fits.fits]
+    order = sorted(range(len(fitted)), key=lambda i: (fitted[i][0], -fitted[i][1]))
+    ours = [fitted[i] for i in order]
+    possible: Any = getattr(found, "possible", ())
+    ours += [("possible", _score_of(one), _place_of(one)) for one in possible]
+    calls = _matched(scan, places, ours)
+    marks = [-1] * len(fits.fits)
+    for i, call in zip(order, calls, strict=False):
+        marks[i] = call.mark
+    return calls, marks
+
+
+def _score_of(possible: Any) -> float:
+    """Return the probability of a possible marker."""
+    return float(getattr(possible, "probability", getattr(possible, "score", 0.0)))
+
+
+def _place_of(possible: Any) -> Array:
+    """Return the place of a possible marker."""
+    return np.asarray(getattr(possible, "p_base_rough", getattr(possible, "p_base", None)))
+
+
+def _centres(scan: Scan, fits: MarkerFits, marks: Sequence[int]) -> dict[int, Centre]:
+    """Return the errors of centres by mark; that of the heading, which all share, is taken out.
+
+    Squares are in units of the covariance with the heading's own sigma, heading left in.
+    """
+    true = transform(inverse(scan.stop.truth.T_site_base), scan.world.field.marks.p_site)
+    matched = [(fit, mark) for fit, mark in zip(fits.fits, marks, strict=True) if mark >= 0]
+    if not matched:
+        return {}
+    errors = np.array([fit.p_base - true[mark] for fit, mark in matched])
+    p = true[[mark for _, mark in matched]]
+    aside = np.column_stack([-p[:, 1], p[:, 0], np.zeros(len(p))])
+    weights = 1.0 / np.array([np.trace(fit.cov_p_base) for fit, _ in matched])
+    turn = (weights * (aside * errors).sum(axis=1)).sum() / (weights * (aside**2).sum(axis=1)).sum()
+    left = errors - turn * aside if len(matched) > 1 else errors
+    bounds, sigma_heading = _bounds(scan), fits.levelling.sigma_heading
+    found = {}
+    for (fit, mark), error, rest in zip(matched, errors, left, strict=True):
+        square = float(error @ np.linalg.solve(fit.cov_with_heading(sigma_heading), error))
+        bound2 = bounds.get(mark, np.nan)
+        found[mark] = Centre(fit.status.value, float(rest @ rest), bound2, square)
+    return found
+
+
+def _bounds(scan: Scan) -> dict[int, float]:
+    """Return the least mean squared error of each marker that ranges allow [m^2]."""
+    cloud, rows = _tagged(scan, scan.stop.rig)
+    labels, config, field = scan.stop.marks[rows], scan.world.config, scan.world.field
+    true = transform(inverse(scan.stop.truth.T_site_base), field.marks.p_site)
+    sigmas = np.hypot(scan.stop.sigmas[rows], config.range_step / np.sqrt(12.0))
+    bounds = {}
+    for mark in range(len(true)):
+        own = np.flatnonzero(labels == mark)
+        try:
+            cov = cramer_rao(beams(cloud, own), true[mark], field.marker_radius, sigmas[own])
+        except DegenerateGeometryError:
+            continue
+        bounds[mark] = float(np.trace(cov))
+    return bounds
+
+
+def _station(scan: Scan, fits: MarkerFits, config: SurveyConfig) -> Station | None:
+    """Return the errors of the station on the true marks; None without one."""
+    try:
+        fix = resect(_RESECTION, fits, scan.world.field.marks, config.resection)
+    except SolveError:
+        return None
+    pose = (fix.T_site_station, fix.cov_T_site_station)
+    error, _, squares = pose_errors(pose, scan.stop.truth, fits.levelling)
+    return Station(fix.status.value, float(error @ error), squares["pose"])
+
+
+def report_of(scores: Sequence[Score], first_seed: int, peers: Sequence[str]) -> Plain:
+    """Pool the scores of all scans.
+
+    Parameters
+    ----------
+    scores : sequence of Score
+        One for each world.
+    first_seed : int
+        Seed of the first.
+    peers : sequence of str
+        Names of other methods.
+
+    Returns
+    -------
+    dict
+        Rows of ``markers``, ``methods``, ``decoys``, ``curve``, ``families`` and ``failures``.
+    """
+    seen = [one for score in scores for one in score.seen]
+    calls = [call for score in scores for call in score.calls]
+    present = Counter(kind for score in scores for kind in score.decoys)
+    methods = (*_OURS, *peers)
+    families = dict.fromkeys(score.family for score in scores)
+    return {
+        "n_worlds": len(scores),
+        "first_seed": first_seed,
+        "seconds": float(np.mean([score.seconds for score in scores])) if scores else None,
+        "markers": [_recall([s for s in seen if s.kind == kind], kind, peers) for kind in CLASSES],
+        "methods": [_precision(scores, name) for name in methods],
+        "decoys": [_decoy(calls, kind, present[kind], methods) for kind in _kinds(calls, present)],
+        "curve": [_at_rate(scores, rate) for rate in RATES],
+        "families": [
+            _family(name, [score for score in scores if score.family == name]) for name in families
+        ]
+        + ([_family("all", scores)] if len(families) > 1 else []),
+        "failures": [
+            {"seed": one.seed, "family": one.family, "reason": one.failure}
+            for one in scores
+            if one.failure
+        ],
+    }
+
+
+def _recall(seen: Sequence[Seen], kind: str, peers: Sequence[str]) -> Plain:
+    """Return how many markers of a class were found, by whom, and why not."""
+    n = {name: sum(name in one.found for one in seen) for name in (*_OURS, *peers)}
+    reasons = Counter(one.reason for one in seen if not one.found and one.reason)
+    return {
+        "class": kind,
+        "n": len(seen),
+        "n_ok": n["ok"],
+        "n_weak": n["weak"],
+        "n_possible": n["possible"],
+        "share": _share(n["ok"] + n["weak"], len(seen)),
+        **{f"share_{name}": _share(n[name], len(seen)) for name in peers},
+        "reasons": dict(reasons.most_common()),
+    }
+
+
+def _share(n: int, of: int) -> float | None:
+    """Return a share; None of nothing."""
+    return n / of if of else None
+
+
+def _precision(scores: Sequence[Score], name: str) -> Plain:
+    """Return how many markers a method gave, and how many were false."""
+    calls = [[call for call in score.calls if call.by == name] for score in scores]
+    n = sum(len(own) for own in calls)
+    false = [sum(call.mark < 0 for call in own) for own in calls]
+    return {
+        "method": name,
+        "n": n,
+        "n_false": sum(false),
+        "precision": _share(n - sum(false), n),
+        "false_per_scan": sum(false) / len(scores) if scores else None,
+        "n_scans_with_false": sum(one > 0 for one in false),
+    }
+
+
+def _kinds(calls: Sequence[Call], present: Mapping[str, int]) -> list[str]:
+    """Return the kinds of decoys, and where else there were false markers."""
+    elsewhere = {call.decoy for call in calls if call.mark < 0} - set(present)
+    return sorted(present) + sorted(elsewhere)
+
+
+def _decoy(calls: Sequence[Call], kind: str, n: int, methods: Sequence[str]) -> Plain:
+    """Return how often a kind of decoy was there, and was taken for a marker by each method."""
+    own = Counter(call.by for call in calls if call.mark < 0 and call.decoy == kind)
+    return {"decoy": kind, "n": n or None, **{f"n_{name}": own[name] for name in methods}}
+
+
+def _at_rate(scores: Sequence[Score], rate: float) -> Plain:
+    """Return precision and recall at the level that gives a rate of false markers in a scan."""
+    calls = [call for score in scores for call in score.calls if call.by in _OURS]
+    false = np.sort([call.score for call in calls if call.mark < 0])[::-1]
+    n_allowed = int(rate * len(scores))
+    level = float(false[n_allowed]) if n_allowed < len(false) else -np.inf
+    n_true, of = Counter[str](), Counter(one.kind for score in scores for one in score.seen)
+    for score in scores:
+        for call in score.calls:
+            if call.by in _OURS and call.mark >= 0 and call.score > level:
+                n_true[score.seen[call.mark].kind] += 1
+    n_false = int(np.sum(false > level))
+    n = sum(n_true.values())
+    return {
+        "rate": rate,
+        "level": level if np.isfinite(level) else None,
+        "precision": _share(n, n + n_false),
+        **{f"recall_{i}": _share(n_true[kind], of[kind]) for i, kind in enumerate(CLASSES)},
+    }
+
+
+def _family(name: str, scores: Sequence[Score]) -> Plain:
+    """Return detection and errors in the worlds of one family."""
+    seen = [one for score in scores for one in score.seen]
+    many = [one for one in seen if one.kind == CLASSES[0]]
+    n_false = Counter(call.by for score in scores for call in score.calls if call.mark < 0)
+    centres = [one.centre for one in seen if one.centre is not None and one.centre.status == "ok"]
+    stations = [score.station for score in scores if score.station is not None]
+    sure = [one for one in stations if one.status == "ok"]
+    ratios = np.array([one.error2 / one.bound2 for one in centres])
+    squares = np.array([one.square for one in centres])
+    return {
+        "family": name,
+        "n_scans": len(scores),
+        "recall": _share(sum("ok" in s.found or "weak" in s.found for s in many), len(many)),
+        **{f"false_{by}": n_false[by] / len(scores) if scores else None for by in _OURS},
+        "n_centres": len(centres),
+        "rms_m": _root([one.error2 for one in centres]),
+        "rms_over_bound": _root(ratios[np.isfinite(ratios)]),
+        "nees": _mean(squares / 3.0),
+        **{
+            f"within_{round(100 * level)}": _mean(squares <= chi2.ppf(level, 3)) for level in LEVELS
+        },
+        "n_stations": len(sure),
+        "station_rms_m": _root([one.error2 for one in sure]),
+        "station_nees": _mean([one.square / 6.0 for one in sure]),
+    }
+
+
+def _mean(values: Any) -> float | None:
+    """Return the mean; None of nothing."""
+    return float(np.mean(values)) if len(values) else None
+
+
+def _root(squares: Any) -> float | None:
+    """Return the root of the mean of squares; None of nothing."""
+    return float(np.sqrt(np.mean(squares))) if len(squares) else None
+
+
+def tables(report: Plain) -> list[Table]:
+    """Lay the report out in tables.
+
+    Parameters
+    ----------
+    report : mapping
+        What ``report_of`` gives.
+
+    Returns
+    -------
+    list of Table
+        Recall, precision, decoys, the curve, and families.
+    """
+    names = [one["method"] for one in report["methods"]]
+    peers = names[len(_OURS) :]
+    title = (
+        f"{report['n_worlds']} random worlds, every other seed from {report['first_seed']}; "
+        f"detection and fitting take {report['seconds']:.2f} s a scan"
+    )
+    return [
+        Table(title=title, columns=_recall_columns(peers), rows=report["markers"]),
+        Table(title="Taken for markers", columns=_PRECISION, rows=report["methods"]),
+        Table(title="At decoys", columns=_decoy_columns(names), rows=report["decoys"]),
+        Table(title="By the level of decision", columns=_CURVE, rows=report["curve"]),
+        Table(
+            title="By family of world; centres and stations that are ok",
+            columns=_FAMILY,
+            rows=report["families"],
+            notes=[
+                f"Seed {one['seed']} ({one['family']}): {one['reason']}"
+                for one in report["failures"]
+            ],
+        ),
+    ]
+
+
+def _recall_columns(peers: Sequence[str]) -> tuple[Column, ...]:
+    """Return the columns of the table of recall."""
+    return (
+        Column("class", "markers"),
+        Column("n", "n", "", ",d"),
+        *(Column(f"n_{name}", name, "", ",d") for name in _OURS),
+        Column("share", "ok or weak", "%", ".1f"),
+        *(Column(f"share_{name}", name, "%", ".1f") for name in peers),
+        Column(main_reasons, "why not"),
+    )
+
+
+def _decoy_columns(methods: Sequence[str]) -> tuple[Column, ...]:
+    """Return the columns of the table of decoys."""
+    counts = (Column(f"n_{name}", name, "", ",d") for name in methods)
+    return (Column("decoy", "decoy"), Column("n", "in scans", "", ",d"), *counts)
+
+
+_PRECISION = (
+    Column("method", "by"),
+    Column("n", "n", "", ",d"),
+    Column("n_false", "false", "", ",d"),
+    Column("precision", "precision", "%", ".2f"),
+    Column("false_per_scan", "false in a scan", "", ".3f"),
+    Column("n_scans_with_false", "scans with one", "", ",d"),
+)
+_CURVE = (
+    Column("rate", "false in a scan", "", ".3f"),
+    Column("level", "level", "", ".4f"),
+    Column("precision", "precision", "%", ".2f"),
+    *(Column(f"recall_{i}", kind, "%", ".1f") for i, kind in enumerate(CLASSES)),
+)
+_FAMILY = (
+    Column("family", "family"),
+    Column("n_scans", "scans", "", "d"),
+    Column("recall", f"found, {N_MANY} returns", "%", ".1f"),
+    *(Column(f"false_{name}", f"false {name}", "1/scan", ".2f") for name in _OURS),
+    Column("n_centres", "centres", "", "d"),
+    Column("rms_m", "RMS", "mm", ".1f"),
+    Column("rms_over_bound", "RMS/bound", "", ".2f"),
+    Column("nees", "NEES/3", "", ".2f"),
+    *(Column(f"within_{round(100 * p)}", f"in {round(100 * p)} %", "%", ".0f") for p in LEVELS),
+    Column("n_stations", "stations", "", "d"),
+    Column("station_rms_m", "RMS", "mm", ".1f"),
+    Column("station_nees", "NEES/6", "", ".2f"),
+)
