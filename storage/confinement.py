@@ -74,9 +74,19 @@ def leave_files() -> bool:
 
 
 def enter_folder(folder: Path) -> Path:
-    """Make a folder the root of this process's files, where it may; return its path from now on.
+    """Make a folder the root of this process's files, where it may.
 
     Call it after ``leave_network``, whose namespace allows it.
+
+    Parameters
+    ----------
+    folder : Path
+        The folder.
+
+    Returns
+    -------
+    Path
+        Its path from now on: ``/``, or the path as before.
     """
     try:
         os.chroot(folder)

@@ -29,6 +29,15 @@ about = APIRouter(include_in_schema=False)
 class _Application(FastAPI):
     """FastAPI whose responses to unexpected errors, outside all middleware, have the headers."""
 
+    def openapi(self) -> dict[str, Any]:
+        """Return the description of the interface, in which problems have their media type."""
+        if self.openapi_schema is None:
+            for path in super().openapi()["paths"].values():
+                for operation in path.values():
+                    content = operation["responses"]["default"]["content"]
+                    content[errors.MEDIA_TYPE] = content.pop(next(iter(content)))
+        return super().openapi()
+
     def build_middleware_stack(self) -> ASGIApp:
         """Return the whole application."""
         return security.SecureHeaders(super().build_middleware_stack())

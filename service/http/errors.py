@@ -36,7 +36,10 @@ def install(app: FastAPI, page: ErrorPage | None = None) -> None:
         return problem_response(problem, headers)
 
     def ours(request: Request, error: Exception) -> Response:
-        return respond(request, problem_of(cast(SpheremarkError, error), request.url.path), None)
+        problem = problem_of(cast(SpheremarkError, error), request.url.path)
+        if problem.status >= 500:
+            logger.error("%s %s failed: %s", request.method, request.url.path, problem.detail)
+        return respond(request, problem, None)
 
     def http(request: Request, error: Exception) -> Response:
         known = cast(HTTPException, error)

@@ -14,6 +14,7 @@ from __future__ import annotations
 import csv
 import io
 import json
+import logging
 import math
 import os
 import signal
@@ -40,6 +41,8 @@ _HEADROOM = 1 << 30  # [bytes] of addresses for Python and DuckDB themselves, be
 _MESSAGE_MAX = 600  # characters of DuckDB's own message
 _START_MAX = 20.0  # [s] until a process may have started on a machine that is busy
 _KINDS = ("SELECT", "EXPLAIN")
+
+logger = logging.getLogger(__name__)
 
 
 class QueryRejectedError(InputError):
@@ -213,7 +216,8 @@ def _in_child(request: str, limits: QueryLimits) -> dict[str, Any]:
         sentence = f"It ended with {signal.Signals(-child.returncode).name}."
         return {"rejected": f"{_too_much_memory(limits.memory_bytes)} {sentence}"}
     if child.returncode:
-        raise SpheremarkError(f"The process of the query failed: {trace[-_MESSAGE_MAX:]}")
+        logger.error("The process of a query failed: %s", trace)
+        raise SpheremarkError("The process of the query failed; the service's log has the reason.")
     response: dict[str, Any] = json.loads(text)
     return response
 

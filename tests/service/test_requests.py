@@ -16,13 +16,21 @@ from spheremark.service.http.security import HEADERS, SecureHeaders, SecurityMid
 from spheremark.service.settings import Settings
 
 DIGEST = "0" * 64
+JSON = {"Content-Type": "application/json"}
+
+
+def _nested(key, depth):
+    """Return the JSON of a job, or of a rig, whose one value has so many brackets."""
+    value = f'{{"a": {"[" * depth}{"]" * depth}}}'
+    return f'{{"survey": "a", "recording": "{DIGEST}", "{key}": {value}}}'
+
+
 WRONG = [  # method, path, arguments, status, code
     ("GET", "/api/v1/nowhere", {}, 404, "not_found"),
     ("PATCH", "/api/v1/surveys", {}, 405, "method_not_allowed"),
     ("POST", "/api/v1/surveys", {"json": {}}, 422, "input.validation"),
     ("POST", "/api/v1/surveys", {"json": {"name": "a", "nme": "b"}}, 422, "input.validation"),
-    ("POST", "/api/v1/surveys", {"content": "{", "headers": {"Content-Type": "application/json"}},
-     400, "input.validation"),
+    ("POST", "/api/v1/surveys", {"content": "{", "headers": JSON}, 400, "input.validation"),
     ("GET", "/api/v1/surveys?limit=0", {}, 422, "input.validation"),
     ("GET", "/api/v1/surveys?after=nonsense", {}, 400, "input"),
     ("GET", "/api/v1/surveys/nobody", {}, 404, "not_found"),
@@ -61,6 +69,12 @@ WRONG = [  # method, path, arguments, status, code
     ("POST", "/api/v1/jobs",
      {"json": {"kind": "adjust", "survey": "a", "recording": DIGEST, "recordings": [DIGEST]}},
      422, "input.validation"),
+    ("POST", "/api/v1/jobs", {"content": _nested("rig", 900), "headers": JSON},
+     422, "input.validation"),
+    ("POST", "/api/v1/jobs", {"content": _nested("config", 900), "headers": JSON},
+     422, "input.validation"),
+    ("POST", "/api/v1/jobs", {"content": _nested("options", 10**6), "headers": JSON},
+     400, "input.validation"),
     ("POST", "/api/v1/rigs", {"content": ""}, 400, "input.empty"),
     ("POST", "/api/v1/rigs", {"json": {"name": "bench"}}, 400, "input.rig"),
     ("GET", "/api/v1/rigs/none", {}, 404, "not_found"),
@@ -82,6 +96,7 @@ WRONG = [  # method, path, arguments, status, code
     ("GET", "/api/v1/runs?colour=red", {}, 422, "input.validation"),
     ("GET", "/api/v1/marker-fits/none", {}, 404, "not_found"),
     ("GET", "/api/v1/marker-fits?limit=1001", {}, 422, "input.validation"),
+    ("GET", f"/api/v1/marker-fits?after={10**22}", {}, 422, "input.validation"),
     ("GET", "/api/v1/station-fixes?latest=perhaps", {}, 422, "input.validation"),
     ("GET", "/api/v1/station-fixes/none", {}, 404, "not_found"),
     ("POST", "/api/v1/sql", {"json": {"sql": "SELEKT 1"}}, 400, "query.rejected"),

@@ -163,6 +163,7 @@ def test_what_only_reads_is_allowed(query, sql):
         ("", "no statement"),
         ("-- nothing", "no statement"),
         ("SELEC 1", "syntax error"),
+        ("SELECT (repeat('[', 1000000) || repeat(']', 1000000))::JSON", "nested too|memory limit"),
         ("SELECT * FROM nowhere", "nowhere does not exist"),
     ],
 )

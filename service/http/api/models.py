@@ -3,18 +3,20 @@
 from __future__ import annotations
 
 from datetime import datetime
-from typing import Any, Generic, Literal, Self, TypeVar
+from typing import Annotated, Any, Generic, Literal, Self, TypeVar
 
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, model_validator
 
 from spheremark.pipelines.model import ControlMarks, Rig
 from spheremark.pipelines.scan.rigs import rig_digest, rig_to_mapping
 from spheremark.service.jobs.handlers import KINDS, JobKind
 from spheremark.storage.catalogue.records import JobStatus
+from spheremark.storage.imports.nesting import require_shallow
 from spheremark.storage.recordings.preflight import Preflight
 
 Item = TypeVar("Item")
 SurveyKey = str  # id or name
+Plain = Annotated[dict[str, Any], AfterValidator(require_shallow)]  # an object of any keys
 
 
 class Strict(BaseModel):
@@ -146,16 +148,16 @@ class NewJob(Strict):
         min_length=1,
         description="Ids of recordings, for kinds that read several; all of the survey by default.",
     )
-    rig: str | dict[str, Any] | None = Field(
+    rig: str | Plain | None = Field(
         default=None,
         description="Digest of a rig, or a rig file's JSON; by default the rig of the survey, "
         "and the one that each log describes where it has none.",
     )
-    config: dict[str, Any] = Field(
+    config: Plain = Field(
         default_factory=dict,
         description="What differs from the default configuration, nested as GET /config shows it.",
     )
-    options: dict[str, Any] = Field(default_factory=dict, description="Options of the kind.")
+    options: Plain = Field(default_factory=dict, description="Options of the kind.")
 
     @model_validator(mode="after")
     def _check_logs(self) -> Self:

@@ -12,9 +12,10 @@ from spheremark.pipelines.placement import PlaceRules, RandomPlanSpec, Sensor
 from spheremark.pipelines.placement.optimisation import MARKS_MOST
 from spheremark.service.http.api.models import Strict
 
-Finite = Annotated[float, Field(allow_inf_nan=False)]
-Point = tuple[float, float, float]
-Area = Annotated[list[tuple[Finite, Finite]], Field(min_length=3, max_length=200)]
+_FAR = 1e8  # [m]; projected coordinates, zone in front, have at most eight digits
+Coordinate = Annotated[float, Field(ge=-_FAR, le=_FAR)]
+Point = tuple[Coordinate, Coordinate, Coordinate]
+Area = Annotated[list[tuple[Coordinate, Coordinate]], Field(min_length=3, max_length=200)]
 Name = Annotated[str, Field(min_length=1, max_length=50)]
 
 
@@ -22,9 +23,9 @@ class RequestedMark(Strict):
     """A mark: on a pole of some height, or with its centre at a position."""
 
     name: Name
-    x_m: float | None = None
-    y_m: float | None = None
-    pole_height_m: float | None = Field(
+    x_m: Coordinate | None = None
+    y_m: Coordinate | None = None
+    pole_height_m: Coordinate | None = Field(
         default=None, description="Height of the sphere's centre above the ground [m]."
     )
     position_m: Point | None = Field(
@@ -44,8 +45,8 @@ class RequestedStop(Strict):
     """A stop, with the LiDAR at its usual height above the ground."""
 
     name: Name
-    x_m: float
-    y_m: float
+    x_m: Coordinate
+    y_m: Coordinate
 
 
 class ScanOptions(Strict):

@@ -90,17 +90,14 @@ _NETWORK_FILE: dict[int | str, dict[str, Any]] = {200: _FILE | {"model": Network
 _CALIBRATION_FILE: dict[int | str, dict[str, Any]] = {200: _FILE | {"model": CalibrationDocument}}
 
 
-class RowFilter(Strict):
+class RowFilter(rows.ResultFilter):
     """Which rows of a list of results are requested."""
 
-    survey: str | None = Field(default=None, description="Id or name of a survey.")
     run: str | None = Field(default=None, description="Id of a run, even if a newer one exists.")
     stop: str | None = Field(default=None, description="Name of a stop.")
     fit_method: str | None = Field(default=None, description="Fitting method.")
     status: str | None = Field(default=None, description="ok, weak, or failed for a station.")
     latest: bool = Field(default=True, description="Only the newest run of each log.")
-    after: int = Field(default=0, ge=0, description="The 'next' of the part before.")
-    limit: int = Field(default=100, ge=1, le=1000, description="Items in one part.")
 
 
 class RunFilter(Strict):

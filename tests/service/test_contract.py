@@ -1,0 +1,75 @@
+"""Every operation against requests that its description allows, and ones that it does not."""
+
+import json
+
+import hypothesis
+import pytest
+import requests
+import schemathesis
+from fastapi.testclient import TestClient
+from hypothesis import HealthCheck, Phase
+from schemathesis.generation import GenerationMode
+
+from spheremark.service.http.app import create_app
+from spheremark.service.http.security import HEADERS
+from spheremark.service.settings import Settings
+
+CHECKS = [
+    getattr(schemathesis.checks, name)
+    for name in (
+        "not_a_server_error",
+        "status_code_conformance",
+        "content_type_conformance",
+        "response_schema_conformance",
+    )
+]
+HOST = "http://127.0.0.1:8000"
+N_REQUESTS = 15  # of each operation and mode; two minutes in all
+DESCRIPTION = create_app(Settings()).openapi()
+OPERATIONS = [
+    found.ok()
+    for found in schemathesis.openapi.from_dict(DESCRIPTION).get_all_operations()
+    if "text/event-stream" not in json.dumps(found.ok().definition.raw)  # they do not end
+]
+NO_WRONG = hypothesis.errors.Unsatisfiable  # every request of the operation is right
+
+
+@pytest.fixture(scope="module")
+def client(tmp_path_factory):
+    app = create_app(Settings(data=tmp_path_factory.mktemp("data"), workers=1))
+    with TestClient(app, base_url=HOST, raise_server_exceptions=False) as client:
+        yield client
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("mode", [GenerationMode.POSITIVE, GenerationMode.NEGATIVE])
+@pytest.mark.parametrize("operation", OPERATIONS, ids=lambda one: one.label)
+def test_no_request_fails_the_service_or_gets_what_is_not_described(client, operation, mode):
+    @hypothesis.seed(2)
+    @hypothesis.given(case=operation.as_strategy(generation_mode=mode))
+    @hypothesis.settings(
+        max_examples=N_REQUESTS,
+        deadline=None,
+        database=None,
+        phases=[Phase.generate],
+        suppress_health_check=list(HealthCheck),
+    )
+    def check(case):
+        arguments = case.as_transport_kwargs(base_url=HOST)
+        arguments.pop("cookies", None)
+        sent = requests.Request(**arguments).prepare()
+        hypothesis.assume(len(sent.url) < 60_000)  # the most that this client sends
+        answer = client.request(
+            sent.method, sent.url, content=sent.body, headers=dict(sent.headers)
+        )
+        for name, value in HEADERS.items():
+            assert answer.headers[name] == value
+        case.validate_response(answer, checks=CHECKS)
+        if answer.status_code >= 400:
+            problem = answer.json()
+            assert client.get(problem["type"]).json()["code"] == problem["code"]
+
+    try:
+        check()
+    except NO_WRONG:
+        assert mode is GenerationMode.NEGATIVE
