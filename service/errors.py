@@ -17,6 +17,7 @@ from spheremark.pipelines.errors import (
 )
 from spheremark.storage.catalogue.records import RecordingRecord
 from spheremark.storage.catalogue.sandbox import QueryTimeoutError
+from spheremark.storage.files import StorageError, StorageFullError
 
 
 class TooLargeError(InputError):
@@ -35,6 +36,48 @@ class MediaTypeError(InputError):
     """The request's body is of a type that this route does not read."""
 
     code: ClassVar[str] = "input.media_type"
+
+
+class DigestError(InputError):
+    """The request's body is not the one whose digest its header names."""
+
+    code: ClassVar[str] = "input.digest"
+
+
+class SlowBodyError(InputError):
+    """The request's body came too slowly."""
+
+    code: ClassVar[str] = "input.timeout"
+
+
+class ChecksumError(InputError):
+    """A part of a resumable upload is not the one whose checksum its header names."""
+
+    code: ClassVar[str] = "input.checksum"
+
+
+class TusVersionError(InputError):
+    """A request for a resumable upload is of another version of the protocol."""
+
+    code: ClassVar[str] = "input.tus_version"
+
+
+class OffsetError(ConflictError):
+    """A part of a resumable upload does not begin where the upload ends so far."""
+
+    code: ClassVar[str] = "conflict.offset"
+
+
+class LockedError(ConflictError):
+    """Another request is writing to this upload."""
+
+    code: ClassVar[str] = "conflict.locked"
+
+
+class QuotaError(SpheremarkError):
+    """The logs of this service take as much space as they may."""
+
+    code: ClassVar[str] = "storage.quota"
 
 
 class EmptyBodyError(InputError):
@@ -94,6 +137,9 @@ STATUS: Mapping[type[SpheremarkError], int] = {
     InputError: 400,
     TooLargeError: 413,
     MediaTypeError: 415,
+    SlowBodyError: 408,
+    ChecksumError: 460,  # of tus
+    TusVersionError: 412,
     ReusedKeyError: 422,
     BusyError: 429,
     RecordingError: 422,
@@ -103,7 +149,11 @@ STATUS: Mapping[type[SpheremarkError], int] = {
     ForbiddenError: 403,
     NotFoundError: 404,
     ConflictError: 409,
+    LockedError: 423,
     UnavailableError: 503,
+    StorageError: 503,
+    StorageFullError: 507,
+    QuotaError: 507,
 }
 """HTTP status by error class; a class without its own has that of its nearest ancestor."""
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import os
 import signal
 import socket
 from collections.abc import Callable
@@ -16,6 +17,7 @@ from spheremark.service.settings import Settings
 
 Ready = Callable[[str], None]
 _APPLICATION = "spheremark.service.http.app:create_app"  # by name: commands do not import it
+_PROTOCOL = "spheremark.service.http.protocol:BoundedProtocol"
 _PATIENCE = 5  # [s] that open requests have at shutdown
 
 
@@ -40,6 +42,7 @@ class _Server(uvicorn.Server):
 
 def serve(settings: Settings, *, ready: Ready) -> None:
     """Serve until SIGINT or SIGTERM; ``ready`` gets the address once requests are accepted."""
+    os.umask(0o077)  # what the service and its workers write is for its user alone
     create_app = import_from_string(_APPLICATION)  # Dask, which it imports, configures logging too
     logging.basicConfig(level=logging.WARNING, format="%(levelname)s %(name)s: %(message)s")
     app: FastAPI = create_app(settings)
@@ -47,6 +50,7 @@ def serve(settings: Settings, *, ready: Ready) -> None:
         address = settings.address(listener.getsockname()[1])
         config = uvicorn.Config(
             app,
+            http=_PROTOCOL,
             log_level="critical",  # what goes wrong is logged once, by the service
             access_log=False,
             timeout_graceful_shutdown=_PATIENCE,

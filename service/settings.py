@@ -66,6 +66,14 @@ class Settings(BaseSettings):
     max_upload_bytes: int = Field(
         default=8 << 30, ge=1, description="Largest log that is accepted [bytes]."
     )
+    min_free_bytes: int = Field(
+        default=256 << 20,
+        ge=0,
+        description="Free space of the disk below which no upload is accepted [bytes].",
+    )
+    quota_bytes: int = Field(
+        default=0, ge=0, description="Space that all logs may take [bytes]; 0: no limit."
+    )
     sql_seconds: float = Field(
         default=5.0, gt=0, le=600, description="Time after which a person's query is ended [s]."
     )

@@ -5,19 +5,138 @@ A file is written under another name and moved, so that a reader never sees a pa
 
 from __future__ import annotations
 
+import errno
 import hashlib
+import os
 import posixpath
 import secrets
+import shutil
 from collections.abc import Callable, Iterator
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import fsspec
 
-from spheremark.pipelines.errors import NotFoundError
+from spheremark.pipelines.errors import NotFoundError, SpheremarkError
 
 _BLOCK = 1 << 20  # [bytes] read at a time
+_FULL = (errno.ENOSPC, errno.EDQUOT)
+
+
+class StorageError(SpheremarkError):
+    """The disk of the data folder cannot be written at the moment."""
+
+    code: ClassVar[str] = "storage"
+
+
+class StorageFullError(StorageError):
+    """The disk of the data folder has too little free space."""
+
+    code: ClassVar[str] = "storage.full"
+
+
+def unwritten(path: Path, error: Exception) -> StorageError:
+    """Return why a file could not be written.
+
+    Parameters
+    ----------
+    path : Path
+        The file.
+    error : Exception
+        What the operating system or a library said.
+
+    Returns
+    -------
+    StorageError
+        A ``StorageFullError`` where space ran out.
+    """
+    if getattr(error, "errno", None) in _FULL or "No space left" in str(error):
+        return StorageFullError(
+            f"The disk of {path.parent.name or path.parent} is full ({free_bytes(path):,} bytes "
+            "are free). Nothing that was acknowledged is lost; free space, then try again."
+        )
+    return StorageError(f"{path.name} cannot be written: {str(error).strip().splitlines()[0]}")
+
+
+def free_bytes(path: Path) -> int:
+    """Return the free space of the disk on which a file or folder is.
+
+    Parameters
+    ----------
+    path : Path
+        It, or what shall be made in an existing folder.
+
+    Returns
+    -------
+    int
+        What this user may still write [bytes].
+    """
+    return shutil.disk_usage(path if path.exists() else path.parent).free
+
+
+def require_free(path: Path, n_bytes: int) -> None:
+    """Refuse to write what would leave too little space for the database.
+
+    Parameters
+    ----------
+    path : Path
+        Folder on the disk.
+    n_bytes : int
+        What must be free, the reserve included.
+
+    Raises
+    ------
+    StorageFullError
+        If less is free.
+    """
+    if (free := free_bytes(path)) < n_bytes:
+        raise StorageFullError(
+            f"The disk has {free:,} bytes free; {n_bytes:,} are needed, with what is kept free for "
+            "the database. Free space, or use a data folder on another disk."
+        )
+
+
+def sync_folder(folder: Path) -> None:
+    """Make the names in a folder last through a loss of power.
+
+    Parameters
+    ----------
+    folder : Path
+        The folder.
+    """
+    descriptor = os.open(folder, os.O_RDONLY)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)
+
+
+class Reserve:
+    """Space on a disk that is kept for the database, as a file.
+
+    Parameters
+    ----------
+    path : Path
+        The file.
+    size : int
+        Its size [bytes].
+    """
+
+    def __init__(self, path: Path, size: int) -> None:
+        self._path, self._size = path, size
+
+    def hold(self) -> None:
+        """Take the space, if twice as much is free and it is not taken already."""
+        if self._path.exists() or free_bytes(self._path) < 2 * self._size:
+            return
+        with suppress(OSError), self._path.open("wb") as file:
+            os.posix_fallocate(file.fileno(), 0, self._size)
+
+    def release(self) -> None:
+        """Give the space back."""
+        self._path.unlink(missing_ok=True)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -22,6 +22,7 @@ HTTP_CODES: Mapping[int, str] = {
     400: "input.validation",  # FastAPI: the body cannot be parsed
     404: "not_found",
     405: "method_not_allowed",
+    408: "input.timeout",
     413: "input.too_large",
 }
 ErrorPage = Callable[[Request, Problem], Response]

@@ -12,6 +12,7 @@ import hmac
 import ipaddress
 import re
 from collections.abc import Mapping
+from time import monotonic
 
 from fastapi import Request
 from starlette.datastructures import Headers, MutableHeaders
@@ -32,7 +33,11 @@ from spheremark.service.settings import Settings
 COOKIE = "spheremark_token"
 OPEN_PATHS = ("/healthz", "/login", "/static/")  # open without the token
 LONG_PATHS = ("/api/v1/recordings", "/api/v1/terrains")  # streamed, with a limit of their own
+UPLOADS = "/api/v1/uploads/"  # and what is below it
 BODY_MAX = 16 << 20  # [bytes] of any other body
+BODY_SECONDS = 120.0  # until such a body has arrived
+IDLE_SECONDS = 30.0  # between two parts of a body
+SLOWEST = 1 << 10  # [bytes/s] of a body of any size, after that time
 UNREAD_MAX = 1 << 30  # [bytes] of a refused body that are read before the response is sent
 UNREAD_SECONDS = 30.0
 _SHOWN = 80  # characters of a malformed header that its refusal repeats
@@ -135,7 +140,7 @@ class SecurityMiddleware:
                 "things here."
             )
         declared = int(headers.get("content-length", "0"))
-        if path not in LONG_PATHS and declared > BODY_MAX:
+        if not is_long(path) and declared > BODY_MAX:
             raise _too_large(f"{declared:,}")
         is_open = path.startswith(OPEN_PATHS)
         if self.token and not is_open and not carries_token(request, self.token):
@@ -143,6 +148,11 @@ class SecurityMiddleware:
                 "This service needs its token: send 'Authorization: Bearer <token>', or open "
                 "/login?token=<token> once in a browser."
             )
+
+
+def is_long(path: str) -> bool:
+    """Whether a path takes whole files."""
+    return path in LONG_PATHS or path.startswith(UPLOADS)
 
 
 def check_form(headers: Headers) -> None:
@@ -230,17 +240,36 @@ class _Body:
         headers = request.headers
         self._receive = receive
         self._n_bytes = 0
-        self._is_bounded = request.scope["path"] not in LONG_PATHS
+        self._is_bounded = not is_long(request.scope["path"])
+        self._begin = monotonic()
         self._expects_continue = "expect" in headers  # sends nothing before 100 Continue
         self._is_open = headers.get("content-length", "0") != "0" or "transfer-encoding" in headers
 
     async def receive(self) -> Message:
-        """Return the next part; HTTPException once it is more than any route reads."""
-        message = await self._next()
+        """Return the next part; HTTPException if it is too late, or more than any route reads."""
+        try:
+            async with asyncio.timeout(self._seconds()):
+                message = await self._next()
+        except TimeoutError:
+            self._is_open = False  # nothing more is awaited of it
+            raise HTTPException(
+                408,
+                f"The body came too slowly: {self._n_bytes:,} bytes in "
+                f"{monotonic() - self._begin:.0f} s. Send it again, or in parts "
+                "(/api/v1/uploads) where the connection is slow.",
+                headers={"Connection": "close"},
+            ) from None
         if self._is_bounded and self._n_bytes > BODY_MAX:
             error = _too_large(f"over {BODY_MAX:,}")
             raise HTTPException(413, str(error))  # the one kind that passes FastAPI while it reads
         return message
+
+    def _seconds(self) -> float | None:
+        """Return how long the next part may take [s]; after the end of the body, for ever."""
+        if not self._is_open:
+            return None
+        allowed = BODY_SECONDS + (0.0 if self._is_bounded else self._n_bytes / SLOWEST)
+        return max(0.0, min(IDLE_SECONDS, self._begin + allowed - monotonic()))
 
     async def read_to_its_end(self) -> None:
         """Throw away what is still to come, within reason."""

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import asyncio
 import threading
-from collections import OrderedDict
 from collections.abc import AsyncIterator, Callable
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import asynccontextmanager
@@ -14,8 +13,8 @@ from typing import Annotated, Any, TypeVar
 from fastapi import Depends, Request
 
 from spheremark.pipelines.errors import NotFoundError
-from spheremark.service.errors import BusyError, ReusedKeyError
-from spheremark.service.http.uploads import Inbox
+from spheremark.service.errors import BusyError
+from spheremark.service.http.uploads import Inbox, Resumable, adopt_orphans
 from spheremark.service.jobs.queue import JobQueue
 from spheremark.service.planning.requests import Planner
 from spheremark.service.settings import Settings
@@ -24,31 +23,8 @@ from spheremark.storage.imports.confined import end_children
 
 _Result = TypeVar("_Result")
 
-_KEYS_KEPT = 10_000
 _READERS = 2  # foreign files that are read at once, each in a process of its own
 _READERS_WAITING = 8  # uploads that wait for one of them; others are refused
-
-
-class Idempotency:
-    """The result of each request with an Idempotency-Key, since the service started."""
-
-    def __init__(self) -> None:
-        self._lock = threading.Lock()
-        self._known: OrderedDict[str, tuple[str, str]] = OrderedDict()
-
-    def once(self, key: str | None, request: str, make: Callable[[], str]) -> str:
-        """Return the id of what a request makes, making it only the first time."""
-        if key is None:
-            return make()
-        with self._lock:
-            if key not in self._known:
-                self._known[key] = (request, make())
-            known, made = self._known[key]
-            if len(self._known) > _KEYS_KEPT:
-                self._known.popitem(last=False)
-        if known != request:
-            raise ReusedKeyError(f"The Idempotency-Key {key!r} was used with another request.")
-        return made
 
 
 class Readers:
@@ -90,11 +66,12 @@ class Service:
     settings: Settings
     catalogue: Catalogue
     inbox: Inbox
+    uploads: Resumable
     terrains: Inbox
     jobs: JobQueue
     planner: Planner
     readers: Readers = field(default_factory=Readers)
-    idempotency: Idempotency = field(default_factory=Idempotency)
+    keys: threading.Lock = field(default_factory=threading.Lock)  # of requests that must be one
 
     def row(self, sql: str, key: str, what: str) -> dict[str, Any]:
         """Return the row of a query that takes ``$id``; NotFoundError without one."""
@@ -109,14 +86,20 @@ async def opened(settings: Settings) -> AsyncIterator[Service]:
     """Open the database, the inbox and the cluster; close them in the opposite order."""
     settings = settings.model_copy(update={"data": settings.data.resolve()})
     data = settings.data
-    inbox, terrains = Inbox(data / "recordings"), Inbox(data / "terrains")
-    for one in (inbox, terrains):
+    data.mkdir(parents=True, exist_ok=True)
+    data.chmod(0o700)  # nobody else's: logs, results and digests of tokens
+    inbox, terrains = (
+        Inbox(data / name, settings.min_free_bytes) for name in ("recordings", "terrains")
+    )
+    uploads = Resumable(inbox)
+    for one in (inbox, terrains, uploads):
         one.open()
     with Catalogue(settings.database, snapshots=settings.snapshots) as catalogue:
         async with JobQueue(settings, catalogue, data / "clouds") as jobs:
             threading.Thread(target=_warm_up, name="warm-up", daemon=True).start()
+            await asyncio.to_thread(adopt_orphans, catalogue, inbox)
             planner = Planner(catalogue)
-            service = Service(settings, catalogue, inbox, terrains, jobs, planner)
+            service = Service(settings, catalogue, inbox, uploads, terrains, jobs, planner)
             try:
                 yield service
             finally:

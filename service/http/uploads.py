@@ -1,29 +1,52 @@
-"""Files on their way in: a body streamed to disk while it is hashed, then named by its digest.
+"""Files on their way in: streamed to disk while they are hashed, then named by their digest.
 
-Hides temporary files, blocks and threads; nothing of an upload that breaks off remains.
+Hides temporary files, blocks, threads, and what a loss of power could take: a file has its name
+only when it is complete, its digest right, and file and folder are synced. Nothing of an upload
+that breaks off remains, but for resumable ones (``Resumable``) until they expire.
 """
 
 from __future__ import annotations
 
 import asyncio
+import base64
 import hashlib
+import json
+import logging
 import os
+import re
+import secrets
 import tempfile
-from collections.abc import AsyncIterator
-from contextlib import asynccontextmanager
-from dataclasses import dataclass, replace
+import time
+from collections.abc import AsyncIterator, Callable, Mapping
+from contextlib import asynccontextmanager, contextmanager
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
-from typing import IO, ClassVar
+from typing import IO, Any, ClassVar
 
 from starlette.requests import ClientDisconnect
 
 from spheremark.pipelines.errors import InputError, NotFoundError
-from spheremark.service.errors import EmptyBodyError, RefusedRecordingError, TooLargeError
+from spheremark.service.errors import (
+    ChecksumError,
+    DigestError,
+    EmptyBodyError,
+    LockedError,
+    OffsetError,
+    RefusedRecordingError,
+    TooLargeError,
+)
 from spheremark.storage.catalogue.catalogue import Catalogue
 from spheremark.storage.catalogue.records import RecordingRecord
+from spheremark.storage.files import require_free, sync_folder, unwritten
 from spheremark.storage.recordings import inspect_log
 
+logger = logging.getLogger(__name__)
+
+LOG = ".mcap"
 _BLOCK = 4 << 20  # [bytes] hashed and written at once; large enough that a thread pays off
+_KEPT_SECONDS = 7 * 24 * 3600.0  # until an upload that nobody resumes is removed
+_DIGEST = re.compile(r"(?:^|,)\s*sha-256=:([A-Za-z0-9+/=]+):")
+_NAME = re.compile(rf"([0-9a-f]{{64}}){re.escape(LOG)}")
 
 
 class InterruptedUploadError(InputError):
@@ -44,70 +67,274 @@ class Received:
 class Inbox:
     """A folder of files named by digest, and the files that are still being written beside it."""
 
-    def __init__(self, folder: Path) -> None:
+    def __init__(self, folder: Path, min_free: int = 0) -> None:
         self.folder = folder
-        self._partial = folder / ".partial"
+        self.min_free = min_free
+        self.partial = folder / ".partial"
 
     def open(self) -> None:
         """Make the folders, and remove unfinished uploads of an earlier process."""
-        self._partial.mkdir(parents=True, exist_ok=True)
-        for left in self._partial.iterdir():
-            left.unlink()
+        self.partial.mkdir(parents=True, exist_ok=True)
+        for left in self.partial.iterdir():
+            if left.is_file():
+                left.unlink()
 
-    async def receive(self, chunks: AsyncIterator[bytes], max_bytes: int) -> Received:
-        """Keep a log as ``<sha256>.mcap``; the same bytes twice are one file."""
+    async def receive(
+        self, chunks: AsyncIterator[bytes], max_bytes: int, headers: Mapping[str, str]
+    ) -> Received:
+        """Keep a log under its digest; the same bytes twice are one file."""
+        self.require_room(int(headers.get("content-length", "0")))
         async with self.received(chunks, max_bytes) as part:
-            return replace(part, path=await asyncio.to_thread(self.keep, part, ".mcap"))
+            _check_digest(part.digest, headers)
+            return replace(part, path=await asyncio.to_thread(self.keep, part, LOG))
+
+    def require_room(self, n_bytes: int) -> None:
+        """Refuse a file of so many bytes where too little would be left for the database."""
+        require_free(self.folder, n_bytes + self.min_free)
 
     @asynccontextmanager
     async def received(
         self, chunks: AsyncIterator[bytes], max_bytes: int
     ) -> AsyncIterator[Received]:
         """Have a body as a file without a name of its own, which is removed at the end."""
-        handle, name = tempfile.mkstemp(dir=self._partial)
+        handle, name = tempfile.mkstemp(dir=self.partial)
         path = Path(name)
+        sha = hashlib.sha256()
         try:
             with os.fdopen(handle, "wb") as file:
-                digest, size = await _write_and_hash(chunks, file, max_bytes)
+                size = await self.write(chunks, file, max_bytes, sha.update)
+                await asyncio.to_thread(os.fsync, file.fileno())
             if size == 0:
                 raise EmptyBodyError("The body is empty; send the file itself as the body.")
-            yield Received(path=path, digest=digest, size_bytes=size)
+            yield Received(path=path, digest=sha.hexdigest(), size_bytes=size)
         finally:
             path.unlink(missing_ok=True)  # noqa: ASYNC240  at once: threads may all be busy
 
     def keep(self, part: Received, ending: str) -> Path:
         """Name a file by the digest of what was received."""
         target = self.folder / f"{part.digest}{ending}"
-        part.path.chmod(0o644)
+        part.path.chmod(0o600)
         part.path.replace(target)
+        sync_folder(self.folder)
         return target
 
+    async def write(
+        self,
+        chunks: AsyncIterator[bytes],
+        file: IO[bytes],
+        max_bytes: int,
+        seen: Callable[[bytes], None],
+    ) -> int:
+        """Write all chunks and return how many bytes they are; what was received stays."""
+        block = bytearray()
+        size = 0
 
-async def _write_and_hash(
-    chunks: AsyncIterator[bytes], file: IO[bytes], max_bytes: int
-) -> tuple[str, int]:
-    """Write all chunks; return the SHA-256 and the size of what was written."""
-    sha = hashlib.sha256()
-    block = bytearray()
-    size = 0
+        def put(data: bytearray) -> None:
+            require_free(self.folder, self.min_free)
+            with _translated(self.folder):
+                file.write(data)
+                file.flush()
+            seen(bytes(data))
 
-    def put(data: bytearray) -> None:
-        file.write(data)
-        sha.update(data)
+        try:
+            async for chunk in chunks:
+                block += chunk
+                size += len(chunk)
+                if size > max_bytes:
+                    raise TooLargeError(
+                        f"The body is larger than the {max_bytes:,} bytes accepted."
+                    )
+                if len(block) >= _BLOCK:
+                    await asyncio.to_thread(put, block)
+                    block = bytearray()
+        except ClientDisconnect as error:
+            await asyncio.to_thread(put, block)
+            raise InterruptedUploadError(f"The sender went away after {size:,} bytes.") from error
+        await asyncio.to_thread(put, block)
+        return size
 
+
+@contextmanager
+def _translated(folder: Path) -> Any:
+    """Turn errors of the disk into ours."""
     try:
-        async for chunk in chunks:
-            block += chunk
-            size += len(chunk)
-            if size > max_bytes:
-                raise TooLargeError(f"The body is larger than the {max_bytes:,} bytes accepted.")
-            if len(block) >= _BLOCK:
-                await asyncio.to_thread(put, block)
-                block = bytearray()
-    except ClientDisconnect as error:
-        raise InterruptedUploadError(f"The sender went away after {size:,} bytes.") from error
-    await asyncio.to_thread(put, block)
-    return sha.hexdigest(), size
+        yield
+    except OSError as error:
+        raise unwritten(folder, error) from error
+
+
+def _check_digest(found: str, headers: Mapping[str, str]) -> None:
+    """Refuse a body that is not the one whose SHA-256 its header names (RFC 9530)."""
+    for name in ("repr-digest", "content-digest"):
+        if match := _DIGEST.search(headers.get(name, "")):
+            expected = base64.b64decode(match[1]).hex()
+            if expected != found:
+                raise DigestError(
+                    f"The SHA-256 of the body is {found}, that of its header {expected}: it was "
+                    "changed on its way. Send it again."
+                )
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Upload:
+    """A resumable upload: its whole length [bytes], what the sender says of it, and its end."""
+
+    upload_id: str
+    length: int
+    metadata: Mapping[str, str]
+    expires_at: float
+    path: Path
+
+    @property
+    def offset(self) -> int:
+        """Number of bytes that are here."""
+        return self.path.stat().st_size
+
+
+@dataclass(slots=True)
+class _Progress:
+    """The SHA-256 of the first bytes of an upload."""
+
+    sha: Any = field(default_factory=hashlib.sha256)
+    n_bytes: int = 0
+
+    def add(self, data: bytes) -> None:
+        """Take in the next bytes."""
+        self.sha.update(data)
+        self.n_bytes += len(data)
+
+
+class Resumable:
+    """Uploads that go on after an interruption, also of the service: files beside the inbox."""
+
+    def __init__(self, inbox: Inbox) -> None:
+        self._inbox = inbox
+        self._folder = inbox.partial / "resumable"
+        self._progress: dict[str, _Progress] = {}
+        self._busy: set[str] = set()
+
+    def open(self) -> None:
+        """Make the folder, and remove uploads that have expired."""
+        self._folder.mkdir(parents=True, exist_ok=True)
+        for about in self._folder.glob("*.json"):
+            self._existing(about.stem)
+        known = {about.stem for about in self._folder.glob("*.json")}
+        for left in self._folder.iterdir():
+            if left.stem not in known:
+                left.unlink()
+
+    def create(self, length: int, metadata: Mapping[str, str]) -> Upload:
+        """Begin an upload of so many bytes."""
+        self._inbox.require_room(length)
+        upload_id = secrets.token_hex(16)
+        path = self._folder / upload_id
+        upload = Upload(
+            upload_id=upload_id,
+            length=length,
+            metadata=dict(metadata),
+            expires_at=time.time() + _KEPT_SECONDS,
+            path=path,
+        )
+        path.touch(mode=0o600)
+        about = asdict(upload) | {"path": str(path)}
+        path.with_suffix(".json").write_text(json.dumps(about), encoding="utf-8")
+        return upload
+
+    def get(self, upload_id: str) -> Upload:
+        """Return an upload that has not expired."""
+        upload = self._existing(upload_id) if re.fullmatch(r"[0-9a-f]{32}", upload_id) else None
+        if upload is None:
+            raise NotFoundError(
+                f"There is no upload {upload_id!r}: it is complete, was ended, or has expired."
+            )
+        return upload
+
+    def end(self, upload_id: str) -> None:
+        """Forget an upload and its bytes."""
+        self._progress.pop(upload_id, None)
+        path = self._folder / upload_id
+        path.with_suffix(".json").unlink(missing_ok=True)
+        path.unlink(missing_ok=True)
+
+    async def append(
+        self,
+        upload: Upload,
+        offset: int,
+        chunks: AsyncIterator[bytes],
+        checksum: tuple[str, bytes] | None,
+    ) -> Received | None:
+        """Write the next part; return the file once it is complete."""
+        if upload.upload_id in self._busy:
+            raise LockedError("Another request is writing to this upload; wait for its end.")
+        self._busy.add(upload.upload_id)
+        try:
+            if offset != upload.offset:
+                raise OffsetError(
+                    f"The part begins at byte {offset:,}; the upload ends at {upload.offset:,}. "
+                    "Ask for the offset (HEAD) and send the rest."
+                )
+            await self._write(upload, chunks, checksum)
+            if upload.offset < upload.length:
+                return None
+            return await asyncio.to_thread(self._complete, upload)
+        finally:
+            self._busy.discard(upload.upload_id)
+
+    async def _write(
+        self, upload: Upload, chunks: AsyncIterator[bytes], checksum: tuple[str, bytes] | None
+    ) -> None:
+        """Append a part; one with a wrong checksum leaves nothing."""
+        offset = upload.offset
+        progress = await asyncio.to_thread(self._progress_of, upload)
+        part = hashlib.new(checksum[0]) if checksum else None
+        backup = progress.sha.copy()
+
+        def seen(data: bytes) -> None:
+            progress.add(data)
+            if part is not None:
+                part.update(data)
+
+        with upload.path.open("ab") as file:
+            await self._inbox.write(chunks, file, upload.length - offset, seen)
+            if part is not None and checksum is not None and part.digest() != checksum[1]:
+                file.truncate(offset)
+                self._progress[upload.upload_id] = _Progress(backup, offset)
+                raise ChecksumError(
+                    f"The {checksum[0]} of the part is not that of its header; send it again."
+                )
+            await asyncio.to_thread(os.fsync, file.fileno())
+
+    def _progress_of(self, upload: Upload) -> _Progress:
+        """Return the digest so far; read again what an earlier process has received."""
+        progress = self._progress.get(upload.upload_id)
+        if progress is None or progress.n_bytes != upload.offset:
+            progress = _Progress()
+            with upload.path.open("rb") as file:
+                while data := file.read(_BLOCK):
+                    progress.add(data)
+            self._progress[upload.upload_id] = progress
+        return progress
+
+    def _complete(self, upload: Upload) -> Received:
+        """Give a complete file its name."""
+        digest = self._progress_of(upload).sha.hexdigest()
+        part = Received(path=upload.path, digest=digest, size_bytes=upload.length)
+        kept = replace(part, path=self._inbox.keep(part, LOG))
+        self.end(upload.upload_id)
+        return kept
+
+    def _existing(self, upload_id: str) -> Upload | None:
+        """Return an upload if it is there; remove one that has expired or is damaged."""
+        path = self._folder / upload_id
+        try:
+            about = json.loads(path.with_suffix(".json").read_text("utf-8"))
+            upload = Upload(**about | {"path": path})
+        except (OSError, ValueError, TypeError):
+            upload = None
+        if upload is None or upload.expires_at < time.time() or not path.exists():
+            self.end(upload_id)
+            return None
+        return upload
 
 
 def take_in(catalogue: Catalogue, received: Received, name: str) -> tuple[RecordingRecord, bool]:
@@ -115,21 +342,48 @@ def take_in(catalogue: Catalogue, received: Received, name: str) -> tuple[Record
 
     A log that cannot be processed is kept with the reason, which is then raised.
     """
-    try:
-        recording, is_new = catalogue.get_recording(received.digest), False
-    except NotFoundError:
-        recording, is_new = _enter(catalogue, received, name), True
+    recording, is_new = enter(catalogue, received, name)
     if recording.verdict == "refused":
         raise RefusedRecordingError.of(recording)
     return recording, is_new
 
 
-def _enter(catalogue: Catalogue, received: Received, name: str) -> RecordingRecord:
-    """Inspect a log and enter it with what was found."""
-    return catalogue.add_recording(
-        received.digest,
-        name=name.removesuffix(".mcap"),
-        size_bytes=received.size_bytes,
-        url=str(received.path),
-        preflight=inspect_log(received.path).to_mapping(),
-    )
+def enter(catalogue: Catalogue, received: Received, name: str) -> tuple[RecordingRecord, bool]:
+    """Enter a log that arrived, with its preflight; return it, and whether it is new."""
+    try:
+        return catalogue.get_recording(received.digest), False
+    except NotFoundError:
+        recording = catalogue.add_recording(
+            received.digest,
+            name=name.removesuffix(LOG),
+            size_bytes=received.size_bytes,
+            url=str(received.path),
+            preflight=inspect_log(received.path).to_mapping(),
+        )
+        return recording, True
+
+
+def adopt_orphans(catalogue: Catalogue, inbox: Inbox) -> int:
+    """Enter the logs of which an ended process left the file and no row; return their number.
+
+    Files whose bytes are not those of their name go to ``.damaged`` beside them.
+    """
+    files = {
+        match[1]: path for path in inbox.folder.iterdir() if (match := _NAME.fullmatch(path.name))
+    }
+    known = {row["recording_id"] for row in catalogue.rows("SELECT recording_id FROM recordings")}
+    n_adopted = 0
+    for digest in sorted(files.keys() - known):
+        path = files[digest]
+        with path.open("rb") as file:
+            is_whole = hashlib.file_digest(file, "sha256").hexdigest() == digest
+        if is_whole:
+            received = Received(path=path, digest=digest, size_bytes=path.stat().st_size)
+            enter(catalogue, received, f"recovered-{digest[:8]}")
+            n_adopted += 1
+        else:
+            damaged = inbox.folder / ".damaged"
+            damaged.mkdir(exist_ok=True)
+            path.replace(damaged / path.name)
+        logger.warning("%s without a row: %s", path.name, "entered" if is_whole else "damaged")
+    return n_adopted

@@ -11,11 +11,13 @@ import logging
 import os
 import secrets
 import traceback
+from collections.abc import Callable
 from contextlib import AsyncExitStack, suppress
 from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path
 from time import monotonic
-from typing import Any, Self
+from typing import Any, Self, TypeVar
 
 import dask
 from distributed import Client, Future, LocalCluster, Security
@@ -30,12 +32,16 @@ from spheremark.service.jobs.handlers import KINDS, JobKind, JobResult, JobSpeci
 from spheremark.service.settings import Settings
 from spheremark.storage.catalogue.catalogue import Catalogue
 from spheremark.storage.catalogue.records import JobRecord
+from spheremark.storage.files import StorageError
 
 logger = logging.getLogger(__name__)
+
+_Result = TypeVar("_Result")
 
 INTERNAL = "internal"
 WORKER_DIED = "worker_died"
 _RECORD_EVERY = 0.5  # [s] between two reports of progress that reach the database
+_STORE_AGAIN, _STORE_AGAIN_MAX = 1.0, 30.0  # [s] until a result is written again
 _GRACE = 1.0  # [s] that a dismissed job has to stop between two steps
 
 
@@ -84,7 +90,8 @@ class JobQueue:
         await self._client.register_plugin(tasks.WarmUp(is_ours=not self._settings.scheduler))
         recorder = asyncio.create_task(self._record())
         self._stack.callback(recorder.cancel)
-        for job in await asyncio.to_thread(self._catalogue.take_up_jobs):
+        most = self._settings.job_attempts
+        for job in await asyncio.to_thread(self._catalogue.take_up_jobs, most, self._why_killed()):
             self._start(job)
         return self
 
@@ -93,6 +100,8 @@ class JobQueue:
         for follower in self._followers:
             follower.cancel()
         await asyncio.gather(*self._followers, return_exceptions=True)
+        with suppress(StorageError):
+            await asyncio.to_thread(self._catalogue.release_jobs)
         await self._stack.aclose()
 
     async def _connect(self) -> Client:
@@ -179,7 +188,7 @@ class JobQueue:
             async with live.turn:
                 if not live.has_begun:
                     await self._begin(live)
-                ended = await asyncio.to_thread(self._finish, live, result)
+                ended = await self._stored(self._finish, live, result)
         except FutureCancelledError:
             ended = await asyncio.to_thread(self._catalogue.get_job, job.job_id)
         except KilledWorker:
@@ -222,9 +231,24 @@ class JobQueue:
         job_id = live.job.job_id
         if live.has_begun:
             reason = "The worker died; tried again."
-            await asyncio.to_thread(self._catalogue.requeue_job, job_id, reason)
+            await self._stored(self._catalogue.requeue_job, job_id, reason)
         live.has_begun = True
-        live.job = await asyncio.to_thread(self._catalogue.start_job, job_id)
+        live.job = await self._stored(self._catalogue.start_job, job_id)
+        if live.job.attempts > self._settings.job_attempts:  # those before a restart count too
+            await self._fail(live, WORKER_DIED, self._why_killed())
+            if live.future is not None:
+                await live.future.cancel(force=True)
+
+    async def _stored(self, store: Callable[..., _Result], *arguments: Any) -> _Result:
+        """Write to the catalogue; while the disk refuses, try again: no result is lost by it."""
+        pause = _STORE_AGAIN
+        while True:
+            try:
+                return await asyncio.to_thread(store, *arguments)
+            except StorageError as error:
+                logger.warning("Not stored, trying again in %g s: %s", pause, error)
+                await asyncio.sleep(pause)
+                pause = min(2.0 * pause, _STORE_AGAIN_MAX)
 
     def _finish(self, live: _Live, result: JobResult) -> JobRecord:
         """Write results and end of a job in one transaction; a dismissed job keeps none."""
@@ -239,9 +263,8 @@ class JobQueue:
         """Record why a job failed, unless it was dismissed before."""
         job_id = live.job.job_id
         try:
-            return await asyncio.to_thread(
-                self._catalogue.fail_job, job_id, code=code, reason=reason, traceback=trace
-            )
+            fail = partial(self._catalogue.fail_job, code=code, reason=reason, traceback=trace)
+            return await self._stored(fail, job_id)
         except ConflictError:
             return await asyncio.to_thread(self._catalogue.get_job, job_id)
 
@@ -278,12 +301,9 @@ class JobQueue:
         await self.events.add(live.job)
         if monotonic() - live.recorded_at >= _RECORD_EVERY:
             live.recorded_at = monotonic()
-            await asyncio.to_thread(
-                self._catalogue.report_progress,
-                live.job.job_id,
-                event["percent"],
-                event["message"],
-            )
+            report = (live.job.job_id, event["percent"], event["message"])
+            with suppress(StorageError):  # the next one may succeed
+                await asyncio.to_thread(self._catalogue.report_progress, *report)
 
 
 def recordings_of(job: JobRecord) -> tuple[str, ...]:

@@ -47,6 +47,8 @@ INSERT INTO jobs (job_id, kind, survey_id, recording_id, config, options, create
     progress_percent, message, attempts)
 VALUES (?, ?, ?, ?, ?, ?, ?, 'accepted', 0, 'Waiting for a worker.', 0)
 """
+_KEY = "SELECT request, job_id FROM idempotency_keys WHERE key = $key"
+_KEEP_KEY = "INSERT INTO idempotency_keys VALUES (?, ?, ?, ?)"
 _START = """
 UPDATE jobs SET status = 'running', started_at = ?, attempts = attempts + 1, progress_percent = 0,
     message = 'Started.'
@@ -68,6 +70,16 @@ _DISMISS = """
 UPDATE jobs SET status = 'dismissed', message = 'Dismissed.', finished_at = ? WHERE job_id = ?
 """
 _REQUEUE = "UPDATE jobs SET status = 'accepted', progress_percent = 0, message = ? WHERE job_id = ?"
+_GIVE_UP = """
+UPDATE jobs SET status = 'failed', message = 'Failed.', finished_at = ?, error_code = 'worker_died',
+    error_reason = ?
+WHERE status = 'running' AND attempts >= ?
+"""
+_RELEASE = """
+UPDATE jobs SET status = 'accepted', attempts = attempts - 1, progress_percent = 0,
+    message = 'Waiting for the service.'
+WHERE status = 'running'
+"""
 _RESUME = """
 UPDATE jobs SET status = 'accepted', progress_percent = 0,
     message = 'Taken up again after a restart.'
@@ -100,8 +112,12 @@ class Catalogue(Surveys):
         recording_id: str | None,
         config: Mapping[str, Any],
         options: Mapping[str, Any] = _NO_OPTIONS,
+        key: tuple[str, str] | None = None,
     ) -> JobRecord:
-        """Accept a job on a survey (id or name) and a log; without a log on the whole survey."""
+        """Accept a job on a survey (id or name) and a log; without a log on the whole survey.
+
+        ``key`` names the request, with a digest of it: see ``job_of_key``.
+        """
         check_name("The kind of a job", kind)
         survey_id = self.get_survey(survey).survey_id
         if recording_id is not None:
@@ -110,7 +126,14 @@ class Catalogue(Surveys):
         texts = [json_text(config), json_text(options)]
         with self.writing() as cursor:
             cursor.execute(_CREATE, [job_id, kind, survey_id, recording_id, *texts, now()])
+            if key is not None:
+                cursor.execute(_KEEP_KEY, [*key, job_id, now()])
         return self.get_job(job_id)
+
+    def job_of_key(self, key: str) -> tuple[str, JobRecord] | None:
+        """Return the request that has a key, as its digest, and its job; None if there is none."""
+        rows = self.rows(_KEY, {"key": key})
+        return (rows[0]["request"], self.get_job(rows[0]["job_id"])) if rows else None
 
     def get_job(self, job_id: str) -> JobRecord:
         """Return a job."""
@@ -196,9 +219,18 @@ class Catalogue(Surveys):
         """Accept a running job again, for another attempt; the message gives the reason."""
         return self._change(job_id, (JobStatus.RUNNING,), _REQUEUE, message)
 
-    def take_up_jobs(self) -> tuple[JobRecord, ...]:
-        """Accept interrupted jobs again at the start of the service; return all, oldest first."""
+    def release_jobs(self) -> None:
+        """Accept running jobs again at the end of the service; the attempt does not count."""
         with self.writing() as cursor:
+            cursor.execute(_RELEASE)
+
+    def take_up_jobs(self, attempts: int, reason: str) -> tuple[JobRecord, ...]:
+        """Accept interrupted jobs again at the start of the service; return all, oldest first.
+
+        Those that were begun so many times, and never came to an end, fail for this reason.
+        """
+        with self.writing() as cursor:
+            cursor.execute(_GIVE_UP, [now(), reason, attempts])
             cursor.execute(_RESUME)
             rows = fetch(cursor, _JOBS_ACCEPTED, {}).to_pylist()
             return tuple(record_of(JobRecord, row) for row in rows)

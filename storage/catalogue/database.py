@@ -8,6 +8,7 @@ file again: that would drop the lock that DuckDB holds on it.
 
 from __future__ import annotations
 
+import logging
 import re
 import threading
 from collections.abc import Iterator, Mapping
@@ -25,7 +26,13 @@ from spheremark.pipelines.errors import ConflictError, InputError
 from spheremark.storage.catalogue import migrations
 from spheremark.storage.catalogue.records import TableInfo, tables_of
 from spheremark.storage.catalogue.snapshots import Snapshots, portable_copy
+from spheremark.storage.files import Reserve, StorageError, StorageFullError, unwritten
 
+logger = logging.getLogger(__name__)
+
+_RESERVE = "reserve"  # name of the file beside the database
+_RESERVE_BYTES = 32 << 20  # what DuckDB needs to write its log into the file, many times over
+_PATIENCE = 10.0  # [s] for queries that still run on an invalid database; they fail at once
 _N_ROWS_MAX = 200_000  # of one static query; a page that needs more should aggregate
 _COLUMNS = """
 SELECT c.table_name, c.column_name, c.data_type, c.comment, t.kind, t.comment AS table_comment
@@ -64,16 +71,29 @@ class Database:
     Safe to use from many threads. Once open, the database cannot reach files or the network,
     and its configuration is locked. A query uses one thread: the rows of a page or of a result are
     too few for more.
+
+    A write that the disk refuses makes DuckDB invalid for good. The file is then opened anew, with
+    all that was committed; where the disk is full, the reserve beside the file is given up for it.
     """
 
     def __init__(self, path: Path, *, snapshots: Path, memory_limit: str = "1GB") -> None:
         self.path = path
+        self._memory_limit = memory_limit
         self._lock = threading.RLock()
+        self._readers = 0
+        self._none_reads = threading.Condition()
+        self._failure: duckdb.Error | None = None
         self._version = 0
-        self._connection = _open(path, memory_limit)
+        self._open()
+        self._reserve = Reserve(path.with_name(_RESERVE), _RESERVE_BYTES)
+        self._reserve.hold()
+        self._snapshots = Snapshots(path, snapshots)
+
+    def _open(self) -> None:
+        """Open the file, and what depends on the connection."""
+        self._connection = _open(self.path, self._memory_limit)
         self._writer = self._connection.cursor()
         self._statements: dict[str, duckdb.Statement] = {}
-        self._snapshots = Snapshots(path, snapshots)
 
     def __enter__(self) -> Self:
         return self
@@ -91,6 +111,7 @@ class Database:
         with self._lock:
             self._writer.close()
             self._connection.close()
+            self._reserve.release()
 
     def columns(
         self, sql: str, parameters: Mapping[str, Any] | None = None
@@ -120,7 +141,8 @@ class Database:
         Copied only when more than progress was committed since the last copy, and by another
         process: opening and closing the file here would drop DuckDB's lock.
         """
-        with self._lock:
+        with self._lock, self._usable():
+            self._reserve.hold()
             return self._snapshots.take(self._connection, self._version)
 
     def export(self) -> Path:
@@ -130,13 +152,13 @@ class Database:
     @contextmanager
     def reading(self) -> Iterator[duckdb.DuckDBPyConnection]:
         """Give this thread its own cursor."""
-        with closing(self._connection.cursor()) as cursor:
+        with self._usable(), self._counted(), closing(self._connection.cursor()) as cursor:
             yield cursor
 
     @contextmanager
     def writing(self, *, is_result: bool = True) -> Iterator[duckdb.DuckDBPyConnection]:
         """Hold the write lock and a transaction."""
-        with self._lock:
+        with self._lock, self._usable():
             cursor = self._writer
             try:
                 cursor.execute(self._statement("BEGIN"))
@@ -147,6 +169,58 @@ class Database:
                     cursor.execute("ROLLBACK")
                 raise
             self._version += is_result
+
+    @contextmanager
+    def _usable(self) -> Iterator[None]:
+        """Open the database anew if it was invalid, and note if it becomes so."""
+        if self._failure is not None:
+            self._reopen()
+        try:
+            yield
+        except duckdb.FatalException as error:
+            self._failure = error
+            raise self._unwritten(error) from error
+        except (duckdb.IOException, duckdb.TransactionException) as error:
+            if "Could not write" not in str(error):
+                raise
+            raise self._unwritten(error) from error
+
+    def _unwritten(self, error: duckdb.Error) -> StorageError:
+        """Return why the file could not be written; a full disk gets the room of the reserve."""
+        found = unwritten(self.path, error)
+        logger.error("%s", found)
+        if isinstance(found, StorageFullError):
+            self._reserve.release()
+        return found
+
+    @contextmanager
+    def _counted(self) -> Iterator[None]:
+        """Count those who read: their cursors keep an invalid database in memory."""
+        with self._none_reads:
+            self._readers += 1
+        try:
+            yield
+        finally:
+            with self._none_reads:
+                self._readers -= 1
+                self._none_reads.notify_all()
+
+    def _reopen(self) -> None:
+        """Replace an invalid connection; with the room of the reserve if there is no other."""
+        with self._lock, self._none_reads:
+            if self._failure is None or not self._none_reads.wait_for(
+                lambda: not self._readers, _PATIENCE
+            ):
+                return
+            with suppress(duckdb.Error):
+                self._writer.close()
+                self._connection.close()
+            try:
+                self._open()
+            except (duckdb.Error, InputError) as error:
+                raise unwritten(self.path, error) from error
+            self._failure = None
+            logger.warning("The database is open again: %s", self.path)
 
     def _statement(self, sql: str) -> duckdb.Statement:
         """Return a static statement for the writing cursor, parsed only once."""

@@ -10,6 +10,7 @@ from time import monotonic, sleep
 import duckdb
 
 from spheremark.pipelines.errors import ConflictError
+from spheremark.storage.files import unwritten
 
 _PATIENCE = 10.0  # [s] to wait for readers; a static query takes milliseconds
 _PAUSE = 0.002  # [s] between two tries
@@ -94,5 +95,8 @@ def _copy(source: Path, target: Path) -> None:
     command = ["cp", "--reflink=auto", "--", str(source), str(part)]
     done = subprocess.run(command, capture_output=True, text=True, check=False)
     if done.returncode:
+        part.unlink(missing_ok=True)
+        if "No space left" in done.stderr:
+            raise unwritten(part, OSError(done.stderr))
         raise ConflictError(f"No snapshot of {source} could be made: {done.stderr.strip()}.")
     part.replace(target)

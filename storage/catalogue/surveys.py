@@ -7,7 +7,6 @@ import re
 import secrets
 from collections.abc import Mapping
 from datetime import UTC, datetime
-from pathlib import Path
 from typing import Any
 
 import pyarrow as pa
@@ -77,8 +76,9 @@ _CONTROL = "SELECT * FROM control_marks WHERE survey_id = $id ORDER BY place"
 class Surveys(Lists):
     """The inputs of jobs: surveys with marks and truth, logs, rigs. Opened like ``Database``."""
 
-    def __init__(self, path: Path, *, snapshots: Path, memory_limit: str = "1GB") -> None:
-        super().__init__(path, snapshots=snapshots, memory_limit=memory_limit)
+    def _open(self) -> None:
+        """Open the file, and the writer of its tables."""
+        super()._open()
         self._tables = TableWriter(self._writer)
 
     # Surveys, their marks and their truth

@@ -54,6 +54,8 @@ WRONG = [  # method, path, arguments, status, code
      {"content": b"x", "headers": {"Content-Type": "application/vnd.mcap"}}, 400, "input"),
     ("POST", "/api/v1/recordings?name=a&survey=nobody",
      {"content": b"x", "headers": {"Content-Type": "application/vnd.mcap"}}, 404, "not_found"),
+    ("POST", "/api/v1/uploads", {"headers": {"Upload-Length": "3"}}, 412, "input.tus_version"),
+    ("DELETE", "/api/v1/uploads/none", {"headers": {"Tus-Resumable": "1.0.0"}}, 404, "not_found"),
     ("GET", f"/api/v1/recordings/{DIGEST}", {}, 404, "not_found"),
     ("GET", "/api/v1/recordings/short", {}, 422, "input.validation"),
     ("GET", f"/api/v1/recordings/{DIGEST}/preflight", {}, 404, "not_found"),

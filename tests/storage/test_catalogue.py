@@ -434,11 +434,43 @@ def test_jobs_that_ran_when_the_service_died_are_taken_up_again(tmp_path):
         ran, waited = running(catalogue), job(catalogue)
         done = finished(catalogue)
     with opened(tmp_path) as catalogue:
-        taken = catalogue.take_up_jobs()
+        taken = catalogue.take_up_jobs(3, "The worker died.")
         assert [one.job_id for one in taken] == [ran.job_id, waited.job_id]
         assert all(one.status is JobStatus.ACCEPTED for one in taken)
         assert catalogue.start_job(ran.job_id).attempts == 2
         assert catalogue.get_job(done.job_id).status is JobStatus.SUCCESSFUL
+
+
+def test_a_job_that_ended_the_service_too_often_fails_at_its_next_start(catalogue):
+    catalogue.create_survey("lane")
+    begun = running(catalogue)
+    for _ in range(2):
+        (taken,) = catalogue.take_up_jobs(3, "The worker died.")
+        catalogue.start_job(taken.job_id)
+    assert catalogue.get_job(begun.job_id).attempts == 3
+    assert catalogue.take_up_jobs(3, "The worker died.") == ()
+    failed = catalogue.get_job(begun.job_id)
+    assert (failed.status, failed.error_code) == (JobStatus.FAILED, "worker_died")
+    assert failed.error_reason == "The worker died."
+
+
+def test_an_attempt_that_the_end_of_the_service_interrupts_does_not_count(catalogue):
+    catalogue.create_survey("lane")
+    begun = running(catalogue)
+    catalogue.release_jobs()
+    released = catalogue.get_job(begun.job_id)
+    assert (released.status, released.attempts) == (JobStatus.ACCEPTED, 0)
+
+
+def test_the_job_of_a_key_is_known_after_a_restart(tmp_path):
+    with opened(tmp_path) as catalogue:
+        catalogue.create_survey("lane")
+        made = catalogue.create_job(
+            "process", survey="lane", recording_id=None, config={}, key=("k", "digest")
+        )
+    with opened(tmp_path) as catalogue:
+        assert catalogue.job_of_key("k") == ("digest", catalogue.get_job(made.job_id))
+        assert catalogue.job_of_key("other") is None
 
 
 def test_a_job_whose_worker_died_waits_for_another_attempt(catalogue):

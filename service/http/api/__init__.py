@@ -15,12 +15,13 @@ from spheremark.service.http.api import (
     rigs,
     sql,
     surveys,
+    uploads,
 )
 from spheremark.service.http.api import sites as products
 
 router = APIRouter()
 for part in (
-    *(surveys, recordings, jobs, results),
+    *(surveys, recordings, uploads, jobs, results),
     *(products, rigs, plans, sql, problems),
 ):
     router.include_router(part.router)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 from collections.abc import AsyncIterator
 from typing import Annotated, Any
@@ -15,7 +16,7 @@ from starlette.exceptions import HTTPException
 from spheremark.pipelines.config import SurveyConfig
 from spheremark.pipelines.errors import InputError
 from spheremark.pipelines.scan.rigs import rig_digest
-from spheremark.service.errors import RefusedRecordingError
+from spheremark.service.errors import RefusedRecordingError, ReusedKeyError
 from spheremark.service.http.api.models import Job, Listing, NewJob
 from spheremark.service.http.api.surveys import After, Limit
 from spheremark.service.http.state import Current, Service
@@ -39,11 +40,21 @@ def create_job(
     idempotency_key: Annotated[str | None, Header(min_length=1, max_length=200)] = None,
 ) -> Job:
     """Start a job; the same Idempotency-Key with the same request is the same job."""
-    job = service.idempotency.once(
-        idempotency_key, new.model_dump_json(), lambda: start(service, new).job_id
-    )
-    response.headers["Location"] = f"/api/v1/jobs/{job}"
-    return Job.of(service.catalogue.get_job(job))
+    job = start(service, new) if idempotency_key is None else _once(service, new, idempotency_key)
+    response.headers["Location"] = f"/api/v1/jobs/{job.job_id}"
+    return job
+
+
+def _once(service: Service, new: NewJob, key: str) -> Job:
+    """Start a job, or return the one that the same request with this key has started."""
+    request = hashlib.sha256(new.model_dump_json().encode()).hexdigest()
+    with service.keys:
+        known = service.catalogue.job_of_key(key)
+        if known is None:
+            return start(service, new, (key, request))
+    if known[0] != request:
+        raise ReusedKeyError(f"The Idempotency-Key {key!r} was used with another request.")
+    return Job.of(known[1])
 
 
 @router.get("", name="list_jobs")
@@ -106,7 +117,7 @@ async def dismiss_job(job: JobId, service: Current) -> Job:
     return Job.of(await service.jobs.dismiss(job))
 
 
-def start(service: Service, new: NewJob) -> Job:
+def start(service: Service, new: NewJob, key: tuple[str, str] | None = None) -> Job:
     """Accept a job and submit it to the cluster."""
     survey = service.catalogue.get_survey(new.survey)
     kind = KINDS[new.kind]
@@ -119,6 +130,7 @@ def start(service: Service, new: NewJob) -> Job:
         recording_id=recordings[0] if kind.takes_one_log else None,
         config=config.to_mapping(),
         options=options if kind.takes_one_log else options | {"recordings": recordings},
+        key=key,
     )
     service.jobs.submit(record)
     return Job.of(record)

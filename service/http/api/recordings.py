@@ -9,7 +9,7 @@ from fastapi import APIRouter, Path, Query, Request, Response
 from fastapi.responses import FileResponse
 
 from spheremark.pipelines.errors import InputError
-from spheremark.service.errors import MediaTypeError, TooLargeError
+from spheremark.service.errors import MediaTypeError, QuotaError, TooLargeError
 from spheremark.service.http.api.jobs import start
 from spheremark.service.http.api.models import Job, Listing, NewJob, Recording, Upload
 from spheremark.service.http.api.surveys import After, Limit
@@ -23,6 +23,7 @@ router = APIRouter(prefix="/recordings", tags=["recordings"])
 Digest = Annotated[str, Path(description="SHA-256 of the log.", pattern="^[0-9a-f]{64}$")]
 MCAP = "application/vnd.mcap"
 _MEDIA_TYPES = (MCAP, "application/octet-stream")
+_USED = "SELECT coalesce(sum(size_bytes), 0)::BIGINT AS used FROM recordings"
 _BODY = {
     "requestBody": {
         "required": True,
@@ -49,16 +50,19 @@ async def upload_recording(
     process: Annotated[bool, Query(description="Whether to start a job at once.")] = False,  # noqa: FBT002
 ) -> Upload:
     """Take in a log: the body is the file, streamed to disk; a refused log is kept as well."""
-    _check_upload(request, service.settings.max_upload_bytes)
+    most = service.settings.max_upload_bytes
+    _check_upload(request, most)
     if process or survey is not None:
-        await asyncio.to_thread(_check_survey, service, survey)
-    received = await service.inbox.receive(request.stream(), service.settings.max_upload_bytes)
+        await asyncio.to_thread(check_survey, service, survey)
+    declared = int(request.headers.get("content-length", "0"))
+    await asyncio.to_thread(check_quota, service, declared)
+    received = await service.inbox.receive(request.stream(), most, request.headers)
     recording, is_new = await asyncio.to_thread(take_in, service.catalogue, received, name)
     response.status_code = 201 if is_new else 200
     response.headers["Location"] = f"/api/v1/recordings/{recording.recording_id}"
     if survey is not None:
         await asyncio.to_thread(service.catalogue.add_to_survey, survey, recording.recording_id)
-    job = await asyncio.to_thread(_start, service, survey, recording) if process else None
+    job = await asyncio.to_thread(start_job, service, survey, recording) if process else None
     return Upload(**Recording.of(recording).model_dump(), job=job)
 
 
@@ -107,14 +111,25 @@ def _check_upload(request: Request, max_bytes: int) -> None:
         raise TooLargeError(f"The log has {int(declared):,} bytes; {max_bytes:,} are accepted.")
 
 
-def _check_survey(service: Service, survey: str | None) -> str:
+def check_quota(service: Service, n_bytes: int) -> None:
+    """Refuse a log with which all logs take more space than they may."""
+    quota = service.settings.quota_bytes
+    (row,) = service.catalogue.rows(_USED) if quota else ({"used": 0},)
+    if quota and row["used"] + n_bytes > quota:
+        raise QuotaError(
+            f"The log has {n_bytes:,} bytes; {max(0, quota - row['used']):,} of the "
+            f"{quota:,} for all logs are left (SPHEREMARK_QUOTA_BYTES)."
+        )
+
+
+def check_survey(service: Service, survey: str | None) -> str:
     """Return the survey that a job shall belong to."""
     if survey is None:
         raise InputError("process=true needs survey=<id or name>: results belong to a survey.")
     return service.catalogue.get_survey(survey).survey_id
 
 
-def _start(service: Service, survey: str | None, recording: RecordingRecord) -> Job:
+def start_job(service: Service, survey: str | None, recording: RecordingRecord) -> Job:
     """Start a job for a log that just came."""
-    survey_id = _check_survey(service, survey)
+    survey_id = check_survey(service, survey)
     return start(service, NewJob(survey=survey_id, recording=recording.recording_id))

@@ -111,6 +111,14 @@ CREATE TABLE jobs (
     options JSON DEFAULT '{}'  -- Options beside the configuration: rig (a digest), recordings (of a job that reads several), and those of its kind.
 );
 
+-- Requests that were sent with an Idempotency-Key, so that the same one again makes nothing new.
+CREATE TABLE idempotency_keys (
+    key VARCHAR PRIMARY KEY,  -- The key that the sender chose.
+    request VARCHAR NOT NULL,  -- SHA-256 of the request.
+    job_id VARCHAR NOT NULL,  -- The job that it made.
+    created_at TIMESTAMPTZ NOT NULL  -- Instant of the request (UTC).
+);
+
 -- A recording processed with one configuration by one version of the code.
 CREATE TABLE runs (
     run_id VARCHAR PRIMARY KEY,  -- The same in every table of results.

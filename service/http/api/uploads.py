@@ -1,0 +1,195 @@
+"""Routes of resumable uploads: the protocol tus 1.0 (https://tus.io/protocols/resumable-upload)."""
+
+from __future__ import annotations
+
+import asyncio
+import base64
+import binascii
+from collections.abc import Mapping
+from email.utils import formatdate
+from typing import Annotated
+
+from fastapi import APIRouter, Header, Path, Request, Response
+
+from spheremark.pipelines.errors import InputError
+from spheremark.service.errors import MediaTypeError, TooLargeError, TusVersionError
+from spheremark.service.http.api.recordings import check_quota, check_survey, start_job
+from spheremark.service.http.state import Current, Service
+from spheremark.service.http.uploads import Received, Upload, enter
+
+router = APIRouter(prefix="/uploads", tags=["recordings"])
+
+VERSION = "1.0.0"
+PART = "application/offset+octet-stream"
+EXTENSIONS = "creation,creation-with-upload,checksum,expiration,termination"
+ALGORITHMS = ("sha256", "sha1", "md5")
+_BODY = {
+    "requestBody": {"content": {PART: {"schema": {"type": "string", "format": "binary"}}}},
+}
+
+UploadId = Annotated[str, Path(description="Id of the upload.")]
+Tus = Annotated[str | None, Header(alias="Tus-Resumable", description=f"{VERSION}.")]
+Checksum = Annotated[
+    str | None,
+    Header(alias="Upload-Checksum", description="Algorithm and Base64 of the part's digest."),
+]
+
+
+@router.options("", name="describe_uploads", status_code=204, response_class=Response)
+def describe_uploads(service: Current) -> Response:
+    """Say what of tus is supported."""
+    return _answer(
+        {
+            "Tus-Version": VERSION,
+            "Tus-Extension": EXTENSIONS,
+            "Tus-Max-Size": str(service.settings.max_upload_bytes),
+            "Tus-Checksum-Algorithm": ",".join(ALGORITHMS),
+        }
+    )
+
+
+@router.post(
+    "", name="create_upload", status_code=201, response_class=Response, openapi_extra=_BODY
+)
+async def create_upload(
+    request: Request,
+    service: Current,
+    length: Annotated[
+        int, Header(alias="Upload-Length", ge=1, description="Length of the log [bytes].")
+    ],
+    metadata: Annotated[
+        str,
+        Header(
+            alias="Upload-Metadata",
+            description="Pairs of a key and Base64: filename, survey, process (true or false).",
+        ),
+    ] = "",
+    tus: Tus = None,
+    checksum: Checksum = None,
+) -> Response:
+    """Begin an upload; a body is its first part."""
+    _check_version(tus)
+    if length > service.settings.max_upload_bytes:
+        most = service.settings.max_upload_bytes
+        raise TooLargeError(f"The log has {length:,} bytes; {most:,} are accepted.")
+    about = _metadata(metadata)
+    await asyncio.to_thread(_check, service, length, about)
+    upload = await asyncio.to_thread(service.uploads.create, length, about)
+    headers = {"Location": f"/api/v1/uploads/{upload.upload_id}", **_expiry(upload)}
+    if request.headers.get("content-type", "") == PART:
+        headers |= await _append(service, upload, request, 0, checksum)
+    return _answer(headers, 201)
+
+
+@router.head("/{upload}", name="get_upload", response_class=Response)
+def get_upload(upload: UploadId, service: Current, tus: Tus = None) -> Response:
+    """Say how many bytes of an upload are here."""
+    _check_version(tus)
+    found = service.uploads.get(upload)
+    headers = {"Upload-Offset": str(found.offset), "Upload-Length": str(found.length)}
+    return _answer(headers | _expiry(found) | {"Cache-Control": "no-store"}, 200)
+
+
+@router.patch(
+    "/{upload}",
+    name="append_to_upload",
+    status_code=204,
+    response_class=Response,
+    openapi_extra=_BODY,
+)
+async def append_to_upload(
+    upload: UploadId,
+    request: Request,
+    service: Current,
+    offset: Annotated[
+        int, Header(alias="Upload-Offset", ge=0, description="Where the part begins [bytes].")
+    ],
+    tus: Tus = None,
+    checksum: Checksum = None,
+) -> Response:
+    """Add the next part; the last one makes a recording (Content-Location)."""
+    _check_version(tus)
+    if request.headers.get("content-type", "") != PART:
+        raise MediaTypeError(f"The part must be of the type {PART}.")
+    found = service.uploads.get(upload)
+    return _answer(await _append(service, found, request, offset, checksum))
+
+
+@router.delete("/{upload}", name="end_upload", status_code=204, response_class=Response)
+def end_upload(upload: UploadId, service: Current, tus: Tus = None) -> Response:
+    """Forget an upload and its bytes."""
+    _check_version(tus)
+    service.uploads.end(service.uploads.get(upload).upload_id)
+    return _answer({})
+
+
+async def _append(
+    service: Service, upload: Upload, request: Request, offset: int, checksum: str | None
+) -> dict[str, str]:
+    """Add a part, and enter the log that it completes; return the headers that say so."""
+    received = await service.uploads.append(upload, offset, request.stream(), _checksum(checksum))
+    if received is None:
+        return {"Upload-Offset": str(upload.offset), **_expiry(upload)}
+    headers = await asyncio.to_thread(_enter, service, received, upload.metadata)
+    return {"Upload-Offset": str(upload.length), **headers}
+
+
+def _enter(service: Service, received: Received, about: Mapping[str, str]) -> dict[str, str]:
+    """Enter a log; its own verdict says whether it can be processed."""
+    recording, _ = enter(service.catalogue, received, about.get("filename") or received.digest[:8])
+    headers = {"Content-Location": f"/api/v1/recordings/{recording.recording_id}"}
+    if survey := about.get("survey"):
+        service.catalogue.add_to_survey(survey, recording.recording_id)
+        if about.get("process") == "true" and recording.verdict != "refused":
+            job = start_job(service, survey, recording)
+            headers["Link"] = f'</api/v1/jobs/{job.job_id}>; rel="related"; title="job"'
+    return headers
+
+
+def _check(service: Service, length: int, about: Mapping[str, str]) -> None:
+    """Refuse an upload before its first byte."""
+    check_quota(service, length)
+    if about.get("process") == "true" or "survey" in about:
+        check_survey(service, about.get("survey"))
+
+
+def _check_version(version: str | None) -> None:
+    """Refuse a request of another version of the protocol."""
+    if version != VERSION:
+        raise TusVersionError(f"Tus-Resumable is {version!r}; {VERSION} is expected.")
+
+
+def _metadata(text: str) -> dict[str, str]:
+    """Return what the sender says of the file."""
+    pairs = (pair.strip().partition(" ") for pair in text.split(",") if pair.strip())
+    try:
+        return {key: base64.b64decode(value, validate=True).decode() for key, _, value in pairs}
+    except (binascii.Error, UnicodeDecodeError) as error:
+        raise InputError(f"Upload-Metadata is not pairs of a key and Base64: {error}.") from error
+
+
+def _checksum(text: str | None) -> tuple[str, bytes] | None:
+    """Return algorithm and digest of a part."""
+    if text is None:
+        return None
+    name, _, value = text.partition(" ")
+    try:
+        digest = base64.b64decode(value, validate=True)
+    except binascii.Error:
+        digest = b""
+    if name not in ALGORITHMS or not digest:
+        raise InputError(
+            f"Upload-Checksum is {text[:80]!r}; one of {', '.join(ALGORITHMS)} and a "
+            "digest in Base64 is expected."
+        )
+    return name, digest
+
+
+def _expiry(upload: Upload) -> dict[str, str]:
+    """Return until when an upload is kept."""
+    return {"Upload-Expires": formatdate(upload.expires_at, usegmt=True)}
+
+
+def _answer(headers: Mapping[str, str], status: int = 204) -> Response:
+    """Return a response of the protocol."""
+    return Response(status_code=status, headers={"Tus-Resumable": VERSION, **headers})
