@@ -201,7 +201,18 @@ def parse_truth(text: str) -> Truth:
 
 
 def format_truth(truth: Truth) -> str:
-    """Return a truth as JSON text."""
+    """Return a truth as JSON text.
+
+    Parameters
+    ----------
+    truth : Truth
+        The truth.
+
+    Returns
+    -------
+    str
+        What ``parse_truth`` reads.
+    """
     values = {
         "format": TRUTH_FORMAT,
         "marks": [
