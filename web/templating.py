@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import re
 from datetime import UTC, datetime
 from functools import cache
 from typing import Any
@@ -16,6 +17,7 @@ from spheremark.web import assets, theme
 
 _MM = 1e3  # [mm/m]
 _UNKNOWN = "\N{EN DASH}"
+_HEAD = re.compile(r"(>?)\s*(.*?)\s*(\[.*\])?")
 _ENDINGS = {
     "_deg_per_s": "deg/s",
     "_deg": "deg",
@@ -38,7 +40,7 @@ def environment() -> Environment:
         lstrip_blocks=True,
     )
     made.filters.update(
-        metres=lambda value: number(value, 3),
+        metres=metres,
         mm=lambda value, digits=1: number(None if value is None else value * _MM, digits),
         signed_mm=lambda value: signed(value * _MM, 1),
         degrees=lambda value: number(math.degrees(value), 2),
@@ -50,7 +52,7 @@ def environment() -> Environment:
         method=lambda name: theme.method_style(name).label,
         heading=heading,
     )
-    made.globals.update(assets=assets)
+    made.globals.update(assets=assets, heads_of=heads_of, zip=zip)
     return made
 
 
@@ -83,6 +85,18 @@ def _words(name: str) -> str:
     return words[:1].upper() + words[1:]
 
 
+def heads_of(text: str) -> list[tuple[str, str, bool]]:
+    """Return the heads of a table, ``Mark | >x [m]``: name, unit, and whether numbers follow."""
+    found = [_HEAD.fullmatch(part.strip()) for part in text.split("|")]
+    return [(one[2], one[3] or "", bool(one[1])) for one in found if one]
+
+
+def metres(value: float | None, sigma: float | None = None) -> str:
+    """Format a coordinate to millimetres, or to the first digit of a smaller sigma."""
+    digits = 3 if not sigma else max(3, min(5, math.ceil(-math.log10(sigma))))
+    return number(value, digits)
+
+
 def signed(value: float, decimals: int = 2) -> str:
     """Format a number with its sign, a true minus; a dash for an unknown one."""
     if not math.isfinite(value):
@@ -94,7 +108,8 @@ def number(value: float | None, decimals: int = 2) -> str:
     """Format a number; a dash for an unknown one."""
     if value is None or not math.isfinite(value):
         return _UNKNOWN
-    return f"{value:.{decimals}f}"
+    text = f"{value:.{decimals}f}"
+    return text.lstrip("-") if float(text) == 0 else text
 
 
 def _moment(value: datetime | None) -> str:
