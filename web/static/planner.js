@@ -1,7 +1,6 @@
 // The planner: marks that can be moved, their evaluation by the service, and the state in the address.
-const { PlanMap, SHOWN, rangeOf, paintScale } = await import(document.getElementById("planner").dataset.map);
-const { parseAreas, areasText, square, isInside, fillTable } = await import(document.getElementById("planner").dataset.areas);
-const { fillStop } = await import(document.getElementById("planner").dataset.stop);
+const map = await import(document.getElementById("planner").dataset.map);
+const { PlanMap, h, rangeOf, paintScale, areaText, parseArea, square, isInside, sizeOf } = map;
 
 const API = "/api/v1/plans";
 const CELLS = { moving: 32, still: 64 }; // across the longer side of the map
@@ -12,21 +11,23 @@ const state = { plans: [], active: 0, stop: "", stops: null, areas: [], corners:
 
 // ---- the address
 
+const MARK_KEYS = ["x", "y", "pole"];
+const STOP_KEYS = ["x", "y"];
+const round = (value, digits) => String(+value.toFixed(digits));
+
 function readAddress() {
   const query = new URLSearchParams(location.search);
-  for (const name of controls) {
-    const value = query.get(name);
-    const field = byId(name);
-    if (value === null) continue;
+  for (const name of controls.filter((one) => query.has(one))) {
+    const [field, value] = [byId(name), query.get(name)];
     if (field.tagName === "SELECT" && ![...field.options].some((option) => option.value === value)) {
       field.add(new Option(value, value)); // the service refuses an unknown name
     }
     field.value = value;
   }
   state.stop = query.get("stop") ?? "";
-  state.stops = query.get("stops") === null ? null : parsePlaces(query.get("stops"), STOP_KEYS);
-  state.areas = parseAreas(query.get("keep") ?? "");
-  return ["a", "b"].map((key) => query.get(key)).filter((text) => text !== null).map((text) => parsePlaces(text, MARK_KEYS));
+  state.stops = query.has("stops") ? parsePlaces(query.get("stops"), STOP_KEYS) : null;
+  state.areas = (query.get("keep") ?? "").split("|").map(parseArea).filter(Boolean);
+  return ["a", "b"].filter((key) => query.has(key)).map((key) => parsePlaces(query.get(key), MARK_KEYS));
 }
 
 // Places as the address has them: name:x,y;name:x,y with further numbers for some.
@@ -38,9 +39,6 @@ function parsePlaces(text, keys) {
   }).filter((place) => keys.every((key) => Number.isFinite(place[key])));
 }
 
-const MARK_KEYS = ["x", "y", "pole"];
-const STOP_KEYS = ["x", "y"];
-const round = (value, digits) => String(+value.toFixed(digits));
 const placesText = (places, keys) => places.map((one) => `${one.name}:${keys.map((key) => round(one[key], 3)).join(",")}`).join(";");
 
 function writeAddress() {
@@ -49,7 +47,7 @@ function writeAddress() {
   state.plans.forEach((plan, i) => query.set("ab"[i], placesText(plan.marks, MARK_KEYS)));
   if (state.stop) query.set("stop", state.stop);
   if (state.stops) query.set("stops", placesText(state.stops, STOP_KEYS));
-  if (state.areas.length) query.set("keep", areasText(state.areas));
+  if (state.areas.length) query.set("keep", state.areas.map(areaText).join("|"));
   history.replaceState(null, "", `/plan?${query}`);
 }
 
@@ -117,183 +115,157 @@ const evaluateAll = () => state.plans.forEach((plan) => evaluate(plan, CELLS.sti
 
 // ---- drawing
 
+const isKnown = (value) => value !== null && value !== undefined;
+const fixed = (value, digits, scale = 1) => (isKnown(value) ? (+(scale * value).toFixed(digits) || 0).toFixed(digits) : "–"); // never -0
+const mm = (value) => fixed(value, value < 0.01 ? 2 : 1, 1000);
+const percent = (value) => fixed(value, 1, 100);
+const cell = (inner, kind = "number") => h("td", { class: kind }, inner);
+const evaluatedStop = (plan, name) => plan.evaluation?.stops.find((stop) => stop.name === name);
+
 function draw() {
   const shown = byId("show").value;
   const tolerance = byId("tolerance").valueAsNumber / 1000;
+  const active = state.plans[state.active];
   const fields = shown === "ground" ? [state.site.ground] : state.plans.map((plan) => plan.field);
   const range = rangeOf(fields, shown, tolerance);
   for (const plan of state.plans) {
-    plan.map.show({ ...plan, site: state.site, stops: state.stops, areas: state.areas, corners: state.corners, shown, range, tolerance, stop: state.stop });
-    plan.figure.classList.toggle("active", plan === state.plans[state.active]);
+    const { site, stops, areas, corners, stop } = state;
+    plan.map.show({ ...plan, site, stops, areas, corners, shown, range, tolerance, stop });
+    plan.figure.classList.toggle("active", plan === active);
     paintScale(plan.figure, shown, range, tolerance, plan.field);
     drawHead(plan, tolerance);
   }
-  drawMarks();
+  drawMarks(active);
   drawStops();
-  fillStop(byId("marks-at-stop"), state.plans[state.active].evaluation?.stops.find((stop) => stop.name === state.stop));
+  drawStop(evaluatedStop(active, state.stop));
   byId("rests").disabled = !byId("step").valueAsNumber;
   byId("turn").disabled = !byId("rests").disabled;
-  byId("areas").hidden = !state.areas.length;
-  fillTable(byId("areas-table").tBodies[0], state.areas, onArea);
+  drawAreas();
 }
 
-const fixed = (value, digits) => (+value.toFixed(digits) || 0).toFixed(digits); // never -0
-const mm = (value) => (value === null || value === undefined ? "–" : (1000 * value).toFixed(value < 0.01 ? 2 : 1));
-const percent = (value) => (value === null || value === undefined ? "–" : (100 * value).toFixed(1));
-
 function drawHead(plan, tolerance) {
+  const { evaluation, figure, marks } = plan;
   const letter = "AB"[state.plans.indexOf(plan)];
-  const n = plan.marks.length;
-  plan.figure.querySelector("h2").textContent =
-    `${state.plans.length > 1 ? `Arrangement ${letter}: ` : ""}${n} mark${n === 1 ? "" : "s"}`;
-  const { evaluation } = plan;
-  const fenced = plan.marks.filter((mark) => state.areas.some((area) => isInside(area, mark.x, mark.y))).map((mark) => mark.name);
-  plan.figure.querySelector(".caption").textContent = (evaluation
+  figure.querySelector("h2").textContent =
+    `${state.plans.length > 1 ? `Arrangement ${letter}: ` : ""}${marks.length} mark${marks.length === 1 ? "" : "s"}`;
+  const fenced = marks.filter((mark) => state.areas.some((area) => isInside(area, mark.x, mark.y))).map((mark) => mark.name);
+  figure.querySelector(".caption").textContent = (evaluation
     ? `${evaluation.site.name}, ${evaluation.method === "paper" ? "three circles" : "free station"}. ${evaluation.model.text}`
     : "No prediction yet.") + (fenced.length ? ` In a keep-out area: ${fenced.join(", ")}.` : "");
   const stops = evaluation?.stops ?? [];
-  const worst = stops.reduce((a, b) => (worse(a, b) ? a : b), stops[0]);
-  const n_kept = stops.filter((stop) => stop.probability_within_tolerance >= 0.95).length;
-  plan.figure.querySelector(".readouts").replaceChildren(
-    readout("Worst stop, 3-D sigma", mm(worst?.sigma_3d_m), "mm", worst?.name ?? ""),
-    readout(`Within ${round(1000 * tolerance, 3)} mm, least`, percent(worst?.probability_within_tolerance), "%", "probability at the worst stop"),
-    readout("Stops that keep it", `${n_kept} of ${stops.length}`, "", "with 95 % probability"),
-  );
+  const size = (stop) => stop.sigma_3d_m ?? Infinity; // without a position is worst
+  const worst = stops.reduce((a, b) => (size(a) >= size(b) ? a : b), stops[0]);
+  const nKept = stops.filter((stop) => stop.probability_within_tolerance >= 0.95).length;
+  figure.querySelector(".readouts").replaceChildren(...[
+    ["Worst stop, 3-D sigma", mm(worst?.sigma_3d_m), "mm", worst?.name ?? ""],
+    [`Within ${round(1000 * tolerance, 3)} mm, least`, percent(worst?.probability_within_tolerance), "%", "probability at the worst stop"],
+    ["Stops that keep it", `${nKept} of ${stops.length}`, "", "with 95 % probability"],
+  ].map(([label, value, unit, note]) =>
+    h("div", { class: "readout" }, h("dt", {}, label), h("dd", {}, value, h("small", {}, unit)), h("dd", { class: "note" }, note))));
 }
 
-// Whether one stop is worse than another: without a position is worst.
-const worse = (a, b) => (a.sigma_3d_m ?? Infinity) >= (b.sigma_3d_m ?? Infinity);
+// Whether something is typed into a table that keeps its rows: they are not replaced then.
+const isTyped = (body, n) => body.contains(document.activeElement) && document.activeElement.tagName === "INPUT" && body.rows.length === n;
 
-function readout(label, value, unit, note) {
-  const box = document.createElement("div");
-  box.className = "readout";
-  const [dt, dd, small, about] = ["dt", "dd", "small", "dd"].map((name) => document.createElement(name));
-  dt.textContent = label;
-  dd.textContent = value;
-  small.textContent = unit;
-  about.className = "note";
-  about.textContent = note;
-  dd.append(small);
-  box.append(dt, dd, about);
-  return box;
-}
+const remover = (label, action) => h("button", { type: "button", class: "remove", title: label, "aria-label": label, onclick: action }, "\u00d7");
 
-function cell(text, kind = "number") {
-  const place = document.createElement("td");
-  place.className = kind;
-  place.textContent = text;
-  return place;
-}
-
-function drawMarks() {
-  const plan = state.plans[state.active];
+function drawMarks(plan) {
   const body = byId("marks-table").tBodies[0];
-  const rows = plan.marks.map((mark, place) => markRow(plan, mark, place));
-  const focus = document.activeElement?.dataset?.cell;
-  if (body.contains(document.activeElement) && body.rows.length === rows.length) {
-    plan.marks.forEach((mark, place) => refreshRow(body.rows[place], plan, mark)); // keep what is being typed
+  if (isTyped(body, plan.marks.length)) {
+    plan.marks.forEach((mark, place) => derived(plan, mark).forEach((text, i) => { body.rows[place].cells[4 + i].textContent = text; }));
     return;
   }
-  body.replaceChildren(...rows);
-  if (focus) body.querySelector(`[data-cell="${CSS.escape(focus)}"]`)?.focus();
+  body.replaceChildren(...plan.marks.map((mark, place) => markRow(plan, mark, place)));
   byId("marks-head").textContent = state.plans.length > 1 ? `Marks of arrangement ${"AB"[state.active]}` : "Marks";
 }
 
-const known = (plan, mark) => plan.evaluation?.marks.find((one) => one.name === mark.name);
-
 function derived(plan, mark) {
-  const found = known(plan, mark);
+  const found = plan.evaluation?.marks.find((one) => one.name === mark.name);
   const stops = plan.evaluation?.stops ?? [];
   const n = stops.filter((stop) => stop.visible_marks.includes(mark.name)).length;
-  return [
-    found ? fixed(found.ground_m, 3) : "–",
-    found ? fixed(found.position_m[2], 3) : "–",
-    stops.length ? `${n} of ${stops.length}` : "–",
-  ];
-}
-
-function refreshRow(row, plan, mark) {
-  derived(plan, mark).forEach((text, i) => { row.cells[4 + i].textContent = text; });
+  return [fixed(found?.ground_m, 3), fixed(found?.position_m[2], 3), stops.length ? `${n} of ${stops.length}` : "–"];
 }
 
 function markRow(plan, mark, place) {
-  const row = document.createElement("tr");
-  const input = (key, digits) => {
-    const field = document.createElement("input");
-    Object.assign(field, { type: "number", step: "0.01", value: fixed(mark[key], digits) });
-    field.dataset.cell = `${place} ${key}`;
-    field.setAttribute("aria-label", `${{ x: "x", y: "y", pole: "Pole height" }[key]} of ${mark.name} [m]`);
-    field.addEventListener("change", () => {
-      if (!Number.isFinite(field.valueAsNumber)) { field.value = fixed(mark[key], digits); return; }
+  const input = (key, digits, label) => {
+    const onchange = (event) => {
+      const value = event.target.valueAsNumber;
+      if (!Number.isFinite(value)) { event.target.value = fixed(mark[key], digits); return; }
       remember();
-      mark[key] = field.valueAsNumber;
+      mark[key] = value;
       changed(plan, CELLS.still);
-    });
-    const box = cell("");
-    box.append(field);
-    return box;
+    };
+    return cell(h("input", { type: "number", step: "0.01", value: fixed(mark[key], digits), "aria-label": `${label} of ${mark.name} [m]`, onchange }));
   };
-  const remove = document.createElement("button");
-  Object.assign(remove, { type: "button", className: "remove", textContent: "\u00d7", title: `Remove ${mark.name}` });
-  remove.setAttribute("aria-label", `Remove ${mark.name}`);
-  remove.addEventListener("click", () => drop(plan, place));
-  const last = cell("", "screen-only");
-  last.append(remove);
-  row.append(cell(mark.name, "mono"), input("x", 3), input("y", 3), input("pole", 2), ...derived(plan, mark).map((text) => cell(text)), last);
-  return row;
+  const remove = remover(`Remove ${mark.name}`, () => drop(plan, place));
+  return h("tr", {}, cell(mark.name, "mono"), input("x", 3, "x"), input("y", 3, "y"), input("pole", 2, "Pole height"),
+    ...derived(plan, mark).map((text) => cell(text)), cell(remove, "screen-only"));
 }
 
 function drawStops() {
   const table = byId("stops-table");
-  const heads = ["Stop"];
-  state.plans.forEach((_, i) => {
-    const letter = state.plans.length > 1 ? `${"AB"[i]}: ` : "";
-    heads.push(`${letter}sigma [mm]`, `${letter}within [%]`, `${letter}marks`, `${letter}angles [deg]`, `${letter}DOP`);
-  });
-  heads.push("Why not, or weak");
-  const head = document.createElement("tr");
-  head.append(...heads.map((text, i) => {
-    const place = document.createElement("th");
-    const [name, unit] = text.split(" [");
-    place.textContent = name;
-    if (unit) {
-      const small = document.createElement("small");
-      small.textContent = ` [${unit}`;
-      place.append(small);
-    }
-    if (i > 0 && i < heads.length - 1) place.className = "number";
-    return place;
-  }));
-  table.tHead.replaceChildren(head);
+  const heads = state.plans.flatMap((_, i) => ["sigma [mm]", "within [%]", "marks", "angles [deg]", "DOP"].map(
+    (head) => (state.plans.length > 1 ? `${"AB"[i]}: ` : "") + head));
+  table.tHead.replaceChildren(h("tr", {}, h("th", {}, "Stop"), ...heads.map((head) => {
+    const [name, unit] = head.split(" [");
+    return h("th", { class: "number" }, name, ...(unit ? [h("small", {}, ` [${unit}`)] : []));
+  }), h("th", {}, "Why not, or weak")));
   const names = state.plans.flatMap((plan) => plan.evaluation?.stops.map((stop) => stop.name) ?? []);
   table.tBodies[0].replaceChildren(...[...new Set(names)].map(stopRow));
-  byId("stops-about").textContent =
-    "Predicted for each stop. Choose one to see what each mark does for it, and on the map which are in its sight: broken lines are hidden or too far.";
 }
 
 function stopRow(name) {
-  const row = document.createElement("tr");
-  row.setAttribute("aria-selected", String(name === state.stop));
-  const button = document.createElement("button");
-  Object.assign(button, { type: "button", className: "plain", textContent: name });
-  const first = cell("", "mono");
-  first.append(button);
-  row.append(first);
-  const reasons = [];
-  for (const plan of state.plans) {
-    const stop = plan.evaluation?.stops.find((one) => one.name === name);
+  const found = state.plans.map((plan) => evaluatedStop(plan, name));
+  const numbers = found.flatMap((stop) => {
     const p = stop?.probability_within_tolerance;
-    const within = cell(percent(p));
-    if (p !== undefined && p < 0.95) within.innerHTML = `<span class="over">${percent(p)}</span>`;
-    const angle = (value) => (value === null || value === undefined ? "–" : value.toFixed(0));
-    const angles = stop ? `${angle(stop.included_angle_min_deg)} to ${angle(stop.included_angle_max_deg)}` : "–";
-    const dop = stop?.dop === null || stop?.dop === undefined ? "–" : stop.dop.toFixed(2);
-    row.append(cell(mm(stop?.sigma_3d_m)), within, cell(stop ? String(stop.n_used) : "–"), cell(angles), cell(dop));
-    if (stop?.reason) reasons.push(stop.reason);
-  }
-  row.append(cell([...new Set(reasons)].join(" "), "reason"));
-  row.addEventListener("click", () => choose(name));
-  return row;
+    const angles = ["min", "max"].map((which) => fixed(stop?.[`included_angle_${which}_deg`], 0));
+    const within = p < 0.95 ? h("span", { class: "over" }, percent(p)) : percent(p);
+    return [mm(stop?.sigma_3d_m), within, String(stop?.n_used ?? "–"), stop ? angles.join(" to ") : "–", fixed(stop?.dop, 2)];
+  });
+  const reasons = new Set(found.map((stop) => stop?.reason).filter(Boolean));
+  return h("tr", { "aria-selected": String(name === state.stop), onclick: () => choose(name) },
+    cell(h("button", { type: "button", class: "plain" }, name), "mono"), ...numbers.map((inner) => cell(inner)), cell([...reasons].join(" "), "reason"));
+}
+
+// The marks as predicted from the chosen stop.
+function drawStop(stop) {
+  const section = byId("marks-at-stop");
+  section.hidden = !stop;
+  if (!stop) return;
+  section.querySelector("h2").textContent = `Marks from ${stop.name}`;
+  const sigmas = [0, 1, 2].map((k) => fixed(Math.sqrt(stop.covariance_m2[k][k]), 2, 1000)).join(", ");
+  section.querySelector("p").textContent = stop.sigma_3d_m === null ? `No position: ${stop.reason}.`
+    : `Sigma of the position along x, y and z: ${sigmas} mm; ${stop.dof} degrees of freedom.`;
+  section.querySelector("tbody").replaceChildren(...stop.marks.map((one) => {
+    const isUsed = one.redundancy > 0;
+    const reliability = [fixed(one.redundancy, 2), fixed(one.minimal_detectable_bias_m, 1, 1000), fixed(one.external_reliability_m, 2, 1000)];
+    const numbers = [fixed(one.visible_share, 0, 100), fixed(one.range_m, 2), fixed(one.n_points, 0), ...reliability.map((text) => (isUsed ? text : "–"))];
+    return h("tr", {}, cell(one.name, "mono"), cell(foundText(one), ""), ...numbers.map((text) => cell(text)));
+  }));
+}
+
+function foundText(one) {
+  if (one.surface_behind_m !== null) return `${one.is_seen ? "yes" : "no"}: a surface ${one.surface_behind_m.toFixed(1)} m behind`;
+  if (one.is_seen) return "yes";
+  return one.visible_share < 0.5 ? "no: less than half visible" : "no: too far";
+}
+
+function drawAreas() {
+  byId("areas").hidden = !state.areas.length;
+  const body = byId("areas-table").tBodies[0];
+  if (isTyped(body, state.areas.length)) return;
+  body.replaceChildren(...state.areas.map((area, i) => {
+    const onchange = (event) => {
+      const typed = parseArea(event.target.value);
+      if (typed) { onArea.onChange(i, typed, true); return; }
+      event.target.value = areaText(area);
+      showProblem("An area needs three corners or more, as x,y;x,y;x,y in metres.");
+    };
+    const label = `Corners of keep-out area ${i + 1}: x,y;x,y;… [m]`;
+    const field = h("input", { type: "text", value: areaText(area), spellcheck: "false", "aria-label": label, onchange });
+    const remove = remover(`Remove keep-out area ${i + 1}`, () => onArea.onRemove(i));
+    return h("tr", {}, cell(String(i + 1), "mono"), cell(field, "wide"), cell(sizeOf(area).toFixed(1)), cell(remove, "screen-only"));
+  }));
 }
 
 // ---- changes
@@ -331,7 +303,7 @@ function freeName(taken, letter) {
   }
 }
 
-// The stops become the user's own when the first of them is moved, added or removed.
+// The stops become the plan's own when the first of them is moved, added or removed.
 function ownStops() {
   state.stops ??= state.site.stops.map((stop) => ({ name: stop.name, x: stop.position_m[0], y: stop.position_m[1] }));
   return state.stops;
@@ -432,7 +404,6 @@ const onArea = {
     writeAddress();
     draw();
   },
-  onRefused: showProblem,
 };
 
 function addArea(area) {
@@ -497,8 +468,9 @@ async function during(button, work, news = "") {
 
 // ---- controls
 
-byId("add").addEventListener("click", () => setAdding(state.adding === "mark" ? "" : "mark"));
-byId("add-stop").addEventListener("click", () => setAdding(state.adding === "stop" ? "" : "stop"));
+for (const [id, what] of [["add", "mark"], ["add-stop", "stop"]]) {
+  byId(id).addEventListener("click", () => setAdding(state.adding === what ? "" : what));
+}
 byId("add-area").addEventListener("click", (event) => {
   if (event.detail) { setAdding(state.adding === "area" ? "" : "area"); return; }
   const [x0, y0, x1, y1] = state.site.extent_m; // by keyboard: a square to begin with
@@ -550,8 +522,7 @@ byId("save").addEventListener("click", (event) => during(event.currentTarget, as
   const survey = byId("model").value.startsWith("survey:") ? byId("model").value.slice(7) : null;
   const kept = await post("", { ...request(plan), name, survey });
   showNews("");
-  const link = document.createElement("a");
-  Object.assign(link, { href: `/plan/${kept.placement_id}`, textContent: name });
+  const link = h("a", { href: `/plan/${kept.placement_id}` }, name);
   byId("plan-news").replaceChildren("Kept as ", link, `: ${kept.stops.length} rows of placements.`);
   byId("plan-news").hidden = false;
 }));
@@ -559,8 +530,7 @@ for (const button of document.querySelectorAll("[data-file]")) {
   const [type, ending] = { csv: ["text/csv", "csv"], dxf: ["image/vnd.dxf", "dxf"], landxml: ["application/xml", "xml"] }[button.dataset.file];
   button.addEventListener("click", () => during(button, async (plan) => {
     const text = await post("/evaluate", request(plan), type);
-    const link = document.createElement("a");
-    Object.assign(link, { href: URL.createObjectURL(new Blob([text], { type })), download: `plan.${ending}` });
+    const link = h("a", { href: URL.createObjectURL(new Blob([text], { type })), download: `plan.${ending}` });
     link.click();
     URL.revokeObjectURL(link.href);
   }));
