@@ -152,6 +152,7 @@ def _process_stop(
     progress(0.0, f"Stitching {name}")
     with _timed(timings, "stitching"):
         cloud = stitch(log, rig, config.stitching)
+    weaknesses = log.weaknesses
     del log
     progress(0.3, f"Extracting markers from {len(cloud.p_base):,} returns")
     with _timed(timings, "extraction"):
@@ -166,7 +167,7 @@ def _process_stop(
             )
     progress(0.8, "Positioning the station")
     with _timed(timings, "resection"):
-        fixes = _position(fits, marks, config, cloud.coverage)
+        fixes = _position(fits, marks, config, (*weaknesses, *_half_turn(cloud.coverage)))
     with _timed(timings, "subsets"):
         subsets = _subsets(fits, fixes, marks, config)
     with _timed(timings, "quality_control"):
@@ -189,7 +190,7 @@ def _position(
     fits: dict[str, MarkerFits],
     marks: ControlMarks | None,
     config: SurveyConfig,
-    coverage: float,
+    weaknesses: tuple[str, ...],
 ) -> dict[tuple[str, str], StationFix | NoFix]:
     """Position the station from each set of fits by each resection method."""
     fixes: dict[tuple[str, str], StationFix | NoFix] = {}
@@ -203,7 +204,7 @@ def _position(
                 no = NoFix(method=method, code=error.code, reason=str(error))
                 fixes[fit_method, method] = no
             else:
-                fixes[fit_method, method] = _qualified(fix, coverage)
+                fixes[fit_method, method] = _qualified(fix, weaknesses)
     return fixes
 
 
@@ -256,15 +257,21 @@ def _distances(
         return DistanceChecks.none(str(error))
 
 
-def _qualified(fix: StationFix, coverage: float) -> StationFix:
-    """Return the fix, weak if the gimbal turned by less than half a turn [rad]."""
+def _half_turn(coverage: float) -> tuple[str, ...]:
+    """Return why results are weak where the gimbal turned by less than half a turn [rad]."""
     if coverage >= np.pi:
-        return fix
-    reason = (
+        return ()
+    return (
         f"the gimbal turned by {np.degrees(coverage):.0f} deg only: under 180 deg no direction is "
-        "swept twice, and errors of the gimbal neither cancel nor show"
+        "swept twice, and errors of the gimbal neither cancel nor show",
     )
-    reason = f"{fix.reason}; {reason}" if fix.reason else reason
+
+
+def _qualified(fix: StationFix, weaknesses: tuple[str, ...]) -> StationFix:
+    """Return the fix, weak if there is a reason."""
+    if not weaknesses:
+        return fix
+    reason = "; ".join(one.rstrip(".") for one in (fix.reason, *weaknesses) if one)
     return replace(fix, status=Status.WEAK, reason=reason)
 
 

@@ -138,6 +138,11 @@ class ScanLog:
         What the recording lacks, as sentences.
     has_heights : bool or None
         Whether the coordinates include the heights of the lasers; none where only a rig says it.
+    weaknesses : tuple of str
+        Why every result is weak, as sentences; they are among the notes too.
+    sigma_levelling : float
+        Standard deviation per axis of the sensor behind the orientations, beyond that of the
+        configuration [rad].
     """
 
     p_lidar: Column
@@ -153,6 +158,8 @@ class ScanLog:
     origin: Origin
     notes: tuple[str, ...] = ()
     has_heights: bool | None = None
+    weaknesses: tuple[str, ...] = ()
+    sigma_levelling: float = 0.0
 
     def __post_init__(self) -> None:
         seal(

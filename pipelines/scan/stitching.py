@@ -45,6 +45,8 @@ _FULL_TURN = 2.0 * np.pi
 _NEARLY_FULL = np.radians(359.0)  # a joint sample may be missing at either end
 _SMEAR = np.radians(0.05)  # 7 mm at 7.5 m: largest turn during a message without pulse times
 _RESTS_MIN = 4  # fewer rests than this are those before and after an even turn
+_SPEED_MAX = 5.0 * np.pi  # per second: revolutions of 10 Hz would be a quarter of a turn apart
+_TURNS = np.radians(0.1)  # per second; a gimbal at rest turns less
 _JOINT_GAP = 0.5  # [s]; over a longer gap of a moving gimbal the angle is a guess
 _JOINT_GAP_MOTION = np.radians(0.5)
 _SIGMA_UNLEVELLED = np.radians(3.0)  # how a rover may lean on ground it can drive on
@@ -113,7 +115,7 @@ def level(log: ScanLog, rig: Rig, config: StitchingConfig) -> Levelling:
     return Levelling(
         roll=float(np.arctan2(up[1], up[2])),
         pitch=float(np.arctan2(-up[0], np.hypot(up[1], up[2]))),
-        sigma=float(np.hypot(config.sigma_levelling, scatter)),
+        sigma=float(np.hypot(np.hypot(config.sigma_levelling, scatter), log.sigma_levelling)),
         is_measured=True,
         sigma_heading=rig.sigma_heading,
     )
@@ -165,7 +167,8 @@ def stitch(log: ScanLog, rig: Rig, config: StitchingConfig) -> StitchedCloud:
     MissingPulseTimesError
         If the points carry no time of their own and the gimbal does not rest during a message.
     RecordingError
-        If no return has a gimbal angle and a range within the limits.
+        If no return has a gimbal angle and a range within the limits, or the gimbal turns faster
+        than a gimbal can.
 
     Notes
     -----
@@ -246,9 +249,23 @@ def _joints(log: ScanLog, rig: Rig) -> Joints:
     angles = log.gimbal_angles
     angles = angles + cosine * np.cos(angles) + sine * np.sin(angles)
     gaps, steps = np.diff(stamps_ns), np.diff(angles)
+    _refuse_speed(log, np.abs(steps) / (gaps * _NS))
     rates = np.append(steps / gaps, 0.0)
     rates[:-1][(gaps > _JOINT_GAP / _NS) & (np.abs(steps) > _JOINT_GAP_MOTION)] = np.nan
     return Joints(stamps_ns, angles, rates)
+
+
+def _refuse_speed(log: ScanLog, speeds: Array) -> None:
+    """Raise RecordingError if the gimbal turns faster than a gimbal can [rad/s]."""
+    turning = speeds[speeds > _TURNS]
+    speed = float(np.median(turning)) if len(turning) else 0.0
+    if speed > _SPEED_MAX:
+        raise RecordingError(
+            f"The gimbal of {log.origin.name} would turn at {np.degrees(speed):,.0f} deg/s; at "
+            f"most {np.degrees(_SPEED_MAX):.0f} are plausible. Give the unit of its angle, as "
+            "--joint-unit deg or the number of steps of a full turn (joint_unit=... in a request), "
+            "or name another joint with --joint."
+        )
 
 
 def _without_smear(log: ScanLog, joints: Joints) -> tuple[Joints, tuple[str, ...]]:
@@ -257,8 +274,11 @@ def _without_smear(log: ScanLog, joints: Joints) -> tuple[Joints, tuple[str, ...
         return joints, ()
     messages = np.unique(log.stamps_lidar_ns)
     if len(messages) > 1:
-        edges = np.append(messages, 2 * messages[-1] - messages[-2])
-        moved = np.abs(np.diff(_angles_at(joints, edges)))
+        # A message lasts no longer than usual, however long the next one is in coming.
+        lasting = np.minimum(np.diff(messages, append=messages[-1]), np.median(np.diff(messages)))
+        lasting[-1] = lasting[:-1].max()
+        ends = messages + lasting.astype(np.int64)
+        moved = np.abs(_angles_at(joints, ends) - _angles_at(joints, messages))
     else:  # the duration of the only message is unknown
         moved = np.ptp(joints.angles, keepdims=True)
     smeared, n_rests = _smeared(moved)

@@ -239,7 +239,7 @@ def n_leading(is_so: Mask) -> int:
 def definition_agrees(channel: Channel, expected: str) -> bool:
     """Return whether the recorded definition has the fields that the decoder reads."""
     text = channel.definition.decode("utf-8", "replace")
-    if channel.schema_encoding != "ros2msg" or not text.strip():
+    if channel.schema_encoding not in ("ros1msg", "ros2msg") or not text.strip():
         return True
     return _fields(text) == _fields(expected)
 

@@ -7,7 +7,6 @@ is used before it is checked.
 
 from __future__ import annotations
 
-import hashlib
 import mmap
 import struct
 import tempfile
@@ -48,10 +47,9 @@ _USES[[SCHEMA, CHANNEL, MESSAGE]] = _OF_USE
 _USES[CHUNK] = _OF_CHUNKS
 _USES[[FOOTER, DATA_END]] = _ENDS
 _KEEP_MAPPED = 1 << 25  # [bytes] pages behind this distance are given back
-_BLOCK = 1 << 22  # [bytes] read at a time for the digest
 _MORE = 1.1  # margin of the expansion of a file over that of its first chunks
 _EXPANSION_MAX = 10.0  # largest expansion for which memory is reserved in advance
-_RECOVER = "recover what is readable with `mcap recover` and use the result"
+RECOVER = "use what is readable with --recover (recover=true in a request)"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -141,8 +139,7 @@ class Container:
         found = self.octets[: len(MAGIC)].tobytes()
         if found != MAGIC:
             raise NotMcapError(
-                f"The file begins with {found!r}, not with {MAGIC!r}: it is not an MCAP file. "
-                "Record with `ros2 bag record --storage mcap`, or convert with `mcap convert`."
+                f"The file begins with {found!r}, not with {MAGIC!r}: it is not an MCAP file."
             )
         self._source = Chunks(self.octets, self.file)
 
@@ -158,9 +155,10 @@ class Container:
         likely = min(_MORE * expansion, _EXPANSION_MAX) if expansion > 1.0 else 1.0
         return int(likely * self.size)
 
-    def topics(self) -> dict[str, str]:
-        """Return the message type of each topic, as far as the walk has come."""
-        return {channel.topic: channel.schema for channel in self.channels.values()}
+    @property
+    def topics(self) -> dict[str, Channel]:
+        """Channel of each topic, as far as the walk has come."""
+        return {channel.topic: channel for channel in self.channels.values()}
 
     def batches(self) -> Iterator[Batch]:
         """Yield all messages, in the order of the file."""
@@ -262,16 +260,14 @@ class Container:
         duration = 0.0 if self._first_ns is None else (self._last_ns - self._first_ns) / 1e9
         return TruncatedRecordingError(
             f"The recording is incomplete: {what}. It is readable up to byte {position:,} of "
-            f"{self.size:,}, which is {duration:.1f} s of messages; {_RECOVER}."
+            f"{self.size:,}, which is {duration:.1f} s of messages; {RECOVER}."
         )
 
 
 @contextmanager
-def opened(url: str | Path) -> Iterator[Container]:
-    """Open a recording for one walk."""
-    with local_copy(url) as path, path.open("rb") as file:
-        if path.stat().st_size == 0:
-            raise NotMcapError(f"{path.name} is empty, not an MCAP file: was the upload cut?")
+def mapped(path: Path) -> Iterator[Container]:
+    """Open an MCAP file for one walk."""
+    with path.open("rb") as file:
         mapping = mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ)
         mapping.madvise(mmap.MADV_SEQUENTIAL)
         # Not closed here: views may outlive the walk, and the last one of them unmaps.
@@ -281,7 +277,7 @@ def opened(url: str | Path) -> Iterator[Container]:
 @contextmanager
 def local_copy(url: str | Path) -> Iterator[Path]:
     """Yield the path of a recording on this machine, copied if it is elsewhere."""
-    if "://" not in str(url) and (here := Path(url)).is_file():
+    if "://" not in str(url) and ((here := Path(url)).is_file() or here.is_dir()):
         yield here
         return
     import fsspec  # slow to import; a file on a disk needs none of it
@@ -292,7 +288,7 @@ def local_copy(url: str | Path) -> Iterator[Path]:
     except FileNotFoundError as error:
         raise NotFoundError(f"There is no recording {url}.") from error
     if details["type"] == "directory":
-        raise RecordingError(f"{url} is a folder; name the .mcap file in it.")
+        raise RecordingError(f"{url} is a folder; name the files in it, or a zip of them.")
     if isinstance(files, fsspec.implementations.local.LocalFileSystem):
         require_file(Path(inner))
         yield Path(inner)
@@ -321,20 +317,6 @@ def require_file(path: Path) -> None:
             f"{path} is no regular file: a recording is read from a disk, not from a pipe or a "
             "device. Save it to a file and name that."
         )
-
-
-def file_digest(url: str | Path) -> str:
-    """Return the SHA-256 of a file's bytes, in hexadecimal."""
-    import fsspec
-
-    digest = hashlib.sha256()
-    try:
-        with fsspec.open(str(url), "rb") as file:
-            while block := file.read(_BLOCK):
-                digest.update(block)
-    except FileNotFoundError as error:
-        raise NotFoundError(f"There is no recording {url}.") from error
-    return digest.hexdigest()
 
 
 def _runs(rows: Nanos) -> Iterator[Nanos]:

@@ -45,6 +45,10 @@ class Returns:
         What is missing, as sentences.
     has_heights : bool or None
         Whether the coordinates include the heights of the lasers; None where that is not known.
+    span_ns : int
+        Median time from the stamp of a message to its last pulse; 0 where that is not known.
+    lateness_ns : int
+        Median time from the last pulse of a message to its recording.
     """
 
     topic: str
@@ -57,6 +61,8 @@ class Returns:
     message_stamps_ns: Nanos
     notes: tuple[str, ...]
     has_heights: bool | None = None
+    span_ns: int = 0
+    lateness_ns: int = 0
 
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
@@ -75,6 +81,8 @@ class Series:
         Angle [rad]; or translation [m] and quaternion x y z w; or quaternion alone.
     notes : tuple of str
         What is missing or was repaired, as sentences.
+    lateness_ns : int
+        Median time from a stamp to its recording.
     """
 
     topic: str
@@ -82,6 +90,7 @@ class Series:
     stamps_ns: Nanos
     values: Array
     notes: tuple[str, ...] = ()
+    lateness_ns: int = 0
 
 
 class Decoder(Protocol):
@@ -119,6 +128,7 @@ def series_of(
     near = plausible(stamps_ns, log_times_ns)
     if not near.all():
         notes.append(far_note(topic, int((~near).sum()), "samples"))
+    late = int(np.median((log_times_ns - stamps_ns)[near])) if near.any() else 0
     usable = near & np.isfinite(values).all(axis=1)
     stamps_ns, values = stamps_ns[usable], values[usable]
     moved = int((stamps_ns[1:] <= stamps_ns[:-1]).sum())
@@ -126,7 +136,14 @@ def series_of(
         stamps_ns, first = np.unique(stamps_ns, return_index=True)
         values = values[first]
         notes.append(f"{moved} samples of {topic} were out of order or double.")
-    return Series(topic=topic, names=names, stamps_ns=stamps_ns, values=values, notes=tuple(notes))
+    return Series(
+        topic=topic,
+        names=names,
+        stamps_ns=stamps_ns,
+        values=values,
+        notes=tuple(notes),
+        lateness_ns=late,
+    )
 
 
 def plausible(stamps_ns: Nanos, log_times_ns: Nanos) -> Mask:

@@ -31,9 +31,9 @@ class FrameTree:
     turning: dict[str, Series] = field(default_factory=dict)
 
     def add(self, series: Series) -> None:
-        """Add a frame under its parent; transforms of a topic ``tf_static`` do not change."""
+        """Add a frame under its parent: one whose transform changes, or one that is fixed."""
         parent, child = series.names
-        if not series.topic.endswith("tf_static"):
+        if not series.topic.endswith("tf_static") and np.ptp(series.values, axis=0).any():
             self.turning[child] = series
         elif len(series.values) and child not in self.parents:
             translation, quaternion = np.split(series.values[-1], [3])

@@ -65,6 +65,8 @@ uint8  datatype
 uint32 count
 """
 
+_UNITS = (1_000, 1_000_000)  # [ns] of times that are no nanoseconds
+_FILLED = (0.8, 3.0)  # of the time between messages to their duration, in the right unit
 _BAD_MAX = 0.05  # share of messages whose times may be unusable before all are
 
 
@@ -223,10 +225,18 @@ class PointClouds:
                 self._out.put(self._n, self._out.taken(slice(row, row + n)))
             self._n += n
 
+    def stamped_at_end(self) -> Returns:
+        """Return all returns, where the stamp of a message is the instant of its last point."""
+        messages = self._near([])
+        shifts = messages.spans_ns
+        self._out.stamps[: self._n] -= np.repeat(shifts, messages.counts)
+        self._parts = [messages._replace(stamps_ns=messages.stamps_ns - shifts)]
+        return self.returns()
+
     def returns(self) -> Returns:
         """Return all returns, in the order of their instants."""
         notes = [*broken_note(self._topic, self._n_broken, self._reason)]
-        messages = self._near(notes)
+        messages = self._in_unit(self._near(notes), notes)
         self._parts = [messages := self._stamped(messages, notes)]
         has_times = self._has_times(messages, notes)
         if self._layout.intensity is None:
@@ -248,7 +258,29 @@ class PointClouds:
             has_pulse_times=has_times,
             message_stamps_ns=np.sort(messages.stamps_ns),
             notes=tuple(notes),
+            span_ns=int(np.median(messages.spans_ns)) if has_times else 0,
+            lateness_ns=_lateness(messages),
         )
+
+    def _in_unit(self, messages: _Messages, notes: list[str]) -> _Messages:
+        """Take whole times as micro- or milliseconds where that makes clouds last until the next.
+
+        A LiDAR that scans without a pause fills the time between its messages; as nanoseconds its
+        times would fill a thousandth of it, or a millionth.
+        """
+        time, stamps = self._layout.time, np.unique(messages.stamps_ns)
+        span = float(np.median(messages.spans_ns)) if len(stamps) > 2 else 0.0
+        if time is None or time.kind[0] not in "iu" or span <= 0.0:
+            return messages
+        ratio = float(np.median(np.diff(stamps))) / span
+        unit = next((one for one in _UNITS if _FILLED[0] < ratio / one < _FILLED[1]), None)
+        if unit is None:
+            return messages
+        out, starts = self._out.stamps[: self._n], np.repeat(messages.stamps_ns, messages.counts)
+        out[:] = starts + (out - starts) * unit
+        name = "microseconds" if unit == _UNITS[0] else "milliseconds"
+        notes.append(f"The times of {self._topic} are taken as {name}: they fill its messages so.")
+        return messages._replace(spans_ns=messages.spans_ns * unit)
 
     def _near(self, notes: list[str]) -> _Messages:
         """Leave out messages with implausible stamps; return the others."""
@@ -282,6 +314,12 @@ class PointClouds:
         notes.append(f"The points of {self._topic} carry no time of their own: {fault}.")
         self._out.stamps[: self._n] = np.repeat(messages.stamps_ns, messages.counts)
         return False
+
+
+def _lateness(messages: _Messages) -> int:
+    """Return how long after its last point a message was recorded [ns]; 0 if that is not known."""
+    late = messages.log_times_ns - messages.stamps_ns
+    return int(np.median(late - messages.spans_ns)) if late.any() else 0
 
 
 def _alike(batch: Batch, i: int, head: _Head, step: int) -> Nanos:

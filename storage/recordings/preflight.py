@@ -6,6 +6,7 @@ bad recording gets a report; only one that does not exist raises.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -16,8 +17,11 @@ from spheremark.pipelines.config import StitchingConfig
 from spheremark.pipelines.errors import InputError, MissingRigError, NotFoundError
 from spheremark.pipelines.model import Array, Index, Nanos, Origin, Rig, ScanLog
 from spheremark.pipelines.scan.rigs import tilted_vlp16
-from spheremark.storage.recordings.container import Batch, Channel, opened
-from spheremark.storage.recordings.reading import Choice, Decoders, assemble, stem
+from spheremark.storage.recordings.container import Batch, Channel
+from spheremark.storage.recordings.decoding import Decoders
+from spheremark.storage.recordings.options import LogOptions
+from spheremark.storage.recordings.reading import assemble, stem
+from spheremark.storage.recordings.sources import opened
 
 OK, WEAK, REFUSED = "ok", "weak", "refused"
 
@@ -97,6 +101,8 @@ class Preflight:
         Revolutions of the LiDAR per minute.
     coverage_gap_deg : float or None
         Largest angle along the horizon that no scan line crosses, at the worst stop.
+    reading : dict
+        Options with which the log was read, as far as they are no defaults.
     """
 
     verdict: str
@@ -116,6 +122,7 @@ class Preflight:
     gimbal_speed_deg_per_s: float | None = None
     lidar_speed_rpm: float | None = None
     coverage_gap_deg: float | None = None
+    reading: dict[str, Any] = field(default_factory=dict)
 
     def to_mapping(self) -> dict[str, Any]:
         """Return the report as plain values for JSON."""
@@ -154,13 +161,19 @@ class _Times:
         )
 
 
-def inspect_log(url: str | Path) -> Preflight:
+def inspect_log(
+    url: str | Path, options: LogOptions | None = None, *, beside: Sequence[Path] = ()
+) -> Preflight:
     """Inspect a recording.
 
     Parameters
     ----------
     url : str or Path
-        A path, or any address that fsspec knows.
+        As for ``read_log``.
+    options : LogOptions, optional
+        Topics, joint and clocks, where they cannot be found.
+    beside : sequence of Path
+        Further files of the same log.
 
     Returns
     -------
@@ -176,35 +189,38 @@ def inspect_log(url: str | Path) -> Preflight:
     -----
     Reads the whole file once, and stitches a sample of its returns.
     """
+    options = options or LogOptions()
+    start = Preflight(verdict=OK, reading=options.to_mapping())
     try:
-        return _inspect(url)
+        return _inspect(url, beside, options, start)
     except NotFoundError:
         raise
     except InputError as error:
-        return _refused(Preflight(verdict=OK), error)
+        return _refused(start, error)
 
 
-def _inspect(url: str | Path) -> Preflight:
-    """Walk the recording and return its report; only a file that is not MCAP raises."""
+def _inspect(
+    url: str | Path, beside: Sequence[Path], options: LogOptions, start: Preflight
+) -> Preflight:
+    """Walk the recording and return its report; only a file that is no log raises."""
     damage: InputError | None = None
     times = _Times()
-    with opened(url) as container:
-        decoders = Decoders(container=container)
+    with opened(url, beside, recover=options.recover) as recording:
+        decoders = Decoders(recording)
         try:
-            for batch in container.batches():
+            for batch in recording.batches():
                 times.add(batch)
                 decoders.add(batch)
         except InputError as error:
             damage = error
-        topics = {channel.topic: channel for channel in container.channels.values()}
-        report = Preflight(
-            verdict=OK,
-            size_bytes=container.size,
+        topics = recording.channels
+        report = replace(
+            start,
+            size_bytes=recording.size,
             topics=tuple(times.report(topics[topic]) for topic in sorted(topics)),
         )
-        found = container.topics()
     try:
-        log = assemble(decoders, found, Choice(), Origin(name=stem(url), digest=""))
+        log = assemble(decoders, options, Origin(name=stem(url), digest=""))
     except InputError as error:
         return _refused(report, damage or error)
     report = _with_verdict(_described(report, log), log, _skew(decoders, times))
@@ -254,7 +270,7 @@ def _with_verdict(report: Preflight, log: ScanLog, skew: float | None) -> Prefli
             refusal = refusal or error
     gaps = [gap for gap in (_horizon_gap(stop, rig) for stop in stops) if gap is not None]
     coverage, gap = min(coverages, default=None), max(gaps, default=None)
-    reasons += [note for stop in stops for note in pause_notes(stop)]
+    reasons += [*log.weaknesses, *(note for stop in stops for note in pause_notes(stop))]
     reasons += _reasons(report, coverage, gap, skew)
     report = replace(
         report,

@@ -17,6 +17,7 @@ from spheremark.pipelines.model import Array, Mask, Nanos
 NO_FIELD = "there is no such field"
 PULSES_MIN = 32  # points that a message needs before its times can be judged
 _REVOLUTION_LIMIT = 10.0  # [s] no message spans more; a larger time has another meaning
+_OTHER_UNITS = (1e6, 1e3, 1.0)  # [ns] of floating times that are too large for seconds
 _EPOCH = 1e6  # [s] a larger time is absolute
 _EPOCH_NS = 1e15  # the same in nanoseconds
 _ZEROS_MAX = 0.25  # share of zero times that a message with times may have
@@ -43,7 +44,7 @@ def _written(times: NDArray[np.generic], stamp_ns: int, out: Nanos) -> tuple[int
         return 0, fault
     offsets = _offsets_ns(times, low, high, stamp_ns)
     if offsets is None:
-        return 0, f"its times run from {low:g} to {high:g}, neither seconds nor nanoseconds"
+        return 0, f"its times run from {low:g} to {high:g}, which no unit of time explains"
     out[:] = offsets + stamp_ns
     return int(offsets.max()), ""
 
@@ -87,8 +88,10 @@ def _offsets_ns(times: NDArray[np.generic], low: float, high: float, stamp_ns: i
         # A driver may stamp points by the sensor's clock and messages by the computer's.
         far = stamp_ns and abs(int(absolute[0]) - stamp_ns) > _REVOLUTION_LIMIT * 1e9
         return absolute - (int(absolute.min()) if far else stamp_ns)
-    scale = _scale(times.dtype.kind)
-    if max(abs(low), abs(high)) * scale > _REVOLUTION_LIMIT * 1e9:
+    most = max(abs(low), abs(high))
+    units = (_scale(times.dtype.kind), *_OTHER_UNITS)
+    scale = next((one for one in units if most * one <= _REVOLUTION_LIMIT * 1e9), None)
+    if scale is None:
         return None
     return np.rint(times.astype(np.float64) * scale).astype(np.int64)
 

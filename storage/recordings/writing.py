@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import heapq
-import struct
 from collections.abc import Iterator
 from itertools import pairwise
 from pathlib import Path
@@ -11,12 +10,12 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 from mcap.writer import CompressionType, Writer
-from numpy.typing import NDArray
 
 from spheremark.pipelines.errors import ConfigError, RecordingError
 from spheremark.pipelines.model import Array, Firings, ImuMount, Nanos, Rig, ScanLog
 from spheremark.storage.recordings import (
     joint_states,
+    messages,
     orientations,
     packets,
     pointclouds,
@@ -34,15 +33,20 @@ _COMPRESSIONS = {
     "zstd": CompressionType.ZSTD,
 }
 _GRAVITY = 9.80665  # [m/s^2] that an accelerometer at rest shows upwards (REP-145)
-_FIELDS = {  # name: type, PointField.datatype, offset
-    "x": ("<f4", 7, 0),
-    "y": ("<f4", 7, 4),
-    "z": ("<f4", 7, 8),
-    "intensity": ("<f4", 7, 12),
-    "ring": ("<u2", 4, 16),
-    "time": ("<f4", 7, 18),
-}
-_POINT = np.dtype([(name, kind) for name, (kind, _, _) in _FIELDS.items()])
+_POINT = np.dtype(
+    [
+        ("x", "<f4"),
+        ("y", "<f4"),
+        ("z", "<f4"),
+        ("intensity", "<f4"),
+        ("ring", "<u2"),
+        ("time", "<f4"),
+    ]
+)
+_FIELDS = [
+    messages.PointField(name, 4 * place if name != "time" else 18, 4 if name == "ring" else 7)
+    for place, name in enumerate(("x", "y", "z", "intensity", "ring", "time"))
+]
 _QOS = (
     "- history: 3\n  depth: 0\n  reliability: 1\n  durability: {durability}\n"
     "  deadline:\n    sec: 9223372036\n    nsec: 854775807\n"
@@ -154,7 +158,7 @@ def _clouds(topic: str, log: ScanLog, revolution_ns: int) -> Iterator[Item]:
     points["intensity"], points["ring"] = log.intensities[order], log.rings[order]
     turns = (stamps - stamps[0]) // revolution_ns
     edges = [*(np.flatnonzero(np.diff(turns, prepend=-1))).tolist(), len(stamps)]
-    names = [name for name in _FIELDS if name != "time" or log.has_pulse_times]
+    fields = [field for field in _FIELDS if field.name != "time" or log.has_pulse_times]
     for begin, end in pairwise(edges):
         stamp = (
             int(stamps[0] + turns[begin] * revolution_ns)
@@ -162,35 +166,15 @@ def _clouds(topic: str, log: ScanLog, revolution_ns: int) -> Iterator[Item]:
             else int(stamps[begin])
         )
         points["time"][begin:end] = (stamps[begin:end] - stamp) * 1e-9
-        yield int(stamps[end - 1]), topic, _cloud(points[begin:end], names, stamp)
-
-
-def _cloud(points: NDArray[np.void], names: list[str], stamp: int) -> bytes:
-    """Encode one cloud."""
-    message = _header(stamp, LIDAR_FRAME)
-    message += struct.pack("<III", 1, len(points), len(names))
-    for name in names:
-        _, datatype, offset = _FIELDS[name]
-        message += _text(name)
-        _align(message, 4)
-        message += struct.pack("<IB3xI", offset, datatype, 1)
-    size = points.nbytes
-    message += struct.pack("<B", 0)
-    _align(message, 4)
-    message += struct.pack("<III", _POINT.itemsize, size, size)
-    return bytes(message) + points.tobytes() + b"\x01"
+        data = points[begin:end].tobytes()
+        message = messages.cloud(stamp, LIDAR_FRAME, fields, _POINT.itemsize, data)
+        yield int(stamps[end - 1]), topic, message
 
 
 def _joints(topic: str, log: ScanLog) -> Iterator[Item]:
     """Give one joint state per sample."""
     for stamp, angle in zip(log.stamps_gimbal_ns.tolist(), log.gimbal_angles.tolist(), strict=True):
-        message = _header(stamp, "")
-        message += struct.pack("<I", 1) + _text(JOINT)
-        _align(message, 4)
-        message += struct.pack("<I", 1)
-        _align(message, 8)
-        message += struct.pack("<dII", angle, 0, 0)
-        yield stamp, topic, bytes(message)
+        yield stamp, topic, messages.joint_state(stamp, (JOINT,), (angle,))
 
 
 def _imus(topic: str, log: ScanLog) -> Iterator[Item]:
@@ -200,13 +184,9 @@ def _imus(topic: str, log: ScanLog) -> Iterator[Item]:
     rotations = Rotation.from_quat(log.quaternions_imu)
     rates = _rates(rotations, log.stamps_imu_ns)
     up = rotations.inv().apply([0.0, 0.0, _GRAVITY])
-    unknown = [0.0] * 9
     columns = np.hstack([log.quaternions_imu, rates, up]).tolist()
     for stamp, row in zip(log.stamps_imu_ns.tolist(), columns, strict=True):
-        message = _header(stamp, IMU_FRAME)
-        _align(message, 8)
-        message += struct.pack("<37d", *row[:4], *unknown, *row[4:7], *unknown, *row[7:], *unknown)
-        yield stamp, topic, bytes(message)
+        yield stamp, topic, messages.imu(stamp, IMU_FRAME, row[:4], row[4:7], row[7:])
 
 
 def _rates(rotations: Rotation, stamps_ns: Nanos) -> Array:
@@ -226,35 +206,12 @@ def _static_transforms(rig: Rig, stamp: int) -> bytes:
     mount = HEAD_FRAME if rig.imu_mount is ImuMount.HEAD else BASE_FRAME
     T_mount_imu = np.eye(4)
     T_mount_imu[:3, :3] = rig.R_mount_imu
-    message = bytearray(b"\x00\x01\x00\x00") + struct.pack("<I", 2)
-    for parent, child, T in (
-        (HEAD_FRAME, LIDAR_FRAME, rig.T_head_lidar),
-        (mount, IMU_FRAME, T_mount_imu),
-    ):
-        _align(message, 4)
-        message += struct.pack("<iI", *divmod(stamp, 1_000_000_000)) + _text(parent)
-        _align(message, 4)
-        message += _text(child)
-        _align(message, 8)
-        quaternion = Rotation.from_matrix(T[:3, :3]).as_quat()
-        message += struct.pack("<7d", *T[:3, 3], *quaternion)
-    return bytes(message)
-
-
-def _header(stamp: int, frame: str) -> bytearray:
-    """Begin a message: encapsulation, stamp and frame, aligned for what follows."""
-    message = bytearray(b"\x00\x01\x00\x00")
-    message += struct.pack("<iI", *divmod(stamp, 1_000_000_000)) + _text(frame)
-    _align(message, 4)
-    return message
-
-
-def _text(text: str) -> bytes:
-    """Encode a string."""
-    octets = text.encode() + b"\0"
-    return struct.pack("<I", len(octets)) + octets
-
-
-def _align(message: bytearray, size: int) -> None:
-    """Pad a message to a multiple of a size, counted from behind the encapsulation."""
-    message += bytes((4 - len(message)) % size)
+    links = ((HEAD_FRAME, LIDAR_FRAME, rig.T_head_lidar), (mount, IMU_FRAME, T_mount_imu))
+    return messages.transforms(
+        [
+            messages.Transform(
+                stamp, parent, child, T[:3, 3], Rotation.from_matrix(T[:3, :3]).as_quat()
+            )
+            for parent, child, T in links
+        ]
+    )

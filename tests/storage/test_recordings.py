@@ -22,7 +22,8 @@ from spheremark.pipelines.geometry import rigid, rot_x, rot_y, rot_z
 from spheremark.pipelines.model import RING_UNKNOWN, ImuMount, Origin, ScanLog
 from spheremark.pipelines.scan.rigs import tilted_vlp16, vlp16
 from spheremark.storage.recordings import file_digest, read_log, write_log
-from spheremark.storage.recordings.container import Container, opened
+from spheremark.storage.recordings.container import Container
+from spheremark.storage.recordings.sources import opened
 from tests.real_scans import recordings
 from tests.storage.recorder import (
     DEFINITIONS,
@@ -310,7 +311,7 @@ def useless_times(kind):
         "zero": times * 0,
         "constant": times * 0 + 0.05,
         "half": np.where(np.arange(64) < 32, times, 0),
-        "huge": times * 1e9,
+        "huge": times * 1e12,
         "nan": np.where(np.arange(64) < 3, np.nan, times),
     }[kind]
 
@@ -564,10 +565,13 @@ def test_the_mounting_of_the_ahrs_is_found_through_other_frames(tmp_path):
 def test_orientations_that_the_device_does_not_know_are_left_out(tmp_path):
     items = small_log(np.random.default_rng(21))
     items += [
-        ("/imu", T0, imu(T0, STILL, covariance=-1.0)),
+        ("/imu", T0, imu(T0, TURN, covariance=-1.0)),
         ("/imu", T0, imu(T0 + 1, (0, 0, 0, 0))),
     ]
-    assert len(read_log(record(tmp_path / "a.mcap", items)).quaternions_imu) == 0
+    log = read_log(record(tmp_path / "a.mcap", items))
+    assert_array_equal(log.quaternions_imu, [STILL])  # by the accelerations
+    assert any("levelled by the accelerations of /imu" in note for note in log.notes)
+    assert log.sigma_levelling > 0
 
 
 def test_broken_messages_cost_themselves_only(tmp_path):

@@ -26,8 +26,8 @@ from spheremark.pipelines.errors import (
 from spheremark.pipelines.model import Origin, ScanLog
 from spheremark.pipelines.scan.rigs import tilted_vlp16
 from spheremark.storage.recordings import inspect_log, read_log, write_log
-from spheremark.storage.recordings.container import opened
 from spheremark.storage.recordings.records import MAGIC
+from spheremark.storage.recordings.sources import opened
 from tests.storage.recorder import T0, cloud, joints, record, small_log, turning, velodyne
 
 
@@ -44,12 +44,13 @@ def test_a_pipe_is_refused_before_anybody_waits_for_it(tmp_path):
         read_log(tmp_path / "log.mcap")
 
 
-def test_a_folder_is_refused(tmp_path):
-    with pytest.raises(RecordingError, match="is a folder"):
+def test_a_folder_without_a_log_is_refused_with_its_files(tmp_path):
+    (tmp_path / "notes.txt").write_text("nothing")
+    with pytest.raises(NotMcapError, match=r"holds no log. Found: notes.txt"):
         read_log(tmp_path)
 
 
-@pytest.mark.parametrize("octets", [b"", b"#ROSBAG V2.0\n", MAGIC[:5]])
+@pytest.mark.parametrize("octets", [b"", b"#ROSBAG V1.2\n", MAGIC[:5]])
 def test_what_is_not_mcap_is_refused(tmp_path, octets):
     (tmp_path / "a.mcap").write_bytes(octets)
     with pytest.raises(NotMcapError):
