@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from pathlib import Path
 
 from spheremark.pipelines.calibration import Calibration, calibrate
 from spheremark.pipelines.config import SurveyConfig
@@ -21,7 +20,7 @@ from spheremark.pipelines.model import (
 from spheremark.pipelines.network import AdjustedNetwork, Refusal, adjust_network, assemble
 from spheremark.pipelines.progress import Progress, part_of
 from spheremark.pipelines.survey import StopErrors, process, stop_errors
-from spheremark.storage.recordings import read_log
+from spheremark.storage.recordings import LogFile
 
 _SCANS = 0.95  # share of the time of an adjustment that the scans take
 
@@ -53,7 +52,7 @@ class Fieldbook:
 
 
 def process_file(
-    path: Path,
+    file: LogFile,
     config: SurveyConfig,
     progress: Progress,
     *,
@@ -62,8 +61,8 @@ def process_file(
     truth: Truth | None = None,
 ) -> ProcessedLog:
     """Process a log; the truth, if given, adds errors and changes nothing else."""
-    progress(0.0, f"Reading {path.name}")
-    logs = [read_log(path)]
+    progress(0.0, f"Reading {file.path.name}")
+    logs = [file.read()]
     origin, notes = logs[0].origin, logs[0].notes
     stops = process(  # releases the log once it is stitched: no reference to it may remain here
         logs.pop(), config=config, rig=rig, marks=marks, progress=progress
@@ -80,20 +79,20 @@ def process_file(
 
 
 def read_scans(
-    paths: Sequence[Path], config: SurveyConfig, rig: Rig | None, progress: Progress
+    files: Sequence[LogFile], config: SurveyConfig, rig: Rig | None, progress: Progress
 ) -> Fieldbook:
     """Find the markers of each log; a log that fails is refused, and the error raised if all do."""
     scans: list[tuple[str, MarkerFits]] = []
     refused: list[Refusal] = []
     first: SpheremarkError | None = None
-    for i, path in enumerate(paths):
+    for i, file in enumerate(files):
         try:
-            part = part_of(progress, _SCANS * i / len(paths), _SCANS * (i + 1) / len(paths))
-            stops = process(read_log(path), config=config, rig=rig, progress=part)
+            part = part_of(progress, _SCANS * i / len(files), _SCANS * (i + 1) / len(files))
+            stops = process(file.read(), config=config, rig=rig, progress=part)
             scans += [(stop.name, stop.fits[config.fitting.methods[0]]) for stop in stops]
         except SpheremarkError as error:
             first = first or error
-            refused.append(Refusal(station=path.stem, code=error.code, reason=str(error)))
+            refused.append(Refusal(station=file.path.stem, code=error.code, reason=str(error)))
     if not scans and first is not None:
         raise first
     return Fieldbook(scans=tuple(scans), refused=tuple(refused))
@@ -101,14 +100,14 @@ def read_scans(
 
 def with_calibration(
     book: Fieldbook,
-    paths: Sequence[Path],
+    files: Sequence[LogFile],
     config: SurveyConfig,
     rig: Rig | None,
     progress: Progress,
 ) -> Fieldbook:
     """Return a fieldbook with the rig from its logs, or the reason why they do not determine it."""
     refused = {one.station for one in book.refused}
-    good = [path for path in paths if path.stem not in refused]
+    good = [file for file in files if file.path.stem not in refused]
     try:
         return replace(book, calibration=calibrate_files(good, config, rig, progress))
     except (SolveError, RigError) as error:
@@ -142,25 +141,25 @@ def merged_truth(truths: Sequence[Truth]) -> Truth:
 class _Logs:
     """Logs that are read one by one in each pass of a calibration; a single one is kept."""
 
-    paths: tuple[Path, ...]
+    files: tuple[LogFile, ...]
     kept: tuple[ScanLog, ...]
 
     def __iter__(self) -> Iterator[ScanLog]:
-        return iter(self.kept) if self.kept else (_read(path) for path in self.paths)
+        return iter(self.kept) if self.kept else (_read(file) for file in self.files)
 
 
 def calibrate_files(
-    paths: Sequence[Path], config: SurveyConfig, rig: Rig | None, progress: Progress
+    files: Sequence[LogFile], config: SurveyConfig, rig: Rig | None, progress: Progress
 ) -> Calibration:
     """Estimate the rig from the spheres of some logs."""
-    kept = (_read(paths[0]),) if len(paths) == 1 else ()
-    return calibrate(_Logs(tuple(paths), kept), config=config, rig=rig, progress=progress)
+    kept = (_read(files[0]),) if len(files) == 1 else ()
+    return calibrate(_Logs(tuple(files), kept), config=config, rig=rig, progress=progress)
 
 
-def _read(path: Path) -> ScanLog:
+def _read(file: LogFile) -> ScanLog:
     """Read one log of several; an error names it."""
     try:
-        return read_log(path)
+        return file.read()
     except RecordingError as error:
-        error.args = (f"{path.name}: {error}",)
+        error.args = (f"{file.path.name}: {error}",)
         raise

@@ -19,6 +19,7 @@ import typer
 from spheremark.pipelines.errors import ConfigError, SpheremarkError
 from spheremark.service.cli.bench import bench, reproduce
 from spheremark.service.cli.plan import plan
+from spheremark.service.cli.reading import LogFiles, OneLog, reads_logs
 from spheremark.service.cli.site import site
 from spheremark.service.cli.survey import (
     Axes,
@@ -46,7 +47,6 @@ app.add_typer(plan, name="plan")
 
 _EXPORTS = "results.duckdb, or points as .csv, .dxf, .xml (LandXML) or .geojson."
 AsJson = Annotated[bool, typer.Option("--json", help="JSON for programs.")]
-LogFile = Annotated[Path, typer.Argument(exists=True, dir_okay=False, help="Log (MCAP).")]
 
 
 class Format(StrEnum):
@@ -199,23 +199,25 @@ def simulate(
 
 
 @app.command()
-def inspect(log: LogFile, as_json: AsJson = False) -> None:
+@reads_logs
+def inspect(log: OneLog, as_json: AsJson = False) -> None:
     """Report what a log holds and lacks, and whether it can be processed."""
     from spheremark.service.cli import render
     from spheremark.storage.recordings import inspect_log
 
-    report = inspect_log(log)
+    report = inspect_log(log.path, log.options, beside=log.beside)
     if as_json:
         _print_json(report.to_mapping())
     else:
-        render.print_preflight(out, log.name, report)
+        render.print_preflight(out, log.path.name, report)
     if report.verdict == "refused":
         raise typer.Exit(1)
 
 
 @app.command()
+@reads_logs
 def process(
-    logs: Annotated[list[Path], typer.Argument(metavar="LOG...", exists=True, dir_okay=False)],
+    logs: LogFiles,
     control: ControlFile = None,
     control_axes: ControlAxes = Axes.ENU,
     control_unit: ControlUnit = Unit.METRE,

@@ -7,13 +7,13 @@ from typing import Annotated, Any
 
 import typer
 
+from spheremark.service.cli.reading import LogFiles, reads_logs
 from spheremark.service.cli.survey import (
     AsJson,
     Axes,
     ControlAxes,
     ControlFile,
     ControlUnit,
-    Logs,
     RigFile,
     TargetHeight,
     Unit,
@@ -34,8 +34,9 @@ GeoTiff = Annotated[
 ]
 
 
+@reads_logs
 def site(
-    logs: Logs,
+    logs: LogFiles,
     control: ControlFile = None,
     control_axes: ControlAxes = Axes.ENU,
     control_unit: ControlUnit = Unit.METRE,

@@ -8,12 +8,12 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from spheremark.service.cli.reading import LogFiles, reads_logs
 from spheremark.service.cli.terminal import out, print_json, progress
 
 if TYPE_CHECKING:
     from spheremark.pipelines.model import ControlMarks
 
-Logs = Annotated[list[Path], typer.Argument(metavar="LOG...", exists=True, dir_okay=False)]
 AsJson = Annotated[bool, typer.Option("--json", help="JSON for programs.")]
 
 
@@ -60,8 +60,9 @@ def read_control(
     return read(path, layout) if path else None
 
 
+@reads_logs
 def adjust(
-    logs: Logs,
+    logs: LogFiles,
     control: ControlFile = None,
     control_axes: ControlAxes = Axes.ENU,
     control_unit: ControlUnit = Unit.METRE,
@@ -127,8 +128,9 @@ def adjust(
         render.print_network(out, plain)
 
 
+@reads_logs
 def calibrate(
-    logs: Logs,
+    logs: LogFiles,
     rig: Annotated[
         Path | None,
         typer.Option(

@@ -38,11 +38,12 @@ from spheremark.service.errors import (
 from spheremark.storage.catalogue.catalogue import Catalogue
 from spheremark.storage.catalogue.records import RecordingRecord
 from spheremark.storage.files import require_free, sync_folder, unwritten
-from spheremark.storage.recordings import inspect_log
+from spheremark.storage.recordings import LogOptions, inspect_log
 
 logger = logging.getLogger(__name__)
 
 LOG = ".mcap"
+_ENDING = re.compile(r"\.(mcap|db3|bag|pcap|pcapng|zip)$", re.IGNORECASE)
 _BLOCK = 4 << 20  # [bytes] hashed and written at once; large enough that a thread pays off
 _KEPT_SECONDS = 7 * 24 * 3600.0  # until an upload that nobody resumes is removed
 _DIGEST = re.compile(r"(?:^|,)\s*sha-256=:([A-Za-z0-9+/=]+):")
@@ -337,28 +338,36 @@ class Resumable:
         return upload
 
 
-def take_in(catalogue: Catalogue, received: Received, name: str) -> tuple[RecordingRecord, bool]:
+def take_in(
+    catalogue: Catalogue, received: Received, name: str, options: LogOptions
+) -> tuple[RecordingRecord, bool]:
     """Enter a log that arrived, with its preflight; return it, and whether it is new.
 
-    A log that cannot be processed is kept with the reason, which is then raised.
+    A log that cannot be processed is kept with the reason, which is then raised. One that was here
+    already is inspected again if it is to be read in another way.
     """
-    recording, is_new = enter(catalogue, received, name)
+    recording, is_new = enter(catalogue, received, name, options)
+    if not is_new and recording.preflight.get("reading", {}) != options.to_mapping():
+        found = inspect_log(received.path, options).to_mapping()
+        recording = catalogue.inspect_again(received.digest, found)
     if recording.verdict == "refused":
         raise RefusedRecordingError.of(recording)
     return recording, is_new
 
 
-def enter(catalogue: Catalogue, received: Received, name: str) -> tuple[RecordingRecord, bool]:
+def enter(
+    catalogue: Catalogue, received: Received, name: str, options: LogOptions | None = None
+) -> tuple[RecordingRecord, bool]:
     """Enter a log that arrived, with its preflight; return it, and whether it is new."""
     try:
         return catalogue.get_recording(received.digest), False
     except NotFoundError:
         recording = catalogue.add_recording(
             received.digest,
-            name=name.removesuffix(LOG),
+            name=_ENDING.sub("", name) or name,
             size_bytes=received.size_bytes,
             url=str(received.path),
-            preflight=inspect_log(received.path).to_mapping(),
+            preflight=inspect_log(received.path, options).to_mapping(),
         )
         return recording, True
 

@@ -11,7 +11,7 @@ import logging
 import os
 import secrets
 import traceback
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from contextlib import AsyncExitStack, suppress
 from dataclasses import dataclass, field, replace
 from functools import partial
@@ -28,7 +28,14 @@ from spheremark.pipelines.config import SurveyConfig
 from spheremark.pipelines.errors import ConflictError, SpheremarkError
 from spheremark.service.jobs import worker as tasks
 from spheremark.service.jobs.events import EventLog
-from spheremark.service.jobs.handlers import KINDS, JobKind, JobResult, JobSpecification, Log
+from spheremark.service.jobs.handlers import (
+    KINDS,
+    JobKind,
+    JobResult,
+    JobSpecification,
+    Log,
+    Reading,
+)
 from spheremark.service.settings import Settings
 from spheremark.storage.catalogue.catalogue import Catalogue
 from spheremark.storage.catalogue.records import JobRecord
@@ -212,7 +219,7 @@ class JobQueue:
             kind=kind,
             result_id=secrets.token_hex(8),
             survey_id=job.survey_id,
-            logs=tuple(self._log(one) for one in recordings_of(job)),
+            logs=tuple(self._log(one, job.options) for one in recordings_of(job)),
             config=SurveyConfig.from_mapping(job.config),
             marks=catalogue.control_marks(job.survey_id),
             rig=None if rig is None else catalogue.get_rig(rig),
@@ -221,10 +228,13 @@ class JobQueue:
         )
         return replace(spec, known=KINDS[kind].gather(catalogue, spec))
 
-    def _log(self, recording_id: str) -> Log:
-        """Return address and name of a log."""
+    def _log(self, recording_id: str, options: Mapping[str, Any]) -> Log:
+        """Return address and name of a log, and how to read it: as uploaded, or as the job says."""
         known = self._catalogue.get_recording(recording_id)
-        return Log(recording_id=recording_id, name=known.name, url=known.url)
+        given = ((name, options.get(name)) for name in Reading.model_fields)
+        chosen = {name: value for name, value in given if value is not None}
+        reading = {**known.preflight.get("reading", {}), **chosen}
+        return Log(recording_id=recording_id, name=known.name, url=known.url, reading=reading)
 
     async def _begin(self, live: _Live) -> None:
         """Record that a worker began; again, if the one before died."""

@@ -32,6 +32,7 @@ if TYPE_CHECKING:
     from spheremark.pipelines.config import SurveyConfig
     from spheremark.pipelines.model import ControlMarks, Rig, ScanLog, StitchedCloud
     from spheremark.pipelines.network import Network
+    from spheremark.storage.recordings import LogFile
 
 KINDS = ("laz", "e57", "geotiff")
 ENDINGS = {"laz": ".laz", "e57": ".e57", "geotiff": ".tif"}
@@ -146,7 +147,7 @@ def stitched(
 
 
 def of_logs(
-    logs: Sequence[Path],
+    logs: Sequence[LogFile],
     marks: ControlMarks | None,
     rig: Rig | None,
     config: SurveyConfig,
@@ -155,18 +156,17 @@ def of_logs(
 ) -> tuple[Site, Network]:
     """Adjust the stations of logs and write the requested files; logs that fail are refused."""
     from spheremark.service.log_files import adjust_scans, read_scans
-    from spheremark.storage.recordings import read_log
 
     book = read_scans(logs, config, rig, part_of(progress, 0.0, 0.5))
     result = adjust_scans(book, marks, config)
     poses = {pose.name: pose for pose in poses_of_network(result)}
     refused = {one.station for one in book.refused}
-    good = [path for path in logs if path.stem not in refused]
+    good = [file for file in logs if file.path.stem not in refused]
 
     def read() -> Iterator[ScanLog]:
-        for i, path in enumerate(good):
-            progress(0.5 + 0.5 * i / len(good), f"Adding {path.stem} to the site")
-            yield read_log(path)
+        for i, file in enumerate(good):
+            progress(0.5 + 0.5 * i / len(good), f"Adding {file.path.stem} to the site")
+            yield file.read()
 
     stops = stitched(read(), config, lambda _name: rig, poses)
     site = make_site(stops, tuple(poses.values()), request)

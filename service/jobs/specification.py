@@ -3,16 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
 from enum import StrEnum
 from time import perf_counter
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal, Self
 
-from pydantic import BaseModel, ConfigDict
+from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from spheremark.pipelines.config import SurveyConfig
-from spheremark.pipelines.model import ControlMarks, Rig
+from spheremark.pipelines.errors import ConfigError
+from spheremark.pipelines.model import ControlMarks, Origin, Rig, ScanLog
 from spheremark.service.provenance import code_version
 
 if TYPE_CHECKING:
@@ -20,6 +21,7 @@ if TYPE_CHECKING:
 
     from spheremark.pipelines.survey import Progress
     from spheremark.storage.catalogue.catalogue import Catalogue
+    from spheremark.storage.recordings import LogOptions
 
 
 Row = dict[str, Any]
@@ -36,11 +38,22 @@ class JobKind(StrEnum):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Log:
-    """An uploaded log: its digest, its name, and the address of its bytes."""
+    """An uploaded log: its digest, its name, the address of its bytes, and how to read it.
+
+    ``reading`` are options as ``LogOptions.from_mapping`` takes them.
+    """
 
     recording_id: str
     name: str
     url: str
+    reading: Mapping[str, Any] = field(default_factory=dict)
+
+    def read(self, name: str | None = None) -> ScanLog:
+        """Read the log, under the name of its recording or a given one."""
+        from spheremark.storage.recordings import LogOptions, read_log
+
+        log = read_log(self.url, LogOptions.from_mapping(self.reading), digest=self.recording_id)
+        return replace(log, origin=Origin(name=name or self.name, digest=self.recording_id))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -100,6 +113,49 @@ class Options(BaseModel):
     """Options of a kind beside logs, rig and configuration; none by default."""
 
     model_config = ConfigDict(extra="forbid")
+
+
+class Reading(Options):
+    """How the logs of a job are read, where that differs from their uploads."""
+
+    topic: list[str] | None = Field(default=None, description="Topics to use.")
+    joint: str | None = Field(
+        default=None, description="Joint of the gimbal, frame that turns, or topic of numbers."
+    )
+    joint_sign: int | None = Field(
+        default=None, description="-1 where angles grow clockwise seen from above."
+    )
+    joint_unit: str | None = Field(
+        default=None, description="rad, deg, turn, or the number of steps of a full turn."
+    )
+    joint_offset_deg: float | None = Field(default=None, description="Added to the angle.")
+    lidar_offset_s: float | None = Field(default=None, description="Added to the LiDAR's stamps.")
+    stamp: Literal["auto", "start", "end"] | None = Field(
+        default=None, description="Instant of a cloud that its stamp is."
+    )
+    recover: bool | None = Field(
+        default=None, description="Whether to use what is readable of a damaged log."
+    )
+
+    @model_validator(mode="after")
+    def _check(self) -> Self:
+        """Refuse values that cannot be, before a job reads them."""
+        try:
+            self.options()
+        except ConfigError as error:
+            raise ValueError(str(error)) from error
+        return self
+
+    def options(self) -> LogOptions:
+        """Return the options as the reader of logs takes them."""
+        from spheremark.storage.recordings.options import LogOptions
+
+        return LogOptions.from_mapping(self.given())
+
+    def given(self) -> dict[str, Any]:
+        """Return what is given as plain values."""
+        values = ((name, getattr(self, name)) for name in Reading.model_fields)
+        return {name: value for name, value in values if value is not None}
 
 
 def _nothing(_catalogue: Catalogue, _spec: JobSpecification) -> Mapping[str, pa.Table]:

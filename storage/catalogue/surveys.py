@@ -56,6 +56,7 @@ WHERE ($at::TIMESTAMPTZ IS NULL OR (s.created_at, s.survey_id) < ($at::TIMESTAMP
 ORDER BY s.created_at DESC, s.survey_id DESC LIMIT $n
 """
 )
+_INSPECTED = "UPDATE recordings SET verdict = $v, preflight = $p WHERE recording_id = $id"
 _RECORDING = "SELECT * FROM recordings WHERE recording_id = $id"
 _RECORDINGS_AFTER = """
 SELECT * FROM recordings
@@ -165,6 +166,13 @@ class Surveys(Lists):
         row = [digest, name, size_bytes, now(), url, verdict, json_text(preflight)]
         with self.writing() as cursor:
             cursor.execute("INSERT OR IGNORE INTO recordings VALUES (?, ?, ?, ?, ?, ?, ?)", row)
+        return self.get_recording(digest)
+
+    def inspect_again(self, digest: str, preflight: Mapping[str, Any]) -> RecordingRecord:
+        """Replace the preflight report of a recording, as after reading it with other options."""
+        row = {"v": str(preflight["verdict"]), "p": json_text(preflight), "id": digest}
+        with self.writing() as cursor:
+            cursor.execute(_INSPECTED, row)
         return self.get_recording(digest)
 
     def get_recording(self, recording_id: str) -> RecordingRecord:

@@ -10,11 +10,12 @@ recording, and every declared length is checked before use.
 from spheremark.storage.recordings.container import require_file
 from spheremark.storage.recordings.options import LogOptions
 from spheremark.storage.recordings.preflight import Preflight, TopicReport, inspect_log
-from spheremark.storage.recordings.reading import read_log
+from spheremark.storage.recordings.reading import LogFile, read_log
 from spheremark.storage.recordings.sources import file_digest
 from spheremark.storage.recordings.writing import write_log
 
 __all__ = [
+    "LogFile",
     "LogOptions",
     "Preflight",
     "TopicReport",

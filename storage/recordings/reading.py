@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Collection, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path, PurePosixPath
 from typing import TypeVar
 
@@ -30,6 +30,29 @@ _T = TypeVar("_T")
 
 _EARLY = (-1.25, -0.5)  # of the points' duration: so early are clouds that are stamped at their end
 _UNREAD = ("LaserScan", "Packet", "Packets", "PacketMsg", "UdpFrame", "CompressedPointCloud")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class LogFile:
+    """A log on this machine, and how to read it.
+
+    Attributes
+    ----------
+    path : Path
+        A file or a folder.
+    options : LogOptions
+        What cannot be found in it.
+    beside : tuple of Path
+        Further files of the same log.
+    """
+
+    path: Path
+    options: LogOptions = field(default_factory=LogOptions)
+    beside: tuple[Path, ...] = ()
+
+    def read(self) -> ScanLog:
+        """Read the log."""
+        return read_log(self.path, self.options, beside=self.beside)
 
 
 def read_log(

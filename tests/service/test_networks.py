@@ -19,6 +19,7 @@ from spheremark.service.log_files import Fieldbook, adjust_scans, read_scans, wi
 from spheremark.service.serialise.models import NetworkDocument
 from spheremark.service.serialise.network import serialise_network
 from spheremark.storage.imports.survey_files import read_control, read_truth
+from spheremark.storage.recordings import LogFile
 
 CONFIG = SurveyConfig.from_mapping({"fitting": {"methods": ["along_beam"]}})
 STOPS = ("lane2-stop2", "lane3-stop5", "lane4-stop3")
@@ -236,7 +237,7 @@ def test_a_rig_that_the_logs_do_not_tell_stays_and_the_network_stands(logs):
     upright["T_head_lidar"] = np.eye(4).tolist()
     book = Fieldbook(scans=scans_of(logs[:2]), refused=())
     told = with_calibration(
-        book, logs[:2], CONFIG, rig_from_mapping(upright), lambda _share, _what: None
+        book, log_files(logs[:2]), CONFIG, rig_from_mapping(upright), lambda _share, _what: None
     )
     answer = serialise_network(
         adjust_scans(told, None, CONFIG), CONFIG, uncalibrated=told.uncalibrated
@@ -246,8 +247,12 @@ def test_a_rig_that_the_logs_do_not_tell_stays_and_the_network_stands(logs):
     assert len(answer["stations"]) == 2
 
 
+def log_files(logs):
+    return [LogFile(path=path) for path in logs]
+
+
 def scans_of(logs):
-    book = read_scans(logs, CONFIG, None, lambda _share, _what: None)
+    book = read_scans(log_files(logs), CONFIG, None, lambda _share, _what: None)
     assert not book.refused
     return book.scans
 

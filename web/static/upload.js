@@ -21,7 +21,10 @@ function line(file) {
 }
 
 function send(file, parts) {
-  const query = new URLSearchParams({ name: file.name.replace(/\.mcap$/i, "") });
+  const query = new URLSearchParams({ name: file.name });
+  for (const [key, value] of new FormData(document.getElementById("reading"))) {
+    if (value !== "") query.append(key, value);
+  }
   const survey = document.getElementById("upload-survey").value;
   if (survey) {
     query.set("survey", survey);
@@ -30,7 +33,7 @@ function send(file, parts) {
   return new Promise((resolve) => {
     const request = new XMLHttpRequest(); // fetch tells nothing of the progress of a body
     request.open("POST", `/api/v1/recordings?${query}`);
-    request.setRequestHeader("Content-Type", "application/vnd.mcap");
+    request.setRequestHeader("Content-Type", "application/octet-stream");
     request.responseType = "json";
     request.upload.addEventListener("progress", (event) => {
       parts.progress.value = event.loaded;

@@ -21,7 +21,7 @@ from spheremark.service.http.api.models import Job, Listing, NewJob
 from spheremark.service.http.api.surveys import After, Limit
 from spheremark.service.http.state import Current, Service
 from spheremark.service.jobs.events import JobEvent
-from spheremark.service.jobs.handlers import KINDS, Kind
+from spheremark.service.jobs.handlers import KINDS, Kind, Reading
 from spheremark.storage.catalogue.records import JobRecord, JobStatus, SurveyRecord
 from spheremark.storage.imports.survey_files import parse_rig
 
@@ -142,9 +142,10 @@ def _recordings(service: Service, new: NewJob, survey: SurveyRecord) -> list[str
     found = named or service.catalogue.recordings_of_survey(survey.survey_id)
     records = [service.catalogue.get_recording(one) for one in dict.fromkeys(found)]
     refused = [one for one in records if one.verdict == "refused"]
-    if refused and named:
+    is_read_anew = any(new.options.get(name) is not None for name in Reading.model_fields)
+    if refused and named and not is_read_anew:
         raise RefusedRecordingError.of(refused[0])
-    records = [one for one in records if one.verdict != "refused"]
+    records = [one for one in records if one.verdict != "refused" or (named and is_read_anew)]
     if not records:
         raise InputError(
             f"The survey {survey.name} has no log that can be read; upload one with "

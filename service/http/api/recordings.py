@@ -7,6 +7,7 @@ from typing import Annotated
 
 from fastapi import APIRouter, Path, Query, Request, Response
 from fastapi.responses import FileResponse
+from pydantic import Field
 
 from spheremark.pipelines.errors import InputError
 from spheremark.service.errors import MediaTypeError, QuotaError, TooLargeError
@@ -15,6 +16,7 @@ from spheremark.service.http.api.models import Job, Listing, NewJob, Recording, 
 from spheremark.service.http.api.surveys import After, Limit
 from spheremark.service.http.state import Current, Service
 from spheremark.service.http.uploads import take_in
+from spheremark.service.jobs.handlers import Reading
 from spheremark.storage.catalogue.records import RecordingRecord
 from spheremark.storage.recordings.preflight import Preflight
 
@@ -22,7 +24,15 @@ router = APIRouter(prefix="/recordings", tags=["recordings"])
 
 Digest = Annotated[str, Path(description="SHA-256 of the log.", pattern="^[0-9a-f]{64}$")]
 MCAP = "application/vnd.mcap"
-_MEDIA_TYPES = (MCAP, "application/octet-stream")
+_MEDIA_TYPES = (
+    MCAP,
+    "application/octet-stream",  # a log is known by its first bytes
+    "application/zip",
+    "application/x-zip-compressed",
+    "application/vnd.sqlite3",
+    "application/x-sqlite3",
+    "application/vnd.tcpdump.pcap",
+)
 _USED = "SELECT coalesce(sum(size_bytes), 0)::BIGINT AS used FROM recordings"
 _BODY = {
     "requestBody": {
@@ -32,6 +42,14 @@ _BODY = {
         },
     }
 }
+
+
+class NewUpload(Reading):
+    """The query of an upload."""
+
+    name: str = Field(min_length=1, max_length=200, description="Name of the log.")
+    survey: str | None = Field(default=None, description="Id or name of its survey.")
+    process: bool = Field(default=False, description="Whether to start a job at once.")
 
 
 @router.post(
@@ -45,24 +63,28 @@ async def upload_recording(
     request: Request,
     response: Response,
     service: Current,
-    name: Annotated[str, Query(min_length=1, max_length=200, description="Name of the log.")],
-    survey: Annotated[str | None, Query(description="Id or name of its survey.")] = None,
-    process: Annotated[bool, Query(description="Whether to start a job at once.")] = False,  # noqa: FBT002
+    query: Annotated[NewUpload, Query()],
 ) -> Upload:
-    """Take in a log: the body is the file, streamed to disk; a refused log is kept as well."""
-    most = service.settings.max_upload_bytes
+    """Take in a log: the body is the file, streamed to disk; a refused log is kept as well.
+
+    MCAP, a part of rosbag2 (.db3), a ROS 1 bag, a PCAP, or a zip of these.
+    """
+    most, survey, options = service.settings.max_upload_bytes, query.survey, query.options()
     _check_upload(request, most)
-    if process or survey is not None:
+    if query.process or survey is not None:
         await asyncio.to_thread(check_survey, service, survey)
     declared = int(request.headers.get("content-length", "0"))
     await asyncio.to_thread(check_quota, service, declared)
     received = await service.inbox.receive(request.stream(), most, request.headers)
-    recording, is_new = await asyncio.to_thread(take_in, service.catalogue, received, name)
+    recording, is_new = await asyncio.to_thread(
+        take_in, service.catalogue, received, query.name, options
+    )
     response.status_code = 201 if is_new else 200
     response.headers["Location"] = f"/api/v1/recordings/{recording.recording_id}"
     if survey is not None:
         await asyncio.to_thread(service.catalogue.add_to_survey, survey, recording.recording_id)
-    job = await asyncio.to_thread(start_job, service, survey, recording) if process else None
+    start = query.process
+    job = await asyncio.to_thread(start_job, service, survey, recording) if start else None
     return Upload(**Recording.of(recording).model_dump(), job=job)
 
 

@@ -7,15 +7,18 @@ import base64
 import binascii
 from collections.abc import Mapping
 from email.utils import formatdate
-from typing import Annotated
+from typing import Annotated, Any
 
 from fastapi import APIRouter, Header, Path, Request, Response
+from pydantic import ValidationError
 
 from spheremark.pipelines.errors import InputError
 from spheremark.service.errors import MediaTypeError, TooLargeError, TusVersionError
 from spheremark.service.http.api.recordings import check_quota, check_survey, start_job
 from spheremark.service.http.state import Current, Service
 from spheremark.service.http.uploads import Received, Upload, enter
+from spheremark.service.jobs.handlers import Reading
+from spheremark.storage.recordings import LogOptions
 
 router = APIRouter(prefix="/uploads", tags=["recordings"])
 
@@ -61,7 +64,8 @@ async def create_upload(
         str,
         Header(
             alias="Upload-Metadata",
-            description="Pairs of a key and Base64: filename, survey, process (true or false).",
+            description="Pairs of a key and Base64: filename, survey, process (true or false), "
+            "joint, joint_unit and the others of the query of POST /recordings.",
         ),
     ] = "",
     tus: Tus = None,
@@ -136,7 +140,8 @@ async def _append(
 
 def _enter(service: Service, received: Received, about: Mapping[str, str]) -> dict[str, str]:
     """Enter a log; its own verdict says whether it can be processed."""
-    recording, _ = enter(service.catalogue, received, about.get("filename") or received.digest[:8])
+    name = about.get("filename") or received.digest[:8]
+    recording, _ = enter(service.catalogue, received, name, _reading(about))
     headers = {"Content-Location": f"/api/v1/recordings/{recording.recording_id}"}
     if survey := about.get("survey"):
         service.catalogue.add_to_survey(survey, recording.recording_id)
@@ -148,9 +153,21 @@ def _enter(service: Service, received: Received, about: Mapping[str, str]) -> di
 
 def _check(service: Service, length: int, about: Mapping[str, str]) -> None:
     """Refuse an upload before its first byte."""
+    _reading(about)
     check_quota(service, length)
     if about.get("process") == "true" or "survey" in about:
         check_survey(service, about.get("survey"))
+
+
+def _reading(about: Mapping[str, str]) -> LogOptions:
+    """Return how a log is to be read, by the keys that the query of an upload has too."""
+    given: dict[str, Any] = {name: about[name] for name in Reading.model_fields if name in about}
+    if "topic" in given:
+        given["topic"] = [given["topic"]]
+    try:
+        return Reading.model_validate(given).options()
+    except ValidationError as error:
+        raise InputError(f"Upload-Metadata: {error.errors()[0]['msg']}.") from error
 
 
 def _check_version(version: str | None) -> None:

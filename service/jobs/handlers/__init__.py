@@ -14,13 +14,16 @@ from spheremark.service.jobs.specification import (
     Kind,
     Log,
     Options,
+    Reading,
 )
 
-__all__ = ["KINDS", "JobKind", "JobResult", "JobSpecification", "Kind", "Log", "Options"]
+__all__ = ["KINDS", "JobKind", "JobResult", "JobSpecification", "Kind", "Log", "Options", "Reading"]
 
 KINDS: Mapping[JobKind, Kind] = {
-    JobKind.PROCESS: Kind(handle=process.handle, takes_one_log=True),
+    JobKind.PROCESS: Kind(handle=process.handle, takes_one_log=True, options=Reading),
     JobKind.ADJUST: Kind(handle=adjust.handle, options=adjust.AdjustOptions, gather=adjust.gather),
-    JobKind.CALIBRATE: Kind(handle=calibrate.handle, begins_with_rig_of_survey=False),
+    JobKind.CALIBRATE: Kind(
+        handle=calibrate.handle, begins_with_rig_of_survey=False, options=Reading
+    ),
     JobKind.SITE: Kind(handle=sites.handle, options=sites.SiteOptions, gather=sites.gather),
 }

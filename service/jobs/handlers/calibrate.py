@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable, Iterable, Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from time import perf_counter
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from spheremark.pipelines.model import Origin, Rig, ScanLog, marker_name
+from spheremark.pipelines.model import Rig, ScanLog, marker_name
 from spheremark.pipelines.progress import Progress, part_of
 from spheremark.pipelines.scan.rigs import rig_digest, rig_to_mapping
 from spheremark.service.jobs.specification import JobResult, JobSpecification
@@ -33,11 +33,8 @@ class _Logs:
     spec: JobSpecification
 
     def __iter__(self) -> Iterator[ScanLog]:
-        from spheremark.storage.recordings import read_log
-
         for one, name in zip(self.spec.logs, self.spec.log_names, strict=True):
-            log = read_log(one.url, digest=one.recording_id)
-            yield replace(log, origin=Origin(name=name, digest=one.recording_id))
+            yield one.read(name)
 
 
 def logs_of(spec: JobSpecification) -> Iterable[ScanLog]:

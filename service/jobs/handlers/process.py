@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
 from datetime import UTC, datetime
 from time import perf_counter
 from typing import TYPE_CHECKING
@@ -11,8 +10,6 @@ from typing import TYPE_CHECKING
 from spheremark.pipelines.model import (
     ControlMarks,
     NoFix,
-    Origin,
-    ScanLog,
     StationFix,
     Status,
     StopResult,
@@ -43,7 +40,7 @@ def process_log(
     forget_peak_memory()
     progress(0.0, f"Reading {recording.name}")
     stops = process(
-        _read(recording),  # released once it is stitched: no reference is kept
+        recording.read(),  # released once it is stitched: no reference is kept
         config=spec.config,
         rig=spec.rig,
         marks=spec.marks,
@@ -100,11 +97,3 @@ def _contradiction(stop: StopResult, marks: ControlMarks) -> str:
         f"{int(checks.is_off.sum())} of {len(checks.is_off)} distances between marks in "
         f"{stop.name} are not those of the control: look at {names}."
     )
-
-
-def _read(recording: Log) -> ScanLog:
-    """Read a log, with the name of its recording."""
-    from spheremark.storage.recordings import read_log
-
-    log = read_log(recording.url, digest=recording.recording_id)
-    return replace(log, origin=Origin(name=recording.name, digest=recording.recording_id))

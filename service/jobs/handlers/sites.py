@@ -12,7 +12,6 @@ import json
 import shutil
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
-from dataclasses import replace
 from datetime import UTC, datetime
 from pathlib import Path
 from tempfile import TemporaryDirectory, gettempdir
@@ -20,7 +19,6 @@ from typing import TYPE_CHECKING, Any
 
 from pydantic import Field
 
-from spheremark.pipelines.model import Origin
 from spheremark.pipelines.scan.rigs import rig_from_mapping
 from spheremark.service.jobs.specification import JobResult, JobSpecification, Options
 from spheremark.service.provenance import code_version
@@ -162,7 +160,6 @@ def _stops(
 ) -> Iterator[tuple[StitchedCloud, StationPose]]:
     """Yield the stops that have poses, log by log."""
     from spheremark.service.jobs.site import stitched
-    from spheremark.storage.recordings import read_log
 
     rigs = {
         row["rig_digest"]: rig_from_mapping(json.loads(row["rig"]))
@@ -172,13 +169,12 @@ def _stops(
         progress(0.95 * i / len(spec.logs), f"Adding {log.name} to the site")
         own = {stop: pose for (key, stop), pose in poses.items() if key == log.recording_id}
         if own:
-            read = read_log(log.url, digest=log.recording_id)
-            named = replace(read, origin=Origin(name=log.name, digest=log.recording_id))
+            read = log.read()
 
             def rig_of(stop: str, key: str = log.recording_id) -> Rig | None:
                 return rigs.get(rows[key, stop]["rig_digest"], spec.rig)
 
-            yield from stitched((named,), spec.config, rig_of, own)
+            yield from stitched((read,), spec.config, rig_of, own)
 
 
 def _common(spec: JobSpecification, options: Row, source: Row, n_stations: int) -> Row:

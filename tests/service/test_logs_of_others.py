@@ -1,0 +1,115 @@
+"""Logs that are no MCAP, or that need a word about their joint, by command and over HTTP."""
+
+import json
+import zipfile
+
+import numpy as np
+import pytest
+from mcap.reader import make_reader
+from rosbags.rosbag2 import StoragePlugin, Writer
+
+from spheremark.storage.recordings import read_log, write_log
+from tests.service.test_commands import run
+from tests.storage.recorder import STORE
+
+
+@pytest.fixture(scope="module")
+def bag(stop, tmp_path_factory):
+    """Return the simulated stop as a folder of rosbag2, written by rosbags."""
+    folder = tmp_path_factory.mktemp("bags") / "field"
+    with (
+        stop.log.open("rb") as file,
+        Writer(folder, version=9, storage_plugin=StoragePlugin.SQLITE3) as written,
+    ):
+        known = {}
+        for schema, channel, message in make_reader(file).iter_messages():
+            if channel.topic not in known:
+                known[channel.topic] = written.add_connection(
+                    channel.topic, schema.name, typestore=STORE
+                )
+            written.write(known[channel.topic], message.log_time, message.data)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def zipped(bag):
+    path = bag.with_suffix(".zip")
+    with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive:
+        for one in bag.iterdir():
+            archive.write(one, f"field/{one.name}")
+    return path
+
+
+@pytest.fixture(scope="module")
+def clockwise(stop, tmp_path_factory):
+    """Return the simulated stop with its angles in degrees, clockwise, on a joint among others."""
+    from dataclasses import replace
+
+    log = read_log(stop.log)
+    path = tmp_path_factory.mktemp("logs") / "clockwise.mcap"
+    write_log(replace(log, gimbal_angles=-np.degrees(log.gimbal_angles)), path)
+    return path
+
+
+def centres(answer):
+    return np.array([one["centre_m"] for one in answer["stops"][0]["markers"]])
+
+
+def test_a_folder_and_its_zip_give_the_centres_of_the_mcap(stop, bag, zipped):
+    expected = centres(json.loads(run("process", stop.log, "--json").stdout))
+    for log in (bag, zipped):
+        answer = json.loads(run("process", log, "--json").stdout)
+        np.testing.assert_array_equal(centres(answer), expected)
+        assert answer["stops"][0]["name"] == "field"
+    assert "/velodyne_points" in run("inspect", bag).stdout
+
+
+def test_joint_unit_and_sign_mend_a_log_on_the_command_line(stop, clockwise):
+    refused = json.loads(run("inspect", clockwise, "--json", code=1).stdout)
+    assert "--joint-unit" in refused["reasons"][0]
+    options = ("--joint", "gimbal_joint", "--joint-unit", "deg", "--joint-sign", "-1")
+    answer = json.loads(run("process", clockwise, *options, "--json").stdout)
+    expected = centres(json.loads(run("process", stop.log, "--json").stdout))
+    np.testing.assert_allclose(centres(answer), expected, rtol=0, atol=1e-6)
+
+
+def test_options_that_cannot_be_are_a_misuse(stop):
+    assert "joint_unit" in run("inspect", stop.log, "--joint-unit", "gon", code=2).stderr
+
+
+def test_a_zip_is_uploaded_and_processed(site, zipped):
+    site.survey("bags")
+    answer = site.upload(zipped.read_bytes(), name="field.zip", survey="bags", process=True)
+    assert answer.status_code == 201, answer.text
+    assert answer.json()["name"] == "field"
+    assert site.ended(answer.json()["job"]["job_id"])["status"] == "successful"
+
+
+def test_an_upload_says_how_it_is_read_and_jobs_may_say_otherwise(site, clockwise):
+    site.survey("clockwise")
+    body = clockwise.read_bytes()
+    refused = site.upload(body, name="clockwise", survey="clockwise")
+    assert refused.status_code == 422
+    digest = refused.json()["recording_id"]
+    job = {"survey": "clockwise", "recording": digest}
+    options = {"joint_unit": "deg", "joint_sign": -1}
+    done = site.client.post("/api/v1/jobs", json={**job, "options": options})
+    assert site.ended(done.json()["job_id"])["status"] == "successful"
+    mended = site.upload(body, name="clockwise", survey="clockwise", process=True, **options)
+    assert (mended.status_code, mended.json()["preflight"]["reading"]) == (200, options)
+    assert site.ended(mended.json()["job"]["job_id"])["status"] == "successful"
+    wrong = site.client.post("/api/v1/jobs", json={**job, "options": {"joint_unit": "gon"}})
+    assert (wrong.status_code, "joint_unit" in wrong.text) == (422, True)
+
+
+def test_a_damaged_upload_is_used_when_that_is_accepted(site):
+    site.survey("damaged")
+    octets = site.stop.log.read_bytes()
+    cut = octets[: int(0.97 * len(octets))]
+    refused = site.upload(cut, name="cut", survey="damaged")
+    assert (refused.status_code, "recover" in refused.json()["detail"]) == (422, True)
+    answer = site.upload(cut, name="cut", survey="damaged", process=True, recover=True)
+    assert answer.json()["verdict"] == "weak"
+    job = site.ended(answer.json()["job"]["job_id"])
+    assert job["status"] == "successful"
+    assert "weak" in job["message"]
