@@ -147,9 +147,10 @@ class FittingConfig:
         Standard deviation of the power of the cosine of incidence with which a part of the
         footprint weighs in the range of its echo. 0 is even; 1 is the energy of a matt surface.
     sigma_range_common : float
-        Standard deviation of what all lasers measure too long in common [m].
+        Standard deviation of what all lasers measure too long in common [m]. 0.002; where the
+        lasers of a scan differ by more than ``sigma_range_bias`` it grows with them.
     sigma_range_scale : float
-        Standard deviation of the scale of all ranges, relative. 3e-5: the oscillator of the
+        Standard deviation of the scale of all ranges, relative. 5e-5: the oscillator of the
         sensor's clock.
     paper_model : str
         What ``paper`` registers to the returns, of ``PAPER_MODELS``. hemisphere: as the study does;
@@ -170,8 +171,8 @@ class FittingConfig:
     sigma_beam_width: float = 0.35
     sigma_beam_window: float = 0.5
     sigma_echo_cosine: float = 0.7
-    sigma_range_common: float = 0.0005
-    sigma_range_scale: float = 3e-5
+    sigma_range_common: float = 0.002
+    sigma_range_scale: float = 5e-5
     paper_model: str = "hemisphere"
     paper_cut: str = "equator"
 

@@ -19,7 +19,13 @@ from spheremark.pipelines.sphere.linearisation import Linear, linearise
 from spheremark.pipelines.sphere.mounting import N_MOUNTING, effects_on
 from spheremark.pipelines.sphere.noise import Noise, Weighed, weigh
 from spheremark.pipelines.sphere.normal_equations import Normals, normals_of, reduce
-from spheremark.pipelines.sphere.optics import OPTICS, derivatives, with_widths
+from spheremark.pipelines.sphere.optics import (
+    N_ESTIMATED,
+    OPTICS,
+    SIGMAS_PROFILE,
+    derivatives,
+    with_widths,
+)
 from spheremark.pipelines.sphere.radius import Ranges, free_radii
 from spheremark.pipelines.sphere.returns import Returns, may_be_sphere, moved_faces
 
@@ -54,7 +60,7 @@ class Prior(NamedTuple):
     sigma_biases : (k,)
         Standard deviations of the range biases of the lasers that occur [m].
     sigma_optics : (q,)
-        Standard deviations of ``OPTICS``.
+        Standard deviations of ``OPTICS``; of these the first ``N_ESTIMATED`` are estimated.
     sigma_mounting : (6,)
         Standard deviations of the unknowns of the mounting.
     """
@@ -66,8 +72,10 @@ class Prior(NamedTuple):
 
     @property
     def sigmas(self) -> Array:
-        """Standard deviations of all shared unknowns, none of them zero."""
-        parts = (self.sigma_biases, self.sigma_optics, self.sigma_mounting)
+        """Standard deviations of all shared unknowns, tiny for those that are not estimated."""
+        held = np.zeros(len(OPTICS) - N_ESTIMATED)
+        optics = np.append(self.sigma_optics[:N_ESTIMATED], held)
+        parts = (self.sigma_biases, optics, self.sigma_mounting)
         least = np.repeat([_SIGMA_BIAS_MIN, _SIGMA_MIN, _SIGMA_MIN], [len(part) for part in parts])
         return np.asarray(np.maximum(np.concatenate(parts), least))
 
@@ -184,13 +192,12 @@ def _start(rough: Array, prior: Prior) -> State:
 
 
 def _corrected(returns: Returns, state: State) -> Returns:
-    """Return the returns as mounting and optics say they are, less biases and scale of ranges."""
+    """Return the returns as mounting and optics say they are, less the biases of lasers."""
     if not state.shared.any():
         return returns
     moved = moved_faces(returns, effects_on(state.centres) @ state.mounting)
-    bias, scale = state.optics[-2:]
-    excess = state.biases[returns.lasers] + bias + scale * returns.ranges
-    return with_widths(moved, state.optics)._replace(ranges=returns.ranges - excess)
+    ranges = returns.ranges - state.biases[returns.lasers]
+    return with_widths(moved, state.optics)._replace(ranges=ranges)
 
 
 def _spheres(state: State, radius: float) -> tuple[Array, Array]:
@@ -232,16 +239,16 @@ def _add_limb(N: Normals, returns: Returns, now: Estimate, edge: Edge, factors: 
 
 def _stepped(state: State, N: Normals, prior: Prior) -> State:
     """Return the state after one Gauss-Newton step of centres and shared unknowns together."""
-    n = len(state.biases)
     reduced = reduce(
         N, effects_on(state.centres), state.sigmas**-2.0, -state.shared / state.sigmas**2
     )
-    cov_shared: Array = inverse(reduced.N)
-    step = state.has_shared * (cov_shared @ reduced.rhs)
+    estimated: Array = inverse(reduced.N)
+    step = state.has_shared * (estimated @ reduced.rhs)
     shared, sigmas = state.shared + step, prior.sigmas.copy()
     if state.has_shared:
-        for part in (slice(n), slice(-N_MOUNTING, None)):
-            sigmas[part] *= _spread((shared[part], np.diag(cov_shared)[part]), sigmas[part])
+        for part in (slice(len(state.biases)), slice(-N_MOUNTING, None)):
+            sigmas[part] *= _spread((shared[part], np.diag(estimated)[part]), sigmas[part])
+    cov_shared = _with_considered(estimated, reduced.N, prior, sigmas[0] / prior.sigmas[0])
     return state._replace(
         centres=state.centres + _shortened(reduced.local_steps(step), prior.radius),
         shared=shared,
@@ -251,6 +258,24 @@ def _stepped(state: State, N: Normals, prior: Prior) -> State:
         by_shared=reduced.gains,
         cov_shared=cov_shared,
     )
+
+
+def _with_considered(estimated: Array, N: Array, prior: Prior, spread: float) -> Array:
+    """Return the covariance of the shared unknowns with those that are not estimated (Schmidt).
+
+    The apparent size of spheres would determine bias and scale of ranges, if the profile of the
+    beams were known as well as the model of an even footprint assumes. What that profile leaves
+    open of the other optics is added. Lasers whose biases spread by more than expected may have
+    more in common, too.
+    """
+    optics = len(prior.sigma_biases) + np.arange(len(OPTICS))
+    considered = optics[N_ESTIMATED:]
+    response = -estimated @ N[:, considered]
+    response[considered] = np.eye(len(considered))
+    sigmas = prior.sigma_optics[N_ESTIMATED:] * (max(spread, 1.0), 1.0)
+    cov = estimated + (response * sigmas**2) @ response.T
+    cov[optics, optics] += np.append(SIGMAS_PROFILE, np.zeros(len(considered))) ** 2
+    return np.asarray(cov)
 
 
 def _spread(found: tuple[Array, Array], sigmas: Array) -> float:

@@ -25,6 +25,13 @@ OPTICS = (
 VLP-16's; weight of an echo by this power of the cosine of incidence; bias [m] and scale of all
 ranges."""
 
+N_ESTIMATED = 3
+"""How many of them a scan determines; it says nothing of bias and scale."""
+
+SIGMAS_PROFILE = np.array([0.1, 0.03, 0.3])
+"""Standard deviations of what beams of other profiles than an even one leave open of these, from
+simulated scans with Gaussian profiles and with two lobes."""
+
 _WINDOW = np.array(
     [12.7e-3, 9.5e-3]
 )  # [m] width of a VLP-16's beam at its window, across and along

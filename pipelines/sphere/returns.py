@@ -13,7 +13,7 @@ from spheremark.pipelines.model import Array, Beams, Index, Mask
 
 _THIN = 1e-6  # [m]; a thinner footprint is treated as a ray
 _POLE_BEGINS = 1.0  # radii below the centre: a footprint that begins lower is on the pole
-_POLE_HALF = 0.25  # radii from the vertical through the centre: half width of the pole's region
+_POLE_HALF = 0.35  # radii from the vertical through the centre: half width of the pole's region
 
 
 class Returns(NamedTuple):

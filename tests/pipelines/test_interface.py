@@ -81,7 +81,7 @@ def test_a_cloud_that_cannot_be_used_is_refused_with_what_was_found(change, sent
 
 
 def test_scans_are_processed_and_adjusted_with_two_calls():
-    field = scenario("paper-field", 11)
+    field = scenario("paper-field", 12)
     quick = SimulationConfig(only_near_spheres=True)
     made = [simulate_stop(field, stop.name, quick) for stop in field.stops[:2]]
     stops = [spheremark.process(one.log, marks=field.marks)[0] for one in made]

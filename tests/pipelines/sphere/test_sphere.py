@@ -104,11 +104,14 @@ def stop_of(rng, distance, n, *, sigma, bias=0.0, pole=0.015):
     return draw, centres
 
 
-def whitened(draw, centres, rng, n_repeats):
+NOTHING_IN_COMMON = replace(CONFIG, sigma_range_common=0.0, sigma_range_scale=0.0)
+
+
+def whitened(draw, centres, rng, n_repeats, config=NOTHING_IN_COMMON):
     """Squared errors in units of the claimed covariance, errors and unit vectors to the centres."""
     squares, errors, outward = [], [], []
     for _ in range(n_repeats):
-        fits = fit_markers("along_beam", *draw(rng), CONFIG, RADIUS).fits
+        fits = fit_markers("along_beam", *draw(rng), config, RADIUS).fits
         for fit in fits:
             true = centres[np.argmin(np.linalg.norm(centres - fit.p_base, axis=1))]
             errors.append(fit.p_base - true)
@@ -255,7 +258,7 @@ def test_the_range_error_that_all_centres_share_has_a_sigma():
 
     def shared_sigma(bias):
         draw, _ = stop_of(rng, 8.0, 8, sigma=0.006, bias=bias)
-        fits = fit_markers("along_beam", *draw(rng), CONFIG, RADIUS).fits
+        fits = fit_markers("along_beam", *draw(rng), NOTHING_IN_COMMON, RADIUS).fits
         sigmas = np.array([fit.sigma_range_shared for fit in fits])
         assert np.ptp(sigmas) < 0.05 * sigmas.mean()
         return sigmas.mean()
@@ -266,6 +269,28 @@ def test_the_range_error_that_all_centres_share_has_a_sigma():
     typical = np.sqrt(np.mean(rough**2))
     assert np.sqrt(low) < typical / (0.01 / 4.0) < np.sqrt(high)
     assert shared_sigma(0.0) < 0.4 * typical
+
+
+def test_a_bias_that_all_lasers_share_is_in_the_covariance_and_not_in_the_centres():
+    rng, common = np.random.default_rng(22), CONFIG.sigma_range_common
+    draw, centres = stop_of(rng, 8.0, 8, sigma=0.006, bias=0.0)
+    cloud, candidates = draw(rng)
+    lines = centres / np.linalg.norm(centres, axis=1, keepdims=True)
+    longer = replace(cloud, p_base=(cloud.p_base + common * unit_of(cloud)).astype(np.float32))
+    plain, moved = (
+        fit_markers("along_beam", one, candidates, CONFIG, RADIUS).fits for one in (cloud, longer)
+    )
+    steps = np.array([m.p_base - p.p_base for p, m in zip(plain, moved, strict=True)])
+    # centres go with the ranges, to the share by which the apparent size of spheres holds them
+    assert_allclose(np.sum(steps * lines, axis=1), common, rtol=0.15)
+    for fit, line in zip(plain, lines, strict=True):
+        assert common**2 < line @ fit.cov_p_base @ line < 3.0 * common**2
+        assert common < fit.sigma_range_shared < 1.2 * common
+
+
+def unit_of(cloud):
+    """Directions of the beams of a cloud."""
+    return beams(cloud, np.arange(len(cloud.p_base))).directions_base
 
 
 def test_three_returns_are_refused_with_the_reason():
