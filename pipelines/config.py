@@ -214,7 +214,10 @@ class ResectionConfig:
         from one direction to the next and both faces share, as the jitter of the encoder [m].
     sigma_range : float
         Standard deviation of the common range bias, an unknown of a network [m]; 0 leaves it out.
-        1 mm: the mean of 16 lasers of 3 mm each, and the model of a beam.
+        2.1 mm: ``fitting.sigma_range_common``, and the mean of 16 lasers of 3 mm each.
+    sigma_range_scale : float
+        Standard deviation of the scale of all ranges, an unknown of a network; 0 leaves it out.
+        5e-5, as in ``fitting``.
     sigma_range_shared : float
         Part of ``sigma_range`` that the covariance of each centre already contains, for fits that
         do not report it (``along_beam`` does, from the biases that it estimates) [m]. 0.9 mm: the
@@ -232,7 +235,8 @@ class ResectionConfig:
     test_level: float = 0.001
     test_power: float = 0.80
     sigma_common: float = 0.00005
-    sigma_range: float = 0.001
+    sigma_range: float = 0.0021
+    sigma_range_scale: float = 5e-5
     sigma_range_shared: float = 0.0009
     sigma_height: float = 0.0003
 
@@ -244,6 +248,7 @@ class ResectionConfig:
         _check("resection.test_power", self.test_power, 0.5, 0.999)
         _check("resection.sigma_common", self.sigma_common, 0.0, 0.1)
         _check("resection.sigma_range", self.sigma_range, 0.0, 0.1)
+        _check("resection.sigma_range_scale", self.sigma_range_scale, 0.0, 0.01)
         _check("resection.sigma_range_shared", self.sigma_range_shared, 0.0, 0.1)
         _check("resection.sigma_height", self.sigma_height, 0.0, 0.1)
 

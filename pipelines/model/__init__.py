@@ -17,10 +17,12 @@ from spheremark.pipelines.model.arrays import (
 )
 from spheremark.pipelines.model.ellipse import ErrorEllipse
 from spheremark.pipelines.model.marker import (
+    OPTICS,
     MarkerCandidate,
     MarkerCandidates,
     MarkerFit,
     MarkerFits,
+    Optics,
     Rejection,
     Status,
     marker_name,
@@ -51,6 +53,7 @@ from spheremark.pipelines.model.station import (
 )
 
 __all__ = [
+    "OPTICS",
     "RING_UNKNOWN",
     "Array",
     "Beams",
@@ -71,6 +74,7 @@ __all__ = [
     "Nanos",
     "NoFix",
     "Omissions",
+    "Optics",
     "Origin",
     "Rejection",
     "Rig",

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from enum import StrEnum
 
 import numpy as np
@@ -101,6 +101,38 @@ class MarkerCandidates:
     ground_height_max: float
 
 
+OPTICS = ("beam_width", "beam_window", "echo_cosine")
+"""Names of what a scan determines of its beams, see ``Optics``."""
+
+
+@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
+class Optics:
+    """What a scan shows of its beams.
+
+    Three numbers: relative excess of the divergence, width at the window in units of the VLP-16's,
+    and power of the cosine of incidence with which an echo weighs.
+
+    Attributes
+    ----------
+    estimates : (3,)
+        Their values, with which the centres of the scan were computed.
+    weights : (3, 3)
+        Inverse covariance of what the scan says of them.
+    sigmas_prior : (3,)
+        Standard deviations before any scan, about zero.
+    sigmas_profile : (3,)
+        Standard deviations of what no scan says: beams of other profiles seem to differ by so much.
+    """
+
+    estimates: Array
+    weights: Array
+    sigmas_prior: Array
+    sigmas_profile: Array
+
+    def __post_init__(self) -> None:
+        seal(self, estimates=(3,), weights=(3, 3), sigmas_prior=(3,), sigmas_profile=(3,))
+
+
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class MarkerFit:
     """A marker centre with covariance.
@@ -148,6 +180,10 @@ class MarkerFit:
     sigma_range_shared : float
         Part of its standard deviation along the line of sight that all centres of the stop have in
         common, included in its covariance; NaN when not computed [m].
+    optics : Optics, optional
+        What the scan of this centre shows of its beams, the same for all of its centres.
+    range_by_optics : (3,)
+        By how much this centre is too far where each number of ``optics`` is too small [m].
     """
 
     name: str
@@ -170,10 +206,13 @@ class MarkerFit:
     incidence: float = np.nan
     variant: str = ""
     sigma_range_shared: float = np.nan
+    optics: Optics | None = None
+    range_by_optics: Array = field(default_factory=lambda: np.zeros(3))
 
     def __post_init__(self) -> None:
         seal(
             self,
+            range_by_optics=(3,),
             p_base=(3,),
             cov_p_base=(3, 3),
             used=(None,),

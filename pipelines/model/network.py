@@ -14,6 +14,9 @@ from spheremark.pipelines.model import Array, ErrorEllipse, Index, Mask
 RANGE_BIAS = "common_range_bias"
 """Name of the common range bias: the amount by which all ranges are too long [m]."""
 
+RANGE_SCALE = "range_scale"
+"""Name of the scale of all ranges: the share by which they are too long."""
+
 HEIGHT_BIAS = "common_height_bias"
 """Name of the common height bias: the amount by which all centres are too high [m]."""
 
@@ -69,20 +72,21 @@ class Shared:
     Attributes
     ----------
     names : tuple of str
-        ``RANGE_BIAS``, ``HEIGHT_BIAS``, or parameters of the rig.
-    effects : (n, 3, k)
-        Derivatives of each observed centre, in base, by each of them.
-    weights : (k, k)
-        Prior weights about zero: the inverse of a covariance, singular where nothing is known.
+        ``RANGE_BIAS``, ``RANGE_SCALE``, ``HEIGHT_BIAS``, optics, or parameters of the rig.
+    derivatives : (n, 3, k)
+        Of each observed centre, in base, by each of them.
+    prior_weights : (k, k)
+        Weights about zero: the inverse of a covariance, singular where nothing is known.
     """
 
     names: tuple[str, ...]
-    effects: Array
-    weights: Array
+    derivatives: Array
+    prior_weights: Array
 
     def __post_init__(self) -> None:
         k = len(self.names)
-        seal(self, {"effects": (len(self.effects), 3, k), "weights": (k, k)})
+        n = len(self.derivatives)
+        seal(self, {"derivatives": (n, 3, k), "prior_weights": (k, k)})
 
     @classmethod
     def none(cls, n: int) -> Shared:
@@ -98,11 +102,11 @@ class Shared:
         Shared
             Without names.
         """
-        return cls(names=(), effects=np.zeros((n, 3, 0)), weights=np.zeros((0, 0)))
+        return cls(names=(), derivatives=np.zeros((n, 3, 0)), prior_weights=np.zeros((0, 0)))
 
     @classmethod
-    def of_rig(
-        cls, p_base: Array, ups_base: Array, sigma_range: float, sigma_height: float
+    def of_sensor(
+        cls, p_base: Array, ups_base: Array, sigmas: tuple[float, float, float]
     ) -> Shared:
         """Return what all ranges of a survey are too long, and all centres too high.
 
@@ -112,29 +116,46 @@ class Shared:
             Observed centres [m].
         ups_base : (n, 3)
             The up direction in base, for each.
-        sigma_range, sigma_height : float
-            Standard deviations before anything is seen; 0 for no such unknown [m].
+        sigmas : tuple of float
+            Standard deviations of bias [m] and scale of ranges, and of the heights [m], before
+            anything is seen; 0 for no such unknown.
 
         Returns
         -------
         Shared
-            With two names, one or none.
+            With three names or fewer.
         """
         towards = p_base / np.linalg.norm(p_base, axis=1)[:, None]
-        known = [
-            (name, effect, sigma)
-            for name, effect, sigma in (
-                (RANGE_BIAS, towards, sigma_range),
-                (HEIGHT_BIAS, ups_base, sigma_height),
-            )
-            if sigma > 0.0
-        ]
+        columns = ((RANGE_BIAS, towards), (RANGE_SCALE, p_base), (HEIGHT_BIAS, ups_base))
+        known = [(*column, sigma) for column, sigma in zip(columns, sigmas, strict=True) if sigma]
         if not known:
             return cls.none(len(p_base))
         return cls(
             names=tuple(name for name, _, _ in known),
-            effects=np.stack([effect for _, effect, _ in known], axis=-1),
-            weights=np.diag([sigma**-2.0 for _, _, sigma in known]),
+            derivatives=np.stack([derivative for _, derivative, _ in known], axis=-1),
+            prior_weights=np.diag([sigma**-2.0 for _, _, sigma in known]),
+        )
+
+    def joined(self, other: Shared) -> Shared:
+        """Return the unknowns of both.
+
+        Parameters
+        ----------
+        other : Shared
+            Other unknowns of the same centres.
+
+        Returns
+        -------
+        Shared
+            These first.
+        """
+        k = len(self.names)
+        weights = np.zeros((k + len(other.names),) * 2)
+        weights[:k, :k], weights[k:, k:] = self.prior_weights, other.prior_weights
+        return Shared(
+            names=(*self.names, *other.names),
+            derivatives=np.concatenate([self.derivatives, other.derivatives], axis=2),
+            prior_weights=weights,
         )
 
 
@@ -223,8 +244,8 @@ class Network:
                 "p_site": (m, 3),
             },
         )
-        if len(self.shared.effects) != n:
-            raise InputError(f"There are {n} centres, but effects on {len(self.shared.effects)}.")
+        if (k := len(self.shared.derivatives)) != n:
+            raise InputError(f"There are {n} centres, but derivatives of {k}.")
         if len(self.markers) != n:
             raise InputError(f"There are {n} centres, but names of {len(self.markers)}.")
         if len(self.suspicions) != m:
@@ -236,7 +257,7 @@ class Network:
         if RANGE_BIAS not in self.shared.names:
             return 0.0
         place = self.shared.names.index(RANGE_BIAS)
-        return float(self.shared.weights[place, place] ** -0.5)
+        return float(self.shared.prior_weights[place, place] ** -0.5)
 
     @property
     def is_free(self) -> bool:
@@ -462,7 +483,7 @@ class AdjustedNetwork:
     @property
     def shared_redundancies(self) -> Array:
         """Redundancy number of the prior of each shared unknown, (k,)."""
-        return np.asarray(1.0 - np.diag(self.network.shared.weights @ self.cov_shared))
+        return np.asarray(1.0 - np.diag(self.network.shared.prior_weights @ self.cov_shared))
 
     @property
     def n_observations(self) -> int:
@@ -486,7 +507,7 @@ class AdjustedNetwork:
     @property
     def p_base(self) -> Array:
         """Observed centres less what all have in common, (n, 3) [m]."""
-        return np.asarray(self.network.p_base - self.network.shared.effects @ self.shared)
+        return np.asarray(self.network.p_base - self.network.shared.derivatives @ self.shared)
 
     @property
     def cov_positions(self) -> Array:

@@ -23,7 +23,7 @@ from spheremark.pipelines.errors import (
     SolveError,
 )
 from spheremark.pipelines.geometry import levelling_rotation, rigid, transform, unit, up_by_lean
-from spheremark.pipelines.model import Array, ControlMarks, MarkerFits
+from spheremark.pipelines.model import OPTICS, Array, ControlMarks, MarkerFit, MarkerFits
 from spheremark.pipelines.model.network import LeftOut, Network, Refusal, Shared
 from spheremark.pipelines.network.false_marks import suspect_marks
 from spheremark.pipelines.positioning.hypotheses import Spans, spans_between
@@ -157,18 +157,15 @@ def assemble(
     _refuse_nothing(used, found, control, _foremost(refused, [names[i] for i in reasons]))
     network = _network(scans, found, used, suspicions)
     cov_p_base = network.cov_p_base + config.sigma_common**2 * np.eye(3)
+    fits_of = {name: found_there.fits for name, found_there in scans}
+    rows = zip(network.sightings[:, 0], network.fits, strict=True)
+    seen = [fits_of[network.stations[i]][fit] for i, fit in rows]
     if calibration is None:
-        fits = {name: found_there.fits for name, found_there in scans}
-        rows = zip(network.sightings[:, 0], network.fits, strict=True)
-        sigmas = [fits[network.stations[i]][fit].sigma_range_shared for i, fit in rows]
-        variances = shared_variances(network.p_base, cov_p_base, np.array(sigmas), config)
+        sigmas = np.array([fit.sigma_range_shared for fit in seen])
+        variances = shared_variances(network.p_base, cov_p_base, sigmas, config)
         cov_p_base = own_covariances(network.p_base, cov_p_base, variances)
-    network = replace(
-        network,
-        cov_p_base=cov_p_base,
-        shared=_in_common(network, config, calibration),
-        refused=refused,
-    )
+    network = replace(network, cov_p_base=cov_p_base, refused=refused)
+    network = _in_common(network, seen, config, calibration)
     return replace(network, left_out=_unseen(scans, found, used, unshared, dropped))
 
 
@@ -422,21 +419,50 @@ def _symmetric(p_base: Array, cov_p_base: Array) -> Array:
 
 
 def _in_common(
-    network: Network, config: ResectionConfig, calibration: Calibration | None
-) -> Shared:
-    """Return what all stations share: a range bias, and the parameters of a calibration."""
+    network: Network,
+    fits: Sequence[MarkerFit],
+    config: ResectionConfig,
+    calibration: Calibration | None,
+) -> Network:
+    """Return the network with what all stations share: rig, sensor, and optics of the beams."""
     ups_base = network.R_station_base[network.sightings[:, 0], 2]
-    bias = Shared.of_rig(network.p_base, ups_base, config.sigma_range, config.sigma_height)
-    if calibration is None:
-        return bias
-    names, weights = calibration.unknowns, calibration.weights
-    rows = zip(network.sightings[:, 0], network.fits, strict=True)
-    effects = np.array([calibration.effects(network.stations[i], int(fit)) for i, fit in rows])
-    k = len(names)
-    known = np.zeros((k + len(bias.names),) * 2)
-    known[:k, :k], known[k:, k:] = weights, bias.weights
-    return Shared(
-        names=(*names, *bias.names),
-        effects=np.concatenate([effects, bias.effects], axis=2),
-        weights=known,
+    sigmas = (config.sigma_range, config.sigma_range_scale, config.sigma_height)
+    shared = Shared.of_sensor(network.p_base, ups_base, sigmas)
+    network, optics = _with_common_optics(network, fits)
+    shared = shared.joined(optics)
+    if calibration is not None:
+        rows = zip(network.sightings[:, 0], network.fits, strict=True)
+        of_rig = [calibration.effects(network.stations[i], int(fit)) for i, fit in rows]
+        shared = Shared(
+            names=calibration.unknowns,
+            derivatives=np.array(of_rig),
+            prior_weights=calibration.weights,
+        ).joined(shared)
+    return replace(network, shared=shared)
+
+
+def _with_common_optics(network: Network, fits: Sequence[MarkerFit]) -> tuple[Network, Shared]:
+    """Return centres computed with the optics that all scans together show, and those as unknowns.
+
+    Each scan has estimated its own. What beams of an unknown profile leave open is common to all.
+    """
+    by_station = dict(
+        zip(network.sightings[:, 0].tolist(), (fit.optics for fit in fits), strict=True)
     )
+    found = {station: optics for station, optics in by_station.items() if optics is not None}
+    if len(found) < len(by_station):
+        return network, Shared.none(len(fits))
+    first = next(iter(found.values()))
+    weights = np.diag(first.sigmas_prior**-2.0) + sum(one.weights for one in found.values())
+    weighted = sum(one.weights @ one.estimates for one in found.values())
+    cov = np.linalg.inv(weights)
+    mean = cov @ np.asarray(weighted)
+    off = np.array([mean - found[station].estimates for station in network.sightings[:, 0]])
+    towards, by_optics = unit(network.p_base), np.array([fit.range_by_optics for fit in fits])
+    shifts = np.einsum("ni,nk,nk->ni", towards, by_optics, off)
+    shared = Shared(
+        names=OPTICS,
+        derivatives=towards[:, :, None] * by_optics[:, None],
+        prior_weights=np.linalg.inv(cov + np.diag(first.sigmas_profile**2)),
+    )
+    return replace(network, p_base=network.p_base - shifts), shared

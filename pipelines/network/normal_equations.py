@@ -138,8 +138,8 @@ def linearise(network: Network, state: State, used: Mask) -> Linearised:
     station, mark = network.sightings.T
     R, t = state.T_site_base[:, :3, :3], state.T_site_base[:, :3, 3]
     R_each = R[station]
-    effects = R_each @ network.shared.effects
-    p = np.einsum("nij,nj->ni", R_each, network.p_base) + t[station] - effects @ state.shared
+    derivatives = R_each @ network.shared.derivatives
+    p = np.einsum("nij,nj->ni", R_each, network.p_base) + t[station] - derivatives @ state.shared
     J_mark = np.broadcast_to(-np.eye(3), (n, 3, 3))
     weights = R_each @ invert_each(network.cov_p_base)[0] @ np.swapaxes(R_each, 1, 2)
     up = np.einsum("sij,sj->si", R, network.R_station_base[:, 2])
@@ -149,7 +149,7 @@ def linearise(network: Network, state: State, used: Mask) -> Linearised:
         v_centres=p - state.p_site[mark],
         P_centres=weights * used[:n, None, None],
         J_centres=by_motion(p),
-        J_common=np.concatenate([J_mark, -effects], axis=2),
+        J_common=np.concatenate([J_mark, -derivatives], axis=2),
         v_gravity=up[:, :2],
         P_gravity=invert_each(cov_up)[0] * used[n : n + s, None, None],
         J_gravity=np.concatenate([-skew(up)[:, :2], np.zeros((s, 2, 3))], axis=2),
@@ -194,7 +194,7 @@ def _common_alone(network: Network, lin: Linearised, shared: Array) -> tuple[Arr
     N[: 3 * m, : 3 * m] = diagonal.reshape(3 * m, 3 * m)
     N[: 3 * m, 3 * m :] = blocks[:, :, 3:].reshape(3 * m, k)
     N[3 * m :, : 3 * m] = N[: 3 * m, 3 * m :].T
-    weights = network.shared.weights
+    weights = network.shared.prior_weights
     N[3 * m :, 3 * m :] = squares[:, 3:, 3:].sum(axis=0) + weights
     tail = products[:, 3:].sum(axis=0) - weights @ shared
     return N, np.concatenate([rhs.ravel(), tail])

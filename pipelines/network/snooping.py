@@ -94,7 +94,7 @@ class Tested:
     def vtpv(self) -> float:
         """The weighted sum of squares, with the shared unknowns against their prior."""
         shared = self.state.shared
-        return sum(self.squares) + float(shared @ self.network.shared.weights @ shared)
+        return sum(self.squares) + float(shared @ self.network.shared.prior_weights @ shared)
 
     @property
     def sigma0(self) -> float:

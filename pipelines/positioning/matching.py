@@ -57,6 +57,7 @@ _N_DISSENT = 3  # other markers that agree on another place: control contradicts
 _PAIR = 25.0  # weighted sum of squares (2 dof) above which two markers are not those two marks
 _CHANCE = 0.01  # expected number of chance agreements above which a match is none
 _SHARED = 0.55  # of the variance along a line of sight, at most, that all centres share
+_SHARED_REPORTED = 0.98  # the same where fits report how much
 _SHARE = 0.4  # of markers or marks, the fewer: of mirrored fields five in fourteen may still fit
 
 
@@ -179,6 +180,7 @@ def gather(fits: MarkerFits, marks: ControlMarks, config: ResectionConfig) -> Sc
     cov_p_base = np.stack([fit.cov_p_base for fit in fits.fits])
     cov_p_base += config.sigma_common**2 * np.eye(3)
     sigmas_shared = np.array([fit.sigma_range_shared for fit in fits.fits])
+    is_reported = np.isfinite(sigmas_shared) & (config.sigma_range > 0.0)
     return Scene(
         names=marks.names,
         centres_base=p_base,
@@ -191,7 +193,7 @@ def gather(fits: MarkerFits, marks: ControlMarks, config: ResectionConfig) -> Sc
         sigma_level=levelling.sigma,
         is_levelled=levelling.is_measured,
         sigma_heading=levelling.sigma_heading,
-        sigma_range=config.sigma_range,
+        sigma_range=(float(np.median(sigmas_shared)) if is_reported.all() else config.sigma_range),
         shared=shared_variances(p_base, cov_p_base, sigmas_shared, config),
         sigma_height=config.sigma_height,
     )
@@ -216,8 +218,8 @@ def shared_variances(
     Returns
     -------
     (n,)
-        Variance along each line of sight, at most about half of what the centre has if all else
-        of it were known [m^2].
+        Variance along each line of sight, less than what the centre has if all else of it were
+        known [m^2].
 
     Notes
     -----
@@ -227,8 +229,10 @@ def shared_variances(
     """
     v = unit(p_base)
     own = 1.0 / np.einsum("ni,ni->n", v, (invert_each(cov_p_base)[0] @ v[..., None])[..., 0])
-    sigmas = np.where(np.isfinite(sigmas_shared), sigmas_shared, config.sigma_range_shared)
-    return np.asarray(np.minimum(sigmas**2, _SHARED * own))
+    is_reported = np.isfinite(sigmas_shared)
+    sigmas = np.where(is_reported, sigmas_shared, config.sigma_range_shared)
+    most = np.where(is_reported, _SHARED_REPORTED, _SHARED)
+    return np.asarray(np.minimum(sigmas**2, most * own))
 
 
 def own_covariances(p_base: Array, cov_p_base: Array, variances: Array) -> Array:

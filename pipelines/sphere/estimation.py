@@ -13,7 +13,7 @@ from typing import NamedTuple
 import numpy as np
 
 from spheremark.pipelines.estimation.linear_algebra import inverse
-from spheremark.pipelines.model import Array, Mask
+from spheremark.pipelines.model import Array, Mask, Optics
 from spheremark.pipelines.sphere.limb import Edge, edge_of, limb_normals, prior_edge
 from spheremark.pipelines.sphere.linearisation import Linear, linearise
 from spheremark.pipelines.sphere.mounting import N_MOUNTING, effects_on
@@ -21,8 +21,8 @@ from spheremark.pipelines.sphere.noise import Noise, Weighed, weigh
 from spheremark.pipelines.sphere.normal_equations import Normals, normals_of, reduce
 from spheremark.pipelines.sphere.optics import (
     N_ESTIMATED,
-    OPTICS,
     SIGMAS_PROFILE,
+    UNKNOWNS,
     derivatives,
     with_widths,
 )
@@ -60,7 +60,7 @@ class Prior(NamedTuple):
     sigma_biases : (k,)
         Standard deviations of the range biases of the lasers that occur [m].
     sigma_optics : (q,)
-        Standard deviations of ``OPTICS``; of these the first ``N_ESTIMATED`` are estimated.
+        Standard deviations of ``UNKNOWNS``; of these the first ``N_ESTIMATED`` are estimated.
     sigma_mounting : (6,)
         Standard deviations of the unknowns of the mounting.
     """
@@ -73,7 +73,7 @@ class Prior(NamedTuple):
     @property
     def sigmas(self) -> Array:
         """Standard deviations of all shared unknowns, tiny for those that are not estimated."""
-        held = np.zeros(len(OPTICS) - N_ESTIMATED)
+        held = np.zeros(len(UNKNOWNS) - N_ESTIMATED)
         optics = np.append(self.sigma_optics[:N_ESTIMATED], held)
         parts = (self.sigma_biases, optics, self.sigma_mounting)
         least = np.repeat([_SIGMA_BIAS_MIN, _SIGMA_MIN, _SIGMA_MIN], [len(part) for part in parts])
@@ -88,7 +88,7 @@ class State(NamedTuple):
     centres : (m, 3)
         Centres [m].
     shared : (k + q + 6,)
-        Range biases of the lasers [m], ``OPTICS``, and errors of the mounting in the order of
+        Range biases of the lasers [m], ``UNKNOWNS``, and errors of the mounting in the order of
         ``mounting.effects_on``.
     sigmas : (k + q + 6,)
         Their prior standard deviations, those of biases and mounting scaled as estimated.
@@ -102,6 +102,8 @@ class State(NamedTuple):
         Derivatives of the centres by the shared unknowns, with the sign turned.
     cov_shared : (k + q + 6, k + q + 6)
         Covariance of the shared unknowns.
+    cov_optics : (q, q)
+        That of ``UNKNOWNS`` as far as they are estimated, if beams had the assumed profile.
     """
 
     centres: Array
@@ -113,16 +115,17 @@ class State(NamedTuple):
     cov_shared_part: Array
     by_shared: Array
     cov_shared: Array
+    cov_optics: Array
 
     @property
     def biases(self) -> Array:
         """Range biases of the lasers [m]."""
-        return self.shared[: -N_MOUNTING - len(OPTICS)]
+        return self.shared[: -N_MOUNTING - len(UNKNOWNS)]
 
     @property
     def optics(self) -> Array:
-        """Values of ``OPTICS``."""
-        return self.shared[-N_MOUNTING - len(OPTICS) : -N_MOUNTING]
+        """Values of ``UNKNOWNS``."""
+        return self.shared[-N_MOUNTING - len(UNKNOWNS) : -N_MOUNTING]
 
     @property
     def mounting(self) -> Array:
@@ -188,6 +191,7 @@ def _start(rough: Array, prior: Prior) -> State:
         cov_shared_part=nothing,
         by_shared=np.zeros((len(rough), 3, len(sigmas))),
         cov_shared=np.diag(sigmas**2),
+        cov_optics=np.diag(prior.sigma_optics**2),
     )
 
 
@@ -257,6 +261,7 @@ def _stepped(state: State, N: Normals, prior: Prior) -> State:
         cov_shared_part=reduced.gains @ cov_shared @ reduced.gains.transpose(0, 2, 1),
         by_shared=reduced.gains,
         cov_shared=cov_shared,
+        cov_optics=estimated[_optics_of(prior), _optics_of(prior)],
     )
 
 
@@ -268,7 +273,7 @@ def _with_considered(estimated: Array, N: Array, prior: Prior, spread: float) ->
     open of the other optics is added. Lasers whose biases spread by more than expected may have
     more in common, too.
     """
-    optics = len(prior.sigma_biases) + np.arange(len(OPTICS))
+    optics = np.arange(len(estimated))[_optics_of(prior)]
     considered = optics[N_ESTIMATED:]
     response = -estimated @ N[:, considered]
     response[considered] = np.eye(len(considered))
@@ -276,6 +281,11 @@ def _with_considered(estimated: Array, N: Array, prior: Prior, spread: float) ->
     cov = estimated + (response * sigmas**2) @ response.T
     cov[optics, optics] += np.append(SIGMAS_PROFILE, np.zeros(len(considered))) ** 2
     return np.asarray(cov)
+
+
+def _optics_of(prior: Prior) -> slice:
+    """Return the places of the optics among the shared unknowns."""
+    return slice(len(prior.sigma_biases), -N_MOUNTING)
 
 
 def _spread(found: tuple[Array, Array], sigmas: Array) -> float:
@@ -323,3 +333,18 @@ def shared_range_sigmas(state: State) -> Array:
     own = np.diag(cov)
     common = (cov.sum(axis=1) - own) / (len(cov) - 1) if len(cov) > 1 else own
     return np.asarray(np.sqrt(np.maximum(common, 0.0)))
+
+
+def optics_of(state: State, prior: Prior) -> tuple[Optics, Array]:
+    """Return what the scan tells of its beams, and its effect on the ranges of centres, (m, 3)."""
+    sigmas = np.maximum(prior.sigma_optics[:N_ESTIMATED], _SIGMA_MIN)
+    cov = state.cov_optics[:N_ESTIMATED, :N_ESTIMATED]
+    optics = Optics(
+        estimates=state.optics[:N_ESTIMATED].copy(),
+        weights=inverse(cov) - np.diag(sigmas**-2.0),
+        sigmas_prior=sigmas,
+        sigmas_profile=SIGMAS_PROFILE.copy(),
+    )
+    lines = state.centres / np.linalg.norm(state.centres, axis=1, keepdims=True)
+    by_optics = state.by_shared[:, :, _optics_of(prior)][:, :, :N_ESTIMATED]
+    return optics, np.einsum("mi,mik->mk", lines, by_optics)

@@ -10,23 +10,18 @@ from __future__ import annotations
 import numpy as np
 
 from spheremark.pipelines.config import FittingConfig
-from spheremark.pipelines.model import Array
+from spheremark.pipelines.model import OPTICS, Array
+from spheremark.pipelines.model.network import RANGE_BIAS, RANGE_SCALE
 from spheremark.pipelines.sphere.linearisation import Linear
 from spheremark.pipelines.sphere.returns import Returns
 
-OPTICS = (
-    "beam_width",
-    "beam_window",
-    "echo_cosine",
-    "common_range_bias",
-    "range_scale",
-)
+N_ESTIMATED = len(OPTICS)
+"""Unknowns that a scan determines; it says nothing of the others."""
+
+UNKNOWNS = (*OPTICS, RANGE_BIAS, RANGE_SCALE)
 """Unknowns of the optics: relative excess of the divergence; width at the window in units of the
 VLP-16's; weight of an echo by this power of the cosine of incidence; bias [m] and scale of all
 ranges."""
-
-N_ESTIMATED = 3
-"""How many of them a scan determines; it says nothing of bias and scale."""
 
 SIGMAS_PROFILE = np.array([0.1, 0.03, 0.3])
 """Standard deviations of what beams of other profiles than an even one leave open of these, from
@@ -39,7 +34,7 @@ _NARROWEST = 0.02  # of the specified half widths: a ray
 
 
 def prior_sigmas(config: FittingConfig) -> Array:
-    """Return the prior standard deviations of ``OPTICS``."""
+    """Return the prior standard deviations of ``UNKNOWNS``."""
     return np.array(
         [
             config.sigma_beam_width,
@@ -68,7 +63,7 @@ def with_widths(returns: Returns, optics: Array) -> Returns:
 
 
 def derivatives(returns: Returns, linear: Linear) -> Array:
-    """Return the derivatives, (5, n), of predicted ranges by ``OPTICS``.
+    """Return the derivatives, (5, n), of predicted ranges by ``UNKNOWNS``.
 
     ``returns`` have the footprints as specified.
     """

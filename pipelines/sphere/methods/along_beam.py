@@ -42,6 +42,7 @@ from spheremark.pipelines.sphere.estimation import (
     Prior,
     estimate,
     estimate_radii,
+    optics_of,
     shared_range_sigmas,
 )
 from spheremark.pipelines.sphere.mounting import sigmas_of
@@ -121,6 +122,7 @@ def _fit(
     best = estimate(stop.returns, rough, prior, observe, uses_limb=uses_limb)
     radii, sigmas = estimate_radii(stop.returns, best, radius)
     shared = shared_range_sigmas(best.state)
+    optics, by_optics = optics_of(best.state, prior)
     results = [
         _result(
             stop,
@@ -131,6 +133,8 @@ def _fit(
             radius_free=float(radii[k]),
             sigma_radius_free=float(sigmas[k]),
             sigma_range_shared=float(shared[k]),
+            optics=optics,
+            range_by_optics=by_optics[k].copy(),
         )
         for k, candidate in enumerate(found.candidates)
     ]

@@ -23,7 +23,11 @@ from tests.synthetic import control, field, pose, sightings
 
 EXACT = 1e-7  # [m] and [rad] noise-free in, truth out
 CONFIG = ResectionConfig(
-    sigma_common=0.0, sigma_range=0.0, sigma_range_shared=0.0, sigma_height=0.0
+    sigma_common=0.0,
+    sigma_range=0.0,
+    sigma_range_scale=0.0,
+    sigma_range_shared=0.0,
+    sigma_height=0.0,
 )
 SIGMA = 4e-3  # [m] of a centre, per axis
 LEVEL = 3e-3  # [rad] of roll and of pitch

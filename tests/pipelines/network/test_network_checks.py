@@ -11,7 +11,7 @@ from spheremark.pipelines.model import Status
 from spheremark.pipelines.network import Shared, adjust_network, assemble, repeated_stops
 from tests.synthetic import control, field, pose, sightings
 
-CONFIG = ResectionConfig(sigma_common=0.0, sigma_range=0.0, sigma_height=0.0)
+CONFIG = ResectionConfig(sigma_common=0.0, sigma_range=0.0, sigma_range_scale=0.0, sigma_height=0.0)
 SIGMA = 4e-3  # [m] of a centre, per axis
 LEVEL = 3e-3  # [rad] of roll and of pitch
 
@@ -146,7 +146,7 @@ def test_what_a_rig_does_to_all_stations_is_found_with_its_sigma(rng):
         effects = np.stack([towards, tilted * np.abs(network.p_base[:, :1])], axis=2)
         moved = network.p_base + effects @ true
         shared = Shared(
-            names=("common_range_bias", "bend"), effects=effects, weights=np.zeros((2, 2))
+            names=("common_range_bias", "bend"), derivatives=effects, prior_weights=np.zeros((2, 2))
         )
         result = adjust_network(replace(network, p_base=moved, shared=shared), CONFIG)
         off = result.shared - true
