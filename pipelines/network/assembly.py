@@ -446,11 +446,9 @@ def _with_common_optics(network: Network, fits: Sequence[MarkerFit]) -> tuple[Ne
 
     Each scan has estimated its own. What beams of an unknown profile leave open is common to all.
     """
-    by_station = dict(
-        zip(network.sightings[:, 0].tolist(), (fit.optics for fit in fits), strict=True)
-    )
-    found = {station: optics for station, optics in by_station.items() if optics is not None}
-    if len(found) < len(by_station):
+    rows = zip(network.sightings[:, 0].tolist(), fits, strict=True)
+    found = {station: fit.optics for station, fit in rows if fit.optics is not None}
+    if len(found) < len(network.stations):
         return network, Shared.none(len(fits))
     first = next(iter(found.values()))
     weights = np.diag(first.sigmas_prior**-2.0) + sum(one.weights for one in found.values())

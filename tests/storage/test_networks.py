@@ -14,7 +14,7 @@ from spheremark.pipelines.network import adjust_network, assemble
 from spheremark.storage.exports.network import format_coordinates, format_gama
 from tests.synthetic import field, pose, sightings
 
-CONFIG = ResectionConfig(sigma_common=0.0, sigma_range=0.0)
+CONFIG = ResectionConfig(sigma_common=0.0, sigma_range=0.0, sigma_range_scale=0.0)
 GAMA = {"g": "http://www.gnu.org/software/gama/gama-local"}
 HUNDREDTH = 1e-5  # [m]
 

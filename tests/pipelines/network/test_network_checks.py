@@ -7,7 +7,7 @@ import pytest
 
 from spheremark.pipelines.config import ResectionConfig
 from spheremark.pipelines.errors import DegenerateGeometryError
-from spheremark.pipelines.model import Status
+from spheremark.pipelines.model import OPTICS, Optics, Status
 from spheremark.pipelines.network import Shared, adjust_network, assemble, repeated_stops
 from tests.synthetic import control, field, pose, sightings
 
@@ -213,3 +213,32 @@ def test_a_field_that_is_its_own_image_turned_is_refused_for_each_station(rng):
     ring = control(np.stack([8 * np.cos(angle), 8 * np.sin(angle), np.full(6, 1.0)], axis=1))
     with pytest.raises(DegenerateGeometryError, match="more than one way"):
         assemble(survey(rng, ring, 3), ring, CONFIG)
+
+
+def test_optics_that_scans_estimated_apart_are_brought_together_and_blur_the_scale(rng):
+    marks, true = field(rng), np.array([0.2, 0.3, 0.8])
+    weights = np.diag(np.array([0.1, 0.05, 0.3]) ** -2.0)
+    scans = []
+    for name, fits in survey(rng, marks, 6):
+        own = true + rng.normal(0, [0.1, 0.05, 0.3])
+        optics = Optics(
+            estimates=own,
+            weights=weights.copy(),
+            sigmas_prior=np.array([0.35, 0.5, 0.7]),
+            sigmas_profile=np.full(3, 1e-3),
+        )
+        changed = []
+        for fit in fits.fits:
+            towards = fit.p_base / np.linalg.norm(fit.p_base)
+            by_optics = 1e-5 * (fit.p_base @ fit.p_base) * np.array([1.0, 0.5, -0.5])
+            moved = fit.p_base + towards * (by_optics @ (true - own))
+            changed.append(replace(fit, p_base=moved, optics=optics, range_by_optics=by_optics))
+        scans.append((name, replace(fits, fits=tuple(changed))))
+    network = assemble(scans, None, CONFIG)
+    result = adjust_network(network, CONFIG)
+    assert network.shared.names == OPTICS
+    sigmas = np.sqrt(np.diag(result.cov_shared))
+    assert np.all(sigmas < 0.6 * np.array([0.1, 0.05, 0.3]))  # six scans know more than one
+    fixed = replace(network, shared=Shared.none(len(network.fits)))
+    trusting = adjust_network(fixed, CONFIG)
+    assert np.trace(result.cov_p_site) > np.trace(trusting.cov_p_site)
