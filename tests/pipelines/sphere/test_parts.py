@@ -12,7 +12,7 @@ from spheremark.pipelines.sphere.footprint import predict
 from spheremark.pipelines.sphere.linearisation import linearise
 from spheremark.pipelines.sphere.mounting import effects_on
 from spheremark.pipelines.sphere.normal_equations import normals_of, reduce
-from spheremark.pipelines.sphere.optics import OPTICS, derivatives, with_widths
+from spheremark.pipelines.sphere.optics import UNKNOWNS, derivatives, with_widths
 from spheremark.pipelines.sphere.radius import Ranges, free_radii
 from spheremark.pipelines.sphere.returns import of_markers, returns_of
 
@@ -112,8 +112,8 @@ def test_derivatives_by_the_optics_agree_with_wider_footprints_and_with_weighted
     spheres, covs = spheres_and_covs(1e-6)
     linear, step = linearise(returns, spheres, covs), 0.1
     exact = predict(pulses, CENTRES, spheres[:, 3], returns.markers)
-    by_optics = dict(zip(OPTICS, derivatives(returns, linear), strict=True))
-    optics = dict.fromkeys(OPTICS, 0.0)
+    by_optics = dict(zip(UNKNOWNS, derivatives(returns, linear), strict=True))
+    optics = dict.fromkeys(UNKNOWNS, 0.0)
     seen = exact.lit > 0.3
     for name, value in (("beam_width", step), ("beam_window", step)):
         wide = with_widths(returns, np.array(list((optics | {name: value}).values())))
