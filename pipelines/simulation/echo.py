@@ -128,9 +128,10 @@ def _trace_bundles(
     across /= np.linalg.norm(across, axis=1, keepdims=True)
     along = np.cross(across, aims.directions_site)
     offsets = footprint(optics.profile, _N_RAYS)
+    k = len(offsets)
     directions = _bundles(aims.directions_site, across, along, offsets * divergence / 2)
     starts = offsets * np.array(optics.window) / 2
-    rays = np.empty((n, _N_RAYS, 6), dtype=np.float32)
+    rays = np.empty((n, k, 6), dtype=np.float32)
     for j, (u, v) in enumerate(starts):
         rays[:, j, :3] = aims.origins_site + u * across + v * along
     rays[:, :, 3:] = directions
@@ -139,10 +140,10 @@ def _trace_bundles(
     found: tuple[Array, Array, Index] = _echoes(
         (aims.origins_site, across, along, starts),
         directions,
-        distances.reshape(n, _N_RAYS),
-        shades.reshape(n, _N_RAYS),
+        distances.reshape(n, k),
+        shades.reshape(n, k),
         np.column_stack([spheres.p_site, spheres.radii, spheres.reflectivities]),
-        (optics.incidence, optics.gate, optics.energy_half * _N_RAYS, _PICKS[optics.pick]),
+        (optics.incidence, optics.gate, optics.energy_half * k, _PICKS[optics.pick]),
     )
     return found
 
@@ -168,15 +169,16 @@ def disc(n: int) -> Array:
 
 
 def footprint(profile: Profile, n: int) -> Array:
-    """Return rays of equal energy, (n, 2): places across and along, in half widths."""
-    even = disc(n)
+    """Return about n rays of equal energy: places across and along, in half widths, (k, 2)."""
+    if profile is Profile.EVEN:
+        return disc(n)
+    half = disc(n // 2)
     if profile is Profile.GAUSSIAN:  # within rho lies the share 1 - exp(-2 rho^2)
-        squares = (even**2).sum(axis=1, keepdims=True)
-        return np.asarray(even * np.sqrt(-0.5 * np.log1p(-squares) / squares))
-    if profile is Profile.TWO_LOBES:
-        side = np.where(np.arange(n) % 2, 1.0, -1.0)
-        return np.column_stack([_LOBE * even[:, 0] + (1.0 - _LOBE) * side, even[:, 1]])
-    return even
+        squares = (half**2).sum(axis=1, keepdims=True)
+        half *= np.sqrt(-0.5 * np.log1p(-squares) / squares)
+    else:
+        half = half * (_LOBE, 1.0) + (1.0 - _LOBE, 0.0)
+    return np.concatenate([half, -half])  # symmetric: a slope moves the mean by curvature alone
 
 
 @compiled

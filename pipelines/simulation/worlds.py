@@ -191,6 +191,11 @@ def random_world(seed: int, family: str = "") -> Scan:
     return Scan(stop.log, survey_truth(world.field, [stop], world.config, seed), world, stop)
 
 
+def family_of(seed: int) -> str:
+    """Return the family of a seed: they take turns with the even ones, and with the odd ones."""
+    return FAMILIES[seed // 2 % len(FAMILIES)]
+
+
 def draw_world(seed: int, family: str = "") -> RandomWorld:
     """Draw a random world.
 
@@ -211,7 +216,7 @@ def draw_world(seed: int, family: str = "") -> RandomWorld:
     ConfigError
         If there is no such family, or the seed is negative.
     """
-    family = family or FAMILIES[checked_seed(seed) // 2 % len(FAMILIES)]
+    family = family or family_of(checked_seed(seed))
     if family not in FAMILIES:
         raise ConfigError(f"There is no family {family!r}; there are: {', '.join(FAMILIES)}.")
     rng = np.random.default_rng([seed, _CONFIG])

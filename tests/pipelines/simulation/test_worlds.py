@@ -1,0 +1,139 @@
+"""Random worlds: families, priors, seeds, and what a log must not hold."""
+
+from collections import Counter
+from dataclasses import fields
+
+import numpy as np
+import pytest
+from numpy.testing import assert_array_equal
+
+from spheremark.pipelines.errors import ConfigError
+from spheremark.pipelines.model import RING_UNKNOWN
+from spheremark.pipelines.scan.rigs import rig_digest
+from spheremark.pipelines.simulation import FAMILIES, commensurability, draw_world, random_world
+from spheremark.pipelines.simulation.options import Profile
+from spheremark.pipelines.simulation.rig import nominal_rig
+from spheremark.pipelines.simulation.worlds import PRIORS, family_of
+from spheremark.storage.recordings import write_log
+
+
+@pytest.fixture(scope="module")
+def scan():
+    return random_world(10)
+
+
+@pytest.fixture(scope="module")
+def worlds():
+    """One world of each family, not simulated."""
+    return {name: draw_world(2 * i + 32, name) for i, name in enumerate(FAMILIES)}
+
+
+def test_every_family_is_drawn_by_even_and_by_odd_seeds_alike():
+    for parity in (0, 1):
+        drawn = Counter(family_of(seed) for seed in range(parity, 2 * len(FAMILIES), 2))
+        assert drawn == dict.fromkeys(FAMILIES, 1)
+
+
+def test_a_family_has_what_it_is_named_after(worlds):
+    of = {name: world.config for name, world in worlds.items()}
+    kinds = {name: {d.kind for d in world.field.decoys} for name, world in worlds.items()}
+    assert commensurability(of["lattice"])
+    assert of["step-and-shoot"].step > 0
+    assert of["one face"].sweep < 1.2 * np.pi
+    assert not of["bare"].has_rings
+    assert abs(of["clock"].gimbal_clock_offset) >= 0.005
+    assert of["dust"].optics.dust > 0
+    assert of["plain"].optics.profile is Profile.EVEN
+    assert not worlds["empty"].field.marks.names
+    assert len(worlds["empty"].field.decoys) > 20
+    assert {"person", "bush", "tree"} <= kinds["clutter"]
+    assert kinds["panels"] & {"panel", "wall beside", "post beside", "screen"}
+    assert {"cube", "cylinder", "wrong ball"} <= kinds["decoys"]
+    assert sum(d.kind == "rock" for d in worlds["rocks"].field.decoys) > 20
+    assert [name for name, config in of.items() if not config.shot_times] in ([], ["bare"])
+
+
+def test_every_quantity_has_a_prior_that_widens_in_its_families():
+    for name, prior in PRIORS.items():
+        assert prior.usual[0] < prior.usual[1], name
+        assert prior.wide[0] < prior.wide[1], name
+        assert set(prior.families) <= set(FAMILIES), name
+        assert np.ptp(prior.wide) >= np.ptp(prior.usual), name
+        rng = np.random.default_rng(0)
+        drawn = [prior.draw(rng, "plain") for _ in range(200)]
+        assert prior.usual[0] <= min(drawn) < max(drawn) <= prior.usual[1], name
+
+
+def test_radii_go_from_three_centimetres_to_two_and_a_half_metres_at_fitting_distances():
+    found = [draw_world(seed, "radius").field for seed in range(0, 24, 2)]
+    radii = np.array([field.marker_radius for field in found])
+    assert radii.min() < 0.1
+    assert radii.max() > 0.8
+    for field in found:
+        eye = field.stops[0].p_site
+        distances = np.linalg.norm(field.marks.p_site - eye, axis=1)
+        assert (distances > 4 * field.marker_radius).all()
+        assert (distances < 400 * field.marker_radius + 2).all()
+        above = field.marks.p_site[:, 2] - field.terrain.height_at(field.marks.p_site)
+        assert (above > field.marker_radius).all()
+
+
+def test_decoys_of_wrong_size_are_never_of_the_markers_size(worlds):
+    for world in worlds.values():
+        n, radius = len(world.field.marks.names), world.field.marker_radius
+        wrong = [d.p_site for d in world.field.decoys if d.kind == "wrong ball"]
+        for p in wrong:
+            i = np.argmin(np.linalg.norm(world.field.scene.spheres.p_site - p, axis=1))
+            ratio = world.field.scene.spheres.radii[i] / radius
+            assert i >= n
+            assert 0.7 <= ratio <= 0.9 or 1.1 <= ratio <= 1.5
+
+
+def test_the_log_holds_the_nominal_rig_and_nothing_of_the_truth(scan, tmp_path):
+    log, about = scan.log, scan.truth.about
+    assert rig_digest(log.rig) == rig_digest(nominal_rig(scan.world.config))
+    assert rig_digest(log.rig) != rig_digest(scan.truth.rig)
+    write_log(log, tmp_path / "log.mcap")
+    written = (tmp_path / "log.mcap").read_bytes()
+    words = {about["family"], "random", "range_bias", "sigma_weak", "decoy", "visible"}
+    words |= {kind for decoy in about["decoys"] if len(kind := decoy["kind"]) > 5}
+    assert not [word for word in words if word.encode() in written]
+
+
+def test_the_truth_lists_family_decoys_returns_and_shares(scan):
+    about, names = scan.truth.about, scan.world.field.marks.names
+    assert about["family"] == "panels"
+    assert {"kind", "p_site_m", "reach_m"} <= set(about["decoys"][0])
+    returns = about["returns"][scan.log.origin.name]
+    assert set(returns) == set(names)
+    for i, name in enumerate(names):
+        assert returns[name]["n"] == np.sum(scan.stop.marks == i)
+        assert returns[name]["n_lines"] <= returns[name]["n"]
+
+
+def test_visible_shares_and_returns_agree(scan):
+    about, name = scan.truth.about, scan.log.origin.name
+    for mark, share in about["visible_shares"][name].items():
+        assert (about["returns"][name][mark]["n"] > 0) == (share > 0.02), mark
+
+
+def test_a_seed_gives_one_world_and_another_seed_another(scan):
+    again, other = random_world(10), draw_world(12)
+    for one in fields(scan.log):
+        found, wanted = getattr(again.log, one.name), getattr(scan.log, one.name)
+        if isinstance(wanted, np.ndarray):
+            assert_array_equal(found, wanted)
+    assert other.config != scan.world.config
+    assert other.field.marks.names != scan.world.field.marks.names or not np.array_equal(
+        other.field.marks.p_site, scan.world.field.marks.p_site
+    )
+
+
+def test_a_bare_log_has_no_rings():
+    log = random_world(24).log
+    assert set(np.unique(log.rings)) == {RING_UNKNOWN}
+
+
+def test_an_unknown_family_is_refused():
+    with pytest.raises(ConfigError, match="no family 'moon'; there are: plain, "):
+        draw_world(0, "moon")
