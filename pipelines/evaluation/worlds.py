@@ -248,11 +248,11 @@ def _calls(
     scan: Scan, found: MarkerCandidates, fits: MarkerFits, places: Array
 ) -> tuple[list[Call], list[int]]:
     """Return our markers, sure ones first, and the mark of each fit."""
-    scores = {one.name: float(getattr(one, "probability", one.score)) for one in found.candidates}
+    scores = {one.name: _score_of(one) for one in found.candidates}
     fitted = [(fit.status.value, scores[fit.name], fit.p_base) for fit in fits.fits]
     order = sorted(range(len(fitted)), key=lambda i: (fitted[i][0], -fitted[i][1]))
     ours = [fitted[i] for i in order]
-    possible: Any = getattr(found, "possible", ())
+    possible: Any = getattr(fits, "possible", getattr(found, "possible", ()))
     ours += [("possible", _score_of(one), _place_of(one)) for one in possible]
     calls = _matched(scan, places, ours)
     marks = [-1] * len(fits.fits)
@@ -261,9 +261,10 @@ def _calls(
     return calls, marks
 
 
-def _score_of(possible: Any) -> float:
-    """Return the probability of a possible marker."""
-    return float(getattr(possible, "probability", getattr(possible, "score", 0.0)))
+def _score_of(one: Any) -> float:
+    """Return the probability that something is a marker, or its score where it has none."""
+    probability = float(getattr(one, "probability", np.nan))
+    return probability if np.isfinite(probability) else float(getattr(one, "score", 0.0))
 
 
 def _place_of(possible: Any) -> Array:
