@@ -2,12 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 from spheremark.pipelines.calibration import Calibration, calibrate
 from spheremark.pipelines.config import SurveyConfig
-from spheremark.pipelines.errors import RecordingError, RigError, SolveError, SpheremarkError
+from spheremark.pipelines.errors import (
+    NoMarkersError,
+    RecordingError,
+    RigError,
+    SolveError,
+    SpheremarkError,
+)
 from spheremark.pipelines.model import (
     ControlMarks,
     MarkerFits,
@@ -19,6 +25,7 @@ from spheremark.pipelines.model import (
 )
 from spheremark.pipelines.network import AdjustedNetwork, Refusal, adjust_network, assemble
 from spheremark.pipelines.progress import Progress, part_of
+from spheremark.pipelines.scan.diagnosis import diagnose
 from spheremark.pipelines.survey import StopErrors, process, stop_errors
 from spheremark.storage.recordings import LogFile
 
@@ -64,9 +71,12 @@ def process_file(
     progress(0.0, f"Reading {file.path.name}")
     logs = [file.read()]
     origin, notes = logs[0].origin, logs[0].notes
-    stops = process(  # releases the log once it is stitched: no reference to it may remain here
-        logs.pop(), config=config, rig=rig, marks=marks, progress=progress
-    )
+    try:
+        stops = process(  # releases the log once it is stitched: no reference may remain here
+            logs.pop(), config=config, rig=rig, marks=marks, progress=progress
+        )
+    except NoMarkersError as error:
+        raise explained(error, file.read, rig) from error
     errors = {stop.name: stop_errors(stop, truth) for stop in stops} if truth else {}
     return ProcessedLog(
         origin=origin,
@@ -76,6 +86,13 @@ def process_file(
         stops=stops,
         errors={name: one for name, one in errors.items() if one is not None},
     )
+
+
+def explained(
+    error: NoMarkersError, read: Callable[[], ScanLog], rig: Rig | None
+) -> NoMarkersError:
+    """Return the error of a log without spheres with what other ways to read it show."""
+    return NoMarkersError(" ".join((str(error), *diagnose(read(), rig))))
 
 
 def read_scans(

@@ -200,12 +200,19 @@ def simulate(
 
 @app.command()
 @reads_logs
-def inspect(log: OneLog, as_json: AsJson = False) -> None:
+def inspect(
+    log: OneLog,
+    diagnose: Annotated[
+        bool,
+        typer.Option("--diagnose", help="Try other signs, units and clocks; takes seconds."),
+    ] = False,
+    as_json: AsJson = False,
+) -> None:
     """Report what a log holds and lacks, and whether it can be processed."""
     from spheremark.service.cli import render
     from spheremark.storage.recordings import inspect_log
 
-    report = inspect_log(log.path, log.options, beside=log.beside)
+    report = inspect_log(log.path, log.options, beside=log.beside, diagnosing=diagnose)
     if as_json:
         _print_json(report.to_mapping())
     else:

@@ -26,7 +26,7 @@ Plain = Mapping[str, Any]
 def print_preflight(out: Console, name: str, report: Preflight) -> None:
     """Print the preflight report of a log."""
     out.print(f"[bold]{escape(name)}[/]: {_coloured(report.verdict)}")
-    for reason in (*report.reasons, *report.notes):
+    for reason in (*report.reasons, *report.notes, *report.diagnosis):
         out.print(f"  {escape(reason)}", highlight=False)
     if report.topics:
         rows = [

@@ -16,6 +16,7 @@ import numpy as np
 from spheremark.pipelines.config import StitchingConfig
 from spheremark.pipelines.errors import InputError, MissingRigError, NotFoundError
 from spheremark.pipelines.model import Array, Index, Nanos, Origin, Rig, ScanLog
+from spheremark.pipelines.scan.diagnosis import diagnose
 from spheremark.pipelines.scan.rigs import tilted_vlp16
 from spheremark.storage.recordings.container import Batch, Channel
 from spheremark.storage.recordings.decoding import Decoders
@@ -103,6 +104,8 @@ class Preflight:
         Largest angle along the horizon that no scan line crosses, at the worst stop.
     reading : dict
         Options with which the log was read, as far as they are no defaults.
+    diagnosis : tuple of str
+        What other signs, units and clocks make of the scan, if that was tried.
     """
 
     verdict: str
@@ -123,6 +126,7 @@ class Preflight:
     lidar_speed_rpm: float | None = None
     coverage_gap_deg: float | None = None
     reading: dict[str, Any] = field(default_factory=dict)
+    diagnosis: tuple[str, ...] = ()
 
     def to_mapping(self) -> dict[str, Any]:
         """Return the report as plain values for JSON."""
@@ -162,7 +166,11 @@ class _Times:
 
 
 def inspect_log(
-    url: str | Path, options: LogOptions | None = None, *, beside: Sequence[Path] = ()
+    url: str | Path,
+    options: LogOptions | None = None,
+    *,
+    beside: Sequence[Path] = (),
+    diagnosing: bool = False,
 ) -> Preflight:
     """Inspect a recording.
 
@@ -174,6 +182,8 @@ def inspect_log(
         Topics, joint and clocks, where they cannot be found.
     beside : sequence of Path
         Further files of the same log.
+    diagnosing : bool
+        Whether to try other signs, units and clocks, which takes seconds.
 
     Returns
     -------
@@ -192,17 +202,20 @@ def inspect_log(
     options = options or LogOptions()
     start = Preflight(verdict=OK, reading=options.to_mapping())
     try:
-        return _inspect(url, beside, options, start)
+        report, log = _inspect(url, beside, options, start)
+        if diagnosing and log is not None:
+            report = replace(report, diagnosis=diagnose(log, None))
     except NotFoundError:
         raise
     except InputError as error:
         return _refused(start, error)
+    return report
 
 
 def _inspect(
     url: str | Path, beside: Sequence[Path], options: LogOptions, start: Preflight
-) -> Preflight:
-    """Walk the recording and return its report; only a file that is no log raises."""
+) -> tuple[Preflight, ScanLog | None]:
+    """Walk the recording; return its report and its log. Only a file that is no log raises."""
     damage: InputError | None = None
     times = _Times()
     with opened(url, beside, recover=options.recover) as recording:
@@ -222,9 +235,9 @@ def _inspect(
     try:
         log = assemble(decoders, options, Origin(name=stem(url), digest=""))
     except InputError as error:
-        return _refused(report, damage or error)
+        return _refused(report, damage or error), None
     report = _with_verdict(_described(report, log), log, _skew(decoders, times))
-    return report if damage is None else _refused(report, damage)
+    return (report if damage is None else _refused(report, damage)), log
 
 
 def _refused(report: Preflight, error: InputError) -> Preflight:

@@ -2,6 +2,7 @@
 
 import json
 import zipfile
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -43,8 +44,6 @@ def zipped(bag):
 @pytest.fixture(scope="module")
 def clockwise(stop, tmp_path_factory):
     """Return the simulated stop with its angles in degrees, clockwise, on a joint among others."""
-    from dataclasses import replace
-
     log = read_log(stop.log)
     path = tmp_path_factory.mktemp("logs") / "clockwise.mcap"
     write_log(replace(log, gimbal_angles=-np.degrees(log.gimbal_angles)), path)
@@ -113,3 +112,21 @@ def test_a_damaged_upload_is_used_when_that_is_accepted(site):
     job = site.ended(answer.json()["job"]["job_id"])
     assert job["status"] == "successful"
     assert "weak" in job["message"]
+
+
+def test_diagnosis_names_the_option_that_mends_a_log(stop, tmp_path):
+    log = read_log(stop.log)
+    start = log.stamps_gimbal_ns[0]
+    slow = replace(  # 5 deg/s in degrees are 286 deg/s in radians, which a gimbal could do
+        log,
+        gimbal_angles=-np.degrees(log.gimbal_angles),
+        stamps_gimbal_ns=start + 6 * (log.stamps_gimbal_ns - start),
+        stamps_lidar_ns=start + 6 * (log.stamps_lidar_ns - start),
+    )
+    write_log(slow, tmp_path / "slow.mcap", revolution=0.6)
+    found = json.loads(run("inspect", tmp_path / "slow.mcap", "--diagnose", "--json").stdout)
+    assert "--joint-unit deg --joint-sign -1" in found["diagnosis"][0]
+    failed = run("process", tmp_path / "slow.mcap", "--radius-m", "0.5", code=1)
+    assert "--joint-unit deg --joint-sign -1" in failed.stderr
+    good = json.loads(run("inspect", stop.log, "--diagnose", "--json").stdout)
+    assert "no other sign" in good["diagnosis"][0]

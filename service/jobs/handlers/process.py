@@ -7,6 +7,7 @@ from datetime import UTC, datetime
 from time import perf_counter
 from typing import TYPE_CHECKING
 
+from spheremark.pipelines.errors import NoMarkersError
 from spheremark.pipelines.model import (
     ControlMarks,
     NoFix,
@@ -33,19 +34,24 @@ def process_log(
 ) -> tuple[tuple[StopResult, ...], dict[str, pa.Table]]:
     """Read a log, run the chain, store the clouds, make the tables of a run."""
     from spheremark.pipelines.survey import process
+    from spheremark.service.log_files import explained
     from spheremark.storage.catalogue.results import RunInfo, tables
     from spheremark.storage.clouds.stop import write_cloud
 
     start = perf_counter()
     forget_peak_memory()
     progress(0.0, f"Reading {recording.name}")
-    stops = process(
-        recording.read(),  # released once it is stitched: no reference is kept
-        config=spec.config,
-        rig=spec.rig,
-        marks=spec.marks,
-        progress=part_of(progress, 0.1, 0.9),
-    )
+    try:
+        stops = process(
+            recording.read(),  # released once it is stitched: no reference is kept
+            config=spec.config,
+            rig=spec.rig,
+            marks=spec.marks,
+            progress=part_of(progress, 0.1, 0.9),
+        )
+    except NoMarkersError as error:
+        progress(0.9, "Trying other signs, units and clocks")
+        raise explained(error, recording.read, spec.rig) from error
     progress(0.9, "Storing the results")
     clouds = {stop.name: write_cloud(stop, spec.clouds_url) for stop in stops}
     run = RunInfo(
