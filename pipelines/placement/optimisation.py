@@ -33,6 +33,7 @@ from spheremark.pipelines.placement.station_covariance import (
     shared_variance,
 )
 from spheremark.pipelines.placement.visibility import find_visibility
+from spheremark.pipelines.progress import checkpoint
 
 MARKS_MOST = 40
 """Marks that are placed at most."""
@@ -556,6 +557,7 @@ def _sigmas(problem: _Problem, chosen: Index) -> Array:
 
 def _score(problem: _Problem, chosen: Index) -> tuple[float, float]:
     """Return the largest sigma over all stops, or their power mean, and their mean [m]."""
+    checkpoint()
     sigmas = _sigmas(problem, chosen)
     worst = float(sigmas.max())
     if np.isfinite(problem.power):

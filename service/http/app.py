@@ -19,6 +19,7 @@ from spheremark.service.http import api, errors, security
 from spheremark.service.http.pages import frame, jobs, networks, plans, sites, surveys
 from spheremark.service.http.state import Current, opened
 from spheremark.service.settings import Settings
+from spheremark.storage.files import StorageError
 
 ROOT = "/api/v1"
 STATIC = Path(str(resources.files("spheremark.web"))) / "static"
@@ -86,17 +87,36 @@ def create_app(settings: Settings) -> FastAPI:
 
 
 @about.get("/healthz")
-def health(service: Current, response: Response) -> dict[str, Any]:
-    """Report whether each part of the service runs."""
+async def health(service: Current) -> dict[str, Any]:
+    """Report that the service responds, and how its parts are; it waits for none of them."""
     workers = service.jobs.n_workers()
-    service.catalogue.rows("SELECT 1 AS one")
-    response.status_code = 200 if workers else 503
+    is_open = service.catalogue.is_usable
     return {
-        "status": "ok" if workers else "degraded",
+        "status": "ok" if workers and is_open else "degraded",
         "version": metadata.version("spheremark"),
-        "database": "ok",
+        "database": "ok" if is_open else "unavailable",
         "cluster": {"status": "ok" if workers else "no workers", "workers": workers},
     }
+
+
+@about.get("/readyz")
+def readiness(service: Current, response: Response) -> dict[str, Any]:
+    """Report whether each part of the service can take work now; 503 if one cannot."""
+    try:
+        service.catalogue.rows("SELECT 1 AS one")
+        database = "ok"
+    except StorageError as error:
+        database = str(error)
+    try:
+        service.inbox.require_room(0)
+        disk = "ok"
+    except StorageError as error:
+        disk = str(error)
+    cluster = "ok" if service.jobs.n_workers() else "no workers"
+    parts = {"database": database, "disk": disk, "cluster": cluster}
+    is_ready = set(parts.values()) == {"ok"}
+    response.status_code = 200 if is_ready else 503
+    return {"status": "ready" if is_ready else "not ready", **parts}
 
 
 @about.get("/login")

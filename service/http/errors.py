@@ -25,6 +25,7 @@ HTTP_CODES: Mapping[int, str] = {
     408: "input.timeout",
     413: "input.too_large",
 }
+_RETRY_AFTER = "5"  # [s] what is refused for want of room or places
 ErrorPage = Callable[[Request, Problem], Response]
 
 
@@ -40,7 +41,8 @@ def install(app: FastAPI, page: ErrorPage | None = None) -> None:
         problem = problem_of(cast(SpheremarkError, error), request.url.path)
         if problem.status >= 500:
             logger.error("%s %s failed: %s", request.method, request.url.path, problem.detail)
-        return respond(request, problem, None)
+        headers = {"Retry-After": _RETRY_AFTER} if problem.status in (429, 503, 507) else None
+        return respond(request, problem, headers)
 
     def http(request: Request, error: Exception) -> Response:
         known = cast(HTTPException, error)

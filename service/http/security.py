@@ -31,7 +31,7 @@ from spheremark.service.http.errors import problem_response
 from spheremark.service.settings import Settings
 
 COOKIE = "spheremark_token"
-OPEN_PATHS = ("/healthz", "/login", "/static/")  # open without the token
+OPEN_PATHS = ("/healthz", "/readyz", "/login", "/static/")  # open without the token
 LONG_PATHS = ("/api/v1/recordings", "/api/v1/terrains")  # streamed, with a limit of their own
 UPLOADS = "/api/v1/uploads/"  # and what is below it
 BODY_MAX = 16 << 20  # [bytes] of any other body

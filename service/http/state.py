@@ -4,59 +4,21 @@ from __future__ import annotations
 
 import asyncio
 import threading
-from collections.abc import AsyncIterator, Callable
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
 from dataclasses import dataclass, field
-from typing import Annotated, Any, TypeVar
+from typing import Annotated, Any
 
 from fastapi import Depends, Request
 
 from spheremark.pipelines.errors import NotFoundError
-from spheremark.service.errors import BusyError
+from spheremark.service.http.places import Places
 from spheremark.service.http.uploads import Inbox, Resumable, adopt_orphans
 from spheremark.service.jobs.queue import JobQueue
 from spheremark.service.planning.requests import Planner
 from spheremark.service.settings import Settings
 from spheremark.storage.catalogue.catalogue import Catalogue
 from spheremark.storage.imports.confined import end_children
-
-_Result = TypeVar("_Result")
-
-_READERS = 2  # foreign files that are read at once, each in a process of its own
-_READERS_WAITING = 8  # uploads that wait for one of them; others are refused
-
-
-class Readers:
-    """Threads that wait for the processes in which foreign files are read.
-
-    They are threads of their own: a slow file keeps neither jobs nor uploads of logs waiting.
-    """
-
-    def __init__(self) -> None:
-        self._threads = ThreadPoolExecutor(_READERS, "reader")
-        self._n = 0
-
-    async def run(self, function: Callable[..., _Result], *arguments: Any) -> _Result:
-        """Return what a function returns; raise BusyError where too many wait already."""
-        if self._n >= _READERS + _READERS_WAITING:
-            raise BusyError(
-                f"{self._n} files are being read or wait for it; {_READERS + _READERS_WAITING} are "
-                "the most. Try again in a minute."
-            )
-        self._n += 1
-        future = asyncio.get_running_loop().run_in_executor(self._threads, function, *arguments)
-        future.add_done_callback(self._leave)
-        return await future
-
-    def _leave(self, _: asyncio.Future[Any]) -> None:
-        """Count one less."""
-        self._n -= 1
-
-    def close(self) -> None:
-        """End what is being read, and start nothing that waits."""
-        self._threads.shutdown(wait=False, cancel_futures=True)
-        end_children()
 
 
 @dataclass(frozen=True, slots=True)
@@ -70,7 +32,9 @@ class Service:
     terrains: Inbox
     jobs: JobQueue
     planner: Planner
-    readers: Readers = field(default_factory=Readers)
+    readers: Places = field(default_factory=lambda: Places("foreign files", 2, 8))
+    queries: Places = field(default_factory=lambda: Places("queries", 4, 12))
+    plans: Places = field(default_factory=lambda: Places("plans", 2, 6))
     keys: threading.Lock = field(default_factory=threading.Lock)  # of requests that must be one
 
     def row(self, sql: str, key: str, what: str) -> dict[str, Any]:
@@ -103,7 +67,9 @@ async def opened(settings: Settings) -> AsyncIterator[Service]:
             try:
                 yield service
             finally:
-                service.readers.close()
+                for places in (service.readers, service.queries, service.plans):
+                    places.close()
+                end_children()
 
 
 def _warm_up() -> None:

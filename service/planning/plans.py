@@ -9,7 +9,17 @@ import numpy as np
 
 from spheremark.pipelines import placement
 from spheremark.pipelines.errors import InputError
-from spheremark.pipelines.placement import Arrangement, Goal, PlaceRules, Requirement, Sensor, Stops
+from spheremark.pipelines.model import Array
+from spheremark.pipelines.placement import (
+    Arrangement,
+    FieldMap,
+    Goal,
+    PlaceRules,
+    Requirement,
+    Sensor,
+    Stops,
+)
+from spheremark.pipelines.progress import checkpoint
 from spheremark.service.planning.centre_models import Query, model_of_surveys
 from spheremark.service.planning.requests import (
     Ground,
@@ -30,6 +40,7 @@ from spheremark.service.serialise.plans import (
 )
 from spheremark.storage.imports.plan_files import read_keep_out, read_stops
 
+_PAIRS_MAX = 250_000  # of places and marks at once; 100 MB or so
 _SEED = 0  # of the optimiser's later starts
 
 
@@ -98,10 +109,22 @@ def evaluate(plan: Plan, cache: VisibilityCache | None = None) -> Plain:
     """Return the predicted accuracy of an arrangement at its stops."""
     site, stops, marks = plan.ground.site, plan.stops, plan.marks
     visibility = None if cache is None else cache.find(plan.ground, stops.p_site, marks)
+    checkpoint()
     found = placement.evaluate(
         site, stops, marks, plan.model, plan.requirement, visibility=visibility
     )
     return evaluation_json(site, plan.model, found)
+
+
+def require_small(plan: Plan) -> None:
+    """Refuse a plan whose evaluation takes more memory than a request may."""
+    n_stops, n_marks = len(plan.stops.names), len(plan.marks.names)
+    placement.check_sizes(n_stops, n_marks)
+    if n_stops * n_marks > _PAIRS_MAX:
+        raise InputError(
+            f"{n_stops:,} stops and {n_marks:,} marks are {n_stops * n_marks:,} pairs; a request "
+            f"takes {_PAIRS_MAX:,}. Evaluate parts of the field, or use `spheremark plan evaluate`."
+        )
 
 
 def evaluate_field(plan: Plan, n_across: int, cache: VisibilityCache) -> Plain:
@@ -109,13 +132,24 @@ def evaluate_field(plan: Plan, n_across: int, cache: VisibilityCache) -> Plain:
     x0, y0, x1, y1 = plan.ground.view
     step = max(x1 - x0, y1 - y0) / n_across
     xs, ys = (np.arange(a + step / 2, b, step) for a, b in ((x0, x1), (y0, y1)))
+    n_lines = max(1, _PAIRS_MAX // (max(1, len(plan.marks.names)) * len(xs)))
+    parts = [
+        _part_of_map(plan, xs, ys[first : first + n_lines], cache)
+        for first in range(0, len(ys), n_lines)
+    ]
+    layers = ("ys", "sigma_3d", "probability", "n_seen")
+    joined = {name: np.concatenate([getattr(one, name) for one in parts]) for name in layers}
+    return map_json(replace(parts[0], **joined))
+
+
+def _part_of_map(plan: Plan, xs: Array, ys: Array, cache: VisibilityCache) -> FieldMap:
+    """Return some lines of a map."""
     site = plan.ground.site
     stations, _ = placement.map_stations(site, xs, ys)
     visibility = cache.find(plan.ground, stations, plan.marks)
-    return map_json(
-        placement.field_map(
-            site, xs, ys, plan.marks, plan.model, plan.requirement, visibility=visibility
-        )
+    checkpoint()
+    return placement.field_map(
+        site, xs, ys, plan.marks, plan.model, plan.requirement, visibility=visibility
     )
 
 

@@ -33,6 +33,7 @@ from spheremark.pipelines.placement import (
     site_of_field,
     stops_of_field,
 )
+from spheremark.pipelines.progress import checkpoint
 from spheremark.pipelines.simulation import scenario
 from spheremark.service.planning.centre_models import model_of_surveys
 from spheremark.storage.catalogue import plans as kept
@@ -52,6 +53,7 @@ _GROUNDS_KEPT = 6
 _MODELS_KEPT = 8
 _NEWEST = "SELECT max(finished_at) AS finished_at, count(*) AS n FROM runs"
 _COLUMNS_KEPT = 400  # marks; of a map of 64 x 64 places each takes 130 kB
+_PAIRS_AT_ONCE = 100_000  # of places and marks, between two checks whether to go on
 _ROUND_IT = 3.0  # [m] shown around the outermost marks
 _SEED_DIGITS = 18  # a seed of more digits is a mistake
 _POLE_MOST = 100.0  # [m] above the ground, beyond which the height of a mark is a mistake
@@ -219,14 +221,16 @@ class VisibilityCache:
         with self._lock:
             known = {key: self._known[key] for key in keys if key in self._known}
         new = [k for k, key in enumerate(keys) if key not in known]
-        if new or not keys:
-            fresh = find_visibility(
-                ground.site, stations_site, marks.rows(np.array(new, dtype=np.intp))
-            )
-            if not keys:
-                return fresh
-            known |= {keys[k]: fresh.rows(np.array([i])) for i, k in enumerate(new)}
-            self._remember({keys[k]: known[keys[k]] for k in new})
+        if not keys:
+            return find_visibility(ground.site, stations_site, marks)
+        at_once = max(1, _PAIRS_AT_ONCE // len(stations_site))
+        for first in range(0, len(new), at_once):
+            checkpoint()
+            some = new[first : first + at_once]
+            chosen = marks.rows(np.array(some, dtype=np.intp))
+            fresh = find_visibility(ground.site, stations_site, chosen)
+            known |= {keys[k]: fresh.rows(np.array([i])) for i, k in enumerate(some)}
+            self._remember({keys[k]: known[keys[k]] for k in some})
         return Visibility.joined([known[key] for key in keys])
 
     def _remember(self, fresh: dict[tuple[str, bytes, bytes], Visibility]) -> None:

@@ -106,6 +106,11 @@ class Database:
     ) -> None:
         self.close()
 
+    @property
+    def is_usable(self) -> bool:
+        """Whether no write has made the database invalid since it was opened."""
+        return self._failure is None
+
     def close(self) -> None:
         """Close the file."""
         with self._lock:

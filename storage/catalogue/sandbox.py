@@ -23,12 +23,13 @@ import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from time import perf_counter
+from time import monotonic, perf_counter
 from typing import Any, ClassVar
 
 import duckdb
 
 from spheremark.pipelines.errors import InputError, SpheremarkError
+from spheremark.pipelines.progress import checkpoint
 from spheremark.storage.confinement import enter_folder, leave_network, limit_resources
 
 _WHOLE_TYPES = ("TINYINT", "SMALLINT", "INTEGER", "BIGINT")
@@ -40,6 +41,7 @@ _INSTANT_FORMAT = "%Y-%m-%dT%H:%M:%S.%f"
 _HEADROOM = 1 << 30  # [bytes] of addresses for Python and DuckDB themselves, beyond the limit
 _MESSAGE_MAX = 600  # characters of DuckDB's own message
 _START_MAX = 20.0  # [s] until a process may have started on a machine that is busy
+_LOOK_EVERY = 0.5  # [s] whether the caller still waits
 _KINDS = ("SELECT", "EXPLAIN")
 
 logger = logging.getLogger(__name__)
@@ -200,13 +202,10 @@ def _in_child(request: str, limits: QueryLimits) -> dict[str, Any]:
         text=True,
     ) as child:
         try:
-            text, trace = child.communicate(request, timeout=limits.seconds + _START_MAX)
-        except subprocess.TimeoutExpired as error:
+            text, trace = _communicate(child, request, limits.seconds + _START_MAX)
+        except BaseException:
             child.kill()
-            raise QueryTimeoutError(
-                f"The query did not begin within {_START_MAX:g} s: the machine is too busy. "
-                "Try again later."
-            ) from error
+            raise
     if child.returncode == -signal.SIGALRM:
         raise QueryTimeoutError(
             f"The query was ended after {limits.seconds:g} s, its time limit. "
@@ -220,6 +219,23 @@ def _in_child(request: str, limits: QueryLimits) -> dict[str, Any]:
         raise SpheremarkError("The process of the query failed; the service's log has the reason.")
     response: dict[str, Any] = json.loads(text)
     return response
+
+
+def _communicate(child: subprocess.Popen[str], request: str, seconds: float) -> tuple[str, str]:
+    """Send a request to a child and return what it writes; end where its caller does."""
+    deadline = monotonic() + seconds
+    given: str | None = request
+    while True:
+        checkpoint()
+        try:
+            return child.communicate(given, timeout=_LOOK_EVERY)
+        except subprocess.TimeoutExpired as error:
+            given = None
+            if monotonic() > deadline:
+                raise QueryTimeoutError(
+                    f"The query did not begin within {_START_MAX:g} s: the machine is too busy. "
+                    "Try again later."
+                ) from error
 
 
 def _too_much_memory(limit: int) -> str:

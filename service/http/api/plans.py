@@ -81,20 +81,27 @@ def get_site(site: SiteKey, service: Current) -> PlanSite:
 
 
 @router.post("/plans/evaluate", name="evaluate_plan", response_model=MappedEvaluation)
-def evaluate_plan(
+async def evaluate_plan(
     plan: EvaluationRequest,
     request: Request,
     service: Current,
     origin: Annotated[str | None, Query(description=ORIGIN)] = None,
 ) -> Response:
     """Predict the accuracy of every stop, as JSON, CSV, DXF, LandXML or GeoJSON, and on a map."""
+    accept = request.headers.get("accept", "")
+    return await service.plans.run(request, _evaluated, service, plan, accept, origin)
+
+
+def _evaluated(
+    service: Service, plan: EvaluationRequest, accept: str, origin: str | None
+) -> Response:
+    """Return an evaluation in the format that is accepted."""
     place = GeographicOrigin.parse(origin) if origin else None
     assembled = _assembled(service, plan)
     found = plans.evaluate(assembled, service.planner.visibility)
     if plan.field_cells:
         cache = service.planner.visibility
         found["field"] = plans.evaluate_field(assembled, plan.field_cells, cache)
-    accept = request.headers.get("accept", "")
     if accept.startswith("text/csv"):
         return PlainTextResponse(to_csv(found), media_type="text/csv")
     for kind, media_type in POINT_MEDIA.items():
@@ -105,24 +112,37 @@ def evaluate_plan(
 
 
 @router.post("/plans/optimise", name="optimise_plan")
-def optimise_plan(plan: OptimisationRequest, service: Current) -> OptimisedPlan:
+async def optimise_plan(
+    plan: OptimisationRequest, request: Request, service: Current
+) -> OptimisedPlan:
     """Find the best places for a number of marks, or the fewest that keep the tolerance."""
     goal = Goal(n_marks=plan.n_marks, is_robust=plan.is_robust)
-    found = plans.optimise(_assembled(service, plan), plan.rules.to_rules(), goal)
-    return OptimisedPlan.model_validate(found)
+
+    def optimised() -> Plain:
+        return plans.optimise(_assembled(service, plan), plan.rules.to_rules(), goal)
+
+    return OptimisedPlan.model_validate(await service.plans.run(request, optimised))
 
 
 @router.post("/plans/suggest", name="suggest_mark")
-def suggest_mark(plan: SuggestionRequest, service: Current) -> SuggestedMark:
+async def suggest_mark(
+    plan: SuggestionRequest, request: Request, service: Current
+) -> SuggestedMark:
     """Return the one more mark that would help most."""
-    found = plans.suggest(_assembled(service, plan), plan.rules.to_rules())
-    return SuggestedMark.model_validate(found)
+
+    def suggested() -> Plain:
+        return plans.suggest(_assembled(service, plan), plan.rules.to_rules())
+
+    return SuggestedMark.model_validate(await service.plans.run(request, suggested))
 
 
 @router.post("/plans/random", name="try_at_random")
-def simulate_random_plans(options: RandomPlansRequest, service: Current) -> RandomPlansResult:
+async def simulate_random_plans(
+    options: RandomPlansRequest, request: Request, service: Current
+) -> RandomPlansResult:
     """Simulate random arrangements as in the study: an error on every centre, pass or fail."""
-    return RandomPlansResult.model_validate(simulated(service, options))
+    found = await service.plans.run(request, simulated, service, options)
+    return RandomPlansResult.model_validate(found)
 
 
 def simulated(service: Service, options: RandomPlansRequest) -> Plain:
@@ -144,12 +164,20 @@ def simulated(service: Service, options: RandomPlansRequest) -> Plain:
 
 
 @router.post("/plans", name="keep_plan", status_code=201)
-def store_plan(plan: NewPlan, service: Current, response: Response) -> StoredPlan:
+async def store_plan(
+    plan: NewPlan, request: Request, service: Current, response: Response
+) -> StoredPlan:
     """Store a plan: its predictions become rows of placements."""
+    stored_plan = await service.plans.run(request, _store, service, plan)
+    response.headers["Location"] = f"/api/v1/plans/{stored_plan.placement_id}"
+    return stored_plan
+
+
+def _store(service: Service, plan: NewPlan) -> StoredPlan:
+    """Evaluate a plan and store it."""
     survey = service.catalogue.get_survey(plan.survey).survey_id if plan.survey else None
     found = plans.evaluate(_assembled(service, plan), service.planner.visibility)
     placement_id = stored.keep_plan(service.catalogue, _to_store(plan, survey, found))
-    response.headers["Location"] = f"/api/v1/plans/{placement_id}"
     return StoredPlan.model_validate(stored.get_plan(service.catalogue, placement_id))
 
 
@@ -182,7 +210,7 @@ async def upload_terrain(
     check_ending(name)
     most = service.settings.max_upload_bytes
     async with service.terrains.received(request.stream(), most) as received:
-        return await service.readers.run(_enter_terrain, service, received, name)
+        return await service.readers.run(request, _enter_terrain, service, received, name)
 
 
 def _enter_terrain(service: Service, received: Received, name: str) -> Key:
@@ -212,13 +240,15 @@ def _assembled(service: Service, plan: PlanRequest) -> Plan:
     stops = ground.stops
     if plan.stops is not None:
         stops = stops_at(site, [(one.name, one.x_m, one.y_m) for one in plan.stops])
-    return Plan(
+    assembled = Plan(
         ground=replace(ground, site=site),
         stops=stops,
         marks=marks_at(site, [_place(one) for one in plan.marks]),
         model=service.planner.model(plan.model, plan.to_sensor(), site.marker_radius),
         requirement=Requirement(tolerance=plan.tolerance_m, method=plan.method),
     )
+    plans.require_small(assembled)
+    return assembled
 
 
 def _place(mark: RequestedMark) -> Place:

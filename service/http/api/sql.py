@@ -40,9 +40,9 @@ class PointFile(StrEnum):
     response_model=QueryResponse,
     responses={200: {"content": {"text/csv": {}}}},
 )
-def query(body: Query, request: Request, service: Current) -> Any:
+async def query(body: Query, request: Request, service: Current) -> Any:
     """Run one SELECT on a snapshot of the database, as JSON or CSV, within announced limits."""
-    return _run(service, body, request.headers.get("accept", ""))
+    return await service.queries.run(request, _run, service, body, _accepted(request))
 
 
 @router.get(
@@ -51,13 +51,13 @@ def query(body: Query, request: Request, service: Current) -> Any:
     response_model=QueryResponse,
     responses={200: {"content": {"text/csv": {}}}},
 )
-def query_by_link(
+async def query_by_link(
     q: Annotated[str, QueryParameter(min_length=1, max_length=8000, description="One SELECT.")],
     request: Request,
     service: Current,
 ) -> Any:
     """Run one SELECT that is part of the address: every query is a link."""
-    return _run(service, Query(sql=q), request.headers.get("accept", ""))
+    return await service.queries.run(request, _run, service, Query(sql=q), _accepted(request))
 
 
 @router.get("/sql/schema", name="get_schema")
@@ -111,6 +111,11 @@ def export_points(
     place = GeographicOrigin.parse(origin) if origin else None
     text = format_points(named_points(service.catalogue, survey), f".{kind}", place)
     return Response(text, media_type=POINT_MEDIA[kind])
+
+
+def _accepted(request: Request) -> str:
+    """Return what the client accepts."""
+    return request.headers.get("accept", "")
 
 
 def _run(service: Service, request: Query, accept: str) -> QueryResponse | Response:
