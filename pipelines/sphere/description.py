@@ -137,7 +137,9 @@ def limb_coverage(directions: Array, passed: Array, radius: float) -> float:
     first /= np.linalg.norm(first)
     x, y = first @ passed, cross @ first @ passed
     octants = 4 * (y < 0.0) + 2 * (x < 0.0) + (np.abs(y) > np.abs(x))
-    return len(np.unique(octants[x * x + y * y > (_MIDDLE * radius) ** 2])) / 8.0
+    is_seen = np.zeros(8, dtype=np.bool_)
+    is_seen[octants[x * x + y * y > (_MIDDLE * radius) ** 2]] = True
+    return float(is_seen.mean())
 
 
 def incidence(offsets: Array, radius: float) -> float:

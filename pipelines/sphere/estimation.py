@@ -14,7 +14,7 @@ import numpy as np
 
 from spheremark.pipelines.estimation.linear_algebra import inverse
 from spheremark.pipelines.model import Array, Mask, Optics
-from spheremark.pipelines.sphere.limb import Edge, edge_of, limb_normals, prior_edge
+from spheremark.pipelines.sphere.limb import Edge, edge_of, limb_normals
 from spheremark.pipelines.sphere.linearisation import Linear, linearise
 from spheremark.pipelines.sphere.mounting import N_MOUNTING, effects_on
 from spheremark.pipelines.sphere.noise import Noise, Weighed, weigh
@@ -32,11 +32,10 @@ from spheremark.pipelines.sphere.returns import Returns, may_be_sphere, moved_fa
 _EFFICIENCY = 0.9753  # variance of the estimate over the inverse normal matrix
 _SIGMA_BIAS_MIN = 1e-5  # [m] of the laser biases: keeps their prior invertible
 _SIGMA_MIN = 1e-9  # of the other shared unknowns: likewise
-_N_STEPS = 8
-_N_STEPS_GATED = 5  # after these the choice of returns by their place is fixed
+_N_STEPS = 7
+_N_STEPS_GATED = 4  # after these the choice of returns by their place is fixed
 _N_STEPS_RANGES = 3  # without the limb
-_N_STEPS_ROBUST = 2  # after these the noise is that of the weighted residuals
-_N_STEPS_SOFT = 3  # before the edge at the limb is estimated
+_N_STEPS_ROBUST = 3  # after these the noise is that of the weighted residuals
 _N_OPTICS = 4  # spheres, whose common radius is another unknown beside three of the optics
 _OPTICS_MAX = 15.1  # sum of squares over prior sigmas that optics exceed once in 100 scans
 _ROUGH = 0.1  # radii: standard deviation per axis of a rough centre
@@ -149,33 +148,33 @@ class Estimate(NamedTuple):
 def estimate(
     returns: Returns, rough: Array, prior: Prior, observe: Observe | None, *, uses_limb: bool
 ) -> Estimate:
-    """Estimate all centres, the laser biases and the mounting, from rough centres, (m, 3)."""
+    """Estimate all centres, laser biases, optics and mounting, from rough centres, (m, 3)."""
     state, radius = _start(rough, prior), prior.radius
     is_used = np.ones(len(returns.ranges), dtype=bool)
-    edge, factors = prior_edge(radius), np.zeros((len(returns.ranges), 2))
+    factors = np.zeros((len(returns.ranges), 2))
     for step in range(_N_STEPS):
-        linear = _linear(returns, state, is_used, radius)
+        corrected = _corrected(returns, state)
+        linear = linearise(corrected, *_spheres(state, radius), is_used)
         if step < _N_STEPS_GATED:
             is_used = may_be_sphere(returns, linear.offsets, _margins(state, radius), radius)
-        now = _weighed(returns, state, linear, radius, is_used)
-        state = now.state._replace(has_shared=step >= _N_STEPS_GATED)
-        if step < _N_STEPS_ROBUST:
-            state = state._replace(noise=None)
-        residuals, sigmas, weights, _ = now.weighed
+        noise = state.noise if step >= _N_STEPS_ROBUST else None
+        weighed = _weighed(corrected, state, linear, (radius, noise, is_used))
+        state = state._replace(noise=weighed.noise, has_shared=step >= _N_STEPS_GATED)
+        residuals, sigmas, weights, _ = weighed
         J = (linear.J[:3], derivatives(returns, linear))
         N = normals_of(returns, J, residuals, weights / sigmas**2, len(state.biases))
-        seen = with_widths(returns, state.optics)
-        if uses_limb and step >= _N_STEPS_SOFT:
-            edge = edge_of(seen, linear, weights, radius)
         if uses_limb and step >= _N_STEPS_RANGES:
-            factors = _add_limb(N, seen, now, edge, factors)
+            edge = edge_of(corrected, linear, weights, radius)
+            factors = _add_limb(N, corrected, Estimate(state, linear, weighed), edge, factors)
         if observe is not None and step >= _N_STEPS_RANGES:
             centres, rhs = observe(state.centres, state.covs)
             N.centres[:, :, :3] += centres
             N.centres[:, :, -1] += rhs
         state = _stepped(state, N, prior)
-    linear = _linear(returns, state, is_used, radius)
-    return _weighed(returns, state, linear, radius, is_used)
+    corrected = _corrected(returns, state)
+    linear = linearise(corrected, *_spheres(state, radius), is_used)
+    weighed = _weighed(corrected, state, linear, (radius, state.noise, is_used))
+    return Estimate(state._replace(noise=weighed.noise), linear, weighed)
 
 
 def _start(rough: Array, prior: Prior) -> State:
@@ -211,11 +210,6 @@ def _spheres(state: State, radius: float) -> tuple[Array, Array]:
     return spheres, covs
 
 
-def _linear(returns: Returns, state: State, is_used: Mask, radius: float) -> Linear:
-    """Return predicted ranges, linearised over the uncertainty of the centres."""
-    return linearise(_corrected(returns, state), *_spheres(state, radius), is_used)
-
-
 def _margins(state: State, radius: float) -> Array:
     """Return how far a footprint may lie outside each sphere and still be its own [m]."""
     sigma = np.sqrt(np.trace(state.cov_noise, axis1=1, axis2=2))
@@ -223,12 +217,11 @@ def _margins(state: State, radius: float) -> Array:
 
 
 def _weighed(
-    returns: Returns, state: State, linear: Linear, radius: float, is_used: Mask
-) -> Estimate:
-    """Return a state with its residuals, and the noise that they show."""
-    ranges = _corrected(returns, state).ranges - state.optics[2] * linear.J_optics[1]
-    weighed = weigh(returns._replace(ranges=ranges), linear, radius, state.noise, is_used)
-    return Estimate(state._replace(noise=weighed.noise), linear, weighed)
+    corrected: Returns, state: State, linear: Linear, known: tuple[float, Noise | None, Mask]
+) -> Weighed:
+    """Return residuals with weights, for radius, noise and used returns that are known."""
+    ranges = corrected.ranges - state.optics[N_ESTIMATED - 1] * linear.J_optics[1]
+    return weigh(corrected._replace(ranges=ranges), linear, *known)
 
 
 def _add_limb(N: Normals, returns: Returns, now: Estimate, edge: Edge, factors: Array) -> Array:

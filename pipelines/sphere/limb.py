@@ -73,11 +73,6 @@ class LimbNormals(NamedTuple):
     factors: Array
 
 
-def prior_edge(radius: float) -> Edge:
-    """Return the edge that is assumed before returns are counted: one sigma softer than likely."""
-    return Edge(radius, np.full(2, _EDGE), np.full(2, _SOFTNESS * math.exp(_SPREAD)))
-
-
 def edge_of(returns: Returns, linear: Linear, weights: Array, radius: float) -> Edge:
     """Estimate how returns end at the limb of the spheres of a stop.
 

@@ -55,12 +55,11 @@ def normals_of(
     m, lasers, by_optics = len(returns.starts) - 1, returns.lasers, J[1]
     cells = n_lasers * returns.markers + lasers
     columns, weighted = np.vstack([*J, residuals]), weights * J[0]
-
-    def rows(weighted: Array) -> Array:
-        """Return the rows of the centres from weighted derivatives, (3, n)."""
-        own = sums_of_products(returns.starts, weighted, columns)
-        mixed = [np.bincount(cells, row, m * n_lasers).reshape(m, n_lasers) for row in weighted]
-        return np.concatenate([own[:, :, :3], np.stack(mixed, axis=1), own[:, :, 3:]], axis=2)
+    both = np.vstack([weighted, returns.vertical[0] * weighted])  # all alike, and by face
+    own = sums_of_products(returns.starts, both, columns)
+    mixed = np.array([np.bincount(cells, row, m * n_lasers) for row in both])
+    mixed = mixed.reshape(6, m, n_lasers).transpose(1, 0, 2)
+    rows = np.concatenate([own[:, :, :3], mixed, own[:, :, 3:]], axis=2)
 
     others = weights * np.vstack([by_optics, residuals])
     crossed = np.array([np.bincount(lasers, row, n_lasers) for row in others])  # (q + 1, k)
@@ -69,7 +68,7 @@ def normals_of(
     shared[:n_lasers, :n_lasers] = np.diag(np.bincount(lasers, weights, n_lasers))
     shared[:n_lasers, n_lasers:], shared[n_lasers:, :n_lasers] = crossed.T, crossed[:q]
     shared[n_lasers:, n_lasers:] = others[:q] @ np.vstack([by_optics, residuals]).T
-    return Normals(rows(weighted), rows(returns.vertical[0] * weighted), shared)
+    return Normals(rows[:, :3], rows[:, 3:], shared)
 
 
 def reduce(N: Normals, effects: Array, precisions: Array, rhs_prior: Array) -> Reduced:

@@ -10,7 +10,7 @@ from __future__ import annotations
 import numpy as np
 
 from spheremark.pipelines.config import FittingConfig
-from spheremark.pipelines.model import OPTICS, Array
+from spheremark.pipelines.model import OPTICS, Array, Rig
 from spheremark.pipelines.model.network import RANGE_BIAS, RANGE_SCALE
 from spheremark.pipelines.sphere.linearisation import Linear
 from spheremark.pipelines.sphere.returns import Returns
@@ -33,14 +33,18 @@ _WINDOW = np.array(
 _NARROWEST = 0.02  # of the specified half widths: a ray
 
 
-def prior_sigmas(config: FittingConfig) -> Array:
-    """Return the prior standard deviations of ``UNKNOWNS``."""
+def prior_sigmas(config: FittingConfig, rig: Rig) -> Array:
+    """Return the prior standard deviations of ``UNKNOWNS``.
+
+    A calibration removes what lasers differ by, and leaves what they have in common.
+    """
+    spread = float(np.std(rig.laser_range_biases)) / config.sigma_range_bias
     return np.array(
         [
             config.sigma_beam_width,
             config.sigma_beam_window,
             config.sigma_echo_cosine,
-            config.sigma_range_common,
+            config.sigma_range_common * max(1.0, spread),
             config.sigma_range_scale,
         ]
     )

@@ -115,7 +115,7 @@ def _fit(
     prior = Prior(
         radius,
         sigma_biases,
-        prior_sigmas(config),
+        prior_sigmas(config, cloud.rig),
         sigmas_of(config.sigma_mounting, config.sigma_offset),
     )
     rough = np.array([c.p_base_rough for c in found.candidates])
