@@ -14,7 +14,7 @@ from spheremark.pipelines.config import ExtractionConfig, StitchingConfig
 from spheremark.pipelines.detection import extract
 from spheremark.pipelines.evaluation.experiment import Column, Experiment, Plain, Table
 from spheremark.pipelines.geometry import inverse, transform
-from spheremark.pipelines.model import Array, MarkerCandidates, StitchedCloud
+from spheremark.pipelines.model import Array, MarkerCandidates
 from spheremark.pipelines.scan.stitching import stitch
 from spheremark.pipelines.simulation import SimulationConfig, scenario, simulate_stop
 from spheremark.pipelines.simulation.rig import nominal_rig
@@ -38,7 +38,6 @@ CLASSES = (
 )
 """Classes of markers by returns and visible share."""
 
-_ON = 0.07  # [m] of depth: within this of a marker's surface a return is one of its own
 _NEAR_DECOY = 0.3  # [m] from a decoy within which a rejection is about it
 _MEASURED = re.compile(r"\d+(\.\d+)?")  # figures, in which equal reasons differ
 _N_REASONS = 3  # the most frequent reasons that a table shows
@@ -142,8 +141,10 @@ def _score(world: tuple[str, int, str], *, config: SimulationConfig) -> _Score:
     is_false = ~is_near.any(axis=1)
     charged = _nearest(decoys, rough[is_false])
     markers = [
-        _Thing(_class_of(_n_on(cloud, p, field.marker_radius), share), True, bool(hit), p)
-        for p, share, hit in zip(marks, shares, is_near.any(axis=0), strict=True)
+        _Thing(_class_of(n, share), True, bool(hit), p)
+        for p, (n, _), share, hit in zip(
+            marks, simulated.counts, shares, is_near.any(axis=0), strict=True
+        )
     ]
     others = [
         _Thing(decoy.kind, False, i in charged, decoys[i]) for i, decoy in enumerate(field.decoys)
@@ -162,22 +163,11 @@ def _nearest(decoys: Array, places: Array) -> set[int]:
     return {int(np.argmin(np.linalg.norm(decoys - place, axis=1))) for place in places}
 
 
-def _n_on(cloud: StitchedCloud, centre: Array, radius: float) -> int:
-    """Return how many returns lie on a marker."""
-    near = np.linalg.norm(cloud.p_base - centre, axis=1) < 2.0 * radius
-    points = cloud.p_base[near].astype(np.float64)
-    ranges = np.linalg.norm(points, axis=1)
-    along = points @ centre / ranges
-    inside2 = radius**2 - (centre @ centre - along**2)
-    expected = along - np.sqrt(np.maximum(inside2, 0.0))
-    return int(np.sum((inside2 > 0.0) & (np.abs(ranges - expected) < _ON)))
-
-
-def _class_of(n_on: int, share: float) -> str:
+def _class_of(n: int, share: float) -> str:
     """Return the class of a marker by its returns and its visible share."""
-    if share < HALF or n_on < N_FEW:
+    if share < HALF or n < N_FEW:
         return CLASSES[2]
-    return CLASSES[0] if n_on >= N_MANY else CLASSES[1]
+    return CLASSES[0] if n >= N_MANY else CLASSES[1]
 
 
 def reason_near(found: MarkerCandidates, place: Array) -> str:

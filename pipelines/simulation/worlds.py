@@ -67,7 +67,7 @@ PRIORS: Mapping[str, Prior] = {
     "window": Prior((0.0, 0.5), (0.0, 1.0), False, _OPTICS, "beam there, of 12.7 x 9.5 mm"),
     "gate": Prior((0.1, 1.0), (0.05, 1.2), True, _OPTICS, "surfaces in one echo [m]"),
     "range_bias": Prior((0.001, 0.003), (0.002, 0.015), True, _OPTICS, "its sigma, in common [m]"),
-    "range_scale": Prior((1e-5, 1e-4), (1e-4, 1e-3), True, _OPTICS, "its sigma"),
+    "range_scale": Prior((1e-6, 5e-5), (1e-5, 3e-4), True, _OPTICS, "its sigma"),
     "shade": Prior((0.3, 0.8), (0.1, 0.9), False, _OPTICS, "reflectivity of the markers"),
     "sigma_laser_bias": Prior((0.001, 0.004), (0.002, 0.012), True, _RIG, "between lasers [m]"),
     "sigma_misalignment": Prior((1e-4, 5e-4), (5e-4, 4.4e-3), True, _RIG, "to 0.25 deg [rad]"),

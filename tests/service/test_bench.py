@@ -191,3 +191,31 @@ def test_growth_is_printed_with_its_lines():
     text = out.export_text()
     assert "24 x 20" in text
     assert "CPU of adjustment with 20 marks in a straight line: 200.0 ms and 5.00 ms" in text
+
+
+def test_peers_find_a_sphere_in_the_open_and_say_where():
+    rng = np.random.default_rng(4)
+    centre, radius = np.array([5.0, 1.0, 0.2]), 0.1
+    away = rng.standard_normal((600, 3))
+    away /= np.linalg.norm(away, axis=1, keepdims=True)
+    ball = centre + radius * away[away @ centre < 0.0]
+    ground = np.column_stack([rng.uniform(2.0, 9.0, (20_000, 2)), np.full(20_000, -1.0)])
+    cloud = np.concatenate([ground, ball]) + rng.normal(0.0, 0.003, (20_000 + len(ball), 3))
+    found = peers.spheres_of_peers(cloud, radius)
+    assert set(found) == set(peers.PEERS)
+    for centres in found.values():
+        assert centres.shape == (1, 3)
+        assert np.linalg.norm(centres[0] - centre) < 0.03
+
+
+def test_random_worlds_are_measured_and_kept_with_their_tables(tmp_path, monkeypatch):
+    monkeypatch.setenv("SPHEREMARK_DATA", str(tmp_path))
+    command = ["bench", "--worlds", "1", "--first-seed", "22", "--quick", "--json"]
+    done = CliRunner().invoke(app, command)
+    assert done.exit_code == 0, done.stderr
+    found = json.loads(done.stdout)
+    assert [one["family"] for one in found["families"]] == ["radius"]
+    kept = json.loads((tmp_path / "worlds.json").read_text())
+    assert kept["markers"] == found["markers"]
+    assert len(kept["tables"]) == 5
+    assert (tmp_path / "worlds-families.csv").read_text().startswith("family,")
