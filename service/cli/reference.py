@@ -93,9 +93,10 @@ def _priors() -> Iterator[str]:
     yield (
         "\n`simulate --world random` and `bench --worlds` draw these evenly between the bounds, or "
         "evenly in the logarithm (log).\nFamilies, in turn with every other seed: "
-        f"{', '.join(FAMILIES)}.\nBesides: an even, Gaussian or two-lobed footprint; the strongest, first "
-        "or last echo; with or without the cosine of\nincidence; ranges with constant noise or by "
-        "reflectivity; no divergence in 15 % of the wide worlds of optics.\n"
+        f"{', '.join(FAMILIES)}.\n"
+        "Besides: an even, Gaussian or two-lobed footprint; the strongest, first or last echo; "
+        "with or without the cosine of\nincidence; constant noise or noise by reflectivity; no "
+        "divergence in 15 % of the worlds where optics are wide.\n"
     )
     yield "| quantity | meaning | usual | wide | wide in |\n|---|---|---|---|---|"
     for name, prior in PRIORS.items():
