@@ -21,6 +21,7 @@ from spheremark.service.cli.bench import bench, reproduce
 from spheremark.service.cli.plan import plan
 from spheremark.service.cli.reading import LogFiles, OneLog, reads_logs
 from spheremark.service.cli.site import site
+from spheremark.service.cli.spheres import spheres
 from spheremark.service.cli.survey import (
     Axes,
     ControlAxes,
@@ -277,6 +278,7 @@ def process(
         _print_json(results[0] if len(results) == 1 else results)
 
 
+app.command()(spheres)
 app.command()(adjust)
 app.command()(calibrate)
 app.command()(site)

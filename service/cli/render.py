@@ -71,6 +71,19 @@ def print_log(out: Console, result: Plain) -> None:
         _print_distances(out, stop["distances"])
 
 
+def print_spheres(out: Console, result: Plain) -> None:
+    """Print the spheres in the cloud of a single scan."""
+    out.print(f"[bold]{escape(result['file'])}[/]: {result['n_points']:,} points")
+    if result["spheres"]:
+        out.print(_markers(result["spheres"]))
+    else:
+        out.print(f"  No sphere of {result['radius_m']} m. Is --station where the scanner stood?")
+    for one in (*result["spheres"], *result["rejected"]):
+        if one["reason"]:
+            place = ", ".join(f"{value:.3f}" for value in one["centre_m"])
+            out.print(f"  {place}: {escape(one['reason'])}", highlight=False, soft_wrap=True)
+
+
 def _print_distances(out: Console, distances: Plain | None) -> None:
     """Print how the distances between marks compare with the control."""
     if distances is None or not distances["n"]:

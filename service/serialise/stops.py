@@ -6,6 +6,7 @@ A public interface: names, frames and signs as in CONVENTIONS.md; what is unknow
 from __future__ import annotations
 
 import math
+from collections.abc import Iterable
 from typing import Literal
 
 import numpy as np
@@ -50,6 +51,15 @@ def serialise_log(
     }
 
 
+def serialise_spheres(fits: MarkerFits) -> Plain:
+    """Return the spheres in the cloud of a single scan."""
+    R = np.eye(3)
+    return {
+        "spheres": [_marker(fit, R, 0.0) for fit in fits.fits],
+        "rejected": _rejected([fits], R),
+    }
+
+
 def _stop(log: ProcessedLog, stop: StopResult, frame: Frame, truth: Truth | None) -> Plain:
     """Return all results of one stop."""
     cloud, errors = stop.cloud, log.errors.get(stop.name)
@@ -69,7 +79,7 @@ def _stop(log: ProcessedLog, stop: StopResult, frame: Frame, truth: Truth | None
         "name": stop.name,
         "frame": frame,
         "markers": markers,
-        "rejected": _rejected(stop, R_frame_base),
+        "rejected": _rejected(stop.fits.values(), R_frame_base),
         "station": first if "position_m" in first else None,
         "stations": stations,
         "distances": _distances(stop, log.marks),
@@ -123,10 +133,10 @@ def _marker(fit: MarkerFit, R_frame_base: Array, sigma_heading: float) -> Plain:
     }
 
 
-def _rejected(stop: StopResult, R_frame_base: Array) -> list[Plain]:
+def _rejected(found: Iterable[MarkerFits], R_frame_base: Array) -> list[Plain]:
     """Return the rejected groups of returns, each once."""
     groups: dict[tuple[object, ...], Plain] = {}
-    for fits in stop.fits.values():
+    for fits in found:
         for rejection in fits.rejected:
             centre = numbers(R_frame_base @ rejection.p_base)
             group = {

@@ -33,7 +33,7 @@ Pieces = Iterator[Array]
 
 def read_las(file: IO[bytes], *, name: str, cells_max: int) -> dict[str, Array]:
     """Return the grid of a LAS or LAZ file: ``xs``, ``ys``, ``ground`` and ``surface``."""
-    _check_las(file, name)
+    check_las(file, name)
     with laspy.open(file, closefd=False, laz_backend=laspy.LazBackend.Lazrs) as las:
         header = las.header
         low, high = np.array(header.mins[:2]), np.array(header.maxs[:2])
@@ -72,7 +72,7 @@ def read_parquet(file: IO[bytes], *, name: str, cells_max: int) -> dict[str, Arr
     return _gridded(pieces(), *_extent(pieces()), name, cells_max)
 
 
-def _check_las(file: IO[bytes], name: str) -> None:
+def check_las(file: IO[bytes], name: str) -> None:
     """Refuse a header (ASPRS LAS 1.4, table 3) whose counts or scales cannot be."""
     size, head = size_of(file), file.read(375)
     file.seek(0)
