@@ -36,24 +36,13 @@ SMALLEST_COUNT = 100
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class PublishedCentres:
-    """Errors of sphere centres as a table of the study gives them.
+    """Errors of sphere centres as a table of the study gives them."""
 
-    Attributes
-    ----------
-    ranges : (n,)
-        Distances from the LiDAR to the centres [m].
-    n_points : (n,)
-        Numbers of returns.
-    errors : (n, 3)
-        Errors along the axes of the study's own frame, which it does not define [m].
-    errors_3d : (n,)
-        Lengths of the errors as printed [m].
-    """
-
-    ranges: Array
-    n_points: Array
+    ranges: Array  # (n,) distances from the LiDAR to the centres [m]
+    n_points: Array  # (n,) numbers of returns
+    # (n, 3) errors along the axes of the study's own frame, which it does not define [m]
     errors: Array
-    errors_3d: Array
+    errors_3d: Array  # (n,) lengths of the errors as printed [m]
 
     def __post_init__(self) -> None:
         seal(self, ranges=(None,), n_points=(None,), errors=(None, 3), errors_3d=(None,))
@@ -91,18 +80,10 @@ TABLE_2 = PublishedCentres(
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class PublishedStations:
-    """Errors of the station by included angle as the study's Table 3 gives them.
+    """Errors of the station by included angle as the study's Table 3 gives them."""
 
-    Attributes
-    ----------
-    included_angles : (n,)
-        Between its two markers, seen from the station [rad].
-    errors : (n,)
-        Error of the station [m].
-    """
-
-    included_angles: Array
-    errors: Array
+    included_angles: Array  # (n,) between its two markers, seen from the station [rad]
+    errors: Array  # (n,) error of the station [m]
 
     def __post_init__(self) -> None:
         seal(self, included_angles=(None,), errors=(None,))

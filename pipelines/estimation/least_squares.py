@@ -37,20 +37,11 @@ class Observations:
     """A group of k blocks of m observations each, at some state of the p unknowns.
 
     Leading dimensions, where there are any, are independent problems of the same shape.
-
-    Attributes
-    ----------
-    residuals : (..., k, m)
-        Observed minus computed.
-    J : (..., k, m, p)
-        Derivative of the residuals by a small change of the unknowns.
-    cov : (..., k, m, m)
-        Covariance of each block.
     """
 
-    residuals: Array
-    J: Array
-    cov: Array
+    residuals: Array  # (..., k, m) observed minus computed
+    J: Array  # (..., k, m, p) derivative of the residuals by a small change of the unknowns
+    cov: Array  # (..., k, m, m) covariance of each block
 
 
 Groups = tuple[Observations, ...]
@@ -60,21 +51,11 @@ Move = Callable[[Array, Array], Array]
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class Solution:
-    """Where the weighted sum of squares is least.
+    """Where the weighted sum of squares is least."""
 
-    Attributes
-    ----------
-    estimate : array
-        The unknowns.
-    cov : (p, p)
-        Covariance of a small change of the estimate.
-    groups : tuple of Observations
-        The observations at the estimate.
-    """
-
-    estimate: Array
-    cov: Array
-    groups: Groups
+    estimate: Array  # the unknowns
+    cov: Array  # (p, p) covariance of a small change of the estimate
+    groups: Groups  # the observations at the estimate
 
     @property
     def vtpv(self) -> float:
@@ -87,70 +68,34 @@ class Solution:
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class Solutions:
-    """Solutions of independent problems.
+    """Solutions of independent problems."""
 
-    Attributes
-    ----------
-    estimates : (s, ...)
-        The unknowns of each problem.
-    covs : (s, p, p)
-        Covariances of small changes; NaN where the unknowns are undetermined.
-    is_settled : (s,)
-        Whether the steps became small.
-    """
-
-    estimates: Array
-    covs: Array
-    is_settled: Mask
+    estimates: Array  # (s, ...) the unknowns of each problem
+    covs: Array  # (s, p, p) covariances of small changes; NaN where the unknowns are undetermined
+    is_settled: Mask  # (s,) whether the steps became small
 
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class Adjustment:
-    """An estimate with the statistics of its blocks, in the order of the groups.
+    """An estimate with the statistics of its blocks, in the order of the groups."""
 
-    Attributes
-    ----------
-    estimate : array
-        The unknowns.
-    cov : (p, p)
-        Covariance of a small change of the estimate, by the a-priori sigmas.
-    groups : tuple of Observations
-        The observations at the estimate.
-    statistics : tuple of BlockStatistics
-        Tests of the blocks of each group.
-    dof : int
-        Degrees of freedom: observations minus unknowns.
-    vtpv : float
-        Weighted sum of squares of the residuals.
-    sigma0 : float
-        Square root of the a-posteriori variance factor; NaN without redundancy.
-    passes_global_test : bool
-        Whether ``vtpv`` is no larger than the sigmas promise, at the level of the test.
-    redundancies : (b,)
-        Redundancy of each block's observations together.
-    w_statistics : (b,)
-        Largest absolute w-statistic among each block's observations; NaN where not testable.
-    detectable_biases : (b,)
-        Minimal detectable bias along each block's weakest axis; infinite if none is.
-    noncentrality : float
-        Square root of Baarda's lambda0: how many sigmas a bias must move w to be found.
-    critical_w : float
-        Largest w that good data have, at the level of the test.
-    """
-
-    estimate: Array
-    cov: Array
-    groups: Groups
-    statistics: tuple[BlockStatistics, ...]
-    dof: int
-    vtpv: float
-    sigma0: float
+    estimate: Array  # the unknowns
+    cov: Array  # (p, p) covariance of a small change of the estimate, by the a-priori sigmas
+    groups: Groups  # the observations at the estimate
+    statistics: tuple[BlockStatistics, ...]  # tests of the blocks of each group
+    dof: int  # degrees of freedom: observations minus unknowns
+    vtpv: float  # weighted sum of squares of the residuals
+    sigma0: float  # square root of the a-posteriori variance factor; NaN without redundancy
+    # whether ``vtpv`` is no larger than the sigmas promise, at the level of the test
     passes_global_test: bool
-    redundancies: Array
+    redundancies: Array  # (b,) redundancy of each block's observations together
+    # (b,) largest absolute w-statistic among each block's observations; NaN where not testable
     w_statistics: Array
+    # (b,) minimal detectable bias along each block's weakest axis; infinite if none is
     detectable_biases: Array
+    # square root of Baarda's lambda0: how many sigmas a bias must move w to be found
     noncentrality: float
-    critical_w: float
+    critical_w: float  # largest w that good data have, at the level of the test
 
     def external_reliabilities(self, J_of_interest: Array) -> Array:
         """Return how far a bias that stays unseen can move something of interest.

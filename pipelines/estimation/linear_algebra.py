@@ -163,27 +163,14 @@ def invert_each(N: Array) -> tuple[Array, Mask]:
 
 
 class Reduced(NamedTuple):
-    """Normal equations of common unknowns, those of local ones eliminated.
+    """Normal equations of common unknowns, those of local ones eliminated."""
 
-    Attributes
-    ----------
-    N : (q, q)
-        Normal matrix of the common unknowns: the Schur complement.
-    rhs : (q,)
-        Right-hand side.
-    own : (s, a, a)
-        Covariance of each set of local unknowns if the common ones were known.
-    gains : (s, a, q)
-        By how much a unit of each common unknown moves the local ones, with the sign turned.
-    steps : (s, a)
-        Solution of the local unknowns if the common ones stay where they are.
-    """
-
-    N: Array
-    rhs: Array
-    own: Array
+    N: Array  # (q, q) normal matrix of the common unknowns: the Schur complement
+    rhs: Array  # (q,) right-hand side
+    own: Array  # (s, a, a) covariance of each set of local unknowns if the common ones were known
+    # (s, a, q) by how much a unit of each common unknown moves the local ones, with the sign turned
     gains: Array
-    steps: Array
+    steps: Array  # (s, a) solution of the local unknowns if the common ones stay where they are
 
     def local_steps(self, common: Array) -> Array:
         """Return the solution, (s, a), of the local unknowns for one of the common ones."""

@@ -20,24 +20,13 @@ UNTESTABLE = 1e-7
 
 
 class BlockStatistics(NamedTuple):
-    """Statistics of blocks of m observations each.
+    """Statistics of blocks of m observations each."""
 
-    Attributes
-    ----------
-    redundancies : (...)
-        Redundancy of each block's observations together.
-    w : (...)
-        Largest absolute w-statistic among each block's observations; NaN where not testable.
-    testability : (..., m, m)
-        ``P Q_v P``.
-    weakest : (...)
-        Its smallest eigenvalue; 0 where a bias in some direction cannot show.
-    """
-
-    redundancies: Array
+    redundancies: Array  # (...) redundancy of each block's observations together
+    # (...) largest absolute w-statistic among each block's observations; NaN where not testable
     w: Array
-    testability: Array
-    weakest: Array
+    testability: Array  # (..., m, m) ``P Q_v P``
+    weakest: Array  # (...) its smallest eigenvalue; 0 where a bias in some direction cannot show
 
     def detectable_biases(self, noncentrality: float) -> Array:
         """Return the minimal detectable bias along each block's weakest axis, or infinity."""

@@ -31,38 +31,23 @@ _GRAZING = 0.1  # ... and as much again where beams graze at this sine: they see
 
 
 class Grid(NamedTuple):
-    """Sums over stops; rows run north, columns east, sub-cells four times as fine.
+    """Sums over stops; rows run north, columns east, sub-cells four times as fine."""
 
-    Attributes
-    ----------
-    corner : (2,)
-        South-western corner [m].
-    weights : (4r, 4c) float64
-        Sum of the weights of stops.
-    moments : (4r, 4c, 3) float64
-        Weighted sums of x and y from the corner and of height [m].
-    noises : (4r, 4c) float64
-        Sum of squared weight over returns: times the variance of one return, that of the sum.
-    counts : (4r, 4c) int32
-        Returns.
-    beams : (r, c, 6) float64
-        Weighted sums of the products of the beams' directions: xx, xy, xz, yy, yz, zz.
-    shares : (r, c) float64
-        Sums of the weights.
-    poses : (r, c, 6) float64
-        Sums of squared weight times the covariance that the pose of a station gives to a point.
-    distances : (r, c) float64
-        Weighted sums of the squared distances from the stations [m^2].
-    """
-
-    corner: Array
-    weights: Array
-    moments: Array
+    corner: Array  # (2,) south-western corner [m]
+    weights: Array  # (4r, 4c) float64 sum of the weights of stops
+    moments: Array  # (4r, 4c, 3) float64 weighted sums of x and y from the corner and of height [m]
+    # (4r, 4c) float64 sum of squared weight over returns: times the variance of one return, that of
+    # the sum
     noises: Array
-    counts: NDArray[np.int32]
+    counts: NDArray[np.int32]  # (4r, 4c) int32 returns
+    # (r, c, 6) float64 weighted sums of the products of the beams' directions: xx, xy, xz, yy, yz,
+    # zz
     beams: Array
-    shares: Array
+    shares: Array  # (r, c) float64 sums of the weights
+    # (r, c, 6) float64 sums of squared weight times the covariance that the pose of a station gives
+    # to a point
     poses: Array
+    # (r, c) float64 weighted sums of the squared distances from the stations [m^2]
     distances: Array
 
 

@@ -23,32 +23,15 @@ from spheremark.pipelines.model import (
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class StationPoints:
-    """Returns of one stop in the station frame, with its pose in the site.
+    """Returns of one stop in the station frame, with its pose in the site."""
 
-    Attributes
-    ----------
-    name : str
-        Name of the stop.
-    T_site_station : (4, 4)
-        Its pose [m].
-    p_station : (n, 3) float32
-        Returns [m].
-    intensities : (n,) float32
-        Calibrated reflectivity, 0-255.
-    rings : (n,) uint8
-        Laser of each return.
-    times : (n,) float32
-        Instant of each return since the first of the stop [s].
-    start_ns : int
-        Instant of that first one by the clock of the log [ns]; 0 where it is not known.
-    """
-
-    name: str
-    T_site_station: Array
-    p_station: Column
-    intensities: Column
-    rings: Rings
-    times: Column
+    name: str  # name of the stop
+    T_site_station: Array  # (4, 4) its pose [m]
+    p_station: Column  # (n, 3) float32 returns [m]
+    intensities: Column  # (n,) float32 calibrated reflectivity, 0-255
+    rings: Rings  # (n,) uint8 laser of each return
+    times: Column  # (n,) float32 instant of each return since the first of the stop [s]
+    # instant of that first one by the clock of the log [ns]; 0 where it is not known
     start_ns: int = 0
 
     def __post_init__(self) -> None:

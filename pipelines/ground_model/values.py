@@ -65,20 +65,11 @@ class ElevationConfig:
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class StationPose:
-    """Pose of a stop in the site.
+    """Pose of a stop in the site."""
 
-    Attributes
-    ----------
-    name : str
-        Name of the stop.
-    T_site_station : (4, 4)
-        Pose of the levelled frame [m].
-    cov_T_site_station : (6, 6)
-        Covariance of a small motion (rotation [rad], translation [m]) on the left.
-    """
-
-    name: str
-    T_site_station: Array
+    name: str  # name of the stop
+    T_site_station: Array  # (4, 4) pose of the levelled frame [m]
+    # (6, 6) covariance of a small motion (rotation [rad], translation [m]) on the left
     cov_T_site_station: Array
 
     def __post_init__(self) -> None:
@@ -115,30 +106,16 @@ def pose_of_fix(name: str, fix: StationFix) -> StationPose:
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class ElevationModel:
-    """Mean height of the ground in each cell of a grid, with its standard deviation.
+    """Mean height of the ground in each cell of a grid, with its standard deviation."""
 
-    Attributes
-    ----------
-    corner : (2,)
-        South-western corner of the first cell, x and y in the site frame [m].
-    cell : float
-        Edge of a cell [m].
-    heights : (rows, columns) float32
-        Mean height of the ground; NaN where none was seen; rows run north [m].
-    sigmas : (rows, columns) float32
-        Standard deviation of that height; NaN likewise [m].
-    counts : (rows, columns) int32
-        Returns that carry it; 0 where it is interpolated or missing.
-    is_filled : (rows, columns) bool
-        Whether it is interpolated from cells around.
-    """
-
-    corner: Array
-    cell: float
+    corner: Array  # (2,) south-western corner of the first cell, x and y in the site frame [m]
+    cell: float  # edge of a cell [m]
+    # (rows, columns) float32 mean height of the ground; NaN where none was seen; rows run north [m]
     heights: Column
-    sigmas: Column
+    sigmas: Column  # (rows, columns) float32 standard deviation of that height; NaN likewise [m]
+    # (rows, columns) int32 returns that carry it; 0 where it is interpolated or missing
     counts: NDArray[np.int32]
-    is_filled: Mask
+    is_filled: Mask  # (rows, columns) bool whether it is interpolated from cells around
 
     def __post_init__(self) -> None:
         shape = self.heights.shape

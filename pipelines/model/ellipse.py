@@ -14,19 +14,11 @@ _TO_95 = float(np.sqrt(-2.0 * np.log(0.05)))  # from the standard ellipse to the
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ErrorEllipse:
-    """The standard error ellipse of a position in the plane.
+    """The standard error ellipse of a position in the plane."""
 
-    Attributes
-    ----------
-    major, minor : float
-        Semi-axes [m].
-    bearing : float
-        Bearing of the major axis, clockwise from y, 0 to pi [rad].
-    """
-
-    major: float
+    major: float  # semi-axes [m]
     minor: float
-    bearing: float
+    bearing: float  # bearing of the major axis, clockwise from y, 0 to pi [rad]
 
     @classmethod
     def of(cls, cov: Array) -> Self:

@@ -20,24 +20,14 @@ class Status(StrEnum):
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class MarkerCandidate:
-    """A group of returns that may be a marker.
+    """A group of returns that may be a marker."""
 
-    Attributes
-    ----------
-    name : str
-        Name of the marker at this stop, the same for every method.
-    members : (n,)
-        Rows of the stitched cloud, ascending: the sphere, and the part of its pole that touches it.
-    p_base_rough : (3,)
-        Rough centre, good to a few centimetres [m].
-    score : float
-        0 (hardly a sphere) to 1 (all tests passed with ease).
-    """
-
-    name: str
+    name: str  # name of the marker at this stop, the same for every method
+    # (n,) rows of the stitched cloud, ascending: the sphere, and the part of its pole that touches
+    # it
     members: Index
-    p_base_rough: Array
-    score: float
+    p_base_rough: Array  # (3,) rough centre, good to a few centimetres [m]
+    score: float  # 0 (hardly a sphere) to 1 (all tests passed with ease)
 
     def __post_init__(self) -> None:
         seal(self, members=(None,), p_base_rough=(3,))
@@ -61,21 +51,11 @@ def marker_name(place: int) -> str:
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class Rejection:
-    """A group of returns that was examined and is not used as a marker.
+    """A group of returns that was examined and is not used as a marker."""
 
-    Attributes
-    ----------
-    p_base : (3,)
-        Where it is [m].
-    n_points : int
-        Number of its returns.
-    reason : str
-        Why it was rejected, as a sentence.
-    """
-
-    p_base: Array
-    n_points: int
-    reason: str
+    p_base: Array  # (3,) where it is [m]
+    n_points: int  # number of its returns
+    reason: str  # why it was rejected, as a sentence
 
     def __post_init__(self) -> None:
         seal(self, p_base=(3,))
@@ -83,21 +63,13 @@ class Rejection:
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class MarkerCandidates:
-    """The groups of one stitched cloud that may be markers, and those that were rejected.
+    """The groups of one stitched cloud that may be markers, and those that were rejected."""
 
-    Attributes
-    ----------
-    candidates : tuple of MarkerCandidate
-        Groups that may be markers.
-    rejected : tuple of Rejection
-        Groups that passed the first test, with the reason against them.
-    ground_height_max : float
-        Height of the highest ground point near the station in the levelled frame, the level of the
-        published method's cut [m]; minus infinity when no ground was seen.
-    """
-
-    candidates: tuple[MarkerCandidate, ...]
+    candidates: tuple[MarkerCandidate, ...]  # groups that may be markers
+    # groups that passed the first test, with the reason against them
     rejected: tuple[Rejection, ...]
+    # height of the highest ground point near the station in the levelled frame, the level of the
+    # published method's cut [m]; minus infinity when no ground was seen
     ground_height_max: float
 
 

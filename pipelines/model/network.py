@@ -23,64 +23,32 @@ HEIGHT_BIAS = "common_height_bias"
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class Refusal:
-    """A station that is not in the network.
+    """A station that is not in the network."""
 
-    Attributes
-    ----------
-    station : str
-        Its name.
-    code : str
-        Stable code of the error.
-    reason : str
-        Why, as a sentence for people.
-    """
-
-    station: str
-    code: str
-    reason: str
+    station: str  # its name
+    code: str  # stable code of the error
+    reason: str  # why, as a sentence for people
 
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class LeftOut:
-    """An observation that is not used.
+    """An observation that is not used."""
 
-    Attributes
-    ----------
-    kind : str
-        ``centre``, ``gravity`` or ``control``.
-    station : str
-        Whose observation; empty for a control mark.
-    marker : str
-        What the marker is called at the station; empty where it is no centre.
-    mark : str
-        Name of the mark; empty where none is known.
-    reason : str
-        Why, as a sentence for people.
-    """
-
-    kind: str
-    station: str
-    marker: str
-    mark: str
-    reason: str
+    kind: str  # ``centre``, ``gravity`` or ``control``
+    station: str  # whose observation; empty for a control mark
+    marker: str  # what the marker is called at the station; empty where it is no centre
+    mark: str  # name of the mark; empty where none is known
+    reason: str  # why, as a sentence for people
 
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class Shared:
-    """Systematic errors common to all stations, which no single centre reveals.
+    """Systematic errors common to all stations, which no single centre reveals."""
 
-    Attributes
-    ----------
-    names : tuple of str
-        ``RANGE_BIAS``, ``RANGE_SCALE``, ``HEIGHT_BIAS``, optics, or parameters of the rig.
-    derivatives : (n, 3, k)
-        Of each observed centre, in base, by each of them.
-    prior_weights : (k, k)
-        Weights about zero: the inverse of a covariance, singular where nothing is known.
-    """
-
+    # ``RANGE_BIAS``, ``RANGE_SCALE``, ``HEIGHT_BIAS``, optics, or parameters of the rig
     names: tuple[str, ...]
-    derivatives: Array
+    derivatives: Array  # (n, 3, k) of each observed centre, in base, by each of them
+    # (k, k) weights about zero: the inverse of a covariance, singular where nothing is known
     prior_weights: Array
 
     def __post_init__(self) -> None:
@@ -272,23 +240,15 @@ class Network:
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class BlockTests:
-    """Statistics of blocks of observations, one row per block.
+    """Statistics of blocks of observations, one row per block."""
 
-    Attributes
-    ----------
-    residuals : (b, k)
-        Observed minus computed, in the site frame [m], or of the up direction [rad].
-    redundancies : (b,)
-        Redundancy of the block's observations together; NaN where it is not used.
-    w_statistics : (b,)
-        Largest absolute w-statistic of the block; NaN where not testable or not used.
-    detectable_biases : (b,)
-        Minimal detectable bias along the weakest axis; infinite if none is, NaN if not used.
-    """
-
+    # (b, k) observed minus computed, in the site frame [m], or of the up direction [rad]
     residuals: Array
+    # (b,) redundancy of the block's observations together; NaN where it is not used
     redundancies: Array
+    # (b,) largest absolute w-statistic of the block; NaN where not testable or not used
     w_statistics: Array
+    # (b,) minimal detectable bias along the weakest axis; infinite if none is, NaN if not used
     detectable_biases: Array
 
     def __post_init__(self) -> None:
@@ -299,21 +259,14 @@ class BlockTests:
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class Parts:
-    """What the joint covariance of stations, marks and shared unknowns is made of.
+    """What the joint covariance of stations, marks and shared unknowns is made of."""
 
-    Attributes
-    ----------
-    own : (s, 6, 6)
-        Covariance of each station's motion if marks and shared unknowns were known.
-    coupling : (s, 6, 3m + k)
-        How much a station moves, with the sign turned, when marks and shared unknowns move.
-    cov_common : (3m + k, 3m + k)
-        Covariance of marks and shared unknowns.
-    """
-
+    # (s, 6, 6) covariance of each station's motion if marks and shared unknowns were known
     own: Array
+    # (s, 6, 3m + k) how much a station moves, with the sign turned, when marks and shared unknowns
+    # move
     coupling: Array
-    cov_common: Array
+    cov_common: Array  # (3m + k, 3m + k) covariance of marks and shared unknowns
 
     def __post_init__(self) -> None:
         s, u = len(self.own), len(self.cov_common)
@@ -321,27 +274,14 @@ class Parts:
 
 
 class Repeat(NamedTuple):
-    """Two stations at one place, each with its own centres alone.
+    """Two stations at one place, each with its own centres alone."""
 
-    Attributes
-    ----------
-    stations : (2,)
-        Places among the stations.
-    apart : (3,)
-        How far the second stands from the first, after the adjustment [m].
-    n_marks : int
-        Marks that both saw.
-    rms : float
-        Root mean square 3-D difference of the centres, laid on each other by a rigid motion [m].
-    predicted_rms : float
-        What their covariances promise [m].
-    """
-
-    stations: tuple[int, int]
-    apart: Array
-    n_marks: int
+    stations: tuple[int, int]  # (2,) places among the stations
+    apart: Array  # (3,) how far the second stands from the first, after the adjustment [m]
+    n_marks: int  # marks that both saw
+    # root mean square 3-D difference of the centres, laid on each other by a rigid motion [m]
     rms: float
-    predicted_rms: float
+    predicted_rms: float  # what their covariances promise [m]
 
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)

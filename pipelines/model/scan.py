@@ -31,18 +31,10 @@ class ImuMount(StrEnum):
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class Origin:
-    """Where a recording came from.
+    """Where a recording came from."""
 
-    Attributes
-    ----------
-    name : str
-        Stem of the log's file name.
-    digest : str
-        SHA-256 of the file's bytes, in hexadecimal; empty when the log never was a file.
-    """
-
-    name: str
-    digest: str
+    name: str  # stem of the log's file name
+    digest: str  # SHA-256 of the file's bytes, in hexadecimal; empty when the log never was a file
 
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
@@ -180,25 +172,16 @@ class ScanLog:
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class Firings:
-    """All pulses of a VLP-16 as its packets hold them, with and without a return.
+    """All pulses of a VLP-16 as its packets hold them, with and without a return."""
 
-    Attributes
-    ----------
-    azimuths : (n,) uint16
-        Azimuth of the first pulse of each block of two firings, in hundredths of a degree,
-        clockwise from x seen from +z.
-    distances : (n, 32) uint16
-        Distance of each pulse in units of 2 mm, in the order of firing; 0 without a return.
-    reflectivities : (n, 32) uint8
-        Calibrated reflectivity of each pulse; 0 without a return.
-    start_ns : int
-        Instant of the first pulse; blocks follow each other without a pause.
-    """
-
+    # (n,) uint16 azimuth of the first pulse of each block of two firings, in hundredths of a
+    # degree, clockwise from x seen from +z
     azimuths: NDArray[np.uint16]
+    # (n, 32) uint16 distance of each pulse in units of 2 mm, in the order of firing; 0 for none
     distances: NDArray[np.uint16]
+    # (n, 32) uint8 calibrated reflectivity of each pulse; 0 without a return
     reflectivities: NDArray[np.uint8]
-    start_ns: int
+    start_ns: int  # instant of the first pulse; blocks follow each other without a pause
 
     def __post_init__(self) -> None:
         n = len(self.azimuths)
@@ -207,54 +190,30 @@ class Firings:
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class Levelling:
-    """How the base leans by the AHRS, and the heading error that all centres of a stop share.
+    """How the base leans by the AHRS, and the heading error that all centres of a stop share."""
 
-    Attributes
-    ----------
-    roll, pitch : float
-        Angles of ``R_station_base = Ry(pitch) Rx(roll)`` [rad].
-    sigma : float
-        Standard deviation of each of the two angles [rad].
-    is_measured : bool
-        False when no AHRS was recorded and the base is only assumed to be about level.
-    sigma_heading : float
-        Standard deviation of the heading, from mounting and encoder [rad].
-    """
-
-    roll: float
+    roll: float  # angles of ``R_station_base = Ry(pitch) Rx(roll)`` [rad]
     pitch: float
-    sigma: float
+    sigma: float  # standard deviation of each of the two angles [rad]
+    # false when no AHRS was recorded and the base is only assumed to be about level
     is_measured: bool
-    sigma_heading: float = 0.0
+    sigma_heading: float = 0.0  # standard deviation of the heading, from mounting and encoder [rad]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Timed:
     """A column that changes evenly between samples: computed for the rows that are read.
 
-    Attributes
-    ----------
-    stamps_ns : (n,)
-        Instant of each row.
-    samples_ns : (m,)
-        Instants of the samples, increasing; no row is before the first.
-    values : (m,)
-        Values at the samples.
-    rates : (m,)
-        Change from each sample on [1/ns].
-    is_angle : bool
-        Whether to reduce to [-pi, pi) [rad].
-
     Notes
     -----
     Of millions of rows a few thousand are needed; ``column[:]`` gives all of them.
     """
 
-    stamps_ns: Nanos
-    samples_ns: Nanos
-    values: Array
-    rates: Array
-    is_angle: bool = False
+    stamps_ns: Nanos  # (n,) instant of each row
+    samples_ns: Nanos  # (m,) instants of the samples, increasing; no row is before the first
+    values: Array  # (m,) values at the samples
+    rates: Array  # (m,) change from each sample on [1/ns]
+    is_angle: bool = False  # whether to reduce to [-pi, pi) [rad]
 
     def __post_init__(self) -> None:
         seal(self, stamps_ns=(None,), samples_ns=(None,), values=(None,), rates=(None,))
@@ -340,35 +299,17 @@ class StitchedCloud:
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class Beams:
-    """The beams of some returns of a stitched cloud, as lines in the base frame.
+    """The beams of some returns of a stitched cloud, as lines in the base frame."""
 
-    Attributes
-    ----------
-    origins_base : (n, 3)
-        Where each beam leaves the spin axis of the LiDAR [m].
-    directions_base : (n, 3)
-        Unit vectors from origin to return.
-    ranges : (n,)
-        Distance from origin to return [m].
-    across_base : (n, 3)
-        Unit vectors across the beam, along the sweep of the LiDAR: the footprint's first axis.
-    rings : (n,) uint8
-        Laser of each beam.
-    intensities : (n,)
-        Calibrated reflectivity, 0-255.
-    times : (n,)
-        Instant of each pulse since the first one of the stop [s].
-    divergence : (2,)
-        Full width of the footprint along ``across_base`` and square to it [rad].
-    """
-
-    origins_base: Array
-    directions_base: Array
-    ranges: Array
+    origins_base: Array  # (n, 3) where each beam leaves the spin axis of the LiDAR [m]
+    directions_base: Array  # (n, 3) unit vectors from origin to return
+    ranges: Array  # (n,) distance from origin to return [m]
+    # (n, 3) unit vectors across the beam, along the sweep of the LiDAR: the footprint's first axis
     across_base: Array
-    rings: Rings
-    intensities: Array
-    times: Array
+    rings: Rings  # (n,) uint8 laser of each beam
+    intensities: Array  # (n,) calibrated reflectivity, 0-255
+    times: Array  # (n,) instant of each pulse since the first one of the stop [s]
+    # (2,) full width of the footprint along ``across_base`` and square to it [rad]
     divergence: Array
 
     def __post_init__(self) -> None:

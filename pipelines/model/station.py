@@ -38,18 +38,10 @@ class ControlMarks:
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class Exclusion:
-    """A marker that a fix left out.
+    """A marker that a fix left out."""
 
-    Attributes
-    ----------
-    fit : int
-        Its place among the fits.
-    reason : str
-        Why, as a sentence for people.
-    """
-
-    fit: int
-    reason: str
+    fit: int  # its place among the fits
+    reason: str  # why, as a sentence for people
 
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
@@ -165,34 +157,17 @@ class StationFix:
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class SubsetFixes:
-    """The station positioned from every k of its marks alone, one row per subset.
+    """The station positioned from every k of its marks alone, one row per subset."""
 
-    Attributes
-    ----------
-    method : str
-        Name of the resection method.
-    marks : (n, k)
-        Places of the marks among the control marks; k is 2 for pairs, 3 for triples.
-    included_angles : (n, 2)
-        Smallest and largest 3-D angle at the station between two of the centres; equal for pairs
-        [rad].
-    included_angles_horizontal : (n, 2)
-        The same in the levelled plane [rad].
-    p_site : (n, 3)
-        Position of the station [m].
-    sigma_horizontal : (n,)
-        Square root of the trace of the covariance of x and y [m].
-    sigma_3d : (n,)
-        Square root of the trace of the position's covariance [m].
-    """
-
-    method: str
+    method: str  # name of the resection method
+    # (n, k) places of the marks among the control marks; k is 2 for pairs, 3 for triples
     marks: Index
+    # (n, 2) smallest and largest 3-D angle at the station between two centres [rad]
     included_angles: Array
-    included_angles_horizontal: Array
-    p_site: Array
-    sigma_horizontal: Array
-    sigma_3d: Array
+    included_angles_horizontal: Array  # (n, 2) the same in the levelled plane [rad]
+    p_site: Array  # (n, 3) position of the station [m]
+    sigma_horizontal: Array  # (n,) square root of the trace of the covariance of x and y [m]
+    sigma_3d: Array  # (n,) square root of the trace of the position's covariance [m]
 
     def __post_init__(self) -> None:
         angles: dict[str, Shape] = dict.fromkeys(
@@ -205,54 +180,28 @@ class SubsetFixes:
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class NoFix:
-    """A station that could not be positioned by one method.
+    """A station that could not be positioned by one method."""
 
-    Attributes
-    ----------
-    method : str
-        Name of the resection method.
-    code : str
-        Stable code of the error.
-    reason : str
-        Why, as a sentence for people.
-    """
-
-    method: str
-    code: str
-    reason: str
+    method: str  # name of the resection method
+    code: str  # stable code of the error
+    reason: str  # why, as a sentence for people
 
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class DistanceChecks:
-    """Distances between the marks of one scan, as measured against as given, one row per pair.
+    """Distances between the marks of one scan, as measured against as given, one row per pair."""
 
-    Attributes
-    ----------
-    fits : (n, 2)
-        Places of the two among the fits.
-    marks : (n, 2)
-        Places of the two among the control marks.
-    measured, given : (n,)
-        Distance between the centres, and between the control marks [m].
-    sigmas : (n,)
-        Standard deviation of their difference [m].
-    is_off : (n,) bool
-        Whether they differ by more than the tolerance, or by more than 3.29 sigma.
-    suspects : tuple of int
-        Places among the control marks of those without which no distance would be off, or that most
-        of the distances that are off share.
-    reason : str
-        Why nothing could be compared; empty when it was.
-    """
-
-    fits: Index
-    marks: Index
-    measured: Array
+    fits: Index  # (n, 2) places of the two among the fits
+    marks: Index  # (n, 2) places of the two among the control marks
+    measured: Array  # (n,) distance between the centres, and between the control marks [m]
     given: Array
-    sigmas: Array
+    sigmas: Array  # (n,) standard deviation of their difference [m]
+    # (n,) bool whether they differ by more than the tolerance, or by more than 3.29 sigma
     is_off: Mask
+    # places among the control marks of those without which no distance would be off, or that most
+    # of the distances that are off share
     suspects: tuple[int, ...]
-    reason: str = ""
+    reason: str = ""  # why nothing could be compared; empty when it was
 
     def __post_init__(self) -> None:
         n = len(self.fits)
@@ -277,24 +226,16 @@ class DistanceChecks:
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class Omissions:
-    """A station without each of its markers, one row per used marker, in the order of its matches.
+    """A station without each of its markers, one row per match."""
 
-    Attributes
-    ----------
-    shifts_site : (n, 3)
-        Position of the station without the marker, minus its position with all; NaN, as all else of
-        the row, where the other marks stand on one plumb line and determine no heading, or
-        contradict each other and determine no position [m].
-    predictions_site : (n, 3)
-        Where the scan puts the mark when the others alone position the station, minus where it is
-        given [m].
-    cov_predictions_site : (n, 3, 3)
-        Covariances of these differences [m^2].
-    """
-
+    # (n, 3) position of the station without the marker, minus its position with all; NaN, as all
+    # else of the row, where the other marks stand on one plumb line and determine no heading, or
+    # contradict each other and determine no position [m]
     shifts_site: Array
+    # (n, 3) where the scan puts the mark when the others alone position the station, minus where it
+    # is given [m]
     predictions_site: Array
-    cov_predictions_site: Array
+    cov_predictions_site: Array  # (n, 3, 3) covariances of these differences [m^2]
 
     def __post_init__(self) -> None:
         n = len(self.shifts_site)
@@ -369,18 +310,10 @@ class StopResult:
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class StopTruth:
-    """What a simulated stop really was: for comparison only, never an input of the pipeline.
+    """What a simulated stop really was: for comparison only, never an input of the pipeline."""
 
-    Attributes
-    ----------
-    name : str
-        Name of the stop.
-    T_site_base : (4, 4)
-        True pose of the base frame [m].
-    """
-
-    name: str
-    T_site_base: Array
+    name: str  # name of the stop
+    T_site_base: Array  # (4, 4) true pose of the base frame [m]
 
     def __post_init__(self) -> None:
         seal(self, T_site_base=(4, 4))
@@ -388,21 +321,10 @@ class StopTruth:
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class Truth:
-    """The truth of a survey: for comparison only, never an input of the pipeline.
+    """The truth of a survey: for comparison only, never an input of the pipeline."""
 
-    Attributes
-    ----------
-    marks : ControlMarks
-        True centres, with zero covariance.
-    stops : tuple of StopTruth
-        True poses.
-    rig : Rig or None
-        True rig, when known.
-    about : mapping
-        Seed, scenario and the like, for people.
-    """
-
-    marks: ControlMarks
-    stops: tuple[StopTruth, ...]
-    rig: Rig | None
+    marks: ControlMarks  # true centres, with zero covariance
+    stops: tuple[StopTruth, ...]  # true poses
+    rig: Rig | None  # true rig, when known
+    # seed, scenario and the like, for people
     about: Mapping[str, Any] = field(default_factory=dict)

@@ -63,21 +63,11 @@ class PlaceRules:
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class Candidates:
-    """Places where a mark may stand, several heights at each.
+    """Places where a mark may stand, several heights at each."""
 
-    Attributes
-    ----------
-    p_site : (c, 3)
-        Centres of spheres [m].
-    ground : (c,)
-        Height of the ground below each [m].
-    apart : float
-        Least distance between two marks [m].
-    """
-
-    p_site: Array
-    ground: Array
-    apart: float
+    p_site: Array  # (c, 3) centres of spheres [m]
+    ground: Array  # (c,) height of the ground below each [m]
+    apart: float  # least distance between two marks [m]
 
     def __post_init__(self) -> None:
         seal(self, p_site=(None, 3), ground=(len(self.p_site),))

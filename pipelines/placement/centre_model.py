@@ -39,63 +39,33 @@ _LOST_MAX = 0.05  # share of places between the lines where a sphere may be miss
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class Provenance:
-    """Where a model's numbers come from.
+    """Where a model's numbers come from."""
 
-    Attributes
-    ----------
-    source : str
-        ``sensor``, or ``fitted``.
-    n_rows, n_stops : int
-        Fits and stops that it rests on; 0 for the sensor model.
-    surveys : tuple of str
-        Names of the surveys that they are from.
-    fit_method : str
-        Fitting method that they are from; empty for the sensor model.
-    newest : str
-        When the newest of them was made, ISO 8601; empty likewise.
-    note : str
-        What a user should know, for people.
-    """
-
-    source: str
-    n_rows: int = 0
+    source: str  # ``sensor``, or ``fitted``
+    n_rows: int = 0  # fits and stops that it rests on; 0 for the sensor model
     n_stops: int = 0
-    surveys: tuple[str, ...] = ()
-    fit_method: str = ""
-    newest: str = ""
-    note: str = ""
+    surveys: tuple[str, ...] = ()  # names of the surveys that they are from
+    fit_method: str = ""  # fitting method that they are from; empty for the sensor model
+    newest: str = ""  # when the newest of them was made, ISO 8601; empty likewise
+    note: str = ""  # what a user should know, for people
 
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class CentreModel:
-    """How many returns a sphere will have, and the covariance of its centre.
+    """How many returns a sphere will have, and the covariance of its centre."""
 
-    Attributes
-    ----------
-    sensor : Sensor
-        The sensor and how it is driven.
-    marker_radius : float
-        Radius of the spheres [m].
-    log_factors : (7,)
-        Logarithms of variance over the sensor model's: of the three ``AXES`` at the reference, and
-        the powers of the four ``TERMS``.
-    cov_log_factors : (7, 7)
-        Their covariance.
-    log_count : (2,)
-        Logarithm of returns over the sensor model's, and its standard deviation.
-    at : (4,)
-        The terms' values where a mark will stand less those at the reference, in logarithms; the
-        first two are replaced by those of each mark.
-    provenance : Provenance
-        Where the numbers come from.
-    """
-
-    sensor: Sensor
-    marker_radius: float
+    sensor: Sensor  # the sensor and how it is driven
+    marker_radius: float  # radius of the spheres [m]
+    # (7,) logarithms of variance over the sensor model's: of the three ``AXES`` at the reference,
+    # and the powers of the four ``TERMS``
     log_factors: Array
-    cov_log_factors: Array
+    cov_log_factors: Array  # (7, 7) their covariance
+    # (2,) logarithm of returns over the sensor model's, and its standard deviation
     log_count: Array
+    # (4,) the terms' values where a mark will stand less those at the reference, in logarithms; the
+    # first two are replaced by those of each mark
     at: Array
+    # where the numbers come from
     provenance: Provenance = field(default_factory=lambda: Provenance(source="sensor"))
 
     def __post_init__(self) -> None:
@@ -125,24 +95,13 @@ class CentreModel:
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class Centres:
-    """Prediction of each mark's centre from each station.
+    """Prediction of each mark's centre from each station."""
 
-    Attributes
-    ----------
-    shares : (s, n)
-        Share of the returns of a wholly visible sphere, 0 to 1.
-    n_points : (s, n)
-        Expected returns.
-    lost : (s, n)
-        Probability that lines pass the sphere by; 1 where a surface touches it.
-    cov_site : (s, n, 3, 3)
-        Covariance of the centre by the noise of its returns, in the axes of the site; infinite on
-        the diagonal where nothing is seen [m^2].
-    """
-
-    shares: Array
-    n_points: Array
-    lost: Array
+    shares: Array  # (s, n) share of the returns of a wholly visible sphere, 0 to 1
+    n_points: Array  # (s, n) expected returns
+    lost: Array  # (s, n) probability that lines pass the sphere by; 1 where a surface touches it
+    # (s, n, 3, 3) covariance of the centre by the noise of its returns, in the axes of the site;
+    # infinite on the diagonal where nothing is seen [m^2]
     cov_site: Array
 
 

@@ -43,47 +43,23 @@ _N_STEPS = 12
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class FitRows:
-    """Fits of surveys, one row per centre.
+    """Fits of surveys, one row per centre."""
 
-    Attributes
-    ----------
-    ranges : (n,)
-        Distances [m].
-    n_points : (n,)
-        Returns that carry each.
-    incidences : (n,)
-        Mean angles of incidence; NaN where not known [rad].
-    intensities : (n,)
-        Mean reflectivity, 0 to 255; NaN where not known.
-    variances : (n, 3)
-        Stated variances towards, left and up, without that of the heading [m^2].
-    turns : (n,)
-        Times of the turns that saw them [s].
-    stops : (n,)
-        Number of the stop that each is from.
-    dof, sigma0 : (n,)
-        Degrees of freedom and square root of the variance factor of that stop's position; NaN where
-        there is none.
-    surveys : tuple of str
-        Names of the surveys.
-    fit_method : str
-        Fitting method of all of them.
-    newest : str
-        Time of the newest, ISO 8601.
-    """
-
-    ranges: Array
-    n_points: Array
-    incidences: Array
-    intensities: Array
+    ranges: Array  # (n,) distances [m]
+    n_points: Array  # (n,) returns that carry each
+    incidences: Array  # (n,) mean angles of incidence; NaN where not known [rad]
+    intensities: Array  # (n,) mean reflectivity, 0 to 255; NaN where not known
+    # (n, 3) stated variances towards, left and up, without that of the heading [m^2]
     variances: Array
-    turns: Array
-    stops: Index
+    turns: Array  # (n,) times of the turns that saw them [s]
+    stops: Index  # (n,) number of the stop that each is from
+    # (n,) degrees of freedom and square root of the variance factor of that stop's position; NaN
+    # where there is none
     dof: Array
     sigma0: Array
-    surveys: tuple[str, ...]
-    fit_method: str
-    newest: str
+    surveys: tuple[str, ...]  # names of the surveys
+    fit_method: str  # fitting method of all of them
+    newest: str  # time of the newest, ISO 8601
 
     def __post_init__(self) -> None:
         columns = dict.fromkeys(_COLUMNS, (None,))

@@ -113,18 +113,10 @@ def bilinear(site: Site, grid: Array, p_site: Array) -> Array:
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class Stops:
-    """Stops: positions of the LiDAR.
+    """Stops: positions of the LiDAR."""
 
-    Attributes
-    ----------
-    names : tuple of str
-        Unique.
-    p_site : (s, 3)
-        Origins of the base: on the gimbal's axis at the height of the LiDAR [m].
-    """
-
-    names: tuple[str, ...]
-    p_site: Array
+    names: tuple[str, ...]  # unique
+    p_site: Array  # (s, 3) origins of the base: on the gimbal's axis at the height of the LiDAR [m]
 
     def __post_init__(self) -> None:
         seal(self, p_site=(None, 3))
@@ -134,18 +126,10 @@ class Stops:
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class Arrangement:
-    """Marks that stand, or might stand, on a site.
+    """Marks that stand, or might stand, on a site."""
 
-    Attributes
-    ----------
-    names : tuple of str
-        Unique.
-    p_site : (n, 3)
-        Centres of the spheres [m].
-    """
-
-    names: tuple[str, ...]
-    p_site: Array
+    names: tuple[str, ...]  # unique
+    p_site: Array  # (n, 3) centres of the spheres [m]
 
     def __post_init__(self) -> None:
         seal(self, p_site=(None, 3))
@@ -218,18 +202,13 @@ class Requirement:
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class Visibility:
-    """Visible part of each mark from each station.
+    """Visible part of each mark from each station."""
 
-    Attributes
-    ----------
-    lowest : (s, n, c) float32
-        For each upright strip of the sphere's disc, from left to right, the height above the centre
-        above which it is visible, in units of half the disc's height: -1 all of it, 1 nothing.
-    gaps : (s, n) float32
-        From the centre on to the surface behind it; infinite where none is near [m].
-    """
-
+    # (s, n, c) float32 for each upright strip of the sphere's disc, from left to right, the height
+    # above the centre above which it is visible, in units of half the disc's height: -1 all of it,
+    # 1 nothing
     lowest: np.ndarray
+    # (s, n) float32 from the centre on to the surface behind it; infinite where none is near [m]
     gaps: np.ndarray
 
     def __post_init__(self) -> None:
@@ -352,25 +331,15 @@ class Evaluation:
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class FieldMap:
-    """Predicted accuracy of an arrangement on a grid of places.
+    """Predicted accuracy of an arrangement on a grid of places."""
 
-    Attributes
-    ----------
-    xs, ys : (n,), (m,)
-        Lines of the grid [m].
-    sigma_3d : (m, n)
-        3-D sigma of a position there, rows along y; NaN where there is none [m].
-    probability : (m, n)
-        Probability that its 3-D error is within the tolerance; NaN where there is no position.
-    n_seen : (m, n)
-        Marks that will be found from there; 0 where the ground is not known.
-    """
-
-    xs: Array
+    xs: Array  # (n,), (m,) lines of the grid [m]
     ys: Array
+    # (m, n) 3-D sigma of a position there, rows along y; NaN where there is none [m]
     sigma_3d: Array
+    # (m, n) probability that its 3-D error is within the tolerance; NaN where there is no position
     probability: Array
-    n_seen: Index
+    n_seen: Index  # (m, n) marks that will be found from there; 0 where the ground is not known
 
     def __post_init__(self) -> None:
         shape = (len(self.ys), len(self.xs))

@@ -33,34 +33,20 @@ _FIRST, _THIRD = np.radians(105.0), np.radians(10.0)  # headings of the study's 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RandomPlanSpec:
-    """Distribution of random arrangements and of their errors.
+    """Distribution of random arrangements and of their errors."""
 
-    Attributes
-    ----------
-    n_arrangements : int
-        Number of arrangements.
-    n_marks : tuple of int
-        Least and greatest number of marks; all numbers are equally frequent.
-    distances : tuple of float
-        Nearest and farthest that a mark stands [m]. 7.5: the study's greatest distance.
-    angles : tuple of float
-        Window of included angles that the marks used must keep [rad]; 0 and pi allow all.
-    error : float or None
-        Size of the error on each axis of each centre, of random sign [m]. 0.017: the study's, 0.03
-        in space; by default normal errors of the model of centres.
-    tolerance : float
-        3-D error that passes [m].
-    seed : int
-        Of the random numbers.
-    """
-
-    n_arrangements: int = 100_000
+    n_arrangements: int = 100_000  # number of arrangements
+    # least and greatest number of marks; all numbers are equally frequent
     n_marks: tuple[int, int] = (3, 14)
+    # nearest and farthest that a mark stands [m]. 7.5: the study's greatest distance.
     distances: tuple[float, float] = (2.0, 7.5)
+    # window of included angles that the marks used must keep [rad]; 0 and pi allow all
     angles: tuple[float, float] = (0.0, float(np.pi))
+    # size of the error on each axis of each centre, of random sign [m]. 0.017: the study's, 0.03 in
+    # space; by default normal errors of the model of centres.
     error: float | None = 0.017
-    tolerance: float = 0.03
-    seed: int = 0
+    tolerance: float = 0.03  # 3-D error that passes [m]
+    seed: int = 0  # of the random numbers
 
     def __post_init__(self) -> None:
         if not 1 <= self.n_arrangements <= ARRANGEMENTS_MAX:
@@ -86,28 +72,15 @@ class RandomPlanSpec:
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class RandomPlanResults:
-    """Result of each arrangement.
+    """Result of each arrangement."""
 
-    Attributes
-    ----------
-    spec : RandomPlanSpec
-        Their distribution.
-    n_marks : (n,)
-        Marks of each arrangement.
-    worst_angles : (n,)
-        Of the three marks used, the included angle that is farthest from a right one, as its
-        distance from 0 or 180 degrees, whichever is nearer; at most 90 [rad].
-    errors_3d : (n,)
-        3-D error of each position [m].
-    is_in_window : (n,)
-        Whether the included angles of the three keep the window.
-    """
-
-    spec: RandomPlanSpec
-    n_marks: Index
+    spec: RandomPlanSpec  # their distribution
+    n_marks: Index  # (n,) marks of each arrangement
+    # (n,) of the three marks used, the included angle that is farthest from a right one, as its
+    # distance from 0 or 180 degrees, whichever is nearer; at most 90 [rad]
     worst_angles: Array
-    errors_3d: Array
-    is_in_window: Mask
+    errors_3d: Array  # (n,) 3-D error of each position [m]
+    is_in_window: Mask  # (n,) whether the included angles of the three keep the window
 
     def __post_init__(self) -> None:
         names = ("n_marks", "worst_angles", "errors_3d", "is_in_window")
@@ -121,28 +94,14 @@ class RandomPlanResults:
 
 
 class PassRate(NamedTuple):
-    """Pass rate of a class of arrangements.
+    """Pass rate of a class of arrangements."""
 
-    Attributes
-    ----------
-    low, high : float
-        Edges of the class: number of marks, or worst included angle [deg].
-    n : int
-        Arrangements in it.
-    share : float
-        Share of them that passes; NaN for none.
-    median : float
-        Median 3-D error [m].
-    p95 : float
-        95th percentile of the 3-D error [m].
-    """
-
-    low: float
+    low: float  # edges of the class: number of marks, or worst included angle [deg]
     high: float
-    n: int
-    share: float
-    median: float
-    p95: float
+    n: int  # arrangements in it
+    share: float  # share of them that passes; NaN for none
+    median: float  # median 3-D error [m]
+    p95: float  # 95th percentile of the 3-D error [m]
 
 
 def simulate_random_plans(

@@ -125,30 +125,19 @@ class Sensor:
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class Returns:
-    """Information of a sphere's returns, by distance, strip and rows from the top.
+    """Information of a sphere's returns, by distance, strip and rows from the top."""
 
-    Attributes
-    ----------
-    distances : (d,)
-        Distances that are tabulated, ascending, even in the logarithm [m].
-    areas : (d, c, k)
-        Area that returns come from, of the upper k rows of each strip, k from 0 [m^2].
-    information : (d, c, k, 6)
-        Fisher information that the same area gives for one return per square metre:
-        towards-towards, towards-left, towards-up, left-left, left-up, up-up [1].
-    spread : (d, 3)
-        Factor of a centre's variances by the positions of the lines, against evenly spread returns:
-        towards, left, up; of one among some that share a position, over places where they are
-        found.
-    lost : (d,)
-        Share of places at which a centre cannot be found.
-    """
-
-    distances: Array
+    distances: Array  # (d,) distances that are tabulated, ascending, even in the logarithm [m]
+    # (d, c, k) area that returns come from, of the upper k rows of each strip, k from 0 [m^2]
     areas: Array
+    # (d, c, k, 6) Fisher information of the same area for one return per square metre, upper
+    # triangle row by row, axes towards, left and up [1]
     information: Array
+    # (d, 3) factor of a centre's variances by the positions of the lines, against evenly spread
+    # returns: towards, left, up; of one among some that share a position, over places where they
+    # are found
     spread: Array
-    lost: Array
+    lost: Array  # (d,) share of places at which a centre cannot be found
 
     def __post_init__(self) -> None:
         d = len(self.distances)
@@ -157,21 +146,11 @@ class Returns:
 
 
 class _Disc(NamedTuple):
-    """Beams over a sphere's disc at one distance, and the information of each.
+    """Beams over a sphere's disc at one distance, and the information of each."""
 
-    Attributes
-    ----------
-    left : (n,)
-        Where they pass the centre, to the left [m].
-    information : (n, 3, 3)
-        Of each; zero where it does not return.
-    returns : (n,)
-        Whether each returns.
-    """
-
-    left: Array
-    information: Array
-    returns: Array
+    left: Array  # (n,) where they pass the centre, to the left [m]
+    information: Array  # (n, 3, 3) of each; zero where it does not return
+    returns: Array  # (n,) whether each returns
 
 
 @lru_cache(maxsize=16)

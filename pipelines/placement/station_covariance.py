@@ -29,27 +29,14 @@ _ANY = 2.0  # beyond the cosine of any angle
 
 
 class Observables(NamedTuple):
-    """Marks as they can be observed from stations.
+    """Marks as they can be observed from stations."""
 
-    Attributes
-    ----------
-    stations_site : (s, 3)
-        Positions of the LiDAR [m].
-    marks_site : (n, 3)
-        Marks [m].
-    cov_centres : (s, n, 3, 3)
-        Covariances of their centres by noise, in the axes of the site [m^2].
-    sigma_laser_bias : float
-        Standard deviation of the range bias of a laser [m].
-    is_seen : (s, n)
-        Which are found.
-    """
-
-    stations_site: Array
-    marks_site: Array
+    stations_site: Array  # (s, 3) positions of the LiDAR [m]
+    marks_site: Array  # (n, 3) marks [m]
+    # (s, n, 3, 3) covariances of their centres by noise, in the axes of the site [m^2]
     cov_centres: Array
-    sigma_laser_bias: float
-    is_seen: Mask
+    sigma_laser_bias: float  # standard deviation of the range bias of a laser [m]
+    is_seen: Mask  # (s, n) which are found
 
     @property
     def vectors(self) -> Array:
@@ -58,58 +45,30 @@ class Observables(NamedTuple):
 
 
 class Positions(NamedTuple):
-    """Predicted positions.
+    """Predicted positions."""
 
-    Attributes
-    ----------
-    cov_motion : (s, 6, 6)
-        Of a small motion about the station, rotation [rad] and translation [m]; infinite on the
-        diagonal where there is no position.
-    cofactor : (s, 6, 6)
-        The same as the adjustment of the survey will state it.
-    used : (s, n)
-        Marks that carry each position.
-    """
-
+    # (s, 6, 6) of a small motion about the station, rotation [rad] and translation [m]; infinite on
+    # the diagonal where there is no position
     cov_motion: Array
-    cofactor: Array
-    used: Mask
+    cofactor: Array  # (s, 6, 6) the same as the adjustment of the survey will state it
+    used: Mask  # (s, n) marks that carry each position
 
 
 class Information(NamedTuple):
-    """Contributions of marks to the normal equations of a free station; they add up.
+    """Contributions of marks to the normal equations of a free station; they add up."""
 
-    Attributes
-    ----------
-    normal : (s, n, 6, 6)
-        To the normal matrix by the weights of a survey.
-    cov_rhs : (s, n, 6, 6)
-        To the covariance of the right-hand side.
-    bias_rhs : (s, n, 6)
-        To the right-hand side by a common error of all ranges of 1 m [1/m].
-    """
-
-    normal: Array
-    cov_rhs: Array
-    bias_rhs: Array
+    normal: Array  # (s, n, 6, 6) to the normal matrix by the weights of a survey
+    cov_rhs: Array  # (s, n, 6, 6) to the covariance of the right-hand side
+    bias_rhs: Array  # (s, n, 6) to the right-hand side by a common error of all ranges of 1 m [1/m]
 
 
 class Reliability(NamedTuple):
-    """Internal and external reliability of each mark.
+    """Internal and external reliability of each mark."""
 
-    Attributes
-    ----------
-    redundancies : (s, n)
-        Redundancy of each mark's observations together; 0 where it is not used.
-    detectable_biases : (s, n)
-        Minimal detectable bias along the weakest axis [m].
-    external : (s, n)
-        Largest shift of the position by a bias of that size [m].
-    """
-
+    # (s, n) redundancy of each mark's observations together; 0 where it is not used
     redundancies: Array
-    detectable_biases: Array
-    external: Array
+    detectable_biases: Array  # (s, n) minimal detectable bias along the weakest axis [m]
+    external: Array  # (s, n) largest shift of the position by a bias of that size [m]
 
 
 def predict_positions(observables: Observables, requirement: Requirement) -> Positions:

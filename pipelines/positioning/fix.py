@@ -13,27 +13,13 @@ from spheremark.pipelines.positioning.matching import Scene
 
 
 class Pose(NamedTuple):
-    """A station in the unshifted site frame, with what its adjustment says of it.
+    """A station in the unshifted site frame, with what its adjustment says of it."""
 
-    Attributes
-    ----------
-    T_site_station : (4, 4)
-        Pose [m].
-    cov_T_site_station : (6, 6)
-        Its covariance.
-    cov_p_site : (3, 3)
-        Covariance of the position [m^2].
-    J_position : (3, p)
-        Derivative of the position by the unknowns of the adjustment.
-    residuals_site : (k, 3)
-        Residuals of the centres [m].
-    """
-
-    T_site_station: Array
-    cov_T_site_station: Array
-    cov_p_site: Array
-    J_position: Array
-    residuals_site: Array
+    T_site_station: Array  # (4, 4) pose [m]
+    cov_T_site_station: Array  # (6, 6) its covariance
+    cov_p_site: Array  # (3, 3) covariance of the position [m^2]
+    J_position: Array  # (3, p) derivative of the position by the unknowns of the adjustment
+    residuals_site: Array  # (k, 3) residuals of the centres [m]
 
 
 def station_fix(

@@ -20,37 +20,19 @@ _N_CELLS = 500  # of the way across the marks: they are sorted into these
 
 
 class Spans(NamedTuple):
-    """Marks two by two, in both orders, the nearest to each other first.
+    """Marks two by two, in both orders, the nearest to each other first."""
 
-    Attributes
-    ----------
-    first, second : (h,)
-        Places among the marks.
-    targets : (h, 3)
-        From the first to the second [m].
-    lengths : (h,)
-        How long each is [m].
-    """
-
-    first: Index
+    first: Index  # (h,) places among the marks
     second: Index
-    targets: Array
-    lengths: Array
+    targets: Array  # (h, 3) from the first to the second [m]
+    lengths: Array  # (h,) how long each is [m]
 
 
 class Hypotheses(NamedTuple):
-    """Poses of the levelled frame that are to be tried.
+    """Poses of the levelled frame that are to be tried."""
 
-    Attributes
-    ----------
-    yaws : (h,)
-        Headings [rad].
-    translations : (h, 3)
-        Translations [m].
-    """
-
-    yaws: Array
-    translations: Array
+    yaws: Array  # (h,) headings [rad]
+    translations: Array  # (h, 3) translations [m]
 
 
 IDENTITY = Hypotheses(np.zeros(1), np.zeros((1, 3)))

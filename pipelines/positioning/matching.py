@@ -63,86 +63,39 @@ _SHARE = 0.4  # of markers or marks, the fewer: of mirrored fields five in fourt
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class Scene:
-    """The observations and control of a station, as arrays.
+    """The observations and control of a station, as arrays."""
 
-    Attributes
-    ----------
-    names : tuple of str
-        Of the control marks.
-    centres_base : (n, 3)
-        Fitted centres [m].
-    cov_centres : (n, 3, 3)
-        Their covariances in base, ``sigma_common`` included [m^2].
-    marks_site : (m, 3)
-        Control marks relative to ``middle`` [m].
-    cov_marks : (m, 3, 3)
-        Their covariances [m^2].
-    middle : (3,)
-        Middle of the control marks in the site frame [m].
-    R_station_base : (3, 3)
-        The measured levelling; its last row is the up direction in base.
-    J_up : (3, 2)
-        Derivative of the up direction by roll and pitch.
-    sigma_level : float
-        Standard deviation of each of the two angles [rad].
-    is_levelled : bool
-        Whether they were measured.
-    sigma_heading : float
-        Standard deviation of the heading that mounting and encoder leave unknown [rad].
-    sigma_range : float
-        Standard deviation of what all ranges are too long together [m].
-    shared : (n,)
-        How much of each centre's variance along its line of sight is that [m^2].
-    sigma_height : float
-        Standard deviation of what all centres are too high together [m].
-    """
-
-    names: tuple[str, ...]
-    centres_base: Array
-    cov_centres: Array
-    marks_site: Array
-    cov_marks: Array
-    middle: Array
-    R_station_base: Array
-    J_up: Array
-    sigma_level: float
-    is_levelled: bool
+    names: tuple[str, ...]  # of the control marks
+    centres_base: Array  # (n, 3) fitted centres [m]
+    cov_centres: Array  # (n, 3, 3) their covariances in base, ``sigma_common`` included [m^2]
+    marks_site: Array  # (m, 3) control marks relative to ``middle`` [m]
+    cov_marks: Array  # (m, 3, 3) their covariances [m^2]
+    middle: Array  # (3,) middle of the control marks in the site frame [m]
+    R_station_base: Array  # (3, 3) the measured levelling; its last row is the up direction in base
+    J_up: Array  # (3, 2) derivative of the up direction by roll and pitch
+    sigma_level: float  # standard deviation of each of the two angles [rad]
+    is_levelled: bool  # whether they were measured
+    # standard deviation of the heading that mounting and encoder leave unknown [rad]
     sigma_heading: float
-    sigma_range: float
-    shared: Array
-    sigma_height: float
+    sigma_range: float  # standard deviation of what all ranges are too long together [m]
+    shared: Array  # (n,) how much of each centre's variance along its line of sight is that [m^2]
+    sigma_height: float  # standard deviation of what all centres are too high together [m]
 
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class Match:
-    """Which fit is which mark, and the pose that goes with it.
+    """Which fit is which mark, and the pose that goes with it."""
 
-    Attributes
-    ----------
-    marks : (n,)
-        Place of each fit's mark among the control marks; -1 for none.
-    T_site_base : (4, 4)
-        Pose of base, relative to the middle of the marks [m].
-    vtpv : float
-        Weighted sum of squares of the residuals, gravity included.
-    dof : int
-        Degrees of freedom.
-    largest_residual : float
-        Of the matched fits [m].
-    alternatives : (k, 3)
-        Where base would stand, relative to the middle of the marks, by other matches of two
-        markers that explain them about as well; no rows for three or more [m].
-    dissent : (k, 4)
-        How many other markers agree on another place than these, and where base would stand by
-        them, relative to the middle of the marks [m]: control that contradicts itself.
-    """
-
-    marks: Index
-    T_site_base: Array
-    vtpv: float
-    dof: int
-    largest_residual: float
+    marks: Index  # (n,) place of each fit's mark among the control marks; -1 for none
+    T_site_base: Array  # (4, 4) pose of base, relative to the middle of the marks [m]
+    vtpv: float  # weighted sum of squares of the residuals, gravity included
+    dof: int  # degrees of freedom
+    largest_residual: float  # of the matched fits [m]
+    # (k, 3) where base would stand, relative to the middle of the marks, by other matches of two
+    # markers that explain them about as well; no rows for three or more [m]
     alternatives: Array = field(default_factory=lambda: np.zeros((0, 3)))
+    # (k, 4) how many other markers agree on another place than these, and where base would stand by
+    # them, relative to the middle of the marks [m]: control that contradicts itself
     dissent: Array = field(default_factory=lambda: np.zeros((0, 4)))
 
     @property

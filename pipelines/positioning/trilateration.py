@@ -45,22 +45,12 @@ _STEEP = 0.9  # vertical part of a motion that is about the height
 
 
 class Influences(NamedTuple):
-    """What each marker adds to the gradient of a position from distances.
+    """What each marker adds to the gradient of a position from distances."""
 
-    Attributes
-    ----------
-    noise : (k, 3, 3)
-        Its covariance by the errors of centre and mark alone.
-    ranges, heights : (k, 3)
-        The gradient by a unit of the centre's range, and of its height.
-    leans : (k, 3, 2)
-        The gradient by a sigma of roll and of pitch.
-    """
-
-    noise: Array
-    ranges: Array
+    noise: Array  # (k, 3, 3) its covariance by the errors of centre and mark alone
+    ranges: Array  # (k, 3) the gradient by a unit of the centre's range, and of its height
     heights: Array
-    leans: Array
+    leans: Array  # (k, 3, 2) the gradient by a sigma of roll and of pitch
 
 
 def slope_ranges(v: Array) -> tuple[Array, Array]:
@@ -339,21 +329,11 @@ def best_three(lines: Array, least: float, greatest: float, three: Index) -> tup
 
 
 class Positions(NamedTuple):
-    """Positions of independent stations.
+    """Positions of independent stations."""
 
-    Attributes
-    ----------
-    p : (s, 3)
-        Positions [m].
-    cov : (s, 3, 3)
-        Their covariances [m^2].
-    is_settled : (s,) bool
-        Whether the steps became small and the covariance is finite.
-    """
-
-    p: Array
-    cov: Array
-    is_settled: Mask
+    p: Array  # (s, 3) positions [m]
+    cov: Array  # (s, 3, 3) their covariances [m^2]
+    is_settled: Mask  # (s,) bool whether the steps became small and the covariance is finite
 
 
 def meet(chosen: Index, marks: Array, measured: Array, weights: Array, start: Array) -> Positions:
