@@ -188,6 +188,37 @@ def solve_each(linearise: Callable[[Array, Index], Groups], move: Move, start: A
     return Solutions(estimates=states, covs=covs, is_settled=is_settled)
 
 
+def solve_by_chords(
+    covs: Array, rhs: Callable[[Array], Array], move: Move, start: Array
+) -> tuple[Array, Mask]:
+    """Solve independent problems whose normal matrices hardly change on the way.
+
+    Parameters
+    ----------
+    covs : (s, p, p)
+        Inverses of the normal matrices at the start.
+    rhs : callable
+        Gives the right-hand sides, (s, p), at states.
+    move : callable
+        Gives states after small changes.
+    start : (s, ...)
+        Approximate unknowns of each problem.
+
+    Returns
+    -------
+    tuple
+        The unknowns of each problem, and whether its steps became small.
+    """
+    states, is_settled = start, np.zeros(len(start), dtype=np.bool_)
+    for _ in range(_STEPS):
+        right = rhs(states)
+        steps = (covs @ right[..., None])[..., 0]
+        states, is_settled = move(states, steps), np.einsum("sp,sp->s", steps, right) < _SETTLED
+        if is_settled.all():
+            break
+    return states, is_settled
+
+
 def solve(linearise: Callable[[Array], Groups], move: Move, start: Array) -> Solution:
     """Find the unknowns for which the weighted sum of squares is least.
 

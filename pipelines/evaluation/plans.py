@@ -134,7 +134,7 @@ def _against_all(site: Site, every_stop: Stops, method: str, i: int) -> Plain:
     stops = Stops(names=tuple(every_stop.names[j] for j in some), p_site=every_stop.p_site[some])
     places = find_candidates(site, every_stop, PlaceRules())
     few = rng.choice(len(places.p_site), _PLACES_SMALL, replace=False)
-    places = replace(places, p_site=places.p_site[few], ground=places.ground[few])
+    places = replace(places, p_site=places.p_site[few], ground=places.ground[few], rules=None)
     given = (site, stops, places, sensor_model(Sensor()))
     requirement = Requirement(method=method)
     best = best_without_search(*given, requirement, _MARKS_SMALL, None)

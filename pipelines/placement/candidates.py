@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import product
 
 import numpy as np
 from scipy.ndimage import distance_transform_edt
 
 from spheremark.pipelines.errors import ConfigError, DegenerateGeometryError
 from spheremark.pipelines.model import Array, Mask, seal
-from spheremark.pipelines.placement.plan import Arrangement, Site, Stops, bilinear
+from spheremark.pipelines.placement.plan import Site, Stops, bilinear
 
 CANDIDATES_MAX = 20_000
 """Most places of one comparison."""
@@ -68,15 +69,11 @@ class Candidates:
     p_site: Array  # (c, 3) centres of spheres [m]
     ground: Array  # (c,) height of the ground below each [m]
     apart: float  # least distance between two marks [m]
+    rules: PlaceRules | None = None  # that places between these keep too; none allows no others
+    spacing: float = 0.0  # of the grid of places [m]
 
     def __post_init__(self) -> None:
         seal(self, p_site=(None, 3), ground=(len(self.p_site),))
-
-    @property
-    def arrangement(self) -> Arrangement:
-        """All of them as marks."""
-        names = tuple(str(k) for k in range(len(self.p_site)))
-        return Arrangement(names=names, p_site=self.p_site)
 
 
 def find_candidates(site: Site, stops: Stops, rules: PlaceRules) -> Candidates:
@@ -118,23 +115,45 @@ def find_candidates(site: Site, stops: Stops, rules: PlaceRules) -> Candidates:
     x, y = (np.ravel(grid) for grid in np.meshgrid(*lines))
     place = np.round(np.column_stack([x, y]), _DIGITS)
     masks = _masks(site, stops, rules, place)
-    keep = np.logical_and.reduce(list(masks.values()))
-    if not keep.any():
+    place = place[np.logical_and.reduce(list(masks.values()))]
+    if not len(place):
         left = ", ".join(f"{int(mask.sum())} {why}" for why, mask in masks.items())
         raise DegenerateGeometryError(
-            f"No mark may stand anywhere: of {len(place)} places, one every {spacing:g} m, {left}."
+            f"No mark may stand anywhere: of {len(x)} places, one every {spacing:g} m, {left}."
         )
-    place = place[keep]
     heights = np.unique(np.linspace(*site.pole_heights, _LEVELS))
     if len(place) * len(heights) > CANDIDATES_MAX:
         raise ConfigError(
             f"{len(place)} places at {len(heights)} heights are too many to compare; "
             f"{CANDIDATES_MAX:,} are the most. Take a wider spacing than {spacing:g} m."
         )
-    ground = np.repeat(site.ground_at(place), len(heights))
-    tops = np.round(ground + np.tile(heights, len(place)), _DIGITS)
-    p_site = np.column_stack([np.repeat(place, len(heights), axis=0), tops])
-    return Candidates(p_site=p_site, ground=ground, apart=max(rules.apart, 1e-6))
+    place = np.repeat(place, len(heights), axis=0)
+    return _candidates(site, rules, place, np.tile(heights, len(place) // len(heights)), spacing)
+
+
+def places_near(
+    site: Site, stops: Stops, rules: PlaceRules, p_site: Array, step: float
+) -> Candidates:
+    """Return marks, first, and the places a step away from each on which a mark may stand too."""
+    ways = np.array([way for way in product((0, -1, 1), repeat=3) if any(way)])
+    moved = np.round((p_site[:, None] + step * ways).reshape(-1, 3), _DIGITS)
+    place = np.concatenate([p_site, moved])
+    ground = site.ground_at(place)
+    heights = np.clip(place[:, 2] - ground, *site.pole_heights)
+    keep = np.logical_and.reduce(list(_masks(site, stops, rules, place[:, :2]).values()))
+    keep[: len(p_site)] = True
+    heights[: len(p_site)] = p_site[:, 2] - ground[: len(p_site)]
+    return _candidates(site, rules, place[keep, :2], heights[keep], step)
+
+
+def _candidates(
+    site: Site, rules: PlaceRules, place: Array, heights: Array, spacing: float
+) -> Candidates:
+    """Return places on poles of some heights."""
+    ground = site.ground_at(place)
+    p_site = np.column_stack([place, np.round(ground + heights, _DIGITS)])
+    apart = max(rules.apart, 1e-6)
+    return Candidates(p_site=p_site, ground=ground, apart=apart, rules=rules, spacing=spacing)
 
 
 def _spacing(stops: Stops, rules: PlaceRules) -> float:

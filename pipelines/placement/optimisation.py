@@ -1,13 +1,11 @@
-"""Where to put marks: greedy on information, then exchanges on the accuracy of positions.
+"""Where to put marks: exchanges between places of a grid, then steps off it, with a bound.
 
-The normal equations of a free station are a sum over its marks, so that a mark can be added,
-removed or exchanged in some hundred operations per stop. The study's method has no such sum; its
-arrangements are evaluated whole.
+A set of marks is scored in some microseconds per stop; thousands of sets are scored in one call.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from itertools import combinations
 from typing import NamedTuple
@@ -17,42 +15,57 @@ from scipy.spatial.distance import cdist
 
 from spheremark.pipelines.compilation import compiled
 from spheremark.pipelines.errors import ConfigError, DegenerateGeometryError
-from spheremark.pipelines.estimation.linear_algebra import invert
-from spheremark.pipelines.model import Array, Index, Mask
-from spheremark.pipelines.placement.bounds import least_sigmas, widest_sigma
-from spheremark.pipelines.placement.candidates import Candidates
+from spheremark.pipelines.model import Array, Index
+from spheremark.pipelines.placement.bounds import (
+    gained,
+    groups_of,
+    information_of,
+    least_sigmas,
+    relax,
+    start_information,
+    widest_sigma,
+)
+from spheremark.pipelines.placement.candidates import (
+    CANDIDATES_MAX,
+    Candidates,
+    find_candidates,
+    places_near,
+)
 from spheremark.pipelines.placement.centre_model import CentreModel
 from spheremark.pipelines.placement.evaluation import check_sizes, evaluate, predict_observables
 from spheremark.pipelines.placement.plan import Arrangement, Evaluation, Requirement, Site, Stops
 from spheremark.pipelines.placement.station_covariance import (
-    LOOSE2,
-    Information,
     Observables,
-    information,
-    predict_positions,
-    shared_variance,
+    Pairs,
+    add_mark,
+    best_circles,
+    pairs_of,
+    shared_sigmas,
+    sigma_3d,
+    start_of,
 )
 from spheremark.pipelines.placement.visibility import find_visibility
 from spheremark.pipelines.progress import checkpoint
+from spheremark.pipelines.threads import side_by_side
 
 MARKS_MOST = 40
 """Marks that are placed at most."""
 
 _LOST = 1e3  # [m] counts for a stop without a position: worse than any that has one
-_LOOSE_PRIOR = np.array([3.0, 3.0, 3.0, 10.0, 10.0, 10.0])  # [rad, m] before any mark is seen
 _Z_95 = 1.96  # sigmas within which an error of any shape lies with 95 %: 3-D sigma on one axis
 _ROUNDS_MAX = 30  # of exchanges; four to eight settle
-_STARTS_MAX, _STARTS_MIN = 16, 2
-_MARKS_STARTED = 96  # in all starts together: many marks leave little to chance
-_STARTS_PAPER = 4  # where arrangements are evaluated whole
-_DRAWN, _DRAWN_KEPT = 1500, 40  # random arrangements that these begin with, and evaluate in full
+_DRAWN_EVENLY, _DRAWN_BY_SHARES = 1600, 400  # random arrangements, of which starts are chosen
+_MARKS_STARTED, _STARTS_MIN, _STARTS_MAX = 48, 3, 12  # in all descents on the grid; descents
+_POLISHED = 3  # of these that are carried off the grid
+_FINEST = 0.01  # [m] last step off the grid: finer than a mark can be staked out
 _POWER = 12.0  # of the mean over stops that is as good as their largest, and smoother
-_SHARE_MOVED = 0.4  # share of marks that a later start has elsewhere
-_FEW = 10  # marks that are always searched in full
-_SLACK, _SLACK_PAPER = 1.15, 2.0  # times the tolerance that a quick search keeps: more is hopeless
+_WORTH = 0.9998  # of the objective that is reached: a smaller gain ends a search
 _WORSE_MOST = 1.3  # than now, at most, while the loss of a mark would break the tolerance
-_TRIED_MAX = 12  # candidates that are evaluated in full for each mark, the most promising first
-_SCREENED = 800  # candidates of a round by whole evaluation, for all marks together
+_TRIED = 32  # places for a mark of which losses are evaluated, the most promising first
+_LOSS = 0.03  # exponent of the sigma after a loss, beside that of the worst stop
+_BLOCK = 1000  # places that are predicted at a time
+_SLACK = 1.15  # times the tolerance that a quick search keeps: more is hopeless
+_FINER = (3, 2, 1)  # times that the grid of the bound is finer, as far as places suffice
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -89,95 +102,57 @@ class Goal:
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class Optimum:
-    """The best places that were found.
+    """The best places that were found."""
 
-    Attributes
-    ----------
-    evaluation : Evaluation
-        Its marks are the best places.
-    ground : (k,)
-        Height of the ground under each mark [m].
-    worst_after_loss : float
-        Largest 3-D sigma over all stops after the loss of any one mark; infinite where a stop
-        would have no position [m].
-    is_kept : bool
-        Whether the goal is reached.
-    log_det, log_det_bound : float
-        Information gained, as the sum over stops of the logarithm of its determinant, and its upper
-        bound over all arrangements of as many marks; NaN for a method that has no such sum.
-    n_candidates : int
-        Places that were compared.
-    n_exchanges : int
-        Exchanges that improved on the greedy start.
-    """
-
-    evaluation: Evaluation
-    ground: Array
+    evaluation: Evaluation  # its marks are the best places
+    ground: Array  # (k,) height of the ground under each mark [m]
+    # largest 3-D sigma over all stops after the loss of any one mark; infinite where a stop would
+    # have no position [m]
     worst_after_loss: float
-    is_kept: bool
+    is_kept: bool  # whether the goal is reached
+    # largest 3-D sigma over all stops that no arrangement of as many marks on the places of the
+    # bound goes below; NaN for a method without one [m]
+    bound: float
+    bound_spacing: float  # of the grid of these places; 0 if they are those given [m]
+    n_bounded: int  # how many these are
+    # information gained, as the sum over stops of the logarithm of its determinant, and its upper
+    # bound over all arrangements of as many marks; NaN for a method that has no such sum
     log_det: float
     log_det_bound: float
-    n_candidates: int
-    n_exchanges: int
+    n_candidates: int  # places that were compared
+    n_exchanges: int  # exchanges and steps that improved on the starts
 
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class Proposal:
-    """One more mark.
+    """One more mark."""
 
-    Attributes
-    ----------
-    p_site : (3,)
-        Centre of its sphere [m].
-    ground : float
-        Height of the ground under it [m].
-    before, after : Evaluation
-        The arrangement without and with it; it is the last mark.
-    """
-
-    p_site: Array
-    ground: float
-    before: Evaluation
-    after: Evaluation
+    p_site: Array  # (3,) centre of its sphere [m]
+    ground: float  # height of the ground under it [m]
+    before: Evaluation  # the arrangement without it
+    after: Evaluation  # the arrangement with it; it is the last mark
 
 
 class _Problem(NamedTuple):
-    """All candidates as observed from all stops.
-
-    Attributes
-    ----------
-    site, stops, candidates, model, requirement
-        As given to ``optimise``.
-    observables : Observables
-        All candidates, marks that stand already after them.
-    added : Information
-        Contribution of each to the normal equations.
-    prior : (6, 6)
-        Information of the AHRS.
-    shared2 : tuple of float
-        Variances of the common errors of all ranges and of all heights of centres [m^2].
-    near : (c, c)
-        Which candidates are too near to each other.
-    power : float
-        Of the mean over stops that stands for their largest sigma.
-    """
+    """All candidates as observed from all stops."""
 
     site: Site
     stops: Stops
     candidates: Candidates
     model: CentreModel
     requirement: Requirement
-    observables: Observables
-    added: Information
-    prior: Array
-    shared2: tuple[float, float]
-    near: Mask
-    power: float = np.inf
+    pairs: Pairs
+    power: float = np.inf  # of the mean over stops that stands for their largest sigma
+    is_loss_first: bool = False  # whether the tolerance after a loss comes before all else
 
-    @property
-    def is_paper(self) -> bool:
-        """Whether arrangements have to be evaluated whole."""
-        return self.requirement.method == "paper"
+
+class _Found(NamedTuple):
+    """An arrangement."""
+
+    score: tuple[float, float, float]  # excess after a loss, objective, mean over stops [m]
+    problem: _Problem  # whose candidates
+    chosen: Index  # are its marks
+    n_exchanges: int
 
 
 def optimise(  # noqa: PLR0913  all that a plan is made of
@@ -198,7 +173,7 @@ def optimise(  # noqa: PLR0913  all that a plan is made of
     stops : Stops
         Positions of the LiDAR; all of them count at once.
     candidates : Candidates
-        Where a mark may stand.
+        Where a mark may stand; places between are tried too where these have rules.
     model : CentreModel
         Accuracy of centres.
     requirement : Requirement
@@ -206,12 +181,12 @@ def optimise(  # noqa: PLR0913  all that a plan is made of
     goal : Goal
         Number of marks, or the accuracy that decides it.
     rng : numpy.random.Generator
-        Perturbs the later starts.
+        Draws the starts.
 
     Returns
     -------
     Optimum
-        Marks and their evaluation.
+        Marks, their evaluation, and the bound of all arrangements.
 
     Raises
     ------
@@ -220,39 +195,35 @@ def optimise(  # noqa: PLR0913  all that a plan is made of
 
     Notes
     -----
-    Greedy on the regularised logarithm of the determinant of the information, summed over stops,
-    which is monotone and submodular: at least 63 % of the greatest gain (Nemhauser, Wolsey, Fisher,
-    1978); the bound adds the largest remaining gains. Then marks are exchanged one at a time while
-    that lowers, in this order, the excess over the tolerance after a loss, the largest 3-D sigma
-    over all stops, and their mean. Cost of a round grows with marks times candidates times stops.
+    The best of many random arrangements, a fifth of them drawn by the shares of the convex
+    relaxation (``bounds.relax``), are improved by exchanging one mark at a time, first on a high
+    power mean over the stops, which has fewer local minima than their largest, then on that; the
+    best leave the grid in steps that halve. The objective is the largest 3-D sigma over all stops
+    to the power 0.97 times that after the loss of any one mark to the power 0.03: no plan that is
+    better in both scores worse. Where the tolerance does not hold after a loss, that comes first,
+    if it can be reached. Cost grows with marks times candidates times stops.
     """
     check_sizes(len(stops.names), goal.n_marks or goal.most)
     problem = _problem(site, stops, candidates, model, requirement)
     if goal.n_marks is not None:
-        return _optimum(problem, _search(problem, goal.n_marks, goal, rng), goal)
+        return _optimum(_search(problem, goal.n_marks, goal, rng), problem, goal)
     least = _least(problem, goal)
-    slack = _SLACK_PAPER if problem.is_paper else _SLACK
-    most = _quick_search(problem, goal.most, goal, rng)
-    if most is not None and not _keeps(problem, most, goal):
-        is_near = _keeps(problem, most, goal, slack)
-        best = _search(problem, goal.most, goal, rng) if is_near else (most, 0)
-        found = _optimum(problem, best, goal)
-        if not found.is_kept:
+    most = _search(problem, goal.most, goal, rng, is_quick=True)
+    if not _keeps(most, goal):
+        if _keeps(most, goal, _SLACK):
+            most = _search(problem, goal.most, goal, rng)
+        if not (found := _optimum(most, problem, goal)).is_kept:
             raise DegenerateGeometryError(_impossible(problem, found, goal))
     for k in range(least, goal.most):
-        some = _quick_search(problem, k, goal, rng)
-        if some is not None and _keeps(problem, some, goal):
-            found = _optimum(problem, _search(problem, k, goal, rng), goal)
+        quick = _search(problem, k, goal, rng, is_quick=True)
+        if _keeps(quick, goal, _SLACK):
+            found = _optimum(_search(problem, k, goal, rng), problem, goal)
             # a smaller sigma may come with an error ellipsoid of worse shape
-            return found if found.is_kept else _optimum(problem, (some, 0), goal)
-        if some is None or _keeps(problem, some, goal, slack):
-            found = _optimum(problem, _search(problem, k, goal, rng), goal)
+            if not found.is_kept and _keeps(quick, goal):
+                found = _optimum(quick, problem, goal)
             if found.is_kept:
                 return found
-    found = _optimum(problem, _search(problem, goal.most, goal, rng), goal)
-    if found.is_kept:
-        return found
-    raise DegenerateGeometryError(_impossible(problem, found, goal))
+    return _optimum(_search(problem, goal.most, goal, rng), problem, goal)
 
 
 def propose_mark(
@@ -284,7 +255,7 @@ def propose_mark(
     DegenerateGeometryError
         If no candidate is far enough from the marks that stand.
     """
-    gaps = np.linalg.norm(candidates.p_site[:, None] - present.p_site[None], axis=2)
+    gaps = cdist(candidates.p_site, present.p_site)
     places = np.flatnonzero(gaps.min(axis=1, initial=np.inf) >= candidates.apart)
     n = len(places)
     if not n:
@@ -295,9 +266,8 @@ def propose_mark(
     ground = np.concatenate([candidates.ground[places], np.zeros(len(present.names))])
     joined = Candidates(p_site=p_site, ground=ground, apart=1e-6)
     problem = _problem(site, stops, joined, model, requirement)._replace(power=_POWER)
-    fixed = np.arange(n, n + len(present.names))
-    scores = [_score(problem, np.append(fixed, c)) for c in range(n)]
-    best = min(range(n), key=scores.__getitem__)
+    fixed, each = np.arange(n, n + len(present.names)), np.arange(n)[:, None]
+    best = int(np.lexsort(_scores(problem, fixed, each).T[::-1])[0])
     name = next(f"P{i:02d}" for i in range(1, 1000) if f"P{i:02d}" not in present.names)
     wider = Arrangement(
         names=(*present.names, name), p_site=np.vstack([present.p_site, p_site[best]])
@@ -336,271 +306,292 @@ def best_without_search(  # noqa: PLR0913  all that a plan is made of
         Reference for optimised arrangements [m].
     """
     problem = _problem(site, stops, candidates, model, requirement)
-    near = problem.near
-    some: Iterable[Index]
+    p_site, apart = candidates.p_site, candidates.apart
     if drawn is not None:
-        some = (_draw(near, n_marks, drawn[1]) for _ in range(drawn[0]))
+        some = [
+            _draw(candidates, n_marks, drawn[1].permutation(len(p_site))) for _ in range(drawn[0])
+        ]
     else:
+        near = cdist(p_site, p_site) < apart
         every = map(np.array, combinations(range(len(near)), n_marks))
-        some = (c for c in every if near[np.ix_(c, c)].sum() == n_marks)
-    return min(_score(problem, chosen)[0] for chosen in some)
+        some = [c for c in every if near[np.ix_(c, c)].sum() == n_marks]
+    return float(_scores(problem, np.zeros(0, np.intp), np.array(some))[:, 0].min())
+
+
+def _observed(
+    site: Site, stops: Stops, candidates: Candidates, model: CentreModel, requirement: Requirement
+) -> Iterator[Observables]:
+    """Predict candidates from all stops, block by block."""
+    for first in range(0, len(candidates.p_site), _BLOCK):
+        marks = Arrangement.numbered(candidates.p_site[first : first + _BLOCK])
+        visibility = find_visibility(site, stops.p_site, marks)
+        yield predict_observables(stops.p_site, marks, model, requirement, visibility)[1]
 
 
 def _problem(
     site: Site, stops: Stops, candidates: Candidates, model: CentreModel, requirement: Requirement
 ) -> _Problem:
     """Predict all candidates from all stops."""
-    marks = candidates.arrangement
-    visibility = find_visibility(site, stops.p_site, marks)
-    _, observables = predict_observables(stops.p_site, marks, model, requirement, visibility)
-    return _Problem(
-        site=site,
-        stops=stops,
-        candidates=candidates,
-        model=model,
-        requirement=requirement,
-        observables=observables,
-        added=information(observables, requirement),
-        prior=np.diag([requirement.sigma_levelling**-2.0] * 2 + [0.0] * 4),
-        shared2=(
-            shared_variance(model.sensor.sigma_range_bias),
-            requirement.resection.sigma_height**2,
-        ),
-        near=_near(candidates),
-    )
+    blocks = _observed(site, stops, candidates, model, requirement)
+    parts = zip(*(pairs_of(some, requirement) for some in blocks), strict=True)
+    pairs = Pairs(*(np.concatenate(part, axis=1) for part in parts))
+    return _Problem(site, stops, candidates, model, requirement, pairs)
 
 
-def _near(candidates: Candidates) -> Mask:
-    """Return which candidates are too near to each other, (c, c)."""
-    return np.asarray(cdist(candidates.p_site, candidates.p_site) < candidates.apart)
+def _information(problem: _Problem, candidates: Candidates) -> Array:
+    """Return the information of candidates, block by block."""
+    site, stops, _, model, requirement, *_ = problem
+    blocks = _observed(site, stops, candidates, model, requirement)
+    return np.concatenate([information_of(some, requirement) for some in blocks])
 
 
-def _sums(problem: _Problem, chosen: Index) -> tuple[Array, Array, Array]:
-    """Return the normal equations of all stops with some candidates."""
-    normal, cov_rhs, bias_rhs = (part[:, chosen].sum(axis=1) for part in problem.added)
-    return normal + problem.prior, cov_rhs + problem.prior, bias_rhs
+def _start(problem: _Problem) -> Array:
+    """Return the information of a station without marks."""
+    return start_information(problem.model.sensor.sigma_range_bias, problem.requirement)
 
 
-def _search(problem: _Problem, k: int, goal: Goal, rng: np.random.Generator) -> tuple[Index, int]:
-    """Return the best k places of several starts, and the number of exchanges.
+def _search(
+    problem: _Problem, k: int, goal: Goal, rng: np.random.Generator, *, is_quick: bool = False
+) -> _Found:
+    """Return the best k places of several starts, on the grid and, unless quick, off it."""
+    n_starts = 1 if is_quick else min(max(_MARKS_STARTED // k, _STARTS_MIN), _STARTS_MAX)
+    starts = _starts(problem, k, n_starts, rng)
+    found = [_descended(problem, start, goal, rng) for start in starts]
+    best = _best_off_grid(found, goal, rng, is_quick=is_quick)
+    limit = problem.requirement.tolerance / _Z_95
+    if not goal.is_robust or k < 3 or _after_loss(best) <= limit:
+        return best
+    first = problem._replace(is_loss_first=True)
+    found = [_descended(first, start, goal, rng) for start in starts]
+    kept = _best_off_grid(found, goal, rng, is_quick=is_quick)
+    return kept if kept.score[0] == 0.0 else best
 
-    The first start is greedy, or the best of many random ones where information is no sum; the
-    second is random, the others perturb the best so far (iterated local search: Lourenco, Martin,
-    Stuetzle, 2003). Each descends on a high power mean over the stops, which has fewer local
-    minima than their largest, then on that.
+
+def _starts(problem: _Problem, k: int, n: int, rng: np.random.Generator) -> list[Index]:
+    """Return the best of each of some lots of random arrangements.
+
+    Most are drawn evenly, the last by the shares of the relaxation.
     """
-    smooth = problem._replace(power=_POWER)
-    best, score, n_exchanges = _greedy(problem, k), (np.inf, np.inf, np.inf), 0
-    n_starts = max(_STARTS_MIN, min(_STARTS_MAX, _MARKS_STARTED // k))
-    if problem.is_paper:
-        best, n_starts = _best_drawn(problem, best, goal, rng), _STARTS_PAPER
-    for i in range(n_starts):
-        start = best if i == 0 else _perturbed(problem, best, 1.0 if i == 1 else _SHARE_MOVED, rng)
-        found, n = _exchanged(smooth, start, goal, rng)
-        found, m = _exchanged(problem, found, goal, rng)
-        n_exchanges += n + m
-        if (other := _objective(problem, found, goal)) < score:
-            best, score = found, other
-    return best, n_exchanges
+    candidates = problem.candidates
+    is_seen = np.asarray(problem.pairs.is_seen.any(axis=0))
+    orders = [rng.permutation(len(is_seen)) for _ in range(_DRAWN_EVENLY)]
+    information = _information(problem, candidates)
+    shares = relax(
+        information, _start(problem), groups_of(candidates.p_site, candidates.apart), k, 0.0
+    ).shares
+    luck = rng.gumbel(size=(_DRAWN_BY_SHARES, len(shares)))
+    orders += list(np.argsort(-(np.log(np.maximum(shares, 1e-12)) + luck), axis=1))
+    drawn = [_draw(candidates, k, order[is_seen[order]]) for order in orders]
+    most = max(map(len, drawn))
+    if most < k:
+        raise DegenerateGeometryError(
+            f"There is room for {most} of {k} marks that a stop can see; allow more places, or "
+            "marks nearer to each other."
+        )
+    every = np.array([one for one in drawn if len(one) == k])
+    scores = _scores(problem._replace(power=_POWER), np.zeros(0, np.intp), every)[:, 0]
+    parts = np.array_split(np.arange(len(every)), n)
+    return [every[part[np.argmin(scores[part])]] for part in parts if len(part)]
 
 
-def _quick_search(problem: _Problem, k: int, goal: Goal, rng: np.random.Generator) -> Index | None:
-    """Return k places of a short search; none without room, and for few marks of a free station."""
-    if k <= _FEW and not problem.is_paper:
-        return None
-    try:
-        chosen = _greedy(problem, k)
-    except DegenerateGeometryError:
-        return None
-    if problem.is_paper:
-        return _best_drawn(problem, chosen, goal, rng)
-    quick = replace(goal, is_robust=False)  # evaluating losses takes ten times as long
-    return _exchanged(problem._replace(power=_POWER), chosen, quick, rng)[0]
-
-
-def _best_drawn(problem: _Problem, other: Index, goal: Goal, rng: np.random.Generator) -> Index:
-    """Return the best of many random arrangements and of another with as many marks."""
-    drawn = [other, *(_draw(problem.near, len(other), rng) for _ in range(_DRAWN))]
-    drawn = [chosen for chosen in drawn if len(chosen) == len(other)]
-    drawn.sort(key=lambda chosen: _score(problem, chosen))
-    return min(drawn[:_DRAWN_KEPT], key=lambda chosen: _objective(problem, chosen, goal))
-
-
-def _draw(near: Mask, k: int, rng: np.random.Generator) -> Index:
-    """Return k random candidates that are not too near to each other; fewer without room."""
+def _draw(candidates: Candidates, k: int, order: Index) -> Index:
+    """Return the first k candidates of an order that are not too near to each other, or fewer."""
     chosen: list[int] = []
-    for c in rng.permutation(len(near)):
+    places = candidates.p_site
+    for c in order:
         if len(chosen) == k:
             break
-        if not near[c, chosen].any():
+        off = places[chosen] - places[c]
+        if not (np.einsum("ij,ij->i", off, off) < candidates.apart**2).any():
             chosen.append(int(c))
     return np.array(chosen, dtype=np.intp)
 
 
-def _greedy(problem: _Problem, k: int) -> Index:
-    """Return k candidates, each the one that adds most information to those before it."""
-    chosen: list[int] = []
-    allowed = problem.observables.is_seen.any(axis=0)
-    added = problem.added.normal
-    normal = np.tile(problem.prior + np.diag(_LOOSE_PRIOR**-2.0), (len(added), 1, 1))
-    for _ in range(k):
-        if not allowed.any():
-            raise DegenerateGeometryError(
-                f"There is room for {len(chosen)} of {k} marks that a stop can see; allow more "
-                "places, or marks nearer to each other."
-            )
-        best = int(np.argmax(np.where(allowed, _gains(normal, added), -np.inf)))
-        chosen.append(best)
-        normal += added[:, best]
-        allowed &= ~problem.near[best]
-    return np.array(chosen, dtype=np.intp)
+def _descended(problem: _Problem, start: Index, goal: Goal, rng: np.random.Generator) -> _Found:
+    """Exchange marks on a smooth objective, then on the objective itself."""
+    smooth = _exchanged(problem._replace(power=_POWER), start, goal, rng)
+    exact = _exchanged(problem, smooth.chosen, goal, rng)
+    return exact._replace(n_exchanges=exact.n_exchanges + smooth.n_exchanges)
 
 
-def _bound(problem: _Problem, chosen: Index) -> tuple[float, float]:
-    """Return the information gained, and its upper bound over arrangements of as many marks."""
-    start, added = problem.prior + np.diag(_LOOSE_PRIOR**-2.0), problem.added.normal
-    normal = start + added[:, chosen].sum(axis=1)
-    gained = float((np.linalg.slogdet(normal)[1] - np.linalg.slogdet(start)[1]).sum())
-    further, singles = (
-        float(np.sort(_gains(before, added))[::-1][: len(chosen)].sum())
-        for before in (normal, np.tile(start, (len(normal), 1, 1)))
-    )
-    return gained, min(gained + further, singles)
+def _best_off_grid(
+    found: list[_Found], goal: Goal, rng: np.random.Generator, *, is_quick: bool
+) -> _Found:
+    """Return the best of arrangements after the best few have left the grid, if they may."""
+    found = sorted(found, key=lambda one: one.score)
+    if is_quick or found[0].problem.candidates.rules is None:
+        return found[0]
+    several = {tuple(sorted(one.chosen)): one for one in found}
+    polished = [_off_grid(one, goal, rng) for one in list(several.values())[:_POLISHED]]
+    return min(polished, key=lambda one: one.score)
 
 
-def _perturbed(problem: _Problem, chosen: Index, share: float, rng: np.random.Generator) -> Index:
-    """Return an arrangement of which a share of the marks stands elsewhere."""
-    out = chosen.copy()
-    for i in rng.choice(len(out), max(1, round(share * len(out))), replace=False):
-        free = np.flatnonzero(~problem.near[np.delete(out, i)].any(axis=0))
-        out[i] = rng.choice(free) if len(free) else out[i]
+def _off_grid(found: _Found, goal: Goal, rng: np.random.Generator) -> _Found:
+    """Move marks by steps that halve, while that improves the objective."""
+    candidates = found.problem.candidates
+    site, stops, _, model, requirement, *_ = found.problem
+    assert candidates.rules is not None
+    step = candidates.spacing / 2.0
+    while step > _FINEST:
+        p_site = found.problem.candidates.p_site[found.chosen]
+        local = places_near(site, stops, candidates.rules, p_site, step)
+        problem = _problem(site, stops, local, model, requirement)
+        problem = problem._replace(is_loss_first=found.problem.is_loss_first)
+        moved = _descended(problem, np.arange(len(p_site)), goal, rng)
+        if _is_worth(moved.score, found.score):
+            found = moved._replace(n_exchanges=found.n_exchanges + moved.n_exchanges)
+        else:
+            step /= 2.0
+    return found
+
+
+def _exchanged(problem: _Problem, start: Index, goal: Goal, rng: np.random.Generator) -> _Found:
+    """Exchange marks one at a time while that improves the objective."""
+    chosen, n_exchanges = start.copy(), 0
+    (score,) = _objectives(problem, chosen[1:], chosen[:1], goal)
+    for _ in range(_ROUNDS_MAX):
+        before = score
+        for i in rng.permutation(len(chosen)):
+            others = np.delete(chosen, i)
+            tried = _promising(problem, others, score)
+            found = _objectives(problem, others, tried, goal)
+            best = min(range(len(tried)), key=found.__getitem__, default=-1)
+            if best >= 0 and found[best] < score:
+                chosen[i], score, n_exchanges = tried[best], found[best], n_exchanges + 1
+        if not _is_worth(score, before):
+            break
+    return _Found(score, problem, chosen, n_exchanges)
+
+
+def _is_worth(score: tuple[float, float, float], before: tuple[float, float, float]) -> bool:
+    """Return whether an objective is so much better that a search should go on."""
+    return score[0] < before[0] or (score[0] == before[0] and score[1] < _WORTH * before[1])
+
+
+def _promising(problem: _Problem, others: Index, score: tuple[float, float, float]) -> Index:
+    """Return the candidates beside others that leave the worst stop best, the best first."""
+    p_site = problem.candidates.p_site
+    near = cdist(p_site, p_site[others]) < problem.candidates.apart
+    places = np.flatnonzero(~near.any(axis=1) & problem.pairs.is_seen.any(axis=0))
+    limit = score[1] if score[0] == 0.0 else _WORSE_MOST * score[1]
+    scores = _scores(problem, others, places[:, None], limit)
+    order = np.lexsort((scores[:, 1], scores[:, 0]))
+    order = order[scores[order, 0] < limit]  # a loss only adds to the objective
+    return np.asarray(places[order[:_TRIED]])
+
+
+def _objectives(
+    problem: _Problem, others: Index, tried: Index, goal: Goal
+) -> list[tuple[float, float, float]]:
+    """Return the objective with each of some candidates beside others, the less the better.
+
+    The excess over the tolerance after the loss of a mark if that comes first, the largest sigma
+    over all stops, weighed with that after a loss, and the mean over stops [m].
+    """
+    worst, mean = _scores(problem, others, tried[:, None]).T
+    excess = np.zeros(len(tried))
+    if goal.is_robust and len(others) > 1:
+        none = np.zeros((1, 0), dtype=np.intp)
+        after = np.full(len(tried), _scores(problem, others, none)[0, 0])
+        for j in range(len(others)):
+            rest = np.delete(others, j)
+            after = np.maximum(after, _scores(problem, rest, tried[:, None])[:, 0])
+        if problem.is_loss_first:
+            excess = np.maximum(after - problem.requirement.tolerance / _Z_95, 0.0)
+        worst = worst ** (1.0 - _LOSS) * after**_LOSS
+    return list(zip(excess.tolist(), worst.tolist(), mean.tolist(), strict=True))
+
+
+def _after_loss(found: _Found) -> float:
+    """Return the largest sigma over all stops after the loss of any one mark [m]."""
+    k, none = len(found.chosen), np.zeros(0, dtype=np.intp)
+    sets = np.array([np.delete(found.chosen, i) for i in range(k)])
+    return float(_scores(found.problem._replace(power=np.inf), none, sets)[:, 0].max())
+
+
+def _scores(
+    problem: _Problem,
+    common: Index,
+    varied: Index,
+    limit: float = np.inf,
+    *,
+    stops: list[int] | None = None,
+) -> Array:
+    """Return the largest sigma over all stops, or their power mean, and the mean of sets of marks.
+
+    Each row of ``varied`` joins the common marks. Above the limit numbers are only lower bounds.
+    """
+    checkpoint()
+    requirement, p_stops = problem.requirement, problem.stops.p_site
+    sigmas = shared_sigmas(problem.model.sensor.sigma_range_bias, requirement)
+    rule = limit, problem.power, requirement.resection.sigma_height
+    # stops at the edge are mostly the worst, and show first that a set is beyond the limit
+    outwards = np.argsort(-np.linalg.norm(p_stops - p_stops.mean(axis=0), axis=1))
+    order = outwards if stops is None else np.array(stops)
+    out = np.zeros((len(varied), 2))
+    start, varied = start_of(requirement), np.ascontiguousarray(varied)
+
+    def part(first: int, last: int) -> None:
+        rows = varied[first:last]
+        _score_each(problem.pairs, start, sigmas, common, rows, order, rule, out[first:last])
+
+    side_by_side(part, len(varied), threaded_from=64)
+    out /= len(order)
+    if np.isfinite(problem.power):
+        out[:, 0] **= 1.0 / problem.power
+    else:
+        out[:, 0] *= len(order)
     return out
 
 
-def _exchanged(
-    problem: _Problem, start: Index, goal: Goal, rng: np.random.Generator
-) -> tuple[Index, int]:
-    """Exchange marks one at a time while that improves the objective."""
-    chosen, n_exchanges = start.copy(), 0
-    score = _objective(problem, chosen, goal)
-    for _ in range(_ROUNDS_MAX):
-        is_better = False
-        for i in rng.permutation(len(chosen)):
-            for c in _promising(problem, chosen, int(i), score, rng):
-                changed = chosen.copy()
-                changed[i] = c
-                found = _objective(problem, changed, goal, score[0])
-                if found < score:
-                    chosen, score, is_better = changed, found, True
-                    n_exchanges += 1
-                    break
-        if not is_better:
-            break
-    return chosen, n_exchanges
-
-
-def _promising(
-    problem: _Problem,
-    chosen: Index,
-    i: int,
-    score: tuple[float, float, float],
-    rng: np.random.Generator,
-) -> Index:
-    """Return the candidates that would be better as mark i than the present one, best first."""
-    others = np.delete(chosen, i)
-    free = np.array(~problem.near[others].any(axis=0))
-    free[chosen] = False
-    places = np.flatnonzero(free)
-    if problem.is_paper:
-        places = rng.permutation(places)[: max(_SCREENED // len(chosen), 30)]
-        scores = np.array([_score(problem, np.append(others, c)) for c in places]).reshape(-1, 2)
-    else:
-        scores = np.empty((len(places), 2))
-        limit = score[1] if score[0] == 0.0 else _WORSE_MOST * score[1]
-        stops = np.argsort(-_sigmas(problem, chosen))
-        sums, rule = _sums(problem, others), (limit, problem.power)
-        _score_each(sums, tuple(problem.added), problem.shared2, places, stops, rule, scores)
-    order = np.lexsort((scores[:, 1], scores[:, 0]))
-    if score[0] == 0.0:
-        order = order[[tuple(scores[o]) < score[1:] for o in order]]
-    return places[order[:_TRIED_MAX]]
-
-
-def _objective(
-    problem: _Problem, chosen: Index, goal: Goal, most: float = np.inf
-) -> tuple[float, float, float]:
-    """Return the objective, the less the better.
-
-    The excess over the tolerance after the loss of a mark, evaluated up to some length, the largest
-    sigma over all stops, and their mean [m].
-    """
-    if not goal.is_robust or len(chosen) < 3:
-        return 0.0, *_score(problem, chosen)
-    sigma = problem.requirement.tolerance / _Z_95
-    excess = max(_after_loss(problem, chosen, most + sigma) - sigma, 0.0)
-    return (excess, np.inf, np.inf) if excess > most else (excess, *_score(problem, chosen))
-
-
-def _sigmas(problem: _Problem, chosen: Index) -> Array:
-    """Return the 3-D sigma at each stop; large where there is no position [m]."""
-    if not problem.is_paper:
-        return np.asarray(_sigma_each(_sums(problem, chosen), problem.shared2), dtype=np.float64)
-    every = problem.observables
-    some = every._replace(
-        marks_site=every.marks_site[chosen],
-        cov_centres=every.cov_centres[:, chosen],
-        is_seen=every.is_seen[:, chosen],
-    )
-    cov = predict_positions(some, problem.requirement).cov_motion[:, 3:, 3:]
-    return np.asarray(np.minimum(np.sqrt(np.trace(cov, axis1=1, axis2=2)), _LOST))
-
-
-def _score(problem: _Problem, chosen: Index) -> tuple[float, float]:
-    """Return the largest sigma over all stops, or their power mean, and their mean [m]."""
-    checkpoint()
-    sigmas = _sigmas(problem, chosen)
-    worst = float(sigmas.max())
-    if np.isfinite(problem.power):
-        worst *= float(np.mean((sigmas / worst) ** problem.power)) ** (1.0 / problem.power)
-    return worst, float(sigmas.mean())
-
-
-def _after_loss(problem: _Problem, chosen: Index, most: float = np.inf) -> float:
-    """Return the largest sigma over all stops after the loss of any one mark, or one above most."""
-    worst = 0.0
-    for i in range(len(chosen)):
-        worst = max(worst, float(_sigmas(problem, np.delete(chosen, i)).max()))
-        if worst > most:
-            break
-    return worst
-
-
-def _optimum(problem: _Problem, found: tuple[Index, int], goal: Goal) -> Optimum:
+def _optimum(found: _Found, problem: _Problem, goal: Goal) -> Optimum:
     """Assemble the result; marks are named by azimuth about the middle of the stops."""
     site, stops, candidates, model, requirement, *_ = problem
-    chosen, n_exchanges = found
-    off = candidates.p_site[chosen, :2] - stops.p_site[:, :2].mean(axis=0)
+    own, chosen = found.problem.candidates, found.chosen
+    off = own.p_site[chosen, :2] - stops.p_site[:, :2].mean(axis=0)
     chosen = chosen[np.argsort(np.arctan2(off[:, 1], off[:, 0]))]
-    marks = Arrangement.numbered(candidates.p_site[chosen])
-    after = _after_loss(problem, chosen) if len(chosen) > 2 else np.inf
-    gained, bound = (np.nan, np.nan) if problem.is_paper else _bound(problem, chosen)
+    marks, k = Arrangement.numbered(own.p_site[chosen]), len(chosen)
+    after = _after_loss(found) if k > 2 else np.inf
+    bound, gain, n_bounded, spacing = np.nan, (np.nan, np.nan), 0, 0.0
+    if requirement.method != "paper":
+        finer = _finer(problem)
+        information, start = _information(problem, finer), _start(problem)
+        groups = groups_of(finer.p_site, finer.apart)
+        bound = relax(information, start, groups, k, requirement.resection.sigma_height).bound
+        plan = replace(finer, p_site=marks.p_site.copy(), ground=np.zeros(k))
+        gain = gained(information, start, _information(problem, plan), k)
+        n_bounded, spacing = len(finer.p_site), finer.spacing
     return Optimum(
         evaluation=evaluate(site, stops, marks, model, requirement),
-        ground=candidates.ground[chosen].copy(),
+        ground=own.ground[chosen].copy(),
         worst_after_loss=after if after < _LOST else np.inf,
-        is_kept=_keeps(problem, chosen, goal),
-        log_det=gained,
-        log_det_bound=bound,
+        is_kept=_keeps(found, goal),
+        bound=bound,
+        bound_spacing=spacing,
+        n_bounded=n_bounded,
+        log_det=gain[0],
+        log_det_bound=gain[1],
         n_candidates=len(candidates.p_site),
-        n_exchanges=n_exchanges,
+        n_exchanges=found.n_exchanges,
     )
 
 
-def _keeps(problem: _Problem, chosen: Index, goal: Goal, slack: float = 1.0) -> bool:
+def _finer(problem: _Problem) -> Candidates:
+    """Return the places of the bound: a finer grid where the candidates allow others."""
+    given, site, stops = problem.candidates, problem.site, problem.stops
+    if given.rules is None:
+        return given
+    for times in _FINER:
+        if times**2 * len(given.p_site) <= CANDIDATES_MAX // 2:
+            return find_candidates(site, stops, replace(given.rules, spacing=given.spacing / times))
+    return given
+
+
+def _keeps(found: _Found, goal: Goal, slack: float = 1.0) -> bool:
     """Return whether marks reach the goal for a multiple of the tolerance."""
-    site, stops, candidates, model, requirement, *_ = problem
+    site, stops, candidates, model, requirement, *_ = found.problem
     wider = replace(requirement, tolerance=slack * requirement.tolerance)
-    marks, n = Arrangement.numbered(candidates.p_site[chosen]), len(chosen)
+    marks, n = Arrangement.numbered(candidates.p_site[found.chosen]), len(found.chosen)
     remaining = [np.arange(n)]
     if goal.is_robust and n >= 3:
         remaining += [np.delete(np.arange(n), i) for i in range(n)]
@@ -616,12 +607,13 @@ def _keeps(problem: _Problem, chosen: Index, goal: Goal, slack: float = 1.0) -> 
 
 def _least(problem: _Problem, goal: Goal) -> int:
     """Return a lower bound of the number of marks; raise if no number keeps the tolerance."""
-    least = 3 if problem.is_paper or goal.is_robust else 2
+    requirement = problem.requirement
+    least = 3 if requirement.method == "paper" or goal.is_robust else 2
     if goal.most < least:
         raise ConfigError(f"At most {goal.most} marks; {least} are needed for this goal.")
     _refuse_impossible(problem)
-    requirement = problem.requirement
-    sigmas = least_sigmas(problem.observables, requirement)[:, : goal.most]
+    information = _information(problem, problem.candidates)
+    sigmas = least_sigmas(information, requirement)[:, : goal.most]
     widest = widest_sigma(requirement.tolerance, goal.probability)
     enough = np.flatnonzero(sigmas.max(axis=0) <= widest) + 1 + goal.is_robust
     if len(enough) and enough[0] <= goal.most:
@@ -647,12 +639,14 @@ def _goal_text(problem: _Problem, goal: Goal) -> str:
 
 def _sigmas_of_all(problem: _Problem) -> Array:
     """Return the 3-D sigma at each stop with a mark at every candidate [m]."""
-    return _sigmas(problem, np.flatnonzero(problem.observables.is_seen.any(axis=0)))
+    every, none = np.arange(len(problem.candidates.p_site)), np.zeros((1, 0), dtype=np.intp)
+    each = range(len(problem.stops.names))
+    return np.array([_scores(problem, every, none, stops=[e])[0, 0] for e in each])
 
 
 def _refuse_impossible(problem: _Problem) -> None:
     """Raise if not even all marks at once would bring the 3-D sigma below the tolerance."""
-    if problem.is_paper:
+    if problem.requirement.method == "paper":
         return
     sigmas, tolerance = _sigmas_of_all(problem), problem.requirement.tolerance
     worst = int(np.argmax(sigmas))
@@ -660,7 +654,7 @@ def _refuse_impossible(problem: _Problem) -> None:
         best = f"{1e3 * sigmas[worst]:.2g} mm (3-D sigma)" if sigmas[worst] < _LOST else "nothing"
         raise DegenerateGeometryError(
             f"No arrangement keeps {1e3 * tolerance:g} mm: even a mark at each of "
-            f"{len(problem.near)} places at once would leave {best} at "
+            f"{len(problem.candidates.p_site)} places at once would leave {best} at "
             f"{problem.stops.names[worst]}. Ask for a larger tolerance, or allow more places."
         )
 
@@ -673,7 +667,7 @@ def _impossible(problem: _Problem, best: Optimum, goal: Goal) -> str:
         f"leaves {1e3 * best.evaluation.sigma_3d[worst]:.3g} mm (3-D sigma) at "
         f"{problem.stops.names[worst]}."
     )
-    if not problem.is_paper:
+    if problem.requirement.method != "paper":
         text += (
             f" Even a mark at each of {best.n_candidates} places at once would leave "
             f"{1e3 * float(_sigmas_of_all(problem).max()):.2g} mm: ask for a larger tolerance."
@@ -682,112 +676,51 @@ def _impossible(problem: _Problem, best: Optimum, goal: Goal) -> str:
 
 
 @compiled
-def _add(a: Array, b: Array, out: Array) -> None:
-    """Write the sum of two (6, 6) matrices."""
-    for i in range(6):
-        for j in range(6):
-            out[i, j] = a[i, j] + b[i, j]
-
-
-@compiled
-def _log_det(N: Array) -> float:
-    """Return the logarithm of the determinant of a positive (6, 6) matrix; overwrites the matrix.
-
-    Without the limit of ``factorise``: a loose prior beside precise marks is no singularity.
-    """
-    total = 0.0
-    for i in range(6):
-        for k in range(i):
-            N[i, i] -= N[i, k] * N[i, k]
-        if N[i, i] <= 0.0:
-            return -np.inf
-        N[i, i] = np.sqrt(N[i, i])
-        total += 2.0 * np.log(N[i, i])
-        for j in range(i + 1, 6):
-            for k in range(i):
-                N[j, i] -= N[j, k] * N[i, k]
-            N[j, i] /= N[i, i]
-    return total
-
-
-@compiled
-def _gains(normal: Array, added: Array) -> Array:
-    """Return what each candidate adds to the log-determinants of all stops together."""
-    gains, work, nothing = np.zeros(added.shape[1]), np.empty((6, 6)), np.zeros((6, 6))
-    for e in range(len(normal)):
-        _add(normal[e], nothing, work)
-        before = _log_det(work)
-        for c in range(added.shape[1]):
-            if added[e, c, 3, 3] + added[e, c, 4, 4] + added[e, c, 5, 5] > 0.0:
-                _add(normal[e], added[e, c], work)
-                gains[c] += _log_det(work) - before
-    return gains
-
-
-@compiled
-def _sigma(
-    N: Array, cov_rhs: Array, bias_rhs: Array, shared2: tuple[float, float], inverse: Array
-) -> float:
-    """Return the 3-D sigma of one stop; large without a position."""
-    if not invert(N, inverse) or inverse[3, 3] + inverse[4, 4] + inverse[5, 5] > LOOSE2:
-        return _LOST
-    total = shared2[1]
-    for i in range(3, 6):
-        moved = 0.0
-        for j in range(6):
-            moved += inverse[i, j] * bias_rhs[j]
-            for k in range(6):
-                total += inverse[i, j] * cov_rhs[j, k] * inverse[k, i]
-        total += shared2[0] * moved * moved
-    return float(np.sqrt(total))
-
-
-@compiled
-def _sigma_each(sums: tuple[Array, Array, Array], shared2: tuple[float, float]) -> Array:
-    """Return the 3-D sigma of each stop; large without a position."""
-    normal, cov_rhs, bias_rhs = sums
-    inverse, out = np.empty((6, 6)), np.empty(len(normal))
-    for e in range(len(normal)):
-        out[e] = _sigma(normal[e], cov_rhs[e], bias_rhs[e], shared2, inverse)
-    return out
-
-
-@compiled
 def _score_each(  # noqa: PLR0913  a kernel takes what it needs
-    sums: tuple[Array, Array, Array],
-    added: tuple[Array, Array, Array],
-    shared2: tuple[float, float],
-    places: Index,
-    stops: Index,
-    rule: tuple[float, float],
+    pairs: Pairs,
+    start: Array,
+    shared: Array,
+    common: Index,
+    varied: Index,
+    order: Index,
+    rule: tuple[float, float, float],
     out: Array,
 ) -> None:
-    """Write the largest sigma, or power mean, and the mean with each candidate added.
+    """Add up the largest sigma, or powers of sigmas, and sigmas of sets of marks over all stops.
 
-    Stops are left out once a candidate exceeds the limit of the rule.
+    A set is left out once it exceeds the limit of the rule.
     """
-    limit, power = rule
-    is_smooth = np.isfinite(power)
-    beyond = len(stops) * limit**power if is_smooth and np.isfinite(limit) else np.inf
-    N, cov_rhs, bias_rhs = np.empty((6, 6)), np.empty((6, 6)), np.empty(6)
-    inverse = np.empty((6, 6))
-    for i in range(len(places)):
-        c = places[i]
-        worst, total, powers = 0.0, 0.0, 0.0
-        for s in range(len(stops)):
-            e = stops[s]
-            _add(sums[0][e], added[0][e, c], N)
-            _add(sums[1][e], added[1][e, c], cov_rhs)
-            for k in range(6):
-                bias_rhs[k] = sums[2][e, k] + added[2][e, c, k]
-            sigma = _sigma(N, cov_rhs, bias_rhs, shared2, inverse)
-            total += sigma
-            if is_smooth:
-                powers += sigma**power
-            else:
-                worst = max(worst, sigma)
-            if worst > limit or powers > beyond:
-                worst, powers, total = max(worst, 2.0 * limit), 2.0 * beyond, np.inf
-                break
-        out[i, 0] = (powers / len(stops)) ** (1.0 / power) if is_smooth else worst
-        out[i, 1] = total / len(stops)
+    limit, power, sigma_height = rule
+    p, n, is_smooth = len(start), len(common), np.isfinite(power)
+    beyond = len(order) * limit**power if is_smooth and np.isfinite(limit) else limit
+    base = start.copy(), start.copy(), np.zeros((p, len(shared)))
+    work = start.copy(), start.copy(), np.zeros((p, len(shared)))
+    marks, three = np.empty(n + varied.shape[1], np.intp), np.empty(3, np.intp)
+    marks[:n] = common
+    for e in order:
+        base[0][:], base[1][:], base[2][:] = start, start, 0.0
+        if p > 3:
+            _add_seen(pairs, e, common, base)
+        for m in range(len(varied)):
+            if out[m, 0] > beyond:
+                continue
+            work[0][:], work[1][:], work[2][:] = base[0], base[1], base[2]
+            used, is_fixed = varied[m], True
+            if p == 3:
+                marks[n:] = varied[m]
+                is_fixed = best_circles(pairs, e, marks, three)
+                used = three
+            sigma = _LOST
+            if is_fixed:
+                _add_seen(pairs, e, used, work)
+                sigma = min(sigma_3d(*work, shared, sigma_height), _LOST)
+            out[m, 0] = out[m, 0] + sigma**power if is_smooth else max(out[m, 0], sigma)
+            out[m, 1] += sigma
+
+
+@compiled
+def _add_seen(pairs: Pairs, e: int, marks: Index, work: tuple[Array, Array, Array]) -> None:
+    """Add those of some marks that are found to the equations of a station."""
+    for c in marks:
+        if pairs.is_seen[e, c]:
+            add_mark(pairs, e, c, work[0], work[1], work[2])

@@ -12,6 +12,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from spheremark.pipelines.config import StitchingConfig
 from spheremark.pipelines.errors import ConfigError
 from spheremark.pipelines.model import Array, Beams, seal
 from spheremark.pipelines.scan.rigs import FIRING_CYCLE, N_LASERS
@@ -30,7 +31,7 @@ _SIGMAS = (0.0137, 0.0107, 0.0089, 0.0067, 0.0064)  # ... this noise of ranges [
 _TOGETHER = 5  # centres that share a position
 _SHARE_MIN = 0.02  # of a footprint that makes a return
 _N_ROUNDS = 4  # in which precision and worth of the returns settle
-_DISTANCES = np.geomspace(1.5, 45.0, 28)  # [m]
+_DISTANCES = np.geomspace(0.5, 45.0, 55)  # [m]
 _LOST = 1e-4  # [m^2] a centre worse than this, and than six times the usual, counts as lost
 
 
@@ -211,7 +212,9 @@ def _disc(sensor: Sensor, radius: float, n_strips: int, distance: float) -> _Dis
     cov = np.eye(3) * (0.02 * radius) ** 2
     lateral2 = (sensor.sigma_direction * distance) ** 2
     middle = _ranges(table, np.array([distance, 0.0, 0.0]), radius)
-    returns = (middle.lit > _SHARE_MIN).astype(np.float64)
+    is_lit = middle.lit > _SHARE_MIN
+    returns = (is_lit & (middle.ranges >= StitchingConfig().range_min)).astype(np.float64)
+    returns *= 2.0 * returns.sum() >= is_lit.sum()  # else it is too near to be found
     information: Array = np.zeros((len(left), 3, 3))
     for _ in range(_N_ROUNDS):
         J, bend2 = _slopes(table, middle.ranges, distance, radius, cov)
@@ -277,6 +280,7 @@ def _spread(sensor: Sensor, radius: float, disc: _Disc, distance: float) -> tupl
     variances = np.einsum("pii->pi", np.linalg.inv(information + floor))
     usual = np.diag(np.linalg.inv(even + floor))
     is_found = variances.sum(axis=1) < max(_LOST, 6.0 * float(usual.sum()))
+    is_found &= bool(disc.returns.any())
     ratios = variances[is_found] / usual if is_found.any() else np.full((1, 3), 36.0)
     return _together(ratios), float(np.mean(~is_found))
 

@@ -54,12 +54,13 @@ class Positions(NamedTuple):
     used: Mask  # (s, n) marks that carry each position
 
 
-class Information(NamedTuple):
-    """Contributions of marks to the normal equations of a free station; they add up."""
+class Pairs(NamedTuple):
+    """Stations and marks two by two: what each mark adds to the equations of each station."""
 
-    normal: Array  # (s, n, 6, 6) to the normal matrix by the weights of a survey
-    cov_rhs: Array  # (s, n, 6, 6) to the covariance of the right-hand side
-    bias_rhs: Array  # (s, n, 6) to the right-hand side by a common error of all ranges of 1 m [1/m]
+    vectors: Array  # (s, n, 3) from stations to marks [m]
+    weights: Array  # (s, n, 3, 3) information about the position, as a survey weighs it [1/m^2]
+    spreads: Array  # (s, n, 3, 3) true covariance of what a mark adds to the right-hand side
+    is_seen: Mask  # (s, n) which are found
 
 
 class Reliability(NamedTuple):
@@ -86,14 +87,62 @@ def predict_positions(observables: Observables, requirement: Requirement) -> Pos
     levelling error carried through them as in ``trilateration``; the heading is the mean of the
     three directions.
     """
+    is_paper = requirement.method == "paper"
+    pairs = pairs_of(observables, requirement)
+    used = _choose_three(pairs) if is_paper else np.array(observables.is_seen)
+    normal, spread, shared = _equations(pairs, used, requirement, observables.sigma_laser_bias)
+    cofactor, is_fixed = invert_each(normal)
+    is_fixed &= np.trace(cofactor[:, -3:, -3:], axis1=1, axis2=2) <= LOOSE2
+    cofactor[~is_fixed], used[~is_fixed & is_paper] = 0.0, False
+    moved = cofactor @ shared
+    cov = cofactor @ spread @ cofactor + moved @ _transposed(moved)
+    if is_paper:
+        position, place = cofactor, cov
+        cov = np.zeros((len(cov), 6, 6))
+        level2 = requirement.sigma_levelling**2
+        cov[:, 0, 0] = cov[:, 1, 1] = level2
+        cov[:, 3:, :2] = -requirement.sigma_levelling * moved[:, :, 1:]
+        cov[:, :2, 3:] = _transposed(cov[:, 3:, :2])
+        cov[:, 2, 2] = _heading_variances(observables, used, requirement)
+        cofactor, cov[:, 3:, 3:] = cov.copy(), place
+        cofactor[:, 3:, 3:] = position
+    cov[:, 5, 5] += requirement.resection.sigma_height**2
+    cov[~is_fixed] = cofactor[~is_fixed] = np.diag(np.full(6, np.inf))
+    return Positions(cov, cofactor, used)
+
+
+def pairs_of(observables: Observables, requirement: Requirement) -> Pairs:
+    """Return what each mark adds to the equations of each station.
+
+    Notes
+    -----
+    By three circles, horizontal distances and heights of levelled centres alone count.
+    """
+    v, is_seen = observables.vectors, observables.is_seen
+    stated, true = (
+        np.where(is_seen[..., None, None], covs, np.eye(3))
+        for covs in covariances(observables, requirement)
+    )
     if requirement.method == "paper":
-        found, moved = _three_circles(observables, requirement)
+        J, lean = _circle_equations(v)
+        levelling = requirement.sigma_levelling**2 * lean @ _transposed(lean)
+        weights = _transposed(J) @ np.linalg.inv(_on_circles(J, stated) + levelling) @ J
     else:
-        found, moved = _free_stations(observables, requirement)
-    shared2 = shared_variance(observables.sigma_laser_bias)
-    found.cov_motion[:] += shared2 * moved[:, :, None] * moved[:, None, :]
-    found.cov_motion[:, 5, 5] += requirement.resection.sigma_height**2
-    return found
+        weights = invert_each(stated)[0]
+    return Pairs(v, weights, weights @ true @ weights, is_seen)
+
+
+def start_of(requirement: Requirement) -> Array:
+    """Return the normal matrix without a mark: position, or gravity, heading and position."""
+    if requirement.method == "paper":
+        return np.zeros((3, 3))
+    return np.diag([requirement.sigma_levelling**-2.0] * 2 + [0.0] * 4)
+
+
+def shared_sigmas(sigma_laser_bias: float, requirement: Requirement) -> Array:
+    """Return the sigmas of errors that marks of a station share, in the order of ``add_mark``."""
+    sigmas = [np.sqrt(shared_variance(sigma_laser_bias)), *[requirement.sigma_levelling] * 2]
+    return np.array(sigmas if requirement.method == "paper" else sigmas[:1])
 
 
 def claimed_bias_variance(sigma_laser_bias: float) -> float:
@@ -106,37 +155,12 @@ def shared_variance(sigma_laser_bias: float) -> float:
     return sigma_laser_bias**2 / N_LASERS
 
 
-def information(
-    observables: Observables, requirement: Requirement, *, is_summed: bool = False
-) -> Information:
-    """Return the contributions of marks, or (``is_summed``) their sum over the marks seen."""
-    n_stations, n_marks = observables.is_seen.shape
-    shape = (n_stations, 1 if is_summed else n_marks)
-    out = Information(np.zeros((*shape, 6, 6)), np.zeros((*shape, 6, 6)), np.zeros((*shape, 6)))
-    if n_marks:
-        v, covs, is_seen = observables.vectors, observables.cov_centres, observables.is_seen
-        sigma_bias = observables.sigma_laser_bias
-        _add_contributions(v, *_covariances(v, covs, sigma_bias, requirement), is_seen, tuple(out))
-    return out
-
-
-def independent_information(observables: Observables, requirement: Requirement) -> Array:
-    """Return the information of each mark about a station's position for a known rotation."""
-    v = observables.vectors
-    across = np.sum(v**2, axis=2)[..., None, None] * np.eye(3) - v[..., :, None] * v[..., None, :]
-    noise = observables.cov_centres + requirement.sigma_marks**2 * np.eye(3)
-    is_seen = observables.is_seen[..., None, None]
-    covs = np.where(is_seen, noise + _SIGMA_AIM**2 * across, np.eye(3))
-    return np.where(is_seen, np.linalg.inv(covs), 0.0)
-
-
 def reliability(
     observables: Observables, found: Positions, requirement: Requirement
 ) -> Reliability:
     """Return the size of errors in a mark that tests find, and the effect of smaller ones."""
     v = observables.vectors
-    sigma_bias = observables.sigma_laser_bias
-    stated, _ = _covariances(v, observables.cov_centres, sigma_bias, requirement)
+    stated, _ = covariances(observables, requirement)
     covs = np.where(found.used[..., None, None], stated, np.eye(3))
     is_fixed: Mask = np.asarray(np.isfinite(found.cov_motion).all(axis=(1, 2)))
     used = np.asarray(found.used & is_fixed[:, None])
@@ -160,84 +184,48 @@ def reliability(
     )
 
 
-def _covariances(
-    v: Array, cov_centres: Array, sigma_laser_bias: float, requirement: Requirement
-) -> tuple[Array, Array]:
+def covariances(observables: Observables, requirement: Requirement) -> tuple[Array, Array]:
     """Return the centres' covariances as a survey states them, and the true ones.
 
     A survey takes the remaining laser biases as independent, along the ranges; true are noise and
     the error of aiming across them, beside a range error that all centres share.
     """
+    v = observables.vectors
     d2 = np.maximum(np.sum(v**2, axis=-1), 1e-9)[..., None, None]
     along = v[..., :, None] * v[..., None, :]
-    noise = cov_centres + requirement.sigma_marks**2 * np.eye(3)
-    bias2 = claimed_bias_variance(sigma_laser_bias)
+    noise = observables.cov_centres + requirement.sigma_marks**2 * np.eye(3)
+    bias2 = claimed_bias_variance(observables.sigma_laser_bias)
     stated = noise + requirement.resection.sigma_common**2 * np.eye(3) + bias2 / d2 * along
     return stated, noise + _SIGMA_AIM**2 * (d2 * np.eye(3) - along)
 
 
-def _free_stations(observables: Observables, requirement: Requirement) -> tuple[Positions, Array]:
-    """Return the positions of free stations, and their motion by a common range error of 1 m."""
-    parts = information(observables, requirement, is_summed=True)
-    normal, cov_rhs, bias_rhs = (part[:, 0] for part in parts)
-    for matrix in (normal, cov_rhs):
-        matrix[:, [0, 1], [0, 1]] += requirement.sigma_levelling**-2
-    cofactor, is_fixed = invert_each(normal)
-    is_fixed &= np.trace(cofactor[:, 3:, 3:], axis1=1, axis2=2) <= LOOSE2
-    cofactor[~is_fixed] = 0.0
-    cov, moved = cofactor @ cov_rhs @ cofactor, (cofactor @ bias_rhs[..., None])[..., 0]
-    cov[~is_fixed] = cofactor[~is_fixed] = np.diag(np.full(6, np.inf))
-    return Positions(cov, cofactor, np.array(observables.is_seen)), moved
+def _equations(
+    pairs: Pairs, used: Mask, requirement: Requirement, sigma_laser_bias: float
+) -> tuple[Array, Array, Array]:
+    """Return normal matrices, covariances and shared errors of right-hand sides of stations."""
+    start, sigmas = start_of(requirement), shared_sigmas(sigma_laser_bias, requirement)
+    normal, spread = (np.tile(start, (len(used), 1, 1)) for _ in range(2))
+    shared = np.zeros((*normal.shape[:2], len(sigmas)))
+    _add_marks(pairs, used, normal, spread, shared)
+    normal, spread = (np.tril(one) + _transposed(np.tril(one, -1)) for one in (normal, spread))
+    return normal, spread, shared * sigmas
 
 
-def _three_circles(observables: Observables, requirement: Requirement) -> tuple[Positions, Array]:
-    """Return positions by three circles, and their motion by a common range error of 1 m."""
-    level2 = requirement.sigma_levelling**2
-    is_cut, three = _choose_three(observables)
-    cov = np.tile(np.diag(np.full(6, np.inf)), (len(is_cut), 1, 1))
-    cofactor, moved = cov.copy(), np.zeros(cov.shape[:2])
-    used = np.zeros(observables.is_seen.shape, dtype=np.bool_)
-    rows = np.flatnonzero(is_cut)
-    pairs = rows[:, None], three[rows]
-    v = observables.vectors[pairs]
-    sigma_bias = observables.sigma_laser_bias
-    stated, true = _covariances(v, observables.cov_centres[pairs], sigma_bias, requirement)
-    J, lean = _circle_equations(v)
-    weights = np.linalg.inv(_on_circles(J, stated) + level2 * lean @ _transposed(lean))
-    weighted = _transposed(J) @ weights
-    inverse = np.linalg.inv((weighted @ J).sum(axis=1))
-    gain = inverse[:, None] @ weighted
-    tilt = (gain @ lean).sum(axis=1)
-    position = (gain @ _on_circles(J, true) @ _transposed(gain)).sum(axis=1)
-    position = position + level2 * tilt @ _transposed(tilt)
-    flat2 = np.sum(v[..., :2] ** 2, axis=2)
-    left = np.stack([-v[..., 1], v[..., 0], np.zeros(v.shape[:-1])], axis=-1) / flat2[..., None]
-    is_fixed = np.trace(position, axis1=1, axis2=2) <= LOOSE2
-    rows, (inverse, gain, tilt, position, left, true, v) = (
-        rows[is_fixed],
-        (part[is_fixed] for part in (inverse, gain, tilt, position, left, true, v)),
-    )
-    used[rows[:, None], three[rows]] = True
-    cov[rows] = 0.0
-    cov[rows, 0, 0] = cov[rows, 1, 1] = level2
-    cov[rows, 2, 2] = np.einsum("eki,ekij,ekj->e", left, true, left) / 9.0
-    cov[rows, 3:, :2] = -level2 * tilt
-    cov[rows, :2, 3:] = -level2 * _transposed(tilt)
-    cov[rows, 3:, 3:] = position
-    cofactor[rows] = cov[rows]
-    cofactor[rows, 3:, 3:] = inverse
-    towards = v / np.linalg.norm(v, axis=2, keepdims=True)
-    moved[rows, 3:] = np.einsum("ekij,ekjl,ekl->ei", gain, J[is_fixed], towards)
-    return Positions(cov, cofactor, used), moved
+def _heading_variances(observables: Observables, used: Mask, requirement: Requirement) -> Array:
+    """Return the variances of the mean of the directions to three marks."""
+    v = observables.vectors
+    _, true = covariances(observables, requirement)
+    flat2 = np.maximum(np.sum(v[..., :2] ** 2, axis=2), 1e-18)
+    left = np.stack([-v[..., 1], v[..., 0]], axis=-1) / flat2[..., None]
+    variances = np.einsum("eni,enij,enj->en", left, true[..., :2, :2], left)
+    return np.asarray(np.where(used, variances, 0.0).sum(axis=1) / 9.0)
 
 
-def _choose_three(observables: Observables) -> tuple[Mask, Index]:
-    """Return at which stations three circles cut, and the three marks whose circles cut best."""
-    v = observables.vectors[..., :2]
-    lines = v / np.maximum(np.linalg.norm(v, axis=2, keepdims=True), 1e-9)
-    is_cut, three = np.zeros(len(v), dtype=np.bool_), np.zeros((len(v), 3), dtype=np.intp)
-    _choose_each(lines, observables.is_seen, is_cut, three)
-    return is_cut, three
+def _choose_three(pairs: Pairs) -> Mask:
+    """Return the three marks of each station whose circles cut best; none where they do not cut."""
+    used = np.zeros(pairs.is_seen.shape, dtype=np.bool_)
+    _choose_each(pairs, used)
+    return used
 
 
 def _circle_equations(v: Array) -> tuple[Array, Array]:
@@ -257,55 +245,114 @@ def _transposed(stack: Array) -> Array:
 
 
 @compiled
-def _choose_each(lines: Array, is_seen: Mask, is_cut: Mask, three: Index) -> None:
-    """Choose three marks for each station."""
-    places, seen = np.empty(lines.shape[1], np.intp), np.empty((lines.shape[1], 2))
-    for e in range(len(lines)):
-        n = 0
-        for m in range(lines.shape[1]):
-            if is_seen[e, m]:
-                places[n], seen[n, 0], seen[n, 1] = m, lines[e, m, 0], lines[e, m, 1]
-                n += 1
-        trace, _ = best_three(seen[:n], -_ANY, _ANY, three[e])
-        is_cut[e] = trace < _TRACE_MOST
-        if is_cut[e]:
-            for k in range(3):
-                three[e, k] = places[three[e, k]]
+def best_circles(pairs: Pairs, e: int, marks: Index, three: Index) -> bool:
+    """Find the three of some marks whose circles cut best at a station; return whether they cut."""
+    n, lines, seen = 0, np.empty((len(marks), 2)), np.empty(len(marks), np.intp)
+    for c in marks:
+        if pairs.is_seen[e, c]:
+            x, y = pairs.vectors[e, c, 0], pairs.vectors[e, c, 1]
+            flat = max(np.sqrt(x * x + y * y), 1e-9)
+            seen[n], lines[n, 0], lines[n, 1] = c, x / flat, y / flat
+            n += 1
+    trace, _ = best_three(lines[:n], -_ANY, _ANY, three)
+    if trace >= _TRACE_MOST:
+        return False
+    for k in range(3):
+        three[k] = seen[three[k]]
+    return True
 
 
 @compiled
-def _add_contributions(
-    vectors: Array, stated: Array, true: Array, is_seen: Mask, out: tuple[Array, Array, Array]
-) -> None:
-    """Add the contribution of each mark to its own row of the output, or all to the only one."""
-    normal, cov_rhs, bias_rhs = out
-    weight, J = np.empty((3, 3)), np.zeros((3, 6))
-    weighted, propagated = np.empty((3, 6)), np.empty((3, 6))
-    J[0, 3] = J[1, 4] = J[2, 5] = 1.0
-    for e in range(len(vectors)):
-        for m in range(vectors.shape[1]):
-            if not is_seen[e, m] or not invert(stated[e, m], weight):
-                continue
-            k = min(m, normal.shape[1] - 1)
-            x, y, z = vectors[e, m, 0], vectors[e, m, 1], vectors[e, m, 2]
-            d = np.sqrt(x * x + y * y + z * z)
-            J[0, 1], J[0, 2], J[1, 0], J[1, 2], J[2, 0], J[2, 1] = z, -y, -z, x, y, -x
-            _multiply(weight, J, weighted)
-            _multiply(true[e, m], weighted, propagated)
-            for i in range(6):
-                along = weighted[0, i] * x + weighted[1, i] * y + weighted[2, i] * z
-                bias_rhs[e, k, i] += along / d
-                for j in range(6):
-                    for a in range(3):
-                        normal[e, k, i, j] += J[a, i] * weighted[a, j]
-                        cov_rhs[e, k, i, j] += weighted[a, i] * propagated[a, j]
+def _choose_each(pairs: Pairs, used: Mask) -> None:
+    """Mark the three marks that each station uses."""
+    three, marks = np.empty(3, np.intp), np.arange(used.shape[1])
+    for e in range(len(used)):
+        if best_circles(pairs, e, marks, three):
+            for c in three:
+                used[e, c] = True
 
 
 @compiled
-def _multiply(left: Array, right: Array, out: Array) -> None:
-    """Write the product of a (3, 3) and a (3, 6) matrix."""
-    for i in range(3):
-        for j in range(6):
-            out[i, j] = (
-                left[i, 0] * right[0, j] + left[i, 1] * right[1, j] + left[i, 2] * right[2, j]
-            )
+def _add_marks(pairs: Pairs, used: Mask, normal: Array, spread: Array, shared: Array) -> None:
+    """Add the marks that each station uses to its equations."""
+    for e in range(len(used)):
+        for c in range(used.shape[1]):
+            if used[e, c]:
+                add_mark(pairs, e, c, normal[e], spread[e], shared[e])
+
+
+@compiled
+def add_mark(pairs: Pairs, e: int, c: int, normal: Array, spread: Array, shared: Array) -> None:
+    """Add a mark to the equations of a station: lower triangles, and shared errors.
+
+    Shared are a range error of 1 m and, where the unknowns are the position alone, a turn of 1 rad
+    of the levelled frame about x and about y.
+    """
+    v, weight = pairs.vectors[e, c], pairs.weights[e, c]
+    _add_block(v, weight, normal)
+    _add_block(v, pairs.spreads[e, c], spread)
+    x, y, z = v
+    d, n = np.sqrt(x * x + y * y + z * z), len(normal) - 3
+    p = (weight[0, 0] * x + weight[1, 0] * y + weight[2, 0] * z) / d
+    q = (weight[1, 0] * x + weight[1, 1] * y + weight[2, 1] * z) / d
+    r = (weight[2, 0] * x + weight[2, 1] * y + weight[2, 2] * z) / d
+    shared[n, 0] += p
+    shared[n + 1, 0] += q
+    shared[n + 2, 0] += r
+    for k in range(1, shared.shape[1]):
+        for i in range(3):
+            shared[i, k] += _turned(v, weight, i, k - 1)
+    if n:
+        shared[0, 0] += y * r - z * q
+        shared[1, 0] += z * p - x * r
+        shared[2, 0] += x * q - y * p
+
+
+@compiled
+def _add_block(v: Array, block: Array, out: Array) -> None:
+    """Add ``J' block J`` to at least the lower triangle of a matrix, ``J = [-[v]x, 1]`` or 1."""
+    x, y, z = v
+    n = len(out) - 3
+    for j in range(3):
+        for i in range(j, 3):
+            out[n + i, n + j] += block[i, j]
+        if n:
+            p, q, r = _turned(v, block, 0, j), _turned(v, block, 1, j), _turned(v, block, 2, j)
+            out[3, j] += p
+            out[4, j] += q
+            out[5, j] += r
+            out[0, j] += y * r - z * q
+            out[1, j] += z * p - x * r
+            out[2, j] += x * q - y * p
+
+
+@compiled
+def _turned(v: Array, block: Array, i: int, j: int) -> float:
+    """Return one element of ``-block [v]x``."""
+    k, m = (j + 1) % 3, (j + 2) % 3
+    return float(block[i, m] * v[k] - block[i, k] * v[m])
+
+
+@compiled
+def sigma_3d(
+    normal: Array, spread: Array, shared: Array, sigmas: Array, sigma_height: float
+) -> float:
+    """Return the 3-D sigma of a station; infinite without a position. Inverts the normal matrix.
+
+    The first two matrices by their lower triangles.
+    """
+    if not invert(normal, normal):
+        return np.inf
+    p, total, trace = len(normal), sigma_height**2, 0.0
+    for a in range(p - 3, p):
+        trace += normal[a, a]
+        for i in range(p):
+            total += spread[i, i] * normal[a, i] ** 2
+            for j in range(i):
+                total += 2.0 * spread[i, j] * normal[a, i] * normal[a, j]
+        for r in range(len(sigmas)):
+            moved = 0.0
+            for i in range(p):
+                moved += shared[i, r] * normal[a, i]
+            total += (sigmas[r] * moved) ** 2
+    return np.sqrt(total) if trace <= LOOSE2 else np.inf

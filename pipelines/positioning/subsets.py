@@ -13,14 +13,14 @@ import numpy as np
 
 from spheremark.pipelines.config import ResectionConfig
 from spheremark.pipelines.errors import ConfigError
-from spheremark.pipelines.estimation.least_squares import normal_equations
+from spheremark.pipelines.estimation.least_squares import solve_by_chords
 from spheremark.pipelines.estimation.linear_algebra import invert_each
 from spheremark.pipelines.geometry import (
     by_motion,
     has_heading,
     included_angle,
     rigid,
-    transform,
+    skew,
     unit,
 )
 from spheremark.pipelines.model import (
@@ -35,8 +35,8 @@ from spheremark.pipelines.positioning.matching import (
     Scene,
     cov_of_shared,
     gather,
+    moved,
     observe,
-    solve_poses,
 )
 from spheremark.pipelines.positioning.trilateration import (
     USELESS,
@@ -239,23 +239,39 @@ def _of_three(_towards: Array, groups: Sequence[Index]) -> list[Index]:
 def _by_pose(
     scene: Scene, matches: Index, groups: Sequence[Index], start: Array
 ) -> list[Positions]:
-    """Position subsets by their full poses: centres and gravity, as the free station does."""
-    R = start[:3, :3]
-    p_site = transform(start, scene.centres_base[matches[:, 0]])
-    weighted = invert_each(observe(scene, matches, start)[0].cov)[0]
-    weighted = np.swapaxes(by_motion(p_site), 1, 2) @ weighted  # J' P
-    by_ranges = (weighted @ unit(p_site - start[:3, 3])[..., None])[..., 0]
-    by_heights = weighted @ (R @ scene.R_station_base[2])
-    J = by_motion(start[:3, 3])
+    """Position subsets by their full poses: centres and gravity, as the free station does.
+
+    Unknown are small motions in base, about its origin, in which the equations stay the same.
+    """
+    R, base = start[:3, :3], scene.centres_base[matches[:, 0]]
+    goals, plumb = scene.marks_site[matches[:, 1]], scene.R_station_base[2]
+    centres, gravity = observe(scene, matches, start)
+    J, turn = by_motion(base), np.hstack([-skew(plumb), np.zeros((3, 3))])
+    weighted = np.swapaxes(J, 1, 2) @ (R.T @ invert_each(centres.cov)[0] @ R)
+    level = invert_each(gravity.cov[0])[0]
+    leaned = R[:2] @ turn
+    normal, start_normal = weighted @ J, leaned.T @ level @ leaned
+    by_ranges, by_heights = (weighted @ unit(base)[..., None])[..., 0], weighted @ plumb
     found = []
     for chosen in groups:
-        solved = solve_poses(scene, matches[chosen], start)
-        cov, _ = invert_each(normal_equations(observe(scene, matches[chosen], start))[0])
-        gains = J @ cov
-        cov = gains @ J.T + _cov_shared(
+        cov, _ = invert_each(normal[chosen].sum(axis=1) + start_normal)
+        stacked = weighted[chosen].swapaxes(2, 3).reshape(len(chosen), -1, 6)
+
+        def rhs(T: Array, chosen: Index = chosen, stacked: Array = stacked) -> Array:
+            off = base[chosen] + (T[:, None, :3, 3] - goals[chosen]) @ T[:, :3, :3]
+            tilt = (T[:, :2, :3] @ plumb) @ level
+            up = (tilt[:, None] @ T[:, :2, :3])[:, 0] @ turn
+            return np.asarray(-(off.reshape(len(off), 1, -1) @ stacked)[:, 0] - up)
+
+        def move(T: Array, xi: Array) -> Array:
+            return np.asarray(T @ moved(np.tile(np.eye(4), (len(T), 1, 1)), xi))
+
+        T, is_settled = solve_by_chords(cov, rhs, move, np.tile(start, (len(chosen), 1, 1)))
+        gains = R @ cov[:, 3:]
+        cov = gains[:, :, 3:] @ R.T + _cov_shared(
             scene, matches[chosen, 0], gains, by_ranges[chosen], by_heights[chosen]
         )
-        found.append(Positions(solved.estimates[:, :3, 3], cov, solved.is_settled))
+        found.append(Positions(T[:, :3, 3], cov, is_settled))
     return found
 
 

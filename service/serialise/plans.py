@@ -114,10 +114,13 @@ def optimum_json(found: Optimum, goal: Goal) -> Plain:
     if np.isfinite(found.worst_after_loss):
         worst = 1e3 * found.worst_after_loss
         notes[0] += f" Without its worst mark: {worst:.2f} mm (3-D sigma)."
-    if np.isfinite(found.log_det):
+    excess = found.evaluation.worst_sigma_3d / found.bound - 1.0
+    if np.isfinite(excess):
+        where = f"every {found.bound_spacing:.2f} m" if found.bound_spacing else "that were given"
         notes.append(
-            f"{found.n_candidates:,} places compared; {100 * share:.1f} % of the information that "
-            "no arrangement of as many marks can exceed."
+            f"{found.n_candidates:,} places compared. The worst stop is within "
+            f"{max(100 * excess, 0.0):.1f} % of any arrangement of as many marks on "
+            f"{found.n_bounded:,} places {where}: none has less than {1e3 * found.bound:.3f} mm."
         )
     return {
         "optimum": {
@@ -128,6 +131,10 @@ def optimum_json(found: Optimum, goal: Goal) -> Plain:
             "information_gain": _number(found.log_det),
             "information_gain_bound": _number(found.log_det_bound),
             "share_of_bound": _number(share),
+            "worst_sigma_3d_bound_m": _number(found.bound),
+            "excess_over_bound": _number(excess),
+            "bound_spacing_m": found.bound_spacing or None,
+            "n_bounded": found.n_bounded,
             "n_candidates": found.n_candidates,
             "n_exchanges": found.n_exchanges,
         },

@@ -327,6 +327,10 @@ class OptimumQuality(Plain):
     information_gain: float | None
     information_gain_bound: float | None
     share_of_bound: float | None
+    worst_sigma_3d_bound_m: float | None
+    excess_over_bound: float | None
+    bound_spacing_m: float | None
+    n_bounded: int
     n_candidates: int
     n_exchanges: int
 

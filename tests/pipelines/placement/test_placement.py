@@ -37,7 +37,7 @@ from spheremark.pipelines.placement import (
     site_of_grid,
     stops_of_field,
 )
-from spheremark.pipelines.placement.bounds import least_sigmas, widest_sigma
+from spheremark.pipelines.placement.bounds import information_of, least_sigmas, widest_sigma
 from spheremark.pipelines.placement.centre_model import expect_centres
 from spheremark.pipelines.placement.evaluation import predict_observables
 from spheremark.pipelines.placement.probability import probability_within
@@ -491,11 +491,10 @@ def test_what_no_arrangement_can_is_refused_without_a_search():
     rng = np.random.default_rng(1)
     for method in PLAN_METHODS:
         requirement = Requirement(method=method)
-        visibility = find_visibility(site, stops.p_site, candidates.arrangement)
-        _, seen = predict_observables(
-            stops.p_site, candidates.arrangement, MODEL, requirement, visibility
-        )
-        bound = least_sigmas(seen, requirement)
+        every = Arrangement.numbered(candidates.p_site)
+        visibility = find_visibility(site, stops.p_site, every)
+        _, seen = predict_observables(stops.p_site, every, MODEL, requirement, visibility)
+        bound = least_sigmas(information_of(seen, requirement), requirement)
         for k in (3, 4, 7, 12):
             for _ in range(10):
                 drawn = drawn_marks(candidates, k, rng)
