@@ -19,7 +19,7 @@ from scipy.stats import chi2
 
 from spheremark.pipelines.config import SurveyConfig
 from spheremark.pipelines.detection import extract
-from spheremark.pipelines.errors import DegenerateGeometryError, InputError, SolveError
+from spheremark.pipelines.errors import DegenerateGeometryError, SolveError, SpheremarkError
 from spheremark.pipelines.evaluation.detection import (
     N_MANY,
     main_reasons,
@@ -60,9 +60,10 @@ N_FEW, N_LINES, HALF = 8, 2, 0.5
 CLASSES = (
     f"{N_MANY} returns or more, half visible",
     f"{N_FEW} to {N_MANY - 1} returns, half visible",
+    f"{N_FEW} returns or more, on one scan line",
     "fewer returns, or mostly hidden",
 )
-"""Classes of markers by returns and visible share; those of the first lie on two lines or more."""
+"""Classes of markers by returns and visible share; the first two lie on two scan lines or more."""
 
 LEVELS = (0.50, 0.68, 0.95)
 """Levels of the ellipsoids that errors are compared with."""
@@ -161,14 +162,14 @@ def _score(seed: int, *, peers: Peers | None) -> Score:
     decoys = [decoy.kind for decoy in field.decoys]
     try:
         cloud, rows = _tagged(scan, choose_rig(scan.log, None))
-    except InputError as error:
+        start = perf_counter()
+        found = extract(cloud, config.extraction, field.marker_radius)
+        fits = fit_markers(_METHOD, cloud, found, config.fitting, field.marker_radius)
+        seconds = perf_counter() - start
+    except SpheremarkError as error:
         n_marks = len(field.marks.names)
         seen = [Seen(_class_of(scan, i), (), error.code, None) for i in range(n_marks)]
         return Score(seed, field.family, seen, [], decoys, None, str(error), 0.0)
-    start = perf_counter()
-    found = extract(cloud, config.extraction, field.marker_radius)
-    fits = fit_markers(_METHOD, cloud, found, config.fitting, field.marker_radius)
-    seconds = perf_counter() - start
     places = _places(scan, cloud, rows)
     calls, matched = _calls(scan, found, fits, places)
     if peers:
@@ -202,8 +203,10 @@ def _class_of(scan: Scan, mark: int) -> str:
     n, n_lines = scan.stop.counts[mark]
     about, name = scan.truth.about, scan.world.field.marks.names[mark]
     if about["visible_shares"][scan.stop.truth.name][name] < HALF or n < N_FEW:
+        return CLASSES[3]
+    if n_lines < N_LINES:
         return CLASSES[2]
-    return CLASSES[0] if n >= N_MANY and n_lines >= N_LINES else CLASSES[1]
+    return CLASSES[0] if n >= N_MANY else CLASSES[1]
 
 
 def _places(scan: Scan, cloud: StitchedCloud, rows: Index) -> Array:
