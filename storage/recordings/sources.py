@@ -13,6 +13,7 @@ import shutil
 import sqlite3
 import struct
 import zipfile
+import zlib
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, closing, contextmanager
 from dataclasses import dataclass, field
@@ -249,7 +250,8 @@ def _complaint(path: Path, head: bytes) -> str:
         return f"{path.name} is empty, not an MCAP file: was the upload cut?"
     return (
         f"The file begins with {head[:8]!r}: it is not an MCAP file, nor a rosbag2 (.db3), a ROS 1 "
-        "bag, a PCAP of a Velodyne, or a zip of these."
+        "bag, a PCAP of a Velodyne, or a zip of these. The cloud of a single scan is read by "
+        "`spheremark spheres`."
     )
 
 
@@ -294,7 +296,7 @@ def _unzip(path: Path, folder: Path) -> None:
                 place.parent.mkdir()
                 with archive.open(member) as packed, place.open("wb") as file:
                     shutil.copyfileobj(packed, file, _BATCH)
-    except (zipfile.BadZipFile, RuntimeError, EOFError, OSError, ValueError) as error:
+    except (zipfile.BadZipFile, zlib.error, RuntimeError, EOFError, OSError, ValueError) as error:
         raise RecordingError(f"The zip cannot be read: {error}. Pack it again.") from error
 
 

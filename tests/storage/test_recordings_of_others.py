@@ -41,6 +41,7 @@ from spheremark.storage.recordings import (
     read_log,
     transforms,
 )
+from spheremark.storage.recordings.apart import inspect_apart
 from tests.storage.recorder import (
     DEFINITIONS,
     STORE,
@@ -494,6 +495,44 @@ def test_a_zip_that_declares_more_than_it_can_hold_is_refused(tmp_path):
         archive.writestr("../../notes.txt", "no log")
     with pytest.raises(NotMcapError, match=r"b\.zip holds no log"):
         read_log(tmp_path / "b.zip")
+
+
+def test_a_foreign_container_is_inspected_in_a_process_that_can_be_ended(tmp_path, items):
+    (part,) = rosbag2(tmp_path / "bag", items).glob("*.db3")
+    options = LogOptions(joint="gimbal_joint")
+    assert inspect_apart(part, options).to_mapping() == inspect_log(part, options).to_mapping()
+    ended = inspect_apart(part, seconds=0.001)
+    assert (ended.verdict, ended.topics) == ("refused", ())
+    assert "ended with code" in ended.reasons[0]
+
+
+def test_a_zip_whose_compressed_bytes_are_damaged_is_refused(tmp_path, items):
+    record(tmp_path / "a.mcap", items)
+    with zipfile.ZipFile(tmp_path / "a.zip", "w", zipfile.ZIP_DEFLATED) as archive:
+        archive.write(tmp_path / "a.mcap", "a.mcap")
+    octets = bytearray((tmp_path / "a.zip").read_bytes())
+    octets[200:240] = bytes(40)
+    (tmp_path / "a.zip").write_bytes(octets)
+    with pytest.raises(RecordingError, match="zip cannot be read"):
+        read_log(tmp_path / "a.zip")
+
+
+def test_mutated_logs_give_a_report_and_never_an_unknown_error(tmp_path, items):
+    (part,) = rosbag2(tmp_path / "bag", items).glob("*.db3")
+    seeds = [
+        record(tmp_path / "a.mcap", items, chunk_size=2000).read_bytes(),
+        part.read_bytes(),
+        rosbag1(tmp_path / "a.bag", items, next(iter(Bag1.CompressionFormat))).read_bytes(),
+    ]
+    rng = np.random.default_rng(2)
+    path = tmp_path / "mutated"
+    for k in range(90):
+        octets = bytearray(seeds[k % 3])
+        for place in rng.integers(0, len(octets), 3):
+            octets[place : place + 4] = rng.choice([b"\xff" * 4, bytes(4), rng.bytes(4)])
+        path.write_bytes(octets[: rng.integers(20, len(octets))] if k % 4 == 0 else octets)
+        report = inspect_log(path, LogOptions(recover=bool(k % 2)))
+        assert report.reasons or report.n_returns
 
 
 def test_a_database_that_is_no_bag_is_refused(tmp_path):

@@ -445,3 +445,25 @@ def test_stops_are_cut_alike_when_the_cloud_is_not_in_order_of_time(rng):
     swapped = np.arange(len(log.rings)).reshape(-1, 10)[:, ::-1].ravel()
     expected = [len(stop.rings) for stop in split_stops(log, CONFIG)]
     assert [len(stop.rings) for stop in split_stops(subset(log, swapped), CONFIG)] == expected
+
+
+def test_packets_without_times_keep_all_returns_whatever_gaps_follow_them(rng):
+    rig = crooked_rig(rng)
+    log, _ = scan_log(rng, rig, n=60_000)  # a few returns in each packet
+    first = log.stamps_lidar_ns.min()
+    packet = 1_330_000  # [ns]; the gimbal turns by less than 0.05 deg in one
+    starts = first + (log.stamps_lidar_ns - first) // packet * packet
+    kept = (starts - first) // packet % 5 != 2  # every fifth one is lost on its way
+    turn = np.linspace(-1, 1 + np.ptp(log.stamps_lidar_ns) / NS, 500)
+    packets = joints(subset(log, kept), turn, np.radians(27.0) * turn)
+    packets = replace(packets, stamps_lidar_ns=starts[kept], has_pulse_times=False)
+    cloud = stitch(packets, rig, CONFIG)
+    assert len(cloud.p_base) == kept.sum()
+
+
+def test_a_gimbal_that_turns_faster_than_any_is_refused_with_the_option_for_its_unit(rng):
+    rig = crooked_rig(rng)
+    log, _ = scan_log(rng, rig)
+    fast = replace(log, gimbal_angles=np.degrees(log.gimbal_angles))
+    with pytest.raises(RecordingError, match=r"deg/s; at most 900.*--joint-unit deg"):
+        stitch(fast, rig, CONFIG)
