@@ -10,6 +10,8 @@ from typing import TYPE_CHECKING, Literal, Self
 from pydantic import Field, SecretStr, model_validator
 from pydantic_settings import BaseSettings, SettingsConfigDict
 
+from spheremark.service.tokens import BITS_MIN, Tokens, is_strong
+
 if TYPE_CHECKING:
     from spheremark.storage.catalogue.sandbox import QueryLimits
 
@@ -45,7 +47,8 @@ class Settings(BaseSettings):
     )
     token: SecretStr | None = Field(
         default=None,
-        description="Secret that every request must carry as 'Authorization: Bearer <token>'.",
+        description="Secret of 128 bits or more that requests carry ('Authorization: Bearer "
+        "<token>'), beside those of `spheremark token`.",
     )
     workers: int = Field(
         default_factory=lambda: min(2, os.cpu_count() or 1),
@@ -122,10 +125,15 @@ class Settings(BaseSettings):
     @model_validator(mode="after")
     def _is_safe(self) -> Self:
         """Refuse an open address without a token, and an address that is no scheduler."""
-        if not is_loopback(self.host) and not self.token_text:
+        if self.token_text and not is_strong(self.token_text):
             raise ValueError(
-                f"host is {self.host}, which others can reach; set SPHEREMARK_TOKEN to a secret, "
-                "or listen on 127.0.0.1"
+                f"SPHEREMARK_TOKEN has less than {BITS_MIN} bits; take 22 random characters or "
+                "more, or use `spheremark token make NAME`"
+            )
+        if not is_loopback(self.host) and not Tokens(self.data, self.token_text).all():
+            raise ValueError(
+                f"host is {self.host}, which others can reach; make a token with `spheremark token "
+                "make NAME`, set SPHEREMARK_TOKEN, or listen on 127.0.0.1"
             )
         if self.scheduler and not self.scheduler.startswith(_KNOWN_SCHEMES):
             raise ValueError(

@@ -37,6 +37,7 @@ from spheremark.service.cli.terminal import announce_compilation, err, out
 from spheremark.service.cli.terminal import print_json as _print_json
 from spheremark.service.cli.terminal import progress as _progress
 from spheremark.service.cli.terminal import settings as _settings
+from spheremark.service.cli.tokens import token
 
 app = typer.Typer(
     help="Station positions from spherical markers and a gimbal-mounted LiDAR.",
@@ -45,6 +46,7 @@ app = typer.Typer(
     add_completion=False,
 )
 app.add_typer(plan, name="plan")
+app.add_typer(token, name="token")
 
 _EXPORTS = "results.duckdb, or points as .csv, .dxf, .xml (LandXML) or .geojson."
 AsJson = Annotated[bool, typer.Option("--json", help="JSON for programs.")]

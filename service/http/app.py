@@ -8,18 +8,23 @@ from contextlib import asynccontextmanager
 from importlib import metadata, resources
 from pathlib import Path
 from typing import Any
+from urllib.parse import parse_qs
 
 from fastapi import APIRouter, FastAPI, Request, Response
-from fastapi.responses import RedirectResponse
+from fastapi.responses import HTMLResponse, RedirectResponse
 from fastapi.staticfiles import StaticFiles
 from starlette.types import ASGIApp
 
+from spheremark.pipelines.errors import InputError
 from spheremark.service.errors import Problem, UnauthorizedError
 from spheremark.service.http import api, errors, security
 from spheremark.service.http.pages import frame, jobs, networks, plans, sites, surveys
 from spheremark.service.http.state import Current, opened
 from spheremark.service.settings import Settings
+from spheremark.service.tokens import Tokens
 from spheremark.storage.files import StorageError
+from spheremark.web.pages.base import Frame
+from spheremark.web.templating import render
 
 ROOT = "/api/v1"
 STATIC = Path(str(resources.files("spheremark.web"))) / "static"
@@ -119,17 +124,27 @@ def readiness(service: Current, response: Response) -> dict[str, Any]:
     return {"status": "ready" if is_ready else "not ready", **parts}
 
 
-@about.get("/login")
-def login(request: Request, service: Current, token: str = "") -> Response:
-    """Exchange the token for a cookie."""
-    known = service.settings.token_text
-    if known and not security.is_token(token, known):
-        raise UnauthorizedError("That is not the token; open /login?token=<token>.")
+@about.get("/login", response_class=HTMLResponse)
+def login_page(request: Request) -> Response:
+    """Show the form that takes a token; one in the address would be kept in histories and logs."""
+    if "token" in request.query_params:
+        raise InputError("A token does not belong into an address; open /login and enter it there.")
+    return HTMLResponse(render("login.html", frame=Frame()))
+
+
+@about.post("/login")
+async def login(request: Request, service: Current) -> Response:
+    """Exchange a token for a cookie."""
+    form = parse_qs((await request.body()).decode(errors="replace"))
+    tokens = Tokens(service.settings.data, service.settings.token_text)
+    found = tokens.of_text(form.get("token", [""])[0])
+    if found is None and tokens.all():
+        raise UnauthorizedError("That is no token of this service; open /login and try again.")
     response = RedirectResponse("/", status_code=303)
-    if known:
+    if found is not None:
         response.set_cookie(
             security.COOKIE,
-            security.cookie_value(known),
+            found.cookie,
             httponly=True,
             samesite="strict",
             secure=request.url.scheme == "https",

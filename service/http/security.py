@@ -7,8 +7,6 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-import hashlib
-import hmac
 import ipaddress
 import re
 from collections.abc import Mapping
@@ -29,9 +27,16 @@ from spheremark.service.errors import (
 )
 from spheremark.service.http.errors import problem_response
 from spheremark.service.settings import Settings
+from spheremark.service.tokens import Audit, Token, Tokens
+from spheremark.service.tokens import Scope as AccessScope
 
 COOKIE = "spheremark_token"
 OPEN_PATHS = ("/healthz", "/readyz", "/login", "/static/")  # open without the token
+ADMIN_PATHS = ("/api/v1/audit",)
+READING_PATHS = (
+    "/api/v1/sql",
+    *(f"/api/v1/plans/{verb}" for verb in ("evaluate", "optimise", "suggest", "random")),
+)
 LONG_PATHS = ("/api/v1/recordings", "/api/v1/terrains")  # streamed, with a limit of their own
 UPLOADS = "/api/v1/uploads/"  # and what is below it
 BODY_MAX = 16 << 20  # [bytes] of any other body
@@ -100,7 +105,8 @@ class SecurityMiddleware:
     def __init__(self, app: ASGIApp, settings: Settings) -> None:
         self.app = app
         self.own_host = settings.host
-        self.token = settings.token_text
+        self.tokens = Tokens(settings.data, settings.token_text)
+        self.audit = Audit(settings.data)
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Handle one request."""
@@ -110,26 +116,41 @@ class SecurityMiddleware:
 
         request = Request(scope)
         body = _Body(receive, request)
+        token: Token | None = None
 
         async def send_after_body(message: Message) -> None:
-            if message["type"] == "http.response.start" and message["status"] >= 400:
-                await body.read_to_its_end()
+            if message["type"] == "http.response.start":
+                self.note(request, token, message["status"])
+                if message["status"] >= 400:
+                    await body.read_to_its_end()
             await send(message)
 
         try:
-            self.check(request)
+            token = self.check(request)
         except SpheremarkError as error:
             response = problem_response(problem_of(error, scope["path"]), _challenge(error))
             await response(scope, receive, send_after_body)
             return
         await self.app(scope, body.receive, send_after_body)
 
-    def check(self, request: Request) -> None:
-        """Raise unless the request may pass."""
+    def note(self, request: Request, token: Token | None, status: int) -> None:
+        """Write into the audit log what changes something, and what was not allowed to."""
+        if request.method not in SAFE_METHODS or status in (401, 403):
+            self.audit.add(
+                token=token.name if token else "",
+                method=request.method,
+                path=request.scope["path"],
+                status=status,
+                client=request.client.host if request.client else "",
+            )
+
+    def check(self, request: Request) -> Token | None:
+        """Raise unless the request may pass; return its token, where tokens are needed."""
         headers, path = request.headers, request.scope["path"]
         check_form(headers)
         host = headers.get("host", "")
-        if not (self.token or is_trustworthy(host, self.own_host)):
+        needs_token = bool(self.tokens.all())
+        if not (needs_token or is_trustworthy(host, self.own_host)):
             raise ForbiddenError(
                 f"The request is for the host {host!r}, a name that others can point at this "
                 "machine; use 127.0.0.1 or localhost."
@@ -142,12 +163,29 @@ class SecurityMiddleware:
         declared = int(headers.get("content-length", "0"))
         if not is_long(path) and declared > BODY_MAX:
             raise _too_large(f"{declared:,}")
-        is_open = path.startswith(OPEN_PATHS)
-        if self.token and not is_open and not carries_token(request, self.token):
+        if not needs_token or path.startswith(OPEN_PATHS):
+            return None
+        token = token_of(request, self.tokens)
+        if token is None:
             raise UnauthorizedError(
-                "This service needs its token: send 'Authorization: Bearer <token>', or open "
-                "/login?token=<token> once in a browser."
+                "This service needs a token: send 'Authorization: Bearer <token>', or log in at "
+                "/login in a browser."
             )
+        needed = scope_of(request.method, path)
+        if not token.scope.includes(needed):
+            raise ForbiddenError(
+                f"The token {token.name!r} allows to {token.scope}; this needs {needed}. Make one "
+                f"with `spheremark token make NAME --scope {needed}`."
+            )
+        return token
+
+
+def scope_of(method: str, path: str) -> AccessScope:
+    """Return the scope that a request needs."""
+    if path.startswith(ADMIN_PATHS):
+        return AccessScope.ADMIN
+    is_reading = method in SAFE_METHODS or path in READING_PATHS
+    return AccessScope.READ if is_reading else AccessScope.WRITE
 
 
 def is_long(path: str) -> bool:
@@ -209,25 +247,15 @@ def is_cross_site(headers: Headers) -> bool:
     return origin is not None and origin.partition("://")[2] != headers.get("host", "")
 
 
-def carries_token(request: Request, token: str) -> bool:
-    """Whether the request carries the token in its header, or what stands for it in a cookie."""
+def token_of(request: Request, tokens: Tokens) -> Token | None:
+    """Return the token of a request: of its header, or of a cookie."""
     scheme, _, given = request.headers.get("authorization", "").partition(" ")
     if scheme.lower() == "bearer":
-        return is_token(given.strip(), token)
+        return tokens.of_text(given.strip())
     # Python's own parser of cookies takes quadratic time up to 3.11.9 and 3.12.5
     pairs = (one.strip().partition("=") for one in request.headers.get("cookie", "").split(";"))
-    kept = cookie_value(token)
-    return any(name == COOKIE and is_token(value, kept) for name, _, value in pairs)
-
-
-def is_token(given: str, token: str) -> bool:
-    """Whether this is the token, compared in constant time."""
-    return hmac.compare_digest(given.encode(), token.encode())
-
-
-def cookie_value(token: str) -> str:
-    """Return what a browser keeps in place of the token itself."""
-    return hmac.new(token.encode(), b"spheremark cookie", hashlib.sha256).hexdigest()
+    found = (tokens.of_cookie(value) for name, _, value in pairs if name == COOKIE)
+    return next((one for one in found if one is not None), None)
 
 
 class _Body:

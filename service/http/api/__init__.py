@@ -7,6 +7,7 @@ Every handler parses, makes one call and returns; requests and responses are in 
 from fastapi import APIRouter
 
 from spheremark.service.http.api import (
+    audit,
     jobs,
     plans,
     problems,
@@ -22,6 +23,6 @@ from spheremark.service.http.api import sites as products
 router = APIRouter()
 for part in (
     *(surveys, recordings, uploads, jobs, results),
-    *(products, rigs, plans, sql, problems),
+    *(products, rigs, plans, sql, audit, problems),
 ):
     router.include_router(part.router)
