@@ -152,7 +152,7 @@ def _process_stop(
     progress(0.0, f"Stitching {name}")
     with _timed(timings, "stitching"):
         cloud = stitch(log, rig, config.stitching)
-    weaknesses = log.weaknesses
+    weaknesses = (*log.weaknesses, *cloud.weaknesses, *_half_turn(cloud.coverage))
     del log
     progress(0.3, f"Extracting markers from {len(cloud.p_base):,} returns")
     with _timed(timings, "extraction"):
@@ -167,7 +167,7 @@ def _process_stop(
             )
     progress(0.8, "Positioning the station")
     with _timed(timings, "resection"):
-        fixes = _position(fits, marks, config, (*weaknesses, *_half_turn(cloud.coverage)))
+        fixes = _position(fits, marks, config, weaknesses)
     with _timed(timings, "subsets"):
         subsets = _subsets(fits, fixes, marks, config)
     with _timed(timings, "quality_control"):

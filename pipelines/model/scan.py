@@ -271,6 +271,8 @@ class StitchedCloud:
         Name of the stop.
     notes : tuple of str
         What weakens the result, as sentences.
+    weaknesses : tuple of str
+        Why a station of this scan is weak, among the notes too.
     """
 
     p_base: Column
@@ -284,6 +286,7 @@ class StitchedCloud:
     duration: float
     name: str
     notes: tuple[str, ...] = ()
+    weaknesses: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         columns = ("gimbal_angles", "intensities", "rings", "times")

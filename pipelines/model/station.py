@@ -307,6 +307,12 @@ class StopResult:
     distances: DistanceChecks | None = None
     timings: Mapping[str, float] = field(default_factory=dict)
 
+    @property
+    def sigma_heading(self) -> float:
+        """Standard deviation of the heading of base [rad], by the first fitting method."""
+        levellings = [found.levelling for found in self.fits.values()] or [self.cloud.levelling]
+        return levellings[0].sigma_heading
+
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class StopTruth:

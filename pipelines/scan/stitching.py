@@ -47,6 +47,7 @@ _SMEAR = np.radians(0.05)  # 7 mm at 7.5 m: largest turn during a message withou
 _RESTS_MIN = 4  # fewer rests than this are those before and after an even turn
 _SPEED_MAX = 5.0 * np.pi  # per second: revolutions of 10 Hz would be a quarter of a turn apart
 _TURNS = np.radians(0.1)  # per second; a gimbal at rest turns less
+_OVERRUN = 3.0  # joint samples after whose last one returns may go on
 _JOINT_GAP = 0.5  # [s]; over a longer gap of a moving gimbal the angle is a guess
 _JOINT_GAP_MOTION = np.radians(0.5)
 _SIGMA_UNLEVELLED = np.radians(3.0)  # how a rover may lean on ground it can drive on
@@ -184,7 +185,7 @@ def stitch(log: ScanLog, rig: Rig, config: StitchingConfig) -> StitchedCloud:
     pulses = Pulses(log.p_lidar, log.intensities, rings, log.stamps_lidar_ns)
     kept, tally = turn_returns(pulses, joints, _lidar(rig, config))
     _refuse_empty(log, joints, tally, config)
-    levelling = level(log, rig, config)
+    levelling, weaknesses = _clocked(level(log, rig, config), tally, joints)
     coverage, duration = _extent(tally, joints)
     notes += smear_note + pause_notes(log) + _count_notes(tally)
     notes += _level_notes(levelling) + _turn_notes(coverage)
@@ -199,7 +200,34 @@ def stitch(log: ScanLog, rig: Rig, config: StitchingConfig) -> StitchedCloud:
         coverage=coverage,
         duration=duration,
         name=log.origin.name,
-        notes=log.notes + notes,
+        notes=log.notes + notes + weaknesses,
+        weaknesses=weaknesses,
+    )
+
+
+def _clocked(
+    levelling: Levelling, tally: Tally, joints: Joints
+) -> tuple[Levelling, tuple[str, ...]]:
+    """Return the levelling with a heading as uncertain as the clocks, and why it is.
+
+    Both sensors are recorded for the same time: returns that go on after the last joint sample, and
+    begin by more after the first, carry stamps that are too late, as messages stamped at the end of
+    a revolution whose times count from its first point. At an even speed of the gimbal that is a
+    turn of everything, which nothing in the scan shows.
+    """
+    lead = (tally.first_ns - int(joints.stamps_ns[0])) * _NS
+    overrun = (tally.last_ns - int(joints.stamps_ns[-1])) * _NS
+    gaps = np.diff(joints.stamps_ns) * _NS
+    if not len(gaps) or overrun < _OVERRUN * np.median(gaps) or lead < overrun:
+        return levelling, ()
+    late = 0.5 * (lead + overrun)
+    turned = float(np.nanmedian(np.abs(joints.rates)) / _NS * late)
+    sigma = float(np.hypot(levelling.sigma_heading, turned))
+    return replace(levelling, sigma_heading=sigma), (
+        f"Returns go on for {overrun:.2f} s after the last joint sample and begin {lead:.2f} s "
+        f"after the first: their stamps seem {late:.2f} s too late (the end of a revolution, not "
+        f"its start?), and the heading is uncertain by {np.degrees(turned):.1f} deg. If so, give "
+        f"gimbal_clock_offset_s {late:+.3f} in the rig.",
     )
 
 

@@ -20,23 +20,16 @@ the Cramer-Rao bound, for comparisons with truth.
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 
 from spheremark.pipelines.config import FittingConfig
 from spheremark.pipelines.errors import ConfigError
-from spheremark.pipelines.model import (
-    MarkerCandidates,
-    MarkerFit,
-    MarkerFits,
-    Rejection,
-    StitchedCloud,
-)
+from spheremark.pipelines.model import MarkerCandidates, MarkerFits, StitchedCloud
+from spheremark.pipelines.sphere.description import Fits
 from spheremark.pipelines.sphere.methods import along_beam, astm, paper, silhouette
 from spheremark.pipelines.sphere.methods import free_radius as free
 
-Method = Callable[
-    [StitchedCloud, MarkerCandidates, FittingConfig, float],
-    tuple[tuple[MarkerFit, ...], tuple[Rejection, ...]],
-]
+Method = Callable[[StitchedCloud, MarkerCandidates, FittingConfig, float], Fits]
 METHODS: dict[str, Method] = {
     along_beam.NAME: along_beam.fit,
     silhouette.NAME: silhouette.fit,
@@ -82,10 +75,12 @@ def fit_markers(
     """
     if method not in METHODS:
         raise ConfigError(f"Fitting method {method!r} is unknown; known: {', '.join(METHODS)}.")
-    fits, rejected = METHODS[method](cloud, candidates, config, marker_radius)
+    found = METHODS[method](cloud, candidates, config, marker_radius)
+    levelling = cloud.levelling
+    sigma_heading = found.heading_factor * levelling.sigma_heading
     return MarkerFits(
         method=method,
-        fits=fits,
-        rejected=candidates.rejected + rejected,
-        levelling=cloud.levelling,
+        fits=found.fits,
+        rejected=candidates.rejected + found.rejected,
+        levelling=replace(levelling, sigma_heading=sigma_heading),
     )

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -38,7 +38,17 @@ _MIDDLE = 0.3  # radii: returns nearer to the middle belong to no octant of the 
 
 _N_STEPS, _SETTLED = 30, 1e-7  # steps, [m]
 
-Fits = tuple[tuple[MarkerFit, ...], tuple[Rejection, ...]]
+
+class Fits(NamedTuple):
+    """Fits and refused candidates of a stop, and by how much its heading is uncertain.
+
+    ``heading_factor`` multiplies the sigma of the heading that the rig states: errors of the
+    mounting that move the two faces of spheres apart have one of the heading beside them.
+    """
+
+    fits: tuple[MarkerFit, ...]
+    rejected: tuple[Rejection, ...]
+    heading_factor: float = 1.0
 
 
 def each(
@@ -48,7 +58,7 @@ def each(
     """Fit candidates one by one."""
     results = [fit_one(candidate) for candidate in candidates]
     fits = tuple(r for r in results if isinstance(r, MarkerFit))
-    return fits, tuple(r for r in results if isinstance(r, Rejection))
+    return Fits(fits, tuple(r for r in results if isinstance(r, Rejection)))
 
 
 def on_sphere(

@@ -341,3 +341,9 @@ def optics_of(state: State, prior: Prior) -> tuple[Optics, Array]:
     lines = state.centres / np.linalg.norm(state.centres, axis=1, keepdims=True)
     by_optics = state.by_shared[:, :, _optics_of(prior)][:, :, :N_ESTIMATED]
     return optics, np.einsum("mi,mik->mk", lines, by_optics)
+
+
+def mounting_factor(state: State, prior: Prior) -> float:
+    """Return by how much errors of the mounting exceed their prior; 1 where they do not."""
+    ratios = (state.sigmas / prior.sigmas)[-N_MOUNTING:]
+    return max(float(ratios.max()), 1.0)

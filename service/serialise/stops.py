@@ -70,7 +70,7 @@ def _stop(log: ProcessedLog, stop: StopResult, frame: Frame, truth: Truth | None
     ]
     markers = []
     for method, fits in stop.fits.items():
-        own = [_marker(fit, R_frame_base, cloud.rig.sigma_heading) for fit in fits.fits]
+        own = [_marker(fit, R_frame_base, stop.sigma_heading) for fit in fits.fits]
         if errors is not None and truth is not None:
             _add_errors(own, errors.markers[method], truth.marks)
         markers += own
@@ -84,7 +84,7 @@ def _stop(log: ProcessedLog, stop: StopResult, frame: Frame, truth: Truth | None
         "stations": stations,
         "distances": _distances(stop, log.marks),
         "levelling": _levelling(cloud.levelling),
-        "sigma_heading_rad": cloud.rig.sigma_heading,
+        "sigma_heading_rad": stop.sigma_heading,
         "scan": {
             "n_returns": len(cloud.p_base),
             "coverage_deg": math.degrees(cloud.coverage),

@@ -171,7 +171,7 @@ def _stop_rows(
     """Return the rows of one stop by table, without the columns of run and stop."""
     rows: dict[str, list[Row]] = {name: [] for name in TABLES[2:]}
     rows["stops"].append(_stop_row(stop, cloud_url))
-    R, sigma_heading = levelling_rotation(stop.cloud.levelling), stop.cloud.rig.sigma_heading
+    R, sigma_heading = levelling_rotation(stop.cloud.levelling), stop.sigma_heading
     for method, found in stop.fits.items():
         label = {"fit_method": method}
         matched = _matched(stop, method, names)
@@ -201,7 +201,7 @@ def _stop_row(stop: StopResult, cloud_url: str | None) -> Row:
         **row_of("stops", cloud.levelling),
         "n_returns": len(cloud.p_base),
         "sigma_levelling_deg": np.degrees(cloud.levelling.sigma),
-        "sigma_heading_deg": np.degrees(cloud.rig.sigma_heading),
+        "sigma_heading_deg": np.degrees(stop.sigma_heading),
         "cloud_url": cloud_url,
         "timings_s": json.dumps(dict(stop.timings)),
     }

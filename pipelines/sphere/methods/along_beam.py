@@ -42,6 +42,7 @@ from spheremark.pipelines.sphere.estimation import (
     Prior,
     estimate,
     estimate_radii,
+    mounting_factor,
     optics_of,
     shared_range_sigmas,
 )
@@ -110,7 +111,7 @@ def _fit(
 ) -> Fits:
     """Return the fits of all candidates, and the refused ones."""
     if not found.candidates:
-        return (), ()
+        return Fits((), ())
     stop, sigma_biases = _gather(cloud, found.candidates, config)
     prior = Prior(
         radius,
@@ -139,7 +140,8 @@ def _fit(
         for k, candidate in enumerate(found.candidates)
     ]
     fits = tuple(r for r in results if isinstance(r, MarkerFit))
-    return fits, tuple(r for r in results if isinstance(r, Rejection))
+    rejected = tuple(r for r in results if isinstance(r, Rejection))
+    return Fits(fits, rejected, mounting_factor(best.state, prior))
 
 
 def _gather(

@@ -114,14 +114,14 @@ def fit(
     places across the line of sight.
     """
     if not found.candidates:
-        return (), ()
+        return Fits((), ())
     firings, why_not = firings_of(cloud)
     if firings is None:
-        fits, rejected = along_beam.fit(cloud, found, config, radius)
-        return tuple(_without_limb(fit, why_not) for fit in fits), rejected
+        result = along_beam.fit(cloud, found, config, radius)
+        return result._replace(fits=tuple(_without_limb(fit, why_not) for fit in result.fits))
     limb = _Limb(cloud, firings, radius)
-    fits, rejected = along_beam.fit_ranges(cloud, found, config, radius, limb.observe)
-    return tuple(_named(fit) for fit in fits), rejected
+    result = along_beam.fit_ranges(cloud, found, config, radius, limb.observe)
+    return result._replace(fits=tuple(_named(fit) for fit in result.fits))
 
 
 def _without_limb(fit: MarkerFit, why_not: str) -> MarkerFit:

@@ -271,6 +271,21 @@ def test_returns_without_a_gimbal_angle_are_left_out_and_counted(rng):
     assert any(note.startswith(f"{lost} returns have no gimbal angle") for note in cloud.notes)
 
 
+def test_stamps_of_the_end_of_a_revolution_make_the_heading_uncertain_by_what_it_turned(rng):
+    rig, times = crooked_rig(rng), np.arange(0.0, 10.01, 0.01)
+    log, _ = scan_log(rng, rig, duration=10.0, n=20000)
+    log = joints(log, times, 2 * np.pi * times / 10.0)
+    assert not stitch(log, rig, CONFIG).weaknesses
+    late = replace(log, stamps_lidar_ns=log.stamps_lidar_ns + NS // 10)
+    cloud = stitch(late, rig, CONFIG)
+    (weakness,) = cloud.weaknesses
+    assert "give gimbal_clock_offset_s +0.1" in weakness
+    turned = 2 * np.pi / 10.0 * 0.1
+    assert cloud.levelling.sigma_heading == pytest.approx(turned, rel=0.05)
+    longer = replace(log, stamps_gimbal_ns=log.stamps_gimbal_ns + NS // 10)
+    assert not stitch(longer, rig, CONFIG).weaknesses  # joints that go on for longer are no sign
+
+
 def by_message(log):
     """The log with the times of its messages only, ten a second."""
     begin = log.stamps_lidar_ns[0]

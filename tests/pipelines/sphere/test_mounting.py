@@ -12,6 +12,7 @@ from spheremark.pipelines.geometry import rot_z
 from spheremark.pipelines.simulation import SimulationConfig, scenario, simulate_stop
 from spheremark.pipelines.sphere.mounting import N_MOUNTING, effects_on, sigmas_of
 from spheremark.pipelines.survey import process
+from tests import chance
 
 CONFIG = SurveyConfig.from_mapping({"fitting": {"methods": ["along_beam"]}})
 STEPPED = SimulationConfig(step=np.radians(2.0), only_near_spheres=True)
@@ -81,3 +82,16 @@ def test_lines_of_rests_that_fall_together_give_centres_as_good_as_promised(fiel
     before, promised = across(stops, field.marks, replace(CONFIG, fitting=trusting))
     assert np.mean((before / promised) ** 2) > 3.0
     assert np.mean(errors**2) < 0.5 * np.mean(before**2)
+
+
+@pytest.mark.parametrize("seed", [0, 4])
+def test_a_mounting_that_is_much_worse_than_its_prior_is_found_on_other_fields_too(seed):
+    field = scenario("paper-field", seed)
+    worse = replace(STEPPED, sigma_misalignment=np.radians(0.1), sigma_axis_offset=0.002)
+    stops = [simulate_stop(field, name, worse) for name in ("lane2-stop3", "lane4-stop6")]
+    errors, sigmas = across(stops, field.marks, CONFIG)
+    assert len(errors) > 20
+    assert np.mean((errors / sigmas) ** 2) < chance.of_mean_square(len(errors) - 2)[1]
+    fits = process(stops[0].log, config=CONFIG)[0].fits["along_beam"]
+    # what parts the two faces has a turn of both beside it, which only the heading would show
+    assert fits.levelling.sigma_heading > 2.0 * stops[0].log.rig.sigma_heading
