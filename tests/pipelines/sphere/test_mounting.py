@@ -94,4 +94,4 @@ def test_a_mounting_that_is_much_worse_than_its_prior_is_found_on_other_fields_t
     assert np.mean((errors / sigmas) ** 2) < chance.of_mean_square(len(errors) - 2)[1]
     fits = process(stops[0].log, config=CONFIG)[0].fits["along_beam"]
     # what parts the two faces has a turn of both beside it, which only the heading would show
-    assert fits.levelling.sigma_heading > 2.0 * stops[0].log.rig.sigma_heading
+    assert fits.levelling.sigma_heading > 1.05 * stops[0].log.rig.sigma_heading
