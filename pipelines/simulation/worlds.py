@@ -20,7 +20,7 @@ from spheremark.pipelines.simulation import objects
 from spheremark.pipelines.simulation.bodies import box, cylinder
 from spheremark.pipelines.simulation.clutter import Ground, panel, placed, screen, with_items
 from spheremark.pipelines.simulation.field import Field, Stop, checked_seed, marker_surfaces
-from spheremark.pipelines.simulation.objects import Builder, Item
+from spheremark.pipelines.simulation.objects import Item
 from spheremark.pipelines.simulation.options import Optics, Pick, Profile, SimulationConfig
 from spheremark.pipelines.simulation.rig import commensurability
 from spheremark.pipelines.simulation.rocks import draw_rocks, rock_mesh
@@ -112,37 +112,29 @@ _N_MARKS, _N_STOPS = (4, 16), 12
 _RETURNS = 7500.0  # of a sphere of 0.1 m at 1 m, by a turn of 13.2 s
 _FEWEST = 6.0  # returns at the greatest distance
 _NEAREST, _FARTHEST = 1.8, 75.0  # [m]
-_REACH = 25.0  # [m] within which most objects stand
+_REACH = (12.0, 33.0)  # [m] within which objects stand, as far as markers do
+_STOP_CLEAR = 0.9  # [m] from a stop to the nearest object
+_SPREAD = 4.8  # [m] of the stops about the first one
 _N_TRIES = 300
 _SKIRT = 150.0  # [m] half side of the ground
 _CONFIG, _LAYOUT, _ITEMS, _LAND = range(30, 34)  # random streams
 _Values = Mapping[str, float]
-_ROUND: tuple[tuple[Builder, float], ...] = (
-    (objects.a_round_rock, 0.3),
-    (objects.perched_rock, 0.5),
+# Builders with the room that they need: metres, and radii of the markers.
+_ROUND = ((objects.a_round_rock, 0.0, 2.5), (objects.perched_rock, 0.0, 4.5))
+_GROWN = ((objects.tree, 1.1, 0.0), (objects.bush, 0.8, 0.0), (objects.person, 0.35, 0.0))
+_BUILT = (
+    (objects.vehicle, 2.6, 0.0),
+    (objects.fence, 2.1, 0.0),
+    (objects.cable, 1.0, 0.0),
+    (objects.wall, 2.0, 0.0),
+    (objects.corner, 2.0, 0.0),
+    (objects.barrel, 0.35, 0.0),
+    (objects.bare_pole, 0.1, 0.0),
+    (objects.upright_pipe, 0.1, 1.0),
+    (objects.lying_pipe, 0.7, 1.0),
+    (objects.sign, 0.1, 3.0),
 )
-_GROWN: tuple[tuple[Builder, float], ...] = (
-    (objects.tree, 1.1),
-    (objects.bush, 0.8),
-    (objects.person, 0.35),
-)
-_BUILT: tuple[tuple[Builder, float], ...] = (
-    (objects.vehicle, 2.6),
-    (objects.fence, 2.1),
-    (objects.cable, 1.0),
-    (objects.wall, 2.0),
-    (objects.corner, 2.0),
-    (objects.barrel, 0.35),
-    (objects.bare_pole, 0.1),
-    (objects.upright_pipe, 0.2),
-    (objects.lying_pipe, 0.8),
-    (objects.sign, 0.3),
-)
-_LIKE: tuple[tuple[Builder, float], ...] = (
-    (objects.wrong_ball, 0.2),
-    (objects.cube, 0.2),
-    (objects.drum, 0.2),
-)
+_LIKE = ((objects.wrong_ball, 0.05, 2.0), (objects.cube, 0.05, 2.6), (objects.drum, 0.05, 2.2))
 
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
@@ -315,12 +307,12 @@ def _field(values: _Values, seed: int, family: str, config: SimulationConfig) ->
     terrain = _terrain(values, np.random.default_rng([seed, _LAND]))
     farthest = _farthest(radius, config)
     marks = _marks(rng, 0 if family == "empty" else int(rng.integers(*_N_MARKS)), radius, farthest)
-    stops = _stops(rng, terrain, values["mast"], 0.4 * min(farthest, 12.0))
+    stops = _stops(rng, terrain, values["mast"], _clearances(marks, radius))
     marks[:, 2] = _heights(rng, marks, terrain, radius)
     shade = values["shade"]
     stem = float(np.clip(radius * rng.uniform(0.08, 0.3), 0.004, 0.15))
     posts, spheres, poles = marker_surfaces(marks, terrain, radius, stem, shade)
-    clear = [(s.p_site[0], s.p_site[1], 0.9) for s in stops]
+    clear = [(s.p_site[0], s.p_site[1], _STOP_CLEAR) for s in stops]
     clear += [(x, y, radius + 0.4) for x, y, _ in marks]
     lies = np.random.default_rng([seed, _LAND, 1])
     rocks = rock_mesh(lies, draw_rocks(lies, np.array(clear), values["cover"]), terrain)
@@ -336,7 +328,7 @@ def _field(values: _Values, seed: int, family: str, config: SimulationConfig) ->
         stops=stops,
         family=family,
     )
-    items = _items(np.random.default_rng([seed, _ITEMS]), world, family)
+    items = _items(np.random.default_rng([seed, _ITEMS]), world, family, farthest)
     return with_items(world, "random", items)
 
 
@@ -390,14 +382,23 @@ def _heights(rng: np.random.Generator, marks: Array, terrain: Terrain, radius: f
     return np.asarray(terrain.height_at(marks) + above)
 
 
+def _clearances(marks: Array, radius: float) -> Array:
+    """Return places of markers, and how far a stop keeps away from each, (n, 3) [m]."""
+    return np.column_stack([marks[:, :2], np.full(len(marks), _NEAREST + radius)])
+
+
 def _stops(
-    rng: np.random.Generator, terrain: Terrain, mast: float, spread: float
+    rng: np.random.Generator, terrain: Terrain, mast: float, clear: Array
 ) -> tuple[Stop, ...]:
-    """Draw stops: the first at the origin, the others about it."""
+    """Draw stops: the first at the origin, the others about it, clear of some places."""
     places = [np.zeros(3)]
-    for _ in range(_N_STOPS - 1):
-        distance, bearing = spread * np.sqrt(rng.random()), rng.uniform(-np.pi, np.pi)
-        places.append(distance * np.array([np.cos(bearing), np.sin(bearing), 0.0]))
+    for _ in range(_N_TRIES):
+        if len(places) == _N_STOPS:
+            break
+        distance, bearing = _SPREAD * np.sqrt(rng.random()), rng.uniform(-np.pi, np.pi)
+        place = distance * np.array([np.cos(bearing), np.sin(bearing), 0.0])
+        if (np.hypot(*(clear[:, :2] - place[:2]).T) > clear[:, 2]).all():
+            places.append(place)
     stops = []
     for i, place in enumerate(places):
         place[2] = terrain.height_at(place) + mast
@@ -406,10 +407,10 @@ def _stops(
     return tuple(stops)
 
 
-def _items(rng: np.random.Generator, world: Field, family: str) -> list[Item]:
+def _items(rng: np.random.Generator, world: Field, family: str, farthest: float) -> list[Item]:
     """Draw the objects of a world."""
     ground = Ground(world, world.stops[0], hides=family in ("clutter", _ALL) and rng.random() < 0.5)
-    items: list[Item] = []
+    items, reach = list[Item](), float(np.clip(farthest, *_REACH))
     if family in ("panels", _ALL):
         items += _beside(rng, ground)
     rates = {
@@ -421,15 +422,16 @@ def _items(rng: np.random.Generator, world: Field, family: str) -> list[Item]:
         _ALL: (10.0, 2.0, 0.8, 2.0),
     }.get(family, (2.0, 0.4, 0.3, 0.7))
     for rate, kinds in zip(rates, (_ROUND, _GROWN, _BUILT, _LIKE), strict=True):
-        for builder, room in kinds:
-            ring = (2.0 + room, _REACH)
+        for builder, metres, radii in kinds:
+            room = metres + radii * world.marker_radius
+            ring = (2.0 + room, max(reach, 4.0 + 2.0 * room))
             items += placed(rng, ground, (int(rng.poisson(rate)), ring, room), builder)
     return items
 
 
 def _beside(rng: np.random.Generator, ground: Ground) -> list[Item]:
     """Draw panels 5 cm to 1 m behind markers, bodies as near beside them, and screens before."""
-    radius, items = ground.world.marker_radius, []
+    radius, items = ground.world.marker_radius, list[Item]()
     scale = max(1.0, radius / 0.1)
     for mark in ground.world.marks.p_site:
         gap = radius + float(np.exp(rng.uniform(np.log(0.05), 0.0)))
@@ -440,7 +442,12 @@ def _beside(rng: np.random.Generator, ground: Ground) -> list[Item]:
             items.append(_neighbour(rng, ground, mark, gap))
         elif kind == 2 and rng.random() < 0.5:
             items.append(screen(rng, ground, mark))
-    return items
+    stops = np.array([stop.p_site for stop in ground.world.stops])
+    return [
+        item
+        for item in items
+        if np.linalg.norm(stops - item.p_site, axis=1).min() > item.reach + _STOP_CLEAR
+    ]
 
 
 def _neighbour(rng: np.random.Generator, ground: Ground, mark: Array, gap: float) -> Item:
