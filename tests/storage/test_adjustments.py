@@ -136,7 +136,7 @@ def test_centres_come_back_from_their_rows_as_they_were_fitted():
     assert (found.levelling.roll, found.levelling.pitch) == pytest.approx(
         (expected.levelling.roll, expected.levelling.pitch), abs=1e-15
     )
-    assert found.levelling.sigma_heading == pytest.approx(fitted.cloud.rig.sigma_heading)
+    assert found.levelling.sigma_heading == pytest.approx(fitted.sigma_heading)
     for one, other in zip(found.fits, expected.fits, strict=True):
         np.testing.assert_allclose(one.p_base, other.p_base, rtol=0, atol=1e-14)
         np.testing.assert_allclose(one.cov_p_base, other.cov_p_base, rtol=0, atol=1e-15)
