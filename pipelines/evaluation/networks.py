@@ -12,11 +12,13 @@ from functools import partial
 from time import process_time
 
 import numpy as np
+from scipy.stats import chi2
 
 from spheremark.pipelines.calibration import Calibration, calibrate
 from spheremark.pipelines.calibration.gimbal import GIMBAL, moved
 from spheremark.pipelines.config import FittingConfig, SurveyConfig
 from spheremark.pipelines.errors import SpheremarkError
+from spheremark.pipelines.evaluation.ellipse_coverage import LEVELS
 from spheremark.pipelines.evaluation.experiment import Column, Experiment, Plain, Table
 from spheremark.pipelines.model import MarkerFits, Rig, Truth
 from spheremark.pipelines.network import AdjustedNetwork, Network, adjust_network, assemble, compare
@@ -158,9 +160,25 @@ def _by_family(rows: Sequence[Plain]) -> list[Plain]:
                     name: float(np.nanmean([row[name] for row in adjusted])) if adjusted else None
                     for name in _MEASURES
                 },
+                **{
+                    f"within_{round(100 * level)}_{what}": _share_within(adjusted, what, level)
+                    for what in ("marks", "stations")
+                    for level in LEVELS
+                },
             }
         )
     return found
+
+
+def _share_within(rows: Sequence[Plain], what: str, level: float) -> float | None:
+    """Return the share of surveys whose marks, or stations, lie together within their ellipsoid."""
+    inside = []
+    for row in rows:
+        n = row["n_marks"] - row["n_false_marks"] if what == "marks" else row["n_stations"]
+        freedom = 3 * n - 6  # place and attitude are taken out
+        if np.isfinite(row[f"nees_{what}"]) and freedom > 0:
+            inside.append(row[f"nees_{what}"] * freedom <= chi2.ppf(level, freedom))
+    return float(np.mean(inside)) if inside else None
 
 
 def _random_tables(report: Plain) -> list[Table]:
@@ -176,9 +194,17 @@ def _random_tables(report: Plain) -> list[Table]:
         Column("n_marks", "marks", "", "d"),
         Column("n_false_marks", "false", "", "d"),
         Column("rms_marks_m", "marks, RMS", "mm", ".2f"),
-        Column("nees_marks", "marks, NEES per degree", "", ".2f"),
+        Column("nees_marks", "NEES per degree", "", ".2f"),
+        *(
+            Column(f"within_{round(100 * p)}_marks", f"in {round(100 * p)} %", "%", ".0f")
+            for p in LEVELS
+        ),
         Column("rms_stations_m", "stations, RMS", "mm", ".2f"),
-        Column("nees_stations", "stations, NEES per degree", "", ".2f"),
+        Column("nees_stations", "NEES per degree", "", ".2f"),
+        *(
+            Column(f"within_{round(100 * p)}_stations", f"in {round(100 * p)} %", "%", ".0f")
+            for p in LEVELS
+        ),
     )
     notes = [
         f"Seed {row['seed']} ({row['family']}): {row['failure']}"

@@ -25,7 +25,7 @@ from spheremark.pipelines.evaluation.detection import (
     main_reasons,
     reason_near,
 )
-from spheremark.pipelines.evaluation.ellipse_coverage import pose_errors
+from spheremark.pipelines.evaluation.ellipse_coverage import LEVELS, pose_errors
 from spheremark.pipelines.evaluation.experiment import Column, Experiment, Plain, Table
 from spheremark.pipelines.geometry import inverse, transform
 from spheremark.pipelines.model import (
@@ -64,9 +64,6 @@ CLASSES = (
     "fewer returns, or mostly hidden",
 )
 """Classes of markers by returns and visible share; the first two lie on two scan lines or more."""
-
-LEVELS = (0.50, 0.68, 0.95)
-"""Levels of the ellipsoids that errors are compared with."""
 
 RATES = (0.003, 0.01, 0.03, 0.1, 0.3, 1.0, 3.0)
 """False markers in a scan for which the curve gives precision and recall."""

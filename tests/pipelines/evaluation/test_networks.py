@@ -11,6 +11,7 @@ from spheremark.pipelines.config import ResectionConfig
 from spheremark.pipelines.evaluation.networks import (
     is_gross_found,
     networks,
+    random_networks,
     wrong_rig,
 )
 from spheremark.pipelines.network import adjust_network, assemble
@@ -82,3 +83,25 @@ def test_a_gross_error_is_found_where_many_stations_see_the_marks_and_not_where_
     found = [is_gross_found(few, np.random.default_rng(k)) for k in range(12)]
     assert before == few.left_out
     assert not all(found)
+
+
+def test_surveys_of_random_worlds_are_pooled_by_family():
+    rng = np.random.default_rng(2)
+    rows = [
+        {"seed": 2 * i, "family": "plain", "failure": "", "n_marks": 11, "n_false_marks": 1,
+         "n_stations": 4, "rms_marks_m": 0.001, "rms_stations_m": 0.002,
+         "nees_marks": rng.chisquare(24) / 24, "nees_stations": rng.chisquare(6) / 6}
+        for i in range(2000)
+    ]  # fmt: skip
+    rows.append({"seed": 1, "family": "empty", "failure": "no marker"})
+    experiment = random_networks(len(rows), seed=0, n_stops=4)
+    assert list(experiment.worlds)[:3] == [0, 2, 4]
+    report = experiment.pool(rows)
+    plain, empty, both = report["families"]
+    assert (plain["n_adjusted"], empty["n_adjusted"], both["n_adjusted"]) == (2000, 0, 2000)
+    for level in (50, 68, 95):
+        for what in ("marks", "stations"):
+            assert plain[f"within_{level}_{what}"] == pytest.approx(level / 100, abs=0.04)
+    assert empty["nees_marks"] is None
+    (table,) = experiment.tables(report)
+    assert "Seed 1 (empty): no marker" in table.notes
