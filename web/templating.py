@@ -101,15 +101,14 @@ def signed(value: float, decimals: int = 2) -> str:
     """Format a number with its sign, a true minus; a dash for an unknown one."""
     if not math.isfinite(value):
         return _UNKNOWN
-    return f"{value:+.{decimals}f}".replace("-", "\N{MINUS SIGN}")
+    return f"{value:+z.{decimals}f}".replace("-", "\N{MINUS SIGN}")
 
 
 def number(value: float | None, decimals: int = 2) -> str:
     """Format a number; a dash for an unknown one."""
     if value is None or not math.isfinite(value):
         return _UNKNOWN
-    text = f"{value:.{decimals}f}"
-    return text.lstrip("-") if float(text) == 0 else text
+    return f"{value:z.{decimals}f}"
 
 
 def _moment(value: datetime | None) -> str:

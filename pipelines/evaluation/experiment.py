@@ -27,7 +27,7 @@ class Column(NamedTuple):
     ``>`` does that for text.
     """
 
-    key: str | Callable[[Plain], str]
+    key: str | Callable[[Plain], Any]
     title: str
     unit: str = ""
     form: str = ""

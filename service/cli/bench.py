@@ -183,7 +183,7 @@ def _run(experiment: Experiment[Any, Any, Plain], *, as_json: bool) -> None:
 
 def _print(report: Plain, tables: Callable[[Plain], Iterable[Table]], *, as_json: bool) -> None:
     """Print a report as JSON or as tables."""
-    from spheremark.service.bench.report import print_tables
+    from spheremark.service.cli.render import print_tables
 
     if as_json:
         print_json(report)

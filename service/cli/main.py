@@ -11,6 +11,7 @@ import math
 import sys
 from dataclasses import replace
 from enum import StrEnum
+from importlib import metadata
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -18,21 +19,12 @@ import typer
 
 from spheremark.pipelines.errors import ConfigError, SpheremarkError
 from spheremark.service.cli.bench import bench, reproduce
+from spheremark.service.cli.options import AsJson, Field, RadiusM, grouped
 from spheremark.service.cli.plan import plan
-from spheremark.service.cli.reading import LogFiles, OneLog, reads_logs
+from spheremark.service.cli.reading import Logs, OneLog, Reading
 from spheremark.service.cli.site import site
 from spheremark.service.cli.spheres import spheres
-from spheremark.service.cli.survey import (
-    Axes,
-    ControlAxes,
-    ControlFile,
-    ControlUnit,
-    TargetHeight,
-    Unit,
-    adjust,
-    calibrate,
-    read_control,
-)
+from spheremark.service.cli.survey import adjust, calibrate
 from spheremark.service.cli.terminal import announce_compilation, err, out
 from spheremark.service.cli.terminal import print_json as _print_json
 from spheremark.service.cli.terminal import progress as _progress
@@ -40,16 +32,15 @@ from spheremark.service.cli.terminal import settings as _settings
 from spheremark.service.cli.tokens import token
 
 app = typer.Typer(
-    help="Station positions from spherical markers and a gimbal-mounted LiDAR.",
     no_args_is_help=True,
     pretty_exceptions_enable=False,
     add_completion=False,
+    context_settings={"help_option_names": ["-h", "--help"]},
 )
 app.add_typer(plan, name="plan")
 app.add_typer(token, name="token")
 
 _EXPORTS = "results.duckdb, or points as .csv, .dxf, .xml (LandXML) or .geojson."
-AsJson = Annotated[bool, typer.Option("--json", help="JSON for programs.")]
 
 
 class Format(StrEnum):
@@ -72,6 +63,16 @@ class Frame(StrEnum):
 
     STATION = "station"
     BASE = "base"
+
+
+@app.callback(invoke_without_command=True)
+def about(
+    version: Annotated[bool, typer.Option("--version", help="Print the version.")] = False,
+) -> None:
+    """Station positions from spherical markers and a gimbal-mounted LiDAR."""
+    if version:
+        sys.stdout.write(f"{metadata.version('spheremark')}\n")
+        raise typer.Exit
 
 
 def main() -> None:
@@ -162,7 +163,7 @@ def simulate(
     shot_times: Annotated[
         bool | None,
         typer.Option(
-            help="Whether the points of a cloud carry a time each.", show_default="shot-times"
+            help="Whether each point of a cloud carries a time.", show_default="shot-times"
         ),
     ] = None,
     form: Annotated[
@@ -202,9 +203,10 @@ def simulate(
 
 
 @app.command()
-@reads_logs
+@grouped
 def inspect(
     log: OneLog,
+    reading: Reading,
     diagnose: Annotated[
         bool,
         typer.Option("--diagnose", help="Try other signs, units and clocks; takes seconds."),
@@ -215,26 +217,22 @@ def inspect(
     from spheremark.service.cli import render
     from spheremark.storage.recordings import inspect_log
 
-    report = inspect_log(log.path, log.options, beside=log.beside, diagnosing=diagnose)
+    (file,) = reading.files([log])
+    report = inspect_log(file.path, file.options, beside=file.beside, diagnosing=diagnose)
     if as_json:
         _print_json(report.to_mapping())
     else:
-        render.print_preflight(out, log.path.name, report)
+        render.print_preflight(out, log.name, report)
     if report.verdict == "refused":
         raise typer.Exit(1)
 
 
 @app.command()
-@reads_logs
+@grouped
 def process(
-    logs: LogFiles,
-    control: ControlFile = None,
-    control_axes: ControlAxes = Axes.ENU,
-    control_unit: ControlUnit = Unit.METRE,
-    target_height_m: TargetHeight = 0.0,
-    rig: Annotated[
-        Path | None, typer.Option(exists=True, dir_okay=False, help="Rig (JSON), if not the log's.")
-    ] = None,
+    logs: Logs,
+    reading: Reading,
+    field: Field,
     method: Annotated[
         list[str] | None, typer.Option(help="Fitting method; again for more. The first counts.")
     ] = None,
@@ -244,7 +242,7 @@ def process(
     ] = None,
     frame: Annotated[Frame, typer.Option(help="Frame of the centres.")] = Frame.STATION,
     tolerance_m: Annotated[float, typer.Option(help="Error that is accepted \\[m].")] = 0.03,
-    radius_m: Annotated[float, typer.Option(help="Radius of the spheres \\[m].")] = 0.100,
+    radius_m: RadiusM = 0.100,
     truth: Annotated[
         Path | None,
         typer.Option(exists=True, dir_okay=False, help="Truth (JSON); adds errors, no more."),
@@ -256,7 +254,7 @@ def process(
     from spheremark.service.cli import render
     from spheremark.service.log_files import process_file
     from spheremark.service.serialise.stops import serialise_log
-    from spheremark.storage.imports import survey_files as site_files
+    from spheremark.storage.imports.survey_files import read_truth
 
     config = SurveyConfig.from_mapping(
         {
@@ -266,13 +264,12 @@ def process(
             "resection": {"methods": resection or ["free_station"]},
         }
     )
-    given_rig = site_files.read_rig(rig) if rig else None
-    marks = read_control(control, control_axes, control_unit, target_height_m)
-    true = site_files.read_truth(truth) if truth else None
+    marks, rig = field.read()
+    true = read_truth(truth) if truth else None
     results = []
-    for log in logs:
+    for log in reading.files(logs):
         with _progress() as progress:
-            found = process_file(log, config, progress, rig=given_rig, marks=marks, truth=true)
+            found = process_file(log, config, progress, rig=rig, marks=marks, truth=true)
         results.append(serialise_log(found, frame=frame.value, truth=true))
         if not as_json:
             render.print_log(out, results[-1])
@@ -280,10 +277,10 @@ def process(
         _print_json(results[0] if len(results) == 1 else results)
 
 
-app.command()(spheres)
 app.command()(adjust)
 app.command()(calibrate)
 app.command()(site)
+app.command()(spheres)
 app.command()(bench)
 
 

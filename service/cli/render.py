@@ -5,67 +5,142 @@ from __future__ import annotations
 import csv
 import io
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import asdict
 from typing import Any
 
+from rich import table as rich_table
 from rich.console import Console
 from rich.markup import escape
 from rich.measure import Measurement
-from rich.table import Table
 from rich.text import Text
 
+from spheremark.pipelines.evaluation.experiment import Column, Table
 from spheremark.storage.recordings import Preflight
 
 _ROWS_SHOWN = 100  # of a query; programs get all
 _WIDEST = 100_000  # [characters]; no row is wider
 _COLOURS = {"ok": "green", "weak": "yellow", "refused": "red", "failed": "red"}
+_UNITS = {"m": (1e3, "mm"), "rad": (math.degrees(1.0), "deg"), "s": (1e3, "ms")}
 
 Plain = Mapping[str, Any]
+
+
+def print_tables(out: Console, tables: Iterable[Table]) -> None:
+    """Print tables with their titles and notes."""
+    for one in tables:
+        if one.title:
+            out.print(f"[bold]{escape(one.title)}[/]", highlight=False, soft_wrap=True)
+        if one.rows:
+            out.print(_drawn(one))
+        for note in one.notes:
+            _say(out, note)
+
+
+def _drawn(table: Table) -> rich_table.Table:
+    """Return a table for the terminal: units below the heads, text flush left, numbers right."""
+    drawn = rich_table.Table(box=None, pad_edge=False, header_style="bold")
+    for column in table.columns:
+        head = escape(f"{column.title}\n[{column.unit}]" if column.unit else column.title)
+        justify = "right" if column.form else "left"
+        drawn.add_column(head, justify=justify, overflow="fold")  # type: ignore[arg-type]
+    for row in table.rows:
+        cells = [column.cell(row) for column in table.columns]
+        drawn.add_row(*(Text(cell, style=_COLOURS.get(cell, "")) for cell in cells))
+    return drawn
+
+
+def _say(out: Console, sentence: str) -> None:
+    """Print a sentence; nothing in it is markup."""
+    out.print(sentence, highlight=False, markup=False, soft_wrap=True)
+
+
+def _at(key: str, i: int) -> Callable[[Plain], Any]:
+    """Return the function to an element of a vector of a row."""
+    return lambda row: row[key][i]
+
+
+def _vector(key: str, unit: str, form: str, titles: Sequence[str] = "xyz") -> tuple[Column, ...]:
+    """Return the columns of the coordinates of a vector."""
+    return tuple(Column(_at(key, i), title, unit, form) for i, title in enumerate(titles))
+
+
+_TOPICS = (
+    Column("topic", "topic"),
+    Column("schema", "type"),
+    Column("n_messages", "messages", "", ",d"),
+    Column("rate_hz", "rate", "Hz", ".1f"),
+    Column("longest_gap_s", "longest gap", "s", ".3f"),
+)
+_FACTS = (Column("fact", "fact"), Column("value", "value", "", ">"))
+_MARKERS = (
+    Column("id", "marker"),
+    Column("status", "status"),
+    *_vector("centre_m", "m", "z.4f"),
+    Column("sigma_3d_m", "sigma", "mm", ".1f"),
+    Column("range_m", "range", "m", ".2f"),
+    Column("n_points", "returns", "", "d"),
+    Column("rms_m", "rms", "mm", ".1f"),
+)
+_ERROR = Column("error_3d_m", "error", "mm", ".1f")
+_PLACED = (
+    *_vector("position_m", "m", "z.4f"),
+    Column("sigma_3d_m", "sigma", "mm", ".1f"),
+    Column("ellipse_major_95_m", "95 % ellipse, a", "mm", ".1f"),
+    Column("ellipse_minor_95_m", "b", "mm", ".1f"),
+    Column("n_observations", "centres", "", "d"),
+)
+_CONTROL = (
+    Column("mark", "control left out"),
+    *_vector("predicted_minus_given_m", "mm", "+z.1f", ("dx", "dy", "dz")),
+    *_vector("sigma_predicted_minus_given_m", "mm", ".1f", ("sigma x", "y", "z")),
+)
+_PARAMETERS = (
+    Column("name", "parameter"),
+    Column("unit", "unit"),
+    *(Column(name, name, "", ".4f") for name in ("start", "estimate", "sigma")),
+)
 
 
 def print_preflight(out: Console, name: str, report: Preflight) -> None:
     """Print the preflight report of a log."""
     out.print(f"[bold]{escape(name)}[/]: {_coloured(report.verdict)}")
     for reason in (*report.reasons, *report.notes, *report.diagnosis):
-        out.print(f"  {escape(reason)}", highlight=False)
-    if report.topics:
-        rows = [
-            (t.topic, t.schema, f"{t.n_messages:,}", f"{t.rate_hz:.1f}", f"{t.longest_gap_s:.3f}")
-            for t in report.topics
-        ]
-        heads = ("topic", "type", "messages", "rate [Hz]", "longest gap [s]")
-        out.print(_table(heads, rows, left=2))
+        _say(out, f"  {reason}")
     facts = {
         "returns": f"{report.n_returns:,}",
-        "duration [s]": _fixed(report.duration_s, 1),
+        "duration [s]": _text(report.duration_s, 1, 1),
         "stops": str(report.n_stops),
-        "gimbal coverage [deg]": _fixed(report.gimbal_coverage_deg, 1),
-        "gimbal speed [deg/s]": _fixed(report.gimbal_speed_deg_per_s, 2),
-        "LiDAR speed [1/min]": _fixed(report.lidar_speed_rpm, 1),
-        "coverage gap [deg]": _fixed(report.coverage_gap_deg, 2),
-        "clock skew [s]": _fixed(report.clock_skew_s, 3),
-        "time for each shot": "yes" if report.has_shot_times else "no",
+        "gimbal coverage [deg]": _text(report.gimbal_coverage_deg, 1, 1),
+        "gimbal speed [deg/s]": _text(report.gimbal_speed_deg_per_s, 1, 2),
+        "LiDAR speed [1/min]": _text(report.lidar_speed_rpm, 1, 1),
+        "coverage gap [deg]": _text(report.coverage_gap_deg, 1, 2),
+        "clock skew [s]": _text(report.clock_skew_s, 1, 3),
+        "time for each return": "yes" if report.has_shot_times else "no",
         "orientation (AHRS)": "yes" if report.has_orientation else "no",
         "rig": report.rig or "not in the log",
     }
-    out.print(_table(("fact", "value"), list(facts.items())))
+    topics = Table(columns=_TOPICS, rows=[asdict(topic) for topic in report.topics])
+    rows = [{"fact": fact, "value": value} for fact, value in facts.items()]
+    print_tables(out, [topics, Table(columns=_FACTS, rows=rows)])
 
 
 def print_log(out: Console, result: Plain) -> None:
     """Print markers and station of each stop of a log."""
     for stop in result["stops"]:
-        out.print(f"[bold]{escape(stop['name'])}[/]  (centres in the {stop['frame']} frame)")
-        out.print(_markers(stop["markers"]))
-        for one in stop["markers"]:
-            if one["reason"]:
-                text = f"  {one['id']} ({one['method']}): {escape(one['reason'])}"
-                out.print(text, highlight=False, soft_wrap=True)
+        markers = stop["markers"]
+        columns = (*_MARKERS, _ERROR) if any("error_3d_m" in one for one in markers) else _MARKERS
+        for method in dict.fromkeys(one["method"] for one in markers):
+            title = f"{stop['name']}, {method} (centres in the {stop['frame']} frame)"
+            own = [one for one in markers if one["method"] == method]
+            notes = [f"  {one['id']}: {one['reason']}" for one in own if one["reason"]]
+            print_tables(out, [Table(title=title, columns=columns, rows=own, notes=notes)])
         for note in stop["scan"]["notes"]:
-            out.print(f"  {note}", highlight=False)
+            _say(out, f"  {note}")
         if stop["rejected"]:
-            out.print(f"  {len(stop['rejected'])} groups of returns were refused (see --json).")
+            _say(out, f"  {len(stop['rejected'])} groups of returns were refused (see --json).")
         if not stop["stations"]:
-            out.print(f"  {stop['reason']}")
+            _say(out, f"  {stop['reason']}")
         for station in stop["stations"]:
             _print_station(out, station)
         _print_distances(out, stop["distances"])
@@ -73,141 +148,131 @@ def print_log(out: Console, result: Plain) -> None:
 
 def print_spheres(out: Console, result: Plain) -> None:
     """Print the spheres in the cloud of a single scan."""
-    out.print(f"[bold]{escape(result['file'])}[/]: {result['n_points']:,} points")
-    if result["spheres"]:
-        out.print(_markers(result["spheres"]))
-    else:
-        out.print(f"  No sphere of {result['radius_m']} m. Is --station where the scanner stood?")
-    for one in (*result["spheres"], *result["rejected"]):
-        if one["reason"]:
-            place = ", ".join(f"{value:.3f}" for value in one["centre_m"])
-            out.print(f"  {place}: {escape(one['reason'])}", highlight=False, soft_wrap=True)
+    found = result["spheres"]
+    reasons = [
+        f"  {', '.join(f'{value:.3f}' for value in one['centre_m'])}: {one['reason']}"
+        for one in (*found, *result["rejected"])
+        if one["reason"]
+    ]
+    if not found:
+        text = f"  No sphere of {result['radius_m']} m. Is --station where the scanner stood?"
+        reasons.insert(0, text)
+    title = f"{result['file']}: {result['n_points']:,} points"
+    print_tables(out, [Table(title=title, columns=_MARKERS, rows=found, notes=reasons)])
 
 
 def _print_distances(out: Console, distances: Plain | None) -> None:
     """Print how the distances between marks compare with the control."""
     if distances is None or not distances["n"]:
         return
-    n, n_off = distances["n"], distances["n_off"]
     worst = max(distances["pairs"], key=lambda pair: abs(pair["residual_m"] / pair["sigma_m"]))
-    first, second = worst["marks"]
     text = (
-        f"  Distances between marks against control: {n_off} of {n} are off; worst {first} - "
-        f"{second}: {1e3 * worst['residual_m']:+.1f} mm, sigma {1e3 * worst['sigma_m']:.1f} mm"
+        f"  Distances between marks against control: {distances['n_off']} of {distances['n']} are "
+        f"off; worst {' - '.join(worst['marks'])}: {1e3 * worst['residual_m']:+.1f} mm, sigma "
+        f"{1e3 * worst['sigma_m']:.1f} mm"
     )
-    if distances["suspects"]:
-        text += f"; look at {', '.join(distances['suspects'])}"
-    out.print(text, highlight=False, markup=False, soft_wrap=True)
+    suspects = ", ".join(distances["suspects"])
+    _say(out, f"{text}; check {suspects}" if suspects else text)
 
 
 def print_calibration(out: Console, result: Plain) -> None:
     """Print a calibration: lengths in millimetres, angles in degrees."""
-    scales = {"m": (1e3, "mm"), "rad": (math.degrees(1.0), "deg"), "s": (1e3, "ms")}
     rows = []
-    for parameter in result["parameters"]:
-        scale, unit = scales[parameter["unit"]]
-        numbers = [scale * parameter[key] for key in ("start", "estimate", "sigma")]
-        rows.append((parameter["name"], unit, *(f"{number:.4f}" for number in numbers)))
-    out.print(_table(("parameter", "unit", "start", "estimate", "sigma"), rows, left=2))
-    out.print(
+    for row in result["parameters"]:
+        scale, unit = _UNITS[row["unit"]]
+        numbers = {key: scale * row[key] for key in ("start", "estimate", "sigma")}
+        rows.append({"name": row["name"], "unit": unit, **numbers})
+    summary = (
         f"{result['n_two_faced']} of {result['n_spheres']} spheres on both faces, "
         f"{result['n_returns']:,} returns; residuals {1e3 * result['residual_rms_before_m']:.1f} "
         f"-> {1e3 * result['residual_rms_after_m']:.1f} mm; rig {result['rig_digest']}"
     )
-    for held in result["not_separable"]:
-        out.print(f"  {held['name']} stays as it was. {held['reason']}", highlight=False)
+    held = [f"  {one['name']} does not change. {one['reason']}" for one in result["not_separable"]]
+    print_tables(out, [Table(columns=_PARAMETERS, rows=rows, notes=[summary, *held])])
 
 
 def print_rows(out: Console, result: Plain) -> None:
-    """Print the result of a query."""
+    """Print the result of a query; rows wider than the terminal one below the other."""
     heads = [column["name"] for column in result["columns"]]
     rows = [["" if v is None else _short(v) for v in row] for row in result["rows"][:_ROWS_SHOWN]]
-    table = _table(heads, rows, left=len(heads))
+    table = rich_table.Table(box=None, pad_edge=False, header_style="bold")
+    for head in heads:
+        table.add_column(escape(head))
+    for row in rows:
+        table.add_row(*map(escape, row))
     if Measurement.get(out, out.options.update(max_width=_WIDEST), table).maximum <= out.width:
         out.print(table)
     else:
-        _print_one_by_one(out, heads, rows)
-    shown, n = len(rows), len(result["rows"])
-    more = f", {shown} shown (--json or --csv for all)" if shown < n else ""
+        columns = (Column("column", "column"), Column("value", "value"))
+        for i, row in enumerate(rows, start=1):
+            pairs = zip(heads, row, strict=True)
+            shown = [{"column": head, "value": value} for head, value in pairs]
+            print_tables(out, [Table(title=f"row {i}", columns=columns, rows=shown)])
+    shown_n, n = len(rows), len(result["rows"])
+    more = f", {shown_n} shown (--json or --csv for all)" if shown_n < n else ""
     out.print(f"{n:,} rows in {result['elapsed_ms']:.1f} ms{more}")
-
-
-def _print_one_by_one(out: Console, heads: Sequence[str], rows: Sequence[Sequence[str]]) -> None:
-    """Print rows that are wider than the terminal one below the other."""
-    for i, row in enumerate(rows, start=1):
-        out.print(f"[bold]row {i}[/]")
-        out.print(_table(("column", "value"), list(zip(heads, row, strict=True)), left=2))
 
 
 def print_network(out: Console, result: Plain) -> None:
     """Print stations, marks and datum of a network."""
-    verdict = "passed" if result["passes_global_test"] else "[red]failed[/]"
+    test = "passed" if result["passes_global_test"] else "[red]failed[/]"
     out.print(
         f"[bold]Network[/]: {_coloured(result['status'])}  {len(result['stations'])} stations, "
         f"{len(result['marks'])} marks, {result['dof']} degrees of freedom, sigma0 "
-        f"{_fixed(result['sigma0'], 2)}, global test {verdict}"
+        f"{_text(result['sigma0'], 1, 2)}, global test {test}"
     )
-    out.print(result["datum"]["text"], highlight=False, soft_wrap=True)
+    _say(out, result["datum"]["text"])
     for warning in result["warnings"]:
         out.print(f"[yellow]Warning:[/] {escape(warning)}", highlight=False, soft_wrap=True)
-    for kind in ("stations", "marks"):
-        rows = [
-            (
-                row["name"],
-                *(f"{value:.4f}" for value in row["position_m"]),
-                f"{1e3 * row['sigma_3d_m']:.1f}",
-                f"{1e3 * row['ellipse_major_95_m']:.1f} x {1e3 * row['ellipse_minor_95_m']:.1f}",
-                str(row["n_observations"]),
-            )
-            for row in result[kind]
-        ]
-        heads = ("x [m]", "y [m]", "z [m]", "sigma [mm]", "95 % ellipse [mm]", "centres")
-        out.print(_table((kind[:-1], *heads), rows))
-    _print_checks(out, result)
-    for one in result["refused"]:
-        out.print(
-            f"  {escape(one['station'])}: {escape(one['reason'])}", highlight=False, soft_wrap=True
-        )
-    for one in result["excluded"]:
-        what = " ".join(part for part in (one["station"], one["marker"], one["mark"]) if part)
-        text = f"  {one['kind'].capitalize()} {what}: {escape(one['reason'])}"
-        out.print(text, highlight=False, soft_wrap=True)
-
-
-def _print_checks(out: Console, result: Plain) -> None:
-    """Print the checks of a network that need no truth."""
-    for row in result["marks"]:
-        if row["status"] != "ok":
-            out.print(f"  Mark {escape(row['name'])}: {escape(row['reason'])}", highlight=False)
-    rows = [
-        (
-            row["mark"],
-            *(f"{1e3 * value:+.1f}" for value in row["predicted_minus_given_m"]),
-            *(f"{1e3 * value:.1f}" for value in row["sigma_predicted_minus_given_m"]),
-        )
-        for row in result["control"]
-        if row["predicted_minus_given_m"] is not None
+    checks = [row for row in result["control"] if row["predicted_minus_given_m"] is not None]
+    tables = [
+        Table(columns=(Column("name", "station"), *_PLACED), rows=result["stations"]),
+        Table(columns=(Column("name", "mark"), *_PLACED), rows=result["marks"]),
+        Table(columns=_CONTROL, rows=checks, notes=[*_checks(result)]),
     ]
-    if rows:
-        heads = ("control left out", "dx [mm]", "dy", "dz", "sigma x [mm]", "y", "z")
-        out.print(_table(heads, rows))
-    for row in result["repeated_stops"]:
-        out.print(
-            f"  {' and '.join(row['stations'])} stand {1e3 * row['apart_3d_m']:.1f} mm apart; "
-            f"their centres agree to {1e3 * row['difference_rms_m']:.1f} mm (RMS; predicted "
-            f"{1e3 * row['predicted_rms_m']:.1f})",
-            highlight=False,
-        )
+    print_tables(out, tables)
     if result["calibration"]:
         print_calibration(out, result["calibration"])
+    for sentence in _exceptions(result):
+        _say(out, sentence)
+
+
+def _checks(result: Plain) -> Iterable[str]:
+    """Yield the checks of a network that need no truth, in sentences."""
+    for row in result["marks"]:
+        if row["status"] != "ok":
+            yield f"  Mark {row['name']}: {row['reason']}"
+    for row in result["repeated_stops"]:
+        yield (
+            f"  {' and '.join(row['stations'])} stand {1e3 * row['apart_3d_m']:.1f} mm apart; "
+            f"their centres agree to {1e3 * row['difference_rms_m']:.1f} mm (RMS; predicted "
+            f"{1e3 * row['predicted_rms_m']:.1f})"
+        )
+
+
+def _exceptions(result: Plain) -> Iterable[str]:
+    """Yield the errors of a network against truth, and what it does not use, in sentences."""
     if errors := result.get("errors"):
-        out.print(
+        yield (
             f"Against truth, place and attitude apart: marks {1e3 * errors['rms_marks_m']:.2f} mm "
-            f"RMS, stations {1e3 * errors['rms_stations_m']:.2f} mm RMS; normalised squared error "
-            f"{_fixed(errors['nees_per_dof_marks'], 2)} and "
-            f"{_fixed(errors['nees_per_dof_stations'], 2)}; {errors['n_false_marks']} false marks",
-            highlight=False, soft_wrap=True,
-        )  # fmt: skip
+            f"RMS, stations {1e3 * errors['rms_stations_m']:.2f} mm RMS"
+            f"{_nees(errors)}; {errors['n_false_marks']} false marks"
+        )
+    for one in result["refused"]:
+        yield f"  {one['station']}: {one['reason']}"
+    for one in result["excluded"]:
+        what = " ".join(part for part in (one["station"], one["marker"], one["mark"]) if part)
+        yield f"  {one['kind'].capitalize()} {what}: {one['reason']}"
+
+
+def _nees(errors: Plain) -> str:
+    """Return the normalised squared errors that are known, as a part of a sentence."""
+    known = [
+        f"{_text(errors[f'nees_per_dof_{kind}'], 1, 2)} ({kind})"
+        for kind in ("marks", "stations")
+        if errors[f"nees_per_dof_{kind}"] is not None
+    ]
+    return f"; normalised squared error {' and '.join(known)}" if known else ""
 
 
 def to_csv(result: Plain) -> str:
@@ -223,7 +288,7 @@ def _print_station(out: Console, station: Plain) -> None:
     """Print a station with its status."""
     methods = f"{station['fit_method']}, {station['method']}"
     if station.get("position_m") is None:
-        out.print(f"  Station ({methods}): [red]none[/]; {station['reason']}", highlight=False)
+        out.print(f"  Station ({methods}): [red]none[/]; {escape(station['reason'])}")
         return
     x, y, z = station["position_m"]
     error = station.get("error_3d_m")
@@ -231,37 +296,12 @@ def _print_station(out: Console, station: Plain) -> None:
     out.print(
         f"  Station ({methods}): {_coloured(station['status'])}  x {x:.4f} y {y:.4f} z {z:.4f} m, "
         f"yaw {station['yaw_deg']:.3f} deg, sigma {1e3 * station['sigma_3d_m']:.1f} mm (3-D) "
-        f"from {len(station['matches'])} marks, sigma0 {_fixed(station['sigma0'], 2)}{against}",
+        f"from {len(station['matches'])} marks, sigma0 {_text(station['sigma0'], 1, 2)}{against}",
         highlight=False,
         soft_wrap=True,
     )
     if station["reason"]:
-        out.print(f"  {station['reason']}", highlight=False)
-
-
-def _markers(markers: Sequence[Plain]) -> Table:
-    """Return markers as a table, with errors where there is truth."""
-    heads = ["marker", "method", "status", "x [m]", "y [m]", "z [m]", "sigma [mm]", "range [m]"]
-    heads += ["points", "rms [mm]"]
-    has_errors = any("error_3d_m" in marker for marker in markers)
-    rows = []
-    for one in markers:
-        row = [one["id"], one["method"], Text.from_markup(_coloured(one["status"]))]
-        row += [f"{value:.4f}" for value in one["centre_m"]]
-        row += [_mm(one["sigma_3d_m"]), f"{one['range_m']:.2f}", str(one["n_points"])]
-        row += [_mm(one["rms_m"])]
-        rows.append(row + ([_mm(one.get("error_3d_m"))] if has_errors else []))
-    return _table(heads + (["error [mm]"] if has_errors else []), rows, left=3)
-
-
-def _table(heads: Sequence[str], rows: Sequence[Sequence[str | Text]], left: int = 1) -> Table:
-    """Return a table whose first columns are flush left; strings are not markup."""
-    table = Table(box=None, pad_edge=False, header_style="bold")
-    for i, head in enumerate(heads):
-        table.add_column(escape(head), justify="left" if i < left else "right")
-    for row in rows:
-        table.add_row(*(escape(cell) if isinstance(cell, str) else cell for cell in row))
-    return table
+        _say(out, f"  {station['reason']}")
 
 
 def _coloured(status: str) -> str:
@@ -269,16 +309,93 @@ def _coloured(status: str) -> str:
     return f"[{_COLOURS[status]}]{status}[/]"
 
 
-def _mm(length: float | None) -> str:
-    """Return a length in millimetres."""
-    return "" if length is None else f"{1e3 * length:.1f}"
-
-
-def _fixed(value: float | None, digits: int) -> str:
-    """Return a number, or a dash for null."""
-    return "-" if value is None else f"{value:.{digits}f}"
-
-
 def _short(value: object) -> str:
     """Return a value of a query, numbers to six digits."""
     return f"{value:.6g}" if isinstance(value, float) else str(value)
+
+
+_PASSED = (
+    Column("pass_rate", "pass", "%", ".1f"),
+    Column("median_error_3d_m", "median", "mm", ".1f"),
+    Column("p95_error_3d_m", "p95", "mm", ".1f"),
+)
+_BY_NUMBER = (Column("n_marks", "marks", "", "d"), Column("n", "in the window", "", ",d"), *_PASSED)
+_BY_ANGLE = (
+    Column(
+        lambda row: f"{row['angle_from_deg']:g} - {row['angle_to_deg']:g}", "worst angle", "deg"
+    ),
+    Column("n", "all", "", ",d"),
+    *_PASSED,
+)
+_TABLE_3 = (
+    Column("included_angle_deg", "included angle", "deg", ".2f"),
+    Column("study_error_3d_m", "study", "mm", ".1f"),
+    Column("median_error_3d_m", "here", "mm", ".1f"),
+)
+_PLANNED_MARKS = (
+    Column("name", "mark"),
+    *(Column(axis, axis, "m", ".3f") for axis in "xyz"),
+    Column("pole_height_m", "pole", "m", ".2f"),
+)
+
+
+def print_random_plans(out: Console, results: Plain) -> None:
+    """Print how many arrangements pass."""
+    limits = results["limits"]
+    out.print(
+        f"{results['n_arrangements']:,} arrangements from {results['distance_min_m']:g} to "
+        f"{results['distance_max_m']:g} m ({limits['distance_source']}), included angles from "
+        f"{results['angle_min_deg']:g} to {results['angle_max_deg']:g} deg "
+        f"({limits['angle_source']}): {results['n_in_window']:,} in the window. "
+        f"Of these {_text(results['pass_rate_in_window'], 100.0, 1)} % pass, of the others "
+        f"{_text(results['pass_rate_outside'], 100.0, 1)} %.",
+        highlight=False,
+    )
+    print_tables(
+        out,
+        [
+            Table(columns=_BY_NUMBER, rows=results["by_number_of_marks"]),
+            Table(columns=_BY_ANGLE, rows=results["by_worst_angle"]),
+            Table(columns=_TABLE_3, rows=results["table3"]),
+        ],
+    )
+
+
+def print_plan(out: Console, plan: Plain) -> None:
+    """Print marks and stops as tables."""
+    out.print(f"[bold]{escape(plan['site']['name'])}[/], method {plan['method']}")
+    out.print(plan["model"]["text"], markup=False, highlight=False)
+    within = f"P(<= {1e3 * plan['tolerance_m']:g} mm)"
+    marks = [one | dict(zip("xyz", one["position_m"], strict=True)) for one in plan["marks"]]
+    stops = (
+        Column("name", "stop"),
+        Column("sigma_3d_m", "sigma 3-D", "mm", ".2f"),
+        Column("probability_within_tolerance", within, "", ".4f"),
+        Column(lambda row: f"{row['n_used']} of {len(row['visible_marks'])}", "marks", "", ">"),
+        Column(_angles, "angles", "deg", ">"),
+        Column("reason", "note"),
+    )
+    notes = list(plan.get("notes", ()))
+    if one := plan.get("one_more"):
+        at = ", ".join(f"{v:.2f}" for v in one["position_m"])
+        changes = (
+            f"from {_text(one[f'{which}_sigma_3d_before_m'], 1e3, 3)} to "
+            f"{_text(one[f'{which}_sigma_3d_m'], 1e3, 3)} mm"
+            for which in ("worst", "mean")
+        )
+        notes.append(
+            f"One more mark at {at} m (pole {one['pole_height_m']:.2f} m) would bring the worst "
+            "stop {} (3-D sigma), the mean of all stops {}.".format(*changes)
+        )
+    tables = [Table(columns=_PLANNED_MARKS, rows=marks)]
+    print_tables(out, [*tables, Table(columns=stops, rows=plan["stops"], notes=notes)])
+
+
+def _angles(stop: Plain) -> str:
+    """Return the included angles of a stop."""
+    return " - ".join(_text(stop[f"included_angle_{one}_deg"], 1, 0) for one in ("min", "max"))
+
+
+def _text(value: float | None, factor: float, digits: int) -> str:
+    """Return a number in a larger unit; a dash for none."""
+    return "-" if value is None else f"{factor * value:.{digits}f}"

@@ -7,44 +7,27 @@ from typing import Annotated, Any
 
 import typer
 
-from spheremark.service.cli.reading import LogFiles, reads_logs
-from spheremark.service.cli.survey import (
-    AsJson,
-    Axes,
-    ControlAxes,
-    ControlFile,
-    ControlUnit,
-    RigFile,
-    TargetHeight,
-    Unit,
-    read_control,
-)
+from spheremark.service.cli.options import AsJson, Field, RadiusM, grouped
+from spheremark.service.cli.reading import Logs, Reading
 from spheremark.service.cli.terminal import err, out, print_json, progress
 
-Laz = Annotated[
-    Path | None, typer.Option(dir_okay=False, help="Write the cloud in the site frame (LAZ).")
-]
-E57 = Annotated[
-    Path | None,
-    typer.Option(dir_okay=False, help="Write the cloud as scans with their poses (E57)."),
-]
-GeoTiff = Annotated[
-    Path | None,
-    typer.Option(dir_okay=False, help="Write the ground's heights and sigmas (GeoTIFF)."),
-]
 
-
-@reads_logs
+@grouped
 def site(
-    logs: LogFiles,
-    control: ControlFile = None,
-    control_axes: ControlAxes = Axes.ENU,
-    control_unit: ControlUnit = Unit.METRE,
-    target_height_m: TargetHeight = 0.0,
-    rig: RigFile = None,
-    laz: Laz = None,
-    e57: E57 = None,
-    geotiff: GeoTiff = None,
+    logs: Logs,
+    reading: Reading,
+    field: Field,
+    laz: Annotated[
+        Path | None, typer.Option(dir_okay=False, help="Write the cloud in the site frame (LAZ).")
+    ] = None,
+    e57: Annotated[
+        Path | None,
+        typer.Option(dir_okay=False, help="Write the cloud as scans with their poses (E57)."),
+    ] = None,
+    geotiff: Annotated[
+        Path | None,
+        typer.Option(dir_okay=False, help="Write the ground's heights and sigmas (GeoTIFF)."),
+    ] = None,
     cell_m: Annotated[float, typer.Option(help="Edge of a cell of the ground \\[m].")] = 0.25,
     ground_range_m: Annotated[
         float, typer.Option(help="How far from a station ground is used \\[m].")
@@ -56,14 +39,13 @@ def site(
     voxel_m: Annotated[
         float, typer.Option(help="Keep a return in cubes of this edge \\[m]; 0: all.")
     ] = 0.0,
-    radius_m: Annotated[float, typer.Option(help="Radius of the spheres \\[m].")] = 0.100,
+    radius_m: RadiusM = 0.100,
     as_json: AsJson = False,
 ) -> None:
     """Put all stops into one frame: a cloud, and a model of the ground with its uncertainty."""
     from spheremark.pipelines.config import SurveyConfig
     from spheremark.service.jobs import site as sites
     from spheremark.service.provenance import code_version
-    from spheremark.storage.imports import survey_files as site_files
 
     given = {"laz": laz, "e57": e57, "geotiff": geotiff}
     targets = {kind: path for kind, path in given.items() if path is not None}
@@ -81,11 +63,9 @@ def site(
     config = SurveyConfig.from_mapping(
         {"marker_radius": radius_m, "fitting": {"methods": ["along_beam"]}}
     )
-    marks = read_control(control, control_axes, control_unit, target_height_m)
+    marks, rig = field.read()
     with progress() as track:
-        made, network = sites.of_logs(
-            logs, marks, site_files.read_rig(rig) if rig else None, config, request, track
-        )
+        made, network = sites.of_logs(reading.files(logs), marks, rig, config, request, track)
     plain = sites.serialise_site(made, request, network)
     if as_json:
         print_json(plain)

@@ -2,77 +2,26 @@
 
 from __future__ import annotations
 
-from enum import StrEnum
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import typer
 
-from spheremark.service.cli.reading import LogFiles, reads_logs
+from spheremark.service.cli.options import AsJson, Field, RadiusM, grouped
+from spheremark.service.cli.reading import Logs, Reading
 from spheremark.service.cli.terminal import out, print_json, progress
 
-if TYPE_CHECKING:
-    from spheremark.pipelines.model import ControlMarks
 
-AsJson = Annotated[bool, typer.Option("--json", help="JSON for programs.")]
-
-
-class Axes(StrEnum):
-    """What three coordinates of control marks can be."""
-
-    ENU = "enu"
-    NEU = "neu"
-    NED = "ned"
-
-
-class Unit(StrEnum):
-    """Units of control marks."""
-
-    METRE = "m"
-    MILLIMETRE = "mm"
-    FOOT = "ft"
-    US_FOOT = "us-ft"
-
-
-ControlFile = Annotated[
-    Path | None, typer.Option(exists=True, dir_okay=False, help="Control marks (CSV).")
-]
-ControlAxes = Annotated[
-    Axes, typer.Option(help="Order of coordinates that are not called by name in the control file.")
-]
-ControlUnit = Annotated[Unit, typer.Option(help="Unit of the control file.")]
-TargetHeight = Annotated[
-    float, typer.Option(help="Height of the centres above the points of the control file \\[m].")
-]
-RigFile = Annotated[
-    Path | None, typer.Option(exists=True, dir_okay=False, help="Rig (JSON), if not the logs'.")
-]
-
-
-def read_control(
-    path: Path | None, axes: Axes, unit: Unit, target_height_m: float
-) -> ControlMarks | None:
-    """Read control marks in the given axes and unit."""
-    from spheremark.storage.imports.survey_files import ControlLayout
-    from spheremark.storage.imports.survey_files import read_control as read
-
-    layout = ControlLayout(axes=axes.value, unit=unit.value, target_height=target_height_m)
-    return read(path, layout) if path else None
-
-
-@reads_logs
+@grouped
 def adjust(
-    logs: LogFiles,
-    control: ControlFile = None,
-    control_axes: ControlAxes = Axes.ENU,
-    control_unit: ControlUnit = Unit.METRE,
-    target_height_m: TargetHeight = 0.0,
-    rig: RigFile = None,
+    logs: Logs,
+    reading: Reading,
+    field: Field,
     calibrating: Annotated[
         bool, typer.Option("--calibrate", help="Estimate the rig in the same adjustment.")
     ] = False,
     method: Annotated[str, typer.Option(help="Fitting method.")] = "along_beam",
-    radius_m: Annotated[float, typer.Option(help="Radius of the spheres \\[m].")] = 0.100,
+    radius_m: RadiusM = 0.100,
     gama: Annotated[
         Path | None, typer.Option(dir_okay=False, help="Write input of GNU Gama (XML).")
     ] = None,
@@ -103,12 +52,12 @@ def adjust(
     config = SurveyConfig.from_mapping(
         {"marker_radius": radius_m, "fitting": {"methods": [method]}}
     )
-    marks = read_control(control, control_axes, control_unit, target_height_m)
-    given = site_files.read_rig(rig) if rig else None
+    marks, given = field.read()
+    files = reading.files(logs)
     with progress() as track:
-        book = log_files.read_scans(logs, config, given, track)
+        book = log_files.read_scans(files, config, given, track)
         if calibrating:
-            book = log_files.with_calibration(book, logs, config, given, track)
+            book = log_files.with_calibration(book, files, config, given, track)
     result = log_files.adjust_scans(book, marks, config)
     found = log_files.adjusted_rig(result, book)
     plain = serialise.serialise_network(result, config, rig=found, uncalibrated=book.uncalibrated)
@@ -128,16 +77,17 @@ def adjust(
         render.print_network(out, plain)
 
 
-@reads_logs
+@grouped
 def calibrate(
-    logs: LogFiles,
+    logs: Logs,
+    reading: Reading,
     rig: Annotated[
         Path | None,
         typer.Option(
             exists=True, dir_okay=False, help="Rig to start with (JSON), if not the logs'."
         ),
     ] = None,
-    radius_m: Annotated[float, typer.Option(help="Radius of the spheres \\[m].")] = 0.100,
+    radius_m: RadiusM = 0.100,
     target: Annotated[
         Path | None, typer.Option("--out", dir_okay=False, help="Write a rig file for --rig.")
     ] = None,
@@ -153,7 +103,7 @@ def calibrate(
     config = SurveyConfig.from_mapping({"marker_radius": radius_m})
     start = site_files.read_rig(rig) if rig else None
     with progress() as track:
-        found = calibrate_files(logs, config, start, track)
+        found = calibrate_files(reading.files(logs), config, start, track)
     if target:
         target.write_text(site_files.format_rig(found.rig), encoding="utf-8")
     plain = serialise_calibration(found)

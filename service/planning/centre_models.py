@@ -47,17 +47,16 @@ _KNOWN = "SELECT name FROM surveys WHERE name = '{survey}' OR survey_id = '{surv
 _NAME_MOST = 200  # characters
 
 
-def model_of_surveys(
-    query: Query,
+def model_of(
+    query: Query | None,
     sensor: Sensor,
     radius: float,
-    *,
     survey: str = "",
     fit_method: str = "along_beam",
 ) -> CentreModel:
-    """Return the model of surveys; that of the sensor where they have too few fits."""
-    rows = read_fit_rows(query, radius, survey=survey, fit_method=fit_method)
-    return sensor_model(sensor, radius) if rows is None else fitted_model(sensor, radius, rows)
+    """Return the model of surveys; that of the sensor without results or with too few fits."""
+    rows = query and read_fit_rows(query, radius, survey=survey, fit_method=fit_method)
+    return fitted_model(sensor, radius, rows) if rows else sensor_model(sensor, radius)
 
 
 def require_survey(query: Query, survey: str) -> None:

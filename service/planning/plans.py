@@ -20,7 +20,7 @@ from spheremark.pipelines.placement import (
     Stops,
 )
 from spheremark.pipelines.progress import checkpoint
-from spheremark.service.planning.centre_models import Query, model_of_surveys
+from spheremark.service.planning.centre_models import Query, model_of
 from spheremark.service.planning.requests import (
     Ground,
     Place,
@@ -88,11 +88,6 @@ def assemble(
 ) -> Plan:
     """Return a plan on its ground, with the model of the results that can be queried."""
     radius = ground.site.marker_radius
-    model = (
-        placement.sensor_model(sensor, radius)
-        if query is None
-        else model_of_surveys(query, sensor, radius, survey=survey)
-    )
     places = () if marks is None else zip(marks.names, marks.p_site.tolist(), strict=True)
     standing = [Place(name, p[0], p[1], z=p[2]) for name, p in places]
     placement.check_sizes(len(ground.stops.names), len(standing))
@@ -100,7 +95,7 @@ def assemble(
         ground=ground,
         stops=ground.stops,
         marks=marks_at(ground.site, standing),
-        model=model,
+        model=model_of(query, sensor, radius, survey),
         requirement=requirement,
     )
 

@@ -35,7 +35,7 @@ from spheremark.pipelines.placement import (
 )
 from spheremark.pipelines.progress import checkpoint
 from spheremark.pipelines.simulation import scenario
-from spheremark.service.planning.centre_models import model_of_surveys
+from spheremark.service.planning.centre_models import model_of
 from spheremark.storage.catalogue import plans as kept
 from spheremark.storage.catalogue.catalogue import Catalogue
 from spheremark.storage.imports.terrain import open_terrain
@@ -276,7 +276,7 @@ class Planner:
         with self._lock:
             known = self._models.get(version)
         if known is None:
-            known = model_of_surveys(self.query, sensor, radius, survey=survey)
+            known = model_of(self.query, sensor, radius, survey)
             with self._lock:
                 newest_models = dict(list(self._models.items())[-_MODELS_KEPT:])
                 self._models = {**newest_models, version: known}

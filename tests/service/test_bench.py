@@ -11,9 +11,9 @@ from typer.testing import CliRunner
 from spheremark.pipelines.errors import RecordingError
 from spheremark.pipelines.simulation import SimulationConfig, scenario, simulate_stop
 from spheremark.service.bench import chain, growth, peers, speed, yardstick
-from spheremark.service.bench.report import print_tables
 from spheremark.service.bench.yardstick import Cost
 from spheremark.service.cli.main import app
+from spheremark.service.cli.render import print_tables
 from spheremark.storage.recordings import read_log, write_log
 
 TURN = 4.0  # [s]: half a million returns

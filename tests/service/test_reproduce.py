@@ -13,7 +13,6 @@ from rich.console import Console
 from spheremark.pipelines.errors import NotFoundError
 from spheremark.pipelines.evaluation.reproduction.plan import OURS, PAPER
 from spheremark.pipelines.published import TABLE_2
-from spheremark.service.bench.report import print_tables
 from spheremark.service.bench.reproduce import (
     ReproductionOptions,
     _report,
@@ -21,6 +20,7 @@ from spheremark.service.bench.reproduce import (
     reproduce,
     reproduction_tables,
 )
+from spheremark.service.cli.render import print_tables
 from spheremark.web import assets, theme
 from spheremark.web.pages import reproduction as drawing
 from tests.reproduced import reproduction

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Any
+from collections.abc import Callable
+from typing import Annotated, Any, Literal, TypeVar
 
 from fastapi import APIRouter, Path, Query, Response
 from pydantic import Field
@@ -14,6 +15,7 @@ from spheremark.service.http.state import Current, Service
 from spheremark.service.serialise.models import CalibrationDocument, NetworkDocument
 
 router = APIRouter()
+_Route = TypeVar("_Route", bound=Callable[..., Any])
 
 _FILTERS = """
 WHERE ($survey::VARCHAR IS NULL OR s.survey_id = $survey OR s.name = $survey)
@@ -23,35 +25,22 @@ WHERE ($survey::VARCHAR IS NULL OR s.survey_id = $survey OR s.name = $survey)
     AND ($status::VARCHAR IS NULL OR x.status = $status)
     AND ($run::VARCHAR IS NOT NULL OR NOT $latest OR x.run_id IN (SELECT run_id FROM latest_runs))
 """
-_FITS = (
-    """
-SELECT concat_ws('~', x.run_id, x.stop, x.fit_method, x.marker) AS id,
-    s.name AS survey, r.recording_id, x.*
-FROM marker_fits AS x JOIN runs AS r USING (run_id) JOIN surveys AS s USING (survey_id)
+_ROWS = """
+SELECT {id} AS id, s.name AS survey, r.recording_id, x.*
+FROM {table} AS x JOIN runs AS r USING (run_id) JOIN surveys AS s USING (survey_id)
 """
-    + _FILTERS
-    + "ORDER BY r.finished_at, x.run_id, x.stop, x.fit_method, x.marker LIMIT $n OFFSET $after"
-)
-_FIXES = (
-    """
-SELECT concat_ws('~', x.run_id, x.stop, x.fit_method, x.resection_method) AS id,
-    s.name AS survey, r.recording_id, x.*
-FROM station_fixes AS x JOIN runs AS r USING (run_id) JOIN surveys AS s USING (survey_id)
-"""
-    + _FILTERS
-    + "ORDER BY r.finished_at, x.run_id, x.stop, x.fit_method, x.resection_method "
-    "LIMIT $n OFFSET $after"
-)
-_FIT = """
-SELECT $id AS id, s.name AS survey, r.recording_id, x.*
-FROM marker_fits AS x JOIN runs AS r USING (run_id) JOIN surveys AS s USING (survey_id)
-WHERE concat_ws('~', x.run_id, x.stop, x.fit_method, x.marker) = $id
-"""
-_FIX = """
-SELECT $id AS id, s.name AS survey, r.recording_id, x.*
-FROM station_fixes AS x JOIN runs AS r USING (run_id) JOIN surveys AS s USING (survey_id)
-WHERE concat_ws('~', x.run_id, x.stop, x.fit_method, x.resection_method) = $id
-"""
+_LIST = _ROWS + _FILTERS + "ORDER BY r.finished_at, {order} LIMIT $n OFFSET $after"
+_ONE = _ROWS + "WHERE {id} = $id"
+_FIT = {
+    "id": "concat_ws('~', x.run_id, x.stop, x.fit_method, x.marker)",
+    "table": "marker_fits",
+    "order": "x.run_id, x.stop, x.fit_method, x.marker",
+}
+_FIX = {
+    "id": "concat_ws('~', x.run_id, x.stop, x.fit_method, x.resection_method)",
+    "table": "station_fixes",
+    "order": "x.run_id, x.stop, x.fit_method, x.resection_method",
+}
 _OBSERVATIONS = """
 SELECT * FROM observations WHERE concat_ws('~', run_id, stop, fit_method, resection_method) = $id
 ORDER BY marker
@@ -85,9 +74,6 @@ _CALIBRATION_PARTS = {
 RowId = Annotated[str, Path(description="Id of the row, as the list gives it.")]
 AdjustmentId = Annotated[str, Path(description="Id of the adjustment.")]
 CalibrationId = Annotated[str, Path(description="Id of the calibration.")]
-_FILE = {"content": {"application/octet-stream": {}}, "description": "The file."}
-_NETWORK_FILE: dict[int | str, dict[str, Any]] = {200: _FILE | {"model": NetworkDocument}}
-_CALIBRATION_FILE: dict[int | str, dict[str, Any]] = {200: _FILE | {"model": CalibrationDocument}}
 
 
 class RowFilter(rows.ResultFilter):
@@ -96,7 +82,9 @@ class RowFilter(rows.ResultFilter):
     run: str | None = Field(default=None, description="Id of a run, even if a newer one exists.")
     stop: str | None = Field(default=None, description="Name of a stop.")
     fit_method: str | None = Field(default=None, description="Fitting method.")
-    status: str | None = Field(default=None, description="ok, weak, or failed for a station.")
+    status: Literal["ok", "weak", "failed"] | None = Field(
+        default=None, description="ok, weak, or failed for a station."
+    )
     latest: bool = Field(default=True, description="Only the newest run of each log.")
 
 
@@ -108,6 +96,18 @@ class RunFilter(Strict):
     job: str | None = Field(default=None, description="Id of a job.")
     after: str | None = Field(default=None, description="The 'next' of the part before.")
     limit: int = Field(default=100, ge=1, le=1000, description="Items in one part.")
+
+
+def _get(path: str, name: str, model: Any, tag: str = "results") -> Callable[[_Route], _Route]:
+    """Return the decorator of a route to rows, whose model is known at run time only."""
+    return router.get(path, name=name, tags=[tag], response_model=model)
+
+
+def _download(path: str, name: str, model: Any, tag: str) -> Callable[[_Route], _Route]:
+    """Return the decorator of a route to the files of a result, one of which is of a model."""
+    file = {"content": {"application/octet-stream": {}}, "description": "The file."}
+    responses: dict[int | str, dict[str, Any]] = {200: file | {"model": model}}
+    return router.get(path, name=name, tags=[tag], response_class=Response, responses=responses)
 
 
 @router.get("/runs", name="list_runs", tags=["results"])
@@ -129,119 +129,81 @@ def get_run(run: Annotated[str, Path(description="Id of the run.")], service: Cu
     return Run.of(service.catalogue.get_run(run))
 
 
-@router.get(
-    "/marker-fits",
-    name="list_marker_fits",
-    tags=["results"],
-    response_model=listing_of(rows.MarkerFit),
-)
+@_get("/marker-fits", "list_marker_fits", listing_of(rows.MarkerFit))
 def list_marker_fits(chosen: Annotated[RowFilter, Query()], service: Current) -> Plain:
     """List sphere centres in the station frame: one per stop, marker and fitting method."""
-    return rows.listed(service, _FITS, chosen.model_dump())
+    return _listed(service, _FIT, chosen)
 
 
-@router.get(
-    "/marker-fits/{row:path}",
-    name="get_marker_fit",
-    tags=["results"],
-    response_model=rows.MarkerFit,
-)
+@_get("/marker-fits/{row:path}", "get_marker_fit", rows.MarkerFit)
 def get_marker_fit(row: RowId, service: Current) -> Plain:
     """Return one sphere centre."""
-    return rows.one_of(service, _FIT, row, "marker fit")
+    return rows.one_of(service, _ONE.format(**_FIT), row, "marker fit")
 
 
-@router.get(
-    "/station-fixes",
-    name="list_station_fixes",
-    tags=["results"],
-    response_model=listing_of(rows.StationFix),
-)
+@_get("/station-fixes", "list_station_fixes", listing_of(rows.StationFix))
 def list_station_fixes(chosen: Annotated[RowFilter, Query()], service: Current) -> Plain:
     """List stations in the site frame: one per stop, fitting and resection method."""
-    return rows.listed(service, _FIXES, chosen.model_dump())
+    return _listed(service, _FIX, chosen)
 
 
-@router.get(
-    "/station-fixes/{row:path}",
-    name="get_station_fix",
-    tags=["results"],
-    response_model=rows.StationFixDetail,
-)
+@_get("/station-fixes/{row:path}", "get_station_fix", rows.StationFixDetail)
 def get_station_fix(row: RowId, service: Current) -> Plain:
     """Return one station with its observations: residuals, redundancy, reliability."""
-    fix = rows.one_of(service, _FIX, row, "station fix")
+    fix = rows.one_of(service, _ONE.format(**_FIX), row, "station fix")
     return fix | {"observations": service.catalogue.rows(_OBSERVATIONS, {"id": row})}
 
 
-@router.get(
-    "/adjustments",
-    name="list_adjustments",
-    tags=["adjustments"],
-    response_model=listing_of(rows.Adjustment),
-)
+@_get("/adjustments", "list_adjustments", listing_of(rows.Adjustment), "adjustments")
 def list_adjustments(chosen: Annotated[ResultFilter, Query()], service: Current) -> Plain:
     """List adjusted networks, newest first."""
     return _results(service, _ADJUSTMENT, chosen)
 
 
-@router.get(
-    "/adjustments/{adjustment}",
-    name="get_adjustment",
-    tags=["adjustments"],
-    response_model=rows.AdjustmentDetail,
-)
+@_get("/adjustments/{adjustment}", "get_adjustment", rows.AdjustmentDetail, "adjustments")
 def get_adjustment(adjustment: AdjustmentId, service: Current) -> Plain:
     """Return a network with its stations, marks, and control marks left out in turn."""
     row = rows.one_of(service, _RESULT.format(**_ADJUSTMENT), adjustment, "adjustment")
     return rows.detailed(service, row, _ADJUSTMENT_PARTS, adjustment)
 
 
-@router.get(
-    "/adjustments/{adjustment}/files/{name}",
-    name="download_adjustment",
-    tags=["adjustments"],
-    response_class=Response,
-    responses=_NETWORK_FILE,
+@_download(
+    "/adjustments/{adjustment}/files/{name}", "download_adjustment", NetworkDocument, "adjustments"
 )
 def download_adjustment(adjustment: AdjustmentId, name: FileName, service: Current) -> Response:
     """Return a network as a file: JSON, report, CSV or GNU Gama XML."""
     return rows.document(service, adjustment, name)
 
 
-@router.get(
-    "/calibrations",
-    name="list_calibrations",
-    tags=["calibrations"],
-    response_model=listing_of(rows.Calibration),
-)
+@_get("/calibrations", "list_calibrations", listing_of(rows.Calibration), "calibrations")
 def list_calibrations(chosen: Annotated[ResultFilter, Query()], service: Current) -> Plain:
     """List calibrations, newest first."""
     return _results(service, _CALIBRATION, chosen)
 
 
-@router.get(
-    "/calibrations/{calibration}",
-    name="get_calibration",
-    tags=["calibrations"],
-    response_model=rows.CalibrationDetail,
-)
+@_get("/calibrations/{calibration}", "get_calibration", rows.CalibrationDetail, "calibrations")
 def get_calibration(calibration: CalibrationId, service: Current) -> Plain:
     """Return a calibration with each parameter before and after, and the gaps of the faces."""
     row = rows.one_of(service, _RESULT.format(**_CALIBRATION), calibration, "calibration")
     return rows.detailed(service, row, _CALIBRATION_PARTS, calibration)
 
 
-@router.get(
+@_download(
     "/calibrations/{calibration}/files/{name}",
-    name="download_calibration",
-    tags=["calibrations"],
-    response_class=Response,
-    responses=_CALIBRATION_FILE,
+    "download_calibration",
+    CalibrationDocument,
+    "calibrations",
 )
 def download_calibration(calibration: CalibrationId, name: FileName, service: Current) -> Response:
     """Return a calibration as a file: JSON, or the rig alone."""
     return rows.document(service, calibration, name)
+
+
+def _listed(service: Service, table: dict[str, str], chosen: RowFilter) -> Plain:
+    """Return a part of the rows of runs; refuse a survey that does not exist."""
+    if chosen.survey is not None:
+        service.catalogue.get_survey(chosen.survey)
+    return rows.listed(service, _LIST.format(**table), chosen.model_dump())
 
 
 def _results(service: Service, table: dict[str, str], chosen: ResultFilter) -> Plain:

@@ -17,7 +17,7 @@ from spheremark.pipelines.evaluation.networks import (
 from spheremark.pipelines.network import adjust_network, assemble
 from spheremark.pipelines.simulation import SimulationConfig
 from spheremark.pipelines.simulation.rig import nominal_rig
-from spheremark.service.bench.report import print_tables
+from spheremark.service.cli.render import print_tables
 from tests.synthetic import field, pose, sightings
 
 CONFIG = ResectionConfig()
