@@ -161,6 +161,7 @@ OTHER_KINDS: Mapping[str, tuple[str, int]] = {
     "input.validation": ("The request does not have the shape that this route reads.", 422),
     "method_not_allowed": ("The address does not support this method.", 405),
     "internal": ("The service failed for a reason that it does not know.", 500),
+    "job_timeout": ("The job took longer than a job may.", 500),
     "worker_died": ("The worker process of a job died each time that it was tried.", 500),
 }
 """Problems without an error class: code, sentence and status."""

@@ -66,6 +66,14 @@ class Settings(BaseSettings):
         le=10,
         description="How often a job is started before a dead worker fails it.",
     )
+    job_seconds: float = Field(
+        default=6 * 3600.0, gt=0, description="Time after which an attempt at a job is ended [s]."
+    )
+    job_memory_bytes: int = Field(
+        default=0,
+        ge=0,
+        description="Memory of a worker, beyond which it is ended [bytes]; 0: an even share.",
+    )
     max_upload_bytes: int = Field(
         default=8 << 30, ge=1, description="Largest log that is accepted [bytes]."
     )

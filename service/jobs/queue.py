@@ -47,8 +47,10 @@ _Result = TypeVar("_Result")
 
 INTERNAL = "internal"
 WORKER_DIED = "worker_died"
+TOO_LONG = "job_timeout"
 _RECORD_EVERY = 0.5  # [s] between two reports of progress that reach the database
 _STORE_AGAIN, _STORE_AGAIN_MAX = 1.0, 30.0  # [s] until a result is written again
+_COUNT_EVERY = 2.0  # [s] between two counts of the workers
 _GRACE = 1.0  # [s] that a dismissed job has to stop between two steps
 
 
@@ -62,6 +64,8 @@ class _Live:
     has_begun: bool = False
     is_running: bool = False
     recorded_at: float = 0.0
+    rank: int = 0
+    deadline: asyncio.TimerHandle | None = None
     stopped: asyncio.Event = field(default_factory=asyncio.Event)
     turn: asyncio.Lock = field(default_factory=asyncio.Lock)  # beginning and end, one at a time
 
@@ -83,6 +87,9 @@ class JobQueue:
         self._settings = settings
         self._catalogue = catalogue
         self._clouds = clouds
+        self._n_workers = 0
+        self._ranks: dict[str, int] = {}  # of the last job of each survey
+        self._rank = 0  # highest of those that have begun
         self._live: dict[str, _Live] = {}
         self._followers: set[asyncio.Task[None]] = set()
         self._events_in: asyncio.Queue[dict[str, Any]] = asyncio.Queue()
@@ -95,8 +102,8 @@ class JobQueue:
             tasks.TOPIC, lambda event: self._events_in.put_nowait(event[1])
         )
         await self._client.register_plugin(tasks.WarmUp(is_ours=not self._settings.scheduler))
-        recorder = asyncio.create_task(self._record())
-        self._stack.callback(recorder.cancel)
+        for task in (self._record(), self._count_workers()):
+            self._stack.callback(asyncio.create_task(task).cancel)
         most = self._settings.job_attempts
         for job in await asyncio.to_thread(self._catalogue.take_up_jobs, most, self._why_killed()):
             self._start(job)
@@ -131,6 +138,7 @@ class JobQueue:
                 LocalCluster(
                     n_workers=self._settings.workers,
                     threads_per_worker=1,
+                    memory_limit=self._settings.job_memory_bytes or "auto",
                     processes=True,
                     host="127.0.0.1",
                     protocol="tls://",
@@ -145,8 +153,16 @@ class JobQueue:
         return client
 
     def n_workers(self) -> int:
-        """Return the number of worker processes that are ready."""
-        return len(self._client.scheduler_info(n_workers=-1)["workers"])
+        """Return the number of worker processes that were ready a few seconds ago."""
+        return self._n_workers
+
+    async def _count_workers(self) -> None:
+        """Keep the number of workers: Dask's own copy of it may be minutes old."""
+        while True:
+            with suppress(OSError):
+                known = await self._client.scheduler.identity(n_workers=-1)
+                self._n_workers = len(known["workers"])
+            await asyncio.sleep(_COUNT_EVERY)
 
     def submit(self, job: JobRecord) -> None:
         """Submit an accepted job to the cluster; may be called from any thread."""
@@ -172,8 +188,10 @@ class JobQueue:
         await self._client.run(os._exit, 1, workers=[live.worker], on_error="ignore")
 
     def _start(self, job: JobRecord) -> None:
-        """Follow a job from here to its end."""
-        self._live[job.job_id] = _Live(job)
+        """Follow a job from here to its end; surveys take turns, however many jobs each has."""
+        rank = max(self._ranks.get(job.survey_id, 0) + 1, self._rank)
+        self._ranks[job.survey_id] = rank
+        self._live[job.job_id] = _Live(job, rank=rank)
         self._keep(self._follow(self._live[job.job_id]))
 
     def _keep(self, coroutine: Any) -> None:
@@ -189,7 +207,11 @@ class JobQueue:
             await self.events.add(job)
             spec = await asyncio.to_thread(self._specification, job)
             live.future = self._client.submit(
-                tasks.run, spec, key=f"{job.job_id}-{spec.result_id}", pure=False
+                tasks.run,
+                spec,
+                key=f"{job.job_id}-{spec.result_id}",
+                pure=False,
+                priority=-live.rank,
             )
             result = await live.future
             async with live.turn:
@@ -207,6 +229,8 @@ class JobQueue:
             text = "".join(traceback.format_exception(error))
             ended = await self._fail(live, INTERNAL, f"{type(error).__name__}: {error}", text)
         self._live.pop(job.job_id, None)
+        if live.deadline is not None:
+            live.deadline.cancel()
         if ended.status.is_final:
             await self.events.add(ended)
 
@@ -243,11 +267,29 @@ class JobQueue:
             reason = "The worker died; tried again."
             await self._stored(self._catalogue.requeue_job, job_id, reason)
         live.has_begun = True
+        self._rank = max(self._rank, live.rank)
+        if live.deadline is not None:
+            live.deadline.cancel()
+        live.deadline = self._loop.call_later(
+            self._settings.job_seconds, lambda: self._keep(self._end_late(live))
+        )
         live.job = await self._stored(self._catalogue.start_job, job_id)
         if live.job.attempts > self._settings.job_attempts:  # those before a restart count too
             await self._fail(live, WORKER_DIED, self._why_killed())
             if live.future is not None:
                 await live.future.cancel(force=True)
+
+    async def _end_late(self, live: _Live) -> None:
+        """Fail a job that runs too long, and end it."""
+        reason = (
+            f"The job was ended after {self._settings.job_seconds:g} s, its time limit. Process "
+            "fewer logs at once, or raise SPHEREMARK_JOB_SECONDS."
+        )
+        await self._fail(live, TOO_LONG, reason)
+        if live.future is not None:
+            await live.future.cancel(force=True)
+        if live.is_running:
+            await self._stop(live)
 
     async def _stored(self, store: Callable[..., _Result], *arguments: Any) -> _Result:
         """Write to the catalogue; while the disk refuses, try again: no result is lost by it."""

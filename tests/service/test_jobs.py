@@ -168,6 +168,31 @@ def test_a_job_whose_worker_dies_is_tried_again(site):
     assert len(runs) == 1
 
 
+def test_surveys_take_turns_however_many_jobs_each_has(site):
+    recording = site.upload().json()["recording_id"]
+    jobs = []
+    for survey in ("many",) * 5 + ("few",):
+        site.survey(survey) if survey not in [name for name, _ in jobs] else None
+        new = {"survey": survey, "recording": recording}
+        jobs.append((survey, site.client.post("/api/v1/jobs", json=new).json()["job_id"]))
+    ended = [(site.ended(job)["started_at"], survey) for survey, job in jobs]
+    order = [survey for _, survey in sorted(ended)]
+    assert order.index("few") <= 2, order  # one or two of the others had begun by then
+
+
+def test_a_job_ends_at_its_time_limit_and_the_next_is_served(tmp_path, stop, control, open_site):
+    settings = Settings(data=tmp_path, workers=1, job_seconds=0.01)
+    with TestClient(create_app(settings), base_url="http://127.0.0.1:8000") as client:
+        site = open_site(client, stop, control)
+        site.survey("late")
+        new = {"survey": "late", "recording": site.upload().json()["recording_id"]}
+        for _ in range(2):
+            job = site.ended(client.post("/api/v1/jobs", json=new).json()["job_id"])
+            assert (job["status"], job["error_code"]) == ("failed", "job_timeout"), job
+            assert "0.01 s, its time limit" in job["error_reason"]
+        assert client.get("/api/v1/runs", params={"survey": "late"}).json()["items"] == []
+
+
 def test_jobs_are_taken_up_again_after_a_restart(tmp_path, stop, control, open_site):
     settings = Settings(data=tmp_path, workers=1)
 

@@ -14,7 +14,7 @@ from spheremark.service.http.api.models import Strict
 
 _FAR = 1e8  # [m]; projected coordinates, zone in front, have at most eight digits
 Coordinate = Annotated[float, Field(ge=-_FAR, le=_FAR)]
-Point = tuple[Coordinate, Coordinate, Coordinate]
+Point = tuple[Coordinate, Coordinate, float]
 Area = Annotated[list[tuple[Coordinate, Coordinate]], Field(min_length=3, max_length=200)]
 Name = Annotated[str, Field(min_length=1, max_length=50)]
 
@@ -25,7 +25,7 @@ class RequestedMark(Strict):
     name: Name
     x_m: Coordinate | None = None
     y_m: Coordinate | None = None
-    pole_height_m: Coordinate | None = Field(
+    pole_height_m: float | None = Field(
         default=None, description="Height of the sphere's centre above the ground [m]."
     )
     position_m: Point | None = Field(
