@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 import os
 import signal
 import socket
@@ -13,6 +12,7 @@ from fastapi import FastAPI
 from uvicorn.importer import import_from_string
 
 from spheremark.pipelines.errors import ConflictError
+from spheremark.service.logs import log_to_stderr
 from spheremark.service.settings import Settings
 
 Ready = Callable[[str], None]
@@ -44,7 +44,7 @@ def serve(settings: Settings, *, ready: Ready) -> None:
     """Serve until SIGINT or SIGTERM; ``ready`` gets the address once requests are accepted."""
     os.umask(0o077)  # what the service and its workers write is for its user alone
     create_app = import_from_string(_APPLICATION)  # Dask, which it imports, configures logging too
-    logging.basicConfig(level=logging.WARNING, format="%(levelname)s %(name)s: %(message)s")
+    log_to_stderr(settings.log_format)
     app: FastAPI = create_app(settings)
     with _listener(settings) as listener:
         address = settings.address(listener.getsockname()[1])

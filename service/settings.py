@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Literal, Self
 from pydantic import Field, SecretStr, model_validator
 from pydantic_settings import BaseSettings, SettingsConfigDict
 
+from spheremark.service.logs import LogFormat
 from spheremark.service.tokens import BITS_MIN, Tokens, is_strong
 
 if TYPE_CHECKING:
@@ -96,6 +97,9 @@ class Settings(BaseSettings):
     )
     sql_memory_bytes: int = Field(
         default=512 << 20, ge=64 << 20, description="Memory that one query may use [bytes]."
+    )
+    log_format: LogFormat = Field(
+        default="text", description="Lines of the log: text, or json with ids of request and job."
     )
     log_level: Literal["debug", "info", "warning", "error"] = Field(
         default="info", description="Least severity that is logged."

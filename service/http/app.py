@@ -13,13 +13,15 @@ from urllib.parse import parse_qs
 from fastapi import APIRouter, FastAPI, Request, Response
 from fastapi.responses import HTMLResponse, RedirectResponse
 from fastapi.staticfiles import StaticFiles
+from prometheus_client import CONTENT_TYPE_LATEST, generate_latest
 from starlette.types import ASGIApp
 
 from spheremark.pipelines.errors import InputError
 from spheremark.service.errors import Problem, UnauthorizedError
-from spheremark.service.http import api, errors, security
+from spheremark.service.http import api, errors, observation, security
 from spheremark.service.http.pages import frame, jobs, networks, plans, sites, surveys
 from spheremark.service.http.state import Current, opened
+from spheremark.service.logs import event_level
 from spheremark.service.settings import Settings
 from spheremark.service.tokens import Tokens
 from spheremark.storage.files import StorageError
@@ -46,7 +48,9 @@ class _Application(FastAPI):
 
     def build_middleware_stack(self) -> ASGIApp:
         """Return the whole application."""
-        return security.SecureHeaders(super().build_middleware_stack())
+        app: ASGIApp = super().build_middleware_stack()
+        app = observation.Observation(app, self.state.metrics, self.state.event_level)
+        return security.SecureHeaders(app)
 
 
 def create_app(settings: Settings) -> FastAPI:
@@ -58,7 +62,9 @@ def create_app(settings: Settings) -> FastAPI:
         try:
             async with opened(settings) as service:
                 app.state.service = service
+                app.state.metrics.register(collector := observation.ServiceCollector(service))
                 yield
+                app.state.metrics.unregister(collector)
         except BaseException as error:
             app.state.failure = error  # for the server process; uvicorn only logs it
             raise
@@ -74,6 +80,8 @@ def create_app(settings: Settings) -> FastAPI:
         generate_unique_id_function=lambda route: route.name,
         responses={"default": {"model": Problem, "description": "The problem."}},
     )
+    app.state.metrics = observation.new_registry()
+    app.state.event_level = event_level(settings.log_format)
     app.add_middleware(security.SecurityMiddleware, settings=settings)
     app.include_router(api.router, prefix=ROOT)
     app.include_router(about)
@@ -122,6 +130,13 @@ def readiness(service: Current, response: Response) -> dict[str, Any]:
     is_ready = set(parts.values()) == {"ok"}
     response.status_code = 200 if is_ready else 503
     return {"status": "ready" if is_ready else "not ready", **parts}
+
+
+@about.get("/metrics")
+async def metrics(request: Request) -> Response:
+    """Return the metrics of this process, in the format of Prometheus; it waits for nothing."""
+    text = generate_latest(request.app.state.metrics)
+    return Response(text, media_type=CONTENT_TYPE_LATEST)
 
 
 @about.get("/login", response_class=HTMLResponse)

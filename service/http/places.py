@@ -67,6 +67,11 @@ class Places:
                 gone.set()
         return future.result()
 
+    @property
+    def n_taken(self) -> int:
+        """Number of requests that run or wait."""
+        return self._n
+
     def _leave(self, future: asyncio.Future[Any]) -> None:
         """Count one less."""
         self._n -= 1

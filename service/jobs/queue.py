@@ -11,6 +11,7 @@ import logging
 import os
 import secrets
 import traceback
+from collections import Counter
 from collections.abc import Callable, Mapping
 from contextlib import AsyncExitStack, suppress
 from dataclasses import dataclass, field, replace
@@ -36,6 +37,7 @@ from spheremark.service.jobs.handlers import (
     Log,
     Reading,
 )
+from spheremark.service.logs import event_level
 from spheremark.service.settings import Settings
 from spheremark.storage.catalogue.catalogue import Catalogue
 from spheremark.storage.catalogue.records import JobRecord
@@ -87,6 +89,7 @@ class JobQueue:
         self._settings = settings
         self._catalogue = catalogue
         self._clouds = clouds
+        self.n_ended: Counter[tuple[str, str]] = Counter()  # jobs by kind and status
         self._n_workers = 0
         self._ranks: dict[str, int] = {}  # of the last job of each survey
         self._rank = 0  # highest of those that have begun
@@ -155,6 +158,11 @@ class JobQueue:
     def n_workers(self) -> int:
         """Return the number of worker processes that were ready a few seconds ago."""
         return self._n_workers
+
+    def count_live(self) -> dict[str, int]:
+        """Return the number of jobs that wait and that run."""
+        running = sum(live.is_running for live in self._live.values())
+        return {"waiting": len(self._live) - running, "running": running}
 
     async def _count_workers(self) -> None:
         """Keep the number of workers: Dask's own copy of it may be minutes old."""
@@ -229,6 +237,10 @@ class JobQueue:
             text = "".join(traceback.format_exception(error))
             ended = await self._fail(live, INTERNAL, f"{type(error).__name__}: {error}", text)
         self._live.pop(job.job_id, None)
+        self.n_ended[job.kind, ended.status.value] += 1
+        about = (ended.status, ended.error_reason or ended.message)
+        level = event_level(self._settings.log_format)
+        logger.log(level, "Job ended: %s. %s", *about, extra={"job": job.job_id})
         if live.deadline is not None:
             live.deadline.cancel()
         if ended.status.is_final:
