@@ -30,6 +30,7 @@ from spheremark.service.cli.terminal import print_json as _print_json
 from spheremark.service.cli.terminal import progress as _progress
 from spheremark.service.cli.terminal import settings as _settings
 from spheremark.service.cli.tokens import token
+from spheremark.service.cli.upkeep import backup, doctor, restore
 
 app = typer.Typer(
     no_args_is_help=True,
@@ -331,6 +332,8 @@ def export(
 
 
 app.command()(reproduce)
+for command in (doctor, backup, restore):
+    app.command()(command)
 
 
 if __name__ == "__main__":

@@ -177,6 +177,9 @@ def test_a_service_is_asked_exported_and_stopped_by_a_signal(tmp_path):
         asked = run("query", "SELECT 1 AS one_m", "--json", **settings)
         assert json.loads(asked.stdout)["rows"] == [[1]]
         run("export", tmp_path / "copy.duckdb", "--url", address)
+        assert run("doctor", **settings).stdout == ""
+        run("backup", tmp_path / "backup", **settings)
+        assert run("doctor", "--mend", code=1, **settings).stdout == ""
         half_an_upload(port)
         in_use = run("query", "SELECT 1", "--data", tmp_path / "data", code=1)
         assert "in use" in in_use.stderr
@@ -185,7 +188,11 @@ def test_a_service_is_asked_exported_and_stopped_by_a_signal(tmp_path):
             assert process.wait(120) == 0  # an open stream that kept it running would last for ever
         assert DASK_RECORD.sub(b"", process.stderr.read()) == b""
     assert (tmp_path / "copy.duckdb").stat().st_size > 0
-    assert not list((tmp_path / "data/recordings/.partial").iterdir())
+    assert not [one for one in (tmp_path / "data/recordings/.partial").rglob("*") if one.is_file()]
+    files = [one for one in (tmp_path / "data").rglob("*") if one.is_file()]
+    assert not [one for one in files if one.stat().st_mode & 0o077]
+    run("restore", tmp_path / "backup", "--data", tmp_path / "again")
+    assert "Nothing is wrong" in run("doctor", "--data", tmp_path / "again").stderr
     offline = run("query", "SELECT count(*) AS n FROM recordings", "--csv", **settings)
     assert offline.stdout.split() == ["n", "0"]
 

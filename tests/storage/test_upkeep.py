@@ -1,0 +1,117 @@
+"""Upkeep of a data folder: findings, backups, and back again."""
+
+import hashlib
+import json
+import shutil
+
+import pytest
+
+from spheremark.pipelines.errors import ConflictError, InputError
+from spheremark.storage.catalogue.catalogue import Catalogue
+from spheremark.storage.upkeep import DamagedBackupError, back_up, examine, mend, restore
+
+
+def log(catalogue, data, content=b"a log"):
+    digest = hashlib.sha256(content).hexdigest()
+    path = data / "recordings" / f"{digest}.mcap"
+    path.parent.mkdir(exist_ok=True)
+    path.write_bytes(content)
+    catalogue.add_recording(
+        digest, name="a", size_bytes=len(content), url=str(path), preflight={"verdict": "ok"}
+    )
+    return path
+
+
+@pytest.fixture
+def data(tmp_path):
+    folder = tmp_path / "data"
+    folder.mkdir(mode=0o700)
+    return folder
+
+
+@pytest.fixture
+def catalogue(data):
+    with Catalogue(data / "spheremark.duckdb", snapshots=data / "snapshots") as opened:
+        opened.create_survey("lane")
+        yield opened
+
+
+def kinds(catalogue, data):
+    return sorted(one.kind for one in examine(catalogue.snapshot(), data))
+
+
+def test_nothing_is_wrong_with_a_folder_in_order(catalogue, data):
+    log(catalogue, data)
+    assert kinds(catalogue, data) == []
+
+
+def test_each_fault_is_named(catalogue, data):
+    missing, damaged, cut = (log(catalogue, data, bytes([i]) * 100) for i in range(3))
+    missing.unlink()
+    damaged.write_bytes(b"x" * 100)
+    cut.write_bytes(b"x")
+    (data / "recordings" / "unknown.mcap").write_bytes(b"x")
+    (data / "clouds").mkdir()
+    (data / "clouds" / "left.parquet").write_bytes(b"x")
+    data.chmod(0o755)
+    with catalogue.writing() as cursor:
+        cursor.execute("INSERT INTO rejections VALUES ('no run', 's', 'm', 0, 0, 0, 1, 'r')")
+    assert kinds(catalogue, data) == [
+        "clouds.without_row", "permissions", "recordings.damaged", "recordings.damaged",
+        "recordings.missing", "recordings.without_row", "rows.lost",
+    ]  # fmt: skip
+    left = mend(examine(catalogue.snapshot(), data))
+    assert {"clouds.without_row", "permissions"}.isdisjoint(one.kind for one in left)
+    assert not (data / "clouds" / "left.parquet").exists()
+    assert data.stat().st_mode & 0o777 == 0o700
+
+
+def test_a_backup_of_a_database_in_use_is_restored_elsewhere(catalogue, data, tmp_path):
+    kept = log(catalogue, data)
+    assert back_up(catalogue.export(), data, tmp_path / "copy") == 2
+    catalogue.create_survey("later")
+    log(catalogue, data, b"another")
+    assert back_up(catalogue.export(), data, tmp_path / "copy") == 3
+    shutil.rmtree(tmp_path / "copy" / "other", ignore_errors=True)
+    assert restore(tmp_path / "copy", tmp_path / "new") == 3
+    with Catalogue(
+        tmp_path / "new" / "spheremark.duckdb", snapshots=tmp_path / "new" / "snapshots"
+    ) as again:
+        assert {one.name for one in again.list_surveys().items} == {"lane", "later"}
+        url = again.get_recording(kept.stem).url
+        assert url == str(tmp_path / "new" / "recordings" / kept.name)
+        assert examine(again.snapshot(), tmp_path / "new") == []
+        again.create_survey("goes on")
+
+
+def test_a_damaged_backup_is_refused_before_anything_is_made(catalogue, data, tmp_path):
+    kept = log(catalogue, data)
+    back_up(catalogue.export(), data, tmp_path / "copy")
+    (tmp_path / "copy" / "recordings" / kept.name).write_bytes(b"other")
+    with pytest.raises(DamagedBackupError, match=kept.name):
+        restore(tmp_path / "copy", tmp_path / "new")
+    assert not (tmp_path / "new").exists()
+
+
+@pytest.mark.parametrize(
+    "manifest",
+    [None, "{", "[]", json.dumps({"format": "spheremark-backup/1", "files": {"../x": {}}})],
+)
+def test_what_is_no_backup_is_refused(tmp_path, manifest):
+    if manifest is not None:
+        (tmp_path / "manifest.json").write_text(manifest)
+    with pytest.raises(DamagedBackupError):
+        restore(tmp_path, tmp_path / "new")
+
+
+def test_a_folder_with_a_database_is_not_overwritten(catalogue, data, tmp_path):
+    back_up(catalogue.export(), data, tmp_path / "copy")
+    with pytest.raises(ConflictError, match="another folder"):
+        restore(tmp_path / "copy", data)
+
+
+def test_a_damaged_log_is_not_copied_as_if_it_were_whole(catalogue, data, tmp_path):
+    log(catalogue, data).write_bytes(b"other")
+    with pytest.raises(InputError, match="is damaged"):
+        back_up(catalogue.export(), data, tmp_path / "copy")
+    assert not (tmp_path / "copy" / "manifest.json").exists()
