@@ -21,6 +21,9 @@ LASER_CYCLE = 2.304e-6  # [s] between two lasers of one firing
 RANGE_STEP = 0.002  # [m] resolution of a range
 AZIMUTH_STEP = np.radians(0.01)  # resolution of an azimuth
 N_BLOCKS, FIRINGS_PER_BLOCK = 12, 2  # of a packet
+VLP16_ELEVATIONS = np.radians(np.arange(-15.0, 16.0, 2.0))
+"""Elevation of each laser above the plane of the spin, the lowest first [rad]."""
+
 FIRING_ORDER = np.array([0, 8, 1, 9, 2, 10, 3, 11, 4, 12, 5, 13, 6, 14, 7, 15])
 """Laser index (0 the lowest) in the order of firing: -15, +1, -13, +3, ... degrees."""
 
@@ -60,7 +63,6 @@ def vlp16(
     Elevations and vertical offsets after the VLP-16 user manual (63-9243), section 9: the beams
     cross 41.91 mm off the spin axis, which gives the offset of each laser.
     """
-    elevations = np.radians(np.arange(-15.0, 16.0, 2.0))
     mounting = np.array(T_head_lidar, dtype=np.float64)
     mounting[2, 3] = 0.0
     return Rig(
@@ -68,8 +70,8 @@ def vlp16(
         T_head_lidar=mounting,
         R_mount_imu=np.eye(3) if R_mount_imu is None else np.array(R_mount_imu, dtype=np.float64),
         imu_mount=imu_mount,
-        laser_elevations=elevations,
-        laser_heights=-_FOCAL_OFFSET * np.tan(elevations),
+        laser_elevations=VLP16_ELEVATIONS.copy(),
+        laser_heights=-_FOCAL_OFFSET * np.tan(VLP16_ELEVATIONS),
         laser_range_biases=np.zeros(N_LASERS),
         cloud_carries_heights=True,
         divergence=np.array(_DIVERGENCE),

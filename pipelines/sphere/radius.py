@@ -17,7 +17,7 @@ from spheremark.pipelines.sphere.linearisation import Linear, linearise
 from spheremark.pipelines.sphere.normal_equations import sums_of_products
 from spheremark.pipelines.sphere.returns import Returns, may_be_sphere, of_markers, returns_of
 
-_ITERATED = 1.0  # standard deviations of one step, beyond which the steps are iterated
+_ITERATED = 2.0  # standard deviations of one step, beyond which the steps are iterated
 _BETTER, _BETTER_OWN = 9.0, 14.0  # chi-square in favour of another radius; noise unknown
 _CLIP = 9.0  # squared standard deviations beyond which a residual is an outlier
 _WEAK_PRIOR = 5.0  # radii: sigma of a prior that only keeps equations solvable
