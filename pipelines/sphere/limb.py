@@ -25,7 +25,8 @@ _SOFTNESS, _SPREAD = 0.2, 0.7  # prior of the softness, and its sigma in the log
 _FROM, _BIN, _N_BINS = -2.0, 0.05, 75  # half widths inside: bins of the histogram of returns
 _POLE_BELOW, _POLE_HALF = 0.6, 0.25  # radii below the centre and to either side: beside the pole
 _SOFTNESS_MIN = 0.03  # half widths: an edge that a bin cannot tell from a sharp one
-_SIGMA_OWN = 0.05  # half widths: scatter of the edges of single spheres about that of all
+# Half widths: scatter of the edges of single spheres about that of all, even and between halves
+_SIGMAS_OWN = np.array([0.05, 0.1])
 _POLE_BLUR = 0.3  # half widths by which returns beside the pole may be the pole's
 _OUTLIERS = 0.01  # share of returns with the sphere's range whose beam did not meet it
 _CERTAIN = 4.0  # standard deviations inside the limb beyond which a return carries no information
@@ -136,8 +137,8 @@ def limb_normals(
     multiplied in, and a normal distribution of the same mean and variance replaces the product.
     Only the place across the line of sight is observed: the apparent size of the limb also depends
     on the distance, but less exactly than the footprint is known. Where returns lie on one side
-    only, a deviation of the edge would shift the centre: each sphere has an edge of its own, which
-    is eliminated.
+    only, a deviation of the edge would shift the centre, and a deviation between the two halves
+    would lift it: each sphere has both of its own, which are eliminated.
     """
     distances, halves = distances_and_halves(returns, linear.offsets)
     upper = _is_upper(returns, linear.offsets)
@@ -153,13 +154,14 @@ def limb_normals(
     # the centre to the beam, square to the line of sight to the centre
     x, y = linear.offsets[:, used] / distances[used]
     tilt = distances[used] / returns.ranges[used]
-    columns = np.empty((4, len(used)))
+    columns = np.empty((5, len(used)))
     columns[:3] = (
         x * returns.first_axes[:, used]
         + y * returns.second_axes[:, used]
         + tilt * returns.directions[:, used]
     )
     columns[3] = -halves
+    columns[4] = -halves * np.sum(np.stack([x, y]) * returns.vertical[:, used], axis=0)
     rows = columns[:3]
     variances = np.einsum("in,nij,jn->n", rows, covs[returns.markers[used]], rows)
     found = np.zeros(factors.shape)
@@ -169,13 +171,12 @@ def limb_normals(
     starts, right = np.searchsorted(used, returns.starts), np.vstack([precisions * columns, rhs])
     both = sums_of_products(starts, columns, right)
     faces = sums_of_products(starts, columns, returns.vertical[0, used] * right)
-    both[:, 3, 3] += 1.0 / _SIGMA_OWN**2
-    gains = both[:, :3, 3, None] / both[:, 3, 3, None, None]
-    N = both[:, :3] - gains * both[:, 3, None]
-    gains_faces = faces[:, :3, 3] / both[:, 3, 3, None]
-    reduced_faces = faces[:, :3, :3] - gains * faces[:, 3, None, :3]
-    rhs_faces = faces[:, :3, 4] - gains_faces * both[:, 3, 4, None]
-    return LimbNormals(N[:, :, :3], N[:, :, 4], reduced_faces, rhs_faces, found)
+    both[:, 3:, 3:5] += np.diag(_SIGMAS_OWN**-2.0)
+    inverse = np.linalg.inv(both[:, 3:, 3:5])
+    N = both[:, :3] - both[:, :3, 3:5] @ inverse @ both[:, 3:]
+    of_faces = faces[:, :3, :3] - both[:, :3, 3:5] @ inverse @ faces[:, 3:, :3]
+    rhs_faces = faces[:, :3, 5:] - faces[:, :3, 3:5] @ inverse @ both[:, 3:, 5:]
+    return LimbNormals(N[:, :, :3], N[:, :, 5], of_faces, rhs_faces[:, :, 0], found)
 
 
 def _approximated(inside: Array, variances: tuple[Array, Array], factors: Array) -> Array:
