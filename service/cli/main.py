@@ -9,11 +9,13 @@ from __future__ import annotations
 import json
 import math
 import sys
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import closing, contextmanager
 from dataclasses import replace
 from enum import StrEnum
 from importlib import metadata
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -31,6 +33,9 @@ from spheremark.service.cli.terminal import progress as _progress
 from spheremark.service.cli.terminal import settings as _settings
 from spheremark.service.cli.tokens import token
 from spheremark.service.cli.upkeep import backup, doctor, restore
+
+if TYPE_CHECKING:
+    from spheremark.pipelines.model import StopResult
 
 app = typer.Typer(
     no_args_is_help=True,
@@ -248,6 +253,12 @@ def process(
         Path | None,
         typer.Option(exists=True, dir_okay=False, help="Truth (JSON); adds errors, no more."),
     ] = None,
+    mcap: Annotated[
+        Path | None,
+        typer.Option(
+            dir_okay=False, help="Write spheres, clouds and poses (MCAP), for viewers of the log."
+        ),
+    ] = None,
     as_json: AsJson = False,
 ) -> None:
     """Find the markers of logs and position their stations."""
@@ -268,14 +279,33 @@ def process(
     marks, rig = field.read()
     true = read_truth(truth) if truth else None
     results = []
-    for log in reading.files(logs):
-        with _progress() as progress:
-            found = process_file(log, config, progress, rig=rig, marks=marks, truth=true)
-        results.append(serialise_log(found, frame=frame.value, truth=true))
-        if not as_json:
-            render.print_log(out, results[-1])
+    with _result_log(mcap) as add:
+        for log in reading.files(logs):
+            with _progress() as progress:
+                found = process_file(log, config, progress, rig=rig, marks=marks, truth=true)
+            add(found.stops)
+            results.append(serialise_log(found, frame=frame.value, truth=true))
+            if not as_json:
+                render.print_log(out, results[-1])
     if as_json:
         _print_json(results[0] if len(results) == 1 else results)
+
+
+@contextmanager
+def _result_log(path: Path | None) -> Iterator[Callable[[Sequence[StopResult]], None]]:
+    """Yield a function that writes stops into a log of results, if there is a path for one."""
+    if path is None:
+        yield lambda _stops: None
+        return
+    from spheremark.storage.exports.result_log import ResultLog
+
+    with closing(ResultLog(path)) as log:
+
+        def add(stops: Sequence[StopResult]) -> None:
+            for stop in stops:
+                log.add(stop)
+
+        yield add
 
 
 app.command()(adjust)

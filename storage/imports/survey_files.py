@@ -293,7 +293,18 @@ def read_control(path: str | Path, layout: ControlLayout = _PLAIN) -> ControlMar
 
 
 def read_truth(path: str | Path) -> Truth:
-    """Read the truth of a survey from a file, as ``parse_truth`` does."""
+    """Read the truth of a survey from a file, as ``parse_truth`` does.
+
+    Parameters
+    ----------
+    path : str or Path
+        The file.
+
+    Returns
+    -------
+    Truth
+        True marks, stops and rig.
+    """
     return _read(path, parse_truth, TruthError)
 
 

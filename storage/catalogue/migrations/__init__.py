@@ -49,7 +49,13 @@ class Migration:
 
 
 def released() -> tuple[Migration, ...]:
-    """Return the migrations of this version, in order."""
+    """Return the migrations of this version.
+
+    Returns
+    -------
+    tuple of Migration
+        In order.
+    """
     files = (f for f in resources.files(__name__).iterdir() if f.name.endswith(".sql"))
     return tuple(
         Migration(
