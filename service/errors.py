@@ -114,6 +114,12 @@ class RefusedRecordingError(RecordingError):
         return cls(" ".join(recording.preflight.get("reasons", ())), recording)
 
 
+class ClientLeftError(SpheremarkError):
+    """The client closed the connection before the response was ready."""
+
+    code: ClassVar[str] = "client_left"
+
+
 class UnauthorizedError(SpheremarkError):
     """The request does not carry the token of this service."""
 
@@ -142,6 +148,7 @@ STATUS: Mapping[type[SpheremarkError], int] = {
     TusVersionError: 412,
     ReusedKeyError: 422,
     BusyError: 429,
+    ClientLeftError: 499,  # as nginx has it; only the log sees it
     RecordingError: 422,
     QueryTimeoutError: 504,
     SolveError: 422,

@@ -140,7 +140,7 @@ class Settings(BaseSettings):
         if self.token_text and not is_strong(self.token_text):
             raise ValueError(
                 f"SPHEREMARK_TOKEN has less than {BITS_MIN} bits; take 22 random characters or "
-                "more, or use `spheremark token make NAME`"
+                "more, or use `spheremark token create NAME`"
             )
         if not is_loopback(self.host) and not Tokens(self.data, self.token_text).all():
             raise ValueError(

@@ -18,7 +18,7 @@ Name = Annotated[str, typer.Argument(help="Name of the token, of who or what use
 
 
 @token.command()
-def make(
+def create(
     name: Name,
     scope: Annotated[
         Scope, typer.Option(help="Read; write: upload, plan and start jobs; admin: audit log too.")

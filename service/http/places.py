@@ -15,16 +15,11 @@ from typing import Any, TypeVar
 
 from fastapi import Request
 
-from spheremark.pipelines.errors import SpheremarkError
 from spheremark.pipelines.progress import checked_by
-from spheremark.service.errors import BusyError
+from spheremark.service.errors import BusyError, ClientLeftError
 
 _Result = TypeVar("_Result")
 _LOOK_EVERY = 0.5  # [s] whether the client is still there
-
-
-class _AbandonedError(SpheremarkError):
-    """The client of a request has left."""
 
 
 class Places:
@@ -85,4 +80,4 @@ class Places:
 def _go_on(gone: threading.Event) -> None:
     """Raise once the client has left."""
     if gone.is_set():
-        raise _AbandonedError("The client has left.")
+        raise ClientLeftError("The client has left.")

@@ -175,7 +175,7 @@ class SecurityMiddleware:
         if not token.scope.includes(needed):
             raise ForbiddenError(
                 f"The token {token.name!r} allows to {token.scope}; this needs {needed}. Make one "
-                f"with `spheremark token make NAME --scope {needed}`."
+                f"with `spheremark token create NAME --scope {needed}`."
             )
         return token
 

@@ -102,7 +102,7 @@ def test_tokens_have_names_of_their_own(tmp_path):
 
 def test_the_command_makes_lists_and_revokes(tmp_path):
     run = CliRunner().invoke
-    made = run(app, ["token", "make", "rover", "--scope", "read", "--data", str(tmp_path)])
+    made = run(app, ["token", "create", "rover", "--scope", "read", "--data", str(tmp_path)])
     text = made.stdout.strip().splitlines()[0]
     assert Tokens(tmp_path).of_text(text).name == "rover"
     listed = json.loads(run(app, ["token", "list", "--json", "--data", str(tmp_path)]).stdout)
