@@ -28,31 +28,6 @@ _LAYOUTS_MAX = 256  # layouts of one length on one channel; real topics have one
 
 _Kind = TypeVar("_Kind", bound=np.generic)
 
-HEADER = """std_msgs/Header header
-"""
-HEADER_PARTS = """================================================================================
-MSG: std_msgs/Header
-# Standard metadata for higher-level stamped data types.
-builtin_interfaces/Time stamp
-string frame_id
-================================================================================
-MSG: builtin_interfaces/Time
-int32 sec
-uint32 nanosec
-"""
-VECTOR_PARTS = """================================================================================
-MSG: geometry_msgs/Vector3
-float64 x
-float64 y
-float64 z
-================================================================================
-MSG: geometry_msgs/Quaternion
-float64 x 0
-float64 y 0
-float64 z 0
-float64 w 1
-"""
-
 
 class Cursor:
     """Reads one message from front to back without copying it."""
@@ -236,12 +211,12 @@ def n_leading(is_so: Mask) -> int:
     return len(is_so) if is_so.all() else int(np.argmin(is_so))
 
 
-def definition_agrees(channel: Channel, expected: str) -> bool:
-    """Return whether the recorded definition has the fields that the decoder reads."""
+def definition_agrees(channel: Channel, fields: str) -> bool:
+    """Return whether the recorded definition has the fields that the decoder reads, in order."""
     text = channel.definition.decode("utf-8", "replace")
     if channel.schema_encoding not in ("ros1msg", "ros2msg") or not text.strip():
         return True
-    return _fields(text) == _fields(expected)
+    return _fields(text) == _fields(fields.replace(", ", "\n"))
 
 
 @lru_cache(64)

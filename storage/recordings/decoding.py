@@ -18,16 +18,16 @@ from spheremark.storage.recordings.families import LidarDecoder, SeriesDecoder, 
 from spheremark.storage.recordings.sources import Recording
 from spheremark.storage.recordings.translations import Translator, translator_of
 
-# By message type: the decoder, and the definition that it reads. A new family is a module and a
+# By message type: the decoder, and the fields that it reads. A new family is a module and a
 # line here; other encodings and types are rewritten by ``translations``.
 _LIDARS: dict[str, tuple[Callable[[Channel, int], LidarDecoder], str]] = {
-    pointclouds.SCHEMA: (pointclouds.PointClouds, pointclouds.DEFINITION),
-    packets.SCHEMA: (packets.Packets, packets.DEFINITION),
+    pointclouds.SCHEMA: (pointclouds.PointClouds, pointclouds.FIELDS),
+    packets.SCHEMA: (packets.Packets, packets.FIELDS),
 }
 _SIGNALS: dict[str, tuple[str, Callable[[Channel], SeriesDecoder], str]] = {
-    joint_states.SCHEMA: ("joints", joint_states.JointStates, joint_states.DEFINITION),
-    transforms.SCHEMA: ("frames", transforms.Transforms, transforms.DEFINITION),
-    orientations.SCHEMA: ("ahrs", orientations.Orientations, orientations.DEFINITION),
+    joint_states.SCHEMA: ("joints", joint_states.JointStates, joint_states.FIELDS),
+    transforms.SCHEMA: ("frames", transforms.Transforms, transforms.FIELDS),
+    orientations.SCHEMA: ("ahrs", orientations.Orientations, orientations.FIELDS),
 }
 LIDAR_TYPES = (*_LIDARS, "foxglove.PointCloud", "CustomMsg of Livox")
 
@@ -94,17 +94,17 @@ class Decoders:
             return self.lidars.setdefault(channel.topic, decoder)
         if read.schema not in _SIGNALS:
             return None
-        role, make_signal, definition = _SIGNALS[read.schema]
-        if not self._is_readable(channel, read, definition):
+        role, make_signal, fields = _SIGNALS[read.schema]
+        if not self._is_readable(channel, read, fields):
             return None
         mine: dict[str, SeriesDecoder]
         mine = getattr(self, "numbers" if channel.schema.startswith("std_msgs/") else role)
         return mine.setdefault(channel.topic, make_signal(read))
 
-    def _is_readable(self, channel: Channel, read: Channel, definition: str) -> bool:
+    def _is_readable(self, channel: Channel, read: Channel, fields: str) -> bool:
         """Return whether the definition is that of the decoder; note it if not."""
         is_same = channel.schema.replace("/msg/", "/") == read.schema.replace("/msg/", "/")
-        if not is_same or definition_agrees(channel, definition):
+        if not is_same or definition_agrees(channel, fields):
             return True
         self.notes.append(
             f"{channel.topic} is left out: its definition of {channel.schema} is not that of ROS."

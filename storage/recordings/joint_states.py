@@ -9,13 +9,7 @@ from spheremark.storage.recordings.container import Channel
 from spheremark.storage.recordings.families import Series, series_of
 
 SCHEMA = "sensor_msgs/msg/JointState"
-DEFINITION = f"""# State of a set of torque controlled joints.
-{cdr.HEADER}
-string[] name
-float64[] position
-float64[] velocity
-float64[] effort
-{cdr.HEADER_PARTS}"""
+FIELDS = "Header header, string[] name, float64[] position, float64[] velocity, float64[] effort"
 
 
 class JointStates(cdr.SignalDecoder):

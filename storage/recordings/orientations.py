@@ -10,15 +10,11 @@ from spheremark.storage.recordings.container import Channel
 from spheremark.storage.recordings.families import Series, series_of
 
 SCHEMA = "sensor_msgs/msg/Imu"
-DEFINITION = f"""# Orientation, angular velocity [rad/s] and linear acceleration [m/s^2] of an IMU.
-{cdr.HEADER}
-geometry_msgs/Quaternion orientation
-float64[9] orientation_covariance
-geometry_msgs/Vector3 angular_velocity
-float64[9] angular_velocity_covariance
-geometry_msgs/Vector3 linear_acceleration
-float64[9] linear_acceleration_covariance
-{cdr.HEADER_PARTS}{cdr.VECTOR_PARTS}"""
+FIELDS = (
+    "Header header, Quaternion orientation, float64[9] orientation_covariance, "
+    "Vector3 angular_velocity, float64[9] angular_velocity_covariance, "
+    "Vector3 linear_acceleration, float64[9] linear_acceleration_covariance"
+)
 
 _UNIT = 0.1  # how far the norm of a quaternion may be from 1
 

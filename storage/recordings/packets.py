@@ -43,13 +43,7 @@ from spheremark.storage.recordings.points import Columns
 from spheremark.storage.recordings.records import Octets
 
 SCHEMA = "velodyne_msgs/msg/VelodyneScan"
-DEFINITION = f"""# Velodyne LIDAR scan packets.
-{cdr.HEADER}VelodynePacket[] packets
-{cdr.HEADER_PARTS}================================================================================
-MSG: velodyne_msgs/VelodynePacket
-builtin_interfaces/Time stamp
-uint8[1206] data
-"""
+FIELDS = "Header header, VelodynePacket[] packets"
 
 _PULSES = FIRINGS_PER_BLOCK * N_LASERS  # of a block
 _STRIDE = 1216  # [bytes] of a packet in a message: its stamp, its data, and what aligns the next

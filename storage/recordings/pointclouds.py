@@ -39,31 +39,10 @@ from spheremark.storage.recordings.pulse_times import (
 from spheremark.storage.recordings.records import Octets
 
 SCHEMA = "sensor_msgs/msg/PointCloud2"
-DEFINITION = f"""# A collection of N-dimensional points, possibly organised as an image.
-{cdr.HEADER}
-uint32 height
-uint32 width
-PointField[] fields
-bool is_bigendian
-uint32 point_step
-uint32 row_step
-uint8[] data
-bool is_dense
-{cdr.HEADER_PARTS}================================================================================
-MSG: sensor_msgs/PointField
-uint8 INT8    = 1
-uint8 UINT8   = 2
-uint8 INT16   = 3
-uint8 UINT16  = 4
-uint8 INT32   = 5
-uint8 UINT32  = 6
-uint8 FLOAT32 = 7
-uint8 FLOAT64 = 8
-string name
-uint32 offset
-uint8  datatype
-uint32 count
-"""
+FIELDS = (
+    "Header header, uint32 height, uint32 width, PointField[] fields, bool is_bigendian, "
+    "uint32 point_step, uint32 row_step, uint8[] data, bool is_dense"
+)
 
 _UNITS = (1_000, 1_000_000)  # [ns] of times that are no nanoseconds
 _FILLED = (0.8, 3.0)  # of the time between messages to their duration, in the right unit

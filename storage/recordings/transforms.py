@@ -9,17 +9,7 @@ from spheremark.storage.recordings.container import Channel
 from spheremark.storage.recordings.families import Series, series_of
 
 SCHEMA = "tf2_msgs/msg/TFMessage"
-DEFINITION = f"""geometry_msgs/TransformStamped[] transforms
-================================================================================
-MSG: geometry_msgs/TransformStamped
-# This expresses a transform from coordinate frame header.frame_id to child_frame_id.
-{cdr.HEADER}string child_frame_id
-Transform transform
-================================================================================
-MSG: geometry_msgs/Transform
-Vector3 translation
-Quaternion rotation
-{cdr.HEADER_PARTS}{cdr.VECTOR_PARTS}"""
+FIELDS = "TransformStamped[] transforms"
 
 _TRANSFORM_MIN = 70  # [bytes] of a transform with empty names
 

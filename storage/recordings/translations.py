@@ -11,9 +11,8 @@ import json
 import struct
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
-from functools import cache
 from types import SimpleNamespace
-from typing import Any, Protocol
+from typing import Any, Protocol, cast
 
 import numpy as np
 
@@ -26,6 +25,7 @@ from spheremark.storage.recordings import (
     transforms,
 )
 from spheremark.storage.recordings.container import Batch, Channel
+from spheremark.storage.recordings.definitions import store
 from spheremark.storage.recordings.families import BrokenMessageError
 
 Translate = Callable[[bytes], bytes]
@@ -115,23 +115,12 @@ def translator_of(channel: Channel) -> Translator | None:
     return Translator(channel, schema, lambda data: build(decode(data), channel.topic))
 
 
-@cache
-def _store() -> Any:
-    """Return the types of ROS, and the raw packets of a Velodyne."""
-    from rosbags.typesys import Stores, get_types_from_msg, get_typestore  # slow to import
-
-    store = get_typestore(Stores.ROS2_HUMBLE)
-    types = get_types_from_msg(packets.DEFINITION, packets.SCHEMA)
-    store.register({name: one for name, one in types.items() if name.startswith("velodyne")})
-    return store
-
-
 def _from_ros1(data: bytes, schema: str) -> bytes:
     """Rewrite a message of ROS 1 in CDR."""
     from rosbags.serde.errors import SerdeError
 
     try:
-        return bytes(_store().ros1_to_cdr(data, schema))
+        return bytes(store().ros1_to_cdr(data, schema))
     except SerdeError as error:
         raise BrokenMessageError(str(error)) from error
 
@@ -154,10 +143,9 @@ def _parsed(data: bytes, kind: str) -> _Message:
     from rosbags.serde.errors import SerdeError
 
     try:
-        message: _Message = _store().deserialize_cdr(data, kind)
+        return cast("_Message", store().deserialize_cdr(data, kind))
     except SerdeError as error:
         raise BrokenMessageError(str(error)) from error
-    return message
 
 
 def _from_json(data: bytes) -> _Message:

@@ -21,6 +21,7 @@ from spheremark.storage.recordings import (
     pointclouds,
     transforms,
 )
+from spheremark.storage.recordings.definitions import definition
 
 if TYPE_CHECKING:
     from scipy.spatial.transform import Rotation
@@ -118,28 +119,28 @@ def _write_messages(
     """Write all topics that the log has something for, merged by time."""
     channels: dict[str, int] = {}
 
-    def topic(name: str, schema: str, definition: str, durability: int = 2) -> str:
-        schema_id = writer.register_schema(schema, "ros2msg", definition.encode())
+    def topic(name: str, schema: str, durability: int = 2) -> str:
+        schema_id = writer.register_schema(schema, "ros2msg", definition(schema).encode())
         metadata = {"offered_qos_profiles": _QOS.format(durability=durability)}
         channels[name] = writer.register_channel(name, "cdr", schema_id, metadata)
         return name
 
     items: list[Iterator[Item]] = []
     if log.rig is not None:
-        name = topic("/tf_static", transforms.SCHEMA, transforms.DEFINITION, durability=1)
+        name = topic("/tf_static", transforms.SCHEMA, durability=1)
         first = min((int(s.min()) for s in _stamps(log) if len(s)), default=0)
         items.append(iter([(first, name, _static_transforms(log.rig, first))]))
     if firings is not None:
-        name = topic("/velodyne_packets", packets.SCHEMA, packets.DEFINITION)
+        name = topic("/velodyne_packets", packets.SCHEMA)
         items.append(packets.scans(name, LIDAR_FRAME, firings, revolution_ns))
     elif len(log.p_lidar):
-        name = topic("/velodyne_points", pointclouds.SCHEMA, pointclouds.DEFINITION)
+        name = topic("/velodyne_points", pointclouds.SCHEMA)
         items.append(_clouds(name, log, revolution_ns))
     if len(log.gimbal_angles):
-        name = topic("/joint_states", joint_states.SCHEMA, joint_states.DEFINITION)
+        name = topic("/joint_states", joint_states.SCHEMA)
         items.append(_joints(name, log))
     if len(log.quaternions_imu):
-        name = topic("/imu/data", orientations.SCHEMA, orientations.DEFINITION)
+        name = topic("/imu/data", orientations.SCHEMA)
         items.append(_imus(name, log))
     counts = dict.fromkeys(channels, 0)
     for log_time, name, data in heapq.merge(*items, key=lambda item: item[0]):

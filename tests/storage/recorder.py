@@ -5,10 +5,11 @@ from mcap.writer import CompressionType, Writer
 from rosbags.typesys import Stores, get_typestore
 
 from spheremark.storage.recordings import joint_states, orientations, pointclouds, transforms
+from spheremark.storage.recordings.definitions import definition
 
 STORE = get_typestore(Stores.ROS2_HUMBLE)
 DEFINITIONS = {
-    module.SCHEMA: module.DEFINITION
+    module.SCHEMA: definition(module.SCHEMA)
     for module in (joint_states, orientations, pointclouds, transforms)
 }
 T0 = 1_700_000_000_000_000_000

@@ -16,7 +16,8 @@ from spheremark.pipelines.model import Firings
 from spheremark.pipelines.scan.rigs import FIRING_ORDER
 from spheremark.pipelines.simulation import SimulationConfig, scenario, simulate_stop
 from spheremark.storage.recordings import inspect_log, read_log, write_log
-from spheremark.storage.recordings.packets import DEFINITION, SCHEMA, encoded, punctual
+from spheremark.storage.recordings.definitions import definition
+from spheremark.storage.recordings.packets import SCHEMA, encoded, punctual
 from tests.real_scans import REAL, needs
 from tests.storage.recorder import DEFINITIONS, T0, cloud, joints, record, turning, velodyne
 
@@ -26,6 +27,7 @@ CLOCK = 2e-6  # [s] the decoder counts by the sensor's clock of whole microsecon
 HOUR = 3_600_000_000_000
 PACKET = 24 * 55_296  # [ns]
 STORE = get_typestore(Stores.ROS2_HUMBLE)
+DEFINITION = definition(SCHEMA)
 STORE.register(get_types_from_msg(DEFINITION, SCHEMA))
 
 needs_real = needs("vlp16_packets")

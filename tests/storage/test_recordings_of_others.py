@@ -42,6 +42,7 @@ from spheremark.storage.recordings import (
     transforms,
 )
 from spheremark.storage.recordings.apart import inspect_apart
+from spheremark.storage.recordings.definitions import definition
 from tests.storage.recorder import (
     DEFINITIONS,
     STORE,
@@ -64,7 +65,9 @@ ROS1 = get_typestore(Stores.ROS1_NOETIC)
 ROS1.register(
     {
         name: one
-        for name, one in get_types_from_msg(transforms.DEFINITION, transforms.SCHEMA).items()
+        for name, one in get_types_from_msg(
+            definition(transforms.SCHEMA), transforms.SCHEMA
+        ).items()
         if name not in ROS1.types
     }
 )
@@ -445,7 +448,7 @@ def test_a_capture_beside_the_log_of_the_gimbal_is_a_log(tmp_path, rng, kind):
             ("/packets", T0 + 10**8, ("velodyne_msgs/msg/VelodyneScan", bytes(scan))),
             *turning(step=0.01),
         ],
-        definitions=DEFINITIONS | {packets.SCHEMA: packets.DEFINITION},
+        definitions=DEFINITIONS | {packets.SCHEMA: definition(packets.SCHEMA)},
     )
     same = read_log(ros)
     assert len(found.p_lidar) == len(same.p_lidar) > 30_000
