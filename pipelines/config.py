@@ -225,7 +225,7 @@ class ResectionConfig:
         a centre's variance along its line of sight counts as shared.
     sigma_height : float
         Standard deviation of what all centres of a survey are too high, as the foot of their poles
-        and the tilt of the spin axis leave [m]; 0 leaves it out. 0.3 mm, by simulation of beams
+        and the tilt of the spin axis leave [m]; 0 leaves it out. 0.2 mm, by simulation of beams
         of several profiles: what stands behind the lower half of spheres moves its limb.
     """
 
@@ -238,7 +238,7 @@ class ResectionConfig:
     sigma_range: float = 0.0021
     sigma_range_scale: float = 5e-5
     sigma_range_shared: float = 0.0009
-    sigma_height: float = 0.0003
+    sigma_height: float = 0.0002
 
     def __post_init__(self) -> None:
         _check_methods("resection.methods", self.methods, RESECTION_METHODS)

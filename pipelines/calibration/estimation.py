@@ -8,7 +8,6 @@ import numpy as np
 
 from spheremark.pipelines.calibration.gimbal import (
     GIMBAL,
-    N_SHADES,
     Linearised,
     Parameter,
     Pulses,
@@ -19,6 +18,7 @@ from spheremark.pipelines.errors import NotConvergedError
 from spheremark.pipelines.estimation.linear_algebra import Reduced, eliminate, inverse
 from spheremark.pipelines.estimation.robust import tukey_loss, tukey_weights
 from spheremark.pipelines.model import RING_UNKNOWN, Array, Index, Mask, Rig, Rings
+from spheremark.pipelines.sphere.noise import N_CLASSES
 
 _TUKEY = 6.0  # sigmas at which a return has no weight; 98 % efficient on clean data
 _EXPECTED_SQUARE = 0.8449  # mean of weight times square of normal residuals: 1 - 6/c^2 + 15/c^4
@@ -201,10 +201,10 @@ class _Problem(NamedTuple):
         scaled = state.lin.residuals / self.sigmas(state, before)
         weights = tukey_weights(scaled, _TUKEY)
         squares = weights * (scaled * before) ** 2 / _EXPECTED_SQUARE
-        counts = np.bincount(shades, weights > 0.0, N_SHADES)
+        counts = np.bincount(shades, weights > 0.0, N_CLASSES)
         share = max(1.0 - 3.0 * m / max(float(counts.sum()), 1.0), 0.01)
         of_all = float(squares.sum()) / max(share * float(counts.sum()), 1.0)
-        by_shade = (np.bincount(shades, squares, N_SHADES) + _DOF_NOISE * of_all) / (
+        by_shade = (np.bincount(shades, squares, N_CLASSES) + _DOF_NOISE * of_all) / (
             share * counts + _DOF_NOISE
         )
         dofs = np.maximum(np.bincount(which, weights > 0.0, m) - 3.0, 0.0)

@@ -15,13 +15,10 @@ from scipy.spatial.transform import Rotation
 from spheremark.pipelines.model import Array, Beams, Index, Rig, Rings, ScanLog, StitchedCloud
 from spheremark.pipelines.scan.stitching import beams
 from spheremark.pipelines.sphere.footprint import predict
+from spheremark.pipelines.sphere.noise import classes_of
 
 _RATE_WINDOW = 0.05  # [s] over which the speed of the gimbal is taken: encoders jitter
 _NS = 1e-9  # [s] in a nanosecond
-_REFLECTIVITIES = np.array([5.0, 15.0, 40.0, 100.0])  # limits between classes of noise
-
-N_SHADES = len(_REFLECTIVITIES) + 1
-"""Classes of reflectivity: weak returns of a VLP-16 have twice the noise."""
 
 
 class Parameter(NamedTuple):
@@ -104,7 +101,7 @@ class Pulses(NamedTuple):
     rings : (n,) uint8
         Lasers.
     shades : (n,)
-        Class of reflectivity, 0 to ``N_SHADES - 1`` from dark to bright: the noise depends on it.
+        Class of reflectivity, from dark to bright: the noise depends on it.
     which : (n,)
         The sphere that each one met.
     divergence : (2,)
@@ -152,7 +149,7 @@ def recorded_pulses(log: ScanLog, cloud: StitchedCloud, rows: Index, which: Inde
         angles=_recorded(turned, rig) + rates * rig.gimbal_clock_offset,
         rates=rates,
         rings=table.rings,
-        shades=np.digitize(table.intensities, _REFLECTIVITIES),
+        shades=classes_of(table.intensities)[0],
         which=which,
         divergence=rig.divergence,
     )

@@ -20,6 +20,9 @@ from spheremark.pipelines.sphere.returns import Returns
 _REFLECTIVITIES = np.array([5.0, 15.0, 40.0, 100.0])  # limits between the classes
 _SIGMAS = np.array([0.0137, 0.0107, 0.0089, 0.0067, 0.0064])
 
+N_CLASSES = len(_SIGMAS)
+"""Classes of reflectivity."""
+
 FACTOR_MIN = 0.08
 """Least noise in units of the prior: 2 mm quantisation alone gives as much."""
 
@@ -108,12 +111,12 @@ def weigh(
         return own, sigmas, tukey_weights(residuals / sigmas, _TUKEY)
 
     own, sigmas, weights = weighed(noise)
-    classes, n_classes = returns.classes, len(_SIGMAS)
+    classes = returns.classes
     counted = is_used & (weights > 0.0)
     squares = counted * weights * (residuals / sigmas) ** 2 / EXPECTED_SQUARE
     found = _pooled(
-        np.asarray(np.bincount(classes, squares * noise.factors[classes] ** 2, n_classes), float),
-        np.bincount(classes[counted], minlength=n_classes),
+        np.asarray(np.bincount(classes, squares * noise.factors[classes] ** 2, N_CLASSES), float),
+        np.bincount(classes[counted], minlength=N_CLASSES),
         3.0 * (len(returns.starts) - 1),
     )
     slopes = counted * (faded - faded[counted].mean()) * own / sigmas**2 if counted.any() else 0.0

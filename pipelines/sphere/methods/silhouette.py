@@ -52,14 +52,10 @@ _LIT = (np.arccos(-_INSIDE) + _INSIDE * np.sqrt(1.0 - _INSIDE**2)) / np.pi  # it
 
 
 class _Link(NamedTuple):
-    """How the probability of a return rises with the lit share of the footprint.
+    """Probability of a return by the lit share of the footprint.
 
-    Attributes
-    ----------
-    least : float
-        Share of a footprint at _AT for which half of the pulses return.
-    softness : float
-        Distance over which the probability rises [half widths].
+    ``least`` is the share at _AT for which half of the pulses return, ``softness`` the distance
+    over which the probability rises [half widths].
     """
 
     least: float
@@ -67,14 +63,9 @@ class _Link(NamedTuple):
 
 
 class _Factor(NamedTuple):
-    """The likelihood of a limb across the line of sight, approximated by a normal distribution.
+    """Likelihood of a limb across the line of sight, approximated by a normal distribution.
 
-    Attributes
-    ----------
-    precision : (2, 2)
-        Inverse covariance [1/m^2].
-    rhs : (2,)
-        That times the mean [1/m].
+    ``precision``, (2, 2), is its inverse covariance [1/m^2], ``rhs``, (2,), that times its mean.
     """
 
     precision: Array
@@ -84,12 +75,7 @@ class _Factor(NamedTuple):
 class _Cavity(NamedTuple):
     """A centre across its line of sight, with and without the observations of its limb.
 
-    Attributes
-    ----------
-    place, cov : (2,), (2, 2)
-        The present estimate by all observations [m], and its covariance [m^2].
-    mean, precision : (2,), (2, 2)
-        Mean without the limb [m], and inverse covariance [1/m^2].
+    ``place`` and ``cov`` are by all observations; ``mean`` and ``precision`` without the limb.
     """
 
     place: Array
@@ -168,17 +154,7 @@ def _logarithms(entered: Array, has_hit: Mask, edges: Array, softness: float) ->
 
 
 class _Limb:
-    """The limbs of a stop's spheres as observations of the centres, with the state between steps.
-
-    Parameters
-    ----------
-    cloud : StitchedCloud
-        The stop.
-    firings : Firings
-        All its pulses.
-    radius : float
-        Radius of the spheres [m].
-    """
+    """The limbs of a stop's spheres as observations of the centres, with their state."""
 
     def __init__(self, cloud: StitchedCloud, firings: Firings, radius: float) -> None:
         self._cloud, self._firings, self._radius = cloud, firings, radius
