@@ -31,8 +31,8 @@ _TURN = 20.7  # [s]: three million returns
 _NEAR = 0.1  # [m] from a true centre: farther is a false marker
 _OURS = {"fitting": f"fitting.{METHOD}"}  # where a peer's step is called otherwise here
 _POINTS, _PACKETS, _ZSTD = "points", "packets", "points in zstd"
-_BARS = {_POINTS: 8.0, _PACKETS: 8.0, _ZSTD: 20.0}  # x read+CRC that the chain may cost
-_BAR_PEERS = 15.0  # times quicker than the usual libraries
+_BARS = {_POINTS: 10.0, _PACKETS: 10.0, _ZSTD: 20.0}  # x read+CRC that the chain may cost
+_BAR_PEERS = 20.0  # times quicker than the usual libraries
 _BAR_MEMORY = 500e6  # [bytes] of one scan
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import csv
 import io
 import math
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping
 from dataclasses import asdict
 from typing import Any
 
@@ -15,7 +15,8 @@ from rich.markup import escape
 from rich.measure import Measurement
 from rich.text import Text
 
-from spheremark.pipelines.evaluation.experiment import Column, Table
+from spheremark.pipelines.tables import Column, Table
+from spheremark.service.serialise.network_report import checks, not_used, places, vector
 from spheremark.storage.recordings import Preflight
 
 _ROWS_SHOWN = 100  # of a query; programs get all
@@ -39,13 +40,13 @@ def print_tables(out: Console, tables: Iterable[Table]) -> None:
 
 def _drawn(table: Table) -> rich_table.Table:
     """Return a table for the terminal: units below the heads, text flush left, numbers right."""
-    drawn = rich_table.Table(box=None, pad_edge=False, header_style="bold")
+    drawn = rich_table.Table(box=None, padding=(0, 1, 0, 0), pad_edge=False, header_style="bold")
     for column in table.columns:
         head = escape(f"{column.title}\n[{column.unit}]" if column.unit else column.title)
         justify = "right" if column.form else "left"
         drawn.add_column(head, justify=justify, overflow="fold")  # type: ignore[arg-type]
     for row in table.rows:
-        cells = [column.cell(row) for column in table.columns]
+        cells = [column.cell(row).strip() for column in table.columns]
         drawn.add_row(*(Text(cell, style=_COLOURS.get(cell, "")) for cell in cells))
     return drawn
 
@@ -53,16 +54,6 @@ def _drawn(table: Table) -> rich_table.Table:
 def _say(out: Console, sentence: str) -> None:
     """Print a sentence; nothing in it is markup."""
     out.print(sentence, highlight=False, markup=False, soft_wrap=True)
-
-
-def _at(key: str, i: int) -> Callable[[Plain], Any]:
-    """Return the function to an element of a vector of a row."""
-    return lambda row: row[key][i]
-
-
-def _vector(key: str, unit: str, form: str, titles: Sequence[str] = "xyz") -> tuple[Column, ...]:
-    """Return the columns of the coordinates of a vector."""
-    return tuple(Column(_at(key, i), title, unit, form) for i, title in enumerate(titles))
 
 
 _TOPICS = (
@@ -76,25 +67,13 @@ _FACTS = (Column("fact", "fact"), Column("value", "value", "", ">"))
 _MARKERS = (
     Column("id", "marker"),
     Column("status", "status"),
-    *_vector("centre_m", "m", "z.4f"),
+    *vector("centre_m", "m", "z.4f", "xyz"),
     Column("sigma_3d_m", "sigma", "mm", ".1f"),
     Column("range_m", "range", "m", ".2f"),
     Column("n_points", "returns", "", "d"),
     Column("rms_m", "rms", "mm", ".1f"),
 )
 _ERROR = Column("error_3d_m", "error", "mm", ".1f")
-_PLACED = (
-    *_vector("position_m", "m", "z.4f"),
-    Column("sigma_3d_m", "sigma", "mm", ".1f"),
-    Column("ellipse_major_95_m", "95 % ellipse, a", "mm", ".1f"),
-    Column("ellipse_minor_95_m", "b", "mm", ".1f"),
-    Column("n_observations", "centres", "", "d"),
-)
-_CONTROL = (
-    Column("mark", "control left out"),
-    *_vector("predicted_minus_given_m", "mm", "+z.1f", ("dx", "dy", "dz")),
-    *_vector("sigma_predicted_minus_given_m", "mm", ".1f", ("sigma x", "y", "z")),
-)
 _PARAMETERS = (
     Column("name", "parameter"),
     Column("unit", "unit"),
@@ -224,45 +203,18 @@ def print_network(out: Console, result: Plain) -> None:
     _say(out, result["datum"]["text"])
     for warning in result["warnings"]:
         out.print(f"[yellow]Warning:[/] {escape(warning)}", highlight=False, soft_wrap=True)
-    checks = [row for row in result["control"] if row["predicted_minus_given_m"] is not None]
-    tables = [
-        Table(columns=(Column("name", "station"), *_PLACED), rows=result["stations"]),
-        Table(columns=(Column("name", "mark"), *_PLACED), rows=result["marks"]),
-        Table(columns=_CONTROL, rows=checks, notes=[*_checks(result)]),
-    ]
-    print_tables(out, tables)
+    print_tables(out, [*places(result), *checks(result)])
     if result["calibration"]:
         print_calibration(out, result["calibration"])
-    for sentence in _exceptions(result):
-        _say(out, sentence)
-
-
-def _checks(result: Plain) -> Iterable[str]:
-    """Yield the checks of a network that need no truth, in sentences."""
-    for row in result["marks"]:
-        if row["status"] != "ok":
-            yield f"  Mark {row['name']}: {row['reason']}"
-    for row in result["repeated_stops"]:
-        yield (
-            f"  {' and '.join(row['stations'])} stand {1e3 * row['apart_3d_m']:.1f} mm apart; "
-            f"their centres agree to {1e3 * row['difference_rms_m']:.1f} mm (RMS; predicted "
-            f"{1e3 * row['predicted_rms_m']:.1f})"
-        )
-
-
-def _exceptions(result: Plain) -> Iterable[str]:
-    """Yield the errors of a network against truth, and what it does not use, in sentences."""
     if errors := result.get("errors"):
-        yield (
+        _say(
+            out,
             f"Against truth, place and attitude apart: marks {1e3 * errors['rms_marks_m']:.2f} mm "
             f"RMS, stations {1e3 * errors['rms_stations_m']:.2f} mm RMS"
-            f"{_nees(errors)}; {errors['n_false_marks']} false marks"
+            f"{_nees(errors)}; {errors['n_false_marks']} false marks",
         )
-    for one in result["refused"]:
-        yield f"  {one['station']}: {one['reason']}"
-    for one in result["excluded"]:
-        what = " ".join(part for part in (one["station"], one["marker"], one["mark"]) if part)
-        yield f"  {one['kind'].capitalize()} {what}: {one['reason']}"
+    for sentence in not_used(result):
+        _say(out, f"  {sentence}")
 
 
 def _nees(errors: Plain) -> str:

@@ -1,0 +1,63 @@
+"""Tables of plain values: columns with units, for terminals, pages and text reports."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+Plain = dict[str, Any]
+
+_PER_SI = {"mm": 1e3, "ms": 1e3, "ns": 1e9, "MB": 1e-6, "%": 100.0}  # units that scale a cell
+
+
+class Column(NamedTuple):
+    """One column of a table: a key of the rows, or a function from a row to the cell's text.
+
+    Values of the rows are SI, and ``unit`` is the one shown. A column with a format is flush right;
+    ``>`` does that for text.
+    """
+
+    key: str | Callable[[Any], Any]
+    title: str
+    unit: str = ""
+    form: str = ""
+
+    @property
+    def heading(self) -> str:
+        """Title with the unit in brackets."""
+        return f"{self.title} [{self.unit}]" if self.unit else self.title
+
+    def cell(self, row: Mapping[str, Any]) -> str:
+        """Return the text of one cell; a hyphen where there is no value."""
+        value = self.key(row) if callable(self.key) else row.get(self.key)
+        if value is None:
+            return "-"
+        if not self.form or isinstance(value, str):
+            return str(value)
+        return format(_PER_SI.get(self.unit, 1) * value, self.form)
+
+
+@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
+class Table:
+    """Rows of plain values with the columns to show, and sentences above and below."""
+
+    title: str = ""
+    columns: Sequence[Column] = ()
+    rows: Sequence[Mapping[str, Any]] = ()
+    notes: Sequence[str] = ()
+
+    def to_texts(self) -> Plain:
+        """Return the table as shown: headings with whether they are of numbers, rows of cells.
+
+        Returns
+        -------
+        dict
+            Plain values.
+        """
+        return {
+            "title": self.title,
+            "headings": [[column.heading, bool(column.form)] for column in self.columns],
+            "rows": [[column.cell(row) for column in self.columns] for row in self.rows],
+            "notes": list(self.notes),
+        }
