@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import io
+from collections.abc import Iterator
 from xml.etree import ElementTree as ET
 
 import numpy as np
@@ -111,7 +112,8 @@ def format_gama(result: AdjustedNetwork, description: str = "") -> str:
     root = ET.Element("gama-local", xmlns=_NAMESPACE)
     frame = {"axes-xy": "en", "angles": "right-handed"}
     network = ET.SubElement(root, "network", frame)
-    ET.SubElement(network, "description").text = description or "Written by spheremark."
+    text = " ".join(filter(None, (description or "Written by spheremark.", *_reduced(result))))
+    ET.SubElement(network, "description").text = text
     parameters = {"sigma-apr": "1", "conf-pr": "0.95", "tol-abs": "1000", "sigma-act": "apriori"}
     ET.SubElement(network, "parameters", parameters)
     observed = ET.SubElement(network, "points-observations")
@@ -122,6 +124,27 @@ def format_gama(result: AdjustedNetwork, description: str = "") -> str:
     _add_control(observed, result, fixed)
     ET.indent(root)
     return '<?xml version="1.0" ?>\n' + ET.tostring(root, encoding="unicode") + "\n"
+
+
+def _reduced(result: AdjustedNetwork) -> Iterator[str]:
+    """Yield what of the network Gama's model has no place for, as sentences."""
+    if names := result.network.shared.names:
+        sigmas = np.sqrt(np.diag(result.cov_shared))
+        known = ", ".join(
+            f"{name} = {value:.3g} (sigma {sigma:.2g})"
+            for name, value, sigma in zip(names, result.shared, sigmas, strict=True)
+        )
+        yield (
+            f"Reduced: the observations are corrected for what all stations share ({known}), whose "
+            "uncertainty is not in this file: standard deviations from it are those of known "
+            "corrections and at most as large as spheremark's, and the variance factor has "
+            f"the prior of {len(names)} unknown(s) less."
+        )
+    if result.network.is_free:
+        yield (
+            "Datum: all marks together here, the first station in spheremark; coordinates agree, "
+            "their standard deviations refer to that datum."
+        )
 
 
 def _used_controls(result: AdjustedNetwork) -> list[tuple[int, int]]:

@@ -137,12 +137,51 @@ def test_a_dense_solution_of_the_exported_observations_agrees(is_free, exact):
     assert read.is_fixed.any() == exact
 
 
+def test_standard_deviations_of_the_exported_observations_are_ours_but_for_what_is_reduced():
+    result = adjusted(False)
+    read = GamaNetwork(format_gama(result))
+    x0 = np.concatenate([read.start[~read.is_fixed].ravel(), np.zeros(len(read.sets))])
+    places, _ = read.solve()
+    p = np.array([places[name] for name in read.names])
+    x0[: 3 * np.sum(~read.is_fixed)] = p[~read.is_fixed].ravel()
+    J = np.empty((len(read.residuals(x0)), len(x0)))
+    for k, step in enumerate(np.where(np.arange(len(x0)) < 3 * np.sum(~read.is_fixed), 1e-5, 1e-4)):
+        ahead, behind = x0.copy(), x0.copy()
+        ahead[k] += step
+        behind[k] -= step
+        J[:, k] = (read.residuals(ahead) - read.residuals(behind)) / (2 * step)
+    sigmas = np.sqrt(np.diag(np.linalg.inv(J.T @ J)))[: 3 * np.sum(~read.is_fixed)].reshape(-1, 3)
+    names = [name for name, fixed in zip(read.names, read.is_fixed, strict=True) if not fixed]
+    ours = dict(zip(result.network.marks, result.mark_covariances, strict=True))
+    ours |= dict(zip(result.network.stations, result.station_covariances, strict=True))
+    expected = np.array([np.sqrt(np.diag(ours[name])) for name in names])
+    np.testing.assert_allclose(sigmas[:, :2], expected[:, :2], rtol=5e-3)
+    np.testing.assert_allclose(sigmas[:8, 2], expected[:8, 2], rtol=5e-3)
+    (shared,) = np.sqrt(np.diag(result.cov_shared))  # the height of all stations over their marks
+    np.testing.assert_allclose(np.hypot(sigmas[8:, 2], shared), expected[8:, 2], rtol=5e-3)
+
+
+def test_the_export_says_what_it_leaves_out():
+    rng = np.random.default_rng(5)
+    marks = field(rng, 8, middle=(250.0, 40.0, 3.0))
+    scans = [
+        (f"stop{i}", sightings(marks, pose(marks.p_site.mean(axis=0) + np.array([i, 0, 0]), i)))
+        for i in range(4)
+    ]
+    config = ResectionConfig(sigma_range=0.003)
+    result = adjust_network(assemble(scans, marks, config), config)
+    assert result.network.shared.names
+    text = GamaNetwork(format_gama(result)).network.find("g:description", GAMA).text
+    assert "Reduced: the observations are corrected" in text
+    assert all(name in text for name in result.network.shared.names)
+
+
 def test_the_export_states_its_axes_and_angles():
     read = GamaNetwork(format_gama(adjusted(True), "Two <stations> & more"))
     assert read.network.get("axes-xy") == "en"
     assert read.network.get("angles") == "right-handed"
     (text,) = read.network.findall("g:description", GAMA)
-    assert text.text == "Two <stations> & more"
+    assert text.text.startswith("Two <stations> & more Datum: all marks together")
 
 
 def test_what_the_tests_left_out_is_not_exported():
