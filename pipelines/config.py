@@ -281,7 +281,7 @@ class SurveyConfig:
     resection: ResectionConfig = field(default_factory=ResectionConfig)
 
     def __post_init__(self) -> None:
-        _check("marker_radius", self.marker_radius, 0.01, 1.0)
+        _check("marker_radius", self.marker_radius, 0.01, 3.0)
         _check("tolerance", self.tolerance, 1e-4, 1.0)
 
     @classmethod
