@@ -41,7 +41,7 @@ EXAMPLES: tuple[tuple[str, str], ...] = (
         "ORDER BY n_marks, resection_method, fit_method, included_angle_from_deg;",
     ),
     (
-        "Are the sigmas honest?",
+        "Errors against sigmas",
         "SELECT survey, fit_method, count(error_3d_m) AS n,\n"
         "    sqrt(avg(error_3d_m ^ 2)) * 1000 AS error_rms_mm,\n"
         "    sqrt(avg(sigma_3d_m ^ 2)) * 1000 AS predicted_mm,\n"

@@ -31,7 +31,7 @@ function send(file, parts) {
     query.set("process", "true");
   }
   return new Promise((resolve) => {
-    const request = new XMLHttpRequest(); // fetch tells nothing of the progress of a body
+    const request = new XMLHttpRequest(); // fetch does not report the progress of a body
     request.open("POST", `/api/v1/recordings?${query}`);
     request.setRequestHeader("Content-Type", "application/octet-stream");
     request.responseType = "json";

@@ -50,7 +50,7 @@ class RequestedStop(Strict):
 
 
 class ScanOptions(Strict):
-    """How the scans are driven."""
+    """The motion of gimbal and LiDAR in the scans."""
 
     turn_s: float = Field(default=13.2, gt=0, le=3600, description="Time of a turn [s].")
     spin_rpm: float = Field(default=600.0, description="Revolutions of the LiDAR per minute.")
