@@ -62,7 +62,6 @@ _POWER = 12.0  # of the mean over stops that is as good as their largest, and sm
 _WORTH = 0.9998  # of the objective that is reached: a smaller gain ends a search
 _WORSE_MOST = 1.3  # than now, at most, while the loss of a mark would break the tolerance
 _TRIED = 32  # places for a mark of which losses are evaluated, the most promising first
-_LOSS = 0.03  # exponent of the sigma after a loss, beside that of the worst stop
 _BLOCK = 1000  # places that are predicted at a time
 _SLACK = 1.15  # times the tolerance that a quick search keeps: more is hopeless
 _FINER = (3, 2, 1)  # times that the grid of the bound is finer, as far as places suffice
@@ -82,12 +81,16 @@ class Goal:
         Whether this shall hold after the loss of any one mark too; only for three marks or more.
     most : int
         Largest number of marks when the least number is searched.
+    loss_weight : float
+        Exponent of the largest sigma after a loss in the objective, 0 to 1, beside that of the
+        worst stop. 0.03: one percent at the worst stop is worth a third after a loss.
     """
 
     n_marks: int | None = None
     probability: float = 0.95
     is_robust: bool = True
     most: int = 20
+    loss_weight: float = 0.03
 
     def __post_init__(self) -> None:
         if self.n_marks is not None and not 2 <= self.n_marks <= MARKS_MOST:
@@ -98,6 +101,8 @@ class Goal:
             raise ConfigError(f"At most {self.most} marks; it must be from 2 to {MARKS_MOST}.")
         if not 0.0 < self.probability < 1.0:
             raise ConfigError(f"probability is {self.probability!r}; it must lie between 0 and 1.")
+        if not 0.0 <= self.loss_weight <= 1.0:
+            raise ConfigError(f"loss_weight is {self.loss_weight!r}; it must be from 0 to 1.")
 
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
@@ -198,10 +203,10 @@ def optimise(  # noqa: PLR0913  all that a plan is made of
     The best of many random arrangements, a fifth of them drawn by the shares of the convex
     relaxation (``bounds.relax``), are improved by exchanging one mark at a time, first on a high
     power mean over the stops, which has fewer local minima than their largest, then on that; the
-    best leave the grid in steps that halve. The objective is the largest 3-D sigma over all stops
-    to the power 0.97 times that after the loss of any one mark to the power 0.03: no plan that is
-    better in both scores worse. Where the tolerance does not hold after a loss, that comes first,
-    if it can be reached. Cost grows with marks times candidates times stops.
+    best leave the grid in steps that halve. The objective is the product of the largest 3-D sigma
+    over all stops and that after the loss of any one mark, with the exponents of the goal: no plan
+    that is better in both scores worse. Where the tolerance does not hold after a loss, that comes
+    first, if it can be reached. Cost grows with marks times candidates times stops.
     """
     check_sizes(len(stops.names), goal.n_marks or goal.most)
     problem = _problem(site, stops, candidates, model, requirement)
@@ -364,7 +369,7 @@ def _search(
     first = problem._replace(is_loss_first=True)
     found = [_descended(first, start, goal, rng) for start in starts]
     kept = _best_off_grid(found, goal, rng, is_quick=is_quick)
-    return kept if kept.score[0] == 0.0 else best
+    return kept if _evaluated(kept, goal)[0] == 0.0 else best
 
 
 def _starts(problem: _Problem, k: int, n: int, rng: np.random.Generator) -> list[Index]:
@@ -419,11 +424,10 @@ def _best_off_grid(
 ) -> _Found:
     """Return the best of arrangements after the best few have left the grid, if they may."""
     found = sorted(found, key=lambda one: one.score)
-    if is_quick or found[0].problem.candidates.rules is None:
-        return found[0]
-    several = {tuple(sorted(one.chosen)): one for one in found}
-    polished = [_off_grid(one, goal, rng) for one in list(several.values())[:_POLISHED]]
-    return min(polished, key=lambda one: one.score)
+    several = list({tuple(sorted(one.chosen)): one for one in found}.values())
+    if not is_quick and found[0].problem.candidates.rules is not None:
+        several += [_off_grid(one, goal, rng) for one in several[:_POLISHED]]
+    return min(several, key=lambda one: _evaluated(one, goal))
 
 
 def _off_grid(found: _Found, goal: Goal, rng: np.random.Generator) -> _Found:
@@ -498,15 +502,36 @@ def _objectives(
             after = np.maximum(after, _scores(problem, rest, tried[:, None])[:, 0])
         if problem.is_loss_first:
             excess = np.maximum(after - problem.requirement.tolerance / _Z_95, 0.0)
-        worst = worst ** (1.0 - _LOSS) * after**_LOSS
+        worst = worst ** (1.0 - goal.loss_weight) * after**goal.loss_weight
     return list(zip(excess.tolist(), worst.tolist(), mean.tolist(), strict=True))
+
+
+def _evaluations(found: _Found, slack: float = 1.0) -> list[Evaluation]:
+    """Return the evaluations of marks that hide each other too: all, then without each of them."""
+    site, stops, candidates, model, requirement, *_ = found.problem
+    wider = replace(requirement, tolerance=slack * requirement.tolerance)
+    marks, n = Arrangement.numbered(candidates.p_site[found.chosen]), len(found.chosen)
+    visibility = find_visibility(site, stops.p_site, marks)
+    remaining = [np.arange(n), *(np.delete(np.arange(n), i) for i in range(n) if n > 2)]
+    return [
+        evaluate(site, stops, marks.rows(keep), model, wider, visibility=visibility.rows(keep))
+        for keep in remaining
+    ]
 
 
 def _after_loss(found: _Found) -> float:
     """Return the largest sigma over all stops after the loss of any one mark [m]."""
-    k, none = len(found.chosen), np.zeros(0, dtype=np.intp)
-    sets = np.array([np.delete(found.chosen, i) for i in range(k)])
-    return float(_scores(found.problem._replace(power=np.inf), none, sets)[:, 0].max())
+    return max((one.worst_sigma_3d for one in _evaluations(found)[1:]), default=np.inf)
+
+
+def _evaluated(found: _Found, goal: Goal) -> tuple[float, float]:
+    """Return the objective of an arrangement whose marks hide each other too."""
+    whole, *rest = (min(one.worst_sigma_3d, _LOST) for one in _evaluations(found))
+    if not goal.is_robust or not rest:
+        return 0.0, whole
+    excess = max(max(rest) - found.problem.requirement.tolerance / _Z_95, 0.0)
+    weighed = whole ** (1.0 - goal.loss_weight) * max(rest) ** goal.loss_weight
+    return excess * found.problem.is_loss_first, weighed
 
 
 def _scores(
@@ -551,7 +576,7 @@ def _optimum(found: _Found, problem: _Problem, goal: Goal) -> Optimum:
     off = own.p_site[chosen, :2] - stops.p_site[:, :2].mean(axis=0)
     chosen = chosen[np.argsort(np.arctan2(off[:, 1], off[:, 0]))]
     marks, k = Arrangement.numbered(own.p_site[chosen]), len(chosen)
-    after = _after_loss(found) if k > 2 else np.inf
+    after = _after_loss(found)
     bound, gain, n_bounded, spacing = np.nan, (np.nan, np.nan), 0, 0.0
     if requirement.method != "paper":
         finer = _finer(problem)
@@ -589,20 +614,9 @@ def _finer(problem: _Problem) -> Candidates:
 
 def _keeps(found: _Found, goal: Goal, slack: float = 1.0) -> bool:
     """Return whether marks reach the goal for a multiple of the tolerance."""
-    site, stops, candidates, model, requirement, *_ = found.problem
-    wider = replace(requirement, tolerance=slack * requirement.tolerance)
-    marks, n = Arrangement.numbered(candidates.p_site[found.chosen]), len(found.chosen)
-    remaining = [np.arange(n)]
-    if goal.is_robust and n >= 3:
-        remaining += [np.delete(np.arange(n), i) for i in range(n)]
-    visibility = find_visibility(site, stops.p_site, marks)
-    return all(
-        evaluate(
-            site, stops, marks.rows(keep), model, wider, visibility=visibility.rows(keep)
-        ).worst_probability
-        >= goal.probability
-        for keep in remaining
-    )
+    whole, *rest = _evaluations(found, slack)
+    every = [whole, *rest] if goal.is_robust else [whole]
+    return all(one.worst_probability >= goal.probability for one in every)
 
 
 def _least(problem: _Problem, goal: Goal) -> int:

@@ -155,6 +155,12 @@ def optimise(
     robust: Annotated[
         bool, typer.Option(help="Whether it shall be kept after the loss of any one mark too.")
     ] = True,
+    loss_weight: Annotated[
+        float,
+        typer.Option(
+            help="Weight of the worst stop after a loss: 0 ignores it, 1 counts it alone."
+        ),
+    ] = 0.03,
     keep_out: Annotated[
         Path | None,
         typer.Option(
@@ -167,6 +173,8 @@ def optimise(
     reach_m: Annotated[
         float, typer.Option(help="Farthest a mark may stand from a stop \\[m].")
     ] = 6.0,
+    clear_m: Annotated[float, typer.Option(help="Least distance from stops \\[m].")] = 1.0,
+    apart_m: Annotated[float, typer.Option(help="Least distance between marks \\[m].")] = 1.0,
     slope_deg: Annotated[float, typer.Option(help="Steepest ground for a pole \\[deg].")] = 15.0,
     inside: Annotated[
         bool, typer.Option("--inside", help="Marks may stand between the stops too.")
@@ -184,11 +192,13 @@ def optimise(
     assembled = plans.assemble(ground, None, scans.sensor(), requirement, query, results.survey)
     rules = PlaceRules(
         reach=reach_m,
+        clear=clear_m,
+        apart=apart_m,
         slope_max=math.radians(slope_deg),
         spacing=spacing_m,
         is_inside_allowed=inside,
     )
-    goal = Goal(n_marks=marks, probability=probability, is_robust=robust)
+    goal = Goal(n_marks=marks, probability=probability, is_robust=robust, loss_weight=loss_weight)
     files.deliver(plans.optimise(assembled, rules, goal))
 
 

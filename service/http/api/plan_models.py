@@ -141,6 +141,12 @@ class OptimisationRequest(SuggestionRequest):
     is_robust: bool = Field(
         default=True, description="Whether the tolerance holds after the loss of any one mark."
     )
+    loss_weight: float = Field(
+        default=0.03,
+        ge=0.0,
+        le=1.0,
+        description="Weight of the worst stop after a loss: 0 ignores it, 1 counts it alone.",
+    )
 
 
 class NewPlan(PlanRequest):

@@ -116,7 +116,7 @@ async def optimise_plan(
     plan: OptimisationRequest, request: Request, service: Current
 ) -> OptimisedPlan:
     """Find the best places for a number of marks, or the fewest that keep the tolerance."""
-    goal = Goal(n_marks=plan.n_marks, is_robust=plan.is_robust)
+    goal = Goal(n_marks=plan.n_marks, is_robust=plan.is_robust, loss_weight=plan.loss_weight)
 
     def optimised() -> Plain:
         return plans.optimise(_assembled(service, plan), plan.rules.to_rules(), goal)

@@ -9,7 +9,7 @@ from numpy.testing import assert_allclose
 
 from spheremark.pipelines.config import ResectionConfig
 from spheremark.pipelines.errors import ConfigError, DegenerateGeometryError, InputError
-from spheremark.pipelines.geometry import rigid, rot_z
+from spheremark.pipelines.geometry import by_motion, rigid, rot_z
 from spheremark.pipelines.model import ControlMarks, Levelling, MarkerFit, MarkerFits, Status
 from spheremark.pipelines.placement import (
     PLAN_METHODS,
@@ -37,12 +37,20 @@ from spheremark.pipelines.placement import (
     site_of_grid,
     stops_of_field,
 )
-from spheremark.pipelines.placement.bounds import information_of, least_sigmas, widest_sigma
-from spheremark.pipelines.placement.centre_model import expect_centres
+from spheremark.pipelines.placement.bounds import (
+    groups_of,
+    information_of,
+    least_sigmas,
+    relax,
+    start_information,
+    widest_sigma,
+)
+from spheremark.pipelines.placement.centre_model import centres_ahead, expect_centres
 from spheremark.pipelines.placement.evaluation import predict_observables
 from spheremark.pipelines.placement.probability import probability_within
 from spheremark.pipelines.placement.station_covariance import (
     claimed_bias_variance,
+    covariances,
     predict_positions,
 )
 from spheremark.pipelines.positioning.resection import resect
@@ -419,8 +427,113 @@ def test_optimised_marks_beat_marks_at_random(world):
         evaluate(site, stops, drawn_marks(candidates, 5, rng), MODEL, Requirement()).worst_sigma_3d
         for _ in range(100)
     )
-    assert best.evaluation.worst_sigma_3d < drawn
+    assert best.bound < best.evaluation.worst_sigma_3d < drawn
     assert best.log_det <= best.log_det_bound
+
+
+def worst_after_loss(site, stops, marks):
+    rest = [marks.rows(np.delete(np.arange(len(marks.names)), k)) for k in range(len(marks.names))]
+    return max(evaluate(site, stops, some, MODEL, Requirement()).worst_sigma_3d for some in rest)
+
+
+@pytest.mark.parametrize(("n_marks", "weight"), [(3, 0.03), (3, 1.0), (5, 0.03)])
+def test_no_plan_at_random_is_better_at_the_worst_stop_or_after_a_loss(n_marks, weight):
+    """Three marks cannot keep the tolerance after a loss: then the worst stop still counts."""
+    site, stops = flat_site(), one_stop((0.0, 0.0, 1.05), (4.0, 0.0, 1.05), (2.0, 3.0, 1.05))
+    candidates = find_candidates(site, stops, PlaceRules(spacing=2.0))
+    rng = np.random.default_rng(6)
+    goal = Goal(n_marks=n_marks, loss_weight=weight)
+    found = optimise(site, stops, candidates, MODEL, Requirement(), goal, rng)
+    worst, after = found.evaluation.worst_sigma_3d, found.worst_after_loss
+    assert_allclose(after, worst_after_loss(site, stops, found.evaluation.marks), rtol=0.02)
+    for _ in range(60):
+        marks = drawn_marks(candidates, n_marks, rng)
+        others = (
+            evaluate(site, stops, marks, MODEL, Requirement()).worst_sigma_3d,
+            worst_after_loss(site, stops, marks),
+        )
+        assert worst < others[0] or after < others[1]
+        assert after < others[1] if weight == 1.0 else worst < others[0]
+
+
+def test_marks_between_the_places_of_a_grid_are_better_and_keep_the_rules(world):
+    site, stops = site_of_field(world), stops_of_field(world)
+    rules = PlaceRules(spacing=3.0)
+    places = find_candidates(site, stops, rules)
+    goal, given = Goal(n_marks=4), (MODEL, Requirement())
+    off = optimise(site, stops, places, *given, goal, np.random.default_rng(0)).evaluation
+    places = replace(places, rules=None)
+    on = optimise(site, stops, places, *given, goal, np.random.default_rng(0)).evaluation
+    assert off.worst_sigma_3d < 0.95 * on.worst_sigma_3d
+    p = off.marks.p_site
+    gaps = np.linalg.norm(p[:, None, :2] - stops.p_site[None, :, :2], axis=2)
+    assert gaps.min() >= rules.clear
+    assert gaps.min(axis=1).max() <= rules.reach
+    apart = np.linalg.norm(p[:, None] - p[None], axis=2)[np.triu_indices(4, 1)]
+    assert apart.min() >= rules.apart
+    heights = p[:, 2] - site.ground_at(p)
+    assert heights.min() >= site.pole_heights[0] - 1e-3
+    assert heights.max() <= site.pole_heights[1] + 1e-3
+
+
+def test_the_bound_is_below_every_choice_and_reached_where_there_is_none():
+    """Against all choices of 3 of 12 places; and of all places at once, which leaves no choice."""
+    site, rng = flat_site(), np.random.default_rng(8)
+    stops = one_stop((0.0, 0.0, 1.05), (3.0, 1.0, 1.05), (-2.0, 2.0, 1.05))
+    p = np.column_stack([rng.uniform(-9, 9, (12, 2)), rng.uniform(0.6, 1.5, 12)])
+    requirement = Requirement()
+    every = Arrangement.numbered(p)
+    visibility = find_visibility(site, stops.p_site, every)
+    _, seen = predict_observables(stops.p_site, every, MODEL, requirement, visibility)
+    information = information_of(seen, requirement)
+    start = start_information(seen.sigma_laser_bias, requirement)
+    sigma_height = requirement.resection.sigma_height
+    choices = [
+        predict_positions(
+            seen._replace(
+                marks_site=p[[*some]],
+                cov_centres=seen.cov_centres[:, [*some]],
+                is_seen=seen.is_seen[:, [*some]],
+            ),
+            requirement,
+        ).cov_motion[:, 3:, 3:]
+        for some in combinations(range(12), 3)
+    ]
+    best = min(np.sqrt(np.trace(covs, axis1=1, axis2=2).max()) for covs in choices)
+    groups = np.arange(12)
+    bound = relax(information, start, groups, 3, sigma_height).bound
+    assert 0.5 * best < bound < best
+    no_choice = relax(information, start, groups, 12, sigma_height).bound
+    v, (_, true) = seen.vectors, covariances(seen, requirement)
+    J = np.concatenate([by_motion(v), (v / np.linalg.norm(v, axis=2)[..., None])[..., None]], -1)
+    normal = start + np.einsum("snai,snab,snbj->sij", J, np.linalg.inv(true), J)
+    variances = np.trace(np.linalg.inv(normal)[:, 3:6, 3:6], axis1=1, axis2=2)
+    assert_allclose(no_choice, np.sqrt(variances.max() + sigma_height**2), rtol=5e-3)
+
+
+def test_groups_hold_only_places_too_near_for_two_marks():
+    p = np.random.default_rng(1).uniform(0.0, [9.0, 9.0, 0.9], (2000, 3))
+    for apart in (0.4, 1.0, 3.0):
+        groups = groups_of(p, apart)
+        for group in np.unique(groups):
+            some = p[groups == group]
+            assert np.linalg.norm(some[:, None] - some[None], axis=2).max() < apart
+
+
+def test_returns_thin_out_with_distance_without_a_step_down_to_the_sensors_least_range():
+    """In simulated scans spheres at 0.95 m are found eight times of eight, at 0.9 m three times."""
+    distances = np.geomspace(1.05, 40.0, 60)
+    marks = Arrangement.numbered(np.column_stack([distances, np.zeros(60), np.full(60, 1.05)]))
+    counts, variances = centres_ahead(MODEL, distances)
+    assert (np.diff(counts) < 0).all()
+    assert (np.diff(np.log(counts)) > -0.25).all()
+    assert (np.abs(np.diff(np.log(variances), axis=0)) < 0.3).all()
+    near = Arrangement.numbered(np.array([[d, 0.0, 1.05] for d in (0.8, 1.0)]))
+    seen = [
+        evaluate(flat_site(), one_stop(), one, MODEL, Requirement()).is_seen[0, 0]
+        for one in (near.rows(np.array([0])), near.rows(np.array([1])), marks.rows(np.array([5])))
+    ]
+    assert seen == [False, True, True]
 
 
 def test_a_small_case_comes_near_the_best_of_all():
