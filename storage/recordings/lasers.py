@@ -26,7 +26,8 @@ def with_lasers(rig: Rig | None, returns: Returns) -> tuple[Rig | None, Rings, t
     rings = returns.rings
     if rig is None or not len(rings) or rings[0] == RING_UNKNOWN:
         return rig, rings, ()
-    elevations, scatter = _elevations(returns)
+    samples, lasers = _sample(returns)
+    elevations = _elevations(samples, lasers, int(rings.max()) + 1)
     seen = np.flatnonzero(np.isfinite(elevations))
     if not len(seen):
         return rig, rings, ()
@@ -36,7 +37,7 @@ def with_lasers(rig: Rig | None, returns: Returns) -> tuple[Rig | None, Rings, t
             return rig, rings, ()
         if np.abs(known[::-1][: len(elevations)] - elevations)[seen].max() < _SAME:
             return rig, np.asarray(len(known) - 1 - rings, np.uint8), ()
-    if np.median(scatter[seen]) > _STEADY:
+    if 1.4826 * np.nanmedian(np.abs(samples - elevations[lasers])) > _STEADY:
         return rig, rings, ()
     order = np.argsort(elevations)  # rings without returns come last
     rank = np.zeros(len(elevations), np.uint8)
@@ -61,18 +62,20 @@ def with_lasers(rig: Rig | None, returns: Returns) -> tuple[Rig | None, Rings, t
     )
 
 
-def _elevations(returns: Returns) -> tuple[Array, Array]:
-    """Return the median elevation of each ring, NaN where it is not seen, and its scatter [rad]."""
+def _sample(returns: Returns) -> tuple[Array, Rings]:
+    """Return elevations [rad] and rings of some returns that are far enough."""
     rows = slice(None, None, max(1, len(returns.rings) // _SAMPLE))
-    p, rings = returns.p_lidar[rows].astype(np.float64), returns.rings[rows]
+    p = returns.p_lidar[rows].astype(np.float64)
     horizontal = np.hypot(p[:, 0], p[:, 1])
-    elevations = np.arctan2(p[:, 2], horizontal)
-    elevations, rings = elevations[horizontal > _FAR], rings[horizontal > _FAR]
-    n = int(returns.rings.max()) + 1
-    medians, scatters = np.full(n, np.nan), np.full(n, np.nan)
+    is_far = horizontal > _FAR
+    return np.arctan2(p[is_far, 2], horizontal[is_far]), returns.rings[rows][is_far]
+
+
+def _elevations(samples: Array, lasers: Rings, n: int) -> Array:
+    """Return the median elevation of each ring, NaN where it is not seen [rad]."""
+    medians = np.full(n, np.nan)
     for ring in range(n):
-        mine = elevations[rings == ring]
+        mine = samples[lasers == ring]
         if len(mine) >= _N_MIN:
             medians[ring] = np.median(mine)
-            scatters[ring] = 1.4826 * np.median(np.abs(mine - medians[ring]))
-    return medians, scatters
+    return medians
