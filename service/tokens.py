@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import hmac
 import json
+import logging
 import os
 import secrets
 import tempfile
@@ -16,6 +17,8 @@ from pathlib import Path
 from typing import Any
 
 from spheremark.pipelines.errors import ConflictError, InputError, NotFoundError
+
+logger = logging.getLogger(__name__)
 
 TOKENS = "tokens.json"
 AUDIT = "audit.jsonl"  # in the data folder
@@ -146,11 +149,12 @@ class Audit:
         line = json.dumps({"at": datetime.now(UTC).isoformat(timespec="milliseconds"), **entry})
         flags = os.O_WRONLY | os.O_APPEND | os.O_CREAT
         try:
-            handle = os.open(self._path, flags, 0o600)
+            with os.fdopen(os.open(self._path, flags, 0o600), "w") as file:
+                file.write(line + "\n")
         except FileNotFoundError:  # the data folder is not made yet
             return
-        with os.fdopen(handle, "w") as file:
-            file.write(line + "\n")
+        except OSError as error:  # a full disk must not refuse what the database could still keep
+            logger.warning("Not in the audit log (%s): %s", error.strerror, line)
 
     def last(self, n: int) -> list[dict[str, Any]]:
         """Return the newest entries, newest first."""

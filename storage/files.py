@@ -11,6 +11,7 @@ import os
 import posixpath
 import secrets
 import shutil
+import sys
 from collections.abc import Callable, Iterator
 from contextlib import suppress
 from dataclasses import dataclass
@@ -132,7 +133,10 @@ class Reserve:
         if self._path.exists() or free_bytes(self._path) < 2 * self._size:
             return
         with suppress(OSError), self._path.open("wb") as file:
-            os.posix_fallocate(file.fileno(), 0, self._size)
+            if sys.platform == "linux":
+                os.posix_fallocate(file.fileno(), 0, self._size)
+            else:
+                file.writelines(bytes(_BLOCK) for _ in range(self._size // _BLOCK))
 
     def release(self) -> None:
         """Give the space back."""

@@ -23,6 +23,7 @@ CHECKS = [
         "response_schema_conformance",
     )
 ]
+schemathesis.serializer.alias("application/offset+octet-stream", "application/octet-stream")
 HOST = "http://127.0.0.1:8000"
 N_REQUESTS = 15  # of each operation and mode; two minutes in all
 DESCRIPTION = create_app(Settings()).openapi()
@@ -65,7 +66,7 @@ def test_no_request_fails_the_service_or_gets_what_is_not_described(client, oper
         for name, value in HEADERS.items():
             assert answer.headers[name] == value
         case.validate_response(answer, checks=CHECKS)
-        if answer.status_code >= 400:
+        if answer.status_code >= 400 and sent.method != "HEAD":  # which has no body
             problem = answer.json()
             assert client.get(problem["type"]).json()["code"] == problem["code"]
 
