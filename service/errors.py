@@ -114,6 +114,12 @@ class RefusedRecordingError(RecordingError):
         return cls(" ".join(recording.preflight.get("reasons", ())), recording)
 
 
+class PredictionTimeoutError(InputError):
+    """The prediction of a plan ran into its time limit."""
+
+    code: ClassVar[str] = "prediction.timeout"
+
+
 class ClientLeftError(SpheremarkError):
     """The client closed the connection before the response was ready."""
 
@@ -151,6 +157,7 @@ STATUS: Mapping[type[SpheremarkError], int] = {
     ClientLeftError: 499,  # as nginx has it; only the log sees it
     RecordingError: 422,
     QueryTimeoutError: 504,
+    PredictionTimeoutError: 504,
     SolveError: 422,
     UnauthorizedError: 401,
     ForbiddenError: 403,

@@ -98,6 +98,12 @@ class Settings(BaseSettings):
     sql_memory_bytes: int = Field(
         default=512 << 20, ge=64 << 20, description="Memory that one query may use [bytes]."
     )
+    prediction_seconds: float = Field(
+        default=300.0, gt=0, description="Time after which the search of a plan is ended [s]."
+    )
+    prediction_memory_bytes: int = Field(
+        default=2 << 30, ge=512 << 20, description="Memory that such a search may use [bytes]."
+    )
     log_format: LogFormat = Field(
         default="text", description="Lines of the log: text, or json with ids of request and job."
     )

@@ -15,10 +15,13 @@ from spheremark.pipelines.errors import NotFoundError
 from spheremark.service.http.places import Places
 from spheremark.service.http.uploads import Inbox, Resumable, adopt_orphans
 from spheremark.service.jobs.queue import JobQueue
+from spheremark.service.planning.predictions import Predictions
 from spheremark.service.planning.requests import Planner
 from spheremark.service.settings import Settings
 from spheremark.storage.catalogue.catalogue import Catalogue
 from spheremark.storage.imports.confined import end_children
+
+_PLANS = 2  # that are computed at once
 
 
 @dataclass(frozen=True, slots=True)
@@ -32,9 +35,10 @@ class Service:
     terrains: Inbox
     jobs: JobQueue
     planner: Planner
+    predictions: Predictions
     readers: Places = field(default_factory=lambda: Places("foreign files", 2, 8))
     queries: Places = field(default_factory=lambda: Places("queries", 4, 12))
-    plans: Places = field(default_factory=lambda: Places("plans", 2, 6))
+    plans: Places = field(default_factory=lambda: Places("plans", _PLANS, 6))
     keys: threading.Lock = field(default_factory=threading.Lock)  # of requests that must be one
 
     def row(self, sql: str, key: str, what: str) -> dict[str, Any]:
@@ -63,13 +67,21 @@ async def opened(settings: Settings) -> AsyncIterator[Service]:
             threading.Thread(target=_warm_up, name="warm-up", daemon=True).start()
             await asyncio.to_thread(adopt_orphans, catalogue, inbox)
             planner = Planner(catalogue)
-            service = Service(settings, catalogue, inbox, uploads, terrains, jobs, planner)
+            predictions = Predictions(
+                n_processes=_PLANS,
+                seconds=settings.prediction_seconds,
+                memory_bytes=settings.prediction_memory_bytes,
+            )
+            service = Service(
+                *(settings, catalogue, inbox, uploads, terrains, jobs, planner, predictions)
+            )
             try:
                 yield service
             finally:
                 for places in (service.readers, service.queries, service.plans):
                     places.close()
                 end_children()
+                await asyncio.to_thread(predictions.close)
 
 
 def _warm_up() -> None:

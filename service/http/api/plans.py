@@ -119,7 +119,8 @@ async def optimise_plan(
     goal = Goal(n_marks=plan.n_marks, is_robust=plan.is_robust, loss_weight=plan.loss_weight)
 
     def optimised() -> Plain:
-        return plans.optimise(_assembled(service, plan), plan.rules.to_rules(), goal)
+        rules = plan.rules.to_rules()
+        return service.predictions.run(plans.optimise, _assembled(service, plan), rules, goal)
 
     return OptimisedPlan.model_validate(await service.plans.run(request, optimised))
 
@@ -131,7 +132,8 @@ async def suggest_mark(
     """Return the one more mark that would help most."""
 
     def suggested() -> Plain:
-        return plans.suggest(_assembled(service, plan), plan.rules.to_rules())
+        rules = plan.rules.to_rules()
+        return service.predictions.run(plans.suggest, _assembled(service, plan), rules)
 
     return SuggestedMark.model_validate(await service.plans.run(request, suggested))
 
@@ -160,7 +162,7 @@ def simulated(service: Service, options: RandomPlansRequest) -> Plain:
         options.to_spec(), limits, options.distance_max_m, (low, high)
     )
     model = planner.model(options.model, options.to_sensor(), _MARKER_RADIUS)
-    return random_plans.run(spec, model, limits)
+    return service.predictions.run(random_plans.run, spec, model, limits)
 
 
 @router.post("/plans", name="keep_plan", status_code=201)

@@ -1,0 +1,84 @@
+"""Predictions of plans in processes of their own: bounded in time and memory, and ended at will.
+
+The processes start with the first request and stay, with the compiled code. One that is ended is
+replaced.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import resource
+import signal
+import sys
+from collections.abc import Callable
+from concurrent.futures import wait
+from multiprocessing import get_context
+from typing import Any
+
+from pebble import ProcessExpired, ProcessPool
+
+from spheremark.pipelines.errors import SolveError
+from spheremark.pipelines.progress import checkpoint
+from spheremark.service.errors import PredictionTimeoutError
+from spheremark.service.serialise.plans import Plain
+
+_LOOK_EVERY = 0.2  # [s] whether the caller still waits
+_DEATH_SIGNAL = 1  # PR_SET_PDEATHSIG of Linux
+
+
+class Predictions:
+    """A few processes that compute.
+
+    Parameters
+    ----------
+    n_processes : int
+        Their number.
+    seconds, memory_bytes : float, int
+        What one prediction may take.
+    """
+
+    def __init__(self, *, n_processes: int, seconds: float, memory_bytes: int) -> None:
+        self._seconds, self._memory_bytes = seconds, memory_bytes
+        self._pool = ProcessPool(
+            max_workers=n_processes,
+            initializer=_confine,
+            initargs=(memory_bytes,),
+            context=get_context("spawn"),
+        )
+
+    def run(self, function: Callable[..., Plain], *arguments: Any) -> Plain:
+        """Return what a function returns; its process is killed where a checkpoint raises.
+
+        Raises PredictionTimeoutError and SolveError where time or memory do not suffice.
+        """
+        future = self._pool.schedule(function, arguments, timeout=self._seconds)
+        try:
+            while not wait((future,), _LOOK_EVERY).done:
+                checkpoint()
+            found: Plain = future.result()
+        except TimeoutError as error:
+            raise PredictionTimeoutError(
+                f"The prediction was ended after {self._seconds:g} s, its time limit. Ask for "
+                "fewer marks, stops or places."
+            ) from error
+        except (MemoryError, ProcessExpired) as error:
+            raise SolveError(
+                f"The prediction needs more than {self._memory_bytes >> 20} MiB of memory, its "
+                "limit. Ask for fewer marks, stops or places."
+            ) from error
+        finally:
+            future.cancel()  # type: ignore[no-untyped-call]
+        return found
+
+    def close(self) -> None:
+        """End all processes."""
+        self._pool.stop()  # type: ignore[no-untyped-call]
+        self._pool.join()
+
+
+def _confine(memory_bytes: int) -> None:
+    """Bound the memory of this process, and let it end with its parent."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the service
+    if sys.platform == "linux":
+        ctypes.CDLL(None).prctl(_DEATH_SIGNAL, signal.SIGKILL)
+        resource.setrlimit(resource.RLIMIT_DATA, (memory_bytes, memory_bytes))
