@@ -6,7 +6,8 @@
 - ``cells`` sorts returns by place and direction,
 - ``ground`` separates the ground, ``seeds`` picks the places to examine,
 - ``neighbourhoods`` gathers the returns about a place, ``features`` measures their shape,
-- ``evidence`` counts where the beams towards and about a group end,
+- ``evidence`` counts where the beams towards and about a group end, ``pulses`` those of which no
+  return shows it,
 - ``hypotheses`` compares the sphere with other shapes,
 - ``decision`` gives the reasons why a group is no marker.
 

@@ -110,8 +110,6 @@ def _not_round(features: Features, config: ExtractionConfig, target: Target) -> 
             f"Its returns scatter by {1e3 * features.scatter:.0f} mm about a sphere of the known "
             f"radius; at most {1e3 * config.scatter_max:.0f} mm are taken for noise."
         )
-    if features.width < _WIDTH_MIN * radius:
-        return _too_slim(features, target)
     if features.height < _HEIGHT_MIN * radius:
         return (
             f"Its returns lie on one line, {1e3 * features.height:.0f} mm high: nothing shows "
@@ -173,7 +171,8 @@ def _not_seen_as_ball(features: Features, evidence: Evidence, target: Target) ->
             f"Most of it is hidden: {evidence.n_before} returns inside its outline lie before it, "
             f"where {evidence.n_on} lie on it."
         )
-    if shows_width and features.width < _WIDTH_SHOWN * target.radius:
+    width_min = (_WIDTH_SHOWN if shows_width else _WIDTH_MIN) * target.radius
+    if features.width < width_min and not evidence.is_gapless:
         return _too_slim(features, target)
     if evidence.spread < expected - slack:
         seems_like = target.radius * sqrt(evidence.spread / expected)

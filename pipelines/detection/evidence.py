@@ -19,6 +19,7 @@ from spheremark.pipelines.detection.cells import (
     direction_cells,
     rows_in,
 )
+from spheremark.pipelines.detection.pulses import clock_of, n_unheard_inside
 from spheremark.pipelines.detection.target import Target, blur_at, rays_of, seen_from, view_of
 from spheremark.pipelines.model import Array, Column, StitchedCloud
 from spheremark.pipelines.threads import side_by_side
@@ -31,7 +32,9 @@ _HELD = (-4.0, 1.5)  # radii of depth within which a return may belong to the sa
 _ON = (-1.3, 0.3)  # radii of depth within which a return may lie on the sphere
 _PLACE = 0.1  # radii: beams nearer to each other than this pass at the same place
 _MEAN_WIDTH = 0.75  # of the greater half width of a beam: in any direction
+_WELL_INSIDE = 0.8  # radii: no beam that passes nearer misses a sphere
 _TINY = 1e-6
+_TOUCHING = 0.10  # share of the beams on a sphere that may end elsewhere: mixed pixels
 _OBSTRUCTED = 3.0  # ratio of beams below it that end nearer to those that go past
 
 _Groups = tuple[NDArray[np.int64], NDArray[np.int32]]  # start of each group, and the members
@@ -67,6 +70,8 @@ class Evidence(NamedTuple):
         Returns of the cloud whose beams pass within four radii, ascending.
     seen : (3, m)
         How these beams pass the centre, as from ``passing`` [m].
+    n_silent : int
+        Pulses well inside the limb without a return; -1 where times or rings do not show them.
     """
 
     n_on: int
@@ -80,6 +85,7 @@ class Evidence(NamedTuple):
     n_distinct: int
     rows: NDArray[np.int32]
     seen: Array
+    n_silent: int = -1
 
     @property
     def is_open_below(self) -> bool:
@@ -96,6 +102,12 @@ class Evidence(NamedTuple):
         return self.n_past > 2 and self.n_past > self.n_held + self.n_short
 
     @property
+    def is_gapless(self) -> bool:
+        """Whether all pulses well inside its limb are known, and next to none goes past."""
+        n_past = self.n_through + self.n_silent
+        return self.n_silent >= 0 and n_past <= 1.0 + _TOUCHING * min(self.n_aimed, 2 * self.n_on)
+
+    @property
     def n_aimed(self) -> int:
         """Number of beams that would have met the sphere if nothing were nearer."""
         return self.n_on + self.n_before
@@ -107,6 +119,7 @@ def gather_evidence(
     """Count the beams towards and about some centres by the depth at which they end."""
     if not len(centres):
         return []
+    clock = clock_of(cloud)
     reach = (_REACH + 0.5) * target.radius + 0.05
     starts, owners = _centres_by_direction(centres, _sides(centres, reach), target.up, reach)
     is_wanted, cones = starts[1:] > starts[:-1], _cones(centres, target)
@@ -123,7 +136,12 @@ def gather_evidence(
         for i in range(first, end):
             rows = np.concatenate([rows[begin[i] : begin[i + 1]] for begin, rows in parts])
             fields = _count_beams(cloud.p_base, cloud.intensities, rows, centres[i], target)
-            found.append(Evidence(*fields))
+            one = Evidence(*fields)
+            if clock is not None:
+                reach = _WELL_INSIDE * target.radius
+                n_silent = n_unheard_inside(cloud, clock, rows, centres[i], reach)
+                one = one._replace(n_silent=n_silent)
+            found.append(one)
         return found
 
     return list(chain(*side_by_side(counted, len(centres), threaded_from=4)))
@@ -163,7 +181,7 @@ def _count_beams(
             light += share * intensities[rows[i]]
             lit += share * share
         n_before += is_aimed and depth <= _ON[0]
-        n_through += gap < 0.8 and depth > 1.0
+        n_through += gap < _WELL_INSIDE and depth > 1.0
         is_below = along < -0.3 and gap > 1.2 + blur and _POLE + blur < across < _ASIDE + blur
         if is_below:
             n_past += depth > _HELD[1]

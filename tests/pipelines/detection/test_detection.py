@@ -90,7 +90,7 @@ def test_scores_are_between_hardly_and_surely(found):
     ("place", "words"),
     [
         ((*POST[:2], GROUND + 1.3), "free|pole|curved|radius"),
-        ((*SLIM[:2], GROUND + 0.9), "slim|free|curved"),
+        ((*SLIM[:2], GROUND + 0.9), "slim|free|curved|radius"),
         (BIG, "radius|free"),
         (SMALL, "radius|small"),
     ],

@@ -1,0 +1,58 @@
+"""Markers in turns whose scan lines fall on scan lines: two or three lines show a sphere."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from spheremark.pipelines.config import ExtractionConfig, StitchingConfig
+from spheremark.pipelines.detection import extract
+from spheremark.pipelines.detection.pulses import clock_of, n_unheard_inside
+from spheremark.pipelines.geometry import inverse, transform
+from spheremark.pipelines.model import RING_UNKNOWN
+from spheremark.pipelines.scan.stitching import stitch
+from spheremark.pipelines.simulation import SimulationConfig, scenario, simulate_stop
+from spheremark.pipelines.simulation.rig import nominal_rig
+
+CONFIG = SimulationConfig(turn=12.0)  # lines one degree apart
+
+
+@pytest.fixture(scope="module")
+def scan():
+    field = scenario("paper-field", 0)
+    stop = simulate_stop(field, "lane3-stop4", CONFIG)
+    cloud = stitch(stop.log, nominal_rig(CONFIG), StitchingConfig())
+    return cloud, transform(inverse(stop.truth.T_site_base), field.marks.p_site), field
+
+
+def n_silent(scan, place):
+    cloud, _, field = scan
+    rows = np.flatnonzero(np.linalg.norm(cloud.p_base - place, axis=1) < 0.5).astype(np.int32)
+    return n_unheard_inside(cloud, clock_of(cloud), rows, place, 0.8 * field.marker_radius)
+
+
+def test_no_marker_is_refused_for_the_width_that_the_lines_show_and_nothing_else_is_found(scan):
+    cloud, marks, field = scan
+    found = extract(cloud, ExtractionConfig(), field.marker_radius)
+    rough = np.array([c.p_base_rough for c in found.candidates])
+    assert (np.linalg.norm(rough[:, None] - marks, axis=2).min(axis=1) < field.marker_radius).all()
+    near = [
+        r.reason
+        for r in found.rejected
+        if np.linalg.norm(marks - r.p_base, axis=1).min() < field.marker_radius
+    ]
+    assert not any("slim" in reason for reason in near), near
+
+
+def test_no_pulse_at_a_marker_is_silent_and_all_are_in_the_sky(scan):
+    _, marks, _ = scan
+    assert max(n_silent(scan, mark) for mark in marks) <= 3
+    assert (
+        min(n_silent(scan, 7.0 * mark / np.linalg.norm(mark) + [0, 0, 4.0]) for mark in marks) > 5
+    )
+
+
+def test_without_rings_there_is_no_clock(scan):
+    cloud, _, _ = scan
+    bare = replace(cloud, rings=np.full(len(cloud.rings), RING_UNKNOWN, np.uint8))
+    assert clock_of(bare) is None
