@@ -379,13 +379,12 @@ def _starts(problem: _Problem, k: int, n: int, rng: np.random.Generator) -> list
     """
     candidates = problem.candidates
     is_seen = np.asarray(problem.pairs.is_seen.any(axis=0))
-    orders = [rng.permutation(len(is_seen)) for _ in range(_DRAWN_EVENLY)]
-    information = _information(problem, candidates)
-    shares = relax(
-        information, _start(problem), groups_of(candidates.p_site, candidates.apart), k, 0.0
-    ).shares
-    luck = rng.gumbel(size=(_DRAWN_BY_SHARES, len(shares)))
-    orders += list(np.argsort(-(np.log(np.maximum(shares, 1e-12)) + luck), axis=1))
+    groups = groups_of(candidates.p_site, candidates.apart)
+    shares = relax(_information(problem, candidates), _start(problem), groups, k, 0.0).shares
+    odds = np.log(np.maximum(shares, 1e-12))
+    n_drawn = _DRAWN_EVENLY + _DRAWN_BY_SHARES
+    luck = (rng.gumbel(size=len(odds)) for _ in range(n_drawn))
+    orders = (np.argsort(-(one + odds * (i >= _DRAWN_EVENLY))) for i, one in enumerate(luck))
     drawn = [_draw(candidates, k, order[is_seen[order]]) for order in orders]
     most = max(map(len, drawn))
     if most < k:
