@@ -161,10 +161,11 @@ def _not_seen_as_ball(features: Features, evidence: Evidence, target: Target) ->
     expected = spread_expected(features, target)
     slack = max(_SPREAD_SIGMAS / sqrt(12.0 * max(evidence.n_on, 1)), _SPREAD_SLACK)
     shows_width = features.n_points >= _N_SHAPELY and evidence.n_before < _SCREENED * evidence.n_on
-    if evidence.n_through > 1.0 + _TOUCHING * min(evidence.n_aimed, 2 * evidence.n_on):
+    n_through = evidence.n_through + evidence.n_open
+    if n_through > 1.0 + _TOUCHING * min(evidence.n_aimed, 2 * evidence.n_on):
         return (
-            f"It lets beams through: {evidence.n_through} returns inside its outline lie behind "
-            f"it, where {evidence.n_on} lie on it."
+            f"It lets beams through: {n_through} pulses inside its outline end behind it or have "
+            f"no return, where {evidence.n_on} lie on it."
         )
     if evidence.n_before > 2.0 + _HIDDEN * evidence.n_on:
         return (

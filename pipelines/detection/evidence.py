@@ -19,23 +19,36 @@ from spheremark.pipelines.detection.cells import (
     direction_cells,
     rows_in,
 )
-from spheremark.pipelines.detection.pulses import clock_of, n_unheard_inside
-from spheremark.pipelines.detection.target import Target, blur_at, rays_of, seen_from, view_of
+from spheremark.pipelines.detection.pulses import (
+    WELL_INSIDE,
+    Hearing,
+    clock_of,
+    count_unheard,
+    hearing_of,
+)
+from spheremark.pipelines.detection.target import (
+    Target,
+    blur_at,
+    is_beside_pole,
+    rays_of,
+    seen_from,
+    view_of,
+)
 from spheremark.pipelines.model import Array, Column, StitchedCloud
 from spheremark.pipelines.threads import side_by_side
 
 _STEP = 0.05  # [m] at most between the directions about a centre whose cells are searched
 _REACH = 4.0  # radii about a centre: shoulders lie within three radii below a head
-_POLE = 0.5  # radii: half the width of a pole
-_ASIDE = 1.9  # radii: anything farther to a side may be another object
 _HELD = (-4.0, 1.5)  # radii of depth within which a return may belong to the same object
 _ON = (-1.3, 0.3)  # radii of depth within which a return may lie on the sphere
 _PLACE = 0.1  # radii: beams nearer to each other than this pass at the same place
 _MEAN_WIDTH = 0.75  # of the greater half width of a beam: in any direction
-_WELL_INSIDE = 0.8  # radii: no beam that passes nearer misses a sphere
 _TINY = 1e-6
 _TOUCHING = 0.10  # share of the beams on a sphere that may end elsewhere: mixed pixels
 _OBSTRUCTED = 3.0  # ratio of beams below it that end nearer to those that go past
+_LOUD = 4.0  # times the weakest echoes of a scan: none is lost for weakness
+_LOST_MAX, _SIGMAS_LOST = 0.5, 3.0  # a scan that loses more shows no openings; chance
+_UNKNOWN = Hearing(lost=1.0, weakest=0.0)
 
 _Groups = tuple[NDArray[np.int64], NDArray[np.int32]]  # start of each group, and the members
 
@@ -57,7 +70,7 @@ class Evidence(NamedTuple):
     n_held : int
         Returns below it and beside the pole, at about its distance.
     n_past : int
-        Returns there that lie behind it.
+        Returns there that lie behind it, and pulses there without a return.
     n_short : int
         Returns there that end long before it.
     brightness : float
@@ -72,6 +85,8 @@ class Evidence(NamedTuple):
         How these beams pass the centre, as from ``passing`` [m].
     n_silent : int
         Pulses well inside the limb without a return; -1 where times or rings do not show them.
+    n_open : int
+        As many of them as the scan would not have lost on a surface that echoes as strongly.
     """
 
     n_on: int
@@ -86,6 +101,7 @@ class Evidence(NamedTuple):
     rows: NDArray[np.int32]
     seen: Array
     n_silent: int = -1
+    n_open: int = 0
 
     @property
     def is_open_below(self) -> bool:
@@ -120,6 +136,7 @@ def gather_evidence(
     if not len(centres):
         return []
     clock = clock_of(cloud)
+    hearing = hearing_of(cloud, clock, target.up) if clock is not None else _UNKNOWN
     reach = (_REACH + 0.5) * target.radius + 0.05
     starts, owners = _centres_by_direction(centres, _sides(centres, reach), target.up, reach)
     is_wanted, cones = starts[1:] > starts[:-1], _cones(centres, target)
@@ -138,13 +155,21 @@ def gather_evidence(
             fields = _count_beams(cloud.p_base, cloud.intensities, rows, centres[i], target)
             one = Evidence(*fields)
             if clock is not None:
-                reach = _WELL_INSIDE * target.radius
-                n_silent = n_unheard_inside(cloud, clock, rows, centres[i], reach)
-                one = one._replace(n_silent=n_silent)
+                inside, below = count_unheard(cloud, clock, rows, centres[i], target)
+                n_open = _n_open(inside, one, hearing, float(centres[i] @ centres[i]))
+                one = one._replace(n_silent=inside, n_open=n_open, n_past=one.n_past + below)
             found.append(one)
         return found
 
     return list(chain(*side_by_side(counted, len(centres), threaded_from=4)))
+
+
+def _n_open(n_silent: int, evidence: Evidence, hearing: Hearing, range2: float) -> int:
+    """Return how many silent pulses inside the limb show an opening."""
+    if hearing.lost > _LOST_MAX or evidence.brightness < _LOUD * hearing.weakest * range2:
+        return 0
+    expected = evidence.n_on * hearing.lost / (1.0 - hearing.lost)
+    return max(int(n_silent - expected - _SIGMAS_LOST * np.sqrt(expected)), 0)
 
 
 def _cones(centres: Array, target: Target) -> Array:
@@ -181,9 +206,8 @@ def _count_beams(
             light += share * intensities[rows[i]]
             lit += share * share
         n_before += is_aimed and depth <= _ON[0]
-        n_through += gap < _WELL_INSIDE and depth > 1.0
-        is_below = along < -0.3 and gap > 1.2 + blur and _POLE + blur < across < _ASIDE + blur
-        if is_below:
+        n_through += gap < WELL_INSIDE and depth > 1.0
+        if is_beside_pole(across, along, blur):
             n_past += depth > _HELD[1]
             n_short += depth < _HELD[0]
             n_held += _HELD[0] <= depth <= _HELD[1]

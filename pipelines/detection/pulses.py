@@ -12,10 +12,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from spheremark.pipelines.compilation import compiled
+from spheremark.pipelines.detection.target import Target, blur_at, is_beside_pole, view_of
 from spheremark.pipelines.model import RING_UNKNOWN, Array, Index, StitchedCloud
 from spheremark.pipelines.scan.rigs import FIRING_CYCLE, FIRING_ORDER, LASER_CYCLE, N_LASERS
 from spheremark.pipelines.scan.stitching import beams
 
+WELL_INSIDE = 0.8
+"""Radii: no beam that passes nearer misses a sphere."""
+
+_REACH = 3.0  # radii: the returns of beams that pass nearer are all known
 _DELAYS = np.argsort(FIRING_ORDER) * LASER_CYCLE  # [s] of each laser within its firing
 _PHASE_MAX = 3e-6  # [s] scatter of the firing clock: about one laser's share of a firing
 _KNOT = 0.002  # [s] between the returns that show spin and gimbal: far less than a revolution
@@ -23,6 +28,11 @@ _N_KNOTS = (500, 50_000)
 _OFF_MAX = 1e-3  # [rad] a third of a beam: median by which a pulse may be misplaced
 _SLOWEST, _FASTEST = 2.0, 200.0  # [rad/s] of a spin
 _MARGIN = 0.02  # [rad] beside a place where pulses are searched: what the gimbal turns meanwhile
+
+_EVERY, _N_SAMPLED = 0.0437, 4  # [s] between samples of so many firings: no part of a revolution
+_GROUND = (0.25, 0.55)  # sines of the angles below the horizon where the ground is near
+_N_SECTORS, _N_IN_SECTOR = 24, 20  # of azimuth, and pulses that show one
+_WEAKEST = 0.01  # share of the returns that are taken for the weakest
 
 
 class Clock(NamedTuple):
@@ -100,15 +110,74 @@ def clock_of(cloud: StitchedCloud) -> Clock | None:
     )
 
 
-def n_unheard_inside(
-    cloud: StitchedCloud, clock: Clock, rows: NDArray[np.int32], c: Array, radius: float
-) -> int:
-    """Return how many pulses pass a place within a radius and have no return."""
+def count_unheard(
+    cloud: StitchedCloud, clock: Clock, rows: NDArray[np.int32], c: Array, target: Target
+) -> tuple[int, int]:
+    """Return how many pulses have no return: well inside a sphere, and below it beside its pole.
+
+    ``rows`` are the returns about it.
+    """
     rows = rows[cloud.rings[rows] < N_LASERS]
     rings = cloud.rings[rows].astype(np.int64)
     seconds = cloud.times[rows.astype(np.intp)] - _DELAYS[rings] - clock.phase
     heard = np.sort(np.rint(seconds / FIRING_CYCLE).astype(np.int64) * N_LASERS + rings)
-    return int(_n_unheard(clock, _DELAYS, heard, c, radius))
+    inside, below = _count_unheard(clock, _DELAYS, heard, c, target)
+    return int(inside), int(below)
+
+
+class Hearing(NamedTuple):
+    """How well a scan hears its echoes.
+
+    Attributes
+    ----------
+    lost : float
+        Share of the pulses towards the ground nearby that have no return: the scan loses them
+        anyway. 1 where that is not known.
+    weakest : float
+        Reflectivity over squared range of the weakest returns [1/m^2].
+    """
+
+    lost: float
+    weakest: float
+
+
+def hearing_of(cloud: StitchedCloud, clock: Clock, up: Array) -> Hearing:
+    """Return how well a scan hears its echoes, by some of its firings."""
+    width = _N_SAMPLED * FIRING_CYCLE
+    times = cloud.times[:]
+    rows = np.flatnonzero((times % np.float32(_EVERY)) < width)
+    rows = rows[cloud.rings[rows] < N_LASERS]
+    rings = cloud.rings[rows].astype(np.int64)
+    numbers = np.rint((times[rows] - _DELAYS[rings] - clock.phase) / FIRING_CYCLE).astype(np.int64)
+    strengths = cloud.intensities[rows] / np.sum(cloud.p_base[rows] ** 2, axis=1)
+    firings = np.arange(numbers.min() + 1, numbers.max())
+    into = (clock.phase + firings * FIRING_CYCLE) % _EVERY
+    firings = firings[(into > 0.0) & (into < width - FIRING_CYCLE)]
+    lasers = np.arange(N_LASERS)
+    is_heard = np.isin(firings[:, None] * N_LASERS + lasers, numbers * N_LASERS + rings)
+    directions = _directions(clock, clock.phase + firings * FIRING_CYCLE)
+    steep = directions @ up
+    is_ground = (steep > -_GROUND[1]) & (steep < -_GROUND[0])
+    sectors = (np.arctan2(directions[..., 1], directions[..., 0]) * _N_SECTORS / 6.2832).astype(int)
+    shares = [
+        1.0 - is_heard[chosen].mean()
+        for chosen in (is_ground & (sectors == sector) for sector in np.unique(sectors))
+        if chosen.sum() >= _N_IN_SECTOR
+    ]  # by sectors, because the rover hides some of the ground
+    lost = float(np.median(shares)) if len(shares) > _N_SECTORS // 2 else 1.0
+    return Hearing(lost, float(np.quantile(strengths, _WEAKEST)))
+
+
+def _directions(clock: Clock, instants: Array) -> Array:
+    """Return the directions of all lasers at some instants in the base frame, (n, 16, 3)."""
+    azimuths = np.interp(instants, clock.times, clock.azimuths)[:, None]
+    angles = np.interp(instants, clock.times, clock.angles)[:, None]
+    c = np.cos(clock.elevations)
+    z = np.broadcast_to(np.sin(clock.elevations), (len(instants), N_LASERS))
+    v = np.stack([c * np.cos(azimuths), -c * np.sin(azimuths), z], axis=-1) @ clock.R.T
+    x = np.cos(angles) * v[..., 0] - np.sin(angles) * v[..., 1]
+    y = np.sin(angles) * v[..., 0] + np.cos(angles) * v[..., 1]
+    return np.stack([x, y, v[..., 2]], axis=-1)
 
 
 def _azimuths(cloud: StitchedCloud, rows: Index) -> Array:
@@ -140,15 +209,16 @@ def _at(times: Array, values: Array, t: float) -> float:
 
 
 @compiled
-def _n_unheard(  # noqa: PLR0915  one compiled loop
-    clock: Clock, delays: Array, heard: NDArray[np.int64], c: Array, reach: float
-) -> int:
-    """Return how many pulses within reach of a place were not heard.
+def _count_unheard(  # noqa: PLR0915  one compiled loop
+    clock: Clock, delays: Array, heard: NDArray[np.int64], c: Array, target: Target
+) -> tuple[int, int]:
+    """Return how many pulses inside a sphere, and below it beside its pole, were not heard.
 
     Once a revolution the plane of the lasers passes the place; about that instant each pulse is
     tried.
     """
-    n, R = 0, clock.R
+    n_inside, n_below, R, radius = 0, 0, clock.R, target.radius
+    view, blur, reach = view_of(c, target.up), blur_at(c, target) / radius, _REACH * radius
     distance = np.sqrt(c[0] ** 2 + c[1] ** 2 + c[2] ** 2)
     aside = np.sqrt(clock.origin[0] ** 2 + clock.origin[1] ** 2) + np.max(np.abs(clock.heights))
     wide = (reach + aside) / distance + _MARGIN
@@ -209,7 +279,11 @@ def _n_unheard(  # noqa: PLR0915  one compiled loop
                 p, q, u, v = cs * p - sn * q, sn * p + cs * q, cs * u - sn * v, sn * u + cs * v
                 along = (c[0] - p) * u + (c[1] - q) * v + (c[2] - r) * w
                 dx, dy, dz = p + along * u - c[0], q + along * v - c[1], r + along * w - c[2]
-                if along < 0.0 or dx * dx + dy * dy + dz * dz > reach * reach:
+                gap2 = (dx * dx + dy * dy + dz * dz) / (radius * radius)
+                if along < 0.0 or gap2 > _REACH * _REACH:
                     continue
-                n += 1
-    return n
+                across = (dx * view.across[0] + dy * view.across[1] + dz * view.across[2]) / radius
+                high = (dx * view.up[0] + dy * view.up[1] + dz * view.up[2]) / radius
+                n_inside += gap2 < WELL_INSIDE * WELL_INSIDE
+                n_below += is_beside_pole(across, high, blur)
+    return n_inside, n_below

@@ -13,6 +13,9 @@ from numpy.typing import NDArray
 from spheremark.pipelines.compilation import compiled
 from spheremark.pipelines.model import Array, Column
 
+_POLE = 0.5  # radii: half the width of a pole
+_ASIDE = 1.9  # radii: anything farther to a side may be another object
+
 
 class Target(NamedTuple):
     """The sphere that is searched for: radius [m], upward unit vector, beam divergence [rad]."""
@@ -26,6 +29,13 @@ class Target(NamedTuple):
 def blur_at(c: Array, target: Target) -> float:
     """Return half the width of a beam at a place."""
     return float(0.5 * target.divergence * np.sqrt(c[0] ** 2 + c[1] ** 2 + c[2] ** 2))
+
+
+@compiled
+def is_beside_pole(across: float, along: float, blur: float) -> bool:
+    """Return whether a beam passes a sphere below it and beside its pole; all in radii."""
+    is_out = across * across + along * along > (1.2 + blur) ** 2
+    return bool(is_out and along < -0.3 and _POLE + blur < abs(across) < _ASIDE + blur)
 
 
 class View(NamedTuple):

@@ -7,7 +7,8 @@ import pytest
 
 from spheremark.pipelines.config import ExtractionConfig, StitchingConfig
 from spheremark.pipelines.detection import extract
-from spheremark.pipelines.detection.pulses import clock_of, n_unheard_inside
+from spheremark.pipelines.detection.pulses import clock_of, count_unheard
+from spheremark.pipelines.detection.target import Target
 from spheremark.pipelines.geometry import inverse, transform
 from spheremark.pipelines.model import RING_UNKNOWN
 from spheremark.pipelines.scan.stitching import stitch
@@ -28,7 +29,8 @@ def scan():
 def n_silent(scan, place):
     cloud, _, field = scan
     rows = np.flatnonzero(np.linalg.norm(cloud.p_base - place, axis=1) < 0.5).astype(np.int32)
-    return n_unheard_inside(cloud, clock_of(cloud), rows, place, 0.8 * field.marker_radius)
+    target = Target(field.marker_radius, np.array([0.0, 0.0, 1.0]), 0.003)
+    return count_unheard(cloud, clock_of(cloud), rows, place, target)[0]
 
 
 def test_no_marker_is_refused_for_the_width_that_the_lines_show_and_nothing_else_is_found(scan):
