@@ -156,19 +156,22 @@ def gather_evidence(
             one = Evidence(*fields)
             if clock is not None:
                 inside, below = count_unheard(cloud, clock, rows, centres[i], target)
-                n_open = _n_open(inside, one, hearing, float(centres[i] @ centres[i]))
-                one = one._replace(n_silent=inside, n_open=n_open, n_past=one.n_past + below)
+                n_open = 0
+                if one.brightness > _LOUD * hearing.weakest * float(centres[i] @ centres[i]):
+                    n_open = _n_open(inside, one.n_on, hearing)
+                n_past = one.n_past + below
+                one = one._replace(n_silent=inside, n_open=n_open, n_past=n_past)
             found.append(one)
         return found
 
     return list(chain(*side_by_side(counted, len(centres), threaded_from=4)))
 
 
-def _n_open(n_silent: int, evidence: Evidence, hearing: Hearing, range2: float) -> int:
-    """Return how many silent pulses inside the limb show an opening."""
-    if hearing.lost > _LOST_MAX or evidence.brightness < _LOUD * hearing.weakest * range2:
+def _n_open(n_silent: int, n_on: int, hearing: Hearing) -> int:
+    """Return how many silent pulses inside the limb are more than a scan loses by chance."""
+    if hearing.lost > _LOST_MAX:
         return 0
-    expected = evidence.n_on * hearing.lost / (1.0 - hearing.lost)
+    expected = n_on * hearing.lost / (1.0 - hearing.lost)
     return max(int(n_silent - expected - _SIGMAS_LOST * np.sqrt(expected)), 0)
 
 

@@ -283,7 +283,7 @@ def _count_unheard(  # noqa: PLR0915  one compiled loop
                 if along < 0.0 or gap2 > _REACH * _REACH:
                     continue
                 across = (dx * view.across[0] + dy * view.across[1] + dz * view.across[2]) / radius
-                high = (dx * view.up[0] + dy * view.up[1] + dz * view.up[2]) / radius
+                upward = (dx * view.up[0] + dy * view.up[1] + dz * view.up[2]) / radius
                 n_inside += gap2 < WELL_INSIDE * WELL_INSIDE
-                n_below += is_beside_pole(across, high, blur)
+                n_below += is_beside_pole(across, upward, blur)
     return n_inside, n_below

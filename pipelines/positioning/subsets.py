@@ -255,13 +255,13 @@ def _by_pose(
     found = []
     for chosen in groups:
         cov, _ = invert_each(normal[chosen].sum(axis=1) + start_normal)
-        stacked = weighted[chosen].swapaxes(2, 3).reshape(len(chosen), -1, 6)
+        stacked = weighted[chosen].swapaxes(2, 3).reshape(len(chosen), 3 * chosen.shape[1], 6)
 
         def rhs(T: Array, chosen: Index = chosen, stacked: Array = stacked) -> Array:
             off = base[chosen] + (T[:, None, :3, 3] - goals[chosen]) @ T[:, :3, :3]
             tilt = (T[:, :2, :3] @ plumb) @ level
             up = (tilt[:, None] @ T[:, :2, :3])[:, 0] @ turn
-            return np.asarray(-(off.reshape(len(off), 1, -1) @ stacked)[:, 0] - up)
+            return np.asarray(-(off.reshape(len(off), 1, stacked.shape[1]) @ stacked)[:, 0] - up)
 
         def move(T: Array, xi: Array) -> Array:
             return np.asarray(T @ moved(np.tile(np.eye(4), (len(T), 1, 1)), xi))

@@ -76,7 +76,20 @@ class Weighed(NamedTuple):
 
 
 def classes_of(intensities: Array) -> tuple[Index, Array]:
-    """Return classes of reflectivity and prior noise of ranges."""
+    """Return classes of reflectivity and prior noise of ranges.
+
+    Parameters
+    ----------
+    intensities : (n,)
+        Calibrated reflectivity, 0-255.
+
+    Returns
+    -------
+    classes : (n,)
+        Class of each return.
+    sigmas : (n,)
+        Standard deviation of its range before any estimate [m].
+    """
     classes = np.searchsorted(_REFLECTIVITIES, intensities, side="right")
     return classes, _SIGMAS[classes]
 

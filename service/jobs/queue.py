@@ -282,7 +282,7 @@ class JobQueue:
         self._rank = max(self._rank, live.rank)
         if live.deadline is not None:
             live.deadline.cancel()
-        live.deadline = self._loop.call_later(
+        live.deadline = asyncio.get_running_loop().call_later(
             self._settings.job_seconds, lambda: self._keep(self._end_late(live))
         )
         live.job = await self._stored(self._catalogue.start_job, job_id)

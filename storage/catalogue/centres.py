@@ -11,7 +11,14 @@ import numpy as np
 import pyarrow as pa
 
 from spheremark.pipelines.geometry import levelling_rotation
-from spheremark.pipelines.model import Array, Levelling, MarkerFit, MarkerFits, Status
+from spheremark.pipelines.model import (
+    Array,
+    Levelling,
+    MarkerFit,
+    MarkerFits,
+    Optics,
+    Status,
+)
 from spheremark.storage.catalogue.rows import Row, places
 
 _COV = ("xx", "xy", "xz", "xy", "yy", "yz", "xz", "yz", "zz")
@@ -93,6 +100,21 @@ def _fit(row: Row, levelling: Levelling) -> MarkerFit:
         incidence=np.radians(_number(row["incidence_deg"])),
         variant=row["variant"] or "",
         sigma_range_shared=_number(row["sigma_range_shared_m"]),
+        optics=_optics(row["optics"]),
+        range_by_optics=np.array(row["range_by_optics_m"] or np.zeros(3)),
+    )
+
+
+def _optics(numbers: list[float] | None) -> Optics | None:
+    """Return what a scan shows of its beams."""
+    if numbers is None:
+        return None
+    estimates, weights, prior, profile = np.split(np.array(numbers), [3, 12, 15])
+    return Optics(
+        estimates=estimates,
+        weights=weights.reshape(3, 3),
+        sigmas_prior=prior,
+        sigmas_profile=profile,
     )
 
 

@@ -25,6 +25,7 @@ from spheremark.pipelines.model import (
     MarkerFit,
     MarkerFits,
     NoFix,
+    Optics,
     StationFix,
     StationQuality,
     StopResult,
@@ -220,8 +221,17 @@ def _fit_rows(fits: Sequence[MarkerFit], R: Array, sigma_heading: float) -> list
         row_of("marker_fits", fit)
         | named(_FIT_NUMBERS, row)
         | {"marker": fit.name, "range_m": fit.mean_range, "n_rejected": len(fit.rejected)}
+        | {"range_by_optics_m": fit.range_by_optics.tolist(), "optics": _optics(fit.optics)}
         for fit, row in zip(fits, numbers, strict=True)
     ]
+
+
+def _optics(optics: Optics | None) -> list[float] | None:
+    """Return what a scan shows of its beams, as the column of that name."""
+    if optics is None:
+        return None
+    parts = (optics.estimates, optics.weights, optics.sigmas_prior, optics.sigmas_profile)
+    return list(np.concatenate([part.ravel() for part in parts]).tolist())
 
 
 def _fix_row(fix: StationFix | NoFix) -> Row:

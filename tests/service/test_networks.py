@@ -117,7 +117,7 @@ def test_without_control_the_shape_is_true(free, logs):
 
 
 def test_redundancies_add_up_to_the_degrees_of_freedom(tied):
-    rows = [*tied["observations"], *tied["gravity"], *tied["control"], tied["range_bias"]]
+    rows = [*tied["observations"], *tied["gravity"], *tied["control"], *tied["shared_unknowns"]]
     assert sum(row["redundancy"] or 0.0 for row in rows) == pytest.approx(tied["dof"], abs=1e-3)
 
 

@@ -46,6 +46,8 @@ def successes(openapi):
     for path, operations in openapi["paths"].items():
         for method, operation in operations.items():
             found = [r for status, r in operation["responses"].items() if status.startswith("2")]
+            if path.startswith("/api/v1/uploads"):
+                continue  # answers of tus are headers alone
             yield method, path, {k: v for r in found for k, v in r.get("content", {}).items()}
 
 

@@ -66,7 +66,7 @@ def test_centres_and_covariances_are_those_of_the_levelled_frame():
     for i, row in enumerate(rows(made_tables(), "marker_fits", fit_method="along_beam")):
         np.testing.assert_allclose(R.T @ place(row), fits[i].p_base, rtol=0, atol=1e-12)
         back = R.T @ covariance(row) @ R
-        cov_base = fits[i].cov_with_heading(stop().cloud.rig.sigma_heading)
+        cov_base = fits[i].cov_with_heading(stop().sigma_heading)
         np.testing.assert_allclose(back, cov_base, rtol=0, atol=1e-15)
         x, y, z = place(row)
         length = np.linalg.norm([x, y, z])
@@ -132,7 +132,7 @@ def test_the_sigma_of_a_centre_has_the_heading_at_its_distance():
         result.fits["along_beam"].fits,
         strict=True,
     ):
-        sideways = np.hypot(*fit.p_base[:2]) * result.cloud.rig.sigma_heading
+        sideways = np.hypot(*fit.p_base[:2]) * result.sigma_heading
         assert row["sigma_3d_m"] ** 2 == pytest.approx(np.trace(fit.cov_p_base) + sideways**2)
 
 

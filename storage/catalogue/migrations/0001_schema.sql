@@ -193,6 +193,8 @@ CREATE TABLE marker_fits (
     error_radial_m DOUBLE,  -- Estimate minus truth along the line of sight; positive is too far.
     error_3d_m DOUBLE,  -- Length of the error.
     sigma_range_shared_m DOUBLE,  -- Standard deviation of the range error that all centres of the stop share, part of their covariances; NULL where the method gives none.
+    range_by_optics_m DOUBLE[],  -- Change of the range to the centre with each unknown of the optics: divergence, width at the window, echo weight.
+    optics DOUBLE[],  -- What the scan shows of these three: estimates, then the inverse of their covariance (nine), then sigmas before any scan, then those of the profile; NULL where the method gives none.
     PRIMARY KEY (run_id, stop, fit_method, marker)
 );
 

@@ -9,6 +9,7 @@ import pytest
 from spheremark.pipelines.config import ExtractionConfig, StitchingConfig
 from spheremark.pipelines.detection import extract
 from spheremark.pipelines.evaluation.detection import CLASSES, DETECTION_PLAN, extraction
+from spheremark.pipelines.model import RING_UNKNOWN
 from spheremark.pipelines.scan.stitching import choose_rig, stitch
 from spheremark.pipelines.simulation import SimulationConfig, simulate_stop
 from spheremark.pipelines.simulation.lane import range_lane
@@ -53,7 +54,7 @@ def test_a_marker_half_of_which_is_hidden_is_found(few):
     place = ring_of_markers(n=5)[0]
     side = np.cross([0.0, 0.0, 1.0], place)
     hidden = (few.p_base @ side > 0.0) & (few.p_base @ place > 0.8 * place @ place)
-    half = replace(few, **{name: getattr(few, name)[~hidden] for name in COLUMNS})
+    half = replace(few, p_base=np.where(hidden[:, None], 0.5, 1.0).astype(np.float32) * few.p_base)
     assert near(rough(extract(half, ExtractionConfig(), RADIUS)))[0]
 
 
@@ -71,11 +72,9 @@ def test_a_marker_at_the_edge_of_a_partial_turn_is_found_if_half_of_it_is_seen(
 ):
     place = ring_of_markers(n=5)[0]
     seen = aside(few, place) <= seen_to
-    found = extract(
-        replace(few, **{name: getattr(few, name)[seen] for name in COLUMNS}),
-        ExtractionConfig(),
-        RADIUS,
-    )
+    part = {name: getattr(few, name)[seen] for name in COLUMNS}
+    part["rings"] = np.full(seen.sum(), RING_UNKNOWN, np.uint8)  # no pulse beyond the edge
+    found = extract(replace(few, **part), ExtractionConfig(), RADIUS)
     assert near(rough(found))[0] == is_found
     refused = [r.reason for r in found.rejected if np.linalg.norm(r.p_base - place) < 2 * RADIUS]
     assert bool(refused) != is_found
@@ -125,7 +124,8 @@ def test_what_nothing_shows_a_pole_of_must_be_painted_as_the_markers(few, dimmed
     is_below = height < place[2] / np.linalg.norm(place)
     left = own | ~(is_below & (np.abs(aside(few, place)) < 4.0))  # against the sky
     painted = np.where(own, dimmed, 1.0) * few.intensities
-    cloud = replace(few, intensities=painted.astype(few.intensities.dtype))
+    unknown = np.full(len(few.rings), RING_UNKNOWN, np.uint8)  # nor do silent pulses show it
+    cloud = replace(few, intensities=painted.astype(few.intensities.dtype), rings=unknown)
     found = extract(
         replace(cloud, **{name: getattr(cloud, name)[left] for name in COLUMNS}),
         ExtractionConfig(),
