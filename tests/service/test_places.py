@@ -18,7 +18,7 @@ from spheremark.service.http.app import create_app
 from spheremark.service.http.places import Places
 from spheremark.service.settings import Settings
 
-SLOW = "SELECT count(*) FROM range(100000000) AS a, range(100000000) AS b WHERE a.range < b.range"
+SLOW = "SELECT sum(hash(i)) FROM range(1000000000000) AS t(i)"  # takes time, no memory
 MANY = [{"name": f"m{i}", "x_m": i % 20 - 10.0, "y_m": i // 20 - 10.0, "pole_height_m": 1.0}
         for i in range(400)]  # fmt: skip
 
