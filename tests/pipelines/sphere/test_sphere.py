@@ -201,8 +201,9 @@ def test_covariances_agree_with_errors_and_the_mean_is_not_biased():
 @pytest.mark.parametrize(
     ("distance", "sigma", "low", "high"),
     # the limb of this world is the same at every distance and without blur: what few returns add
-    # to a covariance, found where neither holds, is more than they need here
-    [(4, 0.01, 2.4, 3.6), (7.5, 0.02, 2.4, 3.6), (10, 0.01, 2.4, 3.6), (20, 0.02, 2.0, 4.5)],
+    # to a covariance, found where neither holds, is more than they need here; optics and scale of
+    # ranges, which are uncertain to a fit, have their nominal values, and that counts with distance
+    [(4, 0.01, 2.4, 3.6), (7.5, 0.02, 2.1, 3.6), (10, 0.01, 2.1, 3.6), (20, 0.02, 1.6, 4.5)],
 )
 def test_covariances_hold_at_every_distance(distance, sigma, low, high):
     rng = np.random.default_rng(12)
