@@ -29,7 +29,7 @@ _OFF_MAX = 1e-3  # [rad] a third of a beam: median by which a pulse may be mispl
 _SLOWEST, _FASTEST = 2.0, 200.0  # [rad/s] of a spin
 _MARGIN = 0.02  # [rad] beside a place where pulses are searched: what the gimbal turns meanwhile
 
-_EVERY, _N_SAMPLED = 0.0437, 4  # [s] between samples of so many firings: no part of a revolution
+_N_SAMPLES, _N_SAMPLE = 300, 100  # samples of so many returns that follow each other
 _GROUND = (0.25, 0.55)  # sines of the angles below the horizon where the ground is near
 _N_SECTORS, _N_IN_SECTOR = 24, 20  # of azimuth, and pulses that show one
 _WEAKEST = 0.01  # share of the returns that are taken for the weakest
@@ -143,16 +143,15 @@ class Hearing(NamedTuple):
 
 def hearing_of(cloud: StitchedCloud, clock: Clock, up: Array) -> Hearing:
     """Return how well a scan hears its echoes, by some of its firings."""
-    width = _N_SAMPLED * FIRING_CYCLE
-    times = cloud.times[:]
-    rows = np.flatnonzero((times % np.float32(_EVERY)) < width)
-    rows = rows[cloud.rings[rows] < N_LASERS]
-    rings = cloud.rings[rows].astype(np.int64)
-    numbers = np.rint((times[rows] - _DELAYS[rings] - clock.phase) / FIRING_CYCLE).astype(np.int64)
+    starts = np.linspace(0, max(len(cloud.p_base) - _N_SAMPLE, 0), _N_SAMPLES).astype(np.intp)
+    rows = np.minimum((starts[:, None] + np.arange(_N_SAMPLE)).ravel(), len(cloud.p_base) - 1)
+    rings = np.minimum(cloud.rings[rows], N_LASERS - 1).astype(np.int64)
+    seconds = cloud.times[rows] - _DELAYS[rings] - clock.phase
+    numbers = np.rint(seconds / FIRING_CYCLE).astype(np.int64)
     strengths = cloud.intensities[rows] / np.sum(cloud.p_base[rows] ** 2, axis=1)
-    firings = np.arange(numbers.min() + 1, numbers.max())
-    into = (clock.phase + firings * FIRING_CYCLE) % _EVERY
-    firings = firings[(into > 0.0) & (into < width - FIRING_CYCLE)]
+    whole = numbers.reshape(_N_SAMPLES, -1)  # firings between the first and the last of a sample
+    ends = zip(whole.min(axis=1) + 1, whole.max(axis=1), strict=True)
+    firings = np.unique(np.concatenate([np.arange(i, min(j, i + _N_SAMPLE)) for i, j in ends]))
     lasers = np.arange(N_LASERS)
     is_heard = np.isin(firings[:, None] * N_LASERS + lasers, numbers * N_LASERS + rings)
     directions = _directions(clock, clock.phase + firings * FIRING_CYCLE)
