@@ -30,7 +30,6 @@ from spheremark.pipelines.detection.decision import (
     reason_by_features,
     reason_by_hypotheses,
     reference_of,
-    score,
     spread_expected,
     with_reference_scatter,
 )
@@ -99,7 +98,7 @@ def extract(
     reasons = [reason or next(following) for reason in reasons]
     rejected = [one for one in zip(groups, reasons, strict=True) if one[1]]
     return MarkerCandidates(
-        candidates=_candidates(found, target, config),
+        candidates=_candidates(found, target),
         rejected=tuple(
             Rejection(p_base=features.p_base, n_points=features.n_points, reason=reason)
             for features, reason in rejected[:_REJECTIONS_MAX]
@@ -151,9 +150,7 @@ def _reason_by_shape(features: Features, evidence: Evidence, target: Target, noi
     return reason_by_hypotheses(compare_hypotheses(features, evidence.seen, spread, target, noise))
 
 
-def _candidates(
-    found: list[_Group], target: Target, config: ExtractionConfig
-) -> tuple[MarkerCandidate, ...]:
+def _candidates(found: list[_Group], target: Target) -> tuple[MarkerCandidate, ...]:
     """Return candidates M01, M02 ... by azimuth."""
     ordered = sorted(found, key=lambda group: np.arctan2(group[0].y, group[0].x))
     return tuple(
@@ -161,7 +158,6 @@ def _candidates(
             name=marker_name(place),
             members=_members(features, evidence, target),
             p_base_rough=features.p_base,
-            score=score(features, config, target),
         )
         for place, (features, evidence) in enumerate(ordered)
     )

@@ -339,16 +339,3 @@ def is_resolved(features: Features, target: Target) -> bool:
 def _may_be_hidden(features: Features, target: Target) -> bool:
     """Return whether the shape is so clear that the lower half may be hidden."""
     return features.n_points >= _N_SURE and features.sigma_radius < _SHAPE_SURE * target.radius
-
-
-def score(features: Features, config: ExtractionConfig, target: Target) -> float:
-    """Return the margin to the limits of the tests, 0 to 1."""
-    few = np.inf if is_resolved(features, target) else 1.0 + _TOUCHING * features.n_points
-    used = (
-        features.n_beside / few,
-        features.n_below / few,
-        features.n_unexplained / (_UNEXPLAINED * (features.n_points + features.n_unexplained)),
-        features.scatter / config.scatter_max,
-        abs(features.radius_free - target.radius) / _radius_slack(features, target),
-    )
-    return max(1.0 - sum(share**2 for share in used) / len(used), 0.0)

@@ -31,7 +31,6 @@ from spheremark.pipelines.geometry import inverse, transform
 from spheremark.pipelines.model import (
     Array,
     Index,
-    MarkerCandidates,
     MarkerFits,
     Rig,
     StitchedCloud,
@@ -168,7 +167,7 @@ def _score(seed: int, *, peers: Peers | None) -> Score:
         seen = [Seen(_class_of(scan, i), (), error.code, None) for i in range(n_marks)]
         return Score(seed, field.family, seen, [], decoys, None, str(error), 0.0)
     places = _places(scan, cloud, rows)
-    calls, matched = _calls(scan, found, fits, places)
+    calls, matched = _calls(scan, fits, places)
     if peers:
         by_name = peers.find(cloud.p_base.astype(np.float64), field.marker_radius)
         for name, centres in by_name.items():
@@ -244,32 +243,17 @@ def _matched(scan: Scan, places: Array, found: Sequence[tuple[str, float, Array]
     return calls
 
 
-def _calls(
-    scan: Scan, found: MarkerCandidates, fits: MarkerFits, places: Array
-) -> tuple[list[Call], list[int]]:
+def _calls(scan: Scan, fits: MarkerFits, places: Array) -> tuple[list[Call], list[int]]:
     """Return our markers, sure ones first, and the mark of each fit."""
-    scores = {one.name: _score_of(one) for one in found.candidates}
-    fitted = [(fit.status.value, scores[fit.name], fit.p_base) for fit in fits.fits]
+    fitted = [(fit.status.value, fit.probability, fit.p_base) for fit in fits.fits]
     order = sorted(range(len(fitted)), key=lambda i: (fitted[i][0], -fitted[i][1]))
     ours = [fitted[i] for i in order]
-    possible: Any = getattr(fits, "possible", getattr(found, "possible", ()))
-    ours += [("possible", _score_of(one), _place_of(one)) for one in possible]
+    ours += [("possible", one.probability, one.p_base) for one in fits.possible]
     calls = _matched(scan, places, ours)
     marks = [-1] * len(fits.fits)
     for i, call in zip(order, calls, strict=False):
         marks[i] = call.mark
     return calls, marks
-
-
-def _score_of(one: Any) -> float:
-    """Return the probability that something is a marker, or its score where it has none."""
-    probability = float(getattr(one, "probability", np.nan))
-    return probability if np.isfinite(probability) else float(getattr(one, "score", 0.0))
-
-
-def _place_of(possible: Any) -> Array:
-    """Return the place of a possible marker."""
-    return np.asarray(getattr(possible, "p_base_rough", getattr(possible, "p_base", None)))
 
 
 def _centres(scan: Scan, fits: MarkerFits, marks: Sequence[int]) -> dict[int, Centre]:

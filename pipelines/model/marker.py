@@ -27,7 +27,8 @@ class MarkerCandidate:
     # it
     members: Index
     p_base_rough: Array  # (3,) rough centre, good to a few centimetres [m]
-    score: float  # 0 (hardly a sphere) to 1 (all tests passed with ease)
+    probability: float = np.nan  # posterior probability that it is a marker; NaN when not computed
+    hypothesis: str = ""  # the most likely other hypothesis with the odds, as words
 
     def __post_init__(self) -> None:
         seal(self, members=(None,), p_base_rough=(3,))
@@ -56,6 +57,7 @@ class Rejection:
     p_base: Array  # (3,) where it is [m]
     n_points: int  # number of its returns
     reason: str  # why it was rejected, as a sentence
+    probability: float = np.nan  # posterior probability that it is a marker; NaN when not computed
 
     def __post_init__(self) -> None:
         seal(self, p_base=(3,))
@@ -63,14 +65,16 @@ class Rejection:
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class MarkerCandidates:
-    """The groups of one stitched cloud that may be markers, and those that were rejected."""
+    """The markers of one stitched cloud, possible ones, and groups that were rejected."""
 
-    candidates: tuple[MarkerCandidate, ...]  # groups that may be markers
+    candidates: tuple[MarkerCandidate, ...]  # groups that are markers
     # groups that passed the first test, with the reason against them
     rejected: tuple[Rejection, ...]
     # height of the highest ground point near the station in the levelled frame, the level of the
     # published method's cut [m]; minus infinity when no ground was seen
     ground_height_max: float
+    # groups too probable to be rejected, not probable enough to be markers: they enter nothing
+    possible: tuple[Rejection, ...] = ()
 
 
 OPTICS = ("beam_width", "beam_window", "echo_cosine")
@@ -156,6 +160,10 @@ class MarkerFit:
         What the scan of this centre shows of its beams, the same for all of its centres.
     range_by_optics : (3,)
         By how much this centre is too far where each number of ``optics`` is too small [m].
+    probability : float
+        Posterior probability that it is a marker; NaN when not computed.
+    hypothesis : str
+        The most likely other hypothesis with the odds, as words; empty likewise.
     """
 
     name: str
@@ -180,6 +188,8 @@ class MarkerFit:
     sigma_range_shared: float = np.nan
     optics: Optics | None = None
     range_by_optics: Array = field(default_factory=lambda: np.zeros(3))
+    probability: float = np.nan
+    hypothesis: str = ""
 
     def __post_init__(self) -> None:
         seal(
@@ -225,9 +235,12 @@ class MarkerFits:
         Groups that this method or the detection rejected.
     levelling : Levelling
         How the base leans.
+    possible : tuple of Rejection
+        Groups too probable to be rejected, not probable enough to be markers: they enter nothing.
     """
 
     method: str
     fits: tuple[MarkerFit, ...]
     rejected: tuple[Rejection, ...]
     levelling: Levelling
+    possible: tuple[Rejection, ...] = ()

@@ -24,7 +24,7 @@ from dataclasses import replace
 
 from spheremark.pipelines.config import FittingConfig
 from spheremark.pipelines.errors import ConfigError
-from spheremark.pipelines.model import MarkerCandidates, MarkerFits, StitchedCloud
+from spheremark.pipelines.model import MarkerCandidates, MarkerFit, MarkerFits, StitchedCloud
 from spheremark.pipelines.sphere.description import Fits
 from spheremark.pipelines.sphere.methods import along_beam, astm, paper, silhouette
 from spheremark.pipelines.sphere.methods import free_radius as free
@@ -80,7 +80,14 @@ def fit_markers(
     sigma_heading = found.heading_factor * levelling.sigma_heading
     return MarkerFits(
         method=method,
-        fits=found.fits,
+        fits=tuple(_judged(fit, candidates) for fit in found.fits),
         rejected=candidates.rejected + found.rejected,
         levelling=replace(levelling, sigma_heading=sigma_heading),
+        possible=candidates.possible,
     )
+
+
+def _judged(fit: MarkerFit, candidates: MarkerCandidates) -> MarkerFit:
+    """Return a fit with the probability of its candidate."""
+    one = next(one for one in candidates.candidates if one.name == fit.name)
+    return replace(fit, probability=one.probability, hypothesis=one.hypothesis)

@@ -116,6 +116,13 @@ def print_log(out: Console, result: Plain) -> None:
             print_tables(out, [Table(title=title, columns=columns, rows=own, notes=notes)])
         for note in stop["scan"]["notes"]:
             _say(out, f"  {note}")
+        for one in stop["possible"]:
+            place = ", ".join(f"{x:.2f}" for x in one["centre_m"])
+            _say(
+                out,
+                f"  Possible marker at ({place}) m, {one['n_points']} returns, not used: "
+                f"{one['reason']}",
+            )
         if stop["rejected"]:
             _say(out, f"  {len(stop['rejected'])} groups of returns were refused (see --json).")
         if not stop["stations"]:

@@ -52,6 +52,8 @@ class Marker(_Declared):
     radius_free_m: float | None
     sigma_radius_free_m: float | None
     mean_intensity: float | None
+    probability: float | None = None
+    hypothesis: str = ""
     true_mark: str | None = None
     error_3d_m: float | None = None
 
@@ -62,6 +64,7 @@ class Rejected(_Declared):
     centre_m: Vector
     reason: str
     n_points: int
+    probability: float | None = None
 
 
 class Match(_Declared):
@@ -181,6 +184,7 @@ class Stop(_Declared):
     frame: Literal["station", "base"]
     markers: list[Marker]
     rejected: list[Rejected]
+    possible: list[Rejected] = []
     station: Station | None
     stations: list[Station | NoStation]
     distances: Distances | None

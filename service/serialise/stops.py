@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable
+from itertools import chain
 from typing import Literal
 
 import numpy as np
@@ -21,6 +22,7 @@ from spheremark.pipelines.model import (
     MarkerFits,
     NoFix,
     Omissions,
+    Rejection,
     Rig,
     StationFix,
     StopResult,
@@ -56,7 +58,8 @@ def serialise_spheres(fits: MarkerFits) -> Plain:
     R = np.eye(3)
     return {
         "spheres": [_marker(fit, R, 0.0) for fit in fits.fits],
-        "rejected": _rejected([fits], R),
+        "rejected": _groups(fits.rejected, R),
+        "possible": _groups(fits.possible, R),
     }
 
 
@@ -79,7 +82,12 @@ def _stop(log: ProcessedLog, stop: StopResult, frame: Frame, truth: Truth | None
         "name": stop.name,
         "frame": frame,
         "markers": markers,
-        "rejected": _rejected(stop.fits.values(), R_frame_base),
+        "rejected": _groups(
+            chain.from_iterable(fits.rejected for fits in stop.fits.values()), R_frame_base
+        ),
+        "possible": _groups(
+            chain.from_iterable(fits.possible for fits in stop.fits.values()), R_frame_base
+        ),
         "station": first if "position_m" in first else None,
         "stations": stations,
         "distances": _distances(stop, log.marks),
@@ -130,21 +138,23 @@ def _marker(fit: MarkerFit, R_frame_base: Array, sigma_heading: float) -> Plain:
         "radius_free_m": number(fit.radius_free),
         "sigma_radius_free_m": number(fit.sigma_radius_free),
         "mean_intensity": number(fit.mean_intensity),
+        "probability": number(fit.probability),
+        "hypothesis": fit.hypothesis,
     }
 
 
-def _rejected(found: Iterable[MarkerFits], R_frame_base: Array) -> list[Plain]:
-    """Return the rejected groups of returns, each once."""
+def _groups(found: Iterable[Rejection], R_frame_base: Array) -> list[Plain]:
+    """Return groups of returns that are not used as markers, each once."""
     groups: dict[tuple[object, ...], Plain] = {}
-    for fits in found:
-        for rejection in fits.rejected:
-            centre = numbers(R_frame_base @ rejection.p_base)
-            group = {
-                "centre_m": centre,
-                "reason": rejection.reason,
-                "n_points": rejection.n_points,
-            }
-            groups.setdefault((*centre, rejection.reason), group)
+    for one in found:
+        centre = numbers(R_frame_base @ one.p_base)
+        group = {
+            "centre_m": centre,
+            "reason": one.reason,
+            "n_points": one.n_points,
+            "probability": number(one.probability),
+        }
+        groups.setdefault((*centre, one.reason), group)
     return list(groups.values())
 
 

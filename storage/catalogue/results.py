@@ -179,8 +179,12 @@ def _stop_rows(
         for i, row in enumerate(_fit_rows(found.fits, R, sigma_heading)):
             rows["marker_fits"].append(label | {"mark": matched.get(i)} | row)
         rows["rejections"] += [
-            label | named(PLACE, R @ r.p_base) | {"n_points": r.n_points, "reason": r.reason}
-            for r in found.rejected
+            label
+            | row_of("rejections", one)
+            | named(PLACE, R @ one.p_base)
+            | {"is_possible": may_be}
+            for groups, may_be in ((found.possible, True), (found.rejected, False))
+            for one in groups
         ]
     for (fit_method, method), fix in stop.fixes.items():
         label = {"fit_method": fit_method, "resection_method": method}

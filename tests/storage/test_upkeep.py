@@ -55,7 +55,9 @@ def test_each_fault_is_named(catalogue, data):
     (data / "clouds" / "left.parquet").write_bytes(b"x")
     data.chmod(0o755)
     with catalogue.writing() as cursor:
-        cursor.execute("INSERT INTO rejections VALUES ('no run', 's', 'm', 0, 0, 0, 1, 'r')")
+        cursor.execute(
+            "INSERT INTO rejections VALUES ('no run', 's', 'm', 0, 0, 0, 1, 'r', 0, false)"
+        )
     assert kinds(catalogue, data) == [
         "clouds.without_row", "permissions", "recordings.damaged", "recordings.damaged",
         "recordings.missing", "recordings.without_row", "rows.lost",

@@ -35,13 +35,17 @@ def stop_page(
     """
     place = more["stops"].index(stop["stop"])
     names = ("", *more["stops"], "")
+    groups = plain_rows(tables["rejections"])
     return render(
         "stop.html",
         frame=frame,
         survey=frame.survey,
         stop=stop,
         markers=plain_rows(tables["fits"]),
-        rejected=plain_rows(tables["rejections"]),
+        **{
+            name: [row for row in groups if row["is_possible"] == (name == "possible")]
+            for name in ("possible", "rejected")
+        },
         used=plain_rows(tables["observations"]),
         panels=_panels(tables, scan, more["marker"], more["tolerance_m"]),
         fix=next((fix for fix in more["fixes"] if fix["fit_method"] == more["method"]), None),

@@ -195,10 +195,12 @@ CREATE TABLE marker_fits (
     sigma_range_shared_m DOUBLE,  -- Standard deviation of the range error that all centres of the stop share, part of their covariances; NULL where the method gives none.
     range_by_optics_m DOUBLE[],  -- Change of the range to the centre with each unknown of the optics: divergence, width at the window, echo weight.
     optics DOUBLE[],  -- What the scan shows of these three: estimates, then the inverse of their covariance (nine), then sigmas before any scan, then those of the profile; NULL where the method gives none.
+    probability DOUBLE,  -- Posterior probability that it is a marker.
+    hypothesis VARCHAR NOT NULL,  -- The most likely other hypothesis, with its odds.
     PRIMARY KEY (run_id, stop, fit_method, marker)
 );
 
--- Candidates that are no markers, with the reason.
+-- Possible markers, which enter nothing, and candidates that are no markers, with the reason.
 CREATE TABLE rejections (
     run_id VARCHAR NOT NULL,
     stop VARCHAR NOT NULL,
@@ -207,7 +209,9 @@ CREATE TABLE rejections (
     y_m DOUBLE NOT NULL,  -- Position in the station frame.
     z_m DOUBLE NOT NULL,  -- Position in the station frame.
     n_points INTEGER NOT NULL,  -- Number of its returns.
-    reason VARCHAR NOT NULL  -- Reason of the rejection, as a sentence.
+    reason VARCHAR NOT NULL,  -- Reason of the rejection, as a sentence.
+    probability DOUBLE,  -- Posterior probability that it is a marker; NULL where it was not computed.
+    is_possible BOOLEAN NOT NULL  -- Whether it may be a marker: too probable to be refused, not probable enough to be used.
 );
 
 -- Station poses in the site frame, one row per stop, fitting and resection method; status is ok, weak or failed.

@@ -32,7 +32,6 @@ def scans(optics):
                 name=marker_name(k),
                 members=np.flatnonzero(np.linalg.norm(cloud.p_base - p, axis=1) < 0.16),
                 p_base_rough=p + 0.01 * rng.standard_normal(3),
-                score=1.0,
             )
             for k, p in enumerate(true)
         )

@@ -25,7 +25,7 @@ def lane():
         np.flatnonzero(np.linalg.norm(cloud.p_base - centre, axis=1) < 0.17) for centre in centres
     ]
     candidates = tuple(
-        MarkerCandidate(name="", members=rows, p_base_rough=centre, score=1.0)
+        MarkerCandidate(name="", members=rows, p_base_rough=centre)
         for rows, centre in zip(members, centres, strict=True)
     )
     return cloud, candidates

@@ -54,9 +54,7 @@ RAY = replace(RIG, divergence=np.zeros(2))
 def found(*groups, ground=-10.0):
     """Candidates from (members, rough centre) pairs."""
     candidates = tuple(
-        MarkerCandidate(
-            name=marker_name(i), members=np.array(rows), p_base_rough=np.array(p), score=1.0
-        )
+        MarkerCandidate(name=marker_name(i), members=np.array(rows), p_base_rough=np.array(p))
         for i, (rows, p) in enumerate(groups)
     )
     return MarkerCandidates(candidates=candidates, rejected=(), ground_height_max=ground)
