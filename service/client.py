@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 import warnings
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from types import TracebackType
 from typing import TYPE_CHECKING, Any, ClassVar, Self
@@ -81,20 +81,28 @@ class Client:
         self._http.close()
 
     def upload(
-        self, log: str | Path, *, survey: str, name: str = "", process: bool = True
+        self,
+        log: str | Path,
+        *,
+        survey: str,
+        name: str = "",
+        process: bool = True,
+        reading: Mapping[str, Any] | None = None,
     ) -> dict[str, Any]:
         """Upload a log to a survey, which is made if it is missing, and start its job.
 
         Parameters
         ----------
         log : str or Path
-            The file; it is streamed.
+            The file, or a folder of the files of one log; they are streamed.
         survey : str
             Name of the survey.
         name : str
             Name of the log; that of the file by default.
         process : bool
             Whether to start a job at once.
+        reading : mapping, optional
+            How to read it, such as ``{"joint": "pan", "joint_unit": "deg"}``.
 
         Returns
         -------
@@ -109,13 +117,22 @@ class Client:
             If there is no such file.
         """
         path = Path(log)
-        if not path.is_file():
+        files = sorted(one for one in path.iterdir() if one.is_file()) if path.is_dir() else [path]
+        if not files or not all(one.is_file() for one in files):
             raise InputError(f"There is no log {path}.")
         self._ensure_survey(survey)
         query = {"name": name or path.stem, "survey": survey, "process": str(process).lower()}
-        with path.open("rb") as file:
+        query |= {key: _query_text(value) for key, value in (reading or {}).items()}
+        with ExitStack() as stack:
+            opened = [(one.name, stack.enter_context(one.open("rb"))) for one in files]
+            if path.is_dir():
+                parts = [("file", one) for one in opened]
+                return self.request("POST", "/recordings", params=query, files=parts)
             return self.request(
-                "POST", "/recordings", params=query, content=file, headers={"Content-Type": _MCAP}
+                *("POST", "/recordings"),
+                params=query,
+                content=opened[0][1],
+                headers={"Content-Type": _MCAP},
             )
 
     def set_control(self, survey: str, marks: str | Path) -> dict[str, Any]:
@@ -346,6 +363,11 @@ def checked(response: httpx.Response) -> httpx.Response:
         is_problem = "json" in response.headers.get("content-type", "")
         raise RemoteError(response.json()["detail"] if is_problem else response.reason_phrase)
     return response
+
+
+def _query_text(value: Any) -> Any:
+    """Return a value as a query has it."""
+    return str(value).lower() if isinstance(value, bool) else value
 
 
 def _text(value: str) -> str:

@@ -17,6 +17,18 @@ _THIN = 1e-9  # of the tolerance; a thinner ellipsoid is flat
 def probability_within(covs: Array, tolerance: float) -> Array:
     """Return how probable it is that errors are no longer than a tolerance.
 
+    Parameters
+    ----------
+    covs : (n, 3, 3)
+        Covariances of the errors [m^2].
+    tolerance : float
+        The length [m].
+
+    Returns
+    -------
+    (n,)
+        Probabilities; 0 where a covariance is not known.
+
     Notes
     -----
     The distribution of a quadratic form with unequal axes (Imhof, 1961; Ruben, 1962), here by

@@ -18,7 +18,7 @@ import secrets
 import tempfile
 import time
 from collections.abc import AsyncIterator, Callable, Mapping
-from contextlib import asynccontextmanager, contextmanager
+from contextlib import asynccontextmanager, closing, contextmanager
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import IO, Any, ClassVar
@@ -35,6 +35,7 @@ from spheremark.service.errors import (
     RefusedRecordingError,
     TooLargeError,
 )
+from spheremark.service.http.folders import FORM, FolderWriter
 from spheremark.storage.catalogue.catalogue import Catalogue
 from spheremark.storage.catalogue.records import RecordingRecord
 from spheremark.storage.files import require_free, sync_folder, unwritten
@@ -84,10 +85,16 @@ class Inbox:
     async def receive(
         self, chunks: AsyncIterator[bytes], max_bytes: int, headers: Mapping[str, str]
     ) -> Received:
-        """Keep a log under its digest; the same bytes twice are one file."""
+        """Keep a log under its digest; the same bytes twice are one file.
+
+        The files of a body of several (multipart/form-data) are one log, kept as a zip.
+        """
         self.require_room(int(headers.get("content-length", "0")))
-        async with self.received(chunks, max_bytes) as part:
-            _check_digest(part.digest, headers)
+        form = headers.get("content-type", "")
+        form = form if form.startswith(FORM) else ""
+        async with self.received(chunks, max_bytes, form) as part:
+            if not form:
+                _check_digest(part.digest, headers)
             return replace(part, path=await asyncio.to_thread(self.keep, part, LOG))
 
     def require_room(self, n_bytes: int) -> None:
@@ -96,15 +103,26 @@ class Inbox:
 
     @asynccontextmanager
     async def received(
-        self, chunks: AsyncIterator[bytes], max_bytes: int
+        self, chunks: AsyncIterator[bytes], max_bytes: int, form: str = ""
     ) -> AsyncIterator[Received]:
-        """Have a body as a file without a name of its own, which is removed at the end."""
+        """Have a body as a file without a name of its own, which is removed at the end.
+
+        With the content type of a form, the file is a zip of the files in it.
+        """
         handle, name = tempfile.mkstemp(dir=self.partial)
         path = Path(name)
         sha = hashlib.sha256()
         try:
             with os.fdopen(handle, "wb") as file:
-                size = await self.write(chunks, file, max_bytes, sha.update)
+                if form:
+                    with closing(FolderWriter(form, file, sha.update)) as folder:
+                        size = await self._write(chunks, folder.feed, max_bytes)
+                        if size:
+                            await asyncio.to_thread(folder.finish)
+                    size = size and file.tell()
+                else:
+                    size = await self.write(chunks, file, max_bytes, sha.update)
+                file.flush()
                 await asyncio.to_thread(os.fsync, file.fileno())
             if size == 0:
                 raise EmptyBodyError("The body is empty; send the file itself as the body.")
@@ -128,15 +146,25 @@ class Inbox:
         seen: Callable[[bytes], None],
     ) -> int:
         """Write all chunks and return how many bytes they are; what was received stays."""
+
+        def add(data: bytes) -> None:
+            file.write(data)
+            file.flush()
+            seen(data)
+
+        return await self._write(chunks, add, max_bytes)
+
+    async def _write(
+        self, chunks: AsyncIterator[bytes], add: Callable[[bytes], None], max_bytes: int
+    ) -> int:
+        """Give all chunks to a function in a thread; return how many bytes they are."""
         block = bytearray()
         size = 0
 
         def put(data: bytearray) -> None:
             require_free(self.folder, self.min_free)
             with _translated(self.folder):
-                file.write(data)
-                file.flush()
-            seen(bytes(data))
+                add(bytes(data))
 
         try:
             async for chunk in chunks:

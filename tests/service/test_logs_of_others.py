@@ -9,6 +9,7 @@ import pytest
 from mcap.reader import make_reader
 from rosbags.rosbag2 import StoragePlugin, Writer
 
+from spheremark.service.client import Client
 from spheremark.storage.recordings import read_log, write_log
 from tests.service.test_commands import run
 from tests.storage.recorder import STORE
@@ -130,3 +131,34 @@ def test_diagnosis_names_the_option_that_mends_a_log(stop, tmp_path):
     assert "--joint-unit deg --joint-sign -1" in failed.stderr
     good = json.loads(run("inspect", stop.log, "--diagnose", "--json").stdout)
     assert "no other sign" in good["diagnosis"][0]
+
+
+def test_the_files_of_a_folder_are_uploaded_in_one_form_as_one_log(site, bag):
+    site.survey("folders")
+    query = {"name": "field", "survey": "folders", "process": True}
+    parts = [("file", (f"field/{one.name}", one.read_bytes())) for one in sorted(bag.iterdir())]
+    answer = site.client.post("/api/v1/recordings", params=query, files=parts)
+    assert answer.status_code == 201, answer.text
+    assert {one["topic"] for one in answer.json()["preflight"]["topics"]} >= {"/velodyne_points"}
+    job = site.ended(answer.json()["job"]["job_id"])
+    assert (job["status"], "good enough" in job["message"]) == ("successful", True)
+    again = Client(http=site.client).upload(bag, survey="folders", process=False)
+    assert again["recording_id"] == answer.json()["recording_id"]
+
+
+@pytest.mark.parametrize(
+    ("body", "kind", "words"),
+    [
+        (b"", "multipart/form-data; boundary=x", "empty"),
+        (b"--x\r\n\r\n", "multipart/form-data", "boundary"),
+        (b"--x--\r\n", "multipart/form-data; boundary=x", "no files"),
+        (b'--x\r\nContent-Disposition: form-data; name="a"; filename="a"\r\n\r\nA', None, "cut"),
+        (b"no boundary here", None, "well-formed"),
+    ],
+)
+def test_a_form_that_is_cut_or_has_no_files_is_refused_and_leaves_nothing(site, body, kind, words):
+    kind = kind or "multipart/form-data; boundary=x"
+    answer = site.client.post(
+        "/api/v1/recordings?name=a", content=body, headers={"Content-Type": kind}
+    )
+    assert (answer.status_code, words in answer.json()["detail"]) == (400, True), answer.text

@@ -14,6 +14,7 @@ from spheremark.service.errors import MediaTypeError, QuotaError, TooLargeError
 from spheremark.service.http.api.jobs import start
 from spheremark.service.http.api.models import Job, Listing, NewJob, Recording, Upload
 from spheremark.service.http.api.surveys import After, Limit
+from spheremark.service.http.folders import FORM
 from spheremark.service.http.state import Current, Service
 from spheremark.service.http.uploads import take_in
 from spheremark.service.jobs.handlers import Reading
@@ -32,6 +33,7 @@ _MEDIA_TYPES = (
     "application/vnd.sqlite3",
     "application/x-sqlite3",
     "application/vnd.tcpdump.pcap",
+    FORM,  # the files of a folder
 )
 _USED = "SELECT coalesce(sum(size_bytes), 0)::BIGINT AS used FROM recordings"
 _BODY = {
@@ -67,7 +69,8 @@ async def upload_recording(
 ) -> Upload:
     """Take in a log: the body is the file, streamed to disk; a refused log is kept as well.
 
-    MCAP, a part of rosbag2 (.db3), a ROS 1 bag, a PCAP, or a zip of these.
+    MCAP, a part of rosbag2 (.db3), a ROS 1 bag, a PCAP, or a zip of these; or a form with the files
+    of a folder, which are one log.
     """
     most, survey, options = service.settings.max_upload_bytes, query.survey, query.options()
     _check_upload(request, most)

@@ -2,19 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from datetime import UTC, datetime
 from time import perf_counter
 from typing import TYPE_CHECKING
 
 from spheremark.pipelines.errors import NoMarkersError
-from spheremark.pipelines.model import (
-    ControlMarks,
-    NoFix,
-    StationFix,
-    Status,
-    StopResult,
-)
+from spheremark.pipelines.model import StopResult
 from spheremark.pipelines.progress import Progress, part_of
 from spheremark.service.jobs.specification import JobResult, JobSpecification, Log
 from spheremark.service.provenance import code_version, forget_peak_memory, peak_memory
@@ -25,8 +18,11 @@ if TYPE_CHECKING:
 
 def handle(spec: JobSpecification, progress: Progress) -> JobResult:
     """Process the one log of a job."""
+    from spheremark.service.stop_decisions import decide
+
     stops, rows = process_log(spec, spec.logs[0], spec.result_id, progress)
-    return JobResult(tables=rows, message=summary(stops, spec.marks))
+    decisions = (decide(stop, spec.config, spec.marks) for stop in stops)
+    return JobResult(tables=rows, message=" ".join(one.text for one in decisions))
 
 
 def process_log(
@@ -66,40 +62,3 @@ def process_log(
         peak_memory_bytes=peak_memory(),
     )
     return stops, tables(run, stops, marks=spec.marks, clouds=clouds)
-
-
-def summary(stops: Sequence[StopResult], marks: ControlMarks | None) -> str:
-    """Return the results of a log in sentences: markers, station, contradictions with control."""
-    sentences = [_stop_summary(stop) for stop in stops]
-    if marks is not None:
-        sentences += [text for stop in stops if (text := _contradiction(stop, marks))]
-    return " ".join(sentences)
-
-
-def _stop_summary(stop: StopResult) -> str:
-    """Return the result of one stop by the first methods in a sentence."""
-    n_markers = len(next(iter(stop.fits.values())).fits)
-    text = f"{stop.name}: {n_markers} marker{'' if n_markers == 1 else 's'}"
-    if not stop.fixes:
-        return f"{text}; no control marks, so no position."
-    fix = next(iter(stop.fixes.values()))
-    if isinstance(fix, NoFix):
-        return f"{text}; no position: {fix.reason}"
-    sigma = (
-        f"{text}, {len(fix.matches)} of them on marks; station with a sigma of "
-        f"{1000 * fix.sigma_3d:.1f} mm (3-D)"
-    )
-    return f"{sigma}; weak: {fix.reason}" if fix.status is Status.WEAK else f"{sigma}."
-
-
-def _contradiction(stop: StopResult, marks: ControlMarks) -> str:
-    """Name the control marks that the distances in a scan contradict, if any."""
-    checks = stop.distances
-    is_fixed = any(isinstance(fix, StationFix) for fix in stop.fixes.values())
-    if checks is None or not checks.suspects or not is_fixed:
-        return ""
-    names = ", ".join(marks.names[mark] for mark in checks.suspects)
-    return (
-        f"{int(checks.is_off.sum())} of {len(checks.is_off)} distances between marks in "
-        f"{stop.name} are not those of the control: look at {names}."
-    )
