@@ -19,7 +19,7 @@ from starlette.types import ASGIApp
 from spheremark.pipelines.errors import InputError
 from spheremark.service.errors import Problem, UnauthorizedError
 from spheremark.service.http import api, errors, observation, security
-from spheremark.service.http.pages import frame, jobs, networks, plans, sites, surveys
+from spheremark.service.http.pages import accuracy, frame, jobs, networks, plans, sites, surveys
 from spheremark.service.http.state import Current, opened
 from spheremark.service.logs import event_level
 from spheremark.service.settings import Settings
@@ -86,6 +86,7 @@ def create_app(settings: Settings) -> FastAPI:
     app.include_router(api.router, prefix=ROOT)
     app.include_router(about)
     for page in (
+        accuracy,
         sites,
         surveys,
         jobs,

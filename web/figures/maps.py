@@ -17,7 +17,7 @@ from spheremark.web.figures.elements import (
 )
 
 _ELLIPSE_SHARE = 0.08  # the largest ellipse is drawn at most this large, as a share of the field
-_MARK = theme.Style("control mark", theme.MARK, "circle-cross-open")
+MARK_STYLE = theme.Style("control mark", theme.MARK, "circle-cross-open")
 NAMES = {"textposition": "top center", "textfont": {"size": 11, "color": theme.MUTED}}
 """How names stand beside points of a map."""
 
@@ -29,7 +29,7 @@ def site_map(marks: Columns, fixes: Columns, true_stops: Columns) -> go.Figure:
     named = {"mode": "markers+text", "text": texts(marks, "mark"), "cliponaxis": False} | NAMES
     hover = "<b>{text}</b><br>x {x:.3f} m<br>y {y:.3f} m<br>z {z_m:.3f} m"
     x, y = floats(marks, "x_m"), floats(marks, "y_m")
-    add_points(figure, x, y, _MARK, hover, marks, marker_size=10, **named)
+    add_points(figure, x, y, MARK_STYLE, hover, marks, marker_size=10, **named)
     for method, rows in by_method(fixes):
         _add_stations(figure, method, rows, factor, true_stops)
     make_map(figure, ", site")

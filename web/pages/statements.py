@@ -7,6 +7,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from spheremark.pipelines.error_model import (
     Bound,
@@ -63,7 +64,23 @@ class Statement:
         if self.model is None or term not in self.model.terms:
             return "\N{EN DASH}"
         power, sigma = self.model.exponent(term), self.model.sigma(term)
+        if sigma > abs(power):
+            return f"not determined (± {sigma:.2f})"
         return f"{signed(power)} ± {sigma:.2f}"
+
+
+def exponents(one: Statement) -> str:
+    """Return the powers of a model that its errors determine, as a sentence; the rest by name."""
+    if one.model is None:
+        return one.reason
+    known = [
+        f"{term} to the power {one.power(term)}"
+        for term in one.model.terms
+        if one.model.sigma(term) <= abs(one.model.exponent(term))
+    ]
+    rest = [term for term in one.model.terms if not any(text.startswith(term) for text in known)]
+    unknown = f"{' and '.join(rest)} not determined" if rest else ""
+    return "; ".join(part for part in (", ".join(known), unknown) if part)
 
 
 def statements(fits: Columns, tolerance_m: float, *, place: str = "") -> tuple[Statement, ...]:
@@ -79,7 +96,7 @@ def _statement(method: str, rows: Columns, tolerance_m: float, place: str) -> St
     sample = ErrorSample(
         ranges=floats(rows, "range_m").copy(),
         n_points=floats(rows, "n_points").copy(),
-        incidences=np.full(len(scans), np.nan),
+        incidences=_incidences(rows),
         errors_3d=floats(rows, "error_3d_m").copy(),
         scans=scans.astype(np.intp),
     )
@@ -95,6 +112,13 @@ def _statement(method: str, rows: Columns, tolerance_m: float, place: str) -> St
             method=method, place=place, model=None, p95=None, mean=None, reason=str(error)
         )
     return Statement(method=method, place=place, model=model, p95=found["p95"], mean=found["mean"])
+
+
+def _incidences(rows: Columns) -> NDArray[np.float64]:
+    """Return the incidences of rows [rad]; NaN where the table has none."""
+    if "incidence_deg" not in rows:
+        return np.full(len(rows["stop"]), np.nan)
+    return np.radians(floats(rows, "incidence_deg"))
 
 
 def distance_words(bound: Bound) -> str:

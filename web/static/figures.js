@@ -1,10 +1,11 @@
-// Draws each <div class="plot" data-figure="id"> from its JSON block, in the colours of the theme.
+// Draws each <div class="plot" data-figure>: from a JSON block of the page (its id), or from an
+// address (data-source). The ids of points are links: addresses, or filters that begin with "?".
 const CONFIG = {
   responsive: true,
   displaylogo: false,
-  modeBarButtonsToRemove: ["select2d", "lasso2d", "autoScale2d"],
-  toImageButtonOptions: { format: "svg" },
+  modeBarButtonsToRemove: ["select2d", "lasso2d", "autoScale2d", "toImage"],
 };
+const drawn = new Map(); // place -> {figure, links, stops}
 
 function coloured(value, styles) {
   if (typeof value === "string") {
@@ -34,22 +35,231 @@ function fitted(figure, place) {
   return layout;
 }
 
+function failed(place, text, kind = "failed") {
+  const note = document.createElement("p");
+  note.className = kind;
+  note.textContent = text;
+  place.replaceChildren(note);
+  place.dataset.drawn = "failed";
+}
+
 export async function draw(place, figure) {
   const styles = getComputedStyle(document.documentElement);
   const { data, layout } = coloured({ data: figure.data, layout: fitted(figure, place) }, styles);
   try {
     await Plotly.react(place, data, layout, CONFIG);
+    if (!drawn.has(place)) listen(place);
+    drawn.set(place, { figure, ...indexed(figure) });
     place.dataset.drawn = document.documentElement.dataset.theme;
   } catch (error) {
-    place.innerHTML = '<p class="failed">This figure could not be drawn.</p>';
+    failed(place, "This figure could not be drawn.");
     throw error;
   }
+}
+
+// Links: the same thing has the same address in every figure and table of the page
+
+const pathOf = (link) => link.split("?")[0];
+
+function indexed(figure) {
+  const [links, stops] = [new Map(), new Map()];
+  figure.data.forEach((trace, curveNumber) => {
+    trace.ids?.forEach?.((link, pointNumber) => {
+      if (!link || trace.hoverinfo === "none") return;
+      if (!links.has(link)) links.set(link, { curveNumber, pointNumber });
+      if (!link.startsWith("?") && !stops.has(pathOf(link))) {
+        stops.set(pathOf(link), { curveNumber, pointNumber });
+      }
+    });
+  });
+  return { links, stops };
+}
+
+const linkOf = (event) => {
+  const point = event.points?.[0];
+  return point?.data?.ids?.[point.pointNumber ?? point.pointIndex] || "";
+};
+
+export function follow(link) {
+  if (!link.startsWith("?")) {
+    location.assign(link);
+    return;
+  }
+  const query = new URLSearchParams(location.search);
+  for (const [name, value] of new URLSearchParams(link)) query.set(name, value);
+  query.delete("after");
+  location.search = query;
+}
+
+let isSpreading = false; // hovers that a hover causes cause no others
+
+export function spotlight(link, source) {
+  if (isSpreading) return;
+  isSpreading = true;
+  try {
+    for (const row of document.querySelectorAll("[data-key]")) {
+      const isIt = Boolean(link) && (row.dataset.key === link || pathOf(row.dataset.key) === pathOf(link));
+      row.classList.toggle("spot", isIt && !link.startsWith("?"));
+    }
+    for (const [place, { links, stops }] of drawn) {
+      if (place === source || !place.isConnected) continue;
+      const at = link && (links.get(link) ?? (link.startsWith("?") ? null : stops.get(pathOf(link))));
+      if (!place._fullLayout?.xaxis) continue;
+      if (at) Plotly.Fx.hover(place, [at]);
+      else Plotly.Fx.unhover(place);
+    }
+  } finally {
+    isSpreading = false;
+  }
+}
+
+function listen(place) {
+  place.on?.("plotly_click", (event) => {
+    const link = linkOf(event);
+    if (link) follow(link);
+  });
+  place.on?.("plotly_hover", (event) => {
+    const link = linkOf(event);
+    place.classList.toggle("linked", Boolean(link));
+    if (link) spotlight(link, place);
+  });
+  place.on?.("plotly_unhover", () => {
+    place.classList.remove("linked");
+    spotlight("", place);
+  });
+}
+
+document.addEventListener("mouseover", (event) => {
+  const row = event.target.closest?.("[data-key]");
+  if (row) spotlight(row.dataset.key, null);
+});
+document.addEventListener("mouseout", (event) => {
+  if (event.target.closest?.("[data-key]")) spotlight("", null);
+});
+
+// The menu of each figure: picture, data, query
+
+function asCsv(figure) {
+  const rows = [["trace", "x", "y", "z", "text"]];
+  for (const trace of figure.data) {
+    const n = Math.max(...["x", "y", "z"].map((axis) => trace[axis]?.length ?? 0));
+    for (let i = 0; i < n; i += 1) {
+      rows.push([trace.name, ...["x", "y", "z", "text"].map((name) => trace[name]?.[i] ?? "")]);
+    }
+  }
+  const quoted = (value) => (/[",\n]/.test(`${value}`) ? `"${`${value}`.replaceAll('"', '""')}"` : value);
+  return rows.map((row) => row.map(quoted).join(",")).join("\n");
+}
+
+function save(name, url) {
+  const link = document.createElement("a");
+  link.href = url;
+  link.download = name;
+  link.click();
+}
+
+async function picture(place, format) {
+  const styles = getComputedStyle(document.documentElement);
+  const name = place.closest("figure")?.id || "figure";
+  const [width, height] = [Math.max(900, place.clientWidth), Math.max(500, place.clientHeight)];
+  const ground = styles.getPropertyValue("--raised").trim();
+  const title = { text: place.closest("figure")?.querySelector("h2")?.textContent ?? "" };
+  const layout = { ...place.layout, paper_bgcolor: ground, plot_bgcolor: ground, width, height };
+  layout.title = { ...title, x: 0.02, font: { size: 15 } };
+  layout.margin = { ...layout.template?.layout?.margin, ...layout.margin, t: 84 };
+  const url = await Plotly.toImage({ data: place.data, layout }, { format, width, height, scale: 2 });
+  save(`${name}.${format}`, url);
+}
+
+function entry(text, act, href) {
+  const one = document.createElement(href ? "a" : "button");
+  one.textContent = text;
+  if (href) one.href = href;
+  else one.type = "button";
+  if (act) one.addEventListener("click", act);
+  return one;
+}
+
+export function addMenu(place) {
+  const header = place.closest("figure")?.querySelector(":scope > header");
+  if (!header || header.querySelector(".menu")) return;
+  const menu = document.createElement("details");
+  menu.className = "menu";
+  const handle = document.createElement("summary");
+  const title = header.querySelector("h2")?.textContent ?? "figure";
+  handle.textContent = "Save";
+  handle.setAttribute("aria-label", `Save: ${title}`);
+  const list = document.createElement("div");
+  list.append(entry("PNG", () => picture(place, "png")), entry("SVG", () => picture(place, "svg")));
+  const source = place.dataset.source;
+  if (source) {
+    const as = (form) => source.replace(/\.json(?=\?|$)/, `.${form}`);
+    list.append(entry("Data, CSV", null, as("csv")), entry("Data, Parquet", null, as("parquet")));
+    list.append(entry("Data, JSON", null, source), entry("SQL that made it", () => toSql(as("sql"))));
+  } else {
+    const csv = () => asCsv(place);
+    const file = () => URL.createObjectURL(new Blob([csv()], { type: "text/csv" }));
+    list.append(entry("Data, CSV", () => save(`${place.closest("figure").id}.csv`, file())));
+    const sql = place.dataset.sql;
+    if (sql) list.append(entry("SQL of its rows", null, `/sql?${new URLSearchParams({ q: sql })}`));
+  }
+  menu.append(handle, list);
+  header.append(menu);
+}
+
+async function toSql(address) {
+  const response = await fetch(address);
+  location.assign(`/sql?${new URLSearchParams({ q: await response.text() })}`);
+}
+
+document.addEventListener("click", (event) => {
+  for (const menu of document.querySelectorAll("details.menu[open]")) {
+    if (!menu.contains(event.target) || event.target.closest(".menu > div")) menu.open = false;
+  }
+});
+document.addEventListener("keydown", (event) => {
+  const menu = event.key === "Escape" && document.querySelector("details.menu[open]");
+  if (!menu) return;
+  menu.open = false;
+  menu.querySelector("summary").focus();
+});
+
+// Figures by address
+
+async function load(place) {
+  const response = await fetch(place.dataset.source);
+  const body = await response.json();
+  if (!response.ok) {
+    failed(place, body.detail ?? "This figure could not be loaded.");
+    return null;
+  }
+  const panel = place.closest("figure");
+  const head = panel?.querySelector("h2");
+  if (head) head.textContent = body.title;
+  const caption = panel?.querySelector(".caption");
+  if (caption) caption.textContent = body.caption;
+  place.setAttribute("aria-label", body.title);
+  if (!body.n_rows) {
+    failed(place, "No row of these results has the values that this figure shows.", "empty");
+    place.classList.add("bare");
+    return null;
+  }
+  return body.figure;
+}
+
+async function show(place) {
+  const known = drawn.get(place)?.figure;
+  const block = place.dataset.figure && document.getElementById(place.dataset.figure);
+  const figure = known ?? (block ? JSON.parse(block.textContent) : await load(place));
+  if (!figure) return;
+  await draw(place, figure);
+  addMenu(place);
 }
 
 async function drawAll() {
   await document.fonts.ready;
   for (const place of document.querySelectorAll("[data-figure]")) {
-    await draw(place, JSON.parse(document.getElementById(place.dataset.figure).textContent));
+    await show(place);
     await new Promise((resume) => setTimeout(resume));
   }
 }

@@ -8,6 +8,7 @@ from fastapi import APIRouter
 
 from spheremark.service.http.api import (
     audit,
+    figures,
     jobs,
     plans,
     problems,
@@ -23,6 +24,6 @@ from spheremark.service.http.api import sites as products
 router = APIRouter()
 for part in (
     *(surveys, recordings, uploads, jobs, results),
-    *(products, rigs, plans, sql, audit, problems),
+    *(products, rigs, plans, sql, figures, audit, problems),
 ):
     router.include_router(part.router)
