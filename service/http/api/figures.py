@@ -97,7 +97,7 @@ class LimitsList(BaseModel):
 
 FigureName = Annotated[str, Path(description="distance, count, incidence, angle, map and so on.")]
 FormName = Annotated[Form, Path(description="json, csv, parquet or sql.")]
-_FILES: dict[str, Any] = {media: {} for media in figures.MEDIA.values() if media != "application/json"}
+_FILES: dict[str, Any] = {media: {} for form, media in figures.MEDIA.items() if form != "json"}
 
 
 def _chosen(query: Annotated[SelectionQuery, Query()], service: Current) -> figures.Chosen:
