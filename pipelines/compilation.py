@@ -107,6 +107,16 @@ def load_kernels(package: str = "spheremark") -> int:
     return n
 
 
+def compile_in_memory() -> None:
+    """Keep nothing that is compiled from now on, and have all that compiling needs in memory."""
+    import numba
+    from numba.core.caching import NullCache
+
+    numba.njit(lambda x: x + 1)(1)
+    for kernel in _KERNELS:
+        kernel._cache = NullCache()
+
+
 def _kept(kernel: Any) -> Any:
     """Enter a kernel into the list of kernels."""
     _KERNELS.append(kernel)

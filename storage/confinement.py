@@ -17,9 +17,10 @@ from pathlib import Path
 
 _FILES_MAX = 64  # open files of the process
 _NEW_NAMESPACES = 0x10000000 | 0x40000000 | 0x08000000  # of users, of networks, of shared memory
+_NEW_MOUNTS, _MOUNT_BIND = 0x00020000, 1 << 12
 _CREATE_RULESET, _ADD_RULE, _RESTRICT_SELF = 444, 445, 446  # Landlock, on every architecture
 _RIGHTS = (13, 14, 15, 15, 16)  # to files, that versions 1 to 5 of Landlock know
-_READ_FILE = 1 << 2
+_EXECUTE, _READ_FILE = 1 << 0, 1 << 2
 
 
 def limit_resources(*, memory_bytes: int, seconds: float, file_bytes: int) -> None:
@@ -96,13 +97,32 @@ def enter_folder(folder: Path) -> Path:
     return Path("/")
 
 
-def forbid_files(readable: Iterable[int]) -> bool:
+def show_file(path: Path, place: Path) -> None:
+    """Make a file appear at another path too, for this process alone, where it may.
+
+    Call it after ``leave_network``, whose namespace allows it.
+
+    Parameters
+    ----------
+    path : Path
+        The file.
+    place : Path
+        An existing file, hidden from now on.
+    """
+    libc = ctypes.CDLL(None)
+    if libc.unshare(_NEW_MOUNTS) == 0:
+        libc.mount(os.fsencode(path), os.fsencode(place), None, ctypes.c_ulong(_MOUNT_BIND), None)
+
+
+def forbid_files(readable: Iterable[int], folder: int | None = None) -> bool:
     """Forbid to open, make and run files, to use TCP and to signal other processes (Landlock).
 
     Parameters
     ----------
     readable : iterable of int
         Descriptors of the only files that may still be opened, for reading.
+    folder : int, optional
+        Descriptor of the only folder in which files may still be made, read, written and removed.
 
     Returns
     -------
@@ -119,8 +139,11 @@ def forbid_files(readable: Iterable[int]) -> bool:
     network, scope = (3 if version >= 4 else 0), (3 if version >= 6 else 0)
     rules = struct.pack("=QQQ", rights, network, scope)
     ruleset = libc.syscall(_CREATE_RULESET, rules, ctypes.c_size_t(len(rules)), 0)
-    for descriptor in readable:
-        libc.syscall(_ADD_RULE, ruleset, 1, struct.pack("=Qi", _READ_FILE, descriptor), 0)
+    allowed = [(_READ_FILE, descriptor) for descriptor in readable]
+    if folder is not None:
+        allowed.append((rights & ~_EXECUTE, folder))
+    for right, descriptor in allowed:
+        libc.syscall(_ADD_RULE, ruleset, 1, struct.pack("=Qi", right, descriptor), 0)
     libc.prctl(38, 1, 0, 0, 0)  # PR_SET_NO_NEW_PRIVS
     is_restricted = libc.syscall(_RESTRICT_SELF, ruleset, 0) == 0
     os.close(ruleset)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 import threading
 from collections.abc import AsyncIterator
-from contextlib import asynccontextmanager
+from contextlib import asynccontextmanager, suppress
 from dataclasses import dataclass, field
 from typing import Annotated, Any
 
@@ -19,7 +19,7 @@ from spheremark.service.planning.predictions import Predictions
 from spheremark.service.planning.requests import Planner
 from spheremark.service.settings import Settings
 from spheremark.storage.catalogue.catalogue import Catalogue
-from spheremark.storage.imports.confined import end_children
+from spheremark.storage.imports.confined import end_children, start_readers
 
 _PLANS = 2  # that are computed at once
 
@@ -85,11 +85,9 @@ async def opened(settings: Settings) -> AsyncIterator[Service]:
 
 
 def _warm_up() -> None:
-    """Load the compiled kernels that read a log, so that the first upload is as fast as others."""
-    from spheremark.pipelines.compilation import load_kernels
-
-    for package in ("spheremark.storage.recordings", "spheremark.pipelines.scan"):
-        load_kernels(package)
+    """Start the process that reads logs, so that the first upload is as fast as others."""
+    with suppress(RuntimeError):  # each upload tries again, and says so
+        start_readers()
 
 
 def current(request: Request) -> Service:

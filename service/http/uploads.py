@@ -39,8 +39,8 @@ from spheremark.service.http.folders import FORM, FolderWriter
 from spheremark.storage.catalogue.catalogue import Catalogue
 from spheremark.storage.catalogue.records import RecordingRecord
 from spheremark.storage.files import require_free, sync_folder, unwritten
+from spheremark.storage.imports.uploads import inspect_upload
 from spheremark.storage.recordings import LogOptions
-from spheremark.storage.recordings.apart import inspect_apart
 
 logger = logging.getLogger(__name__)
 
@@ -377,7 +377,7 @@ def take_in(
     """
     recording, is_new = enter(catalogue, received, name, options)
     if not is_new and recording.preflight.get("reading", {}) != options.to_mapping():
-        found = inspect_apart(received.path, options).to_mapping()
+        found = inspect_upload(received.path, options).to_mapping()
         recording = catalogue.inspect_again(received.digest, found)
     if recording.verdict == "refused":
         raise RefusedRecordingError.of(recording)
@@ -396,7 +396,7 @@ def enter(
             name=_ENDING.sub("", name) or name,
             size_bytes=received.size_bytes,
             url=str(received.path),
-            preflight=inspect_apart(received.path, options).to_mapping(),
+            preflight=inspect_upload(received.path, options).to_mapping(),
         )
         return recording, True
 

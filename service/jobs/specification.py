@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from enum import StrEnum
 from time import perf_counter
@@ -49,11 +49,13 @@ class Log:
     reading: Mapping[str, Any] = field(default_factory=dict)
 
     def read(self, name: str | None = None) -> ScanLog:
-        """Read the log, under the name of its recording or a given one."""
-        from spheremark.storage.recordings import LogOptions, read_log
+        """Read the log in a confined process, under the name of its recording or a given one."""
+        from spheremark.storage.imports.uploads import read_upload
+        from spheremark.storage.recordings import LogOptions, local_copy
 
-        log = read_log(self.url, LogOptions.from_mapping(self.reading), digest=self.recording_id)
-        return replace(log, origin=Origin(name=name or self.name, digest=self.recording_id))
+        origin = Origin(name=name or self.name, digest=self.recording_id)
+        with local_copy(self.url) as path:
+            return read_upload(path, LogOptions.from_mapping(self.reading), origin)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -20,6 +20,7 @@ from spheremark.pipelines.compilation import watch_compilation
 from spheremark.pipelines.config import SurveyConfig
 from spheremark.service.jobs.handlers import KINDS, JobResult, JobSpecification
 from spheremark.service.jobs.memory import keep_memory
+from spheremark.storage.imports.confined import start_readers
 
 if TYPE_CHECKING:
     from distributed import Worker
@@ -106,11 +107,11 @@ def warm_up() -> None:
 
     from spheremark.pipelines import survey  # noqa: F401
     from spheremark.pipelines.compilation import load_kernels
-    from spheremark.storage import recordings  # noqa: F401
     from spheremark.storage.catalogue import results  # noqa: F401
     from spheremark.storage.clouds import stop  # noqa: F401
 
     load_kernels()
+    start_readers()
 
 
 def compile_kernels() -> None:

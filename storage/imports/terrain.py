@@ -226,6 +226,7 @@ def _site(name: str, arrays: Mapping[str, NDArray[Any]]) -> Site:
     is_whole = is_whole and (len(ys), len(xs)) == ground.shape == surface.shape
     if not is_whole or not np.isfinite(np.concatenate([xs, ys])).all():
         raise UnreadableFileError(f"{name} cannot be read: its reader gave no grid.")
-    for heights in (ground, surface):
-        heights[~(np.abs(heights) < _HEIGHT_MAX)] = np.nan
+    ground, surface = (
+        np.where(np.abs(one) < _HEIGHT_MAX, one, np.nan) for one in (ground, surface)
+    )
     return site_of_grid(name, xs, ys, ground, surface=surface)

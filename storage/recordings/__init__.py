@@ -7,7 +7,7 @@ into neutral columns (``families``): ``pointclouds``, ``packets``, ``joint_state
 recording, and every declared length is checked before use.
 """
 
-from spheremark.storage.recordings.container import require_file
+from spheremark.storage.recordings.container import local_copy, require_file
 from spheremark.storage.recordings.options import LogOptions
 from spheremark.storage.recordings.preflight import Preflight, TopicReport, inspect_log
 from spheremark.storage.recordings.reading import LogFile, read_log
@@ -21,6 +21,7 @@ __all__ = [
     "TopicReport",
     "file_digest",
     "inspect_log",
+    "local_copy",
     "read_log",
     "require_file",
     "write_log",

@@ -49,6 +49,11 @@ _USES[[FOOTER, DATA_END]] = _ENDS
 _KEEP_MAPPED = 1 << 25  # [bytes] pages behind this distance are given back
 _MORE = 1.1  # margin of the expansion of a file over that of its first chunks
 _EXPANSION_MAX = 10.0  # largest expansion for which memory is reserved in advance
+_RECORDS_MAX = 50_000_000  # chunks among them: a day of 500 messages a second
+_UNPACKED_MAX = (
+    1 << 29,
+    100,
+)  # [bytes] of all chunks, and per byte of the file; 10 is usual
 RECOVER = "use what is readable with --recover (recover=true in a request)"
 
 
@@ -134,6 +139,8 @@ class Container:
     _first_ns: int | None = None
     _last_ns: int = 0
     _released: int = 0
+    _n_records: int = 0
+    _n_unpacked: int = 0
 
     def __post_init__(self) -> None:
         found = self.octets[: len(MAGIC)].tobytes()
@@ -166,6 +173,7 @@ class Container:
         plain = False  # whether messages stand outside chunks
         while is_whole and position < self.size:
             rows, position, is_whole = walk(self.octets, position)
+            self._count(len(rows), 0)
             for alike in _runs(rows[_USES[rows[:, 0]] > 0]):
                 opcode, start, length = alike[0, :3].tolist()
                 if opcode == FOOTER:
@@ -184,9 +192,21 @@ class Container:
     def _chunked(self, rows: Nanos) -> Iterator[Batch]:
         """Yield the messages of chunks that follow each other."""
         for stretch in self._source.stretches(rows):
+            self._count(len(stretch.rows), len(stretch.octets))
             yield from self._group(stretch.octets, stretch.rows)
             if stretch.damage is not None:
                 raise self._truncated(*stretch.damage)
+
+    def _count(self, n_records: int, n_unpacked: int) -> None:
+        """Refuse more records, or more unpacked bytes, than any recording of this size has."""
+        self._n_records += n_records
+        self._n_unpacked += n_unpacked
+        most = _UNPACKED_MAX[0] + _UNPACKED_MAX[1] * self.size
+        if self._n_records > _RECORDS_MAX or self._n_unpacked > most:
+            raise RecordingError(
+                f"The recording has over {self._n_records:,} records, of {self._n_unpacked:,} "
+                f"unpacked bytes; {_RECORDS_MAX:,} and {most:,} are the most. Record less at once."
+            )
 
     def _group(self, octets: Octets, rows: Nanos) -> Iterator[Batch]:
         """Register schemas and channels of some records, then yield their messages by channel."""
@@ -276,7 +296,25 @@ def mapped(path: Path) -> Iterator[Container]:
 
 @contextmanager
 def local_copy(url: str | Path) -> Iterator[Path]:
-    """Yield the path of a recording on this machine, copied if it is elsewhere."""
+    """Yield the path of a recording on this machine, copied if it is elsewhere.
+
+    Parameters
+    ----------
+    url : str or Path
+        A file, a folder, or any address of a file that fsspec knows.
+
+    Yields
+    ------
+    Path
+        The recording; a copy lasts until the end of the context.
+
+    Raises
+    ------
+    NotFoundError
+        If there is no such file.
+    RecordingError
+        If it is a folder that is not on this machine, or no regular file.
+    """
     if "://" not in str(url) and ((here := Path(url)).is_file() or here.is_dir()):
         yield here
         return

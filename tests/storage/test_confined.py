@@ -7,7 +7,7 @@ from pathlib import Path
 import psutil
 import pytest
 
-from spheremark.pipelines.errors import InputError
+from spheremark.pipelines.errors import InputError, TruncatedRecordingError
 from spheremark.storage.imports import confined
 from spheremark.storage.imports.confined import (
     Limits,
@@ -20,17 +20,44 @@ LIMITS = Limits(seconds=10.0, memory_bytes=256 << 20, result_bytes=1 << 20)
 SHORT = Limits(seconds=1.0, memory_bytes=256 << 20, result_bytes=1 << 20)
 
 
-@pytest.fixture
-def run(tmp_path):
+READERS = "tests.storage.confined_readers"
+
+
+@pytest.fixture(scope="module")
+def forks():
+    """A process that keeps the readers of these tests loaded."""
+    with pytest.MonkeyPatch.context() as changed:
+        changed.setattr(confined, "READY", READERS)
+        changed.setattr(confined, "_FORKS", confined._Forks())
+        yield confined._FORKS
+        confined._FORKS.end()
+
+
+@pytest.fixture(params=["started", "forked"])
+def run(tmp_path, request, monkeypatch):
+    """Run a reader in a process of its own, started anew or forked from one that is ready."""
+    if request.param == "forked":
+        forks = request.getfixturevalue("forks")
+        monkeypatch.setattr(confined, "READY", READERS)
+        monkeypatch.setattr(confined, "_FORKS", forks)
+        forks.start()
+    else:
+        monkeypatch.setattr(confined, "READY", "none")
     path = tmp_path / "file"
     path.write_bytes(b"12345")
 
     def read(reader, limits=LIMITS, **options):
-        return run_confined(
-            f"tests.storage.confined_readers:{reader}", path, limits, name="file.x", **options
-        )
+        return run_confined(f"{READERS}:{reader}", path, limits, name="file.x", **options)
 
     return read
+
+
+@pytest.fixture
+def run_forked(run, request):
+    """Run a reader that needs a process forked from one that is ready."""
+    if "started" in request.node.name:
+        pytest.skip("for forked readers")
+    return run
 
 
 def test_a_reader_gets_the_file_and_its_arrays_come_back(run):
@@ -88,10 +115,18 @@ def test_a_reader_that_fails_is_an_error_with_its_reason(run, reader, limits, re
     assert str(found.value).isprintable()
 
 
+def begun():
+    """Whether a reader of this process runs."""
+    own = psutil.Process().children(recursive=True)
+    return bool(confined._CHILDREN) or any(
+        "--ready" in one.cmdline() and "--ready" in one.parent().cmdline() for one in own
+    )
+
+
 def test_the_end_of_the_service_ends_readers(run):
     with ThreadPoolExecutor(1) as thread:
         future = thread.submit(run, "sleep")
-        while not confined._CHILDREN:  # it can be ended once it has begun
+        while not begun():
             assert not future.done()
         end_children()
         with pytest.raises(UnreadableFileError, match="SIGKILL"):
@@ -108,7 +143,7 @@ def test_a_reader_that_ignores_its_timer_is_killed(run, monkeypatch):
     with pytest.raises(UnreadableFileError, match="took more than 1 s"):
         run("sleep", SHORT)
     assert time.monotonic() - begin < 15
-    assert not [one for one in psutil.Process().children() if "confined" in str(one.cmdline())]
+    assert not begun()
 
 
 @pytest.mark.parametrize(
@@ -130,6 +165,36 @@ def test_a_reader_that_ignores_its_timer_is_killed(run, monkeypatch):
 def test_a_forged_answer_is_refused(run, answer):
     with pytest.raises(UnreadableFileError, match="no sensible answer"):
         run("forge", answer=answer)
+
+
+def test_a_reader_that_unpacks_has_a_folder_of_its_own(run_forked, tmp_path):
+    assert run_forked("use_own_folder") == {"text": "12345", "shown": "file"}
+    assert [one.name for one in tmp_path.iterdir()] == ["file"]
+
+
+def test_a_refusal_keeps_its_class(run):
+    with pytest.raises(TruncatedRecordingError, match="it ends early"):
+        run("refuse_by_class")
+
+
+def test_an_answer_that_could_still_be_changed_is_none(run_forked):
+    with pytest.raises(UnreadableFileError, match="no sensible answer"):
+        run_forked("keep_the_answer_open")
+
+
+def test_what_a_reader_leaves_behind_is_ended(run_forked):
+    run_forked("fork_on")
+    (server,) = (one for one in psutil.Process().children() if "--ready" in one.cmdline())
+    deadline = time.monotonic() + 60
+    while server.children():
+        assert time.monotonic() < deadline
+
+
+def test_the_process_that_keeps_readers_loaded_is_started_anew(run_forked):
+    (server,) = (one for one in psutil.Process().children() if "--ready" in one.cmdline())
+    server.kill()
+    server.wait(60)
+    assert run_forked("size_of")["size"].tolist() == [5]
 
 
 def test_no_descriptor_stays_open(run):

@@ -32,7 +32,8 @@ from spheremark.pipelines.errors import (
     RecordingError,
     TruncatedRecordingError,
 )
-from spheremark.pipelines.model import ImuMount
+from spheremark.pipelines.model import ImuMount, Origin
+from spheremark.storage.imports.uploads import inspect_upload, read_upload
 from spheremark.storage.recordings import (
     LogOptions,
     file_digest,
@@ -41,7 +42,6 @@ from spheremark.storage.recordings import (
     read_log,
     transforms,
 )
-from spheremark.storage.recordings.apart import inspect_apart
 from spheremark.storage.recordings.definitions import definition
 from tests.storage.recorder import (
     DEFINITIONS,
@@ -500,13 +500,20 @@ def test_a_zip_that_declares_more_than_it_can_hold_is_refused(tmp_path):
         read_log(tmp_path / "b.zip")
 
 
-def test_a_foreign_container_is_inspected_in_a_process_that_can_be_ended(tmp_path, items):
-    (part,) = rosbag2(tmp_path / "bag", items).glob("*.db3")
-    options = LogOptions(joint="gimbal_joint")
-    assert inspect_apart(part, options).to_mapping() == inspect_log(part, options).to_mapping()
-    ended = inspect_apart(part, seconds=0.001)
-    assert (ended.verdict, ended.topics) == ("refused", ())
-    assert "ended with code" in ended.reasons[0]
+@pytest.mark.parametrize("kind", ["mcap", "zip", "bag", "db3"])
+def test_an_upload_is_read_in_a_confined_process_to_the_same_log(tmp_path, items, expected, kind):
+    path = tmp_path / f"a.{kind}"
+    if kind == "bag":
+        rosbag1(path, items)
+    elif kind == "db3":
+        shutil.copy(next(iter(rosbag2(tmp_path / "bag", items).glob("*.db3"))), path)
+    else:
+        record(tmp_path / "a.mcap", items)
+    if kind == "zip":
+        with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive:
+            archive.write(tmp_path / "a.mcap", "a.mcap")
+    assert_same(read_upload(path, LogOptions(), Origin(name="a", digest="b")), expected)
+    assert inspect_upload(path).to_mapping() == inspect_log(path).to_mapping()
 
 
 def test_a_zip_whose_compressed_bytes_are_damaged_is_refused(tmp_path, items):

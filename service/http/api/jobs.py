@@ -23,7 +23,7 @@ from spheremark.service.http.state import Current, Service
 from spheremark.service.jobs.events import JobEvent
 from spheremark.service.jobs.handlers import KINDS, Kind, Reading
 from spheremark.storage.catalogue.records import JobRecord, JobStatus, SurveyRecord
-from spheremark.storage.imports.survey_files import parse_rig
+from spheremark.storage.imports.uploads import rig_of
 
 router = APIRouter(prefix="/jobs", tags=["jobs"])
 
@@ -166,7 +166,7 @@ def _options(kind: Kind, new: NewJob) -> dict[str, Any]:
 def _rig(service: Service, new: NewJob, survey: SurveyRecord) -> dict[str, str]:
     """Return the rig that a job is to use, as an option; none for the one of each log."""
     if isinstance(new.rig, dict):
-        return {"rig": service.catalogue.put_rig(parse_rig(json.dumps(new.rig)))}
+        return {"rig": service.catalogue.put_rig(rig_of(json.dumps(new.rig)))}
     if new.rig is not None:
         return {"rig": rig_digest(service.catalogue.get_rig(new.rig))}
     if survey.rig_digest is None or not KINDS[new.kind].begins_with_rig_of_survey:

@@ -9,7 +9,7 @@ from fastapi import APIRouter, Path, Response
 from spheremark.service.http.api.models import StoredRig
 from spheremark.service.http.api.surveys import File, bodies
 from spheremark.service.http.state import Current
-from spheremark.storage.imports.survey_files import parse_rig
+from spheremark.storage.imports.uploads import rig_of
 
 router = APIRouter(prefix="/rigs", tags=["rigs"])
 
@@ -19,7 +19,7 @@ RigDigest = Annotated[str, Path(description="Digest of the rig.")]
 @router.post("", name="put_rig", status_code=201, openapi_extra=bodies("application/json"))
 def put_rig(file: File, service: Current, response: Response) -> StoredRig:
     """Keep a rig file (JSON), so that jobs can name it; the same rig twice is one."""
-    rig = parse_rig(file.text)
+    rig = rig_of(file.text)
     digest = service.catalogue.put_rig(rig)
     response.headers["Location"] = f"/api/v1/rigs/{digest}"
     return StoredRig.of(rig)

@@ -24,7 +24,8 @@ from spheremark.service.http.api.models import (
     TruthSummary,
 )
 from spheremark.service.http.state import Current
-from spheremark.storage.imports.survey_files import format_control, parse_control, parse_truth
+from spheremark.storage.imports.survey_files import format_control
+from spheremark.storage.imports.uploads import control_of, truth_of
 
 router = APIRouter(prefix="/surveys", tags=["surveys"])
 
@@ -120,7 +121,7 @@ def choose_rig(survey: Key, chosen: ChosenRig, service: Current) -> Survey:
 @router.put("/{survey}/truth", name="put_truth", openapi_extra=bodies("application/json"))
 def put_truth(survey: Key, file: File, service: Current) -> TruthSummary:
     """Give a survey its truth: for comparison only, no job ever sees it."""
-    service.catalogue.put_truth(survey, parse_truth(file.text))
+    service.catalogue.put_truth(survey, truth_of(file.text))
     truth = service.catalogue.truth(survey)
     n_marks, n_stops = (len(truth.marks.names), len(truth.stops)) if truth else (0, 0)
     return TruthSummary(n_marks=n_marks, n_stops=n_stops)
@@ -129,7 +130,7 @@ def put_truth(survey: Key, file: File, service: Current) -> TruthSummary:
 def _read_control(file: Document) -> ControlMarks:
     """Read control marks from CSV or JSON."""
     if file.media_type in ("text/csv", "text/plain", "application/csv"):
-        return parse_control(file.text)
+        return control_of(file.text)
     if file.media_type != "application/json":
         raise MediaTypeError(
             f"The body is {file.media_type or 'of no type'}; send text/csv or application/json."
@@ -138,7 +139,7 @@ def _read_control(file: Document) -> ControlMarks:
         marks = _to_marks(Control.model_validate_json(file.text).marks)
     except ValidationError as error:
         raise RequestValidationError(error.errors()) from error
-    return parse_control(format_control(marks))  # one set of checks for both forms
+    return control_of(format_control(marks))  # one set of checks for both forms
 
 
 def _to_marks(marks: list[Mark]) -> ControlMarks:
