@@ -86,6 +86,12 @@ class EmptyBodyError(InputError):
     code: ClassVar[str] = "input.empty"
 
 
+class UnknownNameError(InputError):
+    """The query or the body of the request names something that does not exist."""
+
+    code: ClassVar[str] = "input.unknown"
+
+
 class ReusedKeyError(InputError):
     """An Idempotency-Key was used before with another request."""
 
@@ -153,6 +159,7 @@ STATUS: Mapping[type[SpheremarkError], int] = {
     ChecksumError: 460,  # of tus
     TusVersionError: 412,
     ReusedKeyError: 422,
+    UnknownNameError: 422,
     BusyError: 429,
     ClientLeftError: 499,  # as nginx has it; only the log sees it
     RecordingError: 422,

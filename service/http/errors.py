@@ -12,8 +12,8 @@ from fastapi.exceptions import RequestValidationError
 from fastapi.responses import JSONResponse
 from starlette.exceptions import HTTPException
 
-from spheremark.pipelines.errors import SpheremarkError
-from spheremark.service.errors import Problem, problem_of
+from spheremark.pipelines.errors import NotFoundError, SpheremarkError
+from spheremark.service.errors import Problem, UnknownNameError, problem_of
 
 logger = logging.getLogger(__name__)
 
@@ -38,7 +38,10 @@ def install(app: FastAPI, page: ErrorPage | None = None) -> None:
         return problem_response(problem, headers)
 
     def ours(request: Request, error: Exception) -> Response:
-        problem = problem_of(cast(SpheremarkError, error), request.url.path)
+        found = cast(SpheremarkError, error)
+        if isinstance(found, NotFoundError) and not request.path_params:
+            found = UnknownNameError(str(found))  # the address exists
+        problem = problem_of(found, request.url.path)
         if problem.status >= 500:
             logger.error("%s %s failed: %s", request.method, request.url.path, problem.detail)
         headers = {"Retry-After": _RETRY_AFTER} if problem.status in (429, 503, 507) else None

@@ -69,6 +69,7 @@ class _Live:
     rank: int = 0
     deadline: asyncio.TimerHandle | None = None
     stopped: asyncio.Event = field(default_factory=asyncio.Event)
+    ended: asyncio.Event = field(default_factory=asyncio.Event)
     turn: asyncio.Lock = field(default_factory=asyncio.Lock)  # beginning and end, one at a time
 
     @property
@@ -213,6 +214,8 @@ class JobQueue:
         job = live.job
         try:
             await self.events.add(job)
+            if job.waits_for:
+                await self._wait_for(job)
             spec = await asyncio.to_thread(self._specification, job)
             live.future = self._client.submit(
                 tasks.run,
@@ -237,6 +240,7 @@ class JobQueue:
             text = "".join(traceback.format_exception(error))
             ended = await self._fail(live, INTERNAL, f"{type(error).__name__}: {error}", text)
         self._live.pop(job.job_id, None)
+        live.ended.set()
         self.n_ended[job.kind, ended.status.value] += 1
         about = (ended.status, ended.error_reason or ended.message)
         level = event_level(self._settings.log_format)
@@ -245,6 +249,13 @@ class JobQueue:
             live.deadline.cancel()
         if ended.status.is_final:
             await self.events.add(ended)
+
+    async def _wait_for(self, job: JobRecord) -> None:
+        """Wait for the end of the jobs whose results a job reads, however they end."""
+        for live in [self._live[one] for one in job.waits_for if one in self._live]:
+            await live.ended.wait()
+        if (await asyncio.to_thread(self._catalogue.get_job, job.job_id)).status.is_final:
+            raise FutureCancelledError(job.job_id, "dismissed")
 
     def _specification(self, job: JobRecord) -> JobSpecification:
         """Return the input of a worker for a job."""

@@ -27,7 +27,13 @@ _NO_OPTIONS: Mapping[str, Any] = {}
 _ACTIVE = (JobStatus.ACCEPTED, JobStatus.RUNNING)
 
 _JOBS = """
-SELECT j.*, s.name AS survey, r.name AS recording
+SELECT j.*, s.name AS survey, r.name AS recording, coalesce((
+    SELECT list(w.job_id ORDER BY w.created_at, w.job_id) FROM jobs AS w
+    WHERE j.status = 'accepted' AND w.status IN ('accepted', 'running')
+        AND w.survey_id = j.survey_id AND (w.created_at, w.job_id) < (j.created_at, j.job_id)
+        AND (w.kind = 'process' AND j.kind IN ('adjust', 'site')
+            OR w.kind = 'adjust' AND j.kind = 'site')
+), []) AS waits_for
 FROM jobs AS j JOIN surveys AS s USING (survey_id) LEFT JOIN recordings AS r USING (recording_id)
 """
 _JOB = _JOBS + "WHERE j.job_id = $id"
@@ -47,6 +53,7 @@ INSERT INTO jobs (job_id, kind, survey_id, recording_id, config, options, create
     progress_percent, message, attempts)
 VALUES (?, ?, ?, ?, ?, ?, ?, 'accepted', 0, 'Waiting for a worker.', 0)
 """
+_WAIT = "UPDATE jobs SET message = ? WHERE job_id = ?"
 _KEY = "SELECT request, job_id FROM idempotency_keys WHERE key = $key"
 _KEEP_KEY = "INSERT INTO idempotency_keys VALUES (?, ?, ?, ?)"
 _START = """
@@ -128,6 +135,10 @@ class Catalogue(Surveys):
             cursor.execute(_CREATE, [job_id, kind, survey_id, recording_id, *texts, now()])
             if key is not None:
                 cursor.execute(_KEEP_KEY, [*key, job_id, now()])
+            (job,) = fetch(cursor, _JOB, {"id": job_id}).to_pylist()
+            if before := job["waits_for"]:
+                text = f"Waiting for {len(before)} job{'s' * (len(before) > 1)} of the survey."
+                cursor.execute(_WAIT, [text, job_id])
         return self.get_job(job_id)
 
     def job_of_key(self, key: str) -> tuple[str, JobRecord] | None:

@@ -84,7 +84,8 @@ class RecordingRecord:
 class JobRecord:
     """A job: a row of ``jobs``, whose comments define the columns, with the names of its inputs.
 
-    ``recording_id`` and ``recording`` are None for a job on the survey as a whole.
+    ``recording_id`` and ``recording`` are None for a job on the survey as a whole. ``waits_for``
+    are the open jobs of the survey whose results this job reads.
     """
 
     job_id: str
@@ -105,6 +106,7 @@ class JobRecord:
     error_code: str | None
     error_reason: str | None
     error_traceback: str | None
+    waits_for: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

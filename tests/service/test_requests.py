@@ -53,7 +53,7 @@ WRONG = [  # method, path, arguments, status, code
     ("POST", "/api/v1/recordings?name=a&process=true",
      {"content": b"x", "headers": {"Content-Type": "application/vnd.mcap"}}, 400, "input"),
     ("POST", "/api/v1/recordings?name=a&survey=nobody",
-     {"content": b"x", "headers": {"Content-Type": "application/vnd.mcap"}}, 404, "not_found"),
+     {"content": b"x", "headers": {"Content-Type": "application/vnd.mcap"}}, 422, "input.unknown"),
     ("POST", "/api/v1/uploads", {"headers": {"Upload-Length": "3"}}, 412, "input.tus_version"),
     ("DELETE", "/api/v1/uploads/none", {"headers": {"Tus-Resumable": "1.0.0"}}, 404, "not_found"),
     ("GET", f"/api/v1/recordings/{DIGEST}", {}, 404, "not_found"),
@@ -61,7 +61,7 @@ WRONG = [  # method, path, arguments, status, code
     ("GET", f"/api/v1/recordings/{DIGEST}/preflight", {}, 404, "not_found"),
     ("GET", f"/api/v1/recordings/{DIGEST}/file", {}, 404, "not_found"),
     ("POST", "/api/v1/jobs", {"json": {"survey": "nobody", "recording": DIGEST}},
-     404, "not_found"),
+     422, "input.unknown"),
     ("POST", "/api/v1/jobs", {"json": {"kind": "magic", "survey": "a", "recording": DIGEST}},
      422, "input.validation"),
     ("POST", "/api/v1/jobs", {"json": {"survey": "a"}}, 422, "input.validation"),
@@ -83,7 +83,7 @@ WRONG = [  # method, path, arguments, status, code
     ("PUT", "/api/v1/surveys/nobody/rig", {"json": {"rig_digest": None}}, 404, "not_found"),
     ("PUT", "/api/v1/surveys/nobody/rig", {"json": {}}, 422, "input.validation"),
     ("GET", "/api/v1/adjustments?survey=a&colour=red", {}, 422, "input.validation"),
-    ("GET", "/api/v1/adjustments?survey=nobody", {}, 404, "not_found"),
+    ("GET", "/api/v1/adjustments?survey=nobody", {}, 422, "input.unknown"),
     ("GET", f"/api/v1/adjustments?after={10**30}", {}, 422, "input.validation"),
     ("GET", "/api/v1/adjustments/none", {}, 404, "not_found"),
     ("GET", "/api/v1/adjustments/none/files/report.txt", {}, 404, "not_found"),
@@ -96,6 +96,17 @@ WRONG = [  # method, path, arguments, status, code
     ("DELETE", "/api/v1/jobs/none", {}, 404, "not_found"),
     ("GET", "/api/v1/runs/none", {}, 404, "not_found"),
     ("GET", "/api/v1/runs?colour=red", {}, 422, "input.validation"),
+    ("GET", "/api/v1/runs?job=none", {}, 422, "input.unknown"),
+    ("GET", f"/api/v1/runs?recording={DIGEST}", {}, 422, "input.unknown"),
+    ("GET", "/api/v1/jobs?survey=nobody", {}, 422, "input.unknown"),
+    ("GET", f"/api/v1/jobs?recording={DIGEST}", {}, 422, "input.unknown"),
+    ("GET", "/api/v1/export/coordinates.csv?survey=nobody", {}, 422, "input.unknown"),
+    ("GET", "/api/v1/marker-fits?survey=nobody", {}, 422, "input.unknown"),
+    ("GET", "/api/v1/marker-fits?status=bogus", {}, 422, "input.validation"),
+    ("GET", "/api/v1/marker-fits?fit_method=bogus", {}, 422, "input.validation"),
+    ("GET", "/api/v1/marker-fits?run=none", {}, 422, "input.unknown"),
+    ("GET", "/api/v1/station-fixes?stop=nowhere", {}, 422, "input.unknown"),
+    ("GET", "/api/v1/surveys?surveyy=a", {}, 422, "input.validation"),
     ("GET", "/api/v1/marker-fits/none", {}, 404, "not_found"),
     ("GET", "/api/v1/marker-fits?limit=1001", {}, 422, "input.validation"),
     ("GET", f"/api/v1/marker-fits?after={10**22}", {}, 422, "input.validation"),
@@ -130,7 +141,7 @@ WRONG = [  # method, path, arguments, status, code
     ("POST", "/api/v1/plans/random", {"json": {"n_arrangements": 0}}, 422, "input.validation"),
     ("POST", "/api/v1/plans/random", {"json": {"n_marks_min": 2}}, 400, "input.config"),
     ("POST", "/api/v1/plans/random", {"json": {"fit_method": "guess"}}, 400, "input"),
-    ("GET", "/api/v1/plans?survey=nobody", {}, 404, "not_found"),
+    ("GET", "/api/v1/plans?survey=nobody", {}, 422, "input.unknown"),
     ("GET", "/api/v1/plans/sites/paper-field@" + 5000 * "9", {}, 404, "not_found"),
     ("POST", "/api/v1/plans", {"json": {"marks": []}}, 422, "input.validation"),
     ("GET", "/api/v1/plans/none", {}, 404, "not_found"),
@@ -322,7 +333,7 @@ class Listening:
         self.thread.join()
 
 
-@pytest.mark.parametrize(("path", "status"), [("/api/v1/plans", 413), ("/api/v1/recordings", 404)])
+@pytest.mark.parametrize(("path", "status"), [("/api/v1/plans", 413), ("/api/v1/recordings", 422)])
 def test_a_refusal_is_read_by_a_sender_who_sends_all_before_reading(tmp_path, path, status):
     with Listening(tmp_path) as port:
         connection = http.client.HTTPConnection("127.0.0.1", port, timeout=20)

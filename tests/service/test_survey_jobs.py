@@ -407,3 +407,30 @@ def test_logs_of_one_name_are_told_apart_alike_by_networks_and_calibrations(fiel
     )  # fmt: skip
     assert order.log_names == ("a", "a (2)", "a (3)", "b", "a (4)")
     assert [log.origin.name for log in logs_of(order)] == list(order.log_names)
+
+
+def test_a_job_names_the_jobs_whose_results_it_reads_and_waits_for_them(site):
+    site.survey("in turn")
+    processed = site.upload(survey="in turn", process=True).json()["job"]["job_id"]
+    adjust = site.client.post("/api/v1/jobs", json={"kind": "adjust", "survey": "in turn"}).json()
+    made = site.client.post("/api/v1/jobs", json={"kind": "site", "survey": "in turn"}).json()
+    calibrate = {"kind": "calibrate", "survey": "in turn"}
+    assert site.client.post("/api/v1/jobs", json=calibrate).json()["waits_for"] == []
+    assert adjust["waits_for"] == [processed]
+    assert made["waits_for"] == [processed, adjust["job_id"]]
+    assert made["message"] == "Waiting for 2 jobs of the survey."
+    ended = [site.ended(one) for one in (processed, adjust["job_id"], made["job_id"])]
+    assert [one["waits_for"] for one in ended] == [[], [], []]
+    begins = [one["started_at"] for one in ended]
+    ends = [one["finished_at"] for one in ended]
+    assert ends[0] <= begins[1] and ends[1] <= begins[2]
+
+
+def test_a_job_that_waits_for_another_can_be_dismissed(site):
+    site.survey("left waiting")
+    processed = site.upload(survey="left waiting", process=True).json()["job"]["job_id"]
+    adjust = {"kind": "adjust", "survey": "left waiting"}
+    job = site.client.post("/api/v1/jobs", json=adjust).json()["job_id"]
+    assert site.client.delete(f"/api/v1/jobs/{job}").json()["status"] == "dismissed"
+    assert site.ended(processed)["status"] == "successful"
+    assert site.client.get(f"/api/v1/jobs/{job}").json()["status"] == "dismissed"

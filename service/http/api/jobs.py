@@ -67,6 +67,8 @@ def list_jobs(
     limit: Limit = 100,
 ) -> Listing[Job]:
     """List jobs, newest first."""
+    if recording is not None:
+        service.catalogue.get_recording(recording)
     page = service.catalogue.list_jobs(
         survey=survey, recording_id=recording, status=status, after=after, limit=limit
     )

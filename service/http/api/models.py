@@ -193,6 +193,9 @@ class Job(Recorded):
     finished_at: datetime | None
     error_code: str | None
     error_reason: str | None
+    waits_for: tuple[str, ...] = Field(
+        default=(), description="Ids of the open jobs whose results this job reads."
+    )
 
 
 class Upload(Recording):

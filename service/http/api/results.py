@@ -6,8 +6,10 @@ from collections.abc import Callable
 from typing import Annotated, Any, Literal, TypeVar
 
 from fastapi import APIRouter, Path, Query, Response
-from pydantic import Field
+from pydantic import AfterValidator, Field
 
+from spheremark.pipelines.errors import NotFoundError
+from spheremark.pipelines.sphere import METHODS
 from spheremark.service.http.api import rows
 from spheremark.service.http.api.models import Listing, Run, Strict
 from spheremark.service.http.api.rows import FileName, Plain, ResultFilter, listing_of
@@ -31,6 +33,7 @@ FROM {table} AS x JOIN runs AS r USING (run_id) JOIN surveys AS s USING (survey_
 """
 _LIST = _ROWS + _FILTERS + "ORDER BY r.finished_at, {order} LIMIT $n OFFSET $after"
 _ONE = _ROWS + "WHERE {id} = $id"
+_STOP = "SELECT stop FROM stops WHERE stop = $stop LIMIT 1"
 _FIT = {
     "id": "concat_ws('~', x.run_id, x.stop, x.fit_method, x.marker)",
     "table": "marker_fits",
@@ -76,12 +79,24 @@ AdjustmentId = Annotated[str, Path(description="Id of the adjustment.")]
 CalibrationId = Annotated[str, Path(description="Id of the calibration.")]
 
 
+def _check_method(name: str) -> str:
+    """Refuse the name of no fitting method."""
+    if name not in METHODS:
+        raise ValueError(f"{name!r} is no fitting method; there are {', '.join(METHODS)}")
+    return name
+
+
+FitMethod = Annotated[
+    str, AfterValidator(_check_method), Field(json_schema_extra={"enum": [*METHODS]})
+]
+
+
 class RowFilter(rows.ResultFilter):
     """Which rows of a list of results are requested."""
 
     run: str | None = Field(default=None, description="Id of a run, even if a newer one exists.")
     stop: str | None = Field(default=None, description="Name of a stop.")
-    fit_method: str | None = Field(default=None, description="Fitting method.")
+    fit_method: FitMethod | None = Field(default=None, description="Fitting method.")
     status: Literal["ok", "weak", "failed"] | None = Field(
         default=None, description="ok, weak, or failed for a station."
     )
@@ -113,6 +128,10 @@ def _download(path: str, name: str, model: Any, tag: str) -> Callable[[_Route], 
 @router.get("/runs", name="list_runs", tags=["results"])
 def list_runs(chosen: Annotated[RunFilter, Query()], service: Current) -> Listing[Run]:
     """List runs, newest first."""
+    if chosen.recording is not None:
+        service.catalogue.get_recording(chosen.recording)
+    if chosen.job is not None:
+        service.catalogue.get_job(chosen.job)
     page = service.catalogue.list_runs(
         survey=chosen.survey,
         recording_id=chosen.recording,
@@ -200,9 +219,13 @@ def download_calibration(calibration: CalibrationId, name: FileName, service: Cu
 
 
 def _listed(service: Service, table: dict[str, str], chosen: RowFilter) -> Plain:
-    """Return a part of the rows of runs; refuse a survey that does not exist."""
+    """Return a part of the rows of runs; refuse names that do not exist."""
     if chosen.survey is not None:
         service.catalogue.get_survey(chosen.survey)
+    if chosen.run is not None:
+        service.catalogue.get_run(chosen.run)
+    if chosen.stop is not None and not service.catalogue.rows(_STOP, {"stop": chosen.stop}):
+        raise NotFoundError(f"There are no results of a stop {chosen.stop!r}.")
     return rows.listed(service, _LIST.format(**table), chosen.model_dump())
 
 

@@ -92,6 +92,8 @@ def export_coordinates(
     survey: Annotated[str | None, QueryParameter(description="Id or name of a survey.")] = None,
 ) -> Response:
     """Return the newest stations and the control marks as CSV, in the site frame."""
+    if survey is not None:
+        service.catalogue.get_survey(survey)
     return Response(coordinates_csv(service.catalogue, survey), media_type="text/csv")
 
 
@@ -108,6 +110,8 @@ def export_points(
     origin: Annotated[str | None, QueryParameter(description=ORIGIN)] = None,
 ) -> Response:
     """Return the newest stations and the control marks for other programs."""
+    if survey is not None:
+        service.catalogue.get_survey(survey)
     place = GeographicOrigin.parse(origin) if origin else None
     text = format_points(named_points(service.catalogue, survey), f".{kind}", place)
     return Response(text, media_type=POINT_MEDIA[kind])
