@@ -31,6 +31,17 @@ def plotly_url() -> str:
     return f"{STATIC}/plotly-{metadata.version('plotly')}.min.js"
 
 
+def reference_folder() -> Path:
+    """Return the folder of Swagger UI in the installed package."""
+    return Path(str(resources.files("fastapi_offline"))) / "static"
+
+
+def reference_urls() -> dict[str, str]:
+    """Return the addresses of Swagger UI's files, which change with its version."""
+    folder = f"{STATIC}/swagger-{metadata.version('fastapi-offline')}"
+    return {"script": f"{folder}/swagger-ui-bundle.js", "style": f"{folder}/swagger-ui.css"}
+
+
 @cache
 def digest() -> str:
     """Return a short digest of all static files."""

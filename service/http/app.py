@@ -18,7 +18,7 @@ from starlette.types import ASGIApp
 
 from spheremark.pipelines.errors import InputError
 from spheremark.service.errors import Problem, UnauthorizedError
-from spheremark.service.http import api, errors, observation, security
+from spheremark.service.http import api, errors, examples, observation, security
 from spheremark.service.http.pages import accuracy, frame, jobs, networks, plans, sites, surveys
 from spheremark.service.http.state import Current, opened
 from spheremark.service.logs import event_level
@@ -44,6 +44,8 @@ class _Application(FastAPI):
                 for operation in path.values():
                     content = operation["responses"]["default"]["content"]
                     content[errors.MEDIA_TYPE] = content.pop(next(iter(content)))
+                    operation["summary"] = operation["description"].partition("\n")[0].rstrip(".")
+                    examples.add_to(operation)
         return super().openapi()
 
     def build_middleware_stack(self) -> ASGIApp:

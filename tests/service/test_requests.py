@@ -333,7 +333,7 @@ class Listening:
         self.thread.join()
 
 
-@pytest.mark.parametrize(("path", "status"), [("/api/v1/plans", 413), ("/api/v1/recordings", 422)])
+@pytest.mark.parametrize(("path", "status"), [("/api/v1/plans", 413), ("/api/v1/recordings", 404)])
 def test_a_refusal_is_read_by_a_sender_who_sends_all_before_reading(tmp_path, path, status):
     with Listening(tmp_path) as port:
         connection = http.client.HTTPConnection("127.0.0.1", port, timeout=20)

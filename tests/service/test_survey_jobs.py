@@ -423,7 +423,8 @@ def test_a_job_names_the_jobs_whose_results_it_reads_and_waits_for_them(site):
     assert [one["waits_for"] for one in ended] == [[], [], []]
     begins = [one["started_at"] for one in ended]
     ends = [one["finished_at"] for one in ended]
-    assert ends[0] <= begins[1] and ends[1] <= begins[2]
+    assert ends[0] <= begins[1]
+    assert ends[1] <= begins[2]
 
 
 def test_a_job_that_waits_for_another_can_be_dismissed(site):

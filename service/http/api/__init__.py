@@ -25,7 +25,6 @@ from spheremark.service.http.api import (
 from spheremark.service.http.api import sites as products
 
 
-
 def _require_known_parameters(request: Request) -> None:
     """Refuse parameters of the query that the operation does not describe."""
     known = _parameters(request.app).get(request.scope["route"].name)
@@ -34,9 +33,7 @@ def _require_known_parameters(request: Request) -> None:
     unknown = [name for name in request.query_params if name not in known]
     if unknown:
         text = f"this operation has {', '.join(sorted(known)) or 'no parameters'}"
-        found = [
-            {"type": "extra_forbidden", "loc": ("query", one), "msg": text} for one in unknown
-        ]
+        found = [{"type": "extra_forbidden", "loc": ("query", one), "msg": text} for one in unknown]
         raise RequestValidationError(found)
 
 

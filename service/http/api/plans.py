@@ -51,6 +51,12 @@ router = APIRouter(tags=["plans"])
 
 _MARKER_RADIUS = 0.100  # [m]
 _GROUND_ACROSS = 150  # places of the ground's heights that a map shows
+_TERRAIN = {
+    "requestBody": {
+        "required": True,
+        "content": {"application/octet-stream": {"schema": {"type": "string", "format": "binary"}}},
+    }
+}
 
 SiteKey = Annotated[
     str, Path(description="paper-field, paper-field@3 (another seed), or terrain:<id>.")
@@ -202,7 +208,7 @@ def get_plan(
     return StoredPlan.model_validate(stored.get_plan(service.catalogue, plan))
 
 
-@router.post("/terrains", name="upload_terrain", status_code=201)
+@router.post("/terrains", name="upload_terrain", status_code=201, openapi_extra=_TERRAIN)
 async def upload_terrain(
     request: Request,
     service: Current,

@@ -56,7 +56,10 @@ async def document(request: Request) -> Document:
 
 def bodies(*media_types: str) -> dict[str, Any]:
     """Describe in OpenAPI a body that is a file of one of these types."""
-    content = {one: {"schema": {"type": "string"}} for one in media_types}
+    content = {
+        one: {"schema": {"type": "object" if one == "application/json" else "string"}}
+        for one in media_types
+    }
     return {"requestBody": {"required": True, "content": content}}
 
 

@@ -30,6 +30,13 @@ _BODY = {
     "requestBody": {"content": {PART: {"schema": {"type": "string", "format": "binary"}}}},
 }
 
+_PROTOCOL = {
+    "Tus-Version": {"schema": {"type": "string"}, "example": VERSION},
+    "Tus-Extension": {"schema": {"type": "string"}, "example": EXTENSIONS},
+    "Tus-Max-Size": {"schema": {"type": "string"}, "example": "8589934592"},
+    "Tus-Checksum-Algorithm": {"schema": {"type": "string"}, "example": ",".join(ALGORITHMS)},
+}
+
 UploadId = Annotated[str, Path(description="Id of the upload.")]
 Tus = Annotated[str | None, Header(alias="Tus-Resumable", description=f"{VERSION}.")]
 Checksum = Annotated[
@@ -38,7 +45,13 @@ Checksum = Annotated[
 ]
 
 
-@router.options("", name="describe_uploads", status_code=204, response_class=Response)
+@router.options(
+    "",
+    name="describe_uploads",
+    status_code=204,
+    response_class=Response,
+    responses={204: {"headers": _PROTOCOL}},
+)
 def describe_uploads(service: Current) -> Response:
     """Say what of tus is supported."""
     return _answer(

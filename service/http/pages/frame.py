@@ -29,6 +29,20 @@ def plotly_script() -> FileResponse:
     )
 
 
+@router.get(assets.reference_urls()["script"], response_class=FileResponse)
+@router.get(assets.reference_urls()["style"], response_class=FileResponse)
+def reference_file(request: Request) -> FileResponse:
+    """Return a file of Swagger UI from the installed package."""
+    path = assets.reference_folder() / request.url.path.rpartition("/")[2]
+    return FileResponse(path, headers={"Cache-Control": _A_YEAR})
+
+
+@router.get("/docs")
+def docs(service: Current) -> str:
+    """Show the interface for programs."""
+    return render("docs.html", frame=frame_of(service), reference=assets.reference_urls())
+
+
 @router.get("/sql")
 def sql(service: Current, q: Annotated[str, Query(max_length=100_000)] = "") -> str:
     """Show the workbench for queries."""
