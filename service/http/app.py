@@ -40,12 +40,13 @@ class _Application(FastAPI):
     def openapi(self) -> dict[str, Any]:
         """Return the description of the interface, in which problems have their media type."""
         if self.openapi_schema is None:
+            schemas = super().openapi()["components"]["schemas"]
             for path in super().openapi()["paths"].values():
                 for operation in path.values():
                     content = operation["responses"]["default"]["content"]
                     content[errors.MEDIA_TYPE] = content.pop(next(iter(content)))
                     operation["summary"] = operation["description"].partition("\n")[0].rstrip(".")
-                    examples.add_to(operation)
+                    examples.add_to(operation, schemas)
         return super().openapi()
 
     def build_middleware_stack(self) -> ASGIApp:

@@ -52,31 +52,77 @@ _PARAMETERS: Plain = {
 """Values of parameters by name, where an operation has none of its own."""
 
 
-def add_to(operation: Plain) -> None:
+def add_to(operation: Plain, schemas: Plain) -> None:
     """Add the examples of an operation to its description in OpenAPI."""
     found = _examples().get(operation["operationId"], {})
     given = _PARAMETERS | found.get("parameters", {})
     for parameter in operation.get("parameters", ()):
         if parameter["name"] in given:
-            parameter["example"] = given[parameter["name"]]
-    for media_type, body in operation.get("requestBody", {}).get("content", {}).items():
-        if media_type != "application/json":
-            body["example"] = _TEXTS.get(media_type, _BINARY)
-        elif "body" in found:
-            body["example"] = found["body"]
-    for status, response in operation["responses"].items():
-        _add_to_response(response, found.get("response") if found.get("status") == status else None)
+            is_list = parameter["schema"].get("type") == "array"
+            value = given[parameter["name"]]
+            parameter["example"] = [value] if is_list else value
+        elif parameter.get("required"):
+            parameter["example"] = _sample(parameter["schema"], schemas)
+    bodies = [(operation.get("requestBody", {}), found.get("body"))]
+    bodies += [
+        (response, found.get("response") if found.get("status") == status else None)
+        for status, response in operation["responses"].items()
+    ]
+    for body, shown in bodies:
+        for media_type, content in body.get("content", {}).items():
+            content["example"] = _example(media_type, content.get("schema", {}), schemas, shown)
 
 
-def _add_to_response(response: Plain, shown: Any) -> None:
-    """Add examples to a response: what was shown as JSON, and texts of the other types."""
-    for media_type, content in response.get("content", {}).items():
-        if media_type == MEDIA_TYPE:
-            content["example"] = _PROBLEM
-        elif media_type != "application/json":
-            content["example"] = _TEXTS.get(media_type, _BINARY)
-        elif shown is not None:
-            content["example"] = shown
+def _example(media_type: str, schema: Plain, schemas: Plain, shown: Any) -> Any:
+    """Return the example of a body: what a service gave, else the least that its schema allows."""
+    if media_type == MEDIA_TYPE:
+        return _PROBLEM
+    if media_type != "application/json":
+        return _TEXTS.get(media_type, _BINARY)
+    return _sample(schema, schemas) if shown is None else _completed(shown, schema, schemas)
+
+
+def _completed(value: Any, schema: Plain, schemas: Plain) -> Any:
+    """Return a value with the fields that its schema requires since it was taken."""
+    if "$ref" in schema:
+        return _completed(value, schemas[schema["$ref"].rpartition("/")[2]], schemas)
+    if isinstance(value, list):
+        return [_completed(one, schema.get("items", {}), schemas) for one in value]
+    if not isinstance(value, dict) or "properties" not in schema:
+        return value
+    fields = schema["properties"]
+    known = {key: _completed(one, fields.get(key, {}), schemas) for key, one in value.items()}
+    missing = (name for name in schema.get("required", ()) if name not in known)
+    return known | {name: _sample(fields[name], schemas) for name in missing}
+
+
+def _sample(schema: Plain, schemas: Plain) -> Any:
+    """Return a value that a schema allows, with the fields that it requires."""
+    if "$ref" in schema:
+        return _sample(schemas[schema["$ref"].rpartition("/")[2]], schemas)
+    for key in ("example", "default", "const"):
+        if key in schema:
+            return schema[key]
+    if "enum" in schema:
+        return schema["enum"][0]
+    if "anyOf" in schema:
+        return _sample(schema["anyOf"][0], schemas)
+    if schema.get("type") == "object":
+        fields = schema.get("properties", {})
+        return {name: _sample(fields[name], schemas) for name in schema.get("required", ())}
+    return _simple(schema, schemas)
+
+
+def _simple(schema: Plain, schemas: Plain) -> Any:
+    """Return a list, a text or a number that a schema allows."""
+    kind, least = schema.get("type", "string"), schema.get("minimum", 0)
+    if kind == "array":
+        items = schema.get("prefixItems") or [schema["items"]] * schema.get("minItems", 0)
+        return [_sample(one, schemas) for one in items]
+    if schema.get("format") == "date-time":
+        return "2026-11-22T12:00:00Z"
+    values = {"integer": least, "number": float(schema.get("exclusiveMinimum", least)) + 1.0}
+    return values.get(kind, kind == "boolean" or "name")
 
 
 @cache
