@@ -19,7 +19,16 @@ from starlette.types import ASGIApp
 from spheremark.pipelines.errors import InputError
 from spheremark.service.errors import Problem, UnauthorizedError
 from spheremark.service.http import api, errors, examples, observation, security
-from spheremark.service.http.pages import accuracy, frame, jobs, networks, plans, sites, surveys
+from spheremark.service.http.pages import (
+    accuracy,
+    compare,
+    frame,
+    jobs,
+    networks,
+    plans,
+    sites,
+    surveys,
+)
 from spheremark.service.http.state import Current, opened
 from spheremark.service.logs import event_level
 from spheremark.service.settings import Settings
@@ -90,6 +99,7 @@ def create_app(settings: Settings) -> FastAPI:
     app.include_router(about)
     for page in (
         accuracy,
+        compare,
         sites,
         surveys,
         jobs,

@@ -85,9 +85,12 @@ async def opened(settings: Settings) -> AsyncIterator[Service]:
 
 
 def _warm_up() -> None:
-    """Start the process that reads logs, so that the first upload is as fast as others."""
+    """Start the process that reads logs and load plots: the first of each is as fast as others."""
+    from spheremark.web.figures.accuracy import Shown, distribution
+
     with suppress(RuntimeError):  # each upload tries again, and says so
         start_readers()
+    distribution([], Shown(is_error=True, tolerance_m=1.0)).to_plotly_json()
 
 
 def current(request: Request) -> Service:

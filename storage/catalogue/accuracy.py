@@ -62,7 +62,7 @@ def _on_fits(sql: str) -> str:
     return sql.replace("{fits}", FITS.strip())
 
 
-# 3000 errors of each method for a model, of whole stops; 1500 stations of a map, 60 surveys of a
+# 3000 errors of each method for a model, of whole stops; 600 stations of a map, 60 surveys of a
 # figure: more are neither legible nor fast
 QUERIES: Mapping[str, str] = {
     "distance": _binned(FITS, "range_m", "floor(range_m)", "floor(range_m) + 1"),
@@ -135,7 +135,7 @@ WITH fixes AS (
         AND f.x_m IS NOT NULL AND f.resection_method = $resection
 )
 SELECT *, count(*) OVER () AS n_all FROM fixes
-ORDER BY coalesce(error_3d_m, sigma_3d_m) DESC, survey, stop, fit_method LIMIT 1500
+ORDER BY coalesce(error_3d_m, sigma_3d_m) DESC, survey, stop, fit_method LIMIT 600
 """),
     "marks": """
 SELECT s.name AS survey, c.mark, c.x_m, c.y_m, c.z_m

@@ -37,7 +37,7 @@ Row = Mapping[str, Any]
 LEVELS = (0.5, 1, 2, 3, 5, 7, 10, *range(15, 90, 5), 90, 93, 95, 97, 98, 99, 99.5)
 """Percentages of the quantiles of a distribution."""
 _TOP = 1.25  # of the greatest 97.5 % quantile is the end of a linear axis
-_N_OUTLINES = 400  # ellipses of one map: those of the worst stations
+_N_OUTLINES = 150  # ellipses of one map: those of the worst stations
 _N_NAMED = 40  # marks and stations with their names
 _STUDY = theme.Style("study, Table 2", theme.TEXT, "x-thin")
 
@@ -215,9 +215,9 @@ def _add_stations(figure: go.Figure, method: str, rows: Columns, factor: float) 
     ids = [stop_url(survey, stop, method) for survey, stop in names]
     hidden = {"legendgroup": style.label, "showlegend": False, "hoverinfo": "none"}
     few = range(min(len(x), _N_OUTLINES))
-    outlines = [ellipse_outline(rows, i, factor) for i in few]
-    linked = [ids[i] for i in few for _ in range(len(outlines[i]) + 1)]
-    add_strokes(figure, outlines, style, line_width=1.5, ids=linked, **hidden)
+    outlines = [ellipse_outline(rows, i, factor)[::2] for i in few]
+    linked = {"links": [ids[i] for i in few], "step": len(outlines[0]) + 1}
+    add_strokes(figure, outlines, style, line_width=1.5, meta=linked, **hidden)
     errors = np.column_stack([floats(rows, f"error_{axis}_m") for axis in "xy"])
     places = np.column_stack([x, y])
     lines = [np.stack([places[i], places[i] - factor * errors[i]]) for i in few]

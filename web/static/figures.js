@@ -77,7 +77,10 @@ function indexed(figure) {
 
 const linkOf = (event) => {
   const point = event.points?.[0];
-  return point?.data?.ids?.[point.pointNumber ?? point.pointIndex] || "";
+  if (!point) return "";
+  const number = point.pointNumber ?? point.pointIndex;
+  const { ids, meta } = point.data; // of lines, one link for each stroke of so many vertices
+  return ids?.[number] || meta?.links?.[Math.floor(number / meta.step)] || "";
 };
 
 export function follow(link) {

@@ -11,6 +11,7 @@ from fastapi.exceptions import RequestValidationError
 
 from spheremark.service.http.api import (
     audit,
+    compare,
     figures,
     jobs,
     plans,
@@ -48,6 +49,6 @@ def _parameters(app: FastAPI) -> dict[str, set[str]]:
 router = APIRouter(dependencies=[Depends(_require_known_parameters)])
 for part in (
     *(surveys, recordings, uploads, jobs, results),
-    *(products, rigs, plans, sql, figures, audit, problems),
+    *(products, rigs, plans, sql, figures, compare, audit, problems),
 ):
     router.include_router(part.router)
