@@ -35,7 +35,9 @@ class Column(NamedTuple):
             return "-"
         if not self.form or isinstance(value, str):
             return str(value)
-        return format(_PER_SI.get(self.unit, 1) * value, self.form)
+        sign = self.form[:1] if self.form[:1] == "+" else ""
+        form = f"{sign}z{self.form[len(sign) :]}" if self.form.endswith("f") else self.form
+        return format(_PER_SI.get(self.unit, 1) * value, form)
 
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)

@@ -24,6 +24,7 @@ from spheremark.service.cli.bench import bench, reproduce
 from spheremark.service.cli.options import AsJson, Field, RadiusM, grouped
 from spheremark.service.cli.plan import plan
 from spheremark.service.cli.reading import Logs, OneLog, Reading
+from spheremark.service.cli.report import report
 from spheremark.service.cli.site import site
 from spheremark.service.cli.spheres import spheres
 from spheremark.service.cli.survey import adjust, calibrate
@@ -312,6 +313,7 @@ app.command()(adjust)
 app.command()(calibrate)
 app.command()(site)
 app.command()(spheres)
+app.command()(report)
 app.command()(bench)
 
 

@@ -7,6 +7,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from shutil import copyfile
 from typing import Any
+from urllib.parse import quote
 
 import httpx
 
@@ -60,6 +61,22 @@ class Source:
                 place = GeographicOrigin.parse(origin) if origin else None
                 points = named_points(catalogue, survey)
                 target.write_text(format_points(points, target.suffix, place), encoding="utf-8")
+
+    def report(self, survey: str, target: Path, adjustment: str | None) -> None:
+        """Write the report of a survey to a file, as PDF or HTML by its ending."""
+        if self._url:
+            query = {"adjustment": adjustment} if adjustment else {}
+            with self._client() as client:
+                path = f"/surveys/{quote(survey, safe='')}/report{target.suffix}"
+                client.download(path, target, **query)
+            return
+        from spheremark.service.serialise.survey_report import survey_report
+        from spheremark.web.pages.report import report_html, report_pdf
+
+        with self._catalogue() as catalogue:
+            made = survey_report(catalogue, survey, adjustment)
+        is_pdf = target.suffix == ".pdf"
+        target.write_bytes(report_pdf(made) if is_pdf else report_html(made).encode())
 
     def _running(self) -> str:
         """Return the address of the settings if a service answers there."""

@@ -26,6 +26,7 @@ from spheremark.service.http.pages import (
     jobs,
     networks,
     plans,
+    reports,
     sites,
     surveys,
 )
@@ -100,6 +101,7 @@ def create_app(settings: Settings) -> FastAPI:
     for page in (
         accuracy,
         compare,
+        reports,
         sites,
         surveys,
         jobs,

@@ -31,9 +31,9 @@ def _sigma(i: int) -> Callable[[Plain], float]:
 _PLACES = (
     Column(lambda row: row["name"] + "*" * row.get("is_control", False), "Name"),
     *vector("position_m", "m", "12.4f"),
-    *(Column(_sigma(i), f"s{axis}", "mm", ".1f") for i, axis in enumerate("XYZ")),
-    Column("ellipse_major_95_m", "a95", "mm", ".1f"),
-    Column("ellipse_minor_95_m", "b95", "mm", ".1f"),
+    *(Column(_sigma(i), f"s{axis}", "mm", ".2f") for i, axis in enumerate("XYZ")),
+    Column("ellipse_major_95_m", "a95", "mm", ".2f"),
+    Column("ellipse_minor_95_m", "b95", "mm", ".2f"),
     Column("ellipse_bearing_deg", "bearing", "deg", ".0f"),
     Column("n_observations", "seen", "", "d"),
 )
@@ -75,7 +75,12 @@ _RIG = (
 def report(network: Plain, title: str = "") -> str:
     """Return the report of a network, from its JSON."""
     parts = [*_summary(network, title)]
-    for table in (*places(network), *_observations(network), *checks(network), *_rest(network)):
+    for table in (
+        *places(network),
+        *tables_of_observations(network),
+        *checks(network),
+        *_rest(network),
+    ):
         parts += [table.title, _RULE, *_aligned(table), *table.notes, ""]
     return "\n".join(parts)
 
@@ -118,7 +123,7 @@ def not_used(network: Plain) -> Iterator[str]:
         yield f"{one['kind'].capitalize()} {what}: {one['reason']}"
 
 
-def _observations(network: Plain) -> Iterator[Table]:
+def tables_of_observations(network: Plain) -> Iterator[Table]:
     """Yield the tables of residuals: centres with reliability, levelling, control."""
     title = "OBSERVED CENTRES, largest w first (v observed - computed, r of 3, EX: shift by an MDB)"
     centres = sorted(network["observations"], key=lambda row: -(row["w"] or 0.0))

@@ -31,6 +31,7 @@ PAGES = [
     f"{STOP}?method=paper&marker=M03",
     "/jobs",
     "/docs",
+    "/surveys/field/report",
     "/plan?a=P01:6.5,0.5,1;P02:-1,6.5,1;P03:-6.5,-3,1&b=P01:6.5,0.5,1;P02:-1,6.5,1&stop=lane3-stop1",
     "/plan/random?n_arrangements=2000",
     "/sql?q=SELECT+stop%2C+x_m%2C+y_m+FROM+latest_station_fixes+ORDER+BY+ALL",

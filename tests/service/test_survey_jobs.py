@@ -425,6 +425,10 @@ def test_a_job_names_the_jobs_whose_results_it_reads_and_waits_for_them(site):
     ends = [one["finished_at"] for one in ended]
     assert ends[0] <= begins[1]
     assert ends[1] <= begins[2]
+    report = site.client.get("/api/v1/surveys/in turn/report.html").text
+    assert "Network adjustment report" in report
+    assert "Observed centres" in report
+    assert "lane1-stop1" in report
 
 
 def test_a_job_that_waits_for_another_can_be_dismissed(site):

@@ -17,6 +17,7 @@ from spheremark.service.http.api import (
     plans,
     problems,
     recordings,
+    reports,
     results,
     rigs,
     sql,
@@ -48,7 +49,7 @@ def _parameters(app: FastAPI) -> dict[str, set[str]]:
 
 router = APIRouter(dependencies=[Depends(_require_known_parameters)])
 for part in (
-    *(surveys, recordings, uploads, jobs, results),
+    *(surveys, reports, recordings, uploads, jobs, results),
     *(products, rigs, plans, sql, figures, compare, audit, problems),
 ):
     router.include_router(part.router)

@@ -1,0 +1,2 @@
+// The report's page: its button prints it.
+document.getElementById("print").addEventListener("click", () => print());
