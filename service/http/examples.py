@@ -115,13 +115,15 @@ def _sample(schema: Plain, schemas: Plain) -> Any:
 
 def _simple(schema: Plain, schemas: Plain) -> Any:
     """Return a list, a text or a number that a schema allows."""
-    kind, least = schema.get("type", "string"), schema.get("minimum", 0)
+    kind: str = schema.get("type", "string")
+    least: float = schema.get("minimum", 0)
     if kind == "array":
         items = schema.get("prefixItems") or [schema["items"]] * schema.get("minItems", 0)
         return [_sample(one, schemas) for one in items]
     if schema.get("format") == "date-time":
         return "2026-11-22T12:00:00Z"
-    values = {"integer": least, "number": float(schema.get("exclusiveMinimum", least)) + 1.0}
+    above: float = schema.get("exclusiveMinimum", least)
+    values = {"integer": least, "number": above + 1.0}
     return values.get(kind, kind == "boolean" or "name")
 
 
