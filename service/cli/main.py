@@ -34,6 +34,7 @@ from spheremark.service.cli.terminal import progress as _progress
 from spheremark.service.cli.terminal import settings as _settings
 from spheremark.service.cli.tokens import token
 from spheremark.service.cli.upkeep import backup, doctor, restore
+from spheremark.service.cli.watch import watch
 
 if TYPE_CHECKING:
     from spheremark.pipelines.model import StopResult
@@ -314,6 +315,7 @@ app.command()(calibrate)
 app.command()(site)
 app.command()(spheres)
 app.command()(report)
+app.command()(watch)
 app.command()(bench)
 
 

@@ -7,6 +7,7 @@ into neutral columns (``families``): ``pointclouds``, ``packets``, ``joint_state
 recording, and every declared length is checked before use.
 """
 
+from spheremark.storage.recordings.closed import closed_logs
 from spheremark.storage.recordings.container import local_copy, require_file
 from spheremark.storage.recordings.options import LogOptions
 from spheremark.storage.recordings.preflight import Preflight, TopicReport, inspect_log
@@ -19,6 +20,7 @@ __all__ = [
     "LogOptions",
     "Preflight",
     "TopicReport",
+    "closed_logs",
     "file_digest",
     "inspect_log",
     "local_copy",

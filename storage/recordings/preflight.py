@@ -18,6 +18,7 @@ from spheremark.pipelines.errors import InputError, MissingRigError, NotFoundErr
 from spheremark.pipelines.model import Array, Index, Nanos, Origin, Rig, ScanLog
 from spheremark.pipelines.scan.diagnosis import diagnose
 from spheremark.pipelines.scan.rigs import tilted_vlp16
+from spheremark.storage.recordings import timeline
 from spheremark.storage.recordings.container import Batch, Channel
 from spheremark.storage.recordings.decoding import Decoders
 from spheremark.storage.recordings.options import LogOptions
@@ -35,6 +36,7 @@ _TURN_WEAK = np.pi  # half a turn shows the whole scene to a tilted LiDAR
 _MOVES = np.radians(0.1)  # per second; a gimbal at rest turns less
 _SPIN_MIN, _SPIN_MAX = 1.0, 1e3  # [rad/s] a VLP-16 turns at 31 to 126
 _STOP_MAX = 3600.0  # [s]; scan lines of longer stops are not counted
+_FAR_NS = 86_400_000_000_000  # [ns] a day: topics that begin so much later have no clock
 _CROSSING_MIN = 1e-6  # a laser whose plane is nearer to the horizontal never crosses the horizon
 
 
@@ -52,6 +54,10 @@ class TopicReport:
         Messages per second; 0 for fewer than two.
     longest_gap_s : float
         Longest time between two messages, by the recorder's clock.
+    counts : tuple of int
+        Messages in each of 120 equal parts of the log.
+    gaps_s : tuple of (float, float)
+        Begin and end of its longest pauses, since the first message of the log.
     """
 
     topic: str
@@ -60,6 +66,8 @@ class TopicReport:
     n_messages: int
     rate_hz: float
     longest_gap_s: float
+    counts: tuple[int, ...] = ()
+    gaps_s: tuple[tuple[float, float], ...] = ()
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -106,6 +114,12 @@ class Preflight:
         Options with which the log was read, as far as they are no defaults.
     diagnosis : tuple of str
         What other signs, units and clocks make of the scan, if that was tried.
+    log_duration_s : float
+        From the first message of any topic to the last.
+    gimbal_times_s, gimbal_angles_deg : tuple of float
+        Samples of the gimbal's angle, since the first message of the log.
+    stop_spans_s : tuple of (float, float)
+        First and last return of each stop, likewise.
     """
 
     verdict: str
@@ -127,6 +141,10 @@ class Preflight:
     coverage_gap_deg: float | None = None
     reading: dict[str, Any] = field(default_factory=dict)
     diagnosis: tuple[str, ...] = ()
+    log_duration_s: float = 0.0
+    gimbal_times_s: tuple[float, ...] = ()
+    gimbal_angles_deg: tuple[float, ...] = ()
+    stop_spans_s: tuple[tuple[float, float], ...] = ()
 
     def to_mapping(self) -> dict[str, Any]:
         """Return the report as plain values for JSON."""
@@ -150,11 +168,21 @@ class _Times:
         """Return the times of a topic in ascending order."""
         return np.asarray(np.sort(np.concatenate(self.parts[topic])))
 
+    def span(self) -> tuple[int, int]:
+        """Return the first and the last time of all topics, without implausible ones."""
+        ends = [self.of(topic)[[0, -1]] for topic in self.parts]
+        if not ends:
+            return 0, 0
+        middle = np.median([end[0] for end in ends])
+        near = [end for end in ends if abs(end[0] - middle) < _FAR_NS] or ends
+        return int(min(end[0] for end in near)), int(max(end[1] for end in near))
+
     def report(self, channel: Channel) -> TopicReport:
         """Return what a topic holds."""
         times = self.of(channel.topic) if channel.topic in self.parts else np.empty(0, np.int64)
         steps = times[1:] - times[:-1]
         span = float(steps.sum()) * 1e-9
+        start, end = self.span()
         return TopicReport(
             topic=channel.topic,
             schema=channel.schema,
@@ -162,6 +190,8 @@ class _Times:
             n_messages=len(times),
             rate_hz=len(steps) / span if span else 0.0,
             longest_gap_s=float(steps.max()) * 1e-9 if len(steps) else 0.0,
+            counts=timeline.counts(times, start, end) if len(times) else (),
+            gaps_s=timeline.gaps(times, start),
         )
 
 
@@ -231,12 +261,13 @@ def _inspect(
             start,
             size_bytes=recording.size,
             topics=tuple(times.report(topics[topic]) for topic in sorted(topics)),
+            log_duration_s=float(times.span()[1] - times.span()[0]) * 1e-9,
         )
     try:
         log = assemble(decoders, options, Origin(name=stem(url), digest=""))
     except InputError as error:
         return _refused(report, damage or error), None
-    report = _with_verdict(_described(report, log), log, _skew(decoders, times))
+    report = _with_verdict(_described(report, log), log, _skew(decoders, times), times.span())
     return (report if damage is None else _refused(report, damage)), log
 
 
@@ -262,7 +293,9 @@ def _described(report: Preflight, log: ScanLog) -> Preflight:
     )
 
 
-def _with_verdict(report: Preflight, log: ScanLog, skew: float | None) -> Preflight:
+def _with_verdict(
+    report: Preflight, log: ScanLog, skew: float | None, span_ns: tuple[int, int]
+) -> Preflight:
     """Return the report with stops, coverage, reasons and verdict."""
     from spheremark.pipelines.scan.stitching import choose_rig, pause_notes, split_stops, stitch
 
@@ -293,6 +326,7 @@ def _with_verdict(report: Preflight, log: ScanLog, skew: float | None) -> Prefli
         n_stops=len(stops),
         gimbal_coverage_deg=None if coverage is None else float(np.degrees(coverage)),
         coverage_gap_deg=None if gap is None else float(np.degrees(gap)),
+        **timeline.of_log(log, stops, *span_ns),
     )
     return report if refusal is None else _refused(report, refusal)
 

@@ -6,12 +6,15 @@ import json
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from fastapi import APIRouter
+import numpy as np
+from fastapi import APIRouter, Request
 from fastapi.responses import HTMLResponse
 
 from spheremark.pipelines.errors import NotFoundError
-from spheremark.service.http.pages.frame import frame_of
+from spheremark.service.http.pages.frame import address_of, frame_of
 from spheremark.service.http.state import Current, Service
+from spheremark.service.stop_decisions import is_good_enough
+from spheremark.web.pages.recording import recording_page
 from spheremark.web.templating import render
 
 router = APIRouter(include_in_schema=False, default_response_class=HTMLResponse)
@@ -40,6 +43,21 @@ UNION ALL
 SELECT '/calibrations/' || calibration_id, 'Calibration of the gimbal'
 FROM calibrations WHERE job_id = $id
 """
+_N_LIVE = 30
+_LIVE = """
+SELECT j.job_id, j.status, j.progress_percent, j.message, j.error_reason, j.created_at,
+    j.recording_id, c.name AS recording, s.name AS survey, s.tolerance_m
+FROM jobs AS j JOIN surveys AS s USING (survey_id) JOIN recordings AS c USING (recording_id)
+WHERE j.kind = 'process' ORDER BY j.created_at DESC, j.job_id LIMIT $n
+"""
+_LIVE_STOPS = """
+SELECT r.job_id, x.stop, f.status, f.sigma_3d_m, f.cov_xx_m2, f.cov_xy_m2, f.cov_xz_m2,
+    f.cov_yy_m2, f.cov_yz_m2, f.cov_zz_m2
+FROM stops AS x JOIN runs AS r USING (run_id)
+LEFT JOIN station_fixes AS f ON f.run_id = x.run_id AND f.stop = x.stop
+    AND f.fit_method = 'along_beam' AND f.resection_method = 'free_station'
+WHERE list_contains($jobs, r.job_id) ORDER BY x.stop
+"""
 _RECORDING = """
 SELECT recording_id, name, size_bytes, uploaded_at, verdict, preflight
 FROM recordings WHERE recording_id = $id
@@ -50,6 +68,29 @@ FROM recordings WHERE recording_id = $id
 def jobs(service: Current) -> str:
     """Show the newest jobs."""
     return render("jobs.html", frame=frame_of(service), jobs=newest_jobs(service))
+
+
+@router.get("/live")
+def live(request: Request, service: Current) -> str:
+    """Show the stops as they come, newest first, each with its decision."""
+    rows = service.catalogue.rows
+    found = [dict(row) for row in rows(_LIVE, {"n": _N_LIVE})]
+    by_job = {one["job_id"]: one | {"stops": []} for one in found}
+    for stop in rows(_LIVE_STOPS, {"jobs": list(by_job)}):
+        job = by_job[stop["job_id"]]
+        job["stops"].append({**stop, "grade": _grade(stop, job["tolerance_m"])})
+    shown = {"jobs": list(by_job.values()), "address": address_of(request)}
+    return render("live.html", frame=frame_of(service), **shown)
+
+
+def _grade(stop: Mapping[str, Any], tolerance: float) -> str:
+    """Return the decision on a stop: good enough, not good enough, or without a position."""
+    if stop["sigma_3d_m"] is None:
+        return "no position"
+    xx, xy, xz, yy, yz, zz = (stop[f"cov_{ij}_m2"] for ij in ("xx", "xy", "xz", "yy", "yz", "zz"))
+    cov = np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
+    is_good = is_good_enough(stop["status"], cov, tolerance)
+    return "good enough" if is_good else "not good enough"
 
 
 @router.get("/jobs/{job_id}")
@@ -74,9 +115,9 @@ def job(job_id: str, service: Current) -> str:
 def recording(recording_id: str, service: Current) -> str:
     """Show one recording: its preflight report and its jobs."""
     found = service.row(_RECORDING, recording_id, "recording")
-    preflight, own = json.loads(found["preflight"]), newest_jobs(service, recording=recording_id)
-    shown = {"recording": found, "preflight": preflight, "jobs": own}
-    return render("recording.html", frame=frame_of(service), **shown)
+    frame = frame_of(service)
+    jobs = newest_jobs(service, recording=recording_id)
+    return recording_page(frame, found, json.loads(found["preflight"]), jobs, frame.surveys)
 
 
 def newest_jobs(

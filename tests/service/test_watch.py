@@ -1,0 +1,153 @@
+"""Decisions on stops, when their recordings are closed: by the command line and on the page."""
+
+import json
+import shutil
+import threading
+import time
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from rosbags.rosbag2 import StoragePlugin
+
+from spheremark.pipelines.config import SurveyConfig
+from spheremark.pipelines.geometry import skew
+from spheremark.pipelines.model import Exclusion, NoFix, Status
+from spheremark.service.stop_decisions import _sigmas_with, decide, is_good_enough
+from spheremark.storage.recordings import closed_logs
+from tests.service.test_commands import run
+from tests.storage.made_up import MARKS
+from tests.storage.made_up import stop as made_up_stop
+from tests.storage.recorder import record, small_log
+from tests.storage.test_recordings_of_others import rosbag2
+
+FIRST = ("along_beam", "free_station")
+
+
+@pytest.mark.parametrize("plugin", list(StoragePlugin))
+def test_a_bag_is_closed_by_its_metadata_and_all_its_parts(tmp_path, plugin):
+    folder = tmp_path / "rover"
+    folder.mkdir()
+    bag = rosbag2(tmp_path / "bag", small_log(np.random.default_rng(2)), plugin)
+    (part,) = (one for one in bag.iterdir() if one.name != "metadata.yaml")
+    (folder / "bag").mkdir()
+    shutil.copy(part, folder / "bag")
+    assert closed_logs(folder) == []
+    shutil.copy(bag / "metadata.yaml", folder / "bag")
+    assert closed_logs(folder) == [folder / "bag"]
+    copied = folder / "bag" / part.name
+    copied.write_bytes(part.read_bytes()[: part.stat().st_size - 20])  # a copy that goes on
+    assert closed_logs(folder) == []
+    copied.unlink()
+    assert closed_logs(folder) == []
+
+
+def test_an_mcap_file_is_closed_by_its_footer_and_a_ros1_bag_by_its_name(tmp_path):
+    path = record(tmp_path / "a.mcap", small_log(np.random.default_rng(2)))
+    assert closed_logs(tmp_path) == [path]
+    path.write_bytes(path.read_bytes()[:-1])
+    (tmp_path / "b.bag.active").write_bytes(b"#ROSBAG V2.0\n")
+    (tmp_path / "notes.txt").write_text("no log")
+    (tmp_path / "short.mcap").write_bytes(b"\x89MCAP")
+    assert closed_logs(tmp_path) == []
+    (tmp_path / "b.bag.active").rename(tmp_path / "b.bag")
+    assert closed_logs(tmp_path) == [tmp_path / "b.bag"]
+
+
+def test_each_bag_is_decided_on_when_it_is_closed(stop, tmp_path):
+    def rover():
+        time.sleep(1.0)
+        (tmp_path / "cut.mcap").write_bytes(stop.log.read_bytes()[:5000])
+        (tmp_path / "bad.bag").write_bytes(b"#ROSBAG V2.0\nnothing")
+        shutil.copy(stop.log, tmp_path / "stop1.mcap")
+
+    recorder = threading.Thread(target=rover)
+    recorder.start()
+    control = stop.log.parent / "control.csv"
+    done = run("watch", tmp_path, "--control", control, "--count", "2", "--json")
+    recorder.join()
+    bad, good = (json.loads(line) for line in done.stdout.splitlines())
+    assert (bad["log"], bad["code"].startswith("input.recording")) == ("bad.bag", True)
+    (decision,) = good["stops"]
+    assert (good["log"], decision["stop"]) == ("stop1.mcap", "stop1")
+    assert decision["is_good_enough"]
+    assert "of them on marks" in decision["summary"]
+    assert good["seconds"] > 0.0
+
+
+def test_logs_that_were_there_before_are_taken_on_request(stop, tmp_path):
+    shutil.copy(stop.log, tmp_path / "stop1.mcap")
+    shown = run("watch", tmp_path, "--existing", "--count", "1").stdout
+    assert "no control marks, so no position" in shown
+
+
+def test_a_server_needs_a_survey_and_has_its_control(stop, tmp_path):
+    assert "--survey" in run("watch", tmp_path, "--server", "http://127.0.0.1:1", code=2).stderr
+    control = stop.log.parent / "control.csv"
+    both = ("--server", "http://127.0.0.1:1", "--survey", "a", "--control", control)
+    assert "those of the survey" in run("watch", tmp_path, *both, code=2).stderr
+
+
+def test_the_page_shows_the_decision_on_each_stop(site):
+    site.survey("live")
+    job = site.upload(survey="live", process=True, name="live-stop").json()["job"]["job_id"]
+    assert site.ended(job)["status"] == "successful"
+    page = site.client.get("/live").text
+    assert "live-stop" in page
+    assert '<span class="chip ok">good enough</span>' in page
+
+
+def decision_of(stop, **changes):
+    found = replace(stop, fixes={FIRST: replace(stop.fixes[FIRST], **changes)})
+    return decide(found, SurveyConfig(), MARKS)
+
+
+def test_a_station_is_good_enough_if_95_of_100_errors_are_within_the_tolerance():
+    """Of a spherical normal error, 95 % are within 2.7955 sigma (chi with 3 degrees of freedom)."""
+    for sigma, is_good in ((0.0099, True), (0.0101, False)):
+        cov = np.eye(3) * (0.03 / 2.7955 / 0.01 * sigma) ** 2
+        assert is_good_enough("ok", cov, 0.03) is is_good
+        assert not is_good_enough("weak", cov, 0.03)
+
+
+def test_a_decision_names_bad_markers_and_what_would_help():
+    found = decision_of(made_up_stop(), cov_p_site=np.eye(3) * 0.02**2)
+    assert not found.is_good_enough
+    assert "M07 is weak: Few points." in found.bad_markers
+    assert "M06 is left out: Fails the w-test." in found.bad_markers
+    (missing,) = (one for one in found.advice if "was not found" in one)
+    assert missing.startswith(MARKS.names[5])  # the one mark of six that the fix does not use
+    assert found.text.startswith("L1S1: not good enough.")
+    good = decision_of(made_up_stop(), cov_p_site=np.eye(3) * 1e-6)
+    assert (good.is_good_enough, good.advice) == (True, ())
+
+
+def test_a_stop_without_position_or_control_is_decided_on_by_its_reason_and_its_markers():
+    stop = made_up_stop()
+    no = NoFix(method="free_station", code="solve.no_match", reason="No match")
+    found = decide(replace(stop, fixes={FIRST: no}), SurveyConfig(), MARKS)
+    assert (found.is_good_enough, "no position: No match." in found.summary) == (False, True)
+    alone = decide(replace(stop, fixes={}), SurveyConfig(), None)
+    assert alone.is_good_enough
+    fits = stop.fits["along_beam"]
+    few = replace(stop, fixes={}, fits={"along_beam": replace(fits, fits=fits.fits[:2])})
+    assert "Place more markers" in decide(few, SurveyConfig(), None).advice[-1]
+
+
+def test_a_turn_that_is_not_full_is_advised_to_be():
+    stop = made_up_stop()
+    stop = replace(stop, cloud=replace(stop.cloud, coverage=np.radians(200.0)))
+    found = decision_of(
+        stop, status=Status.WEAK, reason="weak", excluded=(Exclusion(fit=0, reason="x."),)
+    )
+    assert any("turned by 200 deg" in one for one in found.advice)
+
+
+def test_the_gain_of_one_more_marker_is_that_of_the_normal_equations():
+    rng = np.random.default_rng(2)
+    root = rng.normal(size=(6, 6)) * 1e-3
+    cov, offset, variance = root @ root.T, np.array([3.0, -4.0, 0.5]), 4e-6
+    J = np.hstack([-skew(offset), np.eye(3)])
+    expected = np.linalg.inv(np.linalg.inv(cov) + J.T @ J / variance)
+    (sigma,) = _sigmas_with(cov, offset[None], variance)
+    np.testing.assert_allclose(sigma, np.sqrt(np.trace(expected[3:, 3:])), rtol=1e-7, atol=0)
