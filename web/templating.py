@@ -42,6 +42,8 @@ def environment() -> Environment:
     made.filters.update(
         metres=metres,
         mm=lambda value, digits=1: number(None if value is None else value * _MM, digits),
+        mm_by=_mm_by,
+        degrees_by=lambda value, sigma: number(value, _digits(sigma)),
         signed_mm=lambda value: signed(value * _MM, 1),
         degrees=lambda value: number(math.degrees(value), 2),
         fixed=number,
@@ -93,8 +95,20 @@ def heads_of(text: str) -> list[tuple[str, str, bool]]:
 
 def metres(value: float | None, sigma: float | None = None) -> str:
     """Format a coordinate to millimetres, or to the first digit of a smaller sigma."""
-    digits = 3 if not sigma else max(3, min(5, math.ceil(-math.log10(sigma))))
-    return number(value, digits)
+    return number(value, max(3, min(5, _digits(sigma))))
+
+
+def _digits(sigma: float | None) -> int:
+    """Return the decimals that reach the first digit of a sigma; 3 without one."""
+    return 3 if not sigma else max(0, math.ceil(-math.log10(sigma)))
+
+
+def _mm_by(value: float | None) -> str:
+    """Format a length in millimetres; two decimals below one millimetre, so that none is zero."""
+    if value is None or not math.isfinite(value):
+        return _UNKNOWN
+    size = abs(value * _MM)
+    return number(value * _MM, 2 if size < 0.995 else 1)
 
 
 def signed(value: float, decimals: int = 2) -> str:

@@ -18,18 +18,8 @@ from starlette.types import ASGIApp
 
 from spheremark.pipelines.errors import InputError
 from spheremark.service.errors import Problem, UnauthorizedError
-from spheremark.service.http import api, errors, examples, observation, security
-from spheremark.service.http.pages import (
-    accuracy,
-    compare,
-    frame,
-    jobs,
-    networks,
-    plans,
-    reports,
-    sites,
-    surveys,
-)
+from spheremark.service.http import api, errors, examples, observation, pages, security
+from spheremark.service.http.pages import frame
 from spheremark.service.http.state import Current, opened
 from spheremark.service.logs import event_level
 from spheremark.service.settings import Settings
@@ -98,18 +88,8 @@ def create_app(settings: Settings) -> FastAPI:
     app.add_middleware(security.SecurityMiddleware, settings=settings)
     app.include_router(api.router, prefix=ROOT)
     app.include_router(about)
-    for page in (
-        accuracy,
-        compare,
-        reports,
-        sites,
-        surveys,
-        jobs,
-        frame,
-        plans,
-        networks,
-    ):  # the name of a survey takes slashes
-        app.include_router(page.router)
+    for router in pages.ROUTERS:
+        app.include_router(router)
     app.mount("/static", StaticFiles(directory=STATIC), name="static")
     errors.install(app, frame.error_page)
     return app

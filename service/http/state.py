@@ -13,6 +13,7 @@ from fastapi import Depends, Request
 
 from spheremark.pipelines.errors import NotFoundError
 from spheremark.service.http.places import Places
+from spheremark.service.http.samples import Samples
 from spheremark.service.http.uploads import Inbox, Resumable, adopt_orphans
 from spheremark.service.jobs.queue import JobQueue
 from spheremark.service.planning.predictions import Predictions
@@ -39,6 +40,7 @@ class Service:
     readers: Places = field(default_factory=lambda: Places("foreign files", 2, 8))
     queries: Places = field(default_factory=lambda: Places("queries", 4, 12))
     plans: Places = field(default_factory=lambda: Places("plans", _PLANS, 6))
+    samples: Samples = field(default_factory=Samples)
     keys: threading.Lock = field(default_factory=threading.Lock)  # of requests that must be one
 
     def row(self, sql: str, key: str, what: str) -> dict[str, Any]:
@@ -78,6 +80,7 @@ async def opened(settings: Settings) -> AsyncIterator[Service]:
             try:
                 yield service
             finally:
+                await asyncio.to_thread(service.samples.close)
                 for places in (service.readers, service.queries, service.plans):
                     places.close()
                 end_children()

@@ -64,6 +64,17 @@ WHERE job_id = ?
 _PROGRESS = """
 UPDATE jobs SET progress_percent = ?, message = ? WHERE job_id = ? AND status = 'running'
 """
+_SAME = """
+SELECT j.job_id FROM jobs AS j
+LEFT JOIN runs AS r ON r.job_id = j.job_id
+LEFT JOIN control_changes AS c ON c.survey_id = j.survey_id
+WHERE j.kind = $kind AND j.survey_id = $survey AND j.recording_id = $recording
+    AND j.config = $config::JSON AND j.options = $options::JSON
+    AND (j.status IN ('accepted', 'running')
+        OR (j.status = 'successful' AND r.code_version = $version
+            AND j.created_at >= coalesce(c.changed_at, j.created_at)))
+ORDER BY j.created_at DESC LIMIT 1
+"""
 _SUCCEED = """
 UPDATE jobs SET status = 'successful', progress_percent = 100, message = ?, finished_at = ?
 WHERE job_id = ? AND status = 'running'
@@ -140,6 +151,16 @@ class Catalogue(Surveys):
                 text = f"Waiting for {len(before)} job{'s' * (len(before) > 1)} of the survey."
                 cursor.execute(_WAIT, [text, job_id])
         return self.get_job(job_id)
+
+    def same_job(self, new: Mapping[str, Any], code_version: str) -> JobRecord | None:
+        """Return the job on one log whose results those of another one would equal, if any.
+
+        ``new`` has kind, survey (id), recording, config and options. A job that ended counts where
+        this version of the code did it, and where the control marks were not set since.
+        """
+        texts = {name: json_text(new[name]) for name in ("config", "options")}
+        rows = self.rows(_SAME, {**new, **texts, "version": code_version})
+        return self.get_job(rows[0]["job_id"]) if rows else None
 
     def job_of_key(self, key: str) -> tuple[str, JobRecord] | None:
         """Return the request that has a key, as its digest, and its job; None if there is none."""

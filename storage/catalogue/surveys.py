@@ -10,8 +10,9 @@ from datetime import UTC, datetime
 from typing import Any
 
 import pyarrow as pa
+from duckdb import DuckDBPyConnection
 
-from spheremark.pipelines.errors import ConflictError, InputError
+from spheremark.pipelines.errors import ConflictError, InputError, NotFoundError
 from spheremark.pipelines.model import ControlMarks, Rig, Truth
 from spheremark.pipelines.scan.rigs import rig_digest, rig_from_mapping, rig_to_mapping
 from spheremark.storage.catalogue.database import fetch
@@ -45,14 +46,16 @@ SELECT s.survey_id, s.name, s.tolerance_m, s.created_at, s.rig_digest,
         SELECT j.recording_id FROM jobs AS j
         WHERE j.survey_id = s.survey_id AND j.recording_id IS NOT NULL
         UNION SELECT o.recording_id FROM survey_recordings AS o WHERE o.survey_id = s.survey_id
+        EXCEPT SELECT x.recording_id FROM removed_recordings AS x WHERE x.survey_id = s.survey_id
     )) AS n_recordings
 FROM surveys AS s
+WHERE s.survey_id NOT IN (SELECT survey_id FROM deleted_surveys)
 """
-_SURVEY_BY_KEY = _SURVEYS + "WHERE s.survey_id = $key OR s.name = $key ORDER BY s.survey_id <> $key"
+_SURVEY_BY_KEY = _SURVEYS + "AND (s.survey_id = $key OR s.name = $key) ORDER BY s.survey_id <> $key"
 _SURVEYS_AFTER = (
     _SURVEYS
     + """
-WHERE ($at::TIMESTAMPTZ IS NULL OR (s.created_at, s.survey_id) < ($at::TIMESTAMPTZ, $id))
+AND ($at::TIMESTAMPTZ IS NULL OR (s.created_at, s.survey_id) < ($at::TIMESTAMPTZ, $id))
 ORDER BY s.created_at DESC, s.survey_id DESC LIMIT $n
 """
 )
@@ -69,8 +72,14 @@ SELECT recording_id, name FROM recordings WHERE recording_id IN (
     SELECT recording_id FROM jobs WHERE survey_id = $id AND status <> 'dismissed'
     UNION SELECT recording_id FROM runs WHERE survey_id = $id
     UNION SELECT recording_id FROM survey_recordings WHERE survey_id = $id
+    EXCEPT SELECT recording_id FROM removed_recordings WHERE survey_id = $id
 ) ORDER BY uploaded_at, recording_id
 """
+_N_ACTIVE = """
+SELECT count(*) AS n FROM jobs WHERE survey_id = $id AND status IN ('accepted', 'running')
+"""
+_DELETED = "SELECT * FROM deleted_surveys ORDER BY deleted_at DESC, survey_id"
+_PUT_BACK = "DELETE FROM removed_recordings WHERE survey_id = ? AND recording_id = ?"
 _CONTROL = "SELECT * FROM control_marks WHERE survey_id = $id ORDER BY place"
 
 
@@ -87,11 +96,9 @@ class Surveys(Lists):
     def create_survey(self, name: str, *, tolerance: float = 0.03) -> SurveyRecord:
         """Create a survey."""
         check_name("The name of a survey", name)
-        if not 0.0 < tolerance <= 1.0:
-            raise InputError(f"The tolerance is {tolerance!r} m; it must be above 0 and at most 1.")
+        _check_tolerance(tolerance)
         with self.writing() as cursor:
-            if fetch(cursor, _SURVEY_BY_KEY, {"key": name}).num_rows:
-                raise ConflictError(f"There is already a survey called {name!r}; choose another.")
+            self._require_free(cursor, name)
             survey_id = secrets.token_hex(8)
             cursor.execute(
                 "INSERT INTO surveys (survey_id, name, tolerance_m, created_at) "
@@ -109,6 +116,64 @@ class Surveys(Lists):
         """Return a page of the surveys, newest first; ``after`` is ``next`` of the page before."""
         return self._page(SurveyRecord, _SURVEYS_AFTER, {}, after, limit)
 
+    def change_survey(
+        self, survey: str, *, name: str | None = None, tolerance: float | None = None
+    ) -> SurveyRecord:
+        """Rename a survey, or set its tolerance; what is None stays."""
+        known = self.get_survey(survey)
+        name = known.name if name is None else name
+        tolerance = known.tolerance if tolerance is None else tolerance
+        check_name("The name of a survey", name)
+        _check_tolerance(tolerance)
+        with self.writing() as cursor:
+            self._require_free(cursor, name, known.survey_id)
+            cursor.execute(
+                "UPDATE surveys SET name = ?, tolerance_m = ? WHERE survey_id = ?",
+                [name, tolerance, known.survey_id],
+            )
+        return self.get_survey(known.survey_id)
+
+    def delete_survey(self, survey: str) -> str:
+        """Delete a survey until it is restored; return its id. Its name becomes free."""
+        known = self.get_survey(survey)
+        (active,) = self.rows(_N_ACTIVE, {"id": known.survey_id})
+        if active["n"]:
+            raise ConflictError(
+                f"The survey {known.name} has {active['n']} active jobs; dismiss them first."
+            )
+        with self.writing() as cursor:
+            row = [known.survey_id, known.name, now()]
+            cursor.execute("INSERT INTO deleted_surveys VALUES (?, ?, ?)", row)
+            cursor.execute(
+                "UPDATE surveys SET name = ? WHERE survey_id = ?",
+                [f"{known.name} (deleted {known.survey_id})", known.survey_id],
+            )
+        return known.survey_id
+
+    def deleted_surveys(self) -> list[dict[str, Any]]:
+        """Return id, name and instant of each deleted survey, newest first."""
+        return self.rows(_DELETED)
+
+    def restore_survey(self, survey_id: str) -> SurveyRecord:
+        """Restore a deleted survey under its name, or with its id behind it if that is taken."""
+        found = [row for row in self.deleted_surveys() if row["survey_id"] == survey_id]
+        if not found:
+            raise NotFoundError(f"There is no deleted survey {survey_id!r}.")
+        name = found[0]["name"]
+        with self.writing() as cursor:
+            if fetch(cursor, _SURVEY_BY_KEY, {"key": name}).num_rows:
+                name = f"{name} ({survey_id})"
+            cursor.execute("DELETE FROM deleted_surveys WHERE survey_id = ?", [survey_id])
+            cursor.execute("UPDATE surveys SET name = ? WHERE survey_id = ?", [name, survey_id])
+        return self.get_survey(survey_id)
+
+    @staticmethod
+    def _require_free(cursor: DuckDBPyConnection, name: str, survey_id: str = "") -> None:
+        """Refuse a name that another survey has."""
+        known = fetch(cursor, _SURVEY_BY_KEY, {"key": name}).to_pylist()
+        if any(row["survey_id"] != survey_id for row in known):
+            raise ConflictError(f"There is already a survey called {name!r}; choose another.")
+
     def put_control_marks(self, survey: str, marks: ControlMarks) -> None:
         """Set the control marks of a survey, in place of those before."""
         check_marks(marks)
@@ -118,6 +183,18 @@ class Surveys(Lists):
             cursor.execute(
                 "DELETE FROM control_marks WHERE survey_id = ? AND NOT list_contains(?, mark)",
                 [survey_id, list(marks.names)],
+            )
+            cursor.execute(
+                "INSERT OR REPLACE INTO control_changes VALUES (?, ?)", [survey_id, now()]
+            )
+
+    def delete_control_marks(self, survey: str) -> None:
+        """Take the control marks from a survey."""
+        survey_id = self.get_survey(survey).survey_id
+        with self.writing() as cursor:
+            cursor.execute("DELETE FROM control_marks WHERE survey_id = ?", [survey_id])
+            cursor.execute(
+                "INSERT OR REPLACE INTO control_changes VALUES (?, ?)", [survey_id, now()]
             )
 
     def control_marks(self, survey: str) -> ControlMarks | None:
@@ -187,10 +264,20 @@ class Surveys(Lists):
         return self._page(RecordingRecord, _RECORDINGS_AFTER, {}, after, limit)
 
     def add_to_survey(self, survey: str, recording_id: str) -> None:
-        """Assign a log to a survey."""
+        """Assign a log to a survey, or put it back with its results."""
         row = [self.get_survey(survey).survey_id, self.get_recording(recording_id).recording_id]
         with self.writing() as cursor:
             cursor.execute("INSERT OR IGNORE INTO survey_recordings VALUES (?, ?)", row)
+            cursor.execute(_PUT_BACK, row)
+
+    def remove_from_survey(self, survey: str, recording_id: str) -> None:
+        """Take a log and its results out of a survey until it is assigned again."""
+        known = self.get_survey(survey)
+        if recording_id not in self.recordings_of_survey(known.survey_id):
+            raise NotFoundError(f"The survey {known.name} has no recording {recording_id!r}.")
+        with self.writing() as cursor:
+            row = [known.survey_id, recording_id, now()]
+            cursor.execute("INSERT OR REPLACE INTO removed_recordings VALUES (?, ?, ?)", row)
 
     def recordings_of_survey(self, survey: str) -> tuple[str, ...]:
         """Return the logs that are assigned to a survey (id or name) or read by its jobs."""
@@ -222,6 +309,12 @@ class Surveys(Lists):
                 "UPDATE surveys SET rig_digest = ? WHERE survey_id = ?", [digest, survey_id]
             )
         return self.get_survey(survey_id)
+
+
+def _check_tolerance(tolerance: float) -> None:
+    """Refuse a tolerance that no survey can have."""
+    if not 0.0 < tolerance <= 1.0:
+        raise InputError(f"The tolerance is {tolerance!r} m; it must be above 0 and at most 1.")
 
 
 def check_name(what: str, name: str) -> None:

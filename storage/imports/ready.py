@@ -63,6 +63,7 @@ def read_document(
     name: str,  # noqa: ARG001
     path: str,  # noqa: ARG001
     kind: str,
+    layout: dict[str, Any] | None = None,
 ) -> dict[str, Any]:
     """Return the text of a document in the form in which this program writes it."""
     text = file.read().decode()
@@ -70,7 +71,8 @@ def read_document(
         return {"text": survey_files.format_rig(survey_files.parse_rig(text))}
     if kind == "truth":
         return {"text": survey_files.format_truth(survey_files.parse_truth(text))}
-    return {"text": survey_files.format_control(survey_files.parse_control(text))}
+    marks = survey_files.parse_control(text, survey_files.ControlLayout(**(layout or {})))
+    return {"text": survey_files.format_control(marks)}
 
 
 def prepare() -> None:

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import tempfile
 from collections.abc import Mapping
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +15,12 @@ from spheremark.pipelines.errors import RecordingError
 from spheremark.pipelines.model import ControlMarks, Origin, Rig, ScanLog, Truth
 from spheremark.pipelines.scan.rigs import rig_from_mapping
 from spheremark.storage.imports.confined import READY, Limits, UnreadableFileError, run_confined
-from spheremark.storage.imports.survey_files import parse_control, parse_rig, parse_truth
+from spheremark.storage.imports.survey_files import (
+    ControlLayout,
+    parse_control,
+    parse_rig,
+    parse_truth,
+)
 from spheremark.storage.recordings import LogOptions, Preflight, TopicReport
 
 _SECONDS, _BYTES_PER_SECOND = 60.0, 1e6  # the slowest format that is known takes five of them
@@ -82,20 +88,23 @@ def read_upload(path: Path, options: LogOptions, origin: Origin) -> ScanLog:
         raise RecordingError(str(error)) from error
 
 
-def control_of(text: str) -> ControlMarks:
+def control_of(text: str, layout: ControlLayout | None = None) -> ControlMarks:
     """Return the control marks of a table, parsed in a confined process.
 
     Parameters
     ----------
     text : str
         As for ``parse_control``.
+    layout : ControlLayout, optional
+        The layout where the header does not specify it.
 
     Returns
     -------
     ControlMarks
         The marks.
     """
-    return parse_control(_parsed(text, "control"))
+    given = asdict(layout or ControlLayout())
+    return parse_control(_parsed(text, "control", layout=given))
 
 
 def rig_of(text: str) -> Rig:
@@ -148,12 +157,14 @@ def _report(values: Mapping[str, Any]) -> Preflight:
     return Preflight(**{**values, **lists})
 
 
-def _parsed(text: str, kind: str) -> str:
+def _parsed(text: str, kind: str, **more: Any) -> str:
     """Return a document as this program writes it."""
     with tempfile.TemporaryFile() as file:
         file.write(text.encode())
         file.seek(0)
         name = f"the {kind} file"
         return str(
-            run_confined(f"{READY}:read_document", file, _DOCUMENT, name=name, kind=kind)["text"]
+            run_confined(f"{READY}:read_document", file, _DOCUMENT, name=name, kind=kind, **more)[
+                "text"
+            ]
         )

@@ -25,7 +25,13 @@ STOP = "/surveys/field/stops/lane3-stop1"
 PAGES = [
     "/",
     "/surveys/field",
-    "/surveys/field?axes=log&method=along_beam",
+    "/surveys/field/accuracy?axes=log&method=along_beam",
+    "/surveys/field/stops",
+    "/surveys/field/network",
+    "/surveys/field/rig",
+    "/surveys/field/site",
+    "/surveys/field/logs",
+    "/new",
     "/surveys/blind",
     STOP,
     f"{STOP}?method=paper&marker=M03",
@@ -120,7 +126,17 @@ def test_a_page_draws_without_complaint_and_asks_no_other_host(visit, path):
 @pytest.mark.parametrize(("width", "scheme"), LOOKS)
 def test_no_page_is_wider_than_the_window(visit, width, scheme):
     one = visit(width=width, scheme=scheme)
-    for path in ("/", "/surveys/field", STOP, "/jobs", "/plan", "/sql", "/nowhere"):
+    for path in (
+        "/",
+        "/new",
+        "/surveys/field",
+        "/surveys/field/logs",
+        STOP,
+        "/jobs",
+        "/plan",
+        "/sql",
+        "/nowhere",
+    ):
         page = one.open(path)
         assert page.evaluate("document.documentElement.scrollWidth") <= width, path
         assert page.evaluate("document.documentElement.dataset.theme") == scheme
@@ -128,7 +144,7 @@ def test_no_page_is_wider_than_the_window(visit, width, scheme):
 
 def test_the_toggle_redraws_the_figures_and_is_remembered(visit):
     one = visit()
-    page = one.open("/surveys/field")
+    page = one.open("/surveys/field/accuracy")
     ground = page.evaluate("getComputedStyle(document.body).backgroundColor")
     page.click("#theme-toggle")
     page.wait_for_selector("#distance [data-drawn=dark]")
@@ -137,7 +153,7 @@ def test_the_toggle_redraws_the_figures_and_is_remembered(visit):
 
 
 def test_changing_a_filter_changes_the_address(visit):
-    page = visit().open("/surveys/field")
+    page = visit().open("/surveys/field/accuracy")
     page.select_option("#stop", "lane3-stop2")
     page.wait_for_url(re.compile(r"stop=lane3-stop2"))
     assert page.locator('[aria-labelledby="stops-head"] tbody tr').count() == 2

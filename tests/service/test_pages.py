@@ -50,39 +50,91 @@ def test_the_overview_lists_surveys_and_recordings_and_says_how_to_upload(client
     assert "lane3-stop2" in text
     assert "curl -X POST" in text
     assert "http://testserver/api/v1/recordings" in text
-    assert "mm RMS error" in text
+    assert "control met to" in text
+    assert "/new" in text
 
 
-def test_a_dashboard_has_all_its_figures(client):
+def test_a_survey_opens_with_its_decision_and_one_solution(client):
     text = page(client, "/surveys/field")
-    for name in ("distance", "count", "map", "angle", "lane"):
-        assert f'id="figure-{name}"' in text
-    assert "28 of 28 within 30 mm" in text
+    sentence = re.search(r"<h1>([^<]+)</h1>", text)[1]
+    assert re.fullmatch(
+        r"2 stations, \d\.\d mm \(3-D sigma, RMS\), control met to \d+\.\d mm \(largest\): .*",
+        sentence,
+    )
+    result = client.get("/api/v1/surveys/field/result").json()
+    assert result["sentence"] == sentence
+    assert result["solution"] == "single stations"
+    for one in result["checks"]:
+        assert one["n"] > 0
+        assert one["ratio_low"] < 1 < one["ratio_high"]
+    assert 'id="figure-map"' in text
+    assert 'id="figure-heights"' in text
+    assert "paper&#39;s method" not in text
 
 
-def test_a_filter_in_the_address_narrows_the_dashboard(client):
-    text = page(client, "/surveys/field?stop=lane3-stop2&method=along_beam")
-    assert "14 of 14 within 30 mm" in text
-    assert "paper&#39;s method" not in text.split('class="readouts"')[1]
+@pytest.mark.parametrize("tab", ["stops", "network", "rig", "site", "accuracy", "logs"])
+def test_each_tab_of_a_survey_has_an_address(client, tab):
+    for survey in ("field", "bare", "empty"):
+        text = page(client, f"/surveys/{survey}/{tab}")
+        assert f'href="/surveys/{survey}/{tab}" aria-current="page"' in text
 
 
-def test_a_filter_that_nothing_passes_says_what_to_do(client):
-    text = page(client, "/surveys/field?range_from_m=90")
-    assert "No fit passes these filters" in text
-    assert 'id="figure-distance"' not in text
+def test_an_address_of_the_dashboard_before_leads_to_the_tab_of_accuracy(client):
+    response = client.get("/surveys/field?stop=lane3-stop2&axes=log", follow_redirects=False)
+    assert response.status_code == 308
+    assert response.headers["location"] == "/surveys/field/accuracy?stop=lane3-stop2&axes=log"
 
 
-def test_a_filter_that_cannot_be_read_is_a_clear_refusal(client):
-    response = client.get("/surveys/field?range_from_m=near", headers=HTML)
-    assert response.status_code == 400
-    assert "range_from_m is &#39;near&#39;" in response.text
+def test_a_survey_is_renamed_deleted_and_restored_with_its_results(client):
+    client.post("/api/v1/surveys", json={"name": "doubtful"}).raise_for_status()
+    changed = {"name": "certain", "tolerance_m": 0.01}
+    survey = client.patch("/api/v1/surveys/doubtful", json=changed).json()
+    assert (survey["name"], survey["tolerance_m"]) == ("certain", 0.01)
+    assert client.patch("/api/v1/surveys/certain", json={"name": "field"}).status_code == 409
+    key = client.delete("/api/v1/surveys/certain").json()["survey_id"]
+    assert client.get("/api/v1/surveys/certain").status_code == 404
+    assert client.get(f"/surveys/{key}", headers=HTML).status_code == 404
+    assert "certain" in page(client, "/")
+    client.post("/api/v1/surveys", json={"name": "certain"}).raise_for_status()
+    restored = client.post(f"/api/v1/surveys/{key}/restoration").json()
+    assert restored["name"] == f"certain ({key})"
+    assert client.post(f"/api/v1/surveys/{key}/restoration").status_code == 404
+
+
+def test_a_log_that_is_removed_takes_its_results_and_brings_them_back(client):
+    before = client.get("/api/v1/station-fixes?survey=twins").json()["items"]
+    recording = before[0]["recording_id"]
+    address = f"/api/v1/surveys/twins/recordings/{recording}"
+    assert client.delete(address).json()["n_recordings"] == 1
+    assert client.delete(address).status_code == 404
+    fewer = client.get("/api/v1/station-fixes?survey=twins").json()["items"]
+    assert {row["recording_id"] for row in fewer} == {row["recording_id"] for row in before} - {
+        recording
+    }
+    client.put(address).raise_for_status()
+    assert client.get("/api/v1/station-fixes?survey=twins").json()["items"] == before
+
+
+def test_control_is_read_in_other_units_and_axes_before_it_is_stored(client):
+    client.post("/api/v1/surveys", json={"name": "feet"}).raise_for_status()
+    table, kind = "A,10,20,3\nB,30,40,5\nC,0,7,1", {"content-type": "text/csv"}
+    query = "unit=ft&axes=neu&sigma_m=0.002&target_height_m=1"
+    address = "/api/v1/surveys/feet/control"
+    found = client.post(f"{address}/preview?{query}", content=table, headers=kind).json()["marks"]
+    assert found[0]["x_m"] == pytest.approx(20 * 0.3048)
+    assert found[0]["z_m"] == pytest.approx(3 * 0.3048 + 1)
+    assert found[0]["sigma_x_m"] == pytest.approx(0.002)
+    assert client.get(address).json()["marks"] == []
+    assert client.put(f"{address}?{query}", content=table, headers=kind).json()["marks"] == found
+    assert client.delete(address).json()["n_control_marks"] == 0
 
 
 def test_without_truth_nothing_is_called_an_error(client):
-    text = page(client, link(page(client, "/"), '/surveys/%3C[^"]+'))
-    assert "Predicted sigma of sphere centres" in text
-    assert "truth not known" in text
-    assert "RMS error" not in text
+    survey = link(page(client, "/"), '/surveys/%3C[^"]+')
+    assert "Truth is not known" in page(client, f"{survey}/accuracy")
+    text = page(client, survey)
+    assert "error against truth" not in text
+    assert "residual" in text
 
 
 def test_names_are_escaped_wherever_they_stand(client):
@@ -124,14 +176,17 @@ def test_logs_of_one_name_are_each_within_reach(client):
 def test_an_empty_survey_says_what_to_do(client):
     text = page(client, "/surveys/bare")
     assert "No results yet" in text
-    assert "survey=bare&amp;process=true" in text
+    assert "/surveys/bare/logs" in text
+    assert "survey=bare&amp;process=true" in page(client, "/surveys/bare/logs")
 
 
 def test_a_survey_whose_only_job_failed_offers_work_on_its_log(client):
     text = page(client, "/surveys/empty")
     assert "No results yet" in text
     assert "1 log belongs to this survey" in text
-    assert "Adjust all stations" in text
+    text = page(client, "/surveys/empty/logs")
+    assert "Process those without results" in text
+    assert "No marker &lt;b&gt;here&lt;/b&gt;." in text
 
 
 def test_jobs_show_why_they_failed(client):

@@ -319,10 +319,11 @@ def test_the_page_of_a_calibration_lets_one_use_its_rig(site, calibrated, rows):
 
 @pytest.mark.usefixtures("tied", "calibrated")
 def test_the_survey_offers_work_on_the_whole_and_lists_what_came_of_it(site):
-    text = page(site, "/surveys/field")
+    text = page(site, "/surveys/field/network")
     assert "Adjust all stations" in text
-    assert "Calibrate the gimbal" in text
-    assert "Network, with control" in text
+    assert "the chosen solution of the survey" in text
+    assert "Calibrate the gimbal" in page(site, "/surveys/field/rig")
+    assert "network with control" in page(site, "/surveys/field")
     answer = site.client.post(
         "/surveys/field/jobs", data={"kind": "adjust", "control": "no"}, follow_redirects=False
     )
@@ -390,6 +391,7 @@ def test_logs_that_were_uploaded_for_a_survey_belong_to_it_before_any_job_read_t
     assert site.client.get("/api/v1/surveys/later").json()["n_recordings"] == 2
     text = site.client.get("/surveys/later", headers={"Accept": "text/html"}).text
     assert "2 logs belong to this survey" in text
+    text = site.client.get("/surveys/later/network", headers={"Accept": "text/html"}).text
     assert "Adjust all stations</button>" in text
     job = run("adjust", survey="later")
     assert job["status"] == "successful", job

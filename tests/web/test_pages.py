@@ -1,53 +1,9 @@
 import json
 
-import numpy as np
 import pytest
 
 from spheremark.web import assets, templating
-from spheremark.web.pages import readouts
 from spheremark.web.pages.base import Frame
-
-
-def rows(errors, sigmas, marks, method="along_beam"):
-    n = len(errors)
-    return {
-        "stop": np.array(["s1"] * n, dtype=object),
-        "fit_method": np.array([method] * n, dtype=object),
-        "mark": np.array(marks, dtype=object),
-        "error_3d_m": np.array(errors, dtype=float),
-        "sigma_3d_m": np.array(sigmas, dtype=float),
-    }
-
-
-def nothing():
-    return rows([], [], [])
-
-
-def test_the_headline_gives_rms_in_millimetres_and_the_share_within_tolerance():
-    fits = rows([0.003, 0.004, 0.040], [0.003] * 3, ["A", "B", "C"])
-    first = readouts.headline(fits, nothing(), 0.03)[0]
-    assert (first.value, first.unit) == ("23.3", "mm RMS error")
-    assert first.note == "2 of 3 within 30 mm, largest 40.0 mm"
-
-
-def test_the_headline_counts_fits_on_no_mark_apart():
-    fits = rows([0.003, np.nan], [0.003, 0.020], ["A", None])
-    first = readouts.headline(fits, nothing(), 0.03)[0]
-    assert first.value == "3.0"
-    assert first.note.endswith("1 on no mark")
-
-
-def test_without_truth_the_headline_gives_sigma_and_never_error():
-    fits = rows([np.nan, np.nan], [0.003, 0.004], ["A", "B"])
-    text = str(readouts.headline(fits, fits, 0.03))
-    assert "mm predicted sigma" in text
-    assert "error" not in text
-
-
-def test_the_headline_sets_error_against_what_was_predicted():
-    last = readouts.headline(rows([0.004], [0.002], ["A"]), nothing(), 0.03)[-1]
-    assert (last.value, last.unit) == ("2.0", "mm sigma")
-    assert "2.00" in last.note
 
 
 @pytest.mark.parametrize(

@@ -13,10 +13,11 @@ Row = Mapping[str, Any]
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Frame:
-    """The frame of every page: all surveys, and the present one."""
+    """The frame of every page: all surveys, the present one, and its present tab."""
 
     surveys: tuple[str, ...] = ()
     survey: str = ""
+    tab: str = ""
 
 
 class Panel(NamedTuple):

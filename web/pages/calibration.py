@@ -25,9 +25,14 @@ _LASERS = (
 
 
 def calibration_page(
-    frame: Frame, calibration: Row, parameters: Columns, gaps: Columns, **more: Any
+    frame: Frame, calibration: Row | None, parameters: Columns, gaps: Columns, **more: Any
 ) -> str:
-    """Return the page of a calibration; ``more`` are its files and whether its rig is in use."""
+    """Return the page of a calibration.
+
+    ``more`` are its files, whether its rig is in use, all calibrations of the survey and its rig.
+    """
+    if calibration is None:
+        return render("calibration.html", frame=frame, calibration=None, **more)
     rows = [_readable(row) for row in plain_rows(parameters)]
     estimated = [row for row in rows if row["is_estimated"]]
     return render(

@@ -29,9 +29,19 @@ _CHECKS = (
 
 
 def adjustment_page(
-    frame: Frame, adjustment: Row, tables: Mapping[str, Columns], files: tuple[str, ...]
+    frame: Frame,
+    adjustment: Row | None,
+    tables: Mapping[str, Columns],
+    files: tuple[str, ...],
+    **more: Any,
 ) -> str:
-    """Return the page of a network from its rows of each table."""
+    """Return the page of a network from its rows of each table.
+
+    ``more`` are all networks of the survey, the number of its control marks, and the id of the
+    network that is its chosen solution.
+    """
+    if adjustment is None:
+        return render("adjustment.html", frame=frame, adjustment=None, **more)
     observations = tables["adjusted_observations"]
     rows = {name: plain_rows(columns) for name, columns in tables.items()}
     centres = select(observations, observations["kind"] == "centre")
@@ -48,6 +58,7 @@ def adjustment_page(
         left_out=[row for row in rows["adjusted_observations"] if not row["used"]],
         n_centres=len(centres["kind"]),
         has_truth=has_errors(tables["adjusted_stations"]),
+        **more,
     )
 
 

@@ -74,3 +74,18 @@ def _panels(
         figure = scene.stop_scene(scan, fits, tables["rejections"])
         panels.append(Panel("scene", figure, _SCENE, "tall"))
     return {panel.name: panel for panel in panels}
+
+
+def stops_page(frame: Frame, rows: list[Row], **more: Any) -> str:
+    """Return the stops of a survey by its chosen solution.
+
+    ``more`` are the tolerance, the number of all stops, the place of the first of these rows, and
+    the most rows of one part.
+    """
+    return render(
+        "stops.html",
+        frame=frame,
+        rows=rows,
+        has_truth=any(row["error_rms_m"] is not None for row in rows),
+        **more,
+    )

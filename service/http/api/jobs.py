@@ -22,6 +22,7 @@ from spheremark.service.http.api.surveys import After, Limit
 from spheremark.service.http.state import Current, Service
 from spheremark.service.jobs.events import JobEvent
 from spheremark.service.jobs.handlers import KINDS, Kind, Reading
+from spheremark.service.provenance import code_version
 from spheremark.storage.catalogue.records import JobRecord, JobStatus, SurveyRecord
 from spheremark.storage.imports.uploads import rig_of
 
@@ -119,13 +120,24 @@ async def dismiss_job(job: JobId, service: Current) -> Job:
     return Job.of(await service.jobs.dismiss(job))
 
 
-def start(service: Service, new: NewJob, key: tuple[str, str] | None = None) -> Job:
-    """Accept a job and submit it to the cluster."""
+def start(
+    service: Service,
+    new: NewJob,
+    key: tuple[str, str] | None = None,
+    *,
+    is_repeated: bool = True,
+) -> Job:
+    """Accept a job and submit it; unless repeated, one that would give the same is returned."""
     survey = service.catalogue.get_survey(new.survey)
     kind = KINDS[new.kind]
     recordings = _recordings(service, new, survey)
     config = SurveyConfig.from_mapping({"tolerance": survey.tolerance} | new.config)
     options = _options(kind, new) | _rig(service, new, survey)
+    if not is_repeated and kind.takes_one_log:
+        named = {"kind": new.kind, "survey": survey.survey_id, "recording": recordings[0]}
+        named |= {"config": config.to_mapping(), "options": options}
+        if same := service.catalogue.same_job(named, code_version()):
+            return Job.of(same)
     record = service.catalogue.create_job(
         new.kind,
         survey=survey.survey_id,

@@ -50,6 +50,25 @@ class NewSurvey(Strict):
     tolerance_m: float = Field(default=0.03, gt=0, le=1, description="Accepted error [m].")
 
 
+class ChangedSurvey(Strict):
+    """What to change of a survey."""
+
+    name: str | None = Field(
+        default=None, min_length=1, max_length=200, description="New name; null: as before."
+    )
+    tolerance_m: float | None = Field(
+        default=None, gt=0, le=1, description="Accepted error [m]; null: as before."
+    )
+
+
+class DeletedSurvey(BaseModel):
+    """A survey that was deleted and can be restored."""
+
+    survey_id: str
+    name: str
+    deleted_at: datetime
+
+
 class Survey(Recorded):
     """A field with its control marks and logs."""
 
@@ -61,6 +80,38 @@ class Survey(Recorded):
     n_control_marks: int
     n_true_stops: int
     n_recordings: int
+
+
+class ResultCheck(BaseModel):
+    """Errors or residuals of one kind of result over their sigmas."""
+
+    what: str = Field(description="centres, stations or control.")
+    measure: str = Field(description="What is compared: error, residual or difference.")
+    n: int = Field(description="Compared positions.")
+    ratio_rms: float | None = Field(
+        description="Root mean square of error over sigma in each coordinate; 1 is expected."
+    )
+    ratio_low: float | None = Field(description="Lower end of its 95 % interval by chance.")
+    ratio_high: float | None = Field(description="Upper end of its 95 % interval by chance.")
+    rms_m: float
+    largest_m: float
+    largest_at: str
+
+
+class SurveyResult(BaseModel):
+    """The chosen solution of a survey, and the decision on it."""
+
+    solution: str | None = Field(
+        description="network with control, single stations, free network, or null without any."
+    )
+    adjustment_id: str | None
+    fit_method: str | None
+    resection_method: str | None
+    status: Literal["accepted", "weak", "refused", "none"]
+    sentence: str = Field(description="The decision as a sentence.")
+    reasons: list[str] = Field(description="Why the survey is not accepted, or what is weak.")
+    missing_stops: list[str] = Field(description="Stops without a position in the solution.")
+    checks: list[ResultCheck]
 
 
 class Mark(Strict):

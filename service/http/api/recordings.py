@@ -155,6 +155,7 @@ def check_survey(service: Service, survey: str | None) -> str:
 
 
 def start_job(service: Service, survey: str | None, recording: RecordingRecord) -> Job:
-    """Start a job for a log that just came."""
-    survey_id = check_survey(service, survey)
-    return start(service, NewJob(survey=survey_id, recording=recording.recording_id))
+    """Start a job for a log that just came, unless one that would give the same is there."""
+    new = NewJob(survey=check_survey(service, survey), recording=recording.recording_id)
+    with service.keys:
+        return start(service, new, is_repeated=False)

@@ -2,33 +2,39 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Annotated, Any
+from dataclasses import dataclass, replace
+from typing import Annotated, Any, Literal
 
 import numpy as np
 from fastapi import APIRouter, Depends, Path, Query, Request, Response
 from fastapi.exceptions import RequestValidationError
 from fastapi.responses import PlainTextResponse
-from pydantic import ValidationError
+from pydantic import Field, ValidationError
 
 from spheremark.pipelines.errors import InputError, NotFoundError
 from spheremark.pipelines.model import ControlMarks
 from spheremark.service.errors import EmptyBodyError, MediaTypeError
 from spheremark.service.http.api.models import (
+    ChangedSurvey,
     ChosenRig,
     Control,
+    DeletedSurvey,
     Listing,
     Mark,
     NewSurvey,
+    Strict,
     Survey,
+    SurveyResult,
     TruthSummary,
 )
 from spheremark.service.http.state import Current
-from spheremark.storage.imports.survey_files import format_control
+from spheremark.service.serialise.solution import plain_result, survey_result
+from spheremark.storage.imports.survey_files import ControlLayout, format_control
 from spheremark.storage.imports.uploads import control_of, truth_of
 
 router = APIRouter(prefix="/surveys", tags=["surveys"])
 
+RecordingId = Annotated[str, Path(description="Id of the recording.")]
 Key = Annotated[str, Path(description="Id or name of the survey.")]
 After = Annotated[str | None, Query(description="The 'next' of the part before.")]
 Limit = Annotated[int, Query(ge=1, le=1000, description="Items in one part.")]
@@ -66,6 +72,33 @@ def bodies(*media_types: str) -> dict[str, Any]:
 File = Annotated[Document, Depends(document)]
 
 
+class Layout(Strict):
+    """How a table of control marks is laid out, where its header does not specify it."""
+
+    axes: Literal["enu", "neu", "ned"] = Field(
+        default="enu", description="Axes of three coordinates without names, or named x, y and z."
+    )
+    unit: Literal["m", "mm", "ft", "us-ft"] = Field(
+        default="m", description="Unit of coordinates and their sigmas."
+    )
+    target_height_m: float = Field(
+        default=0.0, gt=-100, lt=100, description="Height of the centres above the points [m]."
+    )
+    sigma_m: float = Field(
+        default=0.0, ge=0, le=1, description="Sigma of coordinates that have none in the file [m]."
+    )
+
+    def layout(self) -> ControlLayout:
+        """Return the layout as the reader takes it."""
+        return ControlLayout(axes=self.axes, unit=self.unit, target_height=self.target_height_m)
+
+    def with_sigma(self, marks: ControlMarks) -> ControlMarks:
+        """Return marks whose missing sigmas are the given one."""
+        missing = np.diagonal(marks.cov_p_site, axis1=1, axis2=2) == 0.0
+        added = np.eye(3) * (self.sigma_m**2 * missing)[:, None, :]
+        return replace(marks, cov_p_site=marks.cov_p_site + added)
+
+
 @router.post("", status_code=201, name="create_survey")
 def create_survey(new: NewSurvey, service: Current, response: Response) -> Survey:
     """Create a survey."""
@@ -90,15 +123,30 @@ def get_survey(survey: Key, service: Current) -> Survey:
 @router.put(
     "/{survey}/control", name="put_control", openapi_extra=bodies("text/csv", "application/json")
 )
-def put_control(survey: Key, file: File, service: Current) -> Control:
+def put_control(
+    survey: Key, file: File, layout: Annotated[Layout, Query()], service: Current
+) -> Control:
     """Give a survey its control marks, as CSV or JSON; a survey of that name is made if missing."""
-    marks = _read_control(file)
+    marks = _read_control(file, layout)
     try:
         service.catalogue.get_survey(survey)
     except NotFoundError:
         service.catalogue.create_survey(survey)
     service.catalogue.put_control_marks(survey, marks)
     return Control.of(service.catalogue.control_marks(survey))
+
+
+@router.delete("/{survey}/control", name="delete_control")
+def delete_control(survey: Key, service: Current) -> Survey:
+    """Take the control marks from a survey; its next adjustment is free."""
+    service.catalogue.delete_control_marks(survey)
+    return Survey.of(service.catalogue.get_survey(survey))
+
+
+@router.post("/{survey}/control/preview", name="preview_control", openapi_extra=bodies("text/csv"))
+def preview_control(survey: Key, file: File, layout: Annotated[Layout, Query()]) -> Control:  # noqa: ARG001
+    """Read control marks as PUT would, and store nothing; the survey need not exist."""
+    return Control.of(_read_control(file, layout))
 
 
 @router.get(
@@ -113,6 +161,49 @@ def get_control(survey: Key, request: Request, service: Current) -> Response | C
     if "text/csv" in request.headers.get("accept", "") and marks is not None:
         return PlainTextResponse(format_control(marks), media_type="text/csv")
     return Control.of(marks)
+
+
+@router.get("/{survey}/result", name="get_result")
+def get_result(survey: Key, service: Current) -> SurveyResult:
+    """Return the chosen solution of a survey, the decision on it, and the checks behind that."""
+    found = survey_result(service.catalogue, survey)
+    return SurveyResult.model_validate(plain_result(found))
+
+
+@router.patch("/{survey}", name="change_survey")
+def change_survey(survey: Key, change: ChangedSurvey, service: Current) -> Survey:
+    """Rename a survey, or set its tolerance."""
+    record = service.catalogue.change_survey(survey, name=change.name, tolerance=change.tolerance_m)
+    return Survey.of(record)
+
+
+@router.delete("/{survey}", name="delete_survey")
+def delete_survey(survey: Key, service: Current) -> DeletedSurvey:
+    """Delete a survey with its results, until it is restored; its name becomes free."""
+    survey_id = service.catalogue.delete_survey(survey)
+    deleted = service.catalogue.deleted_surveys()
+    row = next(one for one in deleted if one["survey_id"] == survey_id)
+    return DeletedSurvey.model_validate(row)
+
+
+@router.post("/{survey}/restoration", name="restore_survey")
+def restore_survey(survey: Key, service: Current) -> Survey:
+    """Restore a deleted survey, named by its id, with all its results."""
+    return Survey.of(service.catalogue.restore_survey(survey))
+
+
+@router.put("/{survey}/recordings/{recording}", name="assign_recording")
+def assign_recording(survey: Key, recording: RecordingId, service: Current) -> Survey:
+    """Assign a log to a survey, or put it back with its results after a removal."""
+    service.catalogue.add_to_survey(survey, recording)
+    return Survey.of(service.catalogue.get_survey(survey))
+
+
+@router.delete("/{survey}/recordings/{recording}", name="remove_recording")
+def remove_recording(survey: Key, recording: RecordingId, service: Current) -> Survey:
+    """Take a log and its results out of a survey; assigning it again puts them back."""
+    service.catalogue.remove_from_survey(survey, recording)
+    return Survey.of(service.catalogue.get_survey(survey))
 
 
 @router.put("/{survey}/rig", name="choose_rig")
@@ -130,10 +221,10 @@ def put_truth(survey: Key, file: File, service: Current) -> TruthSummary:
     return TruthSummary(n_marks=n_marks, n_stops=n_stops)
 
 
-def _read_control(file: Document) -> ControlMarks:
+def _read_control(file: Document, layout: Layout) -> ControlMarks:
     """Read control marks from CSV or JSON."""
     if file.media_type in ("text/csv", "text/plain", "application/csv"):
-        return control_of(file.text)
+        return layout.with_sigma(control_of(file.text, layout.layout()))
     if file.media_type != "application/json":
         raise MediaTypeError(
             f"The body is {file.media_type or 'of no type'}; send text/csv or application/json."

@@ -1,1 +1,25 @@
 """Routes of pages: queries of the catalogue, handed to the functions that draw."""
+
+from spheremark.service.http.pages import (
+    accuracy,
+    compare,
+    frame,
+    jobs,
+    logs,
+    networks,
+    overview,
+    plans,
+    reports,
+    result,
+    sites,
+    stops,
+)
+
+ROUTERS = tuple(
+    page.router
+    for page in (
+        *(frame, overview, compare, jobs, plans),
+        *(sites, stops, networks, accuracy, logs, reports),
+        result,  # last: the name of a survey takes slashes
+    )
+)

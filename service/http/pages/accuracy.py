@@ -36,7 +36,7 @@ def _page(request: Request, service: Service, survey: str) -> str:
     query = {name: request.query_params.getlist(name) for name in request.query_params}
     selection = Selection(surveys=(survey,) if survey else ())
     return accuracy_page(
-        frame_of(service, survey),
+        frame_of(service, survey, "accuracy" if survey else ""),
         query,
         survey=survey,
         methods=[row["fit_method"] for row in service.catalogue.rows(_METHODS)],

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import asdict
-from typing import Annotated
+from typing import Annotated, Any
 
 from fastapi import APIRouter, Query, Request
 from fastapi.responses import FileResponse, HTMLResponse
@@ -18,7 +19,14 @@ from spheremark.web.templating import render
 router = APIRouter(include_in_schema=False, default_response_class=HTMLResponse)
 
 _A_YEAR = "public, max-age=31536000, immutable"
-_SURVEY_NAMES = "SELECT name FROM surveys ORDER BY created_at DESC, name"
+_SURVEY_NAMES = """
+SELECT name FROM surveys WHERE survey_id NOT IN (SELECT survey_id FROM deleted_surveys)
+ORDER BY created_at DESC, name
+"""
+_SURVEY = """
+SELECT survey_id, name, tolerance_m, rig_digest FROM surveys
+WHERE (name = $id OR survey_id = $id) AND survey_id NOT IN (SELECT survey_id FROM deleted_surveys)
+"""
 
 
 @router.get(assets.plotly_url())
@@ -56,10 +64,15 @@ def error_page(_: Request, problem: Problem) -> HTMLResponse:
     return HTMLResponse(text, status_code=problem.status)
 
 
-def frame_of(service: Service, survey: str = "") -> Frame:
-    """Return what every page shows around itself."""
+def frame_of(service: Service, survey: str = "", tab: str = "") -> Frame:
+    """Return what every page shows around itself; a page of a survey names the tab it is in."""
     names = tuple(row["name"] for row in service.catalogue.rows(_SURVEY_NAMES))
-    return Frame(surveys=names, survey=survey)
+    return Frame(surveys=names, survey=survey, tab=tab)
+
+
+def survey_row(service: Service, key: str) -> Mapping[str, Any]:
+    """Return the survey of that name or id."""
+    return service.row(_SURVEY, key, "survey")
 
 
 def address_of(request: Request) -> str:

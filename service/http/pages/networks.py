@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from typing import Annotated
-from urllib.parse import parse_qsl, quote
+from collections.abc import Mapping
+from typing import Annotated, Any
+from urllib.parse import parse_qsl
 
 from fastapi import APIRouter, Depends, Request
 from fastapi.responses import HTMLResponse, RedirectResponse
@@ -11,9 +12,11 @@ from fastapi.responses import HTMLResponse, RedirectResponse
 from spheremark.pipelines.errors import InputError
 from spheremark.service.http.api.jobs import start
 from spheremark.service.http.api.models import NewJob
-from spheremark.service.http.pages.frame import frame_of
+from spheremark.service.http.pages.frame import frame_of, survey_row
 from spheremark.service.http.state import Current, Service
 from spheremark.service.jobs.handlers import KINDS
+from spheremark.storage.catalogue.solutions import chosen_solution
+from spheremark.web.links import survey_url
 from spheremark.web.pages.calibration import calibration_page
 from spheremark.web.pages.network import adjustment_page
 
@@ -40,31 +43,91 @@ FROM calibrations AS c JOIN surveys AS s USING (survey_id) WHERE c.calibration_i
 """
 _PARAMETERS = "SELECT * FROM calibrated_parameters WHERE calibration_id = $id ORDER BY place"
 _GAPS = "SELECT * FROM calibration_gaps WHERE calibration_id = $id ORDER BY stop, marker"
+_ADJUSTMENTS = """
+SELECT a.adjustment_id, a.datum, a.status, a.n_stations, a.n_marks, a.passes_global_test, a.sigma0,
+    a.finished_at,
+    (SELECT sqrt(avg(x.sigma_3d_m ^ 2)) FROM adjusted_stations AS x
+        WHERE x.adjustment_id = a.adjustment_id) AS station_sigma_rms_m,
+    (SELECT max(x.difference_3d_m) FROM control_checks AS x
+        WHERE x.adjustment_id = a.adjustment_id) AS control_max_m
+FROM adjustments AS a WHERE a.survey_id = $id ORDER BY a.finished_at DESC LIMIT 20
+"""
+_CALIBRATIONS = """
+SELECT calibration_id, rig_digest, len(stops) AS n_stops, gap_rms_before_m, gap_rms_after_m,
+    finished_at
+FROM calibrations WHERE survey_id = $id ORDER BY finished_at DESC LIMIT 20
+"""
+_N_CONTROL = "SELECT count(*) AS n FROM control_marks WHERE survey_id = $id"
 _FILES = "SELECT name FROM documents WHERE result_id = $id ORDER BY name"
 _FORM = "application/x-www-form-urlencoded"
+
+
+@router.get("/surveys/{name:path}/network")
+def network(name: str, service: Current) -> str:
+    """Show the chosen network of a survey, else its newest, and all others by name."""
+    found = survey_row(service, name)
+    solution = chosen_solution(service.catalogue, found["survey_id"])
+    return _network(service, found, solution.adjustment_id if solution else None)
 
 
 @router.get("/adjustments/{adjustment_id}")
 def adjustment(adjustment_id: str, service: Current) -> str:
     """Show an adjusted network."""
     found = service.row(_ADJUSTMENT, adjustment_id, "adjustment")
+    return _network(service, survey_row(service, found["survey_id"]), adjustment_id)
+
+
+def _network(service: Service, survey: Mapping[str, Any], shown: str | None) -> str:
+    """Return the page of a network of a survey; without one, how to adjust."""
+    frame = frame_of(service, survey["name"], "network")
+    rows, key = service.catalogue.rows, {"id": survey["survey_id"]}
+    all_of_survey = rows(_ADJUSTMENTS, key)
+    control = rows(_N_CONTROL, key)[0]["n"]
+    if shown is None and not all_of_survey:
+        return adjustment_page(frame, None, {}, (), networks=[], n_control=control, chosen="")
+    shown = shown or all_of_survey[0]["adjustment_id"]
     sql = "SELECT * FROM {} WHERE adjustment_id = $id ORDER BY {}"
     tables = {
-        table: service.catalogue.columns(sql.format(table, order), {"id": adjustment_id})
+        table: service.catalogue.columns(sql.format(table, order), {"id": shown})
         for table, order in _TABLES.items()
     }
-    frame, files = frame_of(service, found["survey"]), _files(service, adjustment_id)
-    return adjustment_page(frame, found, tables, files)
+    solution = chosen_solution(service.catalogue, survey["survey_id"])
+    return adjustment_page(
+        frame,
+        service.row(_ADJUSTMENT, shown, "adjustment"),
+        tables,
+        _files(service, shown),
+        networks=all_of_survey,
+        n_control=control,
+        chosen=(solution and solution.adjustment_id) or "",
+    )
+
+
+@router.get("/surveys/{name:path}/rig")
+def rig(name: str, service: Current) -> str:
+    """Show the newest calibration of a survey, and all others by name."""
+    return _rig(service, survey_row(service, name), None)
 
 
 @router.get("/calibrations/{calibration_id}")
 def calibration(calibration_id: str, service: Current) -> str:
     """Show a calibration."""
     found = service.row(_CALIBRATION, calibration_id, "calibration")
-    columns, key = service.catalogue.columns, {"id": calibration_id}
-    more = {"is_chosen": found["chosen_rig"] == found["rig_digest"]}
-    more["files"] = _files(service, calibration_id)
-    frame = frame_of(service, found["survey"])
+    return _rig(service, survey_row(service, found["survey_id"]), calibration_id)
+
+
+def _rig(service: Service, survey: Mapping[str, Any], shown: str | None) -> str:
+    """Return the page of a calibration of a survey; without one, how to calibrate."""
+    frame = frame_of(service, survey["name"], "rig")
+    columns = service.catalogue.columns
+    all_of_survey = service.catalogue.rows(_CALIBRATIONS, {"id": survey["survey_id"]})
+    more: dict[str, Any] = {"calibrations": all_of_survey, "rig": survey["rig_digest"]}
+    if shown is None and not all_of_survey:
+        return calibration_page(frame, None, {}, {}, files=(), is_chosen=False, **more)
+    shown = shown or all_of_survey[0]["calibration_id"]
+    found, key = service.row(_CALIBRATION, shown, "calibration"), {"id": shown}
+    more["is_chosen"] = found["chosen_rig"] == found["rig_digest"]
+    more["files"] = _files(service, shown)
     return calibration_page(frame, found, columns(_PARAMETERS, key), columns(_GAPS, key), **more)
 
 
@@ -86,7 +149,11 @@ def start_job(name: str, fields: Fields, service: Current) -> RedirectResponse:
     kind = kinds.get(fields.get("kind", ""))
     if kind is None:
         raise InputError(f"The kind is {fields.get('kind')!r}; it is one of {', '.join(kinds)}.")
-    options = {name: fields[name] == "yes" for name in ("control", "calibrate") if name in fields}
+    options = {
+        name: fields[name] == "yes"
+        for name in ("control", "calibrate", "reprocess")
+        if name in fields
+    }
     job = start(service, NewJob(kind=kind, survey=name, options=options))
     return RedirectResponse(f"/jobs/{job.job_id}", status_code=303)
 
@@ -97,7 +164,7 @@ def choose_rig(name: str, fields: Fields, service: Current) -> RedirectResponse:
     survey = service.catalogue.choose_rig(name, fields.get("rig") or None)
     back = fields.get("back", "")
     is_ours = back.startswith("/calibrations/")
-    target = back if is_ours else f"/surveys/{quote(survey.name, safe='')}"
+    target = back if is_ours else survey_url(survey.name, "rig")
     return RedirectResponse(target, status_code=303)
 
 

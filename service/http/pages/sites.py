@@ -14,6 +14,7 @@ from spheremark.service.http.pages.frame import frame_of
 from spheremark.service.http.pages.networks import Fields
 from spheremark.service.http.state import Current, Service
 from spheremark.service.jobs.handlers import JobKind
+from spheremark.storage.catalogue.solutions import chosen_solution
 from spheremark.storage.exports.reports import kept_coverage, kept_worlds
 from spheremark.web.pages.ellipse_coverage import coverage_page
 from spheremark.web.pages.site import site_page
@@ -28,9 +29,8 @@ WHERE s.survey_id = $id ORDER BY mark
 _STATIONS = """
 SELECT station AS name, x_m, y_m FROM adjusted_stations WHERE adjustment_id = $adjustment
 UNION ALL
-SELECT DISTINCT stop AS name, x_m, y_m FROM latest_station_fixes
-WHERE $adjustment IS NULL AND survey_id = $id AND x_m IS NOT NULL
-    AND fit_method = 'along_beam' AND resection_method = 'free_station'
+SELECT station AS name, x_m, y_m FROM chosen_stations
+WHERE $adjustment IS NULL AND survey_id = $id
 ORDER BY name
 """
 _JOBS = """
@@ -61,12 +61,13 @@ def site(name: str, service: Current) -> str:
     adjustment = {"adjustment": newest.adjustment_id if newest else None}
     columns = service.catalogue.columns
     return site_page(
-        frame_of(service, survey.name),
+        frame_of(service, survey.name, "site"),
         _model(service, newest),
         columns(_MARKS, key),
         columns(_STATIONS, key | adjustment),
         products=[one.model_dump() for one in products],
         jobs=[row["job_id"] for row in rows(_JOBS, key)],
+        solution=chosen_solution(service.catalogue, survey.survey_id),
     )
 
 

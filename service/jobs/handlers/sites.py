@@ -1,7 +1,6 @@
 """Jobs of the kind ``site``: all stops of a survey in one frame, as clouds and as ground.
 
-Poses are those of the newest adjustment, one with control before a free one; without any, those of
-each station alone.
+Poses are those of the survey's chosen solution.
 """
 
 from __future__ import annotations
@@ -37,26 +36,11 @@ Key = tuple[str, str]  # recording and stop
 
 _SCRATCH, _IN_USE = "spheremark-site-", "in-use"  # names of folders, and of the file that is locked
 
-_ADJUSTED = """
-SELECT x.recording_id, x.stop, x.rig_digest, x.x_m, x.y_m, x.z_m, x.rotation, x.cov_motion,
-    a.datum AS poses, a.adjustment_id
-FROM adjusted_stations AS x JOIN adjustments AS a USING (adjustment_id)
-WHERE a.adjustment_id = (
-    SELECT adjustment_id FROM adjustments WHERE survey_id = $survey
-    ORDER BY datum = 'free', finished_at DESC LIMIT 1
-)
-ORDER BY x.station
-"""
-_FIXED = """
-SELECT f.recording_id, f.stop, r.rig_digest, f.x_m, f.y_m, f.z_m, f.rotation, f.cov_motion,
-    'fixes' AS poses, NULL::VARCHAR AS adjustment_id
-FROM latest_station_fixes AS f JOIN runs AS r USING (run_id)
-WHERE f.survey_id = $survey AND f.rotation IS NOT NULL
-QUALIFY row_number() OVER (
-    PARTITION BY f.recording_id, f.stop
-    ORDER BY f.fit_method <> 'along_beam', f.resection_method <> 'free_station'
-) = 1
-ORDER BY f.stop
+_POSES = """
+SELECT recording_id, stop, rig_digest, x_m, y_m, z_m, rotation, cov_motion, adjustment_id,
+    CASE solution WHEN 'network with control' THEN 'control' WHEN 'free network' THEN 'free'
+        ELSE 'fixes' END AS poses
+FROM chosen_stations WHERE survey_id = $survey ORDER BY station
 """
 _RIGS = "SELECT rig_digest, rig FROM rigs WHERE list_contains($digests::VARCHAR[], rig_digest)"
 
@@ -85,10 +69,7 @@ class SiteOptions(Options):
 
 def gather(catalogue: Catalogue, spec: JobSpecification) -> Mapping[str, pa.Table]:
     """Return the poses of the survey's stations and the rigs that they were computed with."""
-    survey = {"survey": spec.survey_id}
-    poses = catalogue.table(_ADJUSTED, survey)
-    if not len(poses):
-        poses = catalogue.table(_FIXED, survey)
+    poses = catalogue.table(_POSES, {"survey": spec.survey_id})
     digests = sorted({digest for digest in poses.column("rig_digest").to_pylist() if digest})
     return {"poses": poses, "rigs": catalogue.table(_RIGS, {"digests": digests})}
 

@@ -1,0 +1,337 @@
+"""Whether the stated uncertainty of a survey holds, and whether the survey is accepted."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.stats import chi2
+
+Array = NDArray[np.float64]
+
+LEVEL = 0.95  # of the interval by chance
+RADIUS_95 = 1.96  # of sigma_3d: the sphere of 95 % is smallest where one axis has all variance
+_DATUM = 4  # coordinates of control that position and heading of a network use up
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Check:
+    """Errors or residuals of one kind of result over their sigmas.
+
+    Attributes
+    ----------
+    what : str
+        centres, stations or control.
+    measure : str
+        What is compared: error against truth, residual, or difference when left out in turn.
+    n : int
+        Compared positions.
+    ratio : float or None
+        Root mean square of error over sigma in each coordinate; 1 is expected; None if unknown.
+    low, high : float or None
+        Interval of the ratio by chance, with a probability of 95 %, for sigmas that hold.
+    rms, largest : float
+        Root mean square and maximum of the lengths [m].
+    where : str
+        Position of the largest.
+    """
+
+    what: str
+    measure: str
+    n: int
+    ratio: float | None
+    low: float | None
+    high: float | None
+    rms: float
+    largest: float
+    where: str
+
+    @property
+    def is_within(self) -> bool | None:
+        """Whether the ratio is in the interval; None if there is no ratio."""
+        if self.ratio is None or self.low is None or self.high is None:
+            return None
+        return self.low <= self.ratio <= self.high
+
+    @property
+    def excess(self) -> str:
+        """The ratio beside its upper limit by chance, where it is above that; else empty."""
+        if self.ratio is None or self.high is None or self.ratio <= self.high:
+            return ""
+        return f"{self.ratio:.2f} times its sigma (RMS); by chance at most {self.high:.2f}"
+
+
+class Compared(NamedTuple):
+    """Vectors of error or residual by name, (n, 3) [m]."""
+
+    names: Sequence[str]
+    vectors: Array
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Decision:
+    """The decision on a survey, with its reasons where it is not accepted."""
+
+    status: str
+    sentence: str
+    reasons: tuple[str, ...] = ()
+
+    @property
+    def summary(self) -> str:
+        """The sentence without the decision itself."""
+        return self.sentence.rpartition(": ")[0] or self.sentence
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Evidence:
+    """What the decision on a survey depends on.
+
+    Attributes
+    ----------
+    stations : sequence of str
+        Names of the stations with coordinates.
+    sigmas_3d : (n,)
+        Their standard deviations [m].
+    failed : sequence of str
+        Stations whose global test fails; all of a network that fails.
+    missing : sequence of str
+        Stops without a position in the solution.
+    control : Check or None
+        The check of control.
+    warnings : sequence of str
+        Weaknesses of the solution.
+    is_free : bool
+        Whether the solution has no control.
+    """
+
+    stations: Sequence[str]
+    sigmas_3d: Array
+    failed: Sequence[str] = ()
+    missing: Sequence[str] = ()
+    control: Check | None = None
+    warnings: Sequence[str] = field(default=())
+    is_free: bool = False
+
+
+def by_chance(dof: float) -> tuple[float, float]:
+    """Return the interval of a root mean square of errors over sigmas by chance.
+
+    Parameters
+    ----------
+    dof : float
+        Number of independent coordinates.
+
+    Returns
+    -------
+    tuple of float
+        Its ends, with a probability of 95 % in between (chi-square).
+    """
+    tail = (1.0 - LEVEL) / 2.0
+    low, high = (math.sqrt(chi2.ppf(share, dof) / dof) for share in (tail, 1.0 - tail))
+    return low, high
+
+
+def check_of(what: str, measure: str, compared: Compared, ratio: float, dof: float) -> Check:
+    """Return a check whose ratio and independent coordinates are known.
+
+    Parameters
+    ----------
+    what, measure : str
+        See ``Check``.
+    compared : Compared
+        The vectors, without covariances.
+    ratio : float
+        Root mean square over sigma; NaN if unknown.
+    dof : float
+        Independent coordinates, or the redundancy; below 1 there is no interval.
+
+    Returns
+    -------
+    Check
+        With RMS and largest length of the vectors.
+    """
+    lengths = np.linalg.norm(compared.vectors, axis=1)
+    worst = int(lengths.argmax())
+    known = math.isfinite(ratio) and dof >= 1.0
+    low, high = by_chance(dof) if known else (None, None)
+    return Check(
+        what=what,
+        measure=measure,
+        n=len(lengths),
+        ratio=ratio if known else None,
+        low=low,
+        high=high,
+        rms=float(np.sqrt(np.mean(np.square(lengths)))),
+        largest=float(lengths[worst]),
+        where=compared.names[worst],
+    )
+
+
+def check_errors(what: str, compared: Compared, covariances: Array, dof: float) -> Check:
+    """Return the check of errors against truth.
+
+    Parameters
+    ----------
+    what : str
+        See ``Check``.
+    compared : Compared
+        The errors.
+    covariances : (n, 3, 3)
+        Their covariances.
+    dof : float
+        Independent coordinates among them: see ``independent_coordinates``.
+
+    Returns
+    -------
+    Check
+        Its ratio is the root mean square per coordinate of the whitened errors.
+    """
+    solved = np.linalg.solve(covariances, compared.vectors[..., None])[..., 0]
+    squares = np.sum(compared.vectors * solved, axis=1)
+    ratio = float(np.sqrt(np.mean(squares) / 3.0))
+    return check_of(what, "error against truth", compared, ratio, dof)
+
+
+def check_control(names: Sequence[str], differences: Array, sigmas: Array) -> Check:
+    """Return the check of control marks that were left out in turn.
+
+    Parameters
+    ----------
+    names : sequence of str
+        The marks.
+    differences, sigmas : (n, 3)
+        Predicted minus given, and its standard deviations along the axes [m].
+
+    Returns
+    -------
+    Check
+        Of its 3 n coordinates four determine position and heading.
+    """
+    ratio = float(np.sqrt(np.mean(np.square(differences / sigmas))))
+    measure = "difference when left out in turn"
+    return check_of(
+        "control", measure, Compared(names, differences), ratio, max(3 * len(names) - _DATUM, 1)
+    )
+
+
+def independent_coordinates(covariances: Array, shared: Array, scans: NDArray[np.intp]) -> float:
+    """Return how many independent coordinates errors with shared parts are worth.
+
+    Parameters
+    ----------
+    covariances : (n, 3, 3)
+        Covariances of the errors.
+    shared : (n, k, 3)
+        Effects of errors that all positions of a scan share, one sigma each; they are part of the
+        covariances.
+    scans : (n,)
+        Scan of each position.
+
+    Returns
+    -------
+    float
+        At most 3 n.
+
+    Notes
+    -----
+    The sum of squares of the whitened errors has the mean 3 n and the variance 2 (3 n + s), s being
+    the squared norm of all correlations between different positions; it is that of a scaled
+    chi-square distribution of (3 n)^2 / (3 n + s) degrees of freedom (Satterthwaite, 1946).
+    """
+    roots = np.linalg.inv(np.linalg.cholesky(covariances))
+    white = np.einsum("nij,nkj->nki", roots, shared)
+    products = np.einsum("nki,nli->nkl", white, white)  # |a_i a_j^T + ...|^2 factorises into these
+    total = -float(np.sum(np.square(products)))
+    for scan in np.unique(scans):
+        total += float(np.sum(np.square(products[scans == scan].sum(axis=0))))
+    n = 3.0 * len(covariances)
+    return n * n / (n + total)
+
+
+def decide(evidence: Evidence, tolerance: float) -> Decision:
+    """Return whether a survey is accepted.
+
+    Parameters
+    ----------
+    evidence : Evidence
+        The stations and their tests.
+    tolerance : float
+        Accepted 3-D error, which 95 % of the errors must keep [m].
+
+    Returns
+    -------
+    Decision
+        accepted; weak where a warning or a missing stop remains; refused where a test fails, a
+        station is too uncertain, or control differs by more than the tolerance.
+    """
+    n = len(evidence.stations)
+    if not n:
+        return Decision(status="none", sentence="No station has a position yet")
+    refused, weak = _refusals(evidence, tolerance), _weaknesses(evidence)
+    status = "refused" if refused else "weak" if weak else "accepted"
+    words = {"refused": "not accepted", "weak": "accepted with reservations"}.get(status, status)
+    sigma = float(np.sqrt(np.mean(np.square(evidence.sigmas_3d))))
+    size = "no valid sigma" if evidence.failed else f"{1e3 * sigma:.1f} mm (3-D sigma, RMS)"
+    return Decision(
+        status=status,
+        sentence=f"{_counted(n, 'station')}, {size}, {_control_words(evidence)}: {words}",
+        reasons=(*refused, *weak),
+    )
+
+
+def _refusals(evidence: Evidence, tolerance: float) -> list[str]:
+    """Return why a survey cannot be accepted."""
+    found = []
+    if evidence.failed:
+        found.append(
+            f"The global test fails at {_list(evidence.failed)}: residuals are larger than the "
+            "sigmas allow, so these sigmas are not valid."
+        )
+    wide = [
+        name
+        for name, sigma in zip(evidence.stations, evidence.sigmas_3d, strict=True)
+        if RADIUS_95 * sigma > tolerance
+    ]
+    if wide:
+        found.append(
+            f"{_list(wide)}: 95 % of the errors may exceed the tolerance of {1e3 * tolerance:g} mm."
+        )
+    control = evidence.control
+    if control is not None and control.largest > tolerance:
+        found.append(
+            f"Control differs by {1e3 * control.largest:.1f} mm at {control.where}, more than the "
+            f"tolerance of {1e3 * tolerance:g} mm."
+        )
+    return found
+
+
+def _weaknesses(evidence: Evidence) -> list[str]:
+    """Return what remains to be done or known of a survey."""
+    found = list(evidence.warnings)
+    if evidence.missing:
+        found.append(f"No position in this solution: {_list(evidence.missing)}.")
+    if evidence.control is not None and evidence.control.excess:
+        found.append(f"Control differs by {evidence.control.excess}.")
+    return found
+
+
+def _control_words(evidence: Evidence) -> str:
+    """Return how control is met."""
+    if evidence.control is not None:
+        return f"control met to {1e3 * evidence.control.largest:.1f} mm (largest)"
+    return "no control" if evidence.is_free else "control not checked"
+
+
+def _counted(n: int, what: str) -> str:
+    """Return a number of things."""
+    return f"{n} {what}{'' if n == 1 else 's'}"
+
+
+def _list(names: Sequence[str], most: int = 5) -> str:
+    """Return names as text, the first few of many."""
+    more = f" and {len(names) - most} more" if len(names) > most else ""
+    return ", ".join(names[:most]) + more

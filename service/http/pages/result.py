@@ -1,0 +1,51 @@
+"""The tab that a survey opens with: its decision, its coordinates, its map."""
+
+from __future__ import annotations
+
+from fastapi import APIRouter, Request
+from fastapi.responses import HTMLResponse, RedirectResponse
+
+from spheremark.service.http.pages.frame import frame_of, survey_row
+from spheremark.service.http.pages.jobs import newest_jobs
+from spheremark.service.http.state import Current
+from spheremark.service.serialise.solution import survey_result
+from spheremark.web.links import survey_url
+from spheremark.web.pages.result import result_page
+
+router = APIRouter(include_in_schema=False, default_response_class=HTMLResponse)
+
+_MARKS = "SELECT mark, x_m, y_m, z_m FROM control_marks WHERE survey_id = $id ORDER BY mark"
+_TRUE_STOPS = "SELECT stop, x_m, y_m, z_m FROM true_stops WHERE survey_id = $id ORDER BY stop"
+_COUNTS = """
+SELECT (SELECT count(*) FROM stops JOIN latest_runs USING (run_id) WHERE survey_id = $id)
+        AS n_stops,
+    (SELECT count(*) FROM control_marks WHERE survey_id = $id) AS n_control,
+    (SELECT count(*) FROM adjustments WHERE survey_id = $id) AS n_networks,
+    (SELECT count(*) FROM site_products WHERE survey_id = $id) AS n_products,
+    (SELECT changed_at FROM control_changes WHERE survey_id = $id) AS control_changed_at
+"""
+_DASHBOARD = {
+    *("method", "lane", "stop", "range_from_m", "range_to_m", "status"),
+    *("axes", "marks", "resection"),
+}
+
+
+@router.get("/surveys/{name:path}", response_model=None)
+def result(name: str, request: Request, service: Current) -> str | RedirectResponse:
+    """Show the result of a survey; an address with filters moved to the tab of accuracy."""
+    found = survey_row(service, name)
+    if _DASHBOARD & set(request.query_params):
+        target = f"{survey_url(found['name'], 'accuracy')}?{request.url.query}"
+        return RedirectResponse(target, status_code=308)
+    key, catalogue = {"id": found["survey_id"]}, service.catalogue
+    return result_page(
+        frame_of(service, found["name"], "result"),
+        survey_result(catalogue, found["survey_id"]),
+        catalogue.columns(_MARKS, key),
+        catalogue.columns(_TRUE_STOPS, key),
+        tolerance_m=found["tolerance_m"],
+        counts=catalogue.rows(_COUNTS, key)[0],
+        n_logs=len(catalogue.recordings_of_survey(found["survey_id"])),
+        sample=service.samples.message(found["survey_id"]),
+        jobs=newest_jobs(service, survey=found["survey_id"], is_active=True),
+    )

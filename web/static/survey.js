@@ -1,0 +1,131 @@
+// The tab of logs: process, move, remove and put back logs; control; name and deletion.
+import { putControl } from "./control.js";
+
+const survey = document.getElementById("survey").dataset.survey;
+const home = `/api/v1/surveys/${survey}`;
+const by = (id) => document.getElementById(id);
+
+async function call(method, address, body) {
+  const answer = await fetch(address, {
+    method,
+    headers: body === undefined ? {} : { "Content-Type": "application/json" },
+    body: body === undefined ? undefined : JSON.stringify(body),
+  });
+  const found = await answer.json();
+  if (!answer.ok) throw new Error(found.detail);
+  return found;
+}
+
+function complain(place) {
+  return (error) => {
+    place.textContent = error.message;
+    place.hidden = false;
+    place.classList.add("bad");
+  };
+}
+
+function on(attribute, act) {
+  for (const button of document.querySelectorAll(`[data-${attribute}]`)) {
+    button.addEventListener("click", () => act(button).catch(complain(by("undo"))));
+  }
+}
+
+// Says what was done in place of the page, with a button that undoes it.
+function undone(text, undo) {
+  const button = document.createElement("button");
+  button.type = "button";
+  button.textContent = "Undo";
+  button.addEventListener("click", async () => {
+    await undo();
+    location.reload();
+  });
+  by("undo").classList.remove("bad");
+  by("undo").replaceChildren(`${text} `, button);
+  by("undo").hidden = false;
+  by("undo").focus();
+}
+
+const process = (recording, more = {}) =>
+  call("POST", "/api/v1/jobs", { kind: "process", survey, recording, ...more });
+
+on("process", async (button) => {
+  for (const one of button.dataset.process.split(" ")) await process(one);
+  location.reload();
+});
+on("remove", async (button) => {
+  const address = `${home}/recordings/${button.dataset.remove}`;
+  await call("DELETE", address);
+  button.closest("tr").remove();
+  undone(`${button.dataset.name} and its results were removed.`, () => call("PUT", address));
+});
+on("put-back", async (button) => {
+  await call("PUT", `${home}/recordings/${button.dataset.putBack}`);
+  location.reload();
+});
+
+let chosen = "";
+on("options", async (button) => {
+  chosen = button.dataset.options;
+  by("options-head").textContent = `Process ${button.dataset.name} with options`;
+  by("options-dialog").showModal();
+});
+on("move", async (button) => {
+  chosen = button.dataset.move;
+  by("move-head").textContent = `Move ${button.dataset.name} to another survey`;
+  by("move-dialog").showModal();
+});
+
+function typed(field) {
+  if (field.type === "checkbox") return field.checked || undefined;
+  if (field.value === "") return undefined;
+  if (field.name === "topic") return [field.value];
+  const isNumber = field.type === "number" || field.name === "joint_sign";
+  return isNumber ? Number(field.value) : field.value;
+}
+
+by("options-start").addEventListener("click", async () => {
+  const more = { options: {}, config: {} };
+  for (const field of by("options-dialog").querySelectorAll("[name]")) {
+    const [group, name] = field.name.startsWith("config.")
+      ? ["config", field.name.slice(7)]
+      : ["options", field.name];
+    const value = typed(field);
+    if (value !== undefined) more[group][name] = value;
+  }
+  await process(chosen, more).then(() => location.reload(), complain(by("options-status")));
+});
+by("move-start").addEventListener("click", async () => {
+  const target = encodeURIComponent(by("move-target").value);
+  await call("PUT", `/api/v1/surveys/${target}/recordings/${chosen}`);
+  await call("DELETE", `${home}/recordings/${chosen}`);
+  await call("POST", "/api/v1/jobs", {
+    kind: "process", survey: by("move-target").value, recording: chosen,
+  });
+  location.assign(`/surveys/${target}/logs`);
+});
+
+document.addEventListener("control", (event) => {
+  by("put-control").disabled = !event.detail;
+});
+by("put-control").addEventListener("click", async () => {
+  const answer = await putControl(survey);
+  if (answer.ok) return location.reload();
+  by("control-status").textContent = (await answer.json()).detail;
+});
+
+by("change-survey").addEventListener("submit", async (event) => {
+  event.preventDefault();
+  const given = new FormData(event.target);
+  const body = { name: given.get("name"), tolerance_m: Number(given.get("tolerance_mm")) / 1000 };
+  await call("PATCH", home, body).then(
+    (found) => location.assign(`/surveys/${encodeURIComponent(found.name)}/logs`),
+    complain(by("change-status")),
+  );
+});
+by("delete-survey").addEventListener("click", async () => {
+  await call("DELETE", home).then(
+    () => location.assign(`/?deleted=${survey}#deleted`),
+    complain(by("change-status")),
+  );
+});
+document.addEventListener("uploaded", () => setTimeout(() => location.reload(), 800));
