@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -76,7 +76,7 @@ def _panels(
     return {panel.name: panel for panel in panels}
 
 
-def stops_page(frame: Frame, rows: list[Row], **more: Any) -> str:
+def stops_page(frame: Frame, rows: Sequence[Row], **more: Any) -> str:
     """Return the stops of a survey by its chosen solution.
 
     ``more`` are the tolerance, the number of all stops, the place of the first of these rows, and

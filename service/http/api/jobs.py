@@ -134,9 +134,9 @@ def start(
     config = SurveyConfig.from_mapping({"tolerance": survey.tolerance} | new.config)
     options = _options(kind, new) | _rig(service, new, survey)
     if not is_repeated and kind.takes_one_log:
-        named = {"kind": new.kind, "survey": survey.survey_id, "recording": recordings[0]}
-        named |= {"config": config.to_mapping(), "options": options}
-        if same := service.catalogue.same_job(named, code_version()):
+        named = {"survey": survey.survey_id, "recording": recordings[0]}
+        given = {"kind": new.kind, "config": config.to_mapping(), "options": options}
+        if same := service.catalogue.same_job(named | given, code_version()):
             return Job.of(same)
     record = service.catalogue.create_job(
         new.kind,
