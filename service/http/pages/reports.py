@@ -23,4 +23,4 @@ def report(name: str, service: Current, adjustment: Annotated[str, Query()] = ""
     address = f"/api/v1/surveys/{quote(found.survey_id)}/report"
     query = f"?{urlencode({'adjustment': adjustment})}" if adjustment else ""
     made = survey_report(service.catalogue, found.survey_id, adjustment or None)
-    return report_page(frame_of(service, found.name), made, address, query)
+    return report_page(frame_of(service, found.name, "report"), made, address, query)
