@@ -3,6 +3,7 @@
 # make check  format, lint, types, import contracts, spelling, lock files
 # make bench  speed and memory as ratios against a peer in the same run
 # make reference  renew REFERENCE.md from the commands and the settings
+# make docs   build the guide that the service shows at /guide, with pictures of its pages
 # make lock   renew the lock files from pyproject.toml
 # make sbom   write the software bill of materials (CycloneDX) to build/sbom.json
 # make clean  remove what the other targets made
@@ -15,7 +16,7 @@ KERNELS := $(shell git ls-files 'pipelines/*.py' 'storage/*.py' 2>/dev/null)
 export OPENBLAS_NUM_THREADS ?= 1
 SIDE_BY_SIDE := --numprocesses 2 --dist loadfile
 
-.PHONY: help setup setup-dev demo test check bench reference lock sbom clean
+.PHONY: help setup setup-dev demo test check bench docs reference lock sbom clean
 
 help:
 	@sed -n 's/^# //p' Makefile
@@ -65,6 +66,11 @@ bench: setup-dev
 reference: setup
 	@$(BIN)/python -m spheremark.service.cli.reference > REFERENCE.md
 
+docs: setup-dev
+	@$(BIN)/python -m tests.pictures web/guide/made/pictures
+	@$(BIN)/sphinx-build -q -W -d build/doctrees -b html web/guide web/guide/site
+	@echo "The guide is in web/guide/site; the service shows it at /guide."
+
 lock: setup-dev
 	.ci/locks $(VENV) --renew
 
@@ -74,6 +80,6 @@ sbom: setup-dev
 		--output-reproducible -o build/sbom.json requirements.lock
 
 clean:
-	rm -rf .venv .venv-* build dist *.egg-info .mypy_cache .ruff_cache .pytest_cache .hypothesis \
+	rm -rf .venv .venv-* build dist web/guide/made web/guide/site *.egg-info .mypy_cache .ruff_cache .pytest_cache .hypothesis \
 		.import_linter_cache
 	find . -name __pycache__ -type d -prune -exec rm -rf {} +

@@ -21,6 +21,11 @@ def static_folder() -> Path:
     return Path(str(resources.files("spheremark.web"))) / "static"
 
 
+def guide_folder() -> Path:
+    """Return the folder of the guide, which exists once ``make docs`` has built it."""
+    return Path(str(resources.files("spheremark.web"))) / "guide" / "site"
+
+
 def plotly_script() -> Path:
     """Return the path of Plotly's script in the installed package."""
     return Path(str(resources.files("plotly"))) / "package_data" / "plotly.min.js"

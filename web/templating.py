@@ -13,7 +13,7 @@ from jinja2 import Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup
 from plotly.io.json import to_json_plotly
 
-from spheremark.web import assets, theme
+from spheremark.web import assets, glossary, theme
 
 _MM = 1e3  # [mm/m]
 _UNKNOWN = "\N{EN DASH}"
@@ -53,6 +53,7 @@ def environment() -> Environment:
         figure_block=lambda figure: _as_block(str(to_json_plotly(figure.to_plotly_json()))),
         method=lambda name: theme.method_style(name).label,
         heading=heading,
+        term=glossary.term,
     )
     made.globals.update(assets=assets, heads_of=heads_of, zip=zip)
     return made

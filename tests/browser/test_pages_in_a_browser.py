@@ -37,6 +37,7 @@ PAGES = [
     f"{STOP}?method=paper&marker=M03",
     "/jobs",
     "/docs",
+    "/glossary",
     "/surveys/field/report",
     "/plan?a=P01:6.5,0.5,1;P02:-1,6.5,1;P03:-6.5,-3,1&b=P01:6.5,0.5,1;P02:-1,6.5,1&stop=lane3-stop1",
     "/plan/random?n_arrangements=2000",

@@ -6,12 +6,13 @@ from collections.abc import Mapping
 from dataclasses import asdict
 from typing import Annotated, Any
 
-from fastapi import APIRouter, Query, Request
-from fastapi.responses import FileResponse, HTMLResponse
+from fastapi import APIRouter, Query, Request, Response
+from fastapi.responses import FileResponse, HTMLResponse, RedirectResponse
 
+from spheremark.pipelines.errors import NotFoundError
 from spheremark.service.errors import Problem
 from spheremark.service.http.state import Current, Service
-from spheremark.web import assets
+from spheremark.web import assets, glossary
 from spheremark.web.pages.base import Frame
 from spheremark.web.pages.sql import sql_page
 from spheremark.web.templating import render
@@ -43,6 +44,28 @@ def reference_file(request: Request) -> FileResponse:
     """Return a file of Swagger UI from the installed package."""
     path = assets.reference_folder() / request.url.path.rpartition("/")[2]
     return FileResponse(path, headers={"Cache-Control": _A_YEAR})
+
+
+@router.get("/guide")
+@router.get("/guide/{page:path}")
+def guide(request: Request, service: Current, page: str = "") -> Response:
+    """Return a file of the guide, or how to build it."""
+    folder = assets.guide_folder()
+    if not folder.is_dir():
+        return HTMLResponse(render("guide.html", frame=frame_of(service)))
+    if request.url.path == "/guide":
+        return RedirectResponse("/guide/")
+    found = (folder / (page or "index.html")).resolve()
+    if not found.is_relative_to(folder.resolve()) or not found.is_file():
+        raise NotFoundError(f"The guide has no page {page!r}; /guide/ lists its pages.")
+    return FileResponse(found)
+
+
+@router.get("/glossary")
+def show_glossary(service: Current) -> str:
+    """Show the words of the product and their meaning."""
+    words = glossary.glossary()
+    return render("glossary.html", frame=frame_of(service), words=words, anchor=glossary.anchor)
 
 
 @router.get("/docs")
