@@ -32,7 +32,8 @@ from spheremark.pipelines.sphere.returns import Returns, may_be_sphere, moved_fa
 _EFFICIENCY = 0.9753  # variance of the estimate over the inverse normal matrix
 _SIGMA_BIAS_MIN = 1e-5  # [m] of the laser biases: keeps their prior invertible
 _SIGMA_MIN = 1e-9  # of the other shared unknowns: likewise
-_N_STEPS = 7
+_N_STEPS, _N_STEPS_MAX = 7, 16  # at the least, and where errors of the mounting are still found
+_SETTLED = 0.2  # sigmas by which centres may still move
 _N_STEPS_GATED = 4  # after these the choice of returns by their place is fixed
 _N_STEPS_RANGES = 3  # without the limb
 _N_STEPS_ROBUST = 3  # after these the noise is that of the weighted residuals
@@ -152,7 +153,7 @@ def estimate(
     state, radius = _start(rough, prior), prior.radius
     is_used = np.ones(len(returns.ranges), dtype=bool)
     factors = np.zeros((len(returns.ranges), 2))
-    for step in range(_N_STEPS):
+    for step in range(_N_STEPS_MAX):
         corrected = _corrected(returns, state)
         linear = linearise(corrected, *_spheres(state, radius), is_used)
         if step < _N_STEPS_GATED:
@@ -170,7 +171,9 @@ def estimate(
             centres, rhs = observe(state.centres, state.covs)
             N.centres[:, :, :3] += centres
             N.centres[:, :, -1] += rhs
-        state = _stepped(state, N, prior)
+        before, state = state, _stepped(state, N, prior)
+        if step + 1 >= _N_STEPS and _moved(before, state) < _SETTLED:
+            break
     corrected = _corrected(returns, state)
     linear = linearise(corrected, *_spheres(state, radius), is_used)
     weighed = _weighed(corrected, state, linear, (radius, state.noise, is_used))
@@ -256,6 +259,12 @@ def _stepped(state: State, N: Normals, prior: Prior) -> State:
         cov_shared=cov_shared,
         cov_optics=estimated[_optics_of(prior), _optics_of(prior)],
     )
+
+
+def _moved(before: State, state: State) -> float:
+    """Return how far the centre that moved most did so, in sigmas by the noise."""
+    steps = np.linalg.norm(state.centres - before.centres, axis=1)
+    return float(np.max(steps / np.sqrt(np.trace(state.cov_noise, axis1=1, axis2=2))))
 
 
 def _with_considered(estimated: Array, N: Array, prior: Prior, spread: float) -> Array:

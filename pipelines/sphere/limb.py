@@ -30,6 +30,7 @@ _SIGMAS_OWN = np.array([0.05, 0.1])
 _POLE_BLUR = 0.3  # half widths by which returns beside the pole may be the pole's
 _OUTLIERS = 0.01  # share of returns with the sphere's range whose beam did not meet it
 _CERTAIN = 4.0  # standard deviations inside the limb beyond which a return carries no information
+_DAMPING = 0.5  # part of the factors before that those of a step keep
 _CAVITY_MIN = 0.05  # least share of a centre's precision that is not one return's own
 _DENSITY = 1.0 / math.sqrt(2.0 * math.pi)
 
@@ -166,6 +167,8 @@ def limb_normals(
     variances = np.einsum("in,nij,jn->n", rows, covs[returns.markers[used]], rows)
     found = np.zeros(factors.shape)
     found[used] = weights[used, None] * _approximated(inside, (variances, blur2), factors[used])
+    if factors.any():  # factors that change together would overshoot, and come back
+        found[used] += _DAMPING * (factors[used] - found[used])
 
     precisions, rhs = found[used, 0], found[used, 1] - found[used, 0] * inside
     starts, right = np.searchsorted(used, returns.starts), np.vstack([precisions * columns, rhs])

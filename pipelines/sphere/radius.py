@@ -18,6 +18,7 @@ from spheremark.pipelines.sphere.normal_equations import sums_of_products
 from spheremark.pipelines.sphere.returns import Returns, may_be_sphere, of_markers, returns_of
 
 _ITERATED = 2.0  # standard deviations of one step, beyond which the steps are iterated
+_MISFIT = 4.0  # standard deviations of a sum of squares, likewise
 _BETTER, _BETTER_OWN = 9.0, 14.0  # chi-square in favour of another radius; noise unknown
 _CLIP = 9.0  # squared standard deviations beyond which a residual is an outlier
 _WEAK_PRIOR = 5.0  # radii: sigma of a prior that only keeps equations solvable
@@ -68,12 +69,15 @@ def free_radii(
     unbiased and its sigma holds if the assumption is true, however few returns there are. The
     maximum-likelihood radius is not: small spheres look precise. The sigma is that of the step by
     the noise alone (sandwich form). Where the likelihood of another radius is so much greater that
-    the assumption must be wrong, the maximum-likelihood radius is returned.
+    the assumption must be wrong, the maximum-likelihood radius is returned; it is looked for where
+    the step is long or residuals are greater than the noise.
     """
     assumed = spheres[:, 3]
     steps, prior_covs, sigmas = _score_steps(returns, observed, spheres, covs, residuals)
     radii = assumed + steps[:, 3]
-    doubtful = np.flatnonzero(np.abs(steps[:, 3]) > _ITERATED * sigmas)
+    misfits, n = _misfits(returns, observed, residuals), np.diff(returns.starts)
+    is_misfit = misfits > n + _MISFIT * np.sqrt(2.0 * n)
+    doubtful = np.flatnonzero((np.abs(steps[:, 3]) > _ITERATED * sigmas) | is_misfit)
     if len(doubtful):
         some, rows = of_markers(returns, doubtful)
         ranges = Ranges(*(column[rows] for column in observed))
@@ -81,8 +85,7 @@ def free_radii(
         started = spheres[doubtful] + np.clip(steps[doubtful], -limits, limits)
         found, found_covs = _iterated(some, ranges, started, prior_covs[doubtful])
         linear = linearise(some, found, covs[doubtful], ranges.weights > 0.0)
-        gains = _misfits(some, ranges, residuals[rows])
-        gains -= _misfits(some, ranges, ranges.ranges - linear.ranges)
+        gains = misfits[doubtful] - _misfits(some, ranges, ranges.ranges - linear.ranges)
         better = gains > _BETTER
         radii[doubtful[better]] = found[better, 3]
         sigmas[doubtful[better]] = np.sqrt(found_covs[better, 3, 3])

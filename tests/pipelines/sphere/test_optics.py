@@ -71,10 +71,13 @@ def test_a_gaussian_beam_and_a_matt_surface_shift_centres_by_less_than_half(matt
 
 
 def test_beams_without_divergence_shift_centres_by_less_than_half():
-    worlds = list(scans(Optics(divergence_scale=0.0)))
+    worlds, even = list(scans(Optics(divergence_scale=0.0))), list(scans(Optics()))
     off, _, optics = along(worlds, FittingConfig())
     before, _, _ = along(worlds, SPECIFIED)
-    assert abs(off.mean()) < 0.5 * abs(before.mean())
+    # the noise of 42 centres shifts their mean by as much, in worlds of either beam alike
+    by_noise = along(even, SPECIFIED)[0].mean()
+    assert before.mean() - by_noise < -0.0002
+    assert abs(off.mean() - by_noise) < 0.5 * abs(before.mean() - by_noise)
     # widths at 8 m: 17 mm by the divergence as specified, and 11 mm at the window
     widths = [
         1.0 + width + 11.0 / 17.0 * window for width, window, _ in (o.estimates for o in optics)
