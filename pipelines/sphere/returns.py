@@ -63,9 +63,9 @@ class Returns(NamedTuple):
 
 
 def returns_of(
-    beams: Beams, starts: Index, up: Array, lasers: Index, noise: tuple[Index, Array, float]
+    beams: Beams, starts: Index, up: Array, lasers: Index, noise: tuple[Index, Array, Array | float]
 ) -> Returns:
-    """Build the columns; ``noise`` is reflectivity classes, range sigmas, direction sigma."""
+    """Build the columns; ``noise`` is reflectivity classes, sigmas of range and direction."""
     classes, sigmas, sigma_direction = noise
     origins, directions, first_axes = (
         np.ascontiguousarray(vectors.T)

@@ -103,13 +103,21 @@ def footprint(shots, divergence, n=24):
     return v / np.linalg.norm(v, axis=-1, keepdims=True)
 
 
-def lit_ranges(shots, centre, radius, divergence, n=24):
-    """Mean range over the part of each footprint that hits a sphere, infinite where none does."""
+def lit_ranges(shots, centre, radius, divergence, n=24, power=0.0):
+    """Mean range over the part of each footprint that hits a sphere, infinite where none does.
+
+    Parts weigh by a power of the cosine of incidence.
+    """
     rays = footprint(shots, divergence, n)
     t = sphere_ranges(shots.origins[:, None], rays, centre, radius)
     hits = np.isfinite(t)
-    total = np.where(hits, t, 0).sum(axis=1)
-    return np.where(hits.any(axis=1), total / np.maximum(hits.sum(axis=1), 1), np.inf), hits.mean(1)
+    reached, weights = np.where(hits, t, 0), hits.astype(float)
+    if power:
+        out = shots.origins[:, None] + reached[..., None] * rays - centre
+        cosines = -np.einsum("...i,...i->...", rays, out) / radius
+        weights *= np.maximum(cosines, 0.05) ** power
+    total, weight = (weights * reached).sum(axis=1), weights.sum(axis=1)
+    return np.where(weight > 0, total / np.maximum(weight, 1e-12), np.inf), hits.mean(axis=1)
 
 
 def cloud_of(shots, ranges, intensity=30.0, rig=RIG, levelling=LEVEL):
@@ -131,10 +139,12 @@ def cloud_of(shots, ranges, intensity=30.0, rig=RIG, levelling=LEVEL):
     )
 
 
-def marker_shots(centre, rng, *, sigma=0.0, divergence=RIG.divergence, pole=0.0, step=0.002):
+def marker_shots(
+    centre, rng, *, sigma=0.0, divergence=RIG.divergence, pole=0.0, step=0.002, power=0.0
+):
     """Shots at one marker and their noisy ranges: footprint, pole below, mixed pixels with it."""
     near = towards(fire(), centre, 2.6 * RADIUS)
-    ranges, lit = lit_ranges(near, centre, RADIUS, divergence)
+    ranges, lit = lit_ranges(near, centre, RADIUS, divergence, power=power)
     ranges = np.where(lit > 0.5, ranges, np.inf)
     if pole:
         foot = centre - [0, 0, 2.0]
