@@ -65,6 +65,10 @@ class StitchingConfig:
     sigma_levelling : float
         Standard deviation of the AHRS's roll and pitch [rad]. 0.2 deg: data sheet of the
         MTi-G-710 for static use.
+    sigma_clock : float
+        Standard deviation of the gimbal's stamps on the LiDAR's clock, which the heading of a
+        station carries: at an even speed an offset turns all centres alike, and nothing shows it
+        [s]. 0.03: a stamp anywhere in a revolution of 0.1 s. Sensors that share a clock have less.
     rest : float
         A rest of the gimbal, or a gap, longer than this ends a stop once the gimbal has turned by
         half a turn [s]. 3: longer than any step of a step-and-shoot scan.
@@ -73,12 +77,14 @@ class StitchingConfig:
     range_min: float = 0.9
     range_max: float = 60.0
     sigma_levelling: float = math.radians(0.2)
+    sigma_clock: float = 0.03
     rest: float = 3.0
 
     def __post_init__(self) -> None:
         _check("stitching.range_min", self.range_min, 0.0, 10.0)
         _check("stitching.range_max", self.range_max, 1.0, 300.0)
         _check("stitching.sigma_levelling", self.sigma_levelling, 1e-6, 0.5)
+        _check("stitching.sigma_clock", self.sigma_clock, 0.0, 1.0)
         _check("stitching.rest", self.rest, 0.1, 600.0)
 
 
@@ -147,11 +153,12 @@ class FittingConfig:
         Standard deviation of the power of the cosine of incidence with which a part of the
         footprint weighs in the range of its echo. 0 is even; 1 is the energy of a matt surface.
     sigma_range_common : float
-        Standard deviation of what all lasers measure too long in common [m]. 0.002; where the
-        lasers of a scan differ by more than ``sigma_range_bias`` it grows with them.
+        Standard deviation of what all lasers measure too long in common [m]. 0.0034: what the
+        maker's 0.03, as three sigma, leaves beside noise of 0.0089 and ``sigma_range_bias``; where
+        the lasers of a scan differ by more than that it grows with them.
     sigma_range_scale : float
-        Standard deviation of the scale of all ranges, relative. 5e-5: the oscillator of the
-        sensor's clock.
+        Standard deviation of the scale of all ranges, relative. 1e-4: the maker's 0.03 m at 100 m,
+        as three sigma.
     paper_model : str
         What ``paper`` registers to the returns, of ``PAPER_MODELS``. hemisphere: as the study does;
         its Figure 3 shows the whole sphere instead.
@@ -171,8 +178,8 @@ class FittingConfig:
     sigma_beam_width: float = 0.35
     sigma_beam_window: float = 0.5
     sigma_echo_cosine: float = 0.7
-    sigma_range_common: float = 0.002
-    sigma_range_scale: float = 5e-5
+    sigma_range_common: float = 0.0034
+    sigma_range_scale: float = 1e-4
     paper_model: str = "hemisphere"
     paper_cut: str = "equator"
 
@@ -214,10 +221,10 @@ class ResectionConfig:
         from one direction to the next and both faces share, as the jitter of the encoder [m].
     sigma_range : float
         Standard deviation of the common range bias, an unknown of a network [m]; 0 leaves it out.
-        2.1 mm: ``fitting.sigma_range_common``, and the mean of 16 lasers of 3 mm each.
+        3.5 mm: ``fitting.sigma_range_common``, and the mean of 16 lasers of 3 mm each.
     sigma_range_scale : float
         Standard deviation of the scale of all ranges, an unknown of a network; 0 leaves it out.
-        5e-5, as in ``fitting``.
+        1e-4, as in ``fitting``.
     sigma_range_shared : float
         Part of ``sigma_range`` that the covariance of each centre already contains, for fits that
         do not report it (``along_beam`` does, from the biases that it estimates) [m]. 0.9 mm: the
@@ -235,8 +242,8 @@ class ResectionConfig:
     test_level: float = 0.001
     test_power: float = 0.80
     sigma_common: float = 0.00005
-    sigma_range: float = 0.0021
-    sigma_range_scale: float = 5e-5
+    sigma_range: float = 0.0035
+    sigma_range_scale: float = 1e-4
     sigma_range_shared: float = 0.0009
     sigma_height: float = 0.0002
 

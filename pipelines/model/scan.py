@@ -198,6 +198,12 @@ class Levelling:
     # false when no AHRS was recorded and the base is only assumed to be about level
     is_measured: bool
     sigma_heading: float = 0.0  # standard deviation of the heading, from mounting and encoder [rad]
+    sigma_clock: float = 0.0  # the same from the clocks of gimbal and LiDAR [rad]
+
+    @property
+    def sigma_heading_station(self) -> float:
+        """Standard deviation of the heading of the station [rad]."""
+        return float(np.hypot(self.sigma_heading, self.sigma_clock))
 
 
 @dataclass(frozen=True, slots=True, eq=False)

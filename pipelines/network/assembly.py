@@ -389,7 +389,7 @@ def _network(
         ),
         R_station_base=np.array([levelling_rotation(one) for one in levellings]),
         cov_up_base=np.array([one.sigma**2 * J @ J.T for one, J in leans]),
-        sigma_headings=np.array([one.sigma_heading for one in levellings]),
+        sigma_headings=np.array([one.sigma_heading_station for one in levellings]),
         controls=np.array([row[mark] for mark in controls], dtype=np.intp),
         p_control_site=np.array([found.p_site[mark] for mark in controls]).reshape(-1, 3),
         cov_control_site=given + _EXACT**2 * np.eye(3),

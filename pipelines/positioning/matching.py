@@ -75,7 +75,7 @@ class Scene:
     J_up: Array  # (3, 2) derivative of the up direction by roll and pitch
     sigma_level: float  # standard deviation of each of the two angles [rad]
     is_levelled: bool  # whether they were measured
-    # standard deviation of the heading that mounting and encoder leave unknown [rad]
+    # standard deviation of the heading that mounting, encoder and clocks leave unknown [rad]
     sigma_heading: float
     sigma_range: float  # standard deviation of what all ranges are too long together [m]
     shared: Array  # (n,) how much of each centre's variance along its line of sight is that [m^2]
@@ -145,7 +145,7 @@ def gather(fits: MarkerFits, marks: ControlMarks, config: ResectionConfig) -> Sc
         J_up=up_by_lean(levelling),
         sigma_level=levelling.sigma,
         is_levelled=levelling.is_measured,
-        sigma_heading=levelling.sigma_heading,
+        sigma_heading=levelling.sigma_heading_station,
         sigma_range=(float(np.median(sigmas_shared)) if is_reported.all() else config.sigma_range),
         shared=shared_variances(p_base, cov_p_base, sigmas_shared, config),
         sigma_height=config.sigma_height,

@@ -185,7 +185,10 @@ def stitch(log: ScanLog, rig: Rig, config: StitchingConfig) -> StitchedCloud:
     pulses = Pulses(log.p_lidar, log.intensities, rings, log.stamps_lidar_ns)
     kept, tally = turn_returns(pulses, joints, _lidar(rig, config))
     _refuse_empty(log, joints, tally, config)
-    levelling, weaknesses = _clocked(level(log, rig, config), tally, joints)
+    levelling = level(log, rig, config)
+    rate = float(np.nan_to_num(np.nanmedian(np.abs(joints.rates)))) / _NS
+    levelling = replace(levelling, sigma_clock=rate * config.sigma_clock)
+    levelling, weaknesses = _clocked(levelling, rate, tally, joints)
     coverage, duration = _extent(tally, joints)
     notes += smear_note + pause_notes(log) + _count_notes(tally)
     notes += _level_notes(levelling) + _turn_notes(coverage)
@@ -206,7 +209,7 @@ def stitch(log: ScanLog, rig: Rig, config: StitchingConfig) -> StitchedCloud:
 
 
 def _clocked(
-    levelling: Levelling, tally: Tally, joints: Joints
+    levelling: Levelling, rate: float, tally: Tally, joints: Joints
 ) -> tuple[Levelling, tuple[str, ...]]:
     """Return the levelling with a heading as uncertain as the clocks, and why it is.
 
@@ -221,7 +224,7 @@ def _clocked(
     if not len(gaps) or overrun < _OVERRUN * np.median(gaps) or lead < overrun:
         return levelling, ()
     late = 0.5 * (lead + overrun)
-    turned = float(np.nanmedian(np.abs(joints.rates)) / _NS * late)
+    turned = rate * late
     sigma = float(np.hypot(levelling.sigma_heading, turned))
     return replace(levelling, sigma_heading=sigma), (
         f"Returns go on for {overrun:.2f} s after the last joint sample and begin {lead:.2f} s "

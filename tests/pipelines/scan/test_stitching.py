@@ -271,6 +271,18 @@ def test_returns_without_a_gimbal_angle_are_left_out_and_counted(rng):
     assert any(note.startswith(f"{lost} returns have no gimbal angle") for note in cloud.notes)
 
 
+def test_clocks_leave_the_heading_uncertain_by_what_the_gimbal_turns_in_their_offset(rng):
+    rig, times = crooked_rig(rng), np.arange(0.0, 10.01, 0.01)
+    log = joints(scan_log(rng, rig, duration=10.0, n=20000)[0], times, 2 * np.pi * times / 10.0)
+    levelling = stitch(log, rig, replace(CONFIG, sigma_clock=0.004)).levelling
+    assert levelling.sigma_clock == pytest.approx(2 * np.pi / 10.0 * 0.004, rel=1e-6)
+    assert levelling.sigma_heading_station == pytest.approx(
+        np.hypot(rig.sigma_heading, levelling.sigma_clock)
+    )
+    known = stitch(log, rig, replace(CONFIG, sigma_clock=0.0)).levelling
+    assert known.sigma_heading_station == rig.sigma_heading
+
+
 def test_stamps_of_the_end_of_a_revolution_make_the_heading_uncertain_by_what_it_turned(rng):
     rig, times = crooked_rig(rng), np.arange(0.0, 10.01, 0.01)
     log, _ = scan_log(rng, rig, duration=10.0, n=20000)
