@@ -31,6 +31,7 @@ from spheremark.pipelines.geometry import inverse, transform
 from spheremark.pipelines.model import (
     Array,
     Index,
+    MarkerFit,
     MarkerFits,
     Rig,
     StitchedCloud,
@@ -259,7 +260,7 @@ def _calls(scan: Scan, fits: MarkerFits, places: Array) -> tuple[list[Call], lis
 def _centres(scan: Scan, fits: MarkerFits, marks: Sequence[int]) -> dict[int, Centre]:
     """Return the errors of centres by mark; that of the heading, which all share, is taken out.
 
-    Squares are in units of the covariance with the heading's own sigma, heading left in.
+    Squares are those of the prediction from the heading that the other centres show.
     """
     true = transform(inverse(scan.stop.truth.T_site_base), scan.world.field.marks.p_site)
     matched = [(fit, mark) for fit, mark in zip(fits.fits, marks, strict=True) if mark >= 0]
@@ -271,13 +272,25 @@ def _centres(scan: Scan, fits: MarkerFits, marks: Sequence[int]) -> dict[int, Ce
     weights = 1.0 / np.array([np.trace(fit.cov_p_base) for fit, _ in matched])
     turn = (weights * (aside * errors).sum(axis=1)).sum() / (weights * (aside**2).sum(axis=1)).sum()
     left = errors - turn * aside if len(matched) > 1 else errors
-    bounds, sigma_heading = _bounds(scan), fits.levelling.sigma_heading
-    found = {}
-    for (fit, mark), error, rest in zip(matched, errors, left, strict=True):
-        square = float(error @ np.linalg.solve(fit.cov_with_heading(sigma_heading), error))
-        bound2 = bounds.get(mark, np.nan)
-        found[mark] = Centre(fit.status.value, float(rest @ rest), bound2, square)
-    return found
+    bounds, squares = _bounds(scan), _squares(errors, aside, fits, [fit for fit, _ in matched])
+    return {
+        mark: Centre(fit.status.value, float(rest @ rest), bounds.get(mark, np.nan), float(square))
+        for (fit, mark), rest, square in zip(matched, left, squares, strict=True)
+    }
+
+
+def _squares(errors: Array, aside: Array, fits: MarkerFits, matched: Sequence[MarkerFit]) -> Array:
+    """Return squared errors over covariances; ``aside`` is how a heading moves each centre.
+
+    The heading of the stop is known by its prior and by the errors of all other centres.
+    """
+    covs = np.array([fit.cov_p_base for fit in matched])
+    weighted = np.linalg.solve(covs, aside[:, :, None])[:, :, 0]
+    own, shown = np.sum(weighted * aside, axis=1), np.sum(weighted * errors, axis=1)
+    variances = 1.0 / (fits.levelling.sigma_heading_station**-2.0 + own.sum() - own)
+    left = errors - (variances * (shown.sum() - shown))[:, None] * aside
+    covs += variances[:, None, None] * aside[:, :, None] * aside[:, None, :]
+    return np.asarray(np.einsum("ni,ni->n", left, np.linalg.solve(covs, left[:, :, None])[:, :, 0]))
 
 
 def _bounds(scan: Scan) -> dict[int, float]:
