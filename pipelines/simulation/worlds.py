@@ -162,15 +162,13 @@ class Scan(NamedTuple):
     stop: SimulatedStop
 
 
-def random_world(seed: int, family: str = "") -> Scan:
+def random_world(seed: int) -> Scan:
     """Simulate one stop of a random world.
 
     Parameters
     ----------
     seed : int
-        Seed of everything, 0 or more.
-    family : str
-        One of ``FAMILIES``; by default families take turns with the seeds.
+        Seed of ``draw_world`` and of the scan.
 
     Returns
     -------
@@ -178,7 +176,7 @@ def random_world(seed: int, family: str = "") -> Scan:
         Log, truth, world and stop. The truth holds family, decoys by kind and place, and visible
         share, returns and scan lines of each marker.
     """
-    world = draw_world(seed, family)
+    world = draw_world(seed)
     stop = simulate_stop(world.field, world.field.stops[0].name, world.config)
     return Scan(stop.log, survey_truth(world.field, [stop], world.config, seed), world, stop)
 
