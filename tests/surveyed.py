@@ -221,7 +221,9 @@ def fill(
 def _finish(catalogue, folder, survey_id, moment, result, control):
     """Enter a recording and a successful job with its results."""
     digest = hashlib.sha256(f"{survey_id} {moment}".encode()).hexdigest()
-    report = {"verdict": "ok", "reasons": [], "topics": [{"topic": "/points", "n_messages": 132}]}
+    topic = {"topic": "/points", "schema": "sensor_msgs/msg/PointCloud2", "encoding": "cdr"}
+    topic |= {"n_messages": 132, "rate_hz": 10.0, "longest_gap_s": 0.1}
+    report = {"verdict": "ok", "reasons": [], "topics": [topic]}
     catalogue.add_recording(
         digest, name=result.name, size_bytes=91_000_000, url="/nowhere.mcap", preflight=report
     )

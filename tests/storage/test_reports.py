@@ -7,7 +7,9 @@ from spheremark.storage.exports.reports import keep_coverage, kept_coverage, wri
 
 def test_a_report_on_coverage_is_read_as_it_was_kept_with_its_rows_as_csv_beside_it(tmp_path):
     data = tmp_path / "data"
-    assert kept_coverage(data) is None
+    released = kept_coverage(data)
+    assert released["is_released"]
+    assert released["n_stations"] == 15 * released["n_surveys"] > 300
     report = {
         "levels": [{"method": "network", "share": 0.5}],
         "curve": [{"method": "network", "share": 0.25}],

@@ -51,10 +51,10 @@ def test_shares_that_miss_their_level_by_more_than_five_points_are_marked(report
     assert "error 3.21 mm, predicted 3.33 mm" in text
 
 
-def test_without_a_report_the_page_has_the_command_that_makes_one():
-    text = coverage_page(Frame(), None)
-    assert "spheremark bench --coverage" in text
-    assert "data-figure" not in text
+def test_a_released_report_names_its_worlds(report):
+    text = coverage_page(Frame(), report | {"is_released": True})
+    assert "measured for the release" in text
+    assert f"Seeds {report['seed']} to {report['seed'] + report['n_surveys'] - 1}" in text
 
 
 def test_found_shares_are_drawn_against_nominal_ones_with_their_intervals(report):

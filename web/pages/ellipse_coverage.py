@@ -36,15 +36,16 @@ _SQUARES = (
 _WITHIN = 0.05  # by which a share may be off
 
 
-def coverage_page(frame: Frame, report: Mapping[str, Any] | None) -> str:
-    """Return the page of a report of many simulated surveys, if there is one."""
+def coverage_page(frame: Frame, report: Mapping[str, Any]) -> str:
+    """Return the page of a report of many simulated surveys."""
     return render(
         "coverage.html",
         frame=frame,
         report=report,
-        panels=() if report is None else _panels(report),
+        panels=_panels(report),
         labels=_LABELS,
-        rows=() if report is None else report["nees"],
+        rows=report["nees"],
+        is_released=report.get("is_released", False),
         is_of=_is_of,
         within=_WITHIN,
     )

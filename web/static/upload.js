@@ -1,6 +1,8 @@
 // Uploads dropped or chosen logs one after another, each with its progress and its result.
 // The files of a folder that `ros2 bag record` wrote are one log. Each log that arrived is
 // announced by an event "uploaded" of the document, whose detail is the answer of the service.
+import { Resumable, isWorthParts } from "./resumable.js";
+
 const drop = document.getElementById("drop");
 const list = document.getElementById("uploads");
 const LOG = /\.(mcap|db3|bag|pcap|pcapng|zip)(\.zstd)?$/i;
@@ -49,6 +51,43 @@ function bodyOf(log) {
   return form;
 }
 
+function count(log, parts, loaded) {
+  parts.progress.value = loaded;
+  const share = Math.min(1, loaded / (log.size || 1));
+  parts.outcome.textContent = `${(100 * share).toFixed(0)} %`;
+}
+
+// Sends a large log with a button that pauses it; returns status and response as of a POST.
+async function inParts(log, parts, query) {
+  query.set("filename", log.name);
+  query.delete("name");
+  const upload = new Resumable(log.parts[0], query, (loaded) => count(log, parts, loaded));
+  const pause = document.createElement("button");
+  pause.type = "button";
+  pause.textContent = "Pause";
+  pause.addEventListener("click", () => {
+    upload.toggle();
+    pause.textContent = upload.isPaused ? "Resume" : "Pause";
+  });
+  parts.item.append(pause);
+  try {
+    const answer = await upload.run();
+    if (!answer.ok) return { status: answer.status, response: await answer.json() };
+    const found = await (await fetch(answer.headers.get("Content-Location"))).json();
+    const job = /jobs\/(\w+)/.exec(answer.headers.get("Link") ?? "");
+    if (found.verdict !== "refused") {
+      return { status: 201, response: { ...found, job: job && { job_id: job[1] } } };
+    }
+    const { code, reasons } = found.preflight;
+    const response = { code, detail: reasons.join(" "), recording_id: found.recording_id };
+    return { status: 400, response };
+  } catch {
+    return { status: 0, response: null };
+  } finally {
+    pause.remove();
+  }
+}
+
 function send(log, parts, given) {
   const query = new URLSearchParams({ name: log.name });
   for (const [key, value] of new FormData(document.getElementById("reading"))) {
@@ -60,6 +99,7 @@ function send(log, parts, given) {
     query.set("process", "true");
   }
   for (const [key, value] of Object.entries(given)) query.set(key, value);
+  if (log.parts.length === 1 && isWorthParts(log.parts[0])) return inParts(log, parts, query);
   return new Promise((resolve) => {
     const request = new XMLHttpRequest(); // fetch does not report the progress of a body
     request.open("POST", `/api/v1/recordings?${query}`);
@@ -68,9 +108,7 @@ function send(log, parts, given) {
     }
     request.responseType = "json";
     request.upload.addEventListener("progress", (event) => {
-      parts.progress.value = event.loaded;
-      const share = Math.min(1, event.loaded / (log.size || 1));
-      parts.outcome.textContent = `${(100 * share).toFixed(0)} %`;
+      count(log, parts, event.loaded);
     });
     request.addEventListener("loadend", () => resolve(request));
     request.send(bodyOf(log));
