@@ -64,7 +64,8 @@ function table(marks) {
   row(made.createTHead(), ["Mark", "x [m]", "y [m]", "z [m]", "Sigma [mm]"], "th");
   const body = made.createTBody();
   for (const mark of marks.slice(0, 200)) {
-    const sigma = (1000 * Math.max(mark.sigma_x_m, mark.sigma_y_m, mark.sigma_z_m)).toFixed(1);
+    const largest = Math.max(mark.sigma_x_m, mark.sigma_y_m, mark.sigma_z_m);
+    const sigma = largest ? (1000 * largest).toFixed(1) : "exact";
     row(body, [mark.mark, ...["x_m", "y_m", "z_m"].map((k) => mark[k].toFixed(4)), sigma], "td");
   }
   return made;

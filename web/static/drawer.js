@@ -3,7 +3,9 @@ const OPEN = new Set(["accepted", "running"]);
 const by = (id) => document.getElementById(id);
 const drawer = by("jobs-drawer");
 const jobs = new Map();
+const EVERY = 5000; // [ms] between two counts of active jobs while the drawer is closed
 let source;
+let timer;
 
 function item(job) {
   const place = document.createElement("li");
@@ -56,6 +58,9 @@ async function load() {
   for (const job of (await answer.json()).items) jobs.set(job.job_id, job);
   show();
   follow();
+  clearTimeout(timer);
+  const isActive = [...jobs.values()].some((job) => OPEN.has(job.status));
+  if (isActive && !source) timer = setTimeout(load, EVERY);
 }
 
 // Only while something is active: a connection for each open page would block others.

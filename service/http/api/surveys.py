@@ -85,7 +85,7 @@ class Layout(Strict):
         default=0.0, gt=-100, lt=100, description="Height of the centres above the points [m]."
     )
     sigma_m: float = Field(
-        default=0.0, ge=0, le=1, description="Sigma of coordinates that have none in the file [m]."
+        default=0.0, ge=0, le=1, description="Sigma of coordinates whose sigma is missing or 0 [m]."
     )
 
     def layout(self) -> ControlLayout:
