@@ -11,6 +11,7 @@ from fastapi.exceptions import RequestValidationError
 
 from spheremark.service.http.api import (
     audit,
+    clouds,
     compare,
     figures,
     jobs,
@@ -50,6 +51,6 @@ def _parameters(app: FastAPI) -> dict[str, set[str]]:
 router = APIRouter(dependencies=[Depends(_require_known_parameters)])
 for part in (
     *(surveys, reports, recordings, uploads, jobs, results),
-    *(products, rigs, plans, sql, figures, compare, audit, problems),
+    *(products, rigs, plans, sql, figures, compare, clouds, audit, problems),
 ):
     router.include_router(part.router)

@@ -2,6 +2,7 @@
 
 from spheremark.service.http.pages import (
     accuracy,
+    clouds,
     compare,
     frame,
     jobs,
@@ -19,7 +20,7 @@ ROUTERS = tuple(
     page.router
     for page in (
         *(frame, overview, compare, jobs, plans),
-        *(sites, stops, networks, accuracy, logs, reports),
+        *(sites, clouds, stops, networks, accuracy, logs, reports),
         result,  # last: the name of a survey takes slashes
     )
 )
