@@ -59,7 +59,7 @@ def test_the_nodes_hold_all_points_of_the_cloud(client, scene):
     [
         ("surveys/field/scene?stop=nowhere", 404),
         ("surveys/nothing/scene", 404),
-        ("clouds/octree?run=x&stop=y", 404),
+        ("clouds/octree?run=x&stop=y", 422),
         ("clouds/octree/../x?run=x&stop=y", 404),
         ("clouds/octree/r9?run=x&stop=y", 422),
     ],

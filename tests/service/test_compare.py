@@ -68,11 +68,11 @@ def test_methods_are_compared_stop_by_stop(client):
 @pytest.mark.parametrize(
     ("a", "b", "status"),
     [
-        ("run:none", "run:none", 404),
-        ("network:none", "network:none", 404),
-        ("rig:none", "rig:none", 404),
-        ("plan:none", "plan:none", 404),
-        ("method:field/none", "method:field/paper", 404),
+        ("run:none", "run:none", 422),
+        ("network:none", "network:none", 422),
+        ("rig:none", "rig:none", 422),
+        ("plan:none", "plan:none", 422),
+        ("method:field/none", "method:field/paper", 422),
         ("nothing", "run:x", 400),
         ("run:x", "plan:y", 400),
     ],

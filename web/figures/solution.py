@@ -16,6 +16,7 @@ from spheremark.web.figures.elements import (
     make_map,
 )
 from spheremark.web.figures.maps import NAMES, ellipse_factor, ellipse_outline
+from spheremark.web.links import stop_url
 
 _HALF_95 = 1.96  # half of a 95 % interval, in sigmas
 _N_NAMED = 60  # stations whose names stand beside them
@@ -38,13 +39,16 @@ def solution_map(marks: Columns, stations: Columns, true_stops: Columns) -> go.F
         "<b>{station}</b><br>x {x:.4f} m<br>y {y:.4f} m<br>z {z_m:.4f} m<br>"
         "sigma {sigma_3d_m:mm} mm (3-D), {sigma_z_m:mm} mm (height)"
     )
-    look = {"marker_size": 7}
+    ids = _links(stations)
+    look = {"marker_size": 7, "ids": ids}
     if len(x) <= _N_NAMED:
         look |= named | {"text": short_names(texts(stations, "station"))}
     add_points(figure, x, y, _STATION, hover, rows, **look)
     hidden = {"showlegend": False, "line_width": 1.5}
     outlines = [ellipse_outline(stations, i, factor) for i in range(len(x))] if factor else []
-    add_strokes(figure, outlines, _STATION, **hidden)
+    if outlines:
+        linked = {"links": ids, "step": len(outlines[0]) + 1}
+        add_strokes(figure, outlines, _STATION, meta=linked, hoverinfo="none", **hidden)
     truth = dict(zip(texts(true_stops, "stop"), zip(*_plan(true_stops), strict=True), strict=True))
     errors = [
         np.array([(px, py), (px + factor * (truth[s][0] - px), py + factor * (truth[s][1] - py))])
@@ -78,13 +82,22 @@ def heights(stations: Columns) -> go.Figure:
     style = theme.Style("95 % interval", theme.OURS, "line-ns-open")
     hover = "<b>{x}</b><br>height known to ±{half:.2f} mm (95 %)"
     zero = np.zeros(len(names))
-    look = {"error_y": bars, "marker_size": 9, "marker_line_width": 2}
+    ids = _links(stations)
+    look = {"error_y": bars, "marker_size": 9, "marker_line_width": 2, "ids": ids}
     add_points(figure, names, zero, style, hover, {"half": half}, **look)
     if np.isfinite(error).any():
         style = theme.Style("error against truth", theme.PAPER, "diamond")
-        add_points(figure, names, error, style, "<b>{x}</b><br>height error {y:.2f} mm")
+        add_points(figure, names, error, style, "<b>{x}</b><br>height error {y:.2f} mm", ids=ids)
     add_zero(figure)
     return figure.update_xaxes(type="category")
+
+
+def _links(stations: Columns) -> list[str]:
+    """Return the address of the stop of each station; none where the survey is not known."""
+    if "survey" not in stations:
+        return [""] * len(stations["station"])
+    names = zip(texts(stations, "survey"), texts(stations, "stop"), strict=True)
+    return [stop_url(survey, stop) for survey, stop in names]
 
 
 def _plan(rows: Columns) -> tuple[list[float], list[float]]:

@@ -61,6 +61,18 @@ export async function draw(place, figure) {
 
 const pathOf = (link) => link.split("?")[0];
 
+// A row is about what its data-key names, or its first link to a stop
+const keyOf = (row) =>
+  row.dataset.key ?? row.querySelector('a[href*="/stops/"]')?.getAttribute("href") ?? "";
+
+const markerOf = (link) => new URLSearchParams(link.split("?")[1]).get("marker");
+
+function isOf(key, link) {
+  if (!key || link.startsWith("?") || pathOf(key) !== pathOf(link)) return false;
+  const [one, other] = [markerOf(key), markerOf(link)];
+  return !one || !other || one === other;
+}
+
 function indexed(figure) {
   const [links, stops] = [new Map(), new Map()];
   figure.data.forEach((trace, curveNumber) => {
@@ -100,12 +112,11 @@ export function spotlight(link, source) {
   if (isSpreading) return;
   isSpreading = true;
   try {
-    for (const row of document.querySelectorAll("[data-key]")) {
-      const isIt = Boolean(link) && (row.dataset.key === link || pathOf(row.dataset.key) === pathOf(link));
-      row.classList.toggle("spot", isIt && !link.startsWith("?"));
+    for (const row of document.querySelectorAll("main tbody tr")) {
+      row.classList.toggle("spot", Boolean(link) && isOf(keyOf(row), link));
     }
     for (const [place, { links, stops }] of drawn) {
-      if (place === source || !place.isConnected) continue;
+      if (place === source || !place.isConnected || !(links.size || stops.size)) continue;
       const at = link && (links.get(link) ?? (link.startsWith("?") ? null : stops.get(pathOf(link))));
       if (!place._fullLayout?.xaxis) continue;
       if (at) Plotly.Fx.hover(place, [at]);
@@ -132,12 +143,12 @@ function listen(place) {
   });
 }
 
+let over = null; // the row under the pointer
 document.addEventListener("mouseover", (event) => {
-  const row = event.target.closest?.("[data-key]");
-  if (row) spotlight(row.dataset.key, null);
-});
-document.addEventListener("mouseout", (event) => {
-  if (event.target.closest?.("[data-key]")) spotlight("", null);
+  const row = event.target.closest?.("main tbody tr") ?? null;
+  if (row === over) return;
+  over = row;
+  spotlight(row ? keyOf(row) : "", null);
 });
 
 // The menu of each figure: picture, data, query
