@@ -31,6 +31,7 @@ from spheremark.pipelines.calibration.result import BIAS, Calibration, Scan
 from spheremark.pipelines.config import SurveyConfig
 from spheremark.pipelines.detection import extract
 from spheremark.pipelines.errors import DegenerateGeometryError, RigError
+from spheremark.pipelines.geometry import unit
 from spheremark.pipelines.model import Array, Index, MarkerFits, Mask, Rig, ScanLog, Status
 from spheremark.pipelines.scan.rigs import rig_digest
 from spheremark.pipelines.scan.stitching import choose_rig, split_stops, stitch
@@ -240,13 +241,18 @@ def _calibration(start: Rig, seen: _Seen, found: Estimate, config: SurveyConfig)
 
 
 def _scans(seen: _Seen, found: Estimate) -> Iterator[tuple[str, Scan]]:
-    """Yield name and centres of each stop, those of the estimate in place of the rough ones."""
+    """Yield name and centres of each stop, those of the estimate in place of the rough ones.
+
+    The rig is adjusted with beams as specified: centres are moved by what their scan shows of them.
+    """
     for number, (name, rough) in enumerate(seen.scans):
         fits = list(rough.fits)
         effects = np.zeros((len(fits), 3, found.basis.shape[1]))
         for sphere in np.flatnonzero(seen.places[:, 0] == number):
             place = seen.places[sphere, 1]
-            p, cov = found.centres[sphere].copy(), found.cov_centres[sphere].copy()
-            fits[place] = replace(fits[place], p_base=p, cov_p_base=cov)
+            p, cov = found.centres[sphere], found.cov_centres[sphere].copy()
+            if (optics := fits[place].optics) is not None:
+                p = p - unit(p) * (fits[place].range_by_optics @ optics.estimates)
+            fits[place] = replace(fits[place], p_base=p.copy(), cov_p_base=cov)
             effects[place] = found.effects[sphere]
         yield name, Scan(fits=replace(rough, fits=tuple(fits)), effects=effects)

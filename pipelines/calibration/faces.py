@@ -107,8 +107,12 @@ def both_faces(cloud: StitchedCloud, config: SurveyConfig) -> list[tuple[MarkerF
 def _fits(cloud: StitchedCloud, rows: Index, config: SurveyConfig) -> list[MarkerFit]:
     """Return the fits of one face, with their rows in the whole cloud."""
     face = replace(cloud, **{name: getattr(cloud, name)[rows] for name in _COLUMNS})
-    candidates = extract(face, config.extraction, config.marker_radius)
-    alone = replace(config.fitting, sigma_mounting=0.0, sigma_offset=0.0)  # are estimated here
+    # without times: the detection would take the pulses of the other face for ones not returned
+    untimed = replace(face, times=np.zeros(len(rows), np.float32))
+    candidates = extract(untimed, config.extraction, config.marker_radius)
+    # the mounting is estimated here, and what ranges have in common is alike on both faces
+    zeros = ("sigma_mounting", "sigma_offset", "sigma_range_common", "sigma_range_scale")
+    alone = replace(config.fitting, **dict.fromkeys(zeros, 0.0))
     fits = fit_markers("along_beam", face, candidates, alone, config.marker_radius).fits
     return [replace(fit, used=rows[fit.used], rejected=rows[fit.rejected]) for fit in fits]
 

@@ -295,3 +295,12 @@ def test_centres_are_as_good_across_as_they_say_where_noise_grows_towards_the_ou
     squares, dof = np.sum(parts, axis=0)
     assert dof > 200
     assert 0.75 < squares / dof < 1.25
+
+
+def test_a_scan_with_its_ground_calibrates_as_one_of_spheres_alone_does():
+    field = scenario("paper-field", 2)
+    stop = simulate_stop(field, field.stops[17].name, SimulationConfig(sigma_range=0.020))
+    found = calibrate([stop.log], config=CONFIG)
+    # each face is a part of the scan, whose other pulses did return
+    assert found.n_two_faced > 0.8 * len(field.marks.names)
+    assert set(found.names[:6]) == FROM_TWO_FACES
