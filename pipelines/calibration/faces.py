@@ -111,8 +111,8 @@ def _fits(cloud: StitchedCloud, rows: Index, config: SurveyConfig) -> list[Marke
     untimed = replace(face, times=np.zeros(len(rows), np.float32))
     candidates = extract(untimed, config.extraction, config.marker_radius)
     # the mounting is estimated here, and what ranges have in common is alike on both faces
-    zeros = ("sigma_mounting", "sigma_offset", "sigma_range_common", "sigma_range_scale")
-    alone = replace(config.fitting, **dict.fromkeys(zeros, 0.0))
+    alone = replace(config.fitting, sigma_mounting=0.0, sigma_offset=0.0)
+    alone = replace(alone, sigma_range_common=0.0, sigma_range_scale=0.0)
     fits = fit_markers("along_beam", face, candidates, alone, config.marker_radius).fits
     return [replace(fit, used=rows[fit.used], rejected=rows[fit.rejected]) for fit in fits]
 
