@@ -191,7 +191,27 @@ def keep_bytes(content: bytes, ending: str, folder: str) -> str:
     str
         Path or URL of the file; the same bytes give the same.
     """
-    url = posixpath.join(folder, f"{hashlib.sha256(content).hexdigest()}{ending}")
+    return keep_named(content, f"{hashlib.sha256(content).hexdigest()}{ending}", folder)
+
+
+def keep_named(content: bytes, name: str, folder: str) -> str:
+    """Write bytes into a folder, unless there is a file of that name.
+
+    Parameters
+    ----------
+    content : bytes
+        The content of the file.
+    name : str
+        Its name.
+    folder : str
+        Path or fsspec URL of a folder; created when missing.
+
+    Returns
+    -------
+    str
+        Path or URL of the file.
+    """
+    url = posixpath.join(folder, name)
     _put(url, lambda files, target: files.pipe_file(target, content))
     return url
 

@@ -106,8 +106,10 @@ def format_gama(result: AdjustedNetwork, description: str = "") -> str:
     station together and is in the covariance of the set, so that Gama solves the same problem. It
     is linearised at the adjusted network: otherwise half a degree of levelling would tilt a free
     network by a millimetre. The orientation of a set is the heading of the station. Distances are
-    corrected for the range bias of the network. Exact control marks are fixed, others are observed
-    coordinates; in a free network the marks define the datum (``adj="XYZ"``).
+    corrected for the range bias of the network. Control marks are observed coordinates, exact ones
+    with the sigma that the adjustment gives them: fixed points are no unknowns in Gama, and its
+    graph of unknowns would have one part for each station ("network is not connected"). In a free
+    network the marks define the datum (``adj="XYZ"``).
     """
     root = ET.Element("gama-local", xmlns=_NAMESPACE)
     frame = {"axes-xy": "en", "angles": "right-handed"}
@@ -117,11 +119,10 @@ def format_gama(result: AdjustedNetwork, description: str = "") -> str:
     parameters = {"sigma-apr": "1", "conf-pr": "0.95", "tol-abs": "1000", "sigma-act": "apriori"}
     ET.SubElement(network, "parameters", parameters)
     observed = ET.SubElement(network, "points-observations")
-    fixed = _fixed(result)
-    _add_points(observed, result, fixed)
+    _add_points(observed, result)
     for station in range(len(result.network.stations)):
         _add_set(observed, result, station)
-    _add_control(observed, result, fixed)
+    _add_control(observed, result)
     ET.indent(root)
     return '<?xml version="1.0" ?>\n' + ET.tostring(root, encoding="unicode") + "\n"
 
@@ -140,6 +141,9 @@ def _reduced(result: AdjustedNetwork) -> Iterator[str]:
             "corrections and at most as large as spheremark's, and the variance factor has "
             f"the prior of {len(names)} unknown(s) less."
         )
+    covs = result.network.cov_control_site
+    if not result.network.is_free and (np.diagonal(covs, axis1=1, axis2=2) < _EXACT**2).any():
+        yield "Exact control has a sigma of 0.01 mm, as in spheremark: the network stays connected."
     if result.network.is_free:
         yield (
             "Datum: all marks together here, the first station in spheremark; coordinates agree, "
@@ -154,22 +158,12 @@ def _used_controls(result: AdjustedNetwork) -> list[tuple[int, int]]:
     return [(row, int(mark)) for row, mark in enumerate(network.controls) if used[row]]
 
 
-def _fixed(result: AdjustedNetwork) -> dict[int, Array]:
-    """Return the coordinates of exact control marks."""
-    network = result.network
-    return {
-        mark: network.p_control_site[row]
-        for row, mark in _used_controls(result)
-        if np.sqrt(np.trace(network.cov_control_site[row]) / 3) < _EXACT
-    }
-
-
-def _add_points(parent: ET.Element, result: AdjustedNetwork, fixed: dict[int, Array]) -> None:
+def _add_points(parent: ET.Element, result: AdjustedNetwork) -> None:
     """Add marks and stations with approximate coordinates."""
     network = result.network
-    for mark, name in enumerate(network.marks):
-        status = {"fix": "xyz"} if mark in fixed else {"adj": "XYZ" if network.is_free else "xyz"}
-        _add_point(parent, name, fixed.get(mark, result.p_site[mark]), status)
+    status = {"adj": "XYZ" if network.is_free else "xyz"}
+    for name, p in zip(network.marks, result.p_site, strict=True):
+        _add_point(parent, name, p, status)
     for name, T in zip(network.stations, result.T_site_station, strict=True):
         _add_point(parent, name, T[:3, 3], {"adj": "xyz"})
 
@@ -233,10 +227,9 @@ def _polar(p: Array) -> tuple[Array, Array]:
     return np.stack([np.arctan2(y, x), np.arctan2(flat, z), r], axis=1), J
 
 
-def _add_control(parent: ET.Element, result: AdjustedNetwork, fixed: dict[int, Array]) -> None:
-    """Add control marks with sigmas as observed coordinates."""
-    network = result.network
-    loose = [(row, mark) for row, mark in _used_controls(result) if mark not in fixed]
+def _add_control(parent: ET.Element, result: AdjustedNetwork) -> None:
+    """Add control marks as observed coordinates."""
+    network, loose = result.network, _used_controls(result)
     if not loose:
         return
     group = ET.SubElement(parent, "coordinates")

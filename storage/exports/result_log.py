@@ -1,14 +1,17 @@
 """Results of stops as an MCAP log, for Foxglove, Lichtblick and Rerun, beside the scan log.
 
-Messages of Foxglove's schemas in protobuf, at the instant of each stop. The frames are ``site``,
-``station`` and ``base_link``, to which the transforms of the scan log attach its sensors.
+Messages of Foxglove's schemas in protobuf, and the pose of ROS 2, at the instant of each stop. The
+frames are ``site``, ``station`` and ``base_link``, to which the transforms of the scan log attach
+its sensors.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+import io
+from collections.abc import Iterator, Sequence
+from contextlib import closing
 from pathlib import Path
-from typing import Any
+from typing import IO, Any
 
 import numpy as np
 from foxglove_schemas_protobuf.Color_pb2 import Color
@@ -20,16 +23,20 @@ from foxglove_schemas_protobuf.Pose_pb2 import Pose
 from foxglove_schemas_protobuf.SceneEntity_pb2 import SceneEntity
 from foxglove_schemas_protobuf.SceneUpdate_pb2 import SceneUpdate
 from google.protobuf.timestamp_pb2 import Timestamp
-from mcap_protobuf.writer import Writer
+from mcap.writer import CompressionType, Writer
+from mcap_protobuf.schema import register_schema
 from scipy.spatial.transform import Rotation
 
-from spheremark.pipelines.geometry import levelling_rotation
+from spheremark.pipelines.geometry import by_motion, levelling_rotation
 from spheremark.pipelines.model import Array, MarkerFit, StationFix, Status, StopResult
 from spheremark.storage.clouds.stop import view
+from spheremark.storage.files import keep_named
+from spheremark.storage.recordings.definitions import definition, store
 
 ELLIPSOID_SCALE = 100.0
 """How much larger than they are the 95 % ellipsoids of the centres are drawn."""
 
+_POSE = "geometry_msgs/msg/PoseWithCovarianceStamped"
 _SITE, _STATION, _BASE = "site", "station", "base_link"
 _N_MAX = 200_000  # returns of a stop, away from markers
 _CHI_95 = 2.7955  # square root of the 95 % quantile of chi squared with 3 degrees of freedom
@@ -43,24 +50,98 @@ class ResultLog:
 
     Parameters
     ----------
-    path : str or Path
-        The file.
+    target : str, Path or binary file
+        Where to write.
     """
 
-    def __init__(self, path: str | Path) -> None:
-        self._file = Path(path).open("wb")  # noqa: SIM115  closed by close
-        self._writer = Writer(self._file)
+    def __init__(self, target: str | Path | IO[bytes]) -> None:
+        self._own: IO[bytes] | None = None
+        if isinstance(target, str | Path):
+            self._own = Path(target).open("wb")  # noqa: SIM115  closed by close
+        self._writer = Writer(self._own or target, compression=CompressionType.ZSTD)  # type: ignore[arg-type]
+        self._writer.start(profile="", library="spheremark")
+        self._channels: dict[str, int] = {}
 
     def add(self, stop: StopResult) -> None:
         """Write one stop."""
         stamp_ns = stop.cloud.start_ns
         for topic, message in _messages(stop, stamp_ns):
-            self._writer.write_message(topic, message, log_time=stamp_ns, publish_time=stamp_ns)
+            data = message.SerializeToString()
+            self._add(topic, "protobuf", stamp_ns, data, message)
+        fix = next(iter(stop.fixes.values()), None)
+        if isinstance(fix, StationFix):
+            self._add("/spheremark/pose", "cdr", stamp_ns, _ros_pose(fix, stamp_ns))
+
+    def _add(
+        self, topic: str, encoding: str, stamp_ns: int, data: bytes, message: Any = None
+    ) -> None:
+        """Write a message; the first of a topic with its schema."""
+        if topic not in self._channels:
+            if message is None:
+                schema = self._writer.register_schema(_POSE, "ros2msg", definition(_POSE).encode())
+            else:
+                schema = register_schema(self._writer, type(message))
+            self._channels[topic] = self._writer.register_channel(topic, encoding, schema)
+        self._writer.add_message(self._channels[topic], stamp_ns, data, stamp_ns)
 
     def close(self) -> None:
         """Write the end of the file."""
-        self._writer.finish()  # type: ignore[no-untyped-call]  # mcap_protobuf ships half of them
-        self._file.close()
+        self._writer.finish()  # type: ignore[no-untyped-call]
+        if self._own is not None:
+            self._own.close()
+
+
+def write_result_log(stops: Sequence[StopResult], folder: str, run_id: str) -> str:
+    """Write the results of a run as a log into a folder of clouds.
+
+    Parameters
+    ----------
+    stops : sequence of StopResult
+        The stops of the run.
+    folder : str
+        Path or fsspec URL of a folder; created when missing.
+    run_id : str
+        Id of the run, which names the file.
+
+    Returns
+    -------
+    str
+        Path or URL of the file.
+    """
+    buffer = io.BytesIO()
+    with closing(ResultLog(buffer)) as log:
+        for stop in stops:
+            log.add(stop)
+    return keep_named(buffer.getvalue(), f"{run_id}.mcap", folder)
+
+
+def _ros_pose(fix: StationFix, stamp_ns: int) -> bytes:
+    """Return the pose of a station as ROS has it.
+
+    Its covariance is ordered position, rotation, both along the axes of the site, and the rotation
+    is about the station, not about the origin of the site.
+    """
+    motion = np.eye(6)
+    motion[3:, :3] = by_motion(fix.p_site)[:, :3]
+    cov = motion @ fix.cov_T_site_station @ motion.T
+    cov[3:, 3:] = fix.cov_p_site
+    order = [3, 4, 5, 0, 1, 2]
+    kinds = store().types
+    pose = _pose(fix.p_site, fix.T_site_station[:3, :3])
+    p, q = pose.position, pose.orientation
+    stamp = kinds["builtin_interfaces/msg/Time"](
+        sec=stamp_ns // 1_000_000_000, nanosec=stamp_ns % 1_000_000_000
+    )
+    point = kinds["geometry_msgs/msg/Point"](x=p.x, y=p.y, z=p.z)
+    turn = kinds["geometry_msgs/msg/Quaternion"](x=q.x, y=q.y, z=q.z, w=q.w)
+    message = kinds[_POSE](
+        header=kinds["std_msgs/msg/Header"](stamp=stamp, frame_id=_SITE),
+        pose=kinds["geometry_msgs/msg/PoseWithCovariance"](
+            pose=kinds["geometry_msgs/msg/Pose"](position=point, orientation=turn),
+            covariance=cov[np.ix_(order, order)].ravel(),
+        ),
+    )
+    return bytes(store().serialize_cdr(message, _POSE))
 
 
 def _messages(stop: StopResult, stamp_ns: int) -> Iterator[tuple[str, Any]]:

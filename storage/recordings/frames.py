@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+import math
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -33,11 +34,17 @@ class FrameTree:
     def add(self, series: Series) -> None:
         """Add a frame under its parent: one whose transform changes, or one that is fixed."""
         parent, child = series.names
+        is_finite = np.isfinite(series.values).all(axis=1)
+        if not is_finite.all():
+            stamps, values = series.stamps_ns[is_finite], series.values[is_finite]
+            series = replace(series, stamps_ns=stamps, values=values)
+        if not len(series.values):
+            return
         if not series.topic.endswith("tf_static") and np.ptp(series.values, axis=0).any():
             self.turning[child] = series
-        elif len(series.values) and child not in self.parents:
+        elif child not in self.parents:
             translation, quaternion = np.split(series.values[-1], [3])
-            norm = np.linalg.norm(quaternion)
+            norm = math.hypot(*quaternion)
             if abs(norm - 1.0) < _UNIT:
                 *axis, w = quaternion / norm
                 cross = skew(axis)

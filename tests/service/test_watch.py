@@ -1,5 +1,6 @@
 """Decisions on stops, when their recordings are closed: by the command line and on the page."""
 
+import io
 import json
 import shutil
 import threading
@@ -8,6 +9,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from mcap.reader import make_reader
 from rosbags.rosbag2 import StoragePlugin
 
 from spheremark.pipelines.config import SurveyConfig
@@ -90,11 +92,27 @@ def test_a_server_needs_a_survey_and_has_its_control(stop, tmp_path):
 
 def test_the_page_shows_the_decision_on_each_stop(site):
     site.survey("live")
-    job = site.upload(survey="live", process=True, name="live-stop").json()["job"]["job_id"]
-    assert site.ended(job)["status"] == "successful"
+    sent = site.upload(survey="live", process=True).json()
+    assert site.ended(sent["job"]["job_id"])["status"] == "successful"
     page = site.client.get("/live").text
-    assert "live-stop" in page
+    assert f">{sent['name']}</a>" in page
     assert '<span class="chip ok">good enough</span>' in page
+
+
+def test_the_results_of_a_run_are_downloaded_as_a_log(site):
+    site.survey("out")
+    sent = site.upload(survey="out", process=True).json()
+    job = sent["job"]["job_id"]
+    assert site.ended(job)["status"] == "successful"
+    (run_of_job,) = site.client.get("/api/v1/runs", params={"job": job}).json()["items"]
+    url = f"/api/v1/runs/{run_of_job['run_id']}/result.mcap"
+    answer = site.client.get(url)
+    assert answer.status_code == 200
+    reader = make_reader(io.BytesIO(answer.content))
+    topics = {channel.topic for channel in reader.get_summary().channels.values()}
+    assert topics == {f"/spheremark/{one}" for one in ("tf", "markers", "cloud", "pose")}
+    assert url in site.client.get(f"/surveys/out/stops/{sent['name']}").text
+    assert site.client.get("/api/v1/runs/none/result.mcap").status_code == 404
 
 
 def decision_of(stop, **changes):

@@ -78,6 +78,29 @@ class GamaNetwork:
         values = np.array([[float(point.get(k)) for k in "xyz"] for point in points])
         return [self.place(point.get("id")) for point in points], values, covariance(one)
 
+    def n_parts(self):
+        """Parts of the graph of unknowns: those of one observation are joined, fixed ones are none.
+
+        Gama calls a network with more than one of them not connected.
+        """
+        part = {
+            name: name for name, fixed in zip(self.names, self.is_fixed, strict=True) if not fixed
+        }
+        part |= {i: i for i in range(len(self.sets))}  # orientations
+
+        def root(one):
+            while part[one] != one:
+                one = part[one]
+            return one
+
+        for i, (here, kinds, to, _, _) in enumerate(self.sets):
+            for kind, mark in zip(kinds, to, strict=True):
+                own = [self.names[here], self.names[mark], *([i] if kind == "direction" else [])]
+                roots = [root(one) for one in own if one in part]
+                for other in roots[1:]:
+                    part[root(other)] = root(roots[0])
+        return len({root(one) for one in part})
+
     def residuals(self, x):
         """Whitened residuals in Gama's units: gon to cc, metres to millimetres."""
         p = self.start.copy()
@@ -134,11 +157,12 @@ def test_a_dense_solution_of_the_exported_observations_agrees(is_free, exact):
         np.testing.assert_allclose(p[name], T[:3, 3], rtol=0, atol=HUNDREDTH)
     assert vtpv == pytest.approx(result.vtpv, rel=1e-3)
     assert read.is_datum.any() == is_free
-    assert read.is_fixed.any() == exact
+    assert read.n_parts() == 1
 
 
-def test_standard_deviations_of_the_exported_observations_are_ours_but_for_what_is_reduced():
-    result = adjusted(False)
+@pytest.mark.parametrize("exact", [False, True])
+def test_standard_deviations_of_the_exported_observations_are_ours_but_for_what_is_reduced(exact):
+    result = adjusted(False, exact=exact)
     read = GamaNetwork(format_gama(result))
     x0 = np.concatenate([read.start[~read.is_fixed].ravel(), np.zeros(len(read.sets))])
     places, _ = read.solve()
@@ -174,6 +198,15 @@ def test_the_export_says_what_it_leaves_out():
     text = GamaNetwork(format_gama(result)).network.find("g:description", GAMA).text
     assert "Reduced: the observations are corrected" in text
     assert all(name in text for name in result.network.shared.names)
+
+
+def test_fixed_control_would_not_be_connected_in_gama_and_is_observed_instead():
+    text = format_gama(adjusted(False, exact=True))
+    assert "the network stays connected" in text
+    fixed = GamaNetwork(text)
+    fixed.is_fixed = np.array([not name.startswith("stop") for name in fixed.names])
+    assert fixed.is_fixed.sum() == 8
+    assert fixed.n_parts() == len(fixed.sets) == 4
 
 
 def test_the_export_states_its_axes_and_angles():

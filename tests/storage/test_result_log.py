@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from mcap.reader import make_reader
 from mcap_protobuf.decoder import DecoderFactory
+from mcap_ros2.decoder import DecoderFactory as RosDecoderFactory
 from scipy.spatial.transform import Rotation
 
 from spheremark.pipelines.geometry import levelling_rotation
@@ -19,7 +20,8 @@ def messages(tmp_path_factory):
     with closing(ResultLog(path)) as log:
         log.add(stop())
     with path.open("rb") as file:
-        reader = make_reader(file, decoder_factories=[DecoderFactory()])
+        factories = [DecoderFactory(), RosDecoderFactory()]
+        reader = make_reader(file, decoder_factories=factories)
         return {
             channel.topic: (schema.name, message.log_time, decoded)
             for schema, channel, message, decoded in reader.iter_decoded_messages()
@@ -31,6 +33,7 @@ def test_each_message_is_of_a_schema_that_viewers_know_at_the_time_of_its_stop(m
         "/spheremark/tf": "foxglove.FrameTransforms",
         "/spheremark/markers": "foxglove.SceneUpdate",
         "/spheremark/cloud": "foxglove.PointCloud",
+        "/spheremark/pose": "geometry_msgs/msg/PoseWithCovarianceStamped",
     }
     assert {time for _, time, _ in messages.values()} == {stop().cloud.start_ns}
 
@@ -73,3 +76,36 @@ def test_the_cloud_has_the_returns_in_the_frame_of_the_station(messages):
     expected = stop().cloud.p_base @ levelling_rotation(stop().cloud.levelling).T
     assert len(rows) == len(expected)
     np.testing.assert_allclose(rows[:, :3], expected, atol=1e-5)
+
+
+def test_the_pose_of_ros_has_its_covariance_about_the_station_in_axes_of_the_site(messages):
+    """By numbers drawn: small motions about the origin, as positions and rotations about itself."""
+    fix = stop().fixes["along_beam", "free_station"]
+    message = messages["/spheremark/pose"][2]
+    assert message.header.frame_id == "site"
+    p, q = message.pose.pose.position, message.pose.pose.orientation
+    np.testing.assert_allclose([p.x, p.y, p.z], fix.p_site)
+    turned = Rotation.from_quat([q.x, q.y, q.z, q.w]).as_matrix()
+    np.testing.assert_allclose(turned, fix.T_site_station[:3, :3], atol=1e-12)
+    rng = np.random.default_rng(2)
+    motions = rng.multivariate_normal(np.zeros(6), fix.cov_T_site_station, 200_000)
+    moved = motions[:, 3:] + np.cross(motions[:, :3], fix.p_site)
+    drawn = np.cov(np.hstack([moved, motions[:, :3]]).T)
+    cov = np.array(message.pose.covariance).reshape(6, 6)
+    scale = np.sqrt(np.outer(np.diag(cov), np.diag(cov)))
+    np.testing.assert_allclose(drawn / scale, cov / scale, rtol=0, atol=0.02)
+
+
+def test_other_libraries_find_no_fault_in_the_file(tmp_path):
+    """Summary, statistics, checksums and index agree with what the messages are."""
+    path = tmp_path / "results.mcap"
+    with closing(ResultLog(path)) as log:
+        log.add(stop())
+        log.add(stop("L1S2", seed=4))
+    with path.open("rb") as file:
+        reader = make_reader(file, validate_crcs=True)
+        summary = reader.get_summary()
+        n = sum(1 for _ in reader.iter_messages())
+    assert summary.statistics.message_count == n == 8
+    assert summary.statistics.channel_count == len(summary.channels) == 4
+    assert {one.encoding for one in summary.schemas.values()} == {"protobuf", "ros2msg"}

@@ -6,6 +6,7 @@ from collections.abc import Callable
 from typing import Annotated, Any, Literal, TypeVar
 
 from fastapi import APIRouter, Path, Query, Response
+from fastapi.responses import FileResponse
 from pydantic import AfterValidator, Field
 
 from spheremark.pipelines.errors import NotFoundError
@@ -146,6 +147,26 @@ def list_runs(chosen: Annotated[RunFilter, Query()], service: Current) -> Listin
 def get_run(run: Annotated[str, Path(description="Id of the run.")], service: Current) -> Run:
     """Return a run."""
     return Run.of(service.catalogue.get_run(run))
+
+
+@router.get(
+    "/runs/{run}/result.mcap",
+    name="download_result_log",
+    tags=["results"],
+    response_class=FileResponse,
+    responses={200: {"content": {"application/vnd.mcap": {}}, "description": "The log."}},
+)
+def download_result_log(
+    run: Annotated[str, Path(description="Id of the run.")], service: Current
+) -> FileResponse:
+    """Return spheres, clouds and poses of a run as MCAP, for viewers of the scan log."""
+    found = service.catalogue.get_run(run)
+    path = service.settings.data / "clouds" / f"{found.run_id}.mcap"
+    if not path.is_file():
+        raise NotFoundError(
+            f"The run {run} has no log of its results; process its recording again for one."
+        )
+    return FileResponse(path, media_type="application/vnd.mcap", filename=f"result-{run}.mcap")
 
 
 @_get("/marker-fits", "list_marker_fits", listing_of(rows.MarkerFit))

@@ -33,6 +33,7 @@ def process_log(
     from spheremark.service.log_files import explained
     from spheremark.storage.catalogue.results import RunInfo, tables
     from spheremark.storage.clouds.stop import write_cloud
+    from spheremark.storage.exports.result_log import write_result_log
 
     start = perf_counter()
     forget_peak_memory()
@@ -50,6 +51,7 @@ def process_log(
         raise explained(error, recording.read, spec.rig) from error
     progress(0.9, "Storing the results")
     clouds = {stop.name: write_cloud(stop, spec.clouds_url) for stop in stops}
+    write_result_log(stops, spec.clouds_url, run_id)
     run = RunInfo(
         run_id=run_id,
         job_id=spec.job_id,
