@@ -203,6 +203,68 @@ def test_a_file_that_is_no_log_is_refused_with_its_reason(visit, tmp_path):
     assert page.locator("#uploads li").count() == 1
 
 
+def test_a_survey_is_made_from_nothing_renamed_deleted_and_restored(visit, tmp_path):
+    page = visit().open("/new")
+    page.fill("#name", "quarry")
+    page.fill("#tolerance", "20")
+    page.get_by_role("button", name="Continue").click()
+    page.locator("summary", has_text="paste").click()
+    page.fill("#control-text", "A,1,2,3\nB,4,5")
+    page.wait_for_selector("#control-error:not([hidden])")
+    assert page.locator("#use-control").is_disabled()
+    page.fill("#control-text", "A,1000,2000,3000\nB,4000,5000,3000\nC,0,9000,1000")
+    page.select_option("[name=unit]", "mm")
+    page.wait_for_selector("#control-preview:not([hidden])")
+    assert page.locator("#control-preview circle").count() == 3
+    assert page.locator("#control-preview tbody tr").first.inner_text().split()[:3] == [
+        "A", "1.0000", "2.0000"]  # fmt: skip
+    page.click("#use-control")
+    log = tmp_path / "notes.mcap"
+    log.write_bytes(b"this is not a log" * 400_000)  # more than one part
+    page.locator("#choose").wait_for(state="visible")
+    page.route("**/api/v1/uploads/*", lambda route: (time.sleep(0.3), route.continue_()))
+    page.set_input_files("#files", log)
+    page.get_by_role("button", name="Pause").click()
+    page.wait_for_timeout(700)
+    assert not page.locator("#uploads .outcome.bad").count()
+    page.get_by_role("button", name="Resume").click()
+    page.wait_for_selector("#uploads .outcome.bad")
+    page.click("#finish")
+    page.wait_for_url(re.compile("/surveys/quarry$"))
+    page.get_by_role("link", name="Logs", exact=True).click()
+    page.locator('[aria-labelledby="control-head"] tbody tr').nth(2).wait_for()
+    page.fill("#survey-name", "pit")
+    page.get_by_role("button", name="Save").click()
+    page.wait_for_url(re.compile("/surveys/pit/logs$"))
+    page.click("#delete-survey")
+    page.wait_for_url(re.compile("deleted="))
+    page.get_by_role("button", name="Restore").click()
+    page.wait_for_url(re.compile("/surveys/pit$"))
+
+
+def test_a_log_that_is_removed_can_be_put_back_at_once(visit):
+    page = visit().open("/surveys/field/logs")
+    rows = page.locator('[aria-labelledby="logs-head"] tbody tr')
+    n = rows.count()
+    page.get_by_role("button", name="Remove").first.click()
+    page.get_by_role("button", name="Undo").wait_for()
+    assert rows.count() == n - 1
+    page.get_by_role("button", name="Undo").click()
+    page.wait_for_function(
+        "n => document.querySelectorAll('[aria-labelledby=logs-head] tbody tr').length === n", arg=n
+    )
+
+
+def test_jobs_are_at_hand_on_every_page(visit):
+    page = visit(width=390).open("/sql")
+    page.wait_for_load_state("networkidle")
+    page.click("#jobs-toggle")
+    page.locator("#jobs-list li a").first.wait_for()
+    assert page.evaluate("document.documentElement.scrollWidth") <= 390
+    page.keyboard.press("Escape")
+    assert page.locator("#jobs-drawer").is_hidden()
+
+
 KEEP_WHAT_CHANGES = """() => {
   for (const part of ["attempts", "started"]) {
     const place = document.querySelector(`[data-part=${part}]`);

@@ -56,7 +56,7 @@ def test_the_overview_lists_surveys_and_recordings_and_says_how_to_upload(client
 
 def test_a_survey_opens_with_its_decision_and_one_solution(client):
     text = page(client, "/surveys/field")
-    sentence = re.search(r"<h1>([^<]+)</h1>", text)[1]
+    sentence = re.search(r"<h2>(\d[^<]+)</h2>", text)[1]
     assert re.fullmatch(
         r"2 stations, \d\.\d mm \(3-D sigma, RMS\), control met to \d+\.\d mm \(largest\): .*",
         sentence,

@@ -13,6 +13,7 @@ from spheremark.web.pages.base import Frame, Panel, Readout, Row
 from spheremark.web.templating import number, render
 
 _N_WORST = 40  # observations in the table; all are in the database and in the files
+_HELD = 1e-6  # [m] sigma of a mark that control holds: its error is that of control, by definition
 _MAP = (
     "Solid: the 95 % ellipse; dotted: the standard ellipse (39 %). The fill is the mean redundancy "
     "of the centres: 0 is uncontrolled, 3 is controlled completely by the others."
@@ -77,24 +78,30 @@ def _readouts(one: Row, tables: Mapping[str, Columns]) -> list[Readout]:
         Readout("Global test", test, "", limit),
         Readout("Variance factor", factor, "a posteriori", prior),
         Readout("Degrees of freedom", str(one["dof"]), "", counts),
-        _sizes("Stations", tables["adjusted_stations"], fitted),
-        _sizes("Marks", tables["adjusted_marks"], fitted),
     ]
-    return (
-        [*found, _left_out(checks)] if len((checks := tables["control_checks"])["mark"]) else found
-    )
+    for what in ("station", "mark"):
+        rows = tables[f"adjusted_{what}s"]
+        free = select(rows, floats(rows, "sigma_3d_m") > _HELD)
+        if len(free[what]):
+            is_valid = bool(one["passes_global_test"])
+            found.append(_sizes(f"{what.capitalize()}s", free, fitted, is_valid=is_valid))
+    checks = tables["control_checks"]
+    return [*found, _left_out(checks)] if len(checks["mark"]) else found
 
 
-def _sizes(what: str, rows: Columns, fitted: str) -> Readout:
+def _sizes(what: str, rows: Columns, fitted: str, *, is_valid: bool) -> Readout:
     """Return the accuracy of stations or marks: against truth if known, else predicted."""
     sigma, error = floats(rows, "sigma_3d_m"), floats(rows, "error_3d_m")
     known = error[np.isfinite(error)]
     largest = f"largest {number(float(sigma.max()) * MM, 2)} mm"
     predicted = number(rms(sigma) * MM, 2)
+    if not is_valid and not len(known):
+        note = "the global test fails, so predicted sigmas are not valid"
+        return Readout(f"{what}, predicted", "\N{EN DASH}", "mm RMS sigma", note)
     if not len(known):
         note = f"{largest}; truth not known"
         return Readout(f"{what}, predicted", predicted, "mm RMS sigma", note)
-    note = f"predicted {predicted} mm RMS, {largest}{fitted}"
+    note = f"predicted {predicted} mm RMS, {largest}{fitted}" if is_valid else "sigmas not valid"
     return Readout(f"{what}, against truth", number(rms(known) * MM, 2), "mm RMS error", note)
 
 

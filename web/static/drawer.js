@@ -104,7 +104,7 @@ if (again) setTimeout(() => location.reload(), 1000 * Number(again.dataset.reloa
 for (const place of document.querySelectorAll(".scroll")) {
   if (place.scrollWidth <= place.clientWidth || place.tabIndex === 0) continue;
   place.tabIndex = 0;
-  place.setAttribute("role", "region");
-  const named = place.closest("section, figure")?.getAttribute("aria-labelledby");
-  place.setAttribute(named ? "aria-labelledby" : "aria-label", named ?? "Table");
+  const named = place.closest("section, figure")?.querySelector("h2, h3")?.textContent;
+  place.setAttribute("role", "group"); // no landmark of its own
+  place.setAttribute("aria-label", `Table ${named ?? ""}, to be scrolled`);
 }

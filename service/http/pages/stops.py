@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-from typing import Annotated
+from collections.abc import Mapping
+from typing import Annotated, Any
 
 from fastapi import APIRouter, Query
 from fastapi.responses import HTMLResponse
 
 from spheremark.pipelines.errors import NotFoundError
 from spheremark.service.http.pages.frame import frame_of, survey_row
-from spheremark.service.http.state import Current
+from spheremark.service.http.state import Current, Service
 from spheremark.storage.clouds import stop as clouds
 from spheremark.web.figures import scene
 from spheremark.web.pages.stop import stop_page, stops_page
@@ -77,6 +78,15 @@ JOIN marker_fits AS m USING (run_id, stop, fit_method, marker)
 JOIN station_fixes AS f USING (run_id, stop, fit_method, resection_method)
 WHERE o.run_id = $run AND o.stop = $stop AND o.fit_method = $method ORDER BY o.marker
 """
+_CHOSEN = """
+SELECT solution, adjustment_id, station, x_m, y_m, z_m, sigma_3d_m, passes_global_test
+FROM chosen_stations WHERE recording_id = $recording AND stop = $stop AND survey_id = $id
+"""
+_IN_NETWORK = """
+SELECT x.marker, x.used, x.w, a.w_limit
+FROM adjusted_observations AS x JOIN adjustments AS a USING (adjustment_id)
+WHERE x.adjustment_id = $id AND x.station = $station AND x.kind = 'centre'
+"""
 _STOP_TABLES = {
     "fits": _STOP_FITS,
     "rejections": _STOP_REJECTIONS,
@@ -117,6 +127,7 @@ def stop(
     key = {"run": shown["run_id"], "stop": shown["stop"]}
     methods = [one["fit_method"] for one in rows(_STOP_METHODS, key)]
     chosen = method if method in methods else next(iter(methods), "")
+    solution, network = _solution_of(service, survey["survey_id"], shown)
     columns, by_method = service.catalogue.columns, key | {"method": chosen}
     return stop_page(
         frame_of(service, survey["name"], "stops"),
@@ -129,8 +140,23 @@ def stop(
         methods=methods,
         marker=marker,
         fixes=rows(_STOP_FIXES, key),
+        chosen=solution,
+        network=network,
         namesakes=found if len(found) > 1 else (),
     )
+
+
+def _solution_of(
+    service: Service, survey_id: str, stop: Mapping[str, Any]
+) -> tuple[Mapping[str, Any] | None, Mapping[str, Mapping[str, Any]]]:
+    """Return the station of a stop in the chosen solution, and its markers in that network."""
+    rows = service.catalogue.rows
+    place = {"recording": stop["recording_id"], "stop": stop["stop"], "id": survey_id}
+    found = rows(_CHOSEN, place)
+    if not found or found[0]["adjustment_id"] is None:
+        return next(iter(found), None), {}
+    names = {"id": found[0]["adjustment_id"], "station": found[0]["station"]}
+    return found[0], {row["marker"]: row for row in rows(_IN_NETWORK, names)}
 
 
 def _scan(url: str | None) -> scene.Scan | None:
