@@ -9,12 +9,12 @@ function reach(row, name) {
   if (value > 0) return `${value.toFixed(1)} m`;
   if (name === "reach_m") return "nowhere";
   return row.reach_m > 0 && row.n_stops < row.n_stops_needed
-    ? `not shown: ${row.n_stops_needed} stops needed, ${row.n_stops} here`
+    ? `needs ${row.n_stops_needed} stops`
     : "nowhere";
 }
 
 const COLUMNS = [
-  ["Centres", "number", (row) => `${row.n.toLocaleString("en")} of ${row.n_stops.toLocaleString("en")} stops`],
+  ["Centres", "number", (row) => `${row.n.toLocaleString("en")} in ${row.n_stops.toLocaleString("en")} stops`],
   ["Median [mm]", "number", (row) => mm(row.median_m)],
   ["95 % within [mm]", "number", (row) => mm(row.p95_m)],
   ["Within tolerance", "number", (row) => `${(100 * row.share_within).toFixed(2)} %`],

@@ -79,9 +79,9 @@ function indexed(figure) {
     trace.ids?.forEach?.((link, pointNumber) => {
       if (!link || trace.hoverinfo === "none") return;
       if (!links.has(link)) links.set(link, { curveNumber, pointNumber });
-      if (!link.startsWith("?") && !stops.has(pathOf(link))) {
-        stops.set(pathOf(link), { curveNumber, pointNumber });
-      }
+      if (link.startsWith("?")) return;
+      const thing = `${pathOf(link)}#${markerOf(link) ?? ""}`;
+      if (!stops.has(thing)) stops.set(thing, { curveNumber, pointNumber });
     });
   });
   return { links, stops };
@@ -106,6 +106,12 @@ export function follow(link) {
   location.search = query;
 }
 
+function of(stops, link) {
+  if (link.startsWith("?")) return null;
+  const marker = markerOf(link) ?? "";
+  return stops.get(`${pathOf(link)}#${marker}`) ?? stops.get(`${pathOf(link)}#`);
+}
+
 let isSpreading = false; // hovers that a hover causes cause no others
 
 export function spotlight(link, source) {
@@ -117,7 +123,7 @@ export function spotlight(link, source) {
     }
     for (const [place, { links, stops }] of drawn) {
       if (place === source || !place.isConnected || !(links.size || stops.size)) continue;
-      const at = link && (links.get(link) ?? (link.startsWith("?") ? null : stops.get(pathOf(link))));
+      const at = link && (links.get(link) ?? of(stops, link));
       if (!place._fullLayout?.xaxis) continue;
       if (at) Plotly.Fx.hover(place, [at]);
       else Plotly.Fx.unhover(place);
