@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from urllib.parse import quote, urlencode
 
+_ROWS = "SELECT * FROM {table} WHERE {where} ORDER BY ALL"
+
 
 def survey_url(survey: str, tab: str = "") -> str:
     """Return the address of a survey, or of one of its tabs."""
@@ -15,6 +17,14 @@ def stop_url(survey: str, stop: str, method: str = "", marker: str = "") -> str:
     query = {"method": method, "marker": marker}
     chosen = urlencode({name: value for name, value in query.items() if value})
     return f"{survey_url(survey)}/stops/{quote(stop, safe='')}" + (f"?{chosen}" if chosen else "")
+
+
+def query_text(table: str, **where: str) -> str:
+    """Return the query of the rows behind a figure, for a person to run."""
+    conditions = [
+        f"{name} = '{value.replace(chr(39), 2 * chr(39))}'" for name, value in where.items()
+    ]
+    return _ROWS.format(table=table, where=" AND ".join(conditions))
 
 
 def filter_link(**values: object) -> str:

@@ -70,10 +70,11 @@ def add_points(
     rows: Any = None,
     **more: Any,
 ) -> None:
-    """Draw points; further arguments go to the trace."""
+    """Draw points, each with the ``link`` of its row if there is one; more goes to the trace."""
     look: Look = {"mode": "markers", "name": style.label, "marker_size": 8}
     look |= {"marker_color": style.colour, "marker_symbol": style.symbol}
     look |= hover_of(hover, style, rows)
+    look |= {"ids": texts(rows, "link")} if rows is not None and "link" in rows else {}
     figure.add_scatter(x=x, y=y, **(look | more))
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -54,18 +55,22 @@ class MarkerReturns:
     is_used: NDArray[np.bool_]
 
 
-def stop_scene(scan: Scan, fits: Columns, rejections: Columns) -> go.Figure:
+def stop_scene(
+    scan: Scan, fits: Columns, rejections: Columns, *, links: Sequence[str] = ()
+) -> go.Figure:
     """Draw a stop: surroundings by height, spheres, and returns coloured by their residual."""
     figure = _figure_3d(f"Scan, spheres and {_what(scan, fits).lower()}")
     reach = _reach(fits)
-    fits = select(fits, floats(fits, "range_m") <= reach)
+    near = floats(fits, "range_m") <= reach
+    links = [link for link, is_shown in zip(links, near, strict=False) if is_shown]
+    fits = select(fits, near)
     shown = scan.p_station[_surroundings(scan, reach)]
     heights = {"size": 1.6, "color": shown[:, 2], "colorscale": theme.HEIGHTS}
     _add_3d(figure, shown, "surroundings", marker=heights)
     returns = [marker_returns(scan, fits, i) for i in range(len(fits["marker"]))]
     if returns:
         _add_returns(figure, returns, floats(fits, "rms_m"), _what(scan, fits), size=2.5)
-        _add_labels(figure, fits)
+        _add_labels(figure, fits, links)
     if len(rejections["reason"]):
         more = {"text": texts(rejections, "reason"), "visible": "legendonly"}
         look = {"size": 4, "color": theme.MUTED, "symbol": "cross"}
@@ -201,7 +206,7 @@ def _add_returns(
     _add_3d(figure, p, "returns of markers", "{mm:.1f} mm", residuals, marker=look)
 
 
-def _add_labels(figure: go.Figure, fits: Columns) -> None:
+def _add_labels(figure: go.Figure, fits: Columns, links: Sequence[str]) -> None:
     """Draw the centres with their names."""
     style = theme.method_style(texts(fits, "fit_method")[0])
     names = zip(texts(fits, "marker"), texts(fits, "mark"), strict=True)
@@ -210,6 +215,7 @@ def _add_labels(figure: go.Figure, fits: Columns) -> None:
     look = {"size": 5, "color": style.colour, "symbol": "circle-open"}
     hover = "<b>{text}</b><br>{range_m:.2f} m, {n_points:.0f} returns"
     more = {"mode": "markers+text", "text": shown, "marker": look} | font
+    more |= {"ids": links} if links else {}
     _add_3d(figure, _centres(fits), f"centres, {style.label}", hover, fits, **more)
 
 

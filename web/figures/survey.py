@@ -90,7 +90,9 @@ def error_along_lane(fits: Columns, tolerance_m: float) -> go.Figure:
     return figure
 
 
-def station_residuals(observations: Columns, tolerance_m: float) -> go.Figure:
+def station_residuals(
+    observations: Columns, tolerance_m: float, *, links: Sequence[str] = ()
+) -> go.Figure:
     """Draw the residuals of each marker by axis, with bars of twice their sigma about zero."""
     title = "Residuals of the station, by marker and axis"
     figure = blank_figure(title, "Mark", "Observed - computed [mm]")
@@ -105,7 +107,8 @@ def station_residuals(observations: Columns, tolerance_m: float) -> go.Figure:
         group = {"offsetgroup": axis, "legendgroup": axis}
         add_line(figure, names, zeros, style, error_y=bars, line_width=0, showlegend=False, **group)
         hover = f"<b>{{x}}</b><br>{axis} {{y:.1f}} mm, sigma {{sigma_{axis}_m:mm}} mm"
-        add_points(figure, names, values, style, hover, observations, **group)
+        linked = group | ({"ids": links} if links else {})
+        add_points(figure, names, values, style, hover, observations, **linked)
     if len(names) and largest(floats(observations, "residual_x_m")) > tolerance_m / 2:
         add_tolerance(figure, tolerance_m)
     group_by_axis(figure, 0.35)

@@ -21,12 +21,13 @@ class Frame:
 
 
 class Panel(NamedTuple):
-    """A figure with its caption."""
+    """A figure with its caption, and the query of its rows where there is one."""
 
     name: str
     figure: go.Figure
     caption: str
     kind: str = ""
+    sql: str = ""
 
     @property
     def title(self) -> str:

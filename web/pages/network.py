@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from itertools import zip_longest
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
-from spheremark.web.columns import MM, Columns, floats, has_errors, plain_rows, rms, select
+from spheremark.web.columns import MM, Columns, floats, has_errors, plain_rows, rms, select, texts
 from spheremark.web.figures import network as figures
+from spheremark.web.links import query_text, stop_url
 from spheremark.web.pages.base import Frame, Panel, Readout, Row
 from spheremark.web.templating import number, render
 
@@ -116,12 +119,19 @@ def _left_out(checks: Columns) -> Readout:
 
 def _panels(one: Row, tables: Mapping[str, Columns], centres: Columns) -> list[Panel]:
     """Return the figures of a network."""
-    places = figures.network_map(tables["adjusted_stations"], tables["adjusted_marks"])
+    stations, survey = tables["adjusted_stations"], str(one["survey"])
+    names = zip(texts(stations, "station"), texts(stations, "stop"), strict=True)
+    stops = dict(names)
+    stations = {**stations, **_links(survey, stops, texts(stations, "station"))}
+    observed = (texts(centres, "station"), str(one["fit_method"]), texts(centres, "marker"))
+    centres = {**centres, **_links(survey, stops, *observed)}
+    rows = query_text("adjusted_observations", adjustment_id=str(one["adjustment_id"]))
+    places = figures.network_map(stations, tables["adjusted_marks"])
     tested = select(centres, np.isfinite(floats(centres, "w")))
     panels = [
         Panel("map", places, _MAP),
-        Panel("residuals", figures.residuals(centres), _RESIDUALS),
-        Panel("tests", figures.tests(tested, one["w_limit"]), _TESTS),
+        Panel("residuals", figures.residuals(centres), _RESIDUALS, sql=rows),
+        Panel("tests", figures.tests(tested, one["w_limit"]), _TESTS, sql=rows),
     ]
     if len(tables["control_checks"]["mark"]):
         figure = figures.control_differences(tables["control_checks"])
@@ -133,3 +143,18 @@ def _worst(observations: list[dict[str, Any]]) -> list[dict[str, Any]]:
     """Return the most critical centres: those left out, then by w."""
     centres = [row for row in observations if row["kind"] == "centre"]
     return sorted(centres, key=lambda row: (row["used"], -(row["w"] or 0.0)))[:_N_WORST]
+
+
+def _links(
+    survey: str,
+    stops: Mapping[str, str],
+    stations: Sequence[str],
+    method: str = "",
+    markers: Sequence[str] = (),
+) -> dict[str, NDArray[Any]]:
+    """Return the column of links to the stop of each station, or to the marker observed there."""
+    links = [
+        stop_url(survey, stops.get(station, station), method, marker)
+        for station, marker in zip_longest(stations, markers, fillvalue="")
+    ]
+    return {"link": np.array(links, dtype=object)}

@@ -7,7 +7,7 @@ from typing import Any
 
 from spheremark.web.columns import Columns, has_errors, plain_rows
 from spheremark.web.figures.solution import heights, solution_map
-from spheremark.web.links import survey_url
+from spheremark.web.links import query_text, survey_url
 from spheremark.web.pages.base import Frame, Panel
 from spheremark.web.templating import render
 
@@ -30,9 +30,11 @@ def result_page(frame: Frame, result: Any, marks: Columns, true_stops: Columns, 
         given = {name: column[:0] for name, column in marks.items()} if free else marks
         shown = true_stops if not free else {n: c[:0] for n, c in true_stops.items()}
         text = _MAP + (_MAP_ERRORS if len(shown["stop"]) else "")
+        sql = query_text("chosen_stations", survey=frame.survey)
+        note = f"{_HEIGHTS}{_HEIGHT_ERRORS * has_truth}."
         panels = [
-            Panel("map", solution_map(given, stations, shown), f"{text}.", "tall"),
-            Panel("heights", heights(stations), f"{_HEIGHTS}{_HEIGHT_ERRORS * has_truth}.", "tall"),
+            Panel("map", solution_map(given, stations, shown), f"{text}.", "tall", sql),
+            Panel("heights", heights(stations), note, "tall", sql),
         ]
     return render(
         "result.html",

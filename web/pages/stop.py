@@ -10,6 +10,7 @@ import numpy as np
 from spheremark.web.columns import Columns, floats, has_errors, plain_rows, select, texts
 from spheremark.web.figures import scene
 from spheremark.web.figures import survey as figures
+from spheremark.web.links import query_text, stop_url
 from spheremark.web.pages.base import Frame, Panel, Row
 from spheremark.web.templating import render
 
@@ -47,7 +48,9 @@ def stop_page(
             for name in ("possible", "rejected")
         },
         used=plain_rows(tables["observations"]),
-        panels=_panels(tables, scan, more["marker"], more["tolerance_m"]),
+        panels=_panels(
+            tables, scan, more["marker"], more["tolerance_m"], _Links(frame, stop, more)
+        ),
         fix=next((fix for fix in more["fixes"] if fix["fit_method"] == more["method"]), None),
         before=names[place],
         after=names[place + 2],
@@ -56,23 +59,48 @@ def stop_page(
     )
 
 
+class _Links:
+    """Links to the markers of a stop by one method, and queries of its rows."""
+
+    def __init__(self, frame: Frame, stop: Row, more: Mapping[str, Any]) -> None:
+        self._stop = (frame.survey, str(stop["stop"]), str(more["method"]))
+        self._run = str(stop["run_id"])
+
+    def of(self, markers: Sequence[str]) -> list[str]:
+        """Return the address of each marker."""
+        return [stop_url(*self._stop, marker) for marker in markers]
+
+    def query(self, table: str) -> str:
+        """Return the query of the rows of a table."""
+        return query_text(table, run_id=self._run, stop=self._stop[1], fit_method=self._stop[2])
+
+
 def _panels(
-    tables: Mapping[str, Columns], scan: scene.Scan | None, marker: str, tolerance_m: float
+    tables: Mapping[str, Columns],
+    scan: scene.Scan | None,
+    marker: str,
+    tolerance_m: float,
+    links: _Links,
 ) -> dict[str, Panel]:
     """Return the figures of a stop by name."""
-    panels = []
+    panels, fit_rows = [], links.query("marker_fits")
     fits, observations = tables["fits"], tables["observations"]
     used = select(observations, np.isfinite(floats(observations, "residual_x_m")))
     if len(used["marker"]):
-        figure = figures.station_residuals(used, tolerance_m)
-        panels.append(Panel("residuals", figure, _RESIDUALS))
+        markers = links.of(texts(used, "marker"))
+        figure = figures.station_residuals(used, tolerance_m, links=markers)
+        panels.append(Panel("residuals", figure, _RESIDUALS, sql=links.query("observations")))
     if scan is not None and marker in (names := texts(fits, "marker")):
         i = names.index(marker)
-        panels.append(Panel("scene", scene.marker_close_up(scan, fits, i), _CLOSE_UP, "tall"))
-        panels.append(Panel("returns", scene.marker_residuals(scan, fits, i), _RETURNS))
+        panels.append(
+            Panel("scene", scene.marker_close_up(scan, fits, i), _CLOSE_UP, "tall", fit_rows)
+        )
+        residuals = scene.marker_residuals(scan, fits, i)
+        panels.append(Panel("returns", residuals, _RETURNS, sql=fit_rows))
     elif scan is not None:
-        figure = scene.stop_scene(scan, fits, tables["rejections"])
-        panels.append(Panel("scene", figure, _SCENE, "tall"))
+        markers = links.of(texts(fits, "marker"))
+        figure = scene.stop_scene(scan, fits, tables["rejections"], links=markers)
+        panels.append(Panel("scene", figure, _SCENE, "tall", fit_rows))
     return {panel.name: panel for panel in panels}
 
 

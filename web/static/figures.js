@@ -63,7 +63,9 @@ const pathOf = (link) => link.split("?")[0];
 
 // A row is about what its data-key names, or its first link to a stop
 const keyOf = (row) =>
-  row.dataset.key ?? row.querySelector('a[href*="/stops/"]')?.getAttribute("href") ?? "";
+  row.dataset.key ??
+  row.querySelector('a[href*="/stops/"]')?.getAttribute("href").split("#")[0] ??
+  "";
 
 const markerOf = (link) => new URLSearchParams(link.split("?")[1]).get("marker");
 
