@@ -21,7 +21,7 @@ from spheremark.storage.recordings.gimbal import (
     level_by_gravity,
     require_overlap,
 )
-from spheremark.storage.recordings.lasers import with_lasers
+from spheremark.storage.recordings.lasers import carries_heights, with_lasers
 from spheremark.storage.recordings.options import LogOptions, listed
 from spheremark.storage.recordings.pointclouds import PointClouds
 from spheremark.storage.recordings.sources import file_digest, opened
@@ -29,6 +29,10 @@ from spheremark.storage.recordings.sources import file_digest, opened
 _T = TypeVar("_T")
 
 _EARLY = (-1.25, -0.5)  # of the points' duration: so early are clouds that are stamped at their end
+_WITHOUT_HEIGHTS = (
+    "The points of {} are without the vertical offsets of their beams, as their lines show: they "
+    "are read so, whatever the rig says of cloud_carries_heights."
+)
 _UNREAD = ("LaserScan", "Packet", "Packets", "PacketMsg", "UdpFrame", "CompressedPointCloud")
 
 
@@ -151,18 +155,21 @@ def assemble(decoders: Decoders, options: LogOptions, origin: Origin) -> ScanLog
     gimbal, rig = choose_gimbal(signals, options, returns.frame, rig)
     returns = _from_start(lidar, returns, gimbal, options)
     require_overlap(returns, gimbal)
-    rig, rings, lasers = with_lasers(rig, returns)
+    rig, rings, laser_notes, laser_weaknesses = with_lasers(rig, returns)
+    has_heights = carries_heights(rig, rings, returns)
+    if has_heights is False and returns.has_heights is None:
+        laser_notes = (*laser_notes, _WITHOUT_HEIGHTS.format(returns.topic))
     sigma, level_notes = 0.0, tuple[str, ...]()
     if imu is None:
         imu, rig, sigma, level_notes = level_by_gravity(imus, tree, rig, returns.frame)
-    weaknesses = (*decoders.recording.lost, *lasers)
+    weaknesses = (*decoders.recording.lost, *laser_weaknesses)
     notes = (
         *decoders.all_notes(),
         *returns.notes,
         *gimbal.notes,
         *(imu.notes if imu else ()),
         *rig_notes,
-        *lasers,
+        *laser_notes,
         *level_notes,
     )
     return ScanLog(
@@ -178,7 +185,7 @@ def assemble(decoders: Decoders, options: LogOptions, origin: Origin) -> ScanLog
         rig=rig,
         origin=origin,
         notes=tuple(dict.fromkeys(notes)),
-        has_heights=returns.has_heights,
+        has_heights=has_heights,
         weaknesses=weaknesses,
         sigma_levelling=sigma,
     )

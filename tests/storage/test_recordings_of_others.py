@@ -38,6 +38,7 @@ from spheremark.storage.recordings import (
     LogOptions,
     file_digest,
     inspect_log,
+    lasers,
     packets,
     read_log,
     transforms,
@@ -703,6 +704,51 @@ def test_lasers_of_another_lidar_are_those_of_its_returns(tmp_path, rng):
     found = np.degrees(np.arctan2(log.p_lidar[:, 2], np.hypot(*log.p_lidar[:, :2].T)))
     assert_allclose(found, elevations[::-1][log.rings], rtol=0, atol=1e-3)
     assert "no VLP-16: it has 32 lasers" in log.weaknesses[0]
+
+
+@pytest.mark.parametrize("model", lasers.MODELS, ids=lambda one: one.name)
+@pytest.mark.parametrize("step", [1, -1])
+def test_a_known_model_has_the_optics_of_its_maker(tmp_path, rng, model, step):
+    elevations = np.degrees(model.elevations)[::step]
+    items = [
+        ("/tf_static", T0, frames(MOUNT)),
+        ("/p", T0 + 10**8, cloud(spinning(rng, elevations, 4000))),
+    ]
+    log = read_log(record(tmp_path / "a.mcap", [*items, *turning()]))
+    assert_array_equal(log.rig.laser_elevations, model.elevations)
+    assert_array_equal(log.rig.divergence, (0.003, 0.0015))
+    found = np.degrees(np.arctan2(log.p_lidar[:, 2], np.hypot(*log.p_lidar[:, :2].T)))
+    assert_allclose(found, np.degrees(model.elevations)[log.rings], rtol=0, atol=1e-3)
+    assert any(model.name in note for note in log.notes)
+    assert not log.weaknesses
+
+
+@pytest.mark.parametrize("has_rig", [True, False])
+@pytest.mark.parametrize("carries", [True, False, None])
+def test_points_show_whether_they_include_the_offsets_of_their_beams(
+    tmp_path, rng, carries, has_rig
+):
+    points = spinning(rng, np.arange(-15, 16, 2), 4000)
+    if carries:
+        points["z"] += -0.04191 * np.tan(np.radians(np.arange(-15, 16, 2)))[points["ring"]]
+    if carries is None:  # noise across the beams, as no LiDAR has it, leaves it open
+        points["z"] += rng.normal(0, 0.3, len(points))
+    items = [("/p", T0 + 10**8, cloud(points)), *turning()]
+    items = [("/tf_static", T0, frames(MOUNT)), *items] if has_rig else items
+    log = read_log(record(tmp_path / "a.mcap", items))
+    assert log.has_heights is carries
+    assert any("without the vertical offsets" in n for n in log.notes) == (carries is False)
+
+
+def test_rings_from_the_top_down_are_turned_over_where_the_log_has_no_rig(tmp_path, rng):
+    path = record(
+        tmp_path / "a.mcap",
+        [("/p", T0 + 10**8, cloud(spinning(rng, np.linspace(22.5, -22.5, 32)))), *turning()],
+    )
+    log = read_log(path)
+    assert log.rig is None
+    found = np.degrees(np.arctan2(log.p_lidar[:, 2], np.hypot(*log.p_lidar[:, :2].T)))
+    assert_allclose(found, np.linspace(-22.5, 22.5, 32)[log.rings], rtol=0, atol=1e-3)
 
 
 def test_rings_of_a_vlp16_from_the_top_down_are_turned_over(tmp_path, rng):
