@@ -7,6 +7,7 @@ variance of a position is convex in it.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
@@ -19,7 +20,6 @@ from spheremark.pipelines.placement.plan import Requirement
 from spheremark.pipelines.placement.station_covariance import (
     Observables,
     covariances,
-    shared_variance,
 )
 from spheremark.pipelines.progress import checkpoint
 
@@ -28,7 +28,10 @@ _ROWS, _COLUMNS = np.tril_indices(_N_UNKNOWNS)
 _POSITION = [3, 4, 5]
 _TWICE = np.where(_ROWS == _COLUMNS, 1.0, 2.0)  # of elements off the diagonal in a trace
 _LOOSE_PRIOR = np.array([3.0, 3.0, 3.0, 10.0, 10.0, 10.0, 1.0])  # [rad, m] before a mark is seen
-_STEPS = 400  # of the relaxation; the gap to its optimum is then some 0.2 %
+_STEPS = 600  # of the relaxation; the gap to its optimum is then some 0.2 %
+_FULL_EVERY = 10  # steps with all places; only these bound
+_ACTIVE = 1000  # places of the steps between, by shares
+_SETTLED, _PATIENCE = 1e-4, 16  # a smaller gain is none; so many of these in turn end it
 _ROUNDS = 4  # in which the scale of shares settles well enough: the bound holds for any
 _ROUNDING = 1e-5  # of single precision, in which information is kept
 _PACE = 8.0  # exponent of the first steps of the weights of stops
@@ -48,55 +51,91 @@ def information_of(observables: Observables, requirement: Requirement) -> Array:
     along = v / np.maximum(np.linalg.norm(v, axis=2, keepdims=True), 1e-9)
     J = np.concatenate([by_motion(v), along[..., None]], axis=-1)
     found = np.swapaxes(J, -1, -2) @ np.where(is_seen, weights, 0.0) @ J
+    found *= observables.found[..., None, None]
     rows = np.swapaxes(found[..., _ROWS, _COLUMNS], 0, 1).reshape(v.shape[1], -1)
     return np.asarray(rows, dtype=np.float32)
 
 
-def start_information(sigma_laser_bias: float, requirement: Requirement) -> Array:
+def start_information(variance: float, requirement: Requirement) -> Array:
     """Return the information of a station without marks: gravity, and the range error's size."""
     level = requirement.sigma_levelling**-2.0
-    shared = 1.0 / max(shared_variance(sigma_laser_bias), 1e-18)
+    shared = 1.0 / max(variance, 1e-18)
     return np.diag([level, level, 0.0, 0.0, 0.0, 0.0, shared])
 
 
-def relax(
-    information: Array, start: Array, groups: Index, n_marks: int, sigma_height: float
+def relax(  # noqa: PLR0913  all that a relaxation is made of
+    information: Array,
+    start: Array,
+    groups: Index,
+    n_marks: int,
+    sigma_height: float,
+    *,
+    is_mean: bool = False,
+    report: Callable[[float, float], None] = lambda _share, _bound: None,
 ) -> Relaxation:
-    """Bound the 3-D sigma at the worst stop over all arrangements of so many marks.
+    """Bound the 3-D sigma at the worst stop, or its mean over stops, over all arrangements.
 
-    ``groups`` are places too near to each other for two marks.
+    ``groups`` are places too near to each other for two marks; ``start`` is the information of
+    stations without marks; the share of the steps and the bound so far are reported.
 
     Notes
     -----
     The least largest variance over shares of marks, of which no group has more than one, is a
     convex problem. Multiplicative steps on shares and on weights of the stops (Fedorov and Hackl,
-    1997; Arora et al., 2012) approach it; the bound needs no convergence. For weights ``w``, and
-    with ``Y`` the position's columns of any inverse, ``sum w (2 trace(Y_p) - trace(Y' N Y))`` is
-    below the weighted variance of every arrangement and linear in its information, so that the
-    arrangement with the largest sum of scores, one in each group, bounds them all.
+    1997; Arora et al., 2012) approach it, most of them on the places with the largest shares
+    alone; the bound needs no convergence. For weights ``w``, and with ``Y`` the position's columns
+    of any inverse, ``sum w (2 trace(Y_p) - trace(Y' N Y))`` is below the weighted variance of every
+    arrangement and linear in its information, so that the arrangement with the largest sum of
+    scores, one in each group, bounds them all. A sigma is convex in the information too, so that
+    tangents bound its mean.
     """
     n_stops = information.shape[1] // len(_ROWS)
     weights = np.ones(n_stops)
     shares = np.full(len(information), n_marks / len(information))
-    best = Relaxation(0.0, shares)
+    best, gains = Relaxation(0.0, shares), 0
+    start = np.broadcast_to(start, (n_stops, _N_UNKNOWNS, _N_UNKNOWNS))
+    part, some, fixed = information, np.arange(len(information)), start
     for step in range(_STEPS):
         checkpoint()
-        weights /= weights.sum()
-        columns = np.linalg.inv(start + _unpacked(shares.astype(np.float32) @ information))[
-            :, :, _POSITION
-        ]
+        is_full = step % _FULL_EVERY == 0
+        if is_full:
+            part, some, fixed = information, np.arange(len(shares)), start
+        normal = fixed + unpacked(shares[some].astype(np.float32) @ part)
+        columns = np.linalg.inv(normal)[:, :, _POSITION]
         variances = np.trace(columns[:, _POSITION], axis1=1, axis2=2)
+        sigmas = np.sqrt(variances + sigma_height**2)
+        weights = 0.5 / sigmas / n_stops if is_mean else weights / weights.sum()
         squares = columns @ np.swapaxes(columns, 1, 2)
-        scores = _scored(information, weights[:, None, None] * squares)
-        room = 2.0 * variances - np.einsum("ij,sij->s", start, squares)
-        bound = float(weights @ room) - _largest_sum(scores, groups, n_marks)
-        if bound > best.bound:
-            best = Relaxation(bound, shares)
-        shares = _divided(shares * np.sqrt(np.maximum(scores, 0.0)), groups, n_marks)
+        scores = _scored(part, weights[:, None, None] * squares)
+        moved = shares[some] * np.sqrt(np.maximum(scores, 0.0))
+        if is_full:
+            own = np.einsum("sij,sij->s", start, squares)
+            free = variances - own + (sigmas / weights / n_stops if is_mean else variances)
+            bound = float(weights @ free) - _largest_sum(scores, groups, n_marks)
+            gains = gains + 1 if bound < (1.0 + _SETTLED) * best.bound else 0
+            if bound > best.bound:
+                best = Relaxation(bound, shares)
+            shares = _divided(moved, groups, n_marks)
+            report(step / _STEPS, _sigma(best.bound, sigma_height, is_mean=is_mean))
+            if gains >= _PATIENCE:
+                break
+            some = np.argsort(-shares)[:_ACTIVE]
+            part = information[some]
+            others = np.delete(np.arange(len(shares)), some)
+            fixed = start + unpacked(shares[others].astype(np.float32) @ information[others])
+        else:
+            shares = shares.copy()
+            shares[some] = moved * (shares[some].sum() / moved.sum())
+            shares = _divided(shares, groups, n_marks)
         pace = _PACE / np.sqrt(1.0 + step / 50.0)
         weights = weights * np.exp(pace * 0.5 * (variances / variances.max() - 1.0))
-    variance = max((1.0 - _ROUNDING) * best.bound, 0.0)
-    return best._replace(bound=float(np.sqrt(variance + sigma_height**2)))
+    return best._replace(bound=_sigma(best.bound, sigma_height, is_mean=is_mean))
+
+
+def _sigma(bound: float, sigma_height: float, *, is_mean: bool) -> float:
+    """Return the sigma of a bound of weighted variances, or of the mean of sigmas [m]."""
+    bound = max((1.0 - _ROUNDING) * bound, 0.0)
+    return bound if is_mean else float(np.sqrt(bound + sigma_height**2))
 
 
 def groups_of(p_site: Array, apart: float) -> Index:
@@ -116,7 +155,7 @@ def gained(information: Array, start: Array, chosen: Array, n_marks: int) -> tup
     The bound is the tangent of the concave logarithm at the marks' own information.
     """
     loose = start + np.diag(_LOOSE_PRIOR**-2.0)
-    normal = loose + _unpacked(chosen.sum(axis=0))
+    normal = loose + unpacked(chosen.sum(axis=0))
     inverse = np.asarray(np.linalg.inv(normal), dtype=np.float64)
     gain = float((np.linalg.slogdet(normal)[1] - np.linalg.slogdet(loose)[1]).sum())
     scores, own = (_scored(part, inverse) for part in (information, chosen))
@@ -147,7 +186,7 @@ def widest_sigma(tolerance: float, probability: float) -> float:
     return float(max(tolerance * np.sqrt(n) / chi(n).ppf(probability) for n in (1, 2, 3)))
 
 
-def _unpacked(rows: Array) -> Array:
+def unpacked(rows: Array) -> Array:
     """Return symmetric matrices, (s, 7, 7), from their lower triangles one after another."""
     rows = rows.reshape(-1, len(_ROWS))
     out = np.empty((len(rows), _N_UNKNOWNS, _N_UNKNOWNS))

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import product
 
 import numpy as np
 from scipy.ndimage import distance_transform_edt
 
 from spheremark.pipelines.errors import ConfigError, DegenerateGeometryError
-from spheremark.pipelines.model import Array, Mask, seal
+from spheremark.pipelines.model import Array, Index, Mask, seal
 from spheremark.pipelines.placement.plan import Site, Stops, bilinear
 
 CANDIDATES_MAX = 20_000
@@ -40,6 +40,8 @@ class PlaceRules:
         Grid on which places are tried [m]; 0 takes one that gives some hundred.
     apart : float
         Least distance between two marks [m].
+    placement : float
+        How far from its planned place a mark may end up [m]; the rules hold wherever it does.
     """
 
     reach: float = 6.0
@@ -48,6 +50,7 @@ class PlaceRules:
     is_inside_allowed: bool = False
     spacing: float = 0.0
     apart: float = 1.0
+    placement: float = 0.0
 
     def __post_init__(self) -> None:
         for name, low, high in (
@@ -56,6 +59,7 @@ class PlaceRules:
             ("clear", 0.0, 50.0),
             ("spacing", 0.0, 20.0),
             ("apart", 0.0, 50.0),
+            ("placement", 0.0, 5.0),
         ):
             value = getattr(self, name)
             if not low <= value <= high:
@@ -74,6 +78,10 @@ class Candidates:
 
     def __post_init__(self) -> None:
         seal(self, p_site=(None, 3), ground=(len(self.p_site),))
+
+    def rows(self, keep: Index) -> Candidates:
+        """Return some of the places."""
+        return replace(self, p_site=self.p_site[keep].copy(), ground=self.ground[keep].copy())
 
 
 def find_candidates(site: Site, stops: Stops, rules: PlaceRules) -> Candidates:
@@ -152,7 +160,7 @@ def _candidates(
     """Return places on poles of some heights."""
     ground = site.ground_at(place)
     p_site = np.column_stack([place, np.round(ground + heights, _DIGITS)])
-    apart = max(rules.apart, 1e-6)
+    apart = max(rules.apart + 2.0 * rules.placement, 1e-6)
     return Candidates(p_site=p_site, ground=ground, apart=apart, rules=rules, spacing=spacing)
 
 
@@ -166,14 +174,15 @@ def _masks(site: Site, stops: Stops, rules: PlaceRules, place: Array) -> dict[st
     """Return which places satisfy each rule, by the text of the rule."""
     gaps = np.hypot(*(place[:, None] - stops.p_site[None, :, :2]).transpose(2, 0, 1)).min(axis=1)
     masks = {
-        "within reach of a stop": gaps <= rules.reach,
-        "clear of the stops": (gaps >= rules.clear) & ~_inside(stops, rules, place),
+        "within reach of a stop": gaps <= rules.reach - rules.placement,
+        "clear of the stops": (gaps >= rules.clear + rules.placement)
+        & ~_inside(stops, rules, place),
         "on known ground": np.isfinite(site.ground_at(place)),
         "not too steep": _slopes(site, place) <= rules.slope_max,
         "free of obstacles": _is_free(site, place),
     }
     if site.keep_out:
-        masks["outside the polygons"] = ~_covered(site.keep_out, place)
+        masks["outside the polygons"] = ~_covered(site.keep_out, place, rules.placement)
     return masks
 
 
@@ -183,15 +192,15 @@ def _inside(stops: Stops, rules: PlaceRules, place: Array) -> Mask:
 
     if rules.is_inside_allowed or len(stops.names) < 3:
         return np.zeros(len(place), dtype=np.bool_)
-    hull = MultiPoint(stops.p_site[:, :2]).convex_hull.buffer(rules.clear)
+    hull = MultiPoint(stops.p_site[:, :2]).convex_hull.buffer(rules.clear + rules.placement)
     return np.asarray(contains_xy(hull, place[:, 0], place[:, 1]), dtype=np.bool_)
 
 
-def _covered(polygons: tuple[Array, ...], place: Array) -> Mask:
-    """Return which places lie in one of some polygons."""
+def _covered(polygons: tuple[Array, ...], place: Array, margin: float) -> Mask:
+    """Return which places lie in one of some polygons or within a margin."""
     from shapely import MultiPolygon, Polygon, contains_xy, union_all
 
-    area = union_all([Polygon(corners).buffer(0) for corners in polygons])
+    area = union_all([Polygon(corners).buffer(margin) for corners in polygons])
     area = area if not area.is_empty else MultiPolygon()
     return np.asarray(contains_xy(area, place[:, 0], place[:, 1]), dtype=np.bool_)
 

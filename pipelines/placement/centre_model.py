@@ -34,6 +34,7 @@ _EFFICIENCY = (0.85, 1.02, 0.93)
 # near to be told apart. Over 130 simulated spheres at 0.2 to 0.85 m before a wall.
 _TOUCHING, _MIXING = 0.15, 0.85  # [m]
 _MIXED_RETURNS, _MIXED_VARIANCE = 0.79, 2.5
+_MISSED = 0.7  # times the root of the returns: spheres that are not found or not matched
 _LOST_MAX = 0.05  # share of places between the lines where a sphere may be missed
 
 
@@ -191,6 +192,16 @@ def centres_ahead(model: CentreModel, distances: Array) -> tuple[Array, Array]:
     marks = Arrangement.numbered(np.column_stack([distances, np.zeros((n, 2))]))
     centres = expect_centres(model, np.zeros((1, 3)), marks, Visibility.open(1, n, N_STRIPS))
     return centres.n_points[0], np.einsum("nii->ni", centres.cov_site[0])
+
+
+def detection(centres: Centres) -> Array:
+    """Return the probability that the chain finds and matches each sphere that is seen.
+
+    Over 736 spheres on poles, clear of surfaces, in random worlds: 0.83 with 20 to 30 returns, 0.92
+    with 50 to 100, 0.97 with more than 500.
+    """
+    missed = np.minimum(_MISSED / np.sqrt(np.maximum(centres.n_points, 1.0)), 1.0)
+    return np.asarray((1.0 - centres.lost) * (1.0 - missed))
 
 
 def is_found(centres: Centres, n_points_min: float, share_min: float) -> Mask:

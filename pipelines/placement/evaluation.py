@@ -9,6 +9,7 @@ from spheremark.pipelines.model import Array, Index, Mask
 from spheremark.pipelines.placement.centre_model import (
     CentreModel,
     Centres,
+    detection,
     expect_centres,
     is_found,
 )
@@ -92,6 +93,7 @@ def evaluate(
         version=model.version,
         source=model.provenance.source,
         is_seen=seen,
+        found=observables.found * seen,
         shares=centres.shares,
         gaps=visibility.gaps.astype(np.float64),
         ranges=np.linalg.norm(observables.vectors, axis=2),
@@ -109,6 +111,43 @@ def evaluate(
         external_reliabilities=tested.external,
         reasons=_reasons(seen, centres, positions, requirement),
     )
+
+
+def worst_after_loss(
+    site: Site, found: Evaluation, model: CentreModel, *, visibility: Visibility | None = None
+) -> float:
+    """Return the largest 3-D sigma over all stops after the loss of any one mark [m].
+
+    Parameters
+    ----------
+    site : Site
+        Ground and what hides marks.
+    found : Evaluation
+        The arrangement with all its marks.
+    model : CentreModel
+        Accuracy of centres.
+    visibility : Visibility, optional
+        As of ``evaluate``.
+
+    Returns
+    -------
+    float
+        Infinite where a stop has no position then, or with fewer than three marks.
+    """
+    stops, marks, n = found.stops, found.marks, len(found.marks.names)
+    if n < 3:
+        return np.inf
+    alone = find_visibility(site, stops.p_site, marks) if visibility is None else visibility
+    worst = 0.0
+    for i in range(n):
+        keep = np.delete(np.arange(n), i)
+        some, left = marks.rows(keep), alone.rows(keep)
+        seen = with_occlusion(site, stops.p_site, some, left)
+        requirement = found.requirement
+        _, observables = predict_observables(stops.p_site, some, model, requirement, seen)
+        covs = predict_positions(observables, requirement).cov_motion[:, 3:, 3:]
+        worst = max(worst, float(np.sqrt(np.trace(covs, axis1=1, axis2=2)).max()))
+    return worst
 
 
 def field_map(  # noqa: PLR0913  all that a map is made of
@@ -161,6 +200,7 @@ def field_map(  # noqa: PLR0913  all that a map is made of
         sigma_3d=np.where(is_open, np.nan, sigmas).reshape(shape),
         probability=np.where(is_open, np.nan, probability).reshape(shape),
         n_seen=(observables.is_seen.sum(axis=1) * is_known).astype(np.intp).reshape(shape),
+        is_seen=(observables.is_seen & is_known[:, None]).reshape(*shape, -1),
     )
 
 
@@ -228,12 +268,16 @@ def predict_observables(
 ) -> tuple[Centres, Observables]:
     """Predict the centres, and which marks are found."""
     centres = expect_centres(model, stations, marks, visibility)
+    found = detection(centres) * (1.0 - requirement.occlusion)
     observables = Observables(
         stations_site=stations,
         marks_site=marks.p_site,
         cov_centres=centres.cov_site,
         sigma_laser_bias=model.sensor.sigma_range_bias,
+        sigma_range_common=model.sensor.sigma_range_common,
+        sigma_aim=model.sensor.sigma_aim,
         is_seen=is_found(centres, requirement.n_points_min, requirement.share_min),
+        found=found,
     )
     return centres, observables
 

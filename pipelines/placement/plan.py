@@ -26,6 +26,7 @@ _LIMITS: dict[str, tuple[float, float]] = {
     "sigma_levelling": (1e-6, 0.5),
     "n_points_min": (1.0, 10_000.0),
     "share_min": (0.0, 1.0),
+    "occlusion": (0.0, 0.9),
 }
 
 
@@ -176,6 +177,8 @@ class Requirement:
     share_min : float
         Share of a sphere that must be seen for it to be found. 0.5: with less detection finds
         every second one.
+    occlusion : float
+        Probability that people or vehicles that pass hide a mark from a stop during its scan.
     resection : ResectionConfig
         Levels of the tests, and what every centre has beyond its own covariance.
     """
@@ -186,6 +189,7 @@ class Requirement:
     sigma_levelling: float = float(np.radians(0.2))
     n_points_min: float = 20.0
     share_min: float = 0.5
+    occlusion: float = 0.0
     resection: ResectionConfig = field(default_factory=ResectionConfig)
 
     def __post_init__(self) -> None:
@@ -250,7 +254,9 @@ class Evaluation:
     version, source : str
         Which model of centres was used: its digest, and ``sensor`` or ``fitted``.
     is_seen : (s, n)
-        Whether a mark will be found from a stop.
+        Whether a mark is visible and near enough to be found from a stop.
+    found : (s, n)
+        Probability that it is found: detected, and not hidden by what passes.
     shares : (s, n)
         Share of a sphere's disc that nothing hides, 0 to 1.
     gaps : (s, n)
@@ -293,6 +299,7 @@ class Evaluation:
     version: str
     source: str
     is_seen: Mask
+    found: Array
     shares: Array
     gaps: Array
     ranges: Array
@@ -312,7 +319,10 @@ class Evaluation:
 
     def __post_init__(self) -> None:
         s, n = len(self.stops.names), len(self.marks.names)
-        seal(self, **dict.fromkeys(("is_seen", "shares", "gaps", "ranges", "n_points"), (s, n)))
+        seal(
+            self,
+            **dict.fromkeys(("is_seen", "found", "shares", "gaps", "ranges", "n_points"), (s, n)),
+        )
         pairs = ("redundancies", "detectable_biases", "external_reliabilities")
         seal(self, **dict.fromkeys(pairs, (s, n)))
         seal(self, **dict.fromkeys(("sigma_3d", "probability", "dop", "n_used", "dof"), (s,)))
@@ -340,7 +350,9 @@ class FieldMap:
     # (m, n) probability that its 3-D error is within the tolerance; NaN where there is no position
     probability: Array
     n_seen: Index  # (m, n) marks that will be found from there; 0 where the ground is not known
+    is_seen: Mask  # (m, n, k) which these are
 
     def __post_init__(self) -> None:
         shape = (len(self.ys), len(self.xs))
         seal(self, xs=(None,), ys=(None,), sigma_3d=shape, probability=shape, n_seen=shape)
+        seal(self, is_seen=(*shape, None))

@@ -23,7 +23,6 @@ LOOSE2 = 1.0
 """Variance of a position above which it counts as undetermined [m^2]."""
 
 _BIAS_LEFT = 0.22  # of the spread of laser biases: what a survey leaves to each centre, simulated
-_SIGMA_AIM = 1.5e-5  # [rad] of each direction, by mounting and encoder, after both faces; simulated
 _TRACE_MOST = 1e6  # of the horizontal cofactor matrix of three circles that cut at all
 _ANY = 2.0  # beyond the cosine of any angle
 
@@ -36,12 +35,20 @@ class Observables(NamedTuple):
     # (s, n, 3, 3) covariances of their centres by noise, in the axes of the site [m^2]
     cov_centres: Array
     sigma_laser_bias: float  # standard deviation of the range bias of a laser [m]
-    is_seen: Mask  # (s, n) which are found
+    sigma_range_common: float  # of what all lasers measure too long together [m]
+    sigma_aim: float  # of each direction, by mounting and encoder, after both faces [rad]
+    is_seen: Mask  # (s, n) which are visible and near enough to be found
+    found: Array  # (s, n) probability that each is found
 
     @property
     def vectors(self) -> Array:
         """Vectors from stations to marks, (s, n, 3) [m]."""
         return np.asarray(self.marks_site[None] - self.stations_site[:, None])
+
+    @property
+    def shared_variance(self) -> float:
+        """Variance of the common error of all ranges: bias, and the lasers' mean [m^2]."""
+        return shared_variance(self.sigma_laser_bias, self.sigma_range_common)
 
 
 class Positions(NamedTuple):
@@ -60,7 +67,7 @@ class Pairs(NamedTuple):
     vectors: Array  # (s, n, 3) from stations to marks [m]
     weights: Array  # (s, n, 3, 3) information about the position, as a survey weighs it [1/m^2]
     spreads: Array  # (s, n, 3, 3) true covariance of what a mark adds to the right-hand side
-    is_seen: Mask  # (s, n) which are found
+    is_seen: Mask  # (s, n) which are visible and near enough to be found
 
 
 class Reliability(NamedTuple):
@@ -80,9 +87,10 @@ def predict_positions(observables: Observables, requirement: Requirement) -> Pos
     ``free_station``: weights are those of the adjustment, ``Q = (sum J' P J + G)^-1`` with
     ``J = [-[v]x, 1]`` of each mark and the AHRS's information ``G`` on roll and pitch; a survey
     takes what lasers and gimbal leave as different at every mark. The covariance of the estimate
-    has them as they are: noise of each mark, the remaining error of its direction, and a common
-    error of all ranges, which hardly moves a station with marks all round: ``Q J' P C P J Q``. A
-    common error of the centres' heights goes to the height of the station.
+    has them as they are: noise of each mark, what is left of its laser biases and direction, and a
+    common error of all ranges, which hardly moves a station with marks all round:
+    ``Q J' P C P J Q``. A common error of the centres' heights goes to the height of the station.
+    Each mark counts with the probability that it is found.
     ``paper``: horizontal distances and heights of the three marks whose circles cut best, and the
     levelling error carried through them as in ``trilateration``; the heading is the mean of the
     three directions.
@@ -90,7 +98,7 @@ def predict_positions(observables: Observables, requirement: Requirement) -> Pos
     is_paper = requirement.method == "paper"
     pairs = pairs_of(observables, requirement)
     used = _choose_three(pairs) if is_paper else np.array(observables.is_seen)
-    normal, spread, shared = _equations(pairs, used, requirement, observables.sigma_laser_bias)
+    normal, spread, shared = _equations(pairs, used, requirement, observables.shared_variance)
     cofactor, is_fixed = invert_each(normal)
     is_fixed &= np.trace(cofactor[:, -3:, -3:], axis1=1, axis2=2) <= LOOSE2
     cofactor[~is_fixed], used[~is_fixed & is_paper] = 0.0, False
@@ -107,6 +115,9 @@ def predict_positions(observables: Observables, requirement: Requirement) -> Pos
         cofactor, cov[:, 3:, 3:] = cov.copy(), place
         cofactor[:, 3:, 3:] = position
     cov[:, 5, 5] += requirement.resection.sigma_height**2
+    if (observables.found < 1.0).any():  # a survey states what the marks that it finds give
+        all_found = observables._replace(found=np.ones_like(observables.found))
+        cofactor = predict_positions(all_found, requirement).cofactor
     cov[~is_fixed] = cofactor[~is_fixed] = np.diag(np.full(6, np.inf))
     return Positions(cov, cofactor, used)
 
@@ -129,7 +140,9 @@ def pairs_of(observables: Observables, requirement: Requirement) -> Pairs:
         weights = _transposed(J) @ np.linalg.inv(_on_circles(J, stated) + levelling) @ J
     else:
         weights = invert_each(stated)[0]
-    return Pairs(v, weights, weights @ true @ weights, is_seen)
+    # by three circles the next best mark replaces one that is not found
+    found = 1.0 if requirement.method == "paper" else observables.found[..., None, None]
+    return Pairs(v, found * weights, found * (weights @ true @ weights), is_seen)
 
 
 def start_of(requirement: Requirement) -> Array:
@@ -139,9 +152,9 @@ def start_of(requirement: Requirement) -> Array:
     return np.diag([requirement.sigma_levelling**-2.0] * 2 + [0.0] * 4)
 
 
-def shared_sigmas(sigma_laser_bias: float, requirement: Requirement) -> Array:
+def shared_sigmas(variance: float, requirement: Requirement) -> Array:
     """Return the sigmas of errors that marks of a station share, in the order of ``add_mark``."""
-    sigmas = [np.sqrt(shared_variance(sigma_laser_bias)), *[requirement.sigma_levelling] * 2]
+    sigmas = [np.sqrt(variance), *[requirement.sigma_levelling] * 2]
     return np.array(sigmas if requirement.method == "paper" else sigmas[:1])
 
 
@@ -150,9 +163,9 @@ def claimed_bias_variance(sigma_laser_bias: float) -> float:
     return (_BIAS_LEFT * sigma_laser_bias) ** 2
 
 
-def shared_variance(sigma_laser_bias: float) -> float:
-    """Return the variance of the common error of all ranges of a survey: the lasers' mean bias."""
-    return sigma_laser_bias**2 / N_LASERS
+def shared_variance(sigma_laser_bias: float, sigma_range_common: float) -> float:
+    """Return the variance of the common error of all ranges: bias, and the lasers' mean."""
+    return sigma_range_common**2 + sigma_laser_bias**2 / N_LASERS
 
 
 def reliability(
@@ -187,23 +200,25 @@ def reliability(
 def covariances(observables: Observables, requirement: Requirement) -> tuple[Array, Array]:
     """Return the centres' covariances as a survey states them, and the true ones.
 
-    A survey takes the remaining laser biases as independent, along the ranges; true are noise and
-    the error of aiming across them, beside a range error that all centres share.
+    A survey takes the remaining laser biases as independent, along the ranges, and adds what all
+    directions leave; true are these biases, noise and the error of aiming across the ranges, beside
+    a range error that all centres share.
     """
     v = observables.vectors
     d2 = np.maximum(np.sum(v**2, axis=-1), 1e-9)[..., None, None]
     along = v[..., :, None] * v[..., None, :]
     noise = observables.cov_centres + requirement.sigma_marks**2 * np.eye(3)
     bias2 = claimed_bias_variance(observables.sigma_laser_bias)
-    stated = noise + requirement.resection.sigma_common**2 * np.eye(3) + bias2 / d2 * along
-    return stated, noise + _SIGMA_AIM**2 * (d2 * np.eye(3) - along)
+    noise = noise + bias2 / d2 * along
+    stated = noise + requirement.resection.sigma_common**2 * np.eye(3)
+    return stated, noise + observables.sigma_aim**2 * (d2 * np.eye(3) - along)
 
 
 def _equations(
-    pairs: Pairs, used: Mask, requirement: Requirement, sigma_laser_bias: float
+    pairs: Pairs, used: Mask, requirement: Requirement, variance: float
 ) -> tuple[Array, Array, Array]:
     """Return normal matrices, covariances and shared errors of right-hand sides of stations."""
-    start, sigmas = start_of(requirement), shared_sigmas(sigma_laser_bias, requirement)
+    start, sigmas = start_of(requirement), shared_sigmas(variance, requirement)
     normal, spread = (np.tile(start, (len(used), 1, 1)) for _ in range(2))
     shared = np.zeros((*normal.shape[:2], len(sigmas)))
     _add_marks(pairs, used, normal, spread, shared)

@@ -111,6 +111,10 @@ class Scans:
     rest_revolutions: Annotated[
         int, typer.Option(help="Revolutions of the LiDAR during each rest.")
     ] = 3
+    noise_m: Annotated[
+        float | None,
+        typer.Option(help="Noise of a range to a sphere \\[m]; of a VLP-16 if not given."),
+    ] = None
 
     def sensor(self) -> Sensor:
         """Return the sensor of the core."""
@@ -121,6 +125,7 @@ class Scans:
             spin_rpm=self.rpm,
             step=math.radians(self.step_deg),
             rest_revolutions=self.rest_revolutions,
+            noise=self.noise_m,
         )
 
 

@@ -9,12 +9,14 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from spheremark.pipelines.errors import InputError
 from spheremark.service.cli.options import AsJson, Results, Scans, grouped
 from spheremark.service.cli.terminal import out, print_json
 
 if TYPE_CHECKING:
     from spheremark.pipelines.placement import Requirement
-    from spheremark.service.planning.requests import Ground
+    from spheremark.service.planning.plans import Aim
+    from spheremark.service.planning.requests import Ground, Plan
 
 plan = typer.Typer(
     help="Where to put markers: evaluate, optimise, simulate at random.", no_args_is_help=True
@@ -49,13 +51,19 @@ class PlannedField:
     sigma_marks_m: Annotated[
         float, typer.Option(help="Sigma per axis of the marks themselves \\[m].")
     ] = 0.0
+    occlusion: Annotated[
+        float, typer.Option(help="Probability that what passes hides a mark from a stop.")
+    ] = 0.0
 
     def requirement(self) -> Requirement:
         """Return the requirement of the core."""
         from spheremark.pipelines.placement import Requirement
 
         return Requirement(
-            tolerance=self.tolerance_m, method=self.method, sigma_marks=self.sigma_marks_m
+            tolerance=self.tolerance_m,
+            method=self.method,
+            sigma_marks=self.sigma_marks_m,
+            occlusion=self.occlusion,
         )
 
     def ground(self, **more: Any) -> Ground:
@@ -139,6 +147,104 @@ def evaluate(
     files.deliver(found)
 
 
+@dataclass(frozen=True, kw_only=True)
+class Search:
+    """Where marks may stand, and what is best."""
+
+    objective: Annotated[
+        str, typer.Option(help="What is least: worst (stop), after_loss or mean.")
+    ] = "worst"
+    probability: Annotated[
+        float, typer.Option(help="With which the tolerance shall be kept at every stop.")
+    ] = 0.95
+    robust: Annotated[
+        bool, typer.Option(help="Whether it shall be kept after the loss of any one mark too.")
+    ] = True
+    most: Annotated[int, typer.Option(help="Most marks where the fewest are searched.")] = 20
+    loss_weight: Annotated[
+        float,
+        typer.Option(
+            help="Weight of the worst stop after a loss: 0 ignores it, 1 counts it alone."
+        ),
+    ] = 0.03
+    walk_weight: Annotated[
+        float, typer.Option(help="Weight of the way past all marks, 0 to 1: 0 ignores it.")
+    ] = 0.0
+    stop_reach_m: Annotated[
+        float, typer.Option(help="How far stops may be moved to better places \\[m].")
+    ] = 0.0
+    standing: Annotated[
+        Path | None,
+        typer.Option(
+            exists=True, dir_okay=False, help="Marks that stand already and stay (JSON or CSV)."
+        ),
+    ] = None
+    cost_mark: Annotated[float, typer.Option(help="Cost of a mark, in any unit.")] = 0.0
+    cost_metre: Annotated[float, typer.Option(help="Cost of a metre past all marks.")] = 0.0
+    keep_out: Annotated[
+        Path | None,
+        typer.Option(
+            exists=True, dir_okay=False, help="Polygons where no mark may stand (GeoJSON)."
+        ),
+    ] = None
+    pole_m: Annotated[
+        tuple[float, float], typer.Option(help="Least and greatest height of a centre \\[m].")
+    ] = (0.62, 1.50)
+    reach_m: Annotated[float, typer.Option(help="Farthest a mark may stand from a stop \\[m].")] = (
+        6.0
+    )
+    clear_m: Annotated[float, typer.Option(help="Least distance from stops \\[m].")] = 1.0
+    apart_m: Annotated[float, typer.Option(help="Least distance between marks \\[m].")] = 1.0
+    placement_m: Annotated[
+        float, typer.Option(help="How far from its place a mark may end up \\[m].")
+    ] = 0.0
+    slope_deg: Annotated[float, typer.Option(help="Steepest ground for a pole \\[deg].")] = 15.0
+    inside: Annotated[
+        bool, typer.Option("--inside", help="Marks may stand between the stops too.")
+    ] = False
+    spacing_m: Annotated[
+        float, typer.Option(help="Grid of places that are tried \\[m]; 0 takes one that suits.")
+    ] = 0.0
+
+    def plan(self, field: PlannedField, scans: Scans, results: Results) -> Plan:
+        """Return the plan to search, with the marks that stand."""
+        from spheremark.service.planning import plans
+        from spheremark.storage.imports.plan_files import read_marks
+
+        ground = field.ground(keep_out=self.keep_out, poles=self.pole_m)
+        marks = None if self.standing is None else read_marks(self.standing)
+        requirement, query = field.requirement(), results.query()
+        return plans.assemble(ground, marks, scans.sensor(), requirement, query, results.survey)
+
+    def aim(self, n_marks: int | None) -> Aim:
+        """Return what the search is for."""
+        from spheremark.pipelines.placement import Goal, PlaceRules
+        from spheremark.service.planning.plans import Aim
+        from spheremark.service.serialise.plans import Costs
+
+        rules = PlaceRules(
+            reach=self.reach_m,
+            clear=self.clear_m,
+            apart=self.apart_m,
+            slope_max=math.radians(self.slope_deg),
+            spacing=self.spacing_m,
+            is_inside_allowed=self.inside,
+            placement=self.placement_m,
+        )
+        goal = Goal(
+            n_marks=n_marks,
+            probability=self.probability,
+            is_robust=self.robust,
+            most=self.most,
+            objective=self.objective,
+            loss_weight=self.loss_weight,
+            walk_weight=self.walk_weight,
+            stop_reach=self.stop_reach_m,
+        )
+        costs = Costs(per_mark=self.cost_mark, per_metre=self.cost_metre)
+        return Aim(rules=rules, goal=goal, costs=costs, keeps_marks=self.standing is not None)
+
+
 @plan.command()
 @grouped
 def optimise(
@@ -146,60 +252,70 @@ def optimise(
     scans: Scans,
     results: Results,
     files: PlanFiles,
+    search: Search,
     marks: Annotated[
         int | None, typer.Option(help="Number of marks; if not given, the least that suffices.")
     ] = None,
-    probability: Annotated[
-        float, typer.Option(help="With which the tolerance shall be kept at every stop.")
-    ] = 0.95,
-    robust: Annotated[
-        bool, typer.Option(help="Whether it shall be kept after the loss of any one mark too.")
-    ] = True,
-    loss_weight: Annotated[
-        float,
-        typer.Option(
-            help="Weight of the worst stop after a loss: 0 ignores it, 1 counts it alone."
-        ),
-    ] = 0.03,
-    keep_out: Annotated[
-        Path | None,
-        typer.Option(
-            exists=True, dir_okay=False, help="Polygons where no mark may stand (GeoJSON)."
-        ),
-    ] = None,
-    pole_m: Annotated[
-        tuple[float, float], typer.Option(help="Least and greatest height of a centre \\[m].")
-    ] = (0.62, 1.50),
-    reach_m: Annotated[
-        float, typer.Option(help="Farthest a mark may stand from a stop \\[m].")
-    ] = 6.0,
-    clear_m: Annotated[float, typer.Option(help="Least distance from stops \\[m].")] = 1.0,
-    apart_m: Annotated[float, typer.Option(help="Least distance between marks \\[m].")] = 1.0,
-    slope_deg: Annotated[float, typer.Option(help="Steepest ground for a pole \\[deg].")] = 15.0,
-    inside: Annotated[
-        bool, typer.Option("--inside", help="Marks may stand between the stops too.")
-    ] = False,
-    spacing_m: Annotated[
-        float, typer.Option(help="Grid of places that are tried \\[m]; 0 takes one that suits.")
-    ] = 0.0,
 ) -> None:
     """Find the best places for a number of marks, or the fewest that keep the tolerance."""
-    from spheremark.pipelines.placement import Goal, PlaceRules
+    from spheremark.service.cli.terminal import searching
     from spheremark.service.planning import plans
 
-    ground = field.ground(keep_out=keep_out, poles=pole_m)
-    query, requirement = results.query(), field.requirement()
-    assembled = plans.assemble(ground, None, scans.sensor(), requirement, query, results.survey)
-    rules = PlaceRules(
-        reach=reach_m,
-        clear=clear_m,
-        apart=apart_m,
-        slope_max=math.radians(slope_deg),
-        spacing=spacing_m,
-        is_inside_allowed=inside,
-    )
-    goal = Goal(n_marks=marks, probability=probability, is_robust=robust, loss_weight=loss_weight)
-    files.deliver(plans.optimise(assembled, rules, goal))
+    assembled = search.plan(field, scans, results)
+    with searching() as report:
+        found = plans.optimise(assembled, search.aim(marks), report)
+    files.deliver(found)
+
+
+@plan.command("trade-off")
+@grouped
+def trade_off(
+    field: PlannedField,
+    scans: Scans,
+    results: Results,
+    search: Search,
+    numbers: Annotated[
+        str, typer.Option(help="Numbers of marks, as 4-8,10,14; empty for none.")
+    ] = "4,5,6,8,10,14",
+    loss_weights: Annotated[
+        str, typer.Option(help="Weights of a loss to compare, as 0,0.03,0.2,1; needs --marks.")
+    ] = "",
+    marks: Annotated[
+        int | None, typer.Option(help="Number of marks for the weights of a loss.")
+    ] = None,
+    as_json: AsJson = False,
+) -> None:
+    """Compare the best arrangements of several numbers of marks, and weights of a loss."""
+    from spheremark.service.cli import render
+    from spheremark.service.cli.terminal import searching
+    from spheremark.service.planning import plans
+
+    aim = search.aim(marks)
+    chosen = _numbers(numbers), _weights(loss_weights)
+    assembled = search.plan(field, scans, results)
+    with searching() as report:
+        found = plans.trade_off(assembled, aim, *chosen, report)
+    if as_json:
+        print_json(found)
+    else:
+        render.print_trade_off(out, found)
+
+
+def _numbers(text: str) -> list[int]:
+    """Return numbers of marks from a list with ranges."""
+    try:
+        parts = [[int(end) for end in part.split("-")] for part in text.split(",") if part.strip()]
+    except ValueError as error:
+        raise InputError(f"--numbers is {text!r}; it must be a list as 4-8,10,14.") from error
+    return [n for ends in parts for n in range(ends[0], ends[-1] + 1)]
+
+
+def _weights(text: str) -> list[float]:
+    """Return weights from a list."""
+    try:
+        return [float(part) for part in text.split(",") if part.strip()]
+    except ValueError as error:
+        raise InputError(f"--loss-weights is {text!r}; it must be a list as 0,0.03,1.") from error
 
 
 @plan.command()

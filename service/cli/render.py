@@ -328,7 +328,7 @@ def print_plan(out: Console, plan: Plain) -> None:
     marks = [one | dict(zip("xyz", one["position_m"], strict=True)) for one in plan["marks"]]
     stops = (
         Column("name", "stop"),
-        Column("sigma_3d_m", "sigma 3-D", "mm", ".2f"),
+        Column("sigma_3d_m", "sigma 3-D", "mm", ".3f"),
         Column("probability_within_tolerance", within, "", ".4f"),
         Column(lambda row: f"{row['n_used']} of {len(row['visible_marks'])}", "marks", "", ">"),
         Column(_angles, "angles", "deg", ">"),
@@ -348,6 +348,48 @@ def print_plan(out: Console, plan: Plain) -> None:
         )
     tables = [Table(columns=_PLANNED_MARKS, rows=marks)]
     print_tables(out, [*tables, Table(columns=stops, rows=plan["stops"], notes=notes)])
+
+
+def print_trade_off(out: Console, found: Plain) -> None:
+    """Print the best plans of several numbers of marks and of several weights of a loss."""
+    columns = (
+        Column("n_marks", "marks", "", "d"),
+        Column("worst_sigma_3d_m", "worst stop", "mm", ".3f"),
+        Column("bound", "bound", "mm", ".3f"),
+        Column("excess", "within", "%", ".1f"),
+        Column("worst_sigma_3d_after_loss_m", "after a loss", "mm", ".3f"),
+        Column("mean_sigma_3d_m", "mean", "mm", ".3f"),
+        Column("walk_m", "walk", "m", ".0f"),
+        Column("cost", "cost", "", "g"),
+        Column("kept", "tolerance"),
+    )
+    tables = []
+    for name, head, values in (
+        ("by_number", "", found["numbers"]),
+        ("by_loss_weight", "weight of a loss", found["loss_weights"]),
+    ):
+        pairs = zip(found[name], values, strict=True)
+        rows = [{**_compared(plan), "value": value} for plan, value in pairs]
+        first = (Column("value", head, "", "g"),) if head else ()
+        tables += [Table(columns=(*first, *columns), rows=rows)] if rows else []
+    print_tables(out, tables)
+    if found["cheapest"] is not None:
+        out.print(f"{found['cheapest']} marks reach the goal at the least cost.")
+
+
+def _compared(plan: Plain) -> Plain:
+    """Return the row of a plan among several."""
+    quality = plan["optimum"]
+    excess = quality["excess_over_bound"]
+    return {
+        **{key: plan[key] for key in plan if key.endswith("_m") and "sigma" in key},
+        "n_marks": len(plan["marks"]),
+        "bound": quality["worst_sigma_3d_bound_m"],
+        "excess": None if excess is None else 100 * excess,
+        "walk_m": quality["walk_m"],
+        "cost": quality["cost"],
+        "kept": "kept" if quality["keeps_tolerance"] else "not kept",
+    }
 
 
 def _angles(stop: Plain) -> str:

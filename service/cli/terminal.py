@@ -14,6 +14,7 @@ from rich.console import Console
 from spheremark.pipelines.compilation import watch_compilation
 
 if TYPE_CHECKING:
+    from spheremark.pipelines.placement import Report, SearchState
     from spheremark.pipelines.survey import Progress
     from spheremark.service.settings import Settings
 
@@ -36,6 +37,21 @@ def progress() -> Iterator[Progress]:
     with Progress(*columns, console=err, transient=True, disable=not err.is_terminal) as bar:
         task = bar.add_task("", total=1.0)
         yield lambda share, what: bar.update(task, completed=share, description=what)
+
+
+@contextmanager
+def searching() -> Iterator[Report]:
+    """Show how far a search of plans has come, with the best and the bound so far."""
+    with progress() as shown:
+        yield lambda state: shown(state.share, _closing_in(state))
+
+
+def _closing_in(state: SearchState) -> str:
+    """Return a search with its best arrangement and its bound."""
+    found = f"best {1e3 * state.worst:.3f} mm" if state.worst < float("inf") else ""
+    bound = f"none below {1e3 * state.bound:.3f} mm" if state.bound else ""
+    near = f"within {100 * (state.worst / state.bound - 1):.1f} %" if found and bound else ""
+    return "; ".join(part for part in (state.step, found, bound, near) if part)
 
 
 def announce_compilation() -> None:

@@ -18,6 +18,7 @@ from spheremark.service.http.uploads import Inbox, Resumable, adopt_orphans
 from spheremark.service.jobs.queue import JobQueue
 from spheremark.service.planning.predictions import Predictions
 from spheremark.service.planning.requests import Planner
+from spheremark.service.planning.searches import Searches
 from spheremark.service.settings import Settings
 from spheremark.storage.catalogue.catalogue import Catalogue
 from spheremark.storage.imports.confined import end_children, start_readers
@@ -37,6 +38,7 @@ class Service:
     jobs: JobQueue
     planner: Planner
     predictions: Predictions
+    searches: Searches
     readers: Places = field(default_factory=lambda: Places("foreign files", 2, 8))
     queries: Places = field(default_factory=lambda: Places("queries", 4, 12))
     plans: Places = field(default_factory=lambda: Places("plans", _PLANS, 6))
@@ -74,9 +76,15 @@ async def opened(settings: Settings) -> AsyncIterator[Service]:
                 seconds=settings.prediction_seconds,
                 memory_bytes=settings.prediction_memory_bytes,
             )
-            service = Service(
-                *(settings, catalogue, inbox, uploads, terrains, jobs, planner, predictions)
+            searching = Predictions(
+                n_processes=1,
+                seconds=settings.job_seconds,
+                memory_bytes=settings.prediction_memory_bytes,
             )
+            searches = Searches(searching, data / "searches")
+            searches.open()
+            parts = (settings, catalogue, inbox, uploads, terrains, jobs)
+            service = Service(*parts, planner, predictions, searches)
             try:
                 yield service
             finally:
@@ -85,6 +93,7 @@ async def opened(settings: Settings) -> AsyncIterator[Service]:
                     places.close()
                 end_children()
                 await asyncio.to_thread(predictions.close)
+                await asyncio.to_thread(searching.close)
 
 
 def _warm_up() -> None:

@@ -154,7 +154,7 @@ def _compile_planner() -> None:
         requirement=Requirement(),
     )
     plans.evaluate(plan)
-    plans.optimise(plan, PlaceRules(spacing=4.0), Goal(n_marks=3))
+    plans.optimise(plan, plans.Aim(rules=PlaceRules(spacing=4.0), goal=Goal(n_marks=3)))
 
 
 if __name__ == "__main__":

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
@@ -12,11 +13,15 @@ from spheremark.pipelines.errors import InputError
 from spheremark.pipelines.model import Array
 from spheremark.pipelines.placement import (
     Arrangement,
+    Candidates,
+    CentreModel,
     FieldMap,
     Goal,
     PlaceRules,
+    Report,
     Requirement,
     Sensor,
+    Site,
     Stops,
 )
 from spheremark.pipelines.progress import checkpoint
@@ -32,11 +37,13 @@ from spheremark.service.planning.requests import (
     terrain_ground,
 )
 from spheremark.service.serialise.plans import (
+    Costs,
     Plain,
     evaluation_json,
     map_json,
     optimum_json,
     proposal_json,
+    trade_off_json,
 )
 from spheremark.storage.imports.plan_files import read_keep_out, read_stops
 
@@ -45,7 +52,7 @@ _SEED = 0  # of the optimiser's later starts
 
 
 def read_ground(
-    field: str,
+    scenario: str,
     terrain: Path | None,
     stops: Path | None,
     *,
@@ -54,7 +61,7 @@ def read_ground(
 ) -> Ground:
     """Return a simulated field or a terrain, with the stops, polygons and poles given."""
     if terrain is None:
-        ground = simulated_ground(field)
+        ground = simulated_ground(scenario)
     else:
         ground = terrain_ground(str(terrain), terrain.name, terrain)
     site = ground.site
@@ -108,7 +115,8 @@ def evaluate(plan: Plan, cache: VisibilityCache | None = None) -> Plain:
     found = placement.evaluate(
         site, stops, marks, plan.model, plan.requirement, visibility=visibility
     )
-    return evaluation_json(site, plan.model, found)
+    after = placement.worst_after_loss(site, found, plan.model, visibility=visibility)
+    return evaluation_json(site, plan.model, found, after)
 
 
 def require_small(plan: Plan) -> None:
@@ -122,8 +130,13 @@ def require_small(plan: Plan) -> None:
         )
 
 
-def evaluate_field(plan: Plan, n_across: int, cache: VisibilityCache) -> Plain:
-    """Return the predicted accuracy on a grid over the part of the field that a map shows."""
+def evaluate_field(
+    plan: Plan, n_across: int, cache: VisibilityCache, viewshed_of: str | None = None
+) -> Plain:
+    """Return the predicted accuracy on a grid over the part of the field that a map shows.
+
+    With it, where the mark of a name is found from.
+    """
     x0, y0, x1, y1 = plan.ground.view
     step = max(x1 - x0, y1 - y0) / n_across
     xs, ys = (np.arange(a + step / 2, b, step) for a, b in ((x0, x1), (y0, y1)))
@@ -132,9 +145,11 @@ def evaluate_field(plan: Plan, n_across: int, cache: VisibilityCache) -> Plain:
         _part_of_map(plan, xs, ys[first : first + n_lines], cache)
         for first in range(0, len(ys), n_lines)
     ]
-    layers = ("ys", "sigma_3d", "probability", "n_seen")
+    layers = ("ys", "sigma_3d", "probability", "n_seen", "is_seen")
     joined = {name: np.concatenate([getattr(one, name) for one in parts]) for name in layers}
-    return map_json(replace(parts[0], **joined))
+    names = plan.marks.names
+    mark = names.index(viewshed_of) if viewshed_of in names else None
+    return map_json(replace(parts[0], **joined), mark)
 
 
 def _part_of_map(plan: Plan, xs: Array, ys: Array, cache: VisibilityCache) -> FieldMap:
@@ -148,14 +163,51 @@ def _part_of_map(plan: Plan, xs: Array, ys: Array, cache: VisibilityCache) -> Fi
     )
 
 
-def optimise(plan: Plan, rules: PlaceRules, goal: Goal) -> Plain:
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Aim:
+    """What a search is for: rules of places, goal, costs, and whether the plan's marks stay."""
+
+    rules: PlaceRules = field(default_factory=PlaceRules)
+    goal: Goal = field(default_factory=Goal)
+    costs: Costs = field(default_factory=Costs)
+    keeps_marks: bool = False
+
+
+def optimise(plan: Plan, aim: Aim, report: Report | None = None) -> Plain:
     """Return the best places, and how near they are to the bound."""
+    site, given = plan.ground.site, _given(plan, aim)
+    rng, standing = np.random.default_rng(_SEED), plan.marks if aim.keeps_marks else None
+    found = placement.optimise(*given, aim.goal, rng, standing=standing, report=report)
+    evaluation = evaluation_json(site, plan.model, found.evaluation, found.worst_after_loss)
+    return evaluation | optimum_json(found, aim.goal, aim.costs)
+
+
+def trade_off(
+    plan: Plan,
+    aim: Aim,
+    numbers: Sequence[int],
+    weights: Sequence[float],
+    report: Report | None = None,
+) -> Plain:
+    """Return the best plans of several numbers of marks, and of several weights of a loss."""
+    found = placement.trade_off(
+        *_given(plan, aim),
+        aim.goal,
+        np.random.default_rng(_SEED),
+        numbers=numbers,
+        weights=weights,
+        standing=plan.marks if aim.keeps_marks else None,
+        report=report,
+    )
+    return trade_off_json(plan.ground.site, plan.model, found, aim.goal, aim.costs)
+
+
+def _given(plan: Plan, aim: Aim) -> tuple[Site, Stops, Candidates, CentreModel, Requirement]:
+    """Return what a search takes, checked."""
     site, stops = plan.ground.site, plan.stops
-    placement.check_sizes(len(stops.names), goal.n_marks or 0)
-    candidates = placement.find_candidates(site, stops, rules)
-    rng = np.random.default_rng(_SEED)
-    found = placement.optimise(site, stops, candidates, plan.model, plan.requirement, goal, rng)
-    return evaluation_json(site, plan.model, found.evaluation) | optimum_json(found, goal)
+    placement.check_sizes(len(stops.names), aim.goal.n_marks or 0)
+    candidates = placement.find_candidates(site, stops, aim.rules)
+    return site, stops, candidates, plan.model, plan.requirement
 
 
 def suggest(plan: Plan, rules: PlaceRules | None = None) -> Plain:

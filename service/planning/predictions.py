@@ -11,7 +11,7 @@ import resource
 import signal
 import sys
 from collections.abc import Callable
-from concurrent.futures import wait
+from concurrent.futures import Future, wait
 from multiprocessing import get_context
 from typing import Any
 
@@ -51,11 +51,23 @@ class Predictions:
 
         Raises PredictionTimeoutError and SolveError where time or memory do not suffice.
         """
-        future = self._pool.schedule(function, arguments, timeout=self._seconds)
+        future = self.start(function, *arguments)
         try:
             while not wait((future,), _LOOK_EVERY).done:
                 checkpoint()
-            found: Plain = future.result()
+            return self.result_of(future)
+        finally:
+            future.cancel()
+
+    def start(self, function: Callable[..., Plain], *arguments: Any) -> Future[Plain]:
+        """Start a function in a process; cancelling the future ends it."""
+        future: Future[Plain] = self._pool.schedule(function, arguments, timeout=self._seconds)
+        return future
+
+    def result_of(self, future: Future[Plain]) -> Plain:
+        """Return what a function has returned; raise as ``run`` does."""
+        try:
+            return future.result()
         except TimeoutError as error:
             raise PredictionTimeoutError(
                 f"The prediction was ended after {self._seconds:g} s, its time limit. Ask for "
@@ -66,9 +78,6 @@ class Predictions:
                 f"The prediction needs more than {self._memory_bytes >> 20} MiB of memory, its "
                 "limit. Ask for fewer marks, stops or places."
             ) from error
-        finally:
-            future.cancel()  # type: ignore[no-untyped-call]
-        return found
 
     def close(self) -> None:
         """End all processes."""

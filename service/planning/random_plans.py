@@ -15,6 +15,8 @@ from spheremark.pipelines.errors import InputError
 from spheremark.pipelines.placement import (
     CentreModel,
     RandomPlanSpec,
+    Report,
+    SearchState,
     errors_by_angle,
     simulate_random_plans,
 )
@@ -137,6 +139,12 @@ def run(spec: RandomPlanSpec, model: CentreModel, limits: Plain) -> Plain:
         (angles, errors_by_angle(angles, error, distance)),
         errors_by_angle(study.TABLE_3.included_angles, error, distance),
     )
+
+
+def run_reported(spec: RandomPlanSpec, model: CentreModel, limits: Plain, report: Report) -> Plain:
+    """Do as ``run``, and report the begin."""
+    report(SearchState(0.05, f"Drawing {spec.n_arrangements:,} arrangements", 0, np.inf, 0.0))
+    return run(spec, model, limits)
 
 
 def write(folder: Path, results: Plain) -> None:

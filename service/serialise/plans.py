@@ -6,6 +6,7 @@ import csv
 import io
 import math
 from collections.abc import Mapping
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -23,6 +24,7 @@ from spheremark.pipelines.placement import (
     RandomPlanResults,
     Site,
     Stops,
+    TradeOff,
     by_number,
     by_worst_angle,
 )
@@ -32,8 +34,22 @@ from spheremark.storage.exports.points import NamedPoint
 Plain = dict[str, Any]
 
 
-def evaluation_json(site: Site, model: CentreModel, found: Evaluation) -> Plain:
-    """Return the evaluation of an arrangement."""
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Costs:
+    """What a mark costs, and a metre of the way past all marks; in any unit."""
+
+    per_mark: float = 0.0
+    per_metre: float = 0.0
+
+    def of(self, found: Optimum) -> float:
+        """Return the costs of a plan."""
+        return self.per_mark * len(found.ground) + self.per_metre * found.walk
+
+
+def evaluation_json(
+    site: Site, model: CentreModel, found: Evaluation, after_loss: float = math.nan
+) -> Plain:
+    """Return the evaluation of an arrangement, with the worst sigma after a loss if known."""
     worst = int(np.argmax(np.where(np.isfinite(found.sigma_3d), found.sigma_3d, np.inf)))
     return {
         "site": {"name": site.name},
@@ -43,7 +59,9 @@ def evaluation_json(site: Site, model: CentreModel, found: Evaluation) -> Plain:
         "marks": marks_json(site, found.marks),
         "stops": [stop_json(found, i) for i in range(len(found.stops.names))],
         "worst_stop": found.stops.names[worst],
-        "worst_sigma_3d_m": _number(found.worst_sigma_3d),
+        "worst_sigma_3d_m": number_or_null(found.worst_sigma_3d),
+        "mean_sigma_3d_m": number_or_null(found.sigma_3d.mean()),
+        "worst_sigma_3d_after_loss_m": number_or_null(after_loss),
         "worst_probability_within_tolerance": found.worst_probability,
         "keeps_tolerance_95": bool(found.worst_probability >= 0.95),
     }
@@ -56,8 +74,8 @@ def marks_json(site: Site, marks: Arrangement) -> list[Plain]:
         {
             "name": name,
             "position_m": _numbers(p),
-            "ground_m": _number(z),
-            "pole_height_m": _number(p[2] - z),
+            "ground_m": number_or_null(z),
+            "pole_height_m": number_or_null(p[2] - z),
         }
         for name, p, z in zip(marks.names, marks.p_site, ground, strict=True)
     ]
@@ -71,14 +89,14 @@ def stop_json(found: Evaluation, i: int) -> Plain:
     return {
         "name": found.stops.names[i],
         "position_m": _numbers(found.stops.p_site[i]),
-        "sigma_3d_m": _number(found.sigma_3d[i]),
+        "sigma_3d_m": number_or_null(found.sigma_3d[i]),
         "probability_within_tolerance": float(found.probability[i]),
         "covariance_m2": _numbers(found.cov_p_site[i]),
         "visible_marks": [marks[k] for k in np.flatnonzero(found.is_seen[i])],
         "n_used": int(found.n_used[i]),
-        "included_angle_min_deg": _number(low) if has_angle else None,
-        "included_angle_max_deg": _number(high) if has_angle else None,
-        "dop": _number(found.dop[i]),
+        "included_angle_min_deg": number_or_null(low) if has_angle else None,
+        "included_angle_max_deg": number_or_null(high) if has_angle else None,
+        "dop": number_or_null(found.dop[i]),
         "dof": int(found.dof[i]),
         "reason": found.reasons[i],
         "marks": [_mark_at_stop(found, i, k) for k in range(len(marks))],
@@ -90,19 +108,51 @@ def _mark_at_stop(found: Evaluation, i: int, k: int) -> Plain:
     return {
         "name": found.marks.names[k],
         "is_seen": bool(found.is_seen[i, k]),
+        "probability_found": float(found.found[i, k]),
         "visible_share": float(found.shares[i, k]),
-        "surface_behind_m": _number(found.gaps[i, k]),
+        "surface_behind_m": number_or_null(found.gaps[i, k]),
         "range_m": float(found.ranges[i, k]),
         "n_points": float(found.n_points[i, k]),
         "redundancy": float(found.redundancies[i, k]),
-        "minimal_detectable_bias_m": _number(found.detectable_biases[i, k]),
-        "external_reliability_m": _number(found.external_reliabilities[i, k]),
+        "minimal_detectable_bias_m": number_or_null(found.detectable_biases[i, k]),
+        "external_reliability_m": number_or_null(found.external_reliabilities[i, k]),
     }
 
 
-def optimum_json(found: Optimum, goal: Goal) -> Plain:
+def optimum_json(found: Optimum, goal: Goal, costs: Costs) -> Plain:
     """Return the quality of an optimum, beside its evaluation."""
     share = found.log_det / found.log_det_bound
+    reached = found.evaluation.sigma_3d
+    reached = reached.mean() if goal.objective == "mean" else reached.max()
+    excess = reached / found.bound - 1.0
+    return {
+        "optimum": {
+            "keeps_tolerance": found.is_kept,
+            "probability": goal.probability,
+            "is_robust": goal.is_robust,
+            "objective": goal.objective,
+            "unreachable": found.unreachable,
+            "worst_sigma_3d_after_loss_m": number_or_null(found.worst_after_loss),
+            "worst_sigma_3d_after_loss_bound_m": number_or_null(found.bound_after_loss),
+            "worst_sigma_3d_as_placed_m": number_or_null(found.worst_as_placed),
+            "walk_m": found.walk,
+            "cost": costs.of(found),
+            "information_gain": number_or_null(found.log_det),
+            "information_gain_bound": number_or_null(found.log_det_bound),
+            "share_of_bound": number_or_null(share),
+            "worst_sigma_3d_bound_m": number_or_null(found.bound),
+            "excess_over_bound": number_or_null(excess),
+            "bound_spacing_m": found.bound_spacing or None,
+            "n_bounded": found.n_bounded,
+            "n_candidates": found.n_candidates,
+            "n_exchanges": found.n_exchanges,
+        },
+        "notes": _notes(found, goal, float(excess), costs),
+    }
+
+
+def _notes(found: Optimum, goal: Goal, excess: float, costs: Costs) -> list[str]:
+    """Return what a plan reaches, for people."""
     kept = f"with {100 * goal.probability:g} % at every stop"
     if found.is_kept:
         text = f"is kept {kept}" + ", after the loss of any one mark too" * goal.is_robust
@@ -111,34 +161,47 @@ def optimum_json(found: Optimum, goal: Goal) -> Plain:
     else:
         text = f"is NOT kept {kept}"
     notes = [f"The tolerance {text}."]
-    if np.isfinite(found.worst_after_loss):
+    if found.unreachable:
+        notes.append(f"{found.unreachable} The rest of the goal was optimised.")
+    if math.isfinite(found.worst_after_loss):
         worst = 1e3 * found.worst_after_loss
-        notes[0] += f" Without its worst mark: {worst:.2f} mm (3-D sigma)."
-    excess = found.evaluation.worst_sigma_3d / found.bound - 1.0
-    if np.isfinite(excess):
+        notes[0] += f" Without its worst mark: {worst:.3f} mm (3-D sigma)."
+    if math.isfinite(excess):
         where = f"every {found.bound_spacing:.2f} m" if found.bound_spacing else "that were given"
+        what = "mean of all stops" if goal.objective == "mean" else "worst stop"
         notes.append(
-            f"{found.n_candidates:,} places compared. The worst stop is within "
+            f"{found.n_candidates:,} places compared. The {what} is within "
             f"{max(100 * excess, 0.0):.1f} % of any arrangement of as many marks on "
             f"{found.n_bounded:,} places {where}: none has less than {1e3 * found.bound:.3f} mm."
         )
+    if math.isfinite(found.worst_as_placed):
+        notes.append(
+            f"Where marks end up beside their places, 95 % of such arrangements have "
+            f"{1e3 * found.worst_as_placed:.3f} mm or less at the worst stop."
+        )
+    if goal.stop_reach:
+        notes.append("Stops were moved; the bound holds for where they are now.")
+    walk = f"The round from the first stop past all marks is {found.walk:.0f} m"
+    return [*notes, f"{walk}; costs {costs.of(found):g}." if costs != Costs() else f"{walk}."]
+
+
+def trade_off_json(
+    site: Site, model: CentreModel, found: TradeOff, goal: Goal, costs: Costs
+) -> Plain:
+    """Return the best plans of several numbers of marks and of several weights of a loss."""
+
+    def plain(one: Optimum) -> Plain:
+        evaluation = evaluation_json(site, model, one.evaluation, one.worst_after_loss)
+        return evaluation | optimum_json(one, goal, costs)
+
+    reached = [one for one in found.by_number if one.is_kept]
+    cheapest = min(reached, key=lambda one: (costs.of(one), len(one.ground)), default=None)
     return {
-        "optimum": {
-            "keeps_tolerance": found.is_kept,
-            "probability": goal.probability,
-            "is_robust": goal.is_robust,
-            "worst_sigma_3d_after_loss_m": _number(found.worst_after_loss),
-            "information_gain": _number(found.log_det),
-            "information_gain_bound": _number(found.log_det_bound),
-            "share_of_bound": _number(share),
-            "worst_sigma_3d_bound_m": _number(found.bound),
-            "excess_over_bound": _number(excess),
-            "bound_spacing_m": found.bound_spacing or None,
-            "n_bounded": found.n_bounded,
-            "n_candidates": found.n_candidates,
-            "n_exchanges": found.n_exchanges,
-        },
-        "notes": notes,
+        "by_number": [plain(one) for one in found.by_number],
+        "by_loss_weight": [plain(one) for one in found.by_weight],
+        "numbers": list(found.numbers),
+        "loss_weights": list(found.weights),
+        "cheapest": None if cheapest is None else len(cheapest.ground),
     }
 
 
@@ -146,13 +209,13 @@ def proposal_json(site: Site, found: Proposal) -> Plain:
     """Return one more mark, with the accuracy without and with it."""
     before, after = found.before.sigma_3d, found.after.sigma_3d
     return marks_json(site, found.after.marks)[-1] | {
-        "worst_sigma_3d_before_m": _number(before.max()),
-        "worst_sigma_3d_m": _number(after.max()),
-        "mean_sigma_3d_before_m": _number(before.mean()),
-        "mean_sigma_3d_m": _number(after.mean()),
+        "worst_sigma_3d_before_m": number_or_null(before.max()),
+        "worst_sigma_3d_m": number_or_null(after.max()),
+        "mean_sigma_3d_before_m": number_or_null(before.mean()),
+        "mean_sigma_3d_m": number_or_null(after.mean()),
         "worst_probability_within_tolerance": found.after.worst_probability,
         "stops": [
-            {"name": name, "sigma_3d_before_m": _number(a), "sigma_3d_m": _number(b)}
+            {"name": name, "sigma_3d_before_m": number_or_null(a), "sigma_3d_m": number_or_null(b)}
             for name, a, b in zip(found.after.stops.names, before, after, strict=True)
         ],
     }
@@ -215,15 +278,16 @@ def _pass_rate(row: PassRate) -> Plain:
     """Return the pass rate of a class."""
     return {
         "n": row.n,
-        "pass_rate": _number(row.share),
-        "median_error_3d_m": _number(row.median),
-        "p95_error_3d_m": _number(row.p95),
+        "pass_rate": number_or_null(row.share),
+        "median_error_3d_m": number_or_null(row.median),
+        "p95_error_3d_m": number_or_null(row.p95),
     }
 
 
-def map_json(field: FieldMap) -> Plain:
-    """Return an evaluation on a grid of places, rows along y."""
+def map_json(field: FieldMap, mark: int | None = None) -> Plain:
+    """Return an evaluation on a grid of places, rows along y, and where a mark is found from."""
     return {
+        "viewshed": None if mark is None else field.is_seen[..., mark].astype(int).tolist(),
         "x_m": _numbers(field.xs),
         "y_m": _numbers(field.ys),
         "sigma_3d_m": _rounded(field.sigma_3d, 6),
@@ -336,7 +400,7 @@ def plan_points(evaluation: Mapping[str, Any]) -> list[NamedPoint]:
     ]
 
 
-def _number(value: float) -> float | None:
+def number_or_null(value: float) -> float | None:
     """Return a number, or null where JSON has none for it."""
     return float(value) if math.isfinite(value) else None
 

@@ -1,5 +1,6 @@
 import csv
 import io
+import time
 import xml.etree.ElementTree as ET
 
 import numpy as np
@@ -38,6 +39,18 @@ def evaluated(client, **plan):
     )
     response.raise_for_status()
     return response.json()
+
+
+def searched(client, **kind):
+    """Start a search and return it at its end."""
+    begun = client.post("/api/v1/plans/searches", json=kind)
+    assert begun.status_code == 202, begun.text
+    for _ in range(600):
+        found = client.get(begun.headers["Location"]).json()
+        if found["status"] != "running":
+            return found
+        time.sleep(0.2)
+    raise AssertionError("The search does not end.")
 
 
 def refused(client, path="/api/v1/plans/evaluate", **plan):
@@ -85,10 +98,10 @@ def test_evaluations_are_as_documented(client):
 def test_the_interface_describes_what_every_route_of_plans_gives(client):
     interface = client.get("/api/v1/openapi.json").json()
     routes = {path: one for path, one in interface["paths"].items() if "/plans" in path}
-    assert len(routes) == 8
+    assert len(routes) == 10
     for path, methods in routes.items():
         for method in methods.values():
-            (code,) = {"200", "201"} & set(method["responses"])
+            (code,) = {"200", "201", "202"} & set(method["responses"])
             schema = method["responses"][code]["content"]["application/json"]["schema"]
             described = interface["components"]["schemas"][schema["$ref"].rsplit("/", 1)[-1]]
             assert described["properties"], path
@@ -155,6 +168,8 @@ def test_random_plans_use_the_speeds_of_the_scans(client):
     speeds = {"tolerance_m": 0.002, "step_deg": 4.0, "rest_revolutions": 1}
     assert passed(tolerance_m=0.002) > passed(**speeds) + 0.05
     query = {"n_arrangements": 2_000, "error_per_axis_mm": 0, "step_deg": 4, "rest_revolutions": 1}
+    speeds = {"step_deg": 4, "rest_revolutions": 1}
+    searched(client, random={"n_arrangements": 2_000, "error_per_axis_m": None, **speeds})
     page = client.get("/plan/random", params=query).text
     assert 'name="step_deg" type="number" step="any" value="4"' in page
     assert "Rests every 4 deg" in page
@@ -275,7 +290,11 @@ def test_random_plans_come_as_json_and_as_a_page(client):
     answer = client.post("/api/v1/plans/random", json=wanted).json()
     assert [row["n_marks"] for row in answer["by_number_of_marks"]] == [3, 4, 5]
     assert answer["pass_rate_in_window"] > answer["pass_rate_outside"]
-    page = client.get("/plan/random", params={**wanted, "error_per_axis_mm": 17, "seed": ""}).text
+    query = {**wanted, "error_per_axis_mm": 17, "seed": ""}
+    assert "data-search-request" in client.get("/plan/random", params=query).text
+    found = searched(client, random=wanted)
+    assert found["random"] == answer
+    page = client.get("/plan/random", params=query).text
     assert f"{100 * answer['pass_rate_in_window']:.1f}<small>%" in page
     ours = client.post("/api/v1/plans/random", json={**wanted, "error_per_axis_m": None}).json()
     assert ours["pass_rate"] > 0.99
@@ -300,6 +319,96 @@ def test_impossible_random_plans_are_refused_on_the_page(client):
         answer = client.get("/plan/random", params=wrong)
         assert answer.status_code == 400
         assert said in answer.text
+
+
+STOPS = [{"name": "A", "x_m": 0.0, "y_m": 0.0}, {"name": "B", "x_m": 3.0, "y_m": 1.0}]
+SMALL = {"model": "sensor", "stops": STOPS, "rules": {"spacing_m": 2.5}}
+
+
+def test_a_search_gives_what_its_evaluation_gives_and_has_a_page(client):
+    wanted = {**SMALL, "n_marks": 4, "objective": "mean", "cost_per_mark": 2, "marks": MARKS}
+    found = searched(client, optimise={**wanted, "keep_marks": True, "occlusion": 0.1})
+    plan = found["optimised"]
+    assert found["progress_percent"] == 100
+    assert plan["optimum"]["worst_sigma_3d_bound_m"] < plan["mean_sigma_3d_m"]
+    assert plan["optimum"]["cost"] == 8
+    names = {mark["name"]: mark["position_m"][:2] for mark in plan["marks"]}
+    assert [names[mark["name"]] for mark in MARKS] == [[mark["x_m"], mark["y_m"]] for mark in MARKS]
+    again = evaluated(client, stops=STOPS, marks=plan["marks"], occlusion=0.1)
+    assert again["stops"] == plan["stops"]
+    assert again["worst_sigma_3d_after_loss_m"] == plan["worst_sigma_3d_after_loss_m"]
+    page = client.get(f"/plan/search/{found['search_id']}").text
+    assert "Open in the planner" in page
+    assert "Field sheet" in page
+    assert found["search_id"] in [
+        one["search_id"] for one in client.get("/api/v1/plans/searches").json()["items"]
+    ]
+
+
+def test_more_marks_and_no_weight_of_a_loss_are_better_at_the_worst_stop(client):
+    wanted = {**SMALL, "n_marks": 4, "numbers": [3, 5], "loss_weights": [0.0, 1.0]}
+    found = searched(client, trade_off={**wanted, "cost_per_metre": 1.0})["trade_off"]
+    few, many = found["by_number"]
+    assert many["worst_sigma_3d_m"] < few["worst_sigma_3d_m"]
+    ignored, alone = found["by_loss_weight"]
+    assert ignored["worst_sigma_3d_m"] <= alone["worst_sigma_3d_m"]
+    assert alone["worst_sigma_3d_after_loss_m"] <= ignored["worst_sigma_3d_after_loss_m"]
+    assert found["cheapest"] in (3, 5)
+
+
+def test_a_search_that_is_dismissed_ends_and_says_so(client):
+    body = {"trade_off": {"model": "sensor", "numbers": list(range(8, 20))}}
+    begun = client.post("/api/v1/plans/searches", json=body).json()
+    address = f"/api/v1/plans/searches/{begun['search_id']}"
+    assert client.delete(address).json()["status"] == "dismissed"
+    assert client.delete(address).status_code == 409
+    assert client.get("/plan/search/" + begun["search_id"]).status_code == 200
+
+
+def test_what_no_search_can_do_is_refused_or_fails_with_the_reason(client):
+    for wrong in ({}, {"optimise": {}, "random": {}}, {"optimise": {"n_marks": 1}}):
+        assert client.post("/api/v1/plans/searches", json=wrong).status_code == 422
+    assert client.get("/api/v1/plans/searches/0123456789abcdef").status_code == 404
+    failed = searched(client, optimise={**SMALL, "tolerance_m": 2e-5})
+    assert failed["status"] == "failed"
+    assert "Ask for a larger tolerance" in failed["error_reason"]
+
+
+def test_a_goal_that_is_out_of_reach_after_a_loss_is_told_and_the_rest_optimised(client):
+    wanted = {**SMALL, "tolerance_m": 0.0042, "most": 3}
+    found = searched(client, optimise=wanted)
+    assert found["status"] == "successful", found["error_reason"]
+    quality = found["optimised"]["optimum"]
+    assert not quality["keeps_tolerance"]
+    assert "after the loss of any one" in quality["unreachable"]
+    assert found["optimised"]["keeps_tolerance_95"]
+
+
+def test_stops_may_move_to_better_places_and_marks_end_up_beside_theirs(client):
+    rules = {"spacing_m": 2.5, "placement_m": 0.2}
+    wanted = {**SMALL, "rules": rules, "n_marks": 3}
+    still = searched(client, optimise=wanted)["optimised"]
+    moved = searched(client, optimise={**wanted, "stop_reach_m": 1.0})["optimised"]
+    assert moved["worst_sigma_3d_m"] < still["worst_sigma_3d_m"]
+    for stop, given in zip(moved["stops"], STOPS, strict=True):
+        off = np.array(stop["position_m"][:2]) - [given["x_m"], given["y_m"]]
+        assert np.hypot(*off) <= 1.0 + 1e-3
+    assert still["optimum"]["worst_sigma_3d_as_placed_m"] > still["worst_sigma_3d_m"]
+
+
+def test_the_map_of_a_mark_shows_from_where_it_is_found(client):
+    field = evaluated(client, field_cells=21, viewshed_of="A")["field"]
+    assert 1 in np.unique(field["viewshed"])
+    assert (np.array(field["viewshed"]) <= np.array(field["n_seen"])).all()
+
+
+def test_the_field_sheet_of_an_address_holds_coordinates_and_distances(client):
+    query = {"a": "A:6.5,0.5,1;B:-1,6.5,1;C:-6.5,-3,1", "model": "sensor"}
+    query["stops"] = "S1:0.5,0.5;S2:3,1"
+    page = client.get("/plan/sheet", params=query).text
+    for text in ("Field sheet: 3 marks", "6.000", "90.0", "Stake-out"):
+        assert text in page
+    assert client.get("/plan/sheet").status_code == 400
 
 
 def test_a_stop_that_sees_nothing_says_so(client):

@@ -10,6 +10,7 @@ export const SHOWN = {
   sigma: { key: "sigma_3d_m", scale: 1000, unit: "mm", digits: 2, least: 1e-4, isUp: true, beyond: "red: beyond the tolerance" },
   probability: { key: "probability_within_tolerance", scale: 100, unit: "%", digits: 1, least: 0.01, beyond: "red: below 95 %" },
   seen: { key: "n_seen", scale: 1, unit: "marks", digits: 0, least: 1 },
+  viewshed: { key: "viewshed", scale: 1, unit: "", digits: 0, least: 1 },
   ground: { key: "ground_m", scale: 1, unit: "m", digits: 2, least: 0.05, isUp: true },
 };
 

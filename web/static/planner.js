@@ -1,5 +1,6 @@
 // The planner: marks that can be moved, their evaluation by the service, and the state in the address.
 const map = await import(document.getElementById("planner").dataset.map);
+const searches = await import(document.getElementById("planner").dataset.searchModule);
 const { PlanMap, h, rangeOf, paintScale, areaText, parseArea, square, isInside, sizeOf } = map;
 
 const API = "/api/v1/plans";
@@ -7,7 +8,21 @@ const CELLS = { moving: 32, still: 64 }; // across the longer side of the map
 const KEPT = 60; // steps that can be undone
 const byId = (name) => document.getElementById(name);
 const controls = ["site", "method", "tolerance", "turn", "step", "rests", "rpm", "model", "show"];
-const state = { plans: [], active: 0, stop: "", stops: null, areas: [], corners: null, site: null, past: [], adding: "" };
+// Further settings by id: the field of the request and what one unit is there; tick boxes have none.
+const SETTINGS = {
+  noise: ["noise_m", 0.001], sigma_marks: ["sigma_marks_m", 0.001], occlusion: ["occlusion", 0.01],
+};
+const SEARCHED = {
+  objective: ["objective"], loss_weight: ["loss_weight", 1], walk_weight: ["walk_weight", 1], probability: ["probability", 0.01],
+  robust: ["is_robust"], most: ["most", 1], keep_marks: ["keep_marks"], stop_reach: ["stop_reach_m", 1],
+  cost_mark: ["cost_per_mark", 1], cost_metre: ["cost_per_metre", 1],
+};
+const RULES = {
+  reach: ["reach_m", 1], clear: ["clear_m", 1], apart: ["apart_m", 1], placement: ["placement_m", 1], slope: ["slope_max_deg", 1],
+  spacing: ["spacing_m", 1], inside: ["is_inside_allowed"],
+};
+const more = [...Object.keys({ ...SETTINGS, ...SEARCHED, ...RULES }), "pole_low", "pole_high", "origin"];
+const state = { mark: "", plans: [], active: 0, stop: "", stops: null, areas: [], corners: null, site: null, past: [], adding: "" };
 
 // ---- the address
 
@@ -24,7 +39,13 @@ function readAddress() {
     }
     field.value = value;
   }
+  for (const name of more.filter((one) => query.has(one))) {
+    if (byId(name).type === "checkbox") byId(name).checked = query.get(name) === "1";
+    else byId(name).value = query.get(name);
+  }
+  byId("settings").open = more.some((name) => query.has(name));
   state.stop = query.get("stop") ?? "";
+  state.mark = query.get("mark") ?? "";
   state.stops = query.has("stops") ? parsePlaces(query.get("stops"), STOP_KEYS) : null;
   state.areas = (query.get("keep") ?? "").split("|").map(parseArea).filter(Boolean);
   return ["a", "b"].filter((key) => query.has(key)).map((key) => parsePlaces(query.get(key), MARK_KEYS));
@@ -41,9 +62,24 @@ function parsePlaces(text, keys) {
 
 const placesText = (places, keys) => places.map((one) => `${one.name}:${keys.map((key) => round(one[key], 3)).join(",")}`).join(";");
 
+const valueOf = (field) => (field.type === "checkbox" ? String(Number(field.checked)) : field.value);
+const usual = new Map(more.map((name) => [name, valueOf(byId(name))]));
+
+// The fields of a request by their settings; an empty one is left to the service.
+function given(settings) {
+  const pairs = Object.entries(settings).map(([id, [key, unit]]) => {
+    const field = byId(id);
+    if (field.type === "checkbox") return [key, field.checked];
+    return [key, field.type === "number" ? unit * field.valueAsNumber : field.value];
+  });
+  return Object.fromEntries(pairs.filter(([, value]) => !Number.isNaN(value)));
+}
+
 function writeAddress() {
   const query = new URLSearchParams();
   for (const name of controls) query.set(name, byId(name).value);
+  for (const field of more.map(byId).filter((one) => valueOf(one) !== usual.get(one.id))) query.set(field.id, valueOf(field));
+  if (state.mark) query.set("mark", state.mark);
   state.plans.forEach((plan, i) => query.set("ab"[i], placesText(plan.marks, MARK_KEYS)));
   if (state.stop) query.set("stop", state.stop);
   if (state.stops) query.set("stops", placesText(state.stops, STOP_KEYS));
@@ -53,7 +89,9 @@ function writeAddress() {
 
 // ---- the service
 
-function request(plan, more = {}) {
+const poles = () => ["pole_low", "pole_high"].map((name) => byId(name).valueAsNumber);
+
+function request(plan, extra = {}) {
   return {
     site: byId("site").value,
     marks: plan.marks.map((m) => ({ name: m.name, x_m: m.x, y_m: m.y, pole_height_m: m.pole })),
@@ -66,7 +104,9 @@ function request(plan, more = {}) {
     step_deg: byId("step").valueAsNumber,
     rest_revolutions: byId("rests").valueAsNumber,
     model: byId("model").value,
-    ...more,
+    ...given(SETTINGS),
+    ...(poles().every(Number.isFinite) ? { pole_heights_m: poles() } : {}),
+    ...extra,
   };
 }
 
@@ -98,7 +138,7 @@ async function evaluate(plan, cells) {
     const cellsNow = plan.pending;
     plan.pending = 0;
     try {
-      const response = await post("/evaluate", request(plan, { field_cells: cellsNow }));
+      const response = await post("/evaluate", request(plan, { field_cells: cellsNow, viewshed_of: state.mark || null }));
       Object.assign(plan, { evaluation: response, field: response.field });
       showProblem("");
     } catch (error) {
@@ -115,9 +155,10 @@ const evaluateAll = () => state.plans.forEach((plan) => evaluate(plan, CELLS.sti
 
 // ---- drawing
 
+const mean = (values) => (values.length ? values.reduce((a, b) => a + b, 0) / values.length : null);
 const isKnown = (value) => value !== null && value !== undefined;
 const fixed = (value, digits, scale = 1) => (isKnown(value) ? (+(scale * value).toFixed(digits) || 0).toFixed(digits) : "–"); // never -0
-const mm = (value) => fixed(value, value < 0.01 ? 2 : 1, 1000);
+const mm = (value) => fixed(value, value < 0.01 ? 3 : 1, 1000);
 const percent = (value) => fixed(value, 1, 100);
 const cell = (inner, kind = "number") => h("td", { class: kind }, inner);
 const evaluatedStop = (plan, name) => plan.evaluation?.stops.find((stop) => stop.name === name);
@@ -155,10 +196,14 @@ function drawHead(plan, tolerance) {
   const stops = evaluation?.stops ?? [];
   const size = (stop) => stop.sigma_3d_m ?? Infinity; // without a position is worst
   const worst = stops.reduce((a, b) => (size(a) >= size(b) ? a : b), stops[0]);
+  const chances = stops.flatMap((stop) => stop.marks.filter((one) => one.is_seen).map((one) => one.probability_found));
   const nKept = stops.filter((stop) => stop.probability_within_tolerance >= 0.95).length;
   figure.querySelector(".readouts").replaceChildren(...[
     ["Worst stop, 3-D sigma", mm(worst?.sigma_3d_m), "mm", worst?.name ?? ""],
     [`Within ${round(1000 * tolerance, 3)} mm, least`, percent(worst?.probability_within_tolerance), "%", "probability at the worst stop"],
+    ["Without its worst mark", mm(evaluation?.worst_sigma_3d_after_loss_m), "mm", "3-D sigma at the worst stop"],
+    ["Mean of all stops", mm(evaluation?.mean_sigma_3d_m), "mm", "3-D sigma"],
+    ["Marks in sight, found with", percent(mean(chances)), "%", chances.length ? `the least likely ${percent(Math.min(...chances))} %` : ""],
     ["Stops that keep it", `${nKept} of ${stops.length}`, "", "with 95 % probability"],
   ].map(([label, value, unit, note]) =>
     h("div", { class: "readout" }, h("dt", {}, label), h("dd", {}, value, h("small", {}, unit)), h("dd", { class: "note" }, note))));
@@ -198,14 +243,25 @@ function markRow(plan, mark, place) {
     return cell(h("input", { type: "number", step: "0.01", value: fixed(mark[key], digits), "aria-label": `${label} of ${mark.name} [m]`, onchange }));
   };
   const remove = remover(`Remove ${mark.name}`, () => drop(plan, place));
-  return h("tr", {}, cell(mark.name, "mono"), input("x", 3, "x"), input("y", 3, "y"), input("pole", 2, "Pole height"),
+  const seen = h("button", { type: "button", class: "plain", title: `Show from where ${mark.name} is found`, "aria-pressed": String(mark.name === state.mark), onclick: () => showViewshed(mark.name) }, mark.name);
+  return h("tr", {}, cell(seen, "mono"), input("x", 3, "x"), input("y", 3, "y"), input("pole", 2, "Pole height"),
     ...derived(plan, mark).map((text) => cell(text)), cell(remove, "screen-only"));
+}
+
+// The map of one mark: from where it is found; again: back to the map before.
+function showViewshed(name) {
+  state.mark = state.mark === name ? "" : name;
+  byId("show").value = state.mark ? "viewshed" : "sigma";
+  writeAddress();
+  draw();
+  evaluateAll();
 }
 
 function drawStops() {
   const table = byId("stops-table");
   const heads = state.plans.flatMap((_, i) => ["sigma [mm]", "within [%]", "marks", "angles [deg]", "DOP"].map(
     (head) => (state.plans.length > 1 ? `${"AB"[i]}: ` : "") + head));
+  if (state.plans.length > 1) heads.push("B \u2212 A [mm]");
   table.tHead.replaceChildren(h("tr", {}, h("th", {}, "Stop"), ...heads.map((head) => {
     const [name, unit] = head.split(" [");
     return h("th", { class: "number" }, name, ...(unit ? [h("small", {}, ` [${unit}`)] : []));
@@ -222,6 +278,10 @@ function stopRow(name) {
     const within = p < 0.95 ? h("span", { class: "over" }, percent(p)) : percent(p);
     return [mm(stop?.sigma_3d_m), within, String(stop?.n_used ?? "–"), stop ? angles.join(" to ") : "–", fixed(stop?.dop, 2)];
   });
+  if (found.length > 1) {
+    const [a, b] = found.map((stop) => stop?.sigma_3d_m);
+    numbers.push(isKnown(a) && isKnown(b) ? `${b < a ? "\u2212" : "+"}${fixed(Math.abs(b - a), 3, 1000)}` : "\u2013");
+  }
   const reasons = new Set(found.map((stop) => stop?.reason).filter(Boolean));
   return h("tr", { "aria-selected": String(name === state.stop), onclick: () => choose(name) },
     cell(h("button", { type: "button", class: "plain" }, name), "mono"), ...numbers.map((inner) => cell(inner)), cell([...reasons].join(" "), "reason"));
@@ -239,7 +299,7 @@ function drawStop(stop) {
   section.querySelector("tbody").replaceChildren(...stop.marks.map((one) => {
     const isUsed = one.redundancy > 0;
     const reliability = [fixed(one.redundancy, 2), fixed(one.minimal_detectable_bias_m, 1, 1000), fixed(one.external_reliability_m, 2, 1000)];
-    const numbers = [fixed(one.visible_share, 0, 100), fixed(one.range_m, 2), fixed(one.n_points, 0), ...reliability.map((text) => (isUsed ? text : "–"))];
+    const numbers = [fixed(one.probability_found, 0, 100), fixed(one.visible_share, 0, 100), fixed(one.range_m, 2), fixed(one.n_points, 0), ...reliability.map((text) => (isUsed ? text : "–"))];
     return h("tr", {}, cell(one.name, "mono"), cell(foundText(one), ""), ...numbers.map((text) => cell(text)));
   }));
 }
@@ -500,15 +560,48 @@ byId("compare").addEventListener("click", () => {
   const marks = state.plans.map((plan) => plan.marks);
   setMarks(marks.length > 1 ? [marks[state.active]] : [marks[0], structuredClone(marks[0])], marks.length > 1 ? 0 : 1);
 });
-byId("optimise").addEventListener("click", (event) => byId("plan-controls").reportValidity() && during(event.currentTarget, async (plan) => {
-  const found = await post("/optimise", request(plan, { n_marks: byId("count").valueAsNumber }));
+// A search runs under an address of its own; the page follows it, and leaving the page does not end it.
+async function searched(kind, body) {
+  const box = byId("plan-search");
+  const [bar, text, cancel, link] = ["progress", "p", "button", "a"].map((name) => box.querySelector(name));
+  const begun = await searches.start({ [kind]: body });
+  const show = (found) => { bar.value = found.progress_percent; text.textContent = searches.closingIn(found); };
+  const end = () => searches.dismiss(begun.search_id).catch(() => {});
+  link.href = `/plan/search/${begun.search_id}`;
+  show(begun);
+  box.hidden = false;
+  cancel.addEventListener("click", end);
+  try {
+    return await searches.follow(begun.search_id, show);
+  } finally {
+    cancel.removeEventListener("click", end);
+    box.hidden = true;
+  }
+}
+
+const areValid = () => byId("plan-controls").reportValidity() && [...byId("settings").querySelectorAll("input")].every((one) => one.reportValidity());
+
+const goal = () => ({ ...given(SEARCHED), rules: given(RULES), ...(Number.isNaN(byId("count").valueAsNumber) ? {} : { n_marks: byId("count").valueAsNumber }) });
+
+byId("optimise").addEventListener("click", (event) => areValid() && during(event.currentTarget, async (plan) => {
+  const { optimised: found } = await searched("optimise", request(plan, goal()));
   remember();
   plan.marks = found.marks.map(own);
+  Object.assign(plan, { evaluation: found, field: null }); // the map follows
+  if (byId("stop_reach").valueAsNumber) state.stops = found.stops.map((stop) => ({ name: stop.name, x: stop.position_m[0], y: stop.position_m[1] }));
   changed(plan, CELLS.still);
   showNews(found.notes.join(" "));
-}, Number.isNaN(byId("count").valueAsNumber) ? "Searching the fewest marks that keep the tolerance" : "Searching the best places"));
+}));
+byId("trade-off").addEventListener("click", (event) => areValid() && during(event.currentTarget, async (plan) => {
+  const typed = window.prompt("Numbers of marks to compare", "4, 5, 6, 8, 10, 14");
+  if (!typed) return;
+  const numbers = typed.split(/[\s,;]+/).filter(Boolean).map(Number);
+  const weights = Number.isNaN(byId("count").valueAsNumber) ? [] : [0, 0.03, 0.2, 1];
+  const found = await searched("trade_off", request(plan, { ...goal(), numbers, loss_weights: weights }));
+  location.assign(`/plan/search/${found.search_id}`);
+}));
 byId("suggest").addEventListener("click", (event) => byId("plan-controls").reportValidity() && during(event.currentTarget, async (plan) => {
-  const found = await post("/suggest", request(plan));
+  const found = await post("/suggest", request(plan, { rules: given(RULES) }));
   remember();
   plan.marks.push(own(found));
   changed(plan, CELLS.still);
@@ -527,15 +620,33 @@ byId("save").addEventListener("click", (event) => during(event.currentTarget, as
   byId("plan-news").hidden = false;
 }));
 for (const button of document.querySelectorAll("[data-file]")) {
-  const [type, ending] = { csv: ["text/csv", "csv"], dxf: ["image/vnd.dxf", "dxf"], landxml: ["application/xml", "xml"] }[button.dataset.file];
+  const [type, ending] = { csv: ["text/csv", "csv"], dxf: ["image/vnd.dxf", "dxf"], landxml: ["application/xml", "xml"], geojson: ["application/geo+json", "geojson"] }[button.dataset.file];
   button.addEventListener("click", () => during(button, async (plan) => {
-    const text = await post("/evaluate", request(plan), type);
+    const origin = byId("origin").value.trim();
+    if (ending === "geojson" && !origin) {
+      byId("settings").open = true;
+      byId("origin").focus();
+      throw new Error("GeoJSON holds longitudes and latitudes: give the origin of the site in WGS 84 first.");
+    }
+    const text = await post(`/evaluate${origin ? `?${new URLSearchParams({ origin })}` : ""}`, request(plan), type);
     const link = h("a", { href: URL.createObjectURL(new Blob([text], { type })), download: `plan.${ending}` });
     link.click();
     URL.revokeObjectURL(link.href);
   }));
 }
 byId("print").addEventListener("click", () => window.print());
+byId("sheet").addEventListener("click", () => {
+  const query = new URLSearchParams(location.search);
+  query.set("a", placesText(state.plans[state.active].marks, MARK_KEYS));
+  window.open(`/plan/sheet?${query}`, "_blank", "noopener");
+});
+for (const name of more) {
+  byId(name).addEventListener("change", () => {
+    if (!byId(name).reportValidity()) return;
+    writeAddress();
+    if (name in SETTINGS || name.startsWith("pole_")) evaluateAll();
+  });
+}
 byId("terrain-choose").addEventListener("click", () => byId("terrain-file").click());
 byId("terrain-file").addEventListener("change", (event) => during(byId("terrain-choose"), async () => {
   const [file] = event.target.files;
@@ -554,7 +665,7 @@ for (const name of controls) {
     if (name === "site") { changeSite().catch((error) => showProblem(error.message)); return; }
     writeAddress();
     draw();
-    if (name !== "show") evaluateAll();
+    if (name !== "show" || byId("show").value === "viewshed") evaluateAll();
   });
 }
 byId("plan-controls").addEventListener("submit", (event) => event.preventDefault());

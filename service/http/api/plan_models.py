@@ -8,9 +8,9 @@ from typing import Annotated, Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
-from spheremark.pipelines.placement import PlaceRules, RandomPlanSpec, Sensor
-from spheremark.pipelines.placement.optimisation import MARKS_MOST
+from spheremark.pipelines.placement import MARKS_MOST, Goal, PlaceRules, RandomPlanSpec, Sensor
 from spheremark.service.http.api.models import Strict
+from spheremark.service.serialise.plans import Costs
 
 _FAR = 1e8  # [m]; projected coordinates, zone in front, have at most eight digits
 Coordinate = Annotated[float, Field(ge=-_FAR, le=_FAR)]
@@ -60,6 +60,12 @@ class ScanOptions(Strict):
     rest_revolutions: int = Field(
         default=3, description="Revolutions of the LiDAR during each rest."
     )
+    noise_m: float | None = Field(
+        default=None,
+        gt=0,
+        le=0.5,
+        description="Noise of a range to a sphere; of a VLP-16 by default [m].",
+    )
 
     def to_sensor(self) -> Sensor:
         """Return the sensor of the core."""
@@ -68,6 +74,7 @@ class ScanOptions(Strict):
             spin_rpm=self.spin_rpm,
             step=math.radians(self.step_deg),
             rest_revolutions=self.rest_revolutions,
+            noise=self.noise_m,
         )
 
 
@@ -86,6 +93,18 @@ class PlanRequest(ScanOptions):
     )
     method: Literal["free_station", "paper"] = "free_station"
     tolerance_m: float = Field(default=0.03, gt=0, le=10)
+    sigma_marks_m: float = Field(
+        default=0.0, ge=0, le=1, description="Sigma per axis of the marks themselves [m]."
+    )
+    occlusion: float = Field(
+        default=0.0,
+        ge=0,
+        le=0.9,
+        description="Probability that people or vehicles that pass hide a mark from a stop.",
+    )
+    pole_heights_m: tuple[float, float] | None = Field(
+        default=None, description="Least and greatest height of a centre; of the field by default."
+    )
     model: str = Field(
         default="auto",
         description="Accuracy of centres: 'sensor'; 'survey:<name>', from its marker_fits; or "
@@ -99,6 +118,9 @@ class EvaluationRequest(PlanRequest):
     field_cells: int = Field(
         default=0, ge=0, le=200, description="Places across the map of the field; 0 for none."
     )
+    viewshed_of: str | None = Field(
+        default=None, description="Mark of which the map shows from where it is found."
+    )
 
 
 class PlaceOptions(Strict):
@@ -111,6 +133,12 @@ class PlaceOptions(Strict):
     is_inside_allowed: bool = Field(
         default=False, description="Whether marks may stand between the stops."
     )
+    spacing_m: float = Field(
+        default=0.0, description="Grid of places that are tried; 0 takes one that suits [m]."
+    )
+    placement_m: float = Field(
+        default=0.0, description="How far from its place a mark may end up [m]."
+    )
 
     def to_rules(self) -> PlaceRules:
         """Return the rules of the core."""
@@ -120,6 +148,8 @@ class PlaceOptions(Strict):
             clear=self.clear_m,
             apart=self.apart_m,
             is_inside_allowed=self.is_inside_allowed,
+            spacing=self.spacing_m,
+            placement=self.placement_m,
         )
 
 
@@ -147,6 +177,61 @@ class OptimisationRequest(SuggestionRequest):
         le=1.0,
         description="Weight of the worst stop after a loss: 0 ignores it, 1 counts it alone.",
     )
+    probability: float = Field(
+        default=0.95, gt=0, lt=1, description="With which the tolerance is kept at every stop."
+    )
+    most: int = Field(
+        default=20, ge=2, le=MARKS_MOST, description="Most marks where the fewest are searched."
+    )
+    objective: Literal["worst", "after_loss", "mean"] = Field(
+        default="worst", description="What is least: the worst stop's sigma, after a loss, or mean."
+    )
+    walk_weight: float = Field(
+        default=0.0, ge=0, le=1, description="Weight of the way past all marks: 0 ignores it."
+    )
+    stop_reach_m: float = Field(
+        default=0.0, ge=0, le=20, description="How far stops may be moved to better places [m]."
+    )
+    keep_marks: bool = Field(
+        default=False, description="Whether the marks of the request stand already and stay."
+    )
+    cost_per_mark: float = Field(default=0.0, ge=0, description="Of a mark, in any unit.")
+    cost_per_metre: float = Field(default=0.0, ge=0, description="Of the way past all marks.")
+
+    def to_goal(self) -> Goal:
+        """Return the goal of the core."""
+        return Goal(
+            n_marks=self.n_marks,
+            probability=self.probability,
+            is_robust=self.is_robust,
+            most=self.most,
+            objective=self.objective,
+            loss_weight=self.loss_weight,
+            walk_weight=self.walk_weight,
+            stop_reach=self.stop_reach_m,
+        )
+
+    def costs(self) -> Costs:
+        """Return the costs."""
+        return Costs(per_mark=self.cost_per_mark, per_metre=self.cost_per_metre)
+
+
+class TradeOffRequest(OptimisationRequest):
+    """A field whose best arrangements of several numbers of marks are compared."""
+
+    numbers: list[Annotated[int, Field(ge=2, le=MARKS_MOST)]] = Field(
+        default=[4, 5, 6, 8, 10, 14], max_length=20, description="Numbers of marks."
+    )
+    loss_weights: list[Annotated[float, Field(ge=0, le=1)]] = Field(
+        default=[], max_length=10, description="Weights of a loss, with n_marks marks."
+    )
+
+    @model_validator(mode="after")
+    def _has_work(self) -> TradeOffRequest:
+        """Refuse a comparison of nothing."""
+        if not self.numbers and not self.loss_weights:
+            raise ValueError("give numbers of marks, or loss_weights with n_marks")
+        return self
 
 
 class NewPlan(PlanRequest):
@@ -186,6 +271,27 @@ class RandomPlansRequest(ScanOptions):
             tolerance=self.tolerance_m,
             seed=self.seed,
         )
+
+
+class NewSearch(Strict):
+    """A search to start: exactly one of its kinds."""
+
+    optimise: OptimisationRequest | None = None
+    trade_off: TradeOffRequest | None = None
+    random: RandomPlansRequest | None = None
+
+    @model_validator(mode="after")
+    def _is_one(self) -> NewSearch:
+        """Refuse none and several."""
+        given = [name for name in type(self).model_fields if getattr(self, name) is not None]
+        if len(given) != 1:
+            raise ValueError("give one of optimise, trade_off and random")
+        return self
+
+    @property
+    def kind(self) -> str:
+        """Which it is."""
+        return next(name for name in type(self).model_fields if getattr(self, name) is not None)
 
 
 class Plain(BaseModel):
@@ -259,6 +365,7 @@ class MarkAtStop(Plain):
 
     name: str
     is_seen: bool
+    probability_found: float = Field(description="Detected and matched, and not hidden by chance.")
     visible_share: float
     surface_behind_m: float | None
     range_m: float
@@ -294,6 +401,9 @@ class FieldEvaluation(Plain):
     sigma_3d_m: list[list[float | None]]
     probability_within_tolerance: list[list[float | None]]
     n_seen: list[list[int]]
+    viewshed: list[list[int]] | None = Field(
+        default=None, description="1 where the requested mark is found from."
+    )
 
 
 class SiteName(Plain):
@@ -313,6 +423,8 @@ class PlanEvaluation(Plain):
     stops: list[StopEvaluation]
     worst_stop: str
     worst_sigma_3d_m: float | None
+    mean_sigma_3d_m: float | None
+    worst_sigma_3d_after_loss_m: float | None
     worst_probability_within_tolerance: float
     keeps_tolerance_95: bool
 
@@ -337,6 +449,14 @@ class OptimumQuality(Plain):
     excess_over_bound: float | None
     bound_spacing_m: float | None
     n_bounded: int
+    objective: str
+    worst_sigma_3d_after_loss_bound_m: float | None
+    worst_sigma_3d_as_placed_m: float | None = Field(
+        description="With marks beside their places, exceeded by 5 % of such arrangements."
+    )
+    walk_m: float = Field(description="Round from the first stop past all marks.")
+    cost: float
+    unreachable: str = Field(description="Why the goal cannot be reached; empty if it can.")
     n_candidates: int
     n_exchanges: int
 
@@ -346,6 +466,37 @@ class OptimisedPlan(PlanEvaluation):
 
     optimum: OptimumQuality
     notes: list[str]
+
+
+class TradeOff(Plain):
+    """The best arrangements of several numbers of marks, and of several weights of a loss."""
+
+    by_number: list[OptimisedPlan]
+    by_loss_weight: list[OptimisedPlan]
+    numbers: list[int]
+    loss_weights: list[float]
+    cheapest: int | None = Field(description="Fewest costs that reach the goal: number of marks.")
+
+
+class PlanSearch(Plain):
+    """A search of plans: how far it has come, and its result."""
+
+    search_id: str
+    kind: Literal["optimise", "trade_off", "random"]
+    status: Literal["running", "successful", "failed", "dismissed"]
+    progress_percent: float
+    message: str
+    n_marks: int | None
+    worst_sigma_3d_m: float | None = Field(description="Of the best arrangement so far.")
+    worst_sigma_3d_bound_m: float | None = Field(description="That no arrangement goes below.")
+    created_at: datetime
+    finished_at: datetime | None
+    error_code: str | None
+    error_reason: str | None
+    request: dict[str, Any]
+    optimised: OptimisedPlan | None = None
+    trade_off: TradeOff | None = None
+    random: RandomPlansResult | None = None
 
 
 class StopChange(Plain):

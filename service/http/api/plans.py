@@ -4,22 +4,25 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
+from functools import partial
 from typing import Annotated
 
 import numpy as np
 from fastapi import APIRouter, Path, Query, Request, Response
 from fastapi.responses import JSONResponse, PlainTextResponse
 
-from spheremark.pipelines.placement import Goal, Requirement
+from spheremark.pipelines.placement import CentreModel, RandomPlanSpec, Requirement
 from spheremark.service.http.api.models import Listing
 from spheremark.service.http.api.plan_models import (
     EvaluationRequest,
     Key,
     MappedEvaluation,
     NewPlan,
+    NewSearch,
     OptimisationRequest,
     OptimisedPlan,
     PlanRequest,
+    PlanSearch,
     PlanSite,
     PlanSummary,
     RandomPlansRequest,
@@ -103,11 +106,12 @@ def _evaluated(
 ) -> Response:
     """Return an evaluation in the format that is accepted."""
     place = GeographicOrigin.parse(origin) if origin else None
-    assembled = _assembled(service, plan)
+    assembled = assembled_of(service, plan)
     found = plans.evaluate(assembled, service.planner.visibility)
     if plan.field_cells:
         cache = service.planner.visibility
-        found["field"] = plans.evaluate_field(assembled, plan.field_cells, cache)
+        seen = plan.viewshed_of
+        found["field"] = plans.evaluate_field(assembled, plan.field_cells, cache, seen)
     if accept.startswith("text/csv"):
         return PlainTextResponse(to_csv(found), media_type="text/csv")
     for kind, media_type in POINT_MEDIA.items():
@@ -122,13 +126,66 @@ async def optimise_plan(
     plan: OptimisationRequest, request: Request, service: Current
 ) -> OptimisedPlan:
     """Find the best places for a number of marks, or the fewest that keep the tolerance."""
-    goal = Goal(n_marks=plan.n_marks, is_robust=plan.is_robust, loss_weight=plan.loss_weight)
 
     def optimised() -> Plain:
-        rules = plan.rules.to_rules()
-        return service.predictions.run(plans.optimise, _assembled(service, plan), rules, goal)
+        return service.predictions.run(plans.optimise, assembled_of(service, plan), _aim(plan))
 
     return OptimisedPlan.model_validate(await service.plans.run(request, optimised))
+
+
+@router.post("/plans/searches", name="start_search", status_code=202)
+async def start_search(
+    new: NewSearch, request: Request, service: Current, response: Response
+) -> PlanSearch:
+    """Start a search of plans: of the best one, of several to choose from, or at random."""
+    found = await service.plans.run(request, _started, service, new)
+    response.headers["Location"] = f"/api/v1/plans/searches/{found['search_id']}"
+    return PlanSearch.model_validate(found)
+
+
+def _started(service: Service, new: NewSearch) -> Plain:
+    """Start a search."""
+    given = getattr(new, new.kind)
+    start = partial(service.searches.start, new.kind, given.model_dump(mode="json"))
+    if new.random is not None:
+        return start(random_plans.run_reported, *random_specification(service, new.random))
+    assembled, aim = assembled_of(service, given), _aim(given)
+    if new.trade_off is not None:
+        weights = new.trade_off.loss_weights
+        return start(plans.trade_off, assembled, aim, new.trade_off.numbers, weights)
+    return start(plans.optimise, assembled, aim)
+
+
+def _aim(plan: OptimisationRequest) -> plans.Aim:
+    """Return what a search is for."""
+    return plans.Aim(
+        rules=plan.rules.to_rules(),
+        goal=plan.to_goal(),
+        costs=plan.costs(),
+        keeps_marks=plan.keep_marks,
+    )
+
+
+SearchId = Annotated[str, Path(description="Id of the search.")]
+
+
+@router.get("/plans/searches", name="list_searches")
+def list_searches(service: Current) -> Listing[PlanSearch]:
+    """List searches of plans without their results, newest first."""
+    every = service.searches.list()
+    return Listing(items=[PlanSearch.model_validate(one) for one in every])
+
+
+@router.get("/plans/searches/{search}", name="get_search")
+def get_search(search: SearchId, service: Current) -> PlanSearch:
+    """Return a search: how far it has come and, once it has ended, its result."""
+    return PlanSearch.model_validate(service.searches.get(search))
+
+
+@router.delete("/plans/searches/{search}", name="dismiss_search")
+def dismiss_search(search: SearchId, service: Current) -> PlanSearch:
+    """End a search."""
+    return PlanSearch.model_validate(service.searches.dismiss(search))
 
 
 @router.post("/plans/suggest", name="suggest_mark")
@@ -139,7 +196,7 @@ async def suggest_mark(
 
     def suggested() -> Plain:
         rules = plan.rules.to_rules()
-        return service.predictions.run(plans.suggest, _assembled(service, plan), rules)
+        return service.predictions.run(plans.suggest, assembled_of(service, plan), rules)
 
     return SuggestedMark.model_validate(await service.plans.run(request, suggested))
 
@@ -149,12 +206,19 @@ async def simulate_random_plans(
     options: RandomPlansRequest, request: Request, service: Current
 ) -> RandomPlansResult:
     """Simulate random arrangements as in the study: an error on every centre, pass or fail."""
-    found = await service.plans.run(request, simulated, service, options)
+    found = await service.plans.run(request, _simulated, service, options)
     return RandomPlansResult.model_validate(found)
 
 
-def simulated(service: Service, options: RandomPlansRequest) -> Plain:
+def _simulated(service: Service, options: RandomPlansRequest) -> Plain:
     """Return the results of random arrangements."""
+    return service.predictions.run(random_plans.run, *random_specification(service, options))
+
+
+def random_specification(
+    service: Service, options: RandomPlansRequest
+) -> tuple[RandomPlanSpec, CentreModel, Plain]:
+    """Return what random arrangements are drawn by: their specification, model and limits."""
     planner = service.planner
     survey = options.model.partition("survey:")[2]  # its fits give the limits too
     limits = random_plans.limits_of_results(
@@ -168,7 +232,7 @@ def simulated(service: Service, options: RandomPlansRequest) -> Plain:
         options.to_spec(), limits, options.distance_max_m, (low, high)
     )
     model = planner.model(options.model, options.to_sensor(), _MARKER_RADIUS)
-    return service.predictions.run(random_plans.run, spec, model, limits)
+    return spec, model, limits
 
 
 @router.post("/plans", name="keep_plan", status_code=201)
@@ -184,7 +248,7 @@ async def store_plan(
 def _store(service: Service, plan: NewPlan) -> StoredPlan:
     """Evaluate a plan and store it."""
     survey = service.catalogue.get_survey(plan.survey).survey_id if plan.survey else None
-    found = plans.evaluate(_assembled(service, plan), service.planner.visibility)
+    found = plans.evaluate(assembled_of(service, plan), service.planner.visibility)
     placement_id = stored.keep_plan(service.catalogue, _to_store(plan, survey, found))
     return StoredPlan.model_validate(stored.get_plan(service.catalogue, placement_id))
 
@@ -240,11 +304,13 @@ def _enter_terrain(service: Service, received: Received, name: str) -> Key:
     return Key.model_validate({"key": TERRAIN + received.digest, "name": entered["name"]})
 
 
-def _assembled(service: Service, plan: PlanRequest) -> Plan:
+def assembled_of(service: Service, plan: PlanRequest) -> Plan:
     """Return a requested plan as values."""
     ground = service.planner.ground(plan.site)
     areas = tuple(np.array(area, dtype=np.float64) for area in plan.keep_out_m)
     site = replace(ground.site, keep_out=(*ground.site.keep_out, *areas)) if areas else ground.site
+    if plan.pole_heights_m is not None:
+        site = replace(site, pole_heights=plan.pole_heights_m)
     stops = ground.stops
     if plan.stops is not None:
         stops = stops_at(site, [(one.name, one.x_m, one.y_m) for one in plan.stops])
@@ -253,7 +319,12 @@ def _assembled(service: Service, plan: PlanRequest) -> Plan:
         stops=stops,
         marks=marks_at(site, [_place(one) for one in plan.marks]),
         model=service.planner.model(plan.model, plan.to_sensor(), site.marker_radius),
-        requirement=Requirement(tolerance=plan.tolerance_m, method=plan.method),
+        requirement=Requirement(
+            tolerance=plan.tolerance_m,
+            method=plan.method,
+            sigma_marks=plan.sigma_marks_m,
+            occlusion=plan.occlusion,
+        ),
     )
     plans.require_small(assembled)
     return assembled

@@ -1,0 +1,201 @@
+"""Searches of plans: started, followed, ended, and kept with their results under an address.
+
+Each is a file of JSON in the data folder; while it runs, its process writes how far it has come
+beside it. A search that a restart interrupted is a failed one.
+"""
+
+from __future__ import annotations
+
+import json
+import secrets
+from collections.abc import Callable, Mapping
+from concurrent.futures import CancelledError, Future
+from contextlib import suppress
+from datetime import UTC, datetime
+from pathlib import Path
+from threading import Lock
+from time import monotonic
+from typing import Any
+
+from spheremark.pipelines.errors import ConflictError, NotFoundError, SpheremarkError
+from spheremark.pipelines.placement import SearchState
+from spheremark.service.errors import BusyError
+from spheremark.service.planning.predictions import Predictions
+from spheremark.service.serialise.plans import Plain, number_or_null
+
+_KEPT = 200  # searches; beyond, the oldest that have ended are removed
+_OPEN_MOST = 8  # that run or wait
+_REPORT_EVERY = 0.3  # [s] between two reports of a search
+_ID_DIGITS = 16
+
+
+class Searches:
+    """The searches of one service.
+
+    Parameters
+    ----------
+    predictions : Predictions
+        Processes that search.
+    folder : Path
+        Where searches are kept.
+    """
+
+    def __init__(self, predictions: Predictions, folder: Path) -> None:
+        self._predictions, self._folder = predictions, folder
+        self._lock = Lock()
+        self._running: dict[str, Future[Plain]] = {}
+
+    def open(self) -> None:
+        """Make the folder, and record which searches a restart interrupted."""
+        self._folder.mkdir(parents=True, exist_ok=True)
+        for path in self._folder.glob("*.json"):
+            found = json.loads(path.read_text(encoding="utf-8"))
+            if found["status"] == "running":
+                reason = "The service was restarted while this search ran; start it again."
+                self._end(found, "failed", code="interrupted", reason=reason)
+
+    def start(
+        self, kind: str, request: Mapping[str, Any], function: Callable[..., Plain], *arguments: Any
+    ) -> Plain:
+        """Start a search: a function that takes the arguments and a report, and return it."""
+        with self._lock:
+            if len(self._running) >= _OPEN_MOST:
+                raise BusyError(
+                    f"{_OPEN_MOST} searches of plans run or wait, the most; wait for one to end."
+                )
+            record: Plain = {
+                "search_id": secrets.token_hex(_ID_DIGITS // 2),
+                "kind": kind,
+                "status": "running",
+                "progress_percent": 0.0,
+                "message": "Waiting for a process",
+                "n_marks": None,
+                "worst_sigma_3d_m": None,
+                "worst_sigma_3d_bound_m": None,
+                "created_at": datetime.now(UTC).isoformat(),
+                "finished_at": None,
+                "error_code": None,
+                "error_reason": None,
+                "request": dict(request),
+            }
+            self._write(record)
+            path = self._beside(record["search_id"])
+            future = self._predictions.start(_reported, str(path), function, arguments)
+            self._running[record["search_id"]] = future
+        future.add_done_callback(lambda done: self._ended(record, done))
+        self._forget()
+        return self.get(record["search_id"])
+
+    def get(self, search_id: str) -> Plain:
+        """Return a search; raise NotFoundError if there is none."""
+        if not (len(search_id) == _ID_DIGITS and search_id.isalnum()):
+            raise NotFoundError(f"There is no search {search_id!r}.")
+        try:
+            found: Plain = json.loads(self._file(search_id).read_text(encoding="utf-8"))
+        except FileNotFoundError as error:
+            raise NotFoundError(f"There is no search {search_id!r}.") from error
+        if found["status"] == "running":
+            with suppress(FileNotFoundError, ValueError):
+                found |= json.loads(self._beside(search_id).read_text(encoding="utf-8"))
+        return found
+
+    def list(self) -> list[Plain]:
+        """Return all searches without their results, newest first."""
+        every = [self.get(path.stem) for path in self._folder.glob("*.json")]
+        every.sort(key=lambda one: one["created_at"], reverse=True)
+        return [{k: v for k, v in one.items() if k not in _RESULTS} for one in every]
+
+    def dismiss(self, search_id: str) -> Plain:
+        """End a search; raise ConflictError if it has ended."""
+        found = self.get(search_id)
+        with self._lock:
+            future = self._running.get(search_id)
+        if future is None:
+            raise ConflictError(f"Search {search_id} is {found['status']} and cannot be ended.")
+        future.cancel()
+        self._end(found, "dismissed", reason="Ended on request.")
+        return self.get(search_id)
+
+    def find(self, kind: str, request: Mapping[str, Any]) -> Plain | None:
+        """Return the newest search with a request that has not failed, if there is one."""
+        alike = (one for one in self.list() if one["kind"] == kind and one["request"] == request)
+        newest = next((one for one in alike if one["status"] in ("running", "successful")), None)
+        return None if newest is None else self.get(newest["search_id"])
+
+    def _ended(self, record: Plain, future: Future[Plain]) -> None:
+        """Record the end of a search."""
+        with self._lock:
+            self._running.pop(record["search_id"], None)
+        found = self.get(record["search_id"])
+        if found["status"] != "running":
+            return
+        try:
+            result = self._predictions.result_of(future)
+        except CancelledError:
+            self._end(found, "dismissed", reason="Ended on request.")
+        except SpheremarkError as error:
+            self._end(found, "failed", code=error.code, reason=str(error))
+        except Exception as error:  # noqa: BLE001  it becomes the recorded failure, as of a job
+            reason = f"{type(error).__name__}: {error}"
+            self._end(found, "failed", code="internal", reason=reason)
+        else:
+            kind = str(record["kind"])
+            name = {"optimise": "optimised"}.get(kind, kind)
+            self._end(found | {name: result, "progress_percent": 100.0}, "successful")
+
+    def _end(self, found: Plain, status: str, *, code: str | None = None, reason: str = "") -> None:
+        """Write the end of a search."""
+        ended = {"status": status, "finished_at": datetime.now(UTC).isoformat()}
+        why = {"error_code": code, "error_reason": reason or None}
+        message = {"successful": "Done.", "dismissed": reason}.get(status, reason)
+        self._write(found | ended | why | {"message": message})
+        self._beside(found["search_id"]).unlink(missing_ok=True)
+
+    def _write(self, record: Plain) -> None:
+        """Write a search whole."""
+        _write(self._file(record["search_id"]), record)
+
+    def _file(self, search_id: str) -> Path:
+        """Return the file of a search."""
+        return self._folder / f"{search_id}.json"
+
+    def _beside(self, search_id: str) -> Path:
+        """Return the file in which its process writes how far it has come."""
+        return self._folder / f"{search_id}.progress"
+
+    def _forget(self) -> None:
+        """Remove the oldest searches that have ended, beyond those that are kept."""
+        for one in self.list()[_KEPT:]:
+            if one["status"] != "running":
+                self._file(one["search_id"]).unlink(missing_ok=True)
+
+
+_RESULTS = ("optimised", "trade_off", "random")
+
+
+def _write(path: Path, record: Mapping[str, Any]) -> None:
+    """Write a file whole or not at all."""
+    part = path.with_suffix(f".{secrets.token_hex(4)}")
+    part.write_text(json.dumps(record), encoding="utf-8")
+    part.replace(path)
+
+
+def _reported(path: str, function: Callable[..., Plain], arguments: tuple[Any, ...]) -> Plain:
+    """Return what a function returns, while it writes how far it has come."""
+    last = 0.0
+
+    def report(state: SearchState) -> None:
+        nonlocal last
+        if monotonic() - last < _REPORT_EVERY:
+            return
+        last = monotonic()
+        come = {
+            "progress_percent": round(100.0 * state.share, 1),
+            "message": state.step,
+            "n_marks": state.n_marks or None,
+            "worst_sigma_3d_m": number_or_null(state.worst),
+            "worst_sigma_3d_bound_m": state.bound or None,
+        }
+        _write(Path(path), come)
+
+    return function(*arguments, report)
