@@ -29,6 +29,7 @@ from spheremark.pipelines.placement import (
     Goal,
     Optimum,
     PlaceRules,
+    Report,
     Requirement,
     Sensor,
     Site,
@@ -199,6 +200,9 @@ def optimise_plan(  # noqa: PLR0913  all that a plan is made of
     sensor: Sensor | None = None,
     requirement: Requirement | None = None,
     rules: PlaceRules | None = None,
+    goal: Goal | None = None,
+    standing: ArrayLike | None = None,
+    report: Report | None = None,
     seed: int = 0,
 ) -> Optimum:
     """Find the best places for marks, or the fewest that keep the tolerance at every stop.
@@ -217,13 +221,20 @@ def optimise_plan(  # noqa: PLR0913  all that a plan is made of
         Tolerance and positioning method.
     rules : PlaceRules, optional
         Where marks may stand.
+    goal : Goal, optional
+        What is least: worst stop, after a loss or mean, the weight of the way past all marks, and
+        how far stops may move. The number of marks is that of ``n_marks``, if given.
+    standing : (n, 3) array_like, optional
+        Centres of marks that stand already and stay; they count among the number [m].
+    report : callable, optional
+        Takes the state of the search: the best arrangement and the bound so far.
     seed : int
         Of the optimiser's later starts.
 
     Returns
     -------
     Optimum
-        Marks and their evaluation.
+        Marks, their evaluation, and the bound that no arrangement goes below.
 
     Raises
     ------
@@ -234,14 +245,17 @@ def optimise_plan(  # noqa: PLR0913  all that a plan is made of
     """
     where = _places("stops", stops)
     site, rules = site or _flat_site(where, where), rules or PlaceRules()
+    goal = goal or Goal()
     return optimise(
         site,
         _stops(where),
         find_candidates(site, _stops(where), rules),
         sensor_model(sensor or Sensor(), site.marker_radius),
         requirement or Requirement(),
-        Goal(n_marks=n_marks),
+        goal if n_marks is None else replace(goal, n_marks=n_marks),
         np.random.default_rng(seed),
+        standing=None if standing is None else Arrangement.numbered(_places("marks", standing)),
+        report=report,
     )
 
 

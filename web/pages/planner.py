@@ -114,7 +114,8 @@ def trade_off_figure(result: Row) -> go.Figure:
     if len(bounds) == len(plans):
         style = theme.Style("no arrangement below", theme.FAINT)
         add_line(figure, numbers, bounds, style, line_width=1, line_dash="dash")
-    return figure.update_yaxes(type="log")
+    figure.update_xaxes(dtick=1)
+    return figure.update_yaxes(type="log", dtick="D2")
 
 
 def _of(plan: Row, key: str) -> float | None:
