@@ -218,13 +218,16 @@ class Client:
             raise RemoteError(f"Job {job} is {state['status']}: {reason}")
         return state
 
-    def query(self, sql: str) -> pd.DataFrame:
+    def query(self, sql: str, **parameters: Any) -> pd.DataFrame:
         """Return the answer to one SELECT.
 
         Parameters
         ----------
         sql : str
-            One SELECT on the tables and views that ``/sql`` describes.
+            One SELECT on the tables and views that ``/sql`` describes; ``$name`` stands for a
+            parameter.
+        **parameters
+            Values of its parameters.
 
         Returns
         -------
@@ -240,7 +243,7 @@ class Client:
         """
         import pandas as pd
 
-        answer = self.request("POST", "/sql", json={"sql": sql})
+        answer = self.request("POST", "/sql", json={"sql": sql, "parameters": parameters})
         if answer["truncated"]:
             warnings.warn(
                 f"The service cut the answer at {answer['row_limit']} rows; aggregate or filter, "

@@ -5,6 +5,7 @@ import shutil
 import threading
 import time
 from contextlib import contextmanager
+from urllib.parse import urlencode
 
 import psutil
 import pytest
@@ -185,6 +186,46 @@ def test_a_query_is_written_run_and_kept_by_keyboard_alone(visit):
     assert page.locator("#result tbody td").inner_text() == "42"
     assert "SELECT+42" in page.url
     assert page.locator("#history li").count() == 1
+
+
+def test_a_query_with_a_parameter_is_kept_shared_explained_and_taken_elsewhere(visit):
+    page = visit().open("/sql?q=SELECT+stop+FROM+stops+WHERE+stop+%3D+$stop&p=stop%3Dlane3-stop1")
+    page.wait_for_selector("#result tbody td")
+    assert page.locator("#result tbody td").all_inner_texts() == ["lane3-stop1"]
+    page.locator("#parameters input").fill("nowhere")
+    page.locator("#run").click()
+    page.wait_for_selector("#result-count:has-text('0 rows')")
+    assert "p=stop%3Dnowhere" in page.url
+    assert "stop%3Dnowhere" in page.locator("#get-parquet").get_attribute("href")
+    page.locator("[data-copy=notebook]").click()
+    lines = page.locator("#copied").inner_text().splitlines()
+    assert len(lines) == 3
+    found = {}
+    exec("\n".join([*lines[:2], f"rows = {lines[2]}"]), found)  # as in a notebook
+    assert found["rows"].columns.tolist() == ["stop"]
+    page.locator("#explain").click()
+    page.wait_for_selector("#result-plan:not([hidden])")
+    assert (
+        page.locator("#result-plan")
+        .inner_text()
+        .startswith("\N{BOX DRAWINGS LIGHT ARC DOWN AND RIGHT}")
+    )
+    page.locator("#save-name").fill("one stop")
+    page.locator("#save-form button[type=submit]").click()
+    page.wait_for_selector("#saved a[aria-current]")
+    assert "name=one+stop" in page.url
+    page.locator("#delete-saved").click()
+    page.wait_for_selector("#saved[hidden]", state="attached")
+
+
+def test_a_query_that_runs_can_be_cancelled(visit):
+    page = visit().open("/sql")
+    page.wait_for_selector(".cm-content")
+    long = "SELECT count(*) FROM range(100000000) AS a, range(999) AS b WHERE a.range % 7 = b.range"
+    page.goto(f"{page.url}?{urlencode({'q': long})}")
+    page.locator("#cancel").click()
+    page.wait_for_selector("#result-error:not([hidden])")
+    assert page.locator("#result-error").inner_text() == "Cancelled."
 
 
 def test_a_query_that_cannot_run_says_why(visit):

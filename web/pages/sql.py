@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 from typing import Any
 
 import plotly.graph_objects as go
@@ -56,14 +57,32 @@ EXAMPLES: tuple[tuple[str, str], ...] = (
 """Example queries by title."""
 
 
-def sql_page(frame: Frame, query: str, tables: Sequence[Row], limits: Mapping[str, Any]) -> str:
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SqlQuery:
+    """The query of an address: its text, the values of its parameters, and its name if kept."""
+
+    text: str = ""
+    parameters: Mapping[str, Any] = field(default_factory=dict)
+    name: str = ""
+
+
+def sql_page(
+    frame: Frame,
+    query: SqlQuery,
+    tables: Sequence[Row],
+    limits: Mapping[str, Any],
+    saved: Sequence[Row] = (),
+) -> str:
     """Return the page for queries: schema, limits, and the query of the address."""
     layout = go.Figure(layout={"template": theme.template()}).to_plotly_json()["layout"]
     colours = {name: theme.method_style(name).colour for name in ("along_beam", "paper")}
     return render(
         "sql.html",
         frame=frame,
-        query=query or EXAMPLES[0][1],
+        query=query.text or EXAMPLES[0][1],
+        name=query.name,
+        parameters=dict(query.parameters),
+        saved=saved,
         tables=tables,
         limits=limits,
         schema={table["name"]: [row["name"] for row in table["columns"]] for table in tables},

@@ -20,36 +20,104 @@ function insert(word) {
   }
 }
 
-async function ask(sql, format) {
-  return fetch("/api/v1/sql", {
-    method: "POST",
-    headers: { "Content-Type": "application/json" },
-    body: JSON.stringify({ sql, format }),
-  });
+// Parameters: each $name of the query has a field
+
+const given = JSON.parse(byId("given").textContent);
+const known = { ...given.parameters };
+
+function named() {
+  const bare = text().replace(/'[^']*'/g, "");
+  return [...new Set([...bare.matchAll(/\$([A-Za-z_]\w*)/g)].map((one) => one[1]))];
 }
 
-async function run({ keep = true } = {}) {
-  const sql = text();
-  if (!sql) return;
-  byId("run").disabled = true;
-  byId("run").textContent = "Running";
-  if (keep) history.pushState(null, "", `/sql?${new URLSearchParams({ q: sql })}`);
+function valueOf(written) {
   try {
-    const response = await ask(sql, "json");
-    const body = await response.json();
-    if (response.ok) showAnswer(body);
-    else showError(body.detail);
-    if (response.ok) remember(sql);
+    const found = JSON.parse(written);
+    return typeof found === "object" && found !== null ? written : found;
   } catch {
-    showError("The service did not respond; is it still running?");
-  } finally {
-    byId("run").disabled = false;
-    byId("run").textContent = "Run";
+    return written;
   }
 }
 
+function showParameters() {
+  const names = named();
+  const place = byId("parameters");
+  place.hidden = names.length === 0;
+  if (place.dataset.names === names.join()) return;
+  place.dataset.names = names.join();
+  place.replaceChildren(...names.map((name) => {
+    const label = document.createElement("label");
+    const input = document.createElement("input");
+    input.value = known[name] ?? "";
+    input.addEventListener("input", () => { known[name] = input.value; showLinks(); });
+    label.append(`$${name} `, input);
+    return label;
+  }));
+}
+
+const parameters = () =>
+  Object.fromEntries(named().map((name) => [name, valueOf(String(known[name] ?? ""))]));
+
+function search(more = {}) {
+  const found = new URLSearchParams({ q: text(), ...more });
+  for (const name of named()) found.append("p", `${name}=${known[name] ?? ""}`);
+  return found;
+}
+
+function showLinks() {
+  for (const link of document.querySelectorAll("[data-format]")) {
+    link.href = `/api/v1/sql?${search({ format: link.dataset.format })}`;
+  }
+}
+
+let waiting = null;
+
+async function ask(sql) {
+  waiting = new AbortController();
+  return fetch("/api/v1/sql", {
+    method: "POST",
+    headers: { "Content-Type": "application/json" },
+    body: JSON.stringify({ sql, parameters: parameters() }),
+    signal: waiting.signal,
+  });
+}
+
+function setRunning(isRunning) {
+  byId("run").disabled = isRunning;
+  byId("run").textContent = isRunning ? "Running" : "Run";
+  byId("cancel").hidden = !isRunning;
+}
+
+async function run({ keep = true, explain = false } = {}) {
+  const sql = text();
+  if (!sql) return;
+  showParameters();
+  view?.contentDOM.blur(); // closes the completion
+  setRunning(true);
+  if (keep && !explain) history.pushState(null, "", `/sql?${search()}`);
+  try {
+    const response = await ask(explain ? `EXPLAIN ${sql}` : sql);
+    const body = await response.json();
+    if (!response.ok) showError(body.detail);
+    else if (explain) showPlan(body);
+    else showAnswer(body);
+    if (response.ok && !explain) remember(sql);
+  } catch (error) {
+    const isCancelled = error.name === "AbortError";
+    showError(isCancelled ? "Cancelled." : "The service did not respond; is it still running?");
+  } finally {
+    setRunning(false);
+  }
+}
+
+function showPlan(body) {
+  byId("result-plan").textContent = body.rows.map((row) => row.at(-1)).join("\n");
+  byId("chart").hidden = true;
+  reveal("result-plan");
+}
+
 function reveal(name) {
-  for (const part of ["result-empty", "result-full", "result-error"]) {
+  for (const part of ["result-empty", "result-full", "result-plan", "result-error"]) {
     byId(part).hidden = part !== name;
   }
 }
@@ -111,24 +179,60 @@ function showAnswer(body) {
     `truncated at ${answer.row_limit.toLocaleString("en")} rows`;
   byId("result-time").textContent = `${answer.elapsed_ms.toFixed(0)} ms`;
   reveal("result-full");
+  showLinks();
   offerChart();
 }
 
-function save(content, type, name) {
-  const link = document.createElement("a");
-  link.href = URL.createObjectURL(new Blob([content], { type }));
-  link.download = name;
-  link.click();
-  setTimeout(() => URL.revokeObjectURL(link.href), 1000);
+// The query elsewhere
+
+const quoted = (written) => `'${written.replaceAll("'", "'\\''")}'`;
+const addressOf = (format) => `${location.origin}/api/v1/sql?${search({ format })}`;
+const pythonOf = (value) =>
+  ({ true: "True", false: "False", null: "None" })[String(value)] ?? JSON.stringify(value);
+
+function argumentsOf() {
+  const values = Object.entries(parameters()).map(([name, value]) => `, ${name}=${pythonOf(value)}`);
+  return JSON.stringify(text()) + values.join("");
 }
 
-byId("get-json").addEventListener("click", () =>
-  save(JSON.stringify(answer, null, 1), "application/json", "spheremark.json"),
-);
-byId("get-csv").addEventListener("click", async () => {
-  const response = await ask(text(), "csv");
-  if (response.ok) save(await response.text(), "text/csv", "spheremark.csv");
-  else showError((await response.json()).detail);
+const uses = {
+  link: () => `${location.origin}/sql?${search()}`,
+  curl: () => `curl -s ${quoted(addressOf("csv"))}`,
+  notebook: () =>
+    `import pandas as pd\nurl = ${JSON.stringify(addressOf("parquet"))}\npd.read_parquet(url)`,
+  python: () =>
+    `from spheremark import Client\nclient = Client(${JSON.stringify(location.origin)})\n` +
+    `client.query(${argumentsOf()})`,
+};
+
+for (const button of document.querySelectorAll("[data-copy]")) {
+  button.addEventListener("click", async () => {
+    const written = uses[button.dataset.copy]();
+    byId("copied").textContent = written;
+    byId("copied").hidden = false;
+    try {
+      await navigator.clipboard.writeText(written);
+      byId("saved-message").textContent = "Copied.";
+    } catch {
+      byId("saved-message").textContent = "Select the text above to copy it.";
+    }
+  });
+}
+
+byId("save-form").addEventListener("submit", async (event) => {
+  event.preventDefault();
+  const name = byId("save-name").value;
+  const response = await fetch(`/api/v1/queries/${encodeURIComponent(name)}`, {
+    method: "PUT",
+    headers: { "Content-Type": "application/json" },
+    body: JSON.stringify({ sql: text(), parameters: parameters() }),
+  });
+  if (response.ok) location.assign(`/sql?${new URLSearchParams({ name })}`);
+  else byId("saved-message").textContent = (await response.json()).detail;
+});
+byId("delete-saved")?.addEventListener("click", async () => {
+  await fetch(`/api/v1/queries/${encodeURIComponent(given.name)}`, { method: "DELETE" });
+  location.assign(`/sql?${search()}`);
 });
 
 // The chart: two numeric columns, one series for each value of a third
@@ -145,7 +249,7 @@ function offerChart() {
   byId("chart").hidden = numeric.length < 2 || answer.rows.length < 2;
   if (byId("chart").hidden) return;
   options(byId("chart-x"), numeric, numeric[0]);
-  options(byId("chart-y"), numeric, numeric.find((name) => /rms|error_|sigma/.test(name)) ?? numeric[1]);
+  options(byId("chart-y"), numeric, numeric.slice(1).find((name) => /rms|error_|sigma/.test(name)) ?? numeric[1]);
   options(byId("chart-by"), ["", ...words], words.find((name) => name === "fit_method") ?? "");
   drawChart();
 }
@@ -233,6 +337,12 @@ async function begin() {
   area.hidden = true;
 }
 
+byId("cancel").addEventListener("click", () => waiting?.abort());
+byId("explain").addEventListener("click", () => run({ explain: true }));
+area.addEventListener("input", showParameters);
+byId("editor").addEventListener("keyup", showParameters);
 showHistory();
 await begin().catch(() => {}); // without the editor the plain text area stays
-if (new URLSearchParams(location.search).has("q")) run({ keep: false });
+showParameters();
+const address = new URLSearchParams(location.search);
+if (address.has("q") || address.has("name")) run({ keep: false });

@@ -279,11 +279,40 @@ class ProblemKind(BaseModel):
     status: int
 
 
+QueryFormat = Literal["json", "csv", "parquet", "arrow"]
+Scalar = bool | int | float | str | None
+
+
+class NewQuery(Strict):
+    """A query to keep under a name."""
+
+    sql: str = Field(
+        min_length=1, max_length=100_000, description="One SELECT; $name stands for a parameter."
+    )
+    parameters: dict[str, Scalar] = Field(
+        default_factory=dict,
+        max_length=50,
+        description="Values of its parameters where an address gives none.",
+    )
+
+
+class SavedQuery(NewQuery):
+    """A query that is kept."""
+
+    name: str
+    changed_at: datetime
+
+
 class Query(Strict):
     """A query in SQL."""
 
-    sql: str = Field(min_length=1, max_length=100_000, description="One SELECT.")
-    format: Literal["json", "csv"] = Field(default="json", description="Format of the response.")
+    sql: str = Field(
+        min_length=1, max_length=100_000, description="One SELECT; $name stands for a parameter."
+    )
+    format: QueryFormat = Field(default="json", description="Format of the response.")
+    parameters: dict[str, Scalar] = Field(
+        default_factory=dict, max_length=50, description="Values of the parameters."
+    )
 
 
 class Column(BaseModel):

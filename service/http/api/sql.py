@@ -2,17 +2,31 @@
 
 from __future__ import annotations
 
+import json
+from collections.abc import Callable, Mapping
 from enum import StrEnum
 from typing import Annotated, Any
 
 from fastapi import APIRouter, Path, Request, Response
 from fastapi import Query as QueryParameter
-from fastapi.responses import FileResponse, PlainTextResponse
+from fastapi.exceptions import RequestValidationError
+from fastapi.responses import FileResponse
 
-from spheremark.service.http.api.models import Listing, Query, QueryResponse, Table
+from spheremark.pipelines.errors import InputError
+from spheremark.service.http.api.models import (
+    Listing,
+    NewQuery,
+    Query,
+    QueryFormat,
+    QueryResponse,
+    SavedQuery,
+    Table,
+)
 from spheremark.service.http.state import Current, Service
 from spheremark.service.serialise.queries import serialise_query
+from spheremark.storage.catalogue import saved_queries
 from spheremark.storage.catalogue.coordinates import coordinates_csv, named_points
+from spheremark.storage.catalogue.query_files import to_arrow, to_parquet
 from spheremark.storage.catalogue.sandbox import QueryResult, run_query, to_csv
 from spheremark.storage.exports.points import GeographicOrigin, format_points
 
@@ -24,6 +38,20 @@ POINT_MEDIA = {
     "xml": "application/xml",
     "geojson": "application/geo+json",
 }
+_WRITERS: Mapping[str, Callable[[QueryResult], str | bytes]] = {
+    "csv": to_csv,
+    "parquet": to_parquet,
+    "arrow": to_arrow,
+}
+_MEDIA = {
+    "csv": "text/csv",
+    "parquet": "application/vnd.apache.parquet",
+    "arrow": "application/vnd.apache.arrow.stream",
+}
+_FORMATS: dict[int | str, dict[str, Any]] = {
+    200: {"content": {media: {} for media in _MEDIA.values()}}
+}
+QueryName = Annotated[str, Path(description="Name of the query.", max_length=200)]
 
 
 class PointFile(StrEnum):
@@ -34,30 +62,86 @@ class PointFile(StrEnum):
     GEOJSON = "geojson"
 
 
-@router.post(
-    "/sql",
-    name="query",
-    response_model=QueryResponse,
-    responses={200: {"content": {"text/csv": {}}}},
-)
+@router.post("/sql", name="query", response_model=QueryResponse, responses=_FORMATS)
 async def query(body: Query, request: Request, service: Current) -> Any:
-    """Run one SELECT on a snapshot of the database, as JSON or CSV, within announced limits."""
+    """Run one SELECT on a snapshot of the database, within announced limits."""
     return await service.queries.run(request, _run, service, body, _accepted(request))
 
 
-@router.get(
-    "/sql",
-    name="query_by_link",
-    response_model=QueryResponse,
-    responses={200: {"content": {"text/csv": {}}}},
-)
+@router.get("/sql", name="query_by_link", response_model=QueryResponse, responses=_FORMATS)
 async def query_by_link(
-    q: Annotated[str, QueryParameter(min_length=1, max_length=8000, description="One SELECT.")],
     request: Request,
     service: Current,
+    q: Annotated[
+        str | None, QueryParameter(min_length=1, max_length=8000, description="One SELECT.")
+    ] = None,
+    name: Annotated[
+        str | None, QueryParameter(description="Name of a query that is kept, in place of q.")
+    ] = None,
+    p: Annotated[
+        list[str] | None,
+        QueryParameter(description="Value of a parameter, as name=value; again for more."),
+    ] = None,
+    format: Annotated[  # the word of the interface
+        QueryFormat | None, QueryParameter(description="Format of the response.")
+    ] = None,
 ) -> Any:
-    """Run one SELECT that is part of the address: every query is a link."""
-    return await service.queries.run(request, _run, service, Query(sql=q), _accepted(request))
+    """Run one SELECT that is part of the address, or kept under a name: every query is a link."""
+    chosen = query_of(service, q, name, p or [])
+    asked = Query(format=format or "json", **chosen)
+    accept = "" if format else _accepted(request)
+    return await service.queries.run(request, _run, service, asked, accept)
+
+
+def query_of(service: Service, q: str | None, name: str | None, given: list[str]) -> dict[str, Any]:
+    """Return the text of a query and the values of its parameters, from those of an address."""
+    if (q is None) == (name is None):
+        text = "give either q, one SELECT, or name, that of a query that is kept"
+        raise RequestValidationError([{"type": "missing", "loc": ("query", "q"), "msg": text}])
+    found: dict[str, Any] = {"sql": q, "parameters": {}}
+    if name is not None:
+        found = saved_queries.get_query(service.catalogue, name)
+    values = dict(_value_of(one) for one in given)
+    return {"sql": found["sql"], "parameters": found["parameters"] | values}
+
+
+def _value_of(text: str) -> tuple[str, Any]:
+    """Return a parameter of an address: numbers, true, false and null as such, else text."""
+    name, mark, value = text.partition("=")
+    if not mark or not name:
+        raise InputError(f"The parameter {text!r} must have the form name=value.")
+    try:
+        found = json.loads(value)
+    except ValueError:
+        return name, value
+    return name, value if isinstance(found, str | list | dict) else found
+
+
+@router.get("/queries", name="list_queries")
+def list_queries(service: Current) -> Listing[SavedQuery]:
+    """List the queries that are kept under a name."""
+    rows = saved_queries.list_queries(service.catalogue)
+    return Listing(items=[SavedQuery.model_validate(row) for row in rows])
+
+
+@router.put("/queries/{name}", name="put_query")
+def put_query(name: QueryName, new: NewQuery, service: Current) -> SavedQuery:
+    """Keep a query under a name, in place of the one that has it."""
+    row = saved_queries.put_query(service.catalogue, name, new.sql, new.parameters)
+    return SavedQuery.model_validate(row)
+
+
+@router.get("/queries/{name}", name="get_query")
+def get_query(name: QueryName, service: Current) -> SavedQuery:
+    """Return a query that is kept."""
+    return SavedQuery.model_validate(saved_queries.get_query(service.catalogue, name))
+
+
+@router.delete("/queries/{name}", name="delete_query", status_code=204, response_class=Response)
+def delete_query(name: QueryName, service: Current) -> Response:
+    """Forget a query that is kept."""
+    saved_queries.delete_query(service.catalogue, name)
+    return Response(status_code=204)
 
 
 @router.get("/sql/schema", name="get_schema")
@@ -123,19 +207,17 @@ def _accepted(request: Request) -> str:
 
 
 def _run(service: Service, request: Query, accept: str) -> QueryResponse | Response:
-    """Run a query on a snapshot; return CSV where the body or the Accept header requests it."""
+    """Run a query on a snapshot; return the format that the body or the Accept header requests."""
     limits, snapshot = service.settings.query_limits, service.catalogue.snapshot()
-    result = run_query(snapshot, request.sql, limits)
-    if request.format == "csv" or accept.startswith("text/csv"):
-        return _csv(result, limits.rows)
-    return QueryResponse.model_validate(serialise_query(result, limits, snapshot))
-
-
-def _csv(result: QueryResult, row_limit: int) -> Response:
-    """Return a result as CSV; truncation, limit and time are in the headers."""
+    result = run_query(snapshot, request.sql, limits, request.parameters)
+    accepted = (one for one, media in _MEDIA.items() if accept.startswith(media))
+    wanted = request.format if request.format != "json" else next(accepted, "json")
+    if wanted == "json":
+        return QueryResponse.model_validate(serialise_query(result, limits, snapshot))
     headers = {
         "X-Truncated": str(result.truncated).lower(),
-        "X-Row-Limit": str(row_limit),
+        "X-Row-Limit": str(limits.rows),
         "X-Elapsed-Ms": f"{result.elapsed_ms:.3f}",
+        "Content-Disposition": f'inline; filename="spheremark.{wanted}"',
     }
-    return PlainTextResponse(to_csv(result), media_type="text/csv", headers=headers)
+    return Response(_WRITERS[wanted](result), media_type=_MEDIA[wanted], headers=headers)

@@ -11,10 +11,12 @@ from fastapi.responses import FileResponse, HTMLResponse, RedirectResponse
 
 from spheremark.pipelines.errors import NotFoundError
 from spheremark.service.errors import Problem
+from spheremark.service.http.api.sql import query_of
 from spheremark.service.http.state import Current, Service
+from spheremark.storage.catalogue import saved_queries
 from spheremark.web import assets, glossary
 from spheremark.web.pages.base import Frame
-from spheremark.web.pages.sql import sql_page
+from spheremark.web.pages.sql import SqlQuery, sql_page
 from spheremark.web.templating import render
 
 router = APIRouter(include_in_schema=False, default_response_class=HTMLResponse)
@@ -75,10 +77,22 @@ def docs(service: Current) -> str:
 
 
 @router.get("/sql")
-def sql(service: Current, q: Annotated[str, Query(max_length=100_000)] = "") -> str:
+def sql(
+    service: Current,
+    q: Annotated[str, Query(max_length=100_000)] = "",
+    name: Annotated[str, Query(max_length=200)] = "",
+    p: Annotated[list[str] | None, Query()] = None,
+) -> str:
     """Show the workbench for queries."""
     tables = [asdict(table) for table in service.catalogue.schema()]
-    return sql_page(frame_of(service), q, tables, asdict(service.settings.query_limits))
+    chosen = query_of(service, None if name else q, name or None, p or [])
+    return sql_page(
+        frame_of(service),
+        SqlQuery(text=chosen["sql"], parameters=chosen["parameters"], name=name),
+        tables,
+        asdict(service.settings.query_limits),
+        saved_queries.list_queries(service.catalogue),
+    )
 
 
 def error_page(_: Request, problem: Problem) -> HTMLResponse:
