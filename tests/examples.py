@@ -139,6 +139,7 @@ def described(examples):
         "upload_recording": {
             "parameters": {"name": "lane3-stop1", "survey": SURVEY, "process": True}
         },
+        "get_octree_node": {"parameters": {"node": "r0"}},
         "upload_terrain": {"parameters": {"name": "quarry.tif"}},
         "download_adjustment": {"parameters": {"name": "report.txt"}},
         "download_calibration": {"parameters": {"name": "rig.json"}},
