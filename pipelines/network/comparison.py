@@ -15,7 +15,7 @@ from spheremark.pipelines.model.network import AdjustedNetwork, seal
 _NEAR = 0.15  # [m] a mark of a network may be from the true mark that it is
 _N_DATUM = 6  # place and attitude, which only control and levelling give
 _N_MARKS = 3
-_EXACT = 1e-4  # [m] 3-D sigma below which a mark was given, not found
+SIGMA_GIVEN = 1e-4  # [m] 3-D sigma below which a mark was given, not found
 
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
@@ -99,7 +99,7 @@ def compare(result: AdjustedNetwork, truth: Truth) -> NetworkErrors:
     goals = [T_true[n][:3, 3] for n in result.network.stations if n in T_true]
     error_stations[is_known] = p[is_known] - transform(back, np.array(goals))
     joint, s = result.cov_positions, len(p)
-    is_open = np.trace(result.mark_covariances[found], axis1=1, axis2=2) > _EXACT**2
+    is_open = np.trace(result.mark_covariances[found], axis1=1, axis2=2) > SIGMA_GIVEN**2
     return NetworkErrors(
         marks=marks,
         error_marks=error_marks,

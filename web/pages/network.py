@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from spheremark.pipelines.network.comparison import SIGMA_GIVEN
 from spheremark.web.columns import MM, Columns, floats, has_errors, plain_rows, rms, select, texts
 from spheremark.web.figures import network as figures
 from spheremark.web.links import query_text, stop_url
@@ -16,7 +17,6 @@ from spheremark.web.pages.base import Frame, Panel, Readout, Row
 from spheremark.web.templating import number, render
 
 _N_WORST = 40  # observations in the table; all are in the database and in the files
-_HELD = 1e-6  # [m] sigma of a mark that control holds: its error is that of control, by definition
 _MAP = (
     "Solid: the 95 % ellipse; dotted: the standard ellipse (39 %). The fill is the mean redundancy "
     "of the centres: 0 is uncontrolled, 3 is controlled completely by the others."
@@ -84,7 +84,7 @@ def _readouts(one: Row, tables: Mapping[str, Columns]) -> list[Readout]:
     ]
     for what in ("station", "mark"):
         rows = tables[f"adjusted_{what}s"]
-        free = select(rows, floats(rows, "sigma_3d_m") > _HELD)
+        free = select(rows, floats(rows, "sigma_3d_m") > SIGMA_GIVEN)
         if len(free[what]):
             is_valid = bool(one["passes_global_test"])
             found.append(_sizes(f"{what.capitalize()}s", free, fitted, is_valid=is_valid))

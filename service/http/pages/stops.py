@@ -79,7 +79,7 @@ JOIN station_fixes AS f USING (run_id, stop, fit_method, resection_method)
 WHERE o.run_id = $run AND o.stop = $stop AND o.fit_method = $method ORDER BY o.marker
 """
 _CHOSEN = """
-SELECT solution, adjustment_id, station, x_m, y_m, z_m, sigma_3d_m, passes_global_test
+SELECT solution, adjustment_id, fit_method, station, x_m, y_m, z_m, sigma_3d_m, passes_global_test
 FROM chosen_stations WHERE recording_id = $recording AND stop = $stop AND survey_id = $id
 """
 _IN_NETWORK = """
@@ -127,7 +127,7 @@ def stop(
     key = {"run": shown["run_id"], "stop": shown["stop"]}
     methods = [one["fit_method"] for one in rows(_STOP_METHODS, key)]
     chosen = method if method in methods else next(iter(methods), "")
-    solution, network = _solution_of(service, survey["survey_id"], shown)
+    solution, network = _solution_of(service, survey["survey_id"], shown, chosen)
     columns, by_method = service.catalogue.columns, key | {"method": chosen}
     return stop_page(
         frame_of(service, survey["name"], "stops"),
@@ -147,13 +147,16 @@ def stop(
 
 
 def _solution_of(
-    service: Service, survey_id: str, stop: Mapping[str, Any]
+    service: Service, survey_id: str, stop: Mapping[str, Any], method: str
 ) -> tuple[Mapping[str, Any] | None, Mapping[str, Mapping[str, Any]]]:
-    """Return the station of a stop in the chosen solution, and its markers in that network."""
+    """Return the station of a stop in the chosen solution, and its markers in that network.
+
+    There are none of a method whose centres the network does not use.
+    """
     rows = service.catalogue.rows
     place = {"recording": stop["recording_id"], "stop": stop["stop"], "id": survey_id}
     found = rows(_CHOSEN, place)
-    if not found or found[0]["adjustment_id"] is None:
+    if not found or found[0]["adjustment_id"] is None or found[0]["fit_method"] != method:
         return next(iter(found), None), {}
     names = {"id": found[0]["adjustment_id"], "station": found[0]["station"]}
     return found[0], {row["marker"]: row for row in rows(_IN_NETWORK, names)}
