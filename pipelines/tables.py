@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Self
 
 Plain = dict[str, Any]
 
@@ -22,6 +22,38 @@ class Column(NamedTuple):
     title: str
     unit: str = ""
     form: str = ""
+
+    @classmethod
+    def mm(cls, key: str, title: str) -> Self:
+        """Return a column of lengths in millimetres, with one decimal.
+
+        Parameters
+        ----------
+        key, title : str
+            Key of the rows and heading.
+
+        Returns
+        -------
+        Column
+            The column.
+        """
+        return cls(key, title, "mm", ".1f")
+
+    @classmethod
+    def whole(cls, key: str, title: str) -> Self:
+        """Return a column of whole numbers, with commas.
+
+        Parameters
+        ----------
+        key, title : str
+            Key of the rows and heading.
+
+        Returns
+        -------
+        Column
+            The column.
+        """
+        return cls(key, title, "", ",d")
 
     @property
     def heading(self) -> str:

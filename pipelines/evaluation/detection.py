@@ -102,8 +102,8 @@ def _tables(report: Plain) -> list[Table]:
     """Return a table of markers and decoys for each scenario."""
     columns = (
         Column("kind", "what"),
-        Column("n", "in scans", "", ",d"),
-        Column("n_found", "taken for a marker", "", ",d"),
+        Column.whole("n", "in scans"),
+        Column.whole("n_found", "taken for a marker"),
         Column(lambda row: f"{row['n_found'] / row['n']:.3f}", "share", "", ">"),
         Column(main_reasons, "why not"),
     )

@@ -133,9 +133,9 @@ _COLUMNS = (
     Column("rms_m", "RMS", "mm", ".2f"),
     Column("bound_over_rms", "bound/RMS", "", ".2f"),
     Column("bound_clear_over_rms", "clear/RMS", "", ".2f"),
-    Column("median_m", "median", "mm", ".1f"),
-    Column("p95_m", "p95", "mm", ".1f"),
-    Column("radial_bias_m", "radial", "mm", ".1f"),
+    Column.mm("median_m", "median"),
+    Column.mm("p95_m", "p95"),
+    Column.mm("radial_bias_m", "radial"),
     Column("mean_nees", "NEES", "", ".1f"),
 )
 _NOTE = (

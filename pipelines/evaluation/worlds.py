@@ -510,7 +510,7 @@ def _recall_columns(peers: Sequence[str]) -> tuple[Column, ...]:
     """Return the columns of the table of recall."""
     return (
         Column("class", "markers"),
-        Column("n", "n", "", ",d"),
+        Column.whole("n", "n"),
         *(Column(f"n_{name}", name, "", ",d") for name in _OURS),
         Column("share", "ok or weak", "%", ".1f"),
         *(Column(f"share_{name}", name, "%", ".1f") for name in peers),
@@ -521,16 +521,16 @@ def _recall_columns(peers: Sequence[str]) -> tuple[Column, ...]:
 def _decoy_columns(methods: Sequence[str]) -> tuple[Column, ...]:
     """Return the columns of the table of decoys."""
     counts = (Column(f"n_{name}", name, "", ",d") for name in methods)
-    return (Column("decoy", "decoy"), Column("n", "in scans", "", ",d"), *counts)
+    return (Column("decoy", "decoy"), Column.whole("n", "in scans"), *counts)
 
 
 _PRECISION = (
     Column("method", "by"),
-    Column("n", "n", "", ",d"),
-    Column("n_false", "false", "", ",d"),
+    Column.whole("n", "n"),
+    Column.whole("n_false", "false"),
     Column("precision", "precision", "%", ".2f"),
     Column("false_per_scan", "false in a scan", "", ".3f"),
-    Column("n_scans_with_false", "scans with one", "", ",d"),
+    Column.whole("n_scans_with_false", "scans with one"),
 )
 _CURVE = (
     Column("rate", "false in a scan", "", ".3f"),
@@ -544,11 +544,11 @@ _FAMILY = (
     Column("recall", f"found, {N_MANY} returns", "%", ".1f"),
     *(Column(f"false_{name}", f"false {name}", "1/scan", ".2f") for name in _OURS),
     Column("n_centres", "centres", "", "d"),
-    Column("rms_m", "RMS", "mm", ".1f"),
+    Column.mm("rms_m", "RMS"),
     Column("rms_over_bound", "RMS/bound", "", ".2f"),
     Column("nees", "NEES/3", "", ".2f"),
     *(Column(f"within_{round(100 * p)}", f"in {round(100 * p)} %", "%", ".0f") for p in LEVELS),
     Column("n_stations", "stations", "", "d"),
-    Column("station_rms_m", "RMS", "mm", ".1f"),
+    Column.mm("station_rms_m", "RMS"),
     Column("station_nees", "NEES/6", "", ".2f"),
 )

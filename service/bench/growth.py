@@ -84,7 +84,7 @@ def _measured(log: ScanLog, n_returns: int, scan: Scan, folder: Path) -> Plain:
 
 
 _SIZE_COLUMNS = (
-    Column("n_returns", "returns", "", ",d"),
+    Column.whole("n_returns", "returns"),
     Column("seconds", "log to rows", "s", ".3f"),
     Column("ns_per_return", "ns a return", "", ".0f"),
     Column("cpu_ns_per_return", "CPU [ns]", "", ".0f"),

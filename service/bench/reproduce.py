@@ -290,25 +290,25 @@ def _words(one: Statement) -> dict[str, str]:
 _TABLE_2 = (
     Column("distance_m", "distance", "m", ".2f"),
     Column("study_n_points", "study: returns", "", "d"),
-    Column("study_error_3d_m", "error", "mm", ".1f"),
+    Column.mm("study_error_3d_m", "error"),
     Column("paper_n_points_mean", "paper: returns", "", ".0f"),
-    Column("paper_error_3d_mean_m", "error", "mm", ".1f"),
+    Column.mm("paper_error_3d_mean_m", "error"),
     Column("paper_minus_study_m", "- study", "mm", "+.1f"),
     Column("along_beam_n_points_mean", "along_beam: returns", "", ".0f"),
-    Column("along_beam_error_3d_mean_m", "error", "mm", ".1f"),
+    Column.mm("along_beam_error_3d_mean_m", "error"),
 )
 _TABLE_3 = (
     Column("included_angle_deg", "angle", "deg", ".2f"),
-    Column("study_error_m", "study", "mm", ".1f"),
-    Column("three_circles_error_m", "circles", "mm", ".1f"),
+    Column.mm("study_error_m", "study"),
+    Column.mm("three_circles_error_m", "circles"),
     Column("three_circles_minus_study_m", "- study", "mm", "+.1f"),
-    Column("two_centres_error_m", "free station: two", "mm", ".1f"),
-    Column("three_centres_error_m", "three", "mm", ".1f"),
+    Column.mm("two_centres_error_m", "free station: two"),
+    Column.mm("three_centres_error_m", "three"),
 )
 _TABLE_4 = (
     Column("stop", "stop"),
-    Column("paper_error_3d_mean_m", "paper", "mm", ".1f"),
-    Column("along_beam_error_3d_mean_m", "along_beam", "mm", ".1f"),
+    Column.mm("paper_error_3d_mean_m", "paper"),
+    Column.mm("along_beam_error_3d_mean_m", "along_beam"),
 )
 _STATEMENTS = (
     Column("place", "where"),

@@ -237,7 +237,7 @@ _CENTRES = (
     Column("method", "centres"),
     Column(lambda row: f"{row['n_found']} of {row['n_markers']}", "found", "", ">"),
     Column("n_false", "false", "", "d"),
-    Column("error_rms_m", "RMS error", "mm", ".1f"),
+    Column.mm("error_rms_m", "RMS error"),
 )
 
 

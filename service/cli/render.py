@@ -59,7 +59,7 @@ def _say(out: Console, sentence: str) -> None:
 _TOPICS = (
     Column("topic", "topic"),
     Column("schema", "type"),
-    Column("n_messages", "messages", "", ",d"),
+    Column.whole("n_messages", "messages"),
     Column("rate_hz", "rate", "Hz", ".1f"),
     Column("longest_gap_s", "longest gap", "s", ".3f"),
 )
@@ -68,12 +68,12 @@ _MARKERS = (
     Column("id", "marker"),
     Column("status", "status"),
     *vector("centre_m", "m", "z.4f", "xyz"),
-    Column("sigma_3d_m", "sigma", "mm", ".1f"),
+    Column.mm("sigma_3d_m", "sigma"),
     Column("range_m", "range", "m", ".2f"),
     Column("n_points", "returns", "", "d"),
-    Column("rms_m", "rms", "mm", ".1f"),
+    Column.mm("rms_m", "rms"),
 )
-_ERROR = Column("error_3d_m", "error", "mm", ".1f")
+_ERROR = Column.mm("error_3d_m", "error")
 _PARAMETERS = (
     Column("name", "parameter"),
     Column("unit", "unit"),
@@ -275,21 +275,21 @@ def _short(value: object) -> str:
 
 _PASSED = (
     Column("pass_rate", "pass", "%", ".1f"),
-    Column("median_error_3d_m", "median", "mm", ".1f"),
-    Column("p95_error_3d_m", "p95", "mm", ".1f"),
+    Column.mm("median_error_3d_m", "median"),
+    Column.mm("p95_error_3d_m", "p95"),
 )
-_BY_NUMBER = (Column("n_marks", "marks", "", "d"), Column("n", "in the window", "", ",d"), *_PASSED)
+_BY_NUMBER = (Column("n_marks", "marks", "", "d"), Column.whole("n", "in the window"), *_PASSED)
 _BY_ANGLE = (
     Column(
         lambda row: f"{row['angle_from_deg']:g} - {row['angle_to_deg']:g}", "worst angle", "deg"
     ),
-    Column("n", "all", "", ",d"),
+    Column.whole("n", "all"),
     *_PASSED,
 )
 _TABLE_3 = (
     Column("included_angle_deg", "included angle", "deg", ".2f"),
-    Column("study_error_3d_m", "study", "mm", ".1f"),
-    Column("median_error_3d_m", "here", "mm", ".1f"),
+    Column.mm("study_error_3d_m", "study"),
+    Column.mm("median_error_3d_m", "here"),
 )
 _PLANNED_MARKS = (
     Column("name", "mark"),

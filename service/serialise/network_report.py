@@ -44,9 +44,9 @@ _CENTRES = (
     Column("mark", "Mark"),
     *vector("residual_m", "mm", ".1f", ("vX", "vY", "vZ")),
     *_W,
-    Column("minimal_detectable_bias_m", "MDB", "mm", ".1f"),
-    Column("external_reliability_station_m", "EX stn", "mm", ".1f"),
-    Column("external_reliability_mark_m", "EX mark", "mm", ".1f"),
+    Column.mm("minimal_detectable_bias_m", "MDB"),
+    Column.mm("external_reliability_station_m", "EX stn"),
+    Column.mm("external_reliability_mark_m", "EX mark"),
     Column(lambda row: "" if row["used"] else "left out", ""),
 )
 _LEVELLING = (

@@ -75,11 +75,11 @@ _SEEN = (
     Column("stop", "Station"),
     Column("marker", "Marker"),
     Column("mark", "Mark"),
-    *(Column(f"residual_{axis}_m", f"v{axis.upper()}", "mm", ".1f") for axis in "xyz"),
+    *(Column.mm(f"residual_{axis}_m", f"v{axis.upper()}") for axis in "xyz"),
     Column("redundancy", "r", "", ".2f"),
     Column("w", "w", "", ".2f"),
-    Column("minimal_detectable_bias_m", "MDB", "mm", ".1f"),
-    Column("external_reliability_m", "EX", "mm", ".1f"),
+    Column.mm("minimal_detectable_bias_m", "MDB"),
+    Column.mm("external_reliability_m", "EX"),
     Column(lambda row: "" if row["used"] else "left out", ""),
 )
 _LOG = (
