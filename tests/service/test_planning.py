@@ -86,6 +86,23 @@ def test_the_least_number_of_marks_is_found_and_one_more_is_named(small, tmp_pat
     assert more["worst_sigma_3d_m"] < more["worst_sigma_3d_before_m"]
 
 
+def test_numbers_of_marks_are_compared_beside_those_that_stand(small, tmp_path):
+    standing = tmp_path / "standing.csv"
+    standing.write_text("mark,x_m,y_m,z_m\nOLD,4,0,1\n")
+    options = (*small, "--spacing-m", 2.5, "--standing", standing, "--placement-m", 0.1)
+    found = plan("trade-off", *options, "--numbers", "3-4", "--cost-mark", 5, "--json")
+    three, four = found["by_number"]
+    assert four["worst_sigma_3d_m"] < three["worst_sigma_3d_m"]
+    for one in (three, four):
+        assert one["marks"][0]["name"] == "OLD"
+        assert one["marks"][0]["position_m"][:2] == [4.0, 0.0]
+        assert one["optimum"]["worst_sigma_3d_as_placed_m"] > 0
+    assert (three["optimum"]["cost"], four["optimum"]["cost"]) == (15, 20)
+    words = ["plan", "trade-off", *map(str, options), "--numbers", "four"]
+    with pytest.raises(InputError, match="must be a list as 4-8"):
+        CliRunner().invoke(app, words, catch_exceptions=False)
+
+
 def test_a_plan_refuses_what_cannot_be(small, tmp_path):
     marks = tmp_path / "marks.csv"
     marks.write_text("mark,x_m,y_m,z_m\nM1,4,0,-0.5\nM2,0,4,1\nM3,-4,0,1\n")
