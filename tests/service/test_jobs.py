@@ -48,6 +48,13 @@ def test_a_log_over_http_becomes_a_position_near_the_truth(site):
     ]
     assert len(errors) > 8
     assert np.sqrt(np.mean(np.square(errors))) < 0.010  # [m] a third of what the study needs
+    again = site.upload(survey="whole", process="true").json()["job"]
+    assert again["job_id"] == job["job_id"]  # what it would give is here already
+    site.client.put("/api/v1/surveys/whole/control", content=site.control,
+                    headers={"Content-Type": "text/csv"}).raise_for_status()  # fmt: skip
+    anew = site.upload(survey="whole", process="true").json()["job"]
+    assert anew["job_id"] != job["job_id"]  # control was set since
+    assert site.ended(anew["job_id"])["status"] == "successful"
     (ours,) = [fix for fix in fixes if fix["fit_method"] == "along_beam"]
     assert ours["error_3d_m"] < 0.005  # [m] four sigma
     assert ours["sigma_3d_m"] < 0.005
