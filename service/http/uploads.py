@@ -372,13 +372,9 @@ def take_in(
 ) -> tuple[RecordingRecord, bool]:
     """Enter a log that arrived, with its preflight; return it, and whether it is new.
 
-    A log that cannot be processed is kept with the reason, which is then raised. One that was here
-    already is inspected again if it is to be read in another way.
+    A log that cannot be processed is kept with the reason, which is then raised.
     """
     recording, is_new = enter(catalogue, received, name, options)
-    if not is_new and recording.preflight.get("reading", {}) != options.to_mapping():
-        found = inspect_upload(received.path, options).to_mapping()
-        recording = catalogue.inspect_again(received.digest, found)
     if recording.verdict == "refused":
         raise RefusedRecordingError.of(recording)
     return recording, is_new
@@ -387,9 +383,16 @@ def take_in(
 def enter(
     catalogue: Catalogue, received: Received, name: str, options: LogOptions | None = None
 ) -> tuple[RecordingRecord, bool]:
-    """Enter a log that arrived, with its preflight; return it, and whether it is new."""
+    """Enter a log that arrived, with its preflight; return it, and whether it is new.
+
+    One that was here already is inspected again if it is to be read in another way.
+    """
     try:
-        return catalogue.get_recording(received.digest), False
+        known = catalogue.get_recording(received.digest)
+        if options is None or known.preflight.get("reading", {}) == options.to_mapping():
+            return known, False
+        found = inspect_upload(received.path, options).to_mapping()
+        return catalogue.inspect_again(received.digest, found), False
     except NotFoundError:
         recording = catalogue.add_recording(
             received.digest,

@@ -55,6 +55,7 @@ _EXPANSION_MAX = 100  # of a zip; what recorders write expands by 10 at most
 _ZSTD = b"\x28\xb5\x2f\xfd"
 _PCAPS = (b"\xa1\xb2\xc3\xd4", b"\xd4\xc3\xb2\xa1", b"\xa1\xb2\x3c\x4d", b"\x4d\x3c\xb2\xa1")
 _PACKET = 1206  # [bytes] of data from a Velodyne
+_PACKET_HEAD = b"\xff\xee"
 _SCAN_PACKETS = 76  # of a revolution at 10 Hz
 
 Item = tuple[Channel, int, bytes]  # channel, log time [ns], message
@@ -248,6 +249,11 @@ def _complaint(path: Path, head: bytes) -> str:
     """Return the reason why a file is no log."""
     if not head:
         return f"{path.name} is empty, not an MCAP file: was the upload cut?"
+    if head.startswith(_PACKET_HEAD):
+        return (
+            f"{path.name} has the packets of a Velodyne without the times at which they came: save "
+            "them as a PCAP (tcpdump, Wireshark), and read it with the gimbal's log (--pcap)."
+        )
     return (
         f"The file begins with {head[:8]!r}: it is not an MCAP file, nor a rosbag2 (.db3), a ROS 1 "
         "bag, a PCAP of a Velodyne, or a zip of these. The cloud of a single scan is read by "
@@ -440,7 +446,7 @@ def _of_pcap(path: Path, topics: dict[str, Channel]) -> Iterator[Item]:
     with path.open("rb") as file:
         for seconds, frame in UniversalReader(file):
             data = frame[-_PACKET:]  # the payload is the end of a frame, whatever carries it
-            if len(data) < _PACKET or data[:2] != b"\xff\xee":
+            if len(data) < _PACKET or data[:2] != _PACKET_HEAD:
                 continue
             sender = frame[-_PACKET - 16 : -_PACKET - 12]  # IPv4, before its receiver and UDP
             if sender not in channels:

@@ -67,6 +67,14 @@ def test_a_log_in_parts_becomes_the_recording_of_its_digest(site, log):
     assert site.client.head(url, headers=TUS).status_code == 404
 
 
+def test_a_truncated_log_in_parts_is_used_when_it_is_sent_again_with_recover(site, log):
+    cut = log[: int(0.96 * len(log))]
+    for more, verdict in (({}, "refused"), ({"recover": "true"}, "weak")):
+        url = begin(site, cut, filename="cut.mcap", **more)
+        last = send(site, url, cut, 0)
+        assert site.client.get(last.headers["content-location"]).json()["verdict"] == verdict
+
+
 def test_a_part_with_a_wrong_checksum_leaves_nothing(site, log):
     url = begin(site, log)
     digest = base64.b64encode(hashlib.sha1(log[:1000]).digest()).decode()

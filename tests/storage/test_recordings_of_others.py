@@ -619,15 +619,9 @@ def test_scans_of_one_plane_are_named_as_unsupported(tmp_path):
     kinds = STORE.types
     scan = kinds["sensor_msgs/msg/LaserScan"](
         header=header(T0, "laser"),
-        angle_min=0.0,
-        angle_max=1.0,
-        angle_increment=0.1,
-        time_increment=0.0,
-        scan_time=0.1,
-        range_min=0.0,
-        range_max=9.0,
-        ranges=np.ones(10, np.float32),
-        intensities=np.ones(10, np.float32),
+        **dict.fromkeys(("angle_min", "angle_max", "angle_increment", "time_increment"), 0.1),
+        **dict.fromkeys(("scan_time", "range_min", "range_max"), 9.0),
+        **dict.fromkeys(("ranges", "intensities"), np.ones(10, np.float32)),
     )
     path = record(tmp_path / "a.mcap", [("/scan", T0, scan), *turning()])
     with pytest.raises(

@@ -59,6 +59,12 @@ def test_what_is_not_mcap_is_refused(tmp_path, octets):
     assert (report.verdict, report.code) == ("refused", NotMcapError.code)
 
 
+def test_packets_without_times_are_named_with_what_would_help(tmp_path):
+    (tmp_path / "a.bin").write_bytes(b"\xff\xee" + bytes(1204))
+    with pytest.raises(NotMcapError, match=r"without the times.*PCAP.*--pcap"):
+        read_log(tmp_path / "a.bin")
+
+
 def test_a_recording_cut_anywhere_is_truncated(tmp_path):
     whole = record(tmp_path / "a.mcap", small_log(np.random.default_rng(1)), chunk_size=700)
     octets = whole.read_bytes()

@@ -30,7 +30,7 @@ _TICKS = (
     3600.0,
 )  # [s]
 _N_TICKS = 10  # at most
-_WINDOW = 5  # messages that show a rate
+_WINDOW = 20  # messages that show a rate to an eighth
 _EMPTY: Mapping[str, Any] = {
     "reasons": [],
     "notes": [],
@@ -156,7 +156,7 @@ def findings(preflight: Mapping[str, Any]) -> list[Finding]:
         Finding(
             "The mounting of the LiDAR",
             "ok" if has("rig") else "failed",
-            f"The log has the rig {has('rig')}."
+            f"The log describes it (rig {has('rig')})."
             if has("rig")
             else "The log has no /tf_static from the gimbal to the LiDAR: record it, or give a rig "
             "to the survey.",
@@ -259,7 +259,7 @@ def _lane(topic: Mapping[str, Any], scale: float) -> Lane:
 def _density(counts: Sequence[int]) -> list[float]:
     """Return the density of messages against the usual one, in quarters; 0 where there are none.
 
-    Counted over windows of five messages or more, so that few messages show no pattern of chance.
+    Counted over windows of twenty messages or more, so that few messages show no pattern of chance.
     """
     n, n_messages = len(counts), sum(counts)
     half = min(n, -(-_WINDOW * n // max(n_messages, 1))) // 2
