@@ -44,6 +44,7 @@ _PARAMETERS: Plain = {
     "upload": "0b7c52e94f1d8a36",
     "code": "not_found",
     "name": "report.txt",
+    "node": "r07",
     "kind": "laz",
     "Tus-Resumable": "1.0.0",
     "Upload-Length": 1048576,

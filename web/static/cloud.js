@@ -567,7 +567,10 @@ renderer.domElement.addEventListener("pointerup", (event) => {
 });
 
 function measure(p) {
-  if (!p) return;
+  if (!p) {
+    byId("cloud-status").textContent = "There is no point within 6 pixels of that place; come nearer.";
+    return;
+  }
   if (chosen.length === 2) {
     chosen = [];
     measured.clear();
