@@ -379,7 +379,7 @@ function addSpheres() {
     refused.add(line);
     const likely = one.probability === null ? "" : `, ${(100 * one.probability).toFixed(0)} %`;
     const text = `${one.is_possible ? "possible" : "refused"}${likely}: ${one.reason}`;
-    name(line.position, text, { kind: "refused", title: `${one.stop}: ${one.n_points} returns`, isRefused: true });
+    name(line.position, text, { kind: "refused", title: `${one.stop}, ${one.n_points} returns: ${one.reason}`, isRefused: true });
   }
   facts.stops.forEach((stop, i) => {
     name(new Vector3().setFromMatrixPosition(clouds[i].group.matrixWorld), stop.stop, { href: stop.href, kind: "stop" });
@@ -577,7 +577,7 @@ function measure(p) {
     labels = labels.filter((one) => !one.element.classList.contains("measure") || one.element.remove());
   }
   chosen.push(p);
-  const marked = new LineSegments(cross(), new LineBasicMaterial({ color: token("--tolerance") }));
+  const marked = new LineSegments(cross(), new LineBasicMaterial({ color: token("--tolerance"), depthTest: false }));
   marked.position.copy(p);
   marked.scale.setScalar(0.4);
   measured.add(marked);
@@ -585,7 +585,7 @@ function measure(p) {
   byId("cloud-status").textContent = `First point: ${places(p)} m. Choose the second.`;
   if (chosen.length === 2) {
     const geometry = new BufferGeometry().setFromPoints(chosen);
-    measured.add(new Line(geometry, new LineBasicMaterial({ color: token("--tolerance") })));
+    measured.add(new Line(geometry, new LineBasicMaterial({ color: token("--tolerance"), depthTest: false })));
     const d = chosen[1].clone().sub(chosen[0]);
     const text = `${d.length().toFixed(3)} m`;
     name(chosen[0].clone().add(chosen[1]).divideScalar(2), text, { kind: "measure" });
