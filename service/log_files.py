@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 
 from spheremark.pipelines.calibration import Calibration, calibrate
 from spheremark.pipelines.config import SurveyConfig
 from spheremark.pipelines.errors import (
     NoMarkersError,
-    RecordingError,
     RigError,
     SolveError,
     SpheremarkError,
@@ -69,14 +69,15 @@ def process_file(
 ) -> ProcessedLog:
     """Process a log; the truth, if given, adds errors and changes nothing else."""
     progress(0.0, f"Reading {file.path.name}")
-    logs = [file.read()]
+    logs = [_read(file)]
     origin, notes = logs[0].origin, logs[0].notes
-    try:
-        stops = process(  # releases the log once it is stitched: no reference may remain here
-            logs.pop(), config=config, rig=rig, marks=marks, progress=progress
-        )
-    except NoMarkersError as error:
-        raise explained(error, file.read, rig) from error
+    with naming(file):
+        try:
+            stops = process(  # releases the log once it is stitched: no reference may remain here
+                logs.pop(), config=config, rig=rig, marks=marks, progress=progress
+            )
+        except NoMarkersError as error:
+            raise explained(error, file.read, rig) from error
     errors = {stop.name: stop_errors(stop, truth) for stop in stops} if truth else {}
     return ProcessedLog(
         origin=origin,
@@ -105,7 +106,8 @@ def read_scans(
     for i, file in enumerate(files):
         try:
             part = part_of(progress, _SCANS * i / len(files), _SCANS * (i + 1) / len(files))
-            stops = process(file.read(), config=config, rig=rig, progress=part)
+            with naming(file):
+                stops = process(file.read(), config=config, rig=rig, progress=part)
             scans += [(stop.name, stop.fits[config.fitting.methods[0]]) for stop in stops]
         except SpheremarkError as error:
             first = first or error
@@ -175,8 +177,16 @@ def calibrate_files(
 
 def _read(file: LogFile) -> ScanLog:
     """Read one log of several; an error names it."""
-    try:
+    with naming(file):
         return file.read()
-    except RecordingError as error:
-        error.args = (f"{file.path.name}: {error}",)
+
+
+@contextmanager
+def naming(file: LogFile) -> Iterator[None]:
+    """Put the name of a log in front of the text of errors."""
+    try:
+        yield
+    except SpheremarkError as error:
+        if file.path.name not in str(error):
+            error.args = (f"{file.path.name}: {error}", *error.args[1:])
         raise

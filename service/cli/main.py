@@ -21,6 +21,7 @@ import typer
 
 from spheremark.pipelines.errors import ConfigError, SpheremarkError
 from spheremark.service.cli.bench import bench, reproduce
+from spheremark.service.cli.jobs import jobs
 from spheremark.service.cli.options import AsJson, Field, RadiusM, grouped
 from spheremark.service.cli.plan import plan
 from spheremark.service.cli.reading import Logs, OneLog, Reading
@@ -315,6 +316,7 @@ app.command()(calibrate)
 app.command()(site)
 app.command()(spheres)
 app.command()(report)
+app.command()(jobs)
 app.command()(watch)
 app.command()(bench)
 
@@ -322,7 +324,9 @@ app.command()(bench)
 @app.command()
 def query(
     sql: Annotated[str, typer.Argument(help="One SELECT.")],
-    url: Annotated[str | None, typer.Option(help="Address of a running service.")] = None,
+    url: Annotated[
+        str | None, typer.Option("--url", "--server", help="Address of a running service.")
+    ] = None,
     data: Annotated[Path | None, typer.Option(help="Data folder that no service uses.")] = None,
     as_json: AsJson = False,
     as_csv: Annotated[bool, typer.Option("--csv", help="CSV for programs.")] = False,
@@ -346,7 +350,9 @@ def query(
 @app.command()
 def export(
     target: Annotated[Path, typer.Argument(metavar="OUT", help=_EXPORTS)],
-    url: Annotated[str | None, typer.Option(help="Address of a running service.")] = None,
+    url: Annotated[
+        str | None, typer.Option("--url", "--server", help="Address of a running service.")
+    ] = None,
     data: Annotated[Path | None, typer.Option(help="Data folder that no service uses.")] = None,
     survey: Annotated[str | None, typer.Option(help="Only the points of this survey.")] = None,
     origin: Annotated[

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from pathlib import Path
 from shutil import copyfile
 from typing import Any
@@ -11,7 +11,7 @@ from urllib.parse import quote
 
 import httpx
 
-from spheremark.pipelines.errors import InputError
+from spheremark.pipelines.errors import ConflictError, InputError
 from spheremark.service.client import Client
 from spheremark.service.serialise.queries import serialise_query
 from spheremark.service.settings import Settings
@@ -100,5 +100,13 @@ class Source:
                 f"No service answers and there is no database in {self._settings.data}; start "
                 "`spheremark serve`, or name a place with --url or --data."
             )
-        with Catalogue(path, snapshots=self._settings.snapshots) as catalogue:
+        try:
+            opened = Catalogue(path, snapshots=self._settings.snapshots)
+        except ConflictError as error:
+            address = self._running()
+            where = f"--server {address}" if address else "--server and its address"
+            raise ConflictError(
+                f"{error} Or take the results from that service: {where} in place of --data."
+            ) from error
+        with closing(opened) as catalogue:
             yield catalogue

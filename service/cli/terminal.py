@@ -32,8 +32,10 @@ err = Console(stderr=True)
 def progress() -> Iterator[Progress]:
     """Show a bar on standard error while something long runs."""
     from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
+    from rich.progress import TimeRemainingColumn as TimeLeft
 
-    columns = (BarColumn(), TextColumn("{task.description}"), TimeElapsedColumn())
+    about = TextColumn("{task.description}")
+    columns = (BarColumn(24), about, TimeElapsedColumn(), TextColumn("left"), TimeLeft())
     with Progress(*columns, console=err, transient=True, disable=not err.is_terminal) as bar:
         task = bar.add_task("", total=1.0)
         yield lambda share, what: bar.update(task, completed=share, description=what)

@@ -1,10 +1,15 @@
 """Queries by address: formats, parameters, and names under which they are kept."""
 
 import io
+import json
+import threading
+import time
+from contextlib import contextmanager
 
 import pandas as pd
 import pyarrow as pa
 import pytest
+import uvicorn
 from fastapi.testclient import TestClient
 from pyarrow import ipc, parquet
 
@@ -12,6 +17,7 @@ from spheremark.service.client import Client
 from spheremark.service.http.app import create_app
 from spheremark.service.settings import Settings
 from spheremark.storage.catalogue.catalogue import Catalogue
+from tests.service.test_commands import run
 from tests.surveyed import fill
 
 API = "/api/v1/sql"
@@ -30,6 +36,19 @@ def client(tmp_path_factory):
         fill(catalogue, data / "clouds", "field", n_stops=2)
     with TestClient(create_app(Settings(data=data, workers=1)), base_url=HOST) as one:
         yield one
+
+
+@contextmanager
+def served(app):
+    """Serve an application on a port of its own."""
+    server = uvicorn.Server(uvicorn.Config(app, port=0, log_level="error"))
+    thread = threading.Thread(target=server.run)
+    thread.start()
+    while thread.is_alive() and not server.started:
+        time.sleep(0.05)
+    yield f"http://127.0.0.1:{server.servers[0].sockets[0].getsockname()[1]}"
+    server.should_exit = True
+    thread.join(timeout=120)
 
 
 def get(client, status=200, **query):
@@ -54,11 +73,11 @@ def test_arrow_csv_and_json_have_the_same_rows(client):
     sql = "SELECT stop, sigma_3d_m FROM latest_station_fixes ORDER BY ALL"
     arrow = ipc.open_stream(get(client, q=sql, format="arrow").content).read_all().to_pylist()
     csv = pd.read_csv(io.StringIO(get(client, q=sql, format="csv").text)).to_dict("records")
-    json = [
+    plain = [
         dict(zip(("stop", "sigma_3d_m"), row, strict=True))
         for row in get(client, q=sql).json()["rows"]
     ]
-    assert json == arrow
+    assert plain == arrow
     assert csv == [pytest.approx(row) for row in arrow]
 
 
@@ -107,3 +126,29 @@ def test_the_client_takes_parameters(client):
 def test_explain_gives_the_plan(client):
     found = get(client, q="EXPLAIN SELECT stop FROM stops WHERE n_returns > 3").json()
     assert "stops" in found["rows"][0][-1]
+
+
+def test_a_folder_in_use_offers_the_service_that_has_it(tmp_path):
+    with Catalogue(tmp_path / "spheremark.duckdb", snapshots=tmp_path / "snapshots"):
+        done = run("query", "SELECT 1", "--data", tmp_path, code=1, SPHEREMARK_PORT="1")
+    assert "--server" in done.stderr
+
+
+def test_an_error_names_the_file(tmp_path):
+    log = tmp_path / "bad.mcap"
+    log.write_bytes(b"no log at all" * 9)
+    assert "bad.mcap" in run("process", log, code=1).stderr
+    assert "bad.mcap" in run("adjust", log, code=1).stderr
+
+
+def test_jobs_of_a_service_are_listed_and_followed(tmp_path):
+    with Catalogue(tmp_path / "spheremark.duckdb", snapshots=tmp_path / "snapshots") as catalogue:
+        fill(catalogue, tmp_path / "clouds", "field", n_stops=1)
+    app = create_app(Settings(data=tmp_path, workers=1))
+    with served(app) as address:
+        listed = run("jobs", "--server", address)
+        assert "process lane3-stop1" in listed.stdout
+        assert max(map(len, listed.stdout.splitlines())) <= 80
+        (job,) = json.loads(run("jobs", "--follow", "--json", "--server", address).stdout)
+        assert job["status"] == "successful"
+        assert "one is expected" in run("jobs", "zz", "--server", address, code=1).stderr
