@@ -37,6 +37,7 @@ from spheremark.pipelines.placement.stop_moves import moved_stops
 from spheremark.pipelines.placement.walk import round_trip
 
 _SLACK = 1.15  # times the tolerance that a quick search keeps: more is hopeless
+_HOPELESS = 2.0  # the same where places between those of a grid, however wide, come after it
 _FINER = (3, 2, 1)  # times that the grid of the bound is finer, as far as places suffice
 _BOUND, _SEARCH = 0.2, 0.9  # shares of the time after the bound and after the search
 _PLACED = 40  # arrangements that are displaced by chance
@@ -394,7 +395,7 @@ def _fewest(problem: Problem, goal: Goal, rng: np.random.Generator, course: _Cou
         course.n_marks = k
         course.at(0.0, f"Trying {k} marks")
         quick = search(problem, k, goal, rng, is_quick=True)
-        if quick.keeps(goal, _SLACK):
+        if quick.keeps(goal, _SLACK if problem.candidates.rules is None else _HOPELESS):
             found = _best(problem, k, goal, rng, course)
             # a smaller sigma may come with an error ellipsoid of worse shape
             if not found.is_kept and quick.keeps(goal):
