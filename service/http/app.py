@@ -20,6 +20,7 @@ from spheremark.pipelines.errors import InputError
 from spheremark.service.errors import Problem, UnauthorizedError
 from spheremark.service.http import api, errors, examples, observation, pages, security
 from spheremark.service.http.pages import frame
+from spheremark.service.http.representation import Representation
 from spheremark.service.http.state import Current, opened
 from spheremark.service.logs import event_level
 from spheremark.service.settings import Settings
@@ -85,6 +86,7 @@ def create_app(settings: Settings) -> FastAPI:
     )
     app.state.metrics = observation.new_registry()
     app.state.event_level = event_level(settings.log_format)
+    app.add_middleware(Representation)
     app.add_middleware(security.SecurityMiddleware, settings=settings)
     app.include_router(api.router, prefix=ROOT)
     app.include_router(about)

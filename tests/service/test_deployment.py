@@ -35,12 +35,58 @@ def wait_for(url, **options):
             time.sleep(0.1)
 
 
-@pytest.fixture(scope="module")
-def site(tmp_path_factory):
-    """Return the address of a service behind the proxy, a token, and the proxy's authority."""
-    caddy = shutil.which("caddy") or pytest.skip("caddy is not installed")
+def caddy(folder, upstream, port):
+    """Return the command of Caddy, its environment, and the file of its authority."""
+    program = shutil.which("caddy") or pytest.skip("caddy is not installed")
+    (folder / "Caddyfile").write_text(FOR_TESTS + (DEPLOY / "Caddyfile").read_text())
+    environment = {
+        "SPHEREMARK_SITE": f"https://localhost:{port}",
+        "SPHEREMARK_UPSTREAM": f"127.0.0.1:{upstream}",
+        "XDG_DATA_HOME": str(folder / "proxy"),
+        "XDG_CONFIG_HOME": str(folder / "proxy"),
+    }
+    authority = folder / "proxy" / "caddy" / "pki" / "authorities" / "local" / "root.crt"
+    command = [program, "run", "--config", folder / "Caddyfile", "--adapter", "caddyfile"]
+    return command, environment, authority
+
+
+def nginx(folder, upstream, port):
+    """Return the command of nginx, with a certificate made for the test."""
+    program = shutil.which("nginx", path=f"{os.environ['PATH']}:/usr/sbin")
+    openssl = shutil.which("openssl")
+    if not (program and openssl):
+        pytest.skip("nginx is not installed")
+    certificate, key = folder / "site.pem", folder / "site.key"
+    request = [openssl, "req", "-x509", "-newkey", "rsa:2048", "-nodes", "-days", "2"]
+    about = ["-subj", "/CN=localhost", "-addext", "subjectAltName=DNS:localhost"]
+    files = ["-keyout", key, "-out", certificate]
+    subprocess.run([*request, *about, *files], check=True, capture_output=True)
+    server = (DEPLOY / "nginx.conf").read_text()
+    live = "/etc/letsencrypt/live/survey.example"
+    for ours, its in (
+        ("listen 443 ssl;", f"listen 127.0.0.1:{port} ssl;"),
+        ("server_name survey.example;", "server_name localhost;"),
+        (f"{live}/fullchain.pem", str(certificate)),
+        (f"{live}/privkey.pem", str(key)),
+        ("http://127.0.0.1:8000;", f"http://127.0.0.1:{upstream};"),
+    ):
+        assert server.count(ours) == 1
+        server = server.replace(ours, its)
+    kept = "".join(
+        f"{kind}_temp_path {folder / kind};\n"
+        for kind in ("client_body", "proxy", "fastcgi", "uwsgi", "scgi")
+    )
+    around = f"daemon off; pid {folder / 'pid'}; error_log stderr; events {{}}\n"
+    (folder / "nginx.conf").write_text(f"{around}http {{ access_log off;\n{kept}{server}}}\n")
+    return [program, "-c", folder / "nginx.conf", "-p", folder], {}, certificate
+
+
+@pytest.fixture(scope="module", params=[caddy, nginx], ids=lambda one: one.__name__)
+def site(tmp_path_factory, request):
+    """Return the address of a service behind a proxy, a token, and the proxy's authority."""
     folder = tmp_path_factory.mktemp("deployed")
     upstream, port = free_port(), free_port()
+    command_of_proxy, of_proxy, authority = request.param(folder, upstream, port)
     spheremark = [sys.executable, "-m", "spheremark.service.cli"]
     clean = {k: v for k, v in os.environ.items() if not k.startswith("SPHEREMARK_")}
     settings = {
@@ -53,25 +99,13 @@ def site(tmp_path_factory):
         command, env=clean | settings, check=True, capture_output=True, text=True, timeout=PATIENCE
     )
     token = max(made.stdout.split(), key=len)
-    (folder / "Caddyfile").write_text(FOR_TESTS + (DEPLOY / "Caddyfile").read_text())
-    of_proxy = {
-        "SPHEREMARK_SITE": f"https://localhost:{port}",
-        "SPHEREMARK_UPSTREAM": f"127.0.0.1:{upstream}",
-        "XDG_DATA_HOME": str(folder / "proxy"),
-        "XDG_CONFIG_HOME": str(folder / "proxy"),
-    }
     running = [
         subprocess.Popen([*spheremark, "serve"], env=clean | settings),
-        subprocess.Popen(
-            [caddy, "run", "--config", folder / "Caddyfile", "--adapter", "caddyfile"],
-            env=clean | of_proxy,
-            stderr=subprocess.DEVNULL,
-        ),
+        subprocess.Popen(command_of_proxy, env=clean | of_proxy, stderr=subprocess.DEVNULL),
     ]
     try:
         wait_for(f"http://127.0.0.1:{upstream}/healthz")
         wait_for(f"https://localhost:{port}/healthz", verify=False)
-        authority = folder / "proxy" / "caddy" / "pki" / "authorities" / "local" / "root.crt"
         yield f"https://localhost:{port}", token, ssl.create_default_context(cafile=authority)
     finally:
         for one in running:

@@ -7,6 +7,11 @@ from spheremark.service.http.app import create_app
 from spheremark.service.settings import Settings
 from spheremark.storage.catalogue.catalogue import Catalogue
 
+OF_TUS = {
+    "tus-resumable", "tus-version", "tus-extension", "tus-max-size", "tus-checksum-algorithm",
+    "location", "upload-offset", "upload-length", "upload-expires", "content-location", "link",
+    "cache-control",
+}  # fmt: skip
 LABELS = {"id", "survey", "recording_id"}
 TABLES = {
     rows.MarkerFit: "marker_fits",
@@ -47,7 +52,7 @@ def successes(openapi):
         for method, operation in operations.items():
             found = [r for status, r in operation["responses"].items() if status.startswith("2")]
             if path.startswith("/api/v1/uploads"):
-                continue  # answers of tus are headers alone
+                continue  # answers of tus are headers alone, see below
             yield method, path, {k: v for r in found for k, v in r.get("content", {}).items()}
 
 
@@ -58,6 +63,47 @@ def test_every_route_declares_what_it_returns(openapi):
         assert content, f"{method} {path} declares no response"
         declared = content.get("application/json", {"schema": {"$ref": "a file"}})
         assert "$ref" in declared["schema"], f"{method} {path} declares no model"
+
+
+def declared(openapi, method, path, status):
+    """Return the headers that a response is declared to have, in lower case."""
+    answer = openapi["paths"][path][method]["responses"][str(status)]
+    assert "content" not in answer
+    return {name.lower() for name in answer["headers"]}
+
+
+def test_resumable_uploads_have_the_headers_that_are_declared(openapi, site):
+    one, tus = "/api/v1/uploads/{upload}", {"Tus-Resumable": "1.0.0"}
+    log = site.stop.log.read_bytes()
+    part = {**tus, "Content-Type": "application/offset+octet-stream"}
+    begin = site.client.post("/api/v1/uploads", headers={**tus, "Upload-Length": str(len(log))})
+    url, first = begin.headers["location"], {**part, "Upload-Offset": "0"}
+    end = {**part, "Upload-Offset": str(len(log) // 2)}
+    answers = [
+        ("options", "/api/v1/uploads", site.client.options("/api/v1/uploads")),
+        ("post", "/api/v1/uploads", begin),
+        ("patch", one, site.client.patch(url, content=log[: len(log) // 2], headers=first)),
+        ("head", one, site.client.head(url, headers=tus)),
+        ("patch", one, site.client.patch(url, content=log[len(log) // 2 :], headers=end)),
+    ]
+    again = site.client.post("/api/v1/uploads", headers={**tus, "Upload-Length": "9"})
+    ended = site.client.delete(again.headers["location"], headers=tus)
+    found = set()
+    for method, path, answer in [*answers, ("delete", one, ended)]:
+        names = declared(openapi, method, path, answer.status_code)
+        sent = {name for name in answer.headers if name in OF_TUS}
+        assert sent <= names, (method, path)
+        found |= {(method, path, name) for name in sent}
+    for method, path in {(method, path) for method, path, _ in found}:
+        operation = openapi["paths"][path][method]["responses"]
+        (status,) = (key for key in operation if key.startswith("2"))
+        always = declared(openapi, method, path, status) - {"link"}
+        if path == "/api/v1/uploads" and method == "post":
+            always -= {"upload-offset", "content-location"}  # without a body
+        assert {name for m, p, name in found if (m, p) == (method, path)} == always
+    for path in ("/api/v1/uploads", one):
+        for operation in openapi["paths"][path].values():
+            assert operation["responses"]["default"]["content"]
 
 
 def test_no_declared_response_takes_just_any_key(openapi):
