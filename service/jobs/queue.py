@@ -53,6 +53,9 @@ TOO_LONG = "job_timeout"
 _RECORD_EVERY = 0.5  # [s] between two reports of progress that reach the database
 _STORE_AGAIN, _STORE_AGAIN_MAX = 1.0, 30.0  # [s] until a result is written again
 _COUNT_EVERY = 2.0  # [s] between two counts of the workers
+_PARTING = 10.0  # [s] that a scheduler has to answer
+_SCHEDULER_LOST = "scheduler-connection-lost"  # as Dask gives it for a reason
+_LOST = (OSError, TimeoutError, RuntimeError, ValueError)  # what Dask raises without a scheduler
 _GRACE = 1.0  # [s] that a dismissed job has to stop between two steps
 
 
@@ -98,14 +101,13 @@ class JobQueue:
         self._followers: set[asyncio.Task[None]] = set()
         self._events_in: asyncio.Queue[dict[str, Any]] = asyncio.Queue()
         self._stack = AsyncExitStack()
+        self._cluster = AsyncExitStack()
+        self._connecting = asyncio.Lock()
 
     async def __aenter__(self) -> Self:
         self._loop = asyncio.get_running_loop()
         self._client = await self._connect()
-        self._client.subscribe_topic(
-            tasks.TOPIC, lambda event: self._events_in.put_nowait(event[1])
-        )
-        await self._client.register_plugin(tasks.WarmUp(is_ours=not self._settings.scheduler))
+        self._stack.push_async_callback(self._disconnect)
         for task in (self._record(), self._count_workers()):
             self._stack.callback(asyncio.create_task(task).cancel)
         most = self._settings.job_attempts
@@ -126,7 +128,7 @@ class JobQueue:
         """Start a cluster, or use the one that the settings name."""
         address: str | LocalCluster = self._settings.scheduler
         if not address:
-            self._stack.enter_context(
+            self._cluster.enter_context(
                 dask.config.set(
                     {
                         "distributed.scheduler.allowed-failures": self._settings.job_attempts - 1,
@@ -138,7 +140,7 @@ class JobQueue:
                     }
                 )
             )
-            address = await self._stack.enter_async_context(
+            address = await self._cluster.enter_async_context(
                 LocalCluster(
                     n_workers=self._settings.workers,
                     threads_per_worker=1,
@@ -153,8 +155,28 @@ class JobQueue:
                     silence_logs=logging.ERROR,
                 )
             )
-        client: Client = await self._stack.enter_async_context(Client(address, asynchronous=True))
+        client: Client = await self._cluster.enter_async_context(Client(address, asynchronous=True))
+        client.subscribe_topic(tasks.TOPIC, lambda event: self._events_in.put_nowait(event[1]))
+        await client.register_plugin(tasks.WarmUp(is_ours=not self._settings.scheduler))
         return client
+
+    async def _disconnect(self) -> None:
+        """End the cluster that the service started, or leave the other one."""
+        cluster, self._cluster = self._cluster, AsyncExitStack()
+        with suppress(*_LOST):
+            await asyncio.wait_for(cluster.aclose(), _PARTING)
+
+    async def _reconnect(self, lost: Client) -> None:
+        """Connect again in place of a client that has lost its scheduler; start a new cluster."""
+        async with self._connecting:
+            while self._client is lost:
+                logger.error("The scheduler of the jobs is lost; connecting again.")
+                self._n_workers = 0
+                await self._disconnect()
+                try:
+                    self._client = await self._connect()
+                except _LOST:
+                    await asyncio.sleep(_COUNT_EVERY)
 
     def n_workers(self) -> int:
         """Return the number of worker processes that were ready a few seconds ago."""
@@ -168,9 +190,13 @@ class JobQueue:
     async def _count_workers(self) -> None:
         """Keep the number of workers: Dask's own copy of it may be minutes old."""
         while True:
-            with suppress(OSError):
-                known = await self._client.scheduler.identity(n_workers=-1)
+            client = self._client
+            try:
+                known = await asyncio.wait_for(client.scheduler.identity(n_workers=-1), _PARTING)
                 self._n_workers = len(known["workers"])
+            except _LOST:
+                if client.status != "running":
+                    await self._reconnect(client)
             await asyncio.sleep(_COUNT_EVERY)
 
     def submit(self, job: JobRecord) -> None:
@@ -216,15 +242,7 @@ class JobQueue:
             await self.events.add(job)
             if job.waits_for:
                 await self._wait_for(job)
-            spec = await asyncio.to_thread(self._specification, job)
-            live.future = self._client.submit(
-                tasks.run,
-                spec,
-                key=f"{job.job_id}-{spec.result_id}",
-                pure=False,
-                priority=-live.rank,
-            )
-            result = await live.future
+            result = await self._result(live)
             async with live.turn:
                 if not live.has_begun:
                     await self._begin(live)
@@ -256,6 +274,28 @@ class JobQueue:
             await live.ended.wait()
         if (await asyncio.to_thread(self._catalogue.get_job, job.job_id)).status.is_final:
             raise FutureCancelledError(job.job_id, "dismissed")
+
+    async def _result(self, live: _Live) -> JobResult:
+        """Return the result of a job; run it again where its scheduler was lost."""
+        while True:
+            client = self._client
+            spec = await asyncio.to_thread(self._specification, live.job)
+            live.future = client.submit(
+                tasks.run,
+                spec,
+                key=f"{live.job.job_id}-{spec.result_id}",
+                pure=False,
+                priority=-live.rank,
+            )
+            try:
+                result: JobResult = await live.future
+            except FutureCancelledError as error:
+                if error.reason != _SCHEDULER_LOST:
+                    raise
+                live.is_running = False
+                await self._reconnect(client)
+            else:
+                return result
 
     def _specification(self, job: JobRecord) -> JobSpecification:
         """Return the input of a worker for a job."""
