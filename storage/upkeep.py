@@ -91,9 +91,13 @@ def examine(database: Path, data: Path) -> list[Finding]:
     list of Finding
         What is wrong; empty where nothing is.
     """
-    with duckdb.connect(str(database), read_only=True) as connection:
-        files = list(_files(connection))
-        found = [*_schema_findings(connection), *_row_findings(connection)]
+    try:
+        with duckdb.connect(str(database), read_only=True) as connection:
+            files = list(_files(connection))
+            found = [*_schema_findings(connection), *_row_findings(connection)]
+    except duckdb.Error as error:
+        advice = f"{str(error).splitlines()[0]}. Check the disk, and restore the newest backup."
+        return [Finding(kind="database.damaged", place=str(database), advice=advice)]
     for file in files:
         found += _file_findings(file)
     known = {file.path.resolve() for file in files}

@@ -109,7 +109,8 @@ class Inbox:
 
         With the content type of a form, the file is a zip of the files in it.
         """
-        handle, name = tempfile.mkstemp(dir=self.partial)
+        with _translated(self.folder):
+            handle, name = tempfile.mkstemp(dir=self.partial)
         path = Path(name)
         sha = hashlib.sha256()
         try:
@@ -133,9 +134,10 @@ class Inbox:
     def keep(self, part: Received, ending: str) -> Path:
         """Name a file by the digest of what was received."""
         target = self.folder / f"{part.digest}{ending}"
-        part.path.chmod(0o600)
-        part.path.replace(target)
-        sync_folder(self.folder)
+        with _translated(target):
+            part.path.chmod(0o600)
+            part.path.replace(target)
+            sync_folder(self.folder)
         return target
 
     async def write(
@@ -265,9 +267,10 @@ class Resumable:
             expires_at=time.time() + _KEPT_SECONDS,
             path=path,
         )
-        path.touch(mode=0o600)
         about = asdict(upload) | {"path": str(path)}
-        path.with_suffix(".json").write_text(json.dumps(about), encoding="utf-8")
+        with _translated(path):
+            path.touch(mode=0o600)
+            path.with_suffix(".json").write_text(json.dumps(about), encoding="utf-8")
         return upload
 
     def get(self, upload_id: str) -> Upload:

@@ -27,6 +27,7 @@ from distributed.scheduler import KilledWorker
 
 from spheremark.pipelines.config import SurveyConfig
 from spheremark.pipelines.errors import ConflictError, SpheremarkError
+from spheremark.service.jobs import clock
 from spheremark.service.jobs import worker as tasks
 from spheremark.service.jobs.events import EventLog
 from spheremark.service.jobs.handlers import (
@@ -151,6 +152,7 @@ class JobQueue:
                     security=Security.temporary(),  # for this service alone
                     dashboard_address="127.0.0.1:0",
                     worker_dashboard_address="127.0.0.1:0",
+                    preload=[clock.__name__],
                     asynchronous=True,
                     silence_logs=logging.ERROR,
                 )

@@ -32,6 +32,7 @@ logger = logging.getLogger(__name__)
 
 _RESERVE = "reserve"  # name of the file beside the database
 _RESERVE_BYTES = 32 << 20  # what DuckDB needs to write its log into the file, many times over
+_DAMAGED = "Corrupt database file"  # in DuckDB's errors of pages that were changed
 _PATIENCE = 10.0  # [s] for queries that still run on an invalid database; they fail at once
 _N_ROWS_MAX = 200_000  # of one static query; a page that needs more should aggregate
 _COLUMNS = """
@@ -189,6 +190,10 @@ class Database:
             if "Could not write" not in str(error):
                 raise
             raise self._unwritten(error) from error
+        except duckdb.Error as error:
+            if _DAMAGED not in str(error):
+                raise
+            raise damaged(self.path, error) from error
 
     def _unwritten(self, error: duckdb.Error) -> StorageError:
         """Return why the file could not be written; a full disk gets the room of the reserve."""
@@ -244,10 +249,33 @@ def _open(path: Path, memory_limit: str) -> duckdb.DuckDBPyConnection:
         migrations.migrate(connection, migrations.released())
         connection.execute("SET enable_external_access = false")
         connection.execute("SET lock_configuration = true")
-    except BaseException:
+    except BaseException as error:
         connection.close()
+        if isinstance(error, duckdb.Error) and _DAMAGED in str(error):
+            raise damaged(path, error) from error
         raise
     return connection
+
+
+def damaged(path: Path, error: duckdb.Error) -> StorageError:
+    """Return the error of a file of which pages were changed on the disk.
+
+    Parameters
+    ----------
+    path : Path
+        The database.
+    error : duckdb.Error
+        What DuckDB found.
+
+    Returns
+    -------
+    StorageError
+        Where the damage is, and what to do.
+    """
+    return StorageError(
+        f"{path.name} is damaged on its disk: {str(error).strip().splitlines()[0]}. Check the "
+        "disk, and restore the newest backup (spheremark restore)."
+    )
 
 
 def _require_alone(connection: duckdb.DuckDBPyConnection, path: Path) -> None:
@@ -276,6 +304,8 @@ def _connect(path: Path, memory_limit: str) -> duckdb.DuckDBPyConnection:
         raise InputError(f"{path} is not a database of spheremark: {error}") from error
     except duckdb.ConnectionException as error:
         raise ConflictError(f"{path} is already open in this process; close that first.") from error
+    except duckdb.Error as error:
+        raise damaged(path, error) from error
 
 
 def fetch(cursor: duckdb.DuckDBPyConnection, sql: str, parameters: Mapping[str, Any]) -> pa.Table:
