@@ -29,12 +29,41 @@ ALGORITHMS = ("sha256", "sha1", "md5")
 _BODY = {
     "requestBody": {"content": {PART: {"schema": {"type": "string", "format": "binary"}}}},
 }
+_HEADERS = {
+    "Tus-Resumable": ("Version of the protocol.", "string"),
+    "Tus-Version": ("Versions that are known.", "string"),
+    "Tus-Extension": ("Extensions that are known.", "string"),
+    "Tus-Max-Size": ("Longest log that is accepted [bytes].", "integer"),
+    "Tus-Checksum-Algorithm": ("Algorithms for the digest of a part.", "string"),
+    "Location": ("Address of the upload.", "string"),
+    "Upload-Offset": ("How many bytes are here.", "integer"),
+    "Upload-Length": ("Length of the log [bytes].", "integer"),
+    "Upload-Expires": ("Until when an unfinished upload is kept.", "string"),
+    "Content-Location": ("Address of the recording, once the log is complete.", "string"),
+    "Link": ("Address of the job that was started.", "string"),
+    "Cache-Control": ("no-store.", "string"),
+}
 
-_PROTOCOL = {
-    "Tus-Version": {"schema": {"type": "string"}, "example": VERSION},
-    "Tus-Extension": {"schema": {"type": "string"}, "example": EXTENSIONS},
-    "Tus-Max-Size": {"schema": {"type": "string"}, "example": "8589934592"},
-    "Tus-Checksum-Algorithm": {"schema": {"type": "string"}, "example": ",".join(ALGORITHMS)},
+
+def _answers(status: int, what: str, *names: str) -> dict[int | str, dict[str, Any]]:
+    """Describe in OpenAPI an answer that is headers alone."""
+    headers = {
+        name: {"description": text, "schema": {"type": kind}}
+        | ({"example": _EXAMPLES[name]} if name in _EXAMPLES else {})
+        for name, (text, kind) in _HEADERS.items()
+        if name in ("Tus-Resumable", *names)
+    }
+    return {status: {"description": what, "headers": headers}}
+
+
+_STATE = ("Upload-Offset", "Upload-Expires", "Content-Location", "Link")
+
+_EXAMPLES = {
+    "Tus-Resumable": VERSION,
+    "Tus-Version": VERSION,
+    "Tus-Extension": EXTENSIONS,
+    "Tus-Max-Size": 8589934592,
+    "Tus-Checksum-Algorithm": ",".join(ALGORITHMS),
 }
 
 UploadId = Annotated[str, Path(description="Id of the upload.")]
@@ -50,7 +79,7 @@ Checksum = Annotated[
     name="describe_uploads",
     status_code=204,
     response_class=Response,
-    responses={204: {"headers": _PROTOCOL}},
+    responses=_answers(204, "What is supported.", *(n for n in _HEADERS if n.startswith("Tus-"))),
 )
 def describe_uploads(service: Current) -> Response:
     """Say what of tus is supported."""
@@ -65,7 +94,12 @@ def describe_uploads(service: Current) -> Response:
 
 
 @router.post(
-    "", name="create_upload", status_code=201, response_class=Response, openapi_extra=_BODY
+    "",
+    name="create_upload",
+    status_code=201,
+    response_class=Response,
+    openapi_extra=_BODY,
+    responses=_answers(201, "The upload has begun.", "Location", *_STATE),
 )
 async def create_upload(
     request: Request,
@@ -98,7 +132,14 @@ async def create_upload(
     return _answer(headers, 201)
 
 
-@router.head("/{upload}", name="get_upload", response_class=Response)
+@router.head(
+    "/{upload}",
+    name="get_upload",
+    response_class=Response,
+    responses=_answers(
+        200, "What is here.", "Upload-Offset", "Upload-Length", "Upload-Expires", "Cache-Control"
+    ),
+)
 def get_upload(upload: UploadId, service: Current, tus: Tus = None) -> Response:
     """Say how many bytes of an upload are here."""
     _check_version(tus)
@@ -113,6 +154,7 @@ def get_upload(upload: UploadId, service: Current, tus: Tus = None) -> Response:
     status_code=204,
     response_class=Response,
     openapi_extra=_BODY,
+    responses=_answers(204, "The part is kept.", *_STATE),
 )
 async def append_to_upload(
     upload: UploadId,
@@ -132,7 +174,13 @@ async def append_to_upload(
     return _answer(await _append(service, found, request, offset, checksum))
 
 
-@router.delete("/{upload}", name="end_upload", status_code=204, response_class=Response)
+@router.delete(
+    "/{upload}",
+    name="end_upload",
+    status_code=204,
+    response_class=Response,
+    responses=_answers(204, "It is forgotten."),
+)
 def end_upload(upload: UploadId, service: Current, tus: Tus = None) -> Response:
     """Forget an upload and its bytes."""
     _check_version(tus)
