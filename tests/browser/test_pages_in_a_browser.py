@@ -39,6 +39,7 @@ PAGES = [
     "/surveys/blind",
     STOP,
     f"{STOP}?method=paper&marker=M03",
+    "/live",
     "/jobs",
     "/docs",
     "/glossary",
