@@ -283,6 +283,15 @@ def decide(evidence: Evidence, tolerance: float) -> Decision:
     )
 
 
+def rule(tolerance: float) -> str:
+    """Return the rule of ``decide`` as a sentence, for a tolerance [m]."""
+    return (
+        f"Accepted where the global test passes, {RADIUS_95:g} times the 3-D sigma of each station "
+        "(not less than its radius of 95 %) and the largest difference at control are within "
+        f"{1e3 * tolerance:g} mm, and nothing is weak or missing."
+    )
+
+
 def _refusals(evidence: Evidence, tolerance: float) -> list[str]:
     """Return why a survey cannot be accepted."""
     found = []

@@ -13,8 +13,10 @@ from typing import Any
 
 from spheremark.pipelines.errors import InputError, NotFoundError
 from spheremark.pipelines.tables import Column, Table
+from spheremark.pipelines.trust import rule
 from spheremark.service.provenance import code_version
 from spheremark.service.serialise import network_report
+from spheremark.service.serialise.solution import survey_result
 from spheremark.storage.catalogue.catalogue import Catalogue
 
 Plain = dict[str, Any]
@@ -96,7 +98,12 @@ def survey_report(catalogue: Catalogue, survey: str, adjustment: str | None = No
     """Return the report of a survey as plain values."""
     found = catalogue.get_survey(survey)
     key = {"survey": found.survey_id}
-    networks = catalogue.rows(_ADJUSTMENT, key | {"id": adjustment})
+    result = survey_result(catalogue, found.survey_id)
+    chosen = result.solution and result.solution.adjustment_id
+    is_chosen = result.solution is not None and adjustment in (None, chosen)
+    networks = []
+    if adjustment or chosen or result.solution is None:
+        networks = catalogue.rows(_ADJUSTMENT, key | {"id": adjustment or chosen})
     if adjustment is not None and not networks:
         raise NotFoundError(f"The survey {found.name} has no adjustment {adjustment!r}.")
     about = [
@@ -114,6 +121,12 @@ def survey_report(catalogue: Catalogue, survey: str, adjustment: str | None = No
     else:
         report = _stations_part(catalogue, found.survey_id, found.tolerance)
         report["digests"] = _digests(catalogue.rows(_RUNS, key))
+    if is_chosen:
+        report["verdict"] = (
+            f"{result.decision.summary}. {' '.join(result.decision.reasons)}".strip()
+        )
+        report["is_accepted"] = result.decision.status == "accepted"
+        report["rule"] = rule(found.tolerance)
     control = Table(title="Control marks as given", columns=_GIVEN, rows=given)
     report["sections"] = [control.to_texts(), *report["sections"]] if given else report["sections"]
     if not given:

@@ -430,7 +430,10 @@ def test_a_job_names_the_jobs_whose_results_it_reads_and_waits_for_them(site):
     report = site.client.get("/api/v1/surveys/in turn/report.html").text
     assert "Network adjustment report" in report
     assert "Observed centres" in report
-    assert "lane1-stop1" in report
+    assert STOPS[0] in report  # the same bytes have the name that they first had
+    decision = site.client.get("/api/v1/surveys/in turn/result").json()
+    assert decision["solution"] == "network with control"
+    assert decision["sentence"].rpartition(": ")[0] in report
 
 
 def test_a_job_that_waits_for_another_can_be_dismissed(site):
