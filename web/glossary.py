@@ -38,6 +38,9 @@ def term(text: str) -> str | Markup:
     """Return a text as a link whose hint is its meaning; a text that is no word stays as it is."""
     word = text.lower()
     word = _OTHER_FORMS.get(word, word)
+    if word not in glossary():  # the first word counts: "Sigma, 3-D", "Error of height"
+        word = word.replace(",", " ").partition(" ")[0]
+        word = _OTHER_FORMS.get(word, word)
     if word not in glossary():
         return text
     link = Markup('<a class="term" href="/glossary#{}" title="{}">{}</a>')

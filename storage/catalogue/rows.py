@@ -19,7 +19,18 @@ COV = tuple(f"cov_{axes}_m2" for axes in ("xx", "xy", "xz", "yy", "yz", "zz"))
 
 
 def places(rows: Sequence[Row]) -> Array:
-    """Return the coordinates of rows, (n, 3) [m]."""
+    """Return the coordinates of rows.
+
+    Parameters
+    ----------
+    rows : sequence of mapping
+        Rows with the columns of a place.
+
+    Returns
+    -------
+    (n, 3)
+        Their coordinates [m].
+    """
     return np.array([[row[name] for name in PLACE] for row in rows]).reshape(-1, 3)
 
 
