@@ -38,7 +38,10 @@ from spheremark.pipelines.placement.walk import round_trip
 
 _SLACK = 1.15  # times the tolerance that a quick search keeps: more is hopeless
 _HOPELESS = 2.0  # the same where places between those of a grid, however wide, come after it
-_FINER = (3, 2, 1)  # times that the grid of the bound is finer, as far as places suffice
+_FINER, _FINE = (
+    3,
+    0.3,
+)  # times that the grid of the bound is finer, its spacing [m]; if places suffice
 _BOUND, _SEARCH = 0.2, 0.9  # shares of the time after the bound and after the search
 _PLACED = 40  # arrangements that are displaced by chance
 _ROUNDS_OF_STOPS = 4  # in which stops and marks move in turn
@@ -508,7 +511,7 @@ def _finer(problem: Problem) -> Candidates:
     free = given.rows(np.arange(len(given.p_site) - len(problem.fixed)))
     if given.rules is None:
         return free
-    for times in _FINER:
+    for times in range(max(_FINER, int(np.ceil(given.spacing / _FINE))), 0, -1):
         if times**2 * len(free.p_site) <= CANDIDATES_MAX // 2:
             finer = find_candidates(
                 site, stops, replace(given.rules, spacing=given.spacing / times)

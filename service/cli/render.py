@@ -385,7 +385,7 @@ def _compared(plan: Plain) -> Plain:
         **{key: plan[key] for key in plan if key.endswith("_m") and "sigma" in key},
         "n_marks": len(plan["marks"]),
         "bound": quality["worst_sigma_3d_bound_m"],
-        "excess": None if excess is None else 100 * excess,
+        "excess": excess,
         "walk_m": quality["walk_m"],
         "cost": quality["cost"],
         "kept": "kept" if quality["keeps_tolerance"] else "not kept",
