@@ -284,7 +284,18 @@ def decide(evidence: Evidence, tolerance: float) -> Decision:
 
 
 def rule(tolerance: float) -> str:
-    """Return the rule of ``decide`` as a sentence, for a tolerance [m]."""
+    """Return the rule of ``decide`` as a sentence.
+
+    Parameters
+    ----------
+    tolerance : float
+        Accepted 3-D error [m].
+
+    Returns
+    -------
+    str
+        The rule.
+    """
     return (
         f"Accepted where the global test passes, {RADIUS_95:g} times the 3-D sigma of each station "
         "(not less than its radius of 95 %) and the largest difference at control are within "
