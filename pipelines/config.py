@@ -101,10 +101,13 @@ class ExtractionConfig:
         Returns less than this above the local ground start no marker [m]. 0.20: most rocks are
         lower, and the balls of a survey stand higher.
     scatter_max : float
-        Along-beam scatter about a sphere above this is no noise [m]. 0.035: the maker's 0.03 and
-        its uncertainty.
+        The first guess of the noise of ranges is at most this [m]. 0.035: the maker's 0.03 and its
+        uncertainty.
     n_points_min : int
         A group with fewer returns is not looked at. 6: twice the unknowns of a centre.
+    false_rate : float
+        Wanted rate of false markers in a scan. 0.01: a group is a marker where the probability that
+        it is none is at most this. Groups that are rather markers than not are possible ones.
     range_max : float
         Markers are not looked for beyond this distance [m]. 35: fewer than six returns there.
     """
@@ -113,6 +116,7 @@ class ExtractionConfig:
     ground_clearance: float = 0.20
     scatter_max: float = 0.035
     n_points_min: int = 6
+    false_rate: float = 0.01
     range_max: float = 35.0
 
     def __post_init__(self) -> None:
@@ -120,6 +124,7 @@ class ExtractionConfig:
         _check("extraction.ground_clearance", self.ground_clearance, 0.02, 2.0)
         _check("extraction.scatter_max", self.scatter_max, 0.001, 0.1)
         _check("extraction.n_points_min", self.n_points_min, 4, 1000)
+        _check("extraction.false_rate", self.false_rate, 1e-9, 0.5)
         _check("extraction.range_max", self.range_max, 1.0, 100.0)
 
 

@@ -6,10 +6,9 @@
 - ``cells`` sorts returns by place and direction,
 - ``ground`` separates the ground, ``seeds`` picks the places to examine,
 - ``neighbourhoods`` gathers the returns about a place, ``features`` measures their shape,
-- ``evidence`` counts where the beams towards and about a group end, ``pulses`` those of which no
-  return shows it,
+- ``evidence`` gathers the beams towards and about a group, ``pulses`` those without a return,
 - ``hypotheses`` compares the sphere with other shapes,
-- ``decision`` gives the reasons why a group is no marker.
+- ``decision`` says what a group is, and how surely.
 
 Works in the base frame with the levelled vertical. The sensor is taken as one point (the origin of
 the base): a few centimetres of axis offset do not change which returns look like a sphere.
@@ -17,29 +16,39 @@ the base): a few centimetres of axis offset do not change which returns look lik
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
+from scipy.spatial import KDTree
 
 from spheremark.pipelines.config import ExtractionConfig
 from spheremark.pipelines.detection.cells import cells_of
 from spheremark.pipelines.detection.decision import (
-    Reference,
+    Judgement,
     distinct,
     is_resolved,
-    reason_among_markers,
+    judged,
+    noise_of,
     reason_by_evidence,
     reason_by_features,
-    reason_by_hypotheses,
-    reference_of,
-    spread_expected,
-    with_reference_scatter,
+    reason_by_reflectivity,
+    reflectivity_of,
+    sure_ones,
 )
 from spheremark.pipelines.detection.evidence import Evidence, gather_evidence
-from spheremark.pipelines.detection.features import NOISE_MIN, Features, measure_features
+from spheremark.pipelines.detection.features import (
+    N_RESOLVED,
+    NOISE_MIN,
+    Features,
+    measure_features,
+)
 from spheremark.pipelines.detection.ground import ground_of
-from spheremark.pipelines.detection.hypotheses import compare_hypotheses
+from spheremark.pipelines.detection.hypotheses import NAMES, Physics, log_likelihoods
+from spheremark.pipelines.detection.pulses import Hearing
 from spheremark.pipelines.detection.seeds import find_seeds
 from spheremark.pipelines.detection.target import Target
 from spheremark.pipelines.model import (
+    Array,
     Index,
     MarkerCandidate,
     MarkerCandidates,
@@ -47,13 +56,27 @@ from spheremark.pipelines.model import (
     StitchedCloud,
     marker_name,
 )
+from spheremark.pipelines.threads import side_by_side
 
 __all__ = ["extract"]
 
 _MIDDLE = 0.87  # radii: incidence up to 60 degrees, as ASTM E3125-17 takes them
+_POSSIBLE = 0.9  # probability from which a group that is no sure marker is a possible one
 _REJECTIONS_MAX = 200  # the most sphere-like groups that are kept with their reason
+_SIGMAS_LOG_NOISE = (0.3, 0.6)  # of one marker about the others of a scan; of a scan about a group
 
-_Group = tuple[Features, Evidence]
+_NEARBY = 1.0  # [m] beyond two radii within which other groups show leaves, walls and fences
+
+
+class _Compared(NamedTuple):
+    """A group that is compared: its features, its evidence, and how many others stand near it."""
+
+    features: Features
+    evidence: Evidence
+    n_neighbours: int
+
+
+_Group = tuple[_Compared, Judgement]
 
 
 def extract(
@@ -66,100 +89,122 @@ def extract(
     cloud : StitchedCloud
         One stop; rings and times are not needed.
     config : ExtractionConfig
-        Ground grid, limits of the tests.
+        Ground grid, first tests, level of decision.
     marker_radius : float
         Radius of the spheres [m].
 
     Returns
     -------
     MarkerCandidates
-        Candidates in the order of azimuth; of the groups that passed the first test of size and
-        were then rejected, the (at most 200) most like a sphere, with the reason; and the height of
-        the highest ground point within 10 m, where the published method cuts its clouds.
+        Candidates in the order of azimuth; possible ones; of the groups that passed the first test
+        of size and were then rejected, the (at most 200) most like a sphere, with the reason; and
+        the height of the highest ground point within 10 m, where the published method cuts its
+        clouds.
 
     Notes
     -----
-    A marker is a sphere of known radius that stands free on a pole. Each place where a surface ends
-    upward and to a side is a seed: mean shift of a disc of the sphere's size, a robust fit along
-    the beams, then the tests of ``decision``. Ground is the opening of the lowest point per cell.
-    Where no ground was seen, nothing is cut. Cost grows linearly with the returns.
+    A marker is a sphere of known radius on a pole. Each place where a surface ends upward and to a
+    side is a seed: mean shift of a disc of the sphere's size, a robust fit along the beams; then
+    the beams about it are compared under nine hypotheses. Ground is the opening of the lowest point
+    per cell. Where no ground was seen, nothing is cut. Cost grows linearly with the returns.
     """
     cells = cells_of(cloud, config)
     target = Target(marker_radius, cells.R_station_base[2], float(cloud.rig.divergence.max()))
     ground = ground_of(cloud, cells, config)
     seeds = find_seeds(ground.points_above, target, config.n_points_min)
     groups = distinct(measure_features(cloud, cells, seeds, target), config, marker_radius)
-    reasons = [reason_by_features(features, config, target) for features in groups]
-    passed = [features for features, reason in zip(groups, reasons, strict=True) if not reason]
-    centres = np.array([features.p_base for features in passed]).reshape(-1, 3)
-    evidence = gather_evidence(cloud, cells.directions, centres, target)
-    found, later = _decided(list(zip(passed, evidence, strict=True)), config, target)
-    following = iter(later)
-    reasons = [reason or next(following) for reason in reasons]
-    rejected = [one for one in zip(groups, reasons, strict=True) if one[1]]
+    reasons = [reason_by_features(features, marker_radius) for features in groups]
+    near = _n_neighbours(groups, marker_radius)
+    passed = [i for i, reason in enumerate(reasons) if not reason]
+    centres = np.array([groups[i].p_base for i in passed]).reshape(-1, 3)
+    gathered, hearing = gather_evidence(cloud, cells.directions, centres, target)
+    evidence = dict(zip(passed, gathered, strict=True))
+    for i in passed:
+        reasons[i] = reason_by_evidence(groups[i], evidence[i], target)
+    compared = [_Compared(groups[i], evidence[i], near[i]) for i in passed if not reasons[i]]
+    judgements = judged(_log_likelihoods(compared, noise_of(groups), hearing, config, target))
+    is_sure = sure_ones([one.probability for one in judgements], config.false_rate)
+    usual = reflectivity_of(
+        [one.evidence for one, sure in zip(compared, is_sure, strict=True) if sure]
+    )
+    markers, possible, rejected = list[_Group](), list[Rejection](), list[Rejection]()
+    for one, judgement, sure in zip(compared, judgements, is_sure, strict=True):
+        other = reason_by_reflectivity(one.evidence, usual)
+        if sure and not other:
+            markers.append((one, judgement))
+            continue
+        groups_of = possible if judgement.probability >= _POSSIBLE else rejected
+        reason = other or judgement.reason
+        groups_of.append(_rejection(one.features, reason, judgement.probability))
+    rejected += [
+        _rejection(features, reason)
+        for features, reason in zip(groups, reasons, strict=True)
+        if reason
+    ]
     return MarkerCandidates(
-        candidates=_candidates(found, target),
-        rejected=tuple(
-            Rejection(p_base=features.p_base, n_points=features.n_points, reason=reason)
-            for features, reason in rejected[:_REJECTIONS_MAX]
-        ),
+        candidates=_candidates(markers, target),
+        possible=tuple(possible),
+        rejected=tuple(rejected[:_REJECTIONS_MAX]),
         ground_height_max=ground.height_max,
     )
 
 
-def _decided(
-    groups: list[_Group], config: ExtractionConfig, target: Target
-) -> tuple[list[_Group], list[str]]:
-    """Return the groups that may be markers, and for every group the reason against it.
+def _n_neighbours(groups: list[Features], radius: float) -> list[int]:
+    """Return how many other groups stand near each."""
+    if not groups:
+        return []
+    tree = KDTree(np.array([features.p_base for features in groups]))
+    near = tree.query_ball_point(tree.data, _NEARBY + 2.0 * radius, return_length=True)
+    return list((np.asarray(near) - 1).tolist())
 
-    First each group by its own evidence; then against other shapes and the remaining groups, among
-    which none scatters less than the others.
-    """
-    reasons = [reason_by_evidence(*group, target) for group in groups]
-    reference = reference_of(
-        [group for group, reason in zip(groups, reasons, strict=True) if not reason]
+
+def _rejection(features: Features, reason: str, probability: float = float("nan")) -> Rejection:
+    """Return a group that is not used."""
+    return Rejection(
+        p_base=features.p_base,
+        n_points=features.n_points,
+        reason=reason,
+        probability=probability,
     )
-    groups = [(with_reference_scatter(group[0], reference), group[1]) for group in groups]
-    reasons = [
-        reason or _reason_in_context(*group, reference, config, target)
-        for group, reason in zip(groups, reasons, strict=True)
-    ]
-    return [group for group, reason in zip(groups, reasons, strict=True) if not reason], reasons
 
 
-def _reason_in_context(
-    features: Features,
-    evidence: Evidence,
-    reference: Reference,
+def _log_likelihoods(
+    compared: list[_Compared],
+    noise: float,
+    hearing: Hearing,
     config: ExtractionConfig,
     target: Target,
-) -> str:
-    """Return why a group that passed alone is rejected among the others of the scan."""
-    return (
-        reason_by_features(features, config, target)
-        or reason_by_evidence(features, evidence, target)
-        or _reason_by_shape(features, evidence, target, reference.noise)
-        or reason_among_markers(features, evidence, reference)
-    )
+) -> Array:
+    """Return the logarithms of the likelihoods of some groups by all hypotheses, (n, k)."""
+    found = np.empty((len(compared), len(NAMES)))
 
+    def compare(first: int, end: int) -> None:
+        for i, (features, evidence, n_neighbours) in enumerate(compared[first:end], first):
+            if np.isnan(noise):
+                least = 0.0 if features.n_points >= N_RESOLVED else NOISE_MIN
+                own = min(max(features.scatter, least), config.scatter_max)
+                physics = Physics(own, _SIGMAS_LOG_NOISE[1], *hearing)
+            else:
+                physics = Physics(noise, _SIGMAS_LOG_NOISE[0], *hearing)
+            distance = float(np.linalg.norm(features.p_base))
+            found[i] = log_likelihoods(evidence, distance, n_neighbours, target.radius, physics)
 
-def _reason_by_shape(features: Features, evidence: Evidence, target: Target, noise: float) -> str:
-    """Return why another shape explains a group better; NaN noise stands for the group's own."""
-    spread = evidence.spread / spread_expected(features, target)
-    noise = max(features.scatter, NOISE_MIN) if np.isnan(noise) else noise
-    return reason_by_hypotheses(compare_hypotheses(features, evidence.seen, spread, target, noise))
+    side_by_side(compare, len(compared), threaded_from=4)
+    return found
 
 
 def _candidates(found: list[_Group], target: Target) -> tuple[MarkerCandidate, ...]:
     """Return candidates M01, M02 ... by azimuth."""
-    ordered = sorted(found, key=lambda group: np.arctan2(group[0].y, group[0].x))
+    ordered = sorted(found, key=lambda group: np.arctan2(group[0].features.y, group[0].features.x))
     return tuple(
         MarkerCandidate(
             name=marker_name(place),
-            members=_members(features, evidence, target),
-            p_base_rough=features.p_base,
+            members=_members(one.features, one.evidence, target),
+            p_base_rough=one.features.p_base,
+            probability=judgement.probability,
+            hypothesis=judgement.hypothesis,
         )
-        for place, (features, evidence) in enumerate(ordered)
+        for place, (one, judgement) in enumerate(ordered)
     )
 
 
@@ -171,7 +216,7 @@ def _members(features: Features, evidence: Evidence, target: Target) -> Index:
     """
     across, along, depth = evidence.seen
     reach = 1.5 * target.radius + features.blur
-    if is_resolved(features, target):
+    if is_resolved(features, target.radius):
         reach = _MIDDLE * target.radius
     is_about = across * across + along * along < reach * reach
     is_level = (depth > -2.2 * target.radius) & (depth < 1.6 * target.radius)

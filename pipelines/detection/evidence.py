@@ -20,11 +20,11 @@ from spheremark.pipelines.detection.cells import (
     rows_in,
 )
 from spheremark.pipelines.detection.pulses import (
-    WELL_INSIDE,
+    Clock,
     Hearing,
     clock_of,
-    count_unheard,
     hearing_of,
+    unheard_about,
 )
 from spheremark.pipelines.detection.target import (
     Target,
@@ -34,7 +34,7 @@ from spheremark.pipelines.detection.target import (
     seen_from,
     view_of,
 )
-from spheremark.pipelines.model import Array, Column, StitchedCloud
+from spheremark.pipelines.model import Array, Column, Rig, StitchedCloud
 from spheremark.pipelines.threads import side_by_side
 
 _STEP = 0.05  # [m] at most between the directions about a centre whose cells are searched
@@ -44,10 +44,8 @@ _ON = (-1.3, 0.3)  # radii of depth within which a return may lie on the sphere
 _PLACE = 0.1  # radii: beams nearer to each other than this pass at the same place
 _MEAN_WIDTH = 0.75  # of the greater half width of a beam: in any direction
 _TINY = 1e-6
-_TOUCHING = 0.10  # share of the beams on a sphere that may end elsewhere: mixed pixels
+_ROUGH, _SLOPE = 0.05, 0.1  # [m] of the ground, and its tilt
 _OBSTRUCTED = 3.0  # ratio of beams below it that end nearer to those that go past
-_LOUD = 4.0  # times the weakest echoes of a scan: none is lost for weakness
-_LOST_MAX, _SIGMAS_LOST = 0.5, 3.0  # a scan that loses more shows no openings; chance
 _UNKNOWN = Hearing(lost=1.0, weakest=0.0)
 
 _Groups = tuple[NDArray[np.int64], NDArray[np.int32]]  # start of each group, and the members
@@ -60,13 +58,8 @@ class Evidence(NamedTuple):
     ----------
     n_on : int
         Returns inside the limb at the depth of the sphere.
-    n_through : int
-        Returns well inside the limb that lie behind the sphere.
     n_before : int
         Returns inside the limb that lie before the sphere: beams that would have met it.
-    spread : float
-        Mean square of the distances from the centre at which the beams of ``n_on`` pass it, in
-        units of the radius squared: about a half for a sphere of the known radius.
     n_held : int
         Returns below it and beside the pole, at about its distance.
     n_past : int
@@ -83,16 +76,20 @@ class Evidence(NamedTuple):
         Returns of the cloud whose beams pass within four radii, ascending.
     seen : (3, m)
         How these beams pass the centre, as from ``passing`` [m].
-    n_silent : int
-        Pulses well inside the limb without a return; -1 where times or rings do not show them.
-    n_open : int
-        As many of them as the scan would not have lost on a surface that echoes as strongly.
+    faces : (m,)
+        Plus or minus a half by the face of the scan that they are of.
+    silent : (3, k), optional
+        Where pulses without a return pass it, across and up [m], and their face; None where times
+        or rings do not show them.
+    blur : (2,)
+        Half the width of a beam across and up the line of sight [m].
+    height, sigma_height : float
+        Height of the centre above what is seen just before it, and its standard deviation as a
+        height above the ground [m]; infinite where nothing is seen there.
     """
 
     n_on: int
-    n_through: int
     n_before: int
-    spread: float
     n_held: int
     n_past: int
     n_short: int
@@ -100,8 +97,11 @@ class Evidence(NamedTuple):
     n_distinct: int
     rows: NDArray[np.int32]
     seen: Array
-    n_silent: int = -1
-    n_open: int = 0
+    faces: Array
+    silent: Array | None
+    blur: Array
+    height: float
+    sigma_height: float
 
     @property
     def is_open_below(self) -> bool:
@@ -118,12 +118,6 @@ class Evidence(NamedTuple):
         return self.n_past > 2 and self.n_past > self.n_held + self.n_short
 
     @property
-    def is_gapless(self) -> bool:
-        """Whether all pulses well inside its limb are known, and next to none goes past."""
-        n_past = self.n_through + self.n_silent
-        return self.n_silent >= 0 and n_past <= 1.0 + _TOUCHING * min(self.n_aimed, 2 * self.n_on)
-
-    @property
     def n_aimed(self) -> int:
         """Number of beams that would have met the sphere if nothing were nearer."""
         return self.n_on + self.n_before
@@ -131,10 +125,10 @@ class Evidence(NamedTuple):
 
 def gather_evidence(
     cloud: StitchedCloud, directions: NDArray[np.uint16], centres: Array, target: Target
-) -> list[Evidence]:
-    """Count the beams towards and about some centres by the depth at which they end."""
+) -> tuple[list[Evidence], Hearing]:
+    """Return the beams towards and about some centres, and how well the scan hears its echoes."""
     if not len(centres):
-        return []
+        return [], _UNKNOWN
     clock = clock_of(cloud)
     hearing = hearing_of(cloud, clock, target.up) if clock is not None else _UNKNOWN
     reach = (_REACH + 0.5) * target.radius + 0.05
@@ -148,31 +142,104 @@ def gather_evidence(
 
     parts = side_by_side(towards, len(directions))
 
-    def counted(first: int, end: int) -> list[Evidence]:
-        found = []
-        for i in range(first, end):
-            rows = np.concatenate([rows[begin[i] : begin[i + 1]] for begin, rows in parts])
-            fields = _count_beams(cloud.p_base, cloud.intensities, rows, centres[i], target)
-            one = Evidence(*fields)
-            if clock is not None:
-                inside, below = count_unheard(cloud, clock, rows, centres[i], target)
-                n_open = 0
-                if one.brightness > _LOUD * hearing.weakest * float(centres[i] @ centres[i]):
-                    n_open = _n_open(inside, one.n_on, hearing)
-                n_past = one.n_past + below
-                one = one._replace(n_silent=inside, n_open=n_open, n_past=n_past)
-            found.append(one)
-        return found
+    def gathered(first: int, end: int) -> list[Evidence]:
+        return [
+            _evidence_at(
+                cloud,
+                clock,
+                np.concatenate([rows[begin[i] : begin[i + 1]] for begin, rows in parts]),
+                centres[i],
+                target,
+            )
+            for i in range(first, end)
+        ]
 
-    return list(chain(*side_by_side(counted, len(centres), threaded_from=4)))
+    return list(chain(*side_by_side(gathered, len(centres), threaded_from=4))), hearing
 
 
-def _n_open(n_silent: int, n_on: int, hearing: Hearing) -> int:
-    """Return how many silent pulses inside the limb are more than a scan loses by chance."""
-    if hearing.lost > _LOST_MAX:
-        return 0
-    expected = n_on * hearing.lost / (1.0 - hearing.lost)
-    return max(int(n_silent - expected - _SIGMAS_LOST * np.sqrt(expected)), 0)
+def _evidence_at(
+    cloud: StitchedCloud, clock: Clock | None, rows: NDArray[np.int32], c: Array, target: Target
+) -> Evidence:
+    """Return the evidence of the beams of some returns, and of the pulses between them."""
+    angles = cloud.gimbal_angles[rows.astype(np.intp)]
+    origins = _origins(cloud.rig, angles)
+    n_on, n_before, n_held, n_past, n_short, brightness, n_distinct, seen = _count_beams(
+        cloud.p_base, cloud.intensities, rows, c, target, origins
+    )
+    silent = None
+    if clock is not None:
+        silent = unheard_about(cloud, clock, rows, c, target)
+        n_past += _n_beside_pole(silent / target.radius, blur_at(c, target) / target.radius)
+    height, sigma_height = _height_above_ground(cloud.p_base, rows, seen, c, target)
+    is_left = np.cos(angles) * c[1] > np.sin(angles) * c[0]
+    return Evidence(
+        n_on=n_on,
+        n_before=n_before,
+        n_held=n_held,
+        n_past=n_past,
+        n_short=n_short,
+        brightness=brightness,
+        n_distinct=n_distinct,
+        rows=rows,
+        seen=seen,
+        faces=np.where(is_left, 0.5, -0.5),
+        silent=silent,
+        blur=_half_widths(cloud.rig, angles, c, target),
+        height=height,
+        sigma_height=sigma_height,
+    )
+
+
+@compiled
+def _height_above_ground(
+    p_base: Column, rows: NDArray[np.int32], seen: Array, c: Array, target: Target
+) -> tuple[float, float]:
+    """Return the height of a centre above what is seen just below and before it, and its sigma [m].
+
+    The nearest return decides; between it and the place the ground may rise or fall by a slope.
+    """
+    radius, height, sigma = target.radius, np.nan, np.inf
+    blur = blur_at(c, target) / radius
+    for i in range(len(rows)):
+        across, along, depth = seen[0, i] / radius, seen[1, i] / radius, seen[2, i] / radius
+        if depth > _HELD[1] or not is_beside_pole(abs(across), along, blur):
+            continue
+        p, q, r = p_base[rows[i], 0] - c[0], p_base[rows[i], 1] - c[1], p_base[rows[i], 2] - c[2]
+        up = p * target.up[0] + q * target.up[1] + r * target.up[2]
+        away = np.sqrt(max(p * p + q * q + r * r - up * up, 0.0))
+        own = _ROUGH + _SLOPE * away
+        if own < sigma:
+            height, sigma = -up, own
+    return height, sigma
+
+
+def _origins(rig: Rig, angles: Column) -> Array:
+    """Return where the beams under some gimbal angles leave the head, (2, n) [m]."""
+    c, s, (x, y) = np.cos(angles), np.sin(angles), rig.T_head_lidar[:2, 3]
+    return np.array([c * x - s * y, s * x + c * y], np.float64)
+
+
+def _half_widths(rig: Rig, angles: Column, c: Array, target: Target) -> Array:
+    """Return half the width of a beam at a place across and up the line of sight [m]."""
+    if not len(angles):
+        return np.full(2, blur_at(c, target))
+    angle = angles[len(angles) // 2]
+    x, y, z = rig.T_head_lidar[:3, 2]
+    axis = (np.cos(angle) * x - np.sin(angle) * y, np.sin(angle) * x + np.cos(angle) * y, z)
+    view = view_of(c, target.up)
+    aside = np.array([np.dot(axis, view.across), np.dot(axis, view.up)]) ** 2
+    sweep, along = rig.divergence**2
+    half: Array = 0.5 * np.linalg.norm(c) * np.sqrt(aside * along + (1.0 - aside) * sweep)
+    return half
+
+
+@compiled
+def _n_beside_pole(silent: Array, blur: float) -> int:
+    """Return how many pulses without a return pass below a sphere and beside its pole."""
+    n = 0
+    for i in range(silent.shape[1]):
+        n += is_beside_pole(abs(silent[0, i]), silent[1, i], blur)
+    return n
 
 
 def _cones(centres: Array, target: Target) -> Array:
@@ -184,14 +251,24 @@ def _cones(centres: Array, target: Target) -> Array:
 
 @compiled
 def _count_beams(
-    p_base: Column, intensities: Column, rows: NDArray[np.int32], c: Array, target: Target
-) -> tuple[int, int, int, float, int, int, int, float, int, NDArray[np.int32], Array]:
-    """Return the fields of ``Evidence`` of one group, from its returns."""
+    p_base: Column,
+    intensities: Column,
+    rows: NDArray[np.int32],
+    c: Array,
+    target: Target,
+    origins: Array,
+) -> tuple[int, int, int, int, int, float, int, Array]:
+    """Return the counts of ``Evidence``, its brightness, and how the beams pass the centre."""
     radius = target.radius
     blur = blur_at(c, target) / radius
-    seen = seen_from(rays_of(p_base, rows), view_of(c, target.up))
-    n_on, n_through, n_before, n_held, n_past, n_short, n_distinct = 0, 0, 0, 0, 0, 0, 0
-    gaps2, light, lit = 0.0, 0.0, 0.0
+    view, rays = view_of(c, target.up), rays_of(p_base, rows)
+    seen = seen_from(rays, view)
+    for i in range(len(rows)):  # the beam leaves the head, not the origin of the base
+        share, x, y = seen[2, i] / rays[3, i], origins[0, i], origins[1, i]
+        seen[0, i] += share * (view.across[0] * x + view.across[1] * y)
+        seen[1, i] += share * (view.up[0] * x + view.up[1] * y)
+    n_on, n_before, n_held, n_past, n_short, n_distinct = 0, 0, 0, 0, 0, 0
+    light, lit = 0.0, 0.0
     half = int((1.0 + blur) / _PLACE) + 1
     is_met = np.zeros((2 * half, 2 * half), np.bool_)
     for i in range(len(rows)):
@@ -200,7 +277,6 @@ def _count_beams(
         is_aimed = gap < 1.0 + blur and along > -0.9
         if is_aimed and _ON[0] < depth < _ON[1]:
             n_on += 1
-            gaps2 += gap * gap
             column = half + int(np.floor(seen[0, i] / radius / _PLACE))
             row = half + int(np.floor(along / _PLACE))
             n_distinct += not is_met[column, row]
@@ -209,14 +285,11 @@ def _count_beams(
             light += share * intensities[rows[i]]
             lit += share * share
         n_before += is_aimed and depth <= _ON[0]
-        n_through += gap < WELL_INSIDE and depth > 1.0
         if is_beside_pole(across, along, blur):
             n_past += depth > _HELD[1]
             n_short += depth < _HELD[0]
             n_held += _HELD[0] <= depth <= _HELD[1]
-    spread, brightness = gaps2 / max(n_on, 1), light / max(lit, _TINY)
-    counts = (n_on, n_through, n_before, spread, n_held, n_past, n_short)
-    return (*counts, brightness, n_distinct, rows, seen)
+    return n_on, n_before, n_held, n_past, n_short, light / max(lit, _TINY), n_distinct, seen
 
 
 @compiled

@@ -12,13 +12,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from spheremark.pipelines.compilation import compiled
-from spheremark.pipelines.detection.target import Target, blur_at, is_beside_pole, view_of
+from spheremark.pipelines.detection.target import Target, view_of
 from spheremark.pipelines.model import RING_UNKNOWN, Array, Index, StitchedCloud
 from spheremark.pipelines.scan.rigs import FIRING_CYCLE, FIRING_ORDER, LASER_CYCLE, N_LASERS
 from spheremark.pipelines.scan.stitching import beams
-
-WELL_INSIDE = 0.8
-"""Radii: no beam that passes nearer misses a sphere."""
 
 _REACH = 3.0  # radii: the returns of beams that pass nearer are all known
 _DELAYS = np.argsort(FIRING_ORDER) * LASER_CYCLE  # [s] of each laser within its firing
@@ -110,10 +107,10 @@ def clock_of(cloud: StitchedCloud) -> Clock | None:
     )
 
 
-def count_unheard(
+def unheard_about(
     cloud: StitchedCloud, clock: Clock, rows: NDArray[np.int32], c: Array, target: Target
-) -> tuple[int, int]:
-    """Return how many pulses have no return: well inside a sphere, and below it beside its pole.
+) -> Array:
+    """Return where pulses without a return pass a centre, across and up [m], and faces, (3, k).
 
     ``rows`` are the returns about it.
     """
@@ -121,8 +118,8 @@ def count_unheard(
     rings = cloud.rings[rows].astype(np.int64)
     seconds = cloud.times[rows.astype(np.intp)] - _DELAYS[rings] - clock.phase
     heard = np.sort(np.rint(seconds / FIRING_CYCLE).astype(np.int64) * N_LASERS + rings)
-    inside, below = _count_unheard(clock, _DELAYS, heard, c, target)
-    return int(inside), int(below)
+    found: Array = _unheard(clock, _DELAYS, heard, c, target)
+    return found
 
 
 class Hearing(NamedTuple):
@@ -208,16 +205,16 @@ def _at(times: Array, values: Array, t: float) -> float:
 
 
 @compiled
-def _count_unheard(  # noqa: PLR0915  one compiled loop
+def _unheard(  # noqa: C901, PLR0915  one compiled loop
     clock: Clock, delays: Array, heard: NDArray[np.int64], c: Array, target: Target
-) -> tuple[int, int]:
-    """Return how many pulses inside a sphere, and below it beside its pole, were not heard.
+) -> Array:
+    """Return where pulses that were not heard pass a centre, and on which face, (3, k).
 
     Once a revolution the plane of the lasers passes the place; about that instant each pulse is
     tried.
     """
-    n_inside, n_below, R, radius = 0, 0, clock.R, target.radius
-    view, blur, reach = view_of(c, target.up), blur_at(c, target) / radius, _REACH * radius
+    found, n, R = np.empty((3, 256)), 0, clock.R
+    view, reach = view_of(c, target.up), _REACH * target.radius
     distance = np.sqrt(c[0] ** 2 + c[1] ** 2 + c[2] ** 2)
     aside = np.sqrt(clock.origin[0] ** 2 + clock.origin[1] ** 2) + np.max(np.abs(clock.heights))
     wide = (reach + aside) / distance + _MARGIN
@@ -278,11 +275,12 @@ def _count_unheard(  # noqa: PLR0915  one compiled loop
                 p, q, u, v = cs * p - sn * q, sn * p + cs * q, cs * u - sn * v, sn * u + cs * v
                 along = (c[0] - p) * u + (c[1] - q) * v + (c[2] - r) * w
                 dx, dy, dz = p + along * u - c[0], q + along * v - c[1], r + along * w - c[2]
-                gap2 = (dx * dx + dy * dy + dz * dz) / (radius * radius)
-                if along < 0.0 or gap2 > _REACH * _REACH:
+                if along < 0.0 or dx * dx + dy * dy + dz * dz > reach * reach:
                     continue
-                across = (dx * view.across[0] + dy * view.across[1] + dz * view.across[2]) / radius
-                upward = (dx * view.up[0] + dy * view.up[1] + dz * view.up[2]) / radius
-                n_inside += gap2 < WELL_INSIDE * WELL_INSIDE
-                n_below += is_beside_pole(across, upward, blur)
-    return n_inside, n_below
+                if n == found.shape[1]:
+                    found = np.concatenate((found, np.empty_like(found)), axis=1)
+                found[0, n] = dx * view.across[0] + dy * view.across[1] + dz * view.across[2]
+                found[1, n] = dx * view.up[0] + dy * view.up[1] + dz * view.up[2]
+                found[2, n] = 0.5 if sn * c[0] < cs * c[1] else -0.5
+                n += 1
+    return found[:, :n].copy()

@@ -1,18 +1,18 @@
-"""What is refused for its surroundings, and when a shape is close enough to do without them."""
+"""What is refused before it is compared, and which of those that are compared are markers."""
 
 import numpy as np
 import pytest
 
-from spheremark.pipelines.config import ExtractionConfig
 from spheremark.pipelines.detection.decision import (
     is_resolved,
+    judged,
     reason_by_evidence,
     reason_by_features,
-    reference_of,
-    with_reference_scatter,
+    sure_ones,
 )
 from spheremark.pipelines.detection.evidence import Evidence
 from spheremark.pipelines.detection.features import Features
+from spheremark.pipelines.detection.hypotheses import NAMES
 from spheremark.pipelines.detection.target import Target
 
 TARGET = Target(0.10, np.array([0.0, 0.0, 1.0]), 0.003)
@@ -33,16 +33,15 @@ def features(n_points=70, scatter_free=0.0075, **changes):
 def evidence(**changes):
     """A ball that stands on a pole before something far."""
     seen = Evidence(
-        n_on=70, n_through=0, n_before=0, spread=0.55, n_held=0, n_past=150, n_short=0,
-        brightness=50.0, n_distinct=70, rows=np.empty(0, np.int32), seen=np.empty((3, 0)),
+        n_on=70, n_before=0, n_held=0, n_past=150, n_short=0, brightness=50.0, n_distinct=70,
+        rows=np.empty(0, np.int32), seen=np.empty((3, 0)), faces=np.empty(0), silent=None,
+        blur=np.full(2, 0.015), height=np.nan, sigma_height=np.inf,
     )  # fmt: skip
     return seen._replace(**changes)
 
 
 def refusal(seen, about):
-    return reason_by_features(seen, ExtractionConfig(), TARGET) or reason_by_evidence(
-        seen, about, TARGET
-    )
+    return reason_by_features(seen, TARGET.radius) or reason_by_evidence(seen, about, TARGET)
 
 
 def test_a_ball_on_a_pole_passes_and_a_head_on_shoulders_does_not():
@@ -53,28 +52,8 @@ def test_a_ball_on_a_pole_passes_and_a_head_on_shoulders_does_not():
 
 def test_a_ball_seen_more_closely_than_any_other_shape_may_stand_on_something():
     close = features(scatter_free=0.003, **SHOULDERS)
-    assert is_resolved(close, TARGET)
+    assert is_resolved(close, TARGET.radius)
     assert refusal(close, evidence(n_held=56, n_past=3)) == ""
-
-
-def test_among_markers_that_scatter_more_none_is_seen_closely():
-    """Of seventy returns, a robust scatter is less by a third once in fifty."""
-    lucky = features(scatter_free=0.005, **SHOULDERS)
-    others = [(features(), evidence()) for _ in range(3)]
-    assert is_resolved(lucky, TARGET)
-    usual = with_reference_scatter(lucky, reference_of([*others, (lucky, evidence())]))
-    assert usual == lucky._replace(scatter_free=0.0075)
-    assert not is_resolved(usual, TARGET)
-    assert "head" in refusal(usual, evidence())
-
-
-def test_a_ball_alone_or_among_others_as_close_stays_close():
-    close = features(scatter_free=0.003)
-    alone = reference_of([(close, evidence())] * 2)
-    assert np.isnan(alone.scatter_free)
-    assert with_reference_scatter(close, alone) == close
-    among = reference_of([(features(scatter_free=s), evidence()) for s in (0.002, 0.0032, 0.004)])
-    assert is_resolved(with_reference_scatter(close, among), TARGET)
 
 
 @pytest.mark.parametrize("share_seen", [1.0, 0.5, 0.04])
@@ -94,8 +73,35 @@ def test_of_a_ball_two_thirds_may_be_hidden():
     assert "hidden" in refusal(features(n_points=25), evidence(n_on=25, n_before=55))
 
 
-def test_a_ball_of_which_something_hides_a_side_may_look_slim():
-    slim = features(n_points=34, width=0.056)
-    assert "slim" in refusal(slim, evidence(n_on=34))
-    assert refusal(slim, evidence(n_on=34, n_before=30)) == ""
-    assert "slim" in refusal(slim._replace(width=0.04), evidence(n_on=34, n_before=30))
+def likelihoods(*sphere_over_others):
+    """Logarithms of likelihoods of groups whose other hypotheses are all alike."""
+    found = np.zeros((len(sphere_over_others), len(NAMES)))
+    found[:, 0] = sphere_over_others
+    return found
+
+
+def test_probabilities_follow_the_likelihoods_and_name_the_best_other_hypothesis():
+    found = likelihoods(12.0, 3.0, -4.0)
+    found[2, NAMES.index("head on shoulders")] = 2.0
+    sure, doubtful, head = judged(found)
+    assert sure.probability > 0.999 > doubtful.probability > head.probability
+    assert head.hypothesis.startswith("head on shoulders: ")
+    assert head.reason.startswith("Head on shoulders: ")
+    assert "likelier than a marker" in head.reason
+    assert judged(likelihoods()) == []
+
+
+def test_among_trees_a_group_that_may_be_leaves_is_rather_leaves():
+    doubtful = likelihoods(4.0)
+    leaves = likelihoods(*[-30.0] * 20)
+    leaves[:, NAMES.index("foliage or other clutter")] = 5.0
+    alone = judged(doubtful)[0].probability
+    assert judged(np.vstack([doubtful, leaves]))[0].probability < alone
+
+
+def test_markers_hold_no_more_false_ones_than_wanted():
+    probabilities = [0.999, 0.996, 0.9999, 0.992, 0.3]
+    assert sure_ones(probabilities, 0.01) == [True, True, True, False, False]
+    assert sure_ones(probabilities, 0.02) == [True, True, True, True, False]
+    assert sure_ones(probabilities, 1e-6) == [False] * 5
+    assert sure_ones([], 0.01) == []

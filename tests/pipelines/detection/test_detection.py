@@ -83,9 +83,9 @@ def test_no_marker_loses_points_to_the_ground(cloud, found):
 @pytest.mark.parametrize(
     ("place", "words"),
     [
-        ((*POST[:2], GROUND + 1.3), "free|pole|curved|radius"),
-        ((*SLIM[:2], GROUND + 0.9), "slim|free|curved|radius"),
-        (BIG, "radius|free"),
+        ((*POST[:2], GROUND + 1.3), "pole|post|Post"),
+        ((*SLIM[:2], GROUND + 0.9), "post|cylinder|box|Box|Post"),
+        (BIG, "radius|pole"),
         (SMALL, "radius|small"),
     ],
 )

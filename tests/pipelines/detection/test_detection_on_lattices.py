@@ -7,7 +7,7 @@ import pytest
 
 from spheremark.pipelines.config import ExtractionConfig, StitchingConfig
 from spheremark.pipelines.detection import extract
-from spheremark.pipelines.detection.pulses import clock_of, count_unheard
+from spheremark.pipelines.detection.pulses import clock_of, unheard_about
 from spheremark.pipelines.detection.target import Target
 from spheremark.pipelines.geometry import inverse, transform
 from spheremark.pipelines.model import RING_UNKNOWN
@@ -30,7 +30,8 @@ def n_silent(scan, place):
     cloud, _, field = scan
     rows = np.flatnonzero(np.linalg.norm(cloud.p_base - place, axis=1) < 0.5).astype(np.int32)
     target = Target(field.marker_radius, np.array([0.0, 0.0, 1.0]), 0.003)
-    return count_unheard(cloud, clock_of(cloud), rows, place, target)[0]
+    across, up, _ = unheard_about(cloud, clock_of(cloud), rows, place, target)
+    return int(np.sum(np.hypot(across, up) < 0.8 * field.marker_radius))
 
 
 def test_no_marker_is_refused_for_the_width_that_the_lines_show_and_nothing_else_is_found(scan):
