@@ -91,7 +91,14 @@ def require_free(path: Path, n_bytes: int) -> None:
     ------
     StorageFullError
         If less is free.
+    StorageError
+        If nothing may be written there.
     """
+    if path.exists() and not os.access(path, os.W_OK):
+        raise StorageError(
+            f"{path.name} cannot be written: its disk is read-only, or the folder is not ours. "
+            "Check the disk, then mount it for writing."
+        )
     if (free := free_bytes(path)) < n_bytes:
         raise StorageFullError(
             f"The disk has {free:,} bytes free; {n_bytes:,} are needed, with what is kept free for "

@@ -145,7 +145,7 @@ class Inbox:
         chunks: AsyncIterator[bytes],
         file: IO[bytes],
         max_bytes: int,
-        seen: Callable[[bytes], None],
+        seen: Callable[[bytearray], None],
     ) -> int:
         """Write all chunks and return how many bytes they are; what was received stays."""
 
@@ -230,7 +230,7 @@ class _Progress:
     sha: Any = field(default_factory=hashlib.sha256)
     n_bytes: int = 0
 
-    def add(self, data: bytes) -> None:
+    def add(self, data: bytes | bytearray) -> None:
         """Take in the next bytes."""
         self.sha.update(data)
         self.n_bytes += len(data)
@@ -322,7 +322,7 @@ class Resumable:
         part = hashlib.new(checksum[0]) if checksum else None
         backup = progress.sha.copy()
 
-        def seen(data: bytes) -> None:
+        def seen(data: bytearray) -> None:
             progress.add(data)
             if part is not None:
                 part.update(data)

@@ -130,8 +130,11 @@ def test_a_worker_out_of_memory_fails_its_job_and_the_next_is_served(
         jobs = client.app.state.service.jobs
         made = site.upload(survey="memory", process="true").json()
         site.begun(made["job"]["job_id"])
-        hoard = jobs._client.run(take_memory, limit, on_error="ignore")
-        asyncio.run_coroutine_threadsafe(hoard, jobs._loop)
+
+        async def hoard():
+            await jobs._client.run(take_memory, limit, on_error="ignore")
+
+        asyncio.run_coroutine_threadsafe(hoard(), jobs._loop)
         ended = site.ended(made["job"]["job_id"])
         assert (ended["status"], ended["error"]["code"]) == ("failed", "worker_died"), ended
         assert "memory" in ended["error"]["reason"]
