@@ -125,7 +125,7 @@ class Victim:
             "fixes twice": sorted({str(one) for one in fixes if fixes.count(one) > 1}),
             "too many attempts": [key for key, one in jobs.items() if one["attempts"] > 10],
             "internal errors": [
-                key for key, one in jobs.items() if (one["error"] or {}).get("code") == "internal"
+                key for key, one in jobs.items() if one["error_code"] == "internal"
             ],
         }
         about = {"logs": len(rows), "jobs": len(jobs), "runs": len(runs), "fixes": len(fixes)}

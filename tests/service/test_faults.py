@@ -136,8 +136,8 @@ def test_a_worker_out_of_memory_fails_its_job_and_the_next_is_served(
 
         asyncio.run_coroutine_threadsafe(hoard(), jobs._loop)
         ended = site.ended(made["job"]["job_id"])
-        assert (ended["status"], ended["error"]["code"]) == ("failed", "worker_died"), ended
-        assert "memory" in ended["error"]["reason"]
+        assert (ended["status"], ended["error_code"]) == ("failed", "worker_died"), ended
+        assert "memory ran out" in ended["error_reason"]
         new = {"kind": "process", "survey": "memory", "recording": made["recording_id"]}
         job = client.post("/api/v1/jobs", json=new).json()["job_id"]
         assert site.ended(job)["status"] == "successful"
