@@ -156,7 +156,7 @@ def test_every_number_of_the_database_carries_its_unit():
     unitless = re.compile(
         r"^(n_|share_|dof$|dop$|sigma0$|redundancy$|w$|coverage$|attempts$"
         r"|mean_(n_points|intensity|redundancy)$"
-        r"|number$|place$|probability_|cov_motion$|optics$|rotation$|n_points_(from|to)$"
+        r"|number$|place$|probability|cov_motion$|optics$|rotation$|n_points_(from|to)$"
         r"|(vtpv|vtpv_limit|w_limit|test_level)$|variance_factor_"
         r"|(start_value|estimate|sigma)$)"  # calibrated_parameters: the unit stands in the row
     )

@@ -68,11 +68,12 @@ def read_centres(
 
 def levelling_of(row: Row) -> Levelling:
     """Return the levelling of a stop from its row."""
-    roll, pitch, sigma, heading = (
-        float(np.radians(row[f"{name}_deg"]))
-        for name in ("roll", "pitch", "sigma_levelling", "sigma_heading")
-    )
-    return Levelling(roll=roll, pitch=pitch, sigma=sigma, is_measured=True, sigma_heading=heading)
+    angles = {
+        name: float(np.radians(row[f"{name}_deg"]))
+        for name in ("roll", "pitch", "sigma_heading", "sigma_clock")
+    }
+    sigma = float(np.radians(row["sigma_levelling_deg"]))
+    return Levelling(sigma=sigma, is_measured=True, **angles)
 
 
 def _fit(row: Row, levelling: Levelling) -> MarkerFit:

@@ -207,6 +207,7 @@ def _stop_row(stop: StopResult, cloud_url: str | None) -> Row:
         "n_returns": len(cloud.p_base),
         "sigma_levelling_deg": np.degrees(cloud.levelling.sigma),
         "sigma_heading_deg": np.degrees(stop.sigma_heading),
+        "sigma_clock_deg": np.degrees(cloud.levelling.sigma_clock),
         "cloud_url": cloud_url,
         "timings_s": json.dumps(dict(stop.timings)),
     }

@@ -28,5 +28,16 @@ def store() -> Typestore:
 
 
 def definition(schema: str) -> str:
-    """Return the whole definition of a type, as ROS 2 records it."""
+    """Return the whole definition of a type, as ROS 2 records it.
+
+    Parameters
+    ----------
+    schema : str
+        Name of the type, as sensor_msgs/msg/PointCloud2.
+
+    Returns
+    -------
+    str
+        Its fields and those of all types in it.
+    """
     return store().generate_msgdef(schema, ros_version=2)[0]

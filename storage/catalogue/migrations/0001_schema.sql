@@ -147,6 +147,7 @@ CREATE TABLE stops (
     pitch_deg DOUBLE NOT NULL,  -- Rotation of the base in R_station_base = Ry(pitch) Rx(roll).
     sigma_levelling_deg DOUBLE NOT NULL,  -- Standard deviation of roll and of pitch.
     sigma_heading_deg DOUBLE NOT NULL,  -- Standard deviation of the heading from mounting and encoder; it rotates all centres of the stop together and is part of their covariances.
+    sigma_clock_deg DOUBLE NOT NULL,  -- Standard deviation of the heading from the clocks of gimbal and LiDAR; it is part of the station's heading alone.
     cloud_url VARCHAR,  -- Location of the thinned cloud; NULL without one.
     notes VARCHAR[] NOT NULL,  -- Weaknesses of the scan, as sentences.
     timings_s JSON NOT NULL,  -- Duration of each step.
