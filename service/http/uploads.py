@@ -145,7 +145,7 @@ class Inbox:
         chunks: AsyncIterator[bytes],
         file: IO[bytes],
         max_bytes: int,
-        seen: Callable[[bytearray], None],
+        seen: Callable[[bytes | bytearray], None],
     ) -> int:
         """Write all chunks and return how many bytes they are; what was received stays."""
 
@@ -322,7 +322,7 @@ class Resumable:
         part = hashlib.new(checksum[0]) if checksum else None
         backup = progress.sha.copy()
 
-        def seen(data: bytearray) -> None:
+        def seen(data: bytes | bytearray) -> None:
             progress.add(data)
             if part is not None:
                 part.update(data)
