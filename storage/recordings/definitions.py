@@ -19,7 +19,13 @@ uint8[1206] data
 
 @cache
 def store() -> Typestore:
-    """Return all types; slow to make the first time."""
+    """Return all types; slow to make the first time.
+
+    Returns
+    -------
+    Typestore
+        Those of ROS 2 and the raw packets.
+    """
     from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
     types = get_typestore(Stores.ROS2_HUMBLE)
