@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import zipfile
 from collections.abc import Callable
+from contextlib import suppress
 from pathlib import PurePosixPath
 from typing import IO
 
@@ -93,9 +94,10 @@ class FolderWriter:
         self._zip.close()
 
     def close(self) -> None:
-        """Close the zip, however much of it there is."""
-        self._end()
-        self._zip.close()
+        """Close the zip, however much of it there is; why it is not whole was raised before."""
+        with suppress(OSError):
+            self._end()
+            self._zip.close()
 
     def _on_name(self, data: bytes, start: int, end: int) -> None:
         """Take a part of the name of a header."""
@@ -119,6 +121,11 @@ class FolderWriter:
             raise InputError(f"The folder has more than {_FILES_MAX} files.")
         path = PurePosixPath(options[b"filename"].decode("utf-8", "replace").replace("\\", "/"))
         about = zipfile.ZipInfo(path.name or "file", _TIME)
+        if about.filename in self._zip.NameToInfo:
+            raise InputError(
+                f"The folder has two files called {about.filename!r}; the files of a log have "
+                "names of their own. Send other folders as logs of their own."
+            )
         self._member = self._zip.open(about, "w", force_zip64=True)
 
     def _add(self, data: bytes, start: int, end: int) -> None:

@@ -146,13 +146,17 @@ def test_the_files_of_a_folder_are_uploaded_in_one_form_as_one_log(site, bag):
     assert again["recording_id"] == answer.json()["recording_id"]
 
 
+PART = b'--x\r\nContent-Disposition: form-data; name="a"; filename="%s"\r\n\r\nA'
+
+
 @pytest.mark.parametrize(
     ("body", "kind", "words"),
     [
         (b"", "multipart/form-data; boundary=x", "empty"),
         (b"--x\r\n\r\n", "multipart/form-data", "boundary"),
         (b"--x--\r\n", "multipart/form-data; boundary=x", "no files"),
-        (b'--x\r\nContent-Disposition: form-data; name="a"; filename="a"\r\n\r\nA', None, "cut"),
+        (PART % b"a", None, "cut"),
+        (PART % b"1/a.bag" + b"\r\n" + PART % b"2/a.bag", None, "two files called 'a.bag'"),
         (b"no boundary here", None, "well-formed"),
     ],
 )
@@ -162,3 +166,5 @@ def test_a_form_that_is_cut_or_has_no_files_is_refused_and_leaves_nothing(site, 
         "/api/v1/recordings?name=a", content=body, headers={"Content-Type": kind}
     )
     assert (answer.status_code, words in answer.json()["detail"]) == (400, True), answer.text
+    partial = site.client.app.state.service.inbox.partial
+    assert [one for one in partial.iterdir() if one.is_file()] == []
