@@ -10,7 +10,7 @@ from typing import Any
 import pyarrow as pa
 from pyarrow import ipc, parquet
 
-from spheremark.storage.catalogue.sandbox import QueryResult
+from spheremark.storage.catalogue.sandbox import QueryRejectedError, QueryResult
 
 _TYPES = {
     "BOOLEAN": pa.bool_(),
@@ -72,15 +72,22 @@ def _table(result: QueryResult) -> pa.Table:
     """Return a result as a table; types without a counterpart become text, as JSON if nested."""
     columns = list(zip(*result.rows, strict=True)) or [()] * len(result.columns)
     kinds = [column.type for column in result.columns]
-    arrays = [_array(kind, values) for kind, values in zip(kinds, columns, strict=True)]
-    table = pa.Table.from_arrays(arrays, names=[column.name for column in result.columns])
+    names = [column.name for column in result.columns]
+    arrays = [_array(*one) for one in zip(names, kinds, columns, strict=True)]
+    table = pa.Table.from_arrays(arrays, names=names)
     return table.replace_schema_metadata({"truncated": str(result.truncated).lower()})
 
 
-def _array(kind: str, values: Sequence[Any]) -> pa.Array:
+def _array(name: str, kind: str, values: Sequence[Any]) -> pa.Array:
     """Return the values of a column."""
     if kind in ("TIMESTAMP", "TIMESTAMP WITH TIME ZONE"):
-        instants = [None if one is None else _instant(one) for one in values]
+        try:
+            instants = [None if one is None else _instant(one) for one in values]
+        except ValueError as error:
+            raise QueryRejectedError(
+                f"The column {name!r} has an instant that no file takes ({error}): files have the "
+                f"years 1 to 9999. Cast it in the query: {name}::VARCHAR."
+            ) from error
         return pa.array(instants, pa.timestamp("us", "UTC")).cast(_TYPES[kind])
     if kind in _TYPES:
         return pa.array(values, _TYPES[kind])

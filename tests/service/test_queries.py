@@ -100,6 +100,15 @@ def test_parameters_of_an_address_are_values_and_no_sql(client):
     assert rows == [[text, 3.5]]
     assert get(client, 422, q="SELECT 1", name="both").json()["code"] == "input.validation"
     assert "name=value" in get(client, 400, q="SELECT $a", p="a").json()["detail"]
+    deep = "[" * 6000  # more than a parser of JSON descends
+    assert get(client, q="SELECT $a AS a", p=f"a={deep}").json()["rows"] == [[deep]]
+
+
+@pytest.mark.parametrize("instant", ["290000-01-01", "infinity", "0044-03-15 (BC)"])
+def test_an_instant_that_files_do_not_have_is_refused_with_its_column(client, instant):
+    sql = f"SELECT '{instant}'::TIMESTAMP AS t"
+    assert "'t'" in get(client, 400, q=sql, format="parquet").json()["detail"]
+    assert get(client, q=sql, format="csv").text.startswith("t")
 
 
 def test_a_query_that_is_kept_is_shared_by_its_name(client):

@@ -112,7 +112,7 @@ def _value_of(text: str) -> tuple[str, Any]:
         raise InputError(f"The parameter {text!r} must have the form name=value.")
     try:
         found = json.loads(value)
-    except ValueError:
+    except (ValueError, RecursionError):
         return name, value
     return name, value if isinstance(found, str | list | dict) else found
 
