@@ -59,6 +59,19 @@ def test_the_pdf_is_of_the_kind_for_archives(client):
     assert len(response.content) < 2_000_000
 
 
+def test_names_are_text_in_the_pdf_and_never_markup(client):
+    """A name of control characters, which no font has, is refused; no name is run as Typst."""
+    for name, status in (('#panic("run") $x$ *b* @c', 200), ("a\x01b", 400)):
+        marks = f"mark,x_m,y_m,z_m\n{name.replace(chr(34), chr(39))},0,0,1\nB,1,0,1\nC,0,1,1\n"
+        address = f"{API}/names-{status}"
+        kind = {"Content-Type": "text/csv"}
+        client.put(f"{address}/control", content=marks, headers=kind).raise_for_status()
+        response = client.get(f"{address}/report.pdf")
+        assert response.status_code == status, response.text
+        assert client.get(f"{address}/report.html").status_code == 200
+    assert "take the report as HTML" in response.json()["detail"]
+
+
 def test_the_page_has_the_same_report_and_links_to_its_files(client):
     text = client.get("/surveys/field/report").text
     (address,) = re.findall(r'href="(/api/v1/surveys/\w+/report\.pdf)"', text)

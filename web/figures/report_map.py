@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Mapping, Sequence
 from typing import Any
 from xml.sax.saxutils import escape
@@ -10,6 +11,7 @@ from xml.sax.saxutils import escape
 Place = Mapping[str, Any]
 
 _WIDTH, _MOST_HEIGHT, _MARGIN = 720.0, 620.0, 46.0
+_NOT_XML = re.compile("[^\t\n\r\x20-\ud7ff\ue000-\ufffd\U00010000-\U0010ffff]")
 _LEAST_ACROSS = 1.0  # [m] of a map of one point
 _ELLIPSE_SHARE = 0.03  # of the map's width that the largest ellipse takes
 _INK, _FAINT, _STATION = "#1a2026", "#b4bbb9", "#1767a8"
@@ -96,8 +98,9 @@ def _ellipse(one: Place, x: float, y: float, scale: float) -> str:
 def _text(x: float, y: float, text: str, size: float = 12.0) -> str:
     """Draw a text."""
     place = f'x="{x:.1f}" y="{y:.1f}" font-size="{size}"'
+    shown = escape(_NOT_XML.sub("\ufffd", text))
     halo = 'stroke="white" stroke-width="3" paint-order="stroke"'  # over lines of sight
-    return f'<text {place} fill="{_INK}" {halo}>{escape(text)}</text>'
+    return f'<text {place} fill="{_INK}" {halo}>{shown}</text>'
 
 
 def _legend(scale: float, factor: float, height: float) -> list[str]:

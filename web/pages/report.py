@@ -10,9 +10,12 @@ from typing import Any
 import typst
 from markupsafe import Markup
 
+from spheremark.pipelines.errors import InputError
 from spheremark.web.figures.report_map import report_map
 from spheremark.web.pages.base import Frame
 from spheremark.web.templating import render
+
+_NO_FONT = "could not be displayed"  # of Typst, where PDF/A is to have each character
 
 
 def report_page(frame: Frame, report: Mapping[str, Any], address: str, query: str = "") -> str:
@@ -28,14 +31,30 @@ def report_html(report: Mapping[str, Any]) -> str:
 
 
 def report_pdf(report: Mapping[str, Any]) -> bytes:
-    """Return the report as PDF/A-2u, which is made for keeping."""
+    """Return the report as PDF/A-2u, which is made for keeping; InputError without a font."""
+    try:
+        return _compiled(report, is_alone=True)
+    except typst.TypstError as error:
+        if _NO_FONT not in str(error):
+            raise
+    try:
+        return _compiled(report, is_alone=False)
+    except typst.TypstError as error:
+        raise InputError(
+            f"The PDF cannot be written: {error}. Install a font that has this character on the "
+            "machine of the service, or take the report as HTML."
+        ) from error
+
+
+def _compiled(report: Mapping[str, Any], *, is_alone: bool) -> bytes:
+    """Return the PDF, with the fonts of the template alone or with those of the machine, too."""
     template = resources.files("spheremark.web").joinpath("templates/report.typ").read_bytes()
     return bytes(
         typst.compile(
             template,
             sys_inputs={"report": json.dumps(_drawn(report))},
             pdf_standards=["a-2u"],
-            ignore_system_fonts=True,
+            ignore_system_fonts=is_alone,
         )
     )
 
