@@ -35,9 +35,8 @@ function undone(text, undo) {
   const button = document.createElement("button");
   button.type = "button";
   button.textContent = "Undo";
-  button.addEventListener("click", async () => {
-    await undo();
-    location.reload();
+  button.addEventListener("click", () => {
+    undo().then(() => location.reload(), complain(by("undo")));
   });
   by("undo").classList.remove("bad");
   by("undo").replaceChildren(`${text} `, button);
@@ -94,14 +93,16 @@ by("options-start").addEventListener("click", async () => {
   }
   await process(chosen, more).then(() => location.reload(), complain(by("options-status")));
 });
-by("move-start").addEventListener("click", async () => {
-  const target = encodeURIComponent(by("move-target").value);
-  await call("PUT", `/api/v1/surveys/${target}/recordings/${chosen}`);
+async function move(target) {
+  const address = `/api/v1/surveys/${encodeURIComponent(target)}`;
+  await call("PUT", `${address}/recordings/${chosen}`);
   await call("DELETE", `${home}/recordings/${chosen}`);
-  await call("POST", "/api/v1/jobs", {
-    kind: "process", survey: by("move-target").value, recording: chosen,
-  });
-  location.assign(`/surveys/${target}/logs`);
+  await call("POST", "/api/v1/jobs", { kind: "process", survey: target, recording: chosen });
+  location.assign(`/surveys/${encodeURIComponent(target)}/logs`);
+}
+
+by("move-start").addEventListener("click", () => {
+  move(by("move-target").value).catch(complain(by("move-status")));
 });
 
 document.addEventListener("control", (event) => {
