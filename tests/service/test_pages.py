@@ -101,6 +101,26 @@ def test_a_survey_is_renamed_deleted_and_restored_with_its_results(client):
     assert client.post(f"/api/v1/surveys/{key}/restoration").status_code == 404
 
 
+def test_the_form_of_a_survey_has_its_tolerance_whole(client):
+    survey = {"name": "fine", "tolerance_m": 0.0125}
+    client.post("/api/v1/surveys", json=survey).raise_for_status()
+    assert 'name="tolerance_mm" min="0.1" max="1000" step="any" required value="12.5"' in page(
+        client, "/surveys/fine/logs"
+    )
+    client.delete("/api/v1/surveys/fine").raise_for_status()
+
+
+@pytest.mark.parametrize("name", ["%00", "a" * 300, "..%2f..%2fassets.py", "/etc/passwd"])
+def test_the_guide_has_no_file_from_elsewhere(client, name, tmp_path, monkeypatch):
+    site = tmp_path / "site"
+    site.mkdir()
+    (site / "index.html").write_text("the guide")
+    monkeypatch.setattr(assets, "guide_folder", lambda: site)
+    assert page(client, "/guide/") == "the guide"
+    response = client.get(f"/guide/{name}")
+    assert (response.status_code, "/guide/" in response.json()["detail"]) == (404, True)
+
+
 def test_a_log_that_is_removed_takes_its_results_and_brings_them_back(client):
     before = client.get("/api/v1/station-fixes?survey=twins").json()["items"]
     recording = before[0]["recording_id"]

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from contextlib import suppress
 from dataclasses import asdict
+from pathlib import Path
 from typing import Annotated, Any
 
 from fastapi import APIRouter, Query, Request, Response
@@ -57,10 +59,16 @@ def guide(request: Request, service: Current, page: str = "") -> Response:
         return HTMLResponse(render("guide.html", frame=frame_of(service)))
     if request.url.path == "/guide":
         return RedirectResponse("/guide/")
-    found = (folder / (page or "index.html")).resolve()
-    if not found.is_relative_to(folder.resolve()) or not found.is_file():
-        raise NotFoundError(f"The guide has no page {page!r}; /guide/ lists its pages.")
-    return FileResponse(found)
+    return FileResponse(_page_of_guide(folder.resolve(), page or "index.html"))
+
+
+def _page_of_guide(folder: Path, page: str) -> Path:
+    """Return a file below the folder of the guide; NotFoundError for any other path."""
+    with suppress(OSError, ValueError):  # names that no file can have: too long, or with a NUL
+        found = (folder / page).resolve()
+        if found.is_relative_to(folder) and found.is_file():
+            return found
+    raise NotFoundError(f"The guide has no page {page[:200]!r}; /guide/ lists its pages.")
 
 
 @router.get("/glossary")

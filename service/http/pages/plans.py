@@ -84,8 +84,6 @@ def _requested(query: dict[str, str]) -> PlanRequest:
             given[key] = scale * _number(query[name])
     if query.get("pole_low") and query.get("pole_high"):
         given["pole_heights_m"] = [_number(query["pole_low"]), _number(query["pole_high"])]
-    if "rest_revolutions" in given:
-        given["rest_revolutions"] = int(given["rest_revolutions"])
     return _valid(PlanRequest, given)
 
 

@@ -95,7 +95,7 @@ _STOP_TABLES = {
 
 
 @router.get("/surveys/{name:path}/stops")
-def stops(name: str, service: Current, after: Annotated[int, Query(ge=0)] = 0) -> str:
+def stops(name: str, service: Current, after: Annotated[int, Query(ge=0, le=10**9)] = 0) -> str:
     """Show the stops of a survey by its chosen solution."""
     found, rows = survey_row(service, name), service.catalogue.rows
     key = {"id": found["survey_id"]}
