@@ -60,6 +60,7 @@ def watch(
     by its footer. Each log is a line of JSON with --json.
     """
     from spheremark.pipelines.errors import ConfigError, SpheremarkError
+    from spheremark.storage.recordings import closed_logs
 
     if bool(service.server) != bool(service.survey):
         raise ConfigError("--server and --survey belong together: give both, or neither.")
@@ -72,8 +73,9 @@ def watch(
         if service.server
         else _local(reading, field, {"tolerance": tolerance_m, "marker_radius": radius_m})
     )
-    err.print(f"Watching {folder}. Ctrl-C ends.")
-    for n, log in enumerate(_closed(folder, existing=existing), start=1):
+    known = set() if existing else set(closed_logs(folder))
+    err.print(f"Watching {folder}. Ctrl-C ends.")  # from here on, each log that is closed is taken
+    for n, log in enumerate(_closed(folder, known), start=1):
         begin = time.monotonic()
         try:
             found = decide(log)
@@ -89,11 +91,10 @@ def watch(
             return
 
 
-def _closed(folder: Path, *, existing: bool) -> Iterator[Path]:
-    """Yield each recording once, when it is closed."""
+def _closed(folder: Path, known: set[Path]) -> Iterator[Path]:
+    """Yield each recording that is not known once, when it is closed."""
     from spheremark.storage.recordings import closed_logs
 
-    known = set() if existing else set(closed_logs(folder))
     while True:
         for log in closed_logs(folder):
             if log not in known:

@@ -3,8 +3,7 @@
 import io
 import json
 import shutil
-import threading
-import time
+import subprocess
 from dataclasses import replace
 
 import numpy as np
@@ -17,7 +16,8 @@ from spheremark.pipelines.geometry import skew
 from spheremark.pipelines.model import Exclusion, NoFix, Status
 from spheremark.service.stop_decisions import _sigmas_with, decide, is_good_enough
 from spheremark.storage.recordings import closed_logs
-from tests.service.test_commands import run
+from tests.service.conftest import PATIENCE
+from tests.service.test_commands import COMMAND, run
 from tests.storage.made_up import MARKS
 from tests.storage.made_up import stop as made_up_stop
 from tests.storage.recorder import record, small_log
@@ -57,18 +57,19 @@ def test_an_mcap_file_is_closed_by_its_footer_and_a_ros1_bag_by_its_name(tmp_pat
 
 
 def test_each_bag_is_decided_on_when_it_is_closed(stop, tmp_path):
-    def rover():
-        time.sleep(1.0)
+    (tmp_path / "before.bag").write_bytes(b"#ROSBAG V2.0\nnothing")
+    control = stop.log.parent / "control.csv"
+    command = [*COMMAND, "watch", tmp_path, "--control", control, "--count", "2", "--json"]
+    pipe = subprocess.PIPE
+    with subprocess.Popen(command, stdout=pipe, stderr=pipe, text=True) as watching:
+        assert "Watching" in watching.stderr.readline()
         (tmp_path / "cut.mcap").write_bytes(stop.log.read_bytes()[:5000])
         (tmp_path / "bad.bag").write_bytes(b"#ROSBAG V2.0\nnothing")
+        first = watching.stdout.readline()
         shutil.copy(stop.log, tmp_path / "stop1.mcap")
-
-    recorder = threading.Thread(target=rover)
-    recorder.start()
-    control = stop.log.parent / "control.csv"
-    done = run("watch", tmp_path, "--control", control, "--count", "2", "--json")
-    recorder.join()
-    bad, good = (json.loads(line) for line in done.stdout.splitlines())
+        written, complaints = watching.communicate(timeout=PATIENCE)
+    assert watching.returncode == 0, complaints
+    bad, good = (json.loads(line) for line in (first, written))
     assert (bad["log"], bad["code"].startswith("input.recording")) == ("bad.bag", True)
     (decision,) = good["stops"]
     assert (good["log"], decision["stop"]) == ("stop1.mcap", "stop1")
