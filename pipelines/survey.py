@@ -9,7 +9,12 @@ from time import perf_counter
 
 import numpy as np
 
-from spheremark.pipelines.accuracy import MarkerErrors, StationError, marker_errors, station_error
+from spheremark.pipelines.accuracy.truth import (
+    MarkerErrors,
+    StationError,
+    marker_errors,
+    station_error,
+)
 from spheremark.pipelines.config import SurveyConfig
 from spheremark.pipelines.detection import extract
 from spheremark.pipelines.errors import NoMarkersError, SolveError

@@ -12,7 +12,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from spheremark.pipelines.accuracy import UNMATCHED, marker_errors
+from spheremark.pipelines.accuracy.truth import UNMATCHED, marker_errors
 from spheremark.pipelines.config import FITTING_METHODS, SurveyConfig
 from spheremark.pipelines.detection import extract
 from spheremark.pipelines.errors import DegenerateGeometryError

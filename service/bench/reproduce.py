@@ -15,9 +15,9 @@ from numpy.typing import NDArray
 from plotly.io.json import to_json_plotly
 
 from spheremark.pipelines import published as study
+from spheremark.pipelines.accuracy.error_model import Bound
 from spheremark.pipelines.config import SurveyConfig
 from spheremark.pipelines.detection import extract
-from spheremark.pipelines.error_model import Bound
 from spheremark.pipelines.errors import NotFoundError
 from spheremark.pipelines.evaluation.experiment import Column, Plain, Progress, Table, to_json
 from spheremark.pipelines.evaluation.reproduction.included_angle import angle_experiment

@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from spheremark.pipelines.comparison import (
+from spheremark.pipelines.accuracy.comparison import (
     aligned,
     compare_numbers,
     compare_pairs,

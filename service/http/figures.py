@@ -13,8 +13,8 @@ import pyarrow.csv
 import pyarrow.parquet as pq
 from plotly.graph_objects import Figure
 
+from spheremark.pipelines.accuracy.tolerance import CONFIDENCE, DistanceBins, tolerance_reach
 from spheremark.pipelines.errors import InputError, NotFoundError
-from spheremark.pipelines.tolerance import CONFIDENCE, DistanceBins, tolerance_reach
 from spheremark.service.http.state import Service
 from spheremark.storage.catalogue import accuracy
 from spheremark.storage.catalogue.accuracy import QUERIES, TABLES, Selection

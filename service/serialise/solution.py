@@ -9,8 +9,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from spheremark.pipelines import trust
-from spheremark.pipelines.trust import Array, Check, Compared, Decision, Evidence
+from spheremark.pipelines.accuracy import acceptance
+from spheremark.pipelines.accuracy.acceptance import Check, Compared, Decision, SolutionQuality
+from spheremark.pipelines.model import Array
 from spheremark.storage.catalogue.catalogue import Catalogue
 from spheremark.storage.catalogue.solutions import Solution, chosen_solution
 
@@ -83,7 +84,7 @@ def survey_result(catalogue: Catalogue, survey: str) -> SurveyResult:
         network = catalogue.rows(_ADJUSTMENT, {"id": solution.adjustment_id})[0]
     checks = () if solution is None else _checks(catalogue, solution, stations, network)
     passes = stations["passes_global_test"]
-    evidence = Evidence(
+    quality = SolutionQuality(
         stations=stations["station"].tolist(),
         sigmas_3d=stations["sigma_3d_m"].astype(np.float64),
         failed=[
@@ -98,7 +99,7 @@ def survey_result(catalogue: Catalogue, survey: str) -> SurveyResult:
     )
     return SurveyResult(
         solution=solution,
-        decision=trust.decide(evidence, record.tolerance),
+        decision=acceptance.decide(quality, record.tolerance),
         checks=checks,
         stations=stations,
         missing=missing,
@@ -152,7 +153,8 @@ def _checks(
     if known.any():
         # stations of one survey share control and rig: their errors may be a single draw
         compared = Compared(stations["station"][known].tolist(), errors[known])
-        found.append(trust.check_errors("stations", compared, _covariances(stations)[known], 3.0))
+        covariances = _covariances(stations)[known]
+        found.append(acceptance.check_errors("stations", compared, covariances, 3.0))
     found.append(_control(catalogue, solution, stations))
     return tuple(one for one in found if one is not None)
 
@@ -171,9 +173,9 @@ def _centres(
     line = np.stack([rows[f"unit_{axis}"] for axis in "xyz"], axis=1)
     shared = np.stack([heading, line * rows["sigma_range"][:, None]], axis=1)
     _, scans = np.unique(rows["scan"].astype(str), return_inverse=True)
-    dof = trust.independent_coordinates(covariances, shared, scans)
+    dof = acceptance.independent_coordinates(covariances, shared, scans)
     compared = Compared(rows["name"].tolist(), _vectors(rows, "error"))
-    return trust.check_errors("centres", compared, covariances, dof)
+    return acceptance.check_errors("centres", compared, covariances, dof)
 
 
 def _residuals(
@@ -193,7 +195,7 @@ def _residuals(
         return None
     ratio = float("nan") if factor is None else float(np.sqrt(factor))
     compared = Compared(rows["name"].tolist(), _vectors(rows, "residual"))
-    return trust.check_of("centres", _RESIDUAL, compared, ratio, dof)
+    return acceptance.check_of("centres", _RESIDUAL, compared, ratio, dof)
 
 
 def _control(catalogue: Catalogue, solution: Solution, stations: Columns) -> Check | None:
@@ -205,7 +207,7 @@ def _control(catalogue: Catalogue, solution: Solution, stations: Columns) -> Che
         if not len(rows["mark"]):
             return None
         sigmas = _vectors(rows, "sigma")
-        return trust.check_control(rows["mark"].tolist(), _vectors(rows, "difference"), sigmas)
+        return acceptance.check_control(rows["mark"].tolist(), _vectors(rows, "difference"), sigmas)
     found = _residuals(catalogue, solution, stations, None)
     return found and replace(found, what="control")
 

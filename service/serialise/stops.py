@@ -12,7 +12,7 @@ from typing import Literal
 
 import numpy as np
 
-from spheremark.pipelines.accuracy import UNMATCHED, MarkerErrors, StationError
+from spheremark.pipelines.accuracy.truth import UNMATCHED, MarkerErrors, StationError
 from spheremark.pipelines.geometry import levelling_rotation
 from spheremark.pipelines.model import (
     Array,

@@ -11,9 +11,9 @@ from collections.abc import Mapping, Sequence
 from datetime import UTC, datetime
 from typing import Any
 
+from spheremark.pipelines.accuracy.acceptance import rule
 from spheremark.pipelines.errors import InputError, NotFoundError
 from spheremark.pipelines.tables import Column, Table
-from spheremark.pipelines.trust import rule
 from spheremark.service.provenance import code_version
 from spheremark.service.serialise import network_report
 from spheremark.service.serialise.solution import survey_result

@@ -14,7 +14,7 @@ from datetime import datetime
 import numpy as np
 import pyarrow as pa
 
-from spheremark.pipelines.accuracy import centre_errors, station_error
+from spheremark.pipelines.accuracy.truth import centre_errors, station_error
 from spheremark.pipelines.config import SurveyConfig, digest_of
 from spheremark.pipelines.errors import InputError
 from spheremark.pipelines.geometry import levelling_rotation, rigid

@@ -4,7 +4,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from spheremark.pipelines.accuracy import marker_errors, station_error
+from spheremark.pipelines.accuracy.truth import marker_errors, station_error
 from spheremark.pipelines.config import SurveyConfig
 from spheremark.pipelines.errors import MissingRigError, NoMarkersError
 from spheremark.pipelines.model import ControlMarks, NoFix, Status

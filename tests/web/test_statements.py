@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from spheremark.pipelines.error_model import Bound
+from spheremark.pipelines.accuracy.error_model import Bound
 from spheremark.web.pages import statements as study
 
 

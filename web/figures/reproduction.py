@@ -10,7 +10,7 @@ import numpy as np
 import plotly.graph_objects as go
 from plotly.subplots import make_subplots
 
-from spheremark.pipelines.error_model import ErrorModel
+from spheremark.pipelines.accuracy.error_model import ErrorModel
 from spheremark.pipelines.evaluation.experiment import Plain
 from spheremark.pipelines.evaluation.reproduction.included_angle import (
     CIRCLES,

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from spheremark.pipelines import published as study
-from spheremark.pipelines.accuracy import ErrorSummary
+from spheremark.pipelines.accuracy.truth import ErrorSummary
 from spheremark.pipelines.evaluation.experiment import Plain
 from spheremark.pipelines.evaluation.reproduction.included_angle import AngleExperiment
 from spheremark.pipelines.evaluation.reproduction.noise import RangeNoise

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from spheremark.pipelines.error_model import (
+from spheremark.pipelines.accuracy.error_model import (
     Bound,
     Demand,
     ErrorModel,

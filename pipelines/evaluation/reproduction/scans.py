@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from spheremark.pipelines.accuracy import UNMATCHED, marker_errors, mean_incidence
+from spheremark.pipelines.accuracy.truth import UNMATCHED, marker_errors, mean_incidence
 from spheremark.pipelines.config import FittingConfig, SurveyConfig
 from spheremark.pipelines.detection import extract
 from spheremark.pipelines.evaluation.experiment import Experiment, Plain

@@ -7,8 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from spheremark.pipelines.accuracy import ErrorSummary, summarise
-from spheremark.pipelines.error_model import (
+from spheremark.pipelines.accuracy.error_model import (
     Demand,
     ErrorModel,
     ErrorSample,
@@ -17,6 +16,7 @@ from spheremark.pipelines.error_model import (
     fit_error_model,
     limits,
 )
+from spheremark.pipelines.accuracy.truth import ErrorSummary, summarise
 from spheremark.pipelines.evaluation.experiment import Plain
 from spheremark.pipelines.evaluation.reproduction.plan import (
     CENTRE,

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
-from spheremark.pipelines.accuracy import marker_errors
+from spheremark.pipelines.accuracy.truth import marker_errors
 from spheremark.pipelines.config import SurveyConfig
 from spheremark.pipelines.geometry import rot_z
 from spheremark.pipelines.simulation import SimulationConfig, scenario, simulate_stop

@@ -8,7 +8,7 @@ import pytest
 from numpy.testing import assert_allclose
 from scipy.stats import chi2
 
-from spheremark.pipelines.accuracy import marker_errors
+from spheremark.pipelines.accuracy.truth import marker_errors
 from spheremark.pipelines.config import (
     FITTING_METHODS,
     ExtractionConfig,

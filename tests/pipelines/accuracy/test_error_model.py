@@ -3,7 +3,7 @@ import dataclasses
 import numpy as np
 import pytest
 
-from spheremark.pipelines.error_model import Demand, ErrorSample, fit_error_model, limits
+from spheremark.pipelines.accuracy.error_model import Demand, ErrorSample, fit_error_model, limits
 from spheremark.pipelines.errors import TooFewObservationsError
 from tests import chance
 

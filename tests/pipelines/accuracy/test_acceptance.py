@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from spheremark.pipelines import trust
-from spheremark.pipelines.trust import Compared, Evidence
+from spheremark.pipelines.accuracy import acceptance
+from spheremark.pipelines.accuracy.acceptance import Compared, SolutionQuality
 
 NAMES = ("A", "B", "C", "D", "E", "F")
 
@@ -26,9 +26,9 @@ def test_the_interval_by_chance_holds_95_of_100_surveys_whose_sigmas_hold(shared
     inside = []
     for _ in range(400):
         errors, cov, shared, scans = drawn(rng, 4, 10, shared_sigma)
-        dof = trust.independent_coordinates(cov, shared, scans)
+        dof = acceptance.independent_coordinates(cov, shared, scans)
         names = [str(i) for i in range(len(errors))]
-        check = trust.check_errors("centres", Compared(names, errors), cov, dof)
+        check = acceptance.check_errors("centres", Compared(names, errors), cov, dof)
         inside.append(check.is_within)
     assert 0.90 < np.mean(inside) < 0.99  # 0.95, with its own chance of 400 draws
 
@@ -36,13 +36,15 @@ def test_the_interval_by_chance_holds_95_of_100_surveys_whose_sigmas_hold(shared
 def test_errors_without_shared_parts_are_all_independent():
     cov = np.tile(np.eye(3), (7, 1, 1))
     none = np.zeros((7, 1, 3))
-    assert trust.independent_coordinates(cov, none, np.zeros(7, np.intp)) == pytest.approx(21.0)
+    assert acceptance.independent_coordinates(cov, none, np.zeros(7, np.intp)) == pytest.approx(
+        21.0
+    )
 
 
 def test_sigmas_of_half_the_errors_are_found_too_small():
     rng = np.random.default_rng(6)
     differences = 2e-3 * rng.normal(size=(6, 3))
-    check = trust.check_control(NAMES, differences, np.full((6, 3), 1e-3))
+    check = acceptance.check_control(NAMES, differences, np.full((6, 3), 1e-3))
     assert check.is_within is False
     assert "times its sigma" in check.excess
     lengths = np.linalg.norm(differences, axis=1)
@@ -51,12 +53,12 @@ def test_sigmas_of_half_the_errors_are_found_too_small():
 
 
 def control(size):
-    return trust.check_control(NAMES, np.full((6, 3), size), np.full((6, 3), size))
+    return acceptance.check_control(NAMES, np.full((6, 3), size), np.full((6, 3), size))
 
 
 def test_a_survey_whose_tests_pass_within_the_tolerance_is_accepted():
-    evidence = Evidence(stations=NAMES, sigmas_3d=np.full(6, 3e-4), control=control(5e-4))
-    found = trust.decide(evidence, 0.03)
+    quality = SolutionQuality(stations=NAMES, sigmas_3d=np.full(6, 3e-4), control=control(5e-4))
+    found = acceptance.decide(quality, 0.03)
     assert found.status == "accepted"
     assert found.sentence == (
         "6 stations, 0.3 mm (3-D sigma, RMS), control met to 0.9 mm (largest): accepted"
@@ -76,7 +78,7 @@ def test_a_survey_whose_tests_pass_within_the_tolerance_is_accepted():
 )
 def test_a_survey_is_not_accepted_for_a_reason(changed, status, reason):
     given = {"stations": NAMES, "sigmas_3d": np.full(6, 3e-4), "control": control(5e-4)}
-    found = trust.decide(Evidence(**(given | changed)), 0.03)
+    found = acceptance.decide(SolutionQuality(**(given | changed)), 0.03)
     assert found.status == status
     assert any(one.startswith(reason) for one in found.reasons), found.reasons
     if changed.get("failed"):
@@ -84,4 +86,7 @@ def test_a_survey_is_not_accepted_for_a_reason(changed, status, reason):
 
 
 def test_a_survey_without_positions_has_no_decision():
-    assert trust.decide(Evidence(stations=(), sigmas_3d=np.zeros(0)), 0.03).status == "none"
+    assert (
+        acceptance.decide(SolutionQuality(stations=(), sigmas_3d=np.zeros(0)), 0.03).status
+        == "none"
+    )

@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
-from spheremark.pipelines.accuracy import UNMATCHED, centre_errors, mean_incidence, summarise
+from spheremark.pipelines.accuracy.truth import UNMATCHED, centre_errors, mean_incidence, summarise
 from spheremark.pipelines.geometry import inverse, rigid, rot_x, rot_y, rot_z, transform
 from spheremark.pipelines.model import Beams, ControlMarks, StopTruth
 

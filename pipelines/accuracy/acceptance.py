@@ -8,13 +8,12 @@ from dataclasses import dataclass, field
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.stats import chi2
 
-Array = NDArray[np.float64]
+from spheremark.pipelines.model import Array, Index
 
 LEVEL = 0.95  # of the interval by chance
-RADIUS_95 = 1.96  # of sigma_3d: the sphere of 95 % is smallest where one axis has all variance
+RADIUS_95 = 1.96  # of sigma_3d: radius of 95 % where one axis has all variance, else less
 _DATUM = 4  # coordinates of control that position and heading of a network use up
 
 
@@ -87,7 +86,7 @@ class Decision:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Evidence:
+class SolutionQuality:
     """What the decision on a survey depends on.
 
     Attributes
@@ -218,7 +217,7 @@ def check_control(names: Sequence[str], differences: Array, sigmas: Array) -> Ch
     )
 
 
-def independent_coordinates(covariances: Array, shared: Array, scans: NDArray[np.intp]) -> float:
+def independent_coordinates(covariances: Array, shared: Array, scans: Index) -> float:
     """Return how many independent coordinates errors with shared parts are worth.
 
     Parameters
@@ -252,12 +251,12 @@ def independent_coordinates(covariances: Array, shared: Array, scans: NDArray[np
     return n * n / (n + total)
 
 
-def decide(evidence: Evidence, tolerance: float) -> Decision:
+def decide(quality: SolutionQuality, tolerance: float) -> Decision:
     """Return whether a survey is accepted.
 
     Parameters
     ----------
-    evidence : Evidence
+    quality : SolutionQuality
         The stations and their tests.
     tolerance : float
         Accepted 3-D error, which 95 % of the errors must keep [m].
@@ -268,17 +267,17 @@ def decide(evidence: Evidence, tolerance: float) -> Decision:
         accepted; weak where a warning or a missing stop remains; refused where a test fails, a
         station is too uncertain, or control differs by more than the tolerance.
     """
-    n = len(evidence.stations)
+    n = len(quality.stations)
     if not n:
         return Decision(status="none", sentence="No station has a position yet")
-    refused, weak = _refusals(evidence, tolerance), _weaknesses(evidence)
+    refused, weak = _refusals(quality, tolerance), _weaknesses(quality)
     status = "refused" if refused else "weak" if weak else "accepted"
     words = {"refused": "not accepted", "weak": "accepted with reservations"}.get(status, status)
-    sigma = float(np.sqrt(np.mean(np.square(evidence.sigmas_3d))))
-    size = "no valid sigma" if evidence.failed else f"{1e3 * sigma:.1f} mm (3-D sigma, RMS)"
+    sigma = float(np.sqrt(np.mean(np.square(quality.sigmas_3d))))
+    size = "no valid sigma" if quality.failed else f"{1e3 * sigma:.1f} mm (3-D sigma, RMS)"
     return Decision(
         status=status,
-        sentence=f"{_counted(n, 'station')}, {size}, {_control_words(evidence)}: {words}",
+        sentence=f"{_counted(n, 'station')}, {size}, {_control_words(quality)}: {words}",
         reasons=(*refused, *weak),
     )
 
@@ -303,24 +302,24 @@ def rule(tolerance: float) -> str:
     )
 
 
-def _refusals(evidence: Evidence, tolerance: float) -> list[str]:
+def _refusals(quality: SolutionQuality, tolerance: float) -> list[str]:
     """Return why a survey cannot be accepted."""
     found = []
-    if evidence.failed:
+    if quality.failed:
         found.append(
-            f"The global test fails at {_list(evidence.failed)}: residuals are larger than the "
+            f"The global test fails at {_list(quality.failed)}: residuals are larger than the "
             "sigmas allow, so these sigmas are not valid."
         )
     wide = [
         name
-        for name, sigma in zip(evidence.stations, evidence.sigmas_3d, strict=True)
+        for name, sigma in zip(quality.stations, quality.sigmas_3d, strict=True)
         if RADIUS_95 * sigma > tolerance
     ]
     if wide:
         found.append(
             f"{_list(wide)}: 95 % of the errors may exceed the tolerance of {1e3 * tolerance:g} mm."
         )
-    control = evidence.control
+    control = quality.control
     if control is not None and control.largest > tolerance:
         found.append(
             f"Control differs by {1e3 * control.largest:.1f} mm at {control.where}, more than the "
@@ -329,21 +328,21 @@ def _refusals(evidence: Evidence, tolerance: float) -> list[str]:
     return found
 
 
-def _weaknesses(evidence: Evidence) -> list[str]:
+def _weaknesses(quality: SolutionQuality) -> list[str]:
     """Return what remains to be done or known of a survey."""
-    found = list(evidence.warnings)
-    if evidence.missing:
-        found.append(f"No position in this solution: {_list(evidence.missing)}.")
-    if evidence.control is not None and evidence.control.excess:
-        found.append(f"Control differs by {evidence.control.excess}.")
+    found = list(quality.warnings)
+    if quality.missing:
+        found.append(f"No position in this solution: {_list(quality.missing)}.")
+    if quality.control is not None and quality.control.excess:
+        found.append(f"Control differs by {quality.control.excess}.")
     return found
 
 
-def _control_words(evidence: Evidence) -> str:
+def _control_words(quality: SolutionQuality) -> str:
     """Return how control is met."""
-    if evidence.control is not None:
-        return f"control met to {1e3 * evidence.control.largest:.1f} mm (largest)"
-    return "no control" if evidence.is_free else "control not checked"
+    if quality.control is not None:
+        return f"control met to {1e3 * quality.control.largest:.1f} mm (largest)"
+    return "no control" if quality.is_free else "control not checked"
 
 
 def _counted(n: int, what: str) -> str:

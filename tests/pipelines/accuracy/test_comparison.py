@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from spheremark.pipelines.comparison import (
+from spheremark.pipelines.accuracy.comparison import (
     aligned,
     compare_numbers,
     compare_pairs,

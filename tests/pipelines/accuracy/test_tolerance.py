@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from spheremark.pipelines.tolerance import DistanceBins, tolerance_reach
+from spheremark.pipelines.accuracy.tolerance import DistanceBins, tolerance_reach
 
 
 def bins(within, sizes, farthest):
