@@ -48,7 +48,12 @@ _CONFIDENCE = (0.025, 0.975)
 _SURVEYS_MIN = 2
 _CURVE = tuple(np.round(np.arange(0.05, 1.0, 0.05), 2).tolist())
 _BINS = np.arange(0.0, 20.5, 0.5)
-_CONFIG = SurveyConfig.from_mapping({"fitting": {"methods": ["along_beam"]}})
+_CONFIG = SurveyConfig.from_mapping(
+    {
+        "fitting": {"methods": ["along_beam"]},
+        "stitching": {"sigma_clock": 0.0},  # simulated sensors share a clock
+    }
+)
 _SIMULATION = SimulationConfig(only_near_spheres=True)
 
 _Scan = tuple[str, MarkerFits]

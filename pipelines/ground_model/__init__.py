@@ -13,6 +13,7 @@ from spheremark.pipelines.ground_model.values import (
     ElevationModel,
     StationPose,
     pose_of_fix,
+    pose_of_points,
     poses_of_network,
 )
 
@@ -23,6 +24,7 @@ __all__ = [
     "StationPose",
     "Terrain",
     "pose_of_fix",
+    "pose_of_points",
     "poses_of_network",
     "station_points",
 ]

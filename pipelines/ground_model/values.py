@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from spheremark.pipelines.errors import ConfigError
+from spheremark.pipelines.geometry import turn_in_place
 from spheremark.pipelines.model import Array, Column, Mask, StationFix, seal
 from spheremark.pipelines.network import AdjustedNetwork
 
@@ -69,7 +70,8 @@ class StationPose:
 
     name: str  # name of the stop
     T_site_station: Array  # (4, 4) pose of the levelled frame [m]
-    # (6, 6) covariance of a small motion (rotation [rad], translation [m]) on the left
+    # (6, 6) covariance of a small motion (rotation [rad], translation [m]) on the left, without the
+    # heading that mounting, encoder and clocks leave unknown: it turns points and centres alike
     cov_T_site_station: Array
 
     def __post_init__(self) -> None:
@@ -89,19 +91,41 @@ def poses_of_network(result: AdjustedNetwork) -> tuple[StationPose, ...]:
     tuple of StationPose
         One for each station, with covariance.
     """
+    network = result.network
+    columns = (result.T_site_station, result.cov_T_site_station, network.sigma_headings)
     return tuple(
-        StationPose(name=name, T_site_station=T.copy(), cov_T_site_station=cov.copy())
-        for name, T, cov in zip(
-            result.network.stations, result.T_site_station, result.cov_T_site_station, strict=True
-        )
+        pose_of_points(name, T, cov, sigma)
+        for name, T, cov, sigma in zip(network.stations, *columns, strict=True)
     )
 
 
 def pose_of_fix(name: str, fix: StationFix) -> StationPose:
     """Return the pose of a station that was positioned alone."""
-    return StationPose(
-        name=name, T_site_station=fix.T_site_station, cov_T_site_station=fix.cov_T_site_station
-    )
+    return pose_of_points(name, fix.T_site_station, fix.cov_T_site_station, fix.sigma_heading)
+
+
+def pose_of_points(name: str, T: Array, cov: Array, sigma_heading: float) -> StationPose:
+    """Return the pose of the points of a scan from that of its station.
+
+    Parameters
+    ----------
+    name : str
+        Name of the stop.
+    T : (4, 4)
+        Pose of the station.
+    cov : (6, 6)
+        Its covariance, with the heading that mounting, encoder and clocks leave unknown.
+    sigma_heading : float
+        Standard deviation of that heading [rad].
+
+    Returns
+    -------
+    StationPose
+        Without it.
+    """
+    turn = turn_in_place(T)
+    own = cov - sigma_heading**2 * np.outer(turn, turn)
+    return StationPose(name=name, T_site_station=T.copy(), cov_T_site_station=own)
 
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)

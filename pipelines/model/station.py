@@ -88,6 +88,9 @@ class StationFix:
         Why it is weak; empty when it is not.
     excluded : tuple of Exclusion
         Markers that were left out.
+    sigma_heading : float
+        The part of ``sigma_yaw`` that mounting, encoder and clocks leave unknown. Whatever the scan
+        holds is turned by the same error, so that its points do not have it in the site [rad].
     """
 
     method: str
@@ -107,6 +110,7 @@ class StationFix:
     status: Status
     reason: str
     excluded: tuple[Exclusion, ...] = ()
+    sigma_heading: float = 0.0
 
     def __post_init__(self) -> None:
         columns: dict[str, Shape] = {

@@ -15,7 +15,7 @@ from spheremark.pipelines.estimation.statistical_tests import (
     critical_w,
     noncentrality,
 )
-from spheremark.pipelines.geometry import by_motion, skew
+from spheremark.pipelines.geometry import by_motion, skew, turn_in_place
 from spheremark.pipelines.model import Array
 from spheremark.pipelines.model.network import (
     AdjustedNetwork,
@@ -196,8 +196,7 @@ def _mark_weaknesses(network: Network, tested: Tested) -> tuple[str, ...]:
 
 def _cov_heading(network: Network, T: Array) -> Array:
     """Return the covariance of stations that turn about their own plumb lines, (s, 6, 6)."""
-    up = T[:, :3, 2]
-    turns = np.concatenate([up, np.cross(T[:, :3, 3], up)], axis=1)
+    turns = turn_in_place(T)
     return np.asarray(
         network.sigma_headings[:, None, None] ** 2 * turns[:, :, None] * turns[:, None]
     )

@@ -41,6 +41,7 @@ def station_fix(
         cov_T_site_station=pose.cov_T_site_station,
         cov_p_site=pose.cov_p_site,
         matches=np.array(pairs),
+        sigma_heading=scene.sigma_heading,
         residuals_site=pose.residuals_site,
         redundancies=adjustment.redundancies[:n],
         w_statistics=adjustment.w_statistics[:n],

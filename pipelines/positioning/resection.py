@@ -19,13 +19,13 @@ from spheremark.pipelines.estimation.linear_algebra import invert_each
 from spheremark.pipelines.estimation.statistical_tests import Dropped, snoop
 from spheremark.pipelines.geometry import (
     by_motion,
-    cross,
     has_heading,
     inverse,
     is_on_a_line,
     rigid,
     skew,
     transform,
+    turn_in_place,
     unit,
 )
 from spheremark.pipelines.model import (
@@ -258,9 +258,11 @@ def _fix(
     T_site_base = rigid(T[:3, :3], T[:3, 3] + scene.middle)
     cov, J = adjustment.cov + _cov_shared(scene, used, adjustment), by_motion(T[:3, 3])
     elsewhere = match.alternatives + scene.middle - T_site_base[:3, 3]
+    T_site_station = T_site_base @ inverse(rigid(scene.R_station_base, np.zeros(3)))
     pose = Pose(
-        T_site_station=T_site_base @ inverse(rigid(scene.R_station_base, np.zeros(3))),
-        cov_T_site_station=shift @ cov @ shift.T + _cov_of_heading(scene, elsewhere, T_site_base),
+        T_site_station=T_site_station,
+        cov_T_site_station=shift @ cov @ shift.T
+        + _cov_of_heading(scene, elsewhere, T_site_station),
         cov_p_site=J @ cov @ J.T + _cov_of_alternatives(elsewhere),
         J_position=J,
         residuals_site=adjustment.groups[0].residuals,
@@ -287,14 +289,13 @@ def _cov_of_alternatives(elsewhere: Array) -> Array:
     return np.asarray(elsewhere.T @ elsewhere / (len(elsewhere) + 1))
 
 
-def _cov_of_heading(scene: Scene, elsewhere: Array, T_site_base: Array) -> Array:
+def _cov_of_heading(scene: Scene, elsewhere: Array, T_site_station: Array) -> Array:
     """Return the covariance that an uncertain heading and alternative positions add, (6, 6).
 
-    Mounting and encoder leave the zero of the joint angle uncertain, and so the heading of base;
-    the position does not move. The alternatives lie half a turn away.
+    Mounting, encoder and clocks leave the zero of the joint angle uncertain, and so the heading of
+    base; the position does not move. The alternatives lie half a turn away.
     """
-    up, k = T_site_base[:3, :3] @ scene.R_station_base[2], len(elsewhere)
-    turn = np.concatenate([up, cross(T_site_base[:3, 3], up)])  # 1 rad about the plumb line
+    k, turn = len(elsewhere), turn_in_place(T_site_station)
     cov = (scene.sigma_heading**2 + np.pi**2 * k / (k + 1)) * np.outer(turn, turn)
     cov[3:, 3:] += _cov_of_alternatives(elsewhere)
     return np.asarray(cov)

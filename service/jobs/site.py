@@ -22,6 +22,7 @@ from spheremark.pipelines.ground_model import (
     ElevationModel,
     StationPose,
     Terrain,
+    pose_of_points,
     poses_of_network,
     station_points,
 )
@@ -239,7 +240,7 @@ def pose_from_row(name: str, row: Mapping[str, Any]) -> StationPose:
     T[:3, :3] = np.reshape(row["rotation"], (3, 3))
     T[:3, 3] = [row[f"{axis}_m"] for axis in "xyz"]
     cov = np.reshape(np.asarray(row["cov_motion"], dtype=np.float64), (6, 6)).copy()
-    return StationPose(name=name, T_site_station=T, cov_T_site_station=cov)
+    return pose_of_points(name, T, cov, row["sigma_heading"])
 
 
 def require_poses(poses: Mapping[Any, StationPose]) -> None:

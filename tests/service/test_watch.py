@@ -12,7 +12,7 @@ from mcap.reader import make_reader
 from rosbags.rosbag2 import StoragePlugin
 
 from spheremark.pipelines.config import SurveyConfig
-from spheremark.pipelines.geometry import skew
+from spheremark.pipelines.geometry import skew, turn_in_place
 from spheremark.pipelines.model import Exclusion, NoFix, Status
 from spheremark.service.stop_decisions import _sigmas_with, decide, is_good_enough
 from spheremark.storage.recordings import closed_logs
@@ -139,6 +139,15 @@ def test_a_decision_names_bad_markers_and_what_would_help():
     assert found.text.startswith("L1S1: not good enough.")
     good = decision_of(made_up_stop(), cov_p_site=np.eye(3) * 1e-6)
     assert (good.is_good_enough, good.advice) == (True, ())
+
+
+def test_a_heading_that_clocks_leave_unknown_changes_no_advice():
+    stop = made_up_stop()
+    fix, weak = stop.fixes[FIRST], {"cov_p_site": np.eye(3) * 0.02**2}
+    turn = turn_in_place(fix.T_site_station)
+    cov = fix.cov_T_site_station + 0.014**2 * np.outer(turn, turn)
+    unknown = decision_of(stop, cov_T_site_station=cov, sigma_heading=0.014, **weak)
+    assert unknown.advice == decision_of(stop, **weak).advice
 
 
 def test_a_stop_without_position_or_control_is_decided_on_by_its_reason_and_its_markers():

@@ -37,10 +37,12 @@ Key = tuple[str, str]  # recording and stop
 _SCRATCH, _IN_USE = "spheremark-site-", "in-use"  # names of folders, and of the file that is locked
 
 _POSES = """
-SELECT recording_id, stop, rig_digest, x_m, y_m, z_m, rotation, cov_motion, adjustment_id,
+SELECT c.recording_id, stop, c.rig_digest, x_m, y_m, z_m, rotation, cov_motion, adjustment_id,
+    radians(sqrt(s.sigma_heading_deg ^ 2 + s.sigma_clock_deg ^ 2)) AS sigma_heading,
     CASE solution WHEN 'network with control' THEN 'control' WHEN 'free network' THEN 'free'
         ELSE 'fixes' END AS poses
-FROM chosen_stations WHERE survey_id = $survey ORDER BY station
+FROM chosen_stations AS c JOIN stops AS s USING (run_id, stop)
+WHERE survey_id = $survey ORDER BY station
 """
 _RIGS = "SELECT rig_digest, rig FROM rigs WHERE list_contains($digests::VARCHAR[], rig_digest)"
 

@@ -8,12 +8,13 @@ import numpy as np
 import pytest
 
 from spheremark.pipelines.errors import ConfigError, NoGroundError
-from spheremark.pipelines.geometry import exp_motion, rigid, rot_z
+from spheremark.pipelines.geometry import exp_motion, rigid, rot_z, turn_in_place
 from spheremark.pipelines.ground_model import (
     ElevationConfig,
     StationPose,
     Terrain,
     pose_of_fix,
+    pose_of_points,
     station_points,
 )
 from spheremark.pipelines.model import Levelling, StitchedCloud
@@ -143,6 +144,15 @@ def test_an_uncertain_lean_of_a_station_grows_with_the_distance():
     column = int(np.argmin(np.abs(vague.xs - 6.0)))
     expected = 0.003 * vague.xs[column]
     assert abs(np.nanmedian(added[:, column]) - expected) < 0.1 * expected
+
+
+def test_a_heading_that_clocks_leave_unknown_is_in_no_height():
+    points, T = scanned(np.random.default_rng(6)), rigid(rot_z(0.4), np.array([30.0, -20.0, 1.0]))
+    own, turn = np.diag([1e-8, 1e-8, 1e-8, 1e-6, 1e-6, 1e-6]), turn_in_place(T)
+    vague = pose_of_points("stop", T, own + 0.014**2 * np.outer(turn, turn), 0.014)
+    sharp = StationPose(name="stop", T_site_station=T, cov_T_site_station=own)
+    expected = model_of(points, where=sharp).sigmas
+    np.testing.assert_allclose(model_of(points, where=vague).sigmas, expected, rtol=1e-6)
 
 
 def test_stops_that_agree_make_heights_surer():
