@@ -22,7 +22,7 @@ import typer
 from spheremark.pipelines.errors import ConfigError, SpheremarkError
 from spheremark.service.cli.bench import bench, reproduce
 from spheremark.service.cli.jobs import jobs
-from spheremark.service.cli.options import AsJson, Field, RadiusM, grouped
+from spheremark.service.cli.options import AsJson, Field, RadiusM, SigmaClockS, grouped
 from spheremark.service.cli.plan import plan
 from spheremark.service.cli.reading import Logs, OneLog, Reading
 from spheremark.service.cli.report import report
@@ -252,6 +252,7 @@ def process(
     frame: Annotated[Frame, typer.Option(help="Frame of the centres.")] = Frame.STATION,
     tolerance_m: Annotated[float, typer.Option(help="Error that is accepted \\[m].")] = 0.03,
     radius_m: RadiusM = 0.100,
+    sigma_clock_s: SigmaClockS = 0.03,
     truth: Annotated[
         Path | None,
         typer.Option(exists=True, dir_okay=False, help="Truth (JSON); adds errors, no more."),
@@ -275,6 +276,7 @@ def process(
         {
             "marker_radius": radius_m,
             "tolerance": tolerance_m,
+            "stitching": {"sigma_clock": sigma_clock_s},
             "fitting": {"methods": method or ["along_beam"]},
             "resection": {"methods": resection or ["free_station"]},
         }

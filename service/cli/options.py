@@ -21,6 +21,10 @@ if TYPE_CHECKING:
 
 AsJson = Annotated[bool, typer.Option("--json", help="JSON for programs.")]
 RadiusM = Annotated[float, typer.Option(help="Radius of the spheres \\[m].")]
+SigmaClockS = Annotated[
+    float,
+    typer.Option(help="Sigma of the offset between the clocks of gimbal and LiDAR \\[s]."),
+]
 
 
 def grouped(function: Callable[..., None]) -> Callable[..., None]:

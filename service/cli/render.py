@@ -254,7 +254,8 @@ def _print_station(out: Console, station: Plain) -> None:
     against = "" if error is None else f"; error {1e3 * error:.1f} mm"
     out.print(
         f"  Station ({methods}): {_coloured(station['status'])}  x {x:.4f} y {y:.4f} z {z:.4f} m, "
-        f"yaw {station['yaw_deg']:.3f} deg, sigma {1e3 * station['sigma_3d_m']:.1f} mm (3-D) "
+        f"yaw {station['yaw_deg']:.3f} deg (sigma {station['sigma_yaw_deg']:.3f}), "
+        f"sigma {1e3 * station['sigma_3d_m']:.1f} mm (3-D) "
         f"from {len(station['matches'])} marks, sigma0 {_text(station['sigma0'], 1, 2)}{against}",
         highlight=False,
         soft_wrap=True,

@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from spheremark.service.cli.options import AsJson, Field, RadiusM, grouped
+from spheremark.service.cli.options import AsJson, Field, RadiusM, SigmaClockS, grouped
 from spheremark.service.cli.reading import Logs, Reading
 from spheremark.service.cli.terminal import out, print_json, progress
 
@@ -22,6 +22,7 @@ def adjust(
     ] = False,
     method: Annotated[str, typer.Option(help="Fitting method.")] = "along_beam",
     radius_m: RadiusM = 0.100,
+    sigma_clock_s: SigmaClockS = 0.03,
     gama: Annotated[
         Path | None, typer.Option(dir_okay=False, help="Write input of GNU Gama (XML).")
     ] = None,
@@ -50,7 +51,11 @@ def adjust(
     from spheremark.storage.imports import survey_files as site_files
 
     config = SurveyConfig.from_mapping(
-        {"marker_radius": radius_m, "fitting": {"methods": [method]}}
+        {
+            "marker_radius": radius_m,
+            "stitching": {"sigma_clock": sigma_clock_s},
+            "fitting": {"methods": [method]},
+        }
     )
     marks, given = field.read()
     files = reading.files(logs)
