@@ -67,7 +67,7 @@ _FACTS = (Column("fact", "fact"), Column("value", "value", "", ">"))
 _MARKERS = (
     Column("id", "marker"),
     Column("status", "status"),
-    *vector("centre_m", "m", "z.4f", "xyz"),
+    *vector("centre_m", "m", ".4f", "xyz"),
     Column.mm("sigma_3d_m", "sigma"),
     Column("range_m", "range", "m", ".2f"),
     Column("n_points", "returns", "", "d"),

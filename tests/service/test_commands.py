@@ -124,6 +124,18 @@ def test_truth_adds_errors_and_changes_nothing_else(answer, stop):
         assert "error_3d_m" in set(with_truth) - set(without)
 
 
+def test_a_better_clock_makes_a_heading_surer_and_moves_no_station(stop):
+    control = stop.log.parent / "control.csv"
+    options = ("process", stop.log, "--control", control, "--json")
+    known, unknown = (
+        json.loads(run(*options, "--sigma-clock-s", value).stdout)["stops"][0]["station"]
+        for value in ("0", "0.03")
+    )
+    assert known["sigma_yaw_deg"] < 0.05 < 0.5 < unknown["sigma_yaw_deg"]
+    for name in ("position_m", "sigma_3d_m", "yaw_deg"):
+        assert known[name] == unknown[name]
+
+
 def test_people_get_a_table_and_programs_get_json(stop):
     assert "M08" in run("process", stop.log).stdout
     assert json.loads(run("inspect", stop.log, "--json").stdout)["verdict"] in ("ok", "weak")
