@@ -108,8 +108,8 @@ def _local(
 ) -> Callable[[Path], dict[str, Any]]:
     """Return what processes a log in this process, whose kernels are loaded once."""
     from spheremark.pipelines.config import SurveyConfig
+    from spheremark.pipelines.stop_decisions import decide
     from spheremark.service.log_files import process_file
-    from spheremark.service.stop_decisions import decide
 
     marks, rig = field.read()
     config = SurveyConfig.from_mapping(

@@ -11,9 +11,9 @@ from fastapi import APIRouter, Request
 from fastapi.responses import HTMLResponse
 
 from spheremark.pipelines.errors import NotFoundError
+from spheremark.pipelines.stop_decisions import is_good_enough
 from spheremark.service.http.pages.frame import address_of, frame_of
 from spheremark.service.http.state import Current, Service
-from spheremark.service.stop_decisions import is_good_enough
 from spheremark.web.pages.recording import recording_page
 from spheremark.web.templating import render
 

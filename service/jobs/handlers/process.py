@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 def handle(spec: JobSpecification, progress: Progress) -> JobResult:
     """Process the one log of a job."""
-    from spheremark.service.stop_decisions import decide
+    from spheremark.pipelines.stop_decisions import decide
 
     stops, rows = process_log(spec, spec.logs[0], spec.result_id, progress)
     decisions = (decide(stop, spec.config, spec.marks) for stop in stops)
