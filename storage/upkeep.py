@@ -26,7 +26,9 @@ from spheremark.storage.files import sync_folder, unwritten
 MANIFEST = "manifest.json"
 _DATABASE = "results.duckdb"  # in a backup
 _FORMAT = "spheremark-backup/1"
-_BESIDE = ("coverage.json", "coverage.csv")  # files of the folder that no row names
+_REPORTS = ("coverage.json", "coverage.csv", "worlds.json")
+_RESULT_LOGS = "clouds/*.mcap"  # each called after its run
+_SEARCHES = "searches/*.json"
 _URLS = (
     ("recordings", "url"),
     ("terrains", "url"),
@@ -94,13 +96,14 @@ def examine(database: Path, data: Path) -> list[Finding]:
     try:
         with duckdb.connect(str(database), read_only=True) as connection:
             files = list(_files(connection))
+            logs = _result_logs(connection, data)
             found = [*_schema_findings(connection), *_row_findings(connection)]
     except duckdb.Error as error:
         advice = f"{str(error).splitlines()[0]}. Check the disk, and restore the newest backup."
         return [Finding(kind="database.damaged", place=str(database), advice=advice)]
     for file in files:
         found += _file_findings(file)
-    known = {file.path.resolve() for file in files}
+    known = {path.resolve() for path in (*logs, *(file.path for file in files))}
     for folder in ("recordings", "terrains", "clouds"):
         for path in sorted((data / folder).glob("*")):
             if path.is_file() and path.resolve() not in known:
@@ -171,7 +174,9 @@ def back_up(database: Path, data: Path, target: Path) -> int:
     """
     with duckdb.connect(str(database), read_only=True) as connection:
         paths = {file.path: file.sha256 for file in _files(connection)}
-    paths |= {data / name: None for name in _BESIDE if (data / name).exists()}
+        paths |= dict.fromkeys(_result_logs(connection, data))
+    paths |= {data / name: None for name in _REPORTS if (data / name).exists()}
+    paths |= dict.fromkeys(one for one in data.glob(_SEARCHES) if _has_ended(one))
     entries: dict[str, dict[str, Any]] = {}
     try:
         target.mkdir(parents=True, exist_ok=True, mode=0o700)
@@ -268,6 +273,20 @@ def _files(connection: duckdb.DuckDBPyConnection) -> Iterator[_File]:
     for table, url, sha256, size in connection.execute(_FILES).fetchall():
         if "://" not in url:
             yield _File(table=table, path=Path(url), sha256=sha256, size=size)
+
+
+def _result_logs(connection: duckdb.DuckDBPyConnection, data: Path) -> list[Path]:
+    """Return the logs of the results of runs."""
+    runs = {run for (run,) in connection.execute("SELECT run_id FROM runs").fetchall()}
+    return [path for path in data.glob(_RESULT_LOGS) if path.stem in runs]
+
+
+def _has_ended(search: Path) -> bool:
+    """Whether a search of plans has ended, and its file does not change any more."""
+    try:
+        return bool(json.loads(search.read_text("utf-8"))["status"] != "running")
+    except FileNotFoundError:  # removed just now, as the oldest of many
+        return False
 
 
 def _file_findings(file: _File) -> Iterator[Finding]:

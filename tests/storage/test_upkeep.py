@@ -86,6 +86,30 @@ def test_a_backup_of_a_database_in_use_is_restored_elsewhere(catalogue, data, tm
         again.create_survey("goes on")
 
 
+def test_logs_of_results_and_ended_searches_are_in_order_and_copied(catalogue, data, tmp_path):
+    kept = log(catalogue, data)
+    row = ["run1", "job1", catalogue.get_survey("lane").survey_id, kept.stem]
+    with catalogue.writing() as cursor:
+        sql = "INSERT INTO runs VALUES (?, ?, ?, ?, '{}', 'd', '1', 'd', now(), 1, NULL)"
+        cursor.execute(sql, row)
+    files = {
+        "clouds/run1.mcap": "spheres",
+        "clouds/left.mcap": "of no run",
+        "searches/ended.json": '{"status": "successful"}',
+        "searches/open.json": '{"status": "running"}',
+        "worlds.json": "{}",
+    }
+    for name, text in files.items():
+        (data / name).parent.mkdir(exist_ok=True)
+        (data / name).write_text(text)
+    (unknown,) = examine(catalogue.snapshot(), data)
+    assert unknown.place == str(data / "clouds/left.mcap")
+    back_up(catalogue.export(), data, tmp_path / "copy")
+    restore(tmp_path / "copy", tmp_path / "new")
+    copied = {name for name in files if (tmp_path / "new" / name).exists()}
+    assert copied == {"clouds/run1.mcap", "searches/ended.json", "worlds.json"}
+
+
 def test_a_damaged_backup_is_refused_before_anything_is_made(catalogue, data, tmp_path):
     kept = log(catalogue, data)
     back_up(catalogue.export(), data, tmp_path / "copy")
