@@ -2,6 +2,7 @@ import csv
 import hashlib
 import io
 import json
+import socket
 from pathlib import Path
 
 import psutil
@@ -15,6 +16,7 @@ from spheremark.storage.catalogue.sandbox import (
     run_query,
     to_csv,
 )
+from tests.storage.hostile_queries import TEXTS
 
 LIMITS = QueryLimits(seconds=20.0, memory_bytes=256 << 20, rows=1000)
 
@@ -174,6 +176,33 @@ def test_what_is_no_query_of_the_snapshot_is_refused(query, snapshot, sql, reaso
     assert len(str(refusal.value)) < 1000
     assert hashlib.sha256(snapshot.read_bytes()).digest() == before
     assert sorted(path.name for path in snapshot.parent.iterdir()) == [snapshot.name]
+
+
+@pytest.fixture(scope="module")
+def outside(tmp_path_factory):
+    """Return a file that no query may read, its folder, and an address that none may reach."""
+    folder = tmp_path_factory.mktemp("outside")
+    file = folder / "secret.csv"
+    file.write_text("a\nthe secret of this machine\n")
+    with socket.create_server(("127.0.0.1", 0)) as listener:
+        listener.setblocking(False)
+        port = listener.getsockname()[1]
+        yield {"file": file, "folder": folder, "address": f"http://127.0.0.1:{port}"}
+        assert list(folder.iterdir()) == [file]
+        assert file.read_text() == "a\nthe secret of this machine\n"
+        with pytest.raises(BlockingIOError):
+            listener.accept()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("text", TEXTS, ids=lambda text: text[:60])
+def test_no_query_leaves_the_snapshot(query, snapshot, outside, text):
+    before = hashlib.sha256(snapshot.read_bytes()).digest()
+    with pytest.raises(QueryRejectedError) as refusal:
+        query(text.format(**outside))
+    assert "secret of this" not in str(refusal.value)
+    assert hashlib.sha256(snapshot.read_bytes()).digest() == before
+    assert list(outside["folder"].iterdir()) == [outside["file"]]
 
 
 @pytest.mark.parametrize(
