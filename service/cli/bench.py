@@ -69,6 +69,16 @@ def bench(
     full: Annotated[
         bool, typer.Option("--full", help="Over 1000 fits at each distance for --accuracy.")
     ] = False,
+    load: Annotated[
+        float,
+        typer.Option(
+            min=0, help="Times, errors and memory of a service under load, for minutes instead."
+        ),
+    ] = 0.0,
+    upload: Annotated[
+        int,
+        typer.Option(min=0, help="Memory of a service that receives a file of so many MB instead."),
+    ] = 0,
     seed: Annotated[
         int,
         typer.Option(
@@ -81,7 +91,9 @@ def bench(
     as_json: AsJson = False,
 ) -> None:
     """Measure each step against one read of the file with a checksum, in the same run."""
-    if extraction:
+    if load or upload:
+        _served(load, upload * 1_000_000, as_json=as_json)
+    elif extraction:
         from spheremark.pipelines.evaluation import detection
 
         seeds = range(seed, seed + (worlds or _WORLDS_OF_EXTRACTION))
@@ -135,6 +147,18 @@ def reproduce(
     with progress() as show:
         report = study.reproduce(folder, options, show)
     _print(report, study.reproduction_tables, as_json=as_json)
+
+
+def _served(minutes: float, n_bytes: int, *, as_json: bool) -> None:
+    """Measure a service of its own under load, or while it receives a large file."""
+    from spheremark.service.bench import served
+
+    with progress() as show:
+        if minutes:
+            report, tables = served.load(minutes, show), served.load_tables
+        else:
+            report, tables = served.upload(n_bytes, show), served.upload_tables
+    _print(report, tables, as_json=as_json)
 
 
 def _worlds(n: int, seed: int, n_stops: int, *, is_quick: bool, as_json: bool) -> None:

@@ -1,19 +1,23 @@
 """Kills a service at random moments of its work, then compares its files with its rows.
 
-``python -m tests.service.kills --rounds 50`` is the long form of the test of the same name.
+``python -m tests.service.kills LOG CONTROL --rounds 50`` is the long form of the test.
 """
 
 import argparse
 import contextlib
 import hashlib
 import json
+import math
 import os
 import random
+import re
 import subprocess
 import sys
 import tempfile
 import threading
 import time
+from base64 import b64encode
+from collections import Counter
 from pathlib import Path
 
 import httpx
@@ -23,6 +27,7 @@ MCAP = {"Content-Type": "application/vnd.mcap"}
 TUS = {"Tus-Resumable": "1.0.0"}
 PART = {**TUS, "Content-Type": "application/offset+octet-stream"}
 PATIENCE = 300.0  # [s]
+ATTEMPTS = 10  # at a job; no job meets more kills by chance
 COMMAND = (sys.executable, "-m", "spheremark.service.cli")
 
 
@@ -33,7 +38,10 @@ class Victim:
         self.folder, self.log, self.control = folder, log, control
         self.acknowledged = set()  # digests of logs, whatever comes
         self.jobs = set()
-        self.number = 0
+        self.kept = {}  # by digest: address of an unfinished upload, acknowledged bytes
+        self.shortened = []  # uploads of which acknowledged bytes were gone
+        self.refused = []
+        self.number = self.round = 0
 
     def start(self):
         """Start it; return a client."""
@@ -41,7 +49,7 @@ class Victim:
             "SPHEREMARK_DATA": str(self.folder),
             "SPHEREMARK_PORT": "0",
             "SPHEREMARK_WORKERS": "1",
-            "SPHEREMARK_JOB_ATTEMPTS": "10",
+            "SPHEREMARK_JOB_ATTEMPTS": str(ATTEMPTS),
         }
         self.process = subprocess.Popen(
             [*COMMAND, "serve"],
@@ -58,47 +66,87 @@ class Victim:
         raise RuntimeError("the service did not start")
 
     def kill(self, *, workers):
-        """Kill the service, or one of its workers."""
+        """Kill the service, or one of its workers; return the processes that must end by it."""
+        found = psutil.Process(self.process.pid).children(recursive=True)
         if workers:
-            found = psutil.Process(self.process.pid).children(recursive=True)
             own = [one for one in found if "spawn_main" in " ".join(one.cmdline())]
             if own:
                 random.choice(own).kill()
-            return
+            return []
         self.process.kill()
         self.process.wait(60)
+        return found
 
     def work(self, client):
         """Upload whole and in parts, start jobs, export and adjust, until the service is gone."""
-        with contextlib.suppress(httpx.HTTPError):
-            client.put("/api/v1/surveys/field/control", content=self.control,
+        self.round += 1
+        survey = f"field{self.round}"
+        with contextlib.suppress(httpx.TransportError):
+            client.put(f"/api/v1/surveys/{survey}/control", content=self.control,
                        headers={"Content-Type": "text/csv"}).raise_for_status()  # fmt: skip
+            for digest, (url, n_bytes) in tuple(self.kept.items()):
+                self.resume(client, digest, url, n_bytes)
             while True:
                 self.number += 1
-                self.upload(client, self.log + f"{self.number:09d}".encode())
-                client.get("/api/v1/export/results.duckdb")
-                answer = client.post("/api/v1/jobs", json={"kind": "adjust", "survey": "field"})
-                if answer.status_code == 202:
+                self.upload(client, self.log + f"{self.number:09d}".encode(), survey)
+                self.asked(client.get("/api/v1/export/results.duckdb"))
+                if self.number % 3 == 0:
+                    about = {"kind": "adjust", "survey": survey}
+                    answer = self.asked(client.post("/api/v1/jobs", json=about))
                     self.jobs.add(answer.json()["job_id"])
 
-    def upload(self, client, log):
-        """Send a log, every second one in two parts, and start its job."""
+    def asked(self, answer):
+        """Return an answer; keep the refused ones."""
+        if not answer.is_success:
+            self.refused.append(f"{answer.request.url.path}: {answer.status_code} {answer.text}")
+        return answer.raise_for_status()
+
+    def upload(self, client, log, survey):
+        """Send a log and start its job, every second one in two parts."""
+        name = f"l{self.number}"
         if self.number % 2:
-            query = {"name": f"l{self.number}", "survey": "field", "process": "true"}
+            query = {"name": name, "survey": survey, "process": "true"}
             answer = client.post("/api/v1/recordings", params=query, content=log, headers=MCAP)
-            made = answer.json()
-            if "recording_id" in made:
-                self.acknowledged.add(made["recording_id"])
-            if made.get("job"):
-                self.jobs.add(made["job"]["job_id"])
+            made = self.asked(answer).json()
+            self.acknowledged.add(made["recording_id"])
+            self.jobs.add(made["job"]["job_id"])
             return
-        begin = client.post("/api/v1/uploads", headers={**TUS, "Upload-Length": str(len(log))})
-        url, half = begin.headers["location"], len(log) // 2
-        for start, part in ((0, log[:half]), (half, log[half:])):
-            place = {**PART, "Upload-Offset": str(start)}
-            answer = client.patch(url, content=part, headers=place)
+        about = {"filename": name, "survey": survey, "process": "true"}
+        pairs = (f"{key} {b64encode(value.encode()).decode()}" for key, value in about.items())
+        sizes = {"Upload-Length": str(len(log)), "Upload-Metadata": ",".join(pairs)}
+        begin = self.asked(client.post("/api/v1/uploads", headers={**TUS, **sizes}))
+        digest, url = hashlib.sha256(log).hexdigest(), begin.headers["location"]
+        self.kept[digest] = (url, 0)
+        half = len(log) // 2
+        self.append(client, digest, url, 0, log[:half])
+        self.append(client, digest, url, half, log[half:])
+
+    def append(self, client, digest, url, offset, part):
+        """Send a part; note what is acknowledged."""
+        place = {**PART, "Upload-Offset": str(offset)}
+        answer = self.asked(client.patch(url, content=part, headers=place))
+        self.kept[digest] = (url, offset + len(part))
         if "content-location" in answer.headers:
-            self.acknowledged.add(hashlib.sha256(log).hexdigest())
+            self.acknowledged.add(digest)
+            self.jobs.add(re.search(r"/jobs/(\w+)", answer.headers["link"])[1])
+            del self.kept[digest]
+
+    def resume(self, client, digest, url, n_bytes):
+        """Complete an upload that an earlier kill has interrupted."""
+        answer = client.head(url, headers=TUS)
+        if answer.status_code == 404:  # complete, but for its answer
+            self.acknowledged.add(digest)
+            del self.kept[digest]
+            return
+        offset = int(self.asked(answer).headers["upload-offset"])
+        if offset < n_bytes:
+            self.shortened.append(f"{url}: {offset} of {n_bytes} acknowledged bytes")
+        (log,) = (
+            log
+            for log in (self.log + f"{one:09d}".encode() for one in range(1, self.number + 1))
+            if hashlib.sha256(log).hexdigest() == digest
+        )
+        self.append(client, digest, url, offset, log[offset:])
 
     def audit(self, client):
         """Return what was lost and what is there twice; nothing of either should be."""
@@ -108,8 +156,12 @@ class Victim:
                 raise TimeoutError("jobs did not end")
             time.sleep(0.5)
         jobs = {one["job_id"]: one for one in everything(client, "jobs")}
+        done = {
+            key for key, one in jobs.items()
+            if one["status"] == "successful" and one["kind"] == "process"
+        }  # fmt: skip
         rows = [one["recording_id"] for one in everything(client, "recordings")]
-        files = {one.stem for one in (self.folder / "recordings").glob("*.mcap")}
+        files = {one.stem: one for one in (self.folder / "recordings").glob("*.mcap")}
         runs = [one["job_id"] for one in everything(client, "runs")]
         fixes = [
             (one["run_id"], one["stop"], one["fit_method"], one["resection_method"])
@@ -117,19 +169,53 @@ class Victim:
         ]
         found = {
             "logs lost": sorted(self.acknowledged - set(rows)),
-            "logs twice": sorted({one for one in rows if rows.count(one) > 1}),
-            "files without rows": sorted(files - set(rows)),
-            "rows without files": sorted(set(rows) - files),
+            "logs twice": twice(rows),
+            "files without rows": sorted(files.keys() - set(rows)),
+            "rows without files": sorted(set(rows) - files.keys()),
+            "files of other bytes": sorted(
+                stem
+                for stem, path in files.items()
+                if hashlib.sha256(path.read_bytes()).hexdigest() != stem
+            ),
+            "uploads shortened": self.shortened,
+            "requests refused": self.refused,
             "jobs lost": sorted(self.jobs - jobs.keys()),
-            "runs twice": sorted({one for one in runs if runs.count(one) > 1 and one}),
-            "fixes twice": sorted({str(one) for one in fixes if fixes.count(one) > 1}),
-            "too many attempts": [key for key, one in jobs.items() if one["attempts"] > 10],
-            "internal errors": [
-                key for key, one in jobs.items() if one["error_code"] == "internal"
-            ],
+            "jobs failed": {
+                key: f"{one['kind']}, {one['attempts']} attempts, {one['error_code']}: "
+                f"{one['error_reason']}"
+                for key, one in jobs.items()
+                if one["status"] == "failed"
+            },
+            "jobs without run": sorted(done - set(runs)),
+            "runs without job": sorted(set(runs) - jobs.keys()),
+            "runs twice": twice(runs),
+            "fixes twice": twice(fixes),
+            "too many attempts": [key for key, one in jobs.items() if one["attempts"] > ATTEMPTS],
         }
-        about = {"logs": len(rows), "jobs": len(jobs), "runs": len(runs), "fixes": len(fixes)}
+        about = {
+            "logs": len(rows),
+            "jobs": len(jobs),
+            "tried again": sum(one["attempts"] > 1 for one in jobs.values()),
+            "runs": len(runs),
+            "fixes": len(fixes),
+        }
         return {key: value for key, value in found.items() if value}, about
+
+    def doctor(self):
+        """Return what the command finds wrong in the folder of a service that has ended."""
+        done = subprocess.run(
+            [*COMMAND, "doctor"],
+            env={**os.environ, "SPHEREMARK_DATA": str(self.folder)},
+            capture_output=True,
+            text=True,
+            check=False,
+        )
+        return {} if done.returncode == 0 else {"doctor": done.stdout + done.stderr}
+
+
+def twice(items):
+    """Return those that are in a list more than once."""
+    return sorted({str(one) for one, n in Counter(items).items() if n > 1 and one})
 
 
 def everything(client, what):
@@ -144,32 +230,41 @@ def everything(client, what):
             return items
 
 
-def run(folder, log, control, *, rounds, seed):
+def run(folder, log, control, *, rounds, seed, until=math.inf, show=lambda _: None):
     """Kill so many times; return what the audit found, and how much there was."""
     chance = random.Random(seed)
     victim = Victim(folder, log, control)
     client = victim.start()
+    left = []
     try:
         for number in range(rounds):
+            if time.time() > until:
+                break
             worker = threading.Thread(target=victim.work, args=(client,), daemon=True)
             worker.start()
             before, deadline = len(victim.acknowledged), time.monotonic() + PATIENCE
-            while len(victim.acknowledged) == before and time.monotonic() < deadline:
+            while len(victim.acknowledged) == before and worker.is_alive():
+                if time.monotonic() > deadline:
+                    raise TimeoutError("no log was acknowledged")
                 time.sleep(0.05)  # a service that has just begun loads its readers first
             time.sleep(chance.uniform(0.0, 5.0))
             workers = number % 5 == 4
-            victim.kill(workers=workers)
+            left += victim.kill(workers=workers)
             if workers:
                 time.sleep(chance.uniform(0.2, 2.0))
-                victim.kill(workers=False)
+                left += victim.kill(workers=False)
             worker.join(60)
             client.close()
             client = victim.start()
-        return victim.audit(client)
+            show(f"round {number + 1}: {len(victim.acknowledged)} logs, {len(victim.jobs)} jobs")
+        faults, about = victim.audit(client)
     finally:
         client.close()
         victim.process.terminate()
         victim.process.wait(60)
+    if alive := [one for one in left if one.is_running()]:
+        faults["processes left"] = [" ".join(one.cmdline()) for one in alive]
+    return faults | victim.doctor(), {"rounds": victim.round} | about
 
 
 if __name__ == "__main__":
@@ -178,10 +273,20 @@ if __name__ == "__main__":
     parser.add_argument("control", type=Path)
     parser.add_argument("--rounds", type=int, default=50)
     parser.add_argument("--seed", type=int, default=2)
+    parser.add_argument("--minutes", type=float, default=math.inf, help="no round after")
     given = parser.parse_args()
+    begin_wall = time.time()
+
+    def show(text):
+        """Print progress."""
+        sys.stderr.write(text + "\n")
+
     with tempfile.TemporaryDirectory() as place:
         content = given.log.read_bytes(), given.control.read_text()
         begin = time.monotonic()
-        faults, about = run(Path(place), *content, rounds=given.rounds, seed=given.seed)
+        until = begin_wall + given.minutes * 60.0
+        faults, about = run(
+            Path(place), *content, rounds=given.rounds, seed=given.seed, until=until, show=show
+        )
         seconds = round(time.monotonic() - begin)
         sys.stdout.write(json.dumps({"faults": faults, **about, "seconds": seconds}) + "\n")
