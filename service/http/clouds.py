@@ -88,7 +88,8 @@ def cloud_of(service: Service, run: str, stop: str) -> Octree:
     found = service.catalogue.rows(_CLOUD, {"run": run, "stop": stop})
     if not found or found[0]["cloud_url"] is None:
         raise NotFoundError(f"There is no cloud of a stop {stop!r} of a run {run!r}.")
-    return octree_of(found[0]["cloud_url"], service.settings.data / "octrees")
+    settings = service.settings
+    return octree_of(found[0]["cloud_url"], settings.data / "octrees", settings.min_free_bytes)
 
 
 def _pose(row: dict[str, Any] | None) -> dict[str, Any]:

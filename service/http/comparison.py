@@ -37,16 +37,19 @@ _RUNS = """
 SELECT r.run_id AS key, c.name || ', ' || s.name || ', '
     || strftime(r.finished_at, '%d %b %H:%M:%S') AS label
 FROM runs AS r JOIN recordings AS c USING (recording_id) JOIN surveys AS s USING (survey_id)
+WHERE survey_id NOT IN (SELECT survey_id FROM deleted_surveys)
 ORDER BY r.finished_at DESC LIMIT 100
 """
 _NETWORKS = """
 SELECT a.adjustment_id AS key, s.name || ', ' || a.datum || ', '
     || strftime(a.finished_at, '%d %b %H:%M:%S') AS label
-FROM adjustments AS a JOIN surveys AS s USING (survey_id) ORDER BY a.finished_at DESC LIMIT 100
+FROM adjustments AS a JOIN surveys AS s USING (survey_id)
+WHERE survey_id NOT IN (SELECT survey_id FROM deleted_surveys) ORDER BY a.finished_at DESC LIMIT 100
 """
 _RIGS = """
 SELECT c.calibration_id AS key, s.name || ', ' || strftime(c.finished_at, '%d %b %H:%M:%S') AS label
-FROM calibrations AS c JOIN surveys AS s USING (survey_id) ORDER BY c.finished_at DESC LIMIT 100
+FROM calibrations AS c JOIN surveys AS s USING (survey_id)
+WHERE survey_id NOT IN (SELECT survey_id FROM deleted_surveys) ORDER BY c.finished_at DESC LIMIT 100
 """
 _METHODS = """
 SELECT DISTINCT s.name || '/' || f.fit_method AS key,

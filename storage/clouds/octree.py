@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from spheremark.pipelines.errors import InputError
 from spheremark.pipelines.model import Index
 from spheremark.storage.clouds.stop import CloudView, read_cloud
-from spheremark.storage.files import unwritten
+from spheremark.storage.files import require_free, unwritten
 
 BYTES_PER_POINT = 10
 _VERSION = 1
@@ -44,7 +44,7 @@ class Octree:
     begin: int
 
 
-def octree_of(url: str, folder: Path) -> Octree:
+def octree_of(url: str, folder: Path, min_free: int = 0) -> Octree:
     """Return the octree of a stop's cloud, made when it is not there yet.
 
     Parameters
@@ -53,6 +53,8 @@ def octree_of(url: str, folder: Path) -> Octree:
         Result of ``write_cloud``; names the cloud by its digest.
     folder : Path
         Where octrees are kept.
+    min_free : int
+        Space that is kept free on its disk, for the database [bytes].
 
     Returns
     -------
@@ -64,13 +66,13 @@ def octree_of(url: str, folder: Path) -> Octree:
     NotFoundError
         If the cloud is not there any more.
     StorageError
-        If the file cannot be written.
+        If the file cannot be written, or not without that space.
     """
     path = folder / f"{url.rsplit('/', 1)[-1].removesuffix('.parquet')}-{_VERSION}.octree"
     if not path.exists():
         with _building:
             if not path.exists():
-                _write(read_cloud(url), path)
+                _write(read_cloud(url), path, min_free)
     with path.open("rb") as file:
         size = int.from_bytes(file.read(8), "little")
         return Octree(json.loads(file.read(size)), path, 8 + size)
@@ -104,13 +106,14 @@ def node_bytes(octree: Octree, key: str) -> bytes:
         return file.read(node["n"] * BYTES_PER_POINT)
 
 
-def _write(cloud: CloudView, path: Path) -> None:
+def _write(cloud: CloudView, path: Path, min_free: int) -> None:
     """Write the octree of a cloud under another name, then move it."""
     index, content = build(cloud)
     text = json.dumps(index).encode()
     part = path.with_suffix(f".{secrets.token_hex(4)}.part")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
+        require_free(path.parent, len(text) + len(content) + min_free)
         part.write_bytes(len(text).to_bytes(8, "little") + text + content)
         part.replace(path)
     except OSError as error:

@@ -87,3 +87,13 @@ def test_the_page_offers_what_there_is(client):
     text = client.get("/compare", headers=HTML).text
     assert "method:field/along_beam" in text
     assert "Nothing chosen yet" in text
+
+
+def test_results_of_a_deleted_survey_are_not_offered(client):
+    (run,) = client.get("/api/v1/runs", params={"survey": "again"}).json()["items"]
+    assert ">again</a>" in client.get("/live", headers=HTML).text
+    key = client.delete("/api/v1/surveys/again").json()["survey_id"]
+    assert run["run_id"] not in client.get("/compare", headers=HTML).text
+    assert f"(deleted {key})" not in client.get("/live", headers=HTML).text
+    client.post(f"/api/v1/surveys/{key}/restoration").raise_for_status()
+    assert run["run_id"] in client.get("/compare", headers=HTML).text

@@ -6,6 +6,7 @@ import pytest
 from spheremark.pipelines.errors import InputError
 from spheremark.storage.clouds.octree import BYTES_PER_POINT, build, node_bytes, octree_of
 from spheremark.storage.clouds.stop import CloudView, write_cloud
+from spheremark.storage.files import StorageFullError
 from tests.surveyed import marks, stop
 
 N = 60_000
@@ -82,6 +83,9 @@ def test_an_octree_is_kept_and_read_node_by_node(tmp_path):
     rng = np.random.default_rng(2)
     result, _ = stop("one", np.array([0.0, 0.0, 1.0]), marks(), rng)
     url = write_cloud(result, str(tmp_path / "clouds"))
+    with pytest.raises(StorageFullError, match="are needed"):
+        octree_of(url, tmp_path / "octrees", min_free=1 << 60)
+    assert list((tmp_path / "octrees").iterdir()) == []
     made = octree_of(url, tmp_path / "octrees")
     changed = made.path.stat().st_mtime_ns
     again = octree_of(url, tmp_path / "octrees")

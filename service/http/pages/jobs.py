@@ -48,7 +48,8 @@ _LIVE = """
 SELECT j.job_id, j.status, j.progress_percent, j.message, j.error_reason, j.created_at,
     j.recording_id, c.name AS recording, s.name AS survey, s.tolerance_m
 FROM jobs AS j JOIN surveys AS s USING (survey_id) JOIN recordings AS c USING (recording_id)
-WHERE j.kind = 'process' ORDER BY j.created_at DESC, j.job_id LIMIT $n
+WHERE j.kind = 'process' AND survey_id NOT IN (SELECT survey_id FROM deleted_surveys)
+ORDER BY j.created_at DESC, j.job_id LIMIT $n
 """
 _LIVE_STOPS = """
 SELECT r.job_id, x.stop, f.status, f.sigma_3d_m, f.cov_xx_m2, f.cov_xy_m2, f.cov_xz_m2,
