@@ -43,7 +43,8 @@ def _is_closed(path: Path) -> bool:
         about = path / METADATA
         if not about.is_file():
             return False
-        parts = {path / Path(name).name for name in _PART.findall(about.read_text("utf-8"))}
+        text = about.read_text("utf-8", "replace")  # it may be half written
+        parts = {path / Path(name).name for name in _PART.findall(text)}
         return bool(parts) and all(one.is_file() and _is_whole(one) for one in parts)
     if path.suffix == ".bag":
         return path.stat().st_size > 0

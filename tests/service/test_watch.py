@@ -26,6 +26,8 @@ def test_a_bag_is_closed_by_its_metadata_and_all_its_parts(tmp_path, plugin):
     (folder / "bag").mkdir()
     shutil.copy(part, folder / "bag")
     assert closed_logs(folder) == []
+    (folder / "bag" / "metadata.yaml").write_bytes(b"\xff\xfe no text")
+    assert closed_logs(folder) == []
     shutil.copy(bag / "metadata.yaml", folder / "bag")
     assert closed_logs(folder) == [folder / "bag"]
     copied = folder / "bag" / part.name
