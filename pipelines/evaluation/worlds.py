@@ -268,28 +268,32 @@ def _centres(scan: Scan, fits: MarkerFits, marks: Sequence[int]) -> dict[int, Ce
         return {}
     errors = np.array([fit.p_base - true[mark] for fit, mark in matched])
     p = true[[mark for _, mark in matched]]
-    aside = np.column_stack([-p[:, 1], p[:, 0], np.zeros(len(p))])
+    sideways = np.column_stack([-p[:, 1], p[:, 0], np.zeros(len(p))])
     weights = 1.0 / np.array([np.trace(fit.cov_p_base) for fit, _ in matched])
-    turn = (weights * (aside * errors).sum(axis=1)).sum() / (weights * (aside**2).sum(axis=1)).sum()
-    left = errors - turn * aside if len(matched) > 1 else errors
-    bounds, squares = _bounds(scan), _squares(errors, aside, fits, [fit for fit, _ in matched])
+    turn = (weights * (sideways * errors).sum(axis=1)).sum() / (
+        weights * (sideways**2).sum(axis=1)
+    ).sum()
+    left = errors - turn * sideways if len(matched) > 1 else errors
+    bounds, squares = _bounds(scan), _squares(errors, sideways, fits, [fit for fit, _ in matched])
     return {
         mark: Centre(fit.status.value, float(rest @ rest), bounds.get(mark, np.nan), float(square))
         for (fit, mark), rest, square in zip(matched, left, squares, strict=True)
     }
 
 
-def _squares(errors: Array, aside: Array, fits: MarkerFits, matched: Sequence[MarkerFit]) -> Array:
-    """Return squared errors over covariances; ``aside`` is how a heading moves each centre.
+def _squares(
+    errors: Array, sideways: Array, fits: MarkerFits, matched: Sequence[MarkerFit]
+) -> Array:
+    """Return squared errors over covariances; ``sideways`` is how a heading moves each centre.
 
     The heading of the stop is known by its prior and by the errors of all other centres.
     """
     covs = np.array([fit.cov_p_base for fit in matched])
-    weighted = np.linalg.solve(covs, aside[:, :, None])[:, :, 0]
-    own, shown = np.sum(weighted * aside, axis=1), np.sum(weighted * errors, axis=1)
+    weighted = np.linalg.solve(covs, sideways[:, :, None])[:, :, 0]
+    own, shown = np.sum(weighted * sideways, axis=1), np.sum(weighted * errors, axis=1)
     variances = 1.0 / (fits.levelling.sigma_heading_station**-2.0 + own.sum() - own)
-    left = errors - (variances * (shown.sum() - shown))[:, None] * aside
-    covs += variances[:, None, None] * aside[:, :, None] * aside[:, None, :]
+    left = errors - (variances * (shown.sum() - shown))[:, None] * sideways
+    covs += variances[:, None, None] * sideways[:, :, None] * sideways[:, None, :]
     return np.asarray(np.einsum("ni,ni->n", left, np.linalg.solve(covs, left[:, :, None])[:, :, 0]))
 
 
