@@ -71,6 +71,15 @@ class Compared(NamedTuple):
     vectors: Array
 
 
+class Lengths(NamedTuple):
+    """Number, root mean square and maximum of lengths [m], and where the maximum is."""
+
+    n: int
+    rms: float
+    largest: float
+    where: str
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Decision:
     """The decision on a survey, with its reasons where it is not accepted."""
@@ -134,15 +143,34 @@ def by_chance(dof: float) -> tuple[float, float]:
     return low, high
 
 
-def check_of(what: str, measure: str, compared: Compared, ratio: float, dof: float) -> Check:
+def lengths_of(compared: Compared) -> Lengths:
+    """Return number, root mean square and maximum of the lengths of vectors.
+
+    Parameters
+    ----------
+    compared : Compared
+        One vector at least.
+
+    Returns
+    -------
+    Lengths
+        With the name of the longest.
+    """
+    lengths = np.linalg.norm(compared.vectors, axis=1)
+    worst = int(lengths.argmax())
+    rms = float(np.sqrt(np.mean(np.square(lengths))))
+    return Lengths(len(lengths), rms, float(lengths[worst]), compared.names[worst])
+
+
+def check_of(what: str, measure: str, lengths: Lengths, ratio: float, dof: float) -> Check:
     """Return a check whose ratio and independent coordinates are known.
 
     Parameters
     ----------
     what, measure : str
         See ``Check``.
-    compared : Compared
-        The vectors, without covariances.
+    lengths : Lengths
+        Number and size of the errors or residuals.
     ratio : float
         Root mean square over sigma; NaN if unknown.
     dof : float
@@ -151,23 +179,12 @@ def check_of(what: str, measure: str, compared: Compared, ratio: float, dof: flo
     Returns
     -------
     Check
-        With RMS and largest length of the vectors.
+        With the interval by chance where there is one.
     """
-    lengths = np.linalg.norm(compared.vectors, axis=1)
-    worst = int(lengths.argmax())
     known = math.isfinite(ratio) and dof >= 1.0
     low, high = by_chance(dof) if known else (None, None)
-    return Check(
-        what=what,
-        measure=measure,
-        n=len(lengths),
-        ratio=ratio if known else None,
-        low=low,
-        high=high,
-        rms=float(np.sqrt(np.mean(np.square(lengths)))),
-        largest=float(lengths[worst]),
-        where=compared.names[worst],
-    )
+    kept = ratio if known else None
+    return Check(what=what, measure=measure, ratio=kept, low=low, high=high, **lengths._asdict())
 
 
 def check_errors(what: str, compared: Compared, covariances: Array, dof: float) -> Check:
@@ -192,7 +209,7 @@ def check_errors(what: str, compared: Compared, covariances: Array, dof: float) 
     solved = np.linalg.solve(covariances, compared.vectors[..., None])[..., 0]
     squares = np.sum(compared.vectors * solved, axis=1)
     ratio = float(np.sqrt(np.mean(squares) / 3.0))
-    return check_of(what, "error against truth", compared, ratio, dof)
+    return check_of(what, "error against truth", lengths_of(compared), ratio, dof)
 
 
 def check_control(names: Sequence[str], differences: Array, sigmas: Array) -> Check:
@@ -212,9 +229,8 @@ def check_control(names: Sequence[str], differences: Array, sigmas: Array) -> Ch
     """
     ratio = float(np.sqrt(np.mean(np.square(differences / sigmas))))
     measure = "difference when left out in turn"
-    return check_of(
-        "control", measure, Compared(names, differences), ratio, max(3 * len(names) - _DATUM, 1)
-    )
+    lengths = lengths_of(Compared(names, differences))
+    return check_of("control", measure, lengths, ratio, max(3 * len(names) - _DATUM, 1))
 
 
 def independent_coordinates(covariances: Array, shared: Array, scans: Index) -> float:

@@ -2,15 +2,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from spheremark.pipelines.accuracy import acceptance
-from spheremark.pipelines.accuracy.acceptance import Check, Compared, Decision, SolutionQuality
+from spheremark.pipelines.accuracy.acceptance import (
+    Check,
+    Compared,
+    Decision,
+    Lengths,
+    SolutionQuality,
+)
 from spheremark.pipelines.model import Array
 from spheremark.storage.catalogue.catalogue import Catalogue
 from spheremark.storage.catalogue.solutions import Solution, chosen_solution
@@ -44,17 +50,43 @@ SELECT concat_ws(' ', station, marker) AS name, residual_x_m, residual_y_m, resi
 FROM adjusted_observations
 WHERE adjustment_id = $id AND kind = 'centre' AND used AND residual_x_m IS NOT NULL
 """
-_STATION_RESIDUALS = """
-SELECT o.stop || ' ' || o.marker AS name, o.residual_x_m, o.residual_y_m, o.residual_z_m,
-    o.redundancy, o.stop
-FROM observations AS o
+_CHECKS = "SELECT * FROM control_checks WHERE adjustment_id = $id ORDER BY mark"
+_SOLUTIONS = "SELECT * FROM chosen_solutions WHERE list_contains($ids::VARCHAR[], survey_id)"
+_STATION_LISTS = """
+SELECT survey_id, list({'station': station, 'sigma_3d_m': sigma_3d_m, 'dof': dof, 'sigma0': sigma0,
+    'passes_global_test': passes_global_test, 'status': status, 'reason': reason}
+    ORDER BY station) AS stations
+FROM chosen_stations WHERE list_contains($ids::VARCHAR[], survey_id) GROUP BY survey_id
+"""
+_MISSING_LISTS = """
+SELECT r.survey_id, list_sort(list_distinct(list(x.stop))) AS stops
+FROM stops AS x JOIN latest_runs AS r USING (run_id)
+ANTI JOIN (
+    SELECT survey_id, recording_id, stop FROM chosen_stations
+    WHERE list_contains($ids::VARCHAR[], survey_id)
+) AS c ON c.survey_id = r.survey_id AND c.recording_id = r.recording_id AND c.stop = x.stop
+WHERE list_contains($ids::VARCHAR[], r.survey_id) GROUP BY r.survey_id
+"""
+_RESIDUAL_SUMS = """
+SELECT c.survey_id, count(*) AS n, max(length_m) AS largest_m, sqrt(avg(length_m ^ 2)) AS rms_m,
+    arg_max(name, length_m) AS worst
+FROM (
+    SELECT *, stop || ' ' || marker AS name,
+        sqrt(residual_x_m ^ 2 + residual_y_m ^ 2 + residual_z_m ^ 2) AS length_m
+    FROM observations WHERE used AND residual_x_m IS NOT NULL
+) AS o
 JOIN chosen_stations AS c
     ON c.run_id = o.run_id AND c.stop = o.stop AND c.fit_method = o.fit_method
     AND c.resection_method = o.resection_method
-WHERE c.survey_id = $id AND c.adjustment_id IS NULL AND o.used AND o.residual_x_m IS NOT NULL
+WHERE list_contains($ids::VARCHAR[], c.survey_id) AND c.adjustment_id IS NULL
+GROUP BY c.survey_id
 """
-_CHECKS = "SELECT * FROM control_checks WHERE adjustment_id = $id ORDER BY mark"
 _RESIDUAL = "residual"
+_DECISIVE = (
+    *("station", "sigma_3d_m", "passes_global_test", "dof", "sigma0"),
+    *("status", "reason"),
+)
+"""Columns of stations that a decision depends on."""
 _PARTS = ("xx", "xy", "xz", "xy", "yy", "yz", "xz", "yz", "zz")
 
 
@@ -79,30 +111,71 @@ def survey_result(catalogue: Catalogue, survey: str) -> SurveyResult:
     solution = chosen_solution(catalogue, record.survey_id)
     stations = catalogue.columns(_STATIONS, key)
     missing = tuple(catalogue.columns(_NOT_IN, key)["stop"].tolist())
-    network = None
-    if solution is not None and solution.adjustment_id is not None:
-        network = catalogue.rows(_ADJUSTMENT, {"id": solution.adjustment_id})[0]
-    checks = () if solution is None else _checks(catalogue, solution, stations, network)
-    passes = stations["passes_global_test"]
-    quality = SolutionQuality(
-        stations=stations["station"].tolist(),
-        sigmas_3d=stations["sigma_3d_m"].astype(np.float64),
-        failed=[
-            name
-            for name, good in zip(stations["station"], passes, strict=True)
-            if good is not None and not good
-        ],
-        missing=missing,
-        control=next((one for one in checks if one.what == "control"), None),
-        warnings=_warnings(stations, network),
-        is_free=solution is not None and solution.is_free,
-    )
+    network = _network(catalogue, solution)
+    sums = {row["survey_id"]: row for row in catalogue.rows(_RESIDUAL_SUMS, {"ids": [key["id"]]})}
+    control = _control(catalogue, solution, stations, sums.get(record.survey_id))
     return SurveyResult(
         solution=solution,
-        decision=acceptance.decide(quality, record.tolerance),
-        checks=checks,
+        decision=acceptance.decide(
+            _quality(solution, stations, missing, control, network), record.tolerance
+        ),
+        checks=() if solution is None else _checks(catalogue, solution, stations, network, control),
         stations=stations,
         missing=missing,
+    )
+
+
+def survey_decisions(
+    catalogue: Catalogue, tolerances: Mapping[str, float]
+) -> dict[str, tuple[Solution | None, Decision]]:
+    """Return chosen solution and decision of each survey in ``tolerances`` (id to metres).
+
+    The same as ``survey_result`` decides, by a few queries over all surveys.
+    """
+    ids = {"ids": list(tolerances)}
+
+    def by_survey(sql: str) -> dict[str, dict[str, Any]]:
+        return {row["survey_id"]: row for row in catalogue.rows(sql, ids)}
+
+    solutions = {name: Solution(**row) for name, row in by_survey(_SOLUTIONS).items()}
+    stations = {name: row["stations"] for name, row in by_survey(_STATION_LISTS).items()}
+    missing = {name: row["stops"] for name, row in by_survey(_MISSING_LISTS).items()}
+    sums = by_survey(_RESIDUAL_SUMS)
+    found = {}
+    for name, tolerance in tolerances.items():
+        solution, rows = solutions.get(name), stations.get(name, [])
+        columns = {one: np.array([row[one] for row in rows]) for one in _DECISIVE}
+        control = _control(catalogue, solution, columns, sums.get(name))
+        network = _network(catalogue, solution)
+        quality = _quality(solution, columns, missing.get(name, ()), control, network)
+        found[name] = solution, acceptance.decide(quality, tolerance)
+    return found
+
+
+def _network(catalogue: Catalogue, solution: Solution | None) -> Mapping[str, Any] | None:
+    """Return the adjustment of a solution; None of single stations."""
+    if solution is None or solution.adjustment_id is None:
+        return None
+    return catalogue.rows(_ADJUSTMENT, {"id": solution.adjustment_id})[0]
+
+
+def _quality(
+    solution: Solution | None,
+    stations: Columns,
+    missing: Sequence[str],
+    control: Check | None,
+    network: Mapping[str, Any] | None,
+) -> SolutionQuality:
+    """Return what the decision on a solution depends on."""
+    tested = zip(stations["station"], stations["passes_global_test"], strict=True)
+    return SolutionQuality(
+        stations=stations["station"].tolist(),
+        sigmas_3d=stations["sigma_3d_m"].astype(np.float64),
+        failed=[name for name, good in tested if good is not None and not good],
+        missing=missing,
+        control=control,
+        warnings=_warnings(stations, network),
+        is_free=solution is not None and solution.is_free,
     )
 
 
@@ -144,29 +217,34 @@ def _warnings(stations: Columns, network: Mapping[str, Any] | None) -> tuple[str
 
 
 def _checks(
-    catalogue: Catalogue, solution: Solution, stations: Columns, network: Mapping[str, Any] | None
+    catalogue: Catalogue,
+    solution: Solution,
+    stations: Columns,
+    network: Mapping[str, Any] | None,
+    control: Check | None,
 ) -> tuple[Check, ...]:
     """Return the checks of centres, stations and control, as far as they can be made."""
     errors = _vectors(stations, "error")
     known = np.isfinite(errors).all(axis=1)
-    found = [_centres(catalogue, solution, stations, network)]
+    found = [_centres(catalogue, solution, network)]
     if known.any():
         # stations of one survey share control and rig: their errors may be a single draw
         compared = Compared(stations["station"][known].tolist(), errors[known])
-        covariances = _covariances(stations)[known]
-        found.append(acceptance.check_errors("stations", compared, covariances, 3.0))
-    found.append(_control(catalogue, solution, stations))
+        found.append(
+            acceptance.check_errors("stations", compared, _covariances(stations)[known], 3.0)
+        )
+    found.append(control)
     return tuple(one for one in found if one is not None)
 
 
 def _centres(
-    catalogue: Catalogue, solution: Solution, stations: Columns, network: Mapping[str, Any] | None
+    catalogue: Catalogue, solution: Solution, network: Mapping[str, Any] | None
 ) -> Check | None:
     """Return the check of centres: against truth if it is known, else by residuals."""
     key = {"id": solution.survey_id, "method": solution.fit_method}
     rows = catalogue.columns(_CENTRES, key)
     if not len(rows["name"]):  # of single stations the residuals are those at control
-        return None if network is None else _residuals(catalogue, solution, stations, network)
+        return None if network is None else _residuals(catalogue, network)
     covariances = _covariances(rows)
     zero = np.zeros(len(rows["name"]))
     heading = np.stack([-rows["y_m"], rows["x_m"], zero], axis=1) * rows["sigma_heading"][:, None]
@@ -178,29 +256,25 @@ def _centres(
     return acceptance.check_errors("centres", compared, covariances, dof)
 
 
-def _residuals(
-    catalogue: Catalogue, solution: Solution, stations: Columns, network: Mapping[str, Any] | None
-) -> Check | None:
-    """Return the check of centres by their residuals, over the redundancy of all."""
-    if network is not None:
-        rows = catalogue.columns(_NETWORK_RESIDUALS, {"id": solution.adjustment_id})
-        factor, dof = network["variance_factor_centres"], float(np.nansum(rows["redundancy"]))
-    else:
-        rows = catalogue.columns(_STATION_RESIDUALS, {"id": solution.survey_id})
-        dofs = np.nan_to_num(stations["dof"].astype(np.float64))
-        sigma0 = np.nan_to_num(stations["sigma0"].astype(np.float64))
-        dof = float(dofs.sum())
-        factor = float(np.sum(dofs * sigma0**2) / dof) if dof else None
+def _residuals(catalogue: Catalogue, network: Mapping[str, Any]) -> Check | None:
+    """Return the check of the centres of a network by their residuals, over the redundancy."""
+    rows = catalogue.columns(_NETWORK_RESIDUALS, {"id": network["adjustment_id"]})
     if not len(rows["name"]):
         return None
+    factor, dof = network["variance_factor_centres"], float(np.nansum(rows["redundancy"]))
     ratio = float("nan") if factor is None else float(np.sqrt(factor))
-    compared = Compared(rows["name"].tolist(), _vectors(rows, "residual"))
-    return acceptance.check_of("centres", _RESIDUAL, compared, ratio, dof)
+    lengths = acceptance.lengths_of(Compared(rows["name"].tolist(), _vectors(rows, "residual")))
+    return acceptance.check_of("centres", _RESIDUAL, lengths, ratio, dof)
 
 
-def _control(catalogue: Catalogue, solution: Solution, stations: Columns) -> Check | None:
+def _control(
+    catalogue: Catalogue,
+    solution: Solution | None,
+    stations: Columns,
+    residuals: Mapping[str, Any] | None,
+) -> Check | None:
     """Return the check of control: marks left out in turn, or residuals of single stations."""
-    if solution.is_free:
+    if solution is None or solution.is_free:
         return None
     if solution.adjustment_id is not None:
         rows = catalogue.columns(_CHECKS, {"id": solution.adjustment_id})
@@ -208,8 +282,14 @@ def _control(catalogue: Catalogue, solution: Solution, stations: Columns) -> Che
             return None
         sigmas = _vectors(rows, "sigma")
         return acceptance.check_control(rows["mark"].tolist(), _vectors(rows, "difference"), sigmas)
-    found = _residuals(catalogue, solution, stations, None)
-    return found and replace(found, what="control")
+    if residuals is None:
+        return None
+    dofs = np.nan_to_num(stations["dof"].astype(np.float64))
+    sigma0 = np.nan_to_num(stations["sigma0"].astype(np.float64))
+    dof = float(dofs.sum())
+    ratio = float(np.sqrt(np.sum(dofs * sigma0**2) / dof)) if dof else float("nan")
+    sizes = (residuals[name] for name in ("n", "rms_m", "largest_m", "worst"))
+    return acceptance.check_of("control", _RESIDUAL, Lengths(*sizes), ratio, dof)
 
 
 def _vectors(rows: Columns, name: str) -> Array:

@@ -8,7 +8,7 @@ from fastapi.responses import HTMLResponse, RedirectResponse
 from spheremark.service.http.pages.frame import address_of, frame_of
 from spheremark.service.http.pages.networks import Fields
 from spheremark.service.http.state import Current
-from spheremark.service.serialise.solution import survey_result
+from spheremark.service.serialise.solution import survey_decisions
 from spheremark.web.links import survey_url
 from spheremark.web.templating import render
 
@@ -32,8 +32,10 @@ def overview(request: Request, service: Current) -> str:
     """Show each survey with its decision, and how to bring more."""
     rows = service.catalogue.rows
     surveys = rows(_SURVEYS, {"n": _N_SURVEYS})
+    tolerances = {survey["survey_id"]: survey["tolerance_m"] for survey in surveys}
+    decisions = survey_decisions(service.catalogue, tolerances)
     for survey in surveys:
-        survey["result"] = survey_result(service.catalogue, survey["survey_id"])
+        survey["solution"], survey["decision"] = decisions[survey["survey_id"]]
     return render(
         "overview.html",
         frame=frame_of(service),
