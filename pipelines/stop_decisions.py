@@ -24,6 +24,7 @@ from spheremark.pipelines.model import (
 )
 from spheremark.pipelines.placement.probability import probability_within
 
+_CERTAIN = 0.999  # probability above which its digits say nothing
 _ENOUGH = 0.95  # probability of an error within the tolerance, as the tolerance is defined
 _N_TIED = 3  # markers that tie a stop without control to others, with none to spare
 _TURN = np.radians(350.0)  # a full turn, but for the ends that no revolution fills
@@ -145,7 +146,7 @@ def _summary(fix: StationFix, counted: str, tolerance: float) -> str:
     text = (
         f"{counted}, {len(fix.matches)} of them on marks; station with a sigma of "
         f"{1000 * fix.sigma_3d:.1f} mm (3-D), within {1000 * tolerance:.0f} mm with a probability "
-        f"of {100 * within:.1f} %"
+        f"{'of' if within < _CERTAIN else 'above'} {100 * min(within, _CERTAIN):.1f} %"
     )
     return f"{text}; weak: {_ended(fix.reason)}" if fix.status is Status.WEAK else f"{text}."
 

@@ -21,6 +21,7 @@ from spheremark.storage.catalogue.accuracy import QUERIES, TABLES, Selection
 from spheremark.web.columns import by_method
 from spheremark.web.figures import accuracy as figures
 from spheremark.web.figures.captions import CAPTIONS
+from spheremark.web.figures.solution import heights, solution_map
 from spheremark.web.links import stop_url, survey_url
 from spheremark.web.pages.statements import exponents, statements
 
@@ -31,6 +32,7 @@ MEDIA = {
     "parquet": "application/vnd.apache.parquet",
     "sql": "application/sql",
 }
+_OF_SOLUTION = ("solution", "heights")  # figures of the same rows
 _PART = "SELECT * FROM ({rows}) ORDER BY {order} LIMIT $limit OFFSET $after"
 _COUNT = "SELECT count(*) AS n FROM ({rows})"
 
@@ -78,7 +80,11 @@ def figure_of(service: Service, name: str, chosen: Chosen) -> dict[str, Any]:
     )
     figure = _drawn(service, name, data, shown, chosen)
     caption = CAPTIONS[name].format(n=accuracy.N_WORST)
-    if name == "map" and data.num_rows and (n_all := data["n_all"][0].as_py()) > data.num_rows:
+    if (
+        "n_all" in data.column_names
+        and data.num_rows
+        and (n_all := data["n_all"][0].as_py()) > data.num_rows
+    ):
         caption += f" The worst {data.num_rows:,} of {n_all:,} are drawn."
     return {
         "title": str(figure.layout.title.text),
@@ -96,12 +102,27 @@ def _drawn(
         marks = accuracy.used_by(QUERIES["marks"], chosen.values)
         columns = {one: np.asarray(data[one].to_numpy()) for one in data.column_names}
         return figures.field_map(service.catalogue.columns(QUERIES["marks"], marks), columns)
+    if name in _OF_SOLUTION:
+        return _solution(service, name, data, chosen)
     rows = data.to_pylist()
     if name == "distribution":
         return figures.distribution(rows, shown)
     if name == "surveys":
         return figures.surveys(rows, shown)
     return figures.binned(name, rows, shown)
+
+
+def _solution(service: Service, name: str, data: pa.Table, chosen: Chosen) -> Figure:
+    """Draw the stations of chosen solutions; a free network has a frame without marks."""
+    stations = {one: np.asarray(data[one].to_numpy()) for one in data.column_names}
+    if name == "heights":
+        return heights(stations)
+    marks = service.catalogue.columns(
+        QUERIES["marks"], accuracy.used_by(QUERIES["marks"], chosen.values)
+    )
+    if "free network" in stations["solution"]:
+        marks = {column: values[:0] for column, values in marks.items()}
+    return solution_map(marks, stations)
 
 
 def limits_of(service: Service, chosen: Chosen) -> list[dict[str, Any]]:
@@ -218,4 +239,4 @@ def _query(name: str) -> str:
     """Return the query of a figure."""
     if name not in CAPTIONS:
         raise NotFoundError(f"There is no figure {name!r}; there are {', '.join(CAPTIONS)}.")
-    return QUERIES[name]
+    return QUERIES["solution" if name in _OF_SOLUTION else name]

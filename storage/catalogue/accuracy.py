@@ -137,6 +137,16 @@ WITH fixes AS (
 SELECT *, count(*) OVER () AS n_all FROM fixes
 ORDER BY coalesce(error_3d_m, sigma_3d_m) DESC, survey, stop, fit_method LIMIT 600
 """),
+    "solution": """
+SELECT * FROM (
+    SELECT survey, station, stop, solution, x_m, y_m, z_m, sigma_3d_m, sqrt(cov_zz_m2) AS sigma_z_m,
+        ellipse_major_95_m, ellipse_minor_95_m, ellipse_bearing_deg, error_x_m, error_y_m,
+        error_z_m, error_3d_m, count(*) OVER () AS n_all
+    FROM chosen_stations
+    WHERE len($surveys::VARCHAR[]) = 0 OR list_contains($surveys::VARCHAR[], survey)
+    ORDER BY coalesce(error_3d_m, sigma_3d_m) DESC, survey, station LIMIT 600
+) ORDER BY survey, station
+""",
     "marks": """
 SELECT s.name AS survey, c.mark, c.x_m, c.y_m, c.z_m
 FROM control_marks AS c JOIN surveys AS s USING (survey_id)

@@ -67,8 +67,8 @@ def test_a_survey_opens_with_its_decision_and_one_solution(client):
     for one in result["checks"]:
         assert one["n"] > 0
         assert one["ratio_low"] < 1 < one["ratio_high"]
-    assert 'id="figure-map"' in text
-    assert 'id="figure-heights"' in text
+    for name in ("solution", "heights"):
+        assert f'data-source="/api/v1/figures/{name}.json?survey=field"' in text
     assert "paper&#39;s method" not in text
 
 

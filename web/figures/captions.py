@@ -19,6 +19,14 @@ CAPTIONS: Mapping[str, str] = {
     ),
     "distribution": "All centres of each method: the better one is farther to the left.",
     "surveys": "Median and band of 95 % of each survey; click one for its own dashboard.",
+    "solution": (
+        "Ellipses are those of 95 % probability, horizontal. Where truth is known, the line from a"
+        " station ends at its true position, with the same scale."
+    ),
+    "heights": (
+        "Bars are the 95 % interval of each height. Where truth is known, dots are the height"
+        " error."
+    ),
     "map": (
         "Click a station or its ellipse to open it. The thin line ends at the true place; the thick"
         " bar is the error of height, upwards if too high (without truth twice its sigma)."

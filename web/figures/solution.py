@@ -24,7 +24,7 @@ _MARK = theme.Style("control mark", theme.MARK, "circle-cross-open")
 _STATION = theme.Style("station", theme.OURS)
 
 
-def solution_map(marks: Columns, stations: Columns, true_stops: Columns) -> go.Figure:
+def solution_map(marks: Columns, stations: Columns) -> go.Figure:
     """Draw marks and the stations of one solution, with ellipses and errors to one scale."""
     figure = blank_figure("Stations and control marks")
     factor = ellipse_factor(marks, stations)
@@ -34,7 +34,6 @@ def solution_map(marks: Columns, stations: Columns, true_stops: Columns) -> go.F
     look = named | {"text": texts(marks, "mark"), "marker_size": 10}
     add_points(figure, x, y, _MARK, hover, marks, **look)
     x, y = floats(stations, "x_m"), floats(stations, "y_m")
-    rows = {**stations, "sigma_z_m": np.sqrt(floats(stations, "cov_zz_m2"))}
     hover = (
         "<b>{station}</b><br>x {x:.4f} m<br>y {y:.4f} m<br>z {z_m:.4f} m<br>"
         "sigma {sigma_3d_m:mm} mm (3-D), {sigma_z_m:mm} mm (height)"
@@ -43,18 +42,16 @@ def solution_map(marks: Columns, stations: Columns, true_stops: Columns) -> go.F
     look = {"marker_size": 7, "ids": ids}
     if len(x) <= _N_NAMED:
         look |= named | {"text": short_names(texts(stations, "station"))}
-    add_points(figure, x, y, _STATION, hover, rows, **look)
+    add_points(figure, x, y, _STATION, hover, stations, **look)
     hidden = {"showlegend": False, "line_width": 1.5}
-    outlines = [ellipse_outline(stations, i, factor) for i in range(len(x))] if factor else []
+    outlines = [ellipse_outline(stations, i, factor)[::2] for i in range(len(x))] if factor else []
     if outlines:
         linked = {"links": ids, "step": len(outlines[0]) + 1}
         add_strokes(figure, outlines, _STATION, meta=linked, hoverinfo="none", **hidden)
-    truth = dict(zip(texts(true_stops, "stop"), zip(*_plan(true_stops), strict=True), strict=True))
-    errors = [
-        np.array([(px, py), (px + factor * (truth[s][0] - px), py + factor * (truth[s][1] - py))])
-        for s, px, py in zip(texts(stations, "stop"), x, y, strict=True)
-        if s in truth
-    ]
+    places = np.column_stack([x, y])
+    ends = places - factor * np.column_stack([floats(stations, f"error_{k}_m") for k in "xy"])
+    lines = np.stack([places, ends], axis=1)
+    errors = list(lines[np.isfinite(lines).all(axis=(1, 2))])
     add_strokes(figure, errors, _STATION, **hidden)
     make_map(figure, "")
     if factor:
@@ -75,7 +72,7 @@ def short_names(names: list[str]) -> list[str]:
 def heights(stations: Columns) -> go.Figure:
     """Draw the 95 % interval of the height of each station, and its error where it is known."""
     figure = blank_figure("Heights", "Station", "Height [mm]")
-    half = _HALF_95 * MM * np.sqrt(floats(stations, "cov_zz_m2"))
+    half = _HALF_95 * MM * floats(stations, "sigma_z_m")
     error = MM * floats(stations, "error_z_m")
     names = texts(stations, "station")
     bars = {"type": "data", "array": half, "thickness": 2, "width": 5, "color": theme.OURS}
@@ -89,17 +86,11 @@ def heights(stations: Columns) -> go.Figure:
         style = theme.Style("error against truth", theme.PAPER, "diamond")
         add_points(figure, names, error, style, "<b>{x}</b><br>height error {y:.2f} mm", ids=ids)
     add_zero(figure)
-    return figure.update_xaxes(type="category")
+    ticks = short_names(names) if len(names) <= _N_NAMED else names
+    return figure.update_xaxes(type="category", tickvals=names, ticktext=ticks)
 
 
 def _links(stations: Columns) -> list[str]:
-    """Return the address of the stop of each station; none where the survey is not known."""
-    if "survey" not in stations:
-        return [""] * len(stations["station"])
+    """Return the address of the stop of each station."""
     names = zip(texts(stations, "survey"), texts(stations, "stop"), strict=True)
     return [stop_url(survey, stop) for survey, stop in names]
-
-
-def _plan(rows: Columns) -> tuple[list[float], list[float]]:
-    """Return x and y of rows."""
-    return floats(rows, "x_m").tolist(), floats(rows, "y_m").tolist()

@@ -4,10 +4,9 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping, Sequence
-from typing import NamedTuple
 from urllib.parse import urlencode
 
-from spheremark.web.pages.base import Frame
+from spheremark.web.pages.base import Frame, Place
 from spheremark.web.templating import render
 
 Column = tuple[str, str, str]
@@ -47,14 +46,6 @@ _FILTERS = (
     ("incidence_from_deg", "incidence_to_deg", "Incidence [deg]"),
 )
 _PLACES = ("distance", "count", "incidence", "angle", "distribution", "map", "surveys")
-
-
-class Place(NamedTuple):
-    """Where a figure is drawn from its address."""
-
-    name: str
-    source: str
-    kind: str = ""
 
 
 def accuracy_page(

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, NamedTuple
+from urllib.parse import urlencode
 
 import plotly.graph_objects as go
 
@@ -33,6 +34,27 @@ class Panel(NamedTuple):
     def title(self) -> str:
         """The title of the figure."""
         return str(self.figure.layout.title.text)
+
+
+class Place(NamedTuple):
+    """Where a figure is drawn from its address."""
+
+    name: str
+    source: str
+    kind: str = ""
+
+    @classmethod
+    def of(cls, name: str, survey: str, kind: str = "") -> Place:
+        """Return the place of a figure of one survey."""
+        return cls(name, f"/api/v1/figures/{name}.json?{urlencode({'survey': survey})}", kind)
+
+
+class Part(NamedTuple):
+    """A part of a long table: the place of its first row, its most rows, and all rows."""
+
+    after: int
+    n_most: int
+    n_all: int
 
 
 class Readout(NamedTuple):

@@ -5,48 +5,33 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-from spheremark.web.columns import Columns, has_errors, plain_rows
-from spheremark.web.figures.solution import heights, solution_map
-from spheremark.web.links import query_text, survey_url
-from spheremark.web.pages.base import Frame, Panel
+from spheremark.web.columns import has_errors, plain_rows
+from spheremark.web.links import survey_url
+from spheremark.web.pages.base import Frame, Part, Place
 from spheremark.web.templating import render
 
-_MAP = "Ellipses are those of 95 % probability, horizontal"
-_MAP_ERRORS = "; the line from a station points to its true position, with the same scale"
-_HEIGHTS = "Bars are the 95 % interval of each height"
-_HEIGHT_ERRORS = "; dots are the height error against truth"
+_N_ROWS = 100  # stations in one part of the table
+_FIGURES = ("solution", "heights")
 
 
-def result_page(frame: Frame, result: Any, marks: Columns, true_stops: Columns, **more: Any) -> str:
+def result_page(frame: Frame, result: Any, *, after: int, **more: Any) -> str:
     """Return the result of a survey; ``result`` has its solution, decision, checks and stations.
 
-    ``more`` are the tolerance, the number of logs and of other results, and the active jobs.
+    ``after`` is the place of the first station in the table; ``more`` are the tolerance, the number
+    of logs and of other results, and the active jobs.
     """
-    stations, has_truth = result.stations, has_errors(result.stations)
-    is_valid = all(good is None or bool(good) for good in stations["passes_global_test"])
-    panels = []
-    if len(stations["station"]):
-        free = result.solution.solution == "free network"
-        given = {name: column[:0] for name, column in marks.items()} if free else marks
-        shown = true_stops if not free else {n: c[:0] for n, c in true_stops.items()}
-        text = _MAP + (_MAP_ERRORS if len(shown["stop"]) else "")
-        sql = query_text("chosen_stations", survey=frame.survey)
-        note = f"{_HEIGHTS}{_HEIGHT_ERRORS * has_truth}."
-        panels = [
-            Panel("map", solution_map(given, stations, shown), f"{text}.", "tall", sql),
-            Panel("heights", heights(stations), note, "tall", sql),
-        ]
+    stations = {name: result.stations[name] for name in _SHOWN}
+    part = slice(after, after + _N_ROWS)
     return render(
         "result.html",
         frame=frame,
         decision=result.decision,
         solution=result.solution,
         checks=result.checks,
-        rows=plain_rows({name: stations[name] for name in _SHOWN}),
-        missing=result.missing,
-        panels=panels,
-        has_truth=has_truth,
-        is_valid=is_valid,
+        rows=plain_rows({name: column[part] for name, column in stations.items()}),
+        part=Part(after, _N_ROWS, len(stations["station"])),
+        places=[Place.of(name, frame.survey, "tall") for name in _FIGURES],
+        has_truth=has_errors(result.stations),
         steps=next_steps(frame.survey, result, more["n_logs"], more["counts"]),
         **more,
     )

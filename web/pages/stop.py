@@ -107,13 +107,15 @@ def _panels(
 def stops_page(frame: Frame, rows: Sequence[Row], **more: Any) -> str:
     """Return the stops of a survey by its chosen solution.
 
-    ``more`` are the tolerance, the number of all stops, the place of the first of these rows, and
-    the most rows of one part.
+    ``more`` are the tolerance, and which part of all stops these rows are.
     """
     return render(
         "stops.html",
         frame=frame,
         rows=rows,
         has_truth=any(row["error_rms_m"] is not None for row in rows),
+        has_remarks=any(
+            row["solution"] is None or row["station_reason"] or row["notes"] for row in rows
+        ),
         **more,
     )

@@ -108,3 +108,6 @@ for (const place of document.querySelectorAll(".scroll")) {
   place.setAttribute("role", "group"); // no landmark of its own
   place.setAttribute("aria-label", `Table ${named ?? ""}, to be scrolled`);
 }
+
+// Of tabs that do not fit, the present one is in sight
+document.querySelector(".tabs [aria-current]")?.scrollIntoView({ block: "nearest", inline: "center" });

@@ -43,7 +43,7 @@ UNION ALL
 SELECT '/calibrations/' || calibration_id, 'Calibration of the gimbal'
 FROM calibrations WHERE job_id = $id
 """
-_N_LIVE = 30
+_N_LIVE, _N_LIVE_STOPS = 30, 12  # jobs, and stops of each, on the page of live stops
 _LIVE = """
 SELECT j.job_id, j.status, j.progress_percent, j.message, j.error_reason, j.created_at,
     j.recording_id, c.name AS recording, s.name AS survey, s.tolerance_m
@@ -52,12 +52,13 @@ WHERE j.kind = 'process' AND survey_id NOT IN (SELECT survey_id FROM deleted_sur
 ORDER BY j.created_at DESC, j.job_id LIMIT $n
 """
 _LIVE_STOPS = """
-SELECT r.job_id, x.stop, f.status, f.sigma_3d_m, f.cov_xx_m2, f.cov_xy_m2, f.cov_xz_m2,
-    f.cov_yy_m2, f.cov_yz_m2, f.cov_zz_m2
+SELECT r.job_id, x.stop, count(*) OVER (PARTITION BY r.job_id) AS n_stops,
+    f.status, f.sigma_3d_m, f.cov_xx_m2, f.cov_xy_m2, f.cov_xz_m2, f.cov_yy_m2, f.cov_yz_m2, f.cov_zz_m2
 FROM stops AS x JOIN runs AS r USING (run_id)
 LEFT JOIN station_fixes AS f ON f.run_id = x.run_id AND f.stop = x.stop
     AND f.fit_method = 'along_beam' AND f.resection_method = 'free_station'
-WHERE list_contains($jobs, r.job_id) ORDER BY x.stop
+WHERE list_contains($jobs, r.job_id)
+QUALIFY row_number() OVER (PARTITION BY r.job_id ORDER BY x.stop) <= $n_stops ORDER BY x.stop
 """
 _RECORDING = """
 SELECT recording_id, name, size_bytes, uploaded_at, verdict, preflight
@@ -77,7 +78,7 @@ def live(request: Request, service: Current) -> str:
     rows = service.catalogue.rows
     found = [dict(row) for row in rows(_LIVE, {"n": _N_LIVE})]
     by_job = {one["job_id"]: one | {"stops": []} for one in found}
-    for stop in rows(_LIVE_STOPS, {"jobs": list(by_job)}):
+    for stop in rows(_LIVE_STOPS, {"jobs": list(by_job), "n_stops": _N_LIVE_STOPS}):
         job = by_job[stop["job_id"]]
         job["stops"].append({**stop, "grade": _grade(stop, job["tolerance_m"])})
     shown = {"jobs": list(by_job.values()), "address": address_of(request)}

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
-from fastapi import APIRouter, Request
+from typing import Annotated
+
+from fastapi import APIRouter, Query, Request
 from fastapi.responses import HTMLResponse
 
 from spheremark.service.http.pages.frame import address_of, frame_of, survey_row
 from spheremark.service.http.state import Current
+from spheremark.web.pages.base import Part
 from spheremark.web.templating import render
 
 router = APIRouter(include_in_schema=False, default_response_class=HTMLResponse)
@@ -23,17 +26,20 @@ LEFT JOIN (
 ) AS j USING (recording_id)
 LEFT JOIN (SELECT * FROM latest_runs WHERE survey_id = $id) AS n USING (recording_id)
 WHERE list_contains($recordings::VARCHAR[], r.recording_id)
-ORDER BY r.uploaded_at, r.name
+ORDER BY r.uploaded_at, r.name LIMIT $n OFFSET $after
 """
+_ROWS = 60  # logs in one part of the table
 _REMOVED = """
 SELECT r.recording_id, r.name, x.removed_at
 FROM removed_recordings AS x JOIN recordings AS r USING (recording_id)
-WHERE x.survey_id = $id ORDER BY x.removed_at DESC
+WHERE x.survey_id = $id ORDER BY x.removed_at DESC LIMIT $n
 """
 
 
 @router.get("/surveys/{name:path}/logs")
-def logs(name: str, request: Request, service: Current) -> str:
+def logs(
+    name: str, request: Request, service: Current, after: Annotated[int, Query(ge=0)] = 0
+) -> str:
     """Show the logs of a survey, with what to do with them, its control and its name."""
     found, catalogue = survey_row(service, name), service.catalogue
     key = {"id": found["survey_id"]}
@@ -43,7 +49,8 @@ def logs(name: str, request: Request, service: Current) -> str:
         frame=frame_of(service, found["name"], "logs"),
         survey=found,
         control=catalogue.control_marks(found["survey_id"]),
-        logs=catalogue.rows(_LOGS, key | {"recordings": recordings}),
-        removed=catalogue.rows(_REMOVED, key),
+        logs=catalogue.rows(_LOGS, key | {"recordings": recordings, "n": _ROWS, "after": after}),
+        part=Part(after, _ROWS, len(recordings)),
+        removed=catalogue.rows(_REMOVED, key | {"n": _ROWS}),
         address=address_of(request),
     )

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from fastapi import APIRouter, Request
+from typing import Annotated
+
+from fastapi import APIRouter, Query, Request
 from fastapi.responses import HTMLResponse, RedirectResponse
 
 from spheremark.service.http.pages.frame import frame_of, survey_row
@@ -14,8 +16,6 @@ from spheremark.web.pages.result import result_page
 
 router = APIRouter(include_in_schema=False, default_response_class=HTMLResponse)
 
-_MARKS = "SELECT mark, x_m, y_m, z_m FROM control_marks WHERE survey_id = $id ORDER BY mark"
-_TRUE_STOPS = "SELECT stop, x_m, y_m, z_m FROM true_stops WHERE survey_id = $id ORDER BY stop"
 _COUNTS = """
 SELECT (SELECT count(*) FROM stops JOIN latest_runs USING (run_id) WHERE survey_id = $id)
         AS n_stops,
@@ -31,7 +31,9 @@ _DASHBOARD = {
 
 
 @router.get("/surveys/{name:path}", response_model=None)
-def result(name: str, request: Request, service: Current) -> str | RedirectResponse:
+def result(
+    name: str, request: Request, service: Current, after: Annotated[int, Query(ge=0)] = 0
+) -> str | RedirectResponse:
     """Show the result of a survey; an address with filters moved to the tab of accuracy."""
     found = survey_row(service, name)
     if _DASHBOARD & set(request.query_params):
@@ -41,8 +43,7 @@ def result(name: str, request: Request, service: Current) -> str | RedirectRespo
     return result_page(
         frame_of(service, found["name"], "result"),
         survey_result(catalogue, found["survey_id"]),
-        catalogue.columns(_MARKS, key),
-        catalogue.columns(_TRUE_STOPS, key),
+        after=after,
         tolerance_m=found["tolerance_m"],
         counts=catalogue.rows(_COUNTS, key)[0],
         n_logs=len(catalogue.recordings_of_survey(found["survey_id"])),

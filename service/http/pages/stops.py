@@ -13,6 +13,7 @@ from spheremark.service.http.pages.frame import frame_of, survey_row
 from spheremark.service.http.state import Current, Service
 from spheremark.storage.clouds import stop as clouds
 from spheremark.web.figures import scene
+from spheremark.web.pages.base import Part
 from spheremark.web.pages.stop import stop_page, stops_page
 
 router = APIRouter(include_in_schema=False, default_response_class=HTMLResponse)
@@ -39,7 +40,7 @@ LEFT JOIN chosen_stations AS c
 ORDER BY f.stop, f.recording_id LIMIT $n OFFSET $after
 """
 _N_STOPS = "SELECT count(*) AS n FROM stops JOIN latest_runs USING (run_id) WHERE survey_id = $id"
-_ROWS = 200  # stops in one part of the table
+_ROWS = 100  # stops in one part of the table
 _STOP_NAMES = """
 SELECT DISTINCT x.stop FROM stops AS x JOIN latest_runs AS r USING (run_id)
 WHERE r.survey_id = $id ORDER BY x.stop
@@ -102,9 +103,7 @@ def stops(name: str, service: Current, after: Annotated[int, Query(ge=0, le=10**
     return stops_page(
         frame_of(service, found["name"], "stops"),
         rows(_STOPS, key | {"n": _ROWS, "after": after}),
-        n_all=rows(_N_STOPS, key)[0]["n"],
-        after=after,
-        n_rows=_ROWS,
+        part=Part(after, _ROWS, rows(_N_STOPS, key)[0]["n"]),
         tolerance_m=found["tolerance_m"],
     )
 
