@@ -52,8 +52,8 @@ WHERE j.kind = 'process' AND survey_id NOT IN (SELECT survey_id FROM deleted_sur
 ORDER BY j.created_at DESC, j.job_id LIMIT $n
 """
 _LIVE_STOPS = """
-SELECT r.job_id, x.stop, count(*) OVER (PARTITION BY r.job_id) AS n_stops,
-    f.status, f.sigma_3d_m, f.cov_xx_m2, f.cov_xy_m2, f.cov_xz_m2, f.cov_yy_m2, f.cov_yz_m2, f.cov_zz_m2
+SELECT r.job_id, x.stop, count(*) OVER (PARTITION BY r.job_id) AS n_stops, f.status,
+    f.sigma_3d_m, f.cov_xx_m2, f.cov_xy_m2, f.cov_xz_m2, f.cov_yy_m2, f.cov_yz_m2, f.cov_zz_m2
 FROM stops AS x JOIN runs AS r USING (run_id)
 LEFT JOIN station_fixes AS f ON f.run_id = x.run_id AND f.stop = x.stop
     AND f.fit_method = 'along_beam' AND f.resection_method = 'free_station'
