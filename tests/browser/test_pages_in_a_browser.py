@@ -261,7 +261,7 @@ def test_a_survey_is_made_from_nothing_renamed_deleted_and_restored(visit, tmp_p
     assert page.locator("#use-control").is_disabled()
     page.fill("#control-text", "A,1000,2000,3000\nB,4000,5000,3000\nC,0,9000,1000")
     page.select_option("[name=unit]", "mm")
-    page.wait_for_selector("#control-preview:not([hidden])")
+    page.locator("#control-preview td", has_text=re.compile("^1.0000$")).first.wait_for()
     assert page.locator("#control-preview circle").count() == 3
     assert page.locator("#control-preview tbody tr").first.inner_text().split()[:3] == [
         "A", "1.0000", "2.0000"]  # fmt: skip
@@ -269,11 +269,15 @@ def test_a_survey_is_made_from_nothing_renamed_deleted_and_restored(visit, tmp_p
     log = tmp_path / "notes.mcap"
     log.write_bytes(b"this is not a log" * 400_000)  # more than one part
     page.locator("#choose").wait_for(state="visible")
-    page.route("**/api/v1/uploads/*", lambda route: (time.sleep(0.3), route.continue_()))
+    held = []
+    page.route(
+        "**/api/v1/uploads/*", lambda route: held.append(route)
+    )  # no part arrives before the pause
     page.set_input_files("#files", log)
     page.get_by_role("button", name="Pause").click()
-    page.wait_for_timeout(700)
+    page.get_by_role("button", name="Resume").wait_for()
     assert not page.locator("#uploads .outcome.bad").count()
+    page.unroute("**/api/v1/uploads/*")
     page.get_by_role("button", name="Resume").click()
     page.wait_for_selector("#uploads .outcome.bad")
     page.click("#finish")

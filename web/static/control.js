@@ -87,10 +87,15 @@ function show(marks, error) {
   document.dispatchEvent(new CustomEvent("control", { detail: marks }));
 }
 
+let newest = 0; // preview: an earlier one that comes later is not shown
+
 async function preview() {
+  newest += 1;
+  const own = newest;
   if (!text.trim()) return show(null);
   const answer = await send("POST", "/api/v1/surveys/new/control/preview", text);
   const found = await answer.json();
+  if (own !== newest) return;
   show(answer.ok ? found.marks : null, answer.ok ? undefined : found.detail);
 }
 
