@@ -164,8 +164,8 @@ def get_table(
     chosen = figures.choose(service, query.selection())
     if form is Form.SQL:
         return Response(figures.sql_of(table, chosen), media_type=figures.MEDIA[form])
-    asked = "limit" in query.model_fields_set or form is Form.JSON
-    limit = query.limit if asked else figures.ROWS_MAX
+    is_limited = "limit" in query.model_fields_set or form is Form.JSON
+    limit = query.limit if is_limited else figures.ROWS_MAX
     found = figures.page_of(service, table, chosen, query.sort, query.after, limit)
     n_all = figures.count_of(service, table, chosen)
     end = query.after + found.num_rows

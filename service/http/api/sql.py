@@ -88,9 +88,9 @@ async def query_by_link(
 ) -> Any:
     """Run one SELECT that is part of the address, or kept under a name: every query is a link."""
     chosen = query_of(service, q, name, p or [])
-    asked = Query(format=format or "json", **chosen)
+    given = Query(format=format or "json", **chosen)
     accept = "" if format else _accepted(request)
-    return await service.queries.run(request, _run, service, asked, accept)
+    return await service.queries.run(request, _run, service, given, accept)
 
 
 def query_of(service: Service, q: str | None, name: str | None, given: list[str]) -> dict[str, Any]:
