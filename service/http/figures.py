@@ -113,7 +113,7 @@ def _drawn(
 
 
 def _solution(service: Service, name: str, data: pa.Table, chosen: Chosen) -> Figure:
-    """Draw the stations of chosen solutions; a free network has a frame without marks."""
+    """Draw the stations of chosen solutions; a free network has a frame of its own."""
     stations = {one: np.asarray(data[one].to_numpy()) for one in data.column_names}
     if name == "heights":
         return heights(stations)
@@ -122,6 +122,7 @@ def _solution(service: Service, name: str, data: pa.Table, chosen: Chosen) -> Fi
     )
     if "free network" in stations["solution"]:
         marks = {column: values[:0] for column, values in marks.items()}
+        stations |= {f"error_{axis}_m": np.full(len(data), np.nan) for axis in "xy"}
     return solution_map(marks, stations)
 
 

@@ -9,6 +9,7 @@ from spheremark.web.assets import static_folder
 from spheremark.web.columns import lane_and_number
 from spheremark.web.figures import elements, maps
 from spheremark.web.figures import survey as figures
+from spheremark.web.figures.solution import heights, solution_map
 
 MM = 1e-9  # [mm]; figures only scale
 
@@ -57,8 +58,12 @@ def marks():
     }
 
 
-def places(stops, x, y):
-    return {"stop": np.array(stops, dtype=object), "x_m": np.array(x), "y_m": np.array(y)}
+def stations(n=1, **changes):
+    shared = {name: column for name, column in fixes(n).items() if name != "fit_method"}
+    errors = dict.fromkeys(("error_x_m", "error_y_m", "error_z_m"), np.full(n, 0.001))
+    names = {"survey": np.array(["field"] * n, dtype=object), "station": shared["stop"]}
+    given = {name: np.array(column) for name, column in changes.items()}
+    return shared | errors | names | {"sigma_z_m": np.full(n, 0.001)} | given
 
 
 def trace(figure, name):
@@ -158,11 +163,11 @@ def test_lanes_and_numbers_are_read_from_names(stop, lane, number):
 
 
 def test_the_map_has_equal_axes_and_names_its_scale_factor():
-    figure = maps.site_map(marks(), fixes(), places([], [], []))
-    factor = maps.ellipse_factor(marks(), fixes())
+    figure = solution_map(marks(), stations())
+    factor = maps.ellipse_factor(marks(), stations())
     assert figure.layout.yaxis.scaleanchor == "x"
     assert figure.layout.yaxis.scaleratio == 1
-    assert figure.layout.xaxis.title.text == "x, site [m]"
+    assert figure.layout.xaxis.title.text == "x [m]"
     assert any(f"{factor:g}" in note.text for note in figure.layout.annotations)
 
 
@@ -179,11 +184,22 @@ def test_an_ellipse_points_along_its_bearing_from_y_to_x():
 
 
 def test_the_line_of_a_station_leads_to_its_true_place_enlarged_alike():
-    truth = places(["lane3-stop1"], [-4.0 + 0.003], [0.001])
-    figure = maps.site_map(marks(), fixes(), truth)
-    factor = maps.ellipse_factor(marks(), fixes())
+    figure = solution_map(marks(), stations(error_x_m=[-0.003], error_y_m=[-0.001]))
+    factor = maps.ellipse_factor(marks(), stations())
     line = figure.data[-1]
     assert_allclose([line.x[1], line.y[1]], [-4.0 + factor * 0.003, factor * 0.001], atol=1e-9)
+
+
+def test_without_truth_no_line_leaves_a_station():
+    traces = [len(solution_map(marks(), stations(error_x_m=[x])).data) for x in (0.001, np.nan)]
+    assert traces[0] == traces[1] + 1
+
+
+def test_the_bar_of_a_height_is_its_interval_of_95_percent():
+    figure = heights(stations(3, error_z_m=[0.002, -0.001, 0.0]))
+    assert_allclose(figure.data[0].error_y.array, [1.96] * 3, atol=0.01)
+    assert_allclose(trace(figure, "error against truth").y, [2.0, -1.0, 0.0], atol=1e-9)
+    assert list(figure.layout.xaxis.ticktext) == ["1", "2", "3"]
 
 
 def test_every_residual_of_a_station_stands_beside_its_sigma():

@@ -1,42 +1,17 @@
-"""The map of a field: marks, stations, and their ellipses and errors with one scale factor."""
+"""Parts of maps: names, and ellipses with one scale factor."""
 
 from __future__ import annotations
 
 import numpy as np
-import plotly.graph_objects as go
 from numpy.typing import NDArray
 
 from spheremark.web import theme
-from spheremark.web.columns import Columns, by_method, floats, known_values, largest, texts
-from spheremark.web.figures.elements import (
-    add_note,
-    add_points,
-    add_strokes,
-    blank_figure,
-    make_map,
-)
+from spheremark.web.columns import Columns, floats, known_values, largest
 
 _ELLIPSE_SHARE = 0.08  # the largest ellipse is drawn at most this large, as a share of the field
 MARK_STYLE = theme.Style("control mark", theme.MARK, "circle-cross-open")
 NAMES = {"textposition": "top center", "textfont": {"size": 11, "color": theme.MUTED}}
 """How names stand beside points of a map."""
-
-
-def site_map(marks: Columns, fixes: Columns, true_stops: Columns) -> go.Figure:
-    """Draw marks, stations, and their 95 % ellipses and errors with one scale factor."""
-    figure = blank_figure("Field, stations and 95 % ellipses")
-    factor = ellipse_factor(marks, fixes)
-    named = {"mode": "markers+text", "text": texts(marks, "mark"), "cliponaxis": False} | NAMES
-    hover = "<b>{text}</b><br>x {x:.3f} m<br>y {y:.3f} m<br>z {z_m:.3f} m"
-    x, y = floats(marks, "x_m"), floats(marks, "y_m")
-    add_points(figure, x, y, MARK_STYLE, hover, marks, marker_size=10, **named)
-    for method, rows in by_method(fixes):
-        _add_stations(figure, method, rows, factor, true_stops)
-    make_map(figure, ", site")
-    if factor:
-        what = "ellipses and errors" if len(true_stops["stop"]) else "ellipses"
-        add_note(figure, f"{what} \N{MULTIPLICATION SIGN}{factor:g}")
-    return figure
 
 
 def ellipse_factor(marks: Columns, fixes: Columns) -> float:
@@ -65,35 +40,3 @@ def ellipse_outline(
     x = floats(fixes, "x_m")[i] + major * np.sin(bearing) + minor * np.cos(bearing)
     y = floats(fixes, "y_m")[i] + major * np.cos(bearing) - minor * np.sin(bearing)
     return np.column_stack([x, y])
-
-
-def _add_stations(
-    figure: go.Figure, method: str, rows: Columns, factor: float, true_stops: Columns
-) -> None:
-    """Draw the stations of one method with their scaled ellipses and errors."""
-    style = theme.method_style(method)
-    x, y = floats(rows, "x_m"), floats(rows, "y_m")
-    hover = (
-        "<b>{stop}</b> {status}<br>x {x:.3f} m<br>y {y:.3f} m<br>z {z_m:.3f} m<br>"
-        "sigma {sigma_3d_m:mm} mm, {n_markers:.0f} marks"
-    )
-    add_points(figure, x, y, style, hover, rows, marker_size=6, legendgroup=style.label)
-    outlines = [ellipse_outline(rows, i, factor) for i in range(len(x))]
-    hidden = {"legendgroup": style.label, "showlegend": False}
-    add_strokes(figure, outlines, style, line_width=1.5, **hidden)
-    add_strokes(figure, _errors(rows, true_stops, factor), style, line_width=1.0, **hidden)
-
-
-def _errors(rows: Columns, true_stops: Columns, factor: float) -> list[NDArray[np.float64]]:
-    """Return the scaled line from each station towards its true position."""
-
-    def places(columns: Columns) -> zip[tuple[str, NDArray[np.float64]]]:
-        xy = np.column_stack([floats(columns, "x_m"), floats(columns, "y_m")])
-        return zip(texts(columns, "stop"), xy, strict=True)
-
-    truth = dict(places(true_stops))
-    return [
-        np.stack([start, start + factor * (truth[stop] - start)])
-        for stop, start in places(rows)
-        if stop in truth
-    ]

@@ -44,7 +44,6 @@ from spheremark.web.figures.elements import (
 
 _RANGE_BIN = 1.0  # [m]; as the view accuracy_by_distance
 _COUNT_BIN = 20  # as the view accuracy_by_point_count
-ANGLE_BIN = 10.0  # [deg]; as the view accuracy_by_included_angle
 _LABEL_GAP = 0.05  # between names of lanes, as a share of the largest error
 _STUDY = theme.Style("study, Table 2", theme.TEXT, "x-thin")
 _SYMBOLS = {"x": "circle", "y": "diamond", "z": "square"}
