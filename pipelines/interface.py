@@ -25,6 +25,7 @@ from spheremark.pipelines.model import (
 from spheremark.pipelines.network import AdjustedNetwork, adjust_network, assemble
 from spheremark.pipelines.placement import (
     Arrangement,
+    Costs,
     Evaluation,
     Goal,
     Optimum,
@@ -202,6 +203,7 @@ def optimise_plan(  # noqa: PLR0913  all that a plan is made of
     rules: PlaceRules | None = None,
     goal: Goal | None = None,
     standing: ArrayLike | None = None,
+    costs: Costs | None = None,
     report: Report | None = None,
     seed: int = 0,
 ) -> Optimum:
@@ -226,6 +228,8 @@ def optimise_plan(  # noqa: PLR0913  all that a plan is made of
         how far stops may move. The number of marks is that of ``n_marks``, if given.
     standing : (n, 3) array_like, optional
         Centres of marks that stand already and stay; they count among the number [m].
+    costs : Costs, optional
+        What marks and the way past them cost: ``cost`` of the result.
     report : callable, optional
         Takes the state of the search: the best arrangement and the bound so far.
     seed : int
@@ -246,7 +250,7 @@ def optimise_plan(  # noqa: PLR0913  all that a plan is made of
     where = _places("stops", stops)
     site, rules = site or _flat_site(where, where), rules or PlaceRules()
     goal = goal or Goal()
-    return optimise(
+    found = optimise(
         site,
         _stops(where),
         find_candidates(site, _stops(where), rules),
@@ -257,6 +261,7 @@ def optimise_plan(  # noqa: PLR0913  all that a plan is made of
         standing=None if standing is None else Arrangement.numbered(_places("marks", standing)),
         report=report,
     )
+    return found if costs is None else replace(found, cost=costs.of(found))
 
 
 def _columns(

@@ -23,6 +23,7 @@ from spheremark.pipelines.placement.evaluation import (
     worst_after_loss,
 )
 from spheremark.pipelines.placement.optimisation import (
+    Costs,
     Optimum,
     Proposal,
     Report,
@@ -72,6 +73,7 @@ __all__ = [
     "Arrangement",
     "Candidates",
     "CentreModel",
+    "Costs",
     "Evaluation",
     "FieldMap",
     "FitRows",

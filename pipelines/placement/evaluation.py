@@ -275,7 +275,7 @@ def predict_observables(
         cov_centres=centres.cov_site,
         sigma_laser_bias=model.sensor.sigma_range_bias,
         sigma_range_common=model.sensor.sigma_range_common,
-        sigma_aim=model.sensor.sigma_aim,
+        sigma_aim=centres.sigma_aim,
         is_seen=is_found(centres, requirement.n_points_min, requirement.share_min),
         found=found,
     )

@@ -38,10 +38,8 @@ from spheremark.pipelines.placement.walk import round_trip
 
 _SLACK = 1.15  # times the tolerance that a quick search keeps: more is hopeless
 _HOPELESS = 2.0  # the same where places between those of a grid, however wide, come after it
-_FINER, _FINE = (
-    3,
-    0.3,
-)  # times that the grid of the bound is finer, its spacing [m]; if places suffice
+_FINER = 3  # times that the grid of the bound is finer, if places suffice ...
+_FINE = 0.3  # [m] ... and its spacing
 _BOUND, _SEARCH = 0.2, 0.9  # shares of the time after the bound and after the search
 _PLACED = 40  # arrangements that are displaced by chance
 _ROUNDS_OF_STOPS = 4  # in which stops and marks move in turn
@@ -89,6 +87,19 @@ class Optimum:
     walk: float  # round from the first stop past all marks [m]
     n_candidates: int  # places that were compared
     n_exchanges: int  # exchanges and steps that improved on the starts
+    cost: float = 0.0  # of marks and of the way past them, in the unit of ``Costs``
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Costs:
+    """What a mark costs, and a metre of the way past all marks; in any unit."""
+
+    per_mark: float = 0.0
+    per_metre: float = 0.0
+
+    def of(self, found: Optimum) -> float:
+        """Return the costs of a plan."""
+        return self.per_mark * len(found.ground) + self.per_metre * found.walk
 
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)

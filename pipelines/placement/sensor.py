@@ -16,7 +16,12 @@ from spheremark.pipelines.config import FittingConfig, StitchingConfig
 from spheremark.pipelines.errors import ConfigError
 from spheremark.pipelines.model import Array, Beams, seal
 from spheremark.pipelines.scan.rigs import FIRING_CYCLE, N_LASERS
-from spheremark.pipelines.simulation import SimulationConfig, commensurability, horizon_lines
+from spheremark.pipelines.simulation import (
+    SimulationConfig,
+    commensurability,
+    face_lines,
+    recorded_time,
+)
 from spheremark.pipelines.sphere.footprint import Prediction, predict
 
 N_ROWS = 16
@@ -30,6 +35,7 @@ _REFLECTIVITIES = (3.0, 9.0, 24.5, 63.0, 130.0)  # calibrated, at which real pac
 _SIGMAS = (0.0137, 0.0107, 0.0089, 0.0067, 0.0064)  # ... this noise of ranges [m]
 _TOGETHER = 5  # centres that share a position
 _SHARE_MIN = 0.02  # of a footprint that makes a return
+_SAMPLES_MIN = 3.0  # of the angle, of a pulse between two of them on each of two faces
 _N_ROUNDS = 4  # in which precision and worth of the returns settle
 _DISTANCES = np.geomspace(0.5, 45.0, 55)  # [m]
 _LOST = 1e-4  # [m^2] a centre worse than this, and than six times the usual, counts as lost
@@ -63,9 +69,17 @@ class Sensor:
         Standard deviation of the range bias of a laser [m].
     sigma_range_common : float
         Standard deviation of what all lasers measure too long together [m]; as of the fits.
-    sigma_aim : float
-        Standard deviation of each direction, by mounting and encoder, after both faces [rad].
-        6e-5: over 250 stations of random worlds; 1.5e-5 for a rig with its nominal errors.
+    sigma_mounting : float
+        Standard deviation of the directions in which LiDAR and gimbal sit, per axis; it parts the
+        two faces of the scan [rad]. As of the fits.
+    sigma_encoder : float
+        Standard deviation of one sample of the gimbal's angle [rad]. 9e-5: steps of 16 bits, and
+        0.005 deg of jitter.
+    joint_rate : float
+        Samples of the gimbal's angle in a second [Hz].
+    sigma_aim : float or None
+        Standard deviation of each direction after both faces, by mounting and encoder [rad]; by
+        default that of ``Returns.aim``, which grows with the distance.
     divergence : tuple of float
         Full width of the footprint along the sweep and square to it [rad].
     elevations : tuple of float
@@ -83,7 +97,10 @@ class Sensor:
     sigma_direction: float = 1e-4
     sigma_range_bias: float = 0.003
     sigma_range_common: float = FittingConfig().sigma_range_common
-    sigma_aim: float = 6e-5
+    sigma_mounting: float = FittingConfig().sigma_mounting
+    sigma_encoder: float = 9e-5
+    joint_rate: float = 100.0
+    sigma_aim: float | None = None
     divergence: tuple[float, float] = (3.0e-3, 1.5e-3)
     elevations: tuple[float, float] = (float(np.radians(-75.0)), float(np.radians(75.0)))
 
@@ -122,7 +139,7 @@ class Sensor:
     def line_spacing(self) -> float:
         """Mean angle between lines at the horizon, those that fall on each other too [rad]."""
         if self.step:
-            return 2.0 * np.pi / len(horizon_lines(self.scan))
+            return 2.0 * np.pi / sum(map(len, face_lines(self.scan)))
         return 2.0 * np.pi / (2.0 * N_LASERS * self.turn * self.spin_rpm / 60.0)
 
     @property
@@ -146,11 +163,12 @@ class Returns:
     # are found
     spread: Array
     lost: Array  # (d,) share of places at which a centre cannot be found
+    aim: Array  # (d,) standard deviation of directions by mounting and encoder [rad]
 
     def __post_init__(self) -> None:
         d = len(self.distances)
         seal(self, distances=(d,), areas=(d, None, None), information=(d, None, None, 6))
-        seal(self, spread=(d, 3), lost=(d,))
+        seal(self, spread=(d, 3), lost=(d,), aim=(d,))
 
 
 class _Disc(NamedTuple):
@@ -169,6 +187,9 @@ def returns_of(sensor: Sensor, radius: float, n_strips: int) -> Returns:
     -----
     A return is the mean range over its footprint, linearised over the uncertainty of the centre, as
     in the fit along the beam. The spread comes from the true lines of one turn at 400 places.
+    An error of the mounting moves the two faces apart: the share by which the information of one
+    exceeds that of the other is left of it. Errors of the encoder are averaged over the samples of
+    its angle that are taken while the lines pass the sphere.
     """
     discs = [_disc(sensor, radius, n_strips, d) for d in _DISTANCES]
     shape = (len(_DISTANCES), n_strips, N_ROWS, _N_PER_ROW * _N_PER_STRIP)
@@ -179,13 +200,14 @@ def returns_of(sensor: Sensor, radius: float, n_strips: int) -> Returns:
     upper = np.triu_indices(3)
     worth = worth[..., upper[0], upper[1]] * cell[..., None]
     spreads = [_spread(sensor, radius, disc, d) for disc, d in zip(discs, _DISTANCES, strict=True)]
-    mean, lost = (np.array(column) for column in zip(*spreads, strict=True))
+    mean, lost, uneven = (np.array(column) for column in zip(*spreads, strict=True))
     return Returns(
         distances=_DISTANCES.copy(),
         areas=_from_top(areas.sum(axis=-1)),
         information=_from_top(worth.sum(axis=3)),
         spread=mean,
         lost=lost,
+        aim=_aims(sensor, radius, uneven),
     )
 
 
@@ -273,14 +295,29 @@ def _beams(sensor: Sensor, left: Array, up: Array, distance: float) -> Beams:
     )
 
 
-def _spread(sensor: Sensor, radius: float, disc: _Disc, distance: float) -> tuple[Array, float]:
-    """Return the mean spread, and the share of places at which a centre is lost."""
+def _aims(sensor: Sensor, radius: float, uneven: Array) -> Array:
+    """Return the standard deviation of directions by how unevenly two faces are sampled [rad]."""
+    if sensor.sigma_aim is not None:
+        return np.full(len(_DISTANCES), sensor.sigma_aim)
+    share = 2.0 * radius / _DISTANCES / (2.0 * np.pi)  # of a turn, on each face
+    n_samples = 2.0 * sensor.joint_rate * recorded_time(sensor.scan) * share
+    encoder = sensor.sigma_encoder / np.sqrt(np.maximum(n_samples, _SAMPLES_MIN))
+    return np.asarray(np.hypot(sensor.sigma_mounting * uneven, encoder))
+
+
+def _spread(
+    sensor: Sensor, radius: float, disc: _Disc, distance: float
+) -> tuple[Array, float, float]:
+    """Return the mean spread, the share of lost centres, and by how much two faces differ."""
     columns, inverse = np.unique(np.round(disc.left, 9), return_inverse=True)
     worth = np.zeros((len(columns), 3, 3))
     np.add.at(worth, inverse, disc.information)
     height = 2.0 * (columns[1] - columns[0]) * len(columns) / 2.0 / (N_ROWS * _N_PER_ROW)
     per_line = height / (distance * sensor.pulse_spacing)
-    crossings = _crossings(sensor, columns, distance)
+    faces = np.array([_crossings(lines, columns, distance) for lines in face_lines(sensor.scan)])
+    across = faces @ (worth[:, 1, 1] + worth[:, 2, 2])
+    uneven = (across[0] - across[1]) / np.maximum(across.sum(axis=0), 1e-300)
+    crossings = faces.sum(axis=0)
     information = np.einsum("pc,cij->pij", crossings, worth) * per_line
     even = information.mean(axis=0)
     floor = np.eye(3) / (0.3 * radius) ** 2
@@ -289,7 +326,7 @@ def _spread(sensor: Sensor, radius: float, disc: _Disc, distance: float) -> tupl
     is_found = variances.sum(axis=1) < max(_LOST, 6.0 * float(usual.sum()))
     is_found &= bool(disc.returns.any())
     ratios = variances[is_found] / usual if is_found.any() else np.full((1, 3), 36.0)
-    return _together(ratios), float(np.mean(~is_found))
+    return _together(ratios), float(np.mean(~is_found)), float(np.sqrt(np.mean(uneven**2)))
 
 
 def _together(ratios: Array) -> Array:
@@ -299,9 +336,8 @@ def _together(ratios: Array) -> Array:
     return np.asarray((1.0 / worth).mean(axis=0))
 
 
-def _crossings(sensor: Sensor, columns: Array, distance: float) -> Array:
+def _crossings(lines: Array, columns: Array, distance: float) -> Array:
     """Return how many lines pass each column of a disc at each place it may stand, (p, c)."""
-    lines = np.sort(horizon_lines(sensor.scan))
     lines = np.concatenate([lines - 2 * np.pi, lines, lines + 2 * np.pi])
     places = 2 * np.pi * (np.arange(_N_PHASES) * _GOLDEN % 1.0)
     half = 0.5 * (columns[1] - columns[0])

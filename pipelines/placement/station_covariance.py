@@ -36,7 +36,7 @@ class Observables(NamedTuple):
     cov_centres: Array
     sigma_laser_bias: float  # standard deviation of the range bias of a laser [m]
     sigma_range_common: float  # of what all lasers measure too long together [m]
-    sigma_aim: float  # of each direction, by mounting and encoder, after both faces [rad]
+    sigma_aim: Array  # (s, n) of each direction, by mounting and encoder, after both faces [rad]
     is_seen: Mask  # (s, n) which are visible and near enough to be found
     found: Array  # (s, n) probability that each is found
 
@@ -211,7 +211,8 @@ def covariances(observables: Observables, requirement: Requirement) -> tuple[Arr
     bias2 = claimed_bias_variance(observables.sigma_laser_bias)
     noise = noise + bias2 / d2 * along
     stated = noise + requirement.resection.sigma_common**2 * np.eye(3)
-    return stated, noise + observables.sigma_aim**2 * (d2 * np.eye(3) - along)
+    aim2 = observables.sigma_aim[..., None, None] ** 2
+    return stated, noise + aim2 * (d2 * np.eye(3) - along)
 
 
 def _equations(

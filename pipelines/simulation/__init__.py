@@ -18,7 +18,7 @@ The steps of the pipeline import nothing from here, and a log holds nothing of t
 
 from spheremark.pipelines.simulation.field import Decoy, Field, Stop
 from spheremark.pipelines.simulation.options import SimulationConfig
-from spheremark.pipelines.simulation.rig import commensurability, horizon_lines
+from spheremark.pipelines.simulation.rig import commensurability, face_lines, recorded_time
 from spheremark.pipelines.simulation.scenarios import SCENARIOS, scenario
 from spheremark.pipelines.simulation.stop import SimulatedStop, simulate_stop, survey_truth
 from spheremark.pipelines.simulation.worlds import FAMILIES, RandomWorld, draw_world, random_world
@@ -34,8 +34,9 @@ __all__ = [
     "Stop",
     "commensurability",
     "draw_world",
-    "horizon_lines",
+    "face_lines",
     "random_world",
+    "recorded_time",
     "scenario",
     "simulate_stop",
     "survey_truth",

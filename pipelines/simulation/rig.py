@@ -46,7 +46,18 @@ class Motion:
 
 
 def recorded_time(config: SimulationConfig) -> float:
-    """Return the duration of the recording [s]."""
+    """Return the duration of the recording [s].
+
+    Parameters
+    ----------
+    config : SimulationConfig
+        The speeds of gimbal and LiDAR.
+
+    Returns
+    -------
+    float
+        From the first pulse to the last [s].
+    """
     if config.step:
         rest = config.rest_revolutions * 60.0 / config.spin_rpm
         return _n_steps(config) * (rest + config.move) + rest
@@ -210,6 +221,11 @@ def quantised(values: Array, step: float) -> Array:
 
 
 def horizon_lines(config: SimulationConfig) -> Array:
+    """Return the directions in which the scan lines of one turn cross the horizon, ascending."""
+    return np.sort(np.concatenate(face_lines(config)))
+
+
+def face_lines(config: SimulationConfig) -> tuple[Array, Array]:
     """Return the directions in which the scan lines of one turn cross the horizon.
 
     Parameters
@@ -219,8 +235,8 @@ def horizon_lines(config: SimulationConfig) -> Array:
 
     Returns
     -------
-    (n,)
-        Azimuths in the base frame, front and back face, ascending from 0 to 2 pi [rad].
+    front, back : (n,), (m,)
+        Azimuths in the base frame, of each face ascending from 0 to 2 pi [rad].
     """
     period = 60.0 / config.spin_rpm
     elevations = nominal_rig(config).laser_elevations
@@ -229,7 +245,7 @@ def horizon_lines(config: SimulationConfig) -> Array:
     up, down = np.arange(0.0, end, period), np.arange(period / 2, end, period)
     front = motion.angle_at(up)[:, None] + np.pi / 2 - elevations
     back = motion.angle_at(down)[:, None] - np.pi / 2 + elevations
-    return np.sort(np.concatenate([front.ravel(), back.ravel()]) % (2 * np.pi))
+    return np.sort(front.ravel() % (2 * np.pi)), np.sort(back.ravel() % (2 * np.pi))
 
 
 def _horizon_gaps(config: SimulationConfig) -> Array:

@@ -55,6 +55,10 @@ def bench(
     plans: Annotated[
         int, typer.Option(min=0, help="Optimised marks beside the best of so many at random.")
     ] = 0,
+    promises: Annotated[
+        int,
+        typer.Option(min=0, help="Stations of so many random worlds over what plans promise."),
+    ] = 0,
     wrong_rig: Annotated[
         bool, typer.Option("--wrong-rig", help="With wrong rigs, calibrated, for --networks.")
     ] = False,
@@ -110,6 +114,10 @@ def bench(
         from spheremark.pipelines.evaluation import plans as planning
 
         _run(planning.plans(plans, seed), as_json=as_json)
+    elif promises:
+        from spheremark.pipelines.evaluation.promises import promises as over_promises
+
+        _run(over_promises(promises, seed), as_json=as_json)
     elif accuracy:
         from spheremark.pipelines.evaluation.precision import full_precision, precision
 

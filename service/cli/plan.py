@@ -218,9 +218,8 @@ class Search:
 
     def aim(self, n_marks: int | None) -> Aim:
         """Return what the search is for."""
-        from spheremark.pipelines.placement import Goal, PlaceRules
+        from spheremark.pipelines.placement import Costs, Goal, PlaceRules
         from spheremark.service.planning.plans import Aim
-        from spheremark.service.serialise.plans import Costs
 
         rules = PlaceRules(
             reach=self.reach_m,

@@ -77,7 +77,7 @@ async def opened(settings: Settings) -> AsyncIterator[Service]:
                 memory_bytes=settings.prediction_memory_bytes,
             )
             searching = Predictions(
-                n_processes=1,
+                n_processes=_PLANS,
                 seconds=settings.job_seconds,
                 memory_bytes=settings.prediction_memory_bytes,
             )

@@ -15,6 +15,7 @@ from spheremark.pipelines.placement import (
     Arrangement,
     Candidates,
     CentreModel,
+    Costs,
     FieldMap,
     Goal,
     PlaceRules,
@@ -37,7 +38,6 @@ from spheremark.service.planning.requests import (
     terrain_ground,
 )
 from spheremark.service.serialise.plans import (
-    Costs,
     Plain,
     evaluation_json,
     map_json,

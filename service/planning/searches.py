@@ -9,7 +9,7 @@ from __future__ import annotations
 import json
 import secrets
 from collections.abc import Callable, Mapping
-from concurrent.futures import CancelledError, Future
+from concurrent.futures import CancelledError, Future, wait
 from contextlib import suppress
 from datetime import UTC, datetime
 from pathlib import Path
@@ -19,12 +19,14 @@ from typing import Any
 
 from spheremark.pipelines.errors import ConflictError, NotFoundError, SpheremarkError
 from spheremark.pipelines.placement import SearchState
+from spheremark.pipelines.progress import checkpoint
 from spheremark.service.errors import BusyError
 from spheremark.service.planning.predictions import Predictions
 from spheremark.service.serialise.plans import Plain, number_or_null
 
 _KEPT = 200  # searches; beyond, the oldest that have ended are removed
 _OPEN_MOST = 8  # that run or wait
+_LOOK_EVERY = 0.2  # [s] whether the caller still waits
 _REPORT_EVERY = 0.3  # [s] between two reports of a search
 _ID_DIGITS = 16
 
@@ -58,6 +60,41 @@ class Searches:
         self, kind: str, request: Mapping[str, Any], function: Callable[..., Plain], *arguments: Any
     ) -> Plain:
         """Start a search: a function that takes the arguments and a report, and return it."""
+        search_id, _ = self._begin(kind, request, function, arguments)
+        return self.get(search_id)
+
+    def run(
+        self,
+        kind: str,
+        request: Mapping[str, Any],
+        seconds: float,
+        function: Callable[..., Plain],
+        *arguments: Any,
+    ) -> tuple[Plain | None, str]:
+        """Return the result of a search, or None if it takes longer than some time, and its id.
+
+        The search goes on then; where a checkpoint raises, it ends. Its errors are raised.
+        """
+        search_id, future = self._begin(kind, request, function, arguments)
+        end = monotonic() + seconds
+        try:
+            while not wait((future,), min(_LOOK_EVERY, max(end - monotonic(), 0.0))).done:
+                checkpoint()
+                if monotonic() >= end:
+                    return None, search_id
+        except BaseException:
+            future.cancel()
+            raise
+        return self._predictions.result_of(future), search_id
+
+    def _begin(
+        self,
+        kind: str,
+        request: Mapping[str, Any],
+        function: Callable[..., Plain],
+        arguments: tuple[Any, ...],
+    ) -> tuple[str, Future[Plain]]:
+        """Start a search, and return its id and its future."""
         with self._lock:
             if len(self._running) >= _OPEN_MOST:
                 raise BusyError(
@@ -84,7 +121,7 @@ class Searches:
             self._running[record["search_id"]] = future
         future.add_done_callback(lambda done: self._ended(record, done))
         self._forget()
-        return self.get(record["search_id"])
+        return record["search_id"], future
 
     def get(self, search_id: str) -> Plain:
         """Return a search; raise NotFoundError if there is none."""

@@ -6,7 +6,6 @@ import csv
 import io
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -15,6 +14,7 @@ from numpy.typing import ArrayLike
 from spheremark.pipelines.placement import (
     Arrangement,
     CentreModel,
+    Costs,
     Evaluation,
     FieldMap,
     Goal,
@@ -32,18 +32,6 @@ from spheremark.pipelines.published import TABLE_3
 from spheremark.storage.exports.points import NamedPoint
 
 Plain = dict[str, Any]
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Costs:
-    """What a mark costs, and a metre of the way past all marks; in any unit."""
-
-    per_mark: float = 0.0
-    per_metre: float = 0.0
-
-    def of(self, found: Optimum) -> float:
-        """Return the costs of a plan."""
-        return self.per_mark * len(found.ground) + self.per_metre * found.walk
 
 
 def evaluation_json(

@@ -6,7 +6,7 @@ from numpy.testing import assert_allclose
 
 import spheremark
 from spheremark.pipelines.errors import InputError
-from spheremark.pipelines.placement import PlaceRules
+from spheremark.pipelines.placement import Costs, PlaceRules
 from spheremark.pipelines.simulation import SimulationConfig, scenario, simulate_stop
 from tests import chance
 
@@ -100,7 +100,9 @@ def test_scans_are_processed_and_adjusted_with_two_calls():
 
 def test_an_optimised_plan_is_better_than_marks_in_a_bunch_and_evaluates_to_what_it_promised():
     stops = np.array([[0.0, 0.0, 1.05], [3.0, 1.0, 1.05]])
-    found = spheremark.optimise_plan(stops, 4, rules=PlaceRules(spacing=2.0))
+    costs = Costs(per_mark=2.0, per_metre=0.1)
+    found = spheremark.optimise_plan(stops, 4, rules=PlaceRules(spacing=2.0), costs=costs)
+    assert_allclose(found.cost, 8.0 + 0.1 * found.walk, rtol=1e-12)
     bunch = spheremark.evaluate_plan([[6, 0, 1], [6, 1.5, 1], [7, 0, 1], [7, 1.5, 1]], stops)
     assert found.evaluation.sigma_3d.max() < bunch.sigma_3d.max()
     again = spheremark.evaluate_plan(found.evaluation.marks.p_site, stops)

@@ -287,11 +287,11 @@ def test_what_cannot_be_planned_is_refused_with_the_reason(client, wrong, said):
 
 def test_random_plans_come_as_json_and_as_a_page(client):
     wanted = {"n_arrangements": 3000, "n_marks_max": 5, "distance_max_m": 7.5}
+    query = {**wanted, "error_per_axis_mm": 17, "seed": ""}
+    assert "data-search-request" in client.get("/plan/random", params=query).text
     answer = client.post("/api/v1/plans/random", json=wanted).json()
     assert [row["n_marks"] for row in answer["by_number_of_marks"]] == [3, 4, 5]
     assert answer["pass_rate_in_window"] > answer["pass_rate_outside"]
-    query = {**wanted, "error_per_axis_mm": 17, "seed": ""}
-    assert "data-search-request" in client.get("/plan/random", params=query).text
     found = searched(client, random=wanted)
     assert found["random"] == answer
     page = client.get("/plan/random", params=query).text
@@ -415,3 +415,20 @@ def test_a_stop_that_sees_nothing_says_so(client):
     answer = evaluated(client, marks=[])
     assert all(stop["sigma_3d_m"] is None and stop["reason"] for stop in answer["stops"])
     assert answer["worst_sigma_3d_m"] is None
+
+
+def test_a_plan_that_takes_longer_than_its_request_waits_is_a_search_with_an_address(client):
+    wanted = {**SMALL, "n_marks": 3, "is_robust": False}
+    begun = client.post("/api/v1/plans/optimise", json=wanted, headers={"Prefer": "respond-async"})
+    assert begun.status_code == 202
+    assert begun.json()["search_id"] == begun.headers["Location"].rpartition("/")[2]
+    for _ in range(600):
+        found = client.get(begun.headers["Location"]).json()
+        if found["status"] != "running":
+            break
+        time.sleep(0.2)
+    assert found["optimised"] == client.post("/api/v1/plans/optimise", json=wanted).json()
+    trial = {"n_arrangements": 100_000, "model": "sensor"}
+    soon = client.post("/api/v1/plans/random", json=trial, headers={"Prefer": "wait=0"})
+    assert soon.status_code == 202
+    client.delete(soon.headers["Location"])

@@ -8,9 +8,15 @@ from typing import Annotated, Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
-from spheremark.pipelines.placement import MARKS_MOST, Goal, PlaceRules, RandomPlanSpec, Sensor
+from spheremark.pipelines.placement import (
+    MARKS_MOST,
+    Costs,
+    Goal,
+    PlaceRules,
+    RandomPlanSpec,
+    Sensor,
+)
 from spheremark.service.http.api.models import Strict
-from spheremark.service.serialise.plans import Costs
 
 _FAR = 1e8  # [m]; projected coordinates, zone in front, have at most eight digits
 Coordinate = Annotated[float, Field(ge=-_FAR, le=_FAR)]

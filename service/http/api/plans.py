@@ -4,11 +4,10 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
-from functools import partial
-from typing import Annotated
+from typing import Annotated, Any
 
 import numpy as np
-from fastapi import APIRouter, Path, Query, Request, Response
+from fastapi import APIRouter, Header, Path, Query, Request, Response
 from fastapi.responses import JSONResponse, PlainTextResponse
 
 from spheremark.pipelines.placement import CentreModel, RandomPlanSpec, Requirement
@@ -60,6 +59,24 @@ _TERRAIN = {
         "content": {"application/octet-stream": {"schema": {"type": "string", "format": "binary"}}},
     }
 }
+
+_WAIT = 90.0  # [s] that a request waits for a search at most: proxies end silent ones at 100 s
+_ACCEPTED: dict[int | str, dict[str, Any]] = {
+    202: {
+        "model": PlanSearch,
+        "description": "It takes longer than the request waits: a search, with its address.",
+        "headers": {
+            "Location": {"description": "Address of the search.", "schema": {"type": "string"}}
+        },
+    }
+}
+Preference = Annotated[
+    str | None,
+    Header(
+        description="How long the request waits: `wait=10` seconds, 90 at most and by default, or "
+        "`respond-async`, not at all (RFC 7240)."
+    ),
+]
 
 SiteKey = Annotated[
     str, Path(description="paper-field, paper-field@3 (another seed), or terrain:<id>.")
@@ -121,16 +138,19 @@ def _evaluated(
     return JSONResponse(found)
 
 
-@router.post("/plans/optimise", name="optimise_plan")
+@router.post(
+    "/plans/optimise", name="optimise_plan", response_model=OptimisedPlan, responses=_ACCEPTED
+)
 async def optimise_plan(
-    plan: OptimisationRequest, request: Request, service: Current
-) -> OptimisedPlan:
+    plan: OptimisationRequest,
+    request: Request,
+    service: Current,
+    prefer: Preference = None,
+) -> OptimisedPlan | Response:
     """Find the best places for a number of marks, or the fewest that keep the tolerance."""
-
-    def optimised() -> Plain:
-        return service.predictions.run(plans.optimise, assembled_of(service, plan), _aim(plan))
-
-    return OptimisedPlan.model_validate(await service.plans.run(request, optimised))
+    new = NewSearch(optimise=plan)
+    found = await service.plans.run(request, _awaited, service, new, _seconds(prefer))
+    return found if isinstance(found, Response) else OptimisedPlan.model_validate(found)
 
 
 @router.post("/plans/searches", name="start_search", status_code=202)
@@ -145,15 +165,44 @@ async def start_search(
 
 def _started(service: Service, new: NewSearch) -> Plain:
     """Start a search."""
-    given = getattr(new, new.kind)
-    start = partial(service.searches.start, new.kind, given.model_dump(mode="json"))
+    return service.searches.start(new.kind, _request(new), *_call(service, new))
+
+
+def _awaited(service: Service, new: NewSearch, seconds: float) -> Plain | Response:
+    """Return the result of a search, or its address if it takes longer than some time."""
+    call = _call(service, new)
+    found, search_id = service.searches.run(new.kind, _request(new), seconds, *call)
+    if found is not None:
+        return found
+    search = PlanSearch.model_validate(service.searches.get(search_id))
+    headers = {"Location": f"/api/v1/plans/searches/{search_id}"}
+    return JSONResponse(search.model_dump(mode="json"), 202, headers)
+
+
+def _request(new: NewSearch) -> Plain:
+    """Return what a search was asked for, as it is kept."""
+    request: Plain = getattr(new, new.kind).model_dump(mode="json")
+    return request
+
+
+def _call(service: Service, new: NewSearch) -> tuple[Any, ...]:
+    """Return the function of a search and its arguments."""
     if new.random is not None:
-        return start(random_plans.run_reported, *random_specification(service, new.random))
+        return random_plans.run_reported, *random_specification(service, new.random)
+    given = getattr(new, new.kind)
     assembled, aim = assembled_of(service, given), _aim(given)
     if new.trade_off is not None:
-        weights = new.trade_off.loss_weights
-        return start(plans.trade_off, assembled, aim, new.trade_off.numbers, weights)
-    return start(plans.optimise, assembled, aim)
+        return plans.trade_off, assembled, aim, new.trade_off.numbers, new.trade_off.loss_weights
+    return plans.optimise, assembled, aim
+
+
+def _seconds(prefer: str | None) -> float:
+    """Return how long a request waits for its result, by the header Prefer (RFC 7240) [s]."""
+    wanted = [one.strip().lower() for one in (prefer or "").split(",")]
+    waits = [one.removeprefix("wait=") for one in wanted if one.startswith("wait=")]
+    if waits and waits[0].isdecimal():
+        return min(float(waits[0]), _WAIT)
+    return 0.0 if "respond-async" in wanted else _WAIT
 
 
 def _aim(plan: OptimisationRequest) -> plans.Aim:
@@ -201,18 +250,19 @@ async def suggest_mark(
     return SuggestedMark.model_validate(await service.plans.run(request, suggested))
 
 
-@router.post("/plans/random", name="try_at_random")
+@router.post(
+    "/plans/random", name="try_at_random", response_model=RandomPlansResult, responses=_ACCEPTED
+)
 async def simulate_random_plans(
-    options: RandomPlansRequest, request: Request, service: Current
-) -> RandomPlansResult:
+    options: RandomPlansRequest,
+    request: Request,
+    service: Current,
+    prefer: Preference = None,
+) -> RandomPlansResult | Response:
     """Simulate random arrangements as in the study: an error on every centre, pass or fail."""
-    found = await service.plans.run(request, _simulated, service, options)
-    return RandomPlansResult.model_validate(found)
-
-
-def _simulated(service: Service, options: RandomPlansRequest) -> Plain:
-    """Return the results of random arrangements."""
-    return service.predictions.run(random_plans.run, *random_specification(service, options))
+    new = NewSearch(random=options)
+    found = await service.plans.run(request, _awaited, service, new, _seconds(prefer))
+    return found if isinstance(found, Response) else RandomPlansResult.model_validate(found)
 
 
 def random_specification(

@@ -48,6 +48,7 @@ from spheremark.pipelines.placement.bounds import (
 from spheremark.pipelines.placement.centre_model import centres_ahead, expect_centres
 from spheremark.pipelines.placement.evaluation import predict_observables
 from spheremark.pipelines.placement.probability import probability_within
+from spheremark.pipelines.placement.sensor import returns_of
 from spheremark.pipelines.placement.station_covariance import (
     claimed_bias_variance,
     covariances,
@@ -495,6 +496,7 @@ def test_the_bound_is_below_every_choice_and_reached_where_there_is_none():
             seen._replace(
                 marks_site=p[[*some]],
                 cov_centres=seen.cov_centres[:, [*some]],
+                sigma_aim=seen.sigma_aim[:, [*some]],
                 is_seen=seen.is_seen[:, [*some]],
                 found=seen.found[:, [*some]],
             ),
@@ -807,3 +809,14 @@ def test_promises_are_kept_by_simulated_scans():
         assert 0.85 < np.sqrt(np.mean(np.square(ratios))) < 1.15
         assert min(ratios) > 0.8
         assert max(ratios) < 1.25
+
+
+def test_directions_err_by_the_encoder_near_by_and_by_uneven_faces_far_off():
+    """Samples of the angle, on both faces: 100 Hz, 0.2 m wide, in a turn of 13.3 s."""
+    encoder = returns_of(Sensor(sigma_mounting=0.0), 0.1, 8)
+    n_samples = 2.0 * 100.0 * 13.3 * 0.2 / (2.0 * np.pi * encoder.distances)
+    assert_allclose(encoder.aim, 9e-5 / np.sqrt(np.maximum(n_samples, 3.0)), rtol=1e-9)
+    mounting = returns_of(Sensor(sigma_encoder=0.0), 0.1, 8).aim / Sensor().sigma_mounting
+    near, far = np.interp([2.0, 20.0], encoder.distances, mounting)
+    assert 0.0 < near < far < 1.0  # a share: fewer lines pass a sphere far off
+    assert (returns_of(Sensor(sigma_aim=2e-5), 0.1, 8).aim == 2e-5).all()
