@@ -187,7 +187,10 @@ def _log_likelihoods(
             else:
                 physics = Physics(noise, _SIGMAS_LOG_NOISE[0], *hearing)
             distance = float(np.linalg.norm(features.p_base))
-            found[i] = log_likelihoods(evidence, distance, n_neighbours, target.radius, physics)
+            level = float(features.p_base @ target.up)
+            found[i] = log_likelihoods(
+                evidence, distance, level, n_neighbours, target.radius, physics
+            )
 
     side_by_side(compare, len(compared), threaded_from=4)
     return found

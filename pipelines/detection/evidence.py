@@ -169,7 +169,7 @@ def _evidence_at(
     silent = None
     if clock is not None:
         silent = unheard_about(cloud, clock, rows, c, target)
-        n_past += _n_beside_pole(silent / target.radius, blur_at(c, target) / target.radius)
+        n_past += n_beside_pole(silent / target.radius, blur_at(c, target) / target.radius)
     height, sigma_height = _height_above_ground(cloud.p_base, rows, seen, c, target)
     is_left = np.cos(angles) * c[1] > np.sin(angles) * c[0]
     return Evidence(
@@ -234,7 +234,7 @@ def _half_widths(rig: Rig, angles: Column, c: Array, target: Target) -> Array:
 
 
 @compiled
-def _n_beside_pole(silent: Array, blur: float) -> int:
+def n_beside_pole(silent: Array, blur: float) -> int:
     """Return how many pulses without a return pass below a sphere and beside its pole."""
     n = 0
     for i in range(silent.shape[1]):

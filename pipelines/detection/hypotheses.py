@@ -13,7 +13,8 @@ from typing import NamedTuple
 import numpy as np
 
 from spheremark.pipelines.compilation import compiled
-from spheremark.pipelines.detection.evidence import Evidence
+from spheremark.pipelines.detection.evidence import Evidence, n_beside_pole
+from spheremark.pipelines.detection.target import ASIDE
 from spheremark.pipelines.estimation.linear_algebra import invert
 from spheremark.pipelines.model import Array
 
@@ -53,18 +54,9 @@ _N_MAX = 96  # beams that are compared: more decide nothing, and errors of the m
 _FLOOR = 1e-9
 _NEVER = 60.0  # logarithm of odds behind the best that stand for any more
 _HOPELESS = 15.0  # logarithm of odds behind the best from which a hypothesis is given up
-_GIVEN_UP = 20.0  # the same of the sphere, from which no other hypothesis is compared
-_ORDER = (
-    0,
-    8,
-    7,
-    4,
-    6,
-    5,
-    3,
-    2,
-    1,
-)  # the sphere, then what is refuted or refutes at the least cost
+_GIVEN_UP = 12.0  # the same of the sphere, from which no other hypothesis is compared
+_ORDER = (0, 8, 7, 4, 6, 5, 3, 2, 1)  # the sphere, then what refutes it at the least cost
+_CLOSE = 0.05  # logarithm of odds: a round of a search that gains less is followed by finer steps
 _N_ROUNDS = 7
 _SAME = 0.15  # relative deviation of a radius, or of three axes, within which it may be a marker
 _AS_ROUND = 0.002  # share of other balls and stones that are known to be so, and are no markers
@@ -101,6 +93,9 @@ _NOT_GROUND = 0.1  # probability that what is just before a place is not the gro
 _N_NEAR_FREE = 0.2  # groups near what stands free, in the mean
 _CROWDED = 5.0 / 6.0  # odds of one more group near leaves, panels and posts: five in the mean
 _AMONG = 0.03  # probability that what stands free stands among these
+
+
+_BELOW = -0.3  # radii: beams so far below a centre pass a marker beside its pole
 
 
 class Physics(NamedTuple):
@@ -148,7 +143,12 @@ class _Beams(NamedTuple):
 
 
 def log_likelihoods(
-    evidence: Evidence, distance: float, n_neighbours: int, radius: float, physics: Physics
+    evidence: Evidence,
+    distance: float,
+    level: float,
+    n_neighbours: int,
+    radius: float,
+    physics: Physics,
 ) -> Array:
     """Return the logarithms of the likelihoods of all hypotheses about a place.
 
@@ -158,6 +158,8 @@ def log_likelihoods(
         The beams towards and about it.
     distance : float
         From the sensor [m].
+    level : float
+        Height above the sensor [m].
     n_neighbours : int
         Other groups that stand near it.
     radius : float
@@ -187,9 +189,12 @@ def log_likelihoods(
     n_below, n_past = evidence.n_held + evidence.n_short, evidence.n_past
     if evidence.silent is None:  # pulses are as dense below, and those without a return go past
         n_past = max(n_past, evidence.n_on - n_below)
+    is_low = silent[1] < -level / radius  # no ground is above the horizon, in the mean
+    unheard, blur = silent[:, is_low], evidence.blur.max() / radius
+    n_known = n_past - _n_unknown(evidence.seen[:2] / radius, unheard, blur)
     for kind in range(len(NAMES)):
         logs[kind] += _log_share(n_beside, n_passing, _SHARES_BESIDE[kind])
-        logs[kind] += _log_share(n_below, n_past, _SHARES_BELOW[kind])
+        logs[kind] += _log_share(n_below, n_known, _SHARES_BELOW[kind])
         logs[kind] += np.log(_height_density(kind, evidence.height, evidence.sigma_height, radius))
         logs[kind] += np.log(_neighbour_probability(kind, n_neighbours))
     priors = _priors(radius, physics)
@@ -200,6 +205,19 @@ def log_likelihoods(
     found: Array = _compared(beams, priors, logs)
     never = float(found.max()) - _NEVER
     return np.asarray(np.maximum(found, never))
+
+
+def _n_unknown(seen: Array, silent: Array, blur: float) -> float:
+    """Return how many pulses without a return below a place may have met ground that is not heard.
+
+    The beams to the sides, past where a pole or shoulders would be, show how much of it is heard.
+    """
+    n_heard, n_silent = (
+        int(np.sum((up < _BELOW) & (abs(across) > ASIDE + blur)))
+        for across, up in (seen, silent[:2])
+    )
+    n_below = n_beside_pole(silent, blur)
+    return float(n_below * (n_silent + 0.5) / (n_heard + n_silent + 1.0))
 
 
 def _priors(radius: float, physics: Physics) -> Array:
@@ -220,7 +238,7 @@ def _priors(radius: float, physics: Physics) -> Array:
     return priors
 
 
-def _log_share(n_near: int, n_past: int, beta: tuple[float, float, float]) -> float:
+def _log_share(n_near: int, n_past: float, beta: tuple[float, float, float]) -> float:
     """Return the log probability that so many beams end near, and so many go past."""
 
     def of(a: float, b: float) -> float:
@@ -475,7 +493,7 @@ def _evidence(kind: int, shape: Array, prior: Array, beams: _Beams, least: float
     for round_no in range(_N_ROUNDS if kind != _SPHERE else 2 * _N_ROUNDS):
         if found < least - _HOPELESS * (1.0 + 4.0 / (1.0 + round_no)):
             return -np.inf
-        is_better = False
+        before = found
         for j in range(_N_PARAMETERS):
             if steps[j] == 0.0:
                 continue
@@ -484,10 +502,10 @@ def _evidence(kind: int, shape: Array, prior: Array, beams: _Beams, least: float
                 shape[j] = kept + steps[j]
                 trial = _log_likelihood(kind, shape, prior, beams)
                 if trial > found:
-                    found, is_better = trial, True
+                    found = trial
                     break
                 shape[j], steps[j] = kept, -steps[j]
-        if not is_better:
+        if found < before + _CLOSE:
             steps *= 0.4
     return float(found + _log_volume(kind, shape, prior, beams, found))
 

@@ -14,7 +14,8 @@ from spheremark.pipelines.compilation import compiled
 from spheremark.pipelines.model import Array, Column
 
 _POLE = 0.5  # radii: half the width of a pole
-_ASIDE = 1.9  # radii: anything farther to a side may be another object
+ASIDE = 1.9
+"""Radii: anything farther to a side may be another object."""
 
 
 class Target(NamedTuple):
@@ -35,7 +36,7 @@ def blur_at(c: Array, target: Target) -> float:
 def is_beside_pole(across: float, along: float, blur: float) -> bool:
     """Return whether a beam passes a sphere below it and beside its pole; all in radii."""
     is_out = across * across + along * along > (1.2 + blur) ** 2
-    return bool(is_out and along < -0.3 and _POLE + blur < abs(across) < _ASIDE + blur)
+    return bool(is_out and along < -0.3 and _POLE + blur < abs(across) < ASIDE + blur)
 
 
 class View(NamedTuple):
