@@ -58,12 +58,14 @@ class Victim:
             stderr=subprocess.STDOUT,
             text=True,
         )
+        lines = []
         for line in self.process.stdout:
+            lines.append(line)
             if "http://" in line:
                 address = line[line.index("http://") :].split()[0].rstrip(".,;")
                 threading.Thread(target=self.process.stdout.read, daemon=True).start()
                 return httpx.Client(base_url=address, timeout=60.0)
-        raise RuntimeError("the service did not start")
+        raise RuntimeError("the service did not start: " + "".join(lines))
 
     def kill(self, *, workers):
         """Kill the service, or one of its workers; return the processes that must end by it."""
@@ -82,8 +84,8 @@ class Victim:
         self.round += 1
         survey = f"field{self.round}"
         with contextlib.suppress(httpx.TransportError):
-            client.put(f"/api/v1/surveys/{survey}/control", content=self.control,
-                       headers={"Content-Type": "text/csv"}).raise_for_status()  # fmt: skip
+            url, kind = f"/api/v1/surveys/{survey}/control", {"Content-Type": "text/csv"}
+            self.asked(client.put(url, content=self.control, headers=kind))
             for digest, (url, n_bytes) in tuple(self.kept.items()):
                 self.resume(client, digest, url, n_bytes)
             while True:
@@ -253,7 +255,9 @@ def run(folder, log, control, *, rounds, seed, until=math.inf, show=lambda _: No
             if workers:
                 time.sleep(chance.uniform(0.2, 2.0))
                 left += victim.kill(workers=False)
-            worker.join(60)
+            worker.join(90)  # longer than the timeout of a request
+            if worker.is_alive():
+                raise TimeoutError("a request did not end with its service")
             client.close()
             client = victim.start()
             show(f"round {number + 1}: {len(victim.acknowledged)} logs, {len(victim.jobs)} jobs")
