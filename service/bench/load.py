@@ -40,6 +40,10 @@ INSERT INTO surveys BY NAME SELECT 'load-test-' || k AS survey_id, 'load-test-' 
 _KEEP = "DELETE FROM resections WHERE n_marks != 2 OR resection_method != 'free_station'"
 _SIZES = "SELECT (SELECT count(*) FROM stops), (SELECT count(*) FROM marker_fits)"
 _ADDRESSES = (
+    "/",
+    "/live",
+    *(f"/surveys/load-test-7{tab}" for tab in ("", "/stops", "/logs")),
+    "/api/v1/figures/solution.json?survey=load-test-7",
     "/accuracy",
     *(
         f"/api/v1/figures/{name}.json"

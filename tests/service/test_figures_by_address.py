@@ -14,7 +14,10 @@ from spheremark.service.settings import Settings
 from spheremark.storage.catalogue.catalogue import Catalogue
 from tests.surveyed import NOW, fill
 
-FIGURES = ("distance", "count", "incidence", "angle", "distribution", "surveys", "map")
+FIGURES = (
+    *("distance", "count", "incidence", "angle", "distribution", "surveys", "map"),
+    *("solution", "heights"),
+)
 HTML = {"accept": "text/html"}
 
 
