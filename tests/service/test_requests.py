@@ -39,6 +39,8 @@ WRONG = [  # method, path, arguments, status, code
     ("DELETE", "/api/v1/surveys/nobody", {}, 404, "not_found"),
     ("POST", "/api/v1/surveys/nobody/restoration", {}, 404, "not_found"),
     ("GET", "/api/v1/surveys/nobody/result", {}, 404, "not_found"),
+    ("GET", "/api/v1/surveys/nobody/scene", {}, 404, "not_found"),
+    ("GET", "/api/v1/compare?a=run:none&b=run:none", {}, 422, "input.unknown"),
     ("PUT", "/api/v1/surveys/nobody/recordings/none", {}, 404, "not_found"),
     ("DELETE", "/api/v1/surveys/nobody/recordings/none", {}, 404, "not_found"),
     ("DELETE", "/api/v1/surveys/nobody/control", {}, 404, "not_found"),

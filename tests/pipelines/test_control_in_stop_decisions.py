@@ -1,4 +1,4 @@
-"""What a job says of a log in a sentence."""
+"""Decisions on stops name control marks that the distances between markers contradict."""
 
 from dataclasses import replace
 
@@ -8,7 +8,7 @@ import pytest
 from spheremark.pipelines.config import SurveyConfig
 from spheremark.pipelines.model import ControlMarks
 from spheremark.pipelines.positioning.quality_control import check_distances
-from spheremark.service.jobs.handlers.process import summary
+from spheremark.pipelines.stop_decisions import decide
 from tests.surveyed import marks, stop
 
 
@@ -40,9 +40,9 @@ def checked(seen, control):
 @pytest.mark.parametrize("shift", [0.08, 0.4])
 def test_a_control_mark_that_the_distances_contradict_is_named(seen, control, shift):
     wrong = moved(control, 2, [shift, 0.0, 0.0])
-    assert f"look at {control.names[2]}." in summary([checked(seen, wrong)], wrong)
+    assert f"look at {control.names[2]}." in decide(checked(seen, wrong), SurveyConfig(), wrong).text
 
 
 def test_control_that_agrees_and_no_control_are_not_spoken_of(seen, control):
-    assert "look at" not in summary([checked(seen, control)], control)
-    assert "look at" not in summary([replace(seen, fixes={})], None)
+    assert "look at" not in decide(checked(seen, control), SurveyConfig(), control).text
+    assert "look at" not in decide(replace(seen, fixes={}), SurveyConfig(), None).text
