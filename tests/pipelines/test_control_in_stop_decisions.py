@@ -40,7 +40,9 @@ def checked(seen, control):
 @pytest.mark.parametrize("shift", [0.08, 0.4])
 def test_a_control_mark_that_the_distances_contradict_is_named(seen, control, shift):
     wrong = moved(control, 2, [shift, 0.0, 0.0])
-    assert f"look at {control.names[2]}." in decide(checked(seen, wrong), SurveyConfig(), wrong).text
+    assert (
+        f"look at {control.names[2]}." in decide(checked(seen, wrong), SurveyConfig(), wrong).text
+    )
 
 
 def test_control_that_agrees_and_no_control_are_not_spoken_of(seen, control):
