@@ -7,6 +7,7 @@ beside it. A search that a restart interrupted is a failed one.
 from __future__ import annotations
 
 import json
+import logging
 import secrets
 from collections.abc import Callable, Mapping
 from concurrent.futures import CancelledError, Future, wait
@@ -23,6 +24,8 @@ from spheremark.pipelines.progress import checkpoint
 from spheremark.service.errors import BusyError
 from spheremark.service.planning.predictions import Predictions
 from spheremark.service.serialise.plans import Plain, number_or_null
+
+logger = logging.getLogger(__name__)
 
 _KEPT = 200  # searches; beyond, the oldest that have ended are removed
 _OPEN_MOST = 8  # that run or wait
@@ -48,11 +51,20 @@ class Searches:
         self._running: dict[str, Future[Plain]] = {}
 
     def open(self) -> None:
-        """Make the folder, and record which searches a restart interrupted."""
+        """Make the folder, and record which searches a restart interrupted.
+
+        A damaged file is renamed, so that it is kept and read no more.
+        """
         self._folder.mkdir(parents=True, exist_ok=True)
         for path in self._folder.glob("*.json"):
-            found = json.loads(path.read_text(encoding="utf-8"))
-            if found["status"] == "running":
+            try:
+                found = json.loads(path.read_text(encoding="utf-8"))
+                is_open = found["status"] == "running"
+            except (ValueError, TypeError, KeyError):
+                logger.warning("Search %s is damaged; its file is renamed.", path.stem)
+                path.rename(path.with_suffix(".damaged"))
+                continue
+            if is_open:
                 reason = "The service was restarted while this search ran; start it again."
                 self._end(found, "failed", code="interrupted", reason=reason)
 
@@ -138,7 +150,10 @@ class Searches:
 
     def list(self) -> list[Plain]:
         """Return all searches without their results, newest first."""
-        every = [self.get(path.stem) for path in self._folder.glob("*.json")]
+        every = []
+        for path in self._folder.glob("*.json"):
+            with suppress(NotFoundError):  # removed in the meantime
+                every.append(self.get(path.stem))
         every.sort(key=lambda one: one["created_at"], reverse=True)
         return [{k: v for k, v in one.items() if k not in _RESULTS} for one in every]
 

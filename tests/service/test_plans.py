@@ -1,5 +1,6 @@
 import csv
 import io
+import json
 import time
 import xml.etree.ElementTree as ET
 
@@ -11,6 +12,8 @@ from rasterio.transform import Affine
 
 from spheremark.service.http.api.plan_models import MappedEvaluation
 from spheremark.service.http.app import create_app
+from spheremark.service.planning.predictions import Predictions
+from spheremark.service.planning.searches import Searches
 from spheremark.service.settings import Settings
 from spheremark.storage.catalogue.catalogue import Catalogue
 from tests.surveyed import fill
@@ -432,3 +435,17 @@ def test_a_plan_that_takes_longer_than_its_request_waits_is_a_search_with_an_add
     soon = client.post("/api/v1/plans/random", json=trial, headers={"Prefer": "wait=0"})
     assert soon.status_code == 202
     client.delete(soon.headers["Location"])
+
+
+def test_a_damaged_search_is_kept_apart_and_an_interrupted_one_has_failed(tmp_path):
+    searches = Searches(
+        Predictions(n_processes=1, seconds=10.0, memory_bytes=2**30), tmp_path / "searches"
+    )
+    searches.open()
+    (tmp_path / "searches" / "00000000000000aa.json").write_text("{")
+    open_one = {"search_id": "00000000000000bb", "status": "running", "created_at": "2026-01-01"}
+    (tmp_path / "searches" / "00000000000000bb.json").write_text(json.dumps(open_one))
+    searches.open()
+    assert (tmp_path / "searches" / "00000000000000aa.damaged").read_text() == "{"
+    (found,) = searches.list()
+    assert (found["status"], found["error_code"]) == ("failed", "interrupted")
