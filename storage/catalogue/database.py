@@ -151,6 +151,23 @@ class Database:
             self._reserve.hold()
             return self._snapshots.take(self._connection, self._version)
 
+    @contextmanager
+    def lent_snapshot(self) -> Iterator[Path]:
+        """Lend a snapshot that stays until the end, however many results are committed meanwhile.
+
+        Yields
+        ------
+        Path
+            The file, as ``snapshot`` returns it.
+        """
+        with self._lock, self._usable():
+            self._reserve.hold()
+            lent = self._snapshots.lend(self._connection, self._version)
+        try:
+            yield lent
+        finally:
+            lent.unlink(missing_ok=True)
+
     def export(self) -> Path:
         """Return a copy like ``snapshot`` that DuckDB 1.0 and all later versions can open."""
         return portable_copy(self.snapshot())

@@ -25,7 +25,7 @@ class Snapshots:
         self._folder = folder
         self._version: int | None = None
         folder.mkdir(parents=True, exist_ok=True)
-        for stale in (*self._files(), *folder.glob("portable-*")):
+        for stale in (*self._files(), *folder.glob("portable-*"), *folder.glob("lent-*")):
             stale.unlink(missing_ok=True)
 
     def take(self, connection: duckdb.DuckDBPyConnection, version: int) -> Path:
@@ -41,6 +41,12 @@ class Snapshots:
         for old in files[: 1 - _N_KEPT]:
             old.unlink(missing_ok=True)
         return target
+
+    def lend(self, connection: duckdb.DuckDBPyConnection, version: int) -> Path:
+        """Return a snapshot by a name of its own, which no later one removes."""
+        lent = self._folder / f"lent-{secrets.token_hex(8)}.duckdb"
+        lent.hardlink_to(self.take(connection, version))
+        return lent
 
     def _files(self) -> list[Path]:
         """Return the present snapshots, oldest first."""

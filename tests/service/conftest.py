@@ -15,6 +15,14 @@ PATIENCE = 300.0  # [s] ends a test that would hang; one that passes never waits
 MCAP = {"Content-Type": "application/vnd.mcap"}
 
 
+def is_spawned(process):
+    """Whether a process is a worker that lives."""
+    try:
+        return "spawn_main" in " ".join(process.cmdline())
+    except psutil.Error:  # it ended since it was listed
+        return False
+
+
 class Site:
     """A service that runs, and the steps that many tests begin with."""
 
@@ -42,7 +50,7 @@ class Site:
     def workers(self):
         """Return the worker processes of the service."""
         children = psutil.Process().children(recursive=True)
-        return [one for one in children if "spawn_main" in " ".join(one.cmdline())]
+        return [one for one in children if is_spawned(one)]
 
     def begun(self, job_id):
         """Wait for the beginning of a job, which on a busy machine may be seen after its end."""

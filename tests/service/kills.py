@@ -23,6 +23,8 @@ from pathlib import Path
 import httpx
 import psutil
 
+from tests.service.conftest import is_spawned
+
 MCAP = {"Content-Type": "application/vnd.mcap"}
 TUS = {"Tus-Resumable": "1.0.0"}
 PART = {**TUS, "Content-Type": "application/offset+octet-stream"}
@@ -71,7 +73,7 @@ class Victim:
         """Kill the service, or one of its workers; return the processes that must end by it."""
         found = psutil.Process(self.process.pid).children(recursive=True)
         if workers:
-            own = [one for one in found if "spawn_main" in " ".join(one.cmdline())]
+            own = [one for one in found if is_spawned(one)]
             if own:
                 random.choice(own).kill()
             return []

@@ -597,6 +597,17 @@ def test_old_snapshots_go(catalogue, tmp_path):
     assert kept == made[-3:]
 
 
+def test_a_lent_snapshot_stays_however_many_are_made_meanwhile(catalogue, tmp_path):
+    catalogue.create_survey("lane")
+    with catalogue.lent_snapshot() as lent:
+        for i in range(6):
+            catalogue.create_survey(f"s{i}")
+            catalogue.snapshot()
+        with duckdb.connect(str(lent), read_only=True) as copy:
+            assert copy.execute("SELECT name FROM surveys").fetchall() == [("lane",)]
+    assert len(list((tmp_path / "snapshots").iterdir())) == 3
+
+
 def test_a_snapshot_does_not_open_the_door_to_other_owners(catalogue):
     catalogue.create_survey("lane")
     catalogue.snapshot()

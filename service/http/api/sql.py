@@ -208,12 +208,13 @@ def _accepted(request: Request) -> str:
 
 def _run(service: Service, request: Query, accept: str) -> QueryResponse | Response:
     """Run a query on a snapshot; return the format that the body or the Accept header requests."""
-    limits, snapshot = service.settings.query_limits, service.catalogue.snapshot()
-    result = run_query(snapshot, request.sql, limits, request.parameters)
+    limits = service.settings.query_limits
     accepted = (one for one, media in _MEDIA.items() if accept.startswith(media))
     wanted = request.format if request.format != "json" else next(accepted, "json")
-    if wanted == "json":
-        return QueryResponse.model_validate(serialise_query(result, limits, snapshot))
+    with service.catalogue.lent_snapshot() as snapshot:
+        result = run_query(snapshot, request.sql, limits, request.parameters)
+        if wanted == "json":
+            return QueryResponse.model_validate(serialise_query(result, limits, snapshot))
     headers = {
         "X-Truncated": str(result.truncated).lower(),
         "X-Row-Limit": str(limits.rows),
