@@ -49,7 +49,7 @@ def test_every_request_has_an_id_in_its_response_and_its_line(client, log):
     assert len(other.headers["x-request-id"]) == 16
     first, second = [line for line in log() if "path" in line]
     assert (first["request"], first["path"], first["status"]) == (
-        *("of-the-proxy", "/api/v1/surveys"), 200,
+        *("of-the-proxy", "/api/v1/surveys"), 422,
     )  # fmt: skip
     assert "private" not in str(first)
     assert second["request"] == other.headers["x-request-id"]

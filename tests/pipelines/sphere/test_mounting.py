@@ -81,7 +81,7 @@ def test_lines_of_rests_that_fall_together_give_centres_as_good_as_promised(fiel
     trusting = replace(CONFIG.fitting, sigma_mounting=0.0, sigma_offset=0.0)
     before, promised = across(stops, field.marks, replace(CONFIG, fitting=trusting))
     assert np.mean((before / promised) ** 2) > 3.0
-    assert np.mean(errors**2) < 0.5 * np.mean(before**2)
+    assert np.mean((errors / sigmas) ** 2) < 0.5 * np.mean((before / sigmas) ** 2)
 
 
 @pytest.mark.parametrize("seed", [0, 4])
