@@ -33,6 +33,12 @@ ATTEMPTS = 10  # at a job; no job meets more kills by chance
 COMMAND = (sys.executable, "-m", "spheremark.service.cli")
 
 
+def _drain(pipe):
+    """Read what a service prints to its end."""
+    with pipe:
+        pipe.read()
+
+
 class Victim:
     """A service in a process of its own, on one data folder, started again after each kill."""
 
@@ -65,7 +71,7 @@ class Victim:
             lines.append(line)
             if "http://" in line:
                 address = line[line.index("http://") :].split()[0].rstrip(".,;")
-                threading.Thread(target=self.process.stdout.read, daemon=True).start()
+                threading.Thread(target=_drain, args=[self.process.stdout], daemon=True).start()
                 return httpx.Client(base_url=address, timeout=60.0)
         raise RuntimeError("the service did not start: " + "".join(lines))
 
