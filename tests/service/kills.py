@@ -212,14 +212,15 @@ class Victim:
         return {key: value for key, value in found.items() if value}, about
 
     def doctor(self):
-        """Return what the command finds wrong in the folder of a service that has ended."""
-        done = subprocess.run(
-            [*COMMAND, "doctor"],
-            env={**os.environ, "SPHEREMARK_DATA": str(self.folder)},
-            capture_output=True,
-            text=True,
-            check=False,
-        )
+        """Return what the command finds wrong beyond what it mends: files of ended workers."""
+        for command in ("--mend",), ():
+            done = subprocess.run(
+                [*COMMAND, "doctor", *command],
+                env={**os.environ, "SPHEREMARK_DATA": str(self.folder)},
+                capture_output=True,
+                text=True,
+                check=False,
+            )
         return {} if done.returncode == 0 else {"doctor": done.stdout + done.stderr}
 
 
