@@ -205,7 +205,7 @@ def _starts(problem: Problem, k: int, n: int, rng: np.random.Generator) -> list[
     most = max(map(len, drawn))
     if most < k_free:
         raise DegenerateGeometryError(
-            f"There is room for {most} of {k_free} marks that a stop can see; allow more places, "
+            f"Only {most} of {k_free} marks fit where a stop can see them; allow more places, "
             "or marks nearer to each other."
         )
     every = np.array([one for one in drawn if len(one) == k_free])

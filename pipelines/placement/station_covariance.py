@@ -87,8 +87,8 @@ def predict_positions(observables: Observables, requirement: Requirement) -> Pos
     ``free_station``: weights are those of the adjustment, ``Q = (sum J' P J + G)^-1`` with
     ``J = [-[v]x, 1]`` of each mark and the AHRS's information ``G`` on roll and pitch; a survey
     takes what lasers and gimbal leave as different at every mark. The covariance of the estimate
-    has them as they are: noise of each mark, what is left of its laser biases and direction, and a
-    common error of all ranges, which hardly moves a station with marks all round:
+    has them as they are: noise of each mark, the remaining laser biases and error of direction, and
+    a common error of all ranges, which hardly moves a station with marks all round:
     ``Q J' P C P J Q``. A common error of the centres' heights goes to the height of the station.
     Each mark counts with the probability that it is found.
     ``paper``: horizontal distances and heights of the three marks whose circles cut best, and the

@@ -20,7 +20,7 @@ from spheremark.storage.recordings import read_log, write_log
 
 @pytest.fixture(scope="module")
 def too_early(site):
-    """Return the job that was asked for before any log of the survey was processed."""
+    """Return the job that was requested before any log of the survey was processed."""
     site.survey("quarry")
     recording = site.upload().json()["recording_id"]
     wanted = {"kind": "site", "survey": "quarry", "recordings": [recording]}

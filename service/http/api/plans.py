@@ -180,7 +180,7 @@ def _awaited(service: Service, new: NewSearch, seconds: float) -> Plain | Respon
 
 
 def _request(new: NewSearch) -> Plain:
-    """Return what a search was asked for, as it is kept."""
+    """Return the request of a search, as kept."""
     request: Plain = getattr(new, new.kind).model_dump(mode="json")
     return request
 
