@@ -65,9 +65,9 @@ class Lasers(NamedTuple):
 def with_lasers(rig: Rig | None, returns: Returns) -> Lasers:
     """Return rig and rings that fit each other, and sentences where the LiDAR is no VLP-16.
 
-    Rings from the top down are turned over, whoever gives the rig. A known model has the optics of
-    its maker; the elevations of any other LiDAR are those of its returns, and its beams are taken
-    to leave its origin. Where rings keep no elevation, both are as they were.
+    Rings that count from the top are turned over, also with a rig of the user. A known model has
+    the optics of its maker; the elevations of any other LiDAR are those of its returns; its beams
+    are taken to leave its origin. Where rings keep no elevation, both are as they were.
     """
     rings = returns.rings
     as_they_were = Lasers(rig, rings)
