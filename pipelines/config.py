@@ -90,7 +90,7 @@ class StitchingConfig:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ExtractionConfig:
-    """How markers are told from ground, poles and rocks.
+    """How markers are distinguished from ground, poles and rocks.
 
     Attributes
     ----------
@@ -211,7 +211,7 @@ class ResectionConfig:
     ----------
     methods : tuple of str
         Resection methods to run, of ``RESECTION_METHODS``; the first is the one that counts.
-        free_station: it uses all that a centre tells.
+        free_station: it uses all three coordinates of each centre.
     subset_methods : tuple of str
         Methods by which the station is positioned from each pair and each triple of its markers
         too, to show what the included angle does. Ours and the study's.

@@ -150,7 +150,7 @@ def sightings(marks, T_site_base, *, lean=(0.0, 0.0), sigma_level=3e-3, cov=None
     cov = np.broadcast_to(np.eye(3) * 4e-3**2 if cov is None else cov, (len(p_base), 3, 3))
     levelling = Levelling(roll=lean[0], pitch=lean[1], sigma=sigma_level, is_measured=True)
     names = [f"M{i:02d}" for i in range(1, len(p_base) + 1)]
-    fits = tuple(marker_fit(*told) for told in zip(p_base, cov, names, strict=True))
+    fits = tuple(marker_fit(*one) for one in zip(p_base, cov, names, strict=True))
     return MarkerFits(method="along_beam", fits=fits, rejected=(), levelling=levelling)
 
 

@@ -1,7 +1,7 @@
 """Random worlds against their truth: detection, centres and stations, by family of world.
 
 Each world is scanned once and processed with the rig that its log describes. Markers count by their
-true returns, so that what a scan cannot show is asked of nobody. Other methods of detection can be
+true returns, so that a mark out of sight is not a missed one. Other methods of detection can be
 run on the same scans.
 """
 

@@ -170,7 +170,7 @@ class Network:
     refused : tuple of Refusal
         Stations that share too little with the others.
     left_out : tuple of LeftOut
-        Centres that are no marks of the network, control marks that nobody saw.
+        Centres that are no marks of the network, control marks without an observation.
     """
 
     stations: tuple[str, ...]
@@ -229,7 +229,7 @@ class Network:
 
     @property
     def is_free(self) -> bool:
-        """Whether nothing but the marks themselves tells where and how the network lies."""
+        """Whether the marks alone fix position and direction of the network."""
         return len(self.controls) == 0
 
     @property
@@ -324,7 +324,7 @@ class AdjustedNetwork:
         What the joint covariance of all is made of.
     control_predictions : (c, 3)
         Where each control mark would be by all else, minus where it is given; NaN where nothing
-        else tells [m].
+        else determines it [m].
     cov_control_predictions : (c, 3, 3)
         Covariances of these differences [m^2].
     mark_weaknesses : tuple of str

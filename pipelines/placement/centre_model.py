@@ -31,7 +31,7 @@ REFERENCE_DISTANCE = 8.0
 # 700 simulated spheres from 2 to 16 m; the limb gives back what the pole and lost edges cost.
 _EFFICIENCY = (0.85, 1.02, 0.93)
 # A surface close behind a sphere mixes with the returns of its limb, and touches it where it is too
-# near to be told apart. Over 130 simulated spheres at 0.2 to 0.85 m before a wall.
+# near to be separated. Over 130 simulated spheres at 0.2 to 0.85 m before a wall.
 _TOUCHING, _MIXING = 0.15, 0.85  # [m]
 _MIXED_RETURNS, _MIXED_VARIANCE = 0.79, 2.5
 _MISSED = 0.7  # times the root of the returns: spheres that are not found or not matched

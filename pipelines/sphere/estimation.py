@@ -338,7 +338,7 @@ def shared_range_sigmas(state: State) -> Array:
 
 
 def optics_of(state: State, prior: Prior) -> tuple[Optics, Array]:
-    """Return what the scan tells of its beams, and its effect on the ranges of centres, (m, 3)."""
+    """Return the beams' optics as estimated, and their effect on the ranges of centres, (m, 3)."""
     sigmas = np.maximum(prior.sigma_optics[:N_ESTIMATED], _SIGMA_MIN)
     cov = state.cov_optics[:N_ESTIMATED, :N_ESTIMATED]
     optics = Optics(

@@ -35,7 +35,7 @@ class Returns(NamedTuple):
         Measured ranges [m].
     vertical : (2, n)
         The vertical projected on the footprint's axes, as a unit vector. The sign of its first
-        component tells upward from downward sweeps of the gimbal.
+        component is that of the gimbal's sweep, upward or downward.
     vertical_half_widths : (2, n)
         Half widths of the footprint along that vertical and across it [m].
     lasers, classes : (n,)

@@ -47,7 +47,7 @@ logger = logging.getLogger(__name__)
 LOG = ".mcap"
 _ENDING = re.compile(r"\.(mcap|db3|bag|pcap|pcapng|zip)$", re.IGNORECASE)
 _BLOCK = 4 << 20  # [bytes] hashed and written at once; large enough that a thread pays off
-_KEPT_SECONDS = 7 * 24 * 3600.0  # until an upload that nobody resumes is removed
+_KEPT_SECONDS = 7 * 24 * 3600.0  # until an upload that is not resumed is removed
 _DIGEST = re.compile(r"(?:^|,)\s*sha-256=:([A-Za-z0-9+/=]+):")
 _NAME = re.compile(rf"([0-9a-f]{{64}}){re.escape(LOG)}")
 

@@ -79,12 +79,12 @@ def test_returns_left_out_in_either_half_leave_no_gap():
 
 
 def test_seeds_are_worked_on_in_other_processes_and_answered_in_order():
-    told = []
+    shares = []
     found = in_processes(
-        math.factorial, range(4), n_processes=2, progress=lambda share, _what: told.append(share)
+        math.factorial, range(4), n_processes=2, progress=lambda share, _what: shares.append(share)
     )
     assert found == [1, 1, 2, 6]
-    assert told == [0.0, 0.25, 0.5, 0.75, 1.0]
+    assert shares == [0.0, 0.25, 0.5, 0.75, 1.0]
 
 
 def test_an_error_and_a_cancellation_in_a_process_reach_the_caller():

@@ -232,15 +232,15 @@ def test_a_rig_is_adjusted_with_the_network_and_serves_as_a_rig(logs, tmp_path):
     assert again["passes_global_test"]
 
 
-def test_a_rig_that_the_logs_do_not_tell_stays_and_the_network_stands(logs):
+def test_a_rig_that_the_logs_do_not_determine_stays_and_the_network_stands(logs):
     upright = rig_to_mapping(read_truth(logs[0].with_name(f"{logs[0].stem}.truth.json")).rig)
     upright["T_head_lidar"] = np.eye(4).tolist()
     book = Fieldbook(scans=scans_of(logs[:2]), refused=())
-    told = with_calibration(
+    calibrated = with_calibration(
         book, log_files(logs[:2]), CONFIG, rig_from_mapping(upright), lambda _share, _what: None
     )
     answer = serialise_network(
-        adjust_scans(told, None, CONFIG), CONFIG, uncalibrated=told.uncalibrated
+        adjust_scans(calibrated, None, CONFIG), CONFIG, uncalibrated=calibrated.uncalibrated
     )
     assert answer["calibration"] is None
     assert any("two faces" in warning for warning in answer["warnings"])

@@ -100,7 +100,7 @@ def test_a_service_is_ready_once_its_parts_are(server):
 
 
 def begin(address, path, body):
-    """Send a request whose answer nobody reads; return its connection."""
+    """Send a request and leave its answer unread; return the connection."""
     text = json.dumps(body).encode()
     head = f"POST {path} HTTP/1.1\r\nHost: localhost\r\nContent-Type: application/json\r\n"
     connection = socket.create_connection(address)

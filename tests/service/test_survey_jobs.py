@@ -186,9 +186,9 @@ def test_a_calibration_brings_the_faces_together_and_its_rig_is_kept(site, calib
     (whole,) = rows("calibrations", calibrated)
     assert whole["gap_rms_after_m"] < whole["gap_rms_before_m"]
     assert whole["gap_rms_after_m"] == pytest.approx(whole["gap_sigma_after_m"], rel=0.5)
-    told = rows("calibrated_parameters", calibrated)
-    assert all(one["sigma"] > 0 for one in told if one["is_estimated"])
-    assert [one for one in told if not one["is_estimated"] and one["reason"]]
+    parameters = rows("calibrated_parameters", calibrated)
+    assert all(one["sigma"] > 0 for one in parameters if one["is_estimated"])
+    assert [one for one in parameters if not one["is_estimated"] and one["reason"]]
     rig = site.client.get(f"/api/v1/rigs/{whole['rig_digest']}").json()
     file = site.client.get(f"/api/v1/calibrations/{whole['calibration_id']}/files/rig.json").json()
     assert rig["rig"] == file

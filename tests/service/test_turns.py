@@ -57,7 +57,7 @@ def test_a_job_that_ends_before_the_news_of_its_beginning_is_recorded_once(tmp_p
         for _ in range(3):
             queue = JobQueue(Settings(data=tmp_path), catalogue, tmp_path)
             job = catalogue.create_job("adjust", survey=survey, recording_id=None, config={})
-            told = asyncio.run(outrun(queue, catalogue, job))
+            states = asyncio.run(outrun(queue, catalogue, job))
             ended = catalogue.get_job(job.job_id)
             assert (ended.status, ended.attempts, ended.message) == ("successful", 1, "Found.")
-            assert told[-1] == "successful"
+            assert states[-1] == "successful"

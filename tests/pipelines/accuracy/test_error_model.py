@@ -79,11 +79,11 @@ def test_the_greatest_distance_and_smallest_count_are_those_of_the_law():
     rng = np.random.default_rng(10)
     p95 = 0.004 * np.sqrt(7.8147)  # of chi with three degrees of freedom
     distance, count = 8.0 * (0.03 / p95) ** (1 / 1.5), 100.0 * (p95 / 0.015) ** 2
-    wish = Demand(tolerance=0.03, at_range=8.0, density=6400.0)
+    demand = Demand(tolerance=0.03, at_range=8.0, density=6400.0)
     strict = Demand(tolerance=0.015, at_range=8.0)
     holds = []
     for _ in range(20):
-        far = limits(sample(rng, n_scans=80), wish, rng).greatest_distance
+        far = limits(sample(rng, n_scans=80), demand, rng).greatest_distance
         few = limits(sample(rng, n_scans=80), strict, rng).smallest_count
         assert far.value == pytest.approx(distance, rel=0.06)
         holds += [far.low < distance < far.high, few.low < count < few.high]

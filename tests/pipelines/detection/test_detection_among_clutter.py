@@ -170,7 +170,7 @@ def test_markers_are_found_and_nothing_else_in_worlds_of_clutter():
 
 
 def test_far_balls_of_the_right_size_are_not_refused_for_their_size():
-    """Of 20 to 60 returns, beams as wide as half a radius: size is told badly, and not surely."""
+    """Of 20 to 60 returns, beams as wide as half a radius: their size is uncertain."""
     n_lost = n_balls = 0
     for seed in range(940, 944):
         world = range_lane(seed, np.array([12.5, 15.0, 17.5]), 30)

@@ -257,12 +257,12 @@ def test_only_what_centres_say_that_they_share_is_taken_from_their_own_variances
     marks = field(rng)
     scans, _ = survey(rng, marks, 3)
     shared = 0.4 * SIGMA
-    told = [
+    weighted = [
         (name, replace(fits, fits=tuple(replace(f, sigma_range_shared=s) for f in fits.fits)))
         for (name, fits), s in zip(scans, (0.0, shared, np.nan), strict=True)
     ]
     config = replace(CONFIG, sigma_range_shared=0.5 * SIGMA)
-    found = assemble(told, marks, config)
+    found = assemble(weighted, marks, config)
     lines = found.p_base / np.linalg.norm(found.p_base, axis=1, keepdims=True)
     along = np.einsum("ni,nij,nj->n", lines, found.cov_p_base, lines)
     of_station = found.sightings[:, 0]

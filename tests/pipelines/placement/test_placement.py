@@ -62,7 +62,7 @@ MODEL = sensor_model(Sensor())
 # of scans that are simulated with a nominal rig: no range error that all lasers share
 NOMINAL = sensor_model(Sensor(sigma_range_common=0.0, sigma_aim=1.5e-5))
 
-# what all centres share is told apart from what a mark adds
+# errors that all centres share stand apart from those of each mark
 _OWN_ERRORS = ResectionConfig(sigma_range=0.0, sigma_range_shared=0.0, sigma_height=0.0)
 
 

@@ -329,9 +329,9 @@ def test_packets_know_better_than_a_rig_whether_heights_are_included(rng):
     rig = crooked_rig(rng)
     log, p_base = scan_log(rng, rig)
     wrong = replace(rig, cloud_carries_heights=not rig.cloud_carries_heights)
-    told = replace(log, has_heights=rig.cloud_carries_heights)
+    flagged = replace(log, has_heights=rig.cloud_carries_heights)
     assert choose_rig(log, wrong) is wrong
-    cloud = stitch(told, choose_rig(told, wrong), CONFIG)
+    cloud = stitch(flagged, choose_rig(flagged, wrong), CONFIG)
     np.testing.assert_allclose(cloud.p_base, p_base, rtol=0, atol=FLOAT32)
 
 
