@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 
+from spheremark.pipelines.accuracy.probability import keeps_tolerance, probability_within
 from spheremark.pipelines.config import SurveyConfig
 from spheremark.pipelines.geometry import by_motion
 from spheremark.pipelines.model import (
@@ -22,10 +23,8 @@ from spheremark.pipelines.model import (
     Status,
     StopResult,
 )
-from spheremark.pipelines.placement.probability import probability_within
 
 _CERTAIN = 0.999  # probability above which its digits say nothing
-_ENOUGH = 0.95  # probability of an error within the tolerance, as the tolerance is defined
 _N_TIED = 3  # markers that tie a stop without control to others, with none to spare
 _TURN = np.radians(350.0)  # a full turn, but for the ends that no revolution fills
 _N_DIRECTIONS = 36  # in which one more marker is tried
@@ -83,8 +82,7 @@ def is_good_enough(status: str, cov_p_site: Array, tolerance: float) -> bool:
     bool
         Whether it is good enough.
     """
-    within = float(probability_within(np.asarray(cov_p_site)[None], tolerance)[0])
-    return status == Status.OK and within >= _ENOUGH
+    return status == Status.OK and bool(keeps_tolerance(np.asarray(cov_p_site)[None], tolerance)[0])
 
 
 def decide(stop: StopResult, config: SurveyConfig, marks: ControlMarks | None) -> StopDecision:

@@ -10,10 +10,16 @@ from typing import NamedTuple
 import numpy as np
 from scipy.stats import chi2
 
+from spheremark.pipelines.accuracy.probability import keeps_tolerance
 from spheremark.pipelines.model import Array, Index
 
 LEVEL = 0.95  # of the interval by chance
-RADIUS_95 = 1.96  # of sigma_3d: radius of 95 % where one axis has all variance, else less
+_GRADES = {
+    "accepted": "accepted",
+    "weak": "accepted with reservations",
+    "refused": "not accepted",
+    "none": "not accepted",
+}
 _DATUM = 4  # coordinates of control that position and heading of a network use up
 
 
@@ -89,6 +95,11 @@ class Decision:
     reasons: tuple[str, ...] = ()
 
     @property
+    def grade(self) -> str:
+        """The decision in words."""
+        return _GRADES[self.status]
+
+    @property
     def summary(self) -> str:
         """The sentence without the decision itself."""
         return self.sentence.rpartition(": ")[0] or self.sentence
@@ -102,8 +113,8 @@ class SolutionQuality:
     ----------
     stations : sequence of str
         Names of the stations with coordinates.
-    sigmas_3d : (n,)
-        Their standard deviations [m].
+    covariances : (n, 3, 3)
+        Covariances of their positions [m^2].
     failed : sequence of str
         Stations whose global test fails; all of a network that fails.
     missing : sequence of str
@@ -117,7 +128,7 @@ class SolutionQuality:
     """
 
     stations: Sequence[str]
-    sigmas_3d: Array
+    covariances: Array
     failed: Sequence[str] = ()
     missing: Sequence[str] = ()
     control: Check | None = None
@@ -288,12 +299,11 @@ def decide(quality: SolutionQuality, tolerance: float) -> Decision:
         return Decision(status="none", sentence="No station has a position yet")
     refused, weak = _refusals(quality, tolerance), _weaknesses(quality)
     status = "refused" if refused else "weak" if weak else "accepted"
-    words = {"refused": "not accepted", "weak": "accepted with reservations"}.get(status, status)
-    sigma = float(np.sqrt(np.mean(np.square(quality.sigmas_3d))))
+    sigma = float(np.sqrt(np.mean(np.trace(quality.covariances, axis1=1, axis2=2))))
     size = "no valid sigma" if quality.failed else f"{1e3 * sigma:.1f} mm (3-D sigma, RMS)"
     return Decision(
         status=status,
-        sentence=f"{_counted(n, 'station')}, {size}, {_control_words(quality)}: {words}",
+        sentence=f"{_counted(n, 'station')}, {size}, {_control_words(quality)}: {_GRADES[status]}",
         reasons=(*refused, *weak),
     )
 
@@ -312,9 +322,9 @@ def rule(tolerance: float) -> str:
         The rule.
     """
     return (
-        f"Accepted where the global test passes, {RADIUS_95:g} times the 3-D sigma of each station "
-        "(not less than its radius of 95 %) and the largest difference at control are within "
-        f"{1e3 * tolerance:g} mm, and nothing is weak or missing."
+        "Accepted where the global test passes, each station is within "
+        f"{1e3 * tolerance:g} mm (3-D) with a probability of 95 % or more by its covariance, the "
+        "largest difference at control is within the same, and nothing is weak or missing."
     )
 
 
@@ -326,14 +336,12 @@ def _refusals(quality: SolutionQuality, tolerance: float) -> list[str]:
             f"The global test fails at {_list(quality.failed)}: residuals are larger than the "
             "sigmas allow, so these sigmas are not valid."
         )
-    wide = [
-        name
-        for name, sigma in zip(quality.stations, quality.sigmas_3d, strict=True)
-        if RADIUS_95 * sigma > tolerance
-    ]
+    kept = keeps_tolerance(quality.covariances, tolerance)
+    wide = [name for name, is_kept in zip(quality.stations, kept, strict=True) if not is_kept]
     if wide:
         found.append(
-            f"{_list(wide)}: 95 % of the errors may exceed the tolerance of {1e3 * tolerance:g} mm."
+            f"{_list(wide)}: errors are within the tolerance of {1e3 * tolerance:g} mm with a "
+            "probability below 95 %."
         )
     control = quality.control
     if control is not None and control.largest > tolerance:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from spheremark.pipelines.accuracy.probability import probability_within
 from spheremark.pipelines.errors import InputError
 from spheremark.pipelines.model import Array, Index, Mask
 from spheremark.pipelines.placement.centre_model import (
@@ -22,7 +23,6 @@ from spheremark.pipelines.placement.plan import (
     Stops,
     Visibility,
 )
-from spheremark.pipelines.placement.probability import probability_within
 from spheremark.pipelines.placement.station_covariance import (
     Observables,
     Positions,

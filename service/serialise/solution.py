@@ -52,11 +52,10 @@ WHERE adjustment_id = $id AND kind = 'centre' AND used AND residual_x_m IS NOT N
 """
 _CHECKS = "SELECT * FROM control_checks WHERE adjustment_id = $id ORDER BY mark"
 _SOLUTIONS = "SELECT * FROM chosen_solutions WHERE list_contains($ids::VARCHAR[], survey_id)"
-_STATION_LISTS = """
-SELECT survey_id, list({'station': station, 'sigma_3d_m': sigma_3d_m, 'dof': dof, 'sigma0': sigma0,
-    'passes_global_test': passes_global_test, 'status': status, 'reason': reason}
-    ORDER BY station) AS stations
-FROM chosen_stations WHERE list_contains($ids::VARCHAR[], survey_id) GROUP BY survey_id
+_DECISIVE = """
+SELECT survey_id, station, passes_global_test, dof, sigma0, status, reason,
+    cov_xx_m2, cov_xy_m2, cov_xz_m2, cov_yy_m2, cov_yz_m2, cov_zz_m2
+FROM chosen_stations WHERE list_contains($ids::VARCHAR[], survey_id) ORDER BY survey_id, station
 """
 _MISSING_LISTS = """
 SELECT r.survey_id, list_sort(list_distinct(list(x.stop))) AS stops
@@ -82,11 +81,6 @@ WHERE list_contains($ids::VARCHAR[], c.survey_id) AND c.adjustment_id IS NULL
 GROUP BY c.survey_id
 """
 _RESIDUAL = "residual"
-_DECISIVE = (
-    *("station", "sigma_3d_m", "passes_global_test", "dof", "sigma0"),
-    *("status", "reason"),
-)
-"""Columns of stations that a decision depends on."""
 _PARTS = ("xx", "xy", "xz", "xy", "yy", "yz", "xz", "yz", "zz")
 
 
@@ -138,13 +132,15 @@ def survey_decisions(
         return {row["survey_id"]: row for row in catalogue.rows(sql, ids)}
 
     solutions = {name: Solution(**row) for name, row in by_survey(_SOLUTIONS).items()}
-    stations = {name: row["stations"] for name, row in by_survey(_STATION_LISTS).items()}
+    stations = catalogue.columns(_DECISIVE, ids)
+    owners = stations["survey_id"].astype(str)
     missing = {name: row["stops"] for name, row in by_survey(_MISSING_LISTS).items()}
     sums = by_survey(_RESIDUAL_SUMS)
     found = {}
     for name, tolerance in tolerances.items():
-        solution, rows = solutions.get(name), stations.get(name, [])
-        columns = {one: np.array([row[one] for row in rows]) for one in _DECISIVE}
+        solution = solutions.get(name)
+        own = slice(*(np.searchsorted(owners, name, side) for side in ("left", "right")))
+        columns = {column: values[own] for column, values in stations.items()}
         control = _control(catalogue, solution, columns, sums.get(name))
         network = _network(catalogue, solution)
         quality = _quality(solution, columns, missing.get(name, ()), control, network)
@@ -170,7 +166,7 @@ def _quality(
     tested = zip(stations["station"], stations["passes_global_test"], strict=True)
     return SolutionQuality(
         stations=stations["station"].tolist(),
-        sigmas_3d=stations["sigma_3d_m"].astype(np.float64),
+        covariances=_covariances(stations),
         failed=[name for name, good in tested if good is not None and not good],
         missing=missing,
         control=control,

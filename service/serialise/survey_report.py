@@ -6,23 +6,30 @@ Made from the adjusted network if there is one, else from the stations one by on
 from __future__ import annotations
 
 import json
-import math
 from collections.abc import Mapping, Sequence
 from datetime import UTC, datetime
 from typing import Any
 
-from spheremark.pipelines.accuracy.acceptance import rule
+import numpy as np
+
+from spheremark.pipelines.accuracy.acceptance import (
+    Decision,
+    SolutionQuality,
+    check_control,
+    decide,
+    rule,
+)
 from spheremark.pipelines.errors import InputError, NotFoundError
 from spheremark.pipelines.tables import Column, Table
 from spheremark.service.provenance import code_version
 from spheremark.service.serialise import network_report
 from spheremark.service.serialise.solution import survey_result
 from spheremark.storage.catalogue.catalogue import Catalogue
+from spheremark.storage.catalogue.solutions import Solution
 
 Plain = dict[str, Any]
 Pairs = list[list[str]]
 
-_RADIUS_95 = 2.7955  # root of the 95 % quantile of chi-square with 3 degrees of freedom
 _ROWS_MOST = 1000  # observations of a report; the interface has all
 _ADJUSTMENT = """
 SELECT a.*, d.text AS document FROM adjustments AS a
@@ -100,8 +107,7 @@ def survey_report(catalogue: Catalogue, survey: str, adjustment: str | None = No
     key = {"survey": found.survey_id}
     result = survey_result(catalogue, found.survey_id)
     chosen = result.solution and result.solution.adjustment_id
-    is_chosen = result.solution is not None and adjustment in (None, chosen)
-    networks = []
+    decision, networks = result.decision, []
     if adjustment or chosen or result.solution is None:
         networks = catalogue.rows(_ADJUSTMENT, key | {"id": adjustment or chosen})
     if adjustment is not None and not networks:
@@ -115,18 +121,15 @@ def survey_report(catalogue: Catalogue, survey: str, adjustment: str | None = No
     logs = catalogue.rows(_LOGS, {"ids": list(catalogue.recordings_of_survey(found.survey_id))})
     if networks:
         row = networks[0]
-        report = network_part(json.loads(row["document"]), found.tolerance)
+        network = json.loads(row["document"])
+        report = network_part(network)
+        if row["adjustment_id"] != chosen:
+            decision = _network_decision(network, found.tolerance)
         when = f"{row['finished_at'].astimezone(UTC):%Y-%m-%d %H:%M:%S} UTC"
         report["digests"] = [*_digests([row]), ["Adjustment", f"{row['adjustment_id']}, {when}"]]
     else:
-        report = _stations_part(catalogue, found.survey_id, found.tolerance)
+        report = _stations_part(catalogue, found.survey_id, result.solution)
         report["digests"] = _digests(catalogue.rows(_RUNS, key))
-    if is_chosen:
-        report["verdict"] = (
-            f"{result.decision.summary}. {' '.join(result.decision.reasons)}".strip()
-        )
-        report["is_accepted"] = result.decision.status == "accepted"
-        report["rule"] = rule(found.tolerance)
     control = Table(title="Control marks as given", columns=_GIVEN, rows=given)
     report["sections"] = [control.to_texts(), *report["sections"]] if given else report["sections"]
     if not given:
@@ -135,14 +138,15 @@ def survey_report(catalogue: Catalogue, survey: str, adjustment: str | None = No
         )
     table = Table(title="Logs", columns=_LOG, rows=logs, notes=[] if logs else ["None."])
     report["sections"].append(table.to_texts())
-    return _complete(report, about)
+    return _complete(report | _decided(decision, found.tolerance), about)
 
 
 def report_of_document(text: str, name: str) -> Plain:
     """Return the report of a file that ``spheremark adjust --json`` wrote."""
     try:
         network = json.loads(text)
-        report = network_part(network, float(network["config"]["tolerance"]))
+        tolerance = float(network["config"]["tolerance"])
+        report = network_part(network) | _decided(_network_decision(network, tolerance), tolerance)
     except (ValueError, KeyError, TypeError) as error:
         raise InputError(
             f"{name} is not the JSON of a network ({type(error).__name__}: {error}); "
@@ -153,32 +157,17 @@ def report_of_document(text: str, name: str) -> Plain:
     return _complete(report, [["File", name]])
 
 
-def network_part(network: Mapping[str, Any], tolerance: float) -> Plain:
+def network_part(network: Mapping[str, Any]) -> Plain:
     """Return what a report shows of a network."""
     tables = [*network_report.places(network), *network_report.tables_of_observations(network)]
     tables += network_report.checks(network)
     notes = list(network_report.not_used(network)) or ["Nothing: all observations were used."]
     shown = [_shortened(table.to_texts()) for table in tables]
     shown.append(Table(title="Not used", notes=notes).to_texts())
-    sigma = max(_largest_sigma(one) for one in network["stations"])
-    is_good = network["passes_global_test"] and _RADIUS_95 * sigma <= tolerance
-    left_out = [
-        math.dist(one["predicted_minus_given_m"], (0, 0, 0))
-        for one in network["control"]
-        if one["predicted_minus_given_m"] is not None
-    ]
-    met = f"; control left out in turn is met to {1e3 * max(left_out):.1f} mm (largest)"
-    verdict = (
-        f"{len(network['stations'])} stations; largest sigma of a coordinate {1e3 * sigma:.1f} mm; "
-        f"global test {'passed' if network['passes_global_test'] else 'failed'}"
-        f"{met if left_out else ''}."
-    )
-    missing = [] if left_out else ["No independent check: no control mark could be left out."]
+    is_checked = any(one["predicted_minus_given_m"] is not None for one in network["control"])
+    missing = [] if is_checked else ["No independent check: no control mark could be left out."]
     return {
         "title": "Network adjustment report",
-        "is_accepted": bool(is_good),
-        "verdict": verdict,
-        "rule": _rule(tolerance),
         "tests": _tests(network),
         "warnings": list(network["warnings"]),
         "missing": missing,
@@ -188,15 +177,44 @@ def network_part(network: Mapping[str, Any], tolerance: float) -> Plain:
     }
 
 
-def _stations_part(catalogue: Catalogue, survey_id: str, tolerance: float) -> Plain:
+def _decided(decision: Decision, tolerance: float) -> Plain:
+    """Return the decision of a report with its reasons and the rule."""
+    return {
+        "is_accepted": decision.status == "accepted",
+        "grade": f"{decision.grade.capitalize()}.",
+        "decision": f"{decision.summary}. {' '.join(decision.reasons)}".strip(),
+        "rule": rule(tolerance),
+    }
+
+
+def _network_decision(network: Mapping[str, Any], tolerance: float) -> Decision:
+    """Return the decision on a network, from its JSON."""
+    names = [one["name"] for one in network["stations"]]
+    checks = [one for one in network["control"] if one["predicted_minus_given_m"] is not None]
+    off, sigmas = (
+        np.array([one[key] for one in checks])
+        for key in ("predicted_minus_given_m", "sigma_predicted_minus_given_m")
+    )
+    quality = SolutionQuality(
+        stations=names,
+        covariances=np.array([one["position_covariance_m2"] for one in network["stations"]]),
+        failed=[] if network["passes_global_test"] else names,
+        missing=[one["station"] for one in network["refused"]],
+        control=check_control([one["mark"] for one in checks], off, sigmas) if checks else None,
+        warnings=network["warnings"],
+        is_free=network["datum"]["kind"] == "free",
+    )
+    return decide(quality, tolerance)
+
+
+def _stations_part(catalogue: Catalogue, survey_id: str, solution: Solution | None) -> Plain:
     """Return what a report shows of stations that were positioned one by one."""
-    methods = catalogue.rows(_METHOD, {"survey": survey_id})
-    key = {"survey": survey_id, "method": methods[0]["fit_method"] if methods else ""}
+    methods = [] if solution else catalogue.rows(_METHOD, {"survey": survey_id})
+    method = solution.fit_method if solution else methods[0]["fit_method"] if methods else ""
+    key = {"survey": survey_id, "method": method}
     rows = catalogue.rows(_STATIONS, key)
     known = [row for row in rows if row["x_m"] is not None]
     weak = [row for row in rows if row["status"] != "ok"]
-    sigmas = [row[f"sigma_{axis}_m"] for row in known for axis in "xyz"]
-    is_good = bool(known) and not weak and _RADIUS_95 * max(sigmas) <= tolerance
     missing = [
         "No network: each station was positioned alone, and no observation checks two stations "
         "together. Start an adjustment and report again."
@@ -213,12 +231,8 @@ def _stations_part(catalogue: Catalogue, survey_id: str, tolerance: float) -> Pl
         ),
         Table(title="Observed centres, largest w first", columns=_SEEN, rows=observed),
     ]
-    largest = f"; largest sigma of a coordinate {1e3 * max(sigmas):.1f} mm" if sigmas else ""
     return {
         "title": "Station report",
-        "is_accepted": is_good,
-        "verdict": f"{len(known)} stations{largest}; {len(weak)} weak or without a position.",
-        "rule": _rule(tolerance),
         "tests": [],
         "warnings": [],
         "missing": missing,
@@ -226,15 +240,6 @@ def _stations_part(catalogue: Catalogue, survey_id: str, tolerance: float) -> Pl
         "lines": [[row["stop"], row["mark"]] for row in observed if row["used"]],
         "sections": [_shortened(one.to_texts()) for one in tables if one.rows],
     }
-
-
-def _rule(tolerance: float) -> str:
-    """Return the rule of acceptance."""
-    return (
-        "Accepted where the global test passes and, at each station, 2.80 times the largest "
-        "sigma of a coordinate (the radius of 95 % in three dimensions) is within "
-        f"{1e3 * tolerance:g} mm."
-    )
 
 
 def _tests(network: Mapping[str, Any]) -> Pairs:
@@ -266,11 +271,6 @@ def _tests(network: Mapping[str, Any]) -> Pairs:
 def _number(value: float | None) -> str:
     """Return a factor, or a hyphen where it is not known."""
     return "-" if value is None else f"{value:.3f}"
-
-
-def _largest_sigma(station: Mapping[str, Any]) -> float:
-    """Return the largest standard deviation of a coordinate of a station."""
-    return math.sqrt(max(station["position_covariance_m2"][i][i] for i in range(3)))
 
 
 def _places(network: Mapping[str, Any]) -> list[Plain]:

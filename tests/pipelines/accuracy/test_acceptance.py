@@ -5,8 +5,12 @@ import pytest
 
 from spheremark.pipelines.accuracy import acceptance
 from spheremark.pipelines.accuracy.acceptance import Compared, SolutionQuality
+from spheremark.pipelines.accuracy.probability import keeps_tolerance, probability_within
 
 NAMES = ("A", "B", "C", "D", "E", "F")
+GOOD = np.tile(3e-8 * np.eye(3), (6, 1, 1))  # 0.3 mm, 3-D
+WIDE = np.concatenate([GOOD[:5], [1.4e-4 * np.eye(3)]])  # 33 mm hold 95 %
+THIN = np.concatenate([GOOD[:5], [np.diag([2.5e-4, 0.0, 0.0])]])  # 31 mm hold 95 %
 
 
 def drawn(rng, n_scans, n, shared_sigma):
@@ -57,7 +61,7 @@ def control(size):
 
 
 def test_a_survey_whose_tests_pass_within_the_tolerance_is_accepted():
-    quality = SolutionQuality(stations=NAMES, sigmas_3d=np.full(6, 3e-4), control=control(5e-4))
+    quality = SolutionQuality(stations=NAMES, covariances=GOOD, control=control(5e-4))
     found = acceptance.decide(quality, 0.03)
     assert found.status == "accepted"
     assert found.sentence == (
@@ -70,14 +74,15 @@ def test_a_survey_whose_tests_pass_within_the_tolerance_is_accepted():
     ("changed", "status", "reason"),
     [
         ({"failed": ("B",)}, "refused", "The global test fails at B"),
-        ({"sigmas_3d": np.array([3e-4] * 5 + [0.02])}, "refused", "F: 95 % of the errors"),
+        ({"covariances": WIDE}, "refused", "F: errors are within the tolerance of 30 mm with a"),
+        ({"covariances": THIN}, "refused", "F: errors are within the tolerance of 30 mm with a"),
         ({"control": control(0.02)}, "refused", "Control differs by 34.6 mm at A"),
         ({"missing": ("G",)}, "weak", "No position in this solution: G"),
         ({"warnings": ("Only one mark is shared.",)}, "weak", "Only one mark"),
     ],
 )
 def test_a_survey_is_not_accepted_for_a_reason(changed, status, reason):
-    given = {"stations": NAMES, "sigmas_3d": np.full(6, 3e-4), "control": control(5e-4)}
+    given = {"stations": NAMES, "covariances": GOOD, "control": control(5e-4)}
     found = acceptance.decide(SolutionQuality(**(given | changed)), 0.03)
     assert found.status == status
     assert any(one.startswith(reason) for one in found.reasons), found.reasons
@@ -85,8 +90,25 @@ def test_a_survey_is_not_accepted_for_a_reason(changed, status, reason):
         assert "no valid sigma" in found.sentence
 
 
+def test_the_bound_of_the_rule_and_its_quadrature_agree():
+    """95 % of errors along one axis are within 1.96 sigma, of spherical ones within 2.7955."""
+    rng = np.random.default_rng(8)
+    roots = rng.normal(size=(300, 3, 3)) * 10.0 ** rng.uniform(-3.0, -1.5, size=(300, 1, 3))
+    covs = roots @ np.swapaxes(roots, 1, 2)
+    within = probability_within(covs, 0.03)
+    assert 30 < np.sum(within >= 0.95) < 270
+    assert (keeps_tolerance(covs, 0.03) == (within >= 0.95)).all()
+    for axes, radius in (((1.0, 0.0, 0.0), 1.95996), ((1.0, 1.0, 1.0), 2.79548)):
+        for factor in (0.999, 1.001):
+            cov = np.diag(axes)[None] * (0.03 / radius * factor) ** 2
+            assert keeps_tolerance(cov, 0.03)[0] == (factor < 1.0)
+    assert not keeps_tolerance(np.full((1, 3, 3), np.nan), 0.03)[0]
+
+
 def test_a_survey_without_positions_has_no_decision():
     assert (
-        acceptance.decide(SolutionQuality(stations=(), sigmas_3d=np.zeros(0)), 0.03).status
+        acceptance.decide(
+            SolutionQuality(stations=(), covariances=np.zeros((0, 3, 3))), 0.03
+        ).status
         == "none"
     )

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
+from spheremark.pipelines.accuracy.probability import probability_within
 from spheremark.pipelines.config import ResectionConfig
 from spheremark.pipelines.errors import ConfigError, DegenerateGeometryError, InputError
 from spheremark.pipelines.geometry import by_motion, rigid, rot_z
@@ -47,7 +48,6 @@ from spheremark.pipelines.placement.bounds import (
 )
 from spheremark.pipelines.placement.centre_model import centres_ahead, expect_centres
 from spheremark.pipelines.placement.evaluation import predict_observables
-from spheremark.pipelines.placement.probability import probability_within
 from spheremark.pipelines.placement.sensor import returns_of
 from spheremark.pipelines.placement.station_covariance import (
     claimed_bias_variance,
