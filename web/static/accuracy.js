@@ -1,4 +1,6 @@
 // How far the tolerance is kept, by method: <div data-limits="address">.
+import { get } from "./request.js";
+
 const MM = 1000;
 const METHODS = { along_beam: "along beam (ours)", paper: "paper's method" };
 const mm = (value) => (value === null ? "–" : (value * MM).toFixed(1));
@@ -59,12 +61,8 @@ function headed(body) {
 }
 
 async function load(place) {
-  const response = await fetch(place.dataset.limits);
-  const body = await response.json();
-  if (!response.ok || !body.items.length) {
-    place.firstElementChild.textContent = body.detail ?? "No centre passes these filters.";
-    return;
-  }
+  const body = await get(place.dataset.limits);
+  if (!body.items.length) throw new Error("No centre passes these filters.");
   const scroll = document.createElement("div");
   scroll.className = "scroll";
   scroll.tabIndex = 0;
@@ -76,4 +74,6 @@ async function load(place) {
   head.textContent = `How far ${(body.tolerance_m * MM).toFixed(0)} mm is kept`;
 }
 
-for (const place of document.querySelectorAll("[data-limits]")) load(place);
+for (const place of document.querySelectorAll("[data-limits]")) {
+  load(place).catch((error) => { place.firstElementChild.textContent = error.message; });
+}

@@ -1,4 +1,6 @@
 // Reads a table of control marks with the service, and shows it as a table and a map.
+import { call } from "./request.js";
+
 const SVG = "http://www.w3.org/2000/svg";
 const form = document.querySelector(".control-form");
 const part = (name) => document.getElementById(`control-${name}`);
@@ -14,9 +16,9 @@ function query() {
 }
 
 const send = (method, address, body) =>
-  fetch(`${address}?${query()}`, { method, headers: { "Content-Type": "text/csv" }, body });
+  call(method, `${address}?${query()}`, body, { headers: { "Content-Type": "text/csv" } });
 
-// Gives a survey the marks of the form; returns the response.
+// Gives a survey the marks of the form.
 export const putControl = (survey) =>
   send("PUT", `/api/v1/surveys/${encodeURIComponent(survey)}/control`, text);
 
@@ -93,10 +95,10 @@ async function preview() {
   newest += 1;
   const own = newest;
   if (!text.trim()) return show(null);
-  const answer = await send("POST", "/api/v1/surveys/new/control/preview", text);
-  const found = await answer.json();
-  if (own !== newest) return;
-  show(answer.ok ? found.marks : null, answer.ok ? undefined : found.detail);
+  await send("POST", "/api/v1/surveys/new/control/preview", text).then(
+    (found) => { if (own === newest) show(found.marks); },
+    (error) => { if (own === newest) show(null, error.message); },
+  );
 }
 
 if (form) {

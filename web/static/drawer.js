@@ -1,4 +1,6 @@
 // The drawer of jobs on every page: the newest ones, live; and pages that load again by themselves.
+import { call, get } from "./request.js";
+
 const OPEN = new Set(["accepted", "running"]);
 const by = (id) => document.getElementById(id);
 const drawer = by("jobs-drawer");
@@ -29,7 +31,9 @@ function item(job) {
     dismiss.setAttribute("aria-label", `Dismiss ${link.textContent}`);
     dismiss.addEventListener("click", async () => {
       dismiss.disabled = true;
-      await fetch(`/api/v1/jobs/${job.job_id}`, { method: "DELETE" });
+      await call("DELETE", `/api/v1/jobs/${job.job_id}`).catch((error) => {
+        message.textContent = error.message;
+      });
       load();
     });
     place.append(progress, dismiss);
@@ -53,9 +57,9 @@ function show() {
 }
 
 async function load() {
-  const answer = await fetch("/api/v1/jobs?limit=20");
-  if (!answer.ok) return;
-  for (const job of (await answer.json()).items) jobs.set(job.job_id, job);
+  const page = await get("/api/v1/jobs?limit=20").catch(() => null);
+  if (!page) return;
+  for (const job of page.items) jobs.set(job.job_id, job);
   show();
   follow();
   clearTimeout(timer);

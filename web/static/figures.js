@@ -1,5 +1,7 @@
 // Draws each <div class="plot" data-figure>: from a JSON block of the page (its id), or from an
 // address (data-source). The ids of points are links: addresses, or filters that begin with "?".
+import { get, send } from "./request.js";
+
 const CONFIG = {
   responsive: true,
   displaylogo: false,
@@ -230,7 +232,7 @@ export function addMenu(place) {
 }
 
 async function toSql(address) {
-  const response = await fetch(address);
+  const response = await send("GET", address);
   location.assign(`/sql?${new URLSearchParams({ q: await response.text() })}`);
 }
 
@@ -249,12 +251,8 @@ document.addEventListener("keydown", (event) => {
 // Figures by address
 
 async function load(place) {
-  const response = await fetch(place.dataset.source);
-  const body = await response.json();
-  if (!response.ok) {
-    failed(place, body.detail ?? "This figure could not be loaded.");
-    return null;
-  }
+  const body = await get(place.dataset.source).catch((error) => failed(place, error.message));
+  if (!body) return null;
   const panel = place.closest("figure");
   const head = panel?.querySelector("h2");
   if (head) head.textContent = body.title;

@@ -1,4 +1,6 @@
 // Keeps every [data-job] of the page up to date from the service's events, over one connection.
+import { call } from "./request.js";
+
 const OPEN = new Set(["accepted", "running"]);
 const places = new Map(
   [...document.querySelectorAll("[data-job]")].map((place) => [place.dataset.job, place]),
@@ -56,8 +58,9 @@ if ([...places.values()].some(isOpen)) {
 for (const button of document.querySelectorAll("[data-cancel]")) {
   button.addEventListener("click", async () => {
     button.disabled = true;
-    const answer = await fetch(`/api/v1/jobs/${button.dataset.cancel}`, { method: "DELETE" });
-    if (answer.ok) return location.reload();
-    document.querySelector('[data-part="cancel"]').textContent = (await answer.json()).detail;
+    await call("DELETE", `/api/v1/jobs/${button.dataset.cancel}`).then(
+      () => location.reload(),
+      (error) => { document.querySelector('[data-part="cancel"]').textContent = error.message; },
+    );
   });
 }

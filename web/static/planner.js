@@ -1,4 +1,6 @@
 // The planner: marks that can be moved, their evaluation by the service, and the state in the address.
+import { call, get, send } from "./request.js";
+
 const map = await import(document.getElementById("planner").dataset.map);
 const searches = await import(document.getElementById("planner").dataset.searchModule);
 const { PlanMap, h, rangeOf, paintScale, areaText, parseArea, square, isInside, sizeOf } = map;
@@ -111,12 +113,7 @@ function request(plan, extra = {}) {
 }
 
 async function post(path, body, accept = "application/json") {
-  const response = await fetch(`${API}${path}`, {
-    method: "POST",
-    headers: { "Content-Type": "application/json", Accept: accept },
-    body: JSON.stringify(body),
-  });
-  if (!response.ok) throw new Error((await response.json()).detail);
+  const response = await send("POST", `${API}${path}`, body, { headers: { Accept: accept } });
   return accept === "application/json" ? response.json() : response.text();
 }
 
@@ -651,9 +648,7 @@ byId("terrain-choose").addEventListener("click", () => byId("terrain-file").clic
 byId("terrain-file").addEventListener("change", (event) => during(byId("terrain-choose"), async () => {
   const [file] = event.target.files;
   if (!file) return;
-  const response = await fetch(`/api/v1/terrains?${new URLSearchParams({ name: file.name })}`, { method: "POST", body: file });
-  const found = await response.json();
-  if (!response.ok) throw new Error(found.detail);
+  const found = await call("POST", `/api/v1/terrains?${new URLSearchParams({ name: file.name })}`, file);
   const field = byId("site");
   if (![...field.options].some((option) => option.value === found.key)) field.add(new Option(found.name, found.key));
   field.value = found.key;
@@ -671,9 +666,7 @@ for (const name of controls) {
 byId("plan-controls").addEventListener("submit", (event) => event.preventDefault());
 
 async function openSite(all) {
-  const response = await fetch(`${API}/sites/${encodeURIComponent(byId("site").value)}`);
-  const found = await response.json();
-  if (!response.ok) throw new Error(found.detail);
+  const found = await get(`${API}/sites/${encodeURIComponent(byId("site").value)}`);
   state.site = found;
   state.past = [];
   byId("undo").disabled = true;

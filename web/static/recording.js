@@ -1,4 +1,6 @@
 // Starts a job for the recording of the page, read as the form says.
+import { call } from "./request.js";
+
 const form = document.getElementById("process");
 const NUMBERS = new Set(["joint_sign", "joint_offset_deg", "lidar_offset_s"]);
 
@@ -18,16 +20,10 @@ form.addEventListener("submit", async (event) => {
   const data = new FormData(form);
   const status = document.getElementById("process-status");
   status.textContent = "Starting …";
-  const answer = await fetch("/api/v1/jobs", {
-    method: "POST",
-    headers: { "Content-Type": "application/json" },
-    body: JSON.stringify({
-      survey: data.get("survey"),
-      recording: form.dataset.recording,
-      options: optionsOf(data),
-    }),
-  });
-  const job = await answer.json();
-  if (answer.ok) location.assign(`/jobs/${job.job_id}`);
-  else status.textContent = job.detail;
+  const { recording } = form.dataset;
+  const body = { survey: data.get("survey"), recording, options: optionsOf(data) };
+  await call("POST", "/api/v1/jobs", body).then(
+    (job) => location.assign(`/jobs/${job.job_id}`),
+    (error) => { status.textContent = error.message; },
+  );
 });

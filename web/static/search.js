@@ -1,24 +1,16 @@
 // Searches of plans: started, followed until their end, dismissed.
+import { call, get } from "./request.js";
+
 const API = "/api/v1/plans/searches";
 const LOOK_EVERY = 700; // [ms]
 
-async function answer(response) {
-  const found = await response.json();
-  if (!response.ok) throw new Error(found.detail);
-  return found;
-}
-
-export async function start(body) {
-  const headers = { "Content-Type": "application/json" };
-  return answer(await fetch(API, { method: "POST", headers, body: JSON.stringify(body) }));
-}
-
-export const dismiss = async (id) => answer(await fetch(`${API}/${id}`, { method: "DELETE" }));
+export const start = (body) => call("POST", API, body);
+export const dismiss = (id) => call("DELETE", `${API}/${id}`);
 
 // Shows a search until it ends; returns it, or throws why it failed.
 export async function follow(id, show) {
   for (;;) {
-    const found = await answer(await fetch(`${API}/${id}`));
+    const found = await get(`${API}/${id}`);
     show(found);
     if (found.status === "successful") return found;
     if (found.status !== "running") throw new Error(found.error_reason ?? found.message);

@@ -1,4 +1,6 @@
 // The page for queries: an editor, the address with its query, the result as table, files and chart.
+import { call } from "./request.js";
+
 const KEY = "spheremark-queries";
 const KEPT = 30;
 const SHOWN = 1000; // rows in the page; files hold them all
@@ -74,12 +76,8 @@ let waiting = null;
 
 async function ask(sql) {
   waiting = new AbortController();
-  return fetch("/api/v1/sql", {
-    method: "POST",
-    headers: { "Content-Type": "application/json" },
-    body: JSON.stringify({ sql, parameters: parameters() }),
-    signal: waiting.signal,
-  });
+  const body = { sql, parameters: parameters() };
+  return call("POST", "/api/v1/sql", body, { signal: waiting.signal });
 }
 
 function setRunning(isRunning) {
@@ -96,15 +94,12 @@ async function run({ keep = true, explain = false } = {}) {
   setRunning(true);
   if (keep && !explain) history.pushState(null, "", `/sql?${search()}`);
   try {
-    const response = await ask(explain ? `EXPLAIN ${sql}` : sql);
-    const body = await response.json();
-    if (!response.ok) showError(body.detail);
-    else if (explain) showPlan(body);
+    const body = await ask(explain ? `EXPLAIN ${sql}` : sql);
+    if (explain) showPlan(body);
     else showAnswer(body);
-    if (response.ok && !explain) remember(sql);
+    if (!explain) remember(sql);
   } catch (error) {
-    const isCancelled = error.name === "AbortError";
-    showError(isCancelled ? "Cancelled." : "The service did not respond; is it still running?");
+    showError(error.name === "AbortError" ? "Cancelled." : error.message);
   } finally {
     setRunning(false);
   }
@@ -222,17 +217,17 @@ for (const button of document.querySelectorAll("[data-copy]")) {
 byId("save-form").addEventListener("submit", async (event) => {
   event.preventDefault();
   const name = byId("save-name").value;
-  const response = await fetch(`/api/v1/queries/${encodeURIComponent(name)}`, {
-    method: "PUT",
-    headers: { "Content-Type": "application/json" },
-    body: JSON.stringify({ sql: text(), parameters: parameters() }),
-  });
-  if (response.ok) location.assign(`/sql?${new URLSearchParams({ name })}`);
-  else byId("saved-message").textContent = (await response.json()).detail;
+  const body = { sql: text(), parameters: parameters() };
+  await call("PUT", `/api/v1/queries/${encodeURIComponent(name)}`, body).then(
+    () => location.assign(`/sql?${new URLSearchParams({ name })}`),
+    (error) => { byId("saved-message").textContent = error.message; },
+  );
 });
 byId("delete-saved")?.addEventListener("click", async () => {
-  await fetch(`/api/v1/queries/${encodeURIComponent(given.name)}`, { method: "DELETE" });
-  location.assign(`/sql?${search()}`);
+  await call("DELETE", `/api/v1/queries/${encodeURIComponent(given.name)}`).then(
+    () => location.assign(`/sql?${search()}`),
+    (error) => { byId("saved-message").textContent = error.message; },
+  );
 });
 
 // The chart: two numeric columns, one series for each value of a third

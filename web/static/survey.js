@@ -1,20 +1,10 @@
 // The tab of logs: process, move, remove and put back logs; control; name and deletion.
 import { putControl } from "./control.js";
+import { call } from "./request.js";
 
 const survey = document.getElementById("survey").dataset.survey;
 const home = `/api/v1/surveys/${survey}`;
 const by = (id) => document.getElementById(id);
-
-async function call(method, address, body) {
-  const answer = await fetch(address, {
-    method,
-    headers: body === undefined ? {} : { "Content-Type": "application/json" },
-    body: body === undefined ? undefined : JSON.stringify(body),
-  });
-  const found = await answer.json();
-  if (!answer.ok) throw new Error(found.detail);
-  return found;
-}
 
 function complain(place) {
   return (error) => {
@@ -109,9 +99,7 @@ document.addEventListener("control", (event) => {
   by("put-control").disabled = !event.detail;
 });
 by("put-control").addEventListener("click", async () => {
-  const answer = await putControl(survey);
-  if (answer.ok) return location.reload();
-  by("control-status").textContent = (await answer.json()).detail;
+  await putControl(survey).then(() => location.reload(), complain(by("control-status")));
 });
 
 by("change-survey").addEventListener("submit", async (event) => {

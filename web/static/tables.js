@@ -1,5 +1,7 @@
 // Tables by address: <div data-table="/api/v1/tables/..." data-columns="[[name, head, kind]]">. The
 // address of the page keeps order and part (sort, after), so that a link shows the same rows.
+import { get } from "./request.js";
+
 const MM = 1000;
 const SHOWN = 25;
 
@@ -121,12 +123,9 @@ class Table {
   }
 
   async load() {
-    const response = await fetch(this.address("json", { after: this.after, limit: SHOWN }));
-    const page = await response.json();
-    if (!response.ok) {
-      this.foot.textContent = page.detail ?? "The rows could not be loaded.";
-      return;
-    }
+    const address = this.address("json", { after: this.after, limit: SHOWN });
+    const page = await get(address).catch((error) => { this.foot.textContent = error.message; });
+    if (!page) return;
     const focused = document.activeElement?.closest?.("th")?.cellIndex;
     this.head.replaceChildren(...this.heads());
     if (focused !== undefined) this.head.cells[focused]?.querySelector("button")?.focus();
