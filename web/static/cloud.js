@@ -24,6 +24,7 @@ import {
   WebGLRenderer,
   WireframeGeometry,
 } from "./vendor/three.js";
+import { get, send } from "./request.js";
 
 const byId = (name) => document.getElementById(name);
 const [panel, stage, overlay] = [byId("cloud"), byId("cloud-stage"), byId("cloud-overlay")];
@@ -163,8 +164,7 @@ async function load(node) {
   loading += 1;
   try {
     const query = new URLSearchParams({ run: node.cloud.run, stop: node.cloud.stop });
-    const response = await fetch(`/api/v1/clouds/octree/${node.key}?${query}`);
-    if (!response.ok) throw new Error(`node ${node.key}: ${response.status}`);
+    const response = await send("GET", `/api/v1/clouds/octree/${node.key}?${query}`);
     fill(node, await response.arrayBuffer());
   } catch (error) {
     node.hasFailed = true;
@@ -224,6 +224,7 @@ function choose(most) {
     const [[, node]] = queue.splice(best, 1);
     if (!frustum.intersectsSphere(node.ball)) continue;
     if (node.points) {
+      if (n && n + node.n > most) break; // the root is always drawn
       node.points.visible = true;
       node.used = performance.now();
       n += node.n;
@@ -290,11 +291,13 @@ function frame(now) {
     }
   }
   last = now;
-  shown = choose(isMoving ? Math.min(budget, wanted()) : wanted());
+  const most = isMoving ? Math.min(budget, wanted()) : wanted();
+  shown = choose(most);
   renderer.render(scene, camera);
   place();
   forget();
   panel.dataset.points = shown;
+  panel.dataset.most = Math.round(most);
   panel.dataset.loading = loading;
 }
 
@@ -401,13 +404,7 @@ function cross() {
 }
 
 async function open() {
-  const response = await fetch(panel.dataset.scene);
-  const body = await response.json();
-  if (!response.ok) {
-    byId("cloud-about").textContent = body.detail;
-    return;
-  }
-  facts = body;
+  facts = await get(panel.dataset.scene);
   clouds = facts.stops.map((stop, i) => {
     const group = new Group();
     group.matrixAutoUpdate = false;
@@ -431,13 +428,10 @@ async function open() {
 
 async function openCloud(cloud) {
   const query = new URLSearchParams({ run: cloud.run, stop: cloud.stop });
-  const response = await fetch(`/api/v1/clouds/octree?${query}`);
-  if (!response.ok) {
-    byId("cloud-status").textContent = (await response.json()).detail;
-    return;
-  }
-  cloud.index = await response.json();
-  if (!cloud.index.n_points) return;
+  cloud.index = await get(`/api/v1/clouds/octree?${query}`).catch((error) => {
+    byId("cloud-status").textContent = error.message;
+  });
+  if (!cloud.index?.n_points) return;
   cloud.root = nodeOf(cloud, "r");
   await load(cloud.root);
 }
@@ -630,4 +624,4 @@ new ResizeObserver(() => {
 }).observe(stage);
 
 requestAnimationFrame(frame);
-open();
+open().catch((error) => { byId("cloud-about").textContent = error.message; });
