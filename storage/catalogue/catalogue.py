@@ -35,12 +35,14 @@ SELECT j.*, s.name AS survey, r.name AS recording, coalesce((
             OR w.kind = 'adjust' AND j.kind = 'site')
 ), []) AS waits_for
 FROM jobs AS j JOIN surveys AS s USING (survey_id) LEFT JOIN recordings AS r USING (recording_id)
+LEFT JOIN deleted_surveys AS d ON d.survey_id = j.survey_id
 """
 _JOB = _JOBS + "WHERE j.job_id = $id"
 _JOBS_AFTER = (
     _JOBS
     + """
 WHERE ($at::TIMESTAMPTZ IS NULL OR (j.created_at, j.job_id) < ($at::TIMESTAMPTZ, $id))
+    AND d.survey_id IS NULL
     AND ($survey_id::VARCHAR IS NULL OR j.survey_id = $survey_id)
     AND ($recording_id::VARCHAR IS NULL OR j.recording_id = $recording_id)
     AND ($status::VARCHAR IS NULL OR j.status = $status)
@@ -180,7 +182,7 @@ class Catalogue(Surveys):
         after: str | None = None,
         limit: int = 100,
     ) -> Page[JobRecord]:
-        """Return a page of the jobs, newest first, of one survey, log or status if given."""
+        """Return a page of jobs, newest first, of one survey, log or status if given."""
         survey_id = None if survey is None else self.get_survey(survey).survey_id
         filters = {"survey_id": survey_id, "recording_id": recording_id, "status": status}
         return self._page(JobRecord, _JOBS_AFTER, filters, after, limit)

@@ -21,9 +21,10 @@ router = APIRouter(include_in_schema=False, default_response_class=HTMLResponse)
 
 _N_JOBS = 100  # in one page; the API lists all
 _JOBS = """
-SELECT j.*, s.name AS survey, r.name AS recording
+SELECT j.*, s.name AS survey, r.name AS recording, d.survey_id IS NOT NULL AS is_of_deleted
 FROM jobs AS j JOIN surveys AS s USING (survey_id) LEFT JOIN recordings AS r USING (recording_id)
-WHERE ($job IS NULL OR j.job_id = $job)
+LEFT JOIN deleted_surveys AS d ON d.survey_id = j.survey_id
+WHERE ($job IS NULL AND d.survey_id IS NULL OR j.job_id = $job)
     AND ($recording IS NULL OR j.recording_id = $recording)
     AND ($survey IS NULL OR j.survey_id = $survey)
     AND (NOT $is_active OR j.status IN ('accepted', 'running'))
@@ -102,12 +103,13 @@ def job(job_id: str, service: Current) -> str:
     if not found:
         raise NotFoundError(f"There is no job {job_id!r}.")
     rows, key = service.catalogue.rows, {"id": job_id}
+    is_of_deleted = found[0]["is_of_deleted"]
     return render(
         "job.html",
-        frame=frame_of(service, found[0]["survey"]),
+        frame=frame_of(service, "" if is_of_deleted else found[0]["survey"]),
         job=found[0],
-        stops=rows(_JOB_STOPS, key),
-        made=rows(_JOB_MADE, key),
+        stops=[] if is_of_deleted else rows(_JOB_STOPS, key),
+        made=[] if is_of_deleted else rows(_JOB_MADE, key),
         config=json.dumps(json.loads(found[0]["config"]), indent=2),
         options=json.loads(found[0]["options"] or "{}"),
     )
