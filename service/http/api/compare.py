@@ -7,8 +7,8 @@ from typing import Annotated, Any
 from fastapi import APIRouter, Query
 from pydantic import BaseModel, Field
 
-from spheremark.service.http.comparison import compared
 from spheremark.service.http.state import Current
+from spheremark.service.serialise.comparison import compared
 
 router = APIRouter(tags=["results"])
 
@@ -38,4 +38,4 @@ class Comparison(BaseModel):
 @router.get("/compare", name="compare", response_model=Comparison)
 def compare(a: Name, b: Name, service: Current) -> Any:
     """Compare two results of one kind: differences B minus A with their significance."""
-    return compared(service, a, b)
+    return compared(service.catalogue, a, b)

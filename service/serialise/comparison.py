@@ -16,7 +16,7 @@ from spheremark.pipelines.accuracy.comparison import (
 )
 from spheremark.pipelines.errors import InputError, NotFoundError, TooFewObservationsError
 from spheremark.pipelines.model import Array
-from spheremark.service.http.state import Service
+from spheremark.storage.catalogue.catalogue import Catalogue
 from spheremark.storage.catalogue.rows import COV, places
 from spheremark.web.links import stop_url
 
@@ -30,7 +30,7 @@ class Kind(NamedTuple):
 
     label: str
     choices: str
-    compare: Callable[[Service, str, str], Row]
+    compare: Callable[[Catalogue, str, str], Row]
 
 
 _RUNS = """
@@ -116,7 +116,7 @@ FROM planned_stops WHERE placement_id = $id ORDER BY place
 """
 
 
-def compared(service: Service, a: str, b: str) -> Row:
+def compared(catalogue: Catalogue, a: str, b: str) -> Row:
     """Return two results side by side; each is named by its kind and key, ``run:0123``."""
     kinds = [one.partition(":")[0] for one in (a, b)]
     for kind, one in zip(kinds, (a, b), strict=True):
@@ -125,27 +125,27 @@ def compared(service: Service, a: str, b: str) -> Row:
     if kinds[0] != kinds[1]:
         raise InputError(f"{kinds[0]} and {kinds[1]} are compared; both must be of one kind.")
     keys = [one.partition(":")[2] for one in (a, b)]
-    return {"kind": kinds[0], "a": a, "b": b} | KINDS[kinds[0]].compare(service, *keys)
+    return {"kind": kinds[0], "a": a, "b": b} | KINDS[kinds[0]].compare(catalogue, *keys)
 
 
-def choices(service: Service) -> dict[str, list[Row]]:
+def choices(catalogue: Catalogue) -> dict[str, list[Row]]:
     """Return what can be compared, by kind, newest first."""
-    return {name: service.catalogue.rows(kind.choices) for name, kind in KINDS.items()}
+    return {name: catalogue.rows(kind.choices) for name, kind in KINDS.items()}
 
 
-def _runs(service: Service, a: str, b: str) -> Row:
+def _runs(catalogue: Catalogue, a: str, b: str) -> Row:
     """Compare the stations of two runs."""
-    about = [service.row(_RUN, key, "run") for key in (a, b)]
-    rows = [service.catalogue.rows(_RUN_FIXES, {"id": key}) for key in (a, b)]
+    about = [_one(catalogue, _RUN, key, "run") for key in (a, b)]
+    rows = [catalogue.rows(_RUN_FIXES, {"id": key}) for key in (a, b)]
     survey = about[0]["survey"]
     links = {one["name"]: stop_url(survey, one["stop"], one["fit_method"]) for one in rows[0]}
     return _made(about) | _points(rows, links, is_free=False)
 
 
-def _networks(service: Service, a: str, b: str) -> Row:
+def _networks(catalogue: Catalogue, a: str, b: str) -> Row:
     """Compare the stations and marks of two networks."""
-    about = [service.row(_NETWORK, key, "network") for key in (a, b)]
-    rows = [service.catalogue.rows(_NETWORK_POINTS, {"id": key}) for key in (a, b)]
+    about = [_one(catalogue, _NETWORK, key, "network") for key in (a, b)]
+    rows = [catalogue.rows(_NETWORK_POINTS, {"id": key}) for key in (a, b)]
     is_free = any(one["datum"] == "free" for one in about)
     return _made(about) | _points(rows, {}, is_free=is_free)
 
@@ -204,12 +204,11 @@ def _points(rows: Sequence[Sequence[Row]], links: Mapping[str, str], *, is_free:
     }
 
 
-def _rigs(service: Service, a: str, b: str) -> Row:
+def _rigs(catalogue: Catalogue, a: str, b: str) -> Row:
     """Compare the parameters of two calibrations."""
-    about = [service.row(_RIG, key, "calibration") for key in (a, b)]
+    about = [_one(catalogue, _RIG, key, "calibration") for key in (a, b)]
     known = [
-        {one["name"]: one for one in service.catalogue.rows(_PARAMETERS, {"id": key})}
-        for key in (a, b)
+        {one["name"]: one for one in catalogue.rows(_PARAMETERS, {"id": key})} for key in (a, b)
     ]
     names = [name for name in known[0] if name in known[1]]
 
@@ -236,12 +235,11 @@ def _rigs(service: Service, a: str, b: str) -> Row:
     return _made(about) | {"rows": table, "notes": [], "summary": summary}
 
 
-def _methods(service: Service, a: str, b: str) -> Row:
+def _methods(catalogue: Catalogue, a: str, b: str) -> Row:
     """Compare two fitting methods stop by stop, by the RMS of their centres."""
     parts = [one.rpartition("/") for one in (a, b)]
     found = [
-        service.catalogue.rows(_METHOD, {"survey": survey, "method": method})
-        for survey, _, method in parts
+        catalogue.rows(_METHOD, {"survey": survey, "method": method}) for survey, _, method in parts
     ]
     for one, rows in zip((a, b), found, strict=True):
         if not rows:
@@ -287,13 +285,10 @@ def _methods(service: Service, a: str, b: str) -> Row:
     }
 
 
-def _plans(service: Service, a: str, b: str) -> Row:
+def _plans(catalogue: Catalogue, a: str, b: str) -> Row:
     """Compare the predictions of two stored plans at the stops that both have."""
-    about = [service.row(_PLAN, key, "plan") for key in (a, b)]
-    known = [
-        {one["name"]: one for one in service.catalogue.rows(_PLANNED, {"id": key})}
-        for key in (a, b)
-    ]
+    about = [_one(catalogue, _PLAN, key, "plan") for key in (a, b)]
+    known = [{one["name"]: one for one in catalogue.rows(_PLANNED, {"id": key})} for key in (a, b)]
     names = [name for name in known[0] if name in known[1]]
     table = []
     for name in names:
@@ -320,6 +315,14 @@ def _plans(service: Service, a: str, b: str) -> Row:
     )
     notes = ["Predictions have no noise: a difference is that of the plans, if both use one model."]
     return _made(about) | {"rows": table[:ROWS_MAX], "notes": notes, "summary": summary}
+
+
+def _one(catalogue: Catalogue, sql: str, key: str, what: str) -> Row:
+    """Return the row of an id."""
+    rows = catalogue.rows(sql, {"id": key})
+    if not rows:
+        raise NotFoundError(f"There is no {what} {key!r}.")
+    return rows[0]
 
 
 def _made(about: Sequence[Row]) -> Row:
