@@ -15,9 +15,9 @@ from spheremark.storage.catalogue.database import Database
 
 N_WORST = 12  # rows of each bin that keep their names
 
-FITS = """
-SELECT s.name AS survey, r.recording_id, m.run_id, m.stop, m.fit_method, m.marker, m.mark, m.status,
-    m.reason, m.range_m, m.n_points, m.incidence_deg, m.sigma_3d_m, m.error_3d_m,
+_FITS = """
+SELECT {place}s.name AS survey, r.recording_id, m.run_id, m.stop, m.fit_method, m.marker, m.mark,
+    m.status, m.reason, m.range_m, m.n_points, m.incidence_deg, m.sigma_3d_m, m.error_3d_m,
     m.error_radial_m, CASE WHEN $is_error THEN m.error_3d_m ELSE m.sigma_3d_m END AS value_m
 FROM marker_fits AS m JOIN latest_runs AS r USING (run_id) JOIN surveys AS s USING (survey_id)
 WHERE (len($surveys::VARCHAR[]) = 0 OR list_contains($surveys::VARCHAR[], s.name))
@@ -27,21 +27,34 @@ WHERE (len($surveys::VARCHAR[]) = 0 OR list_contains($surveys::VARCHAR[], s.name
     AND m.n_points BETWEEN $count_from AND $count_to
     AND coalesce(m.incidence_deg, 0) BETWEEN $incidence_from_deg AND $incidence_to_deg
 """
+FITS = _FITS.replace("{place}", "")
 """The centres of a selection: of newest runs, with error or predicted sigma as ``value_m``."""
 
+_PLACED = _FITS.replace("{place}", "m.rowid AS place, ")
+
+# names are read for the worst rows alone: with each row they take twice the time of all the rest
 _BINNED = """
-SELECT fit_method, {low} AS bin_from, {high} AS bin_to, count(*) AS n,
-    count(DISTINCT (run_id, stop)) AS n_stops, avg({x}) AS mean_x,
-    quantile_cont(value_m, 0.025) AS p025_m, quantile_cont(value_m, 0.5) AS median_m,
-    quantile_cont(value_m, 0.95) AS p95_m, quantile_cont(value_m, 0.975) AS p975_m,
-    sqrt(avg(value_m ^ 2)) AS rms_m, sqrt(avg(sigma_3d_m ^ 2)) AS sigma_rms_m,
-    arg_max({{'survey': survey, 'stop': stop, 'marker': marker, 'x': {x}, 'value_m': value_m,
-        'status': status}}, value_m, {n_worst}) AS worst
-FROM ({rows}) WHERE value_m IS NOT NULL AND {x} IS NOT NULL
-GROUP BY ALL ORDER BY fit_method, bin_from
+WITH bins AS (
+    SELECT fit_method, {low} AS bin_from, {high} AS bin_to, count(*) AS n,
+        count(DISTINCT hash(run_id, stop)) AS n_stops, avg({x}) AS mean_x,
+        quantile_cont(value_m, [0.025, 0.5, 0.95, 0.975]) AS quantiles_m,
+        sqrt(avg(value_m ^ 2)) AS rms_m, sqrt(avg(sigma_3d_m ^ 2)) AS sigma_rms_m,
+        arg_max(place, value_m, {n_worst}) AS places
+    FROM ({rows}) WHERE value_m IS NOT NULL AND {x} IS NOT NULL GROUP BY ALL
+), worst AS (
+    SELECT b.fit_method, b.bin_from, list({{'survey': survey, 'stop': stop, 'marker': marker,
+        'x': {x}, 'value_m': value_m, 'status': status}} ORDER BY value_m DESC, place) AS worst
+    FROM (SELECT fit_method, bin_from, unnest(places) AS place FROM bins) AS b
+        JOIN ({rows}) AS x USING (place) GROUP BY ALL
+)
+SELECT fit_method, bin_from, bin_to, n, n_stops, mean_x, quantiles_m[1] AS p025_m,
+    quantiles_m[2] AS median_m, quantiles_m[3] AS p95_m, quantiles_m[4] AS p975_m, rms_m,
+    sigma_rms_m, worst
+FROM bins JOIN worst USING (fit_method, bin_from) ORDER BY fit_method, bin_from
 """
 _PAIRS = """
-SELECT s.name AS survey, x.run_id, x.stop, x.fit_method, array_to_string(x.marks, ' + ') AS marker,
+SELECT s.name AS survey, x.rowid AS place, x.run_id, x.stop, x.fit_method,
+    array_to_string(x.marks, ' + ') AS marker,
     '' AS status, x.included_angle_max_deg, x.sigma_horizontal_m AS sigma_3d_m,
     CASE WHEN $is_error THEN x.error_horizontal_m ELSE x.sigma_horizontal_m END AS value_m
 FROM resections AS x JOIN latest_runs AS r USING (run_id) JOIN surveys AS s USING (survey_id)
@@ -65,15 +78,15 @@ def _on_fits(sql: str) -> str:
 # 3000 errors of each method for a model, of whole stops; 600 stations of a map, 60 surveys of a
 # figure: more are neither legible nor fast
 QUERIES: Mapping[str, str] = {
-    "distance": _binned(FITS, "range_m", "floor(range_m)", "floor(range_m) + 1"),
+    "distance": _binned(_PLACED, "range_m", "floor(range_m)", "floor(range_m) + 1"),
     "count": _binned(
-        FITS,
+        _PLACED,
         "n_points",
         "floor(10 ^ (floor(6 * log10(greatest(n_points, 1)) + 1e-9) / 6))",
         "floor(10 ^ ((floor(6 * log10(greatest(n_points, 1)) + 1e-9) + 1) / 6))",
     ),
     "incidence": _binned(
-        FITS, "incidence_deg", "2 * floor(incidence_deg / 2)", "2 * floor(incidence_deg / 2) + 2"
+        _PLACED, "incidence_deg", "2 * floor(incidence_deg / 2)", "2 * floor(incidence_deg / 2) + 2"
     ),
     "angle": _binned(
         _PAIRS,
