@@ -3,13 +3,15 @@
 import pytest
 from axe_playwright_python.sync_playwright import Axe
 
-from tests.browser.test_pages_in_a_browser import CHROMIUM, PAGES, address, browser, visit
+from tests.browser.visits import NEEDS_CHROMIUM, PAGES
 
-pytestmark = pytest.mark.skipif(CHROMIUM is None, reason="Chromium is not installed")
-__all__ = ["address", "browser", "visit"]  # fixtures
+pytestmark = NEEDS_CHROMIUM
 
 MORE = ["/coverage", "/worlds", "/login", "/guide", "/surveys/none", "/plan/sheet?a=P01:6,0,1"]
-LOOKS = [(width, scheme) for width in (1280, 390) for scheme in ("light", "dark")]
+LOOKS = [(1280, "light"), (1280, "dark"), (390, "dark"), (390, "light")]
+DRAWN = """(theme) => document.documentElement.dataset.theme === theme
+    && [...document.querySelectorAll("[data-figure]")].every(
+        (one) => [theme, "failed"].includes(one.dataset.drawn))"""
 
 
 def found(page):
@@ -20,9 +22,13 @@ def found(page):
 
 @pytest.mark.parametrize("path", [*PAGES, *MORE])
 def test_a_page_passes_axe(visit, path):
+    """The page is loaded once: theme and width change as for its reader."""
+    page = visit(width=LOOKS[0][0], scheme=LOOKS[0][1]).open(path)
+    page.wait_for_load_state("networkidle")
     for width, scheme in LOOKS:
-        page = visit(width=width, scheme=scheme).open(path)
-        page.wait_for_load_state("networkidle")
+        page.set_viewport_size({"width": width, "height": 900})
+        page.emulate_media(color_scheme=scheme)
+        page.wait_for_function(DRAWN, arg=scheme)
         assert found(page) == [], (width, scheme)
 
 

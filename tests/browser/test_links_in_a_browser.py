@@ -2,10 +2,9 @@
 
 import pytest
 
-from tests.browser.test_pages_in_a_browser import CHROMIUM, address, browser, visit
+from tests.browser.visits import NEEDS_CHROMIUM
 
-pytestmark = pytest.mark.skipif(CHROMIUM is None, reason="Chromium is not installed")
-__all__ = ["address", "browser", "visit"]  # fixtures
+pytestmark = NEEDS_CHROMIUM
 
 ACCURACY = "/surveys/field/accuracy"
 POINT = """(name) => {

@@ -1,123 +1,16 @@
 """Every page in a real Chromium: it draws, obeys the policy, stays on this host, and fits."""
 
 import re
-import shutil
-import threading
-import time
 from contextlib import contextmanager
 from urllib.parse import urlencode
 
 import psutil
 import pytest
-import uvicorn
-from playwright.sync_api import sync_playwright
 
-from spheremark.service.http.app import create_app
-from spheremark.service.settings import Settings
-from spheremark.storage.catalogue.catalogue import Catalogue
-from tests.surveyed import fill
+from tests.browser.visits import NEEDS_CHROMIUM, PAGES, STOP
 
-CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser")
-pytestmark = pytest.mark.skipif(
-    CHROMIUM is None, reason="Chromium is not installed; on Debian: apt-get install chromium"
-)
-
-STOP = "/surveys/field/stops/lane3-stop1"
-PAGES = [
-    "/",
-    "/surveys/field",
-    "/surveys/field/accuracy?axes=log&method=along_beam",
-    "/accuracy",
-    "/compare",
-    "/surveys/field/cloud",
-    "/surveys/field/stops",
-    "/surveys/field/network",
-    "/surveys/field/rig",
-    "/surveys/field/site",
-    "/surveys/field/logs",
-    "/new",
-    "/surveys/blind",
-    STOP,
-    f"{STOP}?method=paper&marker=M03",
-    "/live",
-    "/jobs",
-    "/docs",
-    "/glossary",
-    "/surveys/field/report",
-    "/plan?a=P01:6.5,0.5,1;P02:-1,6.5,1;P03:-6.5,-3,1&b=P01:6.5,0.5,1;P02:-1,6.5,1&stop=lane3-stop1",
-    "/plan/random?n_arrangements=2000",
-    "/sql?q=SELECT+stop%2C+x_m%2C+y_m+FROM+latest_station_fixes+ORDER+BY+ALL",
-]
+pytestmark = NEEDS_CHROMIUM
 LOOKS = [(1440, "dark"), (390, "light")]
-HARMLESS = re.compile("GPU stall|willReadFrequently|GroupMarkerNotSet")  # no GPU in a test
-
-
-@pytest.fixture(scope="module")
-def address(tmp_path_factory):
-    data = tmp_path_factory.mktemp("data")
-    with Catalogue(data / "spheremark.duckdb", snapshots=data / "snapshots") as catalogue:
-        fill(catalogue, data / "clouds", "field", n_stops=2)
-        fill(catalogue, data / "clouds", "blind", n_stops=1, with_truth=False, lane="a")
-    app = create_app(Settings(data=data, workers=1))
-    server = uvicorn.Server(uvicorn.Config(app, port=0, log_level="error"))
-    thread = threading.Thread(target=server.run)
-    thread.start()
-    while not server.started:
-        assert thread.is_alive(), "The service did not start."
-        time.sleep(0.05)
-    yield f"http://127.0.0.1:{server.servers[0].sockets[0].getsockname()[1]}"
-    server.should_exit = True
-    thread.join(timeout=120)
-
-
-@pytest.fixture(scope="module")
-def browser():
-    with sync_playwright() as playwright:
-        browser = playwright.chromium.launch(executable_path=CHROMIUM, args=["--no-sandbox"])
-        yield browser
-        browser.close()
-
-
-class Visit:
-    """A page that is watched while it loads."""
-
-    def __init__(self, browser, address, *, width=1440, scheme="light"):
-        self.address, self.complaints, self.strangers = address, [], []
-        self.context = browser.new_context(
-            viewport={"width": width, "height": 900}, color_scheme=scheme
-        )
-        self.page = self.context.new_page()
-        self.page.on("console", self._hear)
-        self.page.on("pageerror", lambda error: self.complaints.append(str(error)))
-        self.page.on("request", self._see)
-
-    def _hear(self, message):
-        if message.type in ("error", "warning") and not HARMLESS.search(message.text):
-            self.complaints.append(message.text)
-
-    def _see(self, request):
-        if not request.url.startswith((self.address, "data:", "blob:")):
-            self.strangers.append(request.url)
-
-    def open(self, path):
-        self.page.goto(self.address + path)
-        searching = "[data-search], [data-search-request]"  # it loads the page again at its end
-        self.page.wait_for_selector(searching, state="detached", timeout=120_000)
-        self.page.wait_for_selector("[data-figure]:not([data-drawn])", state="detached")
-        return self.page
-
-
-@pytest.fixture
-def visit(browser, address):
-    visits = []
-
-    def start(**look):
-        visits.append(Visit(browser, address, **look))
-        return visits[-1]
-
-    yield start
-    for one in visits:
-        one.context.close()
 
 
 @pytest.mark.parametrize("path", PAGES)

@@ -1,0 +1,68 @@
+"""Pages that the tests of this folder open in a real Chromium, and how they are watched."""
+
+import re
+import shutil
+
+import pytest
+
+CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser")
+NEEDS_CHROMIUM = pytest.mark.skipif(
+    CHROMIUM is None, reason="Chromium is not installed; on Debian: apt-get install chromium"
+)
+
+STOP = "/surveys/field/stops/lane3-stop1"
+PAGES = [
+    "/",
+    "/surveys/field",
+    "/surveys/field/accuracy?axes=log&method=along_beam",
+    "/accuracy",
+    "/compare",
+    "/surveys/field/cloud",
+    "/surveys/field/stops",
+    "/surveys/field/network",
+    "/surveys/field/rig",
+    "/surveys/field/site",
+    "/surveys/field/logs",
+    "/new",
+    "/surveys/blind",
+    STOP,
+    f"{STOP}?method=paper&marker=M03",
+    "/live",
+    "/jobs",
+    "/docs",
+    "/glossary",
+    "/surveys/field/report",
+    "/plan?a=P01:6.5,0.5,1;P02:-1,6.5,1;P03:-6.5,-3,1&b=P01:6.5,0.5,1;P02:-1,6.5,1&stop=lane3-stop1",
+    "/plan/random?n_arrangements=2000",
+    "/sql?q=SELECT+stop%2C+x_m%2C+y_m+FROM+latest_station_fixes+ORDER+BY+ALL",
+]
+HARMLESS = re.compile("GPU stall|willReadFrequently|GroupMarkerNotSet")  # no GPU in a test
+
+
+class Visit:
+    """A page that is watched while it loads."""
+
+    def __init__(self, browser, address, *, width=1440, scheme="light"):
+        self.address, self.complaints, self.strangers = address, [], []
+        self.context = browser.new_context(
+            viewport={"width": width, "height": 900}, color_scheme=scheme
+        )
+        self.page = self.context.new_page()
+        self.page.on("console", self._hear)
+        self.page.on("pageerror", lambda error: self.complaints.append(str(error)))
+        self.page.on("request", self._see)
+
+    def _hear(self, message):
+        if message.type in ("error", "warning") and not HARMLESS.search(message.text):
+            self.complaints.append(message.text)
+
+    def _see(self, request):
+        if not request.url.startswith((self.address, "data:", "blob:")):
+            self.strangers.append(request.url)
+
+    def open(self, path):
+        self.page.goto(self.address + path)
+        searching = "[data-search], [data-search-request]"  # it loads the page again at its end
+        self.page.wait_for_selector(searching, state="detached", timeout=120_000)
+        self.page.wait_for_selector("[data-figure]:not([data-drawn])", state="detached")
+        return self.page
