@@ -346,21 +346,23 @@ def has_heading(p: Array) -> Mask:
     return np.asarray(across > _PLUMB * np.linalg.norm(off, axis=(-2, -1)))
 
 
-def turn_in_place(T: Array) -> Array:
-    """Return the small motion on the left that turns a frame by 1 rad about its own z axis.
+def turn_in_place(T: Array, axis: ArrayLike = (0.0, 0.0, 1.0)) -> Array:
+    """Return the small motion on the left that turns a frame by 1 rad about an axis of its own.
 
     Parameters
     ----------
     T : (..., 4, 4)
         Poses of frames.
+    axis : (..., 3)
+        Unit vectors in these frames; z by default.
 
     Returns
     -------
     (..., 6)
         Rotation [rad] and translation [m]; the origin of the frame stays.
     """
-    axis = T[..., :3, 2]
-    return np.concatenate([axis, cross(T[..., :3, 3], axis)], axis=-1)
+    turned = (T[..., :3, :3] @ np.asarray(axis)[..., None])[..., 0]
+    return np.concatenate([turned, cross(T[..., :3, 3], turned)], axis=-1)
 
 
 def by_motion(p: Array) -> Array:

@@ -184,8 +184,9 @@ def _more_markers(fix: StationFix, found: MarkerFits, marks: ControlMarks) -> It
     motion[3:, :3] = by_motion(fix.p_site)[:, :3]
     cov = motion @ fix.cov_T_site_station @ motion.T  # of rotation and place at the station
     cov[3:, 3:] = fix.cov_p_site
-    up = fix.T_site_station[:3, 2]  # all centres are turned alike by what leaves the heading open
-    cov[:3, :3] -= fix.sigma_heading**2 * np.outer(up, up)
+    # all centres are turned alike by what leaves the heading open
+    axis = fix.T_site_station[:3, :3] @ fix.axis_station
+    cov[:3, :3] -= fix.sigma_heading**2 * np.outer(axis, axis)
     reach = max(found.fits[i].mean_range for i in used)
     offsets = marks.p_site - fix.p_site
     missing = np.setdiff1d(np.flatnonzero(np.linalg.norm(offsets, axis=1) <= reach), on)

@@ -92,19 +92,21 @@ def poses_of_network(result: AdjustedNetwork) -> tuple[StationPose, ...]:
         One for each station, with covariance.
     """
     network = result.network
-    columns = (result.T_site_station, result.cov_T_site_station, network.sigma_headings)
+    headings = zip(network.sigma_headings.tolist(), network.R_station_base[:, :, 2], strict=True)
+    columns = (result.T_site_station, result.cov_T_site_station, headings)
     return tuple(
-        pose_of_points(name, T, cov, sigma)
-        for name, T, cov, sigma in zip(network.stations, *columns, strict=True)
+        pose_of_points(name, T, cov, heading)
+        for name, T, cov, heading in zip(network.stations, *columns, strict=True)
     )
 
 
 def pose_of_fix(name: str, fix: StationFix) -> StationPose:
     """Return the pose of a station that was positioned alone."""
-    return pose_of_points(name, fix.T_site_station, fix.cov_T_site_station, fix.sigma_heading)
+    heading = fix.sigma_heading, fix.axis_station
+    return pose_of_points(name, fix.T_site_station, fix.cov_T_site_station, heading)
 
 
-def pose_of_points(name: str, T: Array, cov: Array, sigma_heading: float) -> StationPose:
+def pose_of_points(name: str, T: Array, cov: Array, heading: tuple[float, Array]) -> StationPose:
     """Return the pose of the points of a scan from that of its station.
 
     Parameters
@@ -115,16 +117,18 @@ def pose_of_points(name: str, T: Array, cov: Array, sigma_heading: float) -> Sta
         Pose of the station.
     cov : (6, 6)
         Its covariance, with the heading that mounting, encoder and clocks leave unknown.
-    sigma_heading : float
-        Standard deviation of that heading [rad].
+    heading : (float, (3,))
+        Standard deviation of that heading [rad], and the axis in the station frame about which it
+        turns: that of the gimbal.
 
     Returns
     -------
     StationPose
         Without it.
     """
-    turn = turn_in_place(T)
-    own = cov - sigma_heading**2 * np.outer(turn, turn)
+    sigma, axis = heading
+    turn = turn_in_place(T, axis)
+    own = cov - sigma**2 * np.outer(turn, turn)
     return StationPose(name=name, T_site_station=T.copy(), cov_T_site_station=own)
 
 

@@ -91,6 +91,9 @@ class StationFix:
     sigma_heading : float
         The part of ``sigma_yaw`` that mounting, encoder and clocks leave unknown. Whatever the scan
         holds is turned by the same error, so that its points do not have it in the site [rad].
+    axis_station : (3,)
+        The axis about which that turns the station: that of the gimbal, plumb where only distances
+        position it.
     """
 
     method: str
@@ -111,6 +114,7 @@ class StationFix:
     reason: str
     excluded: tuple[Exclusion, ...] = ()
     sigma_heading: float = 0.0
+    axis_station: Array = field(default_factory=lambda: np.array([0.0, 0.0, 1.0]))
 
     def __post_init__(self) -> None:
         columns: dict[str, Shape] = {
@@ -130,6 +134,7 @@ class StationFix:
             matches=(None, 2),
             residuals_site=(len(self.matches), 3),
             included_angles=(2,),
+            axis_station=(3,),
             **columns,
         )
 

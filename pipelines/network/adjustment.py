@@ -195,8 +195,8 @@ def _mark_weaknesses(network: Network, tested: Tested) -> tuple[str, ...]:
 
 
 def _cov_heading(network: Network, T: Array) -> Array:
-    """Return the covariance of stations that turn about their own plumb lines, (s, 6, 6)."""
-    turns = turn_in_place(T)
+    """Return the covariance of stations that turn about the axes of their gimbals, (s, 6, 6)."""
+    turns = turn_in_place(T, network.R_station_base[:, :, 2])
     return np.asarray(
         network.sigma_headings[:, None, None] ** 2 * turns[:, :, None] * turns[:, None]
     )

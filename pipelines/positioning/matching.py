@@ -77,8 +77,10 @@ class Scene:
     is_levelled: bool  # whether they were measured
     # standard deviation of the heading that mounting, encoder and clocks leave unknown [rad]
     sigma_heading: float
-    sigma_range: float  # standard deviation of what all ranges are too long together [m]
-    shared: Array  # (n,) how much of each centre's variance along its line of sight is that [m^2]
+    # (n, 3, k) factors of the errors that centres have in common, in base: the covariance of two is
+    # the product of theirs; and the part of it that the covariances of the centres contain [m]
+    shared_base: Array
+    included_base: Array
     sigma_height: float  # standard deviation of what all centres are too high together [m]
 
 
@@ -132,8 +134,7 @@ def gather(fits: MarkerFits, marks: ControlMarks, config: ResectionConfig) -> Sc
     p_base = np.stack([fit.p_base for fit in fits.fits])
     cov_p_base = np.stack([fit.cov_p_base for fit in fits.fits])
     cov_p_base += config.sigma_common**2 * np.eye(3)
-    sigmas_shared = np.array([fit.sigma_range_shared for fit in fits.fits])
-    is_reported = np.isfinite(sigmas_shared) & (config.sigma_range > 0.0)
+    shared, included = _in_common(fits, p_base, cov_p_base, config)
     return Scene(
         names=marks.names,
         centres_base=p_base,
@@ -146,10 +147,30 @@ def gather(fits: MarkerFits, marks: ControlMarks, config: ResectionConfig) -> Sc
         sigma_level=levelling.sigma,
         is_levelled=levelling.is_measured,
         sigma_heading=levelling.sigma_heading_station,
-        sigma_range=(float(np.median(sigmas_shared)) if is_reported.all() else config.sigma_range),
-        shared=shared_variances(p_base, cov_p_base, sigmas_shared, config),
+        shared_base=shared,
+        included_base=included,
         sigma_height=config.sigma_height,
     )
+
+
+def _in_common(
+    fits: MarkerFits, p_base: Array, cov_p_base: Array, config: ResectionConfig
+) -> tuple[Array, Array]:
+    """Return factors of what centres have in common, and of what their covariances hold of it.
+
+    Fits report both in full, or a sigma of range, or nothing.
+    """
+    v = unit(p_base)[..., None]
+    if len({fit.shared_base.shape for fit in fits.fits}) == 1 and fits.fits[0].shared_base.size:
+        factors = np.stack([fit.shared_base for fit in fits.fits])
+        if config.sigma_range:
+            return factors, factors
+        return factors - v @ (np.swapaxes(v, 1, 2) @ factors), factors
+    sigmas = np.array([fit.sigma_range_shared for fit in fits.fits])
+    variances = shared_variances(p_base, cov_p_base, sigmas, config)
+    is_reported = bool(np.isfinite(sigmas).all()) and config.sigma_range > 0.0
+    sigma = float(np.median(sigmas)) if is_reported else config.sigma_range
+    return sigma * v, np.sqrt(variances)[:, None, None] * v
 
 
 def shared_variances(
@@ -209,18 +230,22 @@ def own_covariances(p_base: Array, cov_p_base: Array, variances: Array) -> Array
     return np.asarray(cov_p_base - variances[:, None, None] * v[:, :, None] * v[:, None, :])
 
 
-def cov_of_shared(scene: Scene, variances: Array, of_ranges: Array, of_heights: Array) -> Array:
+def cov_of_shared(scene: Scene, fits: Index, effects: Array) -> Array:
     """Return the correction of a covariance for errors common to all centres.
+
+    ``effects``, (..., k, p, 3), are the derivatives of the estimates by the centres ``fits``,
+    (..., k), in base.
 
     Notes
     -----
-    An error of all ranges is partly in the covariance of each centre, as if it were its own; an
-    error of all heights is not. The estimate is the same: only how sure it is, changes.
+    Errors of ranges and of the mounting are in the covariance of each centre, as if they were its
+    own; an error of all heights is not. The estimate is the same: only how sure it is, changes.
     """
-    together = of_ranges.sum(axis=-2)
-    shared = scene.sigma_range**2 * together[..., :, None] * together[..., None, :]
-    shared += scene.sigma_height**2 * of_heights[..., :, None] * of_heights[..., None, :]
-    return np.asarray(shared - np.swapaxes(of_ranges * variances[..., None], -1, -2) @ of_ranges)
+    together = (effects @ scene.shared_base[fits]).sum(axis=-3)
+    heights = scene.sigma_height * effects.sum(axis=-3) @ scene.R_station_base[2]
+    own = effects @ scene.included_base[fits]
+    cov = together @ np.swapaxes(together, -1, -2) + heights[..., :, None] * heights[..., None, :]
+    return np.asarray(cov - (own @ np.swapaxes(own, -1, -2)).sum(axis=-3))
 
 
 def match_marks(scene: Scene, config: ResectionConfig, spans: Spans | None = None) -> Match:

@@ -12,7 +12,7 @@ import numpy as np
 
 from spheremark.pipelines.config import ResectionConfig
 from spheremark.pipelines.estimation.linear_algebra import invert_each
-from spheremark.pipelines.geometry import by_motion, has_heading, rigid, transform, unit
+from spheremark.pipelines.geometry import by_motion, has_heading, rigid, transform
 from spheremark.pipelines.model import (
     Array,
     ControlMarks,
@@ -28,7 +28,6 @@ from spheremark.pipelines.positioning.matching import (
     Scene,
     gather,
     match_marks,
-    own_covariances,
     solve_poses,
 )
 from spheremark.pipelines.positioning.trilateration import circles, slope_ranges
@@ -97,9 +96,8 @@ def check_distances(
 
     Notes
     -----
-    Neither pose nor levelling enters. A range bias that all share changes a distance by as much as
-    the two lines of sight open towards each other; what the covariances of the centres hold of it
-    is taken off them.
+    Neither pose nor levelling enters. What centres have in common changes a distance by as much as
+    it moves the two apart: a range bias, as the two lines of sight open towards each other.
     """
     scene = gather(fits, marks, config)
     match = match_marks(scene, config)
@@ -112,12 +110,13 @@ def check_distances(
     given = np.linalg.norm(goals[:, 1] - goals[:, 0], axis=1)
     along = (q - p) / measured[:, None]
     along_site = (goals[:, 1] - goals[:, 0]) / given[:, None]
-    cov = own_covariances(scene.centres_base, scene.cov_centres, scene.shared)[places[..., 0]].sum(
-        axis=1
+    included, (a, b) = scene.included_base, places[..., 0].T
+    own = scene.cov_centres - included @ np.swapaxes(included, 1, 2)
+    cov, cov_given = own[a] + own[b], scene.cov_marks[places[..., 1]].sum(axis=1)
+    apart = (along[:, None] @ (scene.shared_base[b] - scene.shared_base[a]))[:, 0]
+    sigmas = np.sqrt(
+        _projected(cov, along) + _projected(cov_given, along_site) + np.sum(apart**2, axis=1)
     )
-    cov_given = scene.cov_marks[places[..., 1]].sum(axis=1)
-    opening = np.sum(along * (unit(q) - unit(p)), axis=1) * config.sigma_range
-    sigmas = np.sqrt(_projected(cov, along) + _projected(cov_given, along_site) + opening**2)
     off = np.abs(measured - given)
     is_off = (off > tolerance) | (off > _SURPRISE * sigmas)
     return DistanceChecks(

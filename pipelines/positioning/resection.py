@@ -26,7 +26,6 @@ from spheremark.pipelines.geometry import (
     skew,
     transform,
     turn_in_place,
-    unit,
 )
 from spheremark.pipelines.model import (
     Array,
@@ -267,18 +266,15 @@ def _fix(
         J_position=J,
         residuals_site=adjustment.groups[0].residuals,
     )
-    return station_fix("free_station", scene, used, adjustment, pose, (reasons, excluded))
+    fix = station_fix("free_station", scene, used, adjustment, pose, (reasons, excluded))
+    return replace(fix, axis_station=scene.R_station_base[:, 2].copy())
 
 
 def _cov_shared(scene: Scene, used: Index, adjustment: Adjustment) -> Array:
     """Return the correction of a motion's covariance for errors common to all centres, (6, 6)."""
     R, group = adjustment.estimate[:3, :3], adjustment.groups[0]
-    p_base = scene.centres_base[used[:, 0]]
-    lines = unit(p_base) @ R.T
     gains = adjustment.cov @ np.swapaxes(invert_each(group.cov)[0] @ group.J, 1, 2)  # up to sign
-    of_ranges = (gains @ lines[..., None])[..., 0]
-    of_heights = gains.sum(axis=0) @ (R @ scene.R_station_base[2])
-    return cov_of_shared(scene, scene.shared[used[:, 0]], of_ranges, of_heights)
+    return cov_of_shared(scene, used[:, 0], gains @ R)
 
 
 def _cov_of_alternatives(elsewhere: Array) -> Array:
@@ -292,11 +288,15 @@ def _cov_of_alternatives(elsewhere: Array) -> Array:
 def _cov_of_heading(scene: Scene, elsewhere: Array, T_site_station: Array) -> Array:
     """Return the covariance that an uncertain heading and alternative positions add, (6, 6).
 
-    Mounting, encoder and clocks leave the zero of the joint angle uncertain, and so the heading of
-    base; the position does not move. The alternatives lie half a turn away.
+    Mounting, encoder and clocks leave the zero of the joint angle uncertain, which turns all
+    centres about the axis of the gimbal; the position does not move. That axis leans as the rover
+    does: on a slope of 3 degrees a degree of heading is 1 mrad of lean too. The alternatives lie
+    half a turn away.
     """
-    k, turn = len(elsewhere), turn_in_place(T_site_station)
-    cov = (scene.sigma_heading**2 + np.pi**2 * k / (k + 1)) * np.outer(turn, turn)
+    k, heading = len(elsewhere), turn_in_place(T_site_station, scene.R_station_base[:, 2])
+    turn = turn_in_place(T_site_station)
+    cov = scene.sigma_heading**2 * np.outer(heading, heading)
+    cov += np.pi**2 * k / (k + 1) * np.outer(turn, turn)
     cov[3:, 3:] += _cov_of_alternatives(elsewhere)
     return np.asarray(cov)
 

@@ -21,7 +21,6 @@ from spheremark.pipelines.geometry import (
     included_angle,
     rigid,
     skew,
-    unit,
 )
 from spheremark.pipelines.model import (
     Array,
@@ -251,7 +250,6 @@ def _by_pose(
     level = invert_each(gravity.cov[0])[0]
     leaned = R[:2] @ turn
     normal, start_normal = weighted @ J, leaned.T @ level @ leaned
-    by_ranges, by_heights = (weighted @ unit(base)[..., None])[..., 0], weighted @ plumb
     found = []
     for chosen in groups:
         cov, _ = invert_each(normal[chosen].sum(axis=1) + start_normal)
@@ -268,8 +266,8 @@ def _by_pose(
 
         T, is_settled = solve_by_chords(cov, rhs, move, np.tile(start, (len(chosen), 1, 1)))
         gains = R @ cov[:, 3:]
-        cov = gains[:, :, 3:] @ R.T + _cov_shared(
-            scene, matches[chosen, 0], gains, by_ranges[chosen], by_heights[chosen]
+        cov = gains[:, :, 3:] @ R.T + cov_of_shared(
+            scene, matches[chosen, 0], gains[:, None] @ weighted[chosen]
         )
         found.append(Positions(T[:, :3, 3], cov, is_settled))
     return found
@@ -289,25 +287,11 @@ def _by_distances(
         one = meet(chosen, marks, measured, weights, p_start)
         lean = own.leans[chosen].sum(axis=1)
         spread = own.noise[chosen].sum(axis=1) + lean @ np.swapaxes(lean, 1, 2)
-        cov = one.cov @ spread @ one.cov + _cov_shared(
-            scene, matches[chosen, 0], one.cov, own.ranges[chosen], own.heights[chosen]
+        cov = one.cov @ spread @ one.cov + cov_of_shared(
+            scene, matches[chosen, 0], one.cov[:, None] @ own.centres[chosen]
         )
         found.append(one._replace(cov=cov))
     return found
-
-
-def _cov_shared(
-    scene: Scene, fits: Index, gains: Array, by_ranges: Array, by_heights: Array
-) -> Array:
-    """Return what shared errors change in covariances of positions, (s, 3, 3).
-
-    ``by_ranges`` and ``by_heights``, (s, k, p), are what a unit of range or height of each centre
-    adds to the right-hand side, ``gains``, (s, 3, p), what that does to the position.
-    """
-    back = np.swapaxes(gains, 1, 2)
-    return cov_of_shared(
-        scene, scene.shared[fits], by_ranges @ back, (by_heights @ back).sum(axis=1)
-    )
 
 
 _METHODS: dict[str, tuple[_Usable, _Solve]] = {

@@ -48,8 +48,7 @@ class Influences(NamedTuple):
     """What each marker adds to the gradient of a position from distances."""
 
     noise: Array  # (k, 3, 3) its covariance by the errors of centre and mark alone
-    ranges: Array  # (k, 3) the gradient by a unit of the centre's range, and of its height
-    heights: Array
+    centres: Array  # (k, 3, 3) the gradient by the centre in base
     leans: Array  # (k, 3, 2) the gradient by a sigma of roll and of pitch
 
 
@@ -169,8 +168,7 @@ def influences(measure: Measure, scene: Scene, pairs: Index, p: Array) -> Influe
     own += of_mark @ scene.cov_marks[pairs[:, 1]] @ np.swapaxes(of_mark, -1, -2)
     return Influences(
         noise=own,
-        ranges=(of_centre @ unit(levelled)[..., None])[..., 0],
-        heights=of_centre[..., 2],
+        centres=of_centre @ scene.R_station_base,
         leans=scene.sigma_level * of_centre @ _leaned(levelled),
     )
 
@@ -221,10 +219,7 @@ def _pose(
     effects[1, :, 0] += weights[:, None] * by_mark
     covs = np.stack([cov_levelled, scene.cov_marks[pairs[:, 1]]])
     cov = np.einsum("ekab,ekbc,ekdc->ad", effects, covs, effects)
-    of_ranges = (effects[0] @ unit(levelled)[..., None])[..., 0]
-    cov += cov_of_shared(
-        scene, scene.shared[pairs[:, 0]], of_ranges, effects[0, ..., 2].sum(axis=0)
-    )
+    cov += cov_of_shared(scene, pairs[:, 0], effects[0] @ scene.R_station_base)
     lean = np.zeros((6, 2))  # of the measured levelling
     lean[2:] = -np.einsum("kab,kbc->ac", effects[0], _leaned(levelled))
     lean[:2] = -rot_z(yaw)[:2, :2]

@@ -43,6 +43,7 @@ _ROUGH = 0.1  # radii: standard deviation per axis of a rough centre
 _STEP_MAX = 0.25  # radii per step
 _GAP_SIGMAS = 3.0  # of its centre by which a return may lie outside a sphere and still be its own
 _GAP_MIN, _GAP_MAX = 0.02, 0.3  # radii: least and most of that
+_UNFELT = 1e-6  # [m] by all centres together: what they share less than this
 _DOF_SPREAD = 2.0  # unknowns that the prior counts for in the estimate of their spread
 
 Observe = Callable[[Array, Array], tuple[Array, Array]]
@@ -335,6 +336,15 @@ def shared_range_sigmas(state: State) -> Array:
     own = np.diag(cov)
     common = (cov.sum(axis=1) - own) / (len(cov) - 1) if len(cov) > 1 else own
     return np.asarray(np.sqrt(np.maximum(common, 0.0)))
+
+
+def shared_factors(state: State) -> Array:
+    """Return factors, (m, 3, k), of the covariances between centres by the shared unknowns [m]."""
+    values, vectors = np.linalg.eigh(state.cov_shared)
+    factors = state.by_shared @ (vectors * np.sqrt(np.maximum(values, 0.0)))
+    left, sizes, _ = np.linalg.svd(factors.reshape(-1, factors.shape[2]), full_matrices=False)
+    felt = sizes > _UNFELT
+    return np.asarray((left * sizes)[:, felt].reshape(*factors.shape[:2], -1))
 
 
 def optics_of(state: State, prior: Prior) -> tuple[Optics, Array]:

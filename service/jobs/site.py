@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from spheremark.pipelines.errors import ConfigError, InputError, NotFoundError
+from spheremark.pipelines.geometry import rot_x, rot_y
 from spheremark.pipelines.ground_model import (
     ElevationConfig,
     ElevationModel,
@@ -240,7 +241,9 @@ def pose_from_row(name: str, row: Mapping[str, Any]) -> StationPose:
     T[:3, :3] = np.reshape(row["rotation"], (3, 3))
     T[:3, 3] = [row[f"{axis}_m"] for axis in "xyz"]
     cov = np.reshape(np.asarray(row["cov_motion"], dtype=np.float64), (6, 6)).copy()
-    return pose_of_points(name, T, cov, row["sigma_heading"])
+    up = np.array([0.0, 0.0, 1.0])
+    axis = up if row["is_by_distances"] else rot_y(row["pitch"]) @ rot_x(row["roll"]) @ up
+    return pose_of_points(name, T, cov, (row["sigma_heading"], axis))
 
 
 def require_poses(poses: Mapping[Any, StationPose]) -> None:

@@ -162,8 +162,8 @@ def _by_centres(centres: Array, marks: Array, sigma: float = GRANTED_ERROR) -> A
         sigma_level=_SIGMA_UP,
         is_levelled=True,
         sigma_heading=0.0,
-        sigma_range=0.0,
-        shared=np.zeros(n),
+        shared_base=np.zeros((n, 3, 0)),
+        included_base=np.zeros((n, 3, 0)),
         sigma_height=0.0,
     )
     pairs = np.stack([np.arange(n).reshape(s, k), np.tile(np.arange(k), (s, 1))], axis=2)

@@ -48,6 +48,7 @@ from spheremark.pipelines.sphere.estimation import (
     estimate_radii,
     mounting_factor,
     optics_of,
+    shared_factors,
     shared_range_sigmas,
 )
 from spheremark.pipelines.sphere.mounting import sigmas_of
@@ -132,7 +133,7 @@ def _fit(
     rough = np.array([c.p_base_rough for c in found.candidates])
     best = estimate(stop.returns, rough, prior, observe, uses_limb=uses_limb)
     radii, sigmas = estimate_radii(stop.returns, best, radius)
-    shared = shared_range_sigmas(best.state)
+    shared, factors = shared_range_sigmas(best.state), shared_factors(best.state)
     optics, by_optics = optics_of(best.state, prior)
     results = [
         _result(
@@ -144,6 +145,7 @@ def _fit(
             radius_free=float(radii[k]),
             sigma_radius_free=float(sigmas[k]),
             sigma_range_shared=float(shared[k]),
+            shared_base=factors[k].copy(),
             optics=optics,
             range_by_optics=by_optics[k].copy(),
         )

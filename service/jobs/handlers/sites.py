@@ -39,6 +39,8 @@ _SCRATCH, _IN_USE = "spheremark-site-", "in-use"  # names of folders, and of the
 _POSES = """
 SELECT c.recording_id, stop, c.rig_digest, x_m, y_m, z_m, rotation, cov_motion, adjustment_id,
     radians(sqrt(s.sigma_heading_deg ^ 2 + s.sigma_clock_deg ^ 2)) AS sigma_heading,
+    adjustment_id IS NULL AND c.resection_method <> 'free_station' AS is_by_distances,
+    radians(s.roll_deg) AS roll, radians(s.pitch_deg) AS pitch,
     CASE solution WHEN 'network with control' THEN 'control' WHEN 'free network' THEN 'free'
         ELSE 'fixes' END AS poses
 FROM chosen_stations AS c JOIN stops AS s USING (run_id, stop)

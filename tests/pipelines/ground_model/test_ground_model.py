@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from spheremark.pipelines.errors import ConfigError, NoGroundError
-from spheremark.pipelines.geometry import exp_motion, rigid, rot_z, turn_in_place
+from spheremark.pipelines.geometry import exp_motion, rigid, rot_y, rot_z, turn_in_place
 from spheremark.pipelines.ground_model import (
     ElevationConfig,
     StationPose,
@@ -148,8 +148,9 @@ def test_an_uncertain_lean_of_a_station_grows_with_the_distance():
 
 def test_a_heading_that_clocks_leave_unknown_is_in_no_height():
     points, T = scanned(np.random.default_rng(6)), rigid(rot_z(0.4), np.array([30.0, -20.0, 1.0]))
-    own, turn = np.diag([1e-8, 1e-8, 1e-8, 1e-6, 1e-6, 1e-6]), turn_in_place(T)
-    vague = pose_of_points("stop", T, own + 0.014**2 * np.outer(turn, turn), 0.014)
+    axis = rot_y(0.05)[:, 2]  # of a gimbal that leans
+    own, turn = np.diag([1e-8, 1e-8, 1e-8, 1e-6, 1e-6, 1e-6]), turn_in_place(T, axis)
+    vague = pose_of_points("stop", T, own + 0.014**2 * np.outer(turn, turn), (0.014, axis))
     sharp = StationPose(name="stop", T_site_station=T, cov_T_site_station=own)
     expected = model_of(points, where=sharp).sigmas
     np.testing.assert_allclose(model_of(points, where=vague).sigmas, expected, rtol=1e-6)

@@ -293,8 +293,10 @@ def test_what_mounting_leaves_of_the_heading_turns_a_station_and_moves_none(rng)
     np.testing.assert_allclose(
         blunt.station_covariances, sharp.station_covariances, rtol=0, atol=1e-12
     )
-    more = blunt.cov_T_site_station[:, 2, 2] - sharp.cov_T_site_station[:, 2, 2]
-    np.testing.assert_allclose(more, 1e-4, rtol=1e-3)
+    more = (blunt.cov_T_site_station - sharp.cov_T_site_station)[:, :3, :3]
+    axes = (blunt.T_site_station[:, :3, :3] @ blunt.network.R_station_base)[:, :, 2]
+    expected = 1e-4 * axes[:, :, None] * axes[:, None]  # about the axes of the gimbals
+    np.testing.assert_allclose(more, expected, rtol=0, atol=1e-7)
     fixes = [resect("ranges", one[0][1], marks, CONFIG) for one in (scans, blurred)]
     assert fixes[1].sigma_yaw == pytest.approx(np.hypot(fixes[0].sigma_yaw, 0.01), rel=1e-6)
 

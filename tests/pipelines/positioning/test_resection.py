@@ -167,6 +167,65 @@ def test_the_covariance_of_the_pose_is_honest_at_length(n_marks):
         assert low <= np.mean(chi2.cdf(squared, dof) < probability) <= high
 
 
+def squares_of_poses(draws, marks):
+    """Squared errors over covariances of poses, from true poses and what was seen there."""
+    squares = []
+    for T, fits in draws:
+        fix = free(fits, marks)
+        assert fix.status is Status.OK
+        xi = log_motion(station(T, fits.levelling) @ inverse(fix.T_site_station))
+        squares.append(xi @ np.linalg.solve(fix.cov_T_site_station, xi))
+    return np.array(squares)
+
+
+def test_an_unknown_heading_turns_the_station_about_the_axis_of_its_gimbal(rng):
+    """A gimbal that leans by 4 degrees, and clocks that leave 2 degrees of heading unknown."""
+    marks, sigma = field(rng), np.radians(2.0)
+
+    def draws():
+        for _ in range(200):
+            T, noise = pose(STAND, 2.2, LEAN), rng.normal(0, 4e-3, (14, 3))
+            turned = T @ rigid(turn_z(np.array(rng.normal(0, sigma))), np.zeros(3))
+            fits = sightings(marks, turned, lean=LEAN, noise=noise, sigma_level=1e-2)
+            yield T, replace(fits, levelling=replace(fits.levelling, sigma_heading=sigma))
+
+    low, high = chance.of_mean_square(6 * 200)
+    assert low < np.mean(squares_of_poses(draws(), marks)) / 6 < high
+
+
+def test_errors_that_all_centres_share_do_not_average_out(rng):
+    """A scan of one face: a direction of the mounting lifts all centres by their distance."""
+    marks, T, sigma = field(rng), pose(STAND, 2.2), 3e-4
+    p = (marks.p_site - T[:3, 3]) @ T[:3, :3]
+    factors = sigma * np.linalg.norm(p, axis=1)[:, None, None] * np.array([[0.0], [0.0], [1.0]])
+    factors[:, :2, 0] = 1e-3 * p[:, :2] / np.linalg.norm(p[:, :2], axis=1, keepdims=True)
+    own = 1e-3**2 * np.eye(3)
+
+    def draws(*, reports):
+        for _ in range(200):
+            noise = rng.normal(0, 1e-3, (14, 3)) + (factors @ rng.normal(size=1))
+            cov = own + factors @ np.swapaxes(factors, 1, 2)
+            fits = sightings(marks, T, noise=noise, cov=cov)
+            if reports:
+                pairs = zip(fits.fits, factors, strict=True)
+                found = tuple(replace(fit, shared_base=factor) for fit, factor in pairs)
+                fits = replace(fits, fits=found)
+            yield T, fits
+
+    config = replace(CONFIG, sigma_range=3.5e-3)
+    low, high = chance.of_mean_square(3 * 200)
+    found = {}
+    for reports in (False, True):
+        squares = []
+        for _, fits in draws(reports=reports):
+            fix = free(fits, marks, config if reports else CONFIG)
+            off = T[:3, 3] - fix.p_site
+            squares.append(off @ np.linalg.solve(fix.cov_p_site, off) / 3)
+        found[reports] = np.mean(squares)
+    assert found[False] > 1.5
+    assert low < found[True] < high
+
+
 @pytest.mark.parametrize("method", ["free_station", "ranges", "paper"])
 def test_positions_far_from_the_origin_are_as_sure_as_at_it(rng, method):
     marks = field(rng)
