@@ -39,7 +39,7 @@ from spheremark.pipelines.model import (
 from spheremark.pipelines.positioning.resection import resect
 from spheremark.pipelines.scan.stitching import beams, choose_rig, stitch
 from spheremark.pipelines.simulation import random_world
-from spheremark.pipelines.simulation.worlds import Scan
+from spheremark.pipelines.simulation.worlds import PRIORS, Scan
 from spheremark.pipelines.sphere import fit_markers
 from spheremark.pipelines.sphere.bound import cramer_rao
 
@@ -298,16 +298,22 @@ def _squares(
 
 
 def _bounds(scan: Scan) -> dict[int, float]:
-    """Return the least mean squared error of each marker that ranges allow [m^2]."""
+    """Return the least mean squared error of each marker that ranges allow [m^2].
+
+    A bias that all ranges have in common is drawn anew for each world, as its prior says.
+    """
     cloud, rows = _tagged(scan, scan.stop.rig)
     labels, config, field = scan.stop.marks[rows], scan.world.config, scan.world.field
     true = transform(inverse(scan.stop.truth.T_site_base), field.marks.p_site)
     sigmas = np.hypot(scan.stop.sigmas[rows], config.range_step / np.sqrt(12.0))
+    common = PRIORS["range_bias"].rms(field.family)
     bounds = {}
     for mark in range(len(true)):
         own = np.flatnonzero(labels == mark)
         try:
-            cov = cramer_rao(beams(cloud, own), true[mark], field.marker_radius, sigmas[own])
+            cov = cramer_rao(
+                beams(cloud, own), true[mark], field.marker_radius, sigmas[own], common
+            )
         except DegenerateGeometryError:
             continue
         bounds[mark] = float(np.trace(cov))

@@ -46,12 +46,23 @@ class Prior(NamedTuple):
     families: tuple[str, ...]
     what: str
 
+    def bounds(self, family: str) -> tuple[float, float]:
+        """Return the bounds in worlds of a family."""
+        return self.wide if family in self.families else self.usual
+
     def draw(self, rng: np.random.Generator, family: str) -> float:
         """Return a value between the bounds, evenly or evenly in its logarithm."""
-        low, high = self.wide if family in self.families else self.usual
+        low, high = self.bounds(family)
         if self.is_log:
             return _between(rng, (low, high))
         return float(rng.uniform(low, high))
+
+    def rms(self, family: str) -> float:
+        """Return the root of the mean square of such values."""
+        low, high = self.bounds(family)
+        if self.is_log:
+            return float(np.sqrt((high**2 - low**2) / (2.0 * np.log(high / low))))
+        return float(np.sqrt((low**2 + low * high + high**2) / 3.0))
 
 
 _OPTICS, _RIG = ("optics", _ALL), ("rig", _ALL)

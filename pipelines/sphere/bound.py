@@ -47,7 +47,13 @@ def hits(
     )
 
 
-def cramer_rao(returns: Beams, p_true: Array, radius: float, sigma: float | Array) -> Array:
+def cramer_rao(
+    returns: Beams,
+    p_true: Array,
+    radius: float,
+    sigma: float | Array,
+    sigma_common: float = 0.0,
+) -> Array:
     """Return the Cramer-Rao bound of a centre: the least covariance of unbiased estimates.
 
     Parameters
@@ -60,24 +66,41 @@ def cramer_rao(returns: Beams, p_true: Array, radius: float, sigma: float | Arra
         Radius of the sphere, which is known [m].
     sigma : float or (n,)
         Standard deviation of the ranges; directions are exact [m].
+    sigma_common : float
+        Standard deviation of an error that all ranges of the LiDAR have in common, over the LiDARs
+        of its kind [m].
 
     Returns
     -------
     (3, 3)
-        Inverse of the Fisher information ``sum J^T J / sigma^2``, where ``J`` is the derivative of
-        the range averaged over the footprint [m^2].
+        Inverse of the Fisher information, where ``J`` is the derivative of the range averaged over
+        the footprint [m^2].
 
     Raises
     ------
     DegenerateGeometryError
         If the beams leave the centre undetermined.
+
+    Notes
+    -----
+    The information is ``I = sum J^T J / sigma^2``. A common error ``b`` of variance ``s^2`` is one
+    more unknown with a prior: with ``g = sum J / sigma^2`` and ``w = sum 1 / sigma^2`` it leaves
+    ``I - g g^T / (w + 1 / s^2)`` (Schur complement; the hybrid bound of Rockah and Schultheiss
+    1987). As ``J`` is nearly the direction of the beam along the line of sight, the variance there
+    grows by nearly ``s^2``, whatever the number of returns: the apparent size of a sphere hardly
+    tells a bias from a distance.
     """
     n = len(returns.ranges)
     expected = predict(returns, p_true[None], np.array([radius]), np.zeros(n, dtype=np.intp))
     is_lit = expected.lit > 0.0
-    J = expected.J[is_lit, :3] / np.broadcast_to(sigma, n)[is_lit, None]
+    roots = 1.0 / np.broadcast_to(sigma, n)[is_lit, None]
+    J = expected.J[is_lit, :3] * roots
     information = J.T @ J
-    if len(J) < _N_MIN or np.linalg.cond(information) > _CONDITION_MAX:
+    is_open = len(J) < _N_MIN or bool(np.linalg.cond(information) > _CONDITION_MAX)
+    if sigma_common > 0.0:
+        common = J.T @ roots
+        information -= common @ common.T / (np.sum(roots**2) + sigma_common**-2.0)
+    if is_open:
         raise DegenerateGeometryError(
             f"{len(J)} of {n} beams meet the sphere and leave its centre undetermined; at least "
             f"{_N_MIN} that do not lie on one line are needed."

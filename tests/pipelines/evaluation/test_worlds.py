@@ -127,5 +127,6 @@ def test_a_world_is_scanned_and_scored_with_its_peers():
     assert many["n_ok"] >= many["n"] - 1
     assert row(report, "methods", "method", "one")["n_false"] == 1
     (family,) = report["families"]
-    assert 0.3 < family["rms_over_bound"] < 4.0
+    # the bound knows a bias that LiDARs differ by; this one's is drawn once, and may be near zero
+    assert 0.05 < family["rms_over_bound"] < 2.5
     assert family["nees"] < 3.0

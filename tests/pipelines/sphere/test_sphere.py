@@ -632,3 +632,14 @@ def test_the_bound_falls_with_noise_squared_and_needs_three_returns():
     assert hits(table, CENTRE, RADIUS, 0.01).all()
     with pytest.raises(DegenerateGeometryError, match="leave its centre undetermined"):
         cramer_rao(beams(cloud, np.arange(2)), CENTRE, RADIUS, 0.02)
+
+
+def test_a_range_error_in_common_adds_its_variance_to_the_bound_along_the_line_of_sight():
+    cloud = cloud_of(*marker_shots(CENTRE, np.random.default_rng(28), step=0.0))
+    table = beams(cloud, np.arange(len(cloud.p_base)))
+    line = CENTRE / np.linalg.norm(CENTRE)
+    sharp = cramer_rao(table, CENTRE, RADIUS, 0.02)
+    added = cramer_rao(table, CENTRE, RADIUS, 0.02, 0.003) - sharp
+    assert line @ added @ line == pytest.approx(0.003**2, rel=0.1)
+    assert np.trace(added) < 1.3 * 0.003**2
+    assert_allclose(cramer_rao(table, CENTRE, RADIUS, 0.02, 1e-9), sharp, rtol=1e-6)
