@@ -1,14 +1,16 @@
 """Coverage of error ellipses: whole simulated surveys against their own covariances.
 
-Each survey has a field, a rig and sensors of its own: noise of ranges, biases of lasers, encoder,
-misalignment, axis offset, levelling and tilt are all drawn anew. Its stops share the rig, so they
-are not independent: intervals come from resampling whole surveys.
+Each survey has a field, a rig and sensors of its own: noise of ranges, biases of lasers, optics,
+encoder, misalignment, axis offset, levelling and tilt are all drawn anew. What a fit takes for
+unknown has to be unknown here too: optics and what all ranges have in common are drawn from its
+priors. Stops of a survey share the rig, so they are not independent: intervals come from resampling
+whole surveys.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import NamedTuple
 
@@ -32,6 +34,7 @@ from spheremark.pipelines.model import (
 from spheremark.pipelines.network import adjust_network, assemble
 from spheremark.pipelines.positioning.resection import resect
 from spheremark.pipelines.simulation import SimulationConfig, scenario, simulate_stop
+from spheremark.pipelines.simulation.options import Optics, Profile
 from spheremark.pipelines.survey import process
 
 QUANTITIES = {"horizontal": 2, "position": 3, "pose": 6}
@@ -55,6 +58,9 @@ _CONFIG = SurveyConfig.from_mapping(
     }
 )
 _SIMULATION = SimulationConfig(only_near_spheres=True)
+_LIDAR = 102  # random stream
+_WINDOW = np.array([12.7e-3, 9.5e-3])  # [m] width of a VLP-16's beam there
+_NARROWEST = 0.2  # of the nominal divergence
 
 _Scan = tuple[str, MarkerFits]
 _Pose = tuple[Array, Array] | None  # T_site_station and its covariance
@@ -197,8 +203,9 @@ def survey_draws(seed: int, *, n_stops: int) -> Draws:
         raise ConfigError(f"{n_stops} stops are wanted; a survey has 1 to {len(field.stops)}.")
     places = np.round((np.arange(n_stops) + 0.5) * len(field.stops) / n_stops - 0.5).astype(int)
     scans, truths = [], []
+    simulation = replace(_SIMULATION, optics=drawn_optics(np.random.default_rng([seed, _LIDAR])))
     for name in (field.stops[place].name for place in places):
-        stop = simulate_stop(field, name, _SIMULATION)
+        stop = simulate_stop(field, name, simulation)
         (result,) = process(stop.log, config=_CONFIG)
         scans.append((name, result.fits[_CONFIG.fitting.methods[0]]))
         truths.append(stop.truth)
@@ -207,6 +214,20 @@ def survey_draws(seed: int, *, n_stops: int) -> Draws:
         "network": _network(scans, field.marks),
     }
     return _compared(seed, scans, truths, poses)
+
+
+def drawn_optics(rng: np.random.Generator) -> Optics:
+    """Return the optics of a LiDAR of the kind that the priors of a fit describe."""
+    prior, profiles = _CONFIG.fitting, list(Profile)
+    across, along = (abs(rng.normal(0.0, prior.sigma_beam_window)) * _WINDOW).tolist()
+    return Optics(
+        profile=profiles[rng.integers(len(profiles))],
+        divergence_scale=max(rng.normal(1.0, prior.sigma_beam_width), _NARROWEST),
+        window=(across, along),
+        incidence=float(rng.integers(2)),
+        range_bias=rng.normal(0.0, prior.sigma_range_common),
+        range_scale=rng.normal(0.0, prior.sigma_range_scale),
+    )
 
 
 def _free_stations(scans: Sequence[_Scan], marks: ControlMarks) -> list[_Pose]:
