@@ -25,9 +25,8 @@ from spheremark.pipelines.model import (
 )
 from spheremark.pipelines.network import AdjustedNetwork, Refusal, adjust_network, assemble
 from spheremark.pipelines.progress import Progress, part_of
-from spheremark.pipelines.scan.diagnosis import diagnose
 from spheremark.pipelines.survey import StopErrors, process, stop_errors
-from spheremark.storage.recordings import LogFile
+from spheremark.storage.recordings import LogFile, LogOptions, diagnosis
 
 _SCANS = 0.95  # share of the time of an adjustment that the scans take
 
@@ -77,7 +76,9 @@ def process_file(
                 logs.pop(), config=config, rig=rig, marks=marks, progress=progress
             )
         except NoMarkersError as error:
-            raise explained(error, file.read, rig) from error
+            raise explained(
+                error, lambda one: replace(file, options=one).read(), file.options, rig
+            ) from error
     errors = {stop.name: stop_errors(stop, truth) for stop in stops} if truth else {}
     return ProcessedLog(
         origin=origin,
@@ -90,10 +91,14 @@ def process_file(
 
 
 def explained(
-    error: NoMarkersError, read: Callable[[], ScanLog], rig: Rig | None
+    error: NoMarkersError,
+    read: Callable[[LogOptions], ScanLog],
+    options: LogOptions,
+    rig: Rig | None,
 ) -> NoMarkersError:
     """Return the error of a log without spheres with what other ways to read it show."""
-    return NoMarkersError(" ".join((str(error), *diagnose(read(), rig))))
+    found = diagnosis(read(options), options, read, rig)
+    return NoMarkersError(" ".join((str(error), *found)))
 
 
 def read_scans(

@@ -6,6 +6,8 @@ up from the ground lies at the same place in both halves only if angles and cloc
 
 from __future__ import annotations
 
+import re
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -24,6 +26,8 @@ _RANGES = (1.0, 15.0)  # [m] where beams lie close enough
 _FAR = 0.5  # [m]; farther apart, faces do not show the same thing
 _BETTER = 0.6  # of the distance as read: less is no chance, by the scatter of the mean below
 _SHIFTS = (-1.0, -0.5, -0.2, -0.1, -0.05, 0.05, 0.1, 0.2, 0.5, 1.0)  # [s] of clocks
+_STEPS = tuple(1 << bits for bits in range(10, 21))  # of a full turn, as encoders have
+_TURNS = (0.5, 4.0)  # full turns of a stop: less shows nothing twice, more no gimbal makes
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -42,7 +46,14 @@ class Cause:
     distance: float
 
 
-def diagnose(log: ScanLog, rig: Rig | None) -> tuple[str, ...]:
+def diagnose(
+    log: ScanLog,
+    rig: Rig | None,
+    others: Iterable[tuple[str, ScanLog]] = (),
+    *,
+    joint_scale: float = 1.0,
+    lidar_offset: float = 0.0,
+) -> tuple[str, ...]:
     """Try the likely mistakes in the reading of a log, on its first stop.
 
     Parameters
@@ -51,6 +62,12 @@ def diagnose(log: ScanLog, rig: Rig | None) -> tuple[str, ...]:
         One stop or many.
     rig : Rig or None
         How the LiDAR sits on the gimbal; that of the log by default.
+    others : iterable of (str, ScanLog)
+        The same log read with an option of the command line that changes its LiDAR.
+    joint_scale : float
+        Angle that a recorded 1 was taken for, with its sign [rad].
+    lidar_offset : float
+        What was added to the stamps of the LiDAR [s].
 
     Returns
     -------
@@ -68,37 +85,46 @@ def diagnose(log: ScanLog, rig: Rig | None) -> tuple[str, ...]:
     in nothing. Takes seconds: each change turns some hundred thousand returns.
     """
     rig = choose_rig(log, rig)
+    thin = _thinned(log)
+    causes = [_cause(thin, rig, "", 1.0, 0.0)]
+    for option, scale in _scales(thin, joint_scale):
+        causes.append(_cause(thin, rig, option, scale, 0.0))
+    for shift in _SHIFTS:
+        option = f"--lidar-offset-s {lidar_offset + shift:g}"
+        causes.append(_cause(thin, rig, option, 1.0, shift))
+    causes += [_cause(_thinned(other), rig, option, 1.0, 0.0) for option, other in others]
+    return _sentences([cause for cause in causes if cause is not None])
+
+
+def _thinned(log: ScanLog) -> ScanLog:
+    """Return the first stop with some of its returns, those from where beams lie close enough."""
     log = next(iter(split_stops(log, StitchingConfig())), log)
     stride = len(log.stamps_lidar_ns) // _RETURNS_MAX + 1
-    rows = slice(None, None, stride)
-    p_lidar, stamps_ns = log.p_lidar[rows].astype(np.float64), log.stamps_lidar_ns[rows]
-    ranges = np.linalg.norm(p_lidar, axis=1)
-    near = (ranges > _RANGES[0]) & (ranges < _RANGES[1])
-    thin = replace(
+    ranges = np.linalg.norm(log.p_lidar[::stride].astype(np.float64), axis=1)
+    rows = np.flatnonzero((ranges > _RANGES[0]) & (ranges < _RANGES[1])) * stride
+    return replace(
         log,
-        p_lidar=log.p_lidar[rows][near],
-        intensities=log.intensities[rows][near],
-        rings=log.rings[rows][near],
-        stamps_lidar_ns=stamps_ns[near],
+        p_lidar=log.p_lidar[rows],
+        intensities=log.intensities[rows],
+        rings=log.rings[rows],
+        stamps_lidar_ns=log.stamps_lidar_ns[rows],
     )
-    causes = [
-        cause
-        for option, scale, shift in _changes()
-        if (cause := _cause(thin, rig, option, scale, shift)) is not None
-    ]
-    return _sentences(causes)
 
 
-def _changes() -> list[tuple[str, float, float]]:
-    """Return the changes: option, factor of the angle, shift of the LiDAR's clock [s]."""
-    degree = float(np.radians(1.0))
-    angles = [
-        ("", 1.0, 0.0),
-        ("--joint-sign -1", -1.0, 0.0),
-        ("--joint-unit deg", degree, 0.0),
-        ("--joint-unit deg --joint-sign -1", -degree, 0.0),
-    ]
-    return angles + [(f"--lidar-offset-s {shift:g}", 1.0, shift) for shift in _SHIFTS]
+def _scales(log: ScanLog, as_read: float) -> list[tuple[str, float]]:
+    """Return other units and signs of the angle: option, and factor of the angle as it was read."""
+    full = 2.0 * np.pi
+    turned = float(np.ptp(log.gimbal_angles)) / abs(as_read) if len(log.gimbal_angles) else 0.0
+    units = {"rad": 1.0, "deg": full / 360.0, "turn": full}
+    units |= {str(n): full / n for n in _STEPS if _TURNS[0] < turned / n < _TURNS[1]}
+    scales = []
+    for unit, scale in units.items():
+        for sign in (1, -1):
+            parts = [f"--joint-unit {unit}"] if scale != abs(as_read) else []
+            parts += [f"--joint-sign {sign}"] if sign < 0 or as_read < 0 else []
+            if sign * scale != as_read:
+                scales.append((" ".join(parts), sign * scale / as_read))
+    return scales
 
 
 def _cause(log: ScanLog, rig: Rig, option: str, scale: float, shift: float) -> Cause | None:
@@ -145,6 +171,12 @@ def _distance(p: Array, others: Array) -> float:
     return float(np.minimum(distances, _FAR).mean())
 
 
+def _in_request(options: str) -> str:
+    """Return options of the command line as those of a request."""
+    pairs = re.findall(r"--(\S+) (\S+)", options)
+    return "&".join(f"{name.replace('-', '_')}={value}" for name, value in pairs)
+
+
 def _sentences(causes: list[Cause]) -> tuple[str, ...]:
     """Return what the changes show."""
     as_read = next((one for one in causes if not one.option), None)
@@ -157,8 +189,9 @@ def _sentences(causes: list[Cause]) -> tuple[str, ...]:
     best = min(causes, key=lambda one: one.distance)
     was = _FAR if as_read is None else as_read.distance
     if best.option and best.distance < _BETTER * was:
+        option = f"{best.option} ({_in_request(best.option)} in a request)"
         return (
-            f"With {best.option} what was swept twice agrees to {1000 * best.distance:.0f} mm, as "
+            f"With {option} what was swept twice agrees to {1000 * best.distance:.0f} mm, as "
             f"read to {1000 * was:.0f} mm: read the log so.",
         )
     return (

@@ -27,6 +27,16 @@ class Stamp(StrEnum):
     END = "end"
 
 
+class TimeUnit(StrEnum):
+    """Unit of the times of points."""
+
+    AUTO = "auto"
+    S = "s"
+    MS = "ms"
+    US = "us"
+    NS = "ns"
+
+
 @dataclass(frozen=True, kw_only=True)
 class Reading:
     """How logs are read."""
@@ -47,6 +57,9 @@ class Reading:
     ] = 0.0
     lidar_offset_s: Annotated[float, typer.Option(help="Added to the LiDAR's stamps \\[s].")] = 0.0
     stamp: Annotated[Stamp, typer.Option(help="Instant of a cloud that its stamp is.")] = Stamp.AUTO
+    time_unit: Annotated[TimeUnit, typer.Option(help="Unit of the times of points.")] = (
+        TimeUnit.AUTO
+    )
     recover: Annotated[
         bool, typer.Option("--recover", help="Use what is readable of a damaged log.")
     ] = False
@@ -61,7 +74,8 @@ class Reading:
 
         if self.pcap and len(paths) > 1:
             raise ConfigError("--pcap belongs to one log; name a single LOG with it.")
-        values = asdict(self) | {"topic": tuple(self.topic or ()), "stamp": self.stamp.value}
+        values = asdict(self) | {"topic": tuple(self.topic or ())}
+        values |= {"stamp": self.stamp.value, "time_unit": self.time_unit.value}
         del values["pcap"]
         options, beside = LogOptions(**values), tuple(self.pcap or ())
         return [LogFile(path=path, options=options, beside=beside) for path in paths]

@@ -48,14 +48,25 @@ class Log:
     url: str
     reading: Mapping[str, Any] = field(default_factory=dict)
 
+    @property
+    def options(self) -> LogOptions:
+        """Its reading as the reader of logs takes it."""
+        from spheremark.storage.recordings.options import LogOptions
+
+        return LogOptions.from_mapping(self.reading)
+
     def read(self, name: str | None = None) -> ScanLog:
         """Read the log in a confined process, under the name of its recording or a given one."""
+        return self.read_with(self.options, name)
+
+    def read_with(self, options: LogOptions, name: str | None = None) -> ScanLog:
+        """Read the log with other options."""
         from spheremark.storage.imports.uploads import read_upload
-        from spheremark.storage.recordings import LogOptions, local_copy
+        from spheremark.storage.recordings import local_copy
 
         origin = Origin(name=name or self.name, digest=self.recording_id)
         with local_copy(self.url) as path:
-            return read_upload(path, LogOptions.from_mapping(self.reading), origin)
+            return read_upload(path, options, origin)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -134,6 +145,9 @@ class Reading(Options):
     lidar_offset_s: float | None = Field(default=None, description="Added to the LiDAR's stamps.")
     stamp: Literal["auto", "start", "end"] | None = Field(
         default=None, description="Instant of a cloud that its stamp is."
+    )
+    time_unit: Literal["auto", "s", "ms", "us", "ns"] | None = Field(
+        default=None, description="Unit of the times of points."
     )
     recover: bool | None = Field(
         default=None, description="Whether to use what is readable of a damaged log."

@@ -11,7 +11,7 @@ from spheremark.storage.recordings.closed import closed_logs
 from spheremark.storage.recordings.container import local_copy, require_file
 from spheremark.storage.recordings.options import LogOptions
 from spheremark.storage.recordings.preflight import Preflight, TopicReport, inspect_log
-from spheremark.storage.recordings.reading import LogFile, read_log
+from spheremark.storage.recordings.reading import LogFile, diagnosis, read_log
 from spheremark.storage.recordings.sources import file_digest
 from spheremark.storage.recordings.writing import write_log
 
@@ -21,6 +21,7 @@ __all__ = [
     "Preflight",
     "TopicReport",
     "closed_logs",
+    "diagnosis",
     "file_digest",
     "inspect_log",
     "local_copy",

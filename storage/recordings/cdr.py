@@ -10,7 +10,6 @@ import re
 import struct
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
-from functools import lru_cache
 from typing import TypeVar
 
 import numpy as np
@@ -219,7 +218,6 @@ def definition_agrees(channel: Channel, fields: str) -> bool:
     return _fields(text) == _fields(fields.replace(", ", "\n"))
 
 
-@lru_cache(64)
 def _fields(text: str) -> list[tuple[str, str]]:
     """Return type and name of each field of the top level of a definition."""
     top = re.split(r"^={20,}\s*$", text, maxsplit=1, flags=re.MULTILINE)[0]

@@ -11,6 +11,7 @@ from spheremark.pipelines.errors import ConfigError, RecordingError
 
 UNITS = {"rad": 1.0, "deg": pi / 180.0, "turn": 2.0 * pi}
 STAMPS = ("auto", "start", "end")
+TIME_UNITS = {"s": 10**9, "ms": 10**6, "us": 10**3, "ns": 1}  # [ns] that a recorded 1 stands for
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -36,6 +37,9 @@ class LogOptions:
     stamp : str
         Whether a cloud is stamped with the ``start`` or the ``end`` of its points; ``auto`` takes
         the start, unless the points would have been measured after they were recorded.
+    time_unit : str
+        Unit of the times of points, ``s``, ``ms``, ``us`` or ``ns``; ``auto`` takes the one in
+        which clouds last until the next one.
     recover : bool
         Whether to use what can be read of a truncated or damaged log.
     """
@@ -47,6 +51,7 @@ class LogOptions:
     joint_offset_deg: float = 0.0
     lidar_offset_s: float = 0.0
     stamp: str = "auto"
+    time_unit: str = "auto"
     recover: bool = False
 
     def __post_init__(self) -> None:
@@ -54,6 +59,8 @@ class LogOptions:
             raise ConfigError(f"joint_sign is {self.joint_sign!r}; it must be 1 or -1.")
         if self.stamp not in STAMPS:
             raise ConfigError(f"stamp is {self.stamp!r}; it must be auto, start or end.")
+        if self.time_unit not in ("auto", *TIME_UNITS):
+            raise ConfigError(f"time_unit is {self.time_unit!r}; it must be auto, s, ms, us or ns.")
         if not (isfinite(self.joint_offset_deg) and isfinite(self.lidar_offset_s)):
             raise ConfigError("joint_offset_deg and lidar_offset_s must be finite numbers.")
         _ = self.joint_scale

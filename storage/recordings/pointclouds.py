@@ -10,7 +10,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from spheremark.pipelines.model import RING_UNKNOWN, Mask, Nanos
+from spheremark.pipelines.model import RING_UNKNOWN, Array, Mask, Nanos
 from spheremark.storage.recordings import cdr
 from spheremark.storage.recordings.container import Batch, Channel
 from spheremark.storage.recordings.families import (
@@ -20,6 +20,7 @@ from spheremark.storage.recordings.families import (
     far_note,
     plausible,
 )
+from spheremark.storage.recordings.options import TIME_UNITS
 from spheremark.storage.recordings.points import (
     Columns,
     Layout,
@@ -31,9 +32,11 @@ from spheremark.storage.recordings.points import (
 from spheremark.storage.recordings.pulse_times import (
     NO_FIELD,
     PULSES_MIN,
+    PulseTimes,
     fault_of,
-    plain_span,
     plain_spans,
+    plain_times,
+    plain_unit,
     pulse_times,
 )
 from spheremark.storage.recordings.records import Octets
@@ -44,8 +47,10 @@ FIELDS = (
     "uint32 point_step, uint32 row_step, uint8[] data, bool is_dense"
 )
 
-_UNITS = (1_000, 1_000_000)  # [ns] of times that are no nanoseconds
-_FILLED = (0.8, 3.0)  # of the time between messages to their duration, in the right unit
+_UNIT_NAMES = {10**9: "seconds", 10**6: "milliseconds", 10**3: "microseconds", 1: "nanoseconds"}
+_FILLED = (0.8, 30.0)  # of the time between messages to their duration: they do not overlap, and a
+# log that lacks more of them is no scan; units are a thousand apart
+_OFFSET_MAX = 1e18  # [ns] of times since a stamp: their sum fits 64 bits
 _BAD_MAX = 0.05  # share of messages whose times may be unusable before all are
 
 
@@ -67,6 +72,9 @@ class _Messages(NamedTuple):
     spans_ns: Nanos  # from the stamp to the latest instant
     has_times: Nanos  # 1 or 0; -1 where there are too few points
     is_ascending: Nanos  # 1 or 0: whether the instants within a message are
+    extents_ns: Nanos  # from the earliest to the latest instant
+    units_ns: Nanos  # that a recorded 1 was taken for; 0 where times are absolute, or are none
+    plain_ns: Nanos  # that a recorded 1 is with most drivers that use this type
 
 
 class PointClouds:
@@ -80,7 +88,7 @@ class PointClouds:
         self._layout = Layout(description=b"", fields={}, order="<", step=0)
         self._n = 0
         self._out = Columns.empty(0)
-        self._parts = [_Messages(*(np.empty(0, np.int64),) * 6)]
+        self._parts = [_Messages(*(np.empty(0, np.int64),) * len(_Messages._fields))]
         self._has_bad_rings = False
         self._time_fault = ""
         self._n_broken = 0
@@ -146,14 +154,17 @@ class PointClouds:
         n, times, has_bad_ring = unpack_any(points, self._layout, out)
         self._has_bad_rings |= has_bad_ring
         stamps = out.stamps[:n]
-        span, fault = pulse_times(times, stamp, stamps)
-        is_ascending = bool((stamps[1:] >= stamps[:-1]).all())
-        return (n, span, self._has_times_of(n, span, fault), is_ascending)
+        found = pulse_times(times, stamp, stamps)
+        return self._about(n, found, is_ascending=bool((stamps[1:] >= stamps[:-1]).all()))
 
-    def _has_times_of(self, n: int, span: int, fault: str) -> int:
-        """Return 1 if the times of a message are usable, 0 if not, -1 if they are too few."""
+    def _about(self, n: int, times: PulseTimes, *, is_ascending: bool) -> tuple[int, ...]:
+        """Return the columns about a message of n returns."""
+        span, extent, unit, fault = times
         self._time_fault = self._time_fault or fault
-        return int(not fault) if n >= PULSES_MIN or span else -1
+        has_times = int(not fault) if n >= PULSES_MIN or span else -1
+        time = self._layout.time
+        plain = 0 if time is None else plain_unit(time.kind)
+        return (n, span, has_times, is_ascending, extent, unit, plain)
 
     def _add_clouds(self, octets: Octets, clouds: Nanos, log_times_ns: Nanos) -> None:
         """Append the returns of messages of one layout that the compiled loop reads."""
@@ -171,31 +182,32 @@ class PointClouds:
     def _plain(self, tally: Tally) -> tuple[Nanos, Mask]:
         """Return the columns about clouds, and which of them have times since the stamp."""
         n, low, high, n_zeros, is_ascending, _ = tally
-        kept = np.ones((len(n), 4), np.int64)
+        kept = np.ones((len(n), 7), np.int64)
         kept[:, 0], kept[:, 3] = n, is_ascending
         if self._layout.time is None:
             return kept, np.zeros(len(n), np.bool_)
-        kept[:, 1], is_plain = plain_spans(self._layout.time.kind, low, high, n_zeros, n)
+        found = plain_spans(self._layout.time.kind, low, high, n_zeros, n)
+        kept[:, 1], kept[:, 4], kept[:, 5], is_plain = found
+        kept[:, 6] = plain_unit(self._layout.time.kind)
         return kept, is_plain
 
     def _corrected(self, octets: Octets, cloud: list[int], tally: Tally, k: int) -> tuple[int, ...]:
         """Correct the instants of cloud k if its times are unusable; return its columns."""
         begin, n_points, stamp, row = cloud
         n, low, high, n_zeros, is_ascending, _ = (column[k].item() for column in tally)
-        time, fault = self._layout.time, ""
-        span: int | None = 0
+        time = self._layout.time
+        found: PulseTimes | None = PulseTimes()
         if n and time is None:
-            fault = NO_FIELD
+            found = PulseTimes(fault=NO_FIELD)
         elif n and time is not None:
             fault = fault_of(low, high, n_zeros, n)
-            span = 0 if fault else plain_span(time.kind, low, high)
-        if span is None:
+            found = PulseTimes(fault=fault) if fault else plain_times(time.kind, low, high)
+        if found is None:
             points = octets[begin : begin + n_points * self._layout.step]
             return self._unpack_one(points, stamp, row, n_points)
-        if fault:
+        if found.fault:
             self._out.stamps[row : row + n] = stamp
-        has_times = self._has_times_of(n, span, fault)
-        return (n, span, has_times, bool(fault) or is_ascending)
+        return self._about(n, found, is_ascending=bool(found.fault) or is_ascending)
 
     def _close_gaps(self, rows: Nanos, counts: Nanos) -> None:
         """Close the gaps behind clouds with points that are no returns."""
@@ -212,10 +224,10 @@ class PointClouds:
         self._parts = [messages._replace(stamps_ns=messages.stamps_ns - shifts)]
         return self.returns()
 
-    def returns(self) -> Returns:
-        """Return all returns, in the order of their instants."""
+    def returns(self, time_unit: str = "auto") -> Returns:
+        """Return all returns, in the order of their instants; the unit is as of ``LogOptions``."""
         notes = [*broken_note(self._topic, self._n_broken, self._reason)]
-        messages = self._in_unit(self._near(notes), notes)
+        messages = self._in_unit(self._near(notes), time_unit, notes)
         self._parts = [messages := self._stamped(messages, notes)]
         has_times = self._has_times(messages, notes)
         if self._layout.intensity is None:
@@ -241,25 +253,37 @@ class PointClouds:
             lateness_ns=_lateness(messages),
         )
 
-    def _in_unit(self, messages: _Messages, notes: list[str]) -> _Messages:
-        """Take whole times as micro- or milliseconds where that makes clouds last until the next.
+    def _in_unit(self, messages: _Messages, time_unit: str, notes: list[str]) -> _Messages:
+        """Give the times of all messages one unit: the one that is named, or that fills them.
 
-        A LiDAR that scans without a pause fills the time between its messages; as nanoseconds its
-        times would fill a thousandth of it, or a millionth.
+        A LiDAR that scans without a pause fills the time between its messages; as nanoseconds,
+        microseconds would fill a thousandth of it. Where no unit does, the likeliest one counts.
         """
-        time, stamps = self._layout.time, np.unique(messages.stamps_ns)
-        span = float(np.median(messages.spans_ns)) if len(stamps) > 2 else 0.0
-        if time is None or time.kind[0] not in "iu" or span <= 0.0:
+        factors = np.ones(len(messages.counts))
+        known = (messages.units_ns > 0) & (messages.extents_ns > 0)
+        for plain in np.unique(messages.plain_ns[known]).tolist():
+            mine = known & (messages.plain_ns == plain)
+            likely = int(np.sort(messages.units_ns[mine])[mine.sum() // 2])
+            unit = TIME_UNITS.get(time_unit) or _unit_that_fills(messages, mine) or likely
+            has_unit = (messages.units_ns > 0) & (messages.plain_ns == plain)
+            factors[has_unit] = unit / messages.units_ns[has_unit]
+            if unit != plain and time_unit not in TIME_UNITS:
+                reason = ": they fill its messages so" if unit != likely else ""
+                notes.append(
+                    f"The times of {self._topic} are taken as {_UNIT_NAMES[unit]}{reason} "
+                    "(--time-unit, or time_unit=... in a request, names another unit)."
+                )
+        if (factors == 1.0).all():
             return messages
-        ratio = float(np.median(np.diff(stamps))) / span
-        unit = next((one for one in _UNITS if _FILLED[0] < ratio / one < _FILLED[1]), None)
-        if unit is None:
-            return messages
-        out, starts = self._out.stamps[: self._n], np.repeat(messages.stamps_ns, messages.counts)
-        out[:] = starts + (out - starts) * unit
-        name = "microseconds" if unit == _UNITS[0] else "milliseconds"
-        notes.append(f"The times of {self._topic} are taken as {name}: they fill its messages so.")
-        return messages._replace(spans_ns=messages.spans_ns * unit)
+        starts = np.repeat(messages.stamps_ns, messages.counts)
+        offsets = self._out.stamps[: self._n] - starts
+        scaled = _scaled(offsets, np.repeat(factors, messages.counts))
+        self._out = self._out._replace(stamps=starts + scaled)
+        return messages._replace(
+            spans_ns=_scaled(messages.spans_ns, factors),
+            extents_ns=_scaled(messages.extents_ns, factors),
+            units_ns=_scaled(messages.units_ns, factors),
+        )
 
     def _near(self, notes: list[str]) -> _Messages:
         """Leave out messages with implausible stamps; return the others."""
@@ -293,6 +317,23 @@ class PointClouds:
         notes.append(f"The points of {self._topic} carry no time of their own: {fault}.")
         self._out.stamps[: self._n] = np.repeat(messages.stamps_ns, messages.counts)
         return False
+
+
+def _scaled(offsets_ns: Nanos, factors: Array) -> Nanos:
+    """Return offsets in another unit, as far as 64 bits hold them."""
+    return np.rint(np.clip(offsets_ns * factors, -_OFFSET_MAX, _OFFSET_MAX)).astype(np.int64)
+
+
+def _unit_that_fills(messages: _Messages, known: Mask) -> int:
+    """Return the unit in which messages last until the next one [ns]; 0 if none does."""
+    has_stamps = messages.stamps_ns.any()
+    stamps = np.unique(messages.stamps_ns if has_stamps else messages.log_times_ns)
+    if len(stamps) < 3:
+        return 0
+    recorded = float(np.median(messages.extents_ns[known] / messages.units_ns[known]))
+    ratio = float(np.median(np.diff(stamps))) / recorded
+    fitting = (one for one in TIME_UNITS.values() if _FILLED[0] < ratio / one < _FILLED[1])
+    return next(fitting, 0)
 
 
 def _lateness(messages: _Messages) -> int:

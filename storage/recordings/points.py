@@ -25,6 +25,7 @@ _INTENSITIES = ("intensity", "i", "reflectivity", "signal")
 _RINGS = ("ring", "channel", "line", "laser_id", "laserid")
 _TIMES = ("time", "t", "timestamp", "time_stamp", "offset_time", "time_offset", "timeoffset")
 _FIELD_MIN = 13  # [bytes] of a field with an empty name
+_STEP_MAX = 1 << 16  # [bytes] of a point; drivers write 12 to 48
 _PAGE = 1 << 21  # [bytes] of a large page of memory: fewer pages, fewer page faults
 _WORTH = 4  # clouds that two threads unpack sooner than one
 _PIECE = 8  # clouds that a thread takes at a time
@@ -215,6 +216,8 @@ def _checked(fields: dict[str, Field], step: int) -> dict[str, Field]:
     missing = [axis for axis in "xyz" if axis not in fields]
     if missing:
         raise BrokenMessageError(f"it has no field {missing[0]!r}, only {', '.join(fields)}")
+    if step > _STEP_MAX:
+        raise BrokenMessageError(f"its points would have {step:,} bytes each")
     for name, one in fields.items():
         if one.end > step:
             raise BrokenMessageError(f"its field {name!r} lies outside the {step} bytes of a point")

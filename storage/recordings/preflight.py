@@ -16,13 +16,12 @@ import numpy as np
 from spheremark.pipelines.config import StitchingConfig
 from spheremark.pipelines.errors import InputError, MissingRigError, NotFoundError
 from spheremark.pipelines.model import Array, Index, Nanos, Origin, Rig, ScanLog
-from spheremark.pipelines.scan.diagnosis import diagnose
 from spheremark.pipelines.scan.rigs import tilted_vlp16
 from spheremark.storage.recordings import timeline
 from spheremark.storage.recordings.container import Batch, Channel
 from spheremark.storage.recordings.decoding import Decoders
 from spheremark.storage.recordings.options import LogOptions
-from spheremark.storage.recordings.reading import assemble, stem
+from spheremark.storage.recordings.reading import assemble, diagnosis, read_log, stem
 from spheremark.storage.recordings.sources import opened
 
 OK, WEAK, REFUSED = "ok", "weak", "refused"
@@ -241,7 +240,10 @@ def inspect_log(
     try:
         report, log = _inspect(url, beside, options, start)
         if diagnosing and log is not None:
-            report = replace(report, diagnosis=diagnose(log, None))
+            found = diagnosis(
+                log, options, lambda other: read_log(url, other, beside=beside, digest="-")
+            )
+            report = replace(report, diagnosis=found)
     except NotFoundError:
         raise
     except InputError as error:

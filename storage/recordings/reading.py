@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
 from pathlib import Path, PurePosixPath
@@ -10,8 +10,9 @@ from typing import TypeVar
 
 import numpy as np
 
-from spheremark.pipelines.errors import MissingLidarError
-from spheremark.pipelines.model import RING_UNKNOWN, Origin, ScanLog
+from spheremark.pipelines.errors import InputError, MissingLidarError
+from spheremark.pipelines.model import RING_UNKNOWN, Origin, Rig, ScanLog
+from spheremark.pipelines.scan.diagnosis import diagnose
 from spheremark.storage.recordings.decoding import LIDAR_TYPES, Decoders
 from spheremark.storage.recordings.families import LidarDecoder, Returns, Series, SeriesDecoder
 from spheremark.storage.recordings.frames import FrameTree, recorded_rig
@@ -22,7 +23,7 @@ from spheremark.storage.recordings.gimbal import (
     require_overlap,
 )
 from spheremark.storage.recordings.lasers import carries_heights, with_lasers
-from spheremark.storage.recordings.options import LogOptions, listed
+from spheremark.storage.recordings.options import TIME_UNITS, LogOptions, listed
 from spheremark.storage.recordings.pointclouds import PointClouds
 from spheremark.storage.recordings.sources import file_digest, opened
 
@@ -129,6 +130,48 @@ def read_log(
     return assemble(decoders, options, Origin(name=stem(url), digest=digest))
 
 
+def diagnosis(
+    log: ScanLog,
+    options: LogOptions,
+    read: Callable[[LogOptions], ScanLog],
+    rig: Rig | None = None,
+) -> tuple[str, ...]:
+    """Try other signs, units and clocks on a log.
+
+    Parameters
+    ----------
+    log : ScanLog
+        As it was read.
+    options : LogOptions
+        How it was read.
+    read : callable
+        Reads it with other options.
+    rig : Rig, optional
+        How the LiDAR sits on the gimbal; that of the log by default.
+
+    Returns
+    -------
+    tuple of str
+        Sentences: the option that makes the scan consistent, or that none does.
+    """
+    others = _in_other_units(log, options, read)
+    scale, offset = options.joint_scale, options.lidar_offset_s
+    return diagnose(log, rig, others, joint_scale=scale, lidar_offset=offset)
+
+
+def _in_other_units(
+    log: ScanLog, options: LogOptions, read: Callable[[LogOptions], ScanLog]
+) -> Iterator[tuple[str, ScanLog]]:
+    """Yield a log with other units of its points' times, and the option of each."""
+    for unit in TIME_UNITS:
+        try:
+            other = read(replace(options, time_unit=unit))
+        except InputError:  # as clocks that have no instant in common with that unit
+            continue
+        if not np.array_equal(other.stamps_lidar_ns, log.stamps_lidar_ns):
+            yield f"--time-unit {unit}", other
+
+
 def stem(url: str | Path) -> str:
     """Return the name of a recording: that of its file, without the ending."""
     return PurePosixPath(str(url)).stem
@@ -138,7 +181,7 @@ def assemble(decoders: Decoders, options: LogOptions, origin: Origin) -> ScanLog
     """Choose among the decoded topics and build the log."""
     found = decoders.recording.topics()
     options.check(found)
-    lidar, returns = _choose_lidar(_among(decoders.lidars, options), found)
+    lidar, returns = _choose_lidar(_among(decoders.lidars, options), found, options)
     tree = FrameTree()
     for series in _all_series(_among(decoders.frames, options)):
         tree.add(series)
@@ -155,14 +198,15 @@ def assemble(decoders: Decoders, options: LogOptions, origin: Origin) -> ScanLog
     gimbal, rig = choose_gimbal(signals, options, returns.frame, rig)
     returns = _from_start(lidar, returns, gimbal, options)
     require_overlap(returns, gimbal)
-    rig, rings, laser_notes, laser_weaknesses = with_lasers(rig, returns)
-    has_heights = carries_heights(rig, rings, returns)
+    lasers = with_lasers(rig, returns)
+    rig, laser_notes = lasers.rig, lasers.notes
+    has_heights = carries_heights(lasers, returns)
     if has_heights is False and returns.has_heights is None:
         laser_notes = (*laser_notes, _WITHOUT_HEIGHTS.format(returns.topic))
     sigma, level_notes = 0.0, tuple[str, ...]()
     if imu is None:
         imu, rig, sigma, level_notes = level_by_gravity(imus, tree, rig, returns.frame)
-    weaknesses = (*decoders.recording.lost, *laser_weaknesses)
+    weaknesses = (*decoders.recording.lost, *lasers.weaknesses)
     notes = (
         *decoders.all_notes(),
         *returns.notes,
@@ -175,7 +219,7 @@ def assemble(decoders: Decoders, options: LogOptions, origin: Origin) -> ScanLog
     return ScanLog(
         p_lidar=returns.p_lidar,
         intensities=returns.intensities,
-        rings=rings,
+        rings=lasers.rings,
         stamps_lidar_ns=returns.stamps_ns,
         has_pulse_times=returns.has_pulse_times,
         gimbal_angles=gimbal.values[:, 0],
@@ -203,7 +247,7 @@ def _all_series(decoders: Mapping[str, SeriesDecoder]) -> list[Series]:
 
 
 def _choose_lidar(
-    lidars: dict[str, LidarDecoder], found: Mapping[str, str]
+    lidars: dict[str, LidarDecoder], found: Mapping[str, str], options: LogOptions
 ) -> tuple[LidarDecoder, Returns]:
     """Return the topic with the best returns: with pulse times, with rings, with most."""
     if not lidars:
@@ -217,7 +261,13 @@ def _choose_lidar(
             f"The recording holds no LiDAR topic. Found: {listed(found)}. Expected one of: "
             f"{', '.join(LIDAR_TYPES)}.{hint}"
         )
-    read = [(lidar, lidar.returns()) for lidar in lidars.values()]
+    read = [
+        (
+            lidar,
+            lidar.returns(options.time_unit) if isinstance(lidar, PointClouds) else lidar.returns(),
+        )
+        for lidar in lidars.values()
+    ]
     lidar, best = max(
         read,
         key=lambda pair: (

@@ -2,6 +2,7 @@
 
 import base64
 import json
+import re
 import shutil
 import struct
 import zipfile
@@ -9,6 +10,7 @@ import zipfile
 import dpkt
 import numpy as np
 import pytest
+import velodyne_decoder
 from foxglove_schemas_protobuf.FrameTransform_pb2 import FrameTransform
 from foxglove_schemas_protobuf.FrameTransforms_pb2 import FrameTransforms
 from foxglove_schemas_protobuf.JointStates_pb2 import JointStates
@@ -644,6 +646,61 @@ def test_whole_times_are_in_the_unit_that_fills_the_messages(tmp_path, rng, unit
     assert any(said in note for note in log.notes)
 
 
+def timed(rng, unit, kind, spans, pause=0):
+    """Items of clouds with times in a unit [1/s], one behind the other, each as long as given."""
+    items, begin = [], T0
+    for span in spans:
+        points = np.zeros(64, [("x", "f4"), ("y", "f4"), ("z", "f4"), ("time", kind)])
+        points["x"], points["time"] = rng.uniform(1, 9, 64), np.linspace(0, span, 64) * unit
+        end = begin + round(span * 1e9)
+        items.append(("/p", end, cloud(points, begin)))
+        begin = end + pause
+    return items
+
+
+@pytest.mark.parametrize(
+    ("unit", "said"),
+    [(1.0, ""), (1e3, "milliseconds"), (1e6, "microseconds"), (1e9, "nanoseconds")],
+)
+@pytest.mark.parametrize("kind", ["f4", "f8"])
+@pytest.mark.parametrize(
+    "spans", [(0.1,) * 4, (0.005, 0.1, 0.1, 0.1), (1.3e-3,) * 40], ids=["all", "begun", "packets"]
+)
+def test_floating_times_are_in_one_unit_that_fills_the_messages(
+    tmp_path, rng, unit, said, kind, spans
+):
+    items = timed(rng, unit, kind, spans)
+    log = read_log(record(tmp_path / "a.mcap", [*items, *turning()]))
+    ends = np.cumsum(np.round(np.array(spans) * 1e9))
+    offsets = (log.stamps_lidar_ns - T0).reshape(len(spans), 64)
+    expected = np.linspace(0, np.round(np.array(spans) * 1e9), 64, axis=1)
+    expected += np.append(0, ends[:-1])[:, None]
+    assert_allclose(offsets, expected, rtol=0, atol=100)  # [ns] of float32 times
+    assert any(said in note for note in log.notes)
+    assert any("--time-unit" in note for note in log.notes) == (unit != 1.0)
+
+
+@pytest.mark.parametrize("unit", [1.0, 1e3, 1e6, 1e9])
+def test_absolute_times_may_be_in_any_unit(tmp_path, unit):
+    points = np.zeros(64, [("x", "f4"), ("y", "f4"), ("z", "f4"), ("timestamp", "f8")])
+    seconds = np.linspace(0, 0.1, 64)
+    points["x"], points["timestamp"] = 1.0, (T0 * 1e-9 + seconds) * unit
+    log = read_log(record(tmp_path / "a.mcap", [("/p", T0, cloud(points)), *turning()]))
+    assert_allclose(log.stamps_lidar_ns - T0, seconds * 1e9, rtol=0, atol=250)
+
+
+def test_a_unit_of_times_that_cannot_be_found_can_be_named(tmp_path, rng):
+    items = timed(rng, 1e9, "u4", (1e-5, 1e-5, 1e-5), pause=10**8)  # as of flashes
+    path = record(tmp_path / "a.mcap", [*items, *turning()])
+    found = {
+        unit: int(np.ptp(read_log(path, LogOptions(time_unit=unit)).stamps_lidar_ns[:64]))
+        for unit in ("ns", "us")
+    }
+    assert found == {"ns": 10**4, "us": 10**7}
+    with pytest.raises(ConfigError, match="time_unit"):
+        LogOptions(time_unit="minutes")
+
+
 def late(ns):
     return ns + 2_000_000 + ns // 1000 % 1000
 
@@ -702,19 +759,48 @@ def test_lasers_of_another_lidar_are_those_of_its_returns(tmp_path, rng):
 
 @pytest.mark.parametrize("model", lasers.MODELS, ids=lambda one: one.name)
 @pytest.mark.parametrize("step", [1, -1])
-def test_a_known_model_has_the_optics_of_its_maker(tmp_path, rng, model, step):
+@pytest.mark.parametrize("carries", [False, True])
+def test_a_known_model_has_the_optics_of_its_maker(tmp_path, rng, model, step, carries):
     elevations = np.degrees(model.elevations)[::step]
-    items = [
-        ("/tf_static", T0, frames(MOUNT)),
-        ("/p", T0 + 10**8, cloud(spinning(rng, elevations, 4000))),
-    ]
+    points = spinning(rng, elevations, 20_000)
+    points["z"] += carries * model.heights[::step][points["ring"]]
+    items = [("/tf_static", T0, frames(MOUNT)), ("/p", T0 + 10**8, cloud(points))]
     log = read_log(record(tmp_path / "a.mcap", [*items, *turning()]))
     assert_array_equal(log.rig.laser_elevations, model.elevations)
-    assert_array_equal(log.rig.divergence, (0.003, 0.0015))
-    found = np.degrees(np.arctan2(log.p_lidar[:, 2], np.hypot(*log.p_lidar[:, :2].T)))
+    assert_array_equal(log.rig.laser_heights, model.heights)
+    assert_array_equal(log.rig.divergence, model.divergence)
+    z = log.p_lidar[:, 2] - carries * model.heights[log.rings]
+    found = np.degrees(np.arctan2(z, np.hypot(*log.p_lidar[:, :2].T)))
     assert_allclose(found, np.degrees(model.elevations)[log.rings], rtol=0, atol=1e-3)
+    assert log.has_heights is carries
     assert any(model.name in note for note in log.notes)
     assert not log.weaknesses
+
+
+@pytest.mark.parametrize(
+    ("model", "other"),
+    list(zip(lasers.MODELS, ("PuckHiRes", "HDL32E", "VLP32C", "AlphaPrime"), strict=True)),
+    ids=lambda one: one if isinstance(one, str) else one.name,
+)
+def test_known_models_are_those_of_velodyne_decoder(model, other):
+    calibrations = velodyne_decoder.Calibration.default_calibs
+    text = calibrations[getattr(velodyne_decoder.Model, other)].to_string()
+    found = [re.findall(rf"{key}: (\S+)", text) for key in ("vert_correction", "vert_offset_\\w+")]
+    elevations, heights = np.array(
+        sorted(zip(*found, strict=True), key=lambda one: float(one[0])), float
+    ).T
+    # Rounded to 0.01 deg in the maker's tables; the drawing of the Hi-Res has even steps.
+    assert_allclose(np.degrees(model.elevations), np.degrees(elevations), rtol=0, atol=0.006)
+    limit = 5e-4 if other == "PuckHiRes" else 1e-4
+    assert_allclose(model.heights, heights, rtol=0, atol=limit)
+
+
+def test_lasers_are_found_whatever_the_pace_of_their_rings(tmp_path, rng):
+    model = lasers.MODELS[0]
+    points = spinning(rng, np.degrees(model.elevations), 16 * 5_000 * 2)  # a stride of 32 rows
+    items = [("/tf_static", T0, frames(MOUNT)), ("/p", T0 + 10**8, cloud(points))]
+    log = read_log(record(tmp_path / "a.mcap", [*items, *turning()]))
+    assert_array_equal(log.rig.laser_elevations, model.elevations)
 
 
 @pytest.mark.parametrize("has_rig", [True, False])

@@ -25,7 +25,7 @@ from spheremark.pipelines.errors import (
 )
 from spheremark.pipelines.model import Origin, ScanLog
 from spheremark.pipelines.scan.rigs import tilted_vlp16
-from spheremark.storage.recordings import inspect_log, read_log, write_log
+from spheremark.storage.recordings import LogOptions, inspect_log, read_log, write_log
 from spheremark.storage.recordings.records import MAGIC
 from spheremark.storage.recordings.sources import opened
 from tests.storage.recorder import T0, cloud, joints, record, small_log, turning, velodyne
@@ -184,6 +184,18 @@ def test_clouds_without_coordinates_are_refused_with_their_fields(tmp_path):
     path = record(tmp_path / "a.mcap", [("/points", T0, cloud(points)), *turning()])
     with pytest.raises(MissingLidarError, match="no field 'z', only x, y, depth"):
         read_log(path)
+
+
+@pytest.mark.parametrize("step", [2**31, 2**32 - 1, 2**17])
+def test_points_of_senseless_size_cost_their_message(tmp_path, step):
+    rng = np.random.default_rng(2)
+    message = cloud(velodyne(rng)[:0])
+    message.point_step = step
+    items = [("/p", T0, message), ("/q", T0, cloud(velodyne(rng))), *turning()]
+    log = read_log(record(tmp_path / "a.mcap", items))
+    assert len(log.p_lidar) == 64
+    with pytest.raises(MissingLidarError, match=f"its points would have {step:,} bytes"):
+        read_log(tmp_path / "a.mcap", LogOptions(topic=("/p",)))
 
 
 def test_a_recording_without_gimbal_angle_is_refused(tmp_path):

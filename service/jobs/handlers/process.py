@@ -48,7 +48,7 @@ def process_log(
         )
     except NoMarkersError as error:
         progress(0.9, "Trying other signs, units and clocks")
-        raise explained(error, recording.read, spec.rig) from error
+        raise explained(error, recording.read_with, recording.options, spec.rig) from error
     progress(0.9, "Storing the results")
     clouds = {stop.name: write_cloud(stop, spec.clouds_url) for stop in stops}
     write_result_log(stops, spec.clouds_url, run_id)
