@@ -6,6 +6,7 @@ point count that keep a tolerance, with confidence intervals.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal, NamedTuple
 
@@ -277,12 +278,42 @@ def limits(
     (of single errors, where there are fewer than five scans); the interval is that of their bounds
     (percentile bootstrap). Cost grows linearly with errors times resamples.
     """
+    (found,) = limits_of_each(sample, (demand,), rng, n_resamples=n_resamples)
+    return found
+
+
+def limits_of_each(
+    sample: ErrorSample,
+    demands: Sequence[Demand],
+    rng: np.random.Generator,
+    *,
+    n_resamples: int = 400,
+) -> tuple[Limits, ...]:
+    """Return the limits of several tolerances or statistics from the same resamples.
+
+    Parameters
+    ----------
+    sample, rng, n_resamples
+        See ``limits``.
+    demands : sequence of Demand
+        Tolerances and conditions.
+
+    Returns
+    -------
+    tuple of Limits
+        Of each demand.
+    """
     data = _regression(sample, TERMS[:2])
-    if demand.density is not None:
-        data = data._replace(density=demand.density)
     drawn = _resampled(data.scans, n_resamples, rng)
     weights = np.vstack([np.ones(len(data.y)), drawn])
     coefficients = _coefficients(data, weights)
+    return tuple(_limits(data, one, coefficients, weights) for one in demands)
+
+
+def _limits(data: _Regression, demand: Demand, coefficients: Array, weights: Array) -> Limits:
+    """Return the limits of a demand from the fits to all resamples."""
+    if demand.density is not None:
+        data = data._replace(density=demand.density)
     factors = np.log(_factors(data, coefficients, weights, demand.statistic))
     excess = np.log(demand.tolerance) - coefficients[:, 0] - factors  # what powers may add
     at = float(data.reference[0]) if demand.at_range is None else demand.at_range

@@ -17,7 +17,7 @@ from spheremark.pipelines.accuracy.error_model import (
     Limits,
     Statistic,
     fit_error_model,
-    limits,
+    limits_of_each,
 )
 from spheremark.pipelines.errors import TooFewObservationsError
 from spheremark.web.columns import Columns, by_method, floats, has_errors, texts
@@ -100,18 +100,16 @@ def _statement(method: str, rows: Columns, tolerance_m: float, place: str) -> St
         errors_3d=floats(rows, "error_3d_m").copy(),
         scans=scans.astype(np.intp),
     )
-    found: dict[Statistic, Limits] = {}
+    demands = [Demand(tolerance=tolerance_m, statistic=one) for one in _STATISTICS]
+    rng = np.random.default_rng(_SEED)
     try:
         model = fit_error_model(sample)
-        for statistic in _STATISTICS:
-            demand = Demand(tolerance=tolerance_m, statistic=statistic)
-            rng = np.random.default_rng(_SEED)
-            found[statistic] = limits(sample, demand, rng, n_resamples=_N_RESAMPLES)
+        p95, mean = limits_of_each(sample, demands, rng, n_resamples=_N_RESAMPLES)
     except TooFewObservationsError as error:
         return Statement(
             method=method, place=place, model=None, p95=None, mean=None, reason=str(error)
         )
-    return Statement(method=method, place=place, model=model, p95=found["p95"], mean=found["mean"])
+    return Statement(method=method, place=place, model=model, p95=p95, mean=mean)
 
 
 def _incidences(rows: Columns) -> NDArray[np.float64]:
