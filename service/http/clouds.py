@@ -6,6 +6,7 @@ from typing import Any
 
 from spheremark.pipelines.errors import NotFoundError
 from spheremark.service.http.state import Service
+from spheremark.storage.catalogue.rows import natural
 from spheremark.storage.clouds.octree import Octree, octree_of
 from spheremark.web.links import stop_url
 
@@ -15,8 +16,8 @@ _STOPS = """
 SELECT x.run_id, x.stop, x.cloud_url IS NOT NULL AS has_cloud, x.n_returns, r.recording_id
 FROM stops AS x JOIN latest_runs AS r USING (run_id) JOIN surveys AS s USING (survey_id)
 WHERE s.name = $survey AND (len($stops::VARCHAR[]) = 0 OR list_contains($stops::VARCHAR[], x.stop))
-ORDER BY x.stop, r.finished_at DESC LIMIT $n
-"""
+ORDER BY {natural}, r.finished_at DESC LIMIT $n
+""".replace("{natural}", natural("x.stop"))
 _COUNT = """
 SELECT count(*) AS n FROM stops AS x JOIN latest_runs AS r USING (run_id)
     JOIN surveys AS s USING (survey_id) WHERE s.name = $survey

@@ -19,11 +19,14 @@ from spheremark.pipelines.accuracy.acceptance import (
 )
 from spheremark.pipelines.model import Array
 from spheremark.storage.catalogue.catalogue import Catalogue
+from spheremark.storage.catalogue.rows import natural
 from spheremark.storage.catalogue.solutions import Solution, chosen_solution
 
 Columns = Mapping[str, NDArray[Any]]
 
-_STATIONS = "SELECT * FROM chosen_stations WHERE survey_id = $id ORDER BY station"
+_STATIONS = """
+SELECT * FROM chosen_stations WHERE survey_id = $id ORDER BY {natural}
+""".replace("{natural}", natural("station"))
 _ADJUSTMENT = "SELECT * FROM adjustments WHERE adjustment_id = $id"
 _NOT_IN = """
 SELECT DISTINCT x.stop FROM stops AS x JOIN latest_runs AS r USING (run_id)

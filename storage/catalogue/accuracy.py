@@ -12,13 +12,25 @@ from dataclasses import dataclass
 from typing import Any
 
 from spheremark.storage.catalogue.database import Database
+from spheremark.storage.catalogue.rows import natural
 
 N_WORST = 12  # rows of each bin that keep their names
 
+# root mean square of an error whitened by its covariance (adjugate over determinant)
+_WHITENED = """sqrt(greatest((error_x_m ^ 2 * (cov_yy_m2 * cov_zz_m2 - cov_yz_m2 ^ 2)
+        + error_y_m ^ 2 * (cov_xx_m2 * cov_zz_m2 - cov_xz_m2 ^ 2)
+        + error_z_m ^ 2 * (cov_xx_m2 * cov_yy_m2 - cov_xy_m2 ^ 2)
+        + 2 * error_x_m * error_y_m * (cov_xz_m2 * cov_yz_m2 - cov_xy_m2 * cov_zz_m2)
+        + 2 * error_x_m * error_z_m * (cov_xy_m2 * cov_yz_m2 - cov_xz_m2 * cov_yy_m2)
+        + 2 * error_y_m * error_z_m * (cov_xy_m2 * cov_xz_m2 - cov_xx_m2 * cov_yz_m2))
+        / nullif(3 * (cov_xx_m2 * (cov_yy_m2 * cov_zz_m2 - cov_yz_m2 ^ 2)
+            - cov_xy_m2 * (cov_xy_m2 * cov_zz_m2 - cov_yz_m2 * cov_xz_m2)
+            + cov_xz_m2 * (cov_xy_m2 * cov_yz_m2 - cov_yy_m2 * cov_xz_m2)), 0), 0))"""
 _FITS = """
 SELECT {place}s.name AS survey, r.recording_id, m.run_id, m.stop, m.fit_method, m.marker, m.mark,
     m.status, m.reason, m.range_m, m.n_points, m.incidence_deg, m.sigma_3d_m, m.error_3d_m,
-    m.error_radial_m, CASE WHEN $is_error THEN m.error_3d_m ELSE m.sigma_3d_m END AS value_m
+    m.error_radial_m, {whitened} AS error_over_sigma,
+    CASE WHEN $is_error THEN m.error_3d_m ELSE m.sigma_3d_m END AS value_m
 FROM marker_fits AS m JOIN latest_runs AS r USING (run_id) JOIN surveys AS s USING (survey_id)
 WHERE (len($surveys::VARCHAR[]) = 0 OR list_contains($surveys::VARCHAR[], s.name))
     AND (len($methods::VARCHAR[]) = 0 OR list_contains($methods::VARCHAR[], m.fit_method))
@@ -26,7 +38,7 @@ WHERE (len($surveys::VARCHAR[]) = 0 OR list_contains($surveys::VARCHAR[], s.name
     AND m.range_m BETWEEN $range_from_m AND $range_to_m
     AND m.n_points BETWEEN $count_from AND $count_to
     AND coalesce(m.incidence_deg, 0) BETWEEN $incidence_from_deg AND $incidence_to_deg
-"""
+""".replace("{whitened}", _WHITENED)
 FITS = _FITS.replace("{place}", "")
 """The centres of a selection: of newest runs, with error or predicted sigma as ``value_m``."""
 
@@ -98,8 +110,7 @@ QUERIES: Mapping[str, str] = {
 SELECT fit_method, count(*) AS n, count(DISTINCT (run_id, stop)) AS n_stops,
     count(*) FILTER (value_m <= $tolerance_m) AS n_within, max(value_m) AS largest_m,
     sqrt(avg(value_m ^ 2)) AS rms_m, quantile_cont(value_m, 0.5) AS median_m,
-    quantile_cont(value_m, 0.95) AS p95_m, sqrt(avg((value_m / nullif(sigma_3d_m, 0)) ^ 2))
-        AS ratio_rms,
+    quantile_cont(value_m, 0.95) AS p95_m, sqrt(avg(error_over_sigma ^ 2)) AS ratio_rms,
     quantile_cont(value_m, [0.005, 0.01, 0.02, 0.03, 0.05, 0.07, 0.1, 0.15, 0.2, 0.25, 0.3, 0.35,
         0.4, 0.45, 0.5, 0.55, 0.6, 0.65, 0.7, 0.75, 0.8, 0.85, 0.9, 0.93, 0.95, 0.97, 0.98, 0.99,
         0.995]) AS quantiles_m
@@ -158,8 +169,8 @@ SELECT * FROM (
     FROM chosen_stations
     WHERE len($surveys::VARCHAR[]) = 0 OR list_contains($surveys::VARCHAR[], survey)
     ORDER BY coalesce(error_3d_m, sigma_3d_m) DESC, survey, station LIMIT 600
-) ORDER BY survey, station
-""",
+) ORDER BY survey, {natural}
+""".replace("{natural}", natural("station")),
     "marks": """
 SELECT s.name AS survey, c.mark, c.x_m, c.y_m, c.z_m
 FROM control_marks AS c JOIN surveys AS s USING (survey_id)

@@ -34,6 +34,23 @@ def places(rows: Sequence[Row]) -> Array:
     return np.array([[row[name] for name in PLACE] for row in rows]).reshape(-1, 3)
 
 
+def natural(column: str) -> str:
+    """Return the SQL that orders names by the numbers in them: stop2 before stop10.
+
+    Parameters
+    ----------
+    column : str
+        The column of the names.
+
+    Returns
+    -------
+    str
+        An expression of the names with numbers of eight digits or more.
+    """
+    wide = rf"regexp_replace({column}, '(\d+)', '0000000\1', 'g')"
+    return rf"regexp_replace({wide}, '0*(\d{{8}})', '\1', 'g')"
+
+
 def named(names: Sequence[str], values: Any) -> Row:
     """Return values as columns."""
     return dict(zip(names, values, strict=True))

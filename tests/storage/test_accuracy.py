@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from spheremark.service.serialise.solution import survey_result
 from spheremark.storage.catalogue import accuracy
 from spheremark.storage.catalogue.accuracy import QUERIES, TABLES, Selection
 from spheremark.storage.catalogue.catalogue import Catalogue
@@ -54,6 +55,12 @@ def test_a_distribution_counts_what_is_within_the_tolerance(catalogue):
     known = [one["error_3d_m"] for one in errors(catalogue)]
     assert row["n_within"] == sum(one <= 0.022 for one in known)
     assert row["quantiles_m"][14] == pytest.approx(np.median(known))
+
+
+def test_the_ratio_of_errors_to_sigmas_is_that_of_the_result(catalogue):
+    (row,) = result(catalogue, "distribution", surveys=("field",), methods=("along_beam",))
+    checks = {one.what: one for one in survey_result(catalogue, "field").checks}
+    assert row["ratio_rms"] == pytest.approx(checks["centres"].ratio)
 
 
 def test_without_truth_the_predicted_sigmas_are_aggregated(catalogue):

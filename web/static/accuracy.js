@@ -16,11 +16,11 @@ function reach(row, name) {
 }
 
 const COLUMNS = [
-  ["Centres", "number", (row) => `${row.n.toLocaleString("en")} in ${row.n_stops.toLocaleString("en")} stops`],
+  ["Centres", "number", (row) => `${row.n.toLocaleString("en")} in ${row.n_stops.toLocaleString("en")} stop${row.n_stops === 1 ? "" : "s"}`],
   ["Median [mm]", "number", (row) => mm(row.median_m)],
   ["95 % within [mm]", "number", (row) => mm(row.p95_m)],
   ["Within tolerance", "number", (row) => `${(100 * row.share_within).toFixed(2)} %`],
-  ["Error over sigma", "number", (row) => row.ratio_rms?.toFixed(2) ?? "–"],
+  ["Error over sigma [RMS]", "number", (row) => row.ratio_rms?.toFixed(2) ?? "–"],
   ["Kept to, by counts", "number", (row) => reach(row, "reach_m")],
   ["with 95 % confidence", "number", (row) => reach(row, "reach_confident_m")],
   ["by the model (95 %)", "number", (row) => row.model_distance ?? "–"],

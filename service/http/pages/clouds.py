@@ -9,14 +9,15 @@ from fastapi.responses import HTMLResponse
 
 from spheremark.service.http.pages.frame import frame_of
 from spheremark.service.http.state import Current
+from spheremark.storage.catalogue.rows import natural
 from spheremark.web.pages.clouds import cloud_page
 
 router = APIRouter(include_in_schema=False, default_response_class=HTMLResponse)
 
 _STOPS = """
-SELECT DISTINCT x.stop FROM stops AS x JOIN latest_runs AS r USING (run_id)
-WHERE r.survey_id = $id ORDER BY x.stop LIMIT 500
-"""
+SELECT x.stop FROM stops AS x JOIN latest_runs AS r USING (run_id)
+WHERE r.survey_id = $id GROUP BY x.stop ORDER BY {natural} LIMIT 500
+""".replace("{natural}", natural("x.stop"))
 _METHODS = """
 SELECT DISTINCT fit_method FROM latest_marker_fits WHERE survey_id = $id
 ORDER BY fit_method != 'along_beam', fit_method

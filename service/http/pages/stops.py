@@ -11,6 +11,7 @@ from fastapi.responses import HTMLResponse
 from spheremark.pipelines.errors import NotFoundError
 from spheremark.service.http.pages.frame import frame_of, survey_row
 from spheremark.service.http.state import Current, Service
+from spheremark.storage.catalogue.rows import natural
 from spheremark.storage.clouds import stop as clouds
 from spheremark.web.figures import scene
 from spheremark.web.pages.base import Part
@@ -37,14 +38,14 @@ FROM (
 ) AS f
 LEFT JOIN chosen_stations AS c
     ON c.survey_id = f.survey_id AND c.recording_id = f.recording_id AND c.stop = f.stop
-ORDER BY f.stop, f.recording_id LIMIT $n OFFSET $after
-"""
+ORDER BY {natural}, f.recording_id LIMIT $n OFFSET $after
+""".replace("{natural}", natural("f.stop"))
 _N_STOPS = "SELECT count(*) AS n FROM stops JOIN latest_runs USING (run_id) WHERE survey_id = $id"
 _ROWS = 100  # stops in one part of the table
 _STOP_NAMES = """
-SELECT DISTINCT x.stop FROM stops AS x JOIN latest_runs AS r USING (run_id)
-WHERE r.survey_id = $id ORDER BY x.stop
-"""
+SELECT x.stop FROM stops AS x JOIN latest_runs AS r USING (run_id)
+WHERE r.survey_id = $id GROUP BY x.stop ORDER BY {natural}
+""".replace("{natural}", natural("x.stop"))
 _STOP = """
 SELECT x.*, r.job_id, r.recording_id, c.name AS recording, r.finished_at, r.code_version,
     r.config_digest, r.rig_digest
