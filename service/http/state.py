@@ -7,6 +7,7 @@ import threading
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager, suppress
 from dataclasses import dataclass, field
+from importlib import import_module
 from typing import Annotated, Any
 
 from fastapi import Depends, Request
@@ -57,6 +58,8 @@ class Service:
 async def opened(settings: Settings) -> AsyncIterator[Service]:
     """Open the database, the inbox and the cluster; close them in the opposite order."""
     settings = settings.model_copy(update={"data": settings.data.resolve()})
+    with suppress(ImportError):  # Plotly uses what it finds of it, while a thread still imports it
+        import_module("pandas")
     data = settings.data
     data.mkdir(parents=True, exist_ok=True)
     data.chmod(0o700)  # nobody else's: logs, results and digests of tokens
