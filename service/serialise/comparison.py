@@ -268,7 +268,7 @@ def _methods(catalogue: Catalogue, a: str, b: str) -> Row:
             f"95 % confidence), p = {test.p_value:.2g} by the signed-rank test"
         )
     except TooFewObservationsError as error:
-        difference = f"not tested: {error}"
+        difference = f"not tested, {str(error).removesuffix('.')}"
     medians = [f"{np.median(one) * _MM:.1f}" if len(one) else "-" for one in values]
     sides = [{"survey": part[0], "method": part[2]} for part in parts]
     return {

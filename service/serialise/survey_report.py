@@ -215,12 +215,12 @@ def _stations_part(catalogue: Catalogue, survey_id: str, solution: Solution | No
     rows = catalogue.rows(_STATIONS, key)
     known = [row for row in rows if row["x_m"] is not None]
     weak = [row for row in rows if row["status"] != "ok"]
-    missing = [
-        "No network: each station was positioned alone, and no observation checks two stations "
-        "together. Start an adjustment and report again."
-    ]
-    if not rows:
-        missing.append("No stations: no log of this survey has been processed with control marks.")
+    missing = "No stations: no log of this survey has been processed with control marks."
+    if rows:
+        missing = (
+            "No network: each station was positioned alone, and no observation checks two stations "
+            "together. Start an adjustment and report again."
+        )
     observed = catalogue.rows(_OBSERVED, key)
     tables = [
         Table(
@@ -235,7 +235,7 @@ def _stations_part(catalogue: Catalogue, survey_id: str, solution: Solution | No
         "title": "Station report",
         "tests": [],
         "warnings": [],
-        "missing": missing,
+        "missing": [missing],
         "places": [_alone(row) for row in known] + _marks_alone(catalogue, survey_id),
         "lines": [[row["stop"], row["mark"]] for row in observed if row["used"]],
         "sections": [_shortened(one.to_texts()) for one in tables if one.rows],

@@ -139,11 +139,12 @@ def test_a_query_that_cannot_run_says_why(visit):
 def test_a_file_that_is_no_log_is_refused_with_its_reason(visit, tmp_path):
     log = tmp_path / "notes.mcap"
     log.write_bytes(b"this is not a log" * 100)
-    page = visit().open("/")
+    page = visit(width=390).open("/")
     page.select_option("#upload-survey", "")
     page.set_input_files("#files", log)
     page.wait_for_selector("#uploads .outcome:has-text('refused'), #uploads .outcome.bad")
     assert page.locator("#uploads li").count() == 1
+    assert page.evaluate("document.documentElement.scrollWidth") <= 390
 
 
 def test_a_survey_is_made_from_nothing_renamed_deleted_and_restored(visit, tmp_path):

@@ -11,6 +11,7 @@ from spheremark.web.figures.elements import add_points, add_zero, blank_figure
 
 _BEYOND = 2.0  # sigmas
 _WAYS = {"radial": "along the line of sight", "across": "across it", "up": "up"}
+_AXES = {"radial": "along [mm]", "across": "across [mm]", "up": "up [mm]"}
 _BEFORE = theme.Style("before", theme.MUTED, "circle-open")
 _AFTER = theme.Style("after", theme.OURS)
 
@@ -26,7 +27,7 @@ def face_gaps(before: Columns, after: Columns) -> go.Figure:
             place = {"legendgroup": style.label, "showlegend": row == 1, "row": row, "col": 1}
             add_points(figure, x, y, style, hover, rows, marker_size=6, **place)
         add_zero(figure, row=row, col=1)
-        figure.update_yaxes(title_text=f"{label} [mm]", row=row, col=1)
+        figure.update_yaxes(title_text=_AXES[way], row=row, col=1)
     figure.update_xaxes(range=[-180, 180], dtick=60)
     figure.update_xaxes(title_text="Azimuth in base [deg]", row=len(_WAYS), col=1)
     return figure

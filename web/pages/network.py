@@ -42,7 +42,7 @@ def adjustment_page(
     """Return the page of a network from its rows of each table.
 
     ``more`` are all networks of the survey, the number of its control marks, and the id of the
-    network that is its chosen solution.
+    network that is its chosen solution; without a network the number of its logs.
     """
     if adjustment is None:
         return render("adjustment.html", frame=frame, adjustment=None, **more)

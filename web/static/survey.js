@@ -44,6 +44,8 @@ on("process", async (button) => {
 on("remove", async (button) => {
   const address = `${home}/recordings/${button.dataset.remove}`;
   await call("DELETE", address);
+  const n = Number.parseInt(by("logs-head").textContent, 10) - 1;
+  by("logs-head").textContent = `${n} log${n === 1 ? "" : "s"}`;
   button.closest("tr").remove();
   undone(`${button.dataset.name} and its results were removed.`, () => call("PUT", address));
 });

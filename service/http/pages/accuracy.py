@@ -14,7 +14,7 @@ from spheremark.web.pages.accuracy import accuracy_page
 router = APIRouter(include_in_schema=False, default_response_class=HTMLResponse)
 
 _METHODS = """
-SELECT DISTINCT fit_method FROM marker_fits
+SELECT DISTINCT fit_method FROM latest_marker_fits WHERE $survey = '' OR survey = $survey
 ORDER BY fit_method != 'along_beam', fit_method
 """
 
@@ -39,6 +39,6 @@ def _page(request: Request, service: Service, survey: str) -> str:
         frame_of(service, survey, "accuracy" if survey else ""),
         query,
         survey=survey,
-        methods=[row["fit_method"] for row in service.catalogue.rows(_METHODS)],
+        methods=[row["fit_method"] for row in service.catalogue.rows(_METHODS, {"survey": survey})],
         has_truth=figures.choose(service, selection).values["is_error"],
     )

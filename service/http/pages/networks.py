@@ -84,7 +84,8 @@ def _network(service: Service, survey: Mapping[str, Any], shown: str | None) -> 
     all_of_survey = rows(_ADJUSTMENTS, key)
     control = rows(_N_CONTROL, key)[0]["n"]
     if shown is None and not all_of_survey:
-        return adjustment_page(frame, None, {}, (), networks=[], n_control=control, chosen="")
+        n_logs = len(service.catalogue.recordings_of_survey(survey["survey_id"]))
+        return adjustment_page(frame, None, {}, (), n_control=control, n_logs=n_logs)
     shown = shown or all_of_survey[0]["adjustment_id"]
     sql = "SELECT * FROM {} WHERE adjustment_id = $id ORDER BY {}"
     tables = {
