@@ -77,7 +77,8 @@ PRIORS: Mapping[str, Prior] = {
     "divergence_scale": Prior((0.85, 1.15), (0.7, 1.3), False, _OPTICS, "true over nominal; or 0"),
     "window": Prior((0.0, 0.5), (0.0, 1.0), False, _OPTICS, "beam there, of 12.7 x 9.5 mm"),
     "gate": Prior((0.1, 1.0), (0.05, 1.2), True, _OPTICS, "surfaces in one echo [m]"),
-    "range_bias": Prior((0.001, 0.003), (0.002, 0.015), True, _OPTICS, "its sigma, in common [m]"),
+    # usual: in the mean of squares what the data sheet leaves, ``fitting.sigma_range_common``
+    "range_bias": Prior((0.002, 0.005), (0.002, 0.015), True, _OPTICS, "its sigma, in common [m]"),
     "range_scale": Prior((1e-6, 5e-5), (1e-5, 3e-4), True, _OPTICS, "its sigma"),
     "shade": Prior((0.3, 0.8), (0.1, 0.9), False, _OPTICS, "reflectivity of the markers"),
     "sigma_laser_bias": Prior((0.001, 0.004), (0.002, 0.012), True, _RIG, "between lasers [m]"),
