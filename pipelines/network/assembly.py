@@ -426,7 +426,7 @@ def _in_common(
 ) -> Network:
     """Return the network with what all stations share: rig, sensor, and optics of the beams."""
     ups_base = network.R_station_base[network.sightings[:, 0], 2]
-    sigmas = (config.sigma_range, config.sigma_range_scale, config.sigma_height)
+    sigmas = (_sigma_range(fits, config), config.sigma_range_scale, config.sigma_height)
     shared = Shared.of_sensor(network.p_base, ups_base, sigmas)
     network, optics = _with_common_optics(network, fits)
     shared = shared.joined(optics)
@@ -439,6 +439,14 @@ def _in_common(
             prior_weights=calibration.weights,
         ).joined(shared)
     return replace(network, shared=shared)
+
+
+def _sigma_range(fits: Sequence[MarkerFit], config: ResectionConfig) -> float:
+    """Return the prior sigma of a common range bias: more where fits show that lasers differ."""
+    reported = np.array([fit.sigma_range_shared for fit in fits])
+    if not config.sigma_range or not np.isfinite(reported).all():
+        return config.sigma_range
+    return max(config.sigma_range, float(np.median(reported)))
 
 
 def _with_common_optics(network: Network, fits: Sequence[MarkerFit]) -> tuple[Network, Shared]:
