@@ -54,7 +54,8 @@ class Source:
             return
         with self._catalogue() as catalogue:
             if target.suffix == ".duckdb":
-                copyfile(catalogue.export(), target)
+                with catalogue.lent_export() as copy:
+                    copyfile(copy, target)
             elif target.suffix == ".csv":
                 target.write_bytes(coordinates_csv(catalogue, survey))
             else:

@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 from spheremark.pipelines.errors import ConflictError, InputError
 from spheremark.storage.catalogue import migrations
 from spheremark.storage.catalogue.records import TableInfo, tables_of
-from spheremark.storage.catalogue.snapshots import Snapshots, portable_copy
+from spheremark.storage.catalogue.snapshots import Snapshots
 from spheremark.storage.files import Reserve, StorageError, StorageFullError, unwritten
 
 logger = logging.getLogger(__name__)
@@ -168,9 +168,21 @@ class Database:
         finally:
             lent.unlink(missing_ok=True)
 
-    def export(self) -> Path:
-        """Return a copy like ``snapshot`` that DuckDB 1.0 and all later versions can open."""
-        return portable_copy(self.snapshot())
+    @contextmanager
+    def lent_export(self) -> Iterator[Path]:
+        """Lend a copy like ``lent_snapshot`` that DuckDB 1.0 and all later versions can open.
+
+        Yields
+        ------
+        Path
+            The file.
+        """
+        with self.lent_snapshot() as snapshot:
+            lent = self._snapshots.lend_portable(snapshot)
+        try:
+            yield lent
+        finally:
+            lent.unlink(missing_ok=True)
 
     @contextmanager
     def reading(self) -> Iterator[duckdb.DuckDBPyConnection]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import secrets
 import subprocess
+import threading
 from pathlib import Path
 from time import monotonic, sleep
 
@@ -15,6 +16,7 @@ from spheremark.storage.files import unwritten
 _PATIENCE = 10.0  # [s] to wait for readers; a static query takes milliseconds
 _PAUSE = 0.002  # [s] between two tries
 _N_KEPT = 3  # one may still be being opened while the next two are made
+_KINDS = ("snapshot", "portable", "lent")  # first words of the names of files
 
 
 class Snapshots:
@@ -24,8 +26,9 @@ class Snapshots:
         self._path = path
         self._folder = folder
         self._version: int | None = None
+        self._converting = threading.Lock()
         folder.mkdir(parents=True, exist_ok=True)
-        for stale in (*self._files(), *folder.glob("portable-*"), *folder.glob("lent-*")):
+        for stale in (one for kind in _KINDS for one in folder.glob(f"{kind}-*")):
             stale.unlink(missing_ok=True)
 
     def take(self, connection: duckdb.DuckDBPyConnection, version: int) -> Path:
@@ -44,8 +47,25 @@ class Snapshots:
 
     def lend(self, connection: duckdb.DuckDBPyConnection, version: int) -> Path:
         """Return a snapshot by a name of its own, which no later one removes."""
-        lent = self._folder / f"lent-{secrets.token_hex(8)}.duckdb"
-        lent.hardlink_to(self.take(connection, version))
+        return self._lent(self.take(connection, version))
+
+    def lend_portable(self, snapshot: Path) -> Path:
+        """Return a copy of a lent snapshot that DuckDB 1.0 can open, lent in the same way."""
+        number = snapshot.stem.rpartition("-")[2]
+        portable = self._folder / f"portable-{number}.duckdb"
+        with self._converting:  # one at a time: others find it made
+            if not portable.exists():
+                _copy_portable(snapshot, portable)
+            for old in self._folder.glob("portable-*.duckdb"):
+                if old != portable:
+                    old.unlink(missing_ok=True)
+            return self._lent(portable)
+
+    def _lent(self, copy: Path) -> Path:
+        """Return a copy by another name, which ends in its number."""
+        number = copy.stem.rpartition("-")[2]
+        lent = self._folder / f"lent-{secrets.token_hex(8)}-{number}.duckdb"
+        lent.hardlink_to(copy)
         return lent
 
     def _files(self) -> list[Path]:
@@ -53,15 +73,9 @@ class Snapshots:
         return sorted(self._folder.glob("snapshot-*.duckdb"))
 
 
-def portable_copy(snapshot: Path) -> Path:
-    """Return a copy of a snapshot that DuckDB 1.0 and all later versions can open.
-
-    DuckDB writes new files in the storage version of its own release, which older ones refuse.
-    """
-    target = snapshot.with_name(snapshot.name.replace("snapshot", "portable"))
-    if target.exists():
-        return target
-    part = target.with_suffix(f".{secrets.token_hex(4)}.part")
+def _copy_portable(snapshot: Path, target: Path) -> None:
+    """Copy a snapshot in the storage version of DuckDB 1.0, which all later ones open as well."""
+    part = target.with_suffix(".part")
     try:
         with duckdb.connect(config={"threads": "1", "memory_limit": "1GB"}) as connection:
             connection.execute(f"ATTACH '{_quoted(snapshot)}' AS source (READ_ONLY)")
@@ -69,11 +83,10 @@ def portable_copy(snapshot: Path) -> Path:
             connection.execute("COPY FROM DATABASE source TO target")
             connection.execute("DETACH target")
         part.replace(target)
+    except (duckdb.IOException, OSError) as error:
+        raise unwritten(target, error) from error
     finally:
         part.unlink(missing_ok=True)
-    for old in sorted(snapshot.parent.glob("portable-*.duckdb"))[:-_N_KEPT]:
-        old.unlink(missing_ok=True)
-    return target
 
 
 def _quoted(path: Path) -> str:

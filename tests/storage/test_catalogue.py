@@ -608,6 +608,28 @@ def test_a_lent_snapshot_stays_however_many_are_made_meanwhile(catalogue, tmp_pa
     assert len(list((tmp_path / "snapshots").iterdir())) == 3
 
 
+def test_an_export_stays_while_results_are_committed_and_others_export(catalogue, tmp_path):
+    def exported(names, number):
+        for i in range(4):
+            catalogue.create_survey(f"{number}-{i}")
+            with catalogue.lent_export() as copy:
+                barrier.wait()  # all are made, and older ones are removed, before any is opened
+                with duckdb.connect(str(copy), read_only=True) as found:
+                    names[number, i] = set(found.execute("SELECT name FROM surveys").fetchall())
+
+    found, barrier = {}, threading.Barrier(3, timeout=60)
+    threads = [threading.Thread(target=exported, args=(found, number)) for number in range(3)]
+    for one in threads:
+        one.start()
+    for one in threads:
+        one.join()
+    assert len(found) == 12
+    for (number, i), names in found.items():
+        assert {(f"{number}-{k}",) for k in range(i + 1)} <= names
+    left = {path.name.partition("-")[0] for path in (tmp_path / "snapshots").iterdir()}
+    assert left == {"snapshot", "portable"}
+
+
 def test_a_snapshot_does_not_open_the_door_to_other_owners(catalogue):
     catalogue.create_survey("lane")
     catalogue.snapshot()
@@ -620,11 +642,12 @@ def test_a_snapshot_does_not_open_the_door_to_other_owners(catalogue):
 
 def test_an_export_has_the_storage_version_that_duckdb_1_0_reads(catalogue):
     catalogue.create_survey("lane")
-    copy = catalogue.export()
-    magic, version = struct.unpack_from("<4sQ", copy.read_bytes(), 8)
-    assert (magic, version) == (b"DUCK", 64)
-    assert catalogue.export() == copy
-    with duckdb.connect(str(copy), read_only=True) as found:
+    with (
+        catalogue.lent_export() as copy,
+        duckdb.connect(str(copy), read_only=True) as found,
+    ):
+        magic, version = struct.unpack_from("<4sQ", copy.read_bytes(), 8)
+        assert (magic, version) == (b"DUCK", 64)
         assert found.execute("SELECT name FROM surveys").fetchall() == [("lane",)]
         assert found.execute("SELECT count(*) FROM placements").fetchall() == [(0,)]
         query = "SELECT count(*) FROM duckdb_columns() WHERE comment IS NOT NULL"
@@ -644,9 +667,8 @@ def test_older_releases_of_duckdb_open_an_export(catalogue, version):
     if uv is None:
         pytest.skip("Older releases of DuckDB cannot be had here: uv is not installed.")
     command = [uv, "run", "--quiet", "--no-project", "--with", f"duckdb=={version}", "python", "-c"]
-    run = subprocess.run(
-        [*command, code, catalogue.export()], capture_output=True, text=True, check=False
-    )
+    with catalogue.lent_export() as copy:
+        run = subprocess.run([*command, code, copy], capture_output=True, text=True, check=False)
     if run.returncode and re.search(r"dns error|connect|timed out|network|resolve", run.stderr):
         pytest.skip(f"DuckDB {version} cannot be had here: {run.stderr.strip()[-200:]}")
     assert run.stdout.startswith("[('lane',)]"), run.stderr

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Mapping
+import pathlib
+from collections.abc import Callable, Iterator, Mapping
 from enum import StrEnum
 from typing import Annotated, Any
 
-from fastapi import APIRouter, Path, Request, Response
+from fastapi import APIRouter, Depends, Path, Request, Response
 from fastapi import Query as QueryParameter
 from fastapi.exceptions import RequestValidationError
 from fastapi.responses import FileResponse
@@ -150,19 +151,21 @@ def get_schema(service: Current) -> Listing[Table]:
     return Listing(items=[Table.model_validate(table) for table in service.catalogue.schema()])
 
 
+def _lent_export(service: Current) -> Iterator[pathlib.Path]:
+    """Lend a copy of the database until the response is sent."""
+    with service.catalogue.lent_export() as copy:
+        yield copy
+
+
 @router.get(
     "/export/results.duckdb",
     name="export_database",
     response_class=FileResponse,
     responses={200: {"content": {"application/vnd.duckdb": {}}}},
 )
-def export_database(service: Current) -> FileResponse:
+def export_database(copy: Annotated[pathlib.Path, Depends(_lent_export)]) -> FileResponse:
     """Return a consistent copy of the database, for one's own DuckDB (1.0 and later)."""
-    return FileResponse(
-        service.catalogue.export(),
-        media_type="application/vnd.duckdb",
-        filename="results.duckdb",
-    )
+    return FileResponse(copy, media_type="application/vnd.duckdb", filename="results.duckdb")
 
 
 @router.get(
