@@ -18,6 +18,7 @@ from spheremark.pipelines.errors import (
 from spheremark.storage.catalogue.records import RecordingRecord
 from spheremark.storage.catalogue.sandbox import QueryTimeoutError
 from spheremark.storage.files import StorageError, StorageFullError
+from spheremark.storage.imports.confined import ReaderEndedError
 
 
 class TooLargeError(InputError):
@@ -172,6 +173,7 @@ STATUS: Mapping[type[SpheremarkError], int] = {
     ConflictError: 409,
     LockedError: 423,
     UnavailableError: 503,
+    ReaderEndedError: 503,
     StorageError: 503,
     StorageFullError: 507,
     QuotaError: 507,

@@ -1,4 +1,4 @@
-"""Upkeep of a data folder: what is wrong with it, copies of it while it is in use, and back again.
+"""Upkeep of a data folder: its faults, what ended processes left, backups, and back again.
 
 Every file that a row names is never changed, so that a copy of the database and then of its files
 is consistent whatever the service does meanwhile.
@@ -8,7 +8,10 @@ from __future__ import annotations
 
 import hashlib
 import json
+import logging
+import math
 import os
+import posixpath
 import shutil
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
@@ -23,11 +26,15 @@ from spheremark.storage.catalogue.catalogue import Catalogue
 from spheremark.storage.catalogue.migrations import released
 from spheremark.storage.files import sync_folder, unwritten
 
+logger = logging.getLogger(__name__)
+
 MANIFEST = "manifest.json"
 _DATABASE = "results.duckdb"  # in a backup
 _FORMAT = "spheremark-backup/1"
 _REPORTS = ("coverage.json", "coverage.csv", "worlds.json")
 _RESULT_LOGS = "clouds/*.mcap"  # each called after its run
+_MADE_AGAIN = ("clouds/*", "terrains/*", "octrees/*.part")  # by a job or an upload
+_SET_ASIDE = "recordings/.damaged/*"
 _SEARCHES = "searches/*.json"
 _URLS = (
     ("recordings", "url"),
@@ -41,6 +48,7 @@ UNION ALL SELECT 'terrains', url, NULL, NULL FROM terrains
 UNION ALL SELECT DISTINCT 'stops', cloud_url, NULL, NULL FROM stops WHERE cloud_url IS NOT NULL
 UNION ALL SELECT DISTINCT 'site_products', url, sha256, size_bytes FROM site_products
 """
+_OLDEST_RUNNING = "SELECT min(epoch(started_at)) FROM jobs WHERE status = 'running'"
 _PARENTS = (
     ("runs", "recording_id", "recordings"),
     ("runs", "survey_id", "surveys"),
@@ -78,7 +86,7 @@ class _File:
     size: int | None
 
 
-def examine(database: Path, data: Path) -> list[Finding]:
+def examine(database: Path, data: Path, served_at: float = math.inf) -> list[Finding]:
     """Examine a data folder against a copy of its database.
 
     Parameters
@@ -87,6 +95,9 @@ def examine(database: Path, data: Path) -> list[Finding]:
         A snapshot or an export; it is only read.
     data : Path
         The data folder.
+    served_at : float
+        When the copy was requested, where a service goes on using the folder [s since 1970]: what
+        its running jobs have written is no fault.
 
     Returns
     -------
@@ -96,32 +107,75 @@ def examine(database: Path, data: Path) -> list[Finding]:
     try:
         with duckdb.connect(str(database), read_only=True) as connection:
             files = list(_files(connection))
-            logs = _result_logs(connection, data)
             found = [*_schema_findings(connection), *_row_findings(connection)]
+            abandoned = _abandoned(connection, data)
+            if served_at < math.inf:
+                ((begin,),) = connection.execute(_OLDEST_RUNNING).fetchall()
+                before = min(served_at, begin or math.inf)
+                abandoned = [path for path in abandoned if path.stat().st_mtime < before]
     except duckdb.Error as error:
         advice = f"{str(error).splitlines()[0]}. Check the disk, and restore the newest backup."
         return [Finding(kind="database.damaged", place=str(database), advice=advice)]
     for file in files:
         found += _file_findings(file)
-    known = {path.resolve() for path in (*logs, *(file.path for file in files))}
-    for folder in ("recordings", "terrains", "clouds"):
-        for path in sorted((data / folder).glob("*")):
-            if path.is_file() and path.resolve() not in known:
-                found.append(_unknown(path, folder))
+    known = {file.path.name for file in files}
+    logs = (path for path in (data / "recordings").glob("*") if path.is_file())
+    found += [_unknown(path, _ENTERED) for path in sorted(logs) if path.name not in known]
+    found += [_unknown(path, _REMOVED) for path in abandoned]
+    for path in sorted(data.glob(_SET_ASIDE)):
+        advice = "Its bytes are not those of its digest: upload the log again, then remove this."
+        found.append(Finding(kind="recordings.set_aside", place=str(path), advice=advice))
     if data.stat().st_mode & 0o077:
         advice = f"Others can read it; chmod 700 {data.name}."
         found.append(Finding(kind="permissions", place=str(data), advice=advice))
     return found
 
 
-def _unknown(path: Path, folder: str) -> Finding:
+_ENTERED = "The service is reading it, or enters it at its next start."
+_REMOVED = "An ended process left it; the next start of the service removes it, or doctor --mend."
+
+
+def _unknown(path: Path, advice: str) -> Finding:
     """Return the finding of a file without a row."""
-    advice = (
-        "The next start of the service enters it."
-        if folder == "recordings"
-        else "An ended worker left it; `spheremark doctor --mend` removes it."
-    )
-    return Finding(kind=f"{folder}.without_row", place=str(path), advice=advice)
+    return Finding(kind=f"{path.parent.name}.without_row", place=str(path), advice=advice)
+
+
+def _abandoned(connection: duckdb.DuckDBPyConnection, data: Path) -> list[Path]:
+    """Return files that no row names and that can be made again.
+
+    Files are compared by name, a digest or the id of a run: the folder may have been moved.
+    """
+    known = {posixpath.basename(row[1]) for row in connection.execute(_FILES).fetchall()}
+    known |= {path.name for path in _result_logs(connection, data)}
+    paths = (path for pattern in _MADE_AGAIN for path in data.glob(pattern))
+    return sorted(path for path in paths if path.is_file() and path.name not in known)
+
+
+def remove_abandoned(catalogue: Catalogue, data: Path) -> int:
+    """Remove the files of results that ended processes left; to be called before any job begins.
+
+    Parameters
+    ----------
+    catalogue : Catalogue
+        The open database of the folder.
+    data : Path
+        The data folder.
+
+    Returns
+    -------
+    int
+        Number of files.
+    """
+    with catalogue.reading() as cursor:
+        abandoned = _abandoned(cursor, data)
+    try:
+        for path in abandoned:
+            path.unlink()
+    except OSError as error:  # a disk that is read-only for now is no reason not to serve
+        logger.warning("%s cannot be removed: %s", error.filename, error.strerror)
+    if abandoned:
+        logger.warning("Removed %d files that ended processes left.", len(abandoned))
+    return len(abandoned)
 
 
 def mend(findings: list[Finding]) -> list[Finding]:
@@ -139,7 +193,7 @@ def mend(findings: list[Finding]) -> list[Finding]:
     """
     left = []
     for one in findings:
-        if one.kind in ("clouds.without_row", "terrains.without_row"):
+        if one.advice == _REMOVED:
             Path(one.place).unlink(missing_ok=True)
         elif one.kind == "permissions":
             Path(one.place).chmod(0o700)

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import asdict
 from pathlib import Path
-from tempfile import TemporaryDirectory
+from time import time
 from typing import Annotated
 
 import typer
@@ -30,10 +31,11 @@ def doctor(
     from spheremark.pipelines.errors import ConflictError
     from spheremark.storage import upkeep
 
+    begin = time()
     with _copy(data, url) as (database, folder, is_served):
         if mend and is_served:
             raise ConflictError("A service uses this data folder; stop it before --mend.")
-        found = upkeep.examine(database, folder)
+        found = upkeep.examine(database, folder, begin if is_served else math.inf)
     if mend:
         found = upkeep.mend(found)
     if as_json:
@@ -77,11 +79,12 @@ def _copy(data: Path | None, url: str | None) -> Iterator[tuple[Path, Path, bool
     """Yield a copy of the database, the data folder, and whether a service uses it."""
     from spheremark.pipelines.errors import ConflictError
     from spheremark.service.cli.source import Source
+    from spheremark.storage.scratch import scratch
 
     settings = read_settings(**({"data": data} if data else {}))
     folder = settings.data.resolve()
-    with TemporaryDirectory(prefix="spheremark-") as temporary:
-        copy = Path(temporary) / "results.duckdb"
+    with scratch() as temporary:
+        copy = temporary / "results.duckdb"
         try:
             Source(settings, url, folder=None if url else folder).export(copy, None, None)
             is_served = url is not None

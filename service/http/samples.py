@@ -10,7 +10,6 @@ import sys
 import threading
 from collections.abc import AsyncIterator, Iterator
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING
 
 from spheremark.pipelines.errors import SpheremarkError
@@ -18,6 +17,7 @@ from spheremark.service.http.uploads import take_in
 from spheremark.service.jobs.handlers import JobKind
 from spheremark.storage.imports.survey_files import parse_control, parse_truth
 from spheremark.storage.recordings import LogOptions
+from spheremark.storage.scratch import scratch
 
 if TYPE_CHECKING:
     from spheremark.service.http.state import Service
@@ -75,9 +75,9 @@ class Samples:
         from spheremark.service.http.api.models import NewJob
 
         try:
-            with TemporaryDirectory(prefix="spheremark-sample-") as folder:
-                for made in self._simulated(Path(folder)):
-                    recording = self._take_in(service, survey_id, Path(folder), made)
+            with scratch() as folder:
+                for made in self._simulated(folder):
+                    recording = self._take_in(service, survey_id, folder, made)
                     start(service, NewJob(survey=survey_id, recording=recording))
                     self._n_made += 1
             if self._n_made == len(_STOPS):

@@ -38,7 +38,7 @@ from typing import IO, Any, ClassVar, NoReturn
 import numpy as np
 from numpy.typing import NDArray
 
-from spheremark.pipelines.errors import InputError
+from spheremark.pipelines.errors import InputError, SpheremarkError
 from spheremark.storage.confinement import (
     enter_folder,
     forbid_files,
@@ -47,6 +47,7 @@ from spheremark.storage.confinement import (
     limit_resources,
     show_file,
 )
+from spheremark.storage.scratch import scratch
 
 Result = dict[str, Any]
 Reader = Callable[..., Mapping[str, Any]]
@@ -84,6 +85,12 @@ class UnreadableFileError(InputError):
     """A foreign file cannot be read within the limits."""
 
     code: ClassVar[str] = "input.unreadable"
+
+
+class ReaderEndedError(SpheremarkError):
+    """The service ends, and with it the reading of a foreign file."""
+
+    code: ClassVar[str] = "reader_ended"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -138,6 +145,8 @@ def run_confined(
         If the reader refuses the file; of the class that it raised.
     UnreadableFileError
         If the reader fails, crashes, or exceeds a limit.
+    ReaderEndedError
+        If it was ended by ``end_children``, which is no fault of the file.
 
     Notes
     -----
@@ -148,13 +157,17 @@ def run_confined(
         opened = stack.enter_context(file.open("rb")) if isinstance(file, Path) else file
         result, log = stack.enter_context(_memory_file()), stack.enter_context(_memory_file())
         files = (opened, result, log)
+        n_ended = _FORKS.n_ended
         with _AT_ONCE:
             if reader.partition(":")[0] == READY:
-                folder = stack.enter_context(tempfile.TemporaryDirectory(prefix="spheremark-"))
+                folder = stack.enter_context(scratch())
                 path = str(file.resolve()) if isinstance(file, Path) else ""
-                code = _wait_for_fork({**request, "path": path, "folder": folder}, files, limits)
+                more = {"path": path, "folder": str(folder)}
+                code = _wait_for_fork(request | more, files, limits)
             else:
                 code = _wait_for_child(json.dumps(request), files, limits)
+        if code < 0 and _FORKS.n_ended != n_ended:
+            raise ReaderEndedError(f"The service ended while it read {name}; it is read again.")
         if code:
             raise UnreadableFileError(_reason(code, log, limits, name))
         return _result(result, limits, name)
@@ -168,10 +181,10 @@ def start_readers() -> None:
 
 def end_children() -> None:
     """End all readers that run, as at the end of the service."""
+    _FORKS.end()
     for child in tuple(_CHILDREN):
         with suppress(ProcessLookupError):
             os.killpg(child.pid, signal.SIGKILL)
-    _FORKS.end()
 
 
 def _memory_file() -> IO[bytes]:
@@ -236,6 +249,7 @@ class _Forks:
         self._lock = threading.Lock()
         self._process: subprocess.Popen[bytes] | None = None
         self._socket: socket.socket | None = None
+        self.n_ended = 0
 
     def start(self) -> socket.socket:
         """Return the socket of the process, which is started anew if it has ended."""
@@ -270,6 +284,7 @@ class _Forks:
 
     def end(self) -> None:
         """End the process and its children."""
+        self.n_ended += 1
         with self._lock:
             if self._socket is not None and self._process is not None:
                 self._socket.close()

@@ -1,6 +1,5 @@
 """A site over HTTP and on the command line: clouds, ground, and the page that shows them."""
 
-import fcntl
 import json
 
 import laspy
@@ -12,7 +11,6 @@ from typer.testing import CliRunner
 from spheremark.pipelines.errors import SpheremarkError
 from spheremark.pipelines.ground_model import StationPose
 from spheremark.service.cli.main import app
-from spheremark.service.jobs.handlers.sites import scratch
 from spheremark.service.jobs.site import SiteRequest, make_site
 from spheremark.storage.exports.ground_model import read_geotiff
 from spheremark.storage.recordings import read_log, write_log
@@ -176,19 +174,6 @@ def test_lengths_that_nobody_can_mean_are_refused_by_name(site, options):
     answer = site.client.post("/api/v1/jobs", json=wanted)
     assert answer.status_code == 422
     assert answer.json()["errors"][0]["field"] == f"options.{next(iter(options))}"
-
-
-def test_what_an_ended_worker_left_is_removed_and_what_is_in_use_is_not(tmp_path, monkeypatch):
-    monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
-    for name in ("spheremark-site-left", "spheremark-site-used", "another"):
-        (tmp_path / name).mkdir()
-        (tmp_path / name / "in-use").touch()
-    with (tmp_path / "spheremark-site-used" / "in-use").open() as lock:
-        fcntl.flock(lock, fcntl.LOCK_EX)
-        with scratch() as folder:
-            found = {path.name for path in tmp_path.iterdir()}
-    assert found == {"spheremark-site-used", "another", folder.name}
-    assert not folder.exists()
 
 
 @pytest.mark.slow

@@ -11,6 +11,7 @@ from spheremark.pipelines.errors import InputError, TruncatedRecordingError
 from spheremark.storage.imports import confined
 from spheremark.storage.imports.confined import (
     Limits,
+    ReaderEndedError,
     UnreadableFileError,
     end_children,
     run_confined,
@@ -129,7 +130,7 @@ def test_the_end_of_the_service_ends_readers(run):
         while not begun():
             assert not future.done()
         end_children()
-        with pytest.raises(UnreadableFileError, match="SIGKILL"):
+        with pytest.raises(ReaderEndedError, match="it is read again"):  # no fault of the file
             future.result(timeout=60)
 
 

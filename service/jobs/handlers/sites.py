@@ -5,15 +5,11 @@ Poses are those of the survey's chosen solution.
 
 from __future__ import annotations
 
-import fcntl
 import hashlib
 import json
-import shutil
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager, suppress
 from datetime import UTC, datetime
 from pathlib import Path
-from tempfile import TemporaryDirectory, gettempdir
 from typing import TYPE_CHECKING, Any
 
 from pydantic import Field
@@ -33,8 +29,6 @@ if TYPE_CHECKING:
 
 Row = dict[str, Any]
 Key = tuple[str, str]  # recording and stop
-
-_SCRATCH, _IN_USE = "spheremark-site-", "in-use"  # names of folders, and of the file that is locked
 
 _POSES = """
 SELECT c.recording_id, stop, c.rig_digest, x_m, y_m, z_m, rotation, cov_motion, adjustment_id,
@@ -83,7 +77,9 @@ def handle(spec: JobSpecification, progress: Progress) -> JobResult:
     from spheremark.service.jobs.site import ENDINGS, KINDS, make_site
     from spheremark.storage.catalogue.schema import tables_of
     from spheremark.storage.files import keep_file
+    from spheremark.storage.scratch import remove_abandoned, scratch
 
+    remove_abandoned()
     own = {key: spec.options[key] for key in SiteOptions.model_fields if key in spec.options}
     options = SiteOptions.model_validate(own).model_dump()
     rows = {(row["recording_id"], row["stop"]): row for row in spec.known["poses"].to_pylist()}
@@ -100,18 +96,6 @@ def handle(spec: JobSpecification, progress: Progress) -> JobResult:
     missing = [log.name for log in spec.logs if log.recording_id not in found]
     rows_made = tables_of(("site_products",), {"site_products": made})
     return JobResult(tables=rows_made, message=_summary(made, missing))
-
-
-@contextmanager
-def scratch() -> Iterator[Path]:
-    """Yield a folder; remove those of workers that were ended before they could do so."""
-    for left in Path(gettempdir()).glob(f"{_SCRATCH}*"):
-        with suppress(OSError), (left / _IN_USE).open() as lock:
-            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)  # refused while its owner lives
-            shutil.rmtree(left)
-    with TemporaryDirectory(prefix=_SCRATCH) as folder, (Path(folder) / _IN_USE).open("w") as lock:
-        fcntl.flock(lock, fcntl.LOCK_EX)
-        yield Path(folder)
 
 
 def _poses(spec: JobSpecification, rows: Mapping[Key, Row]) -> dict[Key, StationPose]:
