@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import asyncio
 import logging
-import os
 import secrets
 import traceback
 from collections import Counter
@@ -23,6 +22,7 @@ from typing import Any, Self, TypeVar
 import dask
 from distributed import Client, Future, LocalCluster, Security
 from distributed.client import FutureCancelledError
+from distributed.core import Status
 from distributed.scheduler import KilledWorker
 
 from spheremark.pipelines.config import SurveyConfig
@@ -58,6 +58,8 @@ _PARTING = 10.0  # [s] that a scheduler has to answer
 _SCHEDULER_LOST = "scheduler-connection-lost"  # as Dask gives it for a reason
 _LOST = (OSError, TimeoutError, RuntimeError, ValueError)  # what Dask raises without a scheduler
 _GRACE = 1.0  # [s] that a dismissed job has to stop between two steps
+_RESTART = "60s"  # that a worker has to start again in, loading its modules on a busy machine
+_GIVEN_UP = (Status.closed, Status.failed)  # of what starts a worker again where it dies
 
 
 @dataclass(slots=True)
@@ -103,6 +105,7 @@ class JobQueue:
         self._events_in: asyncio.Queue[dict[str, Any]] = asyncio.Queue()
         self._stack = AsyncExitStack()
         self._cluster = AsyncExitStack()
+        self._own: LocalCluster | None = None
         self._connecting = asyncio.Lock()
 
     async def __aenter__(self) -> Self:
@@ -135,13 +138,14 @@ class JobQueue:
                         "distributed.scheduler.allowed-failures": self._settings.job_attempts - 1,
                         # one task per worker: a worker that dies takes no waiting job with it
                         "distributed.scheduler.worker-saturation": 1.0,
+                        "distributed.deploy.lost-worker-timeout": _RESTART,
                         # no pages of Dask
                         "distributed.scheduler.http.routes": [],
                         "distributed.worker.http.routes": [],
                     }
                 )
             )
-            address = await self._cluster.enter_async_context(
+            address = self._own = await self._cluster.enter_async_context(
                 LocalCluster(
                     n_workers=self._settings.workers,
                     threads_per_worker=1,
@@ -196,10 +200,21 @@ class JobQueue:
             try:
                 known = await asyncio.wait_for(client.scheduler.identity(n_workers=-1), _PARTING)
                 self._n_workers = len(known["workers"])
+                self._replace_workers()
             except _LOST:
                 if client.status != "running":
                     await self._reconnect(client)
             await asyncio.sleep(_COUNT_EVERY)
+
+    def _replace_workers(self) -> None:
+        """Start workers in place of those that could not start again, which Dask forgets."""
+        if self._own is None or self._n_workers >= self._settings.workers:
+            return
+        for name, nanny in tuple(self._own.workers.items()):
+            if nanny.status in _GIVEN_UP:
+                logger.warning("Starting a worker in place of one that could not start again.")
+                del self._own.workers[name]
+        self._own.scale(self._settings.workers)
 
     def submit(self, job: JobRecord) -> None:
         """Submit an accepted job to the cluster; may be called from any thread."""
@@ -221,8 +236,11 @@ class JobQueue:
         with suppress(asyncio.TimeoutError):
             await asyncio.wait_for(live.stopped.wait(), _GRACE)
             return
+        if live.future is None:
+            return
         logger.warning("Ending a worker", extra={"job": live.job.job_id, "worker": live.worker})
-        await self._client.run(os._exit, 1, workers=[live.worker], on_error="ignore")
+        arguments = {"workers": [live.worker], "on_error": "ignore"}
+        await self._client.run(tasks.end_worker, live.future.key, **arguments)
 
     def _start(self, job: JobRecord) -> None:
         """Follow a job from here to its end; surveys take turns, however many jobs each has."""

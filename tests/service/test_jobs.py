@@ -14,6 +14,7 @@ from distributed.comm import connect
 from fastapi.testclient import TestClient
 
 from spheremark.service.http.app import create_app
+from spheremark.service.jobs.worker import end_worker
 from spheremark.service.settings import Settings
 from spheremark.storage.recordings import read_log, write_log
 
@@ -175,6 +176,41 @@ def test_a_job_whose_worker_dies_is_tried_again(site):
     assert len(runs) == 1
 
 
+def on_loop(site, function, *arguments):
+    """Await what a function returns, on the event loop of the service."""
+
+    async def awaited():
+        return await function(*arguments)
+
+    jobs = site.client.app.state.service.jobs
+    return asyncio.run_coroutine_threadsafe(awaited(), jobs._loop).result(60)
+
+
+def test_a_worker_that_could_not_start_again_is_replaced(site):
+    """As Dask gives up one that needs too long for it on a busy machine."""
+    site.survey("given up")
+    recording = site.upload().json()["recording_id"]
+    jobs = site.client.app.state.service.jobs
+    before = {worker.pid for worker in site.workers()}
+    for nanny in tuple(jobs._own.workers.values()):
+        on_loop(site, nanny.close)
+    new = {"survey": "given up", "recording": recording}
+    job = site.client.post("/api/v1/jobs", json=new).json()["job_id"]
+    assert site.ended(job)["status"] == "successful"
+    assert before.isdisjoint(worker.pid for worker in site.workers())
+
+
+def test_the_end_of_a_dismissed_job_does_not_end_the_job_after_it(site):
+    site.survey("next")
+    new = {"survey": "next", "recording": site.upload().json()["recording_id"]}
+    job = site.client.post("/api/v1/jobs", json=new).json()["job_id"]
+    site.begun(job)
+    jobs = site.client.app.state.service.jobs
+    on_loop(site, jobs._client.run, end_worker, "a job that has stopped")
+    ended = site.ended(job)
+    assert (ended["status"], ended["attempts"]) == ("successful", 1)
+
+
 def test_surveys_take_turns_however_many_jobs_each_has(site):
     recording = site.upload().json()["recording_id"]
     site.survey("many")
@@ -217,9 +253,14 @@ def test_jobs_are_taken_up_again_after_a_restart(tmp_path, stop, control, open_s
         site.survey("restart")
         recording = site.upload().json()["recording_id"]
         new = {"survey": "restart", "recording": recording}
-        jobs = [client.post("/api/v1/jobs", json=new).json()["job_id"] for _ in range(2)]
+        keys = [{"Idempotency-Key": f"k{i}"} for i in range(2)]
+        jobs = [client.post("/api/v1/jobs", json=new, headers=key).json()["job_id"] for key in keys]
     with service() as client:
         site = open_site(client, stop, control)
+        again = [
+            client.post("/api/v1/jobs", json=new, headers=key).json()["job_id"] for key in keys
+        ]
+        assert again == jobs
         assert [site.ended(job)["status"] for job in jobs] == ["successful"] * 2
         runs = client.get("/api/v1/runs", params={"survey": "restart"}).json()["items"]
         assert {run["job_id"] for run in runs} == set(jobs)
