@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import asyncio
+import contextvars
 import threading
-from collections.abc import AsyncIterator
+from collections.abc import AsyncIterator, Callable
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import asynccontextmanager, suppress
 from dataclasses import dataclass, field
 from importlib import import_module
-from typing import Annotated, Any
+from typing import Annotated, Any, TypeVar
 
 from fastapi import Depends, Request
 
@@ -23,8 +25,11 @@ from spheremark.service.planning.searches import Searches
 from spheremark.service.settings import Settings
 from spheremark.storage.catalogue.catalogue import Catalogue
 from spheremark.storage.imports.confined import end_children, start_readers
+from spheremark.storage.scratch import remove_abandoned as remove_scratch
+from spheremark.storage.upkeep import remove_abandoned
 
 _PLANS = 2  # that are computed at once
+_Result = TypeVar("_Result")
 
 
 @dataclass(frozen=True, slots=True)
@@ -43,8 +48,17 @@ class Service:
     readers: Places = field(default_factory=lambda: Places("foreign files", 2, 8))
     queries: Places = field(default_factory=lambda: Places("queries", 4, 12))
     plans: Places = field(default_factory=lambda: Places("plans", _PLANS, 6))
+    arrivals: ThreadPoolExecutor = field(default_factory=lambda: ThreadPoolExecutor(2, "arrivals"))
     samples: Samples = field(default_factory=Samples)
     keys: threading.Lock = field(default_factory=threading.Lock)  # of requests that must be one
+
+    async def inspect(self, function: Callable[..., _Result], *arguments: Any) -> _Result:
+        """Return what a function returns that inspects a log which has arrived.
+
+        On threads of its own: logs whose reading takes long keep nothing waiting but each other.
+        """
+        loop, context = asyncio.get_running_loop(), contextvars.copy_context()
+        return await loop.run_in_executor(self.arrivals, context.run, function, *arguments)
 
     def row(self, sql: str, key: str, what: str) -> dict[str, Any]:
         """Return the row of a query that takes ``$id``; NotFoundError without one."""
@@ -63,13 +77,14 @@ async def opened(settings: Settings) -> AsyncIterator[Service]:
     data = settings.data
     data.mkdir(parents=True, exist_ok=True)
     data.chmod(0o700)  # nobody else's: logs, results and digests of tokens
-    inbox, terrains = (
-        Inbox(data / name, settings.min_free_bytes) for name in ("recordings", "terrains")
-    )
+    inbox = Inbox(data / "recordings", settings.min_free_bytes, settings.quota_bytes)
+    terrains = Inbox(data / "terrains", settings.min_free_bytes)
     uploads = Resumable(inbox)
-    for one in (inbox, terrains, uploads):
-        one.open()
     with Catalogue(settings.database, snapshots=settings.snapshots) as catalogue:
+        for one in (inbox, terrains, uploads):  # by the owner of the database alone
+            one.open()
+        remove_scratch()
+        await asyncio.to_thread(remove_abandoned, catalogue, data)
         async with JobQueue(settings, catalogue, data / "clouds") as jobs:
             threading.Thread(target=_warm_up, name="warm-up", daemon=True).start()
             await asyncio.to_thread(adopt_orphans, catalogue, inbox)
@@ -94,7 +109,9 @@ async def opened(settings: Settings) -> AsyncIterator[Service]:
                 await asyncio.to_thread(service.samples.close)
                 for places in (service.readers, service.queries, service.plans):
                     places.close()
+                service.arrivals.shutdown(wait=False, cancel_futures=True)
                 end_children()
+                await asyncio.to_thread(service.arrivals.shutdown)  # no row after the database
                 await asyncio.to_thread(predictions.close)
                 await asyncio.to_thread(searching.close)
 

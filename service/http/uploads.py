@@ -18,7 +18,7 @@ import secrets
 import tempfile
 import time
 from collections.abc import AsyncIterator, Callable, Mapping
-from contextlib import asynccontextmanager, closing, contextmanager
+from contextlib import asynccontextmanager, closing, contextmanager, suppress
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import IO, Any, ClassVar
@@ -32,6 +32,7 @@ from spheremark.service.errors import (
     EmptyBodyError,
     LockedError,
     OffsetError,
+    QuotaError,
     RefusedRecordingError,
     TooLargeError,
 )
@@ -49,6 +50,7 @@ _ENDING = re.compile(r"\.(mcap|db3|bag|pcap|pcapng|zip)$", re.IGNORECASE)
 _BLOCK = 4 << 20  # [bytes] hashed and written at once; large enough that a thread pays off
 _KEPT_SECONDS = 7 * 24 * 3600.0  # until an upload that is not resumed is removed
 _DIGEST = re.compile(r"(?:^|,)\s*sha-256=:([A-Za-z0-9+/=]+):")
+_RESUMABLE = "resumable"  # name of a folder
 _NAME = re.compile(rf"([0-9a-f]{{64}}){re.escape(LOG)}")
 
 
@@ -68,11 +70,16 @@ class Received:
 
 
 class Inbox:
-    """A folder of files named by digest, and the files that are still being written beside it."""
+    """A folder of files named by digest, and the files that are still being written beside it.
 
-    def __init__(self, folder: Path, min_free: int = 0) -> None:
+    ``min_free`` is what must stay free on the disk [bytes]; ``quota`` is what all files may take,
+    those being written included [bytes], and 0 for no limit.
+    """
+
+    def __init__(self, folder: Path, min_free: int = 0, quota: int = 0) -> None:
         self.folder = folder
         self.min_free = min_free
+        self.quota = quota
         self.partial = folder / ".partial"
 
     def open(self) -> None:
@@ -98,8 +105,23 @@ class Inbox:
             return replace(part, path=await asyncio.to_thread(self.keep, part, LOG))
 
     def require_room(self, n_bytes: int) -> None:
-        """Refuse a file of so many bytes where too little would be left for the database."""
+        """Refuse so many bytes where too little would be free for the database, or beyond quota."""
         require_free(self.folder, n_bytes + self.min_free)
+        if self.quota and n_bytes and (used := self._used()) + n_bytes > self.quota:
+            raise QuotaError(
+                f"All logs take {used:,} bytes, unfinished uploads included; {n_bytes:,} more "
+                f"exceed the {self.quota:,} that they may take (SPHEREMARK_QUOTA_BYTES)."
+            )
+
+    def _used(self) -> int:
+        """Return what all files take [bytes]."""
+        n_bytes = 0
+        for folder in (self.folder, self.partial, self.partial / _RESUMABLE):
+            for one in folder.glob("*"):
+                with suppress(FileNotFoundError):  # named or removed in the meantime
+                    is_log = one.suffix != ".json" and one.is_file()
+                    n_bytes += one.stat().st_size if is_log else 0
+        return n_bytes
 
     @asynccontextmanager
     async def received(
@@ -164,7 +186,7 @@ class Inbox:
         size = 0
 
         def put(data: bytearray) -> None:
-            require_free(self.folder, self.min_free)
+            self.require_room(len(data))
             with _translated(self.folder):
                 add(bytes(data))
 
@@ -241,7 +263,7 @@ class Resumable:
 
     def __init__(self, inbox: Inbox) -> None:
         self._inbox = inbox
-        self._folder = inbox.partial / "resumable"
+        self._folder = inbox.partial / _RESUMABLE
         self._progress: dict[str, _Progress] = {}
         self._busy: set[str] = set()
 
@@ -388,11 +410,13 @@ def enter(
 ) -> tuple[RecordingRecord, bool]:
     """Enter a log that arrived, with its preflight; return it, and whether it is new.
 
-    One that was here already is inspected again if it is to be read in another way.
+    One that was here already is inspected again if it was refused, perhaps only because its reader
+    was ended, or if it is to be read in another way.
     """
     try:
         known = catalogue.get_recording(received.digest)
-        if options is None or known.preflight.get("reading", {}) == options.to_mapping():
+        is_as_before = options is None or known.preflight.get("reading", {}) == options.to_mapping()
+        if is_as_before and known.verdict != "refused":
             return known, False
         found = inspect_upload(received.path, options).to_mapping()
         return catalogue.inspect_again(received.digest, found), False

@@ -211,16 +211,20 @@ class Victim:
         }
         return {key: value for key, value in found.items() if value}, about
 
+    def stop(self):
+        """End it as a supervisor does."""
+        self.process.terminate()
+        self.process.wait(60)
+
     def doctor(self):
-        """Return what the command finds wrong beyond what it mends: files of ended workers."""
-        for command in ("--mend",), ():
-            done = subprocess.run(
-                [*COMMAND, "doctor", *command],
-                env={**os.environ, "SPHEREMARK_DATA": str(self.folder)},
-                capture_output=True,
-                text=True,
-                check=False,
-            )
+        """Return what the command finds wrong."""
+        done = subprocess.run(
+            [*COMMAND, "doctor"],
+            env={**os.environ, "SPHEREMARK_DATA": str(self.folder)},
+            capture_output=True,
+            text=True,
+            check=False,
+        )
         return {} if done.returncode == 0 else {"doctor": done.stdout + done.stderr}
 
 
@@ -273,8 +277,9 @@ def run(folder, log, control, *, rounds, seed, until=math.inf, show=lambda _: No
         faults, about = victim.audit(client)
     finally:
         client.close()
-        victim.process.terminate()
-        victim.process.wait(60)
+        victim.stop()
+    victim.start().close()  # removes what killed workers have left
+    victim.stop()
     if alive := [one for one in left if one.is_running()]:
         faults["processes left"] = [" ".join(one.cmdline()) for one in alive]
     return faults | victim.doctor(), {"rounds": victim.round} | about

@@ -4,11 +4,14 @@ import base64
 import hashlib
 import os
 import subprocess
+import threading
+import time
 from pathlib import Path
 
 import pytest
 from fastapi.testclient import TestClient
 
+from spheremark.pipelines.errors import ConflictError
 from spheremark.service.http.app import create_app
 from spheremark.service.settings import Settings
 from spheremark.storage.files import free_bytes
@@ -160,12 +163,15 @@ def test_files_without_rows_are_entered_at_the_next_start_and_damaged_ones_put_a
     cut = hashlib.sha256(b"whole").hexdigest()
     (folder / f"{cut}.mcap").write_bytes(b"who")
     (folder / ".partial" / "left").write_bytes(b"x")
+    (tmp_path / "clouds").mkdir(exist_ok=True)
+    (tmp_path / "clouds" / "run0.mcap").write_bytes(b"results of a worker that was killed")
     with TestClient(create_app(settings), base_url="http://127.0.0.1:8000") as client:
         (found,) = client.get("/api/v1/recordings").json()["items"]
         assert (found["recording_id"], found["verdict"]) == (digest, "ok")
         assert found["name"] == f"recovered-{digest[:8]}"
     assert (folder / ".damaged" / f"{cut}.mcap").read_bytes() == b"who"
     assert not (folder / ".partial" / "left").exists()
+    assert list((tmp_path / "clouds").iterdir()) == []
 
 
 def test_no_upload_is_accepted_that_leaves_too_little_free_space(tmp_path, log):
@@ -184,8 +190,56 @@ def test_logs_take_no_more_space_than_their_quota(tmp_path, log):
     with TestClient(create_app(settings), base_url="http://127.0.0.1:8000") as client:
         first = client.post("/api/v1/recordings?name=a", content=log, headers=MCAP)
         assert first.status_code == 201
-        answer = client.post("/api/v1/recordings?name=b", content=b"x" * 100, headers=MCAP)
+        for body in (b"x" * 100, iter([b"x" * 100])):  # of a length that is declared, and is not
+            answer = client.post("/api/v1/recordings?name=b", content=body, headers=MCAP)
+            assert (answer.status_code, answer.json()["code"]) == (507, "storage.quota")
+        headers = TUS | {"Upload-Length": "100"}
+        answer = client.post("/api/v1/uploads", headers=headers)
         assert (answer.status_code, answer.json()["code"]) == (507, "storage.quota")
+    assert [path.name for path in (tmp_path / "recordings" / ".partial").iterdir()] == ["resumable"]
+
+
+def test_uploads_that_were_begun_together_take_no_more_than_the_quota(tmp_path, log, open_site):
+    settings = Settings(data=tmp_path, workers=1, quota_bytes=len(log) + 10)
+    with TestClient(create_app(settings), base_url="http://127.0.0.1:8000") as client:
+        site = open_site(client, None, "")
+        first, second = begin(site, log), begin(site, log)
+        assert send(site, first, log[:100], 0).status_code == 204
+        refused = send(site, second, log, 0)
+        assert (refused.status_code, refused.json()["code"]) == (507, "storage.quota")
+        assert client.head(second, headers=TUS).headers["upload-offset"] == "0"
+        assert client.delete(second, headers=TUS).status_code == 204
+        assert send(site, first, log[100:], 100).status_code == 204
+
+
+def test_a_second_service_on_the_same_folder_leaves_uploads_alone(tmp_path):
+    settings = Settings(data=tmp_path, workers=1)
+    with TestClient(create_app(settings), base_url="http://127.0.0.1:8000") as client:
+        arriving = tmp_path / "recordings" / ".partial" / "arriving"
+        arriving.write_bytes(b"x")
+        with pytest.raises(ConflictError), TestClient(create_app(settings)):
+            pass
+        assert arriving.exists()
+        assert client.get("/healthz").status_code == 200
+
+
+def test_a_log_whose_reader_was_ended_with_the_service_is_read_again(tmp_path, log):
+    settings = Settings(data=tmp_path, workers=1)
+
+    def arrives(client):
+        client.post("/api/v1/recordings?name=a", content=log, headers=MCAP)
+
+    app, address = create_app(settings), "http://127.0.0.1:8000"
+    with TestClient(app, base_url=address, raise_server_exceptions=False) as client:
+        folder = tmp_path / "recordings"
+        thread = threading.Thread(target=arrives, args=[client])
+        thread.start()
+        while not list(folder.glob("*.mcap")):
+            time.sleep(0.0005)
+    thread.join()
+    with TestClient(create_app(settings), base_url="http://127.0.0.1:8000") as client:
+        (found,) = client.get("/api/v1/recordings").json()["items"]
+        assert found["verdict"] == "ok"
 
 
 def test_a_disk_that_fills_while_a_log_arrives_refuses_it_and_serves_on(tmp_path):

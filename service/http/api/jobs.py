@@ -7,7 +7,8 @@ import json
 from collections.abc import AsyncIterator
 from typing import Annotated, Any
 
-from fastapi import APIRouter, Depends, Header, Path, Query, Response
+from fastapi import APIRouter, Depends, Header, Path, Query, Request, Response
+from fastapi.concurrency import run_in_threadpool
 from fastapi.exceptions import RequestValidationError
 from fastapi.sse import EventSourceResponse, ServerSentEvent
 from pydantic import ValidationError
@@ -34,21 +35,29 @@ LastEvent = Annotated[int, Header(alias="Last-Event-ID", ge=0)]
 
 
 @router.post("", name="create_job", status_code=202)
-def create_job(
+async def create_job(
     new: NewJob,
+    request: Request,
     service: Current,
     response: Response,
     idempotency_key: Annotated[str | None, Header(min_length=1, max_length=200)] = None,
 ) -> Job:
     """Start a job; the same Idempotency-Key with the same request is the same job."""
-    job = start(service, new) if idempotency_key is None else _once(service, new, idempotency_key)
+    digest = hashlib.sha256(new.model_dump_json().encode()).hexdigest()
+    if isinstance(new.rig, dict):
+        rig = await service.readers.run(request, rig_of, json.dumps(new.rig))
+        kept = await run_in_threadpool(service.catalogue.put_rig, rig)
+        new = new.model_copy(update={"rig": kept})
+    if idempotency_key is None:
+        job = await run_in_threadpool(start, service, new)
+    else:
+        job = await run_in_threadpool(_once, service, new, idempotency_key, digest)
     response.headers["Location"] = f"/api/v1/jobs/{job.job_id}"
     return job
 
 
-def _once(service: Service, new: NewJob, key: str) -> Job:
-    """Start a job, or return the one that the same request with this key has started."""
-    request = hashlib.sha256(new.model_dump_json().encode()).hexdigest()
+def _once(service: Service, new: NewJob, key: str, request: str) -> Job:
+    """Start a job, or return the one that the request of this digest with this key has started."""
     with service.keys:
         known = service.catalogue.job_of_key(key)
         if known is None:
@@ -179,9 +188,7 @@ def _options(kind: Kind, new: NewJob) -> dict[str, Any]:
 
 def _rig(service: Service, new: NewJob, survey: SurveyRecord) -> dict[str, str]:
     """Return the rig that a job is to use, as an option; none for the one of each log."""
-    if isinstance(new.rig, dict):
-        return {"rig": service.catalogue.put_rig(rig_of(json.dumps(new.rig)))}
-    if new.rig is not None:
+    if isinstance(new.rig, str):
         return {"rig": rig_digest(service.catalogue.get_rig(new.rig))}
     if survey.rig_digest is None or not KINDS[new.kind].begins_with_rig_of_survey:
         return {}

@@ -10,7 +10,7 @@ from fastapi.responses import FileResponse
 from pydantic import Field
 
 from spheremark.pipelines.errors import InputError
-from spheremark.service.errors import MediaTypeError, QuotaError, TooLargeError
+from spheremark.service.errors import MediaTypeError, TooLargeError
 from spheremark.service.http.api.jobs import start
 from spheremark.service.http.api.models import Job, Listing, NewJob, Recording, Upload
 from spheremark.service.http.api.surveys import After, Limit
@@ -35,7 +35,6 @@ _MEDIA_TYPES = (
     "application/vnd.tcpdump.pcap",
     FORM,  # the files of a folder
 )
-_USED = "SELECT coalesce(sum(size_bytes), 0)::BIGINT AS used FROM recordings"
 _BODY = {
     "requestBody": {
         "required": True,
@@ -76,10 +75,8 @@ async def upload_recording(
     _check_upload(request, most)
     if query.process or survey is not None:
         await asyncio.to_thread(check_survey, service, survey)
-    declared = int(request.headers.get("content-length", "0"))
-    await asyncio.to_thread(check_quota, service, declared)
     received = await service.inbox.receive(request.stream(), most, request.headers)
-    recording, is_new = await asyncio.to_thread(
+    recording, is_new = await service.inspect(
         take_in, service.catalogue, received, query.name, options
     )
     response.status_code = 201 if is_new else 200
@@ -134,17 +131,6 @@ def _check_upload(request: Request, max_bytes: int) -> None:
     declared = request.headers.get("content-length", "")
     if declared.isdecimal() and int(declared) > max_bytes:
         raise TooLargeError(f"The log has {int(declared):,} bytes; {max_bytes:,} are accepted.")
-
-
-def check_quota(service: Service, n_bytes: int) -> None:
-    """Refuse a log with which all logs take more space than they may."""
-    quota = service.settings.quota_bytes
-    (row,) = service.catalogue.rows(_USED) if quota else ({"used": 0},)
-    if quota and row["used"] + n_bytes > quota:
-        raise QuotaError(
-            f"The log has {n_bytes:,} bytes; {max(0, quota - row['used']):,} of the "
-            f"{quota:,} for all logs are left (SPHEREMARK_QUOTA_BYTES)."
-        )
 
 
 def check_survey(service: Service, survey: str | None) -> str:

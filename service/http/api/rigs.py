@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from typing import Annotated
 
-from fastapi import APIRouter, Path, Response
+from fastapi import APIRouter, Path, Request, Response
+from fastapi.concurrency import run_in_threadpool
 
 from spheremark.service.http.api.models import StoredRig
 from spheremark.service.http.api.surveys import File, bodies
@@ -17,10 +18,10 @@ RigDigest = Annotated[str, Path(description="Digest of the rig.")]
 
 
 @router.post("", name="put_rig", status_code=201, openapi_extra=bodies("application/json"))
-def put_rig(file: File, service: Current, response: Response) -> StoredRig:
+async def put_rig(file: File, request: Request, service: Current, response: Response) -> StoredRig:
     """Keep a rig file (JSON), so that jobs can name it; the same rig twice is one."""
-    rig = rig_of(file.text)
-    digest = service.catalogue.put_rig(rig)
+    rig = await service.readers.run(request, rig_of, file.text)
+    digest = await run_in_threadpool(service.catalogue.put_rig, rig)
     response.headers["Location"] = f"/api/v1/rigs/{digest}"
     return StoredRig.of(rig)
 

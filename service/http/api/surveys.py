@@ -7,12 +7,13 @@ from typing import Annotated, Any, Literal
 
 import numpy as np
 from fastapi import APIRouter, Depends, Path, Query, Request, Response
+from fastapi.concurrency import run_in_threadpool
 from fastapi.exceptions import RequestValidationError
 from fastapi.responses import PlainTextResponse
 from pydantic import Field, ValidationError
 
 from spheremark.pipelines.errors import InputError, NotFoundError
-from spheremark.pipelines.model import ControlMarks
+from spheremark.pipelines.model import ControlMarks, Truth
 from spheremark.service.errors import EmptyBodyError, MediaTypeError
 from spheremark.service.http.api.models import (
     ChangedSurvey,
@@ -29,6 +30,7 @@ from spheremark.service.http.api.models import (
 )
 from spheremark.service.http.state import Current
 from spheremark.service.serialise.solution import plain_result, survey_result
+from spheremark.storage.catalogue.catalogue import Catalogue
 from spheremark.storage.imports.survey_files import ControlLayout, format_control
 from spheremark.storage.imports.uploads import control_of, truth_of
 
@@ -123,17 +125,16 @@ def get_survey(survey: Key, service: Current) -> Survey:
 @router.put(
     "/{survey}/control", name="put_control", openapi_extra=bodies("text/csv", "application/json")
 )
-def put_control(
-    survey: Key, file: File, layout: Annotated[Layout, Query()], service: Current
+async def put_control(
+    survey: Key,
+    file: File,
+    layout: Annotated[Layout, Query()],
+    request: Request,
+    service: Current,
 ) -> Control:
     """Give a survey its control marks, as CSV or JSON; a survey of that name is made if missing."""
-    marks = _read_control(file, layout)
-    try:
-        service.catalogue.get_survey(survey)
-    except NotFoundError:
-        service.catalogue.create_survey(survey)
-    service.catalogue.put_control_marks(survey, marks)
-    return Control.of(service.catalogue.control_marks(survey))
+    marks = await service.readers.run(request, _read_control, file, layout)
+    return await run_in_threadpool(_set_control, service.catalogue, survey, marks)
 
 
 @router.delete("/{survey}/control", name="delete_control")
@@ -144,9 +145,15 @@ def delete_control(survey: Key, service: Current) -> Survey:
 
 
 @router.post("/{survey}/control/preview", name="preview_control", openapi_extra=bodies("text/csv"))
-def preview_control(survey: Key, file: File, layout: Annotated[Layout, Query()]) -> Control:  # noqa: ARG001
+async def preview_control(
+    survey: Key,  # noqa: ARG001
+    file: File,
+    layout: Annotated[Layout, Query()],
+    request: Request,
+    service: Current,
+) -> Control:
     """Read control marks as PUT would, and store nothing; the survey need not exist."""
-    return Control.of(_read_control(file, layout))
+    return Control.of(await service.readers.run(request, _read_control, file, layout))
 
 
 @router.get(
@@ -213,12 +220,28 @@ def choose_rig(survey: Key, chosen: ChosenRig, service: Current) -> Survey:
 
 
 @router.put("/{survey}/truth", name="put_truth", openapi_extra=bodies("application/json"))
-def put_truth(survey: Key, file: File, service: Current) -> TruthSummary:
+async def put_truth(survey: Key, file: File, request: Request, service: Current) -> TruthSummary:
     """Give a survey its truth: for comparison only, no job ever sees it."""
-    service.catalogue.put_truth(survey, truth_of(file.text))
-    truth = service.catalogue.truth(survey)
+    truth = await service.readers.run(request, truth_of, file.text)
+    return await run_in_threadpool(_set_truth, service.catalogue, survey, truth)
+
+
+def _set_truth(catalogue: Catalogue, survey: str, given: Truth) -> TruthSummary:
+    """Store the truth of a survey; return how much of it there is now."""
+    catalogue.put_truth(survey, given)
+    truth = catalogue.truth(survey)
     n_marks, n_stops = (len(truth.marks.names), len(truth.stops)) if truth else (0, 0)
     return TruthSummary(n_marks=n_marks, n_stops=n_stops)
+
+
+def _set_control(catalogue: Catalogue, survey: str, marks: ControlMarks) -> Control:
+    """Store the control marks of a survey, which is made if it is missing."""
+    try:
+        catalogue.get_survey(survey)
+    except NotFoundError:
+        catalogue.create_survey(survey)
+    catalogue.put_control_marks(survey, marks)
+    return Control.of(catalogue.control_marks(survey))
 
 
 def _read_control(file: Document, layout: Layout) -> ControlMarks:

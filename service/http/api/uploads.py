@@ -14,7 +14,7 @@ from pydantic import ValidationError
 
 from spheremark.pipelines.errors import InputError
 from spheremark.service.errors import MediaTypeError, TooLargeError, TusVersionError
-from spheremark.service.http.api.recordings import check_quota, check_survey, start_job
+from spheremark.service.http.api.recordings import check_survey, start_job
 from spheremark.service.http.state import Current, Service
 from spheremark.service.http.uploads import Received, Upload, enter
 from spheremark.service.jobs.handlers import Reading
@@ -124,7 +124,7 @@ async def create_upload(
         most = service.settings.max_upload_bytes
         raise TooLargeError(f"The log has {length:,} bytes; {most:,} are accepted.")
     about = _metadata(metadata)
-    await asyncio.to_thread(_check, service, length, about)
+    await asyncio.to_thread(_check, service, about)
     upload = await asyncio.to_thread(service.uploads.create, length, about)
     headers = {"Location": f"/api/v1/uploads/{upload.upload_id}", **_expiry(upload)}
     if request.headers.get("content-type", "") == PART:
@@ -195,7 +195,7 @@ async def _append(
     received = await service.uploads.append(upload, offset, request.stream(), _checksum(checksum))
     if received is None:
         return {"Upload-Offset": str(upload.offset), **_expiry(upload)}
-    headers = await asyncio.to_thread(_enter, service, received, upload.metadata)
+    headers = await service.inspect(_enter, service, received, upload.metadata)
     return {"Upload-Offset": str(upload.length), **headers}
 
 
@@ -212,10 +212,9 @@ def _enter(service: Service, received: Received, about: Mapping[str, str]) -> di
     return headers
 
 
-def _check(service: Service, length: int, about: Mapping[str, str]) -> None:
+def _check(service: Service, about: Mapping[str, str]) -> None:
     """Refuse an upload before its first byte."""
     _reading(about)
-    check_quota(service, length)
     if about.get("process") == "true" or "survey" in about:
         check_survey(service, about.get("survey"))
 
