@@ -104,14 +104,17 @@ if (!document.querySelector('form[action="/login"], [data-no-jobs]')) load();
 const again = document.querySelector("[data-reload]");
 if (again) setTimeout(() => location.reload(), 1000 * Number(again.dataset.reload));
 
-// A table that is wider than its panel can be scrolled from the keyboard.
-for (const place of document.querySelectorAll(".scroll")) {
-  if (place.scrollWidth <= place.clientWidth || place.tabIndex === 0) continue;
-  place.tabIndex = 0;
-  const named = place.closest("section, figure")?.querySelector("h2, h3")?.textContent;
-  place.setAttribute("role", "group"); // no landmark of its own
-  place.setAttribute("aria-label", `Table ${named ?? ""}, to be scrolled`);
-}
+// A table that is wider than its panel, now or in a narrower window, can be scrolled by keyboard.
+const widths = new ResizeObserver((entries) => {
+  for (const { target: place } of entries) {
+    if (place.scrollWidth <= place.clientWidth || place.tabIndex === 0) continue;
+    place.tabIndex = 0;
+    const named = place.closest("section, figure")?.querySelector("h2, h3")?.textContent;
+    place.setAttribute("role", "group"); // no landmark of its own
+    place.setAttribute("aria-label", `Table ${named ?? ""}, to be scrolled`);
+  }
+});
+for (const place of document.querySelectorAll(".scroll")) widths.observe(place);
 
 // Of tabs that do not fit, the present one is in sight
 document.querySelector(".tabs [aria-current]")?.scrollIntoView({ block: "nearest", inline: "center" });
