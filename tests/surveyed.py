@@ -54,11 +54,11 @@ def marks(n=14):
     return ControlMarks(names=names, p_site=p, cov_p_site=np.tile(1e-6 * np.eye(3), (n, 1, 1)))
 
 
-def stop(name, p_site, control, rng):
+def stop(name, p_site, control, rng, n_ground=4000):
     """Return one stop as the pipeline would give it, and its truth."""
     truth = StopTruth(name=name, T_site_base=rigid(rot_z(0.3), p_site))
     centres = transform(inverse(truth.T_site_base), control.p_site)
-    members, cloud = _cloud(name, centres, rng)
+    members, cloud = _cloud(name, centres, rng, n_ground)
     fits = {method: _fits(method, centres, members, cloud, rng) for method in NOISE}
     fixes = {(m, "free_station"): _fix(truth, control, fits[m], rng) for m in fits}
     subsets = {(m, "free_station"): _subsets(truth, centres, m, rng) for m in fits}
@@ -79,9 +79,9 @@ def stop(name, p_site, control, rng):
     return result, truth
 
 
-def _cloud(name, centres, rng):
+def _cloud(name, centres, rng, n_ground):
     """Return a flat ground and spheres seen from the origin, and which returns are whose."""
-    ground = np.column_stack([rng.uniform(-14, 14, (4000, 2)), np.full(4000, -1.0)])
+    ground = np.column_stack([rng.uniform(-14, 14, (n_ground, 2)), np.full(n_ground, -1.0)])
     points, members = [ground], []
     for centre in centres:
         n = int(6000 / (centre @ centre))
@@ -202,6 +202,7 @@ def fill(
     lane="lane3",
     at=NOW,
     all_called=None,
+    n_ground=4000,
 ):
     """Put a survey with a lane of stops into a catalogue, one job for each."""
     rng, control = np.random.default_rng(7), marks()
@@ -209,7 +210,7 @@ def fill(
     catalogue.put_control_marks(name, control)
     places = np.column_stack([np.linspace(-4, 4, n_stops), np.full((n_stops, 2), [0.4, 1.1])])
     names = [all_called or f"{lane}-stop{i + 1}" for i in range(n_stops)]
-    stops = [stop(*named, control, rng) for named in zip(names, places, strict=True)]
+    stops = [stop(*named, control, rng, n_ground) for named in zip(names, places, strict=True)]
     if with_truth:
         poses = tuple(pose for _, pose in stops)
         catalogue.put_truth(name, Truth(marks=control, stops=poses, rig=None))
@@ -239,5 +240,7 @@ def _finish(catalogue, folder, survey_id, moment, result, control):
         finished_at=moment,
         duration=2.5,
     )
-    clouds = {result.name: write_cloud(result, str(folder), n_max=3000)}
+    n = len(result.cloud.p_base)
+    n_max = n if n > 10**6 else 3000
+    clouds = {result.name: write_cloud(result, str(folder), n_max=n_max)}
     catalogue.finish_job(job.job_id, tables(run, (result,), marks=control, clouds=clouds))

@@ -1,16 +1,10 @@
 """One service and one browser for all tests of this folder."""
 
-import threading
-import time
-
 import pytest
-import uvicorn
 from playwright.sync_api import sync_playwright
 
-from spheremark.service.http.app import create_app
-from spheremark.service.settings import Settings
 from spheremark.storage.catalogue.catalogue import Catalogue
-from tests.browser.visits import CHROMIUM, Visit
+from tests.browser.visits import CHROMIUM, Visit, served
 from tests.surveyed import fill
 
 
@@ -20,16 +14,8 @@ def address(tmp_path_factory):
     with Catalogue(data / "spheremark.duckdb", snapshots=data / "snapshots") as catalogue:
         fill(catalogue, data / "clouds", "field", n_stops=2)
         fill(catalogue, data / "clouds", "blind", n_stops=1, with_truth=False, lane="a")
-    app = create_app(Settings(data=data, workers=1))
-    server = uvicorn.Server(uvicorn.Config(app, port=0, log_level="error"))
-    thread = threading.Thread(target=server.run)
-    thread.start()
-    while not server.started:
-        assert thread.is_alive(), "The service did not start."
-        time.sleep(0.05)
-    yield f"http://127.0.0.1:{server.servers[0].sockets[0].getsockname()[1]}"
-    server.should_exit = True
-    thread.join(timeout=120)
+    with served(data) as address:
+        yield address
 
 
 @pytest.fixture(scope="package")

@@ -2,8 +2,15 @@
 
 import re
 import shutil
+import threading
+import time
+from contextlib import contextmanager
 
 import pytest
+import uvicorn
+
+from spheremark.service.http.app import create_app
+from spheremark.service.settings import Settings
 
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser")
 NEEDS_CHROMIUM = pytest.mark.skipif(
@@ -37,6 +44,21 @@ PAGES = [
     "/sql?q=SELECT+stop%2C+x_m%2C+y_m+FROM+latest_station_fixes+ORDER+BY+ALL",
 ]
 HARMLESS = re.compile("GPU stall|willReadFrequently|GroupMarkerNotSet")  # no GPU in a test
+
+
+@contextmanager
+def served(data):
+    """Serve a data folder, and give the address."""
+    app = create_app(Settings(data=data, workers=1))
+    server = uvicorn.Server(uvicorn.Config(app, port=0, log_level="error"))
+    thread = threading.Thread(target=server.run)
+    thread.start()
+    while not server.started:
+        assert thread.is_alive(), "The service did not start."
+        time.sleep(0.05)
+    yield f"http://127.0.0.1:{server.servers[0].sockets[0].getsockname()[1]}"
+    server.should_exit = True
+    thread.join(timeout=120)
 
 
 class Visit:

@@ -421,7 +421,7 @@ async function open() {
   const n = clouds.reduce((sum, one) => sum + (one.index?.n_points ?? 0), 0);
   const of = facts.n_stops > facts.stops.length ? ` of ${facts.n_stops}` : "";
   byId("cloud-about").textContent =
-    `${facts.stops.length}${of} stop${facts.stops.length === 1 ? "" : "s"}, ${n.toLocaleString("en")} points; poses: ${facts.poses}`;
+    `${facts.stops.length}${of} stop${facts.n_stops === 1 ? "" : "s"}, ${n.toLocaleString("en")} points; poses: ${facts.poses}`;
   panel.dataset.total = n;
   panel.dataset.ready = "yes";
 }
