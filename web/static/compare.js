@@ -4,6 +4,8 @@ const sides = ["a", "b"].map((name) => document.getElementById(name));
 
 const isFresh = !new URLSearchParams(location.search).has("a"); // B begins as another than A
 
+const partOf = (option) => option.text.split(", ")[0];
+
 function offer() {
   for (const [place, side] of sides.entries()) {
     for (const group of side.querySelectorAll("optgroup")) {
@@ -12,8 +14,10 @@ function offer() {
     }
     const isOfKind = side.selectedOptions[0]?.parentElement.dataset.kind === kind.value;
     if (isOfKind && !(isFresh && place)) continue;
-    const own = side.querySelectorAll(`optgroup[data-kind="${kind.value}"] option`);
-    side.value = own[Math.min(place, own.length - 1)]?.value ?? "";
+    const own = [...side.querySelectorAll(`optgroup[data-kind="${kind.value}"] option`)];
+    const others = own.slice(1); // of the same log or survey, if there is one
+    const alike = others.find((one) => partOf(one) === partOf(own[0])) ?? others[0];
+    side.value = (place && alike ? alike : own[0])?.value ?? "";
   }
 }
 
