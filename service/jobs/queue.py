@@ -58,7 +58,7 @@ _PARTING = 10.0  # [s] that a scheduler has to answer
 _SCHEDULER_LOST = "scheduler-connection-lost"  # as Dask gives it for a reason
 _LOST = (OSError, TimeoutError, RuntimeError, ValueError)  # what Dask raises without a scheduler
 _GRACE = 1.0  # [s] that a dismissed job has to stop between two steps
-_RESTART = "60s"  # that a worker has to start again in, loading its modules on a busy machine
+_NEVER = "10000 days"
 _GIVEN_UP = (Status.closed, Status.failed)  # of what starts a worker again where it dies
 
 
@@ -138,7 +138,9 @@ class JobQueue:
                         "distributed.scheduler.allowed-failures": self._settings.job_attempts - 1,
                         # one task per worker: a worker that dies takes no waiting job with it
                         "distributed.scheduler.worker-saturation": 1.0,
-                        "distributed.deploy.lost-worker-timeout": _RESTART,
+                        # else, so long after the death of a worker, Dask ends the process that
+                        # starts it again if it is just then without one, and forgets it
+                        "distributed.deploy.lost-worker-timeout": _NEVER,
                         # no pages of Dask
                         "distributed.scheduler.http.routes": [],
                         "distributed.worker.http.routes": [],
@@ -207,7 +209,7 @@ class JobQueue:
             await asyncio.sleep(_COUNT_EVERY)
 
     def _replace_workers(self) -> None:
-        """Start workers in place of those that could not start again, which Dask forgets."""
+        """Start workers in place of those that could not start again."""
         if self._own is None or self._n_workers >= self._settings.workers:
             return
         for name, nanny in tuple(self._own.workers.items()):
