@@ -16,7 +16,7 @@ from spheremark.pipelines.errors import (
     SpheremarkError,
 )
 from spheremark.storage.catalogue.records import RecordingRecord
-from spheremark.storage.catalogue.sandbox import QueryTimeoutError
+from spheremark.storage.catalogue.sandbox import QueryStarvedError, QueryTimeoutError
 from spheremark.storage.files import StorageError, StorageFullError
 from spheremark.storage.imports.confined import ReaderEndedError
 
@@ -165,6 +165,7 @@ STATUS: Mapping[type[SpheremarkError], int] = {
     ClientLeftError: 499,  # as nginx has it; only the log sees it
     RecordingError: 422,
     QueryTimeoutError: 504,
+    QueryStarvedError: 429,
     PredictionTimeoutError: 504,
     SolveError: 422,
     UnauthorizedError: 401,

@@ -87,7 +87,10 @@ class Settings(BaseSettings):
         default=0, ge=0, description="Space that all logs may take [bytes]; 0: no limit."
     )
     sql_seconds: float = Field(
-        default=5.0, gt=0, le=600, description="Time after which a person's query is ended [s]."
+        default=5.0,
+        gt=0,
+        le=600,
+        description="Computing time after which a person's query is ended [s].",
     )
     sql_rows: int = Field(
         default=10_000,

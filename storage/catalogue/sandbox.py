@@ -40,7 +40,7 @@ _INSTANT_TYPES = ("TIMESTAMP", "TIMESTAMP WITH TIME ZONE")
 _INSTANT_FORMAT = "%Y-%m-%dT%H:%M:%S.%f"
 _HEADROOM = 1 << 30  # [bytes] of addresses for Python and DuckDB themselves, beyond the limit
 _MESSAGE_MAX = 600  # characters of DuckDB's own message
-_START_MAX = 20.0  # [s] until a process may have started on a machine that is busy
+_START_MAX = 20.0  # [s] that a query may take besides, on a machine that is busy
 _LOOK_EVERY = 0.5  # [s] whether the caller still waits
 _KINDS = ("SELECT", "EXPLAIN")
 
@@ -59,6 +59,12 @@ class QueryTimeoutError(InputError):
     code: ClassVar[str] = "query.timeout"
 
 
+class QueryStarvedError(SpheremarkError):
+    """The machine was too busy for the query; try again later."""
+
+    code: ClassVar[str] = "query.busy"
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class QueryLimits:
     """Limits of one query.
@@ -66,7 +72,7 @@ class QueryLimits:
     Attributes
     ----------
     seconds : float
-        Time until the process is ended [s].
+        Computing time after which the query is ended [s].
     memory_bytes : int
         Memory of DuckDB for the query.
     rows, result_bytes : int
@@ -139,7 +145,9 @@ def run_query(
     QueryRejectedError
         If the query is not allowed, is wrong, or needs too much memory.
     QueryTimeoutError
-        If it does not end before the deadline.
+        If it does not end within its computing time.
+    QueryStarvedError
+        If the machine had no time for it.
 
     Notes
     -----
@@ -191,7 +199,7 @@ def _csv_field(value: object) -> object:
 
 
 def _in_child(request: str, limits: QueryLimits) -> dict[str, Any]:
-    """Return the response of a child, whose timer starts with the query: a start can take long."""
+    """Return the response of a child, whose timer counts what the query itself computes."""
     with subprocess.Popen(
         [sys.executable, "-m", "spheremark.storage.catalogue.sandbox"],
         stdin=subprocess.PIPE,
@@ -202,11 +210,13 @@ def _in_child(request: str, limits: QueryLimits) -> dict[str, Any]:
         text=True,
     ) as child:
         try:
-            text, trace = _communicate(child, request, limits.seconds + _START_MAX)
+            text, trace = _communicate(child, request, limits)
         except BaseException:
             child.kill()
             raise
     if child.returncode == -signal.SIGALRM:
+        raise _starved(limits)
+    if child.returncode == -signal.SIGPROF:
         raise QueryTimeoutError(
             f"The query was ended after {limits.seconds:g} s, its time limit. "
             "Reduce it: filter earlier, aggregate, or add a LIMIT."
@@ -221,9 +231,11 @@ def _in_child(request: str, limits: QueryLimits) -> dict[str, Any]:
     return response
 
 
-def _communicate(child: subprocess.Popen[str], request: str, seconds: float) -> tuple[str, str]:
+def _communicate(
+    child: subprocess.Popen[str], request: str, limits: QueryLimits
+) -> tuple[str, str]:
     """Send a request to a child and return what it writes; end where its caller does."""
-    deadline = monotonic() + seconds
+    deadline = monotonic() + limits.seconds + _START_MAX
     given: str | None = request
     while True:
         checkpoint()
@@ -232,10 +244,15 @@ def _communicate(child: subprocess.Popen[str], request: str, seconds: float) -> 
         except subprocess.TimeoutExpired as error:
             given = None
             if monotonic() > deadline:
-                raise QueryTimeoutError(
-                    f"The query did not begin within {_START_MAX:g} s: the machine is too busy. "
-                    "Try again later."
-                ) from error
+                raise _starved(limits) from error
+
+
+def _starved(limits: QueryLimits) -> QueryStarvedError:
+    """Return the error of a query for which the machine had no time."""
+    return QueryStarvedError(
+        f"The query had less than {limits.seconds:g} s of computing, its time limit, within "
+        f"{limits.seconds + _START_MAX:g} s: the machine is too busy. Try again later."
+    )
 
 
 def _too_much_memory(limit: int) -> str:
@@ -257,7 +274,8 @@ def _main() -> None:
     snapshot = Path(request["snapshot"])
     leave_network()
     snapshot = enter_folder(snapshot.parent) / snapshot.name  # hides where the data folder is
-    limit_resources(memory_bytes=memory, seconds=limits.seconds, file_bytes=0)
+    limit_resources(memory_bytes=memory, seconds=limits.seconds + _START_MAX, file_bytes=0)
+    signal.setitimer(signal.ITIMER_PROF, limits.seconds)  # nothing handles it: it ends the process
     try:
         response = _respond(snapshot, request["sql"], request["parameters"], limits)
     except (duckdb.OutOfMemoryException, MemoryError):
