@@ -12,6 +12,7 @@ from fastapi import FastAPI
 from uvicorn.importer import import_from_string
 
 from spheremark.pipelines.errors import ConflictError
+from spheremark.service.jobs.memory import return_memory
 from spheremark.service.logs import log_to_stderr
 from spheremark.service.settings import Settings
 
@@ -42,6 +43,7 @@ class _Server(uvicorn.Server):
 
 def serve(settings: Settings, *, ready: Ready) -> None:
     """Serve until SIGINT or SIGTERM; ``ready`` gets the address once requests are accepted."""
+    return_memory()
     os.umask(0o077)  # what the service and its workers write is for its user alone
     create_app = import_from_string(_APPLICATION)  # Dask, which it imports, configures logging too
     log_to_stderr(settings.log_format)

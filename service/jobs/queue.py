@@ -141,6 +141,8 @@ class JobQueue:
                         # else, so long after the death of a worker, Dask ends the process that
                         # starts it again if it is just then without one, and forgets it
                         "distributed.deploy.lost-worker-timeout": _NEVER,
+                        # no history of processor and memory, which grows for an hour
+                        "distributed.admin.system-monitor.log-length": 10,
                         # no pages of Dask
                         "distributed.scheduler.http.routes": [],
                         "distributed.worker.http.routes": [],
@@ -305,7 +307,8 @@ class JobQueue:
             live.future = client.submit(
                 tasks.run,
                 spec,
-                key=f"{live.job.job_id}-{spec.result_id}",
+                # Dask keeps statistics of each key's beginning for ever: one for all jobs
+                key=f"job-{live.job.job_id}-{spec.result_id}",
                 pure=False,
                 priority=-live.rank,
             )
