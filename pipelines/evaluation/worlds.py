@@ -11,6 +11,7 @@ from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
+from itertools import pairwise
 from time import perf_counter
 from typing import Any, NamedTuple
 
@@ -65,10 +66,17 @@ CLASSES = (
 )
 """Classes of markers by returns and visible share; the first two lie on two scan lines or more."""
 
+PROBABILITIES = (0.01, 0.1, 0.5, 0.9, 0.99, 0.999, 0.9999, 1.0)
+"""Edges of the classes of probability for which its calibration is shown."""
+
+RETURNS = (6, 8, 20, 50, 200)
+"""Numbers of returns from which classes of groups begin."""
+
 RATES = (0.003, 0.01, 0.03, 0.1, 0.3, 1.0, 3.0)
 """False markers in a scan for which the curve gives precision and recall."""
 
 _OURS = ("ok", "weak", "possible")
+_COMPARED = (*_OURS, "refused")
 _METHOD, _RESECTION = "along_beam", "free_station"
 _MEAN_DEPTH = 2.0 / 3.0  # of a sphere's radius: mean height of its surface over its disc
 _NEAREST_MATCH = 0.06  # [m] at the least, within which a candidate is at a marker
@@ -86,21 +94,23 @@ class Centre(NamedTuple):
 
 
 class Seen(NamedTuple):
-    """A true marker in a scan: its class, who found it, why it was missed, and its centre."""
+    """A true marker in a scan: class, who found it, why it was missed, its centre, its returns."""
 
     kind: str
     found: tuple[str, ...]
     reason: str
     centre: Centre | None
+    n_returns: int = 0
 
 
 class Call(NamedTuple):
-    """What was taken for a marker: by whom, how surely, the marker it is, or what it is at."""
+    """What was taken for a marker: by whom, how surely, which one or where, and its returns."""
 
     by: str
     score: float
     mark: int
     decoy: str
+    n_returns: int = 0
 
 
 class Station(NamedTuple):
@@ -165,14 +175,17 @@ def _score(seed: int, *, peers: Peers | None) -> Score:
         seconds = perf_counter() - start
     except SpheremarkError as error:
         n_marks = len(field.marks.names)
-        seen = [Seen(_class_of(scan, i), (), error.code, None) for i in range(n_marks)]
+        seen = [
+            Seen(_class_of(scan, i), (), error.code, None, scan.stop.counts[i][0])
+            for i in range(n_marks)
+        ]
         return Score(seed, field.family, seen, [], decoys, None, str(error), 0.0)
     places = _places(scan, cloud, rows)
     calls, matched = _calls(scan, fits, places)
     if peers:
         by_name = peers.find(cloud.p_base.astype(np.float64), field.marker_radius)
         for name, centres in by_name.items():
-            calls += _matched(scan, places, [(name, 1.0, p) for p in centres])
+            calls += _matched(scan, places, [(name, 1.0, p, 0) for p in centres])
     centres_of = _centres(scan, fits, matched)
     seen = [
         Seen(
@@ -180,6 +193,7 @@ def _score(seed: int, *, peers: Peers | None) -> Score:
             found=tuple(sorted({call.by for call in calls if call.mark == i})),
             reason="" if i in centres_of else reason_near(found, places[i]),
             centre=centres_of.get(i),
+            n_returns=scan.stop.counts[i][0],
         )
         for i in range(len(places))
     ]
@@ -220,7 +234,9 @@ def _places(scan: Scan, cloud: StitchedCloud, rows: Index) -> Array:
     return places
 
 
-def _matched(scan: Scan, places: Array, found: Sequence[tuple[str, float, Array]]) -> list[Call]:
+def _matched(
+    scan: Scan, places: Array, found: Sequence[tuple[str, float, Array, int]]
+) -> list[Call]:
     """Return what was taken for markers with the markers they are, each at most once."""
     field, taken = scan.world.field, set[int]()
     reach = max(field.marker_radius, _NEAREST_MATCH)
@@ -228,7 +244,7 @@ def _matched(scan: Scan, places: Array, found: Sequence[tuple[str, float, Array]
     decoys = transform(T_base_site, np.array([d.p_site for d in field.decoys]).reshape(-1, 3))
     reaches = np.array([decoy.reach for decoy in field.decoys]) + field.marker_radius + _DECOY_REACH
     calls = []
-    for by, score, p in found:
+    for by, score, p, n in found:
         gaps = np.linalg.norm(places - p, axis=1)
         mark = int(np.argmin(gaps)) if len(gaps) else -1
         if mark < 0 or gaps[mark] > reach or mark in taken:
@@ -237,19 +253,22 @@ def _matched(scan: Scan, places: Array, found: Sequence[tuple[str, float, Array]
             at = field.decoys[int(beyond.argmin())].kind if is_near else _NOWHERE
             if mark >= 0 and gaps[mark] <= 2.0 * reach:
                 at = "a marker again"
-            calls.append(Call(by, score, -1, at))
+            calls.append(Call(by, score, -1, at, n))
         else:
             taken.add(mark)
-            calls.append(Call(by, score, mark, ""))
+            calls.append(Call(by, score, mark, "", n))
     return calls
 
 
 def _calls(scan: Scan, fits: MarkerFits, places: Array) -> tuple[list[Call], list[int]]:
-    """Return our markers, sure ones first, and the mark of each fit."""
-    fitted = [(fit.status.value, fit.probability, fit.p_base) for fit in fits.fits]
+    """Return our markers and other groups, sure ones first, and the mark of each fit."""
+    fitted = [(fit.status.value, fit.probability, fit.p_base, len(fit.used)) for fit in fits.fits]
     order = sorted(range(len(fitted)), key=lambda i: (fitted[i][0], -fitted[i][1]))
     ours = [fitted[i] for i in order]
-    ours += [("possible", one.probability, one.p_base) for one in fits.possible]
+    for by, groups in (("possible", fits.possible), ("refused", fits.rejected)):
+        others = [one for one in groups if one.probability >= PROBABILITIES[0]]
+        others.sort(key=lambda one: -one.probability)
+        ours += [(by, one.probability, one.p_base, one.n_points) for one in others]
     calls = _matched(scan, places, ours)
     marks = [-1] * len(fits.fits)
     for i, call in zip(order, calls, strict=False):
@@ -346,7 +365,8 @@ def report_of(scores: Sequence[Score], first_seed: int, peers: Sequence[str]) ->
     Returns
     -------
     dict
-        Rows of ``markers``, ``methods``, ``decoys``, ``curve``, ``families`` and ``failures``.
+        Rows of ``markers``, ``methods``, ``decoys``, ``curve``, ``calibration``, ``returns``,
+        ``families`` and ``failures``.
     """
     seen = [one for score in scores for one in score.seen]
     calls = [call for score in scores for call in score.calls]
@@ -361,6 +381,8 @@ def report_of(scores: Sequence[Score], first_seed: int, peers: Sequence[str]) ->
         "methods": [_precision(scores, name) for name in methods],
         "decoys": [_decoy(calls, kind, present[kind], methods) for kind in _kinds(calls, present)],
         "curve": [_at_rate(scores, rate) for rate in RATES],
+        "calibration": [_calibration(calls, bounds) for bounds in pairwise(PROBABILITIES)],
+        "returns": [_by_returns(seen, calls, bounds) for bounds in pairwise((*RETURNS, np.inf))],
         "families": [
             _family(name, [score for score in scores if score.family == name]) for name in families
         ]
@@ -423,14 +445,14 @@ def _decoy(calls: Sequence[Call], kind: str, n: int, methods: Sequence[str]) -> 
 
 def _at_rate(scores: Sequence[Score], rate: float) -> Plain:
     """Return precision and recall at the level that gives a rate of false markers in a scan."""
-    calls = [call for score in scores for call in score.calls if call.by in _OURS]
+    calls = [call for score in scores for call in score.calls if call.by in _COMPARED]
     false = np.sort([call.score for call in calls if call.mark < 0])[::-1]
     n_allowed = int(rate * len(scores))
     level = float(false[n_allowed]) if n_allowed < len(false) else -np.inf
     n_true, of = Counter[str](), Counter(one.kind for score in scores for one in score.seen)
     for score in scores:
         for call in score.calls:
-            if call.by in _OURS and call.mark >= 0 and call.score > level:
+            if call.by in _COMPARED and call.mark >= 0 and call.score > level:
                 n_true[score.seen[call.mark].kind] += 1
     n_false = int(np.sum(false > level))
     n = sum(n_true.values())
@@ -439,6 +461,35 @@ def _at_rate(scores: Sequence[Score], rate: float) -> Plain:
         "level": level if np.isfinite(level) else None,
         "precision": _share(n, n + n_false),
         **{f"recall_{i}": _share(n_true[kind], of[kind]) for i, kind in enumerate(CLASSES)},
+    }
+
+
+def _calibration(calls: Sequence[Call], bounds: tuple[float, float]) -> Plain:
+    """Return how many groups of some probability are markers."""
+    low, high = bounds
+    own = [
+        call
+        for call in calls
+        if call.by in _COMPARED and low <= call.score and (call.score < high or high == 1.0)
+    ]
+    return {
+        "probability": f"{low:g} to {high:g}",
+        "n": len(own),
+        "mean": _mean([call.score for call in own]),
+        "share": _share(sum(call.mark >= 0 for call in own), len(own)),
+    }
+
+
+def _by_returns(seen: Sequence[Seen], calls: Sequence[Call], bounds: tuple[float, float]) -> Plain:
+    """Return how many markers of so many true returns were found, and false ones of so many."""
+    low, high = bounds
+    marks = [one for one in seen if low <= one.n_returns < high]
+    false = Counter(call.by for call in calls if call.mark < 0 and low <= call.n_returns < high)
+    return {
+        "returns": f"{low:g} or more" if high == np.inf else f"{low:g} to {high - 1:g}",
+        "n": len(marks),
+        **{f"n_{by}": sum(by in one.found for one in marks) for by in _OURS},
+        **{f"false_{by}": false[by] for by in _OURS},
     }
 
 
@@ -491,7 +542,7 @@ def tables(report: Plain) -> list[Table]:
     Returns
     -------
     list of Table
-        Recall, precision, decoys, the curve, and families.
+        Recall, precision, decoys, the curve, calibration, numbers of returns, and families.
     """
     names = [one["method"] for one in report["methods"]]
     peers = names[len(_OURS) :]
@@ -504,6 +555,8 @@ def tables(report: Plain) -> list[Table]:
         Table(title="Taken for markers", columns=_PRECISION, rows=report["methods"]),
         Table(title="At decoys", columns=_decoy_columns(names), rows=report["decoys"]),
         Table(title="By the level of decision", columns=_CURVE, rows=report["curve"]),
+        Table(title="Probability against truth", columns=_CALIBRATION, rows=report["calibration"]),
+        Table(title="By returns, of any visible share", columns=_RETURNS, rows=report["returns"]),
         Table(
             title="By family of world; centres and stations that are ok",
             columns=_FAMILY,
@@ -547,6 +600,18 @@ _CURVE = (
     Column("level", "level", "", ".4f"),
     Column("precision", "precision", "%", ".2f"),
     *(Column(f"recall_{i}", kind, "%", ".1f") for i, kind in enumerate(CLASSES)),
+)
+_CALIBRATION = (
+    Column("probability", "probability"),
+    Column.whole("n", "groups"),
+    Column("mean", "mean", "%", ".2f"),
+    Column("share", "markers", "%", ".2f"),
+)
+_RETURNS = (
+    Column("returns", "returns"),
+    Column.whole("n", "markers"),
+    *(Column(f"n_{name}", name, "", ",d") for name in _OURS),
+    *(Column(f"false_{name}", f"false {name}", "", ",d") for name in _OURS),
 )
 _FAMILY = (
     Column("family", "family"),

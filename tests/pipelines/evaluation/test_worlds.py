@@ -79,6 +79,25 @@ def test_the_curve_falls_from_precision_to_recall(report):
     assert (loose["recall_0"], loose["recall_1"]) == (pytest.approx(2 / 3), 1.0)
 
 
+def test_probabilities_are_compared_with_the_share_of_markers():
+    groups = [Call("ok", 0.995, 0, ""), Call("possible", 0.993, -1, "tree", 30)]
+    groups += [Call("refused", 0.2, -1, "tree"), Call("peer", 0.999, -1, "tree")]
+    seen = [Seen(MANY, ("ok", "peer"), "", None)]
+    report = report_of([score("plain", seen, groups)], 0, ("peer",))
+    sure = row(report, "calibration", "probability", "0.99 to 0.999")
+    assert (sure["n"], sure["mean"], sure["share"]) == (2, pytest.approx(0.994), 0.5)
+    assert row(report, "calibration", "probability", "0.1 to 0.5")["share"] == 0.0
+
+
+def test_found_and_false_ones_are_counted_by_returns():
+    seen = [Seen(MANY, ("ok",), "", None, 60), Seen(FEW, (), "it is a pole", None, 12)]
+    calls = [Call("ok", 0.99, 0, "", 58), Call("possible", 0.95, -1, "tree", 30)]
+    report = report_of([score("plain", seen, calls)], 0, ())
+    assert row(report, "returns", "returns", "50 to 199")["n_ok"] == 1
+    assert row(report, "returns", "returns", "8 to 19")["n_ok"] == 0
+    assert row(report, "returns", "returns", "20 to 49")["false_possible"] == 1
+
+
 def test_errors_are_over_bound_and_covariance_by_family():
     rng = np.random.default_rng(1)
     squares = (rng.standard_normal((4000, 3)) ** 2).sum(axis=1)
@@ -103,7 +122,7 @@ def test_stations_that_are_ok_count_and_families_are_summed(report):
 
 def test_every_table_shows_its_rows(report):
     shown = [table.to_texts() for table in tables(report)]
-    assert [len(one["rows"]) for one in shown] == [4, 4, 2, 7, 3]
+    assert [len(one["rows"]) for one in shown] == [4, 4, 2, 7, 7, 5, 3]
     assert all(len(row) == len(one["headings"]) for one in shown for row in one["rows"])
     assert shown[0]["rows"][0][:3] == [MANY, "3", "1"]
 
