@@ -132,7 +132,7 @@ def _cause(log: ScanLog, rig: Rig, option: str, scale: float, shift: float) -> C
     stamps = (log.stamps_lidar_ns - log.stamps_gimbal_ns[0]) * 1e-9 + shift
     times = (log.stamps_gimbal_ns - log.stamps_gimbal_ns[0]) * 1e-9
     inside = (stamps >= times[0]) & (stamps <= times[-1])
-    angles = np.interp(stamps[inside], times, scale * log.gimbal_angles)
+    angles = np.interp(stamps[inside], times, np.unwrap(scale * log.gimbal_angles))
     p_head = log.p_lidar[inside] @ rig.T_head_lidar[:3, :3].T + rig.T_head_lidar[:3, 3]
     c, s = np.cos(angles), np.sin(angles)
     x, y, z = p_head.T

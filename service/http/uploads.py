@@ -418,15 +418,16 @@ def enter(
         is_as_before = options is None or known.preflight.get("reading", {}) == options.to_mapping()
         if is_as_before and known.verdict != "refused":
             return known, False
-        found = inspect_upload(received.path, options).to_mapping()
+        found = inspect_upload(received.path, options, known.name).to_mapping()
         return catalogue.inspect_again(received.digest, found), False
     except NotFoundError:
+        name = _ENDING.sub("", name) or name
         recording = catalogue.add_recording(
             received.digest,
-            name=_ENDING.sub("", name) or name,
+            name=name,
             size_bytes=received.size_bytes,
             url=str(received.path),
-            preflight=inspect_upload(received.path, options).to_mapping(),
+            preflight=inspect_upload(received.path, options, name).to_mapping(),
         )
         return recording, True
 

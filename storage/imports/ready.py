@@ -49,12 +49,12 @@ def read(_file: IO[bytes], *, name: str, path: str, options: Mapping[str, Any]) 
 def inspect(
     _file: IO[bytes],
     *,
-    name: str,  # noqa: ARG001  a reader is given it
+    name: str,
     path: str,
     options: Mapping[str, Any],
 ) -> dict[str, Any]:
     """Return the preflight report of a log."""
-    return {"report": inspect_log(path, LogOptions.from_mapping(options)).to_mapping()}
+    return {"report": inspect_log(path, LogOptions.from_mapping(options), name=name).to_mapping()}
 
 
 def read_document(

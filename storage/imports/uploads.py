@@ -28,7 +28,7 @@ _MEMORY_BYTES, _EXPANSION = 2 << 30, 12  # ... and what a file stands for, unpac
 _DOCUMENT = Limits(seconds=30.0, memory_bytes=512 << 20, result_bytes=32 << 20)
 
 
-def inspect_upload(path: Path, options: LogOptions | None = None) -> Preflight:
+def inspect_upload(path: Path, options: LogOptions | None = None, name: str = "") -> Preflight:
     """Inspect a log in a confined process.
 
     Parameters
@@ -37,6 +37,8 @@ def inspect_upload(path: Path, options: LogOptions | None = None) -> Preflight:
         The file.
     options : LogOptions, optional
         How to read it.
+    name : str
+        Its name in reasons; that of the file by default.
 
     Returns
     -------
@@ -45,7 +47,7 @@ def inspect_upload(path: Path, options: LogOptions | None = None) -> Preflight:
     """
     options = options or LogOptions()
     try:
-        found = _run("inspect", path, path.stem, options)["report"]
+        found = _run("inspect", path, name or path.stem, options)["report"]
         return _report(found)
     except UnreadableFileError as error:
         return Preflight(

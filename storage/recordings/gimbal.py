@@ -9,7 +9,7 @@ from datetime import UTC, datetime
 import numpy as np
 
 from spheremark.pipelines.errors import MissingGimbalAngleError, RecordingError
-from spheremark.pipelines.model import ImuMount, Nanos, Rig
+from spheremark.pipelines.model import Array, ImuMount, Nanos, Rig
 from spheremark.storage.recordings.families import Returns, Series
 from spheremark.storage.recordings.frames import FrameTree, recorded_rig
 from spheremark.storage.recordings.options import LogOptions, listed
@@ -18,6 +18,9 @@ from spheremark.storage.recordings.orientations import Orientations
 _MOVES = np.radians(1.0)  # a joint that turns less is not the gimbal of a scan
 _UPRIGHT = 0.1  # sine of half the tilt that a gimbal's transform may have off its own z axis
 _HALF_TURN = np.pi / 2.0  # an AHRS on the base turns less while the rover stands
+_CENTRAL = (1.0, 99.0)  # [%] of samples: a few may be spikes
+_ONE_TURN = 2.0 * np.pi + 1e-3  # [rad] with the rounding of an encoder
+_WRAPS_MAX = 0.01  # of the samples: a turn takes seconds, at 10 Hz or more
 _NAMING = "--joint (joint=... in a request)"
 _AVERAGED = 1_000_000_000  # [ns] of accelerations, against vibration
 _SIGMA_GRAVITY = 5e-3  # [rad]: a bias of 0.05 m/s^2, as industrial accelerometers have
@@ -50,8 +53,19 @@ def choose_gimbal(
         if imu is not None and (rig is None or rig.imu_mount is not ImuMount.HEAD):
             rig = _on_head(imu, rig)
         series = _of_ahrs(imu, rig) or _of_numbers(signals)
-    angles = np.unwrap(series.values[:, 0] * options.joint_scale) + options.joint_offset
+    angles = _unwrapped(series.values[:, 0] * options.joint_scale) + options.joint_offset
     return replace(series, values=angles[:, None]), rig
+
+
+def _unwrapped(angles: Array) -> Array:
+    """Return angles without jumps by full turns.
+
+    Jumps that are frequent outside one full turn are no wraps but another unit, such as steps.
+    """
+    low, high = np.percentile(angles, _CENTRAL)
+    is_jump = np.abs(np.diff(angles)) > np.pi
+    is_wrapped = high - low <= _ONE_TURN or is_jump.sum() <= _WRAPS_MAX * len(angles)
+    return np.unwrap(angles) if is_wrapped else angles
 
 
 def _named(signals: Signals, name: str) -> Series:

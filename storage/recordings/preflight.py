@@ -207,6 +207,7 @@ def inspect_log(
     *,
     beside: Sequence[Path] = (),
     diagnosing: bool = False,
+    name: str = "",
 ) -> Preflight:
     """Inspect a recording.
 
@@ -220,6 +221,8 @@ def inspect_log(
         Further files of the same log.
     diagnosing : bool
         Whether to try other signs, units and clocks, which takes seconds.
+    name : str
+        Its name in reasons; that of the file by default.
 
     Returns
     -------
@@ -238,7 +241,8 @@ def inspect_log(
     options = options or LogOptions()
     start = Preflight(verdict=OK, reading=options.to_mapping())
     try:
-        report, log = _inspect(url, beside, options, start)
+        origin = Origin(name=name or stem(url), digest="")
+        report, log = _inspect(url, beside, options, origin, start)
         if diagnosing and log is not None:
             found = diagnosis(
                 log, options, lambda other: read_log(url, other, beside=beside, digest="-")
@@ -252,7 +256,7 @@ def inspect_log(
 
 
 def _inspect(
-    url: str | Path, beside: Sequence[Path], options: LogOptions, start: Preflight
+    url: str | Path, beside: Sequence[Path], options: LogOptions, origin: Origin, start: Preflight
 ) -> tuple[Preflight, ScanLog | None]:
     """Walk the recording; return its report and its log. Only a file that is no log raises."""
     damage: InputError | None = None
@@ -273,7 +277,7 @@ def _inspect(
             log_duration_s=float(times.span()[1] - times.span()[0]) * 1e-9,
         )
     try:
-        log = assemble(decoders, options, Origin(name=stem(url), digest=""))
+        log = assemble(decoders, options, origin)
     except InputError as error:
         return _refused(report, damage or error), None
     report = _with_verdict(_described(report, log), log, _skew(decoders, times), times.span())

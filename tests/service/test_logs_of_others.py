@@ -12,7 +12,7 @@ from rosbags.rosbag2 import StoragePlugin, Writer
 from spheremark.service.client import Client
 from spheremark.storage.recordings import read_log, write_log
 from tests.service.test_commands import run
-from tests.storage.recorder import STORE
+from tests.storage.recorder import STORE, record
 
 
 @pytest.fixture(scope="module")
@@ -90,6 +90,7 @@ def test_an_upload_says_how_it_is_read_and_jobs_may_say_otherwise(site, clockwis
     body = clockwise.read_bytes()
     refused = site.upload(body, name="clockwise", survey="clockwise")
     assert refused.status_code == 422
+    assert "The gimbal of clockwise would turn" in refused.json()["detail"]
     digest = refused.json()["recording_id"]
     job = {"survey": "clockwise", "recording": digest}
     options = {"joint_unit": "deg", "joint_sign": -1}
@@ -131,6 +132,30 @@ def test_diagnosis_names_the_option_that_mends_a_log(stop, tmp_path):
     assert "--joint-unit deg --joint-sign -1" in failed.stderr
     good = json.loads(run("inspect", stop.log, "--diagnose", "--json").stdout)
     assert "no other sign" in good["diagnosis"][0]
+
+
+def test_diagnosis_names_the_steps_of_an_encoder_and_the_unit_of_times(stop, tmp_path):
+    angles, times = tmp_path / "angles.mcap", tmp_path / "times.mcap"
+    log, items = read_log(stop.log), []
+    write_log(replace(log, gimbal_angles=log.gimbal_angles * 4096 / (2 * np.pi)), angles)
+    found = json.loads(run("inspect", angles, "--diagnose", "--json", code=1).stdout)
+    assert "With --joint-unit 4096 (joint_unit=4096 in a request)" in found["diagnosis"][0]
+    with stop.log.open("rb") as file:
+        for schema, channel, message in make_reader(file).iter_messages():
+            one = STORE.deserialize_cdr(message.data, schema.name)
+            if schema.name.endswith("PointCloud2"):
+                at = next(field.offset for field in one.fields if field.name == "time")
+                rows = one.data.copy().reshape(-1, one.point_step)
+                micros = np.ascontiguousarray(rows[:, at : at + 4]).view("<f4") * np.float32(1e6)
+                rows[:, at : at + 4] = micros.view(np.uint8)
+                one.data = rows.ravel()
+            items.append((channel.topic, message.log_time, one))
+    record(times, items)
+    mended = read_log(times)
+    np.testing.assert_allclose(mended.stamps_lidar_ns, log.stamps_lidar_ns, rtol=0, atol=100)
+    read_so = ("--time-unit", "ns", "--diagnose", "--json")  # as it was for a driver of whole ones
+    found = json.loads(run("inspect", times, *read_so).stdout)
+    assert "--time-unit us" in found["diagnosis"][0]
 
 
 def test_the_files_of_a_folder_are_uploaded_in_one_form_as_one_log(site, bag):
