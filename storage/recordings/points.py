@@ -231,7 +231,7 @@ def unpack_any(
     rows = np.frombuffer(points, layout.structured)
     with np.errstate(over="ignore", invalid="ignore"):
         p = np.stack([rows[axis] for axis in "xyz"], axis=1).astype(np.float32)
-    keep = np.isfinite(p).all(axis=1) & p.any(axis=1)
+        keep = np.isfinite(p).all(axis=1) & p.any(axis=1)
     n = int(keep.sum())
     out.p[:n] = p[keep]
     intensities = rows["intensity"][keep] if layout.intensity else np.float32(0)

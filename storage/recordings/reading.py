@@ -253,13 +253,13 @@ def _choose_lidar(
     if not lidars:
         unread = [f"{t} ({s})" for t, s in sorted(found.items()) if s.split("/")[-1] in _UNREAD]
         hint = (
-            f" {', '.join(unread)} cannot be read: record the driver's point clouds."
+            f"{', '.join(unread)} cannot be read: record the driver's point clouds."
             if unread
-            else ""
+            else "Where another file holds it, read both together (a folder, a zip, or --pcap)."
         )
         raise MissingLidarError(
             f"The recording holds no LiDAR topic. Found: {listed(found)}. Expected one of: "
-            f"{', '.join(LIDAR_TYPES)}.{hint}"
+            f"{', '.join(LIDAR_TYPES)}. {hint}"
         )
     read = [
         (

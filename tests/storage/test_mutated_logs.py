@@ -22,3 +22,4 @@ def test_mutated_logs_end_with_a_log_or_a_reason():
     assert any(one.endswith(": log") for one in found["outcomes"])
     assert found["seconds"] < 5.0
     assert found["peak_bytes"] < 1 << 30
+    assert found["kept_blocks"] < 1.0  # blocks of memory for each log: a cache by its bytes shows
