@@ -50,6 +50,7 @@ _TURNS = np.radians(0.1)  # per second; a gimbal at rest turns less
 _OVERRUN = 3.0  # joint samples after whose last one returns may go on
 _JOINT_GAP = 0.5  # [s]; over a longer gap of a moving gimbal the angle is a guess
 _JOINT_GAP_MOTION = np.radians(0.5)
+_HALF_TURN = np.pi + 1e-6  # between two samples: which way the gimbal turned is open
 _SIGMA_UNLEVELLED = np.radians(3.0)  # how a rover may lean on ground it can drive on
 _LEAN_STRANGE = np.radians(45.0)  # more is a wrong mounting, not a slope
 _ELEVATION_CLEAN = 0.1  # of the lasers' spacing: rings are inferred only from such elevations
@@ -282,7 +283,8 @@ def _joints(log: ScanLog, rig: Rig) -> Joints:
     gaps, steps = np.diff(stamps_ns), np.diff(angles)
     _refuse_speed(log, np.abs(steps) / (gaps * _NS))
     rates = np.append(steps / gaps, 0.0)
-    rates[:-1][(gaps > _JOINT_GAP / _NS) & (np.abs(steps) > _JOINT_GAP_MOTION)] = np.nan
+    is_guess = (gaps > _JOINT_GAP / _NS) & (np.abs(steps) > _JOINT_GAP_MOTION)
+    rates[:-1][is_guess | (np.abs(steps) > _HALF_TURN)] = np.nan
     return Joints(stamps_ns, angles, rates)
 
 

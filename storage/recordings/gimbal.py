@@ -19,7 +19,8 @@ _MOVES = np.radians(1.0)  # a joint that turns less is not the gimbal of a scan
 _UPRIGHT = 0.1  # sine of half the tilt that a gimbal's transform may have off its own z axis
 _HALF_TURN = np.pi / 2.0  # an AHRS on the base turns less while the rover stands
 _CENTRAL = (1.0, 99.0)  # [%] of samples: a few may be spikes
-_ONE_TURN = 2.0 * np.pi + 1e-3  # [rad] with the rounding of an encoder
+_WRAPPED = 4.0 * np.pi + 1e-3  # [rad] quaternions show angles within two turns, encoders within one
+_COUNT_MAX = 1e9  # of steps: thousands of turns of the finest encoders
 _WRAPS_MAX = 0.01  # of the samples: a turn takes seconds, at 10 Hz or more
 _NAMING = "--joint (joint=... in a request)"
 _AVERAGED = 1_000_000_000  # [ns] of accelerations, against vibration
@@ -60,12 +61,14 @@ def choose_gimbal(
 def _unwrapped(angles: Array) -> Array:
     """Return angles without jumps by full turns.
 
-    Jumps that are frequent outside one full turn are no wraps but another unit, such as steps.
+    Jumps that are frequent beyond two full turns are no wraps but another unit, such as steps.
     """
     low, high = np.percentile(angles, _CENTRAL)
     is_jump = np.abs(np.diff(angles)) > np.pi
-    is_wrapped = high - low <= _ONE_TURN or is_jump.sum() <= _WRAPS_MAX * len(angles)
-    return np.unwrap(angles) if is_wrapped else angles
+    is_rare = is_jump.sum() <= _WRAPS_MAX * len(angles)
+    is_count = np.abs(angles).max() < _COUNT_MAX
+    is_other = high - low > _WRAPPED and is_count and not is_rare
+    return angles if is_other else np.unwrap(angles)
 
 
 def _named(signals: Signals, name: str) -> Series:

@@ -595,6 +595,20 @@ def test_the_number_of_a_servo_is_an_angle_in_steps(tmp_path, rng, kind):
     assert_array_equal(log.stamps_gimbal_ns, T0 + (np.arange(50) - 5) * 10_000_000)
 
 
+@pytest.mark.parametrize(
+    ("scale", "wrap"), [(1.0, 2 * np.pi), (1.0, 4 * np.pi), (1.0, None), (4096 / 2 / np.pi, None)]
+)
+def test_angles_are_unwrapped_but_not_steps_that_are_read_as_radians(tmp_path, rng, scale, wrap):
+    angles = np.linspace(0, 14.0, 300)
+    shown = np.mod(angles, wrap) if wrap else angles
+    items = [
+        ("/joints", T0 + k * 10**7, joints(T0 + k * 10**7, pan=scale * a))
+        for k, a in enumerate(shown)
+    ]
+    path = record(tmp_path / "a.mcap", [("/p", T0 + 10**8, cloud(velodyne(rng))), *items])
+    assert_allclose(read_log(path).gimbal_angles, scale * angles, rtol=0, atol=1e-9)
+
+
 def test_an_ahrs_on_the_gimbal_alone_is_enough_without_frames(tmp_path, rng):
     mount = Rotation.from_euler("xyz", [0.4, -0.3, 1.0])
     lean = Rotation.from_euler("xyz", [0.02, -0.03, 0.0])
