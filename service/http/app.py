@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import threading
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
 from importlib import metadata, resources
@@ -38,17 +39,26 @@ about = APIRouter(include_in_schema=False)
 class _Application(FastAPI):
     """FastAPI whose responses to unexpected errors, outside all middleware, have the headers."""
 
+    _describing = threading.Lock()  # the first requests may come at once
+
     def openapi(self) -> dict[str, Any]:
         """Return the description of the interface, in which problems have their media type."""
-        if self.openapi_schema is None:
-            schemas = super().openapi()["components"]["schemas"]
-            for path in super().openapi()["paths"].values():
-                for operation in path.values():
-                    content = operation["responses"]["default"]["content"]
-                    content[errors.MEDIA_TYPE] = content.pop(next(iter(content)))
-                    operation["summary"] = operation["description"].partition("\n")[0].rstrip(".")
-                    examples.add_to(operation, schemas)
-        return super().openapi()
+        with self._describing:
+            if self.openapi_schema is None:
+                self.openapi_schema = self._described()
+        return self.openapi_schema
+
+    def _described(self) -> dict[str, Any]:
+        """Return FastAPI's description with the types of problems, summaries and examples."""
+        found = super().openapi()
+        self.openapi_schema = None  # not whole yet
+        for path in found["paths"].values():
+            for operation in path.values():
+                content = operation["responses"]["default"]["content"]
+                content[errors.MEDIA_TYPE] = content.pop(next(iter(content)))
+                operation["summary"] = operation["description"].partition("\n")[0].rstrip(".")
+                examples.add_to(operation, found["components"]["schemas"])
+        return found
 
     def build_middleware_stack(self) -> ASGIApp:
         """Return the whole application."""

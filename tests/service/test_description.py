@@ -1,5 +1,9 @@
 """The description of the interface: examples that its own schemas accept, problems as such."""
 
+import sys
+import threading
+from concurrent.futures import ThreadPoolExecutor
+
 import jsonschema
 import pytest
 
@@ -31,6 +35,23 @@ def contents(operation):
 def body_of(operation):
     """Return the bodies that an operation takes."""
     return operation.get("requestBody", {}).get("content", {})
+
+
+def test_the_first_requests_may_come_at_once():
+    before = sys.getswitchinterval()
+    app, start = create_app(Settings()), threading.Barrier(8, timeout=60)
+
+    def described():
+        start.wait()
+        return app.openapi()
+
+    sys.setswitchinterval(1e-5)
+    try:
+        with ThreadPoolExecutor(8) as threads:
+            found = [one.result() for one in [threads.submit(described) for _ in range(8)]]
+    finally:
+        sys.setswitchinterval(before)
+    assert all(one == DESCRIPTION for one in found)
 
 
 @pytest.mark.parametrize("name", OPERATIONS)
