@@ -63,6 +63,23 @@ def test_a_heading_sorts_and_the_address_keeps_order_and_part(visit):
     assert page.locator("[data-table] tbody tr").first.text_content() == found
 
 
+def test_a_table_of_a_page_is_sorted_by_its_headings(visit):
+    page = visit().open("/surveys/field/logs")
+    table = page.locator('[aria-labelledby="control-head"] table')
+
+    def column(i):
+        return [row.locator("td").nth(i).inner_text() for row in table.locator("tbody tr").all()]
+
+    heights = sorted(column(3), key=float)
+    table.locator("th").nth(3).click()
+    assert column(3) == heights[::-1]
+    table.get_by_role("button", name="Sort by z").press("Enter")
+    assert column(3) == heights
+    assert table.locator("th").nth(3).get_attribute("aria-sort") == "ascending"
+    table.get_by_role("button", name="Sort by Mark").press("Enter")
+    assert column(0) == [f"S{i:02d}" for i in range(1, 15)]
+
+
 def test_a_median_filters_the_page_to_its_bin(visit):
     _, page = opened(visit, ACCURACY)
     link = page.evaluate(

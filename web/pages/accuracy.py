@@ -25,19 +25,6 @@ CENTRES: tuple[Column, ...] = (
     ("error_3d_m", "Error [mm]", "mm"),
     ("error_radial_m", "Radial [mm]", "mm"),
 )
-STOPS: tuple[Column, ...] = (
-    ("stop", "Stop", "link"),
-    ("survey", "Survey", "text"),
-    ("fit_method", "Method", "method"),
-    ("n_markers", "Markers", "count"),
-    ("mean_range_m", "Mean distance [m]", "m"),
-    ("sigma_rms_m", "Centres, sigma [mm]", "mm"),
-    ("error_rms_m", "Centres, error [mm]", "mm"),
-    ("error_max_m", "Largest [mm]", "mm"),
-    ("station_status", "Station", "status"),
-    ("station_sigma_3d_m", "Sigma [mm]", "mm"),
-    ("station_error_3d_m", "Error [mm]", "mm"),
-)
 """Columns of tables: name in the database, heading, and how its values are written."""
 
 _FILTERS = (
