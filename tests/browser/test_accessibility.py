@@ -14,7 +14,8 @@ DRAWN = """(theme) => document.documentElement.dataset.theme === theme
         (one) => [theme, "failed"].includes(one.dataset.drawn))"""
 
 
-COLOURS = {"runOnly": {"type": "tag", "values": ["cat.color"]}}  # what a theme can change
+COLOURS = {"runOnly": {"type": "rule", "values": ["color-contrast", "link-in-text-block"]}}
+"""The rules whose outcome a theme can change."""
 
 
 def found(page, options=None):
@@ -40,5 +41,5 @@ def test_a_fault_is_found(visit):
     page.evaluate("document.querySelector('main').append(document.createElement('button'))")
     assert [one[0] for one in found(page)] == ["button-name"]
     assert found(page, COLOURS) == []
-    page.add_style_tag(content="main p { color: var(--paper) }")
+    page.evaluate("document.querySelector('main p').style.color = '#c8c8c8'")
     assert [one[0] for one in found(page, COLOURS)] == ["color-contrast"]
