@@ -14,7 +14,7 @@ import numpy as np
 
 from spheremark.pipelines.config import ResectionConfig
 from spheremark.pipelines.errors import ConfigError, DegenerateGeometryError, NoMarkersError
-from spheremark.pipelines.estimation.least_squares import Adjustment, adjust
+from spheremark.pipelines.estimation.least_squares import Adjustment, Groups, Observations, adjust
 from spheremark.pipelines.estimation.linear_algebra import invert_each
 from spheremark.pipelines.estimation.statistical_tests import Dropped, snoop
 from spheremark.pipelines.geometry import (
@@ -47,7 +47,6 @@ from spheremark.pipelines.positioning.matching import (
     Match,
     Scene,
     contradiction,
-    cov_of_shared,
     gather,
     match_marks,
     moved,
@@ -103,23 +102,27 @@ def free_station(fits: MarkerFits, marks: ControlMarks, config: ResectionConfig)
     -----
     Residuals are ``T_site_base p_base - p_mark`` with the covariances of both in the site frame,
     and the horizontal part of the measured up direction, turned into the site, with that of the
-    AHRS. To each centre ``sigma_common`` is added per axis and independently: a fit's covariance
-    knows the noise of its returns, lasers and the mounting, not what changes from direction to
-    direction and moves both faces alike; the part that all centres share is a motion of the pose
-    and cannot be separated from it. Where data snooping would leave out more than a third of the
-    markers, the sigmas are to blame: it is done again with w divided by sigma0. Gravity that
-    contradicts three or more marks is left out like a bad marker, and the fix is weak.
+    AHRS. The errors that centres have in common, of ranges above all, are unknowns beside the pose,
+    with their priors, and taken off the covariances of the centres. To each centre ``sigma_common``
+    is added per axis and independently: a fit's covariance knows the noise of its returns, lasers
+    and the mounting, not what changes from direction to direction and moves both faces alike; what
+    of it all centres share is a motion of the pose and cannot be separated from it. Where data
+    snooping would leave out more than a third of the markers, the sigmas are to blame: it is done
+    again with w divided by sigma0. Gravity that contradicts three or more marks is left out like a
+    bad marker, and the fix is weak.
     """
     _refuse_too_few(fits, marks)
     scene = gather(fits, marks, config)
     match = match_marks(scene, config)
-    pairs = match.pairs
+    pairs, n_shared = match.pairs, scene.shared_base.shape[2]
+    own = scene.cov_centres - scene.included_base @ np.swapaxes(scene.included_base, 1, 2)
+    alone = replace(scene, cov_centres=own)
 
     def adjusted(keep: Mask) -> Adjustment:
         return adjust(
-            lambda T: observe(scene, pairs[keep[:-1]], T)[: 1 + int(keep[-1])],
-            moved,
-            match.T_site_base,
+            lambda state: _observe(alone, pairs[keep[:-2]], state, has_gravity=bool(keep[-2])),
+            _moved,
+            np.column_stack([match.T_site_base, np.zeros((4, n_shared))]),
             test_level=config.test_level,
             test_power=config.test_power,
         )
@@ -127,19 +130,46 @@ def free_station(fits: MarkerFits, marks: ControlMarks, config: ResectionConfig)
     def may_drop(keep: Mask, block: int) -> bool:
         rest = keep.copy()
         rest[block] = False
-        if not rest[-1]:
-            return not is_on_a_line(scene.marks_site[pairs[rest[:-1], 1]])
-        return int(rest[:-1].sum()) >= 2 and bool(
-            has_heading(scene.marks_site[pairs[rest[:-1], 1]])
-        )
+        left = scene.marks_site[pairs[rest[:-2], 1]]
+        if not (rest[-1] and rest[-2]):
+            return bool(rest[-1]) and not is_on_a_line(left)
+        return len(left) >= 2 and bool(has_heading(left))
 
-    adjustment, keep, dropped = snoop(adjusted, len(pairs) + 1, may_drop)
+    adjustment, keep, dropped = snoop(adjusted, len(pairs) + 2, may_drop)
     if len(dropped) > _MANY_LEFT_OUT * len(pairs):
-        adjustment, keep, dropped = snoop(adjusted, len(pairs) + 1, may_drop, is_studentised=True)
-    used = pairs[keep[:-1]]
+        adjustment, keep, dropped = snoop(adjusted, len(pairs) + 2, may_drop, is_studentised=True)
+    used = pairs[keep[:-2]]
     excluded = _exclusions(match, dropped, scene, adjustment, config)
     reasons = _weaknesses(scene, match, used, adjustment, dropped)
     return _fix(scene, match, used, adjustment, excluded, reasons)
+
+
+def _observe(scene: Scene, pairs: Index, state: Array, *, has_gravity: bool) -> Groups:
+    """Linearise centres, gravity, and what centres have in common, by the pose and by that.
+
+    The state is the pose with a column for each error in common; the last row has their sizes.
+    """
+    T, sizes = state[:, :4], state[3, 4:]
+    nearer = replace(scene, centres_base=scene.centres_base - scene.shared_base @ sizes)
+    centres, gravity = observe(nearer, pairs, T)
+    by_sizes = -T[:3, :3] @ scene.shared_base[pairs[:, 0]]
+    groups = [replace(centres, J=np.concatenate([centres.J, by_sizes], axis=2))]
+    if has_gravity:
+        free = np.zeros((1, 2, len(sizes)))
+        groups.append(replace(gravity, J=np.concatenate([gravity.J, free], axis=2)))
+    prior = Observations(
+        residuals=sizes[None],
+        J=np.eye(len(sizes), 6 + len(sizes), 6)[None],
+        cov=np.eye(len(sizes))[None],
+    )
+    return (*groups, prior)
+
+
+def _moved(state: Array, step: Array) -> Array:
+    """Move a pose on the left, and the sizes of what centres have in common."""
+    out = moved(state, step[:6])
+    out[3, 4:] += step[6:]
+    return out
 
 
 def _refuse_too_few(fits: MarkerFits, marks: ControlMarks) -> None:
@@ -166,8 +196,8 @@ def _exclusions(
 ) -> tuple[Exclusion, ...]:
     """Return which markers were left out, and why."""
     pairs = match.pairs
-    placed = transform(adjustment.estimate, scene.centres_base)
-    excluded = _false_markers(match, scene, adjustment.estimate, config)
+    placed = transform(adjustment.estimate[:, :4], scene.centres_base)
+    excluded = _false_markers(match, scene, adjustment.estimate[:, :4], config)
     for block, w in dropped:
         if block < len(pairs):
             fit, mark = pairs[block]
@@ -251,11 +281,11 @@ def _fix(
     reasons: list[str],
 ) -> StationFix:
     """Assemble a fix, back in the unshifted site frame."""
-    T = adjustment.estimate
+    T = adjustment.estimate[:, :4]
     shift = np.eye(6)
     shift[3:, :3] = skew(scene.middle)
     T_site_base = rigid(T[:3, :3], T[:3, 3] + scene.middle)
-    cov, J = adjustment.cov + _cov_shared(scene, used, adjustment), by_motion(T[:3, 3])
+    cov, J = _covariance(scene, adjustment), by_motion(T[:3, 3])
     elsewhere = match.alternatives + scene.middle - T_site_base[:3, 3]
     T_site_station = T_site_base @ inverse(rigid(scene.R_station_base, np.zeros(3)))
     pose = Pose(
@@ -263,18 +293,19 @@ def _fix(
         cov_T_site_station=shift @ cov @ shift.T
         + _cov_of_heading(scene, elsewhere, T_site_station),
         cov_p_site=J @ cov @ J.T + _cov_of_alternatives(elsewhere),
-        J_position=J,
+        J_position=np.column_stack([J, np.zeros((3, len(adjustment.cov) - 6))]),
         residuals_site=adjustment.groups[0].residuals,
     )
     fix = station_fix("free_station", scene, used, adjustment, pose, (reasons, excluded))
     return replace(fix, axis_station=scene.R_station_base[:, 2].copy())
 
 
-def _cov_shared(scene: Scene, used: Index, adjustment: Adjustment) -> Array:
-    """Return the correction of a motion's covariance for errors common to all centres, (6, 6)."""
+def _covariance(scene: Scene, adjustment: Adjustment) -> Array:
+    """Return the covariance of a motion, (6, 6), with an error that all heights share."""
     R, group = adjustment.estimate[:3, :3], adjustment.groups[0]
     gains = adjustment.cov @ np.swapaxes(invert_each(group.cov)[0] @ group.J, 1, 2)  # up to sign
-    return cov_of_shared(scene, used[:, 0], gains @ R)
+    of_heights = scene.sigma_height * gains.sum(axis=0)[:6] @ (R @ scene.R_station_base[2])
+    return np.asarray(adjustment.cov[:6, :6] + np.outer(of_heights, of_heights))
 
 
 def _cov_of_alternatives(elsewhere: Array) -> Array:

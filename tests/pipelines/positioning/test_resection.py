@@ -226,6 +226,29 @@ def test_errors_that_all_centres_share_do_not_average_out(rng):
     assert low < found[True] < high
 
 
+def test_a_range_error_that_centres_share_is_estimated_beside_the_pose(rng):
+    """Four marks of 1 mm each, and 3.5 mm of all ranges: taken as each one's own it blurs them."""
+    marks, T = control(field(rng).p_site[[0, 4, 7, 11]]), pose(STAND, 2.2)
+    p = (marks.p_site - T[:3, 3]) @ T[:3, :3]
+    factors = 3.5e-3 * (p / np.linalg.norm(p, axis=1, keepdims=True))[..., None]
+    cov = 1e-3**2 * np.eye(3) + factors @ np.swapaxes(factors, 1, 2)
+    squares, errors = [], {False: [], True: []}
+    for _ in range(200):
+        noise = rng.normal(0, 1e-3, (4, 3)) + factors @ rng.normal(size=1)
+        fits = sightings(marks, T, noise=noise, cov=cov)
+        pairs = zip(fits.fits, factors, strict=True)
+        reported = tuple(replace(fit, shared_base=factor) for fit, factor in pairs)
+        for is_shared, some in ((False, fits.fits), (True, reported)):
+            config = replace(CONFIG, sigma_range=3.5e-3 * is_shared)
+            fix = free(replace(fits, fits=some), marks, config)
+            errors[is_shared].append(np.linalg.norm(fix.p_site - T[:3, 3]))
+        off = T[:3, 3] - fix.p_site
+        squares.append(off @ np.linalg.solve(fix.cov_p_site, off) / 3)
+    low, high = chance.of_mean_square(3 * 200)
+    assert low < np.mean(squares) < high
+    assert np.mean(np.square(errors[True])) < 0.7 * np.mean(np.square(errors[False]))
+
+
 @pytest.mark.parametrize("method", ["free_station", "ranges", "paper"])
 def test_positions_far_from_the_origin_are_as_sure_as_at_it(rng, method):
     marks = field(rng)
