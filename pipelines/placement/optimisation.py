@@ -11,14 +11,14 @@ import numpy as np
 from scipy.spatial.distance import cdist
 
 from spheremark.pipelines.errors import ConfigError, DegenerateGeometryError
-from spheremark.pipelines.model import Array
+from spheremark.pipelines.model import Array, Column
 from spheremark.pipelines.placement.bounds import (
     gained,
     groups_of,
     least_sigmas,
-    relax,
     widest_sigma,
 )
+from spheremark.pipelines.placement.branching import Places, branch, relax
 from spheremark.pipelines.placement.candidates import CANDIDATES_MAX, Candidates, find_candidates
 from spheremark.pipelines.placement.centre_model import CentreModel
 from spheremark.pipelines.placement.evaluation import check_sizes, evaluate
@@ -29,8 +29,11 @@ from spheremark.pipelines.placement.search import (
     Found,
     Goal,
     draw,
+    evaluated,
     numbered_after,
+    placed,
     polished,
+    ranked,
     search,
 )
 from spheremark.pipelines.placement.stop_moves import moved_stops
@@ -40,7 +43,7 @@ _SLACK = 1.15  # times the tolerance that a quick search keeps: more is hopeless
 _HOPELESS = 2.0  # the same where places between those of a grid, however wide, come after it
 _FINER = 3  # times that the grid of the bound is finer, if places suffice ...
 _FINE = 0.3  # [m] ... and its spacing
-_BOUND, _SEARCH = 0.2, 0.9  # shares of the time after the bound and after the search
+_SEARCH, _RELAXED, _BOUND = 0.4, 0.45, 0.95  # shares of the time after these steps
 _PLACED = 40  # arrangements that are displaced by chance
 _ROUNDS_OF_STOPS = 4  # in which stops and marks move in turn
 
@@ -145,16 +148,23 @@ class _Course:
             share = self.begin + share * (self.end - self.begin)
             self.report(SearchState(share, step, self.n_marks, self.worst, self.bound))
 
-    def bounded(self, share: float, bound: float) -> None:
-        """Report a bound."""
-        self.bound = bound
-        self.at(_BOUND * share, f"Bounding {self.n_marks} marks")
-
     def found(self, share: float, found: Found) -> None:
         """Report an arrangement."""
         worst = scores_of(found.problem, found.chosen, np.zeros((1, 0), np.intp))[0, 0]
         self.worst = min(self.worst, float(worst))
-        self.at(_BOUND + (_SEARCH - _BOUND) * share, f"Placing {self.n_marks} marks")
+        self.at(_SEARCH * share, f"Placing {self.n_marks} marks")
+
+    def relaxed(self, share: float, bound: float) -> None:
+        """Report the bound of marks that could be divided."""
+        self.bound = max(self.bound, bound)
+        self.at(_SEARCH + (_RELAXED - _SEARCH) * share, f"Bounding {self.n_marks} marks")
+
+    def bounded(self, share: float, bound: float) -> None:
+        """Report the bound of branching."""
+        self.bound = max(self.bound, bound)
+        self.at(
+            _RELAXED + (_BOUND - _RELAXED) * share, f"Raising the bound of {self.n_marks} marks"
+        )
 
 
 def optimise(  # noqa: PLR0913  all that a plan is made of
@@ -328,8 +338,9 @@ def best_without_search(  # noqa: PLR0913  all that a plan is made of
     requirement: Requirement,
     n_marks: int,
     drawn: tuple[int, np.random.Generator] | None,
+    objective: str = "worst",
 ) -> float:
-    """Return the least 3-D sigma at the worst stop of random arrangements, or of all there are.
+    """Return the least objective of random arrangements, or of all there are.
 
     Parameters
     ----------
@@ -339,11 +350,13 @@ def best_without_search(  # noqa: PLR0913  all that a plan is made of
         Number of marks.
     drawn : tuple of int and numpy.random.Generator, optional
         How many arrangements are drawn; by default every arrangement is evaluated.
+    objective : str
+        One of ``OBJECTIVES``.
 
     Returns
     -------
     float
-        Reference for optimised arrangements [m].
+        Reference for optimised arrangements, as if marks did not hide each other [m].
     """
     problem = problem_of(site, stops, candidates, model, requirement)
     p_site, apart = candidates.p_site, candidates.apart
@@ -355,7 +368,8 @@ def best_without_search(  # noqa: PLR0913  all that a plan is made of
         near = cdist(p_site, p_site) < apart
         every = map(np.array, combinations(range(len(near)), n_marks))
         some = [c for c in every if near[np.ix_(c, c)].sum() == n_marks]
-    return float(scores_of(problem, np.zeros(0, np.intp), np.array(some))[:, 0].min())
+    goal = Goal(objective=objective, is_robust=False, loss_weight=0.0)
+    return float(ranked(problem, np.zeros(0, np.intp), np.array(some), goal).min())
 
 
 def _best(
@@ -363,11 +377,10 @@ def _best(
 ) -> Optimum:
     """Return the best places of a number of marks with their bound; stops move too if they may."""
     course.n_marks = k
-    bound = _bound_of(problem, k, goal, course) if not goal.stop_reach else None
     found = search(problem, k, goal, rng, course.found)
     if goal.stop_reach:
         found = _with_stops(found, goal, rng, course)
-    return _optimum(found, problem, goal, course, bound)
+    return _optimum(found, problem, goal, rng, course)
 
 
 def _with_stops(found: Found, goal: Goal, rng: np.random.Generator, course: _Course) -> Found:
@@ -375,16 +388,13 @@ def _with_stops(found: Found, goal: Goal, rng: np.random.Generator, course: _Cou
     given = found.problem.stops
     for i in range(_ROUNDS_OF_STOPS):
         course.at(_SEARCH, f"Moving the stops, round {i + 1}")
-        site, _, places, model, requirement, standing, *_ = found.problem
         stops = moved_stops(given, goal.stop_reach, found.problem, found.marks)
-        own = places.rows(found.chosen[len(standing.names) :])
-        problem = problem_of(site, stops, own, model, requirement, standing)
-        start = np.append(problem.fixed, np.arange(len(own.p_site)))
-        none = np.zeros((1, 0), np.intp)
-        score = (0.0, float(scores_of(problem, start, none)[0, 0]), 0.0)
-        moved = Found(score, problem, start, found.n_exchanges)
+        n_fixed = len(found.problem.standing.names)
+        own = found.problem.candidates.rows(found.chosen[n_fixed:])
+        moved = placed(found.problem._replace(stops=stops), own, goal)
         if own.rules is not None and len(own.p_site):
             moved = polished(moved, goal, rng)
+        none = np.zeros((1, 0), np.intp)
         before = scores_of(found.problem, found.chosen, none)[0, 0]
         after = scores_of(moved.problem, moved.chosen, none)[0, 0]
         if after >= before:
@@ -413,7 +423,7 @@ def _fewest(problem: Problem, goal: Goal, rng: np.random.Generator, course: _Cou
             found = _best(problem, k, goal, rng, course)
             # a smaller sigma may come with an error ellipsoid of worse shape
             if not found.is_kept and quick.keeps(goal):
-                found = _optimum(quick, problem, goal, course)
+                found = _optimum(quick, problem, goal, rng, course)
             if found.is_kept:
                 return found
     return _best(problem, goal.most, goal, rng, course)
@@ -425,41 +435,47 @@ class _Bound(NamedTuple):
     bound: float
     after_loss: float
     places: Candidates
-    information: Array
+    rows: Column  # information at these
 
 
-def _bound_of(problem: Problem, k: int, goal: Goal, course: _Course) -> _Bound | None:
-    """Return the bound of so many marks; None for a method that has none.
+def _bounded(
+    found: Found, problem: Problem, goal: Goal, rng: np.random.Generator, course: _Course
+) -> tuple[Found, _Bound | None]:
+    """Return an arrangement, or a better one that its bound came across, and the bound, if any.
 
     Without any one mark, one less stands: no arrangement of these goes below their bound.
     """
-    n = k - len(problem.fixed)
+    n = len(found.chosen) - len(problem.fixed)
     if problem.requirement.method == "paper" or n < 1:
-        return None
+        return found, None
+    problem = problem._replace(stops=found.problem.stops)
     places = _finer(problem)
-    information, height = problem.information(places), problem.requirement.resection.sigma_height
-    groups, is_mean = groups_of(places.p_site, places.apart), goal.objective == "mean"
-    bound, after = (
-        relax(
-            information,
-            problem.start,
-            groups,
-            number,
-            height,
-            is_mean=is_mean and number == n,
-            report=(lambda _share, _bound: None) if number < n else course.bounded,
-        ).bound
-        if number
-        else np.nan
-        for number in (n, n - 1)
+    rows = problem.information(places)
+    given = Places(
+        rows=rows.reshape(len(rows), -1),
+        start=found.problem.start,
+        groups=groups_of(places.p_site, places.apart),
+        p_site=places.p_site,
+        sigma_height=problem.requirement.resection.sigma_height,
+        is_mean=goal.objective == "mean",
     )
-    return _Bound(bound, after, places, information)
+    after = relax(given._replace(is_mean=False), n - 1).bound if n > 1 else np.nan
+    around = relax(given, n, course.relaxed)
+    alone = replace(goal, is_robust=False, loss_weight=0.0, walk_weight=0.0)
+    alone = replace(alone, objective="mean" if given.is_mean else "worst")
+    branched = branch(given, n, around, evaluated(found, alone)[1], course.bounded)
+    if len(branched.chosen):
+        other = placed(found.problem, places.rows(branched.chosen), goal)
+        other = polished(other, goal, rng) if places.rules is not None else other
+        found = min(found, other, key=lambda one: evaluated(one, goal))
+    return found, _Bound(branched.bound, after, places, rows)
 
 
 def _optimum(
-    found: Found, problem: Problem, goal: Goal, course: _Course, bound: _Bound | None = None
+    found: Found, problem: Problem, goal: Goal, rng: np.random.Generator, course: _Course
 ) -> Optimum:
     """Assemble the result; new marks are named by azimuth about the middle of the stops."""
+    found, bound = _bounded(found, problem, goal, rng, course)
     own, (site, stops, _, model, requirement, standing, *_) = (
         found.problem.candidates,
         found.problem,
@@ -468,14 +484,10 @@ def _optimum(
     off = own.p_site[free, :2] - stops.p_site[:, :2].mean(axis=0)
     free = free[np.argsort(np.arctan2(off[:, 1], off[:, 0]))]
     found = found._replace(chosen=np.append(fixed, free))
-    marks, k = found.marks, len(found.chosen)
-    course.at(_SEARCH, "Evaluating the best")
-    bound = bound or _bound_of(problem._replace(stops=stops), k, goal, course)
+    marks = found.marks
     gain = np.nan, np.nan
     if bound is not None:
-        own_places = replace(bound.places, p_site=own.p_site[free], ground=own.ground[free])
-        chosen = found.problem.information(own_places)
-        gain = gained(bound.information, found.problem.start, chosen, len(free))
+        gain = gained(bound.rows, found.problem.start, found.problem.rows[free])
     after = found.after_loss()
     return Optimum(
         evaluation=evaluate(site, stops, marks, model, requirement),
@@ -540,8 +552,7 @@ def _least(problem: Problem, goal: Goal) -> int:
     if goal.most < least:
         raise ConfigError(f"At most {goal.most} marks; {least} are needed for this goal.")
     _refuse_impossible(problem)
-    information = problem.information(problem.candidates)
-    sigmas = least_sigmas(information, requirement)[:, : goal.most]
+    sigmas = least_sigmas(problem.rows, requirement)[:, : goal.most]
     widest = widest_sigma(requirement.tolerance, goal.probability)
     enough = np.flatnonzero(sigmas.max(axis=0) <= widest) + 1 + goal.is_robust
     if len(enough) and enough[0] <= goal.most:

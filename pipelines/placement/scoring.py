@@ -10,26 +10,23 @@ import numpy as np
 from scipy.spatial.distance import cdist
 
 from spheremark.pipelines.compilation import compiled
-from spheremark.pipelines.model import Array, Index
-from spheremark.pipelines.placement.bounds import (
-    information_of,
-    start_information,
-    unpacked,
-)
+from spheremark.pipelines.estimation.linear_algebra import invert
+from spheremark.pipelines.model import Array, Column, Index, Mask
 from spheremark.pipelines.placement.candidates import Candidates
 from spheremark.pipelines.placement.centre_model import CentreModel
 from spheremark.pipelines.placement.evaluation import predict_observables
+from spheremark.pipelines.placement.packing import N_PACKED, packed, variance_of
 from spheremark.pipelines.placement.plan import Arrangement, Requirement, Site, Stops
 from spheremark.pipelines.placement.station_covariance import (
+    LOOSE2,
+    Circles,
     Observables,
-    Pairs,
-    add_mark,
     best_circles,
-    pairs_of,
+    circles_of,
+    information_of,
     shared_sigmas,
     shared_variance,
-    sigma_3d,
-    start_of,
+    start_information,
 )
 from spheremark.pipelines.placement.visibility import find_visibility
 from spheremark.pipelines.progress import checkpoint
@@ -50,7 +47,8 @@ class Problem(NamedTuple):
     model: CentreModel
     requirement: Requirement
     standing: Arrangement
-    pairs: Pairs
+    rows: Array  # (c, s, 28) information about free stations, packed
+    given: Circles | None  # of the method of three circles
     power: float = np.inf  # of the mean over stops that stands for their largest sigma
     is_loss_first: bool = False  # whether the tolerance after a loss comes before all else
 
@@ -61,13 +59,21 @@ class Problem(NamedTuple):
         return np.arange(n - len(self.standing.names), n)
 
     @property
+    def is_seen(self) -> Mask:
+        """Which candidates any stop sees, (c,)."""
+        if self.given is not None:
+            return np.asarray(self.given.is_seen.any(axis=0))
+        return np.asarray(self.rows.any(axis=(1, 2)))
+
+    @property
+    def gravity(self) -> Array:
+        """Information of a free station without marks, packed, (28,)."""
+        return packed(start_information(self.shared_variance, self.requirement))
+
+    @property
     def start(self) -> Array:
-        """Information of each station by gravity and by the marks that stand, (s, 7, 7)."""
-        standing = self.candidates.rows(self.fixed)
-        gravity = start_information(self.shared_variance, self.requirement)
-        if not len(standing.p_site):
-            return np.tile(gravity, (len(self.stops.names), 1, 1))
-        return gravity + unpacked(self.information(standing).sum(axis=0))
+        """Information of each free station by gravity and marks that stand, packed, (s, 28)."""
+        return np.asarray(self.gravity + self.rows[self.fixed].sum(axis=0))
 
     @property
     def shared_variance(self) -> float:
@@ -75,10 +81,21 @@ class Problem(NamedTuple):
         sensor = self.model.sensor
         return shared_variance(sensor.sigma_range_bias, sensor.sigma_range_common)
 
-    def information(self, candidates: Candidates) -> Array:
-        """Return the information of candidates, block by block."""
-        blocks = _observed(self.site, self.stops, candidates, self.model, self.requirement)
-        return np.concatenate([information_of(some, self.requirement) for some in blocks])
+    def information(self, candidates: Candidates) -> Column:
+        """Return the information of candidates, (c, s, 28), in single precision."""
+        out = np.empty((len(candidates.p_site), len(self.stops.names), N_PACKED), np.float32)
+        _fill(self._replace(candidates=candidates), out)
+        return out
+
+
+def _fill(problem: Problem, out: Array | Column) -> None:
+    """Write the information of all candidates about free stations, packed."""
+    site, stops, candidates, model, requirement, *_ = problem
+    first = 0
+    for some in _observed(site, stops, candidates, model, requirement):
+        rows = np.swapaxes(packed(information_of(some, requirement)), 0, 1)
+        out[first : first + len(rows)] = rows
+        first += len(rows)
 
 
 def problem_of(
@@ -92,10 +109,14 @@ def problem_of(
     """Predict all candidates from all stops; none is nearer to a mark that stands than allowed."""
     standing = Arrangement.numbered(np.empty((0, 3))) if standing is None else standing
     candidates = with_standing(candidates, standing)
+    rows = np.empty((len(candidates.p_site), len(stops.names), N_PACKED))
+    problem = Problem(site, stops, candidates, model, requirement, standing, rows, None)
+    _fill(problem, rows)
+    if requirement.method != "paper":
+        return problem
     blocks = _observed(site, stops, candidates, model, requirement)
-    parts = zip(*(pairs_of(some, requirement) for some in blocks), strict=True)
-    pairs = Pairs(*(np.concatenate(part, axis=1) for part in parts))
-    return Problem(site, stops, candidates, model, requirement, standing, pairs)
+    every = zip(*(circles_of(some, requirement) for some in blocks), strict=True)
+    return problem._replace(given=Circles(*(np.concatenate(part, axis=1) for part in every)))
 
 
 def with_standing(candidates: Candidates, standing: Arrangement) -> Candidates:
@@ -135,17 +156,21 @@ def scores_of(
     """
     checkpoint()
     requirement, p_stops = problem.requirement, problem.stops.p_site
-    sigmas = shared_sigmas(problem.shared_variance, requirement)
     rule = limit, problem.power, requirement.resection.sigma_height
     # stops at the edge are mostly the worst, and show first that a set is beyond the limit
     outwards = np.argsort(-np.linalg.norm(p_stops - p_stops.mean(axis=0), axis=1))
     order = outwards if stops is None else np.array(stops)
-    out = np.zeros((len(varied), 2))
-    start, varied = start_of(requirement), np.ascontiguousarray(varied)
+    out, varied = np.zeros((len(varied), 2)), np.ascontiguousarray(varied)
+    given, rows = problem.given, problem.rows
 
     def part(first: int, last: int) -> None:
-        rows = varied[first:last]
-        _score_each(problem.pairs, start, sigmas, common, rows, order, rule, out[first:last])
+        some, found = varied[first:last], out[first:last]
+        if given is None:
+            base = problem.gravity + rows[common].sum(axis=0)
+            _score_each(rows, base, some, order, rule, found)
+        else:
+            shared = shared_sigmas(problem.shared_variance, requirement)
+            _score_circles(given, shared, common, some, order, rule, found)
 
     side_by_side(part, len(varied), threaded_from=64)
     out /= len(order)
@@ -157,11 +182,9 @@ def scores_of(
 
 
 @compiled
-def _score_each(  # noqa: PLR0913  a kernel takes what it needs
-    pairs: Pairs,
-    start: Array,
-    shared: Array,
-    common: Index,
+def _score_each(
+    rows: Array,
+    base: Array,
     varied: Index,
     order: Index,
     rule: tuple[float, float, float],
@@ -171,37 +194,66 @@ def _score_each(  # noqa: PLR0913  a kernel takes what it needs
 
     A set is left out once it exceeds the limit of the rule.
     """
-    limit, power, sigma_height = rule
-    p, n, is_smooth = len(start), len(common), np.isfinite(power)
-    beyond = len(order) * limit**power if is_smooth and np.isfinite(limit) else limit
-    base = start.copy(), start.copy(), np.zeros((p, len(shared)))
-    work = start.copy(), start.copy(), np.zeros((p, len(shared)))
-    marks, three = np.empty(n + varied.shape[1], np.intp), np.empty(3, np.intp)
-    marks[:n] = common
-    for e in order:
-        base[0][:], base[1][:], base[2][:] = start, start, 0.0
-        if p > 3:
-            _add_seen(pairs, e, common, base)
-        for m in range(len(varied)):
-            if out[m, 0] > beyond:
-                continue
-            work[0][:], work[1][:], work[2][:] = base[0], base[1], base[2]
-            used, is_fixed = varied[m], True
-            if p == 3:
-                marks[n:] = varied[m]
-                is_fixed = best_circles(pairs, e, marks, three)
-                used = three
-            sigma = LOST
-            if is_fixed:
-                _add_seen(pairs, e, used, work)
-                sigma = min(sigma_3d(*work, shared, sigma_height), LOST)
-            out[m, 0] = out[m, 0] + sigma**power if is_smooth else max(out[m, 0], sigma)
-            out[m, 1] += sigma
+    work = np.empty(N_PACKED)
+    for m in range(len(varied)):
+        for e in order:
+            if not _goes_on(out[m, 0], len(order), rule):
+                break
+            for i in range(N_PACKED):
+                work[i] = base[e, i]
+            for c in varied[m]:
+                for i in range(N_PACKED):
+                    work[i] += rows[c, e, i]
+            _enter(variance_of(work), rule, out[m])
 
 
 @compiled
-def _add_seen(pairs: Pairs, e: int, marks: Index, work: tuple[Array, Array, Array]) -> None:
-    """Add those of some marks that are found to the equations of a station."""
-    for c in marks:
-        if pairs.is_seen[e, c]:
-            add_mark(pairs, e, c, work[0], work[1], work[2])
+def _score_circles(  # noqa: PLR0913  a kernel takes what it needs
+    given: Circles,
+    shared: Array,
+    common: Index,
+    varied: Index,
+    order: Index,
+    rule: tuple[float, float, float],
+    out: Array,
+) -> None:
+    """Like ``_score_each``, by the three marks at each stop whose circles cut best."""
+    n, three = len(common), np.empty(3, np.intp)
+    marks = np.empty(n + varied.shape[1], np.intp)
+    marks[:n] = common
+    for m in range(len(varied)):
+        marks[n:] = varied[m]
+        for e in order:
+            if not _goes_on(out[m, 0], len(order), rule):
+                break
+            variance = np.inf
+            if best_circles(given, e, marks, three):
+                parts = given.parts[e, three[0]] + given.parts[e, three[1]]
+                parts += given.parts[e, three[2]]
+                cofactor = np.empty((3, 3))
+                if invert(parts[:, :3].copy(), cofactor):
+                    moved = cofactor @ (parts[:, 6:] * shared)
+                    cov = cofactor @ parts[:, 3:6].copy() @ cofactor
+                    if np.trace(cofactor) <= LOOSE2:
+                        variance = np.trace(cov) + (moved * moved).sum()
+            _enter(variance, rule, out[m])
+
+
+@compiled
+def _goes_on(sum_or_largest: float, n_stops: int, rule: tuple[float, float, float]) -> bool:
+    """Return whether a set of marks may yet stay within the limit."""
+    limit, power, _ = rule
+    if np.isfinite(power) and np.isfinite(limit):
+        return bool(sum_or_largest <= n_stops * limit**power)
+    return bool(sum_or_largest <= limit)
+
+
+@compiled
+def _enter(variance: float, rule: tuple[float, float, float], out: Array) -> None:
+    """Enter the sigma of a stop into the sums of a set."""
+    _, power, sigma_height = rule
+    sigma = LOST
+    if variance <= LOOSE2:
+        sigma = min(np.sqrt(variance + sigma_height**2), LOST)
+    out[0] = out[0] + sigma**power if np.isfinite(power) else max(out[0], sigma)
+    out[1] += sigma

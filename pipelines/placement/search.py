@@ -11,7 +11,8 @@ from scipy.spatial.distance import cdist
 
 from spheremark.pipelines.errors import ConfigError, DegenerateGeometryError
 from spheremark.pipelines.model import Array, Index
-from spheremark.pipelines.placement.bounds import groups_of, relax
+from spheremark.pipelines.placement.bounds import groups_of
+from spheremark.pipelines.placement.branching import Places, relax
 from spheremark.pipelines.placement.candidates import Candidates, places_near
 from spheremark.pipelines.placement.evaluation import evaluate, worst_after_loss
 from spheremark.pipelines.placement.plan import Arrangement, Evaluation
@@ -39,6 +40,9 @@ _FINEST = 0.01  # [m] last step off the grid: finer than a mark can be staked ou
 _WORTH = 0.9998  # of the objective that is reached: a smaller gain ends a search
 _WORSE_MOST = 1.3  # than now, at most, while the loss of a mark would break the tolerance
 _TRIED = 32  # places for a mark of which losses are evaluated, the most promising first
+_LOSSES = 2  # the worst without it, by which these are chosen where a loss weighs ...
+_HEAVY = 0.2  # ... so much
+_FAINT = 1e-12  # share of a place by which none is drawn
 
 Score = tuple[float, float, float]
 """Excess after a loss, objective, mean over stops [m]."""
@@ -163,11 +167,10 @@ def search(
     is_quick: bool = False,
 ) -> Found:
     """Return the best k places of several starts, on the grid and, unless quick, off it."""
-    n_starts = 1 if is_quick else min(max(_MARKS_STARTED // k, _STARTS_MIN), _STARTS_MAX)
-    starts = _starts(problem, k, n_starts, rng)
+    n_starts = _STARTS_MIN if is_quick else min(max(_MARKS_STARTED // k, _STARTS_MIN), _STARTS_MAX)
 
     def searched(problem: Problem, begin: float) -> Found:
-        some = []
+        starts, some = _starts(problem, k, n_starts, goal, rng), []
         for i, start in enumerate(starts):
             some.append(_descended(problem, start, goal, rng))
             found(begin + 0.3 * (i + 1) / len(starts), min(some, key=lambda one: one.score))
@@ -179,10 +182,10 @@ def search(
     if not goal.is_robust or k < 3 or best.after_loss() <= limit:
         return best
     kept = searched(problem._replace(is_loss_first=True), 0.5)
-    return kept if _evaluated(kept, goal)[0] == 0.0 else best
+    return kept if evaluated(kept, goal)[0] == 0.0 else best
 
 
-def _starts(problem: Problem, k: int, n: int, rng: np.random.Generator) -> list[Index]:
+def _starts(problem: Problem, k: int, n: int, goal: Goal, rng: np.random.Generator) -> list[Index]:
     """Return the best of each of some lots of random arrangements.
 
     Most are drawn evenly, the last by the shares of the relaxation.
@@ -194,10 +197,11 @@ def _starts(problem: Problem, k: int, n: int, rng: np.random.Generator) -> list[
         if k_free:
             raise ConfigError(f"{len(fixed)} marks stand already; {k} are requested in all.")
         return [fixed]
-    is_seen = np.asarray(problem.pairs.is_seen[:, : len(free.p_site)].any(axis=0))
+    is_seen, n = problem.is_seen[: len(free.p_site)], min(n, _DRAWN_BY_SHARES)
+    rows = problem.rows[: len(free.p_site)].reshape(len(free.p_site), -1).astype(np.float32)
     groups = groups_of(free.p_site, free.apart)
-    shares = relax(problem.information(free), problem.start, groups, k_free, 0.0).shares
-    odds = np.log(np.maximum(shares, 1e-12))
+    shares = relax(Places(rows, problem.start, groups, free.p_site, 0.0), k_free).shares
+    odds = np.log(np.maximum(shares, _FAINT))
     n_drawn = _DRAWN_EVENLY + _DRAWN_BY_SHARES
     noise = (rng.gumbel(size=len(odds)) for _ in range(n_drawn))
     orders = (np.argsort(-(one + odds * (i >= _DRAWN_EVENLY))) for i, one in enumerate(noise))
@@ -209,9 +213,27 @@ def _starts(problem: Problem, k: int, n: int, rng: np.random.Generator) -> list[
             "or marks nearer to each other."
         )
     every = np.array([one for one in drawn if len(one) == k_free])
-    scores = scores_of(problem._replace(power=POWER), fixed, every)[:, 0]
+    scores = ranked(problem._replace(power=POWER), fixed, every, goal)
     parts = np.array_split(np.arange(len(every)), n)
     return [np.append(fixed, every[part[np.argmin(scores[part])]]) for part in parts if len(part)]
+
+
+def ranked(problem: Problem, fixed: Index, every: Index, goal: Goal) -> Array:
+    """Return the objective of sets of marks, (m, k), beside those that stand, (m,)."""
+    if goal.objective == "mean" and not problem.is_loss_first:
+        return scores_of(problem, fixed, every)[:, 1]
+    worst, weight = scores_of(problem, fixed, every)[:, 0], _weight(problem, goal)
+    if not (goal.counts_loss and weight and len(fixed) + every.shape[1] > 2):
+        return worst
+    rest = [(fixed, np.delete(every, j, axis=1)) for j in range(every.shape[1])]
+    rest += [(np.delete(fixed, j), every) for j in range(len(fixed))]
+    after = np.max([scores_of(problem, *one)[:, 0] for one in rest], axis=0)
+    return np.asarray(worst ** (1.0 - weight) * after**weight)
+
+
+def _weight(problem: Problem, goal: Goal) -> float:
+    """Return how much a loss counts for starts and for the choice of places."""
+    return 1.0 if problem.is_loss_first else goal.weight
 
 
 def draw(candidates: Candidates, k: int, order: Index) -> Index:
@@ -244,7 +266,17 @@ def _best_off_grid(
     several = list({tuple(sorted(one.chosen)): one for one in found}.values())
     if not is_quick and found[0].problem.candidates.rules is not None:
         several += [polished(one, goal, rng) for one in several[:_POLISHED]]
-    return min(several, key=lambda one: _evaluated(one, goal))
+    return min(several, key=lambda one: evaluated(one, goal))
+
+
+def placed(problem: Problem, places: Candidates, goal: Goal) -> Found:
+    """Return the arrangement of a mark at each place beside those that stand."""
+    site, stops, _, model, requirement, standing, *_ = problem
+    own = problem_of(site, stops, places, model, requirement, standing)
+    own = own._replace(is_loss_first=problem.is_loss_first)
+    chosen = np.append(own.fixed, np.arange(len(places.p_site)))
+    (score,) = _objectives(own, chosen[:-1], chosen[-1:], goal)
+    return Found(score, own, chosen, 0)
 
 
 def polished(found: Found, goal: Goal, rng: np.random.Generator) -> Found:
@@ -277,7 +309,7 @@ def _exchanged(problem: Problem, start: Index, goal: Goal, rng: np.random.Genera
         limit = np.inf if goal.walk_weight else score[1] * (_WORSE_MOST if score[0] else 1.0)
         for i in rng.permutation(np.arange(n_fixed, len(chosen))):
             others = np.delete(chosen, i)
-            tried = _promising(problem, others, limit)
+            tried = _promising(problem, others, goal, limit)
             found = _objectives(problem, others, tried, goal)
             best = min(range(len(tried)), key=found.__getitem__, default=-1)
             if best >= 0 and found[best] < score:
@@ -292,12 +324,21 @@ def _is_worth(score: Score, before: Score) -> bool:
     return score[0] < before[0] or (score[0] == before[0] and score[1] < _WORTH * before[1])
 
 
-def _promising(problem: Problem, others: Index, limit: float) -> Index:
-    """Return the candidates beside others that leave the worst stop best, the best first."""
+def _promising(problem: Problem, others: Index, goal: Goal, limit: float) -> Index:
+    """Return the candidates beside others that leave the worst stop best, the best first.
+
+    Where a loss weighs much, the worst stop after the loss of one of the others.
+    """
     p_site = problem.candidates.p_site
     near = cdist(p_site, p_site[others]) < problem.candidates.apart
-    places = np.flatnonzero(~near.any(axis=1) & problem.pairs.is_seen.any(axis=0))
-    scores = scores_of(problem, others, places[:, None], limit)
+    places = np.flatnonzero(~near.any(axis=1) & problem.is_seen)
+    if _weight(problem, goal) < _HEAVY or len(others) < 2:
+        scores = scores_of(problem, others, places[:, None], limit)
+    else:
+        rest, limit = [np.delete(others, j) for j in range(len(others))], np.inf
+        alone = [scores_of(problem, one, np.zeros((1, 0), np.intp))[0, 0] for one in rest]
+        worst = [rest[j] for j in np.argsort(alone)[::-1][:_LOSSES]]
+        scores = np.max([scores_of(problem, one, places[:, None]) for one in worst], axis=0)
     order = np.lexsort((scores[:, 1], scores[:, 0]))
     order = order[scores[order, 0] < limit]
     return np.asarray(places[order[:_TRIED]])
@@ -329,7 +370,7 @@ def _objectives(problem: Problem, others: Index, tried: Index, goal: Goal) -> li
     return list(zip(excess.tolist(), worst.tolist(), mean.tolist(), strict=True))
 
 
-def _evaluated(found: Found, goal: Goal) -> tuple[float, float]:
+def evaluated(found: Found, goal: Goal) -> tuple[float, float]:
     """Return the objective of an arrangement whose marks hide each other too."""
     whole, *rest = found.evaluations()
     worst = min(whole.worst_sigma_3d, LOST)

@@ -11,7 +11,7 @@ from typing import NamedTuple
 import numpy as np
 
 from spheremark.pipelines.compilation import compiled
-from spheremark.pipelines.estimation.linear_algebra import invert, invert_each
+from spheremark.pipelines.estimation.linear_algebra import invert_each
 from spheremark.pipelines.estimation.statistical_tests import block_statistics, noncentrality
 from spheremark.pipelines.geometry import by_motion
 from spheremark.pipelines.model import Array, Index, Mask
@@ -25,6 +25,7 @@ LOOSE2 = 1.0
 _BIAS_LEFT = 0.22  # of the spread of laser biases: what a survey leaves to each centre, simulated
 _TRACE_MOST = 1e6  # of the horizontal cofactor matrix of three circles that cut at all
 _ANY = 2.0  # beyond the cosine of any angle
+_MOTION = [0, 1, 2, 4, 5, 6]  # unknowns of a free station without the common error of ranges
 
 
 class Observables(NamedTuple):
@@ -57,16 +58,19 @@ class Positions(NamedTuple):
     # (s, 6, 6) of a small motion about the station, rotation [rad] and translation [m]; infinite on
     # the diagonal where there is no position
     cov_motion: Array
-    cofactor: Array  # (s, 6, 6) the same as the adjustment of the survey will state it
+    # (s, p, p) of the unknowns of the adjustment, the position last, if all marks that are seen are
+    # found; infinite likewise
+    cofactor: Array
     used: Mask  # (s, n) marks that carry each position
 
 
-class Pairs(NamedTuple):
-    """Stations and marks two by two: what each mark adds to the equations of each station."""
+class Circles(NamedTuple):
+    """Stations and marks two by two: what each mark adds to the equations of three circles."""
 
-    vectors: Array  # (s, n, 3) from stations to marks [m]
-    weights: Array  # (s, n, 3, 3) information about the position, as a survey weighs it [1/m^2]
-    spreads: Array  # (s, n, 3, 3) true covariance of what a mark adds to the right-hand side
+    towards: Array  # (s, n, 2) level unit vectors from stations to marks
+    # (s, n, 3, 9) weights of the position [1/m^2], covariance of what a mark adds to the right-hand
+    # side, and of that what a range error of 1 m and a turn of 1 rad about x and about y change
+    parts: Array
     is_seen: Mask  # (s, n) which are visible and near enough to be found
 
 
@@ -84,78 +88,78 @@ def predict_positions(observables: Observables, requirement: Requirement) -> Pos
 
     Notes
     -----
-    ``free_station``: weights are those of the adjustment, ``Q = (sum J' P J + G)^-1`` with
-    ``J = [-[v]x, 1]`` of each mark and the AHRS's information ``G`` on roll and pitch; a survey
-    takes what lasers and gimbal leave as different at every mark. The covariance of the estimate
-    has them as they are: noise of each mark, the remaining laser biases and error of direction, and
-    a common error of all ranges, which hardly moves a station with marks all round:
-    ``Q J' P C P J Q``. A common error of the centres' heights goes to the height of the station.
-    Each mark counts with the probability that it is found.
+    ``free_station``: ``(sum J' P J + G)^-1`` with ``J = [-[v]x, l, 1]`` of each mark, ``l`` the
+    unit vector of its line of sight, whose unknown is the error that all ranges share, and in ``G``
+    the AHRS's information on roll and pitch and the prior of that error. A common error of the
+    centres' heights goes to the height of the station. Each mark counts with the probability that
+    it is found.
     ``paper``: horizontal distances and heights of the three marks whose circles cut best, and the
     levelling error carried through them as in ``trilateration``; the heading is the mean of the
     three directions.
     """
-    is_paper = requirement.method == "paper"
-    pairs = pairs_of(observables, requirement)
-    used = _choose_three(pairs) if is_paper else np.array(observables.is_seen)
-    normal, spread, shared = _equations(pairs, used, requirement, observables.shared_variance)
-    cofactor, is_fixed = invert_each(normal)
-    is_fixed &= np.trace(cofactor[:, -3:, -3:], axis1=1, axis2=2) <= LOOSE2
-    cofactor[~is_fixed], used[~is_fixed & is_paper] = 0.0, False
-    moved = cofactor @ shared
-    cov = cofactor @ spread @ cofactor + moved @ _transposed(moved)
-    if is_paper:
-        position, place = cofactor, cov
-        cov = np.zeros((len(cov), 6, 6))
-        level2 = requirement.sigma_levelling**2
-        cov[:, 0, 0] = cov[:, 1, 1] = level2
-        cov[:, 3:, :2] = -requirement.sigma_levelling * moved[:, :, 1:]
-        cov[:, :2, 3:] = _transposed(cov[:, 3:, :2])
-        cov[:, 2, 2] = _heading_variances(observables, used, requirement)
-        cofactor, cov[:, 3:, 3:] = cov.copy(), place
-        cofactor[:, 3:, 3:] = position
+    if requirement.method == "paper":
+        cov, cofactor, is_fixed, used = _by_circles(observables, requirement)
+    else:
+        used = np.array(observables.is_seen)
+        cov, is_fixed = _by_all(observables, requirement)
+        every = observables._replace(found=np.ones_like(observables.found))
+        cofactor, _ = _by_all(every, requirement)
+        cov = cov[:, _MOTION][:, :, _MOTION]
     cov[:, 5, 5] += requirement.resection.sigma_height**2
-    if (observables.found < 1.0).any():  # a survey states what the marks that it finds give
-        all_found = observables._replace(found=np.ones_like(observables.found))
-        cofactor = predict_positions(all_found, requirement).cofactor
-    cov[~is_fixed] = cofactor[~is_fixed] = np.diag(np.full(6, np.inf))
+    for one in (cov, cofactor):
+        one[~is_fixed] = np.diag(np.full(one.shape[1], np.inf))
     return Positions(cov, cofactor, used)
 
 
-def pairs_of(observables: Observables, requirement: Requirement) -> Pairs:
-    """Return what each mark adds to the equations of each station.
+def information_of(observables: Observables, requirement: Requirement) -> Array:
+    """Return the information of each mark about a free station, (s, n, 7, 7).
 
-    Notes
-    -----
-    By three circles, horizontal distances and heights of levelled centres alone count.
+    The unknowns are those of ``start_information``.
     """
-    v, is_seen = observables.vectors, observables.is_seen
-    stated, true = (
-        np.where(is_seen[..., None, None], covs, np.eye(3))
-        for covs in covariances(observables, requirement)
+    is_seen = observables.is_seen[..., None, None]
+    weights, _ = invert_each(np.where(is_seen, covariances(observables, requirement), np.eye(3)))
+    weights = np.where(is_seen, weights, 0.0) * observables.found[..., None, None]
+    J = by_unknowns(observables.vectors)
+    return np.asarray(_transposed(J) @ weights @ J)
+
+
+def by_unknowns(v: Array) -> Array:
+    """Return the derivative of centres by rotation, common error of ranges, and position."""
+    along = v / np.maximum(np.linalg.norm(v, axis=-1, keepdims=True), 1e-9)
+    J = by_motion(v)
+    return np.concatenate([J[..., :3], along[..., None], J[..., 3:]], axis=-1)
+
+
+def start_information(variance: float, requirement: Requirement) -> Array:
+    """Return the information of a station without marks: gravity, and the range error's size."""
+    level, shared = requirement.sigma_levelling**-2.0, 1.0 / max(variance, 1e-18)
+    return np.diag([level, level, 0.0, shared, 0.0, 0.0, 0.0])
+
+
+def circles_of(observables: Observables, requirement: Requirement) -> Circles:
+    """Return what each mark adds to the equations of three circles.
+
+    Horizontal distances and heights of levelled centres alone count, weighed by covariances that
+    hold the common error of ranges as if it were each centre's own.
+    """
+    v = observables.vectors
+    J, lean = _circle_equations(v)
+    covs = np.where(
+        observables.is_seen[..., None, None], covariances(observables, requirement), np.eye(3)
     )
-    if requirement.method == "paper":
-        J, lean = _circle_equations(v)
-        levelling = requirement.sigma_levelling**2 * lean @ _transposed(lean)
-        weights = _transposed(J) @ np.linalg.inv(_on_circles(J, stated) + levelling) @ J
-    else:
-        weights = invert_each(stated)[0]
-    # by three circles the next best mark replaces one that is not found
-    found = 1.0 if requirement.method == "paper" else observables.found[..., None, None]
-    return Pairs(v, found * weights, found * (weights @ true @ weights), is_seen)
-
-
-def start_of(requirement: Requirement) -> Array:
-    """Return the normal matrix without a mark: position, or gravity, heading and position."""
-    if requirement.method == "paper":
-        return np.zeros((3, 3))
-    return np.diag([requirement.sigma_levelling**-2.0] * 2 + [0.0] * 4)
+    levelling = requirement.sigma_levelling**2 * lean @ _transposed(lean)
+    along = v / np.maximum(np.linalg.norm(v, axis=-1, keepdims=True), 1e-9)
+    stated = covs + observables.shared_variance * along[..., :, None] * along[..., None, :]
+    weights = _transposed(J) @ np.linalg.inv(_on_circles(J, stated) + levelling) @ J
+    shared = np.concatenate([along[..., None], by_motion(v)[..., :2]], axis=-1)
+    parts = np.concatenate([weights, weights @ covs @ weights, weights @ shared], axis=-1)
+    flat = np.maximum(np.hypot(v[..., 0], v[..., 1]), 1e-9)
+    return Circles(v[..., :2] / flat[..., None], parts, observables.is_seen)
 
 
 def shared_sigmas(variance: float, requirement: Requirement) -> Array:
-    """Return the sigmas of errors that marks of a station share, in the order of ``add_mark``."""
-    sigmas = [np.sqrt(variance), *[requirement.sigma_levelling] * 2]
-    return np.array(sigmas if requirement.method == "paper" else sigmas[:1])
+    """Return the sigmas of errors that the marks of three circles share, as in ``Circles``."""
+    return np.array([np.sqrt(variance), *[requirement.sigma_levelling] * 2])
 
 
 def claimed_bias_variance(sigma_laser_bias: float) -> float:
@@ -173,19 +177,15 @@ def reliability(
 ) -> Reliability:
     """Return the size of errors in a mark that tests find, and the effect of smaller ones."""
     v = observables.vectors
-    stated, _ = covariances(observables, requirement)
-    covs = np.where(found.used[..., None, None], stated, np.eye(3))
     is_fixed: Mask = np.asarray(np.isfinite(found.cov_motion).all(axis=(1, 2)))
-    used = np.asarray(found.used & is_fixed[:, None])
-    inverse = np.where(is_fixed[:, None, None], found.cofactor, 0.0)
+    used = found.used & is_fixed[:, None]
+    covs = np.where(found.used[..., None, None], covariances(observables, requirement), np.eye(3))
+    inverse = np.where(np.isfinite(found.cofactor), found.cofactor, 0.0)
+    J = by_unknowns(v)
     if requirement.method == "paper":
         J, lean = _circle_equations(v)
         covs = _on_circles(J, covs) + requirement.sigma_levelling**2 * lean @ _transposed(lean)
-        inverse = inverse[:, 3:, 3:]
-        to_position = np.eye(3)
-    else:
-        J = by_motion(v)
-        to_position = np.eye(6)[3:]
+    to_position = np.eye(J.shape[-1])[-3:]
     weights = invert_each(covs)[0]
     tests = block_statistics(np.zeros(J.shape[:-1]), weights, J @ inverse[:, None] @ _transposed(J))
     shift = noncentrality(requirement.resection.test_level, requirement.resection.test_power)
@@ -197,51 +197,60 @@ def reliability(
     )
 
 
-def covariances(observables: Observables, requirement: Requirement) -> tuple[Array, Array]:
-    """Return the centres' covariances as a survey states them, and the true ones.
+def covariances(observables: Observables, requirement: Requirement) -> Array:
+    """Return the covariances of the centres, without the range error that all of them share.
 
-    A survey takes the remaining laser biases as independent, along the ranges, and adds what all
-    directions leave; true are these biases, noise and the error of aiming across the ranges, beside
-    a range error that all centres share.
+    Noise, along the ranges what lasers leave at each, and the error of aiming across them.
     """
     v = observables.vectors
     d2 = np.maximum(np.sum(v**2, axis=-1), 1e-9)[..., None, None]
     along = v[..., :, None] * v[..., None, :]
-    noise = observables.cov_centres + requirement.sigma_marks**2 * np.eye(3)
     bias2 = claimed_bias_variance(observables.sigma_laser_bias)
-    noise = noise + bias2 / d2 * along
-    stated = noise + requirement.resection.sigma_common**2 * np.eye(3)
     aim2 = observables.sigma_aim[..., None, None] ** 2
-    return stated, noise + aim2 * (d2 * np.eye(3) - along)
+    own = observables.cov_centres + requirement.sigma_marks**2 * np.eye(3)
+    return np.asarray(own + bias2 / d2 * along + aim2 * (d2 * np.eye(3) - along))
 
 
-def _equations(
-    pairs: Pairs, used: Mask, requirement: Requirement, variance: float
-) -> tuple[Array, Array, Array]:
-    """Return normal matrices, covariances and shared errors of right-hand sides of stations."""
-    start, sigmas = start_of(requirement), shared_sigmas(variance, requirement)
-    normal, spread = (np.tile(start, (len(used), 1, 1)) for _ in range(2))
-    shared = np.zeros((*normal.shape[:2], len(sigmas)))
-    _add_marks(pairs, used, normal, spread, shared)
-    normal, spread = (np.tril(one) + _transposed(np.tril(one, -1)) for one in (normal, spread))
-    return normal, spread, shared * sigmas
+def _by_all(observables: Observables, requirement: Requirement) -> tuple[Array, Mask]:
+    """Return covariances of the unknowns of free stations, and which have a position."""
+    start = start_information(observables.shared_variance, requirement)
+    cov, is_fixed = invert_each(start + information_of(observables, requirement).sum(axis=1))
+    return cov, is_fixed & (np.trace(cov[:, -3:, -3:], axis1=1, axis2=2) <= LOOSE2)
+
+
+def _by_circles(
+    observables: Observables, requirement: Requirement
+) -> tuple[Array, Array, Mask, Mask]:
+    """Return covariances of motions and positions by three circles, which are fixed, and by what.
+
+    The next best mark replaces one that is not found.
+    """
+    given = circles_of(observables, requirement)
+    used = np.zeros(given.is_seen.shape, dtype=np.bool_)
+    _choose_each(given, used)
+    summed = np.where(used[..., None, None], given.parts, 0.0).sum(axis=1)
+    weights, spread, shared = np.split(summed, 3, axis=2)
+    cofactor, is_fixed = invert_each(weights)
+    is_fixed &= np.trace(cofactor, axis1=1, axis2=2) <= LOOSE2
+    cofactor[~is_fixed], used[~is_fixed] = 0.0, False
+    moved = cofactor @ (shared * shared_sigmas(observables.shared_variance, requirement))
+    cov = np.zeros((len(cofactor), 6, 6))
+    cov[:, 0, 0] = cov[:, 1, 1] = requirement.sigma_levelling**2
+    cov[:, 3:, :2] = -requirement.sigma_levelling * moved[:, :, 1:]
+    cov[:, :2, 3:] = _transposed(cov[:, 3:, :2])
+    cov[:, 2, 2] = _heading_variances(observables, used, requirement)
+    cov[:, 3:, 3:] = cofactor @ spread @ cofactor + moved @ _transposed(moved)
+    return cov, cofactor, is_fixed, used
 
 
 def _heading_variances(observables: Observables, used: Mask, requirement: Requirement) -> Array:
     """Return the variances of the mean of the directions to three marks."""
     v = observables.vectors
-    _, true = covariances(observables, requirement)
+    covs = covariances(observables, requirement)
     flat2 = np.maximum(np.sum(v[..., :2] ** 2, axis=2), 1e-18)
     left = np.stack([-v[..., 1], v[..., 0]], axis=-1) / flat2[..., None]
-    variances = np.einsum("eni,enij,enj->en", left, true[..., :2, :2], left)
+    variances = np.einsum("eni,enij,enj->en", left, covs[..., :2, :2], left)
     return np.asarray(np.where(used, variances, 0.0).sum(axis=1) / 9.0)
-
-
-def _choose_three(pairs: Pairs) -> Mask:
-    """Return the three marks of each station whose circles cut best; none where they do not cut."""
-    used = np.zeros(pairs.is_seen.shape, dtype=np.bool_)
-    _choose_each(pairs, used)
-    return used
 
 
 def _circle_equations(v: Array) -> tuple[Array, Array]:
@@ -261,14 +270,12 @@ def _transposed(stack: Array) -> Array:
 
 
 @compiled
-def best_circles(pairs: Pairs, e: int, marks: Index, three: Index) -> bool:
+def best_circles(given: Circles, e: int, marks: Index, three: Index) -> bool:
     """Find the three of some marks whose circles cut best at a station; return whether they cut."""
     n, lines, seen = 0, np.empty((len(marks), 2)), np.empty(len(marks), np.intp)
     for c in marks:
-        if pairs.is_seen[e, c]:
-            x, y = pairs.vectors[e, c, 0], pairs.vectors[e, c, 1]
-            flat = max(np.sqrt(x * x + y * y), 1e-9)
-            seen[n], lines[n, 0], lines[n, 1] = c, x / flat, y / flat
+        if given.is_seen[e, c]:
+            seen[n], lines[n] = c, given.towards[e, c]
             n += 1
     trace, _ = best_three(lines[:n], -_ANY, _ANY, three)
     if trace >= _TRACE_MOST:
@@ -279,96 +286,10 @@ def best_circles(pairs: Pairs, e: int, marks: Index, three: Index) -> bool:
 
 
 @compiled
-def _choose_each(pairs: Pairs, used: Mask) -> None:
+def _choose_each(given: Circles, used: Mask) -> None:
     """Mark the three marks that each station uses."""
     three, marks = np.empty(3, np.intp), np.arange(used.shape[1])
     for e in range(len(used)):
-        if best_circles(pairs, e, marks, three):
+        if best_circles(given, e, marks, three):
             for c in three:
                 used[e, c] = True
-
-
-@compiled
-def _add_marks(pairs: Pairs, used: Mask, normal: Array, spread: Array, shared: Array) -> None:
-    """Add the marks that each station uses to its equations."""
-    for e in range(len(used)):
-        for c in range(used.shape[1]):
-            if used[e, c]:
-                add_mark(pairs, e, c, normal[e], spread[e], shared[e])
-
-
-@compiled
-def add_mark(pairs: Pairs, e: int, c: int, normal: Array, spread: Array, shared: Array) -> None:
-    """Add a mark to the equations of a station: lower triangles, and shared errors.
-
-    Shared are a range error of 1 m and, where the unknowns are the position alone, a turn of 1 rad
-    of the levelled frame about x and about y.
-    """
-    v, weight = pairs.vectors[e, c], pairs.weights[e, c]
-    _add_block(v, weight, normal)
-    _add_block(v, pairs.spreads[e, c], spread)
-    x, y, z = v
-    d, n = np.sqrt(x * x + y * y + z * z), len(normal) - 3
-    p = (weight[0, 0] * x + weight[1, 0] * y + weight[2, 0] * z) / d
-    q = (weight[1, 0] * x + weight[1, 1] * y + weight[2, 1] * z) / d
-    r = (weight[2, 0] * x + weight[2, 1] * y + weight[2, 2] * z) / d
-    shared[n, 0] += p
-    shared[n + 1, 0] += q
-    shared[n + 2, 0] += r
-    for k in range(1, shared.shape[1]):
-        for i in range(3):
-            shared[i, k] += _turned(v, weight, i, k - 1)
-    if n:
-        shared[0, 0] += y * r - z * q
-        shared[1, 0] += z * p - x * r
-        shared[2, 0] += x * q - y * p
-
-
-@compiled
-def _add_block(v: Array, block: Array, out: Array) -> None:
-    """Add ``J' block J`` to at least the lower triangle of a matrix, ``J = [-[v]x, 1]`` or 1."""
-    x, y, z = v
-    n = len(out) - 3
-    for j in range(3):
-        for i in range(j, 3):
-            out[n + i, n + j] += block[i, j]
-        if n:
-            p, q, r = _turned(v, block, 0, j), _turned(v, block, 1, j), _turned(v, block, 2, j)
-            out[3, j] += p
-            out[4, j] += q
-            out[5, j] += r
-            out[0, j] += y * r - z * q
-            out[1, j] += z * p - x * r
-            out[2, j] += x * q - y * p
-
-
-@compiled
-def _turned(v: Array, block: Array, i: int, j: int) -> float:
-    """Return one element of ``-block [v]x``."""
-    k, m = (j + 1) % 3, (j + 2) % 3
-    return float(block[i, m] * v[k] - block[i, k] * v[m])
-
-
-@compiled
-def sigma_3d(
-    normal: Array, spread: Array, shared: Array, sigmas: Array, sigma_height: float
-) -> float:
-    """Return the 3-D sigma of a station; infinite without a position. Inverts the normal matrix.
-
-    The first two matrices by their lower triangles.
-    """
-    if not invert(normal, normal):
-        return np.inf
-    p, total, trace = len(normal), sigma_height**2, 0.0
-    for a in range(p - 3, p):
-        trace += normal[a, a]
-        for i in range(p):
-            total += spread[i, i] * normal[a, i] ** 2
-            for j in range(i):
-                total += 2.0 * spread[i, j] * normal[a, i] * normal[a, j]
-        for r in range(len(sigmas)):
-            moved = 0.0
-            for i in range(p):
-                moved += shared[i, r] * normal[a, i]
-            total += (sigmas[r] * moved) ** 2
-    return np.sqrt(total) if trace <= LOOSE2 else np.inf
