@@ -29,7 +29,7 @@ MCAP = {"Content-Type": "application/vnd.mcap"}
 TUS = {"Tus-Resumable": "1.0.0"}
 PART = {**TUS, "Content-Type": "application/offset+octet-stream"}
 PATIENCE = 300.0  # [s]
-ATTEMPTS = 10  # at a job; no job meets more kills by chance
+ATTEMPTS = 10  # at a job; one that meets so many kills is given up, as is promised
 COMMAND = (sys.executable, "-m", "spheremark.service.cli")
 
 
@@ -49,7 +49,7 @@ class Victim:
         self.kept = {}  # by digest: address of an unfinished upload, acknowledged bytes
         self.shortened = []  # uploads of which acknowledged bytes were gone
         self.refused = []
-        self.number = self.round = 0
+        self.number = self.round = self.n_kills = 0
 
     def start(self):
         """Start it; return a client."""
@@ -77,6 +77,7 @@ class Victim:
 
     def kill(self, *, workers):
         """Kill the service, or one of its workers; return the processes that must end by it."""
+        self.n_kills += 1
         found = psutil.Process(self.process.pid).children(recursive=True)
         if workers:
             own = [one for one in found if is_spawned(one)]
@@ -170,6 +171,10 @@ class Victim:
             key for key, one in jobs.items()
             if one["status"] == "successful" and one["kind"] == "process"
         }  # fmt: skip
+        given_up = {
+            key for key, one in jobs.items()
+            if one["error_code"] == "worker_died" and one["attempts"] == ATTEMPTS <= self.n_kills
+        }  # fmt: skip
         rows = [one["recording_id"] for one in everything(client, "recordings")]
         files = {one.stem: one for one in (self.folder / "recordings").glob("*.mcap")}
         runs = [one["job_id"] for one in everything(client, "runs")]
@@ -194,7 +199,7 @@ class Victim:
                 key: f"{one['kind']}, {one['attempts']} attempts, {one['error_code']}: "
                 f"{one['error_reason']}"
                 for key, one in jobs.items()
-                if one["status"] == "failed"
+                if one["status"] == "failed" and key not in given_up
             },
             "jobs without run": sorted(done - set(runs)),
             "runs without job": sorted(set(runs) - jobs.keys()),
@@ -205,6 +210,7 @@ class Victim:
         about = {
             "logs": len(rows),
             "jobs": len(jobs),
+            "given up": len(given_up),
             "tried again": sum(one["attempts"] > 1 for one in jobs.values()),
             "runs": len(runs),
             "fixes": len(fixes),
