@@ -239,6 +239,13 @@ class PointClouds:
             notes.append(f"The points of {self._topic} have no field for their laser (ring).")
         is_known = not has_times or bool(messages.is_ascending.all())
         out = self._out.in_order(messages.counts if is_known else np.ones(self._n, np.int64))
+        if out.are_double():
+            n = len(out.rings)
+            out = out.once()
+            notes.append(
+                f"{n - len(out.rings):,} of {n:,} returns of {self._topic} are both the strongest "
+                "and the last of their pulse: they count once."
+            )
         return Returns(
             topic=self._topic,
             frame=self._frame,

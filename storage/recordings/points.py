@@ -29,6 +29,10 @@ _STEP_MAX = 1 << 16  # [bytes] of a point; drivers write 12 to 48
 _PAGE = 1 << 21  # [bytes] of a large page of memory: fewer pages, fewer page faults
 _WORTH = 4  # clouds that two threads unpack sooner than one
 _PIECE = 8  # clouds that a thread takes at a time
+_PULSE_NS = 1_000_000  # [ns] between the echoes of a pulse, and far less than a revolution
+_DOUBLE_SAMPLE = 8_192  # returns: a third of a revolution of a VLP-16
+_DOUBLE_MIN = 0.01  # of them; none is double where each pulse has one return
+_MIXING = np.array([0x9E3779B97F4A7C15, 0xC2B2AE3D27D4EB4F, 0x165667B19E3779F9], np.uint64)
 _BLOCK = 512  # points: few enough for the nearest cache
 _EXPONENT = np.uint32(0x7F800000)  # bits of a float32; all are set where it is not finite
 _MAGNITUDE = np.uint32(0x7FFFFFFF)
@@ -72,6 +76,31 @@ class Columns(NamedTuple):
         if (stamps[begins] >= stamps[begins - 1]).all():
             return self.taken(slice(len(stamps)))
         return self.taken(np.argsort(stamps, kind="stable"))
+
+    def once(self) -> Columns:
+        """Return each return once that both echoes of one pulse show, with its instant."""
+        n = len(self.rings)
+        low = np.uint64(n.bit_length())  # bits that hold the row, so that equal keys stay in order
+        rows = np.arange(n, dtype=np.uint64)
+        keys = np.sort((self._keys(slice(None)) >> low << low) | rows)
+        mask = np.uint64((1 << n.bit_length()) - 1)
+        twice = np.flatnonzero(keys[1:] >> low == keys[:-1] >> low)
+        one, other = ((keys[at] & mask).astype(np.intp) for at in (twice, twice + 1))
+        is_same = self.stamps[other] - self.stamps[one] < _PULSE_NS
+        is_same &= (self.p[one] == self.p[other]).all(axis=1)
+        keep = np.ones(n, np.bool_)
+        keep[other[is_same]] = False
+        return self.taken(np.flatnonzero(keep))
+
+    def are_double(self) -> bool:
+        """Return whether returns occur twice at the beginning, where no LiDAR comes back yet."""
+        keys = self._keys(slice(_DOUBLE_SAMPLE))
+        return len(np.unique(keys)) < (1.0 - _DOUBLE_MIN) * len(keys)
+
+    def _keys(self, rows: slice) -> NDArray[np.uint64]:
+        """Return numbers that are equal for equal coordinates, and hardly for others."""
+        bits = np.ascontiguousarray(self.p[rows]).view(np.uint32).astype(np.uint64)
+        return np.asarray(bits @ _MIXING)
 
 
 def _reserved(size: int) -> Octets:

@@ -809,6 +809,27 @@ def test_known_models_are_those_of_velodyne_decoder(model, other):
     assert_allclose(model.heights, heights, rtol=0, atol=limit)
 
 
+@pytest.mark.parametrize("lag", [1, 32])
+@pytest.mark.parametrize("has_times", [True, False])
+def test_equal_dual_returns_of_a_cloud_are_one_and_different_ones_are_two(
+    tmp_path, rng, lag, has_times
+):
+    single = velodyne(rng, 640)
+    last = single.copy()
+    last["x"][::5] += 0.5
+    both = np.stack([single.reshape(-1, lag), last.reshape(-1, lag)], axis=1).ravel()
+    names = list(both.dtype.names) if has_times else list(both.dtype.names)[:-1]
+    points = np.zeros(len(both), [(name, both.dtype[name].str) for name in names])
+    for name in names:
+        points[name] = both[name]
+    later = T0 + 10**8  # the same place in the next revolution is another return
+    items = [("/p", later, cloud(points)), ("/p", later + 10**8, cloud(points, later))]
+    log = read_log(record(tmp_path / "a.mcap", [*items, *turning()]))
+    assert len(log.p_lidar) == 2 * (640 + 128)
+    assert any("1,024 of 2,560 returns of /p are both" in note for note in log.notes)
+    assert len(np.unique(log.p_lidar, axis=0)) == 640 + 128
+
+
 def test_lasers_are_found_whatever_the_pace_of_their_rings(tmp_path, rng):
     model = lasers.MODELS[0]
     points = spinning(rng, np.degrees(model.elevations), 16 * 5_000 * 2)  # a stride of 32 rows
