@@ -88,8 +88,11 @@ def _http_problem(request: Request, error: HTTPException) -> Problem:
     """Return one of the framework's own errors as a problem."""
     title = HTTPStatus(error.status_code).phrase
     code = HTTP_CODES.get(error.status_code, f"http_{error.status_code}")
+    way = "the overview leads to every page"
+    if not _wants_page(request):
+        way = "/api/v1/openapi.json lists the routes"
     detail = {
-        404: f"There is nothing at {request.url.path}; /api/v1/openapi.json lists the routes.",
+        404: f"There is nothing at {request.url.path}; {way}.",
         405: f"{request.url.path} does not support {request.method}.",
     }.get(error.status_code, str(error.detail))
     return Problem(
