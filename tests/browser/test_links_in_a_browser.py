@@ -108,7 +108,8 @@ def test_the_query_of_a_figure_opens_on_the_page_for_sql(visit):
     page.locator("#count .menu summary").click()
     with page.expect_navigation():
         page.locator("#count .menu").get_by_text("SQL that made it").click()
-    assert "/sql?q=SELECT" in page.url
+    assert "/sql?q=WITH" in page.url
+    page.wait_for_selector("#result tbody tr")
 
 
 @pytest.mark.parametrize(("width", "scheme"), [(1280, "light"), (390, "dark")])
