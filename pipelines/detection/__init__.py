@@ -16,6 +16,7 @@ the base): a few centimetres of axis offset do not change which returns look lik
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -24,8 +25,10 @@ from scipy.spatial import KDTree
 from spheremark.pipelines.config import ExtractionConfig
 from spheremark.pipelines.detection.cells import cells_of
 from spheremark.pipelines.detection.decision import (
+    UNDECIDED,
     Judgement,
     distinct,
+    edge_of,
     is_resolved,
     judged,
     noise_of,
@@ -175,25 +178,43 @@ def _log_likelihoods(
     config: ExtractionConfig,
     target: Target,
 ) -> Array:
-    """Return the logarithms of the likelihoods of some groups by all hypotheses, (n, k)."""
-    found = np.empty((len(compared), len(NAMES)))
+    """Return the logarithms of the likelihoods of some groups by all hypotheses, (n, k).
 
-    def compare(first: int, end: int) -> None:
-        for i, (features, evidence, n_neighbours) in enumerate(compared[first:end], first):
-            if np.isnan(noise):
-                least = 0.0 if features.n_points >= N_RESOLVED else NOISE_MIN
-                own = min(max(features.scatter, least), config.scatter_max)
-                physics = Physics(own, _SIGMAS_LOG_NOISE[1], *hearing)
-            else:
-                physics = Physics(noise, _SIGMAS_LOG_NOISE[0], *hearing)
+    Where beams come to hit an outline is known from the surest markers of the scan.
+    """
+    found, edges = np.empty((len(compared), len(NAMES))), np.empty(len(compared))
+    physics = [_physics(one.features, noise, hearing, config) for one in compared]
+
+    def compare(rows: Sequence[int]) -> None:
+        for i in rows:
+            features, evidence, n_neighbours = compared[i]
             distance = float(np.linalg.norm(features.p_base))
             level = float(features.p_base @ target.up)
-            found[i] = log_likelihoods(
-                evidence, distance, level, n_neighbours, target.radius, physics
+            found[i], edges[i] = log_likelihoods(
+                evidence, distance, level, n_neighbours, target.radius, physics[i]
             )
 
-    side_by_side(compare, len(compared), threaded_from=4)
+    n = len(compared)
+    side_by_side(lambda first, end: compare(range(first, end)), n, threaded_from=4)
+    edge, sigma_edge = edge_of(edges, found)
+    if compared and sigma_edge < physics[0].sigma_edge:
+        physics = [one._replace(edge=edge, sigma_edge=sigma_edge) for one in physics]
+        again = np.flatnonzero(found[:, 0] > found.max(axis=1) - UNDECIDED)
+        side_by_side(
+            lambda first, end: compare(again[first:end].tolist()), len(again), threaded_from=4
+        )
     return found
+
+
+def _physics(
+    features: Features, noise: float, hearing: Hearing, config: ExtractionConfig
+) -> Physics:
+    """Return what a scan shows of its physics, at a group."""
+    if not np.isnan(noise):
+        return Physics(noise, _SIGMAS_LOG_NOISE[0], *hearing)
+    least = 0.0 if features.n_points >= N_RESOLVED else NOISE_MIN
+    own = min(max(features.scatter, least), config.scatter_max)
+    return Physics(own, _SIGMAS_LOG_NOISE[1], *hearing)
 
 
 def _candidates(found: list[_Group], target: Target) -> tuple[MarkerCandidate, ...]:

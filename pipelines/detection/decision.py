@@ -33,6 +33,10 @@ _SHADE = 0.25  # standard deviation, as a share, of one return's reflectivity: p
 _DIFFERENT = 0.25  # share by which the reflectivity of a marker may differ from that of the others
 _N_LARGE, _N_KNOWN = 30, 3  # returns that show the noise of a scan, and groups that agree
 _N_PRIOR = 5.0  # places that the usual abundance of a hypothesis counts for in a scan
+_SURELY = 3.0  # logarithm of odds of a sphere that shows the optics of a scan
+_EDGE_VARIES = 0.15  # half widths of a beam, between the markers of a scan
+UNDECIDED = 15.0
+"""Logarithm of odds against a marker up to which it is compared again with better optics."""
 _N_ROUNDS = 10
 _MOST = 1e6  # times likelier: more says nothing
 
@@ -192,6 +196,20 @@ def noise_of(groups: list[Features]) -> float:
         if features.n_points >= _N_LARGE and features.n_unexplained + features.n_beside == 0
     ]
     return median(known) if len(known) >= _N_KNOWN else float("nan")
+
+
+def edge_of(edges: Array, log_likelihoods: Array) -> tuple[float, float]:
+    """Return where beams come to hit an outline, by the groups that are surely spheres.
+
+    In half widths of a beam, with its standard deviation, which is infinite if these are few.
+    """
+    others = log_likelihoods[:, 1:].max(axis=1, initial=-inf)
+    own = edges[log_likelihoods[:, 0] > others + _SURELY] if len(edges) else edges
+    if len(own) < _N_KNOWN:
+        return 0.0, inf
+    middle = float(np.median(own))
+    spread = 1.4826 * float(np.median(np.abs(own - middle)))
+    return middle, float(np.hypot(_EDGE_VARIES, 1.25 * spread / sqrt(len(own))))
 
 
 def judged(log_likelihoods: Array) -> list[Judgement]:

@@ -62,7 +62,7 @@ _SAME = 0.15  # relative deviation of a radius, or of three axes, within which i
 _AS_ROUND = 0.002  # share of other balls and stones that are known to be so, and are no markers
 
 # Means and standard deviations of the parameters
-_CENTRE, _EDGES, _POLE_SIZE = (0.3, 0.3, 0.4), (0.6, 0.4), (float(np.log(0.2)), 0.8)
+_CENTRE, _POLE_SIZE = (0.3, 0.3, 0.4), (float(np.log(0.2)), 0.8)
 _TURNED, _MOVED = 0.003, 0.01  # [rad] and [m] by which the faces lie apart with a rough mounting
 _HEAD_SIZE = (0.085, 1.3, 0.12)  # [m] half the width of a head, its height over it, their spread
 _RELIEF, _SIGMA_LOG_RELIEF = 0.08, 0.3  # of stones, hair and faces about an ellipsoid
@@ -109,12 +109,17 @@ class Physics(NamedTuple):
         Share of the pulses on a surface without a return.
     weakest : float
         Reflectivity over squared range of the weakest returns [1/m^2].
+    edge, sigma_edge : float
+        Half widths of a beam outside an outline where half the beams hit, and how far that may be
+        off.
     """
 
     noise: float
     sigma_log_noise: float
     lost: float
     weakest: float
+    edge: float = 0.6
+    sigma_edge: float = 0.4
 
 
 class _Beams(NamedTuple):
@@ -149,8 +154,8 @@ def log_likelihoods(
     n_neighbours: int,
     radius: float,
     physics: Physics,
-) -> Array:
-    """Return the logarithms of the likelihoods of all hypotheses about a place.
+) -> tuple[Array, float]:
+    """Return the logarithms of the likelihoods of all hypotheses, and the edge of the best sphere.
 
     Parameters
     ----------
@@ -202,9 +207,9 @@ def log_likelihoods(
         moved = _MOVED / radius
         priors[_SPHERE, 1, _SHIFT:_POLE] = moved
         priors[_SPHERE, 1, _SHIFT : _SHIFT + 2] = hypot(_TURNED * distance / radius, moved)
-    found: Array = _compared(beams, priors, logs)
+    found, sphere = _compared(beams, priors, logs)
     never = float(found.max()) - _NEVER
-    return np.asarray(np.maximum(found, never))
+    return np.asarray(np.maximum(found, never)), float(sphere[_EDGE])
 
 
 def _n_unknown(seen: Array, silent: Array, blur: float) -> float:
@@ -225,7 +230,7 @@ def _priors(radius: float, physics: Physics) -> Array:
     priors = np.zeros((len(NAMES), 2, _N_PARAMETERS))
     priors[:, 1, :3], priors[:, 0, _Z] = _CENTRE, -_MEAN
     priors[:, :, _NOISE] = np.log(physics.noise / radius), physics.sigma_log_noise
-    priors[:, :, _EDGE] = _EDGES
+    priors[:, :, _EDGE] = physics.edge, physics.sigma_edge
     half, height, spread = _HEAD_SIZE
     head = ((np.log(half / radius), spread), (np.log(height), spread), (np.log(height), spread))
     for kind, form in {**_FORMS, _HEAD: head}.items():
@@ -537,8 +542,8 @@ def _log_volume(kind: int, shape: Array, prior: Array, beams: _Beams, best: floa
 
 
 @compiled
-def _compared(beams: _Beams, priors: Array, log_priors: Array) -> Array:
-    """Return the logarithms of prior times evidence of all hypotheses."""
+def _compared(beams: _Beams, priors: Array, log_priors: Array) -> tuple[Array, Array]:
+    """Return the logarithms of prior times evidence of all hypotheses, and the best sphere."""
     found, best = np.full(len(log_priors), -np.inf), -np.inf
     sphere = priors[_SPHERE, 0].copy()
     for kind in _ORDER:
@@ -566,4 +571,4 @@ def _compared(beams: _Beams, priors: Array, log_priors: Array) -> Array:
             own = _evidence(_SPHERE, shape, priors[_SPHERE], beams, -np.inf)
             found[_SPHERE] = max(found[_SPHERE], own + log_priors[_SPHERE])
         best = max(best, found[kind])
-    return found
+    return found, sphere

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from spheremark.pipelines.detection.decision import (
+    edge_of,
     is_resolved,
     judged,
     reason_by_evidence,
@@ -105,3 +106,12 @@ def test_markers_hold_no_more_false_ones_than_wanted():
     assert sure_ones(probabilities, 0.02) == [True, True, True, True, False]
     assert sure_ones(probabilities, 1e-6) == [False] * 5
     assert sure_ones([], 0.01) == []
+
+
+def test_the_edge_of_a_scan_is_that_of_its_surest_spheres():
+    found = likelihoods(9.0, 8.0, 12.0, 1.0)
+    edge, sigma = edge_of(np.array([0.2, 0.3, 0.1, 0.9]), found)
+    assert edge == pytest.approx(0.2)
+    assert 0.15 < sigma < 0.25
+    assert edge_of(np.array([0.2, 0.3]), found[:2])[1] == np.inf
+    assert edge_of(np.empty(0), likelihoods())[1] == np.inf
