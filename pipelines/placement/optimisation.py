@@ -463,7 +463,9 @@ def _bounded(
     around = relax(given, n, course.relaxed)
     alone = replace(goal, is_robust=False, loss_weight=0.0, walk_weight=0.0)
     alone = replace(alone, objective="mean" if given.is_mean else "worst")
-    branched = branch(given, n, around, evaluated(found, alone)[1], course.bounded)
+    # a plan for the loss of a mark is no plan for the worst stop: its bound is that of divided ones
+    reached = around.bound if goal.objective == "after_loss" else evaluated(found, alone)[1]
+    branched = branch(given, n, around, reached, course.bounded)
     if len(branched.chosen):
         other = placed(found.problem, places.rows(branched.chosen), goal)
         other = polished(other, goal, rng) if places.rules is not None else other
