@@ -288,7 +288,11 @@ class _Forks:
         with self._lock:
             if self._socket is not None and self._process is not None:
                 self._socket.close()
-                self._process.wait(_START_MAX)
+                try:
+                    self._process.wait(_START_MAX)
+                except subprocess.TimeoutExpired:  # it is stopped, or the machine too busy
+                    self._process.kill()
+                    self._process.wait()
             self._socket = self._process = None
 
 

@@ -1,4 +1,4 @@
-"""One service and one browser for all tests of this folder."""
+"""One service and one browser for each file of this folder."""
 
 import pytest
 from playwright.sync_api import sync_playwright
@@ -8,7 +8,7 @@ from tests.browser.visits import CHROMIUM, Visit, served
 from tests.surveyed import fill
 
 
-@pytest.fixture(scope="package")
+@pytest.fixture(scope="module")
 def address(tmp_path_factory):
     data = tmp_path_factory.mktemp("data")
     with Catalogue(data / "spheremark.duckdb", snapshots=data / "snapshots") as catalogue:
@@ -18,7 +18,7 @@ def address(tmp_path_factory):
         yield address
 
 
-@pytest.fixture(scope="package")
+@pytest.fixture(scope="module")
 def browser():
     with sync_playwright() as playwright:
         browser = playwright.chromium.launch(executable_path=CHROMIUM, args=["--no-sandbox"])

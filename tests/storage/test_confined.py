@@ -183,16 +183,16 @@ def test_an_answer_that_could_still_be_changed_is_none(run_forked):
         run_forked("keep_the_answer_open")
 
 
-def test_what_a_reader_leaves_behind_is_ended(run_forked):
+def test_what_a_reader_leaves_behind_is_ended(run_forked, forks):
     run_forked("fork_on")
-    (server,) = (one for one in psutil.Process().children() if "--ready" in one.cmdline())
+    server = psutil.Process(forks._process.pid)
     deadline = time.monotonic() + 60
     while server.children():
         assert time.monotonic() < deadline
 
 
-def test_the_process_that_keeps_readers_loaded_is_started_anew(run_forked):
-    (server,) = (one for one in psutil.Process().children() if "--ready" in one.cmdline())
+def test_the_process_that_keeps_readers_loaded_is_started_anew(run_forked, forks):
+    server = psutil.Process(forks._process.pid)
     server.kill()
     server.wait(60)
     assert run_forked("size_of")["size"].tolist() == [5]
