@@ -13,6 +13,7 @@ from markupsafe import Markup
 
 STATIC = "/static"
 _FONT = re.compile(r'url\("(fonts/[^"]+)"\)')
+_IMPORT = re.compile(r'from "\./([\w-]+\.js)"')
 _TOKEN = re.compile(r"(--[\w-]+): ([^;]+);")
 
 
@@ -80,8 +81,10 @@ def inline_styles() -> Markup:
 
 
 def inline_script(name: str) -> Markup:
-    """Return a script for a page in one file."""
-    return Markup((static_folder() / name).read_text("utf-8"))
+    """Return a script for a page in one file, with the modules that it imports."""
+    folder = static_folder()
+    text = (folder / name).read_text("utf-8")
+    return Markup(_IMPORT.sub(lambda found: f'from "{_module_url(folder / found[1])}"', text))
 
 
 def tokens(mode: str) -> dict[str, str]:
@@ -90,6 +93,11 @@ def tokens(mode: str) -> dict[str, str]:
     light, _, dark = text.partition(':root[data-theme="dark"]')
     found = dict(_TOKEN.findall(light))
     return found if mode == "light" else found | dict(_TOKEN.findall(dark))
+
+
+def _module_url(path: Path) -> str:
+    """Return a module without imports of its own as a data URL."""
+    return f"data:text/javascript;base64,{base64.b64encode(path.read_bytes()).decode()}"
 
 
 def _data_url(path: Path) -> str:

@@ -316,12 +316,12 @@ def test_no_mark_is_put_where_an_area_was_drawn(visit):
 def test_a_search_shows_its_progress_and_then_its_own_evaluation(visit):
     page = visit().open("/plan?model=sensor&stops=A:0,0;B:3,1&spacing=3")
     page.wait_for_selector("#stops-table tbody tr")
-    page.fill("#count", "3")
+    page.fill("#count", "4")
     page.click("#optimise")
     page.wait_for_selector("#plan-search progress")
     assert "/plan/search/" in page.get_attribute("#plan-search a", "href")
     page.wait_for_selector("#plan-news:not([hidden])", timeout=120_000)
     assert "none has less than" in page.inner_text("#plan-news")
-    assert page.inner_text(".plan h2") == "3 marks"
+    assert page.inner_text(".plan h2") == "4 marks"
     assert page.locator("#stops-table tbody tr").count() == 2
     assert not page.is_visible("#plan-search")
