@@ -14,7 +14,7 @@ PYTHON ?= $(shell for v in 3.11 3.12 3.13 3.14; do command -v python$$v && exit;
 BIN := $(VENV)/bin
 KERNELS := $(shell git ls-files 'pipelines/*.py' 'storage/*.py' 2>/dev/null)
 export OPENBLAS_NUM_THREADS ?= 1
-SIDE_BY_SIDE := --numprocesses 2 --dist loadfile
+SIDE_BY_SIDE := --numprocesses 2 --dist loadfile --max-worker-restart 0
 
 .PHONY: help setup setup-dev demo test check bench docs reference lock sbom clean
 
