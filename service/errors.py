@@ -17,8 +17,8 @@ from spheremark.pipelines.errors import (
 )
 from spheremark.storage.catalogue.records import RecordingRecord
 from spheremark.storage.catalogue.sandbox import QueryStarvedError, QueryTimeoutError
+from spheremark.storage.confined import ReaderEndedError
 from spheremark.storage.files import StorageError, StorageFullError
-from spheremark.storage.imports.confined import ReaderEndedError
 
 
 class TooLargeError(InputError):

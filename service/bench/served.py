@@ -25,6 +25,7 @@ from time import perf_counter, sleep
 
 import httpx
 import numpy as np
+from numpy.typing import NDArray
 
 from spheremark.pipelines.errors import SpheremarkError
 from spheremark.pipelines.evaluation.experiment import Column, Plain, Progress, Table
@@ -44,6 +45,7 @@ _TIMEOUT = 60.0  # [s] of a request
 _BAR_P99, _BAR_UPLOAD = 1.0, 64_000_000  # [s] of pages on quiet cores, [bytes] above idle
 _BLOCK = 1 << 20  # [bytes] of the large upload that are sent at once
 _MIB = 1 << 20
+_STEAL = 7  # place of the stolen time among the times of a processor
 _LOGS = "/api/v1/recordings?name=large"
 _MCAP = {"Content-Type": "application/vnd.mcap"}
 
@@ -71,6 +73,7 @@ def load(minutes: float, progress: Progress) -> Plain:
 async def _loaded(address: str, pid: int, log: bytes, seconds: float, progress: Progress) -> Plain:
     """Send requests for so long; return what was found."""
     found, end = _Found(), perf_counter() + seconds
+    before = _processor_times()
     limits = httpx.Limits(max_connections=None)
     async with httpx.AsyncClient(base_url=address, timeout=_TIMEOUT, limits=limits) as client:
         (await client.post("/api/v1/surveys", json={"name": _SURVEY})).raise_for_status()
@@ -85,7 +88,20 @@ async def _loaded(address: str, pid: int, log: bytes, seconds: float, progress: 
             await asyncio.sleep(min(left, 2.0))
         await asyncio.gather(*tasks)
         jobs = (await client.get("/api/v1/jobs", params={"limit": 1000})).json()["items"]
-    return _report(found, memory, Counter(job["status"] for job in jobs), seconds)
+    jobs_by_status = Counter(job["status"] for job in jobs)
+    return _report(found, memory, jobs_by_status, seconds) | {"stolen": _stolen(before)}
+
+
+def _stolen(before: NDArray[np.int64]) -> float:
+    """Return the share of this machine's time that other virtual machines have had."""
+    used = _processor_times() - before
+    return float(used[_STEAL] / used.sum())
+
+
+def _processor_times() -> NDArray[np.int64]:
+    """Return the times of all processors by use, as Linux counts them."""
+    line = Path("/proc/stat").read_text(encoding="ascii").splitlines()[0]
+    return np.array(line.split()[1 : _STEAL + 2], np.int64)
 
 
 async def _use(client: httpx.AsyncClient, chance: random.Random, found: _Found, end: float) -> None:
@@ -180,7 +196,8 @@ def load_tables(report: Plain) -> list[Table]:
             rows=report["kinds"],
             notes=[
                 f"{report['clients']} clients and {report['uploads']} uploads for "
-                f"{report['seconds']:.0f} s; load average {report['load_average']:.1f} at the end.",
+                f"{report['seconds']:.0f} s; load average {report['load_average']:.1f} at the end, "
+                f"{100.0 * report['stolen']:.0f} % of the time taken by other machines.",
                 f"Errors: {', '.join(f'{k} ({n})' for k, n in errors.items()) or 'none'}.",
                 f"Jobs: {', '.join(f'{n} {k}' for k, n in report['jobs'].items())}.",
                 f"Memory of the service: {begin} MiB at a quarter of the time, {end} at the end, "

@@ -24,7 +24,8 @@ from spheremark.service.planning.requests import Planner
 from spheremark.service.planning.searches import Searches
 from spheremark.service.settings import Settings
 from spheremark.storage.catalogue.catalogue import Catalogue
-from spheremark.storage.imports.confined import end_children, start_readers
+from spheremark.storage.catalogue.sandbox import keep_queries_ready
+from spheremark.storage.confined import end_children, start_readers
 from spheremark.storage.scratch import remove_abandoned as remove_scratch
 from spheremark.storage.upkeep import remove_abandoned
 
@@ -117,10 +118,11 @@ async def opened(settings: Settings) -> AsyncIterator[Service]:
 
 
 def _warm_up() -> None:
-    """Start the process that reads logs and load plots: the first of each is as fast as others."""
+    """Start the processes that read logs and run queries, and load plots: no first one is slow."""
     from spheremark.web.figures.accuracy import Shown, distribution
 
     with suppress(RuntimeError):  # each upload tries again, and says so
+        keep_queries_ready()
         start_readers()
     distribution([], Shown(is_error=True, tolerance_m=1.0)).to_plotly_json()
 

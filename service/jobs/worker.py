@@ -21,7 +21,7 @@ from spheremark.pipelines.compilation import watch_compilation
 from spheremark.pipelines.config import SurveyConfig
 from spheremark.service.jobs.handlers import KINDS, JobResult, JobSpecification
 from spheremark.service.jobs.memory import keep_memory
-from spheremark.storage.imports.confined import start_readers
+from spheremark.storage.confined import start_readers
 
 if TYPE_CHECKING:
     from distributed import Worker

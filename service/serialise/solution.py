@@ -19,6 +19,7 @@ from spheremark.pipelines.accuracy.acceptance import (
 )
 from spheremark.pipelines.model import Array
 from spheremark.storage.catalogue.catalogue import Catalogue
+from spheremark.storage.catalogue.records import SurveyRecord
 from spheremark.storage.catalogue.rows import natural
 from spheremark.storage.catalogue.solutions import Solution, chosen_solution
 
@@ -104,6 +105,13 @@ class SurveyResult:
 def survey_result(catalogue: Catalogue, survey: str) -> SurveyResult:
     """Return the chosen solution of a survey (id or name), its checks and the decision."""
     record = catalogue.get_survey(survey)
+    return catalogue.computed(
+        ("survey_result", record.survey_id), lambda: _survey_result(catalogue, record)
+    )
+
+
+def _survey_result(catalogue: Catalogue, record: SurveyRecord) -> SurveyResult:
+    """Compute the result of a survey."""
     key = {"id": record.survey_id}
     solution = chosen_solution(catalogue, record.survey_id)
     stations = catalogue.columns(_STATIONS, key)
@@ -129,6 +137,16 @@ def survey_decisions(
 
     The same as ``survey_result`` decides, by a few queries over all surveys.
     """
+    return catalogue.computed(
+        ("survey_decisions", tuple(tolerances.items())),
+        lambda: _survey_decisions(catalogue, tolerances),
+    )
+
+
+def _survey_decisions(
+    catalogue: Catalogue, tolerances: Mapping[str, float]
+) -> dict[str, tuple[Solution | None, Decision]]:
+    """Compute chosen solution and decision of each survey."""
     ids = {"ids": list(tolerances)}
 
     def by_survey(sql: str) -> dict[str, dict[str, Any]]:

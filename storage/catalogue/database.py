@@ -11,11 +11,13 @@ from __future__ import annotations
 import logging
 import re
 import threading
-from collections.abc import Iterator, Mapping
+from collections import OrderedDict
+from collections.abc import Callable, Hashable, Iterator, Mapping
+from concurrent.futures import Future
 from contextlib import closing, contextmanager, suppress
 from pathlib import Path
 from types import TracebackType
-from typing import Any, Self
+from typing import Any, Self, TypeVar
 
 import duckdb
 import numpy as np
@@ -30,10 +32,13 @@ from spheremark.storage.files import Reserve, StorageError, StorageFullError, un
 
 logger = logging.getLogger(__name__)
 
+_Value = TypeVar("_Value")
+
 _RESERVE = "reserve"  # name of the file beside the database
 _RESERVE_BYTES = 32 << 20  # what DuckDB needs to write its log into the file, many times over
 _DAMAGED = "Corrupt database file"  # in DuckDB's errors of pages that were changed
 _PATIENCE = 10.0  # [s] for queries that still run on an invalid database; they fail at once
+_N_KEPT = 64  # values that are computed from the present state
 _N_ROWS_MAX = 200_000  # of one static query; a page that needs more should aggregate
 _COLUMNS = """
 SELECT c.table_name, c.column_name, c.data_type, c.comment, t.kind, t.comment AS table_comment
@@ -85,6 +90,9 @@ class Database:
         self._none_reads = threading.Condition()
         self._failure: duckdb.Error | None = None
         self._version = 0
+        self._kept: OrderedDict[Hashable, Future[Any]] = OrderedDict()
+        self._kept_version = 0
+        self._keeping = threading.Lock()
         self._open()
         self._reserve = Reserve(path.with_name(_RESERVE), _RESERVE_BYTES)
         self._reserve.hold()
@@ -134,6 +142,40 @@ class Database:
         """Run a static query and return an Arrow table."""
         with self.reading() as cursor:
             return fetch(cursor, sql, parameters or {})
+
+    def computed(self, key: Hashable, compute: Callable[[], _Value]) -> _Value:
+        """Return what a function computes from results, kept until something is written.
+
+        Parameters
+        ----------
+        key : hashable
+            The function and its arguments.
+        compute : callable
+            Reads the database alone; progress of jobs may be older than that of the database.
+
+        Returns
+        -------
+        object
+            Its value, which others get too and must not change.
+        """
+        with self._keeping:
+            if self._kept_version != self._version:
+                self._kept.clear()
+                self._kept_version = self._version
+            kept = self._kept.get(key)
+            own = kept or self._kept.setdefault(key, Future())
+            if len(self._kept) > _N_KEPT:
+                self._kept.popitem(last=False)
+        if kept is None:
+            try:
+                own.set_result(compute())
+            except BaseException as error:
+                with self._keeping:
+                    if self._kept.get(key) is own:
+                        del self._kept[key]
+                own.set_exception(error)
+                raise
+        return own.result()  # type: ignore[no-any-return]  # of the function under this key
 
     def schema(self) -> tuple[TableInfo, ...]:
         """Return the tables and views that may be queried, with units and comments."""

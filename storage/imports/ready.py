@@ -61,7 +61,6 @@ def read_document(
     file: IO[bytes],
     *,
     name: str,  # noqa: ARG001
-    path: str,  # noqa: ARG001
     kind: str,
     layout: dict[str, Any] | None = None,
 ) -> dict[str, Any]:

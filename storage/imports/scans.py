@@ -8,16 +8,16 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import IO
+from typing import IO, Any
 
 import laspy
 import numpy as np
 
 from spheremark.pipelines.errors import InputError, NotFoundError
 from spheremark.pipelines.model import Array
+from spheremark.storage.confined import Limits, run_confined
 from spheremark.storage.imports import ply
 from spheremark.storage.imports.cloud_files import check_las
-from spheremark.storage.imports.confined import Limits, run_confined
 from spheremark.storage.imports.declared import check_bytes, size_of
 
 POINTS_MAX = 60_000_000
@@ -67,7 +67,7 @@ def read_scan(path: str | Path, *, number: int = 0) -> Array:
         head = file.read(16).lstrip()
     function = next((name for start, name in _READERS if head.startswith(start)), "scans:read_text")
     reader = f"spheremark.storage.imports.{function}"
-    options = {"number": number} if function.endswith("e57") else {}
+    options: dict[str, Any] = {"number": number} if function.endswith("e57") else {}
     points = run_confined(reader, path, LIMITS, name=path.name, **options)["points"]
     points = points[np.isfinite(points).all(axis=1)]
     if not len(points):

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from spheremark.pipelines.errors import InputError, NotFoundError
 from spheremark.pipelines.placement import Site, site_of_grid
 from spheremark.pipelines.placement.sites import CELLS_MAX
-from spheremark.storage.imports.confined import Limits, UnreadableFileError, run_confined
+from spheremark.storage.confined import Limits, UnreadableFileError, run_confined
 
 LIMITS = Limits(seconds=120.0, memory_bytes=2 << 30, result_bytes=17 * CELLS_MAX)
 """Of one terrain: two grids of the most cells, and what it takes to make them."""

@@ -14,7 +14,7 @@ from typing import Any
 from spheremark.pipelines.errors import RecordingError
 from spheremark.pipelines.model import ControlMarks, Origin, Rig, ScanLog, Truth
 from spheremark.pipelines.scan.rigs import rig_from_mapping
-from spheremark.storage.imports.confined import READY, Limits, UnreadableFileError, run_confined
+from spheremark.storage.confined import READY, Limits, UnreadableFileError, run_confined
 from spheremark.storage.imports.survey_files import (
     ControlLayout,
     parse_control,
@@ -149,7 +149,7 @@ def _run(function: str, path: Path, name: str, options: LogOptions) -> dict[str,
         seconds=_SECONDS + size / _BYTES_PER_SECOND, memory_bytes=memory, result_bytes=memory
     )
     plain = options.to_mapping()
-    return run_confined(f"{READY}:{function}", path, limits, name=name, options=plain)
+    return run_confined(f"{READY}:{function}", path, limits, name=name, by_path=True, options=plain)
 
 
 def _report(values: Mapping[str, Any]) -> Preflight:

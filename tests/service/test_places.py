@@ -120,7 +120,11 @@ def queries():
     found = []
     for child in psutil.Process().children(recursive=True):
         with contextlib.suppress(psutil.Error):
-            if "catalogue.sandbox" in " ".join(child.cmdline()):
+            forked_from = " ".join(child.parent().cmdline())
+            is_query = "catalogue.sandbox" in " ".join(child.cmdline())
+            if is_query and (
+                "--ready" not in child.cmdline() or "catalogue.sandbox" in forked_from
+            ):
                 found.append(child)
     return found
 

@@ -7,6 +7,8 @@ import struct
 import subprocess
 import sys
 import threading
+import time
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import duckdb
@@ -524,6 +526,41 @@ def test_values_are_bound_and_never_pasted(catalogue):
 def test_an_answer_that_is_too_long_is_refused(catalogue):
     with pytest.raises(InputError, match="200001 rows; the limit is 200000"):
         catalogue.columns("SELECT * FROM range(200001)")
+
+
+def names_of_surveys(catalogue):
+    return [row["name"] for row in catalogue.rows("SELECT name FROM surveys ORDER BY name")]
+
+
+def test_a_value_is_computed_once_until_something_is_written(catalogue):
+    begun = []
+
+    def compute():
+        begun.append(threading.get_ident())
+        time.sleep(0.05)
+        return names_of_surveys(catalogue)
+
+    with ThreadPoolExecutor(4) as threads:
+        for n_written, name in enumerate(("a", "b", "c"), 1):
+            catalogue.create_survey(name)
+            found = list(threads.map(lambda _: catalogue.computed("names", compute), range(8)))
+            assert found == [names_of_surveys(catalogue)] * 8
+            assert len(begun) == n_written
+
+
+def test_a_value_that_cannot_be_computed_is_tried_again(catalogue):
+    def fail():
+        raise InputError("not yet")
+
+    with pytest.raises(InputError, match="not yet"):
+        catalogue.computed("x", fail)
+    assert catalogue.computed("x", lambda: 3) == 3
+
+
+def test_values_that_are_kept_are_bounded(catalogue):
+    for number in range(200):
+        assert catalogue.computed(number, lambda number=number: number) == number
+    assert len(catalogue._kept) <= 64
 
 
 def test_views_show_the_newest_run_only(catalogue):

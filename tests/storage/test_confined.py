@@ -1,5 +1,6 @@
 import json
 import socket
+import threading
 import time
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
@@ -8,8 +9,8 @@ import psutil
 import pytest
 
 from spheremark.pipelines.errors import InputError, TruncatedRecordingError
-from spheremark.storage.imports import confined
-from spheremark.storage.imports.confined import (
+from spheremark.storage import confined
+from spheremark.storage.confined import (
     Limits,
     ReaderEndedError,
     UnreadableFileError,
@@ -27,11 +28,9 @@ READERS = "tests.storage.confined_readers"
 @pytest.fixture(scope="module")
 def forks():
     """A process that keeps the readers of these tests loaded."""
-    with pytest.MonkeyPatch.context() as changed:
-        changed.setattr(confined, "READY", READERS)
-        changed.setattr(confined, "_FORKS", confined._Forks())
-        yield confined._FORKS
-        confined._FORKS.end()
+    made = confined._Forks(READERS, threading.BoundedSemaphore(2))
+    yield made
+    made.end()
 
 
 @pytest.fixture(params=["started", "forked"])
@@ -39,11 +38,8 @@ def run(tmp_path, request, monkeypatch):
     """Run a reader in a process of its own, started anew or forked from one that is ready."""
     if request.param == "forked":
         forks = request.getfixturevalue("forks")
-        monkeypatch.setattr(confined, "READY", READERS)
-        monkeypatch.setattr(confined, "_FORKS", forks)
+        monkeypatch.setitem(confined._FORKS, READERS, forks)
         forks.start()
-    else:
-        monkeypatch.setattr(confined, "READY", "none")
     path = tmp_path / "file"
     path.write_bytes(b"12345")
 
@@ -139,7 +135,7 @@ def test_what_a_library_prints_is_no_part_of_the_answer(run):
 
 
 def test_a_reader_that_ignores_its_timer_is_killed(run, monkeypatch):
-    monkeypatch.setattr("spheremark.storage.imports.confined._START_MAX", 1.0)
+    monkeypatch.setattr("spheremark.storage.confined._START_MAX", 1.0)
     begin = time.monotonic()
     with pytest.raises(UnreadableFileError, match="took more than 1 s"):
         run("sleep", SHORT)
@@ -168,8 +164,8 @@ def test_a_forged_answer_is_refused(run, answer):
         run("forge", answer=answer)
 
 
-def test_a_reader_that_unpacks_has_a_folder_of_its_own(run_forked, tmp_path):
-    assert run_forked("use_own_folder") == {"text": "12345", "shown": "file"}
+def test_a_reader_that_unpacks_has_a_folder_of_its_own(run, tmp_path):
+    assert run("use_own_folder", by_path=True) == {"text": "12345", "shown": "file"}
     assert [one.name for one in tmp_path.iterdir()] == ["file"]
 
 

@@ -8,17 +8,22 @@ from pathlib import Path
 import psutil
 import pytest
 
+from spheremark.pipelines.errors import ConflictError
+from spheremark.pipelines.progress import checked_by
+from spheremark.storage import confined
 from spheremark.storage.catalogue.catalogue import Catalogue
 from spheremark.storage.catalogue.sandbox import (
     QueryLimits,
     QueryRejectedError,
     QueryStarvedError,
     QueryTimeoutError,
+    keep_queries_ready,
     run_query,
     to_csv,
 )
 from tests.storage.hostile_queries import TEXTS
 
+SANDBOX = "spheremark.storage.catalogue.sandbox"
 LIMITS = QueryLimits(seconds=20.0, memory_bytes=256 << 20, rows=1000)
 
 
@@ -30,6 +35,14 @@ def snapshot(tmp_path_factory):
         copy = catalogue.snapshot()
         yield copy
         assert catalogue.rows("SELECT name FROM surveys") == [{"name": "lane"}]
+
+
+@pytest.fixture(scope="module", autouse=True)
+def ready():
+    """The process from which those of queries are forked, as in the service."""
+    keep_queries_ready()
+    yield confined._FORKS[SANDBOX]
+    confined._FORKS.pop(SANDBOX).end()
 
 
 @pytest.fixture
@@ -220,22 +233,47 @@ def test_a_query_that_needs_too_much_memory_is_refused(query, sql):
         query(sql)
 
 
-def test_a_query_that_runs_too_long_is_ended_and_its_process_gone(query):
-    endless = "SELECT sum(hash(a.range * b.range)) FROM range(1000000000) a, range(1000000) b"
+ENDLESS = "SELECT sum(hash(a.range * b.range)) FROM range(1000000000) a, range(1000000) b"
+
+
+def processes_left(ready):
+    """Processes of queries that are still there a moment after their end."""
+    server = psutil.Process(ready._process.pid)
+    _, alive = psutil.wait_procs(server.children(), timeout=10)
+    return alive
+
+
+def test_a_query_that_runs_too_long_is_ended_and_its_process_gone(query, ready):
     with pytest.raises(QueryTimeoutError, match=r"ended after 0\.6 s, its time limit"):
-        query(endless, seconds=0.6)
-    left = [child.cmdline() for child in psutil.Process().children(recursive=True)]
-    assert not [line for line in left if "spheremark.storage.catalogue.sandbox" in line]
+        query(ENDLESS, seconds=0.6)
+    assert not processes_left(ready)
 
 
-def test_a_query_for_which_the_machine_has_no_time_is_to_be_sent_again(query, monkeypatch):
+def test_a_query_for_which_the_machine_has_no_time_is_to_be_sent_again(query, ready, monkeypatch):
     """Half a second passes before the query has had its share, as on a machine that is busy."""
-    monkeypatch.setattr("spheremark.storage.catalogue.sandbox._START_MAX", 0.5 - LIMITS.seconds)
-    endless = "SELECT sum(hash(a.range * b.range)) FROM range(1000000000) a, range(1000000) b"
+    monkeypatch.setattr(f"{SANDBOX}._START_MAX", 0.5 - LIMITS.seconds)
     with pytest.raises(QueryStarvedError, match="the machine is too busy"):
-        query(endless)
-    left = [child.cmdline() for child in psutil.Process().children(recursive=True)]
-    assert not [line for line in left if "spheremark.storage.catalogue.sandbox" in line]
+        query(ENDLESS)
+    assert not processes_left(ready)
+
+
+def test_a_query_ends_with_the_client_that_sent_it(query, ready):
+    def leave():
+        raise ConflictError("the client has left")
+
+    with checked_by(leave), pytest.raises(ConflictError, match="has left"):
+        query(ENDLESS)
+    assert not processes_left(ready)
+
+
+def test_a_command_runs_a_query_without_a_process_that_is_kept(query, monkeypatch):
+    monkeypatch.delitem(confined._FORKS, SANDBOX)
+    assert query("SELECT name FROM surveys").rows == (("lane",),)
+    with pytest.raises(QueryTimeoutError):
+        query(ENDLESS, seconds=0.6)
+    with pytest.raises(QueryRejectedError, match="disabled by configuration"):
+        query("SELECT * FROM read_text('/etc/passwd')")
+    assert not confined._CHILDREN
 
 
 def test_the_process_of_a_query_sees_no_settings_of_the_service(query, monkeypatch):

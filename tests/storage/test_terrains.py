@@ -7,7 +7,7 @@ import pytest
 
 from spheremark.pipelines.errors import InputError, NotFoundError
 from spheremark.pipelines.placement.sites import CELLS_MAX
-from spheremark.storage.imports.confined import run_confined
+from spheremark.storage.confined import run_confined
 from spheremark.storage.imports.terrain import LIMITS, open_terrain, read_terrain, write_grid
 from tests.storage import hostile_terrains as made
 

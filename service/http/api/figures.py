@@ -142,7 +142,9 @@ def get_survey_figure(
 def get_limits(chosen: ChosenRows, service: Current) -> Any:
     """Return the greatest distance that keeps the tolerance by method, with its confidence."""
     return {
-        "items": figures.limits_of(service, chosen),
+        "items": service.catalogue.computed(
+            ("limits", repr(chosen)), lambda: figures.limits_of(service, chosen)
+        ),
         "tolerance_m": chosen.selection.tolerance_m,
         "has_errors": chosen.values["is_error"],
     }
@@ -182,7 +184,10 @@ def _figure(service: Service, name: str, form: Form, chosen: figures.Chosen) -> 
     if form is Form.SQL:
         return Response(figures.sql_of(name, chosen), media_type=figures.MEDIA[form])
     if form is Form.JSON:
-        text = to_json_plotly(figures.figure_of(service, name, chosen))
+        text = service.catalogue.computed(
+            ("figure", name, repr(chosen)),
+            lambda: to_json_plotly(figures.figure_of(service, name, chosen)),
+        )
         return Response(text, media_type=figures.MEDIA[form])
     return _file(figures.as_file(figures.data_of(service, name, chosen), form), name, form, {})
 

@@ -6,7 +6,8 @@ memory, time and output, no network, no other file. Linux forbids other files fr
 
 The child is this module run as a program: the request is its argument, the file its standard
 input, a memory file of bounded size its standard output. It must stay light to import. For readers
-in ``READY`` it is forked from a process that has loaded them, which takes milliseconds.
+of a module that is kept ready it is forked from a process that has loaded them, which takes
+milliseconds.
 """
 
 from __future__ import annotations
@@ -29,16 +30,18 @@ import sys
 import tempfile
 import threading
 import traceback
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack, suppress
 from dataclasses import asdict, dataclass
 from pathlib import Path
+from time import monotonic
 from typing import IO, Any, ClassVar, NoReturn
 
 import numpy as np
 from numpy.typing import NDArray
 
 from spheremark.pipelines.errors import InputError, SpheremarkError
+from spheremark.pipelines.progress import checkpoint
 from spheremark.storage.confinement import (
     enter_folder,
     forbid_files,
@@ -53,7 +56,7 @@ Result = dict[str, Any]
 Reader = Callable[..., Mapping[str, Any]]
 
 READY = "spheremark.storage.imports.ready"
-"""The module of the readers that a process keeps loaded; its ``prepare`` is called once there."""
+"""The module of the readers of logs and documents; it is always kept ready."""
 
 
 _DTYPES = ("<f8", "<f4", "<i8", "|u1")  # of results
@@ -62,11 +65,12 @@ _HEAD_MAX = 1 << 22  # [bytes] of the line before the arrays
 _LOG_MAX = 1 << 16  # [bytes] of what a child printed last
 _REQUEST_MAX = 1 << 18  # [bytes]; headers and queries of HTTP have 64 kB at most
 _ALIGNED = 64  # [bytes] to a multiple of which head and arrays are filled up
-_THREADS = 4  # of a reader in ``READY``
+_THREADS = 4  # of a reader that gets a path
 _MESSAGE_MAX = 400  # characters of a message out of the child
 _EXCEPTION = re.compile(r"^[\w.]+: ")  # the name of a class before its message
 _START_MAX = 20.0  # [s] until a process may have started on a machine that is busy
-_PROGRAM = (sys.executable, "-P", "-m", "spheremark.storage.imports.confined")
+_PROGRAM = (sys.executable, "-P", "-m", "spheremark.storage.confined")
+_LOOK_EVERY = 0.5  # [s] whether the caller still waits
 _CHILDREN: set[subprocess.Popen[bytes]] = set()
 _SEALABLE = 0x1 | 0x2  # a memory file that is closed in new programs (Linux)
 _SEALS = 0x1 | 0x2 | 0x4 | 0x8  # of seals, shrinking, growing and writing (Linux)
@@ -82,9 +86,19 @@ _COMPILED = ("HOME", "NUMBA_")  # variables that say where compiled kernels are
 
 
 class UnreadableFileError(InputError):
-    """A foreign file cannot be read within the limits."""
+    """A foreign file cannot be read within the limits.
+
+    Attributes
+    ----------
+    signal : int or None
+        Number of the signal that ended its reader, if one did.
+    """
 
     code: ClassVar[str] = "input.unreadable"
+
+    def __init__(self, message: str, signal: int | None = None) -> None:
+        super().__init__(message)
+        self.signal = signal
 
 
 class ReaderEndedError(SpheremarkError):
@@ -113,7 +127,13 @@ class Limits:
 
 
 def run_confined(
-    reader: str, file: Path | IO[bytes], limits: Limits, *, name: str, **options: Any
+    reader: str,
+    file: Path | IO[bytes],
+    limits: Limits,
+    *,
+    name: str,
+    by_path: bool = False,
+    **options: Any,
 ) -> Result:
     """Run a reader on a file in a confined process.
 
@@ -122,14 +142,16 @@ def run_confined(
     reader : str
         ``package.module:function``. The function gets the open file, ``name`` and the options, and
         returns arrays, and values that are plain for JSON, by name. It runs in the child, where
-        nothing can be imported any more. One of the module ``READY`` also gets the ``path`` of
-        the file, and may make files in its temporary folder.
+        nothing can be imported any more.
     file : Path or binary file
         The file.
     limits : Limits
         What the reading may use.
     name : str
         Name of the file in messages.
+    by_path : bool
+        Whether the reader also gets the ``path`` of the file, and may make files in its temporary
+        folder.
     **options
         Further arguments, plain enough for JSON.
 
@@ -150,38 +172,57 @@ def run_confined(
 
     Notes
     -----
-    Takes as long as the imports of the reader's module, and 0.2 s; 0.03 s for one in ``READY``.
+    Takes as long as the imports of the reader's module, and 0.2 s; 0.03 s for one kept ready.
     """
     request = {"reader": reader, "limits": asdict(limits), "options": {"name": name, **options}}
+    forks = _FORKS.get(reader.partition(":")[0]) if sys.platform == "linux" else None
     with ExitStack() as stack:
         opened = stack.enter_context(file.open("rb")) if isinstance(file, Path) else file
         result, log = stack.enter_context(_memory_file()), stack.enter_context(_memory_file())
         files = (opened, result, log)
-        n_ended = _FORKS.n_ended
-        with _AT_ONCE:
-            if reader.partition(":")[0] == READY:
-                folder = stack.enter_context(scratch())
-                path = str(file.resolve()) if isinstance(file, Path) else ""
-                more = {"path": path, "folder": str(folder)}
-                code = _wait_for_fork(request | more, files, limits)
+        n_ended = _n_ended
+        with forks.places if forks else _AT_ONCE:
+            if by_path:
+                request["path"] = str(file.resolve()) if isinstance(file, Path) else ""
+                request["folder"] = str(stack.enter_context(scratch()))
+            if forks:
+                code = _wait_for_fork(forks, json.dumps(request), files, limits)
             else:
                 code = _wait_for_child(json.dumps(request), files, limits)
-        if code < 0 and _FORKS.n_ended != n_ended:
+        if code < 0 and _n_ended != n_ended:
             raise ReaderEndedError(f"The service ended while it read {name}; it is read again.")
         if code:
-            raise UnreadableFileError(_reason(code, log, limits, name))
+            reason = _reason(code, log, limits, name)
+            raise UnreadableFileError(reason, signal=-code if code < 0 else None)
         return _result(result, limits, name)
 
 
+def keep_ready(module: str, n_at_once: int) -> None:
+    """Keep a process from which the children of a module's readers are forked.
+
+    Parameters
+    ----------
+    module : str
+        The module; its ``prepare`` is called once there.
+    n_at_once : int
+        Number of children at the same time; others wait.
+    """
+    _FORKS.setdefault(module, _Forks(module, threading.BoundedSemaphore(n_at_once)))
+
+
 def start_readers() -> None:
-    """Start the process that keeps readers loaded, so that the first file need not wait for it."""
+    """Start the processes that keep readers ready, so that the first file need not wait for it."""
     if sys.platform == "linux":
-        _FORKS.start()
+        for forks in tuple(_FORKS.values()):
+            forks.start()
 
 
 def end_children() -> None:
     """End all readers that run, as at the end of the service."""
-    _FORKS.end()
+    global _n_ended
+    _n_ended += 1
+    for forks in tuple(_FORKS.values()):
+        forks.end()
     for child in tuple(_CHILDREN):
         with suppress(ProcessLookupError):
             os.killpg(child.pid, signal.SIGKILL)
@@ -207,8 +248,9 @@ def _wait_for_child(request: str, files: tuple[IO[bytes], ...], limits: Limits) 
     ) as child:
         _CHILDREN.add(child)
         try:
-            return child.wait(limits.seconds + _START_MAX)
-        except subprocess.TimeoutExpired:
+            for _ in _looks(limits):
+                with suppress(subprocess.TimeoutExpired):
+                    return child.wait(_LOOK_EVERY)
             return -signal.SIGALRM
         finally:
             _CHILDREN.discard(child)
@@ -221,35 +263,42 @@ def _environment() -> dict[str, str]:
     return {**_ENVIRONMENT, "PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
 
 
-def _wait_for_fork(request: Result, files: tuple[IO[bytes], ...], limits: Limits) -> int:
-    """Run a child that is forked from a ready process, and return its code."""
-    if sys.platform != "linux":
-        return _wait_for_child(json.dumps(request), files, limits)
+def _wait_for_fork(
+    forks: _Forks, request: str, files: tuple[IO[bytes], ...], limits: Limits
+) -> int:
+    """Run a child that is forked from a ready process, and return its code; or end it."""
     ours, theirs = socket.socketpair()
     with ours:
         with theirs:
-            _FORKS.send(
-                json.dumps(request).encode(), [*(f.fileno() for f in files), theirs.fileno()]
-            )
-        ours.settimeout(limits.seconds + _START_MAX)
-        try:
-            code = ours.recv(4)
-        except TimeoutError:
-            ours.shutdown(socket.SHUT_WR)  # ends the child
-            ours.settimeout(None)
-            ours.recv(4)
-            return -signal.SIGALRM
-    return int.from_bytes(code, "little", signed=True) if code else -signal.SIGKILL
+            forks.send(request.encode(), [*(f.fileno() for f in files), theirs.fileno()])
+        ours.settimeout(_LOOK_EVERY)
+        for _ in _looks(limits):
+            with suppress(TimeoutError):
+                code = ours.recv(4)
+                return int.from_bytes(code, "little", signed=True) if code else -signal.SIGKILL
+        ours.shutdown(socket.SHUT_WR)  # ends the child
+        ours.settimeout(None)
+        ours.recv(4)
+        return -signal.SIGALRM
+
+
+def _looks(limits: Limits) -> Iterator[None]:
+    """Yield until a child has had its time, and end where its caller does."""
+    deadline = monotonic() + limits.seconds + _START_MAX
+    while monotonic() < deadline:
+        checkpoint()
+        yield
 
 
 class _Forks:
-    """The process that keeps readers loaded and forks for each file; started when needed."""
+    """The process that keeps a module's readers loaded and forks; started when needed."""
 
-    def __init__(self) -> None:
+    def __init__(self, module: str, places: threading.BoundedSemaphore) -> None:
+        self._module = module
+        self.places = places
         self._lock = threading.Lock()
         self._process: subprocess.Popen[bytes] | None = None
         self._socket: socket.socket | None = None
-        self.n_ended = 0
 
     def start(self) -> socket.socket:
         """Return the socket of the process, which is started anew if it has ended."""
@@ -261,7 +310,7 @@ class _Forks:
                 kept = {k: v for k, v in os.environ.items() if k.startswith(_COMPILED)}
                 with theirs:
                     self._process = subprocess.Popen(
-                        [*_PROGRAM, "--ready", READY],
+                        [*_PROGRAM, "--ready", self._module],
                         stdin=theirs.fileno(),
                         stdout=subprocess.DEVNULL,
                         cwd="/",
@@ -284,7 +333,6 @@ class _Forks:
 
     def end(self) -> None:
         """End the process and its children."""
-        self.n_ended += 1
         with self._lock:
             if self._socket is not None and self._process is not None:
                 self._socket.close()
@@ -296,13 +344,14 @@ class _Forks:
             self._socket = self._process = None
 
 
-_FORKS = _Forks()
-atexit.register(_FORKS.end)
+_FORKS = {READY: _Forks(READY, _AT_ONCE)}
+_n_ended = 0  # times that all readers were ended
+atexit.register(end_children)
 
 
 def _reason(code: int, log: IO[bytes], limits: Limits, name: str) -> str:
     """Say why a child ended without a result."""
-    if code in (-signal.SIGALRM, -signal.SIGXCPU):
+    if code in (-signal.SIGALRM, -signal.SIGXCPU, -signal.SIGPROF):
         return (
             f"Reading {name} took more than {limits.seconds:g} s, the limit. Take a part of it, or "
             "thin it out."
