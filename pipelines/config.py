@@ -239,6 +239,9 @@ class ResectionConfig:
         Standard deviation of what all centres of a survey are too high, as the foot of their poles
         and the tilt of the spin axis leave [m]; 0 leaves it out. 0.2 mm, by simulation of beams
         of several profiles: what stands behind the lower half of spheres moves its limb.
+    false_rate : float
+        Wanted share of false ones among the marks of a network. 0.01: a mark is confirmed where the
+        probability that it is none, by all stations that should see it, is at most this.
     """
 
     methods: tuple[str, ...] = ("free_station",)
@@ -251,6 +254,7 @@ class ResectionConfig:
     sigma_range_scale: float = 1e-4
     sigma_range_shared: float = 0.0009
     sigma_height: float = 0.0002
+    false_rate: float = 0.01
 
     def __post_init__(self) -> None:
         _check_methods("resection.methods", self.methods, RESECTION_METHODS)
@@ -263,6 +267,7 @@ class ResectionConfig:
         _check("resection.sigma_range_scale", self.sigma_range_scale, 0.0, 0.01)
         _check("resection.sigma_range_shared", self.sigma_range_shared, 0.0, 0.1)
         _check("resection.sigma_height", self.sigma_height, 0.0, 0.1)
+        _check("resection.false_rate", self.false_rate, 1e-9, 0.5)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

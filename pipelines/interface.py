@@ -107,6 +107,7 @@ def find_spheres(  # noqa: PLR0913  each is a column or a property of the scan
         fits=tuple(replace(fit, p_base=fit.p_base + sensor) for fit in fits.fits),
         rejected=tuple(replace(one, p_base=one.p_base + sensor) for one in fits.rejected),
         possible=tuple(replace(one, p_base=one.p_base + sensor) for one in fits.possible),
+        possible_fits=tuple(replace(one, p_base=one.p_base + sensor) for one in fits.possible_fits),
     )
 
 

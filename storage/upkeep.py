@@ -54,7 +54,9 @@ _PARENTS = (
     ("runs", "survey_id", "surveys"),
     *((name, "run_id", "runs") for name in ("stops", "marker_fits", "station_fixes")),
     *((name, "run_id", "runs") for name in ("rejections", "observations", "resections")),
+    *((name, "run_id", "runs") for name in ("group_likelihoods", "possible_fits")),
     *((f"adjusted_{name}", "adjustment_id", "adjustments") for name in ("stations", "marks")),
+    *((f"mark_{name}", "adjustment_id", "adjustments") for name in ("decisions", "evidence")),
     ("planned_stops", "placement_id", "plans"),
 )
 _LOST = "SELECT count(*) FROM {child} WHERE {key} NOT IN (SELECT {key} FROM {parent})"

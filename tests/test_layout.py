@@ -26,7 +26,7 @@ FRAMELESS = {  # counts, clocks, scalars per row, and tables of the sensor: no c
     "residuals", "matches", "redundancies", "w_statistics", "detectable_biases", "marks",
     "external_reliabilities", "included_angles", "included_angles_horizontal", "sigma_3d",
     "sigma_horizontal", "range_by_optics", "estimates", "weights", "sigmas_prior",
-    "sigmas_profile",
+    "sigmas_profile", "log_likelihoods",
     "divergence", "laser_elevations", "laser_heights", "laser_range_biases",
     "fits", "measured", "given", "sigmas", "is_off",
     "encoder_eccentricity", "stamps_ns", "samples_ns", "values", "rates",
@@ -156,7 +156,7 @@ def test_every_number_of_the_database_carries_its_unit():
     unitless = re.compile(
         r"^(n_|share_|dof$|dop$|sigma0$|redundancy$|w$|coverage$|attempts$"
         r"|mean_(n_points|intensity|redundancy)$"
-        r"|number$|place$|probability|cov_motion$|optics$|rotation$|n_points_(from|to)$"
+        r"|number$|place$|probability|log_(odds|likelihoods)|cov_motion$|optics$|rotation$|n_points_(from|to)$"
         r"|(vtpv|vtpv_limit|w_limit|test_level)$|variance_factor_"
         r"|(start_value|estimate|sigma)$)"  # calibrated_parameters: the unit stands in the row
     )

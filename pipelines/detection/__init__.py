@@ -17,6 +17,7 @@ the base): a few centimetres of axis offset do not change which returns look lik
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
@@ -79,7 +80,7 @@ class _Compared(NamedTuple):
     n_neighbours: int
 
 
-_Group = tuple[_Compared, Judgement]
+_Group = tuple[_Compared, Judgement, Array]
 
 
 def extract(
@@ -125,20 +126,28 @@ def extract(
     for i in passed:
         reasons[i] = reason_by_evidence(groups[i], evidence[i], target)
     compared = [_Compared(groups[i], evidence[i], near[i]) for i in passed if not reasons[i]]
-    judgements = judged(_log_likelihoods(compared, noise_of(groups), hearing, config, target))
+    logs = _log_likelihoods(compared, noise_of(groups), hearing, config, target)
+    judgements = judged(logs)
     is_sure = sure_ones([one.probability for one in judgements], config.false_rate)
     usual = reflectivity_of(
         [one.evidence for one, sure in zip(compared, is_sure, strict=True) if sure]
     )
     markers, possible, rejected = list[_Group](), list[Rejection](), list[Rejection]()
-    for one, judgement, sure in zip(compared, judgements, is_sure, strict=True):
+    for one, judgement, sure, own in zip(compared, judgements, is_sure, logs, strict=True):
         other = reason_by_reflectivity(one.evidence, usual)
         if sure and not other:
-            markers.append((one, judgement))
+            markers.append((one, judgement, own))
             continue
-        groups_of = possible if judgement.probability >= _POSSIBLE else rejected
-        reason = other or judgement.reason
-        groups_of.append(_rejection(one.features, reason, judgement.probability))
+        refused = replace(
+            _rejection(one.features, other or judgement.reason),
+            probability=judgement.probability,
+            log_likelihoods=own.copy(),
+        )
+        if judgement.probability >= _POSSIBLE:
+            members = _members(one.features, one.evidence, target)
+            possible.append(replace(refused, members=members))
+        else:
+            rejected.append(refused)
     rejected += [
         _rejection(features, reason)
         for features, reason in zip(groups, reasons, strict=True)
@@ -161,14 +170,9 @@ def _n_neighbours(groups: list[Features], radius: float) -> list[int]:
     return list((np.asarray(near) - 1).tolist())
 
 
-def _rejection(features: Features, reason: str, probability: float = float("nan")) -> Rejection:
+def _rejection(features: Features, reason: str) -> Rejection:
     """Return a group that is not used."""
-    return Rejection(
-        p_base=features.p_base,
-        n_points=features.n_points,
-        reason=reason,
-        probability=probability,
-    )
+    return Rejection(p_base=features.p_base, n_points=features.n_points, reason=reason)
 
 
 def _log_likelihoods(
@@ -227,8 +231,9 @@ def _candidates(found: list[_Group], target: Target) -> tuple[MarkerCandidate, .
             p_base_rough=one.features.p_base,
             probability=judgement.probability,
             hypothesis=judgement.hypothesis,
+            log_likelihoods=logs.copy(),
         )
-        for place, (one, judgement) in enumerate(ordered)
+        for place, (one, judgement, logs) in enumerate(ordered)
     )
 
 

@@ -218,8 +218,43 @@ def judged(log_likelihoods: Array) -> list[Judgement]:
     How often a scan shows each hypothesis is estimated from all its groups (empirical Bayes): among
     trees, a group that might be leaves is rather leaves.
     """
-    if not len(log_likelihoods):
-        return []
+    _, posteriors = shares_of(log_likelihoods)
+    return [judgement_of(own, NAMES) for own in posteriors]
+
+
+def judgement_of(posteriors: Array, names: Sequence[str]) -> Judgement:
+    """Return what a group is.
+
+    Parameters
+    ----------
+    posteriors : (k,)
+        Logarithms of the probabilities of all hypotheses, the marker first.
+    names : sequence of str
+        What each is called.
+
+    Returns
+    -------
+    Judgement
+        The probability of a marker, and the best other hypothesis.
+    """
+    other = 1 + int(np.argmax(posteriors[1:]))
+    ratio = np.exp(np.clip(posteriors[other] - posteriors[0], -30, 30))
+    return Judgement(float(np.exp(posteriors[0])), names[other], float(ratio))
+
+
+def shares_of(log_likelihoods: Array) -> tuple[Array, Array]:
+    """Return how often each hypothesis is met among groups, and the log posteriors of each group.
+
+    Parameters
+    ----------
+    log_likelihoods : (n, k)
+        Of each group by each hypothesis.
+
+    Returns
+    -------
+    (k,), (n, k)
+        Shares, by expectation maximisation from the usual abundance; logarithms of probabilities.
+    """
     usual = _N_PRIOR * np.array(ABUNDANCE) / sum(ABUNDANCE)
     shares, posteriors = usual / _N_PRIOR, log_likelihoods
     for _ in range(_N_ROUNDS):
@@ -227,12 +262,7 @@ def judged(log_likelihoods: Array) -> list[Judgement]:
         posteriors -= np.logaddexp.reduce(posteriors, axis=1, keepdims=True)
         shares = usual + np.exp(posteriors).sum(axis=0)
         shares /= shares.sum()
-    others = 1 + np.argmax(posteriors[:, 1:], axis=1)
-    ratios = np.exp(np.clip(posteriors[np.arange(len(others)), others] - posteriors[:, 0], -30, 30))
-    return [
-        Judgement(float(np.exp(own)), NAMES[other], float(ratio))
-        for own, other, ratio in zip(posteriors[:, 0], others, ratios, strict=True)
-    ]
+    return shares, posteriors
 
 
 def sure_ones(probabilities: Sequence[float], false_rate: float) -> list[bool]:

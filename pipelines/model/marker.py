@@ -7,7 +7,7 @@ from enum import StrEnum
 
 import numpy as np
 
-from spheremark.pipelines.model.arrays import Array, Index, same_length, seal
+from spheremark.pipelines.model.arrays import Array, Column, Index, same_length, seal
 from spheremark.pipelines.model.scan import Levelling
 
 
@@ -16,6 +16,16 @@ class Status(StrEnum):
 
     OK = "ok"
     WEAK = "weak"
+
+
+def _no_numbers() -> Array:
+    """Return no numbers."""
+    return np.zeros(0)
+
+
+def _no_rows() -> Index:
+    """Return no rows."""
+    return np.zeros(0, dtype=np.intp)
 
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
@@ -29,25 +39,28 @@ class MarkerCandidate:
     p_base_rough: Array  # (3,) rough centre, good to a few centimetres [m]
     probability: float = np.nan  # posterior probability that it is a marker; NaN when not computed
     hypothesis: str = ""  # the most likely other hypothesis with the odds, as words
+    log_likelihoods: Array = field(default_factory=_no_numbers)  # (k,), see ``MarkerFit``
 
     def __post_init__(self) -> None:
-        seal(self, members=(None,), p_base_rough=(3,))
+        seal(self, members=(None,), p_base_rough=(3,), log_likelihoods=(None,))
 
 
-def marker_name(place: int) -> str:
+def marker_name(place: int, letter: str = "M") -> str:
     """Return the name of the marker at a place among those of a stop: M01, M02, ...
 
     Parameters
     ----------
     place : int
         From 0.
+    letter : str
+        M; P for possible markers.
 
     Returns
     -------
     str
         Its name within one stop.
     """
-    return f"M{place + 1:02d}"
+    return f"{letter}{place + 1:02d}"
 
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
@@ -58,9 +71,11 @@ class Rejection:
     n_points: int  # number of its returns
     reason: str  # why it was rejected, as a sentence
     probability: float = np.nan  # posterior probability that it is a marker; NaN when not computed
+    log_likelihoods: Array = field(default_factory=_no_numbers)  # (k,), see ``MarkerFit``
+    members: Index = field(default_factory=_no_rows)  # (n,) rows of the cloud of a possible marker
 
     def __post_init__(self) -> None:
-        seal(self, p_base=(3,))
+        seal(self, p_base=(3,), log_likelihoods=(None,), members=(None,))
 
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
@@ -168,6 +183,8 @@ class MarkerFit:
         Posterior probability that it is a marker; NaN when not computed.
     hypothesis : str
         The most likely other hypothesis with the odds, as words; empty likewise.
+    log_likelihoods : (k,)
+        Logarithms of the likelihoods of all hypotheses, the marker first; empty likewise.
     """
 
     name: str
@@ -195,10 +212,12 @@ class MarkerFit:
     range_by_optics: Array = field(default_factory=lambda: np.zeros(3))
     probability: float = np.nan
     hypothesis: str = ""
+    log_likelihoods: Array = field(default_factory=_no_numbers)
 
     def __post_init__(self) -> None:
         seal(
             self,
+            log_likelihoods=(None,),
             range_by_optics=(3,),
             shared_base=(3, None),
             p_base=(3,),
@@ -242,7 +261,12 @@ class MarkerFits:
     levelling : Levelling
         How the base leans.
     possible : tuple of Rejection
-        Groups too probable to be rejected, not probable enough to be markers: they enter nothing.
+        Groups too probable to be rejected, not probable enough to be markers: they enter nothing
+        but a network in which other stops or control confirm them.
+    possible_fits : tuple of MarkerFit
+        Centres of those of them that have one, P01, P02 ...
+    sample_base : (n, 3) float32
+        An even sample of the returns of the stop, which shows what hides a place [m].
     """
 
     method: str
@@ -250,3 +274,5 @@ class MarkerFits:
     rejected: tuple[Rejection, ...]
     levelling: Levelling
     possible: tuple[Rejection, ...] = ()
+    possible_fits: tuple[MarkerFit, ...] = ()
+    sample_base: Column = field(default_factory=lambda: np.zeros((0, 3), dtype=np.float32))

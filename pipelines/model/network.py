@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from enum import StrEnum
 from typing import NamedTuple
 
 import numpy as np
@@ -39,6 +40,55 @@ class LeftOut:
     marker: str  # what the marker is called at the station; empty where it is no centre
     mark: str  # name of the mark; empty where none is known
     reason: str  # why, as a sentence for people
+
+
+class Finding(StrEnum):
+    """What a station shows at the place of a mark."""
+
+    MARKER = "marker"
+    POSSIBLE = "possible"
+    REFUSED = "refused"
+    NOTHING = "nothing"
+    HIDDEN = "hidden"
+
+
+class Decision(StrEnum):
+    """What all stations together make of a mark."""
+
+    CONFIRMED = "confirmed"
+    DOUBTFUL = "doubtful"
+    REFUSED = "refused"
+
+
+@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
+class StationEvidence:
+    """The evidence of one station that is near enough to a mark to see it."""
+
+    station: str  # its name
+    marker: str  # what the marker is called at the station; empty where there is none
+    finding: Finding
+    range: float  # distance from the station to the mark [m]
+    log_odds: float  # natural logarithm of how much likelier a marker makes it than the decoy
+    reason: str  # what it is there, as words; empty where nothing is known
+
+
+@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
+class MarkEvidence:
+    """The evidence of all stations on one mark, or on what may be one."""
+
+    mark: str  # its name
+    p_site: Array  # (3,) approximate place [m]
+    decision: Decision
+    probability: float  # posterior probability that a marker stands there
+    decoy: str  # the most likely other hypothesis
+    hypothesis: str  # the same with its odds, as words
+    log_odds_prior: float  # of a marker against the decoy before any scan
+    log_odds_radius: float  # what the own radius of all its fits adds, against another radius
+    log_odds: float  # the same after all scans: the prior, the radius, and the sum over stations
+    stations: tuple[StationEvidence, ...]
+
+    def __post_init__(self) -> None:
+        seal(self, {"p_site": (3,)})
 
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
@@ -171,6 +221,8 @@ class Network:
         Stations that share too little with the others.
     left_out : tuple of LeftOut
         Centres that are no marks of the network, control marks without an observation.
+    evidence : tuple of MarkEvidence
+        What all stations say of each mark, and of what may be one.
     """
 
     stations: tuple[str, ...]
@@ -192,6 +244,7 @@ class Network:
     suspicions: tuple[str, ...]
     refused: tuple[Refusal, ...] = ()
     left_out: tuple[LeftOut, ...] = ()
+    evidence: tuple[MarkEvidence, ...] = ()
 
     def __post_init__(self) -> None:
         n, s, m, c = (len(x) for x in (self.sightings, self.stations, self.marks, self.controls))

@@ -1,6 +1,7 @@
 """Many stations and marks, adjusted together.
 
 - ``assembly``: which marker of which station is which mark, and approximate values
+- ``mark_evidence``: whether it is a mark, by all stations that should see it
 - ``normal_equations``, ``snooping``: solution and tests
 - ``adjustment``: the result with reliability and warnings
 
@@ -12,7 +13,10 @@ from spheremark.pipelines.model.network import (
     RANGE_BIAS,
     AdjustedNetwork,
     BlockTests,
+    Decision,
+    Finding,
     LeftOut,
+    MarkEvidence,
     Network,
     Refusal,
     Repeat,
@@ -27,7 +31,10 @@ __all__ = [
     "RANGE_BIAS",
     "AdjustedNetwork",
     "BlockTests",
+    "Decision",
+    "Finding",
     "LeftOut",
+    "MarkEvidence",
     "Network",
     "NetworkErrors",
     "Refusal",

@@ -25,7 +25,7 @@ from spheremark.pipelines.errors import (
 from spheremark.pipelines.geometry import levelling_rotation, rigid, transform, unit, up_by_lean
 from spheremark.pipelines.model import OPTICS, Array, ControlMarks, MarkerFit, MarkerFits
 from spheremark.pipelines.model.network import LeftOut, Network, Refusal, Shared
-from spheremark.pipelines.network.false_marks import suspect_marks
+from spheremark.pipelines.network.mark_evidence import Weighed, weigh_marks
 from spheremark.pipelines.positioning.hypotheses import Spans, spans_between
 from spheremark.pipelines.positioning.matching import (
     gather,
@@ -35,7 +35,8 @@ from spheremark.pipelines.positioning.matching import (
 )
 
 _EXACT = 1e-5  # [m] sigma of control marks that are given as exact: far below any survey's
-_NO_MARK, _SUSPECT = -1, -2  # in place of a mark: none is near; the one that is near may be false
+# In place of a mark: none is near; the one that is near is false; of a possible marker none
+_NO_MARK, _SUSPECT, _UNUSED = -1, -2, -3
 _STEEP = 1e-3  # of a line of sight that is nearly the gimbal axis: across is no direction there
 _NEAR_CONTROL = 1.0  # [m] how far a mark can be from a control mark and still be worth a remark
 
@@ -140,14 +141,16 @@ def assemble(
             f"Two logs are called {twice[0]!r}; stations are identified by name. Rename one."
         )
     if calibration is not None:
-        scans = [(name, calibration.adjusted(name, fits)) for name, fits in scans]
+        scans = [
+            (name, replace(calibration.adjusted(name, fits), possible_fits=()))
+            for name, fits in scans
+        ]
     found, reasons = _grow(scans, control, config)
-    used, unshared = _shared(found)
-    suspicions, dropped = suspect_marks(scans, found, used)
-    for i, fit in dropped:
+    weighed = weigh_marks(scans, found, _shared(found)[0], config)
+    for i, fit in weighed.dropped:
         found.marks_of[i][fit] = _SUSPECT
-    if dropped:
-        used, unshared = _shared(found)
+    scans = _with_confirmed(scans, found, weighed)
+    used, unshared = _shared(found)
     refused = tuple(
         Refusal(station=names[i], code=DegenerateGeometryError.code, reason=reason)
         if isinstance(reason, str)
@@ -155,7 +158,7 @@ def assemble(
         for i, reason in _refused(len(scans), used, reasons)
     )
     _refuse_nothing(used, found, control, _foremost(refused, [names[i] for i in reasons]))
-    network = _network(scans, found, used, suspicions)
+    network = _network(scans, found, used, weighed.suspicions)
     cov_p_base = network.cov_p_base + config.sigma_common**2 * np.eye(3)
     fits_of = {name: found_there.fits for name, found_there in scans}
     rows = zip(network.sightings[:, 0], network.fits, strict=True)
@@ -166,7 +169,20 @@ def assemble(
         cov_p_base = own_covariances(network.p_base, cov_p_base, variances)
     network = replace(network, cov_p_base=cov_p_base, refused=refused)
     network = _in_common(network, seen, config, calibration)
-    return replace(network, left_out=_unseen(scans, found, used, unshared, dropped))
+    left_out = _unseen(scans, found, used, unshared, weighed.dropped)
+    return replace(network, left_out=left_out, evidence=weighed.evidence)
+
+
+def _with_confirmed(scans: Sequence[Scan], found: _Map, weighed: Weighed) -> list[Scan]:
+    """Return the stations with possible markers behind the others; enter those confirmed."""
+    out = []
+    for i, (name, fits) in enumerate(scans):
+        if i in found.poses:
+            marks = [weighed.confirmed.get((i, k), _UNUSED) for k in range(len(fits.possible_fits))]
+            found.marks_of[i] = [*found.marks_of[i], *marks]
+            fits = replace(fits, fits=fits.fits + fits.possible_fits, possible_fits=())
+        out.append((name, fits))
+    return out
 
 
 def _grow(
@@ -253,7 +269,11 @@ def _shared(found: _Map) -> tuple[dict[int, list[tuple[int, int]]], dict[int, li
             break
         stations -= weak
     unshared = {
-        i: [f for f in range(len(found.marks_of[i])) if f not in {fit for fit, _ in pairs}]
+        i: [
+            f
+            for f, mark in enumerate(found.marks_of[i])
+            if mark != _UNUSED and f not in {fit for fit, _ in pairs}
+        ]
         for i, pairs in used.items()
     }
     return used, unshared
@@ -463,7 +483,7 @@ def _with_common_optics(network: Network, fits: Sequence[MarkerFit]) -> tuple[Ne
     weighted = sum(one.weights @ one.estimates for one in found.values())
     cov = np.linalg.inv(weights)
     mean = cov @ np.asarray(weighted)
-    off = np.array([mean - found[station].estimates for station in network.sightings[:, 0]])
+    off = np.array([mean - fit.optics.estimates for fit in fits if fit.optics is not None])
     towards, by_optics = unit(network.p_base), np.array([fit.range_by_optics for fit in fits])
     shifts = np.einsum("ni,nk,nk->ni", towards, by_optics, off)
     shared = Shared(

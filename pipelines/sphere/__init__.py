@@ -24,7 +24,14 @@ from dataclasses import replace
 
 from spheremark.pipelines.config import FittingConfig
 from spheremark.pipelines.errors import ConfigError
-from spheremark.pipelines.model import MarkerCandidates, MarkerFit, MarkerFits, StitchedCloud
+from spheremark.pipelines.model import (
+    MarkerCandidate,
+    MarkerCandidates,
+    MarkerFit,
+    MarkerFits,
+    StitchedCloud,
+    marker_name,
+)
 from spheremark.pipelines.sphere.description import Fits
 from spheremark.pipelines.sphere.methods import along_beam, astm, paper, silhouette
 from spheremark.pipelines.sphere.methods import free_radius as free
@@ -38,6 +45,9 @@ METHODS: dict[str, Method] = {
     free.ALGEBRAIC: free.fit_algebraic,
     paper.NAME: paper.fit,
 }
+
+_POSSIBLE = "P"  # first letter of the names of possible markers
+_N_SAMPLE = 200_000  # returns that show what hides a place: ten within a degree of most directions
 
 
 def fit_markers(
@@ -76,6 +86,10 @@ def fit_markers(
     if method not in METHODS:
         raise ConfigError(f"Fitting method {method!r} is unknown; known: {', '.join(METHODS)}.")
     found = METHODS[method](cloud, candidates, config, marker_radius)
+    more = _with_possible(candidates)
+    together = (
+        METHODS[method](cloud, more, config, marker_radius) if more is not candidates else found
+    )
     levelling = cloud.levelling
     sigma_heading = found.heading_factor * levelling.sigma_heading
     return MarkerFits(
@@ -84,10 +98,37 @@ def fit_markers(
         rejected=candidates.rejected + found.rejected,
         levelling=replace(levelling, sigma_heading=sigma_heading),
         possible=candidates.possible,
+        possible_fits=tuple(
+            _judged(fit, more) for fit in together.fits if fit.name.startswith(_POSSIBLE)
+        ),
+        sample_base=cloud.p_base[:: max(1, len(cloud.p_base) // _N_SAMPLE)].copy(),
     )
+
+
+def _with_possible(candidates: MarkerCandidates) -> MarkerCandidates:
+    """Return the possible markers as candidates beside the others, whose noise they share."""
+    possible = tuple(
+        MarkerCandidate(
+            name=marker_name(place, _POSSIBLE),
+            members=one.members,
+            p_base_rough=one.p_base,
+            probability=one.probability,
+            hypothesis=one.reason,
+            log_likelihoods=one.log_likelihoods,
+        )
+        for place, one in enumerate(candidates.possible)
+    )
+    if not possible:
+        return candidates
+    return replace(candidates, candidates=candidates.candidates + possible)
 
 
 def _judged(fit: MarkerFit, candidates: MarkerCandidates) -> MarkerFit:
     """Return a fit with the probability of its candidate."""
     one = next(one for one in candidates.candidates if one.name == fit.name)
-    return replace(fit, probability=one.probability, hypothesis=one.hypothesis)
+    return replace(
+        fit,
+        probability=one.probability,
+        hypothesis=one.hypothesis,
+        log_likelihoods=one.log_likelihoods,
+    )

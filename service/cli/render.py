@@ -16,7 +16,7 @@ from rich.measure import Measurement
 from rich.text import Text
 
 from spheremark.pipelines.tables import Column, Table
-from spheremark.service.serialise.network_report import checks, not_used, places, vector
+from spheremark.service.serialise.network_report import checks, evidence, not_used, places, vector
 from spheremark.storage.recordings import Preflight
 
 _ROWS_SHOWN = 100  # of a query; programs get all
@@ -210,7 +210,7 @@ def print_network(out: Console, result: Plain) -> None:
     _say(out, result["datum"]["text"])
     for warning in result["warnings"]:
         out.print(f"[yellow]Warning:[/] {escape(warning)}", highlight=False, soft_wrap=True)
-    print_tables(out, [*places(result), *checks(result)])
+    print_tables(out, [*places(result), *evidence(result), *checks(result)])
     if result["calibration"]:
         print_calibration(out, result["calibration"])
     if errors := result.get("errors"):

@@ -29,6 +29,10 @@ def adjust(
     csv: Annotated[
         Path | None, typer.Option(dir_okay=False, help="Write stations and marks (CSV).")
     ] = None,
+    evidence: Annotated[
+        Path | None,
+        typer.Option(dir_okay=False, help="Write what each station says of each mark (CSV)."),
+    ] = None,
     report: Annotated[
         Path | None, typer.Option(dir_okay=False, help="Write the whole report (text).")
     ] = None,
@@ -47,7 +51,11 @@ def adjust(
     from spheremark.service.cli import render
     from spheremark.service.serialise import network as serialise
     from spheremark.service.serialise.network_report import report as format_report
-    from spheremark.storage.exports.network import format_coordinates, format_gama
+    from spheremark.storage.exports.network import (
+        format_coordinates,
+        format_evidence,
+        format_gama,
+    )
     from spheremark.storage.imports import survey_files as site_files
 
     config = SurveyConfig.from_mapping(
@@ -74,6 +82,8 @@ def adjust(
         gama.write_text(format_gama(result), encoding="utf-8")
     if csv:
         csv.write_text(format_coordinates(result), encoding="utf-8")
+    if evidence:
+        evidence.write_text(format_evidence(result), encoding="utf-8")
     if report:
         report.write_text(format_report(plain), encoding="utf-8")
     if as_json:

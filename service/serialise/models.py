@@ -323,6 +323,33 @@ class Datum(_Declared):
     control_marks: list[str]
 
 
+class StationEvidence(_Declared):
+    """The evidence of one station on a mark."""
+
+    station: str
+    marker: str
+    finding: Literal["marker", "possible", "refused", "nothing", "hidden"]
+    range_m: float
+    log_odds: float
+    reason: str
+
+
+class MarkEvidence(_Declared):
+    """The evidence of all stations on a mark, or on what may be one."""
+
+    mark: str
+    is_used: bool
+    decision: Literal["confirmed", "doubtful", "refused"]
+    probability: float
+    decoy: str
+    hypothesis: str
+    log_odds_prior: float
+    log_odds_radius: float
+    log_odds: float
+    position_m: Vector
+    stations: list[StationEvidence]
+
+
 class Repeat(_Declared):
     """Two stations at one place."""
 
@@ -399,6 +426,7 @@ class NetworkDocument(_Declared):
     observations: list[Sighting]
     gravity: list[Gravity]
     control: list[ControlMark]
+    evidence: list[MarkEvidence] = []
     repeated_stops: list[Repeat]
     calibration: CalibrationDocument | None
     shared_unknowns: list[SharedUnknown]

@@ -14,7 +14,13 @@ import numpy as np
 from spheremark.pipelines.calibration import Calibration
 from spheremark.pipelines.config import SurveyConfig
 from spheremark.pipelines.geometry import yaw_pitch_roll
-from spheremark.pipelines.network import AdjustedNetwork, BlockTests, NetworkErrors, Repeat
+from spheremark.pipelines.network import (
+    AdjustedNetwork,
+    BlockTests,
+    MarkEvidence,
+    NetworkErrors,
+    Repeat,
+)
 from spheremark.service.serialise.calibration import serialise_calibration
 from spheremark.service.serialise.plain import Plain, ellipse_fields, number, numbers
 
@@ -49,6 +55,7 @@ def serialise_network(
         "observations": [_observation(result, i) for i in range(len(network.sightings))],
         "gravity": _blocks(result.gravity, network.stations, "station", "rad"),
         "control": _control(result),
+        "evidence": [_evidence(one, network.marks) for one in network.evidence],
         "repeated_stops": [_repeat(network.stations, one) for one in result.repeats],
         "calibration": None if rig is None else serialise_calibration(rig),
         "shared_unknowns": _shared(result),
@@ -151,6 +158,33 @@ def _control(result: AdjustedNetwork) -> list[Plain]:
         row["predicted_minus_given_m"] = numbers(off) if is_predicted else None
         row["sigma_predicted_minus_given_m"] = numbers(sigmas) if is_predicted else None
     return rows
+
+
+def _evidence(one: MarkEvidence, marks: Sequence[str]) -> Plain:
+    """Return what all stations say of a mark; ``marks`` are those of the network."""
+    return {
+        "mark": one.mark,
+        "is_used": one.mark in marks,
+        "decision": one.decision.value,
+        "probability": one.probability,
+        "decoy": one.decoy,
+        "hypothesis": one.hypothesis,
+        "log_odds_prior": one.log_odds_prior,
+        "log_odds_radius": one.log_odds_radius,
+        "log_odds": one.log_odds,
+        "position_m": numbers(one.p_site),
+        "stations": [
+            {
+                "station": station.station,
+                "marker": station.marker,
+                "finding": station.finding.value,
+                "range_m": station.range,
+                "log_odds": station.log_odds,
+                "reason": station.reason,
+            }
+            for station in one.stations
+        ],
+    }
 
 
 def _repeat(names: Sequence[str], repeat: Repeat) -> Plain:

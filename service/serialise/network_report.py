@@ -28,6 +28,11 @@ def _sigma(i: int) -> Callable[[Plain], float]:
     return lambda row: math.sqrt((row.get("position_covariance_m2") or row["covariance_m2"])[i][i])
 
 
+def _n_found(finding: str) -> Callable[[Plain], int]:
+    """Return the function to the number of stations with a finding."""
+    return lambda row: sum(one["finding"] == finding for one in row["stations"])
+
+
 _PLACES = (
     Column(lambda row: row["name"] + "*" * row.get("is_control", False), "Name"),
     *vector("position_m", "m", "12.4f"),
@@ -65,6 +70,17 @@ _LEFT_OUT = (
     *vector("predicted_minus_given_m", "mm", "+.2f", ("dX", "dY", "dZ")),
     *vector("sigma_predicted_minus_given_m", "mm", ".2f", ("sX", "sY", "sZ")),
 )
+_EVIDENCE = (
+    Column("mark", "Mark"),
+    Column("decision", "Decision"),
+    Column("probability", "probability", "", ".3f"),
+    Column("log_odds", "log odds", "", ".1f"),
+    *(
+        Column(_n_found(finding), finding, "", "d")
+        for finding in ("marker", "possible", "refused", "nothing", "hidden")
+    ),
+    Column("hypothesis", "Best other hypothesis"),
+)
 _RIG = (
     Column("name", "Parameter"),
     Column("unit", "unit"),
@@ -77,6 +93,7 @@ def report(network: Plain, title: str = "") -> str:
     parts = [*_summary(network, title)]
     for table in (
         *places(network),
+        *evidence(network),
         *tables_of_observations(network),
         *checks(network),
         *_rest(network),
@@ -91,6 +108,22 @@ def places(network: Plain) -> list[Table]:
         Table(title="ADJUSTED STATIONS", columns=_PLACES, rows=network["stations"]),
         Table(title="ADJUSTED MARKS (* control)", columns=_PLACES, rows=network["marks"]),
     ]
+
+
+def evidence(network: Plain) -> list[Table]:
+    """Return what all stations make of each mark, and each station of those in doubt."""
+    marks = network["evidence"]
+    if not marks:
+        return []
+    notes = [
+        f"{mark['mark']} {mark['decision']}, {one['station']} at {one['range_m']:.1f} m: "
+        f"{one['finding']} ({one['log_odds']:+.1f}). {one['reason']}".rstrip()
+        for mark in marks
+        if mark["decision"] != "confirmed"
+        for one in mark["stations"]
+    ]
+    title = "EVIDENCE OF ALL STATIONS (log odds of a marker; number of stations by finding)"
+    return [Table(title=title, columns=_EVIDENCE, rows=marks, notes=notes)]
 
 
 def checks(network: Plain) -> list[Table]:

@@ -24,6 +24,8 @@ TABLES = (
     "refused_stations",
     "control_checks",
     "repeated_stops",
+    "mark_decisions",
+    "mark_evidence",
 )
 """Tables of an adjusted network."""
 

@@ -5,7 +5,8 @@ Rows hold no returns and residuals: a centre from a row has none.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
+from dataclasses import replace
 
 import numpy as np
 import pyarrow as pa
@@ -17,25 +18,26 @@ from spheremark.pipelines.model import (
     MarkerFit,
     MarkerFits,
     Optics,
+    Rejection,
     Status,
 )
 from spheremark.storage.catalogue.rows import Row, places
 
 _COV = ("xx", "xy", "xz", "xy", "yy", "yz", "xz", "yz", "zz")
-_NO_ROWS = np.zeros(0, dtype=np.intp)
+_NO_ROWS, _NO_NUMBERS = np.zeros(0, dtype=np.intp), np.zeros(0)
+CENTRES = ("stops", "marker_fits", "possible_fits", "group_likelihoods", "rejections")
+"""Tables that hold the centres of runs, and what else stood there."""
 
 
 def read_centres(
-    stops: pa.Table, marker_fits: pa.Table, run_id: str, method: str
+    tables: Mapping[str, pa.Table], run_id: str, method: str
 ) -> Iterator[tuple[str, MarkerFits]]:
     """Yield the centres of each stop of a run by one method.
 
     Parameters
     ----------
-    stops : Table
-        Rows of ``stops``.
-    marker_fits : Table
-        Rows of ``marker_fits`` of the same runs.
+    tables : mapping of str to Table
+        Rows of ``CENTRES`` of some runs.
     run_id : str
         The run.
     method : str
@@ -45,25 +47,55 @@ def read_centres(
     ------
     str, MarkerFits
         Name of the stop, and centres in the base frame in the order of their names, with
-        covariances without levelling and heading, as a fit gives them. Without rejections.
+        covariances without levelling and heading, as a fit gives them. Possible markers count
+        among the refused groups, beside their centres.
     """
-    fits = [
-        row
-        for row in marker_fits.to_pylist()
-        if row["run_id"] == run_id and row["fit_method"] == method
-    ]
-    for stop in stops.to_pylist():
-        if stop["run_id"] == run_id:
-            levelling = levelling_of(stop)
-            own = sorted(
-                (row for row in fits if row["stop"] == stop["stop"]),
-                key=lambda row: int(row["marker"][1:]),
+    rows = {
+        name: [
+            row
+            for row in table.to_pylist()
+            if row["run_id"] == run_id and row.get("fit_method", method) == method
+        ]
+        for name, table in tables.items()
+    }
+    for stop in rows["stops"]:
+        levelling = levelling_of(stop)
+        own = {
+            name: [row for row in of_run if row["stop"] == stop["stop"]]
+            for name, of_run in rows.items()
+        }
+        compared = own["group_likelihoods"]
+        logs = {row["marker"]: np.array(row["log_likelihoods"]) for row in compared}
+        fits, possible = (
+            tuple(
+                replace(_fit(row, levelling), log_likelihoods=logs.get(row["marker"], _NO_NUMBERS))
+                for row in sorted(own[name], key=lambda row: int(row["marker"][1:]))
             )
-            found = tuple(_fit(row, levelling) for row in own)
-            yield (
-                stop["stop"],
-                MarkerFits(method=method, fits=found, rejected=(), levelling=levelling),
-            )
+            for name in ("marker_fits", "possible_fits")
+        )
+        others = [row for row in compared if row["marker"] is None] + [
+            row for row in own["rejections"] if row["probability"] is None
+        ]
+        yield (
+            stop["stop"],
+            MarkerFits(
+                method=method,
+                fits=fits,
+                rejected=tuple(_group(row, levelling) for row in others),
+                levelling=levelling,
+                possible_fits=possible,
+            ),
+        )
+
+
+def _group(row: Row, levelling: Levelling) -> Rejection:
+    """Return a group that is no marker."""
+    return Rejection(
+        p_base=levelling_rotation(levelling).T @ places([row])[0],
+        n_points=row["n_points"],
+        reason=row["reason"],
+        log_likelihoods=np.array(row.get("log_likelihoods") or _NO_NUMBERS),
+    )
 
 
 def levelling_of(row: Row) -> Levelling:
@@ -91,18 +123,20 @@ def _fit(row: Row, levelling: Levelling) -> MarkerFit:
         radius_free=_number(row["radius_free_m"]),
         sigma_radius_free=_number(row["sigma_radius_free_m"]),
         mean_range=row["range_m"],
-        mean_intensity=_number(row["mean_intensity"]),
+        mean_intensity=_number(row.get("mean_intensity")),
         used=_NO_ROWS,
         rejected=_NO_ROWS,
         residuals=np.zeros(0),
         sigma0=_number(row["sigma0"]),
         n_rings=row["n_rings"],
-        coverage=_number(row["coverage"]),
-        incidence=np.radians(_number(row["incidence_deg"])),
-        variant=row["variant"] or "",
+        coverage=_number(row.get("coverage")),
+        incidence=np.radians(_number(row.get("incidence_deg"))),
+        variant=row.get("variant") or "",
         sigma_range_shared=_number(row["sigma_range_shared_m"]),
         optics=_optics(row["optics"]),
         range_by_optics=np.array(row["range_by_optics_m"] or np.zeros(3)),
+        probability=_number(row["probability"]),
+        hypothesis=row["hypothesis"],
     )
 
 

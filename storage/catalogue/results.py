@@ -26,6 +26,7 @@ from spheremark.pipelines.model import (
     MarkerFits,
     NoFix,
     Optics,
+    Rejection,
     StationFix,
     StationQuality,
     StopResult,
@@ -47,6 +48,8 @@ TABLES = (
     "stops",
     "marker_fits",
     "rejections",
+    "group_likelihoods",
+    "possible_fits",
     "station_fixes",
     "observations",
     "resections",
@@ -186,6 +189,9 @@ def _stop_rows(
             for groups, may_be in ((found.possible, True), (found.rejected, False))
             for one in groups
         ]
+        possible = _fit_rows(found.possible_fits, R, sigma_heading, "possible_fits")
+        rows["possible_fits"] += [label | row for row in possible]
+    rows["group_likelihoods"] += _likelihood_rows(next(iter(stop.fits.values())), R)
     for (fit_method, method), fix in stop.fixes.items():
         label = {"fit_method": fit_method, "resection_method": method}
         station: Row = label | _fix_row(fix)
@@ -213,8 +219,26 @@ def _stop_row(stop: StopResult, cloud_url: str | None) -> Row:
     }
 
 
-def _fit_rows(fits: Sequence[MarkerFit], R: Array, sigma_heading: float) -> list[Row]:
-    """Return rows of ``marker_fits`` without errors, method and mark; R levels the base."""
+def _likelihood_rows(found: MarkerFits, R: Array) -> list[Row]:
+    """Return the rows of the compared groups of a stop; R levels the base."""
+    groups: list[tuple[Row, MarkerFit | Rejection]] = [
+        ({"marker": one.name, "reason": one.hypothesis}, one)
+        for one in (*found.fits, *found.possible_fits)
+    ]
+    groups += [({"reason": one.reason}, one) for one in found.rejected]
+    return [
+        named(PLACE, R @ one.p_base)
+        | {"n_points": one.n_points, "log_likelihoods": one.log_likelihoods.tolist()}
+        | words
+        for words, one in groups
+        if len(one.log_likelihoods)
+    ]
+
+
+def _fit_rows(
+    fits: Sequence[MarkerFit], R: Array, sigma_heading: float, table: str = "marker_fits"
+) -> list[Row]:
+    """Return rows of a table of fits without errors, method and mark; R levels the base."""
     p = np.array([fit.p_base for fit in fits]).reshape(-1, 3) @ R.T
     covs = np.array([fit.cov_with_heading(sigma_heading) for fit in fits]).reshape(-1, 3, 3)
     cov = (R @ covs @ R.T)[:, *_UPPER]
@@ -223,7 +247,7 @@ def _fit_rows(fits: Sequence[MarkerFit], R: Array, sigma_heading: float) -> list
     elevations = np.degrees(np.arctan2(p[:, 2], np.hypot(p[:, 0], p[:, 1])))
     numbers = np.column_stack([p, cov, sigmas, azimuths, elevations]).tolist()
     return [
-        row_of("marker_fits", fit)
+        row_of(table, fit)
         | named(_FIT_NUMBERS, row)
         | {"marker": fit.name, "range_m": fit.mean_range, "n_rejected": len(fit.rejected)}
         | {"range_by_optics_m": fit.range_by_optics.tolist(), "optics": _optics(fit.optics)}

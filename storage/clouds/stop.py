@@ -179,6 +179,31 @@ def read_cloud(url: str, *, n_max: int | None = None) -> CloudView:
     return _from_table(table if n_max is None else table.take(_chosen(table, n_max)), about)
 
 
+def read_sample(url: str | None) -> Column:
+    """Read an even sample of the returns of a stop.
+
+    Parameters
+    ----------
+    url : str, optional
+        Result of ``write_cloud``.
+
+    Returns
+    -------
+    (n, 3)
+        Returns in the station frame; none where the cloud is not kept any more [m].
+    """
+    if url is None:
+        return np.zeros((0, 3), np.float32)
+    try:
+        cloud = read_cloud(url)
+    except NotFoundError:
+        return np.zeros((0, 3), np.float32)
+    step = max(1, cloud.n_returns // max(1, int(np.sum(~cloud.is_near))))
+    near = np.flatnonzero(cloud.is_near)[::step]
+    rows = np.sort(np.concatenate([np.flatnonzero(~cloud.is_near), near]))
+    return np.asarray(cloud.p_station[rows])
+
+
 def _near(p: Column, centres: Array) -> Mask:
     """Return which points are near a centre; distances are computed only in cells near one."""
     cells = np.clip(np.floor(p[:, :2]) + _CELLS // 2, 0, _CELLS - 1).astype(np.intp)

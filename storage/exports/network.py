@@ -25,6 +25,11 @@ COORDINATE_COLUMNS = (
     "cov_xy_m2", "cov_xz_m2", "cov_yz_m2", "n_observations",
 )  # fmt: skip
 
+EVIDENCE_COLUMNS = (
+    "mark", "decision", "probability", "decoy", "station", "marker", "finding", "range_m",
+    "log_odds", "reason",
+)  # fmt: skip
+
 
 def format_coordinates(result: AdjustedNetwork) -> str:
     """Return stations and marks of a network as CSV.
@@ -54,6 +59,31 @@ def format_coordinates(result: AdjustedNetwork) -> str:
         others = (cov[0, 1], cov[0, 2], cov[1, 2])
         numbers = (*(f"{x:.5f}" for x in point.p_site), *(f"{x:.6f}" for x in sigmas))
         writer.writerow((point.kind, point.name, *numbers, *(f"{x:.4e}" for x in others), count))
+    return text.getvalue()
+
+
+def format_evidence(result: AdjustedNetwork) -> str:
+    """Return the evidence on the marks of a network as CSV.
+
+    Parameters
+    ----------
+    result : AdjustedNetwork
+        The network.
+
+    Returns
+    -------
+    str
+        One row per mark and station that is near enough to see it, with the columns
+        ``EVIDENCE_COLUMNS``.
+    """
+    text = io.StringIO()
+    writer = csv.writer(text)
+    writer.writerow(EVIDENCE_COLUMNS)
+    for mark in result.network.evidence:
+        of_mark = (mark.mark, mark.decision, f"{mark.probability:.6g}", mark.decoy)
+        for one in mark.stations:
+            numbers = (f"{one.range:.3f}", f"{one.log_odds:.3f}")
+            writer.writerow((*of_mark, one.station, one.marker, one.finding, *numbers, one.reason))
     return text.getvalue()
 
 

@@ -26,6 +26,8 @@ PARTS = {
         "marks": "adjusted_marks",
         "control_checks": "control_checks",
         "repeated_stops": "repeated_stops",
+        "mark_decisions": "mark_decisions",
+        "mark_evidence": "mark_evidence",
         "refused": "refused_stations",
     },
     rows.CalibrationDetail: {"values": "calibrated_parameters", "gaps": "calibration_gaps"},

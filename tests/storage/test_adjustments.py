@@ -16,7 +16,7 @@ from spheremark.pipelines.model import ControlMarks, StopTruth, Truth
 from spheremark.pipelines.scan.rigs import rig_digest, rig_to_mapping, tilted_vlp16
 from spheremark.storage.catalogue.adjustments import TABLES, with_errors
 from spheremark.storage.catalogue.catalogue import Catalogue
-from spheremark.storage.catalogue.centres import read_centres
+from spheremark.storage.catalogue.centres import CENTRES, read_centres
 from spheremark.storage.catalogue.products import documents
 from spheremark.storage.catalogue.schema import table_of, tables_of
 from tests.storage.made_up import made_tables, stop
@@ -130,7 +130,7 @@ def test_without_truth_or_with_one_station_of_a_free_network_there_are_no_errors
 
 def test_centres_come_back_from_their_rows_as_they_were_fitted():
     made, fitted = made_tables(run_id="run1"), stop()
-    ((name, found),) = read_centres(made["stops"], made["marker_fits"], "run1", "along_beam")
+    ((name, found),) = read_centres({key: made[key] for key in CENTRES}, "run1", "along_beam")
     expected = fitted.fits["along_beam"]
     assert name == fitted.name
     assert (found.levelling.roll, found.levelling.pitch) == pytest.approx(

@@ -16,6 +16,7 @@ from spheremark.web.links import query_text, stop_url
 from spheremark.web.pages.base import Frame, Panel, Readout, Row
 from spheremark.web.templating import number, render
 
+_ORDER = ("refused", "doubtful", "confirmed")  # of the decisions on marks
 _N_WORST = 40  # observations in the table; all are in the database and in the files
 _MAP = (
     "Solid: the 95 % ellipse; dotted: the standard ellipse (39 %). The fill is the mean redundancy "
@@ -60,6 +61,7 @@ def adjustment_page(
         worst=_worst(rows["adjusted_observations"]),
         n_worst=_N_WORST,
         left_out=[row for row in rows["adjusted_observations"] if not row["used"]],
+        decisions=_decisions(rows["mark_decisions"], rows["mark_evidence"]),
         n_centres=len(centres["kind"]),
         has_truth=has_errors(tables["adjusted_stations"]),
         **more,
@@ -137,6 +139,17 @@ def _panels(one: Row, tables: Mapping[str, Columns], centres: Columns) -> list[P
         figure = figures.control_differences(tables["control_checks"])
         panels.append(Panel("checks", figure, _CHECKS))
     return panels
+
+
+def _decisions(
+    decisions: list[dict[str, Any]], evidence: list[dict[str, Any]]
+) -> list[dict[str, Any]]:
+    """Return the marks with the evidence of their stations, those in doubt first."""
+    of_marks: dict[str, list[dict[str, Any]]] = {row["mark"]: [] for row in decisions}
+    for row in evidence:
+        of_marks[row["mark"]].append(row)
+    rows = [row | {"stations": of_marks[row["mark"]]} for row in decisions]
+    return sorted(rows, key=lambda row: _ORDER.index(row["decision"]))
 
 
 def _worst(observations: list[dict[str, Any]]) -> list[dict[str, Any]]:

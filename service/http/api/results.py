@@ -66,6 +66,10 @@ _ADJUSTMENT_PARTS = {
     "marks": "SELECT * FROM adjusted_marks WHERE adjustment_id = $id ORDER BY mark",
     "control_checks": "SELECT * FROM control_checks WHERE adjustment_id = $id ORDER BY mark",
     "repeated_stops": "SELECT * FROM repeated_stops WHERE adjustment_id = $id ORDER BY ALL",
+    "mark_decisions": "SELECT * FROM mark_decisions WHERE adjustment_id = $id ORDER BY mark",
+    "mark_evidence": """
+        SELECT * FROM mark_evidence WHERE adjustment_id = $id ORDER BY mark, station
+    """,
     "refused": "SELECT * FROM refused_stations WHERE adjustment_id = $id ORDER BY station",
 }
 _CALIBRATION_PARTS = {

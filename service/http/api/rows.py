@@ -114,6 +114,10 @@ AdjustmentDetail = _table(
         "ControlCheck", "A control mark as all else predicts it.", "control_checks"
     ),
     repeated_stops=_many("RepeatedStop", "Two stations at one place.", "repeated_stops"),
+    mark_decisions=_many(
+        "MarkDecision", "What all stations together make of a mark.", "mark_decisions"
+    ),
+    mark_evidence=_many("MarkEvidence", "What one station shows of a mark.", "mark_evidence"),
     refused=_many("RefusedStation", "A station that is not in the network.", "refused_stations"),
     files=list[str],
 )

@@ -34,6 +34,8 @@ _TABLES = {
     "adjusted_observations": "kind, station, marker, mark",
     "control_checks": "mark",
     "repeated_stops": "station, again",
+    "mark_decisions": "mark",
+    "mark_evidence": "mark, station",
     "refused_stations": "station",
 }
 """Tables of a network, and the order of their rows."""

@@ -22,6 +22,7 @@ from spheremark.service.jobs.handlers.calibrate import calibration_results, logs
 from spheremark.service.jobs.handlers.process import process_log
 from spheremark.service.jobs.specification import JobResult, JobSpecification, Log, Options
 from spheremark.service.provenance import code_version
+from spheremark.storage.catalogue.centres import CENTRES
 
 if TYPE_CHECKING:
     import pyarrow as pa
@@ -41,8 +42,7 @@ WHERE r.survey_id = $survey AND list_contains($recordings::VARCHAR[], r.recordin
     AND (json_extract_string(j.options, '$.rig') IS NOT DISTINCT FROM $rig::VARCHAR)
 ORDER BY r.finished_at DESC
 """
-_STOPS = "SELECT * FROM stops WHERE list_contains($runs::VARCHAR[], run_id) ORDER BY run_id, stop"
-_FITS = "SELECT * FROM marker_fits WHERE list_contains($runs::VARCHAR[], run_id)"
+_ROWS = "SELECT * FROM {} WHERE list_contains($runs::VARCHAR[], run_id) ORDER BY run_id, stop"
 
 
 class AdjustOptions(Options):
@@ -73,11 +73,8 @@ def gather(catalogue: Catalogue, spec: JobSpecification) -> Mapping[str, pa.Tabl
     if spec.options.get("reprocess"):
         runs = runs.slice(0, 0)
     keep = [row["run_id"] for row in runs.to_pylist() if _is_alike(row, spec)]
-    return {
-        "runs": runs,
-        "stops": catalogue.table(_STOPS, {"runs": keep}),
-        "marker_fits": catalogue.table(_FITS, {"runs": keep}),
-    }
+    tables = {name: catalogue.table(_ROWS.format(name), {"runs": keep}) for name in CENTRES}
+    return {"runs": runs, **tables}
 
 
 def _is_alike(run: Row, spec: JobSpecification) -> bool:
@@ -204,9 +201,9 @@ def _centres(
     if run is not None:
         progress(0.0, f"Taking the centres of {log.name} from an earlier run")
         source = {key: run[key] for key in ("run_id", "recording_id", "rig_digest")}
-        stops, fits = spec.known["stops"], spec.known["marker_fits"]
-        for stop, found in read_centres(stops, fits, run["run_id"], method):
-            yield stop, found, source
+        tables = {name: spec.known[name] for name in CENTRES}
+        for stop, found in read_centres(tables, run["run_id"], method):
+            yield stop, _with_sample(found, tables["stops"], run["run_id"], stop), source
         return
     run_id = secrets.token_hex(8)
     done, tables = process_log(spec, log, run_id, progress)
@@ -214,13 +211,32 @@ def _centres(
     for one in done:
         digest = rig_digest(one.cloud.rig)
         source = {"run_id": run_id, "recording_id": log.recording_id, "rig_digest": digest}
-        yield one.name, one.fits[method], source
+        yield one.name, _with_sample(one.fits[method], tables["stops"], run_id, one.name), source
+
+
+def _with_sample(fits: MarkerFits, stops: pa.Table, run_id: str, stop: str) -> MarkerFits:
+    """Return centres with the returns of the kept cloud of their stop, if there is one."""
+    from spheremark.pipelines.geometry import levelling_rotation
+    from spheremark.storage.clouds.stop import read_sample
+
+    (url,) = (
+        row["cloud_url"]
+        for row in stops.select(["run_id", "stop", "cloud_url"]).to_pylist()
+        if (row["run_id"], row["stop"]) == (run_id, stop)
+    )
+    R_station_base = levelling_rotation(fits.levelling).astype("float32")
+    return replace(fits, sample_base=read_sample(url) @ R_station_base)
 
 
 def _files(result: AdjustedNetwork, plain: Row) -> dict[str, str]:
     """Return the files of a network by name."""
     from spheremark.service.serialise.network_report import report
-    from spheremark.storage.exports.network import format_coordinates, format_gama, network_points
+    from spheremark.storage.exports.network import (
+        format_coordinates,
+        format_evidence,
+        format_gama,
+        network_points,
+    )
     from spheremark.storage.exports.points import format_points
 
     points = network_points(result)
@@ -228,6 +244,7 @@ def _files(result: AdjustedNetwork, plain: Row) -> dict[str, str]:
         "adjustment.json": json.dumps(plain),
         "report.txt": report(plain),
         "coordinates.csv": format_coordinates(result),
+        "evidence.csv": format_evidence(result),
         "coordinates.dxf": format_points(points, ".dxf"),
         "coordinates.xml": format_points(points, ".xml"),
         "gama.xml": format_gama(result),

@@ -46,6 +46,21 @@ def network_rows(network: Row, sources: Mapping[str, Row]) -> dict[str, list[Row
         "refused_stations": network["refused"],
         "control_checks": list(_checks(network)),
         "repeated_stops": list(_repeats(network)),
+        "mark_decisions": [_decision(one) for one in network["evidence"]],
+        "mark_evidence": [
+            {"mark": one["mark"], **row} for one in network["evidence"] for row in one["stations"]
+        ],
+    }
+
+
+def _decision(one: Row) -> Row:
+    """Return the decision on a mark, with the number of stations by finding."""
+    findings = [row["finding"] for row in one["stations"]]
+    kinds = ("marker", "possible", "refused", "nothing", "hidden")
+    return {
+        **{key: value for key, value in one.items() if key not in ("stations", "position_m")},
+        **{f"{axis}_m": value for axis, value in zip(_AXES, one["position_m"], strict=True)},
+        **{f"n_{kind}": findings.count(kind) for kind in kinds},
     }
 
 

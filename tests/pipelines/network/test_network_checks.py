@@ -8,7 +8,13 @@ import pytest
 from spheremark.pipelines.config import ResectionConfig
 from spheremark.pipelines.errors import DegenerateGeometryError
 from spheremark.pipelines.model import OPTICS, Optics, Status
-from spheremark.pipelines.network import Shared, adjust_network, assemble, repeated_stops
+from spheremark.pipelines.network import (
+    Decision,
+    Shared,
+    adjust_network,
+    assemble,
+    repeated_stops,
+)
 from tests.synthetic import control, field, pose, sightings
 
 CONFIG = ResectionConfig(sigma_common=0.0, sigma_range=0.0, sigma_range_scale=0.0, sigma_height=0.0)
@@ -115,15 +121,19 @@ def test_weak_sightings_of_a_third_of_the_stations_are_no_mark(rng):
     assert any("Only 9 returns" in one.reason for one in result.left_out)
 
 
-def test_a_mark_of_another_radius_is_doubted(rng):
+def test_a_ball_of_another_radius_is_no_mark(rng):
     marks = field(rng)
     odd = []
     for name, fits in survey(rng, marks, 5):
         first = replace(fits.fits[0], radius_free=0.13, sigma_radius_free=0.01)
         odd.append((name, replace(fits, fits=(first, *fits.fits[1:]))))
     result = adjust_network(assemble(odd, None, CONFIG), CONFIG)
-    (reason,) = [text for text in result.mark_weaknesses if text]
-    assert "Its own radius is 130 mm" in reason
+    (one,) = [one for one in result.network.evidence if one.decision is Decision.REFUSED]
+    assert one.mark not in result.network.marks
+    assert one.decoy == "sphere of nearly that radius"
+    gone = [left for left in result.left_out if "Its own radius is 130 mm" in left.reason]
+    assert {left.marker for left in gone} == {"M01"}
+    assert len(gone) == 5
 
 
 def test_a_station_that_needs_a_doubtful_mark_keeps_it(rng):
