@@ -199,6 +199,11 @@ class _Beams(NamedTuple):
     ranges: Column
     highest: float
 
+    @property
+    def n_usual(self) -> float:
+        """Number of beams about a direction, in the mean."""
+        return 0.5 * (1.0 - _CONE) * len(self.ranges)
+
     @classmethod
     def of(cls, sample_base: Column) -> _Beams:
         """Return those of a sample of returns."""
@@ -254,9 +259,10 @@ def _of_beams(beams: _Beams, p_base: Array, *, is_clear: bool) -> _Shown:
     ranges = beams.ranges[beams.towards @ (p_base / distance).astype(np.float32) > _CONE]
     n, n_before = len(ranges), int(np.sum(ranges < distance - _DEPTH))
     n_past = int(np.sum(ranges > distance + _DEPTH))
-    if n < _N_CONE and p_base[2] > beams.highest * distance:
-        return _Shown(Finding.HIDDEN, _NO_EVIDENCE, None, "It is above all beams that return.")
-    if n >= _N_CONE and n_before > _BEFORE * n:
+    if n < _N_CONE and (beams.n_usual < _N_CONE or p_base[2] > beams.highest * distance):
+        text = "It is above all beams that return, or these are few."
+        return _Shown(Finding.HIDDEN, _NO_EVIDENCE, None, text)
+    if n_before > _BEFORE * n:
         text = f"{n_before} of {n} beams towards it end before it."
         return _Shown(Finding.HIDDEN, _NO_EVIDENCE, None, text)
     if not is_clear:
