@@ -202,7 +202,7 @@ class _Beams(NamedTuple):
     @property
     def n_usual(self) -> float:
         """Number of beams about a direction, in the mean."""
-        return 0.5 * (1.0 - _CONE) * len(self.ranges)
+        return float(0.5 * (1.0 - _CONE) * len(self.ranges))
 
     @classmethod
     def of(cls, sample_base: Column) -> _Beams:
