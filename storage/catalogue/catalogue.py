@@ -11,7 +11,7 @@ import pyarrow as pa
 
 from spheremark.pipelines.errors import ConflictError, NotFoundError
 from spheremark.storage.catalogue import adjustments, results
-from spheremark.storage.catalogue.database import fetch
+from spheremark.storage.catalogue.database import Changed, fetch
 from spheremark.storage.catalogue.records import (
     JobRecord,
     JobStatus,
@@ -144,7 +144,7 @@ class Catalogue(Surveys):
             self.get_recording(recording_id)
         job_id = secrets.token_hex(8)
         texts = [json_text(config), json_text(options)]
-        with self.writing() as cursor:
+        with self.writing(Changed.QUEUE) as cursor:
             cursor.execute(_CREATE, [job_id, kind, survey_id, recording_id, *texts, now()])
             if key is not None:
                 cursor.execute(_KEEP_KEY, [*key, job_id, now()])
@@ -198,7 +198,7 @@ class Catalogue(Surveys):
         -----
         Costs a millisecond, and does not outdate the newest snapshot.
         """
-        with self.writing(is_result=False) as cursor:
+        with self.writing(Changed.PROGRESS) as cursor:
             cursor.execute(_PROGRESS, [min(max(float(percent), 0.0), 100.0), message, job_id])
 
     def finish_job(
@@ -291,7 +291,7 @@ class Catalogue(Surveys):
         self, job_id: str, allowed: tuple[JobStatus, ...], sql: str, *values: object
     ) -> JobRecord:
         """Change a job in a transaction if its status is one of those allowed."""
-        with self.writing() as cursor:
+        with self.writing(Changed.QUEUE) as cursor:
             _require(job_id, _status(cursor, job_id), *allowed)
             cursor.execute(sql, [*values, job_id])
         return self.get_job(job_id)

@@ -15,6 +15,7 @@ from collections import OrderedDict
 from collections.abc import Callable, Hashable, Iterator, Mapping
 from concurrent.futures import Future
 from contextlib import closing, contextmanager, suppress
+from enum import Enum
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Self, TypeVar
@@ -49,6 +50,14 @@ FROM duckdb_columns() AS c JOIN (
 ) AS t USING (table_name)
 WHERE NOT c.internal ORDER BY t.kind DESC, c.table_name, c.column_index
 """
+
+
+class Changed(Enum):
+    """What a transaction changes, at most."""
+
+    RESULTS = "results, surveys, control"
+    QUEUE = "logs and jobs"
+    PROGRESS = "progress of a job"
 
 
 class Database:
@@ -89,7 +98,8 @@ class Database:
         self._readers = 0
         self._none_reads = threading.Condition()
         self._failure: duckdb.Error | None = None
-        self._version = 0
+        self._version = self._results_version = 0
+        self._schema: tuple[TableInfo, ...] | None = None
         self._kept: OrderedDict[Hashable, Future[Any]] = OrderedDict()
         self._kept_version = 0
         self._keeping = threading.Lock()
@@ -144,14 +154,14 @@ class Database:
             return fetch(cursor, sql, parameters or {})
 
     def computed(self, key: Hashable, compute: Callable[[], _Value]) -> _Value:
-        """Return what a function computes from results, kept until something is written.
+        """Return what a function computes from results, kept until one of them changes.
 
         Parameters
         ----------
         key : hashable
             The function and its arguments.
         compute : callable
-            Reads the database alone; progress of jobs may be older than that of the database.
+            Reads results, surveys and control alone: neither logs nor jobs.
 
         Returns
         -------
@@ -159,9 +169,9 @@ class Database:
             Its value, which others get too and must not change.
         """
         with self._keeping:
-            if self._kept_version != self._version:
+            if self._kept_version != self._results_version:
                 self._kept.clear()
-                self._kept_version = self._version
+                self._kept_version = self._results_version
             kept = self._kept.get(key)
             own = kept or self._kept.setdefault(key, Future())
             if len(self._kept) > _N_KEPT:
@@ -179,7 +189,9 @@ class Database:
 
     def schema(self) -> tuple[TableInfo, ...]:
         """Return the tables and views that may be queried, with units and comments."""
-        return tables_of(self.rows(_COLUMNS))
+        if self._schema is None:
+            self._schema = tables_of(self.rows(_COLUMNS))
+        return self._schema
 
     def snapshot(self) -> Path:
         """Return a consistent copy of the database file, as fresh as the last committed result.
@@ -233,7 +245,7 @@ class Database:
             yield cursor
 
     @contextmanager
-    def writing(self, *, is_result: bool = True) -> Iterator[duckdb.DuckDBPyConnection]:
+    def writing(self, changed: Changed = Changed.RESULTS) -> Iterator[duckdb.DuckDBPyConnection]:
         """Hold the write lock and a transaction."""
         with self._lock, self._usable():
             cursor = self._writer
@@ -245,7 +257,8 @@ class Database:
                 with suppress(duckdb.Error):
                     cursor.execute("ROLLBACK")
                 raise
-            self._version += is_result
+            self._version += changed is not Changed.PROGRESS
+            self._results_version += changed is Changed.RESULTS
 
     @contextmanager
     def _usable(self) -> Iterator[None]:

@@ -15,7 +15,7 @@ from duckdb import DuckDBPyConnection
 from spheremark.pipelines.errors import ConflictError, InputError, NotFoundError
 from spheremark.pipelines.model import ControlMarks, Rig, Truth
 from spheremark.pipelines.scan.rigs import rig_digest, rig_from_mapping, rig_to_mapping
-from spheremark.storage.catalogue.database import fetch
+from spheremark.storage.catalogue.database import Changed, fetch
 from spheremark.storage.catalogue.lists import Lists
 from spheremark.storage.catalogue.marks import (
     check_marks,
@@ -241,7 +241,7 @@ class Surveys(Lists):
                 f"verdict is one of {', '.join(_VERDICTS)}, and a size is not negative."
             )
         row = [digest, name, size_bytes, now(), url, verdict, json_text(preflight)]
-        with self.writing() as cursor:
+        with self.writing(Changed.QUEUE) as cursor:
             cursor.execute("INSERT OR IGNORE INTO recordings VALUES (?, ?, ?, ?, ?, ?, ?)", row)
         return self.get_recording(digest)
 

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import cache
 from typing import Any
 
 import plotly.graph_objects as go
+from markupsafe import Markup
 
 from spheremark.web import theme
 from spheremark.web.pages.base import Frame, Row
@@ -66,16 +68,30 @@ class SqlQuery:
     name: str = ""
 
 
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Schema:
+    """Tables and views: the panel that shows them, and the columns of each by name."""
+
+    panel: Markup
+    names: Mapping[str, Sequence[str]]
+
+
+def schema_of(tables: Sequence[Row]) -> Schema:
+    """Render tables and views, which are the same for all who open the page."""
+    return Schema(
+        panel=Markup(render("schema.html", tables=tables)),
+        names={table["name"]: [row["name"] for row in table["columns"]] for table in tables},
+    )
+
+
 def sql_page(
     frame: Frame,
     query: SqlQuery,
-    tables: Sequence[Row],
+    schema: Schema,
     limits: Mapping[str, Any],
     saved: Sequence[Row] = (),
 ) -> str:
     """Return the page for queries: schema, limits, and the query of the address."""
-    layout = go.Figure(layout={"template": theme.template()}).to_plotly_json()["layout"]
-    colours = {name: theme.method_style(name).colour for name in ("along_beam", "paper")}
     return render(
         "sql.html",
         frame=frame,
@@ -83,9 +99,16 @@ def sql_page(
         name=query.name,
         parameters=dict(query.parameters),
         saved=saved,
-        tables=tables,
+        schema=schema,
         limits=limits,
-        schema={table["name"]: [row["name"] for row in table["columns"]] for table in tables},
         examples=EXAMPLES,
-        chart_template={"layout": layout, "colours": colours},
+        chart_template=_chart_template(),
     )
+
+
+@cache
+def _chart_template() -> dict[str, Any]:
+    """Return what charts of results look like."""
+    layout = go.Figure(layout={"template": theme.template()}).to_plotly_json()["layout"]
+    colours = {name: theme.method_style(name).colour for name in ("along_beam", "paper")}
+    return {"layout": layout, "colours": colours}

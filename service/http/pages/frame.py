@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import asdict
+from functools import lru_cache
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -16,9 +17,10 @@ from spheremark.service.errors import Problem
 from spheremark.service.http.api.sql import query_of
 from spheremark.service.http.state import Current, Service
 from spheremark.storage.catalogue import saved_queries
+from spheremark.storage.catalogue.records import TableInfo
 from spheremark.web import assets, glossary
 from spheremark.web.pages.base import Frame
-from spheremark.web.pages.sql import SqlQuery, sql_page
+from spheremark.web.pages.sql import Schema, SqlQuery, schema_of, sql_page
 from spheremark.web.templating import render
 
 router = APIRouter(include_in_schema=False, default_response_class=HTMLResponse)
@@ -92,15 +94,20 @@ def sql(
     p: Annotated[list[str] | None, Query()] = None,
 ) -> str:
     """Show the workbench for queries."""
-    tables = [asdict(table) for table in service.catalogue.schema()]
     chosen = query_of(service, None if name else q, name or None, p or [])
     return sql_page(
         frame_of(service),
         SqlQuery(text=chosen["sql"], parameters=chosen["parameters"], name=name),
-        tables,
+        _schema(service.catalogue.schema()),
         asdict(service.settings.query_limits),
         saved_queries.list_queries(service.catalogue),
     )
+
+
+@lru_cache(maxsize=4)
+def _schema(tables: tuple[TableInfo, ...]) -> Schema:
+    """Return tables and views as the page for queries shows them."""
+    return schema_of([asdict(table) for table in tables])
 
 
 def error_page(_: Request, problem: Problem) -> HTMLResponse:
