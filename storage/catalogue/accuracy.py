@@ -262,8 +262,11 @@ def parameters(database: Database, selection: Selection) -> dict[str, Any]:
     """
     chosen = {name: getattr(selection, name) for name in Selection.__slots__}
     chosen |= {name: list(chosen[name]) for name in ("surveys", "methods")}
-    is_error = database.rows(_HAS_ERRORS, {"surveys": chosen["surveys"]})[0]["has_errors"]
-    return chosen | {"is_error": bool(is_error)}
+    known = {"surveys": chosen["surveys"]}
+    found = database.computed(
+        ("has_errors", selection.surveys), lambda: database.rows(_HAS_ERRORS, known)
+    )
+    return chosen | {"is_error": bool(found[0]["has_errors"])}
 
 
 def edges(database: Database, values: Mapping[str, Any]) -> list[float]:

@@ -79,6 +79,7 @@ _N_ACTIVE = """
 SELECT count(*) AS n FROM jobs WHERE survey_id = $id AND status IN ('accepted', 'running')
 """
 _DELETED = "SELECT * FROM deleted_surveys ORDER BY deleted_at DESC, survey_id"
+_IS_REMOVED = "SELECT 1 FROM removed_recordings WHERE survey_id = ? AND recording_id = ?"
 _PUT_BACK = "DELETE FROM removed_recordings WHERE survey_id = ? AND recording_id = ?"
 _CONTROL = "SELECT * FROM control_marks WHERE survey_id = $id ORDER BY place"
 
@@ -109,8 +110,12 @@ class Surveys(Lists):
 
     def get_survey(self, key: str) -> SurveyRecord:
         """Return a survey by its id or its name; NotFoundError if there is none."""
-        row = self._one(_SURVEY_BY_KEY, {"key": key}, f"survey {key!r}")
-        return record_of(SurveyRecord, row)
+        return self.computed(
+            ("survey", key),
+            lambda: record_of(
+                SurveyRecord, self._one(_SURVEY_BY_KEY, {"key": key}, f"survey {key!r}")
+            ),
+        )
 
     def list_surveys(self, *, after: str | None = None, limit: int = 100) -> Page[SurveyRecord]:
         """Return a page of the surveys, newest first; ``after`` is ``next`` of the page before."""
@@ -266,9 +271,12 @@ class Surveys(Lists):
     def add_to_survey(self, survey: str, recording_id: str) -> None:
         """Assign a log to a survey, or put it back with its results."""
         row = [self.get_survey(survey).survey_id, self.get_recording(recording_id).recording_id]
-        with self.writing() as cursor:
+        with self.writing(Changed.QUEUE) as cursor:
             cursor.execute("INSERT OR IGNORE INTO survey_recordings VALUES (?, ?)", row)
-            cursor.execute(_PUT_BACK, row)
+            is_removed = cursor.execute(_IS_REMOVED, row).fetchone() is not None
+        if is_removed:
+            with self.writing() as cursor:
+                cursor.execute(_PUT_BACK, row)
 
     def remove_from_survey(self, survey: str, recording_id: str) -> None:
         """Take a log and its results out of a survey until it is assigned again."""

@@ -118,13 +118,16 @@ def error_page(_: Request, problem: Problem) -> HTMLResponse:
 
 def frame_of(service: Service, survey: str = "", tab: str = "") -> Frame:
     """Return what every page shows around itself; a page of a survey names the tab it is in."""
-    names = tuple(row["name"] for row in service.catalogue.rows(_SURVEY_NAMES))
+    rows = service.catalogue.computed("names", lambda: service.catalogue.rows(_SURVEY_NAMES))
+    names = tuple(row["name"] for row in rows)
     return Frame(surveys=names, survey=survey, tab=tab)
 
 
 def survey_row(service: Service, key: str) -> Mapping[str, Any]:
     """Return the survey of that name or id."""
-    return service.row(_SURVEY, key, "survey")
+    return service.catalogue.computed(
+        ("survey_row", key), lambda: service.row(_SURVEY, key, "survey")
+    )
 
 
 def address_of(request: Request) -> str:
