@@ -81,7 +81,12 @@ class Scene:
     # the product of theirs; and the part of it that the covariances of the centres contain [m]
     shared_base: Array
     included_base: Array
-    sigma_height: float  # standard deviation of what all centres are too high together [m]
+
+    @property
+    def cov_own(self) -> Array:
+        """Covariances of the centres without what they have in common, (n, 3, 3) [m^2]."""
+        included = self.included_base
+        return np.asarray(self.cov_centres - included @ np.swapaxes(included, 1, 2))
 
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
@@ -135,6 +140,8 @@ def gather(fits: MarkerFits, marks: ControlMarks, config: ResectionConfig) -> Sc
     cov_p_base = np.stack([fit.cov_p_base for fit in fits.fits])
     cov_p_base += config.sigma_common**2 * np.eye(3)
     shared, included = _in_common(fits, p_base, cov_p_base, config)
+    R_station_base = levelling_rotation(levelling)
+    of_heights = np.tile(config.sigma_height * R_station_base[2], (len(p_base), 1))
     return Scene(
         names=marks.names,
         centres_base=p_base,
@@ -142,14 +149,13 @@ def gather(fits: MarkerFits, marks: ControlMarks, config: ResectionConfig) -> Sc
         marks_site=marks.p_site - middle,
         cov_marks=marks.cov_p_site,
         middle=middle,
-        R_station_base=levelling_rotation(levelling),
+        R_station_base=R_station_base,
         J_up=up_by_lean(levelling),
         sigma_level=levelling.sigma,
         is_levelled=levelling.is_measured,
         sigma_heading=levelling.sigma_heading_station,
-        shared_base=shared,
+        shared_base=np.concatenate([shared, of_heights[:, :, None]], axis=2),
         included_base=included,
-        sigma_height=config.sigma_height,
     )
 
 
@@ -242,9 +248,8 @@ def cov_of_shared(scene: Scene, fits: Index, effects: Array) -> Array:
     own; an error of all heights is not. The estimate is the same: only how sure it is, changes.
     """
     together = (effects @ scene.shared_base[fits]).sum(axis=-3)
-    heights = scene.sigma_height * effects.sum(axis=-3) @ scene.R_station_base[2]
     own = effects @ scene.included_base[fits]
-    cov = together @ np.swapaxes(together, -1, -2) + heights[..., :, None] * heights[..., None, :]
+    cov = together @ np.swapaxes(together, -1, -2)
     return np.asarray(cov - (own @ np.swapaxes(own, -1, -2)).sum(axis=-3))
 
 
@@ -347,6 +352,56 @@ def observe(scene: Scene, pairs: Index, T: Array) -> tuple[Observations, Observa
     return centres, gravity
 
 
+def observe_together(scene: Scene, pairs: Index, T: Array) -> tuple[Observations, Observations]:
+    """Linearise centres as one block, with what they have in common, and gravity at many poses.
+
+    Parameters
+    ----------
+    scene : Scene
+        Centres and marks.
+    pairs : (s, k, 2)
+        Places among fits and marks of each pose.
+    T : (s, 4, 4)
+        Poses of base, relative to the middle of the marks [m].
+
+    Returns
+    -------
+    tuple of Observations
+        One block of 3 k coordinates, and one of gravity.
+    """
+    alone, gravity = observe(replace(scene, cov_centres=scene.cov_own), pairs, T)
+    shared = T[:, None, :3, :3] @ scene.shared_base[pairs[..., 0]]
+    n = len(T)
+    return Observations(
+        residuals=alone.residuals.reshape(n, 1, -1),
+        J=alone.J.reshape(n, 1, -1, alone.J.shape[-1]),
+        cov=cov_together(alone.cov, shared)[:, None],
+    ), gravity
+
+
+def cov_together(own: Array, shared: Array) -> Array:
+    """Return the covariance of k centres in one matrix.
+
+    Parameters
+    ----------
+    own : (..., k, 3, 3)
+        Covariances of what is each centre's own [m^2].
+    shared : (..., k, 3, q)
+        Factors of what they have in common [m].
+
+    Returns
+    -------
+    (..., 3 k, 3 k)
+        Their covariance [m^2].
+    """
+    *problems, k, _, q = shared.shape
+    factors = shared.reshape(*problems, 3 * k, q)
+    cov = np.asarray(factors @ np.swapaxes(factors, -1, -2))
+    blocks, i = cov.reshape(*problems, k, 3, k, 3), np.arange(k)
+    blocks[..., i, :, i, :] += np.moveaxis(own, -3, 0)
+    return cov
+
+
 def moved(T: Array, xi: Array) -> Array:
     """Move poses on the left by small motions, to first order.
 
@@ -376,7 +431,7 @@ def solve_pose(scene: Scene, pairs: Index, start: Array) -> Solution:
 
 
 def solve_poses(scene: Scene, pairs: Index, start: Array) -> Solutions:
-    """Find a pose of base from each of many sets of pairs and gravity.
+    """Find a pose of base from each of many sets of pairs, what they share, and gravity.
 
     Parameters
     ----------
@@ -393,7 +448,7 @@ def solve_poses(scene: Scene, pairs: Index, start: Array) -> Solutions:
         Poses with covariances of small motions on the left.
     """
     starts = np.tile(start, (len(pairs), 1, 1))
-    return solve_each(lambda T, rows: observe(scene, pairs[rows], T), moved, starts)
+    return solve_each(lambda T, rows: observe_together(scene, pairs[rows], T), moved, starts)
 
 
 def _refuse_plumb_line(p: Array, kind: str, config: ResectionConfig) -> None:

@@ -28,6 +28,7 @@ from spheremark.pipelines.positioning.matching import (
     Scene,
     gather,
     match_marks,
+    observe_together,
     solve_poses,
 )
 from spheremark.pipelines.positioning.trilateration import circles, slope_ranges
@@ -110,8 +111,7 @@ def check_distances(
     given = np.linalg.norm(goals[:, 1] - goals[:, 0], axis=1)
     along = (q - p) / measured[:, None]
     along_site = (goals[:, 1] - goals[:, 0]) / given[:, None]
-    included, (a, b) = scene.included_base, places[..., 0].T
-    own = scene.cov_centres - included @ np.swapaxes(included, 1, 2)
+    own, (a, b) = scene.cov_own, places[..., 0].T
     cov, cov_given = own[a] + own[b], scene.cov_marks[places[..., 1]].sum(axis=1)
     apart = (along[:, None] @ (scene.shared_base[b] - scene.shared_base[a]))[:, 0]
     sigmas = np.sqrt(
@@ -230,10 +230,21 @@ def leave_each_out(
     fit, mark = fix.matches.T
     R, t = T[:, :3, :3], T[:, :3, 3]
     p_site = np.einsum("nij,nj->ni", R, scene.centres_base[fit]) + t
-    cov = R @ scene.cov_centres[fit] @ np.swapaxes(R, 1, 2) + scene.cov_marks[mark]
-    J = by_motion(p_site)
+    J, shared = by_motion(p_site), R @ scene.shared_base[fit]
+    # what centres have in common moves the station, and the mark that it predicts, together
+    seen, _ = observe_together(scene, others, T)
+    of_others = (R[:, None] @ scene.shared_base[others[..., 0]]).reshape(n, 3 * n - 3, -1)
+    weights = np.swapaxes(seen.J[:, 0], 1, 2) @ invert_each(seen.cov[:, 0])[0]
+    carried = J @ without.covs @ weights @ of_others
+    own = R @ scene.cov_own[fit] @ np.swapaxes(R, 1, 2) + scene.cov_marks[mark]
+    by_noise = J @ without.covs @ np.swapaxes(J, 1, 2) - _square(carried)
     return Omissions(
         shifts_site=t - with_all.estimates[0, :3, 3],
         predictions_site=p_site - scene.marks_site[mark],
-        cov_predictions_site=J @ without.covs @ np.swapaxes(J, 1, 2) + cov,
+        cov_predictions_site=own + by_noise + _square(shared - carried),
     )
+
+
+def _square(factors: Array) -> Array:
+    """Return the covariances that factors, (n, 3, k), stand for."""
+    return np.asarray(factors @ np.swapaxes(factors, 1, 2))

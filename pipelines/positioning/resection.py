@@ -15,7 +15,6 @@ import numpy as np
 from spheremark.pipelines.config import ResectionConfig
 from spheremark.pipelines.errors import ConfigError, DegenerateGeometryError, NoMarkersError
 from spheremark.pipelines.estimation.least_squares import Adjustment, Groups, Observations, adjust
-from spheremark.pipelines.estimation.linear_algebra import invert_each
 from spheremark.pipelines.estimation.statistical_tests import Dropped, snoop
 from spheremark.pipelines.geometry import (
     by_motion,
@@ -115,8 +114,7 @@ def free_station(fits: MarkerFits, marks: ControlMarks, config: ResectionConfig)
     scene = gather(fits, marks, config)
     match = match_marks(scene, config)
     pairs, n_shared = match.pairs, scene.shared_base.shape[2]
-    own = scene.cov_centres - scene.included_base @ np.swapaxes(scene.included_base, 1, 2)
-    alone = replace(scene, cov_centres=own)
+    alone = replace(scene, cov_centres=scene.cov_own)
 
     def adjusted(keep: Mask) -> Adjustment:
         return adjust(
@@ -285,7 +283,7 @@ def _fix(
     shift = np.eye(6)
     shift[3:, :3] = skew(scene.middle)
     T_site_base = rigid(T[:3, :3], T[:3, 3] + scene.middle)
-    cov, J = _covariance(scene, adjustment), by_motion(T[:3, 3])
+    cov, J = adjustment.cov[:6, :6], by_motion(T[:3, 3])
     elsewhere = match.alternatives + scene.middle - T_site_base[:3, 3]
     T_site_station = T_site_base @ inverse(rigid(scene.R_station_base, np.zeros(3)))
     pose = Pose(
@@ -298,14 +296,6 @@ def _fix(
     )
     fix = station_fix("free_station", scene, used, adjustment, pose, (reasons, excluded))
     return replace(fix, axis_station=scene.R_station_base[:, 2].copy())
-
-
-def _covariance(scene: Scene, adjustment: Adjustment) -> Array:
-    """Return the covariance of a motion, (6, 6), with an error that all heights share."""
-    R, group = adjustment.estimate[:3, :3], adjustment.groups[0]
-    gains = adjustment.cov @ np.swapaxes(invert_each(group.cov)[0] @ group.J, 1, 2)  # up to sign
-    of_heights = scene.sigma_height * gains.sum(axis=0)[:6] @ (R @ scene.R_station_base[2])
-    return np.asarray(adjustment.cov[:6, :6] + np.outer(of_heights, of_heights))
 
 
 def _cov_of_alternatives(elsewhere: Array) -> Array:

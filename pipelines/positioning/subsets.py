@@ -33,6 +33,7 @@ from spheremark.pipelines.model import (
 from spheremark.pipelines.positioning.matching import (
     Scene,
     cov_of_shared,
+    cov_together,
     gather,
     moved,
     observe,
@@ -242,34 +243,31 @@ def _by_pose(
 
     Unknown are small motions in base, about its origin, in which the equations stay the same.
     """
-    R, base = start[:3, :3], scene.centres_base[matches[:, 0]]
-    goals, plumb = scene.marks_site[matches[:, 1]], scene.R_station_base[2]
-    centres, gravity = observe(scene, matches, start)
+    R, (fits, marks) = start[:3, :3], matches.T
+    base, goals, plumb = scene.centres_base[fits], scene.marks_site[marks], scene.R_station_base[2]
+    own, shared = scene.cov_own[fits] + R.T @ scene.cov_marks[marks] @ R, scene.shared_base[fits]
+    _, gravity = observe(scene, matches, start)
     J, turn = by_motion(base), np.hstack([-skew(plumb), np.zeros((3, 3))])
-    weighted = np.swapaxes(J, 1, 2) @ (R.T @ invert_each(centres.cov)[0] @ R)
     level = invert_each(gravity.cov[0])[0]
     leaned = R[:2] @ turn
-    normal, start_normal = weighted @ J, leaned.T @ level @ leaned
     found = []
     for chosen in groups:
-        cov, _ = invert_each(normal[chosen].sum(axis=1) + start_normal)
-        stacked = weighted[chosen].swapaxes(2, 3).reshape(len(chosen), 3 * chosen.shape[1], 6)
+        n = len(chosen)
+        by_pose = J[chosen].reshape(n, 3 * chosen.shape[1], 6)
+        weighted = invert_each(cov_together(own[chosen], shared[chosen]))[0] @ by_pose
+        cov, _ = invert_each(np.swapaxes(weighted, 1, 2) @ by_pose + leaned.T @ level @ leaned)
 
-        def rhs(T: Array, chosen: Index = chosen, stacked: Array = stacked) -> Array:
+        def rhs(T: Array, chosen: Index = chosen, weighted: Array = weighted) -> Array:
             off = base[chosen] + (T[:, None, :3, 3] - goals[chosen]) @ T[:, :3, :3]
             tilt = (T[:, :2, :3] @ plumb) @ level
             up = (tilt[:, None] @ T[:, :2, :3])[:, 0] @ turn
-            return np.asarray(-(off.reshape(len(off), 1, stacked.shape[1]) @ stacked)[:, 0] - up)
+            return np.asarray(-(off.reshape(len(off), 1, -1) @ weighted)[:, 0] - up)
 
         def move(T: Array, xi: Array) -> Array:
             return np.asarray(T @ moved(np.tile(np.eye(4), (len(T), 1, 1)), xi))
 
-        T, is_settled = solve_by_chords(cov, rhs, move, np.tile(start, (len(chosen), 1, 1)))
-        gains = R @ cov[:, 3:]
-        cov = gains[:, :, 3:] @ R.T + cov_of_shared(
-            scene, matches[chosen, 0], gains[:, None] @ weighted[chosen]
-        )
-        found.append(Positions(T[:, :3, 3], cov, is_settled))
+        T, is_settled = solve_by_chords(cov, rhs, move, np.tile(start, (n, 1, 1)))
+        found.append(Positions(T[:, :3, 3], R @ cov[:, 3:, 3:] @ R.T, is_settled))
     return found
 
 

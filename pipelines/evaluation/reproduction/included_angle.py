@@ -164,7 +164,6 @@ def _by_centres(centres: Array, marks: Array, sigma: float = GRANTED_ERROR) -> A
         sigma_heading=0.0,
         shared_base=np.zeros((n, 3, 0)),
         included_base=np.zeros((n, 3, 0)),
-        sigma_height=0.0,
     )
     pairs = np.stack([np.arange(n).reshape(s, k), np.tile(np.arange(k), (s, 1))], axis=2)
     return solve_poses(scene, pairs, np.eye(4)).estimates[:, :3, 3]

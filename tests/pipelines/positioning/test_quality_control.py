@@ -13,6 +13,7 @@ from spheremark.pipelines.positioning.quality_control import (
     leave_each_out,
 )
 from spheremark.pipelines.positioning.resection import resect
+from tests import chance
 from tests.synthetic import control, field, pose, sightings
 
 CONFIG = ResectionConfig(sigma_common=0.0, sigma_range=0.0, sigma_range_shared=0.0)
@@ -136,6 +137,32 @@ def test_what_the_others_predict_for_a_mark_is_off_by_as_much_as_is_said(rng):
         d, cov = omissions.predictions_site, omissions.cov_predictions_site
         squares.append(np.einsum("ni,nij,nj->n", d, np.linalg.inv(cov), d))
     assert np.mean(np.concatenate(squares)) / 3 == pytest.approx(1.0, abs=0.15)
+
+
+def test_errors_that_centres_share_move_the_station_and_the_mark_that_it_predicts(rng):
+    """A scan of one face: an error of range, and one that lifts all centres by their distance."""
+    marks = field(rng, 6)
+    T, own = pose([0.5, -0.4, -0.2], 0.7), 1e-3
+    config = replace(CONFIG, sigma_range=4e-3, test_level=1e-6)
+    p = (marks.p_site - T[:3, 3]) @ T[:3, :3]
+    shared = np.stack([4e-3 * p / np.linalg.norm(p, axis=1, keepdims=True), 0.0 * p], axis=2)
+    shared[:, 2, 1] = 5e-4 * np.linalg.norm(p, axis=1)
+    cov = own**2 * np.eye(3) + shared @ np.swapaxes(shared, 1, 2)
+    squares = []
+    for _ in range(400):
+        noise = rng.normal(0, own, (6, 3)) + shared @ rng.normal(size=2)
+        fits = sightings(marks, T, cov=cov, noise=noise)
+        pairs = zip(fits.fits, shared, strict=True)
+        reported = tuple(replace(fit, shared_base=factors) for fit, factors in pairs)
+        fits = replace(fits, fits=reported)
+        fix = resect("free_station", fits, marks, config)
+        omissions = leave_each_out(fix, fits, marks, config)
+        for row, (_, mark) in enumerate(fix.matches[:1]):
+            anew = resect("free_station", *without(fits, marks, mark), config).p_site
+            np.testing.assert_allclose(omissions.shifts_site[row], anew - fix.p_site, atol=1e-5)
+        d, covs = omissions.predictions_site, omissions.cov_predictions_site
+        squares.append(np.mean(np.einsum("ni,nij,nj->n", d, np.linalg.inv(covs), d)) / 3)
+    assert abs(np.mean(squares) - 1.0) < chance.of_mean(squares) < 0.15
 
 
 def test_of_two_markers_none_can_be_left_out(rng):

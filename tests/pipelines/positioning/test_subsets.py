@@ -65,17 +65,25 @@ def test_free_station_has_all_pairs_and_triples_with_their_angles_and_places(rng
             np.testing.assert_allclose(shown[:, 1], expected.max(axis=1), rtol=0, atol=1e-6)
 
 
+@pytest.mark.parametrize("sigma_shared", [0.0, 5e-3])  # [m] of an error that centres share
 @pytest.mark.parametrize("chosen", [(2, 9), (0, 1), (1, 6, 11)])
-def test_a_subset_is_the_fix_of_its_markers_alone(rng, chosen):
+def test_a_subset_is_the_fix_of_its_markers_alone(rng, chosen, sigma_shared):
     p = field(rng).p_site.copy()
     p[chosen[0], 2] = p[chosen[1], 2] + 1.0  # [m] two marks at one height could be swapped
     marks, T = control(p), pose(STAND, 2.2, LEAN)
-    noise = rng.normal(0, 4e-3, (14, 3))
-    found = seen(marks, T, lean=LEAN, noise=noise)[len(chosen) - 2]
+    noise, config = rng.normal(0, 4e-3, (14, 3)), replace(CONFIG, sigma_range=sigma_shared)
+    towards = (marks.p_site - T[:3, 3]) @ T[:3, :3]
+    shared = sigma_shared * (towards / np.linalg.norm(towards, axis=1, keepdims=True))[..., None]
+    cov = 4e-3**2 * np.eye(3) + shared @ np.swapaxes(shared, 1, 2)
+    fits = sightings(marks, T, lean=LEAN, noise=noise, cov=cov)
+    pairs = zip(fits.fits, shared, strict=True)
+    fits = replace(fits, fits=tuple(replace(fit, shared_base=one) for fit, one in pairs))
+    fix = resect("free_station", fits, marks, config)
+    every = resect_subsets(["free_station"], fix, fits, marks, config)["free_station"]
+    found = every[len(chosen) - 2]
     row = int(np.flatnonzero(np.all(found.marks == chosen, axis=1))[0])
-    fits = sightings(marks, T, lean=LEAN, noise=noise)
     few = replace(fits, fits=tuple(fits.fits[i] for i in chosen))
-    alone = resect("free_station", few, control(marks.p_site[list(chosen)]), CONFIG)
+    alone = resect("free_station", few, control(marks.p_site[list(chosen)]), config)
     np.testing.assert_allclose(found.p_site[row], alone.p_site, rtol=0, atol=2e-6)
     assert found.sigma_3d[row] == pytest.approx(alone.sigma_3d, rel=5e-3)  # sigma of another pose
 
