@@ -144,7 +144,7 @@ def _against_all(site: Site, every_stop: Stops, method: str, i: int) -> Plain:
     """Return a small case: three stops and a few places, of which every choice is judged."""
     rng = np.random.default_rng([i, _PLACES_SMALL])
     some = rng.choice(len(every_stop.names), 3, replace=False)
-    stops = Stops(names=tuple(every_stop.names[j] for j in some), p_site=every_stop.p_site[some])
+    stops = every_stop.rows(some)
     places = find_candidates(site, every_stop, PlaceRules())
     few = rng.choice(len(places.p_site), _PLACES_SMALL, replace=False)
     places = replace(places, p_site=places.p_site[few], ground=places.ground[few], rules=None)

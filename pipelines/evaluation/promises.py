@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
 from functools import partial
 from itertools import pairwise
 from typing import NamedTuple
@@ -26,7 +25,9 @@ from spheremark.pipelines.placement import (
     stops_of_field,
 )
 from spheremark.pipelines.positioning.resection import resect
+from spheremark.pipelines.scan.rigs import N_LASERS
 from spheremark.pipelines.simulation import RandomWorld, draw_world, simulate_stop
+from spheremark.pipelines.simulation.worlds import PRIORS
 from spheremark.pipelines.survey import process
 
 N_STOPS = 3
@@ -36,7 +37,6 @@ FOREIGN = ("optics", "rig", "one face", "clock", "dust", "all at once")
 """Families whose physics a plan does not assume: wide priors, or half a turn."""
 
 _METHOD = "along_beam"
-_CONFIG = SurveyConfig.from_mapping({"fitting": {"methods": [_METHOD]}})
 _CLASSES = (20.0, 50.0, 100.0, 500.0, np.inf)  # of expected returns
 _N_RESAMPLES = 2000
 
@@ -67,9 +67,9 @@ def promises(n_worlds: int, first_seed: int) -> Experiment[int, list[Plain], Pla
 
     Notes
     -----
-    A plan knows the marks and the ground of its world, how LiDAR and gimbal turn, and the noise of
-    ranges; all else is what plans assume by default. Every stop counts to which the plan promises a
-    position.
+    A plan and its survey know the marks, the ground, how LiDAR and gimbal turn, and the data sheets
+    of LiDAR, rig and AHRS: the sigmas of the errors, not the errors. Every stop counts to which the
+    plan promises a position.
     """
     return Experiment(
         worlds=range(first_seed, first_seed + 2 * n_worlds, 2),
@@ -84,30 +84,94 @@ def _world(seed: int) -> list[Plain]:
     world = draw_world(seed)
     if len(world.field.marks.names) < 2:
         return []
-    stops = stops_of_field(world.field)
-    first = replace(stops, names=stops.names[:N_STOPS], p_site=stops.p_site[:N_STOPS].copy())
+    stops = stops_of_field(world.field).rows(np.arange(N_STOPS))
     site, marks = site_of_field(world.field), marks_of_field(world.field)
-    model = sensor_model(_sensor(world), world.field.marker_radius)
-    plan = evaluate(site, first, marks, model, Requirement())
-    return [_row(world, plan, e) for e in range(len(first.names)) if np.isfinite(plan.sigma_3d[e])]
+    config = _survey_config(world)
+    model = sensor_model(_sensor(world, config), world.field.marker_radius)
+    requirement = Requirement(
+        sigma_levelling=config.stitching.sigma_levelling, resection=config.resection
+    )
+    plan = evaluate(site, stops, marks, model, requirement)
+    return [
+        _row(world, config, plan, e)
+        for e in range(len(stops.names))
+        if np.isfinite(plan.sigma_3d[e])
+    ]
 
 
-def _sensor(world: RandomWorld) -> Sensor:
-    """Return the sensor as a plan knows it: speeds and noise."""
-    config = world.config
+def _survey_config(world: RandomWorld) -> SurveyConfig:
+    """Return the configuration of a survey with the data sheets of LiDAR, rig and AHRS."""
+    config, family = world.config, world.field.family
+    lasers, common = config.sigma_laser_bias, PRIORS["range_bias"].rms(family)
+    scale = PRIORS["range_scale"].rms(family)
+    return SurveyConfig.from_mapping(
+        {
+            "marker_radius": world.field.marker_radius,
+            "stitching": {"sigma_levelling": config.sigma_ahrs_bias},
+            "fitting": {
+                "methods": [_METHOD],
+                "sigma_range_bias": lasers,
+                "sigma_range_common": common,
+                "sigma_range_scale": scale,
+                "sigma_mounting": config.sigma_misalignment,
+                "sigma_offset": config.sigma_axis_offset,
+            },
+            "resection": {
+                "sigma_range": float(np.hypot(common, lasers / np.sqrt(N_LASERS))),
+                "sigma_range_scale": scale,
+            },
+        }
+    )
+
+
+def _sensor(world: RandomWorld, survey: SurveyConfig) -> Sensor:
+    """Return the sensor as its data sheets describe it: motion, noise, rig and encoder."""
+    config, fitting = world.config, survey.fitting
+    rate = 0.0 if config.step else 2.0 * np.pi / config.turn
+    jitter = np.array([config.sigma_encoder, config.sigma_joint_stamp * rate])
+    steps = np.array([config.encoder_step, config.range_step]) / np.sqrt(12.0)
+    ripples = tuple(
+        (
+            amplitude
+            * float(
+                np.hypot(
+                    config.gimbal_clock_offset * periods * rate,
+                    1.0 - np.sinc(periods / (config.turn * config.joint_rate)) ** 2,
+                )
+            ),
+            periods,
+        )
+        for amplitude, periods in config.ripples
+    )
     return Sensor(
         turn=config.turn,
+        sweep=config.sweep,
         spin_rpm=config.spin_rpm,
         step=config.step,
         rest_revolutions=config.rest_revolutions,
         move=config.move,
-        noise=config.sigma_range,
+        noise=None if config.sigma_range is None else float(np.hypot(config.sigma_range, steps[1])),
+        sigma_weak=config.optics.sigma_weak,
+        reach=config.optics.range_half * float(np.sqrt(_reflectivity(world) / 0.10)),
+        drop_out=config.drop_out,
+        sigma_range_bias=fitting.sigma_range_bias,
+        sigma_range_common=fitting.sigma_range_common,
+        sigma_mounting=fitting.sigma_mounting,
+        sigma_offset=fitting.sigma_offset,
+        sigma_encoder=float(np.hypot(np.linalg.norm(jitter), steps[0])),
+        ripples=ripples,
+        joint_rate=config.joint_rate,
     )
 
 
-def _row(world: RandomWorld, plan: Evaluation, stop: int) -> Plain:
+def _reflectivity(world: RandomWorld) -> float:
+    """Return the reflectivity of the markers, 0 to 1."""
+    return float(world.field.scene.spheres.reflectivities[: len(world.field.marks.names)].mean())
+
+
+def _row(world: RandomWorld, config: SurveyConfig, plan: Evaluation, stop: int) -> Plain:
     """Return a station beside its promise."""
-    found = _surveyed(world, plan.stops.names[stop])
+    found = _surveyed(world, config, plan.stops.names[stop])
     marks = np.flatnonzero(plan.is_seen[stop])
     places = np.searchsorted(_CLASSES, plan.n_points[stop, marks], side="right") - 1
     return {
@@ -127,9 +191,9 @@ def _row(world: RandomWorld, plan: Evaluation, stop: int) -> Plain:
     }
 
 
-def _surveyed(world: RandomWorld, name: str) -> _Matched:
+def _surveyed(world: RandomWorld, config: SurveyConfig, name: str) -> _Matched:
     """Return the error of a station by the whole chain, and the marks that carry it."""
-    field, config = world.field, replace(_CONFIG, marker_radius=world.field.marker_radius)
+    field = world.field
     stop = simulate_stop(field, name, world.config)
     try:
         (result,) = process(stop.log, config=config)
@@ -189,8 +253,15 @@ def _group(name: str, rows: Sequence[Plain]) -> Plain:
         "ratio": float(np.sqrt(squares.mean())) if fixed else np.nan,
         "ratio_low": low,
         "ratio_high": high,
+        "ratio_ok": _ratio(fixed, squares),
         "median_ratio": float(np.sqrt(np.median(squares))) if fixed else np.nan,
     }
+
+
+def _ratio(rows: Sequence[Plain], squares: Array) -> float:
+    """Return the root of the mean square of the stations that their survey calls ok."""
+    sure = squares[[row["status"] == "ok" for row in rows]] if rows else squares
+    return float(np.sqrt(sure.mean())) if len(sure) else np.nan
 
 
 def _interval(seeds: Array, squares: Array) -> tuple[float, float]:
@@ -227,6 +298,7 @@ def _tables(report: Plain) -> list[Table]:
         Column("ratio", "ratio", "", ".2f"),
         Column("ratio_low", "from", "", ".2f"),
         Column("ratio_high", "to", "", ".2f"),
+        Column("ratio_ok", "ratio, ok", "", ".2f"),
         Column("median_ratio", "median", "", ".2f"),
     )
     by_returns = (

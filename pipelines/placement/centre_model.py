@@ -16,7 +16,7 @@ from spheremark.pipelines.compilation import compiled
 from spheremark.pipelines.model import Array, Column, Mask, seal
 from spheremark.pipelines.placement.plan import Arrangement, Visibility
 from spheremark.pipelines.placement.sensor import Returns, Sensor, returns_of
-from spheremark.pipelines.placement.visibility import N_STRIPS
+from spheremark.pipelines.placement.visibility import N_STRIPS, TOUCHING
 
 AXES = ("towards", "left", "up")
 """The axes of a centre's uncertainty, as seen from the stop."""
@@ -30,9 +30,9 @@ REFERENCE_DISTANCE = 8.0
 # Variance of fits by ``along_beam`` over the bound of their returns: towards, left, up. Pooled over
 # 700 simulated spheres from 2 to 16 m; the limb gives back what the pole and lost edges cost.
 _EFFICIENCY = (0.85, 1.02, 0.93)
-# A surface close behind a sphere mixes with the returns of its limb, and touches it where it is too
-# near to be separated. Over 130 simulated spheres at 0.2 to 0.85 m before a wall.
-_TOUCHING, _MIXING = 0.15, 0.85  # [m]
+# A surface close behind a sphere mixes with the returns of its limb. Over 130 simulated spheres at
+# 0.2 to 0.85 m before a wall.
+_MIXING = 0.85  # [m]
 _MIXED_RETURNS, _MIXED_VARIANCE = 0.79, 2.5
 _MISSED = 0.7  # times the root of the returns: spheres that are not found or not matched
 _LOST_MAX = 0.05  # share of places between the lines where a sphere may be missed
@@ -101,6 +101,7 @@ class Centres:
     shares: Array  # (s, n) share of the returns of a wholly visible sphere, 0 to 1
     n_points: Array  # (s, n) expected returns
     lost: Array  # (s, n) probability that lines pass the sphere by; 1 where a surface touches it
+    parted: Array  # (s, n) probability that the mounting parts its two faces too far
     sigma_aim: Array  # (s, n) standard deviation of its direction by mounting and encoder [rad]
     # (s, n, 3, 3) covariance of the centre by the noise of its returns, in the axes of the site;
     # infinite on the diagonal where nothing is seen [m^2]
@@ -165,7 +166,7 @@ def expect_centres(
     areas, worth = table.areas, table.information
     _add_visible(place, is_near, visibility.lowest, share_of_disc, (areas, worth), sums)
     seen, whole = sums[..., 6], sums[..., 7]
-    per_sr = float(np.exp(model.log_count[0])) / (sensor.line_spacing * sensor.pulse_spacing)
+    per_sr = float(np.exp(model.log_count[0])) * sensor.density
     density = np.where(is_near, per_sr / (d * flat), 0.0)
     shares = np.where(is_near, seen / np.where(whole > 0.0, whole, 1.0), 0.0)
     n_points, lost = density * seen, np.where(is_near, _at(table.lost, place), 1.0)
@@ -183,9 +184,16 @@ def expect_centres(
     n_points[is_mixed] *= _MIXED_RETURNS
     covs[is_mixed] *= _MIXED_VARIANCE
     covs[~is_known] = np.diag(np.full(3, np.inf))
-    lost[visibility.gaps < _TOUCHING] = 1.0
+    lost[visibility.gaps < model.marker_radius + TOUCHING] = 1.0
     aims = _at(table.aim, place)
-    return Centres(shares=shares, n_points=n_points, lost=lost, sigma_aim=aims, cov_site=covs)
+    return Centres(
+        shares=shares,
+        n_points=n_points,
+        lost=lost,
+        parted=_at(table.parted, place),
+        sigma_aim=aims,
+        cov_site=covs,
+    )
 
 
 def centres_ahead(model: CentreModel, distances: Array) -> tuple[Array, Array]:
@@ -204,7 +212,7 @@ def detection(centres: Centres) -> Array:
     with more than 500.
     """
     missed = np.minimum(_MISSED / np.sqrt(np.maximum(centres.n_points, 1.0)), 1.0)
-    return np.asarray((1.0 - centres.lost) * (1.0 - missed))
+    return np.asarray((1.0 - centres.lost) * (1.0 - centres.parted) * (1.0 - missed))
 
 
 def is_found(centres: Centres, n_points_min: float, share_min: float) -> Mask:

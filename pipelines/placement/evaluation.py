@@ -30,6 +30,7 @@ from spheremark.pipelines.placement.station_covariance import (
     reliability,
 )
 from spheremark.pipelines.placement.visibility import find_visibility, with_occlusion
+from spheremark.pipelines.sphere.mounting import effects_on, sigmas_of
 
 MARKS_MAX, STOPS_MAX, PLACES_MAX = 500, 5_000, 250_000
 """Limits of one evaluation."""
@@ -81,6 +82,7 @@ def evaluate(
     alone = find_visibility(site, stations, marks) if visibility is None else visibility
     visibility = with_occlusion(site, stations, marks, alone)
     centres, observables = predict_observables(stations, marks, model, requirement, visibility)
+    observables = _on_one_face(observables, model, stops.headings)
     positions = predict_positions(observables, requirement)
     seen = observables.is_seen
     covs = positions.cov_motion[:, 3:, 3:].copy()
@@ -145,6 +147,7 @@ def worst_after_loss(
         seen = with_occlusion(site, stops.p_site, some, left)
         requirement = found.requirement
         _, observables = predict_observables(stops.p_site, some, model, requirement, seen)
+        observables = _on_one_face(observables, model, stops.headings)
         covs = predict_positions(observables, requirement).cov_motion[:, 3:, 3:]
         worst = max(worst, float(np.sqrt(np.trace(covs, axis1=1, axis2=2)).max()))
     return worst
@@ -188,7 +191,7 @@ def field_map(  # noqa: PLR0913  all that a map is made of
     alone = find_visibility(site, stations, marks) if visibility is None else visibility
     visibility = with_occlusion(site, stations, marks, alone)
     _, observables = predict_observables(stations, marks, model, requirement, visibility)
-    positions = predict_positions(observables, requirement)
+    positions = predict_positions(_on_one_face(observables, model, None), requirement)
     covs = positions.cov_motion[:, 3:, 3:]
     sigmas = np.sqrt(np.trace(covs, axis1=1, axis2=2))
     is_open = ~np.isfinite(sigmas) | ~is_known
@@ -278,8 +281,27 @@ def predict_observables(
         sigma_aim=centres.sigma_aim,
         is_seen=is_found(centres, requirement.n_points_min, requirement.share_min),
         found=found,
+        by_mounting=np.zeros((*found.shape, 3, 0)),
+        imbalance=np.zeros(found.shape),
     )
     return centres, observables
+
+
+def _on_one_face(
+    observables: Observables, model: CentreModel, headings: Array | None
+) -> Observables:
+    """Return observables with the errors of the mounting that marks share in part of a turn."""
+    imbalance, v = model.returns.imbalance, observables.vectors
+    if not len(imbalance):
+        return observables
+    azimuths = np.degrees(np.arctan2(v[..., 1], v[..., 0]))
+    if headings is not None:
+        azimuths = azimuths - np.degrees(headings)[:, None]
+    sigmas = sigmas_of(model.sensor.sigma_mounting, model.sensor.sigma_offset)
+    effects = effects_on(v.reshape(-1, 3)).reshape(*v.shape, -1)
+    return observables._replace(
+        by_mounting=effects * sigmas, imbalance=imbalance[(azimuths % 360.0).astype(np.intp) % 360]
+    )
 
 
 def _angles(v: Array, used: Mask) -> Array:
@@ -327,7 +349,8 @@ def _reason(n_seen: int, needed: int, is_fixed: bool, n_hidden: int, n: int) -> 
         seen = f"{n_seen} of {n} marks" if n_seen else f"none of {n} marks"
         return (
             f"sees {seen} well enough ({n_hidden} less than half visible, the others too far, "
-            f"between the lines of the scan or close before a wall); a position needs {needed}"
+            "between the lines of the scan, on the ground or close before a wall); a position "
+            f"needs {needed}"
         )
     if not is_fixed:
         return "the marks stand too nearly in one line with the stop: the position is undetermined"

@@ -118,11 +118,25 @@ class Stops:
 
     names: tuple[str, ...]  # unique
     p_site: Array  # (s, 3) origins of the base: on the gimbal's axis at the height of the LiDAR [m]
+    # (s,) azimuths of base [rad]: where a sweep of less than a full turn begins; by default along x
+    headings: Array | None = None
 
     def __post_init__(self) -> None:
         seal(self, p_site=(None, 3))
         same_length(self, "names", "p_site")
+        if self.headings is not None:
+            seal(self, headings=(len(self.names),))
         _refuse_doubles("stops", self.names)
+
+    def rows(self, keep: Index | Mask) -> Self:
+        """Return some of the stops, by index or mask."""
+        places = np.arange(len(self.names))[keep]
+        return replace(
+            self,
+            names=tuple(self.names[k] for k in places),
+            p_site=self.p_site[places].copy(),
+            headings=None if self.headings is None else self.headings[places].copy(),
+        )
 
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
@@ -212,7 +226,8 @@ class Visibility:
     # above the centre above which it is visible, in units of half the disc's height: -1 all of it,
     # 1 nothing
     lowest: np.ndarray
-    # (s, n) float32 from the centre on to the surface behind it; infinite where none is near [m]
+    # (s, n) float32 from the centre on to the surface behind it, or down to ground that it touches;
+    # infinite where none is near [m]
     gaps: np.ndarray
 
     def __post_init__(self) -> None:
@@ -260,7 +275,8 @@ class Evaluation:
     shares : (s, n)
         Share of a sphere's disc that nothing hides, 0 to 1.
     gaps : (s, n)
-        From centres on to the surface behind them; infinite where none is near [m].
+        From centres on to the surface behind them, or down to ground that they touch; infinite
+        where none is near [m].
     ranges : (s, n)
         Distances from stops to centres [m].
     n_points : (s, n)

@@ -10,6 +10,7 @@ import numpy as np
 from scipy.spatial.distance import cdist
 
 from spheremark.pipelines.compilation import compiled
+from spheremark.pipelines.errors import ConfigError
 from spheremark.pipelines.estimation.linear_algebra import invert
 from spheremark.pipelines.model import Array, Column, Index, Mask
 from spheremark.pipelines.placement.candidates import Candidates
@@ -107,6 +108,11 @@ def problem_of(
     standing: Arrangement | None = None,
 ) -> Problem:
     """Predict all candidates from all stops; none is nearer to a mark that stands than allowed."""
+    if not model.sensor.is_full_turn:
+        raise ConfigError(
+            f"The gimbal turns through {np.degrees(model.sensor.sweep):.0f} degrees; marks are "
+            "placed for a full turn of 360 only. Plans of part of a turn can be evaluated."
+        )
     standing = Arrangement.numbered(np.empty((0, 3))) if standing is None else standing
     candidates = with_standing(candidates, standing)
     rows = np.empty((len(candidates.p_site), len(stops.names), N_PACKED))

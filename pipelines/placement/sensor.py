@@ -15,7 +15,7 @@ import numpy as np
 from spheremark.pipelines.config import FittingConfig, StitchingConfig
 from spheremark.pipelines.errors import ConfigError
 from spheremark.pipelines.model import Array, Beams, seal
-from spheremark.pipelines.scan.rigs import FIRING_CYCLE, N_LASERS
+from spheremark.pipelines.scan.rigs import FIRING_CYCLE, N_LASERS, VLP16_ELEVATIONS
 from spheremark.pipelines.simulation import (
     SimulationConfig,
     commensurability,
@@ -35,6 +35,7 @@ _REFLECTIVITIES = (3.0, 9.0, 24.5, 63.0, 130.0)  # calibrated, at which real pac
 _SIGMAS = (0.0137, 0.0107, 0.0089, 0.0067, 0.0064)  # ... this noise of ranges [m]
 _TOGETHER = 5  # centres that share a position
 _SHARE_MIN = 0.02  # of a footprint that makes a return
+_CLOSED = 1e-6  # [rad] by which a sweep may fall short of a full turn
 _SAMPLES_MIN = 3.0  # of the angle, of a pulse between two of them on each of two faces
 _N_ROUNDS = 4  # in which precision and worth of the returns settle
 _DISTANCES = np.geomspace(0.5, 45.0, 55)  # [m]
@@ -51,6 +52,9 @@ class Sensor:
         Time in which the gimbal turns through 360 degrees [s].
     spin_rpm : float
         Revolutions of the LiDAR per minute.
+    sweep : float
+        Angle that the gimbal turns through. Less than a full turn shows one face of most spheres,
+        whose mounting errors then do not cancel [rad].
     step : float
         Angle between the rests of a gimbal that steps instead of turning evenly; 0 turns evenly
         [rad]. ``turn`` then means nothing.
@@ -62,7 +66,15 @@ class Sensor:
         Calibrated reflectivity of the spheres, 0 to 255. 42: red paint that sends half of the light
         back, the mean over a sphere.
     noise : float or None
-        Noise of a range to a sphere [m]; by default that of a real VLP-16 at the reflectivity.
+        Noise of a range to a sphere near by [m]; by default that of a real VLP-16 at the
+        reflectivity.
+    sigma_weak : float
+        Noise that an echo at the threshold of detection has besides, which falls with its energy
+        [m].
+    reach : float
+        Distance at which a sphere's echoes are at that threshold [m].
+    drop_out : float
+        Share of the returns that are lost for other reasons.
     sigma_direction : float
         Standard deviation of a beam's direction per axis [rad].
     sigma_range_bias : float
@@ -72,9 +84,15 @@ class Sensor:
     sigma_mounting : float
         Standard deviation of the directions in which LiDAR and gimbal sit, per axis; it parts the
         two faces of the scan [rad]. As of the fits.
+    sigma_offset : float
+        Standard deviation of where the LiDAR sits on the gimbal, per axis; it counts where the
+        gimbal turns by less than 360 degrees [m]. As of the fits.
     sigma_encoder : float
         Standard deviation of one sample of the gimbal's angle [rad]. 9e-5: steps of 16 bits, and
         0.005 deg of jitter.
+    ripples : tuple of (float, float)
+        Amplitude [rad] and periods in a turn of errors of the gimbal's angle, as samples that are
+        few and clocks that differ make of an uneven speed.
     joint_rate : float
         Samples of the gimbal's angle in a second [Hz].
     sigma_aim : float or None
@@ -89,16 +107,22 @@ class Sensor:
 
     turn: float = 13.2
     spin_rpm: float = 600.0
+    sweep: float = 2.0 * np.pi
     step: float = 0.0
     rest_revolutions: int = 3
     move: float = 0.1
     reflectivity: float = 42.0
     noise: float | None = None
+    sigma_weak: float = 0.0
+    reach: float = 100.0
+    drop_out: float = 0.0
     sigma_direction: float = 1e-4
     sigma_range_bias: float = 0.003
     sigma_range_common: float = FittingConfig().sigma_range_common
     sigma_mounting: float = FittingConfig().sigma_mounting
+    sigma_offset: float = FittingConfig().sigma_offset
     sigma_encoder: float = 9e-5
+    ripples: tuple[tuple[float, float], ...] = ()
     joint_rate: float = 100.0
     sigma_aim: float | None = None
     divergence: tuple[float, float] = (3.0e-3, 1.5e-3)
@@ -118,12 +142,17 @@ class Sensor:
             return self.noise
         return float(np.interp(np.log(self.reflectivity), np.log(_REFLECTIVITIES), _SIGMAS))
 
+    def sigma_at(self, distance: float) -> float:
+        """Return the noise of a range to a sphere at a distance [m]."""
+        return float(np.hypot(self.sigma_range, self.sigma_weak * (distance / self.reach) ** 2))
+
     @property
     def scan(self) -> SimulationConfig:
         """The same speeds as options of the simulation."""
         return SimulationConfig(
             turn=self.turn,
             spin_rpm=self.spin_rpm,
+            sweep=self.sweep,
             step=self.step,
             rest_revolutions=self.rest_revolutions,
             move=self.move,
@@ -140,7 +169,18 @@ class Sensor:
         """Mean angle between lines at the horizon, those that fall on each other too [rad]."""
         if self.step:
             return 2.0 * np.pi / sum(map(len, face_lines(self.scan)))
-        return 2.0 * np.pi / (2.0 * N_LASERS * self.turn * self.spin_rpm / 60.0)
+        n_revolutions = self.turn * self.spin_rpm / 60.0 * self.sweep / (2.0 * np.pi)
+        return 2.0 * np.pi / (2.0 * N_LASERS * n_revolutions)
+
+    @property
+    def density(self) -> float:
+        """Returns that a steradian at the horizon makes [1]."""
+        return (1.0 - self.drop_out) / (self.line_spacing * self.pulse_spacing)
+
+    @property
+    def is_full_turn(self) -> bool:
+        """Whether every direction is swept on both faces."""
+        return self.sweep >= 2.0 * np.pi - _CLOSED
 
     @property
     def pulse_spacing(self) -> float:
@@ -163,12 +203,16 @@ class Returns:
     # are found
     spread: Array
     lost: Array  # (d,) share of places at which a centre cannot be found
+    parted: Array  # (d,) share of rigs that part its two faces too far for it to be found
     aim: Array  # (d,) standard deviation of directions by mounting and encoder [rad]
+    # (360,) lines of the upward face less those of the other over all lines, by whole degrees from
+    # where the sweep begins; nothing where the gimbal turns fully: ``aim`` holds what differs there
+    imbalance: Array
 
     def __post_init__(self) -> None:
         d = len(self.distances)
         seal(self, distances=(d,), areas=(d, None, None), information=(d, None, None, 6))
-        seal(self, spread=(d, 3), lost=(d,), aim=(d,))
+        seal(self, spread=(d, 3), lost=(d,), parted=(d,), aim=(d,), imbalance=(None,))
 
 
 class _Disc(NamedTuple):
@@ -188,8 +232,9 @@ def returns_of(sensor: Sensor, radius: float, n_strips: int) -> Returns:
     A return is the mean range over its footprint, linearised over the uncertainty of the centre, as
     in the fit along the beam. The spread comes from the true lines of one turn at 400 places.
     An error of the mounting moves the two faces apart: the share by which the information of one
-    exceeds that of the other is left of it. Errors of the encoder are averaged over the samples of
-    its angle that are taken while the lines pass the sphere.
+    exceeds that of the other is left of it. In less than a full turn most spheres are seen on one
+    face, and the error is one that they share (``imbalance``). Errors of the encoder are averaged
+    over the samples of its angle that are taken while the lines pass the sphere.
     """
     discs = [_disc(sensor, radius, n_strips, d) for d in _DISTANCES]
     shape = (len(_DISTANCES), n_strips, N_ROWS, _N_PER_ROW * _N_PER_STRIP)
@@ -207,7 +252,9 @@ def returns_of(sensor: Sensor, radius: float, n_strips: int) -> Returns:
         information=_from_top(worth.sum(axis=3)),
         spread=mean,
         lost=lost,
-        aim=_aims(sensor, radius, uneven),
+        parted=_parted(sensor, radius),
+        aim=_aims(sensor, radius, uneven * sensor.is_full_turn),
+        imbalance=np.zeros(0) if sensor.is_full_turn else _imbalance(sensor),
     )
 
 
@@ -224,7 +271,7 @@ def _reaches(sensor: Sensor, radius: float) -> Array:
 
 def _density(sensor: Sensor, distance: float) -> float:
     """Return the returns per square metre of a disc at the horizon [1/m^2]."""
-    return 1.0 / (sensor.line_spacing * sensor.pulse_spacing * distance**2)
+    return sensor.density / distance**2
 
 
 def _disc(sensor: Sensor, radius: float, n_strips: int, distance: float) -> _Disc:
@@ -247,7 +294,7 @@ def _disc(sensor: Sensor, radius: float, n_strips: int, distance: float) -> _Dis
     information: Array = np.zeros((len(left), 3, 3))
     for _ in range(_N_ROUNDS):
         J, bend2 = _slopes(table, middle.ranges, distance, radius, cov)
-        variance = sensor.sigma_range**2 + lateral2 * np.sum(J[:, 1:] ** 2, axis=1) + bend2
+        variance = sensor.sigma_at(distance) ** 2 + lateral2 * np.sum(J[:, 1:] ** 2, axis=1) + bend2
         information = (returns / variance)[:, None, None] * J[:, :, None] * J[:, None, :]
         N = information.sum(axis=0) * cell * _density(sensor, distance)
         cov = np.asarray(np.linalg.inv(N + np.eye(3) / (0.3 * radius) ** 2))
@@ -302,7 +349,32 @@ def _aims(sensor: Sensor, radius: float, uneven: Array) -> Array:
     share = 2.0 * radius / _DISTANCES / (2.0 * np.pi)  # of a turn, on each face
     n_samples = 2.0 * sensor.joint_rate * recorded_time(sensor.scan) * share
     encoder = sensor.sigma_encoder / np.sqrt(np.maximum(n_samples, _SAMPLES_MIN))
-    return np.asarray(np.hypot(sensor.sigma_mounting * uneven, encoder))
+    aims = np.hypot(sensor.sigma_mounting * uneven, encoder)
+    n_faces = sensor.sweep / np.pi
+    n_lines = np.maximum(2.0 * np.pi * share / sensor.line_spacing, 1.0)
+    for amplitude, periods in sensor.ripples:
+        # the lines over a sphere come from all lasers, while the gimbal turns by what these span
+        alike = np.sinc(periods * np.ptp(VLP16_ELEVATIONS) / (2.0 * np.pi)) ** 2
+        variance = 0.5 * amplitude**2 * (alike / n_faces + (1.0 - alike) / n_lines)
+        aims = np.sqrt(aims**2 + variance)
+    return np.asarray(aims)
+
+
+def _parted(sensor: Sensor, radius: float) -> Array:
+    """Return the probability that the mounting parts the two faces of a sphere by its radius.
+
+    Of two discs so far apart less than 40 % overlaps: they are no sphere. Each of two axes across
+    the line of sight moves one face against the other by twice its error.
+    """
+    sigmas = 2.0 * np.hypot(sensor.sigma_mounting * _DISTANCES, sensor.sigma_offset)
+    return np.asarray(np.exp(-0.5 * (radius / sigmas) ** 2) * sensor.is_full_turn)
+
+
+def _imbalance(sensor: Sensor) -> Array:
+    """Return by how much lines of the upward face outnumber the others, by azimuth in degrees."""
+    degrees = np.radians(np.arange(361))
+    up, down = (np.histogram(lines, degrees)[0] for lines in face_lines(sensor.scan))
+    return np.asarray((up - down) / np.maximum(up + down, 1))
 
 
 def _spread(
@@ -313,7 +385,7 @@ def _spread(
     worth = np.zeros((len(columns), 3, 3))
     np.add.at(worth, inverse, disc.information)
     height = 2.0 * (columns[1] - columns[0]) * len(columns) / 2.0 / (N_ROWS * _N_PER_ROW)
-    per_line = height / (distance * sensor.pulse_spacing)
+    per_line = (1.0 - sensor.drop_out) * height / (distance * sensor.pulse_spacing)
     faces = np.array([_crossings(lines, columns, distance) for lines in face_lines(sensor.scan)])
     across = faces @ (worth[:, 1, 1] + worth[:, 2, 2])
     uneven = (across[0] - across[1]) / np.maximum(across.sum(axis=0), 1e-300)

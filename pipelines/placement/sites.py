@@ -73,11 +73,12 @@ def stops_of_field(world: Field) -> Stops:
     Returns
     -------
     Stops
-        Positions of the LiDAR.
+        Positions of the LiDAR, and its headings.
     """
     return Stops(
         names=tuple(stop.name for stop in world.stops),
         p_site=np.array([stop.p_site for stop in world.stops]),
+        headings=np.array([stop.heading for stop in world.stops]),
     )
 
 

@@ -25,7 +25,7 @@ LOOSE2 = 1.0
 _BIAS_LEFT = 0.22  # of the spread of laser biases: what a survey leaves to each centre, simulated
 _TRACE_MOST = 1e6  # of the horizontal cofactor matrix of three circles that cut at all
 _ANY = 2.0  # beyond the cosine of any angle
-_MOTION = [0, 1, 2, 4, 5, 6]  # unknowns of a free station without the common error of ranges
+_MOTION = [0, 1, 2, -3, -2, -1]  # unknowns of a free station without those that centres share
 
 
 class Observables(NamedTuple):
@@ -40,6 +40,10 @@ class Observables(NamedTuple):
     sigma_aim: Array  # (s, n) of each direction, by mounting and encoder, after both faces [rad]
     is_seen: Mask  # (s, n) which are visible and near enough to be found
     found: Array  # (s, n) probability that each is found
+    # (s, n, 3, q) factors of the errors of the mounting that move the upward face of each, the
+    # other the opposite way; and (s, n) the share by which that face outweighs the other [m]
+    by_mounting: Array
+    imbalance: Array
 
     @property
     def vectors(self) -> Array:
@@ -90,7 +94,8 @@ def predict_positions(observables: Observables, requirement: Requirement) -> Pos
     -----
     ``free_station``: ``(sum J' P J + G)^-1`` with ``J = [-[v]x, l, 1]`` of each mark, ``l`` the
     unit vector of its line of sight, whose unknown is the error that all ranges share, and in ``G``
-    the AHRS's information on roll and pitch and the prior of that error. A common error of the
+    the AHRS's information on roll and pitch and the prior of that error. Where the gimbal turns by
+    less than 360 degrees, the errors of the mounting are unknowns too. A common error of the
     centres' heights goes to the height of the station. Each mark counts with the probability that
     it is found.
     ``paper``: horizontal distances and heights of the three marks whose circles cut best, and the
@@ -112,22 +117,30 @@ def predict_positions(observables: Observables, requirement: Requirement) -> Pos
 
 
 def information_of(observables: Observables, requirement: Requirement) -> Array:
-    """Return the information of each mark about a free station, (s, n, 7, 7).
+    """Return the information of each mark about a free station, (s, n, 7 + q, 7 + q).
 
-    The unknowns are those of ``start_information``.
+    The unknowns are those of ``start_information``, and q of the mounting before the position: of
+    these a mark that both faces show says as much as the fainter one is worth.
     """
     is_seen = observables.is_seen[..., None, None]
     weights, _ = invert_each(np.where(is_seen, covariances(observables, requirement), np.eye(3)))
     weights = np.where(is_seen, weights, 0.0) * observables.found[..., None, None]
-    J = by_unknowns(observables.vectors)
-    return np.asarray(_transposed(J) @ weights @ J)
+    J, share = by_unknowns(observables), observables.imbalance[..., None, None]
+    out, e = np.asarray(_transposed(J) @ weights @ J), observables.by_mounting
+    apart = _transposed(e) @ weights @ e
+    out[..., 4:-3, 4:-3] += (1.0 - share**2) * apart
+    return out
 
 
-def by_unknowns(v: Array) -> Array:
-    """Return the derivative of centres by rotation, common error of ranges, and position."""
+def by_unknowns(observables: Observables) -> Array:
+    """Return the derivative of centres by rotation, common errors, and position."""
+    v, shared = (
+        observables.vectors,
+        observables.imbalance[..., None, None] * observables.by_mounting,
+    )
     along = v / np.maximum(np.linalg.norm(v, axis=-1, keepdims=True), 1e-9)
     J = by_motion(v)
-    return np.concatenate([J[..., :3], along[..., None], J[..., 3:]], axis=-1)
+    return np.concatenate([J[..., :3], along[..., None], shared, J[..., 3:]], axis=-1)
 
 
 def start_information(variance: float, requirement: Requirement) -> Array:
@@ -181,7 +194,7 @@ def reliability(
     used = found.used & is_fixed[:, None]
     covs = np.where(found.used[..., None, None], covariances(observables, requirement), np.eye(3))
     inverse = np.where(np.isfinite(found.cofactor), found.cofactor, 0.0)
-    J = by_unknowns(v)
+    J = by_unknowns(observables)
     if requirement.method == "paper":
         J, lean = _circle_equations(v)
         covs = _on_circles(J, covs) + requirement.sigma_levelling**2 * lean @ _transposed(lean)
@@ -213,8 +226,10 @@ def covariances(observables: Observables, requirement: Requirement) -> Array:
 
 def _by_all(observables: Observables, requirement: Requirement) -> tuple[Array, Mask]:
     """Return covariances of the unknowns of free stations, and which have a position."""
-    start = start_information(observables.shared_variance, requirement)
-    cov, is_fixed = invert_each(start + information_of(observables, requirement).sum(axis=1))
+    N = information_of(observables, requirement).sum(axis=1)
+    start, rest = np.eye(N.shape[-1]), [*range(4), -3, -2, -1]
+    start[np.ix_(rest, rest)] = start_information(observables.shared_variance, requirement)
+    cov, is_fixed = invert_each(start + N)
     return cov, is_fixed & (np.trace(cov[:, -3:, -3:], axis1=1, axis2=2) <= LOOSE2)
 
 

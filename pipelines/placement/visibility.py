@@ -22,6 +22,9 @@ from spheremark.pipelines.threads import side_by_side
 N_STRIPS = 8
 """Strips that a disc is cut into."""
 
+TOUCHING = 0.05
+"""Distance of a surface from a sphere below which it touches it: too near to be separated [m]."""
+
 _COARSE = 5  # cells from one step of the coarse march to the next
 _BEHIND = 0.05  # [m] something nearer to the sphere than this is its own foot
 _MANY = 400  # pairs of station and mark that are worth a second thread
@@ -70,6 +73,9 @@ def find_visibility(site: Site, stations_site: Array, marks: Arrangement) -> Vis
     if site.bodies is not None:
         _refine_by_rays(site.bodies, (stations, p_site), site.marker_radius, lowest)
     _find_gaps(site.surface, frame, (stations, p_site), gaps)
+    above = p_site[:, 2] - site.ground_at(p_site)
+    is_low = above < site.marker_radius + TOUCHING
+    gaps[:, is_low] = np.minimum(gaps[:, is_low], above[is_low])
     return Visibility(lowest=lowest, gaps=gaps)
 
 

@@ -109,6 +109,9 @@ class Scans:
 
     turn_s: Annotated[float, typer.Option(help="Time of a full turn of the gimbal \\[s].")] = 13.2
     rpm: Annotated[float, typer.Option(help="Speed of the LiDAR [1/min].")] = 600.0
+    sweep_deg: Annotated[
+        float, typer.Option(help="Angle that the gimbal turns through \\[deg]; evaluation only.")
+    ] = 360.0
     step_deg: Annotated[
         float, typer.Option(help="Step of a gimbal that rests between \\[deg]; 0 turns evenly.")
     ] = 0.0
@@ -127,6 +130,7 @@ class Scans:
         return Sensor(
             turn=self.turn_s,
             spin_rpm=self.rpm,
+            sweep=math.radians(self.sweep_deg),
             step=math.radians(self.step_deg),
             rest_revolutions=self.rest_revolutions,
             noise=self.noise_m,

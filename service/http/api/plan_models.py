@@ -60,6 +60,12 @@ class ScanOptions(Strict):
 
     turn_s: float = Field(default=13.2, gt=0, le=3600, description="Time of a turn [s].")
     spin_rpm: float = Field(default=600.0, description="Revolutions of the LiDAR per minute.")
+    sweep_deg: float = Field(
+        default=360.0,
+        ge=6,
+        le=360,
+        description="Angle that the gimbal turns through; less than 360 in evaluations only [deg].",
+    )
     step_deg: float = Field(
         default=0.0, description="Step of a gimbal that rests between; 0 turns evenly [deg]."
     )
@@ -78,6 +84,7 @@ class ScanOptions(Strict):
         return Sensor(
             turn=self.turn_s,
             spin_rpm=self.spin_rpm,
+            sweep=math.radians(self.sweep_deg),
             step=math.radians(self.step_deg),
             rest_revolutions=self.rest_revolutions,
             noise=self.noise_m,

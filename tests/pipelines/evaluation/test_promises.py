@@ -13,7 +13,7 @@ def station(seed, family, error, matched=(True, True)):
         {"class": i, "expected": 0.9, "is_matched": is_matched}
         for i, is_matched in enumerate(matched)
     ]
-    status = "none" if math.isnan(error) else "ok"
+    status = "none" if math.isnan(error) else "ok" if error < 9e-3 else "weak"
     return {
         "seed": seed,
         "family": family,
@@ -39,6 +39,7 @@ def test_stations_without_a_position_are_counted_and_foreign_physics_stays_apart
     assert_allclose(usual["ratio"], math.sqrt(2.5), rtol=1e-12)
     assert_allclose(usual["n_expected"], 5.4, rtol=1e-12)
     assert_allclose(groups["all"]["ratio"], math.sqrt(86.0 / 3.0), rtol=1e-12)
+    assert_allclose(groups["all"]["ratio_ok"], math.sqrt(2.5), rtol=1e-12)
     assert [(row["n"], row["n_matched"]) for row in report["marks"]] == [
         (3, 2),
         (3, 1),

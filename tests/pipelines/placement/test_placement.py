@@ -820,6 +820,75 @@ def test_promises_are_kept_by_simulated_scans():
         assert max(ratios) < 1.25
 
 
+def test_marks_of_half_a_turn_share_the_errors_of_the_mounting():
+    """Like the adjustment of centres whose covariance holds those errors, (3 n, 3 n)."""
+    model = sensor_model(Sensor(sweep=np.pi, turn=26.4, sigma_mounting=2e-3, sigma_offset=1e-3))
+    bearings = np.radians([10.0, 70.0, 160.0, 200.0, 290.0])
+    p = np.column_stack([7.0 * np.cos(bearings), 7.0 * np.sin(bearings), np.full(5, 1.2)])
+    stops, marks, requirement = one_stop((0.0, 0.0, 1.05)), Arrangement.numbered(p), Requirement()
+    found = evaluate(flat_site(), stops, marks, model, requirement)
+    visibility = find_visibility(flat_site(), stops.p_site, marks)
+    _, seen = predict_observables(stops.p_site, marks, model, requirement, visibility)
+    # the upward face looks a quarter turn ahead of the gimbal
+    v, upward = seen.vectors[0], np.where(np.cos(bearings) < 0.0, 1.0, -1.0)
+    x, y, z = v.T
+    flat, o, distance = np.hypot(x, y), np.zeros(5), np.linalg.norm(v, axis=1)
+    lateral = np.array([-y, x, o]) / flat
+    effects = [
+        2e-3 * distance * lateral, 2e-3 * np.array([-z * x, -z * y, flat**2]) / flat,
+        1e-3 * np.array([x, y, o]) / flat, 1e-3 * lateral, 1e-3 * x * lateral, 1e-3 * y * lateral,
+    ]  # fmt: skip
+    shared = np.stack([(upward * one).T.ravel() for one in effects], axis=1)
+    shared = np.column_stack([shared, np.sqrt(seen.shared_variance) * (v.T / distance).T.ravel()])
+    own = np.zeros((15, 15))
+    for i, cov in enumerate(covariances(seen, requirement)[0]):
+        own[3 * i : 3 * i + 3, 3 * i : 3 * i + 3] = cov / seen.found[0, i]
+    J = np.concatenate([np.column_stack([_turned(one), np.eye(3)]) for one in v])
+    gravity = np.diag([requirement.sigma_levelling**-2.0] * 2 + [0.0] * 4)
+    N = J.T @ np.linalg.inv(own + shared @ shared.T) @ J + gravity
+    expected = np.trace(np.linalg.inv(N)[3:, 3:]) + requirement.resection.sigma_height**2
+    assert_allclose(found.sigma_3d[0], np.sqrt(expected), rtol=0.01)
+    full = sensor_model(Sensor(sigma_mounting=2e-3, sigma_offset=1e-3))
+    assert found.sigma_3d[0] > evaluate(flat_site(), stops, marks, full, requirement).sigma_3d[0]
+
+
+def _turned(v):
+    """Return the derivative of a vector by a small turn, (3, 3)."""
+    x, y, z = v
+    return np.array([[0.0, z, -y], [-z, 0.0, x], [y, -x, 0.0]])
+
+
+def test_marks_are_placed_for_full_turns_only():
+    stops = one_stop((0.0, 0.0, 1.05))
+    site, rng = flat_site(), np.random.default_rng(0)
+    half = sensor_model(Sensor(sweep=np.pi))
+    places = find_candidates(site, stops, PlaceRules(spacing=2.0))
+    with pytest.raises(ConfigError, match="turns through 180 degrees; marks are placed"):
+        optimise(site, stops, places, half, Requirement(), Goal(n_marks=4), rng)
+
+
+def test_a_sphere_on_the_ground_or_with_parted_faces_is_not_found():
+    stops = one_stop((0.0, 0.0, 1.05))
+    marks = Arrangement.numbered(np.array([[6.0, 0.0, 0.12], [0.0, 6.0, 0.3], [-6.0, 0.0, 1.2]]))
+    found = evaluate(flat_site(), stops, marks, MODEL, Requirement())
+    assert list(found.is_seen[0]) == [False, True, True]
+    assert found.found[0, 1:].min() > 0.9
+    # 2 x 6 m x 0.02 rad is more than a radius on either axis
+    crooked = sensor_model(Sensor(sigma_mounting=0.02))
+    assert evaluate(flat_site(), stops, marks, crooked, Requirement()).found.max() < 0.2
+
+
+def test_weak_echoes_and_lost_returns_make_far_centres_worse():
+    stops = one_stop((0.0, 0.0, 1.05))
+    marks = Arrangement.numbered(np.array([[4.0, 0.0, 1.2], [0.0, 12.0, 1.2]]))
+    usual = evaluate(flat_site(), stops, marks, sensor_model(Sensor()), Requirement())
+    few = evaluate(flat_site(), stops, marks, sensor_model(Sensor(drop_out=0.2)), Requirement())
+    assert_allclose(few.n_points, 0.8 * usual.n_points, rtol=1e-9)
+    weak = Sensor(noise=0.01, sigma_weak=0.03, reach=12.0)
+    assert_allclose(weak.sigma_at(12.0), np.hypot(0.01, 0.03), rtol=1e-12)
+    assert_allclose(weak.sigma_at(4.0), np.hypot(0.01, 0.03 / 9.0), rtol=1e-12)
+
+
 def test_directions_err_by_the_encoder_near_by_and_by_uneven_faces_far_off():
     """Samples of the angle, on both faces: 100 Hz, 0.2 m wide, in a turn of 13.3 s."""
     encoder = returns_of(Sensor(sigma_mounting=0.0), 0.1, 8)
