@@ -134,13 +134,12 @@ def information_of(observables: Observables, requirement: Requirement) -> Array:
 
 def by_unknowns(observables: Observables) -> Array:
     """Return the derivative of centres by rotation, common errors, and position."""
-    v, shared = (
-        observables.vectors,
-        observables.imbalance[..., None, None] * observables.by_mounting,
-    )
+    v, share = observables.vectors, observables.imbalance[..., None, None]
     along = v / np.maximum(np.linalg.norm(v, axis=-1, keepdims=True), 1e-9)
     J = by_motion(v)
-    return np.concatenate([J[..., :3], along[..., None], shared, J[..., 3:]], axis=-1)
+    return np.concatenate(
+        [J[..., :3], along[..., None], share * observables.by_mounting, J[..., 3:]], axis=-1
+    )
 
 
 def start_information(variance: float, requirement: Requirement) -> Array:

@@ -18,13 +18,37 @@ _ECCENTRICITY = 0.5  # sigma of the encoder's amplitudes over that of a directio
 
 
 def sigmas_of(sigma_direction: float, sigma_offset: float) -> Array:
-    """Return the prior standard deviations of the unknowns of the mounting."""
+    """Return the prior standard deviations of the unknowns of the mounting.
+
+    Parameters
+    ----------
+    sigma_direction : float
+        Of the directions in which LiDAR and gimbal sit, per axis [rad].
+    sigma_offset : float
+        Of where the LiDAR sits on the gimbal, per axis [m].
+
+    Returns
+    -------
+    (6,)
+        Of directions [rad], offsets [m] and amplitudes of the encoder [rad].
+    """
     angles, amplitudes = np.full(2, sigma_direction), np.full(2, _ECCENTRICITY * sigma_direction)
     return np.concatenate([angles, np.full(2, sigma_offset), amplitudes])
 
 
 def effects_on(centres: Array) -> Array:
-    """Return the derivatives, (m, 3, 6), of the upward face; those of the other are opposite."""
+    """Return the derivatives of the upward face; those of the other are opposite.
+
+    Parameters
+    ----------
+    centres : (m, 3)
+        Centres in base [m].
+
+    Returns
+    -------
+    (m, 3, 6)
+        Derivatives of the centres by the unknowns of the mounting.
+    """
     x, y, z = centres.T
     flat, zero = np.maximum(np.hypot(x, y), 1e-9), np.zeros(len(centres))
     c, s = x / flat, y / flat

@@ -503,6 +503,8 @@ def test_the_bound_is_below_every_choice_and_reached_where_there_is_none():
                 sigma_aim=seen.sigma_aim[:, [*some]],
                 is_seen=seen.is_seen[:, [*some]],
                 found=seen.found[:, [*some]],
+                by_mounting=seen.by_mounting[:, [*some]],
+                imbalance=seen.imbalance[:, [*some]],
             ),
             requirement,
         ).cov_motion[:, 3:, 3:]
