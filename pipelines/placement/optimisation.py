@@ -255,9 +255,10 @@ def trade_off(  # noqa: PLR0913  all that a plan is made of
     Parameters
     ----------
     site, stops, candidates, model, requirement, goal, rng, standing, report
-        As of ``optimise``; the weights are tried with the goal's number of marks.
+        See ``optimise``; the weights are tried with the goal's number of marks, or the largest of
+        ``numbers`` if it has none.
     numbers : sequence of int
-        Numbers of marks.
+        Numbers of marks, 2 to ``MARKS_MOST``.
     weights : sequence of float
         Weights of a loss, 0 to 1.
 
@@ -265,11 +266,19 @@ def trade_off(  # noqa: PLR0913  all that a plan is made of
     -------
     TradeOff
         No plan of it is worse than another one in every respect, as far as the search found.
+
+    Raises
+    ------
+    ConfigError
+        If a number of marks or a weight is out of range.
+    DegenerateGeometryError
+        If so many marks do not fit where a stop sees them.
     """
-    problem = problem_of(site, stops, candidates, model, requirement, standing)
     k = goal.n_marks or max(numbers, default=goal.most)
-    goals = [(n, goal) for n in numbers]
-    goals += [(k, replace(goal, objective="worst", loss_weight=w)) for w in weights]
+    goals = [(n, replace(goal, n_marks=n)) for n in numbers]
+    goals += [(k, replace(goal, n_marks=k, objective="worst", loss_weight=w)) for w in weights]
+    check_sizes(len(stops.names), max((n for n, _ in goals), default=0))
+    problem = problem_of(site, stops, candidates, model, requirement, standing)
     course, cost = _Course(report), np.cumsum([0.0, *(n for n, _ in goals)])
     found = []
     for i, (n, one) in enumerate(goals):

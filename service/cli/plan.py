@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -277,10 +278,13 @@ def trade_off(
         str, typer.Option(help="Numbers of marks, as 4-8,10,14; empty for none.")
     ] = "4,5,6,8,10,14",
     loss_weights: Annotated[
-        str, typer.Option(help="Weights of a loss to compare, as 0,0.03,0.2,1; needs --marks.")
+        str, typer.Option(help="Weights of a loss to compare, as 0,0.03,0.2,1.")
     ] = "",
     marks: Annotated[
-        int | None, typer.Option(help="Number of marks for the weights of a loss.")
+        int | None,
+        typer.Option(
+            help="Number of marks for these weights; the largest of --numbers if missing."
+        ),
     ] = None,
     as_json: AsJson = False,
 ) -> None:
@@ -302,11 +306,15 @@ def trade_off(
 
 def _numbers(text: str) -> list[int]:
     """Return numbers of marks from a list with ranges."""
-    try:
-        parts = [[int(end) for end in part.split("-")] for part in text.split(",") if part.strip()]
-    except ValueError as error:
-        raise InputError(f"--numbers is {text!r}; it must be a list as 4-8,10,14.") from error
-    return [n for ends in parts for n in range(ends[0], ends[-1] + 1)]
+    parts = [part.strip() for part in text.split(",") if part.strip()]
+    ranges = [re.fullmatch(r"(\d{1,3})(?:-(\d{1,3}))?", part) for part in parts]
+    found = [range(int(one[1]), int(one[2] or one[1]) + 1) for one in ranges if one]
+    if len(found) < len(parts) or not all(found):
+        raise InputError(
+            f"--numbers is {text!r}; it must be a list as 4-8,10,14, the smaller number of each "
+            "range first."
+        )
+    return [n for one in found for n in one]
 
 
 def _weights(text: str) -> list[float]:

@@ -98,9 +98,13 @@ def test_numbers_of_marks_are_compared_beside_those_that_stand(small, tmp_path):
         assert one["marks"][0]["position_m"][:2] == [4.0, 0.0]
         assert one["optimum"]["worst_sigma_3d_as_placed_m"] > 0
     assert (three["optimum"]["cost"], four["optimum"]["cost"]) == (15, 20)
-    words = ["plan", "trade-off", *map(str, options), "--numbers", "four"]
-    with pytest.raises(InputError, match="must be a list as 4-8"):
-        CliRunner().invoke(app, words, catch_exceptions=False)
+    words = ["plan", "trade-off", *map(str, options), "--numbers"]
+    for numbers in ("four", "8-4", "4-6-8", "4,-5"):
+        with pytest.raises(InputError, match="must be a list as 4-8"):
+            CliRunner().invoke(app, [*words, numbers], catch_exceptions=False)
+    for numbers in ("1", "4,100"):
+        with pytest.raises(ConfigError, match="from 2 to 40 can be placed"):
+            CliRunner().invoke(app, [*words, numbers], catch_exceptions=False)
 
 
 def test_a_plan_refuses_what_cannot_be(small, tmp_path):

@@ -236,14 +236,16 @@ class TradeOffRequest(OptimisationRequest):
         default=[4, 5, 6, 8, 10, 14], max_length=20, description="Numbers of marks."
     )
     loss_weights: list[Annotated[float, Field(ge=0, le=1)]] = Field(
-        default=[], max_length=10, description="Weights of a loss, with n_marks marks."
+        default=[],
+        max_length=10,
+        description="Weights of a loss, with n_marks marks or the largest of numbers.",
     )
 
     @model_validator(mode="after")
     def _has_work(self) -> TradeOffRequest:
         """Refuse a comparison of nothing."""
         if not self.numbers and not self.loss_weights:
-            raise ValueError("give numbers of marks, or loss_weights with n_marks")
+            raise ValueError("give numbers of marks, or loss_weights")
         return self
 
 
