@@ -16,6 +16,7 @@ from spheremark.service.planning.predictions import Predictions
 from spheremark.service.planning.searches import Searches
 from spheremark.service.settings import Settings
 from spheremark.storage.catalogue.catalogue import Catalogue
+from spheremark.web.pages.planner import _sheet_map
 from tests.surveyed import fill
 
 MARKS = [
@@ -414,6 +415,14 @@ def test_the_field_sheet_of_an_address_holds_coordinates_and_distances(client):
     for text in ("Field sheet: 3 marks", "6.000", "90.0", "Stake-out"):
         assert text in page
     assert client.get("/plan/sheet").status_code == 400
+
+
+@pytest.mark.parametrize(("x", "y"), [(30_000.0, 5.0), (3.0, 1e6)])
+def test_the_map_of_a_field_sheet_has_few_lines_however_long_a_field_is(x, y):
+    places = [{"name": "A", "position_m": [0.0, 0.0]}, {"name": "B", "position_m": [x, y]}]
+    found = _sheet_map({"marks": places, "stops": []})
+    assert max(found["width"], found["height"]) == pytest.approx(640.0)
+    assert 0 < len(found["lines"]) < 40
 
 
 def test_a_stop_that_sees_nothing_says_so(client):

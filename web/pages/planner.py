@@ -141,9 +141,9 @@ def _sheet_map(plan: Row) -> Row:
     """Return the lines and symbols of a map, in its own units."""
     p = np.array([one["position_m"][:2] for one in (*plan["marks"], *plan["stops"])])
     low, high = p.min(axis=0) - 1.5, p.max(axis=0) + 1.5
-    scale = _SHEET_WIDTH / float(high[0] - low[0])
-    width, height = _SHEET_WIDTH, scale * float(high[1] - low[1])
-    step = next(s for s in (1, 2, 5, 10, 20, 50, 100, 1000) if scale * s >= _LINE_LEAST)
+    scale = _SHEET_SIZE / float((high - low).max())
+    width, height = (scale * (high - low)).tolist()
+    step = _round_step(_LINE_LEAST / scale)
 
     def at(x: float, y: float) -> tuple[float, float]:
         return round(scale * (x - low[0]), 1), round(scale * (high[1] - y), 1)
@@ -169,6 +169,12 @@ def _sheet_map(plan: Row) -> Row:
         "labels": labels,
         **places,
     }
+
+
+def _round_step(least: float) -> float:
+    """Return the least of 1, 2 and 5 times a power of ten that is not below a length [m]."""
+    power = 10.0 ** np.floor(np.log10(least))
+    return float(next(step * power for step in (1, 2, 5, 10) if step * power >= least))
 
 
 def _stake_out(plan: Row) -> list[Row]:
@@ -203,7 +209,7 @@ def _stake_out(plan: Row) -> list[Row]:
     return rows
 
 
-_SHEET_WIDTH, _LINE_LEAST = 640.0, 34.0  # units of the map
+_SHEET_SIZE, _LINE_LEAST = 640.0, 34.0  # longer side, and least spacing of lines: units of the map
 
 
 _RANDOM_PLANS = (
