@@ -338,10 +338,10 @@ def _result_logs(connection: duckdb.DuckDBPyConnection, data: Path) -> list[Path
 
 
 def _has_ended(search: Path) -> bool:
-    """Whether a search of plans has ended, and its file does not change any more."""
+    """Return whether a search of plans has ended, so that its file does not change any more."""
     try:
         return bool(json.loads(search.read_text("utf-8"))["status"] != "running")
-    except FileNotFoundError:  # removed just now, as the oldest of many
+    except (FileNotFoundError, ValueError, KeyError, TypeError):  # removed just now, or damaged
         return False
 
 

@@ -161,6 +161,7 @@ def test_logs_of_results_and_ended_searches_are_in_order_and_backup(catalogue, d
         "clouds/left.mcap": "of no run",
         "searches/ended.json": '{"status": "successful"}',
         "searches/open.json": '{"status": "running"}',
+        "searches/damaged.json": '{"status": "succ',
         "worlds.json": "{}",
     }
     for name, text in files.items():
