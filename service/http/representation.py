@@ -1,4 +1,4 @@
-"""What every GET has beside its content: a HEAD, a tag where it is JSON, and compression."""
+"""What every GET has beside its content: a HEAD, an entity tag where it is JSON, compression."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ _HAVE_THEIR_OWN = "/api/v1/uploads/"  # HEAD of a resumable upload
 _TAGGED = ("application/json", "application/geo+json")
 _COMPRESS_FROM = 1 << 10  # [bytes]; less fits into a packet
 _LEVEL = 5  # of gzip; 9 takes three times as long for 2 % less
-_PACKED = (  # or noise
+_COMPRESSED = (  # already, or noise
     *DEFAULT_EXCLUDED_CONTENT_TYPES,
     "application/octet-stream",
     "application/vnd.apache.arrow.stream",
@@ -27,14 +27,14 @@ _PACKED = (  # or noise
 
 
 class Representation:
-    """Wraps an application: HEAD answers as GET would, JSON has an entity tag, text is packed."""
+    """Wraps an application: HEAD has the headers of GET, JSON an entity tag, text is compressed."""
 
     def __init__(self, app: ASGIApp) -> None:
         self.app = GZipMiddleware(
             _Tagged(app),
             minimum_size=_COMPRESS_FROM,
             compresslevel=_LEVEL,
-            exclude_content_types=_PACKED,
+            exclude_content_types=_COMPRESSED,
         )
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
@@ -44,14 +44,14 @@ class Representation:
             await self.app(scope, receive, send)
             return
         scope["method"] = "GET"
-        async with anyio.create_task_group() as group:
+        with anyio.CancelScope() as sending:
 
             async def send_head(message: Message) -> None:
                 if message["type"] == "http.response.start":
-                    scope["method"] = "HEAD"  # for those who count and log
+                    scope["method"] = "HEAD"  # as metrics and log have it
                     await send(message)
                     await send({"type": "http.response.body", "body": b""})
-                    group.cancel_scope.cancel()  # its content may be long, or never end
+                    sending.cancel()  # its content may be long, or never end
 
             await self.app(scope, receive, send_head)
 
@@ -88,7 +88,7 @@ class _Tagged:
 
 
 def _is_tagged(start: Message) -> bool:
-    """Whether a response is to have a tag."""
+    """Return whether a response is to have a tag."""
     headers = Headers(raw=start["headers"])
     kind = headers.get("content-type", "").partition(";")[0]
     return start["status"] == 200 and kind in _TAGGED and "etag" not in headers
