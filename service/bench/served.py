@@ -1,8 +1,8 @@
 """A service under load: clients beside uploads and a queue of jobs, and one large upload.
 
 The service runs in a process of its own, as ``spheremark serve`` does, on a folder that is removed
-at the end. Clients pause between requests as long as a page is looked at; a response of 429 that
-names when to come again is no error, and is counted apart.
+at the end. Clients pause between requests as readers of a page do; a response of 429 with a
+Retry-After is no error, and is counted apart.
 """
 
 from __future__ import annotations
@@ -52,7 +52,7 @@ _MCAP = {"Content-Type": "application/vnd.mcap"}
 
 @dataclass(slots=True, eq=False)
 class _Found:
-    """Durations by kind of request [s], refusals that name a time, and errors."""
+    """Durations by kind of request [s], refusals with a Retry-After, and errors."""
 
     seconds: dict[str, list[float]] = field(default_factory=lambda: defaultdict(list))
     busy: Counter[str] = field(default_factory=Counter)
@@ -87,6 +87,7 @@ async def _loaded(address: str, pid: int, log: bytes, seconds: float, progress: 
             progress(1.0 - left / seconds, "Clients, uploads and jobs")
             await asyncio.sleep(min(left, 2.0))
         await asyncio.gather(*tasks)
+        memory.append(_memory(pid, "VmRSS"))
         jobs = (await client.get("/api/v1/jobs", params={"limit": 1000})).json()["items"]
     jobs_by_status = Counter(job["status"] for job in jobs)
     return _report(found, memory, jobs_by_status, seconds) | {"stolen": _stolen(before)}
@@ -188,8 +189,8 @@ def load_tables(report: Plain) -> list[Table]:
         Table(
             columns=(
                 Column("kind", "requests"),
-                Column.whole("n", "answered"),
-                Column.whole("busy", "to come again"),
+                Column.whole("n", "successful"),
+                Column.whole("busy", "refused as busy"),
                 Column("p50_s", "median", "s", ".3f"),
                 Column("p99_s", "99th percentile", "s", ".3f"),
             ),
