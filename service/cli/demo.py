@@ -29,6 +29,7 @@ from spheremark.service.settings import Settings
 SURVEY = "paper-field"
 LANE = "lane3"
 _N_STOPS = 7
+_PATIENCE = 600.0  # [s] of a request: on a busy machine kernels are loaded beside the first one
 _POLL = 0.2  # [s] between two requests for the state of a job
 _SUMMARY = """
 SELECT 'sphere centres' AS what, fit_method, count(*) AS n, sqrt(avg(error_3d_m ^ 2)) AS rms_m,
@@ -74,7 +75,7 @@ class Rover:
     def __init__(
         self, settings: Settings, address: str, console: Console, leaving: threading.Event
     ) -> None:
-        self._client = Client(address, token=settings.token_text)
+        self._client = Client(address, token=settings.token_text, timeout=_PATIENCE)
         self._folder = settings.data.resolve() / "simulated"
         self._address = address
         self._console = console
