@@ -19,6 +19,9 @@ function offer() {
     const alike = others.find((one) => partOf(one) === partOf(own[0])) ?? others[0];
     side.value = (place && alike ? alike : own[0])?.value ?? "";
   }
+  const isEmpty = !sides[0].value;
+  document.getElementById("none").hidden = !isEmpty;
+  document.querySelector('form button[type="submit"]').disabled = isEmpty;
 }
 
 kind.addEventListener("change", offer);
