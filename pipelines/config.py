@@ -106,8 +106,9 @@ class ExtractionConfig:
     n_points_min : int
         A group with fewer returns is not looked at. 6: twice the unknowns of a centre.
     false_rate : float
-        Wanted rate of false markers in a scan. 0.01: a group is a marker where the probability that
-        it is none is at most this. Groups that are rather markers than not are possible ones.
+        Accepted mean number of false markers in a scan. Groups are markers, the surest first, while
+        their probabilities of being none add up to at most this. Others whose probability is 0.9 or
+        more are possible markers. 0.01: one false marker in a hundred scans.
     range_max : float
         Markers are not looked for beyond this distance [m]. 35: fewer than six returns there.
     """

@@ -219,7 +219,7 @@ class Client:
         return state
 
     def query(self, sql: str, **parameters: Any) -> pd.DataFrame:
-        """Return the answer to one SELECT.
+        """Return the result of one SELECT.
 
         Parameters
         ----------
@@ -246,7 +246,7 @@ class Client:
         answer = self.request("POST", "/sql", json={"sql": sql, "parameters": parameters})
         if answer["truncated"]:
             warnings.warn(
-                f"The service cut the answer at {answer['row_limit']} rows; aggregate or filter, "
+                f"The service cut the result at {answer['row_limit']} rows; aggregate or filter, "
                 "or export the database.",
                 stacklevel=2,
             )

@@ -13,9 +13,8 @@ from spheremark.pipelines.model import Array, Mask
 _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(24)
 _FAR = 8.5  # standard deviations beyond which nothing is left
 _THIN = 1e-9  # of the tolerance; a thinner ellipsoid is flat
-_WIDEST = (
-    1.96  # of sigma_3d: the radius of 95 % of an ellipsoid with one axis; of others it is less
-)
+WIDEST_95 = 1.96
+"""3-D sigmas within which 95 % of errors along one axis lie; of errors of other shapes more do."""
 
 
 def keeps_tolerance(covs: Array, tolerance: float) -> Mask:
@@ -38,7 +37,7 @@ def keeps_tolerance(covs: Array, tolerance: float) -> Mask:
     Of all covariances of one trace that of a single axis has the largest 95th percentile
     (Szekely and Bakirov, 2003), which decides most cases without the quadrature.
     """
-    found: Mask = np.asarray(_WIDEST**2 * np.trace(covs, axis1=1, axis2=2) <= tolerance**2)
+    found: Mask = np.asarray(WIDEST_95**2 * np.trace(covs, axis1=1, axis2=2) <= tolerance**2)
     found[~found] = probability_within(covs[~found], tolerance) >= SHARE
     return found
 

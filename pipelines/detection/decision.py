@@ -266,14 +266,14 @@ def shares_of(log_likelihoods: Array) -> tuple[Array, Array]:
 
 
 def sure_ones(probabilities: Sequence[float], false_rate: float) -> list[bool]:
-    """Return which groups are markers: as many as hold no more false ones than wanted, on average.
+    """Return which groups are markers: as many as hold no more false ones than that, on average.
 
     The expected number of false ones is the sum of the probabilities that each is false.
     """
-    doubts = 1.0 - np.asarray(probabilities, np.float64)
-    order = np.argsort(doubts, kind="stable")
-    is_sure = np.zeros(len(doubts), np.bool_)
-    is_sure[order] = np.cumsum(doubts[order]) <= false_rate
+    risks = 1.0 - np.asarray(probabilities, np.float64)
+    order = np.argsort(risks, kind="stable")
+    is_sure = np.zeros(len(risks), np.bool_)
+    is_sure[order] = np.cumsum(risks[order]) <= false_rate
     return list(is_sure.tolist())
 
 

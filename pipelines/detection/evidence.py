@@ -227,9 +227,9 @@ def _half_widths(rig: Rig, angles: Column, c: Array, target: Target) -> Array:
     x, y, z = rig.T_head_lidar[:3, 2]
     axis = (np.cos(angle) * x - np.sin(angle) * y, np.sin(angle) * x + np.cos(angle) * y, z)
     view = view_of(c, target.up)
-    aside = np.array([np.dot(axis, view.across), np.dot(axis, view.up)]) ** 2
+    share = np.array([np.dot(axis, view.across), np.dot(axis, view.up)]) ** 2
     sweep, along = rig.divergence**2
-    half: Array = 0.5 * np.linalg.norm(c) * np.sqrt(aside * along + (1.0 - aside) * sweep)
+    half: Array = 0.5 * np.linalg.norm(c) * np.sqrt(share * along + (1.0 - share) * sweep)
     return half
 
 

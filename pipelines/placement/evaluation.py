@@ -129,7 +129,7 @@ def worst_after_loss(
     model : CentreModel
         Accuracy of centres.
     visibility : Visibility, optional
-        As of ``evaluate``.
+        See ``evaluate``.
 
     Returns
     -------
@@ -172,7 +172,7 @@ def field_map(  # noqa: PLR0913  all that a map is made of
     xs, ys : (n,), (m,)
         Lines of the grid [m].
     marks, model, requirement
-        As of ``evaluate``.
+        See ``evaluate``.
     visibility : Visibility, optional
         Result of ``find_visibility`` for ``map_stations`` and these marks; found if not given.
 

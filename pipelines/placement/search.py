@@ -9,6 +9,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy.spatial.distance import cdist
 
+from spheremark.pipelines.accuracy.probability import WIDEST_95
 from spheremark.pipelines.errors import ConfigError, DegenerateGeometryError
 from spheremark.pipelines.model import Array, Index
 from spheremark.pipelines.placement.bounds import groups_of
@@ -28,9 +29,6 @@ MARKS_MOST = 40
 
 POWER = 12.0
 """Exponent of the mean over stops that is as good as their largest, and smoother."""
-
-Z_95 = 1.96
-"""Sigmas within which an error of any shape lies with 95 %: 3-D sigma on one axis."""
 
 _ROUNDS_MAX = 30  # of exchanges; four to eight settle
 _DRAWN_EVENLY, _DRAWN_BY_SHARES = 1600, 400  # random arrangements, of which starts are chosen
@@ -98,7 +96,9 @@ class Goal:
             )
         for name, most in (("loss_weight", 1.0), ("walk_weight", 1.0), ("stop_reach", 20.0)):
             if not 0.0 <= getattr(self, name) <= most:
-                raise ConfigError(f"{name} is {getattr(self, name)!r}; it must be from 0 to {most}")
+                raise ConfigError(
+                    f"{name} is {getattr(self, name)!r}; it must be from 0 to {most:g}."
+                )
 
     @property
     def counts_loss(self) -> bool:
@@ -178,7 +178,7 @@ def search(
 
     best = searched(problem, 0.0)
     found(0.5, best)
-    limit = problem.requirement.tolerance / Z_95
+    limit = problem.requirement.tolerance / WIDEST_95
     if not goal.is_robust or k < 3 or best.after_loss() <= limit:
         return best
     kept = searched(problem._replace(is_loss_first=True), 0.5)
@@ -359,7 +359,7 @@ def _objectives(problem: Problem, others: Index, tried: Index, goal: Goal) -> li
             rest = np.delete(others, j)
             after = np.maximum(after, scores_of(problem, rest, tried[:, None])[:, 0])
         if problem.is_loss_first:
-            excess = np.maximum(after - problem.requirement.tolerance / Z_95, 0.0)
+            excess = np.maximum(after - problem.requirement.tolerance / WIDEST_95, 0.0)
         worst = worst ** (1.0 - goal.weight) * after**goal.weight
     if goal.walk_weight:
         p_site = problem.candidates.p_site
@@ -380,6 +380,6 @@ def evaluated(found: Found, goal: Goal) -> tuple[float, float]:
     if not goal.counts_loss or not rest:
         return 0.0, walk * worst
     after = min(max(one.worst_sigma_3d for one in rest), LOST)
-    excess = max(after - found.problem.requirement.tolerance / Z_95, 0.0)
+    excess = max(after - found.problem.requirement.tolerance / WIDEST_95, 0.0)
     weighed = worst ** (1.0 - goal.weight) * after**goal.weight
     return excess * found.problem.is_loss_first, walk * weighed

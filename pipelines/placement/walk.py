@@ -48,7 +48,7 @@ def round_trip(start: Array, places: Array) -> float:
 def perimeters(places: Array) -> Array:
     """Return the perimeters of sets of places, (m, k, 3), in the order of their azimuths [m].
 
-    What a round past them is where they stand round the stops.
+    Near the length of ``round_trip`` where the places surround the stops.
     """
     flat = places[..., :2]
     off = flat - flat.mean(axis=1, keepdims=True)

@@ -88,7 +88,7 @@ def cramer_rao(
     ``I - g g^T / (w + 1 / s^2)`` (Schur complement; the hybrid bound of Rockah and Schultheiss
     1987). As ``J`` is nearly the direction of the beam along the line of sight, the variance there
     grows by nearly ``s^2``, whatever the number of returns: the apparent size of a sphere hardly
-    tells a bias from a distance.
+    separates a bias from a distance.
     """
     n = len(returns.ranges)
     expected = predict(returns, p_true[None], np.array([radius]), np.zeros(n, dtype=np.intp))

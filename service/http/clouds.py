@@ -50,8 +50,8 @@ def scene_of(service: Service, survey: str, stops: list[str], method: str) -> di
     rows = service.catalogue.rows
     found = rows(_STOPS, {"survey": record.name, "stops": stops, "n": STOPS_MAX})
     if not found:
-        wanted = f"results of a stop {stops[0]!r}" if stops else "results of stops"
-        raise NotFoundError(f"The survey {record.name} has no {wanted}.")
+        missing = f"results of a stop {stops[0]!r}" if stops else "results of stops"
+        raise NotFoundError(f"The survey {record.name} has no {missing}.")
     known = rows(_POSES, {"survey": record.name})
     poses = {(one["run_id"], one["stop"]): one for one in known}
     key = {"runs": [one["run_id"] for one in found], "method": method}

@@ -77,7 +77,7 @@ async def opened(settings: Settings) -> AsyncIterator[Service]:
         import_module("pandas")
     data = settings.data
     data.mkdir(parents=True, exist_ok=True)
-    data.chmod(0o700)  # nobody else's: logs, results and digests of tokens
+    data.chmod(0o700)  # for its user alone: logs, results and digests of tokens
     inbox = Inbox(data / "recordings", settings.min_free_bytes, settings.quota_bytes)
     terrains = Inbox(data / "terrains", settings.min_free_bytes)
     uploads = Resumable(inbox)

@@ -2,7 +2,7 @@
 
 It returns large arrays to the system at once, and the system clears every page that it maps again:
 in a virtual machine that costs a scan more than some of its steps do. Of many threads it keeps a
-heap for each, of which a service that answers small requests never needs the sum.
+heap for each, of which a service with small requests never needs the sum.
 """
 
 from __future__ import annotations

@@ -35,7 +35,7 @@ def test_the_name_of_a_survey_is_no_sql(client):
 
 
 def test_a_cut_answer_warns(client):
-    with pytest.warns(UserWarning, match="cut the answer"):
+    with pytest.warns(UserWarning, match="cut the result"):
         client.query("SELECT * FROM range(1000000)")
 
 

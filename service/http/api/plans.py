@@ -198,11 +198,11 @@ def _call(service: Service, new: NewSearch) -> tuple[Any, ...]:
 
 def _seconds(prefer: str | None) -> float:
     """Return how long a request waits for its result, by the header Prefer (RFC 7240) [s]."""
-    wanted = [one.strip().lower() for one in (prefer or "").split(",")]
-    waits = [one.removeprefix("wait=") for one in wanted if one.startswith("wait=")]
+    preferences = [one.strip().lower() for one in (prefer or "").split(",")]
+    waits = [one.removeprefix("wait=") for one in preferences if one.startswith("wait=")]
     if waits and waits[0].isdecimal():
         return min(float(waits[0]), _WAIT)
-    return 0.0 if "respond-async" in wanted else _WAIT
+    return 0.0 if "respond-async" in preferences else _WAIT
 
 
 def _aim(plan: OptimisationRequest) -> plans.Aim:

@@ -213,15 +213,15 @@ def _run(service: Service, request: Query, accept: str) -> QueryResponse | Respo
     """Run a query on a snapshot; return the format that the body or the Accept header requests."""
     limits = service.settings.query_limits
     accepted = (one for one, media in _MEDIA.items() if accept.startswith(media))
-    wanted = request.format if request.format != "json" else next(accepted, "json")
+    form = request.format if request.format != "json" else next(accepted, "json")
     with service.catalogue.lent_snapshot() as snapshot:
         result = run_query(snapshot, request.sql, limits, request.parameters)
-        if wanted == "json":
+        if form == "json":
             return QueryResponse.model_validate(serialise_query(result, limits, snapshot))
     headers = {
         "X-Truncated": str(result.truncated).lower(),
         "X-Row-Limit": str(limits.rows),
         "X-Elapsed-Ms": f"{result.elapsed_ms:.3f}",
-        "Content-Disposition": f'inline; filename="spheremark.{wanted}"',
+        "Content-Disposition": f'inline; filename="spheremark.{form}"',
     }
-    return Response(_WRITERS[wanted](result), media_type=_MEDIA[wanted], headers=headers)
+    return Response(_WRITERS[form](result), media_type=_MEDIA[form], headers=headers)

@@ -45,8 +45,8 @@ _HEADERS = {
 }
 
 
-def _answers(status: int, what: str, *names: str) -> dict[int | str, dict[str, Any]]:
-    """Describe in OpenAPI an answer that is headers alone."""
+def _headers_of(status: int, what: str, *names: str) -> dict[int | str, dict[str, Any]]:
+    """Describe in OpenAPI a response that is headers alone."""
     headers = {
         name: {"description": text, "schema": {"type": kind}}
         | ({"example": _EXAMPLES[name]} if name in _EXAMPLES else {})
@@ -79,11 +79,13 @@ Checksum = Annotated[
     name="describe_uploads",
     status_code=204,
     response_class=Response,
-    responses=_answers(204, "What is supported.", *(n for n in _HEADERS if n.startswith("Tus-"))),
+    responses=_headers_of(
+        204, "What is supported.", *(n for n in _HEADERS if n.startswith("Tus-"))
+    ),
 )
 def describe_uploads(service: Current) -> Response:
     """Say what of tus is supported."""
-    return _answer(
+    return _response(
         {
             "Tus-Version": VERSION,
             "Tus-Extension": EXTENSIONS,
@@ -99,7 +101,7 @@ def describe_uploads(service: Current) -> Response:
     status_code=201,
     response_class=Response,
     openapi_extra=_BODY,
-    responses=_answers(201, "The upload has begun.", "Location", *_STATE),
+    responses=_headers_of(201, "The upload has begun.", "Location", *_STATE),
 )
 async def create_upload(
     request: Request,
@@ -129,14 +131,14 @@ async def create_upload(
     headers = {"Location": f"/api/v1/uploads/{upload.upload_id}", **_expiry(upload)}
     if request.headers.get("content-type", "") == PART:
         headers |= await _append(service, upload, request, 0, checksum)
-    return _answer(headers, 201)
+    return _response(headers, 201)
 
 
 @router.head(
     "/{upload}",
     name="get_upload",
     response_class=Response,
-    responses=_answers(
+    responses=_headers_of(
         200, "What is here.", "Upload-Offset", "Upload-Length", "Upload-Expires", "Cache-Control"
     ),
 )
@@ -145,7 +147,7 @@ def get_upload(upload: UploadId, service: Current, tus: Tus = None) -> Response:
     _check_version(tus)
     found = service.uploads.get(upload)
     headers = {"Upload-Offset": str(found.offset), "Upload-Length": str(found.length)}
-    return _answer(headers | _expiry(found) | {"Cache-Control": "no-store"}, 200)
+    return _response(headers | _expiry(found) | {"Cache-Control": "no-store"}, 200)
 
 
 @router.patch(
@@ -154,7 +156,7 @@ def get_upload(upload: UploadId, service: Current, tus: Tus = None) -> Response:
     status_code=204,
     response_class=Response,
     openapi_extra=_BODY,
-    responses=_answers(204, "The part is kept.", *_STATE),
+    responses=_headers_of(204, "The part is kept.", *_STATE),
 )
 async def append_to_upload(
     upload: UploadId,
@@ -171,7 +173,7 @@ async def append_to_upload(
     if request.headers.get("content-type", "") != PART:
         raise MediaTypeError(f"The part must be of the type {PART}.")
     found = service.uploads.get(upload)
-    return _answer(await _append(service, found, request, offset, checksum))
+    return _response(await _append(service, found, request, offset, checksum))
 
 
 @router.delete(
@@ -179,13 +181,13 @@ async def append_to_upload(
     name="end_upload",
     status_code=204,
     response_class=Response,
-    responses=_answers(204, "It is forgotten."),
+    responses=_headers_of(204, "It is forgotten."),
 )
 def end_upload(upload: UploadId, service: Current, tus: Tus = None) -> Response:
     """Forget an upload and its bytes."""
     _check_version(tus)
     service.uploads.end(service.uploads.get(upload).upload_id)
-    return _answer({})
+    return _response({})
 
 
 async def _append(
@@ -267,6 +269,6 @@ def _expiry(upload: Upload) -> dict[str, str]:
     return {"Upload-Expires": formatdate(upload.expires_at, usegmt=True)}
 
 
-def _answer(headers: Mapping[str, str], status: int = 204) -> Response:
+def _response(headers: Mapping[str, str], status: int = 204) -> Response:
     """Return a response of the protocol."""
     return Response(status_code=status, headers={"Tus-Resumable": VERSION, **headers})
