@@ -345,7 +345,7 @@ def _unseen(
     found: _Map,
     used: dict[int, list[tuple[int, int]]],
     unshared: dict[int, list[int]],
-    dropped: dict[tuple[int, int], str],
+    dropped: dict[tuple[int, int], tuple[int, str]],
 ) -> tuple[LeftOut, ...]:
     """Return which centres are no marks of the network, and which control marks were not seen."""
     out = []
@@ -354,9 +354,12 @@ def _unseen(
             reason = "No other station sees it: it ties nothing, and may be false."
             if found.marks_of[i][fit] == _NO_MARK:
                 reason = "Another marker is nearer to the mark beside it: a false marker."
-            reason = dropped.get((i, fit), reason)
+            refused, reason = dropped.get((i, fit), (None, reason))
+            mark_name = "" if refused is None else found.names[refused]
             station, name = scans[i][0], scans[i][1].fits[fit].name
-            out.append(LeftOut(kind="centre", station=station, marker=name, mark="", reason=reason))
+            out.append(
+                LeftOut(kind="centre", station=station, marker=name, mark=mark_name, reason=reason)
+            )
     seen = {mark for pairs in used.values() for _, mark in pairs}
     for mark in range(found.n_control):
         if mark not in seen:

@@ -56,15 +56,15 @@ class Weighed(NamedTuple):
         Of all marks that a station shows, in the order of the map.
     suspicions : dict of int to str
         Why a mark that stays may be false.
-    dropped : dict of (int, int) to str
-        Why the mark of a fit of a station is none.
+    dropped : dict of (int, int) to (int, str)
+        The mark of a fit of a station that is refused, and why.
     confirmed : dict of (int, int) to int
         Mark of each possible fit of a station that enters the network.
     """
 
     evidence: tuple[MarkEvidence, ...]
     suspicions: dict[int, str]
-    dropped: dict[tuple[int, int], str]
+    dropped: dict[tuple[int, int], tuple[int, str]]
     confirmed: dict[tuple[int, int], int]
 
 
@@ -109,7 +109,7 @@ def weigh_marks(
             and not is_control
             and all(n_marks[i] > _N_HOLD for i in stations)
         ):
-            out.dropped.update(dict.fromkeys(own, reason))
+            out.dropped.update(dict.fromkeys(own, (mark, reason)))
             for i in stations:
                 n_marks[i] -= 1
         elif one.decision is Decision.REFUSED or not is_control:

@@ -112,10 +112,16 @@ def places(network: Plain) -> list[Table]:
 
 def evidence(network: Plain) -> list[Table]:
     """Return what all stations make of each mark, and each station of those in doubt."""
-    marks = network["evidence"]
+    marks = network.get("evidence")
     if not marks:
         return []
     notes = [
+        f"{mark['mark']} {mark['decision']}, own radius of all its fits: "
+        f"{mark['log_odds_radius']:+.1f}."
+        for mark in marks
+        if mark["decision"] != "confirmed" and mark["log_odds_radius"]
+    ]
+    notes += [
         f"{mark['mark']} {mark['decision']}, {one['station']} at {one['range_m']:.1f} m: "
         f"{one['finding']} ({one['log_odds']:+.1f}). {one['reason']}".rstrip()
         for mark in marks

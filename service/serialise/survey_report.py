@@ -159,8 +159,8 @@ def report_of_document(text: str, name: str) -> Plain:
 
 def network_part(network: Mapping[str, Any]) -> Plain:
     """Return what a report shows of a network."""
-    tables = [*network_report.places(network), *network_report.tables_of_observations(network)]
-    tables += network_report.checks(network)
+    tables = [*network_report.places(network), *network_report.evidence(network)]
+    tables += [*network_report.tables_of_observations(network), *network_report.checks(network)]
     notes = list(network_report.not_used(network)) or ["Nothing: all observations were used."]
     shown = [_shortened(table.to_texts()) for table in tables]
     shown.append(Table(title="Not used", notes=notes).to_texts())

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Annotated, Any
 
 from fastapi import APIRouter, Query
@@ -89,6 +89,12 @@ SELECT x.marker, x.used, x.w, a.w_limit
 FROM adjusted_observations AS x JOIN adjustments AS a USING (adjustment_id)
 WHERE x.adjustment_id = $id AND x.station = $station AND x.kind = 'centre'
 """
+_EVIDENCE = """
+SELECT e.mark, e.marker, e.finding, e.range_m, e.log_odds, e.reason, d.decision, d.is_used,
+    d.probability, d.hypothesis
+FROM mark_evidence AS e JOIN mark_decisions AS d USING (adjustment_id, mark)
+WHERE e.adjustment_id = $id AND e.station = $station ORDER BY e.mark
+"""
 _STOP_TABLES = {
     "fits": _STOP_FITS,
     "rejections": _STOP_REJECTIONS,
@@ -127,7 +133,7 @@ def stop(
     key = {"run": shown["run_id"], "stop": shown["stop"]}
     methods = [one["fit_method"] for one in rows(_STOP_METHODS, key)]
     chosen = method if method in methods else next(iter(methods), "")
-    solution, network = _solution_of(service, survey["survey_id"], shown, chosen)
+    solution, network, evidence = _solution_of(service, survey["survey_id"], shown, chosen)
     columns, by_method = service.catalogue.columns, key | {"method": chosen}
     return stop_page(
         frame_of(service, survey["name"], "stops"),
@@ -142,14 +148,15 @@ def stop(
         fixes=rows(_STOP_FIXES, key),
         chosen=solution,
         network=network,
+        evidence=evidence,
         namesakes=found if len(found) > 1 else (),
     )
 
 
 def _solution_of(
     service: Service, survey_id: str, stop: Mapping[str, Any], method: str
-) -> tuple[Mapping[str, Any] | None, Mapping[str, Mapping[str, Any]]]:
-    """Return the station of a stop in the chosen solution, and its markers in that network.
+) -> tuple[Mapping[str, Any] | None, Mapping[str, Mapping[str, Any]], Sequence[Mapping[str, Any]]]:
+    """Return the station of a stop in the chosen solution, its markers and evidence in a network.
 
     There are none of a method whose centres the network does not use.
     """
@@ -157,9 +164,10 @@ def _solution_of(
     place = {"recording": stop["recording_id"], "stop": stop["stop"], "id": survey_id}
     found = rows(_CHOSEN, place)
     if not found or found[0]["adjustment_id"] is None or found[0]["fit_method"] != method:
-        return next(iter(found), None), {}
+        return next(iter(found), None), {}, ()
     names = {"id": found[0]["adjustment_id"], "station": found[0]["station"]}
-    return found[0], {row["marker"]: row for row in rows(_IN_NETWORK, names)}
+    in_network = {row["marker"]: row for row in rows(_IN_NETWORK, names)}
+    return found[0], in_network, rows(_EVIDENCE, names)
 
 
 def _scan(url: str | None) -> scene.Scan | None:
