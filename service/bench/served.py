@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import asyncio
 import hashlib
+import http.client
 import os
 import random
 import re
@@ -18,10 +19,11 @@ import sys
 import tempfile
 from collections import Counter, defaultdict
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 from time import perf_counter, sleep
+from urllib.parse import urlsplit
 
 import httpx
 import numpy as np
@@ -43,6 +45,7 @@ _PAUSE_UPLOAD = 5.0  # [s] between two uploads of one sender
 _WARM = 0.25  # share of the time after which memory is first read
 _TIMEOUT = 60.0  # [s] of a request
 _BAR_P99, _BAR_UPLOAD = 1.0, 64_000_000  # [s] of pages on quiet cores, [bytes] above idle
+_SETTLED = 5.0  # [s] until workers have started, and take no processor from the upload
 _BLOCK = 1 << 20  # [bytes] of the large upload that are sent at once
 _MIB = 1 << 20
 _STEAL = 7  # place of the stolen time among the times of a processor
@@ -229,14 +232,15 @@ def upload(n_bytes: int, progress: Progress) -> Plain:
             progress(0.3, "Sending it")
             with httpx.Client(base_url=address, timeout=None) as client:
                 client.post(_LOGS, content=b"first", headers=_MCAP)  # loads modules
+                sleep(_SETTLED)
                 idle = _memory(pid, "VmRSS")
                 Path(f"/proc/{pid}/clear_refs").write_text("5", encoding="ascii")
                 begin = perf_counter()
-                response = client.post(_LOGS, content=_blocks(source), headers=_MCAP)
+                response = _sent(address, source)
                 seconds, most = perf_counter() - begin, _memory(pid, "VmHWM")
             size = source.stat().st_size
             if not (folder / "data" / "recordings" / f"{digest}.mcap").exists():
-                raise SpheremarkError(f"The file was not kept: {response.text}")
+                raise SpheremarkError(f"The file was not kept: {response}")
     return {
         "n_bytes": size,
         "idle_bytes": idle,
@@ -259,11 +263,13 @@ def upload_tables(report: Plain) -> list[Table]:
     return [Table(columns=columns, rows=[report])]
 
 
-def _blocks(path: Path) -> Iterator[bytes]:
-    """Yield the blocks of a file."""
-    with path.open("rb") as file:
-        while block := file.read(_BLOCK):
-            yield block
+def _sent(address: str, path: Path) -> str:
+    """Send a file at little cost to the sender, which shares the processors; return the answer."""
+    connection = http.client.HTTPConnection(urlsplit(address).netloc, blocksize=_BLOCK)
+    with closing(connection), path.open("rb") as file:
+        length = {"Content-Length": str(path.stat().st_size)}
+        connection.request("POST", _LOGS, body=file, headers=_MCAP | length)
+        return connection.getresponse().read().decode()
 
 
 @contextmanager

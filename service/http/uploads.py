@@ -167,7 +167,7 @@ class Inbox:
         chunks: AsyncIterator[bytes],
         file: IO[bytes],
         max_bytes: int,
-        seen: Callable[[bytes | bytearray], None],
+        seen: Callable[[bytes], None],
     ) -> int:
         """Write all chunks and return how many bytes they are; what was received stays."""
 
@@ -181,29 +181,41 @@ class Inbox:
     async def _write(
         self, chunks: AsyncIterator[bytes], add: Callable[[bytes], None], max_bytes: int
     ) -> int:
-        """Give all chunks to a function in a thread; return how many bytes they are."""
-        block = bytearray()
-        size = 0
+        """Give all chunks to a function in a thread; return how many bytes they are.
 
-        def put(data: bytearray) -> None:
-            self.require_room(len(data))
+        While one block is written and hashed, the next one is received.
+        """
+        block: list[bytes] = []
+        size = n_put = 0
+        putting: asyncio.Task[None] | None = None
+
+        def put(data: list[bytes]) -> None:
+            self.require_room(sum(map(len, data)))
             with _translated(self.folder):
-                add(bytes(data))
+                for one in data:
+                    add(one)
 
         try:
             async for chunk in chunks:
-                block += chunk
+                block.append(chunk)
                 size += len(chunk)
                 if size > max_bytes:
                     raise TooLargeError(
                         f"The body is larger than the {max_bytes:,} bytes accepted."
                     )
-                if len(block) >= _BLOCK:
-                    await asyncio.to_thread(put, block)
-                    block = bytearray()
+                if size - n_put >= _BLOCK:
+                    if putting is not None:
+                        await putting
+                    putting = asyncio.create_task(asyncio.to_thread(put, block))
+                    block, n_put = [], size
         except ClientDisconnect as error:
+            if putting is not None:
+                await putting
             await asyncio.to_thread(put, block)
             raise InterruptedUploadError(f"The sender went away after {size:,} bytes.") from error
+        finally:
+            if putting is not None:  # the file is open until its thread has ended
+                await putting
         await asyncio.to_thread(put, block)
         return size
 
