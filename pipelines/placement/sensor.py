@@ -169,8 +169,8 @@ class Sensor:
         """Mean angle between lines at the horizon, those that fall on each other too [rad]."""
         if self.step:
             return 2.0 * np.pi / sum(map(len, face_lines(self.scan)))
-        n_revolutions = self.turn * self.spin_rpm / 60.0 * self.sweep / (2.0 * np.pi)
-        return 2.0 * np.pi / (2.0 * N_LASERS * n_revolutions)
+        of_full_turn = 2.0 * np.pi / (2.0 * N_LASERS * self.turn * self.spin_rpm / 60.0)
+        return of_full_turn * (2.0 * np.pi / self.sweep)
 
     @property
     def density(self) -> float:
@@ -271,7 +271,8 @@ def _reaches(sensor: Sensor, radius: float) -> Array:
 
 def _density(sensor: Sensor, distance: float) -> float:
     """Return the returns per square metre of a disc at the horizon [1/m^2]."""
-    return sensor.density / distance**2
+    spacing = sensor.line_spacing * sensor.pulse_spacing
+    return (1.0 - sensor.drop_out) / (spacing * distance**2)
 
 
 def _disc(sensor: Sensor, radius: float, n_strips: int, distance: float) -> _Disc:
