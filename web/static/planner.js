@@ -200,7 +200,7 @@ function drawHead(plan, tolerance) {
     [`Within ${round(1000 * tolerance, 3)} mm, least`, percent(worst?.probability_within_tolerance), "%", "probability at the worst stop"],
     ["Without its worst mark", mm(evaluation?.worst_sigma_3d_after_loss_m), "mm", "3-D sigma at the worst stop"],
     ["Mean of all stops", mm(evaluation?.mean_sigma_3d_m), "mm", "3-D sigma"],
-    ["Marks in sight, found with", percent(mean(chances)), "%", chances.length ? `the least likely ${percent(Math.min(...chances))} %` : ""],
+    ["A mark in sight is found", percent(mean(chances)), "%", chances.length ? `mean probability; least ${percent(Math.min(...chances))} %` : ""],
     ["Stops that keep it", `${nKept} of ${stops.length}`, "", "with 95 % probability"],
   ].map(([label, value, unit, note]) =>
     h("div", { class: "readout" }, h("dt", {}, label), h("dd", {}, value, h("small", {}, unit)), h("dd", { class: "note" }, note))));

@@ -74,7 +74,7 @@ function showLinks() {
 
 let waiting = null;
 
-async function ask(sql) {
+async function resultOf(sql) {
   waiting = new AbortController();
   const body = { sql, parameters: parameters() };
   return call("POST", "/api/v1/sql", body, { signal: waiting.signal });
@@ -94,7 +94,7 @@ async function run({ keep = true, explain = false } = {}) {
   setRunning(true);
   if (keep && !explain) history.pushState(null, "", `/sql?${search()}`);
   try {
-    const body = await ask(explain ? `EXPLAIN ${sql}` : sql);
+    const body = await resultOf(explain ? `EXPLAIN ${sql}` : sql);
     if (explain) showPlan(body);
     else showAnswer(body);
     if (!explain) remember(sql);
