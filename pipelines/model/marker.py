@@ -88,7 +88,7 @@ class MarkerCandidates:
     # height of the highest ground point near the station in the levelled frame, the level of the
     # published method's cut [m]; minus infinity when no ground was seen
     ground_height_max: float
-    # groups too probable to be rejected, not probable enough to be markers: they enter nothing
+    # groups too probable to be rejected, not probable enough to be markers
     possible: tuple[Rejection, ...] = ()
 
 

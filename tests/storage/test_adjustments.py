@@ -1,4 +1,5 @@
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -12,14 +13,15 @@ from spheremark.pipelines.geometry import (
     transform,
     yaw_pitch_roll,
 )
-from spheremark.pipelines.model import ControlMarks, StopTruth, Truth
+from spheremark.pipelines.model import ControlMarks, Rejection, StopTruth, Truth
 from spheremark.pipelines.scan.rigs import rig_digest, rig_to_mapping, tilted_vlp16
 from spheremark.storage.catalogue.adjustments import TABLES, with_errors
 from spheremark.storage.catalogue.catalogue import Catalogue
 from spheremark.storage.catalogue.centres import CENTRES, read_centres
 from spheremark.storage.catalogue.products import documents
+from spheremark.storage.catalogue.results import tables
 from spheremark.storage.catalogue.schema import table_of, tables_of
-from tests.storage.made_up import made_tables, stop
+from tests.storage.made_up import MARKS, made_tables, run, stop
 
 AWAY = rigid(rot_z(1.1), [40.0, -3.0, 2.0])  # where the free network lies
 
@@ -142,6 +144,35 @@ def test_centres_come_back_from_their_rows_as_they_were_fitted():
         np.testing.assert_allclose(one.cov_p_base, other.cov_p_base, rtol=0, atol=1e-15)
         assert (one.status, one.reason, one.method) == (other.status, other.reason, other.method)
         np.testing.assert_equal(one.sigma_range_shared, other.sigma_range_shared)
+
+
+def test_evidence_and_possible_markers_come_back_from_their_rows():
+    fitted = stop()
+    known = fitted.fits["along_beam"]
+    logs = np.linspace(-9.0, -1.0, 9)
+    sure = tuple(replace(fit, log_likelihoods=logs + i) for i, fit in enumerate(known.fits))
+    last = replace(sure[-1], name="P01", probability=0.95, hypothesis="post: likelier")
+    compared = Rejection(
+        p_base=np.array([4.0, -2.0, 0.5]), n_points=31, reason="A box.", probability=0.2,
+        log_likelihoods=logs - 5.0,
+    )  # fmt: skip
+    bare = Rejection(p_base=np.array([1.0, 7.0, 0.3]), n_points=12, reason="One line.")
+    with_more = replace(known, fits=sure, possible_fits=(last,), rejected=(compared, bare))
+    result = replace(fitted, fits={**fitted.fits, "along_beam": with_more})
+    made = tables(run(run_id="run1"), (result,), marks=MARKS)
+    ((_, found),) = read_centres({key: made[key] for key in CENTRES}, "run1", "along_beam")
+    for one, other in zip(found.fits, sure, strict=True):
+        np.testing.assert_array_equal(one.log_likelihoods, other.log_likelihoods)
+    (possible,) = found.possible_fits
+    np.testing.assert_allclose(possible.p_base, last.p_base, rtol=0, atol=1e-14)
+    np.testing.assert_allclose(possible.cov_p_base, last.cov_p_base, rtol=0, atol=1e-15)
+    assert (possible.name, possible.probability) == ("P01", 0.95)
+    np.testing.assert_array_equal(possible.log_likelihoods, last.log_likelihoods)
+    groups = {one.reason: one for one in found.rejected}
+    assert set(groups) == {"A box.", "One line."}
+    np.testing.assert_array_equal(groups["A box."].log_likelihoods, compared.log_likelihoods)
+    assert not len(groups["One line."].log_likelihoods)
+    np.testing.assert_allclose(groups["One line."].p_base, bare.p_base, rtol=0, atol=1e-14)
 
 
 @pytest.fixture

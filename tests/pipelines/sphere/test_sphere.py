@@ -22,6 +22,7 @@ from spheremark.pipelines.model import (
     RING_UNKNOWN,
     MarkerCandidate,
     MarkerCandidates,
+    Rejection,
     Status,
     Timed,
     marker_name,
@@ -291,6 +292,26 @@ def test_laser_biases_are_estimated_and_corrected():
         return np.sqrt(np.mean(np.var(errors, axis=0)))
 
     assert spread(knowing) < 0.8 * spread(blind)
+
+
+def test_a_possible_marker_gets_a_centre_and_changes_no_other():
+    rng = np.random.default_rng(24)
+    draw, centres = stop_of(rng, 9.0, 5, sigma=0.006)
+    cloud, candidates = draw(rng)
+    last = candidates.candidates[-1]
+    possible = Rejection(
+        p_base=last.p_base_rough, n_points=len(last.members), reason="", members=last.members
+    )
+    others = replace(candidates, candidates=candidates.candidates[:-1])
+    alone = fit_markers("along_beam", cloud, others, CONFIG, RADIUS)
+    both = fit_markers("along_beam", cloud, replace(others, possible=(possible,)), CONFIG, RADIUS)
+    for one, other in zip(alone.fits, both.fits, strict=True):
+        np.testing.assert_array_equal(one.p_base, other.p_base)
+    assert alone.possible_fits == ()
+    (fit,) = both.possible_fits
+    assert fit.name == "P01"
+    error = fit.p_base - centres[-1]
+    assert error @ np.linalg.solve(fit.cov_p_base, error) < chi2.isf(1e-4, 3)
 
 
 def test_the_range_error_that_all_centres_share_has_a_sigma():
