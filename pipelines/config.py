@@ -61,7 +61,7 @@ class StitchingConfig:
     range_min : float
         Returns nearer than this are the rover itself [m]. 0.9: the VLP-16's own minimum.
     range_max : float
-        Returns farther than this cannot show a 0.2 m sphere with enough points [m].
+        Returns farther than this are not used [m]. 100: the VLP-16's own maximum.
     sigma_levelling : float
         Standard deviation of the AHRS's roll and pitch [rad]. 0.2 deg: data sheet of the
         MTi-G-710 for static use.
@@ -75,7 +75,7 @@ class StitchingConfig:
     """
 
     range_min: float = 0.9
-    range_max: float = 60.0
+    range_max: float = 100.0
     sigma_levelling: float = math.radians(0.2)
     sigma_clock: float = 0.03
     rest: float = 3.0
@@ -110,7 +110,8 @@ class ExtractionConfig:
         their probabilities of being none add up to at most this. Others whose probability is 0.9 or
         more are possible markers. 0.01: one false marker in a hundred scans.
     range_max : float
-        Markers are not looked for beyond this distance [m]. 35: fewer than six returns there.
+        Markers are not searched for beyond this distance [m]. 100: as far as the sensor measures;
+        ``n_points_min`` limits smaller spheres to less, those of 0.1 m to 35 m in a usual turn.
     """
 
     ground_cell: float = 0.25
@@ -118,7 +119,7 @@ class ExtractionConfig:
     scatter_max: float = 0.035
     n_points_min: int = 6
     false_rate: float = 0.01
-    range_max: float = 35.0
+    range_max: float = 100.0
 
     def __post_init__(self) -> None:
         _check("extraction.ground_cell", self.ground_cell, 0.05, 2.0)
@@ -126,7 +127,7 @@ class ExtractionConfig:
         _check("extraction.scatter_max", self.scatter_max, 0.001, 0.1)
         _check("extraction.n_points_min", self.n_points_min, 4, 1000)
         _check("extraction.false_rate", self.false_rate, 1e-9, 0.5)
-        _check("extraction.range_max", self.range_max, 1.0, 100.0)
+        _check("extraction.range_max", self.range_max, 1.0, 300.0)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

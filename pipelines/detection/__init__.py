@@ -121,13 +121,13 @@ def extract(
     near = _n_neighbours(groups, marker_radius)
     passed = [i for i, reason in enumerate(reasons) if not reason]
     centres = np.array([groups[i].p_base for i in passed]).reshape(-1, 3)
-    gathered, hearing = gather_evidence(cloud, cells.directions, centres, target)
+    gathered, hearing = gather_evidence(cloud, cells, centres, target)
     evidence = dict(zip(passed, gathered, strict=True))
     for i in passed:
         reasons[i] = reason_by_evidence(groups[i], evidence[i], target)
     compared = [_Compared(groups[i], evidence[i], near[i]) for i in passed if not reasons[i]]
     logs = _log_likelihoods(compared, noise_of(groups), hearing, config, target)
-    judgements = judged(logs)
+    judgements = judged(logs, [one.features.n_points for one in compared])
     is_sure = sure_ones([one.probability for one in judgements], config.false_rate)
     usual = reflectivity_of(
         [one.evidence for one, sure in zip(compared, is_sure, strict=True) if sure]

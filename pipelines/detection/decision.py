@@ -32,6 +32,8 @@ _SIGMAS = 3.5  # standard deviations at which reflectivity differs
 _SHADE = 0.25  # standard deviation, as a share, of one return's reflectivity: partly lit beams
 _DIFFERENT = 0.25  # share by which the reflectivity of a marker may differ from that of the others
 _N_LARGE, _N_KNOWN = 30, 3  # returns that show the noise of a scan, and groups that agree
+_N_LEAST, _N_MOST = 6.0, 2500.0  # returns of the farthest and of the nearest markers
+_SCATTERED = 0.5  # share of other objects that lie anywhere, and not where markers are put
 _N_PRIOR = 5.0  # places that the usual abundance of a hypothesis counts for in a scan
 _SURELY = 3.0  # logarithm of odds of a sphere that shows the optics of a scan
 _EDGE_VARIES = 0.15  # half widths of a beam, between the markers of a scan
@@ -212,12 +214,17 @@ def edge_of(edges: Array, log_likelihoods: Array) -> tuple[float, float]:
     return middle, float(np.hypot(_EDGE_VARIES, 1.25 * spread / sqrt(len(own))))
 
 
-def judged(log_likelihoods: Array) -> list[Judgement]:
+def judged(log_likelihoods: Array, n_returns: Sequence[int]) -> list[Judgement]:
     """Return what the groups of a scan are, given the likelihood of each by each hypothesis.
 
     How often a scan shows each hypothesis is estimated from all its groups (empirical Bayes): among
-    trees, a group that might be leaves is rather leaves.
+    trees, a group that might be leaves is rather leaves. With the distance the ground grows that
+    may hold other objects, while markers are put at all distances alike, in the logarithm.
     """
+    n = np.maximum(np.asarray(n_returns, np.float64), _N_LEAST)  # densities: 1 / n^2 and 1 / n
+    odds = _SCATTERED * _N_LEAST * np.log(_N_MOST / _N_LEAST) / n + 1.0 - _SCATTERED
+    log_likelihoods = log_likelihoods.copy()
+    log_likelihoods[:, 1:] += np.log(odds)[:, None]
     _, posteriors = shares_of(log_likelihoods)
     return [judgement_of(own, NAMES) for own in posteriors]
 

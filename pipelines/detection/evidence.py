@@ -16,9 +16,11 @@ from spheremark.pipelines.compilation import compiled
 from spheremark.pipelines.detection.cells import (
     N_DIRECTIONS,
     N_DIRECTIONS_SIDE,
+    Cells,
     direction_cells,
     rows_in,
 )
+from spheremark.pipelines.detection.ground import heights_above
 from spheremark.pipelines.detection.pulses import (
     Clock,
     Hearing,
@@ -44,7 +46,6 @@ _ON = (-1.3, 0.3)  # radii of depth within which a return may lie on the sphere
 _PLACE = 0.1  # radii: beams nearer to each other than this pass at the same place
 _MEAN_WIDTH = 0.75  # of the greater half width of a beam: in any direction
 _TINY = 1e-6
-_ROUGH, _SLOPE = 0.05, 0.1  # [m] of the ground, and its tilt
 _OBSTRUCTED = 3.0  # ratio of beams below it that end nearer to those that go past
 _UNKNOWN = Hearing(lost=1.0, weakest=0.0)
 
@@ -84,8 +85,8 @@ class Evidence(NamedTuple):
     blur : (2,)
         Half the width of a beam across and up the line of sight [m].
     height, sigma_height : float
-        Height of the centre above what is seen just before it, and its standard deviation as a
-        height above the ground [m]; infinite where nothing is seen there.
+        Height of the centre above the ground about it, and its standard deviation [m]; infinite
+        where too little ground is seen.
     """
 
     n_on: int
@@ -100,8 +101,8 @@ class Evidence(NamedTuple):
     faces: Array
     silent: Array | None
     blur: Array
-    height: float
-    sigma_height: float
+    height: float = np.nan
+    sigma_height: float = np.inf
 
     @property
     def is_open_below(self) -> bool:
@@ -124,7 +125,7 @@ class Evidence(NamedTuple):
 
 
 def gather_evidence(
-    cloud: StitchedCloud, directions: NDArray[np.uint16], centres: Array, target: Target
+    cloud: StitchedCloud, cells: Cells, centres: Array, target: Target
 ) -> tuple[list[Evidence], Hearing]:
     """Return the beams towards and about some centres, and how well the scan hears its echoes."""
     if not len(centres):
@@ -136,11 +137,12 @@ def gather_evidence(
     is_wanted, cones = starts[1:] > starts[:-1], _cones(centres, target)
 
     def towards(first: int, end: int) -> _Groups:
-        rows, own = rows_in(directions, is_wanted, first, end)
+        rows, own = rows_in(cells.directions, is_wanted, first, end)
         groups: _Groups = _rows_in_cones(cloud.p_base, rows, own, starts, owners, cones)
         return groups
 
-    parts = side_by_side(towards, len(directions))
+    parts = side_by_side(towards, len(cells.directions))
+    heights = heights_above(cells, centres)
 
     def gathered(first: int, end: int) -> list[Evidence]:
         return [
@@ -150,7 +152,7 @@ def gather_evidence(
                 np.concatenate([rows[begin[i] : begin[i + 1]] for begin, rows in parts]),
                 centres[i],
                 target,
-            )
+            )._replace(height=float(heights[i, 0]), sigma_height=float(heights[i, 1]))
             for i in range(first, end)
         ]
 
@@ -170,7 +172,6 @@ def _evidence_at(
     if clock is not None:
         silent = unheard_about(cloud, clock, rows, c, target)
         n_past += n_beside_pole(silent / target.radius, blur_at(c, target) / target.radius)
-    height, sigma_height = _height_above_ground(cloud.p_base, rows, seen, c, target)
     is_left = np.cos(angles) * c[1] > np.sin(angles) * c[0]
     return Evidence(
         n_on=n_on,
@@ -185,32 +186,7 @@ def _evidence_at(
         faces=np.where(is_left, 0.5, -0.5),
         silent=silent,
         blur=_half_widths(cloud.rig, angles, c, target),
-        height=height,
-        sigma_height=sigma_height,
     )
-
-
-@compiled
-def _height_above_ground(
-    p_base: Column, rows: NDArray[np.int32], seen: Array, c: Array, target: Target
-) -> tuple[float, float]:
-    """Return the height of a centre above what is seen just below and before it, and its sigma [m].
-
-    The nearest return decides; between it and the place the ground may rise or fall by a slope.
-    """
-    radius, height, sigma = target.radius, np.nan, np.inf
-    blur = blur_at(c, target) / radius
-    for i in range(len(rows)):
-        across, along, depth = seen[0, i] / radius, seen[1, i] / radius, seen[2, i] / radius
-        if depth > _HELD[1] or not is_beside_pole(abs(across), along, blur):
-            continue
-        p, q, r = p_base[rows[i], 0] - c[0], p_base[rows[i], 1] - c[1], p_base[rows[i], 2] - c[2]
-        up = p * target.up[0] + q * target.up[1] + r * target.up[2]
-        away = np.sqrt(max(p * p + q * q + r * r - up * up, 0.0))
-        own = _ROUGH + _SLOPE * away
-        if own < sigma:
-            height, sigma = -up, own
-    return height, sigma
 
 
 def _origins(rig: Rig, angles: Column) -> Array:

@@ -23,7 +23,7 @@ from spheremark.pipelines.detection.neighbourhoods import (
 from spheremark.pipelines.detection.seeds import thinned
 from spheremark.pipelines.detection.target import Target, View, blur_at, passing, seen_from, view_of
 from spheremark.pipelines.estimation.linear_algebra import invert
-from spheremark.pipelines.model import Array, Mask, StitchedCloud
+from spheremark.pipelines.model import Array, StitchedCloud
 from spheremark.pipelines.threads import side_by_side
 
 NOISE_MIN = 0.006
@@ -41,7 +41,6 @@ _N_THREADED = 20  # places from which on a second thread gains
 _N_SAMPLE = 1500  # returns in the cells about a seed that decide whether it is plausible
 _N_WHOLE = 2000  # returns there that are taken without sampling
 _NORMAL = 1.4826  # standard deviations of the normal distribution in a median deviation
-_OUTLIER_SIGMAS = 4.0
 _N_STEPS = 6  # of a fit that only has to classify
 # Limits of the radius in a fit, in radii
 _KNOWN_RADIUS, _FREE_RADIUS = (1.0, 1.0), (0.3, 3.0)
@@ -70,12 +69,8 @@ class Features(NamedTuple):
         Radius when it is estimated too, and its standard deviation [m].
     scatter_free : float
         Robust standard deviation along the beams about the sphere of that radius [m].
-    gain_free : float
-        Likelihood ratio of free against known radius: chi-square with one degree of freedom.
-    flat_across, sigma_across : float
-        Share of the curvature across that is missing: 0 a sphere, 1 a plane.
-    flat_along, sigma_along : float
-        The same along the vertical: 0 a sphere, 1 a post.
+    flat_across, flat_along : float
+        Share of the curvature across and along the vertical that is missing: 0 a sphere, 1 a plane.
     blur : float
         Half the width of a beam there [m].
     """
@@ -93,11 +88,8 @@ class Features(NamedTuple):
     radius_free: float
     sigma_radius: float
     scatter_free: float
-    gain_free: float
     flat_across: float
-    sigma_across: float
     flat_along: float
-    sigma_along: float
     blur: float
 
     @property
@@ -244,7 +236,7 @@ def _is_resolved(rays: Array, c: Array, target: Target, every: float) -> bool:
 
 @compiled
 def _measured(nearby: SortedReturns, places: Array, target: Target) -> Array:
-    """Return the fields of ``Features`` near places, (k, 19); zeros without a sphere there."""
+    """Return the fields of ``Features`` near places, (k, 16); zeros without a sphere there."""
     out = np.zeros((len(places), _N_FIELDS))
     for k in range(len(places)):
         rays = rays_near(nearby, runs_about(nearby, places[k]), places[k], 1.0)
@@ -266,23 +258,18 @@ def _measure(rays: Array, start: Array, target: Target, out: Array) -> None:
     if n < _N_FIT_MIN:
         return
     noise = max(rms, NOISE_MIN)
-    flat, cov_flat = _flatness(seen, residuals, weights, radius)
     c_free, radius_free, cov_free = _fit(rays, c, target, _FREE_RADIUS)
     seen_free = seen_from(rays, view_of(c_free, target.up))
     residuals_free = _residuals(seen_free, radius_free)
     scatter_free = _scatter(seen_free, residuals_free, radius_free)
-    weights_free = _weights(seen_free, residuals_free, radius_free, blur, scatter)
     out[0], out[1], out[2] = c[0], c[1], c[2]
     out[3], out[4] = n, _count_unexplained(seen, weights, radius)
     out[5], out[6] = _count_surroundings(rays, c, target)
     out[7], out[8], out[9] = rms, _extent(seen[0], weights), _extent(seen[1], weights)
     out[10], out[11] = radius_free, noise * np.sqrt(cov_free[3, 3])
     out[12] = scatter_free
-    is_in = (weights > 0.0) | (weights_free > 0.0)
-    out[13] = _gain(residuals, residuals_free, is_in, _OUTLIER_SIGMAS * max(scatter, scatter_free))
-    out[14], out[15] = flat[3], noise * np.sqrt(cov_flat[3, 3])
-    out[16], out[17] = flat[4], noise * np.sqrt(cov_flat[4, 4])
-    out[18] = blur
+    out[13], out[14] = _flatness(seen, residuals, weights, radius)
+    out[15] = blur
 
 
 @compiled
@@ -294,22 +281,6 @@ def _weighted_rms(residuals: Array, weights: Array) -> tuple[int, float]:
         total += weights[i]
         squares += weights[i] * (residuals[i] * residuals[i])
     return n, np.sqrt(squares / total)
-
-
-@compiled
-def _gain(residuals: Array, others: Array, is_in: Mask, limit: float) -> float:
-    """Return the likelihood ratio of two sets of residuals with unknown noise.
-
-    Residuals beyond the limit are outliers and count as the limit.
-    """
-    n, known, free = 0, 0.0, 0.0
-    for i in range(len(residuals)):
-        if is_in[i]:
-            n += 1
-            known += min(abs(residuals[i]), limit) ** 2
-            free += min(abs(others[i]), limit) ** 2
-    least = n * NOISE_MIN**2
-    return max(n - 4, 0) * float(np.log(max(known, least) / max(free, least)))
 
 
 @compiled
@@ -467,9 +438,9 @@ def _normal_equations(
 
 
 @compiled
-def _flatness(seen: Array, residuals: Array, weights: Array, radius: float) -> tuple[Array, Array]:
-    """Return centre and missing curvatures, and their covariance for unit noise."""
-    N, rhs, J, flat = np.zeros((5, 5)), np.zeros(5), np.zeros(5), np.zeros(5)
+def _flatness(seen: Array, residuals: Array, weights: Array, radius: float) -> tuple[float, float]:
+    """Return the shares of the curvatures across and along the vertical that are missing."""
+    N, rhs, J, across, along = np.zeros((5, 5)), np.zeros(5), np.zeros(5), 0.0, 0.0
     for j in range(5):
         N[j, j] = 1e-6
     for i in range(len(weights)):
@@ -485,10 +456,9 @@ def _flatness(seen: Array, residuals: Array, weights: Array, radius: float) -> t
                 for k in range(5):
                     N[j, k] += weights[i] * J[j] * J[k]
     invert(N, N)
-    for j in range(5):
-        for k in range(5):
-            flat[j] += N[j, k] * rhs[k]
-    return flat, N
+    for k in range(5):
+        across, along = across + N[3, k] * rhs[k], along + N[4, k] * rhs[k]
+    return across, along
 
 
 @compiled

@@ -18,6 +18,9 @@ _WINDOW = 4  # cells each way of the opening: rocks up to twice this are not gro
 _STEP = 0.10  # [m] that a cell's lowest point may lie above the opened surface
 _CELLS_MIN = 9  # a marker seen alone covers at most 6 cells: that is not yet ground
 _RISE = 0.15  # [m] that ground may rise above its cell of the opened grid: tops of mounds
+_AROUND = 24  # cells each way about a place whose ground may show its height
+_ROUGH, _SLOPE, _TILT = 0.05, 0.05, 0.2  # [m] of the ground, how it bends away, tangent of tilts
+_LOW, _REACHES = 0.2, (0.8, 0.4, 0.2, 0.2)  # share of cells, and heights [m], that may be ground
 
 
 class Ground(NamedTuple):
@@ -49,6 +52,42 @@ def ground_of(cloud: StitchedCloud, cells: Cells, config: ExtractionConfig) -> G
     )
     points = np.concatenate([points for points, _ in parts])
     return Ground(points, max(highest, *(part[1] for part in parts)))
+
+
+def heights_above(cells: Cells, places: Array) -> Array:
+    """Return heights of places above the ground about each, and their sigmas, (n, 2) [m].
+
+    Sigmas are infinite where too little ground is seen within some metres.
+    """
+    n_side, edge, _ = cells.layout
+    found = np.full((len(places), 2), (np.nan, np.inf))
+    for i, (x, y, z) in enumerate(places @ cells.R_station_base.T):
+        row, column = (int(np.floor(a / edge)) + n_side // 2 for a in (x, y))
+        rows = slice(max(row - _AROUND, 0), row + _AROUND + 1)
+        columns = slice(max(column - _AROUND, 0), column + _AROUND + 1)
+        near = cells.lowest[rows, columns]
+        at = np.argwhere(near < np.inf)
+        if len(at) >= _CELLS_MIN:
+            off = (at + [rows.start, columns.start] + 0.5 - n_side // 2) * edge - (x, y)
+            height, sigma = _plane_below(off, near[tuple(at.T)].astype(np.float64))
+            found[i] = z - height, sigma
+    return found
+
+
+def _plane_below(off: Array, lowest: Array) -> tuple[float, float]:
+    """Return the height of the ground at the origin, by a plane through lowest points, and sigma.
+
+    What stands on the ground is left out step by step, from a low level plane on.
+    """
+    J = np.column_stack([np.ones(len(off)), off])
+    precisions = 1.0 / (_ROUGH + _SLOPE * np.hypot(*off.T)) ** 2
+    plane, cov = np.array([np.quantile(lowest, _LOW), 0.0, 0.0]), np.eye(3)
+    for reach in _REACHES:
+        residuals = lowest - J @ plane
+        weights = precisions * (abs(residuals) < reach)
+        cov = np.linalg.inv((J * weights[:, None]).T @ J + np.diag([1e-6, *2 * [_TILT**-2.0]]))
+        plane = cov @ (J.T @ (weights * lowest))
+    return float(plane[0]), float(np.sqrt(_ROUGH**2 + _CELLS_MIN * cov[0, 0]))
 
 
 def _lowest_about(values: Column, window: int) -> Column:

@@ -86,9 +86,9 @@ _SHOULDERS = (5.0, 0.3, 0.001)  # every head has them
 _SHARES_BELOW = (_OPEN, _OPEN, _CLOSED, _SHOULDERS, _OPEN, _ANY, _OPEN, _ANY, _ANY)
 _SHARES_BESIDE = (*(_OPEN,) * 7, _ANY, _ANY)
 _HEIGHTS = 2.5  # [m] up to which markers stand
-_LEAST_HEIGHTS = {_HEAD: 10.0, _BALL: 1.0, _SPHERE: 1.0, _CYLINDER: 1.0, _BOX: 1.0}
+_LEAST_HEIGHTS = {_HEAD: 10.0, _BALL: 1.0, _SPHERE: 3.0, _CYLINDER: 1.0, _BOX: 1.0}
 _BOULDER_HEIGHT = (0.3, 0.6)  # radii: centre above the ground, and standard deviation
-_NOT_GROUND = 0.1  # probability that what is just before a place is not the ground it stands on
+_NOT_GROUND = 0.1  # probability that the ground about a place is not what it stands on
 
 _N_NEAR_FREE = 0.2  # groups near what stands free, in the mean
 _CROWDED = 5.0 / 6.0  # odds of one more group near leaves, panels and posts: five in the mean
@@ -266,7 +266,7 @@ def _neighbour_probability(kind: int, n: int) -> float:
 
 
 def _height_density(kind: int, height: float, sigma: float, radius: float) -> float:
-    """Return the density of the height of a centre above the ground before it [1/m]."""
+    """Return the density of the height of a centre above the ground about it [1/m]."""
     unknown = 1.0 / _HEIGHTS
     if not sigma < _HEIGHTS:
         return unknown

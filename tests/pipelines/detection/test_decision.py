@@ -25,8 +25,7 @@ def features(n_points=70, scatter_free=0.0075, **changes):
     seen = Features(
         x=10.0, y=0.0, z=0.5, n_points=n_points, n_unexplained=0, n_beside=0, n_below=0,
         scatter=0.0075, width=0.2, height=0.19, radius_free=0.1, sigma_radius=0.0009,
-        scatter_free=scatter_free, gain_free=0.0, flat_across=0.0, sigma_across=0.05,
-        flat_along=0.0, sigma_along=0.05, blur=0.015,
+        scatter_free=scatter_free, flat_across=0.0, flat_along=0.0, blur=0.015,
     )  # fmt: skip
     return seen._replace(**changes)
 
@@ -74,6 +73,9 @@ def test_of_a_ball_two_thirds_may_be_hidden():
     assert "hidden" in refusal(features(n_points=25), evidence(n_on=25, n_before=55))
 
 
+MANY = 40  # returns
+
+
 def likelihoods(*sphere_over_others):
     """Logarithms of likelihoods of groups whose other hypotheses are all alike."""
     found = np.zeros((len(sphere_over_others), len(NAMES)))
@@ -84,20 +86,26 @@ def likelihoods(*sphere_over_others):
 def test_probabilities_follow_the_likelihoods_and_name_the_best_other_hypothesis():
     found = likelihoods(12.0, 3.0, -4.0)
     found[2, NAMES.index("head on shoulders")] = 2.0
-    sure, doubtful, head = judged(found)
+    sure, doubtful, head = judged(found, [MANY] * 3)
     assert sure.probability > 0.999 > doubtful.probability > head.probability
     assert head.hypothesis.startswith("head on shoulders: ")
     assert head.reason.startswith("Head on shoulders: ")
     assert "likelier than a marker" in head.reason
-    assert judged(likelihoods()) == []
+    assert judged(likelihoods(), []) == []
 
 
 def test_among_trees_a_group_that_may_be_leaves_is_rather_leaves():
     doubtful = likelihoods(4.0)
     leaves = likelihoods(*[-30.0] * 20)
     leaves[:, NAMES.index("foliage or other clutter")] = 5.0
-    alone = judged(doubtful)[0].probability
-    assert judged(np.vstack([doubtful, leaves]))[0].probability < alone
+    alone = judged(doubtful, [MANY])[0].probability
+    assert judged(np.vstack([doubtful, leaves]), [MANY] * 21)[0].probability < alone
+
+
+def test_of_what_is_far_less_is_a_marker_than_of_what_is_near():
+    """Twice the distance is a quarter of the returns, and four times the ground."""
+    near, far = (judged(likelihoods(6.0), [n])[0].probability for n in (400, 8))
+    assert near > far > 0.9
 
 
 def test_markers_hold_no_more_false_ones_than_wanted():

@@ -9,7 +9,8 @@ from scipy import ndimage
 
 from spheremark.pipelines.config import ExtractionConfig
 from spheremark.pipelines.detection import extract
-from spheremark.pipelines.detection.ground import _lowest_about, _n_about
+from spheremark.pipelines.detection.cells import cells_of
+from spheremark.pipelines.detection.ground import _lowest_about, _n_about, heights_above
 from spheremark.pipelines.geometry import levelling_rotation
 from spheremark.pipelines.model import RING_UNKNOWN, Levelling
 from tests.pipelines.synthetic_stop import RADIUS, World, ring_of_markers, scan
@@ -93,6 +94,20 @@ def test_what_looks_like_a_marker_is_refused_with_a_reason(found, place, words):
     near = [r for r in found.rejected if np.linalg.norm(r.p_base - place) < 0.2]
     assert near
     assert any(word in near[0].reason for word in words.split("|"))
+
+
+def test_heights_of_places_are_above_the_plane_of_the_ground_among_stones(cloud):
+    heights, sigmas = heights_above(cells_of(cloud, CONFIG), MARKERS).T
+    assert (np.abs(heights - (MARKERS[:, 2] - GROUND)) < 3.0 * sigmas).all()
+    assert sigmas.max() < 0.2
+
+
+def test_spheres_are_found_as_far_as_they_have_returns():
+    places = np.array([[40.0, 0.0, 1.2], [0.0, 48.0, 1.2], [-55.0, 0.0, 1.2]])
+    world = World(balls=tuple((tuple(p), 0.4) for p in places), ground=GROUND)
+    far = extract(scan(world, np.random.default_rng(3), sigma=0.01), CONFIG, 0.4)
+    assert len(far.candidates) == len(places)
+    assert_allclose(gaps(far, places).min(axis=0), 0, atol=0.06)
 
 
 def test_a_ball_of_another_size_is_no_marker(found):
