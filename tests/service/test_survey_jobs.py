@@ -151,6 +151,25 @@ def test_every_control_mark_is_left_out_in_turn(tied, free, rows):
     assert not rows("control_checks", free)
 
 
+def test_the_evidence_of_all_stations_is_in_rows_a_file_and_on_the_page(site, tied, rows):
+    decisions, evidence = rows("mark_decisions", tied), rows("mark_evidence", tied)
+    used = {row["mark"] for row in rows("adjusted_marks", tied)}
+    assert {row["mark"] for row in decisions if row["is_used"]} == used
+    for one in decisions:
+        own = [row for row in evidence if row["mark"] == one["mark"]]
+        total = one["log_odds_prior"] + one["log_odds_radius"]
+        assert total + sum(row["log_odds"] for row in own) == pytest.approx(one["log_odds"])
+        assert one["n_marker"] == sum(row["finding"] == "marker" for row in own)
+    assert {row["decision"] for row in decisions if row["is_used"]} == {"confirmed"}
+    (whole,) = rows("adjustments", tied)
+    url = f"/api/v1/adjustments/{whole['adjustment_id']}"
+    written = site.client.get(f"{url}/files/evidence.csv").text.splitlines()
+    assert len(written) == 1 + len(evidence)
+    assert len(site.client.get(url).json()["mark_evidence"]) == len(evidence)
+    page = site.client.get(f"/adjustments/{whole['adjustment_id']}").text
+    assert "Evidence of all stations" in page
+
+
 def test_what_is_not_used_stands_in_the_rows_with_a_reason(tied, rows):
     found = rows("adjusted_observations", tied)
     assert {row["kind"] for row in found} == {"centre", "gravity", "control"}
