@@ -391,7 +391,7 @@ def test_a_log_without_returns_is_refused(rng):
 def test_a_log_with_all_returns_too_near_is_refused(rng):
     rig = crooked_rig(rng)
     log, _ = scan_log(rng, rig)
-    with pytest.raises(RecordingError, match=r"from 0\.9 to 60\.0 m"):
+    with pytest.raises(RecordingError, match=r"from 0\.9 to 100\.0 m"):
         stitch(replace(log, p_lidar=log.p_lidar / 100), rig, CONFIG)
 
 
