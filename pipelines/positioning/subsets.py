@@ -261,7 +261,9 @@ def _by_pose(
             off = base[chosen] + (T[:, None, :3, 3] - goals[chosen]) @ T[:, :3, :3]
             tilt = (T[:, :2, :3] @ plumb) @ level
             up = (tilt[:, None] @ T[:, :2, :3])[:, 0] @ turn
-            return np.asarray(-(off.reshape(len(off), 1, -1) @ weighted)[:, 0] - up)
+            return np.asarray(
+                -(off.reshape(len(off), 1, 3 * chosen.shape[1]) @ weighted)[:, 0] - up
+            )
 
         def move(T: Array, xi: Array) -> Array:
             return np.asarray(T @ moved(np.tile(np.eye(4), (len(T), 1, 1)), xi))
