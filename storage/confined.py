@@ -434,6 +434,7 @@ def _main() -> None:
     """Answer the request that is the argument, or those that come, by forks."""
     if sys.argv[1] == "--ready":
         _serve(sys.argv[2], socket.socket(fileno=os.dup(0)))
+        os._exit(0)  # what is frozen is never freed, and libraries would report it
     else:
         _answer(json.loads(sys.argv[1]))
 

@@ -30,6 +30,7 @@ from spheremark.storage.scratch import remove_abandoned as remove_scratch
 from spheremark.storage.upkeep import remove_abandoned
 
 _PLANS = 2  # that are computed at once
+_WARM_SECONDS = 20.0  # that the end waits for what the start still loads; seconds, once compiled
 _Result = TypeVar("_Result")
 
 
@@ -87,7 +88,8 @@ async def opened(settings: Settings) -> AsyncIterator[Service]:
         remove_scratch()
         await asyncio.to_thread(remove_abandoned, catalogue, data)
         async with JobQueue(settings, catalogue, data / "clouds") as jobs:
-            threading.Thread(target=_warm_up, name="warm-up", daemon=True).start()
+            warming = threading.Thread(target=_warm_up, name="warm-up", daemon=True)
+            warming.start()
             await asyncio.to_thread(adopt_orphans, catalogue, inbox)
             planner = Planner(catalogue)
             predictions = Predictions(
@@ -111,6 +113,7 @@ async def opened(settings: Settings) -> AsyncIterator[Service]:
                 for places in (service.readers, service.queries, service.plans):
                     places.close()
                 service.arrivals.shutdown(wait=False, cancel_futures=True)
+                await asyncio.to_thread(warming.join, _WARM_SECONDS)
                 end_children()
                 await asyncio.to_thread(service.arrivals.shutdown)  # no row after the database
                 await asyncio.to_thread(predictions.close)

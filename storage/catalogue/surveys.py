@@ -110,12 +110,8 @@ class Surveys(Lists):
 
     def get_survey(self, key: str) -> SurveyRecord:
         """Return a survey by its id or its name; NotFoundError if there is none."""
-        return self.computed(
-            ("survey", key),
-            lambda: record_of(
-                SurveyRecord, self._one(_SURVEY_BY_KEY, {"key": key}, f"survey {key!r}")
-            ),
-        )
+        row = self._one(_SURVEY_BY_KEY, {"key": key}, f"survey {key!r}")
+        return record_of(SurveyRecord, row)
 
     def list_surveys(self, *, after: str | None = None, limit: int = 100) -> Page[SurveyRecord]:
         """Return a page of the surveys, newest first; ``after`` is ``next`` of the page before."""

@@ -13,7 +13,6 @@ from spheremark.pipelines.positioning.matching import (
     match_marks,
     moved,
     observe,
-    solve_pose,
     solve_poses,
 )
 from tests.synthetic import control, field, marker_fit, pose, sightings
@@ -240,9 +239,9 @@ def test_many_poses_at_once_are_those_of_each_alone(rng):
     found = solve_poses(scene, pairs, start)
     assert found.is_settled.all()
     for one, T, cov in zip(pairs, found.estimates, found.covs, strict=True):
-        alone = solve_pose(scene, one, start)
-        np.testing.assert_allclose(T, alone.estimate, rtol=0, atol=1e-9)
-        np.testing.assert_allclose(cov, alone.cov, rtol=1e-6, atol=1e-14)
+        alone = solve_poses(scene, one[None], start)
+        np.testing.assert_allclose(T, alone.estimates[0], rtol=0, atol=1e-9)
+        np.testing.assert_allclose(cov, alone.covs[0], rtol=1e-6, atol=1e-14)
 
 
 def test_a_mark_that_is_no_number_spoils_no_other_pose(rng):
