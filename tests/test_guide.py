@@ -1,10 +1,12 @@
-"""The guide: its recipes run, its commands exist, its links lead somewhere, its terms are known."""
+"""The guide and the README: recipes run, commands, addresses, files and terms exist."""
 
 import re
 from pathlib import Path
 
 import pytest
+from starlette.routing import Match
 
+from spheremark.service.http.app import create_app
 from spheremark.service.settings import Settings
 from spheremark.storage.catalogue.catalogue import Catalogue
 from spheremark.storage.catalogue.sandbox import run_query
@@ -14,12 +16,30 @@ from tests.surveyed import fill
 ROOT = Path(__file__).parents[1]
 GUIDE = ROOT / "web/guide"
 PAGES = sorted(GUIDE.glob("*.md"))
+TEXTS = [ROOT / "README.md", *PAGES]
 RECIPES = re.findall(r"## (.+?)\n.*?```sql\n(.*?)```", (GUIDE / "sql.md").read_text(), re.S)
 COMMANDS = [
     (page.name, line)
-    for page in PAGES
-    for line in re.findall(r"(?:^|`)(spheremark (?!takes)[a-z].*?)(?:`|$)", page.read_text(), re.M)
+    for page in TEXTS
+    for line in re.findall(
+        r"(?:^|`)(spheremark (?!takes|finds|$)[a-z].*?)(?:`|#|$)", page.read_text(), re.M
+    )
 ]
+ADDRESSES = sorted(
+    {
+        (page.name, address)
+        for page in TEXTS
+        for address in re.findall(
+            r"(?:http://127\.0\.0\.1:8000|`(?:GET |POST |PUT |DELETE )?)(/[\w/.-]*)",
+            page.read_text(),
+        )
+        if address != "/tf_static"  # a topic
+    }
+)
+FILES = re.findall(
+    r"`((?:pipelines|storage|web|service|tests)/[\w/.]+)`",
+    "".join((ROOT / name).read_text() for name in ("README.md", "CONTRIBUTING.md")),
+)
 
 
 @pytest.fixture(scope="module")
@@ -42,10 +62,28 @@ def test_each_command_and_its_options_are_in_the_reference(page, line):
     reference = (ROOT / "REFERENCE.md").read_text()
     words = line.split()
     command = next(
-        part for part in reference.split("\n### ") if part.startswith(f"`spheremark {words[1]}`")
+        part
+        for part in reference.split("\n### ")
+        if part.startswith((f"`spheremark {words[1]}`", f"`spheremark {' '.join(words[1:3])}`"))
     )
     for option in (word for word in words if word.startswith("-")):
         assert option in command, f"{page}: {line}"
+
+
+@pytest.fixture(scope="module")
+def routes():
+    return create_app(Settings()).routes
+
+
+@pytest.mark.parametrize(("page", "address"), ADDRESSES)
+def test_each_address_has_a_route(routes, page, address):
+    scope = {"type": "http", "method": "GET", "path": address, "headers": []}
+    assert any(route.matches(scope)[0] != Match.NONE for route in routes), f"{page}: {address}"
+
+
+@pytest.mark.parametrize("name", [name for name in FILES if "NAME" not in name])
+def test_each_file_that_is_named_exists(name):
+    assert (ROOT / name).exists()
 
 
 def test_links_between_pages_lead_to_pages_that_there_are():
