@@ -46,8 +46,12 @@ app = typer.Typer(
     add_completion=False,
     context_settings={"help_option_names": ["-h", "--help"]},
 )
-app.add_typer(plan, name="plan")
-app.add_typer(token, name="token")
+# Groups of commands in the help
+_START, _LOGS, _RESULTS, _PLANS = "Start", "Logs to positions", "Results", "Plans"
+_KEEPING, _MEASURING = "Running a service", "Measuring this program"
+
+app.add_typer(plan, name="plan", rich_help_panel=_PLANS)
+app.add_typer(token, name="token", rich_help_panel=_KEEPING)
 
 _EXPORTS = "results.duckdb, or points as .csv, .dxf, .xml (LandXML) or .geojson."
 
@@ -111,7 +115,7 @@ def _print_error(sentence: str) -> None:
     err.print(sentence, markup=False, emoji=False, highlight=False, soft_wrap=True)
 
 
-@app.command()
+@app.command(rich_help_panel=_START)
 def demo() -> None:
     """Simulate, upload, process and serve one lane of the study's field."""
     from spheremark.service.cli.demo import run
@@ -119,11 +123,18 @@ def demo() -> None:
     run(_settings(), out)
 
 
-@app.command()
+@app.command(rich_help_panel=_START)
 def serve(
-    host: Annotated[str | None, typer.Option(help="Address to listen on.")] = None,
-    port: Annotated[int | None, typer.Option(help="Port; 0 takes a free one.")] = None,
-    data: Annotated[Path | None, typer.Option(help="Folder of database, logs and clouds.")] = None,
+    host: Annotated[
+        str | None, typer.Option(help="Address to listen on.", show_default="127.0.0.1")
+    ] = None,
+    port: Annotated[
+        int | None, typer.Option(help="Port; 0 takes a free one.", show_default="8000")
+    ] = None,
+    data: Annotated[
+        Path | None,
+        typer.Option(help="Folder of database, logs and clouds.", show_default="data"),
+    ] = None,
 ) -> None:
     """Run the service; every setting can come from the environment (SPHEREMARK_...)."""
     from spheremark.service.serving import serve as run
@@ -133,7 +144,7 @@ def serve(
     run(settings, ready=lambda address: err.print(f"Serving on [bold]{address}[/]"))
 
 
-@app.command()
+@app.command(rich_help_panel=_LOGS)
 def simulate(
     folder: Annotated[Path, typer.Argument(metavar="OUT", help="Folder for the logs.")],
     scenario: Annotated[
@@ -211,7 +222,7 @@ def simulate(
             sys.stdout.flush()
 
 
-@app.command()
+@app.command(rich_help_panel=_LOGS)
 @grouped
 def inspect(
     log: OneLog,
@@ -236,7 +247,7 @@ def inspect(
         raise typer.Exit(1)
 
 
-@app.command()
+@app.command(rich_help_panel=_LOGS)
 @grouped
 def process(
     logs: Logs,
@@ -313,17 +324,12 @@ def _result_log(path: Path | None) -> Iterator[Callable[[Sequence[StopResult]], 
         yield add
 
 
-app.command()(adjust)
-app.command()(calibrate)
-app.command()(site)
-app.command()(spheres)
-app.command()(report)
-app.command()(jobs)
-app.command()(watch)
-app.command()(bench)
+for command in (adjust, calibrate, site, spheres, watch):
+    app.command(rich_help_panel=_LOGS)(command)
+app.command(rich_help_panel=_RESULTS)(report)
 
 
-@app.command()
+@app.command(rich_help_panel=_RESULTS)
 def query(
     sql: Annotated[str, typer.Argument(help="One SELECT.")],
     url: Annotated[
@@ -349,7 +355,7 @@ def query(
         err.print(f"[yellow]Truncated:[/] only the first {result['row_limit']:,} rows are here.")
 
 
-@app.command()
+@app.command(rich_help_panel=_RESULTS)
 def export(
     target: Annotated[Path, typer.Argument(metavar="OUT", help=_EXPORTS)],
     url: Annotated[
@@ -373,9 +379,10 @@ def export(
     err.print(f"Wrote {target}.")
 
 
-app.command()(reproduce)
-for command in (doctor, backup, restore):
-    app.command()(command)
+for command in (jobs, doctor, backup, restore):
+    app.command(rich_help_panel=_KEEPING)(command)
+for command in (bench, reproduce):
+    app.command(rich_help_panel=_MEASURING)(command)
 
 
 if __name__ == "__main__":

@@ -70,6 +70,8 @@ def _default(parameter: Any) -> str:
     value = parameter.default
     if parameter.required:
         return "required"
+    if isinstance(parameter.show_default, str):
+        return parameter.show_default
     if value is None or value in ((), [], ""):
         return ""
     if isinstance(value, bool):

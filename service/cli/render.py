@@ -86,6 +86,8 @@ def print_preflight(out: Console, name: str, report: Preflight) -> None:
     out.print(f"[bold]{escape(name)}[/]: {_coloured(report.verdict)}")
     for reason in (*report.reasons, *report.notes, *report.diagnosis):
         _say(out, f"  {reason}")
+    if not report.topics:  # no log at all: its facts would be zeros
+        return
     facts = {
         "returns": f"{report.n_returns:,}",
         "duration [s]": _text(report.duration_s, 1, 1),

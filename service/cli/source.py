@@ -98,8 +98,9 @@ class Source:
         path = self._settings.database
         if not path.exists():
             raise InputError(
-                f"No service answers and there is no database in {self._settings.data}; start "
-                "`spheremark serve`, or name a place with --url or --data."
+                f"No service answers at {self._settings.address()}, and the folder "
+                f"{self._settings.data.resolve()} has no database. Start `spheremark serve`, name "
+                "the address of a service with --url, or a data folder with --data."
             )
         try:
             opened = Catalogue(path, snapshots=self._settings.snapshots)
