@@ -1,4 +1,4 @@
-"""The tables of a network, from its JSON, and the text report that they make."""
+"""The tests and tables of a network, from its JSON, and the text report that they make."""
 
 from __future__ import annotations
 
@@ -89,24 +89,63 @@ _RIG = (
 
 
 def report(network: Plain, title: str = "") -> str:
-    """Return the report of a network, from its JSON."""
-    parts = [*_summary(network, title)]
-    for table in (
+    """Return the report of a network as text, from its JSON."""
+    lines = [f"NETWORK ADJUSTMENT{'  ' + title if title else ''}", "=" * 78]
+    lines += [f"{name:<31} {value:>8}" for name, value in summary(network)]
+    lines += [*(f"WARNING: {one}" for one in network["warnings"]), ""]
+    for table in tables(network):
+        lines += [table.title, _RULE, *_aligned(table), *table.notes, ""]
+    return "\n".join(lines)
+
+
+def summary(network: Plain) -> list[tuple[str, str]]:
+    """Return what an adjustment is and whether its tests pass, as pairs of name and value."""
+    test, factors, sigma0 = network["global_test"], network["variance_factors"], network["sigma0"]
+    passed = "passed" if network["passes_global_test"] else "FAILED"
+    pairs = [
+        ("Stations", str(len(network["stations"]))),
+        ("Marks", str(len(network["marks"]))),
+        ("Observations (coordinates)", str(network["n_observations"])),
+        ("Unknowns", str(network["n_unknowns"])),
+        ("Defect of the datum", str(network["datum"]["defect"])),
+        ("Degrees of freedom", str(network["dof"])),
+        ("Sigma0 a priori", "1.000"),
+        ("Sigma0 a posteriori", _number(sigma0)),
+        *((f"Variance factor of {kind}", _number(factor)) for kind, factor in factors.items()),
+        ("Global test (chi-square)", passed),
+        ("  level, v'Pv, limit", f"{test['level']:g}, {test['vtpv']:.1f}, {test['limit']:.1f}"),
+        ("Limit of the local test (w)", f"{network['critical_w']:.2f}"),
+        ("Sigmas and ellipses", "a priori; not scaled by the result of the test"),
+        ("Datum", network["datum"]["text"]),
+    ]
+    if bias := network["range_bias"]:
+        value, sigma, prior = (1e3 * bias[k] for k in ("value_m", "sigma_m", "sigma_a_priori_m"))
+        text = f"{value:.2f} mm, sigma {sigma:.2f} mm (a priori {prior:.2f} mm)"
+        pairs.append(("Range bias of all stations", text))
+    return pairs
+
+
+def tables(network: Plain) -> list[Table]:
+    """Return all tables of a report."""
+    return [
         *places(network),
         *evidence(network),
-        *tables_of_observations(network),
+        *_observations(network),
         *checks(network),
         *_rest(network),
-    ):
-        parts += [table.title, _RULE, *_aligned(table), *table.notes, ""]
-    return "\n".join(parts)
+    ]
+
+
+def _number(value: float | None) -> str:
+    """Return a factor, or a hyphen where it is not known."""
+    return "-" if value is None else f"{value:.3f}"
 
 
 def places(network: Plain) -> list[Table]:
     """Return the tables of stations and marks."""
     return [
-        Table(title="ADJUSTED STATIONS", columns=_PLACES, rows=network["stations"]),
-        Table(title="ADJUSTED MARKS (* control)", columns=_PLACES, rows=network["marks"]),
+        Table(title="Adjusted stations", columns=_PLACES, rows=network["stations"]),
+        Table(title="Adjusted marks (* control)", columns=_PLACES, rows=network["marks"]),
     ]
 
 
@@ -128,7 +167,7 @@ def evidence(network: Plain) -> list[Table]:
         if mark["decision"] != "confirmed"
         for one in mark["stations"]
     ]
-    title = "EVIDENCE OF ALL STATIONS (log odds of a marker; number of stations by finding)"
+    title = "Evidence of all stations (log odds of a marker; number of stations by finding)"
     return [Table(title=title, columns=_EVIDENCE, rows=marks, notes=notes)]
 
 
@@ -149,7 +188,7 @@ def checks(network: Plain) -> list[Table]:
     ]
     if not rows and not notes:
         notes = ["No control mark and no repeated stop: the accuracy is known by sigmas only."]
-    title = "CHECKS WITHOUT TRUTH: control left out, predicted - given"
+    title = "Checks without truth: control left out, predicted - given"
     return [Table(title=title, columns=_LEFT_OUT, rows=rows, notes=notes)]
 
 
@@ -162,24 +201,24 @@ def not_used(network: Plain) -> Iterator[str]:
         yield f"{one['kind'].capitalize()} {what}: {one['reason']}"
 
 
-def tables_of_observations(network: Plain) -> Iterator[Table]:
+def _observations(network: Plain) -> Iterator[Table]:
     """Yield the tables of residuals: centres with reliability, levelling, control."""
-    title = "OBSERVED CENTRES, largest w first (v observed - computed, r of 3, EX: shift by an MDB)"
+    title = "Observed centres, largest w first (v observed - computed, r of 3, EX: shift by an MDB)"
     centres = sorted(network["observations"], key=lambda row: -(row["w"] or 0.0))
     yield Table(title=title, columns=_CENTRES, rows=centres)
-    yield Table(title="OBSERVED LEVELLING", columns=_LEVELLING, rows=network["gravity"])
+    yield Table(title="Observed levelling", columns=_LEVELLING, rows=network["gravity"])
     if network["control"]:
-        yield Table(title="CONTROL MARKS", columns=_CONTROL, rows=network["control"])
+        yield Table(title="Control marks", columns=_CONTROL, rows=network["control"])
 
 
 def _rest(network: Plain) -> Iterator[Table]:
     """Yield the rig, if it was adjusted with the network, and what was not used."""
     if rig := network["calibration"]:
         held = [f"{one['name']}: {one['reason']}" for one in rig["not_separable"]]
-        title = "RIG, ADJUSTED WITH THE NETWORK"
+        title = "Rig, adjusted with the network"
         yield Table(title=title, columns=_RIG, rows=rig["parameters"], notes=held)
     notes = list(not_used(network)) or ["Nothing: all observations were used."]
-    yield Table(title="NOT USED", notes=notes)
+    yield Table(title="Not used", notes=notes)
 
 
 def _aligned(table: Table) -> list[str]:
@@ -193,37 +232,3 @@ def _aligned(table: Table) -> list[str]:
     sides = [">" if column.form else "<" for column in table.columns]
     forms = [f"{side}{width}" for side, width in zip(sides, widths, strict=True)]
     return [" ".join(map(format, cells, forms)).rstrip() for cells in lines]
-
-
-def _summary(network: Plain, title: str) -> list[str]:
-    """Return what the adjustment is and whether it holds."""
-    test, factors, sigma0 = network["global_test"], network["variance_factors"], network["sigma0"]
-    counts = {
-        "Stations": len(network["stations"]),
-        "Marks": len(network["marks"]),
-        "Observations (coordinates)": network["n_observations"],
-        "Unknowns": network["n_unknowns"],
-        "Defect of the datum": network["datum"]["defect"],
-        "Degrees of freedom": network["dof"],
-    }
-    quality = {
-        "Variance factor a priori": 1.0,
-        "Variance factor a posteriori": None if sigma0 is None else sigma0**2,
-        "Sigma0 a posteriori": sigma0,
-        **{f"  variance factor of {kind}": factors[kind] for kind in factors},
-    }
-    numbers = {name: "-" if one is None else f"{one:.3f}" for name, one in quality.items()}
-    lines = [
-        f"NETWORK ADJUSTMENT{'  ' + title if title else ''}",
-        "=" * 78,
-        *(f"{name:<31} {value:>8}" for name, value in (counts | numbers).items()),
-        f"Global test (chi-square, one-sided, level {test['level']:g}): v'Pv = {test['vtpv']:.1f}, "
-        f"limit {test['limit']:.1f}: {'passed' if network['passes_global_test'] else 'FAILED'}",
-        f"Local test (w): limit {network['critical_w']:.2f}",
-        f"Datum: {network['datum']['text']}",
-    ]
-    if bias := network["range_bias"]:
-        value, sigma, prior = (1e3 * bias[k] for k in ("value_m", "sigma_m", "sigma_a_priori_m"))
-        text = f"All ranges too long by {value:.2f} mm, sigma {sigma:.2f} mm"
-        lines.append(f"{text} (a priori {prior:.2f} mm)")
-    return [*lines, *(f"WARNING: {one}" for one in network["warnings"]), ""]

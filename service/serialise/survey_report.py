@@ -159,21 +159,16 @@ def report_of_document(text: str, name: str) -> Plain:
 
 def network_part(network: Mapping[str, Any]) -> Plain:
     """Return what a report shows of a network."""
-    tables = [*network_report.places(network), *network_report.evidence(network)]
-    tables += [*network_report.tables_of_observations(network), *network_report.checks(network)]
-    notes = list(network_report.not_used(network)) or ["Nothing: all observations were used."]
-    shown = [_shortened(table.to_texts()) for table in tables]
-    shown.append(Table(title="Not used", notes=notes).to_texts())
     is_checked = any(one["predicted_minus_given_m"] is not None for one in network["control"])
     missing = [] if is_checked else ["No independent check: no control mark could be left out."]
     return {
         "title": "Network adjustment report",
-        "tests": _tests(network),
+        "tests": network_report.summary(network),
         "warnings": list(network["warnings"]),
         "missing": missing,
         "places": _places(network),
         "lines": [[one["station"], one["mark"]] for one in network["observations"] if one["used"]],
-        "sections": [_sentence_case(one) for one in shown],
+        "sections": [_shortened(one.to_texts()) for one in network_report.tables(network)],
     }
 
 
@@ -242,37 +237,6 @@ def _stations_part(catalogue: Catalogue, survey_id: str, solution: Solution | No
     }
 
 
-def _tests(network: Mapping[str, Any]) -> Pairs:
-    """Return the statistical tests of a network as pairs of name and value."""
-    test, sigma0 = network["global_test"], network["sigma0"]
-    factors = network["variance_factors"].items()
-    groups = [[f"Variance factor of {kind}", _number(one)] for kind, one in factors]
-    passed = "passed" if network["passes_global_test"] else "FAILED"
-    pairs = [
-        ["Datum", network["datum"]["text"]],
-        ["Observations (coordinates)", str(network["n_observations"])],
-        ["Unknowns", str(network["n_unknowns"])],
-        ["Degrees of freedom", str(network["dof"])],
-        ["Sigma0 a priori; a posteriori", f"1.000; {_number(sigma0)}"],
-        *groups,
-        [
-            f"Global test (chi-square, level {test['level']:g})",
-            f"v'Pv = {test['vtpv']:.1f}, limit {test['limit']:.1f}: {passed}",
-        ],
-        ["Limit of the local test (w)", f"{network['critical_w']:.2f}"],
-        ["Sigmas and ellipses", "a priori; not scaled by the result of the test"],
-    ]
-    if bias := network["range_bias"]:
-        value, sigma = 1e3 * bias["value_m"], 1e3 * bias["sigma_m"]
-        pairs.append(["All ranges too long by", f"{value:.2f} mm, sigma {sigma:.2f} mm"])
-    return pairs
-
-
-def _number(value: float | None) -> str:
-    """Return a factor, or a hyphen where it is not known."""
-    return "-" if value is None else f"{value:.3f}"
-
-
 def _places(network: Mapping[str, Any]) -> list[Plain]:
     """Return stations and marks as the map shows them."""
     kinds = [("station", one) for one in network["stations"]]
@@ -325,14 +289,6 @@ def _shortened(table: Plain) -> Plain:
         return table
     note = f"The first {_ROWS_MOST:,} of {n:,} rows; the files of the adjustment have all."
     return table | {"rows": table["rows"][:_ROWS_MOST], "notes": [note, *table["notes"]]}
-
-
-def _sentence_case(table: Plain) -> Plain:
-    """Return a table whose title is no longer in capitals."""
-    head, mark, rest = table["title"].partition(" (")
-    words, comma, more = head.partition(",")
-    plain = (words[:1] + words[1:].lower()) if words[:8].isupper() else words
-    return table | {"title": f"{plain}{comma}{more}{mark}{rest}"}
 
 
 def _complete(report: Plain, about: Pairs) -> Plain:
