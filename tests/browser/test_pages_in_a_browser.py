@@ -1,13 +1,16 @@
 """Every page in a real Chromium: it draws, obeys the policy, stays on this host, and fits."""
 
 import re
+import time
 from contextlib import contextmanager
 from urllib.parse import urlencode
 
+import numpy as np
 import psutil
 import pytest
 
 from tests.browser.visits import NEEDS_CHROMIUM, PAGES, STOP
+from tests.storage.recorder import record, small_log
 
 pytestmark = NEEDS_CHROMIUM
 LOOKS = [(1440, "dark"), (390, "light")]
@@ -188,6 +191,22 @@ def test_a_survey_is_made_from_nothing_renamed_deleted_and_restored(visit, tmp_p
     page.wait_for_url(re.compile("deleted="))
     page.get_by_role("button", name="Restore").click()
     page.wait_for_url(re.compile("/surveys/pit$"))
+
+
+def test_logs_that_are_dropped_together_all_arrive(visit, tmp_path):
+    names = ["first.mcap", "second.mcap", "third.mcap"]
+    for i, name in enumerate(names):
+        record(tmp_path / name, small_log(np.random.default_rng(i)))
+
+    def slowly(route):
+        time.sleep(1.0)  # longer than the page waits before it shows the logs anew
+        route.continue_()
+
+    page = visit().open("/surveys/field/logs")
+    page.route("**/api/v1/recordings?*", slowly)
+    page.set_input_files("#files", [tmp_path / name for name in names])
+    for name in names:
+        page.locator('[aria-labelledby="logs-head"] tbody tr', has_text=name).wait_for()
 
 
 def test_a_log_that_is_removed_can_be_put_back_at_once(visit):

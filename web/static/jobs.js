@@ -30,6 +30,7 @@ function show(place, job) {
 
 function ended() {
   const news = document.getElementById("news");
+  if (document.documentElement.hasAttribute("data-uploading")) return; // their end shows it
   if (news && document.querySelector("[data-figure]")) news.hidden = false;
   else location.reload(); // for the results, the end and its reason
 }

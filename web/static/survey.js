@@ -119,4 +119,7 @@ by("delete-survey").addEventListener("click", async () => {
     complain(by("change-status")),
   );
 });
-document.addEventListener("uploaded", () => setTimeout(() => location.reload(), 800));
+// Shows the table anew after the last upload; where one has failed, its reason stays.
+document.addEventListener("uploads", ({ detail }) => {
+  if (!detail.pending && !detail.failed) setTimeout(() => location.reload(), 800);
+});

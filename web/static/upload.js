@@ -1,6 +1,7 @@
 // Uploads dropped or chosen logs one after another, each with its progress and its result.
 // The files of a folder that `ros2 bag record` wrote are one log. Each log that arrived is
-// announced by an event "uploaded" of the document, whose detail is the answer of the service.
+// announced by an event "uploaded" of the document, whose detail is the answer of the service, and
+// each change of how many are pending by an event "uploads". To leave the page would end these.
 import { Resumable, isWorthParts } from "./resumable.js";
 
 const drop = document.getElementById("drop");
@@ -9,6 +10,17 @@ const LOG = /\.(mcap|db3|bag|pcap|pcapng|zip)(\.zstd)?$/i;
 const CAPTURE = /\.(pcap|pcapng)$/i;
 const TRUNCATED = "input.recording.truncated";
 let last = Promise.resolve();
+let pending = 0;
+let failed = 0;
+
+function announce() {
+  document.documentElement.toggleAttribute("data-uploading", pending > 0);
+  document.dispatchEvent(new CustomEvent("uploads", { detail: { pending, failed } }));
+}
+
+addEventListener("beforeunload", (event) => {
+  if (pending) event.preventDefault();
+});
 
 const pathOf = (file) => file.path ?? file.webkitRelativePath ?? "";
 const folderOf = (file) => pathOf(file).split("/").slice(0, -1).join("/");
@@ -129,6 +141,7 @@ function succeed(log, parts, request) {
 }
 
 function fail(log, parts, answer) {
+  failed += 1;
   parts.outcome.classList.add("bad");
   parts.outcome.textContent = answer?.detail ?? "The service did not respond.";
   if (answer?.recording_id) {
@@ -144,16 +157,21 @@ function fail(log, parts, answer) {
   again.addEventListener("click", () => {
     again.remove();
     parts.outcome.classList.remove("bad");
+    failed -= 1;
     upload(log, parts, { recover: "true" });
   });
   parts.item.append(again);
 }
 
 function upload(log, parts, given = {}) {
+  pending += 1;
+  announce();
   last = last.then(async () => {
     const request = await send(log, parts, given);
     if (request.status >= 200 && request.status < 300) succeed(log, parts, request);
     else fail(log, parts, request.response);
+    pending -= 1;
+    announce();
   });
 }
 

@@ -60,7 +60,11 @@ for (const button of document.querySelectorAll("[data-back]")) {
   button.addEventListener("click", () => go(button.dataset.back));
 }
 
-document.addEventListener("uploaded", () => { by("adjust").disabled = false; });
+let hasLogs = false;
+document.addEventListener("uploaded", () => { hasLogs = true; });
+document.addEventListener("uploads", ({ detail }) => {
+  by("adjust").disabled = !hasLogs || detail.pending > 0;
+});
 by("adjust").addEventListener("click", () => attempt(async () => {
   const options = { control: by("has-control").value === "yes" };
   await call("POST", "/api/v1/jobs", { kind: "adjust", survey: made.survey_id, options });
