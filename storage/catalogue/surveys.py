@@ -38,19 +38,21 @@ from spheremark.storage.catalogue.tables import TableWriter
 _DIGEST = re.compile(r"[0-9a-f]{64}")
 _VERDICTS = ("ok", "weak", "refused")
 
+_LOGS_OF = """
+    SELECT recording_id FROM jobs
+    WHERE survey_id = {id} AND recording_id IS NOT NULL AND status <> 'dismissed'
+    UNION SELECT recording_id FROM runs WHERE survey_id = {id}
+    UNION SELECT recording_id FROM survey_recordings WHERE survey_id = {id}
+    EXCEPT SELECT recording_id FROM removed_recordings WHERE survey_id = {id}
+"""
 _SURVEYS = """
 SELECT s.survey_id, s.name, s.tolerance_m, s.created_at, s.rig_digest,
     (SELECT count(*) FROM control_marks AS c WHERE c.survey_id = s.survey_id) AS n_control_marks,
     (SELECT count(*) FROM true_stops AS t WHERE t.survey_id = s.survey_id) AS n_true_stops,
-    (SELECT count(*) FROM (
-        SELECT j.recording_id FROM jobs AS j
-        WHERE j.survey_id = s.survey_id AND j.recording_id IS NOT NULL
-        UNION SELECT o.recording_id FROM survey_recordings AS o WHERE o.survey_id = s.survey_id
-        EXCEPT SELECT x.recording_id FROM removed_recordings AS x WHERE x.survey_id = s.survey_id
-    )) AS n_recordings
+    (SELECT count(*) FROM ({logs})) AS n_recordings
 FROM surveys AS s
 WHERE s.survey_id NOT IN (SELECT survey_id FROM deleted_surveys)
-"""
+""".replace("{logs}", _LOGS_OF.replace("{id}", "s.survey_id"))
 _SURVEY_BY_KEY = _SURVEYS + "AND (s.survey_id = $key OR s.name = $key) ORDER BY s.survey_id <> $key"
 _SURVEYS_AFTER = (
     _SURVEYS
@@ -68,13 +70,9 @@ ORDER BY uploaded_at DESC, recording_id DESC LIMIT $n
 """
 _RIG = "SELECT rig FROM rigs WHERE rig_digest = $digest"
 _RECORDINGS_OF_SURVEY = """
-SELECT recording_id, name FROM recordings WHERE recording_id IN (
-    SELECT recording_id FROM jobs WHERE survey_id = $id AND status <> 'dismissed'
-    UNION SELECT recording_id FROM runs WHERE survey_id = $id
-    UNION SELECT recording_id FROM survey_recordings WHERE survey_id = $id
-    EXCEPT SELECT recording_id FROM removed_recordings WHERE survey_id = $id
-) ORDER BY uploaded_at, recording_id
-"""
+SELECT recording_id, name FROM recordings WHERE recording_id IN ({logs})
+ORDER BY uploaded_at, recording_id
+""".replace("{logs}", _LOGS_OF.replace("{id}", "$id"))
 _N_ACTIVE = """
 SELECT count(*) AS n FROM jobs WHERE survey_id = $id AND status IN ('accepted', 'running')
 """

@@ -500,6 +500,13 @@ def test_jobs_and_runs_are_listed_by_what_they_belong_to(catalogue):
     assert catalogue.get_survey("lane").n_recordings == 1
 
 
+def test_a_log_whose_only_job_was_dismissed_is_no_log_of_the_survey(catalogue):
+    catalogue.create_survey("lane")
+    catalogue.dismiss_job(job(catalogue).job_id)
+    assert catalogue.get_survey("lane").n_recordings == 0
+    assert catalogue.recordings_of_survey("lane") == ()
+
+
 # Queries, views and schema
 
 
