@@ -3,7 +3,7 @@
 # make check  format, lint, types, import contracts, spelling, lock files
 # make bench  speed and memory as ratios against a peer in the same run
 # make reference  renew REFERENCE.md from the commands and the settings
-# make docs   build the guide that the service shows at /guide, with pictures of its pages
+# make docs   build the guide with pictures and a search; without, /guide shows its text
 # make lock   renew the lock files from pyproject.toml
 # make sbom   write the software bill of materials (CycloneDX) to build/sbom.json
 # make clean  remove what the other targets made

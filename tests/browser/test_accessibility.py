@@ -7,7 +7,7 @@ from tests.browser.visits import NEEDS_CHROMIUM, PAGES
 
 pytestmark = NEEDS_CHROMIUM
 
-MORE = ["/coverage", "/worlds", "/login", "/guide", "/surveys/none", "/plan/sheet?a=P01:6,0,1"]
+MORE = ["/coverage", "/worlds", "/login", "/guide/sql", "/surveys/none", "/plan/sheet?a=P01:6,0,1"]
 LOOKS = [(1280, "light"), (1280, "dark"), (390, "dark"), (390, "light")]
 DRAWN = """(theme) => document.documentElement.dataset.theme === theme
     && [...document.querySelectorAll("[data-figure]")].every(

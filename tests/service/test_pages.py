@@ -121,6 +121,20 @@ def test_the_guide_has_no_file_from_elsewhere(client, name, tmp_path, monkeypatc
     assert (response.status_code, "/guide/" in response.json()["detail"]) == (404, True)
 
 
+def test_a_guide_that_is_not_built_is_shown_from_its_text(client, monkeypatch):
+    missing = assets.guide_folder().parent / "missing"
+    monkeypatch.setattr(assets, "guide_folder", lambda: missing)
+    links = set(re.findall(r'href="(/(?:guide|glossary)[^"#]*)', page(client, "/guide")))
+    assert "/guide/first-survey" in links
+    for link in links:
+        text = page(client, link)
+        links_on = re.findall(r'href="(/guide[^"]*)"', text)
+        assert {one.partition("#")[0] for one in links_on} <= {*links, "/guide"}
+        assert not re.search(r"\{(toctree|include|eval-rst)\}|\.md[)\"]", text)
+    assert 'id="the-report"' in page(client, "/guide/reading")
+    assert client.get("/guide/none").status_code == 404
+
+
 def test_a_log_that_is_removed_takes_its_results_and_brings_them_back(client):
     before = client.get("/api/v1/station-fixes?survey=twins").json()["items"]
     recording = before[0]["recording_id"]

@@ -23,7 +23,12 @@ myst_heading_anchors = 3
 exclude_patterns = ["templates", "site"]
 templates_path = ["templates"]
 html_theme = "basic"
-html_static_path = ["../static/tokens.css", "../static/site.css", "../static/theme.js", "guide.css"]
+html_static_path = [
+    "../static/tokens.css",
+    "../static/site.css",
+    "../static/theme.js",
+    "../static/guide.css",
+]
 html_css_files = ["tokens.css", "site.css", "guide.css"]
 html_js_files = [("theme.js", {"priority": 100})]
 html_extra_path = ["made/pictures"] if (MADE / "pictures").is_dir() else []

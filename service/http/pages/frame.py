@@ -20,6 +20,7 @@ from spheremark.storage.catalogue import saved_queries
 from spheremark.storage.catalogue.records import TableInfo
 from spheremark.web import assets, glossary
 from spheremark.web.pages.base import Frame
+from spheremark.web.pages.guide import guide_page
 from spheremark.web.pages.sql import Schema, SqlQuery, schema_of, sql_page
 from spheremark.web.templating import render
 
@@ -55,12 +56,13 @@ def reference_file(request: Request) -> FileResponse:
 @router.get("/guide")
 @router.get("/guide/{page:path}")
 def guide(request: Request, service: Current, page: str = "") -> Response:
-    """Return a file of the guide, or how to build it."""
-    folder = assets.guide_folder()
-    if not folder.is_dir():
-        return HTMLResponse(render("guide.html", frame=frame_of(service)))
+    """Return a file of the guide; where it is not built, a page of its Markdown."""
     if request.url.path == "/guide":
         return RedirectResponse("/guide/")
+    folder = assets.guide_folder()
+    if not folder.is_dir():
+        name = page.removesuffix(".html").removeprefix("made/")
+        return HTMLResponse(guide_page(frame_of(service), name or "index"))
     return FileResponse(_page_of_guide(folder.resolve(), page or "index.html"))
 
 
