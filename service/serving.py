@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import signal
 import socket
+import sys
 from collections.abc import Callable
 
 import uvicorn
@@ -19,6 +20,8 @@ from spheremark.service.settings import Settings
 Ready = Callable[[str], None]
 _APPLICATION = "spheremark.service.http.app:create_app"  # by name: commands do not import it
 _PROTOCOL = "spheremark.service.http.protocol:BoundedProtocol"
+_TURN = 0.0005  # [s] of a thread while others wait: a short request is not behind long ones
+_KEEP_ALIVE = 75  # [s] between two requests: more than the 60 s of proxies, which then end it first
 _PATIENCE = 5  # [s] that open requests have at shutdown
 
 
@@ -44,6 +47,7 @@ class _Server(uvicorn.Server):
 def serve(settings: Settings, *, ready: Ready) -> None:
     """Serve until SIGINT or SIGTERM; ``ready`` gets the address once requests are accepted."""
     return_memory()
+    sys.setswitchinterval(_TURN)
     os.umask(0o077)  # what the service and its workers write is for its user alone
     create_app = import_from_string(_APPLICATION)  # Dask, which it imports, configures logging too
     log_to_stderr(settings.log_format)
@@ -55,6 +59,7 @@ def serve(settings: Settings, *, ready: Ready) -> None:
             http=_PROTOCOL,
             log_level="critical",  # what goes wrong is logged once, by the service
             access_log=False,
+            timeout_keep_alive=_KEEP_ALIVE,
             timeout_graceful_shutdown=_PATIENCE,
             server_header=False,
         )

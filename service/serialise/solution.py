@@ -19,7 +19,6 @@ from spheremark.pipelines.accuracy.acceptance import (
 )
 from spheremark.pipelines.model import Array
 from spheremark.storage.catalogue.catalogue import Catalogue
-from spheremark.storage.catalogue.records import SurveyRecord
 from spheremark.storage.catalogue.rows import natural
 from spheremark.storage.catalogue.solutions import Solution, chosen_solution
 
@@ -29,13 +28,6 @@ _STATIONS = """
 SELECT * FROM chosen_stations WHERE survey_id = $id ORDER BY {natural}
 """.replace("{natural}", natural("station"))
 _ADJUSTMENT = "SELECT * FROM adjustments WHERE adjustment_id = $id"
-_NOT_IN = """
-SELECT DISTINCT x.stop FROM stops AS x JOIN latest_runs AS r USING (run_id)
-WHERE r.survey_id = $id AND NOT EXISTS (
-    SELECT 1 FROM chosen_stations AS c
-    WHERE c.survey_id = $id AND c.recording_id = r.recording_id AND c.stop = x.stop
-) ORDER BY x.stop
-"""
 _CENTRES = """
 SELECT m.stop || ' ' || m.marker AS name, m.run_id || m.stop AS scan, m.x_m, m.y_m,
     m.cov_xx_m2, m.cov_xy_m2, m.cov_xz_m2, m.cov_yy_m2, m.cov_yz_m2, m.cov_zz_m2,
@@ -57,16 +49,17 @@ WHERE adjustment_id = $id AND kind = 'centre' AND used AND residual_x_m IS NOT N
 _CHECKS = "SELECT * FROM control_checks WHERE adjustment_id = $id ORDER BY mark"
 _SOLUTIONS = "SELECT * FROM chosen_solutions WHERE list_contains($ids::VARCHAR[], survey_id)"
 _DECISIVE = """
-SELECT survey_id, station, passes_global_test, dof, sigma0, status, reason,
+SELECT survey_id, recording_id, run_id, stop, fit_method, resection_method, adjustment_id, station,
+    passes_global_test, dof, sigma0, status, reason,
     cov_xx_m2, cov_xy_m2, cov_xz_m2, cov_yy_m2, cov_yz_m2, cov_zz_m2
 FROM chosen_stations WHERE list_contains($ids::VARCHAR[], survey_id) ORDER BY survey_id, station
 """
-_MISSING_LISTS = """
-SELECT r.survey_id, list_sort(list_distinct(list(x.stop))) AS stops
+_MISSING = """
+SELECT r.survey_id, list_sort(list(DISTINCT x.stop)) AS stops
 FROM stops AS x JOIN latest_runs AS r USING (run_id)
 ANTI JOIN (
-    SELECT survey_id, recording_id, stop FROM chosen_stations
-    WHERE list_contains($ids::VARCHAR[], survey_id)
+    SELECT unnest($survey_id::VARCHAR[]) AS survey_id,
+        unnest($recording_id::VARCHAR[]) AS recording_id, unnest($stop::VARCHAR[]) AS stop
 ) AS c ON c.survey_id = r.survey_id AND c.recording_id = r.recording_id AND c.stop = x.stop
 WHERE list_contains($ids::VARCHAR[], r.survey_id) GROUP BY r.survey_id
 """
@@ -78,12 +71,15 @@ FROM (
         sqrt(residual_x_m ^ 2 + residual_y_m ^ 2 + residual_z_m ^ 2) AS length_m
     FROM observations WHERE used AND residual_x_m IS NOT NULL
 ) AS o
-JOIN chosen_stations AS c
-    ON c.run_id = o.run_id AND c.stop = o.stop AND c.fit_method = o.fit_method
-    AND c.resection_method = o.resection_method
-WHERE list_contains($ids::VARCHAR[], c.survey_id) AND c.adjustment_id IS NULL
+JOIN (
+    SELECT unnest($survey_id::VARCHAR[]) AS survey_id, unnest($run_id::VARCHAR[]) AS run_id,
+        unnest($stop::VARCHAR[]) AS stop, unnest($fit_method::VARCHAR[]) AS fit_method,
+        unnest($resection_method::VARCHAR[]) AS resection_method
+) AS c USING (run_id, stop, fit_method, resection_method)
 GROUP BY c.survey_id
 """
+_OF_STOPS = ("survey_id", "recording_id", "stop")
+_OF_FIXES = ("survey_id", "run_id", "stop", "fit_method", "resection_method")
 _RESIDUAL = "residual"
 _PARTS = ("xx", "xy", "xz", "xy", "yy", "yz", "xz", "yz", "zz")
 
@@ -104,21 +100,19 @@ class SurveyResult:
 
 def survey_result(catalogue: Catalogue, survey: str) -> SurveyResult:
     """Return the chosen solution of a survey (id or name), its checks and the decision."""
-    record = catalogue.get_survey(survey)
-    return catalogue.computed(
-        ("survey_result", record.survey_id), lambda: _survey_result(catalogue, record)
-    )
+    key = catalogue.id_of_survey(survey)
+    return catalogue.computed(("survey_result", key), lambda: _survey_result(catalogue, key))
 
 
-def _survey_result(catalogue: Catalogue, record: SurveyRecord) -> SurveyResult:
+def _survey_result(catalogue: Catalogue, survey_id: str) -> SurveyResult:
     """Compute the result of a survey."""
-    key = {"id": record.survey_id}
-    solution = chosen_solution(catalogue, record.survey_id)
+    record, key = catalogue.get_survey(survey_id), {"id": survey_id}
+    solution = chosen_solution(catalogue, survey_id)
     stations = catalogue.columns(_STATIONS, key)
-    missing = tuple(catalogue.columns(_NOT_IN, key)["stop"].tolist())
     network = _network(catalogue, solution)
-    sums = {row["survey_id"]: row for row in catalogue.rows(_RESIDUAL_SUMS, {"ids": [key["id"]]})}
-    control = _control(catalogue, solution, stations, sums.get(record.survey_id))
+    missing = tuple(_missing(catalogue, [survey_id], stations).get(survey_id, ()))
+    residuals = _residual_sums(catalogue, stations).get(survey_id)
+    control = _control(catalogue, solution, stations, residuals)
     return SurveyResult(
         solution=solution,
         decision=acceptance.decide(
@@ -148,15 +142,11 @@ def _survey_decisions(
 ) -> dict[str, tuple[Solution | None, Decision]]:
     """Compute chosen solution and decision of each survey."""
     ids = {"ids": list(tolerances)}
-
-    def by_survey(sql: str) -> dict[str, dict[str, Any]]:
-        return {row["survey_id"]: row for row in catalogue.rows(sql, ids)}
-
-    solutions = {name: Solution(**row) for name, row in by_survey(_SOLUTIONS).items()}
+    solutions = {row["survey_id"]: Solution(**row) for row in catalogue.rows(_SOLUTIONS, ids)}
     stations = catalogue.columns(_DECISIVE, ids)
     owners = stations["survey_id"].astype(str)
-    missing = {name: row["stops"] for name, row in by_survey(_MISSING_LISTS).items()}
-    sums = by_survey(_RESIDUAL_SUMS)
+    missing = _missing(catalogue, ids["ids"], stations)
+    sums = _residual_sums(catalogue, stations)
     found = {}
     for name, tolerance in tolerances.items():
         solution = solutions.get(name)
@@ -167,6 +157,24 @@ def _survey_decisions(
         quality = _quality(solution, columns, missing.get(name, ()), control, network)
         found[name] = solution, acceptance.decide(quality, tolerance)
     return found
+
+
+def _missing(
+    catalogue: Catalogue, surveys: Sequence[str], stations: Columns
+) -> dict[str, Sequence[str]]:
+    """Return the stops of each survey (id) that are not among its chosen stations."""
+    keys = {name: stations[name].tolist() for name in _OF_STOPS}
+    rows = catalogue.rows(_MISSING, keys | {"ids": list(surveys)})
+    return {row["survey_id"]: row["stops"] for row in rows}
+
+
+def _residual_sums(catalogue: Catalogue, stations: Columns) -> dict[str, dict[str, Any]]:
+    """Return the residuals of single stations at control, summed by survey (id)."""
+    single = np.array([one is None for one in stations["adjustment_id"]], dtype=bool)
+    if not single.any():
+        return {}
+    keys = {name: stations[name][single].tolist() for name in _OF_FIXES}
+    return {row["survey_id"]: row for row in catalogue.rows(_RESIDUAL_SUMS, keys)}
 
 
 def _network(catalogue: Catalogue, solution: Solution | None) -> Mapping[str, Any] | None:

@@ -139,7 +139,7 @@ class Catalogue(Surveys):
         ``key`` names the request, with a digest of it: see ``job_of_key``.
         """
         check_name("The kind of a job", kind)
-        survey_id = self.get_survey(survey).survey_id
+        survey_id = self.id_of_survey(survey)
         if recording_id is not None:
             self.get_recording(recording_id)
         job_id = secrets.token_hex(8)
@@ -183,7 +183,7 @@ class Catalogue(Surveys):
         limit: int = 100,
     ) -> Page[JobRecord]:
         """Return a page of jobs, newest first, of one survey, log or status if given."""
-        survey_id = None if survey is None else self.get_survey(survey).survey_id
+        survey_id = None if survey is None else self.id_of_survey(survey)
         filters = {"survey_id": survey_id, "recording_id": recording_id, "status": status}
         return self._page(JobRecord, _JOBS_AFTER, filters, after, limit)
 
@@ -283,7 +283,7 @@ class Catalogue(Surveys):
         limit: int = 100,
     ) -> Page[RunRecord]:
         """Return a page of the runs, newest first, of one survey, log or job if given."""
-        survey_id = None if survey is None else self.get_survey(survey).survey_id
+        survey_id = None if survey is None else self.id_of_survey(survey)
         filters = {"survey_id": survey_id, "recording_id": recording_id, "job_id": job_id}
         return self._page(RunRecord, _RUNS_AFTER, filters, after, limit)
 

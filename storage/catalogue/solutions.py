@@ -43,5 +43,5 @@ def chosen_solution(catalogue: Catalogue, survey: str) -> Solution | None:
     Solution or None
         None where no station has coordinates.
     """
-    rows = catalogue.rows(_CHOSEN, {"id": catalogue.get_survey(survey).survey_id})
+    rows = catalogue.rows(_CHOSEN, {"id": catalogue.id_of_survey(survey)})
     return Solution(**rows[0]) if rows else None

@@ -54,6 +54,11 @@ FROM surveys AS s
 WHERE s.survey_id NOT IN (SELECT survey_id FROM deleted_surveys)
 """.replace("{logs}", _LOGS_OF.replace("{id}", "s.survey_id"))
 _SURVEY_BY_KEY = _SURVEYS + "AND (s.survey_id = $key OR s.name = $key) ORDER BY s.survey_id <> $key"
+_ID_OF_SURVEY = """
+SELECT survey_id FROM surveys
+WHERE (survey_id = $key OR name = $key) AND survey_id NOT IN (SELECT survey_id FROM deleted_surveys)
+ORDER BY survey_id <> $key
+"""
 _SURVEYS_AFTER = (
     _SURVEYS
     + """
@@ -110,6 +115,11 @@ class Surveys(Lists):
         """Return a survey by its id or its name; NotFoundError if there is none."""
         row = self._one(_SURVEY_BY_KEY, {"key": key}, f"survey {key!r}")
         return record_of(SurveyRecord, row)
+
+    def id_of_survey(self, key: str) -> str:
+        """Return the id of a survey by its id or its name; NotFoundError if there is none."""
+        found: str = self._one(_ID_OF_SURVEY, {"key": key}, f"survey {key!r}")["survey_id"]
+        return found
 
     def list_surveys(self, *, after: str | None = None, limit: int = 100) -> Page[SurveyRecord]:
         """Return a page of the surveys, newest first; ``after`` is ``next`` of the page before."""
@@ -176,7 +186,7 @@ class Surveys(Lists):
     def put_control_marks(self, survey: str, marks: ControlMarks) -> None:
         """Set the control marks of a survey, in place of those before."""
         check_marks(marks)
-        survey_id = self.get_survey(survey).survey_id
+        survey_id = self.id_of_survey(survey)
         with self.writing() as cursor:
             self._tables.append({"control_marks": control_table(survey_id, marks)})
             cursor.execute(
@@ -189,7 +199,7 @@ class Surveys(Lists):
 
     def delete_control_marks(self, survey: str) -> None:
         """Take the control marks from a survey."""
-        survey_id = self.get_survey(survey).survey_id
+        survey_id = self.id_of_survey(survey)
         with self.writing() as cursor:
             cursor.execute("DELETE FROM control_marks WHERE survey_id = ?", [survey_id])
             cursor.execute(
@@ -198,13 +208,13 @@ class Surveys(Lists):
 
     def control_marks(self, survey: str) -> ControlMarks | None:
         """Return the control marks of a survey (id or name); None without."""
-        rows = self.rows(_CONTROL, {"id": self.get_survey(survey).survey_id})
+        rows = self.rows(_CONTROL, {"id": self.id_of_survey(survey)})
         return control_marks_of(rows) if rows else None
 
     def put_truth(self, survey: str, truth: Truth) -> None:
         """Set the truth of a survey, and compute the errors of all its results."""
         check_marks(truth.marks)
-        survey_id = self.get_survey(survey).survey_id
+        survey_id = self.id_of_survey(survey)
         with self.writing() as cursor:
             self._tables.append({"true_marks": marks_table(survey_id, truth.marks)})
             cursor.execute(
@@ -220,7 +230,7 @@ class Surveys(Lists):
 
     def truth(self, survey: str) -> Truth | None:
         """Return the truth of a survey (id or name); None without."""
-        survey_id = self.get_survey(survey).survey_id
+        survey_id = self.id_of_survey(survey)
         with self.reading() as cursor:
             return read_truth(cursor, survey_id)
 
@@ -264,7 +274,7 @@ class Surveys(Lists):
 
     def add_to_survey(self, survey: str, recording_id: str) -> None:
         """Assign a log to a survey, or put it back with its results."""
-        row = [self.get_survey(survey).survey_id, self.get_recording(recording_id).recording_id]
+        row = [self.id_of_survey(survey), self.get_recording(recording_id).recording_id]
         with self.writing(Changed.QUEUE) as cursor:
             cursor.execute("INSERT OR IGNORE INTO survey_recordings VALUES (?, ?)", row)
             is_removed = cursor.execute(_IS_REMOVED, row).fetchone() is not None
@@ -283,7 +293,7 @@ class Surveys(Lists):
 
     def recordings_of_survey(self, survey: str) -> tuple[str, ...]:
         """Return the logs that are assigned to a survey (id or name) or read by its jobs."""
-        rows = self.rows(_RECORDINGS_OF_SURVEY, {"id": self.get_survey(survey).survey_id})
+        rows = self.rows(_RECORDINGS_OF_SURVEY, {"id": self.id_of_survey(survey)})
         return tuple(row["recording_id"] for row in rows)
 
     # Rigs
@@ -303,7 +313,7 @@ class Surveys(Lists):
 
     def choose_rig(self, survey: str, digest: str | None) -> SurveyRecord:
         """Set the rig of those jobs of a survey that name none."""
-        survey_id = self.get_survey(survey).survey_id
+        survey_id = self.id_of_survey(survey)
         if digest is not None:
             self.get_rig(digest)
         with self.writing() as cursor:

@@ -309,7 +309,7 @@ def list_plans(
     survey: Annotated[str | None, Query(description="Id or name of a survey.")] = None,
 ) -> Listing[PlanSummary]:
     """List stored plans, newest first."""
-    survey_id = service.catalogue.get_survey(survey).survey_id if survey else None
+    survey_id = service.catalogue.id_of_survey(survey) if survey else None
     rows = stored.list_plans(service.catalogue, survey_id)
     return Listing(items=[PlanSummary.model_validate(row) for row in rows])
 

@@ -137,7 +137,7 @@ def check_survey(service: Service, survey: str | None) -> str:
     """Return the survey that a job shall belong to."""
     if survey is None:
         raise InputError("process=true needs survey=<id or name>: results belong to a survey.")
-    return service.catalogue.get_survey(survey).survey_id
+    return service.catalogue.id_of_survey(survey)
 
 
 def start_job(service: Service, survey: str | None, recording: RecordingRecord) -> Job:

@@ -45,7 +45,9 @@ def result(
         survey_result(catalogue, found["survey_id"]),
         after=after,
         tolerance_m=found["tolerance_m"],
-        counts=catalogue.rows(_COUNTS, key)[0],
+        counts=catalogue.computed(
+            ("counts", found["survey_id"]), lambda: catalogue.rows(_COUNTS, key)[0]
+        ),
         n_logs=len(catalogue.recordings_of_survey(found["survey_id"])),
         sample=service.samples.message(found["survey_id"]),
         jobs=newest_jobs(service, survey=found["survey_id"], is_active=True),
