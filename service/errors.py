@@ -111,7 +111,7 @@ class RefusedRecordingError(RecordingError):
     code: ClassVar[str] = "input.recording.refused"
 
     def __init__(self, reason: str, recording: RecordingRecord) -> None:
-        super().__init__(f"{reason} The log is kept as recording {recording.recording_id}.")
+        super().__init__(f"{reason} The file is kept.")
         self.recording = recording
         self.reason_code = str(recording.preflight.get("code") or self.code)
 

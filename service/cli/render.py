@@ -86,8 +86,6 @@ def print_preflight(out: Console, name: str, report: Preflight) -> None:
     out.print(f"[bold]{escape(name)}[/]: {_coloured(report.verdict)}")
     for reason in (*report.reasons, *report.notes, *report.diagnosis):
         _say(out, f"  {reason}")
-    if not report.topics:  # no log at all: its facts would be zeros
-        return
     facts = {
         "returns": f"{report.n_returns:,}",
         "duration [s]": _text(report.duration_s, 1, 1),
@@ -103,7 +101,10 @@ def print_preflight(out: Console, name: str, report: Preflight) -> None:
     }
     topics = Table(columns=_TOPICS, rows=[asdict(topic) for topic in report.topics])
     rows = [{"fact": fact, "value": value} for fact, value in facts.items()]
-    print_tables(out, [topics, Table(columns=_FACTS, rows=rows)])
+    tables = [topics] if report.topics else []
+    if report.n_returns:  # else all facts would be zeros
+        tables.append(Table(columns=_FACTS, rows=rows))
+    print_tables(out, tables)
 
 
 def print_log(out: Console, result: Plain) -> None:
@@ -212,7 +213,11 @@ def print_network(out: Console, result: Plain) -> None:
     _say(out, result["datum"]["text"])
     for warning in result["warnings"]:
         out.print(f"[yellow]Warning:[/] {escape(warning)}", highlight=False, soft_wrap=True)
-    print_tables(out, [*places(result), *evidence(result), *checks(result)])
+    marks = result.get("evidence", [])
+    doubts = [mark for mark in marks if mark["decision"] != "confirmed"]
+    print_tables(out, [*places(result), *evidence({"evidence": doubts}), *checks(result)])
+    if marks:
+        _say(out, f"{len(marks) - len(doubts)} of {len(marks)} marks confirmed by their evidence.")
     if result["calibration"]:
         print_calibration(out, result["calibration"])
     if errors := result.get("errors"):

@@ -112,8 +112,10 @@ def summary(network: Plain) -> list[tuple[str, str]]:
         ("Sigma0 a priori", "1.000"),
         ("Sigma0 a posteriori", _number(sigma0)),
         *((f"Variance factor of {kind}", _number(factor)) for kind, factor in factors.items()),
-        ("Global test (chi-square)", passed),
-        ("  level, v'Pv, limit", f"{test['level']:g}, {test['vtpv']:.1f}, {test['limit']:.1f}"),
+        (
+            f"Global test (chi2, level {test['level']:g})",
+            f"{passed}: v'Pv = {test['vtpv']:.1f}, limit {test['limit']:.1f}",
+        ),
         ("Limit of the local test (w)", f"{network['critical_w']:.2f}"),
         ("Sigmas and ellipses", "a priori; not scaled by the result of the test"),
         ("Datum", network["datum"]["text"]),

@@ -254,8 +254,9 @@ def _complaint(path: Path, head: bytes) -> str:
             f"{path.name} has the packets of a Velodyne without the times at which they came: save "
             "them as a PCAP (tcpdump, Wireshark), and read it with the gimbal's log (--pcap)."
         )
+    found = head[:8].decode("latin-1")
     return (
-        f"The file begins with {head[:8]!r}: it is not an MCAP file, nor a rosbag2 (.db3), a ROS 1 "
+        f"The file begins with {found!r}: it is not an MCAP file, nor a rosbag2 (.db3), a ROS 1 "
         "bag, a PCAP of a Velodyne, or a zip of these. The cloud of a single scan is read by "
         "`spheremark spheres`."
     )

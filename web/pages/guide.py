@@ -60,7 +60,7 @@ def _html(name: str) -> Markup:
         if head.type == "heading_open":
             head.attrSet("id", re.sub("-+", "-", anchor(inline.content)).strip("-"))
     made = parser.renderer.render(tokens, parser.options, {})
-    made = made.replace("<table>", '<div class="scroll"><table>').replace(
+    made = made.replace("<table>", '<div class="panel scroll"><table>').replace(
         "</table>", "</table></div>"
     )
     return Markup(made.replace("<pre>", '<pre tabindex="0">'))  # all else was escaped by the parser
