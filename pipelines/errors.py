@@ -46,7 +46,7 @@ class MissingLidarError(RecordingError):
 
 
 class MissingGimbalAngleError(RecordingError):
-    """The recording does not tell the angle of the gimbal."""
+    """The recording lacks the angle of the gimbal."""
 
     code: ClassVar[str] = "input.recording.no_gimbal_angle"
 

@@ -205,8 +205,9 @@ def test_logs_that_are_dropped_together_all_arrive(visit, tmp_path):
     page = visit().open("/surveys/field/logs")
     page.route("**/api/v1/recordings?*", slowly)
     page.set_input_files("#files", [tmp_path / name for name in names])
+    table = page.locator('[aria-labelledby="logs-head"]')
     for name in names:
-        page.locator('[aria-labelledby="logs-head"] tbody tr', has_text=name).wait_for()
+        table.get_by_role("link", name=name.removesuffix(".mcap"), exact=True).wait_for()
 
 
 def test_a_log_that_is_removed_can_be_put_back_at_once(visit):
