@@ -35,6 +35,7 @@ _REFLECTIVITIES = (3.0, 9.0, 24.5, 63.0, 130.0)  # calibrated, at which real pac
 _SIGMAS = (0.0137, 0.0107, 0.0089, 0.0067, 0.0064)  # ... this noise of ranges [m]
 _TOGETHER = 5  # centres that share a position
 _SHARE_MIN = 0.02  # of a footprint that makes a return
+_SOFTNESS = 0.15  # of the threshold, in the logarithm of the energy: noise at six sigma below it
 _CLOSED = 1e-6  # [rad] by which a sweep may fall short of a full turn
 _SAMPLES_MIN = 3.0  # of the angle, of a pulse between two of them on each of two faces
 _N_ROUNDS = 4  # in which precision and worth of the returns settle
@@ -142,9 +143,17 @@ class Sensor:
             return self.noise
         return float(np.interp(np.log(self.reflectivity), np.log(_REFLECTIVITIES), _SIGMAS))
 
-    def sigma_at(self, distance: float) -> float:
-        """Return the noise of a range to a sphere at a distance [m]."""
-        return float(np.hypot(self.sigma_range, self.sigma_weak * (distance / self.reach) ** 2))
+    def sigma_at(self, distance: float, lit: Array | float = 1.0) -> Array:
+        """Return the noise of ranges to a sphere at a distance, by lit shares of footprints [m]."""
+        return np.hypot(self.sigma_range, self.sigma_weak / self._strength(distance, lit))
+
+    def heard_at(self, distance: float, lit: Array | float = 1.0) -> Array:
+        """Return the probability that echoes of a sphere are detected, by lit shares."""
+        return 1.0 / (1.0 + self._strength(distance, lit) ** (-1.0 / _SOFTNESS))
+
+    def _strength(self, distance: float, lit: Array | float) -> Array:
+        """Return the energy of echoes over that at the threshold of detection."""
+        return np.maximum(lit, _SHARE_MIN) * (self.reach / distance) ** 2
 
     @property
     def scan(self) -> SimulationConfig:
@@ -220,7 +229,7 @@ class _Disc(NamedTuple):
 
     left: Array  # (n,) where they pass the centre, to the left [m]
     information: Array  # (n, 3, 3) of each; zero where it does not return
-    returns: Array  # (n,) whether each returns
+    returns: Array  # (n,) probability that each returns
 
 
 @lru_cache(maxsize=16)
@@ -292,10 +301,12 @@ def _disc(sensor: Sensor, radius: float, n_strips: int, distance: float) -> _Dis
     is_lit = middle.lit > _SHARE_MIN
     returns = (is_lit & (middle.ranges >= StitchingConfig().range_min)).astype(np.float64)
     returns *= 2.0 * returns.sum() >= is_lit.sum()  # else it is too near to be found
+    returns *= sensor.heard_at(distance, middle.lit)
+    noise2 = sensor.sigma_at(distance, middle.lit) ** 2
     information: Array = np.zeros((len(left), 3, 3))
     for _ in range(_N_ROUNDS):
         J, bend2 = _slopes(table, middle.ranges, distance, radius, cov)
-        variance = sensor.sigma_at(distance) ** 2 + lateral2 * np.sum(J[:, 1:] ** 2, axis=1) + bend2
+        variance = noise2 + lateral2 * np.sum(J[:, 1:] ** 2, axis=1) + bend2
         information = (returns / variance)[:, None, None] * J[:, :, None] * J[:, None, :]
         N = information.sum(axis=0) * cell * _density(sensor, distance)
         cov = np.asarray(np.linalg.inv(N + np.eye(3) / (0.3 * radius) ** 2))
