@@ -28,6 +28,7 @@ from spheremark.pipelines.placement.station_covariance import (
     Positions,
     predict_positions,
     reliability,
+    sigmas_with_misses,
 )
 from spheremark.pipelines.placement.visibility import find_visibility, with_occlusion
 from spheremark.pipelines.sphere.mounting import effects_on, sigmas_of
@@ -86,6 +87,7 @@ def evaluate(
     positions = predict_positions(observables, requirement)
     seen = observables.is_seen
     covs = positions.cov_motion[:, 3:, 3:].copy()
+    sigmas = np.sqrt(np.trace(covs, axis1=1, axis2=2))
     tested = reliability(observables, positions, requirement)
     n_used = positions.used.sum(axis=1).astype(np.intp)
     return Evaluation(
@@ -102,7 +104,8 @@ def evaluate(
         n_points=centres.n_points,
         cov_p_site=covs,
         cov_motion=positions.cov_motion,
-        sigma_3d=np.sqrt(np.trace(covs, axis1=1, axis2=2)),
+        sigma_3d=sigmas,
+        rms_3d=_with_misses(observables, sigmas, requirement),
         probability=probability_within(covs, requirement.tolerance),
         angles=_angles(observables.vectors, positions.used),
         dop=_dilution(observables.vectors, positions),
@@ -302,6 +305,13 @@ def _on_one_face(
     return observables._replace(
         by_mounting=effects * sigmas, imbalance=imbalance[(azimuths % 360.0).astype(np.intp) % 360]
     )
+
+
+def _with_misses(observables: Observables, sigmas: Array, requirement: Requirement) -> Array:
+    """Return the RMS 3-D errors over which marks are found; of three circles the sigmas."""
+    if requirement.method == "paper":
+        return sigmas
+    return np.where(np.isfinite(sigmas), sigmas_with_misses(observables, requirement), np.inf)
 
 
 def _angles(v: Array, used: Mask) -> Array:

@@ -288,6 +288,9 @@ class Evaluation:
         translation [m], in the axes of the site; infinite on the diagonal where there is none.
     sigma_3d : (s,)
         Square root of the trace of ``cov_p_site``; infinite where there is no position [m].
+    rms_3d : (s,)
+        RMS of the 3-D error over which marks are found, by three or more where so many are seen;
+        ``sigma_3d`` is by the mean information, which is less with few marks [m].
     probability : (s,)
         Probability that the 3-D error is within the tolerance; 0 where there is no position.
     angles : (s, 2)
@@ -323,6 +326,7 @@ class Evaluation:
     cov_p_site: Array
     cov_motion: Array
     sigma_3d: Array
+    rms_3d: Array
     probability: Array
     angles: Array
     dop: Array
@@ -341,7 +345,8 @@ class Evaluation:
         )
         pairs = ("redundancies", "detectable_biases", "external_reliabilities")
         seal(self, **dict.fromkeys(pairs, (s, n)))
-        seal(self, **dict.fromkeys(("sigma_3d", "probability", "dop", "n_used", "dof"), (s,)))
+        seal(self, **dict.fromkeys(("sigma_3d", "rms_3d", "probability"), (s,)))
+        seal(self, **dict.fromkeys(("dop", "n_used", "dof"), (s,)))
         seal(self, cov_p_site=(s, 3, 3), cov_motion=(s, 6, 6), angles=(s, 2))
 
     @property

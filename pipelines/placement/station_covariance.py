@@ -24,6 +24,7 @@ LOOSE2 = 1.0
 
 _BIAS_LEFT = 0.22  # of the spread of laser biases: what a survey leaves to each centre, simulated
 _TRACE_MOST = 1e6  # of the horizontal cofactor matrix of three circles that cut at all
+_MARKS_LISTED = 8  # of which all sets are listed; of more as many sets are drawn
 _ANY = 2.0  # beyond the cosine of any angle
 _MOTION = [0, 1, 2, -3, -2, -1]  # unknowns of a free station without those that centres share
 
@@ -114,6 +115,26 @@ def predict_positions(observables: Observables, requirement: Requirement) -> Pos
     for one in (cov, cofactor):
         one[~is_fixed] = np.diag(np.full(one.shape[1], np.inf))
     return Positions(cov, cofactor, used)
+
+
+def sigmas_with_misses(observables: Observables, requirement: Requirement) -> Array:
+    """Return the RMS 3-D sigmas of free stations over which marks are found, (s,) [m].
+
+    The mean is over the sets of marks that give a position, by their probabilities; infinite where
+    none does. Sets of two marks count only where no more are seen: such positions are weak.
+    """
+    every = observables._replace(found=np.ones_like(observables.found))
+    information, out = information_of(every, requirement), np.full(len(every.found), np.inf)
+    for e, is_seen in enumerate(observables.is_seen):
+        sets, shares = _sets_found(observables.found[e, is_seen])
+        cov, is_fixed = _inverted(
+            np.tensordot(sets, information[e, is_seen], axes=1), observables, requirement
+        )
+        is_fixed &= sets.sum(axis=1) >= min(3, is_seen.sum())
+        if shares[is_fixed].sum() > 0.0:
+            variances = np.trace(cov[is_fixed, -3:, -3:], axis1=1, axis2=2)
+            out[e] = np.sqrt(np.average(variances, weights=shares[is_fixed]))
+    return np.hypot(out, requirement.resection.sigma_height)
 
 
 def information_of(observables: Observables, requirement: Requirement) -> Array:
@@ -225,11 +246,28 @@ def covariances(observables: Observables, requirement: Requirement) -> Array:
 
 def _by_all(observables: Observables, requirement: Requirement) -> tuple[Array, Mask]:
     """Return covariances of the unknowns of free stations, and which have a position."""
-    N = information_of(observables, requirement).sum(axis=1)
-    start, rest = np.eye(N.shape[-1]), [*range(4), -3, -2, -1]
+    sums = information_of(observables, requirement).sum(axis=1)
+    return _inverted(sums, observables, requirement)
+
+
+def _inverted(
+    sums: Array, observables: Observables, requirement: Requirement
+) -> tuple[Array, Mask]:
+    """Return covariances of unknowns by the information of marks, and which have a position."""
+    start, rest = np.eye(sums.shape[-1]), [*range(4), -3, -2, -1]
     start[np.ix_(rest, rest)] = start_information(observables.shared_variance, requirement)
-    cov, is_fixed = invert_each(start + N)
+    cov, is_fixed = invert_each(start + sums)
     return cov, is_fixed & (np.trace(cov[:, -3:, -3:], axis1=1, axis2=2) <= LOOSE2)
+
+
+def _sets_found(found: Array) -> tuple[Array, Array]:
+    """Return which marks may be found together, (k, n), and how probable each set is, (k,)."""
+    n = len(found)
+    if n <= _MARKS_LISTED:
+        sets = np.arange(2**n)[:, None] >> np.arange(n) & 1
+        return sets.astype(np.float64), np.prod(np.where(sets, found, 1.0 - found), axis=1)
+    drawn = np.random.default_rng(0).random((2**_MARKS_LISTED, n)) < found
+    return drawn.astype(np.float64), np.full(len(drawn), 1.0 / len(drawn))
 
 
 def _by_circles(

@@ -337,6 +337,7 @@ def print_plan(out: Console, plan: Plain) -> None:
     stops = (
         Column("name", "stop"),
         Column("sigma_3d_m", "sigma 3-D", "mm", ".3f"),
+        Column("rms_error_3d_m", "with misses", "mm", ".3f"),
         Column("probability_within_tolerance", within, "", ".4f"),
         Column(lambda row: f"{row['n_used']} of {len(row['visible_marks'])}", "marks", "", ">"),
         Column(_angles, "angles", "deg", ">"),

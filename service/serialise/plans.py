@@ -78,6 +78,7 @@ def stop_json(found: Evaluation, i: int) -> Plain:
         "name": found.stops.names[i],
         "position_m": _numbers(found.stops.p_site[i]),
         "sigma_3d_m": number_or_null(found.sigma_3d[i]),
+        "rms_error_3d_m": number_or_null(found.rms_3d[i]),
         "probability_within_tolerance": float(found.probability[i]),
         "covariance_m2": _numbers(found.cov_p_site[i]),
         "visible_marks": [marks[k] for k in np.flatnonzero(found.is_seen[i])],

@@ -396,6 +396,9 @@ class StopEvaluation(Plain):
     name: str
     position_m: Point
     sigma_3d_m: float | None
+    rms_error_3d_m: float | None = Field(
+        default=None, description="Over which marks are found; of older plans null."
+    )
     probability_within_tolerance: float
     covariance_m2: list[list[float | None]]
     visible_marks: list[str]

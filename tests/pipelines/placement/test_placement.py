@@ -49,6 +49,7 @@ from spheremark.pipelines.placement.station_covariance import (
     covariances,
     information_of,
     predict_positions,
+    sigmas_with_misses,
     start_information,
 )
 from spheremark.pipelines.positioning.resection import resect
@@ -889,6 +890,52 @@ def test_weak_echoes_and_lost_returns_make_far_centres_worse():
     weak = Sensor(noise=0.01, sigma_weak=0.03, reach=12.0)
     assert_allclose(weak.sigma_at(12.0), np.hypot(0.01, 0.03), rtol=1e-12)
     assert_allclose(weak.sigma_at(4.0), np.hypot(0.01, 0.03 / 9.0), rtol=1e-12)
+
+
+def test_echoes_below_the_threshold_are_no_returns():
+    """Half of those of a whole footprint are detected at the reach, and fewer near the limb."""
+    sensor = Sensor(reach=12.0)
+    assert_allclose(sensor.heard_at(12.0), 0.5, rtol=1e-12)
+    assert sensor.heard_at(6.0) > 0.999 > 0.2 > sensor.heard_at(6.0, 0.2)
+    stops = one_stop((0.0, 0.0, 1.05))
+    marks = Arrangement.numbered(np.array([[4.0, 0.0, 1.2], [0.0, 12.0, 1.2]]))
+    usual, short = (
+        evaluate(flat_site(), stops, marks, sensor_model(one), Requirement())
+        for one in (Sensor(), sensor)
+    )
+    near, far = (short.n_points / usual.n_points)[0]
+    assert near > 0.97
+    assert 0.3 < far < 0.5
+
+
+def observed_ring(found):
+    """Return marks of unlike distances round a stop as observables, found with probabilities."""
+    n = len(found)
+    marks, stops = ring(n, 6.0), one_stop((0.7, -0.4, 1.05))
+    visibility = find_visibility(flat_site(), stops.p_site, marks)
+    _, observables = predict_observables(stops.p_site, marks, MODEL, Requirement(), visibility)
+    return observables._replace(found=np.array(found)[None])
+
+
+def test_misses_count_by_the_variances_of_the_marks_that_remain():
+    """Of four marks, three or more of which are found: two alone give a weak position."""
+    found = np.array([0.9, 0.8, 0.7, 0.6])
+    seen, requirement = observed_ring(found), Requirement()
+    total = weights = 0.0
+    for lost in (*range(4), None):
+        is_kept = np.arange(4) != (-1 if lost is None else lost)
+        some = seen._replace(found=np.ones((1, 4)), is_seen=is_kept[None])
+        cov = predict_positions(some, requirement).cov_motion[0, 3:, 3:]
+        weight = np.prod(np.where(is_kept, found, 1.0 - found))
+        total, weights = total + weight * np.trace(cov), weights + weight
+    assert_allclose(sigmas_with_misses(seen, requirement), np.sqrt(total / weights), rtol=1e-9)
+
+
+def test_misses_of_many_marks_count_like_the_mean_information():
+    seen, requirement = observed_ring(np.full(12, 0.97)), Requirement()
+    cov = predict_positions(seen, requirement).cov_motion[0, 3:, 3:]
+    (found,) = sigmas_with_misses(seen, requirement)
+    assert 1.0 < found / np.sqrt(np.trace(cov)) < 1.02
 
 
 def test_directions_err_by_the_encoder_near_by_and_by_uneven_faces_far_off():
