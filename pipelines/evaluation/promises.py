@@ -24,9 +24,15 @@ from spheremark.pipelines.placement import (
     site_of_field,
     stops_of_field,
 )
+from spheremark.pipelines.placement.station_covariance import LOOSE2
 from spheremark.pipelines.positioning.resection import resect
 from spheremark.pipelines.scan.rigs import N_LASERS
-from spheremark.pipelines.simulation import RandomWorld, draw_world, simulate_stop
+from spheremark.pipelines.simulation import (
+    RandomWorld,
+    draw_world,
+    recorded_time,
+    simulate_stop,
+)
 from spheremark.pipelines.simulation.worlds import PRIORS
 from spheremark.pipelines.survey import process
 
@@ -69,7 +75,8 @@ def promises(n_worlds: int, first_seed: int) -> Experiment[int, list[Plain], Pla
     -----
     A plan and its survey know the marks, the ground, how LiDAR and gimbal turn, and the data sheets
     of LiDAR, rig and AHRS: the sigmas of the errors, not the errors. Every stop counts to which the
-    plan promises a position.
+    plan promises a position. It has none where the survey states a 3-D sigma of more than 1 m, as
+    two marks leave that stand for each other: plans call such positions undetermined too.
     """
     return Experiment(
         worlds=range(first_seed, first_seed + 2 * n_worlds, 2),
@@ -104,10 +111,11 @@ def _survey_config(world: RandomWorld) -> SurveyConfig:
     config, family = world.config, world.field.family
     lasers, common = config.sigma_laser_bias, PRIORS["range_bias"].rms(family)
     scale = PRIORS["range_scale"].rms(family)
+    drift = config.sigma_ahrs_drift * 0.5 * recorded_time(config)  # of the mean of all samples
     return SurveyConfig.from_mapping(
         {
             "marker_radius": world.field.marker_radius,
-            "stitching": {"sigma_levelling": config.sigma_ahrs_bias},
+            "stitching": {"sigma_levelling": float(np.hypot(config.sigma_ahrs_bias, drift))},
             "fitting": {
                 "methods": [_METHOD],
                 "sigma_range_bias": lasers,
@@ -143,6 +151,7 @@ def _sensor(world: RandomWorld, survey: SurveyConfig) -> Sensor:
         )
         for amplitude, periods in config.ripples
     )
+    shade = _reflectivity(world)
     return Sensor(
         turn=config.turn,
         sweep=config.sweep,
@@ -150,9 +159,11 @@ def _sensor(world: RandomWorld, survey: SurveyConfig) -> Sensor:
         step=config.step,
         rest_revolutions=config.rest_revolutions,
         move=config.move,
-        noise=None if config.sigma_range is None else float(np.hypot(config.sigma_range, steps[1])),
+        noise=float(
+            np.hypot(config.sigma_range or Sensor(reflectivity=shade).sigma_range, steps[1])
+        ),
         sigma_weak=config.optics.sigma_weak,
-        reach=config.optics.range_half * float(np.sqrt(_reflectivity(world) / 0.10)),
+        reach=config.optics.range_half * float(np.sqrt(shade / 10.0)),
         drop_out=config.drop_out,
         sigma_range_bias=fitting.sigma_range_bias,
         sigma_range_common=fitting.sigma_range_common,
@@ -165,8 +176,10 @@ def _sensor(world: RandomWorld, survey: SurveyConfig) -> Sensor:
 
 
 def _reflectivity(world: RandomWorld) -> float:
-    """Return the reflectivity of the markers, 0 to 1."""
-    return float(world.field.scene.spheres.reflectivities[: len(world.field.marks.names)].mean())
+    """Return the calibrated reflectivity of the markers, 0 to 255."""
+    return 100.0 * float(
+        world.field.scene.spheres.reflectivities[: len(world.field.marks.names)].mean()
+    )
 
 
 def _row(world: RandomWorld, config: SurveyConfig, plan: Evaluation, stop: int) -> Plain:
@@ -178,6 +191,7 @@ def _row(world: RandomWorld, config: SurveyConfig, plan: Evaluation, stop: int) 
         "seed": world.field.seed,
         "family": world.field.family,
         "sigma_3d_m": float(plan.sigma_3d[stop]),
+        "promised_rms_3d_m": float(plan.rms_3d[stop]),
         "error_3d_m": found.error,
         "status": found.status,
         "marks": [
@@ -201,9 +215,11 @@ def _surveyed(world: RandomWorld, config: SurveyConfig, name: str) -> _Matched:
         fix = resect("free_station", fits, field.marks, config.resection)
     except SpheremarkError as reason:
         return _Matched(np.nan, reason.code, [])
-    error, _, _ = pose_errors(
+    error, sigma, _ = pose_errors(
         (fix.T_site_station, fix.cov_T_site_station), stop.truth, fits.levelling
     )
+    if sigma**2 > LOOSE2:
+        return _Matched(np.nan, "undetermined", [])
     return _Matched(float(np.linalg.norm(error)), fix.status.value, fix.matches[:, 1].tolist())
 
 
@@ -237,10 +253,12 @@ def _report(parts: Sequence[Sequence[Plain]], *, first_seed: int, n_worlds: int)
 def _group(name: str, rows: Sequence[Plain]) -> Plain:
     """Return errors over promises of some stations, weak ones included."""
     fixed = [row for row in rows if np.isfinite(row["error_3d_m"])]
-    squares = np.array([(row["error_3d_m"] / row["sigma_3d_m"]) ** 2 for row in fixed])
+    squares = np.array([(row["error_3d_m"] / row["promised_rms_3d_m"]) ** 2 for row in fixed])
     low, high = _interval(np.array([row["seed"] for row in fixed]), squares)
     marks = [mark for row in rows for mark in row["marks"]]
-    errors, sigmas = (np.array([row[key] for row in fixed]) for key in ("error_3d_m", "sigma_3d_m"))
+    errors, promised = (
+        np.array([row[key] for row in fixed]) for key in ("error_3d_m", "promised_rms_3d_m")
+    )
     return {
         "family": name,
         "n_stations": len(rows),
@@ -249,7 +267,7 @@ def _group(name: str, rows: Sequence[Plain]) -> Plain:
         "n_expected": sum(mark["expected"] for mark in marks),
         "n_matched": sum(mark["is_matched"] for mark in marks),
         "rms_error_m": float(np.sqrt(np.mean(errors**2))) if fixed else np.nan,
-        "rms_sigma_m": float(np.sqrt(np.mean(sigmas**2))) if fixed else np.nan,
+        "rms_sigma_m": float(np.sqrt(np.mean(promised**2))) if fixed else np.nan,
         "ratio": float(np.sqrt(squares.mean())) if fixed else np.nan,
         "ratio_low": low,
         "ratio_high": high,
@@ -283,7 +301,7 @@ def _tables(report: Plain) -> list[Table]:
         f"{report['first_seed']}, over what plans promise"
     )
     note = (
-        "Errors over promised sigmas: root of the mean square with its 95 % interval from "
+        "Errors over promised RMS: root of the mean square with its 95 % interval from "
         f"resampled worlds, weak stations included; usual physics is without {', '.join(FOREIGN)}."
     )
     columns = (

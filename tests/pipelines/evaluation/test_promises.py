@@ -17,7 +17,8 @@ def station(seed, family, error, matched=(True, True)):
     return {
         "seed": seed,
         "family": family,
-        "sigma_3d_m": 1e-3,
+        "sigma_3d_m": 0.9e-3,
+        "promised_rms_3d_m": 1e-3,
         "error_3d_m": error,
         "status": status,
         "marks": marks,
