@@ -73,7 +73,7 @@ class Sensor:
         Noise that an echo at the threshold of detection has besides, which falls with its energy
         [m].
     reach : float
-        Distance at which a sphere's echoes are at that threshold [m].
+        Distance at which a sphere's echoes are at that threshold [m]. Infinite: all are strong.
     drop_out : float
         Share of the returns that are lost for other reasons.
     sigma_direction : float
@@ -115,7 +115,7 @@ class Sensor:
     reflectivity: float = 42.0
     noise: float | None = None
     sigma_weak: float = 0.0
-    reach: float = 100.0
+    reach: float = np.inf
     drop_out: float = 0.0
     sigma_direction: float = 1e-4
     sigma_range_bias: float = 0.003
