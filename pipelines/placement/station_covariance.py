@@ -134,7 +134,7 @@ def sigmas_with_misses(observables: Observables, requirement: Requirement) -> Ar
         if shares[is_fixed].sum() > 0.0:
             variances = np.trace(cov[is_fixed, -3:, -3:], axis1=1, axis2=2)
             out[e] = np.sqrt(np.average(variances, weights=shares[is_fixed]))
-    return np.hypot(out, requirement.resection.sigma_height)
+    return np.asarray(np.hypot(out, requirement.resection.sigma_height))
 
 
 def information_of(observables: Observables, requirement: Requirement) -> Array:
