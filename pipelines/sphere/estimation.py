@@ -24,6 +24,7 @@ from spheremark.pipelines.sphere.optics import (
     SIGMAS_PROFILE,
     UNKNOWNS,
     derivatives,
+    echo_shifts,
     with_widths,
 )
 from spheremark.pipelines.sphere.radius import Ranges, free_radii
@@ -32,13 +33,13 @@ from spheremark.pipelines.sphere.returns import Returns, may_be_sphere, moved_fa
 _EFFICIENCY = 0.9753  # variance of the estimate over the inverse normal matrix
 _SIGMA_BIAS_MIN = 1e-5  # [m] of the laser biases: keeps their prior invertible
 _SIGMA_MIN = 1e-9  # of the other shared unknowns: likewise
-_N_STEPS, _N_STEPS_MAX = 7, 16  # at the least, and where errors of the mounting are still found
+_N_STEPS, _N_STEPS_MAX = 7, 16  # with returns chosen by their place, and until centres settle
 _SETTLED = 0.2  # sigmas by which centres may still move
-_N_STEPS_GATED = 4  # after these the choice of returns by their place is fixed
+_N_STEPS_CENTRES = 4  # without the shared unknowns
 _N_STEPS_RANGES = 3  # without the limb
 _N_STEPS_ROBUST = 3  # after these the noise is that of the weighted residuals
 _N_OPTICS = 4  # spheres, whose common radius is another unknown beside three of the optics
-_OPTICS_MAX = 15.1  # sum of squares over prior sigmas that optics exceed once in 100 scans
+_OPTICS_MAX = math.sqrt(15.1)  # prior sigmas by which optics are off once in 100 scans
 _ROUGH = 0.1  # radii: standard deviation per axis of a rough centre
 _STEP_MAX = 0.25  # radii per step
 _GAP_SIGMAS = 3.0  # of its centre by which a return may lie outside a sphere and still be its own
@@ -150,20 +151,26 @@ class Estimate(NamedTuple):
 def estimate(
     returns: Returns, rough: Array, prior: Prior, observe: Observe | None, *, uses_limb: bool
 ) -> Estimate:
-    """Estimate all centres, laser biases, optics and mounting, from rough centres, (m, 3)."""
+    """Estimate all centres, laser biases, optics and mounting, from rough centres, (m, 3).
+
+    Returns are chosen with footprints as wide as specified, or as estimated where that is wider and
+    not unlikely: those of a wide beam that reach the limb from beyond the specified width would
+    else be missing there, and the limb would seem as sharp as the choice.
+    """
     state, radius = _start(rough, prior), prior.radius
     is_used = np.ones(len(returns.ranges), dtype=bool)
     factors = np.zeros((len(returns.ranges), 2))
     for step in range(_N_STEPS_MAX):
         corrected = _corrected(returns, state)
         linear = linearise(corrected, *_spheres(state, radius), is_used)
-        if step < _N_STEPS_GATED:
-            is_used = may_be_sphere(returns, linear.offsets, _margins(state, radius), radius)
+        if step < _N_STEPS:
+            widest = _widest(returns, corrected) if _optics_are_likely(state) else returns
+            is_used = may_be_sphere(widest, linear.offsets, _margins(state, radius), radius)
         noise = state.noise if step >= _N_STEPS_ROBUST else None
         weighed = _weighed(corrected, state, linear, (radius, noise, is_used))
-        state = state._replace(noise=weighed.noise, has_shared=step >= _N_STEPS_GATED)
+        state = state._replace(noise=weighed.noise, has_shared=step >= _N_STEPS_CENTRES)
         residuals, sigmas, weights, _ = weighed
-        J = (linear.J[:3], derivatives(returns, linear))
+        J = (linear.J[:3], derivatives(returns, corrected, linear))
         N = normals_of(returns, J, residuals, weights / sigmas**2, len(state.biases))
         if uses_limb and step >= _N_STEPS_RANGES:
             edge = edge_of(corrected, linear, weights, radius)
@@ -220,11 +227,28 @@ def _margins(state: State, radius: float) -> Array:
     return np.asarray(np.clip(_GAP_SIGMAS * sigma, _GAP_MIN * radius, _GAP_MAX * radius))
 
 
+def _widest(returns: Returns, corrected: Returns) -> Returns:
+    """Return returns with the wider of their two footprints."""
+    names = ("half_widths", "vertical_half_widths")
+    wider = {name: np.maximum(getattr(returns, name), getattr(corrected, name)) for name in names}
+    return returns._replace(**wider)
+
+
+def _size_of_optics(state: State, shared: Array) -> float:
+    """Return the length of the optics among shared unknowns, in sigmas of their prior."""
+    return float(np.linalg.norm((shared / state.sigmas)[len(state.biases) : -N_MOUNTING]))
+
+
+def _optics_are_likely(state: State) -> bool:
+    """Tell whether the optics are inside the limit at which their steps end."""
+    return _size_of_optics(state, state.shared) < 0.999 * _OPTICS_MAX
+
+
 def _weighed(
     corrected: Returns, state: State, linear: Linear, known: tuple[float, Noise | None, Mask]
 ) -> Weighed:
     """Return residuals with weights, for radius, noise and used returns that are known."""
-    ranges = corrected.ranges - state.optics[N_ESTIMATED - 1] * linear.J_optics[1]
+    ranges = corrected.ranges - echo_shifts(linear, state.optics)
     return weigh(corrected._replace(ranges=ranges), linear, *known)
 
 
@@ -246,6 +270,7 @@ def _stepped(state: State, N: Normals, prior: Prior) -> State:
     estimated: Array = inverse(reduced.N)
     step = state.has_shared * (estimated @ reduced.rhs)
     shared, sigmas = state.shared + step, prior.sigmas.copy()
+    shared[_optics_of(prior)] *= min(1.0, _OPTICS_MAX / max(_size_of_optics(state, shared), 1e-12))
     if state.has_shared:
         for part in (slice(len(state.biases)), slice(-N_MOUNTING, None)):
             sigmas[part] *= _spread((shared[part], np.diag(estimated)[part]), sigmas[part])
@@ -314,10 +339,9 @@ def estimate_radii(returns: Returns, found: Estimate, radius: float) -> tuple[Ar
     take up what another radius does.
     """
     state, (_, sigmas, weights, _) = found.state, found.weighed
-    shared, optics = state.shared.copy(), slice(len(state.biases), -N_MOUNTING)
-    unlikely = float(np.sum((shared / state.sigmas)[optics] ** 2)) > _OPTICS_MAX
-    if len(state.centres) < _N_OPTICS or unlikely:
-        shared[optics] = 0.0
+    shared = state.shared.copy()
+    if len(state.centres) < _N_OPTICS or not _optics_are_likely(state):
+        shared[len(state.biases) : -N_MOUNTING] = 0.0
     moved, spheres = _corrected(returns, state._replace(shared=shared)), _spheres(state, radius)
     observed = Ranges(
         ranges=moved.ranges,

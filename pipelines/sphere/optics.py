@@ -66,13 +66,26 @@ def with_widths(returns: Returns, optics: Array) -> Returns:
     )
 
 
-def derivatives(returns: Returns, linear: Linear) -> Array:
+def echo_shifts(linear: Linear, optics: Array) -> Array:
+    """Return by how much ranges are longer than even echoes' because echoes weigh, (n,) [m]."""
+    return np.asarray(optics[N_ESTIMATED - 1] * linear.J_optics[1])
+
+
+def derivatives(specified: Returns, widened: Returns, linear: Linear) -> Array:
     """Return the derivatives, (5, n), of predicted ranges by ``UNKNOWNS``.
 
-    ``returns`` have the footprints as specified.
+    ``linear`` holds for footprints as ``widened`` by the present optics. What a footprint adds to
+    a range grows with the sum of the squares of its half widths.
     """
     by_width, by_cosine = linear.J_optics
-    mean = np.sqrt(returns.half_widths[0] * returns.half_widths[1])
-    window = 0.5 * np.sqrt(_WINDOW[0] * _WINDOW[1])
-    ones = np.ones(len(returns.ranges))
-    return np.stack([by_width, by_width * window / mean, by_cosine, ones, returns.ranges])
+    halves = widened.half_widths
+    by_square = by_width / np.sum(halves**2, axis=0)
+    return np.stack(
+        [
+            by_square * np.sum(halves * specified.half_widths, axis=0),
+            by_square * np.sum(halves * 0.5 * _WINDOW[:, None], axis=0),
+            by_cosine,
+            np.ones(len(specified.ranges)),
+            specified.ranges,
+        ]
+    )

@@ -138,7 +138,6 @@ def test_lidars_differ_by_as_much_as_fits_allow_for():
 
 
 @pytest.mark.slow
-@pytest.mark.xfail(strict=True, reason="wide beams: horizontal errors are 1.2 of their sigmas")
 def test_ellipses_of_whole_simulated_surveys_hold_their_shares():
     """Noise, biases, optics, encoder, misalignment, axis offset and tilt are all random.
 

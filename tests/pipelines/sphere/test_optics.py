@@ -6,7 +6,7 @@ import pytest
 from spheremark.pipelines.config import FittingConfig, StitchingConfig
 from spheremark.pipelines.geometry import inverse, transform
 from spheremark.pipelines.model import OPTICS, MarkerCandidate, MarkerCandidates, marker_name
-from spheremark.pipelines.scan.stitching import stitch
+from spheremark.pipelines.scan.stitching import beams, stitch
 from spheremark.pipelines.simulation import SimulationConfig, scenario, simulate_stop
 from spheremark.pipelines.simulation.options import Optics, Profile
 from spheremark.pipelines.sphere import fit_markers
@@ -93,7 +93,7 @@ def test_the_width_of_beams_at_their_window_is_found_within_its_sigma():
         cov = np.linalg.inv(one.weights + np.diag(one.sigmas_prior**-2.0))
         sigma = np.hypot(np.sqrt(cov[place, place]), one.sigmas_profile[place])
         assert abs(one.estimates[place] - 1.0) < 4.0 * sigma
-        assert sigma < 0.3
+        assert sigma < 0.7 * one.sigmas_prior[place]
 
 
 def test_even_beams_as_specified_show_nothing_else():
@@ -103,3 +103,29 @@ def test_even_beams_as_specified_show_nothing_else():
         sigmas = np.sqrt(np.diag(cov) + one.sigmas_profile**2)
         assert np.all(np.abs(one.estimates) < 4.0 * sigmas)
     assert squares.mean() / 3.0 < chance.of_mean_square(3 * len(SEEDS))[1]
+
+
+def outside(cloud, rows, p):
+    """How far beams pass outside a sphere by more than the half width that the rig says [m]."""
+    pulses = beams(cloud, rows)
+    v = p - pulses.origins_base
+    along = np.sum(v * pulses.directions_base, axis=1)
+    passed = v - along[:, None] * pulses.directions_base
+    x = np.sum(passed * pulses.across_base, axis=1)
+    y = np.sum(passed * np.cross(pulses.directions_base, pulses.across_base), axis=1)
+    away = np.hypot(x, y)
+    halves = 0.5 * pulses.ranges * np.hypot(*(pulses.divergence[:, None] * [x, y])) / away
+    is_of_sphere = (np.abs(pulses.ranges - along) < 0.03) & (passed[:, 2] < 0.06)  # not its pole
+    return np.where(is_of_sphere, away - halves, 0.0) - RADIUS
+
+
+def test_returns_that_only_a_wide_beam_has_from_a_sphere_are_used():
+    n_used = n_all = 0
+    for cloud, found, true in scans(Optics(profile=Profile.GAUSSIAN, window=(0.0127, 0.0095))):
+        fits = fit_markers("along_beam", cloud, found, FittingConfig(), RADIUS).fits
+        for fit, candidate, p in zip(fits, found.candidates, true, strict=True):
+            n_used += np.sum(outside(cloud, fit.used, p) > 0.004)
+            n_all += np.sum(outside(cloud, candidate.members, p) > 0.004)
+    assert n_all > 100
+    # with footprints as the rig says, a quarter: the limb seemed to end sharply at that width
+    assert n_used > 2 / 3 * n_all

@@ -87,7 +87,7 @@ def test_the_eliminated_equations_have_the_solution_of_the_dense_ones(stop):
     linear = linearise(returns, *spheres_and_covs(0.002))
     residuals = SIGMA * rng.standard_normal(len(returns.ranges))
     weights = rng.uniform(0.2, 1.0, len(residuals)) / SIGMA**2
-    by_optics = derivatives(returns, linear)
+    by_optics = derivatives(returns, returns, linear)
     q = len(by_optics)
     effects, precisions = effects_on(CENTRES), np.full(N_LASERS + q + 6, 1.0 / 0.01**2)
     N = normals_of(returns, (linear.J[:3], by_optics), residuals, weights, N_LASERS)
@@ -107,30 +107,43 @@ def test_the_eliminated_equations_have_the_solution_of_the_dense_ones(stop):
     assert_allclose(shared, dense[9:], rtol=0, atol=1e-9)
 
 
-def test_derivatives_by_the_optics_agree_with_wider_footprints_and_with_weighted_rays(stop):
+@pytest.mark.parametrize("present", [(0.0, 0.0), (0.3, 0.8), (-0.4, 0.0)])
+def test_derivatives_by_the_widths_agree_with_wider_footprints(stop, present):
     pulses, returns = stop
     spheres, covs = spheres_and_covs(1e-6)
-    linear, step = linearise(returns, spheres, covs), 0.1
-    exact = predict(pulses, CENTRES, spheres[:, 3], returns.markers)
-    by_optics = dict(zip(UNKNOWNS, derivatives(returns, linear), strict=True))
-    optics = dict.fromkeys(UNKNOWNS, 0.0)
-    seen = exact.lit > 0.3
-    for name, value in (("beam_width", step), ("beam_window", step)):
-        wide = with_widths(returns, np.array(list((optics | {name: value}).values())))
-        widths = (2.0 * wide.half_widths / returns.ranges).T
-        ranges = [
-            predict(replace(pulses, divergence=w), CENTRES, spheres[:, 3], returns.markers).ranges[
-                i
-            ]
-            for i, w in enumerate(widths)
+
+    def predicted(width, window):
+        wide = with_widths(returns, np.array([width, window, 0.0, 0.0, 0.0]))
+        each = [
+            predict(replace(pulses, divergence=own), CENTRES, spheres[:, 3], returns.markers)
+            for own in (2.0 * wide.half_widths / returns.ranges).T
         ]
-        expected = (np.array(ranges) - exact.ranges)[seen] / step
-        # the limb cuts some of the few strips of a footprint only when it is wider, and the width
-        # at the window adds more to the narrow axis, which the derivative takes as both
-        assert np.linalg.norm(by_optics[name][seen] - expected) < 0.25 * np.linalg.norm(expected)
+        ranges, lit = (
+            np.array([getattr(one, name)[i] for i, one in enumerate(each)])
+            for name in ("ranges", "lit")
+        )
+        return wide, ranges, lit
+
+    widened, ranges, lit = predicted(*present)
+    found = derivatives(returns, widened, linearise(widened, spheres, covs))
+    seen, step = lit > 0.3, 0.1
+    for k, row in enumerate(found[:2]):
+        moved = np.array(present)
+        moved[k] += step
+        expected = (predicted(*moved)[1] - ranges)[seen] / step
+        # the limb cuts some of the few strips of a footprint only when it is wider
+        assert np.linalg.norm(row[seen] - expected) < 0.25 * np.linalg.norm(expected)
+
+
+def test_the_derivative_by_the_weight_of_echoes_agrees_with_weighted_rays(stop):
+    pulses, returns = stop
+    spheres, covs = spheres_and_covs(1e-6)
+    exact = predict(pulses, CENTRES, spheres[:, 3], returns.markers)
+    seen, linear = exact.lit > 0.3, linearise(returns, spheres, covs)
+    found = derivatives(returns, returns, linear)[UNKNOWNS.index("echo_cosine"), seen]
     depths = rays_of(returns, spheres)[seen]
     weighted = np.nansum(depths**2, axis=1) / np.nansum(depths, axis=1) - np.nanmean(depths, axis=1)
-    assert_allclose(by_optics["echo_cosine"][seen], -weighted, rtol=0.1, atol=1e-4)
+    assert_allclose(found, -weighted, rtol=0.1, atol=1e-4)
 
 
 def rays_of(returns, spheres):
