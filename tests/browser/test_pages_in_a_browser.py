@@ -148,6 +148,11 @@ def test_a_file_that_is_no_log_is_refused_with_its_reason(visit, tmp_path):
     page.wait_for_selector("#uploads .outcome:has-text('refused'), #uploads .outcome.bad")
     assert page.locator("#uploads li").count() == 1
     assert page.evaluate("document.documentElement.scrollWidth") <= 390
+    held = visit()
+    about = held.open(page.get_by_role("link", name="What the log holds").get_attribute("href"))
+    about.wait_for_load_state("networkidle")
+    assert held.complaints == []
+    assert not about.get_by_role("button", name="Process").count()
 
 
 def test_a_survey_is_made_from_nothing_renamed_deleted_and_restored(visit, tmp_path):

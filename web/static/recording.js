@@ -1,7 +1,7 @@
 // Starts a job for the recording of the page, read as the form says.
 import { call } from "./request.js";
 
-const form = document.getElementById("process");
+const form = document.getElementById("process"); // missing where no option can help
 const NUMBERS = new Set(["joint_sign", "joint_offset_deg", "lidar_offset_s"]);
 
 function optionsOf(data) {
@@ -15,7 +15,7 @@ function optionsOf(data) {
   return options;
 }
 
-form.addEventListener("submit", async (event) => {
+form?.addEventListener("submit", async (event) => {
   event.preventDefault();
   const data = new FormData(form);
   const status = document.getElementById("process-status");
