@@ -111,7 +111,7 @@ def _passed(logs: Iterable[ScanLog], rig: Rig, config: SurveyConfig) -> tuple[_S
     return seen, estimate(
         *(seen.pulses, rig, seen.centres, seen.covs),
         config.marker_radius,
-        config.fitting.sigma_direction,
+        config.fitting,
     )
 
 
@@ -243,7 +243,7 @@ def _calibration(start: Rig, seen: _Seen, found: Estimate, config: SurveyConfig)
 def _scans(seen: _Seen, found: Estimate) -> Iterator[tuple[str, Scan]]:
     """Yield name and centres of each stop, those of the estimate in place of the rough ones.
 
-    The rig is adjusted with beams as specified: centres are moved by what their scan shows of them.
+    Those are moved to the optics that their own scan shows, with which networks take them.
     """
     for number, (name, rough) in enumerate(seen.scans):
         fits = list(rough.fits)
@@ -252,7 +252,7 @@ def _scans(seen: _Seen, found: Estimate) -> Iterator[tuple[str, Scan]]:
             place = seen.places[sphere, 1]
             p, cov = found.centres[sphere], found.cov_centres[sphere].copy()
             if (optics := fits[place].optics) is not None:
-                p = p - unit(p) * (fits[place].range_by_optics @ optics.estimates)
+                p = p - unit(p) * (fits[place].range_by_optics @ (optics.estimates - found.optics))
             fits[place] = replace(fits[place], p_base=p.copy(), cov_p_base=cov)
             effects[place] = found.effects[sphere]
         yield name, Scan(fits=replace(rough, fits=tuple(fits)), effects=effects)

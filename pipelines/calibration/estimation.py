@@ -14,11 +14,13 @@ from spheremark.pipelines.calibration.gimbal import (
     linearise,
     moved,
 )
+from spheremark.pipelines.config import FittingConfig
 from spheremark.pipelines.errors import NotConvergedError
 from spheremark.pipelines.estimation.linear_algebra import Reduced, eliminate, inverse
 from spheremark.pipelines.estimation.robust import tukey_loss, tukey_weights
 from spheremark.pipelines.model import RING_UNKNOWN, Array, Index, Mask, Rig, Rings
 from spheremark.pipelines.sphere.noise import N_CLASSES
+from spheremark.pipelines.sphere.optics import N_ESTIMATED, prior_sigmas
 
 _TUKEY = 6.0  # sigmas at which a return has no weight; 98 % efficient on clean data
 _EXPECTED_SQUARE = 0.8449  # mean of weight times square of normal residuals: 1 - 6/c^2 + 15/c^4
@@ -32,7 +34,10 @@ _SHARES = (1.0, 0.5, 0.25, 0.125, 0.0625)  # of a step that are tried
 _SETTLED = 0.02  # of the loss: what a step must save, a fifth of a sigma of one parameter
 _N_STEPS_CENTRES = 6
 _N_LASER = 20  # returns below which the bias of a laser stays as it is
+_SIGMA_MIN = 1e-9  # of optics that are taken as exact
 _PRIOR = 1e3  # [m] of a centre: keeps the equations solvable and is not felt otherwise
+
+_OPTICS = slice(len(GIMBAL), len(GIMBAL) + N_ESTIMATED)  # places among the unknowns
 
 
 class Inseparable(NamedTuple):
@@ -126,6 +131,8 @@ class Estimate(NamedTuple):
     ----------
     rig : Rig
         The rig.
+    optics : (3,)
+        The optics of ``sphere.optics`` that scans determine.
     centres : (m, 3)
         Centres in the base of their stops [m].
     is_free : (q,)
@@ -151,6 +158,7 @@ class Estimate(NamedTuple):
     """
 
     rig: Rig
+    optics: Array
     centres: Array
     is_free: Mask
     held: tuple[Inseparable, ...]
@@ -165,9 +173,10 @@ class Estimate(NamedTuple):
 
 
 class _State(NamedTuple):
-    """Rig and centres [m], with the pulses linearised there."""
+    """Rig, optics and centres [m], with the pulses linearised there."""
 
     rig: Rig
+    optics: Array
     centres: Array
     lin: Linearised
 
@@ -179,11 +188,18 @@ class _Problem(NamedTuple):
     covs: Array
     radius: float
     sigma_direction: float
+    sigmas_optics: Array
     basis: Array
 
-    def at(self, rig: Rig, centres: Array) -> _State:
-        """Return the state at a rig and centres."""
-        return _State(rig, centres, linearise(self.seen, rig, centres, self.covs, self.radius))
+    def at(self, rig: Rig, optics: Array, centres: Array) -> _State:
+        """Return the state at a rig, optics and centres."""
+        lin = linearise(self.seen, rig, optics, (centres, self.covs), self.radius)
+        return _State(rig, optics, centres, lin)
+
+    def loss(self, state: _State, sigmas: Array) -> float:
+        """Return the loss of a state, with that of its optics by their prior."""
+        prior = 0.5 * float(np.sum((state.optics / self.sigmas_optics) ** 2))
+        return prior + tukey_loss(state.lin.residuals / sigmas, _TUKEY)
 
     def extra(self, state: _State) -> Array:
         """Return the noise that directions and linearisation add to each range [m]."""
@@ -213,42 +229,49 @@ class _Problem(NamedTuple):
         return np.asarray(np.maximum(np.sqrt(own), _NOISE_MIN))
 
     def equations(self, state: _State, sigmas: Array) -> Reduced:
-        """Return the normal equations of all parameters and biases."""
+        """Return the normal equations of all parameters, optics and biases, in this order."""
         lin = state.lin
-        J = np.column_stack([lin.J_rig, self.basis[self.seen.rings]])
+        J = np.column_stack([lin.J_rig, lin.J_optics, self.basis[self.seen.rings]])
         weights = tukey_weights(lin.residuals / sigmas, _TUKEY) / sigmas**2
-        return reduced(self.seen.which, lin.J_centres, J, lin.residuals, weights)
+        equations = reduced(self.seen.which, lin.J_centres, J, lin.residuals, weights)
+        equations.N[_OPTICS, _OPTICS] += np.diag(self.sigmas_optics**-2.0)
+        equations.rhs[_OPTICS] -= state.optics / self.sigmas_optics**2
+        return equations
 
     def ahead(self, state: _State, equations: Reduced, chosen: Index, sigmas: Array) -> _State:
         """Return the state after the longest share of a step that lowers the loss, or the last."""
         steps = np.zeros(len(equations.N))
         steps[chosen] = inverse(equations.N[np.ix_(chosen, chosen)]) @ equations.rhs[chosen]
-        by_rig, by_laser = np.split(steps, [len(GIMBAL)])
+        by_rig, by_optics, by_laser = np.split(steps, [_OPTICS.start, _OPTICS.stop])
         biases = (self.basis @ by_laser)[: len(state.rig.laser_range_biases)]
         by_centre = equations.local_steps(steps)
-        loss, trial = _loss(state, sigmas), state
+        loss, trial = self.loss(state, sigmas), state
         for share in _SHARES:
             rig = moved(state.rig, share * by_rig, share * biases)
-            trial = self.at(rig, state.centres + share * by_centre)
-            if _loss(trial, sigmas) < loss:
+            optics = state.optics + share * by_optics
+            trial = self.at(rig, optics, state.centres + share * by_centre)
+            if self.loss(trial, sigmas) < loss:
                 break
         return trial
 
 
 def estimate(
-    seen: Pulses, rig: Rig, centres: Array, covs: Array, radius: float, sigma_direction: float
+    seen: Pulses, rig: Rig, centres: Array, covs: Array, radius: float, config: FittingConfig
 ) -> Estimate:
     """Adjust the rig and all centres to the recorded ranges.
 
     Notes
     -----
+    The optics of the beams are unknowns with their priors: a footprint that is wider than the rig
+    says shifts ranges on slopes by as much as errors of the rig do.
     Gauss-Newton with Tukey's weights, each step shortened until it lowers the loss. Noise is
     estimated by reflectivity and by sphere, each shrunk towards the noise of all: beams that graze
     the limb, which determine a centre across the line of sight, return weakly and are noisy.
     """
     lasers, basis = _contrasts(seen.rings)
-    problem = _Problem(seen, covs, radius, sigma_direction, basis)
-    state = problem.at(rig, centres)
+    sigmas_optics = np.maximum(prior_sigmas(config, rig)[:N_ESTIMATED], _SIGMA_MIN)
+    problem = _Problem(seen, covs, radius, config.sigma_direction, sigmas_optics, basis)
+    state = problem.at(rig, np.zeros(N_ESTIMATED), centres)
     noises = np.full(len(seen.which), _NOISE_START)
     is_free: Mask = np.ones(len(GIMBAL), dtype=np.bool_)
     held: tuple[Inseparable, ...] = ()
@@ -259,9 +282,11 @@ def estimate(
         equations = problem.equations(state, sigmas)
         if number == 0:
             is_free, held = separable(equations.N[: len(GIMBAL), : len(GIMBAL)], GIMBAL)
-        chosen = np.flatnonzero(np.append(is_free, np.ones(basis.shape[1], dtype=np.bool_)))
+        chosen = np.flatnonzero(
+            np.pad(is_free, (0, len(equations.N) - len(GIMBAL)), constant_values=True)
+        )
         better = problem.ahead(state, equations, chosen, sigmas)
-        saved = _loss(state, sigmas) - _loss(better, sigmas)
+        saved = problem.loss(state, sigmas) - problem.loss(better, sigmas)
         if number >= _N_STEPS_NOISE and saved < _SETTLED:
             return _estimate(problem, state, sigmas, is_free, held, lasers)
         state = better
@@ -293,37 +318,43 @@ def _estimate(
 ) -> Estimate:
     """Assemble the estimate."""
     n_free, k = int(is_free.sum()), problem.basis.shape[1]
-    chosen = np.flatnonzero(np.append(is_free, np.ones(k, dtype=np.bool_)))
+    chosen = np.append(np.flatnonzero(is_free), _OPTICS.stop + np.arange(k))
     equations = problem.equations(state, sigmas)
+    adjusted = np.sort(np.append(chosen, np.arange(len(GIMBAL) + N_ESTIMATED)[_OPTICS]))
+    cov = inverse(equations.N[np.ix_(adjusted, adjusted)])
+    of_rig = np.searchsorted(adjusted, chosen)
     J = np.zeros((n_free + len(lasers), n_free + k))
     J[:n_free, :n_free] = np.eye(n_free)
     J[n_free:, n_free:] = problem.basis[lasers]
     is_used = tukey_weights(state.lin.residuals / sigmas, _TUKEY) > 0.0
     return Estimate(
         rig=state.rig,
+        optics=state.optics,
         centres=state.centres,
         is_free=is_free,
         held=held,
         lasers=lasers,
-        cov=_EFFICIENCY * J @ inverse(equations.N[np.ix_(chosen, chosen)]) @ J.T,
+        cov=_EFFICIENCY * J @ cov[np.ix_(of_rig, of_rig)] @ J.T,
         is_used=is_used,
-        dof=int(is_used.sum()) - 3 * len(state.centres) - len(chosen),
+        dof=int(is_used.sum()) - 3 * len(state.centres) - len(adjusted),
         basis=J,
-        weights=_without_bias(equations.N, chosen) / _EFFICIENCY,
+        weights=_without_others(equations.N, chosen) / _EFFICIENCY,
         effects=equations.gains[:, :, chosen],
         cov_centres=_EFFICIENCY * equations.own,
     )
 
 
-def _without_bias(N: Array, chosen: Index) -> Array:
-    """Return the normal matrix of some unknowns, the common range bias eliminated.
+def _without_others(N: Array, chosen: Index) -> Array:
+    """Return the normal matrix of some unknowns, optics and the common range bias eliminated.
 
-    The apparent size of near spheres would determine that bias too, but depends on the assumed
-    width of the beams.
+    The apparent size of near spheres would determine that bias too, but depends on the profile of
+    the beams.
     """
     bias = [parameter.name for parameter in GIMBAL].index("common_range_bias")
-    across = N[chosen, bias]
-    return np.asarray(N[np.ix_(chosen, chosen)] - np.outer(across, across) / N[bias, bias])
+    others = np.append(np.arange(len(GIMBAL) + N_ESTIMATED)[_OPTICS], bias)
+    across = N[np.ix_(chosen, others)]
+    reduction = across @ inverse(N[np.ix_(others, others)]) @ across.T
+    return np.asarray(N[np.ix_(chosen, chosen)] - reduction)
 
 
 def residual_rms(seen: Pulses, rig: Rig, found: Estimate, covs: Array, radius: float) -> float:
@@ -331,13 +362,8 @@ def residual_rms(seen: Pulses, rig: Rig, found: Estimate, covs: Array, radius: f
     centres, weights = found.centres, found.is_used.astype(np.float64)
     nothing = np.zeros((len(weights), 0))
     for _ in range(_N_STEPS_CENTRES):
-        lin = linearise(seen, rig, centres, covs, radius)
+        lin = linearise(seen, rig, found.optics, (centres, covs), radius)
         equations = reduced(seen.which, lin.J_centres, nothing, lin.residuals, weights)
         centres = centres + equations.local_steps(np.zeros(0))
-    residuals = linearise(seen, rig, centres, covs, radius).residuals
+    residuals = linearise(seen, rig, found.optics, (centres, covs), radius).residuals
     return float(np.sqrt(np.mean(residuals[found.is_used] ** 2)))
-
-
-def _loss(state: _State, sigmas: Array) -> float:
-    """Return the loss of a state."""
-    return tukey_loss(state.lin.residuals / sigmas, _TUKEY)

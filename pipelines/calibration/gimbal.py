@@ -14,11 +14,14 @@ from scipy.spatial.transform import Rotation
 
 from spheremark.pipelines.model import Array, Beams, Index, Rig, Rings, ScanLog, StitchedCloud
 from spheremark.pipelines.scan.stitching import beams
-from spheremark.pipelines.sphere.footprint import predict
+from spheremark.pipelines.sphere.linearisation import linearise as linearise_ranges
 from spheremark.pipelines.sphere.noise import classes_of
+from spheremark.pipelines.sphere.optics import N_ESTIMATED, derivatives, echo_shifts, with_widths
+from spheremark.pipelines.sphere.returns import returns_of
 
 _RATE_WINDOW = 0.05  # [s] over which the speed of the gimbal is taken: encoders jitter
 _NS = 1e-9  # [s] in a nanosecond
+_UP = np.array([0.0, 0.0, 1.0])
 
 
 class Parameter(NamedTuple):
@@ -258,6 +261,8 @@ class Linearised(NamedTuple):
         Derivatives of the computed ranges by the centre of the sphere that was met.
     J_rig : (n, q)
         The same by the parameters of ``GIMBAL``.
+    J_optics : (n, 3)
+        The same by the optics of ``sphere.optics`` that scans determine.
     slopes : (n,)
         How much the range changes with the direction of the beam [m/rad].
     sigmas_nonlinear : (n,)
@@ -267,23 +272,31 @@ class Linearised(NamedTuple):
     residuals: Array
     J_centres: Array
     J_rig: Array
+    J_optics: Array
     slopes: Array
     sigmas_nonlinear: Array
 
 
-def linearise(seen: Pulses, rig: Rig, centres: Array, covs: Array, radius: float) -> Linearised:
-    """Compare pulses with spheres.
+def linearise(
+    seen: Pulses, rig: Rig, optics: Array, spheres: tuple[Array, Array], radius: float
+) -> Linearised:
+    """Compare pulses with spheres, whose centres and their covariances are known.
 
     Notes
     -----
     With ``v`` from a beam's origin to the centre and ``J`` the derivative of its range by the
     centre, a turn ``w`` of the beam changes the range by ``(J x v) w`` and a shift of its origin
-    by ``-J``: what counts is where the sphere is as seen from the beam. Near the limb the slope
-    of the range changes within less than a millimetre; there it is that between places to either
-    side of the centre (statistical linearisation by cubature).
+    by ``-J``: what counts is where the sphere is as seen from the beam.
     """
-    table = aimed(seen, rig)
-    ranges, J, nonlinear = _averaged(table, centres, covs, radius, seen.which)
+    table, (centres, covs) = aimed(seen, rig), spheres
+    starts = np.searchsorted(seen.which, np.arange(len(centres) + 1))
+    noise = (seen.shades, np.zeros(len(seen.which)), 0.0)
+    specified = returns_of(table, starts, _UP, seen.shades, noise)
+    widened = with_widths(specified, optics)
+    states, known = np.full((len(centres), 4), radius), np.zeros((len(centres), 4, 4))
+    states[:, :3], known[:, :3, :3] = centres, covs
+    linear = linearise_ranges(widened, states, known)
+    J = linear.J[:3].T
     turns, shifts = motions(seen, rig)
     v = centres[seen.which] - table.origins_base
     J_rig = np.einsum("nqi,ni->nq", turns, np.cross(J, v)) - np.einsum("nqi,ni->nq", shifts, J)
@@ -291,27 +304,13 @@ def linearise(seen: Pulses, rig: Rig, centres: Array, covs: Array, radius: float
     along = np.einsum("ni,ni->n", J, table.directions_base)
     slopes2 = np.maximum(np.einsum("ni,ni->n", J, J) - along**2, 0.0)
     return Linearised(
-        residuals=table.ranges - ranges,
+        residuals=table.ranges - linear.ranges - echo_shifts(linear, optics),
         J_centres=J,
         J_rig=J_rig,
+        J_optics=derivatives(specified, widened, linear)[:N_ESTIMATED].T,
         slopes=table.ranges * np.sqrt(slopes2),
-        sigmas_nonlinear=nonlinear,
+        sigmas_nonlinear=linear.sigmas_nonlinear,
     )
-
-
-def _averaged(
-    table: Beams, centres: Array, covs: Array, radius: float, which: Index
-) -> tuple[Array, Array, Array]:
-    """Return mean ranges, derivatives by the centre and nonlinear part over the centres' widths."""
-    radii = np.full(len(centres), radius)
-    columns = np.sqrt(3.0) * np.linalg.cholesky(covs)
-    places = [centres + side * columns[:, :, k] for k in range(3) for side in (1.0, -1.0)]
-    ranges = np.array([predict(table, place, radii, which).ranges for place in places])
-    slopes = (ranges[0::2] - ranges[1::2]).T / 2.0
-    J = np.asarray(np.einsum("nk,nki->ni", slopes, np.linalg.inv(columns)[which]))
-    linear = np.array([np.einsum("ni,ni->n", J, (place - centres)[which]) for place in places])
-    nonlinear = np.std(ranges - linear, axis=0)
-    return ranges.mean(axis=0), J, nonlinear
 
 
 def _euler(rig: Rig) -> Array:

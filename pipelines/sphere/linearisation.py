@@ -54,9 +54,23 @@ class Linear(NamedTuple):
 
 
 def linearise(returns: Returns, spheres: Array, covs: Array, is_used: Mask | None = None) -> Linear:
-    """Predict ranges to spheres, (m, 4), whose covariances, (m, 4, 4), are known.
+    """Predict ranges to spheres whose covariances are known.
 
-    Returns that are not used get the range and derivatives of the closest approach.
+    Parameters
+    ----------
+    returns : Returns
+        Beams.
+    spheres : (m, 4)
+        Centres and radii [m].
+    covs : (m, 4, 4)
+        Their covariances [m^2].
+    is_used : (n,), optional
+        The other returns get the range and derivatives of the closest approach.
+
+    Returns
+    -------
+    Linear
+        Ranges with derivatives.
 
     Notes
     -----

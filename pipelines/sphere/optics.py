@@ -37,6 +37,18 @@ def prior_sigmas(config: FittingConfig, rig: Rig) -> Array:
     """Return the prior standard deviations of ``UNKNOWNS``.
 
     A calibration removes what lasers differ by, and leaves what they have in common.
+
+    Parameters
+    ----------
+    config : FittingConfig
+        The priors.
+    rig : Rig
+        Biases of lasers that differ widen the prior of what they have in common.
+
+    Returns
+    -------
+    (5,)
+        In the order of ``UNKNOWNS``.
     """
     spread = float(np.std(rig.laser_range_biases)) / config.sigma_range_bias
     return np.array(
@@ -51,7 +63,20 @@ def prior_sigmas(config: FittingConfig, rig: Rig) -> Array:
 
 
 def with_widths(returns: Returns, optics: Array) -> Returns:
-    """Return returns whose footprints have the widths that the optics say."""
+    """Return returns whose footprints have the widths of the optics.
+
+    Parameters
+    ----------
+    returns : Returns
+        With footprints as specified.
+    optics : (2 or more,)
+        Values of ``UNKNOWNS``.
+
+    Returns
+    -------
+    ``Returns``
+        With other half widths.
+    """
     if not optics[:2].any():
         return returns
     width, window = optics[:2]
@@ -67,15 +92,41 @@ def with_widths(returns: Returns, optics: Array) -> Returns:
 
 
 def echo_shifts(linear: Linear, optics: Array) -> Array:
-    """Return by how much ranges are longer than even echoes' because echoes weigh, (n,) [m]."""
+    """Return by how much ranges differ from those of echoes that weigh evenly.
+
+    Parameters
+    ----------
+    linear : Linear
+        Predicted ranges.
+    optics : (3 or more,)
+        Values of ``UNKNOWNS``.
+
+    Returns
+    -------
+    (n,)
+        What is measured longer [m].
+    """
     return np.asarray(optics[N_ESTIMATED - 1] * linear.J_optics[1])
 
 
 def derivatives(specified: Returns, widened: Returns, linear: Linear) -> Array:
-    """Return the derivatives, (5, n), of predicted ranges by ``UNKNOWNS``.
+    """Return the derivatives of predicted ranges by ``UNKNOWNS``.
 
-    ``linear`` holds for footprints as ``widened`` by the present optics. What a footprint adds to
-    a range grows with the sum of the squares of its half widths.
+    Parameters
+    ----------
+    specified, widened : Returns
+        With footprints as specified, and as widened by the present optics.
+    linear : Linear
+        Predicted ranges for the latter.
+
+    Returns
+    -------
+    (5, n)
+        Derivatives.
+
+    Notes
+    -----
+    What a footprint adds to a range grows with the sum of the squares of its half widths.
     """
     by_width, by_cosine = linear.J_optics
     halves = widened.half_widths

@@ -65,7 +65,26 @@ class Returns(NamedTuple):
 def returns_of(
     beams: Beams, starts: Index, up: Array, lasers: Index, noise: tuple[Index, Array, Array | float]
 ) -> Returns:
-    """Build the columns; ``noise`` is reflectivity classes, sigmas of range and direction."""
+    """Build the columns.
+
+    Parameters
+    ----------
+    beams : Beams
+        Returns, candidate by candidate.
+    starts : (m + 1,)
+        First return of each candidate, and the end of the last.
+    up : (3,)
+        Upward direction in base.
+    lasers : (n,)
+        Index of the laser among those of the stop.
+    noise : tuple
+        Classes of reflectivity, (n,), and sigmas of ranges, (n,) [m], and of directions [rad].
+
+    Returns
+    -------
+    ``Returns``
+        Columns with coordinates as first axis.
+    """
     classes, sigmas, sigma_direction = noise
     origins, directions, first_axes = (
         np.ascontiguousarray(vectors.T)
