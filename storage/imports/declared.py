@@ -41,12 +41,12 @@ def check_bytes(what: str, n_bytes: int, n_bytes_max: int, name: str) -> None:
         )
 
 
-def check_points(n_points: int, name: str) -> None:
+def check_points(n_points: int, name: str, most: int = POINTS_MAX) -> None:
     """Refuse more points than a cloud may have."""
-    if n_points > POINTS_MAX:
+    if n_points > most:
         raise InputError(
-            f"{name} has {n_points:,} points; {POINTS_MAX:,} are the most. Cut out the field, or "
-            "thin it out."
+            f"{name} has {n_points:,} points; {most:,} are the most. Cut out the part that is "
+            "needed, or thin it out."
         )
 
 

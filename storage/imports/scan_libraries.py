@@ -12,14 +12,15 @@ import pye57
 
 from spheremark.pipelines.errors import InputError
 from spheremark.pipelines.model import Array
-from spheremark.storage.imports.scans import check_number, joined
+from spheremark.storage.imports.declared import check_points
+from spheremark.storage.imports.scans import POINTS_MAX, joined
 
 
 def read_pcd(file: IO[bytes], *, name: str) -> dict[str, Array]:
     """Return the points of a PCD file."""
     for line in file.read(4096).split(b"\n"):
         if line.startswith(b"POINTS") and (n := line[6:].strip()).isdigit():
-            check_number(int(n), name)
+            check_points(int(n), name, POINTS_MAX)
     cloud = open3d.io.read_point_cloud(Path(_own_path(file)), format="pcd", remove_nan_points=True)
     return joined([np.asarray(cloud.points)])
 
@@ -30,7 +31,7 @@ def read_e57(file: IO[bytes], *, name: str, number: int) -> dict[str, Array]:
         if not 0 <= number < e57.scan_count:
             raise InputError(f"{name} has {e57.scan_count} scans; there is no number {number}.")
         header = e57.get_header(number)
-        check_number(header.point_count, name)
+        check_points(header.point_count, name, POINTS_MAX)
         data = e57.read_scan(number, transform=False, ignore_missing_fields=True)
     columns = [data.get(f"cartesian{axis}") for axis in "XYZ"]
     if any(one is None for one in columns):

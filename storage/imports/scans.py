@@ -18,7 +18,7 @@ from spheremark.pipelines.model import Array
 from spheremark.storage.confined import Limits, run_confined
 from spheremark.storage.imports import ply
 from spheremark.storage.imports.cloud_files import check_las
-from spheremark.storage.imports.declared import check_bytes, size_of
+from spheremark.storage.imports.declared import check_bytes, check_points, size_of
 
 POINTS_MAX = 60_000_000
 LIMITS = Limits(seconds=300.0, memory_bytes=6 << 30, result_bytes=24 * POINTS_MAX)
@@ -79,7 +79,7 @@ def read_las(file: IO[bytes], *, name: str) -> dict[str, Array]:
     """Return the points of a LAS or LAZ file."""
     check_las(file, name)
     with laspy.open(file, closefd=False, laz_backend=laspy.LazBackend.Lazrs) as las:
-        check_number(las.header.point_count, name)
+        check_points(las.header.point_count, name, POINTS_MAX)
         pieces = [np.column_stack([c.x, c.y, c.z]) for c in las.chunk_iterator(_CHUNK)]
     return joined(pieces)
 
@@ -87,7 +87,7 @@ def read_las(file: IO[bytes], *, name: str) -> dict[str, Array]:
 def read_ply(file: IO[bytes], *, name: str) -> dict[str, Array]:
     """Return the vertices of a PLY file."""
     vertices = ply.vertices_of(file, name)
-    check_number(vertices.n, name)
+    check_points(vertices.n, name, POINTS_MAX)
     n_bytes, room = vertices.n * vertices.smallest, size_of(file) - vertices.begin + 1
     check_bytes(f"{vertices.n:,} vertices", n_bytes, room, name)
     return joined(list(vertices.pieces(file, _CHUNK)))
@@ -128,14 +128,6 @@ def read_text(file: IO[bytes], *, name: str) -> dict[str, Array]:
     if not len(points):
         raise InputError(f"{name} {_NO_TEXT}: it has no line of numbers.")
     return joined([points])
-
-
-def check_number(n: int, name: str) -> None:
-    """Refuse more points than a scan may have."""
-    if n > POINTS_MAX:
-        raise InputError(
-            f"{name} has {n:,} points; {POINTS_MAX:,} are the most. Cut out the part with spheres."
-        )
 
 
 def _is_numbers(line: bytes) -> bool:

@@ -61,7 +61,10 @@ _ROWS_MAX = 10_000
 _SIZE_MAX = 4_000_000  # characters; far more than 10,000 rows need
 _APART_MIN = 0.01  # [m] nearer marks are one mark entered twice
 _COORDINATE_MAX = 1e8  # [m] larger than any national grid
-_EXPECTED = "expected mark,x_m,y_m,z_m and, if known, sigma_x_m,sigma_y_m,sigma_z_m [m]"
+_EXPECTED = (
+    "expected mark,x_m,y_m,z_m and, if known, sigma_x_m,sigma_y_m,sigma_z_m [m], with "
+    "decimal points"
+)
 _HEIGHT_MAX = 100.0  # [m] of a target above its mark
 _NUMBER = re.compile(r"[-+.\d]|nan$|inf", re.IGNORECASE)  # how a cell that is no heading begins
 _RIGID_TOLERANCE = 1e-6  # how far a rotation matrix may be from orthonormal
@@ -327,7 +330,8 @@ class _Table:
         if (wrong := np.flatnonzero(~(np.abs(numbers) < _COORDINATE_MAX))).size:
             raise ControlError(
                 f"Line {self.lines[wrong[0]]}, column {column} of the control table is "
-                f"{cells[wrong[0]]!r}; it must be a number of metres below {_COORDINATE_MAX:g}."
+                f"{cells[wrong[0]]!r}; it must be a number of metres below {_COORDINATE_MAX:g}, "
+                "with a decimal point."
             )
         return numbers
 
