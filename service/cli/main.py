@@ -348,7 +348,10 @@ def query(
     if as_json:
         _print_json(result)
     elif as_csv:
-        sys.stdout.write(render.to_csv(result))
+        from spheremark.storage.catalogue.sandbox import csv_text
+
+        names = [column["name"] for column in result["columns"]]
+        sys.stdout.write(csv_text(names, result["rows"]))
     else:
         render.print_rows(out, result)
     if result["truncated"]:

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import csv
-import io
 import math
 from collections.abc import Iterable, Mapping
 from dataclasses import asdict
@@ -239,15 +237,6 @@ def _nees(errors: Plain) -> str:
         if errors[f"nees_per_dof_{kind}"] is not None
     ]
     return f"; normalised squared error {' and '.join(known)}" if known else ""
-
-
-def to_csv(result: Plain) -> str:
-    """Return the result of a query as CSV."""
-    text = io.StringIO()
-    writer = csv.writer(text)
-    writer.writerow([column["name"] for column in result["columns"]])
-    writer.writerows(result["rows"])
-    return text.getvalue()
 
 
 def _print_station(out: Console, station: Plain) -> None:

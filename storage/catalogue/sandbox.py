@@ -14,7 +14,7 @@ import json
 import logging
 import math
 import signal
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from time import perf_counter
@@ -180,12 +180,31 @@ def to_csv(result: QueryResult) -> str:
         NULL is an empty field, lists and objects are JSON. When rows were cut, the last line
         begins with ``# truncated``.
     """
+    text = csv_text([column.name for column in result.columns], result.rows)
+    if result.truncated:
+        text += f"# truncated: only the first {len(result.rows)} rows are here\r\n"
+    return text
+
+
+def csv_text(names: Sequence[str], rows: Iterable[Sequence[object]]) -> str:
+    """Return plain rows as CSV (RFC 4180), lists and objects as JSON.
+
+    Parameters
+    ----------
+    names : sequence of str
+        Names of the columns.
+    rows : iterable of sequence
+        Values of each row.
+
+    Returns
+    -------
+    str
+        The table with its header.
+    """
     text = io.StringIO()
     writer = csv.writer(text)
-    writer.writerow([column.name for column in result.columns])
-    writer.writerows([_csv_field(value) for value in row] for row in result.rows)
-    if result.truncated:
-        text.write(f"# truncated: only the first {len(result.rows)} rows are here\r\n")
+    writer.writerow(names)
+    writer.writerows([_csv_field(value) for value in row] for row in rows)
     return text.getvalue()
 
 

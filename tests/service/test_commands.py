@@ -205,8 +205,9 @@ def test_a_service_is_asked_exported_and_stopped_by_a_signal(tmp_path):
     assert not [one for one in files if one.stat().st_mode & 0o077]
     run("restore", tmp_path / "backup", "--data", tmp_path / "again")
     assert "Nothing is wrong" in run("doctor", "--data", tmp_path / "again").stderr
-    offline = run("query", "SELECT count(*) AS n FROM recordings", "--csv", **settings)
-    assert offline.stdout.split() == ["n", "0"]
+    sql = "SELECT count(*) AS n, ['a'] AS names FROM recordings"
+    offline = run("query", sql, "--csv", **settings)
+    assert offline.stdout.split() == ["n,names", '0,"[""a""]"']  # lists as in the service's CSV
 
 
 def half_an_upload(port):
