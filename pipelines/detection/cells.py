@@ -77,7 +77,9 @@ def cells_of(cloud: StitchedCloud, config: ExtractionConfig) -> Cells:
         ),
         n,
     )
-    lowest, highest = _joined(extremes[0], extremes[-1], n_side)
+    (lows, highs), (other_lows, other_highs) = extremes[0][:-1].T, extremes[-1][:-1].T
+    lowest = np.minimum(lows, other_lows).reshape(n_side, n_side)
+    highest = np.maximum(highs, other_highs).reshape(n_side, n_side)
     return Cells(layout, R, ground, directions, lowest, highest)
 
 
@@ -140,18 +142,6 @@ def _sort(
             extremes[cell, 0] = min(extremes[cell, 0], z[i])
             extremes[cell, 1] = max(extremes[cell, 1], z[i])
     return extremes
-
-
-@compiled
-def _joined(extremes: Column, others: Column, n_side: int) -> tuple[Column, Column]:
-    """Return the lowest and the highest per cell of the ground, of two parts of the returns."""
-    lowest = np.empty((n_side, n_side), np.float32)
-    highest = np.empty((n_side, n_side), np.float32)
-    low, high = lowest.reshape(-1), highest.reshape(-1)
-    for i in range(n_side * n_side):
-        low[i] = min(extremes[i, 0], others[i, 0])
-        high[i] = max(extremes[i, 1], others[i, 1])
-    return lowest, highest
 
 
 @compiled

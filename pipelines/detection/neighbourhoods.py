@@ -5,7 +5,6 @@ Hides how neighbours are found: the returns in the cells about the seeds, sorted
 
 from __future__ import annotations
 
-from itertools import accumulate
 from typing import NamedTuple
 
 import numpy as np
@@ -63,26 +62,12 @@ def returns_about(p_base: Column, cells: Cells, seeds: Array, radius: float) -> 
 
 def _sort_by_cell(
     p_base: Column, cells: NDArray[np.int32], is_wanted: Mask
-) -> tuple[NDArray[np.int32], Column]:
-    """Sort the returns in some cells by cell, by counting; those of a cell keep their order."""
-
-    def counted(first: int, end: int) -> tuple[_Rows, _Rows, _Rows]:
-        rows, own = rows_in(cells, is_wanted, first, end)
-        return rows, own, _counts(own, len(is_wanted))
-
-    parts = side_by_side(counted, len(p_base))
-    counts = [each for _, _, each in parts]
-    starts = np.zeros(len(is_wanted) + 1, np.int32)
-    np.cumsum(sum(counts), out=starts[1:])
-    points = np.empty((starts[-1], 3), np.float32)
-    places = accumulate(counts[:-1], initial=starts[:-1].copy())
-    jobs = [(rows, own, free) for (rows, own, _), free in zip(parts, places, strict=True)]
-    side_by_side(
-        lambda first, end: [_place(p_base, *job, points) for job in jobs[first:end]],
-        len(jobs),
-        threaded_from=2,
-    )
-    return starts, points
+) -> tuple[_Rows, Column]:
+    """Return the starts of some cells, and their returns by cell; those of one keep their order."""
+    parts = side_by_side(lambda first, end: rows_in(cells, is_wanted, first, end), len(p_base))
+    rows, own = (np.concatenate(columns) for columns in zip(*parts, strict=True))
+    starts = np.cumsum(np.bincount(own + 1, minlength=len(is_wanted) + 1), dtype=np.int32)
+    return starts, p_base[rows[np.argsort(own, kind="stable")]]
 
 
 @compiled
@@ -162,23 +147,3 @@ def _cells_about(layout: Layout, R_station_base: Array, places: Array, margin: i
             for m in range(max(column - margin, 0), min(column + margin, last) + 1):
                 is_wanted[k * n_side + m] = True
     return is_wanted
-
-
-@compiled
-def _counts(cells: _Rows, n_cells: int) -> _Rows:
-    """Return how often each cell occurs."""
-    counts = np.zeros(n_cells, np.int32)
-    for cell in cells:
-        counts[cell] += 1
-    return counts
-
-
-@compiled
-def _place(p_base: Column, rows: _Rows, cells: _Rows, free: _Rows, points: Column) -> None:
-    """Write some returns, each to the next free place of its cell."""
-    for i in range(len(rows)):
-        row, cell = np.uint32(rows[i]), np.uint32(cells[i])
-        place = np.uint32(free[cell])
-        free[cell] += 1
-        points[place, 0], points[place, 1] = p_base[row, 0], p_base[row, 1]
-        points[place, 2] = p_base[row, 2]
