@@ -292,7 +292,7 @@ function drawStop(stop) {
   section.querySelector("h2").textContent = `Marks from ${stop.name}`;
   const sigmas = [0, 1, 2].map((k) => fixed(Math.sqrt(stop.covariance_m2[k][k]), 2, 1000)).join(", ");
   section.querySelector("p").textContent = stop.sigma_3d_m === null ? `No position: ${stop.reason}.`
-    : `Sigma of the position along x, y and z: ${sigmas} mm; ${stop.dof} degrees of freedom.`;
+    : `Sigma of the position along x, y and z: ${sigmas} mm; with the marks that may be missed the RMS error is ${fixed(stop.rms_error_3d_m, 2, 1000)} mm; ${stop.dof} degrees of freedom.`;
   section.querySelector("tbody").replaceChildren(...stop.marks.map((one) => {
     const isUsed = one.redundancy > 0;
     const reliability = [fixed(one.redundancy, 2), fixed(one.minimal_detectable_bias_m, 1, 1000), fixed(one.external_reliability_m, 2, 1000)];
