@@ -41,9 +41,9 @@ def find_seeds(points: Column, target: Target, n_points_min: int) -> Array:
     voxels, step = _voxels(points.astype(np.float64), target.radius), _STEP * target.radius
     p = voxels.sums[:, :3] / voxels.sums[:, 3:]
     p = p[_is_free(voxels, p, step * target.up)]
-    aside = np.cross(target.up, p)
-    aside *= step / (np.linalg.norm(aside, axis=1, keepdims=True) + 1e-12)
-    p = p[_is_free(voxels, p, aside) | _is_free(voxels, p, -aside)]
+    across = np.cross(target.up, p)
+    across *= step / (np.linalg.norm(across, axis=1, keepdims=True) + 1e-12)
+    p = p[_is_free(voxels, p, across) | _is_free(voxels, p, -across)]
     sums = _sums_around(voxels, p)
     is_many = sums[:, 3] >= n_points_min
     p, sums = p[is_many], sums[is_many]

@@ -201,8 +201,9 @@ def test_a_worker_that_could_not_start_again_is_replaced(site):
 
 
 def test_pages_come_before_jobs(site):
-    own = os.getpriority(os.PRIO_PROCESS, 0)
-    assert all(worker.nice() > own for worker in site.workers())
+    own, workers = os.getpriority(os.PRIO_PROCESS, 0), site.workers()
+    assert workers
+    assert all(worker.nice() > own for worker in workers)
 
 
 def test_the_end_of_a_dismissed_job_does_not_end_the_job_after_it(site):

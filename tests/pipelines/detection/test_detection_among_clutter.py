@@ -146,7 +146,7 @@ def recall(scenario, place):
 def test_a_stepped_scan_takes_no_crest_for_a_marker():
     stepped = extraction(
         {"paper-field": DETECTION_PLAN["clutter-field"]},
-        (930,),
+        (930, 931),
         SimulationConfig(step=np.radians(5.0)),
     )
     found = stepped.run()["scenarios"]["paper-field"]
