@@ -171,10 +171,14 @@ class MarkerFit:
     sigma_range_shared : float
         Part of its standard deviation along the line of sight that all centres of the stop have in
         common, included in its covariance; NaN when not computed [m].
+    sigma_height_shared : float
+        Part of its standard deviation square to the line of sight, upward, that all centres of the
+        stop have in common by the difference between the limb above and below, likewise; 0 where
+        the method does not use the limb [m].
     shared_base : (3, k)
-        Factor of the errors that it shares with the other centres of the stop, of ranges and of the
-        mounting: the covariance of two centres is the product of their factors, and that with
-        itself is part of ``cov_p_base``; no columns when not computed [m].
+        Factor of the errors that it shares with the other centres of the stop, of ranges, of the
+        limb and of the mounting: the covariance of two centres is the product of their factors, and
+        that with itself is part of ``cov_p_base``; no columns when not computed [m].
     optics : Optics, optional
         What the scan of this centre shows of its beams, the same for all of its centres.
     range_by_optics : (3,)
@@ -207,6 +211,7 @@ class MarkerFit:
     incidence: float = np.nan
     variant: str = ""
     sigma_range_shared: float = np.nan
+    sigma_height_shared: float = 0.0
     shared_base: Array = field(default_factory=lambda: np.zeros((3, 0)))
     optics: Optics | None = None
     range_by_optics: Array = field(default_factory=lambda: np.zeros(3))

@@ -14,7 +14,7 @@ import numpy as np
 
 from spheremark.pipelines.estimation.linear_algebra import inverse
 from spheremark.pipelines.model import Array, Mask, Optics
-from spheremark.pipelines.sphere.limb import Edge, edge_of, limb_normals
+from spheremark.pipelines.sphere.limb import SIGMA_HALVES, Edge, edge_of, limb_normals
 from spheremark.pipelines.sphere.linearisation import Linear, linearise
 from spheremark.pipelines.sphere.mounting import N_MOUNTING, effects_on
 from spheremark.pipelines.sphere.noise import Noise, Weighed, weigh
@@ -44,6 +44,10 @@ _ROUGH = 0.1  # radii: standard deviation per axis of a rough centre
 _STEP_MAX = 0.25  # radii per step
 _GAP_SIGMAS = 3.0  # of its centre by which a return may lie outside a sphere and still be its own
 _GAP_MIN, _GAP_MAX = 0.02, 0.3  # radii: least and most of that
+# Places of the shared unknowns, from the end: lasers, optics, halves of the limb, mounting
+_MOUNTING, _HALVES = slice(-N_MOUNTING, None), -N_MOUNTING - 1
+_OPTICS = slice(_HALVES - len(UNKNOWNS), _HALVES)
+_BIASES = slice(None, _OPTICS.start)
 _UNFELT = 1e-6  # [m] by all centres together: what they share less than this
 _DOF_SPREAD = 2.0  # unknowns that the prior counts for in the estimate of their spread
 
@@ -77,9 +81,10 @@ class Prior(NamedTuple):
         """Standard deviations of all shared unknowns, tiny for those that are not estimated."""
         held = np.zeros(len(UNKNOWNS) - N_ESTIMATED)
         optics = np.append(self.sigma_optics[:N_ESTIMATED], held)
-        parts = (self.sigma_biases, optics, self.sigma_mounting)
-        least = np.repeat([_SIGMA_BIAS_MIN, _SIGMA_MIN, _SIGMA_MIN], [len(part) for part in parts])
-        return np.asarray(np.maximum(np.concatenate(parts), least))
+        parts = (self.sigma_biases, optics, [SIGMA_HALVES], self.sigma_mounting)
+        sigmas = np.maximum(np.concatenate(parts), _SIGMA_MIN)
+        sigmas[_BIASES] = np.maximum(sigmas[_BIASES], _SIGMA_BIAS_MIN)
+        return np.asarray(sigmas)
 
 
 class State(NamedTuple):
@@ -122,22 +127,28 @@ class State(NamedTuple):
     @property
     def biases(self) -> Array:
         """Range biases of the lasers [m]."""
-        return self.shared[: -N_MOUNTING - len(UNKNOWNS)]
+        return self.shared[_BIASES]
 
     @property
     def optics(self) -> Array:
         """Values of ``UNKNOWNS``."""
-        return self.shared[-N_MOUNTING - len(UNKNOWNS) : -N_MOUNTING]
+        return self.shared[_OPTICS]
 
     @property
     def mounting(self) -> Array:
         """Errors of the mounting."""
-        return self.shared[-N_MOUNTING:]
+        return self.shared[_MOUNTING]
 
     @property
     def covs(self) -> Array:
         """Covariances of the centres, (m, 3, 3) [m^2]."""
         return np.asarray(self.cov_noise + self.cov_shared_part)
+
+    @property
+    def by_halves(self) -> Array:
+        """How one sigma of the difference between the halves of the limb moves centres, (m, 3)."""
+        column = self.cov_shared[:, _HALVES]
+        return np.asarray(self.by_shared @ (column / math.sqrt(column[_HALVES])))
 
 
 class Estimate(NamedTuple):
@@ -170,10 +181,12 @@ def estimate(
         weighed = _weighed(corrected, state, linear, (radius, noise, is_used))
         state = state._replace(noise=weighed.noise, has_shared=step >= _N_STEPS_CENTRES)
         residuals, sigmas, weights, _ = weighed
-        J = (linear.J[:3], derivatives(returns, corrected, linear))
+        by_optics = derivatives(returns, corrected, linear)
+        J = (linear.J[:3], np.vstack([by_optics, np.zeros(len(residuals))]))
         N = normals_of(returns, J, residuals, weights / sigmas**2, len(state.biases))
         if uses_limb and step >= _N_STEPS_RANGES:
             edge = edge_of(corrected, linear, weights, radius)
+            state.shared[_HALVES] = edge.halves
             factors = _add_limb(N, corrected, Estimate(state, linear, weighed), edge, factors)
         if observe is not None and step >= _N_STEPS_RANGES:
             centres, rhs = observe(state.centres, state.covs)
@@ -236,7 +249,7 @@ def _widest(returns: Returns, corrected: Returns) -> Returns:
 
 def _size_of_optics(state: State, shared: Array) -> float:
     """Return the length of the optics among shared unknowns, in sigmas of their prior."""
-    return float(np.linalg.norm((shared / state.sigmas)[len(state.biases) : -N_MOUNTING]))
+    return float(np.linalg.norm((shared / state.sigmas)[_OPTICS]))
 
 
 def _optics_are_likely(state: State) -> bool:
@@ -254,11 +267,14 @@ def _weighed(
 
 def _add_limb(N: Normals, returns: Returns, now: Estimate, edge: Edge, factors: Array) -> Array:
     """Add the observations of the limb to normal equations; return the factors of the returns."""
-    limb = limb_normals(returns, now.linear, now.weighed.weights, now.state.covs, edge, factors)
+    by_halves = now.state.by_halves
+    covs = now.state.covs - by_halves[:, :, None] * by_halves[:, None]
+    limb = limb_normals(returns, now.linear, now.weighed.weights, covs, edge, factors)
     N.centres[:, :, :3] += limb.centres
-    N.centres[:, :, -1] += limb.rhs
+    N.centres[:, :, -2:] += np.stack([limb.halves, limb.rhs], axis=-1)
     N.by_face[:, :, :3] += limb.faces
-    N.by_face[:, :, -1] += limb.rhs_faces
+    N.by_face[:, :, -2:] += np.stack([limb.halves_faces, limb.rhs_faces], axis=-1)
+    N.shared[-1, -2:] += limb.of_halves
     return limb.factors
 
 
@@ -270,9 +286,9 @@ def _stepped(state: State, N: Normals, prior: Prior) -> State:
     estimated: Array = inverse(reduced.N)
     step = state.has_shared * (estimated @ reduced.rhs)
     shared, sigmas = state.shared + step, prior.sigmas.copy()
-    shared[_optics_of(prior)] *= min(1.0, _OPTICS_MAX / max(_size_of_optics(state, shared), 1e-12))
+    shared[_OPTICS] *= min(1.0, _OPTICS_MAX / max(_size_of_optics(state, shared), 1e-12))
     if state.has_shared:
-        for part in (slice(len(state.biases)), slice(-N_MOUNTING, None)):
+        for part in (_BIASES, _MOUNTING):
             sigmas[part] *= _spread((shared[part], np.diag(estimated)[part]), sigmas[part])
     cov_shared = _with_considered(estimated, reduced.N, prior, sigmas[0] / prior.sigmas[0])
     return state._replace(
@@ -283,7 +299,7 @@ def _stepped(state: State, N: Normals, prior: Prior) -> State:
         cov_shared_part=reduced.gains @ cov_shared @ reduced.gains.transpose(0, 2, 1),
         by_shared=reduced.gains,
         cov_shared=cov_shared,
-        cov_optics=estimated[_optics_of(prior), _optics_of(prior)],
+        cov_optics=estimated[_OPTICS, _OPTICS],
     )
 
 
@@ -301,7 +317,7 @@ def _with_considered(estimated: Array, N: Array, prior: Prior, spread: float) ->
     open of the other optics is added. Lasers whose biases spread by more than expected may have
     more in common, too.
     """
-    optics = np.arange(len(estimated))[_optics_of(prior)]
+    optics = np.arange(len(estimated))[_OPTICS]
     considered = optics[N_ESTIMATED:]
     response = -estimated @ N[:, considered]
     response[considered] = np.eye(len(considered))
@@ -309,11 +325,6 @@ def _with_considered(estimated: Array, N: Array, prior: Prior, spread: float) ->
     cov = estimated + (response * sigmas**2) @ response.T
     cov[optics, optics] += np.append(SIGMAS_PROFILE, np.zeros(len(considered))) ** 2
     return np.asarray(cov)
-
-
-def _optics_of(prior: Prior) -> slice:
-    """Return the places of the optics among the shared unknowns."""
-    return slice(len(prior.sigma_biases), -N_MOUNTING)
 
 
 def _spread(found: tuple[Array, Array], sigmas: Array) -> float:
@@ -341,7 +352,7 @@ def estimate_radii(returns: Returns, found: Estimate, radius: float) -> tuple[Ar
     state, (_, sigmas, weights, _) = found.state, found.weighed
     shared = state.shared.copy()
     if len(state.centres) < _N_OPTICS or not _optics_are_likely(state):
-        shared[len(state.biases) : -N_MOUNTING] = 0.0
+        shared[_OPTICS] = 0.0
     moved, spheres = _corrected(returns, state._replace(shared=shared)), _spheres(state, radius)
     observed = Ranges(
         ranges=moved.ranges,
@@ -360,6 +371,15 @@ def shared_range_sigmas(state: State) -> Array:
     own = np.diag(cov)
     common = (cov.sum(axis=1) - own) / (len(cov) - 1) if len(cov) > 1 else own
     return np.asarray(np.sqrt(np.maximum(common, 0.0)))
+
+
+def shared_height_sigmas(state: State) -> Array:
+    """Return the part of each centre's sigma upward that all have in common by their limbs."""
+    x, y, z = state.centres.T
+    flat = np.hypot(x, y)
+    upward = np.stack([-x * z, -y * z, flat**2]) / np.maximum(flat * np.hypot(flat, z), 1e-9)
+    heights = np.sum(state.by_halves * upward.T, axis=1)
+    return np.asarray(np.abs(np.maximum(np.sign(heights.sum()) * heights, 0.0)))
 
 
 def shared_factors(state: State) -> Array:
@@ -382,11 +402,11 @@ def optics_of(state: State, prior: Prior) -> tuple[Optics, Array]:
         sigmas_profile=SIGMAS_PROFILE.copy(),
     )
     lines = state.centres / np.linalg.norm(state.centres, axis=1, keepdims=True)
-    by_optics = state.by_shared[:, :, _optics_of(prior)][:, :, :N_ESTIMATED]
+    by_optics = state.by_shared[:, :, _OPTICS][:, :, :N_ESTIMATED]
     return optics, np.einsum("mi,mik->mk", lines, by_optics)
 
 
 def mounting_factor(state: State, prior: Prior) -> float:
     """Return by how much errors of the mounting exceed their prior; 1 where they do not."""
-    ratios = (state.sigmas / prior.sigmas)[-N_MOUNTING:]
+    ratios = (state.sigmas / prior.sigmas)[_MOUNTING]
     return max(float(ratios.max()), 1.0)

@@ -28,6 +28,9 @@ _SOFTNESS_MIN = 0.03  # half widths: an edge that a bin cannot tell from a sharp
 # Half widths: scatter of the edges of single spheres about that of all, even and between halves
 _SIGMAS_OWN = np.array([0.05, 0.1])
 _POLE_BLUR = 0.3  # half widths by which returns beside the pole may be the pole's
+SIGMA_HALVES = _SIGMA_EDGE / math.sqrt(2.0)
+"""Prior of half the difference between the edges above and below [half widths]."""
+
 _OUTLIERS = 0.01  # share of returns with the sphere's range whose beam did not meet it
 _CERTAIN = 4.0  # standard deviations inside the limb beyond which a return carries no information
 _DAMPING = 0.5  # part of the factors before that those of a step keep
@@ -53,6 +56,11 @@ class Edge(NamedTuple):
     inside: Array
     softness: Array
 
+    @property
+    def halves(self) -> float:
+        """By how much half widths more the edge lies inside above than in the mean."""
+        return float(self.inside[1] - self.inside[0]) / 2.0
+
 
 class LimbNormals(NamedTuple):
     """What the limb adds to the normal equations of centres.
@@ -63,6 +71,10 @@ class LimbNormals(NamedTuple):
         Normal matrices and right-hand sides.
     faces, rhs_faces : (m, 3, 3), (m, 3)
         The same with returns of the downward sweep counted negative.
+    halves, halves_faces : (m, 3), (m, 3)
+        Between the centres, all returns alike and by face, and the difference of the two halves.
+    of_halves : (2,)
+        Normal equation of that difference: its precision and right-hand side.
     factors : (n, 2)
         Precision, and precision times mean, of the normal approximation of each return's
         likelihood.
@@ -72,6 +84,9 @@ class LimbNormals(NamedTuple):
     rhs: Array
     faces: Array
     rhs_faces: Array
+    halves: Array
+    halves_faces: Array
+    of_halves: Array
     factors: Array
 
 
@@ -174,12 +189,20 @@ def limb_normals(
     starts, right = np.searchsorted(used, returns.starts), np.vstack([precisions * columns, rhs])
     both = sums_of_products(starts, columns, right)
     faces = sums_of_products(starts, columns, returns.vertical[0, used] * right)
-    both[:, 3:, 3:5] += np.diag(_SIGMAS_OWN**-2.0)
-    inverse = np.linalg.inv(both[:, 3:, 3:5])
-    N = both[:, :3] - both[:, :3, 3:5] @ inverse @ both[:, 3:]
+    inverse = np.linalg.inv(both[:, 3:, 3:5] + np.diag(_SIGMAS_OWN**-2.0))
+    N = both - both[:, :, 3:5] @ inverse @ both[:, 3:]  # fifth is the difference of all spheres
     of_faces = faces[:, :3, :3] - both[:, :3, 3:5] @ inverse @ faces[:, 3:, :3]
-    rhs_faces = faces[:, :3, 5:] - faces[:, :3, 3:5] @ inverse @ both[:, 3:, 5:]
-    return LimbNormals(N[:, :, :3], N[:, :, 5], of_faces, rhs_faces[:, :, 0], found)
+    others = faces[:, :3, 4:] - faces[:, :3, 3:5] @ inverse @ both[:, 3:, 4:]
+    return LimbNormals(
+        centres=N[:, :3, :3],
+        rhs=N[:, :3, 5],
+        faces=of_faces,
+        rhs_faces=others[:, :, 1],
+        halves=N[:, :3, 4],
+        halves_faces=others[:, :, 0],
+        of_halves=N[:, 4, 4:].sum(axis=0),
+        factors=found,
+    )
 
 
 def _approximated(inside: Array, variances: tuple[Array, Array], factors: Array) -> Array:

@@ -49,6 +49,7 @@ from spheremark.pipelines.sphere.estimation import (
     mounting_factor,
     optics_of,
     shared_factors,
+    shared_height_sigmas,
     shared_range_sigmas,
 )
 from spheremark.pipelines.sphere.mounting import sigmas_of
@@ -134,6 +135,7 @@ def _fit(
     best = estimate(stop.returns, rough, prior, observe, uses_limb=uses_limb)
     radii, sigmas = estimate_radii(stop.returns, best, radius)
     shared, factors = shared_range_sigmas(best.state), shared_factors(best.state)
+    heights = shared_height_sigmas(best.state)
     optics, by_optics = optics_of(best.state, prior)
     results = [
         _result(
@@ -145,6 +147,7 @@ def _fit(
             radius_free=float(radii[k]),
             sigma_radius_free=float(sigmas[k]),
             sigma_range_shared=float(shared[k]),
+            sigma_height_shared=float(heights[k]),
             shared_base=factors[k].copy(),
             optics=optics,
             range_by_optics=by_optics[k].copy(),

@@ -93,6 +93,16 @@ def test_the_limb_does_not_determine_the_distance():
     assert N[0, 0, 0] < 1e-6 * N[0, 1, 1]
 
 
+def test_limbs_above_and_below_say_of_the_height_only_what_their_difference_leaves():
+    reach = RADIUS + 0.45 * WIDTHS[0] * AWAY
+    returns, linear, weights, covs = passing(np.array([[0.0, reach], [0.0, -reach]]), 0.003)
+    limb = limb_normals(returns, linear, weights, covs, even_edge(0.0, 0.2), np.zeros((2, 2)))
+    known, between = limb.centres[0, 2, 2], limb.halves[0, 2]
+    assert known > 1e4  # a centimetre or better
+    assert_allclose(between**2 / limb.of_halves[0], known, rtol=1e-3)
+    assert_allclose(between * limb.of_halves[1], limb.of_halves[0] * limb.rhs[0, 2], rtol=1e-3)
+
+
 @pytest.mark.parametrize("edge", [-0.4, 0.0, 0.4, 0.9])
 @pytest.mark.parametrize("softness", [0.1, 0.5])
 def test_place_and_softness_of_the_edge_are_estimated_from_returns(edge, softness):
