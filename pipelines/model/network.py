@@ -197,6 +197,9 @@ class Network:
         Observed centres in the base frames of their stations [m].
     cov_p_base : (n, 3, 3)
         Their covariances, what all centres have in common included [m^2].
+    heights_base : (n, 3)
+        How one standard deviation of the error of height that all centres of a station have in
+        common moves each of them; not in ``cov_p_base`` [m].
     R_station_base : (s, 3, 3)
         Measured levelling; the last row is the up direction in base.
     cov_up_base : (s, 3, 3)
@@ -232,6 +235,7 @@ class Network:
     markers: tuple[str, ...]
     p_base: Array
     cov_p_base: Array
+    heights_base: Array
     R_station_base: Array
     cov_up_base: Array
     sigma_headings: Array
@@ -255,6 +259,7 @@ class Network:
                 "fits": (n,),
                 "p_base": (n, 3),
                 "cov_p_base": (n, 3, 3),
+                "heights_base": (n, 3),
                 "R_station_base": (s, 3, 3),
                 "cov_up_base": (s, 3, 3),
                 "sigma_headings": (s,),
@@ -369,6 +374,8 @@ class AdjustedNetwork:
         centre causes; infinite where a bias cannot be detected, NaN where not used [m].
     mark_shifts : (n,)
         The same of its mark [m].
+    heights : (s,)
+        What the centres of each station are too high, in units of ``Network.heights_base``.
     shared : (k,)
         The unknowns that all stations share, as estimated.
     cov_shared : (k, k)
@@ -419,6 +426,7 @@ class AdjustedNetwork:
     control: BlockTests
     station_shifts: Array
     mark_shifts: Array
+    heights: Array
     shared: Array
     cov_shared: Array
     parts: Parts
@@ -451,6 +459,7 @@ class AdjustedNetwork:
                 "used": (self.network.n_blocks,),
                 "station_shifts": (n,),
                 "mark_shifts": (n,),
+                "heights": (s,),
                 "shared": (len(self.network.shared.names),),
                 "control_predictions": self.network.p_control_site.shape,
                 "cov_control_predictions": self.network.cov_control_site.shape,
@@ -500,7 +509,9 @@ class AdjustedNetwork:
     @property
     def p_base(self) -> Array:
         """Observed centres less what all have in common, (n, 3) [m]."""
-        return np.asarray(self.network.p_base - self.network.shared.derivatives @ self.shared)
+        network = self.network
+        lifted = self.heights[network.sightings[:, 0], None] * network.heights_base
+        return np.asarray(network.p_base - lifted - network.shared.derivatives @ self.shared)
 
     @property
     def cov_positions(self) -> Array:

@@ -93,7 +93,8 @@ def _shifts(network: Network, tested: Tested, shift_w: float) -> tuple[Array, Ar
     own, between = cofactors.of_centres(network)
     J_turned, J_common = np.swapaxes(lin.J_centres, 1, 2), np.swapaxes(lin.J_common, 1, 2)
     J_place = by_motion(tested.state.T_site_base[station, :3, 3])
-    by_station = J_place @ (cofactors.stations[station] @ J_turned + between @ J_common)
+    of_motions = (cofactors.stations[station] @ J_turned + between @ J_common)[:, :6]
+    by_station = J_place @ of_motions
     by_mark = np.swapaxes(between, 1, 2)[:, :3] @ J_turned + own[:, :3] @ J_common
     used, blocks = tested.used[: len(station)], tested.blocks[0]
     of_station, of_mark = (
@@ -123,13 +124,13 @@ def _adjusted(
     left_out = _left_out(network, tested, dropped, critical)
     predictions, cov_predictions = _predicted_control(network, tested)
     tests = _columns(network, tested, shift_w)
-    parts = tested.cofactors.parts
+    parts, stations = tested.cofactors.parts, tested.cofactors.stations[:, :6, :6]
     J = by_motion(tested.state.T_site_base[:, :3, 3])
     return AdjustedNetwork(
         network=network,
         T_site_station=T,
-        cov_T_site_station=shift @ tested.cofactors.stations @ shift.T + _cov_heading(network, T),
-        station_covariances=J @ tested.cofactors.stations @ np.swapaxes(J, 1, 2),
+        cov_T_site_station=shift @ stations @ shift.T + _cov_heading(network, T),
+        station_covariances=J @ stations @ np.swapaxes(J, 1, 2),
         p_site=tested.state.p_site + middle,
         cov_p_site=tested.cofactors.common[: 3 * m, : 3 * m].copy(),
         used=tested.used,
@@ -138,6 +139,7 @@ def _adjusted(
         control=tests["control"],
         station_shifts=station_shifts,
         mark_shifts=mark_shifts,
+        heights=tested.state.heights,
         shared=tested.state.shared,
         cov_shared=tested.cofactors.common[3 * m :, 3 * m :].copy(),
         parts=Parts(

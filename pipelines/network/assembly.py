@@ -23,7 +23,7 @@ from spheremark.pipelines.errors import (
     SolveError,
 )
 from spheremark.pipelines.geometry import levelling_rotation, rigid, transform, unit, up_by_lean
-from spheremark.pipelines.model import OPTICS, Array, ControlMarks, MarkerFit, MarkerFits
+from spheremark.pipelines.model import OPTICS, Array, ControlMarks, MarkerFit, MarkerFits, Mask
 from spheremark.pipelines.model.network import LeftOut, Network, Refusal, Shared
 from spheremark.pipelines.network.mark_evidence import Weighed, weigh_marks
 from spheremark.pipelines.positioning.hypotheses import Spans, spans_between
@@ -37,6 +37,7 @@ from spheremark.pipelines.positioning.matching import (
 _EXACT = 1e-5  # [m] sigma of control marks that are given as exact: far below any survey's
 # In place of a mark: none is near; the one that is near is false; of a possible marker none
 _NO_MARK, _SUSPECT, _UNUSED = -1, -2, -3
+_SHARED_HEIGHT = 0.98  # most of a centre's variance of height that may be an error that all share
 _STEEP = 1e-3  # of a line of sight that is nearly the gimbal axis: across is no direction there
 _NEAR_CONTROL = 1.0  # [m] how far a mark can be from a control mark and still be worth a remark
 
@@ -168,6 +169,7 @@ def assemble(
         variances = shared_variances(network.p_base, cov_p_base, sigmas, config)
         cov_p_base = own_covariances(network.p_base, cov_p_base, variances)
     network = replace(network, cov_p_base=cov_p_base, refused=refused)
+    network = _with_heights(network, seen) if calibration is None else network
     network = _in_common(network, seen, config, calibration)
     left_out = _unseen(scans, found, used, unshared, weighed.dropped)
     return replace(network, left_out=left_out, evidence=weighed.evidence)
@@ -418,6 +420,7 @@ def _network(
         cov_control_site=given + _EXACT**2 * np.eye(3),
         T_site_base=np.array([found.poses[i] for i in used]),
         p_site=np.array([found.p_site[mark] for mark in places]),
+        heights_base=np.zeros((len(fits), 3)),
         shared=Shared.none(len(fits)),
         suspicions=tuple(suspicions.get(mark, "") for mark in places),
     )
@@ -430,15 +433,40 @@ def _symmetric(p_base: Array, cov_p_base: Array) -> Array:
     centre was linearised, and as a weight would turn errors across the line of sight into errors
     along it: over many stations the ring of marks swells by 0.2 mm.
     """
+    axes, is_steep = _axes(p_base)
+    variances = np.einsum("nki,nij,nkj->nk", axes, cov_p_base, axes)
+    alike = np.swapaxes(axes, 1, 2) @ (variances[..., None] * axes)
+    return np.where(is_steep[:, None, None], cov_p_base, alike)
+
+
+def _axes(p_base: Array) -> tuple[Array, Mask]:
+    """Return unit vectors along, across and above lines of sight, (n, 3, 3), and which are steep.
+
+    Across is level, except where the line of sight is nearly the gimbal axis.
+    """
     along = unit(p_base)
     across = np.column_stack([-along[:, 1], along[:, 0], np.zeros(len(along))])
     lengths = np.linalg.norm(across, axis=1, keepdims=True)
-    is_steep = lengths < _STEEP
-    across /= np.where(is_steep, 1.0, lengths)
-    axes = np.stack([along, across, np.cross(along, across)], axis=1)
-    variances = np.einsum("nki,nij,nkj->nk", axes, cov_p_base, axes)
-    alike = np.swapaxes(axes, 1, 2) @ (variances[..., None] * axes)
-    return np.where(is_steep[..., None], cov_p_base, alike)
+    is_steep = (lengths < _STEEP)[:, 0]
+    across /= np.where(is_steep[:, None], 1.0, lengths)
+    return np.stack([along, across, np.cross(along, across)], axis=1), is_steep
+
+
+def _with_heights(network: Network, fits: Sequence[MarkerFit]) -> Network:
+    """Return the network with the error of height that all centres of a station have in common.
+
+    It leaves the covariances of the centres: taken as their own, it would seem to cancel in the
+    height of the station.
+    """
+    axes, is_steep = _axes(network.p_base)
+    upward, covs = axes[:, 2], network.cov_p_base
+    variances = np.array([fit.sigma_height_shared for fit in fits]) ** 2
+    most = _SHARED_HEIGHT * np.einsum("ni,nij,nj->n", upward, covs, upward)
+    sigmas = np.sqrt(np.where(is_steep, 0.0, np.minimum(variances, most)))
+    heights = sigmas[:, None] * upward
+    return replace(
+        network, heights_base=heights, cov_p_base=covs - heights[:, :, None] * heights[:, None]
+    )
 
 
 def _in_common(

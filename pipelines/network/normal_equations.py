@@ -18,6 +18,7 @@ from spheremark.pipelines.model import Array, Mask
 from spheremark.pipelines.model.network import Network, Parts
 from spheremark.pipelines.positioning.matching import moved
 
+_MOTION = 6  # unknowns of a station's motion; one of its error of height follows
 N_DEFECT = 4  # of a free network whose stations are levelled: place and heading
 
 _STEPS = 50  # three to six suffice
@@ -29,10 +30,12 @@ _SINGULAR = 1e-11  # eigenvalue of the reduced normal matrix with unit diagonal
 class State:
     """Poses of the stations, (s, 4, 4), and marks, (m, 3), relative to the middle [m].
 
-    ``shared``, (k,), are the unknowns that all stations have in common.
+    ``heights``, (s,), are errors of height of the stations' centres in standard deviations;
+    ``shared``, (k,), the unknowns that all stations have in common.
     """
 
     T_site_base: Array
+    heights: Array
     p_site: Array
     shared: Array
 
@@ -47,16 +50,16 @@ class Linearised:
         ``T p_base - p_site`` [m].
     P_centres : (n, 3, 3)
         Weights; zero where a block is not used.
-    J_centres : (n, 3, 6)
-        By the motion of the station.
+    J_centres : (n, 3, 7)
+        By the motion of the station and its error of height.
     J_common : (n, 3, 3 + k)
         By the mark, minus the identity, and by what all stations share.
     v_gravity : (s, 2)
         Horizontal part of the measured up direction [rad].
     P_gravity : (s, 2, 2)
         Weights.
-    J_gravity : (s, 2, 6)
-        By the motion of the station.
+    J_gravity : (s, 2, 7)
+        By the same.
     v_control : (c, 3)
         Given minus adjusted coordinates [m]; by the mark minus the identity.
     P_control : (c, 3, 3)
@@ -80,9 +83,9 @@ class Cofactors:
 
     Attributes
     ----------
-    stations : (s, 6, 6)
-        Of small motions of the stations.
-    between : (s, 6, q)
+    stations : (s, 7, 7)
+        Of small motions of the stations, and of their errors of height.
+    between : (s, 7, q)
         Between stations and common unknowns.
     common : (q, q)
         Of the common unknowns.
@@ -98,7 +101,7 @@ class Cofactors:
     def of_centres(self, network: Network) -> tuple[Array, Array]:
         """Return, per centre, the covariance of its mark and what all share, and to its station.
 
-        Shapes are (n, 3 + k, 3 + k) and (n, 6, 3 + k).
+        Shapes are (n, 3 + k, 3 + k) and (n, 7, 3 + k).
         """
         station, mark = network.sightings.T
         m, q = len(network.marks), len(self.common)
@@ -120,13 +123,16 @@ def start(network: Network) -> State:
     T = np.array(network.T_site_base)
     T[:, :3, 3] -= middle
     nothing = np.zeros(len(network.shared.names))
-    return State(T_site_base=T, p_site=network.p_site - middle, shared=nothing)
+    return State(
+        T_site_base=T, heights=np.zeros(len(T)), p_site=network.p_site - middle, shared=nothing
+    )
 
 
 def step_to(state: State, xi: Array, dp: Array, d_shared: Array) -> State:
-    """Move a state."""
+    """Move a state; ``xi``, (s, 7), are motions of the stations and steps of their heights."""
     return State(
-        T_site_base=moved(state.T_site_base, xi),
+        T_site_base=moved(state.T_site_base, xi[:, :_MOTION]),
+        heights=state.heights + xi[:, _MOTION],
         p_site=state.p_site + dp,
         shared=state.shared + d_shared,
     )
@@ -139,7 +145,9 @@ def linearise(network: Network, state: State, used: Mask) -> Linearised:
     R, t = state.T_site_base[:, :3, :3], state.T_site_base[:, :3, 3]
     R_each = R[station]
     derivatives = R_each @ network.shared.derivatives
+    lifts = np.einsum("nij,nj->ni", R_each, network.heights_base)
     p = np.einsum("nij,nj->ni", R_each, network.p_base) + t[station] - derivatives @ state.shared
+    p -= state.heights[station, None] * lifts
     J_mark = np.broadcast_to(-np.eye(3), (n, 3, 3))
     weights = R_each @ invert_each(network.cov_p_base)[0] @ np.swapaxes(R_each, 1, 2)
     up = np.einsum("sij,sj->si", R, network.R_station_base[:, 2])
@@ -148,32 +156,35 @@ def linearise(network: Network, state: State, used: Mask) -> Linearised:
     return Linearised(
         v_centres=p - state.p_site[mark],
         P_centres=weights * used[:n, None, None],
-        J_centres=by_motion(p),
+        J_centres=np.concatenate([by_motion(p), -lifts[..., None]], axis=2),
         J_common=np.concatenate([J_mark, -derivatives], axis=2),
         v_gravity=up[:, :2],
         P_gravity=invert_each(cov_up)[0] * used[n : n + s, None, None],
-        J_gravity=np.concatenate([-skew(up)[:, :2], np.zeros((s, 2, 3))], axis=2),
+        J_gravity=np.concatenate([-skew(up)[:, :2], np.zeros((s, 2, 4))], axis=2),
         v_control=control - state.p_site[network.controls],
         P_control=invert_each(network.cov_control_site)[0] * used[n + s :, None, None],
     )
 
 
-def _reduce(network: Network, lin: Linearised, shared: Array) -> tuple[Reduced, Array]:
+def _reduce(network: Network, lin: Linearised, state: State) -> tuple[Reduced, Array]:
     """Return the normal equations without the stations, and the right-hand sides of these."""
-    s, m, k = len(network.stations), len(network.marks), len(shared)
+    s, m, k = len(network.stations), len(network.marks), len(state.shared)
     station, mark = network.sightings.T
     weighted = np.swapaxes(lin.J_centres, 1, 2) @ lin.P_centres
     levelled = np.swapaxes(lin.J_gravity, 1, 2) @ lin.P_gravity
     local, rhs = levelled @ lin.J_gravity, -np.einsum("sij,sj->si", levelled, lin.v_gravity)
+    local[:, _MOTION, _MOTION] += 1.0  # the prior of the heights
+    rhs[:, _MOTION] -= state.heights
     np.add.at(local, station, weighted @ lin.J_centres)
     np.add.at(rhs, station, -np.einsum("nij,nj->ni", weighted, lin.v_centres))
     coupling = weighted @ lin.J_common
-    to_marks, to_shared = np.zeros((s, m, 6, 3)), np.zeros((s, 6, k))
+    n_own = _MOTION + 1
+    to_marks, to_shared = np.zeros((s, m, n_own, 3)), np.zeros((s, n_own, k))
     np.add.at(to_marks, (station, mark), coupling[..., :3])
     np.add.at(to_shared, station, coupling[..., 3:])
-    flat = np.swapaxes(to_marks, 1, 2).reshape(s, 6, 3 * m)
+    flat = np.swapaxes(to_marks, 1, 2).reshape(s, n_own, 3 * m)
     mixed = np.concatenate([flat, to_shared], axis=2)
-    return eliminate(local, mixed, rhs, *_common_alone(network, lin, shared)), rhs
+    return eliminate(local, mixed, rhs, *_common_alone(network, lin, state.shared)), rhs
 
 
 def _common_alone(network: Network, lin: Linearised, shared: Array) -> tuple[Array, Array]:
@@ -244,7 +255,7 @@ def solve_network(network: Network, state: State, used: Mask) -> tuple[State, Co
     """
     m = len(network.marks)
     for _ in range(_STEPS):
-        reduced, rhs = _reduce(network, linearise(network, state, used), state.shared)
+        reduced, rhs = _reduce(network, linearise(network, state, used), state)
         cov = _inverse(reduced.N, _datum(network, state))
         common = cov @ reduced.rhs
         stations = reduced.local_steps(common)
@@ -265,5 +276,9 @@ def _cofactors(reduced: Reduced, cov_common: Array) -> Cofactors:
         stations=(stations + np.swapaxes(stations, 1, 2)) / 2.0,
         between=between,
         common=cov_common,
-        parts=Parts(own=reduced.own, coupling=reduced.gains, cov_common=cov_common),
+        parts=Parts(
+            own=reduced.own[:, :_MOTION, :_MOTION].copy(),
+            coupling=reduced.gains[:, :_MOTION].copy(),
+            cov_common=cov_common,
+        ),
     )

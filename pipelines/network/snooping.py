@@ -92,9 +92,10 @@ class Tested:
 
     @property
     def vtpv(self) -> float:
-        """The weighted sum of squares, with the shared unknowns against their prior."""
-        shared = self.state.shared
-        return sum(self.squares) + float(shared @ self.network.shared.prior_weights @ shared)
+        """The weighted sum of squares, with shared unknowns and heights against their prior."""
+        shared, heights = self.state.shared, self.state.heights
+        priors = shared @ self.network.shared.prior_weights @ shared + heights @ heights
+        return sum(self.squares) + float(priors)
 
     @property
     def sigma0(self) -> float:

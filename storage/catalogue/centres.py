@@ -133,6 +133,7 @@ def _fit(row: Row, levelling: Levelling) -> MarkerFit:
         incidence=np.radians(_number(row.get("incidence_deg"))),
         variant=row.get("variant") or "",
         sigma_range_shared=_number(row["sigma_range_shared_m"]),
+        sigma_height_shared=row["sigma_height_shared_m"] or 0.0,
         optics=_optics(row["optics"]),
         range_by_optics=np.array(row["range_by_optics_m"] or np.zeros(3)),
         probability=_number(row["probability"]),

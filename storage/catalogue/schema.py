@@ -1,6 +1,7 @@
 """Tables and views as the SQL files declare them: their comments, and the Arrow types of columns.
 
-The comment above a ``CREATE`` describes the table or view, one behind a column the column.
+The comment above a ``CREATE`` describes the table or view, one behind a column the column, also
+where a later file adds it.
 """
 
 from __future__ import annotations
@@ -20,6 +21,9 @@ _OBJECT = re.compile(
     r"^-- (?P<about>[^\n]*)\nCREATE (?P<kind>TABLE|VIEW) (?P<name>\w+)(?P<body>.*?);$", re.M | re.S
 )
 _COLUMN = re.compile(r"^    (?P<sql>.*?),?(?:  -- (?P<about>.*))?$", re.M)
+_ADDED = re.compile(
+    r"^ALTER TABLE (?P<table>\w+) ADD COLUMN (?P<name>\w+) (?P<type>\S+);  -- (?P<about>.*)$", re.M
+)
 _COLUMN_NAME = re.compile(r"(?P<name>\w+?)(?:_(?P<unit>m|deg|s))?")
 _TYPES = {
     "VARCHAR": pa.string(),
@@ -51,13 +55,18 @@ class _Object(NamedTuple):
 
 def comments(sql: str) -> str:
     """Return the statements that write the comments of a schema into the database."""
-    return "".join(
-        f"COMMENT ON {what} IS '{about.replace(chr(39), 2 * chr(39))}';\n"
+    pairs = [
+        (what, about)
         for one in _objects(sql)
         for what, about in (
             (f"{one.kind} {one.name}", one.about),
             *((f"COLUMN {one.name}.{column.name}", column.about) for column in one.columns),
         )
+    ]
+    pairs += [(f"COLUMN {table}.{column.name}", column.about) for table, column in _added(sql)]
+    return "".join(
+        f"COMMENT ON {what} IS '{about.replace(chr(39), 2 * chr(39))}';\n"
+        for what, about in pairs
         if about
     )
 
@@ -67,6 +76,12 @@ def _objects(sql: str) -> Iterator[_Object]:
     for found in _OBJECT.finditer(sql):
         columns = _columns(found["body"], is_view=found["kind"] == "VIEW")
         yield _Object(found["name"], found["kind"], found["about"], tuple(columns))
+
+
+def _added(sql: str) -> Iterator[tuple[str, _Column]]:
+    """Yield the columns that a schema adds to tables of earlier files, with these tables."""
+    for found in _ADDED.finditer(sql):
+        yield found["table"], _Column(found["name"], found["about"], found["type"])
 
 
 def _columns(body: str, *, is_view: bool) -> Iterator[_Column]:
@@ -87,12 +102,20 @@ def _arrow(kind: str) -> pa.DataType:
 def _schemas() -> dict[str, pa.Schema]:
     """Return the columns of every table, in the order of the database."""
     files = resources.files(__package__).joinpath("migrations").iterdir()
-    texts = (file.read_text(encoding="utf-8") for file in files if file.name.endswith(".sql"))
-    return {
-        one.name: pa.schema([(column.name, _arrow(column.type)) for column in one.columns])
+    named = sorted(files, key=lambda file: file.name)
+    texts = [file.read_text(encoding="utf-8") for file in named if file.name.endswith(".sql")]
+    tables = {
+        one.name: list(one.columns)
         for text in texts
         for one in _objects(text)
         if one.kind == "TABLE"
+    }
+    for text in texts:
+        for table, column in _added(text):
+            tables[table].append(column)
+    return {
+        name: pa.schema([(column.name, _arrow(column.type)) for column in columns])
+        for name, columns in tables.items()
     }
 
 

@@ -210,10 +210,12 @@ def _add_set(parent: ET.Element, result: AdjustedNetwork, station: int) -> None:
     rows = np.flatnonzero((network.sightings[:, 0] == station) & result.used[:n])
     level = _level(result.T_site_station[station, :3, :3])
     R = level @ network.R_station_base[station]
-    p = result.p_base[rows] @ R.T
+    heights = network.heights_base[rows]  # an error that all centres share stays in the file
+    p = (result.p_base[rows] + result.heights[station] * heights) @ R.T
     values, J = _polar(p)
-    cov = np.zeros((len(rows), 3, len(rows), 3))
-    cov[np.arange(len(rows)), :, np.arange(len(rows)), :] = (
+    lifts = np.einsum("nij,jk,nk->ni", J, R, heights)
+    cov = np.einsum("na,mb->namb", lifts, lifts)
+    cov[np.arange(len(rows)), :, np.arange(len(rows)), :] += (
         J @ R @ network.cov_p_base[rows] @ R.T @ np.swapaxes(J, 1, 2)
     )
     cov_up = R @ network.cov_up_base[station] @ R.T

@@ -84,7 +84,9 @@ def fits(method, shift, points, rng):
         residuals = rng.normal(size=len(used)) * 0.01
         fit = marker_fit(centre + shift, one, f"M{i:02d}")
         known = {"used": used, "rejected": rejected, "residuals": residuals}
-        found.append(replace(fit, method=method, sigma_range_shared=7e-4, **known))
+        found.append(
+            replace(fit, method=method, sigma_range_shared=7e-4, sigma_height_shared=3e-4, **known)
+        )
     false = marker_fit(np.array([0.0, 0.0, 9.0]), np.eye(3) * 1e-4, f"M{len(centres) + 1:02d}")
     found.append(
         replace(

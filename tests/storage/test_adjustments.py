@@ -144,6 +144,7 @@ def test_centres_come_back_from_their_rows_as_they_were_fitted():
         np.testing.assert_allclose(one.cov_p_base, other.cov_p_base, rtol=0, atol=1e-15)
         assert (one.status, one.reason, one.method) == (other.status, other.reason, other.method)
         np.testing.assert_equal(one.sigma_range_shared, other.sigma_range_shared)
+        assert one.sigma_height_shared == other.sigma_height_shared
 
 
 def test_evidence_and_possible_markers_come_back_from_their_rows():

@@ -60,12 +60,17 @@ def test_a_comment_of_the_schema_is_one_of_the_database():
     connection = duckdb.connect()
     migrate(connection, released())
     sql = "".join(one.sql for one in released())
-    n_columns = len(re.findall(r"^    .*  -- .", sql, re.M))
+    n_columns = len(re.findall(r"^(?:    |ALTER TABLE ).*  -- .", sql, re.M))
     query = "SELECT count(*) FROM duckdb_columns() WHERE comment IS NOT NULL"
     assert connection.execute(query).fetchall() == [(n_columns,)]
     query = "SELECT comment FROM duckdb_columns() WHERE table_name = ? AND column_name = ?"
     for table, column, expected in (
         ("control_marks", "z_m", "Centre of the sphere in the site frame, up."),
+        (
+            "possible_fits",
+            "sigma_height_shared_m",
+            "Standard deviation of the error of height that all centres of the stop share.",
+        ),
         ("accuracy_by_distance", "mean_n_points", "Mean number of returns of a fit."),
         ("accuracy_by_stop", "status", "Status of the station: ok, weak or failed."),
     ):

@@ -33,7 +33,8 @@ def adjusted(is_free, *, exact=False, n=4):
             marks, pose(place, rng.uniform(-3, 3), lean), sigma_level=3e-3,
             lean=tuple(lean + rng.normal(0, 3e-3, 2)), noise=rng.normal(0, 4e-3, (8, 3)),
         )  # fmt: skip
-        scans.append((f"stop{i + 1}", fits))
+        shared = tuple(replace(fit, sigma_height_shared=1.5e-3) for fit in fits.fits)
+        scans.append((f"stop{i + 1}", replace(fits, fits=shared)))
     given = replace(marks, p_site=marks.p_site + noise, cov_p_site=cov)
     return adjust_network(assemble(scans, None if is_free else given, CONFIG), CONFIG)
 

@@ -74,6 +74,13 @@ def longer(scan, bias):
     return name, replace(fits, fits=tuple(moved))
 
 
+def of_shared_height(scan, sigma):
+    """The scan whose centres share a part of their sigma of height."""
+    name, fits = scan
+    shared = tuple(replace(fit, sigma_height_shared=sigma) for fit in fits.fits)
+    return name, replace(fits, fits=shared)
+
+
 def network(scans, marks=None, config=CONFIG):
     return adjust_network(assemble(scans, marks, config), config)
 
@@ -128,13 +135,14 @@ def test_noise_free_centres_without_control_give_the_true_shape(rng):
 def test_derivatives_agree_with_differences(rng):
     marks = field(rng, 5)
     scans, _ = survey(rng, marks, 3)
-    net = assemble(scans, marks, replace(CONFIG, sigma_range=1e-3, sigma_height=1e-4))
+    config = replace(CONFIG, sigma_range=1e-3, sigma_height=1e-4)
+    net = assemble([of_shared_height(scan, 1e-3) for scan in scans], marks, config)
     state, used = start(net), np.ones(net.n_blocks, np.bool_)
-    state = step_to(state, rng.normal(0, 0.1, (3, 6)), rng.normal(0, 0.1, (5, 3)), np.zeros(2))
+    state = step_to(state, rng.normal(0, 0.1, (3, 7)), rng.normal(0, 0.1, (5, 3)), np.zeros(2))
     here, h = linearise(net, state, used), 1e-6
     mark = net.sightings[:, 1]
-    for k in range(6):
-        xi = np.zeros((3, 6))
+    for k in range(7):
+        xi = np.zeros((3, 7))
         xi[:, k] = h
         plus, minus = (
             linearise(net, step_to(state, sign * xi, np.zeros((5, 3)), np.zeros(2)), used)
@@ -147,14 +155,14 @@ def test_derivatives_agree_with_differences(rng):
     for k, unit in enumerate(np.eye(2)):
         plus, minus = (
             linearise(
-                net, step_to(state, np.zeros((3, 6)), np.zeros((5, 3)), sign * h * unit), used
+                net, step_to(state, np.zeros((3, 7)), np.zeros((5, 3)), sign * h * unit), used
             )
             for sign in (1, -1)
         )
         numeric = (plus.v_centres - minus.v_centres) / (2 * h)
         np.testing.assert_allclose(here.J_common[..., 3 + k], numeric, rtol=0, atol=1e-7)
     dp = rng.normal(0, 1, (5, 3))
-    there = linearise(net, step_to(state, np.zeros((3, 6)), dp, np.zeros(2)), used)
+    there = linearise(net, step_to(state, np.zeros((3, 7)), dp, np.zeros(2)), used)
     np.testing.assert_allclose(there.v_centres - here.v_centres, -dp[mark], rtol=0, atol=1e-12)
     expected = -dp[net.controls]
     np.testing.assert_allclose(there.v_control - here.v_control, expected, rtol=0, atol=1e-12)
@@ -176,9 +184,9 @@ def dense(net, levellings):
         p = x[6 * s : 6 * s + 3 * m].reshape(m, 3)
         R = Rotation.from_euler("ZYX", angles).as_matrix()[station]
         seen = np.einsum("nji,nj->ni", R, p[mark] - t[station])
-        bias = x[6 * s + 3 * m :]
+        bias, heights = np.split(x[6 * s + 3 * m :], [-s])
         longer = seen / np.linalg.norm(seen, axis=1)[:, None] * bias.sum()
-        v = net.p_base - seen - longer
+        v = net.p_base - seen - longer - heights[station, None] * net.heights_base
         whitened = np.einsum("nij,nj->ni", roots, v)
         levels = (tilts - angles[:, 1:]) / LEVEL
         given = np.einsum("nij,nj->ni", roots_control, net.p_control_site - p[net.controls])
@@ -196,13 +204,14 @@ def dense(net, levellings):
                 1e5 * centroid,
                 1e5 * np.array(heading),
                 bias / net.sigma_range if len(bias) else bias,
+                heights,
             ]
         )
 
     angles = Rotation.from_matrix(net.T_site_base[:, :3, :3]).as_euler("ZYX")
     none = np.zeros(int(net.sigma_range > 0))
     places = [net.T_site_base[:, :3, 3].ravel(), net.p_site.ravel()]
-    x0 = np.concatenate([angles.ravel(), *places, none])
+    x0 = np.concatenate([angles.ravel(), *places, none, np.zeros(s)])
     found = least_squares(residuals, x0, method="trf", xtol=1e-14, ftol=1e-14, gtol=1e-12)
     cov = np.linalg.inv(found.jac.T @ found.jac)
     return found.x, cov, 2 * found.cost
@@ -216,8 +225,8 @@ def test_an_independent_dense_solution_agrees_to_a_tenth_of_a_millimetre(rng, is
     given = replace(loose, p_site=marks.p_site + rng.normal(0, 2e-3, (8, 3)))
     scans, _ = survey(rng, marks, 5)
     config = replace(CONFIG, sigma_range=sigma_range)
-    net = assemble([longer(scan, 6e-3 if sigma_range else 0.0) for scan in scans],
-                   None if is_free else given, config)  # fmt: skip
+    seen = [longer(of_shared_height(scan, 0.4 * SIGMA), 1.2 * sigma_range) for scan in scans]
+    net = assemble(seen, None if is_free else given, config)
     result = adjust_network(net, config)
     assert result.used.all()
     x, cov, vtpv = dense(net, [fits.levelling for _, fits in scans])
@@ -236,8 +245,9 @@ def test_an_independent_dense_solution_agrees_to_a_tenth_of_a_millimetre(rng, is
     np.testing.assert_allclose(np.sqrt(own), sigmas[3 * s : 6 * s], rtol=0.02)
     assert result.vtpv == pytest.approx(vtpv, rel=0.02)
     if sigma_range:
-        assert result.range_bias == pytest.approx(x[-1], abs=tenth)
-        assert result.sigma_range_bias == pytest.approx(sigmas[-1], rel=0.02)
+        assert result.range_bias == pytest.approx(x[6 * s + 24], abs=tenth)
+        assert result.sigma_range_bias == pytest.approx(sigmas[6 * s + 24], rel=0.02)
+    np.testing.assert_allclose(result.heights, x[-s:], rtol=0, atol=0.01)
 
 
 def test_what_all_ranges_are_too_long_is_found_where_control_tells(rng):
@@ -546,6 +556,7 @@ def wide(rng, n_stations, n_marks=200, n_seen=14):
         markers=("",) * n,
         p_base=centres.reshape(n, 3) + rng.normal(0, SIGMA, (n, 3)),
         cov_p_base=np.tile(SIGMA**2 * np.eye(3), (n, 1, 1)),
+        heights_base=np.zeros((n, 3)),
         R_station_base=np.tile(np.eye(3), (n_stations, 1, 1)),
         cov_up_base=np.tile(np.diag([LEVEL**2, LEVEL**2, 0.0]), (n_stations, 1, 1)),
         sigma_headings=np.zeros(n_stations),
