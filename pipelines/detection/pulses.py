@@ -146,22 +146,30 @@ def hearing_of(cloud: StitchedCloud, clock: Clock, up: Array) -> Hearing:
     seconds = cloud.times[rows] - _DELAYS[rings] - clock.phase
     numbers = np.rint(seconds / FIRING_CYCLE).astype(np.int64)
     strengths = cloud.intensities[rows] / np.sum(cloud.p_base[rows] ** 2, axis=1)
-    whole = numbers.reshape(_N_SAMPLES, -1)  # firings between the first and the last of a sample
-    ends = zip(whole.min(axis=1) + 1, whole.max(axis=1), strict=True)
-    firings = np.unique(np.concatenate([np.arange(i, min(j, i + _N_SAMPLE)) for i, j in ends]))
-    lasers = np.arange(N_LASERS)
-    is_heard = np.isin(firings[:, None] * N_LASERS + lasers, numbers * N_LASERS + rings)
+    firings = _firings_within(numbers.reshape(_N_SAMPLES, -1))
+    is_heard = np.zeros((len(firings), N_LASERS), np.bool_)
+    places = np.minimum(np.searchsorted(firings, numbers), max(len(firings) - 1, 0))
+    is_known = firings[places] == numbers if len(firings) else np.zeros(len(numbers), np.bool_)
+    is_heard[places[is_known], rings[is_known]] = True
     directions = _directions(clock, clock.phase + firings * FIRING_CYCLE)
     steep = directions @ up
     is_ground = (steep > -_GROUND[1]) & (steep < -_GROUND[0])
-    sectors = (np.arctan2(directions[..., 1], directions[..., 0]) * _N_SECTORS / 6.2832).astype(int)
-    shares = [
-        1.0 - is_heard[chosen].mean()
-        for chosen in (is_ground & (sectors == sector) for sector in np.unique(sectors))
-        if chosen.sum() >= _N_IN_SECTOR
-    ]  # by sectors, because the rover hides some of the ground
+    azimuths = np.arctan2(directions[is_ground, 1], directions[is_ground, 0])
+    sectors = (azimuths * _N_SECTORS / 6.2832).astype(int) + _N_SECTORS
+    n, n_heard = np.bincount(sectors), np.bincount(sectors, weights=is_heard[is_ground])
+    is_shown = n >= _N_IN_SECTOR
+    shares = 1.0 - n_heard[is_shown] / n[is_shown]  # by sectors: the rover hides some of the ground
     lost = float(np.median(shares)) if len(shares) > _N_SECTORS // 2 else 1.0
     return Hearing(lost, float(np.quantile(strengths, _WEAKEST)))
+
+
+def _firings_within(numbers: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Return the firings between the first and the last of each sample, (k, n), each once."""
+    begins = numbers.min(axis=1) + 1
+    order = np.argsort(begins, kind="stable")
+    begins, ends = begins[order], np.minimum(numbers.max(axis=1), begins + _N_SAMPLE)[order]
+    begins[1:] = np.maximum(begins[1:], np.maximum.accumulate(ends)[:-1])
+    return np.concatenate([np.arange(i, j) for i, j in zip(begins, ends, strict=True)])
 
 
 def _directions(clock: Clock, instants: Array) -> Array:

@@ -129,12 +129,9 @@ def _trace_bundles(
     along = np.cross(across, aims.directions_site)
     offsets = footprint(optics.profile, _N_RAYS)
     k = len(offsets)
-    directions = _bundles(aims.directions_site, across, along, offsets * divergence / 2)
     starts = offsets * np.array(optics.window) / 2
-    rays = np.empty((n, k, 6), dtype=np.float32)
-    for j, (u, v) in enumerate(starts):
-        rays[:, j, :3] = aims.origins_site + u * across + v * along
-    rays[:, :, 3:] = directions
+    axes = (across, aims.directions_site, along)
+    rays, directions = _bundles(aims.origins_site, axes, starts, offsets * divergence / 2)
     distances, shades = cast(rays.reshape(-1, 6), optics.incidence)
     spheres = scene.spheres
     found: tuple[Array, Array, Index] = _echoes(
@@ -228,18 +225,27 @@ def _sees_step(ranges: Array, stride: int) -> Mask:  # pragma: no cover
 
 @compiled
 def _bundles(
-    directions: Array, across: Array, along: Array, offsets: Array
-) -> Array:  # pragma: no cover
-    """Return the unit vectors of bundles, (n, k, 3), from offsets across and along the axis."""
-    n, k = len(directions), len(offsets)
-    out = np.empty((n, k, 3))
+    origins: Array, axes: tuple[Array, Array, Array], starts: Array, offsets: Array
+) -> tuple[Column, Array]:  # pragma: no cover
+    """Return the rays of bundles, (n, k, 6), and their directions in full, (n, k, 3).
+
+    ``axes`` are unit vectors across, ahead and along the spin axis; ``starts`` and ``offsets`` are
+    places across and along it, at the window and at unit distance.
+    """
+    across, ahead, along = axes
+    n, k = len(origins), len(offsets)
+    rays, directions = np.empty((n, k, 6), dtype=np.float32), np.empty((n, k, 3))
     for i in range(n):
         for j in range(k):
             u, v = offsets[j, 0], offsets[j, 1]
             stretch = 1.0 / np.sqrt(1.0 + u * u + v * v)
             for m in range(3):
-                out[i, j, m] = stretch * (directions[i, m] + u * across[i, m] + v * along[i, m])
-    return out
+                one = stretch * (ahead[i, m] + u * across[i, m] + v * along[i, m])
+                directions[i, j, m] = rays[i, j, 3 + m] = one
+                rays[i, j, m] = (
+                    origins[i, m] + starts[j, 0] * across[i, m] + starts[j, 1] * along[i, m]
+                )
+    return rays, directions
 
 
 @compiled

@@ -173,10 +173,10 @@ def record(
         range_noise(shades) if config.sigma_range is None else config.sigma_range, len(seen)
     )
     if optics.sigma_weak:
-        sigmas = np.hypot(sigmas, optics.sigma_weak / _strengths(echoes, optics)[seen])
+        sigmas = np.hypot(sigmas, optics.sigma_weak / _strengths(echoes, optics, seen))
     ranges = (1.0 + optics.range_scale) * echoes.ranges[seen] + rig.laser_range_biases[rings]
     ranges = quantised(ranges + sigmas * rng.standard_normal(len(seen)), config.range_step)
-    azimuths = recorded_azimuths(pulses.azimuths, config.azimuth_step)[seen]
+    azimuths = recorded_azimuths(pulses.azimuths, config.azimuth_step, seen)
     floor, share = _INTENSITY_NOISE
     counts = shades + (floor + share * shades) * rng.standard_normal(len(seen))
     intensities = np.clip(np.round(counts), 0.0, 255.0).astype(np.float32)
@@ -191,20 +191,21 @@ def record(
     )
 
 
-def recorded_azimuths(azimuths: Array, step: float) -> Array:
-    """Return the azimuths that a driver computes for all pulses of whole packets.
+def recorded_azimuths(azimuths: Array, step: float, chosen: Index) -> Array:
+    """Return the azimuths that a driver computes for some pulses of whole packets.
 
     Notes
     -----
     A packet holds the azimuth of the first of 32 pulses, rounded to the step; that of the others
     follows from the mean speed within the packet and is rounded again, as drivers do.
     """
-    blocks = quantised(azimuths.reshape(-1, N_BLOCKS, _PULSES_PER_BLOCK)[:, :, :1], step)
-    k = np.arange(_PULSES_PER_BLOCK)
+    blocks = quantised(azimuths.reshape(-1, N_BLOCKS, _PULSES_PER_BLOCK)[:, :, 0], step)
+    block, k = np.divmod(chosen, _PULSES_PER_BLOCK)
     times = k // N_LASERS * FIRING_CYCLE + k % N_LASERS * LASER_CYCLE
     lasting = (N_BLOCKS - 1) * FIRINGS_PER_BLOCK * FIRING_CYCLE
-    speeds = (blocks[:, -1:] - blocks[:, :1]) / lasting
-    return quantised((blocks + speeds * times).ravel(), step) % (2 * np.pi)
+    speeds = (blocks[:, -1] - blocks[:, 0]) / lasting
+    found = blocks.ravel()[block] + speeds[block // N_BLOCKS] * times
+    return quantised(found, step) % (2 * np.pi)
 
 
 def _firings(azimuths: Array, seen: Index, ranges: Array, intensities: Column) -> Firings:
@@ -245,15 +246,16 @@ def _disturbed(echoes: Echoes, optics: Optics, rng: np.random.Generator) -> Echo
     return Echoes(ranges=ranges, reflectivities=shades, spheres=spheres)
 
 
-def _strengths(echoes: Echoes, optics: Optics) -> Array:
-    """Return the energies of echoes over that of an even chance of detection."""
-    return np.asarray(echoes.reflectivities / echoes.ranges**2 / optics.energy_half)
+def _strengths(echoes: Echoes, optics: Optics, chosen: Mask | Index) -> Array:
+    """Return the energies of some echoes over that of an even chance of detection."""
+    energies = echoes.reflectivities[chosen] / echoes.ranges[chosen] ** 2
+    return np.asarray(energies / optics.energy_half)
 
 
 def _is_seen(echoes: Echoes, config: SimulationConfig, rng: np.random.Generator) -> Mask:
     """Return which echoes are strong enough and near enough, and not lost by chance."""
     is_seen = (echoes.ranges >= _RANGE_LIMITS[0]) & (echoes.ranges <= _RANGE_LIMITS[1])
-    strength = np.maximum(_strengths(echoes, config.optics)[is_seen], 1e-12)
+    strength = np.maximum(_strengths(echoes, config.optics, is_seen), 1e-12)
     chance = (1.0 - config.drop_out) / (1.0 + strength ** (-1.0 / config.optics.softness))
     is_seen[is_seen] = rng.random(len(chance)) < chance
     return is_seen

@@ -316,7 +316,7 @@ def _near_spheres(run: _Run, pulses: Pulses, optics: Optics) -> Echoes:
 
     The latter show the turn and the ground.
     """
-    anyway = np.arange(len(pulses.rings)) // N_LASERS % _THINNING == 0
+    anyway = np.repeat(np.arange(len(pulses.rings) // N_LASERS) % _THINNING == 0, N_LASERS)
     spheres = run.scene.spheres
     near = float(spheres.radii.max(initial=0.0)) + NEAR
     chosen = anyway | may_pass(pulses, run.rig, run.T_site_base, spheres.p_site, near)
