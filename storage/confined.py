@@ -58,6 +58,9 @@ Reader = Callable[..., Mapping[str, Any]]
 READY = "spheremark.storage.imports.ready"
 """The module of the readers of logs and documents; it is always kept ready."""
 
+CLOUDS = "spheremark.storage.imports.cloud_files"
+"""The module of the readers of terrains that are clouds; it is kept ready from the first one on."""
+
 
 _DTYPES = ("<f8", "<f4", "<i8", "|u1")  # of results
 _DIMENSIONS_MAX = 3
@@ -213,8 +216,9 @@ def keep_ready(module: str, n_at_once: int) -> None:
 def start_readers() -> None:
     """Start the processes that keep readers ready, so that the first file need not wait for it."""
     if sys.platform == "linux":
-        for forks in tuple(_FORKS.values()):
-            forks.start()
+        for module, forks in tuple(_FORKS.items()):
+            if module != CLOUDS:  # which few services ever get
+                forks.start()
 
 
 def end_children() -> None:
@@ -344,7 +348,7 @@ class _Forks:
             self._socket = self._process = None
 
 
-_FORKS = {READY: _Forks(READY, _AT_ONCE)}
+_FORKS = {module: _Forks(module, _AT_ONCE) for module in (READY, CLOUDS)}
 _n_ended = 0  # times that all readers were ended
 atexit.register(end_children)
 
@@ -516,7 +520,7 @@ def _answer(request: Result) -> None:
     is_alone = leave_network()
     module, _, function = request["reader"].partition(":")
     reader: Reader = getattr(importlib.import_module(module), function)
-    file = sys.stdin.buffer
+    file = os.fdopen(0, "rb", closefd=False)  # not sys.stdin: in a fork that was a socket
     limit_resources(
         memory_bytes=_memory_in_use() + limits.memory_bytes,
         seconds=limits.seconds,

@@ -31,6 +31,10 @@ _HEIGHT_MAX = 1e5  # [m] beyond any height on Earth or Moon
 Pieces = Iterator[Array]
 
 
+def prepare() -> None:
+    """Do nothing: what the readers need is imported above."""
+
+
 def read_las(file: IO[bytes], *, name: str, cells_max: int) -> dict[str, Array]:
     """Return the grid of a LAS or LAZ file: ``xs``, ``ys``, ``ground`` and ``surface``."""
     check_las(file, name)

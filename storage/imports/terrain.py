@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from spheremark.pipelines.errors import InputError, NotFoundError
 from spheremark.pipelines.placement import Site, site_of_grid
 from spheremark.pipelines.placement.sites import CELLS_MAX
-from spheremark.storage.confined import Limits, UnreadableFileError, run_confined
+from spheremark.storage.confined import CLOUDS, Limits, UnreadableFileError, run_confined
 
 LIMITS = Limits(seconds=120.0, memory_bytes=2 << 30, result_bytes=17 * CELLS_MAX)
 """Of one terrain: two grids of the most cells, and what it takes to make them."""
@@ -67,21 +67,21 @@ _FORMATS = (
         _CLOUD,
         (".laz", ".las"),
         (b"LASF",),
-        "spheremark.storage.imports.cloud_files:read_las",
+        f"{CLOUDS}:read_las",
     ),
     _Format(
         "PLY",
         _CLOUD,
         (".ply",),
         (b"ply\n", b"ply\r"),
-        "spheremark.storage.imports.cloud_files:read_ply",
+        f"{CLOUDS}:read_ply",
     ),
     _Format(
         "Parquet",
         _CLOUD,
         (".parquet",),
         (b"PAR1",),
-        "spheremark.storage.imports.cloud_files:read_parquet",
+        f"{CLOUDS}:read_parquet",
     ),
 )
 
