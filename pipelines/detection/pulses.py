@@ -151,7 +151,7 @@ def hearing_of(cloud: StitchedCloud, clock: Clock, up: Array) -> Hearing:
     places = np.minimum(np.searchsorted(firings, numbers), max(len(firings) - 1, 0))
     is_known = firings[places] == numbers if len(firings) else np.zeros(len(numbers), np.bool_)
     is_heard[places[is_known], rings[is_known]] = True
-    directions = _directions(clock, clock.phase + firings * FIRING_CYCLE)
+    directions = _directions(clock, clock.phase + firings.astype(np.float64) * FIRING_CYCLE)
     steep = directions @ up
     is_ground = (steep > -_GROUND[1]) & (steep < -_GROUND[0])
     azimuths = np.arctan2(directions[is_ground, 1], directions[is_ground, 0])
