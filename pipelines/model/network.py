@@ -286,6 +286,13 @@ class Network:
         return float(self.shared.prior_weights[place, place] ** -0.5)
 
     @property
+    def sigma_heights(self) -> Array:
+        """Mean size of the error of height that the centres of each station share, (s,) [m]."""
+        sizes, n = np.linalg.norm(self.heights_base, axis=1), len(self.stations)
+        counts = np.bincount(self.sightings[:, 0], minlength=n)
+        return np.asarray(np.bincount(self.sightings[:, 0], sizes, n) / np.maximum(counts, 1))
+
+    @property
     def is_free(self) -> bool:
         """Whether the marks alone fix position and direction of the network."""
         return len(self.controls) == 0
@@ -376,6 +383,8 @@ class AdjustedNetwork:
         The same of its mark [m].
     heights : (s,)
         What the centres of each station are too high, in units of ``Network.heights_base``.
+    sigma_heights : (s,)
+        Standard deviations of these, 1 where nothing determines them.
     shared : (k,)
         The unknowns that all stations share, as estimated.
     cov_shared : (k, k)
@@ -427,6 +436,7 @@ class AdjustedNetwork:
     station_shifts: Array
     mark_shifts: Array
     heights: Array
+    sigma_heights: Array
     shared: Array
     cov_shared: Array
     parts: Parts
@@ -460,6 +470,7 @@ class AdjustedNetwork:
                 "station_shifts": (n,),
                 "mark_shifts": (n,),
                 "heights": (s,),
+                "sigma_heights": (s,),
                 "shared": (len(self.network.shared.names),),
                 "control_predictions": self.network.p_control_site.shape,
                 "cov_control_predictions": self.network.cov_control_site.shape,
@@ -489,16 +500,21 @@ class AdjustedNetwork:
 
     @property
     def n_observations(self) -> int:
-        """Observed coordinates and angles that are used, priors of shared unknowns included."""
+        """Observed coordinates and angles that are used, and priors of systematic errors."""
         n, s = len(self.network.sightings), len(self.network.stations)
         centres, gravity, control = (int(part.sum()) for part in np.split(self.used, [n, n + s]))
-        return 3 * centres + 2 * gravity + 3 * control + len(self.network.shared.names)
+        return 3 * centres + 2 * gravity + 3 * control + self._n_systematic
 
     @property
     def n_unknowns(self) -> int:
-        """Coordinates, angles and shared unknowns that are estimated."""
+        """Coordinates, angles and systematic errors that are estimated."""
         network = self.network
-        return 6 * len(network.stations) + 3 * len(network.marks) + len(network.shared.names)
+        return 6 * len(network.stations) + 3 * len(network.marks) + self._n_systematic
+
+    @property
+    def _n_systematic(self) -> int:
+        """Unknowns with a prior: what all stations share, and heights of stations."""
+        return len(self.network.shared.names) + int(np.sum(self.network.sigma_heights > 0.0))
 
     @property
     def sightings_used(self) -> Index:

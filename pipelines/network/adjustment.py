@@ -140,6 +140,7 @@ def _adjusted(
         station_shifts=station_shifts,
         mark_shifts=mark_shifts,
         heights=tested.state.heights,
+        sigma_heights=np.sqrt(tested.cofactors.stations[:, 6, 6]),
         shared=tested.state.shared,
         cov_shared=tested.cofactors.common[3 * m :, 3 * m :].copy(),
         parts=Parts(

@@ -413,6 +413,12 @@ class RangeBias(_Declared):
     redundancy: float
 
 
+class StationHeight(RangeBias):
+    """What all centres of a station are too high in the mean."""
+
+    station: str
+
+
 class NetworkDocument(_Declared):
     """``spheremark adjust --json``: an adjusted network; ``errors`` with a truth only."""
 
@@ -430,6 +436,7 @@ class NetworkDocument(_Declared):
     repeated_stops: list[Repeat]
     calibration: CalibrationDocument | None
     shared_unknowns: list[SharedUnknown]
+    station_heights: list[StationHeight] = []
     marks_covariance_m2: Matrix | None
     excluded: list[Excluded]
     refused: list[Refused]

@@ -59,6 +59,7 @@ def serialise_network(
         "repeated_stops": [_repeat(network.stations, one) for one in result.repeats],
         "calibration": None if rig is None else serialise_calibration(rig),
         "shared_unknowns": _shared(result),
+        "station_heights": _heights(result),
         "marks_covariance_m2": _joint(result),
         "excluded": _excluded(result),
         "refused": [
@@ -139,6 +140,23 @@ def _shared(result: AdjustedNetwork) -> list[Plain]:
     return [
         {"name": name, "value": float(value), "sigma": float(sigma), "redundancy": float(r)}
         for name, value, sigma, r in rows
+    ]
+
+
+def _heights(result: AdjustedNetwork) -> list[Plain]:
+    """Return what the centres of each station are too high in the mean, where their fits say so."""
+    network, columns = result.network, (result.heights, result.sigma_heights)
+    rows = zip(network.stations, network.sigma_heights, *columns, strict=True)
+    return [
+        {
+            "station": name,
+            "value_m": float(value * size),
+            "sigma_m": float(sigma * size),
+            "sigma_a_priori_m": float(size),
+            "redundancy": float(1.0 - sigma**2),
+        }
+        for name, size, value, sigma in rows
+        if size
     ]
 
 

@@ -117,7 +117,9 @@ def test_without_control_the_shape_is_true(free, logs):
 
 
 def test_redundancies_add_up_to_the_degrees_of_freedom(tied):
-    rows = [*tied["observations"], *tied["gravity"], *tied["control"], *tied["shared_unknowns"]]
+    kinds = ("observations", "gravity", "control", "shared_unknowns", "station_heights")
+    rows = [row for kind in kinds for row in tied[kind]]
+    assert [row["station"] for row in tied["station_heights"]] == list(STOPS)
     assert sum(row["redundancy"] or 0.0 for row in rows) == pytest.approx(tied["dof"], abs=1e-3)
 
 
@@ -220,7 +222,8 @@ def test_a_rig_is_adjusted_with_the_network_and_serves_as_a_rig(logs, tmp_path):
     assert names[:2] == ["axis_offset_x", "axis_offset_y"]
     assert np.shape(rig["covariance"]) == (len(names), len(names))
     assert "common_range_bias" in [row["name"] for row in answer["shared_unknowns"]]
-    rows = [*answer["observations"], *answer["gravity"], *answer["shared_unknowns"]]
+    kinds = ("observations", "gravity", "shared_unknowns", "station_heights")
+    rows = [row for kind in kinds for row in answer[kind]]
     assert sum(row["redundancy"] or 0.0 for row in rows) == pytest.approx(answer["dof"], abs=1e-3)
     truth = read_truth(logs[0].with_name(f"{logs[0].stem}.truth.json")).rig
     place = names.index("axis_offset_x")
