@@ -52,8 +52,9 @@ _UNFELT = 1e-6  # [m] by all centres together: what they share less than this
 _DOF_SPREAD = 2.0  # unknowns that the prior counts for in the estimate of their spread
 
 Observe = Callable[[Array, Array], tuple[Array, Array]]
-"""Further observations of the centres. Called with centres, (m, 3), and their covariances; returns
-the normal matrices, (m, 3, 3) [1/m^2], and right-hand sides, (m, 3) [1/m], that they add."""
+"""Further observations of the limb. Called with the middle of each limb, (m, 3), which is that of
+the sphere where the limb is alike above and below, and with the covariances of these; returns the
+normal matrices, (m, 3, 3) [1/m^2], and right-hand sides, (m, 3) [1/m], that they add."""
 
 
 class Prior(NamedTuple):
@@ -150,6 +151,20 @@ class State(NamedTuple):
         column = self.cov_shared[:, _HALVES]
         return np.asarray(self.by_shared @ (column / math.sqrt(column[_HALVES])))
 
+    @property
+    def covs_of_limb(self) -> Array:
+        """Covariances of the centres if the halves of the limb were known, (m, 3, 3) [m^2]."""
+        moves = self.by_halves
+        return np.asarray(self.covs - moves[:, :, None] * moves[:, None])
+
+    @property
+    def upward(self) -> Array:
+        """Unit vectors square to the lines of sight, upward, (m, 3)."""
+        x, y, z = self.centres.T
+        flat = np.hypot(x, y)
+        away = np.maximum(flat * np.hypot(flat, z), 1e-9)
+        return np.asarray((np.stack([-x * z, -y * z, flat**2]) / away).T)
+
 
 class Estimate(NamedTuple):
     """A state with the predictions, residuals and weights of all returns."""
@@ -189,9 +204,7 @@ def estimate(
             state.shared[_HALVES] = edge.halves
             factors = _add_limb(N, corrected, Estimate(state, linear, weighed), edge, factors)
         if observe is not None and step >= _N_STEPS_RANGES:
-            centres, rhs = observe(state.centres, state.covs)
-            N.centres[:, :, :3] += centres
-            N.centres[:, :, -1] += rhs
+            _add_observed(N, corrected, state, observe)
         before, state = state, _stepped(state, N, prior)
         if step + 1 >= _N_STEPS and _moved(before, state) < _SETTLED:
             break
@@ -267,15 +280,26 @@ def _weighed(
 
 def _add_limb(N: Normals, returns: Returns, now: Estimate, edge: Edge, factors: Array) -> Array:
     """Add the observations of the limb to normal equations; return the factors of the returns."""
-    by_halves = now.state.by_halves
-    covs = now.state.covs - by_halves[:, :, None] * by_halves[:, None]
-    limb = limb_normals(returns, now.linear, now.weighed.weights, covs, edge, factors)
+    state, weights = now.state, now.weighed.weights
+    limb = limb_normals(returns, now.linear, weights, state.covs_of_limb, edge, factors)
     N.centres[:, :, :3] += limb.centres
     N.centres[:, :, -2:] += np.stack([limb.halves, limb.rhs], axis=-1)
     N.by_face[:, :, :3] += limb.faces
     N.by_face[:, :, -2:] += np.stack([limb.halves_faces, limb.rhs_faces], axis=-1)
     N.shared[-1, -2:] += limb.of_halves
     return limb.factors
+
+
+def _add_observed(N: Normals, returns: Returns, state: State, observe: Observe) -> None:
+    """Add further observations of the limb, which the difference of its halves moves down."""
+    counts = np.maximum(np.diff(returns.starts), 1)
+    widths = np.bincount(returns.markers, returns.vertical_half_widths[0], len(counts)) / counts
+    down = -widths[:, None] * state.upward
+    seen, rhs = observe(state.centres + state.shared[_HALVES] * down, state.covs_of_limb)
+    moved = np.einsum("mij,mj->mi", seen, down)
+    N.centres[:, :, :3] += seen
+    N.centres[:, :, -2:] += np.stack([moved, rhs], axis=-1)
+    N.shared[-1, -2:] += np.sum(moved * down), np.sum(rhs * down)
 
 
 def _stepped(state: State, N: Normals, prior: Prior) -> State:
@@ -375,11 +399,8 @@ def shared_range_sigmas(state: State) -> Array:
 
 def shared_height_sigmas(state: State) -> Array:
     """Return the part of each centre's sigma upward that all have in common by their limbs."""
-    x, y, z = state.centres.T
-    flat = np.hypot(x, y)
-    upward = np.stack([-x * z, -y * z, flat**2]) / np.maximum(flat * np.hypot(flat, z), 1e-9)
-    heights = np.sum(state.by_halves * upward.T, axis=1)
-    return np.asarray(np.abs(np.maximum(np.sign(heights.sum()) * heights, 0.0)))
+    heights = np.sum(state.by_halves * state.upward, axis=1)
+    return np.asarray(np.maximum(np.sign(heights.sum()) * heights, 0.0))
 
 
 def shared_factors(state: State) -> Array:
