@@ -32,6 +32,7 @@ _DISTANCES = (5.0, 10.0, 15.0, 20.0, 25.0, 30.0)  # [m]
 _PER_DISTANCE = 20
 _TURN = SimulationConfig().turn
 _LONG_TURN = 20.7  # [s] as incommensurate with the channels as the usual one
+# Ranges have no bias here: expected by fits, it would hide in covariances what noise and beams do
 _UNBIASED = {"sigma_range_common": 0.0, "sigma_range_scale": 0.0}
 _N_STOPS_FULL = 64  # 1280 markers at each distance
 
@@ -154,11 +155,7 @@ def _tables(report: Plain) -> list[Table]:
 
 
 def _stop(world: tuple[Case, int], *, methods: Sequence[str]) -> list[_Row]:
-    """Simulate one stop and compare every method with the truth.
-
-    Ranges have no bias here, and nor do fits expect one: its share of a covariance would hide what
-    noise and beams do to centres.
-    """
+    """Simulate one stop and compare every method with the truth."""
     (case, seed), config = world, SurveyConfig.from_mapping({"fitting": _UNBIASED})
     field = range_lane(seed, np.array(_DISTANCES), _PER_DISTANCE)
     usual = SimulationConfig()

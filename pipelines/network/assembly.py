@@ -440,10 +440,7 @@ def _symmetric(p_base: Array, cov_p_base: Array) -> Array:
 
 
 def _axes(p_base: Array) -> tuple[Array, Mask]:
-    """Return unit vectors along, across and above lines of sight, (n, 3, 3), and which are steep.
-
-    Across is level, except where the line of sight is nearly the gimbal axis.
-    """
+    """Return unit vectors along, across and above lines of sight, (n, 3, 3), and the steep ones."""
     along = unit(p_base)
     across = np.column_stack([-along[:, 1], along[:, 0], np.zeros(len(along))])
     lengths = np.linalg.norm(across, axis=1, keepdims=True)
@@ -453,11 +450,8 @@ def _axes(p_base: Array) -> tuple[Array, Mask]:
 
 
 def _with_heights(network: Network, fits: Sequence[MarkerFit]) -> Network:
-    """Return the network with the error of height that all centres of a station have in common.
-
-    It leaves the covariances of the centres: taken as their own, it would seem to cancel in the
-    height of the station.
-    """
+    """Return the network with the error of height that all centres of a station have in common."""
+    # taken as each centre's own it would seem to cancel in the height of the station
     axes, is_steep = _axes(network.p_base)
     upward, covs = axes[:, 2], network.cov_p_base
     variances = np.array([fit.sigma_height_shared for fit in fits]) ** 2
