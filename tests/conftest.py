@@ -1,11 +1,31 @@
 """Settings of all tests, and what the end of a run names besides pytest's own summary."""
 
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
 from hypothesis import settings
 
 from tests.real_scans import ABSENT
 
 settings.register_profile("spheremark", deadline=None)  # a first call imports or compiles
 settings.load_profile("spheremark")
+
+
+@pytest.fixture(scope="session")
+def scheduler():
+    """Return the address of a scheduler with one worker, which services of tests share."""
+    with subprocess.Popen(
+        [sys.executable, "-m", "tests.scheduler"],
+        cwd=Path(__file__).parents[1],
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        text=True,
+    ) as process:
+        yield process.stdout.readline().strip()
+        process.stdin.close()
+        process.wait(60)
 
 
 def pytest_terminal_summary(terminalreporter):

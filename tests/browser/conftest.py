@@ -9,12 +9,12 @@ from tests.surveyed import fill
 
 
 @pytest.fixture(scope="module")
-def address(tmp_path_factory):
+def address(tmp_path_factory, scheduler):
     data = tmp_path_factory.mktemp("data")
     with Catalogue(data / "spheremark.duckdb", snapshots=data / "snapshots") as catalogue:
         fill(catalogue, data / "clouds", "field", n_stops=2)
         fill(catalogue, data / "clouds", "blind", n_stops=1, with_truth=False, lane="a")
-    with served(data) as address:
+    with served(data, scheduler) as address:
         yield address
 
 
@@ -26,14 +26,22 @@ def browser():
         browser.close()
 
 
+@pytest.fixture(scope="module")
+def context(browser):
+    return browser.new_context()
+
+
 @pytest.fixture
-def visit(browser, address):
+def visit(context, address):
     visits = []
 
     def start(**look):
-        visits.append(Visit(browser, address, **look))
+        tabs = context.pages[len(visits) :] or [context.new_page()]
+        visits.append(Visit(tabs[0], address, **look))
         return visits[-1]
 
     yield start
     for one in visits:
-        one.context.close()
+        one.end()
+    for tab in context.pages[1:]:
+        tab.close()

@@ -24,16 +24,16 @@ LOADED = """() => performance.getEntriesByType("resource")
 
 
 @pytest.fixture(scope="module")
-def address(tmp_path_factory):
+def address(tmp_path_factory, scheduler):
     data = tmp_path_factory.mktemp("data")
     with Catalogue(data / "spheremark.duckdb", snapshots=data / "snapshots") as catalogue:
         fill(catalogue, data / "clouds", "dense", n_stops=1, n_ground=N_POINTS)
-    with served(data) as address:
+    with served(data, scheduler) as address:
         yield address
 
 
-def test_no_frame_of_three_million_points_has_more_than_its_budget(browser, address):
-    page = Visit(browser, address, width=1280).open("/surveys/dense/cloud")
+def test_no_frame_of_three_million_points_has_more_than_its_budget(context, address):
+    page = Visit(context.new_page(), address, width=1280).open("/surveys/dense/cloud")
     page.wait_for_selector('#cloud[data-ready][data-loading="0"]', timeout=120_000)
     assert int(page.locator("#cloud").get_attribute("data-total")) > N_POINTS
     whole = page.evaluate(LOADED)

@@ -10,6 +10,7 @@ import psutil
 import pytest
 
 from tests.browser.visits import NEEDS_CHROMIUM, PAGES, STOP
+from tests.service.conftest import is_spawned
 from tests.storage.recorder import record, small_log
 
 pytestmark = NEEDS_CHROMIUM
@@ -250,11 +251,7 @@ KEEP_WHAT_CHANGES = """() => {
 @contextmanager
 def workers_at_rest():
     """Keep the workers of the service from starting a job."""
-    found = [
-        one
-        for one in psutil.Process().children(recursive=True)
-        if "spawn_main" in " ".join(one.cmdline())
-    ]
+    found = [one for one in psutil.Process().children(recursive=True) if is_spawned(one)]
     assert found
     for one in found:
         one.suspend()
@@ -269,7 +266,7 @@ def test_the_page_of_a_job_says_when_it_began_without_being_loaded_again(visit):
     one = visit()
     request = {"kind": "adjust", "survey": "field"}
     with workers_at_rest():
-        job = one.context.request.post(f"{one.address}/api/v1/jobs", data=request).json()
+        job = one.page.context.request.post(f"{one.address}/api/v1/jobs", data=request).json()
         assert job["attempts"] == 0
         page = one.open(f"/jobs/{job['job_id']}")
         page.evaluate(KEEP_WHAT_CHANGES)

@@ -92,9 +92,9 @@ def control(stop):
 
 
 @pytest.fixture(scope="module")
-def site(tmp_path_factory, stop, control):
-    """Return a service that runs with one worker."""
-    settings = Settings(data=tmp_path_factory.mktemp("data"), workers=1)
+def site(tmp_path_factory, stop, control, scheduler):
+    """Return a service that computes on the worker that tests share."""
+    settings = Settings(data=tmp_path_factory.mktemp("data"), scheduler=scheduler)
     with TestClient(create_app(settings), base_url="http://127.0.0.1:8000") as client:
         yield Site(client, stop, control)
 

@@ -13,11 +13,11 @@ HTML = {"accept": "text/html"}
 
 
 @pytest.fixture(scope="module")
-def client(tmp_path_factory):
+def client(tmp_path_factory, scheduler):
     data = tmp_path_factory.mktemp("data")
     with Catalogue(data / "spheremark.duckdb", snapshots=data / "snapshots") as catalogue:
         fill(catalogue, data / "clouds", "field", n_stops=2)
-    with TestClient(create_app(Settings(data=data, workers=1))) as client:
+    with TestClient(create_app(Settings(data=data, scheduler=scheduler))) as client:
         yield client
 
 

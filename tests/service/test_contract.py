@@ -37,8 +37,8 @@ NO_WRONG = hypothesis.errors.Unsatisfiable  # every request of the operation is 
 
 
 @pytest.fixture(scope="module")
-def client(tmp_path_factory):
-    app = create_app(Settings(data=tmp_path_factory.mktemp("data"), workers=1))
+def client(tmp_path_factory, scheduler):
+    app = create_app(Settings(data=tmp_path_factory.mktemp("data"), scheduler=scheduler))
     with TestClient(app, base_url=HOST, raise_server_exceptions=False) as client:
         yield client
 

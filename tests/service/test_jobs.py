@@ -19,6 +19,14 @@ from spheremark.service.settings import Settings
 from spheremark.storage.recordings import read_log, write_log
 
 
+@pytest.fixture(scope="module")
+def site(tmp_path_factory, stop, control, open_site):
+    """Return a service that has started a worker of its own."""
+    settings = Settings(data=tmp_path_factory.mktemp("data"), workers=1)
+    with TestClient(create_app(settings), base_url="http://127.0.0.1:8000") as client:
+        yield open_site(client, stop, control)
+
+
 def results(site, survey):
     fits = site.client.get("/api/v1/marker-fits", params={"survey": survey, "limit": 1000}).json()
     fixes = site.client.get("/api/v1/station-fixes", params={"survey": survey}).json()

@@ -9,12 +9,12 @@ from spheremark.storage.catalogue.catalogue import Catalogue
 from tests.surveyed import fill
 
 
-def test_pages_of_many_stops_are_as_small_as_those_of_few(tmp_path):
+def test_pages_of_many_stops_are_as_small_as_those_of_few(tmp_path, scheduler):
     source, target = tmp_path / "small", tmp_path / "large"
     with Catalogue(source / DATABASE, snapshots=source / "snapshots") as catalogue:
         fill(catalogue, source / "clouds", "field", n_stops=2)
     assert make(source, target, 2_000) == (2_000, 56_000)
-    with TestClient(create_app(Settings(data=target, workers=1))) as client:
+    with TestClient(create_app(Settings(data=target, scheduler=scheduler))) as client:
         for path in ("/accuracy", "/surveys/load-test-7/accuracy", "/surveys/field/accuracy"):
             assert len(client.get(path, headers={"accept": "text/html"}).content) < 50_000
         for path in ("figures/distance.json", "figures/map.json", "tables/stops.json"):

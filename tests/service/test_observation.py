@@ -25,9 +25,9 @@ def log():
 
 
 @pytest.fixture(scope="module")
-def client(tmp_path_factory):
+def client(tmp_path_factory, scheduler):
     data = tmp_path_factory.mktemp("data")
-    settings = Settings(data=data, workers=1, log_format="json", sql_seconds=0.3)
+    settings = Settings(data=data, scheduler=scheduler, log_format="json", sql_seconds=0.3)
     app = create_app(settings)
     with TestClient(app, base_url="http://127.0.0.1", raise_server_exceptions=False) as client:
         yield client

@@ -17,7 +17,7 @@ HTML = {"accept": "text/html"}
 
 
 @pytest.fixture(scope="module")
-def client(tmp_path_factory):
+def client(tmp_path_factory, scheduler):
     data = tmp_path_factory.mktemp("data")
     with Catalogue(data / "spheremark.duckdb", snapshots=data / "snapshots") as catalogue:
         fill(catalogue, data / "clouds", WICKED, n_stops=1, with_truth=False, lane="a/b<i>")
@@ -30,7 +30,7 @@ def client(tmp_path_factory):
         job = catalogue.create_job("process", survey="empty", recording_id=recording, config={})
         catalogue.start_job(job.job_id)
         catalogue.fail_job(job.job_id, code="solve.no_markers", reason="No marker <b>here</b>.")
-    with TestClient(create_app(Settings(data=data, workers=1))) as client:
+    with TestClient(create_app(Settings(data=data, scheduler=scheduler))) as client:
         yield client
 
 

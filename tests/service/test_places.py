@@ -78,8 +78,10 @@ def test_a_checkpoint_without_a_caller_that_checks_does_nothing():
 
 
 @pytest.fixture(scope="module")
-def server(tmp_path_factory):
-    app = create_app(Settings(data=tmp_path_factory.mktemp("data"), workers=1, sql_seconds=60))
+def server(tmp_path_factory, scheduler):
+    app = create_app(
+        Settings(data=tmp_path_factory.mktemp("data"), scheduler=scheduler, sql_seconds=60)
+    )
     protocol = "spheremark.service.http.protocol:BoundedProtocol"
     server = uvicorn.Server(uvicorn.Config(app, port=0, http=protocol, log_level="critical"))
     thread = threading.Thread(target=lambda: asyncio.run(server.serve()), daemon=True)
@@ -181,9 +183,9 @@ def test_a_plan_ends_when_its_client_leaves(server):
     until(lambda: places._n == 0, seconds=30.0)
 
 
-def test_a_plan_that_takes_too_much_memory_is_refused(tmp_path):
+def test_a_plan_that_takes_too_much_memory_is_refused(tmp_path, scheduler):
     with TestClient(
-        create_app(Settings(data=tmp_path, workers=1)), base_url="http://127.0.0.1:8000"
+        create_app(Settings(data=tmp_path, scheduler=scheduler)), base_url="http://127.0.0.1:8000"
     ) as client:
         stops = [{"name": f"s{i}", "x_m": i % 50 * 0.1, "y_m": i // 50 * 0.1} for i in range(1000)]
         answer = client.post("/api/v1/plans/evaluate", json={"marks": MANY, "stops": stops})

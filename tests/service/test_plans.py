@@ -27,12 +27,12 @@ MARKS = [
 
 
 @pytest.fixture(scope="module")
-def client(tmp_path_factory):
+def client(tmp_path_factory, scheduler):
     data = tmp_path_factory.mktemp("data")
     with Catalogue(data / "spheremark.duckdb", snapshots=data / "snapshots") as catalogue:
         fill(catalogue, data / "clouds", "field", n_stops=2)
     with TestClient(
-        create_app(Settings(data=data, workers=1)), base_url="http://127.0.0.1:8000"
+        create_app(Settings(data=data, scheduler=scheduler)), base_url="http://127.0.0.1:8000"
     ) as client:
         yield client
 

@@ -30,11 +30,11 @@ HOST = "http://127.0.0.1:8000"
 
 
 @pytest.fixture(scope="module")
-def client(tmp_path_factory):
+def client(tmp_path_factory, scheduler):
     data = tmp_path_factory.mktemp("data")
     with Catalogue(data / "spheremark.duckdb", snapshots=data / "snapshots") as catalogue:
         fill(catalogue, data / "clouds", "field", n_stops=2)
-    with TestClient(create_app(Settings(data=data, workers=1)), base_url=HOST) as one:
+    with TestClient(create_app(Settings(data=data, scheduler=scheduler)), base_url=HOST) as one:
         yield one
 
 
@@ -150,10 +150,10 @@ def test_an_error_names_the_file(tmp_path):
     assert "bad.mcap" in run("adjust", log, code=1).stderr
 
 
-def test_jobs_of_a_service_are_listed_and_followed(tmp_path):
+def test_jobs_of_a_service_are_listed_and_followed(tmp_path, scheduler):
     with Catalogue(tmp_path / "spheremark.duckdb", snapshots=tmp_path / "snapshots") as catalogue:
         fill(catalogue, tmp_path / "clouds", "field", n_stops=1)
-    app = create_app(Settings(data=tmp_path, workers=1))
+    app = create_app(Settings(data=tmp_path, scheduler=scheduler))
     with served(app) as address:
         listed = run("jobs", "--server", address)
         assert "process lane3-stop1" in listed.stdout

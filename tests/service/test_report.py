@@ -26,9 +26,9 @@ def folder(tmp_path_factory):
 
 
 @pytest.fixture(scope="module")
-def client(folder):
+def client(folder, scheduler):
     with TestClient(
-        create_app(Settings(data=folder, workers=1)), base_url="http://127.0.0.1:8000"
+        create_app(Settings(data=folder, scheduler=scheduler)), base_url="http://127.0.0.1:8000"
     ) as one:
         yield one
 

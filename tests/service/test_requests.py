@@ -265,8 +265,10 @@ def test_hosts_of_this_machine_are_answered(site, host):
 
 
 @pytest.mark.parametrize("cookie", ['spheremark_token="\\', "=;=,\xff", "a[]=1; spheremark_token"])
-def test_an_odd_cookie_is_no_token_and_no_failure(tmp_path, cookie):
-    settings = Settings(data=tmp_path, workers=1, token="A-secret-of-32-characters-at-least")
+def test_an_odd_cookie_is_no_token_and_no_failure(tmp_path, cookie, scheduler):
+    settings = Settings(
+        data=tmp_path, scheduler=scheduler, token="A-secret-of-32-characters-at-least"
+    )
     guarded = SecureHeaders(
         SecurityMiddleware(None, settings)
     )  # what passes would fail at the call of None
@@ -276,8 +278,10 @@ def test_an_odd_cookie_is_no_token_and_no_failure(tmp_path, cookie):
     assert answer.headers["content-security-policy"] == HEADERS["Content-Security-Policy"]
 
 
-def test_a_long_cookie_takes_no_long_time(tmp_path):
-    settings = Settings(data=tmp_path, workers=1, token="A-secret-of-32-characters-at-least")
+def test_a_long_cookie_takes_no_long_time(tmp_path, scheduler):
+    settings = Settings(
+        data=tmp_path, scheduler=scheduler, token="A-secret-of-32-characters-at-least"
+    )
     client = TestClient(SecureHeaders(SecurityMiddleware(None, settings)), "http://127.0.0.1:8000")
     begin = time.process_time()
     answer = client.get("/api/v1/surveys", headers={"Cookie": 'a="' + '\\"' * 60_000 + '"'})
@@ -328,8 +332,10 @@ def test_a_log_that_breaks_off_is_refused_or_weak_but_never_ok(site):
     assert answer.json()["code"] == "input.recording.truncated"
 
 
-def test_a_log_larger_than_the_limit_is_refused_by_its_header_and_leaves_nothing(tmp_path):
-    settings = Settings(data=tmp_path, workers=1, max_upload_bytes=1000)
+def test_a_log_larger_than_the_limit_is_refused_by_its_header_and_leaves_nothing(
+    tmp_path, scheduler
+):
+    settings = Settings(data=tmp_path, scheduler=scheduler, max_upload_bytes=1000)
     with TestClient(create_app(settings)) as client:
         kind = {"Content-Type": "application/octet-stream"}
         for body in (b"x" * 1001, iter([b"x" * 600] * 2)):

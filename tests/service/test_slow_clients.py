@@ -16,13 +16,13 @@ from spheremark.service.settings import Settings
 
 
 @pytest.fixture(scope="module")
-def address(tmp_path_factory):
+def address(tmp_path_factory, scheduler):
     """A service on a real port, with limits of time that a test can wait for."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(protocol, "HEADER_SECONDS", 0.5)
         patch.setattr(security, "IDLE_SECONDS", 0.5)
         patch.setattr(security, "BODY_SECONDS", 1.5)
-        app = create_app(Settings(data=tmp_path_factory.mktemp("data"), workers=1))
+        app = create_app(Settings(data=tmp_path_factory.mktemp("data"), scheduler=scheduler))
         config = uvicorn.Config(
             app,
             port=0,

@@ -58,9 +58,9 @@ class Uploads:
 
 
 @pytest.fixture(scope="module")
-def uploads(tmp_path_factory):
+def uploads(tmp_path_factory, scheduler):
     data = tmp_path_factory.mktemp("data")
-    app = create_app(Settings(data=data, workers=1))
+    app = create_app(Settings(data=data, scheduler=scheduler))
     with TestClient(app, base_url="http://127.0.0.1:8000") as client:
         found = Uploads(client, data, tmp_path_factory.mktemp("elsewhere"))
         yield found

@@ -32,9 +32,9 @@ def texts(data):
 
 
 @pytest.fixture(scope="module")
-def client(data, texts):
+def client(data, texts, scheduler):
     assert len(texts) == len(Scope)
-    settings = Settings(data=data, workers=1, host="0.0.0.0", token=OWN)
+    settings = Settings(data=data, scheduler=scheduler, host="0.0.0.0", token=OWN)
     with TestClient(create_app(settings), base_url="http://rover.example") as client:
         yield client
 

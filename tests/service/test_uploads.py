@@ -112,8 +112,8 @@ def test_an_upload_that_cannot_be_is_not_begun(site, headers, status, code):
     assert (answer.status_code, answer.json()["code"]) == (status, code)
 
 
-def test_an_upload_goes_on_after_a_restart_of_the_service(tmp_path, log, open_site):
-    settings = Settings(data=tmp_path, workers=1)
+def test_an_upload_goes_on_after_a_restart_of_the_service(tmp_path, log, open_site, scheduler):
+    settings = Settings(data=tmp_path, scheduler=scheduler)
     with TestClient(create_app(settings), base_url="http://127.0.0.1:8000") as client:
         one = open_site(client, None, "")
         url = begin(one, log)
@@ -126,8 +126,8 @@ def test_an_upload_goes_on_after_a_restart_of_the_service(tmp_path, log, open_si
         assert hashlib.sha256(log).hexdigest() in last.headers["content-location"]
 
 
-def test_an_expired_upload_is_removed_at_the_next_start(tmp_path, log, open_site):
-    settings = Settings(data=tmp_path, workers=1)
+def test_an_expired_upload_is_removed_at_the_next_start(tmp_path, log, open_site, scheduler):
+    settings = Settings(data=tmp_path, scheduler=scheduler)
     folder = tmp_path / "recordings" / ".partial" / "resumable"
     with TestClient(create_app(settings), base_url="http://127.0.0.1:8000") as client:
         begin(open_site(client, None, ""), log)
@@ -153,8 +153,10 @@ def test_a_body_whose_digest_is_another_is_refused_and_leaves_no_file(site, log)
     assert kept.status_code in (200, 201)
 
 
-def test_files_without_rows_are_entered_at_the_next_start_and_damaged_ones_put_aside(tmp_path, log):
-    settings = Settings(data=tmp_path, workers=1)
+def test_files_without_rows_are_entered_at_the_next_start_and_damaged_ones_put_aside(
+    tmp_path, log, scheduler
+):
+    settings = Settings(data=tmp_path, scheduler=scheduler)
     folder = tmp_path / "recordings"
     with TestClient(create_app(settings)):
         pass
@@ -174,8 +176,10 @@ def test_files_without_rows_are_entered_at_the_next_start_and_damaged_ones_put_a
     assert list((tmp_path / "clouds").iterdir()) == []
 
 
-def test_no_upload_is_accepted_that_leaves_too_little_free_space(tmp_path, log):
-    settings = Settings(data=tmp_path, workers=1, min_free_bytes=free_bytes(tmp_path) + (1 << 40))
+def test_no_upload_is_accepted_that_leaves_too_little_free_space(tmp_path, log, scheduler):
+    settings = Settings(
+        data=tmp_path, scheduler=scheduler, min_free_bytes=free_bytes(tmp_path) + (1 << 40)
+    )
     with TestClient(create_app(settings), base_url="http://127.0.0.1:8000") as client:
         answer = client.post("/api/v1/recordings?name=a", content=log, headers=MCAP)
         assert (answer.status_code, answer.json()["code"]) == (507, "storage.full")
@@ -185,8 +189,8 @@ def test_no_upload_is_accepted_that_leaves_too_little_free_space(tmp_path, log):
     assert not list((tmp_path / "recordings").glob("*.mcap"))
 
 
-def test_logs_take_no_more_space_than_their_quota(tmp_path, log):
-    settings = Settings(data=tmp_path, workers=1, quota_bytes=len(log) + 10)
+def test_logs_take_no_more_space_than_their_quota(tmp_path, log, scheduler):
+    settings = Settings(data=tmp_path, scheduler=scheduler, quota_bytes=len(log) + 10)
     with TestClient(create_app(settings), base_url="http://127.0.0.1:8000") as client:
         first = client.post("/api/v1/recordings?name=a", content=log, headers=MCAP)
         assert first.status_code == 201
@@ -199,8 +203,10 @@ def test_logs_take_no_more_space_than_their_quota(tmp_path, log):
     assert [path.name for path in (tmp_path / "recordings" / ".partial").iterdir()] == ["resumable"]
 
 
-def test_uploads_that_were_begun_together_take_no_more_than_the_quota(tmp_path, log, open_site):
-    settings = Settings(data=tmp_path, workers=1, quota_bytes=len(log) + 10)
+def test_uploads_that_were_begun_together_take_no_more_than_the_quota(
+    tmp_path, log, open_site, scheduler
+):
+    settings = Settings(data=tmp_path, scheduler=scheduler, quota_bytes=len(log) + 10)
     with TestClient(create_app(settings), base_url="http://127.0.0.1:8000") as client:
         site = open_site(client, None, "")
         first, second = begin(site, log), begin(site, log)
@@ -212,8 +218,8 @@ def test_uploads_that_were_begun_together_take_no_more_than_the_quota(tmp_path, 
         assert send(site, first, log[100:], 100).status_code == 204
 
 
-def test_a_second_service_on_the_same_folder_leaves_uploads_alone(tmp_path):
-    settings = Settings(data=tmp_path, workers=1)
+def test_a_second_service_on_the_same_folder_leaves_uploads_alone(tmp_path, scheduler):
+    settings = Settings(data=tmp_path, scheduler=scheduler)
     with TestClient(create_app(settings), base_url="http://127.0.0.1:8000") as client:
         arriving = tmp_path / "recordings" / ".partial" / "arriving"
         arriving.write_bytes(b"x")
@@ -223,8 +229,8 @@ def test_a_second_service_on_the_same_folder_leaves_uploads_alone(tmp_path):
         assert client.get("/healthz").status_code == 200
 
 
-def test_a_log_whose_reader_was_ended_with_the_service_is_read_again(tmp_path, log):
-    settings = Settings(data=tmp_path, workers=1)
+def test_a_log_whose_reader_was_ended_with_the_service_is_read_again(tmp_path, log, scheduler):
+    settings = Settings(data=tmp_path, scheduler=scheduler)
 
     def arrives(client):
         client.post("/api/v1/recordings?name=a", content=log, headers=MCAP)
@@ -242,7 +248,7 @@ def test_a_log_whose_reader_was_ended_with_the_service_is_read_again(tmp_path, l
         assert found["verdict"] == "ok"
 
 
-def test_a_disk_that_fills_while_a_log_arrives_refuses_it_and_serves_on(tmp_path):
+def test_a_disk_that_fills_while_a_log_arrives_refuses_it_and_serves_on(tmp_path, scheduler):
     made = subprocess.run(
         ["mount", "-t", "tmpfs", "-o", "size=140m", "tmpfs", tmp_path],
         capture_output=True, text=True, check=False,
@@ -250,7 +256,7 @@ def test_a_disk_that_fills_while_a_log_arrives_refuses_it_and_serves_on(tmp_path
     if made.returncode:
         pytest.skip(f"NOT TESTED: a full disk; no file system can be mounted: {made.stderr}")
     try:
-        settings = Settings(data=tmp_path / "data", workers=1, min_free_bytes=8 << 20)
+        settings = Settings(data=tmp_path / "data", scheduler=scheduler, min_free_bytes=8 << 20)
         with TestClient(create_app(settings), base_url="http://127.0.0.1:8000") as client:
             client.post("/api/v1/surveys", json={"name": "before"})
             room = free_bytes(tmp_path)
@@ -276,8 +282,8 @@ def test_a_disk_that_fills_while_a_log_arrives_refuses_it_and_serves_on(tmp_path
         subprocess.run(["umount", "--lazy", tmp_path], check=True)
 
 
-def test_the_data_folder_is_for_its_user_alone(tmp_path):
+def test_the_data_folder_is_for_its_user_alone(tmp_path, scheduler):
     data = tmp_path / "data"
-    with TestClient(create_app(Settings(data=data, workers=1))):
+    with TestClient(create_app(Settings(data=data, scheduler=scheduler))):
         assert data.stat().st_mode & 0o777 == 0o700
     assert Path(data / "spheremark.duckdb").exists()

@@ -1,0 +1,24 @@
+"""A scheduler with one worker, until its standard input ends.
+
+Services of most tests compute there: a worker of its own takes each 3 s of a processor.
+"""
+
+import asyncio
+import sys
+
+from distributed import Nanny, Scheduler
+
+
+async def main():
+    """Print the address of the scheduler, and serve."""
+    async with (
+        Scheduler(host="127.0.0.1", port=0, dashboard=False) as scheduler,
+        Nanny(scheduler.address, nthreads=1, dashboard=False, memory_limit=0),
+    ):
+        sys.stdout.write(scheduler.address + "\n")
+        sys.stdout.flush()
+        await asyncio.to_thread(sys.stdin.read)
+
+
+if __name__ == "__main__":
+    asyncio.run(main())
