@@ -124,9 +124,10 @@ def _without_limb(fit: MarkerFit, why_not: str) -> MarkerFit:
 
 def _entered(pulses: Passing, radius: float, places: Array) -> Array:
     """Return how far footprints are inside the limb [half widths], (k, n), for centres, (k, 2)."""
-    v = pulses.places - places[:, None]
-    away = np.linalg.norm(v, axis=2)
-    widths = np.linalg.norm(np.einsum("nij,knj->kni", pulses.half_widths, v), axis=2)
+    x, y = (pulses.places[:, axis] - places[:, axis, None] for axis in range(2))
+    (a, b), (c, d) = np.moveaxis(pulses.half_widths, 0, -1)
+    away = np.sqrt(x * x + y * y)
+    widths = np.sqrt((a * x + b * y) ** 2 + (c * x + d * y) ** 2)
     return np.asarray((radius - away) / np.maximum(widths / np.maximum(away, 1e-9), _THIN))
 
 
