@@ -1,5 +1,5 @@
 # make demo   set everything up, survey the study's field in simulation, and serve the results
-# make test   all tests: the quick ones, then the slow ones
+# make test   all tests, the longest first
 # make check  format, lint, types, import contracts, spelling, lock files
 # make bench  speed and memory as ratios against a peer in the same run
 # make reference  renew REFERENCE.md from the commands and the settings
@@ -14,7 +14,7 @@ PYTHON ?= $(shell for v in 3.11 3.12 3.13 3.14; do command -v python$$v && exit;
 BIN := $(VENV)/bin
 KERNELS := $(shell git ls-files 'pipelines/*.py' 'storage/*.py' 2>/dev/null)
 export OPENBLAS_NUM_THREADS ?= 1
-SIDE_BY_SIDE := --numprocesses 2 --dist loadfile --max-worker-restart 0
+SIDE_BY_SIDE := --numprocesses 2 --dist loadfile --no-loadscope-reorder --max-worker-restart 0
 
 .PHONY: help setup setup-dev demo test check bench docs reference lock sbom clean
 
@@ -52,8 +52,7 @@ test: export MALLOC_MMAP_MAX_ = 0
 test: export MALLOC_TRIM_THRESHOLD_ = 536870912
 test: setup-dev
 	@.ci/system-packages browser
-	$(BIN)/pytest $(SIDE_BY_SIDE)
-	$(BIN)/pytest $(SIDE_BY_SIDE) -m slow
+	$(BIN)/pytest $(SIDE_BY_SIDE) -m "not benchmark"
 
 check: $(VENV)/.dev
 	$(BIN)/ruff format --check .

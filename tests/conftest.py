@@ -12,6 +12,33 @@ from tests.real_scans import ABSENT
 settings.register_profile("spheremark", deadline=None)  # a first call imports or compiles
 settings.load_profile("spheremark")
 
+LONGEST = (
+    "pipelines/evaluation/test_ellipse_coverage.py",
+    "pipelines/detection/test_detection_among_clutter.py",
+    "service/test_contract.py",
+    "browser/test_accessibility.py",
+    "pipelines/placement/test_placement.py",
+    "pipelines/evaluation/test_precision.py",
+    "service/test_kills.py",
+    "browser/test_pages_in_a_browser.py",
+    "service/test_reproduce.py",
+    "pipelines/ground_model/test_ground_model.py",
+    "pipelines/calibration/test_calibration.py",
+    "pipelines/sphere/test_sphere.py",
+    "pipelines/positioning/test_resection.py",
+    "pipelines/network/test_network_of_scans.py",
+    "service/test_jobs.py",
+    "service/test_plans.py",
+)
+"""Files of more than a minute; begun first, so that no process waits for another at the end."""
+
+
+def pytest_collection_modifyitems(items):
+    """Put the longest files first; ``--no-loadscope-reorder`` leaves them there."""
+    folder = Path(__file__).parent
+    places = {folder / name: place for place, name in enumerate(LONGEST)}
+    items.sort(key=lambda item: places.get(item.path, len(LONGEST)))
+
 
 @pytest.fixture(scope="session")
 def scheduler():

@@ -17,8 +17,13 @@ MCAP = {"Content-Type": "application/vnd.mcap"}
 
 def is_spawned(process):
     """Whether a process is a worker that lives."""
+    return runs(process, "spawn_main")
+
+
+def runs(process, what):
+    """Whether a process lives and its command names something."""
     try:
-        return "spawn_main" in " ".join(process.cmdline())
+        return what in " ".join(process.cmdline())
     except psutil.Error:  # it ended since it was listed
         return False
 
@@ -48,9 +53,10 @@ class Site:
         )
 
     def workers(self):
-        """Return the worker processes of the service."""
-        children = psutil.Process().children(recursive=True)
-        return [one for one in children if is_spawned(one)]
+        """Return the worker processes of the service, without the one that tests share."""
+        own = [one for one in psutil.Process().children() if not runs(one, "tests.scheduler")]
+        found = [inner for one in own for inner in (one, *one.children(recursive=True))]
+        return [one for one in found if is_spawned(one)]
 
     def begun(self, job_id):
         """Wait for the beginning of a job, which on a busy machine may be seen after its end."""

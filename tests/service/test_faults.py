@@ -13,6 +13,7 @@ from fastapi.testclient import TestClient
 from spheremark.service.http.app import create_app
 from spheremark.service.settings import Settings
 from spheremark.storage.files import StorageError
+from tests.hoard import take_memory
 
 PATIENCE = 120.0  # [s] ends a test that would hang; one that passes never waits for it
 UNAVAILABLE = (503, 507)
@@ -109,15 +110,6 @@ def test_a_jump_of_the_clock_loses_nothing(tmp_path, stop, control, open_site, m
         numbers = [int(line[4:]) for line in events.splitlines() if line.startswith("id: ")]
         assert numbers == sorted(set(numbers))
         assert client.get("/readyz").status_code == 200
-
-
-def take_memory(n_bytes):
-    """Fill memory in a worker, as a scan of too many returns would."""
-    import numpy as np
-
-    hoard = np.ones(n_bytes // 8)
-    time.sleep(5.0)  # several looks of the process that watches it
-    return float(hoard[0])
 
 
 def test_a_worker_out_of_memory_fails_its_job_and_the_next_is_served(
