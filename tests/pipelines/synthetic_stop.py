@@ -62,6 +62,10 @@ def turned(v, angles):
 
 def towards(shots, p, reach):
     """The shots that pass a point by less than a distance."""
+    away, off = np.linalg.norm(p), np.linalg.norm(shots.origins[0]) + 0.05
+    if away > reach + 2 * off:  # most go elsewhere, which one product shows
+        limit = np.arcsin(reach / (away - off)) + np.arcsin(off / away) + 1e-3
+        shots = shots.take(np.flatnonzero(shots.directions @ (p / away) > np.cos(limit)))
     v = p - shots.origins
     along = np.einsum("ij,ij->i", v, shots.directions)
     gap2 = np.einsum("ij,ij->i", v, v) - along**2
