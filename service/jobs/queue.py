@@ -165,7 +165,9 @@ class JobQueue:
                     silence_logs=logging.ERROR,
                 )
             )
-        client: Client = await self._cluster.enter_async_context(Client(address, asynchronous=True))
+        client: Client = await Client(address, asynchronous=True)
+        # not as a context: its end would fail outside the task of its beginning, and close nothing
+        self._cluster.push_async_callback(client.close)
         client.subscribe_topic(tasks.TOPIC, lambda event: self._events_in.put_nowait(event[1]))
         await client.register_plugin(tasks.WarmUp(is_ours=not self._settings.scheduler))
         return client
