@@ -16,6 +16,7 @@ from numpydoc.docscrape import FunctionDoc
 
 from spheremark.pipelines import config, errors, model
 from spheremark.storage.catalogue.migrations import migrate, released
+from tests.conftest import LONGEST
 from tests.documented import called_from_outside, modules_below
 
 ROOT = Path(__file__).parent.parent
@@ -205,3 +206,8 @@ def test_every_dependency_is_locked_and_has_a_lower_bound():
 def test_tests_run_with_the_versions_that_the_service_runs_with():
     run, dev = locked("requirements.lock"), locked("requirements-dev.lock")
     assert run.items() <= dev.items()
+
+
+@pytest.mark.parametrize("name", LONGEST)
+def test_a_file_of_tests_that_is_begun_first_is_there(name):
+    assert (ROOT / "tests" / name).is_file()
