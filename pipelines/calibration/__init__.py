@@ -165,7 +165,8 @@ def _see(logs: Iterable[ScanLog], rig: Rig, config: SurveyConfig) -> _Seen:
         rows = np.concatenate([fit.used for fit in good])
         which = np.repeat(np.arange(len(good)), [len(fit.used) for fit in good])
         n_two_faced += _n_two_faced(front_face(cloud)[rows], which)
-        parts.append(recorded_pulses(log, cloud, rows, which))
+        unknown = config.fitting.sigma_direction
+        parts.append(recorded_pulses(log, cloud, rows, which, unknown))
         fits += good
         places += [(len(scans), k) for k in chosen]
         scans.append((log.origin.name, found))

@@ -37,7 +37,9 @@ _N_LASER = 20  # returns below which the bias of a laser stays as it is
 _SIGMA_MIN = 1e-9  # of optics that are taken as exact
 _PRIOR = 1e3  # [m] of a centre: keeps the equations solvable and is not felt otherwise
 
-_OPTICS = slice(len(GIMBAL), len(GIMBAL) + N_ESTIMATED)  # places among the unknowns
+# Places among the unknowns
+_COMMON = [parameter.name for parameter in GIMBAL].index("common_range_bias")
+_OPTICS = slice(len(GIMBAL), len(GIMBAL) + N_ESTIMATED)
 
 
 class Inseparable(NamedTuple):
@@ -142,7 +144,8 @@ class Estimate(NamedTuple):
     lasers : (k,)
         Lasers whose biases were estimated, their mean held.
     cov : (p, p)
-        Covariance of the free parameters, then of the biases of those lasers.
+        Covariance of the free parameters, then of the biases of those lasers; the bias that all
+        have in common, which is held, counts with its prior.
     is_used : (n,)
         Which returns have weight.
     dof : int
@@ -173,38 +176,68 @@ class Estimate(NamedTuple):
 
 
 class _State(NamedTuple):
-    """Rig, optics and centres [m], with the pulses linearised there."""
+    """Rig, optics, centres [m] and errors of lines [rad], with the pulses linearised there.
+
+    ``residuals`` are what those errors leave [m].
+    """
 
     rig: Rig
     optics: Array
     centres: Array
+    errors: Array
     lin: Linearised
+    residuals: Array
+
+
+class _Lines(NamedTuple):
+    """Normal equations of the angles of scan lines, each line an unknown with its prior.
+
+    ``rows``, (l, 3 + p), are those between the angles and the centre and parameters, and
+    ``precisions`` and ``rhs``, (l,), those of the angles themselves.
+    """
+
+    rows: Array
+    precisions: Array
+    rhs: Array
+
+    def solved(self, by_centre: Array, steps: Array) -> Array:
+        """Return the steps of the angles for those of centres, (l, 3), and parameters, (p,)."""
+        by_others = np.sum(self.rows[:, :3] * by_centre, axis=1) + self.rows[:, 3:] @ steps
+        return np.asarray((self.rhs - by_others) / self.precisions)
 
 
 class _Problem(NamedTuple):
-    """What stays the same from step to step; ``basis``, (256, k - 1), spans the laser biases."""
+    """What stays the same from step to step; ``basis``, (256, k - 1), spans the laser biases.
+
+    ``spheres`` and ``sigmas_lines``, (l,), are the sphere of each scan line and the standard
+    deviation of the gimbal's angle during it [rad].
+    """
 
     seen: Pulses
     covs: Array
     radius: float
-    sigma_direction: float
+    config: FittingConfig
     sigmas_optics: Array
     basis: Array
+    spheres: Index
+    sigmas_lines: Array
 
-    def at(self, rig: Rig, optics: Array, centres: Array) -> _State:
-        """Return the state at a rig, optics and centres."""
+    def at(self, rig: Rig, optics: Array, centres: Array, errors: Array) -> _State:
+        """Return the state at a rig, optics, centres and errors of lines."""
         lin = linearise(self.seen, rig, optics, (centres, self.covs), self.radius)
-        return _State(rig, optics, centres, lin)
+        residuals = lin.residuals - lin.J_angle * errors[self.seen.lines]
+        return _State(rig, optics, centres, errors, lin, residuals)
 
     def loss(self, state: _State, sigmas: Array) -> float:
-        """Return the loss of a state, with that of its optics by their prior."""
-        prior = 0.5 * float(np.sum((state.optics / self.sigmas_optics) ** 2))
-        return prior + tukey_loss(state.lin.residuals / sigmas, _TUKEY)
+        """Return the loss of a state, with that of its optics and its lines by their priors."""
+        prior = np.sum((state.optics / self.sigmas_optics) ** 2)
+        prior += np.sum((state.errors / self.sigmas_lines) ** 2)
+        return 0.5 * float(prior) + tukey_loss(state.residuals / sigmas, _TUKEY)
 
     def extra(self, state: _State) -> Array:
         """Return the noise that directions and linearisation add to each range [m]."""
         return np.asarray(
-            np.hypot(self.sigma_direction * state.lin.slopes, state.lin.sigmas_nonlinear)
+            np.hypot(self.config.sigma_direction * state.lin.slopes, state.lin.sigmas_nonlinear)
         )
 
     def sigmas(self, state: _State, noises: Array) -> Array:
@@ -214,26 +247,62 @@ class _Problem(NamedTuple):
     def noises(self, state: _State, before: Array) -> Array:
         """Return the noise of each return [m]: of its reflectivity, times that of its sphere."""
         which, shades, m = self.seen.which, self.seen.shades, len(state.centres)
-        scaled = state.lin.residuals / self.sigmas(state, before)
+        sigmas = self.sigmas(state, before)
+        scaled = state.residuals / sigmas
         weights = tukey_weights(scaled, _TUKEY)
+        unknowns = 3.0 + self.unknown_lines(state, weights / sigmas**2)
         squares = weights * (scaled * before) ** 2 / _EXPECTED_SQUARE
         counts = np.bincount(shades, weights > 0.0, N_CLASSES)
-        share = max(1.0 - 3.0 * m / max(float(counts.sum()), 1.0), 0.01)
+        share = max(1.0 - float(unknowns.sum()) / max(float(counts.sum()), 1.0), 0.01)
         of_all = float(squares.sum()) / max(share * float(counts.sum()), 1.0)
         by_shade = (np.bincount(shades, squares, N_CLASSES) + _DOF_NOISE * of_all) / (
             share * counts + _DOF_NOISE
         )
-        dofs = np.maximum(np.bincount(which, weights > 0.0, m) - 3.0, 0.0)
+        dofs = np.maximum(np.bincount(which, weights > 0.0, m) - unknowns, 0.0)
         ratios = np.bincount(which, squares / by_shade[shades], m) + _DOF_NOISE
         own = by_shade[shades] * (ratios / (dofs + _DOF_NOISE))[which]
         return np.asarray(np.maximum(np.sqrt(own), _NOISE_MIN))
 
+    def weights(self, state: _State, sigmas: Array) -> Array:
+        """Return the weight of each return [1/m^2]."""
+        return np.asarray(tukey_weights(state.residuals / sigmas, _TUKEY) / sigmas**2)
+
+    def derivatives(self, state: _State) -> Array:
+        """Return the derivatives of ranges by all parameters, optics and biases, (n, p)."""
+        lin = state.lin
+        return np.column_stack([lin.J_rig, lin.J_optics, self.basis[self.seen.rings]])
+
+    def unknown_lines(self, state: _State, weights: Array) -> Array:
+        """Return for how many unknowns the lines of each sphere count beside their prior, (m,)."""
+        found = np.bincount(self.seen.lines, weights * state.lin.J_angle**2, len(self.spheres))
+        shares = found / (found + self.sigmas_lines**-2.0)
+        return np.asarray(np.bincount(self.spheres, shares, len(state.centres)))
+
+    def lines(self, state: _State, J: Array, weights: Array) -> _Lines:
+        """Return the normal equations of the angles of lines."""
+        lines, n = self.seen.lines, len(self.spheres)
+        weighted = weights * state.lin.J_angle
+        columns = np.column_stack([state.lin.J_centres, J]).T
+        rows = np.array([np.bincount(lines, weighted * column, n) for column in columns])
+        return _Lines(
+            rows.T,
+            self.sigmas_lines**-2.0 + np.bincount(lines, weighted * state.lin.J_angle, n),
+            np.bincount(lines, weighted * state.residuals, n) - state.errors / self.sigmas_lines**2,
+        )
+
     def equations(self, state: _State, sigmas: Array) -> Reduced:
         """Return the normal equations of all parameters, optics and biases, in this order."""
-        lin = state.lin
-        J = np.column_stack([lin.J_rig, lin.J_optics, self.basis[self.seen.rings]])
-        weights = tukey_weights(lin.residuals / sigmas, _TUKEY) / sigmas**2
-        equations = reduced(self.seen.which, lin.J_centres, J, lin.residuals, weights)
+        lin, J = state.lin, self.derivatives(state)
+        weights = self.weights(state, sigmas)
+        lines = self.lines(state, J, weights)
+        taken = np.column_stack([lines.rows, lines.rhs]) / np.sqrt(lines.precisions)[:, None]
+        equations = reduced(
+            np.append(self.seen.which, self.spheres),
+            np.concatenate([lin.J_centres, taken[:, :3]]),
+            np.concatenate([J, taken[:, 3:-1]]),
+            np.append(state.residuals, taken[:, -1]),
+            np.append(weights, np.full(len(taken), -1.0)),  # what elimination takes away
+        )
         equations.N[_OPTICS, _OPTICS] += np.diag(self.sigmas_optics**-2.0)
         equations.rhs[_OPTICS] -= state.optics / self.sigmas_optics**2
         return equations
@@ -245,11 +314,13 @@ class _Problem(NamedTuple):
         by_rig, by_optics, by_laser = np.split(steps, [_OPTICS.start, _OPTICS.stop])
         biases = (self.basis @ by_laser)[: len(state.rig.laser_range_biases)]
         by_centre = equations.local_steps(steps)
+        lines = self.lines(state, self.derivatives(state), self.weights(state, sigmas))
+        by_line = lines.solved(by_centre[self.spheres], steps)
         loss, trial = self.loss(state, sigmas), state
         for share in _SHARES:
             rig = moved(state.rig, share * by_rig, share * biases)
-            optics = state.optics + share * by_optics
-            trial = self.at(rig, optics, state.centres + share * by_centre)
+            optics, centres = state.optics + share * by_optics, state.centres + share * by_centre
+            trial = self.at(rig, optics, centres, state.errors + share * by_line)
             if self.loss(trial, sigmas) < loss:
                 break
         return trial
@@ -266,12 +337,19 @@ def estimate(
     says shifts ranges on slopes by as much as errors of the rig do.
     Gauss-Newton with Tukey's weights, each step shortened until it lowers the loss. Noise is
     estimated by reflectivity and by sphere, each shrunk towards the noise of all: beams that graze
-    the limb, which determine a centre across the line of sight, return weakly and are noisy.
+    the limb, which determine a centre across the line of sight, return weakly and are noisy. Errors
+    of the gimbal's angle, which all pulses of a scan line share, are unknowns with the scatter of
+    its samples as prior, eliminated line by line.
     """
     lasers, basis = _contrasts(seen.rings)
     sigmas_optics = np.maximum(prior_sigmas(config, rig)[:N_ESTIMATED], _SIGMA_MIN)
-    problem = _Problem(seen, covs, radius, config.sigma_direction, sigmas_optics, basis)
-    state = problem.at(rig, np.zeros(N_ESTIMATED), centres)
+    firsts = np.unique(seen.lines, return_index=True)[1]
+    problem = _Problem(
+        *(seen, covs, radius, config, sigmas_optics, basis),
+        spheres=seen.which[firsts],
+        sigmas_lines=np.maximum(seen.sigmas_angle[firsts], _SIGMA_MIN),
+    )
+    state = problem.at(rig, np.zeros(N_ESTIMATED), centres, np.zeros(len(firsts)))
     noises = np.full(len(seen.which), _NOISE_START)
     is_free: Mask = np.ones(len(GIMBAL), dtype=np.bool_)
     held: tuple[Inseparable, ...] = ()
@@ -321,12 +399,14 @@ def _estimate(
     chosen = np.append(np.flatnonzero(is_free), _OPTICS.stop + np.arange(k))
     equations = problem.equations(state, sigmas)
     adjusted = np.sort(np.append(chosen, np.arange(len(GIMBAL) + N_ESTIMATED)[_OPTICS]))
-    cov = inverse(equations.N[np.ix_(adjusted, adjusted)])
+    cov = _EFFICIENCY * inverse(equations.N[np.ix_(adjusted, adjusted)])
+    sigma_common = prior_sigmas(problem.config, state.rig)[N_ESTIMATED]
+    cov = _with_common_bias(cov, equations.N[adjusted, _COMMON], sigma_common)
     of_rig = np.searchsorted(adjusted, chosen)
     J = np.zeros((n_free + len(lasers), n_free + k))
     J[:n_free, :n_free] = np.eye(n_free)
     J[n_free:, n_free:] = problem.basis[lasers]
-    is_used = tukey_weights(state.lin.residuals / sigmas, _TUKEY) > 0.0
+    is_used = tukey_weights(state.residuals / sigmas, _TUKEY) > 0.0
     return Estimate(
         rig=state.rig,
         optics=state.optics,
@@ -334,7 +414,7 @@ def _estimate(
         is_free=is_free,
         held=held,
         lasers=lasers,
-        cov=_EFFICIENCY * J @ cov[np.ix_(of_rig, of_rig)] @ J.T,
+        cov=J @ cov[np.ix_(of_rig, of_rig)] @ J.T,
         is_used=is_used,
         dof=int(is_used.sum()) - 3 * len(state.centres) - len(adjusted),
         basis=J,
@@ -344,14 +424,22 @@ def _estimate(
     )
 
 
+def _with_common_bias(cov: Array, across: Array, sigma: float) -> Array:
+    """Return a covariance with what the common range bias, which is held, adds to it (Schmidt).
+
+    ``across`` is the normal matrix between it and the unknowns, ``sigma`` its prior [m].
+    """
+    moved = sigma / _EFFICIENCY * (cov @ across)
+    return np.asarray(cov + np.outer(moved, moved))
+
+
 def _without_others(N: Array, chosen: Index) -> Array:
     """Return the normal matrix of some unknowns, optics and the common range bias eliminated.
 
     The apparent size of near spheres would determine that bias too, but depends on the profile of
     the beams.
     """
-    bias = [parameter.name for parameter in GIMBAL].index("common_range_bias")
-    others = np.append(np.arange(len(GIMBAL) + N_ESTIMATED)[_OPTICS], bias)
+    others = np.append(np.arange(len(GIMBAL) + N_ESTIMATED)[_OPTICS], _COMMON)
     across = N[np.ix_(chosen, others)]
     reduction = across @ inverse(N[np.ix_(others, others)]) @ across.T
     return np.asarray(N[np.ix_(chosen, chosen)] - reduction)

@@ -17,7 +17,7 @@ from spheremark.pipelines.scan.stitching import beams
 from spheremark.pipelines.sphere.linearisation import linearise as linearise_ranges
 from spheremark.pipelines.sphere.noise import classes_of
 from spheremark.pipelines.sphere.optics import N_ESTIMATED, derivatives, echo_shifts, with_widths
-from spheremark.pipelines.sphere.returns import returns_of
+from spheremark.pipelines.sphere.returns import returns_of, scan_lines, scatter_of_angles
 
 _RATE_WINDOW = 0.05  # [s] over which the speed of the gimbal is taken: encoders jitter
 _NS = 1e-9  # [s] in a nanosecond
@@ -107,6 +107,10 @@ class Pulses(NamedTuple):
         Class of reflectivity, from dark to bright: the noise depends on it.
     which : (n,)
         The sphere that each one met.
+    lines : (n,)
+        Scan line of each at its sphere, numbered from sphere to sphere.
+    sigmas_angle : (n,)
+        Standard deviation of the gimbal's angle, an error that the pulses of a line share [rad].
     divergence : (2,)
         Full width of the footprint across and along the spin axis [rad].
     """
@@ -119,15 +123,18 @@ class Pulses(NamedTuple):
     rings: Rings
     shades: Index
     which: Index
+    lines: Index
+    sigmas_angle: Array
     divergence: Array
 
     @classmethod
     def joined(cls, parts: list[Pulses]) -> Pulses:
-        """Return the pulses of several stops as one table; spheres are numbered on."""
-        firsts = np.cumsum([0, *(part.which.max(initial=-1) + 1 for part in parts)])
+        """Return the pulses of several stops as one table; spheres and lines are numbered on."""
+        ends = [(part.which.max(initial=-1) + 1, part.lines.max(initial=-1) + 1) for part in parts]
+        firsts = np.cumsum([(0, 0), *ends[:-1]], axis=0)
         numbered = [
-            part._replace(which=part.which + first)
-            for part, first in zip(parts, firsts[:-1], strict=True)
+            part._replace(which=part.which + sphere, lines=part.lines + line)
+            for part, (sphere, line) in zip(parts, firsts, strict=True)
         ]
         columns = [name for name in cls._fields if name != "divergence"]
         return numbered[0]._replace(
@@ -135,8 +142,29 @@ class Pulses(NamedTuple):
         )
 
 
-def recorded_pulses(log: ScanLog, cloud: StitchedCloud, rows: Index, which: Index) -> Pulses:
-    """Undo the stitching of some returns."""
+def recorded_pulses(
+    log: ScanLog, cloud: StitchedCloud, rows: Index, which: Index, unknown: float = 0.0
+) -> Pulses:
+    """Undo the stitching of some returns.
+
+    Parameters
+    ----------
+    log : ScanLog
+        Recording of the stop.
+    cloud : StitchedCloud
+        The same, stitched.
+    rows : (n,)
+        Returns, sphere by sphere.
+    which : (n,)
+        The sphere of each, numbered from 0 on.
+    unknown : float
+        Standard deviation of the gimbal's angle where its samples do not tell it [rad].
+
+    Returns
+    -------
+    Pulses
+        The returns as recorded.
+    """
     rig, table = cloud.rig, beams(cloud, rows)
     turned = cloud.gimbal_angles[rows].astype(np.float64)
     rates = _rates(log, rig, table.times)
@@ -154,8 +182,21 @@ def recorded_pulses(log: ScanLog, cloud: StitchedCloud, rows: Index, which: Inde
         rings=table.rings,
         shades=classes_of(table.intensities)[0],
         which=which,
+        lines=_lines(table.times, which),
+        sigmas_angle=np.full(len(rows), scatter_of_angles(cloud.gimbal_angles, unknown)),
         divergence=rig.divergence,
     )
+
+
+def _lines(times: Array, which: Index) -> Index:
+    """Return the scan line of each pulse, numbered from sphere to sphere."""
+    lines = np.empty(len(times), dtype=np.intp)
+    first = 0
+    for sphere in range(which.max(initial=-1) + 1):
+        own = np.flatnonzero(which == sphere)
+        lines[own] = first + scan_lines(times[own])
+        first = lines[own].max(initial=first - 1) + 1
+    return lines
 
 
 def _rates(log: ScanLog, rig: Rig, times: Array) -> Array:
@@ -263,6 +304,8 @@ class Linearised(NamedTuple):
         The same by the parameters of ``GIMBAL``.
     J_optics : (n, 3)
         The same by the optics of ``sphere.optics`` that scans determine.
+    J_angle : (n,)
+        The same by the angle of the gimbal [m/rad].
     slopes : (n,)
         How much the range changes with the direction of the beam [m/rad].
     sigmas_nonlinear : (n,)
@@ -273,6 +316,7 @@ class Linearised(NamedTuple):
     J_centres: Array
     J_rig: Array
     J_optics: Array
+    J_angle: Array
     slopes: Array
     sigmas_nonlinear: Array
 
@@ -298,7 +342,8 @@ def linearise(
     linear = linearise_ranges(widened, states, known)
     J = linear.J[:3].T
     turns, shifts = motions(seen, rig)
-    v = centres[seen.which] - table.origins_base
+    met = centres[seen.which]
+    v = met - table.origins_base
     J_rig = np.einsum("nqi,ni->nq", turns, np.cross(J, v)) - np.einsum("nqi,ni->nq", shifts, J)
     J_rig[:, -1] = 1.0  # a range that is measured too long
     along = np.einsum("ni,ni->n", J, table.directions_base)
@@ -308,6 +353,7 @@ def linearise(
         J_centres=J,
         J_rig=J_rig,
         J_optics=derivatives(specified, widened, linear)[:N_ESTIMATED].T,
+        J_angle=J[:, 0] * met[:, 1] - J[:, 1] * met[:, 0],
         slopes=table.ranges * np.sqrt(slopes2),
         sigmas_nonlinear=linear.sigmas_nonlinear,
     )

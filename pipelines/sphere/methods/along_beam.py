@@ -13,13 +13,11 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from spheremark.pipelines.config import FittingConfig
-from spheremark.pipelines.estimation.robust import robust_sigma
 from spheremark.pipelines.geometry import levelling_rotation
 from spheremark.pipelines.model import (
     RING_UNKNOWN,
     Array,
     Beams,
-    Column,
     Index,
     MarkerCandidate,
     MarkerCandidates,
@@ -27,7 +25,6 @@ from spheremark.pipelines.model import (
     Rejection,
     Status,
     StitchedCloud,
-    Timed,
 )
 from spheremark.pipelines.scan.stitching import beams
 from spheremark.pipelines.sphere.description import (
@@ -56,12 +53,15 @@ from spheremark.pipelines.sphere.mounting import sigmas_of
 from spheremark.pipelines.sphere.noise import EXPECTED_SQUARE, FACTOR_MIN, classes_of
 from spheremark.pipelines.sphere.optics import prior_sigmas
 from spheremark.pipelines.sphere.radius import other_radius
-from spheremark.pipelines.sphere.returns import Returns, returns_of
+from spheremark.pipelines.sphere.returns import (
+    Returns,
+    n_lines,
+    returns_of,
+    scatter_of_angles,
+)
 
 NAME = "along_beam"
 
-_LINE = 0.01  # [s] between returns of different scan lines, at the least
-_N_SAMPLES = 10  # of the gimbal's angle, from which their scatter is known
 _STRAY = 0.6  # radii that a centre may move from its rough place
 _N_MIN = 4  # returns: one more than unknowns
 _DOF_STOP = 100.0  # returns that the stop's noise counts for in the noise of a marker
@@ -168,7 +168,7 @@ def _gather(
     ends = np.cumsum([0, *(len(c.members) for c in candidates)])
     together, starts = members[is_finite], np.concatenate([[0], np.cumsum(is_finite)])[ends]
     table = beams(cloud, together)
-    of_angles = _scatter_of_angles(cloud.gimbal_angles, config.sigma_direction)
+    of_angles = scatter_of_angles(cloud.gimbal_angles, config.sigma_direction)
     lasers = np.flatnonzero(np.bincount(table.rings))
     # returns of unknown lasers come from all sixteen: their common bias is the mean of as many
     sigma_biases = np.where(
@@ -193,25 +193,9 @@ def _sigmas_direction(
     error: each counts for its part of the line.
     """
     excess2 = max(of_angles**2 - config.sigma_direction**2, 0.0)
-    of_line = [(b - a) / _n_lines(times[a:b]) for a, b in pairwise(starts)]
+    of_line = [(b - a) / n_lines(times[a:b]) for a, b in pairwise(starts)]
     variances = config.sigma_direction**2 + excess2 * np.array(of_line)
     return np.repeat(np.sqrt(variances), np.diff(starts))
-
-
-def _scatter_of_angles(angles: Timed | Column, unknown: float) -> float:
-    """Return the standard deviation of interpolated angles, from samples between neighbours."""
-    if not isinstance(angles, Timed) or len(angles.values) < _N_SAMPLES:
-        return unknown
-    times, values = angles.samples_ns.astype(np.float64), angles.values
-    shares = (times[1:-1] - times[:-2]) / (times[2:] - times[:-2])
-    off = values[1:-1] - values[:-2] - shares * (values[2:] - values[:-2])
-    # of noise s the difference has 1.5 s^2, and an angle between two samples 2/3 s^2 in the mean
-    return 2.0 / 3.0 * robust_sigma(off[np.isfinite(off)])
-
-
-def _n_lines(times: Array) -> int:
-    """Return the number of scan lines of returns, by their times."""
-    return 1 + int(np.sum(np.diff(np.sort(times)) > _LINE))
 
 
 def _result(
@@ -304,4 +288,4 @@ def _covariance(best: Estimate, k: int, n_used: int, ratio: float) -> Array:
 def _by_lines(centre: Array, times: Array, sigma_line: float) -> Array:
     """Return the covariance by the angle of the gimbal, an error that each scan line has once."""
     sideways = np.array([-centre[1], centre[0], 0.0])
-    return np.asarray(sigma_line**2 / _n_lines(times) * np.outer(sideways, sideways))
+    return np.asarray(sigma_line**2 / n_lines(times) * np.outer(sideways, sideways))

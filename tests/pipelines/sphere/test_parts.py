@@ -14,7 +14,7 @@ from spheremark.pipelines.sphere.mounting import effects_on
 from spheremark.pipelines.sphere.normal_equations import normals_of, reduce
 from spheremark.pipelines.sphere.optics import UNKNOWNS, derivatives, with_widths
 from spheremark.pipelines.sphere.radius import Ranges, free_radii
-from spheremark.pipelines.sphere.returns import of_markers, returns_of
+from spheremark.pipelines.sphere.returns import n_lines, of_markers, returns_of, scan_lines
 
 RADIUS, N_LASERS, SIGMA = 0.1, 3, 0.005
 CENTRES = np.array([[6.0, 1.0, 0.2], [-2.0, 7.0, -0.1], [-5.0, -4.0, 0.3]])
@@ -186,3 +186,11 @@ def test_the_limb_is_covered_by_the_octants_that_have_returns():
     assert limb_coverage(directions, limb, RADIUS) == 1.0
     assert limb_coverage(directions[:, :3], limb[:, :3], RADIUS) == 3.0 / 8.0
     assert limb_coverage(directions, 0.2 * limb, RADIUS) == 0.0
+
+
+def test_lasers_that_cross_a_sphere_together_are_one_scan_line_in_whatever_order_they_come():
+    crossings = np.array([0.3, 0.1, 0.2, 0.1, 0.3])  # [s], a revolution apart
+    times = crossings + 1e-3 * np.array([0.0, 1.0, 2.0, 3.0, 4.0])
+    assert scan_lines(times).tolist() == [2, 0, 1, 0, 2]
+    assert n_lines(times) == 3
+    assert n_lines(np.zeros(0)) == n_lines(times[:1]) == 1
