@@ -20,7 +20,7 @@ from spheremark.pipelines.detection.cells import (
     direction_cells,
     rows_in,
 )
-from spheremark.pipelines.detection.ground import heights_above
+from spheremark.pipelines.detection.ground import planes_below, skin_of
 from spheremark.pipelines.detection.pulses import (
     Clock,
     Hearing,
@@ -36,7 +36,7 @@ from spheremark.pipelines.detection.target import (
     seen_from,
     view_of,
 )
-from spheremark.pipelines.model import Array, Column, Rig, StitchedCloud
+from spheremark.pipelines.model import Array, Column, Mask, Rig, StitchedCloud
 from spheremark.pipelines.threads import side_by_side
 
 _STEP = 0.05  # [m] at most between the directions about a centre whose cells are searched
@@ -62,11 +62,11 @@ class Evidence(NamedTuple):
     n_before : int
         Returns inside the limb that lie before the sphere: beams that would have met it.
     n_held : int
-        Returns below it and beside the pole, at about its distance.
+        Returns below it and beside the pole, at about its distance, that are not ground.
     n_past : int
         Returns there that lie behind it, and pulses there without a return.
     n_short : int
-        Returns there that end long before it.
+        Returns there that end long before it, or on the ground at its distance.
     brightness : float
         Reflectivity of the surface, 0-255: least squares over the beams of ``n_on``, weighted by
         their shares inside the limb.
@@ -142,7 +142,8 @@ def gather_evidence(
         return groups
 
     parts = side_by_side(towards, len(cells.directions))
-    heights = heights_above(cells, centres)
+    planes = planes_below(cells, centres)
+    heights = np.sum(planes[:, :3] * centres, axis=1) + planes[:, 3]
 
     def gathered(first: int, end: int) -> list[Evidence]:
         return [
@@ -151,8 +152,9 @@ def gather_evidence(
                 clock,
                 np.concatenate([rows[begin[i] : begin[i + 1]] for begin, rows in parts]),
                 centres[i],
+                planes[i],
                 target,
-            )._replace(height=float(heights[i, 0]), sigma_height=float(heights[i, 1]))
+            )._replace(height=float(heights[i]), sigma_height=float(planes[i, 4]))
             for i in range(first, end)
         ]
 
@@ -160,13 +162,20 @@ def gather_evidence(
 
 
 def _evidence_at(
-    cloud: StitchedCloud, clock: Clock | None, rows: NDArray[np.int32], c: Array, target: Target
+    cloud: StitchedCloud,
+    clock: Clock | None,
+    rows: NDArray[np.int32],
+    c: Array,
+    plane: Array,
+    target: Target,
 ) -> Evidence:
     """Return the evidence of the beams of some returns, and of the pulses between them."""
     angles = cloud.gimbal_angles[rows.astype(np.intp)]
     origins = _origins(cloud.rig, angles)
+    points = cloud.p_base[rows]
+    is_ground = points @ plane[:3] + plane[3] < skin_of(target.radius)
     n_on, n_before, n_held, n_past, n_short, brightness, n_distinct, seen = _count_beams(
-        cloud.p_base, cloud.intensities, rows, c, target, origins
+        points, cloud.intensities[rows], is_ground, c, target, origins
     )
     silent = None
     if clock is not None:
@@ -227,9 +236,9 @@ def _cones(centres: Array, target: Target) -> Array:
 
 @compiled
 def _count_beams(
-    p_base: Column,
+    points: Column,
     intensities: Column,
-    rows: NDArray[np.int32],
+    is_ground: Mask,
     c: Array,
     target: Target,
     origins: Array,
@@ -237,9 +246,9 @@ def _count_beams(
     """Return the counts of ``Evidence``, its brightness, and how the beams pass the centre."""
     radius = target.radius
     blur = blur_at(c, target) / radius
-    view, rays = view_of(c, target.up), rays_of(p_base, rows)
+    view, rays = view_of(c, target.up), rays_of(points, np.arange(len(points)))
     seen = seen_from(rays, view)
-    for i in range(len(rows)):  # the beam leaves the head, not the origin of the base
+    for i in range(len(points)):  # the beam leaves the head, not the origin of the base
         share, x, y = seen[2, i] / rays[3, i], origins[0, i], origins[1, i]
         seen[0, i] += share * (view.across[0] * x + view.across[1] * y)
         seen[1, i] += share * (view.up[0] * x + view.up[1] * y)
@@ -247,7 +256,7 @@ def _count_beams(
     light, lit = 0.0, 0.0
     half = int((1.0 + blur) / _PLACE) + 1
     is_met = np.zeros((2 * half, 2 * half), np.bool_)
-    for i in range(len(rows)):
+    for i in range(len(points)):
         across, along, depth = np.abs(seen[0, i]) / radius, seen[1, i] / radius, seen[2, i] / radius
         gap = np.hypot(across, along)
         is_aimed = gap < 1.0 + blur and along > -0.9
@@ -258,13 +267,14 @@ def _count_beams(
             n_distinct += not is_met[column, row]
             is_met[column, row] = True
             share = _share_inside((1.0 - gap) / (_MEAN_WIDTH * blur))
-            light += share * intensities[rows[i]]
+            light += share * intensities[i]
             lit += share * share
         n_before += is_aimed and depth <= _ON[0]
         if is_beside_pole(across, along, blur):
             n_past += depth > _HELD[1]
-            n_short += depth < _HELD[0]
-            n_held += _HELD[0] <= depth <= _HELD[1]
+            is_held = _HELD[0] <= depth <= _HELD[1]
+            n_held += is_held and not is_ground[i]
+            n_short += depth < _HELD[0] or (is_held and is_ground[i])
     return n_on, n_before, n_held, n_past, n_short, light / max(lit, _TINY), n_distinct, seen
 
 

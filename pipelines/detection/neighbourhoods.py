@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from spheremark.pipelines.compilation import compiled
 from spheremark.pipelines.detection.cells import Cells, Layout, rows_in
+from spheremark.pipelines.detection.ground import N_BLOCK, ground_by_block, skin_of
 from spheremark.pipelines.detection.target import rays_of
 from spheremark.pipelines.model import Array, Column, Mask
 from spheremark.pipelines.threads import side_by_side
@@ -41,6 +42,10 @@ class SortedReturns(NamedTuple):
         Levelling.
     reach : float
         Radius about a seed within which returns are used [m].
+    planes : (k, k, 4)
+        Planes of the ground by block of cells, as from ``ground_by_block``.
+    skin : float
+        Height above these up to which a return is ground, and is left out [m].
     """
 
     starts: NDArray[np.int32]
@@ -49,6 +54,8 @@ class SortedReturns(NamedTuple):
     edge: float
     R_station_base: Array
     reach: float
+    planes: Array
+    skin: float
 
 
 def returns_about(p_base: Column, cells: Cells, seeds: Array, radius: float) -> SortedReturns:
@@ -57,7 +64,9 @@ def returns_about(p_base: Column, cells: Cells, seeds: Array, radius: float) -> 
     margin = int(np.ceil(reach / layout.edge)) + 1
     is_wanted = _cells_about(layout, cells.R_station_base, seeds, margin)
     starts, points = _sort_by_cell(p_base, cells.ground, is_wanted)
-    return SortedReturns(starts, points, layout.n_side, layout.edge, cells.R_station_base, reach)
+    planes = ground_by_block(cells, seeds)
+    R, skin = cells.R_station_base, skin_of(radius)
+    return SortedReturns(starts, points, layout.n_side, layout.edge, R, reach, planes, skin)
 
 
 def _sort_by_cell(
@@ -93,8 +102,10 @@ def n_in(runs: NDArray[np.int32]) -> int:
 
 @compiled
 def rays_near(nearby: SortedReturns, runs: NDArray[np.int32], c: Array, every: float) -> Array:
-    """Return the rays to the returns within reach of a place, or to a sample of them."""
+    """Return the rays to the returns within reach of a place, or to a sample; but to no ground."""
     points, x, y, z, reach2 = nearby.points, c[0], c[1], c[2], nearby.reach**2
+    plane = _plane_at(nearby, c)
+    level = plane[0] * x + plane[1] * y + plane[2] * z + plane[3] - nearby.skin
     rows, n, n_near = np.empty(int(n_in(runs) / every), np.uint32), 0, 0
     for k in range(len(runs)):
         n_run = int((runs[k, 1] - runs[k, 0]) / every)
@@ -104,9 +115,22 @@ def rays_near(nearby: SortedReturns, runs: NDArray[np.int32], c: Array, every: f
         row = rows[i]
         p, q, r = points[row, 0] - x, points[row, 1] - y, points[row, 2] - z
         rows[n_near] = row  # overwritten by the next one unless counted
-        n_near += p * p + q * q + r * r < reach2
+        is_above = plane[0] * p + plane[1] * q + plane[2] * r + level >= 0.0
+        n_near += (p * p + q * q + r * r < reach2) & is_above
     rays: Array = rays_of(points, rows[:n_near])
     return rays
+
+
+@compiled
+def _plane_at(nearby: SortedReturns, c: Array) -> Array:
+    """Return the plane of the ground in the block of a place."""
+    half, last = nearby.n_side // 2, nearby.n_side - 1
+    row = int(np.floor(_along(nearby.R_station_base[0], c) / nearby.edge)) + half
+    column = int(np.floor(_along(nearby.R_station_base[1], c) / nearby.edge)) + half
+    plane: Array = nearby.planes[
+        min(max(row, 0), last) // N_BLOCK, min(max(column, 0), last) // N_BLOCK
+    ]
+    return plane
 
 
 @compiled

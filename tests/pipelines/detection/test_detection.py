@@ -10,7 +10,7 @@ from scipy import ndimage
 from spheremark.pipelines.config import ExtractionConfig
 from spheremark.pipelines.detection import extract
 from spheremark.pipelines.detection.cells import cells_of
-from spheremark.pipelines.detection.ground import _lowest_about, _n_about, heights_above
+from spheremark.pipelines.detection.ground import _lowest_about, _n_about, planes_below
 from spheremark.pipelines.geometry import levelling_rotation
 from spheremark.pipelines.model import RING_UNKNOWN, Levelling
 from tests.pipelines.synthetic_stop import RADIUS, World, ring_of_markers, scan
@@ -97,7 +97,8 @@ def test_what_looks_like_a_marker_is_refused_with_a_reason(found, place, words):
 
 
 def test_heights_of_places_are_above_the_plane_of_the_ground_among_stones(cloud):
-    heights, sigmas = heights_above(cells_of(cloud, CONFIG), MARKERS).T
+    planes = planes_below(cells_of(cloud, CONFIG), MARKERS)
+    heights, sigmas = np.sum(planes[:, :3] * MARKERS, axis=1) + planes[:, 3], planes[:, 4]
     assert (np.abs(heights - (MARKERS[:, 2] - GROUND)) < 3.0 * sigmas).all()
     assert sigmas.max() < 0.2
 
