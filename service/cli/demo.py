@@ -19,6 +19,7 @@ from typing import Any, ClassVar
 
 import httpx
 from rich.console import Console
+from rich.markup import escape
 from rich.table import Table
 
 from spheremark.pipelines.errors import SpheremarkError
@@ -189,7 +190,7 @@ class Rover:
 
 def summary_table(rows: list[list[Any]]) -> Table:
     """Return errors against truth as a table."""
-    table = Table(title="Errors against truth [mm]")
+    table = Table(title=escape("Errors against truth [mm]"))
     for name in ("", "fit", "n", "RMS", "maximum", "predicted"):
         table.add_column(name, justify="left" if name in ("", "fit") else "right")
     for what, method, n, *lengths in rows:

@@ -14,9 +14,11 @@ from types import SimpleNamespace
 import httpx
 import numpy as np
 import pytest
+from rich.console import Console
 
 from spheremark.pipelines.geometry import levelling_rotation
 from spheremark.pipelines.model import Levelling
+from spheremark.service.cli.demo import summary_table
 from spheremark.service.cli.main import main
 from spheremark.service.serialise.models import LogDocument
 
@@ -258,3 +260,11 @@ def test_a_compression_that_nobody_knows_is_refused_before_anything_is_written(t
     out = tmp_path / "logs"
     run("simulate", out, "--compression", "gz", code=2)
     assert not out.exists()
+
+
+def test_errors_of_the_demonstration_are_shown_with_their_unit():
+    out = Console(file=StringIO(), width=80)
+    out.print(summary_table([["stations", "along_beam", 7, 0.0003, 0.0004, 0.0005]]))
+    shown = out.file.getvalue()
+    assert "Errors against truth [mm]" in shown
+    assert re.search(r"stations.*along_beam.*7.*0\.3.*0\.4.*0\.5", shown)
