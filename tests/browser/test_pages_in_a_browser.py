@@ -303,7 +303,10 @@ def test_a_stop_that_is_chosen_shows_what_each_mark_does_for_it(visit):
     table = page.locator("#marks-at-stop tbody tr")
     table.nth(2).wait_for()
     redundancies = [float(row.locator("td").nth(6).inner_text()) for row in table.all()]
-    dof = int(re.search(r"(\d+) degrees", page.locator("#marks-at-stop p").inner_text())[1])
+    text = page.locator("#marks-at-stop p").inner_text()
+    x, y, z, all_axes, _ = map(float, re.findall(r"\d+\.\d+", text))
+    assert np.linalg.norm([x, y, z]) == pytest.approx(all_axes, abs=0.01)
+    dof = int(re.search(r"(\d+) degrees", text)[1])
     # two more are those of levelling, one is that of the error that all ranges share
     assert sum(redundancies) == pytest.approx(dof - 3, abs=0.1)
     page.emulate_media(media="print")

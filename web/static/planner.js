@@ -201,7 +201,7 @@ function drawHead(plan, tolerance) {
     ["Without its worst mark", mm(evaluation?.worst_sigma_3d_after_loss_m), "mm", "3-D sigma at the worst stop"],
     ["Mean of all stops", mm(evaluation?.mean_sigma_3d_m), "mm", "3-D sigma"],
     ["A mark in sight is found", percent(mean(chances)), "%", chances.length ? `mean probability; least ${percent(Math.min(...chances))} %` : ""],
-    ["Stops that keep it", `${nKept} of ${stops.length}`, "", "with 95 % probability"],
+    ["Stops that keep it", evaluation ? `${nKept} of ${stops.length}` : "\u2013", "", "with 95 % probability"],
   ].map(([label, value, unit, note]) =>
     h("div", { class: "readout" }, h("dt", {}, label), h("dd", {}, value, h("small", {}, unit)), h("dd", { class: "note" }, note))));
 }
@@ -292,7 +292,7 @@ function drawStop(stop) {
   section.querySelector("h2").textContent = `Marks from ${stop.name}`;
   const sigmas = [0, 1, 2].map((k) => fixed(Math.sqrt(stop.covariance_m2[k][k]), 2, 1000)).join(", ");
   section.querySelector("p").textContent = stop.sigma_3d_m === null ? `No position: ${stop.reason}.`
-    : `Sigma of the position along x, y and z: ${sigmas} mm; with the marks that may be missed the RMS error is ${fixed(stop.rms_error_3d_m, 2, 1000)} mm; ${stop.dof} degrees of freedom.`;
+    : `Sigma of the position along x, y and z: ${sigmas} mm, in 3-D ${fixed(stop.sigma_3d_m, 2, 1000)} mm. Over the sets of marks that may be found and give a position, the 3-D RMS error is ${fixed(stop.rms_error_3d_m, 2, 1000)} mm. ${stop.dof} degrees of freedom.`;
   section.querySelector("tbody").replaceChildren(...stop.marks.map((one) => {
     const isUsed = one.redundancy > 0;
     const reliability = [fixed(one.redundancy, 2), fixed(one.minimal_detectable_bias_m, 1, 1000), fixed(one.external_reliability_m, 2, 1000)];
