@@ -47,6 +47,7 @@ def test_shares_that_miss_their_level_by_more_than_five_points_are_marked(report
     text = coverage_page(Frame(), report)
     assert text.count('class="over"') == 1
     assert '<span class="over">40.0</span>' in text
+    assert "Red shares are off by more than five points" in text
     assert "20 simulated surveys" in text
     assert "error 3.21 mm, predicted 3.33 mm" in text
 
