@@ -16,6 +16,7 @@ from time import perf_counter
 from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.stats import chi2
 
 from spheremark.pipelines.config import SurveyConfig
@@ -203,10 +204,20 @@ def _score(seed: int, *, peers: Peers | None) -> Score:
 
 def _tagged(scan: Scan, rig: Rig) -> tuple[StitchedCloud, Index]:
     """Return the stitched cloud, and the row of the log that each of its returns is."""
-    numbers = np.arange(len(scan.log.rings), dtype=np.float32)  # exact: fewer than 2^24 returns
-    cloud = stitch(replace(scan.log, intensities=numbers), rig, SurveyConfig().stitching)
-    rows = cloud.intensities.astype(np.intp)
+    tagged = replace(scan.log, intensities=_tags(len(scan.log.rings)))
+    cloud = stitch(tagged, rig, SurveyConfig().stitching)
+    rows = _rows(cloud.intensities)
     return replace(cloud, intensities=scan.log.intensities[rows]), rows
+
+
+def _tags(n: int) -> NDArray[np.float32]:
+    """Return numbers of rows as the bits of reflectivities, which are only carried along."""
+    return np.arange(n, dtype=np.int32).view(np.float32)
+
+
+def _rows(tags: NDArray[np.float32]) -> Index:
+    """Return the numbers of rows that some tags are."""
+    return tags.view(np.int32).astype(np.intp)
 
 
 def _class_of(scan: Scan, mark: int) -> str:

@@ -11,6 +11,8 @@ from spheremark.pipelines.evaluation.worlds import (
     Score,
     Seen,
     Station,
+    _rows,
+    _tags,
     report_of,
     tables,
     worlds,
@@ -125,6 +127,14 @@ def test_every_table_shows_its_rows(report):
     assert [len(one["rows"]) for one in shown] == [4, 4, 2, 7, 7, 5, 3]
     assert all(len(row) == len(one["headings"]) for one in shown for row in one["rows"])
     assert shown[0]["rows"][0][:3] == [MANY, "3", "1"]
+
+
+def test_rows_of_a_log_are_told_apart_beyond_the_whole_numbers_of_single_precision():
+    n = 2**24 + 5
+    kept = np.array([0, 1, 2**24 - 1, 2**24 + 1, n - 1])
+    tags = _tags(n)
+    assert np.isfinite(tags[kept]).all()
+    assert (_rows(tags[kept]) == kept).all()
 
 
 def test_every_other_seed_is_a_world():
