@@ -18,7 +18,7 @@ from spheremark.pipelines.detection.target import Target
 from spheremark.pipelines.model import Array
 
 _TOUCHING = 0.10  # share of a ball's returns that may lie as far away beside it: mixed pixels
-_HEIGHT_MIN = 0.4  # radii: one line of a scan shows no ball
+_EXTENT_MIN = 0.4  # radii: one line of a scan, or a strip at its edge, shows no ball
 _HIDDEN = 2.0  # as many returns before a ball as on it: two thirds of it are hidden
 _SPREAD_SIGMAS = 4.0  # standard deviations of a spread: centres are estimated
 _SLACK = 0.17  # of a spread: half way to that of a ball of 60 mm, whose returns end nearer
@@ -107,7 +107,7 @@ def _passes_first_gate(features: Features, config: ExtractionConfig, radius: flo
 def reason_by_features(features: Features, radius: float) -> str:
     """Return why a group is examined no further; an empty string where it is."""
     few = inf if is_resolved(features, radius) else 1.0
-    if features.height < _HEIGHT_MIN * radius:
+    if features.height < _EXTENT_MIN * radius:
         return (
             f"Its returns lie on one line, {1e3 * features.height:.0f} mm high: nothing shows "
             "whether it is round."
@@ -127,6 +127,11 @@ def reason_by_evidence(features: Features, evidence: Evidence, target: Target) -
         return (
             f"Most of it is hidden: {evidence.n_before} returns inside its outline lie before it, "
             f"where {evidence.n_on} lie on it."
+        )
+    if evidence.silent is None and features.width < _EXTENT_MIN * target.radius:
+        return (
+            f"Its returns lie on a strip {1e3 * features.width:.0f} mm wide, and the scan does not "
+            "show whether it looked beside it: nothing shows whether it is round."
         )
     spread, n = _spread(evidence, target.radius)
     if evidence.silent is None and spread < 0.5 - max(_SPREAD_SIGMAS / sqrt(12.0 * n), _SLACK):

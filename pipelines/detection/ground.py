@@ -24,8 +24,8 @@ _CELLS_MIN = 9  # a marker seen alone covers at most 6 cells: that is not yet gr
 _RISE = 0.15  # [m] that ground may rise above its cell of the opened grid: tops of mounds
 _AROUND = 24  # cells each way about a place whose ground may show its height
 _ROUGH, _SLOPE, _TILT = 0.05, 0.05, 0.2  # [m] of the ground, how it bends away, tangent of tilts
-_SMOOTH = 0.01  # [m] the least roughness of a ground
-_SKIN, _SKIN_MAX = 0.3, 0.03  # radii, and [m]: lower returns show nothing of a sphere there
+_SMOOTH = 0.01  # [m] least roughness: lowest points of cells scatter so on a plane floor
+_SKIN, _SKIN_MAX = 0.3, 0.03  # radii, and [m]: ground is that rough, spheres begin higher
 _LOW, _REACHES = 0.2, (0.8, 0.4, 0.2, 0.2)  # share of cells, and heights [m], that may be ground
 
 
