@@ -278,6 +278,37 @@ def test_pole_and_outliers_are_rejected(share):
     assert n_misled <= 3
 
 
+def before_panel(centre, gap):
+    """Shots at a marker before a panel: the echoes of both are one, at their mean range."""
+    near = towards(fire(), centre, 1.45 * RADIUS)
+    on_sphere, lit = lit_ranges(near, centre, RADIUS, RIG.divergence)
+    away = np.linalg.norm(centre)
+    axis = centre / away
+    on_panel = (away + gap - near.origins @ axis) / (near.directions @ axis)
+    return near, lit * np.where(lit > 0, on_sphere, 0.0) + (1.0 - lit) * on_panel
+
+
+@pytest.mark.parametrize(("distance", "gap"), [(3.5, 0.15), (7.0, 0.25)])
+def test_echoes_mixed_with_those_of_a_panel_close_behind_move_no_centre(distance, gap):
+    rng = np.random.default_rng(41)
+    phi = 2 * np.pi * (np.arange(6) + 0.3) / 6
+    centres = distance * np.column_stack([np.cos(phi), np.sin(phi), 0.05 * np.sin(5 * phi)])
+    parts = [before_panel(centre, gap) for centre in centres[:3]]
+    parts += [returns(*marker_shots(c, rng, sigma=0, step=0)) for c in centres[3:]]
+    shots, ranges, rows = joined(*parts)
+
+    def draw(rng):
+        noisy = ranges + 0.008 * rng.standard_normal(len(ranges))
+        rough = centres + 0.01 * rng.standard_normal(centres.shape)
+        cloud = cloud_of(shots, np.round(noisy / 0.002) * 0.002)
+        return cloud, found(*zip(rows, rough, strict=True))
+
+    squares = whitened(draw, centres, rng, 8)[0].reshape(8, 6) / 3
+    high = chance.of_mean_square(3 * 3 * len(squares))[1]
+    assert squares[:, :3].mean() < high
+    assert squares[:, 3:].mean() < high
+
+
 def test_laser_biases_are_estimated_and_corrected():
     rng = np.random.default_rng(4)
     draw, centres = stop_of(rng, 9.0, 14, sigma=0.006, bias=0.01)
