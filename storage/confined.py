@@ -75,6 +75,7 @@ _START_MAX = 20.0  # [s] until a process may have started on a machine that is b
 _PROGRAM = (sys.executable, "-P", "-m", "spheremark.storage.confined")
 _LOOK_EVERY = 0.5  # [s] whether the caller still waits
 _CHILDREN: set[subprocess.Popen[bytes]] = set()
+_AWAITED: set[socket.socket] = set()  # to forked children; each ends once nothing can be sent there
 _SEALABLE = 0x1 | 0x2  # a memory file that is closed in new programs (Linux)
 _SEALS = 0x1 | 0x2 | 0x4 | 0x8  # of seals, shrinking, growing and writing (Linux)
 _AT_ONCE = threading.BoundedSemaphore(2)  # children; others wait, and so memory is bounded too
@@ -222,11 +223,12 @@ def start_readers() -> None:
 
 
 def end_children() -> None:
-    """End all readers that run, as at the end of the service."""
+    """End all readers that run, as at the end of the service; processes that are ready stay."""
     global _n_ended
     _n_ended += 1
-    for forks in tuple(_FORKS.values()):
-        forks.end()
+    for awaited in tuple(_AWAITED):
+        with suppress(OSError):  # its child ended a moment ago
+            awaited.shutdown(socket.SHUT_WR)
     for child in tuple(_CHILDREN):
         with suppress(ProcessLookupError):
             os.killpg(child.pid, signal.SIGKILL)
@@ -273,17 +275,21 @@ def _wait_for_fork(
     """Run a child that is forked from a ready process, and return its code; or end it."""
     ours, theirs = socket.socketpair()
     with ours:
-        with theirs:
-            forks.send(request.encode(), [*(f.fileno() for f in files), theirs.fileno()])
-        ours.settimeout(_LOOK_EVERY)
-        for _ in _looks(limits):
-            with suppress(TimeoutError):
-                code = ours.recv(4)
-                return int.from_bytes(code, "little", signed=True) if code else -signal.SIGKILL
-        ours.shutdown(socket.SHUT_WR)  # ends the child
-        ours.settimeout(None)
-        ours.recv(4)
-        return -signal.SIGALRM
+        _AWAITED.add(ours)
+        try:
+            with theirs:
+                forks.send(request.encode(), [*(f.fileno() for f in files), theirs.fileno()])
+            ours.settimeout(_LOOK_EVERY)
+            for _ in _looks(limits):
+                with suppress(TimeoutError):
+                    code = ours.recv(4)
+                    return int.from_bytes(code, "little", signed=True) if code else -signal.SIGKILL
+            ours.shutdown(socket.SHUT_WR)  # ends the child
+            ours.settimeout(None)
+            ours.recv(4)
+            return -signal.SIGALRM
+        finally:
+            _AWAITED.discard(ours)
 
 
 def _looks(limits: Limits) -> Iterator[None]:
@@ -350,7 +356,14 @@ class _Forks:
 
 _FORKS = {module: _Forks(module, _AT_ONCE) for module in (READY, CLOUDS)}
 _n_ended = 0  # times that all readers were ended
-atexit.register(end_children)
+
+
+@atexit.register
+def _end_all() -> None:
+    """End readers, and the processes that keep them ready, with this process."""
+    end_children()
+    for forks in tuple(_FORKS.values()):
+        forks.end()
 
 
 def _reason(code: int, log: IO[bytes], limits: Limits, name: str) -> str:

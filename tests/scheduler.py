@@ -6,7 +6,12 @@ Services of most tests compute there: a worker of its own takes each 3 s of a pr
 import asyncio
 import sys
 
+import dask
 from distributed import Nanny, Scheduler
+
+dask.config.set(
+    {"distributed.worker.profile.enabled": False, "distributed.admin.tick.interval": "1s"}
+)  # as in the service: nothing is computed where nothing is asked for
 
 
 async def main():

@@ -36,6 +36,10 @@ def test_a_scan_is_read_and_processed_without_what_only_the_service_needs(module
     assert not imported_by(f"import spheremark.{module}") & HEAVY
 
 
+def test_a_service_starts_without_the_statistics_that_few_pages_need():
+    assert "scipy.stats" not in imported_by("import spheremark.service.http.app")
+
+
 def test_compilation_is_reported_and_leaves_the_level_of_optimisation_as_it_was(tmp_path):
     code = """
 import numba, numpy as np

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 from typing import NamedTuple
 
 import numpy as np
-from scipy.stats import chi2
+from scipy.special import chdtri
 
 from spheremark.pipelines.accuracy.probability import keeps_tolerance
 from spheremark.pipelines.model import Array, Index
@@ -150,7 +150,7 @@ def by_chance(dof: float) -> tuple[float, float]:
         Its ends, with a probability of 95 % in between (chi-square).
     """
     tail = (1.0 - LEVEL) / 2.0
-    low, high = (math.sqrt(chi2.ppf(share, dof) / dof) for share in (tail, 1.0 - tail))
+    low, high = (math.sqrt(chdtri(dof, share) / dof) for share in (1.0 - tail, tail))
     return low, high
 
 

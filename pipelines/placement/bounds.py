@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
-from scipy.stats import chi
+from scipy.special import chdtri
 
 from spheremark.pipelines.model import Array, Column, Index
 from spheremark.pipelines.placement.packing import COLUMNS, ROWS, packed, unpacked
@@ -61,4 +61,4 @@ def least_sigmas(rows: Array, requirement: Requirement) -> Array:
 
 def widest_sigma(tolerance: float, probability: float) -> float:
     """Return the largest 3-D sigma with which an error can be within a tolerance so probably."""
-    return float(max(tolerance * np.sqrt(n) / chi(n).ppf(probability) for n in (1, 2, 3)))
+    return float(max(tolerance * np.sqrt(n / chdtri(n, 1.0 - probability)) for n in (1, 2, 3)))

@@ -12,9 +12,9 @@ sensor:
 
 The maximum-likelihood methods share ``estimation``: a joint least-squares adjustment of all centres
 (``normal_equations``), with ranges averaged over footprints (``footprint``) and linearised over the
-uncertainty of the centres (``linearisation``), robust weights (``noise``), the limb (``limb``),
-errors of the mounting (``mounting``) and a test of the assumed radius (``radius``). ``bound`` is
-the Cramer-Rao bound, for comparisons with truth.
+uncertainty of the centres (``linearisation``), robust weights (``noise``), the limb (``limb``) as
+far as nothing hides it (``occlusion``), errors of the mounting (``mounting``) and a test of the
+assumed radius (``radius``). ``bound`` is the Cramer-Rao bound, for comparisons with truth.
 """
 
 from __future__ import annotations

@@ -19,6 +19,7 @@ from spheremark.pipelines.sphere.linearisation import Linear, linearise
 from spheremark.pipelines.sphere.mounting import N_MOUNTING, effects_on
 from spheremark.pipelines.sphere.noise import Noise, Weighed, weigh
 from spheremark.pipelines.sphere.normal_equations import Normals, normals_of, reduce
+from spheremark.pipelines.sphere.occlusion import Others, faces_seen
 from spheremark.pipelines.sphere.optics import (
     N_ESTIMATED,
     SIGMAS_PROFILE,
@@ -175,16 +176,19 @@ class Estimate(NamedTuple):
 
 
 def estimate(
-    returns: Returns, rough: Array, prior: Prior, observe: Observe | None, *, uses_limb: bool
+    returns: Returns, rough: Array, prior: Prior, observe: Observe | None, others: Others | None
 ) -> Estimate:
     """Estimate all centres, laser biases, optics and mounting, from rough centres, (m, 3).
 
+    The limb of returns is used if the ``others`` towards the candidates are given; each return
+    counts there if, by the ranges alone, the limb opposite it is seen.
     Returns are chosen with footprints as wide as specified, or as estimated where that is wider and
     not unlikely: those of a wide beam that reach the limb from beyond the specified width would
     else be missing there, and the limb would seem as sharp as the choice.
     """
     state, radius = _start(rough, prior), prior.radius
     is_used = np.ones(len(returns.ranges), dtype=bool)
+    is_faced = is_used
     factors = np.zeros((len(returns.ranges), 2))
     for step in range(_N_STEPS_MAX):
         corrected = _corrected(returns, state)
@@ -199,10 +203,13 @@ def estimate(
         by_optics = derivatives(returns, corrected, linear)
         J = (linear.J[:3], np.vstack([by_optics, np.zeros(len(residuals))]))
         N = normals_of(returns, J, residuals, weights / sigmas**2, len(state.biases))
-        if uses_limb and step >= _N_STEPS_RANGES:
+        if others is not None and step == _N_STEPS_RANGES:
+            is_faced = faces_seen(corrected, linear, state.centres, others, radius)
+        if others is not None and step >= _N_STEPS_RANGES:
             edge = edge_of(corrected, linear, weights, radius)
             state.shared[_HALVES] = edge.halves
-            factors = _add_limb(N, corrected, Estimate(state, linear, weighed), edge, factors)
+            faced = weighed._replace(weights=weights * is_faced)
+            factors = _add_limb(N, corrected, Estimate(state, linear, faced), edge, factors)
         if observe is not None and step >= _N_STEPS_RANGES:
             _add_observed(N, corrected, state, observe)
         before, state = state, _stepped(state, N, prior)

@@ -1,7 +1,8 @@
 """What a return says of a centre beside its range: that its beam has met the sphere.
 
 The footprint of a beam that returned reaches inside the limb, so that the outermost returns bound
-the limb from all sides. Missing returns are not used: they may be lost for other reasons.
+the limb from all sides. Missing returns are not used: they may be lost for other reasons. So each
+side has a meaning only beside the opposite one (``occlusion``).
 """
 
 from __future__ import annotations

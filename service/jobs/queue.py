@@ -141,6 +141,10 @@ class JobQueue:
                         # else, so long after the death of a worker, Dask ends the process that
                         # starts it again if it is just then without one, and forgets it
                         "distributed.deploy.lost-worker-timeout": _NEVER,
+                        # no samples of what runs, and a look at each loop every second: at rest
+                        # service and worker take 3 % of a processor, not 8
+                        "distributed.worker.profile.enabled": False,
+                        "distributed.admin.tick.interval": "1s",
                         # no history of processor and memory, which grows for an hour
                         "distributed.admin.system-monitor.log-length": 10,
                         # no pages of Dask

@@ -1,13 +1,14 @@
-"""Every page passes axe, in both themes and at both widths."""
+"""Every page draws, stays on this host, and passes axe in both themes and at both widths."""
 
 import pytest
 from axe_playwright_python.sync_playwright import Axe
 
-from tests.browser.visits import NEEDS_CHROMIUM, PAGES
+from tests.browser.visits import NEEDS_CHROMIUM, PAGES, Visit
 
 pytestmark = NEEDS_CHROMIUM
 
-MORE = ["/coverage", "/worlds", "/login", "/guide/sql", "/surveys/none", "/plan/sheet?a=P01:6,0,1"]
+NOWHERE = "/surveys/none"
+MORE = ["/coverage", "/worlds", "/login", "/guide/sql", NOWHERE, "/plan/sheet?a=P01:6,0,1"]
 LOOKS = [(1280, "light"), (1280, "dark"), (390, "dark"), (390, "light")]
 DRAWN = """(theme) => document.documentElement.dataset.theme === theme
     && [...document.querySelectorAll("[data-figure]")].every(
@@ -27,11 +28,29 @@ def found(page, options=ALL):
     return [(one["id"], len(one["nodes"]), one["nodes"][0]["html"]) for one in violations]
 
 
-@pytest.mark.parametrize("path", [*PAGES, *MORE])
-def test_a_page_passes_axe(visit, path):
-    """The page is loaded once: theme and width change as for its reader."""
-    page = visit(width=LOOKS[0][0], scheme=LOOKS[0][1]).open(path)
+@pytest.fixture(scope="module", params=[*PAGES, *MORE])
+def shown(context, address, request):
+    """Show a page once: theme and width change later as for its reader."""
+    tab = (context.pages or [context.new_page()])[0]
+    one = Visit(tab, address, width=LOOKS[0][0], scheme=LOOKS[0][1])
+    one.open(request.param)
+    yield one
+    one.end()
+
+
+def test_a_page_draws_without_complaint_and_asks_no_other_host(shown):
+    page = shown.page
+    for plot in page.locator("[data-figure]").all():
+        plot.scroll_into_view_if_needed()  # figures by address are fetched when they come in view
+        plot.locator("svg.main-svg, canvas, p.empty").first.wait_for()  # or: nothing to draw
     page.wait_for_load_state("networkidle")
+    # Chromium itself names the page that is not there
+    assert ["404" in one for one in shown.complaints] == [True] * page.url.endswith(NOWHERE)
+    assert shown.strangers == []
+
+
+def test_a_page_passes_axe(shown):
+    page = shown.page
     for width, scheme in LOOKS:
         page.set_viewport_size({"width": width, "height": 900})
         page.emulate_media(color_scheme=scheme)

@@ -66,10 +66,15 @@ def towards(shots, p, reach):
     if away > reach + 2 * off:  # most go elsewhere, which one product shows
         limit = np.arcsin(reach / (away - off)) + np.arcsin(off / away) + 1e-3
         shots = shots.take(np.flatnonzero(shots.directions @ (p / away) > np.cos(limit)))
+    along, gap2 = passing(shots, p)
+    return shots.take((along > 0) & (gap2 < reach**2))
+
+
+def passing(shots, p):
+    """How far along shots pass a point, and the squares of how far beside it."""
     v = p - shots.origins
     along = np.einsum("ij,ij->i", v, shots.directions)
-    gap2 = np.einsum("ij,ij->i", v, v) - along**2
-    return shots.take((along > 0) & (gap2 < reach**2))
+    return along, np.einsum("ij,ij->i", v, v) - along**2
 
 
 def sphere_ranges(origins, directions, centre, radius):
@@ -112,6 +117,10 @@ def lit_ranges(shots, centre, radius, divergence, n=24, power=0.0):
 
     Parts weigh by a power of the cosine of incidence.
     """
+    ranges, lit = np.full(len(shots.rings), np.inf), np.zeros(len(shots.rings))
+    along, gap2 = passing(shots, centre)
+    met = gap2 < (radius + max(divergence) / 2 * (along + 2 * radius)) ** 2  # no ray of another
+    shots = shots.take(met)
     rays = footprint(shots, divergence, n)
     t = sphere_ranges(shots.origins[:, None], rays, centre, radius)
     hits = np.isfinite(t)
@@ -121,7 +130,9 @@ def lit_ranges(shots, centre, radius, divergence, n=24, power=0.0):
         cosines = -np.einsum("...i,...i->...", rays, out) / radius
         weights *= np.maximum(cosines, 0.05) ** power
     total, weight = (weights * reached).sum(axis=1), weights.sum(axis=1)
-    return np.where(weight > 0, total / np.maximum(weight, 1e-12), np.inf), hits.mean(axis=1)
+    ranges[met] = np.where(weight > 0, total / np.maximum(weight, 1e-12), np.inf)
+    lit[met] = hits.mean(axis=1)
+    return ranges, lit
 
 
 def cloud_of(shots, ranges, intensity=30.0, rig=RIG, levelling=LEVEL):

@@ -21,7 +21,7 @@ UNAVAILABLE = (503, 507)
 
 def opened(folder, **more):
     return TestClient(
-        create_app(Settings(data=folder, workers=1, min_free_bytes=0, **more)),
+        create_app(Settings(data=folder, min_free_bytes=0, **more)),
         base_url="http://127.0.0.1",
         raise_server_exceptions=False,
     )
@@ -42,8 +42,10 @@ def folder(tmp_path):
     subprocess.run(["umount", "-l", place], check=True)
 
 
-def test_a_read_only_disk_is_named_and_needs_no_restart(folder, stop, control, open_site):
-    with opened(folder) as client:
+def test_a_read_only_disk_is_named_and_needs_no_restart(
+    folder, stop, control, open_site, scheduler
+):
+    with opened(folder, scheduler=scheduler) as client:
         site = open_site(client, stop, control)
         site.survey("before")
         assert mount("-o", "remount,bind,ro", folder / "recordings")
@@ -62,8 +64,8 @@ def test_a_read_only_disk_is_named_and_needs_no_restart(folder, stop, control, o
         assert client.get("/readyz").status_code == 200
 
 
-def test_a_corrupt_page_of_the_database_is_named_by_doctor_and_service(tmp_path):
-    with opened(tmp_path) as client:
+def test_a_corrupt_page_of_the_database_is_named_by_doctor_and_service(tmp_path, scheduler):
+    with opened(tmp_path, scheduler=scheduler) as client:
         for number in range(30):
             client.post("/api/v1/surveys", json={"name": f"s{number:03d}"}).raise_for_status()
     database = tmp_path / "spheremark.duckdb"
@@ -82,7 +84,7 @@ def test_a_corrupt_page_of_the_database_is_named_by_doctor_and_service(tmp_path)
     assert "restore the newest backup" in " ".join((found.stdout + found.stderr).split())
     assert "Traceback" not in found.stderr
     try:
-        with opened(tmp_path) as client:
+        with opened(tmp_path, scheduler=scheduler) as client:
             answer = client.get("/api/v1/surveys", params={"limit": 1000})
             said = answer.json()["detail"] if answer.status_code == 503 else ""
     except StorageError as error:  # where the page is read at the start
@@ -91,9 +93,11 @@ def test_a_corrupt_page_of_the_database_is_named_by_doctor_and_service(tmp_path)
 
 
 @pytest.mark.parametrize("jump", [-400 * 86400, 400 * 86400], ids=["backwards", "forwards"])
-def test_a_jump_of_the_clock_loses_nothing(tmp_path, stop, control, open_site, monkeypatch, jump):
+def test_a_jump_of_the_clock_loses_nothing(
+    tmp_path, stop, control, open_site, scheduler, monkeypatch, jump
+):
     now = time.time
-    with opened(tmp_path) as client:
+    with opened(tmp_path, scheduler=scheduler) as client:
         site = open_site(client, stop, control)
         site.survey("clock")
         first = site.upload(survey="clock", process="true").json()["job"]["job_id"]
@@ -116,7 +120,7 @@ def test_a_worker_out_of_memory_fails_its_job_and_the_next_is_served(
     tmp_path, stop, control, open_site
 ):
     limit = 1 << 30
-    with opened(tmp_path, job_memory_bytes=limit, job_attempts=1) as client:
+    with opened(tmp_path, workers=1, job_memory_bytes=limit, job_attempts=1) as client:
         site = open_site(client, stop, control)
         site.survey("memory")
         jobs = client.app.state.service.jobs

@@ -1,5 +1,7 @@
 import json
 import socket
+import subprocess
+import sys
 import threading
 import time
 from concurrent.futures import ThreadPoolExecutor
@@ -120,7 +122,8 @@ def begun():
     )
 
 
-def test_the_end_of_the_service_ends_readers(run):
+def test_the_end_of_the_service_ends_readers_and_none_that_is_ready(run, forks):
+    ready = forks._process
     with ThreadPoolExecutor(1) as thread:
         future = thread.submit(run, "sleep")
         while not begun():
@@ -128,6 +131,18 @@ def test_the_end_of_the_service_ends_readers(run):
         end_children()
         with pytest.raises(ReaderEndedError, match="it is read again"):  # no fault of the file
             future.result(timeout=60)
+    assert not begun()
+    assert forks._process is ready
+    assert run("size_of")["size"].tolist() == [5]
+
+
+def test_a_process_that_ends_takes_along_those_that_are_ready():
+    program = (
+        "from spheremark.storage import confined; confined.start_readers();"
+        "print(confined._FORKS[confined.READY]._process.pid)"
+    )
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, check=True)
+    assert not psutil.pid_exists(int(done.stdout))
 
 
 def test_what_a_library_prints_is_no_part_of_the_answer(run):

@@ -7,7 +7,6 @@ from typing import Any
 
 import numpy as np
 import plotly.graph_objects as go
-from scipy.stats import chi2
 
 from spheremark.web import theme
 from spheremark.web.figures.elements import add_line, add_points, blank_figure, hover_of
@@ -80,6 +79,8 @@ def calibration_figure(report: Mapping[str, Any], quantity: str) -> go.Figure:
 
 def squares_figure(report: Mapping[str, Any], quantity: str) -> go.Figure:
     """Draw the distribution of squared errors, and that of chi-square."""
+    from scipy.stats import chi2  # slow to import
+
     title = f"Squared errors: {_LABELS[quantity]}"
     figure = blank_figure(title, "Squared error in units of its covariance", "Density")
     edges = np.array(report["bins"])

@@ -51,6 +51,7 @@ from spheremark.pipelines.sphere.estimation import (
 )
 from spheremark.pipelines.sphere.mounting import sigmas_of
 from spheremark.pipelines.sphere.noise import EXPECTED_SQUARE, FACTOR_MIN, classes_of
+from spheremark.pipelines.sphere.occlusion import others_towards
 from spheremark.pipelines.sphere.optics import prior_sigmas
 from spheremark.pipelines.sphere.radius import other_radius
 from spheremark.pipelines.sphere.returns import (
@@ -132,7 +133,8 @@ def _fit(
         sigmas_of(config.sigma_mounting, config.sigma_offset),
     )
     rough = np.array([c.p_base_rough for c in found.candidates])
-    best = estimate(stop.returns, rough, prior, observe, uses_limb=uses_limb)
+    others = others_towards(cloud, found.candidates, radius) if uses_limb else None
+    best = estimate(stop.returns, rough, prior, observe, others)
     radii, sigmas = estimate_radii(stop.returns, best, radius)
     shared, factors = shared_range_sigmas(best.state), shared_factors(best.state)
     heights = shared_height_sigmas(best.state)

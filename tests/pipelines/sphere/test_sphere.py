@@ -278,6 +278,77 @@ def test_pole_and_outliers_are_rejected(share):
     assert n_misled <= 3
 
 
+def before_panel(centre, gap):
+    """Shots at a marker before a panel: the echoes of both are one, at their mean range."""
+    near = towards(fire(), centre, 1.45 * RADIUS)
+    on_sphere, lit = lit_ranges(near, centre, RADIUS, RIG.divergence)
+    away = np.linalg.norm(centre)
+    axis = centre / away
+    on_panel = (away + gap - near.origins @ axis) / (near.directions @ axis)
+    return near, lit * np.where(lit > 0, on_sphere, 0.0) + (1.0 - lit) * on_panel
+
+
+@pytest.mark.parametrize(("distance", "gap"), [(3.5, 0.15), (7.0, 0.25)])
+def test_echoes_mixed_with_those_of_a_panel_close_behind_move_no_centre(distance, gap):
+    rng = np.random.default_rng(41)
+    phi = 2 * np.pi * (np.arange(6) + 0.3) / 6
+    centres = distance * np.column_stack([np.cos(phi), np.sin(phi), 0.05 * np.sin(5 * phi)])
+    parts = [before_panel(centre, gap) for centre in centres[:3]]
+    parts += [returns(*marker_shots(c, rng, sigma=0, step=0)) for c in centres[3:]]
+    shots, ranges, rows = joined(*parts)
+
+    def draw(rng):
+        noisy = ranges + 0.008 * rng.standard_normal(len(ranges))
+        rough = centres + 0.01 * rng.standard_normal(centres.shape)
+        cloud = cloud_of(shots, np.round(noisy / 0.002) * 0.002)
+        return cloud, found(*zip(rows, rough, strict=True))
+
+    squares = whitened(draw, centres, rng, 8)[0].reshape(8, 6) / 3
+    high = chance.of_mean_square(3 * 3 * len(squares))[1]
+    assert squares[:, :3].mean() < high
+    assert squares[:, 3:].mean() < high
+
+
+def behind_screen(centre, side, edge, before):
+    """Shots at a marker, part of which a screen hides, with those that meet the marker.
+
+    The screen hides what lies to one side of an upright line at ``edge``, seen from the scanner.
+    """
+    away = np.linalg.norm(centre)
+    axis, across = centre / away, np.cross([0.0, 0.0, 1.0], centre / away)
+    near = towards(fire(), centre, 1.45 * RADIUS)
+    on_sphere, lit = lit_ranges(near, centre, RADIUS, RIG.divergence)
+    on_screen = (away - before - near.origins @ axis) / (near.directions @ axis)
+    places = (near.origins + on_screen[:, None] * near.directions) @ across
+    is_hidden = side * places > edge * (1.0 - before / away)
+    ranges = np.where(is_hidden, on_screen, np.where(lit > 0.5, on_sphere, np.inf))
+    keep = np.isfinite(ranges)
+    return near.take(keep), ranges[keep], ~is_hidden[keep]
+
+
+@pytest.mark.parametrize(("distance", "before"), [(2.5, 0.6), (3.5, 1.0)])
+def test_spheres_half_hidden_are_not_drawn_away_from_what_hides_them(distance, before):
+    rng = np.random.default_rng(47)
+    phi = 2 * np.pi * (np.arange(8) + 0.3) / 8
+    centres = distance * np.column_stack([np.cos(phi), np.sin(phi), 0.05 * np.sin(5 * phi)])
+    sides, edges = np.tile([1.0, -1.0], 4), RADIUS * np.repeat([0.0, 0.1, 0.2, 0.3], 2)
+    parts = [behind_screen(c, s, e, before) for c, s, e in zip(centres, sides, edges, strict=True)]
+    shots, ranges, rows = joined(*(part[:2] for part in parts))
+    members = [some[part[2]] for some, part in zip(rows, parts, strict=True)]
+    across = np.cross([0.0, 0.0, 1.0], centres / distance) * sides[:, None]
+
+    def draw(rng):
+        noisy = ranges + 0.008 * rng.standard_normal(len(ranges))
+        rough = centres + 0.01 * rng.standard_normal(centres.shape)
+        cloud = cloud_of(shots, np.round(noisy / 0.002) * 0.002)
+        return cloud, found(*zip(members, rough, strict=True))
+
+    squares, errors, _ = whitened(draw, centres, rng, 16)
+    towards_screens = np.einsum("dki,ki->dk", errors.reshape(16, 8, 3), across).mean(axis=1)
+    assert abs(towards_screens.mean()) < chance.of_mean(towards_screens)
+    assert np.mean(squares) / 3 < chance.of_mean_square(3 * len(squares))[1]
+
+
 def test_laser_biases_are_estimated_and_corrected():
     rng = np.random.default_rng(4)
     draw, centres = stop_of(rng, 9.0, 14, sigma=0.006, bias=0.01)
