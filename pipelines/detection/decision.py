@@ -140,8 +140,8 @@ def reason_by_evidence(features: Features, evidence: Evidence, target: Target) -
         return f"It is too small: its returns lie as on a sphere of radius {seems_like:.0f} mm."
     if evidence.n_carrying > max(few - 1.0 + _TOUCHING * _n_comparable(evidence), 1.0):
         return (
-            f"It does not stand on a pole: {evidence.n_carrying} returns below it and beside a "
-            "pole's place lie about as far away, as on shoulders, a larger stone or the ground."
+            f"It does not stand on a pole: {evidence.n_carrying} returns below it and beside a pole's "
+            "place lie about as far away, as on shoulders, a larger stone or the ground."
         )
     if not (evidence.is_open_below or _may_be_hidden(features, target) or few == inf):
         n_below = evidence.n_held + evidence.n_past + evidence.n_short
@@ -179,7 +179,9 @@ def _may_be_hidden(features: Features, target: Target) -> bool:
     return features.n_points >= _N_SURE and features.sigma_radius < _SHAPE_SURE * target.radius
 
 
-def paint_of(groups: Sequence[Evidence], probabilities: Sequence[float]) -> tuple[Array, list[str]]:
+def paint_of(
+    groups: Sequence[Evidence], probabilities: Sequence[float]
+) -> tuple[Array, list[str]]:
     """Return how much likelier the reflectivity of each group is if it is a marker.
 
     All markers have the same paint, other things have any. What the paint is, the other groups

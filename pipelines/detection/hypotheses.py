@@ -77,7 +77,8 @@ _FORMS: dict[int, tuple[tuple[float, float], ...]] = {
     _PANEL: ((0.0, 0.5), (0.0, 0.5), (0.0, 0.7), (0.0, 0.7)),
     _CLUTTER: ((0.0, 0.4), (1.0, 1.5), (-0.7, 0.7)),
 }
-_STARTS = ((0.0, 0.0), (-0.585, -0.3), (0.585, 0.3))  # [rad] of a box; ln radii of a ball
+_TURNS = (0.0, -0.585, 0.585)  # [rad] of a box, about half a right angle
+_SIZES = (0.0, -0.3, 0.3)  # logarithms of radii of balls
 ABUNDANCE = (208, 31, 274, 10, 33, 191, 18, 36, 36)
 """Groups that were compared in 31 random worlds of the simulator and were each."""
 
@@ -508,9 +509,10 @@ def _evidence(kind: int, shape: Array, prior: Array, beams: _Beams, least: float
     if kind in (_SPHERE, _BALL):  # the centre is fitted already
         steps[:_NOISE] = np.minimum(steps[:_NOISE], 2.0 * np.exp(prior[0, _NOISE]))
     _align(kind, shape, beams)
-    found = _search(kind, shape, steps, prior, beams, least)
+    n_rounds = _N_ROUNDS if kind > _BALL else 2 * _N_ROUNDS
+    found = _search(kind, shape, steps, prior, beams, least, n_rounds)
     if found == -np.inf:
-        return -np.inf
+        return found
     found += _log_volume(kind, shape, prior, beams)
     if kind == _BALL:
         found += _log_other_size(shape, prior, beams)
@@ -519,7 +521,13 @@ def _evidence(kind: int, shape: Array, prior: Array, beams: _Beams, least: float
 
 @compiled
 def _search(
-    kind: int, shape: Array, steps: Array, prior: Array, beams: _Beams, least: float
+    kind: int,
+    shape: Array,
+    steps: Array,
+    prior: Array,
+    beams: _Beams,
+    least: float,
+    n_rounds: int,
 ) -> float:
     """Move a shape to the greatest likelihood times prior; return its logarithm.
 
@@ -527,7 +535,7 @@ def _search(
     """
     densities = np.empty(len(beams.x))
     found = _log_likelihood(kind, shape, prior, beams, densities)
-    for round_no in range(_N_ROUNDS if kind > _BALL else 2 * _N_ROUNDS):
+    for round_no in range(n_rounds):
         if found < least - _HOPELESS * (1.0 + 4.0 / (1.0 + round_no)):
             return -np.inf
         before, begun = found, shape.copy()
@@ -567,7 +575,7 @@ def _log_other_size(shape: Array, prior: Array, beams: _Beams) -> float:
         at_limit, steps = shape.copy(), 0.1 * prior[1]
         at_limit[_FORM], steps[_FORM] = limit, 0.0
         _align(_BALL, at_limit, beams)
-        fallen = best - _search(_BALL, at_limit, steps, prior, beams, -np.inf)
+        fallen = best - _search(_BALL, at_limit, steps, prior, beams, -np.inf, _N_ROUNDS)
         off = np.sqrt(max(fallen, 0.0))  # over the square root of two standard deviations
         is_beyond = (shape[_FORM] - limit) * limit > 0.0
         other += 0.5 * erfc(-off if is_beyond else off)
@@ -641,8 +649,21 @@ def _compared(beams: _Beams, priors: Array, log_priors: Array) -> tuple[Array, A
         if best - found[_SPHERE] > _GIVEN_UP and is_named:
             continue
         shape = sphere
-        for start in _STARTS:
-            shape = sphere if kind == _SPHERE else _start(kind, priors[kind], sphere, start)
+        for turn, size in zip(_TURNS, _SIZES):  # starts
+            shape = priors[kind, 0].copy()
+            if kind == _SPHERE:
+                shape = sphere
+            else:
+                shape[:_FORM] = sphere[:_FORM]
+                shape[_SHIFT:] = sphere[_SHIFT:]
+            if kind in (_BOULDER, _HEAD):
+                shape[_NOISE] = priors[kind, 0, _NOISE]
+            if kind in (_BALL, _BOULDER):
+                shape[_FORM] = sphere[_FORM]
+            if kind == _BALL:
+                shape[_FORM] += size
+            if kind == _BOX:
+                shape[_FORM + 2] += turn
             own = _evidence(kind, shape, priors[kind], beams, best - log_priors[kind])
             found[kind] = max(found[kind], own + log_priors[kind])
             if kind not in (_BOX, _BALL):
@@ -652,19 +673,3 @@ def _compared(beams: _Beams, priors: Array, log_priors: Array) -> tuple[Array, A
             found[_SPHERE] = max(found[_SPHERE], own + log_priors[_SPHERE])
         best = max(best, found[kind])
     return found, sphere
-
-
-@compiled
-def _start(kind: int, prior: Array, sphere: Array, start: tuple[float, float]) -> Array:
-    """Return a start of the search for the best shape of a kind where the best sphere is."""
-    shape: Array = prior[0].copy()
-    shape[:_FORM], shape[_SHIFT:] = sphere[:_FORM], sphere[_SHIFT:]
-    if kind in (_BOULDER, _HEAD):
-        shape[_NOISE] = prior[0, _NOISE]
-    if kind in (_BALL, _BOULDER):
-        shape[_FORM] = sphere[_FORM]
-    if kind == _BALL:
-        shape[_FORM] += start[1]
-    if kind == _BOX:
-        shape[_FORM + 2] += start[0]
-    return shape

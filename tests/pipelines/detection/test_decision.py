@@ -34,9 +34,9 @@ def features(n_points=70, scatter_free=0.0075, **changes):
 def evidence(**changes):
     """A ball that stands on a pole before something far."""
     seen = Evidence(
-        n_on=70, n_before=0, n_held=0, n_carrying=0, n_past=150, n_short=0,
-        brightness=50.0, n_distinct=70, rows=np.empty(0, np.int32), seen=np.empty((3, 0)),
-        faces=np.empty(0), silent=None, blur=np.full(2, 0.015), height=np.nan, sigma_height=np.inf,
+        n_on=70, n_before=0, n_held=0, n_carrying=0, n_past=150, n_short=0, brightness=50.0, n_distinct=70,
+        rows=np.empty(0, np.int32), seen=np.empty((3, 0)), faces=np.empty(0), silent=None,
+        blur=np.full(2, 0.015), height=np.nan, sigma_height=np.inf,
     )  # fmt: skip
     return seen._replace(**{"n_carrying": changes.get("n_held", 0), **changes})
 
