@@ -15,8 +15,8 @@ import numpy as np
 from spheremark.pipelines.compilation import compiled
 from spheremark.pipelines.detection.evidence import Evidence, n_beside_pole
 from spheremark.pipelines.detection.target import ASIDE
-from spheremark.pipelines.estimation.linear_algebra import factorise, invert
-from spheremark.pipelines.model import Array, Index
+from spheremark.pipelines.estimation.linear_algebra import invert
+from spheremark.pipelines.model import Array
 
 NAMES = (
     "sphere",
@@ -48,17 +48,16 @@ _POLE_FROM, _POLE_DEPTH, _POLE_SHARE = 0.8, 0.4, 0.7  # of a pole, and of its be
 _STRAY = 0.02  # share of the returns from a surface that lie anywhere: crosstalk, dust, strays
 _MERGED = 0.6  # share of the echoes of a beam that an outline halves, between it and what is behind
 _MISPLACED = 0.01  # share of the beams on a solid surface that seem to end behind it
-_SOFT = (0.07, 0.35)  # radii, and half widths of a beam besides, over which beams come to hit
+_SOFT = (0.1, 0.5)  # radii, and half widths of a beam besides, over which beams come to hit
 _CELL, _N_CELL = 0.1, 2  # beams that pass the same place share the errors of the model
 _N_MAX = 96  # beams that are compared: more decide nothing, and errors of the model add up
 _FLOOR = 1e-9
 _NEVER = 60.0  # logarithm of odds behind the best that stand for any more
 _HOPELESS = 15.0  # logarithm of odds behind the best from which a hypothesis is given up
 _GIVEN_UP = 12.0  # the same of the sphere, from which no other hypothesis is compared
-_ORDER = (0, 4, 8, 7, 1, 6, 5, 3, 2)  # the sphere, then what refutes it at the least cost
+_ORDER = (0, 8, 7, 4, 6, 5, 3, 2, 1)  # the sphere, then what refutes it at the least cost
 _CLOSE = 0.05  # logarithm of odds: a round of a search that gains less is followed by finer steps
 _N_ROUNDS = 7
-_STEP = 0.1  # of the standard deviations of a prior, between which scores are taken
 _SAME = 0.15  # relative deviation of a radius, or of three axes, within which it may be a marker
 _AS_ROUND = 0.002  # share of other balls and stones that are known to be so, and are no markers
 
@@ -68,7 +67,7 @@ _TURNED, _MOVED = 0.003, 0.01  # [rad] and [m] by which the faces lie apart with
 _HEAD_SIZE = (0.085, 1.3, 0.12)  # [m] half the width of a head, its height over it, their spread
 _RELIEF, _SIGMA_LOG_RELIEF = 0.08, 0.3  # of stones, hair and faces about an ellipsoid
 _FORMS: dict[int, tuple[tuple[float, float], ...]] = {
-    _SPHERE: ((0.0, 0.05),),
+    _SPHERE: ((0.0, 0.07),),
     _BALL: ((0.0, 0.4),),
     _BOULDER: ((0.0, 0.3), (0.0, 0.2), (0.0, 0.3)),
     _CYLINDER: ((-0.1, 0.4), (0.0, 0.4)),
@@ -77,8 +76,7 @@ _FORMS: dict[int, tuple[tuple[float, float], ...]] = {
     _PANEL: ((0.0, 0.5), (0.0, 0.5), (0.0, 0.7), (0.0, 0.7)),
     _CLUTTER: ((0.0, 0.4), (1.0, 1.5), (-0.7, 0.7)),
 }
-_TURNS = (0.0, -0.585, 0.585)  # [rad] of a box, about half a right angle
-_SIZES = (0.0, -0.3, 0.3)  # logarithms of radii of balls
+_YAWS = (0.785, 0.2, 1.37)  # [rad] starts of a box
 ABUNDANCE = (208, 31, 274, 10, 33, 191, 18, 36, 36)
 """Groups that were compared in 31 random worlds of the simulator and were each."""
 
@@ -86,12 +84,11 @@ ABUNDANCE = (208, 31, 274, 10, 33, 191, 18, 36, 36)
 _OPEN, _CLOSED, _ANY = (0.3, 5.0, 0.1), (5.0, 0.3, 0.01), (0.5, 0.5, 1.0)
 _SHOULDERS = (5.0, 0.3, 0.001)  # every head has them
 _SHARES_BELOW = (_OPEN, _OPEN, _CLOSED, _SHOULDERS, _OPEN, _ANY, _OPEN, _ANY, _ANY)
-_NEIGHBOUR = 0.05  # probability that something else stands beside its pole
 _SHARES_BESIDE = (*(_OPEN,) * 7, _ANY, _ANY)
 _HEIGHTS = 2.5  # [m] up to which markers stand
-_LEAST_HEIGHTS = {_HEAD: 10.0, _BALL: 1.0, _SPHERE: 1.0, _CYLINDER: 1.0, _BOX: 1.0}
+_LEAST_HEIGHTS = {_HEAD: 10.0, _BALL: 1.0, _SPHERE: 3.0, _CYLINDER: 1.0, _BOX: 1.0}
 _BOULDER_HEIGHT = (0.3, 0.6)  # radii: centre above the ground, and standard deviation
-_NOT_GROUND = 0.02  # probability that the ground about a place is not what it stands on
+_NOT_GROUND = 0.1  # probability that the ground about a place is not what it stands on
 
 _N_NEAR_FREE = 0.2  # groups near what stands free, in the mean
 _CROWDED = 5.0 / 6.0  # odds of one more group near leaves, panels and posts: five in the mean
@@ -157,7 +154,7 @@ def log_likelihoods(
     n_neighbours: int,
     radius: float,
     physics: Physics,
-) -> tuple[Array, tuple[float, float]]:
+) -> tuple[Array, float]:
     """Return the logarithms of the likelihoods of all hypotheses, and the edge of the best sphere.
 
     Parameters
@@ -200,18 +197,9 @@ def log_likelihoods(
     is_low = silent[1] < -level / radius  # no ground is above the horizon, in the mean
     unheard, blur = silent[:, is_low], evidence.blur.max() / radius
     n_known = n_past - _n_unknown(evidence.seen[:2] / radius, unheard, blur)
-    n_alone = evidence.n_carrying + evidence.n_short
-
-    def log_below(beta: tuple[float, float, float]) -> float:
-        every = _log_share(n_below, n_known, beta)
-        if beta is not _OPEN:
-            return every
-        alone = _log_share(n_alone, n_known, beta)
-        return float(np.logaddexp(every + np.log(1.0 - _NEIGHBOUR), alone + np.log(_NEIGHBOUR)))
-
     for kind in range(len(NAMES)):
         logs[kind] += _log_share(n_beside, n_passing, _SHARES_BESIDE[kind])
-        logs[kind] += log_below(_SHARES_BELOW[kind])
+        logs[kind] += _log_share(n_below, n_known, _SHARES_BELOW[kind])
         logs[kind] += np.log(_height_density(kind, evidence.height, evidence.sigma_height, radius))
         logs[kind] += np.log(_neighbour_probability(kind, n_neighbours))
     priors = _priors(radius, physics)
@@ -221,8 +209,7 @@ def log_likelihoods(
         priors[_SPHERE, 1, _SHIFT : _SHIFT + 2] = hypot(_TURNED * distance / radius, moved)
     found, sphere = _compared(beams, priors, logs)
     never = float(found.max()) - _NEVER
-    edge = float(sphere[_EDGE]), _sigma_edge(sphere, priors[_SPHERE], beams)
-    return np.asarray(np.maximum(found, never)), edge
+    return np.asarray(np.maximum(found, never)), float(sphere[_EDGE])
 
 
 def _n_unknown(seen: Array, silent: Array, blur: float) -> float:
@@ -444,10 +431,8 @@ def _surface(
 
 
 @compiled
-def _log_likelihood(
-    kind: int, shape: Array, prior: Array, beams: _Beams, densities: Array
-) -> float:
-    """Return the logarithm of likelihood times prior density of a shape; write those of beams."""
+def _log_likelihood(kind: int, shape: Array, prior: Array, beams: _Beams) -> float:
+    """Return the logarithm of likelihood times prior density of a shape."""
     total, product, edge = 0.0, 1.0, shape[_EDGE]
     for j in range(_N_PARAMETERS):
         if prior[1, j] > 0.0:
@@ -477,8 +462,7 @@ def _log_likelihood(
             elif beams.z[i] == np.inf and kind != _CLUTTER:  # leaves have gaps anyway
                 on = max(_MISPLACED, beams.lost) if share > beams.faintest else 1.0
             rest = share * on + (1.0 - share) * rest
-        densities[i] = rest + _FLOOR
-        product *= densities[i]
+        product *= rest + _FLOOR
         if product < 1e-200:
             total, product = total + np.log(product), 1.0
     return float(total + np.log(product))
@@ -503,140 +487,58 @@ def _align(kind: int, shape: Array, beams: _Beams) -> None:
 def _evidence(kind: int, shape: Array, prior: Array, beams: _Beams, least: float) -> float:
     """Return the logarithm of the evidence of a hypothesis; its best shape replaces the start.
 
-    By Laplace's approximation. Minus infinity where it falls hopelessly below the least.
+    Pattern search (Hooke and Jeeves, 1961), because the likelihood is not smooth; then Laplace's
+    approximation. Minus infinity where it falls hopelessly below the least.
     """
     steps = 0.4 * prior[1]
     if kind in (_SPHERE, _BALL):  # the centre is fitted already
         steps[:_NOISE] = np.minimum(steps[:_NOISE], 2.0 * np.exp(prior[0, _NOISE]))
     _align(kind, shape, beams)
-    n_rounds = _N_ROUNDS if kind > _BALL else 2 * _N_ROUNDS
-    found = _search(kind, shape, steps, prior, beams, least, n_rounds)
-    if found == -np.inf:
-        return found
-    found += _log_volume(kind, shape, prior, beams)
-    if kind == _BALL:
-        found += _log_other_size(shape, prior, beams)
-    return float(found)
-
-
-@compiled
-def _search(
-    kind: int,
-    shape: Array,
-    steps: Array,
-    prior: Array,
-    beams: _Beams,
-    least: float,
-    n_rounds: int,
-) -> float:
-    """Move a shape to the greatest likelihood times prior; return its logarithm.
-
-    Pattern search (Hooke and Jeeves, 1961), because the likelihood is not smooth.
-    """
-    densities = np.empty(len(beams.x))
-    found = _log_likelihood(kind, shape, prior, beams, densities)
-    for round_no in range(n_rounds):
+    found = _log_likelihood(kind, shape, prior, beams)
+    for round_no in range(_N_ROUNDS if kind != _SPHERE else 2 * _N_ROUNDS):
         if found < least - _HOPELESS * (1.0 + 4.0 / (1.0 + round_no)):
             return -np.inf
-        before, begun = found, shape.copy()
+        before = found
         for j in range(_N_PARAMETERS):
             if steps[j] == 0.0:
                 continue
             for _ in range(2):
                 kept = shape[j]
                 shape[j] = kept + steps[j]
-                trial = _log_likelihood(kind, shape, prior, beams, densities)
+                trial = _log_likelihood(kind, shape, prior, beams)
                 if trial > found:
                     found = trial
                     break
                 shape[j], steps[j] = kept, -steps[j]
-        moved = 2.0 * shape - begun
-        while found > before:  # as far again, where the parameters only gain together
-            trial = _log_likelihood(kind, moved, prior, beams, densities)
-            if trial <= found:
-                break
-            found, begun = trial, shape.copy()
-            shape[:] = moved
-            moved = 2.0 * shape - begun
         if found < before + _CLOSE:
             steps *= 0.4
-    return float(found)
+    return float(found + _log_volume(kind, shape, prior, beams, found))
 
 
 @compiled
-def _log_other_size(shape: Array, prior: Array, beams: _Beams) -> float:
-    """Return the logarithm of the probability that a ball is larger or smaller than a marker.
-
-    By how far the likelihood falls from the best radius to the nearest other ones.
-    """
-    densities, other = np.empty(len(beams.x)), 0.0
-    best = _log_likelihood(_BALL, shape, prior, beams, densities)
-    for limit in (-_SAME, _SAME):
-        at_limit, steps = shape.copy(), 0.1 * prior[1]
-        at_limit[_FORM], steps[_FORM] = limit, 0.0
-        _align(_BALL, at_limit, beams)
-        fallen = best - _search(_BALL, at_limit, steps, prior, beams, -np.inf, _N_ROUNDS)
-        off = np.sqrt(max(fallen, 0.0))  # over the square root of two standard deviations
-        is_beyond = (shape[_FORM] - limit) * limit > 0.0
-        other += 0.5 * erfc(-off if is_beyond else off)
-    return float(np.log(max(other, _AS_ROUND)))
-
-
-@compiled
-def _information(kind: int, shape: Array, prior: Array, beams: _Beams) -> tuple[Index, Array]:
-    """Return the free parameters, and their information with the prior, per its variances.
-
-    By the sum of outer products of the scores (Berndt, Hall, Hall and Hausman, 1974): it is
-    positive, and takes errors of the parameters together.
-    """
-    free = np.flatnonzero(prior[1] > 0.0)
-    scores = np.zeros((len(free), len(beams.x)))
-    above, below = np.empty(len(beams.x)), np.empty(len(beams.x))
-    for j in range(len(free)):
-        if _SHIFT <= free[j] < _POLE:  # a property of the scan: it is the same for all hypotheses
-            continue
-        kept, h = shape[free[j]], _STEP * prior[1, free[j]]
-        shape[free[j]] = kept + h
-        _log_likelihood(kind, shape, prior, beams, above)
-        shape[free[j]] = kept - h
-        _log_likelihood(kind, shape, prior, beams, below)
-        shape[free[j]] = kept
-        scores[j] = np.log(above / below) / (2.0 * _STEP)
-    N = scores @ scores.T
-    for j in range(len(free)):
-        N[j, j] += 1.0
-    return free, N
-
-
-@compiled
-def _log_volume(kind: int, shape: Array, prior: Array, beams: _Beams) -> float:
+def _log_volume(kind: int, shape: Array, prior: Array, beams: _Beams, best: float) -> float:
     """Return the logarithm of the share of the prior that the likelihood leaves about the best."""
-    free, N = _information(kind, shape, prior, beams)
-    total, same, root = 0.0, 1.0, np.zeros_like(N)
-    for j in range(_SHIFT, _POLE):
-        if prior[1, j] > 0.0:  # a property of the scan
+    total, same = 0.0, 1.0
+    for j in range(_N_PARAMETERS):
+        if prior[1, j] == 0.0:
+            continue
+        if _SHIFT <= j < _POLE:  # a property of the scan: it is the same for all hypotheses
             total += 0.5 * ((shape[j] - prior[0, j]) / prior[1, j]) ** 2
-    factorise(N, root)
-    for j in range(len(free)):
-        total -= np.log(root[j, j])
-    if kind == _BOULDER:
-        invert(N, N)
-        for j in range(len(free)):
-            if _FORM <= free[j] < _SHIFT:
-                off = shape[free[j]]
-                scale = 1.0 / (np.sqrt(2.0 * N[j, j]) * prior[1, free[j]])
-                same *= 1.0 - 0.5 * (erfc((_SAME - off) * scale) + erfc((_SAME + off) * scale))
+            continue
+        kept, h = shape[j], 0.1 * prior[1, j]
+        shape[j] = kept + h
+        above = _log_likelihood(kind, shape, prior, beams)
+        shape[j] = kept - h
+        below = _log_likelihood(kind, shape, prior, beams)
+        shape[j] = kept
+        curvature = max((2.0 * best - above - below) / (h * h), 1.0 / prior[1, j] ** 2)
+        total -= 0.5 * np.log(curvature * prior[1, j] ** 2)
+        if _FORM <= j < _SHIFT:
+            scale = np.sqrt(0.5 * curvature)  # of a normal distribution, for the error function
+            same *= 1.0 - 0.5 * (erfc((_SAME - kept) * scale) + erfc((_SAME + kept) * scale))
+    if kind in (_BALL, _BOULDER):
         total += np.log(max(1.0 - same, _AS_ROUND))
     return total
-
-
-@compiled
-def _sigma_edge(shape: Array, prior: Array, beams: _Beams) -> float:
-    """Return how far the edge of the best sphere may be off."""
-    free, N = _information(_SPHERE, shape, prior, beams)
-    invert(N, N)
-    place = np.searchsorted(free, _EDGE)
-    return float(np.sqrt(N[place, place]) * prior[1, _EDGE])
 
 
 @compiled
@@ -645,11 +547,10 @@ def _compared(beams: _Beams, priors: Array, log_priors: Array) -> tuple[Array, A
     found, best = np.full(len(log_priors), -np.inf), -np.inf
     sphere = priors[_SPHERE, 0].copy()
     for kind in _ORDER:
-        is_named = kind != _BALL or found[_CYLINDER] < best  # the two are easily confused
-        if best - found[_SPHERE] > _GIVEN_UP and is_named:
-            continue
+        if best - found[_SPHERE] > _GIVEN_UP:
+            break
         shape = sphere
-        for turn, size in zip(_TURNS, _SIZES):  # starts
+        for yaw in _YAWS:
             shape = priors[kind, 0].copy()
             if kind == _SPHERE:
                 shape = sphere
@@ -660,13 +561,11 @@ def _compared(beams: _Beams, priors: Array, log_priors: Array) -> tuple[Array, A
                 shape[_NOISE] = priors[kind, 0, _NOISE]
             if kind in (_BALL, _BOULDER):
                 shape[_FORM] = sphere[_FORM]
-            if kind == _BALL:
-                shape[_FORM] += size
             if kind == _BOX:
-                shape[_FORM + 2] += turn
+                shape[_FORM + 2] = yaw
             own = _evidence(kind, shape, priors[kind], beams, best - log_priors[kind])
             found[kind] = max(found[kind], own + log_priors[kind])
-            if kind not in (_BOX, _BALL):
+            if kind != _BOX:
                 break
         if kind == _BALL:  # it may have found a better place for the sphere too
             own = _evidence(_SPHERE, shape, priors[_SPHERE], beams, -np.inf)
