@@ -36,14 +36,14 @@ def chunk(content):
     return record(6, head + struct.pack("<Q", len(packed)) + packed)
 
 
-def bomb(kind, n_chunks=4):
+def bomb(kind):
     """A log of a few kilobytes that stands for half a gigabyte or more."""
     repeated = {
         "zeros": bytes(1 << 20),
         "empty records": record(15, b"") * 100_000,
         "messages": record(5, bytes(22)) * 30_000,
     }[kind]
-    return MAGIC + chunk(repeated * (LARGEST // len(repeated))) * n_chunks + END
+    return MAGIC + chunk(repeated * (LARGEST // len(repeated))) * 4 + END
 
 
 @pytest.mark.parametrize("kind", ["zeros", "empty records", "messages"])
@@ -91,7 +91,7 @@ def test_a_refused_document_has_the_error_of_its_kind(parse, text, error):
 
 
 def test_many_bombs_at_once_leave_the_service_responsive(site):
-    content = bomb("messages", n_chunks=1)
+    content = bomb("messages")
     with ThreadPoolExecutor(6) as threads:
         bombs = [threads.submit(site.upload, content + bytes([n]), f"b{n}") for n in range(6)]
         slowest = 0.0
@@ -99,6 +99,5 @@ def test_many_bombs_at_once_leave_the_service_responsive(site):
             begin = time.monotonic()
             assert site.client.get("/healthz").status_code == 200
             slowest = max(slowest, time.monotonic() - begin)
-            time.sleep(0.05)
         assert {one.result().status_code for one in bombs} == {422}
     assert slowest < 10.0  # the service has no processor of its own here
