@@ -29,14 +29,13 @@ from spheremark.pipelines.detection.decision import (
     UNDECIDED,
     Judgement,
     distinct,
-    edge_of,
+    edges_of,
     is_resolved,
     judged,
     noise_of,
+    paint_of,
     reason_by_evidence,
     reason_by_features,
-    reason_by_reflectivity,
-    reflectivity_of,
     sure_ones,
 )
 from spheremark.pipelines.detection.evidence import Evidence, gather_evidence
@@ -126,20 +125,22 @@ def extract(
     for i in passed:
         reasons[i] = reason_by_evidence(groups[i], evidence[i], target)
     compared = [_Compared(groups[i], evidence[i], near[i]) for i in passed if not reasons[i]]
-    logs = _log_likelihoods(compared, noise_of(groups), hearing, config, target)
-    judgements = judged(logs, [one.features.n_points for one in compared])
+    logs = _log_likelihoods(compared, noise_of(groups, target.radius), hearing, config, target)
+    n_returns = [one.features.n_points for one in compared]
+    by_shape = [judgement.probability for judgement in judged(logs, n_returns)]
+    log_ratios, by_paint = paint_of([one.evidence for one in compared], by_shape)
+    logs[:, 0] += log_ratios
+    judgements = judged(logs, n_returns)
     is_sure = sure_ones([one.probability for one in judgements], config.false_rate)
-    usual = reflectivity_of(
-        [one.evidence for one, sure in zip(compared, is_sure, strict=True) if sure]
-    )
     markers, possible, rejected = list[_Group](), list[Rejection](), list[Rejection]()
-    for one, judgement, sure, own in zip(compared, judgements, is_sure, logs, strict=True):
-        other = reason_by_reflectivity(one.evidence, usual)
-        if sure and not other:
+    for one, judgement, paint, sure, own in zip(
+        compared, judgements, by_paint, is_sure, logs, strict=True
+    ):
+        if sure:
             markers.append((one, judgement, own))
             continue
         refused = replace(
-            _rejection(one.features, other or judgement.reason),
+            _rejection(one.features, judgement.reason + paint),
             probability=judgement.probability,
             log_likelihoods=own.copy(),
         )
@@ -186,7 +187,7 @@ def _log_likelihoods(
 
     Where beams come to hit an outline is known from the surest markers of the scan.
     """
-    found, edges = np.empty((len(compared), len(NAMES))), np.empty(len(compared))
+    found, edges = np.empty((len(compared), len(NAMES))), np.empty((len(compared), 2))
     physics = [_physics(one.features, noise, hearing, config) for one in compared]
 
     def compare(rows: Sequence[int]) -> None:
@@ -200,13 +201,15 @@ def _log_likelihoods(
 
     n = len(compared)
     side_by_side(lambda first, end: compare(range(first, end)), n, threaded_from=4)
-    edge, sigma_edge = edge_of(edges, found)
-    if compared and sigma_edge < physics[0].sigma_edge:
-        physics = [one._replace(edge=edge, sigma_edge=sigma_edge) for one in physics]
-        again = np.flatnonzero(found[:, 0] > found.max(axis=1) - UNDECIDED)
-        side_by_side(
-            lambda first, end: compare(again[first:end].tolist()), len(again), threaded_from=4
-        )
+    if n:
+        usual = physics[0].edge, physics[0].sigma_edge
+        known = edges_of(edges, found, usual)
+        physics = [
+            one._replace(edge=edge, sigma_edge=sigma)
+            for one, (edge, sigma) in zip(physics, known.tolist(), strict=True)
+        ]
+    again = np.flatnonzero(found[:, 0] > found.max(axis=1, initial=-np.inf) - UNDECIDED)
+    side_by_side(lambda first, end: compare(again[first:end].tolist()), len(again), threaded_from=4)
     return found
 
 

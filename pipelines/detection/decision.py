@@ -28,9 +28,11 @@ _RADIUS_RESOLVED = 0.015  # of the radius: standard deviation of the free radius
 _RADIUS_SLACK = 0.12  # of the radius: less is no reason to refuse, the fit judges it
 _FLAT_RESOLVED = 0.25  # of the curvature: what may be missing of that of a resolved ball
 _UNEXPLAINED_RESOLVED = 0.05  # share of the returns inside its outline that may be off it
-_SIGMAS = 3.5  # standard deviations at which reflectivity differs
-_SHADE = 0.25  # standard deviation, as a share, of one return's reflectivity: partly lit beams
-_DIFFERENT = 0.25  # share by which the reflectivity of a marker may differ from that of the others
+_SHADE = 0.4  # standard deviation, as a share, of one return's reflectivity: partly lit beams
+_PAINT, _PAINTS = 0.1, 0.7  # the same of markers, by range and incidence; and of all things
+_TAIL = 3.0  # degrees of freedom: of some markers the paint is dirty or in shade
+_UNLIKE = -2.0  # logarithm of odds by paint from which it is told
+_FLAT = 0.236  # of the radius: standard deviation of the depths of a sphere about their mean
 _N_LARGE, _N_KNOWN = 30, 3  # returns that show the noise of a scan, and groups that agree
 _N_LEAST, _N_MOST = 6.0, 2500.0  # returns of the farthest and of the nearest markers
 _SCATTERED = 0.5  # share of other objects that lie anywhere, and not where markers are put
@@ -137,10 +139,10 @@ def reason_by_evidence(features: Features, evidence: Evidence, target: Target) -
     if evidence.silent is None and spread < 0.5 - max(_SPREAD_SIGMAS / sqrt(12.0 * n), _SLACK):
         seems_like = 1e3 * target.radius * sqrt(2.0 * spread)
         return f"It is too small: its returns lie as on a sphere of radius {seems_like:.0f} mm."
-    if evidence.n_held > max(few - 1.0 + _TOUCHING * _n_comparable(evidence), 1.0):
+    if evidence.n_carrying > max(few - 1.0 + _TOUCHING * _n_comparable(evidence), 1.0):
         return (
-            f"It does not stand on a pole: {evidence.n_held} returns below it and beside a pole's "
-            "place lie about as far away, as on shoulders, a larger stone or the ground."
+            f"It does not stand on a pole: {evidence.n_carrying} returns below it and beside a "
+            "pole's place lie about as far away, as on shoulders, a larger stone or the ground."
         )
     if not (evidence.is_open_below or _may_be_hidden(features, target) or few == inf):
         n_below = evidence.n_held + evidence.n_past + evidence.n_short
@@ -178,45 +180,95 @@ def _may_be_hidden(features: Features, target: Target) -> bool:
     return features.n_points >= _N_SURE and features.sigma_radius < _SHAPE_SURE * target.radius
 
 
-def reflectivity_of(groups: Sequence[Evidence]) -> float:
-    """Return the reflectivity of markers whose poles are seen, 0-255; NaN if these are few."""
-    known = [evidence.brightness for evidence in groups if evidence.shows_below]
-    return median(known) if len(known) >= _N_KNOWN else float("nan")
+def paint_of(groups: Sequence[Evidence], probabilities: Sequence[float]) -> tuple[Array, list[str]]:
+    """Return how much likelier the reflectivity of each group is if it is a marker.
+
+    All markers have the same paint, other things have any. What the paint is, the other groups
+    show, by how probably each is a marker. Some markers are dirty or in shade: but what nothing
+    shows a pole of must be painted as they are.
+
+    Parameters
+    ----------
+    groups : sequence of Evidence
+        Groups of a scan.
+    probabilities : sequence of float
+        That each is a marker, by shape and surroundings.
+
+    Returns
+    -------
+    (n,), list of str
+        Logarithms of the ratios; and where one is much against a marker, that as a sentence.
+    """
+    logs = np.log([max(evidence.brightness, 1.0) for evidence in groups])
+    variances = _PAINT**2 + _SHADE**2 / np.array([max(one.n_distinct, 1) for one in groups])
+    has_pole = np.array([evidence.shows_below for evidence in groups], np.bool_)
+    middle = float(np.median(logs)) if len(logs) else 0.0
+    as_other = _log_density(((logs - middle) / _PAINTS) ** 2, _PAINTS**2)
+    found = means = squares = np.zeros(len(logs))
+    for _ in range(_N_ROUNDS):
+        weights = np.asarray(probabilities) / (variances * (1.0 + squares / _TAIL))
+        sums = _PAINTS**-2.0 + weights.sum() - weights
+        means = (middle * _PAINTS**-2.0 + weights @ logs - weights * logs) / sums
+        spreads = variances + 1.0 / sums
+        squares = (logs - means) ** 2 / spreads
+        tails = (_TAIL + 1.0) * np.log1p(squares / _TAIL)  # of Student's distribution
+        found = _log_density(np.where(has_pole, tails, squares), spreads) - as_other
+    texts = [
+        f" Its reflectivity is {evidence.brightness:.0f}, that of the markers {np.exp(mean):.0f}."
+        if ratio < _UNLIKE
+        else ""
+        for evidence, mean, ratio in zip(groups, means, found, strict=True)
+    ]
+    return np.asarray(found), texts
 
 
-def reason_by_reflectivity(evidence: Evidence, usual: float) -> str:
-    """Return why a group whose pole is not seen differs from the markers whose poles are."""
-    tolerance = max(_SIGMAS * _SHADE / sqrt(max(evidence.n_distinct, 1)), _DIFFERENT)
-    if evidence.shows_below or not abs(evidence.brightness - usual) > tolerance * usual:
-        return ""
-    return (
-        f"What it stands on is not seen, and its reflectivity is {evidence.brightness:.0f}, "
-        f"that of the markers {usual:.0f}."
-    )
+def _log_density(squares: Array, variances: Array | float) -> Array:
+    """Return the logarithms of densities, but for a constant, given squares over the variances."""
+    return np.asarray(-0.5 * squares - 0.5 * np.log(variances))
 
 
-def noise_of(groups: list[Features]) -> float:
-    """Return the noise of ranges that groups with many returns agree on; NaN if these are few."""
+def noise_of(groups: list[Features], radius: float) -> float:
+    """Return the noise of ranges that groups with many returns agree on; NaN if these are few.
+
+    Those that a plane fits as well are no spheres, and show none.
+    """
     known = [
         max(features.scatter, NOISE_MIN)
         for features in groups
-        if features.n_points >= _N_LARGE and features.n_unexplained + features.n_beside == 0
+        if features.n_points >= _N_LARGE
+        and features.n_unexplained + features.n_beside == 0
+        and features.scatter < _FLAT * radius
     ]
     return median(known) if len(known) >= _N_KNOWN else float("nan")
 
 
-def edge_of(edges: Array, log_likelihoods: Array) -> tuple[float, float]:
-    """Return where beams come to hit an outline, by the groups that are surely spheres.
+def edges_of(edges: Array, log_likelihoods: Array, usual: tuple[float, float]) -> Array:
+    """Return where beams come to hit an outline, and how far that may be off, for each group.
 
-    In half widths of a beam, with its standard deviation, which is infinite if these are few.
+    Parameters
+    ----------
+    edges : (n, 2)
+        What each shows as a sphere with the usual edge as its prior, in half widths of a beam, and
+        its standard deviation.
+    log_likelihoods : (n, k)
+        Of each by all hypotheses: those that are surely spheres show it.
+    usual : float, float
+        Usual edge and its standard deviation.
+
+    Returns
+    -------
+    (n, 2)
+        Edges as all others show them, and their standard deviations.
     """
     others = log_likelihoods[:, 1:].max(axis=1, initial=-inf)
-    own = edges[log_likelihoods[:, 0] > others + _SURELY] if len(edges) else edges
-    if len(own) < _N_KNOWN:
-        return 0.0, inf
-    middle = float(np.median(own))
-    spread = 1.4826 * float(np.median(np.abs(own - middle)))
-    return middle, float(np.hypot(_EDGE_VARIES, 1.25 * spread / sqrt(len(own))))
+    is_sure = log_likelihoods[:, 0] > others + _SURELY
+    precision = usual[1] ** -2.0
+    own = np.maximum(edges[:, 1] ** -2.0 - precision, 1e-9)  # without the prior
+    weights = is_sure / (1.0 / own + _EDGE_VARIES**2)
+    pulls = weights * (edges[:, 0] * edges[:, 1] ** -2.0 - usual[0] * precision) / own
+    sums = precision + weights.sum() - weights
+    means = (usual[0] * precision + pulls.sum() - pulls) / sums
+    return np.column_stack([means, np.hypot(_EDGE_VARIES, sums**-0.5)])
 
 
 def judged(log_likelihoods: Array, n_returns: Sequence[int]) -> list[Judgement]:

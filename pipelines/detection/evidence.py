@@ -41,7 +41,7 @@ from spheremark.pipelines.threads import side_by_side
 
 _STEP = 0.05  # [m] at most between the directions about a centre whose cells are searched
 _REACH = 4.0  # radii about a centre: shoulders lie within three radii below a head
-_HELD = (-4.0, 1.5)  # radii of depth within which a return may belong to the same object
+_HELD = (-4.0, 1.0)  # radii of depth within which a return may belong to the same object
 _ON = (-1.3, 0.3)  # radii of depth within which a return may lie on the sphere
 _PLACE = 0.1  # radii: beams nearer to each other than this pass at the same place
 _MEAN_WIDTH = 0.75  # of the greater half width of a beam: in any direction
@@ -63,6 +63,9 @@ class Evidence(NamedTuple):
         Returns inside the limb that lie before the sphere: beams that would have met it.
     n_held : int
         Returns below it and beside the pole, at about its distance, that are not ground.
+    n_carrying : int
+        Of these, returns of what may carry it: twice those of the emptier side of the pole if most
+        beams go past there, for then the others show something that stands beside it.
     n_past : int
         Returns there that lie behind it, and pulses there without a return.
     n_short : int
@@ -92,6 +95,7 @@ class Evidence(NamedTuple):
     n_on: int
     n_before: int
     n_held: int
+    n_carrying: int
     n_past: int
     n_short: int
     brightness: float
@@ -111,7 +115,7 @@ class Evidence(NamedTuple):
         Beams that end nearer count for neither; if they are three in four, it is not open.
         """
         n_nearer_max = _OBSTRUCTED * (1 + self.n_past)
-        return self.n_held <= 1 + self.n_past and self.n_short <= n_nearer_max
+        return self.n_carrying <= 1 + self.n_past and self.n_short <= n_nearer_max
 
     @property
     def shows_below(self) -> bool:
@@ -174,18 +178,22 @@ def _evidence_at(
     origins = _origins(cloud.rig, angles)
     points = cloud.p_base[rows]
     is_ground = points @ plane[:3] + plane[3] < skin_of(target.radius)
-    n_on, n_before, n_held, n_past, n_short, brightness, n_distinct, seen = _count_beams(
+    n_on, n_before, below, brightness, n_distinct, seen = _count_beams(
         points, cloud.intensities[rows], is_ground, c, target, origins
     )
     silent = None
     if clock is not None:
         silent = unheard_about(cloud, clock, rows, c, target)
-        n_past += n_beside_pole(silent / target.radius, blur_at(c, target) / target.radius)
+        passing, blur = silent / target.radius, blur_at(c, target) / target.radius
+        for side, is_there in enumerate((passing[0] <= 0.0, passing[0] > 0.0)):
+            below[1, side] += n_beside_pole(passing[:, is_there], blur)
+    n_held, n_past, n_short = below.sum(axis=1).tolist()
     is_left = np.cos(angles) * c[1] > np.sin(angles) * c[0]
     return Evidence(
         n_on=n_on,
         n_before=n_before,
         n_held=n_held,
+        n_carrying=_n_carrying(below),
         n_past=n_past,
         n_short=n_short,
         brightness=brightness,
@@ -196,6 +204,17 @@ def _evidence_at(
         silent=silent,
         blur=_half_widths(cloud.rig, angles, c, target),
     )
+
+
+def _n_carrying(below: NDArray[np.int64]) -> int:
+    """Return the beams below it that are held, but for those by something that stands beside it.
+
+    Where most go past on one side, whatever holds more on the other stands beside the pole.
+    """
+    held, past, _ = below
+    emptier = int(np.argmin(held))
+    is_open = past[emptier] > 2 + held[emptier]
+    return int(2 * held[emptier] if is_open else held.sum())
 
 
 def _origins(rig: Rig, angles: Column) -> Array:
@@ -242,8 +261,11 @@ def _count_beams(
     c: Array,
     target: Target,
     origins: Array,
-) -> tuple[int, int, int, int, int, float, int, Array]:
-    """Return the counts of ``Evidence``, its brightness, and how the beams pass the centre."""
+) -> tuple[int, int, NDArray[np.int64], float, int, Array]:
+    """Return the counts of ``Evidence``, its brightness, and how the beams pass the centre.
+
+    Those below it are held, past and short, (3, 2), to the left and to the right of it.
+    """
     radius = target.radius
     blur = blur_at(c, target) / radius
     view, rays = view_of(c, target.up), rays_of(points, np.arange(len(points)))
@@ -252,7 +274,7 @@ def _count_beams(
         share, x, y = seen[2, i] / rays[3, i], origins[0, i], origins[1, i]
         seen[0, i] += share * (view.across[0] * x + view.across[1] * y)
         seen[1, i] += share * (view.up[0] * x + view.up[1] * y)
-    n_on, n_before, n_held, n_past, n_short, n_distinct = 0, 0, 0, 0, 0, 0
+    n_on, n_before, n_distinct, below = 0, 0, 0, np.zeros((3, 2), np.int64)
     light, lit = 0.0, 0.0
     half = int((1.0 + blur) / _PLACE) + 1
     is_met = np.zeros((2 * half, 2 * half), np.bool_)
@@ -271,11 +293,12 @@ def _count_beams(
             lit += share * share
         n_before += is_aimed and depth <= _ON[0]
         if is_beside_pole(across, along, blur):
-            n_past += depth > _HELD[1]
+            side = int(seen[0, i] > 0.0)
             is_held = _HELD[0] <= depth <= _HELD[1]
-            n_held += is_held and not is_ground[i]
-            n_short += depth < _HELD[0] or (is_held and is_ground[i])
-    return n_on, n_before, n_held, n_past, n_short, light / max(lit, _TINY), n_distinct, seen
+            below[0, side] += is_held and not is_ground[i]
+            below[1, side] += depth > _HELD[1]
+            below[2, side] += depth < _HELD[0] or (is_held and is_ground[i])
+    return n_on, n_before, below, light / max(lit, _TINY), n_distinct, seen
 
 
 @compiled

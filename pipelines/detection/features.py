@@ -37,6 +37,7 @@ N_RESOLVED = 60
 
 _CLOSE, _LOOSE = 0.04, 0.3  # radii: least and most that returns may scatter about a ball
 _N_FIT_MIN = 4  # returns: unknowns of the fit with free radius
+_BACK = 1.0  # radii: what lies deeper than the back of a sphere is not what it is part of
 _N_THREADED = 20  # places from which on a second thread gains
 _N_SAMPLE = 1500  # returns in the cells about a seed that decide whether it is plausible
 _N_WHOLE = 2000  # returns there that are taken without sampling
@@ -201,8 +202,11 @@ def _mean_shift(rays: Array, c: Array, up: Array, radius: float) -> tuple[Array,
 
 @compiled
 def _count_surroundings(rays: Array, c: Array, target: Target) -> tuple[int, int]:
-    """Count the returns beside and below the limb that a free sphere on a pole does not have."""
-    n_beside, n_below, radius = 0, 0, target.radius
+    """Count the returns beside and below the limb that a free sphere on a pole does not have.
+
+    Twice those of the emptier side: what stands beside a sphere or behind its edge is on one side.
+    """
+    beside, below, radius = [0, 0], [0, 0], target.radius
     blur = blur_at(c, target)
     inner2 = (1.1 * radius + blur) ** 2  # no footprint that touches the sphere is farther out
     beside2, below2 = (2.2 * radius + blur) ** 2, (2.8 * radius + blur) ** 2
@@ -211,12 +215,12 @@ def _count_surroundings(rays: Array, c: Array, target: Target) -> tuple[int, int
         across, along, depth = passing(view, rays, i)
         gap2, aside = across * across + along * along, abs(across)
         is_out = (gap2 >= inner2) & ~((along < 0.0) & (aside < 0.6 * radius + blur))
-        is_high = along > -0.5 * radius
-        n_beside += is_out & is_high & (gap2 < beside2) & (abs(depth) < 1.5 * radius)
+        is_high, side = along > -0.5 * radius, int(across > 0.0)
+        beside[side] += is_out & is_high & (gap2 < beside2) & (abs(depth) < _BACK * radius)
         # anything farther out may be another object
         is_under = is_out & ~is_high & (aside < 1.9 * radius + blur) & (gap2 < below2)
-        n_below += is_under & (depth > -3.0 * radius) & (depth < 1.5 * radius)
-    return n_beside, n_below
+        below[side] += is_under & (depth > -3.0 * radius) & (depth < _BACK * radius)
+    return 2 * min(beside[0], beside[1]), 2 * min(below[0], below[1])
 
 
 @compiled

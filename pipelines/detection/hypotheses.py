@@ -15,8 +15,8 @@ import numpy as np
 from spheremark.pipelines.compilation import compiled
 from spheremark.pipelines.detection.evidence import Evidence, n_beside_pole
 from spheremark.pipelines.detection.target import ASIDE
-from spheremark.pipelines.estimation.linear_algebra import invert
-from spheremark.pipelines.model import Array
+from spheremark.pipelines.estimation.linear_algebra import factorise, invert, solve
+from spheremark.pipelines.model import Array, Index, Mask
 
 NAMES = (
     "sphere",
@@ -47,28 +47,35 @@ _BESIDE = (1.2, 2.2)  # distances from a centre, beside half a beam, of beams th
 _POLE_FROM, _POLE_DEPTH, _POLE_SHARE = 0.8, 0.4, 0.7  # of a pole, and of its beams that it stops
 _STRAY = 0.02  # share of the returns from a surface that lie anywhere: crosstalk, dust, strays
 _MERGED = 0.6  # share of the echoes of a beam that an outline halves, between it and what is behind
+_HEARD = 0.5  # of a beam: an object that is heard at all needs no larger share
 _MISPLACED = 0.01  # share of the beams on a solid surface that seem to end behind it
-_SOFT = (0.1, 0.5)  # radii, and half widths of a beam besides, over which beams come to hit
+_SOFT = (0.07, 0.35)  # radii, and half widths of a beam besides, over which beams come to hit
 _CELL, _N_CELL = 0.1, 2  # beams that pass the same place share the errors of the model
-_N_MAX = 96  # beams that are compared: more decide nothing, and errors of the model add up
+_N_MAX = 96  # beams that are compared: more decide nothing
+_N_ALIKE = 300.0  # beams that tell half as much together as apart: errors of the model add up
 _FLOOR = 1e-9
 _NEVER = 60.0  # logarithm of odds behind the best that stand for any more
 _HOPELESS = 15.0  # logarithm of odds behind the best from which a hypothesis is given up
 _GIVEN_UP = 12.0  # the same of the sphere, from which no other hypothesis is compared
-_ORDER = (0, 8, 7, 4, 6, 5, 3, 2, 1)  # the sphere, then what refutes it at the least cost
-_CLOSE = 0.05  # logarithm of odds: a round of a search that gains less is followed by finer steps
-_N_ROUNDS = 7
+_ORDER = (0, 4, 8, 7, 1, 6, 5, 3, 2)  # the sphere, then what refutes it at the least cost
+_N_BEGINS, _N_ROUNDS, _N_CLIMBS = 2, 4, 10  # of a search; of its walks; and of its climbs
+_CLOSE = 0.05  # logarithm of odds: a round of a walk that gains less is followed by finer steps
+_ARRIVED, _MOST_DAMPED = 0.02, 1e3  # the same, which ends a climb; and damping that ends it
+_JUMPS = (-1.5, -0.75, 0.75, 1.5)  # standard deviations of a prior, for parameters with two maxima
+_STEP = 0.1  # of the standard deviations of a prior, between which scores are taken
 _SAME = 0.15  # relative deviation of a radius, or of three axes, within which it may be a marker
-_AS_ROUND = 0.002  # share of other balls and stones that are known to be so, and are no markers
+_AS_LARGE = 0.002  # share of balls as large as markers that are known to be none
+_AS_ROUND = 0.3  # of the stones that would be as round as markers by their prior: fewer are
 
 # Means and standard deviations of the parameters
 _CENTRE, _POLE_SIZE = (0.3, 0.3, 0.4), (float(np.log(0.2)), 0.8)
 _TURNED, _MOVED = 0.003, 0.01  # [rad] and [m] by which the faces lie apart with a rough mounting
 _HEAD_SIZE = (0.085, 1.3, 0.12)  # [m] half the width of a head, its height over it, their spread
+_STRETCH = 0.1  # of depths: what an echo is, and its strength, move the limb against the middle
 _RELIEF, _SIGMA_LOG_RELIEF = 0.08, 0.3  # of stones, hair and faces about an ellipsoid
 _FORMS: dict[int, tuple[tuple[float, float], ...]] = {
-    _SPHERE: ((0.0, 0.07),),
-    _BALL: ((0.0, 0.4),),
+    _SPHERE: ((0.0, 0.05), (0.0, 0.0), (0.0, _STRETCH)),
+    _BALL: ((0.0, 0.4), (0.0, 0.0), (0.0, _STRETCH)),
     _BOULDER: ((0.0, 0.3), (0.0, 0.2), (0.0, 0.3)),
     _CYLINDER: ((-0.1, 0.4), (0.0, 0.4)),
     _POST: ((-0.1, 0.6), (0.0, 0.4)),
@@ -76,7 +83,7 @@ _FORMS: dict[int, tuple[tuple[float, float], ...]] = {
     _PANEL: ((0.0, 0.5), (0.0, 0.5), (0.0, 0.7), (0.0, 0.7)),
     _CLUTTER: ((0.0, 0.4), (1.0, 1.5), (-0.7, 0.7)),
 }
-_YAWS = (0.785, 0.2, 1.37)  # [rad] starts of a box
+_STARTS = ((0.0, 0.0), (-0.585, -0.3), (0.585, 0.3))  # [rad] of a box; ln radii of a ball
 ABUNDANCE = (208, 31, 274, 10, 33, 191, 18, 36, 36)
 """Groups that were compared in 31 random worlds of the simulator and were each."""
 
@@ -84,11 +91,12 @@ ABUNDANCE = (208, 31, 274, 10, 33, 191, 18, 36, 36)
 _OPEN, _CLOSED, _ANY = (0.3, 5.0, 0.1), (5.0, 0.3, 0.01), (0.5, 0.5, 1.0)
 _SHOULDERS = (5.0, 0.3, 0.001)  # every head has them
 _SHARES_BELOW = (_OPEN, _OPEN, _CLOSED, _SHOULDERS, _OPEN, _ANY, _OPEN, _ANY, _ANY)
+_NEIGHBOUR = 0.05  # probability that something else stands beside its pole
 _SHARES_BESIDE = (*(_OPEN,) * 7, _ANY, _ANY)
 _HEIGHTS = 2.5  # [m] up to which markers stand
-_LEAST_HEIGHTS = {_HEAD: 10.0, _BALL: 1.0, _SPHERE: 3.0, _CYLINDER: 1.0, _BOX: 1.0}
+_LEAST_HEIGHTS = {_HEAD: 10.0, _BALL: 1.0, _SPHERE: 1.0, _CYLINDER: 1.0, _BOX: 1.0}
 _BOULDER_HEIGHT = (0.3, 0.6)  # radii: centre above the ground, and standard deviation
-_NOT_GROUND = 0.1  # probability that the ground about a place is not what it stands on
+_NOT_GROUND = 0.02  # probability that the ground about a place is not what it stands on
 
 _N_NEAR_FREE = 0.2  # groups near what stands free, in the mean
 _CROWDED = 5.0 / 6.0  # odds of one more group near leaves, panels and posts: five in the mean
@@ -154,7 +162,7 @@ def log_likelihoods(
     n_neighbours: int,
     radius: float,
     physics: Physics,
-) -> tuple[Array, float]:
+) -> tuple[Array, tuple[float, float]]:
     """Return the logarithms of the likelihoods of all hypotheses, and the edge of the best sphere.
 
     Parameters
@@ -181,6 +189,7 @@ def log_likelihoods(
     if evidence.silent is not None:
         silent = evidence.silent * np.array([[1.0 / radius], [1.0 / radius], [1.0]])
     faintest = physics.weakest * distance**2 / max(evidence.brightness, 1.0)
+    faintest = min(max(faintest, _FLOOR), _HEARD)  # its own returns are heard
     order = np.argsort(evidence.seen[0], kind="stable")  # whatever the order of the returns
     beams, n_beside, n_passing = _beams_about(
         evidence.seen[:, order] / radius,
@@ -196,10 +205,19 @@ def log_likelihoods(
         n_past = max(n_past, evidence.n_on - n_below)
     is_low = silent[1] < -level / radius  # no ground is above the horizon, in the mean
     unheard, blur = silent[:, is_low], evidence.blur.max() / radius
-    n_known = n_past - _n_unknown(evidence.seen[:2] / radius, unheard, blur)
+    n_known = max(n_past - _n_unknown(evidence.seen[:2] / radius, unheard, blur), 0.0)
+    n_alone = evidence.n_carrying + evidence.n_short
+
+    def log_below(beta: tuple[float, float, float]) -> float:
+        every = _log_share(n_below, n_known, beta)
+        if beta is not _OPEN:
+            return every
+        alone = _log_share(n_alone, n_known, beta) + _log_share(max(n_below - n_alone, 0), 0, _ANY)
+        return float(np.logaddexp(every + np.log(1.0 - _NEIGHBOUR), alone + np.log(_NEIGHBOUR)))
+
     for kind in range(len(NAMES)):
         logs[kind] += _log_share(n_beside, n_passing, _SHARES_BESIDE[kind])
-        logs[kind] += _log_share(n_below, n_known, _SHARES_BELOW[kind])
+        logs[kind] += log_below(_SHARES_BELOW[kind])
         logs[kind] += np.log(_height_density(kind, evidence.height, evidence.sigma_height, radius))
         logs[kind] += np.log(_neighbour_probability(kind, n_neighbours))
     priors = _priors(radius, physics)
@@ -209,7 +227,8 @@ def log_likelihoods(
         priors[_SPHERE, 1, _SHIFT : _SHIFT + 2] = hypot(_TURNED * distance / radius, moved)
     found, sphere = _compared(beams, priors, logs)
     never = float(found.max()) - _NEVER
-    return np.asarray(np.maximum(found, never)), float(sphere[_EDGE])
+    edge = float(sphere[_EDGE]), _sigma_edge(sphere, priors[_SPHERE], beams)
+    return np.asarray(np.maximum(found, never)), edge
 
 
 def _n_unknown(seen: Array, silent: Array, blur: float) -> float:
@@ -248,12 +267,13 @@ def _log_share(n_near: int, n_past: float, beta: tuple[float, float, float]) -> 
 
     def of(a: float, b: float) -> float:
         begun = lgamma(a + b) - lgamma(a) - lgamma(b)
-        return exp(
-            begun + lgamma(a + n_near) + lgamma(b + n_past) - lgamma(a + b + n_near + n_past)
-        )
+        return begun + lgamma(a + n_near) + lgamma(b + n_past) - lgamma(a + b + n_near + n_past)
 
     a, b, otherwise = beta
-    return float(np.log((1.0 - otherwise) * of(a, b) + otherwise * of(*_ANY[:2]) + _FLOOR))
+    any_share = of(*_ANY[:2])
+    if otherwise == 1.0:
+        return any_share
+    return float(np.logaddexp(np.log1p(-otherwise) + of(a, b), np.log(otherwise) + any_share))
 
 
 def _neighbour_probability(kind: int, n: int) -> float:
@@ -324,9 +344,20 @@ def _beams_about(
         row = int(i * every)
         for j in range(4):
             kept[j, i] = kept[j, row]
-    _describe_behind(kept[:, :n], near[:, :n_near], past)
+    _describe_behind(kept[:, :n], near[:, :n_near], past, _share_low(seen, silent, blurs))
     columns = (kept[0, :n], kept[1, :n], kept[2, :n], kept[3, :n], kept[4, :n])
     return _Beams(*columns, blurs[0], blurs[1], lost, faintest), n_near, past
+
+
+@compiled
+def _share_low(seen: Array, silent: Array, blurs: Array) -> float:
+    """Return the share of the beams low down, beside the place of a pole, that end near."""
+    x, y = np.append(seen[0], silent[0]), np.append(seen[1], silent[1])
+    z = np.append(seen[2], np.full(silent.shape[1], np.inf))
+    is_beside = (np.abs(x) > _UNDER[0] + blurs[0]) & (np.abs(x) < _BESIDE[1] + blurs[0])
+    is_beside &= (y > _UNDER[1]) & (y < _BELOW) & (np.hypot(x, y) > 1.0 + blurs.max())
+    n, n_near = np.sum(is_beside & (z >= -_NEAR)), np.sum(is_beside & (np.abs(z) < _NEAR))
+    return float((n_near + 0.3) / (n + 1.3))
 
 
 @compiled
@@ -351,16 +382,18 @@ def _plane(near: Array) -> tuple[Array, float]:
 
 
 @compiled
-def _describe_behind(beams: Array, near: Array, n_past: int) -> None:
+def _describe_behind(beams: Array, near: Array, n_past: int, share_low: float) -> None:
     """Write the density of what happens to each beam that passes the object by.
 
-    By the beams beside it: a share of them ends near, half of it on a plane through them.
+    By the beams beside it: a share of them ends near, half of it on a plane through them. Low
+    down, where the ground may be near, by those beside the place of a pole.
     """
     n_near = near.shape[1]
-    share = (n_near + 0.3) / (n_near + n_past + 1.3)
+    share_high = (n_near + 0.3) / (n_near + n_past + 1.3)
     plane, sigma = _plane(near) if n_near > 5 else (np.zeros(3), 0.0)
     for i in range(beams.shape[1]):
         density = 0.5 / _NEAR
+        share = max(share_low, share_high) if beams[1, i] < _LOWEST else share_high
         if beams[2, i] >= _NEAR:
             beams[4, i] = 1.0 - share
             continue
@@ -379,7 +412,8 @@ def _normal(off: float, sigma: float) -> float:
 @compiled
 def _inside(inner: float, blur: float, edge: float) -> float:
     """Return the probability that a beam hits what it passes so far inside the outline of."""
-    return min(max((inner + edge * blur) / (_SOFT[0] + _SOFT[1] * blur) + 0.5, 0.0), 1.0)
+    share = min(max((inner + edge * blur) / (_SOFT[0] + _SOFT[1] * blur) + 0.5, 0.0), 1.0)
+    return share * share * (3.0 - 2.0 * share)
 
 
 @compiled
@@ -387,6 +421,13 @@ def _round(gap: float, radius: float, blur: float) -> float:
     """Return the mean depth of the part of a beam on a round surface."""
     middle = gap if gap + blur < radius else 0.5 * (min(max(gap - blur, 0.0), radius) + radius)
     return -float(np.sqrt(max(radius * radius - middle * middle, 0.0)))
+
+
+@compiled
+def _unheard(share: float, beams: _Beams) -> float:
+    """Return the probability that a beam that is partly on an object has no return."""
+    heard = min(max(share / beams.faintest - 0.5, 0.0), 1.0)
+    return 1.0 - heard * (1.0 - max(_MISPLACED, beams.lost))
 
 
 _Form = tuple[float, float, float, float]
@@ -431,12 +472,20 @@ def _surface(
 
 
 @compiled
-def _log_likelihood(kind: int, shape: Array, prior: Array, beams: _Beams) -> float:
-    """Return the logarithm of likelihood times prior density of a shape."""
-    total, product, edge = 0.0, 1.0, shape[_EDGE]
+def _trust(beams: _Beams) -> float:
+    """Return what a beam tells among others, of what it tells alone."""
+    return 1.0 / (1.0 + len(beams.x) / _N_ALIKE)
+
+
+@compiled
+def _log_likelihood(
+    kind: int, shape: Array, prior: Array, beams: _Beams, densities: Array
+) -> float:
+    """Return the logarithm of likelihood times prior density of a shape; write those of beams."""
+    total, product, edge, log_prior = 0.0, 1.0, shape[_EDGE], 0.0
     for j in range(_N_PARAMETERS):
         if prior[1, j] > 0.0:
-            total -= 0.5 * ((shape[j] - prior[0, j]) / prior[1, j]) ** 2
+            log_prior -= 0.5 * ((shape[j] - prior[0, j]) / prior[1, j]) ** 2
     form, blurs, pole = _form_of(kind, shape), (beams.blur, beams.blur_up), np.exp(shape[_POLE])
     variance = form[2] if kind == _CLUTTER else np.exp(2.0 * shape[_NOISE])
     scale, precision = (1.0 - _STRAY) / np.sqrt(6.283185 * variance), 0.5 / variance
@@ -452,6 +501,8 @@ def _log_likelihood(kind: int, shape: Array, prior: Array, beams: _Beams) -> flo
         if has_pole and y < bottom:
             share = pole_share * _inside(pole - abs(x), blurs[0], edge)
             on = _normal(z - _MEAN, _POLE_DEPTH) if is_near else _MISPLACED
+            if beams.z[i] == np.inf:
+                on = _unheard(share, beams)
             rest = share * on + (1.0 - share) * rest
         share, depth = _surface(kind, x, y, form, edge, blurs)
         if share > 0.0:
@@ -460,12 +511,13 @@ def _log_likelihood(kind: int, shape: Array, prior: Array, beams: _Beams) -> flo
                 stray = (_STRAY + _MERGED * 4.0 * share * (1.0 - share)) / (2.0 * _NEAR)
                 on = stray + scale * np.exp(-precision * (z - depth) ** 2)
             elif beams.z[i] == np.inf and kind != _CLUTTER:  # leaves have gaps anyway
-                on = max(_MISPLACED, beams.lost) if share > beams.faintest else 1.0
+                on = _unheard(share, beams)
             rest = share * on + (1.0 - share) * rest
-        product *= rest + _FLOOR
+        densities[i] = rest + _FLOOR
+        product *= densities[i]
         if product < 1e-200:
             total, product = total + np.log(product), 1.0
-    return float(total + np.log(product))
+    return float(log_prior + _trust(beams) * (total + np.log(product)))
 
 
 @compiled
@@ -487,58 +539,228 @@ def _align(kind: int, shape: Array, beams: _Beams) -> None:
 def _evidence(kind: int, shape: Array, prior: Array, beams: _Beams, least: float) -> float:
     """Return the logarithm of the evidence of a hypothesis; its best shape replaces the start.
 
-    Pattern search (Hooke and Jeeves, 1961), because the likelihood is not smooth; then Laplace's
-    approximation. Minus infinity where it falls hopelessly below the least.
+    By Laplace's approximation. Minus infinity where it falls hopelessly below the least.
     """
     steps = 0.4 * prior[1]
     if kind in (_SPHERE, _BALL):  # the centre is fitted already
         steps[:_NOISE] = np.minimum(steps[:_NOISE], 2.0 * np.exp(prior[0, _NOISE]))
     _align(kind, shape, beams)
-    found = _log_likelihood(kind, shape, prior, beams)
-    for round_no in range(_N_ROUNDS if kind != _SPHERE else 2 * _N_ROUNDS):
+    found = _search(kind, shape, steps, prior, beams, least)
+    if found == -np.inf:
+        return -np.inf
+    found += _log_volume(kind, shape, prior, beams)
+    if kind == _BALL:
+        found += _log_other_size(shape, prior, beams)
+    return float(found)
+
+
+@compiled
+def _evidence_nearby(shape: Array, prior: Array, beams: _Beams) -> float:
+    """Return the logarithm of the evidence of a sphere; its best shape nearby replaces it."""
+    _align(_SPHERE, shape, beams)
+    found = _log_likelihood(_SPHERE, shape, prior, beams, np.empty(len(beams.x)))
+    found = _climbed(_SPHERE, shape, prior[1] > 0.0, prior, beams, found)
+    return float(found + _log_volume(_SPHERE, shape, prior, beams))
+
+
+@compiled
+def _search(
+    kind: int, shape: Array, steps: Array, prior: Array, beams: _Beams, least: float
+) -> float:
+    """Move a shape to the greatest likelihood times prior; return its logarithm.
+
+    The likelihood has several maxima: far jumps and walks seek the greatest, and a climb goes up.
+    """
+    is_free = steps != 0.0
+    found = _log_likelihood(kind, shape, prior, beams, np.empty(len(beams.x)))
+    for begin in range(_N_BEGINS):
+        before = found
+        found = _jumped(kind, shape, is_free, prior, beams, found)
+        if begin and found < before + _CLOSE:
+            break
+        found = _walked(kind, shape, steps.copy(), prior, beams, (found, least))
+        if found == -np.inf:
+            break
+        found = _climbed(kind, shape, is_free, prior, beams, found)
+    return float(found)
+
+
+@compiled
+def _walked(
+    kind: int, shape: Array, steps: Array, prior: Array, beams: _Beams, begun: tuple[float, float]
+) -> float:
+    """Move a shape by a pattern search (Hooke and Jeeves, 1961).
+
+    Return the logarithm of likelihood times prior; minus infinity where it is hopelessly below the
+    least. ``begun`` holds that of the start, and the least.
+    """
+    found, least = begun
+    densities = np.empty(len(beams.x))
+    for round_no in range(_N_ROUNDS):
         if found < least - _HOPELESS * (1.0 + 4.0 / (1.0 + round_no)):
             return -np.inf
-        before = found
+        before, last = found, shape.copy()
         for j in range(_N_PARAMETERS):
             if steps[j] == 0.0:
                 continue
             for _ in range(2):
                 kept = shape[j]
                 shape[j] = kept + steps[j]
-                trial = _log_likelihood(kind, shape, prior, beams)
+                trial = _log_likelihood(kind, shape, prior, beams, densities)
                 if trial > found:
                     found = trial
                     break
                 shape[j], steps[j] = kept, -steps[j]
+        moved = 2.0 * shape - last
+        while found > before:  # as far again, where the parameters only gain together
+            trial = _log_likelihood(kind, moved, prior, beams, densities)
+            if trial <= found:
+                break
+            found, last = trial, shape.copy()
+            shape[:] = moved
+            moved = 2.0 * shape - last
         if found < before + _CLOSE:
             steps *= 0.4
-    return float(found + _log_volume(kind, shape, prior, beams, found))
+    return float(found)
 
 
 @compiled
-def _log_volume(kind: int, shape: Array, prior: Array, beams: _Beams, best: float) -> float:
+def _jumped(
+    kind: int, shape: Array, is_free: Mask, prior: Array, beams: _Beams, found: float
+) -> float:
+    """Move a shape far along one parameter after the other, where that is better."""
+    densities = np.empty(len(beams.x))
+    for j in range(_NOISE, _N_PARAMETERS):
+        if not is_free[j] or _SHIFT <= j < _POLE:
+            continue
+        begun = best = shape[j]
+        for jump in _JUMPS:
+            shape[j] = begun + jump * prior[1, j]
+            trial = _log_likelihood(kind, shape, prior, beams, densities)
+            if trial > found:
+                found, best = trial, shape[j]
+        shape[j] = best
+    return float(found)
+
+
+@compiled
+def _climbed(
+    kind: int, shape: Array, is_free: Mask, prior: Array, beams: _Beams, found: float
+) -> float:
+    """Move a shape to the greatest likelihood times prior nearby; return its logarithm.
+
+    By damped scoring (Berndt, Hall, Hall and Hausman, 1974).
+    """
+    free, trust = np.flatnonzero(is_free), _trust(beams)
+    damping, densities = 0.1, np.empty(len(beams.x))
+    for _ in range(_N_CLIMBS):
+        scores = _scores(kind, shape, free, prior, beams)
+        pull = (prior[0] - shape)[free] / prior[1][free]
+        gradient, squares = pull + trust * scores.sum(axis=1), trust * (scores @ scores.T)
+        gained = 0.0
+        while damping < _MOST_DAMPED:
+            N, step = squares.copy(), gradient.copy()
+            for j in range(len(free)):
+                N[j, j] += 1.0 + damping * (1.0 + squares[j, j])
+            solve(N, step)
+            trial = shape.copy()
+            for j in range(len(free)):
+                trial[free[j]] += step[j] * prior[1, free[j]]
+            gained = _log_likelihood(kind, trial, prior, beams, densities) - found
+            if gained > 0.0:
+                shape[:], found, damping = trial, found + gained, 0.2 * damping
+                break
+            damping *= 6.0
+        if gained < _ARRIVED:
+            break
+    return float(found)
+
+
+@compiled
+def _log_other_size(shape: Array, prior: Array, beams: _Beams) -> float:
+    """Return the logarithm of the probability that a ball is larger or smaller than a marker.
+
+    By how far the likelihood falls from the best radius to the nearest other ones.
+    """
+    densities, other = np.empty(len(beams.x)), 0.0
+    best = _log_likelihood(_BALL, shape, prior, beams, densities)
+    for limit in (-_SAME, _SAME):
+        at_limit, is_free = shape.copy(), prior[1] > 0.0
+        at_limit[_FORM], is_free[_FORM] = limit, False
+        _align(_BALL, at_limit, beams)
+        begun = _log_likelihood(_BALL, at_limit, prior, beams, densities)
+        fallen = best - _climbed(_BALL, at_limit, is_free, prior, beams, begun)
+        off = np.sqrt(max(fallen, 0.0))  # over the square root of two standard deviations
+        is_beyond = (shape[_FORM] - limit) * limit > 0.0
+        other += 0.5 * erfc(-off if is_beyond else off)
+    return float(np.log(max(other, _AS_LARGE)))
+
+
+@compiled
+def _scores(kind: int, shape: Array, free: Index, prior: Array, beams: _Beams) -> Array:
+    """Return the scores of the beams in some parameters, per their standard deviations."""
+    scores = np.zeros((len(free), len(beams.x)))
+    above, below = np.empty(len(beams.x)), np.empty(len(beams.x))
+    for j in range(len(free)):
+        kept, h = shape[free[j]], _STEP * prior[1, free[j]]
+        shape[free[j]] = kept + h
+        _log_likelihood(kind, shape, prior, beams, above)
+        shape[free[j]] = kept - h
+        _log_likelihood(kind, shape, prior, beams, below)
+        shape[free[j]] = kept
+        scores[j] = np.log(above / below) / (2.0 * _STEP)
+    return scores
+
+
+@compiled
+def _information(kind: int, shape: Array, prior: Array, beams: _Beams) -> tuple[Index, Array]:
+    """Return the free parameters, and their information with the prior, per its variances.
+
+    By the sum of outer products of the scores (Berndt, Hall, Hall and Hausman, 1974): it is
+    positive, and takes errors of the parameters together. Those that are a property of the scan,
+    the same for all hypotheses, have the prior's alone.
+    """
+    free = np.flatnonzero(prior[1] > 0.0)
+    scores = _scores(kind, shape, free, prior, beams)
+    for j in range(len(free)):
+        if _SHIFT <= free[j] < _POLE:
+            scores[j] = 0.0
+    N = _trust(beams) * (scores @ scores.T)
+    for j in range(len(free)):
+        N[j, j] += 1.0
+    return free, N
+
+
+@compiled
+def _log_volume(kind: int, shape: Array, prior: Array, beams: _Beams) -> float:
     """Return the logarithm of the share of the prior that the likelihood leaves about the best."""
-    total, same = 0.0, 1.0
-    for j in range(_N_PARAMETERS):
-        if prior[1, j] == 0.0:
-            continue
-        if _SHIFT <= j < _POLE:  # a property of the scan: it is the same for all hypotheses
+    free, N = _information(kind, shape, prior, beams)
+    total, same, root = 0.0, 1.0, np.zeros_like(N)
+    for j in range(_SHIFT, _POLE):
+        if prior[1, j] > 0.0:  # a property of the scan
             total += 0.5 * ((shape[j] - prior[0, j]) / prior[1, j]) ** 2
-            continue
-        kept, h = shape[j], 0.1 * prior[1, j]
-        shape[j] = kept + h
-        above = _log_likelihood(kind, shape, prior, beams)
-        shape[j] = kept - h
-        below = _log_likelihood(kind, shape, prior, beams)
-        shape[j] = kept
-        curvature = max((2.0 * best - above - below) / (h * h), 1.0 / prior[1, j] ** 2)
-        total -= 0.5 * np.log(curvature * prior[1, j] ** 2)
-        if _FORM <= j < _SHIFT:
-            scale = np.sqrt(0.5 * curvature)  # of a normal distribution, for the error function
-            same *= 1.0 - 0.5 * (erfc((_SAME - kept) * scale) + erfc((_SAME + kept) * scale))
-    if kind in (_BALL, _BOULDER):
+    factorise(N, root)
+    for j in range(len(free)):
+        total -= np.log(root[j, j])
+    if kind == _BOULDER:
+        invert(N, N)
+        for j in range(len(free)):
+            if _FORM <= free[j] < _SHIFT:
+                off = shape[free[j]]
+                limit = _SAME if free[j] < _FORM + 2 else _SAME + 2.0 * _STRETCH
+                scale = 1.0 / (np.sqrt(2.0 * N[j, j]) * prior[1, free[j]])
+                same *= 1.0 - 0.5 * (erfc((limit - off) * scale) + erfc((limit + off) * scale))
         total += np.log(max(1.0 - same, _AS_ROUND))
     return total
+
+
+@compiled
+def _sigma_edge(shape: Array, prior: Array, beams: _Beams) -> float:
+    """Return how far the edge of the best sphere may be off."""
+    free, N = _information(_SPHERE, shape, prior, beams)
+    invert(N, N)
+    place = np.searchsorted(free, _EDGE)
+    return float(np.sqrt(N[place, place]) * prior[1, _EDGE])
 
 
 @compiled
@@ -547,28 +769,41 @@ def _compared(beams: _Beams, priors: Array, log_priors: Array) -> tuple[Array, A
     found, best = np.full(len(log_priors), -np.inf), -np.inf
     sphere = priors[_SPHERE, 0].copy()
     for kind in _ORDER:
-        if best - found[_SPHERE] > _GIVEN_UP:
-            break
-        shape = sphere
-        for yaw in _YAWS:
-            shape = priors[kind, 0].copy()
-            if kind == _SPHERE:
-                shape = sphere
-            else:
-                shape[:_FORM] = sphere[:_FORM]
-                shape[_SHIFT:] = sphere[_SHIFT:]
-            if kind in (_BOULDER, _HEAD):
-                shape[_NOISE] = priors[kind, 0, _NOISE]
-            if kind in (_BALL, _BOULDER):
-                shape[_FORM] = sphere[_FORM]
-            if kind == _BOX:
-                shape[_FORM + 2] = yaw
+        is_named = kind != _BALL or found[_CYLINDER] < best  # the two are easily confused
+        if best - found[_SPHERE] > _GIVEN_UP and is_named:
+            continue
+        for start in _STARTS:
+            shape = _start(kind, priors[kind], sphere, start)
             own = _evidence(kind, shape, priors[kind], beams, best - log_priors[kind])
             found[kind] = max(found[kind], own + log_priors[kind])
-            if kind != _BOX:
+            best = max(best, found[kind])
+            if kind in (_BALL, _BOULDER):  # it may have found a better place for the sphere too
+                again = _start(_SPHERE, priors[_SPHERE], shape, start)
+                own = _evidence_nearby(again, priors[_SPHERE], beams)
+                if own + log_priors[_SPHERE] > found[_SPHERE]:
+                    found[_SPHERE] = own + log_priors[_SPHERE]
+                    sphere[:] = again
+            if kind == _SPHERE:
+                sphere[:] = shape
+            if kind not in (_BOX, _BALL):
                 break
-        if kind == _BALL:  # it may have found a better place for the sphere too
-            own = _evidence(_SPHERE, shape, priors[_SPHERE], beams, -np.inf)
-            found[_SPHERE] = max(found[_SPHERE], own + log_priors[_SPHERE])
-        best = max(best, found[kind])
+        best = max(best, found[_SPHERE])
     return found, sphere
+
+
+@compiled
+def _start(kind: int, prior: Array, sphere: Array, start: tuple[float, float]) -> Array:
+    """Return a start of the search for the best shape of a kind where the best sphere is."""
+    shape: Array = prior[0].copy()
+    shape[:_FORM], shape[_SHIFT:] = sphere[:_FORM], sphere[_SHIFT:]
+    if kind in (_BOULDER, _HEAD):
+        shape[_NOISE] = prior[0, _NOISE]
+    if kind == _SPHERE:
+        shape[_POLE], shape[_FORM + 2] = prior[0, _POLE], sphere[_FORM + 2]
+    if kind in (_BALL, _BOULDER):
+        shape[_FORM], shape[_FORM + 2] = sphere[_FORM], sphere[_FORM + 2]
+    if kind == _BALL:
+        shape[_FORM] += start[1]
+    if kind == _BOX:
+        shape[_FORM + 2] += start[0]
+    return shape

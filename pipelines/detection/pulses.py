@@ -160,7 +160,8 @@ def hearing_of(cloud: StitchedCloud, clock: Clock, up: Array) -> Hearing:
     is_shown = n >= _N_IN_SECTOR
     shares = 1.0 - n_heard[is_shown] / n[is_shown]  # by sectors: the rover hides some of the ground
     lost = float(np.median(shares)) if len(shares) > _N_SECTORS // 2 else 1.0
-    return Hearing(lost, float(np.quantile(strengths, _WEAKEST)))
+    strengths = strengths[np.isfinite(strengths)]
+    return Hearing(lost, float(np.quantile(strengths, _WEAKEST)) if len(strengths) else 0.0)
 
 
 def _firings_within(numbers: NDArray[np.int64]) -> NDArray[np.int64]:

@@ -4,9 +4,11 @@ import numpy as np
 import pytest
 
 from spheremark.pipelines.detection.decision import (
-    edge_of,
+    edges_of,
     is_resolved,
     judged,
+    noise_of,
+    paint_of,
     reason_by_evidence,
     reason_by_features,
     sure_ones,
@@ -33,11 +35,11 @@ def features(n_points=70, scatter_free=0.0075, **changes):
 def evidence(**changes):
     """A ball that stands on a pole before something far."""
     seen = Evidence(
-        n_on=70, n_before=0, n_held=0, n_past=150, n_short=0, brightness=50.0, n_distinct=70,
-        rows=np.empty(0, np.int32), seen=np.empty((3, 0)), faces=np.empty(0), silent=None,
-        blur=np.full(2, 0.015), height=np.nan, sigma_height=np.inf,
+        n_on=70, n_before=0, n_held=0, n_carrying=0, n_past=150, n_short=0,
+        brightness=50.0, n_distinct=70, rows=np.empty(0, np.int32), seen=np.empty((3, 0)),
+        faces=np.empty(0), silent=None, blur=np.full(2, 0.015), height=np.nan, sigma_height=np.inf,
     )  # fmt: skip
-    return seen._replace(**changes)
+    return seen._replace(**{"n_carrying": changes.get("n_held", 0), **changes})
 
 
 def refusal(seen, about):
@@ -62,10 +64,13 @@ def test_what_is_held_below_counts_by_how_much_is_seen_there(share_seen):
     n_seen = round(100 * share_seen)
     about = evidence(n_on=120, n_short=100 - n_seen)
     n_few = 1 + round(0.1 * 120 * share_seen)
-    passes = about._replace(n_held=n_few - 1, n_past=n_seen - n_few + 1)
-    held = about._replace(n_held=n_few + 2, n_past=n_seen - n_few - 2)
-    assert "pole" not in reason_by_evidence(features(n_points=120), passes, TARGET)
-    assert "pole" in reason_by_evidence(features(n_points=120), held, TARGET)
+
+    def reason(n):
+        held = about._replace(n_held=n, n_carrying=n, n_past=n_seen - n)
+        return reason_by_evidence(features(n_points=120), held, TARGET)
+
+    assert "pole" not in reason(n_few - 1)
+    assert "pole" in reason(n_few + 2)
 
 
 def test_of_a_ball_two_thirds_may_be_hidden():
@@ -116,10 +121,50 @@ def test_markers_hold_no_more_false_ones_than_wanted():
     assert sure_ones([], 0.01) == []
 
 
-def test_the_edge_of_a_scan_is_that_of_its_surest_spheres():
+def test_what_a_plane_fits_as_well_shows_no_noise():
+    balls = [features(scatter=sigma) for sigma in (0.010, 0.011, 0.012)]
+    clutter = [features(scatter=0.03)] * 9
+    assert noise_of(balls + clutter, TARGET.radius) == pytest.approx(0.011)
+    assert np.isnan(noise_of(clutter, TARGET.radius))
+
+
+NO_PRIOR = (0.6, 100.0)  # edge and its standard deviation
+
+
+def test_the_edge_of_a_scan_is_that_of_its_other_sure_spheres():
     found = likelihoods(9.0, 8.0, 12.0, 1.0)
-    edge, sigma = edge_of(np.array([0.2, 0.3, 0.1, 0.9]), found)
-    assert edge == pytest.approx(0.2)
-    assert 0.15 < sigma < 0.25
-    assert edge_of(np.array([0.2, 0.3]), found[:2])[1] == np.inf
-    assert edge_of(np.empty(0), likelihoods())[1] == np.inf
+    edges = np.array([[0.2, 0.1], [0.3, 0.1], [0.1, 0.1], [0.9, 0.1]])
+    known = edges_of(edges, found, NO_PRIOR)
+    assert known[:, 0] == pytest.approx([0.2, 0.15, 0.25, 0.2], abs=1e-4)
+    assert known[3, 1] < known[0, 1] < 0.25
+
+
+def test_without_other_spheres_the_edge_is_the_usual_one():
+    alone = edges_of(np.array([[0.2, 0.1]]), likelihoods(9.0), (0.6, 0.4))
+    assert alone[0, 0] == pytest.approx(0.6)
+    assert alone[0, 1] >= 0.4
+    assert edges_of(np.empty((0, 2)), likelihoods(), (0.6, 0.4)).shape == (0, 2)
+
+
+def painted(*reflectivities, n_past=150):
+    """Ratios of a marker's paint to any paint, and sentences, of groups that may be markers."""
+    groups = [evidence(brightness=value, n_past=n_past) for value in reflectivities]
+    return paint_of(groups, [0.9] * len(groups))
+
+
+def test_what_is_painted_as_the_others_is_likelier_a_marker():
+    ratios, texts = painted(50.0, 50.0, 51.0, 49.0, 20.0)
+    assert min(ratios[:4]) > 1.0 > -2.0 > ratios[4]
+    assert texts[:4] == [""] * 4
+    assert "reflectivity is 20, that of the markers 50" in texts[4]
+
+
+def test_dirt_may_hide_the_paint_of_a_marker_whose_pole_is_seen_only():
+    on_pole, unseen = (painted(50.0, 50.0, 51.0, 49.0, 10.0, n_past=n)[0][4] for n in (150, 0))
+    assert -4.0 < on_pole < -2.0
+    assert unseen < -8.0
+
+
+def test_a_group_alone_shows_no_paint():
+    assert abs(painted(20.0)[0][0]) < 0.5
+    assert len(painted()[0]) == 0

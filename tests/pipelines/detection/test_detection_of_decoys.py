@@ -92,6 +92,17 @@ def test_balls_of_other_radii_are_no_markers(share):
     assert n_taken(found) == 0
 
 
+def test_markers_beside_a_post_are_found():
+    """On one side beams go past the marker: what holds those on the other does not carry it."""
+    near = MARKERS[:5]
+    aside = np.column_stack([-near[:, 1], near[:, 0], np.zeros(len(near))])
+    feet = near + 0.27 * aside / np.linalg.norm(aside, axis=1, keepdims=True)
+    feet[:, 2] = GROUND
+    found = extracted(posts=tuple((tuple(p), 0.08, 1.6) for p in feet))
+    rough = [candidate.p_base_rough for candidate in found.candidates]
+    assert gaps(near, rough).min(axis=1).max() < 0.5 * RADIUS
+
+
 def test_short_cylinders_are_no_markers():
     feet = OTHERS - [0.0, 0.0, RADIUS]
     found = extracted(posts=tuple((tuple(p), RADIUS, 2 * RADIUS) for p in feet))

@@ -61,9 +61,16 @@ def test_markers_are_found_and_stones_of_their_size_on_the_ground_are_not(cloud)
 
 
 def test_markers_of_a_thinned_log_are_found_though_most_pulses_seem_silent(cloud):
+    """Of those with fewer than 20 returns the size is not sure: they may be possible ones."""
     kept = np.random.default_rng(61).random(len(cloud.rings)) < 0.4
     thinned = replace(cloud, **{name: getattr(cloud, name)[kept] for name in COLUMNS})
-    assert_found_alone(MARKERS, extract(thinned, ExtractionConfig(), RADIUS), 0.5 * RADIUS)
+    found = extract(thinned, ExtractionConfig(), RADIUS)
+    all_found = [c.p_base_rough for c in found.candidates] + [c.p_base for c in found.possible]
+    offs = np.linalg.norm(MARKERS[:, None] - np.array(all_found), axis=2)
+    assert len(all_found) == len(MARKERS)
+    assert offs.min(axis=1).max() < 0.5 * RADIUS
+    assert all(possible.n_points < 20 for possible in found.possible)
+    assert len(found.candidates) >= len(MARKERS) - 1
 
 
 def behind_leaves(cloud: StitchedCloud, middle, rng) -> StitchedCloud:
@@ -96,7 +103,6 @@ def test_spheres_of_two_metres_are_found_though_ranges_scatter_by_eight_centimet
 
 
 @pytest.mark.slow
-@pytest.mark.xfail(reason="two decoys of a stepped scan are taken for markers")
 def test_markers_of_a_stepped_scan_are_found_and_nothing_else():
     seed = 18
     assert family_of(seed) == "step-and-shoot"
