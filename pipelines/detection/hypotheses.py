@@ -52,7 +52,7 @@ _MISPLACED = 0.01  # share of the beams on a solid surface that seem to end behi
 _SOFT = (0.07, 0.35)  # radii, and half widths of a beam besides, over which beams come to hit
 _CELL, _N_CELL = 0.1, 2  # beams that pass the same place share the errors of the model
 _N_MAX = 96  # beams that are compared: more decide nothing
-_N_ALIKE = 300.0  # beams that tell half as much together as apart: errors of the model add up
+_N_ALIKE = 300.0  # beams that share errors of the model so that each counts as half a beam
 _FLOOR = 1e-9
 _NEVER = 60.0  # logarithm of odds behind the best that stand for any more
 _HOPELESS = 15.0  # logarithm of odds behind the best from which a hypothesis is given up
@@ -207,17 +207,9 @@ def log_likelihoods(
     unheard, blur = silent[:, is_low], evidence.blur.max() / radius
     n_known = max(n_past - _n_unknown(evidence.seen[:2] / radius, unheard, blur), 0.0)
     n_alone = evidence.n_carrying + evidence.n_short
-
-    def log_below(beta: tuple[float, float, float]) -> float:
-        every = _log_share(n_below, n_known, beta)
-        if beta is not _OPEN:
-            return every
-        alone = _log_share(n_alone, n_known, beta) + _log_share(max(n_below - n_alone, 0), 0, _ANY)
-        return float(np.logaddexp(every + np.log(1.0 - _NEIGHBOUR), alone + np.log(_NEIGHBOUR)))
-
     for kind in range(len(NAMES)):
         logs[kind] += _log_share(n_beside, n_passing, _SHARES_BESIDE[kind])
-        logs[kind] += log_below(_SHARES_BELOW[kind])
+        logs[kind] += _log_below(n_below, n_alone, n_known, _SHARES_BELOW[kind])
         logs[kind] += np.log(_height_density(kind, evidence.height, evidence.sigma_height, radius))
         logs[kind] += np.log(_neighbour_probability(kind, n_neighbours))
     priors = _priors(radius, physics)
@@ -274,6 +266,20 @@ def _log_share(n_near: int, n_past: float, beta: tuple[float, float, float]) -> 
     if otherwise == 1.0:
         return any_share
     return float(np.logaddexp(np.log1p(-otherwise) + of(a, b), np.log(otherwise) + any_share))
+
+
+def _log_below(
+    n_below: int, n_alone: int, n_known: float, beta: tuple[float, float, float]
+) -> float:
+    """Return the log probability of the beams below: all by what is there, or some by a neighbour.
+
+    Without those of a neighbour fewer end near; it stops all of its own.
+    """
+    every = _log_share(n_below, n_known, beta)
+    if beta is not _OPEN:
+        return every
+    alone = _log_share(n_alone, n_known, beta) + _log_share(max(n_below - n_alone, 0), 0, _ANY)
+    return float(np.logaddexp(every + np.log(1.0 - _NEIGHBOUR), alone + np.log(_NEIGHBOUR)))
 
 
 def _neighbour_probability(kind: int, n: int) -> float:
@@ -473,7 +479,7 @@ def _surface(
 
 @compiled
 def _trust(beams: _Beams) -> float:
-    """Return what a beam tells among others, of what it tells alone."""
+    """Return the information of a beam among others, as a share of its information alone."""
     return 1.0 / (1.0 + len(beams.x) / _N_ALIKE)
 
 
