@@ -11,6 +11,7 @@ import numpy as np
 
 from spheremark.pipelines.config import SurveyConfig
 from spheremark.pipelines.errors import SpheremarkError
+from spheremark.pipelines.evaluation.data_sheets import data_sheet
 from spheremark.pipelines.evaluation.ellipse_coverage import pose_errors
 from spheremark.pipelines.evaluation.experiment import Column, Experiment, Plain, Table
 from spheremark.pipelines.model import Array
@@ -26,14 +27,11 @@ from spheremark.pipelines.placement import (
 )
 from spheremark.pipelines.placement.station_covariance import LOOSE2
 from spheremark.pipelines.positioning.resection import resect
-from spheremark.pipelines.scan.rigs import N_LASERS
 from spheremark.pipelines.simulation import (
     RandomWorld,
     draw_world,
-    recorded_time,
     simulate_stop,
 )
-from spheremark.pipelines.simulation.worlds import PRIORS
 from spheremark.pipelines.survey import process
 
 N_STOPS = 3
@@ -93,7 +91,7 @@ def _world(seed: int) -> list[Plain]:
         return []
     stops = stops_of_field(world.field).rows(np.arange(N_STOPS))
     site, marks = site_of_field(world.field), marks_of_field(world.field)
-    config = _survey_config(world)
+    config = data_sheet(world)
     model = sensor_model(_sensor(world, config), world.field.marker_radius)
     requirement = Requirement(
         sigma_levelling=config.stitching.sigma_levelling, resection=config.resection
@@ -104,32 +102,6 @@ def _world(seed: int) -> list[Plain]:
         for e in range(len(stops.names))
         if np.isfinite(plan.sigma_3d[e])
     ]
-
-
-def _survey_config(world: RandomWorld) -> SurveyConfig:
-    """Return the configuration of a survey with the data sheets of LiDAR, rig and AHRS."""
-    config, family = world.config, world.field.family
-    lasers, common = config.sigma_laser_bias, PRIORS["range_bias"].rms(family)
-    scale = PRIORS["range_scale"].rms(family)
-    drift = config.sigma_ahrs_drift * 0.5 * recorded_time(config)  # of the mean of all samples
-    return SurveyConfig.from_mapping(
-        {
-            "marker_radius": world.field.marker_radius,
-            "stitching": {"sigma_levelling": float(np.hypot(config.sigma_ahrs_bias, drift))},
-            "fitting": {
-                "methods": [_METHOD],
-                "sigma_range_bias": lasers,
-                "sigma_range_common": common,
-                "sigma_range_scale": scale,
-                "sigma_mounting": config.sigma_misalignment,
-                "sigma_offset": config.sigma_axis_offset,
-            },
-            "resection": {
-                "sigma_range": float(np.hypot(common, lasers / np.sqrt(N_LASERS))),
-                "sigma_range_scale": scale,
-            },
-        }
-    )
 
 
 def _sensor(world: RandomWorld, survey: SurveyConfig) -> Sensor:

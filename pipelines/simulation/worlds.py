@@ -115,7 +115,7 @@ _LATTICES = ((12.0, 600.0), (9.0, 600.0), (18.0, 600.0), (6.0, 1200.0), (12.0, 3
 _RPM, _RPM_OFF = (300.0, 600.0, 600.0, 600.0, 900.0, 1200.0), 0.003
 _STEPS = (1.3, 1.7, 2.3, 3.1, 5.0)  # [deg] of a gimbal that rests
 _SLOWER = 1.7  # the turn of a scan of one face
-_CLOCK = (0.005, 0.1)  # [s] by which stamps are off in the family of that name
+_CLOCK = Prior((0.005, 0.1), (0.005, 0.1), True, (), "latency in the family of that name [s]")
 _DUST = (1e-4, 5e-3)  # [1/m]
 _BY_TABLE, _WEAKER, _PENCILS = 0.25, 0.7, 0.15  # noise by the VLP-16's table; grows; no divergence
 _PICKS = (0.7, 0.15, 0.15)  # shares of worlds by the echo that is recorded
@@ -228,6 +228,23 @@ def draw_world(seed: int, family: str = "") -> RandomWorld:
     return RandomWorld(field=field, config=config)
 
 
+def latency_rms(family: str) -> float:
+    """Return the root of the mean square of a gimbal's latency in worlds of a family [s].
+
+    Parameters
+    ----------
+    family : str
+        One of ``FAMILIES``.
+
+    Returns
+    -------
+    float
+        What a data sheet gives as its sigma.
+    """
+    prior = _CLOCK if family == "clock" else PRIORS["gimbal_clock_offset"]
+    return prior.rms(family)
+
+
 def random_field(seed: int) -> Field:
     """Return the field of a random world, to be scanned with other physics than its own."""
     return draw_world(seed).field
@@ -237,7 +254,7 @@ def _config(rng: np.random.Generator, values: _Values, family: str) -> Simulatio
     """Draw optics, rig and motion."""
     latency, step = values["gimbal_clock_offset"], RANGE_STEP
     if family == "clock":
-        latency = _between(rng, _CLOCK)
+        latency = _CLOCK.draw(rng, family)
     if family in _OPTICS:
         step *= float(rng.choice([0.5, 1.0, 2.0, 5.0]))
     drawn: dict[str, Any] = {name: values[name] for name in _IN_CONFIG}

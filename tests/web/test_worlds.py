@@ -21,7 +21,7 @@ FRAME = Frame()
 
 @pytest.fixture
 def report():
-    centre = Centre("ok", 1e-6, 1e-6, 3.0)
+    centre = Centre("ok", 1e-6, 1e-6, 3.0, 3.0)
     seen = [Seen(CLASSES[0], ("ok",), "", centre), Seen(CLASSES[0], (), "it is a pole", None)]
     calls = [Call("ok", 0.9, 0, ""), Call("weak", 0.5, -1, "cube")]
     score = Score(4, "optics", seen, calls, ["cube", "tree"], None, "", 0.2)

@@ -7,23 +7,31 @@ from spheremark.pipelines.evaluation.worlds import (
     CLASSES,
     Call,
     Centre,
+    Common,
     Peers,
     Score,
     Seen,
+    Sheet,
     Station,
+    _anew,
+    _of_worlds,
     _rows,
+    _squares,
     _tags,
+    _turn,
+    _without_heading,
     report_of,
     tables,
     worlds,
 )
+from spheremark.pipelines.geometry import rot_z
 from spheremark.pipelines.simulation.worlds import family_of
 
 MANY, FEW, ONE_LINE, _ = CLASSES
 
 
-def centre(error, sigma=1.0):
-    return Centre("ok", error**2, 1.0, error**2 / sigma**2)
+def centre(error, sigma=1.0, status="ok", bound2=1.0, anew=1.0):
+    return Centre(status, error**2, bound2, error**2 / sigma**2, anew)
 
 
 def score(family, seen, calls, **more):
@@ -103,8 +111,8 @@ def test_found_and_false_ones_are_counted_by_returns():
 def test_errors_are_over_bound_and_covariance_by_family():
     rng = np.random.default_rng(1)
     squares = (rng.standard_normal((4000, 3)) ** 2).sum(axis=1)
-    seen = [Seen(MANY, ("ok",), "", Centre("ok", s, 3.0 / 4.0, s)) for s in squares]
-    seen.append(Seen(MANY, ("weak",), "", Centre("weak", 1e6, 1.0, 1e6)))
+    seen = [Seen(MANY, ("ok",), "", centre(np.sqrt(s), bound2=3.0 / 4.0)) for s in squares]
+    seen.append(Seen(MANY, ("weak",), "", centre(1e3, status="weak")))
     (family,) = report_of([score("rig", seen, [])], 0, ())["families"]
     assert family["n_centres"] == 4000
     assert family["rms_over_bound"] == pytest.approx(2.0, rel=0.03)
@@ -122,9 +130,96 @@ def test_stations_that_are_ok_count_and_families_are_summed(report):
     assert both["n_scans"] == 2
 
 
+def test_data_sheets_stand_beside_the_defaults(report):
+    low, high = (
+        score("optics", [Seen(MANY, ("ok",), "", centre(3.0))], [], station=Station("ok", 1.0, s))
+        for s in (12.0, 24.0)
+    )
+    weak = centre(30.0, status="weak")
+    known = [
+        one._replace(sheet=Sheet((centre(square**0.5), weak), Station("ok", 1.0, 6.0)))
+        for one, square in ((low, 2.0), (high, 4.0))
+    ]
+    (family,) = report_of(known, 0, ())["families"]
+    assert (family["nees"], family["nees_se"]) == (3.0, 0.0)
+    assert (family["station_nees"], family["station_nees_se"]) == (3.0, pytest.approx(1.0))
+    assert family["sheet_nees"] == pytest.approx(1.0)
+    assert family["sheet_nees_se"] == pytest.approx(1.0 / 3.0)
+    assert family["station_sheet_nees"] == 1.0
+    (empty, *_) = report["families"]
+    assert (empty["sheet_nees"], empty["nees_se"]) == (None, None)
+
+
+def test_a_standard_error_is_that_of_worlds_not_of_their_results():
+    rng = np.random.default_rng(3)
+    of_worlds = rng.standard_normal(12)
+    groups = [[one] * 5 for one in of_worlds]
+    mean, error = _of_worlds(groups)
+    assert mean == pytest.approx(of_worlds.mean())
+    assert error == pytest.approx(of_worlds.std(ddof=1) / np.sqrt(12))
+    assert _of_worlds([*groups, []]) == (mean, error)
+    assert _of_worlds([[1.0, 2.0], []]) == (1.5, None)
+    assert _of_worlds([[]]) == (None, None)
+
+
+def test_standard_errors_hold_for_worlds_of_unlike_size():
+    rng = np.random.default_rng(5)
+    means, errors = [], []
+    for _ in range(400):
+        shared = rng.standard_normal(20)
+        mean, error = _of_worlds([[one] * rng.integers(1, 9) for one in shared])
+        means.append(mean)
+        errors.append(error)
+    assert np.sqrt(np.mean(np.square(errors))) == pytest.approx(np.std(means), rel=0.12)
+
+
+PLACES = np.array([[6.0, 0.0, 0.2], [0.0, 9.0, -0.4], [-3.0, -4.0, 0.1], [10.0, -8.0, 0.6]])
+SIGMAS = np.array([2e-3, 1e-3, 3e-3])
+
+
+def own_covariances():
+    return np.tile(np.diag(SIGMAS**2), (len(PLACES), 1, 1))
+
+
+def test_a_turn_of_the_whole_scan_is_no_error_of_centres():
+    found, covs = PLACES @ rot_z(-0.05), own_covariances()  # 0.05 rad of it is 13 mm at 10 m
+    turn = _turn(found, PLACES, covs)
+    assert turn == pytest.approx(0.05, abs=1e-4)
+    errors = found @ rot_z(turn) - PLACES
+    left, _ = _without_heading(errors, turn, PLACES, (covs, 1.0))
+    assert np.abs(left).max() < 2e-5
+
+
+def test_a_heading_that_is_known_beforehand_counts_as_a_prior():
+    covs, turn = own_covariances(), 0.01
+    errors = PLACES @ rot_z(-turn) @ rot_z(turn) - PLACES
+    left, _ = _without_heading(errors, turn, PLACES, (covs, 1e-6))
+    sideways = np.column_stack([-PLACES[:, 1], PLACES[:, 0], np.zeros(len(PLACES))])
+    np.testing.assert_allclose(left, turn * sideways, rtol=0.01, atol=1e-9)
+
+
+def test_biases_drawn_anew_say_the_same_with_less_scatter():
+    rng, n = np.random.default_rng(11), 4000
+    distances = np.linalg.norm(PLACES, axis=1)
+    sights = PLACES / distances[:, None]
+    common = Common(0.0, 0.0, 4e-3, 3e-4)
+    variances = common.sigma_bias**2 + (common.sigma_scale * distances) ** 2
+    covs = own_covariances() + variances[:, None, None] * sights[:, :, None] * sights[:, None]
+    drawn, anew = [], []
+    for _ in range(n):
+        bias, scale = rng.normal(0.0, common.sigma_bias), rng.normal(0.0, common.sigma_scale)
+        errors = SIGMAS * rng.standard_normal((len(PLACES), 3))
+        errors += (bias + scale * distances)[:, None] * sights
+        drawn.append(_squares(errors, covs).mean())
+        anew.append(_anew(errors, covs, PLACES, common._replace(bias=bias, scale=scale)).mean())
+    assert np.mean(drawn) == pytest.approx(3.0, abs=4.0 * np.std(drawn) / np.sqrt(n))
+    assert np.mean(anew) == pytest.approx(3.0, abs=4.0 * np.std(anew) / np.sqrt(n))
+    assert np.std(anew) < 0.8 * np.std(drawn)
+
+
 def test_every_table_shows_its_rows(report):
     shown = [table.to_texts() for table in tables(report)]
-    assert [len(one["rows"]) for one in shown] == [4, 4, 2, 7, 7, 5, 3]
+    assert [len(one["rows"]) for one in shown] == [4, 4, 2, 7, 7, 5, 3, 3]
     assert all(len(row) == len(one["headings"]) for one in shown for row in one["rows"])
     assert shown[0]["rows"][0][:3] == [MANY, "3", "1"]
 
@@ -159,3 +254,4 @@ def test_a_world_is_scanned_and_scored_with_its_peers():
     # the bound knows a bias that LiDARs differ by; this one's is drawn once, and may be near zero
     assert 0.05 < family["rms_over_bound"] < 2.5
     assert family["nees"] < 3.0
+    assert family["sheet_nees"] == pytest.approx(family["nees"], rel=0.3)
