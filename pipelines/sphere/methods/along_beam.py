@@ -22,6 +22,7 @@ from spheremark.pipelines.model import (
     MarkerCandidate,
     MarkerCandidates,
     MarkerFit,
+    Mask,
     Rejection,
     Status,
     StitchedCloud,
@@ -56,6 +57,7 @@ from spheremark.pipelines.sphere.optics import prior_sigmas
 from spheremark.pipelines.sphere.radius import other_radius
 from spheremark.pipelines.sphere.returns import (
     Returns,
+    errors_of_interpolation,
     n_lines,
     returns_of,
     scatter_of_angles,
@@ -65,6 +67,8 @@ NAME = "along_beam"
 
 _STRAY = 0.6  # radii that a centre may move from its rough place
 _N_MIN = 4  # returns: one more than unknowns
+_BENT = 2.0  # sigmas of a direction by which a gimbal that starts or stops may be off
+_BENT_SHARE = 0.5  # of a candidate's returns that may be left out for that reason
 _DOF_STOP = 100.0  # returns that the stop's noise counts for in the noise of a marker
 _FEW_INFLATION = 0.45  # variance of a centre of n returns: times 1 + this exp(-n /
 _FEW_RETURNS = 30.0  # this), by Monte Carlo
@@ -166,9 +170,11 @@ def _gather(
 ) -> tuple[_Stop, Array]:
     """Return the members of all candidates as one table, and the prior sigmas of laser biases."""
     members = np.concatenate([c.members for c in candidates])
-    is_finite = np.isfinite(cloud.p_base[members]).all(axis=1)
     ends = np.cumsum([0, *(len(c.members) for c in candidates)])
-    together, starts = members[is_finite], np.concatenate([[0], np.cumsum(is_finite)])[ends]
+    is_kept = np.isfinite(cloud.p_base[members]).all(axis=1)
+    bent = errors_of_interpolation(cloud.gimbal_angles, members)
+    is_kept &= ~_too_bent(bent > _BENT * config.sigma_direction, ends)
+    together, starts = members[is_kept], np.concatenate([[0], np.cumsum(is_kept)])[ends]
     table = beams(cloud, together)
     of_angles = scatter_of_angles(cloud.gimbal_angles, config.sigma_direction)
     lasers = np.flatnonzero(np.bincount(table.rings))
@@ -184,6 +190,16 @@ def _gather(
         (*classes_of(table.intensities), _sigmas_direction(of_angles, table.times, starts, config)),
     )
     return _Stop(table, together, returns, min(of_angles, config.sigma_direction)), sigma_biases
+
+
+def _too_bent(is_bent: Mask, ends: Index) -> Mask:
+    """Tell which returns to leave out of candidates, (n,), because their gimbal angle is unknown.
+
+    Such errors are no noise: all returns between two samples are off to one side. A candidate of
+    which most returns are of this kind keeps them.
+    """
+    shares = [is_bent[a:b].mean() if b > a else 0.0 for a, b in pairwise(ends)]
+    return is_bent & np.repeat(np.array(shares) <= _BENT_SHARE, np.diff(ends))
 
 
 def _sigmas_direction(

@@ -257,6 +257,48 @@ def test_a_gimbal_whose_angles_scatter_widens_the_covariance_across_the_beam():
     assert 0.5 * expected < added < 2.0 * expected
 
 
+def jerked(cloud, every):
+    """The cloud of a gimbal that starts or stops during every few scan lines, and its angles."""
+    stamps_ns, samples_ns = np.int64(1e9 * cloud.times), np.arange(0, 13_300_000_000, 10_000_000)
+    intervals = np.unique(stamps_ns // 10_000_000)
+    lines = intervals[np.append(True, np.diff(intervals) > 1)]
+    corners = 0.01 * (lines[::every] + 0.5)
+    knots = np.concatenate([[0.0], corners, [13.4]])
+    speeds = np.where(np.arange(len(knots) - 1) % 2, 1.9, 0.2)
+    at_knots = np.append(0.0, np.cumsum(speeds * np.diff(knots)))
+    values = np.interp(1e-9 * samples_ns, knots, at_knots)
+    rates = np.append(np.diff(values) / 10_000_000, 0.0)
+    column = Timed(stamps_ns, samples_ns, values, rates)
+    k = stamps_ns // 10_000_000
+    interpolated = values[k] + rates[k] * (stamps_ns - samples_ns[k])
+    off = interpolated - np.interp(1e-9 * stamps_ns, knots, at_knots)
+    c, s, (x, y, z) = np.cos(off), np.sin(off), cloud.p_base.T
+    moved = np.column_stack([c * x - s * y, s * x + c * y, z]).astype(np.float32)
+    return replace(cloud, p_base=moved, gimbal_angles=column), np.abs(off)
+
+
+def test_returns_while_a_gimbal_starts_or_stops_are_left_out_and_move_no_centre():
+    cloud = cloud_of(*returns(*marker_shots(CENTRE, np.random.default_rng(35), sigma=0.01)))
+    moved, off = jerked(cloud, every=4)
+    is_off = off > 2.0 * CONFIG.sigma_direction
+    assert 0.1 < np.mean(is_off) < 0.4
+    assert off.max() > 3e-3  # 22 mm at this distance
+    (fit,) = fit_one(moved, CENTRE).fits
+    assert not set(fit.used) & set(np.flatnonzero(is_off))
+    assert set(np.flatnonzero(is_off)) <= set(fit.rejected)
+    even = found((np.flatnonzero(~is_off), CENTRE))
+    (without,) = fit_markers("along_beam", cloud, even, CONFIG, RADIUS).fits
+    assert_allclose(fit.p_base, without.p_base, atol=5e-4)
+
+
+def test_a_marker_that_a_gimbal_passes_only_while_it_starts_or_stops_keeps_its_returns():
+    cloud = cloud_of(*returns(*marker_shots(CENTRE, np.random.default_rng(36), sigma=0.01)))
+    moved, off = jerked(cloud, every=1)
+    assert np.mean(off > 2.0 * CONFIG.sigma_direction) > 0.5
+    (fit,) = fit_one(moved, CENTRE).fits
+    assert len(fit.used) > 0.5 * len(off)
+
+
 @pytest.mark.parametrize("share", [0.04, 0.08])
 def test_pole_and_outliers_are_rejected(share):
     rng = np.random.default_rng(3)
