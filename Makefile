@@ -16,7 +16,7 @@ KERNELS := $(shell git ls-files 'pipelines/*.py' 'storage/*.py' 2>/dev/null)
 export OPENBLAS_NUM_THREADS ?= 1
 SIDE_BY_SIDE := --numprocesses 2 --dist loadfile --no-loadscope-reorder --max-worker-restart 0
 
-.PHONY: help setup setup-dev demo test check bench docs reference lock sbom clean
+.PHONY: help setup setup-dev demo test check check-text check-types check-locks bench docs reference lock sbom clean
 
 help:
 	@sed -n 's/^# //p' Makefile
@@ -28,7 +28,7 @@ setup-dev: setup $(VENV)/.dev
 $(VENV)/.ready: requirements.lock pyproject.toml .ci/install
 	@.ci/system-packages libraries
 	@echo "Installing the locked packages into $(VENV) ..."
-	@.ci/install "$(PYTHON)" $(VENV) requirements.lock
+	@.ci/install "$(PYTHON)" $(VENV) requirements.lock --checkout
 	@touch $@
 
 $(VENV)/.dev: $(VENV)/.ready requirements-dev.lock
@@ -54,12 +54,18 @@ test: setup-dev
 	@.ci/system-packages browser
 	$(BIN)/pytest $(SIDE_BY_SIDE) -m "not benchmark"
 
-check: $(VENV)/.dev
+check: check-text check-types check-locks
+
+check-text: $(VENV)/.dev
 	$(BIN)/ruff format --check .
 	$(BIN)/ruff check .
-	$(BIN)/mypy
 	$(BIN)/lint-imports
 	@$(BIN)/codespell $(shell git ls-files '*.py' '*.md' '*.sql' '*.html' '*.toml')
+
+check-types: $(VENV)/.dev
+	$(BIN)/mypy
+
+check-locks: $(VENV)/.dev
 	.ci/locks $(VENV)
 
 bench: setup-dev
