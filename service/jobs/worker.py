@@ -19,11 +19,14 @@ from distributed import WorkerPlugin, get_worker
 
 from spheremark.pipelines.compilation import watch_compilation
 from spheremark.pipelines.config import SurveyConfig
+from spheremark.pipelines.threads import in_processes
 from spheremark.service.jobs.handlers import KINDS, JobResult, JobSpecification
 from spheremark.service.jobs.memory import keep_memory
 from spheremark.storage.confined import start_readers
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
+
     from distributed import Worker
 
 _LOG = logging.getLogger(__name__)
@@ -124,7 +127,17 @@ def warm_up() -> None:
 
 
 def compile_kernels() -> None:
-    """Run the whole chain on a small simulated log, so that later runs find compiled kernels."""
+    """Run a survey and a plan, each in its process, so that later runs find compiled kernels."""
+    in_processes(_call, (_compile_survey, _compile_planner))
+
+
+def _call(work: Callable[[], None]) -> None:
+    """Do some work."""
+    work()
+
+
+def _compile_survey() -> None:
+    """Run the whole chain on a small simulated log."""
     from spheremark.pipelines.interface import adjust
     from spheremark.pipelines.simulation import SimulationConfig, scenario, simulate_stop
     from spheremark.pipelines.survey import process
@@ -145,7 +158,6 @@ def compile_kernels() -> None:
         view(result, 1000)
     adjust(results, field.marks)
     simulate_stop(field, field.stops[0].name, SimulationConfig(turn=_SHORT_TURN))
-    _compile_planner()
 
 
 def _compile_planner() -> None:
