@@ -13,7 +13,8 @@ from spheremark.pipelines.evaluation.precision import (
 
 
 def rows_of(n_stops, seed=0, **options):
-    return precision(n_stops, seed, **options).run()["rows"]
+    # few stops: to start processes would take as long as several of them
+    return precision(n_stops, seed, **options).run(n_processes=1)["rows"]
 
 
 def test_the_full_sample_is_a_thousand_fits_at_each_distance_and_has_a_long_turn():
