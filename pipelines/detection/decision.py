@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from math import inf, sqrt
+from math import inf
 from statistics import median
 from typing import NamedTuple
 
@@ -18,15 +18,9 @@ from spheremark.pipelines.detection.target import Target
 from spheremark.pipelines.model import Array
 
 _TOUCHING = 0.10  # share of a ball's returns that may lie as far away beside it: mixed pixels
-_EXTENT_MIN = 0.4  # radii: one line of a scan, or a strip at its edge, shows no ball
+_EXTENT_MIN = 0.4  # radii: one line of a scan shows no ball
+_HALF_SEEN = 0.8  # radii: the returns of half a ball are as wide, but for those at its edges
 _HIDDEN = 2.0  # as many returns before a ball as on it: two thirds of it are hidden
-_SPREAD_SIGMAS = 4.0  # standard deviations of a spread: centres are estimated
-_SLACK = 0.17  # of a spread: half way to that of a ball of 60 mm, whose returns end nearer
-_N_SURE = 20  # returns that show a shape well enough to say that something hides the rest
-_SHAPE_SURE = 0.05  # of the radius: the same, of the standard deviation of the free radius
-_RADIUS_RESOLVED = 0.015  # of the radius: standard deviation of the free radius of a resolved ball
-_RADIUS_SLACK = 0.12  # of the radius: less is no reason to refuse, the fit judges it
-_FLAT_RESOLVED = 0.25  # of the curvature: what may be missing of that of a resolved ball
 _UNEXPLAINED_RESOLVED = 0.05  # share of the returns inside its outline that may be off it
 _SHADE = 0.4  # standard deviation, as a share, of one return's reflectivity: partly lit beams
 _PAINT, _PAINTS = 0.1, 0.7  # the same of markers, by range and incidence; and of all things
@@ -108,16 +102,10 @@ def _passes_first_gate(features: Features, config: ExtractionConfig, radius: flo
 
 def reason_by_features(features: Features, radius: float) -> str:
     """Return why a group is examined no further; an empty string where it is."""
-    few = inf if is_resolved(features, radius) else 1.0
     if features.height < _EXTENT_MIN * radius:
         return (
             f"Its returns lie on one line, {1e3 * features.height:.0f} mm high: nothing shows "
             "whether it is round."
-        )
-    if features.n_below > few + _TOUCHING * features.n_points:
-        return (
-            f"It does not stand on a pole: {features.n_below} returns below its outline and beside "
-            "a pole's place lie as far away, as under a rock or a head."
         )
     return ""
 
@@ -130,40 +118,17 @@ def reason_by_evidence(features: Features, evidence: Evidence, target: Target) -
             f"Most of it is hidden: {evidence.n_before} returns inside its outline lie before it, "
             f"where {evidence.n_on} lie on it."
         )
-    if evidence.silent is None and features.width < _EXTENT_MIN * target.radius:
+    if evidence.silent is None and features.width < _HALF_SEEN * target.radius:
         return (
             f"Its returns lie on a strip {1e3 * features.width:.0f} mm wide, and the scan does not "
             "show whether it looked beside it: nothing shows whether it is round."
         )
-    spread, n = _spread(evidence, target.radius)
-    if evidence.silent is None and spread < 0.5 - max(_SPREAD_SIGMAS / sqrt(12.0 * n), _SLACK):
-        seems_like = 1e3 * target.radius * sqrt(2.0 * spread)
-        return f"It is too small: its returns lie as on a sphere of radius {seems_like:.0f} mm."
     if evidence.n_carrying > max(few - 1.0 + _TOUCHING * _n_comparable(evidence), 1.0):
         return (
             f"It does not stand on a pole: {evidence.n_carrying} returns below it and beside a "
             "pole's place lie about as far away, as on shoulders, a larger stone or the ground."
         )
-    if not (evidence.is_open_below or _may_be_hidden(features, target) or few == inf):
-        n_below = evidence.n_held + evidence.n_past + evidence.n_short
-        return (
-            f"It rests on the ground: of {n_below} beams that pass below it beside a pole's "
-            f"place, {evidence.n_held + evidence.n_short} end at its distance or nearer."
-        )
     return ""
-
-
-def _spread(evidence: Evidence, radius: float) -> tuple[float, int]:
-    """Return the mean square distance at which beams on it pass the centre, in radii, and their n.
-
-    A half for a sphere of the known radius. It shows the outline where pulses without a return are
-    not known.
-    """
-    across, along, depth = evidence.seen / radius
-    gap = np.hypot(across, along)
-    is_on = (gap < 1.0 + evidence.blur.max() / radius) & (along > -0.9) & (abs(depth + 0.5) < 0.8)
-    n = int(is_on.sum())
-    return float(np.mean(gap[is_on] ** 2)) if n else 0.5, max(n, 1)
 
 
 def _n_comparable(evidence: Evidence) -> float:
@@ -173,11 +138,6 @@ def _n_comparable(evidence: Evidence) -> float:
     """
     n_seen = evidence.n_held + evidence.n_past
     return evidence.n_aimed * n_seen / max(n_seen + evidence.n_short, 1)
-
-
-def _may_be_hidden(features: Features, target: Target) -> bool:
-    """Return whether the shape is so clear that the lower half may be hidden."""
-    return features.n_points >= _N_SURE and features.sigma_radius < _SHAPE_SURE * target.radius
 
 
 def paint_of(groups: Sequence[Evidence], probabilities: Sequence[float]) -> tuple[Array, list[str]]:
@@ -345,9 +305,6 @@ def is_resolved(features: Features, radius: float) -> bool:
     """Return whether the shape is so clear that the sphere need not stand free to be accepted."""
     return (
         features.n_points >= N_RESOLVED
-        and features.scatter_free < RESOLUTION * radius
-        and features.sigma_radius < _RADIUS_RESOLVED * radius
-        and abs(features.radius_free - radius) < _RADIUS_SLACK * radius
-        and max(abs(features.flat_across), abs(features.flat_along)) < _FLAT_RESOLVED
+        and features.scatter < RESOLUTION * radius
         and features.n_unexplained <= _UNEXPLAINED_RESOLVED * features.n_points
     )

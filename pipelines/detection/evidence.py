@@ -46,7 +46,6 @@ _ON = (-1.3, 0.3)  # radii of depth within which a return may lie on the sphere
 _PLACE = 0.1  # radii: beams nearer to each other than this pass at the same place
 _MEAN_WIDTH = 0.75  # of the greater half width of a beam: in any direction
 _TINY = 1e-6
-_OBSTRUCTED = 3.0  # ratio of beams below it that end nearer to those that go past
 _UNKNOWN = Hearing(lost=1.0, weakest=0.0)
 
 _Groups = tuple[NDArray[np.int64], NDArray[np.int32]]  # start of each group, and the members
@@ -107,15 +106,6 @@ class Evidence(NamedTuple):
     blur: Array
     height: float = np.nan
     sigma_height: float = np.inf
-
-    @property
-    def is_open_below(self) -> bool:
-        """Whether most beams below it and beside the pole go past it.
-
-        Beams that end nearer count for neither; if they are three in four, it is not open.
-        """
-        n_nearer_max = _OBSTRUCTED * (1 + self.n_past)
-        return self.n_carrying <= 1 + self.n_past and self.n_short <= n_nearer_max
 
     @property
     def shows_below(self) -> bool:

@@ -1,7 +1,6 @@
 """Features of a group of returns, measured against a sphere of the known radius.
 
-Mean shift of a disc finds the place; robust fits along the beams with known radius, with free
-radius and with missing curvature measure the shape.
+Mean shift of a disc finds the place; a robust fit along the beams measures the shape.
 """
 
 from __future__ import annotations
@@ -22,29 +21,27 @@ from spheremark.pipelines.detection.neighbourhoods import (
 )
 from spheremark.pipelines.detection.seeds import thinned
 from spheremark.pipelines.detection.target import Target, View, blur_at, passing, seen_from, view_of
-from spheremark.pipelines.estimation.linear_algebra import invert
+from spheremark.pipelines.estimation.linear_algebra import solve
 from spheremark.pipelines.model import Array, StitchedCloud
 from spheremark.pipelines.threads import side_by_side
 
 NOISE_MIN = 0.006
 """Scatter of any VLP-16: a smaller sample scatter is chance [m]."""
 
-RESOLUTION = 0.055
-"""Scatter, in radii, below which a shape is rounder than natural objects are."""
+RESOLUTION = 0.08
+"""Scatter, in radii, below which a shape is rounder than stones are, whose relief is as high."""
 
 N_RESOLVED = 60
 """Least number of returns of such a shape."""
 
 _CLOSE, _LOOSE = 0.04, 0.3  # radii: least and most that returns may scatter about a ball
-_N_FIT_MIN = 4  # returns: unknowns of the fit with free radius
+_N_FIT_MIN = 4  # returns: more than the unknowns of the fit
 _BACK = 1.0  # radii: what lies deeper than the back of a sphere is not what it is part of
 _N_THREADED = 20  # places from which on a second thread gains
 _N_SAMPLE = 1500  # returns in the cells about a seed that decide whether it is plausible
 _N_WHOLE = 2000  # returns there that are taken without sampling
 _NORMAL = 1.4826  # standard deviations of the normal distribution in a median deviation
 _N_STEPS = 6  # of a fit that only has to classify
-# Limits of the radius in a fit, in radii
-_KNOWN_RADIUS, _FREE_RADIUS = (1.0, 1.0), (0.3, 3.0)
 
 
 class Features(NamedTuple):
@@ -60,18 +57,10 @@ class Features(NamedTuple):
         Returns inside its limb, at about its distance, that are off the sphere.
     n_beside : int
         Returns beside and above its limb, at about its distance.
-    n_below : int
-        Returns below it and beside the pole, at about its distance or somewhat nearer.
     scatter : float
         Robust standard deviation along the beams [m].
     width, height : float
         Extent of the returns on the sphere, across and along the vertical [m].
-    radius_free, sigma_radius : float
-        Radius when it is estimated too, and its standard deviation [m].
-    scatter_free : float
-        Robust standard deviation along the beams about the sphere of that radius [m].
-    flat_across, flat_along : float
-        Share of the curvature across and along the vertical that is missing: 0 a sphere, 1 a plane.
     blur : float
         Half the width of a beam there [m].
     """
@@ -82,15 +71,9 @@ class Features(NamedTuple):
     n_points: int
     n_unexplained: int
     n_beside: int
-    n_below: int
     scatter: float
     width: float
     height: float
-    radius_free: float
-    sigma_radius: float
-    scatter_free: float
-    flat_across: float
-    flat_along: float
     blur: float
 
     @property
@@ -113,7 +96,7 @@ def measure_features(
     places = thinned(found[:, :4].copy(), 0.5 * target.radius)[:, :3]
     rows = _by_azimuth(_measured, nearby, places, target)
     return [
-        Features(*row[:3], *(int(count) for count in row[3:7]), *row[7:])
+        Features(*row[:3], *(int(count) for count in row[3:6]), *row[6:])
         for row in rows.tolist()
         if row[3]
     ]
@@ -226,21 +209,14 @@ def _count_surroundings(rays: Array, c: Array, target: Target) -> tuple[int, int
 @compiled
 def _is_resolved(rays: Array, c: Array, target: Target, every: float) -> bool:
     """Return whether a sphere fits so closely that it need not stand free to be accepted."""
-    rays, scatter, is_sample = _within(rays, c, 2.0 * target.radius), np.inf, every > 1.0
-    for step_no in range(_N_STEPS):
-        view = view_of(c, target.up)
-        seen, residuals, scatter = _residuals_about(rays, view, c, target, target.radius)
-        if step_no > is_sample and scatter > 4.0 * RESOLUTION * target.radius:
-            break  # the limit is out of reach
-        weights = _weights(seen, residuals, target.radius, blur_at(c, target), scatter)
-        N, rhs = _normal_equations(seen, residuals, weights, target.radius)
-        c = _moved(c, view, _solve_step(N[:3, :3], rhs[:3], 1e-3, 0.5 * target.radius)[0])
-    return scatter < (2.5 if is_sample else 1.5) * RESOLUTION * target.radius
+    near, limit = _within(rays, c, 2.0 * target.radius), RESOLUTION * target.radius
+    _, scatter = _fit(near, c, target, 3.0 * limit)
+    return scatter < (1.7 if every > 1.0 else 1.0) * limit
 
 
 @compiled
 def _measured(nearby: SortedReturns, places: Array, target: Target) -> Array:
-    """Return the fields of ``Features`` near places, (k, 16); zeros without a sphere there."""
+    """Return the fields of ``Features`` near places, (k, 10); zeros without a sphere there."""
     out = np.zeros((len(places), _N_FIELDS))
     for k in range(len(places)):
         rays = rays_near(nearby, runs_about(nearby, places[k]), places[k], 1.0)
@@ -252,7 +228,7 @@ def _measured(nearby: SortedReturns, places: Array, target: Target) -> Array:
 def _measure(rays: Array, start: Array, target: Target, out: Array) -> None:
     """Write the features near a place; nothing if too few returns lie on a sphere there."""
     radius = target.radius
-    c, _, _ = _fit(rays, start, target, _KNOWN_RADIUS)
+    c, _ = _fit(rays, start, target, np.inf)
     blur = blur_at(c, target)
     seen = seen_from(rays, view_of(c, target.up))
     residuals = _residuals(seen, radius)
@@ -261,19 +237,11 @@ def _measure(rays: Array, start: Array, target: Target, out: Array) -> None:
     n, rms = _weighted_rms(residuals, weights)
     if n < _N_FIT_MIN:
         return
-    noise = max(rms, NOISE_MIN)
-    c_free, radius_free, cov_free = _fit(rays, c, target, _FREE_RADIUS)
-    seen_free = seen_from(rays, view_of(c_free, target.up))
-    residuals_free = _residuals(seen_free, radius_free)
-    scatter_free = _scatter(seen_free, residuals_free, radius_free)
     out[0], out[1], out[2] = c[0], c[1], c[2]
     out[3], out[4] = n, _count_unexplained(seen, weights, radius)
-    out[5], out[6] = _count_surroundings(rays, c, target)
-    out[7], out[8], out[9] = rms, _extent(seen[0], weights), _extent(seen[1], weights)
-    out[10], out[11] = radius_free, noise * np.sqrt(cov_free[3, 3])
-    out[12] = scatter_free
-    out[13], out[14] = _flatness(seen, residuals, weights, radius)
-    out[15] = blur
+    out[5] = _count_surroundings(rays, c, target)[0]
+    out[6], out[7], out[8] = rms, _extent(seen[0], weights), _extent(seen[1], weights)
+    out[9] = blur
 
 
 @compiled
@@ -309,68 +277,47 @@ def _extent(places: Array, weights: Array) -> float:
 
 
 @compiled
-def _fit(
-    rays: Array, start: Array, target: Target, limits: tuple[float, float]
-) -> tuple[Array, float, Array]:
-    """Return the sphere's centre near a place, its radius, and the covariance for unit noise.
+def _fit(rays: Array, start: Array, target: Target, worst: float) -> tuple[Array, float]:
+    """Return the sphere's centre near a place, and the scatter about it.
 
-    The radius is estimated within limits, in radii; equal limits keep it. The prior, a third of
-    the radius on a start good to that, bounds the step of a handful of returns.
+    The prior, a third of the radius on a start good to that, bounds the step of a handful of
+    returns. It gives up where the scatter stays above the worst.
     """
-    c, radius, n = start.copy(), target.radius, 4 if limits[0] < limits[1] else 3
-    inverse = np.zeros((n, n))
-    for _ in range(_N_STEPS):
+    c, scatter = start.copy(), np.inf
+    for step_no in range(_N_STEPS):
         view = view_of(c, target.up)
-        seen, residuals, scatter = _residuals_about(rays, view, c, target, radius)
-        weights = _weights(seen, residuals, radius, blur_at(c, target), scatter)
-        N, rhs = _normal_equations(seen, residuals, weights, radius)
-        prior = (scatter / (_LOOSE * target.radius)) ** 2
-        step, inverse = _solve_step(N[:n, :n], rhs[:n], prior, 0.5 * target.radius)
-        c = _moved(c, view, step)
-        if n > 3:
-            low, high = limits[0] * target.radius, limits[1] * target.radius
-            radius = min(max(radius + step[3], low), high)
-    return c, radius, inverse
+        seen, residuals, scatter = _residuals_about(rays, view, c, target)
+        if step_no > 1 and scatter > worst:
+            break
+        weights = _weights(seen, residuals, target.radius, blur_at(c, target), scatter)
+        N, step = _normal_equations(seen, residuals, weights, target.radius)
+        for j in range(3):
+            N[j, j] += (scatter / (_LOOSE * target.radius)) ** 2
+        solve(N, step)
+        c = _moved(c, view, step, 0.5 * target.radius)
+    return c, scatter
 
 
 @compiled
 def _residuals_about(
-    rays: Array, view: View, c: Array, target: Target, radius: float
+    rays: Array, view: View, c: Array, target: Target
 ) -> tuple[Array, Array, float]:
     """Return how beams pass a sphere within its limb, their residuals, and the scatter."""
-    seen = _about(rays, view, radius + blur_at(c, target))
-    residuals = _residuals(seen, radius)
-    return seen, residuals, _scatter(seen, residuals, radius)
+    seen = _about(rays, view, target.radius + blur_at(c, target))
+    residuals = _residuals(seen, target.radius)
+    return seen, residuals, _scatter(seen, residuals, target.radius)
 
 
 @compiled
-def _moved(c: Array, view: View, step: Array) -> Array:
-    """Return a centre after a step across, up and away from the sensor."""
+def _moved(c: Array, view: View, step: Array, longest: float) -> Array:
+    """Return a centre after a step across, up and away from the sensor, at most the longest."""
     moved = c.copy()
+    share = min(1.0, longest / (np.sqrt(step @ step) + 1e-12))
     distance = np.sqrt(c[0] ** 2 + c[1] ** 2 + c[2] ** 2)
     for axis in range(3):
-        moved[axis] += step[0] * view.across[axis] + step[1] * view.up[axis]
-        moved[axis] += step[2] * c[axis] / distance
+        aside = step[0] * view.across[axis] + step[1] * view.up[axis]
+        moved[axis] += share * (aside + step[2] * c[axis] / distance)
     return moved
-
-
-@compiled
-def _solve_step(N: Array, rhs: Array, prior: float, longest: float) -> tuple[Array, Array]:
-    """Return the step, at most the longest, and the inverse normal matrix.
-
-    The prior is the weight of each unknown being zero.
-    """
-    n = len(rhs)
-    inverse, step, length2 = N.copy(), np.zeros(n), 0.0
-    for i in range(n):
-        inverse[i, i] += prior
-    invert(inverse, inverse)
-    for i in range(n):
-        for j in range(n):
-            step[i] += inverse[i, j] * rhs[j]
-        length2 += step[i] * step[i]
-    step *= min(1.0, longest / (np.sqrt(length2) + 1e-12))
-    return step, inverse
 
 
 @compiled
@@ -408,61 +355,26 @@ def _residuals(seen: Array, radius: float) -> Array:
     return residuals
 
 
-@compiled
-def _slopes(x: float, y: float, radius: float) -> tuple[float, float, float]:
-    """Return the derivatives of a residual by the centre across and up, and by the radius."""
-    h2 = radius * radius - x * x - y * y
-    # the footprint bounds the slope at the limb
-    steep = max(np.sqrt(max(h2, 0.0)), 0.25 * radius)
-    share = 1.0 / steep if h2 > 0.0 else 0.0
-    return -x * share, -y * share, -radius * share
-
-
 @compiled_with(fastmath=REASSOCIATED)
 def _normal_equations(
     seen: Array, residuals: Array, weights: Array, radius: float
 ) -> tuple[Array, Array]:
-    """Return normal matrix and right-hand side of centre across, up, along the beam, and radius."""
-    aa, ab, ac, ad, bb, bc, bd, cc, cd, dd = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
-    pa, pb, pc, pd = 0.0, 0.0, 0.0, 0.0
+    """Return normal matrix and right-hand side of the centre across, up, and along the beam."""
+    aa, ab, ac, bb, bc, cc, pa, pb, pc = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
     for i in range(len(weights)):
-        w, r = weights[i], weights[i] * residuals[i]
-        a, b, d = _slopes(seen[0, i], seen[1, i], radius)
-        aa, ab, ac, ad = aa + w * a * a, ab + w * a * b, ac + w * a, ad + w * a * d
-        bb, bc, bd = bb + w * b * b, bc + w * b, bd + w * b * d
-        cc, cd, dd = cc + w, cd + w * d, dd + w * d * d
-        pa, pb, pc, pd = pa + r * a, pb + r * b, pc + r, pd + r * d
-    N, rhs = np.empty((4, 4)), np.empty(4)  # filled by element: rows take a second to compile
-    N[0, 0], N[0, 1], N[0, 2], N[0, 3] = aa, ab, ac, ad
-    N[1, 0], N[1, 1], N[1, 2], N[1, 3] = ab, bb, bc, bd
-    N[2, 0], N[2, 1], N[2, 2], N[2, 3] = ac, bc, cc, cd
-    N[3, 0], N[3, 1], N[3, 2], N[3, 3] = ad, bd, cd, dd
-    rhs[0], rhs[1], rhs[2], rhs[3] = pa, pb, pc, pd
+        w, r, x, y = weights[i], weights[i] * residuals[i], seen[0, i], seen[1, i]
+        h2 = radius * radius - x * x - y * y
+        # the footprint bounds the slope at the limb
+        share = -1.0 / max(np.sqrt(max(h2, 0.0)), 0.25 * radius) if h2 > 0.0 else 0.0
+        a, b = share * x, share * y
+        aa, ab, ac = aa + w * a * a, ab + w * a * b, ac + w * a
+        bb, bc, cc = bb + w * b * b, bc + w * b, cc + w
+        pa, pb, pc = pa + r * a, pb + r * b, pc + r
+    N, rhs = np.empty((3, 3)), np.empty(3)  # filled by element: rows take a second to compile
+    N[0, 0], N[0, 1], N[0, 2], N[1, 1], N[1, 2], N[2, 2] = aa, ab, ac, bb, bc, cc
+    N[1, 0], N[2, 0], N[2, 1] = ab, ac, bc
+    rhs[0], rhs[1], rhs[2] = pa, pb, pc
     return N, rhs
-
-
-@compiled
-def _flatness(seen: Array, residuals: Array, weights: Array, radius: float) -> tuple[float, float]:
-    """Return the shares of the curvatures across and along the vertical that are missing."""
-    N, rhs, J, across, along = np.zeros((5, 5)), np.zeros(5), np.zeros(5), 0.0, 0.0
-    for j in range(5):
-        N[j, j] = 1e-6
-    for i in range(len(weights)):
-        if weights[i] > 0.0:
-            x, y = seen[0, i], seen[1, i]
-            half = np.sqrt(max(radius * radius - x * x - y * y, 0.0))
-            J[0], J[1], _ = _slopes(x, y, radius)
-            J[2] = 1.0
-            J[3] = half - np.sqrt(radius * radius - y * y) if half > 0.0 else 0.0
-            J[4] = half - np.sqrt(radius * radius - x * x) if half > 0.0 else 0.0
-            for j in range(5):
-                rhs[j] += weights[i] * J[j] * residuals[i]
-                for k in range(5):
-                    N[j, k] += weights[i] * J[j] * J[k]
-    invert(N, N)
-    for k in range(5):
-        across, along = across + N[3, k] * rhs[k], along + N[4, k] * rhs[k]
-    return across, along
 
 
 @compiled
