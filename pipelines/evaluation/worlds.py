@@ -67,8 +67,10 @@ CLASSES = (
     f"{N_FEW} to {N_MANY - 1} returns, half visible",
     f"{N_FEW} returns or more, on one scan line",
     "fewer returns, or mostly hidden",
+    f"on the ground, {N_FEW} returns or more",
 )
-"""Classes of markers by returns and visible share; the first two lie on two scan lines or more."""
+"""Classes of markers by returns and visible share; the first two stand on poles, and lie on two
+scan lines or more, as do the last."""
 
 PROBABILITIES = (0.01, 0.1, 0.5, 0.9, 0.99, 0.999, 0.9999, 1.0)
 """Edges of the classes of probability for which its calibration is shown."""
@@ -85,6 +87,7 @@ _METHOD, _RESECTION = "along_beam", "free_station"
 _MEAN_DEPTH = 2.0 / 3.0  # of a sphere's radius: mean height of its surface over its disc
 _NEAREST_MATCH = 0.06  # [m] at the least, within which a candidate is at a marker
 _DECOY_REACH = 0.1  # [m] beyond a decoy and a marker's radius, within which a false one is at it
+_ON_GROUND = 0.1  # [m] above the ground that the lowest point of a marker lies that is on no pole
 _NOWHERE = "ground, scattered rocks"
 
 
@@ -264,13 +267,17 @@ def _rows(tags: NDArray[np.float32]) -> Index:
 
 
 def _class_of(scan: Scan, mark: int) -> str:
-    """Return the class of a marker by its true returns, lines and visible share."""
+    """Return the class of a marker by its true returns, lines, visible share and stance."""
     n, n_lines = scan.stop.counts[mark]
     about, name = scan.truth.about, scan.world.field.marks.names[mark]
     if about["visible_shares"][scan.stop.truth.name][name] < HALF or n < N_FEW:
         return CLASSES[3]
     if n_lines < N_LINES:
         return CLASSES[2]
+    field = scan.world.field
+    place, radius = field.marks.p_site[mark], field.marker_radius
+    if float(place[2] - field.terrain.height_at(place)) < radius + _ON_GROUND:
+        return CLASSES[4]
     return CLASSES[0] if n >= N_MANY else CLASSES[1]
 
 

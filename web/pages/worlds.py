@@ -12,7 +12,7 @@ from spheremark.web.figures.elements import add_line, add_points, blank_figure
 from spheremark.web.pages.base import Frame, Panel
 from spheremark.web.templating import render
 
-_COLOURS = (theme.OURS, theme.PAPER, theme.TEXT, theme.TOLERANCE)
+_COLOURS = (theme.OURS, theme.PAPER, theme.TEXT, theme.TOLERANCE, theme.GREEN)
 _CURVE = (
     "Share of markers found against false markers in a scan, as the level of decision falls. "
     "Diamonds: the markers that are called ok."

@@ -25,9 +25,9 @@ from spheremark.pipelines.evaluation.worlds import (
     worlds,
 )
 from spheremark.pipelines.geometry import rot_z
-from spheremark.pipelines.simulation.worlds import family_of
+from spheremark.pipelines.simulation.worlds import draw_world, family_of
 
-MANY, FEW, ONE_LINE, _ = CLASSES
+MANY, FEW, ONE_LINE, _, LYING = CLASSES
 
 
 def centre(error, sigma=1.0, status="ok", bound2=1.0, anew=1.0):
@@ -249,6 +249,9 @@ def test_a_world_is_scanned_and_scored_with_its_peers():
     many = row(report, "markers", "class", MANY)
     assert many["n"] >= 4
     assert many["n_ok"] >= many["n"] - 1
+    marks, ground = draw_world(seed).field.marks.p_site, draw_world(seed).field.terrain
+    heights = marks[:, 2] - ground.height_at(marks) - draw_world(seed).field.marker_radius
+    assert (heights < 0.05).sum() == row(report, "markers", "class", LYING)["n"] == 1
     assert row(report, "methods", "method", "one")["n_false"] == 1
     (family,) = report["families"]
     # the bound knows a bias that LiDARs differ by; this one's is drawn once, and may be near zero
