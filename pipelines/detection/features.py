@@ -211,7 +211,7 @@ def _is_resolved(rays: Array, c: Array, target: Target, every: float) -> bool:
     """Return whether a sphere fits so closely that it need not stand free to be accepted."""
     near, limit = _within(rays, c, 2.0 * target.radius), RESOLUTION * target.radius
     _, scatter = _fit(near, c, target, 3.0 * limit)
-    return scatter < (1.7 if every > 1.0 else 1.0) * limit
+    return bool(scatter < (1.7 if every > 1.0 else 1.0) * limit)
 
 
 @compiled
