@@ -14,8 +14,7 @@ PYTHON ?= $(shell for v in 3.11 3.12 3.13 3.14; do command -v python$$v && exit;
 BIN := $(VENV)/bin
 KERNELS := $(shell git ls-files 'pipelines/*.py' 'storage/*.py' 2>/dev/null)
 export OPENBLAS_NUM_THREADS ?= 1
-# Three on two processors, which are idle else while tests wait for services, browsers and kills
-SIDE_BY_SIDE := --numprocesses 3 --dist loadfile --no-loadscope-reorder --max-worker-restart 0
+SIDE_BY_SIDE := --numprocesses 2 --dist loadfile --no-loadscope-reorder --max-worker-restart 0
 
 .PHONY: help setup setup-dev demo test check check-text check-types check-locks bench docs reference lock sbom clean
 
