@@ -23,6 +23,7 @@ from spheremark.pipelines.simulation import (
     recorded_time,
 )
 from spheremark.pipelines.sphere.footprint import Prediction, predict
+from spheremark.pipelines.sphere.returns import BENT
 
 N_ROWS = 16
 """Rows that each strip of a disc is cut into."""
@@ -38,6 +39,7 @@ _SHARE_MIN = 0.02  # of a footprint that makes a return
 _SOFTNESS = 0.15  # of the threshold, in the logarithm of the energy: noise at six sigma below it
 _CLOSED = 1e-6  # [rad] by which a sweep may fall short of a full turn
 _SAMPLES_MIN = 3.0  # of the angle, of a pulse between two of them on each of two faces
+_N_CORNERS = 100  # places between two joint samples where a gimbal may start
 _N_ROUNDS = 4  # in which precision and worth of the returns settle
 _DISTANCES = np.geomspace(0.5, 45.0, 55)  # [m]
 _LOST = 1e-4  # [m^2] a centre worse than this, and than six times the usual, counts as lost
@@ -182,9 +184,24 @@ class Sensor:
         return of_full_turn * (2.0 * np.pi / self.sweep)
 
     @property
+    def kept(self) -> float:
+        """Share of the pulses on a surface that count for a centre.
+
+        Some have no return. Others come where a gimbal that steps starts or stops between two joint
+        samples, and the line between these misses the angle (``errors_of_interpolation``).
+        """
+        if not self.step:
+            return 1.0 - self.drop_out
+        after = (np.arange(_N_CORNERS) + 0.5) / _N_CORNERS  # where between two samples it starts
+        reach = BENT * self.sigma_direction * self.move / self.step
+        left_out = np.maximum(1.0 / self.joint_rate - reach / after - reach / (1.0 - after), 0.0)
+        rest = self.rest_revolutions * 60.0 / self.spin_rpm
+        return (1.0 - self.drop_out) * (1.0 - 2.0 * float(left_out.mean()) / (rest + self.move))
+
+    @property
     def density(self) -> float:
         """Returns that a steradian at the horizon makes [1]."""
-        return (1.0 - self.drop_out) / (self.line_spacing * self.pulse_spacing)
+        return self.kept / (self.line_spacing * self.pulse_spacing)
 
     @property
     def is_full_turn(self) -> bool:
@@ -281,7 +298,7 @@ def _reaches(sensor: Sensor, radius: float) -> Array:
 def _density(sensor: Sensor, distance: float) -> float:
     """Return the returns per square metre of a disc at the horizon [1/m^2]."""
     spacing = sensor.line_spacing * sensor.pulse_spacing
-    return (1.0 - sensor.drop_out) / (spacing * distance**2)
+    return sensor.kept / (spacing * distance**2)
 
 
 def _disc(sensor: Sensor, radius: float, n_strips: int, distance: float) -> _Disc:
@@ -397,7 +414,7 @@ def _spread(
     worth = np.zeros((len(columns), 3, 3))
     np.add.at(worth, inverse, disc.information)
     height = 2.0 * (columns[1] - columns[0]) * len(columns) / 2.0 / (N_ROWS * _N_PER_ROW)
-    per_line = (1.0 - sensor.drop_out) * height / (distance * sensor.pulse_spacing)
+    per_line = sensor.kept * height / (distance * sensor.pulse_spacing)
     faces = np.array([_crossings(lines, columns, distance) for lines in face_lines(sensor.scan)])
     across = faces @ (worth[:, 1, 1] + worth[:, 2, 2])
     uneven = (across[0] - across[1]) / np.maximum(across.sum(axis=0), 1e-300)

@@ -13,6 +13,9 @@ from spheremark.pipelines.estimation.robust import robust_sigma
 from spheremark.pipelines.model import Array, Beams, Column, Index, Mask, Timed
 
 _THIN = 1e-6  # [m]; a thinner footprint is treated as a ray
+BENT = 2.0
+"""Standard deviations of a direction by which a gimbal that starts or stops may be off."""
+
 _POLE_BEGINS = 1.0  # radii below the centre: a footprint that begins lower is on the pole
 _POLE_HALF = 0.35  # radii from the vertical through the centre: half width of the pole's region
 _LINE = 0.01  # [s] between returns of different scan lines, at the least

@@ -216,5 +216,5 @@ def test_random_worlds_are_measured_and_kept_with_their_tables(tmp_path, monkeyp
     assert [one["family"] for one in found["families"]] == ["radius"]
     kept = json.loads((tmp_path / "worlds.json").read_text())
     assert kept["markers"] == found["markers"]
-    assert len(kept["tables"]) == 7
+    assert len(kept["tables"]) == 8
     assert (tmp_path / "worlds-families.csv").read_text().startswith("family,")

@@ -56,6 +56,7 @@ from spheremark.pipelines.sphere.occlusion import others_towards
 from spheremark.pipelines.sphere.optics import prior_sigmas
 from spheremark.pipelines.sphere.radius import other_radius
 from spheremark.pipelines.sphere.returns import (
+    BENT,
     Returns,
     errors_of_interpolation,
     n_lines,
@@ -67,7 +68,6 @@ NAME = "along_beam"
 
 _STRAY = 0.6  # radii that a centre may move from its rough place
 _N_MIN = 4  # returns: one more than unknowns
-_BENT = 2.0  # sigmas of a direction by which a gimbal that starts or stops may be off
 _BENT_SHARE = 0.5  # of a candidate's returns that may be left out for that reason
 _DOF_STOP = 100.0  # returns that the stop's noise counts for in the noise of a marker
 _FEW_INFLATION = 0.45  # variance of a centre of n returns: times 1 + this exp(-n /
@@ -173,7 +173,7 @@ def _gather(
     ends = np.cumsum([0, *(len(c.members) for c in candidates)])
     is_kept = np.isfinite(cloud.p_base[members]).all(axis=1)
     bent = errors_of_interpolation(cloud.gimbal_angles, members)
-    is_kept &= ~_too_bent(bent > _BENT * config.sigma_direction, ends)
+    is_kept &= ~_too_bent(bent > BENT * config.sigma_direction, ends)
     together, starts = members[is_kept], np.concatenate([[0], np.cumsum(is_kept)])[ends]
     table = beams(cloud, together)
     of_angles = scatter_of_angles(cloud.gimbal_angles, config.sigma_direction)
