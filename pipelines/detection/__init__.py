@@ -64,6 +64,7 @@ from spheremark.pipelines.threads import side_by_side
 __all__ = ["extract"]
 
 _MIDDLE = 0.87  # radii: incidence up to 60 degrees, as ASTM E3125-17 takes them
+_SHARP = 0.06  # radii: scatter of scanners whose returns at a limb err by more than their noise
 _POSSIBLE = 0.9  # probability from which a group that is no sure marker is a possible one
 _REJECTIONS_MAX = 200  # the most sphere-like groups that are kept with their reason
 _SIGMAS_LOG_NOISE = (0.3, 0.6)  # of one marker about the others of a scan; of a scan about a group
@@ -243,12 +244,12 @@ def _candidates(found: list[_Group], target: Target) -> tuple[MarkerCandidate, .
 def _members(features: Features, evidence: Evidence, target: Target) -> Index:
     """Return the rows on and about a sphere, ascending: its limb, and the pole that touches it.
 
-    Of a resolved sphere, only its middle: the returns at its limb, which belong partly to the
-    background, would weigh more than the noise of all the others.
+    Of a resolved sphere that noise hardly blurs, only its middle: the returns at its limb, which
+    belong partly to the background, would weigh more than the noise of all the others.
     """
     across, along, depth = evidence.seen
     reach = 1.5 * target.radius + features.blur
-    if is_resolved(features, target.radius):
+    if is_resolved(features, target.radius) and features.scatter < _SHARP * target.radius:
         reach = _MIDDLE * target.radius
     is_about = across * across + along * along < reach * reach
     is_level = (depth > -2.2 * target.radius) & (depth < 1.6 * target.radius)
