@@ -59,3 +59,16 @@ def test_without_rings_there_is_no_clock(scan):
     cloud, _, _ = scan
     bare = replace(cloud, rings=np.full(len(cloud.rings), RING_UNKNOWN, np.uint8))
     assert clock_of(bare) is None
+
+
+def test_limbs_of_markers_stay_in_the_fit_of_a_vlp16(scan):
+    cloud, places, field = scan
+    found = extract(cloud, ExtractionConfig(), field.marker_radius)
+    near = [one for one in found.candidates if len(one.members) > 100]
+    assert len(near) > 3
+    for one in near:
+        place = places[np.linalg.norm(places - one.p_base_rough, axis=1).argmin()]
+        rays = cloud.p_base[one.members].astype(np.float64)
+        rays /= np.linalg.norm(rays, axis=1, keepdims=True)
+        passing = np.linalg.norm(place - (rays @ place)[:, None] * rays, axis=1)
+        assert passing.max() > 0.97 * field.marker_radius
