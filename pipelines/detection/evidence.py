@@ -13,13 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from spheremark.pipelines.compilation import compiled
-from spheremark.pipelines.detection.cells import (
-    N_DIRECTIONS,
-    N_DIRECTIONS_SIDE,
-    Cells,
-    direction_cells,
-    rows_in,
-)
+from spheremark.pipelines.detection.cells import N_SECTORS, Cells, rows_by_cell, sector_of
 from spheremark.pipelines.detection.ground import planes_below, skin_of
 from spheremark.pipelines.detection.pulses import (
     Clock,
@@ -39,7 +33,6 @@ from spheremark.pipelines.detection.target import (
 from spheremark.pipelines.model import Array, Column, Mask, Rig, StitchedCloud
 from spheremark.pipelines.threads import side_by_side
 
-_STEP = 0.05  # [m] at most between the directions about a centre whose cells are searched
 _REACH = 4.0  # radii about a centre: shoulders lie within three radii below a head
 _HELD = (-4.0, 1.0)  # radii of depth within which a return may belong to the same object
 _ON = (-1.3, 0.3)  # radii of depth within which a return may lie on the sphere
@@ -47,8 +40,6 @@ _PLACE = 0.1  # radii: beams nearer to each other than this pass at the same pla
 _MEAN_WIDTH = 0.75  # of the greater half width of a beam: in any direction
 _TINY = 1e-6
 _UNKNOWN = Hearing(lost=1.0, weakest=0.0)
-
-_Groups = tuple[NDArray[np.int64], NDArray[np.int32]]  # start of each group, and the members
 
 
 class Evidence(NamedTuple):
@@ -126,16 +117,11 @@ def gather_evidence(
         return [], _UNKNOWN
     clock = clock_of(cloud)
     hearing = hearing_of(cloud, clock, target.up) if clock is not None else _UNKNOWN
-    reach = (_REACH + 0.5) * target.radius + 0.05
-    starts, owners = _centres_by_direction(centres, _sides(centres, reach), target.up, reach)
-    is_wanted, cones = starts[1:] > starts[:-1], _cones(centres, target)
-
-    def towards(first: int, end: int) -> _Groups:
-        rows, own = rows_in(cells.directions, is_wanted, first, end)
-        groups: _Groups = _rows_in_cones(cloud.p_base, rows, own, starts, owners, cones)
-        return groups
-
-    parts = side_by_side(towards, len(cells.directions))
+    cones = [_Cone.about(c, target) for c in centres]
+    is_met = np.zeros(N_SECTORS, np.bool_)
+    for cone in cones:
+        is_met[cone.sectors] = True
+    rows, starts = rows_by_cell(cells.sectors, is_met)
     planes = planes_below(cells, centres)
     heights = np.sum(planes[:, :3] * centres, axis=1) + planes[:, 3]
 
@@ -144,7 +130,7 @@ def gather_evidence(
             _evidence_at(
                 cloud,
                 clock,
-                np.concatenate([rows[begin[i] : begin[i + 1]] for begin, rows in parts]),
+                _rows_in_cone(cloud.p_base, rows, starts, cones[i]),
                 centres[i],
                 planes[i],
                 target,
@@ -236,11 +222,46 @@ def n_beside_pole(silent: Array, blur: float) -> int:
     return n
 
 
-def _cones(centres: Array, target: Target) -> Array:
-    """Return the cones about the centres, (k, 4): axis a, and (a . u)^2 of a unit u on the edge."""
-    distances2 = np.sum(centres**2, axis=1)
-    tangents = _REACH * target.radius / np.sqrt(distances2) + 0.5 * target.divergence
-    return np.column_stack([centres, distances2 / (1.0 + tangents**2)])
+class _Cone(NamedTuple):
+    """A cone about a centre a: (a . u)^2 of a unit u on its edge, and the sectors that it meets."""
+
+    a: Array
+    edge2: float
+    sectors: NDArray[np.int64]
+
+    @classmethod
+    def about(cls, c: Array, target: Target) -> _Cone:
+        """Return the cone of the beams that pass a centre nearby."""
+        distance, level = np.linalg.norm(c), np.hypot(c[0], c[1])
+        half = np.arctan(_REACH * target.radius / distance + 0.5 * target.divergence)
+        sectors = np.arange(N_SECTORS)
+        if np.sin(half) * distance < level:
+            azimuth, wide = np.arctan2(c[1], c[0]), np.arcsin(np.sin(half) * distance / level)
+            first, last = (
+                sector_of(np.cos(angle), np.sin(angle))
+                for angle in (azimuth - wide, azimuth + wide)
+            )
+            n = (last - first) % N_SECTORS + 3  # one more on both sides for rounding
+            sectors = (first - 1 + np.arange(min(n, N_SECTORS))) % N_SECTORS
+        return cls(c, float((distance * np.cos(half)) ** 2), sectors)
+
+
+@compiled
+def _rows_in_cone(
+    p_base: Column, rows: NDArray[np.int64], starts: NDArray[np.int64], cone: _Cone
+) -> NDArray[np.int32]:
+    """Return the rows that lie in a cone, ascending."""
+    most, n = 0, 0
+    for sector in cone.sectors:
+        most += starts[sector + 1] - starts[sector]
+    near, a, b, c = np.empty(most + 1, np.int32), cone.a[0], cone.a[1], cone.a[2]
+    for sector in cone.sectors:
+        for row in rows[starts[sector] : starts[sector + 1]]:
+            x, y, z = p_base[row, 0], p_base[row, 1], p_base[row, 2]
+            along = a * x + b * y + c * z
+            near[n] = row  # overwritten by the next one unless counted
+            n += along > 0.0 and along * along > cone.edge2 * (x * x + y * y + z * z)
+    return np.sort(near[:n])
 
 
 @compiled
@@ -296,89 +317,3 @@ def _share_inside(inside: float) -> float:
     """Return the share of a beam inside an outline that it enters by so many half widths."""
     inside = min(max(inside, -1.0), 1.0)
     return float((np.arccos(-inside) + inside * np.sqrt(1.0 - inside * inside)) / np.pi)
-
-
-@compiled
-def _rows_in_cones(
-    p_base: Column,
-    rows: NDArray[np.int32],
-    directions: NDArray[np.int32],
-    starts: NDArray[np.int64],
-    owners: NDArray[np.int32],
-    cones: Array,
-) -> _Groups:
-    """Return the rows that lie in each cone: the start of each cone's, and the rows."""
-    n = 0
-    for cell in directions:
-        n += starts[cell + 1] - starts[cell]
-    near, whose = np.empty(n + 1, np.int32), np.empty(n + 1, np.int32)
-    n = 0
-    for j in range(len(rows)):
-        row, cell = rows[j], directions[j]
-        x, y, z = p_base[row, 0], p_base[row, 1], p_base[row, 2]
-        for i in range(starts[cell], starts[cell + 1]):
-            owner = owners[i]
-            along = cones[owner, 0] * x + cones[owner, 1] * y + cones[owner, 2] * z
-            near[n], whose[n] = row, owner  # overwritten by the next one unless counted
-            n += along > 0.0 and along * along > cones[owner, 3] * (x * x + y * y + z * z)
-    groups: _Groups = _grouped(near[:n], whose[:n], len(cones))
-    return groups
-
-
-def _sides(centres: Array, reach: float) -> NDArray[np.int64]:
-    """Return the side of the lattice of directions about each centre that leaves out no cell."""
-    n_fine = 1.5 * reach * N_DIRECTIONS_SIDE / np.linalg.norm(centres, axis=1)
-    return np.asarray(2 * (2 + np.maximum(n_fine, reach / _STEP).astype(np.int64)) + 1)
-
-
-@compiled
-def _centres_by_direction(
-    centres: Array, sides: NDArray[np.int64], up: Array, reach: float
-) -> _Groups:
-    """Return the centres within reach of each cell of directions: starts, and the centres."""
-    most = 0
-    for side in sides:
-        most += min(side * side, N_DIRECTIONS)
-    owners = np.empty(most, np.int32)
-    cells = np.empty(len(owners), np.uint16)
-    latest = np.full(N_DIRECTIONS, -1, np.int64)
-    n = 0
-    for k in range(len(centres)):
-        for cell in _directions_about(centres[k], up, reach, sides[k]):
-            if latest[cell] != k:
-                latest[cell], cells[n], owners[n] = k, cell, k
-                n += 1
-    groups: _Groups = _grouped(owners[:n], cells[:n], N_DIRECTIONS)
-    return groups
-
-
-@compiled
-def _directions_about(c: Array, up: Array, reach: float, n: int) -> NDArray[np.uint16]:
-    """Return the cells of directions about a centre on a lattice, so many each way."""
-    x, y, z = up[1] * c[2] - up[2] * c[1], up[2] * c[0] - up[0] * c[2], up[0] * c[1] - up[1] * c[0]
-    scale = reach / (np.sqrt(x * x + y * y + z * z) + 1e-12)
-    v_across = (scale * x, scale * y, scale * z)
-    xyz, cells, half = np.empty((3, n), np.float32), np.empty((n, n), np.uint16), n // 2
-    for i in range(n):
-        for j in range(n):
-            for axis in range(3):
-                aside = (i - half) * v_across[axis] + (j - half) * reach * up[axis]
-                xyz[axis, j] = c[axis] + aside / half
-        direction_cells(xyz[0], xyz[1], xyz[2], cells[i])
-    return cells.reshape(-1)
-
-
-@compiled
-def _grouped(items: NDArray[np.int32], groups: NDArray[np.integer], n_groups: int) -> _Groups:
-    """Sort items by group, by counting: the start of each group, and the items."""
-    starts = np.zeros(n_groups + 2, np.int64)  # of the group before, until they have moved on
-    for group in groups:
-        starts[group + 2] += 1
-    for i in range(n_groups):
-        starts[i + 2] += starts[i + 1]
-    grouped = np.empty_like(items)
-    for i in range(len(items)):
-        group_before = groups[i] + 1
-        grouped[starts[group_before]] = items[i]
-        starts[group_before] += 1
-    return starts[:-1], grouped

@@ -12,18 +12,12 @@ import numpy as np
 
 from spheremark.pipelines.compilation import REASSOCIATED, compiled, compiled_with
 from spheremark.pipelines.detection.cells import Cells
-from spheremark.pipelines.detection.neighbourhoods import (
-    SortedReturns,
-    n_in,
-    rays_near,
-    returns_about,
-    runs_about,
-)
+from spheremark.pipelines.detection.neighbourhoods import SortedReturns, rays_near, returns_about
 from spheremark.pipelines.detection.seeds import thinned
 from spheremark.pipelines.detection.target import Target, View, blur_at, passing, seen_from, view_of
 from spheremark.pipelines.estimation.linear_algebra import solve
 from spheremark.pipelines.model import Array, StitchedCloud
-from spheremark.pipelines.threads import side_by_side
+from spheremark.pipelines.threads import by_turns
 
 NOISE_MIN = 0.006
 """Scatter of any VLP-16: a smaller sample scatter is chance [m]."""
@@ -37,9 +31,7 @@ N_RESOLVED = 60
 _CLOSE, _LOOSE = 0.04, 0.3  # radii: least and most that returns may scatter about a ball
 _N_FIT_MIN = 4  # returns: more than the unknowns of the fit
 _BACK = 1.0  # radii: what lies deeper than the back of a sphere is not what it is part of
-_N_THREADED = 20  # places from which on a second thread gains
-_N_SAMPLE = 1500  # returns in the cells about a seed that decide whether it is plausible
-_N_WHOLE = 2000  # returns there that are taken without sampling
+_N_TURN = 10  # places that a thread measures at a time
 _NORMAL = 1.4826  # standard deviations of the normal distribution in a median deviation
 _N_STEPS = 6  # of a fit that only has to classify
 
@@ -90,11 +82,21 @@ def measure_features(
 ) -> list[Features]:
     """Return the features of the groups where the discs of plausible seeds came to rest."""
     nearby = returns_about(cloud.p_base, cells, seeds, target.radius)
-    found = _by_azimuth(_rest_discs, nearby, seeds, target)
+
+    def of_all(work: Callable[..., Array], places: Array) -> Array:
+        parts = by_turns(
+            lambda first, end: work(nearby, places[first:end], target),
+            len(places),
+            size=_N_TURN,
+            threaded_from=2 * _N_TURN,
+        )
+        return np.concatenate(parts)
+
+    found = of_all(_rest_discs, seeds)
     found = found[(found[:, 3] >= _N_FIT_MIN) & (found[:, 4] > 0.0)]
     found = found[np.lexsort((found[:, 2], found[:, 1], found[:, 0], -found[:, 3]))]
     places = thinned(found[:, :4].copy(), 0.5 * target.radius)[:, :3]
-    rows = _by_azimuth(_measured, nearby, places, target)
+    rows = of_all(_measured, places)
     return [
         Features(*row[:3], *(int(count) for count in row[3:6]), *row[6:])
         for row in rows.tolist()
@@ -102,60 +104,26 @@ def measure_features(
     ]
 
 
-def _by_azimuth(
-    work: Callable[[SortedReturns, Array, Target], Array],
-    nearby: SortedReturns,
-    places: Array,
-    target: Target,
-) -> Array:
-    """Measure at all places, alternating between threads by azimuth: neighbours share returns."""
-    n, by_azimuth = len(places), np.argsort(np.arctan2(places[:, 1], places[:, 0]))
-    dealt = np.concatenate([by_azimuth[0::2], by_azimuth[1::2]])
-    mine = places[dealt]
-    parts = side_by_side(
-        lambda first, end: work(nearby, mine[first:end], target), n, threaded_from=_N_THREADED
-    )
-    rows = np.concatenate(parts)
-    found = np.empty_like(rows)
-    found[dealt] = rows
-    return found
-
-
 @compiled
 def _rest_discs(nearby: SortedReturns, seeds: Array, target: Target) -> Array:
-    """Return where the seeds' discs came to rest, their returns, and 1 if plausible, (k, 5).
-
-    Where returns are many, a sample of them is tested first.
-    """
+    """Return where the seeds' discs came to rest, their returns, and 1 if plausible, (k, 5)."""
     out = np.zeros((len(seeds), 5))
     for k in range(len(seeds)):
-        runs = runs_about(nearby, seeds[k])
-        n = n_in(runs)
-        if n > _N_WHOLE:
-            every = n / _N_SAMPLE
-            rays = rays_near(nearby, runs, seeds[k], every)
-            if not _rest_disc(rays, seeds[k], target, every)[2]:
-                continue
-        c, n, is_plausible = _rest_disc(
-            rays_near(nearby, runs, seeds[k], 1.0), seeds[k], target, 1.0
-        )
+        c, n, is_plausible = _rest_disc(rays_near(nearby, seeds[k]), seeds[k], target)
         out[k, 0], out[k, 1], out[k, 2], out[k, 3], out[k, 4] = c[0], c[1], c[2], n, is_plausible
     return out
 
 
 @compiled
-def _rest_disc(rays: Array, seed: Array, target: Target, every: float) -> tuple[Array, int, bool]:
+def _rest_disc(rays: Array, seed: Array, target: Target) -> tuple[Array, int, bool]:
     """Return where a seed's disc comes to rest, the returns in it, and whether it is plausible.
 
-    Plausible is a free sphere or a resolved one. ``every`` is the number of returns per sampled
-    one; a sample is tested with room for its chance.
+    Plausible is a free sphere or a resolved one.
     """
     c, n = _mean_shift(rays, seed, target.up, target.radius)
     n_beside, n_below = _count_surroundings(rays, c, target)
-    n_about = n_beside + n_below
-    room = 2.0 * np.sqrt(n + n_about) if every > 1.0 else 0.0
-    is_free = n_about <= 2.0 + 0.6 * n + room
-    return c, n, is_free or (n * every >= N_RESOLVED and _is_resolved(rays, c, target, every))
+    is_free = n_beside + n_below <= 2.0 + 0.6 * n
+    return c, n, is_free or (n >= N_RESOLVED and _is_resolved(rays, c, target))
 
 
 @compiled_with(fastmath=REASSOCIATED)
@@ -207,11 +175,11 @@ def _count_surroundings(rays: Array, c: Array, target: Target) -> tuple[int, int
 
 
 @compiled
-def _is_resolved(rays: Array, c: Array, target: Target, every: float) -> bool:
+def _is_resolved(rays: Array, c: Array, target: Target) -> bool:
     """Return whether a sphere fits so closely that it need not stand free to be accepted."""
     near, limit = _within(rays, c, 2.0 * target.radius), RESOLUTION * target.radius
     _, scatter = _fit(near, c, target, 3.0 * limit)
-    return bool(scatter < (1.7 if every > 1.0 else 1.0) * limit)
+    return bool(scatter < limit)
 
 
 @compiled
@@ -219,7 +187,7 @@ def _measured(nearby: SortedReturns, places: Array, target: Target) -> Array:
     """Return the fields of ``Features`` near places, (k, 10); zeros without a sphere there."""
     out = np.zeros((len(places), _N_FIELDS))
     for k in range(len(places)):
-        rays = rays_near(nearby, runs_about(nearby, places[k]), places[k], 1.0)
+        rays = rays_near(nearby, places[k])
         _measure(rays, places[k], target, out[k])
     return out
 

@@ -11,18 +11,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from spheremark.pipelines.compilation import compiled
-from spheremark.pipelines.detection.cells import Cells, Layout, rows_in
+from spheremark.pipelines.detection.cells import Cells, Layout, rows_by_cell
 from spheremark.pipelines.detection.ground import N_BLOCK, ground_by_block, skin_of
 from spheremark.pipelines.detection.target import rays_of
 from spheremark.pipelines.model import Array, Column, Mask
-from spheremark.pipelines.threads import side_by_side
 
 _REACH = 4.5  # radii about a seed whose returns decide whether a sphere stands free there
 
-_GOLDEN = 0.5 * (np.sqrt(5.0) - 1.0)  # its multiples are spread evenly and never in step
 _ROUNDED = 1e-4  # [m]: more than a cell's edge may be off by rounding
-
-_Rows = NDArray[np.int32]
 
 
 class SortedReturns(NamedTuple):
@@ -30,7 +26,7 @@ class SortedReturns(NamedTuple):
 
     Attributes
     ----------
-    starts : (n_side ** 2 + 2,) int32
+    starts : (n_side ** 2 + 2,)
         The returns of a cell are ``points[starts[cell]:starts[cell + 1]]``.
     points : (m, 3) float32
         The returns themselves [m].
@@ -48,7 +44,7 @@ class SortedReturns(NamedTuple):
         Height above these up to which a return is ground, and is left out [m].
     """
 
-    starts: NDArray[np.int32]
+    starts: NDArray[np.int64]
     points: Column
     n_side: int
     edge: float
@@ -63,61 +59,31 @@ def returns_about(p_base: Column, cells: Cells, seeds: Array, radius: float) -> 
     reach, layout = _REACH * radius, cells.layout
     margin = int(np.ceil(reach / layout.edge)) + 1
     is_wanted = _cells_about(layout, cells.R_station_base, seeds, margin)
-    starts, points = _sort_by_cell(p_base, cells.ground, is_wanted)
+    rows, starts = rows_by_cell(cells.ground, is_wanted)
     planes = ground_by_block(cells, seeds)
     R, skin = cells.R_station_base, skin_of(radius)
-    return SortedReturns(starts, points, layout.n_side, layout.edge, R, reach, planes, skin)
-
-
-def _sort_by_cell(
-    p_base: Column, cells: NDArray[np.int32], is_wanted: Mask
-) -> tuple[_Rows, Column]:
-    """Return the starts of some cells, and their returns by cell; those of one keep their order."""
-    parts = side_by_side(lambda first, end: rows_in(cells, is_wanted, first, end), len(p_base))
-    rows, own = (np.concatenate(columns) for columns in zip(*parts, strict=True))
-    starts = np.cumsum(np.bincount(own + 1, minlength=len(is_wanted) + 1), dtype=np.int32)
-    return starts, p_base[rows[np.argsort(own, kind="stable")]]
+    return SortedReturns(starts, p_base[rows], layout.n_side, layout.edge, R, reach, planes, skin)
 
 
 @compiled
-def runs_about(nearby: SortedReturns, c: Array) -> NDArray[np.int32]:
-    """Return the returns in the cells that may hold some within reach of a place."""
-    bottom, top = _span(nearby, nearby.R_station_base[0], c)
-    low, high = _span(nearby, nearby.R_station_base[1], c)
-    runs = np.empty((max(top + 1 - bottom, 0), 2), np.int32)
-    for k in range(len(runs)):
-        cell = (bottom + k) * nearby.n_side
-        runs[k, 0], runs[k, 1] = nearby.starts[cell + low], nearby.starts[cell + high + 1]
-    return runs
-
-
-@compiled
-def n_in(runs: NDArray[np.int32]) -> int:
-    """Return the number of returns in some runs."""
-    n = 0
-    for k in range(len(runs)):
-        n += runs[k, 1] - runs[k, 0]
-    return n
-
-
-@compiled
-def rays_near(nearby: SortedReturns, runs: NDArray[np.int32], c: Array, every: float) -> Array:
-    """Return the rays to the returns within reach of a place, or to a sample; but to no ground."""
+def rays_near(nearby: SortedReturns, c: Array) -> Array:
+    """Return the rays to the returns within reach of a place, but to no ground."""
     points, x, y, z, reach2 = nearby.points, c[0], c[1], c[2], nearby.reach**2
     plane = _plane_at(nearby, c)
     level = plane[0] * x + plane[1] * y + plane[2] * z + plane[3] - nearby.skin
-    rows, n, n_near = np.empty(int(n_in(runs) / every), np.uint32), 0, 0
-    for k in range(len(runs)):
-        n_run = int((runs[k, 1] - runs[k, 0]) / every)
-        _sample(runs[k, 0], every, rows[n : n + n_run])
-        n += n_run
-    for i in range(n):
-        row = rows[i]
-        p, q, r = points[row, 0] - x, points[row, 1] - y, points[row, 2] - z
-        rows[n_near] = row  # overwritten by the next one unless counted
-        is_above = plane[0] * p + plane[1] * q + plane[2] * r + level >= 0.0
-        n_near += (p * p + q * q + r * r < reach2) & is_above
-    rays: Array = rays_of(points, rows[:n_near])
+    bottom, top = _span(nearby, nearby.R_station_base[0], c)
+    low, high = _span(nearby, nearby.R_station_base[1], c)
+    most = 0
+    for row in range(bottom * nearby.n_side, (top + 1) * nearby.n_side, nearby.n_side):
+        most += nearby.starts[row + high + 1] - nearby.starts[row + low]
+    rows, n = np.empty(most, np.uint32), 0
+    for row in range(bottom * nearby.n_side, (top + 1) * nearby.n_side, nearby.n_side):
+        for i in range(nearby.starts[row + low], nearby.starts[row + high + 1]):
+            p, q, r = points[i, 0] - x, points[i, 1] - y, points[i, 2] - z
+            rows[n] = i  # overwritten by the next one unless counted
+            is_above = plane[0] * p + plane[1] * q + plane[2] * r + level >= 0.0
+            n += (p * p + q * q + r * r < reach2) & is_above
+    rays: Array = rays_of(points, rows[:n])
     return rays
 
 
@@ -131,15 +97,6 @@ def _plane_at(nearby: SortedReturns, c: Array) -> Array:
         min(max(row, 0), last) // N_BLOCK, min(max(column, 0), last) // N_BLOCK
     ]
     return plane
-
-
-@compiled
-def _sample(first: int, every: float, rows: NDArray[np.uint32]) -> None:
-    """Write one row of every so many of a run, at irregular steps; all of them with 1."""
-    for j in range(len(rows)):
-        aside = _GOLDEN * j
-        skipped = (j + aside - np.floor(aside)) * every if every > 1.0 else float(j)
-        rows[j] = first + np.int32(skipped)
 
 
 @compiled

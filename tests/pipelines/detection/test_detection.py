@@ -5,12 +5,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose
-from scipy import ndimage
 
 from spheremark.pipelines.config import ExtractionConfig
 from spheremark.pipelines.detection import extract
 from spheremark.pipelines.detection.cells import cells_of
-from spheremark.pipelines.detection.ground import _lowest_about, _n_about, planes_below
+from spheremark.pipelines.detection.ground import planes_below
 from spheremark.pipelines.geometry import levelling_rotation
 from spheremark.pipelines.model import RING_UNKNOWN, Levelling
 from tests.pipelines.synthetic_stop import RADIUS, World, ring_of_markers, scan
@@ -168,16 +167,3 @@ def test_an_empty_cloud_has_no_markers(cloud):
     found = extract(empty, CONFIG, RADIUS)
     assert found.candidates == ()
     assert found.rejected == ()
-
-
-@pytest.mark.parametrize("window", [1, 4])
-def test_windows_of_the_ground_are_those_of_scipy(window):
-    rng = np.random.default_rng(5)
-    heights = rng.normal(0.0, 0.1, (30, 41)).astype(np.float32)
-    heights[rng.random(heights.shape) < 0.3] = np.inf
-    size = 2 * window + 1
-    lowest = ndimage.minimum_filter(heights, size, mode="constant", cval=np.inf)
-    np.testing.assert_array_equal(_lowest_about(heights, window), lowest)
-    is_seen = heights < np.inf
-    counts = ndimage.correlate(is_seen.astype(int), np.ones((size, size), int), mode="constant")
-    np.testing.assert_array_equal(_n_about(is_seen, window), counts)
