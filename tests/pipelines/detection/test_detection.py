@@ -8,8 +8,10 @@ from numpy.testing import assert_allclose
 
 from spheremark.pipelines.config import ExtractionConfig
 from spheremark.pipelines.detection import extract
-from spheremark.pipelines.detection.cells import cells_of
+from spheremark.pipelines.detection.cells import N_SECTORS, cells_of, rows_by_cell, sector_of
+from spheremark.pipelines.detection.evidence import _Cone, _rows_in_cone
 from spheremark.pipelines.detection.ground import planes_below
+from spheremark.pipelines.detection.target import Target
 from spheremark.pipelines.geometry import levelling_rotation
 from spheremark.pipelines.model import RING_UNKNOWN, Levelling
 from tests.pipelines.synthetic_stop import RADIUS, World, ring_of_markers, scan
@@ -167,3 +169,21 @@ def test_an_empty_cloud_has_no_markers(cloud):
     found = extract(empty, CONFIG, RADIUS)
     assert found.candidates == ()
     assert found.rejected == ()
+
+
+@pytest.mark.parametrize("azimuth", [0.0, 1.0, np.pi / 2, 3.1, np.pi, -np.pi / 2, -0.003])
+@pytest.mark.parametrize("elevation", [-1.55, -0.5, 0.0, 1.2])
+def test_beams_about_a_place_are_those_of_a_search_through_all_returns(azimuth, elevation):
+    rng = np.random.default_rng(6)
+    level = np.cos(elevation)
+    c = 3.0 * np.array([level * np.cos(azimuth), level * np.sin(azimuth), np.sin(elevation)])
+    p = (c + rng.normal(0.0, 1.0, (20_000, 3))).astype(np.float32)
+    target = Target(RADIUS, np.array([0.0, 0.0, 1.0]), 0.003)
+    cone = _Cone.about(c, target)
+    own = np.array([sector_of(x, y) for x, y in p[:, :2]], np.uint16)
+    rows = _rows_in_cone(p, *rows_by_cell(own, np.ones(N_SECTORS, np.bool_)), cone)
+    along = p.astype(np.float64) @ c
+    squares = np.sum(p.astype(np.float64) ** 2, axis=1)
+    is_in = (along > 0.0) & (along**2 > cone.edge2 * squares)
+    assert 0 < is_in.sum() < len(p)
+    np.testing.assert_array_equal(rows, np.flatnonzero(is_in))
