@@ -1,7 +1,8 @@
 """The pulses about a place that no return shows: where the sky is behind, or echoes are lost.
 
 A driver drops pulses that did not return, but lasers fire by the clock: the azimuths and gimbal
-angles of some returns determine every pulse between them.
+angles of some returns determine every pulse between them. A pulse is known by the number of its
+firing times 16 plus its laser.
 """
 
 from __future__ import annotations
@@ -11,11 +12,9 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from spheremark.pipelines.compilation import compiled
 from spheremark.pipelines.detection.target import Target, view_of
-from spheremark.pipelines.model import RING_UNKNOWN, Array, Index, StitchedCloud
+from spheremark.pipelines.model import RING_UNKNOWN, Array, Index, Mask, Rig, StitchedCloud
 from spheremark.pipelines.scan.rigs import FIRING_CYCLE, FIRING_ORDER, LASER_CYCLE, N_LASERS
-from spheremark.pipelines.scan.stitching import beams
 
 _REACH = 3.0  # radii: the returns of beams that pass nearer are all known
 _DELAYS = np.argsort(FIRING_ORDER) * LASER_CYCLE  # [s] of each laser within its firing
@@ -24,7 +23,8 @@ _KNOT = 0.002  # [s] between the returns that show spin and gimbal: far less tha
 _N_KNOTS = (500, 50_000)
 _OFF_MAX = 1e-3  # [rad] a third of a beam: median by which a pulse may be misplaced
 _SLOWEST, _FASTEST = 2.0, 200.0  # [rad/s] of a spin
-_MARGIN = 0.02  # [rad] beside a place where pulses are searched: what the gimbal turns meanwhile
+_MARGIN = 0.006  # [rad] beside a place where pulses are tried: what turns within a firing
+_LEVEL = 0.9  # least cosine of the elevation of a laser
 
 _N_SAMPLES, _N_SAMPLE = 300, 100  # samples of so many returns that follow each other
 _GROUND = (0.25, 0.55)  # sines of the angles below the horizon where the ground is near
@@ -40,71 +40,45 @@ class Clock(NamedTuple):
     phase : float
         Instant of firing 0 [s].
     times, azimuths, angles : (k,)
-        Instants, increasing [s], azimuths of the spin and angles of the gimbal, unwrapped [rad].
-    spin : float
-        Rate of the azimuths [rad/s].
-    R, origin : (3, 3), (3,)
-        Mounting of the LiDAR in the head.
-    elevations, heights : (16,)
-        Of the lasers [rad], [m].
+        Instants, azimuths of the spin, both increasing, and angles of the gimbal [s], [rad].
+    rig : Rig
+        The rig, with its 16 lasers.
     """
 
     phase: float
     times: Array
     azimuths: Array
     angles: Array
-    spin: float
-    R: Array
-    origin: Array
-    elevations: Array
-    heights: Array
+    rig: Rig
 
 
 def clock_of(cloud: StitchedCloud) -> Clock | None:
     """Return the clock of a scan; None where rings or times are unknown or follow no such clock."""
-    rig, n = cloud.rig, len(cloud.p_base)
-    if len(rig.laser_elevations) != N_LASERS or n < _N_KNOTS[0]:
+    n = len(cloud.p_base)
+    if len(cloud.rig.laser_elevations) != N_LASERS or n < _N_KNOTS[0]:
         return None
     n_knots = int(np.clip(cloud.duration / _KNOT, *_N_KNOTS))
     rows = np.unique(np.linspace(0, n - 1, n_knots).astype(np.intp))
-    rings = cloud.rings[rows]
-    rows = rows[(rings != RING_UNKNOWN) & np.isfinite(cloud.p_base[rows]).all(axis=1)]
+    is_known = (cloud.rings[rows] != RING_UNKNOWN) & np.isfinite(cloud.p_base[rows]).all(axis=1)
+    times, first = np.unique(cloud.times[rows[is_known]].astype(np.float64), return_index=True)
+    rows = rows[is_known][first]
     if len(rows) < _N_KNOTS[0] // 2:
         return None
-    times = cloud.times[rows].astype(np.float64)
-    rows = rows[np.argsort(times, kind="stable")]
-    times = cloud.times[rows].astype(np.float64)
-    firings = times - _DELAYS[cloud.rings[rows]]
-    turns = np.exp(2j * np.pi * firings / FIRING_CYCLE)
-    phase = float(np.angle(turns.mean())) / (2 * np.pi) * FIRING_CYCLE
-    off = np.angle(turns * np.exp(-2j * np.pi * phase / FIRING_CYCLE)) / (2 * np.pi) * FIRING_CYCLE
-    if not np.sqrt(np.mean(off**2)) < _PHASE_MAX:
-        return None
-    azimuths = _azimuths(cloud, rows)
-    gaps, steps = np.diff(times), np.diff(azimuths) % (2 * np.pi)
-    is_close = (gaps > 0.0) & (gaps < 4.0 * _KNOT)
-    spin = float(np.median(steps[is_close] / gaps[is_close])) if is_close.any() else 0.0
-    if not _SLOWEST < spin < _FASTEST:
-        return None
-    knots = np.append(True, gaps > 0.0)
-    times, azimuths, rows = times[knots], azimuths[knots], rows[knots]
-    azimuths = _unwrapped(times, azimuths, spin)
+    turns = np.exp(2j * np.pi * (times - _DELAYS[cloud.rings[rows]]) / FIRING_CYCLE)
+    per_radian = FIRING_CYCLE / (2 * np.pi)
+    off = per_radian * np.angle(turns / turns.mean())
     angles = np.unwrap(cloud.gimbal_angles[rows].astype(np.float64))
+    azimuths, _ = _seen_from_lidar(cloud.rig, cloud.p_base[rows].T, angles)
+    gaps = np.diff(times)
+    rates = (np.diff(azimuths) % (2 * np.pi) / gaps)[gaps < 4.0 * _KNOT]
+    spin = float(np.median(rates)) if len(rates) else 0.0
+    azimuths = spin * times + np.unwrap(azimuths - spin * times)
     # every second one against its neighbours
-    off = azimuths[1:-1:2] - np.interp(times[1:-1:2], times[::2], azimuths[::2])
-    if not np.median(np.abs(off)) < _OFF_MAX:
+    misplaced = azimuths[1:-1:2] - np.interp(times[1:-1:2], times[::2], azimuths[::2])
+    is_steady = np.sqrt(np.mean(off**2)) < _PHASE_MAX and _SLOWEST < spin < _FASTEST
+    if not (is_steady and np.median(np.abs(misplaced)) < _OFF_MAX):
         return None
-    return Clock(
-        phase,
-        times,
-        azimuths,
-        angles,
-        spin,
-        rig.T_head_lidar[:3, :3].copy(),
-        rig.T_head_lidar[:3, 3].copy(),
-        rig.laser_elevations.copy(),
-        rig.laser_heights.copy(),
-    )
+    return Clock(per_radian * float(np.angle(turns.mean())), times, azimuths, angles, cloud.rig)
 
 
 def unheard_about(
@@ -112,14 +86,42 @@ def unheard_about(
 ) -> Array:
     """Return where pulses without a return pass a centre, across and up [m], and faces, (3, k).
 
-    ``rows`` are the returns about it.
+    ``rows`` are the returns about it. Once a revolution the plane of the lasers passes the centre:
+    about that instant the pulses of the lasers that point there are tried.
     """
-    rows = rows[cloud.rings[rows] < N_LASERS]
-    rings = cloud.rings[rows].astype(np.int64)
-    seconds = cloud.times[rows.astype(np.intp)] - _DELAYS[rings] - clock.phase
-    heard = np.sort(np.rint(seconds / FIRING_CYCLE).astype(np.int64) * N_LASERS + rings)
-    found: Array = _unheard(clock, _DELAYS, heard, c, target)
-    return found
+    reach = _REACH * target.radius
+    wide = np.arcsin(min(reach / float(np.linalg.norm(c)), 1.0))
+    spin = (clock.azimuths[-1] - clock.azimuths[0]) / (clock.times[-1] - clock.times[0])
+    turn = 2 * np.pi  # and before and after the scan: the place goes about the spin axis too
+    revolutions = np.arange(clock.azimuths[0] - 2 * turn, clock.azimuths[-1] + 2 * turn, turn)
+    instants = np.interp(revolutions, clock.azimuths, clock.times)
+    elevations = np.zeros(len(instants))
+    for _ in range(2):
+        angles = np.interp(instants, clock.times, clock.angles)
+        azimuths, elevations = _seen_from_lidar(clock.rig, c, angles)
+        ahead = np.unwrap(azimuths - clock.azimuths[0])
+        instants = np.interp(revolutions + ahead, clock.azimuths, clock.times)
+    wide += _MARGIN
+    aims = np.abs(elevations[:, None] - clock.rig.laser_elevations)
+    passages, rings = np.nonzero(aims < wide)
+    across = np.sqrt(wide**2 - aims[passages, rings] ** 2) / (_LEVEL * spin * FIRING_CYCLE)
+    aside = np.arange(-int(across.max(initial=0.0)), int(across.max(initial=0.0)) + 1)
+    tried, later = np.nonzero(np.abs(aside) <= across[:, None])
+    firings = np.rint((instants[passages] - clock.phase) / FIRING_CYCLE).astype(np.int64)
+    firings, rings = firings[tried] + aside[later], rings[tried]
+    v_lidar, angles, is_known = _beams(clock, firings, rings)
+    gaps = _to_lidar(clock.rig, c, angles)
+    gaps[2] -= clock.rig.laser_heights[rings]
+    along = np.sum(gaps * v_lidar, axis=0)
+    passing = along * v_lidar - gaps
+    near = np.flatnonzero(is_known & (along > 0.0) & (np.sum(passing**2, axis=0) < reach**2))
+    pulses, first = np.unique(firings[near] * N_LASERS + rings[near], return_index=True)
+    heard = _pulses(cloud, clock, rows[cloud.rings[rows] < N_LASERS].astype(np.intp))
+    found = near[first[~np.isin(pulses, heard, assume_unique=True)]]
+    view, angles = view_of(c, target.up), angles[found]
+    is_left = np.sin(angles) * c[0] < np.cos(angles) * c[1]
+    p_base = _turned(clock.rig.T_head_lidar[:3, :3] @ passing[:, found], angles)
+    return np.array([view.across @ p_base, view.up @ p_base, np.where(is_left, 0.5, -0.5)])
 
 
 class Hearing(NamedTuple):
@@ -139,157 +141,61 @@ class Hearing(NamedTuple):
 
 
 def hearing_of(cloud: StitchedCloud, clock: Clock, up: Array) -> Hearing:
-    """Return how well a scan hears its echoes, by some of its firings."""
-    starts = np.linspace(0, max(len(cloud.p_base) - _N_SAMPLE, 0), _N_SAMPLES).astype(np.intp)
-    rows = np.minimum((starts[:, None] + np.arange(_N_SAMPLE)).ravel(), len(cloud.p_base) - 1)
-    rings = np.minimum(cloud.rings[rows], N_LASERS - 1).astype(np.int64)
-    seconds = cloud.times[rows] - _DELAYS[rings] - clock.phase
-    numbers = np.rint(seconds / FIRING_CYCLE).astype(np.int64)
-    strengths = cloud.intensities[rows] / np.sum(cloud.p_base[rows] ** 2, axis=1)
-    firings = _firings_within(numbers.reshape(_N_SAMPLES, -1))
-    is_heard = np.zeros((len(firings), N_LASERS), np.bool_)
-    places = np.minimum(np.searchsorted(firings, numbers), max(len(firings) - 1, 0))
-    is_known = firings[places] == numbers if len(firings) else np.zeros(len(numbers), np.bool_)
-    is_heard[places[is_known], rings[is_known]] = True
-    directions = _directions(clock, clock.phase + firings.astype(np.float64) * FIRING_CYCLE)
-    steep = directions @ up
+    """Return how well a scan hears its echoes, by the firings after some that it heard."""
+    starts = np.linspace(0, len(cloud.p_base) - _N_SAMPLE, _N_SAMPLES).astype(np.intp)
+    rows = starts[:, None] + np.arange(_N_SAMPLE)
+    strengths = cloud.intensities[rows] / np.sum(cloud.p_base[rows] ** 2, axis=-1)
+    heard = _pulses(cloud, clock, rows.ravel()).reshape(rows.shape)
+    following = heard // N_LASERS + 1
+    tried = np.unique(following[following < following.max(axis=1, keepdims=True) - 1])
+    firings, rings = np.repeat(tried, N_LASERS), np.tile(np.arange(N_LASERS), len(tried))
+    v_lidar, angles, _ = _beams(clock, firings, rings)
+    x, y, z = _turned(clock.rig.T_head_lidar[:3, :3] @ v_lidar, angles)
+    steep = up @ (x, y, z)
     is_ground = (steep > -_GROUND[1]) & (steep < -_GROUND[0])
-    azimuths = np.arctan2(directions[is_ground, 1], directions[is_ground, 0])
-    sectors = (azimuths * _N_SECTORS / 6.2832).astype(int) + _N_SECTORS
-    n, n_heard = np.bincount(sectors), np.bincount(sectors, weights=is_heard[is_ground])
+    sectors = (np.arctan2(y, x)[is_ground] * _N_SECTORS / 6.2832).astype(int) + _N_SECTORS
+    is_heard = np.isin((firings * N_LASERS + rings)[is_ground], heard)
+    n, n_heard = np.bincount(sectors), np.bincount(sectors, weights=is_heard)
     is_shown = n >= _N_IN_SECTOR
     shares = 1.0 - n_heard[is_shown] / n[is_shown]  # by sectors: the rover hides some of the ground
     lost = float(np.median(shares)) if len(shares) > _N_SECTORS // 2 else 1.0
-    strengths = strengths[np.isfinite(strengths)]
-    return Hearing(lost, float(np.quantile(strengths, _WEAKEST)) if len(strengths) else 0.0)
+    return Hearing(lost, float(np.nanquantile(strengths, _WEAKEST)))
 
 
-def _firings_within(numbers: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Return the firings between the first and the last of each sample, (k, n), each once."""
-    begins = numbers.min(axis=1) + 1
-    order = np.argsort(begins, kind="stable")
-    begins, ends = begins[order], np.minimum(numbers.max(axis=1), begins + _N_SAMPLE)[order]
-    begins[1:] = np.maximum(begins[1:], np.maximum.accumulate(ends)[:-1])
-    return np.concatenate([np.arange(i, j) for i, j in zip(begins, ends, strict=True)])
-
-
-def _directions(clock: Clock, instants: Array) -> Array:
-    """Return the directions of all lasers at some instants in the base frame, (n, 16, 3)."""
-    azimuths = np.interp(instants, clock.times, clock.azimuths)[:, None]
-    angles = np.interp(instants, clock.times, clock.angles)[:, None]
-    c = np.cos(clock.elevations)
-    z = np.broadcast_to(np.sin(clock.elevations), (len(instants), N_LASERS))
-    v = np.stack([c * np.cos(azimuths), -c * np.sin(azimuths), z], axis=-1) @ clock.R.T
-    x = np.cos(angles) * v[..., 0] - np.sin(angles) * v[..., 1]
-    y = np.sin(angles) * v[..., 0] + np.cos(angles) * v[..., 1]
-    return np.stack([x, y, v[..., 2]], axis=-1)
-
-
-def _azimuths(cloud: StitchedCloud, rows: Index) -> Array:
-    """Return the azimuths of returns in the frame of the LiDAR, clockwise [rad]."""
-    d = beams(cloud, rows).directions_base
-    angles = cloud.gimbal_angles[rows].astype(np.float64)
-    c, s = np.cos(angles), np.sin(angles)
-    v_head = np.column_stack([c * d[:, 0] + s * d[:, 1], c * d[:, 1] - s * d[:, 0], d[:, 2]])
-    v = v_head @ cloud.rig.T_head_lidar[:3, :3]
-    return np.asarray(np.arctan2(-v[:, 1], v[:, 0]))
-
-
-@compiled
-def _unwrapped(times: Array, azimuths: Array, spin: float) -> Array:
-    """Return azimuths that grow with the spin, which is followed as it drifts."""
-    out = azimuths.copy()
-    for i in range(1, len(out)):
-        expected = out[i - 1] + spin * (times[i] - times[i - 1])
-        out[i] = azimuths[i] + 2 * np.pi * np.round((expected - azimuths[i]) / (2 * np.pi))
-    return out
-
-
-@compiled
-def _at(times: Array, values: Array, t: float) -> float:
-    """Return a value between knots; beyond them it goes on."""
-    i = min(max(int(np.searchsorted(times, t)) - 1, 0), len(times) - 2)
-    share = (t - times[i]) / (times[i + 1] - times[i])
-    return float(values[i] + share * (values[i + 1] - values[i]))
-
-
-@compiled
-def _unheard(  # noqa: C901, PLR0915  one compiled loop
-    clock: Clock, delays: Array, heard: NDArray[np.int64], c: Array, target: Target
-) -> Array:
-    """Return where pulses that were not heard pass a centre, and on which face, (3, k).
-
-    Once a revolution the plane of the lasers passes the place; about that instant each pulse is
-    tried.
-    """
-    found, n, R = np.empty((3, 256)), 0, clock.R
-    view, reach = view_of(c, target.up), _REACH * target.radius
-    distance = np.sqrt(c[0] ** 2 + c[1] ** 2 + c[2] ** 2)
-    aside = np.sqrt(clock.origin[0] ** 2 + clock.origin[1] ** 2) + np.max(np.abs(clock.heights))
-    wide = (reach + aside) / distance + _MARGIN
-    low, high = clock.elevations[0] - wide, clock.elevations[-1] + wide
-    period, sines, cosines = (
-        2 * np.pi / clock.spin,
-        np.sin(clock.elevations),
-        np.cos(clock.elevations),
+def _beams(
+    clock: Clock, firings: NDArray[np.int64], rings: NDArray[np.int64]
+) -> tuple[Array, Array, Mask]:
+    """Return directions of pulses in the frame of the LiDAR, gimbal angles, and whether known."""
+    instants = clock.phase + firings * FIRING_CYCLE + _DELAYS[rings]
+    azimuths = np.interp(instants, clock.times, clock.azimuths)
+    level, z = (f(clock.rig.laser_elevations)[rings] for f in (np.cos, np.sin))
+    return (
+        np.array([level * np.cos(azimuths), -level * np.sin(azimuths), z]),
+        np.interp(instants, clock.times, clock.angles),
+        (instants > clock.times[0]) & (instants < clock.times[-1]),
     )
-    for turn in range(int((clock.times[-1] - clock.times[0]) / period) + 1):
-        t = clock.times[0] + turn * period
-        elevation = 0.0
-        for _ in range(2):
-            angle = _at(clock.times, clock.angles, t)
-            cs, sn = np.cos(angle), np.sin(angle)
-            hx, hy = cs * c[0] + sn * c[1], cs * c[1] - sn * c[0]
-            x = R[0, 0] * hx + R[1, 0] * hy + R[2, 0] * c[2]
-            y = R[0, 1] * hx + R[1, 1] * hy + R[2, 1] * c[2]
-            z = R[0, 2] * hx + R[1, 2] * hy + R[2, 2] * c[2]
-            elevation = np.arctan2(z, np.sqrt(x * x + y * y))
-            gap = np.arctan2(-y, x) - _at(clock.times, clock.azimuths, t)
-            gap -= 2 * np.pi * np.round(gap / (2 * np.pi))
-            t += gap / clock.spin
-        if elevation < low or elevation > high:
-            continue
-        half = wide / max(np.cos(elevation), 0.1) / clock.spin
-        if t - half < clock.times[0] or t + half > clock.times[-1]:
-            continue
-        # within the passage spin and gimbal turn evenly
-        azimuth_then = _at(clock.times, clock.azimuths, t)
-        angle_then = _at(clock.times, clock.angles, t)
-        turned = _at(clock.times, clock.angles, t + half) - angle_then
-        first = int(np.floor((t - half - clock.phase) / FIRING_CYCLE))
-        last = int(np.ceil((t + half - clock.phase) / FIRING_CYCLE))
-        for number in range(first, last + 1):
-            instant = clock.phase + number * FIRING_CYCLE
-            azimuth = azimuth_then + clock.spin * (instant - t)
-            angle = angle_then + turned * (instant - t) / half
-            cs, sn = np.cos(angle), np.sin(angle)
-            ca, sa = np.cos(azimuth), np.sin(azimuth)
-            for ring in range(len(delays)):
-                if abs(clock.elevations[ring] - elevation) > wide:
-                    continue
-                key = number * len(delays) + ring
-                at = np.searchsorted(heard, key)
-                if at < len(heard) and heard[at] == key:
-                    continue
-                a = clock.spin * delays[ring]  # small: to the first order
-                x = cosines[ring] * (ca - a * sa)
-                y, z = -cosines[ring] * (sa + a * ca), sines[ring]
-                u = R[0, 0] * x + R[0, 1] * y + R[0, 2] * z
-                v = R[1, 0] * x + R[1, 1] * y + R[1, 2] * z
-                w = R[2, 0] * x + R[2, 1] * y + R[2, 2] * z
-                height = clock.heights[ring]
-                p = clock.origin[0] + height * R[0, 2]
-                q = clock.origin[1] + height * R[1, 2]
-                r = clock.origin[2] + height * R[2, 2]
-                p, q, u, v = cs * p - sn * q, sn * p + cs * q, cs * u - sn * v, sn * u + cs * v
-                along = (c[0] - p) * u + (c[1] - q) * v + (c[2] - r) * w
-                dx, dy, dz = p + along * u - c[0], q + along * v - c[1], r + along * w - c[2]
-                if along < 0.0 or dx * dx + dy * dy + dz * dz > reach * reach:
-                    continue
-                if n == found.shape[1]:
-                    found = np.concatenate((found, np.empty_like(found)), axis=1)
-                found[0, n] = dx * view.across[0] + dy * view.across[1] + dz * view.across[2]
-                found[1, n] = dx * view.up[0] + dy * view.up[1] + dz * view.up[2]
-                found[2, n] = 0.5 if sn * c[0] < cs * c[1] else -0.5
-                n += 1
-    return found[:, :n].copy()
+
+
+def _pulses(cloud: StitchedCloud, clock: Clock, rows: Index) -> NDArray[np.int64]:
+    """Return the pulses of some returns."""
+    rings = np.minimum(cloud.rings[rows], N_LASERS - 1).astype(np.int64)
+    seconds = cloud.times[rows] - _DELAYS[rings] - clock.phase
+    return np.rint(seconds / FIRING_CYCLE).astype(np.int64) * N_LASERS + rings
+
+
+def _seen_from_lidar(rig: Rig, p_base: Array, angles: Array) -> tuple[Array, Array]:
+    """Return azimuths, clockwise, and elevations of places as the LiDAR sees them [rad]."""
+    x, y, z = _to_lidar(rig, p_base, angles)
+    return np.arctan2(-y, x), np.arctan2(z, np.hypot(x, y))
+
+
+def _to_lidar(rig: Rig, p_base: Array, angles: Array) -> Array:
+    """Return places, (3, ...), in the frame of the LiDAR under some gimbal angles, (3, n)."""
+    T = rig.T_head_lidar
+    return np.asarray(T[:3, :3].T @ (_turned(p_base, -angles) - T[:3, 3:]))
+
+
+def _turned(v: Array, angles: Array) -> Array:
+    """Return some vectors, (3, ...), turned about the axis of the gimbal, (3, n)."""
+    c, s = np.cos(angles), np.sin(angles)
+    return np.array([c * v[0] - s * v[1], s * v[0] + c * v[1], np.broadcast_to(v[2], c.shape)])
