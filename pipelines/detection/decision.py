@@ -81,8 +81,8 @@ def distinct(groups: list[Features], config: ExtractionConfig, radius: float) ->
     """Return the groups that pass the first test, each once, the best first."""
     worthy = [features for features in groups if _passes_first_gate(features, config, radius)]
     worthy.sort(key=lambda features: (-_support(features), features.x, features.y))
-    places = np.array([(*features[:3], i) for i, features in enumerate(worthy)]).reshape(-1, 4)
-    return [worthy[int(i)] for i in thinned(places, 1.5 * radius)[:, 3]]
+    places = np.array([features[:3] for features in worthy]).reshape(-1, 3)
+    return [worthy[i] for i in thinned(places, 1.5 * radius)]
 
 
 def _support(features: Features) -> float:

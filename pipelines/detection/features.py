@@ -95,7 +95,7 @@ def measure_features(
     found = of_all(_rest_discs, seeds)
     found = found[(found[:, 3] >= _N_FIT_MIN) & (found[:, 4] > 0.0)]
     found = found[np.lexsort((found[:, 2], found[:, 1], found[:, 0], -found[:, 3]))]
-    places = thinned(found[:, :4].copy(), 0.5 * target.radius)[:, :3]
+    places = found[thinned(found[:, :3], 0.5 * target.radius), :3]
     rows = of_all(_measured, places)
     return [
         Features(*row[:3], *(int(count) for count in row[3:6]), *row[6:])
