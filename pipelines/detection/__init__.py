@@ -5,7 +5,7 @@
 - ``target`` is the sphere that is searched for,
 - ``cells`` sorts returns by place and direction,
 - ``ground`` separates the ground, ``seeds`` picks the places to examine,
-- ``neighbourhoods`` gathers the returns about a place, ``features`` measures their shape,
+- ``features`` measures the shape of the returns about a place,
 - ``evidence`` gathers the beams towards and about a group, ``pulses`` those without a return,
 - ``hypotheses`` compares the sphere with other shapes,
 - ``decision`` says what a group is, and how surely.
@@ -49,7 +49,7 @@ from spheremark.pipelines.detection.ground import ground_of
 from spheremark.pipelines.detection.hypotheses import NAMES, Physics, log_likelihoods
 from spheremark.pipelines.detection.pulses import Hearing
 from spheremark.pipelines.detection.seeds import find_seeds
-from spheremark.pipelines.detection.target import Target
+from spheremark.pipelines.detection.target import Target, blur_at
 from spheremark.pipelines.model import (
     Array,
     Index,
@@ -121,12 +121,13 @@ def extract(
     near = _n_neighbours(groups, marker_radius)
     passed = [i for i, reason in enumerate(reasons) if not reason]
     centres = np.array([groups[i].p_base for i in passed]).reshape(-1, 3)
-    gathered, hearing = gather_evidence(cloud, cells, centres, target)
+    gathered, hearing = gather_evidence(cloud, cells, ground, centres, target)
     evidence = dict(zip(passed, gathered, strict=True))
     for i in passed:
         reasons[i] = reason_by_evidence(groups[i], evidence[i], target)
     compared = [_Compared(groups[i], evidence[i], near[i]) for i in passed if not reasons[i]]
-    logs = _log_likelihoods(compared, noise_of(groups, target.radius), hearing, config, target)
+    noise = noise_of([one.features for one in compared], target.radius)
+    logs = _log_likelihoods(compared, noise, hearing, config, target)
     n_returns = [one.features.n_points for one in compared]
     by_shape = [judgement.probability for judgement in judged(logs, n_returns)]
     log_ratios, by_paint = paint_of([one.evidence for one in compared], by_shape)
@@ -248,7 +249,7 @@ def _members(features: Features, evidence: Evidence, target: Target) -> Index:
     belong partly to the background, would weigh more than the noise of all the others.
     """
     across, along, depth = evidence.seen
-    reach = 1.5 * target.radius + features.blur
+    reach = 1.5 * target.radius + blur_at(features.p_base, target)
     if is_resolved(features, target.radius) and features.scatter < _SHARP * target.radius:
         reach = _MIDDLE * target.radius
     is_about = across * across + along * along < reach * reach

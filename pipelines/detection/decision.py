@@ -18,10 +18,10 @@ from spheremark.pipelines.detection.target import Target
 from spheremark.pipelines.model import Array
 
 _TOUCHING = 0.10  # share of a ball's returns that may lie as far away beside it: mixed pixels
+_OFF = 0.6  # as a share of the returns on a free sphere: those off it and its pole
 _EXTENT_MIN = 0.4  # radii: one line of a scan shows no ball
 _HALF_SEEN = 0.8  # radii: the returns of half a ball are as wide, but for those at its edges
 _HIDDEN = 2.0  # as many returns before a ball as on it: two thirds of it are hidden
-_UNEXPLAINED_RESOLVED = 0.05  # share of the returns inside its outline that may be off it
 _SHADE = 0.4  # standard deviation, as a share, of one return's reflectivity: partly lit beams
 _PAINT, _PAINTS = 0.1, 0.7  # the same of markers, by range and incidence; and of all things
 _TAIL = 3.0  # degrees of freedom: of some markers the paint is dirty or in shade
@@ -96,7 +96,6 @@ def _passes_first_gate(features: Features, config: ExtractionConfig, radius: flo
         features.n_points >= config.n_points_min
         and features.scatter > 0.0
         and max(features.width, features.height) > 0.8 * radius
-        and features.n_unexplained <= features.n_points
     )
 
 
@@ -106,6 +105,12 @@ def reason_by_features(features: Features, radius: float) -> str:
         return (
             f"Its returns lie on one line, {1e3 * features.height:.0f} mm high: nothing shows "
             "whether it is round."
+        )
+    most = 2.0 + _OFF * features.n_points
+    if features.n_off > most and not is_resolved(features, radius):
+        return (
+            f"It does not stand free: {features.n_off} returns at about its distance lie on "
+            f"neither it nor a pole, where {features.n_points} lie on it."
         )
     return ""
 
@@ -196,7 +201,7 @@ def noise_of(groups: list[Features], radius: float) -> float:
         max(features.scatter, NOISE_MIN)
         for features in groups
         if features.n_points >= _N_LARGE
-        and features.n_unexplained + features.n_beside == 0
+        and features.n_off == 0
         and features.scatter < _FLAT * radius
     ]
     return median(known) if len(known) >= _N_KNOWN else float("nan")
@@ -303,8 +308,4 @@ def sure_ones(probabilities: Sequence[float], false_rate: float) -> list[bool]:
 
 def is_resolved(features: Features, radius: float) -> bool:
     """Return whether the shape is so clear that the sphere need not stand free to be accepted."""
-    return (
-        features.n_points >= N_RESOLVED
-        and features.scatter < RESOLUTION * radius
-        and features.n_unexplained <= _UNEXPLAINED_RESOLVED * features.n_points
-    )
+    return features.n_points >= N_RESOLVED and features.scatter < RESOLUTION * radius

@@ -13,8 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from spheremark.pipelines.compilation import compiled
-from spheremark.pipelines.detection.cells import N_SECTORS, Cells, rows_by_cell, sector_of
-from spheremark.pipelines.detection.ground import planes_below, skin_of
+from spheremark.pipelines.detection.cells import Cells, rows_about
+from spheremark.pipelines.detection.ground import Ground, planes_below, skin_of
 from spheremark.pipelines.detection.pulses import (
     Clock,
     Hearing,
@@ -26,7 +26,6 @@ from spheremark.pipelines.detection.target import (
     Target,
     blur_at,
     is_beside_pole,
-    rays_of,
     seen_from,
     view_of,
 )
@@ -110,27 +109,24 @@ class Evidence(NamedTuple):
 
 
 def gather_evidence(
-    cloud: StitchedCloud, cells: Cells, centres: Array, target: Target
+    cloud: StitchedCloud, cells: Cells, ground: Ground, centres: Array, target: Target
 ) -> tuple[list[Evidence], Hearing]:
     """Return the beams towards and about some centres, and how well the scan hears its echoes."""
     if not len(centres):
         return [], _UNKNOWN
     clock = clock_of(cloud)
     hearing = hearing_of(cloud, clock, target.up) if clock is not None else _UNKNOWN
-    cones = [_Cone.about(c, target) for c in centres]
-    is_met = np.zeros(N_SECTORS, np.bool_)
-    for cone in cones:
-        is_met[cone.sectors] = True
-    rows, starts = rows_by_cell(cells.sectors, is_met)
-    planes = planes_below(cells, centres)
+    planes = planes_below(ground, cells, centres)
     heights = np.sum(planes[:, :3] * centres, axis=1) + planes[:, 3]
+
+    reach = _REACH * target.radius
 
     def gathered(first: int, end: int) -> list[Evidence]:
         return [
             _evidence_at(
                 cloud,
                 clock,
-                _rows_in_cone(cloud.p_base, rows, starts, cones[i]),
+                np.sort(rows_about(cloud.p_base, cells, centres[i], reach, np.inf)),
                 centres[i],
                 planes[i],
                 target,
@@ -222,48 +218,6 @@ def n_beside_pole(silent: Array, blur: float) -> int:
     return n
 
 
-class _Cone(NamedTuple):
-    """A cone about a centre a: (a . u)^2 of a unit u on its edge, and the sectors that it meets."""
-
-    a: Array
-    edge2: float
-    sectors: NDArray[np.int64]
-
-    @classmethod
-    def about(cls, c: Array, target: Target) -> _Cone:
-        """Return the cone of the beams that pass a centre nearby."""
-        distance, level = np.linalg.norm(c), np.hypot(c[0], c[1])
-        half = np.arctan(_REACH * target.radius / distance + 0.5 * target.divergence)
-        sectors = np.arange(N_SECTORS)
-        if np.sin(half) * distance < level:
-            azimuth, wide = np.arctan2(c[1], c[0]), np.arcsin(np.sin(half) * distance / level)
-            first, last = (
-                sector_of(np.cos(angle), np.sin(angle))
-                for angle in (azimuth - wide, azimuth + wide)
-            )
-            n = (last - first) % N_SECTORS + 3  # one more on both sides for rounding
-            sectors = (first - 1 + np.arange(min(n, N_SECTORS))) % N_SECTORS
-        return cls(c, float((distance * np.cos(half)) ** 2), sectors)
-
-
-@compiled
-def _rows_in_cone(
-    p_base: Column, rows: NDArray[np.int64], starts: NDArray[np.int64], cone: _Cone
-) -> NDArray[np.int32]:
-    """Return the rows that lie in a cone, ascending."""
-    most, n = 0, 0
-    for sector in cone.sectors:
-        most += starts[sector + 1] - starts[sector]
-    near, a, b, c = np.empty(most + 1, np.int32), cone.a[0], cone.a[1], cone.a[2]
-    for sector in cone.sectors:
-        for row in rows[starts[sector] : starts[sector + 1]]:
-            x, y, z = p_base[row, 0], p_base[row, 1], p_base[row, 2]
-            along = a * x + b * y + c * z
-            near[n] = row  # overwritten by the next one unless counted
-            n += along > 0.0 and along * along > cone.edge2 * (x * x + y * y + z * z)
-    return np.sort(near[:n])
-
-
 @compiled
 def _count_beams(
     points: Column,
@@ -279,10 +233,10 @@ def _count_beams(
     """
     radius = target.radius
     blur = blur_at(c, target) / radius
-    view, rays = view_of(c, target.up), rays_of(points, np.arange(len(points)))
-    seen = seen_from(rays, view)
+    view = view_of(c, target.up)
+    seen = seen_from(points, view)
     for i in range(len(points)):  # the beam leaves the head, not the origin of the base
-        share, x, y = seen[2, i] / rays[3, i], origins[0, i], origins[1, i]
+        share, x, y = seen[2, i] / np.sqrt(np.sum(points[i] ** 2)), origins[0, i], origins[1, i]
         seen[0, i] += share * (view.across[0] * x + view.across[1] * y)
         seen[1, i] += share * (view.up[0] * x + view.up[1] * y)
     n_on, n_before, n_distinct, below = 0, 0, 0, np.zeros((3, 2), np.int64)

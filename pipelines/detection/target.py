@@ -8,7 +8,6 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from spheremark.pipelines.compilation import compiled
 from spheremark.pipelines.model import Array, Column
@@ -63,33 +62,15 @@ def view_of(c: Array, up: Array) -> View:
 
 
 @compiled
-def rays_of(points: Column, rows: NDArray[np.integer]) -> Array:
-    """Return the rays to some returns."""
-    rays = np.empty((4, len(rows)))
-    x, y, z, distances = rays[0], rays[1], rays[2], rays[3]
-    for i in range(len(rows)):
-        x[i], y[i], z[i] = points[rows[i], 0], points[rows[i], 1], points[rows[i], 2]
-    for i in range(len(rows)):
-        distances[i] = np.sqrt(x[i] * x[i] + y[i] * y[i] + z[i] * z[i])
-        share = 1.0 / distances[i]
-        x[i], y[i], z[i] = share * x[i], share * y[i], share * z[i]
-    return rays
-
-
-@compiled
-def passing(view: View, rays: Array, i: int) -> tuple[float, float, float]:
-    """Return how far across and up a ray passes a centre, and how much deeper its return lies."""
-    x, y, z = rays[0, i], rays[1, i], rays[2, i]
-    nearest = view.x * x + view.y * y + view.z * z
-    across = nearest * (x * view.across[0] + y * view.across[1] + z * view.across[2])
-    along = nearest * (x * view.up[0] + y * view.up[1] + z * view.up[2])
-    return across, along, rays[3, i] - nearest
-
-
-@compiled
-def seen_from(rays: Array, view: View) -> Array:
-    """Return how some rays pass a centre, (3, n), as ``passing``."""
-    seen = np.empty((3, rays.shape[1]))
-    for i in range(rays.shape[1]):
-        seen[0, i], seen[1, i], seen[2, i] = passing(view, rays, i)
+def seen_from(points: Column, view: View) -> Array:
+    """Return how far across and up beams pass a centre, and how much deeper they end, (3, n)."""
+    seen = np.empty((3, len(points)))
+    for i in range(len(points)):
+        x, y, z = np.float64(points[i, 0]), np.float64(points[i, 1]), np.float64(points[i, 2])
+        distance = np.sqrt(x * x + y * y + z * z)
+        nearest = (view.x * x + view.y * y + view.z * z) / distance
+        share = nearest / distance
+        seen[0, i] = share * (x * view.across[0] + y * view.across[1] + z * view.across[2])
+        seen[1, i] = share * (x * view.up[0] + y * view.up[1] + z * view.up[2])
+        seen[2, i] = distance - nearest
     return seen

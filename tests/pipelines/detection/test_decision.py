@@ -24,8 +24,8 @@ TARGET = Target(0.10, np.array([0.0, 0.0, 1.0]), 0.003)
 def features(n_points=70, **changes):
     """A ball of the known radius 10 m away, as a VLP-16 sees it."""
     seen = Features(
-        x=10.0, y=0.0, z=0.5, n_points=n_points, n_unexplained=0, n_beside=0,
-        scatter=0.0089, width=0.2, height=0.19, blur=0.015,
+        x=10.0, y=0.0, z=0.5, n_points=n_points, n_off=0,
+        scatter=0.0089, width=0.2, height=0.19,
     )  # fmt: skip
     return seen._replace(**changes)
 

@@ -8,10 +8,8 @@ from numpy.testing import assert_allclose
 
 from spheremark.pipelines.config import ExtractionConfig
 from spheremark.pipelines.detection import extract
-from spheremark.pipelines.detection.cells import N_SECTORS, cells_of, rows_by_cell, sector_of
-from spheremark.pipelines.detection.evidence import _Cone, _rows_in_cone
-from spheremark.pipelines.detection.ground import planes_below
-from spheremark.pipelines.detection.target import Target
+from spheremark.pipelines.detection.cells import cells_of, rows_about
+from spheremark.pipelines.detection.ground import ground_of, planes_below
 from spheremark.pipelines.geometry import levelling_rotation
 from spheremark.pipelines.model import RING_UNKNOWN, Levelling
 from tests.pipelines.synthetic_stop import RADIUS, World, ring_of_markers, scan
@@ -98,7 +96,8 @@ def test_what_looks_like_a_marker_is_refused_with_a_reason(found, place, words):
 
 
 def test_heights_of_places_are_above_the_plane_of_the_ground_among_stones(cloud):
-    planes = planes_below(cells_of(cloud, CONFIG), MARKERS)
+    cells = cells_of(cloud, CONFIG)
+    planes = planes_below(ground_of(cloud, cells, CONFIG), cells, MARKERS)
     heights, sigmas = np.sum(planes[:, :3] * MARKERS, axis=1) + planes[:, 3], planes[:, 4]
     assert (np.abs(heights - (MARKERS[:, 2] - GROUND)) < 3.0 * sigmas).all()
     assert sigmas.max() < 0.2
@@ -173,17 +172,17 @@ def test_an_empty_cloud_has_no_markers(cloud):
 
 @pytest.mark.parametrize("azimuth", [0.0, 1.0, np.pi / 2, 3.1, np.pi, -np.pi / 2, -0.003])
 @pytest.mark.parametrize("elevation", [-1.55, -0.5, 0.0, 1.2])
-def test_beams_about_a_place_are_those_of_a_search_through_all_returns(azimuth, elevation):
+@pytest.mark.parametrize("deep", [0.5, np.inf])
+def test_returns_about_a_place_are_those_of_a_search_through_all(cloud, azimuth, elevation, deep):
     rng = np.random.default_rng(6)
     level = np.cos(elevation)
     c = 3.0 * np.array([level * np.cos(azimuth), level * np.sin(azimuth), np.sin(elevation)])
     p = (c + rng.normal(0.0, 1.0, (20_000, 3))).astype(np.float32)
-    target = Target(RADIUS, np.array([0.0, 0.0, 1.0]), 0.003)
-    cone = _Cone.about(c, target)
-    own = np.array([sector_of(x, y) for x, y in p[:, :2]], np.uint16)
-    rows = _rows_in_cone(p, *rows_by_cell(own, np.ones(N_SECTORS, np.bool_)), cone)
-    along = p.astype(np.float64) @ c
-    squares = np.sum(p.astype(np.float64) ** 2, axis=1)
-    is_in = (along > 0.0) & (along**2 > cone.edge2 * squares)
+    names = ("gimbal_angles", "intensities", "rings", "times")
+    some = replace(cloud, p_base=p, **{name: getattr(cloud, name)[: len(p)] for name in names})
+    rows = rows_about(p, cells_of(some, CONFIG), c, 4.0 * RADIUS, deep)
+    distances = np.linalg.norm(p.astype(np.float64), axis=1)
+    angles = np.arccos(p.astype(np.float64) @ c / (3.0 * distances))
+    is_in = (angles < np.arctan(4.0 * RADIUS / 3.0)) & (np.abs(distances - 3.0) < deep)
     assert 0 < is_in.sum() < len(p)
-    np.testing.assert_array_equal(rows, np.flatnonzero(is_in))
+    np.testing.assert_array_equal(np.sort(rows), np.flatnonzero(is_in))

@@ -73,7 +73,6 @@ def test_markers_of_a_thinned_log_are_found_though_most_pulses_seem_silent(cloud
     assert len(found.candidates) >= len(MARKERS) - 1
 
 
-@pytest.mark.xfail(reason="the size of a marker of 14 returns is not sure", strict=True)
 def test_all_markers_of_a_thinned_log_are_sure_ones(cloud):
     kept = np.random.default_rng(61).random(len(cloud.rings)) < 0.4
     thinned = replace(cloud, **{name: getattr(cloud, name)[kept] for name in COLUMNS})
