@@ -7,7 +7,9 @@
 - ``ground`` separates the ground, ``seeds`` picks the places to examine,
 - ``features`` measures the shape of the returns about a place,
 - ``evidence`` gathers the beams towards and about a group, ``pulses`` those without a return,
-- ``hypotheses`` compares the sphere with other shapes,
+- ``beams`` chooses those to compare, and describes what stands behind and beside,
+- ``shapes`` are what may stand there, ``search`` finds the likeliest of each kind,
+- ``hypotheses`` compares the sphere with the others,
 - ``decision`` says what a group is, and how surely.
 
 Works in the base frame with the levelled vertical. The sensor is taken as one point (the origin of
@@ -29,13 +31,13 @@ from spheremark.pipelines.detection.decision import (
     UNDECIDED,
     Judgement,
     distinct,
-    edges_of,
     is_resolved,
     judged,
     noise_of,
     paint_of,
     reason_by_evidence,
     reason_by_features,
+    shared_of,
     sure_ones,
 )
 from spheremark.pipelines.detection.evidence import Evidence, gather_evidence
@@ -46,9 +48,15 @@ from spheremark.pipelines.detection.features import (
     measure_features,
 )
 from spheremark.pipelines.detection.ground import ground_of
-from spheremark.pipelines.detection.hypotheses import NAMES, Physics, log_likelihoods
+from spheremark.pipelines.detection.hypotheses import (
+    SIGMAS,
+    USUAL,
+    Physics,
+    log_likelihoods,
+)
 from spheremark.pipelines.detection.pulses import Hearing
 from spheremark.pipelines.detection.seeds import find_seeds
+from spheremark.pipelines.detection.shapes import NAMES
 from spheremark.pipelines.detection.target import Target, blur_at
 from spheremark.pipelines.model import (
     Array,
@@ -187,9 +195,11 @@ def _log_likelihoods(
 ) -> Array:
     """Return the logarithms of the likelihoods of some groups by all hypotheses, (n, k).
 
-    Where beams come to hit an outline is known from the surest markers of the scan.
+    What markers have in common, as noise and where beams come to hit an outline, is known from all
+    of the scan, by how probably each is one.
     """
-    found, edges = np.empty((len(compared), len(NAMES))), np.empty((len(compared), 2))
+    n = len(compared)
+    found, shared, covs = np.empty((n, len(NAMES))), np.empty((n, 5)), np.empty((n, 5, 5))
     physics = [_physics(one.features, noise, hearing, config) for one in compared]
 
     def compare(rows: Sequence[int]) -> None:
@@ -197,18 +207,18 @@ def _log_likelihoods(
             features, evidence, n_neighbours = compared[i]
             distance = float(np.linalg.norm(features.p_base))
             level = float(features.p_base @ target.up)
-            found[i], edges[i] = log_likelihoods(
+            found[i], shared[i], covs[i] = log_likelihoods(
                 evidence, distance, level, n_neighbours, target.radius, physics[i]
             )
 
-    n = len(compared)
     side_by_side(lambda first, end: compare(range(first, end)), n, threaded_from=4)
     if n:
-        usual = physics[0].edge, physics[0].sigma_edge
-        known = edges_of(edges, found, usual)
+        n_returns = [one.features.n_points for one in compared]
+        probabilities = [one.probability for one in judged(found, n_returns)]
+        known = shared_of(shared, covs, probabilities, physics)
         physics = [
-            one._replace(edge=edge, sigma_edge=sigma)
-            for one, (edge, sigma) in zip(physics, known.tolist(), strict=True)
+            one._replace(shared=means, sigmas=sigmas)
+            for one, means, sigmas in zip(physics, *known, strict=True)
         ]
     again = np.flatnonzero(found[:, 0] > found.max(axis=1, initial=-np.inf) - UNDECIDED)
     side_by_side(lambda first, end: compare(again[first:end].tolist()), len(again), threaded_from=4)
@@ -219,11 +229,14 @@ def _physics(
     features: Features, noise: float, hearing: Hearing, config: ExtractionConfig
 ) -> Physics:
     """Return what a scan shows of its physics, at a group."""
-    if not np.isnan(noise):
-        return Physics(noise, _SIGMAS_LOG_NOISE[0], *hearing)
     least = 0.0 if features.n_points >= N_RESOLVED else NOISE_MIN
     own = min(max(features.scatter, least), config.scatter_max)
-    return Physics(own, _SIGMAS_LOG_NOISE[1], *hearing)
+    log_noise, sigma = (
+        np.log(own if np.isnan(noise) else noise),
+        _SIGMAS_LOG_NOISE[int(np.isnan(noise))],
+    )
+    means, sigmas = np.array([log_noise, *USUAL]), np.array([sigma, *SIGMAS])
+    return Physics(means, sigmas, *hearing)
 
 
 def _candidates(found: list[_Group], target: Target) -> tuple[MarkerCandidate, ...]:

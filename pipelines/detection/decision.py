@@ -12,8 +12,9 @@ import numpy as np
 from spheremark.pipelines.config import ExtractionConfig
 from spheremark.pipelines.detection.evidence import Evidence
 from spheremark.pipelines.detection.features import N_RESOLVED, NOISE_MIN, RESOLUTION, Features
-from spheremark.pipelines.detection.hypotheses import ABUNDANCE, NAMES
+from spheremark.pipelines.detection.hypotheses import ABUNDANCE, Physics
 from spheremark.pipelines.detection.seeds import thinned
+from spheremark.pipelines.detection.shapes import NAMES
 from spheremark.pipelines.detection.target import Target
 from spheremark.pipelines.model import Array
 
@@ -31,8 +32,8 @@ _N_LARGE, _N_KNOWN = 30, 3  # returns that show the noise of a scan, and groups 
 _N_LEAST, _N_MOST = 6.0, 2500.0  # returns of the farthest and of the nearest markers
 _SCATTERED = 0.5  # share of other objects that lie anywhere, and not where markers are put
 _N_PRIOR = 5.0  # places that the usual abundance of a hypothesis counts for in a scan
-_SURELY = 3.0  # logarithm of odds of a sphere that shows the optics of a scan
-_EDGE_VARIES = 0.15  # half widths of a beam, between the markers of a scan
+_VARIES = (0.13, 0.15, 0.15, 0.04, 0.02)  # of what markers of a scan share, between these
+_LEAST_INFORMATION = 1e-6
 UNDECIDED = 15.0
 """Logarithm of odds against a marker up to which it is compared again with better optics."""
 _N_ROUNDS = 10
@@ -207,33 +208,51 @@ def noise_of(groups: list[Features], radius: float) -> float:
     return median(known) if len(known) >= _N_KNOWN else float("nan")
 
 
-def edges_of(edges: Array, log_likelihoods: Array, usual: tuple[float, float]) -> Array:
-    """Return where beams come to hit an outline, and how far that may be off, for each group.
+def shared_of(
+    shown: Array, covs: Array, probabilities: Sequence[float], physics: Sequence[Physics]
+) -> tuple[Array, Array]:
+    """Return what the markers of a scan have in common, for each group as all others show it.
 
     Parameters
     ----------
-    edges : (n, 2)
-        What each shows as a sphere with the usual edge as its prior, in half widths of a beam, and
-        its standard deviation.
-    log_likelihoods : (n, k)
-        Of each by all hypotheses: those that are surely spheres show it.
-    usual : float, float
-        Usual edge and its standard deviation.
+    shown, covs : (n, 5), (n, 5, 5)
+        What each shows as a sphere, as in ``Physics``, and the covariance.
+    probabilities : sequence of float
+        That each is a marker: by as much it counts.
+    physics : sequence of Physics
+        With which these were computed.
 
     Returns
     -------
-    (n, 2)
-        Edges as all others show them, and their standard deviations.
+    (n, 5), (n, 5)
+        Means, and standard deviations that contain how far markers of a scan differ.
+
+    Notes
+    -----
+    Some of them are no markers: each counts by Student's distribution about the others, too.
     """
-    others = log_likelihoods[:, 1:].max(axis=1, initial=-inf)
-    is_sure = log_likelihoods[:, 0] > others + _SURELY
-    precision = usual[1] ** -2.0
-    own = np.maximum(edges[:, 1] ** -2.0 - precision, 1e-9)  # without the prior
-    weights = is_sure / (1.0 / own + _EDGE_VARIES**2)
-    pulls = weights * (edges[:, 0] * edges[:, 1] ** -2.0 - usual[0] * precision) / own
-    sums = precision + weights.sum() - weights
-    means = (usual[0] * precision + pulls.sum() - pulls) / sums
-    return np.column_stack([means, np.hypot(_EDGE_VARIES, sums**-0.5)])
+    means = np.array([one.shared for one in physics])
+    priors = np.array([np.diag(one.sigmas**-2.0) for one in physics])
+    n, varies = len(_VARIES), np.diag(np.array(_VARIES) ** 2)
+    own = np.linalg.inv(covs) - priors  # information of the beams alone, and what they show
+    own += _LEAST_INFORMATION * np.eye(n)
+    alone = np.linalg.solve(
+        own, np.linalg.inv(covs) @ shown[:, :, None] - priors @ means[:, :, None]
+    )
+    spreads = np.linalg.inv(own) + varies
+    every = np.linalg.inv(spreads)
+    shares = np.asarray(probabilities, np.float64)
+    counts, found, known = shares, means, np.linalg.inv(priors)
+    for _ in range(_N_ROUNDS):
+        weights = counts[:, None, None] * every
+        pulls = weights @ alone
+        known = np.linalg.inv(priors + weights.sum(axis=0) - weights)
+        sums = priors @ means[:, :, None] + pulls.sum(axis=0) - pulls
+        found = (known @ sums)[:, :, 0]
+        off = alone[:, :, 0] - found
+        squares = np.einsum("ni,nij,nj->n", off, np.linalg.inv(spreads + known), off)
+        counts = shares * (_TAIL + n) / (_TAIL + squares)
+    return found, np.sqrt(np.diagonal(known + varies, axis1=1, axis2=2))
 
 
 def judged(log_likelihoods: Array, n_returns: Sequence[int]) -> list[Judgement]:

@@ -71,6 +71,8 @@ class Evidence(NamedTuple):
         How these beams pass the centre, as from ``passing`` [m].
     faces : (m,)
         Plus or minus a half by the face of the scan that they are of.
+    strengths : (m,)
+        Reflectivity over squared range of each [1/m^2].
     silent : (3, k), optional
         Where pulses without a return pass it, across and up [m], and their face; None where times
         or rings do not show them.
@@ -92,6 +94,7 @@ class Evidence(NamedTuple):
     rows: NDArray[np.int32]
     seen: Array
     faces: Array
+    strengths: Array
     silent: Array | None
     blur: Array
     height: float = np.nan
@@ -173,6 +176,7 @@ def _evidence_at(
         rows=rows,
         seen=seen,
         faces=np.where(is_left, 0.5, -0.5),
+        strengths=cloud.intensities[rows] / np.sum(points.astype(np.float64) ** 2, axis=1),
         silent=silent,
         blur=_half_widths(cloud.rig, angles, c, target),
     )

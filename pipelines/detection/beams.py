@@ -1,0 +1,182 @@
+"""The beams about a place that are compared, and what stands behind and beside the object there.
+
+Hides which beams say most, and what happens to a beam that passes the object by. Lengths are in
+radii of the sphere that is searched for; x is across the line of sight, y up it, z along it.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from spheremark.pipelines.detection.evidence import Evidence
+from spheremark.pipelines.model import Array, Index, Mask
+
+NEAR = 3.0
+"""Depth about a centre within which a return may belong to the object there."""
+
+BELOW = -0.3
+"""Beams that pass so far below a centre are beside its pole, not beside the object."""
+
+_AROUND = 1.35  # beams that pass so far from a centre, beside half a beam, show its outline
+_LOWEST = -0.9  # anything lower may be what it stands on
+_UNDER = (0.5, -3.0)  # half width and depth below a centre where its pole or the rest of a post is
+_BESIDE = (1.2, 2.2)  # distances from a centre, beside half a beam, of beams that pass it by
+_CELL, _N_CELL = 0.1, 2  # beams that pass the same place share the errors of the model
+_N_MAX = 192  # beams that are compared: more decide nothing
+_N_SIDES, _ANY_SIDE = 12, 0.3  # sides of an object; beams on each of which nothing is known
+_N_PLANE, _ROUGH = 5, 0.1  # returns that show a plane beside it, and the least scatter about one
+_FAINT = 1e-9  # least strength of an echo
+_WIDTHS = np.linspace(-1.0, 1.0, 401)  # half widths of a beam from its middle to an outline
+_SHARES = (np.arccos(_WIDTHS) - _WIDTHS * np.sqrt(1.0 - _WIDTHS**2)) / np.pi  # of it, inside
+
+
+class Beams(NamedTuple):
+    """Beams about a place.
+
+    Attributes
+    ----------
+    x, y, z, face : (n,)
+        Where they pass it; how much deeper they end, infinite without a return; plus or minus a
+        half by the face of the scan.
+    behind : (n,)
+        Density of what happens to them when they pass the object.
+    empty : (n,)
+        Share of the beams on the same side of the object, but beside it, that are not heard.
+    even : (n,)
+        Half widths of a beam outside its outline where the echo of what stands beside it is as
+        strong as that of the object.
+    blur, blur_up : float
+        Half the width of a beam across and up.
+    lost, faintest : float
+        Share of the pulses on a surface that are not heard, and of a beam that must be on it.
+    """
+
+    x: Array
+    y: Array
+    z: Array
+    face: Array
+    behind: Array
+    empty: Array
+    even: Array
+    blur: float
+    blur_up: float
+    lost: float
+    faintest: float
+
+
+def beams_about(
+    evidence: Evidence, radius: float, strength: float, hearing: tuple[float, float]
+) -> tuple[Beams, int, int]:
+    """Return the beams that are compared, and how many beside the object end near or go past.
+
+    Parameters
+    ----------
+    evidence : Evidence
+        The beams towards and about a place.
+    radius : float
+        Of the sphere that is searched for [m].
+    strength : float
+        Reflectivity over squared range of the object [1/m^2].
+    hearing : float, float
+        ``lost`` and ``faintest`` of ``Beams``.
+    """
+    every = _every_beam(evidence, radius)
+    every = every[:, every[2] >= -NEAR]
+    x, y, z = every[:3]
+    blurs = evidence.blur / radius
+    gap, blur, is_near = np.hypot(x, y), blurs.max(), z < NEAR
+    is_beside = (gap > _BESIDE[0] + blur) & (gap < _BESIDE[1] + blur)
+    is_high = is_beside & (y > -0.5)
+    is_under = (np.abs(x) < _UNDER[0] + blurs[0]) & (y > _UNDER[1]) & (y < 0.0)
+    kept = _chosen(every, is_under | ((gap < _AROUND + blur) & (y > _LOWEST)))
+    n_near, n_past = int(np.sum(is_high & is_near)), int(np.sum(is_high & ~is_near))
+    is_low = (np.abs(x) > _UNDER[0] + blurs[0]) & (np.abs(x) < _BESIDE[1] + blurs[0])
+    is_low &= (y > _UNDER[1]) & (y < BELOW) & (gap > 1.0 + blur)
+    share_low = (np.sum(is_low & is_near) + 0.3) / (is_low.sum() + 1.3)
+    share_high = (n_near + 0.3) / (n_near + n_past + 1.3)
+    shares = np.where(y[kept] < _LOWEST, max(share_low, share_high), share_high)
+    empty, even = _beside(every[:, kept], every[:, is_beside], strength)
+    beams = Beams(
+        x=x[kept],
+        y=y[kept],
+        z=z[kept],
+        face=every[3, kept],
+        behind=_density_behind(every[:3, kept], every[:3, is_high & is_near], shares),
+        empty=empty,
+        even=even,
+        blur=blurs[0],
+        blur_up=blurs[1],
+        lost=hearing[0],
+        faintest=hearing[1],
+    )
+    return beams, n_near, n_past
+
+
+def _every_beam(evidence: Evidence, radius: float) -> Array:
+    """Return all beams: where they pass, how deep they end, face and strength of the echo."""
+    order = np.argsort(evidence.seen[0], kind="stable")  # whatever the order of the returns
+    heard = (evidence.seen / radius, evidence.faces, evidence.strengths)
+    every: Array = np.vstack(heard)[:, order]
+    if evidence.silent is None:
+        return every
+    x, y, face = evidence.silent
+    silent = (x / radius, y / radius, np.full(len(x), np.inf), face, np.zeros(len(x)))
+    return np.hstack([every, np.vstack(silent)])
+
+
+def _chosen(every: Array, is_wanted: Mask) -> Index:
+    """Return some beams: few of those that pass the same place and end alike, evenly if many."""
+    rows = np.flatnonzero(is_wanted)
+    x, y, z, face = every[:4, rows]
+    places = np.floor(np.stack([x, y]) / _CELL).astype(np.int64)
+    kinds = (places[0] * 4096 + places[1]) * 4 + 2 * (z < NEAR) + (face > 0.0)
+    _, own, counts = np.unique(kinds, return_inverse=True, return_counts=True)
+    order = np.argsort(own, kind="stable")
+    ranks = np.empty(len(rows), np.int64)
+    ranks[order] = np.arange(len(rows)) - np.repeat(np.cumsum(counts) - counts, counts)
+    rows = rows[ranks < _N_CELL]
+    n = min(len(rows), _N_MAX)
+    return np.asarray(rows[(np.arange(n) * (len(rows) / max(n, 1))).astype(np.intp)])
+
+
+def _density_behind(kept: Array, near: Array, shares: Array) -> Array:
+    """Return the density of what happens to each beam that passes the object by.
+
+    By the beams beside it: a share of them ends near, half of it on a plane through them. Low
+    down, where the ground may be near, by those beside the place of a pole.
+    """
+    density = np.full(kept.shape[1], 0.5 / NEAR)
+    if near.shape[1] > _N_PLANE:
+        x, y, z = near
+        rows = np.column_stack([np.ones(len(x)), x, y])
+        plane = np.linalg.solve(rows.T @ rows + 1e-3 * np.eye(3), rows.T @ z)
+        sigma = max(1.4826 * float(np.median(np.abs(z - rows @ plane))), _ROUGH)
+        off = (kept[2] - plane[0] - plane[1:] @ kept[:2]) / sigma
+        density = 0.5 * density + 0.5 * np.exp(-0.5 * off * off) / (sigma * np.sqrt(2.0 * np.pi))
+    return np.where(kept[2] < NEAR, shares * density, 1.0 - shares)
+
+
+def _beside(kept: Array, beside: Array, strength: float) -> tuple[Array, Array]:
+    """Return what beams show that pass the object on the same side as each: empty, and even."""
+    is_heard, own = beside[2] < np.inf, _sides(beside)
+    logs = np.log(np.maximum(beside[4] / strength, _FAINT))
+    silent, heard, logs = (
+        np.bincount(own, weights=weights, minlength=_N_SIDES)
+        for weights in (~is_heard, is_heard, logs * is_heard)
+    )
+    silent, heard, logs = (
+        sums + np.roll(sums, 1) + np.roll(sums, -1) for sums in (silent, heard, logs)
+    )
+    empty = (silent + _ANY_SIDE) / (silent + heard + 2.0 * _ANY_SIDE)
+    ratios = np.exp(logs / (heard + _ANY_SIDE))
+    even = np.interp(ratios / (1.0 + ratios), _SHARES[::-1], _WIDTHS[::-1])
+    sides = _sides(kept)
+    return empty[sides], even[sides]
+
+
+def _sides(beams: Array) -> Index:
+    """Return the side of the object on which each beam passes it."""
+    turns = np.arctan2(beams[1], beams[0]) / (2.0 * np.pi) + 0.5
+    return np.asarray((turns * _N_SIDES).astype(np.intp) % _N_SIDES)

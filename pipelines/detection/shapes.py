@@ -1,0 +1,204 @@
+"""The shapes that may stand at a place, and the likelihood of the beams about it given one.
+
+Hides surfaces, outlines, poles, and what becomes of a beam that an outline divides. Lengths are in
+radii of the sphere that is searched for; x is across the line of sight, y up it, z along it.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from spheremark.pipelines.compilation import compiled
+from spheremark.pipelines.detection.beams import NEAR, Beams
+from spheremark.pipelines.model import Array
+
+NAMES = (
+    "sphere",
+    "sphere of another radius",
+    "boulder on the ground",
+    "head on shoulders",
+    "short cylinder",
+    "post",
+    "solid of another shape",
+    "panel, edge or leaf",
+    "foliage or other clutter",
+)
+"""What may stand at a place; the first is a marker."""
+
+SPHERE, BALL, BOULDER, HEAD, CYLINDER, POST, SOLID, PANEL, CLUTTER = range(len(NAMES))
+
+# Places of the parameters of a shape: centre, at the mean depth of its surface; logarithm of the
+# noise; half widths of a beam outside an outline where half the beams hit, before an empty sky and
+# before what sends an echo of its own; logarithm of a stretch of depths; up to ten of form; the
+# place of one face of the scan against the other; logarithm of half the width of the pole
+X, Y, Z, NOISE, EDGE, STRETCH, FORM, SHIFT, POLE, N_PARAMETERS = (
+    *(0, 1, 2, 3, 4, 6, 7, 17, 20, 21),
+)
+
+MEAN = 2.0 / 3.0  # of a radius: mean height of a sphere's surface over its disc
+_POLE_FROM, _POLE_DEPTH, _POLE_SHARE = 0.8, 0.4, 0.7  # of a pole, and of its beams that it stops
+_STRAY = 0.02  # share of the returns from a surface that lie anywhere: crosstalk, dust, strays
+_MERGED = 0.6  # share of the echoes of a beam that an outline halves, between it and what is behind
+_MISPLACED = 0.01  # share of the beams on a solid surface that seem to end behind it
+_SOFT = (0.07, 0.35)  # radii, and half widths of a beam besides, over which beams come to hit
+_N_ALIKE = 1000.0  # beams that share errors of the model so that each counts as half a beam
+_FLOOR = 1e-9
+
+
+@compiled
+def _normal(off: float, sigma: float) -> float:
+    """Return the density of a normal distribution about zero."""
+    return float(np.exp(-0.5 * off * off / (sigma * sigma)) / (2.5066283 * sigma))
+
+
+@compiled
+def _inside(inner: float, blur: float, edge: float) -> float:
+    """Return the probability that a beam hits what it passes so far inside the outline of."""
+    share = min(max((inner + edge * blur) / (_SOFT[0] + _SOFT[1] * blur) + 0.5, 0.0), 1.0)
+    return share * share * (3.0 - 2.0 * share)
+
+
+@compiled
+def _round(gap: float, radius: float, blur: float) -> float:
+    """Return the mean depth of the part of a beam on a round surface."""
+    middle = gap if gap + blur < radius else 0.5 * (min(max(gap - blur, 0.0), radius) + radius)
+    return -float(np.sqrt(max(radius * radius - middle * middle, 0.0)))
+
+
+@compiled
+def _beam(shape: Array, beams: Beams, i: int) -> _Beam:
+    """Return how far outside an outline a beam comes to hit, and half its width."""
+    empty = beams.empty[i]
+    edge = empty * shape[EDGE] + (1.0 - empty) * (shape[EDGE + 1] + beams.even[i])
+    return edge, beams.blur, beams.blur_up
+
+
+@compiled
+def _unheard(share: float, beams: Beams) -> float:
+    """Return the probability that a beam that is partly on an object has no return."""
+    heard = min(max(share / beams.faintest - 0.5, 0.0), 1.0)
+    return 1.0 - heard * (1.0 - max(_MISPLACED, beams.lost))
+
+
+_Form = tuple[float, float, float, float]
+_Beam = tuple[float, float, float]  # edge, and half the width across and up
+
+
+@compiled
+def _form_of(kind: int, shape: Array) -> _Form:
+    """Return what the surface of a shape is computed with."""
+    a, b = np.exp(shape[FORM]), np.exp(shape[FORM + 1])
+    if kind <= HEAD:
+        return a, b, np.exp(shape[FORM + 2] + shape[STRETCH]), 0.0
+    if kind == CLUTTER:
+        return a, 1.0 / (1.0 + 1.0 / b), np.exp(2.0 * shape[FORM + 2]), 0.0
+    if kind == SOLID:  # as much lower than wide as its waves make it
+        return a, np.exp(shape[FORM + 4] - shape[FORM + 1]), 0.0, 0.0
+    return a, b, shape[FORM + 2], shape[FORM + 3]
+
+
+@compiled
+def _surface(
+    kind: int, x: float, y: float, shape: Array, form: _Form, beam: _Beam
+) -> tuple[float, float]:
+    """Return the share of a beam that an object stops there, and the depth."""
+    (a, b, c, d), (edge, blur_across, blur_up) = form, beam
+    if kind == SOLID:
+        share, depth = _solid(x, y, shape[FORM:SHIFT], beam)
+        return share, depth
+    if kind <= HEAD or kind == CLUTTER:
+        gap2 = x * x + y * y + _FLOOR
+        blur = np.sqrt(((blur_across * x) ** 2 + (blur_up * y) ** 2) / gap2)
+        if kind == CLUTTER:
+            return b * _inside(a - np.sqrt(gap2), blur, edge), 0.0
+        gap = np.sqrt(x * x + y * y / (b * b))
+        share = _inside((a - gap) * min(b, 1.0), blur, edge)
+        return share, c * (_round(gap, a, blur) + MEAN * a) if share > 0.0 else 0.0
+    over = b - y if kind == POST else b - abs(y)
+    share = min(_inside(a - abs(x), blur_across, edge), _inside(over, blur_up, edge))
+    if kind == PANEL:
+        return share, c * x + d * y
+    return share, _round(abs(x), a, blur_across) + MEAN * a
+
+
+@compiled
+def _solid(x: float, y: float, form: Array, beam: _Beam) -> tuple[float, float]:
+    """Return the share of a beam that a deformed sphere stops, and the depth.
+
+    Its outline has waves of two and three in a turn, its depth any tilt and curvature.
+    """
+    gap = np.sqrt(x * x + y * y + _FLOOR)
+    blur = np.sqrt((beam[1] * x) ** 2 + (beam[2] * y) ** 2) / gap
+    c, s = x / gap, y / gap
+    c2, s2 = c * c - s * s, 2.0 * s * c
+    waves = form[1] * c2 + form[2] * s2
+    waves += form[3] * (c * c2 - s * s2) + form[4] * (s * c2 + c * s2)
+    radius, ratio = np.exp(form[0]), np.exp(waves)
+    share = _inside(radius * ratio - gap, blur, beam[0])
+    if share <= 0.0:
+        return 0.0, 0.0
+    depth = _round(gap / ratio, radius, blur) + MEAN * radius + form[5] * x + form[6] * y
+    depth += form[7] * (gap * gap - 0.5) + gap * gap * (form[8] * c2 + form[9] * s2)
+    return share, depth
+
+
+@compiled
+def trust(beams: Beams) -> float:
+    """Return the information of a beam among others, as a share of its information alone."""
+    return 1.0 / (1.0 + len(beams.x) / _N_ALIKE)
+
+
+@compiled
+def log_likelihood(kind: int, shape: Array, prior: Array, beams: Beams, densities: Array) -> float:
+    """Return the logarithm of likelihood times prior density of a shape; write those of beams."""
+    total, product, log_prior = 0.0, 1.0, 0.0
+    for j in range(N_PARAMETERS):
+        if prior[1, j] > 0.0:
+            log_prior -= 0.5 * ((shape[j] - prior[0, j]) / prior[1, j]) ** 2
+    form, pole = _form_of(kind, shape), np.exp(shape[POLE])
+    variance = form[2] if kind == CLUTTER else np.exp(2.0 * shape[NOISE])
+    scale, precision = (1.0 - _STRAY) / np.sqrt(6.283185 * variance), 0.5 / variance
+    bottom = -form[1] if kind in (CYLINDER, POST) else -_POLE_FROM * form[0] * form[1]
+    pole_share = _POLE_SHARE * pole / (pole + 0.5 * beams.blur)  # a thin pole covers part of a beam
+    has_pole = prior[1, POLE] > 0.0
+    for i in range(len(beams.x)):
+        x = beams.x[i] - shape[X] - beams.face[i] * shape[SHIFT]
+        y = beams.y[i] - shape[Y] - beams.face[i] * shape[SHIFT + 1]
+        z = beams.z[i] - shape[Z] - beams.face[i] * shape[SHIFT + 2]
+        is_near = beams.z[i] < NEAR
+        rest, beam = beams.behind[i], _beam(shape, beams, i)
+        if has_pole and y < bottom:
+            share = pole_share * _inside(pole - abs(x), beams.blur, beam[0])
+            on = _normal(z - MEAN, _POLE_DEPTH) if is_near else _MISPLACED
+            if beams.z[i] == np.inf:
+                on = _unheard(share, beams)
+            rest = share * on + (1.0 - share) * rest
+        share, depth = _surface(kind, x, y, shape, form, beam)
+        if share > 0.0:
+            on = _MISPLACED
+            if is_near:
+                stray = (_STRAY + _MERGED * 4.0 * share * (1.0 - share)) / (2.0 * NEAR)
+                on = stray + scale * np.exp(-precision * (z - depth) ** 2)
+            elif beams.z[i] == np.inf and kind != CLUTTER:  # leaves have gaps anyway
+                on = _unheard(share, beams)
+            rest = share * on + (1.0 - share) * rest
+        densities[i] = rest + _FLOOR
+        product *= densities[i]
+        if product < 1e-200:
+            total, product = total + np.log(product), 1.0
+    return float(log_prior + trust(beams) * (total + np.log(product)))
+
+
+@compiled
+def align(kind: int, shape: Array, beams: Beams) -> None:
+    """Move a shape to the mean depth of the returns that it would explain."""
+    n, total, form = 0, 0.0, _form_of(kind, shape)
+    for i in range(len(beams.x)):
+        x = beams.x[i] - shape[X] - beams.face[i] * shape[SHIFT]
+        y = beams.y[i] - shape[Y] - beams.face[i] * shape[SHIFT + 1]
+        share, depth = _surface(kind, x, y, shape, form, _beam(shape, beams, i))
+        if share > 0.5 and abs(beams.z[i]) < 1.5:
+            n += 1
+            total += beams.z[i] - depth
+    if n:
+        shape[Z] = total / n
