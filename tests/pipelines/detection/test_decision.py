@@ -135,15 +135,15 @@ def physics(n, sigma):
     return [Physics(np.full(N_SHARED, 0.6), np.full(N_SHARED, sigma), 0.0, 0.0)] * n
 
 
-def shared(values, likelihoods, sigma=100.0):
+def shared(values, probabilities, sigma=100.0):
     """What others show, where each shows the same value of all things, to a tenth."""
     shown = np.repeat(np.array(values)[:, None], N_SHARED, axis=1)
     covs = np.repeat(0.01 * np.eye(N_SHARED)[None], len(values), axis=0)
-    return shared_of(shown, covs, likelihoods, physics(len(values), sigma))
+    return shared_of(shown, covs, probabilities, physics(len(values), sigma))
 
 
-def test_what_markers_share_is_what_the_other_sure_spheres_show():
-    means, sigmas = shared([0.2, 0.21, 0.19, 0.9], likelihoods(9.0, 8.0, 12.0, 1.0))
+def test_what_markers_share_is_what_the_others_show_by_their_probability():
+    means, sigmas = shared([0.2, 0.21, 0.19, 0.9], [1.0, 1.0, 1.0, 0.0])
     for own in means.T:
         assert own == pytest.approx([0.2, 0.195, 0.205, 0.2], abs=1e-3)
     assert np.all(sigmas[3] < sigmas[0])
@@ -151,14 +151,14 @@ def test_what_markers_share_is_what_the_other_sure_spheres_show():
 
 
 def test_a_sure_sphere_that_is_unlike_the_others_hardly_counts():
-    values, odds = [0.20, 0.21, 0.19, 0.20, 0.22, 0.18, 3.0], [9.0] * 7
-    means, _ = shared(values, likelihoods(*odds))
+    values = [0.20, 0.21, 0.19, 0.20, 0.22, 0.18, 3.0]
+    means, _ = shared(values, [1.0] * 7)
     assert means[0] == pytest.approx(0.2, abs=0.05)
     assert np.mean(values[1:]) > 0.6
 
 
 def test_without_other_spheres_what_markers_share_is_the_usual():
-    means, sigmas = shared([0.2], likelihoods(9.0), sigma=0.4)
+    means, sigmas = shared([0.2], [1.0], sigma=0.4)
     assert means[0] == pytest.approx(0.6)
     assert np.all(sigmas[0] >= 0.4)
 
