@@ -120,16 +120,27 @@ def test_the_highest_ground_is_that_of_the_plane(found):
     assert GROUND < found.ground_height_max < GROUND + CONFIG.ground_clearance
 
 
-def test_rings_and_times_are_not_needed(cloud, found):
+@pytest.fixture(scope="module")
+def found_bare(cloud):
+    """What is found where rings, times and reflectivities are not known."""
     bare = replace(
         cloud,
         rings=np.full(len(cloud.rings), RING_UNKNOWN, np.uint8),
         times=np.zeros_like(cloud.times),
         intensities=np.zeros_like(cloud.intensities),
     )
-    again = extract(bare, CONFIG, RADIUS)
-    rough = np.array([c.p_base_rough for c in again.candidates])
-    # the one of 20 returns stands before the sky: only pulses without a return show its outline
+    return extract(bare, CONFIG, RADIUS)
+
+
+# the one of 20 returns stands before the sky: only pulses without a return show its outline
+@pytest.mark.xfail(strict=True, raises=(AssertionError, ValueError))
+def test_rings_and_times_are_not_needed(found, found_bare):
+    for one, two in zip(found.candidates, found_bare.candidates, strict=True):
+        assert_allclose(two.p_base_rough, one.p_base_rough, rtol=0, atol=0)
+
+
+def test_rings_and_times_are_not_needed_where_a_marker_has_more_than_20_returns(found, found_bare):
+    rough = np.array([c.p_base_rough for c in found_bare.candidates])
     many = [c for c in found.candidates if len(c.members) > 20]
     assert len(rough) == len(many) == len(MARKERS) - 1
     for one in many:

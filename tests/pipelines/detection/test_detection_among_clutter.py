@@ -199,3 +199,12 @@ def test_far_balls_of_the_right_size_are_not_refused_for_their_size():
         n_balls += len(found.candidates)
     assert n_balls > 350
     assert n_lost <= 1
+
+
+# 88 markers share the 0.01 false ones of a scan: one of 21 returns is not sure enough for that
+@pytest.mark.slow
+@pytest.mark.xfail(strict=True, raises=AssertionError)
+def test_all_markers_of_a_lane_are_found():
+    found = extraction({"range-lane": DETECTION_PLAN["range-lane"]}, (22,)).run()["scenarios"]
+    assert recall(found["range-lane"], 0) == 1.0
+    assert recall(found["range-lane"], 1) > 0.7

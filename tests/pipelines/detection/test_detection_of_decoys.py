@@ -54,7 +54,15 @@ def sure_or_few(found):
     return [candidate.p_base_rough for candidate in found.candidates] + few
 
 
+# the farthest, of 14 returns, has a probability of 0.9
+@pytest.mark.xfail(strict=True, raises=AssertionError)
 def test_far_markers_are_found_and_no_rival_of_theirs(found):
+    rough = [candidate.p_base_rough for candidate in found.candidates]
+    assert len(rough) == len(MARKERS)
+    assert gaps(MARKERS, rough).min(axis=1).max() < 0.5 * RADIUS
+
+
+def test_far_markers_but_the_farthest_are_found_and_no_rival_of_theirs(found):
     rough = [candidate.p_base_rough for candidate in found.candidates]
     assert gaps(rough, MARKERS).min(axis=1).max() < 0.5 * RADIUS
     assert gaps(MARKERS[:-1], rough).min(axis=1).max() < 0.5 * RADIUS  # the farthest: 14 returns
@@ -64,8 +72,7 @@ def test_far_smaller_balls_are_refused_for_their_size(found):
     near = [
         [r for r in found.rejected if np.linalg.norm(r.p_base - place) < 0.15] for place in SMALL
     ]
-    small = [one for one in found.possible if gaps([one.p_base], MARKERS).min() > RADIUS]
-    assert sum(not places for places in near) <= len(small) <= 1
+    assert sum(not places for places in near) <= len(found.possible) <= 1
     by_size = [one for places in near for one in places if "another radius" in one.reason]
     assert len(by_size) >= len(SMALL) // 2
 
@@ -97,6 +104,14 @@ def n_taken(found):
 def test_balls_of_other_radii_are_no_markers(share):
     found = extracted(balls=tuple((tuple(p), share * RADIUS) for p in OTHERS))
     assert n_taken(found) == 0
+
+
+# the farthest, of 14 returns, is a possible one
+@pytest.mark.xfail(strict=True, raises=AssertionError)
+def test_all_markers_among_balls_of_another_radius_are_sure_ones():
+    found = extracted(balls=tuple((tuple(p), 1.5 * RADIUS) for p in OTHERS))
+    rough = [candidate.p_base_rough for candidate in found.candidates]
+    assert gaps(MARKERS, rough).min(axis=1).max() < 0.5 * RADIUS
 
 
 def test_markers_beside_a_post_are_found():
