@@ -199,7 +199,8 @@ def _log_likelihoods(
     of the scan, by how probably each is one.
     """
     n = len(compared)
-    found, shared, covs = np.empty((n, len(NAMES))), np.empty((n, 5)), np.empty((n, 5, 5))
+    k = len(USUAL) + 1  # what markers share, with the noise
+    found, shared, covs = np.empty((n, len(NAMES))), np.empty((n, k)), np.empty((n, k, k))
     physics = [_physics(one.features, noise, hearing, config) for one in compared]
 
     def compare(rows: Sequence[int]) -> None:

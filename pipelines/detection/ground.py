@@ -70,17 +70,17 @@ def planes_below(ground: Ground, cells: Cells, places: Array) -> Array:
         window = ground.lowest[tuple(slice(k, k + 2 * _AROUND + 1) for k in corner)]
         seen = np.argwhere(window < np.inf)
         if len(seen) >= _CELLS_MIN:
-            aside = (seen + corner + 0.5 - n_side // 2) * edge - (x, y)
-            height, *slopes, sigma = _plane_below(aside, window[tuple(seen.T)].astype(np.float64))
+            offsets = (seen + corner + 0.5 - n_side // 2) * edge - (x, y)
+            height, *slopes, sigma = _plane_below(offsets, window[tuple(seen.T)].astype(np.float64))
             plane[:3] -= np.array(slopes) @ R[:2]
             plane[3:] = slopes[0] * x + slopes[1] * y - height, sigma
     return planes
 
 
-def _plane_below(aside: Array, z: Array) -> tuple[float, ...]:
+def _plane_below(offsets: Array, z: Array) -> tuple[float, ...]:
     """Return the height of the ground at the origin by a plane, its two slopes, and a sigma."""
-    J = np.column_stack([np.ones(len(z)), aside])
-    weights = (_ROUGH + _SLOPE * np.linalg.norm(aside, axis=1)) ** -2.0
+    J = np.column_stack([np.ones(len(z)), offsets])
+    weights = (_ROUGH + _SLOPE * np.linalg.norm(offsets, axis=1)) ** -2.0
     N = (J.T * weights) @ J + np.diag([0.0, _TILT**-2.0, _TILT**-2.0])
     plane = np.linalg.solve(N, (J.T * weights) @ z)
     variance = weights @ (z - J @ plane) ** 2 / weights.sum() + _SMOOTH**2

@@ -99,7 +99,7 @@ class Physics(NamedTuple):
     weakest: float
 
 
-USUAL = (1.0, -0.1, 0.0, 0.0)
+USUAL = (1.0, -0.1, 0.0, 0.0)  # edges: measured on markers of random worlds
 """What markers share in a scan that nothing is known of, as in ``Physics``, but for the noise."""
 
 SIGMAS = (0.35, 0.6, 0.1, 0.05)

@@ -105,10 +105,11 @@ def unheard_about(
     aims = np.abs(elevations[:, None] - clock.rig.laser_elevations)
     passages, rings = np.nonzero(aims < wide)
     across = np.sqrt(wide**2 - aims[passages, rings] ** 2) / (_LEVEL * spin * FIRING_CYCLE)
-    aside = np.arange(-int(across.max(initial=0.0)), int(across.max(initial=0.0)) + 1)
-    tried, later = np.nonzero(np.abs(aside) <= across[:, None])
+    most = int(across.max(initial=0.0))
+    shifts = np.arange(-most, most + 1)
+    tried, later = np.nonzero(np.abs(shifts) <= across[:, None])
     firings = np.rint((instants[passages] - clock.phase) / FIRING_CYCLE).astype(np.int64)
-    firings, rings = firings[tried] + aside[later], rings[tried]
+    firings, rings = firings[tried] + shifts[later], rings[tried]
     v_lidar, angles, is_known = _beams(clock, firings, rings)
     gaps = _to_lidar(clock.rig, c, angles)
     gaps[2] -= clock.rig.laser_heights[rings]
