@@ -1,4 +1,4 @@
-"""Every page draws, stays on this host, and passes axe in both themes and at both widths."""
+"""Every page draws, stays on this host, fits, and passes axe in both themes and at both widths."""
 
 import pytest
 from axe_playwright_python.sync_playwright import Axe
@@ -9,7 +9,7 @@ pytestmark = NEEDS_CHROMIUM
 
 NOWHERE = "/surveys/none"
 MORE = ["/coverage", "/worlds", "/login", "/guide/sql", NOWHERE, "/plan/sheet?a=P01:6,0,1"]
-LOOKS = [(1280, "light"), (1280, "dark"), (390, "dark"), (390, "light")]
+LOOKS = [(390, "dark"), (390, "light"), (1280, "light"), (1280, "dark")]  # the first loads
 DRAWN = """(theme) => document.documentElement.dataset.theme === theme
     && [...document.querySelectorAll("[data-figure]")].every(
         (one) => [theme, "failed"].includes(one.dataset.drawn))"""
@@ -33,29 +33,31 @@ def shown(context, address, request):
     """Show a page once: theme and width change later as for its reader."""
     tab = (context.pages or [context.new_page()])[0]
     one = Visit(tab, address, width=LOOKS[0][0], scheme=LOOKS[0][1])
-    one.open(request.param)
+    page = one.open(request.param)
+    for plot in page.locator("[data-figure]").all():
+        plot.scroll_into_view_if_needed()  # figures by address are fetched when they come in view
+        plot.locator("svg.main-svg, canvas, p.empty").first.wait_for()  # or: nothing to draw
     yield one
     one.end()
 
 
-def test_a_page_draws_without_complaint_and_asks_no_other_host(shown):
-    page = shown.page
-    for plot in page.locator("[data-figure]").all():
-        plot.scroll_into_view_if_needed()  # figures by address are fetched when they come in view
-        plot.locator("svg.main-svg, canvas, p.empty").first.wait_for()  # or: nothing to draw
-    page.wait_for_load_state("networkidle")
-    # Chromium itself names the page that is not there
-    assert ["404" in one for one in shown.complaints] == [True] * page.url.endswith(NOWHERE)
-    assert shown.strangers == []
-
-
-def test_a_page_passes_axe(shown):
+def test_a_page_passes_axe_and_is_no_wider_than_the_window(shown):
     page = shown.page
     for width, scheme in LOOKS:
         page.set_viewport_size({"width": width, "height": 900})
         page.emulate_media(color_scheme=scheme)
         page.wait_for_function(DRAWN, arg=scheme)
+        assert page.evaluate("document.documentElement.scrollWidth") <= width, (width, scheme)
         assert found(page, COLOURS if scheme == "dark" else ALL) == [], (width, scheme)
+
+
+def test_a_page_draws_without_complaint_and_asks_no_other_host(shown):
+    """Neither while it loads nor when theme and width change; it is seen after those changes."""
+    shown.page.wait_for_load_state("networkidle")
+    # Chromium itself names the page that is not there
+    absent = [True] * shown.page.url.endswith(NOWHERE)
+    assert ["404" in one for one in shown.complaints] == absent
+    assert shown.strangers == []
 
 
 def test_a_fault_is_found(visit):
