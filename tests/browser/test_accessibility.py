@@ -8,7 +8,9 @@ from tests.browser.visits import NEEDS_CHROMIUM, PAGES, Visit
 pytestmark = NEEDS_CHROMIUM
 
 NOWHERE = "/surveys/none"
-MORE = ["/coverage", "/worlds", "/login", "/guide/sql", NOWHERE, "/plan/sheet?a=P01:6,0,1"]
+MORE = [
+    "/coverage", "/worlds", "/login", "/guide/sql", NOWHERE, "/plan", "/plan/sheet?a=P01:6,0,1",
+]  # fmt: skip
 LOOKS = [(390, "dark"), (390, "light"), (1280, "light"), (1280, "dark")]  # the first loads
 DRAWN = """(theme) => document.documentElement.dataset.theme === theme
     && [...document.querySelectorAll("[data-figure]")].every(
