@@ -14,15 +14,15 @@ settings.load_profile("spheremark")
 
 LONGEST = (
     "pipelines/evaluation/test_ellipse_coverage.py",
+    "pipelines/calibration/test_calibration.py",
     "pipelines/detection/test_detection_among_clutter.py",
     "pipelines/placement/test_placement.py",
     "browser/test_accessibility.py",
     "pipelines/evaluation/test_precision.py",
     "service/test_reproduce.py",
-    "service/test_kills.py",
     "service/test_contract.py",
+    "service/test_kills.py",
     "browser/test_pages_in_a_browser.py",
-    "pipelines/calibration/test_calibration.py",
     "pipelines/ground_model/test_ground_model.py",
     "pipelines/positioning/test_resection.py",
     "pipelines/sphere/test_sphere.py",
