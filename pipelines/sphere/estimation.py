@@ -28,7 +28,7 @@ from spheremark.pipelines.sphere.optics import (
     echo_shifts,
     with_widths,
 )
-from spheremark.pipelines.sphere.radius import Ranges, free_radii
+from spheremark.pipelines.sphere.radius import BeamErrors, Ranges, free_radii
 from spheremark.pipelines.sphere.returns import Returns, may_be_sphere, moved_faces
 
 _EFFICIENCY = 0.9753  # variance of the estimate over the inverse normal matrix
@@ -374,24 +374,29 @@ def _shortened(steps: Array, radius: float) -> Array:
     return np.asarray(steps * np.minimum(1.0, _STEP_MAX * radius / np.maximum(lengths, 1e-12)))
 
 
-def estimate_radii(returns: Returns, found: Estimate, radius: float) -> tuple[Array, Array]:
+def estimate_radii(
+    returns: Returns, found: Estimate, radius: float, prior: Prior
+) -> tuple[Array, Array]:
     """Estimate radii together with the centres; return them with their standard deviations.
 
     With the optics as specified where spheres are few or the estimated ones unlikely: there they
     take up what another radius does.
     """
     state, (_, sigmas, weights, _) = found.state, found.weighed
-    shared = state.shared.copy()
+    shared, cov = state.shared.copy(), state.cov_shared[_OPTICS, _OPTICS]
     if len(state.centres) < _N_OPTICS or not _optics_are_likely(state):
-        shared[_OPTICS] = 0.0
+        shared[_OPTICS], cov = 0.0, np.diag(prior.sigma_optics**2)
     moved, spheres = _corrected(returns, state._replace(shared=shared)), _spheres(state, radius)
     observed = Ranges(
         ranges=moved.ranges,
         variances=np.maximum(sigmas**2 - found.linear.sigmas_nonlinear**2, 1e-12),
         weights=weights,
     )
-    residuals = moved.ranges - linearise(moved, *spheres, weights > 0.0).ranges
-    return free_radii(moved, observed, *spheres, residuals)
+    linear = linearise(moved, *spheres, weights > 0.0)
+    errors = BeamErrors(
+        derivatives(returns, moved, linear)[:N_ESTIMATED], cov[:N_ESTIMATED, :N_ESTIMATED]
+    )
+    return free_radii(moved, observed, *spheres, moved.ranges - linear.ranges, errors)
 
 
 def shared_range_sigmas(state: State) -> Array:

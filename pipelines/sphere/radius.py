@@ -56,8 +56,28 @@ class Ranges(NamedTuple):
     weights: Array
 
 
+class BeamErrors(NamedTuple):
+    """What is not known of the beams.
+
+    Attributes
+    ----------
+    by_optics : (k, n)
+        Derivatives of ranges by unknowns of the optics.
+    cov : (k, k)
+        Covariance of these.
+    """
+
+    by_optics: Array
+    cov: Array
+
+
 def free_radii(
-    returns: Returns, observed: Ranges, spheres: Array, covs: Array, residuals: Array
+    returns: Returns,
+    observed: Ranges,
+    spheres: Array,
+    covs: Array,
+    residuals: Array,
+    errors: BeamErrors,
 ) -> tuple[Array, Array]:
     """Estimate radii together with the centres; return them with their standard deviations.
 
@@ -70,10 +90,13 @@ def free_radii(
     maximum-likelihood radius is not: small spheres look precise. The sigma is that of the step by
     the noise alone (sandwich form). Where the likelihood of another radius is so much greater that
     the assumption must be wrong, the maximum-likelihood radius is returned; it is looked for where
-    the step is long or residuals are greater than the noise.
+    the step is long or residuals are greater than the noise. Unknown optics move the limb, as
+    another radius does: their part of the variance comes last.
     """
     assumed = spheres[:, 3]
-    steps, prior_covs, sigmas = _score_steps(returns, observed, spheres, covs, residuals)
+    steps, prior_covs, sigmas, by_optics = _score_steps(
+        returns, observed, spheres, covs, residuals, errors.by_optics
+    )
     radii = assumed + steps[:, 3]
     misfits, n = _misfits(returns, observed, residuals), np.diff(returns.starts)
     is_misfit = misfits > n + _MISFIT * np.sqrt(2.0 * n)
@@ -89,7 +112,8 @@ def free_radii(
         better = gains > _BETTER
         radii[doubtful[better]] = found[better, 3]
         sigmas[doubtful[better]] = np.sqrt(found_covs[better, 3, 3])
-    return _determined(radii, sigmas, assumed)
+    variances = np.einsum("mk,kl,ml->m", by_optics, errors.cov, by_optics)
+    return _determined(radii, np.sqrt(sigmas**2 + variances), assumed)
 
 
 def _determined(radii: Array, sigmas: Array, assumed: Array) -> tuple[Array, Array]:
@@ -113,9 +137,17 @@ def _with_radius(covs: Array, variances: Array | float) -> Array:
 
 
 def _score_steps(
-    returns: Returns, observed: Ranges, spheres: Array, covs: Array, residuals: Array
-) -> tuple[Array, Array, Array]:
-    """Return steps of centre and radius, (m, 4), their covariances, and sigmas of the radii."""
+    returns: Returns,
+    observed: Ranges,
+    spheres: Array,
+    covs: Array,
+    residuals: Array,
+    by_optics: Array,
+) -> tuple[Array, Array, Array, Array]:
+    """Return steps of centre and radius, (m, 4), and their covariances.
+
+    Then the sigmas of the radii by the noise, and derivatives of the radii by the optics, (m, k).
+    """
     is_used, radii = observed.weights > 0.0, spheres[:, 3]
     wide = _with_radius(covs, np.trace(covs[:, :3, :3], axis1=1, axis2=2))
     linear = linearise(returns, spheres, wide, is_used)
@@ -129,7 +161,9 @@ def _score_steps(
     row = by_rhs[:, 3]
     variances = np.einsum("mi,mij,mj->m", row, of_noise[:, :, :4], row)
     steps = np.einsum("mij,mj->mi", by_rhs, N[:, :, 4])
-    return steps, covs_free, np.sqrt(np.maximum(variances, 0.0))
+    mixed = sums_of_products(returns.starts, weights * linear.J, by_optics)
+    moved = np.einsum("mi,mik->mk", row, mixed)
+    return steps, covs_free, np.sqrt(np.maximum(variances, 0.0)), moved
 
 
 def _weights(observed: Ranges, linear: Linear) -> Array:
@@ -186,7 +220,7 @@ def own_radius(pulses: Beams, radius: float, up: Array) -> tuple[float, float]:
     returns = returns_of(pulses, np.array([0, n]), up, nothing, (nothing, np.ones(n), 0.0))
     spanned = _spanned(pulses)
     observed, residuals, sphere, cov = _with_assumed(returns, spanned, radius)
-    steps, _, sigmas = _score_steps(returns, observed, sphere, cov, residuals)
+    steps, _, sigmas, _ = _score_steps(returns, observed, sphere, cov, residuals, np.empty((0, n)))
     found = radius + steps[:, 3]
     if abs(steps[0, 3]) > _ITERATED * sigmas[0]:
         own, known, gain = _most_likely(returns, spanned, sphere)

@@ -139,7 +139,7 @@ def _fit(
     rough = np.array([c.p_base_rough for c in found.candidates])
     others = others_towards(cloud, found.candidates, radius) if uses_limb else None
     best = estimate(stop.returns, rough, prior, observe, others)
-    radii, sigmas = estimate_radii(stop.returns, best, radius)
+    radii, sigmas = estimate_radii(stop.returns, best, radius, prior)
     shared, factors = shared_range_sigmas(best.state), shared_factors(best.state)
     heights = shared_height_sigmas(best.state)
     optics, by_optics = optics_of(best.state, prior)

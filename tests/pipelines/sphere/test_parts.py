@@ -13,7 +13,7 @@ from spheremark.pipelines.sphere.linearisation import linearise
 from spheremark.pipelines.sphere.mounting import effects_on
 from spheremark.pipelines.sphere.normal_equations import normals_of, reduce
 from spheremark.pipelines.sphere.optics import UNKNOWNS, derivatives, with_widths
-from spheremark.pipelines.sphere.radius import Ranges, free_radii
+from spheremark.pipelines.sphere.radius import BeamErrors, Ranges, free_radii
 from spheremark.pipelines.sphere.returns import (
     errors_of_interpolation,
     n_lines,
@@ -176,13 +176,36 @@ def test_radii_of_many_spheres_are_those_of_each_alone(stop):
     ranges = ranges + 0.002 * rng.standard_normal(len(ranges))
     residuals = ranges - linearise(returns, spheres, covs).ranges
     observed = Ranges(ranges, np.full(len(ranges), 0.002**2), np.ones(len(ranges)))
-    together = np.array(free_radii(returns, observed, spheres, covs, residuals))
+    known = BeamErrors(np.zeros((1, len(ranges))), np.eye(1))
+    together = np.array(free_radii(returns, observed, spheres, covs, residuals, known))
     for m in range(len(CENTRES)):
         one, rows = of_markers(returns, np.array([m]))
         its = Ranges(*(column[rows] for column in observed))
-        alone = free_radii(one, its, spheres[[m]], covs[[m]], residuals[rows])
+        its_known = BeamErrors(known.by_optics[:, rows], known.cov)
+        alone = free_radii(one, its, spheres[[m]], covs[[m]], residuals[rows], its_known)
         assert_allclose(together[:, m], np.ravel(alone), rtol=1e-9)
     assert np.all(np.abs(together[0] - 0.112) < 4 * together[1])
+
+
+def test_sigmas_of_radii_contain_what_unknown_optics_make_of_them(stop):
+    """Draws of optics scatter the radii of ranges without noise as far as the sigmas say."""
+    _, returns = stop
+    spheres, covs = spheres_and_covs(0.002)
+    linear = linearise(returns, spheres, covs)
+    by_optics = derivatives(returns, returns, linear)[:1]
+    cov, n = np.array([[0.3**2]]), len(returns.ranges)
+    noise, nothing = np.full(n, 0.002**2), np.zeros((1, n))
+    shifts = 0.1 * by_optics[0]  # small: the radius is linear in it
+
+    def radii_of(residuals, errors):
+        observed = Ranges(linear.ranges + residuals, noise, np.ones(n))
+        return free_radii(returns, observed, spheres, covs, residuals, errors)
+
+    moved = (radii_of(shifts, BeamErrors(nothing, cov))[0] - RADIUS) / 0.1
+    _, by_noise = radii_of(np.zeros(n), BeamErrors(nothing, cov))
+    _, found = radii_of(np.zeros(n), BeamErrors(by_optics, cov))
+    assert_allclose(found**2, by_noise**2 + (0.3 * moved) ** 2, rtol=1e-6)
+    assert np.all(found > 1.01 * by_noise)
 
 
 def test_the_limb_is_covered_by_the_octants_that_have_returns():
