@@ -74,7 +74,7 @@ __all__ = ["extract"]
 _MIDDLE = 0.87  # radii: incidence up to 60 degrees, as ASTM E3125-17 takes them
 _SHARP = 0.06  # radii: scatter of scanners whose returns at a limb err by more than their noise
 _POSSIBLE = 0.9  # probability from which a group that is no sure marker is a possible one
-_REJECTIONS_MAX = 200  # the most sphere-like groups that are kept with their reason
+_N_REJECTED, _N_NOT_COMPARED = 200, 100  # groups, the best first, that are kept with their reason
 _SIGMAS_LOG_NOISE = (0.3, 0.6)  # of one marker about the others of a scan; of a scan about a group
 
 _NEARBY = 1.0  # [m] beyond two radii within which other groups show leaves, walls and fences
@@ -109,7 +109,7 @@ def extract(
     -------
     MarkerCandidates
         Candidates in the order of azimuth; possible ones; of the groups that passed the first test
-        of size and were then rejected, the (at most 200) most like a sphere, with the reason; and
+        of size and were then rejected, the (at most 300) most like a sphere, with the reason; and
         the height of the highest ground point within 10 m, where the published method cuts its
         clouds.
 
@@ -159,7 +159,7 @@ def extract(
             possible.append(replace(refused, members=members))
         else:
             rejected.append(refused)
-    rejected += [
+    not_compared = [
         _rejection(features, reason)
         for features, reason in zip(groups, reasons, strict=True)
         if reason
@@ -167,7 +167,7 @@ def extract(
     return MarkerCandidates(
         candidates=_candidates(markers, target),
         possible=tuple(possible),
-        rejected=tuple(rejected[:_REJECTIONS_MAX]),
+        rejected=(*rejected[:_N_REJECTED], *not_compared[:_N_NOT_COMPARED]),
         ground_height_max=ground.height_max,
     )
 

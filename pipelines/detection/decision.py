@@ -18,7 +18,7 @@ from spheremark.pipelines.detection.shapes import NAMES
 from spheremark.pipelines.detection.target import Target
 from spheremark.pipelines.model import Array
 
-_TOUCHING = 0.10  # share of a ball's returns that may lie as far away beside it: mixed pixels
+_TOUCHING = 0.2  # of a sphere's returns, as many may lie as far away below it: legs of a tripod
 _OFF = 0.6  # as a share of the returns on a free sphere: those off it and its pole
 _EXTENT_MIN = 0.4  # radii: one line of a scan shows no ball
 _HALF_SEEN = 0.8  # radii: the returns of half a ball are as wide, but for those at its edges
@@ -29,6 +29,7 @@ _TAIL = 3.0  # degrees of freedom: of some markers the paint is dirty or in shad
 _UNLIKE = -2.0  # logarithm of odds by paint from which a reason states it
 _FLAT = 0.236  # of the radius: standard deviation of the depths of a sphere about their mean
 _N_LARGE, _N_KNOWN = 30, 3  # returns that show the noise of a scan, and groups that agree
+_FEW_OFF = 0.05  # share of these that may lie beside such a group
 _N_LEAST, _N_MOST = 6.0, 2500.0  # returns of the farthest and of the nearest markers
 _SCATTERED = 0.5  # share of other objects that lie anywhere, and not where markers are put
 _N_PRIOR = 5.0  # places that the usual abundance of a hypothesis counts for in a scan
@@ -196,13 +197,14 @@ def _log_density(squares: Array, variances: Array | float) -> Array:
 def noise_of(groups: list[Features], radius: float) -> float:
     """Return the noise of ranges that groups with many returns agree on; NaN if these are few.
 
-    Those that a plane fits as well are no spheres, and show none.
+    Those that a plane fits as well are no spheres, and show none. A few returns beside a sphere are
+    of a panel or a pole.
     """
     known = [
         max(features.scatter, NOISE_MIN)
         for features in groups
         if features.n_points >= _N_LARGE
-        and features.n_off == 0
+        and features.n_off <= _FEW_OFF * features.n_points
         and features.scatter < _FLAT * radius
     ]
     return median(known) if len(known) >= _N_KNOWN else float("nan")
