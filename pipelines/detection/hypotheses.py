@@ -45,13 +45,18 @@ _CENTRE, _POLE_SIZE = (0.3, 0.3, 0.4), (float(np.log(0.2)), 0.8)
 _TURNED, _MOVED = 0.003, 0.01  # [rad] and [m] by which the faces lie apart with a rough mounting
 _HEAD_SIZE = (0.085, 1.3, 0.12)  # [m] half the width of a head, its height over it, their spread
 _RELIEF, _SIGMA_LOG_RELIEF = 0.08, 0.3  # of stones, hair and faces about an ellipsoid
-_SOLIDS = (  # those of cubes, cylinders, cones, lamps and mirrors, by least squares
+SOLIDS = (
     *((0.0, 0.3), (0.0, 0.14), (0.0, 0.1), (0.0, 0.1), (0.0, 0.1)),
     *((0.0, 0.2), (0.0, 0.2), (-0.35, 0.3), (0.0, 0.4), (0.0, 0.2)),
 )
+"""Means and standard deviations of the form of a solid of another shape: the logarithm of its size;
+waves of two and of three of its outline, cosine and sine; tilt across and up, curvature, and its
+cosine and sine of two, of its depth. By least squares of cubes, cylinders, cones, lamps and mirrors
+that lean by up to 30 degrees."""
+
 _FORMS: dict[int, tuple[tuple[float, float], ...]] = {
     BALL: ((0.0, 0.4),),
-    SOLID: _SOLIDS,
+    SOLID: SOLIDS,
     BOULDER: ((0.0, 0.3), (0.0, 0.2), (0.0, 0.3)),
     CYLINDER: ((-0.1, 0.4), (0.0, 0.4)),
     POST: ((-0.1, 0.6), (0.0, 0.4)),
