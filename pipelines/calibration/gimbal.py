@@ -13,11 +13,12 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from spheremark.pipelines.model import Array, Beams, Index, Rig, Rings, ScanLog, StitchedCloud
+from spheremark.pipelines.scan.interpolation import scatter_of_angles
 from spheremark.pipelines.scan.stitching import beams
 from spheremark.pipelines.sphere.linearisation import linearise as linearise_ranges
 from spheremark.pipelines.sphere.noise import classes_of
 from spheremark.pipelines.sphere.optics import N_ESTIMATED, derivatives, echo_shifts, with_widths
-from spheremark.pipelines.sphere.returns import returns_of, scan_lines, scatter_of_angles
+from spheremark.pipelines.sphere.returns import returns_of, scan_lines
 
 _RATE_WINDOW = 0.05  # [s] over which the speed of the gimbal is taken: encoders jitter
 _NS = 1e-9  # [s] in a nanosecond

@@ -16,7 +16,6 @@ from spheremark.pipelines.compilation import compiled
 from spheremark.pipelines.detection.cells import Cells, rows_about
 from spheremark.pipelines.detection.ground import Ground, planes_below, skin_of
 from spheremark.pipelines.detection.pulses import (
-    Clock,
     Hearing,
     clock_of,
     hearing_of,
@@ -30,6 +29,7 @@ from spheremark.pipelines.detection.target import (
     view_of,
 )
 from spheremark.pipelines.model import Array, Column, Mask, Rig, StitchedCloud
+from spheremark.pipelines.scan.interpolation import errors_of_interpolation
 from spheremark.pipelines.threads import side_by_side
 
 _REACH = 4.0  # radii about a centre: shoulders lie within three radii below a head
@@ -123,32 +123,50 @@ def gather_evidence(
     heights = np.sum(planes[:, :3] * centres, axis=1) + planes[:, 3]
 
     reach = _REACH * target.radius
+    bends = np.zeros(0)
+    if clock is not None and clock.bends.any():
+        bends = errors_of_interpolation(cloud.gimbal_angles, np.arange(len(cloud.p_base)))
+
+    def evidence_at(i: int) -> Evidence:
+        rows = np.sort(rows_about(cloud.p_base, cells, centres[i], reach, np.inf))
+        straight, silent = rows, None
+        if clock is not None:
+            straight, bend_max = _straight(rows, bends, _PLACE * target.radius, centres[i])
+            known = clock._replace(bend_max=bend_max)
+            silent = unheard_about(cloud, known, rows, centres[i], target)
+        found = _evidence_at(cloud, silent, straight, centres[i], planes[i], target)
+        return found._replace(height=float(heights[i]), sigma_height=float(planes[i, 4]))
 
     def gathered(first: int, end: int) -> list[Evidence]:
-        return [
-            _evidence_at(
-                cloud,
-                clock,
-                np.sort(rows_about(cloud.p_base, cells, centres[i], reach, np.inf)),
-                centres[i],
-                planes[i],
-                target,
-            )._replace(height=float(heights[i]), sigma_height=float(planes[i, 4]))
-            for i in range(first, end)
-        ]
+        return [evidence_at(i) for i in range(first, end)]
 
     return list(chain(*side_by_side(gathered, len(centres), threaded_from=4))), hearing
 
 
+def _straight(
+    rows: NDArray[np.int32], bends: Array, most: float, c: Array
+) -> tuple[NDArray[np.int32], float]:
+    """Return the returns about a place whose gimbal angle is known, and how far it may be off.
+
+    Where a gimbal starts or stops between two samples of its angle, scan lines seem to pass
+    elsewhere. All are kept if most are of this kind. ``bends`` are empty where there are none.
+    """
+    bend_max = most / float(np.linalg.norm(c))
+    is_straight = bends[rows] <= bend_max if len(bends) else np.ones(len(rows), np.bool_)
+    if 2 * is_straight.sum() < len(rows):
+        return rows, np.inf
+    return rows[is_straight], bend_max
+
+
 def _evidence_at(
     cloud: StitchedCloud,
-    clock: Clock | None,
+    silent: Array | None,
     rows: NDArray[np.int32],
     c: Array,
     plane: Array,
     target: Target,
 ) -> Evidence:
-    """Return the evidence of the beams of some returns, and of the pulses between them."""
+    """Return the evidence of the beams of some returns, and of silent pulses between them."""
     angles = cloud.gimbal_angles[rows.astype(np.intp)]
     origins = _origins(cloud.rig, angles)
     points = cloud.p_base[rows]
@@ -156,9 +174,7 @@ def _evidence_at(
     n_on, n_before, below, brightness, n_distinct, seen = _count_beams(
         points, cloud.intensities[rows], is_ground, c, target, origins
     )
-    silent = None
-    if clock is not None:
-        silent = unheard_about(cloud, clock, rows, c, target)
+    if silent is not None:
         passing, blur = silent / target.radius, blur_at(c, target) / target.radius
         for side, is_there in enumerate((passing[0] <= 0.0, passing[0] > 0.0)):
             below[1, side] += n_beside_pole(passing[:, is_there], blur)

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from spheremark.pipelines.detection.target import Target, view_of
 from spheremark.pipelines.model import RING_UNKNOWN, Array, Index, Mask, Rig, StitchedCloud
+from spheremark.pipelines.scan.interpolation import errors_of_interpolation
 from spheremark.pipelines.scan.rigs import FIRING_CYCLE, FIRING_ORDER, LASER_CYCLE, N_LASERS
 
 _REACH = 3.0  # radii: the returns of beams that pass nearer are all known
@@ -41,15 +42,21 @@ class Clock(NamedTuple):
         Instant of firing 0 [s].
     times, azimuths, angles : (k,)
         Instants, azimuths of the spin, both increasing, and angles of the gimbal [s], [rad].
+    bends : (k,)
+        By how much these angles may be off where the gimbal starts or stops [rad].
     rig : Rig
         The rig, with its 16 lasers.
+    bend_max : float
+        Pulses whose angle may be off by more are not known [rad].
     """
 
     phase: float
     times: Array
     azimuths: Array
     angles: Array
+    bends: Array
     rig: Rig
+    bend_max: float = np.inf
 
 
 def clock_of(cloud: StitchedCloud) -> Clock | None:
@@ -78,7 +85,9 @@ def clock_of(cloud: StitchedCloud) -> Clock | None:
     is_steady = np.sqrt(np.mean(off**2)) < _PHASE_MAX and _SLOWEST < spin < _FASTEST
     if not (is_steady and np.median(np.abs(misplaced)) < _OFF_MAX):
         return None
-    return Clock(per_radian * float(np.angle(turns.mean())), times, azimuths, angles, cloud.rig)
+    phase = per_radian * float(np.angle(turns.mean()))
+    bends = errors_of_interpolation(cloud.gimbal_angles, rows)
+    return Clock(phase, times, azimuths, angles, bends, cloud.rig)
 
 
 def unheard_about(
@@ -174,7 +183,9 @@ def _beams(
     return (
         np.array([level * np.cos(azimuths), -level * np.sin(azimuths), z]),
         np.interp(instants, clock.times, clock.angles),
-        (instants > clock.times[0]) & (instants < clock.times[-1]),
+        (instants > clock.times[0])
+        & (instants < clock.times[-1])
+        & (np.interp(instants, clock.times, clock.bends) <= clock.bend_max),
     )
 
 

@@ -9,8 +9,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from spheremark.pipelines.estimation.robust import robust_sigma
-from spheremark.pipelines.model import Array, Beams, Column, Index, Mask, Timed
+from spheremark.pipelines.model import Array, Beams, Index, Mask
 
 _THIN = 1e-6  # [m]; a thinner footprint is treated as a ray
 BENT = 2.0
@@ -19,8 +18,6 @@ BENT = 2.0
 _POLE_BEGINS = 1.0  # radii below the centre: a footprint that begins lower is on the pole
 _POLE_HALF = 0.35  # radii from the vertical through the centre: half width of the pole's region
 _LINE = 0.01  # [s] between returns of different scan lines, at the least
-_N_SAMPLES = 10  # of the gimbal's angle, from which their scatter is known
-_CORNER = 12.0  # times that scatter: changes of the angle's slope, which scatter by 3 times as much
 
 
 class Returns(NamedTuple):
@@ -166,66 +163,6 @@ def distances_and_halves(returns: Returns, offsets: Array) -> tuple[Array, Array
     distances = np.maximum(np.hypot(*offsets), 1e-9)
     halves = np.hypot(*(returns.half_widths * offsets)) / distances
     return distances, np.maximum(halves, _THIN)
-
-
-def scatter_of_angles(angles: Timed | Column, unknown: float) -> float:
-    """Return how far interpolated angles of a gimbal scatter, from samples between neighbours.
-
-    Parameters
-    ----------
-    angles : Timed or (n,)
-        Angles of the gimbal [rad].
-    unknown : float
-        What to return where there are no samples [rad].
-
-    Returns
-    -------
-    float
-        Standard deviation [rad].
-    """
-    if not isinstance(angles, Timed) or len(angles.values) < _N_SAMPLES:
-        return unknown
-    times, values = angles.samples_ns.astype(np.float64), angles.values
-    shares = (times[1:-1] - times[:-2]) / (times[2:] - times[:-2])
-    off = values[1:-1] - values[:-2] - shares * (values[2:] - values[:-2])
-    # of noise s the difference has 1.5 s^2, and an angle between two samples 2/3 s^2 in the mean
-    return 2.0 / 3.0 * robust_sigma(off[np.isfinite(off)])
-
-
-def errors_of_interpolation(angles: Timed | Column, rows: Index) -> Array:
-    """Return by how much interpolated angles may be off where the gimbal's speed changes.
-
-    Parameters
-    ----------
-    angles : Timed or (n,)
-        Angles of the gimbal [rad].
-    rows : (k,)
-        Rows of some returns.
-
-    Returns
-    -------
-    (k,)
-        Largest errors [rad]; zero where samples show no change beyond their scatter.
-
-    Notes
-    -----
-    Where the gimbal starts or stops between two samples, the speeds before and after them meet in a
-    corner, which a straight line between them cuts off: at 1.7 rad/s and 100 samples in a second
-    up to 4 mrad. With changes ``a`` and ``b`` of the speed at the two samples, the line is off by
-    the smaller of ``a`` times the time since the one and ``b`` times the time to the other.
-    """
-    if not isinstance(angles, Timed) or len(angles.values) < _N_SAMPLES:
-        return np.zeros(len(rows))
-    samples, stamps = angles.samples_ns, angles.stamps_ns[rows]
-    jumps = np.zeros(len(samples))
-    jumps[1:-1] = np.diff(angles.rates[:-1])  # there is no speed after the last sample
-    k = np.clip(np.searchsorted(samples, stamps, side="right") - 1, 0, len(samples) - 2)
-    sides = np.stack([stamps - samples[k], samples[k + 1] - stamps]).astype(np.float64)
-    changes = np.stack([jumps[k], jumps[k + 1]])
-    bends = changes * (samples[k + 1] - samples[k])
-    is_corner = np.prod(np.sign(bends), axis=0) > 0.0
-    is_corner &= np.abs(bends).min(axis=0) > _CORNER * scatter_of_angles(angles, 0.0)
-    return np.where(is_corner, np.min(np.abs(changes) * np.maximum(sides, 0.0), axis=0), 0.0)
 
 
 def scan_lines(times: Array) -> Index:

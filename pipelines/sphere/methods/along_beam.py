@@ -27,6 +27,7 @@ from spheremark.pipelines.model import (
     Status,
     StitchedCloud,
 )
+from spheremark.pipelines.scan.interpolation import errors_of_interpolation, scatter_of_angles
 from spheremark.pipelines.scan.stitching import beams
 from spheremark.pipelines.sphere.description import (
     WITHOUT_RINGS,
@@ -58,10 +59,8 @@ from spheremark.pipelines.sphere.radius import other_radius
 from spheremark.pipelines.sphere.returns import (
     BENT,
     Returns,
-    errors_of_interpolation,
     n_lines,
     returns_of,
-    scatter_of_angles,
 )
 
 NAME = "along_beam"
