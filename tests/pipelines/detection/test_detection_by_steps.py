@@ -15,7 +15,7 @@ from spheremark.pipelines.scan.stitching import stitch
 from spheremark.pipelines.simulation import SimulationConfig, scenario, simulate_stop
 from spheremark.pipelines.simulation.rig import nominal_rig
 
-CONFIG = SimulationConfig(step=np.radians(1.0), move=0.03, joint_rate=30.0)
+CONFIG = SimulationConfig(step=np.radians(2.0), move=0.06, joint_rate=30.0)
 EXTRACTION = ExtractionConfig()
 
 
