@@ -18,7 +18,7 @@ from spheremark.pipelines.detection.shapes import NAMES
 from spheremark.pipelines.detection.target import Target
 from spheremark.pipelines.model import Array
 
-_TOUCHING = 0.2  # of a sphere's returns, as many may lie as far away below it: legs of a tripod
+_TOUCHING = 0.10  # share of a ball's returns that may lie as far away beside it: mixed pixels
 _OFF = 0.6  # as a share of the returns on a free sphere: those off it and its pole
 _EXTENT_MIN = 0.4  # radii: one line of a scan shows no ball
 _HALF_SEEN = 0.8  # radii: the returns of half a ball are as wide, but for those at its edges
@@ -197,17 +197,20 @@ def _log_density(squares: Array, variances: Array | float) -> Array:
 def noise_of(groups: list[Features], radius: float) -> float:
     """Return the noise of ranges that groups with many returns agree on; NaN if these are few.
 
-    Those that a plane fits as well are no spheres, and show none. A few returns beside a sphere are
-    of a panel or a pole.
+    Those that a plane fits as well are no spheres, and show none. Where too few stand free, those
+    with a few returns beside them count, as of a panel behind.
     """
-    known = [
-        max(features.scatter, NOISE_MIN)
-        for features in groups
-        if features.n_points >= _N_LARGE
-        and features.n_off <= _FEW_OFF * features.n_points
-        and features.scatter < _FLAT * radius
-    ]
-    return median(known) if len(known) >= _N_KNOWN else float("nan")
+    for off_max in (0.0, _FEW_OFF):
+        known = [
+            max(features.scatter, NOISE_MIN)
+            for features in groups
+            if features.n_points >= _N_LARGE
+            and features.n_off <= off_max * features.n_points
+            and features.scatter < _FLAT * radius
+        ]
+        if len(known) >= _N_KNOWN:
+            return median(known)
+    return float("nan")
 
 
 def shared_of(

@@ -59,10 +59,10 @@ def test_a_ball_seen_more_closely_than_any_other_shape_may_stand_on_something():
 
 @pytest.mark.parametrize("share_seen", [1.0, 0.5, 0.04])
 def test_what_is_held_below_counts_by_how_much_is_seen_there(share_seen):
-    """A fifth of the returns that a ball there would have may be held, and one."""
+    """A tenth of the returns that a ball there would have may be held, and one."""
     n_seen = round(100 * share_seen)
     about = evidence(n_on=120, n_short=100 - n_seen)
-    n_few = 1 + round(0.2 * 120 * share_seen)
+    n_few = 1 + round(0.1 * 120 * share_seen)
 
     def reason(n):
         held = about._replace(n_held=n, n_carrying=n, n_past=n_seen - n)
