@@ -7,11 +7,13 @@ from tests.browser.visits import NEEDS_CHROMIUM, PAGES, Visit
 
 pytestmark = NEEDS_CHROMIUM
 
-NOWHERE = "/surveys/none"
+NOWHERE = ("/surveys/none", "/nowhere")
 MORE = [
-    "/coverage", "/worlds", "/login", "/guide/sql", NOWHERE, "/plan", "/plan/sheet?a=P01:6,0,1",
+    "/coverage", "/worlds", "/login", "/guide/sql", *NOWHERE,
+    "/sql", "/plan", "/plan/sheet?a=P01:6,0,1",
 ]  # fmt: skip
 LOOKS = [(390, "dark"), (390, "light"), (1280, "light"), (1280, "dark")]  # the first loads
+WIDE = 1440  # pages only have to fit there
 DRAWN = """(theme) => document.documentElement.dataset.theme === theme
     && [...document.querySelectorAll("[data-figure]")].every(
         (one) => [theme, "failed"].includes(one.dataset.drawn))"""
@@ -51,6 +53,8 @@ def test_a_page_passes_axe_and_is_no_wider_than_the_window(shown):
         page.wait_for_function(DRAWN, arg=scheme)
         assert page.evaluate("document.documentElement.scrollWidth") <= width, (width, scheme)
         assert found(page, COLOURS if scheme == "dark" else ALL) == [], (width, scheme)
+    page.set_viewport_size({"width": WIDE, "height": 900})
+    assert page.evaluate("document.documentElement.scrollWidth") <= WIDE
 
 
 def test_a_page_draws_without_complaint_and_asks_no_other_host(shown):
