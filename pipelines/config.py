@@ -150,6 +150,10 @@ class FittingConfig:
         0.02 deg, good workmanship. It parts the two faces of the scan.
     sigma_offset : float
         Standard deviation of where the LiDAR sits on the gimbal, per axis [m].
+    sigma_gimbal_clock : float
+        Standard deviation of the offset of the gimbal's clock [s]. 0.003: what encoders and their
+        drivers are late. It moves what is seen while the gimbal turns against what is seen while it
+        rests, or turns faster or slower.
     sigma_beam_width : float
         Standard deviation of the beam's divergence, relative to the rig's. 0.35: sources for one
         sensor differ by a factor of two; makers give contours of different energy.
@@ -182,6 +186,7 @@ class FittingConfig:
     sigma_direction: float = 1e-4
     sigma_mounting: float = 3.5e-4
     sigma_offset: float = 5e-4
+    sigma_gimbal_clock: float = 0.003
     sigma_beam_width: float = 0.35
     sigma_beam_window: float = 0.5
     sigma_echo_cosine: float = 0.7
@@ -196,6 +201,7 @@ class FittingConfig:
         _check("fitting.sigma_direction", self.sigma_direction, 0.0, 0.01)
         _check("fitting.sigma_mounting", self.sigma_mounting, 0.0, 0.1)
         _check("fitting.sigma_offset", self.sigma_offset, 0.0, 0.1)
+        _check("fitting.sigma_gimbal_clock", self.sigma_gimbal_clock, 0.0, 0.1)
         _check("fitting.sigma_beam_width", self.sigma_beam_width, 0.0, 1.0)
         _check("fitting.sigma_beam_window", self.sigma_beam_window, 0.0, 2.0)
         _check("fitting.sigma_echo_cosine", self.sigma_echo_cosine, 0.0, 2.0)

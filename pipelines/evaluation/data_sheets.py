@@ -45,6 +45,7 @@ def data_sheet(world: RandomWorld) -> SurveyConfig:
                 "sigma_range_scale": scale,
                 "sigma_mounting": config.sigma_misalignment,
                 "sigma_offset": config.sigma_axis_offset,
+                "sigma_gimbal_clock": min(latency_rms(family), 0.1),
             },
             "resection": {
                 "sigma_range": float(np.hypot(common, lasers / np.sqrt(N_LASERS))),

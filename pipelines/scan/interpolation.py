@@ -35,6 +35,27 @@ def scatter_of_angles(angles: Timed | Column, unknown: float) -> float:
     return 2.0 / 3.0 * robust_sigma(off[np.isfinite(off)])
 
 
+def speeds_of(angles: Timed | Column, rows: Index) -> Array:
+    """Return the angular speeds of a gimbal at some returns.
+
+    Parameters
+    ----------
+    angles : Timed or (n,)
+        Angles of the gimbal [rad].
+    rows : (k,)
+        Rows of some returns.
+
+    Returns
+    -------
+    (k,)
+        Between two samples of the angle [rad/s]; zero where there are no samples.
+    """
+    if not isinstance(angles, Timed):
+        return np.zeros(len(rows))
+    k = np.searchsorted(angles.samples_ns, angles.stamps_ns[rows], side="right") - 1
+    return np.asarray(np.nan_to_num(angles.rates[k] * 1e9))
+
+
 def errors_of_interpolation(angles: Timed | Column, rows: Index) -> Array:
     """Return by how much interpolated angles may be off where the gimbal's speed changes.
 
@@ -67,5 +88,5 @@ def errors_of_interpolation(angles: Timed | Column, rows: Index) -> Array:
     changes = np.stack([jumps[k], jumps[k + 1]])
     bends = changes * (samples[k + 1] - samples[k])
     is_corner = np.prod(np.sign(bends), axis=0) > 0.0
-    is_corner &= np.abs(bends).min(axis=0) > _CORNER * scatter_of_angles(angles, 0.0)
+    is_corner &= np.abs(bends).sum(axis=0) > _CORNER * scatter_of_angles(angles, 0.0)
     return np.where(is_corner, np.min(np.abs(changes) * np.maximum(sides, 0.0), axis=0), 0.0)

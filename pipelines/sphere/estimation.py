@@ -29,7 +29,7 @@ from spheremark.pipelines.sphere.optics import (
     with_widths,
 )
 from spheremark.pipelines.sphere.radius import BeamErrors, Ranges, free_radii
-from spheremark.pipelines.sphere.returns import Returns, may_be_sphere, moved_faces
+from spheremark.pipelines.sphere.returns import Returns, may_be_sphere, moved_faces, swept
 
 _EFFICIENCY = 0.9753  # variance of the estimate over the inverse normal matrix
 _SIGMA_BIAS_MIN = 1e-5  # [m] of the laser biases: keeps their prior invertible
@@ -45,10 +45,11 @@ _ROUGH = 0.1  # radii: standard deviation per axis of a rough centre
 _STEP_MAX = 0.25  # radii per step
 _GAP_SIGMAS = 3.0  # of its centre by which a return may lie outside a sphere and still be its own
 _GAP_MIN, _GAP_MAX = 0.02, 0.3  # radii: least and most of that
-# Places of the shared unknowns, from the end: lasers, optics, halves of the limb, mounting
-_MOUNTING, _HALVES = slice(-N_MOUNTING, None), -N_MOUNTING - 1
+# Places of the shared unknowns, from the end: lasers, optics, halves of the limb, clock, mounting
+_MOUNTING, _CLOCK, _HALVES = slice(-N_MOUNTING, None), -N_MOUNTING - 1, -N_MOUNTING - 2
 _OPTICS = slice(_HALVES - len(UNKNOWNS), _HALVES)
 _BIASES = slice(None, _OPTICS.start)
+_SIGMA_CLOCK = 3e-4  # [s] by which clocks are off where lines of rests fall together, by simulation
 _UNFELT = 1e-6  # [m] by all centres together: what they share less than this
 _DOF_SPREAD = 2.0  # unknowns that the prior counts for in the estimate of their spread
 
@@ -69,6 +70,8 @@ class Prior(NamedTuple):
         Standard deviations of the range biases of the lasers that occur [m].
     sigma_optics : (q,)
         Standard deviations of ``UNKNOWNS``; of these the first ``N_ESTIMATED`` are estimated.
+    sigma_clock : float
+        Standard deviation of the offset of the gimbal's clock [s].
     sigma_mounting : (6,)
         Standard deviations of the unknowns of the mounting.
     """
@@ -76,6 +79,7 @@ class Prior(NamedTuple):
     radius: float
     sigma_biases: Array
     sigma_optics: Array
+    sigma_clock: float
     sigma_mounting: Array
 
     @property
@@ -83,7 +87,8 @@ class Prior(NamedTuple):
         """Standard deviations of all shared unknowns, tiny for those that are not estimated."""
         held = np.zeros(len(UNKNOWNS) - N_ESTIMATED)
         optics = np.append(self.sigma_optics[:N_ESTIMATED], held)
-        parts = (self.sigma_biases, optics, [SIGMA_HALVES], self.sigma_mounting)
+        common = [SIGMA_HALVES, self.sigma_clock]
+        parts = (self.sigma_biases, optics, common, self.sigma_mounting)
         sigmas = np.maximum(np.concatenate(parts), _SIGMA_MIN)
         sigmas[_BIASES] = np.maximum(sigmas[_BIASES], _SIGMA_BIAS_MIN)
         return np.asarray(sigmas)
@@ -97,8 +102,9 @@ class State(NamedTuple):
     centres : (m, 3)
         Centres [m].
     shared : (k + q + 6,)
-        Range biases of the lasers [m], ``UNKNOWNS``, and errors of the mounting in the order of
-        ``mounting.effects_on``.
+        Range biases of the lasers [m], ``UNKNOWNS``, half the difference between the edges above
+        and below [half widths], offset of the gimbal's clock [s], and errors of the mounting in the
+        order of ``mounting.effects_on``.
     sigmas : (k + q + 6,)
         Their prior standard deviations, those of biases and mounting scaled as estimated.
     has_shared : bool
@@ -201,12 +207,13 @@ def estimate(
         state = state._replace(noise=weighed.noise, has_shared=step >= _N_STEPS_CENTRES)
         residuals, sigmas, weights, _ = weighed
         by_optics = derivatives(returns, corrected, linear)
-        J = (linear.J[:3], np.vstack([by_optics, np.zeros(len(residuals))]))
+        by_clock = np.sum(linear.J[:3] * swept(returns), axis=0)
+        J = (linear.J[:3], np.vstack([by_optics, np.zeros(len(residuals)), by_clock]))
         N = normals_of(returns, J, residuals, weights / sigmas**2, len(state.biases))
         if others is not None and step == _N_STEPS_RANGES:
             is_faced = faces_seen(corrected, linear, state.centres, others, radius)
         if others is not None and step >= _N_STEPS_RANGES:
-            edge = edge_of(corrected, linear, weights, radius)
+            edge = edge_of(corrected, linear, weights, state.covs_of_limb, radius)
             state.shared[_HALVES] = edge.halves
             faced = weighed._replace(weights=weights * is_faced)
             factors = _add_limb(N, corrected, Estimate(state, linear, faced), edge, factors)
@@ -243,6 +250,7 @@ def _corrected(returns: Returns, state: State) -> Returns:
     if not state.shared.any():
         return returns
     moved = moved_faces(returns, effects_on(state.centres) @ state.mounting)
+    moved = moved._replace(origins=moved.origins - state.shared[_CLOCK] * swept(returns))
     ranges = returns.ranges - state.biases[returns.lasers]
     return with_widths(moved, state.optics)._replace(ranges=ranges)
 
@@ -290,10 +298,10 @@ def _add_limb(N: Normals, returns: Returns, now: Estimate, edge: Edge, factors: 
     state, weights = now.state, now.weighed.weights
     limb = limb_normals(returns, now.linear, weights, state.covs_of_limb, edge, factors)
     N.centres[:, :, :3] += limb.centres
-    N.centres[:, :, -2:] += np.stack([limb.halves, limb.rhs], axis=-1)
+    N.centres[:, :, -3:] += np.dstack([limb.shared, limb.rhs])
     N.by_face[:, :, :3] += limb.faces
-    N.by_face[:, :, -2:] += np.stack([limb.halves_faces, limb.rhs_faces], axis=-1)
-    N.shared[-1, -2:] += limb.of_halves
+    N.by_face[:, :, -3:] += np.dstack([limb.shared_faces, limb.rhs_faces])
+    N.shared[-2:, -3:] += limb.of_shared
     return limb.factors
 
 
@@ -305,8 +313,8 @@ def _add_observed(N: Normals, returns: Returns, state: State, observe: Observe) 
     seen, rhs = observe(state.centres + state.shared[_HALVES] * down, state.covs_of_limb)
     moved = np.einsum("mij,mj->mi", seen, down)
     N.centres[:, :, :3] += seen
-    N.centres[:, :, -2:] += np.stack([moved, rhs], axis=-1)
-    N.shared[-1, -2:] += np.sum(moved * down), np.sum(rhs * down)
+    N.centres[:, :, [-3, -1]] += np.stack([moved, rhs], axis=-1)
+    N.shared[-2, [-3, -1]] += np.sum(moved * down), np.sum(rhs * down)
 
 
 def _stepped(state: State, N: Normals, prior: Prior) -> State:
@@ -355,6 +363,7 @@ def _with_considered(estimated: Array, N: Array, prior: Prior, spread: float) ->
     sigmas = prior.sigma_optics[N_ESTIMATED:] * (max(spread, 1.0), 1.0)
     cov = estimated + (response * sigmas**2) @ response.T
     cov[optics, optics] += np.append(SIGMAS_PROFILE, np.zeros(len(considered))) ** 2
+    cov[_CLOCK, _CLOCK] += min(_SIGMA_CLOCK, prior.sigma_clock) ** 2
     return np.asarray(cov)
 
 

@@ -17,15 +17,15 @@ from scipy.special import ndtr
 from spheremark.pipelines.model import Array, Index, Mask
 from spheremark.pipelines.sphere.linearisation import Linear
 from spheremark.pipelines.sphere.normal_equations import sums_of_products
-from spheremark.pipelines.sphere.returns import Returns, distances_and_halves
+from spheremark.pipelines.sphere.returns import Returns, distances_and_halves, swept
 
 _EDGES = np.arange(-0.5, 1.01, 0.05)  # half widths inside the limb
 _SOFTNESSES = 0.05 * 2.0 ** np.arange(0.0, 4.6, 0.5)  # half widths of the footprint
 _EDGE, _SIGMA_EDGE = 0.2, 0.4  # prior of the edge
 _SOFTNESS, _SPREAD = 0.2, 0.7  # prior of the softness, and its sigma in the logarithm
+_BLURS = np.append(0.0, 0.05 * 2.0 ** np.arange(0.0, 6.1, 0.5))  # half widths, of single returns
 _FROM, _BIN, _N_BINS = -2.0, 0.05, 75  # half widths inside: bins of the histogram of returns
 _POLE_BELOW, _POLE_HALF = 0.6, 0.25  # radii below the centre and to either side: beside the pole
-_SOFTNESS_MIN = 0.03  # half widths: an edge that a bin cannot tell from a sharp one
 # Half widths: scatter of the edges of single spheres about that of all, even and between halves
 _SIGMAS_OWN = np.array([0.05, 0.1])
 _POLE_BLUR = 0.3  # half widths by which returns beside the pole may be the pole's
@@ -72,10 +72,11 @@ class LimbNormals(NamedTuple):
         Normal matrices and right-hand sides.
     faces, rhs_faces : (m, 3, 3), (m, 3)
         The same with returns of the downward sweep counted negative.
-    halves, halves_faces : (m, 3), (m, 3)
-        Between the centres, all returns alike and by face, and the difference of the two halves.
-    of_halves : (2,)
-        Normal equation of that difference: its precision and right-hand side.
+    shared, shared_faces : (m, 3, 2), (m, 3, 2)
+        Between the centres, all returns alike and by face, and what all spheres share: the
+        difference of the two halves, and the offset of the gimbal's clock.
+    of_shared : (2, 3)
+        Normal equations of these two, last the right-hand sides.
     factors : (n, 2)
         Precision, and precision times mean, of the normal approximation of each return's
         likelihood.
@@ -85,37 +86,48 @@ class LimbNormals(NamedTuple):
     rhs: Array
     faces: Array
     rhs_faces: Array
-    halves: Array
-    halves_faces: Array
-    of_halves: Array
+    shared: Array
+    shared_faces: Array
+    of_shared: Array
     factors: Array
 
 
-def edge_of(returns: Returns, linear: Linear, weights: Array, radius: float) -> Edge:
+def edge_of(returns: Returns, linear: Linear, weights: Array, covs: Array, radius: float) -> Edge:
     """Estimate how returns end at the limb of the spheres of a stop.
 
     Notes
     -----
     Returns lie evenly up to the edge: one that seems to reach inside of it by ``x``, with standard
     deviation ``s``, has a density proportional to ``Phi(x / s)``. Footprints that are wider or
-    narrower than specified move the edge; errors of directions soften it, which lowers its weight.
-    Posterior mean over a grid, with a weak prior for few spheres. Returns beside the pole are left
-    out: there footprints that miss the sphere return too.
+    narrower than specified move the edge. What is not known of the direction of a return and of the
+    centre of its sphere, by ``covs``, (m, 3, 3), is no softness of the edge: else spheres whose
+    limb is badly seen would soften it for all. Posterior mean over a grid, with a weak prior for
+    few spheres. Returns beside the pole are left out: there footprints that miss the sphere return
+    too.
     """
     distances, halves = distances_and_halves(returns, linear.offsets)
     inside = (radius + halves - distances) / halves
     bins = np.clip((inside - _FROM) / _BIN, 0.0, _N_BINS).astype(np.intp)
     counted = (weights > 0.0) & (bins < _N_BINS) & ~_is_by_pole(returns, linear.offsets, radius)
-    upper = _is_upper(returns, linear.offsets)[counted]
-    counts = np.bincount(bins[counted] + _N_BINS * upper, minlength=2 * _N_BINS)
-    blurs2 = (returns.sigmas_lateral / halves)[counted] ** 2
-    lateral2 = np.bincount(upper, blurs2, 2) / np.maximum(np.bincount(upper, minlength=2), 1.0)
-    logs = np.tensordot(counts.reshape(2, _N_BINS), _log_densities(), axes=1) + _log_prior()
+    rows = _towards_beams(returns, linear.offsets)[:, counted]
+    variances = np.einsum("in,nij,jn->n", rows, covs[returns.markers[counted]], rows)
+    variances += returns.sigmas_lateral[counted] ** 2
+    blurs = np.argmin(np.abs(np.sqrt(variances) / halves[counted] - _BLURS[:, None]), axis=0)
+    cells = (_is_upper(returns, linear.offsets)[counted] * len(_BLURS) + blurs) * _N_BINS
+    counts = np.bincount(cells + bins[counted], minlength=2 * len(_BLURS) * _N_BINS)
+    logs = np.tensordot(counts.reshape(2, len(_BLURS), _N_BINS), _log_densities()) + _log_prior()
     posterior = np.exp(logs - logs.max(axis=(1, 2), keepdims=True))
     posterior /= posterior.sum(axis=(1, 2), keepdims=True)
-    softness2 = np.exp(2.0 * posterior.sum(axis=1) @ np.log(_SOFTNESSES)) - lateral2
-    edges = posterior.sum(axis=2) @ _EDGES
-    return Edge(radius, edges, np.sqrt(np.maximum(softness2, _SOFTNESS_MIN**2)))
+    softness = np.exp(posterior.sum(axis=1) @ np.log(_SOFTNESSES))
+    return Edge(radius, posterior.sum(axis=2) @ _EDGES, softness)
+
+
+def _towards_beams(returns: Returns, offsets: Array) -> Array:
+    """Return unit vectors from centres to beams, square to the lines of sight to them, (3, n)."""
+    distances = np.maximum(np.hypot(*offsets), 1e-9)
+    x, y = offsets / distances
+    tilt = distances / returns.ranges
+    return np.asarray(x * returns.first_axes + y * returns.second_axes + tilt * returns.directions)
 
 
 def _is_upper(returns: Returns, offsets: Array) -> Index:
@@ -125,14 +137,13 @@ def _is_upper(returns: Returns, offsets: Array) -> Index:
 
 @cache
 def _log_densities() -> Array:
-    """Return the log-density of returns in each bin, (b, e, s), for each edge and softness."""
+    """Return the log-density of returns in each bin for each blur, edge and softness."""
     inside = _FROM + _BIN * (np.arange(_N_BINS) + 0.5)
-    z = (inside[:, None, None] - _EDGES[:, None]) / _SOFTNESSES
-    t = (_FROM + _BIN * _N_BINS - _EDGES[:, None]) / _SOFTNESSES
+    sigmas = np.hypot(_BLURS[:, None, None, None], _SOFTNESSES)
+    z = (inside[:, None, None] - _EDGES[:, None]) / sigmas
+    t = (_FROM + _BIN * _N_BINS - _EDGES[:, None]) / sigmas
     length = t * ndtr(t) + _DENSITY * np.exp(-0.5 * t * t)
-    return np.asarray(
-        np.log(_OUTLIERS + (1.0 - _OUTLIERS) * ndtr(z)) - np.log(_SOFTNESSES * length)
-    )
+    return np.asarray(np.log(_OUTLIERS + (1.0 - _OUTLIERS) * ndtr(z)) - np.log(sigmas * length))
 
 
 @cache
@@ -167,22 +178,19 @@ def limb_normals(
     inside, halves, blur2 = inside[used], halves[used], blur2[used]
     blur2 = blur2 + by_pole * (_POLE_BLUR * halves) ** 2
 
-    # derivatives of the depth inside by the centre and the sphere's own edge: the direction from
-    # the centre to the beam, square to the line of sight to the centre
+    # derivatives of the depth inside by the centre and the sphere's own edge
+    columns = np.empty((6, len(used)))
+    columns[:3] = _towards_beams(returns, linear.offsets)[:, used]
     x, y = linear.offsets[:, used] / distances[used]
-    tilt = distances[used] / returns.ranges[used]
-    columns = np.empty((5, len(used)))
-    columns[:3] = (
-        x * returns.first_axes[:, used]
-        + y * returns.second_axes[:, used]
-        + tilt * returns.directions[:, used]
-    )
     columns[3] = -halves
     columns[4] = -halves * np.sum(np.stack([x, y]) * returns.vertical[:, used], axis=0)
     rows = columns[:3]
+    columns[5] = np.sum(rows * swept(returns)[:, used], axis=0)
     variances = np.einsum("in,nij,jn->n", rows, covs[returns.markers[used]], rows)
     found = np.zeros(factors.shape)
-    found[used] = weights[used, None] * _approximated(inside, (variances, blur2), factors[used])
+    found[used] = (weights * returns.shares)[used, None] * _approximated(
+        inside, (variances, blur2), factors[used]
+    )
     if factors.any():  # factors that change together would overshoot, and come back
         found[used] += _DAMPING * (factors[used] - found[used])
 
@@ -190,18 +198,19 @@ def limb_normals(
     starts, right = np.searchsorted(used, returns.starts), np.vstack([precisions * columns, rhs])
     both = sums_of_products(starts, columns, right)
     faces = sums_of_products(starts, columns, returns.vertical[0, used] * right)
-    inverse = np.linalg.inv(both[:, 3:, 3:5] + np.diag(_SIGMAS_OWN**-2.0))
-    N = both - both[:, :, 3:5] @ inverse @ both[:, 3:]  # fifth is the difference of all spheres
-    of_faces = faces[:, :3, :3] - both[:, :3, 3:5] @ inverse @ faces[:, 3:, :3]
-    others = faces[:, :3, 4:] - faces[:, :3, 3:5] @ inverse @ both[:, 3:, 4:]
+    inverse = np.linalg.inv(both[:, 3:5, 3:5] + np.diag(_SIGMAS_OWN**-2.0))
+    # the fifth is the difference of all spheres, too
+    N = both - both[:, :, 3:5] @ inverse @ both[:, 3:5]
+    of_faces = faces[:, :3, :3] - both[:, :3, 3:5] @ inverse @ faces[:, 3:5, :3]
+    others = faces[:, :3, 4:] - faces[:, :3, 3:5] @ inverse @ both[:, 3:5, 4:]
     return LimbNormals(
         centres=N[:, :3, :3],
-        rhs=N[:, :3, 5],
+        rhs=N[:, :3, 6],
         faces=of_faces,
-        rhs_faces=others[:, :, 1],
-        halves=N[:, :3, 4],
-        halves_faces=others[:, :, 0],
-        of_halves=N[:, 4, 4:].sum(axis=0),
+        rhs_faces=others[:, :, 2],
+        shared=N[:, :3, 4:6],
+        shared_faces=others[:, :, :2],
+        of_shared=N[:, 4:6, 4:].sum(axis=0),
         factors=found,
     )
 

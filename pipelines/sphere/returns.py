@@ -17,6 +17,7 @@ BENT = 2.0
 
 _POLE_BEGINS = 1.0  # radii below the centre: a footprint that begins lower is on the pole
 _POLE_HALF = 0.35  # radii from the vertical through the centre: half width of the pole's region
+_SAME_PLACE = 0.25  # half widths of a beam within which returns show the same of a limb
 _LINE = 0.01  # [s] between returns of different scan lines, at the least
 
 
@@ -48,6 +49,11 @@ class Returns(NamedTuple):
         Prior standard deviation of the range [m].
     sigmas_lateral : (n,)
         Standard deviation across the beam by the noise of the direction [m].
+    speeds : (n,)
+        Angular speed of the gimbal about that at the mean return [rad/s].
+    shares : (n,)
+        One over the number of returns of the same candidate at the same place: where scan lines
+        fall on each other, the limb is seen no better than by one of them.
     """
 
     starts: Index
@@ -64,10 +70,17 @@ class Returns(NamedTuple):
     classes: Index
     sigmas: Array
     sigmas_lateral: Array
+    speeds: Array
+    shares: Array
 
 
 def returns_of(
-    beams: Beams, starts: Index, up: Array, lasers: Index, noise: tuple[Index, Array, Array | float]
+    beams: Beams,
+    starts: Index,
+    up: Array,
+    lasers: Index,
+    noise: tuple[Index, Array, Array | float],
+    speeds: Array | None = None,
 ) -> Returns:
     """Build the columns.
 
@@ -83,6 +96,8 @@ def returns_of(
         Index of the laser among those of the stop.
     noise : tuple
         Classes of reflectivity, (n,), and sigmas of ranges, (n,) [m], and of directions [rad].
+    speeds : (n,), optional
+        Angular speeds of the gimbal [rad/s]; even where they are not given.
 
     Returns
     -------
@@ -98,9 +113,10 @@ def returns_of(
     half_widths = np.maximum(0.5 * beams.ranges * beams.divergence[:, None], _THIN)
     vertical = np.stack([up @ first_axes, up @ second_axes])
     vertical /= np.linalg.norm(vertical, axis=0)
+    markers = np.repeat(np.arange(len(starts) - 1), np.diff(starts))
     return Returns(
         starts=starts,
-        markers=np.repeat(np.arange(len(starts) - 1), np.diff(starts)),
+        markers=markers,
         origins=origins,
         directions=directions,
         first_axes=first_axes,
@@ -118,7 +134,21 @@ def returns_of(
         classes=classes,
         sigmas=sigmas,
         sigmas_lateral=sigma_direction * beams.ranges,
+        speeds=np.zeros(len(lasers))
+        if speeds is None
+        else speeds - np.sum(speeds) / max(len(speeds), 1),
+        shares=_shares_of(markers, directions, beams.divergence),
     )
+
+
+def _shares_of(markers: Index, directions: Array, divergence: Array) -> Array:
+    """Return one over the number of returns of a candidate in a cell of directions."""
+    cell = _SAME_PLACE * 0.5 * float(np.sqrt(np.prod(divergence)))
+    places = np.floor(directions / max(cell, _THIN)).astype(np.int64)
+    _, own, counts = np.unique(
+        np.vstack([markers, places]), axis=1, return_inverse=True, return_counts=True
+    )
+    return np.asarray(1.0 / counts[own.ravel()])
 
 
 def of_markers(returns: Returns, markers: Index) -> tuple[Returns, Index]:
@@ -138,6 +168,15 @@ def moved_faces(returns: Returns, moves: Array) -> Returns:
     """Shift the beams of upward sweeps by ``-moves``, (m, 3), those of downward sweeps by it."""
     shifts = returns.vertical[0] * moves[returns.markers].T
     return returns._replace(origins=returns.origins - shifts)
+
+
+def swept(returns: Returns) -> Array:
+    """Return how fast spheres seem to move with the offset of the gimbal's clock, (3, n) [m/s].
+
+    The gimbal was at ``angle - offset * speed``. At an even speed that is a turn of everything.
+    """
+    x, y, _ = returns.origins + returns.ranges * returns.directions
+    return np.asarray(returns.speeds * np.stack([-y, x, np.zeros(len(x))]))
 
 
 def may_be_sphere(returns: Returns, offsets: Array, margins: Array, radius: float) -> Mask:

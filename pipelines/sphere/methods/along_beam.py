@@ -27,7 +27,11 @@ from spheremark.pipelines.model import (
     Status,
     StitchedCloud,
 )
-from spheremark.pipelines.scan.interpolation import errors_of_interpolation, scatter_of_angles
+from spheremark.pipelines.scan.interpolation import (
+    errors_of_interpolation,
+    scatter_of_angles,
+    speeds_of,
+)
 from spheremark.pipelines.scan.stitching import beams
 from spheremark.pipelines.sphere.description import (
     WITHOUT_RINGS,
@@ -133,6 +137,7 @@ def _fit(
         radius,
         sigma_biases,
         prior_sigmas(config, cloud.rig),
+        config.sigma_gimbal_clock,
         sigmas_of(config.sigma_mounting, config.sigma_offset),
     )
     rough = np.array([c.p_base_rough for c in found.candidates])
@@ -187,6 +192,7 @@ def _gather(
         levelling_rotation(cloud.levelling)[2],
         np.searchsorted(lasers, table.rings),
         (*classes_of(table.intensities), _sigmas_direction(of_angles, table.times, starts, config)),
+        speeds_of(cloud.gimbal_angles, together),
     )
     return _Stop(table, together, returns, min(of_angles, config.sigma_direction)), sigma_biases
 

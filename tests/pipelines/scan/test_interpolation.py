@@ -5,7 +5,7 @@ import pytest
 from numpy.testing import assert_allclose
 
 from spheremark.pipelines.model import Timed
-from spheremark.pipelines.scan.interpolation import errors_of_interpolation
+from spheremark.pipelines.scan.interpolation import errors_of_interpolation, speeds_of
 
 REST, MOVE, SPEED, PERIOD = 0.1, 0.05, 1.7, 9_300_000  # [s], [s], [rad/s], [ns] between samples
 
@@ -38,8 +38,9 @@ def test_corners_are_found_through_the_scatter_of_the_samples():
     column = sampled(stepped_angle, scatter=5e-5)
     off = np.abs(column[:].astype(float) - stepped_angle(1e-9 * column.stamps_ns))
     found = errors_of_interpolation(column, np.arange(len(column)))
+    assert np.all(found[off > 3e-4] > 0.5 * off[off > 3e-4])
     assert np.all(found[off > 1e-3] > 0.8 * off[off > 1e-3])
-    assert np.mean(found > 0.0) < 0.2
+    assert np.mean(found > 2e-4) < 0.15
 
 
 @pytest.mark.parametrize(
@@ -54,3 +55,13 @@ def test_an_even_or_rippling_turn_has_no_corners(angle):
     column = sampled(angle, scatter=5e-5)
     assert not errors_of_interpolation(column, np.arange(len(column))).any()
     assert not errors_of_interpolation(column[:], np.arange(len(column))).any()
+
+
+def test_speeds_are_those_between_the_samples_and_none_without_samples():
+    column = sampled(stepped_angle)
+    times = 1e-9 * column.stamps_ns
+    speeds = speeds_of(column, np.arange(len(column)))
+    within, between = times % (REST + MOVE), 2e-9 * PERIOD
+    assert_allclose(speeds[within > REST + between][:20], SPEED)
+    assert_allclose(speeds[(within > between) & (within < REST - between)], 0.0, atol=1e-9)
+    assert not speeds_of(column[:], np.arange(len(column))).any()
