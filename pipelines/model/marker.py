@@ -272,6 +272,9 @@ class MarkerFits:
         Centres of those of them that have one, P01, P02 ...
     sample_base : (n, 3) float32
         An even sample of the returns of the stop, which shows what hides a place [m].
+    mounting_factor : float
+        By how much errors of the mounting exceed what the configuration expects, by the two faces
+        of the spheres; 1 where they do not.
     """
 
     method: str
@@ -281,3 +284,4 @@ class MarkerFits:
     possible: tuple[Rejection, ...] = ()
     possible_fits: tuple[MarkerFit, ...] = ()
     sample_base: Column = field(default_factory=lambda: np.zeros((0, 3), dtype=np.float32))
+    mounting_factor: float = 1.0

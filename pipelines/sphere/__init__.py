@@ -91,7 +91,8 @@ def fit_markers(
         METHODS[method](cloud, more, config, marker_radius) if more is not candidates else found
     )
     levelling = cloud.levelling
-    sigma_heading = found.heading_factor * levelling.sigma_heading
+    # what parts the two faces has a turn of both beside it, which only the heading would show
+    sigma_heading = found.mounting_factor * levelling.sigma_heading
     return MarkerFits(
         method=method,
         fits=tuple(_judged(fit, candidates) for fit in found.fits),
@@ -102,6 +103,7 @@ def fit_markers(
             _judged(fit, more) for fit in together.fits if fit.name.startswith(_POSSIBLE)
         ),
         sample_base=cloud.p_base[:: max(1, len(cloud.p_base) // _N_SAMPLE)].copy(),
+        mounting_factor=found.mounting_factor,
     )
 
 

@@ -40,15 +40,15 @@ _N_STEPS, _SETTLED = 30, 1e-7  # steps, [m]
 
 
 class Fits(NamedTuple):
-    """Fits and refused candidates of a stop, and by how much its heading is uncertain.
+    """Fits and refused candidates of a stop.
 
-    ``heading_factor`` multiplies the sigma of the heading that the rig states: errors of the
-    mounting that move the two faces of spheres apart have one of the heading beside them.
+    ``mounting_factor`` is by how much errors of the mounting, which move the two faces of spheres
+    apart, exceed their prior; 1 where they do not.
     """
 
     fits: tuple[MarkerFit, ...]
     rejected: tuple[Rejection, ...]
-    heading_factor: float = 1.0
+    mounting_factor: float = 1.0
 
 
 def each(

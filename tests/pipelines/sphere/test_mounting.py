@@ -104,6 +104,17 @@ def test_a_mounting_that_is_much_worse_than_its_prior_is_found_on_other_fields_t
     assert fits.levelling.sigma_heading > 1.05 * stops[0].log.rig.sigma_heading
 
 
+def test_a_mounting_that_is_not_as_stated_is_said_with_what_to_do(field, stops):
+    worse = replace(STEPPED, sigma_misalignment=np.radians(0.2), sigma_axis_offset=0.005)
+    for log, is_said in (
+        (stops[0].log, False),
+        (simulate_stop(field, "lane2-stop3", worse).log, True),
+    ):
+        (stop,) = process(log, config=CONFIG)
+        assert any("calibrate the rig" in note for note in stop.cloud.notes) == is_said
+        assert (stop.fits["along_beam"].mounting_factor > 2.0) == is_said
+
+
 def test_the_offset_of_the_clock_of_a_gimbal_that_steps_is_an_unknown():
     field = scenario("paper-field", 72)
     late = replace(STEPPED, step=np.radians(3.1), move=0.15, gimbal_clock_offset=0.004)
