@@ -30,6 +30,7 @@ from spheremark.pipelines.sphere.optics import (
 )
 from spheremark.pipelines.sphere.radius import BeamErrors, Ranges, free_radii
 from spheremark.pipelines.sphere.returns import Returns, may_be_sphere, moved_faces, swept
+from spheremark.pipelines.sphere.strips import on_strips
 
 _EFFICIENCY = 0.9753  # variance of the estimate over the inverse normal matrix
 _SIGMA_BIAS_MIN = 1e-5  # [m] of the laser biases: keeps their prior invertible
@@ -222,10 +223,24 @@ def estimate(
         before, state = state, _stepped(state, N, prior)
         if step + 1 >= _N_STEPS and _moved(before, state) < _SETTLED:
             break
+    if others is not None:
+        state = _beside_strips(returns, state, radius, is_used)
     corrected = _corrected(returns, state)
     linear = linearise(corrected, *_spheres(state, radius), is_used)
     weighed = _weighed(corrected, state, linear, (radius, state.noise, is_used))
     return Estimate(state._replace(noise=weighed.noise), linear, weighed)
+
+
+def _beside_strips(returns: Returns, state: State, radius: float, is_used: Mask) -> State:
+    """Return the state with the likeliest centres of spheres that are seen on a strip."""
+    corrected = _corrected(returns, state)
+    linear = linearise(corrected, *_spheres(state, radius), is_used)
+    weighed = _weighed(corrected, state, linear, (radius, state.noise, is_used))
+    edge = edge_of(corrected, linear, weighed.weights, state.covs_of_limb, radius)
+    ranges = corrected.ranges - echo_shifts(linear, state.optics)
+    measured = (ranges, weighed.sigmas, weighed.weights)
+    moves, covs = on_strips(corrected, linear, measured, state.centres, edge)
+    return state._replace(centres=state.centres + moves, cov_noise=state.cov_noise + covs)
 
 
 def _start(rough: Array, prior: Prior) -> State:

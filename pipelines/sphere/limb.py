@@ -32,7 +32,9 @@ _POLE_BLUR = 0.3  # half widths by which returns beside the pole may be the pole
 SIGMA_HALVES = _SIGMA_EDGE / math.sqrt(2.0)
 """Prior of half the difference between the edges above and below [half widths]."""
 
-_OUTLIERS = 0.01  # share of returns with the sphere's range whose beam did not meet it
+OUTLIERS = 0.01
+"""Share of returns with the range of a sphere whose beam did not meet it."""
+
 _CERTAIN = 4.0  # standard deviations inside the limb beyond which a return carries no information
 _DAMPING = 0.5  # part of the factors before that those of a step keep
 _CAVITY_MIN = 0.05  # least share of a centre's precision that is not one return's own
@@ -113,7 +115,7 @@ def edge_of(returns: Returns, linear: Linear, weights: Array, covs: Array, radiu
     variances = np.einsum("in,nij,jn->n", rows, covs[returns.markers[counted]], rows)
     variances += returns.sigmas_lateral[counted] ** 2
     blurs = np.argmin(np.abs(np.sqrt(variances) / halves[counted] - _BLURS[:, None]), axis=0)
-    cells = (_is_upper(returns, linear.offsets)[counted] * len(_BLURS) + blurs) * _N_BINS
+    cells = (is_upper(returns, linear.offsets)[counted] * len(_BLURS) + blurs) * _N_BINS
     counts = np.bincount(cells + bins[counted], minlength=2 * len(_BLURS) * _N_BINS)
     logs = np.tensordot(counts.reshape(2, len(_BLURS), _N_BINS), _log_densities()) + _log_prior()
     posterior = np.exp(logs - logs.max(axis=(1, 2), keepdims=True))
@@ -130,7 +132,7 @@ def _towards_beams(returns: Returns, offsets: Array) -> Array:
     return np.asarray(x * returns.first_axes + y * returns.second_axes + tilt * returns.directions)
 
 
-def _is_upper(returns: Returns, offsets: Array) -> Index:
+def is_upper(returns: Returns, offsets: Array) -> Index:
     """Return 1 for beams that pass above the centre, else 0."""
     return np.asarray(np.sum(offsets * returns.vertical, axis=0) > 0.0, dtype=np.intp)
 
@@ -143,7 +145,7 @@ def _log_densities() -> Array:
     z = (inside[:, None, None] - _EDGES[:, None]) / sigmas
     t = (_FROM + _BIN * _N_BINS - _EDGES[:, None]) / sigmas
     length = t * ndtr(t) + _DENSITY * np.exp(-0.5 * t * t)
-    return np.asarray(np.log(_OUTLIERS + (1.0 - _OUTLIERS) * ndtr(z)) - np.log(sigmas * length))
+    return np.asarray(np.log(OUTLIERS + (1.0 - OUTLIERS) * ndtr(z)) - np.log(sigmas * length))
 
 
 @cache
@@ -169,7 +171,7 @@ def limb_normals(
     would lift it: each sphere has both of its own, which are eliminated.
     """
     distances, halves = distances_and_halves(returns, linear.offsets)
-    upper = _is_upper(returns, linear.offsets)
+    upper = is_upper(returns, linear.offsets)
     inside = edge.radius + halves - distances - edge.inside[upper] * halves
     blur2 = (edge.softness[upper] * halves) ** 2 + returns.sigmas_lateral**2
     widest = np.trace(covs, axis1=1, axis2=2)[returns.markers]
@@ -225,8 +227,8 @@ def _approximated(inside: Array, variances: tuple[Array, Array], factors: Array)
     rhs = inside / variance - factors[:, 1]
     spread = 1.0 / precision + blur2
     z = rhs / precision / np.sqrt(spread)
-    chance = np.where(z > _CERTAIN, 1.0, _OUTLIERS + (1.0 - _OUTLIERS) * ndtr(z))
-    ratio = (1.0 - _OUTLIERS) * _DENSITY * np.exp(-0.5 * z * z) / chance
+    chance = np.where(z > _CERTAIN, 1.0, OUTLIERS + (1.0 - OUTLIERS) * ndtr(z))
+    ratio = (1.0 - OUTLIERS) * _DENSITY * np.exp(-0.5 * z * z) / chance
     curvature = ratio * (z + ratio) / spread  # minus the second derivative of the log-likelihood
     given = curvature / (1.0 - curvature / precision)
     mean = rhs / precision + ratio / np.sqrt(spread) / precision
