@@ -195,13 +195,13 @@ def _process_stop(
 
 
 def _mounting_notes(fits: MarkerFits) -> tuple[str, ...]:
-    """Return a note where the two faces of spheres show that the rig is not as it is stated."""
+    """Return a note where the two faces of spheres show errors of the rig beyond their prior."""
     if fits.mounting_factor < _MOUNTING_WRONG:
         return ()
     return (
-        f"By the two faces of its spheres the LiDAR sits {fits.mounting_factor:.1f} times as far "
-        "off as fitting.sigma_mounting and sigma_offset allow. Centres are as uncertain as that; "
-        "calibrate the rig (spheremark calibrate) for better ones.",
+        "The two faces of its spheres lie apart as if the errors of the mounting were "
+        f"{fits.mounting_factor:.1f} times fitting.sigma_mounting and sigma_offset. Before you "
+        "rely on its centres, calibrate the rig (spheremark calibrate).",
     )
 
 

@@ -8,7 +8,8 @@ from spheremark.pipelines.estimation.robust import robust_sigma
 from spheremark.pipelines.model import Array, Column, Index, Timed
 
 _N_SAMPLES = 10  # of the gimbal's angle, from which their scatter is known
-_CORNER = 12.0  # times that scatter: changes of the angle's slope, which scatter by 3 times as much
+# times that scatter: changes of the slope at both samples, and at each; they scatter by 3 times it
+_CORNER, _NOISE = 12.0, 3.0
 
 
 def scatter_of_angles(angles: Timed | Column, unknown: float) -> float:
@@ -88,5 +89,6 @@ def errors_of_interpolation(angles: Timed | Column, rows: Index) -> Array:
     changes = np.stack([jumps[k], jumps[k + 1]])
     bends = changes * (samples[k + 1] - samples[k])
     is_corner = np.prod(np.sign(bends), axis=0) > 0.0
-    is_corner &= np.abs(bends).sum(axis=0) > _CORNER * scatter_of_angles(angles, 0.0)
+    sizes, scatter = np.abs(bends), scatter_of_angles(angles, 0.0)
+    is_corner &= (sizes.sum(axis=0) > _CORNER * scatter) & (sizes.min(axis=0) > _NOISE * scatter)
     return np.where(is_corner, np.min(np.abs(changes) * np.maximum(sides, 0.0), axis=0), 0.0)

@@ -1,7 +1,8 @@
 """Joint least-squares estimate of the spheres of a stop.
 
 The spheres share what one of them cannot determine: the noise of the sensor, the range bias of each
-laser, the errors of the mounting, and how sharply returns end at the limb.
+laser, the errors of the mounting, how late the gimbal's clock is, and how sharply returns end at
+the limb.
 """
 
 from __future__ import annotations
@@ -102,11 +103,11 @@ class State(NamedTuple):
     ----------
     centres : (m, 3)
         Centres [m].
-    shared : (k + q + 6,)
+    shared : (k + q + 8,)
         Range biases of the lasers [m], ``UNKNOWNS``, half the difference between the edges above
         and below [half widths], offset of the gimbal's clock [s], and errors of the mounting in the
         order of ``mounting.effects_on``.
-    sigmas : (k + q + 6,)
+    sigmas : (k + q + 8,)
         Their prior standard deviations, those of biases and mounting scaled as estimated.
     has_shared : bool
         Whether the shared unknowns are estimated already.
@@ -114,9 +115,9 @@ class State(NamedTuple):
         That of the stop; none before the first residuals.
     cov_noise, cov_shared_part : (m, 3, 3)
         Covariances of the centres by the noise, and by the shared unknowns [m^2].
-    by_shared : (m, 3, k + q + 6)
+    by_shared : (m, 3, k + q + 8)
         Derivatives of the centres by the shared unknowns, with the sign turned.
-    cov_shared : (k + q + 6, k + q + 6)
+    cov_shared : (k + q + 8, k + q + 8)
         Covariance of the shared unknowns.
     cov_optics : (q, q)
         That of ``UNKNOWNS`` as far as they are estimated, if beams had the assumed profile.
@@ -223,24 +224,32 @@ def estimate(
         before, state = state, _stepped(state, N, prior)
         if step + 1 >= _N_STEPS and _moved(before, state) < _SETTLED:
             break
-    if others is not None:
-        state = _beside_strips(returns, state, radius, is_used)
+    found = _predicted(returns, state, radius, is_used)
+    if others is None:
+        return found
+    moves, covs = _beside_strips(returns, found, radius)
+    if not moves.any():
+        return found
+    centres, cov_noise = found.state.centres + moves, found.state.cov_noise + covs
+    state = found.state._replace(centres=centres, cov_noise=cov_noise)
+    return _predicted(returns, state, radius, is_used)
+
+
+def _predicted(returns: Returns, state: State, radius: float, is_used: Mask) -> Estimate:
+    """Return a state with the predictions, residuals and weights of all returns."""
     corrected = _corrected(returns, state)
     linear = linearise(corrected, *_spheres(state, radius), is_used)
     weighed = _weighed(corrected, state, linear, (radius, state.noise, is_used))
     return Estimate(state._replace(noise=weighed.noise), linear, weighed)
 
 
-def _beside_strips(returns: Returns, state: State, radius: float, is_used: Mask) -> State:
-    """Return the state with the likeliest centres of spheres that are seen on a strip."""
-    corrected = _corrected(returns, state)
-    linear = linearise(corrected, *_spheres(state, radius), is_used)
-    weighed = _weighed(corrected, state, linear, (radius, state.noise, is_used))
+def _beside_strips(returns: Returns, found: Estimate, radius: float) -> tuple[Array, Array]:
+    """Return moves and further covariances of the spheres that are seen on a strip."""
+    (state, linear, weighed), corrected = found, _corrected(returns, found.state)
     edge = edge_of(corrected, linear, weighed.weights, state.covs_of_limb, radius)
     ranges = corrected.ranges - echo_shifts(linear, state.optics)
     measured = (ranges, weighed.sigmas, weighed.weights)
-    moves, covs = on_strips(corrected, linear, measured, state.centres, edge)
-    return state._replace(centres=state.centres + moves, cov_noise=state.cov_noise + covs)
+    return on_strips(corrected, linear, measured, state.centres, edge)
 
 
 def _start(rough: Array, prior: Prior) -> State:

@@ -1,7 +1,8 @@
 """Normal equations of the centres of a stop and of the unknowns that all centres share.
 
-Shared are the range biases of the lasers, the optics and the errors of the mounting. Each centre is
-eliminated first (Schur complement), so that the cost is linear in the markers.
+Shared are the range biases of the lasers, the optics with the limb and the clock of the gimbal, and
+the errors of the mounting. Each centre is eliminated first (Schur complement), so that the cost is
+linear in the markers.
 """
 
 from __future__ import annotations
@@ -22,13 +23,13 @@ class Normals(NamedTuple):
     Attributes
     ----------
     centres : (m, 3, 3 + k + q + 1)
-        Rows of the centres. Columns are the centre, the k laser biases, the q unknowns of the
-        optics, and the right-hand side.
+        Rows of the centres. Columns are the centre, the k laser biases, the q unknowns of optics,
+        limb and clock, and the right-hand side.
     by_face : (m, 3, 3 + k + q + 1)
         The same with returns of the downward sweep counted negative: the mounting moves the two
         faces of a sphere against each other.
     shared : (k + q, k + q + 1)
-        Rows of the laser biases and of the optics, last the right-hand side.
+        Rows of the laser biases and of optics, limb and clock, last the right-hand side.
     """
 
     centres: Array

@@ -105,6 +105,7 @@ def returns_of(
         Columns with coordinates as first axis.
     """
     classes, sigmas, sigma_direction = noise
+    speeds = np.zeros(len(lasers)) if speeds is None else speeds
     origins, directions, first_axes = (
         np.ascontiguousarray(vectors.T)
         for vectors in (beams.origins_base, beams.directions_base, beams.across_base)
@@ -125,18 +126,13 @@ def returns_of(
         ranges=beams.ranges,
         vertical=vertical,
         vertical_half_widths=np.stack(
-            [
-                np.hypot(*(half_widths * vertical)),
-                np.hypot(*(half_widths * vertical[::-1])),
-            ]
+            [np.hypot(*(half_widths * sides)) for sides in (vertical, vertical[::-1])]
         ),
         lasers=lasers,
         classes=classes,
         sigmas=sigmas,
         sigmas_lateral=sigma_direction * beams.ranges,
-        speeds=np.zeros(len(lasers))
-        if speeds is None
-        else speeds - np.sum(speeds) / max(len(speeds), 1),
+        speeds=np.asarray(speeds - np.sum(speeds) / max(len(lasers), 1)),
         shares=_shares_of(markers, directions, beams.divergence),
     )
 

@@ -22,7 +22,7 @@ _STRIP = 0.1  # radii: standard deviation across a strip of returns
 _N_MIN = 4  # returns that show one
 _GRID = np.arange(-1.5, 1.51, 0.1)  # radii beside the strip
 _N_STEPS, _STEP_MAX = 3, 0.3  # along the line of sight and along the strip; and radii
-_LOOSE = 0.5  # radii: prior of these steps
+_LOOSE = 0.5  # radii: sigma of a step where returns do not determine it
 _SQUARE_MAX = 9.0  # of a residual over its variance: more is an outlier
 
 

@@ -36,6 +36,7 @@ def test_a_sheet_has_the_sigmas_of_rig_and_ahrs_in_each_setting(worlds):
     assert sheet.fitting.sigma_range_bias == config.sigma_laser_bias
     assert sheet.fitting.sigma_mounting == config.sigma_misalignment
     assert sheet.fitting.sigma_offset == config.sigma_axis_offset
+    assert sheet.fitting.sigma_gimbal_clock == pytest.approx(latency_rms("rig"))
     assert sheet.stitching.sigma_levelling > config.sigma_ahrs_bias
     assert sheet.resection.sigma_range**2 == pytest.approx(
         sheet.fitting.sigma_range_common**2 + config.sigma_laser_bias**2 / 16.0

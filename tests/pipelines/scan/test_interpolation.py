@@ -40,7 +40,7 @@ def test_corners_are_found_through_the_scatter_of_the_samples():
     found = errors_of_interpolation(column, np.arange(len(column)))
     assert np.all(found[off > 3e-4] > 0.5 * off[off > 3e-4])
     assert np.all(found[off > 1e-3] > 0.8 * off[off > 1e-3])
-    assert np.mean(found > 2e-4) < 0.15
+    assert np.mean(found > 0.0) < 0.2
 
 
 @pytest.mark.parametrize(

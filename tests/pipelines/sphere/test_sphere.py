@@ -290,6 +290,10 @@ def test_returns_while_a_gimbal_starts_or_stops_are_left_out_and_move_no_centre(
     even = found((np.flatnonzero(~is_off), CENTRE))
     (without,) = fit_markers("along_beam", cloud, even, CONFIG, RADIUS).fits
     assert_allclose(fit.p_base, without.p_base, atol=5e-4)
+    # a clock that one sphere alone has to show moves it by less than a sigma
+    (free,) = fit_one(moved, CENTRE).fits
+    off = free.p_base - without.p_base
+    assert off @ np.linalg.solve(free.cov_p_base, off) < 1.0
 
 
 def test_a_marker_that_a_gimbal_passes_only_while_it_starts_or_stops_keeps_its_returns():
