@@ -8,6 +8,7 @@
 - ``features`` measures the shape of the returns about a place,
 - ``evidence`` gathers the beams towards and about a group, ``pulses`` those without a return,
 - ``beams`` chooses those to compare, and describes what stands behind and beside,
+- ``support`` is what holds an object up,
 - ``shapes`` are what may stand there, ``search`` finds the likeliest of each kind,
 - ``hypotheses`` compares the sphere with the others,
 - ``decision`` says what a group is, and how surely.
@@ -109,7 +110,7 @@ def extract(
     -------
     MarkerCandidates
         Candidates in the order of azimuth; possible ones; of the groups that passed the first test
-        of size and were then rejected, the (at most 300) most like a sphere, with the reason; and
+        of size and were then rejected, the (at most 300) that came farthest, with the reason; and
         the height of the highest ground point within 10 m, where the published method cuts its
         clouds.
 
@@ -159,11 +160,8 @@ def extract(
             possible.append(replace(refused, members=members))
         else:
             rejected.append(refused)
-    not_compared = [
-        _rejection(features, reason)
-        for features, reason in zip(groups, reasons, strict=True)
-        if reason
-    ]
+    farthest_first = sorted(range(len(groups)), key=lambda i: i not in evidence)
+    not_compared = [_rejection(groups[i], reasons[i]) for i in farthest_first if reasons[i]]
     return MarkerCandidates(
         candidates=_candidates(markers, target),
         possible=tuple(possible),

@@ -19,6 +19,7 @@ from spheremark.pipelines.detection.target import Target
 from spheremark.pipelines.model import Array
 
 _TOUCHING = 0.10  # share of a ball's returns that may lie as far away beside it: mixed pixels
+_LEGS = 0.15  # share of the beams below it that the legs of a tripod may stop
 _OFF = 0.6  # as a share of the returns on a free sphere: those off it and its pole
 _EXTENT_MIN = 0.4  # radii: one line of a scan shows no ball
 _HALF_SEEN = 0.8  # radii: the returns of half a ball are as wide, but for those at its edges
@@ -119,7 +120,6 @@ def reason_by_features(features: Features, radius: float) -> str:
 
 def reason_by_evidence(features: Features, evidence: Evidence, target: Target) -> str:
     """Return why a group is not compared; an empty string where it is."""
-    few = inf if is_resolved(features, target.radius) else 1.0
     if evidence.n_before > 2.0 + _HIDDEN * evidence.n_on:
         return (
             f"Most of it is hidden: {evidence.n_before} returns inside its outline lie before it, "
@@ -130,9 +130,12 @@ def reason_by_evidence(features: Features, evidence: Evidence, target: Target) -
             f"Its returns lie on a strip {1e3 * features.width:.0f} mm wide, and the scan does not "
             "show whether it looked beside it: nothing shows whether it is round."
         )
-    if evidence.n_carrying > max(few - 1.0 + _TOUCHING * _n_comparable(evidence), 1.0):
+    few = inf if is_resolved(features, target.radius) else 1.0
+    n_carrying, n_near = evidence.n_carrying, evidence.n_held + evidence.n_short
+    is_held = n_carrying > max(few - 1.0 + _TOUCHING * _n_comparable(evidence), 1.0)
+    if is_held and n_near > _LEGS * (n_near + evidence.n_past):
         return (
-            f"It does not stand on a pole: {evidence.n_carrying} returns below it and beside a "
+            f"It does not stand on a pole: {n_carrying} returns below it and beside a "
             "pole's place lie about as far away, as on shoulders, a larger stone or the ground."
         )
     return ""

@@ -32,6 +32,9 @@ from spheremark.pipelines.model import Array, Column, Mask, Rig, StitchedCloud
 from spheremark.pipelines.scan.interpolation import errors_of_interpolation
 from spheremark.pipelines.threads import side_by_side
 
+ROW, N_ROWS = 0.45, 9
+"""Radii below a sphere by which beams there are counted, and how many."""
+
 _REACH = 4.0  # radii about a centre: shoulders lie within three radii below a head
 _HELD = (-4.0, 1.0)  # radii of depth within which a return may belong to the same object
 _ON = (-1.3, 0.3)  # radii of depth within which a return may lie on the sphere
@@ -50,15 +53,10 @@ class Evidence(NamedTuple):
         Returns inside the limb at the depth of the sphere.
     n_before : int
         Returns inside the limb that lie before the sphere: beams that would have met it.
-    n_held : int
-        Returns below it and beside the pole, at about its distance, that are not ground.
-    n_carrying : int
-        Of these, returns of what may carry it: twice those of the emptier side of the pole if most
-        beams go past there, for then the others show something that stands beside it.
-    n_past : int
-        Returns there that lie behind it, and pulses there without a return.
-    n_short : int
-        Returns there that end long before it, or on the ground at its distance.
+    below : (3, 2, 9)
+        Beams below it and beside the pole: returns at about its distance that are not ground;
+        returns behind it and pulses without a return; returns long before it or on the ground at
+        its distance. To the left and to the right, by how far below, in ``ROW`` radii.
     brightness : float
         Reflectivity of the surface, 0-255: least squares over the beams of ``n_on``, weighted by
         their shares inside the limb.
@@ -85,10 +83,7 @@ class Evidence(NamedTuple):
 
     n_on: int
     n_before: int
-    n_held: int
-    n_carrying: int
-    n_past: int
-    n_short: int
+    below: NDArray[np.int64]
     brightness: float
     n_distinct: int
     rows: NDArray[np.int32]
@@ -99,6 +94,33 @@ class Evidence(NamedTuple):
     blur: Array
     height: float = np.nan
     sigma_height: float = np.inf
+
+    @property
+    def n_held(self) -> int:
+        """Number of returns below it at about its distance."""
+        return int(self.below[0].sum())
+
+    @property
+    def n_past(self) -> int:
+        """Number of beams below it that go past it."""
+        return int(self.below[1].sum())
+
+    @property
+    def n_short(self) -> int:
+        """Number of returns below it that end long before it, or on the ground."""
+        return int(self.below[2].sum())
+
+    @property
+    def n_carrying(self) -> int:
+        """Number of returns below it of what may carry it.
+
+        Where most go past on one side, whatever holds more on the other stands beside the pole:
+        twice those of the emptier side count then.
+        """
+        held, past, _ = self.below.sum(axis=2)
+        emptier = int(np.argmin(held))
+        is_open = past[emptier] > 2 + held[emptier]
+        return int(2 * held[emptier] if is_open else held.sum())
 
     @property
     def shows_below(self) -> bool:
@@ -176,17 +198,12 @@ def _evidence_at(
     )
     if silent is not None:
         passing, blur = silent / target.radius, blur_at(c, target) / target.radius
-        for side, is_there in enumerate((passing[0] <= 0.0, passing[0] > 0.0)):
-            below[1, side] += n_beside_pole(passing[:, is_there], blur)
-    n_held, n_past, n_short = below.sum(axis=1).tolist()
+        below[1] += beside_pole(passing, blur)
     is_left = np.cos(angles) * c[1] > np.sin(angles) * c[0]
     return Evidence(
         n_on=n_on,
         n_before=n_before,
-        n_held=n_held,
-        n_carrying=_n_carrying(below),
-        n_past=n_past,
-        n_short=n_short,
+        below=below,
         brightness=brightness,
         n_distinct=n_distinct,
         rows=rows,
@@ -196,17 +213,6 @@ def _evidence_at(
         silent=silent,
         blur=_half_widths(cloud.rig, angles, c, target),
     )
-
-
-def _n_carrying(below: NDArray[np.int64]) -> int:
-    """Return the beams below it that are held, but for those by something that stands beside it.
-
-    Where most go past on one side, whatever holds more on the other stands beside the pole.
-    """
-    held, past, _ = below
-    emptier = int(np.argmin(held))
-    is_open = past[emptier] > 2 + held[emptier]
-    return int(2 * held[emptier] if is_open else held.sum())
 
 
 def _origins(rig: Rig, angles: Column) -> Array:
@@ -230,12 +236,22 @@ def _half_widths(rig: Rig, angles: Column, c: Array, target: Target) -> Array:
 
 
 @compiled
-def n_beside_pole(silent: Array, blur: float) -> int:
-    """Return how many pulses without a return pass below a sphere and beside its pole."""
-    n = 0
+def beside_pole(silent: Array, blur: float) -> NDArray[np.int64]:
+    """Return how many pulses without a return pass a sphere below it and beside its pole, (2, 9).
+
+    To the left and to the right, by how far below.
+    """
+    n = np.zeros((2, N_ROWS), np.int64)
     for i in range(silent.shape[1]):
-        n += is_beside_pole(abs(silent[0, i]), silent[1, i], blur)
+        if is_beside_pole(abs(silent[0, i]), silent[1, i], blur):
+            n[int(silent[0, i] > 0.0), _row(silent[1, i])] += 1
     return n
+
+
+@compiled
+def _row(along: float) -> int:
+    """Return the row of a beam that passes below a sphere."""
+    return min(int(-along / ROW), N_ROWS - 1)
 
 
 @compiled
@@ -249,7 +265,7 @@ def _count_beams(
 ) -> tuple[int, int, NDArray[np.int64], float, int, Array]:
     """Return the counts of ``Evidence``, its brightness, and how the beams pass the centre.
 
-    Those below it are held, past and short, (3, 2), to the left and to the right of it.
+    Those below it are held, past and short, to the left and to the right of it, by rows.
     """
     radius = target.radius
     blur = blur_at(c, target) / radius
@@ -259,7 +275,7 @@ def _count_beams(
         share, x, y = seen[2, i] / np.sqrt(np.sum(points[i] ** 2)), origins[0, i], origins[1, i]
         seen[0, i] += share * (view.across[0] * x + view.across[1] * y)
         seen[1, i] += share * (view.up[0] * x + view.up[1] * y)
-    n_on, n_before, n_distinct, below = 0, 0, 0, np.zeros((3, 2), np.int64)
+    n_on, n_before, n_distinct, below = 0, 0, 0, np.zeros((3, 2, N_ROWS), np.int64)
     light, lit = 0.0, 0.0
     half = int((1.0 + blur) / _PLACE) + 1
     is_met = np.zeros((2 * half, 2 * half), np.bool_)
@@ -278,11 +294,11 @@ def _count_beams(
             lit += share * share
         n_before += is_aimed and depth <= _ON[0]
         if is_beside_pole(across, along, blur):
-            side = int(seen[0, i] > 0.0)
+            side, down = int(seen[0, i] > 0.0), _row(along)
             is_held = _HELD[0] <= depth <= _HELD[1]
-            below[0, side] += is_held and not is_ground[i]
-            below[1, side] += depth > _HELD[1]
-            below[2, side] += depth < _HELD[0] or (is_held and is_ground[i])
+            below[0, side, down] += is_held and not is_ground[i]
+            below[1, side, down] += depth > _HELD[1]
+            below[2, side, down] += depth < _HELD[0] or (is_held and is_ground[i])
     return n_on, n_before, below, light / max(lit, _TINY), n_distinct, seen
 
 

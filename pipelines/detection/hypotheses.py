@@ -1,6 +1,6 @@
 """The hypotheses about a place, and how likely each is given all beams about it.
 
-Hides their priors, and what beams below and beside a place, its height and its neighbours show.
+Hides their priors, and what beams beside a place, its height and its neighbours show.
 """
 
 from __future__ import annotations
@@ -10,8 +10,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from spheremark.pipelines.detection.beams import BELOW, beams_about
-from spheremark.pipelines.detection.evidence import Evidence, n_beside_pole
+from spheremark.pipelines.detection.beams import beams_about
+from spheremark.pipelines.detection.evidence import Evidence
 from spheremark.pipelines.detection.search import compared, cov_shared
 from spheremark.pipelines.detection.shapes import (
     BALL,
@@ -33,7 +33,7 @@ from spheremark.pipelines.detection.shapes import (
     STRETCH,
     Z,
 )
-from spheremark.pipelines.detection.target import ASIDE
+from spheremark.pipelines.detection.support import ANY, OPEN, log_share, log_supports
 from spheremark.pipelines.model import Array
 
 _FLOOR = 1e-9
@@ -66,12 +66,7 @@ _FORMS: dict[int, tuple[tuple[float, float], ...]] = {
 ABUNDANCE = (208, 31, 274, 10, 33, 191, 18, 36, 36)
 """Groups that were compared in 31 random worlds of the simulator and were each."""
 
-# Beta distributions of the share of beams that end near, and the probability that it is any
-_OPEN, _CLOSED, _ANY = (0.3, 5.0, 0.1), (5.0, 0.3, 0.01), (0.5, 0.5, 1.0)
-_SHOULDERS = (5.0, 0.3, 0.001)  # every head has them
-_SHARES_BELOW = (_OPEN, _OPEN, _CLOSED, _SHOULDERS, _OPEN, _ANY, _OPEN, _ANY, _ANY)
-_NEIGHBOUR = 0.05  # probability that something else stands beside its pole
-_SHARES_BESIDE = (*(_OPEN,) * 7, _ANY, _ANY)
+_BESIDE = 0.1  # probability of anything beside what stands free
 _HEIGHTS = 2.5  # [m] up to which markers stand
 _LEAST_HEIGHTS = {HEAD: 10.0, BALL: 1.0, SPHERE: 1.0, CYLINDER: 1.0, SOLID: 1.0}
 _BOULDER_HEIGHT = (0.3, 0.6)  # radii: centre above the ground, and standard deviation
@@ -149,16 +144,9 @@ def log_likelihoods(
     strength = max(evidence.brightness, 1.0) / distance**2
     faintest = min(max(physics.weakest / strength, _FLOOR), _HEARD)  # its own returns are heard
     beams, n_beside, n_passing = beams_about(evidence, radius, strength, (physics.lost, faintest))
-    logs = np.zeros(len(NAMES))
-    n_below, n_past = evidence.n_held + evidence.n_short, evidence.n_past
-    if evidence.silent is None:  # pulses are as dense below, and those without a return go past
-        n_known = float(max(n_past, evidence.n_on - n_below))
-    else:
-        n_known = max(n_past - _n_unknown(evidence, level, radius), 0.0)
-    n_alone = evidence.n_carrying + evidence.n_short
+    logs = log_supports(evidence, level, radius)
     for kind in range(len(NAMES)):
-        logs[kind] += _log_share(n_beside, n_passing, _SHARES_BESIDE[kind])
-        logs[kind] += _log_below(n_below, n_alone, n_known, _SHARES_BELOW[kind])
+        logs[kind] += _log_beside(kind, n_beside, n_passing)
         logs[kind] += np.log(_height_density(kind, evidence.height, evidence.sigma_height, radius))
         logs[kind] += np.log(_neighbour_probability(kind, n_neighbours))
     priors = _priors(radius, physics)
@@ -172,23 +160,6 @@ def log_likelihoods(
     shared[0] += np.log(radius)
     cov = cov_shared(sphere, priors[SPHERE], beams)
     return np.asarray(np.maximum(found, never)), shared, cov
-
-
-def _n_unknown(evidence: Evidence, level: float, radius: float) -> float:
-    """Return how many pulses without a return below a place may have met ground that is not heard.
-
-    The beams to the sides, past where a pole or shoulders would be, show how much of it is heard.
-    No ground is above the horizon, in the mean.
-    """
-    assert evidence.silent is not None
-    silent = evidence.silent[:2, evidence.silent[1] < -level] / radius
-    blur = evidence.blur.max() / radius
-    n_heard, n_silent = (
-        int(np.sum((up < BELOW) & (abs(across) > ASIDE + blur)))
-        for across, up in (evidence.seen[:2] / radius, silent)
-    )
-    n_below = n_beside_pole(silent, blur)
-    return float(n_below * (n_silent + 0.5) / (n_heard + n_silent + 1.0))
 
 
 def _priors(radius: float, physics: Physics) -> Array:
@@ -212,32 +183,13 @@ def _priors(radius: float, physics: Physics) -> Array:
     return priors
 
 
-def _log_share(n_near: int, n_past: float, beta: tuple[float, float, float]) -> float:
-    """Return the log probability that so many beams end near, and so many go past."""
-
-    def of(a: float, b: float) -> float:
-        begun = lgamma(a + b) - lgamma(a) - lgamma(b)
-        return begun + lgamma(a + n_near) + lgamma(b + n_past) - lgamma(a + b + n_near + n_past)
-
-    a, b, otherwise = beta
-    any_share = of(*_ANY[:2])
-    if otherwise == 1.0:
-        return any_share
-    return float(np.logaddexp(np.log1p(-otherwise) + of(a, b), np.log(otherwise) + any_share))
-
-
-def _log_below(
-    n_below: int, n_alone: int, n_known: float, beta: tuple[float, float, float]
-) -> float:
-    """Return the log probability of the beams below: all by what is there, or some by a neighbour.
-
-    Without those of a neighbour fewer end near; it stops all of its own.
-    """
-    every = _log_share(n_below, n_known, beta)
-    if beta is not _OPEN:
-        return every
-    alone = _log_share(n_alone, n_known, beta) + _log_share(max(n_below - n_alone, 0), 0, _ANY)
-    return float(np.logaddexp(every + np.log(1.0 - _NEIGHBOUR), alone + np.log(_NEIGHBOUR)))
+def _log_beside(kind: int, n_near: int, n_past: int) -> float:
+    """Return the log probability of the beams beside an object."""
+    anything = float(log_share(n_near, n_past, ANY))
+    if kind in (PANEL, CLUTTER):
+        return anything
+    nothing = log_share(n_near, n_past, OPEN) + np.log(1.0 - _BESIDE)
+    return float(np.logaddexp(nothing, anything + np.log(_BESIDE)))
 
 
 def _neighbour_probability(kind: int, n: int) -> float:

@@ -13,7 +13,7 @@ from spheremark.pipelines.detection.decision import (
     shared_of,
     sure_ones,
 )
-from spheremark.pipelines.detection.evidence import Evidence
+from spheremark.pipelines.detection.evidence import N_ROWS, Evidence
 from spheremark.pipelines.detection.features import Features
 from spheremark.pipelines.detection.hypotheses import USUAL, Physics
 from spheremark.pipelines.detection.shapes import NAMES
@@ -31,15 +31,23 @@ def features(n_points=70, **changes):
     return seen._replace(**changes)
 
 
-def evidence(**changes):
+def below(n_held, n_past, n_short):
+    """Beams below a ball, half of them to the left, in one row."""
+    counts = np.zeros((3, 2, N_ROWS), np.int64)
+    for counted, n in zip(counts, (n_held, n_past, n_short), strict=True):
+        counted[:, 4] = n - n // 2, n // 2
+    return counts
+
+
+def evidence(n_held=0, n_past=150, n_short=0, **changes):
     """A ball that stands on a pole before something far."""
     seen = Evidence(
-        n_on=70, n_before=0, n_held=0, n_carrying=0, n_past=150, n_short=0,
-        brightness=50.0, n_distinct=70, rows=np.empty(0, np.int32), seen=np.empty((3, 0)),
-        faces=np.empty(0), strengths=np.empty(0), silent=None, blur=np.full(2, 0.015),
-        height=np.nan, sigma_height=np.inf,
+        n_on=70, n_before=0, below=below(n_held, n_past, n_short), brightness=50.0,
+        n_distinct=70, rows=np.empty(0, np.int32), seen=np.empty((3, 0)), faces=np.empty(0),
+        strengths=np.empty(0), silent=None, blur=np.full(2, 0.015), height=np.nan,
+        sigma_height=np.inf,
     )  # fmt: skip
-    return seen._replace(**{"n_carrying": changes.get("n_held", 0), **changes})
+    return seen._replace(**changes)
 
 
 def refusal(seen, about):
@@ -61,15 +69,27 @@ def test_a_ball_seen_more_closely_than_any_other_shape_may_stand_on_something():
 def test_what_is_held_below_counts_by_how_much_is_seen_there(share_seen):
     """A tenth of the returns that a ball there would have may be held, and one."""
     n_seen = round(100 * share_seen)
-    about = evidence(n_on=120, n_short=100 - n_seen)
-    n_few = 1 + round(0.1 * 120 * share_seen)
+    n_few = 1 + round(0.1 * 300 * share_seen)
 
     def reason(n):
-        held = about._replace(n_held=n, n_carrying=n, n_past=n_seen - n)
-        return reason_by_evidence(features(n_points=120), held, TARGET)
+        held = evidence(n_held=n, n_past=n_seen - n, n_short=100 - n_seen, n_on=300)
+        return reason_by_evidence(features(n_points=300), held, TARGET)
 
     assert "pole" not in reason(n_few - 1)
     assert "pole" in reason(n_few + 2)
+
+
+def test_the_legs_of_a_tripod_may_stop_a_seventh_of_the_beams_below():
+    assert refusal(features(), evidence(n_held=14, n_past=86)) == ""
+    assert "pole" in refusal(features(), evidence(n_held=17, n_past=83))
+
+
+def test_what_holds_more_on_one_side_where_most_go_past_on_the_other_stands_beside():
+    beside = below(0, 0, 0)
+    beside[0, :, 4], beside[1, :, 4] = (20, 2), (0, 30)
+    assert refusal(features(), evidence()._replace(below=beside)) == ""
+    beside[1, 1, 4] = 3
+    assert "pole" in refusal(features(), evidence()._replace(below=beside))
 
 
 def test_of_a_ball_two_thirds_may_be_hidden():

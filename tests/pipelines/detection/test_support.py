@@ -1,0 +1,54 @@
+"""What holds an object up, by which beams below it end near."""
+
+from math import comb
+
+import numpy as np
+import pytest
+from scipy.stats import betabinom
+
+from spheremark.pipelines.detection.evidence import N_ROWS
+from spheremark.pipelines.detection.shapes import BOULDER, HEAD, SPHERE
+from spheremark.pipelines.detection.support import _log_supports, log_share
+
+N = 10  # beams in each row on each side
+
+
+def logs(*near):
+    """Log probabilities where so many of the beams of each row end near, on both sides alike."""
+    stopped = np.array([near, near], np.float64)
+    return _log_supports(stopped, N - stopped)
+
+
+@pytest.mark.parametrize(("n_near", "n_past"), [(0, 0), (3, 4), (40, 2)])
+def test_a_share_of_beams_has_the_probability_of_one_order_of_a_beta_binomial(n_near, n_past):
+    n = n_near + n_past
+    expected = betabinom.logpmf(n_near, n, 0.3, 5.0) - np.log(comb(n, n_near))
+    assert log_share(n_near, n_past, (0.3, 5.0)) == pytest.approx(expected, abs=1e-9)
+
+
+def test_legs_that_spread_are_no_shoulders_though_they_stop_as_many_beams():
+    legs = logs(0, 3, 3, 3, 3, 3, 3, 3, 3)
+    shoulders = logs(0, 0, 0, 0, 0, 0, 4, N, N)
+    assert legs[SPHERE] > legs[HEAD] + 4.0
+    assert shoulders[HEAD] > shoulders[SPHERE] + 2.0
+
+
+def test_what_stops_every_beam_from_some_row_on_is_a_head_or_a_boulder():
+    neck = logs(0, 0, 0, 0, N, N, N, N, N)
+    assert np.argmax(neck) == HEAD
+    ground = logs(*[N] * N_ROWS)
+    assert np.argmax(ground) == BOULDER
+
+
+def test_shoulders_of_which_one_is_hidden_are_shoulders():
+    stopped = np.zeros((2, N_ROWS))
+    stopped[1, 4:] = N
+    seen = np.full((2, N_ROWS), float(N))
+    seen[0] = 0.0
+    one_side = _log_supports(stopped, seen - stopped)
+    assert np.argmax(one_side) == HEAD
+
+
+def test_without_beams_below_nothing_is_known():
+    nothing = _log_supports(np.zeros((2, N_ROWS)), np.zeros((2, N_ROWS)))
+    np.testing.assert_allclose(nothing, 0.0, atol=1e-9)
