@@ -106,7 +106,6 @@ def test_balls_of_other_radii_are_no_markers(share):
     assert n_taken(found) == 0
 
 
-# the farthest, of 14 returns, is a possible one
 def test_all_markers_among_balls_of_another_radius_are_sure_ones():
     found = extracted(balls=tuple((tuple(p), 1.5 * RADIUS) for p in OTHERS))
     rough = [candidate.p_base_rough for candidate in found.candidates]
