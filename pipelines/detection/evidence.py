@@ -33,7 +33,7 @@ from spheremark.pipelines.scan.interpolation import errors_of_interpolation
 from spheremark.pipelines.threads import side_by_side
 
 ROW, N_ROWS = 0.45, 9
-"""Radii below a sphere by which beams there are counted, and how many."""
+"""Height in radii of a row of beams below a sphere, and number of rows."""
 
 _REACH = 4.0  # radii about a centre: shoulders lie within three radii below a head
 _HELD = (-4.0, 1.0)  # radii of depth within which a return may belong to the same object
