@@ -53,14 +53,11 @@ class Edge(NamedTuple):
         half of a sphere, where ground behind it may be the stronger echo, and at the upper.
     softness : (2,)
         Standard deviation of that, in the same unit.
-    variance : float
-        Of the mean of both, as far as the returns leave it open.
     """
 
     radius: float
     inside: Array
     softness: Array
-    variance: float = 0.0
 
     @property
     def halves(self) -> float:
@@ -124,10 +121,7 @@ def edge_of(returns: Returns, linear: Linear, weights: Array, covs: Array, radiu
     posterior = np.exp(logs - logs.max(axis=(1, 2), keepdims=True))
     posterior /= posterior.sum(axis=(1, 2), keepdims=True)
     softness = np.exp(posterior.sum(axis=1) @ np.log(_SOFTNESSES))
-    shares = posterior.sum(axis=2)
-    means = shares @ _EDGES
-    variances = shares @ _EDGES**2 - means**2
-    return Edge(radius, means, softness, float(variances.sum()) / 4.0)
+    return Edge(radius, posterior.sum(axis=2) @ _EDGES, softness)
 
 
 def _towards_beams(returns: Returns, offsets: Array) -> Array:
@@ -206,8 +200,7 @@ def limb_normals(
     starts, right = np.searchsorted(used, returns.starts), np.vstack([precisions * columns, rhs])
     both = sums_of_products(starts, columns, right)
     faces = sums_of_products(starts, columns, returns.vertical[0, used] * right)
-    variances_own = _SIGMAS_OWN**2 + (edge.variance, 0.0)
-    inverse = np.linalg.inv(both[:, 3:5, 3:5] + np.diag(1.0 / variances_own))
+    inverse = np.linalg.inv(both[:, 3:5, 3:5] + np.diag(_SIGMAS_OWN**-2.0))
     # the fifth is the difference of all spheres, too
     N = both - both[:, :, 3:5] @ inverse @ both[:, 3:5]
     of_faces = faces[:, :3, :3] - both[:, :3, 3:5] @ inverse @ faces[:, 3:5, :3]
