@@ -49,10 +49,14 @@ def test_rows_are_pooled_by_case_distance_and_method_and_compared_with_the_bound
     assert (cells["RMS"], cells["bound"], cells["distance"]) == ("20.00", "2.00", "10")
 
 
+# the only marker at 30 m that was found in the lane of seed 0 is a possible one now
 @pytest.mark.slow
-def test_every_method_stands_beside_the_bound_at_every_distance():
-    # a lane of which three of the farthest are found; in others there may be none
-    rows = rows_of(n_stops=1, seed=2, cases=(Case(0.02, 13.2),))
+@pytest.mark.parametrize(
+    "seed",
+    [pytest.param(0, marks=pytest.mark.xfail(strict=True, raises=AssertionError)), 2],
+)
+def test_every_method_stands_beside_the_bound_at_every_distance(seed):
+    rows = rows_of(n_stops=1, seed=seed, cases=(Case(0.02, 13.2),))
     assert {row["distance_m"] for row in rows} == {5.0 * i for i in range(1, 7)}
     near = {row["method"]: row for row in rows if row["distance_m"] == 10.0}
     assert len(near) == 6
@@ -67,16 +71,9 @@ def bars(distance):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    ("case", "methods"),
-    [
-        (Case(0.01, 13.2), ("along_beam",)),
-        (Case(0.02, 13.2), ("along_beam", "silhouette")),  # which takes as long as all the rest
-        (Case(0.02, 20.7), ("along_beam",)),
-    ],
-)
-def test_centres_keep_the_bars(case, methods):
-    rows = rows_of(n_stops=4, cases=(case,), methods=methods, seed=300)
+@pytest.mark.parametrize("case", [Case(0.01, 13.2), Case(0.02, 13.2), Case(0.02, 20.7)])
+def test_centres_keep_the_bars(case):
+    rows = rows_of(n_stops=4, cases=(case,), methods=("along_beam", "silhouette"), seed=300)
     for row in rows:
         distance, n, few = row["distance_m"], row["n"], row["mean_hits"] < 40
         # Three standard deviations of what n fits tell; squares of 3-D errors spread by some 0.9
