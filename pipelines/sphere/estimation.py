@@ -324,6 +324,7 @@ def _add_limb(N: Normals, returns: Returns, now: Estimate, edge: Edge, factors: 
     N.centres[:, :, :3] += limb.centres
     N.centres[:, :, -3:] += np.dstack([limb.shared, limb.rhs])
     N.by_face[:, :, :3] += limb.faces
+    N.of_faces[:] += limb.of_faces
     N.by_face[:, :, -3:] += np.dstack([limb.shared_faces, limb.rhs_faces])
     N.shared[-2:, -3:] += limb.of_shared
     return limb.factors
@@ -337,6 +338,7 @@ def _add_observed(N: Normals, returns: Returns, state: State, observe: Observe) 
     seen, rhs = observe(state.centres + state.shared[_HALVES] * down, state.covs_of_limb)
     moved = np.einsum("mij,mj->mi", seen, down)
     N.centres[:, :, :3] += seen
+    N.of_faces[:] += seen
     N.centres[:, :, [-3, -1]] += np.stack([moved, rhs], axis=-1)
     N.shared[-2, [-3, -1]] += np.sum(moved * down), np.sum(rhs * down)
 

@@ -74,6 +74,8 @@ class LimbNormals(NamedTuple):
         Normal matrices and right-hand sides.
     faces, rhs_faces : (m, 3, 3), (m, 3)
         The same with returns of the downward sweep counted negative.
+    of_faces : (m, 3, 3)
+        Normal matrices of moves of the two faces against each other.
     shared, shared_faces : (m, 3, 2), (m, 3, 2)
         Between the centres, all returns alike and by face, and what all spheres share: the
         difference of the two halves, and the offset of the gimbal's clock.
@@ -88,6 +90,7 @@ class LimbNormals(NamedTuple):
     rhs: Array
     faces: Array
     rhs_faces: Array
+    of_faces: Array
     shared: Array
     shared_faces: Array
     of_shared: Array
@@ -203,15 +206,16 @@ def limb_normals(
     inverse = np.linalg.inv(both[:, 3:5, 3:5] + np.diag(_SIGMAS_OWN**-2.0))
     # the fifth is the difference of all spheres, too
     N = both - both[:, :, 3:5] @ inverse @ both[:, 3:5]
-    of_faces = faces[:, :3, :3] - both[:, :3, 3:5] @ inverse @ faces[:, 3:5, :3]
-    others = faces[:, :3, 4:] - faces[:, :3, 3:5] @ inverse @ both[:, 3:5, 4:]
+    by_face = faces[:, :3] - faces[:, :3, 3:5] @ inverse @ both[:, 3:5]
+    of_faces = both[:, :3, :3] - faces[:, :3, 3:5] @ inverse @ faces[:, 3:5, :3]
     return LimbNormals(
         centres=N[:, :3, :3],
         rhs=N[:, :3, 6],
-        faces=of_faces,
-        rhs_faces=others[:, :, 2],
+        faces=by_face[:, :, :3],
+        rhs_faces=by_face[:, :, 6],
+        of_faces=of_faces,
         shared=N[:, :3, 4:6],
-        shared_faces=others[:, :, :2],
+        shared_faces=by_face[:, :, 4:6],
         of_shared=N[:, 4:6, 4:].sum(axis=0),
         factors=found,
     )

@@ -28,12 +28,15 @@ class Normals(NamedTuple):
     by_face : (m, 3, 3 + k + q + 1)
         The same with returns of the downward sweep counted negative: the mounting moves the two
         faces of a sphere against each other.
+    of_faces : (m, 3, 3)
+        What the returns say of a move of the two faces against each other alone.
     shared : (k + q, k + q + 1)
         Rows of the laser biases and of optics, limb and clock, last the right-hand side.
     """
 
     centres: Array
     by_face: Array
+    of_faces: Array
     shared: Array
 
 
@@ -69,7 +72,7 @@ def normals_of(
     shared[:n_lasers, :n_lasers] = np.diag(np.bincount(lasers, weights, n_lasers))
     shared[:n_lasers, n_lasers:], shared[n_lasers:, :n_lasers] = crossed.T, crossed[:q]
     shared[n_lasers:, n_lasers:] = others[:q] @ np.vstack([by_optics, residuals]).T
-    return Normals(rows[:, :3], rows[:, 3:], shared)
+    return Normals(rows[:, :3], rows[:, 3:], own[:, :3, :3].copy(), shared)
 
 
 def reduce(N: Normals, effects: Array, precisions: Array, rhs_prior: Array) -> Reduced:
@@ -90,7 +93,7 @@ def reduce(N: Normals, effects: Array, precisions: Array, rhs_prior: Array) -> R
     between = np.sum(turned @ N.by_face[:, :, 3:], axis=0)
     shared[mounting, others], shared[mounting, -1] = between[:, :-1], between[:, -1]
     shared[others, mounting] = between[:, :-1].T
-    shared[mounting, mounting] = np.sum(turned @ own @ effects, axis=0)
+    shared[mounting, mounting] = np.sum(turned @ N.of_faces @ effects, axis=0)
     shared[:, :-1] += np.diag(precisions)
     shared[:, -1] += rhs_prior
 

@@ -15,6 +15,7 @@ RADIUS, AWAY = 0.1, 10.0
 WIDTHS = np.array([3.0e-3, 1.5e-3])  # of the footprint [rad]
 OUTLIERS = 0.01
 OWN = 0.05  # half widths by which the edges of spheres differ
+OWN_EDGES = np.array([OWN, 0.1])  # the same, and by which their halves do
 
 
 def even_edge(inside, softness):
@@ -91,6 +92,21 @@ def test_the_limb_does_not_determine_the_distance():
     N, rhs, *_ = limb_normals(returns, linear, weights, covs, edge, np.zeros((len(angles), 2)))
     assert_allclose(rhs[0] / np.sqrt(np.trace(N[0])), 0, atol=0.01)
     assert N[0, 0, 0] < 1e-6 * N[0, 1, 1]
+
+
+@pytest.mark.parametrize("faces", [(1.0, 1.0), (1.0, -1.0)])
+def test_the_limb_says_of_a_move_of_the_faces_what_the_edges_of_the_sphere_leave(faces):
+    """A side on each face or both on one, eliminated together with the edges at once."""
+    reach, half = RADIUS + 0.45 * WIDTHS[0] * AWAY, 0.5 * WIDTHS[0] * AWAY
+    returns, linear, weights, covs = passing(np.array([[reach, 0.0], [-reach, 0.0]]), 0.003)
+    signs, sides = np.array(faces), np.sign(linear.offsets[0])
+    returns = returns._replace(vertical=np.stack([signs, np.zeros(2)]))  # as if the head lay
+    limb = limb_normals(returns, linear, weights, covs, even_edge(0.0, 0.2), np.zeros((2, 2)))
+    rows = np.column_stack([sides, signs * sides, np.full(2, -half), -half * sides * signs])
+    N = rows.T @ (limb.factors[:, :1] * rows) + np.diag([0.0, 0.0, *OWN_EDGES**-2.0])
+    dense = N[:2, :2] - N[:2, 2:] @ np.linalg.inv(N[2:, 2:]) @ N[2:, :2]
+    found = [[limb.centres, limb.faces], [limb.faces, limb.of_faces]]
+    assert_allclose(np.array(found)[:, :, 0, 1, 1], dense, rtol=1e-3, atol=1e-3 * dense.max())
 
 
 def test_limbs_above_and_below_say_of_the_height_only_what_their_difference_leaves():
