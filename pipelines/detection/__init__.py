@@ -57,7 +57,7 @@ from spheremark.pipelines.detection.hypotheses import (
 )
 from spheremark.pipelines.detection.pulses import Hearing
 from spheremark.pipelines.detection.seeds import find_seeds
-from spheremark.pipelines.detection.shapes import NAMES
+from spheremark.pipelines.detection.shapes import N_PARAMETERS, NAMES
 from spheremark.pipelines.detection.target import Target, blur_at
 from spheremark.pipelines.model import (
     Array,
@@ -199,15 +199,14 @@ def _log_likelihoods(
     n = len(compared)
     k = len(USUAL) + 1  # what markers share, with the noise
     found, shared, covs = np.empty((n, len(NAMES))), np.empty((n, k)), np.empty((n, k, k))
+    shapes = [np.empty((0, N_PARAMETERS))] * n
     physics = [_physics(one.features, noise, hearing, config) for one in compared]
 
     def compare(rows: Sequence[int]) -> None:
         for i in rows:
             features, evidence, n_neighbours = compared[i]
-            distance = float(np.linalg.norm(features.p_base))
-            level = float(features.p_base @ target.up)
-            found[i], shared[i], covs[i] = log_likelihoods(
-                evidence, distance, level, n_neighbours, target.radius, physics[i]
+            found[i], shared[i], covs[i], shapes[i] = log_likelihoods(
+                evidence, features.p_base, target, n_neighbours, physics[i], shapes[i]
             )
 
     side_by_side(lambda first, end: compare(range(first, end)), n, threaded_from=4)

@@ -34,6 +34,7 @@ from spheremark.pipelines.detection.shapes import (
     Z,
 )
 from spheremark.pipelines.detection.support import ANY, OPEN, log_share, log_supports
+from spheremark.pipelines.detection.target import Target
 from spheremark.pipelines.model import Array
 
 _FLOOR = 1e-9
@@ -108,43 +109,44 @@ SIGMAS = (0.35, 0.6, 0.1, 0.05)
 
 def log_likelihoods(
     evidence: Evidence,
-    distance: float,
-    level: float,
+    centre: Array,
+    target: Target,
     n_neighbours: int,
-    radius: float,
     physics: Physics,
-) -> tuple[Array, Array, Array]:
+    begun: Array,
+) -> tuple[Array, Array, Array, Array]:
     """Return the logarithms of the likelihoods of all hypotheses, and what the best sphere shows.
 
     Parameters
     ----------
     evidence : Evidence
         The beams towards and about it.
-    distance : float
-        From the sensor [m].
-    level : float
-        Height above the sensor [m].
+    centre : (3,)
+        The place, in base [m].
+    target : Target
+        What is searched for.
     n_neighbours : int
         Other groups that stand near it.
-    radius : float
-        Of the sphere that is searched for [m].
     physics : Physics
         Of the scan.
+    begun : (k, p)
+        The best shapes by other physics, to begin with; (0, p) if there are none.
 
     Returns
     -------
-    (k,), (5,), (5, 5)
-        Logarithms; what markers share, as in ``Physics``, and its covariance.
+    (k,), (5,), (5, 5), (k, p)
+        Logarithms; what markers share, as in ``Physics``, and its covariance; the best shapes.
 
     Notes
     -----
     The evidence of a shape is the likelihood at its best parameters by Laplace's
     approximation. Beams are independent but for those of one place.
     """
+    distance, radius = float(np.linalg.norm(centre)), target.radius
     strength = max(evidence.brightness, 1.0) / distance**2
     faintest = min(max(physics.weakest / strength, _FLOOR), _HEARD)  # its own returns are heard
     beams, n_beside, n_passing = beams_about(evidence, radius, strength, (physics.lost, faintest))
-    logs = log_supports(evidence, level, radius)
+    logs = log_supports(evidence, float(centre @ target.up), radius)
     for kind in range(len(NAMES)):
         logs[kind] += _log_beside(kind, n_beside, n_passing)
         logs[kind] += np.log(_height_density(kind, evidence.height, evidence.sigma_height, radius))
@@ -154,12 +156,13 @@ def log_likelihoods(
         moved = _MOVED / radius
         priors[SPHERE, 1, SHIFT:POLE] = moved
         priors[SPHERE, 1, SHIFT : SHIFT + 2] = hypot(_TURNED * distance / radius, moved)
-    found, sphere = compared(beams, priors, logs)
+    found, shapes = compared(beams, priors, logs, begun)
+    sphere = shapes[SPHERE]
     never = float(found.max()) - _NEVER
     shared = sphere[NOISE : FORM + 1].copy()
     shared[0] += np.log(radius)
     cov = cov_shared(sphere, priors[SPHERE], beams)
-    return np.asarray(np.maximum(found, never)), shared, cov
+    return np.asarray(np.maximum(found, never)), shared, cov, shapes
 
 
 def _priors(radius: float, physics: Physics) -> Array:

@@ -5,7 +5,7 @@ Hides the search for the best parameters of a shape, and how much of its prior t
 
 from __future__ import annotations
 
-from math import erfc
+from math import erfc, nan
 
 import numpy as np
 
@@ -57,10 +57,7 @@ def _evidence(kind: int, shape: Array, prior: Array, beams: Beams, least: float)
     found = _search(kind, shape, steps, prior, beams, least)
     if found == -np.inf:
         return -np.inf
-    found += _log_volume(kind, shape, prior, beams)
-    if kind == BALL:
-        found += _log_other_size(shape, prior, beams)
-    return float(found)
+    return float(found + _log_volume(kind, shape, prior, beams))
 
 
 @compiled
@@ -259,6 +256,8 @@ def _log_volume(kind: int, shape: Array, prior: Array, beams: Beams) -> float:
                 scale = 1.0 / (np.sqrt(2.0 * N[j, j]) * prior[1, free[j]])
                 same *= 1.0 - 0.5 * (erfc((limit - off) * scale) + erfc((limit + off) * scale))
         total += np.log(max(1.0 - same, _AS_ROUND))
+    if kind == BALL:
+        total += _log_other_size(shape, prior, beams)
     return total
 
 
@@ -276,34 +275,56 @@ def cov_shared(shape: Array, prior: Array, beams: Beams) -> Array:
 
 
 @compiled
-def compared(beams: Beams, priors: Array, log_priors: Array) -> tuple[Array, Array]:
-    """Return the logarithms of prior times evidence of all hypotheses, and the best sphere."""
-    found, best = np.full(len(log_priors), -np.inf), -np.inf
-    sphere = priors[SPHERE, 0].copy()
+def compared(beams: Beams, priors: Array, log_priors: Array, begun: Array) -> tuple[Array, Array]:
+    """Return the logarithms of prior times evidence of all hypotheses, and their best shapes.
+
+    ``begun`` are the best shapes by other priors, from which these are climbed to, NaN where one
+    was not sought; (0, p) if there are none. The sphere is sought anew beside that, and a solid is
+    always one beside the best sphere.
+    """
+    found, shapes = np.full(len(log_priors), -np.inf), np.full((len(log_priors), N_PARAMETERS), nan)
+    shapes[SPHERE] = priors[SPHERE, 0]
     for kind in _ORDER:
-        is_named = kind != BALL or found[CYLINDER] < best  # the two are easily confused
-        if best - found[SPHERE] > _GIVEN_UP and is_named:
+        is_named = kind != BALL or found[CYLINDER] < found.max()  # the two are easily confused
+        if found.max() - found[SPHERE] > _GIVEN_UP and is_named:
             continue
-        for start in _STARTS:
-            shape = _start(kind, priors[kind], sphere, start, beams)
-            if kind == SOLID:
-                own = _evidence_nearby(kind, shape, priors[kind], beams)
-            else:
-                own = _evidence(kind, shape, priors[kind], beams, best - log_priors[kind])
-            found[kind] = max(found[kind], own + log_priors[kind])
-            best = max(best, found[kind])
-            if kind in (BALL, BOULDER):  # it may have found a better place for the sphere too
-                again = _start(SPHERE, priors[SPHERE], shape, start, beams)
-                own = _evidence_nearby(SPHERE, again, priors[SPHERE], beams)
-                if own + log_priors[SPHERE] > found[SPHERE]:
-                    found[SPHERE] = own + log_priors[SPHERE]
-                    sphere[:] = again
-            if kind == SPHERE:
-                sphere[:] = shape
-            if kind != BALL:
-                break
-        best = max(best, found[SPHERE])
-    return found, sphere
+        is_begun = kind != SOLID and len(begun) > 0 and not np.isnan(begun[kind, 0])
+        if is_begun:
+            shape = begun[kind].copy()
+            own = _evidence_nearby(kind, shape, priors[kind], beams)
+            _keep(kind, shape, own + log_priors[kind], found, shapes)
+        if kind == SPHERE or not is_begun:
+            _seek(kind, priors, log_priors, beams, (found, shapes))
+    return found, shapes
+
+
+@compiled
+def _seek(
+    kind: int, priors: Array, log_priors: Array, beams: Beams, known: tuple[Array, Array]
+) -> None:
+    """Search for the best shape of a kind, where the best sphere is; ``known`` as ``compared``."""
+    found, shapes = known
+    sphere = priors[SPHERE, 0] if kind == SPHERE else shapes[SPHERE]
+    for start in _STARTS:
+        shape = _start(kind, priors[kind], sphere, start, beams)
+        if kind == SOLID:
+            own = _evidence_nearby(kind, shape, priors[kind], beams)
+        else:
+            own = _evidence(kind, shape, priors[kind], beams, found.max() - log_priors[kind])
+        _keep(kind, shape, own + log_priors[kind], found, shapes)
+        if kind in (BALL, BOULDER):  # it may have found a better place for the sphere too
+            again = _start(SPHERE, priors[SPHERE], shape, start, beams)
+            own = _evidence_nearby(SPHERE, again, priors[SPHERE], beams)
+            _keep(SPHERE, again, own + log_priors[SPHERE], found, shapes)
+        if kind != BALL:
+            break
+
+
+@compiled
+def _keep(kind: int, shape: Array, own: float, found: Array, shapes: Array) -> None:
+    """Replace the shape of a kind by one with greater evidence."""
+    if own > found[kind]:
+        found[kind], shapes[kind] = own, shape
 
 
 @compiled
