@@ -15,7 +15,7 @@ _WINDOW = 9  # cells along a side of the opening: smaller rocks are not ground
 _STEP = 0.10  # [m] that a cell's lowest point may lie above the opened surface
 _CELLS_MIN = 9  # a marker seen alone covers at most 6 cells: that is not yet ground
 _RISE = 0.15  # [m] that ground may rise above its cell of the opened grid: tops of mounds
-_AROUND = 24  # cells each way about a place whose ground may show its height
+_AROUND, _N_NEAREST = 24, 40  # cells each way about a place that may show its ground, and used
 _ROUGH, _SLOPE, _TILT = 0.05, 0.05, 0.2  # [m] of the ground, how it bends away, tangent of tilts
 _SMOOTH = 0.01  # [m] least roughness: lowest points of cells scatter so on a plane floor
 _SKIN, _SKIN_MAX = 0.3, 0.03  # radii, and [m]: ground is that rough, spheres begin higher
@@ -58,7 +58,7 @@ def ground_of(cloud: StitchedCloud, cells: Cells, config: ExtractionConfig) -> G
 
 
 def planes_below(ground: Ground, cells: Cells, places: Array) -> Array:
-    """Return the planes of the ground about some places, (n, 5).
+    """Return the planes of the ground about some places, (n, 5), each by the cells nearest to it.
 
     The height of a point p of the base frame above one is ``plane[:3] @ p + plane[3]`` [m], its
     standard deviation at the place ``plane[4]``; both are infinite where too little ground is seen.
@@ -71,7 +71,9 @@ def planes_below(ground: Ground, cells: Cells, places: Array) -> Array:
         seen = np.argwhere(window < np.inf)
         if len(seen) >= _CELLS_MIN:
             offsets = (seen + corner + 0.5 - n_side // 2) * edge - (x, y)
-            height, *slopes, sigma = _plane_below(offsets, window[tuple(seen.T)].astype(np.float64))
+            near = np.argsort(np.linalg.norm(offsets, axis=1), kind="stable")[:_N_NEAREST]
+            heights = window[tuple(seen[near].T)].astype(np.float64)
+            height, *slopes, sigma = _plane_below(offsets[near], heights)
             plane[:3] -= np.array(slopes) @ R[:2]
             plane[3:] = slopes[0] * x + slopes[1] * y - height, sigma
     return planes

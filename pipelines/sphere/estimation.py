@@ -150,6 +150,11 @@ class State(NamedTuple):
         return self.shared[_MOUNTING]
 
     @property
+    def face_moves(self) -> Array:
+        """How the mounting moves the upward face of each sphere, (m, 3) [m]; the other likewise."""
+        return np.asarray(effects_on(self.centres) @ self.mounting)
+
+    @property
     def covs(self) -> Array:
         """Covariances of the centres, (m, 3, 3) [m^2]."""
         return np.asarray(self.cov_noise + self.cov_shared_part)
@@ -273,7 +278,7 @@ def _corrected(returns: Returns, state: State) -> Returns:
     """Return the returns as mounting and optics say they are, less the biases of lasers."""
     if not state.shared.any():
         return returns
-    moved = moved_faces(returns, effects_on(state.centres) @ state.mounting)
+    moved = moved_faces(returns, state.face_moves)
     moved = moved._replace(origins=moved.origins - state.shared[_CLOCK] * swept(returns))
     ranges = returns.ranges - state.biases[returns.lasers]
     return with_widths(moved, state.optics)._replace(ranges=ranges)

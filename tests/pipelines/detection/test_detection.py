@@ -103,6 +103,19 @@ def test_heights_of_places_are_above_the_plane_of_the_ground_among_stones(cloud)
     assert sigmas.max() < 0.2
 
 
+def test_heights_of_places_follow_mounds_that_are_wider_than_a_few_cells(cloud):
+    cells = cells_of(cloud, CONFIG)
+    ground, height, half = ground_of(cloud, cells, CONFIG), 0.3, 1.5  # [m] of the mounds
+    axis = (np.arange(len(ground.lowest)) + 0.5 - len(ground.lowest) // 2) * cells.edge
+    for place in MARKERS:
+        x, y, _ = cells.R_station_base @ place
+        gaps2 = (axis[:, None] - x) ** 2 + (axis - y) ** 2
+        mound = height * np.exp(-gaps2 / half**2)
+        (plane,) = planes_below(ground._replace(lowest=ground.lowest + mound), cells, place[None])
+        found = plane[:3] @ place + plane[3]
+        assert abs(found - (place[2] - GROUND - height)) < 0.1
+
+
 def test_spheres_are_found_as_far_as_they_have_returns():
     places = np.array([[40.0, 0.0, 1.2], [0.0, 48.0, 1.2], [-55.0, 0.0, 1.2]])
     world = World(balls=tuple((tuple(p), 0.4) for p in places), ground=GROUND)

@@ -104,6 +104,21 @@ def test_a_mounting_that_is_much_worse_than_its_prior_is_found_on_other_fields_t
     assert fits.levelling.sigma_heading > 1.05 * stops[0].log.rig.sigma_heading
 
 
+def test_spheres_that_were_found_where_one_face_of_them_is_are_fitted():
+    """Faces of far ones are parted by more than their radius, and one of them has more returns."""
+    field = scenario("paper-field", 4)
+    worse = replace(
+        SimulationConfig(only_near_spheres=True),
+        sigma_misalignment=np.radians(0.3),
+        sigma_axis_offset=0.005,
+    )
+    stop = simulate_stop(field, "lane4-stop6", worse)
+    fits = process(stop.log, config=CONFIG)[0].fits["along_beam"]
+    assert not [one.reason for one in fits.rejected if "left the place" in one.reason]
+    errors, sigmas = across([stop], field.marks, CONFIG)
+    assert np.mean((errors / sigmas) ** 2) < chance.of_mean_square(len(errors) - 1)[1]
+
+
 def test_a_mounting_that_is_not_as_stated_is_said_with_what_to_do(field, stops):
     worse = replace(STEPPED, sigma_misalignment=np.radians(0.2), sigma_axis_offset=0.005)
     for log, is_said in (
