@@ -192,7 +192,7 @@ def _evidence_at(
     angles = cloud.gimbal_angles[rows.astype(np.intp)]
     origins = _origins(cloud.rig, angles)
     points = cloud.p_base[rows]
-    is_ground = points @ plane[:3] + plane[3] < skin_of(target.radius) + plane[4]
+    is_ground = points @ plane[:3] + plane[3] < skin_of(target.radius)
     n_on, n_before, below, brightness, n_distinct, seen = _count_beams(
         points, cloud.intensities[rows], is_ground, c, target, origins
     )
