@@ -29,7 +29,7 @@ class Normals(NamedTuple):
         The same with returns of the downward sweep counted negative: the mounting moves the two
         faces of a sphere against each other.
     of_faces : (m, 3, 3)
-        What the returns say of a move of the two faces against each other alone.
+        Normal matrices of moves of the two faces against each other.
     shared : (k + q, k + q + 1)
         Rows of the laser biases and of optics, limb and clock, last the right-hand side.
     """

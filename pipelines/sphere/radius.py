@@ -34,8 +34,7 @@ _SPAN_MIN = 0.001  # [m] least radius that returns span
 _OUTERMOST = 1.2  # radii over the ninth tenth of the returns' distances from the middle
 _SCATTER_MIN = 0.001  # [m] 2 mm quantisation alone gives as much
 _OUTLIER_SIGMAS = 4.0
-_LIMB = 0.15  # half widths of a beam by which profiles and echoes of no model move a limb, by
-# simulators of two authors: 0.1 and 0.25
+_LIMB = 0.15  # half widths of a beam by which what no model says of its profile moves the limb
 _SIGMAS = 3.0  # by which a free radius may be off, and
 _SLACK = 0.006  # [m] by which it may whatever its sigma
 

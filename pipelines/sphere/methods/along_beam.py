@@ -231,8 +231,8 @@ def _result(
     state, residuals, n = best.state, best.weighed.residuals[used], len(used)
     moved = float(np.linalg.norm(state.centres[k] - candidate.p_base_rough))
     worst = float(np.sqrt(np.linalg.eigvalsh(state.cov_noise[k])[-1]))
-    stray = moved - float(np.linalg.norm(state.face_moves[k]))  # it may be one face's place
-    reason = _refusal(n, worst, (moved, stray), radius)
+    moved -= float(np.linalg.norm(state.face_moves[k]))  # the rough place may be one face's
+    reason = _refusal(n, worst, moved, radius)
     if reason:
         return refused(candidate, reason)
     square = float(np.sum(weights[used - start] * (residuals / best.weighed.sigmas[used]) ** 2))
@@ -274,7 +274,7 @@ def _result(
     )
 
 
-def _refusal(n_used: int, worst: float, move: tuple[float, float], radius: float) -> str:
+def _refusal(n_used: int, worst: float, moved: float, radius: float) -> str:
     """Return why a candidate has no centre; empty if it has one."""
     if n_used < _N_MIN:
         return (
@@ -286,9 +286,9 @@ def _refusal(n_used: int, worst: float, move: tuple[float, float], radius: float
             "Its returns leave the centre undetermined: they lie on one line, or on no sphere of "
             f"radius {1e3 * radius:.0f} mm."
         )
-    if move[1] > _STRAY * radius:
+    if moved > _STRAY * radius:
         return (
-            f"The fit left the place where it was found by {1e3 * move[0]:.0f} mm: no sphere of "
+            f"The fit left the place where it was found by {1e3 * moved:.0f} mm: no sphere of "
             f"radius {1e3 * radius:.0f} mm is there."
         )
     return ""

@@ -141,15 +141,15 @@ def test_lidars_differ_by_as_much_as_fits_allow_for():
 def test_ellipses_of_whole_simulated_surveys_hold_their_shares():
     """Noise, biases, optics, encoder, misalignment, axis offset and tilt are all random.
 
-    A share of one half among 300 stations is known to 2.9 points: the limit is 9. Of products whose
-    ellipses hold 99 % pass, of those whose variances are wrong by an eighth 62 %, by a quarter 3 %.
-    With 660 stations, for which a test is no place, the shares were within 3.2 points.
+    A share of one half among 300 stations is known to 2.9 points, and the limit is 7.5. Of products
+    whose ellipses hold 96 % pass, of those whose variances are wrong by an eighth 46 %, by a
+    quarter 1 %. With 660 stations, for which a test is no place, shares were within 3.2 points.
     """
     draws = joined(in_processes(partial(survey_draws, n_stops=15), range(9000, 9020)))
     assert all(np.isfinite(squares).all() for squares in draws.squares.values())
     for one in coverage(draws):
         if one.quantity != "pose":
-            assert abs(one.share - one.level) <= 0.09, one
+            assert abs(one.share - one.level) <= 0.075, one
     for (_, quantity), value in nees(draws).items():
         if quantity != "pose":
             assert 0.83 < value < 1.2
