@@ -207,13 +207,14 @@ class JobQueue:
         """Keep the number of workers: Dask's own copy of it may be minutes old."""
         while True:
             client = self._client
-            try:
-                known = await asyncio.wait_for(client.scheduler.identity(n_workers=-1), _PARTING)
+            if client.status != "running":  # one that is closed has no scheduler to ask
+                await self._reconnect(client)
+            with suppress(*_LOST):
+                known = await asyncio.wait_for(
+                    self._client.scheduler.identity(n_workers=-1), _PARTING
+                )
                 self._n_workers = len(known["workers"])
                 self._replace_workers()
-            except _LOST:
-                if client.status != "running":
-                    await self._reconnect(client)
             await asyncio.sleep(_COUNT_EVERY)
 
     def _replace_workers(self) -> None:

@@ -5,9 +5,11 @@ import socket
 import subprocess
 import sys
 import time
+from contextlib import suppress
 
 import psutil
 import pytest
+from distributed.client import default_client
 from fastapi.testclient import TestClient
 
 from spheremark.service.http.app import create_app
@@ -30,6 +32,12 @@ def free_port():
         return one.getsockname()[1]
 
 
+def open_client():
+    """The client of the service, if it has one."""
+    with suppress(ValueError):
+        return default_client()
+
+
 def end(process):
     """Kill a scheduler and its workers."""
     if process.poll() is None:
@@ -38,7 +46,7 @@ def end(process):
     process.wait(60)
 
 
-def scheduler(port):
+def scheduler_at(port):
     """A scheduler in a process of its own, with one worker."""
     code = (
         "import asyncio, sys\n"
@@ -56,7 +64,7 @@ def scheduler(port):
 @pytest.mark.slow
 @pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")  # of Dask's client
 def test_a_job_survives_the_loss_of_its_scheduler(tmp_path, stop, control, open_site, free_port):
-    lost = scheduler(free_port)
+    lost = scheduler_at(free_port)
     settings = Settings(data=tmp_path, scheduler=f"tcp://127.0.0.1:{free_port}")
     another = None
     try:
@@ -68,7 +76,7 @@ def test_a_job_survives_the_loss_of_its_scheduler(tmp_path, stop, control, open_
             site.begun(job)
             end(lost)
             wait_until(lambda: client.get("/healthz").json()["status"] == "degraded")
-            another = scheduler(free_port)
+            another = scheduler_at(free_port)
             assert site.ended(job)["status"] == "successful"
             fixes = client.get("/api/v1/station-fixes", params={"survey": "lost"}).json()["items"]
             assert len({one["run_id"] for one in fixes}) == 1
@@ -78,3 +86,14 @@ def test_a_job_survives_the_loss_of_its_scheduler(tmp_path, stop, control, open_
             if one is not None:
                 end(one)
         gc.collect()  # what Dask's client did not await, while this test ignores it
+
+
+@pytest.mark.slow
+def test_a_connection_that_was_closed_is_made_again(tmp_path, scheduler):
+    settings = Settings(data=tmp_path, scheduler=scheduler)
+    with TestClient(create_app(settings), base_url="http://127.0.0.1") as client:
+        wait_until(lambda: client.get("/readyz").status_code == 200)
+        closed = default_client()
+        client.portal.call(closed.close)
+        wait_until(lambda: open_client() not in (None, closed))
+        wait_until(lambda: client.get("/readyz").status_code == 200)
