@@ -82,11 +82,15 @@ _NEARBY = 1.0  # [m] beyond two radii within which other groups show leaves, wal
 
 
 class _Compared(NamedTuple):
-    """A group that is compared: its features, its evidence, and how many others stand near it."""
+    """A group that is compared: its features, its evidence, and how many others stand near it.
+
+    It counts among the groups of the scan unless only doubt of the ground lets it be compared.
+    """
 
     features: Features
     evidence: Evidence
     n_neighbours: int
+    counts: bool
 
 
 _Group = tuple[_Compared, Judgement, Array]
@@ -134,14 +138,21 @@ def extract(
     evidence = dict(zip(passed, gathered, strict=True))
     for i in passed:
         reasons[i] = reason_by_evidence(groups[i], evidence[i], target)
-    compared = [_Compared(groups[i], evidence[i], near[i]) for i in passed if not reasons[i]]
-    noise = noise_of([one.features for one in compared], target.radius)
+    compared = [
+        _Compared(
+            groups[i], evidence[i], near[i],
+            not reason_by_evidence(groups[i], evidence[i].at_worst, target),
+        )
+        for i in passed if not reasons[i]
+    ]  # fmt: skip
+    noise = noise_of([one.features for one in compared if one.counts], target.radius)
     logs = _log_likelihoods(compared, noise, hearing, config, target)
     n_returns = [one.features.n_points for one in compared]
-    by_shape = [judgement.probability for judgement in judged(logs, n_returns)]
+    counts = np.array([one.counts for one in compared])
+    by_shape = [judgement.probability for judgement in judged(logs, n_returns, counts)]
     log_ratios, by_paint = paint_of([one.evidence for one in compared], by_shape)
     logs[:, 0] += log_ratios
-    judgements = judged(logs, n_returns)
+    judgements = judged(logs, n_returns, counts)
     is_sure = sure_ones([one.probability for one in judgements], config.false_rate)
     markers, possible, rejected = list[_Group](), list[Rejection](), list[Rejection]()
     for one, judgement, paint, sure, own in zip(
@@ -204,7 +215,7 @@ def _log_likelihoods(
 
     def compare(rows: Sequence[int]) -> None:
         for i in rows:
-            features, evidence, n_neighbours = compared[i]
+            features, evidence, n_neighbours, _ = compared[i]
             found[i], shared[i], covs[i], shapes[i] = log_likelihoods(
                 evidence, features.p_base, target, n_neighbours, physics[i], shapes[i]
             )
@@ -212,7 +223,8 @@ def _log_likelihoods(
     side_by_side(lambda first, end: compare(range(first, end)), n, threaded_from=4)
     if n:
         n_returns = [one.features.n_points for one in compared]
-        probabilities = [one.probability for one in judged(found, n_returns)]
+        counts = np.array([one.counts for one in compared])
+        probabilities = [one.probability for one in judged(found, n_returns, counts)]
         known = shared_of(shared, covs, probabilities, physics)
         physics = [
             one._replace(shared=means, sigmas=sigmas)

@@ -263,8 +263,12 @@ def shared_of(
     return found, np.sqrt(np.diagonal(known + varies, axis1=1, axis2=2))
 
 
-def judged(log_likelihoods: Array, n_returns: Sequence[int]) -> list[Judgement]:
+def judged(
+    log_likelihoods: Array, n_returns: Sequence[int], counts: Array | float = 1.0
+) -> list[Judgement]:
     """Return what the groups of a scan are, given the likelihood of each by each hypothesis.
+
+    ``counts`` are how much each shows of how often a hypothesis is met.
 
     How often a scan shows each hypothesis is estimated from all its groups (empirical Bayes): among
     trees, a group that might be leaves is rather leaves. With the distance the ground grows that
@@ -274,7 +278,7 @@ def judged(log_likelihoods: Array, n_returns: Sequence[int]) -> list[Judgement]:
     odds = _SCATTERED * _N_LEAST * np.log(_N_MOST / _N_LEAST) / n + 1.0 - _SCATTERED
     log_likelihoods = log_likelihoods.copy()
     log_likelihoods[:, 1:] += np.log(odds)[:, None]
-    _, posteriors = shares_of(log_likelihoods)
+    _, posteriors = shares_of(log_likelihoods, counts)
     return [judgement_of(own, NAMES) for own in posteriors]
 
 
@@ -298,13 +302,15 @@ def judgement_of(posteriors: Array, names: Sequence[str]) -> Judgement:
     return Judgement(float(np.exp(posteriors[0])), names[other], float(ratio))
 
 
-def shares_of(log_likelihoods: Array) -> tuple[Array, Array]:
+def shares_of(log_likelihoods: Array, counts: Array | float = 1.0) -> tuple[Array, Array]:
     """Return how often each hypothesis is met among groups, and the log posteriors of each group.
 
     Parameters
     ----------
     log_likelihoods : (n, k)
         Of each group by each hypothesis.
+    counts : (n,) or float
+        How much each counts.
 
     Returns
     -------
@@ -316,7 +322,7 @@ def shares_of(log_likelihoods: Array) -> tuple[Array, Array]:
     for _ in range(_N_ROUNDS):
         posteriors = log_likelihoods + np.log(shares)
         posteriors -= np.logaddexp.reduce(posteriors, axis=1, keepdims=True)
-        shares = usual + np.exp(posteriors).sum(axis=0)
+        shares = usual + (counts * np.exp(posteriors).T).sum(axis=1)
         shares /= shares.sum()
     return shares, posteriors
 

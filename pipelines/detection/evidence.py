@@ -28,7 +28,7 @@ from spheremark.pipelines.detection.target import (
     seen_from,
     view_of,
 )
-from spheremark.pipelines.model import Array, Column, Mask, Rig, StitchedCloud
+from spheremark.pipelines.model import Array, Column, Rig, StitchedCloud
 from spheremark.pipelines.scan.interpolation import errors_of_interpolation
 from spheremark.pipelines.threads import side_by_side
 
@@ -57,6 +57,9 @@ class Evidence(NamedTuple):
         Beams below it and beside the pole: returns at about its distance that are not ground;
         returns behind it and pulses without a return; returns long before it or on the ground at
         its distance. To the left and to the right, by how far below, in ``ROW`` radii.
+    unsure : (2, 9)
+        Those of the short ones that are the ground's only if its height is off by a standard
+        deviation.
     brightness : float
         Reflectivity of the surface, 0-255: least squares over the beams of ``n_on``, weighted by
         their shares inside the limb.
@@ -84,6 +87,7 @@ class Evidence(NamedTuple):
     n_on: int
     n_before: int
     below: NDArray[np.int64]
+    unsure: NDArray[np.int64]
     brightness: float
     n_distinct: int
     rows: NDArray[np.int32]
@@ -94,6 +98,13 @@ class Evidence(NamedTuple):
     blur: Array
     height: float = np.nan
     sigma_height: float = np.inf
+
+    @property
+    def at_worst(self) -> Evidence:
+        """The same where what is unsure is no ground."""
+        held, past, short = self.below
+        below = np.array([held + self.unsure, past, short - self.unsure])
+        return self._replace(below=below)
 
     @property
     def n_held(self) -> int:
@@ -192,9 +203,10 @@ def _evidence_at(
     angles = cloud.gimbal_angles[rows.astype(np.intp)]
     origins = _origins(cloud.rig, angles)
     points = cloud.p_base[rows]
-    is_ground = points @ plane[:3] + plane[3] < skin_of(target.radius)
+    over = points @ plane[:3] + plane[3] - skin_of(target.radius)
+    ground = (over < plane[4]) + (over < 0.0).astype(np.int8)
     n_on, n_before, below, brightness, n_distinct, seen = _count_beams(
-        points, cloud.intensities[rows], is_ground, c, target, origins
+        points, cloud.intensities[rows], ground, c, target, origins
     )
     if silent is not None:
         passing, blur = silent / target.radius, blur_at(c, target) / target.radius
@@ -203,7 +215,8 @@ def _evidence_at(
     return Evidence(
         n_on=n_on,
         n_before=n_before,
-        below=below,
+        below=below[:3],
+        unsure=below[3],
         brightness=brightness,
         n_distinct=n_distinct,
         rows=rows,
@@ -258,14 +271,15 @@ def _row(along: float) -> int:
 def _count_beams(
     points: Column,
     intensities: Column,
-    is_ground: Mask,
+    ground: NDArray[np.int8],
     c: Array,
     target: Target,
     origins: Array,
 ) -> tuple[int, int, NDArray[np.int64], float, int, Array]:
     """Return the counts of ``Evidence``, its brightness, and how the beams pass the centre.
 
-    Those below it are held, past and short, to the left and to the right of it, by rows.
+    Those below it are held, past, short and unsure, to the left and to the right of it, by rows.
+    ``ground`` is 0 for returns that are not the ground's, 1 and 2 for those that may be and are.
     """
     radius = target.radius
     blur = blur_at(c, target) / radius
@@ -275,7 +289,7 @@ def _count_beams(
         share, x, y = seen[2, i] / np.sqrt(np.sum(points[i] ** 2)), origins[0, i], origins[1, i]
         seen[0, i] += share * (view.across[0] * x + view.across[1] * y)
         seen[1, i] += share * (view.up[0] * x + view.up[1] * y)
-    n_on, n_before, n_distinct, below = 0, 0, 0, np.zeros((3, 2, N_ROWS), np.int64)
+    n_on, n_before, n_distinct, below = 0, 0, 0, np.zeros((4, 2, N_ROWS), np.int64)
     light, lit = 0.0, 0.0
     half = int((1.0 + blur) / _PLACE) + 1
     is_met = np.zeros((2 * half, 2 * half), np.bool_)
@@ -296,9 +310,10 @@ def _count_beams(
         if is_beside_pole(across, along, blur):
             side, down = int(seen[0, i] > 0.0), _row(along)
             is_held = _HELD[0] <= depth <= _HELD[1]
-            below[0, side, down] += is_held and not is_ground[i]
+            below[0, side, down] += is_held and ground[i] == 0
             below[1, side, down] += depth > _HELD[1]
-            below[2, side, down] += depth < _HELD[0] or (is_held and is_ground[i])
+            below[2, side, down] += depth < _HELD[0] or (is_held and ground[i] > 0)
+            below[3, side, down] += is_held and ground[i] == 1
     return n_on, n_before, below, light / max(lit, _TINY), n_distinct, seen
 
 

@@ -42,8 +42,9 @@ def below(n_held, n_past, n_short):
 def evidence(n_held=0, n_past=150, n_short=0, **changes):
     """A ball that stands on a pole before something far."""
     seen = Evidence(
-        n_on=70, n_before=0, below=below(n_held, n_past, n_short), brightness=50.0,
-        n_distinct=70, rows=np.empty(0, np.int32), seen=np.empty((3, 0)), faces=np.empty(0),
+        n_on=70, n_before=0, below=below(n_held, n_past, n_short),
+        unsure=np.zeros((2, N_ROWS), np.int64), brightness=50.0, n_distinct=70,
+        rows=np.empty(0, np.int32), seen=np.empty((3, 0)), faces=np.empty(0),
         strengths=np.empty(0), silent=None, blur=np.full(2, 0.015), height=np.nan,
         sigma_height=np.inf,
     )  # fmt: skip
@@ -92,6 +93,13 @@ def test_what_holds_more_on_one_side_where_most_go_past_on_the_other_stands_besi
     assert "pole" in refusal(features(), evidence()._replace(below=beside))
 
 
+def test_what_may_be_ground_carries_nothing_but_at_worst():
+    seen = evidence(n_past=60, n_short=90, unsure=below(60, 0, 0)[0])
+    assert refusal(features(), seen) == ""
+    assert "60 returns below it" in refusal(features(), seen.at_worst)
+    assert (seen.at_worst.n_held, seen.at_worst.n_short) == (60, 30)
+
+
 def test_of_a_ball_two_thirds_may_be_hidden():
     assert refusal(features(n_points=25), evidence(n_on=25, n_before=50)) == ""
     assert "hidden" in refusal(features(n_points=25), evidence(n_on=25, n_before=55))
@@ -124,6 +132,17 @@ def test_among_trees_a_group_that_may_be_leaves_is_rather_leaves():
     leaves[:, NAMES.index("foliage or other clutter")] = 5.0
     alone = judged(doubtful, [MANY])[0].probability
     assert judged(np.vstack([doubtful, leaves]), [MANY] * 21)[0].probability < alone
+
+
+def test_a_group_that_does_not_count_has_a_probability_and_changes_no_other():
+    doubtful, balls = likelihoods(4.0), likelihoods(*[-30.0] * 20)
+    balls[:, NAMES.index("sphere of another radius")] = 5.0
+    (alone,) = judged(doubtful, [MANY])
+    counts = np.array([1.0] + [0.0] * 20)
+    found = judged(np.vstack([doubtful, balls]), [MANY] * 21, counts)
+    assert found[0] == alone
+    assert found[1].probability < 1e-6
+    assert found[1].hypothesis.startswith("sphere of another radius: ")
 
 
 def test_of_what_is_far_less_is_a_marker_than_of_what_is_near():

@@ -79,6 +79,17 @@ def test_a_marker_close_above_the_ground_is_found(height, distance):
     assert len(found.candidates) == 6
 
 
+@pytest.mark.parametrize("height", [0.22, 0.28])  # [m] above the ground
+def test_the_ground_carries_no_marker_however_much_its_returns_scatter(height):
+    """A ground that scatters is known less exactly: more of what lies above its plane is ground."""
+    place = np.array([2.5, -0.75, -0.8 + height])
+    balls = (*((tuple(p), RADIUS) for p in ring_of_markers(n=5)), (tuple(place), RADIUS))
+    cloud = scan(World(balls=balls, ground=-0.8), np.random.default_rng(6), sigma=0.025)
+    found = extract(cloud, ExtractionConfig(), RADIUS)
+    assert np.linalg.norm(rough(found) - place, axis=1).min() < 0.03
+    assert len(found.candidates) == 6
+
+
 @pytest.mark.parametrize(
     ("seen_to", "is_found"), [(0.5, True), (0.0, True), (-0.5, False), (-0.7, False)]
 )
