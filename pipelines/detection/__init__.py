@@ -138,21 +138,18 @@ def extract(
     evidence = dict(zip(passed, gathered, strict=True))
     for i in passed:
         reasons[i] = reason_by_evidence(groups[i], evidence[i], target)
+    kept = [i for i in passed if not reasons[i]]
+    at_worst = [reason_by_evidence(groups[i], evidence[i].at_worst, target) for i in kept]
     compared = [
-        _Compared(
-            groups[i], evidence[i], near[i],
-            not reason_by_evidence(groups[i], evidence[i].at_worst, target),
-        )
-        for i in passed if not reasons[i]
-    ]  # fmt: skip
+        _Compared(groups[i], evidence[i], near[i], counts=not reason)
+        for i, reason in zip(kept, at_worst, strict=True)
+    ]
     noise = noise_of([one.features for one in compared if one.counts], target.radius)
     logs = _log_likelihoods(compared, noise, hearing, config, target)
-    n_returns = [one.features.n_points for one in compared]
-    counts = np.array([one.counts for one in compared])
-    by_shape = [judgement.probability for judgement in judged(logs, n_returns, counts)]
+    by_shape = [judgement.probability for judgement in _judged(compared, logs)]
     log_ratios, by_paint = paint_of([one.evidence for one in compared], by_shape)
     logs[:, 0] += log_ratios
-    judgements = judged(logs, n_returns, counts)
+    judgements = _judged(compared, logs)
     is_sure = sure_ones([one.probability for one in judgements], config.false_rate)
     markers, possible, rejected = list[_Group](), list[Rejection](), list[Rejection]()
     for one, judgement, paint, sure, own in zip(
@@ -222,9 +219,7 @@ def _log_likelihoods(
 
     side_by_side(lambda first, end: compare(range(first, end)), n, threaded_from=4)
     if n:
-        n_returns = [one.features.n_points for one in compared]
-        counts = np.array([one.counts for one in compared])
-        probabilities = [one.probability for one in judged(found, n_returns, counts)]
+        probabilities = [one.probability for one in _judged(compared, found)]
         known = shared_of(shared, covs, probabilities, physics)
         physics = [
             one._replace(shared=means, sigmas=sigmas)
@@ -233,6 +228,12 @@ def _log_likelihoods(
     again = np.flatnonzero(found[:, 0] > found.max(axis=1, initial=-np.inf) - UNDECIDED)
     side_by_side(lambda first, end: compare(again[first:end].tolist()), len(again), threaded_from=4)
     return found
+
+
+def _judged(compared: list[_Compared], logs: Array) -> list[Judgement]:
+    """Return what groups are; how often each hypothesis is met, those show that count."""
+    n_returns = [one.features.n_points for one in compared]
+    return judged(logs, n_returns, np.array([one.counts for one in compared]))
 
 
 def _physics(
