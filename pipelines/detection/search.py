@@ -14,7 +14,6 @@ from spheremark.pipelines.detection.beams import Beams
 from spheremark.pipelines.detection.shapes import (
     BALL,
     BOULDER,
-    CLUTTER,
     CYLINDER,
     FORM,
     HEAD,
@@ -44,9 +43,6 @@ _SAME = 0.15  # relative deviation of a radius, or of three axes, within which i
 _AS_LARGE = 0.002  # share of balls as large as markers that are known to be none
 _AS_ROUND = 0.3  # of the stones that would be as round as markers by their prior: fewer are
 _STARTS = (0.0, -0.3, 0.3)  # of the logarithm of the radius of a ball
-_CONTESTED = (-2.0, 8.0)  # logarithms of odds for the sphere between which shapes are sought harder
-_SHAKES = 0.5 * np.random.default_rng(1).normal(size=(8, N_PARAMETERS))  # in standard deviations
-_N_OTHERS = 3  # best shapes of other kinds, where such a search begins too
 
 
 @compiled
@@ -283,8 +279,8 @@ def compared(beams: Beams, priors: Array, log_priors: Array, begun: Array) -> tu
     """Return the logarithms of prior times evidence of all hypotheses, and their best shapes.
 
     ``begun`` are the best shapes by other priors, from which these are climbed to, NaN where one
-    was not sought; (0, p) if there are none. A solid is always sought anew, beside the best sphere.
-    Where the decision is close then, what may turn it is sought from more starts.
+    was not sought; (0, p) if there are none. The sphere is sought anew beside that, and a solid is
+    always one beside the best sphere.
     """
     found, shapes = np.full(len(log_priors), -np.inf), np.full((len(log_priors), N_PARAMETERS), nan)
     shapes[SPHERE] = priors[SPHERE, 0]
@@ -297,42 +293,9 @@ def compared(beams: Beams, priors: Array, log_priors: Array, begun: Array) -> tu
             shape = begun[kind].copy()
             own = _evidence_nearby(kind, shape, priors[kind], beams)
             _keep(kind, shape, own + log_priors[kind], found, shapes)
-        else:
+        if kind == SPHERE or not is_begun:
             _seek(kind, priors, log_priors, beams, (found, shapes))
-    odds = found[SPHERE] - found[SPHERE + 1 :].max()
-    if len(begun) > 0 and _CONTESTED[0] < odds < _CONTESTED[1]:
-        for kind in _ORDER:
-            if found[kind] > found.max() - _CONTESTED[1]:
-                _seek_harder(kind, priors[kind], log_priors[kind], beams, (found, shapes))
     return found, shapes
-
-
-@compiled
-def _seek_harder(
-    kind: int, prior: Array, log_prior: float, beams: Beams, known: tuple[Array, Array]
-) -> None:
-    """Climb to a likelier shape of a kind from where two others are best, and from shaken places.
-
-    One search ends in one of several maxima. The likeliest counts, not the widest: how much of the
-    prior one leaves is known too badly to choose by.
-    """
-    found, shapes = known
-    densities, is_free = np.empty(len(beams.x)), prior[1] > 0.0
-    starts = shapes[kind] + _SHAKES * prior[1]
-    for i, other in enumerate(np.argsort(-found)[:_N_OTHERS]):
-        if other != kind and found[other] > -np.inf:
-            starts[i, :STRETCH], starts[i, POLE] = shapes[other][:STRETCH], shapes[other][POLE]
-            if kind in (BOULDER, HEAD, CLUTTER):  # what they scatter by is not the noise
-                starts[i, NOISE] = shapes[kind][NOISE]
-            starts[i, STRETCH:POLE] = shapes[kind][STRETCH:POLE]
-    best = log_likelihood(kind, shapes[kind], prior, beams, densities)
-    for shape in starts:
-        align(kind, shape, beams)
-        likely = log_likelihood(kind, shape, prior, beams, densities)
-        likely = _climbed(kind, shape, is_free, prior, beams, likely)
-        if likely > best:
-            best, shapes[kind] = likely, shape
-            found[kind] = likely + _log_volume(kind, shape, prior, beams) + log_prior
 
 
 @compiled
