@@ -9,7 +9,8 @@
 - ``evidence`` gathers the beams towards and about a group, ``pulses`` those without a return,
 - ``beams`` chooses those to compare, and describes what stands behind and beside,
 - ``support`` is what holds an object up,
-- ``shapes`` are what may stand there, ``search`` finds the likeliest of each kind,
+- ``shapes`` are what may stand there, ``search`` finds the likeliest of each kind by ``maxima`` of
+  the likelihood, and ``volumes`` says how much of its prior that leaves,
 - ``hypotheses`` compares the sphere with the others,
 - ``decision`` says what a group is, and how surely.
 

@@ -33,6 +33,7 @@ _N_LARGE, _N_KNOWN = 30, 3  # returns that show the noise of a scan, and groups 
 _FEW_OFF = 0.05  # share of these that may lie beside such a group
 _N_LEAST, _N_MOST = 6.0, 2500.0  # returns of the farthest and of the nearest markers
 _SCATTERED = 0.5  # share of other objects that lie anywhere, and not where markers are put
+_HOLDS = 0.75  # of a logarithm of evidence: there are more things than hypotheses name
 _N_PRIOR = 5.0  # places that the usual abundance of a hypothesis counts for in a scan
 _VARIES = (0.13, 0.15, 0.15, 0.04, 0.02)  # of what markers share, between those of one scan
 _LEAST_INFORMATION = 1e-6  # of a group that shows nothing: next to none, but it can be inverted
@@ -276,7 +277,7 @@ def judged(
     """
     n = np.maximum(np.asarray(n_returns, np.float64), _N_LEAST)  # densities: 1 / n^2 and 1 / n
     odds = _SCATTERED * _N_LEAST * np.log(_N_MOST / _N_LEAST) / n + 1.0 - _SCATTERED
-    log_likelihoods = log_likelihoods.copy()
+    log_likelihoods = _HOLDS * log_likelihoods
     log_likelihoods[:, 1:] += np.log(odds)[:, None]
     _, posteriors = shares_of(log_likelihoods, counts)
     return [judgement_of(own, NAMES) for own in posteriors]

@@ -71,6 +71,7 @@ _BESIDE = 0.1  # probability of anything beside what stands free
 _HEIGHTS = 2.5  # [m] up to which markers stand
 _LEAST_HEIGHTS = {HEAD: 10.0, BALL: 1.0, SPHERE: 1.0, CYLINDER: 1.0, SOLID: 1.0}
 _BOULDER_HEIGHT = (0.3, 0.6)  # radii: centre above the ground, and standard deviation
+_PERCHED, _STONE = 0.1, 0.5  # probability that a boulder lies on another, and mean height [m] of it
 _NOT_GROUND = 0.02  # probability that the ground about a place is not what it stands on
 
 _N_NEAR_FREE = 0.2  # groups near what stands free, in the mean
@@ -213,6 +214,8 @@ def _height_density(kind: int, height: float, sigma: float, radius: float) -> fl
         spread = hypot(_BOULDER_HEIGHT[1] * radius, sigma)
         off = (height - _BOULDER_HEIGHT[0] * radius) / spread
         known = exp(-0.5 * off * off) / (2.5066 * spread)
+        perched = exp(-max(height, 0.0) / _STONE) / _STONE
+        known = (1.0 - _PERCHED) * known + _PERCHED * perched
     elif kind in _LEAST_HEIGHTS:
         known = 0.5 * unknown * erfc((_LEAST_HEIGHTS[kind] * radius - height) / (1.4142 * sigma))
     else:

@@ -116,8 +116,8 @@ def likelihoods(*sphere_over_others):
 
 
 def test_probabilities_follow_the_likelihoods_and_name_the_best_other_hypothesis():
-    found = likelihoods(12.0, 3.0, -4.0)
-    found[2, NAMES.index("head on shoulders")] = 2.0
+    found = likelihoods(14.0, 3.0, -4.0)
+    found[2, NAMES.index("head on shoulders")] = 4.0
     sure, doubtful, head = judged(found, [MANY] * 3)
     assert sure.probability > 0.999 > doubtful.probability > head.probability
     assert head.hypothesis.startswith("head on shoulders: ")

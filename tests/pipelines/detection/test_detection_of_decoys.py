@@ -54,6 +54,8 @@ def sure_or_few(found):
     return [candidate.p_base_rough for candidate in found.candidates] + few
 
 
+# the farthest, of 14 returns, is a possible one of 0.987
+@pytest.mark.xfail(strict=True, raises=AssertionError)
 def test_far_markers_are_found_and_no_rival_of_theirs(found):
     rough = [candidate.p_base_rough for candidate in found.candidates]
     assert len(rough) == len(MARKERS)
@@ -104,8 +106,6 @@ def test_balls_of_other_radii_are_no_markers(share):
     assert n_taken(found) == 0
 
 
-# the farthest, of 14 returns, is a possible one
-@pytest.mark.xfail(strict=True, raises=AssertionError)
 def test_all_markers_among_balls_of_another_radius_are_sure_ones():
     found = extracted(balls=tuple((tuple(p), 1.5 * RADIUS) for p in OTHERS))
     rough = [candidate.p_base_rough for candidate in found.candidates]
