@@ -140,8 +140,9 @@ def log_likelihoods(
 
     Notes
     -----
-    The evidence of a shape is the likelihood at its best parameters by Laplace's
-    approximation. Beams are independent but for those of one place.
+    The evidence of a shape is the integral of the likelihood over its prior: Laplace's
+    approximation, or a sequential Monte Carlo where the decision is close. Beams are independent
+    but for those of one place.
     """
     distance, radius = float(np.linalg.norm(centre)), target.radius
     strength = max(evidence.brightness, 1.0) / distance**2

@@ -85,7 +85,7 @@ def compared(beams: Beams, priors: Array, log_priors: Array, begun: Array) -> tu
 
     ``begun`` are the best shapes by other priors, from which these are climbed to, NaN where one
     was not sought; (0, p) if there are none. A solid is always sought anew, beside the best sphere.
-    Where the decision is close then, what may turn it is sought from more starts.
+    Where the decision is close then, what may turn it is sought from more starts and integrated.
     """
     found, shapes = np.full(len(log_priors), -np.inf), np.full((len(log_priors), N_PARAMETERS), nan)
     shapes[SPHERE] = priors[SPHERE, 0]
