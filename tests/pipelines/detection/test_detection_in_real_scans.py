@@ -49,7 +49,7 @@ def at_rest(points, rig):
     )
 
 
-# the only marker of its scan, whose returns show a radius 8 % too small: a possible one of 0.96
+# the only marker of its scan, whose returns show a radius 8 % too small: a possible one of 0.985
 SMALLER = pytest.param("L1_S3", marks=pytest.mark.xfail(strict=True, raises=AssertionError))
 
 
