@@ -26,6 +26,8 @@ _HALF_SEEN = 0.8  # radii: the returns of half a ball are as wide, but for those
 _HIDDEN = 2.0  # as many returns before a ball as on it: two thirds of it are hidden
 _SHADE = 0.4  # standard deviation, as a share, of one return's reflectivity: partly lit beams
 _PAINT, _PAINTS = 0.1, 0.7  # the same of markers, by range and incidence; and of all things
+_PAINTS_OF_MARKERS = np.arange(0.0, np.log(256.0), 0.25 * _PAINT)  # logarithms of reflectivities
+_LEAST_SHARE = 1e-9  # of a probability that is counted: nothing is surer
 _TAIL = 3.0  # degrees of freedom: of some markers the paint is dirty or in shade
 _UNLIKE = -2.0  # logarithm of odds by paint from which a reason states it
 _FLAT = 0.236  # of the radius: standard deviation of the depths of a sphere about their mean
@@ -33,7 +35,6 @@ _N_LARGE, _N_KNOWN = 30, 3  # returns that show the noise of a scan, and groups 
 _FEW_OFF = 0.05  # share of these that may lie beside such a group
 _N_LEAST, _N_MOST = 6.0, 2500.0  # returns of the farthest and of the nearest markers
 _SCATTERED = 0.5  # share of other objects that lie anywhere, and not where markers are put
-_HOLDS = 0.85  # of a logarithm of evidence: there are more things than hypotheses name
 _N_PRIOR = 5.0  # places that the usual abundance of a hypothesis counts for in a scan
 _VARIES = (0.13, 0.15, 0.15, 0.04, 0.02)  # of what markers share, between those of one scan
 _LEAST_INFORMATION = 1e-6  # of a group that shows nothing: next to none, but it can be inverted
@@ -126,7 +127,8 @@ def reason_by_evidence(features: Features, evidence: Evidence, target: Target) -
             f"Most of it is hidden: {evidence.n_before} returns inside its outline lie before it, "
             f"where {evidence.n_on} lie on it."
         )
-    if evidence.silent is None and features.width < _HALF_SEEN * target.radius:
+    is_strip = features.width < _HALF_SEEN * target.radius
+    if evidence.silent is None and is_strip and not evidence.shows_beside(target.radius):
         return (
             f"Its returns lie on a strip {1e3 * features.width:.0f} mm wide, and the scan does not "
             "show whether it looked beside it: nothing shows whether it is round."
@@ -170,27 +172,28 @@ def paint_of(groups: Sequence[Evidence], probabilities: Sequence[float]) -> tupl
     (n,), list of str
         Logarithms of the ratios; and where one is much against a marker, that as a sentence.
     """
-    logs = np.log([max(evidence.brightness, 1.0) for evidence in groups])
+    logs = np.log([max(evidence.brightness, 1.0) for evidence in groups])[:, None]
     variances = _PAINT**2 + _SHADE**2 / np.array([max(one.n_distinct, 1) for one in groups])
-    has_pole = np.array([evidence.shows_below for evidence in groups], np.bool_)
+    variances = variances[:, None]
+    has_pole = np.array([evidence.shows_below for evidence in groups], np.bool_)[:, None]
     middle = float(np.median(logs)) if len(logs) else 0.0
     as_other = _log_density(((logs - middle) / _PAINTS) ** 2, _PAINTS**2)
-    found = means = squares = np.zeros(len(logs))
-    for _ in range(_N_ROUNDS):
-        weights = np.asarray(probabilities) / (variances * (1.0 + squares / _TAIL))
-        sums = _PAINTS**-2.0 + weights.sum() - weights
-        means = (middle * _PAINTS**-2.0 + weights @ logs - weights * logs) / sums
-        spreads = variances + 1.0 / sums
-        squares = (logs - means) ** 2 / spreads
-        tails = (_TAIL + 1.0) * np.log1p(squares / _TAIL)  # of Student's distribution
-        found = _log_density(np.where(has_pole, tails, squares), spreads) - as_other
+    squares = (logs - _PAINTS_OF_MARKERS) ** 2 / variances
+    tails = (_TAIL + 1.0) * np.log1p(squares / _TAIL)  # of Student's distribution
+    ratios = _log_density(np.where(has_pole, tails, squares), variances) - as_other
+    shares = np.clip(probabilities, _LEAST_SHARE, 1.0 - _LEAST_SHARE)[:, None]
+    own = np.logaddexp(np.log(shares) + ratios, np.log1p(-shares))
+    known = own.sum(axis=0) - own - 0.5 * ((_PAINTS_OF_MARKERS - middle) / _PAINTS) ** 2
+    known -= np.logaddexp.reduce(known, axis=1, keepdims=True)
+    found = np.logaddexp.reduce(known + ratios, axis=1)
+    means = np.exp(known) @ _PAINTS_OF_MARKERS
     texts = [
         f" Its reflectivity is {evidence.brightness:.0f}, that of the markers {np.exp(mean):.0f}."
         if ratio < _UNLIKE
         else ""
         for evidence, mean, ratio in zip(groups, means, found, strict=True)
     ]
-    return np.asarray(found), texts
+    return found, texts
 
 
 def _log_density(squares: Array, variances: Array | float) -> Array:
@@ -277,7 +280,7 @@ def judged(
     """
     n = np.maximum(np.asarray(n_returns, np.float64), _N_LEAST)  # densities: 1 / n^2 and 1 / n
     odds = _SCATTERED * _N_LEAST * np.log(_N_MOST / _N_LEAST) / n + 1.0 - _SCATTERED
-    log_likelihoods = _HOLDS * log_likelihoods
+    log_likelihoods = log_likelihoods.copy()
     log_likelihoods[:, 1:] += np.log(odds)[:, None]
     _, posteriors = shares_of(log_likelihoods, counts)
     return [judgement_of(own, NAMES) for own in posteriors]

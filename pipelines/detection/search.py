@@ -36,9 +36,7 @@ from spheremark.pipelines.model import Array
 _GIVEN_UP = 12.0  # logarithm of odds against the sphere from which no other shape is sought
 _ORDER = (0, 4, 8, 7, 1, 6, 5, 3, 2)  # the sphere, then what refutes it at the least cost
 _STARTS = (0.0, -0.3, 0.3)  # of the logarithm of the radius of a ball
-_CLOSE = (-2.0, 8.0)  # logarithms of odds for the sphere between which shapes are sought harder
-_UNSURE = (-4.0, 9.0)  # the same, between which evidence is integrated
-_RIVAL = 10.0  # logarithm of odds behind the best up to which it is
+_UNSURE = (-4.0, 9.0)  # logarithms of odds for the sphere between which rivals may turn a decision
 _SHAKES = 0.5 * np.random.default_rng(1).normal(size=(8, N_PARAMETERS))  # in standard deviations
 _N_OTHERS = 3  # best shapes of other kinds, where such a search begins too
 
@@ -100,31 +98,24 @@ def compared(beams: Beams, priors: Array, log_priors: Array, begun: Array) -> tu
             _keep(kind, shape, own + log_priors[kind], found, shapes)
         else:
             _seek(kind, priors, log_priors, beams, (found, shapes))
-    if len(begun) > 0:
+    odds = found[SPHERE] - found[SPHERE + 1 :].max()
+    if len(begun) > 0 and _UNSURE[0] < odds < _UNSURE[1]:
         _settle(priors, log_priors, beams, (found, shapes))
     return found, shapes
 
 
 @compiled
 def _settle(priors: Array, log_priors: Array, beams: Beams, known: tuple[Array, Array]) -> None:
-    """Seek harder where the odds are close, and integrate the evidence where they are unsure."""
+    """Seek the sphere and its rivals harder, and integrate their evidence."""
     found, shapes = known
-    if _is_between(_CLOSE, found):
-        for kind in _ORDER:
-            if found[kind] > found.max() - _CLOSE[1]:
-                _seek_harder(kind, priors[kind], log_priors[kind], beams, known)
-    if _is_between(_UNSURE, found):
-        least = found.max() - _RIVAL
-        for kind in _ORDER:
-            if found[kind] > least:
-                own = log_integral(kind, shapes[kind], priors[kind], beams)
-                found[kind] = own + log_priors[kind]
-
-
-@compiled
-def _is_between(limits: tuple[float, float], found: Array) -> bool:
-    """Return whether the logarithm of the odds for the sphere lies between two limits."""
-    return bool(limits[0] < found[SPHERE] - found[SPHERE + 1 :].max() < limits[1])
+    for kind in _ORDER:
+        if found[kind] > found.max() - _UNSURE[1]:
+            _seek_harder(kind, priors[kind], log_priors[kind], beams, known)
+    least = found.max() - _UNSURE[1]
+    for kind in _ORDER:
+        if found[kind] > least:
+            own = log_integral(kind, shapes[kind], priors[kind], beams)
+            found[kind] = own + log_priors[kind]
 
 
 @compiled

@@ -31,8 +31,7 @@ _AS_ROUND = 0.3  # of the stones that would be as round as markers by their prio
 _N_SHAPES, _N_STAGES, _N_MOVES = 16, 24, 3  # of an integral, and between two of its stages
 _NORMAL = np.random.default_rng(2).normal(size=4093)  # draws, taken in turn; the numbers are prime
 _LOG_UNIFORM = np.log(np.random.default_rng(3).uniform(size=4091))
-_ACCEPTED = 0.25  # share of the moves, by which their size is chosen
-_WORST = -1e4  # logarithm of a likelihood: less says nothing more
+_ACCEPTED = 0.25  # share of the moves: near the best of many dimensions (Roberts et al., 1997)
 
 
 @compiled
@@ -69,35 +68,62 @@ def log_integral(kind: int, shape: Array, prior: Array, beams: Beams) -> float:
     for j in range(len(free)):
         total += np.log(root[j, j])
         root[j] *= prior[1, free[j]]
+    about, found, weights = (shape, free, root), np.empty(_N_SHAPES), np.zeros(_N_SHAPES)
     drawn = _NORMAL[: _N_SHAPES * len(free)].reshape(_N_SHAPES, len(free)).copy()
-    found, weights = np.empty(_N_SHAPES), np.zeros(_N_SHAPES)
-    trial, densities = shape.copy(), np.empty(len(beams.x))
     for i in range(_N_SHAPES):
-        trial[free] = shape[free] + root @ drawn[i]
-        found[i] = max(log_likelihood(kind, trial, prior, beams, densities), _WORST)
-    power, size, n_moved = 0.0, 1.2 / np.sqrt(len(free)), drawn.size
+        found[i] = _log_likelihood_of(kind, about, drawn[i], prior, beams)
+    power, size = 0.0, 1.2 / np.sqrt(len(free))
     for stage in range(1, _N_STAGES + 1):
         step = (stage / _N_STAGES) ** 2 - power
         for i in range(_N_SHAPES):
             weights[i] += step * (found[i] + 0.5 * drawn[i] @ drawn[i])
-        if stage == _N_STAGES:
-            break
-        total += _drawn_anew(drawn, found, weights)
-        power, n_accepted = power + step, 0
-        for i in range(_N_SHAPES):
-            for _ in range(_N_MOVES):
-                moved = drawn[i].copy()
-                for j in range(len(free)):
-                    n_moved += 1
-                    moved[j] += size * _NORMAL[n_moved % len(_NORMAL)]
-                trial[free] = shape[free] + root @ moved
-                likely = log_likelihood(kind, trial, prior, beams, densities)
-                gained = power * (likely - found[i])
-                gained -= 0.5 * (1.0 - power) * (moved @ moved - drawn[i] @ drawn[i])
-                if _LOG_UNIFORM[n_moved % len(_LOG_UNIFORM)] < gained:
-                    drawn[i], found[i], n_accepted = moved, likely, n_accepted + 1
-        size *= np.exp(n_accepted / (_N_SHAPES * _N_MOVES) - _ACCEPTED)
+        if stage < _N_STAGES:
+            power += step
+            total += _drawn_anew(drawn, found, weights)
+            accepted = _moved(kind, about, prior, beams, (drawn, found), (power, size, stage))
+            size *= np.exp(accepted - _ACCEPTED)
     return float(total + weights.max() + np.log(np.exp(weights - weights.max()).mean()))
+
+
+@compiled
+def _log_likelihood_of(
+    kind: int, about: tuple[Array, Index, Array], drawn: Array, prior: Array, beams: Beams
+) -> float:
+    """Return the logarithm of the likelihood of a draw from about a shape."""
+    shape, free, root = about
+    at = shape.copy()
+    at[free] += root @ drawn
+    return float(log_likelihood(kind, at, prior, beams, np.empty(len(beams.x))))
+
+
+@compiled
+def _moved(
+    kind: int,
+    about: tuple[Array, Index, Array],
+    prior: Array,
+    beams: Beams,
+    known: tuple[Array, Array],
+    by: tuple[float, float, int],
+) -> float:
+    """Move draws by the rule of Metropolis; return the share of the moves that were accepted.
+
+    ``known`` are the draws and the logarithms of their likelihoods; ``by`` is the power that the
+    likelihood has at a stage, the size of a move, and the number of the stage.
+    """
+    (drawn, found), (power, size, stage) = known, by
+    n_used, n_accepted = (1 + (stage - 1) * _N_MOVES) * drawn.size, 0
+    for i in range(_N_SHAPES):
+        for _ in range(_N_MOVES):
+            moved = drawn[i].copy()
+            for j in range(len(moved)):
+                n_used += 1
+                moved[j] += size * _NORMAL[n_used % len(_NORMAL)]
+            likely = _log_likelihood_of(kind, about, moved, prior, beams)
+            gained = power * (likely - found[i])
+            gained -= 0.5 * (1.0 - power) * (moved @ moved - drawn[i] @ drawn[i])
+            if _LOG_UNIFORM[n_used % len(_LOG_UNIFORM)] < gained:
+                drawn[i], found[i], n_accepted = moved, likely, n_accepted + 1
+    return n_accepted / (_N_SHAPES * _N_MOVES)
 
 
 @compiled

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from scipy import stats
 
 from spheremark.pipelines.detection.decision import (
     is_resolved,
@@ -116,8 +117,8 @@ def likelihoods(*sphere_over_others):
 
 
 def test_probabilities_follow_the_likelihoods_and_name_the_best_other_hypothesis():
-    found = likelihoods(14.0, 3.0, -4.0)
-    found[2, NAMES.index("head on shoulders")] = 4.0
+    found = likelihoods(12.0, 3.0, -4.0)
+    found[2, NAMES.index("head on shoulders")] = 2.0
     sure, doubtful, head = judged(found, [MANY] * 3)
     assert sure.probability > 0.999 > doubtful.probability > head.probability
     assert head.hypothesis.startswith("head on shoulders: ")
@@ -223,9 +224,21 @@ def test_what_is_painted_as_the_others_is_likelier_a_marker():
 
 
 def test_dirt_may_hide_the_paint_of_a_marker_whose_pole_is_seen_only():
+    """By as much as Student's distribution of markers is below the normal one of other things."""
     on_pole, unseen = (painted(50.0, 50.0, 51.0, 49.0, 10.0, n_past=n)[0][4] for n in (150, 0))
-    assert -4.0 < on_pole < -2.0
+    dirty, scale = np.log(10.0 / 50.0), np.hypot(0.1, 0.4 / np.sqrt(70))
+    tail = stats.t(3, scale=scale).logpdf(dirty) - stats.norm(scale=0.7).logpdf(dirty)
+    assert on_pole == pytest.approx(tail, abs=0.2)
     assert unseen < -8.0
+
+
+def test_many_doubtful_groups_do_not_outvote_a_few_sure_markers():
+    """As among far stones, each of which may be a marker."""
+    n_sure, doubtful = 5, np.geomspace(7.0, 16.0, 40)
+    values = [*n_sure * [21.0], *doubtful]
+    groups = [evidence(brightness=value, n_past=0) for value in values]  # no pole is seen
+    ratios, _ = paint_of(groups, [0.9998] * n_sure + [0.3] * len(doubtful))
+    assert min(ratios[:n_sure]) > 1.0 > max(ratios[n_sure:])
 
 
 def test_a_group_alone_shows_no_paint():
