@@ -109,7 +109,7 @@ class ExtractionConfig:
         Accepted mean number of false markers in a scan. Groups are markers, the surest first, while
         their probabilities of being none add up to at most this. Others whose probability is 0.9 or
         more are possible markers. 0.01: one false marker in a hundred scans if the
-        probabilities hold. Among many decoys it was two in nine scans, as the methods say.
+        probabilities hold. Among many decoys it was one in seven scans, as the methods say.
     range_max : float
         Markers are not searched for beyond this distance [m]. 100: as far as the sensor measures;
         ``n_points_min`` limits smaller spheres to less, those of 0.1 m to 35 m in a usual turn.

@@ -1,6 +1,6 @@
 """How likely each shape is at a place: the evidence of the beams about it.
 
-Hides where the search for the best shape of each kind begins, and which are sought harder.
+Hides where the search for the best shape of each kind begins, and which evidence is integrated.
 """
 
 from __future__ import annotations
@@ -15,7 +15,6 @@ from spheremark.pipelines.detection.maxima import climbed, information, searched
 from spheremark.pipelines.detection.shapes import (
     BALL,
     BOULDER,
-    CLUTTER,
     CYLINDER,
     FORM,
     HEAD,
@@ -37,8 +36,6 @@ _GIVEN_UP = 12.0  # logarithm of odds against the sphere from which no other sha
 _ORDER = (0, 4, 8, 7, 1, 6, 5, 3, 2)  # the sphere, then what refutes it at the least cost
 _STARTS = (0.0, -0.3, 0.3)  # of the logarithm of the radius of a ball
 _UNSURE = (-4.0, 9.0)  # logarithms of odds for the sphere between which rivals may turn a decision
-_SHAKES = 0.5 * np.random.default_rng(1).normal(size=(8, N_PARAMETERS))  # in standard deviations
-_N_OTHERS = 3  # best shapes of other kinds, where such a search begins too
 
 
 @compiled
@@ -83,7 +80,7 @@ def compared(beams: Beams, priors: Array, log_priors: Array, begun: Array) -> tu
 
     ``begun`` are the best shapes by other priors, from which these are climbed to, NaN where one
     was not sought; (0, p) if there are none. A solid is always sought anew, beside the best sphere.
-    Where the decision is close then, what may turn it is sought from more starts and integrated.
+    Where the decision is close then, what may turn it is integrated.
     """
     found, shapes = np.full(len(log_priors), -np.inf), np.full((len(log_priors), N_PARAMETERS), nan)
     shapes[SPHERE] = priors[SPHERE, 0]
@@ -100,50 +97,19 @@ def compared(beams: Beams, priors: Array, log_priors: Array, begun: Array) -> tu
             _seek(kind, priors, log_priors, beams, (found, shapes))
     odds = found[SPHERE] - found[SPHERE + 1 :].max()
     if len(begun) > 0 and _UNSURE[0] < odds < _UNSURE[1]:
-        _settle(priors, log_priors, beams, (found, shapes))
+        _integrate(priors, log_priors, beams, (found, shapes))
     return found, shapes
 
 
 @compiled
-def _settle(priors: Array, log_priors: Array, beams: Beams, known: tuple[Array, Array]) -> None:
-    """Seek the sphere and its rivals harder, and integrate their evidence."""
+def _integrate(priors: Array, log_priors: Array, beams: Beams, known: tuple[Array, Array]) -> None:
+    """Integrate the evidence of the sphere and its rivals; ``known`` as ``compared``."""
     found, shapes = known
-    for kind in _ORDER:
-        if found[kind] > found.max() - _UNSURE[1]:
-            _seek_harder(kind, priors[kind], log_priors[kind], beams, known)
     least = found.max() - _UNSURE[1]
     for kind in _ORDER:
         if found[kind] > least:
             own = log_integral(kind, shapes[kind], priors[kind], beams)
             found[kind] = own + log_priors[kind]
-
-
-@compiled
-def _seek_harder(
-    kind: int, prior: Array, log_prior: float, beams: Beams, known: tuple[Array, Array]
-) -> None:
-    """Climb to a likelier shape of a kind from where two others are best, and from shaken places.
-
-    One search ends in one of several maxima. The likeliest counts, not the widest: how much of the
-    prior one leaves is known too badly to choose by.
-    """
-    found, shapes = known
-    densities, is_free = np.empty(len(beams.x)), prior[1] > 0.0
-    starts = shapes[kind] + _SHAKES * prior[1]
-    for i, other in enumerate(np.argsort(-found)[:_N_OTHERS]):
-        if other != kind and found[other] > -np.inf:
-            starts[i, :STRETCH], starts[i, POLE] = shapes[other][:STRETCH], shapes[other][POLE]
-            if kind in (BOULDER, HEAD, CLUTTER):  # what they scatter by is not the noise
-                starts[i, NOISE] = shapes[kind][NOISE]
-            starts[i, STRETCH:POLE] = shapes[kind][STRETCH:POLE]
-    best = log_likelihood(kind, shapes[kind], prior, beams, densities)
-    for shape in starts:
-        align(kind, shape, beams)
-        likely = log_likelihood(kind, shape, prior, beams, densities)
-        likely = climbed(kind, shape, is_free, prior, beams, likely)
-        if likely > best:
-            best, shapes[kind] = likely, shape
-            found[kind] = likely + log_volume(kind, shape, prior, beams) + log_prior
 
 
 @compiled
