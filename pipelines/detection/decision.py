@@ -26,8 +26,7 @@ _HALF_SEEN = 0.8  # radii: the returns of half a ball are as wide, but for those
 _HIDDEN = 2.0  # as many returns before a ball as on it: two thirds of it are hidden
 _SHADE = 0.4  # standard deviation, as a share, of one return's reflectivity: partly lit beams
 _PAINT, _PAINTS = 0.1, 0.7  # the same of markers, by range and incidence; and of all things
-_PAINTS_OF_MARKERS = np.arange(0.0, np.log(256.0), 0.25 * _PAINT)  # logarithms of reflectivities
-_LEAST_SHARE = 1e-9  # of a probability that is counted: nothing is surer
+_FINE = 0.25  # of the spread of markers: steps of the paint that is summed over
 _TAIL = 3.0  # degrees of freedom: of some markers the paint is dirty or in shade
 _UNLIKE = -2.0  # logarithm of odds by paint from which a reason states it
 _FLAT = 0.236  # of the radius: standard deviation of the depths of a sphere about their mean
@@ -156,9 +155,9 @@ def _n_comparable(evidence: Evidence) -> float:
 def paint_of(groups: Sequence[Evidence], probabilities: Sequence[float]) -> tuple[Array, list[str]]:
     """Return how much likelier the reflectivity of each group is if it is a marker.
 
-    All markers have the same paint, other things have any. What the paint is, the other groups
-    show, by how probably each is a marker. Some markers are dirty or in shade: but what nothing
-    shows a pole of must be painted as they are.
+    All markers have the same paint, other things have any. What it is, the other groups show: each
+    is painted as markers are with its probability, or is anything. Some markers are dirty or in
+    shade: but what nothing shows a pole of must be painted as they are.
 
     Parameters
     ----------
@@ -172,21 +171,23 @@ def paint_of(groups: Sequence[Evidence], probabilities: Sequence[float]) -> tupl
     (n,), list of str
         Logarithms of the ratios; and where one is much against a marker, that as a sentence.
     """
+    if not groups:
+        return np.empty(0), []
     logs = np.log([max(evidence.brightness, 1.0) for evidence in groups])[:, None]
-    variances = _PAINT**2 + _SHADE**2 / np.array([max(one.n_distinct, 1) for one in groups])
-    variances = variances[:, None]
-    has_pole = np.array([evidence.shows_below for evidence in groups], np.bool_)[:, None]
-    middle = float(np.median(logs)) if len(logs) else 0.0
-    as_other = _log_density(((logs - middle) / _PAINTS) ** 2, _PAINTS**2)
-    squares = (logs - _PAINTS_OF_MARKERS) ** 2 / variances
+    n_distinct = np.array([max(evidence.n_distinct, 1) for evidence in groups])[:, None]
+    has_pole = np.array([evidence.shows_below for evidence in groups])[:, None]
+    variances, middle = _PAINT**2 + _SHADE**2 / n_distinct, float(np.median(logs))
+    reach = 3.0 * _PAINTS  # beyond which no paint of markers is expected
+    paints = np.arange(logs.min() - reach, logs.max() + reach, _FINE * _PAINT)
+    squares = (logs - paints) ** 2 / variances
     tails = (_TAIL + 1.0) * np.log1p(squares / _TAIL)  # of Student's distribution
-    ratios = _log_density(np.where(has_pole, tails, squares), variances) - as_other
-    shares = np.clip(probabilities, _LEAST_SHARE, 1.0 - _LEAST_SHARE)[:, None]
-    own = np.logaddexp(np.log(shares) + ratios, np.log1p(-shares))
-    known = own.sum(axis=0) - own - 0.5 * ((_PAINTS_OF_MARKERS - middle) / _PAINTS) ** 2
+    ratios = _log_density(np.where(has_pole, tails, squares), variances)
+    ratios -= _log_density(((logs - middle) / _PAINTS) ** 2, _PAINTS**2)
+    shares = np.minimum(probabilities, 1.0 - 1.0 / _MOST)[:, None]
+    own = np.log1p(shares * np.expm1(ratios))
+    known = own.sum(axis=0) - own - 0.5 * ((paints - middle) / _PAINTS) ** 2
     known -= np.logaddexp.reduce(known, axis=1, keepdims=True)
-    found = np.logaddexp.reduce(known + ratios, axis=1)
-    means = np.exp(known) @ _PAINTS_OF_MARKERS
+    found, means = np.logaddexp.reduce(known + ratios, axis=1), np.exp(known) @ paints
     texts = [
         f" Its reflectivity is {evidence.brightness:.0f}, that of the markers {np.exp(mean):.0f}."
         if ratio < _UNLIKE

@@ -138,15 +138,15 @@ class Evidence(NamedTuple):
         """Whether most of all beams below it and beside the pole go past it."""
         return self.n_past > 2 and self.n_past > self.n_held + self.n_short
 
-    def shows_beside(self, radius: float) -> bool:
-        """Whether returns on both sides of it show that the scan looked there."""
-        reach, across = radius + self.blur[0], self.seen[0]
-        return bool((across < -reach).any() and (across > reach).any())
-
     @property
     def n_aimed(self) -> int:
         """Number of beams that would have met the sphere if nothing were nearer."""
         return self.n_on + self.n_before
+
+    def shows_beside(self, radius: float) -> bool:
+        """Return whether returns beside a ball of some radius [m], left and right, show a look."""
+        reach, across = radius + self.blur[0], self.seen[0]
+        return bool((across < -reach).any() and (across > reach).any())
 
 
 def gather_evidence(

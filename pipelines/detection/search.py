@@ -35,7 +35,7 @@ from spheremark.pipelines.model import Array
 _GIVEN_UP = 12.0  # logarithm of odds against the sphere from which no other shape is sought
 _ORDER = (0, 4, 8, 7, 1, 6, 5, 3, 2)  # the sphere, then what refutes it at the least cost
 _STARTS = (0.0, -0.3, 0.3)  # of the logarithm of the radius of a ball
-_UNSURE = (-4.0, 9.0)  # logarithms of odds for the sphere between which rivals may turn a decision
+_UNSURE = (-4.0, 9.0)  # logarithms of odds for the sphere between which evidence is integrated
 
 
 @compiled
@@ -103,7 +103,7 @@ def compared(beams: Beams, priors: Array, log_priors: Array, begun: Array) -> tu
 
 @compiled
 def _integrate(priors: Array, log_priors: Array, beams: Beams, known: tuple[Array, Array]) -> None:
-    """Integrate the evidence of the sphere and its rivals; ``known`` as ``compared``."""
+    """Integrate the evidence of what may turn a close decision; ``known`` as ``compared``."""
     found, shapes = known
     least = found.max() - _UNSURE[1]
     for kind in _ORDER:

@@ -241,6 +241,12 @@ def test_many_doubtful_groups_do_not_outvote_a_few_sure_markers():
     assert min(ratios[:n_sure]) > 1.0 > max(ratios[n_sure:])
 
 
+def test_the_scale_of_reflectivities_does_not_matter():
+    """Some sensors give signals of thousands."""
+    values = np.array([50.0, 50.0, 51.0, 49.0, 20.0])
+    np.testing.assert_allclose(painted(*values)[0], painted(*100.0 * values)[0], atol=1e-6)
+
+
 def test_a_group_alone_shows_no_paint():
     assert abs(painted(20.0)[0][0]) < 0.5
     assert len(painted()[0]) == 0
