@@ -69,9 +69,10 @@ ABUNDANCE = (208, 31, 274, 10, 33, 191, 18, 36, 36)
 
 _BESIDE = 0.1  # probability of anything beside what stands free
 _HEIGHTS = 2.5  # [m] up to which markers stand
-_LEAST_HEIGHTS = {HEAD: 10.0, BALL: 1.0, SPHERE: 1.0, CYLINDER: 1.0, SOLID: 1.0}
+_LEAST_HEIGHTS = {BALL: 1.0, SPHERE: 1.0, CYLINDER: 1.0, SOLID: 1.0}
 _BOULDER_HEIGHT = (0.3, 0.6)  # radii: centre above the ground, and standard deviation
 _PERCHED, _STONE = 0.1, 0.5  # probability that a boulder lies on another, and mean height [m] of it
+_HEAD_HEIGHT, _LOWERED = (1.6, 0.12), 0.2  # [m] of adults who stand (1.70 m tall); share of others
 _NOT_GROUND = 0.02  # probability that the ground about a place is not what it stands on
 
 _N_NEAR_FREE = 0.2  # groups near what stands free, in the mean
@@ -212,13 +213,26 @@ def _height_density(kind: int, height: float, sigma: float, radius: float) -> fl
     if not sigma < _HEIGHTS:
         return unknown
     if kind == BOULDER:
-        spread = hypot(_BOULDER_HEIGHT[1] * radius, sigma)
-        off = (height - _BOULDER_HEIGHT[0] * radius) / spread
-        known = exp(-0.5 * off * off) / (2.5066 * spread)
-        perched = exp(-max(height, 0.0) / _STONE) / _STONE
-        known = (1.0 - _PERCHED) * known + _PERCHED * perched
+        usual = (_BOULDER_HEIGHT[0] * radius, _BOULDER_HEIGHT[1] * radius)
+        known = _density(height, usual, sigma)
+        known = (1.0 - _PERCHED) * known + _PERCHED * _density_above(height, _STONE, sigma)
+    elif kind == HEAD:
+        known = _LOWERED * unknown + (1.0 - _LOWERED) * _density(height, _HEAD_HEIGHT, sigma)
     elif kind in _LEAST_HEIGHTS:
         known = 0.5 * unknown * erfc((_LEAST_HEIGHTS[kind] * radius - height) / (1.4142 * sigma))
     else:
         known = unknown
     return _NOT_GROUND * unknown + (1.0 - _NOT_GROUND) * known
+
+
+def _density(height: float, usual: tuple[float, float], sigma: float) -> float:
+    """Return the density of a height that is usual within a spread, both in metres [1/m]."""
+    spread = hypot(usual[1], sigma)
+    off = (height - usual[0]) / spread
+    return exp(-0.5 * off * off) / (2.5066 * spread)
+
+
+def _density_above(height: float, mean: float, sigma: float) -> float:
+    """Return the density of an exponentially distributed height that is known to sigma [1/m]."""
+    away = exp(0.5 * (sigma / mean) ** 2 - max(height, -_HEIGHTS) / mean)
+    return 0.5 * away * erfc((sigma / mean - height / sigma) / 1.4142) / mean

@@ -1,0 +1,30 @@
+"""What is known of the height at which each hypothesis is met."""
+
+import numpy as np
+import pytest
+
+from spheremark.pipelines.detection.hypotheses import _HEIGHTS, _height_density
+from spheremark.pipelines.detection.shapes import BOULDER, HEAD, NAMES, SPHERE
+
+RADIUS, SIGMA = 0.1, 0.05  # of a marker, and of the height of a place [m]
+
+
+@pytest.mark.parametrize("kind", range(len(NAMES)), ids=NAMES)
+def test_an_object_is_at_some_height(kind):
+    lowest = -1.0 if kind == BOULDER else 0.0  # stones may lie in the ground
+    heights = np.linspace(lowest, _HEIGHTS, 2001)
+    densities = [_height_density(kind, float(one), SIGMA, RADIUS) for one in heights]
+    # spheres stand a radius above the ground or higher: 4 % less than all
+    assert np.trapezoid(densities, heights) == pytest.approx(1.0, abs=0.06)
+
+
+@pytest.mark.parametrize(("height", "is_as_of_heads"), [(0.8, False), (1.2, False), (1.6, True)])
+def test_heads_are_met_where_people_have_them(height, is_as_of_heads):
+    head, sphere = (_height_density(kind, height, SIGMA, RADIUS) for kind in (HEAD, SPHERE))
+    assert (head > 3.0 * sphere) == is_as_of_heads
+    assert (head < sphere) != is_as_of_heads
+
+
+def test_an_unknown_height_tells_nothing():
+    found = {_height_density(kind, np.inf, np.inf, RADIUS) for kind in range(len(NAMES))}
+    assert found == {1.0 / _HEIGHTS}
