@@ -212,16 +212,14 @@ def _height_density(kind: int, height: float, sigma: float, radius: float) -> fl
     unknown = 1.0 / _HEIGHTS
     if not sigma < _HEIGHTS:
         return unknown
+    least = _LEAST_HEIGHTS.get(kind, 0.0) * radius
+    known = 0.5 * unknown * erfc((least - height) / (1.4142 * sigma))
     if kind == BOULDER:
         usual = (_BOULDER_HEIGHT[0] * radius, _BOULDER_HEIGHT[1] * radius)
-        known = _density(height, usual, sigma)
-        known = (1.0 - _PERCHED) * known + _PERCHED * _density_above(height, _STONE, sigma)
+        known = (1.0 - _PERCHED) * _density(height, usual, sigma)
+        known += _PERCHED * _density_above(height, _STONE, sigma)
     elif kind == HEAD:
-        known = _LOWERED * unknown + (1.0 - _LOWERED) * _density(height, _HEAD_HEIGHT, sigma)
-    elif kind in _LEAST_HEIGHTS:
-        known = 0.5 * unknown * erfc((_LEAST_HEIGHTS[kind] * radius - height) / (1.4142 * sigma))
-    else:
-        known = unknown
+        known = _LOWERED * known + (1.0 - _LOWERED) * _density(height, _HEAD_HEIGHT, sigma)
     return _NOT_GROUND * unknown + (1.0 - _NOT_GROUND) * known
 
 
