@@ -6,6 +6,7 @@ Hides their priors, and what beams beside a place, its height and its neighbours
 from __future__ import annotations
 
 from math import erfc, exp, hypot, lgamma
+from statistics import NormalDist
 from typing import NamedTuple
 
 import numpy as np
@@ -215,22 +216,17 @@ def _height_density(kind: int, height: float, sigma: float, radius: float) -> fl
     least = _LEAST_HEIGHTS.get(kind, 0.0) * radius
     known = 0.5 * unknown * erfc((least - height) / (1.4142 * sigma))
     if kind == BOULDER:
-        usual = (_BOULDER_HEIGHT[0] * radius, _BOULDER_HEIGHT[1] * radius)
-        known = (1.0 - _PERCHED) * _density(height, usual, sigma)
+        mean, spread = _BOULDER_HEIGHT[0] * radius, _BOULDER_HEIGHT[1] * radius
+        known = (1.0 - _PERCHED) * NormalDist(mean, hypot(spread, sigma)).pdf(height)
         known += _PERCHED * _density_above(height, _STONE, sigma)
     elif kind == HEAD:
-        known = _LOWERED * known + (1.0 - _LOWERED) * _density(height, _HEAD_HEIGHT, sigma)
+        mean, spread = _HEAD_HEIGHT
+        standing = NormalDist(mean, hypot(spread, sigma)).pdf(height)
+        known = _LOWERED * known + (1.0 - _LOWERED) * standing
     return _NOT_GROUND * unknown + (1.0 - _NOT_GROUND) * known
 
 
-def _density(height: float, usual: tuple[float, float], sigma: float) -> float:
-    """Return the density of a height that is usual within a spread, both in metres [1/m]."""
-    spread = hypot(usual[1], sigma)
-    off = (height - usual[0]) / spread
-    return exp(-0.5 * off * off) / (2.5066 * spread)
-
-
 def _density_above(height: float, mean: float, sigma: float) -> float:
-    """Return the density of an exponentially distributed height that is known to sigma [1/m]."""
+    """Return the density of a height of an exponential distribution, known to sigma [1/m]."""
     away = exp(0.5 * (sigma / mean) ** 2 - max(height, -_HEIGHTS) / mean)
     return 0.5 * away * erfc((sigma / mean - height / sigma) / 1.4142) / mean
