@@ -67,7 +67,7 @@ def clock_of(cloud: StitchedCloud) -> Clock | None:
     n_knots = int(np.clip(cloud.duration / _KNOT, *_N_KNOTS))
     rows = np.unique(np.linspace(0, n - 1, n_knots).astype(np.intp))
     is_known = (cloud.rings[rows] != RING_UNKNOWN) & np.isfinite(cloud.p_base[rows]).all(axis=1)
-    times, first = np.unique(cloud.times[rows[is_known]].astype(np.float64), return_index=True)
+    times, first = np.unique(cloud.seconds(rows[is_known]), return_index=True)
     rows = rows[is_known][first]
     if len(rows) < _N_KNOTS[0] // 2:
         return None
@@ -183,16 +183,25 @@ def _beams(
     return (
         np.array([level * np.cos(azimuths), -level * np.sin(azimuths), z]),
         np.interp(instants, clock.times, clock.angles),
-        (instants > clock.times[0])
-        & (instants < clock.times[-1])
+        _is_recorded(clock, instants)
         & (np.interp(instants, clock.times, clock.bends) <= clock.bend_max),
     )
+
+
+def _is_recorded(clock: Clock, instants: Array) -> Mask:
+    """Return which instants lie in no pause: a revolution or more without a return is one."""
+    n_turns = (clock.azimuths[-1] - clock.azimuths[0]) / (2.0 * np.pi)
+    revolution = (clock.times[-1] - clock.times[0]) / n_turns
+    later = np.searchsorted(clock.times, instants).clip(1, len(clock.times) - 1)
+    is_inside = (instants > clock.times[0]) & (instants < clock.times[-1])
+    is_inside &= clock.times[later] - clock.times[later - 1] < revolution
+    return np.asarray(is_inside)
 
 
 def _pulses(cloud: StitchedCloud, clock: Clock, rows: Index) -> NDArray[np.int64]:
     """Return the pulses of some returns."""
     rings = np.minimum(cloud.rings[rows], N_LASERS - 1).astype(np.int64)
-    seconds = cloud.times[rows] - _DELAYS[rings] - clock.phase
+    seconds = cloud.seconds(rows) - _DELAYS[rings] - clock.phase
     return np.rint(seconds / FIRING_CYCLE).astype(np.int64) * N_LASERS + rings
 
 

@@ -229,8 +229,8 @@ class Timed:
         """Return the number of rows."""
         return len(self.stamps_ns)
 
-    def __getitem__(self, rows: slice | Index | Mask) -> Column:
-        """Return some rows, float32."""
+    def exact(self, rows: slice | Index | Mask) -> Array:
+        """Return some rows, float64."""
         stamps_ns = self.stamps_ns[rows]
         sample: Any = 0  # a single sample serves all rows
         if len(self.samples_ns) > 1:
@@ -239,7 +239,11 @@ class Timed:
         if self.is_angle:
             turns = found * (0.5 / np.pi)
             found = 2.0 * np.pi * (turns - np.floor(turns + 0.5))
-        column = np.asarray(found, np.float32)
+        return np.asarray(found, np.float64)
+
+    def __getitem__(self, rows: slice | Index | Mask) -> Column:
+        """Return some rows, float32."""
+        column = self.exact(rows).astype(np.float32)
         column.flags.writeable = False  # like a sealed array: compiled loops are specialised by it
         return column
 
@@ -299,6 +303,15 @@ class StitchedCloud:
         arrays = (name for name in columns if not isinstance(getattr(self, name), Timed))
         seal(self, p_base=(None, 3), **dict.fromkeys(arrays, (None,)))
         same_length(self, "p_base", *columns)
+
+    def seconds(self, rows: slice | Index | Mask) -> Array:
+        """Return the times of some rows as exactly as they are known, float64 [s].
+
+        After two minutes float32 no longer tells the lasers of a firing apart.
+        """
+        if isinstance(self.times, Timed):
+            return self.times.exact(rows)
+        return self.times[rows].astype(np.float64)
 
     @property
     def start_ns(self) -> int:

@@ -57,8 +57,10 @@ class Tally(NamedTuple):
     last_ns: int
 
 
-def turn_returns(pulses: Pulses, joints: Joints, lidar: Lidar) -> tuple[Pulses, Tally]:
-    """Transform returns from the LiDAR's frame into the base frame."""
+def turn_returns(
+    pulses: Pulses, joints: Joints, lidar: Lidar
+) -> tuple[Pulses, Tally, Index | slice]:
+    """Transform returns from the LiDAR's frame into the base frame; return which were kept."""
     n = len(pulses.rings)
     p_lidar, p_base = pulses.p.reshape(-1), np.empty(3 * n, np.float32)
     keep = np.ones(n, np.bool_)
@@ -75,10 +77,10 @@ def turn_returns(pulses: Pulses, joints: Joints, lidar: Lidar) -> tuple[Pulses, 
     first, last = stamps_ns.min(initial=limits.max), stamps_ns.max(initial=limits.min)
     tally = Tally._make([*counts, int(first), int(last)])
     found = pulses._replace(p=p_base.reshape(n, 3))
-    if tally.n_kept < n:
-        rows = np.flatnonzero(keep)
-        found = Pulses._make(column.take(rows, axis=0) for column in found)
-    return found, tally
+    if tally.n_kept == n:
+        return found, tally, slice(None)
+    rows = np.flatnonzero(keep)
+    return Pulses._make(column.take(rows, axis=0) for column in found), tally, rows
 
 
 def _knots(joints: Joints) -> tuple[Nanos, Array]:

@@ -88,7 +88,7 @@ def firings_of(cloud: StitchedCloud) -> tuple[Firings | None, str]:
         return None, "the rings of the returns are not known"
     rows = np.unique(np.linspace(0, len(cloud.times) - 1, _N_TIMED).astype(np.intp))
     rows = rows[np.isfinite(cloud.p_base[rows]).all(axis=1)]
-    times = cloud.times[rows].astype(np.float64)
+    times = cloud.seconds(rows)
     firings = times - _DELAYS[cloud.rings[rows]]
     turn = np.exp(2j * np.pi * firings / FIRING_CYCLE)
     phase = float(np.angle(turn.mean())) / (2 * np.pi) * FIRING_CYCLE
@@ -140,15 +140,14 @@ def _all_firings(
     cloud: StitchedCloud, phase: float, spin: float, drifts: tuple[Array, Array]
 ) -> Firings:
     """Return the firings for the instant of firing 0, and a spin with deviations at some times."""
-    seconds = cloud.times[:] - _DELAYS[cloud.rings] - phase
+    seconds = cloud.seconds(slice(None)) - _DELAYS[cloud.rings] - phase
     numbers = np.rint(seconds / FIRING_CYCLE).astype(np.intp)
-    first = int(numbers.min())
-    row_of = np.full((int(numbers.max()) - first + 1, N_LASERS), -1, np.int32)
-    row_of[numbers - first, cloud.rings] = np.arange(len(numbers))
-    numbered = np.arange(first, first + len(row_of), dtype=np.float64)
-    times: Array = phase + FIRING_CYCLE * numbered
+    numbered = _recorded(numbers, 2.0 * np.pi / (abs(spin) * FIRING_CYCLE))
+    row_of = np.full((len(numbered), N_LASERS), -1, np.int32)
+    row_of[np.searchsorted(numbered, numbers), cloud.rings] = np.arange(len(numbers))
+    times = np.asarray(phase + FIRING_CYCLE * numbered, np.float64)
     thin = slice(None, None, max(len(cloud.times) // _N_TIMED, 1))
-    stamps, places = np.unique(cloud.times[thin], return_index=True)
+    stamps, places = np.unique(cloud.seconds(thin), return_index=True)
     angles = np.unwrap(cloud.gimbal_angles[thin][places])
     gimbal = np.interp(times, stamps, angles.astype(np.float64))
     azimuths = spin * times + np.interp(times, *drifts)
@@ -159,6 +158,15 @@ def _all_firings(
         turn=float(np.median(np.diff(gimbal))) / FIRING_CYCLE,
         row_of=row_of,
     )
+
+
+def _recorded(numbers: Index, revolution: float) -> Index:
+    """Return the numbers of all firings but those in pauses: a revolution without a return."""
+    heard = np.unique(numbers)
+    lengths = np.diff(heard, append=heard[-1] + 1)
+    lengths[lengths > revolution] = 1
+    within = np.arange(lengths.sum()) - np.repeat(np.cumsum(lengths) - lengths, lengths)
+    return np.asarray(np.repeat(heard, lengths) + within)
 
 
 def passing_of(
