@@ -15,12 +15,7 @@ from numpy.typing import NDArray
 from spheremark.pipelines.compilation import compiled
 from spheremark.pipelines.detection.cells import Cells, rows_about
 from spheremark.pipelines.detection.ground import Ground, planes_below, skin_of
-from spheremark.pipelines.detection.pulses import (
-    Hearing,
-    clock_of,
-    hearing_of,
-    unheard_about,
-)
+from spheremark.pipelines.detection.pulses import Hearing, hearing_of, unheard_about
 from spheremark.pipelines.detection.target import (
     Target,
     blur_at,
@@ -29,6 +24,7 @@ from spheremark.pipelines.detection.target import (
     view_of,
 )
 from spheremark.pipelines.model import Array, Column, Rig, StitchedCloud
+from spheremark.pipelines.scan.firings import clock_of
 from spheremark.pipelines.scan.interpolation import errors_of_interpolation
 from spheremark.pipelines.threads import side_by_side
 
@@ -155,7 +151,7 @@ def gather_evidence(
     """Return the beams towards and about some centres, and how well the scan hears its echoes."""
     if not len(centres):
         return [], _UNKNOWN
-    clock = clock_of(cloud)
+    clock, _ = clock_of(cloud)
     hearing = hearing_of(cloud, clock, target.up) if clock is not None else _UNKNOWN
     planes = planes_below(ground, cells, centres)
     heights = np.sum(planes[:, :3] * centres, axis=1) + planes[:, 3]

@@ -21,9 +21,10 @@ from spheremark.pipelines.model import (
     Status,
     StitchedCloud,
 )
+from spheremark.pipelines.scan.firings import Clock, clock_of
 from spheremark.pipelines.sphere.description import Fits
 from spheremark.pipelines.sphere.methods import along_beam
-from spheremark.pipelines.sphere.pulses import Firings, Passing, firings_of, passing_of
+from spheremark.pipelines.sphere.pulses import Passing, passing_of
 
 NAME = "silhouette"
 
@@ -101,11 +102,11 @@ def fit(
     """
     if not found.candidates:
         return Fits((), ())
-    firings, why_not = firings_of(cloud)
-    if firings is None:
+    clock, why_not = clock_of(cloud)
+    if clock is None:
         result = along_beam.fit(cloud, found, config, radius)
         return result._replace(fits=tuple(_without_limb(fit, why_not) for fit in result.fits))
-    limb = _Limb(cloud, firings, radius)
+    limb = _Limb(cloud, clock, radius)
     result = along_beam.fit_ranges(cloud, found, config, radius, limb.observe)
     return result._replace(fits=tuple(_named(fit) for fit in result.fits))
 
@@ -157,8 +158,8 @@ def _logarithms(entered: Array, has_hit: Mask, edges: Array, softness: float) ->
 class _Limb:
     """The limbs of a stop's spheres as observations of the centres, with their state."""
 
-    def __init__(self, cloud: StitchedCloud, firings: Firings, radius: float) -> None:
-        self._cloud, self._firings, self._radius = cloud, firings, radius
+    def __init__(self, cloud: StitchedCloud, clock: Clock, radius: float) -> None:
+        self._cloud, self._clock, self._radius = cloud, clock, radius
         self._step = 0
         self._link = _Link(_SHARE, _SOFTNESSES[-1])
         self._passing: list[Passing] = []
@@ -167,7 +168,7 @@ class _Limb:
     def observe(self, centres: Array, covs: Array) -> tuple[Array, Array]:
         """Return what the limbs add to the normal equations of centres, as ``Observe``."""
         if not self._step:
-            near = passing_of(self._cloud, self._firings, centres, self._radius)
+            near = passing_of(self._cloud, self._clock, centres, self._radius)
             self._passing = [
                 _doubtful(*both, self._radius) for both in zip(near, covs, strict=True)
             ]

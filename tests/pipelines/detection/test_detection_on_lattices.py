@@ -7,10 +7,11 @@ import pytest
 
 from spheremark.pipelines.config import ExtractionConfig, StitchingConfig
 from spheremark.pipelines.detection import extract
-from spheremark.pipelines.detection.pulses import clock_of, unheard_about
+from spheremark.pipelines.detection.pulses import unheard_about
 from spheremark.pipelines.detection.target import Target
 from spheremark.pipelines.geometry import inverse, transform
 from spheremark.pipelines.model import RING_UNKNOWN
+from spheremark.pipelines.scan.firings import clock_of
 from spheremark.pipelines.scan.stitching import stitch
 from spheremark.pipelines.simulation import SimulationConfig, scenario, simulate_stop
 from spheremark.pipelines.simulation.rig import nominal_rig
@@ -30,7 +31,7 @@ def n_silent(scan, place):
     cloud, _, field = scan
     rows = np.flatnonzero(np.linalg.norm(cloud.p_base - place, axis=1) < 0.5).astype(np.int32)
     target = Target(field.marker_radius, np.array([0.0, 0.0, 1.0]), 0.003)
-    across, up, _ = unheard_about(cloud, clock_of(cloud), rows, place, target)
+    across, up, _ = unheard_about(cloud, clock_of(cloud)[0], rows, place, target)
     return int(np.sum(np.hypot(across, up) < 0.8 * field.marker_radius))
 
 
@@ -58,7 +59,7 @@ def test_no_pulse_at_a_marker_is_silent_and_all_are_in_the_sky(scan):
 def test_without_rings_there_is_no_clock(scan):
     cloud, _, _ = scan
     bare = replace(cloud, rings=np.full(len(cloud.rings), RING_UNKNOWN, np.uint8))
-    assert clock_of(bare) is None
+    assert clock_of(bare)[0] is None
 
 
 def test_limbs_of_markers_stay_in_the_fit_of_a_vlp16(scan):
