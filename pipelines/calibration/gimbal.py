@@ -12,7 +12,16 @@ from typing import NamedTuple
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from spheremark.pipelines.model import Array, Beams, Index, Rig, Rings, ScanLog, StitchedCloud
+from spheremark.pipelines.model import (
+    Array,
+    Beams,
+    Index,
+    Rig,
+    Rings,
+    ScanLog,
+    StitchedCloud,
+    Timed,
+)
 from spheremark.pipelines.scan.interpolation import scatter_of_angles
 from spheremark.pipelines.scan.stitching import beams
 from spheremark.pipelines.sphere.linearisation import linearise as linearise_ranges
@@ -168,7 +177,7 @@ def recorded_pulses(
     """
     rig, table = cloud.rig, beams(cloud, rows)
     turned = cloud.gimbal_angles[rows].astype(np.float64)
-    rates = _rates(log, rig, table.times)
+    rates = _rates(log, rig, _instants(cloud, rows))
     v_head = _turn(table.directions_base, -turned)
     biases = np.zeros(256)
     biases[: len(rig.laser_range_biases)] = rig.laser_range_biases
@@ -198,6 +207,13 @@ def _lines(times: Array, which: Index) -> Index:
         lines[own] = first + scan_lines(times[own])
         first = lines[own].max(initial=first - 1) + 1
     return lines
+
+
+def _instants(cloud: StitchedCloud, rows: Index) -> Array:
+    """Return the instants of the gimbal angles of some returns since the first pulse [s]."""
+    if not isinstance(cloud.gimbal_angles, Timed):
+        return cloud.seconds(rows)
+    return np.asarray((cloud.gimbal_angles.stamps_ns[rows] - cloud.start_ns) * _NS, np.float64)
 
 
 def _rates(log: ScanLog, rig: Rig, times: Array) -> Array:

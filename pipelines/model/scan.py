@@ -268,7 +268,8 @@ class StitchedCloud:
     rings : (n,) uint8
         Laser of each return; ``RING_UNKNOWN`` when neither recorded nor inferred from elevations.
     times : (n,) float32
-        Instant of each pulse since the first one of the stop [s].
+        Instant of each pulse since the first one of the stop; where a log has none, by the spin, or
+        that of its message [s].
     levelling : Levelling
         How the base leans.
     rig : Rig
@@ -307,7 +308,7 @@ class StitchedCloud:
     def seconds(self, rows: slice | Index | Mask) -> Array:
         """Return the times of some rows as exactly as they are known, float64 [s].
 
-        After two minutes float32 no longer tells the lasers of a firing apart.
+        In float32 the lasers of a firing are not told apart after half a minute.
         """
         if isinstance(self.times, Timed):
             return self.times.exact(rows)

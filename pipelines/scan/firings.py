@@ -12,12 +12,13 @@ import numpy as np
 
 from spheremark.pipelines.model import RING_UNKNOWN, Array, Index, Mask, Rig, StitchedCloud
 from spheremark.pipelines.scan.interpolation import errors_of_interpolation
-from spheremark.pipelines.scan.rigs import FIRING_CYCLE, FIRING_ORDER, LASER_CYCLE, N_LASERS
+from spheremark.pipelines.scan.rigs import FIRING_CYCLE, LASER_DELAYS, N_LASERS
 
-_DELAYS = np.argsort(FIRING_ORDER) * LASER_CYCLE  # [s] of each laser within its firing
 _PHASE_MAX = 3e-6  # [s] scatter of the firing clock: about one laser's share of a firing
 _KNOT = 0.0005  # [s] between the returns that show spin and gimbal: far less than a revolution
-_N_KNOTS, _STEADY = (500, 50_000), 0.01  # of a scan; and [s] about one over which it is steady
+_N_KNOTS = (500, 200_000)
+_STEADY = (0.01, 0.05)  # [s] before and after a return that show azimuth and speed of the spin
+_PAUSE = 0.9  # of a revolution without a return: the scan was not recorded
 _OFF_MAX = 1e-3  # [rad] a third of a beam: median by which a pulse may be misplaced
 _SLOWEST, _FASTEST = 2.0, 200.0  # [rad/s] of a spin
 _MARGIN = 0.006  # [rad] beside a place where pulses are tried: what turns within a firing
@@ -32,7 +33,7 @@ class Clock(NamedTuple):
     phase : float
         Instant of firing 0 [s].
     times, azimuths, angles : (k,)
-        Instants, azimuths of the spin, both increasing, and angles of the gimbal [s], [rad].
+        Instants, increasing, azimuths of the spin, unwrapped, and angles of the gimbal [s], [rad].
     bends : (k,)
         By how much these angles may be off where the gimbal starts or stops [rad].
     rig : Rig
@@ -105,8 +106,8 @@ def clock_of(cloud: StitchedCloud) -> tuple[Clock | None, str]:
     if not len(rows) and n:
         return None, "the rings of the returns are not known"
     if len(rows) < _N_KNOTS[0] // 2:
-        return None, "too few returns have times of their own"
-    turns = np.exp(2j * np.pi * (times - _DELAYS[cloud.rings[rows]]) / FIRING_CYCLE)
+        return None, "too few returns have times that show when the lasers fire"
+    turns = np.exp(2j * np.pi * (times - LASER_DELAYS[cloud.rings[rows]]) / FIRING_CYCLE)
     per_radian = FIRING_CYCLE / (2 * np.pi)
     off = per_radian * np.angle(turns / turns.mean())
     if not np.sqrt(np.mean(off**2)) < _PHASE_MAX:
@@ -114,7 +115,7 @@ def clock_of(cloud: StitchedCloud) -> tuple[Clock | None, str]:
     angles = np.unwrap(cloud.gimbal_angles[rows].astype(np.float64))
     azimuths, _ = _seen_from_lidar(cloud.rig, cloud.p_base[rows].T, angles)
     gaps = np.diff(times)
-    rates = (np.diff(azimuths) % (2 * np.pi) / gaps)[gaps < _STEADY]
+    rates = (np.diff(azimuths) % (2 * np.pi) / gaps)[gaps < _STEADY[0]]
     spin = float(np.median(rates)) if len(rates) else 0.0
     azimuths = spin * times + np.unwrap(azimuths - spin * times)
     # every second one against its neighbours
@@ -128,14 +129,18 @@ def clock_of(cloud: StitchedCloud) -> tuple[Clock | None, str]:
 
 
 def _smooth(times: Array, azimuths: Array) -> Array:
-    """Return azimuths, increasing, by the returns shortly before and after: they are rounded."""
-    first = np.searchsorted(times, times - _STEADY)
-    end = np.searchsorted(times, times + _STEADY, side="right")
+    """Return means of azimuths, which are rounded, moved along by the speed of the spin there."""
     sums = np.cumsum(np.insert(np.stack([times, azimuths]), 0, 0.0, axis=1), axis=1)
-    mean_times, means = (sums[:, end] - sums[:, first]) / (end - first)
-    steps = np.diff(mean_times)
-    spin = np.median(np.diff(means)[steps > 0.0] / steps[steps > 0.0])
-    return np.asarray(means + spin * (times - mean_times))
+
+    def means(before: float, after: float) -> Array:
+        first = np.searchsorted(times, times - before)
+        end = np.searchsorted(times, times + after, side="right")
+        return np.asarray((sums[:, end] - sums[:, first]) / (end - first))
+
+    mean_times, found = means(_STEADY[0], _STEADY[0])
+    lasting, turned = means(0.0, _STEADY[1]) - means(_STEADY[1], 0.0)
+    spins = np.divide(turned, lasting, out=np.zeros_like(times), where=lasting > 0.0)
+    return np.asarray(found + spins * (times - mean_times))
 
 
 def pulses_about(clock: Clock, c: Array, reach: float) -> tuple[Pulses, Array, Array]:
@@ -153,8 +158,8 @@ def pulses_about(clock: Clock, c: Array, reach: float) -> tuple[Pulses, Array, A
     Returns
     -------
     Pulses, (3, k), (k,)
-        By their numbers; from the place to the nearest point of the beam, in the frame of the LiDAR
-        [m]; from where it leaves the LiDAR to that point [m].
+        In the order of their numbers; from the place to the nearest point of each beam, in the
+        frame of the LiDAR [m]; from where the beam leaves the LiDAR to that point [m].
 
     Notes
     -----
@@ -171,7 +176,7 @@ def pulses_about(clock: Clock, c: Array, reach: float) -> tuple[Pulses, Array, A
         azimuths, elevations = _seen_from_lidar(clock.rig, c, angles)
         ahead = np.unwrap(azimuths - clock.azimuths[0])
         instants = np.interp(revolutions + ahead, clock.azimuths, clock.times)
-    wide += _MARGIN
+    wide += _MARGIN + np.abs(clock.rig.laser_heights).max() / np.linalg.norm(c)
     aims = np.abs(elevations[:, None] - clock.rig.laser_elevations)
     passages, rings = np.nonzero(aims < wide)
     across = np.sqrt(wide**2 - aims[passages, rings] ** 2) / (_LEVEL * clock.spin * FIRING_CYCLE)
@@ -205,7 +210,7 @@ def pulses_of(clock: Clock, numbers: Index) -> Pulses:
         In that order.
     """
     rings = numbers % N_LASERS
-    instants = clock.phase + numbers // N_LASERS * FIRING_CYCLE + _DELAYS[rings]
+    instants = clock.phase + numbers // N_LASERS * FIRING_CYCLE + LASER_DELAYS[rings]
     azimuths = np.interp(instants, clock.times, clock.azimuths)
     level, z = (f(clock.rig.laser_elevations)[rings] for f in (np.cos, np.sin))
     return Pulses(
@@ -227,7 +232,7 @@ def numbers_of(cloud: StitchedCloud, clock: Clock, rows: Index) -> Index:
     clock : Clock
         Its clock.
     rows : (k,)
-        Rows of the cloud whose rings are known.
+        Rows of the cloud; those whose rings are not known count as of the last laser.
 
     Returns
     -------
@@ -235,7 +240,7 @@ def numbers_of(cloud: StitchedCloud, clock: Clock, rows: Index) -> Index:
         Numbers.
     """
     rings = np.minimum(cloud.rings[rows], N_LASERS - 1).astype(np.int64)
-    seconds = cloud.seconds(rows) - _DELAYS[rings] - clock.phase
+    seconds = cloud.seconds(rows) - LASER_DELAYS[rings] - clock.phase
     return np.asarray(np.rint(seconds / FIRING_CYCLE).astype(np.int64) * N_LASERS + rings)
 
 
@@ -260,10 +265,11 @@ def in_base(rig: Rig, v_lidar: Array, angles: Array) -> Array:
 
 
 def _is_recorded(clock: Clock, instants: Array) -> Mask:
-    """Return which instants lie in no pause: a revolution or more without a return is one."""
+    """Return which instants lie in no pause."""
     later = np.searchsorted(clock.times, instants).clip(1, len(clock.times) - 1)
     is_inside = (instants > clock.times[0]) & (instants < clock.times[-1])
-    is_inside &= clock.times[later] - clock.times[later - 1] < 2.0 * np.pi / clock.spin
+    longest = _PAUSE * 2.0 * np.pi / clock.spin
+    is_inside &= clock.times[later] - clock.times[later - 1] < longest
     return np.asarray(is_inside)
 
 

@@ -27,6 +27,9 @@ VLP16_ELEVATIONS = np.radians(np.arange(-15.0, 16.0, 2.0))
 FIRING_ORDER = np.array([0, 8, 1, 9, 2, 10, 3, 11, 4, 12, 5, 13, 6, 14, 7, 15])
 """Laser index (0 the lowest) in the order of firing: -15, +1, -13, +3, ... degrees."""
 
+LASER_DELAYS = np.argsort(FIRING_ORDER) * LASER_CYCLE
+"""Instant of each laser within a firing [s]."""
+
 _FOCAL_OFFSET = 0.04191  # [m] from the spin axis to where the beams cross (VLP-16 manual)
 _SIGMA_HEADING = np.radians(0.02)  # what careful mounting and an encoder's index leave
 _DIVERGENCE = (3.0e-3, 1.5e-3)  # [rad] full widths across and along the spin axis

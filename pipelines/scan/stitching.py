@@ -2,8 +2,8 @@
 
 A return becomes ``p_base = Rz(angle) T_head_lidar p_lidar`` with the gimbal angle interpolated to
 the instant of its pulse, after the laser's bias has been subtracted along the beam.
-Inside, ``stops`` cuts a log into stops, ``pulse_times`` finds times that messages lack, and
-``turning`` has the loops.
+Inside, ``stops`` cuts a log into stops, ``spin`` finds the times that clouds lack, ``turning``
+has the loops; ``firings`` are all pulses of a scan, with and without a return.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ from spheremark.pipelines.model import (
     StitchedCloud,
     Timed,
 )
-from spheremark.pipelines.scan.pulse_times import pulse_stamps
+from spheremark.pipelines.scan.spin import stamps_by_spin
 from spheremark.pipelines.scan.stops import pause_notes, split_stops
 from spheremark.pipelines.scan.turning import Joints, Lidar, Pulses, Tally, turn_returns
 
@@ -184,9 +184,10 @@ def stitch(log: ScanLog, rig: Rig, config: StitchingConfig) -> StitchedCloud:
     """
     rings, notes = _lasers_of(log, rig)
     joints = _joints(log, rig)
-    joints, stamps_ns, smear_note = _without_smear(log, rings, joints, rig)
+    joints, by_spin_ns, smear_note = _without_smear(log, rings, joints, rig)
     pulses = Pulses(log.p_lidar, log.intensities, rings, log.stamps_lidar_ns)
     kept, tally, rows = turn_returns(pulses, joints, _lidar(rig, config))
+    stamps_ns = kept.stamps_ns if by_spin_ns is None else by_spin_ns[rows]
     _refuse_empty(log, joints, tally, config)
     levelling = level(log, rig, config)
     rate = float(np.nan_to_num(np.nanmedian(np.abs(joints.rates)))) / _NS
@@ -200,7 +201,7 @@ def stitch(log: ScanLog, rig: Rig, config: StitchingConfig) -> StitchedCloud:
         gimbal_angles=Timed(kept.stamps_ns, *joints, is_angle=True),
         intensities=kept.intensities,
         rings=kept.rings,
-        times=Timed(stamps_ns[rows], np.array([tally.first_ns]), np.zeros(1), np.array([_NS])),
+        times=Timed(stamps_ns, np.array([tally.first_ns]), np.zeros(1), np.array([_NS])),
         levelling=levelling,
         rig=rig,
         coverage=coverage,
@@ -305,13 +306,13 @@ def _refuse_speed(log: ScanLog, speeds: Array) -> None:
 
 def _without_smear(
     log: ScanLog, rings: Rings, joints: Joints, rig: Rig
-) -> tuple[Joints, Nanos, tuple[str, ...]]:
+) -> tuple[Joints, Nanos | None, tuple[str, ...]]:
     """Void the angle during messages without pulse times in which the gimbal moved.
 
-    Return the instants of the pulses too: those of other messages follow from the spin.
+    Return the instants of the other pulses too, where the spin tells them.
     """
     if log.has_pulse_times or not len(log.stamps_lidar_ns):
-        return joints, log.stamps_lidar_ns, ()
+        return joints, None, ()
     messages = np.unique(log.stamps_lidar_ns)
     if len(messages) > 1:
         # A message lasts no longer than usual, however long the next one is in coming.
@@ -330,7 +331,7 @@ def _without_smear(
             "time, or raw packets, or let the gimbal rest while the LiDAR scans."
         )
     is_good = ~smeared[np.searchsorted(messages, log.stamps_lidar_ns)]
-    stamps_ns = pulse_stamps(log.p_lidar, rings, log.stamps_lidar_ns, is_good, rig)
+    by_spin_ns = stamps_by_spin(log.p_lidar, rings, log.stamps_lidar_ns, is_good, rig)
     notes: tuple[str, ...] = ()
     if np.any(smeared):
         joints = _voided(joints, messages[smeared])
@@ -338,7 +339,7 @@ def _without_smear(
             f"The points carry no time of their own: {int(np.sum(smeared))} of {len(messages)} "
             "messages were made while the gimbal moved and are left out.",
         )
-    return joints, log.stamps_lidar_ns if stamps_ns is None else stamps_ns, notes
+    return joints, by_spin_ns, notes
 
 
 def _smeared(moved: Array) -> tuple[Mask, int]:
@@ -489,6 +490,6 @@ def beams(cloud: StitchedCloud, members: Index) -> Beams:
         across_base=across / np.linalg.norm(across, axis=1, keepdims=True),
         rings=cloud.rings[members],
         intensities=cloud.intensities[members].astype(np.float64),
-        times=cloud.times[members].astype(np.float64),
+        times=cloud.seconds(members),
         divergence=rig.divergence,
     )

@@ -5,15 +5,15 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from spheremark.pipelines.geometry import levelling_rotation
-from spheremark.pipelines.model import Array, Mask, StitchedCloud
-from spheremark.pipelines.scan.firings import Clock, in_base, numbers_of, pulses_about
+from spheremark.pipelines.model import Array, Index, Mask, StitchedCloud
+from spheremark.pipelines.scan.firings import Clock, Pulses, in_base, numbers_of, pulses_about
 from spheremark.pipelines.scan.rigs import N_LASERS
 
 _REACH = 1.5  # radii: pulses that pass a centre closer are taken
 _DEPTH = 2.0  # radii before and behind the centre within which a return is the sphere's own
+_BLOCK = 500_000  # returns whose pulses are numbered at once
 _POLE_FROM, _POLE = 0.6, 0.35  # radii below the centre, and from the vertical: may be the pole
 
 
@@ -46,26 +46,39 @@ class Passing(NamedTuple):
 
 def passing_of(cloud: StitchedCloud, clock: Clock, centres: Array, radius: float) -> list[Passing]:
     """Return the pulses that pass each sphere closely, except those that may have met its pole."""
-    rows = np.flatnonzero(cloud.rings < N_LASERS)
-    numbers = numbers_of(cloud, clock, rows)
-    first = int(numbers.min()) // N_LASERS * N_LASERS
-    row_of = np.full(int(numbers.max()) - first + N_LASERS, -1, np.int32)
-    row_of[numbers - first] = rows
-    return [_passing(cloud, clock, (p, radius), (row_of, first)) for p in centres]
+    about = [pulses_about(clock, p, _REACH * radius) for p in centres]
+    wanted = np.unique(np.concatenate([pulses.numbers for pulses, _, _ in about]))
+    rows = _rows_of(cloud, clock, wanted)
+    return [
+        _passing(cloud, (p, radius), one, rows[np.searchsorted(wanted, one[0].numbers)])
+        for p, one in zip(centres, about, strict=True)
+    ]
+
+
+def _rows_of(cloud: StitchedCloud, clock: Clock, wanted: Index) -> Index:
+    """Return the rows of the returns of some pulses, by their numbers; -1 without one."""
+    found, n = np.full(len(wanted), -1), len(cloud.p_base)
+    for begin in range(0, n if len(wanted) else 0, _BLOCK):
+        rows = np.arange(begin, min(begin + _BLOCK, n))
+        rows = rows[cloud.rings[rows] < N_LASERS]
+        numbers = numbers_of(cloud, clock, rows)
+        places = np.searchsorted(wanted, numbers).clip(max=len(wanted) - 1)
+        is_wanted = wanted[places] == numbers
+        found[places[is_wanted]] = rows[is_wanted]
+    return found
 
 
 def _passing(
     cloud: StitchedCloud,
-    clock: Clock,
     sphere: tuple[Array, float],
-    returned: tuple[NDArray[np.int32], int],
+    about: tuple[Pulses, Array, Array],
+    rows: Index,
 ) -> Passing:
-    """Return the pulses that pass one sphere; ``returned`` are rows by number, from the first."""
-    (p, radius), (row_of, first), rig = sphere, returned, clock.rig
-    pulses, passing, along = pulses_about(clock, p, _REACH * radius)
+    """Return the pulses that pass one sphere, of those about it with the rows of their returns."""
+    (p, radius), (pulses, passing, along), rig = sphere, about, cloud.rig
     u, passed = (in_base(rig, v, pulses.angles).T for v in (pulses.directions, passing))
     axes = _plane(p / np.linalg.norm(p), levelling_rotation(cloud.levelling)[2])
-    places, rows = passed @ axes.T, row_of[pulses.numbers - first]
+    places = passed @ axes.T
     behind = np.sum((cloud.p_base[rows] - p) * u, axis=1)
     depth = np.where(rows < 0, np.inf, behind) / radius
     spin_axes = in_base(rig, np.eye(3)[:, 2:], pulses.angles).T

@@ -11,7 +11,7 @@ from spheremark.pipelines.detection.evidence import gather_evidence
 from spheremark.pipelines.detection.ground import ground_of
 from spheremark.pipelines.detection.target import Target
 from spheremark.pipelines.geometry import inverse, transform
-from spheremark.pipelines.scan.pulse_times import pulse_stamps
+from spheremark.pipelines.scan.spin import stamps_by_spin
 from spheremark.pipelines.scan.stitching import stitch
 from spheremark.pipelines.simulation import SimulationConfig, scenario, simulate_stop
 
@@ -49,7 +49,7 @@ def rings_of(log):
 def found(log, rings=None, rows=slice(None)):
     rings = rings_of(log) if rings is None else rings
     good = np.ones(len(rings), np.bool_)
-    return pulse_stamps(
+    return stamps_by_spin(
         log.p_lidar[rows], rings[rows], log.stamps_lidar_ns[rows], good[rows], log.rig
     )
 
