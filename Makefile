@@ -1,5 +1,6 @@
 # make demo   set everything up, survey the study's field in simulation, and serve the results
-# make test   all tests, the longest first
+# make test   all tests but those of minutes, the longest first
+# make test-long  those: statistics of many whole scans, and a service that is killed again and again
 # make check  format, lint, types, import contracts, spelling, lock files
 # make bench  speed and memory as ratios against a peer in the same run
 # make reference  renew REFERENCE.md from the commands and the settings
@@ -16,7 +17,7 @@ KERNELS := $(shell git ls-files 'pipelines/*.py' 'storage/*.py' 2>/dev/null)
 export OPENBLAS_NUM_THREADS ?= 1
 SIDE_BY_SIDE := --numprocesses 2 --dist loadfile --no-loadscope-reorder --max-worker-restart 0
 
-.PHONY: help setup setup-dev demo test check check-text check-types check-locks bench docs reference lock sbom clean
+.PHONY: help setup setup-dev demo test test-long check check-text check-types check-locks bench docs reference lock sbom clean
 
 help:
 	@sed -n 's/^# //p' Makefile
@@ -48,11 +49,13 @@ demo: setup
 	@$(BIN)/spheremark demo
 
 # glibc keeps freed memory, as in the workers of the service: a tenth of the tests' time
-test: export MALLOC_MMAP_MAX_ = 0
-test: export MALLOC_TRIM_THRESHOLD_ = 536870912
-test: setup-dev
+test test-long: export MALLOC_MMAP_MAX_ = 0
+test test-long: export MALLOC_TRIM_THRESHOLD_ = 536870912
+test: WANTED = not long and not benchmark
+test-long: WANTED = long
+test test-long: setup-dev
 	@.ci/system-packages browser
-	$(BIN)/pytest $(SIDE_BY_SIDE) -m "not benchmark"
+	$(BIN)/pytest $(SIDE_BY_SIDE) -m "$(WANTED)"
 
 check: check-text check-types check-locks
 

@@ -14,23 +14,21 @@ settings.load_profile("spheremark")
 
 LONGEST = (
     "pipelines/evaluation/test_ellipse_coverage.py",
-    "pipelines/calibration/test_calibration.py",
-    "pipelines/detection/test_detection_among_clutter.py",
     "pipelines/placement/test_placement.py",
+    "pipelines/calibration/test_calibration.py",
     "browser/test_accessibility.py",
     "pipelines/evaluation/test_precision.py",
-    "service/test_reproduce.py",
     "service/test_contract.py",
-    "service/test_kills.py",
-    "browser/test_pages_in_a_browser.py",
-    "pipelines/ground_model/test_ground_model.py",
-    "pipelines/positioning/test_resection.py",
-    "pipelines/sphere/test_sphere.py",
-    "pipelines/network/test_network_of_scans.py",
     "service/test_jobs.py",
+    "service/test_kills.py",
+    "pipelines/detection/test_detection_among_clutter.py",
+    "service/test_reproduce.py",
+    "pipelines/sphere/test_sphere.py",
+    "service/test_survey_jobs.py",
+    "browser/test_pages_in_a_browser.py",
     "service/test_plans.py",
 )
-"""Files of more than a minute; begun first, so that no process waits for another at the end."""
+"""Files of about a minute or more; begun first, so that no process waits for another at the end."""
 
 
 def pytest_collection_modifyitems(items):

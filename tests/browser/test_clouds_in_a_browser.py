@@ -7,7 +7,7 @@ from spheremark.storage.clouds.octree import BYTES_PER_POINT
 from tests.browser.visits import NEEDS_CHROMIUM, Visit, served
 from tests.surveyed import fill
 
-pytestmark = [NEEDS_CHROMIUM, pytest.mark.slow]
+pytestmark = [NEEDS_CHROMIUM, pytest.mark.long]
 
 N_POINTS = 3_000_000
 FLOOR = 60_000  # points that a slow computer draws while the view moves

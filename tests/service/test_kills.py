@@ -4,13 +4,17 @@ import pytest
 
 from tests.service.kills import run
 
-ROUNDS = 5  # of the fifth, a worker is killed first
 
-
-@pytest.mark.slow
-def test_kills_lose_nothing_and_double_nothing(tmp_path, stop, control):
-    faults, about = run(tmp_path, stop.log.read_bytes(), control, rounds=ROUNDS, seed=4)
+@pytest.mark.parametrize(
+    "rounds",
+    [
+        pytest.param(1, marks=pytest.mark.slow),
+        pytest.param(5, marks=pytest.mark.long),  # of the fifth, a worker is killed first
+    ],
+)
+def test_kills_lose_nothing_and_double_nothing(tmp_path, stop, control, rounds):
+    faults, about = run(tmp_path, stop.log.read_bytes(), control, rounds=rounds, seed=4)
     assert not faults
-    assert about["rounds"] == ROUNDS
-    assert about["logs"] >= ROUNDS
+    assert about["rounds"] == rounds
+    assert about["logs"] >= rounds
     assert about["runs"] >= 1

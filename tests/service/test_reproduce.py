@@ -133,7 +133,7 @@ def test_a_folder_without_real_scans_is_refused_before_anything_is_simulated(tmp
     assert not (tmp_path / "out").exists()
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_the_command_writes_page_tables_and_figures_and_says_the_same_as_json(tmp_path):
     done = subprocess.run(
         [sys.executable, "-m", "spheremark.service.cli", "reproduce", tmp_path / "out",

@@ -294,7 +294,7 @@ def test_no_log_is_refused():
         calibrate([], config=CONFIG)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_sixteen_scans_agree_with_the_predicted_covariance_and_the_true_rig(field):
     world = replace(WORLD, sigma_laser_bias=0.005, sigma_misalignment=np.radians(0.1))
     squares, whole, ours, best = [], [], [], []
@@ -335,7 +335,7 @@ def across(fits, stop, marks):
     return left @ left, len(e) - 3
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_centres_are_as_good_across_as_they_say_where_noise_grows_towards_the_outline(field):
     """Noise by reflectivity, as a VLP-16 has: taken as even, it makes the mean square 1.5.
 

@@ -182,7 +182,7 @@ def recall(scenario, place):
     return row["n_found"] / row["n"]
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_stepped_scan_takes_no_crest_for_a_marker():
     stepped = extraction(
         {"paper-field": DETECTION_PLAN["clutter-field"]},

@@ -137,7 +137,7 @@ def test_lidars_differ_by_as_much_as_fits_allow_for():
     assert all(one.divergence_scale > 0.0 for one in lidars)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_ellipses_of_whole_simulated_surveys_hold_their_shares():
     """Noise, biases, optics, encoder, misalignment, axis offset and tilt are all random.
 

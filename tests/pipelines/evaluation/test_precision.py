@@ -66,8 +66,14 @@ def bars(distance):
     return share, 0.001 if distance <= 20 else 0.003
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("case", [Case(0.01, 13.2), Case(0.02, 13.2), Case(0.02, 20.7)])
+@pytest.mark.parametrize(
+    "case",
+    [
+        pytest.param(Case(0.01, 13.2), marks=pytest.mark.long),
+        pytest.param(Case(0.02, 13.2), marks=pytest.mark.slow),
+        pytest.param(Case(0.02, 20.7), marks=pytest.mark.long),
+    ],
+)
 def test_centres_keep_the_bars(case):
     rows = rows_of(n_stops=4, cases=(case,), methods=("along_beam", "silhouette"), seed=300)
     for row in rows:

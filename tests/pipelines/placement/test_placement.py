@@ -798,7 +798,7 @@ def levelled_wrongly(fits, up, rng):
     return replace(fits, levelling=levelling)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_promises_are_kept_by_simulated_scans():
     """Station RMS of whole scans, spheres only, against what was promised: within 15 %.
 
