@@ -11,6 +11,8 @@ from spheremark.pipelines.detection.evidence import gather_evidence
 from spheremark.pipelines.detection.ground import ground_of
 from spheremark.pipelines.detection.target import Target
 from spheremark.pipelines.geometry import inverse, transform
+from spheremark.pipelines.scan.firings import clock_of
+from spheremark.pipelines.scan.rigs import AZIMUTH_STEP
 from spheremark.pipelines.scan.spin import stamps_by_spin
 from spheremark.pipelines.scan.stitching import stitch
 from spheremark.pipelines.simulation import SimulationConfig, scenario, simulate_stop
@@ -111,3 +113,14 @@ def test_silent_pulses_are_known_and_none_are_made_up_in_pauses(cloud, timed):
         n_on += seen.n_on
     assert n_inside < 0.02 * n_on  # drop-outs alone
     assert n_beside > 0.1 * n_on
+
+
+def test_azimuths_of_the_clock_are_better_than_they_are_recorded(timed):
+    clock, why_not = clock_of(stitch(timed.log, timed.log.rig, StitchingConfig()))
+    assert not why_not
+    times = clock.times - clock.times.mean()
+    even = np.polynomial.Polynomial.fit(times, clock.azimuths, 1)  # the simulator's spin is steady
+    off = clock.azimuths - even(times)
+    rounded = AZIMUTH_STEP / np.sqrt(12.0)
+    assert np.sqrt(np.mean(off**2)) < 0.5 * rounded
+    assert np.abs(off).max() < AZIMUTH_STEP
