@@ -308,7 +308,7 @@ class StitchedCloud:
     def seconds(self, rows: slice | Index | Mask) -> Array:
         """Return the times of some rows as exactly as they are known, float64 [s].
 
-        In float32 the lasers of a firing are not told apart after half a minute.
+        After half a minute float32 has too few digits to keep the lasers of a firing apart.
         """
         if isinstance(self.times, Timed):
             return self.times.exact(rows)

@@ -1,7 +1,7 @@
 """When pulses were fired whose messages have one time only: a steady spin is a clock.
 
-While the gimbal rests, one angle serves a whole message. When each of its pulses was fired, and
-which had no return, the azimuths of the returns tell in the order of firing.
+While the gimbal rests, one angle serves a whole message. In the order of firing, the azimuths of
+its returns show when each pulse was fired, and so which pulses had no return.
 """
 
 from __future__ import annotations

@@ -309,7 +309,7 @@ def _without_smear(
 ) -> tuple[Joints, Nanos | None, tuple[str, ...]]:
     """Void the angle during messages without pulse times in which the gimbal moved.
 
-    Return the instants of the other pulses too, where the spin tells them.
+    Return the instants of the other pulses too, where the spin shows them.
     """
     if log.has_pulse_times or not len(log.stamps_lidar_ns):
         return joints, None, ()

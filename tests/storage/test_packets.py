@@ -14,7 +14,9 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from spheremark.pipelines.errors import MissingLidarError
 from spheremark.pipelines.model import Firings
 from spheremark.pipelines.scan.rigs import FIRING_ORDER
+from spheremark.pipelines.scan.spin import stamps_by_spin
 from spheremark.pipelines.simulation import SimulationConfig, scenario, simulate_stop
+from spheremark.pipelines.simulation.rig import nominal_rig
 from spheremark.storage.recordings import inspect_log, read_log, write_log
 from spheremark.storage.recordings.definitions import definition
 from spheremark.storage.recordings.packets import SCHEMA, encoded, punctual
@@ -170,16 +172,33 @@ def test_made_up_packets_decode_as_velodyne_decoder_does(rng, tmp_path, little_e
     require_equal(log, *decoded(stamps, octets(packets)))
 
 
-@needs_real
-def test_real_strongest_returns_decode_as_velodyne_decoder_does(tmp_path):
+def strongest(tmp_path):
+    """The log of a thousand real packets, with their instants and bytes."""
     data = np.fromfile(PACKETS / "strongest_1000_packets.bin", np.uint8).reshape(-1, 1206)
     packets = encoded(firings(np.random.default_rng(0), n_packets=1000))
     packets["data"] = data.view(packets["data"].dtype).ravel()
     stamps = T0 // HOUR * HOUR + packets["data"]["micros"].astype(np.int64) * 1000
     stamps += T0 - stamps[0]
-    log = read(tmp_path, message(packets, stamps_ns=stamps))
+    return read(tmp_path, message(packets, stamps_ns=stamps)), stamps, data
+
+
+@needs_real
+def test_real_strongest_returns_decode_as_velodyne_decoder_does(tmp_path):
+    log, stamps, data = strongest(tmp_path)
     assert len(log.rings) == 203_034
     require_equal(log, *decoded(stamps, data))
+
+
+@needs_real
+@pytest.mark.parametrize("lasting_ns", [100_000_000, PACKET])
+def test_the_spin_of_a_real_sensor_shows_when_each_pulse_was_fired(tmp_path, lasting_ns):
+    log, _, _ = strongest(tmp_path)
+    begin = log.stamps_lidar_ns[0]
+    of_messages = begin + (log.stamps_lidar_ns - begin) // lasting_ns * lasting_ns
+    rests = np.ones(len(log.rings), np.bool_)
+    rig = nominal_rig(SimulationConfig())
+    off = stamps_by_spin(log.p_lidar, log.rings, of_messages, rests, rig) - log.stamps_lidar_ns
+    assert_allclose(1e-9 * (off - np.median(off)), 0.0, rtol=0, atol=CLOCK)
 
 
 def by_pulse(rings, instants, p):

@@ -56,7 +56,7 @@ def found(log, rings=None, rows=slice(None)):
     )
 
 
-def test_the_spin_tells_when_every_pulse_was_fired(timed, by_message):
+def test_the_spin_shows_when_every_pulse_was_fired(timed, by_message):
     off_ns = found(by_message) - timed.log.stamps_lidar_ns
     # one constant for all: all messages follow each other
     assert np.mean(np.abs(off_ns - np.median(off_ns)) < 10) > 0.999
