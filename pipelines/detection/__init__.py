@@ -126,6 +126,8 @@ def extract(
     the beams about it are compared under nine hypotheses. Ground is the opening of the lowest point
     per cell. Where no ground was seen, nothing is cut. Cost grows linearly with the returns.
     """
+    if not cloud.intensities.any():  # not recorded: all things are as bright
+        cloud = replace(cloud, intensities=np.ones_like(cloud.intensities))
     cells = cells_of(cloud, config)
     target = Target(marker_radius, cells.R_station_base[2], float(cloud.rig.divergence.max()))
     ground = ground_of(cloud, cells, config)

@@ -26,6 +26,7 @@ _HALF_SEEN = 0.8  # radii: the returns of half a ball are as wide, but for those
 _HIDDEN = 2.0  # as many returns before a ball as on it: two thirds of it are hidden
 _SHADE = 0.4  # standard deviation, as a share, of one return's reflectivity: partly lit beams
 _PAINT, _PAINTS = 0.1, 0.7  # the same of markers, by range and incidence; and of all things
+_N_PAINTS = 1.0  # things that the usual spread of paints counts for in a scan
 _FINE = 0.25  # of the spread of markers: steps of the paint that is summed over
 _TAIL = 3.0  # degrees of freedom: of some markers the paint is dirty or in shade
 _UNLIKE = -2.0  # logarithm of odds by paint from which a reason states it
@@ -156,8 +157,9 @@ def paint_of(groups: Sequence[Evidence], probabilities: Sequence[float]) -> tupl
     """Return how much likelier the reflectivity of each group is if it is a marker.
 
     All markers have the same paint, other things have any. What it is, the other groups show: each
-    is painted as markers are with its probability, or is anything. Some markers are dirty or in
-    shade: but what nothing shows a pole of must be painted as they are.
+    is painted as markers are with its probability, or is anything. How unlike the paints of other
+    things are, they show too: where all look alike, paint says nothing. Some markers are dirty or
+    in shade: but what nothing shows a pole of must be painted as they are.
 
     Parameters
     ----------
@@ -177,13 +179,14 @@ def paint_of(groups: Sequence[Evidence], probabilities: Sequence[float]) -> tupl
     n_distinct = np.array([max(evidence.n_distinct, 1) for evidence in groups])[:, None]
     has_pole = np.array([evidence.shows_below for evidence in groups])[:, None]
     variances, middle = _PAINT**2 + _SHADE**2 / n_distinct, float(np.median(logs))
+    shares = np.minimum(probabilities, 1.0 - 1.0 / _MOST)[:, None]
+    wide = variances + _PAINTS**2 * _spread(logs - middle, 1.0 - shares)
     reach = 3.0 * _PAINTS  # beyond which no paint of markers is expected
     paints = np.arange(logs.min() - reach, logs.max() + reach, _FINE * _PAINT)
     squares = (logs - paints) ** 2 / variances
     tails = (_TAIL + 1.0) * np.log1p(squares / _TAIL)  # of Student's distribution
     ratios = _log_density(np.where(has_pole, tails, squares), variances)
-    ratios -= _log_density(((logs - middle) / _PAINTS) ** 2, _PAINTS**2)
-    shares = np.minimum(probabilities, 1.0 - 1.0 / _MOST)[:, None]
+    ratios -= _log_density((logs - middle) ** 2 / wide, wide)
     own = np.log1p(shares * np.expm1(ratios))
     known = own.sum(axis=0) - own - 0.5 * ((paints - middle) / _PAINTS) ** 2
     known -= np.logaddexp.reduce(known, axis=1, keepdims=True)
@@ -195,6 +198,12 @@ def paint_of(groups: Sequence[Evidence], probabilities: Sequence[float]) -> tupl
         for evidence, mean, ratio in zip(groups, means, found, strict=True)
     ]
     return found, texts
+
+
+def _spread(off: Array, weights: Array) -> float:
+    """Return the variance of the paint of all things in a scan, as a share of the usual one."""
+    shown = np.sum(weights * (off / _PAINTS) ** 2)
+    return float((_N_PAINTS + shown) / (_N_PAINTS + np.sum(weights)))
 
 
 def _log_density(squares: Array, variances: Array | float) -> Array:

@@ -250,3 +250,14 @@ def test_the_scale_of_reflectivities_does_not_matter():
 def test_a_group_alone_shows_no_paint():
     assert abs(painted(20.0)[0][0]) < 0.5
     assert len(painted()[0]) == 0
+
+
+@pytest.mark.parametrize("n_others", [5, 40])
+def test_where_all_things_look_alike_paint_says_nothing(n_others):
+    """As in clouds without intensities."""
+    groups = [evidence()] * (8 + n_others)
+    ratios, _ = paint_of(groups, [0.99] * 8 + [0.1] * n_others)
+    assert np.all(np.abs(ratios) < 1.0)
+    groups[8:] = [evidence(brightness=value) for value in np.geomspace(20.0, 125.0, n_others)]
+    ratios, _ = paint_of(groups, [0.99] * 8 + [0.1] * n_others)
+    assert np.all(ratios[:8] > 1.2)
