@@ -59,7 +59,8 @@ class StitchingConfig:
     Attributes
     ----------
     range_min : float
-        Returns nearer than this are the rover itself [m]. 0.9: the VLP-16's own minimum.
+        Returns nearer than this are the rover itself [m]: they are left out, and do not show what
+        is behind them. 0.9: the VLP-16's own minimum.
     range_max : float
         Returns farther than this are not used [m]. 100: the VLP-16's own maximum.
     sigma_levelling : float

@@ -223,7 +223,8 @@ def _log_likelihoods(
     side_by_side(lambda first, end: compare(range(first, end)), n, threaded_from=4)
     if n:
         probabilities = [one.probability for one in _judged(compared, found)]
-        known = shared_of(shared, covs, probabilities, physics)
+        half_widths = np.array([one.evidence.blur.mean() for one in compared])
+        known = shared_of((shared, covs), probabilities, physics, half_widths)
         physics = [
             one._replace(shared=means, sigmas=sigmas)
             for one, means, sigmas in zip(physics, *known, strict=True)

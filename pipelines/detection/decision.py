@@ -17,6 +17,7 @@ from spheremark.pipelines.detection.seeds import thinned
 from spheremark.pipelines.detection.shapes import NAMES
 from spheremark.pipelines.detection.target import Target
 from spheremark.pipelines.model import Array
+from spheremark.pipelines.scan.rigs import BEAM_WINDOW
 
 _TOUCHING = 0.10  # share of a ball's returns that may lie as far away beside it: mixed pixels
 _LEGS = 0.15  # share of the beams below it that the legs of a tripod may stop
@@ -37,6 +38,7 @@ _N_LEAST, _N_MOST = 6.0, 2500.0  # returns of the farthest and of the nearest ma
 _SCATTERED = 0.5  # share of other objects that lie anywhere, and not where markers are put
 _N_PRIOR = 5.0  # places that the usual abundance of a hypothesis counts for in a scan
 _VARIES = (0.13, 0.15, 0.15, 0.04, 0.02)  # of what markers share, between those of one scan
+_WINDOWS = (0.5, 0.3)  # of a VLP-16's: how far a beam's width at its window moves the two edges
 _LEAST_INFORMATION = 1e-6  # of a group that shows nothing: next to none, but it can be inverted
 UNDECIDED = 15.0
 """Logarithm of odds against a marker up to which it is compared again with better optics."""
@@ -231,18 +233,23 @@ def noise_of(groups: list[Features], radius: float) -> float:
 
 
 def shared_of(
-    shown: Array, covs: Array, probabilities: Sequence[float], physics: Sequence[Physics]
+    shown: tuple[Array, Array],
+    probabilities: Sequence[float],
+    physics: Sequence[Physics],
+    half_widths: Array,
 ) -> tuple[Array, Array]:
     """Return what the markers of a scan have in common, for each group as all others show it.
 
     Parameters
     ----------
-    shown, covs : (n, 5), (n, 5, 5)
-        What each shows as a sphere, as in ``Physics``, and the covariance.
+    shown : (n, 5), (n, 5, 5)
+        What each shows as a sphere, as in ``Physics``, and the covariances.
     probabilities : sequence of float
         That each is a marker: by as much it counts.
     physics : sequence of Physics
         With which these were computed.
+    half_widths : (n,)
+        Half the width of a beam at each [m].
 
     Returns
     -------
@@ -252,29 +259,43 @@ def shared_of(
     Notes
     -----
     Some of them are no markers: each counts by Student's distribution about the others, too.
+    How wide beams are where they leave the sensor moves both edges the more the nearer a marker is.
     """
+    (values, covs), n, varies = shown, len(_VARIES), np.diag(np.array(_VARIES) ** 2)
     means = np.array([one.shared for one in physics])
     priors = np.array([np.diag(one.sigmas**-2.0) for one in physics])
-    n, varies = len(_VARIES), np.diag(np.array(_VARIES) ** 2)
     own = np.linalg.inv(covs) - priors  # information of the beams alone, and what they show
     own += _LEAST_INFORMATION * np.eye(n)
     alone = np.linalg.solve(
-        own, np.linalg.inv(covs) @ shown[:, :, None] - priors @ means[:, :, None]
+        own, np.linalg.inv(covs) @ values[:, :, None] - priors @ means[:, :, None]
     )
     spreads = np.linalg.inv(own) + varies
     every = np.linalg.inv(spreads)
     shares = np.asarray(probabilities, np.float64)
+    by = _by_windows(half_widths)
+    sigmas = np.hstack([[one.sigmas for one in physics], np.tile(_WINDOWS, (len(means), 1))])
+    first = sigmas[:, :, None] ** -2.0 * np.eye(n + 2)
+    begun = first[:, :, :n] @ means[:, :, None]
     counts, found, known = shares, means, np.linalg.inv(priors)
     for _ in range(_N_ROUNDS):
-        weights = counts[:, None, None] * every
-        pulls = weights @ alone
-        known = np.linalg.inv(priors + weights.sum(axis=0) - weights)
-        sums = priors @ means[:, :, None] + pulls.sum(axis=0) - pulls
-        found = (known @ sums)[:, :, 0]
+        weights = by.transpose(0, 2, 1) @ (counts[:, None, None] * every)
+        pulls, weights = weights @ alone, weights @ by
+        cov = np.linalg.inv(first + weights.sum(axis=0) - weights)
+        found = (by @ cov @ (begun + pulls.sum(axis=0) - pulls))[:, :, 0]
+        known = by @ cov @ by.transpose(0, 2, 1)
         off = alone[:, :, 0] - found
         squares = np.einsum("ni,nij,nj->n", off, np.linalg.inv(spreads + known), off)
         counts = shares * (_TAIL + n) / (_TAIL + squares)
     return found, np.sqrt(np.diagonal(known + varies, axis1=1, axis2=2))
+
+
+def _by_windows(half_widths: Array) -> Array:
+    """Return what each group shows by what all share and by two widths at the window, (n, 5, 7)."""
+    n = len(_VARIES)
+    by = np.zeros((len(half_widths), n, n + 2))
+    by[:, :, :n] = np.eye(n)
+    by[:, 1, n] = by[:, 2, n + 1] = 0.5 * BEAM_WINDOW.mean() / half_widths
+    return by
 
 
 def judged(

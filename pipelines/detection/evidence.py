@@ -24,7 +24,7 @@ from spheremark.pipelines.detection.target import (
     view_of,
 )
 from spheremark.pipelines.model import Array, Column, Rig, StitchedCloud
-from spheremark.pipelines.scan.firings import clock_of
+from spheremark.pipelines.scan.firings import clock_of, heard_of
 from spheremark.pipelines.scan.interpolation import errors_of_interpolation
 from spheremark.pipelines.threads import side_by_side
 
@@ -152,7 +152,9 @@ def gather_evidence(
     if not len(centres):
         return [], _UNKNOWN
     clock, _ = clock_of(cloud)
-    hearing = hearing_of(cloud, clock, target.up) if clock is not None else _UNKNOWN
+    hearing, heard = _UNKNOWN, np.zeros(0, np.intp)
+    if clock is not None:
+        hearing, heard = hearing_of(cloud, clock, target.up), heard_of(cloud, clock)
     planes = planes_below(ground, cells, centres)
     heights = np.sum(planes[:, :3] * centres, axis=1) + planes[:, 3]
 
@@ -167,7 +169,7 @@ def gather_evidence(
         if clock is not None:
             straight, bend_max = _straight(rows, bends, _PLACE * target.radius, centres[i])
             known = clock._replace(bend_max=bend_max)
-            silent = unheard_about(cloud, known, rows, centres[i], target)
+            silent = unheard_about(known, heard, centres[i], target)
         found = _evidence_at(cloud, silent, straight, centres[i], planes[i], target)
         return found._replace(height=float(heights[i]), sigma_height=float(planes[i, 4]))
 

@@ -5,31 +5,27 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from spheremark.pipelines.detection.target import Target, view_of
-from spheremark.pipelines.model import Array, StitchedCloud
+from spheremark.pipelines.model import Array, Index, StitchedCloud
 from spheremark.pipelines.scan.firings import Clock, in_base, numbers_of, pulses_about, pulses_of
 from spheremark.pipelines.scan.rigs import N_LASERS
 
-_REACH = 3.0  # radii: the returns of beams that pass nearer are all known
-
+_REACH = 3.0  # radii about a place
 _N_SAMPLES, _N_SAMPLE = 300, 100  # samples of so many returns that follow each other
 _GROUND = (0.25, 0.55)  # sines of the angles below the horizon where the ground is near
 _N_SECTORS, _N_IN_SECTOR = 24, 20  # of azimuth, and pulses that show one
 _WEAKEST = 0.01  # share of the returns that are taken for the weakest
 
 
-def unheard_about(
-    cloud: StitchedCloud, clock: Clock, rows: NDArray[np.int32], c: Array, target: Target
-) -> Array:
+def unheard_about(clock: Clock, heard: Index, c: Array, target: Target) -> Array:
     """Return where pulses without a return pass a centre, across and up [m], and faces, (3, k).
 
-    ``rows`` are the returns about it.
+    ``heard`` are the numbers of all others: what stands long before a place hides it.
     """
     pulses, passing, _ = pulses_about(clock, c, _REACH * target.radius)
-    heard = numbers_of(cloud, clock, rows[cloud.rings[rows] < N_LASERS].astype(np.intp))
-    found = ~np.isin(pulses.numbers, heard, assume_unique=True)
+    rows = np.searchsorted(heard, pulses.numbers).clip(max=len(heard) - 1)
+    found = heard[rows] != pulses.numbers
     view, angles = view_of(c, target.up), pulses.angles[found]
     is_left = np.sin(angles) * c[0] < np.cos(angles) * c[1]
     p_base = in_base(clock.rig, passing[:, found], angles)

@@ -33,6 +33,7 @@ from spheremark.pipelines.model import (
 )
 from spheremark.pipelines.network import adjust_network, assemble
 from spheremark.pipelines.positioning.resection import resect
+from spheremark.pipelines.scan.rigs import BEAM_WINDOW
 from spheremark.pipelines.simulation import SimulationConfig, scenario, simulate_stop
 from spheremark.pipelines.simulation.options import Optics, Profile
 from spheremark.pipelines.survey import process
@@ -59,7 +60,6 @@ _CONFIG = SurveyConfig.from_mapping(
 )
 _SIMULATION = SimulationConfig(only_near_spheres=True)
 _LIDAR = 102  # random stream
-_WINDOW = np.array([12.7e-3, 9.5e-3])  # [m] width of a VLP-16's beam there
 _NARROWEST = 0.2  # of the nominal divergence
 
 _Scan = tuple[str, MarkerFits]
@@ -219,7 +219,7 @@ def survey_draws(seed: int, *, n_stops: int) -> Draws:
 def drawn_optics(rng: np.random.Generator) -> Optics:
     """Return the optics of a LiDAR of the kind that the priors of a fit describe."""
     prior, profiles = _CONFIG.fitting, list(Profile)
-    across, along = (abs(rng.normal(0.0, prior.sigma_beam_window)) * _WINDOW).tolist()
+    across, along = (abs(rng.normal(0.0, prior.sigma_beam_window)) * BEAM_WINDOW).tolist()
     return Optics(
         profile=profiles[rng.integers(len(profiles))],
         divergence_scale=max(rng.normal(1.0, prior.sigma_beam_width), _NARROWEST),

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from enum import StrEnum
 from typing import Any
 
@@ -284,6 +284,9 @@ class StitchedCloud:
         What weakens the result, as sentences.
     weaknesses : tuple of str
         Why a station of this scan is weak, among the notes too.
+    near_times, near_rings : (k,), (k,) uint8
+        Pulses whose return is nearer than the least range, as from a mast of the rover: instants,
+        as ``times``, and lasers. They do not show what is behind it [s].
     """
 
     p_base: Column
@@ -298,11 +301,15 @@ class StitchedCloud:
     name: str
     notes: tuple[str, ...] = ()
     weaknesses: tuple[str, ...] = ()
+    near_times: Array = field(default_factory=lambda: np.zeros(0))
+    near_rings: Rings = field(default_factory=lambda: np.zeros(0, np.uint8))
 
     def __post_init__(self) -> None:
         columns = ("gimbal_angles", "intensities", "rings", "times")
-        arrays = (name for name in columns if not isinstance(getattr(self, name), Timed))
-        seal(self, p_base=(None, 3), **dict.fromkeys(arrays, (None,)))
+        arrays = [name for name in columns if not isinstance(getattr(self, name), Timed)]
+        shapes: dict[str, Shape] = dict.fromkeys((*arrays, "near_times", "near_rings"), (None,))
+        seal(self, p_base=(None, 3), **shapes)
+        same_length(self, "near_times", "near_rings")
         same_length(self, "p_base", *columns)
 
     def seconds(self, rows: slice | Index | Mask) -> Array:

@@ -196,7 +196,6 @@ def _sentences(causes: list[Cause]) -> tuple[str, ...]:
         )
     return (
         f"What was swept twice agrees to {1000 * was:.0f} mm as read, and no other sign, unit "
-        f"or clock makes it much better (at best {1000 * best.distance:.0f} mm"
-        f"{f' with {best.option}' if best.option else ''}). If spheres are missing, check their "
-        "radius, their distance and the rig.",
+        "or clock makes it much better: the log seems to be read as it was recorded. If spheres "
+        "are missing, check their radius, their distance and the rig.",
     )

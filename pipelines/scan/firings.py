@@ -10,7 +10,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from spheremark.pipelines.model import RING_UNKNOWN, Array, Index, Mask, Rig, StitchedCloud
+from spheremark.pipelines.model import RING_UNKNOWN, Array, Index, Mask, Rig, Rings, StitchedCloud
 from spheremark.pipelines.scan.interpolation import errors_of_interpolation
 from spheremark.pipelines.scan.rigs import FIRING_CYCLE, LASER_DELAYS, N_LASERS
 
@@ -222,7 +222,7 @@ def pulses_of(clock: Clock, numbers: Index) -> Pulses:
     )
 
 
-def numbers_of(cloud: StitchedCloud, clock: Clock, rows: Index) -> Index:
+def numbers_of(cloud: StitchedCloud, clock: Clock, rows: Index | slice) -> Index:
     """Return the numbers of the pulses of some returns.
 
     Parameters
@@ -231,7 +231,7 @@ def numbers_of(cloud: StitchedCloud, clock: Clock, rows: Index) -> Index:
         The scan.
     clock : Clock
         Its clock.
-    rows : (k,)
+    rows : (k,) or slice
         Rows of the cloud; those whose rings are not known count as of the last laser.
 
     Returns
@@ -239,9 +239,51 @@ def numbers_of(cloud: StitchedCloud, clock: Clock, rows: Index) -> Index:
     (k,)
         Numbers.
     """
-    rings = np.minimum(cloud.rings[rows], N_LASERS - 1).astype(np.int64)
-    seconds = cloud.seconds(rows) - LASER_DELAYS[rings] - clock.phase
-    return np.asarray(np.rint(seconds / FIRING_CYCLE).astype(np.int64) * N_LASERS + rings)
+    return _numbers(clock, cloud.rings[rows], cloud.seconds(rows))
+
+
+def heard_of(cloud: StitchedCloud, clock: Clock) -> Index:
+    """Return the numbers of all pulses that have a return, however near it is.
+
+    Parameters
+    ----------
+    cloud : StitchedCloud
+        The scan.
+    clock : Clock
+        Its clock.
+
+    Returns
+    -------
+    (k,)
+        Numbers, ascending.
+    """
+    numbers = np.concatenate([numbers_of(cloud, clock, slice(None)), near_of(cloud, clock)])
+    return np.sort(numbers, kind="stable")
+
+
+def near_of(cloud: StitchedCloud, clock: Clock) -> Index:
+    """Return the numbers of the pulses whose return is nearer than the least range.
+
+    Parameters
+    ----------
+    cloud : StitchedCloud
+        The scan.
+    clock : Clock
+        Its clock.
+
+    Returns
+    -------
+    (k,)
+        Numbers.
+    """
+    return _numbers(clock, cloud.near_rings, cloud.near_times)
+
+
+def _numbers(clock: Clock, rings: Rings, seconds: Array) -> Index:
+    """Return the numbers of the pulses of some lasers at some instants."""
+    lasers = np.minimum(rings, N_LASERS - 1).astype(np.int64)
+    firings = np.rint((seconds - LASER_DELAYS[lasers] - clock.phase) / FIRING_CYCLE)
+    return np.asarray(firings.astype(np.int64) * N_LASERS + lasers)
 
 
 def in_base(rig: Rig, v_lidar: Array, angles: Array) -> Array:

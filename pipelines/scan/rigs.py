@@ -27,6 +27,9 @@ VLP16_ELEVATIONS = np.radians(np.arange(-15.0, 16.0, 2.0))
 FIRING_ORDER = np.array([0, 8, 1, 9, 2, 10, 3, 11, 4, 12, 5, 13, 6, 14, 7, 15])
 """Laser index (0 the lowest) in the order of firing: -15, +1, -13, +3, ... degrees."""
 
+BEAM_WINDOW = np.array([12.7e-3, 9.5e-3])
+"""Width of a VLP-16's beam at its window, across and along the spin axis [m]."""
+
 LASER_DELAYS = np.argsort(FIRING_ORDER) * LASER_CYCLE
 """Instant of each laser within a firing [s]."""
 

@@ -189,12 +189,14 @@ def stitch(log: ScanLog, rig: Rig, config: StitchingConfig) -> StitchedCloud:
     kept, tally, rows = turn_returns(pulses, joints, _lidar(rig, config))
     stamps_ns = kept.stamps_ns if by_spin_ns is None else by_spin_ns[rows]
     _refuse_empty(log, joints, tally, config)
+    near = _near(log.p_lidar, rows, config.range_min)
+    near_ns = (log.stamps_lidar_ns if by_spin_ns is None else by_spin_ns)[near]
     levelling = level(log, rig, config)
     rate = float(np.nan_to_num(np.nanmedian(np.abs(joints.rates)))) / _NS
     levelling = replace(levelling, sigma_clock=rate * config.sigma_clock)
     levelling, weaknesses = _clocked(levelling, rate, tally, joints)
     coverage, duration = _extent(tally, joints)
-    notes += smear_note + pause_notes(log) + _count_notes(tally)
+    notes += smear_note + pause_notes(log) + _count_notes(tally, by_message=bool(smear_note))
     notes += _level_notes(levelling) + _turn_notes(coverage)
     return StitchedCloud(
         p_base=kept.p,
@@ -209,7 +211,17 @@ def stitch(log: ScanLog, rig: Rig, config: StitchingConfig) -> StitchedCloud:
         name=log.origin.name,
         notes=log.notes + notes + weaknesses,
         weaknesses=weaknesses,
+        near_times=(near_ns - tally.first_ns).astype(np.float64) * _NS,
+        near_rings=rings[near],
     )
+
+
+def _near(p_lidar: Column, kept: Index | slice, range_min: float) -> Index:
+    """Return the rows that are left out because they are nearer than the least range."""
+    is_left = np.ones(len(p_lidar), np.bool_)
+    is_left[kept] = False
+    left = np.flatnonzero(is_left)
+    return np.asarray(left[np.sum(p_lidar[left] ** 2, axis=1) < range_min**2])
 
 
 def _clocked(
@@ -412,13 +424,14 @@ def _extent(tally: Tally, joints: Joints) -> tuple[float, float]:
     return min(turned, _FULL_TURN), float((final - first) * _NS)
 
 
-def _count_notes(tally: Tally) -> tuple[str, ...]:
+def _count_notes(tally: Tally, *, by_message: bool) -> tuple[str, ...]:
     """Return notes on the returns left out; those beyond the range limits need none."""
     notes = []
     if tally.n_without_angle:
+        moved = "in a message during which the gimbal moved, or " if by_message else ""
         notes.append(
-            f"{tally.n_without_angle} returns have no gimbal angle (before, after or in a gap of "
-            "the joint samples) and are left out."
+            f"{tally.n_without_angle:,} returns have no gimbal angle ({moved}before, after or in a "
+            "gap of the joint samples) and are left out."
         )
     if tally.n_not_finite:
         notes.append(f"{tally.n_not_finite} returns are not finite and are left out.")

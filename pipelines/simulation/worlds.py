@@ -15,7 +15,7 @@ import numpy as np
 
 from spheremark.pipelines.errors import ConfigError
 from spheremark.pipelines.model import Array, ControlMarks, ScanLog, Truth
-from spheremark.pipelines.scan.rigs import RANGE_STEP
+from spheremark.pipelines.scan.rigs import BEAM_WINDOW, RANGE_STEP
 from spheremark.pipelines.simulation import objects
 from spheremark.pipelines.simulation.bodies import box, cylinder
 from spheremark.pipelines.simulation.clutter import Ground, panel, placed, screen, with_items
@@ -110,7 +110,6 @@ _IN_CONFIG = sorted(
     & {one.name for one in fields(SimulationConfig)}
     - {"sigma_range", "gimbal_clock_offset", "turn"}
 )
-_WINDOW = np.array([12.7e-3, 9.5e-3])  # [m]
 _LATTICES = ((12.0, 600.0), (9.0, 600.0), (18.0, 600.0), (6.0, 1200.0), (12.0, 300.0), (7.2, 600.0))
 _RPM, _RPM_OFF = (300.0, 600.0, 600.0, 600.0, 900.0, 1200.0), 0.003
 _STEPS = (1.3, 1.7, 2.3, 3.1, 5.0)  # [deg] of a gimbal that rests
@@ -275,7 +274,7 @@ def _optics(rng: np.random.Generator, values: _Values, family: str) -> Optics:
     """Draw footprint and echoes."""
     is_pencil = family in _OPTICS and rng.random() < _PENCILS
     profiles, picks = list(Profile), list(Pick)
-    across, along = (values["window"] * _WINDOW).tolist()
+    across, along = (values["window"] * BEAM_WINDOW).tolist()
     return Optics(
         profile=Profile.EVEN if family == "plain" else profiles[rng.integers(len(profiles))],
         divergence_scale=0.0 if is_pencil else values["divergence_scale"],

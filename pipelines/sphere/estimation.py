@@ -359,7 +359,8 @@ def _stepped(state: State, N: Normals, prior: Prior) -> State:
     shared[_OPTICS] *= min(1.0, _OPTICS_MAX / max(_size_of_optics(state, shared), 1e-12))
     if state.has_shared:
         for part in (_BIASES, _MOUNTING):
-            sigmas[part] *= _spread((shared[part], np.diag(estimated)[part]), sigmas[part])
+            found = (shared[part], estimated[part, part])
+            sigmas[part] *= _spread(found, sigmas[part], about_mean=part == _BIASES)
     cov_shared = _with_considered(estimated, reduced.N, prior, sigmas[0] / prior.sigmas[0])
     return state._replace(
         centres=state.centres + _shortened(reduced.local_steps(step), prior.radius),
@@ -398,14 +399,18 @@ def _with_considered(estimated: Array, N: Array, prior: Prior, spread: float) ->
     return np.asarray(cov)
 
 
-def _spread(found: tuple[Array, Array], sigmas: Array) -> float:
+def _spread(found: tuple[Array, Array], sigmas: Array, *, about_mean: bool) -> float:
     """Return by how much unknowns spread more than their prior, by expectation maximisation.
 
-    ``found`` are their estimates and variances.
+    ``found`` are their estimates and covariance. About their mean, what they have in common does
+    not count: a prior that grows with it would no longer hold it.
     """
-    estimates, variances = found
-    squares = float(np.sum((estimates**2 + variances) / sigmas**2))
-    return math.sqrt((squares + _DOF_SPREAD) / (len(sigmas) + _DOF_SPREAD))
+    (estimates, cov), n = found, len(sigmas)
+    if about_mean:
+        apart, n = np.eye(n) - 1.0 / n, n - 1
+        estimates, cov = apart @ estimates, apart @ cov @ apart
+    squares = float(np.sum((estimates**2 + np.diag(cov)) / sigmas**2))
+    return math.sqrt((squares + _DOF_SPREAD) / (n + _DOF_SPREAD))
 
 
 def _shortened(steps: Array, radius: float) -> Array:

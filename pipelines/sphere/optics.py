@@ -12,6 +12,7 @@ import numpy as np
 from spheremark.pipelines.config import FittingConfig
 from spheremark.pipelines.model import OPTICS, Array, Rig
 from spheremark.pipelines.model.network import RANGE_BIAS, RANGE_SCALE
+from spheremark.pipelines.scan.rigs import BEAM_WINDOW
 from spheremark.pipelines.sphere.linearisation import Linear
 from spheremark.pipelines.sphere.returns import Returns
 
@@ -27,9 +28,6 @@ SIGMAS_PROFILE = np.array([0.1, 0.03, 0.3])
 """Standard deviations of what beams of other profiles than an even one leave open of these, from
 simulated scans with Gaussian profiles and with two lobes."""
 
-_WINDOW = np.array(
-    [12.7e-3, 9.5e-3]
-)  # [m] width of a VLP-16's beam at its window, across and along
 _NARROWEST = 0.02  # of the specified half widths: a ray
 
 
@@ -81,7 +79,7 @@ def with_widths(returns: Returns, optics: Array) -> Returns:
         return returns
     width, window = optics[:2]
     specified = returns.half_widths
-    widened = (1.0 + width) * specified + 0.5 * window * _WINDOW[:, None]
+    widened = (1.0 + width) * specified + 0.5 * window * BEAM_WINDOW[:, None]
     factors = np.maximum(widened / specified, _NARROWEST)
     along, across = returns.vertical_half_widths
     mean = np.sqrt(factors[0] * factors[1])
@@ -134,7 +132,7 @@ def derivatives(specified: Returns, widened: Returns, linear: Linear) -> Array:
     return np.stack(
         [
             by_square * np.sum(halves * specified.half_widths, axis=0),
-            by_square * np.sum(halves * 0.5 * _WINDOW[:, None], axis=0),
+            by_square * np.sum(halves * 0.5 * BEAM_WINDOW[:, None], axis=0),
             by_cosine,
             np.ones(len(specified.ranges)),
             specified.ranges,

@@ -8,7 +8,14 @@ import numpy as np
 
 from spheremark.pipelines.geometry import levelling_rotation
 from spheremark.pipelines.model import Array, Index, Mask, StitchedCloud
-from spheremark.pipelines.scan.firings import Clock, Pulses, in_base, numbers_of, pulses_about
+from spheremark.pipelines.scan.firings import (
+    Clock,
+    Pulses,
+    in_base,
+    near_of,
+    numbers_of,
+    pulses_about,
+)
 from spheremark.pipelines.scan.rigs import N_LASERS
 
 _REACH = 1.5  # radii: pulses that pass a centre closer are taken
@@ -56,8 +63,12 @@ def passing_of(cloud: StitchedCloud, clock: Clock, centres: Array, radius: float
 
 
 def _rows_of(cloud: StitchedCloud, clock: Clock, wanted: Index) -> Index:
-    """Return the rows of the returns of some pulses, by their numbers; -1 without one."""
+    """Return the rows of the returns of some pulses, by their numbers.
+
+    -1 without one, -2 where it is nearer than the least range.
+    """
     found, n = np.full(len(wanted), -1), len(cloud.p_base)
+    found[np.isin(wanted, near_of(cloud, clock))] = -2
     for begin in range(0, n if len(wanted) else 0, _BLOCK):
         rows = np.arange(begin, min(begin + _BLOCK, n))
         rows = rows[cloud.rings[rows] < N_LASERS]
@@ -87,7 +98,7 @@ def _passing(
     both = np.stack([across, np.cross(u, across)], axis=1) @ axes.T
     half_widths = 0.5 * along[:, None, None] * rig.divergence[:, None] * both
     is_pole = (places[:, 1] < -_POLE_FROM * radius) & (np.abs(places[:, 0]) < _POLE * radius)
-    is_taken = (depth > -_DEPTH) & ~is_pole
+    is_taken = (depth > -_DEPTH) & (rows > -2) & ~is_pole
     has_hit = (depth < _DEPTH)[is_taken]
     distance = float(np.linalg.norm(p))
     return Passing(places[is_taken], half_widths[is_taken], has_hit, axes, p, distance)

@@ -135,9 +135,10 @@ def lit_ranges(shots, centre, radius, divergence, n=24, power=0.0):
     return ranges, lit
 
 
-def cloud_of(shots, ranges, intensity=30.0, rig=RIG, levelling=LEVEL):
+def cloud_of(shots, ranges, intensity=30.0, rig=RIG, levelling=LEVEL, range_min=0.0):
     """The stitched cloud that shots with these ranges give; infinite ranges are no returns."""
-    keep = np.isfinite(ranges) & (ranges < 60)
+    near = shots.take(ranges <= range_min)
+    keep = (range_min < ranges) & (ranges < 60)
     shots, ranges = shots.take(keep), ranges[keep]
     p = shots.origins + ranges[:, None] * shots.directions
     return StitchedCloud(
@@ -151,6 +152,8 @@ def cloud_of(shots, ranges, intensity=30.0, rig=RIG, levelling=LEVEL):
         coverage=2 * np.pi,
         duration=float(shots.times[-1] - shots.times[0]) if len(p) else 0.0,
         name="synthetic",
+        near_times=near.times,
+        near_rings=near.rings,
     )
 
 
@@ -203,7 +206,7 @@ def scan(world, rng, *, sigma=0.01, levelling=LEVEL, turn=13.2):
     for foot, r, h in world.posts:
         meet(lambda o, d, f=foot, r=r, h=h: post_ranges(o, d, np.asarray(f), r, h), foot, r)
     ranges = ranges + sigma * rng.standard_normal(len(ranges))
-    return cloud_of(shots, np.where(ranges > 0.9, ranges, np.inf), levelling=levelling)
+    return cloud_of(shots, ranges, levelling=levelling, range_min=0.9)
 
 
 def ring_of_markers(n=14, height=0.4, low=6.84, high=9.34):

@@ -19,6 +19,7 @@ from spheremark.pipelines.detection.features import Features
 from spheremark.pipelines.detection.hypotheses import USUAL, Physics
 from spheremark.pipelines.detection.shapes import NAMES
 from spheremark.pipelines.detection.target import Target
+from spheremark.pipelines.scan.rigs import BEAM_WINDOW
 
 TARGET = Target(0.10, np.array([0.0, 0.0, 1.0]), 0.003)
 
@@ -182,11 +183,12 @@ def physics(n, sigma):
     return [Physics(np.full(N_SHARED, 0.6), np.full(N_SHARED, sigma), 0.0, 0.0)] * n
 
 
-def shared(values, probabilities, sigma=100.0):
+def shared(values, probabilities, sigma=100.0, half_widths=100.0):
     """What others show, where each shows the same value of all things, to a tenth."""
+    half_widths = np.broadcast_to(half_widths, len(values))
     shown = np.repeat(np.array(values)[:, None], N_SHARED, axis=1)
     covs = np.repeat(0.01 * np.eye(N_SHARED)[None], len(values), axis=0)
-    return shared_of(shown, covs, probabilities, physics(len(values), sigma))
+    return shared_of((shown, covs), probabilities, physics(len(values), sigma), half_widths)
 
 
 def test_what_markers_share_is_what_the_others_show_by_their_probability():
@@ -202,6 +204,21 @@ def test_a_sure_sphere_that_is_unlike_the_others_hardly_counts():
     means, _ = shared(values, [1.0] * 7)
     assert means[0] == pytest.approx(0.2, abs=0.05)
     assert np.mean(values[1:]) > 0.6
+
+
+def test_beams_that_are_wide_at_their_window_move_the_edges_of_near_markers_most():
+    """Both edges, in half widths of a beam that has none there; but nothing else does."""
+    half_widths = 0.0015 * np.array([3.0, 4.0, 6.0, 9.0, 12.0, 15.0])  # [m] of 3 mrad
+    edges = 0.6 + 0.4 * 0.5 * BEAM_WINDOW.mean() / half_widths
+    means, sigmas = shared(edges, np.ones(6), 0.3, half_widths)
+    near, far = means[0], means[-1]
+    assert near[1] > 0.6 + 0.6 * (edges[0] - 0.6)
+    assert near[1] - far[1] > 0.6 * (edges[0] - edges[-1])
+    assert near[3] < edges[1:].mean() + 0.01  # as the others show it
+    alone, sigmas_alone = shared(edges[:1], [1.0], 0.3, half_widths[:1])
+    assert alone[0] == pytest.approx(0.6)
+    assert sigmas_alone[0, 1] > sigmas_alone[0, 2] > sigmas_alone[0, 3]
+    assert sigmas[0, 1] < 0.7 * sigmas_alone[0, 1]
 
 
 def test_without_other_spheres_what_markers_share_is_the_usual():

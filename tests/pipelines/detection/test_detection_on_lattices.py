@@ -11,7 +11,7 @@ from spheremark.pipelines.detection.pulses import unheard_about
 from spheremark.pipelines.detection.target import Target
 from spheremark.pipelines.geometry import inverse, transform
 from spheremark.pipelines.model import RING_UNKNOWN
-from spheremark.pipelines.scan.firings import clock_of
+from spheremark.pipelines.scan.firings import clock_of, heard_of
 from spheremark.pipelines.scan.stitching import stitch
 from spheremark.pipelines.simulation import SimulationConfig, scenario, simulate_stop
 from spheremark.pipelines.simulation.rig import nominal_rig
@@ -29,9 +29,9 @@ def scan():
 
 def n_silent(scan, place):
     cloud, _, field = scan
-    rows = np.flatnonzero(np.linalg.norm(cloud.p_base - place, axis=1) < 0.5).astype(np.int32)
+    clock = clock_of(cloud)[0]
     target = Target(field.marker_radius, np.array([0.0, 0.0, 1.0]), 0.003)
-    across, up, _ = unheard_about(cloud, clock_of(cloud)[0], rows, place, target)
+    across, up, _ = unheard_about(clock, heard_of(cloud, clock), place, target)
     return int(np.sum(np.hypot(across, up) < 0.8 * field.marker_radius))
 
 

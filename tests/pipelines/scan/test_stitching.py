@@ -250,6 +250,11 @@ def test_returns_outside_the_limits_of_range_are_left_out(rng):
     assert 0 < len(ranges) < len(log.p_lidar)
     assert ranges.min() >= 5.0 - FLOAT32
     assert ranges.max() <= 10.0 + FLOAT32
+    reach = beams(stitch(log, rig, replace(CONFIG, range_min=0.0)), np.arange(len(log.p_lidar)))
+    is_near = reach.ranges < 5.0
+    np.testing.assert_array_equal(cloud.near_rings, log.rings[is_near])
+    since = (log.stamps_lidar_ns[is_near] - log.stamps_lidar_ns.min()) / NS
+    np.testing.assert_allclose(cloud.near_times, since, rtol=0, atol=1e-9)
 
 
 def test_returns_without_a_gimbal_angle_are_left_out_and_counted(rng):
@@ -268,7 +273,7 @@ def test_returns_without_a_gimbal_angle_are_left_out_and_counted(rng):
     )
     cloud = stitch(gappy, rig, CONFIG)
     assert len(cloud.p_base) == len(log.p_lidar) - lost
-    assert any(note.startswith(f"{lost} returns have no gimbal angle") for note in cloud.notes)
+    assert any(note.startswith(f"{lost:,} returns have no gimbal angle") for note in cloud.notes)
 
 
 def test_clocks_leave_the_heading_uncertain_by_what_the_gimbal_turns_in_their_offset(rng):

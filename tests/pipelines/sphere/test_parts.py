@@ -8,6 +8,7 @@ from numpy.testing import assert_allclose
 
 from spheremark.pipelines.model import Beams
 from spheremark.pipelines.sphere.description import limb_coverage
+from spheremark.pipelines.sphere.estimation import _spread
 from spheremark.pipelines.sphere.footprint import predict
 from spheremark.pipelines.sphere.linearisation import linearise
 from spheremark.pipelines.sphere.mounting import effects_on
@@ -222,3 +223,13 @@ def test_lasers_that_cross_a_sphere_together_are_one_scan_line_in_whatever_order
     assert scan_lines(times).tolist() == [2, 0, 1, 0, 2]
     assert n_lines(times) == 3
     assert n_lines(np.zeros(0)) == n_lines(times[:1]) == 1
+
+
+def test_what_biases_have_in_common_does_not_loosen_their_prior():
+    """Else it would grow with the prior that it loosens, as where outlines of spheres seem wide."""
+    sigmas, cov = np.full(16, 0.003), 1e-8 * np.eye(16)
+    apart = 0.006 * (-1.0) ** np.arange(16)
+    as_they_are = _spread((apart, cov), sigmas, about_mean=True)
+    assert as_they_are == pytest.approx(np.sqrt((16 * 4.0 + 2.0) / 17.0), rel=1e-3)
+    assert _spread((apart + 0.03, cov), sigmas, about_mean=True) == pytest.approx(as_they_are)
+    assert _spread((apart + 0.03, cov), sigmas, about_mean=False) > 4.0 * as_they_are
