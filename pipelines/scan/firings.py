@@ -22,6 +22,7 @@ _PAUSE = 0.9  # of a revolution without a return: the scan was not recorded
 _OFF_MAX = 1e-3  # [rad] a third of a beam: median by which a pulse may be misplaced
 _SLOWEST, _FASTEST = 2.0, 200.0  # [rad/s] of a spin
 _MARGIN = 0.006  # [rad] beside a place where pulses are tried: what turns within a firing
+_BLOCK = 500_000  # returns whose pulses are numbered at once
 _LEVEL = 0.9  # least cosine of the elevation of a laser
 
 
@@ -257,8 +258,9 @@ def heard_of(cloud: StitchedCloud, clock: Clock) -> Index:
     (k,)
         Numbers, ascending.
     """
-    numbers = np.concatenate([numbers_of(cloud, clock, slice(None)), near_of(cloud, clock)])
-    return np.sort(numbers, kind="stable")
+    begins = range(0, len(cloud.p_base), _BLOCK)
+    parts = [numbers_of(cloud, clock, slice(begin, begin + _BLOCK)) for begin in begins]
+    return np.sort(np.concatenate([*parts, near_of(cloud, clock)]), kind="stable")
 
 
 def near_of(cloud: StitchedCloud, clock: Clock) -> Index:
