@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from spheremark.pipelines.compilation import compiled
 from spheremark.pipelines.detection.cells import Cells, rows_about
 from spheremark.pipelines.detection.ground import Ground, planes_below, skin_of
-from spheremark.pipelines.detection.pulses import Hearing, hearing_of, unheard_about
+from spheremark.pipelines.detection.pulses import Hearing, faces_of, hearing_of, unheard_about
 from spheremark.pipelines.detection.target import (
     Target,
     blur_at,
@@ -36,6 +36,7 @@ _HELD = (-4.0, 1.0)  # radii of depth within which a return may belong to the sa
 _ON = (-1.3, 0.3)  # radii of depth within which a return may lie on the sphere
 _PLACE = 0.1  # radii: beams nearer to each other than this pass at the same place
 _MEAN_WIDTH = 0.75  # of the greater half width of a beam: in any direction
+_ABOUT, _N_HIDDEN = 1.3, 5  # radii about a centre where a face shows nothing, of so many pulses
 _TINY = 1e-6
 _UNKNOWN = Hearing(lost=1.0, weakest=0.0)
 
@@ -211,10 +212,11 @@ def _evidence_at(
     n_on, n_before, below, brightness, n_distinct, seen = _count_beams(
         points, cloud.intensities[rows], ground, c, target, origins
     )
+    faces = faces_of(cloud.rig, angles, c)
     if silent is not None:
+        silent = _unhidden(silent, seen, faces, target.radius)
         passing, blur = silent / target.radius, blur_at(c, target) / target.radius
         below[1] += beside_pole(passing, blur)
-    is_left = np.cos(angles) * c[1] > np.sin(angles) * c[0]
     return Evidence(
         n_on=n_on,
         n_before=n_before,
@@ -224,11 +226,26 @@ def _evidence_at(
         n_distinct=n_distinct,
         rows=rows,
         seen=seen,
-        faces=np.where(is_left, 0.5, -0.5),
+        faces=faces,
         strengths=cloud.intensities[rows] / np.sum(points.astype(np.float64) ** 2, axis=1),
         silent=silent,
         blur=_half_widths(cloud.rig, angles, c, target),
     )
+
+
+def _unhidden(silent: Array, seen: Array, faces: Array, radius: float) -> Array:
+    """Return the pulses without a return but for those of a face that shows nothing of a place.
+
+    What the other face shows stands there: something that sends no return hides it, as a mast of
+    the rover that is too near.
+    """
+    is_about = np.hypot(seen[0], seen[1]) < _ABOUT * radius
+    is_inside = np.hypot(silent[0], silent[1]) < radius
+    for face in (-0.5, 0.5):
+        is_own = silent[2] == face
+        if np.sum(is_own & is_inside) >= _N_HIDDEN and not np.any(is_about & (faces == face)):
+            return silent[:, ~is_own]
+    return silent
 
 
 def _origins(rig: Rig, angles: Column) -> Array:

@@ -7,8 +7,9 @@ import pytest
 
 from spheremark.pipelines.config import ExtractionConfig
 from spheremark.pipelines.detection import extract
+from spheremark.pipelines.detection.pulses import faces_of
 from spheremark.pipelines.scan.firings import clock_of, heard_of, pulses_about
-from tests.pipelines.synthetic_stop import RADIUS, World, fire, passing, ring_of_markers, scan
+from tests.pipelines.synthetic_stop import RADIUS, RIG, World, fire, passing, ring_of_markers, scan
 
 MARKERS = ring_of_markers(n=5)
 GROUND = -0.8
@@ -67,8 +68,22 @@ def test_markers_that_are_hidden_in_one_face_are_found_by_the_other(hidden):
     assert len(rough) == len(MARKERS)
 
 
-def test_a_mast_whose_returns_are_not_kept_seems_to_let_pulses_through(by_mast):
-    """What the tests above rest on: that much of each marker is hidden."""
+def test_a_mast_that_sends_no_return_hides_a_face_and_the_other_shows_the_marker(by_mast):
+    """As of what is nearer than a sensor can measure."""
     unknown = replace(by_mast, near_times=np.zeros(0), near_rings=np.zeros(0, np.uint8))
     assert all(np.mean(silent(unknown, place)) > 0.3 for place in MARKERS)
-    assert len(extract(unknown, ExtractionConfig(), RADIUS).candidates) < len(MARKERS)
+    found = extract(unknown, ExtractionConfig(), RADIUS)
+    rough = np.array([c.p_base_rough for c in found.candidates])
+    assert len(rough) == len(MARKERS)
+    assert np.linalg.norm(rough[:, None] - MARKERS, axis=2).min(axis=0).max() < 0.025
+
+
+@pytest.mark.parametrize("turn", [0.5, 1.7, -2.0])
+def test_faces_are_the_same_however_the_head_of_a_gimbal_counts_its_angle(turn):
+    angles, c = np.linspace(-3.0, 3.0, 50), np.array([4.0, 3.0, 1.0])
+    T = np.eye(4)
+    T[:2, :2] = [[np.cos(turn), -np.sin(turn)], [np.sin(turn), np.cos(turn)]]
+    other = replace(RIG, T_head_lidar=T @ RIG.T_head_lidar)
+    faces = faces_of(RIG, angles, c)
+    np.testing.assert_array_equal(faces_of(other, angles - turn, c), faces)
+    assert 15 < np.sum(faces > 0) < 35
