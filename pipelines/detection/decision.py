@@ -294,7 +294,9 @@ def _by_windows(half_widths: Array) -> Array:
     n = len(_VARIES)
     by = np.zeros((len(half_widths), n, n + 2))
     by[:, :, :n] = np.eye(n)
-    by[:, 1, n] = by[:, 2, n + 1] = 0.5 * BEAM_WINDOW.mean() / half_widths
+    is_wide = half_widths > 0.0  # rays have no edges that a window moves
+    by[is_wide, 1, n] = 0.5 * BEAM_WINDOW.mean() / half_widths[is_wide]
+    by[:, 2, n + 1] = by[:, 1, n]
     return by
 
 

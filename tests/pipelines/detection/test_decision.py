@@ -221,6 +221,11 @@ def test_beams_that_are_wide_at_their_window_move_the_edges_of_near_markers_most
     assert sigmas[0, 1] < 0.7 * sigmas_alone[0, 1]
 
 
+def test_rays_without_a_width_have_no_window():
+    means, _ = shared([0.2, 0.21, 0.19], np.ones(3), half_widths=0.0)
+    assert means[0] == pytest.approx(0.2, abs=1e-3)
+
+
 def test_without_other_spheres_what_markers_share_is_the_usual():
     means, sigmas = shared([0.2], [1.0], sigma=0.4)
     assert means[0] == pytest.approx(0.6)
