@@ -221,7 +221,8 @@ def _near(p_lidar: Column, kept: Index | slice, range_min: float) -> Index:
     is_left = np.ones(len(p_lidar), np.bool_)
     is_left[kept] = False
     left = np.flatnonzero(is_left)
-    return np.asarray(left[np.sum(p_lidar[left] ** 2, axis=1) < range_min**2])
+    ranges = np.linalg.norm(p_lidar[left].astype(np.float64), axis=1)
+    return np.asarray(left[ranges < range_min])
 
 
 def _clocked(
