@@ -24,7 +24,8 @@ FRAMES = ("lidar", "head", "base", "station", "site")
 FRAMELESS = {  # counts, clocks, scalars per row, and tables of the sensor: no coordinates in them
     "stamps_lidar_ns", "stamps_gimbal_ns", "stamps_imu_ns", "quaternions_imu", "R_mount_imu",
     "intensities", "rings", "gimbal_angles", "times", "ranges", "members", "used", "rejected",
-    "near_rings", "near_times", "residuals", "matches", "redundancies", "w_statistics", "detectable_biases", "marks",
+    "near_rings", "near_times", "residuals", "matches", "redundancies", "w_statistics",
+    "detectable_biases", "marks",
     "external_reliabilities", "included_angles", "included_angles_horizontal", "sigma_3d",
     "sigma_horizontal", "range_by_optics", "estimates", "weights", "sigmas_prior",
     "sigmas_profile", "log_likelihoods",
