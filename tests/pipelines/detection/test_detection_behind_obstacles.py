@@ -9,6 +9,7 @@ from spheremark.pipelines.config import ExtractionConfig
 from spheremark.pipelines.detection import extract
 from spheremark.pipelines.detection.pulses import faces_of
 from spheremark.pipelines.scan.firings import clock_of, heard_of, pulses_about
+from spheremark.pipelines.sphere.pulses import passing_of
 from tests.pipelines.synthetic_stop import RADIUS, RIG, World, fire, passing, ring_of_markers, scan
 
 MARKERS = ring_of_markers(n=5)
@@ -58,6 +59,14 @@ def test_pulses_that_something_before_a_marker_stopped_are_not_without_a_return(
     for place in MARKERS:
         assert len(silent(hidden, place)) > 50
         assert not silent(hidden, place).any()
+
+
+def test_the_limb_is_not_sought_by_pulses_that_a_mast_stopped(by_mast):
+    clock, _ = clock_of(by_mast)
+    for passed in passing_of(by_mast, clock, MARKERS, RADIUS):
+        is_inside = np.linalg.norm(passed.places, axis=1) < 0.8 * RADIUS
+        assert is_inside.sum() > 10
+        assert passed.has_hit[is_inside].all()
 
 
 def test_markers_that_are_hidden_in_one_face_are_found_by_the_other(hidden):
