@@ -13,6 +13,7 @@ from spheremark.pipelines.detection.target import Target
 from spheremark.pipelines.model import Array, Column, Index, Mask
 
 _STEP = 3.0  # radii beside a surface that must be free for it to end there
+_DUST = 0.05  # of the returns in its voxel: fewer in another one are no surface
 _CAP = 2.0 / 3.0  # radii that the returns of a sphere lie before its centre on average
 
 
@@ -22,12 +23,14 @@ def find_seeds(points: Column, target: Target, n_points_min: int) -> Array:
     p = points.astype(np.float64)
     occupied, own = np.unique(_voxels(p, edge), return_inverse=True)
     columns = (*p.T, np.ones(len(p)))
-    sums = np.column_stack([np.bincount(own, one, len(occupied)) for one in columns])
-    p = sums[:, :3] / sums[:, 3:]
-    p = p[_is_free(occupied, edge, p, step * target.up)]
+    sums = np.array([np.bincount(own, one, len(occupied)) for one in columns], np.float64).T
+    p, n = sums[:, :3] / sums[:, 3:], sums[:, 3]
+    voxels = (occupied, n, edge)
+    is_top = _is_free(voxels, p, n, step * target.up)
+    p, n = p[is_top], n[is_top]
     across = np.cross(target.up, p)
     across *= step / (np.linalg.norm(across, axis=1, keepdims=True) + 1e-12)
-    p = p[_is_free(occupied, edge, p, across) | _is_free(occupied, edge, p, -across)]
+    p = p[_is_free(voxels, p, n, across) | _is_free(voxels, p, n, -across)]
     around = np.zeros((len(p), 4))
     for offset in np.ndindex(3, 3, 3):
         rows, is_held = _find(occupied, _voxels(p + edge * (np.array(offset) - 1.0), edge))
@@ -60,10 +63,17 @@ def _find(occupied: NDArray[np.int64], voxels: NDArray[np.int64]) -> tuple[Index
     return rows, np.asarray(occupied[rows] == voxels)
 
 
-def _is_free(occupied: NDArray[np.int64], edge: float, p: Array, step: Array) -> Mask:
-    """Return whether the voxels one step away, at the same depth or next to it, are empty."""
+def _is_free(
+    voxels: tuple[NDArray[np.int64], Array, float], p: Array, n: Array, step: Array
+) -> Mask:
+    """Return whether the voxels one step away, at the same depth or next to it, hold no surface.
+
+    ``voxels`` are their numbers, what they hold and their edge; ``n`` is how many returns show each
+    place.
+    """
+    occupied, held, edge = voxels
     beams = edge * p / np.linalg.norm(p, axis=1, keepdims=True)
     away = np.stack([p + step + depth * beams for depth in (-1.0, 0.0, 1.0)])
-    return np.asarray(
-        ~_find(occupied, _voxels(away.reshape(-1, 3), edge))[1].reshape(3, -1).any(axis=0)
-    )
+    rows, is_held = _find(occupied, _voxels(away.reshape(-1, 3), edge))
+    shown = np.where(is_held, held[rows], 0.0).reshape(3, -1)
+    return np.asarray((shown <= _DUST * n).all(axis=0))
