@@ -27,6 +27,7 @@ _HALF_SEEN = 0.8  # radii: the returns of half a ball are as wide, but for those
 _HIDDEN = 2.0  # as many returns before a ball as on it: two thirds of it are hidden
 _SHADE = 0.4  # standard deviation, as a share, of one return's reflectivity: partly lit beams
 _PAINT, _PAINTS = 0.1, 0.7  # the same of markers, by range and incidence; and of all things
+_SHOWS_POLE, _NO_POLE = 0.9, 0.5  # markers that show poles; weight, at most, of what does not then
 _N_PAINTS = 1.0  # things that the usual spread of paints counts for in a scan
 _FINE = 0.25  # of the spread of markers: steps of the paint that is summed over
 _TAIL = 3.0  # degrees of freedom: of some markers the paint is dirty or in shade
@@ -161,7 +162,8 @@ def paint_of(groups: Sequence[Evidence], probabilities: Sequence[float]) -> tupl
     All markers have the same paint, other things have any. What it is, the other groups show: each
     is painted as markers are with its probability, or is anything. How unlike the paints of other
     things are, they show too: where all look alike, paint says nothing. Some markers are dirty or
-    in shade: but what nothing shows a pole of must be painted as they are.
+    in shade: but what nothing shows a pole of must be painted as they are, and says little of how
+    where others show theirs.
 
     Parameters
     ----------
@@ -182,6 +184,8 @@ def paint_of(groups: Sequence[Evidence], probabilities: Sequence[float]) -> tupl
     has_pole = np.array([evidence.shows_below for evidence in groups])[:, None]
     variances, middle = _PAINT**2 + _SHADE**2 / n_distinct, float(np.median(logs))
     shares = np.minimum(probabilities, 1.0 - 1.0 / _MOST)[:, None]
+    if np.sum(shares[has_pole]) > _SHOWS_POLE:
+        shares = np.where(has_pole, shares, np.minimum(shares, _NO_POLE))
     wide = variances + _PAINTS**2 * _spread(logs - middle, 1.0 - shares)
     reach = 3.0 * _PAINTS  # beyond which no paint of markers is expected
     paints = np.arange(logs.min() - reach, logs.max() + reach, _FINE * _PAINT)

@@ -263,6 +263,15 @@ def test_many_doubtful_groups_do_not_outvote_a_few_sure_markers():
     assert min(ratios[:n_sure]) > 1.0 > max(ratios[n_sure:])
 
 
+def test_what_shows_no_pole_does_not_outvote_markers_that_do():
+    """As round stones on larger ones, each of which is a sphere by its shape."""
+    n_markers, n_stones = 5, 9
+    groups = [evidence(brightness=30.0, n_past=150)] * n_markers
+    groups += [evidence(brightness=9.0, n_past=0)] * n_stones
+    ratios, _ = paint_of(groups, [0.9998] * (n_markers + n_stones))
+    assert min(ratios[:n_markers]) > 1.0 > -8.0 > max(ratios[n_markers:])
+
+
 def test_the_scale_of_reflectivities_does_not_matter():
     """Some sensors give signals of thousands."""
     values = np.array([50.0, 50.0, 51.0, 49.0, 20.0])
