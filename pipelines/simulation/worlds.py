@@ -124,6 +124,7 @@ _RETURNS = 7500.0  # of a sphere of 0.1 m at 1 m, by a turn of 13.2 s
 _FEWEST = 6.0  # returns at the greatest distance
 _NEAREST, _FARTHEST = 1.8, 75.0  # [m]
 _REACH = (12.0, 33.0)  # [m] within which objects stand, as far as markers do
+_MAST, _MAST_AWAY = (0.008, 0.04), (0.35, 1.2)  # [m] radius of a rover's mast, and from the LiDAR
 _STOP_CLEAR = 0.9  # [m] from a stop to the nearest object
 _SPREAD = 4.8  # [m] of the stops about the first one
 _N_TRIES = 300
@@ -355,6 +356,8 @@ def _field(values: _Values, seed: int, family: str, config: SimulationConfig) ->
         family=family,
     )
     items = _items(np.random.default_rng([seed, _ITEMS]), world, family, farthest)
+    if family in ("clutter", _ALL):
+        items += _masts(np.random.default_rng([seed, _ITEMS, 1]), world)
     return with_items(world, "random", items)
 
 
@@ -474,6 +477,20 @@ def _beside(rng: np.random.Generator, ground: Ground) -> list[Item]:
         for item in items
         if np.linalg.norm(stops - item.p_site, axis=1).min() > item.reach + _STOP_CLEAR
     ]
+
+
+def _masts(rng: np.random.Generator, world: Field) -> list[Item]:
+    """Draw masts and antennas of the rover about its first stop, some nearer than is measured."""
+    items, eye = list[Item](), world.stops[0].p_site
+    for _ in range(int(rng.integers(4))):
+        away, bearing = rng.uniform(*_MAST_AWAY), rng.uniform(-np.pi, np.pi)
+        radius = rng.uniform(*_MAST)
+        place = eye + away * np.array([np.cos(bearing), np.sin(bearing), 0.0])
+        foot = np.append(place[:2], world.terrain.height_at(place))
+        top = objects.above(place, rng.uniform(-0.3, 1.0))
+        mesh, axis = cylinder(foot, top, radius, objects.WALL_SHADE), (foot, top, radius)
+        items.append(Item(kind="mast", p_site=top, meshes=[mesh], sticks=[axis]))
+    return items
 
 
 def _neighbour(rng: np.random.Generator, ground: Ground, mark: Array, gap: float) -> Item:

@@ -53,6 +53,18 @@ def test_a_family_has_what_it_is_named_after(worlds):
     assert [name for name, config in of.items() if not config.shot_times] in ([], ["bare"])
 
 
+def test_a_rover_has_masts_near_its_lidar_that_hide_some_of_the_field():
+    n_near = 0
+    for seed in range(0, 12, 2):
+        field = draw_world(seed, "clutter").field
+        masts = [d for d in field.decoys if d.kind == "mast"]
+        away = [np.linalg.norm((d.p_site - field.stops[0].p_site)[:2]) for d in masts]
+        assert len(masts) <= 3
+        assert all(0.3 < one < 1.3 for one in away)
+        n_near += sum(one < 0.9 for one in away)
+    assert n_near > 0, "nearer than the least range that is used"
+
+
 def test_every_quantity_has_a_prior_that_widens_in_its_families():
     for name, prior in PRIORS.items():
         assert prior.usual[0] < prior.usual[1], name
