@@ -7,6 +7,7 @@
 - ``ground`` separates the ground, ``seeds`` picks the places to examine,
 - ``features`` measures the shape of the returns about a place,
 - ``evidence`` gathers the beams towards and about a group, ``pulses`` those without a return,
+- ``faces`` are the two sides from which a turn sweeps each place,
 - ``beams`` chooses those to compare, and describes what stands behind and beside,
 - ``support`` is what holds an object up,
 - ``shapes`` are what may stand there, ``search`` finds the likeliest of each kind by ``maxima`` of
@@ -28,7 +29,7 @@ import numpy as np
 from scipy.spatial import KDTree
 
 from spheremark.pipelines.config import ExtractionConfig
-from spheremark.pipelines.detection.cells import cells_of
+from spheremark.pipelines.detection.cells import Cells, cells_of
 from spheremark.pipelines.detection.decision import (
     UNDECIDED,
     Judgement,
@@ -43,13 +44,14 @@ from spheremark.pipelines.detection.decision import (
     sure_ones,
 )
 from spheremark.pipelines.detection.evidence import Evidence, gather_evidence
+from spheremark.pipelines.detection.faces import Apart, apart_of, joined
 from spheremark.pipelines.detection.features import (
     N_RESOLVED,
     NOISE_MIN,
     Features,
     measure_features,
 )
-from spheremark.pipelines.detection.ground import ground_of
+from spheremark.pipelines.detection.ground import Ground, ground_of
 from spheremark.pipelines.detection.hypotheses import (
     SIGMAS,
     USUAL,
@@ -58,10 +60,11 @@ from spheremark.pipelines.detection.hypotheses import (
 )
 from spheremark.pipelines.detection.pulses import Hearing
 from spheremark.pipelines.detection.seeds import find_seeds
-from spheremark.pipelines.detection.shapes import N_PARAMETERS, NAMES
+from spheremark.pipelines.detection.shapes import N_PARAMETERS, NAMES, POLE, SHIFT, SPHERE
 from spheremark.pipelines.detection.target import Target, blur_at
 from spheremark.pipelines.model import (
     Array,
+    Column,
     Index,
     MarkerCandidate,
     MarkerCandidates,
@@ -128,27 +131,26 @@ def extract(
     """
     if not cloud.intensities.any():  # not recorded: all things are as bright
         cloud = replace(cloud, intensities=np.ones_like(cloud.intensities))
+    found, apart = _extracted(cloud, config, marker_radius)
+    if apart is None:
+        return found
+    again = joined(cloud, apart)
+    found, _ = _extracted(again, config, marker_radius)
+    return _moved_back(found, again.p_base, cloud.p_base)
+
+
+def _extracted(
+    cloud: StitchedCloud, config: ExtractionConfig, marker_radius: float
+) -> tuple[MarkerCandidates, Apart | None]:
+    """Return what is found in a scan, and how far apart its faces show it."""
     cells = cells_of(cloud, config)
     target = Target(marker_radius, cells.R_station_base[2], float(cloud.rig.divergence.max()))
     ground = ground_of(cloud, cells, config)
     seeds = find_seeds(ground.points_above, target, config.n_points_min)
     groups = distinct(measure_features(cloud, cells, seeds, target), config, marker_radius)
-    reasons = [reason_by_features(features, marker_radius) for features in groups]
-    near = _n_neighbours(groups, marker_radius)
-    passed = [i for i, reason in enumerate(reasons) if not reason]
-    centres = np.array([groups[i].p_base for i in passed]).reshape(-1, 3)
-    gathered, hearing = gather_evidence(cloud, cells, ground, centres, target)
-    evidence = dict(zip(passed, gathered, strict=True))
-    for i in passed:
-        reasons[i] = reason_by_evidence(groups[i], evidence[i], target)
-    kept = [i for i in passed if not reasons[i]]
-    at_worst = [reason_by_evidence(groups[i], evidence[i].at_worst, target) for i in kept]
-    compared = [
-        _Compared(groups[i], evidence[i], near[i], counts=not reason)
-        for i, reason in zip(kept, at_worst, strict=True)
-    ]
+    compared, not_compared, hearing = _sifted(groups, cloud, (cells, ground), target)
     noise = noise_of([one.features for one in compared if one.counts], target.radius)
-    logs = _log_likelihoods(compared, noise, hearing, config, target)
+    logs, shifts = _log_likelihoods(compared, noise, hearing, config, target)
     by_shape = [judgement.probability for judgement in _judged(compared, logs)]
     log_ratios, by_paint = paint_of([one.evidence for one in compared], by_shape)
     logs[:, 0] += log_ratios
@@ -171,13 +173,54 @@ def extract(
             possible.append(replace(refused, members=members))
         else:
             rejected.append(refused)
-    farthest_first = sorted(range(len(groups)), key=lambda i: i not in evidence)
-    not_compared = [_rejection(groups[i], reasons[i]) for i in farthest_first if reasons[i]]
-    return MarkerCandidates(
+    found = MarkerCandidates(
         candidates=_candidates(markers, target),
         possible=tuple(possible),
         rejected=(*rejected[:_N_REJECTED], *not_compared[:_N_NOT_COMPARED]),
         ground_height_max=ground.height_max,
+    )
+    is_shown = np.array(is_sure, np.bool_) & shifts.any(axis=1)
+    places = np.array([one.features.p_base for one in compared]).reshape(-1, 3)
+    distances = np.linalg.norm(places[is_shown], axis=1)
+    return found, apart_of(marker_radius * shifts[is_shown], distances)
+
+
+def _sifted(
+    groups: list[Features], cloud: StitchedCloud, known: tuple[Cells, Ground], target: Target
+) -> tuple[list[_Compared], list[Rejection], Hearing]:
+    """Return the groups to compare; the others, those that came farthest first; the hearing."""
+    reasons = [reason_by_features(features, target.radius) for features in groups]
+    near = _n_neighbours(groups, target.radius)
+    passed = [i for i, reason in enumerate(reasons) if not reason]
+    centres = np.array([groups[i].p_base for i in passed]).reshape(-1, 3)
+    gathered, hearing = gather_evidence(cloud, *known, centres, target)
+    compared, rejected = list[_Compared](), list[Rejection]()
+    for i, evidence in zip(passed, gathered, strict=True):
+        reason = reason_by_evidence(groups[i], evidence, target)
+        if reason:
+            rejected.append(_rejection(groups[i], reason))
+            continue
+        counts = not reason_by_evidence(groups[i], evidence.at_worst, target)
+        compared.append(_Compared(groups[i], evidence, near[i], counts=counts))
+    rejected += [_rejection(groups[i], reason) for i, reason in enumerate(reasons) if reason]
+    return compared, rejected, hearing
+
+
+def _moved_back(found: MarkerCandidates, points: Column, others: Column) -> MarkerCandidates:
+    """Return candidates with their places as other points of the same returns show them."""
+
+    def moved(p: Array, members: Index) -> Array:
+        return np.asarray(p + np.mean(others[members] - points[members], axis=0))
+
+    return replace(
+        found,
+        candidates=tuple(
+            replace(one, p_base_rough=moved(one.p_base_rough, one.members))
+            for one in found.candidates
+        ),
+        possible=tuple(
+            replace(one, p_base=moved(one.p_base, one.members)) for one in found.possible
+        ),
     )
 
 
@@ -201,11 +244,12 @@ def _log_likelihoods(
     hearing: Hearing,
     config: ExtractionConfig,
     target: Target,
-) -> Array:
+) -> tuple[Array, Array]:
     """Return the logarithms of the likelihoods of some groups by all hypotheses, (n, k).
 
-    What markers have in common, as noise and where beams come to hit an outline, is known from all
-    of the scan, by how probably each is one.
+    And how far apart the faces show the best spheres, (n, 3) radii; zero where one does alone. What
+    markers have in common, as noise and where beams come to hit an outline, is known from all of
+    the scan, by how probably each is one.
     """
     n = len(compared)
     k = len(USUAL) + 1  # what markers share, with the noise
@@ -231,7 +275,7 @@ def _log_likelihoods(
         ]
     again = np.flatnonzero(found[:, 0] > found.max(axis=1, initial=-np.inf) - UNDECIDED)
     side_by_side(lambda first, end: compare(again[first:end].tolist()), len(again), threaded_from=4)
-    return found
+    return found, np.array([own[SPHERE, SHIFT:POLE] for own in shapes]).reshape(-1, 3)
 
 
 def _judged(compared: list[_Compared], logs: Array) -> list[Judgement]:

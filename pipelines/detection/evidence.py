@@ -14,8 +14,9 @@ from numpy.typing import NDArray
 
 from spheremark.pipelines.compilation import compiled
 from spheremark.pipelines.detection.cells import Cells, rows_about
+from spheremark.pipelines.detection.faces import faces_of
 from spheremark.pipelines.detection.ground import Ground, planes_below, skin_of
-from spheremark.pipelines.detection.pulses import Hearing, faces_of, hearing_of, unheard_about
+from spheremark.pipelines.detection.pulses import Hearing, hearing_of, unheard_about
 from spheremark.pipelines.detection.target import (
     Target,
     blur_at,

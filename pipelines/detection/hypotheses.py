@@ -13,6 +13,7 @@ import numpy as np
 
 from spheremark.pipelines.detection.beams import beams_about
 from spheremark.pipelines.detection.evidence import Evidence
+from spheremark.pipelines.detection.faces import MOVED, TURNED
 from spheremark.pipelines.detection.search import compared, cov_shared
 from spheremark.pipelines.detection.shapes import (
     BALL,
@@ -44,8 +45,7 @@ _NEVER = 60.0  # logarithm of odds behind the best that stand for any more
 
 # Means and standard deviations of the parameters
 _CENTRE, _POLE_SIZE = (0.3, 0.3, 0.4), (float(np.log(0.2)), 0.8)
-_TURNED, _MOVED = 0.003, 0.01  # [rad] and [m] by which the faces lie apart with a rough mounting
-_HEAD_SIZE = (0.085, 1.3, 0.12)  # [m] half the width of a head, its height over it, their spread
+_HEAD_SIZE = (0.09, 1.2, 0.18)  # [m] half the width of a head or helmet, height over it, spread
 _RELIEF, _SIGMA_LOG_RELIEF = 0.08, 0.3  # of stones, hair and faces about an ellipsoid
 SOLIDS = (
     *((0.0, 0.3), (0.0, 0.14), (0.0, 0.1), (0.0, 0.1), (0.0, 0.1)),
@@ -157,9 +157,9 @@ def log_likelihoods(
         logs[kind] += np.log(_neighbour_probability(kind, n_neighbours))
     priors = _priors(radius, physics)
     if abs(beams.face.sum()) < 0.5 * len(beams.face) - 3:
-        moved = _MOVED / radius
+        moved = MOVED / radius
         priors[SPHERE, 1, SHIFT:POLE] = moved
-        priors[SPHERE, 1, SHIFT : SHIFT + 2] = hypot(_TURNED * distance / radius, moved)
+        priors[SPHERE, 1, SHIFT : SHIFT + 2] = hypot(TURNED * distance / radius, moved)
     found, shapes = compared(beams, priors, logs, begun)
     sphere = shapes[SPHERE]
     never = float(found.max()) - _NEVER

@@ -6,8 +6,9 @@ from typing import NamedTuple
 
 import numpy as np
 
+from spheremark.pipelines.detection.faces import faces_of
 from spheremark.pipelines.detection.target import Target, view_of
-from spheremark.pipelines.model import Array, Column, Index, Rig, StitchedCloud
+from spheremark.pipelines.model import Array, Index, StitchedCloud
 from spheremark.pipelines.scan.firings import Clock, in_base, numbers_of, pulses_about, pulses_of
 from spheremark.pipelines.scan.rigs import N_LASERS
 
@@ -29,13 +30,6 @@ def unheard_about(clock: Clock, heard: Index, c: Array, target: Target) -> Array
     view, angles = view_of(c, target.up), pulses.angles[found]
     p_base = in_base(clock.rig, passing[:, found], angles)
     return np.array([view.across @ p_base, view.up @ p_base, faces_of(clock.rig, angles, c)])
-
-
-def faces_of(rig: Rig, angles: Column, c: Array) -> Array:
-    """Return plus or minus a half by the face of the scan: the side of the spin axis of a place."""
-    (x, y), cos, sin = rig.T_head_lidar[:2, 2], np.cos(angles), np.sin(angles)
-    side = x * (cos * c[1] - sin * c[0]) - y * (cos * c[0] + sin * c[1])
-    return np.where(side > 0.0, 0.5, -0.5)
 
 
 class Hearing(NamedTuple):

@@ -7,7 +7,7 @@ import pytest
 
 from spheremark.pipelines.config import ExtractionConfig
 from spheremark.pipelines.detection import extract
-from spheremark.pipelines.detection.pulses import faces_of
+from spheremark.pipelines.detection.faces import faces_of
 from spheremark.pipelines.scan.firings import clock_of, heard_of, pulses_about
 from spheremark.pipelines.sphere.pulses import passing_of
 from tests.pipelines.synthetic_stop import RADIUS, RIG, World, fire, passing, ring_of_markers, scan

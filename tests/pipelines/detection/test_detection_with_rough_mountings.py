@@ -1,0 +1,73 @@
+"""Markers in scans whose rig says badly how the LiDAR is mounted: the two faces lie apart."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from spheremark.pipelines.config import ExtractionConfig
+from spheremark.pipelines.detection import extract
+from spheremark.pipelines.detection.faces import apart_of, joined
+from spheremark.pipelines.geometry import rot_z
+from tests.pipelines.synthetic_stop import RADIUS, RIG, World, scan, turned
+
+MARKERS = np.array(
+    [[3.0, 1.0, 0.1], [-3.0, 3.5, 0.4], [6.5, -5.0, 0.2], [-9.0, -7.0, 0.5], [2.0, 14.0, 0.6]]
+)
+TURNED, MOVED = 0.006, 0.006  # [rad] about the spin axis, [m] square to it: half of what is between
+
+
+@pytest.fixture(scope="module")
+def true_scan():
+    balls = tuple((tuple(p), RADIUS) for p in MARKERS)
+    return scan(World(balls=balls), np.random.default_rng(5), sigma=0.008, turn=26.4)
+
+
+@pytest.fixture(scope="module")
+def rough_scan(true_scan):
+    """The same, of which the rig says that the LiDAR sits otherwise."""
+    T = RIG.T_head_lidar
+    moved = T.copy()
+    moved[:3, :3] = T[:3, :3] @ rot_z(TURNED)
+    spin = T[:3, 2]
+    moved[:3, 3] += MOVED * np.cross([0.0, 0.0, 1.0], spin)
+    p = true_scan.p_base.astype(np.float64)
+    angles = np.asarray(true_scan.gimbal_angles, np.float64)
+    p_lidar = (turned(p, -angles) - T[:3, 3]) @ T[:3, :3]
+    p_base = turned(p_lidar @ moved[:3, :3].T + moved[:3, 3], angles)
+    return replace(
+        true_scan, p_base=p_base.astype(np.float32), rig=replace(RIG, T_head_lidar=moved)
+    )
+
+
+def test_far_markers_that_the_faces_show_apart_are_found(rough_scan):
+    found = extract(rough_scan, ExtractionConfig(), RADIUS)
+    gaps = [min(np.linalg.norm(one.p_base_rough - p) for one in found.candidates) for p in MARKERS]
+    assert len(found.candidates) == len(MARKERS)
+    assert max(gaps) < RADIUS
+
+
+def test_places_are_those_of_the_given_rig(rough_scan):
+    """What is fitted next starts from the returns as the given rig shows them."""
+    for one in extract(rough_scan, ExtractionConfig(), RADIUS).candidates:
+        middle = rough_scan.p_base[one.members].mean(axis=0)
+        assert np.linalg.norm(one.p_base_rough - middle) < 1.2 * RADIUS
+
+
+def test_a_scan_is_joined_by_what_lies_between_its_faces(true_scan, rough_scan):
+    shifts = np.array([[0.0, 2.0 * TURNED * d, 2.0 * MOVED] for d in (3.0, 5.0, 8.0, 14.0)])
+    between = apart_of(shifts, np.array([3.0, 5.0, 8.0, 14.0]))
+    candidates = [
+        between._replace(higher=a * between.higher, deeper=b * between.deeper)
+        for a in (-1, 1)
+        for b in (-1, 1)
+    ]
+    gaps = [np.abs(joined(rough_scan, one).p_base - true_scan.p_base).max() for one in candidates]
+    assert min(gaps) < 1e-4
+
+
+def test_faces_that_agree_are_left():
+    rng = np.random.default_rng(1)
+    distances = np.geomspace(3.0, 20.0, 8)
+    assert apart_of(rng.normal(0.0, 2e-3, (8, 3)), distances) is None
+    assert apart_of(np.full((2, 3), 0.1), distances[:2]) is None, "too few spheres"
