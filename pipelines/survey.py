@@ -295,14 +295,20 @@ def _qualified(fix: StationFix, weaknesses: tuple[str, ...]) -> StationFix:
 
 
 def _why_no_markers(results: list[StopResult], config: SurveyConfig) -> str:
-    """Return the reason: the returns, and the largest refused group."""
+    """Return the reason: the returns, and the likeliest possible marker or largest other group."""
     returns = sum(len(result.cloud.p_base) for result in results)
-    refused = [r for result in results for fits in result.fits.values() for r in fits.rejected]
-    closest = max(refused, key=lambda rejection: rejection.n_points, default=None)
+    found = [next(iter(result.fits.values())) for result in results if result.fits]
+    possible = [one for fits in found for one in fits.possible]
+    refused = [one for fits in found for one in fits.rejected]
     seen = f"{returns:,} returns show no sphere of radius {config.marker_radius:.3f} m"
-    if closest is None:
-        return f"{seen} between {config.stitching.range_min} and {config.extraction.range_max} m."
-    return f"{seen}; the largest of {len(refused)} refused groups: {closest.reason}"
+    if possible:
+        best = max(possible, key=lambda one: one.probability)
+        what = f"possible ones, {np.linalg.norm(best.p_base):.1f} m away, {best.n_points} returns"
+        return f"{seen} for sure; the likeliest of {len(possible)} {what}: {best.reason}"
+    if refused:
+        largest = max(refused, key=lambda one: one.n_points)
+        return f"{seen}; the largest of {len(refused)} refused groups: {largest.reason}"
+    return f"{seen} between {config.stitching.range_min} and {config.extraction.range_max} m."
 
 
 @contextmanager

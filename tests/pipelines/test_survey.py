@@ -95,6 +95,12 @@ def test_spheres_of_another_size_are_no_markers(stop):
         process(stop.log, config=config)
 
 
+def test_possible_markers_are_named_where_none_is_sure(stop):
+    strict = replace(CONFIG, extraction=replace(CONFIG.extraction, false_rate=1e-9))
+    with pytest.raises(NoMarkersError, match=r"likeliest of \d+ possible ones, \d\.\d m away"):
+        process(stop.log, config=strict)
+
+
 def test_a_log_without_a_rig_is_refused_and_a_given_one_serves(stop):
     bare = replace(stop.log, rig=None)
     with pytest.raises(MissingRigError, match="rig"):
