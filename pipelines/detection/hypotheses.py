@@ -45,7 +45,7 @@ _NEVER = 60.0  # logarithm of odds behind the best that stand for any more
 
 # Means and standard deviations of the parameters
 _CENTRE, _POLE_SIZE = (0.3, 0.3, 0.4), (float(np.log(0.2)), 0.8)
-_HEAD_SIZE = (0.09, 1.2, 0.18)  # [m] half the width of a head or helmet, height over it, spread
+_HEAD_SIZE = (0.085, 1.3, 0.12)  # [m] half the width of a head, its height over it, their spread
 _RELIEF, _SIGMA_LOG_RELIEF = 0.08, 0.3  # of stones, hair and faces about an ellipsoid
 SOLIDS = (
     *((0.0, 0.3), (0.0, 0.14), (0.0, 0.1), (0.0, 0.1), (0.0, 0.1)),
