@@ -204,17 +204,17 @@ def test_residuals_fall_to_the_noise_and_the_result_is_named(found):
 def test_angles_that_jitter_spoil_whole_scan_lines_and_the_covariance_says_so(field):
     """Ranges are nearly exact: the angle errs, by 7 mm at 10 m, alike along a scan line.
 
-    Taken as noise of single returns it makes the mean square 4.8. Of 18 degrees of freedom it is
+    Taken as noise of single returns it makes the mean square 4.8. Of 30 degrees of freedom it is
     within these limits in 998 of 1000 seeds.
     """
     world = replace(WORLD, sigma_range=0.003, sigma_encoder=1e-3, joint_rate=20.0)
     squares = []
-    for seed in range(40, 43):
+    for seed in range(40, 45):
         stop = simulate_stop(field, "lane3-stop4", world, seed=seed)
         found = calibrate([stop.log], config=CONFIG)
         off = errors(found, stop.rig)[:6]
         squares.append(off @ np.linalg.solve(found.cov[:6, :6], off) / 6.0)
-    assert 0.27 < np.mean(squares) < 2.35
+    assert 0.38 < np.mean(squares) < 2.0
 
 
 def test_the_covariance_has_what_a_bias_of_all_ranges_does_to_the_offset_of_the_axis(field):

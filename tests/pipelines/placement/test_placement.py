@@ -446,9 +446,7 @@ def worst_after_loss(site, stops, marks):
     return max(evaluate(site, stops, some, MODEL, Requirement()).worst_sigma_3d for some in rest)
 
 
-@pytest.mark.parametrize(
-    ("n_marks", "weight"), [pytest.param(3, 0.03, marks=pytest.mark.long), (3, 1.0), (5, 0.03)]
-)
+@pytest.mark.parametrize(("n_marks", "weight"), [(3, 0.03), (3, 1.0), (5, 0.03)])
 def test_no_plan_at_random_is_better_at_the_worst_stop_or_after_a_loss(n_marks, weight):
     """Three marks cannot keep the tolerance after a loss: then the worst stop still counts."""
     site, stops = flat_site(), one_stop((0.0, 0.0, 1.05), (4.0, 0.0, 1.05), (2.0, 3.0, 1.05))

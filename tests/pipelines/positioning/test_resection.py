@@ -155,7 +155,7 @@ def test_the_covariance_of_the_pose_is_honest(rng):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("n_marks", [4, pytest.param(14, marks=pytest.mark.long)])
+@pytest.mark.parametrize("n_marks", [4, 14])
 def test_the_covariance_of_the_pose_is_honest_at_length(n_marks):
     errors, squares = whitened(np.random.default_rng(n_marks), n_marks, 2500)
     eigenvalues = np.linalg.eigvalsh(errors.T @ errors / len(errors))
