@@ -127,7 +127,9 @@ def extract(
     A marker is a sphere of known radius on a pole. Each place where a surface ends upward and to a
     side is a seed: mean shift of a disc of the sphere's size, a robust fit along the beams; then
     the beams about it are compared under nine hypotheses. Ground is the opening of the lowest point
-    per cell. Where no ground was seen, nothing is cut. Cost grows linearly with the returns.
+    per cell. Where no ground was seen, nothing is cut. Cost grows linearly with the returns; it
+    doubles where the two faces of the scan show the markers apart, for the search is then done
+    again with a mounting by which they agree.
     """
     if not cloud.intensities.any():  # not recorded: all things are as bright
         cloud = replace(cloud, intensities=np.ones_like(cloud.intensities))
