@@ -82,6 +82,7 @@ _POSSIBLE = 0.9  # probability from which a group that is no sure marker is a po
 _N_REJECTED, _N_NOT_COMPARED = 200, 100  # groups, the best first, that are kept with their reason
 _SIGMAS_LOG_NOISE = (0.3, 0.6)  # of one marker about the others of a scan; of a scan about a group
 
+_N_ABOUT = 16  # returns about a refused group that show where it is by another mounting
 _NEARBY = 1.0  # [m] beyond two radii within which other groups show leaves, walls and fences
 
 
@@ -209,11 +210,13 @@ def _sifted(
 
 
 def _moved_back(found: MarkerCandidates, points: Column, others: Column) -> MarkerCandidates:
-    """Return candidates with their places as other points of the same returns show them."""
+    """Return all groups with their places as other points of the same returns show them."""
 
-    def moved(p: Array, members: Index) -> Array:
-        return np.asarray(p + np.mean(others[members] - points[members], axis=0))
+    def moved(p: Array, rows: Index) -> Array:
+        return np.asarray(p + np.mean(others[rows] - points[rows], axis=0))
 
+    places = np.array([one.p_base for one in found.rejected]).reshape(-1, 3)
+    nearest = np.atleast_2d(KDTree(points).query(places, k=_N_ABOUT)[1])
     return replace(
         found,
         candidates=tuple(
@@ -222,6 +225,10 @@ def _moved_back(found: MarkerCandidates, points: Column, others: Column) -> Mark
         ),
         possible=tuple(
             replace(one, p_base=moved(one.p_base, one.members)) for one in found.possible
+        ),
+        rejected=tuple(
+            replace(one, p_base=moved(one.p_base, rows))
+            for one, rows in zip(found.rejected, nearest, strict=True)
         ),
     )
 

@@ -6,9 +6,10 @@ import numpy as np
 import pytest
 
 from spheremark.pipelines.config import ExtractionConfig
-from spheremark.pipelines.detection import extract
-from spheremark.pipelines.detection.faces import apart_of, joined
+from spheremark.pipelines.detection import _moved_back, extract
+from spheremark.pipelines.detection.faces import apart_of, faces_of, joined
 from spheremark.pipelines.geometry import rot_z
+from spheremark.pipelines.model import MarkerCandidates, Rejection
 from tests.pipelines.synthetic_stop import RADIUS, RIG, World, scan, turned
 
 MARKERS = np.array(
@@ -56,6 +57,20 @@ def test_places_are_those_of_the_given_rig(found, rough_scan):
     for one in found.candidates:
         middle = rough_scan.p_base[one.members].mean(axis=0)
         assert np.linalg.norm(one.p_base_rough - middle) < 1.2 * RADIUS
+
+
+@pytest.mark.parametrize(("faces", "share"), [((0.5,), 1.0), ((-0.5,), 1.0), ((0.5, -0.5), 0.0)])
+def test_refused_groups_too_are_where_the_given_rig_shows_them(true_scan, rough_scan, faces, share):
+    """Away by half of what lies between the faces where one shows them, not where both do."""
+    place = MARKERS[4]
+    is_near = np.linalg.norm(true_scan.p_base - place, axis=1) < 1.5 * RADIUS
+    own = np.isin(faces_of(RIG, true_scan.gimbal_angles, place), faces)
+    points, others = (one.p_base[is_near & own] for one in (true_scan, rough_scan))
+    refused = Rejection(p_base=place, n_points=9, reason="")
+    found = MarkerCandidates(candidates=(), rejected=(refused,), ground_height_max=0.0)
+    (back,) = _moved_back(found, points, others).rejected
+    moved = np.linalg.norm(back.p_base - place)
+    assert moved == pytest.approx(share * 14.2 * TURNED, abs=0.03)
 
 
 def test_a_scan_is_joined_by_what_lies_between_its_faces(true_scan, rough_scan):
