@@ -39,7 +39,7 @@ _N_LEAST, _N_MOST = 6.0, 2500.0  # returns of the farthest and of the nearest ma
 _SCATTERED = 0.5  # share of other objects that lie anywhere, and not where markers are put
 _N_PRIOR = 5.0  # places that the usual abundance of a hypothesis counts for in a scan
 _VARIES = (0.13, 0.15, 0.15, 0.04, 0.02)  # of what markers share, between those of one scan
-_WINDOWS = (0.5, 0.3)  # of a VLP-16's: how far a beam's width at its window moves the two edges
+_WINDOWS = (0.5, 1.0)  # of a VLP-16's width at its window, out or in: the first echo or the last
 _LEAST_INFORMATION = 1e-6  # of a group that shows nothing: next to none, but it can be inverted
 UNDECIDED = 15.0
 """Logarithm of odds against a marker up to which it is compared again with better optics."""

@@ -217,8 +217,16 @@ def test_beams_that_are_wide_at_their_window_move_the_edges_of_near_markers_most
     assert near[3] < edges[1:].mean() + 0.01  # as the others show it
     alone, sigmas_alone = shared(edges[:1], [1.0], 0.3, half_widths[:1])
     assert alone[0] == pytest.approx(0.6)
-    assert sigmas_alone[0, 1] > sigmas_alone[0, 2] > sigmas_alone[0, 3]
+    assert sigmas_alone[0, 2] > sigmas_alone[0, 1] > sigmas_alone[0, 3]
     assert sigmas[0, 1] < 0.7 * sigmas_alone[0, 1]
+
+
+def test_the_last_echo_moves_the_edge_before_something_in_by_the_whole_width_at_the_window():
+    half_widths = 0.0015 * np.array([3.0, 4.0, 6.0, 9.0, 12.0, 15.0])  # [m] of 3 mrad
+    edges = 0.6 - 0.5 * BEAM_WINDOW.mean() / half_widths
+    before_nothing, before_something = shared(edges, np.ones(6), 0.3, half_widths)[0].T[1:3]
+    assert before_something[0] == pytest.approx(edges[0], abs=0.2)
+    assert before_something[0] < before_nothing[0]
 
 
 def test_rays_without_a_width_have_no_window():
