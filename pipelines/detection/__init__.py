@@ -216,7 +216,8 @@ def _moved_back(found: MarkerCandidates, points: Column, others: Column) -> Mark
         return np.asarray(p + np.mean(others[rows] - points[rows], axis=0))
 
     places = np.array([one.p_base for one in found.rejected]).reshape(-1, 3)
-    nearest = np.atleast_2d(KDTree(points).query(places, k=_N_ABOUT)[1])
+    seen = np.flatnonzero(np.isfinite(points).all(axis=1))  # no return is at no place
+    nearest = seen[KDTree(points[seen]).query(places, k=range(1, min(_N_ABOUT, len(seen)) + 1))[1]]
     return replace(
         found,
         candidates=tuple(

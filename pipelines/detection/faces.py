@@ -69,8 +69,9 @@ def joined(cloud: StitchedCloud, apart: Apart) -> StitchedCloud:
     angles = np.asarray(cloud.gimbal_angles)
     cos, sin = np.cos(angles), np.sin(angles)
     x, y, z = cloud.p_base.T
-    p_head = np.column_stack([cos * x + sin * y, cos * y - sin * x, z])
-    x, y, z = (p_head @ moved[:3, :3].T.astype(np.float32) + moved[:3, 3].astype(np.float32)).T
-    p_base = np.column_stack([cos * x - sin * y, cos * y + sin * x, z])
+    with np.errstate(invalid="ignore"):  # returns that are none stay none
+        p_head = np.column_stack([cos * x + sin * y, cos * y - sin * x, z])
+        x, y, z = (p_head @ moved[:3, :3].T.astype(np.float32) + moved[:3, 3].astype(np.float32)).T
+        p_base = np.column_stack([cos * x - sin * y, cos * y + sin * x, z])
     rig = replace(cloud.rig, T_head_lidar=T_head_lidar)
     return replace(cloud, p_base=p_base, rig=rig)

@@ -59,13 +59,33 @@ def test_places_are_those_of_the_given_rig(found, rough_scan):
         assert np.linalg.norm(one.p_base_rough - middle) < 1.2 * RADIUS
 
 
+def test_returns_that_are_none_move_no_marker(found, rough_scan):
+    p = np.vstack([rough_scan.p_base, np.full((50, 3), np.nan), np.full((50, 3), np.inf)])
+    columns = {
+        name: np.append(np.asarray(getattr(rough_scan, name)), np.zeros(100, dtype))
+        for name, dtype in (
+            ("gimbal_angles", np.float32),
+            ("intensities", np.float32),
+            ("rings", np.uint8),
+            ("times", np.float32),
+        )
+    }
+    spoilt = replace(rough_scan, p_base=p.astype(np.float32), **columns)
+    again = extract(spoilt, ExtractionConfig(), RADIUS)
+    places, before = ([one.p_base_rough for one in own.candidates] for own in (again, found))
+    np.testing.assert_allclose(places, before, rtol=0, atol=1e-3)
+
+
 @pytest.mark.parametrize(("faces", "share"), [((0.5,), 1.0), ((-0.5,), 1.0), ((0.5, -0.5), 0.0)])
 def test_refused_groups_too_are_where_the_given_rig_shows_them(true_scan, rough_scan, faces, share):
     """Away by half of what lies between the faces where one shows them, not where both do."""
     place = MARKERS[4]
     is_near = np.linalg.norm(true_scan.p_base - place, axis=1) < 1.5 * RADIUS
     own = np.isin(faces_of(RIG, true_scan.gimbal_angles, place), faces)
-    points, others = (one.p_base[is_near & own] for one in (true_scan, rough_scan))
+    none = np.array([[np.nan] * 3, [np.inf] * 3], np.float32)  # returns that are none
+    points, others = (
+        np.vstack([none, one.p_base[is_near & own]]) for one in (true_scan, rough_scan)
+    )
     refused = Rejection(p_base=place, n_points=9, reason="")
     found = MarkerCandidates(candidates=(), rejected=(refused,), ground_height_max=0.0)
     (back,) = _moved_back(found, points, others).rejected
