@@ -209,6 +209,20 @@ def test_every_route_is_among_the_wrong_requests_or_takes_no_input(site):
         ), path
 
 
+def test_every_operation_takes_the_parameters_of_its_description_and_no_other(site):
+    for path, operations in site.client.get("/api/v1/openapi.json").json()["paths"].items():
+        for method, operation in operations.items():
+            known = sorted(
+                one["name"] for one in operation.get("parameters", ()) if one["in"] == "query"
+            )
+            url = path.replace("{figure}.{form}", "distance.json").replace("{kind}", "geojson")
+            answer = site.client.request(method, url, params=dict.fromkeys((*known, "odd"), "1"))
+            assert answer.status_code == 422, (method, path)
+            if method != "head":  # which has no body
+                wanted = f"query.odd: this operation has {', '.join(known) or 'no parameters'}"
+                assert wanted in answer.json()["detail"].split("; "), (method, path, answer.text)
+
+
 def test_operations_have_names_of_their_own(site):
     paths = site.client.get("/api/v1/openapi.json").json()["paths"]
     names = [one["operationId"] for path in paths.values() for one in path.values()]

@@ -4,10 +4,11 @@ Every handler parses, makes one call and returns; requests and responses are in 
 ``rows``.
 """
 
-from functools import cache
-
-from fastapi import APIRouter, Depends, FastAPI, Request
+from fastapi import APIRouter, Depends, Request
+from fastapi.dependencies.utils import get_flat_params
 from fastapi.exceptions import RequestValidationError
+from fastapi.params import Cookie, Header, Path
+from fastapi.routing import APIRoute
 
 from spheremark.service.http.api import (
     audit,
@@ -30,9 +31,10 @@ from spheremark.service.http.api import sites as products
 
 def _require_known_parameters(request: Request) -> None:
     """Refuse parameters of the query that the operation does not describe."""
-    known = _parameters(request.app).get(request.scope["route"].name)
-    if known is None:  # the operation has no description
+    route: APIRoute = request.scope["route"]
+    if not route.include_in_schema:  # the operation has no description
         return
+    known = _parameters(route)
     unknown = [name for name in request.query_params if name not in known]
     if unknown:
         text = f"this operation has {', '.join(sorted(known)) or 'no parameters'}"
@@ -40,12 +42,10 @@ def _require_known_parameters(request: Request) -> None:
         raise RequestValidationError(found)
 
 
-@cache
-def _parameters(app: FastAPI) -> dict[str, set[str]]:
-    """Return the names of the parameters that the query of each operation may have."""
-    operations = [one for path in app.openapi()["paths"].values() for one in path.values()]
-    found = ((each["operationId"], each.get("parameters", ())) for each in operations)
-    return {key: {one["name"] for one in many if one["in"] == "query"} for key, many in found}
+def _parameters(route: APIRoute) -> set[str]:
+    """Return the names of the parameters that the query of an operation may have."""
+    found = get_flat_params(route.dependant)  # those in models of many are of no class of FastAPI
+    return {one.alias for one in found if not isinstance(one.field_info, (Path, Header, Cookie))}
 
 
 router = APIRouter(dependencies=[Depends(_require_known_parameters)])
