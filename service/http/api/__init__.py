@@ -31,10 +31,7 @@ from spheremark.service.http.api import sites as products
 
 def _require_known_parameters(request: Request) -> None:
     """Refuse parameters of the query that the operation does not describe."""
-    route: APIRoute = request.scope["route"]
-    if not route.include_in_schema:  # the operation has no description
-        return
-    known = _parameters(route)
+    known = _parameters(request.scope["route"])
     unknown = [name for name in request.query_params if name not in known]
     if unknown:
         text = f"this operation has {', '.join(sorted(known)) or 'no parameters'}"
@@ -44,7 +41,7 @@ def _require_known_parameters(request: Request) -> None:
 
 def _parameters(route: APIRoute) -> set[str]:
     """Return the names of the parameters that the query of an operation may have."""
-    found = get_flat_params(route.dependant)  # those in models of many are of no class of FastAPI
+    found = get_flat_params(route.dependant)  # fields of a model have no class that says `Query`
     return {one.alias for one in found if not isinstance(one.field_info, (Path, Header, Cookie))}
 
 
