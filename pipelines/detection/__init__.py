@@ -29,11 +29,13 @@ import numpy as np
 from scipy.spatial import KDTree
 
 from spheremark.pipelines.config import ExtractionConfig
+from spheremark.pipelines.detection.beams import GATES
 from spheremark.pipelines.detection.cells import Cells, cells_of
 from spheremark.pipelines.detection.decision import (
     UNDECIDED,
     Judgement,
     distinct,
+    gates_of,
     is_resolved,
     judged,
     noise_of,
@@ -258,19 +260,19 @@ def _log_likelihoods(
     """Return the logarithms of the likelihoods of some groups by all hypotheses, (n, k).
 
     And how far apart the faces show the best spheres, (n, 3) radii; zero where one does alone. What
-    markers have in common, as noise and where beams come to hit an outline, is known from all of
-    the scan, by how probably each is one.
+    markers have in common, as noise, where beams come to hit an outline and how far echoes merge,
+    is known from all of the scan, by how probably each is one.
     """
     n = len(compared)
     k = len(USUAL) + 1  # what markers share, with the noise
     found, shared, covs = np.empty((n, len(NAMES))), np.empty((n, k)), np.empty((n, k, k))
-    shapes = [np.empty((0, N_PARAMETERS))] * n
+    shapes, by_gate = [np.empty((0, N_PARAMETERS))] * n, np.empty((n, len(GATES)))
     physics = [_physics(one.features, noise, hearing, config) for one in compared]
 
     def compare(rows: Sequence[int]) -> None:
         for i in rows:
             features, evidence, n_neighbours, _ = compared[i]
-            found[i], shared[i], covs[i], shapes[i] = log_likelihoods(
+            found[i], shared[i], covs[i], shapes[i], by_gate[i] = log_likelihoods(
                 evidence, features.p_base, target, n_neighbours, physics[i], shapes[i]
             )
 
@@ -279,8 +281,9 @@ def _log_likelihoods(
         probabilities = [one.probability for one in _judged(compared, found)]
         half_widths = np.array([one.evidence.blur.mean() for one in compared])
         known = shared_of((shared, covs), probabilities, physics, half_widths)
+        gates = gates_of(by_gate, probabilities)
         physics = [
-            one._replace(shared=means, sigmas=sigmas)
+            one._replace(shared=means, sigmas=sigmas, gates=gates)
             for one, means, sigmas in zip(physics, *known, strict=True)
         ]
     again = np.flatnonzero(found[:, 0] > found.max(axis=1, initial=-np.inf) - UNDECIDED)

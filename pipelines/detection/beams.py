@@ -28,8 +28,12 @@ _N_MAX = 192  # beams that are compared at most: each costs as much
 _N_SIDES, _ANY_SIDE = 12, 0.3  # sides of an object; beams on each of which nothing is known
 _N_PLANE, _ROUGH = 5, 0.1  # returns that show a plane beside it, and the least scatter about one
 _FAINT = 1e-9  # least strength of an echo
+_AWAY = 40.0  # depth of what is not seen behind an object: too far to matter
 _WIDTHS = np.linspace(-1.0, 1.0, 401)  # half widths of a beam from its middle to an outline
 _SHARES = (np.arccos(_WIDTHS) - _WIDTHS * np.sqrt(1.0 - _WIDTHS**2)) / np.pi  # of it, inside
+
+GATES = np.array([0.0, *np.geomspace(0.1, 1.0, 8)])
+"""Distances [m] of two surfaces whose echoes are just one; the first means that none ever are."""
 
 
 class Beams(NamedTuple):
@@ -47,6 +51,10 @@ class Beams(NamedTuple):
     even : (n,)
         Half widths of a beam outside its outline where the echo of what stands beside it is as
         strong as that of the object.
+    away : (n,)
+        How deep the beams end, in the mean, that pass the object by on the same side.
+    merged : (n,)
+        Probability that the echoes of the object and of what is there are one.
     blur, blur_up : float
         Half the width of a beam across and up.
     lost, faintest : float
@@ -60,6 +68,8 @@ class Beams(NamedTuple):
     behind: Array
     empty: Array
     even: Array
+    away: Array
+    merged: Array
     blur: float
     blur_up: float
     lost: float
@@ -97,7 +107,7 @@ def beams_about(
     share_low = (np.sum(is_low & is_near) + 0.3) / (is_low.sum() + 1.3)
     share_high = (n_near + 0.3) / (n_near + n_past + 1.3)
     shares = np.where(y[kept] < _LOWEST, max(share_low, share_high), share_high)
-    empty, even = _beside(every[:, kept], every[:, is_beside], strength)
+    empty, even, away = _beside(every[:, kept], every[:, is_beside], strength)
     beams = Beams(
         x=x[kept],
         y=y[kept],
@@ -106,6 +116,8 @@ def beams_about(
         behind=_density_behind(every[:3, kept], every[:3, is_high & is_near], shares),
         empty=empty,
         even=even,
+        away=away,
+        merged=np.zeros(len(kept)),
         blur=blurs[0],
         blur_up=blurs[1],
         lost=hearing[0],
@@ -158,22 +170,29 @@ def _density_behind(kept: Array, near: Array, shares: Array) -> Array:
     return np.where(kept[2] < NEAR, shares * density, 1.0 - shares)
 
 
-def _beside(kept: Array, beside: Array, strength: float) -> tuple[Array, Array]:
-    """Return what beams show that pass the object on the same side as each: empty, and even."""
+def _beside(kept: Array, beside: Array, strength: float) -> tuple[Array, Array, Array]:
+    """Return ``empty``, ``even`` and ``away``: what beams show that pass on the same side."""
     is_heard, own = beside[2] < np.inf, _sides(beside)
     logs = np.log(np.maximum(beside[4] / strength, _FAINT))
-    silent, heard, logs = (
-        np.bincount(own, weights=weights, minlength=_N_SIDES)
-        for weights in (~is_heard, is_heard, logs * is_heard)
-    )
-    silent, heard, logs = (
-        sums + np.roll(sums, 1) + np.roll(sums, -1) for sums in (silent, heard, logs)
+    depths = np.minimum(beside[2], _AWAY)
+    silent, heard, logs, depths = (
+        sums + np.roll(sums, 1) + np.roll(sums, -1)
+        for sums in (
+            np.bincount(own, weights=weights, minlength=_N_SIDES)
+            for weights in (~is_heard, is_heard, logs * is_heard, depths * is_heard)
+        )
     )
     empty = (silent + _ANY_SIDE) / (silent + heard + 2.0 * _ANY_SIDE)
     ratios = np.exp(logs / (heard + _ANY_SIDE))
     even = np.interp(ratios / (1.0 + ratios), _SHARES[::-1], _WIDTHS[::-1])
+    away = (depths + _AWAY * _ANY_SIDE) / (heard + _ANY_SIDE)
     sides = _sides(kept)
-    return empty[sides], even[sides]
+    return empty[sides], even[sides], away[sides]
+
+
+def merged_within(beams: Beams, gates: Array, radius: float) -> Beams:
+    """Return the beams with ``merged`` by the probabilities of each of ``GATES``."""
+    return beams._replace(merged=(beams.away[:, None] * radius < GATES) @ gates)
 
 
 def _sides(beams: Array) -> Index:

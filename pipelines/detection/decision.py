@@ -293,6 +293,28 @@ def shared_of(
     return found, np.sqrt(np.diagonal(known + varies, axis1=1, axis2=2))
 
 
+def gates_of(by_gate: Array, probabilities: Sequence[float]) -> Array:
+    """Return how probable each of ``GATES`` is in a scan, (9,).
+
+    Parameters
+    ----------
+    by_gate : (n, 9)
+        Logarithms of the likelihoods of some groups as spheres.
+    probabilities : sequence of float
+        That each is a marker: by as much it counts.
+
+    Notes
+    -----
+    Half of the prior is for none: then no echo lies between two surfaces. A shape before nothing
+    shows nothing of a gate.
+    """
+    prior = np.full(by_gate.shape[1], 0.5 / (by_gate.shape[1] - 1))
+    prior[0] = 0.5
+    logs = np.asarray(probabilities) @ by_gate + np.log(prior)
+    shares = np.exp(logs - logs.max())
+    return np.asarray(shares / shares.sum())
+
+
 def _by_windows(half_widths: Array) -> Array:
     """Return what each group shows by what all share and by two widths at the window, (n, 5, 7)."""
     n = len(_VARIES)

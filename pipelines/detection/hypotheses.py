@@ -11,7 +11,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from spheremark.pipelines.detection.beams import beams_about
+from spheremark.pipelines.detection.beams import GATES, beams_about, merged_within
 from spheremark.pipelines.detection.evidence import Evidence
 from spheremark.pipelines.detection.faces import MOVED, TURNED
 from spheremark.pipelines.detection.search import compared, cov_shared
@@ -34,6 +34,7 @@ from spheremark.pipelines.detection.shapes import (
     SPHERE,
     STRETCH,
     Z,
+    log_likelihood,
 )
 from spheremark.pipelines.detection.support import ANY, OPEN, log_share, log_supports
 from spheremark.pipelines.detection.target import Target
@@ -95,12 +96,15 @@ class Physics(NamedTuple):
         Share of the pulses on a surface without a return.
     weakest : float
         Reflectivity over squared range of the weakest returns [1/m^2].
+    gates : (9,)
+        Probabilities of each of ``GATES``.
     """
 
     shared: Array
     sigmas: Array
     lost: float
     weakest: float
+    gates: Array = np.eye(1, len(GATES))[0]
 
 
 USUAL = (1.0, -0.1, 0.0, 0.0)  # edges: measured on markers of random worlds
@@ -117,7 +121,7 @@ def log_likelihoods(
     n_neighbours: int,
     physics: Physics,
     begun: Array,
-) -> tuple[Array, Array, Array, Array]:
+) -> tuple[Array, Array, Array, Array, Array]:
     """Return the logarithms of the likelihoods of all hypotheses, and what the best sphere shows.
 
     Parameters
@@ -137,8 +141,9 @@ def log_likelihoods(
 
     Returns
     -------
-    (k,), (5,), (5, 5), (k, p)
-        Logarithms; what markers share, as in ``Physics``, and its covariance; the best shapes.
+    (k,), (5,), (5, 5), (k, p), (9,)
+        Logarithms; what markers share, as in ``Physics``, and its covariance; the best shapes;
+        the logarithms of the likelihoods of the best sphere by each of ``GATES``.
 
     Notes
     -----
@@ -150,6 +155,7 @@ def log_likelihoods(
     strength = max(evidence.brightness, 1.0) / distance**2
     faintest = min(max(physics.weakest / strength, _FLOOR), _HEARD)  # its own returns are heard
     beams, n_beside, n_passing = beams_about(evidence, radius, strength, (physics.lost, faintest))
+    beams = merged_within(beams, physics.gates, radius)
     logs = log_supports(evidence, float(centre @ target.up), radius)
     for kind in range(len(NAMES)):
         logs[kind] += _log_beside(kind, n_beside, n_passing)
@@ -166,7 +172,11 @@ def log_likelihoods(
     shared = sphere[NOISE : FORM + 1].copy()
     shared[0] += np.log(radius)
     cov = cov_shared(sphere, priors[SPHERE], beams)
-    return np.asarray(np.maximum(found, never)), shared, cov, shapes
+    by_gate, densities = np.empty(len(GATES)), np.empty(len(beams.x))
+    for i, gate in enumerate(np.eye(len(GATES))):
+        own = merged_within(beams, gate, radius)
+        by_gate[i] = log_likelihood(SPHERE, sphere, priors[SPHERE], own, densities)
+    return np.asarray(np.maximum(found, never)), shared, cov, shapes, by_gate
 
 
 def _priors(radius: float, physics: Physics) -> Array:

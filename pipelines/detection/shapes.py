@@ -42,6 +42,8 @@ _MERGED = 0.6  # share of the echoes of a beam that an outline halves, between i
 _MISPLACED = 0.01  # share of the beams on a solid surface that seem to end behind it
 _SOFT = (0.07, 0.35)  # radii, and half widths of a beam besides, over which beams come to hit
 _N_ALIKE = 1000.0  # beams that share errors of the model so that each counts as half a beam
+_LEAST_BEHIND = 0.1  # of the same: anything nearer touches the object
+_UNEVEN = 0.05  # of what stands behind an object: how far the mean depth of a side may be off
 _FLOOR = 1e-9
 
 
@@ -56,6 +58,13 @@ def _inside(inner: float, blur: float, edge: float) -> float:
     """Return the probability that a beam hits what it passes so far inside the outline of."""
     share = min(max((inner + edge * blur) / (_SOFT[0] + _SOFT[1] * blur) + 0.5, 0.0), 1.0)
     return share * share * (3.0 - 2.0 * share)
+
+
+@compiled
+def _divided(inner: float, blur: float) -> float:
+    """Return how evenly an outline divides a beam that passes so far inside it: 0 to 1."""
+    share = inner / (blur + _FLOOR)
+    return max(1.0 - share * share, 0.0)
 
 
 @compiled
@@ -100,30 +109,34 @@ def _form_of(kind: int, shape: Array) -> _Form:
 @compiled
 def _surface(
     kind: int, x: float, y: float, shape: Array, form: _Form, beam: _Beam
-) -> tuple[float, float]:
-    """Return the share of a beam that an object stops there, and the depth."""
+) -> tuple[float, float, float]:
+    """Return the share of a beam that an object stops there, the depth, and how it is divided."""
     (a, b, c, d), (edge, blur_across, blur_up) = form, beam
     if kind == SOLID:
-        share, depth = _solid(x, y, shape[FORM:SHIFT], beam)
-        return share, depth
+        share, depth, divided = _solid(x, y, shape[FORM:SHIFT], beam)
+        return share, depth, divided
     if kind <= HEAD or kind == CLUTTER:
         gap2 = x * x + y * y + _FLOOR
         blur = np.sqrt(((blur_across * x) ** 2 + (blur_up * y) ** 2) / gap2)
         if kind == CLUTTER:
-            return b * _inside(a - np.sqrt(gap2), blur, edge), 0.0
+            return b * _inside(a - np.sqrt(gap2), blur, edge), 0.0, 0.0
         gap = np.sqrt(x * x + y * y / (b * b))
-        share = _inside((a - gap) * min(b, 1.0), blur, edge)
-        return share, c * (_round(gap, a, blur) + MEAN * a) if share > 0.0 else 0.0
+        inner = (a - gap) * min(b, 1.0)
+        share, divided = _inside(inner, blur, edge), _divided(inner, blur)
+        is_met = share + divided > 0.0
+        return share, c * (_round(gap, a, blur) + MEAN * a) if is_met else 0.0, divided
     over = b - y if kind == POST else b - abs(y)
     share = min(_inside(a - abs(x), blur_across, edge), _inside(over, blur_up, edge))
+    divided = min(a - abs(x), over * blur_across / (blur_up + _FLOOR))
+    divided = _divided(divided, blur_across)
     if kind == PANEL:
-        return share, c * x + d * y
-    return share, _round(abs(x), a, blur_across) + MEAN * a
+        return share, c * x + d * y, divided
+    return share, _round(abs(x), a, blur_across) + MEAN * a, divided
 
 
 @compiled
-def _solid(x: float, y: float, form: Array, beam: _Beam) -> tuple[float, float]:
-    """Return the share of a beam that a deformed sphere stops, and the depth.
+def _solid(x: float, y: float, form: Array, beam: _Beam) -> tuple[float, float, float]:
+    """Return the share of a beam that a deformed sphere stops, the depth, and how it is divided.
 
     Its outline has waves of two and three in a turn, its depth any tilt and curvature.
     """
@@ -134,12 +147,36 @@ def _solid(x: float, y: float, form: Array, beam: _Beam) -> tuple[float, float]:
     waves = form[1] * c2 + form[2] * s2
     waves += form[3] * (c * c2 - s * s2) + form[4] * (s * c2 + c * s2)
     radius, ratio = np.exp(form[0]), np.exp(waves)
-    share = _inside(radius * ratio - gap, blur, beam[0])
-    if share <= 0.0:
-        return 0.0, 0.0
+    inner = radius * ratio - gap
+    share, divided = _inside(inner, blur, beam[0]), _divided(inner, blur)
+    if share + divided <= 0.0:
+        return 0.0, 0.0, 0.0
     depth = _round(gap / ratio, radius, blur) + MEAN * radius + form[5] * x + form[6] * y
     depth += form[7] * (gap * gap - 0.5) + gap * gap * (form[8] * c2 + form[9] * s2)
-    return share, depth
+    return share, depth, divided
+
+
+@compiled
+def _merged(
+    apart: float, share: float, beams: Beams, i: int, surface: tuple[float, float]
+) -> float:
+    """Return the density of a beam whose echoes from a surface and from behind it may be one.
+
+    The one range lies anywhere between the two. ``apart`` is the density where they are two,
+    ``share`` the probability that they are one, ``surface`` how deep it is, and the noise.
+    """
+    if share <= 0.0:
+        return apart
+    (depth, sigma), z, one = surface, beams.z[i] - surface[0], _STRAY * beams.behind[i]
+    gap, far = max(beams.away[i] - depth, _LEAST_BEHIND), NEAR - depth
+    if z == np.inf:
+        one += _MISPLACED
+    elif z >= far:  # depths are not told apart there
+        one += max(1.0 - far / gap, _MISPLACED)
+    else:
+        low, high = z / sigma, (gap - z) / (sigma + _UNEVEN * gap)
+        one += 1.0 / (gap * (1.0 + np.exp(-max(low, -30.0))) * (1.0 + np.exp(-max(high, -30.0))))
+    return float(share * one + (1.0 - share) * apart)
 
 
 @compiled
@@ -158,14 +195,15 @@ def log_likelihood(kind: int, shape: Array, prior: Array, beams: Beams, densitie
     form, pole = _form_of(kind, shape), np.exp(shape[POLE])
     variance = form[2] if kind == CLUTTER else np.exp(2.0 * shape[NOISE])
     scale, precision = (1.0 - _STRAY) / np.sqrt(6.283185 * variance), 0.5 / variance
+    sigma = np.sqrt(variance)
     bottom = -form[1] if kind in (CYLINDER, POST) else -_POLE_FROM * form[0] * form[1]
     pole_share = _POLE_SHARE * pole / (pole + 0.5 * beams.blur)  # a thin pole covers part of a beam
     has_pole = prior[1, POLE] > 0.0
     for i in range(len(beams.x)):
         x = beams.x[i] - shape[X] - beams.face[i] * shape[SHIFT]
         y = beams.y[i] - shape[Y] - beams.face[i] * shape[SHIFT + 1]
-        z = beams.z[i] - shape[Z] - beams.face[i] * shape[SHIFT + 2]
-        is_near = beams.z[i] < NEAR
+        moved = shape[Z] + beams.face[i] * shape[SHIFT + 2]
+        z, is_near = beams.z[i] - moved, beams.z[i] < NEAR
         rest, beam = beams.behind[i], _beam(shape, beams, i)
         if has_pole and y < bottom:
             share = pole_share * _inside(pole - abs(x), beams.blur, beam[0])
@@ -173,7 +211,7 @@ def log_likelihood(kind: int, shape: Array, prior: Array, beams: Beams, densitie
             if beams.z[i] == np.inf:
                 on = _unheard(share, beams)
             rest = share * on + (1.0 - share) * rest
-        share, depth = _surface(kind, x, y, shape, form, beam)
+        share, depth, divided = _surface(kind, x, y, shape, form, beam)
         if share > 0.0:
             on = _MISPLACED
             if is_near:
@@ -182,6 +220,7 @@ def log_likelihood(kind: int, shape: Array, prior: Array, beams: Beams, densitie
             elif beams.z[i] == np.inf and kind != CLUTTER:  # leaves have gaps anyway
                 on = _unheard(share, beams)
             rest = share * on + (1.0 - share) * rest
+        rest = _merged(rest, divided * beams.merged[i], beams, i, (moved + depth, sigma))
         densities[i] = rest + _FLOOR
         product *= densities[i]
         if product < 1e-200:
@@ -196,7 +235,7 @@ def align(kind: int, shape: Array, beams: Beams) -> None:
     for i in range(len(beams.x)):
         x = beams.x[i] - shape[X] - beams.face[i] * shape[SHIFT]
         y = beams.y[i] - shape[Y] - beams.face[i] * shape[SHIFT + 1]
-        share, depth = _surface(kind, x, y, shape, form, _beam(shape, beams, i))
+        share, depth, _ = _surface(kind, x, y, shape, form, _beam(shape, beams, i))
         if share > 0.5 and abs(beams.z[i]) < 1.5:
             n += 1
             total += beams.z[i] - depth

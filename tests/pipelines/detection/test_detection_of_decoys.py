@@ -164,7 +164,7 @@ def test_cubes_are_no_markers(turn):
 @pytest.mark.parametrize(
     "gap",
     [
-        # one marker alone shows no edge of its scan: before a panel it may be a smaller ball
+        # one marker alone does not show enough of a gate: before a panel it may be a smaller ball
         pytest.param(0.15, marks=pytest.mark.xfail(strict=True, raises=AssertionError)),
         0.3,
         1.0,

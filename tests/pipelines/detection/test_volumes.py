@@ -41,6 +41,8 @@ def beams_at(rng, step):
         behind=np.where(off < 1.0, 1e-3, 0.9),
         empty=ones,
         even=0.0 * ones,
+        away=np.inf * ones,
+        merged=0.0 * ones,
         blur=0.05,
         blur_up=0.05,
         lost=0.02,
