@@ -33,7 +33,7 @@ _WIDTHS = np.linspace(-1.0, 1.0, 401)  # half widths of a beam from its middle t
 _SHARES = (np.arccos(_WIDTHS) - _WIDTHS * np.sqrt(1.0 - _WIDTHS**2)) / np.pi  # of it, inside
 
 GATES = np.array([0.0, *np.geomspace(0.1, 1.0, 8)])
-"""Distances [m] of two surfaces whose echoes are just one; the first means that none ever are."""
+"""Distances [m] below which the echoes of two surfaces are one; the first: they never are."""
 
 
 class Beams(NamedTuple):
@@ -54,7 +54,7 @@ class Beams(NamedTuple):
     away : (n,)
         How deep the beams end, in the mean, that pass the object by on the same side.
     merged : (n,)
-        Probability that the echoes of the object and of what is there are one.
+        Probability that the echoes of the object and of what is there are one; zero at first.
     blur, blur_up : float
         Half the width of a beam across and up.
     lost, faintest : float

@@ -42,8 +42,8 @@ _MERGED = 0.6  # share of the echoes of a beam that an outline halves, between i
 _MISPLACED = 0.01  # share of the beams on a solid surface that seem to end behind it
 _SOFT = (0.07, 0.35)  # radii, and half widths of a beam besides, over which beams come to hit
 _N_ALIKE = 1000.0  # beams that share errors of the model so that each counts as half a beam
-_LEAST_BEHIND = 0.1  # of the same: anything nearer touches the object
-_UNEVEN = 0.05  # of what stands behind an object: how far the mean depth of a side may be off
+_LEAST_BEHIND = 0.1  # radii from a surface to what is behind it: anything nearer touches it
+_UNEVEN = 0.05  # share of that distance by which what is behind may be nearer or farther
 _FLOOR = 1e-9
 
 
@@ -110,7 +110,7 @@ def _form_of(kind: int, shape: Array) -> _Form:
 def _surface(
     kind: int, x: float, y: float, shape: Array, form: _Form, beam: _Beam
 ) -> tuple[float, float, float]:
-    """Return the share of a beam that an object stops there, the depth, and how it is divided."""
+    """Return the share of a beam that an object stops there, depth, and how evenly it is split."""
     (a, b, c, d), (edge, blur_across, blur_up) = form, beam
     if kind == SOLID:
         share, depth, divided = _solid(x, y, shape[FORM:SHIFT], beam)
@@ -136,7 +136,7 @@ def _surface(
 
 @compiled
 def _solid(x: float, y: float, form: Array, beam: _Beam) -> tuple[float, float, float]:
-    """Return the share of a beam that a deformed sphere stops, the depth, and how it is divided.
+    """Return the share of a beam that a deformed sphere stops, depth, and how evenly it is split.
 
     Its outline has waves of two and three in a turn, its depth any tilt and curvature.
     """
@@ -171,7 +171,7 @@ def _merged(
     gap, far = max(beams.away[i] - depth, _LEAST_BEHIND), NEAR - depth
     if z == np.inf:
         one += _MISPLACED
-    elif z >= far:  # depths are not told apart there
+    elif z >= far:  # only that it ends so deep is known
         one += max(1.0 - far / gap, _MISPLACED)
     else:
         low, high = z / sigma, (gap - z) / (sigma + _UNEVEN * gap)
