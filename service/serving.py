@@ -15,6 +15,7 @@ from uvicorn.importer import import_from_string
 from spheremark.pipelines.errors import ConflictError
 from spheremark.service.jobs.memory import return_memory
 from spheremark.service.logs import log_to_stderr
+from spheremark.service.processes import load
 from spheremark.service.settings import Settings
 
 Ready = Callable[[str], None]
@@ -49,6 +50,8 @@ def serve(settings: Settings, *, ready: Ready) -> None:
     return_memory()
     sys.setswitchinterval(_TURN)
     os.umask(0o077)  # what the service and its workers write is for its user alone
+    if not settings.scheduler:
+        load()
     create_app = import_from_string(_APPLICATION)  # Dask, which it imports, configures logging too
     log_to_stderr(settings.log_format)
     app: FastAPI = create_app(settings)

@@ -24,6 +24,7 @@ from distributed import Client, Future, LocalCluster, Security
 from distributed.client import FutureCancelledError
 from distributed.core import Status
 from distributed.scheduler import KilledWorker
+from distributed.utils import get_mp_context
 
 from spheremark.pipelines.config import SurveyConfig
 from spheremark.pipelines.errors import ConflictError, SpheremarkError
@@ -39,6 +40,7 @@ from spheremark.service.jobs.handlers import (
     Reading,
 )
 from spheremark.service.logs import event_level
+from spheremark.service.processes import METHOD, forked
 from spheremark.service.settings import Settings
 from spheremark.storage.catalogue.catalogue import Catalogue
 from spheremark.storage.catalogue.records import JobRecord
@@ -53,7 +55,7 @@ WORKER_DIED = "worker_died"
 TOO_LONG = "job_timeout"
 _RECORD_EVERY = 0.5  # [s] between two reports of progress that reach the database
 _STORE_AGAIN, _STORE_AGAIN_MAX = 1.0, 30.0  # [s] until a result is written again
-_COUNT_EVERY = 2.0  # [s] between two counts of the workers
+_COUNT_EVERY, _COUNT_FIRST = 2.0, 0.2  # [s] between two counts of the workers, and without any
 _PARTING = 10.0  # [s] that a scheduler has to answer
 _SCHEDULER_LOST = "scheduler-connection-lost"  # as Dask gives it for a reason
 _LOST = (OSError, TimeoutError, RuntimeError, ValueError)  # what Dask raises without a scheduler
@@ -147,15 +149,18 @@ class JobQueue:
                         "distributed.admin.tick.interval": "1s",
                         # no history of processor and memory, which grows for an hour
                         "distributed.admin.system-monitor.log-length": 10,
+                        "distributed.worker.multiprocessing-method": METHOD,
                         # no pages of Dask
                         "distributed.scheduler.http.routes": [],
                         "distributed.worker.http.routes": [],
                     }
                 )
             )
+            get_mp_context()  # Dask says but once what a new process has loaded
+            forked()
             address = self._own = await self._cluster.enter_async_context(
                 LocalCluster(
-                    n_workers=self._settings.workers,
+                    n_workers=0,  # the first takes seconds, which pages need not wait for
                     threads_per_worker=1,
                     memory_limit=self._settings.job_memory_bytes or "auto",
                     processes=True,
@@ -174,6 +179,7 @@ class JobQueue:
         self._cluster.push_async_callback(client.close)
         client.subscribe_topic(tasks.TOPIC, lambda event: self._events_in.put_nowait(event[1]))
         await client.register_plugin(tasks.WarmUp(is_ours=not self._settings.scheduler))
+        self._replace_workers()
         return client
 
     async def _disconnect(self) -> None:
@@ -215,7 +221,7 @@ class JobQueue:
                 )
                 self._n_workers = len(known["workers"])
                 self._replace_workers()
-            await asyncio.sleep(_COUNT_EVERY)
+            await asyncio.sleep(_COUNT_EVERY if self._n_workers else _COUNT_FIRST)
 
     def _replace_workers(self) -> None:
         """Start workers in place of those that could not start again."""

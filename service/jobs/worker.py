@@ -115,14 +115,8 @@ def _log_compilation(n_compiled: int) -> None:
 
 def warm_up() -> None:
     """Load the modules of a job, and the kernels compiled by earlier processes."""
-    import open3d  # noqa: F401
+    from spheremark.service.jobs import loaded  # noqa: F401
 
-    from spheremark.pipelines import survey  # noqa: F401
-    from spheremark.pipelines.compilation import load_kernels
-    from spheremark.storage.catalogue import results  # noqa: F401
-    from spheremark.storage.clouds import stop  # noqa: F401
-
-    load_kernels()
     start_readers()
 
 

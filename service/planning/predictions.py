@@ -12,7 +12,6 @@ import signal
 import sys
 from collections.abc import Callable
 from concurrent.futures import Future, wait
-from multiprocessing import get_context
 from typing import Any
 
 from pebble import ProcessExpired, ProcessPool
@@ -20,6 +19,7 @@ from pebble import ProcessExpired, ProcessPool
 from spheremark.pipelines.errors import SolveError
 from spheremark.pipelines.progress import checkpoint
 from spheremark.service.errors import PredictionTimeoutError
+from spheremark.service.processes import forked
 from spheremark.service.serialise.plans import Plain
 
 _LOOK_EVERY = 0.2  # [s] whether the caller still waits
@@ -43,7 +43,7 @@ class Predictions:
             max_workers=n_processes,
             initializer=_confine,
             initargs=(memory_bytes,),
-            context=get_context("spawn"),
+            context=forked(),
         )
 
     def run(self, function: Callable[..., Plain], *arguments: Any) -> Plain:

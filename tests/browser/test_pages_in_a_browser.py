@@ -10,7 +10,7 @@ import psutil
 import pytest
 
 from tests.browser.visits import NEEDS_CHROMIUM, PAGES
-from tests.service.conftest import is_spawned
+from tests.service.conftest import is_worker
 from tests.storage.recorder import record, small_log
 
 pytestmark = NEEDS_CHROMIUM
@@ -219,7 +219,7 @@ KEEP_WHAT_CHANGES = """() => {
 @contextmanager
 def workers_at_rest():
     """Keep the workers of the service from starting a job."""
-    found = [one for one in psutil.Process().children(recursive=True) if is_spawned(one)]
+    found = [one for one in psutil.Process().children(recursive=True) if is_worker(one)]
     assert found
     for one in found:
         one.suspend()

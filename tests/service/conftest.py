@@ -1,6 +1,7 @@
 """One simulated stop, and a running service on a folder of its own, for the tests of this room."""
 
 import time
+from contextlib import suppress
 
 import psutil
 import pytest
@@ -15,9 +16,12 @@ PATIENCE = 300.0  # [s] ends a test that would hang; one that passes never waits
 MCAP = {"Content-Type": "application/vnd.mcap"}
 
 
-def is_spawned(process):
-    """Whether a process is a worker that lives."""
-    return runs(process, "spawn_main")
+def is_worker(process):
+    """Whether a process is a worker that lives: of a service, or of a scheduler besides."""
+    with suppress(psutil.Error):
+        is_forked = runs(process, "forkserver") and runs(process.parent(), "forkserver")
+        return is_forked or runs(process, "spawn_main")
+    return False
 
 
 def runs(process, what):
@@ -53,10 +57,15 @@ class Site:
         )
 
     def workers(self):
-        """Return the worker processes of the service, without the one that tests share."""
-        own = [one for one in psutil.Process().children() if not runs(one, "tests.scheduler")]
-        found = [inner for one in own for inner in (one, *one.children(recursive=True))]
-        return [one for one in found if is_spawned(one)]
+        """Wait for the worker processes of the service, without the one that tests share."""
+        deadline = time.monotonic() + PATIENCE
+        while time.monotonic() < deadline:
+            own = [one for one in psutil.Process().children() if not runs(one, "tests.scheduler")]
+            found = [one for part in own for one in part.children() if is_worker(one)]
+            if found:
+                return found
+            time.sleep(0.05)
+        raise TimeoutError(f"no worker is there after {PATIENCE} s")
 
     def begun(self, job_id):
         """Wait for the beginning of a job, which on a busy machine may be seen after its end."""
@@ -73,7 +82,7 @@ class Site:
             job = self.client.get(f"/api/v1/jobs/{job_id}").json()
             if job["status"] not in ("accepted", "running"):
                 return job
-            time.sleep(0.05)
+            time.sleep(0.2)  # each look takes some of the processor that the job needs
         raise TimeoutError(f"job {job_id} did not end within {PATIENCE} s")
 
 

@@ -23,7 +23,7 @@ from pathlib import Path
 import httpx
 import psutil
 
-from tests.service.conftest import is_spawned
+from tests.service.conftest import is_worker
 
 MCAP = {"Content-Type": "application/vnd.mcap"}
 TUS = {"Tus-Resumable": "1.0.0"}
@@ -80,7 +80,7 @@ class Victim:
         self.n_kills += 1
         found = psutil.Process(self.process.pid).children(recursive=True)
         if workers:
-            own = [one for one in found if is_spawned(one)]
+            own = [one for one in found if is_worker(one)]
             if own:
                 random.choice(own).kill()
             return []

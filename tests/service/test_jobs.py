@@ -5,6 +5,7 @@ import json
 import os
 import signal
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import psutil
@@ -212,6 +213,13 @@ def test_pages_come_before_jobs(site):
     own, workers = os.getpriority(os.PRIO_PROCESS, 0), site.workers()
     assert workers
     assert all(worker.nice() > own for worker in workers)
+
+
+def test_one_process_forks_workers_and_plans_and_has_loaded_what_they_need(site):
+    parents = {worker.ppid() for worker in site.workers()}
+    assert {site.client.app.state.service.predictions.run(os.getppid)} == parents
+    loaded = {Path(one.path).name for one in psutil.Process(parents.pop()).memory_maps()}
+    assert any(name.startswith("libllvmlite") for name in loaded)  # it holds compiled kernels
 
 
 def test_the_end_of_a_dismissed_job_does_not_end_the_job_after_it(site):
