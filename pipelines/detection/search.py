@@ -5,11 +5,8 @@ Hides where the search for the best shape of each kind begins, and which evidenc
 
 from __future__ import annotations
 
-from math import nan
-
 import numpy as np
 
-from spheremark.pipelines.compilation import compiled
 from spheremark.pipelines.detection.beams import Beams
 from spheremark.pipelines.detection.maxima import climbed, information, searched
 from spheremark.pipelines.detection.shapes import (
@@ -38,7 +35,6 @@ _STARTS = (0.0, -0.3, 0.3)  # of the logarithm of the radius of a ball
 _UNSURE = (-4.0, 9.0)  # logarithms of odds for the sphere between which evidence is integrated
 
 
-@compiled
 def _evidence(kind: int, shape: Array, prior: Array, beams: Beams, least: float) -> float:
     """Return the logarithm of the evidence of a hypothesis; its best shape replaces the start.
 
@@ -53,7 +49,6 @@ def _evidence(kind: int, shape: Array, prior: Array, beams: Beams, least: float)
     return float(found + log_volume(kind, shape, prior, beams))
 
 
-@compiled
 def _evidence_nearby(kind: int, shape: Array, prior: Array, beams: Beams) -> float:
     """Return the logarithm of the evidence of a hypothesis; its best shape nearby replaces it."""
     found = log_likelihood(kind, shape, prior, beams, np.empty(len(beams.x)))
@@ -61,20 +56,15 @@ def _evidence_nearby(kind: int, shape: Array, prior: Array, beams: Beams) -> flo
     return float(found + log_volume(kind, shape, prior, beams))
 
 
-@compiled
 def cov_shared(shape: Array, prior: Array, beams: Beams) -> Array:
     """Return the covariance of what the best sphere shares with other markers."""
     free, N = information(SPHERE, shape, prior, beams)
     invert(N, N)
-    first, n = np.searchsorted(free, NOISE), FORM + 1 - NOISE
-    cov = np.empty((n, n))
-    for j in range(n):
-        for k in range(n):
-            cov[j, k] = N[first + j, first + k] * prior[1, NOISE + j] * prior[1, NOISE + k]
-    return cov
+    first, sigmas = int(np.searchsorted(free, NOISE)), prior[1, NOISE : FORM + 1]
+    own = slice(first, first + len(sigmas))
+    return np.asarray(N[own, own] * sigmas[:, None] * sigmas)
 
 
-@compiled
 def compared(beams: Beams, priors: Array, log_priors: Array, begun: Array) -> tuple[Array, Array]:
     """Return the logarithms of prior times evidence of all hypotheses, and their best shapes.
 
@@ -82,11 +72,14 @@ def compared(beams: Beams, priors: Array, log_priors: Array, begun: Array) -> tu
     was not sought; (0, p) if there are none. A solid is always sought anew, beside the best sphere.
     Where the decision is close then, what may turn it is integrated.
     """
-    found, shapes = np.full(len(log_priors), -np.inf), np.full((len(log_priors), N_PARAMETERS), nan)
+    found, shapes = (
+        np.full(len(log_priors), -np.inf),
+        np.full((len(log_priors), N_PARAMETERS), np.nan),
+    )
     shapes[SPHERE] = priors[SPHERE, 0]
     for kind in _ORDER:
         is_named = kind != BALL or found[CYLINDER] < found.max()  # the two are easily confused
-        if found.max() - found[SPHERE] > _GIVEN_UP and is_named:
+        if found[SPHERE] < found.max() - _GIVEN_UP and is_named:
             continue
         is_begun = kind != SOLID and len(begun) > 0 and not np.isnan(begun[kind, 0])
         if is_begun:
@@ -101,7 +94,6 @@ def compared(beams: Beams, priors: Array, log_priors: Array, begun: Array) -> tu
     return found, shapes
 
 
-@compiled
 def _integrate(priors: Array, log_priors: Array, beams: Beams, known: tuple[Array, Array]) -> None:
     """Integrate the evidence of what may turn a close decision; ``known`` as ``compared``."""
     found, shapes = known
@@ -112,7 +104,6 @@ def _integrate(priors: Array, log_priors: Array, beams: Beams, known: tuple[Arra
             found[kind] = own + log_priors[kind]
 
 
-@compiled
 def _seek(
     kind: int, priors: Array, log_priors: Array, beams: Beams, known: tuple[Array, Array]
 ) -> None:
@@ -134,14 +125,12 @@ def _seek(
             break
 
 
-@compiled
 def _keep(kind: int, shape: Array, own: float, found: Array, shapes: Array) -> None:
     """Replace the shape of a kind by one with greater evidence."""
     if own > found[kind]:
         found[kind], shapes[kind] = own, shape
 
 
-@compiled
 def _start(kind: int, prior: Array, sphere: Array, start: float, beams: Beams) -> Array:
     """Return a start of the search for the best shape of a kind where the best sphere is."""
     shape: Array = prior[0].copy()
