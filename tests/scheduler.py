@@ -1,6 +1,6 @@
 """A scheduler with one worker, until its standard input ends.
 
-Services of most tests compute there: a worker of its own takes each 3 s of a processor.
+Services of most tests compute there: a worker of its own, with its reader, takes a second or more.
 """
 
 import asyncio
