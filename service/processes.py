@@ -22,7 +22,7 @@ def forked() -> BaseContext:
 
 
 def load() -> None:
-    """Start the process that forks the others, which imports meanwhile what they need."""
+    """Start the process that forks the others; it imports what they need while this one goes on."""
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # as in workers, before NumPy's import
     forked()
     if METHOD == "forkserver":

@@ -450,7 +450,7 @@ def _array(octets: mmap.mmap, place: int, dtype: str, shape: Any, limits: Limits
 def _main() -> None:
     """Answer the request that is the argument, or those that come, by forks."""
     if sys.argv[1] == "--ready":
-        with suppress(ConnectionError):  # who asks has ended before this was ready
+        with suppress(ConnectionError):  # its parent ended before it was ready
             _serve(sys.argv[2], socket.socket(fileno=os.dup(0)))
         os._exit(0)  # what is frozen is never freed, and libraries would report it
     else:

@@ -72,10 +72,8 @@ def compared(beams: Beams, priors: Array, log_priors: Array, begun: Array) -> tu
     was not sought; (0, p) if there are none. A solid is always sought anew, beside the best sphere.
     Where the decision is close then, what may turn it is integrated.
     """
-    found, shapes = (
-        np.full(len(log_priors), -np.inf),
-        np.full((len(log_priors), N_PARAMETERS), np.nan),
-    )
+    found = np.full(len(log_priors), -np.inf)
+    shapes = np.full((len(log_priors), N_PARAMETERS), np.nan)
     shapes[SPHERE] = priors[SPHERE, 0]
     for kind in _ORDER:
         is_named = kind != BALL or found[CYLINDER] < found.max()  # the two are easily confused

@@ -156,7 +156,7 @@ class JobQueue:
                     }
                 )
             )
-            get_mp_context()  # Dask says but once what a new process has loaded
+            get_mp_context()  # Dask sets, once, what new processes have loaded: forked replaces it
             forked()
             address = self._own = await self._cluster.enter_async_context(
                 LocalCluster(

@@ -57,15 +57,17 @@ class Site:
         )
 
     def workers(self):
-        """Wait for the worker processes of the service, without the one that tests share."""
+        """Wait for all worker processes of the service, without the one that tests share."""
+        wanted = self.client.app.state.service.settings.workers
         deadline = time.monotonic() + PATIENCE
         while time.monotonic() < deadline:
             own = [one for one in psutil.Process().children() if not runs(one, "tests.scheduler")]
             found = [one for part in own for one in part.children() if is_worker(one)]
-            if found:
+            n_ready = self.client.get("/healthz").json()["cluster"]["workers"]
+            if min(len(found), n_ready) >= wanted:
                 return found
             time.sleep(0.05)
-        raise TimeoutError(f"no worker is there after {PATIENCE} s")
+        raise TimeoutError(f"fewer than {wanted} workers are ready after {PATIENCE} s")
 
     def begun(self, job_id):
         """Wait for the beginning of a job, which on a busy machine may be seen after its end."""
