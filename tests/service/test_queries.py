@@ -104,6 +104,16 @@ def test_parameters_of_an_address_are_values_and_no_sql(client):
     assert get(client, q="SELECT $a AS a", p=f"a={deep}").json()["rows"] == [[deep]]
 
 
+def test_more_parameters_than_a_query_has_are_refused(client):
+    given = [f"a{i}={i}" for i in range(51)]
+    assert get(client, 422, q="SELECT 1", p=given).json()["code"] == "input.validation"
+    kept = {"sql": "SELECT $kept", "parameters": {"kept": 0}}
+    client.put("/api/v1/queries/one more", json=kept).raise_for_status()
+    refused = get(client, 422, name="one more", p=given[:50]).json()
+    assert refused["errors"][0]["field"] == "query.parameters"
+    client.delete("/api/v1/queries/one more").raise_for_status()
+
+
 @pytest.mark.parametrize("instant", ["290000-01-01", "infinity", "0044-03-15 (BC)"])
 def test_an_instant_that_files_do_not_have_is_refused_with_its_column(client, instant):
     sql = f"SELECT '{instant}'::TIMESTAMP AS t"

@@ -281,6 +281,7 @@ class ProblemKind(BaseModel):
 
 QueryFormat = Literal["json", "csv", "parquet", "arrow"]
 Scalar = bool | int | float | str | None
+PARAMETERS_MAX = 50  # of one query
 
 
 class NewQuery(Strict):
@@ -291,7 +292,7 @@ class NewQuery(Strict):
     )
     parameters: dict[str, Scalar] = Field(
         default_factory=dict,
-        max_length=50,
+        max_length=PARAMETERS_MAX,
         description="Values of its parameters where an address gives none.",
     )
 
@@ -311,7 +312,7 @@ class Query(Strict):
     )
     format: QueryFormat = Field(default="json", description="Format of the response.")
     parameters: dict[str, Scalar] = Field(
-        default_factory=dict, max_length=50, description="Values of the parameters."
+        default_factory=dict, max_length=PARAMETERS_MAX, description="Values of the parameters."
     )
 
 

@@ -12,9 +12,11 @@ from fastapi import APIRouter, Depends, Path, Request, Response
 from fastapi import Query as QueryParameter
 from fastapi.exceptions import RequestValidationError
 from fastapi.responses import FileResponse
+from pydantic import ValidationError
 
 from spheremark.pipelines.errors import InputError
 from spheremark.service.http.api.models import (
+    PARAMETERS_MAX,
     Listing,
     NewQuery,
     Query,
@@ -81,7 +83,10 @@ async def query_by_link(
     ] = None,
     p: Annotated[
         list[str] | None,
-        QueryParameter(description="Value of a parameter, as name=value; again for more."),
+        QueryParameter(
+            max_length=PARAMETERS_MAX,
+            description="Value of a parameter, as name=value; again for more.",
+        ),
     ] = None,
     format: Annotated[  # the word of the interface
         QueryFormat | None, QueryParameter(description="Format of the response.")
@@ -89,7 +94,11 @@ async def query_by_link(
 ) -> Any:
     """Run one SELECT that is part of the address, or kept under a name: every query is a link."""
     chosen = query_of(service, q, name, p or [])
-    given = Query(format=format or "json", **chosen)
+    try:
+        given = Query(format=format or "json", **chosen)
+    except ValidationError as error:  # with those of a kept query, more than may be
+        found = [{**one, "loc": ("query", *one["loc"])} for one in error.errors()]
+        raise RequestValidationError(found) from error
     accept = "" if format else _accepted(request)
     return await service.queries.run(request, _run, service, given, accept)
 

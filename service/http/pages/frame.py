@@ -14,6 +14,7 @@ from fastapi.responses import FileResponse, HTMLResponse, RedirectResponse
 
 from spheremark.pipelines.errors import NotFoundError
 from spheremark.service.errors import Problem
+from spheremark.service.http.api.models import PARAMETERS_MAX
 from spheremark.service.http.api.sql import query_of
 from spheremark.service.http.state import Current, Service
 from spheremark.storage.catalogue import saved_queries
@@ -93,7 +94,7 @@ def sql(
     service: Current,
     q: Annotated[str, Query(max_length=100_000)] = "",
     name: Annotated[str, Query(max_length=200)] = "",
-    p: Annotated[list[str] | None, Query()] = None,
+    p: Annotated[list[str] | None, Query(max_length=PARAMETERS_MAX)] = None,
 ) -> str:
     """Show the workbench for queries."""
     chosen = query_of(service, None if name else q, name or None, p or [])
