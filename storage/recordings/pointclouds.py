@@ -216,13 +216,13 @@ class PointClouds:
                 self._out.put(self._n, self._out.taken(slice(row, row + n)))
             self._n += n
 
-    def stamped_at_end(self) -> Returns:
+    def stamped_at_end(self, time_unit: str) -> Returns:
         """Return all returns, where the stamp of a message is the instant of its last point."""
         messages = self._near([])
         shifts = messages.spans_ns
         self._out.stamps[: self._n] -= np.repeat(shifts, messages.counts)
         self._parts = [messages._replace(stamps_ns=messages.stamps_ns - shifts)]
-        return self.returns()
+        return self.returns(time_unit)
 
     def returns(self, time_unit: str = "auto") -> Returns:
         """Return all returns, in the order of their instants; the unit is as of ``LogOptions``."""

@@ -317,7 +317,7 @@ def _from_start(
         )
         if is_end or options.stamp == "end":
             notes = (*returns.notes, note) if is_end else returns.notes
-            returns = replace(lidar.stamped_at_end(), notes=notes)
+            returns = replace(lidar.stamped_at_end(options.time_unit), notes=notes)
     if options.lidar_offset_s:
         offset = np.int64(round(options.lidar_offset_s * 1e9))
         returns = replace(returns, stamps_ns=returns.stamps_ns + offset)

@@ -731,6 +731,13 @@ def test_stamps_at_the_end_show_by_points_that_are_later_than_their_recording(tm
     assert any("after they were recorded" in note for note in log.notes) == (stamp == "auto")
 
 
+def test_stamps_at_the_end_leave_the_named_unit_of_times_as_it_is(tmp_path, rng):
+    items = timed(rng, 1e9, "u4", (1e-5, 1e-5, 1e-5), pause=10**8)
+    path = record(tmp_path / "a.mcap", [*items, *turning()])
+    log = read_log(path, LogOptions(time_unit="ns", stamp="end"))
+    assert log.stamps_lidar_ns[[0, 63]].tolist() == [T0 - 10**4, T0]
+
+
 def test_stamps_at_the_start_are_taken_as_they_are(tmp_path, rng):
     items = [
         ("/p", late(T0 + (k + 1) * 10**8), cloud(velodyne(rng), T0 + k * 10**8)) for k in range(3)
