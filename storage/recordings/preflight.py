@@ -183,12 +183,11 @@ class _Times:
         near = [end for end in ends if abs(end[0] - middle) < _FAR_NS] or ends
         return int(min(end[0] for end in near)), int(max(end[1] for end in near))
 
-    def report(self, channel: Channel) -> TopicReport:
-        """Return what a topic holds."""
+    def report(self, channel: Channel, span_ns: tuple[int, int]) -> TopicReport:
+        """Return what a topic holds, in a log from its first time to its last."""
         times = self.of(channel.topic) if channel.topic in self.parts else np.empty(0, np.int64)
         steps = times[1:] - times[:-1]
         span = float(steps.sum()) * 1e-9
-        start, end = self.span()
         return TopicReport(
             topic=channel.topic,
             schema=channel.schema,
@@ -196,8 +195,8 @@ class _Times:
             n_messages=len(times),
             rate_hz=len(steps) / span if span else 0.0,
             longest_gap_s=float(steps.max()) * 1e-9 if len(steps) else 0.0,
-            counts=timeline.counts(times, start, end) if len(times) else (),
-            gaps_s=timeline.gaps(times, start),
+            counts=timeline.counts(times, *span_ns) if len(times) else (),
+            gaps_s=timeline.gaps(times, span_ns[0]),
         )
 
 
@@ -269,18 +268,18 @@ def _inspect(
                 decoders.add(batch)
         except InputError as error:
             damage = error
-        topics = recording.channels
+        topics, span_ns = recording.channels, times.span()
         report = replace(
             start,
             size_bytes=recording.size,
-            topics=tuple(times.report(topics[topic]) for topic in sorted(topics)),
-            log_duration_s=float(times.span()[1] - times.span()[0]) * 1e-9,
+            topics=tuple(times.report(topics[topic], span_ns) for topic in sorted(topics)),
+            log_duration_s=(span_ns[1] - span_ns[0]) * 1e-9,
         )
     try:
         log = assemble(decoders, options, origin)
     except InputError as error:
         return _refused(report, damage or error), None
-    report = _with_verdict(_described(report, log), log, _skew(decoders, times), times.span())
+    report = _with_verdict(_described(report, log), log, _skew(decoders, times), span_ns)
     return (report if damage is None else _refused(report, damage)), log
 
 

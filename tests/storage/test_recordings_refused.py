@@ -278,6 +278,21 @@ def test_the_preflight_of_a_good_log_tells_its_speeds_and_coverage(tmp_path):
     assert_allclose(rates["/joint_states"], 100.0, rtol=0, atol=0.01)
 
 
+def test_the_preflight_sorts_the_times_of_each_topic_as_often_however_many_there_are(
+    tmp_path, monkeypatch
+):
+    log = small_log(np.random.default_rng(12))
+    others = [(f"/other{k}", *message) for k in range(20) for _, *message in turning(3)]
+    sorts, sort = [], np.sort
+    monkeypatch.setattr(np, "sort", lambda *a, **k: sorts.append(a) or sort(*a, **k))
+    n_sorts = []
+    for items in (log, [*log, *others]):
+        sorts.clear()
+        inspect_log(record(tmp_path / "a.mcap", items))
+        n_sorts.append(len(sorts))
+    assert n_sorts[1] - n_sorts[0] < 5 * 20
+
+
 def test_a_pause_of_the_lidar_in_a_turn_is_weak(tmp_path):
     log = turn_log(turn=13.2)
     since = (log.stamps_lidar_ns - log.stamps_lidar_ns[0]) * 1e-9
