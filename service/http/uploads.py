@@ -16,8 +16,9 @@ import os
 import re
 import secrets
 import tempfile
+import threading
 import time
-from collections.abc import AsyncIterator, Callable, Mapping
+from collections.abc import AsyncIterator, Callable, Mapping, Sequence
 from contextlib import asynccontextmanager, closing, contextmanager, suppress
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
@@ -31,6 +32,7 @@ from spheremark.service.errors import (
     DigestError,
     EmptyBodyError,
     LockedError,
+    MalformedHeaderError,
     OffsetError,
     QuotaError,
     RefusedRecordingError,
@@ -49,7 +51,8 @@ LOG = ".mcap"
 _ENDING = re.compile(r"\.(mcap|db3|bag|pcap|pcapng|zip)$", re.IGNORECASE)
 _BLOCK = 4 << 20  # [bytes] hashed and written at once; large enough that a thread pays off
 _KEPT_SECONDS = 7 * 24 * 3600.0  # until an upload that is not resumed is removed
-_DIGEST = re.compile(r"(?:^|,)\s*sha-256=:([A-Za-z0-9+/=]+):")
+_DIGEST = re.compile(r"(?:^|,)\s*sha-256=([^,;]*)")
+_DIGEST_HEADERS = ("Repr-Digest", "Content-Digest")
 _RESUMABLE = "resumable"  # name of a folder
 _NAME = re.compile(rf"([0-9a-f]{{64}}){re.escape(LOG)}")
 
@@ -97,11 +100,11 @@ class Inbox:
         The files of a body of several (multipart/form-data) are one log, kept as a zip.
         """
         self.require_room(int(headers.get("content-length", "0")))
-        form = headers.get("content-type", "")
-        form = form if form.startswith(FORM) else ""
+        expected = _declared_digests(headers)
+        form = headers["content-type"] if media_type_of(headers) == FORM else ""
         async with self.received(chunks, max_bytes, form) as part:
             if not form:
-                _check_digest(part.digest, headers)
+                _check_digest(part.digest, expected)
             return replace(part, path=await asyncio.to_thread(self.keep, part, LOG))
 
     def require_room(self, n_bytes: int) -> None:
@@ -229,16 +232,38 @@ def _translated(folder: Path) -> Any:
         raise unwritten(folder, error) from error
 
 
-def _check_digest(found: str, headers: Mapping[str, str]) -> None:
-    """Refuse a body that is not the one whose SHA-256 its header names (RFC 9530)."""
-    for name in ("repr-digest", "content-digest"):
-        if match := _DIGEST.search(headers.get(name, "")):
-            expected = base64.b64decode(match[1]).hex()
-            if expected != found:
-                raise DigestError(
-                    f"The SHA-256 of the body is {found}, that of its header {expected}: it was "
-                    "changed on its way. Send it again."
+def media_type_of(headers: Mapping[str, str]) -> str:
+    """Return the media type of a body, in lower case and without parameters; empty without one."""
+    return headers.get("content-type", "").partition(";")[0].strip().lower()
+
+
+def _declared_digests(headers: Mapping[str, str]) -> tuple[str, ...]:
+    """Return the SHA-256 that headers name for a body (RFC 9530), in hexadecimal."""
+    found = []
+    for name in _DIGEST_HEADERS:
+        if match := _DIGEST.search(headers.get(name.lower(), "")):
+            text = match[1].strip()
+            try:
+                digest = base64.b64decode(text[1:-1], validate=True)
+            except ValueError:
+                digest = b""
+            if len(digest) != hashlib.sha256().digest_size or text != f":{text[1:-1]}:":
+                raise MalformedHeaderError(
+                    f"{name} has sha-256={text[:80]!r}; the Base64 of 32 bytes between two colons "
+                    "is expected. Correct the header, or send the body without it."
                 )
+            found.append(digest.hex())
+    return tuple(found)
+
+
+def _check_digest(found: str, expected: Sequence[str]) -> None:
+    """Refuse a body that is not the one whose SHA-256 its headers name."""
+    for one in expected:
+        if one != found:
+            raise DigestError(
+                f"The SHA-256 of the body is {found}, that of its header {one}: it was "
+                "changed on its way. Send it again."
+            )
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -277,20 +302,22 @@ class Resumable:
         self._inbox = inbox
         self._folder = inbox.partial / _RESUMABLE
         self._progress: dict[str, _Progress] = {}
+        self._lock = threading.Lock()
         self._busy: set[str] = set()
 
     def open(self) -> None:
         """Make the folder, and remove uploads that have expired."""
         self._folder.mkdir(parents=True, exist_ok=True)
-        for about in self._folder.glob("*.json"):
-            self._existing(about.stem)
+        self._sweep()
         known = {about.stem for about in self._folder.glob("*.json")}
         for left in self._folder.iterdir():
             if left.stem not in known:
                 left.unlink()
 
     def create(self, length: int, metadata: Mapping[str, str]) -> Upload:
-        """Begin an upload of so many bytes."""
+        """Begin an upload of so many bytes; remove those that have expired."""
+        with self._lock:
+            self._sweep()
         self._inbox.require_room(length)
         upload_id = secrets.token_hex(16)
         path = self._folder / upload_id
@@ -302,13 +329,18 @@ class Resumable:
             path=path,
         )
         about = asdict(upload) | {"path": str(path)}
-        with _translated(path):
+        with self._lock, _translated(path):
             path.touch(mode=0o600)
             path.with_suffix(".json").write_text(json.dumps(about), encoding="utf-8")
         return upload
 
     def get(self, upload_id: str) -> Upload:
         """Return an upload that has not expired."""
+        with self._lock:
+            return self._found(upload_id)
+
+    def _found(self, upload_id: str) -> Upload:
+        """Return an upload; raise NotFoundError if there is none."""
         upload = self._existing(upload_id) if re.fullmatch(r"[0-9a-f]{32}", upload_id) else None
         if upload is None:
             raise NotFoundError(
@@ -317,7 +349,23 @@ class Resumable:
         return upload
 
     def end(self, upload_id: str) -> None:
-        """Forget an upload and its bytes."""
+        """Forget an upload and its bytes; raise LockedError while a request writes to it."""
+        with self._lock:
+            self._require_idle(upload_id)
+            self._remove(upload_id)
+
+    def _require_idle(self, upload_id: str) -> None:
+        """Refuse an upload to which a request is writing."""
+        if upload_id in self._busy:
+            raise LockedError("Another request is writing to this upload; wait for its end.")
+
+    def _sweep(self) -> None:
+        """Remove uploads that have expired or are damaged."""
+        for about in self._folder.glob("*.json"):
+            self._existing(about.stem)
+
+    def _remove(self, upload_id: str) -> None:
+        """Remove what is kept of an upload."""
         self._progress.pop(upload_id, None)
         path = self._folder / upload_id
         path.with_suffix(".json").unlink(missing_ok=True)
@@ -331,9 +379,10 @@ class Resumable:
         checksum: tuple[str, bytes] | None,
     ) -> Received | None:
         """Write the next part; return the file once it is complete."""
-        if upload.upload_id in self._busy:
-            raise LockedError("Another request is writing to this upload; wait for its end.")
-        self._busy.add(upload.upload_id)
+        with self._lock:
+            self._require_idle(upload.upload_id)
+            self._found(upload.upload_id)  # it may have been ended since the request began
+            self._busy.add(upload.upload_id)
         try:
             if offset != upload.offset:
                 raise OffsetError(
@@ -387,7 +436,7 @@ class Resumable:
         digest = self._progress_of(upload).sha.hexdigest()
         part = Received(path=upload.path, digest=digest, size_bytes=upload.length)
         kept = replace(part, path=self._inbox.keep(part, LOG))
-        self.end(upload.upload_id)
+        self._remove(upload.upload_id)
         return kept
 
     def _existing(self, upload_id: str) -> Upload | None:
@@ -398,8 +447,9 @@ class Resumable:
             upload = Upload(**about | {"path": path})
         except (OSError, ValueError, TypeError):
             upload = None
-        if upload is None or upload.expires_at < time.time() or not path.exists():
-            self.end(upload_id)
+        is_expired = upload is not None and upload.expires_at < time.time()
+        if upload is None or not path.exists() or (is_expired and upload_id not in self._busy):
+            self._remove(upload_id)
             return None
         return upload
 

@@ -180,6 +180,7 @@ PART = b'--x\r\nContent-Disposition: form-data; name="a"; filename="%s"\r\n\r\nA
         (b"", "multipart/form-data; boundary=x", "empty"),
         (b"--x\r\n\r\n", "multipart/form-data", "boundary"),
         (b"--x--\r\n", "multipart/form-data; boundary=x", "no files"),
+        (b"--x--\r\n", "Multipart/Form-Data; boundary=x", "no files"),
         (PART % b"a", None, "cut"),
         (PART % b"1/a.bag" + b"\r\n" + PART % b"2/a.bag", None, "two files called 'a.bag'"),
         (b"no boundary here", None, "well-formed"),

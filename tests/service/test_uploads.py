@@ -1,5 +1,6 @@
 """Uploads: whole or not at all, resumable by tus 1.0, never more than the disk can take."""
 
+import asyncio
 import base64
 import hashlib
 import os
@@ -13,7 +14,9 @@ import pytest
 from fastapi.testclient import TestClient
 
 from spheremark.pipelines.errors import ConflictError
+from spheremark.service.errors import LockedError
 from spheremark.service.http.app import create_app
+from spheremark.service.http.uploads import Inbox, Resumable
 from spheremark.service.settings import Settings
 from spheremark.storage.files import free_bytes
 
@@ -98,6 +101,23 @@ def test_an_upload_can_be_ended(site, log):
     assert site.client.head(url, headers=TUS).status_code == 404
 
 
+def test_an_upload_is_not_ended_while_a_part_of_it_is_written(tmp_path):
+    inbox = Inbox(tmp_path)
+    uploads = Resumable(inbox)
+    inbox.open()
+    uploads.open()
+    upload = uploads.create(3, {})
+
+    async def parts():
+        yield b"a"
+        with pytest.raises(LockedError):
+            uploads.end(upload.upload_id)
+        yield b"bc"
+
+    received = asyncio.run(uploads.append(upload, 0, parts(), None))
+    assert received.path.read_bytes() == b"abc"
+
+
 @pytest.mark.parametrize(
     ("headers", "status", "code"),
     [
@@ -106,11 +126,17 @@ def test_an_upload_can_be_ended(site, log):
         (TUS, 422, "input.validation"),
         (TUS | {"Upload-Length": str(10**15)}, 413, "input.too_large"),
         (TUS | {"Upload-Length": "10", "Upload-Metadata": "filename ???"}, 400, "input"),
+        (TUS | {"Upload-Length": "10", "Upload-Metadata": "filename \xfc".encode()}, 400, "input"),
+        (PART | {"Upload-Length": "10", "Upload-Checksum": "md5 ???"}, 400, "input"),
+        (PART | {"Upload-Length": "10", "Upload-Checksum": "md5 \xfc".encode()}, 400, "input"),
     ],
 )
 def test_an_upload_that_cannot_be_is_not_begun(site, headers, status, code):
+    folder = site.client.app.state.service.inbox.partial / "resumable"
+    before = set(folder.iterdir())
     answer = site.client.post("/api/v1/uploads", headers=headers)
     assert (answer.status_code, answer.json()["code"]) == (status, code)
+    assert set(folder.iterdir()) == before
 
 
 def test_an_upload_goes_on_after_a_restart_of_the_service(tmp_path, log, open_site, scheduler):
@@ -137,6 +163,28 @@ def test_an_expired_upload_is_removed_at_the_next_start(tmp_path, log, open_site
     (folder / "left-over").write_bytes(b"x")
     with TestClient(create_app(settings), base_url="http://127.0.0.1:8000"):
         assert list(folder.iterdir()) == []
+
+
+def test_expired_uploads_take_nothing_from_the_quota(tmp_path, log, open_site, scheduler):
+    settings = Settings(data=tmp_path, quota_bytes=len(log) + 100, scheduler=scheduler)
+    folder = tmp_path / "recordings" / ".partial" / "resumable"
+    with TestClient(create_app(settings), base_url="http://127.0.0.1:8000") as client:
+        one = open_site(client, None, "")
+        url = begin(one, log)
+        send(one, url, log[:-1], 0)
+        (about,) = folder.glob("*.json")
+        about.write_text(about.read_text().replace('"expires_at": 1', '"expires_at": 0'))
+        assert begin(one, log) != url
+        assert len(list(folder.glob("*.json"))) == 1
+
+
+@pytest.mark.parametrize("digest", [":abc:", ":\xfc:", ":AAAA:", "abc", ""])
+def test_a_digest_of_another_form_is_refused_before_the_body_is_read(site, digest):
+    headers = MCAP | {"Repr-Digest": f"sha-256={digest}".encode()}
+    answer = site.client.post(
+        "/api/v1/recordings", params={"name": "a"}, content=b"", headers=headers
+    )
+    assert (answer.status_code, answer.json()["code"]) == (400, "input.header")
 
 
 def test_a_body_whose_digest_is_another_is_refused_and_leaves_no_file(site, log):

@@ -16,7 +16,7 @@ from spheremark.service.http.api.models import Job, Listing, NewJob, Recording, 
 from spheremark.service.http.api.surveys import After, Limit
 from spheremark.service.http.folders import FORM
 from spheremark.service.http.state import Current, Service
-from spheremark.service.http.uploads import take_in
+from spheremark.service.http.uploads import media_type_of, take_in
 from spheremark.service.jobs.handlers import Reading
 from spheremark.storage.catalogue.records import RecordingRecord
 from spheremark.storage.recordings.preflight import Preflight
@@ -123,7 +123,7 @@ def download_recording(recording: Digest, service: Current) -> FileResponse:
 
 def _check_upload(request: Request, max_bytes: int) -> None:
     """Refuse a body by its headers, before a byte of it is read."""
-    media_type = request.headers.get("content-type", "").partition(";")[0].strip().lower()
+    media_type = media_type_of(request.headers)
     if media_type not in _MEDIA_TYPES:
         raise MediaTypeError(
             f"The body is {media_type or 'of no type'}; send the log itself as {MCAP}."

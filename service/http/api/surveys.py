@@ -29,6 +29,7 @@ from spheremark.service.http.api.models import (
     TruthSummary,
 )
 from spheremark.service.http.state import Current
+from spheremark.service.http.uploads import media_type_of
 from spheremark.service.serialise.solution import plain_result, survey_result
 from spheremark.storage.catalogue.catalogue import Catalogue
 from spheremark.storage.imports.survey_files import ControlLayout, format_control
@@ -52,7 +53,7 @@ class Document:
 
 async def document(request: Request) -> Document:
     """Read a body that is a file."""
-    media_type = request.headers.get("content-type", "").partition(";")[0].strip().lower()
+    media_type = media_type_of(request.headers)
     body = await request.body()
     if not body.strip():
         raise EmptyBodyError("The body is empty; send the file itself as the body.")

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import asyncio
 import base64
-import binascii
 from collections.abc import Mapping
 from email.utils import formatdate
 from typing import Annotated, Any
@@ -16,7 +15,7 @@ from spheremark.pipelines.errors import InputError
 from spheremark.service.errors import MediaTypeError, TooLargeError, TusVersionError
 from spheremark.service.http.api.recordings import check_survey, start_job
 from spheremark.service.http.state import Current, Service
-from spheremark.service.http.uploads import Received, Upload, enter
+from spheremark.service.http.uploads import Received, Upload, enter, media_type_of
 from spheremark.service.jobs.handlers import Reading
 from spheremark.storage.recordings import LogOptions
 
@@ -125,12 +124,12 @@ async def create_upload(
     if length > service.settings.max_upload_bytes:
         most = service.settings.max_upload_bytes
         raise TooLargeError(f"The log has {length:,} bytes; {most:,} are accepted.")
-    about = _metadata(metadata)
+    about, expected = _metadata(metadata), _checksum(checksum)
     await asyncio.to_thread(_check, service, about)
     upload = await asyncio.to_thread(service.uploads.create, length, about)
     headers = {"Location": f"/api/v1/uploads/{upload.upload_id}", **_expiry(upload)}
-    if request.headers.get("content-type", "") == PART:
-        headers |= await _append(service, upload, request, 0, checksum)
+    if media_type_of(request.headers) == PART:
+        headers |= await _append(service, upload, request, 0, expected)
     return _response(headers, 201)
 
 
@@ -170,10 +169,10 @@ async def append_to_upload(
 ) -> Response:
     """Add the next part; the last one makes a recording (Content-Location)."""
     _check_version(tus)
-    if request.headers.get("content-type", "") != PART:
+    if media_type_of(request.headers) != PART:
         raise MediaTypeError(f"The part must be of the type {PART}.")
     found = service.uploads.get(upload)
-    return _response(await _append(service, found, request, offset, checksum))
+    return _response(await _append(service, found, request, offset, _checksum(checksum)))
 
 
 @router.delete(
@@ -191,10 +190,14 @@ def end_upload(upload: UploadId, service: Current, tus: Tus = None) -> Response:
 
 
 async def _append(
-    service: Service, upload: Upload, request: Request, offset: int, checksum: str | None
+    service: Service,
+    upload: Upload,
+    request: Request,
+    offset: int,
+    checksum: tuple[str, bytes] | None,
 ) -> dict[str, str]:
     """Add a part, and enter the log that it completes; return the headers that say so."""
-    received = await service.uploads.append(upload, offset, request.stream(), _checksum(checksum))
+    received = await service.uploads.append(upload, offset, request.stream(), checksum)
     if received is None:
         return {"Upload-Offset": str(upload.offset), **_expiry(upload)}
     headers = await service.inspect(_enter, service, received, upload.metadata)
@@ -243,8 +246,11 @@ def _metadata(text: str) -> dict[str, str]:
     pairs = (pair.strip().partition(" ") for pair in text.split(",") if pair.strip())
     try:
         return {key: base64.b64decode(value, validate=True).decode() for key, _, value in pairs}
-    except (binascii.Error, UnicodeDecodeError) as error:
-        raise InputError(f"Upload-Metadata is not pairs of a key and Base64: {error}.") from error
+    except ValueError as error:
+        raise InputError(
+            f"Upload-Metadata is {text[:80]!r}; pairs of a key and its value in Base64 of UTF-8, "
+            f"with commas between them, are expected ({error})."
+        ) from error
 
 
 def _checksum(text: str | None) -> tuple[str, bytes] | None:
@@ -254,7 +260,7 @@ def _checksum(text: str | None) -> tuple[str, bytes] | None:
     name, _, value = text.partition(" ")
     try:
         digest = base64.b64decode(value, validate=True)
-    except binascii.Error:
+    except ValueError:
         digest = b""
     if name not in ALGORITHMS or not digest:
         raise InputError(

@@ -14,6 +14,7 @@ from spheremark.service.http.api.jobs import start
 from spheremark.service.http.api.models import NewJob
 from spheremark.service.http.pages.frame import frame_of, survey_row
 from spheremark.service.http.state import Current, Service
+from spheremark.service.http.uploads import media_type_of
 from spheremark.service.jobs.handlers import KINDS
 from spheremark.storage.catalogue.solutions import chosen_solution
 from spheremark.web.links import survey_url
@@ -136,7 +137,7 @@ def _rig(service: Service, survey: Mapping[str, Any], shown: str | None) -> str:
 
 async def form(request: Request) -> dict[str, str]:
     """Read the fields of a form."""
-    media_type = request.headers.get("content-type", "").partition(";")[0].strip().lower()
+    media_type = media_type_of(request.headers)
     if media_type != _FORM:
         raise InputError(f"The body is {media_type or 'of no type'}; this page sends {_FORM}.")
     return dict(parse_qsl((await request.body()).decode("utf-8", "replace")))
