@@ -79,10 +79,11 @@ def test_each_tab_of_a_survey_has_an_address(client, tab):
         assert f'href="/surveys/{survey}/{tab}" aria-current="page"' in text
 
 
-def test_an_address_of_the_dashboard_before_leads_to_the_tab_of_accuracy(client):
-    response = client.get("/surveys/field?stop=lane3-stop2&axes=log", follow_redirects=False)
-    assert response.status_code == 308
-    assert response.headers["location"] == "/surveys/field/accuracy?stop=lane3-stop2&axes=log"
+@pytest.mark.parametrize("tab", ["", "/stops", "/logs"])
+def test_a_part_of_a_tab_beyond_any_is_refused(client, tab):
+    response = client.get(f"/surveys/field{tab}?after={2**63}", headers=HTML)
+    assert response.status_code == 422
+    assert "after" in response.text
 
 
 def test_a_survey_is_renamed_deleted_and_restored_with_its_results(client):

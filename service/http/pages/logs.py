@@ -38,7 +38,10 @@ WHERE x.survey_id = $id ORDER BY x.removed_at DESC LIMIT $n
 
 @router.get("/surveys/{name:path}/logs")
 def logs(
-    name: str, request: Request, service: Current, after: Annotated[int, Query(ge=0)] = 0
+    name: str,
+    request: Request,
+    service: Current,
+    after: Annotated[int, Query(ge=0, le=10**9)] = 0,
 ) -> str:
     """Show the logs of a survey, with what to do with them, its control and its name."""
     found, catalogue = survey_row(service, name), service.catalogue

@@ -4,14 +4,13 @@ from __future__ import annotations
 
 from typing import Annotated
 
-from fastapi import APIRouter, Query, Request
-from fastapi.responses import HTMLResponse, RedirectResponse
+from fastapi import APIRouter, Query
+from fastapi.responses import HTMLResponse
 
 from spheremark.service.http.pages.frame import frame_of, survey_row
 from spheremark.service.http.pages.jobs import newest_jobs
 from spheremark.service.http.state import Current
 from spheremark.service.serialise.solution import survey_result
-from spheremark.web.links import survey_url
 from spheremark.web.pages.result import result_page
 
 router = APIRouter(include_in_schema=False, default_response_class=HTMLResponse)
@@ -24,21 +23,12 @@ SELECT (SELECT count(*) FROM stops JOIN latest_runs USING (run_id) WHERE survey_
     (SELECT count(*) FROM site_products WHERE survey_id = $id) AS n_products,
     (SELECT changed_at FROM control_changes WHERE survey_id = $id) AS control_changed_at
 """
-_DASHBOARD = {
-    *("method", "lane", "stop", "range_from_m", "range_to_m", "status"),
-    *("axes", "marks", "resection"),
-}
 
 
-@router.get("/surveys/{name:path}", response_model=None)
-def result(
-    name: str, request: Request, service: Current, after: Annotated[int, Query(ge=0)] = 0
-) -> str | RedirectResponse:
-    """Show the result of a survey; an address with filters moved to the tab of accuracy."""
+@router.get("/surveys/{name:path}")
+def result(name: str, service: Current, after: Annotated[int, Query(ge=0, le=10**9)] = 0) -> str:
+    """Show the result of a survey."""
     found = survey_row(service, name)
-    if _DASHBOARD & set(request.query_params):
-        target = f"{survey_url(found['name'], 'accuracy')}?{request.url.query}"
-        return RedirectResponse(target, status_code=308)
     key, catalogue = {"id": found["survey_id"]}, service.catalogue
     return result_page(
         frame_of(service, found["name"], "result"),
