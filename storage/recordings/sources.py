@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import bz2
 import hashlib
+import lzma
 import re
 import shutil
 import sqlite3
@@ -50,9 +51,11 @@ if TYPE_CHECKING:
 PCAP_TOPIC, _PCAP_FRAME = "/velodyne_packets", "velodyne"
 _HEAD = 16  # [bytes] that show what a file is
 _BATCH = 1 << 24  # [bytes] of messages that are decoded together
+_TIME_LIMIT = 1 << 63  # [ns] in the year 2262
 _PIECE_LIMIT = 1 << 29  # [bytes] a larger decompressed chunk or message is refused
 _EXPANSION_MAX = 100  # of a zip; what recorders write expands by 10 at most
 _ZSTD = b"\x28\xb5\x2f\xfd"
+_PLAIN = (ValueError, KeyError, TypeError, EOFError, OverflowError, RuntimeError, OSError)
 _PCAPS = (b"\xa1\xb2\xc3\xd4", b"\xd4\xc3\xb2\xa1", b"\xa1\xb2\x3c\x4d", b"\x4d\x3c\xb2\xa1")
 _PACKET = 1206  # [bytes] of data from a Velodyne
 _PACKET_HEAD = b"\xff\xee"
@@ -150,8 +153,7 @@ def _damages() -> tuple[type[Exception], ...]:
     from dpkt import Error
     from rosbags.rosbag1.reader import ReaderError
 
-    plain = (ValueError, KeyError, TypeError, EOFError, OverflowError, RuntimeError, OSError)
-    return (ReaderError, Error, sqlite3.Error, struct.error, zstandard.ZstdError, *plain)
+    return (ReaderError, Error, sqlite3.Error, struct.error, zstandard.ZstdError, *_PLAIN)
 
 
 @dataclass(slots=True)
@@ -303,7 +305,7 @@ def _unzip(path: Path, folder: Path) -> None:
                 place.parent.mkdir()
                 with archive.open(member) as packed, place.open("wb") as file:
                     shutil.copyfileobj(packed, file, _BATCH)
-    except (zipfile.BadZipFile, zlib.error, RuntimeError, EOFError, OSError, ValueError) as error:
+    except (zipfile.BadZipFile, zlib.error, lzma.LZMAError, *_PLAIN) as error:
         raise RecordingError(f"The zip cannot be read: {error}. Pack it again.") from error
 
 
@@ -364,7 +366,15 @@ def _of_rosbag2(path: Path, topics: dict[str, Channel]) -> Iterator[Item]:
             "SELECT topic_id, timestamp, data FROM messages ORDER BY id"
         ):
             if identifier in channels:
-                yield channels[identifier], int(log_time), _message(bytes(data))
+                yield channels[identifier], _log_time(log_time), _message(bytes(data))
+
+
+def _log_time(value: float) -> int:
+    """Return the time at which rosbag2 has recorded a message [ns]."""
+    log_time = int(value)
+    if not 0 <= log_time < _TIME_LIMIT:
+        raise ValueError(f"a message has the time {value:g} ns; expected 0 to {_TIME_LIMIT:g}")
+    return log_time
 
 
 def _message(data: bytes) -> bytes:

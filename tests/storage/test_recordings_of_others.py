@@ -4,8 +4,10 @@ import base64
 import json
 import re
 import shutil
+import sqlite3
 import struct
 import zipfile
+from contextlib import closing
 
 import dpkt
 import numpy as np
@@ -519,9 +521,10 @@ def test_an_upload_is_read_in_a_confined_process_to_the_same_log(tmp_path, items
     assert inspect_upload(path).to_mapping() == inspect_log(path).to_mapping()
 
 
-def test_a_zip_whose_compressed_bytes_are_damaged_is_refused(tmp_path, items):
+@pytest.mark.parametrize("method", [zipfile.ZIP_DEFLATED, zipfile.ZIP_BZIP2, zipfile.ZIP_LZMA])
+def test_a_zip_whose_compressed_bytes_are_damaged_is_refused(tmp_path, items, method):
     record(tmp_path / "a.mcap", items)
-    with zipfile.ZipFile(tmp_path / "a.zip", "w", zipfile.ZIP_DEFLATED) as archive:
+    with zipfile.ZipFile(tmp_path / "a.zip", "w", method) as archive:
         archive.write(tmp_path / "a.mcap", "a.mcap")
     octets = bytearray((tmp_path / "a.zip").read_bytes())
     octets[200:240] = bytes(40)
@@ -548,9 +551,20 @@ def test_mutated_logs_give_a_report_and_never_an_unknown_error(tmp_path, items):
         assert report.reasons or report.n_returns
 
 
-def test_a_database_that_is_no_bag_is_refused(tmp_path):
-    import sqlite3
+@pytest.mark.parametrize("time", [1e30, -1, float("inf")])
+def test_a_message_at_a_time_that_cannot_be_is_damage(tmp_path, items, time):
+    (part,) = rosbag2(tmp_path / "bag", items).glob("*.db3")
+    with closing(sqlite3.connect(part)) as connection, connection:
+        connection.execute(
+            "UPDATE messages SET timestamp = ? WHERE id = (SELECT max(id) FROM messages)", (time,)
+        )
+    with pytest.raises(TruncatedRecordingError, match=f" {len(items) - 1} messages are before"):
+        read_log(part)
+    assert inspect_log(part).code == TruncatedRecordingError.code
+    assert len(read_log(part, LogOptions(recover=True)).p_lidar) == 128
 
+
+def test_a_database_that_is_no_bag_is_refused(tmp_path):
     with sqlite3.connect(tmp_path / "a.db3") as connection:
         connection.execute("CREATE TABLE topics (id, name, type, serialization_format)")
         connection.execute("CREATE VIEW messages AS SELECT 1 AS id, 1 AS topic_id")
