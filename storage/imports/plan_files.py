@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import csv
 import io
-import json
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
@@ -14,9 +13,11 @@ import numpy as np
 from spheremark.pipelines.errors import ControlError, InputError
 from spheremark.pipelines.model import Array
 from spheremark.pipelines.placement import Arrangement
+from spheremark.storage.imports.nesting import read_json
 from spheremark.storage.imports.survey_files import parse_control, table_rows
 
 _SIZE_MAX = 20_000_000  # characters of a file
+_POLYGONS = "Polygon or MultiPolygon in metres is expected"
 _STOP_COLUMNS = "name,x_m,y_m and, if known, z_m of the LiDAR [m]"
 
 
@@ -97,11 +98,13 @@ def read_keep_out(path: str | Path) -> tuple[Array, ...]:
     """
     name = Path(path).name
     try:
-        polygons = tuple(_rings(json.loads(_text(path))))
-    except (KeyError, TypeError, ValueError, AttributeError) as error:
-        raise InputError(f"{name} is no GeoJSON with polygons: {error}.") from error
+        polygons = tuple(_rings(read_json(_text(path))))
+    except (LookupError, TypeError, ValueError, AttributeError) as error:
+        raise InputError(
+            f"{name} is no GeoJSON with polygons: {str(error).rstrip('.')}; {_POLYGONS}."
+        ) from error
     if not polygons:
-        raise InputError(f"{name} holds no polygon; Polygon or MultiPolygon is expected.")
+        raise InputError(f"{name} holds no polygon; {_POLYGONS}.")
     return polygons
 
 
@@ -119,7 +122,7 @@ def _text(path: str | Path) -> str:
 def _named_places(file: str, text: str, key: str) -> list[tuple[str, list[float]]]:
     """Return names and positions of a JSON response."""
     try:
-        values = json.loads(text)
+        values = read_json(text)
         rows = values[key] if isinstance(values, Mapping) else values
         found = [(str(row["name"]), [float(v) for v in row["position_m"]]) for row in rows]
     except (KeyError, TypeError, ValueError) as error:
@@ -203,6 +206,11 @@ def _rings(value: Any) -> Iterator[Array]:
         groups = [value["coordinates"]] if kind == "Polygon" else value["coordinates"]
         for rings in groups:
             ring = np.array(rings[0], dtype=np.float64)
-            if ring.ndim != 2 or len(ring) < 4 or not np.isfinite(ring).all():
+            if (
+                ring.ndim != 2
+                or min(ring.shape) < 2
+                or len(ring) < 4
+                or not np.isfinite(ring).all()
+            ):
                 raise ValueError("a polygon needs four corners or more, the last the first again")
             yield np.ascontiguousarray(ring[:, :2])

@@ -27,7 +27,7 @@ from spheremark.pipelines.errors import (
 from spheremark.pipelines.geometry import rigid
 from spheremark.pipelines.model import Array, ControlMarks, Rig, StopTruth, Truth
 from spheremark.pipelines.scan.rigs import rig_from_mapping, rig_to_mapping
-from spheremark.storage.imports.nesting import require_shallow
+from spheremark.storage.imports.nesting import read_json
 
 CONTROL_COLUMNS = ("mark", "x_m", "y_m", "z_m", "sigma_x_m", "sigma_y_m", "sigma_z_m")
 TRUTH_FORMAT = "spheremark-truth/1"
@@ -539,8 +539,8 @@ def _rotation(values: ArrayLike) -> Array:
 def _object(text: str, error_class: type[InputError], what: str) -> dict[str, Any]:
     """Read a JSON object."""
     try:
-        values = require_shallow(json.loads(text.lstrip("\ufeff")))
-    except (ValueError, RecursionError) as error:
+        values = read_json(text)
+    except ValueError as error:
         raise error_class(f"{what} is not JSON that can be read: {error}.") from error
     if not isinstance(values, dict):
         raise error_class(f"{what} holds a {type(values).__name__}; it must be a JSON object.")

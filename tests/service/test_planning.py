@@ -203,6 +203,14 @@ def test_files_of_a_plan_say_what_is_wrong(tmp_path):
     file.write_text('{"type": "Point", "coordinates": [0, 0]}')
     with pytest.raises(InputError, match="no polygon"):
         read_keep_out(file)
+    file.write_text('{"type": "Polygon", "coordinates": []}')
+    with pytest.raises(InputError, match="Polygon or MultiPolygon in metres"):
+        read_keep_out(file)
+    for reader in (read_stops, read_marks, read_keep_out):
+        for deep in ("[" * 100_000 + "]" * 100_000, '{"stops": ' * 9_000 + "1" + "}" * 9_000):
+            file.write_text(deep)
+            with pytest.raises(InputError, match="more than 32 levels"):
+                reader(file)
     square = {"type": "Polygon", "coordinates": [[[0, 0], [1, 0], [1, 1], [0, 1], [0, 0]]]}
     file.write_text(json.dumps(square))
     assert len(read_keep_out(file)[0]) == 5

@@ -21,7 +21,11 @@ JSON = {"Content-Type": "application/json"}
 
 def _nested(key, depth):
     """Return the JSON of a job, or of a rig, whose one value has so many brackets."""
-    value = f'{{"a": {"[" * depth}{"]" * depth}}}'
+    return _with(key, f'{{"a": {"[" * depth}{"]" * depth}}}')
+
+
+def _with(key, value):
+    """Return the JSON of a job with a value."""
     return f'{{"survey": "a", "recording": "{DIGEST}", "{key}": {value}}}'
 
 
@@ -105,6 +109,13 @@ WRONG = [  # method, path, arguments, status, code
      422, "input.validation"),
     ("POST", "/api/v1/jobs", {"content": _nested("options", 10**6), "headers": JSON},
      400, "input.validation"),
+    *(("POST", "/api/v1/jobs", {"content": _with(key, value), "headers": JSON},
+       422, "input.validation")
+      for key in ("rig", "config", "options")
+      for value in (r'{"a": "\ud800"}', r'{"\udfff": 1}', f'{{"tolerance": {10**400}}}')),
+    ("POST", "/api/v1/rigs", {"content": r'{"name": "\ud800"}'}, 400, "input.rig"),
+    ("PUT", "/api/v1/surveys/nobody/truth", {"content": r'{"about": "\ud800"}', "headers": JSON},
+     400, "input.truth"),
     ("POST", "/api/v1/rigs", {"content": ""}, 400, "input.empty"),
     ("POST", "/api/v1/rigs", {"json": {"name": "bench"}}, 400, "input.rig"),
     ("GET", "/api/v1/rigs/none", {}, 404, "not_found"),

@@ -148,6 +148,10 @@ def changed(**changes):
         (changed(marks=[{"name": "A", "position_m": [1, 2]}]), "three numbers"),
         (changed(marks=[{"name": "A", "position_m": [1, 2, 3]}] * 2), "two marks"),
         (changed(marks=None), "expected marks"),
+        (changed(marks=[{"name": "A", "position_m": [1, 2, 10**400]}]), "beyond 1.8e.308"),
+        (changed(about={"\ud800": 1}), "half of a surrogate pair"),
+        (changed(about="long" * 20 + "\udfff"), r"'\\udfff'"),
+        ("[" * 100_000 + "]" * 100_000, "more than 32 levels"),
         (
             changed(
                 stops=[
