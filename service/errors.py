@@ -145,12 +145,6 @@ class ForbiddenError(SpheremarkError):
     code: ClassVar[str] = "forbidden"
 
 
-class UnavailableError(SpheremarkError):
-    """A part of the service is not running."""
-
-    code: ClassVar[str] = "unavailable"
-
-
 STATUS: Mapping[type[SpheremarkError], int] = {
     SpheremarkError: 500,
     InputError: 400,
@@ -173,7 +167,6 @@ STATUS: Mapping[type[SpheremarkError], int] = {
     NotFoundError: 404,
     ConflictError: 409,
     LockedError: 423,
-    UnavailableError: 503,
     ReaderEndedError: 503,
     StorageError: 503,
     StorageFullError: 507,

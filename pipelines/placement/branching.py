@@ -76,7 +76,6 @@ class Branched(NamedTuple):
     bound: float  # sigma that no arrangement goes below [m]
     chosen: Index  # the places of the best arrangement that came along; none is empty
     value: float  # its sigma [m]
-    n_nodes: int  # relaxations that were solved
 
 
 class Cells(NamedTuple):
@@ -169,14 +168,14 @@ def branch(
     root = Node((0,), (n_marks,), around.weights, keep, around.shares[keep])
     heap = [(given.limit(around.bound), 0, root)]
     best, chosen = reached, np.zeros(0, np.intp)
-    spent, n_nodes, serial, least = 0.0, 0, 1, np.inf
+    spent, serial, least = 0.0, 1, np.inf
     while heap and spent < _EFFORT and heap[0][0] < given.limit(best / (1.0 + EXCESS)):
         checkpoint()
         report(spent / _EFFORT, given.sigma(min(heap[0][0], least)))
         limit = given.limit(best / (1.0 + EXCESS))
         some = [heappop(heap) for _ in range(min(_AT_ONCE, len(heap)))]
         for opened in tree.opened(some, limit):
-            n_nodes, spent = n_nodes + 1, spent + opened.effort
+            spent += opened.effort
             if opened.value < best:
                 best, chosen = opened.value, opened.chosen
             if not opened.children:
@@ -185,7 +184,7 @@ def branch(
                 heappush(heap, (bound, serial, node))
                 serial += 1
     bound = min(heap[0][0] if heap else np.inf, least)
-    return Branched(min(given.sigma(bound), best), chosen, best, n_nodes)
+    return Branched(min(given.sigma(bound), best), chosen, best)
 
 
 def _halved(p_site: Array) -> Cells:
