@@ -36,6 +36,7 @@ from spheremark.pipelines.scan.rigs import tilted_vlp16
 from spheremark.storage.catalogue.catalogue import Catalogue
 from spheremark.storage.catalogue.results import RunInfo, tables
 from spheremark.storage.clouds.stop import write_cloud
+from spheremark.storage.recordings import Preflight, TopicReport
 
 RADIUS = 0.1
 NOISE = {"along_beam": 0.02, "paper": 0.02}  # [m] of one range
@@ -224,9 +225,13 @@ def _finish(catalogue, folder, survey_id, moment, result, control):
     digest = hashlib.sha256(f"{survey_id} {moment}".encode()).hexdigest()
     topic = {"topic": "/points", "schema": "sensor_msgs/msg/PointCloud2", "encoding": "cdr"}
     topic |= {"n_messages": 132, "rate_hz": 10.0, "longest_gap_s": 0.1}
-    report = {"verdict": "ok", "reasons": [], "topics": [topic]}
+    report = Preflight(verdict="ok", topics=(TopicReport(**topic),))
     catalogue.add_recording(
-        digest, name=result.name, size_bytes=91_000_000, url="/nowhere.mcap", preflight=report
+        digest,
+        name=result.name,
+        size_bytes=91_000_000,
+        url="/nowhere.mcap",
+        preflight=report.to_mapping(),
     )
     job = catalogue.create_job("process", survey=survey_id, recording_id=digest, config={})
     catalogue.start_job(job.job_id)

@@ -1,7 +1,8 @@
-"""The page of a recording: findings, timeline, and reports of earlier versions."""
+"""The page of a recording: findings and timeline."""
 
 import pytest
 
+from spheremark.storage.recordings import Preflight
 from spheremark.web.pages.base import Frame
 from spheremark.web.pages.recording import findings, recording_page, timeline_of
 
@@ -57,8 +58,8 @@ def test_what_is_missing_comes_with_its_advice(key, value, words):
 
 
 def test_a_truncated_log_offers_what_is_readable():
-    report = {"verdict": "refused", "code": "input.recording.truncated", "reasons": ["It is cut."]}
-    shown = page(report, verdict="refused")
+    report = Preflight(verdict="refused", code="input.recording.truncated", reasons=("It is cut.",))
+    shown = page(report.to_mapping(), verdict="refused")
     assert "Use what is readable" in shown
     assert 'value="true" checked' in shown
 
@@ -76,9 +77,7 @@ def test_the_timeline_has_topics_gaps_angle_and_stops():
     assert page(GOOD).count("<polyline") == 1
 
 
-def test_a_report_of_an_earlier_version_has_no_timeline_and_a_page():
-    old = {key: GOOD[key] for key in list(GOOD)[:17]} | {
-        "topics": [{k: v for k, v in GOOD["topics"][0].items() if k not in ("counts", "gaps_s")}]
-    }
-    assert timeline_of(old) is None
-    assert "/points" in page(old)
+def test_a_log_of_one_instant_has_no_timeline_and_a_page():
+    found = GOOD | {"log_duration_s": 0.0}
+    assert timeline_of(found) is None
+    assert "/points" in page(found)

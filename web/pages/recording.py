@@ -31,13 +31,6 @@ _TICKS = (
 )  # [s]
 _N_TICKS = 10  # at most
 _WINDOW = 20  # messages that show a rate to an eighth
-_EMPTY: Mapping[str, Any] = {
-    "reasons": [],
-    "notes": [],
-    "diagnosis": [],
-    "topics": [],
-    "reading": {},
-}
 
 
 class Finding(NamedTuple):
@@ -92,7 +85,7 @@ def recording_page(
     recording : mapping
         Its row.
     preflight : mapping
-        Its preflight report, of this version or an earlier one.
+        Its preflight report.
     jobs : sequence of mapping
         Its jobs, newest first.
     surveys : sequence of str
@@ -103,7 +96,6 @@ def recording_page(
     str
         HTML.
     """
-    preflight = {**_EMPTY, **preflight}
     found = findings(preflight)
     return render(
         "recording.html",
@@ -116,7 +108,7 @@ def recording_page(
         cannot=[one for one in found if one.state != "ok"],
         timeline=timeline_of(preflight),
         readouts=readouts(preflight),
-        is_cut=preflight.get("code") == "input.recording.truncated",
+        is_cut=preflight["code"] == "input.recording.truncated",
     )
 
 
@@ -205,14 +197,13 @@ def readouts(preflight: Mapping[str, Any]) -> list[Readout]:
 
 
 def timeline_of(preflight: Mapping[str, Any]) -> Timeline | None:
-    """Return the timeline of a log, if its report has one."""
-    duration = float(preflight.get("log_duration_s") or 0.0)
-    topics = [one for one in preflight.get("topics", ()) if one.get("counts")]
+    """Return the timeline of a log; none without messages at different times."""
+    duration = float(preflight["log_duration_s"])
+    topics = [one for one in preflight["topics"] if one["counts"]]
     if duration <= 0.0 or not topics:
         return None
     scale = _WIDTH / duration
-    times = preflight.get("gimbal_times_s") or ()
-    angles = preflight.get("gimbal_angles_deg") or ()
+    times, angles = preflight["gimbal_times_s"], preflight["gimbal_angles_deg"]
     low, high = (min(angles), max(angles)) if angles else (0.0, 0.0)
     tall = _ANGLE_HEIGHT / ((high - low) or 1.0)
     step = next((one for one in _TICKS if duration / one <= _N_TICKS), duration)
@@ -220,7 +211,7 @@ def timeline_of(preflight: Mapping[str, Any]) -> Timeline | None:
         lanes=[_lane(one, scale) for one in topics],
         stops=[
             Bar(scale * begin, scale * (end - begin), 1.0, f"stop {i}: {begin:.1f} to {end:.1f} s")
-            for i, (begin, end) in enumerate(preflight.get("stop_spans_s") or (), start=1)
+            for i, (begin, end) in enumerate(preflight["stop_spans_s"], start=1)
         ],
         line=" ".join(
             f"{scale * time:.1f},{tall * (high - angle):.1f}"
@@ -251,7 +242,7 @@ def _lane(topic: Mapping[str, Any], scale: float) -> Lane:
         bars=[bar for bar in bars if bar.shade],
         gaps=[
             Bar(scale * begin, max(scale * (end - begin), 2.0), 1.0, f"{end - begin:.2f} s silent")
-            for begin, end in topic.get("gaps_s") or ()
+            for begin, end in topic["gaps_s"]
         ],
     )
 

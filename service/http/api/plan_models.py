@@ -397,7 +397,7 @@ class StopEvaluation(Plain):
     position_m: Point
     sigma_3d_m: float | None
     rms_error_3d_m: float | None = Field(
-        default=None, description="Over which marks are found; of older plans null."
+        description="Over the sets of marks that may be found and give a position."
     )
     probability_within_tolerance: float
     covariance_m2: list[list[float | None]]
