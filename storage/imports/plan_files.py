@@ -43,7 +43,7 @@ def read_marks(path: str | Path) -> Arrangement:
     text = _text(path)
     if text.lstrip()[:1] in "[{":
         return _marks_of_json(Path(path).name, text)
-    marks = parse_control(_marks_of_plan(text))
+    marks = parse_control(_marks_of_plan(Path(path).name, text))
     return Arrangement(names=marks.names, p_site=np.array(marks.p_site))
 
 
@@ -146,24 +146,25 @@ def _marks_of_json(file: str, text: str) -> Arrangement:
     )
 
 
-def _marks_of_plan(text: str) -> str:
+def _marks_of_plan(file: str, text: str) -> str:
     """Return the marks of a plan's CSV as a table of control marks; other tables unchanged."""
-    rows = list(csv.DictReader(io.StringIO(text)))
-    if not rows or "kind" not in rows[0]:
+    (_, head), *body = list(table_rows(text, ControlError, file)) or [(0, [])]
+    if "kind" not in head:
         return text
     columns = ("name", "x_m", "y_m", "z_m")
-    if not set(columns) <= set(rows[0]):
+    if not set(columns) <= set(head):
         raise ControlError("The plan lacks a column of name, x_m, y_m, z_m.")
     table = io.StringIO()
     writer = csv.DictWriter(table, columns, extrasaction="ignore", lineterminator="\n")
     writer.writeheader()
-    writer.writerows(row for row in rows if row["kind"] == "mark")
+    rows = (dict(zip(head, cells, strict=False)) for _, cells in body)
+    writer.writerows(row for row in rows if row.get("kind") == "mark")
     return table.getvalue()
 
 
 def _stop_rows(file: str, text: str) -> Iterator[tuple[str, list[float]]]:
     """Return the stops of a table."""
-    (_, head), *body = list(table_rows(text)) or [(0, [])]
+    (_, head), *body = list(table_rows(text, InputError, file)) or [(0, [])]
     heads = [cell.lower().removesuffix("_m") for cell in head]
     name = next((key for key in ("name", "stop", "id") if key in heads), None)
     if name is None or "x" not in heads or "y" not in heads:

@@ -135,7 +135,7 @@ def parse_control(text: str, layout: ControlLayout = _PLAIN) -> ControlMarks:
         raise ControlError(
             f"The control table has {len(text):,} characters; at most {_SIZE_MAX:,} are read."
         )
-    rows = list(table_rows(text))
+    rows = list(table_rows(text, ControlError, "the control table"))
     if not rows:
         raise ControlError(f"The control table is empty; {_EXPECTED}.")
     columns, body = _columns(rows, layout.axes)
@@ -373,13 +373,19 @@ class _Table:
         return unit * sigmas
 
 
-def table_rows(text: str) -> Iterator[tuple[int, list[str]]]:
+def table_rows(
+    text: str, error_class: type[InputError], what: str
+) -> Iterator[tuple[int, list[str]]]:
     """Yield the rows of a table in CSV with comma, semicolon or tab, without comments.
 
     Parameters
     ----------
     text : str
         The table.
+    error_class : type of InputError
+        Class of the error at a cell that is too long.
+    what : str
+        What the table is, for that error.
 
     Yields
     ------
@@ -391,7 +397,13 @@ def table_rows(text: str) -> Iterator[tuple[int, list[str]]]:
     separator = max("\t;,", key=first.count)
     for number, line in enumerate(lines, start=1):
         if line:
-            (cells,) = csv.reader([line], delimiter=separator)
+            try:
+                (cells,) = csv.reader([line], delimiter=separator)
+            except csv.Error as error:
+                raise error_class(
+                    f"Line {number} of {what} has a cell of more than {csv.field_size_limit():,} "
+                    "characters; a name or a number is expected. Shorten it, or end its quotes."
+                ) from error
             yield number, [cell.strip() for cell in cells]
 
 

@@ -197,6 +197,11 @@ def test_files_of_a_plan_say_what_is_wrong(tmp_path):
     file.write_text("name,x_m\nA,1\n")
     with pytest.raises(InputError, match="name,x_m,y_m"):
         read_stops(file)
+    for reader, kind in ((read_stops, "stop"), (read_marks, "mark")):
+        for head in ("", f"kind,name,x_m,y_m,z_m\n{kind},"):
+            file.write_text(head + "A" * 140_000 + ",1,2,3\n")
+            with pytest.raises(InputError, match=r"Line . of file has a cell of more than 131,072"):
+                reader(file)
     file.write_text('{"marks": [{"name": "A"}]}')
     with pytest.raises(InputError, match="position_m"):
         read_marks(file)

@@ -102,6 +102,11 @@ def test_standard_deviations_are_read(text, sigmas):
         ("mark,x,y,z,sigma\nA,1,2,3,-1\n", "negative"),
         ("mark,x,y,z\n" + "".join(f"{k},{k},0,0\n" for k in range(10_001)), "more than 10,000"),
         ("x" * 4_000_001, "characters"),
+        (
+            "mark,x,y,z\nA,1,2,3\n" + "B" * 140_000 + ",4,5,6",
+            "Line 3 .* 131,072 characters; a name",
+        ),
+        ("B" * 140_000 + ",4,5,6", "Line 1 .* 131,072 characters"),
     ],
 )
 def test_a_table_that_cannot_be_used_is_refused(text, message):
