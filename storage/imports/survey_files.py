@@ -323,17 +323,18 @@ class _Table:
     lines: tuple[int, ...]
     cells: Mapping[str, Sequence[str]]
 
-    def numbers(self, column: str) -> Array:
-        """Return the numbers in a column."""
+    def lengths(self, column: str, unit: float) -> Array:
+        """Return the lengths in a column, whose cells are multiples of a unit [m]."""
         cells = self.cells[column]
-        numbers = np.array([_number(cell) for cell in cells])
-        if (wrong := np.flatnonzero(~(np.abs(numbers) < _COORDINATE_MAX))).size:
+        lengths = unit * np.array([_number(cell) for cell in cells])
+        if (wrong := np.flatnonzero(~(np.abs(lengths) < _COORDINATE_MAX))).size:
+            cell, length = cells[wrong[0]], lengths[wrong[0]]
+            found = repr(cell) if np.isnan(length) else f"{cell!r}, that is {length:g} m"
             raise ControlError(
-                f"Line {self.lines[wrong[0]]}, column {column} of the control table is "
-                f"{cells[wrong[0]]!r}; it must be a number of metres below {_COORDINATE_MAX:g}, "
-                "with a decimal point."
+                f"Line {self.lines[wrong[0]]}, column {column} of the control table is {found}; it "
+                f"must be a number below {_COORDINATE_MAX:g} m, with a decimal point."
             )
-        return numbers
+        return lengths
 
     def names(self) -> tuple[str, ...]:
         """Return the names of the marks, all different."""
@@ -352,10 +353,12 @@ class _Table:
     def positions(self, layout: ControlLayout) -> Array:
         """Return the positions of the centres, (n, 3) [m]."""
         unit = _UNITS[layout.unit]
-        up = -self.numbers("down_m") if "down_m" in self.cells else self.numbers("z_m")
-        p = unit * np.column_stack([self.numbers("x_m"), self.numbers("y_m"), up])
+        is_down = "down_m" in self.cells
+        up = -self.lengths("down_m", unit) if is_down else self.lengths("z_m", unit)
+        p = np.column_stack([self.lengths("x_m", unit), self.lengths("y_m", unit), up])
         has_heights = "target_height_m" in self.cells
-        p[:, 2] += unit * self.numbers("target_height_m") if has_heights else layout.target_height
+        height = self.lengths("target_height_m", unit) if has_heights else layout.target_height
+        p[:, 2] += height
         return p
 
     def sigmas(self, unit: float) -> Array:
@@ -363,14 +366,14 @@ class _Table:
         columns = [name for name in CONTROL_COLUMNS[4:] if name in self.cells] or ["sigma_m"] * 3
         if columns[0] not in self.cells:
             return np.zeros((len(self.lines), 3))
-        sigmas = np.column_stack([self.numbers(column) for column in columns])
+        sigmas = np.column_stack([self.lengths(column, unit) for column in columns])
         if (sigmas < 0.0).any():
             row, axis = np.argwhere(sigmas < 0.0)[0]
             raise ControlError(
                 f"Line {self.lines[row]}, column {columns[axis]} of the control table is "
-                f"{sigmas[row, axis]:g}; a standard deviation cannot be negative."
+                f"{sigmas[row, axis]:g} m; a standard deviation cannot be negative."
             )
-        return unit * sigmas
+        return sigmas
 
 
 def table_rows(

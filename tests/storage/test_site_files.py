@@ -253,6 +253,14 @@ def test_feet_are_feet_and_those_of_the_us_survey_a_little_longer():
     assert np.sqrt(feet.cov_p_site[0, 0, 0]) == pytest.approx(0.003048, abs=1e-12)
 
 
+def test_coordinates_of_a_national_grid_may_be_in_millimetres():
+    layout = ControlLayout(unit="mm")
+    marks = parse_control("A,3500000123,5500000456,120789,1,2,3", layout)
+    assert_allclose(marks.p_site, [[3500000.123, 5500000.456, 120.789]], rtol=0, atol=1e-6)
+    with pytest.raises(ControlError, match=r"column x_m .* '2e11', that is 2e\+08 m; .* 1e\+08 m"):
+        parse_control("A,2e11,0,0", layout)
+
+
 @pytest.mark.parametrize("text", ["A,10,20,3,0.1,0.2,0.3", "m,x,y,z,sx,sy,sz\nA,10,20,3,.1,.2,.3"])
 def test_sigmas_follow_their_axes(text):
     text = text.replace("m,x", "mark,x")
