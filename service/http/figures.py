@@ -62,9 +62,14 @@ def data_of(service: Service, name: str, chosen: Chosen) -> pa.Table:
     return service.catalogue.table(sql, accuracy.used_by(sql, chosen.values))
 
 
-def sql_of(name: str, chosen: Chosen) -> str:
-    """Return the query of a figure or table as one runs it on the page for SQL."""
-    sql = TABLES[name][0] if name in TABLES and name not in QUERIES else _query(name)
+def figure_sql(name: str, chosen: Chosen) -> str:
+    """Return the query of a figure as one runs it on the page for SQL."""
+    return accuracy.as_text(_query(name), chosen.values) + "\n"
+
+
+def table_sql(name: str, chosen: Chosen) -> str:
+    """Return the query of a whole table as one runs it on the page for SQL."""
+    sql, _ = _table(name)
     return accuracy.as_text(sql, chosen.values) + "\n"
 
 
@@ -190,10 +195,7 @@ def page_of(
     service: Service, name: str, chosen: Chosen, sort: str, after: int, limit: int
 ) -> pa.Table:
     """Return a part of a table; the column to sort by may begin with a minus."""
-    if name not in TABLES:
-        known = ", ".join(TABLES)
-        raise NotFoundError(f"There is no table {name!r}; there are {known}.")
-    sql, ties = TABLES[name]
+    sql, ties = _table(name)
     values = accuracy.used_by(sql, chosen.values)
     column, order = sort.removeprefix("-"), "DESC" if sort.startswith("-") else "ASC"
     if column:
@@ -208,7 +210,7 @@ def page_of(
 
 def count_of(service: Service, name: str, chosen: Chosen) -> int:
     """Return how many rows a table has."""
-    sql = TABLES[name][0]
+    sql, _ = _table(name)
     text = _COUNT.format(rows=sql.strip())
     return int(service.catalogue.rows(text, accuracy.used_by(sql, chosen.values))[0]["n"])
 
@@ -241,3 +243,10 @@ def _query(name: str) -> str:
     if name not in CAPTIONS:
         raise NotFoundError(f"There is no figure {name!r}; there are {', '.join(CAPTIONS)}.")
     return QUERIES["solution" if name in _OF_SOLUTION else name]
+
+
+def _table(name: str) -> tuple[str, tuple[str, ...]]:
+    """Return the query of a table, and the columns that order its ties."""
+    if name not in TABLES:
+        raise NotFoundError(f"There is no table {name!r}; there are {', '.join(TABLES)}.")
+    return TABLES[name]

@@ -85,6 +85,16 @@ def test_a_table_as_a_file_has_all_its_rows(client, table):
     n_all = get(client, f"tables/{table}.json").json()["n_all"]
     rows = list(csv.DictReader(io.StringIO(get(client, f"tables/{table}.csv").text)))
     assert len(rows) == n_all
+    sql = get(client, f"tables/{table}.sql").text
+    answer = client.post("/api/v1/sql", json={"sql": sql}).json()
+    assert len(answer["rows"]) == n_all
+    table = pq.read_table(io.BytesIO(get(client, f"tables/{table}.parquet").content))
+    assert [column["name"] for column in answer["columns"]] == table.column_names
+
+
+def test_a_query_without_an_upper_limit_can_be_run(client):
+    sql = get(client, "figures/distance.sql", survey="field", range_to_m="inf").text
+    assert client.post("/api/v1/sql", json={"sql": sql}).json()["rows"]
 
 
 def test_limits_hold_the_confidence_that_few_stops_cannot_give(client):
@@ -112,6 +122,15 @@ def test_what_does_not_exist_is_refused_by_name(client, path, status):
     response = client.get(f"/api/v1/{path}")
     assert response.status_code == status
     assert response.json()["detail"]
+
+
+@pytest.mark.parametrize("path", ["tables/nothing", "tables/distance", "figures/centres"])
+@pytest.mark.parametrize("form", ["json", "sql"])
+def test_a_figure_is_no_table_and_a_table_no_figure(client, path, form):
+    response = client.get(f"/api/v1/{path}.{form}")
+    kind, name = path.split("s/")
+    assert response.status_code == 404
+    assert f"There is no {kind} {name!r}" in response.json()["detail"]
 
 
 @pytest.mark.parametrize("path", ["/accuracy", "/surveys/field/accuracy?range_from_m=5"])

@@ -165,7 +165,7 @@ def get_table(
     """Return a part of a table in any order: as JSON with links, or as a file of many rows."""
     chosen = figures.choose(service, query.selection())
     if form is Form.SQL:
-        return Response(figures.sql_of(table, chosen), media_type=figures.MEDIA[form])
+        return Response(figures.table_sql(table, chosen), media_type=figures.MEDIA[form])
     is_limited = "limit" in query.model_fields_set or form is Form.JSON
     limit = query.limit if is_limited else figures.ROWS_MAX
     found = figures.page_of(service, table, chosen, query.sort, query.after, limit)
@@ -182,7 +182,7 @@ def get_table(
 def _figure(service: Service, name: str, form: Form, chosen: figures.Chosen) -> Response:
     """Return a figure in a form."""
     if form is Form.SQL:
-        return Response(figures.sql_of(name, chosen), media_type=figures.MEDIA[form])
+        return Response(figures.figure_sql(name, chosen), media_type=figures.MEDIA[form])
     if form is Form.JSON:
         text = service.catalogue.computed(
             ("figure", name, repr(chosen)),
