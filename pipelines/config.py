@@ -110,7 +110,7 @@ class ExtractionConfig:
         Accepted mean number of false markers in a scan. Groups are markers, the surest first, while
         their probabilities of being none add up to at most this. Others whose probability is 0.9 or
         more are possible markers. 0.01: one false marker in a hundred scans if the
-        probabilities hold. Among many decoys it was one in seven scans, as the methods say.
+        probabilities hold; the page of methods says how many more there were among many decoys.
     range_max : float
         Markers are not searched for beyond this distance [m]. 100: as far as the sensor measures;
         ``n_points_min`` limits smaller spheres to less, those of 0.1 m to 35 m in a usual turn.
@@ -372,22 +372,30 @@ def _build(kind: type[_T], values: object, path: str) -> _T:
     """Build one configuration dataclass from a mapping, recursively."""
     if not isinstance(values, Mapping):
         raise ConfigError(f"{path or 'The configuration'} is {values!r}; it must be an object.")
+    prefix = f"{path}." if path else ""
     types = get_type_hints(kind)
     unknown = [key for key in values if key not in types]
     if unknown:
-        raise ConfigError(f"{path}{unknown[0]} is unknown; known here: {', '.join(types)}.")
-    arguments = {key: _plain(types[key], value, f"{path}{key}") for key, value in values.items()}
+        raise ConfigError(f"{prefix}{unknown[0]} is unknown; known here: {', '.join(types)}.")
+    arguments = {key: _plain(types[key], value, f"{prefix}{key}") for key, value in values.items()}
     return kind(**arguments)
 
 
 def _plain(expected: Any, value: object, path: str) -> object:
     """Bring one value of a mapping to the type that the field declares."""
     if dataclasses.is_dataclass(expected) and isinstance(expected, type):
-        return _build(expected, value, f"{path}.")
+        return _build(expected, value, path)
     if expected == tuple[str, ...]:
         if isinstance(value, str) or not isinstance(value, Sequence):
             raise ConfigError(f"{path} is {value!r}; it must be a list of names.")
         return tuple(value)
     if expected is int and not isinstance(value, int):
         raise ConfigError(f"{path} is {value!r}; it must be a whole number.")
-    return float(value) if expected is float and isinstance(value, int) else value
+    if expected is float and isinstance(value, int):
+        try:
+            return float(value)
+        except OverflowError as error:
+            raise ConfigError(
+                f"{path} is a whole number beyond 1.8e308; it is too large."
+            ) from error
+    return value

@@ -82,6 +82,23 @@ def test_an_unknown_key_of_a_configuration_is_refused_with_its_path():
         config.SurveyConfig.from_mapping({"extraction": {"cell": 1}})
 
 
+@pytest.mark.parametrize(
+    ("values", "message"),
+    [
+        ({"fitting": 5}, "fitting is 5; it must be an object"),
+        (5, "The configuration is 5; it must be an object"),
+        (
+            {"extraction": {"ground_cell": 10**400}},
+            "extraction.ground_cell is a whole number beyond",
+        ),
+        ({"tolerance": -(10**400)}, "tolerance is a whole number beyond"),
+    ],
+)
+def test_values_that_no_configuration_can_hold_are_refused_with_their_path(values, message):
+    with pytest.raises(errors.ConfigError, match=re.escape(message)):
+        config.SurveyConfig.from_mapping(values)
+
+
 def test_a_configuration_survives_its_own_text():
     first = config.SurveyConfig.from_mapping({"tolerance": 0.02, "fitting": {"methods": ["paper"]}})
     again = config.SurveyConfig.from_mapping(first.to_mapping())
