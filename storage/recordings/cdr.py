@@ -76,10 +76,6 @@ class Cursor:
         self.skip("I")
         return at
 
-    def stamp_ns(self) -> int:
-        """Read a time [ns]."""
-        return self.number("i") * 1_000_000_000 + self.number("I")
-
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Layout:

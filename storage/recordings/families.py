@@ -1,7 +1,7 @@
 """The interface of message families: neutral columns between decoders and the log.
 
 A family is a module with a decoder class per message type. It depends on its encoding and message
-type alone; a new one is listed in ``reading.py``.
+type alone; a new one is listed in ``decoding.py``.
 """
 
 from __future__ import annotations

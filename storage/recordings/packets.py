@@ -35,11 +35,10 @@ from spheremark.storage.recordings.container import Batch, Channel
 from spheremark.storage.recordings.families import (
     BrokenMessageError,
     Returns,
-    broken_note,
     far_note,
     plausible,
 )
-from spheremark.storage.recordings.points import Columns
+from spheremark.storage.recordings.points import ReturnsDecoder
 from spheremark.storage.recordings.records import Octets
 
 SCHEMA = "velodyne_msgs/msg/VelodyneScan"
@@ -117,34 +116,17 @@ def _sensor() -> _Sensor:
     )
 
 
-class Packets:
+class Packets(ReturnsDecoder):
     """Decoder of a topic of raw packets."""
 
     def __init__(self, channel: Channel, size: int) -> None:
         """Start without messages."""
-        self._topic = channel.topic
-        self._size = size
-        self._frame = ""
-        self._n = 0
-        self._out = Columns.empty(0)
+        super().__init__(channel, size)
         self._message_stamps = [np.empty(0, np.int64)]
         self._log_times = [np.empty(0, np.int64)]
         self._sizes = [np.empty(0, np.int64)]  # packets of each message
         self._heads = [np.empty((0, 4), np.int64)]  # packets: stamp, micros, mode and returns
-        self._n_broken = 0
-        self._reason = ""
         self._returns: Returns | None = None
-
-    def add(self, batch: Batch) -> None:
-        """Take some messages."""
-        i, n = 0, len(batch.starts)
-        while i < n:
-            try:
-                i += self._add(batch, i)
-            except BrokenMessageError as error:
-                i += 1
-                self._n_broken += 1
-                self._reason = self._reason or str(error)
 
     def _add(self, batch: Batch, i: int) -> int:
         """Append message i, and those behind it that begin alike; return how many these are."""
@@ -179,7 +161,8 @@ class Packets:
             _heads_kernel(octets, places[begin:end], is_little, heads[begin:end])
 
         side_by_side(count, len(places), threaded_from=_WORTH)
-        self._reserve(int(heads[:, 3].sum()), len(heads))
+        n = int(heads[:, 3].sum())
+        self._reserve(n, _MORE * self._size / _STRIDE * n / max(len(heads), 1))
         rows = self._n + np.cumsum(heads[:, 3]) - heads[:, 3]
         sensor, out = _sensor(), (self._out.p.reshape(-1), *self._out[1:])
 
@@ -188,18 +171,8 @@ class Packets:
             _packets_kernel(octets, places[part], rows[part], heads[part], sensor, out)
 
         side_by_side(unpack, len(places), threaded_from=_WORTH)
-        self._n += int(heads[:, 3].sum())
+        self._n += n
         self._heads.append(heads)
-
-    def _reserve(self, n: int, n_packets: int) -> None:
-        """Make room for so many returns of so many packets, the first time as if all were alike."""
-        old = self._out
-        if self._n + n <= len(old.rings):
-            return
-        alike = self._size / _STRIDE * n / max(n_packets, 1)
-        likely = round(_MORE * alike) if not self._n else 2 * len(old.rings)
-        self._out = Columns.empty(max(likely, self._n + n))
-        self._out.put(0, old.taken(slice(self._n)))
 
     def returns(self) -> Returns:
         """Return all returns, in the order of their instants; no message can follow."""
@@ -209,7 +182,7 @@ class Packets:
 
     def _settled(self) -> Returns:
         """Set the instants of all returns, and sort them."""
-        notes = [*broken_note(self._topic, self._n_broken, self._reason)]
+        notes = [*self._broken()]
         messages_ns, counts = self._settle(np.concatenate(self._heads), notes)
         out = self._out.in_order(counts)  # pulses follow each other in a packet
         return Returns(

@@ -16,14 +16,13 @@ from spheremark.storage.recordings.container import Batch, Channel
 from spheremark.storage.recordings.families import (
     BrokenMessageError,
     Returns,
-    broken_note,
     far_note,
     plausible,
 )
 from spheremark.storage.recordings.options import TIME_UNITS
 from spheremark.storage.recordings.points import (
-    Columns,
     Layout,
+    ReturnsDecoder,
     Tally,
     read_layout,
     unpack_any,
@@ -77,33 +76,16 @@ class _Messages(NamedTuple):
     plain_ns: Nanos  # that a recorded 1 is with most drivers that use this type
 
 
-class PointClouds:
+class PointClouds(ReturnsDecoder):
     """Decoder of a topic of point clouds."""
 
     def __init__(self, channel: Channel, size: int) -> None:
         """Start without messages."""
-        self._topic = channel.topic
-        self._size = size
-        self._frame = ""
+        super().__init__(channel, size)
         self._layout = Layout(description=b"", fields={}, order="<", step=0)
-        self._n = 0
-        self._out = Columns.empty(0)
         self._parts = [_Messages(*(np.empty(0, np.int64),) * len(_Messages._fields))]
         self._has_bad_rings = False
         self._time_fault = ""
-        self._n_broken = 0
-        self._reason = ""
-
-    def add(self, batch: Batch) -> None:
-        """Take some messages."""
-        i, n = 0, len(batch.starts)
-        while i < n:
-            try:
-                i += self._add(batch, i)
-            except BrokenMessageError as error:
-                i += 1
-                self._n_broken += 1
-                self._reason = self._reason or str(error)
 
     def _add(self, batch: Batch, i: int) -> int:
         """Append message i, and those behind it with an equal head; return their number."""
@@ -130,19 +112,10 @@ class PointClouds:
             self._layout = read_layout(cursor, octets)
         return _Head(cursor.order, at_shape, cursor.skip("I", 2), cursor.at)
 
-    def _reserve(self, n: int) -> None:
-        """Make room for n more returns."""
-        old = self._out
-        if self._n + n <= len(old.rings):
-            return
-        likely = self._size // self._layout.step if not self._n else 2 * len(old.rings)
-        self._out = Columns.empty(max(likely, self._n + n))
-        self._out.put(0, old.taken(slice(self._n)))
-
     def _add_one(self, octets: Octets, head: _Head, log_time: int) -> None:
         """Append the returns of one message, whatever its layout."""
         points, n = _points(octets, head, self._layout.step)
-        self._reserve(n)
+        self._reserve(n, self._size / self._layout.step)
         stamp = int(cdr.stamps_ns(octets[None], 4, head.order)[0])
         tally = self._unpack_one(points, stamp, self._n, n)
         self._parts.append(_Messages(*np.array([[stamp, log_time, *tally]], np.int64).T))
@@ -169,7 +142,7 @@ class PointClouds:
     def _add_clouds(self, octets: Octets, clouds: Nanos, log_times_ns: Nanos) -> None:
         """Append the returns of messages of one layout that the compiled loop reads."""
         n_points = clouds[:, 1]
-        self._reserve(int(n_points.sum()))
+        self._reserve(int(n_points.sum()), self._size / self._layout.step)
         clouds[:, 3] = self._n + np.cumsum(n_points) - n_points
         tally = unpack_clouds(octets, clouds, self._layout, self._out)
         kept, is_plain = self._plain(tally)
@@ -226,7 +199,7 @@ class PointClouds:
 
     def returns(self, time_unit: str = "auto") -> Returns:
         """Return all returns, in the order of their instants; the unit is as of ``LogOptions``."""
-        notes = [*broken_note(self._topic, self._n_broken, self._reason)]
+        notes = [*self._broken()]
         messages = self._in_unit(self._near(notes), time_unit, notes)
         self._parts = [messages := self._stamped(messages, notes)]
         has_times = self._has_times(messages, notes)

@@ -17,7 +17,8 @@ from spheremark.pipelines.compilation import compiled
 from spheremark.pipelines.model import RING_UNKNOWN, Array, Column, Index, Mask, Nanos, Rings
 from spheremark.pipelines.threads import by_turns
 from spheremark.storage.recordings import cdr
-from spheremark.storage.recordings.families import BrokenMessageError
+from spheremark.storage.recordings.container import Batch, Channel
+from spheremark.storage.recordings.families import BrokenMessageError, broken_note
 from spheremark.storage.recordings.records import Octets
 
 _KINDS = ("", "i1", "u1", "i2", "u2", "i4", "u4", "f4", "f8")  # by PointField.datatype
@@ -108,6 +109,48 @@ def _reserved(size: int) -> Octets:
     block = np.empty(size + _PAGE, np.uint8)
     begin = -block.ctypes.data % _PAGE
     return block[begin : begin + size]
+
+
+class ReturnsDecoder:
+    """Decoder of a LiDAR topic: counts broken messages; subclasses append the returns of others."""
+
+    def __init__(self, channel: Channel, size: int) -> None:
+        """Start without messages."""
+        self._topic = channel.topic
+        self._size = size
+        self._frame = ""
+        self._n = 0
+        self._out = Columns.empty(0)
+        self._n_broken = 0
+        self._reason = ""
+
+    def add(self, batch: Batch) -> None:
+        """Take some messages."""
+        i, n = 0, len(batch.starts)
+        while i < n:
+            try:
+                i += self._add(batch, i)
+            except BrokenMessageError as error:
+                i += 1
+                self._n_broken += 1
+                self._reason = self._reason or str(error)
+
+    def _add(self, batch: Batch, i: int) -> int:
+        """Append message i, and those behind it that begin alike; return how many these are."""
+        raise NotImplementedError
+
+    def _reserve(self, n: int, n_likely: float) -> None:
+        """Make room for n more returns, the first time for as many as are likely."""
+        old = self._out
+        if self._n + n <= len(old.rings):
+            return
+        room = 2 * len(old.rings) if self._n else round(n_likely)
+        self._out = Columns.empty(max(room, self._n + n))
+        self._out.put(0, old.taken(slice(self._n)))
+
+    def _broken(self) -> tuple[str, ...]:
+        """Return the sentence about broken messages, if there were any."""
+        return broken_note(self._topic, self._n_broken, self._reason)
 
 
 class Tally(NamedTuple):
