@@ -143,7 +143,7 @@ def write_grid(site: Site, path: Path) -> None:
     site : Site
         What ``read_terrain`` returned.
     path : Path
-        The file; ``open_terrain`` knows it once its ending is ``KEPT``.
+        The file; ``open_terrain`` reads it.
     """
     arrays = {"xs": site.xs, "ys": site.ys, "ground": site.ground}
     if not np.array_equal(site.surface, site.ground, equal_nan=True):
@@ -161,7 +161,7 @@ def open_terrain(path: Path, name: str) -> Site:
     Parameters
     ----------
     path : Path
-        A grid, or the foreign file itself, which earlier versions kept: that is read again.
+        A grid, as of ``write_grid``.
     name : str
         Name of the foreign file.
 
@@ -170,8 +170,6 @@ def open_terrain(path: Path, name: str) -> Site:
     Site
         Ground, and what hides.
     """
-    if path.suffix != KEPT:
-        return read_terrain(path, name=name)
     try:
         with path.open("rb") as file, np.load(file, allow_pickle=False) as arrays:
             return _site(name, dict(arrays))

@@ -112,22 +112,6 @@ def test_a_terrain_becomes_a_grid_and_the_same_one_twice_is_one(uploads, kind):
     assert site["name"] == f"first{ending}"
 
 
-def test_a_terrain_that_an_earlier_version_kept_whole_still_opens(uploads):
-    ending, body = made.valid()["tif in whole metres"]
-    body += b" "  # a terrain of its own
-    digest = hashlib.sha256(body).hexdigest()
-    path = uploads.data / "terrains" / f"{digest}{ending}"
-    path.write_bytes(body)
-    catalogue = uploads.client.app.state.service.catalogue
-    plans.keep_terrain(catalogue, digest, name="old.tif", size_bytes=len(body), url=str(path))
-    site = uploads.client.get(f"/api/v1/plans/sites/terrain:{digest}")
-    assert (site.status_code, site.json()["name"]) == (200, "old.tif")
-    assert uploads.send(body, "again.tif").json()["name"] == "old.tif"  # and is a grid from now on
-    assert not path.exists()
-    assert uploads.client.get(f"/api/v1/plans/sites/terrain:{digest}").status_code == 200
-    uploads.check()
-
-
 def test_a_grid_that_is_damaged_on_disk_is_said_so(uploads):
     ending, body = made.valid()["asc"]
     key = uploads.send(body + b"\n  \n", f"cut{ending}").json()["key"]
