@@ -5,17 +5,13 @@ A process of its own simulates the stops; each is uploaded over HTTP as soon as 
 
 from __future__ import annotations
 
-import json
 import queue
-import subprocess
-import sys
 import threading
 import time
-from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from datetime import datetime
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any
 
 import httpx
 from rich.console import Console
@@ -24,6 +20,7 @@ from rich.table import Table
 
 from spheremark.pipelines.errors import SpheremarkError
 from spheremark.service.client import Client
+from spheremark.service.processes import simulated
 from spheremark.service.serving import serve
 from spheremark.service.settings import Settings
 
@@ -42,12 +39,6 @@ SELECT 'stations', fit_method, count(*), sqrt(avg(error_3d_m ^ 2)), max(error_3d
 FROM latest_station_fixes WHERE survey = 'paper-field' AND error_3d_m IS NOT NULL GROUP BY ALL
 ORDER BY ALL
 """
-
-
-class SimulationFailedError(SpheremarkError):
-    """The process that simulates the survey ended before it was done."""
-
-    code: ClassVar[str] = "simulation_failed"
 
 
 def run(settings: Settings, console: Console) -> None:
@@ -122,7 +113,7 @@ class Rover:
     def _bring(self, stops: list[str], jobs: queue.SimpleQueue[str | None]) -> None:
         """Simulate and upload stop after stop; queue the job of each, then None."""
         try:
-            for made in self._simulated(stops):
+            for made in simulated(self._folder, stops, self._leaving):
                 self._client.set_control(SURVEY, self._folder / "control.csv")
                 self._client.request(
                     "PUT",
@@ -134,34 +125,6 @@ class Rover:
                 jobs.put(upload["job"]["job_id"])
         finally:
             jobs.put(None)
-
-    def _simulated(self, stops: list[str]) -> Iterator[dict[str, str]]:
-        """Yield each stop as soon as a process of its own has written it."""
-        command = [
-            sys.executable,
-            "-m",
-            "spheremark.service.cli",
-            "simulate",
-            str(self._folder),
-            "--json",
-        ]
-        with subprocess.Popen(
-            [*command, "--stops", ",".join(stops)],
-            stdout=subprocess.PIPE,
-            text=True,
-            start_new_session=True,  # the service handles Ctrl-C and then ends this
-        ) as process:
-            threading.Thread(target=self._stop_with_us, args=(process,), daemon=True).start()
-            for line in process.stdout or ():
-                yield json.loads(line)
-        if process.returncode and not self._leaving.is_set():
-            raise SimulationFailedError("The simulation failed; its message is above.")
-
-    def _stop_with_us(self, process: subprocess.Popen[str]) -> None:
-        """End the simulation when the service stops."""
-        while process.poll() is None:
-            if self._leaving.wait(_POLL):
-                process.terminate()
 
     def _await(self, job_id: str) -> None:
         """Wait for the end of a job and print its message or the reason of its failure."""

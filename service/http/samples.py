@@ -3,18 +3,16 @@
 from __future__ import annotations
 
 import asyncio
-import json
 import logging
-import subprocess
-import sys
 import threading
-from collections.abc import AsyncIterator, Iterator
+from collections.abc import AsyncIterator
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from spheremark.pipelines.errors import SpheremarkError
 from spheremark.service.http.uploads import take_in
 from spheremark.service.jobs.handlers import JobKind
+from spheremark.service.processes import simulated
 from spheremark.storage.imports.survey_files import parse_control, parse_truth
 from spheremark.storage.recordings import LogOptions
 from spheremark.storage.scratch import scratch
@@ -35,7 +33,6 @@ class Samples:
         self._lock = threading.Lock()
         self._leaving = threading.Event()
         self._thread: threading.Thread | None = None
-        self._process: subprocess.Popen[str] | None = None
         self._name = self._survey_id = ""
         self._n_made = 0
 
@@ -64,8 +61,6 @@ class Samples:
     def close(self) -> None:
         """End a simulation, and wait for its thread."""
         self._leaving.set()
-        if self._process is not None:
-            self._process.terminate()
         if self._thread is not None:
             self._thread.join()
 
@@ -76,7 +71,7 @@ class Samples:
 
         try:
             with scratch() as folder:
-                for made in self._simulated(folder):
+                for made in simulated(folder, _STOPS, self._leaving):
                     recording = self._take_in(service, survey_id, folder, made)
                     start(service, NewJob(survey=survey_id, recording=recording))
                     self._n_made += 1
@@ -85,21 +80,6 @@ class Samples:
         except (SpheremarkError, OSError, ValueError) as error:
             if not self._leaving.is_set():
                 logger.warning("The sample survey was not completed: %s", error)
-
-    def _simulated(self, folder: Path) -> Iterator[dict[str, str]]:
-        """Yield each stop as soon as its files are written."""
-        command = [sys.executable, "-m", "spheremark.service.cli", "simulate", str(folder)]
-        options = ["--json", "--stops", ",".join(_STOPS)]
-        with subprocess.Popen(
-            [*command, *options], stdout=subprocess.PIPE, text=True, start_new_session=True
-        ) as process:
-            self._process = process
-            if self._leaving.is_set():
-                process.terminate()
-            for line in process.stdout or ():
-                yield json.loads(line)
-        if process.returncode and not self._leaving.is_set():
-            logger.warning("The simulation of the sample survey ended with an error.")
 
     def _take_in(self, service: Service, survey_id: str, folder: Path, made: dict[str, str]) -> str:
         """Enter the log of a stop with the control and the truth of its field."""

@@ -7,6 +7,7 @@ import signal
 import socket
 import subprocess
 import sys
+import threading
 from contextlib import ExitStack, redirect_stderr, redirect_stdout
 from io import StringIO
 from types import SimpleNamespace
@@ -20,6 +21,7 @@ from spheremark.pipelines.geometry import levelling_rotation
 from spheremark.pipelines.model import Levelling
 from spheremark.service.cli.demo import summary_table
 from spheremark.service.cli.main import main
+from spheremark.service.processes import SimulationFailedError, simulated
 from spheremark.service.serialise.models import LogDocument
 
 COMMAND = (sys.executable, "-m", "spheremark.service.cli")
@@ -275,3 +277,11 @@ def test_errors_of_the_demonstration_are_shown_with_their_unit():
     shown = out.file.getvalue()
     assert "Errors against truth [mm]" in shown
     assert re.search(r"stations.*along_beam.*7.*0\.3.*0\.4.*0\.5", shown)
+
+
+def test_a_simulation_ends_with_the_service_and_is_an_error_when_it_fails(tmp_path):
+    leaving = threading.Event()
+    with pytest.raises(SimulationFailedError, match="its message is above"):
+        list(simulated(tmp_path, ["nowhere"], leaving))
+    leaving.set()
+    assert list(simulated(tmp_path, ["lane3-stop2"], leaving)) == []
