@@ -32,10 +32,10 @@ from spheremark.service.planning.requests import (
     Place,
     Plan,
     VisibilityCache,
+    ground_on,
     marks_at,
     simulated_ground,
     stops_at,
-    terrain_ground,
 )
 from spheremark.service.serialise.plans import (
     Plain,
@@ -46,6 +46,7 @@ from spheremark.service.serialise.plans import (
     trade_off_json,
 )
 from spheremark.storage.imports.plan_files import read_keep_out, read_stops
+from spheremark.storage.imports.terrain import read_terrain
 
 _PAIRS_MAX = 250_000  # of places and marks at once; 100 MB or so
 _SEED = 0  # of the optimiser's later starts
@@ -63,7 +64,7 @@ def read_ground(
     if terrain is None:
         ground = simulated_ground(scenario)
     else:
-        ground = terrain_ground(str(terrain), terrain.name, terrain)
+        ground = ground_on(str(terrain), read_terrain(terrain))
     site = ground.site
     if keep_out is not None:
         site = replace(site, keep_out=(*site.keep_out, *read_keep_out(keep_out)))

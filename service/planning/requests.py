@@ -130,8 +130,12 @@ def _simulated(name: str, seed: int) -> Ground:
 
 @lru_cache(maxsize=_GROUNDS_KEPT)
 def terrain_ground(key: str, name: str, path: Path) -> Ground:
-    """Return a terrain of a file, with stops spread over its middle and no mark yet."""
-    site = open_terrain(path, name)
+    """Return the ground of a terrain that the service keeps."""
+    return ground_on(key, open_terrain(path, name))
+
+
+def ground_on(key: str, site: Site) -> Ground:
+    """Return a terrain with stops spread over its middle and no mark yet."""
     return Ground(key, site, spread_stops(site), Arrangement.numbered(np.empty((0, 3))))
 
 
