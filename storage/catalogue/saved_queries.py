@@ -9,7 +9,7 @@ from typing import Any
 from spheremark.pipelines.errors import NotFoundError
 from spheremark.storage.catalogue.catalogue import Catalogue
 from spheremark.storage.catalogue.records import json_text
-from spheremark.storage.catalogue.surveys import check_name, now
+from spheremark.storage.catalogue.surveys import check_address, now
 
 _ALL = "SELECT * FROM saved_queries ORDER BY name"
 _ONE = "SELECT * FROM saved_queries WHERE name = $name"
@@ -78,7 +78,7 @@ def put_query(
     dict
         The query as kept.
     """
-    check_name("The name of a query", name)
+    check_address("The name of a query", name)
     row = [name, sql, json_text(parameters), now()]
     with catalogue.writing() as cursor:
         cursor.execute("INSERT OR REPLACE INTO saved_queries VALUES (?, ?, ?, ?)", row)

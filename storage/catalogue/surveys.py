@@ -99,7 +99,7 @@ class Surveys(Lists):
 
     def create_survey(self, name: str, *, tolerance: float = 0.03) -> SurveyRecord:
         """Create a survey."""
-        check_name("The name of a survey", name)
+        check_address("The name of a survey", name)
         _check_tolerance(tolerance)
         with self.writing() as cursor:
             self._require_free(cursor, name)
@@ -132,7 +132,7 @@ class Surveys(Lists):
         known = self.get_survey(survey)
         name = known.name if name is None else name
         tolerance = known.tolerance if tolerance is None else tolerance
-        check_name("The name of a survey", name)
+        check_address("The name of a survey", name)
         _check_tolerance(tolerance)
         with self.writing() as cursor:
             self._require_free(cursor, name, known.survey_id)
@@ -333,6 +333,16 @@ def check_name(what: str, name: str) -> None:
     """Refuse a name that cannot be read or typed."""
     if not name.strip() or len(name) > 200 or not name.isprintable():
         raise InputError(f"{what} is {name!r}; it must have 1 to 200 printable characters.")
+
+
+def check_address(what: str, name: str) -> None:
+    """Refuse a name that cannot be read or typed, or be a part of an address."""
+    check_name(what, name)
+    if "/" in name or name in (".", ".."):
+        raise InputError(
+            f"{what} is {name!r}; it stands in addresses, which cannot hold '/' in a name or one "
+            "of dots alone. Use '-' or '_' in its place."
+        )
 
 
 def now() -> datetime:

@@ -12,7 +12,7 @@ from spheremark.storage.catalogue.catalogue import Catalogue
 from spheremark.web import assets
 from tests.surveyed import NOW, fill
 
-WICKED = "<script>alert('x')</script> & \"more\""
+WICKED = "<script>alert('x')<script> & \"more\" ?#%"
 HTML = {"accept": "text/html"}
 
 

@@ -148,7 +148,10 @@ def test_two_surveys_cannot_have_one_name(catalogue):
         catalogue.create_survey("lane")
 
 
-@pytest.mark.parametrize(("name", "tolerance"), [("", 0.03), ("a\nb", 0.03), ("a", 0.0), ("a", 2)])
+@pytest.mark.parametrize(
+    ("name", "tolerance"),
+    [("", 0.03), ("a\nb", 0.03), ("a/b", 0.03), ("..", 0.03), ("a", 0.0), ("a", 2)],
+)
 def test_a_survey_that_makes_no_sense_is_refused(catalogue, name, tolerance):
     with pytest.raises(InputError):
         catalogue.create_survey(name, tolerance=tolerance)
