@@ -9,6 +9,7 @@ from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from types import TracebackType
 from typing import TYPE_CHECKING, Any, ClassVar, Self
+from urllib.parse import quote
 
 import httpx
 
@@ -21,6 +22,8 @@ _API = "/api/v1"
 _MCAP = "application/vnd.mcap"
 _POLL = 0.2  # [s] between two requests for the state of a job
 _ACTIVE = ("accepted", "running")
+_JOB = ("job_id", "status", "message", "error_reason")  # fields of a job that are read here
+_RESULT = ("columns", "rows", "truncated", "row_limit")  # ... and of the result of a query
 _SELECT = "SELECT * FROM {view} WHERE survey = {survey}"
 _TYPES = {".csv": "text/csv", ".json": "application/json"}
 
@@ -127,13 +130,16 @@ class Client:
             opened = [(one.name, stack.enter_context(one.open("rb"))) for one in files]
             if path.is_dir():
                 parts = [("file", one) for one in opened]
-                return self.request("POST", "/recordings", params=query, files=parts)
-            return self.request(
-                *("POST", "/recordings"),
+                return self._uploaded(params=query, files=parts)
+            return self._uploaded(
                 params=query,
                 content=opened[0][1],
                 headers={"Content-Type": _MCAP},
             )
+
+    def _uploaded(self, **request: Any) -> dict[str, Any]:
+        """Send a log; return the recording that it became."""
+        return self._fields("POST", "/recordings", ("recording_id", "job"), **request)
 
     def set_control(self, survey: str, marks: str | Path) -> dict[str, Any]:
         """Give a survey its control marks, from a CSV or JSON file; return them.
@@ -157,7 +163,7 @@ class Client:
         """
         path = Path(marks)
         kind = {"Content-Type": _TYPES.get(path.suffix.lower(), "text/csv")}
-        url = f"/surveys/{survey}/control"
+        url = f"/surveys/{quote(survey, safe='')}/control"
         return self.request("PUT", url, content=path.read_bytes(), headers=kind)
 
     def start(self, kind: str, survey: str, **options: Any) -> dict[str, Any]:
@@ -205,11 +211,16 @@ class Client:
         ------
         RemoteError
             If it failed, was dismissed, or did not end in time.
+        InputError
+            If the log was uploaded without a job.
         """
         if not isinstance(job, str):
-            job = str((job.get("job") or job)["job_id"])
+            found = job.get("job") or job
+            if "job_id" not in found:
+                raise InputError("There is no job to wait for: the log was uploaded without one.")
+            job = str(found["job_id"])
         deadline = time.monotonic() + timeout
-        while (state := self.request("GET", f"/jobs/{job}"))["status"] in _ACTIVE:
+        while (state := self._fields("GET", f"/jobs/{job}", _JOB))["status"] in _ACTIVE:
             if time.monotonic() > deadline:
                 raise RemoteError(f"Job {job} did not end within {timeout:g} s; it goes on.")
             time.sleep(_POLL)
@@ -243,7 +254,8 @@ class Client:
         """
         import pandas as pd
 
-        answer = self.request("POST", "/sql", json={"sql": sql, "parameters": parameters})
+        body = {"sql": sql, "parameters": parameters}
+        answer = self._fields("POST", "/sql", _RESULT, json=body)
         if answer["truncated"]:
             warnings.warn(
                 f"The service cut the result at {answer['row_limit']} rows; aggregate or filter, "
@@ -288,10 +300,10 @@ class Client:
     def _ensure_survey(self, survey: str) -> None:
         """Create a survey that does not exist yet."""
         with reached(self.url):
-            found = self._http.get(f"{_API}/surveys/{survey}")
+            found = self._http.get(f"{_API}/surveys/{quote(survey, safe='')}")
             if found.status_code == httpx.codes.NOT_FOUND:
                 found = self._http.post(f"{_API}/surveys", json={"name": survey})
-        checked(found)
+        _fields_of(checked(found), ("survey_id",))
 
     def request(self, method: str, path: str, **request: Any) -> dict[str, Any]:
         """Send a request and return the JSON of its response.
@@ -315,10 +327,15 @@ class Client:
         RemoteError
             If the service refuses the request or does not answer.
         """
+        return self._fields(method, path, (), **request)
+
+    def _fields(
+        self, method: str, path: str, names: tuple[str, ...], **request: Any
+    ) -> dict[str, Any]:
+        """Send a request and return the JSON of its response, which has fields of these names."""
         with reached(self.url):
             response = self._http.request(method, f"{_API}{path}", **request)
-        found: dict[str, Any] = checked(response).json()
-        return found
+        return _fields_of(checked(response), names)
 
     def download(self, path: str, target: Path, **query: str) -> None:
         """Stream a file of the service to a file on disk.
@@ -363,9 +380,22 @@ def reached(url: str) -> Iterator[None]:
 def checked(response: httpx.Response) -> httpx.Response:
     """Return a response; raise one that is a problem."""
     if response.is_error:
-        is_problem = "json" in response.headers.get("content-type", "")
-        raise RemoteError(response.json()["detail"] if is_problem else response.reason_phrase)
+        raise RemoteError(str(_fields_of(response, ("detail",))["detail"]))
     return response
+
+
+def _fields_of(response: httpx.Response, names: tuple[str, ...]) -> dict[str, Any]:
+    """Return the JSON of a response; raise RemoteError where something else has answered."""
+    try:
+        found = response.json()
+    except ValueError:
+        found = None
+    if not isinstance(found, dict) or not found.keys() >= set(names):
+        raise RemoteError(
+            f"{response.url} answers {response.status_code} {response.reason_phrase}, but not as "
+            "a spheremark service does. Check the address, and the proxy before it if there is one."
+        )
+    return found
 
 
 def _query_text(value: Any) -> Any:

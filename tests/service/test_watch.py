@@ -4,6 +4,8 @@ import io
 import json
 import shutil
 import subprocess
+import threading
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 
 import numpy as np
 import pytest
@@ -15,6 +17,18 @@ from tests.service.conftest import PATIENCE
 from tests.service.test_commands import COMMAND, run
 from tests.storage.recorder import record, small_log
 from tests.storage.test_recordings_of_others import rosbag2
+
+
+class Elsewhere(BaseHTTPRequestHandler):
+    """A server of something else, which has a page for every address."""
+
+    def do_GET(self):
+        self.send_response(200)
+        self.end_headers()
+        self.wfile.write(b"<h1>It works!</h1>")
+
+    def do_POST(self):
+        self.do_GET()
 
 
 @pytest.mark.parametrize("plugin", list(StoragePlugin))
@@ -82,6 +96,20 @@ def test_a_server_needs_a_survey_and_has_its_control(stop, tmp_path):
     control = stop.log.parent / "control.csv"
     both = ("--server", "http://127.0.0.1:1", "--survey", "a", "--control", control)
     assert "those of the survey" in run("watch", tmp_path, *both, code=2).stderr
+
+
+def test_a_server_that_is_no_spheremark_is_said_so(stop, tmp_path):
+    shutil.copy(stop.log, tmp_path / "stop1.mcap")
+    with ThreadingHTTPServer(("127.0.0.1", 0), Elsewhere) as elsewhere:
+        threading.Thread(target=elsewhere.serve_forever, daemon=True).start()
+        server = f"http://127.0.0.1:{elsewhere.server_port}"
+        wanted = ("--server", server, "--survey", "a", "--existing", "--count", "1")
+        try:
+            shown = run("watch", tmp_path, *wanted).stdout
+        finally:
+            elsewhere.shutdown()
+    assert "no result" in shown
+    assert server in shown
 
 
 def test_the_page_shows_the_decision_on_each_stop(site):
