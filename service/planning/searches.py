@@ -24,6 +24,7 @@ from spheremark.pipelines.progress import checkpoint
 from spheremark.service.errors import BusyError
 from spheremark.service.planning.predictions import Predictions
 from spheremark.service.serialise.plans import Plain, number_or_null
+from spheremark.storage.files import StorageError, unwritten
 
 logger = logging.getLogger(__name__)
 
@@ -49,6 +50,7 @@ class Searches:
         self._predictions, self._folder = predictions, folder
         self._lock = Lock()
         self._running: dict[str, Future[Plain]] = {}
+        self._unwritten: dict[str, Plain] = {}  # that have ended, and their disk took no file
 
     def open(self) -> None:
         """Make the folder, and record which searches a restart interrupted.
@@ -127,7 +129,7 @@ class Searches:
                 "error_reason": None,
                 "request": dict(request),
             }
-            self._write(record)
+            _write(self._file(record["search_id"]), record)
             path = self._beside(record["search_id"])
             future = self._predictions.start(_reported, str(path), function, arguments)
             self._running[record["search_id"]] = future
@@ -139,6 +141,9 @@ class Searches:
         """Return a search; raise NotFoundError if there is none."""
         if not (len(search_id) == _ID_DIGITS and search_id.isalnum()):
             raise NotFoundError(f"There is no search {search_id!r}.")
+        if (ended := self._unwritten.get(search_id)) is not None:
+            self._keep(ended)
+            return dict(ended)
         try:
             found: Plain = json.loads(self._file(search_id).read_text(encoding="utf-8"))
         except FileNotFoundError as error:
@@ -200,12 +205,21 @@ class Searches:
         ended = {"status": status, "finished_at": datetime.now(UTC).isoformat()}
         why = {"error_code": code, "error_reason": reason or None}
         message = {"successful": "Done.", "dismissed": reason}.get(status, reason)
-        self._write(found | ended | why | {"message": message})
-        self._beside(found["search_id"]).unlink(missing_ok=True)
+        self._keep(found | ended | why | {"message": message})
+        with suppress(OSError):  # of a disk that is read-only; the file is not read any more
+            self._beside(found["search_id"]).unlink(missing_ok=True)
 
-    def _write(self, record: Plain) -> None:
-        """Write a search whole."""
-        _write(self._file(record["search_id"]), record)
+    def _keep(self, record: Plain) -> None:
+        """Write a search that has ended; hold it in memory while the disk takes no file."""
+        search_id = record["search_id"]
+        try:
+            _write(self._file(search_id), record)
+        except StorageError as error:
+            if search_id not in self._unwritten:
+                logger.warning("Search %s is in memory alone: %s", search_id, error)
+            self._unwritten[search_id] = record
+        else:
+            self._unwritten.pop(search_id, None)
 
     def _file(self, search_id: str) -> Path:
         """Return the file of a search."""
@@ -226,10 +240,15 @@ _RESULTS = ("optimised", "trade_off", "random")
 
 
 def _write(path: Path, record: Mapping[str, Any]) -> None:
-    """Write a file whole or not at all."""
+    """Write a file whole or not at all; raise StorageError where the disk takes none."""
     part = path.with_suffix(f".{secrets.token_hex(4)}")
-    part.write_text(json.dumps(record), encoding="utf-8")
-    part.replace(path)
+    try:
+        part.write_text(json.dumps(record), encoding="utf-8")
+        part.replace(path)
+    except OSError as error:
+        with suppress(OSError):
+            part.unlink(missing_ok=True)
+        raise unwritten(path, error) from error
 
 
 def _reported(path: str, function: Callable[..., Plain], arguments: tuple[Any, ...]) -> Plain:
@@ -248,6 +267,7 @@ def _reported(path: str, function: Callable[..., Plain], arguments: tuple[Any, .
             "worst_sigma_3d_m": number_or_null(state.worst),
             "worst_sigma_3d_bound_m": state.bound or None,
         }
-        _write(Path(path), come)
+        with suppress(StorageError):  # a full disk ends no search
+            _write(Path(path), come)
 
     return function(*arguments, report)

@@ -1,6 +1,8 @@
 import csv
 import io
 import json
+import os
+import subprocess
 import time
 import xml.etree.ElementTree as ET
 
@@ -16,6 +18,7 @@ from spheremark.service.planning.predictions import Predictions
 from spheremark.service.planning.searches import Searches
 from spheremark.service.settings import Settings
 from spheremark.storage.catalogue.catalogue import Catalogue
+from spheremark.storage.files import free_bytes
 from spheremark.web.pages.planner import _sheet_map
 from tests.surveyed import fill
 
@@ -446,6 +449,42 @@ def test_a_plan_that_takes_longer_than_its_request_waits_is_a_search_with_an_add
     soon = client.post("/api/v1/plans/random", json=trial, headers={"Prefer": "wait=0"})
     assert soon.status_code == 202
     client.delete(soon.headers["Location"])
+
+
+@pytest.fixture
+def disk(tmp_path):
+    """A data folder whose searches are on a disk of 1 MB."""
+    searches = tmp_path / "searches"
+    searches.mkdir()
+    made = ["mount", "-t", "tmpfs", "-o", "size=1m", "tmpfs", searches]
+    if subprocess.run(made, capture_output=True, check=False).returncode:
+        pytest.skip("NOT TESTED: a full disk; no file system can be mounted")
+    yield tmp_path
+    subprocess.run(["umount", "--lazy", searches], check=True)
+
+
+def test_a_search_that_ends_on_a_full_disk_keeps_its_result(disk, scheduler):
+    settings = Settings(data=disk, scheduler=scheduler)
+    kind, filling = {"optimise": {**SMALL, "n_marks": 4}}, disk / "searches" / "filling"
+    with TestClient(create_app(settings), base_url="http://127.0.0.1:8000") as client:
+        begun = client.post("/api/v1/plans/searches", json=kind)
+        with filling.open("wb") as file:
+            os.posix_fallocate(file.fileno(), 0, free_bytes(filling))
+        refused = client.post("/api/v1/plans/searches", json=kind)
+        assert (refused.status_code, refused.json()["code"]) == (507, "storage.full")
+        address, deadline = begun.headers["Location"], time.monotonic() + 120.0
+        while (found := client.get(address).json())["status"] == "running":
+            assert time.monotonic() < deadline
+            time.sleep(0.2)
+        assert (found["status"], found["error_reason"]) == ("successful", None)
+        assert found["optimised"]
+        ours = f"{found['search_id']}.json"
+        left = {one.name for one in filling.parent.iterdir()}
+        assert left - {ours.replace("json", "progress")} == {"filling", ours}
+        filling.unlink()
+        assert client.get(address).json() == found
+    with TestClient(create_app(settings), base_url="http://127.0.0.1:8000") as client:
+        assert client.get(address).json() == found
 
 
 def test_a_damaged_search_is_kept_apart_and_an_interrupted_one_has_failed(tmp_path):
