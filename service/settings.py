@@ -102,10 +102,15 @@ class Settings(BaseSettings):
         default=512 << 20, ge=64 << 20, description="Memory that one query may use [bytes]."
     )
     prediction_seconds: float = Field(
-        default=300.0, gt=0, description="Time after which the search of a plan is ended [s]."
+        default=300.0,
+        gt=0,
+        description="Time after which a suggestion of one more mark (POST /api/v1/plans/suggest) "
+        "is ended [s]; searches of plans may take as long as a job.",
     )
     prediction_memory_bytes: int = Field(
-        default=2 << 30, ge=512 << 20, description="Memory that such a search may use [bytes]."
+        default=2 << 30,
+        ge=512 << 20,
+        description="Memory that such a suggestion, or a search of plans, may use [bytes].",
     )
     log_format: LogFormat = Field(
         default="text", description="Lines of the log: text, or json with ids of request and job."
@@ -154,7 +159,7 @@ class Settings(BaseSettings):
         if not is_loopback(self.host) and not Tokens(self.data, self.token_text).all():
             raise ValueError(
                 f"host is {self.host}, which others can reach; make a token with `spheremark token "
-                "make NAME`, set SPHEREMARK_TOKEN, or listen on 127.0.0.1"
+                "create NAME`, set SPHEREMARK_TOKEN, or listen on 127.0.0.1"
             )
         if self.scheduler and not self.scheduler.startswith(_KNOWN_SCHEMES):
             raise ValueError(

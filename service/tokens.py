@@ -97,7 +97,9 @@ class Tokens:
     def make(self, name: str, scope: Scope) -> str:
         """Add a token and return its text, which is kept nowhere."""
         if not name.isprintable() or not 0 < len(name.strip()) <= _NAME_MAX:
-            raise InputError(f"The name is {name!r}; 1 to {_NAME_MAX} printable characters are.")
+            raise InputError(
+                f"The name is {name!r}; it must have 1 to {_NAME_MAX} printable characters."
+            )
         if any(one.name == name for one in self.all()):
             raise ConflictError(f"There is already a token called {name!r}; revoke it first.")
         text = f"sm_{secrets.token_urlsafe(32)}"

@@ -85,5 +85,7 @@ def settings(**given: Any) -> Settings:
     except ValidationError as error:
         for one in error.errors():
             name = "_".join(["SPHEREMARK", *(str(part).upper() for part in one["loc"])])
-            err.print(f"[bold red]Error:[/] {name}: {one['msg']}", highlight=False, soft_wrap=True)
+            about = f"{name}: " if one["loc"] else ""  # rules of several settings name them
+            text = about + one["msg"].removeprefix("Value error, ")
+            err.print(f"[bold red]Error:[/] {text}", highlight=False, soft_wrap=True)
         raise typer.Exit(2) from None

@@ -169,7 +169,10 @@ def test_misuse_is_exit_code_2(arguments):
 
 def test_a_wrong_setting_is_misuse_and_named():
     assert "SPHEREMARK_WORKERS" in run("serve", code=2, SPHEREMARK_WORKERS="none").stderr
-    assert "SPHEREMARK_TOKEN" in run("serve", "--host", "0.0.0.0", code=2).stderr
+    refused = run("serve", "--host", "0.0.0.0", code=2).stderr
+    assert refused.startswith("Error: host is 0.0.0.0")
+    assert "`spheremark token create NAME`" in refused
+    assert "SPHEREMARK_TOKEN" in refused
 
 
 def test_an_unknown_method_is_refused_by_name(stop):

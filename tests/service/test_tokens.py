@@ -6,7 +6,7 @@ import pytest
 from fastapi.testclient import TestClient
 from typer.testing import CliRunner
 
-from spheremark.pipelines.errors import ConflictError, NotFoundError
+from spheremark.pipelines.errors import ConflictError, InputError, NotFoundError
 from spheremark.service.cli.main import app
 from spheremark.service.http.app import create_app
 from spheremark.service.http.security import scope_of
@@ -98,6 +98,12 @@ def test_tokens_have_names_of_their_own(tmp_path):
         tokens.make("rover", Scope.READ)
     with pytest.raises(NotFoundError):
         tokens.revoke("other")
+
+
+@pytest.mark.parametrize("name", [" ", "a\nb", 101 * "a"])
+def test_a_name_that_cannot_be_read_is_refused(tmp_path, name):
+    with pytest.raises(InputError, match="must have 1 to 100 printable characters"):
+        Tokens(tmp_path).make(name, Scope.READ)
 
 
 def test_the_command_makes_lists_and_revokes(tmp_path):
