@@ -113,6 +113,12 @@ WRONG = [  # method, path, arguments, status, code
        422, "input.validation")
       for key in ("rig", "config", "options")
       for value in (r'{"a": "\ud800"}', r'{"\udfff": 1}', f'{{"tolerance": {10**400}}}')),
+    ("POST", "/api/v1/jobs", {"content": r'{"survey": "\ud800", "kind": "adjust"}',
+                              "headers": JSON}, 422, "input.validation"),
+    *(("PUT", "/api/v1/queries/odd",
+       {"content": f'{{"sql": "SELECT 1", "parameters": {value}}}', "headers": JSON},
+       422, "input.validation")
+      for value in (r'{"a": "\ud800"}', r'{"\udfff": 1}', f'{{"a": {10**400}}}')),
     ("POST", "/api/v1/rigs", {"content": r'{"name": "\ud800"}'}, 400, "input.rig"),
     ("PUT", "/api/v1/surveys/nobody/truth", {"content": r'{"about": "\ud800"}', "headers": JSON},
      400, "input.truth"),

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from datetime import datetime
-from typing import Annotated, Any, Generic, Literal, Self, TypeVar
+from typing import Any, Generic, Literal, Self, TypeVar
 
-from pydantic import AfterValidator, BaseModel, ConfigDict, Field, model_validator
+from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from spheremark.pipelines.model import ControlMarks, Rig
 from spheremark.pipelines.scan.rigs import rig_digest, rig_to_mapping
@@ -16,13 +16,19 @@ from spheremark.storage.recordings.preflight import Preflight
 
 Item = TypeVar("Item")
 SurveyKey = str  # id or name
-Plain = Annotated[dict[str, Any], AfterValidator(require_shallow)]  # an object of any keys
+Plain = dict[str, Any]  # an object of any keys; ``Strict`` checks its values
 
 
 class Strict(BaseModel):
-    """A request: an unknown field is an error."""
+    """A request: an unknown field is an error, and so is a value that cannot be kept."""
 
     model_config = ConfigDict(extra="forbid")
+
+    @model_validator(mode="before")
+    @classmethod
+    def _check_values(cls, given: Any) -> Any:
+        """Refuse what is nested too deeply, halves of surrogate pairs, and too great numbers."""
+        return require_shallow(given)
 
 
 class Listing(BaseModel, Generic[Item]):
