@@ -348,9 +348,6 @@ def _enter_terrain(service: Service, received: Received, name: str) -> Key:
         size_bytes=received.size_bytes,
         url=str(grid),
     )
-    for older in grid.parent.glob(f"{received.digest}.*"):
-        if older != grid:
-            older.unlink(missing_ok=True)  # the file itself, which earlier versions kept
     return Key.model_validate({"key": TERRAIN + received.digest, "name": entered["name"]})
 
 
