@@ -21,7 +21,7 @@ def folder(tmp_path_factory):
     data = tmp_path_factory.mktemp("data")
     with Catalogue(data / "spheremark.duckdb", snapshots=data / "snapshots") as catalogue:
         fill(catalogue, data / "clouds", "field", n_stops=2)
-        catalogue.create_survey("empty / <b>")
+        catalogue.create_survey("empty & <b>")
     return data
 
 

@@ -111,14 +111,6 @@ def test_a_log_without_a_pose_is_named_as_missing(made, site, tmp_path):
     assert "Without again, of which there is no pose." in message
 
 
-def test_a_survey_with_a_slash_in_its_name_has_a_site_too(site):
-    site.client.post("/api/v1/surveys", json={"name": "north/pit"})
-    assert site.client.get("/surveys/north%2Fpit/site").status_code == 200
-    form = {"Content-Type": "application/x-www-form-urlencoded"}
-    answer = site.client.post("/surveys/north%2Fpit/site", content="cell_m=2.0", headers=form)
-    assert "no log" in answer.json()["detail"]
-
-
 def test_the_form_of_a_site_starts_a_job(made, site):
     assert made
     form = {"Content-Type": "application/x-www-form-urlencoded"}

