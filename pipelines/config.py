@@ -99,8 +99,8 @@ class ExtractionConfig:
         Edge of a cell of the ground grid [m]. 0.25: wider than a ball, so that a cell of the open
         field holds ground.
     ground_clearance : float
-        Returns less than this above the local ground start no marker [m]. 0.10: half of a ball of
-        0.2 m that lies on the ground is higher.
+        Returns less than this above the local ground start no marker [m]. 0.20: most rocks are
+        lower, and the balls of a survey stand higher.
     scatter_max : float
         The first guess of the noise of ranges is at most this [m]. 0.035: the maker's 0.03 and its
         uncertainty.
@@ -117,7 +117,7 @@ class ExtractionConfig:
     """
 
     ground_cell: float = 0.25
-    ground_clearance: float = 0.10
+    ground_clearance: float = 0.20
     scatter_max: float = 0.035
     n_points_min: int = 6
     false_rate: float = 0.01

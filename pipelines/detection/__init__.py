@@ -1,4 +1,4 @@
-"""Markers among ground, rocks, poles and people: which returns of a stop may be a sphere.
+"""Markers among ground, rocks, poles and people: which returns of a stop may be a sphere on a pole.
 
 ``extract`` finds them. Inside,
 
@@ -89,11 +89,15 @@ _NEARBY = 1.0  # [m] beyond two radii within which other groups show leaves, wal
 
 
 class _Compared(NamedTuple):
-    """A group that is compared: its features, its evidence, and how many others stand near it."""
+    """A group that is compared: its features, its evidence, and how many others stand near it.
+
+    It counts among the groups of the scan unless only doubt of the ground lets it be compared.
+    """
 
     features: Features
     evidence: Evidence
     n_neighbours: int
+    counts: bool
 
 
 _Group = tuple[_Compared, Judgement, Array]
@@ -123,12 +127,12 @@ def extract(
 
     Notes
     -----
-    A marker is a sphere of known radius, most often on a pole. Each place where a surface ends
-    upward and to a side is a seed: mean shift of a disc of the sphere's size, a robust fit along
-    the beams; then the beams about it are compared under nine hypotheses. Ground is the opening of
-    the lowest point per cell. Where no ground was seen, nothing is cut. Cost grows linearly with
-    the returns; it doubles where the two faces of the scan show the markers apart, for the search
-    is then done again with a mounting by which they agree.
+    A marker is a sphere of known radius on a pole. Each place where a surface ends upward and to a
+    side is a seed: mean shift of a disc of the sphere's size, a robust fit along the beams; then
+    the beams about it are compared under nine hypotheses. Ground is the opening of the lowest point
+    per cell. Where no ground was seen, nothing is cut. Cost grows linearly with the returns; it
+    doubles where the two faces of the scan show the markers apart, for the search is then done
+    again with a mounting by which they agree.
     """
     if not cloud.intensities.any():  # not recorded: all things are as bright
         cloud = replace(cloud, intensities=np.ones_like(cloud.intensities))
@@ -150,7 +154,7 @@ def _extracted(
     seeds = find_seeds(ground.points_above, target, config.n_points_min)
     groups = distinct(measure_features(cloud, cells, seeds, target), config, marker_radius)
     compared, not_compared, hearing = _sifted(groups, cloud, (cells, ground), target)
-    noise = noise_of([one.features for one in compared if one.evidence.shows_below], target.radius)
+    noise = noise_of([one.features for one in compared if one.counts], target.radius)
     logs, shifts = _log_likelihoods(compared, noise, hearing, config, target)
     by_shape = [judgement.probability for judgement in _judged(compared, logs)]
     log_ratios, by_paint = paint_of([one.evidence for one in compared], by_shape)
@@ -201,7 +205,8 @@ def _sifted(
         if reason:
             rejected.append(_rejection(groups[i], reason))
             continue
-        compared.append(_Compared(groups[i], evidence, near[i]))
+        counts = not reason_by_evidence(groups[i], evidence.at_worst, target)
+        compared.append(_Compared(groups[i], evidence, near[i], counts=counts))
     rejected += [_rejection(groups[i], reason) for i, reason in enumerate(reasons) if reason]
     return compared, rejected, hearing
 
@@ -266,7 +271,7 @@ def _log_likelihoods(
 
     def compare(rows: Sequence[int]) -> None:
         for i in rows:
-            features, evidence, n_neighbours = compared[i]
+            features, evidence, n_neighbours, _ = compared[i]
             found[i], shared[i], covs[i], shapes[i], by_gate[i] = log_likelihoods(
                 evidence, features.p_base, target, n_neighbours, physics[i], shapes[i]
             )
@@ -287,9 +292,9 @@ def _log_likelihoods(
 
 
 def _judged(compared: list[_Compared], logs: Array) -> list[Judgement]:
-    """Return what groups are."""
+    """Return what groups are; how often each hypothesis is met, those show that count."""
     n_returns = [one.features.n_points for one in compared]
-    return judged(logs, n_returns, [one.evidence.shows_below for one in compared])
+    return judged(logs, n_returns, np.array([one.counts for one in compared]))
 
 
 def _physics(

@@ -26,7 +26,7 @@ _BESIDE = (1.2, 2.2)  # distances from a centre, beside half a beam, of beams th
 _CELL, _N_CELL = 0.1, 2  # beams that pass the same place share the errors of the model
 _N_MAX = 192  # beams that are compared at most: each costs as much
 _N_SIDES, _ANY_SIDE = 12, 0.3  # sides of an object; beams on each of which nothing is known
-_ALIKE = 0.3  # heights of beams, and depths, within which what is wide is alike
+_N_PLANE, _ROUGH = 5, 0.1  # returns that show a plane beside it, and the least scatter about one
 _FAINT = 1e-9  # least strength of an echo
 _AWAY = 40.0  # depth of what is not seen behind an object: too far to matter
 _WIDTHS = np.linspace(-1.0, 1.0, 401)  # half widths of a beam from its middle to an outline
@@ -46,8 +46,6 @@ class Beams(NamedTuple):
         half by the face of the scan.
     behind : (n,)
         Density of what happens to them when they pass the object.
-    wide : (n,)
-        Probability that something wide is as low, which may hide a pole.
     empty : (n,)
         Share of the beams on the same side of the object, but beside it, that are not heard.
     even : (n,)
@@ -68,7 +66,6 @@ class Beams(NamedTuple):
     z: Array
     face: Array
     behind: Array
-    wide: Array
     empty: Array
     even: Array
     away: Array
@@ -105,18 +102,18 @@ def beams_about(
     is_under = (np.abs(x) < _UNDER[0] + blurs[0]) & (y > _UNDER[1]) & (y < 0.0)
     kept = _chosen(every, is_under | ((gap < _AROUND + blur) & (y > _LOWEST)))
     n_near, n_past = int(np.sum(is_high & is_near)), int(np.sum(is_high & ~is_near))
-    share = (n_near + 0.3) / (n_near + n_past + 1.3)
-    is_low = (np.abs(x) > _BESIDE[0] + blurs[0]) & (np.abs(x) < _BESIDE[1] + blurs[0])
-    is_low &= (y > _UNDER[1]) & (y < BELOW)
-    behind, wide = _behind(every[:3, kept], every[:3, is_low], share)
+    is_low = (np.abs(x) > _UNDER[0] + blurs[0]) & (np.abs(x) < _BESIDE[1] + blurs[0])
+    is_low &= (y > _UNDER[1]) & (y < BELOW) & (gap > 1.0 + blur)
+    share_low = (np.sum(is_low & is_near) + 0.3) / (is_low.sum() + 1.3)
+    share_high = (n_near + 0.3) / (n_near + n_past + 1.3)
+    shares = np.where(y[kept] < _LOWEST, max(share_low, share_high), share_high)
     empty, even, away = _beside(every[:, kept], every[:, is_beside], strength)
     beams = Beams(
         x=x[kept],
         y=y[kept],
         z=z[kept],
         face=every[3, kept],
-        behind=behind,
-        wide=wide,
+        behind=_density_behind(every[:3, kept], every[:3, is_high & is_near], shares),
         empty=empty,
         even=even,
         away=away,
@@ -156,24 +153,21 @@ def _chosen(every: Array, is_wanted: Mask) -> Index:
     return np.asarray(rows[(np.arange(n) * (len(rows) / max(n, 1))).astype(np.intp)])
 
 
-def _behind(kept: Array, low: Array, share: float) -> tuple[Array, Array]:
-    """Return ``behind`` and ``wide``.
+def _density_behind(kept: Array, near: Array, shares: Array) -> Array:
+    """Return the density of what happens to each beam that passes the object by.
 
-    A share of the beams ends near. Low down they end as those do that pass farther to the sides at
-    the same height: what a sphere stands on may be wider than a pole.
+    By the beams beside it: a share of them ends near, half of it on a plane through them. Low
+    down, where the ground may be near, by those beside the place of a pole.
     """
-    density = np.where(kept[2] < NEAR, share * 0.5 / NEAR, 1.0 - share)
-    is_under, is_near = kept[1] < _LOWEST, low[2] < NEAR
-    y, z = kept[1:, is_under]
-    weights = np.exp(-0.5 * ((y[:, None] - low[1]) / _ALIKE) ** 2)
-    off = (np.where(z < NEAR, z, 0.0)[:, None] - np.where(is_near, low[2], 0.0)) / _ALIKE
-    near = weights * is_near * np.exp(-0.5 * off * off) / (_ALIKE * np.sqrt(2.0 * np.pi))
-    total = weights.sum(axis=1) + 1.0
-    alike = np.where(z < NEAR, near.sum(axis=1), weights @ ~is_near)
-    wide = np.zeros(kept.shape[1])
-    density[is_under] = (density[is_under] + alike) / total
-    wide[is_under] = weights @ is_near / total
-    return density, wide
+    density = np.full(kept.shape[1], 0.5 / NEAR)
+    if near.shape[1] > _N_PLANE:
+        x, y, z = near
+        rows = np.column_stack([np.ones(len(x)), x, y])
+        plane = np.linalg.solve(rows.T @ rows + 1e-3 * np.eye(3), rows.T @ z)
+        sigma = max(1.4826 * float(np.median(np.abs(z - rows @ plane))), _ROUGH)
+        off = (kept[2] - plane[0] - plane[1:] @ kept[:2]) / sigma
+        density = 0.5 * density + 0.5 * np.exp(-0.5 * off * off) / (sigma * np.sqrt(2.0 * np.pi))
+    return np.where(kept[2] < NEAR, shares * density, 1.0 - shares)
 
 
 def _beside(kept: Array, beside: Array, strength: float) -> tuple[Array, Array, Array]:

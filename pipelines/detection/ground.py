@@ -19,6 +19,12 @@ _AROUND = 24  # cells each way about a place whose ground may show its height
 _N_NEAREST = 40  # of these that do: ground a metre about it, where all cells are seen
 _ROUGH, _SLOPE, _TILT = 0.05, 0.05, 0.2  # [m] of the ground, how it bends away, tangent of tilts
 _SMOOTH = 0.01  # [m] least roughness: lowest points of cells scatter so on a plane floor
+_SKIN, _SKIN_MAX = 0.3, 0.03  # radii, and [m]: ground is that rough, spheres begin higher
+
+
+def skin_of(radius: float) -> float:
+    """Return how far above the plane of the ground a return counts as ground [m]."""
+    return min(_SKIN * radius, _SKIN_MAX)
 
 
 class Ground(NamedTuple):

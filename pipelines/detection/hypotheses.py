@@ -72,8 +72,6 @@ ABUNDANCE = (208, 31, 274, 10, 33, 191, 18, 36, 36)
 _BESIDE = 0.1  # probability of anything beside what stands free
 _HEIGHTS = 2.5  # [m] up to which markers stand
 _LEAST_HEIGHTS = {BALL: 1.0, SPHERE: 1.0, CYLINDER: 1.0, SOLID: 1.0}
-_WIDE, _AS_LOW = 0.4, 2.0  # [m] how high wide things are that carry markers; ratio at most
-_LYING, _UNEVEN = 0.1, 0.2  # probability of an object on the ground; radii that it sinks in
 _BOULDER_HEIGHT = (0.3, 0.6)  # radii: centre above the ground, and standard deviation
 _PERCHED, _STONE = 0.1, 0.5  # probability that a boulder lies on another, and mean height [m] of it
 _HEAD_HEIGHT, _LOWERED = (1.6, 0.12), 0.2  # [m] of adults who stand (1.70 m tall); share of others
@@ -158,7 +156,7 @@ def log_likelihoods(
     faintest = min(max(physics.weakest / strength, _FLOOR), _HEARD)  # its own returns are heard
     beams, n_beside, n_passing = beams_about(evidence, radius, strength, (physics.lost, faintest))
     beams = merged_within(beams, physics.gates, radius)
-    logs = log_supports(evidence, float(centre @ target.up), radius, _as_high(evidence))
+    logs = log_supports(evidence, float(centre @ target.up), radius)
     for kind in range(len(NAMES)):
         logs[kind] += _log_beside(kind, n_beside, n_passing)
         logs[kind] += np.log(_height_density(kind, evidence.height, evidence.sigma_height, radius))
@@ -227,9 +225,6 @@ def _height_density(kind: int, height: float, sigma: float, radius: float) -> fl
         return unknown
     least = _LEAST_HEIGHTS.get(kind, 0.0) * radius
     known = 0.5 * unknown * erfc((least - height) / (1.4142 * sigma))
-    if least > 0.0:  # some lie on the ground
-        lying = NormalDist(least, hypot(_UNEVEN * radius, sigma)).pdf(height)
-        known = (1.0 - _LYING) * known + _LYING * lying
     if kind == BOULDER:
         mean, spread = _BOULDER_HEIGHT[0] * radius, _BOULDER_HEIGHT[1] * radius
         known = (1.0 - _PERCHED) * NormalDist(mean, hypot(spread, sigma)).pdf(height)
@@ -239,14 +234,6 @@ def _height_density(kind: int, height: float, sigma: float, radius: float) -> fl
         standing = NormalDist(mean, hypot(spread, sigma)).pdf(height)
         known = _LOWERED * known + (1.0 - _LOWERED) * standing
     return _NOT_GROUND * unknown + (1.0 - _NOT_GROUND) * known
-
-
-def _as_high(evidence: Evidence) -> float:
-    """Return how many times likelier a height is on something wide than on a pole."""
-    height, sigma = evidence.height, evidence.sigma_height
-    if not sigma < _HEIGHTS:
-        return 1.0
-    return min(2.0 * _HEIGHTS * NormalDist(0.0, hypot(_WIDE, sigma)).pdf(height), _AS_LOW)
 
 
 def _density_above(height: float, mean: float, sigma: float) -> float:

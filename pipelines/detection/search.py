@@ -8,18 +8,16 @@ from __future__ import annotations
 import numpy as np
 
 from spheremark.pipelines.detection.beams import Beams
-from spheremark.pipelines.detection.maxima import climbed, information, searched, walked
+from spheremark.pipelines.detection.maxima import climbed, information, searched
 from spheremark.pipelines.detection.shapes import (
     BALL,
     BOULDER,
-    CLUTTER,
     CYLINDER,
     FORM,
     HEAD,
     N_PARAMETERS,
     NOISE,
     POLE,
-    POST,
     SHIFT,
     SOLID,
     SPHERE,
@@ -32,7 +30,6 @@ from spheremark.pipelines.estimation.linear_algebra import invert
 from spheremark.pipelines.model import Array
 
 _GIVEN_UP = 12.0  # logarithm of odds against the sphere from which no other shape is sought
-_GLANCED = (BALL, CYLINDER, POST, CLUTTER)  # where one is far better, no sphere is sought
 _ORDER = (0, 4, 8, 7, 1, 6, 5, 3, 2)  # the sphere, then what refutes it at the least cost
 _STARTS = (0.0, -0.3, 0.3)  # of the logarithm of the radius of a ball
 _UNSURE = (-4.0, 9.0)  # logarithms of odds for the sphere between which evidence is integrated
@@ -59,13 +56,6 @@ def _evidence_nearby(kind: int, shape: Array, prior: Array, beams: Beams) -> flo
     return float(found + log_volume(kind, shape, prior, beams))
 
 
-def _evidence_at_a_glance(kind: int, shape: Array, prior: Array, beams: Beams) -> float:
-    """Return the logarithm of the evidence of a hypothesis where a short walk ends."""
-    found = log_likelihood(kind, shape, prior, beams, np.empty(len(beams.x)))
-    found = walked(kind, shape, 0.4 * prior[1], prior, beams, (found, -np.inf))
-    return float(found + log_volume(kind, shape, prior, beams))
-
-
 def cov_shared(shape: Array, prior: Array, beams: Beams) -> Array:
     """Return the covariance of what the best sphere shares with other markers."""
     free, N = information(SPHERE, shape, prior, beams)
@@ -85,13 +75,9 @@ def compared(beams: Beams, priors: Array, log_priors: Array, begun: Array) -> tu
     found = np.full(len(log_priors), -np.inf)
     shapes = np.full((len(log_priors), N_PARAMETERS), np.nan)
     shapes[SPHERE] = priors[SPHERE, 0]
-    for kind in () if len(begun) else _GLANCED:
-        shape = _start(kind, priors[kind], shapes[SPHERE], 0.0, beams)
-        own = _evidence_at_a_glance(kind, shape, priors[kind], beams)
-        _keep(kind, shape, own + log_priors[kind], found, shapes)
     for kind in _ORDER:
         is_named = kind != BALL or found[CYLINDER] < found.max()  # the two are easily confused
-        if kind != SPHERE and found[SPHERE] < found.max() - _GIVEN_UP and is_named:
+        if found[SPHERE] < found.max() - _GIVEN_UP and is_named:
             continue
         is_begun = kind != SOLID and len(begun) > 0 and not np.isnan(begun[kind, 0])
         if is_begun:

@@ -160,7 +160,6 @@ def test_derivatives_agree_with_central_differences(stop):
     assert_allclose(exact.J_angle[is_whole], numeric, rtol=0, atol=2e-3 * size)
 
 
-@pytest.mark.xfail(strict=False, reason="without noise one laser alone may keep enough returns")
 def test_ranges_without_noise_give_the_true_rig(field):
     world = SimulationConfig.perfect(only_near_spheres=True)
     stop = simulate_stop(field, "lane3-stop4", world, seed=2)

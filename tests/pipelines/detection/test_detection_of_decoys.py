@@ -54,18 +54,12 @@ def sure_or_few(found):
     return [candidate.p_base_rough for candidate in found.candidates] + few
 
 
-@pytest.mark.xfail(
-    strict=True, reason="one with 23 returns, among smaller balls, is a possible one"
-)
 def test_far_markers_are_found_and_no_rival_of_theirs(found):
     rough = [candidate.p_base_rough for candidate in found.candidates]
     assert len(rough) == len(MARKERS)
     assert gaps(MARKERS, rough).min(axis=1).max() < 0.5 * RADIUS
 
 
-@pytest.mark.xfail(
-    strict=True, reason="one with 23 returns, among smaller balls, is a possible one"
-)
 def test_far_markers_but_the_farthest_are_found_and_no_rival_of_theirs(found):
     rough = [candidate.p_base_rough for candidate in found.candidates]
     assert gaps(rough, MARKERS).min(axis=1).max() < 0.5 * RADIUS

@@ -39,7 +39,6 @@ def beams_at(rng, step):
         z=np.where(off < 1.0, surface, np.inf),
         face=0.5 * ones,
         behind=np.where(off < 1.0, 1e-3, 0.9),
-        wide=0.0 * ones,
         empty=ones,
         even=0.0 * ones,
         away=np.inf * ones,
