@@ -1,4 +1,4 @@
-"""Markers among ground, rocks, poles and people: which returns of a stop may be a sphere on a pole.
+"""Markers among ground, rocks, poles and people: which returns of a stop may be a sphere.
 
 ``extract`` finds them. Inside,
 
@@ -89,15 +89,11 @@ _NEARBY = 1.0  # [m] beyond two radii within which other groups show leaves, wal
 
 
 class _Compared(NamedTuple):
-    """A group that is compared: its features, its evidence, and how many others stand near it.
-
-    It counts among the groups of the scan unless only doubt of the ground lets it be compared.
-    """
+    """A group that is compared: its features, its evidence, and how many others stand near it."""
 
     features: Features
     evidence: Evidence
     n_neighbours: int
-    counts: bool
 
 
 _Group = tuple[_Compared, Judgement, Array]
@@ -127,12 +123,12 @@ def extract(
 
     Notes
     -----
-    A marker is a sphere of known radius on a pole. Each place where a surface ends upward and to a
-    side is a seed: mean shift of a disc of the sphere's size, a robust fit along the beams; then
-    the beams about it are compared under nine hypotheses. Ground is the opening of the lowest point
-    per cell. Where no ground was seen, nothing is cut. Cost grows linearly with the returns; it
-    doubles where the two faces of the scan show the markers apart, for the search is then done
-    again with a mounting by which they agree.
+    A marker is a sphere of known radius, most often on a pole. Each place where a surface ends
+    upward and to a side is a seed: mean shift of a disc of the sphere's size, a robust fit along
+    the beams; then the beams about it are compared under nine hypotheses. Ground is the opening of
+    the lowest point per cell. Where no ground was seen, nothing is cut. Cost grows linearly with
+    the returns; it doubles where the two faces of the scan show the markers apart, for the search
+    is then done again with a mounting by which they agree.
     """
     if not cloud.intensities.any():  # not recorded: all things are as bright
         cloud = replace(cloud, intensities=np.ones_like(cloud.intensities))
@@ -150,16 +146,16 @@ def _extracted(
     """Return what is found in a scan, and how far apart its faces show it."""
     cells = cells_of(cloud, config)
     target = Target(marker_radius, cells.R_station_base[2], float(cloud.rig.divergence.max()))
-    ground = ground_of(cloud, cells, config)
+    ground = ground_of(cloud, cells, config, marker_radius)
     seeds = find_seeds(ground.points_above, target, config.n_points_min)
     groups = distinct(measure_features(cloud, cells, seeds, target), config, marker_radius)
     compared, not_compared, hearing = _sifted(groups, cloud, (cells, ground), target)
-    noise = noise_of([one.features for one in compared if one.counts], target.radius)
+    noise = noise_of([one.features for one in compared if one.evidence.shows_below], target.radius)
     logs, shifts = _log_likelihoods(compared, noise, hearing, config, target)
-    by_shape = [judgement.probability for judgement in _judged(compared, logs)]
+    by_shape = [judgement.probability for judgement in _judged(compared, logs, marker_radius)]
     log_ratios, by_paint = paint_of([one.evidence for one in compared], by_shape)
     logs[:, 0] += log_ratios
-    judgements = _judged(compared, logs)
+    judgements = _judged(compared, logs, marker_radius)
     is_sure = sure_ones([one.probability for one in judgements], config.false_rate)
     markers, possible, rejected = list[_Group](), list[Rejection](), list[Rejection]()
     for one, judgement, paint, sure, own in zip(
@@ -205,8 +201,7 @@ def _sifted(
         if reason:
             rejected.append(_rejection(groups[i], reason))
             continue
-        counts = not reason_by_evidence(groups[i], evidence.at_worst, target)
-        compared.append(_Compared(groups[i], evidence, near[i], counts=counts))
+        compared.append(_Compared(groups[i], evidence, near[i]))
     rejected += [_rejection(groups[i], reason) for i, reason in enumerate(reasons) if reason]
     return compared, rejected, hearing
 
@@ -271,14 +266,14 @@ def _log_likelihoods(
 
     def compare(rows: Sequence[int]) -> None:
         for i in rows:
-            features, evidence, n_neighbours, _ = compared[i]
+            features, evidence, n_neighbours = compared[i]
             found[i], shared[i], covs[i], shapes[i], by_gate[i] = log_likelihoods(
                 evidence, features.p_base, target, n_neighbours, physics[i], shapes[i]
             )
 
     side_by_side(lambda first, end: compare(range(first, end)), n, threaded_from=4)
     if n:
-        probabilities = [one.probability for one in _judged(compared, found)]
+        probabilities = [one.probability for one in _judged(compared, found, target.radius)]
         half_widths = np.array([one.evidence.blur.mean() for one in compared])
         known = shared_of((shared, covs), probabilities, physics, half_widths)
         gates = gates_of(by_gate, probabilities)
@@ -291,10 +286,10 @@ def _log_likelihoods(
     return found, np.array([own[SPHERE, SHIFT:POLE] for own in shapes]).reshape(-1, 3)
 
 
-def _judged(compared: list[_Compared], logs: Array) -> list[Judgement]:
-    """Return what groups are; how often each hypothesis is met, those show that count."""
+def _judged(compared: list[_Compared], logs: Array, radius: float) -> list[Judgement]:
+    """Return what groups are."""
     n_returns = [one.features.n_points for one in compared]
-    return judged(logs, n_returns, np.array([one.counts for one in compared]))
+    return judged(logs, n_returns, [one.evidence.stands_free(radius) for one in compared])
 
 
 def _physics(

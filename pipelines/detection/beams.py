@@ -24,9 +24,9 @@ _LOWEST = -0.9  # anything lower may be what it stands on
 _UNDER = (0.5, -3.0)  # half width and depth below a centre where its pole or the rest of a post is
 _BESIDE = (1.2, 2.2)  # distances from a centre, beside half a beam, of beams that pass it by
 _CELL, _N_CELL = 0.1, 2  # beams that pass the same place share the errors of the model
-_N_MAX = 192  # beams that are compared at most: each costs as much
 _N_SIDES, _ANY_SIDE = 12, 0.3  # sides of an object; beams on each of which nothing is known
 _N_PLANE, _ROUGH = 5, 0.1  # returns that show a plane beside it, and the least scatter about one
+_ALIKE = 0.3  # heights of beams, and depths, within which what is wide is alike
 _FAINT = 1e-9  # least strength of an echo
 _AWAY = 40.0  # depth of what is not seen behind an object: too far to matter
 _WIDTHS = np.linspace(-1.0, 1.0, 401)  # half widths of a beam from its middle to an outline
@@ -46,6 +46,8 @@ class Beams(NamedTuple):
         half by the face of the scan.
     behind : (n,)
         Density of what happens to them when they pass the object.
+    wide : (n,)
+        Probability that something wide is as low, and nearer than a pole, which it hides.
     empty : (n,)
         Share of the beams on the same side of the object, but beside it, that are not heard.
     even : (n,)
@@ -66,6 +68,7 @@ class Beams(NamedTuple):
     z: Array
     face: Array
     behind: Array
+    wide: Array
     empty: Array
     even: Array
     away: Array
@@ -77,7 +80,7 @@ class Beams(NamedTuple):
 
 
 def beams_about(
-    evidence: Evidence, radius: float, strength: float, hearing: tuple[float, float]
+    evidence: Evidence, radius: float, strength: float, hearing: tuple[float, float], n_most: int
 ) -> tuple[Beams, int, int]:
     """Return the beams that are compared, and how many beside the object end near or go past.
 
@@ -91,6 +94,8 @@ def beams_about(
         Reflectivity over squared range of the object [1/m^2].
     hearing : float, float
         ``lost`` and ``faintest`` of ``Beams``.
+    n_most : int
+        Beams that are compared: each costs as much.
     """
     every = _every_beam(evidence, radius)
     every = every[:, every[2] >= -NEAR]
@@ -100,20 +105,21 @@ def beams_about(
     is_beside = (gap > _BESIDE[0] + blur) & (gap < _BESIDE[1] + blur)
     is_high = is_beside & (y > -0.5)
     is_under = (np.abs(x) < _UNDER[0] + blurs[0]) & (y > _UNDER[1]) & (y < 0.0)
-    kept = _chosen(every, is_under | ((gap < _AROUND + blur) & (y > _LOWEST)))
+    kept = _chosen(every, is_under | ((gap < _AROUND + blur) & (y > _LOWEST)), n_most)
     n_near, n_past = int(np.sum(is_high & is_near)), int(np.sum(is_high & ~is_near))
-    is_low = (np.abs(x) > _UNDER[0] + blurs[0]) & (np.abs(x) < _BESIDE[1] + blurs[0])
-    is_low &= (y > _UNDER[1]) & (y < BELOW) & (gap > 1.0 + blur)
-    share_low = (np.sum(is_low & is_near) + 0.3) / (is_low.sum() + 1.3)
-    share_high = (n_near + 0.3) / (n_near + n_past + 1.3)
-    shares = np.where(y[kept] < _LOWEST, max(share_low, share_high), share_high)
+    share = (n_near + 0.3) / (n_near + n_past + 1.3)
+    is_low = (np.abs(x) > _BESIDE[0] + blurs[0]) & (np.abs(x) < _BESIDE[1] + blurs[0])
+    is_low &= (y > _UNDER[1]) & (y < BELOW)
+    behind = share * _density_near(every[:3, kept], every[:3, is_high & is_near])
+    behind, wide = _behind(every[:3, kept], every[:3, is_low], (behind, 1.0 - share))
     empty, even, away = _beside(every[:, kept], every[:, is_beside], strength)
     beams = Beams(
         x=x[kept],
         y=y[kept],
         z=z[kept],
         face=every[3, kept],
-        behind=_density_behind(every[:3, kept], every[:3, is_high & is_near], shares),
+        behind=behind,
+        wide=wide,
         empty=empty,
         even=even,
         away=away,
@@ -138,7 +144,7 @@ def _every_beam(evidence: Evidence, radius: float) -> Array:
     return np.hstack([every, np.vstack(silent)])
 
 
-def _chosen(every: Array, is_wanted: Mask) -> Index:
+def _chosen(every: Array, is_wanted: Mask, n_most: int) -> Index:
     """Return some beams: few of those that pass the same place and end alike, evenly if many."""
     rows = np.flatnonzero(is_wanted)
     x, y, z, face = every[:4, rows]
@@ -149,16 +155,12 @@ def _chosen(every: Array, is_wanted: Mask) -> Index:
     ranks = np.empty(len(rows), np.int64)
     ranks[order] = np.arange(len(rows)) - np.repeat(np.cumsum(counts) - counts, counts)
     rows = rows[ranks < _N_CELL]
-    n = min(len(rows), _N_MAX)
+    n = min(len(rows), n_most)
     return np.asarray(rows[(np.arange(n) * (len(rows) / max(n, 1))).astype(np.intp)])
 
 
-def _density_behind(kept: Array, near: Array, shares: Array) -> Array:
-    """Return the density of what happens to each beam that passes the object by.
-
-    By the beams beside it: a share of them ends near, half of it on a plane through them. Low
-    down, where the ground may be near, by those beside the place of a pole.
-    """
+def _density_near(kept: Array, near: Array) -> Array:
+    """Return the density of depths of beams that end near: half of it on a plane beside them."""
     density = np.full(kept.shape[1], 0.5 / NEAR)
     if near.shape[1] > _N_PLANE:
         x, y, z = near
@@ -167,7 +169,28 @@ def _density_behind(kept: Array, near: Array, shares: Array) -> Array:
         sigma = max(1.4826 * float(np.median(np.abs(z - rows @ plane))), _ROUGH)
         off = (kept[2] - plane[0] - plane[1:] @ kept[:2]) / sigma
         density = 0.5 * density + 0.5 * np.exp(-0.5 * off * off) / (sigma * np.sqrt(2.0 * np.pi))
-    return np.where(kept[2] < NEAR, shares * density, 1.0 - shares)
+    return density
+
+
+def _behind(kept: Array, low: Array, beside: tuple[Array, float]) -> tuple[Array, Array]:
+    """Return ``behind`` and ``wide``.
+
+    Low down, beams end as those do that pass farther to the sides at the same height: what a sphere
+    stands on may be wider than a pole. ``beside`` is the density of those that end near, and the
+    share of the others, higher up.
+    """
+    density = np.where(kept[2] < NEAR, *beside)
+    is_under, is_near = kept[1] < _LOWEST, low[2] < NEAR
+    y, z = kept[1:, is_under]
+    weights = np.exp(-0.5 * ((y[:, None] - low[1]) / _ALIKE) ** 2)
+    off = (np.where(z < NEAR, z, 0.0)[:, None] - np.where(is_near, low[2], 0.0)) / _ALIKE
+    near = weights * is_near * np.exp(-0.5 * off * off) / (_ALIKE * np.sqrt(2.0 * np.pi))
+    total = weights.sum(axis=1) + 1.0
+    alike = np.where(z < NEAR, near.sum(axis=1), weights @ ~is_near)
+    wide = np.zeros(kept.shape[1])
+    density[is_under] = (density[is_under] + alike) / total
+    wide[is_under] = weights @ (low[2] < 0.0) / total
+    return density, wide
 
 
 def _beside(kept: Array, beside: Array, strength: float) -> tuple[Array, Array, Array]:

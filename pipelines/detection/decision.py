@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from math import inf
 from statistics import median
 from typing import NamedTuple
 
@@ -12,16 +11,14 @@ import numpy as np
 from spheremark.pipelines.config import ExtractionConfig
 from spheremark.pipelines.detection.evidence import Evidence
 from spheremark.pipelines.detection.features import N_RESOLVED, NOISE_MIN, RESOLUTION, Features
-from spheremark.pipelines.detection.hypotheses import ABUNDANCE, Physics
+from spheremark.pipelines.detection.hypotheses import ABUNDANCE, ABUNDANCE_HELD, Physics
 from spheremark.pipelines.detection.seeds import thinned
 from spheremark.pipelines.detection.shapes import NAMES
 from spheremark.pipelines.detection.target import Target
 from spheremark.pipelines.model import Array
 from spheremark.pipelines.scan.rigs import BEAM_WINDOW
 
-_TOUCHING = 0.10  # share of a ball's returns that may lie as far away beside it: mixed pixels
-_LEGS = 0.15  # share of the beams below it that the legs of a tripod may stop
-_OFF = 0.6  # as a share of the returns on a free sphere: those off it and its pole
+_OFF = 0.2  # as a share of the returns on a sphere: those off it, above its middle
 _EXTENT_MIN = 0.4  # radii: one line of a scan shows no ball
 _HALF_SEEN = 0.8  # radii: the returns of half a ball are as wide, but for those at its edges
 _HIDDEN = 2.0  # as many returns before a ball as on it: two thirds of it are hidden
@@ -118,7 +115,7 @@ def reason_by_features(features: Features, radius: float) -> str:
     if features.n_off > most and not is_resolved(features, radius):
         return (
             f"It does not stand free: {features.n_off} returns at about its distance lie on "
-            f"neither it nor a pole, where {features.n_points} lie on it."
+            f"neither it nor below it, where {features.n_points} lie on it."
         )
     return ""
 
@@ -136,24 +133,7 @@ def reason_by_evidence(features: Features, evidence: Evidence, target: Target) -
             f"Its returns lie on a strip {1e3 * features.width:.0f} mm wide, and the scan does not "
             "show whether it looked beside it: nothing shows whether it is round."
         )
-    few = inf if is_resolved(features, target.radius) else 1.0
-    n_carrying, n_near = evidence.n_carrying, evidence.n_held + evidence.n_short
-    is_held = n_carrying > max(few - 1.0 + _TOUCHING * _n_comparable(evidence), 1.0)
-    if is_held and n_near > _LEGS * (n_near + evidence.n_past):
-        return (
-            f"It does not stand on a pole: {n_carrying} returns below it and beside a "
-            "pole's place lie about as far away, as on shoulders, a larger stone or the ground."
-        )
     return ""
-
-
-def _n_comparable(evidence: Evidence) -> float:
-    """Return the returns on the sphere, scaled to the share of beams below it that are seen.
-
-    Nearer objects may hide more of the sphere or more of the place below it.
-    """
-    n_seen = evidence.n_held + evidence.n_past
-    return evidence.n_aimed * n_seen / max(n_seen + evidence.n_short, 1)
 
 
 def paint_of(groups: Sequence[Evidence], probabilities: Sequence[float]) -> tuple[Array, list[str]]:
@@ -327,21 +307,22 @@ def _by_windows(half_widths: Array) -> Array:
 
 
 def judged(
-    log_likelihoods: Array, n_returns: Sequence[int], counts: Array | float = 1.0
+    log_likelihoods: Array, n_returns: Sequence[int], is_free: Sequence[bool]
 ) -> list[Judgement]:
     """Return what the groups of a scan are, given the likelihood of each by each hypothesis.
 
-    ``counts`` are how much each shows of how often a hypothesis is met.
-
     How often a scan shows each hypothesis is estimated from all its groups (empirical Bayes): among
-    trees, a group that might be leaves is rather leaves. With the distance the ground grows that
-    may hold other objects, while markers are put at all distances alike, in the logarithm.
+    trees, a group that might be leaves is rather leaves. Those that stand free, as on poles, say
+    nothing of those that do not. With the distance the ground grows that may hold other objects,
+    while markers are put at all distances alike, in the logarithm.
     """
     n = np.maximum(np.asarray(n_returns, np.float64), _N_LEAST)  # densities: 1 / n^2 and 1 / n
     odds = _SCATTERED * _N_LEAST * np.log(_N_MOST / _N_LEAST) / n + 1.0 - _SCATTERED
-    log_likelihoods = log_likelihoods.copy()
-    log_likelihoods[:, 1:] += np.log(odds)[:, None]
-    _, posteriors = shares_of(log_likelihoods, counts)
+    posteriors = log_likelihoods.copy()
+    posteriors[:, 1:] += np.log(odds)[:, None]
+    free = np.asarray(is_free, np.bool_)
+    for own, abundance in ((free, ABUNDANCE), (~free, ABUNDANCE_HELD)):
+        posteriors[own] = shares_of(posteriors[own], abundance)[1]
     return [judgement_of(own, NAMES) for own in posteriors]
 
 
@@ -365,27 +346,27 @@ def judgement_of(posteriors: Array, names: Sequence[str]) -> Judgement:
     return Judgement(float(np.exp(posteriors[0])), names[other], float(ratio))
 
 
-def shares_of(log_likelihoods: Array, counts: Array | float = 1.0) -> tuple[Array, Array]:
+def shares_of(log_likelihoods: Array, abundance: Sequence[int] = ABUNDANCE) -> tuple[Array, Array]:
     """Return how often each hypothesis is met among groups, and the log posteriors of each group.
 
     Parameters
     ----------
     log_likelihoods : (n, k)
         Of each group by each hypothesis.
-    counts : (n,) or float
-        How much each counts.
+    abundance : sequence of int
+        How often each is usually met.
 
     Returns
     -------
     (k,), (n, k)
         Shares, by expectation maximisation from the usual abundance; logarithms of probabilities.
     """
-    usual = _N_PRIOR * np.array(ABUNDANCE) / sum(ABUNDANCE)
+    usual = _N_PRIOR * np.array(abundance) / sum(abundance)
     shares, posteriors = usual / _N_PRIOR, log_likelihoods
     for _ in range(_N_ROUNDS):
         posteriors = log_likelihoods + np.log(shares)
         posteriors -= np.logaddexp.reduce(posteriors, axis=1, keepdims=True)
-        shares = usual + (counts * np.exp(posteriors).T).sum(axis=1)
+        shares = usual + np.exp(posteriors).sum(axis=0)
         shares /= shares.sum()
     return shares, posteriors
 

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from spheremark.pipelines.compilation import compiled
 from spheremark.pipelines.detection.cells import Cells, rows_about
 from spheremark.pipelines.detection.faces import faces_of
-from spheremark.pipelines.detection.ground import Ground, planes_below, skin_of
+from spheremark.pipelines.detection.ground import Ground, planes_below
 from spheremark.pipelines.detection.pulses import Hearing, hearing_of, unheard_about
 from spheremark.pipelines.detection.target import (
     Target,
@@ -33,9 +33,11 @@ ROW, N_ROWS = 0.45, 9
 """Height in radii of a row of beams below a sphere, and number of rows."""
 
 _REACH = 4.0  # radii about a centre: shoulders lie within three radii below a head
-_HELD = (-4.0, 1.0)  # radii of depth within which a return may belong to the same object
+_BEHIND = 1.0  # radii of depth from which a return lies behind the object
 _ON = (-1.3, 0.3)  # radii of depth within which a return may lie on the sphere
 _PLACE = 0.1  # radii: beams nearer to each other than this pass at the same place
+_N_BELOW = 2  # beams below a place: as few show nothing of what it stands on
+_LIFTED = 2.0  # radii: the centre of what lies on the ground is not as high above it
 _MEAN_WIDTH = 0.75  # of the greater half width of a beam: in any direction
 _ABOUT, _N_HIDDEN = 1.3, 5  # radii about a centre where a face shows nothing, of so many pulses
 _TINY = 1e-6
@@ -51,13 +53,10 @@ class Evidence(NamedTuple):
         Returns inside the limb at the depth of the sphere.
     n_before : int
         Returns inside the limb that lie before the sphere: beams that would have met it.
-    below : (3, 2, 9)
-        Beams below it and beside the pole: returns at about its distance that are not ground;
-        returns behind it and pulses without a return; returns long before it or on the ground at
-        its distance. To the left and to the right, by how far below, in ``ROW`` radii.
-    unsure : (2, 9)
-        Those of the short ones that are the ground's only if its height is off by a standard
-        deviation.
+    below : (2, 2, 9)
+        Beams below it and beside the pole: returns that are no deeper than it; returns behind it
+        and pulses without a return. To the left and to the right, by how far below, in ``ROW``
+        radii.
     brightness : float
         Reflectivity of the surface, 0-255: least squares over the beams of ``n_on``, weighted by
         their shares inside the limb.
@@ -85,7 +84,6 @@ class Evidence(NamedTuple):
     n_on: int
     n_before: int
     below: NDArray[np.int64]
-    unsure: NDArray[np.int64]
     brightness: float
     n_distinct: int
     rows: NDArray[np.int32]
@@ -98,48 +96,17 @@ class Evidence(NamedTuple):
     sigma_height: float = np.inf
 
     @property
-    def at_worst(self) -> Evidence:
-        """The same where what is unsure is no ground."""
-        held, past, short = self.below
-        below = np.array([held + self.unsure, past, short - self.unsure])
-        return self._replace(below=below)
-
-    @property
-    def n_held(self) -> int:
-        """Number of returns below it at about its distance."""
-        return int(self.below[0].sum())
-
-    @property
-    def n_past(self) -> int:
-        """Number of beams below it that go past it."""
-        return int(self.below[1].sum())
-
-    @property
-    def n_short(self) -> int:
-        """Number of returns below it that end long before it, or on the ground."""
-        return int(self.below[2].sum())
-
-    @property
-    def n_carrying(self) -> int:
-        """Number of returns below it of what may carry it.
-
-        Where most go past on one side, whatever holds more on the other stands beside the pole:
-        twice those of the emptier side count then.
-        """
-        held, past, _ = self.below.sum(axis=2)
-        emptier = int(np.argmin(held))
-        is_open = past[emptier] > 2 + held[emptier]
-        return int(2 * held[emptier] if is_open else held.sum())
-
-    @property
     def shows_below(self) -> bool:
         """Whether most of all beams below it and beside the pole go past it."""
-        return self.n_past > 2 and self.n_past > self.n_held + self.n_short
+        n_near, n_past = self.below.sum(axis=(1, 2))
+        return bool(n_past > _N_BELOW and n_past > n_near)
 
-    @property
-    def n_aimed(self) -> int:
-        """Number of beams that would have met the sphere if nothing were nearer."""
-        return self.n_on + self.n_before
+    def stands_free(self, radius: float) -> bool:
+        """Return whether a ball of some radius [m] stands on nothing wide, as far as is seen."""
+        n_near, n_past = self.below.sum(axis=(1, 2))
+        if n_near + n_past > _N_BELOW:
+            return bool(n_past > n_near)
+        return not self.height < _LIFTED * radius
 
     def shows_beside(self, radius: float) -> bool:
         """Return whether returns beside a ball of some radius [m], left and right, show a look."""
@@ -172,7 +139,7 @@ def gather_evidence(
             straight, bend_max = _straight(rows, bends, _PLACE * target.radius, centres[i])
             known = clock._replace(bend_max=bend_max)
             silent = unheard_about(known, heard, centres[i], target)
-        found = _evidence_at(cloud, silent, straight, centres[i], planes[i], target)
+        found = _evidence_at(cloud, silent, straight, centres[i], target)
         return found._replace(height=float(heights[i]), sigma_height=float(planes[i, 4]))
 
     def gathered(first: int, end: int) -> list[Evidence]:
@@ -201,17 +168,14 @@ def _evidence_at(
     silent: Array | None,
     rows: NDArray[np.int32],
     c: Array,
-    plane: Array,
     target: Target,
 ) -> Evidence:
     """Return the evidence of the beams of some returns, and of silent pulses between them."""
     angles = cloud.gimbal_angles[rows.astype(np.intp)]
     origins = _origins(cloud.rig, angles)
     points = cloud.p_base[rows]
-    over = points @ plane[:3] + plane[3] - skin_of(target.radius)
-    ground = (over < plane[4]) + (over < 0.0).astype(np.int8)
     n_on, n_before, below, brightness, n_distinct, seen = _count_beams(
-        points, cloud.intensities[rows], ground, c, target, origins
+        points, cloud.intensities[rows], c, target, origins
     )
     faces = faces_of(cloud.rig, angles, c)
     if silent is not None:
@@ -221,8 +185,7 @@ def _evidence_at(
     return Evidence(
         n_on=n_on,
         n_before=n_before,
-        below=below[:3],
-        unsure=below[3],
+        below=below,
         brightness=brightness,
         n_distinct=n_distinct,
         rows=rows,
@@ -292,15 +255,13 @@ def _row(along: float) -> int:
 def _count_beams(
     points: Column,
     intensities: Column,
-    ground: NDArray[np.int8],
     c: Array,
     target: Target,
     origins: Array,
 ) -> tuple[int, int, NDArray[np.int64], float, int, Array]:
     """Return the counts of ``Evidence``, its brightness, and how the beams pass the centre.
 
-    Those below it are held, past, short and unsure, to the left and to the right of it, by rows.
-    ``ground`` is 0 for returns that are not the ground's, 1 and 2 for those that may be and are.
+    Those below it end near or go past, to the left and to the right of it, by rows.
     """
     radius = target.radius
     blur = blur_at(c, target) / radius
@@ -310,7 +271,7 @@ def _count_beams(
         share, x, y = seen[2, i] / np.sqrt(np.sum(points[i] ** 2)), origins[0, i], origins[1, i]
         seen[0, i] += share * (view.across[0] * x + view.across[1] * y)
         seen[1, i] += share * (view.up[0] * x + view.up[1] * y)
-    n_on, n_before, n_distinct, below = 0, 0, 0, np.zeros((4, 2, N_ROWS), np.int64)
+    n_on, n_before, n_distinct, below = 0, 0, 0, np.zeros((2, 2, N_ROWS), np.int64)
     light, lit = 0.0, 0.0
     half = int((1.0 + blur) / _PLACE) + 1
     is_met = np.zeros((2 * half, 2 * half), np.bool_)
@@ -330,11 +291,7 @@ def _count_beams(
         n_before += is_aimed and depth <= _ON[0]
         if is_beside_pole(across, along, blur):
             side, down = int(seen[0, i] > 0.0), _row(along)
-            is_held = _HELD[0] <= depth <= _HELD[1]
-            below[0, side, down] += is_held and ground[i] == 0
-            below[1, side, down] += depth > _HELD[1]
-            below[2, side, down] += depth < _HELD[0] or (is_held and ground[i] > 0)
-            below[3, side, down] += is_held and ground[i] == 1
+            below[int(depth > _BEHIND), side, down] += 1
     return n_on, n_before, below, light / max(lit, _TINY), n_distinct, seen
 
 

@@ -164,10 +164,9 @@ def _n_off(seen: Array, weights: Array, blur: float) -> int:
     Of those beside it, twice those of the emptier side: what stands beside a sphere or behind its
     edge is on one side.
     """
-    gaps, widths, depths = np.hypot(seen[0], seen[1]), np.abs(seen[0]), np.abs(seen[2])
+    gaps, depths = np.hypot(seen[0], seen[1]), np.abs(seen[2])
     is_inside = (gaps < 0.9) & (seen[1] > -0.8) & (depths < 2.0) & (weights <= 0.0)
-    is_beside = (gaps > 1.1 + blur) & (gaps < 2.5 + blur) & (depths < 1.0)
-    is_beside &= (seen[1] > 0.0) | (widths > 0.6 + blur)
+    is_beside = (gaps > 1.1 + blur) & (gaps < 2.5 + blur) & (depths < 1.0) & (seen[1] > 0.0)
     n_left, n_beside = np.sum(is_beside & (seen[0] < 0.0)), np.sum(is_beside)
     n_off: int = np.sum(is_inside) + 2 * min(n_left, n_beside - n_left)
     return n_off

@@ -19,12 +19,6 @@ _AROUND = 24  # cells each way about a place whose ground may show its height
 _N_NEAREST = 40  # of these that do: ground a metre about it, where all cells are seen
 _ROUGH, _SLOPE, _TILT = 0.05, 0.05, 0.2  # [m] of the ground, how it bends away, tangent of tilts
 _SMOOTH = 0.01  # [m] least roughness: lowest points of cells scatter so on a plane floor
-_SKIN, _SKIN_MAX = 0.3, 0.03  # radii, and [m]: ground is that rough, spheres begin higher
-
-
-def skin_of(radius: float) -> float:
-    """Return how far above the plane of the ground a return counts as ground [m]."""
-    return min(_SKIN * radius, _SKIN_MAX)
 
 
 class Ground(NamedTuple):
@@ -45,7 +39,9 @@ class Ground(NamedTuple):
     lowest: Column
 
 
-def ground_of(cloud: StitchedCloud, cells: Cells, config: ExtractionConfig) -> Ground:
+def ground_of(
+    cloud: StitchedCloud, cells: Cells, config: ExtractionConfig, radius: float
+) -> Ground:
     """Return which returns rise above the ground, and how high the ground is."""
     from scipy import ndimage  # slow to import
 
@@ -55,7 +51,8 @@ def ground_of(cloud: StitchedCloud, cells: Cells, config: ExtractionConfig) -> G
     over = cells.heights - np.append(known, np.float32(np.nan))[cells.ground]
     is_field = cloud.p_base[:, 0] ** 2 + cloud.p_base[:, 1] ** 2 < _FIELD**2
     highest = cells.heights[is_field & (over < _RISE)].max(initial=-np.inf)
-    return Ground(cloud.p_base[over > config.ground_clearance], float(highest), lowest)
+    clearance = min(max(radius, 0.5 * config.ground_clearance), config.ground_clearance)
+    return Ground(cloud.p_base[over > clearance], float(highest), lowest)
 
 
 def planes_below(ground: Ground, cells: Cells, places: Array) -> Array:

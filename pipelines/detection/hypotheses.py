@@ -42,6 +42,7 @@ from spheremark.pipelines.model import Array
 
 _FLOOR = 1e-9
 _HEARD = 0.5  # of a beam: an object that is heard at all needs no larger share
+_N_BEAMS = (192, 400)  # that are compared at most: to find shapes, and where they are known
 _NEVER = 60.0  # logarithm of odds behind the best that stand for any more
 
 # Means and standard deviations of the parameters
@@ -66,12 +67,17 @@ _FORMS: dict[int, tuple[tuple[float, float], ...]] = {
     PANEL: ((0.0, 0.5), (0.0, 0.5), (0.0, 0.7), (0.0, 0.7)),
     CLUTTER: ((0.0, 0.4), (1.0, 1.5), (-0.7, 0.7)),
 }
-ABUNDANCE = (208, 31, 274, 10, 33, 191, 18, 36, 36)
-"""Groups that were compared in 31 random worlds of the simulator and were each."""
+ABUNDANCE = (225, 85, 42, 24, 85, 111, 94, 55, 429)
+"""Groups that stand free in 31 random worlds of the simulator and were each."""
+
+ABUNDANCE_HELD = (29, 171, 432, 42, 107, 360, 185, 301, 873)
+"""The same of groups that something wide holds, or the ground."""
 
 _BESIDE = 0.1  # probability of anything beside what stands free
 _HEIGHTS = 2.5  # [m] up to which markers stand
 _LEAST_HEIGHTS = {BALL: 1.0, SPHERE: 1.0, CYLINDER: 1.0, SOLID: 1.0}
+_WIDE, _AS_LOW = 0.4, 2.0  # [m] how high wide things are that carry markers; ratio at most
+_LYING, _UNEVEN = 0.1, 0.2  # probability of an object on the ground; radii that it sinks in
 _BOULDER_HEIGHT = (0.3, 0.6)  # radii: centre above the ground, and standard deviation
 _PERCHED, _STONE = 0.1, 0.5  # probability that a boulder lies on another, and mean height [m] of it
 _HEAD_HEIGHT, _LOWERED = (1.6, 0.12), 0.2  # [m] of adults who stand (1.70 m tall); share of others
@@ -110,7 +116,7 @@ class Physics(NamedTuple):
 USUAL = (1.0, -0.1, 0.0, 0.0)  # edges: measured on markers of random worlds
 """What markers share in a scan that nothing is known of, as in ``Physics``, but for the noise."""
 
-SIGMAS = (0.35, 0.6, 0.1, 0.05)
+SIGMAS = (0.35, 0.6, 0.1, 0.02)
 """How far these may be off: what an echo is moves the limb, and the limb against the middle."""
 
 
@@ -154,9 +160,10 @@ def log_likelihoods(
     distance, radius = float(np.linalg.norm(centre)), target.radius
     strength = max(evidence.brightness, 1.0) / distance**2
     faintest = min(max(physics.weakest / strength, _FLOOR), _HEARD)  # its own returns are heard
-    beams, n_beside, n_passing = beams_about(evidence, radius, strength, (physics.lost, faintest))
+    hearing, n_most = (physics.lost, faintest), _N_BEAMS[int(len(begun) > 0)]
+    beams, n_beside, n_passing = beams_about(evidence, radius, strength, hearing, n_most)
     beams = merged_within(beams, physics.gates, radius)
-    logs = log_supports(evidence, float(centre @ target.up), radius)
+    logs = log_supports(evidence, float(centre @ target.up), radius, _as_high(evidence))
     for kind in range(len(NAMES)):
         logs[kind] += _log_beside(kind, n_beside, n_passing)
         logs[kind] += np.log(_height_density(kind, evidence.height, evidence.sigma_height, radius))
@@ -225,6 +232,9 @@ def _height_density(kind: int, height: float, sigma: float, radius: float) -> fl
         return unknown
     least = _LEAST_HEIGHTS.get(kind, 0.0) * radius
     known = 0.5 * unknown * erfc((least - height) / (1.4142 * sigma))
+    if least > 0.0:  # some lie on the ground
+        lying = NormalDist(least, hypot(_UNEVEN * radius, sigma)).pdf(height)
+        known = (1.0 - _LYING) * known + _LYING * lying
     if kind == BOULDER:
         mean, spread = _BOULDER_HEIGHT[0] * radius, _BOULDER_HEIGHT[1] * radius
         known = (1.0 - _PERCHED) * NormalDist(mean, hypot(spread, sigma)).pdf(height)
@@ -234,6 +244,14 @@ def _height_density(kind: int, height: float, sigma: float, radius: float) -> fl
         standing = NormalDist(mean, hypot(spread, sigma)).pdf(height)
         known = _LOWERED * known + (1.0 - _LOWERED) * standing
     return _NOT_GROUND * unknown + (1.0 - _NOT_GROUND) * known
+
+
+def _as_high(evidence: Evidence) -> float:
+    """Return how many times likelier a height is on something wide than on a pole."""
+    height, sigma = evidence.height, evidence.sigma_height
+    if not sigma < _HEIGHTS:
+        return 1.0
+    return min(2.0 * _HEIGHTS * NormalDist(0.0, hypot(_WIDE, sigma)).pdf(height), _AS_LOW)
 
 
 def _density_above(height: float, mean: float, sigma: float) -> float:

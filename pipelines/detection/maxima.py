@@ -40,7 +40,7 @@ def searched(
         found = _jumped(kind, shape, is_free, prior, beams, found)
         if begin and found < before + _CLOSE:
             break
-        found = _walked(kind, shape, steps.copy(), prior, beams, (found, least))
+        found = walked(kind, shape, steps.copy(), prior, beams, (found, least))
         if found == -np.inf:
             break
         found = climbed(kind, shape, is_free, prior, beams, found)
@@ -48,7 +48,7 @@ def searched(
 
 
 @compiled
-def _walked(
+def walked(
     kind: int, shape: Array, steps: Array, prior: Array, beams: Beams, begun: tuple[float, float]
 ) -> float:
     """Move a shape by a pattern search (Hooke and Jeeves, 1961).

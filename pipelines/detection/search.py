@@ -8,16 +8,18 @@ from __future__ import annotations
 import numpy as np
 
 from spheremark.pipelines.detection.beams import Beams
-from spheremark.pipelines.detection.maxima import climbed, information, searched
+from spheremark.pipelines.detection.maxima import climbed, information, searched, walked
 from spheremark.pipelines.detection.shapes import (
     BALL,
     BOULDER,
+    CLUTTER,
     CYLINDER,
     FORM,
     HEAD,
     N_PARAMETERS,
     NOISE,
     POLE,
+    POST,
     SHIFT,
     SOLID,
     SPHERE,
@@ -30,6 +32,7 @@ from spheremark.pipelines.estimation.linear_algebra import invert
 from spheremark.pipelines.model import Array
 
 _GIVEN_UP = 12.0  # logarithm of odds against the sphere from which no other shape is sought
+_GLANCED = (BALL, CYLINDER, POST, CLUTTER)  # where one is far better, no others are sought
 _ORDER = (0, 4, 8, 7, 1, 6, 5, 3, 2)  # the sphere, then what refutes it at the least cost
 _STARTS = (0.0, -0.3, 0.3)  # of the logarithm of the radius of a ball
 _UNSURE = (-4.0, 9.0)  # logarithms of odds for the sphere between which evidence is integrated
@@ -84,8 +87,11 @@ def compared(beams: Beams, priors: Array, log_priors: Array, begun: Array) -> tu
             shape = begun[kind].copy()
             own = _evidence_nearby(kind, shape, priors[kind], beams)
             _keep(kind, shape, own + log_priors[kind], found, shapes)
+            _seek_sphere(kind, priors, log_priors, beams, (found, shapes))
         else:
             _seek(kind, priors, log_priors, beams, (found, shapes))
+        if kind == SPHERE and not len(begun):
+            _glance(priors, log_priors, beams, (found, shapes))
     odds = found[SPHERE] - found[SPHERE + 1 :].max()
     if len(begun) > 0 and _UNSURE[0] < odds < _UNSURE[1]:
         _integrate(priors, log_priors, beams, (found, shapes))
@@ -95,9 +101,11 @@ def compared(beams: Beams, priors: Array, log_priors: Array, begun: Array) -> tu
 def _integrate(priors: Array, log_priors: Array, beams: Beams, known: tuple[Array, Array]) -> None:
     """Integrate the evidence of what may turn a close decision; ``known`` as ``compared``."""
     found, shapes = known
-    least = found.max() - _UNSURE[1]
+    least, before = found.max() - _UNSURE[1], found[SPHERE]
     for kind in _ORDER:
-        if found[kind] > least:
+        if kind == BALL:  # the same but for its size: so is what its integral holds
+            found[BALL] += found[SPHERE] - before
+        elif found[kind] > least:
             own = log_integral(kind, shapes[kind], priors[kind], beams)
             found[kind] = own + log_priors[kind]
 
@@ -115,12 +123,36 @@ def _seek(
         else:
             own = _evidence(kind, shape, priors[kind], beams, found.max() - log_priors[kind])
         _keep(kind, shape, own + log_priors[kind], found, shapes)
-        if kind in (BALL, BOULDER):  # it may have found a better place for the sphere too
-            again = _start(SPHERE, priors[SPHERE], shape, start, beams)
-            own = _evidence_nearby(SPHERE, again, priors[SPHERE], beams)
-            _keep(SPHERE, again, own + log_priors[SPHERE], found, shapes)
+        _seek_sphere(kind, priors, log_priors, beams, (found, shapes))
         if kind != BALL:
             break
+
+
+def _seek_sphere(
+    kind: int, priors: Array, log_priors: Array, beams: Beams, known: tuple[Array, Array]
+) -> None:
+    """Search for the best sphere where the best ball or boulder is; ``known`` as ``compared``."""
+    found, shapes = known
+    if kind in (BALL, BOULDER):
+        shape = _start(SPHERE, priors[SPHERE], shapes[kind], 0.0, beams)
+        own = _evidence_nearby(SPHERE, shape, priors[SPHERE], beams)
+        _keep(SPHERE, shape, own + log_priors[SPHERE], found, shapes)
+
+
+def _glance(priors: Array, log_priors: Array, beams: Beams, known: tuple[Array, Array]) -> None:
+    """Walk a little to shapes of other kinds; keep them where they make the sphere hopeless.
+
+    Their evidence is rough where a walk ends before the best. ``known`` as ``compared``.
+    """
+    found, shapes = known[0].copy(), known[1].copy()
+    for kind in _GLANCED:
+        shape = _start(kind, priors[kind], shapes[SPHERE], 0.0, beams)
+        own = log_likelihood(kind, shape, priors[kind], beams, np.empty(len(beams.x)))
+        own = walked(kind, shape, 0.4 * priors[kind, 1], priors[kind], beams, (own, -np.inf))
+        own += log_volume(kind, shape, priors[kind], beams)
+        _keep(kind, shape, own + log_priors[kind], found, shapes)
+    if found[SPHERE] < found.max() - 2.0 * _GIVEN_UP:
+        known[0][:], known[1][:] = found, shapes
 
 
 def _keep(kind: int, shape: Array, own: float, found: Array, shapes: Array) -> None:
@@ -141,6 +173,9 @@ def _start(kind: int, prior: Array, sphere: Array, start: float, beams: Beams) -
         shape[POLE] = prior[0, POLE]
     if kind in (BALL, BOULDER, SOLID):
         shape[FORM] = sphere[FORM]
+    if kind == SPHERE:  # its size is nearly known
+        mean, sigma = prior[:, FORM]
+        shape[FORM] = min(max(sphere[FORM], mean - 2.0 * sigma), mean + 2.0 * sigma)
     if kind == BALL:
         shape[FORM] += start
     if kind == BOULDER:

@@ -37,11 +37,12 @@ X, Y, Z, NOISE, EDGE, STRETCH, FORM, SHIFT, POLE, N_PARAMETERS = (
 
 MEAN = 2.0 / 3.0  # of a radius: mean height of a sphere's surface over its disc
 _POLE_FROM, _POLE_DEPTH, _POLE_SHARE = 0.8, 0.4, 0.7  # of a pole, and of its beams that it stops
+_POLE_MOST = 0.5  # radii: half the width of what is a pole, and no post or trunk
 _STRAY = 0.02  # share of the returns from a surface that lie anywhere: crosstalk, dust, strays
 _MERGED = 0.6  # share of the echoes of a beam that an outline halves, between it and what is behind
 _MISPLACED = 0.01  # share of the beams on a solid surface that seem to end behind it
 _SOFT = (0.07, 0.35)  # radii, and half widths of a beam besides, over which beams come to hit
-_N_ALIKE = 1000.0  # beams that share errors of the model so that each counts as half a beam
+_N_ALIKE = 500.0  # beams that share errors of the model so that each counts as half a beam
 _LEAST_BEHIND = 0.1  # radii from a surface to what is behind it: anything nearer touches it
 _UNEVEN = 0.05  # share of that distance by which what is behind may be nearer or farther
 _FLOOR = 1e-9
@@ -192,7 +193,7 @@ def log_likelihood(kind: int, shape: Array, prior: Array, beams: Beams, densitie
     for j in range(N_PARAMETERS):
         if prior[1, j] > 0.0:
             log_prior -= 0.5 * ((shape[j] - prior[0, j]) / prior[1, j]) ** 2
-    form, pole = _form_of(kind, shape), np.exp(shape[POLE])
+    form, pole = _form_of(kind, shape), min(np.exp(shape[POLE]), _POLE_MOST)
     variance = form[2] if kind == CLUTTER else np.exp(2.0 * shape[NOISE])
     scale, precision = (1.0 - _STRAY) / np.sqrt(6.283185 * variance), 0.5 / variance
     sigma = np.sqrt(variance)
@@ -206,7 +207,7 @@ def log_likelihood(kind: int, shape: Array, prior: Array, beams: Beams, densitie
         z, is_near = beams.z[i] - moved, beams.z[i] < NEAR
         rest, beam = beams.behind[i], _beam(shape, beams, i)
         if has_pole and y < bottom:
-            share = pole_share * _inside(pole - abs(x), beams.blur, beam[0])
+            share = (1.0 - beams.wide[i]) * pole_share * _inside(pole - abs(x), beams.blur, beam[0])
             on = _normal(z - MEAN, _POLE_DEPTH) if is_near else _MISPLACED
             if beams.z[i] == np.inf:
                 on = _unheard(share, beams)
@@ -223,7 +224,7 @@ def log_likelihood(kind: int, shape: Array, prior: Array, beams: Beams, densitie
         rest = _merged(rest, divided * beams.merged[i], beams, i, (moved + depth, sigma))
         densities[i] = rest + _FLOOR
         product *= densities[i]
-        if product < 1e-200:
+        if not 1e-200 < product < 1e200:
             total, product = total + np.log(product), 1.0
     return float(log_prior + trust(beams) * (total + np.log(product)))
 

@@ -30,7 +30,7 @@ _SUPPORTS = np.array(  # by hypothesis
 )
 
 
-def log_supports(evidence: Evidence, level: float, radius: float) -> Array:
+def log_supports(evidence: Evidence, level: float, radius: float, as_high: float) -> Array:
     """Return the log probabilities of the beams below a place by all hypotheses, (k,).
 
     Parameters
@@ -41,6 +41,8 @@ def log_supports(evidence: Evidence, level: float, radius: float) -> Array:
         Height above the sensor [m].
     radius : float
         Of the sphere that is searched for [m].
+    as_high : float
+        How many times likelier such a height is on something wide than on a pole.
 
     Notes
     -----
@@ -48,13 +50,15 @@ def log_supports(evidence: Evidence, level: float, radius: float) -> Array:
     stops them is marginalised. Both sides show what holds it up, or one does and the other shows a
     neighbour; the ground is on both.
     """
-    return np.asarray(_log_supports(*_beams_below(evidence, level, radius)))
+    supports = _SUPPORTS.copy()
+    supports[supports[:, 0] > 0.5, 1] *= as_high
+    return np.asarray(_log_supports(*_beams_below(evidence, level, radius), supports))
 
 
 def _beams_below(evidence: Evidence, level: float, radius: float) -> tuple[Array, Array]:
     """Return how many beams below a place end near, and how many are known to go past, (2, 9)."""
-    held, past, short = evidence.below.astype(np.float64)
-    near, n_past = held + short, past.sum()
+    near, past = evidence.below.astype(np.float64)
+    n_past = past.sum()
     if evidence.silent is None:  # pulses are as dense below, and those without a return go past
         return near, past + max(evidence.n_on - near.sum() - n_past, 0.0) / past.size
     n_unknown = _n_unknown(evidence, level, radius)
@@ -79,11 +83,11 @@ def _n_unknown(evidence: Evidence, level: float, radius: float) -> float:
 
 
 @compiled
-def _log_supports(near: Array, past: Array) -> Array:
+def _log_supports(near: Array, past: Array, supports: Array) -> Array:
     """Return the log probabilities of beams to the left and to the right, by rows, (2, 9)."""
-    logs = np.empty(len(_SUPPORTS))
-    for kind in range(len(_SUPPORTS)):
-        support = _SUPPORTS[kind]
+    logs = np.empty(len(supports))
+    for kind in range(len(supports)):
+        support = supports[kind]
         logs[kind] = _log_support(near[0] + near[1], past[0] + past[1], support)
         if kind == BOULDER:
             continue

@@ -33,19 +33,12 @@ def features(n_points=70, **changes):
     return seen._replace(**changes)
 
 
-def below(n_held, n_past, n_short):
-    """Beams below a ball, half of them to the left, in one row."""
-    counts = np.zeros((3, 2, N_ROWS), np.int64)
-    for counted, n in zip(counts, (n_held, n_past, n_short), strict=True):
-        counted[:, 4] = n - n // 2, n // 2
-    return counts
-
-
-def evidence(n_held=0, n_past=150, n_short=0, **changes):
-    """A ball that stands on a pole before something far."""
+def evidence(n_past=150, **changes):
+    """A ball that stands on a pole before something far: half of the beams on each side."""
+    below = np.zeros((2, 2, N_ROWS), np.int64)
+    below[1, :, 4] = n_past // 2
     seen = Evidence(
-        n_on=70, n_before=0, below=below(n_held, n_past, n_short),
-        unsure=np.zeros((2, N_ROWS), np.int64), brightness=50.0, n_distinct=70,
+        n_on=70, n_before=0, below=below, brightness=50.0, n_distinct=70,
         rows=np.empty(0, np.int32), seen=np.empty((3, 0)), faces=np.empty(0),
         strengths=np.empty(0), silent=None, blur=np.full(2, 0.015), height=np.nan,
         sigma_height=np.inf,
@@ -57,49 +50,22 @@ def refusal(seen, about):
     return reason_by_features(seen, TARGET.radius) or reason_by_evidence(seen, about, TARGET)
 
 
-def test_a_ball_on_a_pole_passes_and_a_head_on_shoulders_does_not():
+def test_a_ball_on_a_pole_passes_and_a_piece_of_a_wall_does_not():
     assert refusal(features(), evidence()) == ""
-    assert "shoulders" in refusal(features(), evidence(n_held=56, n_past=3))
+    assert "does not stand free" in refusal(features(n_off=40), evidence())
 
 
-def test_a_ball_seen_more_closely_than_any_other_shape_may_stand_on_something():
+def test_a_ball_seen_more_closely_than_any_other_shape_may_touch_something():
     close = features(scatter=0.003)
     assert is_resolved(close, TARGET.radius)
-    assert refusal(close, evidence(n_held=56, n_past=3)) == ""
+    assert refusal(close._replace(n_off=40), evidence()) == ""
 
 
-@pytest.mark.parametrize("share_seen", [1.0, 0.5, 0.04])
-def test_what_is_held_below_counts_by_how_much_is_seen_there(share_seen):
-    """A tenth of the returns that a ball there would have may be held, and one."""
-    n_seen = round(100 * share_seen)
-    n_few = 1 + round(0.1 * 300 * share_seen)
-
-    def reason(n):
-        held = evidence(n_held=n, n_past=n_seen - n, n_short=100 - n_seen, n_on=300)
-        return reason_by_evidence(features(n_points=300), held, TARGET)
-
-    assert "pole" not in reason(n_few - 1)
-    assert "pole" in reason(n_few + 2)
-
-
-def test_the_legs_of_a_tripod_may_stop_a_seventh_of_the_beams_below():
-    assert refusal(features(), evidence(n_held=14, n_past=86)) == ""
-    assert "pole" in refusal(features(), evidence(n_held=17, n_past=83))
-
-
-def test_what_holds_more_on_one_side_where_most_go_past_on_the_other_stands_beside():
-    beside = below(0, 0, 0)
-    beside[0, :, 4], beside[1, :, 4] = (20, 2), (0, 30)
-    assert refusal(features(), evidence()._replace(below=beside)) == ""
-    beside[1, 1, 4] = 3
-    assert "pole" in refusal(features(), evidence()._replace(below=beside))
-
-
-def test_what_may_be_ground_carries_nothing_but_at_worst():
-    seen = evidence(n_past=60, n_short=90, unsure=below(60, 0, 0)[0])
-    assert refusal(features(), seen) == ""
-    assert "60 returns below it" in refusal(features(), seen.at_worst)
-    assert (seen.at_worst.n_held, seen.at_worst.n_short) == (60, 30)
+def test_what_most_beams_below_go_past_shows_that_it_stands_on_a_pole():
+    seen = evidence()
+    assert seen.shows_below
+    seen.below[0, 0, 4] = 160
+    assert not seen.shows_below
 
 
 def test_of_a_ball_two_thirds_may_be_hidden():
@@ -120,36 +86,35 @@ def likelihoods(*sphere_over_others):
 def test_probabilities_follow_the_likelihoods_and_name_the_best_other_hypothesis():
     found = likelihoods(12.0, 3.0, -4.0)
     found[2, NAMES.index("head on shoulders")] = 2.0
-    sure, doubtful, head = judged(found, [MANY] * 3)
+    sure, doubtful, head = judged(found, [MANY] * 3, [True] * 3)
     assert sure.probability > 0.999 > doubtful.probability > head.probability
     assert head.hypothesis.startswith("head on shoulders: ")
     assert head.reason.startswith("Head on shoulders: ")
     assert "likelier than a marker" in head.reason
-    assert judged(likelihoods(), []) == []
+    assert judged(likelihoods(), [], []) == []
 
 
 def test_among_trees_a_group_that_may_be_leaves_is_rather_leaves():
     doubtful = likelihoods(4.0)
     leaves = likelihoods(*[-30.0] * 20)
     leaves[:, NAMES.index("foliage or other clutter")] = 5.0
-    alone = judged(doubtful, [MANY])[0].probability
-    assert judged(np.vstack([doubtful, leaves]), [MANY] * 21)[0].probability < alone
+    alone = judged(doubtful, [MANY], [True])[0].probability
+    among = judged(np.vstack([doubtful, leaves]), [MANY] * 21, [True] * 21)
+    assert among[0].probability < alone
 
 
-def test_a_group_that_does_not_count_has_a_probability_and_changes_no_other():
-    doubtful, balls = likelihoods(4.0), likelihoods(*[-30.0] * 20)
-    balls[:, NAMES.index("sphere of another radius")] = 5.0
-    (alone,) = judged(doubtful, [MANY])
-    counts = np.array([1.0] + [0.0] * 20)
-    found = judged(np.vstack([doubtful, balls]), [MANY] * 21, counts)
-    assert found[0] == alone
-    assert found[1].probability < 1e-6
-    assert found[1].hypothesis.startswith("sphere of another radius: ")
+def test_what_lies_on_something_says_nothing_of_what_stands_free():
+    doubtful, stones = likelihoods(4.0, 4.0), likelihoods(*[-30.0] * 20)
+    stones[:, NAMES.index("boulder on the ground")] = 5.0
+    (alone,) = judged(doubtful[:1], [MANY], [True])
+    free, lying, *_ = judged(np.vstack([doubtful, stones]), [MANY] * 22, [True] + [False] * 21)
+    assert free == alone
+    assert lying.probability < alone.probability
 
 
 def test_of_what_is_far_less_is_a_marker_than_of_what_is_near():
     """Twice the distance is a quarter of the returns, and four times the ground."""
-    near, far = (judged(likelihoods(6.0), [n])[0].probability for n in (400, 8))
+    near, far = (judged(likelihoods(6.0), [n], [True])[0].probability for n in (400, 8))
     assert near > far > 0.9
 
 

@@ -31,7 +31,7 @@ def test_lines_whose_angle_is_not_known_are_neither_evidence_nor_silent(scan):
     cloud, marks, field = scan
     cells = cells_of(cloud, EXTRACTION)
     target = Target(field.marker_radius, cells.R_station_base[2], 0.003)
-    ground = ground_of(cloud, cells, EXTRACTION)
+    ground = ground_of(cloud, cells, EXTRACTION, field.marker_radius)
     evidence, _ = gather_evidence(cloud, cells, ground, marks, target)
     n_left_out = 0
     for mark, seen in zip(marks, evidence, strict=True):

@@ -36,6 +36,7 @@ def beams_before_a_wall(rng, away, *, is_merged):
         z=z,
         face=0.5 * ones,
         behind=1.0 / 12.0 + 0.5 * norm.pdf(z, away, 2.0 * NOISE_OF_RANGES),
+        wide=0.0 * ones,
         empty=0.0 * ones,
         even=0.0 * ones,
         away=away * ones,

@@ -8,7 +8,7 @@ from scipy.stats import betabinom
 
 from spheremark.pipelines.detection.evidence import N_ROWS
 from spheremark.pipelines.detection.shapes import BOULDER, HEAD, SPHERE
-from spheremark.pipelines.detection.support import _log_supports, log_share
+from spheremark.pipelines.detection.support import _SUPPORTS, _log_supports, log_share
 
 N = 10  # beams in each row on each side
 
@@ -16,7 +16,7 @@ N = 10  # beams in each row on each side
 def logs(*near):
     """Log probabilities where so many of the beams of each row end near, on both sides alike."""
     stopped = np.array([near, near], np.float64)
-    return _log_supports(stopped, N - stopped)
+    return _log_supports(stopped, N - stopped, _SUPPORTS)
 
 
 @pytest.mark.parametrize(("n_near", "n_past"), [(0, 0), (3, 4), (40, 2)])
@@ -45,10 +45,10 @@ def test_shoulders_of_which_one_is_hidden_are_shoulders():
     stopped[1, 4:] = N
     seen = np.full((2, N_ROWS), float(N))
     seen[0] = 0.0
-    one_side = _log_supports(stopped, seen - stopped)
+    one_side = _log_supports(stopped, seen - stopped, _SUPPORTS)
     assert np.argmax(one_side) == HEAD
 
 
 def test_without_beams_below_nothing_is_known():
-    nothing = _log_supports(np.zeros((2, N_ROWS)), np.zeros((2, N_ROWS)))
+    nothing = _log_supports(np.zeros((2, N_ROWS)), np.zeros((2, N_ROWS)), _SUPPORTS)
     np.testing.assert_allclose(nothing, 0.0, atol=1e-9)

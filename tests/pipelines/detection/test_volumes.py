@@ -19,6 +19,7 @@ from spheremark.pipelines.detection.shapes import (
     Y,
     Z,
     log_likelihood,
+    trust,
 )
 from spheremark.pipelines.detection.volumes import log_integral, log_volume
 
@@ -39,6 +40,7 @@ def beams_at(rng, step):
         z=np.where(off < 1.0, surface, np.inf),
         face=0.5 * ones,
         behind=np.where(off < 1.0, 1e-3, 0.9),
+        wide=0.0 * ones,
         empty=ones,
         even=0.0 * ones,
         away=np.inf * ones,
@@ -85,3 +87,17 @@ def test_the_integral_is_the_sum_over_a_grid_and_laplace_s_is_less_near(free):
     by_integral, by_laplace = np.abs(errors).T
     assert by_integral.max() < 0.5  # of sixteen shapes alone
     assert by_integral.mean() < by_laplace.mean()
+
+
+def test_the_likelihood_of_thousands_of_exact_ranges_is_finite():
+    noise = 1e-6  # radii: densities whose product is greater than any number
+    beams = beams_at(np.random.default_rng(3), 0.05)
+    off = np.minimum(np.hypot(beams.x, beams.y), 1.0)
+    beams = beams._replace(
+        z=np.where(beams.z < np.inf, -np.sqrt(1.0 - off**2), np.inf), blur=0.0, blur_up=0.0
+    )
+    shape, densities = prior_of(())[0], np.empty(len(beams.x))
+    shape[NOISE] = np.log(noise)
+    found = log_likelihood(SPHERE, shape, np.zeros((2, N_PARAMETERS)), beams, densities)
+    assert found == pytest.approx(trust(beams) * np.log(densities).sum())
+    assert found > 1000.0

@@ -1,0 +1,68 @@
+"""Markers on the ground and on drums: what is below them stops beams, as below stones and heads."""
+
+import numpy as np
+import pytest
+
+from spheremark.pipelines.config import ExtractionConfig
+from spheremark.pipelines.detection import extract
+from spheremark.pipelines.detection.beams import _behind
+from tests.pipelines.synthetic_stop import RADIUS, World, ring_of_markers, scan
+
+GROUND, N = -0.8, 6
+DRUM_RADIUS, DRUM_HEIGHT = 0.25, 0.5
+
+
+def ring(distance, height, turn):
+    """Places around the sensor, their centres so high above the ground [m]."""
+    phi = 2 * np.pi * (np.arange(N) + turn) / N
+    level = distance * np.column_stack([np.cos(phi), np.sin(phi)])
+    return np.column_stack([level, np.full(N, GROUND + height)])
+
+
+def found_in(places, posts=()):
+    """Whether each place has a marker, and how many markers lie elsewhere, among some on poles."""
+    on_poles = ring_of_markers(n=5)
+    world = World(
+        balls=tuple((tuple(p), RADIUS) for p in (*on_poles, *places)), posts=posts, ground=GROUND
+    )
+    found = extract(scan(world, np.random.default_rng(8)), ExtractionConfig(), RADIUS)
+    rough = np.array([one.p_base_rough for one in found.candidates])
+    gaps = np.linalg.norm(rough[:, None] - np.vstack([on_poles, places]), axis=2)
+    is_met = gaps < 0.5 * RADIUS
+    return is_met[:, 5:].any(axis=0), int(np.sum(~is_met.any(axis=1)))
+
+
+@pytest.mark.parametrize("distance", [3.5, 6.0])
+def test_markers_on_drums_are_found(distance):
+    places = ring(distance, DRUM_HEIGHT + RADIUS, 0.5)
+    drums = tuple(((x, y, GROUND), DRUM_RADIUS, DRUM_HEIGHT) for x, y, _ in places)
+    is_found, n_others = found_in(places, drums)
+    assert is_found.all()
+    assert n_others == 0
+
+
+@pytest.mark.parametrize("distance", [3.0, 4.5, 6.0])
+def test_markers_on_the_ground_are_found(distance):
+    is_found, n_others = found_in(ring(distance, RADIUS, 0.5))
+    assert is_found.all()
+    assert n_others == 0
+
+
+def densities_below(z_beside, z_below):
+    """Density of a beam below an object, where those beside it at the same height end."""
+    sides = np.linspace(-2.2, 2.2, 40)
+    low = np.stack([sides, np.full(40, -1.5), np.full(40, z_beside)])
+    return _behind(np.array([[0.0], [-1.5], [z_below]]), low, (np.array([0.003]), 0.98))
+
+
+def test_beams_below_an_object_end_as_those_beside_them_do():
+    on_drum, wide = densities_below(-0.8, -0.8)
+    before_drum, _ = densities_below(-0.8, 1.5)
+    assert on_drum > 5.0 * before_drum
+    assert wide > 0.9
+    past, wide = densities_below(np.inf, np.inf)
+    assert past > 0.9
+    assert wide == 0.0
+    behind_the_pole, wide = densities_below(0.8, 0.8)
+    assert behind_the_pole == on_drum
+    assert wide == 0.0
