@@ -99,9 +99,9 @@ class ExtractionConfig:
         Edge of a cell of the ground grid [m]. 0.25: wider than a ball, so that a cell of the open
         field holds ground.
     ground_clearance : float
-        Returns less than this above the local ground start no marker [m]; of smaller markers, less
-        than their radius, or half of this. 0.20: most rocks are lower, and the balls of a survey
-        stand higher, or show their upper half.
+        Returns less than this above the local ground start no marker [m]. Where the radius of the
+        markers is smaller, it takes the place of this, but at least half of this does. 0.20: most
+        rocks are lower, and the balls of a survey stand higher, or show their upper half.
     scatter_max : float
         The first guess of the noise of ranges is at most this [m]. 0.035: the maker's 0.03 and its
         uncertainty.

@@ -47,7 +47,7 @@ class Beams(NamedTuple):
     behind : (n,)
         Density of what happens to them when they pass the object.
     wide : (n,)
-        Probability that something wide is as low, and nearer than a pole, which it hides.
+        Probability that something wide, nearer than a pole would be, hides it at their height.
     empty : (n,)
         Share of the beams on the same side of the object, but beside it, that are not heard.
     even : (n,)
@@ -95,7 +95,7 @@ def beams_about(
     hearing : float, float
         ``lost`` and ``faintest`` of ``Beams``.
     n_most : int
-        Beams that are compared: each costs as much.
+        Most beams that are compared: each costs as much.
     """
     every = _every_beam(evidence, radius)
     every = every[:, every[2] >= -NEAR]

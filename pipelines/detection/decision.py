@@ -18,7 +18,7 @@ from spheremark.pipelines.detection.target import Target
 from spheremark.pipelines.model import Array
 from spheremark.pipelines.scan.rigs import BEAM_WINDOW
 
-_OFF = 0.2  # as a share of the returns on a sphere: those off it, above its middle
+_OFF = 0.2  # returns off a sphere, at most, per return on it
 _EXTENT_MIN = 0.4  # radii: one line of a scan shows no ball
 _HALF_SEEN = 0.8  # radii: the returns of half a ball are as wide, but for those at its edges
 _HIDDEN = 2.0  # as many returns before a ball as on it: two thirds of it are hidden
@@ -38,7 +38,7 @@ _N_PRIOR = 5.0  # places that the usual abundance of a hypothesis counts for in 
 _VARIES = (0.13, 0.15, 0.15, 0.04, 0.02)  # of what markers share, between those of one scan
 _WINDOWS = (0.5, 1.0)  # of a VLP-16's width at its window, out or in: the first echo or the last
 _LEAST_INFORMATION = 1e-6  # of a group that shows nothing: next to none, but it can be inverted
-UNDECIDED = 15.0
+UNDECIDED = 12.0
 """Logarithm of odds against a marker up to which it is compared again with better optics."""
 _N_ROUNDS = 10
 _MOST = 1e6  # times likelier: more says nothing
@@ -114,8 +114,8 @@ def reason_by_features(features: Features, radius: float) -> str:
     most = 2.0 + _OFF * features.n_points
     if features.n_off > most and not is_resolved(features, radius):
         return (
-            f"It does not stand free: {features.n_off} returns at about its distance lie on "
-            f"neither it nor below it, where {features.n_points} lie on it."
+            f"It does not stand free: {features.n_off} returns at about its distance lie "
+            f"neither on it nor below it, where {features.n_points} lie on it."
         )
     return ""
 

@@ -43,8 +43,8 @@ class Features(NamedTuple):
     n_points : int
         Returns on the sphere.
     n_off : int
-        Returns at about its distance that are off it and its pole: inside its limb all, beside it
-        twice those of the emptier side.
+        Returns at about its distance that are off it: inside its limb all; beside it, above its
+        middle, twice those of the emptier side.
     scatter : float
         Robust standard deviation along the beams [m].
     width, height : float
@@ -159,10 +159,10 @@ def _adjust(seen: Array, blur: float) -> tuple[Array, Array, float]:
 
 @compiled
 def _n_off(seen: Array, weights: Array, blur: float) -> int:
-    """Count returns at about a sphere's distance that are off it, but for those on its pole.
+    """Count returns at about a sphere's distance that are off it, but for what may hold it up.
 
-    Of those beside it, twice those of the emptier side: what stands beside a sphere or behind its
-    edge is on one side.
+    Of those beside it, above its middle, twice those of the emptier side: what stands beside a
+    sphere or behind its edge is on one side.
     """
     gaps, depths = np.hypot(seen[0], seen[1]), np.abs(seen[2])
     is_inside = (gaps < 0.9) & (seen[1] > -0.8) & (depths < 2.0) & (weights <= 0.0)

@@ -51,7 +51,7 @@ def ground_of(
     over = cells.heights - np.append(known, np.float32(np.nan))[cells.ground]
     is_field = cloud.p_base[:, 0] ** 2 + cloud.p_base[:, 1] ** 2 < _FIELD**2
     highest = cells.heights[is_field & (over < _RISE)].max(initial=-np.inf)
-    clearance = min(max(radius, 0.5 * config.ground_clearance), config.ground_clearance)
+    clearance = np.clip(radius, 0.5 * config.ground_clearance, config.ground_clearance)
     return Ground(cloud.p_base[over > clearance], float(highest), lowest)
 
 

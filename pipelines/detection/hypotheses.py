@@ -42,7 +42,7 @@ from spheremark.pipelines.model import Array
 
 _FLOOR = 1e-9
 _HEARD = 0.5  # of a beam: an object that is heard at all needs no larger share
-_N_BEAMS = (192, 400)  # that are compared at most: to find shapes, and where they are known
+_N_BEAMS = (128, 400)  # that are compared at most: to find shapes, and where they are known
 _NEVER = 60.0  # logarithm of odds behind the best that stand for any more
 
 # Means and standard deviations of the parameters
@@ -68,16 +68,16 @@ _FORMS: dict[int, tuple[tuple[float, float], ...]] = {
     CLUTTER: ((0.0, 0.4), (1.0, 1.5), (-0.7, 0.7)),
 }
 ABUNDANCE = (225, 85, 42, 24, 85, 111, 94, 55, 429)
-"""Groups that stand free in 31 random worlds of the simulator and were each."""
+"""Groups of each hypothesis that stand free, in 31 random worlds of the simulator."""
 
 ABUNDANCE_HELD = (29, 171, 432, 42, 107, 360, 185, 301, 873)
-"""The same of groups that something wide holds, or the ground."""
+"""The same of groups that something wide holds up, or the ground."""
 
 _BESIDE = 0.1  # probability of anything beside what stands free
 _HEIGHTS = 2.5  # [m] up to which markers stand
 _LEAST_HEIGHTS = {BALL: 1.0, SPHERE: 1.0, CYLINDER: 1.0, SOLID: 1.0}
 _WIDE, _AS_LOW = 0.4, 2.0  # [m] how high wide things are that carry markers; ratio at most
-_LYING, _UNEVEN = 0.1, 0.2  # probability of an object on the ground; radii that it sinks in
+_LYING, _UNEVEN = 0.1, 0.2  # probability of lying on the ground; radii that it sinks in, or less
 _BOULDER_HEIGHT = (0.3, 0.6)  # radii: centre above the ground, and standard deviation
 _PERCHED, _STONE = 0.1, 0.5  # probability that a boulder lies on another, and mean height [m] of it
 _HEAD_HEIGHT, _LOWERED = (1.6, 0.12), 0.2  # [m] of adults who stand (1.70 m tall); share of others
@@ -117,7 +117,8 @@ USUAL = (1.0, -0.1, 0.0, 0.0)  # edges: measured on markers of random worlds
 """What markers share in a scan that nothing is known of, as in ``Physics``, but for the noise."""
 
 SIGMAS = (0.35, 0.6, 0.1, 0.02)
-"""How far these may be off: what an echo is moves the limb, and the limb against the middle."""
+"""How far these may be off: what an echo is moves the limb, and the limb against the middle. Radii
+of markers are known to 2 % in common."""
 
 
 def log_likelihoods(

@@ -32,7 +32,7 @@ from spheremark.pipelines.estimation.linear_algebra import invert
 from spheremark.pipelines.model import Array
 
 _GIVEN_UP = 12.0  # logarithm of odds against the sphere from which no other shape is sought
-_GLANCED = (BALL, CYLINDER, POST, CLUTTER)  # where one is far better, no others are sought
+_GLANCED = (BALL, CYLINDER, POST, CLUTTER)  # one that is far better than a sphere ends the search
 _ORDER = (0, 4, 8, 7, 1, 6, 5, 3, 2)  # the sphere, then what refutes it at the least cost
 _STARTS = (0.0, -0.3, 0.3)  # of the logarithm of the radius of a ball
 _UNSURE = (-4.0, 9.0)  # logarithms of odds for the sphere between which evidence is integrated
@@ -87,9 +87,10 @@ def compared(beams: Beams, priors: Array, log_priors: Array, begun: Array) -> tu
             shape = begun[kind].copy()
             own = _evidence_nearby(kind, shape, priors[kind], beams)
             _keep(kind, shape, own + log_priors[kind], found, shapes)
-            _seek_sphere(kind, priors, log_priors, beams, (found, shapes))
         else:
             _seek(kind, priors, log_priors, beams, (found, shapes))
+        if kind in (BALL, BOULDER) and found[kind] > -np.inf:
+            _seek_sphere(shapes[kind], priors, log_priors, beams, (found, shapes))
         if kind == SPHERE and not len(begun):
             _glance(priors, log_priors, beams, (found, shapes))
     odds = found[SPHERE] - found[SPHERE + 1 :].max()
@@ -103,7 +104,7 @@ def _integrate(priors: Array, log_priors: Array, beams: Beams, known: tuple[Arra
     found, shapes = known
     least, before = found.max() - _UNSURE[1], found[SPHERE]
     for kind in _ORDER:
-        if kind == BALL:  # the same but for its size: so is what its integral holds
+        if kind == BALL:  # but for its size a sphere: corrected as that is
             found[BALL] += found[SPHERE] - before
         elif found[kind] > least:
             own = log_integral(kind, shapes[kind], priors[kind], beams)
@@ -116,31 +117,26 @@ def _seek(
     """Search for the best shape of a kind, where the best sphere is; ``known`` as ``compared``."""
     found, shapes = known
     sphere = priors[SPHERE, 0] if kind == SPHERE else shapes[SPHERE]
-    for start in _STARTS:
+    for start in _STARTS if kind == BALL else _STARTS[:1]:
         shape = _start(kind, priors[kind], sphere, start, beams)
         if kind == SOLID:
             own = _evidence_nearby(kind, shape, priors[kind], beams)
         else:
             own = _evidence(kind, shape, priors[kind], beams, found.max() - log_priors[kind])
         _keep(kind, shape, own + log_priors[kind], found, shapes)
-        _seek_sphere(kind, priors, log_priors, beams, (found, shapes))
-        if kind != BALL:
-            break
 
 
 def _seek_sphere(
-    kind: int, priors: Array, log_priors: Array, beams: Beams, known: tuple[Array, Array]
+    other: Array, priors: Array, log_priors: Array, beams: Beams, known: tuple[Array, Array]
 ) -> None:
-    """Search for the best sphere where the best ball or boulder is; ``known`` as ``compared``."""
-    found, shapes = known
-    if kind in (BALL, BOULDER):
-        shape = _start(SPHERE, priors[SPHERE], shapes[kind], 0.0, beams)
-        own = _evidence_nearby(SPHERE, shape, priors[SPHERE], beams)
-        _keep(SPHERE, shape, own + log_priors[SPHERE], found, shapes)
+    """Search for the best sphere where another shape is; ``known`` as ``compared``."""
+    shape = _start(SPHERE, priors[SPHERE], other, 0.0, beams)
+    own = _evidence_nearby(SPHERE, shape, priors[SPHERE], beams)
+    _keep(SPHERE, shape, own + log_priors[SPHERE], *known)
 
 
 def _glance(priors: Array, log_priors: Array, beams: Beams, known: tuple[Array, Array]) -> None:
-    """Walk a little to shapes of other kinds; keep them where they make the sphere hopeless.
+    """Walk once to shapes of other kinds; keep them where they make the sphere hopeless.
 
     Their evidence is rough where a walk ends before the best. ``known`` as ``compared``.
     """

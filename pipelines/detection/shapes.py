@@ -207,10 +207,11 @@ def log_likelihood(kind: int, shape: Array, prior: Array, beams: Beams, densitie
         z, is_near = beams.z[i] - moved, beams.z[i] < NEAR
         rest, beam = beams.behind[i], _beam(shape, beams, i)
         if has_pole and y < bottom:
-            share = (1.0 - beams.wide[i]) * pole_share * _inside(pole - abs(x), beams.blur, beam[0])
+            share = pole_share * _inside(pole - abs(x), beams.blur, beam[0])
             on = _normal(z - MEAN, _POLE_DEPTH) if is_near else _MISPLACED
             if beams.z[i] == np.inf:
                 on = _unheard(share, beams)
+            share *= 1.0 - beams.wide[i]
             rest = share * on + (1.0 - share) * rest
         share, depth, divided = _surface(kind, x, y, shape, form, beam)
         if share > 0.0:

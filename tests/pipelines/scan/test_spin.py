@@ -103,7 +103,7 @@ def test_silent_pulses_are_known_and_none_are_made_up_in_pauses(cloud, timed):
     marks = transform(inverse(timed.truth.T_site_base), field.marks.p_site)
     cells = cells_of(cloud, EXTRACTION)
     target = Target(field.marker_radius, cells.R_station_base[2], 0.003)
-    ground = ground_of(cloud, cells, EXTRACTION, 0.1)
+    ground = ground_of(cloud, cells, EXTRACTION, field.marker_radius)
     evidence, _ = gather_evidence(cloud, cells, ground, marks, target)
     n_inside, n_on, n_beside = 0, 0, 0
     for seen in evidence:
