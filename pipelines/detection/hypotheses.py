@@ -42,7 +42,7 @@ from spheremark.pipelines.model import Array
 
 _FLOOR = 1e-9
 _HEARD = 0.5  # of a beam: an object that is heard at all needs no larger share
-_N_BEAMS = (128, 400)  # that are compared at most: to find shapes, and where they are known
+_N_BEAMS = (192, 400)  # that are compared at most: to find shapes, and where they are known
 _NEVER = 60.0  # logarithm of odds behind the best that stand for any more
 
 # Means and standard deviations of the parameters
