@@ -68,7 +68,8 @@ _FORMS: dict[int, tuple[tuple[float, float], ...]] = {
     CLUTTER: ((0.0, 0.4), (1.0, 1.5), (-0.7, 0.7)),
 }
 ABUNDANCE = (208, 31, 274, 10, 33, 191, 18, 36, 36)
-"""Groups of each hypothesis that stand on poles or stands, in 31 random worlds of the simulator."""
+"""Groups of each hypothesis in 31 random worlds of the simulator, without those that something wide
+held up: the usual abundance of what stands free."""
 
 ABUNDANCE_HELD = (29, 171, 432, 42, 107, 360, 185, 301, 873)
 """Groups of each hypothesis that something wide holds up, or the ground, in as many worlds."""

@@ -68,6 +68,18 @@ def test_what_most_beams_below_go_past_shows_that_it_stands_on_a_pole():
     assert not seen.shows_below
 
 
+def test_what_stands_free_is_known_by_the_beams_below_or_else_by_its_height():
+    seen, radius = evidence(), TARGET.radius
+    assert seen._replace(height=0.5 * radius).stands_free(radius)
+    held = evidence(n_past=0)
+    held.below[0, :, 4] = 2
+    assert not held._replace(height=9.0 * radius).stands_free(radius)
+    unseen = evidence(n_past=2)
+    assert unseen.stands_free(radius)
+    assert unseen._replace(height=3.0 * radius).stands_free(radius)
+    assert not unseen._replace(height=1.5 * radius).stands_free(radius)
+
+
 def test_of_a_ball_two_thirds_may_be_hidden():
     assert refusal(features(n_points=25), evidence(n_on=25, n_before=50)) == ""
     assert "hidden" in refusal(features(n_points=25), evidence(n_on=25, n_before=55))

@@ -93,7 +93,7 @@ def test_no_marker_loses_points_to_the_ground(cloud, found):
 @pytest.mark.parametrize(
     ("place", "words"),
     [
-        ((*POST[:2], GROUND + 1.3), "free|pole|post|Post"),
+        ((*POST[:2], GROUND + 1.3), "free|post|Post"),
         ((*SLIM[:2], GROUND + 0.9), "post|cylinder|box|Box|Post"),
         (BIG, "radius|free"),
         (SMALL, "radius|small"),
