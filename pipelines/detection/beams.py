@@ -27,6 +27,9 @@ _CELL, _N_CELL = 0.1, 2  # beams that pass the same place share the errors of th
 _N_SIDES, _ANY_SIDE = 12, 0.3  # sides of an object; beams on each of which nothing is known
 _N_PLANE, _ROUGH = 5, 0.1  # returns that show a plane beside it, and the least scatter about one
 _ALIKE = 0.3  # heights of beams, and depths, within which what is wide is alike
+_SQUARE = 0.1  # squared radii: fewer beams across do not show that a side is askew
+_CORNER = 0.2  # share of what is wide that is as deep beneath as nothing beside it shows
+_TINY = 1e-9
 _FAINT = 1e-9  # least strength of an echo
 _AWAY = 40.0  # depth of what is not seen behind an object: too far to matter
 _WIDTHS = np.linspace(-1.0, 1.0, 401)  # half widths of a beam from its middle to an outline
@@ -181,16 +184,34 @@ def _behind(kept: Array, low: Array, beside: tuple[Array, float]) -> tuple[Array
     """
     density = np.where(kept[2] < NEAR, *beside)
     is_under, is_near = kept[1] < _LOWEST, low[2] < NEAR
-    y, z = kept[1:, is_under]
+    y, z = kept[1:3, is_under]
     weights = np.exp(-0.5 * ((y[:, None] - low[1]) / _ALIKE) ** 2)
-    off = (np.where(z < NEAR, z, 0.0)[:, None] - np.where(is_near, low[2], 0.0)) / _ALIKE
-    near = weights * is_near * np.exp(-0.5 * off * off) / (_ALIKE * np.sqrt(2.0 * np.pi))
-    total = weights.sum(axis=1) + 1.0
-    alike = np.where(z < NEAR, near.sum(axis=1), weights @ ~is_near)
-    wide = np.zeros(kept.shape[1])
+    total, wide = weights.sum(axis=1) + 1.0, np.zeros(kept.shape[1])
+    near = _density_between(kept[:3, is_under], low[:, is_near], weights[:, is_near])
+    alike = np.where(z < NEAR, near, weights @ ~is_near)
     density[is_under] = (density[is_under] + alike) / total
     wide[is_under] = weights @ (low[2] < 0.0) / total
     return density, wide
+
+
+def _density_between(kept: Array, near: Array, weights: Array) -> Array:
+    """Return the density of depths between beams that end near, times the sum of their weights.
+
+    Some are as deep as any of these, some on the line across their depths, for the side of a box
+    goes on, and some anywhere near, for it may turn a corner.
+    """
+    x, _, z = kept
+    off = (np.where(z < NEAR, z, 0.0)[:, None] - near[2]) / _ALIKE
+    alike = np.sum(weights * np.exp(-0.5 * off * off), axis=1) / (_ALIKE * np.sqrt(2.0 * np.pi))
+    n = weights.sum(axis=1) + _TINY
+    mean_x, mean_z = weights @ near[0] / n, weights @ near[2] / n
+    dx, dz = near[0] - mean_x[:, None], near[2] - mean_z[:, None]
+    slope = np.sum(weights * dx * dz, axis=1) / (np.sum(weights * dx * dx, axis=1) + _SQUARE)
+    rest = dz - slope[:, None] * dx
+    sigma = np.sqrt(np.sum(weights * rest * rest, axis=1) / n + _ROUGH**2)
+    off_line = (z - mean_z - slope * (x - mean_x)) / sigma
+    line = n * np.exp(-0.5 * off_line * off_line) / (sigma * np.sqrt(2.0 * np.pi))
+    return np.asarray(0.5 * (1.0 - _CORNER) * (alike + line) + _CORNER * n / (2.0 * NEAR))
 
 
 def _beside(kept: Array, beside: Array, strength: float) -> tuple[Array, Array, Array]:

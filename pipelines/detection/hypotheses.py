@@ -36,7 +36,13 @@ from spheremark.pipelines.detection.shapes import (
     Z,
     log_likelihood,
 )
-from spheremark.pipelines.detection.support import ANY, OPEN, log_share, log_supports
+from spheremark.pipelines.detection.support import (
+    ANY,
+    OPEN,
+    STANDING,
+    log_share,
+    log_supports,
+)
 from spheremark.pipelines.detection.target import Target
 from spheremark.pipelines.model import Array
 
@@ -76,8 +82,7 @@ ABUNDANCE_HELD = (29, 171, 432, 42, 107, 360, 185, 301, 873)
 
 _BESIDE = 0.1  # probability of anything beside what stands free
 _HEIGHTS = 2.5  # [m] up to which markers stand
-_LEAST_HEIGHTS = {BALL: 1.0, SPHERE: 1.0, CYLINDER: 1.0, SOLID: 1.0}
-_WIDE, _AS_LOW = 0.4, 2.0  # [m] how high wide things are that carry markers; ratio at most
+_ON_WIDE, _WIDE = 0.1, 0.4  # probability of standing on something wide, and how high that is [m]
 _LYING, _UNEVEN = 0.1, 0.2  # probability of lying on the ground; radii that it sinks in, or less
 _BOULDER_HEIGHT = (0.3, 0.6)  # radii: centre above the ground, and standard deviation
 _PERCHED, _STONE = 0.1, 0.5  # probability that a boulder lies on another, and mean height [m] of it
@@ -165,7 +170,9 @@ def log_likelihoods(
     hearing, n_most = (physics.lost, faintest), _N_BEAMS[int(len(begun) > 0)]
     beams, n_beside, n_passing = beams_about(evidence, radius, strength, hearing, n_most)
     beams = merged_within(beams, physics.gates, radius)
-    logs = log_supports(evidence, float(centre @ target.up), radius, _as_high(evidence))
+    standing = _standing_densities(evidence.height, evidence.sigma_height, radius)
+    held = standing[1] / sum(standing)
+    logs = log_supports(evidence, float(centre @ target.up), radius, held)
     for kind in range(len(NAMES)):
         logs[kind] += _log_beside(kind, n_beside, n_passing)
         logs[kind] += np.log(_height_density(kind, evidence.height, evidence.sigma_height, radius))
@@ -230,13 +237,11 @@ def _neighbour_probability(kind: int, n: int) -> float:
 def _height_density(kind: int, height: float, sigma: float, radius: float) -> float:
     """Return the density of the height of a centre above the ground about it [1/m]."""
     unknown = 1.0 / _HEIGHTS
+    if kind in STANDING:
+        return sum(_standing_densities(height, sigma, radius))
     if not sigma < _HEIGHTS:
         return unknown
-    least = _LEAST_HEIGHTS.get(kind, 0.0) * radius
-    known = 0.5 * unknown * erfc((least - height) / (1.4142 * sigma))
-    if least > 0.0:  # some lie on the ground
-        lying = NormalDist(least, hypot(_UNEVEN * radius, sigma)).pdf(height)
-        known = (1.0 - _LYING) * known + _LYING * lying
+    known = 0.5 * unknown * erfc(-height / (1.4142 * sigma))
     if kind == BOULDER:
         mean, spread = _BOULDER_HEIGHT[0] * radius, _BOULDER_HEIGHT[1] * radius
         known = (1.0 - _PERCHED) * NormalDist(mean, hypot(spread, sigma)).pdf(height)
@@ -248,12 +253,22 @@ def _height_density(kind: int, height: float, sigma: float, radius: float) -> fl
     return _NOT_GROUND * unknown + (1.0 - _NOT_GROUND) * known
 
 
-def _as_high(evidence: Evidence) -> float:
-    """Return how many times likelier a height is on something wide than on a pole."""
-    height, sigma = evidence.height, evidence.sigma_height
+def _standing_densities(height: float, sigma: float, radius: float) -> tuple[float, float]:
+    """Return the densities of the height of what a pole holds, and of what is held otherwise.
+
+    Something wide does, or the ground. Their sum is the density of both [1/m].
+    """
+    held, unknown = _ON_WIDE + _LYING, 1.0 / _HEIGHTS
     if not sigma < _HEIGHTS:
-        return 1.0
-    return min(2.0 * _HEIGHTS * NormalDist(0.0, hypot(_WIDE, sigma)).pdf(height), _AS_LOW)
+        return (1.0 - held) * unknown, held * unknown
+    above = erfc((radius - height) / (1.4142 * sigma))
+    wide = _ON_WIDE * above * NormalDist(radius, hypot(_WIDE, sigma)).pdf(height)
+    wide += _LYING * NormalDist(radius, hypot(_UNEVEN * radius, sigma)).pdf(height)
+    on_pole = (1.0 - held) * 0.5 * unknown * above
+    return (
+        (1.0 - _NOT_GROUND) * on_pole + _NOT_GROUND * (1.0 - held) * unknown,
+        (1.0 - _NOT_GROUND) * wide + _NOT_GROUND * held * unknown,
+    )
 
 
 def _density_above(height: float, mean: float, sigma: float) -> float:

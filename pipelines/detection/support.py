@@ -13,24 +13,38 @@ import numpy as np
 from spheremark.pipelines.compilation import compiled
 from spheremark.pipelines.detection.beams import BELOW
 from spheremark.pipelines.detection.evidence import Evidence, beside_pole
-from spheremark.pipelines.detection.shapes import BOULDER
+from spheremark.pipelines.detection.shapes import (
+    BALL,
+    BOULDER,
+    CYLINDER,
+    HEAD,
+    NAMES,
+    SOLID,
+    SPHERE,
+)
 from spheremark.pipelines.detection.target import ASIDE
 from spheremark.pipelines.model import Array
 
 OPEN, CLOSED, ANY = (0.3, 5.0), (5.0, 0.3), (0.5, 0.5)
 """Beta distributions of the share of beams that end near, where nothing is, something, anything."""
 
+STANDING = (SPHERE, BALL, CYLINDER, SOLID)
+"""Hypotheses of what stands on a pole or on something wide, or lies on the ground."""
+
 _NEIGHBOUR = 0.05  # probability that something else stands on one side, but for the ground
-# Probabilities that nothing is below, that something is from some row downwards, and that anything
-# is; then the first and the last such row: shoulders begin within three radii below a head
-_POLE, _SHOULDERS = (0.85, 0.05, 0.1, 1, 8), (0.001, 0.998, 0.001, 2, 6)
-_GROUND, _ANYTHING = (0.005, 0.99, 0.005, 0, 3), (0.05, 0.05, 0.9, 1, 8)
-_SUPPORTS = np.array(  # by hypothesis
-    [_POLE, _POLE, _GROUND, _SHOULDERS, _POLE, _ANYTHING, _POLE, _ANYTHING, _ANYTHING]
-)
+_DOUBT = 0.1  # probability of anything below what stands on a pole or on something wide
+_ROWS = np.array([0.0, *(0.2,) * 3, *(0.08,) * 5])
+"""Probabilities of the row from which something wide stops the beams below what stands on it: it
+begins there, or widens farther down, as a cone does or a tripod."""
+
+# Probabilities that nothing is below, that anything is, and that something is from each row down:
+# shoulders begin within three radii below a head
+_GROUND = (0.005, 0.005, *(0.2475,) * 4, *(0.0,) * 5)
+_SHOULDERS = (0.001, 0.001, 0.0, 0.0, *(0.1996,) * 5, 0.0, 0.0)
+_ANYTHING = (0.05, 0.9, 0.0, *(0.00625,) * 8)
 
 
-def log_supports(evidence: Evidence, level: float, radius: float, as_high: float) -> Array:
+def log_supports(evidence: Evidence, level: float, radius: float, held: float) -> Array:
     """Return the log probabilities of the beams below a place by all hypotheses, (k,).
 
     Parameters
@@ -41,8 +55,8 @@ def log_supports(evidence: Evidence, level: float, radius: float, as_high: float
         Height above the sensor [m].
     radius : float
         Of the sphere that is searched for [m].
-    as_high : float
-        How many times likelier such a height is on something wide than on a pole.
+    held : float
+        Probability that what has this height is held by something wide, and not by a pole.
 
     Notes
     -----
@@ -50,9 +64,14 @@ def log_supports(evidence: Evidence, level: float, radius: float, as_high: float
     stops them is marginalised. Both sides show what holds it up, or one does and the other shows a
     neighbour; the ground is on both.
     """
-    supports = _SUPPORTS.copy()
-    supports[supports[:, 0] > 0.5, 1] *= as_high
-    return np.asarray(_log_supports(*_beams_below(evidence, level, radius), supports))
+    return np.asarray(_log_supports(*_beams_below(evidence, level, radius), supports_of(held)))
+
+
+def supports_of(held: float) -> Array:
+    """Return the probabilities of what is below by all hypotheses, (k, 2 + 9), as ``_ANYTHING``."""
+    stands = ((1.0 - _DOUBT) * (1.0 - held), _DOUBT, *((1.0 - _DOUBT) * held * _ROWS))
+    supports = {BOULDER: _GROUND, HEAD: _SHOULDERS, **dict.fromkeys(STANDING, stands)}
+    return np.array([supports.get(kind, _ANYTHING) for kind in range(len(NAMES))])
 
 
 def _beams_below(evidence: Evidence, level: float, radius: float) -> tuple[Array, Array]:
@@ -102,14 +121,14 @@ def _log_supports(near: Array, past: Array, supports: Array) -> Array:
 @compiled
 def _log_support(near: Array, past: Array, support: Array) -> float:
     """Return the log probability of the beams of some rows, by what holds a place up."""
-    nothing, something, anything, first, last = support
     n_near, n_past = near.sum(), past.sum()
-    found = log(nothing) + log_share(n_near, n_past, OPEN)
-    found = np.logaddexp(found, log(anything) + log_share(n_near, n_past, ANY))
-    over, passed = near[: int(first)].sum(), past[: int(first)].sum()
-    for row in range(int(first), int(last) + 1):
-        begun = log(something / (last + 1.0 - first)) + log_share(over, passed, OPEN)
-        found = np.logaddexp(found, begun + log_share(n_near - over, n_past - passed, CLOSED))
+    found = log(support[0]) + log_share(n_near, n_past, OPEN)
+    found = np.logaddexp(found, log(support[1]) + log_share(n_near, n_past, ANY))
+    over, passed = 0.0, 0.0
+    for row in range(len(near)):
+        if support[2 + row] > 0.0:
+            begun = log(support[2 + row]) + log_share(over, passed, OPEN)
+            found = np.logaddexp(found, begun + log_share(n_near - over, n_past - passed, CLOSED))
         over, passed = over + near[row], passed + past[row]
     return float(found)
 

@@ -66,3 +66,14 @@ def test_beams_below_an_object_end_as_those_beside_them_do():
     behind_the_pole, wide = densities_below(0.8, 0.8)
     assert behind_the_pole == on_drum
     assert wide == 0.0
+
+
+def test_the_side_of_a_box_goes_on_below_an_object():
+    """It turns by 50 degrees from the line of sight: no beam beside it is as deep as one below."""
+    sides = np.array([-2.2, -1.9, -1.6, -1.3, 1.3, 1.6, 1.9, 2.2])
+    low = np.stack([sides, np.full(8, -1.5), 0.8 * sides])
+    depths = np.array([0.0, 0.7])
+    below = np.stack([np.zeros(2), np.full(2, -1.5), depths])
+    on_side, off_side = _behind(below, low, (np.full(2, 0.003), 0.98))[0]
+    assert on_side > 5.0 * off_side
+    assert off_side > 0.02  # it may turn a corner there

@@ -3,7 +3,11 @@
 import numpy as np
 import pytest
 
-from spheremark.pipelines.detection.hypotheses import _HEIGHTS, _height_density
+from spheremark.pipelines.detection.hypotheses import (
+    _HEIGHTS,
+    _height_density,
+    _standing_densities,
+)
 from spheremark.pipelines.detection.shapes import HEAD, NAMES, SPHERE
 
 RADIUS, SIGMA = 0.1, 0.05  # of a marker, and of the height of a place [m]
@@ -25,5 +29,11 @@ def test_heads_are_met_where_people_have_them(height, is_as_of_heads):
 
 
 def test_an_unknown_height_tells_nothing():
-    found = {_height_density(kind, np.inf, np.inf, RADIUS) for kind in range(len(NAMES))}
-    assert found == {1.0 / _HEIGHTS}
+    found = [_height_density(kind, np.inf, np.inf, RADIUS) for kind in range(len(NAMES))]
+    np.testing.assert_allclose(found, 1.0 / _HEIGHTS)
+
+
+def test_low_things_stand_on_something_wide_and_high_ones_on_poles():
+    low, high = (_standing_densities(height, SIGMA, RADIUS) for height in (0.3, 1.6))
+    assert low[1] > 0.3 * low[0]
+    assert high[1] < 0.01 * high[0]

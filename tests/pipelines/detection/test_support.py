@@ -8,15 +8,19 @@ from scipy.stats import betabinom
 
 from spheremark.pipelines.detection.evidence import N_ROWS
 from spheremark.pipelines.detection.shapes import BOULDER, HEAD, SPHERE
-from spheremark.pipelines.detection.support import _SUPPORTS, _log_supports, log_share
+from spheremark.pipelines.detection.support import _log_supports, log_share, supports_of
 
 N = 10  # beams in each row on each side
+ON_POLES, ON_WIDE = (
+    supports_of(0.05),
+    supports_of(0.6),
+)  # by heights where poles, or boxes, are usual
 
 
 def logs(*near):
     """Log probabilities where so many of the beams of each row end near, on both sides alike."""
     stopped = np.array([near, near], np.float64)
-    return _log_supports(stopped, N - stopped, _SUPPORTS)
+    return _log_supports(stopped, N - stopped, ON_POLES)
 
 
 @pytest.mark.parametrize(("n_near", "n_past"), [(0, 0), (3, 4), (40, 2)])
@@ -45,10 +49,17 @@ def test_shoulders_of_which_one_is_hidden_are_shoulders():
     stopped[1, 4:] = N
     seen = np.full((2, N_ROWS), float(N))
     seen[0] = 0.0
-    one_side = _log_supports(stopped, seen - stopped, _SUPPORTS)
+    one_side = _log_supports(stopped, seen - stopped, ON_POLES)
     assert np.argmax(one_side) == HEAD
 
 
+def test_something_wide_from_under_it_on_is_a_box_where_boxes_are_as_high():
+    """And a boulder where poles alone are as high: it would hold the sphere in the air."""
+    near = np.array([[0, 0, 0, *[N] * 6]] * 2, np.float64)
+    low, high = (_log_supports(near, N - near, one) for one in (ON_WIDE, ON_POLES))
+    assert low[SPHERE] - low[HEAD] > high[SPHERE] - high[HEAD] + 2.0
+
+
 def test_without_beams_below_nothing_is_known():
-    nothing = _log_supports(np.zeros((2, N_ROWS)), np.zeros((2, N_ROWS)), _SUPPORTS)
+    nothing = _log_supports(np.zeros((2, N_ROWS)), np.zeros((2, N_ROWS)), ON_POLES)
     np.testing.assert_allclose(nothing, 0.0, atol=1e-9)

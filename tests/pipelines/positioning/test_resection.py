@@ -154,7 +154,7 @@ def test_the_covariance_of_the_pose_is_honest(rng):
     assert low < np.mean(squares) / 3 < high
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize("n_marks", [4, 14])
 def test_the_covariance_of_the_pose_is_honest_at_length(n_marks):
     errors, squares = whitened(np.random.default_rng(n_marks), n_marks, 2500)

@@ -89,7 +89,9 @@ def test_lines_of_rests_that_fall_together_give_centres_as_good_as_promised(fiel
     [
         0,
         # 3.2, the limit is 2.5: the clock of the gimbal comes out as 0.7 ms, twice its sigma
-        pytest.param(4, marks=pytest.mark.xfail(strict=True, raises=AssertionError)),
+        pytest.param(
+            4, marks=[pytest.mark.xfail(strict=True, raises=AssertionError), pytest.mark.long]
+        ),
     ],
 )
 def test_a_mounting_that_is_much_worse_than_its_prior_is_found_on_other_fields_too(seed):
