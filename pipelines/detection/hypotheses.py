@@ -262,13 +262,10 @@ def _standing_densities(height: float, sigma: float, radius: float) -> tuple[flo
     if not sigma < _HEIGHTS:
         return (1.0 - held) * unknown, held * unknown
     above = erfc((radius - height) / (1.4142 * sigma))
-    wide = _ON_WIDE * above * NormalDist(radius, hypot(_WIDE, sigma)).pdf(height)
+    wide = _ON_WIDE * above * NormalDist(0.0, hypot(_WIDE, sigma)).pdf(height)
     wide += _LYING * NormalDist(radius, hypot(_UNEVEN * radius, sigma)).pdf(height)
     on_pole = (1.0 - held) * 0.5 * unknown * above
-    return (
-        (1.0 - _NOT_GROUND) * on_pole + _NOT_GROUND * (1.0 - held) * unknown,
-        (1.0 - _NOT_GROUND) * wide + _NOT_GROUND * held * unknown,
-    )
+    return (1.0 - _NOT_GROUND) * on_pole + _NOT_GROUND * unknown, (1.0 - _NOT_GROUND) * wide
 
 
 def _density_above(height: float, mean: float, sigma: float) -> float:

@@ -38,22 +38,22 @@ _STARTS = (0.0, -0.3, 0.3)  # of the logarithm of the radius of a ball
 _UNSURE = (-4.0, 9.0)  # logarithms of odds for the sphere between which evidence is integrated
 
 
-def _sought(kind: int, shape: Array, prior: Array, beams: Beams, least: float) -> float:
-    """Return the logarithm of the greatest likelihood times prior; its shape replaces the start.
+def _evidence(kind: int, shape: Array, prior: Array, beams: Beams, least: float) -> float:
+    """Return the logarithm of the evidence of a hypothesis; its best shape replaces the start.
 
-    Minus infinity where it falls hopelessly below the least.
+    By Laplace's approximation. Minus infinity where it falls hopelessly below the least.
     """
     steps = 0.4 * prior[1]
     if kind in (SPHERE, BALL):  # the centre is fitted already
         steps[:NOISE] = np.minimum(steps[:NOISE], 2.0 * np.exp(prior[0, NOISE]))
-    return float(searched(kind, shape, steps, prior, beams, least))
+    found = searched(kind, shape, steps, prior, beams, least)
+    if found == -np.inf:
+        return -np.inf
+    return float(found + log_volume(kind, shape, prior, beams))
 
 
 def _evidence_nearby(kind: int, shape: Array, prior: Array, beams: Beams) -> float:
-    """Return the logarithm of the evidence of a hypothesis; its best shape nearby replaces it.
-
-    By Laplace's approximation.
-    """
+    """Return the logarithm of the evidence of a hypothesis; its best shape nearby replaces it."""
     found = log_likelihood(kind, shape, prior, beams, np.empty(len(beams.x)))
     found = climbed(kind, shape, prior[1] > 0.0, prior, beams, found)
     return float(found + log_volume(kind, shape, prior, beams))
@@ -117,18 +117,13 @@ def _seek(
     """Search for the best shape of a kind, where the best sphere is; ``known`` as ``compared``."""
     found, shapes = known
     sphere = priors[SPHERE, 0] if kind == SPHERE else shapes[SPHERE]
-    if kind == SOLID:
-        shape = _start(kind, priors[kind], sphere, 0.0, beams)
-        own = _evidence_nearby(kind, shape, priors[kind], beams)
-    else:
-        own, shape = -np.inf, sphere
-        for start in _STARTS if kind == BALL else _STARTS[:1]:
-            other = _start(kind, priors[kind], sphere, start, beams)
-            least = max(found.max() - log_priors[kind], own)
-            if (likely := _sought(kind, other, priors[kind], beams, least)) > own:
-                own, shape = likely, other
-        own += log_volume(kind, shape, priors[kind], beams) if own > -np.inf else 0.0
-    _keep(kind, shape, own + log_priors[kind], found, shapes)
+    for start in _STARTS if kind == BALL else _STARTS[:1]:
+        shape = _start(kind, priors[kind], sphere, start, beams)
+        if kind == SOLID:
+            own = _evidence_nearby(kind, shape, priors[kind], beams)
+        else:
+            own = _evidence(kind, shape, priors[kind], beams, found.max() - log_priors[kind])
+        _keep(kind, shape, own + log_priors[kind], found, shapes)
 
 
 def _seek_sphere(
