@@ -256,7 +256,8 @@ def _height_density(kind: int, height: float, sigma: float, radius: float) -> fl
 def _standing_densities(height: float, sigma: float, radius: float) -> tuple[float, float]:
     """Return the densities of the height of what a pole holds, and of what is held otherwise.
 
-    Something wide does, or the ground. Their sum is the density of both [1/m].
+    Something wide does, or the ground. Their sum is the density of both [1/m]. A ground that is
+    wrong shows nothing wide.
     """
     held, unknown = _ON_WIDE + _LYING, 1.0 / _HEIGHTS
     if not sigma < _HEIGHTS:

@@ -36,4 +36,4 @@ def test_an_unknown_height_tells_nothing():
 def test_low_things_stand_on_something_wide_and_high_ones_on_poles():
     low, high = (_standing_densities(height, SIGMA, RADIUS) for height in (0.3, 1.6))
     assert low[1] > 0.3 * low[0]
-    assert high[1] < 0.01 * high[0]
+    assert high[1] < 0.001 * high[0]  # else heads on shoulders are markers on crates

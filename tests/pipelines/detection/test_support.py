@@ -11,10 +11,7 @@ from spheremark.pipelines.detection.shapes import BOULDER, HEAD, SPHERE
 from spheremark.pipelines.detection.support import _log_supports, log_share, supports_of
 
 N = 10  # beams in each row on each side
-ON_POLES, ON_WIDE = (
-    supports_of(0.05),
-    supports_of(0.6),
-)  # by heights where poles, or boxes, are usual
+ON_POLES, ON_WIDE = supports_of(0.05), supports_of(0.6)  # at heights of poles, and of crates
 
 
 def logs(*near):
@@ -53,8 +50,8 @@ def test_shoulders_of_which_one_is_hidden_are_shoulders():
     assert np.argmax(one_side) == HEAD
 
 
-def test_something_wide_from_under_it_on_is_a_box_where_boxes_are_as_high():
-    """And a boulder where poles alone are as high: it would hold the sphere in the air."""
+def test_what_is_wide_from_under_it_on_is_rather_a_crate_where_these_are_as_high():
+    """Where only poles are, it is rather shoulders."""
     near = np.array([[0, 0, 0, *[N] * 6]] * 2, np.float64)
     low, high = (_log_supports(near, N - near, one) for one in (ON_WIDE, ON_POLES))
     assert low[SPHERE] - low[HEAD] > high[SPHERE] - high[HEAD] + 2.0
