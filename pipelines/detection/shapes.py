@@ -37,7 +37,9 @@ X, Y, Z, NOISE, EDGE, STRETCH, FORM, SHIFT, POLE, N_PARAMETERS = (
 
 MEAN = 2.0 / 3.0  # of a radius: mean height of a sphere's surface over its disc
 _POLE_FROM, _POLE_DEPTH, _POLE_SHARE = 0.8, 0.4, 0.7  # of a pole, and of its beams that it stops
-_POLE_MOST = 0.5  # radii: half the width of what is a pole, and no post or trunk
+_POLE_MOST = 0.9  # of the radius of what it holds: half the width of a pole
+_POST, _POST_DEPTH = 0.5, 0.1  # radii: least half width of a post, and scatter of its surface
+_UPRIGHT = 0.3  # of posts are round and upright; what else is as wide is anything
 _STRAY = 0.02  # share of the returns from a surface that lie anywhere: crosstalk, dust, strays
 _MERGED = 0.6  # share of the echoes of a beam that an outline halves, between it and what is behind
 _MISPLACED = 0.01  # share of the beams on a solid surface that seem to end behind it
@@ -136,6 +138,19 @@ def _surface(
 
 
 @compiled
+def _pole_density(x: float, z: float, pole: float, blur: float, sigma: float) -> float:
+    """Return the density of a depth about the axis of a pole, which may lean, or of a round post.
+
+    ``pole`` and ``blur`` are half the widths of the pole and of a beam, ``sigma`` the noise.
+    """
+    leaning = float(_normal(z, _POLE_DEPTH))
+    if pole < _POST:
+        return leaning
+    upright = _normal(z - _round(abs(x), pole, blur), sigma + _POST_DEPTH)
+    return float(_UPRIGHT * upright + (1.0 - _UPRIGHT) * leaning)
+
+
+@compiled
 def _solid(x: float, y: float, form: Array, beam: _Beam) -> tuple[float, float, float]:
     """Return the share of a beam that a deformed sphere stops, depth, and how evenly it is split.
 
@@ -193,7 +208,8 @@ def log_likelihood(kind: int, shape: Array, prior: Array, beams: Beams, densitie
     for j in range(N_PARAMETERS):
         if prior[1, j] > 0.0:
             log_prior -= 0.5 * ((shape[j] - prior[0, j]) / prior[1, j]) ** 2
-    form, pole = _form_of(kind, shape), min(np.exp(shape[POLE]), _POLE_MOST)
+    form = _form_of(kind, shape)
+    pole = form[0] * min(np.exp(shape[POLE]), _POLE_MOST)
     variance = form[2] if kind == CLUTTER else np.exp(2.0 * shape[NOISE])
     scale, precision = (1.0 - _STRAY) / np.sqrt(6.283185 * variance), 0.5 / variance
     sigma = np.sqrt(variance)
@@ -208,7 +224,7 @@ def log_likelihood(kind: int, shape: Array, prior: Array, beams: Beams, densitie
         rest, beam = beams.behind[i], _beam(shape, beams, i)
         if has_pole and y < bottom:
             share = pole_share * _inside(pole - abs(x), beams.blur, beam[0])
-            on = _normal(z - MEAN, _POLE_DEPTH) if is_near else _MISPLACED
+            on = _pole_density(x, z - MEAN, pole, beam[1], sigma) if is_near else _MISPLACED
             if beams.z[i] == np.inf:
                 on = _unheard(share, beams)
             share *= 1.0 - beams.wide[i]

@@ -1,4 +1,4 @@
-"""Markers on the ground and on drums: what is below them stops beams, as below stones and heads."""
+"""Markers on the ground, on drums and on posts: what is below them stops beams."""
 
 import numpy as np
 import pytest
@@ -38,6 +38,23 @@ def test_markers_on_drums_are_found(distance):
     drums = tuple(((x, y, GROUND), DRUM_RADIUS, DRUM_HEIGHT) for x, y, _ in places)
     is_found, n_others = found_in(places, drums)
     assert is_found.all()
+    assert n_others == 0
+
+
+@pytest.mark.parametrize(("distance", "share"), [(4.0, 0.8), (9.0, 0.6)])
+def test_markers_on_posts_nearly_as_wide_are_found(distance, share):
+    places, height = ring(distance, 1.0, 0.5), 1.0 - RADIUS
+    posts = tuple(((x, y, GROUND), share * RADIUS, height) for x, y, _ in places)
+    is_found, n_others = found_in(places, posts)
+    assert is_found.all()
+    assert n_others == 0
+
+
+def test_posts_as_wide_as_markers_are_none():
+    tops = ring(6.0, 1.0, 0.5)
+    posts = tuple(((x, y, GROUND), RADIUS, 1.0) for x, y, _ in tops)
+    is_found, n_others = found_in(tops, posts)
+    assert not is_found.any()
     assert n_others == 0
 
 
