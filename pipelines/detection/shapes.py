@@ -30,7 +30,8 @@ SPHERE, BALL, BOULDER, HEAD, CYLINDER, POST, SOLID, PANEL, CLUTTER = range(len(N
 # Places of the parameters of a shape: centre, at the mean depth of its surface; logarithm of the
 # noise; half widths of a beam outside an outline where half the beams hit, before an empty sky and
 # before what sends an echo of its own; logarithm of a stretch of depths; up to ten of form; the
-# place of one face of the scan against the other; logarithm of half the width of the pole
+# place of one face of the scan against the other; logarithm of the width of the pole over that of
+# what it holds
 X, Y, Z, NOISE, EDGE, STRETCH, FORM, SHIFT, POLE, N_PARAMETERS = (
     *(0, 1, 2, 3, 4, 6, 7, 17, 20, 21),
 )
