@@ -352,17 +352,24 @@ class Client:
         Raises
         ------
         RemoteError
-            If the service refuses the request or does not answer.
+            If the service refuses the request, does not answer, or something else answers. A file
+            that was there before is kept then.
         """
+        part = target.with_name(f"{target.name}.part")
         with (
             reached(self.url),
             self._http.stream("GET", f"{_API}{path}", params=query) as response,
         ):
             if response.is_error:
                 response.read()
-            checked(response)
-            with target.open("wb") as file:
-                file.writelines(response.iter_bytes())
+            if "content-disposition" not in checked(response).headers:  # each of ours names a file
+                raise _stranger(response)
+            try:
+                with part.open("wb") as file:
+                    file.writelines(response.iter_bytes())
+                part.replace(target)
+            finally:
+                part.unlink(missing_ok=True)
 
 
 @contextmanager
@@ -391,11 +398,16 @@ def _fields_of(response: httpx.Response, names: tuple[str, ...]) -> dict[str, An
     except ValueError:
         found = None
     if not isinstance(found, dict) or not found.keys() >= set(names):
-        raise RemoteError(
-            f"{response.url} answers {response.status_code} {response.reason_phrase}, but not as "
-            "a spheremark service does. Check the address, and the proxy before it if there is one."
-        )
+        raise _stranger(response)
     return found
+
+
+def _stranger(response: httpx.Response) -> RemoteError:
+    """Return the error that something else has answered."""
+    return RemoteError(
+        f"{response.url} answers {response.status_code} {response.reason_phrase}, but not as "
+        "a spheremark service does. Check the address, and the proxy before it if there is one."
+    )
 
 
 def _query_text(value: Any) -> Any:

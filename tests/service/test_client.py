@@ -80,16 +80,18 @@ def test_a_log_that_is_not_there_is_refused(client, tmp_path):
         {"status_code": 302, "headers": {"location": "/login"}},
     ],
 )
-def test_what_is_no_spheremark_is_said_so(stop, found):
+def test_what_is_no_spheremark_is_said_so(stop, found, tmp_path):
     elsewhere = httpx.MockTransport(lambda _: httpx.Response(**{"status_code": 200} | found))
     one = Client(http=httpx.Client(transport=elsewhere, base_url="http://elsewhere"))
     for ask in (
         lambda: one.query("SELECT 1"),
         lambda: one.wait("0123"),
         lambda: one.wait(one.upload(stop.log, survey="quarry")),
+        lambda: one.download("/export/results.duckdb", tmp_path / "results.duckdb"),
     ):
         with pytest.raises(RemoteError, match="http://elsewhere"):
             ask()
+    assert not list(tmp_path.iterdir())
 
 
 def test_a_log_that_is_only_kept_has_no_job_to_wait_for(client, site):

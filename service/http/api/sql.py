@@ -190,7 +190,7 @@ def export_coordinates(
     """Return the newest stations and the control marks as CSV, in the site frame."""
     if survey is not None:
         service.catalogue.get_survey(survey)
-    return Response(coordinates_csv(service.catalogue, survey), media_type="text/csv")
+    return _coordinates(coordinates_csv(service.catalogue, survey), "text/csv", "csv")
 
 
 @router.get(
@@ -210,7 +210,13 @@ def export_points(
         service.catalogue.get_survey(survey)
     place = GeographicOrigin.parse(origin) if origin else None
     text = format_points(named_points(service.catalogue, survey), f".{kind}", place)
-    return Response(text, media_type=POINT_MEDIA[kind])
+    return _coordinates(text, POINT_MEDIA[kind], kind)
+
+
+def _coordinates(content: str | bytes, media_type: str, ending: str) -> Response:
+    """Return coordinates as a file, to be saved."""
+    headers = {"Content-Disposition": f'attachment; filename="coordinates.{ending}"'}
+    return Response(content, media_type=media_type, headers=headers)
 
 
 def _accepted(request: Request) -> str:
