@@ -81,7 +81,7 @@ __all__ = ["extract"]
 _MIDDLE = 0.87  # radii: incidence up to 60 degrees, as ASTM E3125-17 takes them
 _SHARP = 0.06  # radii: scatter of scanners whose returns at a limb err by more than their noise
 _POSSIBLE = 0.9  # probability from which a group that is no sure marker is a possible one
-_N_REJECTED, _N_NOT_COMPARED = 200, 100  # groups, the best first, that are kept with their reason
+_N_REJECTED, _N_NOT_COMPARED = 200, 100  # groups, the likeliest first, kept with their reason
 _SIGMAS_LOG_NOISE = (0.3, 0.6)  # of one marker about the others of a scan; of a scan about a group
 
 _N_ABOUT = 16  # returns about a refused group that show where it is by another mounting
@@ -117,7 +117,7 @@ def extract(
     -------
     MarkerCandidates
         Candidates in the order of azimuth; possible ones; of the groups that passed the first test
-        of size and were then rejected, the (at most 300) that came farthest, with the reason; and
+        of size and were then rejected, the (at most 300) most probable ones, with the reason; and
         the height of the highest ground point within 10 m, where the published method cuts its
         clouds.
 
@@ -174,6 +174,7 @@ def _extracted(
             possible.append(replace(refused, members=members))
         else:
             rejected.append(refused)
+    rejected.sort(key=lambda one: -one.probability)
     found = MarkerCandidates(
         candidates=_candidates(markers, target),
         possible=tuple(possible),

@@ -171,8 +171,9 @@ def log_likelihoods(
     beams, n_beside, n_passing = beams_about(evidence, radius, strength, hearing, n_most)
     beams = merged_within(beams, physics.gates, radius)
     standing = _standing_densities(evidence.height, evidence.sigma_height, radius)
-    held = standing[1] / sum(standing)
-    logs = log_supports(evidence, float(centre @ target.up), radius, held)
+    lying = _boulder_densities(evidence.height, evidence.sigma_height, radius)
+    held, perched = (own[1] / sum(own) for own in (standing, lying))
+    logs = log_supports(evidence, float(centre @ target.up), radius, held, perched)
     for kind in range(len(NAMES)):
         logs[kind] += _log_beside(kind, n_beside, n_passing)
         logs[kind] += np.log(_height_density(kind, evidence.height, evidence.sigma_height, radius))
@@ -239,14 +240,12 @@ def _height_density(kind: int, height: float, sigma: float, radius: float) -> fl
     unknown = 1.0 / _HEIGHTS
     if kind in STANDING:
         return sum(_standing_densities(height, sigma, radius))
+    if kind == BOULDER:
+        return sum(_boulder_densities(height, sigma, radius))
     if not sigma < _HEIGHTS:
         return unknown
     known = 0.5 * unknown * erfc(-height / (1.4142 * sigma))
-    if kind == BOULDER:
-        mean, spread = _BOULDER_HEIGHT[0] * radius, _BOULDER_HEIGHT[1] * radius
-        known = (1.0 - _PERCHED) * NormalDist(mean, hypot(spread, sigma)).pdf(height)
-        known += _PERCHED * _density_above(height, _STONE, sigma)
-    elif kind == HEAD:
+    if kind == HEAD:
         mean, spread = _HEAD_HEIGHT
         standing = NormalDist(mean, hypot(spread, sigma)).pdf(height)
         known = _LOWERED * known + (1.0 - _LOWERED) * standing
@@ -267,6 +266,21 @@ def _standing_densities(height: float, sigma: float, radius: float) -> tuple[flo
     wide += _LYING * NormalDist(radius, hypot(_UNEVEN * radius, sigma)).pdf(height)
     on_pole = (1.0 - held) * 0.5 * unknown * above
     return (1.0 - _NOT_GROUND) * on_pole + _NOT_GROUND * unknown, (1.0 - _NOT_GROUND) * wide
+
+
+def _boulder_densities(height: float, sigma: float, radius: float) -> tuple[float, float]:
+    """Return the densities of the height of a boulder on the ground, and on another.
+
+    Their sum is the density of both [1/m].
+    """
+    unknown = 1.0 / _HEIGHTS
+    if not sigma < _HEIGHTS:
+        return (1.0 - _PERCHED) * unknown, _PERCHED * unknown
+    mean, spread = _BOULDER_HEIGHT[0] * radius, _BOULDER_HEIGHT[1] * radius
+    on_ground = (1.0 - _PERCHED) * NormalDist(mean, hypot(spread, sigma)).pdf(height)
+    perched = _PERCHED * _density_above(height, _STONE, sigma)
+    on_ground, perched = ((1.0 - _NOT_GROUND) * own for own in (on_ground, perched))
+    return on_ground + _NOT_GROUND * unknown, perched
 
 
 def _density_above(height: float, mean: float, sigma: float) -> float:

@@ -44,7 +44,9 @@ _SHOULDERS = (0.001, 0.001, 0.0, 0.0, *(0.1996,) * 5, 0.0, 0.0)
 _ANYTHING = (0.05, 0.9, 0.0, *(0.00625,) * 8)
 
 
-def log_supports(evidence: Evidence, level: float, radius: float, held: float) -> Array:
+def log_supports(
+    evidence: Evidence, level: float, radius: float, held: float, perched: float
+) -> Array:
     """Return the log probabilities of the beams below a place by all hypotheses, (k,).
 
     Parameters
@@ -57,6 +59,8 @@ def log_supports(evidence: Evidence, level: float, radius: float, held: float) -
         Of the sphere that is searched for [m].
     held : float
         Probability that what has this height is held by something wide, and not by a pole.
+    perched : float
+        Probability that a boulder of this height lies on another, and not on the ground.
 
     Notes
     -----
@@ -64,13 +68,17 @@ def log_supports(evidence: Evidence, level: float, radius: float, held: float) -
     stops them is marginalised. Both sides show what holds it up, or one does and the other shows a
     neighbour; the ground is on both.
     """
-    return np.asarray(_log_supports(*_beams_below(evidence, level, radius), supports_of(held)))
+    supports = supports_of(held, perched)
+    return np.asarray(_log_supports(*_beams_below(evidence, level, radius), supports))
 
 
-def supports_of(held: float) -> Array:
+def supports_of(held: float, perched: float) -> Array:
     """Return the probabilities of what is below by all hypotheses, (k, 2 + 9), as ``_ANYTHING``."""
-    stands = ((1.0 - _DOUBT) * (1.0 - held), _DOUBT, *((1.0 - _DOUBT) * held * _ROWS))
-    supports = {BOULDER: _GROUND, HEAD: _SHOULDERS, **dict.fromkeys(STANDING, stands)}
+    on_wide = np.array([0.0, _DOUBT, *((1.0 - _DOUBT) * _ROWS)])
+    stands = held * on_wide
+    stands[:2] = (1.0 - _DOUBT) * (1.0 - held), _DOUBT
+    boulder = perched * on_wide + (1.0 - perched) * np.array(_GROUND)
+    supports = {BOULDER: boulder, HEAD: _SHOULDERS, **dict.fromkeys(STANDING, stands)}
     return np.array([supports.get(kind, _ANYTHING) for kind in range(len(NAMES))])
 
 

@@ -125,3 +125,6 @@ def test_markers_of_a_stepped_scan_are_found_and_nothing_else():
     assert sum(well_seen) > 1
     assert gaps(places[well_seen], found).min(axis=1).max() < field.marker_radius
     assert gaps(places, found).min(axis=0).max() < field.marker_radius
+    compared = [one.probability for one in found.rejected if not np.isnan(one.probability)]
+    assert len(compared) > 5
+    assert compared == sorted(compared, reverse=True)  # what a user may look for is not cut

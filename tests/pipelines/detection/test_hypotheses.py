@@ -5,6 +5,7 @@ import pytest
 
 from spheremark.pipelines.detection.hypotheses import (
     _HEIGHTS,
+    _boulder_densities,
     _height_density,
     _standing_densities,
 )
@@ -37,3 +38,9 @@ def test_low_things_stand_on_something_wide_and_high_ones_on_poles():
     low, high = (_standing_densities(height, SIGMA, RADIUS) for height in (0.3, 1.6))
     assert low[1] > 0.3 * low[0]
     assert high[1] < 0.001 * high[0]  # else heads on shoulders are markers on crates
+
+
+def test_a_boulder_higher_than_itself_lies_on_another():
+    low, high = (_boulder_densities(height, SIGMA, RADIUS) for height in (0.05, 0.4))
+    assert low[0] > 10.0 * low[1]
+    assert high[1] > 5.0 * high[0]

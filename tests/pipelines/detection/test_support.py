@@ -11,13 +11,18 @@ from spheremark.pipelines.detection.shapes import BOULDER, HEAD, SPHERE
 from spheremark.pipelines.detection.support import _log_supports, log_share, supports_of
 
 N = 10  # beams in each row on each side
-ON_POLES, ON_WIDE = supports_of(0.05), supports_of(0.6)  # at heights of poles, and of crates
+ON_POLES, ON_WIDE = supports_of(0.05, 1.0), supports_of(0.6, 1.0)  # as high as poles, and crates
+LOW = supports_of(0.6, 0.0)  # and as what lies on the ground
 
 
 def logs(*near):
     """Log probabilities where so many of the beams of each row end near, on both sides alike."""
+    return logs_by(ON_POLES, near)
+
+
+def logs_by(supports, near):
     stopped = np.array([near, near], np.float64)
-    return _log_supports(stopped, N - stopped, ON_POLES)
+    return _log_supports(stopped, N - stopped, supports)
 
 
 @pytest.mark.parametrize(("n_near", "n_past"), [(0, 0), (3, 4), (40, 2)])
@@ -37,8 +42,16 @@ def test_legs_that_spread_are_no_shoulders_though_they_stop_as_many_beams():
 def test_what_stops_every_beam_from_some_row_on_is_a_head_or_a_boulder():
     neck = logs(0, 0, 0, 0, N, N, N, N, N)
     assert np.argmax(neck) == HEAD
-    ground = logs(*[N] * N_ROWS)
+    ground = logs_by(LOW, [N] * N_ROWS)
     assert np.argmax(ground) == BOULDER
+
+
+def test_a_boulder_on_another_is_held_as_a_sphere_on_something_wide():
+    """Its stone widens below it as a cone does; the ground would begin higher up."""
+    stone = [0, 0, 0, 3, *[N] * 5]
+    perched, on_ground = (logs_by(supports_of(1.0, share), stone) for share in (1.0, 0.0))
+    assert perched[BOULDER] == pytest.approx(perched[SPHERE], abs=0.2)
+    assert on_ground[BOULDER] < on_ground[SPHERE]
 
 
 def test_shoulders_of_which_one_is_hidden_are_shoulders():
