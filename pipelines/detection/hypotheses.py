@@ -81,7 +81,7 @@ ABUNDANCE_HELD = (29, 171, 432, 42, 107, 360, 185, 301, 873)
 """Groups of each hypothesis that something wide holds up, or the ground, in as many worlds."""
 
 _BESIDE = 0.1  # probability of anything beside what stands free
-_HEIGHTS = 2.5  # [m] up to which markers stand
+_HEIGHTS, _TALLER = 2.5, 1.0  # [m] up to which markers stand; and how much higher, if they do
 _ON_WIDE, _WIDE = 0.1, 0.4  # probability of standing on something wide, and how high that is [m]
 _LYING, _UNEVEN = 0.1, 0.2  # probability of lying on the ground; radii that it sinks in, or less
 _BOULDER_HEIGHT = (0.3, 0.6)  # radii: centre above the ground, and standard deviation
@@ -239,7 +239,11 @@ def _height_density(kind: int, height: float, sigma: float, radius: float) -> fl
     """Return the density of the height of a centre above the ground about it [1/m]."""
     unknown = 1.0 / _HEIGHTS
     if kind in STANDING:
-        return sum(_standing_densities(height, sigma, radius))
+        on_pole, otherwise = _standing_densities(height, sigma, radius)
+        share = (
+            _share_as_high(height - radius - sigma) if kind == SPHERE and sigma < np.inf else 1.0
+        )
+        return share * on_pole + otherwise
     if kind == BOULDER:
         return sum(_boulder_densities(height, sigma, radius))
     if not sigma < _HEIGHTS:
@@ -266,6 +270,14 @@ def _standing_densities(height: float, sigma: float, radius: float) -> tuple[flo
     wide += _LYING * NormalDist(radius, hypot(_UNEVEN * radius, sigma)).pdf(height)
     on_pole = (1.0 - held) * 0.5 * unknown * above
     return (1.0 - _NOT_GROUND) * on_pole + _NOT_GROUND * unknown, (1.0 - _NOT_GROUND) * wide
+
+
+def _share_as_high(height: float) -> float:
+    """Return how many of the poles of markers are so high, for each of a lower height.
+
+    Lamps are higher, and crowns of trees.
+    """
+    return exp(-max(height - _HEIGHTS, 0.0) / _TALLER)
 
 
 def _boulder_densities(height: float, sigma: float, radius: float) -> tuple[float, float]:

@@ -9,7 +9,7 @@ from spheremark.pipelines.detection.hypotheses import (
     _height_density,
     _standing_densities,
 )
-from spheremark.pipelines.detection.shapes import HEAD, NAMES, SPHERE
+from spheremark.pipelines.detection.shapes import BALL, CLUTTER, HEAD, NAMES, SPHERE
 
 RADIUS, SIGMA = 0.1, 0.05  # of a marker, and of the height of a place [m]
 
@@ -44,3 +44,15 @@ def test_a_boulder_higher_than_itself_lies_on_another():
     low, high = (_boulder_densities(height, SIGMA, RADIUS) for height in (0.05, 0.4))
     assert low[0] > 10.0 * low[1]
     assert high[1] > 5.0 * high[0]
+
+
+def test_few_markers_are_as_high_as_lamps_and_crowns_of_trees():
+    """A ground that is known to metres alone says nothing of it."""
+    for other in (BALL, CLUTTER):
+        low, high, unsure = (
+            np.log(_height_density(SPHERE, height, sigma, RADIUS))
+            - np.log(_height_density(other, height, sigma, RADIUS))
+            for height, sigma in ((2.0, SIGMA), (6.0, SIGMA), (4.0, 2.0))
+        )
+        assert high < low - 3.0
+        assert unsure == pytest.approx(low, abs=0.5)
