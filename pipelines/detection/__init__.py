@@ -117,9 +117,9 @@ def extract(
     -------
     MarkerCandidates
         Candidates in the order of azimuth; possible ones; of the groups that passed the first test
-        of size and were then rejected, the (at most 300) most probable ones, with the reason; and
-        the height of the highest ground point within 10 m, where the published method cuts its
-        clouds.
+        of size and were then rejected, the 200 most probable ones and 100 that were not compared,
+        at most, with the reason; and the height of the highest ground point within 10 m, where the
+        published method cuts its clouds.
 
     Notes
     -----
