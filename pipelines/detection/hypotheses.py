@@ -239,11 +239,8 @@ def _height_density(kind: int, height: float, sigma: float, radius: float) -> fl
     """Return the density of the height of a centre above the ground about it [1/m]."""
     unknown = 1.0 / _HEIGHTS
     if kind in STANDING:
-        on_pole, otherwise = _standing_densities(height, sigma, radius)
-        share = (
-            _share_as_high(height - radius - sigma) if kind == SPHERE and sigma < np.inf else 1.0
-        )
-        return share * on_pole + otherwise
+        share = _share_as_high(height - radius - sigma) if kind == SPHERE else 1.0
+        return sum(_standing_densities(height, sigma, radius, share))
     if kind == BOULDER:
         return sum(_boulder_densities(height, sigma, radius))
     if not sigma < _HEIGHTS:
@@ -256,11 +253,13 @@ def _height_density(kind: int, height: float, sigma: float, radius: float) -> fl
     return _NOT_GROUND * unknown + (1.0 - _NOT_GROUND) * known
 
 
-def _standing_densities(height: float, sigma: float, radius: float) -> tuple[float, float]:
+def _standing_densities(
+    height: float, sigma: float, radius: float, share: float = 1.0
+) -> tuple[float, float]:
     """Return the densities of the height of what a pole holds, and of what is held otherwise.
 
     Something wide does, or the ground. Their sum is the density of both [1/m]. A ground that is
-    wrong shows nothing wide.
+    wrong shows nothing wide. A share of the poles is so high.
     """
     held, unknown = _ON_WIDE + _LYING, 1.0 / _HEIGHTS
     if not sigma < _HEIGHTS:
@@ -268,7 +267,7 @@ def _standing_densities(height: float, sigma: float, radius: float) -> tuple[flo
     above = erfc((radius - height) / (1.4142 * sigma))
     wide = _ON_WIDE * above * NormalDist(0.0, hypot(_WIDE, sigma)).pdf(height)
     wide += _LYING * NormalDist(radius, hypot(_UNEVEN * radius, sigma)).pdf(height)
-    on_pole = (1.0 - held) * 0.5 * unknown * above
+    on_pole = share * (1.0 - held) * 0.5 * unknown * above
     return (1.0 - _NOT_GROUND) * on_pole + _NOT_GROUND * unknown, (1.0 - _NOT_GROUND) * wide
 
 

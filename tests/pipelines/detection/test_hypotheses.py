@@ -47,12 +47,15 @@ def test_a_boulder_higher_than_itself_lies_on_another():
 
 
 def test_few_markers_are_as_high_as_lamps_and_crowns_of_trees():
-    """A ground that is known to metres alone says nothing of it."""
+    """Above 2.5 m, a metre higher are as many as e goes into; a wrong ground shows any height."""
     for other in (BALL, CLUTTER):
-        low, high, unsure = (
-            np.log(_height_density(SPHERE, height, sigma, RADIUS))
-            - np.log(_height_density(other, height, sigma, RADIUS))
-            for height, sigma in ((2.0, SIGMA), (6.0, SIGMA), (4.0, 2.0))
+        low, high, highest, unsure = (
+            _height_density(SPHERE, height, sigma, RADIUS)
+            / _height_density(other, height, sigma, RADIUS)
+            for height, sigma in ((2.0, SIGMA), (6.0, SIGMA), (30.0, SIGMA), (4.0, 2.0))
         )
-        assert high < low - 3.0
-        assert unsure == pytest.approx(low, abs=0.5)
+        wrong, poles = 0.02, 0.98 * 0.8
+        as_high = np.exp(-(6.0 - RADIUS - SIGMA - 2.5))
+        assert high / low == pytest.approx((poles * as_high + wrong) / (poles + wrong), rel=0.01)
+        assert highest / low == pytest.approx(wrong / (poles + wrong), rel=0.01)
+        assert unsure / low == pytest.approx(1.0, abs=0.4)  # a ground known to metres says nothing
