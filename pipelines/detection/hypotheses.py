@@ -32,6 +32,7 @@ from spheremark.pipelines.detection.shapes import (
     SHIFT,
     SOLID,
     SPHERE,
+    STONE,
     STRETCH,
     Z,
     log_likelihood,
@@ -83,6 +84,7 @@ ABUNDANCE_HELD = (29, 171, 432, 42, 107, 360, 185, 301, 873)
 _BESIDE = 0.1  # probability of anything beside what stands free
 _HEIGHTS, _TALLER = 2.5, 1.0  # [m] up to which markers stand; and how much higher, if they do
 _ON_WIDE, _WIDE = 0.1, 0.4  # probability of standing on something wide, and how high that is [m]
+_ON_STONE = 0.25  # of what stands on something wide or on the ground, on a stone
 _LYING, _UNEVEN = 0.1, 0.2  # probability of lying on the ground; radii that it sinks in, or less
 _BOULDER_HEIGHT = (0.3, 0.6)  # radii: centre above the ground, and standard deviation
 _PERCHED, _STONE = 0.1, 0.5  # probability that a boulder lies on another, and mean height [m] of it
@@ -179,6 +181,7 @@ def log_likelihoods(
         logs[kind] += np.log(_height_density(kind, evidence.height, evidence.sigma_height, radius))
         logs[kind] += np.log(_neighbour_probability(kind, n_neighbours))
     priors = _priors(radius, physics)
+    priors[STANDING, 0, STONE], priors[BOULDER, 0, STONE] = np.round((_ON_STONE * held, perched), 2)
     if abs(beams.face.sum()) < 0.5 * len(beams.face) - 3:
         moved = MOVED / radius
         priors[SPHERE, 1, SHIFT:POLE] = moved

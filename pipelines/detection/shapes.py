@@ -31,15 +31,17 @@ SPHERE, BALL, BOULDER, HEAD, CYLINDER, POST, SOLID, PANEL, CLUTTER = range(len(N
 # noise; half widths of a beam outside an outline where half the beams hit, before an empty sky and
 # before what sends an echo of its own; logarithm of a stretch of depths; up to ten of form; the
 # place of one face of the scan against the other; logarithm of the width of the pole over that of
-# what it holds
-X, Y, Z, NOISE, EDGE, STRETCH, FORM, SHIFT, POLE, N_PARAMETERS = (
-    *(0, 1, 2, 3, 4, 6, 7, 17, 20, 21),
+# what it holds; probability that a stone holds it, known beforehand
+X, Y, Z, NOISE, EDGE, STRETCH, FORM, SHIFT, POLE, STONE, N_PARAMETERS = (
+    *(0, 1, 2, 3, 4, 6, 7, 17, 20, 21, 22),
 )
 
 MEAN = 2.0 / 3.0  # of a radius: mean height of a sphere's surface over its disc
 _POLE_FROM, _POLE_DEPTH, _POLE_SHARE = 0.8, 0.4, 0.7  # of a pole, and of its beams that it stops
 _POLE_MOST = 0.9  # of the radius of what it holds: half the width of a pole
 _POST, _POST_DEPTH = 0.5, 0.1  # radii: least half width of a post, and scatter of its surface
+_STONE_SIZE, _VARIES = 2.0, 0.125  # radii of a stone below; by what share half its width may be off
+_DIP = 0.25  # of the height at which poles begin: what is not round lies so much deeper on a stone
 _UPRIGHT = 0.3  # of posts are round and upright; what else is as wide is anything
 _STRAY = 0.02  # share of the returns from a surface that lie anywhere: crosstalk, dust, strays
 _MERGED = 0.6  # share of the echoes of a beam that an outline halves, between it and what is behind
@@ -87,14 +89,16 @@ def _beam(shape: Array, beams: Beams, i: int) -> _Beam:
 
 
 @compiled
-def _unheard(share: float, beams: Beams) -> float:
+def _unheard(share: float, hearing: _Hearing) -> float:
     """Return the probability that a beam that is partly on an object has no return."""
-    heard = min(max(share / beams.faintest - 0.5, 0.0), 1.0)
-    return 1.0 - heard * (1.0 - max(_MISPLACED, beams.lost))
+    lost, faintest = hearing
+    heard = min(max(share / faintest - 0.5, 0.0), 1.0)
+    return 1.0 - heard * (1.0 - max(_MISPLACED, lost))
 
 
 _Form = tuple[float, float, float, float]
 _Beam = tuple[float, float, float]  # edge, and half the width across and up
+_Hearing = tuple[float, float]  # ``lost`` and ``faintest`` of ``Beams``
 
 
 @compiled
@@ -139,6 +143,14 @@ def _surface(
 
 
 @compiled
+def _on_pole(x: float, z: float, pole: float, beam: _Beam, sigma: float) -> tuple[float, float]:
+    """Return the share of a beam on a pole, and the density of a depth there."""
+    edge, blur, _ = beam
+    share = _POLE_SHARE * pole / (pole + 0.5 * blur)  # a thin pole covers part of a beam
+    return share * _inside(pole - abs(x), blur, edge), _pole_density(x, z, pole, blur, sigma)
+
+
+@compiled
 def _pole_density(x: float, z: float, pole: float, blur: float, sigma: float) -> float:
     """Return the density of a depth about the axis of a pole, which may lean, or of a round post.
 
@@ -149,6 +161,38 @@ def _pole_density(x: float, z: float, pole: float, blur: float, sigma: float) ->
         return leaning
     upright = _normal(z - _round(abs(x), pole, blur), sigma + _POST_DEPTH)
     return float(_UPRIGHT * upright + (1.0 - _UPRIGHT) * leaning)
+
+
+@compiled
+def _stopped(rest: float, on: tuple[float, float], z: float, wide: float, h: _Hearing) -> float:
+    """Return the density of a beam of which what holds an object up stops a share.
+
+    ``rest`` is the density of what becomes of the others, ``on`` the share and the density of the
+    depth where they stop; ``z`` is how deep the beam ends, ``wide`` as in ``Beams``.
+    """
+    share, density = on
+    if z >= NEAR:
+        density = _unheard(share, h) if z == np.inf else _MISPLACED
+    share *= 1.0 - wide
+    return float(share * density + (1.0 - share) * rest)
+
+
+@compiled
+def _on_stone(x: float, z: float, downs: tuple[float, float], blur: float) -> tuple[float, float]:
+    """Return the share of a beam on a stone, and the density of a depth there.
+
+    It is round on top, and the object lies about its middle. ``downs`` are how far below its top
+    the beam passes, if the object dips into it or touches it: each is as likely.
+    """
+    share, density = 0.0, 0.0
+    for down in downs:
+        if down > 0.0:
+            half = np.sqrt(2.0 * _STONE_SIZE * down)
+            sigma = np.sqrt(_POLE_DEPTH**2 + (_VARIES * half) ** 2)
+            own = 0.5 * _inside(half - abs(x), blur, 0.0)
+            share += own
+            density += own * _normal(z - _round(abs(x), half, blur), sigma)
+    return share, density / (share + _FLOOR)
 
 
 @compiled
@@ -171,6 +215,17 @@ def _solid(x: float, y: float, form: Array, beam: _Beam) -> tuple[float, float, 
     depth = _round(gap / ratio, radius, blur) + MEAN * radius + form[5] * x + form[6] * y
     depth += form[7] * (gap * gap - 0.5) + gap * gap * (form[8] * c2 + form[9] * s2)
     return share, depth, divided
+
+
+@compiled
+def _on_surface(kind: int, share: float, off: float, sigma: float, z: float, h: _Hearing) -> float:
+    """Return the density of a beam of which a surface stops a share, so far before its depth."""
+    if z < NEAR:
+        stray = (_STRAY + _MERGED * 4.0 * share * (1.0 - share)) / (2.0 * NEAR)
+        return float(stray + (1.0 - _STRAY) * _normal(off, sigma))
+    if z == np.inf and kind != CLUTTER:  # leaves have gaps anyway
+        return float(_unheard(share, h))
+    return _MISPLACED
 
 
 @compiled
@@ -204,47 +259,73 @@ def trust(beams: Beams) -> float:
 
 @compiled
 def log_likelihood(kind: int, shape: Array, prior: Array, beams: Beams, densities: Array) -> float:
-    """Return the logarithm of likelihood times prior density of a shape; write those of beams."""
-    total, product, log_prior = 0.0, 1.0, 0.0
-    for j in range(N_PARAMETERS):
-        if prior[1, j] > 0.0:
-            log_prior -= 0.5 * ((shape[j] - prior[0, j]) / prior[1, j]) ** 2
+    """Return the logarithm of likelihood times prior density of a shape; write those of beams.
+
+    What holds it up is a pole or nothing, or a stone: all beams below show which.
+    """
+    total, product, stone = 0.0, 1.0, prior[0, STONE]
+    gained = np.zeros(len(beams.x) if stone > 0.0 else 0)
     form = _form_of(kind, shape)
-    pole = form[0] * min(np.exp(shape[POLE]), _POLE_MOST)
+    pole = form[0] * min(np.exp(shape[POLE]), _POLE_MOST) if prior[1, POLE] > 0.0 else 0.0
     variance = form[2] if kind == CLUTTER else np.exp(2.0 * shape[NOISE])
-    scale, precision = (1.0 - _STRAY) / np.sqrt(6.283185 * variance), 0.5 / variance
     sigma = np.sqrt(variance)
     bottom = -form[1] if kind in (CYLINDER, POST) else -_POLE_FROM * form[0] * form[1]
-    pole_share = _POLE_SHARE * pole / (pole + 0.5 * beams.blur)  # a thin pole covers part of a beam
-    has_pole = prior[1, POLE] > 0.0
+    hearing = (beams.lost, beams.faintest)
     for i in range(len(beams.x)):
         x = beams.x[i] - shape[X] - beams.face[i] * shape[SHIFT]
         y = beams.y[i] - shape[Y] - beams.face[i] * shape[SHIFT + 1]
         moved = shape[Z] + beams.face[i] * shape[SHIFT + 2]
-        z, is_near = beams.z[i] - moved, beams.z[i] < NEAR
+        z, down = beams.z[i] - moved, bottom - y
         rest, beam = beams.behind[i], _beam(shape, beams, i)
-        if has_pole and y < bottom:
-            share = pole_share * _inside(pole - abs(x), beams.blur, beam[0])
-            on = _pole_density(x, z - MEAN, pole, beam[1], sigma) if is_near else _MISPLACED
-            if beams.z[i] == np.inf:
-                on = _unheard(share, beams)
-            share *= 1.0 - beams.wide[i]
-            rest = share * on + (1.0 - share) * rest
+        if pole > 0.0 and down > 0.0:
+            held = _on_pole(x, z - MEAN, pole, beam, sigma)
+            rest = _stopped(rest, held, beams.z[i], beams.wide[i], hearing)
         share, depth, divided = _surface(kind, x, y, shape, form, beam)
+        on = 0.0
         if share > 0.0:
-            on = _MISPLACED
-            if is_near:
-                stray = (_STRAY + _MERGED * 4.0 * share * (1.0 - share)) / (2.0 * NEAR)
-                on = stray + scale * np.exp(-precision * (z - depth) ** 2)
-            elif beams.z[i] == np.inf and kind != CLUTTER:  # leaves have gaps anyway
-                on = _unheard(share, beams)
-            rest = share * on + (1.0 - share) * rest
-        rest = _merged(rest, divided * beams.merged[i], beams, i, (moved + depth, sigma))
-        densities[i] = rest + _FLOOR
+            on = _on_surface(kind, share, z - depth, sigma, beams.z[i], hearing)
+        merged, surface = divided * beams.merged[i], (moved + depth, sigma)
+        density = share * on + (1.0 - share) * rest
+        densities[i] = _merged(density, merged, beams, i, surface) + _FLOOR
+        if stone > 0.0 and down > 0.0:
+            held = _on_stone(x, z - MEAN, (down, down + _DIP * bottom), beams.blur)
+            rest = _stopped(beams.behind[i], held, beams.z[i], beams.wide[i], hearing)
+            density = share * on + (1.0 - share) * rest
+            density = _merged(density, merged, beams, i, surface) + _FLOOR
+            gained[i] = np.log(density / densities[i])
         product *= densities[i]
         if not 1e-200 < product < 1e200:
             total, product = total + np.log(product), 1.0
-    return float(log_prior + trust(beams) * (total + np.log(product)))
+    own = trust(beams)
+    total = _log_prior(shape, prior) + own * (total + np.log(product))
+    return float(total + _log_held(stone, own, gained, densities))
+
+
+@compiled
+def _log_prior(shape: Array, prior: Array) -> float:
+    """Return the logarithm of the prior density of a shape, but for a constant."""
+    total = 0.0
+    for j in range(N_PARAMETERS):
+        if prior[1, j] > 0.0:
+            total -= 0.5 * ((shape[j] - prior[0, j]) / prior[1, j]) ** 2
+    return total
+
+
+@compiled
+def _log_held(stone: float, own: float, gained: Array, densities: Array) -> float:
+    """Return how much likelier beams are if a stone may hold an object up; weight their densities.
+
+    ``gained`` are the logarithms of how much likelier each is if one does, ``own`` as ``trust``.
+    """
+    if stone <= 0.0:
+        return 0.0
+    held = np.log(stone) + own * gained.sum()
+    either = np.logaddexp(np.log(1.0 - stone + _FLOOR), held)
+    share = np.exp(held - either)
+    for i in range(len(gained)):
+        if gained[i] != 0.0:
+            densities[i] *= np.exp(share * gained[i])
+    return float(either)
 
 
 @compiled
