@@ -219,7 +219,7 @@ def _solid(x: float, y: float, form: Array, beam: _Beam) -> tuple[float, float, 
 
 @compiled
 def _on_surface(kind: int, share: float, off: float, sigma: float, z: float, h: _Hearing) -> float:
-    """Return the density of a beam of which a surface stops a share, so far before its depth."""
+    """Return the density of a beam of which a surface stops a share; it ends so far off that."""
     if z < NEAR:
         stray = (_STRAY + _MERGED * 4.0 * share * (1.0 - share)) / (2.0 * NEAR)
         return float(stray + (1.0 - _STRAY) * _normal(off, sigma))
