@@ -50,7 +50,7 @@ def test_rows_are_pooled_by_case_distance_and_method_and_compared_with_the_bound
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("seed", [0, 2])
+@pytest.mark.parametrize("seed", [0, pytest.param(2, marks=pytest.mark.long)])
 def test_every_method_stands_beside_the_bound_at_every_distance(seed):
     rows = rows_of(n_stops=1, seed=seed, cases=(Case(0.02, 13.2),))
     assert {row["distance_m"] for row in rows} == {5.0 * i for i in range(1, 7)}
