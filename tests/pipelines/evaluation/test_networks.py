@@ -32,7 +32,6 @@ def report():
     return found
 
 
-@pytest.mark.long
 def test_surveys_with_wrong_rigs_are_compared_with_their_truth(report):
     assert [row["seed"] for row in report["surveys"]] == [40, 41]
     for row in report["surveys"]:
@@ -43,7 +42,6 @@ def test_surveys_with_wrong_rigs_are_compared_with_their_truth(report):
     assert report["summary"]["rms_stations_m"]["mean"] == pytest.approx(mean)
 
 
-@pytest.mark.long
 def test_the_report_is_a_table_and_json(report):
     out = Console(record=True, width=160)
     print_tables(out, EXPERIMENT.tables(report))

@@ -87,7 +87,7 @@ def test_lines_of_rests_that_fall_together_give_centres_as_good_as_promised(fiel
 @pytest.mark.parametrize(
     "seed",
     [
-        pytest.param(0, marks=pytest.mark.long),
+        0,
         # 3.2, the limit is 2.5: the clock of the gimbal comes out as 0.7 ms, twice its sigma
         pytest.param(
             4, marks=[pytest.mark.xfail(strict=True, raises=AssertionError), pytest.mark.long]
