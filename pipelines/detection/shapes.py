@@ -264,7 +264,7 @@ def log_likelihood(kind: int, shape: Array, prior: Array, beams: Beams, densitie
     What holds it up is a pole or nothing, or a stone: all beams below show which.
     """
     total, product, stone = 0.0, 1.0, prior[0, STONE]
-    gained = np.zeros(len(beams.x) if stone > 0.0 else 0)
+    gain, ratio, others = 0.0, 1.0, np.zeros(len(beams.x) if stone > 0.0 else 0)
     form = _form_of(kind, shape)
     pole = form[0] * min(np.exp(shape[POLE]), _POLE_MOST) if prior[1, POLE] > 0.0 else 0.0
     variance = form[2] if kind == CLUTTER else np.exp(2.0 * shape[NOISE])
@@ -291,14 +291,16 @@ def log_likelihood(kind: int, shape: Array, prior: Array, beams: Beams, densitie
             held = _on_stone(x, z - MEAN, (down, down + _DIP * bottom), beams.blur)
             rest = _stopped(beams.behind[i], held, beams.z[i], beams.wide[i], hearing)
             density = share * on + (1.0 - share) * rest
-            density = _merged(density, merged, beams, i, surface) + _FLOOR
-            gained[i] = np.log(density / densities[i])
+            others[i] = _merged(density, merged, beams, i, surface) + _FLOOR
+            ratio *= others[i] / densities[i]
+            if not 1e-200 < ratio < 1e200:
+                gain, ratio = gain + np.log(ratio), 1.0
         product *= densities[i]
         if not 1e-200 < product < 1e200:
             total, product = total + np.log(product), 1.0
     own = trust(beams)
     total = _log_prior(shape, prior) + own * (total + np.log(product))
-    return float(total + _log_held(stone, own, gained, densities))
+    return float(total + _log_held(stone, own * (gain + np.log(ratio)), others, densities))
 
 
 @compiled
@@ -312,19 +314,21 @@ def _log_prior(shape: Array, prior: Array) -> float:
 
 
 @compiled
-def _log_held(stone: float, own: float, gained: Array, densities: Array) -> float:
-    """Return how much likelier beams are if a stone may hold an object up; weight their densities.
+def _log_held(stone: float, gain: float, others: Array, densities: Array) -> float:
+    """Return the log odds by which beams are likelier if a stone may hold an object up.
 
-    ``gained`` are the logarithms of how much likelier each is if one does, ``own`` as ``trust``.
+    ``gain`` are those if one does, ``others`` the densities of the beams then, 0 for those above.
+    Weights the densities of both.
     """
     if stone <= 0.0:
         return 0.0
-    held = np.log(stone) + own * gained.sum()
+    held = np.log(stone) + gain
     either = np.logaddexp(np.log(1.0 - stone + _FLOOR), held)
     share = np.exp(held - either)
-    for i in range(len(gained)):
-        if gained[i] != 0.0:
-            densities[i] *= np.exp(share * gained[i])
+    if share > _FLOOR:
+        for i in range(len(others)):
+            if others[i] > 0.0:
+                densities[i] *= (others[i] / densities[i]) ** share
     return float(either)
 
 

@@ -134,11 +134,12 @@ class Call(NamedTuple):
 
 
 class Station(NamedTuple):
-    """A station: squared error of the position [m^2] and of the pose over its covariance."""
+    """A station: squared error of its position [m^2]; of pose and position over covariance."""
 
     status: str
     error2: float
     square: float
+    square_position: float
 
 
 class Sheet(NamedTuple):
@@ -454,7 +455,7 @@ def _station(scan: Scan, fits: MarkerFits, config: SurveyConfig) -> Station | No
         return None
     pose = (fix.T_site_station, fix.cov_T_site_station)
     error, _, squares = pose_errors(pose, scan.stop.truth, fits.levelling)
-    return Station(fix.status.value, float(error @ error), squares["pose"])
+    return Station(fix.status.value, float(error @ error), squares["pose"], squares["position"])
 
 
 def report_of(scores: Sequence[Score], first_seed: int, peers: Sequence[str]) -> Plain:
@@ -629,10 +630,18 @@ def _family(name: str, scores: Sequence[Score]) -> Plain:
         **_promise("sheet_anew_", [[one.square_anew / 3.0 for one in own] for own in of_sheets]),
         "n_stations": len(placed),
         "station_rms_m": _root([one.error2 for one in placed]),
-        **_promise("station_", [[one.square / 6.0 for one in own] for own in stations]),
-        **_promise(
-            "station_sheet_", [[one.square / 6.0 for one in own] for own in stations_of_sheets]
-        ),
+        **_promises_of_stations("", stations),
+        **_promises_of_stations("sheet_", stations_of_sheets),
+    }
+
+
+def _promises_of_stations(prefix: str, stations: Sequence[Sequence[Station]]) -> Plain:
+    """Return the means of squares over promise of the stations of worlds."""
+    poses = [[one.square / 6.0 for one in own] for own in stations]
+    positions = [[one.square_position / 3.0 for one in own] for own in stations]
+    return {
+        **_promise(f"station_{prefix}", poses),
+        **_promise(f"position_{prefix}", positions),
     }
 
 
@@ -791,7 +800,9 @@ _PROMISES = (
     *_promised("anew_", "biases anew"),
     *_promised("sheet_", "by data sheets"),
     *_promised("sheet_anew_", "biases anew"),
-    *_promised("station_", "stations"),
+    *_promised("position_", "stations' positions"),
+    *_promised("position_sheet_", "by data sheets"),
+    *_promised("station_", "with tilt and heading"),
     *_promised("station_sheet_", "by data sheets"),
 )
 _ABOUT_PROMISES = (

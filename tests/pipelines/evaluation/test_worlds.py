@@ -45,7 +45,7 @@ def report():
         "plain",
         [Seen(MANY, ("ok", "peer"), "", centre(1.0)), Seen(MANY, ("weak",), "", None)],
         [Call("ok", 0.99, 0, ""), Call("weak", 0.8, 1, ""), Call("peer", 1.0, 0, "")],
-        station=Station("ok", 4.0, 6.0),
+        station=Station("ok", 4.0, 6.0, 3.0),
     )
     second = score(
         "decoys",
@@ -132,12 +132,17 @@ def test_stations_that_are_ok_count_and_families_are_summed(report):
 
 def test_data_sheets_stand_beside_the_defaults(report):
     low, high = (
-        score("optics", [Seen(MANY, ("ok",), "", centre(3.0))], [], station=Station("ok", 1.0, s))
+        score(
+            "optics",
+            [Seen(MANY, ("ok",), "", centre(3.0))],
+            [],
+            station=Station("ok", 1.0, s, s / 4.0),
+        )
         for s in (12.0, 24.0)
     )
     weak = centre(30.0, status="weak")
     known = [
-        one._replace(sheet=Sheet((centre(square**0.5), weak), Station("ok", 1.0, 6.0)))
+        one._replace(sheet=Sheet((centre(square**0.5), weak), Station("ok", 1.0, 6.0, 6.0)))
         for one, square in ((low, 2.0), (high, 4.0))
     ]
     (family,) = report_of(known, 0, ())["families"]
@@ -146,6 +151,8 @@ def test_data_sheets_stand_beside_the_defaults(report):
     assert family["sheet_nees"] == pytest.approx(1.0)
     assert family["sheet_nees_se"] == pytest.approx(1.0 / 3.0)
     assert family["station_sheet_nees"] == 1.0
+    assert (family["position_nees"], family["position_nees_se"]) == (1.5, pytest.approx(0.5))
+    assert family["position_sheet_nees"] == 2.0
     (empty, *_) = report["families"]
     assert (empty["sheet_nees"], empty["nees_se"]) == (None, None)
 
